@@ -1,0 +1,1 @@
+"""E-DQN in one compiled JAX program: a drone learns to fly through unmapped obstacles from events."""

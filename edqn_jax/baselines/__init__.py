@@ -1,0 +1,1 @@
+"""Rivals and references, one file each, each runnable alone."""

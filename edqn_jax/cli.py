@@ -1,0 +1,171 @@
+"""The command line: `edqn train` and `edqn evaluate`. Argument parsing and exit codes, nothing else."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+from tyro.conf import Positional, arg
+
+from edqn_jax.config import Config, ConfigError
+from edqn_jax.endings import (
+    BAD_INPUT,
+    DIVERGED,
+    DONE,
+    INTERRUPTED,
+    TERMINATED,
+    DivergedError,
+    StoppedError,
+    listening_for_sigterm,
+)
+from edqn_jax.resolve import resolve
+from edqn_jax.rundir import Resume, plan_run_directory
+from edqn_jax.validate import validate
+
+Point = tuple[float, float, float]
+
+
+SHORT_NAMES = {
+    "--world": "--world.name",
+    "--num-envs": "--train.num-envs",
+    "--total-steps": "--train.total-steps",
+    "--seed": "--train.seed",
+}
+"""What people reach for first, and the knob that it stands for."""
+
+
+@dataclass(frozen=True)
+class TrainOptions:
+    preset: Literal["default", "paper"] = "default"
+    """`default`: the best that we know. `paper`: Table 1 to the letter."""
+    config: Annotated[Path | None, arg(metavar="FILE.yaml", help_behavior_hint="")] = None
+    """Knobs by group; the file wins over the preset, flags win over the file."""
+    run_dir: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="")] = None
+    """What the run leaves behind goes here (default: a fresh, dated folder under runs/)."""
+    resume: Resume = "auto"
+    """Continue the unfinished run in --run-dir: if there is one; never, start over; or fail without one."""
+
+
+@dataclass(frozen=True)
+class TrainCommand:
+    """Train a drone to fly from events, fly the result, draw it."""
+
+    options: Annotated[TrainOptions, arg(name="")] = field(default_factory=TrainOptions)
+    knobs: Annotated[Config, arg(name="")] = field(default_factory=Config)
+
+
+@dataclass(frozen=True)
+class EvaluateArgs:
+    """Fly a saved run greedily on missions of any world, and measure."""
+
+    run: Annotated[Positional[Path], arg(metavar="RUN")]
+    """Folder of the run."""
+    world: Annotated[str | None, arg(metavar="paper|sparse|medium|dense|FILE.xml", help_behavior_hint="")] = (
+        None
+    )
+    """Where to fly (default: the world of the run)."""
+    start: Annotated[Point | None, arg(metavar="X Y Z", help_behavior_hint="")] = None
+    """Start of every mission, metres (default: the world's; random free ones with --missions)."""
+    goal: Annotated[Point | None, arg(metavar="X Y Z", help_behavior_hint="")] = None
+    """Goal of every mission, metres (default: the world's; random free ones on random worlds)."""
+    missions: Annotated[int, arg(metavar="N")] = 1
+    """How many missions."""
+    seed: Annotated[int, arg(metavar="S")] = 0
+    """Seed of the missions."""
+    json: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
+    """Also write the figures as JSON."""
+    trajectories: Annotated[Path | None, arg(metavar="FILE.npz", help_behavior_hint="")] = None
+    """Also write every flight, a pose per physics step."""
+
+
+TRAIN = "edqn train"
+COMMANDS = {"train": TrainCommand, "evaluate": EvaluateArgs}
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Runs one command and returns its exit code: 0 done, 2 bad input, 3 diverged, 143 stopped by SIGTERM."""
+    argv = list(sys.argv[1:] if argv is None else argv)
+    try:
+        if argv[:1] == ["train"]:
+            return _train(argv[1:])
+        if argv[:1] == ["evaluate"]:
+            return _evaluate(argv[1:])
+        tyro.extras.subcommand_cli_from_dict(COMMANDS, prog="edqn", args=argv[:1] or ["--help"])
+    except SystemExit as ending:  # tyro has printed the help, or what is wrong
+        return int(ending.code or DONE)
+    except (ConfigError, DivergedError, StoppedError, KeyboardInterrupt) as ending:
+        return _explain(ending)
+    return BAD_INPUT
+
+
+def parse_train(argv: Sequence[str]) -> tuple[TrainOptions, Config]:
+    """The options and the checked configuration that the arguments of `edqn train` ask for.
+
+    Raises:
+        ConfigError: if the preset, the file or a limit is not met.
+        SystemExit: after printing, for --help and for what does not parse.
+    """
+    argv = [_long_name(word) for word in argv]
+    # Preset, file and world decide the defaults that the other flags change and that --help shows.
+    early = [word for word in argv if word not in ("-h", "--help")]
+    options, _ = tyro.cli(TrainOptions, args=early, prog=TRAIN, return_unknown_args=True, add_help=False)
+    base = resolve(options.preset, options.config)
+    world = _parse_knobs(early, base).world.name
+    config = _parse_knobs(argv, resolve(options.preset, options.config, world))
+    validate(config)
+    return options, config
+
+
+def _long_name(word: str) -> str:
+    name, equals, value = word.partition("=")
+    return SHORT_NAMES.get(name.replace("_", "-"), name) + equals + value
+
+
+def _parse_knobs(argv: Sequence[str], base: Config) -> Config:
+    names = ", ".join(f"{short} for {long}" for short, long in SHORT_NAMES.items())
+    description = f"{TrainCommand.__doc__}\n\nEvery knob is a flag. Short names: {names}."
+    default = TrainCommand(knobs=base)
+    return tyro.cli(TrainCommand, args=argv, prog=TRAIN, description=description, default=default).knobs
+
+
+def _train(argv: Sequence[str]) -> int:
+    options, config = parse_train(argv)
+    run = plan_run_directory(options.run_dir, config, options.resume)
+
+    from edqn_jax.devices import cores, most_that_divide, use_cpu_devices
+    from edqn_jax.report.progress import Progress
+    from edqn_jax.run import train_run
+
+    use_cpu_devices(config.train.devices or most_that_divide(config.train.shards, cores()))
+    progress = Progress()
+    with listening_for_sigterm() as stop_requested:
+        try:
+            train_run(config, run, progress, stop_requested)
+        finally:
+            progress.stop()
+    return DONE
+
+
+def _evaluate(argv: Sequence[str]) -> int:
+    args = tyro.cli(EvaluateArgs, args=argv, prog="edqn evaluate")
+    if args.missions < 1:
+        raise ConfigError(f"--missions must be at least 1, not {args.missions}")
+    if not (args.run / "config.yaml").is_file():
+        raise ConfigError(f"there is no run in '{args.run}': it holds no config.yaml")
+
+    from edqn_jax.devices import use_cpu_devices
+    from edqn_jax.evaluate import evaluate_command
+
+    use_cpu_devices()
+    evaluate_command(args)
+    return DONE
+
+
+def _explain(ending: BaseException) -> int:
+    print(f"edqn: {str(ending) or 'interrupted'}", file=sys.stderr)
+    codes = {ConfigError: BAD_INPUT, DivergedError: DIVERGED, StoppedError: TERMINATED}
+    return next((code for kind, code in codes.items() if isinstance(ending, kind)), INTERRUPTED)

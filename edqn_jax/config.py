@@ -1,0 +1,322 @@
+"""Every knob of the project: one frozen dataclass per room, nested into one `Config`.
+
+The defaults below are the `default` preset: the best that we know. `preset("paper")` is Table 1 of the
+paper to the letter. A string under a field is its help text on the command line.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass, field
+from typing import Literal
+
+
+@dataclass(frozen=True)
+class WorldConfig:
+    """Where to fly."""
+
+    name: str = "paper"
+    """`paper`, a random density (`sparse`, `medium`, `dense`), or the path of an MJCF file."""
+    pool_size: int = 1024
+    """Random training worlds that are prepared before training (random densities only)."""
+    missions: int = 8192
+    """Prepared (world, start, goal) triples that resets draw from."""
+    own_start_fraction: float = 0.25
+    """Share of training missions that begin within `start_jitter_m` of the world's own start."""
+    start_jitter_m: float = 1.0
+    """Half width of the box around the world's own start that such starts are drawn from, metres."""
+
+
+@dataclass(frozen=True)
+class DroneConfig:
+    """The airframe's inner loops: velocity, attitude and body rate, all at the physics rate."""
+
+    physics_dt_s: float = 0.02
+    """MJX step, seconds."""
+    physics_steps: int = 13
+    """MJX steps per decision: 13 x 0.02 s = 0.26 s."""
+    body_radius_m: float = 0.36
+    """Radius of the sphere that must not touch anything, metres."""
+    velocity_gain: float = 4.5
+    """Commanded horizontal acceleration per velocity error, 1/s."""
+    climb_gain: float = 6.0
+    """Commanded vertical acceleration per velocity error, 1/s."""
+    attitude_gain: float = 10.0
+    """Commanded body rate per tilt error, 1/s."""
+    rate_gain: float = 20.0
+    """Commanded angular acceleration per error of the rates about x and y, 1/s."""
+    yaw_gain: float = 3.0
+    """Commanded yaw rate per heading error, 1/s."""
+    yaw_rate_gain: float = 10.0
+    """Commanded angular acceleration per error of the rate about z, 1/s."""
+    max_body_rate_rad_s: float = 6.0
+    """Largest rate about x and y together that the attitude loop may ask for, rad/s."""
+    max_tilt_rad: float = 1.15
+    """Largest tilt that the velocity loop may ask for, radians."""
+    max_horizontal_m_s2: float = 12.0
+    """Largest horizontal acceleration that the velocity loop may ask for, m/s^2."""
+    max_climb_m_s2: float = 10.0
+    """Largest upward acceleration that the velocity loop may ask for, m/s^2."""
+    max_descent_m_s2: float = 6.5
+    """Largest downward acceleration that the velocity loop may ask for, m/s^2; below gravity."""
+    max_tilt_share: float = 0.8
+    """Share of a rotor's range that torque about x and y may claim; the rest keeps collective thrust steerable."""
+    max_yaw_rate_rad_s: float = 2.0
+    """Rate limit of the yaw setpoint, and largest yaw rate that the heading loop may ask for, rad/s."""
+
+
+@dataclass(frozen=True)
+class CameraConfig:
+    """A pinhole camera at the body's centre."""
+
+    width: int = 32
+    """Pixels across."""
+    height: int = 24
+    """Pixels down."""
+    horizontal_fov_deg: float = 90.0
+    """Horizontal field of view, degrees."""
+    mount: Literal["level", "body"] = "level"
+    """`level`: a gimbal removes roll and pitch. `body`: the camera takes the full attitude."""
+    samples_across: int = 3
+    """Rays per pixel across; texture is filtered analytically, rays only resolve silhouettes."""
+    samples_down: int = 2
+    """Rays per pixel down."""
+    texture_contrast: float = 0.35
+    """Amplitude of the procedural surface texture relative to the surface's brightness."""
+    texture_period_m: float = 1.5
+    """Period of the finer texture octave, metres; the coarser one is four times as long."""
+    ambient: float = 0.4
+    """Share of a surface's brightness that does not depend on the sun."""
+    sun_azimuth_deg: float = 205.0
+    """Direction towards the sun in the world's xy plane, degrees from +x."""
+    sun_elevation_deg: float = 50.0
+    """Height of the sun over the horizon, degrees."""
+    sky_rgb: tuple[float, float, float] = (0.62, 0.74, 0.9)
+    """Brightness of the sky."""
+
+
+@dataclass(frozen=True)
+class EventsConfig:
+    """From a pair of log-brightness frames to events (Eq. 2-5)."""
+
+    law: Literal["paper", "airsim", "esim"] = "paper"
+    """Which event law: the paper's, AirSim's own to the event, or a sensor with memory."""
+    frame_times_s: tuple[float, ...] = (-0.04, 0.0)
+    """When frames are rendered relative to the decision, seconds; each must be a physics step."""
+    threshold: float = 0.1
+    """Th of Eq. 2 (`paper`): log-brightness change that makes events."""
+    tolerance: float = 0.1
+    """TOL of Eq. 4 (`paper`): log-brightness change per event."""
+    contrast_on: float = 0.1
+    """C+ (`esim`): log-brightness rise per event."""
+    contrast_off: float = 0.1
+    """C- (`esim`): log-brightness fall per event."""
+    airsim_tolerance: float = 0.5
+    """TOL of AirSim's event simulator (`airsim`)."""
+    refractory_ns: float = 1000.0
+    """Refractory period, nanoseconds; caps a pixel's events in a window (Eq. 3)."""
+    log_epsilon: float = 1e-3
+    """Added to brightness in [0, 1] before the logarithm of Eq. 1."""
+    threshold_mismatch: float = 0.0
+    """Standard deviation of the per-pixel threshold relative to the threshold; 0 is a perfect sensor."""
+    leak_rate_hz: float = 0.0
+    """ON events a pixel makes by leakage, per second."""
+    shot_rate_hz: float = 0.0
+    """Events of either polarity a pixel makes by shot noise, per second."""
+    hot_pixel_fraction: float = 0.0
+    """Share of pixels that fire on their own at `hot_pixel_rate_hz`."""
+    hot_pixel_rate_hz: float = 50.0
+    """Events a hot pixel makes, per second."""
+
+
+@dataclass(frozen=True)
+class EnvConfig:
+    """Task: actions, outcomes, reward."""
+
+    speed_m_s: float = 4.0
+    """Commanded speed per axis; an action is {-1, 0, 1}^3 times this, in the heading frame."""
+    goal_radius_m: float = 2.0
+    """Body centre within this distance of the goal, at any physics step, is success."""
+    max_decisions: int = 200
+    """Episode limit in decisions (the `threshold` of Table 1)."""
+    heading_hold_m: float = 2.0
+    """Within this horizontal distance of the goal the heading setpoint is held."""
+    reward: Literal["sparse", "progress", "potential"] = "progress"
+    """`sparse`: Eq. 8. `progress`: adds metres gained. `potential`: the policy-invariant form."""
+    goal_reward: float = 100.0
+    """Reward at the goal (Eq. 8)."""
+    collision_reward: float = -100.0
+    """Reward at a collision (Eq. 8)."""
+    left_volume_reward: float = -100.0
+    """Reward for leaving the flight volume; Eq. 8 says 0, and the `paper` preset does too."""
+    step_reward: float = -0.2
+    """Reward of every decision; Eq. 8 says 0."""
+
+
+@dataclass(frozen=True)
+class EncoderConfig:
+    """The event VAE (section 3.2) and when it learns."""
+
+    code_size: int = 32
+    """Values in the code z."""
+    features: int = 48
+    """Sum-pooled features per temporal channel."""
+    pixel_features: Literal["table", "network"] = "table"
+    """f(x, y, p): a free table over pixels and polarities, or a ReLU network on a positional encoding."""
+    time_frequencies: int = 1
+    """Sinusoid pairs of the temporal embedding; phi(t) has 1 + 2 x this many channels."""
+    hidden: int = 128
+    """Width of the ReLU layer between pooled features and code."""
+    decoder_hidden: tuple[int, ...] = (128, 256)
+    """Widths of the decoder's ReLU layers."""
+    target_blur: int = 1
+    """Times that the decoder's target is blurred by a binomial of three pixels; 0 is the sharp event image."""
+    kl_weight: float = 2e-3
+    """beta: weight of the KL term per image against the reconstruction error per image."""
+    learning_rate: float = 2e-3
+    """Adam step size of the VAE."""
+    warmup_decisions: int = 40_960
+    """Decisions of held random manoeuvres in which the VAE learns before the DQN starts."""
+    warmup_updates_per_step: int = 2
+    """VAE updates per training step of the warm-up, each on all new event fields."""
+    hold_decisions: int = 4
+    """Mean number of decisions for which a random manoeuvre of the warm-up is held."""
+    keep_learning: bool = False
+    """Go on training the VAE on every new field after the warm-up. The code that the agent sees stays the warm-up's."""
+
+
+@dataclass(frozen=True)
+class AgentConfig:
+    """The deep Q-network (section 3.3, Eq. 7-10)."""
+
+    hidden: tuple[int, ...] = (256, 256)
+    """Widths of the hidden layers."""
+    history: int = 3
+    """Observations that the network sees at once, the newest included."""
+    layer_norm: bool = True
+    """Layer normalisation after each hidden layer."""
+    dueling: bool = True
+    """Dueling heads (Wang et al. 2016)."""
+    double: bool = True
+    """Double DQN targets (van Hasselt et al. 2016)."""
+    n_step: int = 5
+    """Steps of the return before the bootstrap."""
+    discount: float = 0.99
+    """gamma."""
+    target_rate: float = 0.005
+    """Polyak tau of the target network, per update."""
+    average_rate: float = 0.001
+    """Polyak rate, per update, of the averaged parameters that evaluation flies; 1 flies the newest."""
+    learning_rate: float = 1e-3
+    """Adam step size at the start."""
+    final_learning_rate: float = 1e-4
+    """Adam step size at the end of training (linear decay)."""
+    max_gradient_norm: float = 10.0
+    """Global gradient norm is clipped here."""
+    huber_delta: float = 1.0
+    """Errors beyond this grow linearly, in units of scaled reward; 0 means the pure square of Eq. 9."""
+    reward_scale: float = 0.02
+    """Rewards are multiplied by this before learning."""
+    batch_size: int = 1024
+    """Replayed samples per update."""
+    updates_per_step: int = 1
+    """Updates per training step (a training step is one decision of every environment)."""
+    replay_size: int = 262_144
+    """Observations that the replay holds."""
+    learning_starts: int = 8192
+    """Observations in the replay before the first update."""
+    random_decisions: int = 1000
+    """Random decisions, in all, before epsilon begins to fall."""
+    exploration_start: float = 1.0
+    """epsilon at first."""
+    exploration_end: float = 0.02
+    """epsilon at last."""
+    exploration_fraction: float = 0.3
+    """Share of the DQN phase over which epsilon falls linearly; unused when `exploration_episodes` > 0."""
+    exploration_episodes: int = 0
+    """Episodes per environment over which epsilon falls (`Max_eps_episode` of Table 1); 0 uses the fraction."""
+
+
+@dataclass(frozen=True)
+class TrainConfig:
+    """The run."""
+
+    num_envs: int = 256
+    """Environments that fly at once; a multiple of `shards`."""
+    total_steps: int = 500_000
+    """Decisions in all, warm-up included; rounded up to whole chunks."""
+    max_episodes: int = 0
+    """Stop after this many episodes as well (`Num_episodes` of Table 1); 0 is no limit."""
+    chunk_steps: int = 64
+    """Training steps in one compiled chunk."""
+    shards: int = 8
+    """Logical shards of environments and replay; the number of devices must divide it."""
+    devices: int = 0
+    """Devices to use; 0 is as many as divide the shards."""
+    seed: int = 0
+    """Seed of everything."""
+    validation_every: int = 65_536
+    """Decisions between validations, rounded up to whole chunks; 0 is none but the last."""
+    validation_missions: int = 128
+    """Validation missions flown each time."""
+
+
+@dataclass(frozen=True)
+class Config:
+    """All knobs."""
+
+    world: WorldConfig = field(default_factory=WorldConfig)
+    drone: DroneConfig = field(default_factory=DroneConfig)
+    camera: CameraConfig = field(default_factory=CameraConfig)
+    events: EventsConfig = field(default_factory=EventsConfig)
+    env: EnvConfig = field(default_factory=EnvConfig)
+    encoder: EncoderConfig = field(default_factory=EncoderConfig)
+    agent: AgentConfig = field(default_factory=AgentConfig)
+    train: TrainConfig = field(default_factory=TrainConfig)
+
+
+class ConfigError(ValueError):
+    """A configuration that cannot be run; the message is one sentence for people."""
+
+
+DENSITIES = ("sparse", "medium", "dense")
+"""Names of the random worlds."""
+
+PRESETS = ("default", "paper")
+
+
+def preset(name: str) -> Config:
+    """The named preset.
+
+    Raises:
+        ConfigError: if there is none of that name.
+    """
+    if name == "default":
+        return Config()
+    if name == "paper":
+        return dataclasses.replace(
+            Config(),
+            env=EnvConfig(reward="sparse", left_volume_reward=0.0, step_reward=0.0),
+            agent=AgentConfig(
+                hidden=(16, 16),
+                history=1,
+                layer_norm=False,
+                dueling=False,
+                double=False,
+                n_step=1,
+                learning_rate=4e-4,
+                final_learning_rate=4e-4,
+                max_gradient_norm=float("inf"),
+                average_rate=1.0,
+                huber_delta=0.0,
+                reward_scale=1.0,
+                batch_size=128,
+                updates_per_step=1,
+                learning_starts=1024,
+                exploration_end=0.01,
+                exploration_episodes=10,
+            ),
+            train=TrainConfig(num_envs=16, total_steps=500_000, max_episodes=40_000, chunk_steps=512),
+            world=WorldConfig(own_start_fraction=1.0, start_jitter_m=0.0),
+        )
+    raise ConfigError(f"there is no preset '{name}'; the presets are {', '.join(PRESETS)}")

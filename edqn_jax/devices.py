@@ -1,0 +1,55 @@
+"""How many devices there are, and how many of them a run uses."""
+
+from __future__ import annotations
+
+import os
+
+import jax
+
+from edqn_jax.config import ConfigError
+
+
+def use_cpu_devices(count: int | None = None) -> None:
+    """Lets JAX present the CPU as `count` devices; must be called before JAX is first used.
+
+    `None` means one per core. Has no effect on which accelerators JAX finds, and prefers.
+
+    Raises:
+        RuntimeError: if JAX has been used already.
+    """
+    jax.config.update("jax_num_cpu_devices", cores() if count is None else count)
+
+
+def cores() -> int:
+    """Cores that this process may run on."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def choose_devices(requested: int, shards: int) -> list[jax.Device]:  # pyright: ignore[reportInvalidTypeForm]
+    """The devices that a run spreads over; JAX's default kind, so GPUs where there are any.
+
+    Args:
+        requested: how many; 0 is as many as divide the shards.
+        shards: logical shards of environments and replay.
+
+    Raises:
+        ConfigError: if there are fewer than requested, or their number does not divide the shards.
+    """
+    found = jax.devices()
+    if requested == 0:
+        return found[: most_that_divide(shards, len(found))]
+    if requested > len(found):
+        kind = found[0].platform.upper()
+        raise ConfigError(
+            f"train.devices must be at most {len(found)}, the {kind} devices that there are, not {requested}"
+        )
+    if shards % requested:
+        raise ConfigError(f"train.devices must be a divisor of train.shards ({shards}), not {requested}")
+    return found[:requested]
+
+
+def most_that_divide(shards: int, available: int) -> int:
+    """The largest divisor of `shards` that is at most `available`."""
+    return max(count for count in range(1, available + 1) if shards % count == 0)

@@ -1,0 +1,94 @@
+"""Deep Q-learning: Eq. 7-10 of the paper, and the published refinements that the configuration may switch on.
+
+Functions are for one transition, named as the literature does: `q` values, `a` action, `r` return.
+"""
+
+from __future__ import annotations
+
+import chex
+import jax
+import jax.numpy as jnp
+import optax
+from jax import Array
+
+from edqn_jax.config import AgentConfig
+from edqn_jax.learn.qnetwork import Params, q_values
+from edqn_jax.learn.replay import Batch
+
+
+def target(returns: Array, discount: Array, q_next: Array, q_select: Array) -> Array:
+    """Eq. 7 and 10: y = r + gamma max_a Q(s', a) (1 - done), or its n-step and double forms.
+
+    Args:
+        returns: [] r, or the discounted sum of n rewards.
+        discount: [] gamma (or gamma^n), 0 when the transition ended the episode: (1 - done) of Eq. 10.
+        q_next: [A] target network at s'.
+        q_select: [A] values that choose the action: `q_next` itself, or the online network's (double DQN,
+            van Hasselt et al. 2016).
+    """
+    chex.assert_rank([returns, discount, q_next, q_select], [0, 0, 1, 1])
+    return returns + discount * q_next[jnp.argmax(q_select)]
+
+
+def td_loss(q: Array, a: Array, y: Array, huber_delta: float) -> Array:
+    """Eq. 9: half the squared TD error; beyond `huber_delta` > 0 it grows linearly.
+
+    Args:
+        q: [A] online network at s. a: [] action taken. y: [] target, held constant.
+    """
+    chex.assert_rank([q, a, y], [1, 0, 0])
+    error = jax.lax.stop_gradient(y) - q[a]
+    if huber_delta <= 0:
+        return 0.5 * error**2
+    return optax.losses.huber_loss(error, delta=huber_delta)
+
+
+def batch_loss(config: AgentConfig, params: Params, target_params: Params, actions: int, batch: Batch):
+    """Sum of Eq. 9 over a batch, and what goes with it.
+
+    Returns:
+        loss: [] summed over the samples; (count, mean_q): [] samples and sum of Q(s, a).
+    """
+    q = q_values(config, params, actions, batch.history)
+    q_next = q_values(config, target_params, actions, batch.next_history)
+    q_select = q_values(config, params, actions, batch.next_history) if config.double else q_next
+    y = jax.vmap(target)(config.reward_scale * batch.returns, batch.discount, q_next, q_select)
+    losses = jax.vmap(lambda q, a, y: td_loss(q, a, y, config.huber_delta))(q, batch.action, y)
+    taken = jnp.take_along_axis(q, batch.action[:, None], axis=1)[:, 0]
+    return jnp.sum(batch.weight * losses), (jnp.sum(batch.weight), jnp.sum(batch.weight * taken))
+
+
+def polyak(new: Params, old: Params, rate: float) -> Params:
+    """old + rate (new - old), leaf by leaf: the target network's soft update, tau of Table 1."""
+    return optax.incremental_update(new, old, rate)
+
+
+def epsilon_greedy(q: Array, epsilon: Array, key: Array) -> Array:
+    """The best action of `q` [A], or with probability `epsilon` [] a random one: [] int32."""
+    coin, draw = jax.random.split(key)
+    random = jax.random.randint(draw, (), 0, q.shape[-1])
+    return jnp.where(jax.random.uniform(coin) < epsilon, random, jnp.argmax(q)).astype(jnp.int32)
+
+
+def exploration(config: AgentConfig, decisions: Array, total: int, episodes: Array) -> Array:
+    """epsilon [...]: random at first, then falling linearly.
+
+    Args:
+        decisions: [] decisions of the DQN phase so far, in all environments.
+        total: decisions that the phase will have.
+        episodes: [...] episodes that each environment has finished in the phase.
+    """
+    if config.exploration_episodes > 0:
+        progress = episodes / config.exploration_episodes
+    else:
+        span = max(config.exploration_fraction * total, 1.0)
+        progress = jnp.full(episodes.shape, (decisions - config.random_decisions) / span)
+    progress = jnp.clip(progress, 0.0, 1.0)
+    epsilon = config.exploration_start + progress * (config.exploration_end - config.exploration_start)
+    return jnp.where(decisions < config.random_decisions, 1.0, epsilon)
+
+
+def optimiser(config: AgentConfig, updates: int) -> optax.GradientTransformation:
+    """Adam with a clipped global norm and a step size that falls linearly over `updates`."""
+    rate = optax.linear_schedule(config.learning_rate, config.final_learning_rate, max(updates, 1))
+    return optax.chain(optax.clip_by_global_norm(config.max_gradient_norm), optax.adam(rate))

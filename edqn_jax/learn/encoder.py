@@ -1,0 +1,346 @@
+"""The event VAE (section 3.2): a sum-pooled set encoder, a code, a decoder.
+
+An event is (x, y, t, p). The encoder's first layer is a sum over events, blind to their order,
+
+    pooled = sum over events of f(x, y, p) outer phi(t),
+
+with a learned feature f of where and which sign, and a sinusoidal phi of when. All events of a pixel between
+two frames share x, y and p, so the sum over them reaches only phi, where it is a geometric series with a
+closed form: the dense path costs the same for one event as for a thousand, and it is exact.
+
+Field arrays are `[..., F, H, W]`: any leading dimensions are the batch, carried into a few large matmuls.
+C is the number of temporal channels, 1 + 2 x `time_frequencies`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jax import Array
+from jax.nn.initializers import constant, lecun_normal, zeros
+
+from edqn_jax.config import CameraConfig, EncoderConfig
+from edqn_jax.sim.events import EventField, event_image
+
+Params = Any
+"""Nested dictionaries of arrays."""
+
+POSITION_OCTAVES = 4
+"""Sine-cosine pairs per image axis in the positional encoding; the finest period is a quarter image."""
+
+WAVES = 48
+"""Standing waves of the image that the first and last layer begin with."""
+
+POOL_SCALE = 1.0 / 8.0
+"""Constant factor on the pooled sum: the root of some 64 events, so that the next layer sees unit scale."""
+
+MAX_LOG_VARIANCE = 6.0
+"""The log-variance lives in plus and minus this: its exponential cannot overflow."""
+
+MAX_MEAN = 1e3
+"""Codes live in plus and minus this: their square cannot overflow."""
+
+
+@struct.dataclass
+class Losses:
+    """Both sums over the image or the code, averaged over the batch; scalars."""
+
+    reconstruction: Array
+    kl: Array
+
+
+def temporal_encoding(frequencies: int, tau: Array) -> Array:
+    """`phi(t) = [1, cos(2 pi k tau), sin(2 pi k tau), ...]` for k = 1 .. frequencies: `[...]` to `[..., C]`.
+
+    `tau` is the time normalised to the window: 0 at its start, 1 at its end.
+    """
+    channels = [jnp.ones_like(tau)]
+    for k in range(1, frequencies + 1):
+        channels += [jnp.cos(2.0 * jnp.pi * k * tau), jnp.sin(2.0 * jnp.pi * k * tau)]
+    return jnp.stack(channels, axis=-1)
+
+
+def temporal_sums(frequencies: int, field: EventField) -> list[Array]:
+    """Sums of `temporal_encoding` over each pixel's events in closed form: C arrays `[..., F, H, W]`.
+
+    The geometric series of n phasors a step apart is Dirichlet's kernel, `sin(n x) / sin(x)`, times the
+    middle phasor. Half turns are taken out of x first: the kernel is then stable where sin(x) vanishes.
+    """
+    n = field.count.astype(jnp.float32)
+    first, step = field.t_first / field.window_s, field.t_step / field.window_s
+    sums = [n]
+    for k in range(1, frequencies + 1):
+        half_turns = jnp.round(k * step)
+        rest = k * step - half_turns
+        small = jnp.abs(rest) < 1e-6
+        kernel = jnp.where(small, n, _sin_pi(n * rest) / _sin_pi(jnp.where(small, 0.5, rest)))
+        middle = 2.0 * k * first + (n - 1.0) * (k * step + half_turns)
+        sums += [kernel * _sin_pi(middle + 0.5), kernel * _sin_pi(middle)]
+    return sums
+
+
+def _sin_pi(z: Array) -> Array:
+    """`sin(pi z)` to 1e-7, exact at integers: a polynomial, three times as fast as XLA's sine on a CPU."""
+    turns = jnp.round(z)
+    x = jnp.pi * (z - turns)
+    y = x * x
+    series = 1.0 + y * (-1 / 6 + y * (1 / 120 + y * (-1 / 5040 + y * (1 / 362880 - y / 39916800))))
+    return x * series * (1.0 - 2.0 * (turns - 2.0 * jnp.floor(0.5 * turns)))
+
+
+def positional_encoding(x: Array, y: Array, width: int, height: int) -> Array:
+    """Sines and cosines of a pixel's place, `[...]` to `[..., 4 * POSITION_OCTAVES + 2]`."""
+    u, v = (x + 0.5) / width * 2.0 - 1.0, (y + 0.5) / height * 2.0 - 1.0
+    channels = [u, v]
+    for octave in range(POSITION_OCTAVES):
+        for place in (u, v):
+            angle = jnp.pi * 2.0**octave * 0.5 * place
+            channels += [jnp.cos(angle), jnp.sin(angle)]
+    return jnp.stack(channels, axis=-1)
+
+
+class PixelTable(nn.Module):
+    """f(x, y, p) as a free table over pixels and polarities."""
+
+    features: int
+    height: int
+    width: int
+
+    def setup(self) -> None:
+        shape = (2, self.height * self.width, self.features)
+        self.table = self.param("table", wave_table(self.height, self.width), shape)
+
+    def everywhere(self) -> Array:
+        """`[2, H * W, features]`, ON first."""
+        return self.table
+
+    def at(self, x: Array, y: Array, p: Array) -> Array:
+        """`[..., features]` at columns x, rows y, polarities p."""
+        return self.table[(p < 0).astype(jnp.int32), y * self.width + x]
+
+
+class PixelNetwork(nn.Module):
+    """f(x, y, p) as a ReLU network on the positional encoding and the polarity."""
+
+    features: int
+    height: int
+    width: int
+
+    def setup(self) -> None:
+        self.layers = [nn.Dense(64), nn.Dense(64), nn.Dense(self.features)]
+
+    def everywhere(self) -> Array:
+        y, x = jnp.divmod(jnp.arange(self.height * self.width), self.width)
+        return jnp.stack([self.at(x, y, jnp.full_like(x, p)) for p in (1, -1)])
+
+    def at(self, x: Array, y: Array, p: Array) -> Array:
+        place = positional_encoding(x.astype(jnp.float32), y.astype(jnp.float32), self.width, self.height)
+        z = jnp.concatenate([place, p.astype(jnp.float32)[..., None]], axis=-1)
+        for layer in self.layers[:-1]:
+            z = nn.relu(layer(z))
+        return self.layers[-1](z)
+
+
+def waves(height: int, width: int) -> Array:
+    """The `WAVES` lowest standing waves of the image (products of cosines): `[WAVES, H, W]`."""
+    across, down = np.meshgrid(np.arange(width), np.arange(height))
+    frequency = np.hypot(across / width, down / height).ravel()
+    lowest = np.argsort(frequency, kind="stable")[:WAVES]
+    across, down = across.ravel()[lowest, None], down.ravel()[lowest, None]
+    x, y = (np.arange(width) + 0.5) / width, (np.arange(height) + 0.5) / height
+    image = np.cos(np.pi * down * y)[:, :, None] * np.cos(np.pi * across * x)[:, None, :]
+    return jnp.asarray(image / np.sqrt(np.mean(image**2, axis=(1, 2), keepdims=True)), jnp.float32)
+
+
+def wave_table(height: int, width: int) -> Callable[..., Array]:
+    """Initialiser of `PixelTable`: mixtures of waves, most of each odd in the polarity, some of it even."""
+
+    def init(key: Array, shape: tuple[int, ...]) -> Array:
+        key_odd, key_even = jax.random.split(key)
+        basis = waves(height, width).reshape(-1, height * width).T
+        mix = lecun_normal()
+        odd = basis @ mix(key_odd, (basis.shape[1], shape[-1]))
+        even = 0.5 * basis @ mix(key_even, (basis.shape[1], shape[-1]))
+        return jnp.stack([even + odd, even - odd])
+
+    return init
+
+
+def mirrored(*, inputs: bool, outputs: bool) -> Callable[..., Array]:
+    """Initialiser of ReLU layers that makes the untrained network linear.
+
+    Units come in pairs of opposite sign and are read in pairs of opposite sign: relu(a) - relu(-a) = a. Where
+    the events are then reaches the code, and the code the image, from the first update on.
+    """
+
+    def init(key: Array, shape: tuple[int, ...], dtype: Any = jnp.float32) -> Array:
+        rows = -(-shape[0] // 2) if inputs else shape[0]
+        columns = -(-shape[1] // 2) if outputs else shape[1]
+        kernel = lecun_normal()(key, (rows, columns), dtype)
+        if outputs:
+            kernel = jnp.concatenate([kernel, -kernel], axis=1)
+        if inputs:
+            kernel = jnp.concatenate([kernel, -kernel], axis=0)
+        return kernel[: shape[0], : shape[1]]
+
+    return init
+
+
+def wave_image(key: Array, shape: tuple[int, ...], dtype: Any = jnp.float32) -> Array:
+    """Initialiser of the decoder's last layer, `[hidden, H, W]`: small mixtures of waves, mirrored.
+
+    Event images are smooth on average, white noise is not: from white noise the decoder needs thousands of
+    updates to leave the blank image, from waves it leaves at once.
+    """
+    size, height, width = shape
+    basis = waves(height, width)
+    kernel = 0.0075 * jnp.tensordot(lecun_normal()(key, (-(-size // 2), basis.shape[0]), dtype), basis, 1)
+    return jnp.concatenate([kernel, -kernel])[:size]
+
+
+class Encoder(nn.Module):
+    """Sum-pooled set encoder. `dense` and `sparse` share their parameters and agree."""
+
+    config: EncoderConfig
+    height: int
+    width: int
+
+    def setup(self) -> None:
+        kind = {"table": PixelTable, "network": PixelNetwork}[self.config.pixel_features]
+        self.pixels = kind(self.config.features, self.height, self.width)
+        size = self.config.code_size
+        self.hidden = nn.Dense(self.config.hidden, kernel_init=mirrored(inputs=False, outputs=True))
+        self.mean = nn.Dense(size, kernel_init=mirrored(inputs=True, outputs=False))
+        # Nearly noiseless codes at first; the KL term widens what it may.
+        self.log_variance = nn.Dense(size, kernel_init=zeros, bias_init=constant(-4.0))
+
+    def dense(self, field: EventField) -> tuple[Array, Array]:
+        """Fields `[..., F, H, W]` to mean and log-variance `[..., code_size]`."""
+        on, off = self.pixels.everywhere()
+        batch = field.count.shape[:-3]
+        pooled = []
+        for phi in temporal_sums(self.config.time_frequencies, field):
+            phi_on = jnp.sum(jnp.where(field.polarity > 0, phi, 0.0), axis=-3).reshape(*batch, -1)
+            phi_off = jnp.sum(jnp.where(field.polarity < 0, phi, 0.0), axis=-3).reshape(*batch, -1)
+            pooled.append(phi_on @ on + phi_off @ off)
+        return self._head(jnp.concatenate(pooled, axis=-1))
+
+    def sparse(self, x: Array, y: Array, tau: Array, p: Array) -> tuple[Array, Array]:
+        """Events one by one, each `[..., N]`, to mean and log-variance; places with p = 0 hold no event."""
+        place = self.pixels.at(x, y, p) * (p != 0)[..., None]
+        phi = temporal_encoding(self.config.time_frequencies, tau)
+        pooled = jnp.einsum("...nf,...nc->...cf", place, phi)
+        return self._head(pooled.reshape(*pooled.shape[:-2], -1))
+
+    def _head(self, pooled: Array) -> tuple[Array, Array]:
+        z = nn.relu(self.hidden(pooled * POOL_SCALE))
+        mean = jnp.clip(self.mean(z), -MAX_MEAN, MAX_MEAN)
+        return mean, jnp.clip(self.log_variance(z), -MAX_LOG_VARIANCE, MAX_LOG_VARIANCE)
+
+
+class Decoder(nn.Module):
+    """Code `[..., code_size]` to the reconstructed `target`, `[..., H, W]`."""
+
+    config: EncoderConfig
+    height: int
+    width: int
+
+    @nn.compact
+    def __call__(self, code: Array) -> Array:
+        z = code
+        for layer, size in enumerate(self.config.decoder_hidden):
+            z = nn.relu(nn.Dense(size, kernel_init=mirrored(inputs=layer > 0, outputs=True))(z))
+        kernel = self.param("kernel", wave_image, (z.shape[-1], self.height, self.width))
+        bias = self.param("bias", zeros, (self.height, self.width))
+        image = z @ kernel.reshape(z.shape[-1], -1)
+        return image.reshape(*z.shape[:-1], self.height, self.width) + bias
+
+
+def target(config: EncoderConfig, field: EventField) -> Array:
+    """What the decoder must reconstruct, `[..., H, W]`: sign x log(1 + |event image|), blurred a little.
+
+    The logarithm keeps one bright edge from drowning the rest; the blur (a binomial over
+    2 x `target_blur` + 1 pixels) makes an edge that is off by one pixel one small error, not two large ones.
+    """
+    image = event_image(field).astype(jnp.float32)
+    image = jnp.sign(image) * jnp.log1p(jnp.abs(image))
+    if config.target_blur == 0:
+        return image
+    height, width = image.shape[-2:]
+    return _blur(height, config.target_blur) @ image @ _blur(width, config.target_blur).T
+
+
+def _blur(size: int, times: int) -> Array:
+    """`[size, size]`: the kernel (1, 2, 1) / 4 as a matrix, edges repeated, applied `times` times."""
+    once = 0.5 * np.eye(size) + 0.25 * (np.eye(size, k=1) + np.eye(size, k=-1))
+    once[0, 0] += 0.25
+    once[-1, -1] += 0.25
+    return jnp.asarray(np.linalg.matrix_power(once, times), jnp.float32)
+
+
+def init_encoder(config: EncoderConfig, camera: CameraConfig, key: Array) -> Params:
+    """Fresh parameters, `{"encoder": ..., "decoder": ...}`, for the camera's resolution."""
+    key_encoder, key_decoder = jax.random.split(key)
+    shape = (1, camera.height, camera.width)
+    nothing, when = jnp.zeros(shape, jnp.int32), jnp.zeros(shape)
+    silent = EventField(nothing, nothing.astype(jnp.int8), when, when, window_s=1.0)
+    encoder = Encoder(config, camera.height, camera.width)
+    decoder = Decoder(config, camera.height, camera.width)
+    return {
+        "encoder": encoder.init(key_encoder, silent, method=Encoder.dense)["params"],
+        "decoder": decoder.init(key_decoder, jnp.zeros(config.code_size))["params"],
+    }
+
+
+def encode(config: EncoderConfig, params: Params, field: EventField) -> tuple[Array, Array]:
+    """Fields `[..., F, H, W]` to the code's mean and log-variance, each `[..., code_size]`.
+
+    The code that the agent sees is the mean.
+    """
+    height, width = field.count.shape[-2:]
+    return Encoder(config, height, width).apply({"params": params["encoder"]}, field, method=Encoder.dense)  # type: ignore
+
+
+def encode_events(
+    config: EncoderConfig, params: Params, camera: CameraConfig, x: Array, y: Array, tau: Array, p: Array
+) -> tuple[Array, Array]:
+    """The same as `encode` from a list of events, `[..., N]` each: column, row, time in the window, polarity.
+
+    `tau` is 0 at the window's start and 1 at its end; p = 0 marks a place without event.
+    """
+    encoder = Encoder(config, camera.height, camera.width)
+    return encoder.apply({"params": params["encoder"]}, x, y, tau, p, method=Encoder.sparse)  # type: ignore
+
+
+def embed(config: EncoderConfig, params: Params, field: EventField) -> Array:
+    """The agent's code of fields `[..., F, H, W]`: the mean, `[..., code_size]`."""
+    return encode(config, params, field)[0]
+
+
+def decode(config: EncoderConfig, params: Params, code: Array) -> Array:
+    """Code `[..., code_size]` to the reconstruction of `target`, `[..., H, W]`."""
+    height, width = params["decoder"]["bias"].shape
+    return Decoder(config, height, width).apply({"params": params["decoder"]}, code)  # type: ignore
+
+
+def kl_divergence(mean: Array, log_variance: Array) -> Array:
+    """KL of N(mean, variance) from N(0, 1), summed over the code: `[..., code_size]` to `[...]`."""
+    return 0.5 * jnp.sum(jnp.square(mean) + jnp.exp(log_variance) - 1.0 - log_variance, axis=-1)
+
+
+def vae_loss(config: EncoderConfig, params: Params, field: EventField, key: Array) -> tuple[Array, Losses]:
+    """Eq. 6: squared reconstruction error of an image + `kl_weight` x KL, averaged over the batch.
+
+    `field` is `[..., F, H, W]`; the key draws the codes (reparametrised).
+    """
+    mean, log_variance = encode(config, params, field)
+    code = mean + jnp.exp(0.5 * log_variance) * jax.random.normal(key, mean.shape)
+    error = jnp.sum(jnp.square(decode(config, params, code) - target(config, field)), axis=(-2, -1))
+    losses = Losses(reconstruction=jnp.mean(error), kl=jnp.mean(kl_divergence(mean, log_variance)))
+    return losses.reconstruction + config.kl_weight * losses.kl, losses

@@ -1,0 +1,48 @@
+"""The Q-network: stacked observations in, one value per move out."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import flax.linen as nn
+import jax.numpy as jnp
+from jax import Array
+
+from edqn_jax.config import AgentConfig
+
+Params = Any
+"""A plain pytree of parameters."""
+
+
+class QNetwork(nn.Module):
+    """ReLU layers, optionally normalised, and one value per action, optionally as dueling heads."""
+
+    config: AgentConfig
+    actions: int
+
+    @nn.compact
+    def __call__(self, x: Array) -> Array:
+        """Values [..., actions] of stacked observations `x` [..., history * observation]."""
+        for width in self.config.hidden:
+            x = nn.Dense(width)(x)
+            if self.config.layer_norm:
+                x = nn.LayerNorm()(x)
+            x = nn.relu(x)
+        if not self.config.dueling:
+            return nn.Dense(self.actions)(x)
+        # Q = V + A - mean A (Wang et al. 2016, Eq. 9), both heads in one product.
+        heads = nn.Dense(self.actions + 1)(x)
+        advantage = heads[..., 1:]
+        return heads[..., :1] + advantage - jnp.mean(advantage, axis=-1, keepdims=True)
+
+
+def init_q(config: AgentConfig, observation_size: int, actions: int, key: Array) -> Params:
+    """Fresh parameters."""
+    inputs = jnp.zeros(config.history * observation_size)
+    return QNetwork(config, actions).init(key, inputs)["params"]
+
+
+def q_values(config: AgentConfig, params: Params, actions: int, history: Array) -> Array:
+    """Values [..., actions] of observation histories [..., history, observation], newest last."""
+    flat = history.reshape(*history.shape[:-2], -1)
+    return QNetwork(config, actions).apply({"params": params}, flat)  # type: ignore[return-value]

@@ -1,0 +1,121 @@
+"""Pictures of learning: return against episode (Fig. 8 of the paper), and losses and success over time."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.collections import PathCollection
+from matplotlib.figure import Figure
+from matplotlib.ticker import EngFormatter, PercentFormatter
+
+from edqn_jax.report.style import INK, LINE, OUTCOME_COLOURS, OUTCOME_LABELS, SECOND_LINE, drawing
+
+
+def draw_returns(episodes: Mapping[str, np.ndarray], file: Path) -> Figure:
+    """Return against episode, a point each in its outcome's colour, with the running mean and the shares.
+
+    Args:
+        episodes: columns `return` and `outcome`, each [episodes], in the order in which they ended.
+        file: PNG to write.
+    """
+    returns, outcomes = np.asarray(episodes["return"], np.float64), np.asarray(episodes["outcome"])
+    number = np.arange(1, len(returns) + 1)
+    with drawing(7.0, 4.2, file) as figure:
+        above, below = figure.subplots(2, 1, sharex=True, height_ratios=(3.0, 1.0))
+        size = float(np.clip(30_000 / max(len(returns), 1), 1.0, 12.0))
+        for name, colour in OUTCOME_COLOURS.items():
+            own = outcomes == name
+            if own.any():
+                label = f"{OUTCOME_LABELS[name]} ({own.sum():,})"
+                above.scatter(
+                    number[own], returns[own], s=size, c=colour, lw=0, alpha=0.4, label=label, gid=name
+                )
+        window = max(len(returns) // 60, 1)
+        if len(returns):
+            mean = running_mean(returns, window)
+            above.plot(number[window - 1 :], mean, color="white", lw=3.0)
+            above.plot(number[window - 1 :], mean, color=INK, lw=1.3, label=f"mean of {window:,} episodes")
+        above.set_ylabel("return")
+        above.set_title("Return of every training episode")
+        if len(returns):
+            legend = above.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0))
+            for handle in legend.legend_handles:
+                if isinstance(handle, PathCollection):
+                    handle.set_sizes([18.0])
+                    handle.set_alpha(1.0)
+        _draw_shares(below, outcomes)
+        below.set_xlabel("episode")
+        below.xaxis.set_major_formatter(EngFormatter(sep=""))
+        below.set_xlim(0, len(returns) + 1)
+    return figure
+
+
+def draw_learning(metrics: Sequence[Mapping[str, Any]], file: Path) -> Figure:
+    """Success, exploration and losses over decisions, written to `file` as PNG.
+
+    Args:
+        metrics: the lines of `metrics.jsonl`: `decisions`, and whatever a line has of `success_rate`,
+            `validation_success`, `epsilon`, `q_loss`, `reconstruction_loss` and `kl`.
+        file: PNG to write.
+    """
+    with drawing(7.0, 4.4, file) as figure:
+        (success, exploration), (q_loss, vae) = figure.subplots(2, 2, sharex=True)
+        _line(success, metrics, "success_rate", LINE, "training episodes")
+        _line(success, metrics, "validation_success", SECOND_LINE, "validation missions, greedy", marker="o")
+        success.set_title("Success")
+        success.set_ylim(-0.03, 1.03)
+        success.yaxis.set_major_formatter(PercentFormatter(1.0))
+        _line(exploration, metrics, "epsilon", LINE, "ε")
+        exploration.set_title("Exploration")
+        exploration.set_ylabel("share of random actions ε")
+        exploration.set_ylim(-0.03, 1.03)
+        _line(q_loss, metrics, "q_loss", LINE, "Q-network")
+        q_loss.set_title("Q loss (Eq. 9)")
+        _line(vae, metrics, "reconstruction_loss", LINE, "reconstruction")
+        _line(vae, metrics, "kl", SECOND_LINE, "KL")
+        vae.set_title("Event VAE (Eq. 6)")
+        for axes in (q_loss, vae):
+            if any(np.any(np.asarray(line.get_ydata()) > 0) for line in axes.get_lines()):
+                axes.set_yscale("log")
+            axes.set_xlabel("decisions")
+            axes.xaxis.set_major_formatter(EngFormatter(sep=""))
+        for axes in (success, vae):
+            if axes.get_lines():
+                axes.legend(loc="best")
+    return figure
+
+
+def running_mean(values: np.ndarray, window: int) -> np.ndarray:
+    """Means of every `window` neighbours, [len(values) - window + 1]."""
+    sums = np.cumsum(np.concatenate([[0.0], values]))
+    return (sums[window:] - sums[:-window]) / window
+
+
+def _draw_shares(axes: Axes, outcomes: np.ndarray) -> None:
+    """Stacked shares of the outcomes in up to 120 equal stretches of the run."""
+    stretches = np.array_split(outcomes, min(120, max(len(outcomes), 1)))
+    edges = np.cumsum([0, *(len(stretch) for stretch in stretches)])
+    lower = np.zeros(len(stretches))
+    for name, colour in OUTCOME_COLOURS.items():
+        share = np.array([np.mean(stretch == name) if len(stretch) else 0.0 for stretch in stretches])
+        axes.stairs(lower + share, edges, baseline=lower, fill=True, color=colour, lw=0)
+        lower = lower + share
+    axes.set_ylim(0, 1)
+    axes.yaxis.set_major_formatter(PercentFormatter(1.0))
+    axes.set_ylabel("outcomes")
+    axes.grid(False)
+
+
+def _line(
+    axes: Axes, metrics: Sequence[Mapping[str, Any]], name: str, colour: str, label: str, marker: str = ""
+) -> None:
+    """The metric over decisions, of the lines that have it."""
+    points = [(row["decisions"], row[name]) for row in metrics if row.get(name) is not None]
+    if points:
+        axes.plot(
+            *np.array(points, np.float64).T, color=colour, label=label, marker=marker, ms=4, lw=1.1, gid=name
+        )

@@ -1,0 +1,238 @@
+"""Pictures of where the drone flies: the world (Fig. 5 of the paper) and the flown path in it (Fig. 7)."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.collections import LineCollection, PolyCollection
+from matplotlib.colors import Normalize
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Circle
+
+from edqn_jax.report.solids import GROUND, MAP, Solid, View, draw_shadows, draw_solids, hidden, solids_of
+from edqn_jax.report.style import INK, MUTED, OUTCOME_COLOURS, OUTCOME_LABELS, drawing
+from edqn_jax.sim.scene import Scene
+
+OBLIQUE = View(azimuth=-62.0, elevation=34.0)
+SPEED_COLOURS = "viridis"
+START_COLOUR = "#0072b2"
+GOAL_COLOUR = OUTCOME_COLOURS["goal"]
+SHORTEST_COLOUR = "#c2185b"
+HALO = 3.4
+TICK: dict[str, Any] = {"fontsize": 7, "color": INK, "ha": "center", "va": "center"}
+PATH_POINTS = 1500
+"""A flight is thinned to about this many points; more cannot be seen."""
+
+
+def draw_world(scene: Scene, file: Path) -> Figure:
+    """The world's blocks and ball with start and goal, in proportion, written to `file` as PNG."""
+    start, goal = _ends(scene)
+    volume = np.asarray(scene.volume, np.float64)
+    with drawing(7.0, 4.0, file) as figure:
+        axes = figure.add_subplot()
+        solids = solids_of(scene)
+        _draw_ground(axes, OBLIQUE, volume)
+        draw_shadows(axes, OBLIQUE, solids, _corners(volume))
+        draw_solids(axes, OBLIQUE, solids)
+        for point, name, colour in ((start, "start", START_COLOUR), (goal, "goal", GOAL_COLOUR)):
+            _draw_stem(axes, OBLIQUE, point, colour)
+            x, y = OBLIQUE.project(point)
+            label = f"{name} ({point[0]:g}, {point[1]:g}, {point[2]:g})"
+            axes.annotate(
+                label,
+                (x, y),
+                xytext=(8, 0),
+                textcoords="offset points",
+                va="center",
+                weight="bold",
+                color=colour,
+                bbox={"boxstyle": "round,pad=0.2", "fc": "white", "ec": "none", "alpha": 0.8},
+                zorder=9,
+            )
+        _draw_end_marks(axes, OBLIQUE, start, goal)
+    return figure
+
+
+def draw_path(
+    scene: Scene,
+    trajectory: Mapping[str, np.ndarray],
+    shortest: np.ndarray | None,
+    file: Path,
+    outcome: str = "goal",
+    goal_radius_m: float = 2.0,
+) -> Figure:
+    """The flown path in 3-D and from above, coloured by speed, written to `file` as PNG.
+
+    What a solid hides is drawn faintly; the shortest path is dashed.
+
+    Args:
+        scene: one world.
+        trajectory: columns `x`, `y`, `z` (metres) and `vx`, `vy`, `vz` (m/s), each [T].
+        shortest: corners of the A* path, [K, 3] metres, or None.
+        file: where to write.
+        outcome: how the flight ended; unless it is `goal` its end is marked.
+        goal_radius_m: the circle around the goal.
+    """
+    points = np.stack([np.asarray(trajectory[name], np.float64) for name in ("x", "y", "z")], axis=1)
+    velocity = np.stack([np.asarray(trajectory[name], np.float64) for name in ("vx", "vy", "vz")], axis=1)
+    thin = np.unique(np.linspace(0, len(points) - 1, min(PATH_POINTS, len(points))).round().astype(int))
+    points, speed = points[thin], np.linalg.norm(velocity[thin], axis=1)
+    scale = Normalize(0.0, max(float(np.ceil(speed.max())), 1.0))
+    start, goal = points[0], _ends(scene)[1]
+    volume = np.asarray(scene.volume, np.float64)
+    solids = solids_of(scene)
+    with drawing(9.6, 3.9, file) as figure:
+        oblique, above = figure.subplots(1, 2, width_ratios=(1.75, 1.0))
+        for axes, view in ((oblique, OBLIQUE), (above, MAP)):
+            _draw_ground(axes, view, volume)
+            draw_solids(axes, view, solids)
+            if view is OBLIQUE:
+                draw_shadows(axes, view, solids, _corners(volume))
+                floor = view.project(points * [1, 1, 0])
+                axes.plot(*floor.T, color=MUTED, lw=0.7, alpha=0.7, zorder=1.5)
+                _draw_stem(axes, view, goal, GOAL_COLOUR)
+            else:
+                circle = Circle((goal[0], goal[1]), goal_radius_m, fill=False, ec=GOAL_COLOUR, lw=0.8)
+                axes.add_patch(circle).set_zorder(6)
+            if shortest is not None:
+                _draw_shortest(axes, view, np.asarray(shortest, np.float64), solids)
+            _draw_flown(axes, view, points, speed, scale, solids)
+            _draw_end_marks(axes, view, start, goal)
+            if outcome != "goal":
+                x, y = view.project(points[-1])
+                axes.plot(x, y, "X", ms=8, mfc=OUTCOME_COLOURS[outcome], mec="white", mew=0.8, zorder=10)
+        bar = figure.colorbar(
+            ScalarMappable(scale, SPEED_COLOURS),
+            ax=above,
+            shrink=0.75,
+            aspect=28,
+            pad=0.03,
+            label="speed, m/s",
+        )
+        bar.outline.set_visible(False)  # pyright: ignore[reportCallIssue]
+        figure.legend(
+            handles=_path_legend(shortest is not None, outcome), loc="outside lower center", ncols=5
+        )
+    return figure
+
+
+def _ends(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
+    return np.asarray(scene.start, np.float64), np.asarray(scene.goal, np.float64)
+
+
+def _draw_ground(axes: Axes, view: View, volume: np.ndarray) -> None:
+    """The volume's floor with a 10 m grid, labelled edges and a scale of height."""
+    (x0, y0, _), (x1, y1, top) = volume
+    floor = [view.project(_corners(volume))]
+    axes.add_collection(PolyCollection(floor, facecolors=GROUND, edgecolors=MUTED, linewidths=0.6, zorder=0))
+    lines = [[[x, y0, 0], [x, y1, 0]] for x in _tens(x0, x1)] + [
+        [[x0, y, 0], [x1, y, 0]] for y in _tens(y0, y1)
+    ]
+    grid = LineCollection(
+        list(view.project(np.array(lines, np.float64))), colors="white", linewidths=0.7, zorder=0.5
+    )
+    axes.add_collection(grid)
+    step = 20 if max(x1 - x0, y1 - y0) > 60 else 10
+    out = 0.022 * (x1 - x0)
+    from_above = view.elevation >= 89
+    y_edge, outwards = (x0, -1.4 * out) if from_above else (x1, 1.4 * out)
+    for x in np.arange(np.ceil(x0 / step) * step, x1 + 1e-6, step):
+        _label(axes, view, np.array([x, y0 - 1.4 * out, 0]), f"{x:g}")
+    for y in np.arange(np.ceil(y0 / step) * step, y1 + 1e-6, step):
+        _label(axes, view, np.array([y_edge + outwards, y, 0]), f"{y:g}")
+    _label(axes, view, np.array([(x0 + x1) / 2, y0 - 4 * out, 0]), "x, m")
+    _label(axes, view, np.array([y_edge + 2.9 * outwards, (y0 + y1) / 2, 0]), "y, m")
+    if not from_above:
+        post = view.project(np.array([[x0, y0, 0], [x0, y0, top]], np.float64))
+        axes.plot(*post.T, color=MUTED, lw=0.8, zorder=3)
+        for z in np.arange(10, top + 1e-6, 10):
+            x, y = view.project(np.array([x0, y0, z]))
+            axes.plot([x - 0.6 * out, x], [y, y], color=MUTED, lw=0.8, zorder=3)
+            axes.text(x - 1.4 * out, y, f"{z:g}", **TICK)
+        x, y = view.project(np.array([x0, y0, top]))
+        axes.text(x, y + out, "z, m", **TICK)
+    axes.set_aspect("equal")
+    axes.axis("off")
+    axes.autoscale_view()
+
+
+def _label(axes: Axes, view: View, point: np.ndarray, text: str) -> None:
+    x, y = view.project(point)
+    axes.text(x, y, text, **TICK)
+
+
+def _corners(volume: np.ndarray) -> np.ndarray:
+    """The floor's corners, [4, 3]."""
+    (x0, y0, _), (x1, y1, _) = volume
+    return np.array([[x0, y0, 0.0], [x1, y0, 0.0], [x1, y1, 0.0], [x0, y1, 0.0]])
+
+
+def _tens(low: float, high: float) -> np.ndarray:
+    return np.arange(np.ceil(low / 10) * 10, high + 1e-6, 10)
+
+
+def _draw_stem(axes: Axes, view: View, point: np.ndarray, colour: str) -> None:
+    stem = view.project(np.stack([point * [1, 1, 0], point]))
+    axes.plot(*stem.T, color=colour, lw=0.8, zorder=8)
+    axes.plot(*stem[0], "o", ms=2.0, color=colour, zorder=8)
+
+
+def _draw_end_marks(axes: Axes, view: View, start: np.ndarray, goal: np.ndarray) -> None:
+    axes.plot(*view.project(start), "o", ms=6, mfc="white", mec=START_COLOUR, mew=1.8, zorder=9)
+    axes.plot(*view.project(goal), "*", ms=12, mfc=GOAL_COLOUR, mec="white", mew=0.8, zorder=9)
+
+
+def _draw_shortest(axes: Axes, view: View, corners: np.ndarray, solids: Sequence[Solid]) -> None:
+    legs = [np.linspace(one, other, 200) for one, other in zip(corners, corners[1:], strict=False)]
+    points = np.concatenate(legs)
+    flat, covered = view.project(points), hidden(points, solids, view)[:, None]
+    style: dict[str, Any] = {"color": SHORTEST_COLOUR, "ls": (0, (4, 2.5)), "zorder": 5}
+    axes.plot(*np.where(covered, flat, np.nan).T, lw=0.7, alpha=0.45, **style)
+    axes.plot(*np.where(covered, np.nan, flat).T, lw=1.2, **style)
+
+
+def _draw_flown(
+    axes: Axes, view: View, points: np.ndarray, speed: np.ndarray, scale: Normalize, solids: Sequence[Solid]
+) -> None:
+    flat = view.project(points)
+    pieces = np.stack([flat[:-1], flat[1:]], axis=1)
+    covered = hidden((points[:-1] + points[1:]) / 2, solids, view)
+    middle_speed = (speed[:-1] + speed[1:]) / 2
+    halo = LineCollection(list(pieces[~covered]), colors="white", linewidths=HALO, capstyle="round", zorder=6)
+    axes.add_collection(halo)
+    for which, width, alpha in ((covered, 1.2, 0.45), (~covered, 2.0, 1.0)):
+        line = LineCollection(
+            list(pieces[which]),
+            cmap=SPEED_COLOURS,
+            norm=scale,
+            linewidths=width,
+            alpha=alpha,
+            capstyle="round",
+        )
+        line.set_array(middle_speed[which])
+        line.set_zorder(7)
+        axes.add_collection(line)
+
+
+def _path_legend(with_shortest: bool, outcome: str) -> list[Line2D]:
+    entries = [
+        Line2D([], [], ls="", marker="o", ms=6, mfc="white", mec=START_COLOUR, mew=1.8, label="start"),
+        Line2D([], [], ls="", marker="*", ms=11, mfc=GOAL_COLOUR, mec="white", label="goal"),
+        Line2D([], [], color="#21918c", lw=2.0, label="flown (faint where a solid hides it)"),
+    ]
+    if with_shortest:
+        entries.append(
+            Line2D([], [], color=SHORTEST_COLOUR, lw=1.1, ls="--", label="shortest path (A*, knows the map)")
+        )
+    if outcome != "goal":
+        colour = OUTCOME_COLOURS[outcome]
+        entries.append(
+            Line2D([], [], ls="", marker="X", ms=8, mfc=colour, mec="white", label=OUTCOME_LABELS[outcome])
+        )
+    return entries

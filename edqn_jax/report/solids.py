@@ -1,0 +1,212 @@
+"""A scene as convex solids of flat faces, and an orthographic view that draws them in the right order."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.collections import PolyCollection
+from matplotlib.patches import Polygon
+
+from edqn_jax.sim.scene import PARKED, Scene
+
+AROUND = 36
+"""Corners of a circle."""
+SUN = np.array([-0.45, -0.6, 0.66])
+"""Direction towards the light of the pictures; a unit vector, near enough."""
+GROUND = "#f4f3ef"
+SHADOW = "#dedcd5"
+
+
+@dataclass(frozen=True)
+class Solid:
+    """A convex body: faces are [k, 3] corner rings in metres, any orientation; colour is RGB in [0, 1]."""
+
+    faces: list[np.ndarray]
+    colour: np.ndarray
+
+    @cached_property
+    def corners(self) -> np.ndarray:
+        return np.concatenate(self.faces)
+
+    @cached_property
+    def outward(self) -> np.ndarray:
+        """Unit normals that point out of the body, [faces, 3]."""
+        centre = self.corners.mean(0)
+        normals = np.stack([_ring_normal(face) for face in self.faces])
+        middles = np.stack([face.mean(0) for face in self.faces])
+        sides = np.sign(np.sum(normals * (middles - centre), axis=1, keepdims=True))
+        return normals * sides
+
+
+@dataclass(frozen=True)
+class View:
+    """Looking at the world from far away. Angles in degrees; elevation 90 is a map with x to the right."""
+
+    azimuth: float
+    elevation: float
+
+    @property
+    def towards(self) -> np.ndarray:
+        """Unit vector from the world to the eye, [3]."""
+        a, e = np.radians([self.azimuth, self.elevation])
+        return np.array([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
+
+    def project(self, points: np.ndarray) -> np.ndarray:
+        """[..., 3] metres in the world to [..., 2] metres on the picture, x to the right and y up."""
+        a, e = np.radians([self.azimuth, self.elevation])
+        right = np.array([-np.sin(a), np.cos(a), 0.0])
+        up = np.array([-np.sin(e) * np.cos(a), -np.sin(e) * np.sin(a), np.cos(e)])
+        return np.asarray(points) @ np.stack([right, up], axis=1)
+
+
+MAP = View(azimuth=-90.0, elevation=90.0)
+"""From straight above, x to the right and y up."""
+
+
+def solids_of(scene: Scene) -> list[Solid]:
+    """Every shape of one world that is not parked; planes are left out, the ground is drawn by itself."""
+    found: list[Solid] = []
+    for position, half, yaw, albedo in _present(scene.boxes, "position", "half", "yaw", "albedo"):
+        found.append(Solid(_box(position, half, _about_z(float(yaw))), albedo))
+    for position, half, rotation, albedo in _present(
+        scene.tilted_boxes, "position", "half", "rotation", "albedo"
+    ):
+        found.append(Solid(_box(position, half, rotation), albedo))
+    for position, radius, half, albedo in _present(
+        scene.cylinders, "position", "radius", "half_height", "albedo"
+    ):
+        found.append(Solid(_tube(position, np.array([0.0, 0.0, 1.0]), float(radius), float(half)), albedo))
+    for position, axis, half, radius, albedo in _present(
+        scene.tilted_cylinders, "position", "axis", "half_length", "radius", "albedo"
+    ):
+        found.append(Solid(_tube(position, axis, float(radius), float(half)), albedo))
+    for position, axis, half, radius, albedo in _present(
+        scene.capsules, "position", "axis", "half_length", "radius", "albedo"
+    ):
+        found.append(Solid(_round(position, axis, float(radius), float(half)), albedo))
+    for position, radius, albedo in _present(scene.spheres, "position", "radius", "albedo"):
+        found.append(Solid(_round(position, np.array([0.0, 0.0, 1.0]), float(radius), 0.0), albedo))
+    return found
+
+
+def draw_solids(axes: Axes, view: View, solids: Sequence[Solid]) -> None:
+    """Draws the solids, the far ones first, each as its faces that look at the eye."""
+    rings, colours = [], []
+    for solid in sorted(solids, key=lambda solid: _nearness(solid, view)):
+        normals = solid.outward
+        for face, normal in zip(solid.faces, normals, strict=True):
+            if normal @ view.towards > 0:
+                rings.append(view.project(face))
+                colours.append(_shaded(solid.colour, normal))
+    # Edges in the face's own colour close the hairline between neighbouring faces.
+    bodies = PolyCollection(rings, facecolors=colours, edgecolors=colours, linewidths=0.3, zorder=2)
+    axes.add_collection(bodies)
+
+
+def draw_shadows(axes: Axes, view: View, solids: Sequence[Solid], floor: np.ndarray) -> None:
+    """Draws the solids' shadows on the ground, as far as the floor's [4, 3] corners reach."""
+    fallen = [view.project(_shadow(face)) for solid in solids for face in solid.faces]
+    shadows = PolyCollection(fallen, facecolors=SHADOW, edgecolors="none", zorder=1)
+    axes.add_collection(shadows, autolim=False)
+    shadows.set_clip_path(Polygon(view.project(floor), transform=axes.transData))
+
+
+def hidden(points: np.ndarray, solids: Sequence[Solid], view: View) -> np.ndarray:
+    """Which of the [P, 3] points a solid hides from the eye, [P] bool: rays clipped by each convex body."""
+    covered = np.zeros(len(points), bool)
+    for solid in solids:
+        normals = solid.outward
+        offsets = np.array([normal @ face[0] for normal, face in zip(normals, solid.faces, strict=True)])
+        gap = offsets - points @ normals.T
+        speed = normals @ view.towards
+        with np.errstate(divide="ignore", invalid="ignore"):
+            crossing = gap / speed
+        enter = np.where(speed < -1e-9, crossing, -np.inf).max(1)
+        leave = np.where(speed > 1e-9, crossing, np.inf).min(1)
+        beside = ((np.abs(speed) <= 1e-9) & (gap < 0)).any(1)
+        covered |= ~beside & (leave > np.maximum(enter, 1e-6))
+    return covered
+
+
+def _present(shapes: object, *names: str) -> Iterator[tuple[np.ndarray, ...]]:
+    columns = [np.asarray(getattr(shapes, name), np.float64) for name in names]
+    for row in zip(*columns, strict=True):
+        if np.abs(row[0]).max() < PARKED / 10:
+            yield row
+
+
+def _about_z(yaw: float) -> np.ndarray:
+    c, s = np.cos(yaw), np.sin(yaw)
+    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+
+
+def _box(position: np.ndarray, half: np.ndarray, rotation: np.ndarray) -> list[np.ndarray]:
+    faces = []
+    for axis in range(3):
+        one, other = (axis + 1) % 3, (axis + 2) % 3
+        for side in (-1.0, 1.0):
+            ring = np.zeros((4, 3))
+            ring[:, axis] = side
+            ring[:, one] = [-1, 1, 1, -1]
+            ring[:, other] = [-1, -1, 1, 1]
+            faces.append(position + (ring * half) @ rotation.T)
+    return faces
+
+
+def _rings(position: np.ndarray, axis: np.ndarray, radii: np.ndarray, along: np.ndarray) -> np.ndarray:
+    """Circles around an axis, [circles, AROUND, 3]."""
+    aside = np.eye(3)[np.argmin(np.abs(axis))]
+    one = np.cross(axis, aside)
+    one /= np.linalg.norm(one)
+    other = np.cross(axis, one)
+    angle = np.linspace(0.0, 2 * np.pi, AROUND, endpoint=False)[:, None]
+    circle = np.cos(angle) * one + np.sin(angle) * other
+    return position + radii[:, None, None] * circle + along[:, None, None] * axis
+
+
+def _between(rings: np.ndarray) -> list[np.ndarray]:
+    """Four-cornered faces between neighbouring circles."""
+    following = np.roll(rings, -1, axis=1)
+    corners = np.stack([rings[:-1], following[:-1], following[1:], rings[1:]], axis=2)
+    return list(corners.reshape(-1, 4, 3))
+
+
+def _tube(position: np.ndarray, axis: np.ndarray, radius: float, half: float) -> list[np.ndarray]:
+    rings = _rings(position, axis, np.full(2, radius), np.array([-half, half]))
+    return [*_between(rings), rings[0], rings[1]]
+
+
+def _round(position: np.ndarray, axis: np.ndarray, radius: float, half: float) -> list[np.ndarray]:
+    """A capsule, or a sphere where `half` is 0; the poles are cut flat so that no face is degenerate."""
+    angle = np.linspace(-np.pi / 2 + 0.05, np.pi / 2 - 0.05, 18)
+    along = radius * np.sin(angle) + half * np.sign(angle)
+    rings = _rings(position, axis, radius * np.cos(angle), along)
+    return [*_between(rings), rings[0], rings[-1]]
+
+
+def _ring_normal(face: np.ndarray) -> np.ndarray:
+    # Newell's sum over the edges does not mind a corner that lies on a line between two others.
+    normal = np.sum(np.cross(face, np.roll(face, -1, axis=0)), axis=0)
+    return normal / np.linalg.norm(normal)
+
+
+def _shadow(face: np.ndarray) -> np.ndarray:
+    fallen = face - face[:, 2:] / SUN[2] * SUN
+    return fallen * np.array([1.0, 1.0, 0.0])
+
+
+def _nearness(solid: Solid, view: View) -> float:
+    # The middle's distance; seen from above, the height of the top decides.
+    middle = (solid.corners.min(0) + solid.corners.max(0)) / 2
+    if view.elevation >= 89:
+        return float(solid.corners[:, 2].max())
+    return float(middle @ np.array([*view.towards[:2], 0.0]) + 1e-3 * middle[2])
+
+
+def _shaded(colour: np.ndarray, normal: np.ndarray) -> np.ndarray:
+    light = 0.55 + 0.45 * max(float(normal @ SUN), 0.0)
+    return np.clip(colour * light * 1.15, 0.0, 1.0)

@@ -1,0 +1,82 @@
+"""How every picture of the project looks: one set of type, lines and colours, and one way to the disk."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.colors import LinearSegmentedColormap
+from matplotlib.figure import Figure
+
+OUTCOME_COLOURS = {
+    "goal": "#009e73",
+    "collision": "#d55e00",
+    "left_volume": "#cc79a7",
+    "time_out": "#e69f00",
+    "diverged": "#000000",
+}
+"""Colour of each outcome: Okabe and Ito's, which colour-blind readers can tell apart."""
+
+OUTCOME_LABELS = {
+    "goal": "goal",
+    "collision": "collision",
+    "left_volume": "left the volume",
+    "time_out": "time-out",
+    "diverged": "diverged",
+}
+
+INK = "#222222"
+MUTED = "#7a7a7a"
+LINE = "#0072b2"
+SECOND_LINE = "#d55e00"
+
+POLARITY = LinearSegmentedColormap.from_list(
+    "polarity", ["#1f4fb4", "#8fb0e6", "#ffffff", "#f0988b", "#c4221f"]
+)
+"""Signed event counts: blue darker, white nothing, red brighter."""
+
+STYLE: dict[Any, Any] = {
+    "font.family": "DejaVu Sans",
+    "font.size": 8.0,
+    "axes.titlesize": 9.0,
+    "axes.titleweight": "bold",
+    "axes.titlelocation": "left",
+    "axes.labelsize": 8.0,
+    "axes.labelcolor": INK,
+    "axes.edgecolor": MUTED,
+    "axes.linewidth": 0.6,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "axes.axisbelow": True,
+    "grid.color": "#e6e6e6",
+    "grid.linewidth": 0.6,
+    "xtick.labelsize": 7.0,
+    "ytick.labelsize": 7.0,
+    "xtick.color": MUTED,
+    "ytick.color": MUTED,
+    "xtick.labelcolor": INK,
+    "ytick.labelcolor": INK,
+    "legend.fontsize": 7.0,
+    "legend.frameon": False,
+    "figure.facecolor": "white",
+    "savefig.facecolor": "white",
+    "lines.linewidth": 1.4,
+}
+
+DOTS_PER_INCH = 220
+
+
+@contextmanager
+def drawing(width: float, height: float, file: Path) -> Iterator[Figure]:
+    """A figure of `width` x `height` inches in the house style, written to `file` at the end of the block."""
+    with matplotlib.rc_context(STYLE):
+        figure = Figure(figsize=(width, height), layout="constrained")
+        FigureCanvasAgg(figure)
+        yield figure
+        file.parent.mkdir(parents=True, exist_ok=True)
+        figure.savefig(file, dpi=DOTS_PER_INCH, format="png")

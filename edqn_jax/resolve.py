@@ -1,0 +1,198 @@
+"""From defaults, preset and file to one `Config`: strict about every key and every type.
+
+Precedence: defaults < preset < what the world asks for < file, and flags over all of them. A layer is a
+nested dict, `{"agent": {"batch_size": 512}}`, that names only what it changes.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import re
+import types
+import typing
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any, Literal
+
+import yaml
+
+from edqn_jax.config import DENSITIES, Config, ConfigError, preset
+
+Layer = Mapping[str, Mapping[str, Any]]
+
+RANDOM_WORLD_STEPS = 3_000_000
+"""Decisions that training on random worlds takes unless somebody says otherwise."""
+
+
+def world_layer(world: str) -> Layer:
+    """What a world asks of the `default` preset."""
+    if world in DENSITIES:
+        return {"train": {"total_steps": RANDOM_WORLD_STEPS}}
+    return {}
+
+
+def resolve(preset_name: str = "default", file: Path | None = None, world: str | None = None) -> Config:
+    """The named preset under what the world asks for and under the file; types checked, ranges not.
+
+    Args:
+        preset_name: one of `config.PRESETS`; only `default` gives way to the world.
+        file: a YAML file.
+        world: the world's name where flags decide it; None leaves it to file and preset.
+
+    Raises:
+        ConfigError: one sentence naming the key or the file, and what would be right.
+    """
+    layer = load_layer(file) if file is not None else {}
+    config = apply(preset(preset_name), layer, str(file))
+    if world is not None:
+        config = apply(config, {"world": {"name": world}}, "the command line")
+    if preset_name != "default":
+        return config
+    for_world = apply(preset(preset_name), world_layer(config.world.name), "the world")
+    return dataclasses.replace(apply(for_world, layer, str(file)), world=config.world)
+
+
+def load_layer(file: Path) -> Layer:
+    """The layer that a YAML file holds; {} for an empty file.
+
+    Raises:
+        ConfigError: if it cannot be read, is not YAML, or names a key twice.
+    """
+    try:
+        layer = yaml.load(file.read_text(encoding="utf-8"), Loader=_StrictLoader)
+    except (OSError, UnicodeDecodeError) as error:
+        reason = getattr(error, "strerror", None) or "it is not text"
+        raise ConfigError(f"cannot read the configuration file '{file}': {reason}") from None
+    except yaml.YAMLError as error:
+        mark = getattr(error, "problem_mark", None)
+        where = f" at line {mark.line + 1}" if mark else ""
+        problem = getattr(error, "problem", None) or "it does not parse"
+        raise ConfigError(f"'{file}' is not valid YAML{where}: {problem}") from None
+    if layer is None:
+        return {}
+    if not isinstance(layer, dict):
+        raise ConfigError(f"'{file}' must hold groups of keys such as 'agent:', not {_describe(layer)}")
+    return layer
+
+
+def apply(config: Config, layer: Layer, source: str) -> Config:
+    """`config` with every key that the layer names replaced.
+
+    Raises:
+        ConfigError: at an unknown group or key (naming its nearest neighbour) or a wrong type.
+    """
+    groups = [field.name for field in dataclasses.fields(config)]
+    changed = {}
+    for group, values in layer.items():
+        if group not in groups:
+            owner = [name for name in groups if str(group) in _keys(getattr(config, name))]
+            hint = f"; it belongs under '{owner[0]}:'" if owner else nearest(group, groups)
+            raise ConfigError(f"{source}: there is no group '{group}'{hint}")
+        if not isinstance(values, Mapping):
+            raise ConfigError(
+                f"{source}: '{group}' must hold keys such as '{_example(config, group)}', not "
+                f"{_describe(values)}"
+            )
+        section = getattr(config, group)
+        hints = typing.get_type_hints(type(section))
+        for key in values:
+            if key not in hints:
+                raise ConfigError(f"{source}: there is no key '{group}.{key}'{nearest(key, hints)}")
+        checked = {
+            key: typed(value, hints[key], f"{source}: '{group}.{key}'") for key, value in values.items()
+        }
+        changed[group] = dataclasses.replace(section, **checked)
+    return dataclasses.replace(config, **changed)
+
+
+def typed(value: Any, hint: Any, name: str) -> Any:
+    """`value` as the type that `hint` asks for.
+
+    A whole number may stand for a float and a list for a tuple; nothing else is converted.
+
+    Raises:
+        ConfigError: `<name> must be <what would be right>, not <what it is>`.
+    """
+    origin, arguments = typing.get_origin(hint), typing.get_args(hint)
+    if origin is Literal and value in arguments:
+        return value
+    if hint is float and isinstance(value, int | float) and not isinstance(value, bool):
+        return float(value)
+    if hint in (int, str, bool) and type(value) is hint:
+        return value
+    if origin is tuple and isinstance(value, list | tuple):
+        if arguments[-1] is Ellipsis:
+            return tuple(typed(item, arguments[0], f"each of {name}") for item in value)
+        if len(value) == len(arguments):
+            pairs = zip(value, arguments, strict=True)
+            return tuple(typed(item, argument, f"each of {name}") for item, argument in pairs)
+    raise ConfigError(f"{name} must be {_wanted(hint)}, not {_describe(value)}")
+
+
+def to_yaml(config: Config) -> str:
+    """The whole configuration as YAML that `load_layer` reads back to the same."""
+    plain = dataclasses.asdict(
+        config, dict_factory=lambda items: {k: list(v) if isinstance(v, tuple) else v for k, v in items}
+    )
+    return yaml.safe_dump(plain, sort_keys=False, default_flow_style=None, width=100)
+
+
+def nearest(word: object, known: Iterable[str]) -> str:
+    """`; did you mean '...'?` for the known word that is closest, else a list of what is known."""
+    known = list(known)
+    close = difflib.get_close_matches(str(word), known, n=1, cutoff=0.5)
+    return f"; did you mean '{close[0]}'?" if close else f"; known are {', '.join(known)}"
+
+
+class _StrictLoader(yaml.SafeLoader):
+    """YAML in which a key stands once and 1e-3 is a number, as everywhere else."""
+
+    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
+        seen = set()
+        for key_node, _ in node.value:
+            key = key_node.value
+            if key in seen:
+                raise yaml.constructor.ConstructorError(
+                    problem=f"the key '{key}' stands twice", problem_mark=key_node.start_mark
+                )
+            seen.add(key)
+        return super().construct_mapping(node, deep)
+
+
+_StrictLoader.add_implicit_resolver(
+    "tag:yaml.org,2002:float",
+    re.compile(r"^[-+]?[0-9][0-9_]*(?:\.[0-9_]*)?[eE][-+]?[0-9]+$"),
+    list("-+0123456789"),
+)
+
+
+def _keys(section: Any) -> list[str]:
+    return [field.name for field in dataclasses.fields(section)]
+
+
+def _example(config: Config, group: str) -> str:
+    key = _keys(getattr(config, group))[0]
+    return f"{key}: {getattr(getattr(config, group), key)}"
+
+
+def _wanted(hint: Any) -> str:
+    origin, arguments = typing.get_origin(hint), typing.get_args(hint)
+    if origin is Literal:
+        return f"one of {', '.join(map(str, arguments))}"
+    if origin is tuple:
+        plural = {int: "whole numbers", float: "numbers", str: "words"}[arguments[0]]
+        return f"a list of {'' if arguments[-1] is Ellipsis else f'{len(arguments)} '}{plural}"
+    return {int: "a whole number", float: "a number", str: "text", bool: "true or false"}[hint]
+
+
+def _describe(value: Any) -> str:
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if value is None or isinstance(value, types.NoneType):
+        return "nothing"
+    if isinstance(value, Mapping):
+        return "a group of keys"
+    if isinstance(value, list | tuple):
+        return f"a list of {len(value)}"
+    return f"the text '{value}'" if isinstance(value, str) else str(value)

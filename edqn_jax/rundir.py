@@ -1,0 +1,206 @@
+"""The folder that a run leaves behind: what its files are called, and when a folder may be written into."""
+
+from __future__ import annotations
+
+import csv
+import datetime
+import json
+import math
+import os
+import shutil
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from edqn_jax.config import Config, ConfigError
+from edqn_jax.resolve import to_yaml
+
+Resume = Literal["auto", "never", "must"]
+
+TRAJECTORY_COLUMNS = (
+    "t", "x", "y", "z", "qw", "qx", "qy", "qz", "vx", "vy", "vz", "action", "reward", "clearance",
+)  # fmt: skip
+"""Columns of `trajectory.csv`, one row a physics step: seconds, metres, a unit quaternion, m/s, the action's
+number, the reward of the decision and the distance of the body's sphere from the nearest shape."""
+
+EPISODE_COLUMNS = ("step", "return", "length", "outcome")
+"""Columns of `episodes.csv`: decisions of all environments when the episode ended, undiscounted return,
+decisions of the episode, and how it ended."""
+
+
+@dataclass(frozen=True)
+class RunDirectory:
+    """A run's folder. Nothing is on disk before `create`."""
+
+    path: Path
+
+    @property
+    def config_file(self) -> Path:
+        return self.path / "config.yaml"
+
+    @property
+    def metrics_file(self) -> Path:
+        return self.path / "metrics.jsonl"
+
+    @property
+    def episodes_file(self) -> Path:
+        return self.path / "episodes.csv"
+
+    @property
+    def summary_file(self) -> Path:
+        return self.path / "summary.json"
+
+    @property
+    def trajectory_file(self) -> Path:
+        return self.path / "trajectory.csv"
+
+    @property
+    def figures(self) -> Path:
+        return self.path / "figures"
+
+    @property
+    def checkpoints(self) -> Path:
+        return self.path / "checkpoints"
+
+    def create(self, config: Config) -> None:
+        """Makes the folder, empty but for `config.yaml` and the header of `episodes.csv`.
+
+        What an earlier run left in it goes; `plan_run_directory` has seen to it that this is meant.
+
+        Raises:
+            ConfigError: if it cannot be written.
+        """
+        try:
+            self.path.mkdir(parents=True, exist_ok=True)
+            for file in (self.metrics_file, self.summary_file, self.trajectory_file):
+                file.unlink(missing_ok=True)
+            for folder in (self.figures, self.checkpoints):
+                shutil.rmtree(folder, ignore_errors=True)
+                folder.mkdir()
+            _write(self.config_file, to_yaml(config))
+            _write(self.episodes_file, ",".join(EPISODE_COLUMNS) + "\n")
+        except OSError as error:
+            raise _unwritable(self.path, error.strerror) from None
+
+    def append_metrics(self, metrics: Mapping[str, Any]) -> None:
+        """Adds one line to `metrics.jsonl`."""
+        with self.metrics_file.open("a", encoding="utf-8") as file:
+            file.write(json.dumps(plain(metrics), allow_nan=False) + "\n")
+
+    def append_episodes(self, episodes: Iterable[tuple[int, float, int, str]]) -> None:
+        """Adds rows of `EPISODE_COLUMNS` to `episodes.csv`."""
+        with self.episodes_file.open("a", encoding="utf-8", newline="") as file:
+            rows = (
+                (int(step), f"{gain:.6g}", int(length), outcome) for step, gain, length, outcome in episodes
+            )
+            csv.writer(file, lineterminator="\n").writerows(rows)
+
+    def write_summary(self, summary: Mapping[str, Any]) -> None:
+        """Writes `summary.json`, whole or not at all; it is what makes a run finished."""
+        _write(self.summary_file, json.dumps(plain(summary), indent=2, allow_nan=False) + "\n")
+
+    def write_trajectory(self, columns: Mapping[str, np.ndarray]) -> None:
+        """Writes `trajectory.csv` from one [T] array for each of `TRAJECTORY_COLUMNS`."""
+        table = np.stack([np.asarray(columns[name], np.float64) for name in TRAJECTORY_COLUMNS], axis=1)
+        lines = [",".join(TRAJECTORY_COLUMNS), *(",".join(f"{value:.7g}" for value in row) for row in table)]
+        _write(self.trajectory_file, "\n".join(lines) + "\n")
+
+    def read_metrics(self) -> list[dict[str, Any]]:
+        """The lines of `metrics.jsonl`."""
+        return [json.loads(line) for line in self.metrics_file.read_text(encoding="utf-8").splitlines()]
+
+    def read_episodes(self) -> dict[str, np.ndarray]:
+        """The columns of `episodes.csv`, each [episodes]."""
+        with self.episodes_file.open(encoding="utf-8", newline="") as file:
+            rows = list(csv.reader(file))[1:]
+        kinds = (np.int64, np.float64, np.int64, np.str_)
+        return {
+            name: np.array([row[column] for row in rows], dtype=np.str_).astype(kind)
+            for column, (name, kind) in enumerate(zip(EPISODE_COLUMNS, kinds, strict=True))
+        }
+
+
+def plan_run_directory(given: Path | None, config: Config, resume: Resume = "auto") -> RunDirectory:
+    """The folder that a run may write into; nothing is made yet.
+
+    Args:
+        given: the folder asked for; None is a fresh, dated one under `runs/`.
+        config: names the world and the seed of a fresh one.
+        resume: `never` starts an unfinished run of ours over; `auto` and `must` would continue it.
+
+    Raises:
+        ConfigError: if the folder is foreign, holds a finished run, cannot be written, or holds no run to
+            continue where there must be one.
+    """
+    if given is None:
+        if resume == "must":
+            raise ConfigError("--resume must needs --run-dir, the folder of the run to continue")
+        return RunDirectory(_fresh(Path("runs"), config))
+    run = RunDirectory(given)
+    if given.exists() and not given.is_dir():
+        raise ConfigError(f"--run-dir '{given}' is a file; give a folder")
+    occupied = given.is_dir() and any(given.iterdir())
+    if occupied and not run.config_file.is_file():
+        raise ConfigError(
+            f"--run-dir '{given}' holds files that are no run of edqn; give a new or empty folder"
+        )
+    if run.summary_file.is_file():
+        raise ConfigError(f"--run-dir '{given}' holds a finished run; give another folder")
+    if resume == "must" and not occupied:
+        raise ConfigError(f"--resume must: there is no run to continue in '{given}'")
+    if occupied and resume != "never":
+        raise ConfigError(
+            f"--run-dir '{given}' holds an unfinished run, which this version cannot continue; "
+            "give another folder, or --resume never to start it over"
+        )
+    _check_writable(given)
+    return run
+
+
+def plain(value: Any) -> Any:
+    """`value` as JSON has it: arrays of NumPy and JAX as numbers and lists, what is not finite as None."""
+    if isinstance(value, Mapping):
+        return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain(item) for item in value]
+    if isinstance(value, Path):
+        return str(value)
+    if hasattr(value, "tolist"):
+        return plain(value.tolist())
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value
+
+
+def _fresh(parent: Path, config: Config) -> Path:
+    _check_writable(parent)
+    date = datetime.datetime.now().strftime("%Y-%m-%d")
+    base = f"{date}-{Path(config.world.name).stem}-s{config.train.seed}"
+    path, number = parent / base, 2
+    while path.exists():
+        path, number = parent / f"{base}-{number}", number + 1
+    return path
+
+
+def _check_writable(path: Path) -> None:
+    there = path.absolute()
+    while not there.exists() and there != there.parent:
+        there = there.parent
+    if not there.is_dir():
+        raise _unwritable(path, f"'{there}' is not a folder")
+    if not os.access(there, os.W_OK | os.X_OK):
+        raise _unwritable(path, f"'{there}' is not yours to write in")
+
+
+def _unwritable(path: Path, reason: str | None) -> ConfigError:
+    return ConfigError(f"the run directory '{path}' cannot be written: {reason or 'unknown reason'}")
+
+
+def _write(file: Path, text: str) -> None:
+    # A reader, or a run that is killed here, sees the old file or the new one and never half of it.
+    partial = file.with_name(file.name + ".partial")
+    partial.write_text(text, encoding="utf-8")
+    partial.replace(file)

@@ -1,0 +1,1 @@
+"""The simulator: worlds, drone, camera, events and environment as pure functions; nothing here learns."""

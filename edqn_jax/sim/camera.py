@@ -1,0 +1,102 @@
+"""A pinhole camera by analytic ray casting: depth, luma and RGB of a scene from any pose.
+
+Brightness of a pixel is its area average: Lambert shade under a sun x albedo x texture. Between two frames
+0.04 s apart silhouettes move by a fraction of a pixel, so the fraction has to be right: shapes become layers
+of exact coverage (`coverage.py`), the nearest few are blended over ground and sky, and the texture is
+box-filtered over the pixel (`texture.py`).
+"""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from edqn_jax.config import CameraConfig
+from edqn_jax.sim import coverage, raycast
+from edqn_jax.sim.raycast import Rays, Values
+from edqn_jax.sim.scene import Scene
+from edqn_jax.sim.texture import texture
+
+LUMA = (0.299, 0.587, 0.114)
+"""Weights of R, G and B in Eq. 1."""
+
+
+def _backdrop(config: CameraConfig, scene: Scene, origin: Array, rays: Rays, value: Values, sky: Array) -> Array:
+    """Ground and other planes, textured, before the sky: [H, W]."""
+    shape = jnp.broadcast_shapes(rays.dx.shape, rays.dz.shape)
+    depth, shown = jnp.full(shape, jnp.inf), jnp.broadcast_to(sky, shape)
+    if scene.planes.normal.shape[0] == 0:
+        return shown
+    surfaces = raycast.plane_surfaces(config, scene, origin, rays, value)
+    slopes = jnp.zeros(shape), jnp.zeros(shape)
+    for n in range(surfaces.depth.shape[0]):
+        normal = scene.planes.normal[n]
+        t = surfaces.depth[n]
+        # On a plane t = h / (n . d), so dt = -t (n . d') / (n . d), exactly.
+        approach = normal[0] * rays.dx + normal[1] * rays.dy + normal[2] * rays.dz
+        relative = -t * raycast.inverse(approach) * rays.pitch
+        seen = surfaces.hit[n] & (t < depth)
+        depth = jnp.where(seen, t, depth)
+        shown = jnp.where(seen, surfaces.value[n], shown)
+        right, up = (relative * jnp.dot(normal, way) for way in (rays.right, rays.up))
+        slopes = jnp.where(seen, right, slopes[0]), jnp.where(seen, up, slopes[1])
+    met = depth < jnp.inf
+    factor = texture(config, origin, rays, jnp.where(met, depth, 0.0), *slopes)
+    return jnp.where(met, shown * factor, shown)
+
+
+def _picture(config: CameraConfig, scene: Scene, origin: Array, rotation: Array, weights: Array) -> Array:
+    """Brightness under `weights` [3] of RGB: [H, W]."""
+    value = raycast.albedo_values(scene, weights)
+    rays = raycast.camera_rays(config, rotation)
+    many = raycast.camera_rays(config, rotation, config.samples_across, config.samples_down)
+    layers = coverage.no_layers((config.height, config.width))
+    counted = raycast.other_surfaces(config, scene, origin, many, value)
+    if config.mount != "level":
+        counted += raycast.upright_surfaces(config, scene, origin, many, value)
+    for surfaces in counted:
+        layers = coverage.counted_layers(surfaces, many, layers)
+    layers = coverage.sphere_layers(config, scene, origin, rays, value, layers)
+    if config.mount == "level":
+        layers = coverage.upright_layers(config, scene, origin, rays, value, layers)
+    sky = jnp.sum(jnp.asarray(config.sky_rgb) * weights)
+    behind = _backdrop(config, scene, origin, rays, value, sky)
+    for layer in reversed(layers):
+        met = layer.closeness > 0
+        near = jnp.where(met, raycast.inverse(layer.closeness), 0.0)
+        level = layer.slope == coverage.LEVEL_FACE
+        right = jnp.where(level, 0.0, -near * near * layer.slope)
+        up = jnp.where(level, -near * raycast.inverse(rays.dz) * rays.pitch, 0.0)
+        factor = texture(config, origin, rays, near, right, up)
+        behind = behind + jnp.where(met, layer.value * factor - layer.coverage * behind, 0.0)
+    return coverage.materialised(behind)
+
+
+def luma(config: CameraConfig, scene: Scene, position: Array, rotation: Array) -> Array:
+    """Linear luma of the scene, each pixel the average over its area.
+
+    Shade and texture multiply R, G and B alike, so the luma of Eq. 1 needs one channel, not three.
+
+    Args:
+        position: [3] metres.
+        rotation: [3, 3] body-to-world; the camera looks along body x with body z up. A level mount keeps
+            only the heading.
+
+    Returns:
+        [H, W] in [0, 1], row 0 at the top.
+    """
+    return _picture(config, scene, position, rotation, jnp.asarray(LUMA))
+
+
+def rgb(config: CameraConfig, scene: Scene, position: Array, rotation: Array) -> Array:
+    """Linear RGB of the scene: [H, W, 3] in [0, 1]; `luma` is Eq. 1's weighting of it."""
+    channels = jax.vmap(lambda weights: _picture(config, scene, position, rotation, weights))(jnp.eye(3))
+    return jnp.moveaxis(channels, 0, -1)
+
+
+def depth(config: CameraConfig, scene: Scene, position: Array, rotation: Array) -> Array:
+    """Distance along each pixel's central ray: [H, W] metres, inf where the ray meets nothing."""
+    rays = raycast.camera_rays(config, rotation)
+    nearest = raycast.nearest_depth(config, scene, position, rays)
+    return nearest * jnp.sqrt(rays.dx**2 + rays.dy**2 + rays.dz**2)

@@ -1,0 +1,243 @@
+"""The drone: MJX dynamics and a cascaded controller, velocity -> attitude -> body rate -> rotor thrust.
+
+Frames: the world has z up; the body has x ahead, y left, z up and stands at the centre of mass. A
+quaternion (w, x, y, z) turns body vectors into world vectors.
+
+Heading is the quaternion's turn about the world's z, 2 atan2(z, w): what remains when the tilt is undone by
+the shortest way, as a gimbal does. Unlike the Euler angle it does not move when a drone merely leans.
+
+Inside the scan everything but MJX is written in scalars, one per coordinate: mapped over environments they
+become contiguous rows that XLA fuses into a few loops.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import io
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from flax import struct
+from jax import Array
+
+from edqn_jax.config import DroneConfig
+
+with contextlib.redirect_stdout(io.StringIO()):  # it prints that Warp, an engine we do not use, is missing
+    from mujoco import mjx
+
+AIRFRAME_FILE = Path(__file__).with_name("skydio_x2.xml")
+"""Mass, inertia and rotor layout."""
+
+_LEAST_LEVELNESS = 0.4
+"""Cosine of the tilt beyond which thrust no longer grows to hold the height."""
+
+
+@struct.dataclass
+class Airframe:
+    """What never changes in flight. R = 4 rotors."""
+
+    model: mjx.Model
+    data: mjx.Data  # a template that holds the factored mass matrix
+    mass: Array  # [] kg
+    inertia: Array  # [3] kg m^2 about the body's axes
+    gravity: Array  # [] m/s^2
+    max_thrust: Array  # [] newtons of one rotor
+    mixer: Array  # [R, 4] rotor thrusts per collective thrust (N) and torque about x, y, z (N m)
+
+
+@struct.dataclass
+class DroneState:
+    """What the future of a flight depends on."""
+
+    position: Array  # [3] of the centre of mass, metres, world
+    quaternion: Array  # [4] w, x, y, z; body to world
+    velocity: Array  # [3] m/s, world
+    angular_velocity: Array  # [3] rad/s, body
+    yaw_setpoint: Array  # [] radians
+
+
+@struct.dataclass
+class Flight:
+    """What was flown in one decision: n physics steps, each entry taken after its step."""
+
+    position: Array  # [n, 3] metres, world
+    quaternion: Array  # [n, 4]
+    velocity: Array  # [n, 3] m/s, world
+
+
+def load_airframe(config: DroneConfig) -> Airframe:
+    """The Skydio X2 as MJX arrays, and the mixer that follows from its rotor layout."""
+    spec = mujoco.MjSpec.from_file(str(AIRFRAME_FILE))
+    spec.option.timestep = config.physics_dt_s
+    # MJX solves a sparse mass matrix by unrolled arithmetic, a dense one by a LAPACK call per environment.
+    spec.option.jacobian = mujoco.mjtJacobian.mjJAC_SPARSE
+    for shape in list(spec.geoms):  # they are only for the viewer
+        spec.delete(shape)
+    model = spec.compile()
+    rest = mujoco.MjData(model)
+    mujoco.mj_forward(model, rest)
+    arm = model.site_pos[model.actuator_trnid[:, 0]]
+    push, twist = model.actuator_gear[:, 2], model.actuator_gear[:, 5]
+    wrench_of_thrust = np.stack([push, arm[:, 1] * push, -arm[:, 0] * push, twist])
+    return Airframe(
+        model=mjx.put_model(model, impl="jax"),
+        data=mjx.put_data(model, rest, impl="jax"),
+        mass=jnp.float32(model.body_mass[1]),
+        inertia=jnp.asarray(model.body_inertia[1], jnp.float32),
+        gravity=jnp.float32(-model.opt.gravity[2]),
+        max_thrust=jnp.float32(model.actuator_ctrlrange[0, 1]),
+        mixer=jnp.asarray(np.linalg.inv(wrench_of_thrust), jnp.float32),
+    )
+
+
+def hover(position: Array, yaw: Array) -> DroneState:
+    """At rest and level at `position` [3] metres, nose and setpoint at `yaw` [] radians."""
+    zero = jnp.zeros((), jnp.float32)
+    yaw = jnp.asarray(yaw, jnp.float32)
+    return DroneState(
+        position=jnp.asarray(position, jnp.float32),
+        quaternion=jnp.stack([jnp.cos(yaw / 2), zero, zero, jnp.sin(yaw / 2)]),
+        velocity=jnp.zeros(3, jnp.float32),
+        angular_velocity=jnp.zeros(3, jnp.float32),
+        yaw_setpoint=wrap_angle(yaw),
+    )
+
+
+def wrap_angle(angle: Array) -> Array:
+    """The same angle within [-pi, pi], radians, any shape."""
+    return angle - 2 * jnp.pi * jnp.round(angle / (2 * jnp.pi))
+
+
+def yaw_of(quaternion: Array) -> Array:
+    """Heading [...] in [-pi, pi] of quaternions [..., 4], radians (see the module's text)."""
+    return wrap_angle(2 * jnp.arctan2(quaternion[..., 3], quaternion[..., 0]))
+
+
+def thrusts(config: DroneConfig, airframe: Airframe, state: DroneState, velocity_command: Array) -> Array:
+    """Rotor thrusts [4] newtons towards `velocity_command` [3] m/s (world) and the state's yaw setpoint.
+
+    Velocity error gives a wanted acceleration, that a wanted direction of the body's z axis; the turn still
+    missing gives wanted body rates, their error a wanted torque. Within the rotors' limits torque about x
+    and y comes first, then collective thrust, then torque about z.
+    """
+    half_yaw = state.yaw_setpoint / 2
+    return _thrusts(config, airframe, state, velocity_command, jnp.cos(half_yaw), jnp.sin(half_yaw))
+
+
+def _thrusts(
+    config: DroneConfig,
+    airframe: Airframe,
+    state: DroneState,
+    velocity_command: Array,
+    cos_half_yaw: Array,
+    sin_half_yaw: Array,
+) -> Array:
+    w, x, y, z = state.quaternion
+    p, q, r = state.angular_velocity
+    vx, vy, vz = velocity_command - state.velocity
+
+    # Velocity -> specific force (acceleration plus gravity), within the largest accelerations and tilt.
+    fz = airframe.gravity + jnp.clip(config.climb_gain * vz, -config.max_descent_m_s2, config.max_climb_m_s2)
+    fx, fy = config.velocity_gain * vx, config.velocity_gain * vy
+    most = jnp.minimum(config.max_horizontal_m_s2, float(np.tan(config.max_tilt_rad)) * fz)
+    lean = jnp.minimum(1.0, most * jax.lax.rsqrt(fx * fx + fy * fy + 1e-9))
+    fx, fy = fx * lean, fy * lean
+    norm = jax.lax.rsqrt(fx * fx + fy * fy + fz * fz)
+
+    # Its direction in the body frame: how much tilt is still missing, and towards where.
+    up_x, up_y, up_z = 2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)
+    ahead_x, ahead_y, ahead_z = 1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)
+    left_x, left_y, left_z = 2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)
+    ex = (ahead_x * fx + left_x * fy + up_x * fz) * norm
+    ey = (ahead_y * fx + left_y * fy + up_y * fz) * norm
+    ez = (ahead_z * fx + left_z * fy + up_z * fz) * norm
+
+    # Attitude -> body rates. 2 sin(angle / 2) stands for the angle: no arc functions, strong to 180 degrees.
+    tilt = jnp.minimum(
+        config.attitude_gain * jax.lax.rsqrt(jnp.maximum(0.5 + 0.5 * ez, 1e-2)),
+        config.max_body_rate_rad_s * jax.lax.rsqrt(ex * ex + ey * ey + 1e-9),
+    )
+    cos_error = w * cos_half_yaw + z * sin_half_yaw
+    sin_error = w * sin_half_yaw - z * cos_half_yaw
+    turn = 2 * config.yaw_gain * sin_error * jnp.sign(cos_error) * jax.lax.rsqrt(w * w + z * z + 1e-6)
+    turn = jnp.clip(turn, -config.max_yaw_rate_rad_s, config.max_yaw_rate_rad_s)
+
+    # Body rates -> torque, gyroscopic torque included.
+    ix, iy, iz = airframe.inertia
+    torque_x = ix * config.rate_gain * (-tilt * ey - p) + (iz - iy) * q * r
+    torque_y = iy * config.rate_gain * (tilt * ex - q) + (ix - iz) * p * r
+    torque_z = iz * config.yaw_rate_gain * (turn - r) + (iy - ix) * p * q
+
+    # Collective thrust that gives the wanted vertical force at the tilt of this moment; none upside down.
+    collective = airframe.mass * fz * jnp.maximum(up_z, 0.0) / jnp.maximum(up_z * up_z, _LEAST_LEVELNESS**2)
+
+    # Rotor limits, in order of importance.
+    rotors = range(airframe.mixer.shape[0])
+    mixer, limit = airframe.mixer, airframe.max_thrust
+    tilting = [mixer[i, 1] * torque_x + mixer[i, 2] * torque_y for i in rotors]
+    low, high = _least(tilting), -_least([-t for t in tilting])
+    scale = jnp.minimum(1.0, config.max_tilt_share * limit / (high - low + 1e-9))
+    shared = jnp.clip(mixer[0, 0] * collective, -scale * low, limit - scale * high)
+    levelled = [shared + scale * t for t in tilting]
+    room = jnp.maximum(0.0, _least([jnp.minimum(t, limit - t) for t in levelled]))
+    turning = jnp.clip(jnp.abs(mixer[0, 3]) * torque_z, -room, room)
+    spins = [jnp.sign(mixer[i, 3]) for i in rotors]
+    return jnp.stack([jnp.clip(t + spins[i] * turning, 0.0, limit) for i, t in enumerate(levelled)])
+
+
+def _least(values: list[Array]) -> Array:
+    least = values[0]
+    for value in values[1:]:
+        least = jnp.minimum(least, value)
+    return least
+
+
+def physics_step(config: DroneConfig, airframe: Airframe, state: DroneState, thrust: Array) -> DroneState:
+    """One MJX step under rotor thrusts [4] newtons; only position and velocity are carried over.
+
+    These are the stages of `mjx.step` for this model: with the body frame at the centre of mass and no joint
+    below it, the mass matrix is the template's for ever, and nothing collides, constrains or dampens.
+    """
+    del config  # the time step is in the model
+    model = airframe.model
+    data = airframe.data.replace(
+        qpos=jnp.concatenate([state.position, state.quaternion]),
+        qvel=jnp.concatenate([state.velocity, state.angular_velocity]),
+        ctrl=thrust,
+    )
+    with jax.numpy_rank_promotion("allow"):  # MJX's own arithmetic relies on it
+        data = mjx.transmission(model, mjx.com_pos(model, mjx.kinematics(model, data)))
+        data = mjx.rne(model, mjx.com_vel(model, data))
+        data = mjx.fwd_acceleration(model, mjx.fwd_actuation(model, data))
+        data = mjx.euler(model, data.replace(qacc=data.qacc_smooth))
+    return dataclasses.replace(
+        state,
+        position=data.qpos[:3],
+        quaternion=data.qpos[3:],
+        velocity=data.qvel[:3],
+        angular_velocity=data.qvel[3:],
+    )
+
+
+def fly(
+    config: DroneConfig, airframe: Airframe, state: DroneState, velocity_command: Array, target_yaw: Array
+) -> tuple[DroneState, Flight]:
+    """One decision: `physics_steps` steps at a held `velocity_command` [3] m/s (world).
+
+    The yaw setpoint moves towards `target_yaw` [] radians the shorter way, at most `max_yaw_rate_rad_s` fast.
+    """
+    steps = jnp.arange(1, config.physics_steps + 1, dtype=jnp.float32)
+    most = config.max_yaw_rate_rad_s * config.physics_dt_s * steps
+    yaws = state.yaw_setpoint + jnp.clip(wrap_angle(target_yaw - state.yaw_setpoint), -most, most)
+
+    def body(state: DroneState, half_yaw: tuple[Array, Array]) -> tuple[DroneState, Flight]:
+        thrust = _thrusts(config, airframe, state, velocity_command, *half_yaw)
+        state = physics_step(config, airframe, state, thrust)
+        return state, Flight(state.position, state.quaternion, state.velocity)
+
+    state, flight = jax.lax.scan(body, state, (jnp.cos(yaws / 2), jnp.sin(yaws / 2)))
+    return dataclasses.replace(state, yaw_setpoint=wrap_angle(yaws[-1])), flight

@@ -1,0 +1,335 @@
+"""The task: reset, step, reward and outcome of one drone on one mission.
+
+An ended environment spends its next step on being reset: the step's action is ignored, and what it returns
+is the first observation of a new mission. So the row after an episode's last action holds its final
+observation, every observation is rendered and encoded once, and nothing else is needed to cut episodes.
+"""
+
+from __future__ import annotations
+
+import enum
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jax import Array
+
+from edqn_jax.config import Config, EnvConfig
+from edqn_jax.sim import camera, drone, events
+from edqn_jax.sim.drone import Airframe, DroneState, Flight
+from edqn_jax.sim.events import EventField, EventMemory
+from edqn_jax.sim.scene import Scene, scene_at, segment_contact, take_scene
+from edqn_jax.sim.worlds import Missions
+
+ACTIONS = np.stack(np.meshgrid(*[[-1, 0, 1]] * 3, indexing="ij"), -1).reshape(27, 3)
+"""The 27 moves, {-1, 0, 1}^3: ahead, left, up in the heading frame."""
+
+OWN_SIZE = 10
+"""Values of the drone's own state in an observation."""
+
+
+class Outcome(enum.IntEnum):
+    """How an episode stands. Everything but RUNNING ends it; only TIME_OUT is a truncation."""
+
+    RUNNING = 0
+    GOAL = 1
+    COLLISION = 2
+    LEFT_VOLUME = 3
+    TIME_OUT = 4
+    DIVERGED = 5
+
+
+@struct.dataclass
+class World:
+    """Where environments fly: P worlds and the missions that resets draw from."""
+
+    airframe: Airframe
+    pool: Scene  # every array with a leading [P]
+    missions: Missions
+
+
+@struct.dataclass
+class Observation:
+    """What the agent may know: events of the window before the decision, and its own state."""
+
+    events: EventField
+    own: Array  # [OWN_SIZE], see `own_state`
+
+
+@struct.dataclass
+class EnvState:
+    """One environment."""
+
+    drone: DroneState
+    mission: Array  # [] int32 index into the missions
+    decision: Array  # [] int32 decisions taken in this episode
+    ended: Array  # [] bool, the next step is a reset
+    memory: EventMemory
+    episode_return: Array  # [] sum of rewards so far
+    key: Array  # [] typed key
+
+
+@struct.dataclass
+class Step:
+    """What one decision led to. n physics steps."""
+
+    observation: Observation
+    reward: Array  # [] float32, unscaled
+    outcome: Array  # [] int32, an `Outcome`
+    is_reset: Array  # [] bool, the step was spent on a reset: reward 0, action ignored
+    episode_return: Array  # [] of the episode so far, this step included
+    episode_length: Array  # [] int32, likewise
+    flight: Flight  # [n, ...] after each physics step; for a reset, the new start throughout
+    end_step: Array  # [] int32, physics step (1..n) at which the outcome fell; n while running
+    contact: Array  # [] share of that step flown before a collision touched, 1 otherwise
+
+
+def velocity_command(config: EnvConfig, action: Array, yaw: Array) -> Array:
+    """World velocity [3] m/s that `action` (0..26) commands at heading `yaw`."""
+    move = jnp.asarray(ACTIONS, jnp.float32)[action] * config.speed_m_s
+    cos, sin = jnp.cos(yaw), jnp.sin(yaw)
+    return jnp.stack([cos * move[0] - sin * move[1], sin * move[0] + cos * move[1], move[2]])
+
+
+def own_state(config: EnvConfig, scene: Scene, goal: Array, state: DroneState) -> Array:
+    """The drone's own ten values [10], each of order 1.
+
+    Horizontal distance and height to the goal (in 50 and 10 m), cosine and sine of the heading, own position
+    scaled to [-1, 1] in the flight volume (3), own velocity in the heading frame (3, in commanded speeds).
+    """
+    yaw = drone.yaw_of(state.quaternion)
+    cos, sin = jnp.cos(yaw), jnp.sin(yaw)
+    ahead = goal - state.position
+    distance = jnp.sqrt(ahead[0] ** 2 + ahead[1] ** 2)
+    lower, upper = scene.volume[0], scene.volume[1]
+    position = 2 * (state.position - lower) / (upper - lower) - 1
+    vx, vy, vz = state.velocity / config.speed_m_s
+    return jnp.concatenate(
+        [
+            jnp.stack([distance / 50.0, ahead[2] / 10.0, cos, sin]),
+            position,
+            jnp.stack([cos * vx + sin * vy, cos * vy - sin * vx, vz]),
+        ]
+    )
+
+
+def _bearing(config: EnvConfig, state: DroneState, goal: Array) -> Array:
+    """Heading setpoint for the next decision: towards the goal, or held when it is (nearly) overhead."""
+    ahead = goal - state.position
+    near = ahead[0] ** 2 + ahead[1] ** 2 < config.heading_hold_m**2
+    return jnp.where(near, state.yaw_setpoint, jnp.arctan2(ahead[1], ahead[0]))
+
+
+def judge(config: Config, scene: Scene, goal: Array, before: Array, flight: Flight, decision: Array):
+    """Outcome of one decision: the earliest physics step wins, and at the same step a collision wins.
+
+    Args:
+        before: [3] position before the first physics step.
+        decision: decisions taken, this one included.
+
+    Returns:
+        outcome, end_step in 1..n, contact: as in `Step`.
+    """
+    n = flight.position.shape[0]
+    path = jnp.concatenate([before[None], flight.position])
+    touch, contact = jax.vmap(lambda a, b: segment_contact(scene, a, b, config.drone.body_radius_m))(path[:-1], path[1:])
+    at = flight.position
+    apart = at - goal[None]
+    arrived = jnp.sum(apart * apart, axis=1) < config.env.goal_radius_m**2
+    outside = jnp.any((at < scene.volume[0][None]) | (at > scene.volume[1][None]), axis=1)
+    broken = ~jnp.all(jnp.isfinite(at), axis=1)
+    # Per physics step, the verdicts in order of precedence.
+    verdict = jnp.select(
+        [broken, touch, outside, arrived],
+        [
+            jnp.full(n, int(Outcome.DIVERGED)),
+            jnp.full(n, int(Outcome.COLLISION)),
+            jnp.full(n, int(Outcome.LEFT_VOLUME)),
+            jnp.full(n, int(Outcome.GOAL)),
+        ],
+        jnp.full(n, int(Outcome.RUNNING)),
+    )
+    first = jnp.argmax(verdict != Outcome.RUNNING)
+    outcome = verdict[first]
+    running = outcome == Outcome.RUNNING
+    timed_out = running & (decision >= config.env.max_decisions)
+    outcome = jnp.where(timed_out, int(Outcome.TIME_OUT), outcome).astype(jnp.int32)
+    end_step = jnp.where(running, n, first + 1).astype(jnp.int32)
+    return outcome, end_step, jnp.where(outcome == Outcome.COLLISION, contact[first], 1.0)
+
+
+def reward(config: EnvConfig, discount: float, outcome: Array, before: Array, after: Array) -> Array:
+    """Reward of one decision.
+
+    `sparse` is Eq. 8. `progress` adds the metres gained towards the goal. `potential` adds
+    gamma * Phi(s') - Phi(s) with Phi = -distance, and Phi = 0 at terminal states: the form that leaves the
+    optimal policy unchanged (Ng et al. 1999).
+
+    Args:
+        before, after: distances to the goal, metres.
+    """
+    at_end = jnp.select(
+        [outcome == Outcome.GOAL, outcome == Outcome.COLLISION, outcome == Outcome.LEFT_VOLUME],
+        [config.goal_reward, config.collision_reward, config.left_volume_reward],
+        0.0,
+    )
+    total = at_end + config.step_reward
+    if config.reward == "progress":
+        total = total + (before - after)
+    elif config.reward == "potential":
+        terminal = is_terminal(outcome)
+        total = total + before - jnp.where(terminal, 0.0, discount * after)
+    return jnp.where(outcome == Outcome.DIVERGED, 0.0, total)
+
+
+def is_terminal(outcome: Array) -> Array:
+    """Whether the outcome cuts the bootstrap: every end but a time-out."""
+    return (outcome != Outcome.RUNNING) & (outcome != Outcome.TIME_OUT)
+
+
+def _start(config: Config, world: World, mission: Array, key: Array) -> tuple[DroneState, EventMemory]:
+    """At rest at the mission's start, facing its goal, the sensor at rest."""
+    start, goal = world.missions.start[mission], world.missions.goal[mission]
+    yaw = jnp.arctan2(goal[1] - start[1], goal[0] - start[0])
+    memory = events.reset_memory(config.events, config.camera.height, config.camera.width, key)
+    return drone.hover(start, yaw), memory
+
+
+def frame_steps(config: Config) -> tuple[int, ...]:
+    """Physics steps of a decision, 0..n, at which frames are rendered."""
+    n = config.drone.physics_steps
+    return tuple(n + round(t / config.drone.physics_dt_s) for t in config.events.frame_times_s)
+
+
+def view(config: Config, scene: Scene, position: Array, quaternion: Array) -> Array:
+    """Luma frame [H, W] of the camera on a body at `position` [3] with attitude `quaternion` [4]."""
+    return camera.luma(config.camera, scene, position, mount_rotation(config, quaternion))
+
+
+def mount_rotation(config: Config, quaternion: Array) -> Array:
+    """[3, 3] body-to-world rotation of the camera: the heading alone when level, else the full attitude."""
+    if config.camera.mount == "level":
+        w, z = quaternion[0], quaternion[3]
+        scale = jax.lax.rsqrt(jnp.maximum(w * w + z * z, 1e-9))
+        quaternion = jnp.stack([w * scale, jnp.zeros_like(w), jnp.zeros_like(w), z * scale])
+    w, x, y, z = quaternion
+    return jnp.stack(
+        [
+            jnp.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)]),
+            jnp.stack([2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)]),
+            jnp.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)]),
+        ]
+    )
+
+
+def observe(
+    config: Config, scene: Scene, goal: Array, state: DroneState, poses: Flight, memory: EventMemory, key: Array
+) -> tuple[Observation, EventMemory]:
+    """Events of the window that ends now, and the own state.
+
+    Args:
+        poses: [T, ...] the frames' poses, in order.
+    """
+    frames = jnp.stack([view(config, scene, p, q) for p, q in zip(poses.position, poses.quaternion, strict=True)])
+    field, memory = events.events(config.events, memory, frames, config.events.frame_times_s, key)
+    return Observation(events=field, own=own_state(config.env, scene, goal, state)), memory
+
+
+def reset(config: Config, world: World, key: Array, mission: Array | None = None) -> tuple[EnvState, Observation]:
+    """A fresh environment on a mission drawn from the pool, or on the given one."""
+    key, draw, sensor, noise = jax.random.split(key, 4)
+    if mission is None:
+        mission = jax.random.randint(draw, (), 0, world.missions.scene.shape[0])
+    body, memory = _start(config, world, mission, sensor)
+    state = EnvState(
+        drone=body,
+        mission=mission.astype(jnp.int32),
+        decision=jnp.zeros((), jnp.int32),
+        ended=jnp.zeros((), bool),
+        memory=memory,
+        episode_return=jnp.zeros(()),
+        key=key,
+    )
+    scene = scene_at(take_scene(world.pool, world.missions.scene[mission]), jnp.zeros(()))
+    still = _hold(body, len(config.events.frame_times_s))
+    observation, memory = observe(config, scene, world.missions.goal[mission], body, still, memory, noise)
+    return state.replace(memory=memory), observation
+
+
+def _hold(body: DroneState, n: int) -> Flight:
+    """n times the same pose."""
+    repeat: Callable[[Array], Array] = lambda x: jnp.broadcast_to(x, (n, *x.shape))  # noqa: E731
+    return Flight(position=repeat(body.position), quaternion=repeat(body.quaternion), velocity=repeat(body.velocity))
+
+
+def step(config: Config, world: World, state: EnvState, action: Array) -> tuple[EnvState, Step]:
+    """One decision of one drone, or its reset if its episode has ended.
+
+    Args:
+        action: [] int, 0..26.
+    """
+    key, draw, sensor, noise = jax.random.split(state.key, 4)
+    is_reset = state.ended
+    fresh = jax.random.randint(draw, (), 0, world.missions.scene.shape[0])
+    mission = jnp.where(is_reset, fresh, state.mission)
+    goal = world.missions.goal[mission]
+    time = state.decision * (config.drone.physics_steps * config.drone.physics_dt_s)
+    scene = scene_at(take_scene(world.pool, world.missions.scene[mission]), time)
+
+    # The decision as flown; for an ended environment it is computed and dropped.
+    before = state.drone
+    command = velocity_command(config.env, action, drone.yaw_of(before.quaternion))
+    flown, flight = drone.fly(config.drone, world.airframe, before, command, _bearing(config.env, before, goal))
+    decision = state.decision + 1
+    outcome, end_step, contact = judge(config, scene, goal, before.position, flight, decision)
+    distances = [jnp.sqrt(jnp.sum((goal - p) ** 2)) for p in (before.position, flown.position)]
+    gained = reward(config.env, config.agent.discount, outcome, distances[0], distances[1])
+
+    start, memory = _start(config, world, mission, sensor)
+    # A diverged body must not leave NaN in the last observation; it stays where it was.
+    broken = ~jnp.all(jnp.isfinite(jnp.concatenate([flown.position, flown.quaternion, flown.velocity])))
+    held = _hold(before, flight.position.shape[0])
+    body = _choose(is_reset, start, _choose(broken, before, flown))
+    memory = _choose(is_reset, memory, state.memory)
+    flight = _choose(is_reset, _hold(start, flight.position.shape[0]), _choose(broken, held, flight))
+    outcome = jnp.where(is_reset, int(Outcome.RUNNING), jnp.where(broken, int(Outcome.DIVERGED), outcome))
+
+    first = _choose(is_reset, start, before)
+    path = jax.tree.map(
+        lambda a, b: jnp.concatenate([a[None], b]),
+        Flight(position=first.position, quaternion=first.quaternion, velocity=first.velocity),
+        flight,
+    )
+    poses = jax.tree.map(lambda x: jnp.stack([x[i] for i in frame_steps(config)]), path)
+    observation, memory = observe(config, scene, goal, body, poses, memory, noise)
+
+    gained = jnp.where(is_reset, 0.0, jnp.where(broken, 0.0, gained))
+    episode_return = jnp.where(is_reset, 0.0, state.episode_return + gained)
+    decision = jnp.where(is_reset, 0, decision)
+    after = EnvState(
+        drone=body,
+        mission=mission.astype(jnp.int32),
+        decision=decision,
+        ended=outcome != Outcome.RUNNING,
+        memory=memory,
+        episode_return=episode_return,
+        key=key,
+    )
+    return after, Step(
+        observation=observation,
+        reward=gained,
+        outcome=outcome.astype(jnp.int32),
+        is_reset=is_reset,
+        episode_return=episode_return,
+        episode_length=decision,
+        flight=flight,
+        end_step=end_step,
+        contact=contact,
+    )
+
+
+def _choose(condition: Array, yes, no):
+    """`yes` where the scalar condition holds, leaf by leaf."""
+    return jax.tree.map(lambda a, b: jnp.where(condition, a, b), yes, no)

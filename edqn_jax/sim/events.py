@@ -1,0 +1,416 @@
+"""From brightness frames to events: Eq. 1-5 of the paper, in its order, under three event laws.
+
+Inside the compiled step events are never a list. Between two frames a pixel's events all have one polarity
+and even spacing, so `EventField` holds them exactly; `expand` turns it into the `(t, x, y, p)` stream that
+people exchange, and `collect` turns such a stream back.
+
+Shapes: T frames, F = T - 1 frame pairs (2 F rows in an `EventField` when noise events are on, the second F
+being noise), H rows, W columns.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jax import Array
+from numpy.typing import NDArray
+
+from edqn_jax.config import EventsConfig
+
+STREAM_DTYPE = np.dtype([("t", "<i8"), ("x", "<u2"), ("y", "<u2"), ("p", "i1")])
+"""One event of a stream: time in microseconds, column, row, polarity in {-1, +1}."""
+
+LUMA_WEIGHTS = (0.299, 0.587, 0.114)
+
+AIRSIM_EPSILON = 0.001
+"""What AirSim adds to the 8-bit grey value before the logarithm."""
+
+MIN_THRESHOLD_GAIN = 0.1
+"""Mismatch never makes a threshold smaller than this share of the nominal one."""
+
+MICROSECOND = 1e-6
+
+
+@struct.dataclass
+class EventField:
+    """Events of one window, dense: in each row a pixel's events have one polarity and even spacing."""
+
+    count: Array  # [F, H, W] int32, events of the pixel in this frame pair
+    polarity: Array  # [F, H, W] int8 in {-1, 0, +1}; 0 where count is 0
+    t_first: Array  # [F, H, W] float32 seconds from the start of the window
+    t_step: Array  # [F, H, W] float32 seconds between a pixel's events
+    window_s: float = struct.field(pytree_node=False)  # length of the window, seconds
+
+
+@struct.dataclass
+class EventMemory:
+    """What a law carries from one window to the next; what a configuration does not need is None."""
+
+    residual: Array | None  # [H, W] esim: log brightness of the last frame minus the pixel's reference level
+    last_event: Array | None  # [H, W] esim: time of the last event, seconds from the end of the last window
+    gain: Array | None  # [2, H, W] threshold mismatch of ON and OFF, relative to the nominal threshold
+    hot: Array | None  # [H, W] bool, pixels that fire on their own
+
+
+def luma(rgb: Array) -> Array:
+    """The grey value inside Eq. 1: `[..., 3]` linear RGB to `[...]`."""
+    red, green, blue = LUMA_WEIGHTS
+    return red * rgb[..., 0] + green * rgb[..., 1] + blue * rgb[..., 2]
+
+
+def log_brightness(config: EventsConfig, intensity: Array) -> Array:
+    """Eq. 1: `L = log(intensity + epsilon)` of linear luma `[...]` in [0, 1].
+
+    The paper's logarithm has no epsilon; without one a black pixel would make infinitely many events.
+    """
+    return jnp.log(intensity + config.log_epsilon)
+
+
+def airsim_log_brightness(intensity: Array) -> Array:
+    """Eq. 1 as AirSim computes it: the logarithm of the 8-bit grey value + 0.001, in float32.
+
+    The 256 possible values are tabulated, so that no compiler's logarithm can move an event.
+    """
+    table = np.log(np.arange(256, dtype=np.float32) + np.float32(AIRSIM_EPSILON))
+    grey = jnp.clip(jnp.round(intensity * 255.0), 0.0, 255.0).astype(jnp.int32)
+    return jnp.asarray(table)[grey]
+
+
+def event_polarity(change: Array, threshold: Array | float) -> Array:
+    """Eq. 2: +1 or -1 where the log brightness changed by more than the threshold, else 0. `[...]` int8."""
+    return jnp.where(jnp.abs(change) > threshold, jnp.sign(change), 0.0).astype(jnp.int8)
+
+
+def max_events(config: EventsConfig, interval_s: float) -> int:
+    """Eq. 3: `N_max`, the events that the refractory period leaves room for between two frames."""
+    if config.refractory_ns <= 0.0:
+        return np.iinfo(np.int32).max
+    interval_us = round(interval_s * 1e9) * 1e-3  # whole nanoseconds: no float dust before int()
+    return int(interval_us / (config.refractory_ns * 1e-3))
+
+
+def event_count(change: Array, tolerance: Array | float, limit: Array | int) -> Array:
+    """Eq. 4: `N_e = min(N_max, floor(|change| / TOL))`, `[...]` int32."""
+    return jnp.minimum(jnp.floor(jnp.abs(change) / tolerance).astype(jnp.int32), limit)
+
+
+def airsim_count(before: Array, after: Array, tolerance: Array | float, limit: Array | int) -> Array:
+    """AirSim's number of events: `floor(|change| / TOL) - 1`, and none up to twice the tolerance.
+
+    It counts from the first crossing rather than to it; the float32 rounding of that crossing is kept.
+    """
+    sign = jnp.sign(after - before)
+    crossing = before + sign * tolerance
+    beyond = (after - crossing) * sign
+    count = jnp.where(beyond > 0.0, jnp.floor(beyond / tolerance), 0.0).astype(jnp.int32)
+    return jnp.minimum(count, limit)
+
+
+def event_times(count: Array, starts: Array, intervals: Array) -> tuple[Array, Array]:
+    """Eq. 5: `t_k = t_prev + k dT / N_e`, k = 0 .. N_e - 1, as `(t_first, t_step)` `[F, H, W]`, seconds."""
+    return jnp.broadcast_to(starts, count.shape), intervals / jnp.maximum(count, 1).astype(jnp.float32)
+
+
+def reset_memory(config: EventsConfig, height: int, width: int, key: Array) -> EventMemory:
+    """A sensor at rest: esim's residuals are uniform in (-C-, C+); mismatch and hot pixels are drawn.
+
+    The same key makes the same sensor.
+    """
+    key_residual, key_gain, key_hot = jax.random.split(key, 3)
+    gain = None
+    if config.threshold_mismatch > 0.0:
+        noise = jax.random.normal(key_gain, (2, height, width))
+        gain = jnp.maximum(1.0 + config.threshold_mismatch * noise, MIN_THRESHOLD_GAIN)
+    hot = None
+    if config.hot_pixel_fraction > 0.0:
+        hot = jax.random.bernoulli(key_hot, config.hot_pixel_fraction, (height, width))
+    if config.law != "esim":
+        return EventMemory(residual=None, last_event=None, gain=gain, hot=hot)
+    contrast_on, contrast_off = _both(gain, config.contrast_on, config.contrast_off)
+    share = jax.random.uniform(key_residual, (height, width))
+    return EventMemory(
+        residual=share * (contrast_on + contrast_off) - contrast_off,
+        last_event=jnp.full((height, width), -jnp.inf),
+        gain=gain,
+        hot=hot,
+    )
+
+
+def events(
+    config: EventsConfig,
+    memory: EventMemory,
+    frames: Array,
+    frame_times: Sequence[float],
+    key: Array,
+    *,
+    continuous: bool = False,
+) -> tuple[EventField, EventMemory]:
+    """Events of one window.
+
+    Args:
+        memory: from `reset_memory` or the window before.
+        frames: `[T, H, W]` linear luma in [0, 1], each pixel its area average.
+        frame_times: T times in seconds, rising; only their differences matter. Known when tracing.
+        key: consumed only by noise events.
+        continuous: the first frame is the previous window's last one (`stream` mode), so that esim's
+            refractory clock runs on. Otherwise time has passed unseen: esim's reference is re-anchored at the
+            first frame, keeping each pixel's sub-threshold residual.
+
+    Raises:
+        ValueError: if there are fewer than two frames, or not one rising time for each.
+    """
+    times = np.asarray(frame_times, np.float64)
+    if frames.shape[0] < 2 or times.shape != (frames.shape[0],) or np.any(np.diff(times) <= 0.0):
+        raise ValueError(
+            f"events need at least two frames and one rising time for each; got {frames.shape[0]} frames "
+            f"and times {times.tolist()}"
+        )
+    times = times - times[0]
+    window_s = float(times[-1])
+    if config.law == "esim":
+        level = log_brightness(config, frames)
+        field, memory = _esim(config, memory, level, times, continuous)
+    else:
+        field = _frame_pairs(config, memory.gain, frames, times)
+    if _has_noise(config):
+        field = _join(field, _noise(config, memory.hot, field, times, key))
+    return dataclasses.replace(field, window_s=window_s), memory
+
+
+def signed_count(field: EventField) -> Array:
+    """ON minus OFF events per pixel over the window, clipped to `[H, W]` int8."""
+    return jnp.clip(event_image(field), -127, 127).astype(jnp.int8)
+
+
+def event_image(field: EventField) -> Array:
+    """ON minus OFF events per pixel over the window, `[H, W]` int32."""
+    return jnp.sum(field.count * field.polarity, axis=-3)
+
+
+def field_of_counts(config: EventsConfig, counts: Array) -> EventField:
+    """The field behind a stored `[H, W]` signed count; exact for two frames under `paper` or `airsim`."""
+    window_s = config.frame_times_s[-1] - config.frame_times_s[0]
+    count = jnp.abs(counts.astype(jnp.int32))[None]
+    t_first, t_step = event_times(count, jnp.float32(0.0), jnp.float32(window_s))
+    return EventField(count, jnp.sign(counts).astype(jnp.int8)[None], t_first, t_step, window_s)
+
+
+def event_picture(image: NDArray, background: str = "white") -> NDArray[np.uint8]:
+    """Red-blue picture of a signed event image (Fig. 6): `[H, W]` to `[H, W, 3]`, ON red and OFF blue.
+
+    One event already has half the colour's strength; more events approach it.
+
+    Raises:
+        ValueError: if the background is neither `white` nor `black`.
+    """
+    if background not in ("white", "black"):
+        raise ValueError(f"the background is 'white' or 'black', not '{background}'")
+    image = np.asarray(image).astype(np.float64)
+    paper = np.full(3, 255.0 if background == "white" else 0.0)
+    ink = np.where(image[..., None] > 0, np.array([230.0, 30.0, 30.0]), np.array([40.0, 70.0, 240.0]))
+    strength = np.where(image == 0, 0.0, 1.0 - 0.5 * 0.5 ** (np.abs(image) - 1))[..., None]
+    return np.rint(paper + strength * (ink - paper)).astype(np.uint8)
+
+
+def expand(field: EventField, window_start_us: int = 0) -> NDArray:
+    """The stream of a field: structured array of `STREAM_DTYPE`, sorted by time (host side, NumPy).
+
+    Times are rounded to the microsecond. Ties keep the order row, column.
+    """
+    count = np.asarray(field.count)
+    row, y, x = np.nonzero(count)
+    number = count[row, y, x]
+    first = np.asarray(field.t_first, np.float64)[row, y, x]
+    step = np.asarray(field.t_step, np.float64)[row, y, x]
+    pixel = np.repeat(np.arange(number.size), number)
+    index = np.arange(pixel.size) - (np.cumsum(number) - number)[pixel]
+    stream = np.empty(pixel.size, STREAM_DTYPE)
+    stream["t"] = window_start_us + np.rint((first[pixel] + index * step[pixel]) * 1e6).astype(np.int64)
+    stream["x"], stream["y"] = x[pixel], y[pixel]
+    stream["p"] = np.asarray(field.polarity)[row, y, x][pixel]
+    return stream[np.argsort(stream["t"], kind="stable")]
+
+
+def collect(
+    stream: NDArray, frame_times: Sequence[float], height: int, width: int, window_start_us: int = 0
+) -> EventField:
+    """The field behind a stream: the inverse of `expand` for a field without noise (host side, NumPy).
+
+    Lossless in this sense: `expand(collect(s)) == s` event by event, and `collect(expand(f))` has f's counts
+    and polarities exactly and every event within half a microsecond. Times come back as float64.
+
+    Raises:
+        ValueError: if a pixel has events of both polarities, or unevenly spaced ones, between two frames.
+    """
+    edges = np.rint((np.asarray(frame_times, np.float64) - frame_times[0]) * 1e6).astype(np.int64)
+    shape = (len(edges) - 1, height, width)
+    t = stream["t"] - window_start_us
+    row = np.clip(np.searchsorted(edges, t, side="right") - 1, 0, shape[0] - 1)
+    cell = np.ravel_multi_index((row, stream["y"].astype(np.int64), stream["x"].astype(np.int64)), shape)
+    order = np.lexsort((t, cell))
+    cell, t, sign = cell[order], t[order].astype(np.float64), stream["p"][order]
+    cells, begin, number = np.unique(cell, return_index=True, return_counts=True)
+    pixel = np.repeat(np.arange(cells.size), number)
+    index = np.arange(t.size) - begin[pixel]
+    first, step, width_us = _line_through(t, index, pixel, begin, number)
+    if np.any(sign != sign[begin][pixel]) or np.any(width_us >= 1.0 + 1e-6):
+        raise ValueError(
+            "the stream is no noiseless event field: between two frames a pixel has events of both "
+            "polarities or unevenly spaced ones"
+        )
+    count, polarity = np.zeros(shape, np.int32), np.zeros(shape, np.int8)
+    t_first, t_step = np.zeros(shape), np.zeros(shape)
+    count.flat[cells], polarity.flat[cells] = number, sign[begin]
+    t_first.flat[cells], t_step.flat[cells] = first * MICROSECOND, step * MICROSECOND
+    return EventField(count, polarity, t_first, t_step, float(frame_times[-1] - frame_times[0]))  # type: ignore
+
+
+def _line_through(
+    t: NDArray, index: NDArray, pixel: NDArray, begin: NDArray, number: NDArray
+) -> tuple[NDArray, NDArray, NDArray]:
+    """Per pixel the line `first + index * step` whose largest distance from the stamps `t` is least.
+
+    The width of the strip around the stamps is convex in the slope, so a ternary search finds it. Stamps that
+    are a rounded line lie in a strip narrower than one microsecond, and its middle rounds to them again.
+    """
+    if t.size == 0:
+        return np.zeros(0), np.zeros(0), np.zeros(0)
+
+    def strip(slope: NDArray) -> tuple[NDArray, NDArray]:
+        height = t - index * slope[pixel]
+        return np.minimum.reduceat(height, begin), np.maximum.reduceat(height, begin)
+
+    gaps = np.maximum(number - 1, 1)
+    mean = (t[begin + number - 1] - t[begin]) / gaps
+    low, high = np.where(number > 2, mean - 1.0 / gaps, mean), np.where(number > 2, mean + 1.0 / gaps, mean)
+    for _ in range(90):
+        left, right = low + (high - low) / 3.0, high - (high - low) / 3.0
+        (left_min, left_max), (right_min, right_max) = strip(left), strip(right)
+        better = left_max - left_min <= right_max - right_min
+        low, high = np.where(better, low, left), np.where(better, right, high)
+    slope = (low + high) / 2.0
+    lower, upper = strip(slope)
+    return (lower + upper) / 2.0, slope, upper - lower
+
+
+def _both(gain: Array | None, on: float, off: float) -> tuple[Array, Array]:
+    """ON and OFF thresholds, each a scalar or `[H, W]` with the sensor's mismatch."""
+    if gain is None:
+        return jnp.float32(on), jnp.float32(off)
+    return gain[0] * on, gain[1] * off
+
+
+def _frame_pairs(config: EventsConfig, gain: Array | None, frames: Array, times: NDArray) -> EventField:
+    """The memoryless laws, `paper` and `airsim`."""
+    intervals = np.diff(times)
+    limit = jnp.array([max_events(config, dt) for dt in intervals], jnp.int32)[:, None, None]
+    level = log_brightness(config, frames) if config.law == "paper" else airsim_log_brightness(frames)
+    before, after = level[:-1], level[1:]
+    change = after - before
+    scale: Array | float = 1.0 if gain is None else jnp.where(change > 0.0, gain[0], gain[1])
+    if config.law == "paper":
+        over = event_polarity(change, scale * config.threshold)
+        count = jnp.where(over != 0, event_count(change, scale * config.tolerance, limit), 0)
+    else:
+        count = airsim_count(before, after, scale * config.airsim_tolerance, limit)
+        over = jnp.sign(change).astype(jnp.int8)
+    starts = jnp.asarray(times[:-1, None, None], jnp.float32)
+    t_first, t_step = event_times(count, starts, jnp.asarray(intervals[:, None, None], jnp.float32))
+    return EventField(count, jnp.where(count > 0, over, 0).astype(jnp.int8), t_first, t_step, 0.0)
+
+
+def _esim(
+    config: EventsConfig, memory: EventMemory, level: Array, times: NDArray, continuous: bool
+) -> tuple[EventField, EventMemory]:
+    """The law of a sensor with memory, over the window's frame pairs one after another."""
+    assert memory.residual is not None and memory.last_event is not None
+    last_event = memory.last_event if continuous else jnp.full_like(memory.last_event, -jnp.inf)
+    starts, ends = jnp.asarray(times[:-1], jnp.float32), jnp.asarray(times[1:], jnp.float32)
+    contrasts = _both(memory.gain, config.contrast_on, config.contrast_off)
+
+    def pair(carry: tuple[Array, Array], xs: tuple[Array, ...]) -> tuple[tuple[Array, Array], EventField]:
+        return _esim_pair(config, contrasts, carry, xs)
+
+    carry, field = jax.lax.scan(
+        pair,
+        (memory.residual, last_event),
+        (level[:-1], level[1:], starts, ends),
+        unroll=min(len(times) - 1, 2),  # a window of two or three frames needs no loop
+    )
+    residual, last_event = carry
+    return field, dataclasses.replace(memory, residual=residual, last_event=last_event - ends[-1])
+
+
+def _esim_pair(
+    config: EventsConfig,
+    contrasts: tuple[Array, Array],
+    carry: tuple[Array, Array],
+    pair: tuple[Array, ...],
+) -> tuple[tuple[Array, Array], EventField]:
+    """Crossings of the reference's next levels while brightness moves straight from frame to frame."""
+    residual, last_event = carry
+    before, after, start, end = pair
+    change = after - before
+    rising = change > 0.0
+    contrast = jnp.where(rising, contrasts[0], contrasts[1])
+    offset = jnp.where(rising, residual, -residual)  # distance from the reference, in the direction of travel
+    size = jnp.abs(change)
+    crossings = jnp.maximum(jnp.floor((offset + size) / contrast), 0.0).astype(jnp.int32)
+    residual = residual + change - jnp.where(rising, 1.0, -1.0) * contrast * crossings
+
+    slowness = (end - start) / jnp.maximum(size, 1e-12)
+    # A window is half open, [start, end): a crossing at the very end is stamped a microsecond before it.
+    latest = end - MICROSECOND
+    first = jnp.clip(start + (contrast - offset) * slowness, start, latest)
+    step = jnp.minimum(contrast * slowness, (latest - first) / jnp.maximum(crossings - 1, 1))
+    count = crossings
+    if config.refractory_ns > 0.0:
+        refractory = config.refractory_ns * 1e-9
+        # Evenly spaced crossings leave evenly spaced events: skip the first few, then take every stride-th.
+        spacing = jnp.maximum(step, 1e-12)
+        skipped = jnp.maximum(jnp.ceil((last_event + refractory - first) / spacing), 0.0)
+        stride = jnp.maximum(jnp.ceil(refractory / spacing), 1.0)
+        left = crossings - jnp.minimum(skipped, 1e9).astype(jnp.int32)
+        count = jnp.where(left > 0, 1 + (left - 1) // jnp.minimum(stride, 1e9).astype(jnp.int32), 0)
+        first = jnp.where(count > 0, first + skipped * step, start)
+        step = jnp.where(count > 0, stride * step, step)
+    last_event = jnp.where(count > 0, first + (count - 1) * step, last_event)
+    polarity = jnp.where(count > 0, jnp.where(rising, 1, -1), 0).astype(jnp.int8)
+    return (residual, last_event), EventField(count, polarity, first, step, 0.0)
+
+
+def _has_noise(config: EventsConfig) -> bool:
+    return config.leak_rate_hz > 0.0 or config.shot_rate_hz > 0.0 or config.hot_pixel_fraction > 0.0
+
+
+def _noise(
+    config: EventsConfig, hot: Array | None, field: EventField, times: NDArray, key: Array
+) -> EventField:
+    """Noise events of every frame pair: Poisson counts, evenly spaced from a random phase.
+
+    A pixel's noise events between two frames share one polarity, drawn by the rates: exact while they seldom
+    are more than one. They neither move esim's reference nor wait for the refractory period.
+    """
+    key_count, key_polarity, key_phase = jax.random.split(key, 3)
+    shape = field.count.shape
+    firing = 0.0 if hot is None else config.hot_pixel_rate_hz * hot
+    rate_off = 0.5 * config.shot_rate_hz
+    rate = jnp.broadcast_to(config.leak_rate_hz + config.shot_rate_hz + firing, shape[1:])
+    intervals = jnp.asarray(np.diff(times), jnp.float32)[:, None, None]
+    limit = jnp.array([max_events(config, dt) for dt in np.diff(times)], jnp.int32)[:, None, None]
+    count = jnp.minimum(jax.random.poisson(key_count, rate * intervals, shape, dtype=jnp.int32), limit)
+    off = jax.random.uniform(key_polarity, shape) * rate < rate_off
+    step = intervals / jnp.maximum(count, 1)
+    first = jnp.asarray(times[:-1, None, None], jnp.float32) + jax.random.uniform(key_phase, shape) * step
+    polarity = jnp.where(count > 0, jnp.where(off, -1, 1), 0).astype(jnp.int8)
+    return EventField(count, polarity, first, step, 0.0)
+
+
+def _join(signal: EventField, noise: EventField) -> EventField:
+    """Signal rows, then noise rows."""
+    return jax.tree.map(lambda a, b: jnp.concatenate([a, b]), signal, noise)

@@ -1,0 +1,354 @@
+"""Worlds in and out of MJCF, MuJoCo's own file format.
+
+Any MJCF will do. A world for the drone is made of
+
+* its static geoms (on the world body or on bodies welded to it): boxes, spheres, capsules, cylinders at
+  any rotation, and planes, which are solid below and endless. A geom is taken if a person sees it in
+  MuJoCo's viewer (groups 0 to 2) or if MuJoCo would collide with it (contype or conaffinity set): what
+  is seen is solid, and what is solid is seen. Colour is the material's or the geom's own `rgba`; alpha
+  and textures are ignored.
+* two sites `start` and `goal`, anywhere; their positions count.
+* a box site `volume`, not rotated: the space that the drone may fly in. Without one, the box around all
+  shapes and sites, `VOLUME_MARGIN` wider on every side, but not below a level plane.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Mapping
+from pathlib import Path
+
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+
+from edqn_jax.config import ConfigError
+from edqn_jax.sim.scene import (
+    KINDS,
+    Capsules,
+    Planes,
+    Scene,
+    Shape,
+    Spheres,
+    TiltedBoxes,
+    TiltedCylinders,
+    UprightBoxes,
+    UprightCylinders,
+    build_scene,
+    scene_shapes,
+    shape_distances,
+)
+
+VOLUME_MARGIN = 5.0
+"""Metres around shapes and sites where a world names no `volume`."""
+
+_LEVEL = 1e-6  # an axis this near to vertical (sine of the angle) is vertical: 0.1 mm over 100 m
+
+
+class SceneError(ConfigError):
+    """A world that cannot be flown; the message is one sentence for people."""
+
+
+@dataclasses.dataclass(frozen=True)
+class LoadedWorld:
+    """A scene and what its shapes are called."""
+
+    scene: Scene
+    names: Mapping[str, tuple[str, ...]]
+    """For every kind (field of `Scene`), the name of each of its shapes, in order."""
+    path: Path
+
+
+def scenes_folder() -> Path:
+    """Where the worlds that come with the project lie: beside the package in a checkout, in it in a wheel."""
+    package = Path(__file__).resolve().parents[1]
+    packed = package / "scenes"
+    return packed if packed.is_dir() else package.parent / "scenes"
+
+
+def resolve_world(name: str) -> Path:
+    """The MJCF file of a world that a person named by its path or by its name in `scenes/`.
+
+    Raises:
+        SceneError: if there is none.
+    """
+    path = Path(name).expanduser()
+    if path.is_file():
+        return path
+    folder = scenes_folder()
+    named = folder / f"{name}.xml"
+    if path.name == name and named.is_file():
+        return named
+    known = ", ".join(sorted(file.stem for file in folder.glob("*.xml"))) or "none"
+    if path.suffix == ".xml" or path.name != name:
+        searched = path.parent.resolve()
+        raise SceneError(f"there is no scene file '{path.name}' in {searched}; scenes known by name: {known}")
+    raise SceneError(f"there is no scene '{name}' in {folder}; the scenes there are: {known}")
+
+
+def load_scene(path: str | Path) -> Scene:
+    """`load_world(path).scene`."""
+    return load_world(path).scene
+
+
+def load_world(path: str | Path) -> LoadedWorld:
+    """Read a world from an MJCF file.
+
+    Where the file has no site `start` or `goal`, that point is NaN in the scene; `check_scene` complains
+    unless the caller has replaced it.
+
+    Raises:
+        SceneError: if the file is missing or does not parse, or has a geom that cannot be taken.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise SceneError(f"there is no scene file '{path.name}' in {path.parent.resolve()}")
+    try:
+        model = mujoco.MjModel.from_xml_path(str(path))
+    except ValueError as error:
+        reason = " ".join(str(error).split())
+        raise SceneError(f"{path} is not an MJCF that MuJoCo can read: {reason}") from None
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    shapes: list[Shape] = []
+    names: dict[str, list[str]] = {kind: [] for kind in KINDS}
+    for geom in range(model.ngeom):
+        if model.geom_group[geom] >= 3 and not (model.geom_contype[geom] or model.geom_conaffinity[geom]):
+            continue
+        shape = _shape(model, data, geom, path)
+        shapes.append(shape)
+        kind = next(kind for kind, dataclass in KINDS.items() if isinstance(shape, dataclass))
+        names[kind].append(_geom_name(model, geom))
+    sites = {model.site(i).name: data.site_xpos[i] for i in range(model.nsite)}
+    unknown = np.full(3, np.nan)
+    scene = build_scene(
+        shapes,
+        volume=_volume(model, data, shapes, path),
+        start=sites.get("start", unknown),
+        goal=sites.get("goal", unknown),
+    )
+    return LoadedWorld(scene, {kind: tuple(members) for kind, members in names.items()}, path)
+
+
+def check_scene(
+    scene: Scene,
+    body_radius: float,
+    *,
+    names: Mapping[str, tuple[str, ...]] | None = None,
+    title: str = "the world",
+) -> None:
+    """Make sure that a drone of this radius can stand at the start and at the goal.
+
+    Args:
+        scene: one world.
+        body_radius: metres.
+        names: as in `LoadedWorld`, for the message.
+        title: what to call the world in the message.
+
+    Raises:
+        SceneError: if either is missing, outside the flight volume or too close to a shape.
+    """
+    lower, upper = np.asarray(scene.volume)
+    if not np.all(upper > lower):
+        raise SceneError(f"the flight volume of {title}, {_point(lower)} to {_point(upper)}, is empty")
+    for role, where in (("start", scene.start), ("goal", scene.goal)):
+        point = np.asarray(where)
+        if not np.all(np.isfinite(point)):
+            raise SceneError(
+                f'{title} does not say where its {role} is; add a site, <site name="{role}" pos="x y z"/>'
+            )
+        for axis, value, low, high in zip("xyz", point, lower, upper, strict=True):
+            if not low <= value <= high:
+                raise SceneError(
+                    f"the {role} {_point(point)} lies outside the flight volume of {title}: "
+                    f"{axis} = {value:g} is not within {low:g} to {high:g}"
+                )
+        for kind, distances in shape_distances(scene, jnp.asarray(point)).items():
+            nearest = int(np.argmin(distances))
+            distance = float(distances[nearest])
+            if distance > body_radius:
+                continue
+            known = (names or {}).get(kind, ())
+            name = f"'{known[nearest]}'" if nearest < len(known) else f"{kind}[{nearest}]"
+            if distance < 0:
+                raise SceneError(f"the {role} {_point(point)} of {title} lies inside {name}; move either")
+            raise SceneError(
+                f"the {role} {_point(point)} of {title} is {distance:.2f} m from {name}, "
+                f"closer than the drone's radius of {body_radius:g} m"
+            )
+
+
+def write_scene(scene: Scene, path: str | Path, *, title: str = "world") -> None:
+    """Write one world as MJCF that MuJoCo opens and that loads back to the same scene.
+
+    Parked shapes are left out. A tilted shape that happens to stand upright loads back as an upright one.
+    """
+    root = ElementTree.Element("mujoco", model=title)
+    ElementTree.SubElement(root, "compiler", angle="radian")
+    visual = ElementTree.SubElement(root, "visual")
+    ElementTree.SubElement(visual, "headlight", ambient="0.35 0.35 0.35", diffuse="0.4 0.4 0.4")
+    ElementTree.SubElement(visual, "map", zfar="50")
+    lower, upper = np.asarray(scene.volume)
+    middle, half = (lower + upper) / 2, (upper - lower) / 2
+    ElementTree.SubElement(root, "statistic", center=_numbers(middle), extent=_numbers([np.max(half)]))
+    asset = ElementTree.SubElement(root, "asset")
+    ElementTree.SubElement(
+        asset, "texture", type="skybox", builtin="gradient", width="256", height="256",
+        rgb1="0.45 0.62 0.85", rgb2="0.85 0.9 0.95",
+    )  # fmt: skip
+    world = ElementTree.SubElement(root, "worldbody")
+    sun = _numbers([middle[0], middle[1], upper[2] + 50.0])
+    ElementTree.SubElement(world, "light", directional="true", pos=sun, dir="0.5 0.3 -0.8")
+    for role, where in (("start", scene.start), ("goal", scene.goal)):
+        if np.all(np.isfinite(where)):
+            colour = "0.1 0.6 1 1" if role == "start" else "0.1 0.8 0.2 1"
+            ElementTree.SubElement(world, "site", name=role, pos=_numbers(where), size="0.5", rgba=colour)
+    # Group 3 is hidden in the viewer until asked for.
+    ElementTree.SubElement(
+        world, "site", name="volume", type="box", group="3", pos=_numbers(middle), size=_numbers(half),
+        rgba="0.2 0.4 1 0.1",
+    )  # fmt: skip
+    counts: dict[str, int] = {}
+    for shape in scene_shapes(scene):
+        attributes = _attributes(shape)
+        number = counts[attributes["type"]] = counts.get(attributes["type"], 0) + 1
+        ElementTree.SubElement(world, "geom", {"name": f"{attributes['type']}{number}", **attributes})
+    ElementTree.indent(root)
+    Path(path).write_text(ElementTree.tostring(root, encoding="unicode") + "\n", encoding="utf-8")
+
+
+def _geom_name(model: mujoco.MjModel, geom: int) -> str:
+    kind = _kind_name(mujoco.mjtGeom(model.geom_type[geom]))
+    return model.geom(geom).name or f"geom number {geom} ({kind})"
+
+
+def _kind_name(kind: mujoco.mjtGeom) -> str:
+    return kind.name.removeprefix("mjGEOM_").lower()
+
+
+def _shape(model: mujoco.MjModel, data: mujoco.MjData, geom: int, path: Path) -> Shape:
+    """Geom `geom` as a single shape, in the world's frame."""
+    kind = mujoco.mjtGeom(model.geom_type[geom])
+    name = _geom_name(model, geom)
+    body = model.geom_bodyid[geom]
+    if model.body_weldid[body] != 0 or model.body_mocapid[body] >= 0:
+        raise SceneError(
+            f"{path}: geom '{name}' is on a body that can move; remove the joints (or mocap) of body "
+            f"'{model.body(body).name}', every world is static"
+        )
+    material = model.geom_matid[geom]
+    albedo = (model.geom_rgba[geom] if material < 0 else model.mat_rgba[material])[:3]
+    position, rotation, size = data.geom_xpos[geom], data.geom_xmat[geom].reshape(3, 3), model.geom_size[geom]
+    axis = rotation[:, 2]
+    upright = math.hypot(axis[0], axis[1]) < _LEVEL
+    match kind:
+        case mujoco.mjtGeom.mjGEOM_BOX:
+            return _box(position, rotation, size, albedo)
+        case mujoco.mjtGeom.mjGEOM_SPHERE:
+            return Spheres(position=position, radius=size[0], albedo=albedo)
+        case mujoco.mjtGeom.mjGEOM_CAPSULE:
+            return Capsules(position=position, axis=axis, half_length=size[1], radius=size[0], albedo=albedo)
+        case mujoco.mjtGeom.mjGEOM_CYLINDER if upright:
+            return UprightCylinders(position=position, radius=size[0], half_height=size[1], albedo=albedo)
+        case mujoco.mjtGeom.mjGEOM_CYLINDER:
+            return TiltedCylinders(
+                position=position, axis=axis, half_length=size[1], radius=size[0], albedo=albedo
+            )
+        case mujoco.mjtGeom.mjGEOM_PLANE:
+            return Planes(position=position, normal=axis, albedo=albedo)
+    raise SceneError(
+        f"{path}: geom '{name}' cannot be taken because it is of kind {_kind_name(kind)}; use boxes, "
+        "spheres, capsules, cylinders or planes, or hide it in group 3 with contype and conaffinity 0"
+    )
+
+
+def _box(position: np.ndarray, rotation: np.ndarray, size: np.ndarray, albedo: np.ndarray) -> Shape:
+    """Upright if any of the box's own axes is vertical, whichever it is."""
+    for vertical in (2, 0, 1):
+        if math.hypot(rotation[0, vertical], rotation[1, vertical]) < _LEVEL:
+            across, deep = ((0, 1), (1, 2), (0, 2))[(2, 0, 1).index(vertical)]
+            yaw = math.atan2(rotation[1, across], rotation[0, across])
+            half = size[[across, deep, vertical]]
+            return UprightBoxes(position=position, half=half, yaw=yaw, albedo=albedo)  # type: ignore[arg-type]
+    return TiltedBoxes(position=position, half=size, rotation=rotation, albedo=albedo)  # type: ignore[arg-type]
+
+
+def _volume(model: mujoco.MjModel, data: mujoco.MjData, shapes: list[Shape], path: Path) -> np.ndarray:
+    for i in range(model.nsite):
+        if model.site(i).name == "volume":
+            turned = np.abs(data.site_xmat[i].reshape(3, 3) - np.eye(3)).max() > _LEVEL
+            if model.site_type[i] != mujoco.mjtGeom.mjGEOM_BOX or turned:
+                raise SceneError(f"{path}: the site 'volume' must be a box that is not rotated")
+            return data.site_xpos[i] + np.array([[-1.0], [1.0]]) * model.site_size[i]
+    corners = [data.site_xpos[i] for i in range(model.nsite)]
+    floors = []
+    for shape in shapes:
+        if isinstance(shape, Planes):
+            if shape.normal[2] > 1 - _LEVEL:
+                floors.append(shape.position[2])
+            continue
+        reach = _reach(shape)
+        corners += [shape.position - reach, shape.position + reach]
+    if not corners:
+        raise SceneError(f"{path}: nothing says how large the world is; add a box site named 'volume'")
+    lower, upper = np.min(corners, axis=0) - VOLUME_MARGIN, np.max(corners, axis=0) + VOLUME_MARGIN
+    if floors:
+        lower[2] = max(lower[2], max(floors))
+    return np.stack([lower, upper])
+
+
+def _reach(shape: Shape) -> np.ndarray:
+    """Half extents [3] of the axis-aligned box around a shape."""
+    match shape:
+        case UprightBoxes():
+            c, s = abs(math.cos(shape.yaw)), abs(math.sin(shape.yaw))
+            x, y, z = shape.half
+            return np.array([c * x + s * y, s * x + c * y, z])
+        case TiltedBoxes():
+            return np.asarray(np.abs(shape.rotation) @ shape.half)
+        case UprightCylinders():
+            return np.array([shape.radius, shape.radius, shape.half_height])
+        case Spheres():
+            return np.full(3, shape.radius)
+        case Capsules():
+            return np.asarray(np.abs(shape.axis) * shape.half_length + shape.radius)
+        case TiltedCylinders():
+            across = np.sqrt(np.maximum(1.0 - np.asarray(shape.axis) ** 2, 0.0))
+            return np.asarray(np.abs(shape.axis) * shape.half_length + across * shape.radius)
+    raise TypeError(f"a {type(shape).__name__} has no end")
+
+
+def _attributes(shape: Shape) -> dict[str, str]:
+    """The MJCF attributes of a geom."""
+    common = {"pos": _numbers(shape.position), "rgba": _numbers([*np.asarray(shape.albedo), 1.0])}
+    match shape:
+        case UprightBoxes():
+            own = {"type": "box", "size": _numbers(shape.half), "euler": _numbers([0.0, 0.0, shape.yaw])}
+        case TiltedBoxes():
+            quaternion = np.empty(4)
+            mujoco.mju_mat2Quat(quaternion, np.asarray(shape.rotation, np.float64).ravel())
+            own = {"type": "box", "size": _numbers(shape.half), "quat": _numbers(quaternion)}
+        case UprightCylinders():
+            own = {"type": "cylinder", "size": _numbers([shape.radius, shape.half_height])}
+        case TiltedCylinders():
+            size = _numbers([shape.radius, shape.half_length])
+            own = {"type": "cylinder", "size": size, "zaxis": _numbers(shape.axis)}
+        case Capsules():
+            size = _numbers([shape.radius, shape.half_length])
+            own = {"type": "capsule", "size": size, "zaxis": _numbers(shape.axis)}
+        case Spheres():
+            own = {"type": "sphere", "size": _numbers([shape.radius])}
+        case Planes():
+            own = {"type": "plane", "size": "0 0 1", "zaxis": _numbers(shape.normal)}
+    return {**own, **common}
+
+
+def _numbers(values: object) -> str:
+    """Enough digits for a float32 to survive."""
+    return " ".join(f"{float(value):.9g}" for value in np.asarray(values).ravel())
+
+
+def _point(point: np.ndarray) -> str:
+    return "(" + ", ".join(f"{value:g}" for value in point) + ")"

@@ -1,0 +1,181 @@
+"""The limits of every knob: what cannot be run is named before anything is made."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Iterable
+
+from edqn_jax.config import (
+    AgentConfig,
+    CameraConfig,
+    Config,
+    ConfigError,
+    DroneConfig,
+    EncoderConfig,
+    EnvConfig,
+    EventsConfig,
+    TrainConfig,
+    WorldConfig,
+)
+
+
+def validate(config: Config) -> None:
+    """Nothing if the configuration can be run.
+
+    Raises:
+        ConfigError: one sentence naming the first knob that is out of its limits, and the limits.
+    """
+    _world(config.world)
+    _drone(config.drone)
+    _camera(config.camera)
+    _events(config.events, config.drone)
+    _env(config.env)
+    _encoder(config.encoder)
+    _agent(config.agent)
+    _train(config.train)
+    _replay(config.agent, config.train)
+
+
+def _world(world: WorldConfig) -> None:
+    _positive(world, "world", ["pool_size", "missions"])
+    _share(world, "world", ["own_start_fraction"])
+    _not_negative(world, "world", ["start_jitter_m"])
+    if not world.name:
+        raise ConfigError("world.name must name a world, not be empty")
+
+
+def _drone(drone: DroneConfig) -> None:
+    _positive(drone, "drone", [field.name for field in dataclasses.fields(drone)])
+    tilt, descent = drone.max_tilt_rad, drone.max_descent_m_s2
+    _require(tilt < math.pi / 2, "drone.max_tilt_rad", "less than pi/2", tilt)
+    _require(descent < 9.81, "drone.max_descent_m_s2", "less than gravity, 9.81", descent)
+
+
+def _camera(camera: CameraConfig) -> None:
+    _positive(camera, "camera", ["width", "height", "samples_across", "samples_down", "texture_period_m"])
+    _share(camera, "camera", ["ambient"])
+    _within(camera, "camera", ["horizontal_fov_deg"], 1.0, 170.0)
+    _within(camera, "camera", ["sun_elevation_deg"], 0.0, 90.0)
+    _finite(camera, "camera", ["sun_azimuth_deg"])
+    contrast = camera.texture_contrast
+    _require(0 <= contrast < 1, "camera.texture_contrast", "at least 0 and less than 1", contrast)
+    bright = all(0 <= value <= 1 for value in camera.sky_rgb)
+    _require(bright, "camera.sky_rgb", "three shares between 0 and 1", camera.sky_rgb)
+
+
+def _events(events: EventsConfig, drone: DroneConfig) -> None:
+    thresholds = ["threshold", "tolerance", "contrast_on", "contrast_off", "airsim_tolerance", "log_epsilon"]
+    _positive(events, "events", [*thresholds, "refractory_ns"])
+    _not_negative(
+        events, "events", ["threshold_mismatch", "leak_rate_hz", "shot_rate_hz", "hot_pixel_rate_hz"]
+    )
+    _share(events, "events", ["hot_pixel_fraction"])
+    times = events.frame_times_s
+    name, dt = "events.frame_times_s", drone.physics_dt_s
+    window = drone.physics_steps * dt
+    _require(len(times) >= 2, name, "at least two times, the last 0", times)
+    _require(times[-1] == 0, name, "times that end at 0, the decision", times)
+    rising = all(earlier < later for earlier, later in zip(times, times[1:], strict=False))
+    _require(rising, name, "times in rising order", times)
+    # The floats of 0.02 and 0.26 miss their ratio by some 1e-16; a thousandth of a step is far above that.
+    whole = all(abs(time / dt - round(time / dt)) < 1e-3 for time in times)
+    _require(whole, name, f"multiples of drone.physics_dt_s ({dt:g} s)", times)
+    _require(times[0] >= -window - 1e-3 * dt, name, f"within the decision's {window:g} s", times)
+
+
+def _env(env: EnvConfig) -> None:
+    _positive(env, "env", ["speed_m_s", "goal_radius_m", "max_decisions"])
+    _not_negative(env, "env", ["heading_hold_m"])
+    _finite(env, "env", ["goal_reward", "collision_reward", "left_volume_reward", "step_reward"])
+
+
+def _encoder(encoder: EncoderConfig) -> None:
+    _positive(encoder, "encoder", ["code_size", "features", "hidden", "learning_rate", "hold_decisions"])
+    _not_negative(encoder, "encoder", ["time_frequencies", "target_blur", "kl_weight", "warmup_decisions"])
+    _positive(encoder, "encoder", ["warmup_updates_per_step"])
+    _widths(encoder.decoder_hidden, "encoder.decoder_hidden")
+
+
+def _agent(agent: AgentConfig) -> None:
+    _positive(agent, "agent", ["history", "n_step", "batch_size", "updates_per_step", "replay_size"])
+    _positive(agent, "agent", ["learning_rate", "reward_scale"])
+    _not_negative(agent, "agent", ["final_learning_rate", "huber_delta"])
+    _not_negative(agent, "agent", ["learning_starts", "random_decisions", "exploration_episodes"])
+    _share(agent, "agent", ["discount", "exploration_start", "exploration_end", "exploration_fraction"])
+    for key in ("target_rate", "average_rate"):
+        rate = getattr(agent, key)
+        _require(0 < rate <= 1, f"agent.{key}", "more than 0 and at most 1", rate)
+    norm = agent.max_gradient_norm
+    _require(norm > 0, "agent.max_gradient_norm", "more than 0 (inf clips nothing)", norm)
+    falls = agent.exploration_end <= agent.exploration_start
+    limit = f"at most agent.exploration_start ({agent.exploration_start:g})"
+    _require(falls, "agent.exploration_end", limit, agent.exploration_end)
+    _widths(agent.hidden, "agent.hidden")
+
+
+def _train(train: TrainConfig) -> None:
+    _positive(train, "train", ["num_envs", "total_steps", "chunk_steps", "shards"])
+    _not_negative(train, "train", ["max_episodes", "devices", "validation_every", "seed"])
+    _positive(train, "train", ["validation_missions"])
+    _require(train.seed < 2**32, "train.seed", "less than 2**32", train.seed)
+    shards, envs = train.shards, train.num_envs
+    multiple = f"a multiple of train.shards ({shards}), such as {-(-envs // shards) * shards}"
+    _require(envs % shards == 0, "train.num_envs", multiple, envs)
+    if train.devices:
+        divides = f"0 or a divisor of train.shards ({shards})"
+        _require(shards % train.devices == 0, "train.devices", divides, train.devices)
+
+
+def _replay(agent: AgentConfig, train: TrainConfig) -> None:
+    size, batch = agent.replay_size, agent.batch_size
+    _require(size >= batch, "agent.replay_size", f"at least agent.batch_size ({batch})", size)
+    starts = agent.learning_starts
+    _require(starts <= size, "agent.learning_starts", f"at most agent.replay_size ({size})", starts)
+    shards = train.shards
+    multiple = f"a multiple of train.shards ({shards}), such as {-(-batch // shards) * shards}"
+    _require(batch % shards == 0, "agent.batch_size", multiple, batch)
+    # A sample reads its history, its n steps and the observation after them from one environment's rows.
+    rows = agent.history + agent.n_step + 1
+    needed = rows * train.num_envs
+    limit = f"at least {needed}: {rows} observations for each of the {train.num_envs} environments"
+    _require(size >= needed, "agent.replay_size", limit, size)
+
+
+def _require(holds: bool, name: str, limits: str, value: object) -> None:
+    if not holds:
+        shown = ", ".join(f"{item:g}" for item in value) if isinstance(value, tuple) else value
+        raise ConfigError(f"{name} must be {limits}, not {shown}")
+
+
+def _positive(section: object, group: str, keys: Iterable[str]) -> None:
+    for key in keys:
+        value = getattr(section, key)
+        limits = "at least 1" if isinstance(value, int) else "more than 0"
+        _require(0 < value < math.inf, f"{group}.{key}", limits, value)
+
+
+def _not_negative(section: object, group: str, keys: Iterable[str]) -> None:
+    for key in keys:
+        value = getattr(section, key)
+        _require(0 <= value < math.inf, f"{group}.{key}", "0 or more", value)
+
+
+def _within(section: object, group: str, keys: Iterable[str], low: float, high: float) -> None:
+    for key in keys:
+        value = getattr(section, key)
+        _require(low <= value <= high, f"{group}.{key}", f"between {low:g} and {high:g}", value)
+
+
+def _share(section: object, group: str, keys: Iterable[str]) -> None:
+    _within(section, group, keys, 0.0, 1.0)
+
+
+def _finite(section: object, group: str, keys: Iterable[str]) -> None:
+    for key in keys:
+        value = getattr(section, key)
+        _require(math.isfinite(value), f"{group}.{key}", "a finite number", value)
+
+
+def _widths(widths: tuple[int, ...], name: str) -> None:
+    _require(len(widths) > 0 and min(widths, default=0) > 0, name, "one or more widths of at least 1", widths)

@@ -1,0 +1,219 @@
+"""The pictures of a run: that they show what they were given."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from matplotlib.collections import LineCollection, PathCollection
+from matplotlib.colors import to_rgba
+from matplotlib.figure import Figure
+
+from edqn_jax.report.curves import draw_learning, draw_returns, running_mean
+from edqn_jax.report.flights import draw_path, draw_world
+from edqn_jax.report.images import draw_events, draw_reconstruction
+from edqn_jax.report.solids import MAP, View, hidden, solids_of
+from edqn_jax.report.style import OUTCOME_COLOURS
+from edqn_jax.sim.scene import (
+    PARKED,
+    Capsules,
+    Planes,
+    Scene,
+    Spheres,
+    TiltedBoxes,
+    TiltedCylinders,
+    UprightBoxes,
+    UprightCylinders,
+)
+
+
+def a_scene() -> Scene:
+    """One shape of every kind, and a parked one of each."""
+
+    def points(*point: float) -> jax.Array:
+        return jnp.array([point, [PARKED] * 3])
+
+    grey, ones, long = jnp.full((2, 3), 0.5), jnp.ones(2), jnp.full(2, 4.0)
+    leaning = jnp.array([[0.6, 0.0, 0.8]] * 2)
+    return Scene(
+        boxes=UprightBoxes(points(30, 30, 5), jnp.array([[4.0, 6, 5], [0, 0, 0]]), jnp.array([0.3, 0]), grey),
+        cylinders=UprightCylinders(points(60, 20, 6), 3 * ones, 6 * ones, grey),
+        spheres=Spheres(points(50, 55, 9), 4 * ones, jnp.array([[0.9, 0.8, 0.1]] * 2)),
+        tilted_boxes=TiltedBoxes(points(80, 40, 9), jnp.ones((2, 3)), jnp.stack([jnp.eye(3)] * 2), grey),
+        capsules=Capsules(points(20, 70, 8), leaning, long, ones, grey),
+        tilted_cylinders=TiltedCylinders(points(70, 75, 8), leaning, long, ones, grey),
+        planes=Planes(jnp.zeros((1, 3)), jnp.array([[0, 0, 1.0]]), grey[:1]),
+        volume=jnp.array([[0.0, 0, 0], [110, 110, 25]]),
+        start=jnp.array([1.0, 1, 3]),
+        goal=jnp.array([90.0, 90, 10]),
+    )
+
+
+def a_flight(steps: int = 600) -> dict[str, np.ndarray]:
+    along = np.linspace(0, 1, steps)[:, None]
+    points = np.array([1, 1, 3]) * (1 - along) + np.array([89, 89, 10]) * along
+    velocity = np.broadcast_to([4.0, 4.0, 0.3], points.shape)
+    return dict(zip(("x", "y", "z", "vx", "vy", "vz"), [*points.T, *velocity.T], strict=True))
+
+
+def is_png(file: Path) -> bool:
+    return file.read_bytes().startswith(b"\x89PNG") and file.stat().st_size > 5000
+
+
+def texts(figure: Figure) -> str:
+    legends = [text.get_text() for legend in figure.legends for text in legend.get_texts()]
+    return " ".join([text.get_text() for axes in figure.axes for text in axes.texts] + legends)
+
+
+def test_every_shape_but_the_parked_becomes_a_solid():
+    assert len(solids_of(a_scene())) == 6
+
+
+def test_the_faces_of_a_solid_enclose_its_volume():
+    # The divergence theorem: a third of the sum of area x distance; polygons lie inside the round shapes.
+    volumes = [
+        4 / 3 * 8 * 10 * 12 * 3 / 4,
+        8,
+        np.pi * 9 * 12,
+        np.pi * 8,
+        np.pi * 8 + np.pi * 4 / 3,
+        4 / 3 * np.pi * 64,
+    ]
+    for solid, volume in zip(solids_of(a_scene()), volumes, strict=True):
+        total = 0.0
+        for face, normal in zip(solid.faces, solid.outward, strict=True):
+            area = np.linalg.norm(np.cross(face, np.roll(face, -1, axis=0)).sum(0)) / 2
+            total += area * (normal @ face[0]) / 3
+        assert total == pytest.approx(volume, rel=0.02)
+
+
+def test_a_solid_hides_what_is_behind_it_and_nothing_else():
+    box = solids_of(a_scene())[:1]
+    below_roof, above_roof, beside = [30, 30, 2], [30, 30, 12], [50, 30, 2]
+    assert hidden(np.array([below_roof, above_roof, beside], float), box, MAP).tolist() == [
+        True,
+        False,
+        False,
+    ]
+    level = View(azimuth=0.0, elevation=0.0)
+    behind, in_front = [10, 30, 5], [45, 30, 5]
+    assert hidden(np.array([behind, in_front, [10, 30, 15]], float), box, level).tolist() == [
+        True,
+        False,
+        False,
+    ]
+
+
+def test_a_map_has_x_to_the_right_and_y_up():
+    np.testing.assert_allclose(MAP.project(np.array([[3.0, 7.0, 9.0]])), [[3.0, 7.0]], atol=1e-9)
+
+
+def test_the_world_is_drawn_in_proportion_with_start_and_goal(tmp_path):
+    figure = draw_world(a_scene(), tmp_path / "world.png")
+    assert is_png(tmp_path / "world.png")
+    assert figure.axes[0].get_aspect() == 1.0
+    assert "start (1, 1, 3)" in texts(figure) and "goal (90, 90, 10)" in texts(figure)
+
+
+def test_the_path_is_drawn_whole_in_both_views(tmp_path):
+    figure = draw_path(a_scene(), a_flight(), np.array([[1, 1, 3], [90, 90, 10.0]]), tmp_path / "path.png")
+    assert is_png(tmp_path / "path.png")
+    for axes in figure.axes[:2]:
+        coloured = [
+            c for c in axes.collections if isinstance(c, LineCollection) and c.get_array() is not None
+        ]
+        hidden_part, seen_part = (len(line.get_segments()) for line in coloured)
+        assert hidden_part + seen_part == 599
+        assert hidden_part > 0
+    assert "shortest path" in texts(figure)
+
+
+def test_a_flight_that_fails_says_how(tmp_path):
+    figure = draw_path(a_scene(), a_flight(50), None, tmp_path / "path.png", outcome="collision")
+    assert "collision" in texts(figure) and "shortest path" not in texts(figure)
+
+
+def test_a_flight_of_one_step_can_be_drawn(tmp_path):
+    draw_path(a_scene(), a_flight(1), None, tmp_path / "path.png", outcome="left_volume")
+    assert is_png(tmp_path / "path.png")
+
+
+def test_every_episode_is_a_point_in_its_outcomes_colour(tmp_path):
+    outcomes = np.array(["goal"] * 70 + ["collision"] * 20 + ["time_out"] * 9 + ["left_volume"])
+    figure = draw_returns(
+        {"return": np.linspace(-100, 100, 100), "outcome": outcomes}, tmp_path / "returns.png"
+    )
+    assert is_png(tmp_path / "returns.png")
+    points = {c.get_gid(): c for c in figure.axes[0].collections if isinstance(c, PathCollection)}
+    counts = {name: len(np.asarray(c.get_offsets())) for name, c in points.items()}
+    assert counts == {"goal": 70, "collision": 20, "time_out": 9, "left_volume": 1}
+    for name, collection in points.items():
+        colour = np.asarray(collection.get_facecolor())[0, :3]
+        np.testing.assert_allclose(colour, to_rgba(OUTCOME_COLOURS[str(name)])[:3])
+
+
+def test_a_run_without_episodes_still_has_its_picture(tmp_path):
+    draw_returns({"return": np.array([]), "outcome": np.array([], str)}, tmp_path / "returns.png")
+    assert is_png(tmp_path / "returns.png")
+
+
+def test_the_running_mean_is_the_mean_of_each_window():
+    values = np.array([1.0, 2.0, 6.0, 3.0])
+    np.testing.assert_allclose(running_mean(values, 2), [1.5, 4.0, 4.5])
+
+
+def test_learning_shows_each_metric_where_a_line_has_it(tmp_path):
+    metrics = [{"decisions": 100 * i, "reconstruction_loss": 1.0 / i, "kl": 2.0} for i in range(1, 5)]
+    metrics += [
+        {"decisions": 100 * i, "q_loss": 0.1, "epsilon": 0.5, "success_rate": 0.2} for i in range(5, 9)
+    ]
+    metrics += [{"decisions": 900, "validation_success": 0.75}, {"decisions": 950, "q_loss": None}]
+    figure = draw_learning(metrics, tmp_path / "learning.png")
+    assert is_png(tmp_path / "learning.png")
+    lines = {line.get_gid(): line for axes in figure.axes for line in axes.get_lines()}
+    points = {str(name): len(np.asarray(line.get_xdata())) for name, line in lines.items()}
+    assert points == {
+        "success_rate": 4,
+        "validation_success": 1,
+        "epsilon": 4,
+        "q_loss": 4,
+        "reconstruction_loss": 4,
+        "kl": 4,
+    }
+
+
+def test_learning_can_be_drawn_before_anything_was_learned(tmp_path):
+    draw_learning([], tmp_path / "learning.png")
+    assert is_png(tmp_path / "learning.png")
+
+
+def test_events_stand_below_the_image_that_made_them(tmp_path):
+    counts = np.zeros((3, 24, 32), np.int8)
+    counts[1, 4, 5], counts[2, 6, 7] = 3, -2
+    rgb = np.random.default_rng(0).random((3, 96, 128, 3))
+    figure = draw_events(rgb, rgb[:, ::4, ::4], counts, tmp_path / "events.png", times_s=[0.26, 1.3, 2.6])
+    assert is_png(tmp_path / "events.png")
+    drawn = [np.asarray(axes.images[0].get_array()) for axes in figure.axes if axes.images]
+    np.testing.assert_allclose(drawn[1], rgb[1])
+    np.testing.assert_array_equal(np.stack(drawn[6:9]), counts)
+    assert [axes.get_xlabel() for axes in figure.axes[6:9]] == ["0 events", "3 events", "2 events"]
+
+
+def test_reconstructions_share_the_colours_of_the_events(tmp_path):
+    counts = np.zeros((2, 24, 32))
+    counts[:, 3:9, 10] = 4
+    figure = draw_reconstruction(counts, counts * 0.5, tmp_path / "reconstruction.png")
+    assert is_png(tmp_path / "reconstruction.png")
+    limits = {axes.images[0].get_clim() for axes in figure.axes[:4]}
+    assert limits == {(-4.0, 4.0)}
+    expected = np.sqrt(6 * 2.0**2 / (24 * 32))
+    assert figure.axes[2].get_xlabel() == f"RMS error {expected:.2f}"
+
+
+def test_silent_windows_can_be_drawn(tmp_path):
+    silent = np.zeros((2, 24, 32), np.int32)
+    draw_reconstruction(silent, silent * 1.0, tmp_path / "reconstruction.png")
+    assert is_png(tmp_path / "reconstruction.png")

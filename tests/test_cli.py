@@ -1,0 +1,221 @@
+"""The command line: precedence of flags, exit codes, and sentences for people."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import types
+from pathlib import Path
+
+import pytest
+
+from edqn_jax import cli, devices
+from edqn_jax.cli import main, parse_train
+from edqn_jax.config import Config, ConfigError, preset
+from edqn_jax.endings import DivergedError, StoppedError
+from edqn_jax.resolve import RANDOM_WORLD_STEPS
+from edqn_jax.sim.mjcf import SceneError
+
+ROOT = Path(__file__).parents[1]
+
+
+@pytest.fixture(autouse=True)
+def elsewhere(tmp_path, monkeypatch):
+    """Nothing that a test makes lands in the repository."""
+    monkeypatch.chdir(tmp_path)
+
+
+@pytest.fixture
+def trainer(monkeypatch):
+    """Stands in for training: a function to set, and the calls that reached it."""
+    stand_in = types.ModuleType("edqn_jax.run")
+    calls: list[tuple] = []
+    behaviour = types.SimpleNamespace(calls=calls, act=lambda *call: None)
+
+    def train_run(*call):
+        calls.append(call)
+        return behaviour.act(*call)
+
+    stand_in.__dict__["train_run"] = train_run
+    monkeypatch.setitem(sys.modules, "edqn_jax.run", stand_in)
+    monkeypatch.setattr(devices, "use_cpu_devices", lambda count=None: None)
+    return behaviour
+
+
+def test_no_argument_is_the_default_preset():
+    assert parse_train([])[1] == Config()
+
+
+def test_flags_win_over_the_file_and_the_file_over_the_preset(tmp_path):
+    file = tmp_path / "knobs.yaml"
+    file.write_text("agent: {batch_size: 256, n_step: 3}\n")
+    _, config = parse_train(["--preset", "paper", "--config", str(file), "--agent.n-step", "7"])
+    assert (config.agent.batch_size, config.agent.n_step) == (256, 7)
+    assert config.agent.hidden == preset("paper").agent.hidden
+
+
+@pytest.mark.parametrize(
+    "argv",
+    [
+        ["--num-envs", "64", "--total-steps", "4096", "--seed", "5", "--world", "dense"],
+        ["--num_envs=64", "--total_steps=4096", "--seed=5", "--world=dense"],
+        [
+            "--train.num-envs",
+            "64",
+            "--train.total-steps",
+            "4096",
+            "--train.seed",
+            "5",
+            "--world.name",
+            "dense",
+        ],
+    ],
+)
+def test_short_and_long_names_say_the_same(argv):
+    _, config = parse_train(argv)
+    train = config.train
+    assert (train.num_envs, train.total_steps, train.seed, config.world.name) == (64, 4096, 5, "dense")
+
+
+@pytest.mark.parametrize("flag", ["--world", "--world.name"])
+def test_a_random_world_brings_its_budget_and_a_flag_overrides_it(flag):
+    assert parse_train([flag, "medium"])[1].train.total_steps == RANDOM_WORLD_STEPS
+    assert parse_train([flag, "medium", "--total-steps", "2048"])[1].train.total_steps == 2048
+
+
+def test_every_kind_of_knob_can_be_a_flag():
+    argv = [
+        "--agent.hidden",
+        "32",
+        "16",
+        "--agent.no-double",
+        "--events.frame-times-s",
+        "-0.04",
+        "-0.02",
+        "0",
+    ]
+    _, config = parse_train([*argv, "--events.law", "esim", "--agent.max-gradient-norm", "inf"])
+    assert (config.agent.hidden, config.agent.double, config.events.law) == ((32, 16), False, "esim")
+    assert config.events.frame_times_s == (-0.04, -0.02, 0.0)
+    assert config.agent.max_gradient_norm == float("inf")
+
+
+@pytest.mark.parametrize(
+    ("argv", "says"),
+    [
+        (["train", "--num-envs", "0"], "train.num_envs must be at least 1, not 0"),
+        (["train", "--agent.replay-size", "64"], "agent.replay_size must be at least agent.batch_size"),
+        (["train", "--agent.bach-size", "64"], "--agent.batch-size"),
+        (["train", "--train.num-envs", "many"], "--train.num-envs"),
+        (["train", "--preset", "best"], "invalid choice 'best'"),
+        (["train", "--events.law", "esmi"], "invalid choice 'esmi'"),
+        (["train", "--config", "nowhere.yaml"], "nowhere.yaml"),
+        (["train", "--resume", "must"], "--resume must needs --run-dir"),
+        (["evaluate"], "RUN"),
+        (["evaluate", "nowhere"], "there is no run in 'nowhere'"),
+        (["fly"], "train, evaluate"),
+    ],
+)
+def test_bad_input_ends_with_2_a_sentence_and_nothing_made(argv, says, capsys, tmp_path, trainer):
+    assert main(argv) == 2
+    assert says in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
+    assert trainer.calls == []
+
+
+def test_our_own_complaints_are_one_line(capsys):
+    main(["train", "--num-envs", "12"])
+    assert capsys.readouterr().err == (
+        "edqn: train.num_envs must be a multiple of train.shards (8), such as 16, not 12\n"
+    )
+
+
+def test_missions_must_be_at_least_one(capsys, tmp_path):
+    (tmp_path / "config.yaml").touch()
+    assert main(["evaluate", str(tmp_path), "--missions", "0"]) == 2
+    assert "--missions must be at least 1" in capsys.readouterr().err
+
+
+def test_training_gets_the_configuration_and_a_folder_that_is_not_made_yet(trainer, tmp_path):
+    assert main(["train", "--seed", "3", "--run-dir", "here"]) == 0
+    config, run = trainer.calls[0][:2]
+    assert config.train.seed == 3
+    assert run.path == Path("here") and not run.path.exists()
+
+
+@pytest.mark.parametrize(
+    ("ending", "code"),
+    [
+        (ConfigError("a replay that is too small"), 2),
+        (SceneError("a start inside a wall"), 2),
+        (DivergedError("the Q loss is not finite"), 3),
+        (StoppedError("stopped after saving"), 143),
+        (KeyboardInterrupt(), 130),
+    ],
+)
+def test_each_ending_of_training_has_its_exit_code(ending, code, trainer, capsys):
+    def act(*call):
+        raise ending
+
+    trainer.act = act
+    assert main(["train", "--run-dir", "here"]) == code
+    assert capsys.readouterr().err.count("\n") == 1
+
+
+def test_sigterm_reaches_training_as_a_wish_to_stop(trainer):
+    def act(config, run, progress, stop_requested):
+        assert not stop_requested()
+        os.kill(os.getpid(), signal.SIGTERM)
+        if stop_requested():
+            raise StoppedError("stopped after saving")
+
+    trainer.act = act
+    before = signal.getsignal(signal.SIGTERM)
+    assert main(["train", "--run-dir", "here"]) == 143
+    assert signal.getsignal(signal.SIGTERM) is before
+
+
+def test_evaluate_hands_on_what_was_asked_for(monkeypatch, tmp_path):
+    (tmp_path / "config.yaml").touch()
+    stand_in = types.ModuleType("edqn_jax.evaluate")
+    asked: list[cli.EvaluateArgs] = []
+    stand_in.__dict__["evaluate_command"] = asked.append
+    monkeypatch.setitem(sys.modules, "edqn_jax.evaluate", stand_in)
+    monkeypatch.setattr(devices, "use_cpu_devices", lambda count=None: None)
+    argv = [str(tmp_path), "--world", "dense", "--start", "1", "2", "3", "--goal", "-4", "5.5", "6"]
+    assert main(["evaluate", *argv, "--missions", "9", "--seed", "2", "--json", "a.json"]) == 0
+    assert asked == [
+        cli.EvaluateArgs(
+            tmp_path, "dense", (1.0, 2.0, 3.0), (-4.0, 5.5, 6.0), missions=9, seed=2, json=Path("a.json")
+        )
+    ]
+
+
+def test_help_lists_every_knob_and_does_not_start_jax():
+    script = (
+        "import sys; from edqn_jax.cli import main; code = main(['train', '--world', 'medium', '--help']);"
+        "sys.exit(code or 'jax' in sys.modules)"
+    )
+    shown = subprocess.run(
+        [sys.executable, "-c", script],
+        capture_output=True,
+        text=True,
+        check=True,
+        env={**os.environ, "PYTHONPATH": str(ROOT), "COLUMNS": "100"},
+    ).stdout
+    assert "--agent.batch-size INT" in shown and "Replayed samples per update." in shown
+    assert "--events.frame-times-s" in shown and "(default: 3000000)" in shown
+    assert "--num-envs for --train.num-envs" in shown
+
+
+def test_train_py_is_the_train_command():
+    shown = subprocess.run(
+        [sys.executable, str(ROOT / "train.py"), "--num-envs", "0"],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert shown.returncode == 2
+    assert shown.stderr == "edqn: train.num_envs must be at least 1, not 0\n"

@@ -1,0 +1,184 @@
+"""Loading, merging and checking the configuration."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from edqn_jax.config import DENSITIES, PRESETS, Config, ConfigError, preset
+from edqn_jax.resolve import RANDOM_WORLD_STEPS, apply, load_layer, resolve, to_yaml
+from edqn_jax.validate import validate
+
+
+def write(tmp_path: Path, text: str) -> Path:
+    file = tmp_path / "knobs.yaml"
+    file.write_text(text)
+    return file
+
+
+def changed(group: str, **knobs: Any) -> Config:
+    config = Config()
+    return dataclasses.replace(config, **{group: dataclasses.replace(getattr(config, group), **knobs)})
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_every_preset_is_valid(name):
+    validate(preset(name))
+
+
+@pytest.mark.parametrize("name", PRESETS)
+def test_a_written_configuration_reads_back_the_same(name, tmp_path):
+    config = preset(name)
+    assert apply(Config(), load_layer(write(tmp_path, to_yaml(config))), "file") == config
+
+
+def test_the_file_wins_over_the_preset_and_leaves_the_rest(tmp_path):
+    config = resolve("paper", write(tmp_path, "agent: {batch_size: 256}\n"))
+    assert config == dataclasses.replace(
+        preset("paper"), agent=dataclasses.replace(preset("paper").agent, batch_size=256)
+    )
+
+
+def test_an_empty_file_changes_nothing(tmp_path):
+    assert resolve(file=write(tmp_path, "# nothing\n")) == Config()
+
+
+@pytest.mark.parametrize("world", DENSITIES)
+def test_a_random_world_brings_its_own_budget(world):
+    assert resolve(world=world).train.total_steps == RANDOM_WORLD_STEPS
+
+
+def test_a_random_world_in_the_file_brings_its_budget_too(tmp_path):
+    assert resolve(file=write(tmp_path, "world: {name: dense}\n")).train.total_steps == RANDOM_WORLD_STEPS
+
+
+def test_a_budget_in_the_file_wins_over_the_random_world(tmp_path):
+    file = write(tmp_path, "train: {total_steps: 1024}\n")
+    config = resolve(file=file, world="medium")
+    assert (config.world.name, config.train.total_steps) == ("medium", 1024)
+
+
+def test_the_papers_preset_keeps_its_budget_on_random_worlds():
+    assert resolve("paper", world="medium").train.total_steps == 500_000
+
+
+def test_numbers_in_scientific_notation_and_infinity_are_numbers(tmp_path):
+    agent = resolve(file=write(tmp_path, "agent: {learning_rate: 1e-3, max_gradient_norm: .inf}\n")).agent
+    assert (agent.learning_rate, agent.max_gradient_norm) == (1e-3, float("inf"))
+
+
+def test_a_whole_number_may_stand_for_a_float():
+    discount = apply(Config(), {"agent": {"discount": 1}}, "file").agent.discount
+    assert isinstance(discount, float) and discount == 1.0
+
+
+@pytest.mark.parametrize(
+    ("text", "says"),
+    [
+        ("agent: {bach_size: 3}", "there is no key 'agent.bach_size'; did you mean 'batch_size'?"),
+        ("agnet: {batch_size: 3}", "there is no group 'agnet'; did you mean 'agent'?"),
+        ("batch_size: 3", "there is no group 'batch_size'; it belongs under 'agent:'"),
+        ("zzz: {a: 1}", "known are world, drone, camera"),
+        ("agent: 3", "'agent' must hold keys such as"),
+        ("agent: {batch_size: big}", "'agent.batch_size' must be a whole number, not the text 'big'"),
+        ("agent: {batch_size: 2.5}", "'agent.batch_size' must be a whole number, not 2.5"),
+        ("agent: {batch_size: true}", "'agent.batch_size' must be a whole number, not true"),
+        ("agent: {discount: high}", "'agent.discount' must be a number, not the text 'high'"),
+        ("agent: {double: 1}", "'agent.double' must be true or false, not 1"),
+        ("agent: {hidden: 16}", "'agent.hidden' must be a list of whole numbers, not 16"),
+        (
+            "agent: {hidden: [16, x]}",
+            "each of knobs.yaml: 'agent.hidden' must be a whole number, not the text 'x'",
+        ),
+        ("camera: {sky_rgb: [1, 1]}", "'camera.sky_rgb' must be a list of 3 numbers, not a list of 2"),
+        ("events: {law: esmi}", "'events.law' must be one of paper, airsim, esim, not the text 'esmi'"),
+        ("world: {name: }", "'world.name' must be text, not nothing"),
+        ("- 1", "must hold groups of keys such as 'agent:'"),
+        ("agent: {n_step: 1, n_step: 2}", "is not valid YAML at line 1: the key 'n_step' stands twice"),
+        ("agent: {", "is not valid YAML at line"),
+    ],
+)
+def test_a_mistake_in_the_file_is_named_with_what_would_be_right(text, says, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Path("knobs.yaml").write_text(text)
+    with pytest.raises(ConfigError) as error:
+        resolve(file=Path("knobs.yaml"))
+    assert says in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+def test_a_missing_file_is_named(tmp_path):
+    with pytest.raises(ConfigError, match="cannot read the configuration file .*nowhere.yaml"):
+        resolve(file=tmp_path / "nowhere.yaml")
+
+
+def test_a_file_that_is_not_text_is_named(tmp_path):
+    file = tmp_path / "picture.yaml"
+    file.write_bytes(b"\xff\xfe\x00\x80")
+    with pytest.raises(ConfigError, match="picture.yaml"):
+        resolve(file=file)
+
+
+def numeric_knobs() -> list[tuple[str, str, object]]:
+    nonsense = {int: -(10**9), float: float("nan")}
+    return [
+        (group.name, knob.name, nonsense[type(value)])
+        for group in dataclasses.fields(Config)
+        for knob in dataclasses.fields(getattr(Config(), group.name))
+        if type(value := getattr(getattr(Config(), group.name), knob.name)) in nonsense
+    ]
+
+
+@pytest.mark.parametrize(("group", "knob", "nonsense"), numeric_knobs())
+def test_every_numeric_knob_has_limits(group, knob, nonsense):
+    with pytest.raises(ConfigError, match=f"{group}.{knob} must be"):
+        validate(changed(group, **{knob: nonsense}))
+
+
+@pytest.mark.parametrize(
+    ("group", "knobs", "says"),
+    [
+        ("train", {"num_envs": 0}, "train.num_envs must be at least 1, not 0"),
+        ("train", {"num_envs": 12}, r"must be a multiple of train.shards \(8\), such as 16, not 12"),
+        ("train", {"devices": 3}, "train.devices must be 0 or a divisor of train.shards"),
+        (
+            "agent",
+            {"replay_size": 512},
+            r"agent.replay_size must be at least agent.batch_size \(1024\), not 512",
+        ),
+        (
+            "agent",
+            {"replay_size": 2048, "learning_starts": 0},
+            "observations for each of the 256 environments",
+        ),
+        ("agent", {"learning_starts": 10**9}, "agent.learning_starts must be at most agent.replay_size"),
+        ("agent", {"batch_size": 100}, "agent.batch_size must be a multiple of train.shards"),
+        ("agent", {"hidden": ()}, "agent.hidden must be one or more widths"),
+        (
+            "agent",
+            {"exploration_end": 0.5, "exploration_start": 0.1},
+            "must be at most agent.exploration_start",
+        ),
+        ("events", {"frame_times_s": (0.0,)}, "at least two times"),
+        ("events", {"frame_times_s": (-0.04, -0.02)}, "end at 0"),
+        ("events", {"frame_times_s": (-0.02, -0.04, 0.0)}, "rising order"),
+        (
+            "events",
+            {"frame_times_s": (-0.03, 0.0)},
+            r"multiples of drone.physics_dt_s \(0.02 s\), not -0.03, 0",
+        ),
+        ("events", {"frame_times_s": (-0.28, 0.0)}, "within the decision's 0.26 s"),
+        ("camera", {"sky_rgb": (0.5, 0.5, 1.5)}, "camera.sky_rgb must be three shares"),
+    ],
+)
+def test_what_cannot_be_run_is_named_with_its_limits(group, knobs, says):
+    with pytest.raises(ConfigError, match=says):
+        validate(changed(group, **knobs))
+
+
+def test_frames_may_fill_the_whole_decision():
+    steps = tuple(round(-0.02 * step, 2) for step in range(13, -1, -1))
+    validate(changed("events", frame_times_s=steps))

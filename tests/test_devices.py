@@ -1,0 +1,40 @@
+"""How many devices a run uses."""
+
+from __future__ import annotations
+
+import jax
+import pytest
+
+from edqn_jax.config import ConfigError
+from edqn_jax.devices import choose_devices, cores, most_that_divide, use_cpu_devices
+
+
+@pytest.mark.parametrize(
+    ("shards", "available", "used"), [(8, 2, 2), (8, 3, 2), (8, 7, 4), (8, 64, 8), (6, 4, 3)]
+)
+def test_as_many_devices_as_divide_the_shards(shards, available, used):
+    assert most_that_divide(shards, available) == used
+
+
+def test_no_request_takes_what_divides_and_a_request_takes_just_that():
+    assert choose_devices(0, 8) == jax.devices()[:2]
+    assert choose_devices(1, 8) == jax.devices()[:1]
+    assert choose_devices(0, 7) == jax.devices()[:1]
+
+
+def test_more_devices_than_there_are_is_named():
+    with pytest.raises(
+        ConfigError, match="train.devices must be at most 2, the CPU devices that there are, not 4"
+    ):
+        choose_devices(4, 8)
+
+
+def test_a_number_that_does_not_divide_the_shards_is_named():
+    with pytest.raises(ConfigError, match="must be a divisor of train.shards"):
+        choose_devices(2, 7)
+
+
+def test_devices_cannot_be_made_once_jax_runs():
+    jax.devices()
+    with pytest.raises(RuntimeError):
+        use_cpu_devices(2 + cores())

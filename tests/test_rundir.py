@@ -1,0 +1,131 @@
+"""The folder that a run leaves behind."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from edqn_jax.config import Config, ConfigError
+from edqn_jax.resolve import resolve
+from edqn_jax.rundir import TRAJECTORY_COLUMNS, RunDirectory, plan_run_directory
+
+
+@pytest.fixture
+def run(tmp_path) -> RunDirectory:
+    run = plan_run_directory(tmp_path / "run", Config())
+    run.create(Config())
+    return run
+
+
+def test_planning_makes_nothing(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    plan_run_directory(Path("deep/down/run"), Config())
+    plan_run_directory(None, Config())
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_fresh_folder_is_dated_names_world_and_seed_and_is_never_an_old_one(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    config = resolve(world="medium")
+    first = plan_run_directory(None, config)
+    first.create(config)
+    second = plan_run_directory(None, config)
+    assert first.path.parent == Path("runs") and first.path.name.endswith("-medium-s0")
+    assert second.path.name == f"{first.path.name}-2"
+
+
+def test_the_resolved_configuration_reads_back(run):
+    assert resolve(file=run.config_file) == Config()
+
+
+def test_a_foreign_folder_is_refused_and_left_alone(tmp_path):
+    (tmp_path / "thesis.tex").write_text("years of work")
+    with pytest.raises(ConfigError, match="no run of edqn"):
+        plan_run_directory(tmp_path, Config())
+    assert [file.name for file in tmp_path.iterdir()] == ["thesis.tex"]
+
+
+def test_a_finished_run_is_refused_whatever_resume_says(run):
+    run.write_summary({"success": True})
+    for resume in ("auto", "never", "must"):
+        with pytest.raises(ConfigError, match="finished run"):
+            plan_run_directory(run.path, Config(), resume)
+
+
+def test_an_unfinished_run_is_started_over_only_when_asked(run):
+    run.append_metrics({"decisions": 1})
+    run.append_episodes([(10, 1.0, 5, "goal")])
+    with pytest.raises(ConfigError, match="unfinished run"):
+        plan_run_directory(run.path, Config())
+    again = plan_run_directory(run.path, Config(), "never")
+    assert again.metrics_file.exists()
+    again.create(Config())
+    assert not again.metrics_file.exists()
+    assert len(again.read_episodes()["step"]) == 0
+
+
+def test_resume_must_needs_a_run(tmp_path):
+    with pytest.raises(ConfigError, match="there is no run to continue"):
+        plan_run_directory(tmp_path / "new", Config(), "must")
+
+
+def test_an_empty_folder_is_welcome(tmp_path):
+    assert plan_run_directory(tmp_path, Config()).path == tmp_path
+
+
+@pytest.mark.parametrize("below", ["file", "file/run", "file/deep/run"])
+def test_a_file_in_the_way_is_named(below, tmp_path):
+    (tmp_path / "file").touch()
+    with pytest.raises(ConfigError, match="file"):
+        plan_run_directory(tmp_path / below, Config())
+
+
+def test_a_folder_without_the_right_to_write_is_named(tmp_path, monkeypatch):
+    # The tests may run as root, who may write anywhere; so the answer of the system is made up.
+    monkeypatch.setattr("edqn_jax.rundir.os.access", lambda *_: False)
+    with pytest.raises(ConfigError, match="cannot be written"):
+        plan_run_directory(tmp_path / "run", Config())
+
+
+def test_what_fails_only_when_made_is_a_sentence_too(tmp_path):
+    (tmp_path / "file").touch()
+    with pytest.raises(ConfigError, match="cannot be written"):
+        RunDirectory(tmp_path / "file" / "run").create(Config())
+
+
+def test_numbers_of_numpy_and_jax_become_json_and_what_is_not_finite_null(run):
+    run.append_metrics({"decisions": np.int64(3), "q_loss": jnp.float32(0.5), "kl": float("nan")})
+    run.append_metrics({"shares": np.array([1.0, np.inf]), "phase": "learning"})
+    lines = run.metrics_file.read_text().splitlines()
+    assert [json.loads(line) for line in lines] == run.read_metrics()
+    assert run.read_metrics()[0] == {"decisions": 3, "q_loss": 0.5, "kl": None}
+    assert run.read_metrics()[1] == {"shares": [1.0, None], "phase": "learning"}
+
+
+def test_episodes_are_appended_and_read_back_by_column(run):
+    run.append_episodes([(np.int64(256), np.float32(99.5), 12, "goal")])
+    run.append_episodes([(512, -100.0, 3, "collision")])
+    assert (
+        run.episodes_file.read_text()
+        == "step,return,length,outcome\n256,99.5,12,goal\n512,-100,3,collision\n"
+    )
+    episodes = run.read_episodes()
+    assert episodes["length"].tolist() == [12, 3] and episodes["outcome"].tolist() == ["goal", "collision"]
+
+
+def test_the_trajectory_has_the_columns_that_others_rely_on(run):
+    run.write_trajectory({name: np.full(2, index) for index, name in enumerate(TRAJECTORY_COLUMNS)})
+    header, row, _ = run.trajectory_file.read_text().splitlines()
+    assert header == "t,x,y,z,qw,qx,qy,qz,vx,vy,vz,action,reward,clearance"
+    assert row == ",".join(map(str, range(14)))
+
+
+def test_a_summary_that_cannot_be_written_leaves_the_old_one(run):
+    run.write_summary({"success": np.bool_(True)})
+    with pytest.raises(TypeError):
+        run.write_summary({"success": object()})
+    assert json.loads(run.summary_file.read_text()) == {"success": True}
