@@ -1,0 +1,427 @@
+"""The one scanned training step: act, fly, see, encode, store, learn; for every environment at once.
+
+`TrainState` holds everything that the future depends on. A chunk is a fixed number of training steps,
+compiled once and donated. Environments and replay stand in S logical shards, [S, E, ...], whatever the
+number of devices; `shard_map` spreads the shards over a mesh axis, parameters are replicated, sums are
+added over the axis. Numbers that steer `lax.cond` come in through the scan's inputs, so that they stay
+unbatched when training is `vmap`ped over seeds.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Sequence
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from flax import struct
+from jax import Array, lax
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
+
+from edqn_jax.config import Config, ConfigError
+from edqn_jax.learn import dqn, encoder, qnetwork, replay
+from edqn_jax.learn.policy import PolicyParams, empty_memory, flatten, observation_size, remember
+from edqn_jax.learn.qnetwork import Params
+from edqn_jax.sim import env
+from edqn_jax.sim.env import ACTIONS, EnvState, Outcome, World
+
+AXIS = "env"
+"""Name of the mesh axis that shards are spread over."""
+
+
+@struct.dataclass
+class Learner:
+    """Parameters and optimisers; the same on every device."""
+
+    vae: Params  # what learns
+    vae_optimiser: Any
+    encoder: Params  # what acts: the VAE as it was when the warm-up ended
+    q: Params
+    target: Params
+    average: Params  # Polyak average that evaluation flies
+    q_optimiser: Any
+
+
+@struct.dataclass
+class Actors:
+    """Environments and replay of S shards with E environments each."""
+
+    env: EnvState  # [S, E, ...]
+    memory: Array  # [S, E, H, D] stacked observations, the newest included
+    reward: Array  # [S, E] for arriving where the environment is
+    outcome: Array  # [S, E]
+    is_reset: Array  # [S, E]
+    manoeuvre: Array  # [S, E] the held move of the warm-up
+    episodes: Array  # [S, E] episodes finished since the DQN started
+    replay: replay.Rows  # [S, L, E, ...]
+    key: Array  # [S] typed keys of the shards
+
+
+@struct.dataclass
+class TrainState:
+    """Everything that the future of a run depends on."""
+
+    actors: Actors
+    learner: Learner
+    step: Array  # [] int32 training steps done
+
+
+@struct.dataclass
+class Episodes:
+    """What ended in each training step: [S, E]; an environment that goes on has outcome RUNNING."""
+
+    outcome: Array
+    length: Array
+    episode_return: Array
+
+
+@struct.dataclass
+class Losses:
+    """One training step's means; NaN for what did not learn in it."""
+
+    q_loss: Array
+    mean_q: Array
+    reconstruction: Array
+    kl: Array
+    epsilon: Array
+
+
+@dataclasses.dataclass(frozen=True)
+class Plan:
+    """Numbers of training steps that follow from a configuration; static."""
+
+    total: int
+    warmup: int
+    learn_from: int
+
+    @classmethod
+    def of(cls, config: Config) -> Plan:
+        """Total decisions round up to whole chunks, the warm-up to whole steps."""
+        envs = config.train.num_envs
+        total = math.ceil(config.train.total_steps / envs / config.train.chunk_steps) * config.train.chunk_steps
+        warmup = min(math.ceil(config.encoder.warmup_decisions / envs), total)
+        least = config.agent.n_step + config.agent.history
+        learn_from = warmup + max(math.ceil(config.agent.learning_starts / envs), least)
+        return cls(total=total, warmup=warmup, learn_from=learn_from)
+
+
+def init(config: Config, world: World, key: Array) -> TrainState:
+    """The state before the first step; a pure function of the key, so it can be `vmap`ped over seeds.
+
+    Raises:
+        ConfigError: if the environments or the batch do not divide into the shards.
+    """
+    shards, envs = config.train.shards, config.train.num_envs
+    if envs % shards or config.agent.batch_size % shards:
+        raise ConfigError(
+            f"train.num_envs ({envs}) and agent.batch_size ({config.agent.batch_size}) "
+            f"must be multiples of train.shards ({shards})"
+        )
+    learner_key, env_key, shard_key = jax.random.split(key, 3)
+    # Keys follow the global number of an environment or shard, never a device's.
+    env_keys = jax.vmap(lambda i: jax.random.fold_in(env_key, i))(jnp.arange(envs))
+    shard_keys = jax.vmap(lambda i: jax.random.fold_in(shard_key, i))(jnp.arange(shards))
+    state, observation = jax.vmap(lambda k: env.reset(config, world, k))(env_keys)
+    learner = _init_learner(config, learner_key)
+    fresh = jnp.broadcast_to(empty_memory(config), (envs, *empty_memory(config).shape))
+    memory = remember(fresh, flatten(config, learner.encoder, observation))
+    size = observation_size(config)
+    ring = replay.empty(config.agent, envs // shards, envs, size)
+    flat = Actors(
+        env=state,
+        memory=memory,
+        reward=jnp.zeros(envs),
+        outcome=jnp.zeros(envs, jnp.int32),
+        is_reset=jnp.ones(envs, bool),
+        manoeuvre=jnp.zeros(envs, jnp.int32),
+        episodes=jnp.zeros(envs, jnp.int32),
+        replay=jnp.zeros(envs),  # type: ignore[arg-type]
+        key=jnp.zeros(envs),
+    )
+    actors = jax.tree.map(lambda x: x.reshape(shards, envs // shards, *x.shape[1:]), flat).replace(
+        replay=jax.tree.map(lambda x: jnp.broadcast_to(x, (shards, *x.shape)), ring), key=shard_keys
+    )
+    return TrainState(actors=actors, learner=learner, step=jnp.zeros((), jnp.int32))
+
+
+def _init_learner(config: Config, key: Array) -> Learner:
+    vae_key, q_key = jax.random.split(key)
+    vae = encoder.init_encoder(config.encoder, config.camera, vae_key)
+    q = qnetwork.init_q(config.agent, observation_size(config), len(ACTIONS), q_key)
+    return Learner(
+        vae=vae,
+        vae_optimiser=_vae_optimiser(config).init(vae),
+        encoder=vae,
+        q=q,
+        target=q,
+        average=q,
+        q_optimiser=_q_optimiser(config).init(q),
+    )
+
+
+def _vae_optimiser(config: Config) -> optax.GradientTransformation:
+    return optax.adam(config.encoder.learning_rate)
+
+
+def _q_optimiser(config: Config) -> optax.GradientTransformation:
+    plan = Plan.of(config)
+    return dqn.optimiser(config.agent, (plan.total - plan.learn_from) * config.agent.updates_per_step)
+
+
+def _flat(x: Array) -> Array:
+    """[S, E, ...] -> [S * E, ...]"""
+    return x.reshape(-1, *x.shape[2:])
+
+
+def _all_sum(x, axis: str | None):
+    """Sum over the devices that share the work, if there are any."""
+    return lax.psum(x, axis) if axis is not None else x
+
+
+def train_step(
+    config: Config, world: World, axis: str | None, state: TrainState, step: Array
+) -> tuple[TrainState, tuple[Episodes, Losses]]:
+    """One decision of every environment, and the learning that goes with it.
+
+    Args:
+        axis: name of the mesh axis over which the shards of `state.actors` are spread; None on one device.
+        step: [] int32, the number of this step from 0; steers the phases.
+    """
+    plan = Plan.of(config)
+    actors, learner = state.actors, state.learner
+    shards, envs = actors.reward.shape
+    keys = jax.vmap(lambda k: jax.random.split(k, 5))(actors.key)
+    warming = step < plan.warmup
+    # Decisions of the DQN phase, in all environments of all devices.
+    decisions = jnp.maximum(step - plan.warmup, 0) * config.train.num_envs
+
+    # Act (Algorithm 1, step 5): held random manoeuvres in the warm-up, then epsilon-greedy.
+    total = (plan.total - plan.warmup) * config.train.num_envs
+    epsilon = dqn.exploration(config.agent, decisions, total, actors.episodes)
+    q = qnetwork.q_values(config.agent, learner.q, len(ACTIONS), actors.memory)
+    greedy_keys = jax.vmap(lambda k: jax.random.split(k, envs))(keys[:, 0])
+    chosen = jax.vmap(jax.vmap(dqn.epsilon_greedy))(q, epsilon, greedy_keys)
+    manoeuvre = jax.vmap(partial(_manoeuvre, config.encoder.hold_decisions))(actors.manoeuvre, keys[:, 1])
+    action = jnp.where(warming, manoeuvre, chosen)
+
+    # Store where we are and what we do there.
+    rows = replay.Rows(
+        observation=actors.memory[..., -1, :],
+        reward=actors.reward,
+        outcome=actors.outcome,
+        is_reset=actors.is_reset,
+        action=action,
+    )
+    time = jnp.maximum(step - plan.warmup, 0)
+    ring = jax.vmap(replay.write, in_axes=(0, 0, None))(actors.replay, rows, time)
+
+    # Fly and see.
+    flown, seen = jax.vmap(lambda s, a: env.step(config, world, s, a))(
+        jax.tree.map(_flat, actors.env), _flat(action)
+    )
+    # Learn: the VAE from all new events, the Q-network from the replay.
+    vae_losses, learner = _learn_to_see(config, axis, learner, seen.observation.events, keys[:, 2], step)
+    q_losses, learner = _learn_to_act(config, axis, learner, ring, time, keys[:, 3], step)
+    learner = _publish(plan, learner, step)
+
+    # Encode once, and remember; a new episode, or a new encoder, begins with an empty memory.
+    code = flatten(config, learner.encoder, seen.observation)
+    forget = seen.is_reset | (step + 1 == plan.warmup)
+    memory = remember(jnp.where(forget[:, None, None], 0.0, _flat(actors.memory)), code)
+
+    def shaped(tree):
+        return jax.tree.map(lambda x: x.reshape(shards, envs, *x.shape[1:]), tree)
+
+    ended = shaped(seen.outcome) != Outcome.RUNNING
+    actors = Actors(
+        env=shaped(flown),
+        memory=shaped(memory),
+        reward=shaped(seen.reward),
+        outcome=shaped(seen.outcome),
+        is_reset=shaped(seen.is_reset),
+        manoeuvre=manoeuvre,
+        episodes=actors.episodes + (ended & ~warming),
+        replay=ring,
+        key=keys[:, 4],
+    )
+    episodes = Episodes(
+        outcome=shaped(seen.outcome),
+        length=shaped(seen.episode_length),
+        episode_return=shaped(seen.episode_return),
+    )
+    losses = Losses(
+        q_loss=q_losses[0],
+        mean_q=q_losses[1],
+        reconstruction=vae_losses[0],
+        kl=vae_losses[1],
+        epsilon=jnp.where(warming, 1.0, _all_sum(jnp.mean(epsilon) * shards, axis) / config.train.shards),
+    )
+    return TrainState(actors=actors, learner=learner, step=step + 1), (episodes, losses)
+
+
+def _manoeuvre(hold: int, held: Array, key: Array) -> Array:
+    """Random moves [E] that are held for `hold` decisions on average."""
+    coin, draw = jax.random.split(key)
+    new = jax.random.randint(draw, held.shape, 0, len(ACTIONS))
+    return jnp.where(jax.random.uniform(coin, held.shape) < 1.0 / hold, new, held)
+
+
+def _publish(plan: Plan, learner: Learner, step: Array) -> Learner:
+    """The code that the agent sees changes once: when the warm-up ends, before the replay begins."""
+    publish = step + 1 == plan.warmup
+    return learner.replace(
+        encoder=jax.tree.map(lambda new, old: jnp.where(publish, new, old), learner.vae, learner.encoder)
+    )
+
+
+def _learn_to_see(config: Config, axis: str | None, learner: Learner, fields, keys: Array, step: Array):
+    """VAE updates on this step's event fields: `(reconstruction, kl), learner`."""
+    plan = Plan.of(config)
+    shards = keys.shape[0]
+    # Each shard draws its own noise, so that the layout on devices does not change it.
+    split = jax.tree.map(lambda x: x.reshape(shards, -1, *x.shape[1:]), fields)
+
+    def loss(params: Params, keys: Array):
+        total, parts = jax.vmap(lambda f, k: encoder.vae_loss(config.encoder, params, f, k))(split, keys)
+        return jnp.sum(total) / config.train.shards, parts
+
+    def update(learner: Learner, keys: Array):
+        gradient, parts = jax.grad(loss, has_aux=True)(learner.vae, keys)
+        gradient = _all_sum(gradient, axis)
+        change, optimiser = _vae_optimiser(config).update(gradient, learner.vae_optimiser, learner.vae)
+        learner = learner.replace(vae=optax.apply_updates(learner.vae, change), vae_optimiser=optimiser)
+        return learner, (jnp.sum(parts.reconstruction), jnp.sum(parts.kl))
+
+    def learn(learner: Learner, updates: int):
+        many = jax.vmap(lambda k: jax.random.split(k, updates))(keys).swapaxes(0, 1)
+        learner, sums = lax.scan(update, learner, many)
+        means = jax.tree.map(lambda x: _all_sum(jnp.mean(x), axis) / config.train.shards, sums)
+        return means, learner
+
+    def rest(learner: Learner):
+        if config.encoder.keep_learning:
+            return learn(learner, 1)
+        return (jnp.float32(jnp.nan), jnp.float32(jnp.nan)), learner
+
+    return lax.cond(
+        step < plan.warmup, lambda x: learn(x, config.encoder.warmup_updates_per_step), rest, learner
+    )
+
+
+def _learn_to_act(config: Config, axis: str | None, learner: Learner, ring, time: Array, keys: Array, step: Array):
+    """DQN updates from the replay (Algorithm 1, steps 7-9): `(loss, mean Q), learner`."""
+    plan, agent = Plan.of(config), config.agent
+    share = agent.batch_size // config.train.shards
+
+    def loss(params: Params, learner: Learner, batch: replay.Batch):
+        return dqn.batch_loss(agent, params, learner.target, len(ACTIONS), batch)
+
+    def update(learner: Learner, keys: Array):
+        batch = jax.vmap(lambda r, k: replay.sample(agent, r, time, share, k))(ring, keys)
+        batch = jax.tree.map(_flat, batch)
+        (total, (count, sum_q)), gradient = jax.value_and_grad(loss, has_aux=True)(learner.q, learner, batch)
+        gradient, total, count, sum_q = _all_sum((gradient, total, count, sum_q), axis)
+        gradient = jax.tree.map(lambda g: g / jnp.maximum(count, 1.0), gradient)
+        change, optimiser = _q_optimiser(config).update(gradient, learner.q_optimiser, learner.q)
+        q = optax.apply_updates(learner.q, change)
+        learner = learner.replace(
+            q=q,
+            q_optimiser=optimiser,
+            target=dqn.polyak(q, learner.target, agent.target_rate),
+            average=dqn.polyak(q, learner.average, agent.average_rate),
+        )
+        return learner, (total / jnp.maximum(count, 1.0), sum_q / jnp.maximum(count, 1.0))
+
+    def learn(learner: Learner):
+        many = jax.vmap(lambda k: jax.random.split(k, agent.updates_per_step))(keys).swapaxes(0, 1)
+        learner, losses = lax.scan(update, learner, many)
+        return jax.tree.map(jnp.mean, losses), learner
+
+    def rest(learner: Learner):
+        return (jnp.float32(jnp.nan), jnp.float32(jnp.nan)), learner
+
+    return lax.cond(step >= plan.learn_from, learn, rest, learner)
+
+
+def run_steps(
+    config: Config, world: World, state: TrainState, steps: Array, axis: str | None = None
+) -> tuple[TrainState, tuple[Episodes, Losses]]:
+    """A chunk: the training steps numbered `steps` [K], scanned. Pure; `vmap` it over states for many seeds.
+
+    Returns:
+        state, (episodes [K, S, E], losses [K]).
+    """
+    return lax.scan(partial(train_step, config, world, axis), state, steps)
+
+
+def policy_of(state: TrainState) -> PolicyParams:
+    """What evaluation flies: the acting encoder and the averaged Q-network."""
+    return PolicyParams(encoder=state.learner.encoder, q=state.learner.average)
+
+
+class Trainer:
+    """A compiled, donated chunk over a mesh of devices. The state goes in and comes out; nothing is kept here."""
+
+    def __init__(self, config: Config, world: World, devices: Sequence[jax.Device]):  # pyright: ignore
+        self.config = config
+        self.plan = Plan.of(config)
+        self.mesh = Mesh(np.asarray(devices), (AXIS,))
+        self.replicated = NamedSharding(self.mesh, PartitionSpec())
+        self.world = jax.device_put(world, self.replicated)
+        self._specs = TrainState(
+            actors=PartitionSpec(AXIS), learner=PartitionSpec(), step=PartitionSpec()  # type: ignore[arg-type]
+        )
+        self._shardings = TrainState(
+            actors=NamedSharding(self.mesh, PartitionSpec(AXIS)),  # type: ignore[arg-type]
+            learner=self.replicated,  # type: ignore[arg-type]
+            step=self.replicated,
+        )
+        self._chunk = None
+
+    def init(self, seed: int) -> TrainState:
+        """The state before the first step, laid out over the devices."""
+        make = jax.jit(lambda world, key: init(self.config, world, key))
+        state = make(self.world, jax.random.key(seed))
+        return jax.device_put(state, _prefix(self._shardings, state))
+
+    def compile(self, state: TrainState) -> None:
+        """Trace and compile the chunk, once."""
+        episodes = Episodes(
+            outcome=PartitionSpec(None, AXIS),  # type: ignore[arg-type]
+            length=PartitionSpec(None, AXIS),  # type: ignore[arg-type]
+            episode_return=PartitionSpec(None, AXIS),  # type: ignore[arg-type]
+        )
+        run = jax.shard_map(
+            lambda world, state, steps: run_steps(self.config, world, state, steps, AXIS),
+            mesh=self.mesh,
+            in_specs=(PartitionSpec(), self._specs, PartitionSpec()),
+            out_specs=(self._specs, (episodes, PartitionSpec())),
+            check_vma=False,
+        )
+        jitted = jax.jit(run, donate_argnums=1)
+        self._chunk = jitted.lower(self.world, state, self._steps(0)).compile()
+
+    def _steps(self, first: int) -> Array:
+        numbers = np.arange(first, first + self.config.train.chunk_steps, dtype=np.int32)
+        return jax.device_put(numbers, self.replicated)
+
+    def chunk(self, state: TrainState, first: int) -> tuple[TrainState, tuple[Episodes, Losses]]:
+        """The training steps `first .. first + chunk_steps - 1`; `state` is donated."""
+        if self._chunk is None:
+            self.compile(state)
+        assert self._chunk is not None
+        return self._chunk(self.world, state, self._steps(first))
+
+
+def _prefix(shardings: TrainState, state: TrainState) -> TrainState:
+    """One sharding per leaf of the state."""
+    return TrainState(
+        actors=jax.tree.map(lambda _: shardings.actors, state.actors),
+        learner=jax.tree.map(lambda _: shardings.learner, state.learner),
+        step=shardings.step,
+    )
