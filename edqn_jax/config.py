@@ -143,6 +143,8 @@ class EnvConfig:
     """Within this horizontal distance of the goal the heading setpoint is held."""
     reward: Literal["sparse", "progress", "potential"] = "progress"
     """`sparse`: Eq. 8. `progress`: adds metres gained. `potential`: the policy-invariant form."""
+    progress_weight: float = 3.0
+    """Reward per metre gained towards the goal (`progress`, `potential`)."""
     goal_reward: float = 100.0
     """Reward at the goal (Eq. 8)."""
     collision_reward: float = -100.0
@@ -161,7 +163,7 @@ class EncoderConfig:
     """Values in the code z."""
     features: int = 48
     """Sum-pooled features per temporal channel."""
-    pixel_features: Literal["table", "network"] = "table"
+    pixel_features: Literal["table", "network"] = "network"
     """f(x, y, p): a free table over pixels and polarities, or a ReLU network on a positional encoding."""
     time_frequencies: int = 1
     """Sinusoid pairs of the temporal embedding; phi(t) has 1 + 2 x this many channels."""
@@ -169,13 +171,13 @@ class EncoderConfig:
     """Width of the ReLU layer between pooled features and code."""
     decoder_hidden: tuple[int, ...] = (128, 256)
     """Widths of the decoder's ReLU layers."""
-    target_blur: int = 1
+    target_blur: int = 2
     """Times that the decoder's target is blurred by a binomial of three pixels; 0 is the sharp event image."""
-    kl_weight: float = 2e-3
+    kl_weight: float = 0.5
     """beta: weight of the KL term per image against the reconstruction error per image."""
     learning_rate: float = 2e-3
     """Adam step size of the VAE."""
-    warmup_decisions: int = 40_960
+    warmup_decisions: int = 32_768
     """Decisions of held random manoeuvres in which the VAE learns before the DQN starts."""
     warmup_updates_per_step: int = 2
     """VAE updates per training step of the warm-up, each on all new event fields."""
@@ -189,11 +191,13 @@ class EncoderConfig:
 class AgentConfig:
     """The deep Q-network (section 3.3, Eq. 7-10)."""
 
-    hidden: tuple[int, ...] = (256, 256)
+    hidden: tuple[int, ...] = (128, 128)
     """Widths of the hidden layers."""
-    history: int = 3
+    history: int = 1
     """Observations that the network sees at once, the newest included."""
-    layer_norm: bool = True
+    code_scale: float = 0.2
+    """The code is multiplied by this before the network sees it, so that it does not drown the own state."""
+    layer_norm: bool = False
     """Layer normalisation after each hidden layer."""
     dueling: bool = True
     """Dueling heads (Wang et al. 2016)."""
@@ -201,9 +205,9 @@ class AgentConfig:
     """Double DQN targets (van Hasselt et al. 2016)."""
     n_step: int = 5
     """Steps of the return before the bootstrap."""
-    discount: float = 0.99
+    discount: float = 0.95
     """gamma."""
-    target_rate: float = 0.005
+    target_rate: float = 0.01
     """Polyak tau of the target network, per update."""
     average_rate: float = 0.001
     """Polyak rate, per update, of the averaged parameters that evaluation flies; 1 flies the newest."""
@@ -217,9 +221,9 @@ class AgentConfig:
     """Errors beyond this grow linearly, in units of scaled reward; 0 means the pure square of Eq. 9."""
     reward_scale: float = 0.02
     """Rewards are multiplied by this before learning."""
-    batch_size: int = 1024
+    batch_size: int = 256
     """Replayed samples per update."""
-    updates_per_step: int = 1
+    updates_per_step: int = 8
     """Updates per training step (a training step is one decision of every environment)."""
     replay_size: int = 262_144
     """Observations that the replay holds."""
@@ -231,7 +235,7 @@ class AgentConfig:
     """epsilon at first."""
     exploration_end: float = 0.02
     """epsilon at last."""
-    exploration_fraction: float = 0.3
+    exploration_fraction: float = 0.15
     """Share of the DQN phase over which epsilon falls linearly; unused when `exploration_episodes` > 0."""
     exploration_episodes: int = 0
     """Episodes per environment over which epsilon falls (`Max_eps_episode` of Table 1); 0 uses the fraction."""
@@ -258,7 +262,9 @@ class TrainConfig:
     validation_every: int = 65_536
     """Decisions between validations, rounded up to whole chunks; 0 is none but the last."""
     validation_missions: int = 128
-    """Validation missions flown each time."""
+    """Validation missions flown each time; half of those in the paper's world begin near its start."""
+    keep: Literal["best", "last"] = "best"
+    """Parameters that a run ends with: those of the best validation (the latest among equals), or the last."""
 
 
 @dataclass(frozen=True)
@@ -296,14 +302,14 @@ def preset(name: str) -> Config:
     if name == "paper":
         return dataclasses.replace(
             Config(),
-            env=EnvConfig(reward="sparse", left_volume_reward=0.0, step_reward=0.0),
+            env=EnvConfig(reward="sparse", progress_weight=1.0, left_volume_reward=0.0, step_reward=0.0),
             agent=AgentConfig(
                 hidden=(16, 16),
-                history=1,
-                layer_norm=False,
                 dueling=False,
                 double=False,
                 n_step=1,
+                discount=0.99,
+                target_rate=0.005,
                 learning_rate=4e-4,
                 final_learning_rate=4e-4,
                 max_gradient_norm=float("inf"),
@@ -316,7 +322,9 @@ def preset(name: str) -> Config:
                 exploration_end=0.01,
                 exploration_episodes=10,
             ),
-            train=TrainConfig(num_envs=16, total_steps=500_000, max_episodes=40_000, chunk_steps=512),
+            train=TrainConfig(
+                num_envs=16, total_steps=500_000, max_episodes=40_000, chunk_steps=512, keep="last"
+            ),
             world=WorldConfig(own_start_fraction=1.0, start_jitter_m=0.0),
         )
     raise ConfigError(f"there is no preset '{name}'; the presets are {', '.join(PRESETS)}")

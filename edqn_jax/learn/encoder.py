@@ -26,7 +26,7 @@ from jax import Array
 from jax.nn.initializers import constant, lecun_normal, zeros
 
 from edqn_jax.config import CameraConfig, EncoderConfig
-from edqn_jax.sim.events import EventField, event_image
+from edqn_jax.sim.events import EventField
 
 Params = Any
 """Nested dictionaries of arrays."""
@@ -159,14 +159,14 @@ def waves(height: int, width: int) -> Array:
 
 
 def wave_table(height: int, width: int) -> Callable[..., Array]:
-    """Initialiser of `PixelTable`: mixtures of waves, most of each odd in the polarity, some of it even."""
+    """Initialiser of `PixelTable`: mixtures of waves, half of each odd in the polarity, half even."""
 
     def init(key: Array, shape: tuple[int, ...]) -> Array:
         key_odd, key_even = jax.random.split(key)
         basis = waves(height, width).reshape(-1, height * width).T
         mix = lecun_normal()
         odd = basis @ mix(key_odd, (basis.shape[1], shape[-1]))
-        even = 0.5 * basis @ mix(key_even, (basis.shape[1], shape[-1]))
+        even = basis @ mix(key_even, (basis.shape[1], shape[-1]))
         return jnp.stack([even + odd, even - odd])
 
     return init
@@ -192,15 +192,21 @@ def mirrored(*, inputs: bool, outputs: bool) -> Callable[..., Array]:
     return init
 
 
-def wave_image(key: Array, shape: tuple[int, ...], dtype: Any = jnp.float32) -> Array:
-    """Initialiser of the decoder's last layer, `[hidden, H, W]`: small mixtures of waves, mirrored.
+def wave_images(key: Array, shape: tuple[int, ...], dtype: Any = jnp.float32) -> Array:
+    """Initialiser of the decoder's last layer, `[hidden, 2, H, W]`: small mixtures of waves, mirrored.
 
     Event images are smooth on average, white noise is not: from white noise the decoder needs thousands of
-    updates to leave the blank image, from waves it leaves at once.
+    updates to leave the blank image, from waves it leaves at once. Part of each wave is common to ON and OFF,
+    part of opposite sign.
     """
-    size, height, width = shape
+    size, _, height, width = shape
     basis = waves(height, width)
-    kernel = 0.0075 * jnp.tensordot(lecun_normal()(key, (-(-size // 2), basis.shape[0]), dtype), basis, 1)
+    key_even, key_odd = jax.random.split(key)
+    even, odd = (
+        0.0075 * jnp.tensordot(lecun_normal()(k, (-(-size // 2), basis.shape[0]), dtype), basis, 1)
+        for k in (key_even, key_odd)
+    )
+    kernel = jnp.stack([even + odd, even - odd], axis=1)
     return jnp.concatenate([kernel, -kernel])[:size]
 
 
@@ -245,7 +251,7 @@ class Encoder(nn.Module):
 
 
 class Decoder(nn.Module):
-    """Code `[..., code_size]` to the reconstructed `target`, `[..., H, W]`."""
+    """Code `[..., code_size]` to the reconstructed `target`, `[..., 2, H, W]`."""
 
     config: EncoderConfig
     height: int
@@ -256,20 +262,24 @@ class Decoder(nn.Module):
         z = code
         for layer, size in enumerate(self.config.decoder_hidden):
             z = nn.relu(nn.Dense(size, kernel_init=mirrored(inputs=layer > 0, outputs=True))(z))
-        kernel = self.param("kernel", wave_image, (z.shape[-1], self.height, self.width))
-        bias = self.param("bias", zeros, (self.height, self.width))
+        shape = (2, self.height, self.width)
+        kernel = self.param("kernel", wave_images, (z.shape[-1], *shape))
+        bias = self.param("bias", zeros, shape)
         image = z @ kernel.reshape(z.shape[-1], -1)
-        return image.reshape(*z.shape[:-1], self.height, self.width) + bias
+        return image.reshape(*z.shape[:-1], *shape) + bias
 
 
 def target(config: EncoderConfig, field: EventField) -> Array:
-    """What the decoder must reconstruct, `[..., H, W]`: sign x log(1 + |event image|), blurred a little.
+    """What the decoder must reconstruct, `[..., 2, H, W]`: log(1 + count) of ON and of OFF events, blurred.
 
-    The logarithm keeps one bright edge from drowning the rest; the blur (a binomial over
-    2 x `target_blur` + 1 pixels) makes an edge that is off by one pixel one small error, not two large ones.
+    Two channels, because how many events there are says how near things are, and in a signed image the ON
+    and OFF of a textured wall cancel. The logarithm keeps one bright edge from drowning the rest; the blur (a
+    binomial over 2 x `target_blur` + 1 pixels) makes an edge that is off by one pixel one small error, not two
+    large ones.
     """
-    image = event_image(field).astype(jnp.float32)
-    image = jnp.sign(image) * jnp.log1p(jnp.abs(image))
+    on = jnp.sum(jnp.where(field.polarity > 0, field.count, 0), axis=-3)
+    off = jnp.sum(jnp.where(field.polarity < 0, field.count, 0), axis=-3)
+    image = jnp.log1p(jnp.stack([on, off], axis=-3).astype(jnp.float32))
     if config.target_blur == 0:
         return image
     height, width = image.shape[-2:]
@@ -324,8 +334,8 @@ def embed(config: EncoderConfig, params: Params, field: EventField) -> Array:
 
 
 def decode(config: EncoderConfig, params: Params, code: Array) -> Array:
-    """Code `[..., code_size]` to the reconstruction of `target`, `[..., H, W]`."""
-    height, width = params["decoder"]["bias"].shape
+    """Code `[..., code_size]` to the reconstruction of `target`, `[..., 2, H, W]`."""
+    _, height, width = params["decoder"]["bias"].shape
     return Decoder(config, height, width).apply({"params": params["decoder"]}, code)  # type: ignore
 
 
@@ -341,6 +351,6 @@ def vae_loss(config: EncoderConfig, params: Params, field: EventField, key: Arra
     """
     mean, log_variance = encode(config, params, field)
     code = mean + jnp.exp(0.5 * log_variance) * jax.random.normal(key, mean.shape)
-    error = jnp.sum(jnp.square(decode(config, params, code) - target(config, field)), axis=(-2, -1))
+    error = jnp.sum(jnp.square(decode(config, params, code) - target(config, field)), axis=(-3, -2, -1))
     losses = Losses(reconstruction=jnp.mean(error), kl=jnp.mean(kl_divergence(mean, log_variance)))
     return losses.reconstruction + config.kl_weight * losses.kl, losses

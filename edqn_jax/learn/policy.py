@@ -41,7 +41,8 @@ def remember(memory: Memory, flat: Array) -> Memory:
 
 def flatten(config: Config, params: Params, observation: Observation) -> Array:
     """[..., D] code and own state of observations [...]."""
-    return jnp.concatenate([encoder.embed(config.encoder, params, observation.events), observation.own], axis=-1)
+    code = config.agent.code_scale * encoder.embed(config.encoder, params, observation.events)
+    return jnp.concatenate([code, observation.own], axis=-1)
 
 
 def act(

@@ -22,28 +22,35 @@ LUMA = (0.299, 0.587, 0.114)
 """Weights of R, G and B in Eq. 1."""
 
 
-def _backdrop(config: CameraConfig, scene: Scene, origin: Array, rays: Rays, value: Values, sky: Array) -> Array:
+def _backdrop(
+    config: CameraConfig, scene: Scene, origin: Array, rays: Rays, value: Values, sky: Array
+) -> Array:
     """Ground and other planes, textured, before the sky: [H, W]."""
     shape = jnp.broadcast_shapes(rays.dx.shape, rays.dz.shape)
-    depth, shown = jnp.full(shape, jnp.inf), jnp.broadcast_to(sky, shape)
+    behind = jnp.broadcast_to(sky, shape)
     if scene.planes.normal.shape[0] == 0:
-        return shown
-    surfaces = raycast.plane_surfaces(config, scene, origin, rays, value)
+        return behind
+    depth, shown, share = jnp.full(shape, jnp.inf), jnp.zeros(shape), jnp.zeros(shape)
     slopes = jnp.zeros(shape), jnp.zeros(shape)
-    for n in range(surfaces.depth.shape[0]):
+    for n in range(scene.planes.normal.shape[0]):
         normal = scene.planes.normal[n]
-        t = surfaces.depth[n]
-        # On a plane t = h / (n . d), so dt = -t (n . d') / (n . d), exactly.
+        height = jnp.dot(origin - scene.planes.position[n], normal)
+        across, along = jnp.dot(normal, rays.right) * rays.pitch, jnp.dot(normal, rays.up) * rays.pitch
+        # The plane's horizon is the line n . d = 0; below it lies the part of the pixel that the plane covers.
         approach = normal[0] * rays.dx + normal[1] * rays.dy + normal[2] * rays.dz
-        relative = -t * raycast.inverse(approach) * rays.pitch
-        seen = surfaces.hit[n] & (t < depth)
+        spread = jnp.abs(across) + jnp.abs(along)
+        covered = jnp.clip(0.5 - approach * raycast.inverse(spread), 0.0, 1.0)
+        middle = (approach - spread / 2 + jnp.minimum(approach + spread / 2, 0.0)) / 2
+        t = -height * raycast.inverse(middle)
+        # On a plane t = h / (n . d), so dt = -t (n . d') / (n . d), exactly.
+        relative = -t * raycast.inverse(middle)
+        seen = (middle < 0) & (t > 0) & (t < raycast.HORIZON_M) & (t < depth)
         depth = jnp.where(seen, t, depth)
-        shown = jnp.where(seen, surfaces.value[n], shown)
-        right, up = (relative * jnp.dot(normal, way) for way in (rays.right, rays.up))
-        slopes = jnp.where(seen, right, slopes[0]), jnp.where(seen, up, slopes[1])
-    met = depth < jnp.inf
-    factor = texture(config, origin, rays, jnp.where(met, depth, 0.0), *slopes)
-    return jnp.where(met, shown * factor, shown)
+        share = jnp.where(seen, covered, share)
+        shown = jnp.where(seen, raycast.shade(config, *normal) * value.planes[n], shown)
+        slopes = jnp.where(seen, relative * across, slopes[0]), jnp.where(seen, relative * along, slopes[1])
+    factor = texture(config, origin, rays, jnp.where(share > 0, depth, 0.0), *slopes)
+    return behind + share * (shown * factor - behind)
 
 
 def _picture(config: CameraConfig, scene: Scene, origin: Array, rotation: Array, weights: Array) -> Array:

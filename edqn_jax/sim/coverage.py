@@ -18,6 +18,7 @@ from edqn_jax.sim.raycast import (
     Rays,
     Surfaces,
     Values,
+    for_shapes,
     inverse,
     per_shape,
     shade,
@@ -125,6 +126,7 @@ def _extent_of_cylinders(scene: Scene, origin: Array, forward: tuple[Array, Arra
 
 def _column_shares(left: Array, right: Array, u: Array, pitch: float):
     """Overlap of extents [N] with pixel columns centred at u [C]: coverage, low and high end; [N, C] each."""
+    u = u[None]
     low = jnp.maximum(u - pitch / 2, left[:, None])
     high = jnp.minimum(u + pitch / 2, right[:, None])
     width = high - low
@@ -238,9 +240,9 @@ def upright_layers(
     row = config.height / 2 - 0.5 - jnp.arange(config.height, dtype=jnp.float32)
     low, high = (row - 0.5)[:, None], (row + 0.5)[:, None]
     # Closeness of the cap in each row; where there is no cap, anything beyond the side's.
-    level = materialised(jnp.where(cap[:, None] == 0, 1.0 / NEAR_M, row * inverse(cap)[:, None]))
+    level = materialised(jnp.where(cap[:, None] == 0, 1.0 / NEAR_M, row[None] * inverse(cap)[:, None]))
     for n in range(share.shape[0]):
-        covered, bright, near, far, lean = columns[n]
+        covered, bright, near, far, lean = columns[n][:, None]
         cap_near, cap_far = cap[n] * near, cap[n] * far
         rows_side = jnp.minimum(top[n] * near, high) - jnp.maximum(bottom[n] * near, low)
         rows_cap = jnp.minimum(jnp.maximum(cap_near, cap_far), high) - jnp.maximum(jnp.minimum(cap_near, cap_far), low)
@@ -260,7 +262,7 @@ def sphere_layers(
     config: CameraConfig, scene: Scene, origin: Array, rays: Rays, value: Values, layers: Layers
 ) -> Layers:
     """Layers of spheres for any camera: coverage falls linearly over the pixel that the silhouette crosses."""
-    spheres = scene.spheres
+    spheres, rays = scene.spheres, for_shapes(rays)
     if spheres.radius.shape[0] == 0:
         return layers
     ox, oy, oz = (per_shape(origin[i] - spheres.position[:, i]) for i in range(3))

@@ -163,8 +163,8 @@ def judge(config: Config, scene: Scene, goal: Array, before: Array, flight: Flig
 def reward(config: EnvConfig, discount: float, outcome: Array, before: Array, after: Array) -> Array:
     """Reward of one decision.
 
-    `sparse` is Eq. 8. `progress` adds the metres gained towards the goal. `potential` adds
-    gamma * Phi(s') - Phi(s) with Phi = -distance, and Phi = 0 at terminal states: the form that leaves the
+    `sparse` is Eq. 8. `progress` adds the metres gained towards the goal, times a weight. `potential` adds
+    gamma * Phi(s') - Phi(s) with Phi = -weight * distance, and Phi = 0 at terminal states: the form that leaves the
     optimal policy unchanged (Ng et al. 1999).
 
     Args:
@@ -177,10 +177,10 @@ def reward(config: EnvConfig, discount: float, outcome: Array, before: Array, af
     )
     total = at_end + config.step_reward
     if config.reward == "progress":
-        total = total + (before - after)
+        total = total + config.progress_weight * (before - after)
     elif config.reward == "potential":
         terminal = is_terminal(outcome)
-        total = total + before - jnp.where(terminal, 0.0, discount * after)
+        total = total + config.progress_weight * (before - jnp.where(terminal, 0.0, discount * after))
     return jnp.where(outcome == Outcome.DIVERGED, 0.0, total)
 
 

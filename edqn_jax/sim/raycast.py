@@ -8,6 +8,7 @@ row by broadcasting. A body-mounted camera passes full [R, C] components. N is t
 
 from __future__ import annotations
 
+import dataclasses
 import math
 
 import jax.numpy as jnp
@@ -142,10 +143,13 @@ def per_shape(x: Array) -> Array:
     return x[:, None, None]
 
 
+def for_shapes(rays: Rays) -> Rays:
+    """The same rays with components [1, R, C], to broadcast against [N, 1, 1]."""
+    return dataclasses.replace(rays, dx=rays.dx[None], dy=rays.dy[None], dz=rays.dz[None])
 
 
 def unit_ball(ox: Array, oy: Array, oz: Array, radius: Array, rays: Rays) -> tuple[Array, Array, Array]:
-    """Rays against spheres at offset `origin - centre`: entry depth, depth of the nearest point, its distance."""
+    """Rays (`for_shapes`) against spheres at `origin - centre`: depth of entry, depth and distance of the miss."""
     a = rays.dx**2 + rays.dy**2 + rays.dz**2
     s = -(ox * rays.dx + oy * rays.dy + oz * rays.dz) / a
     # Through the ray's nearest point, not b^2 - a c, whose cancellation costs 1e-3 at 100 m.
@@ -182,7 +186,7 @@ def _upright_box_surfaces(config: CameraConfig, origin: Array, rays: Rays, scene
 
 def _tilted_box_surfaces(config: CameraConfig, origin: Array, rays: Rays, scene: Scene, value: Values) -> Surfaces:
     boxes = scene.tilted_boxes
-    offset = origin - boxes.position
+    offset = origin[None] - boxes.position
     axes = tuple(tuple(boxes.rotation[:, j, i] for j in range(3)) for i in range(3))
     o = tuple(per_shape(sum(axis[j] * offset[:, j] for j in range(3))) for axis in axes)
     d = tuple(
@@ -242,9 +246,9 @@ def _tube_surfaces(
 
 def plane_surfaces(config: CameraConfig, scene: Scene, origin: Array, rays: Rays, value: Values) -> Surfaces:
     """Half-spaces, seen from their free side."""
-    planes = scene.planes
+    planes, rays = scene.planes, for_shapes(rays)
     nx, ny, nz = (per_shape(planes.normal[:, i]) for i in range(3))
-    height = per_shape(jnp.sum((origin - planes.position) * planes.normal, axis=-1))
+    height = per_shape(jnp.sum((origin[None] - planes.position) * planes.normal, axis=-1))
     approach = nx * rays.dx + ny * rays.dy + nz * rays.dz
     t = -height * inverse(approach)
     bright = shade(config, nx, ny, nz) * per_shape(value.planes)
@@ -255,7 +259,7 @@ def upright_surfaces(
     config: CameraConfig, scene: Scene, origin: Array, rays: Rays, value: Values
 ) -> list[Surfaces]:
     """Upright boxes and cylinders, kinds with capacity 0 left out."""
-    found = []
+    found, rays = [], for_shapes(rays)
     if scene.boxes.yaw.shape[0]:
         found.append(_upright_box_surfaces(config, origin, rays, scene, value))
     upright = scene.cylinders
@@ -277,7 +281,7 @@ def other_surfaces(config: CameraConfig, scene: Scene, origin: Array, rays: Rays
 
     A capsule is three surfaces of one shape: they are returned as three, each with the ray's own nearest.
     """
-    found = []
+    found, rays = [], for_shapes(rays)
     if scene.tilted_boxes.half.shape[0]:
         found.append(_tilted_box_surfaces(config, origin, rays, scene, value))
     tilted = scene.tilted_cylinders
@@ -299,6 +303,7 @@ def sphere_surfaces(config: CameraConfig, scene: Scene, origin: Array, rays: Ray
     spheres = scene.spheres
     if not spheres.radius.shape[0]:
         return []
+    rays = for_shapes(rays)
     return [_sphere_surfaces(config, origin, rays, spheres.position, spheres.radius, value.spheres)]
 
 

@@ -1,0 +1,107 @@
+"""Is the verdict right? A run's flights replayed in C MuJoCo, which shares no code with our distances.
+
+Prints for each outcome how many flights C MuJoCo judges alike: a contact at the stated moment where we say
+collision, none anywhere else. `--json FILE` writes it as well. Exit code 1 if a single verdict differs.
+
+    python benchmarks/verdicts.py RUN --missions 200
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import platform
+import sys
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from edqn_jax.agreement import CONTACT_TOLERANCE_M, Agreement, check_verdicts
+from edqn_jax.config import ConfigError
+from edqn_jax.course import load_course
+from edqn_jax.devices import use_cpu_devices
+from edqn_jax.evaluate import fly_on_all_devices, load_run, write_whole
+from edqn_jax.sim.env import Outcome
+
+
+def rows_of(results: list[Agreement]) -> list[dict[str, Any]]:
+    """One row for each outcome that occurs."""
+    rows = []
+    for outcome in Outcome:
+        same = [result for result in results if result.outcome == outcome]
+        if not same:
+            continue
+        apart = [result.apart_m for result in same if result.apart_m is not None]
+        rows.append(
+            {
+                "name": outcome.name.lower(),
+                "flights": len(same),
+                "agree": sum(result.agrees for result in same),
+                "contacts_found": sum(result.found is not None for result in same),
+                "apart_m_largest": float(np.max(apart)) if apart else None,
+            }
+        )
+    return rows
+
+
+def table(rows: list[dict[str, Any]]) -> str:
+    """The rows as a Markdown table."""
+    lines = [
+        "| our verdict | flights | C MuJoCo agrees | contacts it finds | largest distance apart, mm |",
+        "| --- | ---: | ---: | ---: | ---: |",
+    ]
+    for row in rows:
+        apart = "" if row["apart_m_largest"] is None else f"{1e3 * row['apart_m_largest']:.3f}"
+        lines.append(
+            f"| {row['name'].replace('_', ' ')} | {row['flights']} | {row['agree']} "
+            f"| {row['contacts_found']} | {apart} |"
+        )
+    return "\n".join(lines)
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("run", type=Path, help="folder of a run")
+    parser.add_argument("--world", help="where to fly (default: the world of the run)")
+    parser.add_argument("--missions", type=int, default=200, help="how many")
+    parser.add_argument("--seed", type=int, default=0, help="seed of the missions")
+    parser.add_argument("--json", type=Path, help="write the rows to this file")
+    args = parser.parse_args()
+    use_cpu_devices()
+    try:
+        config, params = load_run(args.run)
+        course = load_course(config, args.world or config.world.name, args.missions, args.seed)
+    except ConfigError as error:
+        print(error, file=sys.stderr)
+        return 2
+    flights = fly_on_all_devices(config, course.world, params, args.seed, record=True)
+    results = check_verdicts(config, course, flights)
+    rows = rows_of(results)
+    print(table(rows))
+    for result in results:
+        if not result.agrees:
+            print(f"mission {result.mission}: {result}")
+    if args.json:
+        report = {
+            "workload": {
+                "physics_steps_per_decision": config.drone.physics_steps,
+                "physics_dt": config.drone.physics_dt_s,
+                "missions": args.missions,
+                "seed": args.seed,
+                "world": course.name,
+                "contact_tolerance_m": CONTACT_TOLERANCE_M,
+                "physics": "mjx",
+            },
+            "device": f"{jax.devices()[0].device_kind} ({platform.machine()})",
+            "versions": {name: version(name) for name in ("jax", "mujoco", "mujoco-mjx")},
+            "rows": rows,
+        }
+        write_whole(args.json, (json.dumps(report, indent=1) + "\n").encode())
+    return int(not all(result.agrees for result in results))
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,82 @@
+"""Our verdicts on recorded flights held against C MuJoCo's, on the worlds' MJCF."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import mujoco
+import numpy as np
+
+from edqn_jax.config import Config
+from edqn_jax.course import Course
+from edqn_jax.flights import Flights
+from edqn_jax.sim.env import Outcome
+from edqn_jax.verdict import Judge, load_judge, replay_contact
+
+CONTACT_TOLERANCE_M = 0.01
+"""How far apart along the path the two may see the same contact. `segment_contact` takes the distance seven
+times a segment and interpolates: it may overlook a graze 0.1 mm deep, which at a grazing angle is
+sqrt(2 x 0.36 m x 0.1 mm) = 8.5 mm of path."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Agreement:
+    """One flight, judged twice. A moment is a number of physics steps, with its fraction."""
+
+    mission: int
+    outcome: Outcome
+    """Ours."""
+    stated: float | None
+    """Moment of the contact by our verdict; None where it is no collision."""
+    found: float | None
+    """Moment of the first contact that the other engine finds; None where it finds none."""
+    apart_m: float | None
+    """Metres of path between the two moments; None unless there are both."""
+    touched: str
+    """What the other engine finds touched."""
+
+    @property
+    def agrees(self) -> bool:
+        """Whether there is a contact where we state one, then, and none where we do not."""
+        if self.apart_m is None:
+            return self.stated is self.found  # neither
+        return self.apart_m <= CONTACT_TOLERANCE_M
+
+
+def check_verdicts(config: Config, course: Course, flights: Flights) -> list[Agreement]:
+    """Every recorded flight replayed in C MuJoCo, along the segments between physics steps.
+
+    Args:
+        config: for the radius of the body.
+        course: whose missions were flown; a world from a file is judged by the very file.
+        flights: recorded.
+
+    Raises:
+        ValueError: if the flights were not recorded.
+    """
+    if flights.record is None:
+        raise ValueError("these flights were not recorded")
+    judges = [_judge(text, course.file, config.drone.body_radius_m) for text in course.mjcf()]
+    missions = course.world.missions
+    scenes, starts = np.asarray(missions.scene), np.asarray(missions.start)
+    positions = np.asarray(flights.record.position)
+    outcomes, steps = np.asarray(flights.outcome), np.asarray(flights.physics_steps)
+    results = []
+    for i, (scene, outcome, count) in enumerate(zip(scenes, outcomes, steps, strict=True)):
+        path = np.concatenate([starts[i][None], positions[i, :count]]).astype(np.float64)
+        contact = replay_contact(judges[scene], path)
+        stated = count - 1 + float(flights.contact[i]) if outcome == Outcome.COLLISION else None
+        found = None if contact is None else contact.segment + contact.fraction
+        apart = None
+        if stated is not None and found is not None:
+            travelled = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))])
+            apart = abs(float(np.diff(np.interp([stated, found], np.arange(count + 1), travelled))[0]))
+        touched = "" if contact is None else contact.geom
+        results.append(Agreement(i, Outcome(int(outcome)), stated, found, apart, touched))
+    return results
+
+
+def _judge(text: str, file: Path | None, radius: float) -> Judge:
+    # From the file where there is one: it may include others that lie beside it.
+    return load_judge(file if file is not None else mujoco.MjSpec.from_string(text), radius)

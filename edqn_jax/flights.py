@@ -1,0 +1,319 @@
+"""Missions flown greedily: every mission once, all at once, in one compiled program."""
+
+from __future__ import annotations
+
+import dataclasses
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jax import Array
+from jax.sharding import Mesh, PartitionSpec
+
+from edqn_jax.config import Config
+from edqn_jax.learn import policy
+from edqn_jax.learn.policy import Memory, PolicyParams
+from edqn_jax.sim import env
+from edqn_jax.sim.env import EnvState, Observation, Outcome, Step, World
+from edqn_jax.sim.scene import scene_at, signed_distance, take_scene
+from edqn_jax.sim.worlds import Missions
+
+
+@struct.dataclass
+class Closest:
+    """Where a flight came closest to a shape, its start and end included. M missions."""
+
+    distance: Array  # [M] metres between the body's sphere and the shape
+    time: Array  # [M] seconds since the start
+    position: Array  # [M, 3] metres
+    quaternion: Array  # [M, 4]
+
+
+@struct.dataclass
+class Record:
+    """Whole flights, a row per physics step, taken after it. T = decision limit x physics steps a decision.
+
+    Rows after a flight's end are NaN. The last row of a collision stands beyond the contact: what the physics
+    computed without knowing of it.
+    """
+
+    position: Array  # [M, T, 3] metres
+    quaternion: Array  # [M, T, 4]
+    velocity: Array  # [M, T, 3] m/s
+    clearance: Array  # [M, T] metres from the body's sphere to the nearest shape, at a contact cut off there
+    action: Array  # [M, D] int32, one a decision; -1 after the end
+    reward: Array  # [M, D] of each decision
+
+
+@struct.dataclass
+class Flights:
+    """How M missions went. A flight ends with the physics step of its outcome, a collision at the contact."""
+
+    outcome: Array  # [M] int32, an `Outcome`
+    decisions: Array  # [M] int32
+    physics_steps: Array  # [M] int32, the one of the outcome included
+    contact: Array  # [M] share of the last physics step flown before a collision touched, 1 otherwise
+    episode_return: Array  # [M] undiscounted
+    path_length_m: Array  # [M]
+    flight_seconds: Array  # [M]
+    closest: Closest
+    record: Record | None
+
+
+@struct.dataclass
+class _Flying:
+    """What the loop over decisions carries."""
+
+    state: EnvState
+    observation: Observation
+    memory: Memory
+    flights: Flights  # record not in it
+    record: Record | None  # decision first: [D, M, ...]
+    decision: Array  # [] int32
+    key: Array
+
+
+def fly_missions(
+    config: Config,
+    world: World,
+    params: PolicyParams,
+    key: Array,
+    *,
+    shuffle_codes: bool = False,
+    record: bool = False,
+    mesh: Mesh | None = None,
+) -> Flights:
+    """Fly each of the world's M missions once, taking the best action each time.
+
+    Mission i belongs to environment i; the last flight's end ends the program. Environments whose flight is
+    over go on with other missions, which count for nothing.
+
+    Compiled once for each configuration, choice of flags, mesh, and shapes and layout of the arrays.
+
+    Args:
+        config: of the policy and its world.
+        world: whose missions are flown.
+        params: whose policy flies.
+        key: consumed; sensor noise and the shuffling depend on it.
+        shuffle_codes: give each environment the events of another one, anew at each decision, and leave it
+            its own state: how much does the policy fly by its events?
+        record: keep whole flights.
+        mesh: devices, along one axis, to spread the missions over; the flights do not depend on it, except
+            for whose events are shuffled with whose.
+
+    Raises:
+        ValueError: if codes are to be shuffled and a device has only one mission.
+    """
+    return _compiled(config, shuffle_codes, record, mesh, world, params, key)
+
+
+@partial(jax.jit, static_argnums=(0, 1, 2, 3))  # by position: a flag left out would be another program
+def _compiled(
+    config: Config,
+    shuffle_codes: bool,
+    record: bool,
+    mesh: Mesh | None,
+    world: World,
+    params: PolicyParams,
+    key: Array,
+) -> Flights:
+    missions = world.missions.scene.shape[0]
+    devices = 1 if mesh is None else mesh.size
+    reset_key, loop_key = jax.random.split(key)
+    # Every device flies equally many missions; those too many are the first ones again.
+    number = jnp.arange(-(-missions // devices) * devices) % missions
+    if shuffle_codes and number.shape[0] // devices < 2:
+        raise ValueError("codes can be shuffled between environments only where there are two or more")
+    keys = jax.vmap(partial(jax.random.fold_in, reset_key))(number)
+    fly = partial(_fly, config, shuffle_codes, record)
+    if mesh is not None:
+        (axis,) = mesh.axis_names
+        specs = PartitionSpec(), PartitionSpec(), PartitionSpec(axis), PartitionSpec(axis), PartitionSpec()
+        fly = jax.shard_map(fly, mesh=mesh, in_specs=specs, out_specs=PartitionSpec(axis), check_vma=False)
+    flights = fly(world, params, number, keys, loop_key)
+    return jax.tree.map(lambda leaf: leaf[:missions], flights)
+
+
+def _fly(
+    config: Config,
+    shuffle_codes: bool,
+    record: bool,
+    world: World,
+    params: PolicyParams,
+    number: Array,
+    keys: Array,
+    key: Array,
+) -> Flights:
+    """`fly_missions` on one device: missions `number` [M] with the environments' keys [M]."""
+    missions = number.shape[0]
+
+    def decide(flying: _Flying) -> _Flying:
+        key, act_key, shift_key = jax.random.split(flying.key, 3)
+        seen = flying.observation
+        if shuffle_codes:
+            shift = jax.random.randint(shift_key, (), 1, missions)
+            # The code is a function of the events alone, so moving these moves the codes.
+            events = jax.tree.map(lambda x: jnp.roll(x, shift, axis=0), seen.events)
+            seen = dataclasses.replace(seen, events=events)
+        act = partial(policy.act, config, params, key=act_key)  # the best action is no matter of chance
+        action, memory = jax.vmap(act)(flying.memory, seen)
+        state, step = jax.vmap(partial(env.step, config, world))(flying.state, action)
+        flights, clearance = jax.vmap(partial(_tally, config, world))(flying.flights, flying.state, step)
+        return _Flying(
+            state=state,
+            observation=step.observation,
+            memory=jnp.where(step.is_reset[:, None, None], 0.0, memory),
+            flights=flights,
+            record=_write(flying, action, step, clearance),
+            decision=flying.decision + 1,
+            key=key,
+        )
+
+    state, observation = jax.vmap(partial(env.reset, config, world))(keys, number)
+    memory = policy.empty_memory(config)
+    flying = _Flying(
+        state=state,
+        observation=observation,
+        memory=jnp.broadcast_to(memory, (missions, *memory.shape)),
+        flights=jax.vmap(partial(_at_start, config, world))(state),
+        record=_blank(config, missions) if record else None,
+        decision=jnp.zeros((), jnp.int32),
+        key=key,
+    )
+    flying = jax.lax.while_loop(lambda f: jnp.any(f.flights.outcome == Outcome.RUNNING), decide, flying)
+    whole = None if flying.record is None else _by_mission(flying.record)
+    return dataclasses.replace(flying.flights, record=whole)
+
+
+def own_flight(
+    config: Config, world: World, params: PolicyParams, key: Array, *, mesh: Mesh | None = None
+) -> Flights:
+    """The flight from the first world's own start to its own goal, recorded; M = 1.
+
+    It is flown as often as `world` has missions, all alike, and the first is returned: a program that was
+    compiled for those missions is used again, which costs less than to compile one for a single flight.
+    """
+    own = Missions(scene=jnp.zeros((), jnp.int32), start=world.pool.start[0], goal=world.pool.goal[0])
+
+    def repeat(own: Array, leaf: Array) -> Array:
+        # Laid out as the missions are, or the program would be compiled again.
+        return jax.device_put(np.broadcast_to(own, leaf.shape), leaf.sharding if leaf.committed else None)
+
+    repeated = dataclasses.replace(world, missions=jax.tree.map(repeat, own, world.missions))
+    flights = fly_missions(config, repeated, params, key, record=True, mesh=mesh)
+    return jax.tree.map(lambda leaf: leaf[:1], flights)
+
+
+def _at_start(config: Config, world: World, state: EnvState) -> Flights:
+    """Tallies of one flight that has yet to begin."""
+    body = state.drone
+    scene = scene_at(take_scene(world.pool, world.missions.scene[state.mission]), jnp.zeros(()))
+    zero, none = jnp.zeros(()), jnp.zeros((), jnp.int32)
+    return Flights(
+        outcome=none,
+        decisions=none,
+        physics_steps=none,
+        contact=jnp.ones(()),
+        episode_return=zero,
+        path_length_m=zero,
+        flight_seconds=zero,
+        closest=Closest(
+            distance=signed_distance(scene, body.position) - config.drone.body_radius_m,
+            time=zero,
+            position=body.position,
+            quaternion=body.quaternion,
+        ),
+        record=None,
+    )
+
+
+def _tally(
+    config: Config, world: World, flights: Flights, before: EnvState, step: Step
+) -> tuple[Flights, Array]:
+    """The tallies of one flight after a decision, and the clearance [n] after each of its physics steps."""
+    running = flights.outcome == Outcome.RUNNING
+    steps = jnp.arange(config.drone.physics_steps)
+    flown = steps < step.end_step
+    share = jnp.where(steps == step.end_step - 1, step.contact, 1.0)
+    begin = jnp.concatenate([before.drone.position[None], step.flight.position[:-1]])
+    segment = share[:, None] * (step.flight.position - begin)
+    end = begin + segment
+    times = flights.flight_seconds + (steps + share) * config.drone.physics_dt_s
+
+    time = before.decision * (config.drone.physics_steps * config.drone.physics_dt_s)
+    scene = scene_at(take_scene(world.pool, world.missions.scene[before.mission]), time)
+    clearance = jax.vmap(partial(signed_distance, scene))(end) - config.drone.body_radius_m
+    least = jnp.argmin(jnp.where(flown, clearance, jnp.inf))
+    closest = Closest(
+        distance=clearance[least],
+        time=times[least],
+        position=end[least],
+        quaternion=step.flight.quaternion[least],
+    )
+    closer = closest.distance < flights.closest.distance
+    after = Flights(
+        outcome=step.outcome,
+        decisions=step.episode_length,
+        physics_steps=flights.physics_steps + step.end_step,
+        contact=step.contact,
+        episode_return=step.episode_return,
+        path_length_m=flights.path_length_m
+        + jnp.sum(jnp.where(flown, jnp.sqrt(jnp.sum(segment**2, axis=-1)), 0.0)),
+        flight_seconds=times[step.end_step - 1],
+        closest=jax.tree.map(lambda new, old: jnp.where(closer, new, old), closest, flights.closest),
+        record=None,
+    )
+    return jax.tree.map(lambda new, old: jnp.where(running, new, old), after, flights), clearance
+
+
+def _blank(config: Config, missions: int) -> Record:
+    decisions, steps = config.env.max_decisions, config.drone.physics_steps
+
+    def unwritten(*size: int) -> Array:
+        return jnp.full((decisions, missions, *size), jnp.nan)
+
+    return Record(
+        position=unwritten(steps, 3),
+        quaternion=unwritten(steps, 4),
+        velocity=unwritten(steps, 3),
+        clearance=unwritten(steps),
+        action=jnp.full((decisions, missions), -1, jnp.int32),
+        reward=unwritten(),
+    )
+
+
+def _write(flying: _Flying, action: Array, step: Step, clearance: Array) -> Record | None:
+    """The record with one more decision of the flights that are not over."""
+    if flying.record is None:
+        return None
+    running = flying.flights.outcome == Outcome.RUNNING
+    steps = jnp.arange(clearance.shape[1])[None]
+    flown = running[:, None] & (steps < step.end_step[:, None])
+    row = Record(
+        position=jnp.where(flown[..., None], step.flight.position, jnp.nan),
+        quaternion=jnp.where(flown[..., None], step.flight.quaternion, jnp.nan),
+        velocity=jnp.where(flown[..., None], step.flight.velocity, jnp.nan),
+        clearance=jnp.where(flown, clearance, jnp.nan),
+        action=jnp.where(running, action, -1),
+        reward=jnp.where(running, step.reward, jnp.nan),
+    )
+    return jax.tree.map(lambda whole, new: whole.at[flying.decision].set(new), flying.record, row)
+
+
+def _by_mission(record: Record) -> Record:
+    """[D, M, n, ...] to [M, D n, ...]."""
+
+    def joined(leaf: Array) -> Array:
+        leaf = jnp.moveaxis(leaf, 1, 0)
+        return leaf.reshape(leaf.shape[0], leaf.shape[1] * leaf.shape[2], *leaf.shape[3:])
+
+    return Record(
+        position=joined(record.position),
+        quaternion=joined(record.quaternion),
+        velocity=joined(record.velocity),
+        clearance=joined(record.clearance),
+        action=record.action.T,
+        reward=record.reward.T,
+    )

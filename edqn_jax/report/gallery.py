@@ -1,0 +1,105 @@
+"""All pictures of a run, drawn from its directory and its final flight."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from edqn_jax.config import Config
+from edqn_jax.learn import encoder
+from edqn_jax.learn.policy import PolicyParams
+from edqn_jax.report.curves import draw_learning, draw_returns
+from edqn_jax.report.flights import draw_path, draw_world
+from edqn_jax.report.images import draw_events, draw_reconstruction
+from edqn_jax.rundir import TRAJECTORY_COLUMNS, RunDirectory
+from edqn_jax.sim import camera, env, events
+from edqn_jax.sim.drone import Flight
+from edqn_jax.sim.scene import Scene
+
+MOMENTS = 5
+"""Moments of the flight that are shown."""
+
+FINE = 8
+"""How much finer than the drone's camera the pictures for people are, per axis."""
+
+
+def draw_gallery(
+    config: Config, run: RunDirectory, scene: Scene, params: PolicyParams, shortest: np.ndarray
+) -> None:
+    """World, events, path, returns, learning and reconstruction into the run's `figures/`."""
+    table = np.atleast_2d(np.loadtxt(run.trajectory_file, delimiter=",", skiprows=1))
+    flown = dict(zip(TRAJECTORY_COLUMNS, table.T, strict=True))
+    draw_world(scene, run.figures / "world.png")
+    outcome = _outcome(config, scene, flown)
+    draw_path(scene, flown, shortest, run.figures / "path.png", outcome, config.env.goal_radius_m)
+    draw_returns(run.read_episodes(), run.figures / "returns.png")
+    draw_learning(run.read_metrics(), run.figures / "learning.png")
+    _draw_what_it_sees(config, run, scene, params, flown)
+
+
+def _outcome(config: Config, scene: Scene, flown: dict[str, np.ndarray]) -> str:
+    """How the recorded flight ended, read off its last row."""
+    end = np.array([flown[axis][-1] for axis in "xyz"])
+    if flown["clearance"][-1] <= 1e-3:
+        return "collision"
+    if np.linalg.norm(end - np.asarray(scene.goal)) < config.env.goal_radius_m:
+        return "goal"
+    inside = np.all((end >= np.asarray(scene.volume[0])) & (end <= np.asarray(scene.volume[1])))
+    return "time_out" if inside else "left_volume"
+
+
+def _draw_what_it_sees(
+    config: Config, run: RunDirectory, scene: Scene, params: PolicyParams, flown: dict[str, np.ndarray]
+) -> None:
+    """RGB beside events at moments of the flight, and what the VAE makes of those events."""
+    n, steps = config.drone.physics_steps, len(flown["t"])
+    # Whole decisions, spread over the flight; row k of the table stands after physics step k + 1.
+    decisions = np.unique(np.linspace(1, max(steps // n, 1), MOMENTS + 1).astype(int)[:-1])
+    offsets = np.array(env.frame_steps(config)) - n
+    rows = np.clip(decisions[:, None] * n + offsets[None] - 1, 0, steps - 1)
+    position = np.stack([flown[k] for k in ("x", "y", "z")], -1).astype(np.float32)
+    quaternion = np.stack([flown[k] for k in ("qw", "qx", "qy", "qz")], -1).astype(np.float32)
+    poses = Flight(
+        position=jnp.asarray(position[rows]), quaternion=jnp.asarray(quaternion[rows]), velocity=jnp.zeros(0)
+    )
+    native, fine = _rgb(config, scene, poses, 1), _rgb(config, scene, poses, FINE)
+    frames = native[..., 0] * camera.LUMA[0] + native[..., 1] * camera.LUMA[1] + native[..., 2] * camera.LUMA[2]
+    fields = jax.vmap(lambda f: _field(config, f))(jnp.asarray(frames))
+    counts = np.asarray(jax.vmap(events.event_image)(fields))
+    draw_events(
+        _display(fine[:, -1]), _display(native[:, -1]), counts, run.figures / "events.png", list(rows[:, -1] * config.drone.physics_dt_s)
+    )
+    code = encoder.embed(config.encoder, params.encoder, fields)
+    on, off = np.moveaxis(np.expm1(np.asarray(encoder.decode(config.encoder, params.encoder, code))), -3, 0)
+    draw_reconstruction(counts, on - off, run.figures / "reconstruction.png")
+
+
+def _field(config: Config, frames: Any) -> events.EventField:
+    sensor, noise = jax.random.split(jax.random.key(0))
+    memory = events.reset_memory(config.events, config.camera.height, config.camera.width, sensor)
+    return events.events(config.events, memory, frames, config.events.frame_times_s, noise)[0]
+
+
+def _rgb(config: Config, scene: Scene, poses: Flight, finer: int) -> np.ndarray:
+    """[M, T, H, W, 3] linear RGB at poses [M, T], `finer` times the camera's resolution."""
+    lens = dataclasses.replace(
+        config.camera, width=config.camera.width * finer, height=config.camera.height * finer
+    )
+
+    @jax.jit
+    def picture(position: jax.Array, quaternion: jax.Array) -> jax.Array:
+        return camera.rgb(lens, scene, position, env.mount_rotation(config, quaternion))
+
+    moments = np.shape(poses.position)[:2]
+    wanted = [(m, t) for m in range(moments[0]) for t in range(moments[1])]
+    images = [np.asarray(picture(poses.position[m, t], poses.quaternion[m, t])) for m, t in wanted]
+    return np.stack(images).reshape(*moments, *images[0].shape)
+
+
+def _display(linear: np.ndarray) -> np.ndarray:
+    """Linear brightness as screens show it (gamma 2.2)."""
+    return np.clip(linear, 0.0, 1.0) ** (1 / 2.2)

@@ -1,0 +1,335 @@
+"""The training command: a dumb host loop around compiled chunks, and what a run leaves behind.
+
+Run a chunk; fetch a handful of numbers; log, validate, save, draw progress; again. At the end the greedy
+policy flies the mission, and the pictures are drawn.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import platform
+import time
+from collections.abc import Callable
+from importlib import metadata
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
+
+from edqn_jax.baselines.astar import Path as ShortestPath
+from edqn_jax.baselines.astar import shortest_path
+from edqn_jax.checkpoint import save_policy
+from edqn_jax.config import DENSITIES, Config
+from edqn_jax.devices import choose_devices
+from edqn_jax.endings import DivergedError, StoppedError
+from edqn_jax.evaluate import flight_summary, summarise, trajectory
+from edqn_jax.flights import Flights, fly_missions
+from edqn_jax.learn.policy import PolicyParams
+from edqn_jax.learn.trainer import Episodes, Losses, Plan, Trainer, TrainState, policy_of
+from edqn_jax.report.gallery import draw_gallery
+from edqn_jax.report.progress import Progress
+from edqn_jax.rundir import RunDirectory
+from edqn_jax.sim import drone, worlds
+from edqn_jax.sim.env import Outcome, World
+from edqn_jax.sim.mjcf import check_scene, load_world, resolve_world
+from edqn_jax.sim.scene import Scene, obstacle_count, stack_scenes, take_scene
+from edqn_jax.sim.worlds import Missions
+
+
+@dataclasses.dataclass(frozen=True)
+class Courses:
+    """Where a run trains, validates and is judged; the last two of one shape, so that one program flies both."""
+
+    training: World
+    validation: World
+    final: World
+    """Mission 0 is the one that is judged; nothing flies it before the end."""
+    shortest: ShortestPath
+    """A*'s path of that mission."""
+
+    @property
+    def scene(self) -> Scene:
+        """The world of the mission that is judged."""
+        return take_scene(self.final.pool, self.final.missions.scene[0])
+
+
+def lay_courses(config: Config) -> Courses:
+    """Worlds and missions of a run; all of it follows from the configuration's world and seed.
+
+    Raises:
+        ConfigError: if the world cannot be flown in.
+    """
+    airframe = drone.load_airframe(config.drone)
+    count, radius = config.train.validation_missions, config.drone.body_radius_m
+    root = jax.random.key(config.train.seed)
+    training_key, validation_key = (jax.random.fold_in(root, purpose) for purpose in (1, 2))
+    if config.world.name in DENSITIES:
+        pools = {
+            split: worlds.random_pool(config.world.name, worlds.world_keys(split, number))
+            for split, number in (("training", config.world.pool_size), ("validation", count), ("test", count))
+        }
+        training = worlds.random_missions(pools["training"], config.world.missions, training_key)
+        validation, final = (worlds.own_missions(pools[split]) for split in ("validation", "test"))
+        judged = take_scene(pools["test"], 0)
+        return Courses(
+            training=World(airframe, pools["training"], training),
+            validation=World(airframe, pools["validation"], validation),
+            final=World(airframe, pools["test"], final),
+            shortest=shortest_path(judged, judged.start, judged.goal, radius),
+        )
+    loaded = load_world(resolve_world(config.world.name))
+    check_scene(loaded.scene, radius, names=loaded.names, title=f"'{config.world.name}'")
+    shortest = shortest_path(loaded.scene, loaded.scene.start, loaded.scene.goal, radius)
+    pool = stack_scenes([loaded.scene])
+    spread, jitter = config.world.own_start_fraction, config.world.start_jitter_m
+    training = worlds.spread_missions(pool, config.world.missions, spread, jitter, training_key)
+    # Half of the validation begins near the start, but never at it.
+    validation = worlds.spread_missions(pool, count, 0.5, max(jitter, 0.5), validation_key)
+    own = worlds.own_missions(pool)
+    final = jax.tree.map(lambda one, many: jnp.concatenate([one, many[1:]]), own, validation)
+    return Courses(
+        training=World(airframe, pool, training),
+        validation=World(airframe, pool, validation),
+        final=World(airframe, pool, _typed(final)),
+        shortest=shortest,
+    )
+
+
+def _typed(missions: Missions) -> Missions:
+    return missions.replace(scene=missions.scene.astype(jnp.int32))
+
+
+@dataclasses.dataclass
+class _Best:
+    """The parameters that a run would end with now, and where they come from."""
+
+    params: PolicyParams
+    success: float = -1.0
+    decisions: int = 0
+
+
+class _Log:
+    """What the host keeps of a run while it goes on."""
+
+    def __init__(self, config: Config, run: RunDirectory, progress: Progress) -> None:
+        self.config, self.run, self.progress = config, run, progress
+        self.episodes = 0
+        self.validations: list[tuple[int, float, float, bool]] = []  # decisions, seconds, rate, mission 0
+
+    def chunk(self, first: int, episodes: Episodes, losses: Losses, seconds: float) -> dict[str, Any]:
+        """Writes what ended in a chunk and returns its metrics."""
+        envs = self.config.train.num_envs
+        outcome, length, gain = (
+            np.asarray(x).reshape(len(x), -1) for x in (episodes.outcome, episodes.length, episodes.episode_return)
+        )
+        rows, columns = np.nonzero(outcome)
+        kinds = outcome[rows, columns]
+        self.run.append_episodes(
+            ((first + r + 1) * envs, float(gain[r, c]), int(length[r, c]), Outcome(int(k)).name.lower())
+            for r, c, k in zip(rows, columns, kinds, strict=True)
+        )
+        self.episodes += len(rows)
+        plan = Plan.of(self.config)
+        steps = len(outcome)
+        warming = first + steps <= plan.warmup
+        return {
+            "phase": "seeing" if warming else "flying",
+            "decisions": (first + steps) * envs,
+            "decisions_per_second": steps * envs / seconds,
+            "episodes": self.episodes,
+            "success_rate": float(np.mean(kinds == Outcome.GOAL)) if len(kinds) else None,
+            "mean_return": float(np.mean(gain[rows, columns])) if len(kinds) else None,
+            "epsilon": float(losses.epsilon[-1]),
+            "q_loss": _mean(losses.q_loss),
+            "mean_q": _mean(losses.mean_q),
+            "reconstruction_loss": _mean(losses.reconstruction),
+            "kl": _mean(losses.kl),
+        }
+
+    def first_success(self) -> tuple[int | None, float | None]:
+        """Decisions and seconds at the first validation from which its mission 0 was always flown to the goal."""
+        since: tuple[int | None, float | None] = (None, None)
+        for decisions, seconds, _, flown in self.validations:
+            if not flown:
+                since = (None, None)
+            elif since[0] is None:
+                since = (decisions, seconds)
+        return since
+
+
+def _mean(values: Any) -> float | None:
+    """Mean of what learnt in a chunk; None if nothing did."""
+    finite = np.asarray(values)
+    finite = finite[~np.isnan(finite)]
+    return float(np.mean(finite)) if len(finite) else None
+
+
+def train_run(
+    config: Config, run: RunDirectory, progress: Progress, stop_requested: Callable[[], bool]
+) -> dict[str, Any]:
+    """Train, validate, fly, draw; everything lands in the run directory.
+
+    Returns:
+        what `summary.json` holds.
+
+    Raises:
+        ConfigError: before anything is written, if the run cannot be made.
+        DivergedError: if a loss stops being finite.
+        StoppedError: after saving the policy, if `stop_requested()` turned true.
+    """
+    began = time.perf_counter()
+    courses = lay_courses(config)
+    devices = choose_devices(config.train.devices, config.train.shards)
+    trainer = Trainer(config, courses.training, devices)
+    run.create(config)
+    progress.message(f"{config.world.name} world, {len(devices)} {devices[0].platform} devices; compiling")
+    state = trainer.init(config.train.seed)
+    compiling = time.perf_counter()
+    trainer.compile(state)
+    compile_seconds = time.perf_counter() - compiling
+
+    plan, envs, chunk = trainer.plan, config.train.num_envs, config.train.chunk_steps
+    log = _Log(config, run, progress)
+    best = _Best(jax.tree.map(np.asarray, policy_of(state)))
+    mesh = Mesh(np.asarray(devices), ("mission",))
+    progress.start(plan.total * envs)
+    train_seconds, validated = 0.0, 0
+    done = 0
+    while done < plan.total:
+        started = time.perf_counter()
+        state, (episodes, losses) = trainer.chunk(state, done)
+        losses = jax.tree.map(np.asarray, losses)
+        seconds = time.perf_counter() - started
+        train_seconds += seconds
+        metrics = log.chunk(done, episodes, losses, seconds)
+        done += chunk
+        _check_finite(plan, done, losses)
+        finished = done >= plan.total or 0 < config.train.max_episodes <= log.episodes
+        every = config.train.validation_every
+        # On crossing a multiple, never on equality: right for any number of environments.
+        crossed = every > 0 and done * envs // every > validated // every and done > plan.learn_from
+        if crossed or finished:
+            validated = done * envs
+            params = jax.tree.map(np.asarray, policy_of(state))
+            flights = _fly(config, courses.validation, params, mesh)
+            rate = float(np.mean(flights.outcome == Outcome.GOAL))
+            flown = bool(flights.outcome[0] == Outcome.GOAL)
+            log.validations.append((validated, time.perf_counter() - began, rate, flown))
+            metrics["validation_success"] = rate
+            if config.train.keep == "last" or rate >= best.success:
+                best = _Best(params, rate, validated)
+        run.append_metrics(metrics)
+        progress.update(metrics)
+        if stop_requested() and not finished:
+            save_policy(run.checkpoints, best.params)
+            raise StoppedError(f"stopped after {done * envs:,} decisions; the policy is in '{run.checkpoints}'")
+        if finished:
+            break
+    progress.stop()
+    save_policy(run.checkpoints, best.params)
+
+    flights = _fly(config, courses.final, best.params, mesh)
+    run.write_trajectory(trajectory(config, flights))
+    scene = jax.tree.map(np.asarray, courses.scene)
+    draw_gallery(config, run, scene, best.params, np.asarray(courses.shortest.points))
+    since = log.first_success()
+    summary = {
+        **flight_summary(flights),
+        "shortest_path_m": courses.shortest.length_m,
+        "world": config.world.name,
+        "seed": config.train.seed,
+        "train_decisions": done * envs,
+        "train_seconds": train_seconds,
+        "compile_seconds": compile_seconds,
+        "total_seconds": time.perf_counter() - began,
+        "decisions_per_second": done * envs / train_seconds,
+        "episodes": log.episodes,
+        "first_success_decisions": since[0],
+        "first_success_seconds": since[1],
+        "validation_success": best.success,
+        "parameters_from_decisions": best.decisions,
+        "workload": workload(config, scene),
+        "devices": [str(device) for device in devices],
+        "versions": versions(),
+        "state_digest": state_digest(state),
+    }
+    if config.world.name in DENSITIES:
+        summary["test"] = summarise(flights)
+    run.write_summary(summary)
+    progress.message(_verdict(summary, run))
+    return summary
+
+
+def _fly(config: Config, world: World, params: PolicyParams, mesh: Mesh) -> Flights:
+    """The world's missions, flown and recorded; sensor noise is the same each time."""
+    everywhere = NamedSharding(mesh, PartitionSpec())
+    world, params, key = jax.device_put((world, params, jax.random.key(config.train.seed)), everywhere)
+    flights = fly_missions(config, world, params, key, record=True, mesh=mesh)
+    return jax.tree.map(np.asarray, flights)
+
+
+def _check_finite(plan: Plan, done: int, losses: Losses) -> None:
+    learns = np.arange(done - len(losses.q_loss), done) >= plan.learn_from
+    bad = learns & ~np.isfinite(losses.q_loss)
+    if bad.any():
+        raise DivergedError(f"training diverged: the Q loss was {losses.q_loss[bad][0]} at training step {done}")
+
+
+def _verdict(summary: dict[str, Any], run: RunDirectory) -> str:
+    ending = {
+        "goal": "reached the goal",
+        "collision": "hit something",
+        "left_volume": "left the flight volume",
+        "time_out": "ran out of time",
+        "diverged": "left the range of numbers",
+    }[summary["outcome"]]
+    text = (
+        f"The greedy flight {ending} after {summary['steps']} decisions ({summary['flight_seconds']:.1f} s), "
+        f"{summary['path_length_m']:.1f} m flown where the shortest path is {summary['shortest_path_m']:.1f} m, "
+        f"never nearer than {summary['min_clearance_m']:.2f} m to anything."
+    )
+    if "test" in summary:
+        test = summary["test"]
+        low, high = test["interval"]
+        text += (
+            f"\nUnseen test worlds: {test['successes']} of {test['missions']} "
+            f"({test['success_rate']:.0%}, 95 % interval {low:.0%} to {high:.0%})."
+        )
+    return f"{text}\nTrained in {summary['train_seconds']:.0f} s; everything is in {run.path}"
+
+
+def workload(config: Config, scene: Scene) -> dict[str, Any]:
+    """The workload that a figure is for, as every JSON of ours states it."""
+    agent, envs = config.agent, config.train.num_envs
+    return {
+        "physics_steps_per_decision": config.drone.physics_steps,
+        "physics_dt": config.drone.physics_dt_s,
+        "width": config.camera.width,
+        "height": config.camera.height,
+        "frames_per_decision": len(config.events.frame_times_s),
+        "obstacles": obstacle_count(scene),
+        "replayed_samples_per_decision": agent.batch_size * agent.updates_per_step / envs,
+        "vae_samples_per_decision": 1.0 if config.encoder.keep_learning else 0.0,
+        "num_envs": envs,
+        "physics": "mjx",
+    }
+
+
+def versions() -> dict[str, str]:
+    """Versions of what a figure depends on."""
+    packages = ("jax", "mujoco", "mujoco-mjx", "flax", "optax", "numpy")
+    return {"python": platform.python_version(), **{name: metadata.version(name) for name in packages}}
+
+
+def state_digest(state: TrainState) -> str:
+    """SHA-256 over the leaves of the train state in the order of the pytree."""
+    digest = hashlib.sha256()
+    for leaf in jax.tree.leaves(state):
+        raw = jax.random.key_data(leaf) if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key) else leaf
+        array = np.asarray(raw)
+        digest.update(f"{array.dtype}{array.shape}".encode())
+        digest.update(array.tobytes())
+    return digest.hexdigest()

@@ -1,0 +1,105 @@
+"""The flying policy sees what the replay trained it on."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from edqn_jax.config import AgentConfig, CameraConfig, Config, EncoderConfig
+from edqn_jax.learn import encoder, policy, qnetwork, replay
+from edqn_jax.sim.env import ACTIONS, OWN_SIZE, Observation
+from edqn_jax.sim.events import field_of_counts
+
+CONFIG = Config(
+    camera=CameraConfig(width=8, height=6),
+    encoder=EncoderConfig(code_size=5, features=4, hidden=8, decoder_hidden=(8,)),
+    agent=AgentConfig(history=3, hidden=(16,)),
+)
+SIZE = policy.observation_size(CONFIG)
+
+
+@pytest.fixture(scope="module")
+def params():
+    @jax.jit
+    def fresh(key):
+        code_key, q_key = jax.random.split(key)
+        return policy.PolicyParams(
+            encoder=encoder.init_encoder(CONFIG.encoder, CONFIG.camera, code_key),
+            q=qnetwork.init_q(CONFIG.agent, SIZE, len(ACTIONS), q_key),
+        )
+
+    return fresh(jax.random.key(0))
+
+
+def observations(count, seed=0):
+    rng = np.random.default_rng(seed)
+    counts = rng.integers(-3, 4, (count, 6, 8)).astype(np.int8)
+    own = rng.normal(size=(count, OWN_SIZE)).astype(np.float32)
+    return [
+        Observation(events=field_of_counts(CONFIG.events, jnp.asarray(c)), own=jnp.asarray(o))
+        for c, o in zip(counts, own, strict=True)
+    ]
+
+
+@pytest.fixture(scope="module")
+def act():
+    return jax.jit(lambda *inputs: policy.act(CONFIG, *inputs))
+
+
+def test_memory_stacks_an_episode_as_the_replay_does(params, act):
+    seen = observations(5)
+    flat = np.stack([policy.flatten(CONFIG, params.encoder, each) for each in seen])
+    memory = policy.empty_memory(CONFIG)
+    history = CONFIG.agent.history
+    # The replay's rows: an older episode's observations before this one's first, which is a reset.
+    rows = np.concatenate([np.full((history, SIZE), 9.0, np.float32), flat])
+    resets = np.zeros(len(rows), bool)
+    resets[history] = True
+    for now, each in enumerate(seen):
+        _, memory = act(params, memory, each, jax.random.key(now))
+        window = slice(now + 1, now + 1 + history)
+        trained_on = replay.stacked(jnp.asarray(rows[window]), jnp.asarray(resets[window]))
+        # Compiled and not compiled, hence not to the last digit.
+        np.testing.assert_allclose(memory, trained_on, atol=1e-5)
+
+
+def test_an_observation_is_the_scaled_code_and_the_own_state(params):
+    one = observations(1)[0]
+    flat = policy.flatten(CONFIG, params.encoder, one)
+    assert flat.shape == (SIZE,) == (5 + OWN_SIZE,)
+    code = encoder.embed(CONFIG.encoder, params.encoder, one.events)
+    np.testing.assert_allclose(flat[:5], CONFIG.agent.code_scale * code, rtol=1e-6)
+    np.testing.assert_array_equal(flat[5:], one.own)
+
+
+def test_the_greedy_move_is_the_best_of_the_network(params, act):
+    memory = policy.empty_memory(CONFIG)
+    for number, each in enumerate(observations(4, seed=1)):
+        move, memory = act(params, memory, each, jax.random.key(number))
+        q = qnetwork.q_values(CONFIG.agent, params.q, len(ACTIONS), memory)
+        assert int(move) == int(jnp.argmax(q)) and move.dtype == jnp.int32
+
+
+def test_memories_of_many_drones_are_remembered_side_by_side():
+    memory = jnp.arange(2 * 3 * 4.0).reshape(2, 3, 4)
+    new = -jnp.ones((2, 4))
+    both = policy.remember(memory, new)
+    for drone in range(2):
+        np.testing.assert_array_equal(both[drone], policy.remember(memory[drone], new[drone]))
+    np.testing.assert_array_equal(both[:, :2], memory[:, 1:])
+    np.testing.assert_array_equal(both[:, 2], new)
+
+
+def test_the_table_of_the_paper_has_a_state_of_42():
+    assert policy.observation_size(Config()) == 42
+
+
+@pytest.mark.usefixtures("strict_jax")
+def test_the_policy_is_strict(params):
+    one = observations(1)[0]
+    move, memory = jax.jit(lambda *inputs: policy.act(CONFIG, *inputs, epsilon=0.5))(
+        params, policy.empty_memory(CONFIG), one, jax.random.key(3)
+    )
+    assert memory.shape == (3, SIZE) and move.shape == ()

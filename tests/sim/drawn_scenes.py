@@ -1,0 +1,72 @@
+"""Scenes and poses drawn at random, every kind of shape among them."""
+
+# pyright: reportArgumentType=false
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from numpy.typing import NDArray
+
+from edqn_jax.sim.scene import (
+    Capsules,
+    Planes,
+    Scene,
+    Shape,
+    Spheres,
+    TiltedBoxes,
+    TiltedCylinders,
+    UprightBoxes,
+    UprightCylinders,
+    build_scene,
+    signed_distance,
+)
+
+VOLUME = np.array([[0.0, 0.0, 0.0], [60.0, 60.0, 25.0]])
+GROUND = Planes(position=np.zeros(3), normal=np.array([0.0, 0.0, 1.0]), albedo=np.array([0.37, 0.43, 0.35]))
+
+
+def scene_of(*shapes: Shape, **capacities: int) -> Scene:
+    return build_scene(shapes, volume=VOLUME, start=VOLUME[0], goal=VOLUME[1], capacities=capacities)
+
+
+def rotation_of(roll: float, pitch: float, yaw: float) -> NDArray:
+    """[3, 3] body-to-world: yaw about z, then pitch about y, then roll about x."""
+    (cr, sr), (cp, sp), (cy, sy) = ((np.cos(a), np.sin(a)) for a in (roll, pitch, yaw))
+    turn = np.array([[cy, -sy, 0], [sy, cy, 0], [0, 0, 1]])
+    lean = np.array([[cp, 0, sp], [0, 1, 0], [-sp, 0, cp]])
+    return turn @ lean @ np.array([[1, 0, 0], [0, cr, -sr], [0, sr, cr]])
+
+
+def every_kind(rng: np.random.Generator, each: int = 4) -> Scene:
+    """`each` shapes of every kind over level ground, some flying and overlapping; capacities never vary."""
+    shapes: list[Shape] = [GROUND]
+    for _ in range(each):
+        rotation = rotation_of(*rng.uniform(-np.pi, np.pi, 3))
+        axis = rotation[:, 2]
+        place = [rng.uniform((0, 0, 0), (60, 60, 20)) for _ in range(6)]
+        albedo = [rng.uniform(0.1, 0.9, 3) for _ in range(6)]
+        half = [rng.uniform(0.5, 5, 3) for _ in range(2)]
+        size = rng.uniform(0.4, 4, 8)
+        shapes += [
+            UprightBoxes(position=place[0], half=half[0], yaw=rng.uniform(-3, 3), albedo=albedo[0]),
+            UprightCylinders(position=place[1], radius=size[0], half_height=2 * size[1], albedo=albedo[1]),
+            Spheres(position=place[2], radius=size[2], albedo=albedo[2]),
+            TiltedBoxes(position=place[3], half=half[1], rotation=rotation, albedo=albedo[3]),
+            Capsules(position=place[4], axis=axis, half_length=size[4], radius=size[5], albedo=albedo[4]),
+            TiltedCylinders(
+                position=place[5], axis=axis, half_length=size[6], radius=size[7], albedo=albedo[5]
+            ),
+        ]
+    return scene_of(*shapes)
+
+
+_distances = jax.jit(lambda scene, points: jax.vmap(lambda p: signed_distance(scene, p))(points))
+
+
+def free_points(scene: Scene, rng: np.random.Generator, count: int, clearance: float = 0.5) -> NDArray:
+    """[count, 3] points of the flight volume at least `clearance` metres from everything."""
+    lower, upper = np.asarray(scene.volume)
+    points = rng.uniform(lower + 1, upper - 1, (64 * count, 3)).astype(np.float32)
+    return points[np.asarray(_distances(scene, jnp.asarray(points))) > clearance][:count]

@@ -1,0 +1,153 @@
+"""Figures of flights, and `edqn evaluate` from a folder to its files."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import mujoco
+import numpy as np
+import pytest
+
+from edqn_jax.checkpoint import save_policy
+from edqn_jax.cli import EvaluateArgs
+from edqn_jax.config import Config, ConfigError
+from edqn_jax.evaluate import (
+    decision_latency_ms,
+    evaluate_command,
+    load_run,
+    spl,
+    summarise,
+    wilson_interval,
+)
+from edqn_jax.flights import Closest, Flights
+from edqn_jax.resolve import to_yaml
+from edqn_jax.sim.env import Outcome
+from edqn_jax.verdict import load_judge, replay_contact
+from tests.policies import CONFIG, always
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("run")
+    (folder / "config.yaml").write_text(to_yaml(CONFIG))
+    save_policy(folder / "checkpoints", always((1, 0, 0)))
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("successes", "missions", "low", "high"),
+    [  # by bisection of the score equation n (k/n - p)^2 = z^2 p (1 - p), in decimals
+        (0, 10, 0.0, 0.277533),
+        (5, 10, 0.236593, 0.763407),
+        (10, 10, 0.722467, 1.0),
+        (70, 100, 0.604151, 0.781051),
+        (0, 0, 0.0, 1.0),
+    ],
+)
+def test_the_interval_is_wilsons(successes, missions, low, high):
+    assert wilson_interval(successes, missions) == pytest.approx((low, high), abs=2e-6)
+
+
+def test_spl_is_one_for_the_shortest_path_half_for_twice_it_and_zero_for_a_failure():
+    success = np.array([True, True, False, True])
+    flown, shortest = np.array([10.0, 20.0, 5.0, 9.0]), np.array([10.0, 10.0, np.nan, 10.0])
+    # The last is cut short by the goal's radius and counts as 1, not more.
+    assert spl(success, flown, shortest) == pytest.approx((1 + 0.5 + 0 + 1) / 4)
+
+
+def four_flights() -> Flights:
+    outcome = np.array([Outcome.GOAL, Outcome.GOAL, Outcome.COLLISION, Outcome.TIME_OUT])
+    return Flights(
+        outcome=outcome,  # type: ignore[arg-type]
+        decisions=np.array([10, 20, 5, 200]),  # type: ignore[arg-type]
+        physics_steps=np.array([125, 260, 60, 2600]),  # type: ignore[arg-type]
+        contact=np.array([1.0, 1.0, 0.5, 1.0]),  # type: ignore[arg-type]
+        episode_return=np.array([100.0, 90.0, -100.0, 0.0]),  # type: ignore[arg-type]
+        path_length_m=np.array([10.0, 30.0, 5.0, 50.0]),  # type: ignore[arg-type]
+        flight_seconds=np.array([2.5, 5.2, 1.2, 52.0]),  # type: ignore[arg-type]
+        closest=Closest(
+            distance=np.array([0.5, 0.2, 0.0, 0.1]),  # type: ignore[arg-type]
+            time=np.zeros(4),  # type: ignore[arg-type]
+            position=np.zeros((4, 3)),  # type: ignore[arg-type]
+            quaternion=np.zeros((4, 4)),  # type: ignore[arg-type]
+        ),
+        record=None,
+    )
+
+
+def test_figures_of_four_flights_are_those_worked_out_by_hand():
+    figures = summarise(four_flights(), np.array([10.0, 20.0, np.nan, np.nan]))
+    assert (figures["missions"], figures["successes"], figures["success_rate"]) == (4, 2, 0.5)
+    kinds = ("collisions", "left_volume", "timeouts", "diverged")
+    assert [figures[kind] for kind in kinds] == [1, 0, 1, 0]
+    assert figures["interval"] == pytest.approx([0.150039, 0.849961], abs=2e-6)
+    assert figures["spl"] == pytest.approx((1 + 2 / 3) / 4)
+    assert figures["path_over_shortest"] == pytest.approx(1.25)
+    assert (figures["decisions"], figures["path_length_m"]) == (15.0, 20.0)
+    assert figures["flight_seconds"] == pytest.approx(3.85)
+    assert figures["return"] == pytest.approx(22.5)
+    assert figures["min_clearance_m"] == pytest.approx(0.2)
+
+
+def test_without_shortest_paths_there_is_no_spl():
+    assert summarise(four_flights())["spl"] is None
+
+
+def test_a_decision_takes_a_measured_time():
+    latency = decision_latency_ms(CONFIG, always((0, 0, 0)), calls=20)
+    assert 0 < latency["median"] <= latency["p99"]
+
+
+def test_a_run_is_its_configuration_and_its_policy(run):
+    config, params = load_run(run)
+    assert config == CONFIG
+    np.testing.assert_array_equal(params.q["Dense_1"]["bias"], always((1, 0, 0)).q["Dense_1"]["bias"])
+
+
+def test_no_run_an_empty_one_and_one_that_does_not_fit_are_sentences(tmp_path, run):
+    with pytest.raises(ConfigError, match="it holds no config.yaml"):
+        load_run(tmp_path)
+    (tmp_path / "config.yaml").write_text(to_yaml(Config()))
+    with pytest.raises(ConfigError, match="there is no policy"):
+        load_run(tmp_path)
+    (tmp_path / "checkpoints").symlink_to(run / "checkpoints")
+    with pytest.raises(ConfigError, match="does not have the shapes that its config.yaml asks for"):
+        load_run(tmp_path)
+
+
+def test_a_file_that_cannot_be_written_is_named_before_anything_is_flown(run, tmp_path):
+    with pytest.raises(ConfigError, match="there is no folder"):
+        evaluate_command(EvaluateArgs(run, json=tmp_path / "nowhere" / "figures.json"))
+
+
+@pytest.mark.slow
+def test_the_command_prints_and_writes_flights_that_anybody_can_check(run, tmp_path, capsys):
+    figures_file, flights_file = tmp_path / "figures.json", tmp_path / "flights.npz"
+    args = EvaluateArgs(run, missions=200, seed=3, json=figures_file, trajectories=flights_file)
+    evaluate_command(args)
+    assert "reached the goal" in capsys.readouterr().out
+    figures = json.loads(figures_file.read_text())
+    asked = {"missions", "successes", "success_rate", "interval", "collisions", "left_volume", "timeouts"}
+    assert asked | {"diverged", "spl", "world", "seed", "decision_latency_ms"} <= set(figures)
+    assert (figures["missions"], figures["world"], figures["seed"]) == (200, "paper", 3)
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["figures.json", "flights.npz"]
+
+    flights = np.load(flights_file)
+    radius = float(flights["body_radius_m"])
+    judges = [load_judge(mujoco.MjSpec.from_string(str(text)), radius) for text in flights["mjcf"]]
+    hits = 0
+    for i, outcome in enumerate(flights["outcome"]):
+        path = flights["positions"][i, : flights["lengths"][i]]
+        attitudes = flights["attitudes"][i, : len(path)]
+        np.testing.assert_array_equal(path[0], flights["start"][i])
+        np.testing.assert_allclose(np.linalg.norm(attitudes, axis=1), 1.0, atol=1e-4)
+        contact = replay_contact(judges[flights["scene"][i]], path)
+        assert (contact is not None) == (outcome == "collision")
+        if contact is not None:
+            hits += 1
+            assert contact.segment == len(path) - 2
+            # A millimetre of a segment of 8 cm.
+            assert contact.fraction == pytest.approx(flights["contact"][i], abs=0.0125)
+            np.testing.assert_allclose(contact.position, flights["closest_position"][i], atol=1e-3)
+    assert hits == figures["collisions"] > 0
