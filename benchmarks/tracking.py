@@ -82,9 +82,7 @@ def measure(config: DroneConfig, speed: float, decide: Decide) -> list[dict[str,
     return rows
 
 
-def response(
-    velocity: np.ndarray, before: np.ndarray, after: np.ndarray, dt: float
-) -> dict[str, float | None]:
+def response(velocity: np.ndarray, before: np.ndarray, after: np.ndarray, dt: float) -> dict[str, float | None]:
     """Step-response figures of velocity [n, 3] m/s, its first row flown just before the command changed."""
     steady = float(np.linalg.norm(velocity[-STEADY_STEPS:] - after, axis=1).max())
     size = np.linalg.norm(after - before)

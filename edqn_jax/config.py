@@ -145,6 +145,8 @@ class EnvConfig:
     """`sparse`: Eq. 8. `progress`: adds metres gained. `potential`: the policy-invariant form."""
     progress_weight: float = 3.0
     """Reward per metre gained towards the goal (`progress`, `potential`)."""
+    path_weight: float = 0.5
+    """Reward lost per metre flown (`progress`), so that weaving on the way is not free."""
     goal_reward: float = 100.0
     """Reward at the goal (Eq. 8)."""
     collision_reward: float = -100.0
@@ -302,7 +304,9 @@ def preset(name: str) -> Config:
     if name == "paper":
         return dataclasses.replace(
             Config(),
-            env=EnvConfig(reward="sparse", progress_weight=1.0, left_volume_reward=0.0, step_reward=0.0),
+            env=EnvConfig(
+                reward="sparse", progress_weight=1.0, path_weight=0.0, left_volume_reward=0.0, step_reward=0.0
+            ),
             agent=AgentConfig(
                 hidden=(16, 16),
                 dueling=False,
@@ -322,9 +326,7 @@ def preset(name: str) -> Config:
                 exploration_end=0.01,
                 exploration_episodes=10,
             ),
-            train=TrainConfig(
-                num_envs=16, total_steps=500_000, max_episodes=40_000, chunk_steps=512, keep="last"
-            ),
+            train=TrainConfig(num_envs=16, total_steps=500_000, max_episodes=40_000, chunk_steps=512, keep="last"),
             world=WorldConfig(own_start_fraction=1.0, start_jitter_m=0.0),
         )
     raise ConfigError(f"there is no preset '{name}'; the presets are {', '.join(PRESETS)}")

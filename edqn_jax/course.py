@@ -93,9 +93,7 @@ def load_course(
     scene = dataclasses.replace(loaded.scene, **moved)
     spread = missions > 1
     if spread and start is not None:
-        raise ConfigError(
-            f"--start with --missions {missions}: in '{name}' all would be one and the same flight"
-        )
+        raise ConfigError(f"--start with --missions {missions}: in '{name}' all would be one and the same flight")
     if not spread:
         check_scene(scene, radius, names=loaded.names, title=f"'{name}'")
         pool = stack_scenes([scene])

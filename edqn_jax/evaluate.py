@@ -89,9 +89,7 @@ def spl(success: np.ndarray, flown: np.ndarray, shortest: np.ndarray) -> float:
 
 def shortest_paths(config: Config, world: World, wanted: np.ndarray) -> np.ndarray:
     """Length [M] of A*'s path for each of the `wanted` [M] missions, metres; NaN for the others."""
-    scene_of, starts, goals = (
-        np.asarray(x) for x in (world.missions.scene, world.missions.start, world.missions.goal)
-    )
+    scene_of, starts, goals = (np.asarray(x) for x in (world.missions.scene, world.missions.start, world.missions.goal))
     pool = jax.tree.map(np.asarray, world.pool)
     lengths = np.full(len(starts), np.nan)
     for i in np.flatnonzero(wanted):

@@ -187,9 +187,7 @@ def _fly(
     return dataclasses.replace(flying.flights, record=whole)
 
 
-def own_flight(
-    config: Config, world: World, params: PolicyParams, key: Array, *, mesh: Mesh | None = None
-) -> Flights:
+def own_flight(config: Config, world: World, params: PolicyParams, key: Array, *, mesh: Mesh | None = None) -> Flights:
     """The flight from the first world's own start to its own goal, recorded; M = 1.
 
     It is flown as often as `world` has missions, all alike, and the first is returned: a program that was
@@ -229,9 +227,7 @@ def _at_start(config: Config, world: World, state: EnvState) -> Flights:
     )
 
 
-def _tally(
-    config: Config, world: World, flights: Flights, before: EnvState, step: Step
-) -> tuple[Flights, Array]:
+def _tally(config: Config, world: World, flights: Flights, before: EnvState, step: Step) -> tuple[Flights, Array]:
     """The tallies of one flight after a decision, and the clearance [n] after each of its physics steps."""
     running = flights.outcome == Outcome.RUNNING
     steps = jnp.arange(config.drone.physics_steps)
@@ -259,8 +255,7 @@ def _tally(
         physics_steps=flights.physics_steps + step.end_step,
         contact=step.contact,
         episode_return=step.episode_return,
-        path_length_m=flights.path_length_m
-        + jnp.sum(jnp.where(flown, jnp.sqrt(jnp.sum(segment**2, axis=-1)), 0.0)),
+        path_length_m=flights.path_length_m + jnp.sum(jnp.where(flown, jnp.sqrt(jnp.sum(segment**2, axis=-1)), 0.0)),
         flight_seconds=times[step.end_step - 1],
         closest=jax.tree.map(lambda new, old: jnp.where(closer, new, old), closest, flights.closest),
         record=None,

@@ -91,17 +91,14 @@ def apply(config: Config, layer: Layer, source: str) -> Config:
             raise ConfigError(f"{source}: there is no group '{group}'{hint}")
         if not isinstance(values, Mapping):
             raise ConfigError(
-                f"{source}: '{group}' must hold keys such as '{_example(config, group)}', not "
-                f"{_describe(values)}"
+                f"{source}: '{group}' must hold keys such as '{_example(config, group)}', not {_describe(values)}"
             )
         section = getattr(config, group)
         hints = typing.get_type_hints(type(section))
         for key in values:
             if key not in hints:
                 raise ConfigError(f"{source}: there is no key '{group}.{key}'{nearest(key, hints)}")
-        checked = {
-            key: typed(value, hints[key], f"{source}: '{group}.{key}'") for key, value in values.items()
-        }
+        checked = {key: typed(value, hints[key], f"{source}: '{group}.{key}'") for key, value in values.items()}
         changed[group] = dataclasses.replace(section, **checked)
     return dataclasses.replace(config, **changed)
 

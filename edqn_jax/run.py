@@ -68,8 +68,9 @@ def lay_courses(config: Config) -> Courses:
     training_key, validation_key = (jax.random.fold_in(root, purpose) for purpose in (1, 2))
     if config.world.name in DENSITIES:
         pools = {
-            split: worlds.random_pool(config.world.name, worlds.world_keys(split, number))
-            for split, number in (("training", config.world.pool_size), ("validation", count), ("test", count))
+            "training": worlds.random_pool(config.world.name, worlds.world_keys("training", config.world.pool_size)),
+            "validation": worlds.random_pool(config.world.name, worlds.world_keys("validation", count)),
+            "test": worlds.random_pool(config.world.name, worlds.world_keys("test", count)),
         }
         training = worlds.random_missions(pools["training"], config.world.missions, training_key)
         validation, final = (worlds.own_missions(pools[split]) for split in ("validation", "test"))
@@ -99,7 +100,7 @@ def lay_courses(config: Config) -> Courses:
 
 
 def _typed(missions: Missions) -> Missions:
-    return missions.replace(scene=missions.scene.astype(jnp.int32))
+    return dataclasses.replace(missions, scene=missions.scene.astype(jnp.int32))
 
 
 @dataclasses.dataclass
@@ -128,7 +129,7 @@ class _Log:
         rows, columns = np.nonzero(outcome)
         kinds = outcome[rows, columns]
         self.run.append_episodes(
-            ((first + r + 1) * envs, float(gain[r, c]), int(length[r, c]), Outcome(int(k)).name.lower())
+            (int((first + r + 1) * envs), float(gain[r, c]), int(length[r, c]), str(Outcome(int(k)).name.lower()))
             for r, c, k in zip(rows, columns, kinds, strict=True)
         )
         self.episodes += len(rows)

@@ -93,9 +93,7 @@ class RunDirectory:
     def append_episodes(self, episodes: Iterable[tuple[int, float, int, str]]) -> None:
         """Adds rows of `EPISODE_COLUMNS` to `episodes.csv`."""
         with self.episodes_file.open("a", encoding="utf-8", newline="") as file:
-            rows = (
-                (int(step), f"{gain:.6g}", int(length), outcome) for step, gain, length, outcome in episodes
-            )
+            rows = ((int(step), f"{gain:.6g}", int(length), outcome) for step, gain, length, outcome in episodes)
             csv.writer(file, lineterminator="\n").writerows(rows)
 
     def write_summary(self, summary: Mapping[str, Any]) -> None:
@@ -144,9 +142,7 @@ def plan_run_directory(given: Path | None, config: Config, resume: Resume = "aut
         raise ConfigError(f"--run-dir '{given}' is a file; give a folder")
     occupied = given.is_dir() and any(given.iterdir())
     if occupied and not run.config_file.is_file():
-        raise ConfigError(
-            f"--run-dir '{given}' holds files that are no run of edqn; give a new or empty folder"
-        )
+        raise ConfigError(f"--run-dir '{given}' holds files that are no run of edqn; give a new or empty folder")
     if run.summary_file.is_file():
         raise ConfigError(f"--run-dir '{given}' holds a finished run; give another folder")
     if resume == "must" and not occupied:

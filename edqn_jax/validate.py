@@ -67,9 +67,7 @@ def _camera(camera: CameraConfig) -> None:
 def _events(events: EventsConfig, drone: DroneConfig) -> None:
     thresholds = ["threshold", "tolerance", "contrast_on", "contrast_off", "airsim_tolerance", "log_epsilon"]
     _positive(events, "events", [*thresholds, "refractory_ns"])
-    _not_negative(
-        events, "events", ["threshold_mismatch", "leak_rate_hz", "shot_rate_hz", "hot_pixel_rate_hz"]
-    )
+    _not_negative(events, "events", ["threshold_mismatch", "leak_rate_hz", "shot_rate_hz", "hot_pixel_rate_hz"])
     _share(events, "events", ["hot_pixel_fraction"])
     times = events.frame_times_s
     name, dt = "events.frame_times_s", drone.physics_dt_s
@@ -86,7 +84,7 @@ def _events(events: EventsConfig, drone: DroneConfig) -> None:
 
 def _env(env: EnvConfig) -> None:
     _positive(env, "env", ["speed_m_s", "goal_radius_m", "max_decisions"])
-    _not_negative(env, "env", ["heading_hold_m"])
+    _not_negative(env, "env", ["heading_hold_m", "progress_weight", "path_weight"])
     _finite(env, "env", ["goal_reward", "collision_reward", "left_volume_reward", "step_reward"])
 
 
@@ -99,7 +97,7 @@ def _encoder(encoder: EncoderConfig) -> None:
 
 def _agent(agent: AgentConfig) -> None:
     _positive(agent, "agent", ["history", "n_step", "batch_size", "updates_per_step", "replay_size"])
-    _positive(agent, "agent", ["learning_rate", "reward_scale"])
+    _positive(agent, "agent", ["learning_rate", "reward_scale", "code_scale"])
     _not_negative(agent, "agent", ["final_learning_rate", "huber_delta"])
     _not_negative(agent, "agent", ["learning_starts", "random_decisions", "exploration_episodes"])
     _share(agent, "agent", ["discount", "exploration_start", "exploration_end", "exploration_fraction"])

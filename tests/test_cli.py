@@ -187,9 +187,7 @@ def test_evaluate_hands_on_what_was_asked_for(monkeypatch, tmp_path):
     argv = [str(tmp_path), "--world", "dense", "--start", "1", "2", "3", "--goal", "-4", "5.5", "6"]
     assert main(["evaluate", *argv, "--missions", "9", "--seed", "2", "--json", "a.json"]) == 0
     assert asked == [
-        cli.EvaluateArgs(
-            tmp_path, "dense", (1.0, 2.0, 3.0), (-4.0, 5.5, 6.0), missions=9, seed=2, json=Path("a.json")
-        )
+        cli.EvaluateArgs(tmp_path, "dense", (1.0, 2.0, 3.0), (-4.0, 5.5, 6.0), missions=9, seed=2, json=Path("a.json"))
     ]
 
 

@@ -9,9 +9,7 @@ from edqn_jax.config import ConfigError
 from edqn_jax.devices import choose_devices, cores, most_that_divide, use_cpu_devices
 
 
-@pytest.mark.parametrize(
-    ("shards", "available", "used"), [(8, 2, 2), (8, 3, 2), (8, 7, 4), (8, 64, 8), (6, 4, 3)]
-)
+@pytest.mark.parametrize(("shards", "available", "used"), [(8, 2, 2), (8, 3, 2), (8, 7, 4), (8, 64, 8), (6, 4, 3)])
 def test_as_many_devices_as_divide_the_shards(shards, available, used):
     assert most_that_divide(shards, available) == used
 
@@ -23,9 +21,7 @@ def test_no_request_takes_what_divides_and_a_request_takes_just_that():
 
 
 def test_more_devices_than_there_are_is_named():
-    with pytest.raises(
-        ConfigError, match="train.devices must be at most 2, the CPU devices that there are, not 4"
-    ):
+    with pytest.raises(ConfigError, match="train.devices must be at most 2, the CPU devices that there are, not 4"):
         choose_devices(4, 8)
 
 

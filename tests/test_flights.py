@@ -122,9 +122,7 @@ def test_a_wrong_verdict_is_noticed(course, ahead):
     hit = int(np.flatnonzero((ahead.outcome == Outcome.COLLISION) & (ahead.physics_steps > 1))[0])
 
     def agree(**changed) -> list[bool]:
-        return [
-            result.agrees for result in check_verdicts(CONFIG, course, dataclasses.replace(ahead, **changed))
-        ]
+        return [result.agrees for result in check_verdicts(CONFIG, course, dataclasses.replace(ahead, **changed))]
 
     swapped = np.array(ahead.outcome)
     swapped[goal], swapped[hit] = Outcome.COLLISION, Outcome.GOAL

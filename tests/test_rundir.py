@@ -109,10 +109,7 @@ def test_numbers_of_numpy_and_jax_become_json_and_what_is_not_finite_null(run):
 def test_episodes_are_appended_and_read_back_by_column(run):
     run.append_episodes([(np.int64(256), np.float32(99.5), 12, "goal")])
     run.append_episodes([(512, -100.0, 3, "collision")])
-    assert (
-        run.episodes_file.read_text()
-        == "step,return,length,outcome\n256,99.5,12,goal\n512,-100,3,collision\n"
-    )
+    assert run.episodes_file.read_text() == "step,return,length,outcome\n256,99.5,12,goal\n512,-100,3,collision\n"
     episodes = run.read_episodes()
     assert episodes["length"].tolist() == [12, 3] and episodes["outcome"].tolist() == ["goal", "collision"]
 

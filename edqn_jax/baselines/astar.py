@@ -69,9 +69,7 @@ def shortest_path(
         if not np.all((point >= lattice.lower) & (point <= lattice.upper)):
             raise NoPathError(f"there is no path: the {role} {_text(point)} lies outside the flight volume")
         if lattice.distances(point[None])[0] < radius:
-            raise NoPathError(
-                f"there is no path: a sphere of {radius:g} m does not fit at the {role} {_text(point)}"
-            )
+            raise NoPathError(f"there is no path: a sphere of {radius:g} m does not fit at the {role} {_text(point)}")
     target = lattice.cell_near(goal)
     cells, length = _search(lattice, int(lattice.flat(lattice.origin)), target)
     points = start + cell * (lattice.index(cells) - lattice.origin)
@@ -182,8 +180,7 @@ def _search(lattice: _Lattice, source: int, target: int) -> tuple[np.ndarray, fl
     if not np.isfinite(g[target]):
         ends = _text(lattice.middle(np.array(source))), _text(lattice.middle(np.array(target)))
         raise NoPathError(
-            f"there is no path from {ends[0]} to {ends[1]} for a sphere of {lattice.radius:g} m: "
-            "every way is blocked"
+            f"there is no path from {ends[0]} to {ends[1]} for a sphere of {lattice.radius:g} m: every way is blocked"
         )
     cells = [target]
     while cells[-1] != source:

@@ -59,7 +59,7 @@ def batch_loss(config: AgentConfig, params: Params, target_params: Params, actio
 
 
 def polyak(new: Params, old: Params, rate: float) -> Params:
-    """old + rate (new - old), leaf by leaf: the target network's soft update, tau of Table 1."""
+    """Old + rate (new - old), leaf by leaf: the target network's soft update, tau of Table 1."""
     return optax.incremental_update(new, old, rate)
 
 
@@ -71,7 +71,7 @@ def epsilon_greedy(q: Array, epsilon: Array, key: Array) -> Array:
 
 
 def exploration(config: AgentConfig, decisions: Array, total: int, episodes: Array) -> Array:
-    """epsilon [...]: random at first, then falling linearly.
+    """Epsilon [...]: random at first, then falling linearly.
 
     Args:
         decisions: [] decisions of the DQN phase so far, in all environments.

@@ -46,7 +46,12 @@ def flatten(config: Config, params: Params, observation: Observation) -> Array:
 
 
 def act(
-    config: Config, params: PolicyParams, memory: Memory, observation: Observation, key: Array, epsilon: float = 0.0
+    config: Config,
+    params: PolicyParams,
+    memory: Memory,
+    observation: Observation,
+    key: Array,
+    epsilon: float = 0.0,
 ) -> tuple[Array, Memory]:
     """The move [] int32 for one observation, and the memory with that observation in it."""
     memory = remember(memory, flatten(config, params.encoder, observation))

@@ -221,9 +221,7 @@ def train_step(
     ring = jax.vmap(replay.write, in_axes=(0, 0, None))(actors.replay, rows, time)
 
     # Fly and see.
-    flown, seen = jax.vmap(lambda s, a: env.step(config, world, s, a))(
-        jax.tree.map(_flat, actors.env), _flat(action)
-    )
+    flown, seen = jax.vmap(lambda s, a: env.step(config, world, s, a))(jax.tree.map(_flat, actors.env), _flat(action))
     # Learn: the VAE from all new events, the Q-network from the replay.
     vae_losses, learner = _learn_to_see(config, axis, learner, seen.observation.events, keys[:, 2], step)
     q_losses, learner = _learn_to_act(config, axis, learner, ring, time, keys[:, 3], step)
@@ -274,8 +272,8 @@ def _manoeuvre(hold: int, held: Array, key: Array) -> Array:
 def _publish(plan: Plan, learner: Learner, step: Array) -> Learner:
     """The code that the agent sees changes once: when the warm-up ends, before the replay begins."""
     publish = step + 1 == plan.warmup
-    return learner.replace(
-        encoder=jax.tree.map(lambda new, old: jnp.where(publish, new, old), learner.vae, learner.encoder)
+    return dataclasses.replace(
+        learner, encoder=jax.tree.map(lambda new, old: jnp.where(publish, new, old), learner.vae, learner.encoder)
     )
 
 
@@ -294,7 +292,7 @@ def _learn_to_see(config: Config, axis: str | None, learner: Learner, fields, ke
         gradient, parts = jax.grad(loss, has_aux=True)(learner.vae, keys)
         gradient = _all_sum(gradient, axis)
         change, optimiser = _vae_optimiser(config).update(gradient, learner.vae_optimiser, learner.vae)
-        learner = learner.replace(vae=optax.apply_updates(learner.vae, change), vae_optimiser=optimiser)
+        learner = dataclasses.replace(learner, vae=optax.apply_updates(learner.vae, change), vae_optimiser=optimiser)
         return learner, (jnp.sum(parts.reconstruction), jnp.sum(parts.kl))
 
     def learn(learner: Learner, updates: int):
@@ -308,9 +306,7 @@ def _learn_to_see(config: Config, axis: str | None, learner: Learner, fields, ke
             return learn(learner, 1)
         return (jnp.float32(jnp.nan), jnp.float32(jnp.nan)), learner
 
-    return lax.cond(
-        step < plan.warmup, lambda x: learn(x, config.encoder.warmup_updates_per_step), rest, learner
-    )
+    return lax.cond(step < plan.warmup, lambda x: learn(x, config.encoder.warmup_updates_per_step), rest, learner)
 
 
 def _learn_to_act(config: Config, axis: str | None, learner: Learner, ring, time: Array, keys: Array, step: Array):
@@ -329,7 +325,8 @@ def _learn_to_act(config: Config, axis: str | None, learner: Learner, ring, time
         gradient = jax.tree.map(lambda g: g / jnp.maximum(count, 1.0), gradient)
         change, optimiser = _q_optimiser(config).update(gradient, learner.q_optimiser, learner.q)
         q = optax.apply_updates(learner.q, change)
-        learner = learner.replace(
+        learner = dataclasses.replace(
+            learner,
             q=q,
             q_optimiser=optimiser,
             target=dqn.polyak(q, learner.target, agent.target_rate),
@@ -373,34 +370,29 @@ class Trainer:
         self.mesh = Mesh(np.asarray(devices), (AXIS,))
         self.replicated = NamedSharding(self.mesh, PartitionSpec())
         self.world = jax.device_put(world, self.replicated)
-        self._specs = TrainState(
-            actors=PartitionSpec(AXIS), learner=PartitionSpec(), step=PartitionSpec()  # type: ignore[arg-type]
-        )
-        self._shardings = TrainState(
-            actors=NamedSharding(self.mesh, PartitionSpec(AXIS)),  # type: ignore[arg-type]
-            learner=self.replicated,  # type: ignore[arg-type]
-            step=self.replicated,
-        )
         self._chunk = None
 
     def init(self, seed: int) -> TrainState:
         """The state before the first step, laid out over the devices."""
         make = jax.jit(lambda world, key: init(self.config, world, key))
         state = make(self.world, jax.random.key(seed))
-        return jax.device_put(state, _prefix(self._shardings, state))
+        spread = NamedSharding(self.mesh, PartitionSpec(AXIS))
+        return TrainState(
+            actors=jax.device_put(state.actors, spread),
+            learner=jax.device_put(state.learner, self.replicated),
+            step=jax.device_put(state.step, self.replicated),
+        )
 
     def compile(self, state: TrainState) -> None:
         """Trace and compile the chunk, once."""
-        episodes = Episodes(
-            outcome=PartitionSpec(None, AXIS),  # type: ignore[arg-type]
-            length=PartitionSpec(None, AXIS),  # type: ignore[arg-type]
-            episode_return=PartitionSpec(None, AXIS),  # type: ignore[arg-type]
-        )
+        spread, same = PartitionSpec(AXIS), PartitionSpec()
+        # One spec for each subtree: only environments and replay are spread, and what they return.
+        specs: Any = TrainState(actors=spread, learner=same, step=same)  # pyright: ignore[reportArgumentType]
         run = jax.shard_map(
             lambda world, state, steps: run_steps(self.config, world, state, steps, AXIS),
             mesh=self.mesh,
-            in_specs=(PartitionSpec(), self._specs, PartitionSpec()),
-            out_specs=(self._specs, (episodes, PartitionSpec())),
+            in_specs=(same, specs, same),
+            out_specs=(specs, (PartitionSpec(None, AXIS), same)),
             check_vma=False,
         )
         jitted = jax.jit(run, donate_argnums=1)
@@ -416,12 +408,3 @@ class Trainer:
             self.compile(state)
         assert self._chunk is not None
         return self._chunk(self.world, state, self._steps(first))
-
-
-def _prefix(shardings: TrainState, state: TrainState) -> TrainState:
-    """One sharding per leaf of the state."""
-    return TrainState(
-        actors=jax.tree.map(lambda _: shardings.actors, state.actors),
-        learner=jax.tree.map(lambda _: shardings.learner, state.learner),
-        step=shardings.step,
-    )

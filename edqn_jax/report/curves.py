@@ -31,9 +31,7 @@ def draw_returns(episodes: Mapping[str, np.ndarray], file: Path) -> Figure:
             own = outcomes == name
             if own.any():
                 label = f"{OUTCOME_LABELS[name]} ({own.sum():,})"
-                above.scatter(
-                    number[own], returns[own], s=size, c=colour, lw=0, alpha=0.4, label=label, gid=name
-                )
+                above.scatter(number[own], returns[own], s=size, c=colour, lw=0, alpha=0.4, label=label, gid=name)
         window = max(len(returns) // 60, 1)
         if len(returns):
             mean = running_mean(returns, window)
@@ -116,6 +114,4 @@ def _line(
     """The metric over decisions, of the lines that have it."""
     points = [(row["decisions"], row[name]) for row in metrics if row.get(name) is not None]
     if points:
-        axes.plot(
-            *np.array(points, np.float64).T, color=colour, label=label, marker=marker, ms=4, lw=1.1, gid=name
-        )
+        axes.plot(*np.array(points, np.float64).T, color=colour, label=label, marker=marker, ms=4, lw=1.1, gid=name)

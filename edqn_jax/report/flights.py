@@ -116,9 +116,7 @@ def draw_path(
             label="speed, m/s",
         )
         bar.outline.set_visible(False)  # pyright: ignore[reportCallIssue]
-        figure.legend(
-            handles=_path_legend(shortest is not None, outcome), loc="outside lower center", ncols=5
-        )
+        figure.legend(handles=_path_legend(shortest is not None, outcome), loc="outside lower center", ncols=5)
     return figure
 
 
@@ -131,12 +129,8 @@ def _draw_ground(axes: Axes, view: View, volume: np.ndarray) -> None:
     (x0, y0, _), (x1, y1, top) = volume
     floor = [view.project(_corners(volume))]
     axes.add_collection(PolyCollection(floor, facecolors=GROUND, edgecolors=MUTED, linewidths=0.6, zorder=0))
-    lines = [[[x, y0, 0], [x, y1, 0]] for x in _tens(x0, x1)] + [
-        [[x0, y, 0], [x1, y, 0]] for y in _tens(y0, y1)
-    ]
-    grid = LineCollection(
-        list(view.project(np.array(lines, np.float64))), colors="white", linewidths=0.7, zorder=0.5
-    )
+    lines = [[[x, y0, 0], [x, y1, 0]] for x in _tens(x0, x1)] + [[[x0, y, 0], [x1, y, 0]] for y in _tens(y0, y1)]
+    grid = LineCollection(list(view.project(np.array(lines, np.float64))), colors="white", linewidths=0.7, zorder=0.5)
     axes.add_collection(grid)
     step = 20 if max(x1 - x0, y1 - y0) > 60 else 10
     out = 0.022 * (x1 - x0)
@@ -232,7 +226,5 @@ def _path_legend(with_shortest: bool, outcome: str) -> list[Line2D]:
         )
     if outcome != "goal":
         colour = OUTCOME_COLOURS[outcome]
-        entries.append(
-            Line2D([], [], ls="", marker="X", ms=8, mfc=colour, mec="white", label=OUTCOME_LABELS[outcome])
-        )
+        entries.append(Line2D([], [], ls="", marker="X", ms=8, mfc=colour, mec="white", label=OUTCOME_LABELS[outcome]))
     return entries

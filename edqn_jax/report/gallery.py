@@ -27,12 +27,10 @@ FINE = 8
 """How much finer than the drone's camera the pictures for people are, per axis."""
 
 
-def draw_gallery(
-    config: Config, run: RunDirectory, scene: Scene, params: PolicyParams, shortest: np.ndarray
-) -> None:
+def draw_gallery(config: Config, run: RunDirectory, scene: Scene, params: PolicyParams, shortest: np.ndarray) -> None:
     """World, events, path, returns, learning and reconstruction into the run's `figures/`."""
     table = np.atleast_2d(np.loadtxt(run.trajectory_file, delimiter=",", skiprows=1))
-    flown = dict(zip(TRAJECTORY_COLUMNS, table.T, strict=True))
+    flown: dict[str, np.ndarray] = dict(zip(TRAJECTORY_COLUMNS, table.T, strict=True))
     draw_world(scene, run.figures / "world.png")
     outcome = _outcome(config, scene, flown)
     draw_path(scene, flown, shortest, run.figures / "path.png", outcome, config.env.goal_radius_m)
@@ -57,8 +55,8 @@ def _draw_what_it_sees(
 ) -> None:
     """RGB beside events at moments of the flight, and what the VAE makes of those events."""
     n, steps = config.drone.physics_steps, len(flown["t"])
-    # Whole decisions, spread over the flight; row k of the table stands after physics step k + 1.
-    decisions = np.unique(np.linspace(1, max(steps // n, 1), MOMENTS + 1).astype(int)[:-1])
+    # Whole decisions, from the middle of equal parts of the flight; row k stands after physics step k + 1.
+    decisions = np.unique(((np.arange(MOMENTS) + 0.5) / MOMENTS * max(steps // n, 1)).astype(int).clip(1))
     offsets = np.array(env.frame_steps(config)) - n
     rows = np.clip(decisions[:, None] * n + offsets[None] - 1, 0, steps - 1)
     position = np.stack([flown[k] for k in ("x", "y", "z")], -1).astype(np.float32)
@@ -71,11 +69,17 @@ def _draw_what_it_sees(
     fields = jax.vmap(lambda f: _field(config, f))(jnp.asarray(frames))
     counts = np.asarray(jax.vmap(events.event_image)(fields))
     draw_events(
-        _display(fine[:, -1]), _display(native[:, -1]), counts, run.figures / "events.png", list(rows[:, -1] * config.drone.physics_dt_s)
+        _display(fine[:, -1]),
+        _display(native[:, -1]),
+        counts,
+        run.figures / "events.png",
+        list(rows[:, -1] * config.drone.physics_dt_s),
     )
-    code = encoder.embed(config.encoder, params.encoder, fields)
-    on, off = np.moveaxis(np.expm1(np.asarray(encoder.decode(config.encoder, params.encoder, code))), -3, 0)
-    draw_reconstruction(counts, on - off, run.figures / "reconstruction.png")
+    wanted = encoder.target(config.encoder, fields)
+    made = encoder.decode(config.encoder, params.encoder, encoder.embed(config.encoder, params.encoder, fields))
+    # ON and OFF together, as events per pixel again.
+    seen, remembered = (np.expm1(np.asarray(x)).sum(-3) for x in (wanted, made))
+    draw_reconstruction(seen, remembered, run.figures / "reconstruction.png")
 
 
 def _field(config: Config, frames: Any) -> events.EventField:
@@ -86,9 +90,7 @@ def _field(config: Config, frames: Any) -> events.EventField:
 
 def _rgb(config: Config, scene: Scene, poses: Flight, finer: int) -> np.ndarray:
     """[M, T, H, W, 3] linear RGB at poses [M, T], `finer` times the camera's resolution."""
-    lens = dataclasses.replace(
-        config.camera, width=config.camera.width * finer, height=config.camera.height * finer
-    )
+    lens = dataclasses.replace(config.camera, width=config.camera.width * finer, height=config.camera.height * finer)
 
     @jax.jit
     def picture(position: jax.Array, quaternion: jax.Array) -> jax.Array:

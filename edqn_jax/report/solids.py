@@ -72,13 +72,9 @@ def solids_of(scene: Scene) -> list[Solid]:
     found: list[Solid] = []
     for position, half, yaw, albedo in _present(scene.boxes, "position", "half", "yaw", "albedo"):
         found.append(Solid(_box(position, half, _about_z(float(yaw))), albedo))
-    for position, half, rotation, albedo in _present(
-        scene.tilted_boxes, "position", "half", "rotation", "albedo"
-    ):
+    for position, half, rotation, albedo in _present(scene.tilted_boxes, "position", "half", "rotation", "albedo"):
         found.append(Solid(_box(position, half, rotation), albedo))
-    for position, radius, half, albedo in _present(
-        scene.cylinders, "position", "radius", "half_height", "albedo"
-    ):
+    for position, radius, half, albedo in _present(scene.cylinders, "position", "radius", "half_height", "albedo"):
         found.append(Solid(_tube(position, np.array([0.0, 0.0, 1.0]), float(radius), float(half)), albedo))
     for position, axis, half, radius, albedo in _present(
         scene.tilted_cylinders, "position", "axis", "half_length", "radius", "albedo"

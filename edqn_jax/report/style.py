@@ -34,9 +34,7 @@ MUTED = "#7a7a7a"
 LINE = "#0072b2"
 SECOND_LINE = "#d55e00"
 
-POLARITY = LinearSegmentedColormap.from_list(
-    "polarity", ["#1f4fb4", "#8fb0e6", "#ffffff", "#f0988b", "#c4221f"]
-)
+POLARITY = LinearSegmentedColormap.from_list("polarity", ["#1f4fb4", "#8fb0e6", "#ffffff", "#f0988b", "#c4221f"])
 """Signed event counts: blue darker, white nothing, red brighter."""
 
 STYLE: dict[Any, Any] = {

@@ -22,9 +22,7 @@ LUMA = (0.299, 0.587, 0.114)
 """Weights of R, G and B in Eq. 1."""
 
 
-def _backdrop(
-    config: CameraConfig, scene: Scene, origin: Array, rays: Rays, value: Values, sky: Array
-) -> Array:
+def _backdrop(config: CameraConfig, scene: Scene, origin: Array, rays: Rays, value: Values, sky: Array) -> Array:
     """Ground and other planes, textured, before the sky: [H, W]."""
     shape = jnp.broadcast_shapes(rays.dx.shape, rays.dz.shape)
     behind = jnp.broadcast_to(sky, shape)

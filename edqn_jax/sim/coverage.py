@@ -100,9 +100,7 @@ def _extent_of_boxes(scene: Scene, origin: Array, forward: tuple[Array, Array]) 
     ahead_next, right_next = jnp.roll(ahead, -1, axis=1), jnp.roll(right, -1, axis=1)
     share = (NEAR_M - ahead) * inverse(ahead_next - ahead)
     crossing = (ahead < NEAR_M) != (ahead_next < NEAR_M)
-    u = jnp.concatenate(
-        [right / jnp.maximum(ahead, NEAR_M), (right + share * (right_next - right)) / NEAR_M], axis=1
-    )
+    u = jnp.concatenate([right / jnp.maximum(ahead, NEAR_M), (right + share * (right_next - right)) / NEAR_M], axis=1)
     shown = jnp.concatenate([ahead >= NEAR_M, crossing], axis=1)
     return jnp.min(jnp.where(shown, u, jnp.inf), axis=1), jnp.max(jnp.where(shown, u, -jnp.inf), axis=1)
 
@@ -141,7 +139,8 @@ def _column_shares(left: Array, right: Array, u: Array, pitch: float):
 
 def _box_columns(config: CameraConfig, scene: Scene, origin: Array, rays: Rays, u: Array, value: Array):
     """Upright boxes per column, [N, C] each: coverage, entry and exit depth, brightness of the side and
-    change of its closeness per pixel."""
+    change of its closeness per pixel.
+    """
     boxes = scene.boxes
     forward = (-rays.right[1], rays.right[0])
     coverage, low, high = _column_shares(*_extent_of_boxes(scene, origin, forward), u, rays.pitch)
@@ -158,12 +157,8 @@ def _box_columns(config: CameraConfig, scene: Scene, origin: Array, rays: Rays, 
         mx, my = -bx[:, None] * ix, -by[:, None] * iy
         hx, hy = boxes.half[:, 0:1] * jnp.abs(ix), boxes.half[:, 1:2] * jnp.abs(iy)
         zero = jnp.zeros_like(cos)
-        x_faces = jnp.where(
-            dx < 0, shade(config, cos, sin, zero)[:, None], shade(config, -cos, -sin, zero)[:, None]
-        )
-        y_faces = jnp.where(
-            dy < 0, shade(config, -sin, cos, zero)[:, None], shade(config, sin, -cos, zero)[:, None]
-        )
+        x_faces = jnp.where(dx < 0, shade(config, cos, sin, zero)[:, None], shade(config, -cos, -sin, zero)[:, None])
+        y_faces = jnp.where(dy < 0, shade(config, -sin, cos, zero)[:, None], shade(config, sin, -cos, zero)[:, None])
         near_x, near_y = mx - hx, my - hy
         face = near_x > near_y
         enter = jnp.maximum(near_x, near_y)
@@ -181,7 +176,9 @@ def _box_columns(config: CameraConfig, scene: Scene, origin: Array, rays: Rays, 
     corner = (corner_right * inverse(corner_ahead))[:, None]
     share = jnp.clip((corner - low) * inverse(high - low), 0.0, 1.0)
     side = jnp.where(
-        face_left == face_right, (shade_left + shade_right) / 2, share * shade_left + (1 - share) * shade_right
+        face_left == face_right,
+        (shade_left + shade_right) / 2,
+        share * shade_left + (1 - share) * shade_right,
     )
     side = side * value[:, None]
     enter, leave = jnp.maximum(enter, NEAR_M), jnp.maximum(leave, NEAR_M)
@@ -278,9 +275,7 @@ def sphere_layers(
     closeness = jnp.where(coverage > 0, 1.0 / jnp.maximum(depth, NEAR_M), 0.0)
     for n in range(coverage.shape[0]):
         share, flat = coverage[n], jnp.zeros_like(coverage[n])
-        layers = insert(
-            layers, Layer(closeness=closeness[n], coverage=share, value=share * bright[n], slope=flat)
-        )
+        layers = insert(layers, Layer(closeness=closeness[n], coverage=share, value=share * bright[n], slope=flat))
     return layers
 
 

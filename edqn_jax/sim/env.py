@@ -7,6 +7,7 @@ observation, every observation is rendered and encoded once, and nothing else is
 
 from __future__ import annotations
 
+import dataclasses
 import enum
 from collections.abc import Callable
 
@@ -134,7 +135,9 @@ def judge(config: Config, scene: Scene, goal: Array, before: Array, flight: Flig
     """
     n = flight.position.shape[0]
     path = jnp.concatenate([before[None], flight.position])
-    touch, contact = jax.vmap(lambda a, b: segment_contact(scene, a, b, config.drone.body_radius_m))(path[:-1], path[1:])
+    touch, contact = jax.vmap(lambda a, b: segment_contact(scene, a, b, config.drone.body_radius_m))(
+        path[:-1], path[1:]
+    )
     at = flight.position
     apart = at - goal[None]
     arrived = jnp.sum(apart * apart, axis=1) < config.env.goal_radius_m**2
@@ -160,15 +163,24 @@ def judge(config: Config, scene: Scene, goal: Array, before: Array, flight: Flig
     return outcome, end_step, jnp.where(outcome == Outcome.COLLISION, contact[first], 1.0)
 
 
-def reward(config: EnvConfig, discount: float, outcome: Array, before: Array, after: Array) -> Array:
+def reward(
+    config: EnvConfig,
+    discount: float,
+    outcome: Array,
+    before: Array,
+    after: Array,
+    flown: Array | float = 0.0,
+) -> Array:
     """Reward of one decision.
 
-    `sparse` is Eq. 8. `progress` adds the metres gained towards the goal, times a weight. `potential` adds
+    `sparse` is Eq. 8. `progress` adds the metres gained towards the goal, times a weight, and
+    takes something for each metre flown. `potential` adds
     gamma * Phi(s') - Phi(s) with Phi = -weight * distance, and Phi = 0 at terminal states: the form that leaves the
     optimal policy unchanged (Ng et al. 1999).
 
     Args:
         before, after: distances to the goal, metres.
+        flown: metres flown.
     """
     at_end = jnp.select(
         [outcome == Outcome.GOAL, outcome == Outcome.COLLISION, outcome == Outcome.LEFT_VOLUME],
@@ -177,7 +189,7 @@ def reward(config: EnvConfig, discount: float, outcome: Array, before: Array, af
     )
     total = at_end + config.step_reward
     if config.reward == "progress":
-        total = total + config.progress_weight * (before - after)
+        total = total + config.progress_weight * (before - after) - config.path_weight * flown
     elif config.reward == "potential":
         terminal = is_terminal(outcome)
         total = total + config.progress_weight * (before - jnp.where(terminal, 0.0, discount * after))
@@ -225,7 +237,13 @@ def mount_rotation(config: Config, quaternion: Array) -> Array:
 
 
 def observe(
-    config: Config, scene: Scene, goal: Array, state: DroneState, poses: Flight, memory: EventMemory, key: Array
+    config: Config,
+    scene: Scene,
+    goal: Array,
+    state: DroneState,
+    poses: Flight,
+    memory: EventMemory,
+    key: Array,
 ) -> tuple[Observation, EventMemory]:
     """Events of the window that ends now, and the own state.
 
@@ -255,11 +273,11 @@ def reset(config: Config, world: World, key: Array, mission: Array | None = None
     scene = scene_at(take_scene(world.pool, world.missions.scene[mission]), jnp.zeros(()))
     still = _hold(body, len(config.events.frame_times_s))
     observation, memory = observe(config, scene, world.missions.goal[mission], body, still, memory, noise)
-    return state.replace(memory=memory), observation
+    return dataclasses.replace(state, memory=memory), observation
 
 
 def _hold(body: DroneState, n: int) -> Flight:
-    """n times the same pose."""
+    """N times the same pose."""
     repeat: Callable[[Array], Array] = lambda x: jnp.broadcast_to(x, (n, *x.shape))  # noqa: E731
     return Flight(position=repeat(body.position), quaternion=repeat(body.quaternion), velocity=repeat(body.velocity))
 
@@ -285,7 +303,8 @@ def step(config: Config, world: World, state: EnvState, action: Array) -> tuple[
     decision = state.decision + 1
     outcome, end_step, contact = judge(config, scene, goal, before.position, flight, decision)
     distances = [jnp.sqrt(jnp.sum((goal - p) ** 2)) for p in (before.position, flown.position)]
-    gained = reward(config.env, config.agent.discount, outcome, distances[0], distances[1])
+    moved = jnp.sqrt(jnp.sum((flown.position - before.position) ** 2))
+    gained = reward(config.env, config.agent.discount, outcome, distances[0], distances[1], moved)
 
     start, memory = _start(config, world, mission, sensor)
     # A diverged body must not leave NaN in the last observation; it stays where it was.

@@ -388,9 +388,7 @@ def _has_noise(config: EventsConfig) -> bool:
     return config.leak_rate_hz > 0.0 or config.shot_rate_hz > 0.0 or config.hot_pixel_fraction > 0.0
 
 
-def _noise(
-    config: EventsConfig, hot: Array | None, field: EventField, times: NDArray, key: Array
-) -> EventField:
+def _noise(config: EventsConfig, hot: Array | None, field: EventField, times: NDArray, key: Array) -> EventField:
     """Noise events of every frame pair: Poisson counts, evenly spaced from a random phase.
 
     A pixel's noise events between two frames share one polarity, drawn by the rates: exact while they seldom

@@ -156,9 +156,7 @@ def check_scene(
     for role, where in (("start", scene.start), ("goal", scene.goal)):
         point = np.asarray(where)
         if not np.all(np.isfinite(point)):
-            raise SceneError(
-                f'{title} does not say where its {role} is; add a site, <site name="{role}" pos="x y z"/>'
-            )
+            raise SceneError(f'{title} does not say where its {role} is; add a site, <site name="{role}" pos="x y z"/>')
         for axis, value, low, high in zip("xyz", point, lower, upper, strict=True):
             if not low <= value <= high:
                 raise SceneError(
@@ -253,9 +251,7 @@ def _shape(model: mujoco.MjModel, data: mujoco.MjData, geom: int, path: Path) ->
         case mujoco.mjtGeom.mjGEOM_CYLINDER if upright:
             return UprightCylinders(position=position, radius=size[0], half_height=size[1], albedo=albedo)
         case mujoco.mjtGeom.mjGEOM_CYLINDER:
-            return TiltedCylinders(
-                position=position, axis=axis, half_length=size[1], radius=size[0], albedo=albedo
-            )
+            return TiltedCylinders(position=position, axis=axis, half_length=size[1], radius=size[0], albedo=albedo)
         case mujoco.mjtGeom.mjGEOM_PLANE:
             return Planes(position=position, normal=axis, albedo=albedo)
     raise SceneError(

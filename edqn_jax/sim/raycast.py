@@ -188,7 +188,7 @@ def _tilted_box_surfaces(config: CameraConfig, origin: Array, rays: Rays, scene:
     boxes = scene.tilted_boxes
     offset = origin[None] - boxes.position
     axes = tuple(tuple(boxes.rotation[:, j, i] for j in range(3)) for i in range(3))
-    o = tuple(per_shape(sum(axis[j] * offset[:, j] for j in range(3))) for axis in axes)
+    o = tuple(per_shape(jnp.sum(jnp.stack(axis, axis=1) * offset, axis=1)) for axis in axes)
     d = tuple(
         per_shape(axis[0]) * rays.dx + per_shape(axis[1]) * rays.dy + per_shape(axis[2]) * rays.dz for axis in axes
     )
@@ -235,9 +235,7 @@ def _tube_surfaces(
         return Surfaces(depth=side_t, hit=on_side & (side_t > 0), value=side * per_shape(value))
     per_d = inverse(axis_d)
     middle, half = -axis_o * per_d, per_shape(part.half_length) * jnp.abs(per_d)
-    facing, away = (
-        per_shape(shade(config, *(sign * part.axis[:, i] for i in range(3)))) for sign in (1.0, -1.0)
-    )
+    facing, away = (per_shape(shade(config, *(sign * part.axis[:, i] for i in range(3)))) for sign in (1.0, -1.0))
     enter, leave = jnp.maximum(side_t, middle - half), jnp.minimum(s + reach, middle + half)
     bright = jnp.where(middle - half > side_t, jnp.where(axis_d < 0, facing, away), side)
     hit = (inside > 0) & (enter < leave) & (enter > 0)
@@ -255,9 +253,7 @@ def plane_surfaces(config: CameraConfig, scene: Scene, origin: Array, rays: Rays
     return Surfaces(depth=t, hit=(approach < 0) & (t > 0) & (t < HORIZON_M), value=bright)
 
 
-def upright_surfaces(
-    config: CameraConfig, scene: Scene, origin: Array, rays: Rays, value: Values
-) -> list[Surfaces]:
+def upright_surfaces(config: CameraConfig, scene: Scene, origin: Array, rays: Rays, value: Values) -> list[Surfaces]:
     """Upright boxes and cylinders, kinds with capacity 0 left out."""
     found, rays = [], for_shapes(rays)
     if scene.boxes.yaw.shape[0]:

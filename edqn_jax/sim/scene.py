@@ -173,9 +173,7 @@ def signed_distance(scene: Scene, point: Array) -> Array:
     return jnp.min(jnp.stack(nearest))
 
 
-def segment_contact(
-    scene: Scene, start: Array, end: Array, radius: ArrayLike, samples: int = 8
-) -> tuple[Array, Array]:
+def segment_contact(scene: Scene, start: Array, end: Array, radius: ArrayLike, samples: int = 8) -> tuple[Array, Array]:
     """Whether a sphere that moves straight from `start` to `end` touches anything, and where first.
 
     The distance is taken at `samples` points, both ends included. Along a line the distance to a convex
@@ -233,9 +231,7 @@ def _upright_boxes(boxes: UprightBoxes, x: Array, y: Array, z: Array) -> Array:
 def _tilted_boxes(boxes: TiltedBoxes, x: Array, y: Array, z: Array) -> Array:
     dx, dy, dz = _offset(boxes.position, x, y, z)
     r = boxes.rotation
-    return _solid(
-        *(jnp.abs(r[:, 0, i] * dx + r[:, 1, i] * dy + r[:, 2, i] * dz) - boxes.half[:, i] for i in range(3))
-    )
+    return _solid(*(jnp.abs(r[:, 0, i] * dx + r[:, 1, i] * dy + r[:, 2, i] * dz) - boxes.half[:, i] for i in range(3)))
 
 
 def _upright_cylinders(cylinders: UprightCylinders, x: Array, y: Array, z: Array) -> Array:
@@ -355,8 +351,7 @@ def stack_scenes(scenes: Sequence[Scene]) -> Scene:
     """A pool of worlds: the scenes with a leading axis, each kind padded to its largest capacity."""
     capacities = {kind: max(getattr(s, kind).position.shape[0] for s in scenes) for kind in KINDS}
     padded = [
-        build_scene(scene_shapes(s), volume=s.volume, start=s.start, goal=s.goal, capacities=capacities)
-        for s in scenes
+        build_scene(scene_shapes(s), volume=s.volume, start=s.start, goal=s.goal, capacities=capacities) for s in scenes
     ]
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *padded)
 

@@ -131,15 +131,11 @@ def random_scene(density: str, key: Array) -> Scene:
             half_height=pillar_height / 2 * here[first:second],
             albedo=albedo[first:second],
         ),
-        spheres=Spheres(
-            position=position[second:], radius=ball_radius * here[second:], albedo=albedo[second:]
-        ),
+        spheres=Spheres(position=position[second:], radius=ball_radius * here[second:], albedo=albedo[second:]),
         tilted_boxes=no_shapes(TiltedBoxes),
         capsules=no_shapes(Capsules),
         tilted_cylinders=no_shapes(TiltedCylinders),
-        planes=Planes(
-            position=jnp.zeros((1, 3)), normal=jnp.array([[0.0, 0.0, 1.0]]), albedo=jnp.array([GROUND_RGB])
-        ),
+        planes=Planes(position=jnp.zeros((1, 3)), normal=jnp.array([[0.0, 0.0, 1.0]]), albedo=jnp.array([GROUND_RGB])),
         volume=jnp.array([(0.0, 0.0, 0.0), SIZE]),
         start=jnp.zeros(3),
         goal=jnp.zeros(3),
@@ -182,9 +178,7 @@ def _place(reach: Array, draw: Array) -> tuple[Array, Array, Array]:
         return (x, y, taken.at[number].set(radius)), found
 
     nobody = jnp.full(count, PARKED)
-    (x, y, _), placed = jax.lax.scan(
-        place, (nobody, nobody, jnp.zeros(count)), (jnp.arange(count), reach, candidates)
-    )
+    (x, y, _), placed = jax.lax.scan(place, (nobody, nobody, jnp.zeros(count)), (jnp.arange(count), reach, candidates))
     return x, y, placed
 
 
@@ -304,9 +298,7 @@ def random_missions(pool: Scene, count: int, key: Array) -> Missions:
 
 
 @partial(jax.jit, static_argnums=1)
-def spread_missions(
-    pool: Scene, count: int, own_start_fraction: ArrayLike, jitter: ArrayLike, key: Array
-) -> Missions:
+def spread_missions(pool: Scene, count: int, own_start_fraction: ArrayLike, jitter: ArrayLike, key: Array) -> Missions:
     """Missions to the worlds' own goals, from starts spread over the whole volume.
 
     Args:

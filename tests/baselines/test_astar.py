@@ -36,9 +36,7 @@ def room(*shapes, size=(10.0, 10.0, 4.0)) -> Scene:
 
 def box(lower, upper) -> UprightBoxes:
     lower, upper = np.array(lower, float), np.array(upper, float)
-    return UprightBoxes(
-        position=(lower + upper) / 2, half=(upper - lower) / 2, yaw=np.float32(0), albedo=GREY
-    )
+    return UprightBoxes(position=(lower + upper) / 2, half=(upper - lower) / 2, yaw=np.float32(0), albedo=GREY)
 
 
 def test_in_the_open_the_path_is_the_straight_line():
@@ -77,9 +75,7 @@ def test_the_grid_path_is_as_short_as_dijkstras(seed):
     size, cell = np.array([5.0, 5.0, 3.0]), 0.5
     shapes: list[Shape] = []
     shapes += [
-        UprightBoxes(
-            position=rng.uniform(1, size - 1), half=rng.uniform(0.2, 1, 3), yaw=rng.uniform(0, 3), albedo=GREY
-        )
+        UprightBoxes(position=rng.uniform(1, size - 1), half=rng.uniform(0.2, 1, 3), yaw=rng.uniform(0, 3), albedo=GREY)
         for _ in range(5)
     ]
     shapes.append(Spheres(position=rng.uniform(1, size - 1), radius=0.7, albedo=GREY))

@@ -49,9 +49,7 @@ def frames(camera: CameraConfig, key: Array, side: float = 0.0) -> Array:
     return jnp.stack([frame(0.0), frame(1.0)])
 
 
-def fields(
-    camera: CameraConfig, config: EventsConfig, key: Array, number: int, side: float = 0.0
-) -> EventField:
+def fields(camera: CameraConfig, config: EventsConfig, key: Array, number: int, side: float = 0.0) -> EventField:
     """`number` windows, arrays `[number, 1, H, W]`."""
 
     def one(key: Array) -> EventField:

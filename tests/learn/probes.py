@@ -6,6 +6,7 @@ environment: an ended episode spends its next step on being reset.
 
 from __future__ import annotations
 
+import dataclasses
 from functools import partial
 from typing import NamedTuple
 
@@ -105,7 +106,7 @@ def learn(config: AgentConfig, steps: int, task: Array, key: Array) -> Array:
         key, act_key, live_key, sample_key = jax.random.split(key, 4)
         lives, rows = jax.vmap(partial(live, task))(lives, action, jax.random.split(live_key, ENVS))
         action = draw(act_key)
-        ring = replay.write(ring, rows.replace(action=action), time)
+        ring = replay.write(ring, dataclasses.replace(rows, action=action), time)
         batch = replay.sample(config, ring, time, config.batch_size, sample_key)
 
         def loss(params):

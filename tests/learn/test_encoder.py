@@ -93,7 +93,7 @@ def test_the_encoder_is_blind_to_the_order_of_events():
 def test_time_in_the_window_changes_the_code():
     params = fresh(CONFIG, SMALL, jax.random.key(0))
     field = ragged_field(3)
-    late = field.replace(t_first=field.t_first + 0.01)
+    late = dataclasses.replace(field, t_first=field.t_first + 0.01)
     assert np.abs(embed(CONFIG, params, field) - embed(CONFIG, params, late)).max() > 0.01
 
 
@@ -177,9 +177,7 @@ def trained():
 
     @jax.jit
     def train(params):
-        return jax.lax.scan(
-            update, (params, optimiser.init(params)), jax.random.split(jax.random.key(3), UPDATES)
-        )
+        return jax.lax.scan(update, (params, optimiser.init(params)), jax.random.split(jax.random.key(3), UPDATES))
 
     before = fresh(CONFIG, CAMERA, jax.random.key(0))
     (after, _), losses = train(before)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -48,9 +50,12 @@ def act():
     return jax.jit(lambda *inputs: policy.act(CONFIG, *inputs))
 
 
+flatten = jax.jit(partial(policy.flatten, CONFIG))
+
+
 def test_memory_stacks_an_episode_as_the_replay_does(params, act):
     seen = observations(5)
-    flat = np.stack([policy.flatten(CONFIG, params.encoder, each) for each in seen])
+    flat = np.stack([flatten(params.encoder, each) for each in seen])
     memory = policy.empty_memory(CONFIG)
     history = CONFIG.agent.history
     # The replay's rows: an older episode's observations before this one's first, which is a reset.
@@ -61,13 +66,13 @@ def test_memory_stacks_an_episode_as_the_replay_does(params, act):
         _, memory = act(params, memory, each, jax.random.key(now))
         window = slice(now + 1, now + 1 + history)
         trained_on = replay.stacked(jnp.asarray(rows[window]), jnp.asarray(resets[window]))
-        # Compiled and not compiled, hence not to the last digit.
+        # Two compilations, hence not to the last digit.
         np.testing.assert_allclose(memory, trained_on, atol=1e-5)
 
 
 def test_an_observation_is_the_scaled_code_and_the_own_state(params):
     one = observations(1)[0]
-    flat = policy.flatten(CONFIG, params.encoder, one)
+    flat = flatten(params.encoder, one)
     assert flat.shape == (SIZE,) == (5 + OWN_SIZE,)
     code = encoder.embed(CONFIG.encoder, params.encoder, one.events)
     np.testing.assert_allclose(flat[:5], CONFIG.agent.code_scale * code, rtol=1e-6)

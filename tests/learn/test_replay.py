@@ -89,7 +89,7 @@ def starts(batch: replay.Batch) -> list[tuple[int, int]]:
 
 
 @pytest.mark.parametrize("form", FORMS)
-@settings(max_examples=25, deadline=None, derandomize=True)
+@settings(max_examples=20, deadline=None, derandomize=True)
 @given(
     seed=st.integers(0, 2**32 - 1),
     decisions=st.integers(10, LONGEST),  # up to nearly five times round the ring

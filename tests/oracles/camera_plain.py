@@ -25,16 +25,12 @@ from edqn_jax.sim.scene import (
 from edqn_jax.sim.texture import WAVES
 
 
-def luma(
-    config: CameraConfig, scene: Scene, position: NDArray, rotation: NDArray, samples: int = 8
-) -> NDArray:
+def luma(config: CameraConfig, scene: Scene, position: NDArray, rotation: NDArray, samples: int = 8) -> NDArray:
     """[H, W] luma from `samples` x `samples` rays per pixel."""
     return rgb(config, scene, position, rotation, samples) @ np.array([0.299, 0.587, 0.114])
 
 
-def rgb(
-    config: CameraConfig, scene: Scene, position: NDArray, rotation: NDArray, samples: int = 8
-) -> NDArray:
+def rgb(config: CameraConfig, scene: Scene, position: NDArray, rotation: NDArray, samples: int = 8) -> NDArray:
     """[H, W, 3] linear colour from `samples` x `samples` rays per pixel."""
     rays = directions(config, np.asarray(rotation, np.float64), samples)
     flat = colours(config, scene_shapes(scene), np.asarray(position, np.float64), rays.reshape(-1, 3))
@@ -72,9 +68,7 @@ def colours(config: CameraConfig, shapes: list[Shape], origin: NDArray, rays: ND
 
 def _shade(config: CameraConfig, normal: NDArray) -> NDArray:
     azimuth, elevation = np.radians(config.sun_azimuth_deg), np.radians(config.sun_elevation_deg)
-    sun = np.array(
-        [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)]
-    )
+    sun = np.array([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)])
     return config.ambient + (1 - config.ambient) * np.clip(normal @ sun, 0.0, None)
 
 

@@ -11,9 +11,7 @@ Event = tuple[float, int, int, int]
 """Seconds from the window's start, column, row, polarity."""
 
 
-def paper(
-    level: NDArray, times: NDArray, threshold: float, tolerance: float, refractory_ns: float
-) -> list[Event]:
+def paper(level: NDArray, times: NDArray, threshold: float, tolerance: float, refractory_ns: float) -> list[Event]:
     """Eq. 2-5 for log brightness `[T, H, W]` at `times` (seconds)."""
     found: list[Event] = []
     for pair in range(len(times) - 1):

@@ -29,7 +29,5 @@ class RayCaster:
         rays = rays / np.linalg.norm(rays, axis=1, keepdims=True)
         found, geom = np.empty(len(rays)), np.zeros(1, np.int32)
         for i, ray in enumerate(rays):
-            found[i] = mujoco.mj_ray(
-                self.model, self.data, np.asarray(origin, np.float64), ray, None, 1, -1, geom
-            )
+            found[i] = mujoco.mj_ray(self.model, self.data, np.asarray(origin, np.float64), ray, None, 1, -1, geom)
         return np.where(found < 0, np.inf, found).reshape(directions.shape[:-1])

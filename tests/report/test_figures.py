@@ -122,9 +122,7 @@ def test_the_path_is_drawn_whole_in_both_views(tmp_path):
     figure = draw_path(a_scene(), a_flight(), np.array([[1, 1, 3], [90, 90, 10.0]]), tmp_path / "path.png")
     assert is_png(tmp_path / "path.png")
     for axes in figure.axes[:2]:
-        coloured = [
-            c for c in axes.collections if isinstance(c, LineCollection) and c.get_array() is not None
-        ]
+        coloured = [c for c in axes.collections if isinstance(c, LineCollection) and c.get_array() is not None]
         hidden_part, seen_part = (len(line.get_segments()) for line in coloured)
         assert hidden_part + seen_part == 599
         assert hidden_part > 0
@@ -143,9 +141,7 @@ def test_a_flight_of_one_step_can_be_drawn(tmp_path):
 
 def test_every_episode_is_a_point_in_its_outcomes_colour(tmp_path):
     outcomes = np.array(["goal"] * 70 + ["collision"] * 20 + ["time_out"] * 9 + ["left_volume"])
-    figure = draw_returns(
-        {"return": np.linspace(-100, 100, 100), "outcome": outcomes}, tmp_path / "returns.png"
-    )
+    figure = draw_returns({"return": np.linspace(-100, 100, 100), "outcome": outcomes}, tmp_path / "returns.png")
     assert is_png(tmp_path / "returns.png")
     points = {c.get_gid(): c for c in figure.axes[0].collections if isinstance(c, PathCollection)}
     counts = {name: len(np.asarray(c.get_offsets())) for name, c in points.items()}
@@ -167,9 +163,7 @@ def test_the_running_mean_is_the_mean_of_each_window():
 
 def test_learning_shows_each_metric_where_a_line_has_it(tmp_path):
     metrics = [{"decisions": 100 * i, "reconstruction_loss": 1.0 / i, "kl": 2.0} for i in range(1, 5)]
-    metrics += [
-        {"decisions": 100 * i, "q_loss": 0.1, "epsilon": 0.5, "success_rate": 0.2} for i in range(5, 9)
-    ]
+    metrics += [{"decisions": 100 * i, "q_loss": 0.1, "epsilon": 0.5, "success_rate": 0.2} for i in range(5, 9)]
     metrics += [{"decisions": 900, "validation_success": 0.75}, {"decisions": 950, "q_loss": None}]
     figure = draw_learning(metrics, tmp_path / "learning.png")
     assert is_png(tmp_path / "learning.png")

@@ -55,9 +55,7 @@ def every_kind(rng: np.random.Generator, each: int = 4) -> Scene:
             Spheres(position=place[2], radius=size[2], albedo=albedo[2]),
             TiltedBoxes(position=place[3], half=half[1], rotation=rotation, albedo=albedo[3]),
             Capsules(position=place[4], axis=axis, half_length=size[4], radius=size[5], albedo=albedo[4]),
-            TiltedCylinders(
-                position=place[5], axis=axis, half_length=size[6], radius=size[7], albedo=albedo[5]
-            ),
+            TiltedCylinders(position=place[5], axis=axis, half_length=size[6], radius=size[7], albedo=albedo[5]),
         ]
     return scene_of(*shapes)
 

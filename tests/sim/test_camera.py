@@ -32,9 +32,7 @@ WINDOW_S = 0.04
 @partial(jax.jit, static_argnums=0)
 def images(config, pool, index, positions, rotations):
     """Luma [K, H, W] of K poses, each in its own world of the pool."""
-    return jax.vmap(lambda i, p, r: camera.luma(config, take_scene(pool, i), p, r))(
-        index, positions, rotations
-    )
+    return jax.vmap(lambda i, p, r: camera.luma(config, take_scene(pool, i), p, r))(index, positions, rotations)
 
 
 def references(config, pool, index, positions, rotations, samples=8):
@@ -306,14 +304,13 @@ def test_a_level_camera_ignores_roll_and_pitch_and_a_body_camera_does_not():
         assert (gap < 1e-5) == same
 
 
+@pytest.mark.slow
 def test_both_mounts_see_the_same_from_a_level_body(pools):
     scene = take_scene(pools["paper"], 0)
     position = jnp.array([1.0, 1.0, 3.0])
     rotation = jnp.asarray(rotation_of(0, 0, 0.8), jnp.float32)
     many = {"samples_across": 8, "samples_down": 8}  # rays enough to count coverage finely
-    one, other = (
-        luma_of(CameraConfig(mount=mount, **many), scene, position, rotation) for mount in ("level", "body")
-    )
+    one, other = (luma_of(CameraConfig(mount=mount, **many), scene, position, rotation) for mount in ("level", "body"))
     # They differ where counted layers have neither the slope of closeness nor the third face of a pixel.
     assert rms(one - other) < 0.015
 
@@ -377,9 +374,7 @@ def test_distant_texture_fades_to_the_plain_surface():
     # Ground seen from 2000 m up at an angle: hundreds of periods a pixel, nothing of them may be left.
     scene = scene_of(GROUND)
     pose = jnp.array([0.0, 0.0, 2000.0]), jnp.asarray(rotation_of(0, 1.2, 0), jnp.float32)
-    textured, plain = (
-        luma_of(CameraConfig(mount="body", texture_contrast=c), scene, *pose) for c in (0.35, 0.0)
-    )
+    textured, plain = (luma_of(CameraConfig(mount="body", texture_contrast=c), scene, *pose) for c in (0.35, 0.0))
     np.testing.assert_allclose(textured, plain, atol=1e-6)
 
 

@@ -128,9 +128,7 @@ def test_a_hundred_steps_agree_with_c_mujoco_within_a_millimetre(step):
     state = hover(jnp.array([1.0, -2.0, 30.0]), jnp.float32(0.4))
     state = dataclasses.replace(state, angular_velocity=jnp.array([0.5, -0.3, 0.2]))
     qpos = np.concatenate([state.position, state.quaternion])
-    places, speeds = drone_mujoco.fly_thrusts(
-        qpos, np.concatenate([state.velocity, state.angular_velocity]), sequence
-    )
+    places, speeds = drone_mujoco.fly_thrusts(qpos, np.concatenate([state.velocity, state.angular_velocity]), sequence)
     assert np.linalg.norm(places[-1, :3] - qpos[:3]) > 5  # it went somewhere
     for thrust, place, speed in zip(sequence, places, speeds, strict=True):
         state = step(state, jnp.asarray(thrust, jnp.float32))
@@ -157,9 +155,7 @@ def test_our_stages_are_the_whole_of_mjx_step(airframe, step):
         ours = step(state, thrust)
         # float32: accelerations of a tumbling body reach 500 rad/s^2
         np.testing.assert_allclose(jnp.concatenate([ours.position, ours.quaternion]), data.qpos, atol=2e-6)
-        np.testing.assert_allclose(
-            jnp.concatenate([ours.velocity, ours.angular_velocity]), data.qvel, atol=2e-5
-        )
+        np.testing.assert_allclose(jnp.concatenate([ours.velocity, ours.angular_velocity]), data.qvel, atol=2e-5)
 
 
 def test_a_decision_is_its_physics_steps_one_by_one(decide, thrust_of, step):
@@ -185,14 +181,10 @@ def test_a_decision_is_its_physics_steps_one_by_one(decide, thrust_of, step):
 
 def test_heading_is_the_yaw_of_a_level_drone_and_a_lean_does_not_move_it():
     yaws = jnp.linspace(-3.1, 3.1, 7)
-    np.testing.assert_allclose(
-        jax.vmap(lambda yaw: yaw_of(hover(jnp.zeros(3), yaw).quaternion))(yaws), yaws, atol=1e-6
-    )
+    np.testing.assert_allclose(jax.vmap(lambda yaw: yaw_of(hover(jnp.zeros(3), yaw).quaternion))(yaws), yaws, atol=1e-6)
     leaning = tilted(np.full(BATCH, 1.1), np.linspace(0, 6, BATCH))
     np.testing.assert_allclose(yaw_of(leaning.quaternion), 0.0, atol=1e-6)
-    np.testing.assert_allclose(
-        wrap_angle(jnp.array([3.5, -3.5])), [3.5 - 2 * np.pi, 2 * np.pi - 3.5], atol=1e-6
-    )
+    np.testing.assert_allclose(wrap_angle(jnp.array([3.5, -3.5])), [3.5 - 2 * np.pi, 2 * np.pi - 3.5], atol=1e-6)
 
 
 @pytest.mark.parametrize("error", [0.3, -0.3, 3.0, -3.0])
@@ -321,9 +313,7 @@ def test_a_hundred_thousand_random_decisions_never_diverge_nor_tip_the_drone_ove
 
 def test_fly_traces_to_one_scan_without_callbacks(airframe):
     state = hover(jnp.zeros(3), jnp.float32(0.0))
-    program = str(
-        jax.make_jaxpr(lambda s, c, y: fly(CONFIG, airframe, s, c, y))(state, jnp.zeros(3), jnp.float32(0.0))
-    )
+    program = str(jax.make_jaxpr(lambda s, c, y: fly(CONFIG, airframe, s, c, y))(state, jnp.zeros(3), jnp.float32(0.0)))
     assert "callback" not in program
     assert program.count("length=13") == 1
 

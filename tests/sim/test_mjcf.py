@@ -142,9 +142,7 @@ def test_only_what_is_neither_seen_nor_touched_is_left_out(world_of):
 
 
 def test_without_a_volume_it_is_the_box_around_shapes_and_sites_and_not_below_the_ground(world_of):
-    world = world_of(
-        ENDS + '<geom type="plane" size="0 0 1" pos="0 0 -2"/><geom type="box" size="1 1 1" pos="4 7 0"/>'
-    )
+    world = world_of(ENDS + '<geom type="plane" size="0 0 1" pos="0 0 -2"/><geom type="box" size="1 1 1" pos="4 7 0"/>')
     lower = [0 - VOLUME_MARGIN, 0 - VOLUME_MARGIN, -2]
     upper = [9 + VOLUME_MARGIN, 8 + VOLUME_MARGIN, 5 + VOLUME_MARGIN]
     np.testing.assert_allclose(world.scene.volume, [lower, upper], atol=1e-5)

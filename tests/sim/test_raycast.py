@@ -109,9 +109,7 @@ def test_every_kind_alone_agrees_with_mujoco_from_all_sides(kind):
         ways *= np.sign(ways @ np.asarray(ALONE[kind].normal))[:, None]
     positions = np.array([30, 30, 10]) + 9 * ways / np.linalg.norm(ways, axis=1, keepdims=True)
     looks = [np.array([30, 30, 10]) - p for p in positions]
-    rotations = np.stack(
-        [rotation_of(0.3, -np.arctan2(d[2], np.hypot(*d[:2])), np.arctan2(d[1], d[0])) for d in looks]
-    )
+    rotations = np.stack([rotation_of(0.3, -np.arctan2(d[2], np.hypot(*d[:2])), np.arctan2(d[1], d[0])) for d in looks])
     worst, other, ours = compare(
         CameraConfig(mount="body"), scene, positions.astype(np.float32), rotations.astype(np.float32)
     )
@@ -122,7 +120,7 @@ def test_every_kind_alone_agrees_with_mujoco_from_all_sides(kind):
 def test_depth_in_the_middle_of_the_image_is_the_way_straight_ahead():
     wall = scene_of(UprightBoxes(position=[30, 20, 10], half=[1, 9, 9], yaw=0.0, albedo=ALBEDO))
     config = CameraConfig(width=3, height=3)
-    image = camera.depth(config, wall, jnp.array([20.0, 20.0, 10.0]), jnp.eye(3))
+    image = depths(config, wall, jnp.array([[20.0, 20.0, 10.0]]), jnp.eye(3)[None])[0]
     np.testing.assert_allclose(image[1, 1], 9.0, rtol=1e-6)
     # One pixel aside at 90 degrees over three pixels is two thirds of the half width.
     np.testing.assert_allclose(image[1, 0], 9.0 * np.hypot(1.0, 2 / 3), rtol=1e-6)
@@ -130,7 +128,7 @@ def test_depth_in_the_middle_of_the_image_is_the_way_straight_ahead():
 
 def test_columns_run_to_the_right_and_rows_down():
     left_low = scene_of(Spheres(position=[25, 22.5, 8], radius=1, albedo=ALBEDO))
-    image = camera.depth(CameraConfig(), left_low, jnp.array([20.0, 20.0, 10.0]), jnp.eye(3))
+    image = depths(CameraConfig(), left_low, jnp.array([[20.0, 20.0, 10.0]]), jnp.eye(3)[None])[0]
     row, column = np.unravel_index(np.argmin(image), image.shape)
     # Half a unit to the left of 2, 0.4 units below of 1.5: see the pinhole's geometry.
     assert abs(column - 7.5) <= 1 and abs(row - 17.9) <= 1

@@ -84,9 +84,7 @@ def test_a_worlds_key_depends_on_its_split_and_index_alone():
     np.testing.assert_array_equal(batch[2], single)
 
 
-@pytest.mark.parametrize(
-    ("density", "least", "most"), [("sparse", 12, 12), ("medium", 28, 30), ("dense", 54, 60)]
-)
+@pytest.mark.parametrize(("density", "least", "most"), [("sparse", 12, 12), ("medium", 28, 30), ("dense", 54, 60)])
 def test_a_density_has_its_number_of_shapes(pools, density, least, most):
     counts = [obstacle_count(take_scene(pools[density], i)) for i in range(WORLDS)]
     assert least <= min(counts) and max(counts) <= most

@@ -1,0 +1,286 @@
+"""Does it learn, for any seed? `train.py` from typing to the last picture, one seed after another.
+
+Each seed is a process of its own, timed by the clock on the wall. A seed passes if its one greedy flight
+reaches the goal in at most 188 decisions and 1.15 times A*'s path, and all of it took under three minutes.
+Nothing is tried twice: a seed that has been run is only read, and one whose training failed counts as failed.
+The flight ends at the goal's radius, A*'s path at the goal itself.
+
+    python benchmarks/mission.py --seeds 20 --out runs/mission --json mission.json
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import platform
+import statistics
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from edqn_jax.evaluate import wilson_interval, write_whole
+from edqn_jax.rundir import plain
+
+TRAIN = Path(__file__).resolve().parents[1] / "train.py"
+
+MOST_DECISIONS = 188
+"""What the paper's own flight took."""
+MOST_PATH = 1.15
+"""Flown path over A*'s."""
+MOST_SECONDS = 180.0
+"""From typing to the last picture."""
+
+QUICK = ("--total-steps", "49152", "--encoder.warmup-decisions", "16384")
+"""Flags of `--quick`: long enough to run every part, far too short to learn."""
+
+
+def parse(argv: Sequence[str] | None = None) -> argparse.Namespace:
+    """The arguments; what follows `--` goes to `train.py` as it is, in `flags`."""
+    words = list(sys.argv[1:] if argv is None else argv)
+    cut = words.index("--") if "--" in words else len(words)
+    parser = argparse.ArgumentParser(
+        description=(__doc__ or "").partition("\n")[0], epilog="Flags after -- go to train.py."
+    )
+    parser.add_argument("--seeds", type=int, default=20, help="how many")
+    parser.add_argument("--first-seed", type=int, default=0)
+    parser.add_argument("--world", default="paper", help="as for train.py")
+    parser.add_argument("--out", type=Path, default=Path("runs/mission"), help="folder of the runs")
+    parser.add_argument("--json", type=Path, help="write the rows to this file")
+    parser.add_argument("--quick", action="store_true", help="two seeds, too short to learn")
+    args = parser.parse_args(words[:cut])
+    args.flags = words[cut + 1 :]
+    if args.quick:
+        args.seeds, args.flags = min(args.seeds, 2), [*QUICK, *args.flags]
+    if args.seeds < 1:
+        parser.error(f"--seeds must be at least 1, not {args.seeds}")
+    if args.json is not None and not args.json.absolute().parent.is_dir():
+        parser.error(f"--json {args.json}: there is no folder '{args.json.absolute().parent}'")
+    return args
+
+
+def command(args: argparse.Namespace, seed: int, folder: Path) -> list[str]:
+    """What is run for a seed."""
+    # A run that was cut off is started over: this measures whole runs.
+    options = ["--seed", str(seed), "--world", args.world, "--run-dir", str(folder), "--resume", "never"]
+    return [sys.executable, str(TRAIN), *options, *args.flags]
+
+
+class Ledger:
+    """How long each seed took by the clock on the wall and how it ended, kept beside the runs."""
+
+    def __init__(self, file: Path, asked: dict[str, Any]) -> None:
+        self.file, self.asked = file, asked
+        self.seeds: dict[str, dict[str, Any]] = {}
+        if file.is_file():
+            kept = json.loads(file.read_text(encoding="utf-8"))
+            if kept["asked"] != asked:
+                raise ValueError(f"the runs in '{file.parent}' were made with {kept['asked']}; give another --out")
+            self.seeds = kept["seeds"]
+
+    def note(self, seed: int, wall_seconds: float, exit_code: int) -> None:
+        self.seeds[str(seed)] = {"wall_seconds": wall_seconds, "exit_code": exit_code}
+        kept = {"asked": self.asked, "seeds": self.seeds}
+        write_whole(self.file, (json.dumps(kept, indent=1) + "\n").encode())
+
+
+def measure(args: argparse.Namespace) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
+    """Trains every seed that has not been run yet: `(rows, summaries of the complete runs)`.
+
+    Raises:
+        ValueError: if the folder holds runs of other flags.
+    """
+    args.out.mkdir(parents=True, exist_ok=True)
+    ledger = Ledger(args.out / "ledger.json", {"world": args.world, "flags": args.flags})
+    rows, summaries = [], []
+    for seed in range(args.first_seed, args.first_seed + args.seeds):
+        folder = args.out / f"s{seed}"
+        file = folder / "summary.json"
+        if str(seed) not in ledger.seeds and not file.is_file():
+            print(f"seed {seed} ...", file=sys.stderr, flush=True)
+            began = time.perf_counter()
+            with (args.out / f"s{seed}.log").open("w", encoding="utf-8") as log:
+                done = subprocess.run(command(args, seed, folder), stdout=log, stderr=subprocess.STDOUT)
+            ledger.note(seed, time.perf_counter() - began, done.returncode)
+        known = ledger.seeds.get(str(seed), {"wall_seconds": None, "exit_code": 0})
+        if known["exit_code"]:
+            rows.append(failed_row(seed, known["exit_code"], known["wall_seconds"]))
+            continue
+        summaries.append(json.loads(file.read_text(encoding="utf-8")))
+        rows.append(row_of(seed, summaries[-1], known["wall_seconds"]))
+    return rows, summaries
+
+
+def row_of(seed: int, summary: dict[str, Any], wall_seconds: float | None) -> dict[str, Any]:
+    """One seed's figures and verdicts.
+
+    Args:
+        summary: what its `summary.json` holds.
+        wall_seconds: None if nobody measured them; such a seed does not pass.
+    """
+    ratio = summary["path_length_m"] / summary["shortest_path_m"]
+    goal = summary["outcome"] == "goal"
+    verdicts = {
+        "goal": goal,
+        "decisions_ok": goal and summary["steps"] <= MOST_DECISIONS,
+        "path_ok": goal and ratio <= MOST_PATH,
+        "time_ok": wall_seconds is not None and wall_seconds < MOST_SECONDS,
+    }
+    return {
+        "name": f"seed {seed}",
+        "seed": seed,
+        "exit_code": 0,
+        "outcome": summary["outcome"],
+        "decisions": summary["steps"],
+        "path_over_shortest": ratio,
+        "min_clearance_m": summary["min_clearance_m"],
+        "wall_seconds": wall_seconds,
+        "train_seconds": summary["train_seconds"],
+        "compile_seconds": summary["compile_seconds"],
+        "decisions_per_second": summary["decisions_per_second"],
+        "validation_success": summary["validation_success"],
+        "test_success_rate": summary["test"]["success_rate"] if "test" in summary else None,
+        **verdicts,
+        "passes": all(verdicts.values()),
+    }
+
+
+def failed_row(seed: int, exit_code: int, wall_seconds: float) -> dict[str, Any]:
+    """The row of a seed whose training did not end well: it passes nothing."""
+    nothing = dict.fromkeys(
+        [
+            "decisions",
+            "path_over_shortest",
+            "min_clearance_m",
+            "train_seconds",
+            "compile_seconds",
+            "decisions_per_second",
+            "validation_success",
+            "test_success_rate",
+        ]
+    )
+    verdicts = dict.fromkeys(["goal", "decisions_ok", "path_ok", "time_ok", "passes"], False)
+    return {
+        "name": f"seed {seed}",
+        "seed": seed,
+        "exit_code": exit_code,
+        "outcome": f"exit code {exit_code}",
+        **nothing,
+        "wall_seconds": wall_seconds,
+        **verdicts,
+    }
+
+
+def totals(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """How many seeds meet each bar, Wilson's interval of those that meet all, and medians.
+
+    The medians of decisions and path are of the flights that reached the goal.
+    """
+    counts = {key: sum(row[key] for row in rows) for key in ("goal", "decisions_ok", "path_ok", "time_ok", "passes")}
+    arrived = [row for row in rows if row["goal"]]
+
+    def middle(key: str, among: Sequence[dict[str, Any]]) -> float | None:
+        known = [row[key] for row in among if row[key] is not None]
+        return statistics.median(known) if known else None
+
+    return {
+        "seeds": len(rows),
+        **counts,
+        "goal_interval": list(wilson_interval(counts["goal"], len(rows))),
+        "passes_interval": list(wilson_interval(counts["passes"], len(rows))),
+        "median_decisions": middle("decisions", arrived),
+        "median_path_over_shortest": middle("path_over_shortest", arrived),
+        "median_min_clearance_m": middle("min_clearance_m", arrived),
+        "median_wall_seconds": middle("wall_seconds", rows),
+        "median_decisions_per_second": middle("decisions_per_second", rows),
+    }
+
+
+def table(rows: Sequence[dict[str, Any]]) -> str:
+    """The rows as a Markdown table."""
+
+    def shown(value: float | None, form: str) -> str:
+        return "" if value is None else format(value, form)
+
+    lines = [
+        "| seed | outcome | decisions | path / shortest | clearance, m | wall, s | decisions/s | passes |",
+        "| ---: | --- | ---: | ---: | ---: | ---: | ---: | --- |",
+    ]
+    for row in rows:
+        missed = [bar for bar in ("goal", "decisions_ok", "path_ok", "time_ok") if not row[bar]]
+        verdict = "yes" if row["passes"] else "no: " + ", ".join(bar.removesuffix("_ok") for bar in missed)
+        lines.append(
+            f"| {row['seed']} | {row['outcome'].replace('_', ' ')} | {shown(row['decisions'], 'd')} "
+            f"| {shown(row['path_over_shortest'], '.3f')} | {shown(row['min_clearance_m'], '.2f')} "
+            f"| {shown(row['wall_seconds'], '.0f')} | {shown(row['decisions_per_second'], ',.0f')} "
+            f"| {verdict} |"
+        )
+    return "\n".join(lines)
+
+
+def sentences(total: dict[str, Any]) -> str:
+    """The totals for people."""
+    low, high = total["passes_interval"]
+    text = (
+        f"{total['passes']} of {total['seeds']} seeds pass (95 % interval {low:.0%} to {high:.0%}): "
+        f"{total['goal']} reach the goal, {total['decisions_ok']} in at most {MOST_DECISIONS} decisions, "
+        f"{total['path_ok']} within {MOST_PATH} of the shortest path; "
+        f"{total['time_ok']} took less than {MOST_SECONDS:.0f} s."
+    )
+    if total["median_decisions"] is not None:
+        text += (
+            f"\nMedians of those at the goal: {total['median_decisions']:g} decisions, "
+            f"{total['median_path_over_shortest']:.3f} of the shortest path, "
+            f"clearance {total['median_min_clearance_m']:.2f} m."
+        )
+    if total["median_wall_seconds"] is not None:
+        text += f"\nMedian wall time: {total['median_wall_seconds']:.0f} s."
+    return text
+
+
+def processor() -> str:
+    """The CPU's model name and how many cores this process may use."""
+    cpuinfo = Path("/proc/cpuinfo")
+    lines = cpuinfo.read_text(encoding="utf-8").splitlines() if cpuinfo.is_file() else []
+    named = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    model = named[0] if named else platform.machine()
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    return f"{model}, {cores} cores"
+
+
+def report_of(
+    args: argparse.Namespace, rows: Sequence[dict[str, Any]], summaries: Sequence[dict[str, Any]]
+) -> dict[str, Any]:
+    """What `--json` holds; workload and versions are those that the runs themselves state."""
+    stated = summaries[0] if summaries else {"workload": {}, "versions": {}, "devices": []}
+    return {
+        "workload": {**stated["workload"], "world": args.world, "flags": args.flags},
+        "device": processor(),
+        "devices": stated["devices"],
+        "versions": stated["versions"],
+        "bars": {"decisions": MOST_DECISIONS, "path_over_shortest": MOST_PATH, "wall_seconds": MOST_SECONDS},
+        "totals": totals(rows),
+        "rows": list(rows),
+    }
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Exit code 0 when all was measured, whatever came out; 2 for bad input."""
+    args = parse(argv)
+    try:
+        rows, summaries = measure(args)
+    except (OSError, ValueError) as error:
+        print(error, file=sys.stderr)
+        return 2
+    report = report_of(args, rows, summaries)
+    print(f"{table(rows)}\n\n{sentences(report['totals'])}\n{report['device']}")
+    if args.json is not None:
+        write_whole(args.json, (json.dumps(plain(report), indent=1, allow_nan=False) + "\n").encode())
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,187 @@
+"""The scanned training step: traced once, the same on any layout, its phases in order."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from edqn_jax.config import AgentConfig, CameraConfig, Config, ConfigError, EncoderConfig, TrainConfig
+from edqn_jax.learn import trainer
+from edqn_jax.learn.trainer import Plan, Trainer, TrainState
+from edqn_jax.sim import drone, mjcf, worlds
+from edqn_jax.sim.env import Outcome, World
+from edqn_jax.sim.scene import stack_scenes
+
+CONFIG = Config(
+    camera=CameraConfig(width=8, height=6),
+    encoder=EncoderConfig(
+        code_size=4,
+        features=8,
+        pixel_features="table",
+        hidden=16,
+        decoder_hidden=(16,),
+        warmup_decisions=64,
+        warmup_updates_per_step=1,
+    ),
+    agent=AgentConfig(
+        hidden=(16,),
+        batch_size=16,
+        updates_per_step=2,
+        n_step=3,
+        history=2,
+        learning_starts=64,
+        replay_size=512,
+    ),
+    train=TrainConfig(num_envs=16, chunk_steps=4, total_steps=256),
+)
+
+
+@pytest.fixture(scope="module")
+def world() -> World:
+    pool = stack_scenes([mjcf.load_scene(mjcf.resolve_world("paper"))])
+    missions = worlds.spread_missions(pool, 64, 0.25, 1.0, jax.random.key(1))
+    return World(airframe=drone.load_airframe(CONFIG.drone), pool=pool, missions=missions)
+
+
+def run(config: Config, world: World, devices: int) -> tuple[list[TrainState], list, int]:
+    """States on the host after each chunk, what the chunks returned, and how often the step was traced."""
+    traces = 0
+    step = trainer.train_step
+
+    def counted(*args):
+        nonlocal traces
+        traces += 1
+        return step(*args)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(trainer, "train_step", counted)
+        made = Trainer(config, world, jax.devices()[:devices])
+        state = made.init(config.train.seed)
+        states, returned = [_host(state)], []
+        for first in range(0, made.plan.total, config.train.chunk_steps):
+            state, out = made.chunk(state, first)
+            states.append(_host(state))
+            returned.append(jax.tree.map(np.asarray, out))
+    return states, returned, traces
+
+
+def _host(state: TrainState) -> TrainState:
+    """A copy that donation does not take away, keys as their data."""
+
+    def leaf(x: jax.Array) -> np.ndarray:
+        return np.array(jax.random.key_data(x) if jnp.issubdtype(x.dtype, jax.dtypes.prng_key) else x)
+
+    return jax.tree.map(leaf, state)
+
+
+@pytest.fixture(scope="module")
+def on_one(world: World):
+    return run(CONFIG, world, 1)
+
+
+@pytest.fixture(scope="module")
+def on_two(world: World):
+    return run(CONFIG, world, 2)
+
+
+def test_the_training_chunk_is_traced_exactly_once_in_a_run(on_two) -> None:
+    states, _, traces = on_two
+    assert len(states) == 5
+    assert traces == 1
+
+
+def test_no_callback_to_the_host_hides_in_the_step(world: World) -> None:
+    state = jax.eval_shape(lambda k: trainer.init(CONFIG, world, k), jax.random.key(0))
+    jaxpr = jax.make_jaxpr(lambda s, n: trainer.run_steps(CONFIG, world, s, n))(state, jnp.arange(2))
+    assert "callback" not in str(jaxpr)
+
+
+def test_rollouts_before_learning_are_the_same_on_one_device_and_two(on_one, on_two) -> None:
+    # The first chunk is the warm-up: random manoeuvres, so nothing that was learnt has acted yet. XLA vectorises
+    # another batch size differently, which moves the last bits of a position at 100 m.
+    for one, two in zip(
+        jax.tree.leaves(on_one[0][1].actors.env), jax.tree.leaves(on_two[0][1].actors.env), strict=True
+    ):
+        np.testing.assert_allclose(one, two, atol=1e-4)
+
+
+def test_parameters_agree_on_one_device_and_two_after_the_first_updates(on_one, on_two) -> None:
+    # Sums over shards are added in another order: a few units in the last place per update.
+    for one, two in zip(jax.tree.leaves(on_one[0][1].learner), jax.tree.leaves(on_two[0][1].learner), strict=True):
+        np.testing.assert_allclose(one, two, atol=1e-5)
+
+
+def test_the_acting_encoder_changes_once_at_the_end_of_the_warm_up(on_one) -> None:
+    states = on_one[0]
+    assert Plan.of(CONFIG).warmup == 4
+    start, warm, later, last = states[0].learner, states[1].learner, states[2].learner, states[-1].learner
+    assert not _same(start.encoder, warm.encoder)
+    assert _same(warm.encoder, warm.vae)
+    assert _same(warm.encoder, later.encoder) and _same(warm.encoder, last.encoder)
+
+
+def test_the_q_network_rests_until_there_is_enough_to_learn_from(on_one) -> None:
+    states, returned, _ = on_one
+    plan = Plan.of(CONFIG)
+    losses = np.concatenate([losses.q_loss for _, losses in returned])
+    assert np.isnan(losses[: plan.learn_from]).all()
+    assert np.isfinite(losses[plan.learn_from :]).all()
+    assert _same(states[0].learner.q, states[1].learner.q)
+    assert not _same(states[0].learner.q, states[-1].learner.q)
+    # The average lags behind what learns, and the target too.
+    assert not _same(states[-1].learner.q, states[-1].learner.target)
+
+
+def test_the_replay_holds_what_the_environments_went_through(on_one) -> None:
+    states, returned, _ = on_one
+    plan, actors = Plan.of(CONFIG), states[-1].actors
+    stored = plan.total - plan.warmup
+    # [S, L, E] -> rows 1.. hold the outcome of the step before them.
+    replayed = actors.replay.outcome[:, 1:stored].swapaxes(0, 1)
+    flown = np.concatenate([episodes.outcome for episodes, _ in returned])[plan.warmup :]
+    np.testing.assert_array_equal(replayed, flown[: stored - 1])
+    after_an_end = np.roll(actors.replay.outcome, 1, axis=1)[:, 1:stored] != Outcome.RUNNING
+    np.testing.assert_array_equal(actors.replay.is_reset[:, 1:stored], after_an_end)
+
+
+@pytest.mark.slow
+def test_training_two_seeds_at_once_is_training_each_alone(world: World) -> None:
+    keys = jax.random.split(jax.random.key(3), 2)
+    steps = jnp.arange(8)
+
+    @jax.jit
+    def train(key: jax.Array):
+        return trainer.run_steps(CONFIG, world, trainer.init(CONFIG, world, key), steps)
+
+    @jax.jit
+    def train_both(keys: jax.Array):
+        states = jax.vmap(lambda k: trainer.init(CONFIG, world, k))(keys)
+        return jax.vmap(lambda s: trainer.run_steps(CONFIG, world, s, steps))(states)
+
+    together = train_both(keys)
+    for index in range(2):
+        alone = train(keys[index])
+        both = jax.tree.map(lambda x, i=index: x[i], together)
+        # The warm-up's flights are exact; batched products round otherwise.
+        np.testing.assert_array_equal(both[1][0].outcome[:4], alone[1][0].outcome[:4])
+        np.testing.assert_allclose(both[1][1].reconstruction[:4], alone[1][1].reconstruction[:4], rtol=1e-4)
+
+
+def test_environments_that_do_not_divide_into_shards_are_refused_with_a_sentence(world: World) -> None:
+    config = dataclasses.replace(CONFIG, train=dataclasses.replace(CONFIG.train, num_envs=12))
+    with pytest.raises(ConfigError, match=r"num_envs \(12\).*multiples of train.shards \(8\)"):
+        trainer.init(config, world, jax.random.key(0))
+
+
+def test_totals_round_up_to_whole_chunks() -> None:
+    config = dataclasses.replace(CONFIG, train=dataclasses.replace(CONFIG.train, total_steps=257))
+    assert Plan.of(config).total == 20
+
+
+def _same(one, two) -> bool:
+    pairs = zip(jax.tree.leaves(one), jax.tree.leaves(two), strict=True)
+    return all(np.array_equal(a, b) for a, b in pairs)
