@@ -175,13 +175,13 @@ class EncoderConfig:
     """Widths of the decoder's ReLU layers."""
     target_blur: int = 2
     """Times that the decoder's target is blurred by a binomial of three pixels; 0 is the sharp event image."""
-    kl_weight: float = 0.5
+    kl_weight: float = 0.05
     """beta: weight of the KL term per image against the reconstruction error per image."""
     learning_rate: float = 2e-3
     """Adam step size of the VAE."""
     warmup_decisions: int = 32_768
     """Decisions of held random manoeuvres in which the VAE learns before the DQN starts."""
-    warmup_updates_per_step: int = 2
+    warmup_updates_per_step: int = 8
     """VAE updates per training step of the warm-up, each on all new event fields."""
     hold_decisions: int = 4
     """Mean number of decisions for which a random manoeuvre of the warm-up is held."""
@@ -197,7 +197,7 @@ class AgentConfig:
     """Widths of the hidden layers."""
     history: int = 1
     """Observations that the network sees at once, the newest included."""
-    code_scale: float = 0.2
+    code_scale: float = 0.5
     """The code is multiplied by this before the network sees it, so that it does not drown the own state."""
     layer_norm: bool = False
     """Layer normalisation after each hidden layer."""
@@ -207,7 +207,7 @@ class AgentConfig:
     """Double DQN targets (van Hasselt et al. 2016)."""
     n_step: int = 5
     """Steps of the return before the bootstrap."""
-    discount: float = 0.95
+    discount: float = 0.97
     """gamma."""
     target_rate: float = 0.01
     """Polyak tau of the target network, per update."""

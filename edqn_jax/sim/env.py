@@ -97,8 +97,9 @@ def velocity_command(config: EnvConfig, action: Array, yaw: Array) -> Array:
 def own_state(config: EnvConfig, scene: Scene, goal: Array, state: DroneState) -> Array:
     """The drone's own ten values [10], each of order 1.
 
-    Horizontal distance and height to the goal (in 50 and 10 m), cosine and sine of the heading, own position
-    scaled to [-1, 1] in the flight volume (3), own velocity in the heading frame (3, in commanded speeds).
+    Horizontal distance and height to the goal (asinh(d / 2 m) / 2 and asinh(h / 2 m): metres count near the
+    goal, powers of ten far away), cosine and sine of the heading, own position scaled to [-1, 1] in the
+    flight volume (3), own velocity in the heading frame (3, in commanded speeds).
     """
     yaw = drone.yaw_of(state.quaternion)
     cos, sin = jnp.cos(yaw), jnp.sin(yaw)
@@ -109,7 +110,7 @@ def own_state(config: EnvConfig, scene: Scene, goal: Array, state: DroneState) -
     vx, vy, vz = state.velocity / config.speed_m_s
     return jnp.concatenate(
         [
-            jnp.stack([distance / 50.0, ahead[2] / 10.0, cos, sin]),
+            jnp.stack([jnp.arcsinh(distance / 2.0) / 2.0, jnp.arcsinh(ahead[2] / 2.0), cos, sin]),
             position,
             jnp.stack([cos * vx + sin * vy, cos * vy - sin * vx, vz]),
         ]

@@ -226,5 +226,7 @@ def test_the_learner_finds_the_known_values(learned, task):
     if task == "detour" and learner == "n-step":
         # Uncorrected n-step returns follow the behaviour: random in the second state, 1 on average.
         expected[0, 1] = GAMMA
+    # The tables are found to 1e-3; only what averages over random moves keeps some noise (0.08 over four seeds).
+    tolerance = 0.2 if task == "detour" and learner == "n-step" else 0.02
     for (state, action), value in expected.items():
-        np.testing.assert_allclose(q[task][state, action], value, atol=0.05 * max(1.0, abs(value)))
+        np.testing.assert_allclose(q[task][state, action], value, atol=tolerance)

@@ -91,8 +91,8 @@ def agreement(image, reference) -> Agreement:
 
 
 WINDOWS = {
-    "level": {"paper": 10, "medium": 16, "every kind": 6},
-    "body": {"paper": 6, "medium": 8, "every kind": 4},
+    "level": {"paper": 8, "medium": 12, "every kind": 4},
+    "body": {"paper": 4, "medium": 8, "every kind": 4},
 }
 """How many windows per mount and sort of world."""
 
@@ -123,10 +123,11 @@ def compared(pools, mount, sort):
     return ours, *(references(config, pool, *flat, n).reshape(shape) for n in (8, 2))
 
 
-# Bars on rms luma, rms change of log luma and wrong pixels per event, a third or so above what is reached
-# in two draws of poses (where events are few, 37 a window, more of them are wrong than where there are 90):
-#   level: paper 0.006, 0.023, 0.14-0.23; medium 0.006, 0.025, 0.19; every kind 0.010, 0.037, 0.30
-#   body:  paper 0.011, 0.046, 0.24; medium 0.010, 0.047, 0.23; every kind 0.011, 0.041, 0.28
+# Bars on rms luma, rms change of log luma and wrong pixels per event, a third or so above what was reached over
+# several draws of poses:
+#   level: paper 0.004-0.006, 0.017-0.023, 0.14-0.23; medium 0.006, 0.017-0.025, 0.17-0.19;
+#          every kind 0.010, 0.037, 0.30-0.31
+#   body:  paper 0.011, 0.046, 0.20-0.24; medium 0.010-0.013, 0.047-0.063, 0.23; every kind 0.011, 0.048, 0.28
 # 8 x 8 is itself 0.08 to 0.15 wrong pixels per event away from 16 x 16, and 0.016 in the change of log luma:
 # the level camera is nearer to 16 x 16 than to 8 x 8.
 BARS = {
@@ -134,8 +135,8 @@ BARS = {
     ("level", "medium"): (0.009, 0.034, 0.32),
     ("level", "every kind"): (0.014, 0.049, 0.40),
     ("body", "paper"): (0.015, 0.060, 0.34),
-    ("body", "medium"): (0.015, 0.062, 0.34),
-    ("body", "every kind"): (0.016, 0.056, 0.40),
+    ("body", "medium"): (0.018, 0.080, 0.34),
+    ("body", "every kind"): (0.016, 0.062, 0.40),
 }
 
 

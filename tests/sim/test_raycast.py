@@ -51,13 +51,11 @@ def compare(config, scene, positions, rotations):
             for p, r in zip(positions, rotations, strict=True)
         ]
     )
-    # Near the horizon MuJoCo sees the ground kilometres off, where a rounded direction is all that counts.
-    near = (theirs < 500) | (ours < 500)
     with np.errstate(invalid="ignore"):
         error = np.abs(ours / theirs - 1)
     same = np.isfinite(ours) & np.isfinite(theirs) & (error < 0.02)  # beyond that, it is another surface
     neither = np.isinf(ours) & np.isinf(theirs)
-    return float(error[same & near].max()), float(np.mean(near & ~same & ~neither)), ours
+    return float(error[same].max()), float(np.mean(~same & ~neither)), ours
 
 
 @pytest.mark.parametrize("mount", MOUNTS)
@@ -68,7 +66,7 @@ def test_depth_agrees_with_mujoco_among_shapes_of_every_kind(mount):
     for _ in range(4):
         scene = every_kind(rng)
         found.append(compare(config, scene, *random_poses(scene, rng, 8)))
-    # The project's bars; what is reached is 2e-5 or so and a few grazing pixels in ten thousand.
+    # The project's bars; what is reached is 5e-5, and 4 pixels in 100 000 that meet something else.
     assert max(worst for worst, _, _ in found) < 1e-3
     assert np.mean([share for _, share, _ in found]) < 0.005
     assert np.mean([np.mean(ours < 60) for _, _, ours in found]) > 0.3  # there was something to see
