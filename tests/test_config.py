@@ -146,12 +146,12 @@ def test_every_numeric_knob_has_limits(group, knob, nonsense):
         ("train", {"devices": 3}, "train.devices must be 0 or a divisor of train.shards"),
         (
             "agent",
-            {"replay_size": 512},
+            {"replay_size": 512, "batch_size": 1024},
             r"agent.replay_size must be at least agent.batch_size \(1024\), not 512",
         ),
         (
             "agent",
-            {"replay_size": 2048, "learning_starts": 0},
+            {"replay_size": 1024, "learning_starts": 0},
             "observations for each of the 256 environments",
         ),
         ("agent", {"learning_starts": 10**9}, "agent.learning_starts must be at most agent.replay_size"),
