@@ -47,7 +47,8 @@ class TrainOptions:
     run_dir: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="")] = None
     """What the run leaves behind goes here (default: a fresh, dated folder under runs/)."""
     resume: Resume = "auto"
-    """Continue the unfinished run in --run-dir: if there is one; never, start over; or fail without one."""
+    """What to do with an unfinished run in --run-dir. It cannot be continued yet: `auto` and `must` refuse it with a
+    sentence, `never` starts it over."""
 
 
 @dataclass(frozen=True)

@@ -242,7 +242,7 @@ def collect(
     """The field behind a stream: the inverse of `expand` for a field without noise (host side, NumPy).
 
     Lossless in this sense: `expand(collect(s)) == s` event by event, and `collect(expand(f))` has f's counts
-    and polarities exactly and every event within half a microsecond. Times come back as float64.
+    and polarities exactly and every event within a microsecond. Times come back as float64.
 
     Raises:
         ValueError: if a pixel has events of both polarities, or unevenly spaced ones, between two frames.
