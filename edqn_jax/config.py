@@ -103,13 +103,13 @@ class EventsConfig:
     """Which event law: the paper's, AirSim's own to the event, or a sensor with memory."""
     frame_times_s: tuple[float, ...] = (-0.04, 0.0)
     """When frames are rendered relative to the decision, seconds; each must be a physics step."""
-    threshold: float = 0.1
+    threshold: float = 0.05
     """Th of Eq. 2 (`paper`): log-brightness change that makes events."""
-    tolerance: float = 0.1
+    tolerance: float = 0.05
     """TOL of Eq. 4 (`paper`): log-brightness change per event."""
-    contrast_on: float = 0.1
+    contrast_on: float = 0.05
     """C+ (`esim`): log-brightness rise per event."""
-    contrast_off: float = 0.1
+    contrast_off: float = 0.05
     """C- (`esim`): log-brightness fall per event."""
     airsim_tolerance: float = 0.5
     """TOL of AirSim's event simulator (`airsim`)."""
@@ -145,7 +145,7 @@ class EnvConfig:
     """`sparse`: Eq. 8. `progress`: adds metres gained. `potential`: the policy-invariant form."""
     progress_weight: float = 3.0
     """Reward per metre gained towards the goal (`progress`, `potential`)."""
-    path_weight: float = 0.5
+    path_weight: float = 1.5
     """Reward lost per metre flown (`progress`), so that weaving on the way is not free."""
     goal_reward: float = 100.0
     """Reward at the goal (Eq. 8)."""
@@ -205,7 +205,7 @@ class AgentConfig:
     """Dueling heads (Wang et al. 2016)."""
     double: bool = True
     """Double DQN targets (van Hasselt et al. 2016)."""
-    n_step: int = 5
+    n_step: int = 3
     """Steps of the return before the bootstrap."""
     discount: float = 0.97
     """gamma."""
@@ -266,7 +266,7 @@ class TrainConfig:
     validation_missions: int = 128
     """Validation missions flown each time; half of those in the paper's world begin near its start."""
     keep: Literal["best", "last"] = "best"
-    """Parameters that a run ends with: those of the best validation (the latest among equals), or the last."""
+    """Parameters that a run ends with: those of the best validation (by SPL; the latest among equals), or the last."""
 
 
 @dataclass(frozen=True)
@@ -304,6 +304,7 @@ def preset(name: str) -> Config:
     if name == "paper":
         return dataclasses.replace(
             Config(),
+            events=EventsConfig(threshold=0.1, tolerance=0.1, contrast_on=0.1, contrast_off=0.1),
             env=EnvConfig(
                 reward="sparse", progress_weight=1.0, path_weight=0.0, left_volume_reward=0.0, step_reward=0.0
             ),

@@ -25,7 +25,7 @@ from edqn_jax.checkpoint import save_policy
 from edqn_jax.config import DENSITIES, Config
 from edqn_jax.devices import choose_devices
 from edqn_jax.endings import DivergedError, StoppedError
-from edqn_jax.evaluate import flight_summary, summarise, trajectory
+from edqn_jax.evaluate import flight_summary, spl, summarise, trajectory
 from edqn_jax.flights import Flights, fly_missions
 from edqn_jax.learn.policy import PolicyParams
 from edqn_jax.learn.trainer import Episodes, Losses, Plan, Trainer, TrainState, policy_of
@@ -108,7 +108,8 @@ class _Best:
     """The parameters that a run would end with now, and where they come from."""
 
     params: PolicyParams
-    success: float = -1.0
+    spl: float = -1.0
+    success: float = 0.0
     decisions: int = 0
 
 
@@ -219,9 +220,11 @@ def train_run(
             rate = float(np.mean(flights.outcome == Outcome.GOAL))
             flown = bool(flights.outcome[0] == Outcome.GOAL)
             log.validations.append((validated, time.perf_counter() - began, rate, flown))
-            metrics["validation_success"] = rate
-            if config.train.keep == "last" or rate >= best.success:
-                best = _Best(params, rate, validated)
+            straight = _straight(courses.validation.missions, config.env.goal_radius_m)
+            weighted = spl(flights.outcome == Outcome.GOAL, flights.path_length_m, straight)
+            metrics |= {"validation_success": rate, "validation_spl": weighted}
+            if config.train.keep == "last" or weighted >= best.spl:
+                best = _Best(params, weighted, rate, validated)
         run.append_metrics(metrics)
         progress.update(metrics)
         if stop_requested() and not finished:
@@ -251,6 +254,7 @@ def train_run(
         "first_success_decisions": since[0],
         "first_success_seconds": since[1],
         "validation_success": best.success,
+        "validation_spl": best.spl,
         "parameters_from_decisions": best.decisions,
         "workload": workload(config, scene),
         "devices": [str(device) for device in devices],
@@ -270,6 +274,11 @@ def _fly(config: Config, world: World, params: PolicyParams, mesh: Mesh) -> Flig
     world, params, key = jax.device_put((world, params, jax.random.key(config.train.seed)), everywhere)
     flights = fly_missions(config, world, params, key, record=True, mesh=mesh)
     return jax.tree.map(np.asarray, flights)
+
+
+def _straight(missions: Missions, goal_radius_m: float) -> np.ndarray:
+    """[M] metres from each start straight to the goal's sphere: no flight is shorter, and nothing need be searched."""
+    return np.linalg.norm(np.asarray(missions.goal) - np.asarray(missions.start), axis=1) - goal_radius_m
 
 
 def _check_finite(plan: Plan, done: int, losses: Losses) -> None:
