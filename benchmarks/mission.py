@@ -12,8 +12,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
-import platform
 import statistics
 import subprocess
 import sys
@@ -22,6 +20,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from edqn_jax.devices import processor
 from edqn_jax.evaluate import wilson_interval, write_whole
 from edqn_jax.rundir import plain
 
@@ -239,16 +238,6 @@ def sentences(total: dict[str, Any]) -> str:
     if total["median_wall_seconds"] is not None:
         text += f"\nMedian wall time: {total['median_wall_seconds']:.0f} s."
     return text
-
-
-def processor() -> str:
-    """The CPU's model name and how many cores this process may use."""
-    cpuinfo = Path("/proc/cpuinfo")
-    lines = cpuinfo.read_text(encoding="utf-8").splitlines() if cpuinfo.is_file() else []
-    named = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
-    model = named[0] if named else platform.machine()
-    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    return f"{model}, {cores} cores"
 
 
 def report_of(

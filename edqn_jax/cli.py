@@ -75,11 +75,16 @@ class EvaluateArgs:
     """How many missions."""
     seed: Annotated[int, arg(metavar="S")] = 0
     """Seed of the missions."""
+    shuffle_codes: Annotated[bool, arg(help_behavior_hint="")] = False
+    """Give each drone the events of another one at each decision: how much does the policy fly by its events?"""
     json: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
     """Also write the figures as JSON."""
     trajectories: Annotated[Path | None, arg(metavar="FILE.npz", help_behavior_hint="")] = None
     """Also write every flight, a pose per physics step."""
 
+
+LEAST_TO_SHUFFLE = 32
+"""Missions between which codes can be exchanged on any number of devices that people have."""
 
 TRAIN = "edqn train"
 COMMANDS = {"train": TrainCommand, "evaluate": EvaluateArgs}
@@ -153,6 +158,8 @@ def _evaluate(argv: Sequence[str]) -> int:
     args = tyro.cli(EvaluateArgs, args=argv, prog="edqn evaluate")
     if args.missions < 1:
         raise ConfigError(f"--missions must be at least 1, not {args.missions}")
+    if args.shuffle_codes and args.missions < LEAST_TO_SHUFFLE:
+        raise ConfigError(f"--shuffle-codes needs --missions of at least {LEAST_TO_SHUFFLE}, not {args.missions}")
     if not (args.run / "config.yaml").is_file():
         raise ConfigError(f"there is no run in '{args.run}': it holds no config.yaml")
 

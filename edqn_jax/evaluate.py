@@ -223,11 +223,14 @@ def evaluate_command(args: EvaluateArgs) -> None:
     name = args.world or config.world.name
     course = load_course(config, name, args.missions, args.seed, args.start, args.goal)
     record = args.trajectories is not None
-    flights = fly_on_all_devices(config, course.world, params, args.seed, record=record)
+    flights = fly_on_all_devices(
+        config, course.world, params, args.seed, record=record, shuffle_codes=args.shuffle_codes
+    )
     shortest = shortest_paths(config, course.world, np.asarray(flights.outcome) == Outcome.GOAL)
     figures = {
         "world": course.name,
         "seed": args.seed,
+        "shuffled_codes": args.shuffle_codes,
         **summarise(flights, shortest),
         "decision_latency_ms": decision_latency_ms(config, params),
     }
@@ -264,7 +267,7 @@ def report(figures: dict[str, Any]) -> Table:
 
     low, high = figures["interval"]
     latency = figures["decision_latency_ms"]
-    title = f"{figures['world']}, seed {figures['seed']}"
+    title = f"{figures['world']}, seed {figures['seed']}" + (", shuffled codes" if figures["shuffled_codes"] else "")
     table = Table(title=title, show_header=False, title_justify="left")
     table.add_column()
     table.add_column(justify="right")

@@ -7,7 +7,6 @@ from functools import partial
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from flax import struct
 from jax import Array
 from jax.sharding import Mesh, PartitionSpec
@@ -18,7 +17,6 @@ from edqn_jax.learn.policy import Memory, PolicyParams
 from edqn_jax.sim import env
 from edqn_jax.sim.env import EnvState, Observation, Outcome, Step, World
 from edqn_jax.sim.scene import scene_at, signed_distance, take_scene
-from edqn_jax.sim.worlds import Missions
 
 
 @struct.dataclass
@@ -185,23 +183,6 @@ def _fly(
     flying = jax.lax.while_loop(lambda f: jnp.any(f.flights.outcome == Outcome.RUNNING), decide, flying)
     whole = None if flying.record is None else _by_mission(flying.record)
     return dataclasses.replace(flying.flights, record=whole)
-
-
-def own_flight(config: Config, world: World, params: PolicyParams, key: Array, *, mesh: Mesh | None = None) -> Flights:
-    """The flight from the first world's own start to its own goal, recorded; M = 1.
-
-    It is flown as often as `world` has missions, all alike, and the first is returned: a program that was
-    compiled for those missions is used again, which costs less than to compile one for a single flight.
-    """
-    own = Missions(scene=jnp.zeros((), jnp.int32), start=world.pool.start[0], goal=world.pool.goal[0])
-
-    def repeat(own: Array, leaf: Array) -> Array:
-        # Laid out as the missions are, or the program would be compiled again.
-        return jax.device_put(np.broadcast_to(own, leaf.shape), leaf.sharding if leaf.committed else None)
-
-    repeated = dataclasses.replace(world, missions=jax.tree.map(repeat, own, world.missions))
-    flights = fly_missions(config, repeated, params, key, record=True, mesh=mesh)
-    return jax.tree.map(lambda leaf: leaf[:1], flights)
 
 
 def _at_start(config: Config, world: World, state: EnvState) -> Flights:

@@ -14,7 +14,7 @@ from edqn_jax import flights
 from edqn_jax.agreement import check_verdicts
 from edqn_jax.course import Course, load_course
 from edqn_jax.evaluate import flight_summary, fly_on_all_devices, trajectory
-from edqn_jax.flights import Flights, fly_missions, own_flight
+from edqn_jax.flights import Flights, fly_missions
 from edqn_jax.rundir import TRAJECTORY_COLUMNS
 from edqn_jax.sim.env import Outcome
 from edqn_jax.sim.scene import signed_distance, take_scene
@@ -158,25 +158,26 @@ def test_one_mission_has_nobody_to_shuffle_with(course):
         fly_missions(CONFIG, alone, always((0, 0, 0)), jax.random.key(0), shuffle_codes=True)
 
 
-def test_the_own_flight_begins_at_the_worlds_start_and_is_not_compiled_again(course):
+def test_a_recorded_flight_becomes_columns_and_a_summary_and_compiles_nothing_anew(course):
     mesh = Mesh(np.asarray(jax.devices()), ("mission",))
     layout = NamedSharding(mesh, PartitionSpec())
     world, params = jax.device_put((course.world, always((1, 0, 0))), layout)
     key = jax.random.key(0)
-    fly_missions(CONFIG, world, params, key, record=True, mesh=mesh)
+    flown = fly_missions(CONFIG, world, params, key, record=True, mesh=mesh)
     programs = flights._compiled._cache_size()  # type: ignore[attr-defined]
-    own = own_flight(CONFIG, world, params, key, mesh=mesh)
+    fly_missions(CONFIG, world, params, jax.random.key(1), record=True, mesh=mesh)
     assert flights._compiled._cache_size() == programs  # type: ignore[attr-defined]
-    columns = trajectory(CONFIG, own)
-    summary = flight_summary(own)
+    mission = int(np.flatnonzero(np.asarray(flown.outcome) == Outcome.COLLISION)[0])
+    start = np.asarray(world.missions.start[mission])
+    columns = trajectory(CONFIG, flown, mission)
+    summary = flight_summary(flown, mission)
     assert tuple(columns) == TRAJECTORY_COLUMNS
-    assert {len(column) for column in columns.values()} == {int(own.physics_steps[0])}
-    first = [columns[axis][0] for axis in "xyz"]
-    np.testing.assert_allclose(first, world.pool.start[0], atol=0.01)  # one physics step from rest
+    assert {len(column) for column in columns.values()} == {int(flown.physics_steps[mission])}
+    np.testing.assert_allclose([columns[axis][0] for axis in "xyz"], start, atol=0.01)  # one physics step from rest
     np.testing.assert_allclose(columns["t"][[0, -1]], [DT, DT * len(columns["t"])])
     assert summary["outcome"] == "collision" and not summary["success"]
     assert summary["steps"] == -(-len(columns["t"]) // N)
     rewards = columns["reward"][::N]
     assert summary["return"] == pytest.approx(rewards.sum(), abs=1e-3)
-    straight = np.linalg.norm(np.array([columns[axis][-1] for axis in "xyz"]) - world.pool.start[0])
+    straight = np.linalg.norm(np.array([columns[axis][-1] for axis in "xyz"]) - start)
     assert straight - 0.1 <= summary["path_length_m"] <= straight + 1.0

@@ -223,8 +223,8 @@ def train_step(
     # Fly and see.
     flown, seen = jax.vmap(lambda s, a: env.step(config, world, s, a))(jax.tree.map(_flat, actors.env), _flat(action))
     # Learn: the VAE from all new events, the Q-network from the replay.
-    vae_losses, learner = _learn_to_see(config, axis, learner, seen.observation.events, keys[:, 2], step)
-    q_losses, learner = _learn_to_act(config, axis, learner, ring, time, keys[:, 3], step)
+    vae_losses, learner = learn_to_see(config, axis, learner, seen.observation.events, keys[:, 2], step)
+    q_losses, learner = learn_to_act(config, axis, learner, ring, time, keys[:, 3], step)
     learner = _publish(plan, learner, step)
 
     # Encode once, and remember; a new episode, or a new encoder, begins with an empty memory.
@@ -277,7 +277,7 @@ def _publish(plan: Plan, learner: Learner, step: Array) -> Learner:
     )
 
 
-def _learn_to_see(config: Config, axis: str | None, learner: Learner, fields, keys: Array, step: Array):
+def learn_to_see(config: Config, axis: str | None, learner: Learner, fields, keys: Array, step: Array):
     """VAE updates on this step's event fields: `(reconstruction, kl), learner`."""
     plan = Plan.of(config)
     shards = keys.shape[0]
@@ -309,7 +309,7 @@ def _learn_to_see(config: Config, axis: str | None, learner: Learner, fields, ke
     return lax.cond(step < plan.warmup, lambda x: learn(x, config.encoder.warmup_updates_per_step), rest, learner)
 
 
-def _learn_to_act(config: Config, axis: str | None, learner: Learner, ring, time: Array, keys: Array, step: Array):
+def learn_to_act(config: Config, axis: str | None, learner: Learner, ring, time: Array, keys: Array, step: Array):
     """DQN updates from the replay (Algorithm 1, steps 7-9): `(loss, mean Q), learner`."""
     plan, agent = Plan.of(config), config.agent
     share = agent.batch_size // config.train.shards

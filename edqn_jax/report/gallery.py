@@ -55,21 +55,23 @@ def _draw_what_it_sees(
 ) -> None:
     """RGB beside events at moments of the flight, and what the VAE makes of those events."""
     n, steps = config.drone.physics_steps, len(flown["t"])
-    # Whole decisions, from the middle of equal parts of the flight; row k stands after physics step k + 1.
-    decisions = np.unique(((np.arange(MOMENTS) + 0.5) / MOMENTS * max(steps // n, 1)).astype(int).clip(1))
+    decisions = np.arange(1, max(steps // n, 1) + 1)  # row k stands after physics step k + 1
     offsets = np.array(env.frame_steps(config)) - n
     rows = np.clip(decisions[:, None] * n + offsets[None] - 1, 0, steps - 1)
     position = np.stack([flown[k] for k in ("x", "y", "z")], -1).astype(np.float32)
     quaternion = np.stack([flown[k] for k in ("qw", "qx", "qy", "qz")], -1).astype(np.float32)
-    poses = Flight(
-        position=jnp.asarray(position[rows]), quaternion=jnp.asarray(quaternion[rows]), velocity=jnp.zeros(0)
-    )
-    native, fine = _rgb(config, scene, poses, 1), _rgb(config, scene, poses, FINE)
+
+    def rgb(rows: np.ndarray, finer: int) -> np.ndarray:
+        return _rgb(config, scene, Flight(position[rows], quaternion[rows], np.zeros(0)), finer)  # type: ignore
+
+    native = rgb(rows, 1)
     frames = native[..., 0] * camera.LUMA[0] + native[..., 1] * camera.LUMA[1] + native[..., 2] * camera.LUMA[2]
     fields = jax.vmap(lambda f: _field(config, f))(jnp.asarray(frames))
     counts = np.asarray(jax.vmap(events.event_image)(fields))
+    shown = _busiest(np.abs(counts).sum((1, 2)), MOMENTS)
+    rows, native, counts, fields = rows[shown], native[shown], counts[shown], jax.tree.map(lambda x: x[shown], fields)
     draw_events(
-        _display(fine[:, -1]),
+        _display(rgb(rows[:, -1:], FINE)[:, -1]),
         _display(native[:, -1]),
         counts,
         run.figures / "events.png",
@@ -80,6 +82,13 @@ def _draw_what_it_sees(
     # ON and OFF together, as events per pixel again.
     seen, remembered = (np.expm1(np.asarray(x)).sum(-3) for x in (wanted, made))
     draw_reconstruction(seen, remembered, run.figures / "reconstruction.png")
+
+
+def _busiest(events: np.ndarray, parts: int) -> np.ndarray:
+    """Of each of `parts` equal parts of a flight the decision with the most events; fewer in a short flight."""
+    return np.array(
+        [int(part[np.argmax(events[part])]) for part in np.array_split(np.arange(len(events)), parts) if len(part)]
+    )
 
 
 def _field(config: Config, frames: Any) -> events.EventField:

@@ -69,15 +69,20 @@ class Flight:
     velocity: Array  # [n, 3] m/s, world
 
 
-def load_airframe(config: DroneConfig) -> Airframe:
-    """The Skydio X2 as MJX arrays, and the mixer that follows from its rotor layout."""
+def c_model(config: DroneConfig) -> mujoco.MjModel:
+    """The Skydio X2 as C MuJoCo compiles it, without the shapes that only a viewer needs."""
     spec = mujoco.MjSpec.from_file(str(AIRFRAME_FILE))
     spec.option.timestep = config.physics_dt_s
     # MJX solves a sparse mass matrix by unrolled arithmetic, a dense one by a LAPACK call per environment.
     spec.option.jacobian = mujoco.mjtJacobian.mjJAC_SPARSE
-    for shape in list(spec.geoms):  # they are only for the viewer
+    for shape in list(spec.geoms):
         spec.delete(shape)
-    model = spec.compile()
+    return spec.compile()
+
+
+def load_airframe(config: DroneConfig) -> Airframe:
+    """The Skydio X2 as MJX arrays, and the mixer that follows from its rotor layout."""
+    model = c_model(config)
     rest = mujoco.MjData(model)
     mujoco.mj_forward(model, rest)
     arm = model.site_pos[model.actuator_trnid[:, 0]]

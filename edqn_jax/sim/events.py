@@ -401,8 +401,8 @@ def _noise(config: EventsConfig, hot: Array | None, field: EventField, times: ND
     rate = jnp.broadcast_to(config.leak_rate_hz + config.shot_rate_hz + firing, shape[1:])
     intervals = jnp.asarray(np.diff(times), jnp.float32)[:, None, None]
     limit = jnp.array([max_events(config, dt) for dt in np.diff(times)], jnp.int32)[:, None, None]
-    count = jnp.minimum(jax.random.poisson(key_count, rate * intervals, shape, dtype=jnp.int32), limit)
-    off = jax.random.uniform(key_polarity, shape) * rate < rate_off
+    count = jnp.minimum(jax.random.poisson(key_count, rate[None] * intervals, shape, dtype=jnp.int32), limit)
+    off = jax.random.uniform(key_polarity, shape) * rate[None] < rate_off
     step = intervals / jnp.maximum(count, 1)
     first = jnp.asarray(times[:-1, None, None], jnp.float32) + jax.random.uniform(key_phase, shape) * step
     polarity = jnp.where(count > 0, jnp.where(off, -1, 1), 0).astype(jnp.int8)
