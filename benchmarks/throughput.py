@@ -410,7 +410,8 @@ def measure(config: Config, repeats: int, parts: bool) -> dict[str, Any]:
     devices = choose_devices(config.train.devices, config.train.shards)
     mesh = Mesh(np.asarray(devices), (AXIS,))
     whole = WholeStep(config, courses.training, devices)
-    host = jax.tree.map(lambda x: jax.device_put(x, jax.devices()[0]), whole.state)
+    # A copy: the next chunk is given the state itself.
+    host = jax.tree.map(lambda x: jax.device_put(x, devices[0]).copy(), whole.state)
     timed = (
         [Timed(part, mesh, config.train.num_envs) for part in parts_of(config, courses.training, host)] if parts else []
     )
