@@ -308,6 +308,8 @@ class Timed:
         once = jax.shard_map(part.body, mesh=alone, in_specs=part.specs, out_specs=part.specs[1], check_vma=False)
         shapes = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), (part.stays, part.carry))
         counted: Any = jax.jit(once).lower(*shapes).cost_analysis()
+        if counted is None:  # XLA counts on CPU only
+            return {}
         operations = part.scans * (counted.get("flops", 0.0) + counted.get("transcendentals", 0.0)) / self.decisions
         size = 2 * _bytes(part.carry) if part.moved is None else part.moved
         rate = ceilings["product_flops" if part.products else "vector_flops"]
@@ -443,7 +445,8 @@ def measure(config: Config, repeats: int, parts: bool) -> dict[str, Any]:
     for part in timed:
         us = middle[part.part.name]
         floor = part.floor(middle)
-        rows.append({"name": part.part.name, "us_per_decision": us, **floor, "over_floor": us / floor["floor_us"]})
+        beyond = {"over_floor": us / floor["floor_us"]} if floor else {}
+        rows.append({"name": part.part.name, "us_per_decision": us, **floor, **beyond})
     if timed:
         inside = sum(middle[name] for name in ("physics", "outcome", "rendering", "events"))
         rows.append({"name": "resets_and_rest_of_environment", "us_per_decision": middle[ENVIRONMENT] - inside})
