@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -93,6 +94,8 @@ COMMANDS = {"train": TrainCommand, "evaluate": EvaluateArgs}
 def main(argv: Sequence[str] | None = None) -> int:
     """Runs one command and returns its exit code: 0 done, 2 bad input, 3 diverged, 143 stopped by SIGTERM."""
     argv = list(sys.argv[1:] if argv is None else argv)
+    # XLA's errors are for people, its warnings for those who write XLA; read when JAX is first imported.
+    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")
     try:
         if argv[:1] == ["train"]:
             return _train(argv[1:])

@@ -20,6 +20,10 @@ def use_cpu_devices(count: int | None = None) -> None:
         RuntimeError: if JAX has been used already.
     """
     jax.config.update("jax_num_cpu_devices", cores() if count is None else count)
+    if jax.__version_info__[:2] == (0, 11):
+        # Its new partitioner crashes on arrays without elements, which a scene without capsules has, where
+        # `shard_map` and a loop meet. The old one does not.
+        jax.config.update("jax_use_shardy_partitioner", False)
 
 
 def cores() -> int:

@@ -8,7 +8,9 @@ from collections.abc import Iterator
 import jax
 import pytest
 
-jax.config.update("jax_num_cpu_devices", 2)
+from edqn_jax.devices import use_cpu_devices
+
+use_cpu_devices(2)
 
 
 @pytest.fixture

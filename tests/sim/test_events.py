@@ -341,7 +341,7 @@ def test_noise_rates_are_the_configured_ones():
 
 
 def test_threshold_mismatch_spreads_where_pixels_begin_to_fire():
-    config = dataclasses.replace(EventsConfig(), threshold_mismatch=0.2)
+    config = EventsConfig(threshold=0.1, tolerance=0.1, threshold_mismatch=0.2)
     memory = ev.reset_memory(config, 100, 100, jax.random.key(2))
     frames = jnp.full((2, 100, 100), 0.2).at[1].set((0.2 + 1e-3) * np.exp(0.1 * 1.2) - 1e-3)
     field, _ = run(config, memory, frames, (0.0, 0.02))
