@@ -15,7 +15,7 @@ from edqn_jax import cli, devices
 from edqn_jax.cli import main, parse_train
 from edqn_jax.config import Config, ConfigError, preset
 from edqn_jax.endings import DivergedError, StoppedError
-from edqn_jax.resolve import RANDOM_WORLD_STEPS
+from edqn_jax.resolve import RANDOM_WORLDS
 from edqn_jax.sim.mjcf import SceneError
 
 ROOT = Path(__file__).parents[1]
@@ -81,7 +81,7 @@ def test_short_and_long_names_say_the_same(argv):
 
 @pytest.mark.parametrize("flag", ["--world", "--world.name"])
 def test_a_random_world_brings_its_budget_and_a_flag_overrides_it(flag):
-    assert parse_train([flag, "medium"])[1].train.total_steps == RANDOM_WORLD_STEPS
+    assert parse_train([flag, "medium"])[1].train.total_steps == RANDOM_WORLDS["train"]["total_steps"]
     assert parse_train([flag, "medium", "--total-steps", "2048"])[1].train.total_steps == 2048
 
 

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 
 from edqn_jax.config import DENSITIES, PRESETS, Config, ConfigError, preset
-from edqn_jax.resolve import RANDOM_WORLD_STEPS, apply, load_layer, resolve, to_yaml
+from edqn_jax.resolve import RANDOM_WORLDS, apply, load_layer, resolve, to_yaml
 from edqn_jax.validate import validate
 
 
@@ -48,11 +48,14 @@ def test_an_empty_file_changes_nothing(tmp_path):
 
 @pytest.mark.parametrize("world", DENSITIES)
 def test_a_random_world_brings_its_own_budget(world):
-    assert resolve(world=world).train.total_steps == RANDOM_WORLD_STEPS
+    assert resolve(world=world).train.total_steps == RANDOM_WORLDS["train"]["total_steps"]
 
 
 def test_a_random_world_in_the_file_brings_its_budget_too(tmp_path):
-    assert resolve(file=write(tmp_path, "world: {name: dense}\n")).train.total_steps == RANDOM_WORLD_STEPS
+    assert (
+        resolve(file=write(tmp_path, "world: {name: dense}\n")).train.total_steps
+        == RANDOM_WORLDS["train"]["total_steps"]
+    )
 
 
 def test_a_budget_in_the_file_wins_over_the_random_world(tmp_path):
