@@ -11,6 +11,7 @@ The flight ends at the goal's radius, A*'s path at the goal itself.
 from __future__ import annotations
 
 import argparse
+import hashlib
 import json
 import statistics
 import subprocess
@@ -20,8 +21,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from edqn_jax.cli import parse_train
 from edqn_jax.devices import processor
 from edqn_jax.evaluate import wilson_interval, write_whole
+from edqn_jax.resolve import to_yaml
 from edqn_jax.rundir import plain
 
 TRAIN = Path(__file__).resolve().parents[1] / "train.py"
@@ -68,6 +71,12 @@ def command(args: argparse.Namespace, seed: int, folder: Path) -> list[str]:
     return [sys.executable, str(TRAIN), *options, *args.flags]
 
 
+def knobs(args: argparse.Namespace) -> str:
+    """A digest of every knob but the seed, so that runs of other defaults are not taken for these."""
+    _, config = parse_train(command(args, 0, args.out)[2:])
+    return hashlib.sha256(to_yaml(config).encode()).hexdigest()[:16]
+
+
 class Ledger:
     """How long each seed took by the clock on the wall and how it ended, kept beside the runs."""
 
@@ -93,7 +102,8 @@ def measure(args: argparse.Namespace) -> tuple[list[dict[str, Any]], list[dict[s
         ValueError: if the folder holds runs of other flags.
     """
     args.out.mkdir(parents=True, exist_ok=True)
-    ledger = Ledger(args.out / "ledger.json", {"world": args.world, "flags": args.flags})
+    asked = {"world": args.world, "flags": args.flags, "knobs": knobs(args)}
+    ledger = Ledger(args.out / "ledger.json", asked)
     rows, summaries = [], []
     for seed in range(args.first_seed, args.first_seed + args.seeds):
         folder = args.out / f"s{seed}"

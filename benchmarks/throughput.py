@@ -16,6 +16,7 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import json
+import math
 import statistics
 import sys
 import time
@@ -35,7 +36,7 @@ from mujoco import rollout
 from edqn_jax.cli import parse_train
 from edqn_jax.config import Config, ConfigError
 from edqn_jax.devices import choose_devices, cores, processor, use_cpu_devices
-from edqn_jax.evaluate import write_whole
+from edqn_jax.evaluate import check_can_write, write_whole
 from edqn_jax.learn import dqn, encoder, qnetwork, replay, trainer
 from edqn_jax.learn.trainer import AXIS, Trainer, TrainState
 from edqn_jax.run import lay_courses, versions, workload
@@ -47,7 +48,7 @@ from edqn_jax.sim.scene import take_scene
 SAMPLES = 4
 """Replayed samples per decision unless the flags say otherwise."""
 REPEATS = 5
-ENVIRONMENT, LEARNING = "environment", "dqn_update_and_replay"
+ENVIRONMENT, LEARNING = "environment", "dqn_update_and_sampling"
 TURN_SECONDS = 0.4
 """What a part's turn takes, about."""
 ROLLOUT_STEPS = 130
@@ -58,7 +59,7 @@ def parse(argv: Sequence[str] | None = None) -> tuple[argparse.Namespace, Config
     """The arguments, and the configuration that is timed.
 
     Raises:
-        ConfigError: if the flags after -- cannot be run.
+        ConfigError: if the flags after -- cannot be run, or the file cannot be written.
     """
     words = list(sys.argv[1:] if argv is None else argv)
     cut = words.index("--") if "--" in words else len(words)
@@ -72,12 +73,12 @@ def parse(argv: Sequence[str] | None = None) -> tuple[argparse.Namespace, Config
     args = parser.parse_args(words[:cut])
     if args.repeats < 1:
         parser.error(f"--repeats must be at least 1, not {args.repeats}")
-    if args.json is not None and not args.json.absolute().parent.is_dir():
-        parser.error(f"--json {args.json}: there is no folder '{args.json.absolute().parent}'")
+    if args.json is not None:
+        check_can_write(args.json)
     flags = words[cut + 1 :]
     _, config = parse_train(flags)
-    if not any(flag.replace("_", "-").startswith("--agent.updates-per-step") for flag in flags):
-        updates = max(SAMPLES * config.train.num_envs // config.agent.batch_size, 1)
+    if not any(flag.replace("_", "-").startswith(("--agent.updates-per-step", "--config")) for flag in flags):
+        updates = math.ceil(SAMPLES * config.train.num_envs / config.agent.batch_size)
         config = dataclasses.replace(config, agent=dataclasses.replace(config.agent, updates_per_step=updates))
     return args, steady(config, 8 if args.quick else config.train.chunk_steps)
 
@@ -455,7 +456,6 @@ def measure(config: Config, repeats: int, parts: bool) -> dict[str, Any]:
     if timed:
         inside = sum(middle[name] for name in ("physics", "outcome", "rendering", "events"))
         rows.append({"name": "resets_and_rest_of_environment", "us_per_decision": middle[ENVIRONMENT] - inside})
-        rows.append({"name": "dqn_update", "us_per_decision": middle[LEARNING] - middle["replay"]})
         rows += [{"name": name, "per_device": middle[name]} for name in limits]
     return {
         "workload": {**workload(config, courses.scene), "world": config.world.name},

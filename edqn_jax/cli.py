@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import os
 import sys
 from collections.abc import Sequence
@@ -12,7 +13,7 @@ from typing import Annotated, Literal
 import tyro
 from tyro.conf import Positional, arg
 
-from edqn_jax.config import Config, ConfigError
+from edqn_jax.config import DENSITIES, Config, ConfigError
 from edqn_jax.endings import (
     BAD_INPUT,
     DIVERGED,
@@ -84,9 +85,6 @@ class EvaluateArgs:
     """Also write every flight, a pose per physics step."""
 
 
-LEAST_TO_SHUFFLE = 32
-"""Missions between which codes can be exchanged on any number of devices that people have."""
-
 TRAIN = "edqn train"
 COMMANDS = {"train": TrainCommand, "evaluate": EvaluateArgs}
 
@@ -124,6 +122,10 @@ def parse_train(argv: Sequence[str]) -> tuple[TrainOptions, Config]:
     world = _parse_knobs(early, base).world.name
     config = _parse_knobs(argv, resolve(options.preset, options.config, world))
     validate(config)
+    # A file must be found again from any folder.
+    if config.world.name not in DENSITIES and Path(config.world.name).is_file():
+        world = dataclasses.replace(config.world, name=str(Path(config.world.name).resolve()))
+        config = dataclasses.replace(config, world=world)
     return options, config
 
 
@@ -161,8 +163,6 @@ def _evaluate(argv: Sequence[str]) -> int:
     args = tyro.cli(EvaluateArgs, args=argv, prog="edqn evaluate")
     if args.missions < 1:
         raise ConfigError(f"--missions must be at least 1, not {args.missions}")
-    if args.shuffle_codes and args.missions < LEAST_TO_SHUFFLE:
-        raise ConfigError(f"--shuffle-codes needs --missions of at least {LEAST_TO_SHUFFLE}, not {args.missions}")
     if not (args.run / "config.yaml").is_file():
         raise ConfigError(f"there is no run in '{args.run}': it holds no config.yaml")
 

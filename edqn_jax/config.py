@@ -180,7 +180,7 @@ class EncoderConfig:
     learning_rate: float = 2e-3
     """Adam step size of the VAE."""
     warmup_decisions: int = 32_768
-    """Decisions of held random manoeuvres in which the VAE learns before the DQN starts."""
+    """Decisions of held random manoeuvres in which the VAE learns before the DQN starts; a quarter of all at most."""
     warmup_updates_per_step: int = 8
     """VAE updates per training step of the warm-up, each on all new event fields."""
     hold_decisions: int = 4

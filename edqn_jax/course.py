@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from edqn_jax.baselines.astar import shortest_path
 from edqn_jax.config import DENSITIES, Config, ConfigError
 from edqn_jax.sim import drone, worlds
 from edqn_jax.sim.env import World
@@ -68,7 +69,8 @@ def load_course(
         goal: of every mission.
 
     Raises:
-        ConfigError: if there is no such world, or no drone can stand where a mission starts or ends.
+        ConfigError: if there is no such world, no drone can stand where a mission starts or ends, or there is
+            no way for the only mission.
     """
     if missions < 1:
         raise ConfigError(f"--missions must be at least 1, not {missions}")
@@ -96,6 +98,7 @@ def load_course(
         raise ConfigError(f"--start with --missions {missions}: in '{name}' all would be one and the same flight")
     if not spread:
         check_scene(scene, radius, names=loaded.names, title=f"'{name}'")
+        shortest_path(scene, scene.start, scene.goal, radius)  # or a sentence: there is no way
         pool = stack_scenes([scene])
         return Course(name, World(airframe, pool, worlds.own_missions(pool)), file)
     probe_key, missions_key = jax.random.split(jax.random.fold_in(jax.random.key(_MISSION_SEED), seed))

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
+import os
 import tempfile
 import time
 from pathlib import Path
@@ -217,8 +219,11 @@ def evaluate_command(args: EvaluateArgs) -> None:
         ConfigError: if the run, the world or a file to write is not as it should be.
     """
     for file in (args.json, args.trajectories):
-        if file is not None and not file.absolute().parent.is_dir():
-            raise ConfigError(f"'{file}' cannot be written: there is no folder '{file.absolute().parent}'")
+        if file is not None:
+            check_can_write(file)
+    least = 2 * len(jax.devices())
+    if args.shuffle_codes and args.missions < least:
+        raise ConfigError(f"--shuffle-codes needs --missions of at least {least}, not {args.missions}")
     config, params = load_run(args.run)
     name = args.world or config.world.name
     course = load_course(config, name, args.missions, args.seed, args.start, args.goal)
@@ -331,6 +336,23 @@ def write_trajectories(config: Config, course: Course, flights: Flights, file: P
         write_whole(file, buffer.read())
 
 
+def check_can_write(file: Path) -> None:
+    """Nothing if `write_whole` can write the file; found out before anything costs time.
+
+    Raises:
+        ConfigError: if it cannot.
+    """
+    folder = file.absolute().parent
+    if not folder.is_dir():
+        raise ConfigError(f"'{file}' cannot be written: there is no folder '{folder}'")
+    if file.is_dir():
+        raise ConfigError(f"'{file}' cannot be written: it is a folder")
+    try:
+        os.rmdir(tempfile.mkdtemp(dir=folder))
+    except OSError:
+        raise ConfigError(f"'{file}' cannot be written: nothing can be made in '{folder}'") from None
+
+
 def write_whole(file: Path, content: bytes) -> None:
     """Writes a file whole or not at all.
 
@@ -342,4 +364,6 @@ def write_whole(file: Path, content: bytes) -> None:
         partial.write_bytes(content)
         partial.replace(file)
     except OSError as error:
+        with contextlib.suppress(OSError):
+            partial.unlink(missing_ok=True)
         raise ConfigError(f"'{file}' cannot be written: {error.strerror}") from None

@@ -22,7 +22,7 @@ from edqn_jax.config import DENSITIES, Config, ConfigError, preset
 Layer = Mapping[str, Mapping[str, Any]]
 
 RANDOM_WORLDS: Layer = {
-    "train": {"total_steps": 3_600_000},
+    "train": {"total_steps": 3_200_000},
     "agent": {"updates_per_step": 4, "target_rate": 0.02},
     "events": {"threshold": 0.03, "tolerance": 0.03},
 }
@@ -151,6 +151,10 @@ class _StrictLoader(yaml.SafeLoader):
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
         seen = set()
         for key_node, _ in node.value:
+            if not isinstance(key_node, yaml.ScalarNode):
+                raise yaml.constructor.ConstructorError(
+                    problem="a key must be a word", problem_mark=key_node.start_mark
+                )
             key = key_node.value
             if key in seen:
                 raise yaml.constructor.ConstructorError(

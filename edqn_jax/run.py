@@ -10,7 +10,7 @@ import dataclasses
 import hashlib
 import platform
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from importlib import metadata
 from typing import Any
 
@@ -37,6 +37,9 @@ from edqn_jax.sim.env import Outcome, World
 from edqn_jax.sim.mjcf import check_scene, load_world, resolve_world
 from edqn_jax.sim.scene import Scene, obstacle_count, stack_scenes, take_scene
 from edqn_jax.sim.worlds import Missions
+
+FLIES = 0.8
+"""Share of validation missions from which on a policy counts as one that flies."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -119,7 +122,7 @@ class _Log:
     def __init__(self, config: Config, run: RunDirectory, progress: Progress) -> None:
         self.config, self.run, self.progress = config, run, progress
         self.episodes = 0
-        self.validations: list[tuple[int, float, float, bool]] = []  # decisions, seconds, rate, mission 0
+        self.validations: list[tuple[int, float, float]] = []  # decisions, seconds, success rate
 
     def chunk(self, first: int, episodes: Episodes, losses: Losses, seconds: float) -> dict[str, Any]:
         """Writes what ended in a chunk and returns its metrics."""
@@ -151,15 +154,23 @@ class _Log:
             "kl": _mean(losses.kl),
         }
 
-    def first_success(self) -> tuple[int | None, float | None]:
-        """Decisions and seconds at the first validation from which its mission 0 was always flown to the goal."""
-        since: tuple[int | None, float | None] = (None, None)
-        for decisions, seconds, _, flown in self.validations:
-            if not flown:
-                since = (None, None)
-            elif since[0] is None:
-                since = (decisions, seconds)
-        return since
+
+def first_success(validations: Sequence[tuple[int, float, float]]) -> tuple[int | None, float | None]:
+    """Decisions and seconds at the first validation from which `FLIES` of its missions were always flown.
+
+    Args:
+        validations: decisions, seconds and success rate of each, in order.
+
+    Returns:
+        (None, None) if the last one was not.
+    """
+    since: tuple[int | None, float | None] = (None, None)
+    for decisions, seconds, rate in validations:
+        if rate < FLIES:
+            since = (None, None)
+        elif since[0] is None:
+            since = (decisions, seconds)
+    return since
 
 
 def _mean(values: Any) -> float | None:
@@ -218,17 +229,17 @@ def train_run(
             params = jax.tree.map(np.asarray, policy_of(state))
             flights = _fly(config, courses.validation, params, mesh)
             rate = float(np.mean(flights.outcome == Outcome.GOAL))
-            flown = bool(flights.outcome[0] == Outcome.GOAL)
-            log.validations.append((validated, time.perf_counter() - began, rate, flown))
+            log.validations.append((validated, time.perf_counter() - began, rate))
             straight = _straight(courses.validation.missions, config.env.goal_radius_m)
-            weighted = spl(flights.outcome == Outcome.GOAL, flights.path_length_m, straight)
+            weighted = spl(np.asarray(flights.outcome) == Outcome.GOAL, np.asarray(flights.path_length_m), straight)
             metrics |= {"validation_success": rate, "validation_spl": weighted}
             if config.train.keep == "last" or weighted >= best.spl:
                 best = _Best(params, weighted, rate, validated)
         run.append_metrics(metrics)
         progress.update(metrics)
         if stop_requested() and not finished:
-            save_policy(run.checkpoints, best.params)
+            chosen = config.train.keep == "best" and best.decisions > 0
+            save_policy(run.checkpoints, best.params if chosen else policy_of(state))
             raise StoppedError(f"stopped after {done * envs:,} decisions; the policy is in '{run.checkpoints}'")
         if finished:
             break
@@ -238,10 +249,11 @@ def train_run(
     flights = _fly(config, courses.final, best.params, mesh)
     run.write_trajectory(trajectory(config, flights))
     scene = jax.tree.map(np.asarray, courses.scene)
-    draw_gallery(config, run, scene, best.params, np.asarray(courses.shortest.points))
-    since = log.first_success()
+    flight = flight_summary(flights)
+    draw_gallery(config, run, scene, best.params, np.asarray(courses.shortest.points), flight["outcome"])
+    since = first_success(log.validations)
     summary = {
-        **flight_summary(flights),
+        **flight,
         "shortest_path_m": courses.shortest.length_m,
         "world": config.world.name,
         "seed": config.train.seed,
@@ -278,7 +290,8 @@ def _fly(config: Config, world: World, params: PolicyParams, mesh: Mesh) -> Flig
 
 def _straight(missions: Missions, goal_radius_m: float) -> np.ndarray:
     """[M] metres from each start straight to the goal's sphere: no flight is shorter, and nothing need be searched."""
-    return np.linalg.norm(np.asarray(missions.goal) - np.asarray(missions.start), axis=1) - goal_radius_m
+    apart = np.linalg.norm(np.asarray(missions.goal) - np.asarray(missions.start), axis=1)
+    return np.maximum(apart - goal_radius_m, 1e-3)
 
 
 def _check_finite(plan: Plan, done: int, losses: Losses) -> None:

@@ -8,6 +8,7 @@ import json
 import math
 import os
 import shutil
+import tempfile
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,7 +17,7 @@ from typing import Any, Literal
 import numpy as np
 
 from edqn_jax.config import Config, ConfigError
-from edqn_jax.resolve import to_yaml
+from edqn_jax.resolve import apply, load_layer, to_yaml
 
 Resume = Literal["auto", "never", "must"]
 
@@ -36,6 +37,8 @@ class RunDirectory:
     """A run's folder. Nothing is on disk before `create`."""
 
     path: Path
+    must_be_new: bool = False
+    """Whether `create` refuses a folder that is there already: another run may have taken the name since."""
 
     @property
     def config_file(self) -> Path:
@@ -74,7 +77,7 @@ class RunDirectory:
             ConfigError: if it cannot be written.
         """
         try:
-            self.path.mkdir(parents=True, exist_ok=True)
+            self.path.mkdir(parents=True, exist_ok=not self.must_be_new)
             for file in (self.metrics_file, self.summary_file, self.trajectory_file):
                 file.unlink(missing_ok=True)
             for folder in (self.figures, self.checkpoints):
@@ -82,6 +85,8 @@ class RunDirectory:
                 folder.mkdir()
             _write(self.config_file, to_yaml(config))
             _write(self.episodes_file, ",".join(EPISODE_COLUMNS) + "\n")
+        except FileExistsError:
+            raise ConfigError(f"another run has just taken '{self.path}'; start this one again") from None
         except OSError as error:
             raise _unwritable(self.path, error.strerror) from None
 
@@ -136,12 +141,16 @@ def plan_run_directory(given: Path | None, config: Config, resume: Resume = "aut
     if given is None:
         if resume == "must":
             raise ConfigError("--resume must needs --run-dir, the folder of the run to continue")
-        return RunDirectory(_fresh(Path("runs"), config))
+        return RunDirectory(_fresh(Path("runs"), config), must_be_new=True)
     run = RunDirectory(given)
-    if given.exists() and not given.is_dir():
+    try:
+        taken = given.exists()
+    except OSError as error:  # a name that no file system takes
+        raise _unwritable(given, error.strerror) from None
+    if taken and not given.is_dir():
         raise ConfigError(f"--run-dir '{given}' is a file; give a folder")
-    occupied = given.is_dir() and any(given.iterdir())
-    if occupied and not run.config_file.is_file():
+    occupied = taken and any(given.iterdir())
+    if occupied and not _is_ours(run.config_file):
         raise ConfigError(f"--run-dir '{given}' holds files that are no run of edqn; give a new or empty folder")
     if run.summary_file.is_file():
         raise ConfigError(f"--run-dir '{given}' holds a finished run; give another folder")
@@ -187,8 +196,19 @@ def _check_writable(path: Path) -> None:
         there = there.parent
     if not there.is_dir():
         raise _unwritable(path, f"'{there}' is not a folder")
-    if not os.access(there, os.W_OK | os.X_OK):
-        raise _unwritable(path, f"'{there}' is not yours to write in")
+    try:  # by doing it: permissions do not tell for root, nor on every file system
+        os.rmdir(tempfile.mkdtemp(dir=there))
+    except OSError:
+        raise _unwritable(path, f"nothing can be made in '{there}'") from None
+
+
+def _is_ours(config_file: Path) -> bool:
+    """Whether a folder's `config.yaml` is one of ours."""
+    try:
+        apply(Config(), load_layer(config_file), str(config_file))
+    except ConfigError:
+        return False
+    return True
 
 
 def _unwritable(path: Path, reason: str | None) -> ConfigError:

@@ -121,6 +121,20 @@ def test_a_file_that_cannot_be_written_is_named_before_anything_is_flown(run, tm
         evaluate_command(EvaluateArgs(run, json=tmp_path / "nowhere" / "figures.json"))
 
 
+def test_codes_are_shuffled_between_enough_missions(run):
+    with pytest.raises(ConfigError, match="--shuffle-codes needs --missions of at least 4, not 1"):
+        evaluate_command(EvaluateArgs(run, shuffle_codes=True))
+
+
+def test_a_world_without_a_way_is_a_sentence(run, tmp_path):
+    walls = {"9 5 2": ".1 4 2", "1 5 2": ".1 4 2", "5 1 2": "4 .1 2", "5 9 2": "4 .1 2", "5 5 4": "4.2 4.2 .1"}
+    geoms = "".join(f'<geom type="box" pos="{pos}" size="{size}"/>' for pos, size in walls.items())
+    sites = '<geom type="plane" size="0 0 1"/><site name="start" pos="5 5 2"/><site name="goal" pos="20 20 2"/>'
+    (tmp_path / "closed.xml").write_text(f"<mujoco><worldbody>{geoms}{sites}</worldbody></mujoco>")
+    with pytest.raises(ConfigError, match="there is no path"):
+        evaluate_command(EvaluateArgs(run, world=str(tmp_path / "closed.xml")))
+
+
 @pytest.mark.slow
 def test_the_command_prints_and_writes_flights_that_anybody_can_check(run, tmp_path, capsys):
     figures_file, flights_file = tmp_path / "figures.json", tmp_path / "flights.npz"

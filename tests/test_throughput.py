@@ -47,7 +47,7 @@ def test_a_quick_run_measures_the_whole_every_part_and_c_mujoco(throughput: Modu
     rows = {row["name"]: row for row in report["rows"]}
     assert rows["whole_training_step"]["decisions_per_second"] == report["decisions_per_second"] > 0
     assert rows["c_mujoco_rollout"]["physics_steps_per_second"] > 0
-    for name in ("physics", "rendering", "events", "encoder", "replay", "vae_update", "dqn_update_and_replay"):
+    for name in ("physics", "rendering", "events", "encoder", "replay", "vae_update", "dqn_update_and_sampling"):
         assert rows[name]["us_per_decision"] > rows[name]["floor_us"] > 0
     assert report["workload"]["vae_samples_per_decision"] == 1
     ratio = rows["whole_training_step"]["over_c_mujoco_rollout"]

@@ -101,10 +101,10 @@ class Plan:
 
     @classmethod
     def of(cls, config: Config) -> Plan:
-        """Total decisions round up to whole chunks, the warm-up to whole steps."""
+        """Total decisions round up to whole chunks, the warm-up to whole steps; it takes a quarter at most."""
         envs = config.train.num_envs
         total = math.ceil(config.train.total_steps / envs / config.train.chunk_steps) * config.train.chunk_steps
-        warmup = min(math.ceil(config.encoder.warmup_decisions / envs), total)
+        warmup = min(math.ceil(config.encoder.warmup_decisions / envs), total // 4)
         least = config.agent.n_step + config.agent.history
         learn_from = warmup + max(math.ceil(config.agent.learning_starts / envs), least)
         return cls(total=total, warmup=warmup, learn_from=learn_from)

@@ -27,27 +27,23 @@ FINE = 8
 """How much finer than the drone's camera the pictures for people are, per axis."""
 
 
-def draw_gallery(config: Config, run: RunDirectory, scene: Scene, params: PolicyParams, shortest: np.ndarray) -> None:
-    """World, events, path, returns, learning and reconstruction into the run's `figures/`."""
+def draw_gallery(
+    config: Config, run: RunDirectory, scene: Scene, params: PolicyParams, shortest: np.ndarray, outcome: str
+) -> None:
+    """World, events, path, returns, learning and reconstruction into the run's `figures/`.
+
+    Args:
+        scene: where the recorded flight was flown.
+        shortest: [P, 3] points of the shortest path.
+        outcome: how the flight ended, as `summary.json` says it.
+    """
     table = np.atleast_2d(np.loadtxt(run.trajectory_file, delimiter=",", skiprows=1))
     flown: dict[str, np.ndarray] = dict(zip(TRAJECTORY_COLUMNS, table.T, strict=True))
     draw_world(scene, run.figures / "world.png")
-    outcome = _outcome(config, scene, flown)
     draw_path(scene, flown, shortest, run.figures / "path.png", outcome, config.env.goal_radius_m)
     draw_returns(run.read_episodes(), run.figures / "returns.png")
     draw_learning(run.read_metrics(), run.figures / "learning.png")
     _draw_what_it_sees(config, run, scene, params, flown)
-
-
-def _outcome(config: Config, scene: Scene, flown: dict[str, np.ndarray]) -> str:
-    """How the recorded flight ended, read off its last row."""
-    end = np.array([flown[axis][-1] for axis in "xyz"])
-    if flown["clearance"][-1] <= 1e-3:
-        return "collision"
-    if np.linalg.norm(end - np.asarray(scene.goal)) < config.env.goal_radius_m:
-        return "goal"
-    inside = np.all((end >= np.asarray(scene.volume[0])) & (end <= np.asarray(scene.volume[1])))
-    return "time_out" if inside else "left_volume"
 
 
 def _draw_what_it_sees(

@@ -15,6 +15,7 @@ Any MJCF will do. A world for the drone is made of
 from __future__ import annotations
 
 import dataclasses
+import difflib
 import math
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Mapping
@@ -24,7 +25,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from edqn_jax.config import ConfigError
+from edqn_jax.config import DENSITIES, ConfigError
 from edqn_jax.sim.scene import (
     KINDS,
     Capsules,
@@ -85,7 +86,12 @@ def resolve_world(name: str) -> Path:
     if path.suffix == ".xml" or path.name != name:
         searched = path.parent.resolve()
         raise SceneError(f"there is no scene file '{path.name}' in {searched}; scenes known by name: {known}")
-    raise SceneError(f"there is no scene '{name}' in {folder}; the scenes there are: {known}")
+    close = difflib.get_close_matches(name, [*DENSITIES, *(file.stem for file in folder.glob("*.xml"))], n=1)
+    hint = f"did you mean '{close[0]}'? " if close else ""
+    raise SceneError(
+        f"there is no scene '{name}' in {folder}; {hint}The scenes there are: {known}; "
+        f"random worlds: {', '.join(DENSITIES)}"
+    )
 
 
 def load_scene(path: str | Path) -> Scene:

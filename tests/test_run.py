@@ -1,0 +1,97 @@
+"""The training command, whole and small: what a run leaves behind, and what it keeps when it is stopped."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+
+from edqn_jax import run as training
+from edqn_jax.config import CameraConfig, Config, ConfigError, TrainConfig, WorldConfig
+from edqn_jax.endings import StoppedError
+from edqn_jax.evaluate import load_run
+from edqn_jax.report.progress import Progress
+from edqn_jax.run import first_success, train_run
+from edqn_jax.rundir import TRAJECTORY_COLUMNS, RunDirectory, plain
+from tests.learn.test_trainer import CONFIG as SMALL
+
+CONFIG = dataclasses.replace(
+    SMALL,
+    camera=CameraConfig(width=8, height=6),
+    env=dataclasses.replace(SMALL.env, max_decisions=12),
+    world=WorldConfig(missions=32),
+    train=TrainConfig(num_envs=16, chunk_steps=4, total_steps=512, validation_every=128, validation_missions=4),
+)
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> tuple[RunDirectory, dict]:
+    run = RunDirectory(tmp_path_factory.mktemp("runs") / "whole")
+    return run, train_run(CONFIG, run, Progress(), lambda: False)
+
+
+@pytest.mark.slow
+def test_a_run_leaves_what_the_readme_promises(whole: tuple[RunDirectory, dict]) -> None:
+    run, summary = whole
+    assert json.loads(run.summary_file.read_text()) == plain(summary)
+    figures = {file.stem for file in run.figures.glob("*.png")}
+    assert figures == {"world", "events", "path", "returns", "learning", "reconstruction"}
+    assert summary["train_decisions"] == 512 and summary["outcome"] in {"time_out", "collision", "left_volume"}
+    assert summary["success"] is False and summary["shortest_path_m"] == pytest.approx(129.45, abs=0.5)
+    table = np.loadtxt(run.trajectory_file, delimiter=",", skiprows=1)
+    assert table.shape[1] == len(TRAJECTORY_COLUMNS) and table[-1, 0] == pytest.approx(
+        summary["flight_seconds"], abs=0.02
+    )
+    validations = [row for row in run.read_metrics() if "validation_spl" in row]
+    assert [row["decisions"] for row in validations] == [256, 384, 512]  # none before learning began
+    best = max(row["validation_spl"] for row in validations)
+    chosen = [row["decisions"] for row in validations if row["validation_spl"] == best][-1]
+    assert (summary["parameters_from_decisions"], summary["validation_spl"]) == (chosen, best)
+    config, _ = load_run(run.path)
+    assert config == CONFIG
+
+
+@pytest.mark.slow
+def test_a_run_stopped_before_any_validation_keeps_what_it_has_learnt(tmp_path: Path) -> None:
+    config = dataclasses.replace(CONFIG, train=dataclasses.replace(CONFIG.train, validation_every=0))
+    run = RunDirectory(tmp_path / "stopped")
+    fresh = []
+
+    def init(self, seed: int):
+        state = original(self, seed)
+        fresh.append(jax.tree.map(np.asarray, training.policy_of(state)))
+        return state
+
+    original = training.Trainer.init
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(training.Trainer, "init", init)
+        with pytest.raises(StoppedError, match="stopped after 256 decisions"):
+            train_run(config, run, Progress(), lambda: len(run.read_metrics()) == 4)
+    _, params = load_run(run.path)
+    before, after = (jax.tree.leaves(params) for params in (fresh[0], params))
+    assert any(not np.array_equal(a, b) for a, b in zip(before, after, strict=True))
+    assert not run.summary_file.exists()
+
+
+def test_a_world_that_cannot_be_flown_leaves_nothing_behind(tmp_path: Path) -> None:
+    file = tmp_path / "wall.xml"
+    file.write_text(
+        '<mujoco><worldbody><geom name="wall" type="box" pos="5 5 2" size="2 2 2"/>'
+        '<site name="start" pos="5 5 2"/><site name="goal" pos="30 5 2"/></worldbody></mujoco>'
+    )
+    run = RunDirectory(tmp_path / "run")
+    config = Config(world=WorldConfig(name=str(file)))
+    with pytest.raises(ConfigError, match="the start .* lies inside 'wall'"):
+        train_run(config, run, Progress(), lambda: False)
+    assert not run.path.exists()
+
+
+def test_a_policy_counts_as_flying_from_when_it_kept_flying() -> None:
+    rates = [(100, 1.0, 0.9), (200, 2.0, 0.5), (300, 3.0, 0.8), (400, 4.0, 1.0)]
+    assert first_success(rates) == (300, 3.0)
+    assert first_success(rates[:2]) == (None, None)
+    assert first_success([]) == (None, None)
