@@ -21,6 +21,7 @@ def test_one_mission_in_a_file_is_its_own():
     assert course.mjcf() == [resolve_world("paper").read_text()]
 
 
+@pytest.mark.slow
 def test_many_missions_in_a_file_start_all_over_and_go_to_its_goal():
     missions = load_course(CONFIG, "paper", 50).world.missions
     np.testing.assert_allclose(missions.goal, np.tile([90, 90, 10], (50, 1)))

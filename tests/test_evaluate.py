@@ -94,6 +94,7 @@ def test_without_shortest_paths_there_is_no_spl():
     assert summarise(four_flights())["spl"] is None
 
 
+@pytest.mark.slow
 def test_a_decision_takes_a_measured_time():
     latency = decision_latency_ms(CONFIG, always((0, 0, 0)), calls=20)
     assert 0 < latency["median"] <= latency["p99"]

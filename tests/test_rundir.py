@@ -86,7 +86,10 @@ def test_a_file_in_the_way_is_named(below, tmp_path):
 
 def test_a_folder_without_the_right_to_write_is_named(tmp_path, monkeypatch):
     # The tests may run as root, who may write anywhere; so the answer of the system is made up.
-    monkeypatch.setattr("edqn_jax.rundir.os.access", lambda *_: False)
+    def refuse(**_):
+        raise PermissionError(13, "Permission denied")
+
+    monkeypatch.setattr("edqn_jax.rundir.tempfile.mkdtemp", refuse)
     with pytest.raises(ConfigError, match="cannot be written"):
         plan_run_directory(tmp_path / "run", Config())
 

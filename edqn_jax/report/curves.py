@@ -61,7 +61,9 @@ def draw_learning(metrics: Sequence[Mapping[str, Any]], file: Path) -> Figure:
         file: PNG to write.
     """
     with drawing(7.0, 4.4, file) as figure:
-        (success, exploration), (q_loss, vae) = figure.subplots(2, 2, sharex=True)
+        (success, exploration), (q_loss, vae) = figure.subplots(2, 2)
+        exploration.sharex(success)
+        q_loss.sharex(success)  # the VAE may learn for a short while only, so its axis is its own
         _line(success, metrics, "success_rate", LINE, "training episodes")
         _line(success, metrics, "validation_success", SECOND_LINE, "validation missions, greedy", marker="o")
         success.set_title("Success")
@@ -73,9 +75,10 @@ def draw_learning(metrics: Sequence[Mapping[str, Any]], file: Path) -> Figure:
         exploration.set_ylim(-0.03, 1.03)
         _line(q_loss, metrics, "q_loss", LINE, "Q-network")
         q_loss.set_title("Q loss (Eq. 9)")
-        _line(vae, metrics, "reconstruction_loss", LINE, "reconstruction")
-        _line(vae, metrics, "kl", SECOND_LINE, "KL")
+        _line(vae, metrics, "reconstruction_loss", LINE, "reconstruction", marker=".")
+        _line(vae, metrics, "kl", SECOND_LINE, "KL", marker=".")
         vae.set_title("Event VAE (Eq. 6)")
+        success.xaxis.set_major_formatter(EngFormatter(sep=""))
         for axes in (q_loss, vae):
             if any(np.any(np.asarray(line.get_ydata()) > 0) for line in axes.get_lines()):
                 axes.set_yscale("log")

@@ -220,6 +220,7 @@ VALUES = {
 
 
 @pytest.mark.parametrize("task", probes.TASKS)
+@pytest.mark.slow
 def test_the_learner_finds_the_known_values(learned, task):
     learner, q = learned
     expected = dict(VALUES[task])

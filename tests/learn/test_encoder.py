@@ -53,6 +53,7 @@ def event_list(field: ev.EventField) -> tuple[jax.Array, ...]:
 
 
 @pytest.mark.parametrize("kind", ["table", "network"])
+@pytest.mark.slow
 def test_dense_encoder_equals_the_sum_over_single_events(kind):
     config = EncoderConfig(pixel_features=kind, time_frequencies=2, features=8, hidden=16, code_size=5)
     params = fresh(config, SMALL, jax.random.key(0))
@@ -90,6 +91,7 @@ def test_the_encoder_is_blind_to_the_order_of_events():
     np.testing.assert_allclose(mean, again, rtol=1e-4, atol=1e-4)  # float32 sums in another order
 
 
+@pytest.mark.slow
 def test_time_in_the_window_changes_the_code():
     params = fresh(CONFIG, SMALL, jax.random.key(0))
     field = ragged_field(3)
@@ -108,6 +110,7 @@ def test_a_batch_is_encoded_as_its_fields_are_one_by_one():
     assert en.decode(CONFIG, params, whole).shape == (4, 2, SMALL.height, SMALL.width)
 
 
+@pytest.mark.slow
 def test_the_untrained_decoder_is_linear_in_the_code():
     params = fresh(CONFIG, CAMERA, jax.random.key(0))
     a, b = jax.random.normal(jax.random.key(1), (2, CONFIG.code_size))
@@ -138,6 +141,7 @@ def test_losses_and_gradients_stay_finite_under_huge_activations(scale):
     assert all(np.all(np.isfinite(g)) for g in jax.tree.leaves(gradient))
 
 
+@pytest.mark.slow
 def test_the_loss_is_reconstruction_plus_weighted_kl():
     config = dataclasses.replace(CONFIG, kl_weight=0.3)
     params = fresh(config, SMALL, jax.random.key(0))

@@ -53,6 +53,7 @@ def act():
 flatten = jax.jit(partial(policy.flatten, CONFIG))
 
 
+@pytest.mark.slow
 def test_memory_stacks_an_episode_as_the_replay_does(params, act):
     seen = observations(5)
     flat = np.stack([flatten(params.encoder, each) for each in seen])

@@ -95,6 +95,7 @@ def starts(batch: replay.Batch) -> list[tuple[int, int]]:
     decisions=st.integers(10, LONGEST),  # up to nearly five times round the ring
     end_chance=st.sampled_from([0.02, 0.15, 0.5]),
 )
+@pytest.mark.slow
 def test_samples_are_what_really_happened(form, seed, decisions, end_chance):
     config = FORMS[form]
     life = lives(np.random.default_rng(seed), decisions, end_chance)

@@ -88,12 +88,14 @@ def on_two(world: World):
     return run(CONFIG, world, 2)
 
 
+@pytest.mark.slow
 def test_the_training_chunk_is_traced_exactly_once_in_a_run(on_two) -> None:
     states, _, traces = on_two
     assert len(states) == 5
     assert traces == 1
 
 
+@pytest.mark.slow
 def test_no_callback_to_the_host_hides_in_the_step(world: World) -> None:
     state = jax.eval_shape(lambda k: trainer.init(CONFIG, world, k), jax.random.key(0))
     jaxpr = jax.make_jaxpr(lambda s, n: trainer.run_steps(CONFIG, world, s, n))(state, jnp.arange(2))
@@ -109,6 +111,7 @@ def test_rollouts_before_learning_are_the_same_on_one_device_and_two(on_one, on_
         np.testing.assert_allclose(one, two, atol=1e-4)
 
 
+@pytest.mark.slow
 def test_parameters_agree_on_one_device_and_two_after_the_first_updates(on_one, on_two) -> None:
     # Sums over shards are added in another order: a few units in the last place per update.
     for one, two in zip(jax.tree.leaves(on_one[0][1].learner), jax.tree.leaves(on_two[0][1].learner), strict=True):
@@ -124,6 +127,7 @@ def test_the_acting_encoder_changes_once_at_the_end_of_the_warm_up(on_one) -> No
     assert _same(warm.encoder, later.encoder) and _same(warm.encoder, last.encoder)
 
 
+@pytest.mark.slow
 def test_the_q_network_rests_until_there_is_enough_to_learn_from(on_one) -> None:
     states, returned, _ = on_one
     plan = Plan.of(CONFIG)

@@ -175,6 +175,7 @@ def one_shape(kind, rng):
 
 
 @pytest.mark.parametrize("kind", ["box", "cylinder", "ball"])
+@pytest.mark.slow
 def test_a_lone_silhouette_is_exact_to_a_hundredth(kind):
     # Against the sky, without texture: nothing but coverage and shade.
     config = CameraConfig(texture_contrast=0.0)
@@ -244,6 +245,7 @@ AWKWARD = {
 }
 
 
+@pytest.mark.slow
 def test_awkward_places_are_seen_right():
     # Parked places in every scene, and the same capacities: one compilation.
     capacities = {"boxes": 4, "cylinders": 3, "spheres": 2}
@@ -283,6 +285,7 @@ def view():
 
 
 @pytest.mark.parametrize("mount", ["level", "body"])
+@pytest.mark.slow
 def test_luma_is_eq_1s_weighting_of_the_colours_and_they_are_right(view, mount):
     config = CameraConfig(mount=mount)
     grey, colour = luma_and_colours(config, *view)
@@ -294,6 +297,7 @@ def test_luma_is_eq_1s_weighting_of_the_colours_and_they_are_right(view, mount):
     assert rms(colour - reference) < 0.02
 
 
+@pytest.mark.slow
 def test_a_level_camera_ignores_roll_and_pitch_and_a_body_camera_does_not():
     scene = scene_of(GROUND, box(30, 21, 5, 3, 3, 5, 0.4))
     position = jnp.array([20.0, 20.0, 5.0])
@@ -326,6 +330,7 @@ def test_any_resolution_and_field_of_view(view, mount):
     assert rms(ours - reference) < 0.03
 
 
+@pytest.mark.slow
 def test_a_shape_that_is_not_there_is_not_seen():
     config = CameraConfig()
     shapes = (GROUND, box(30, 21, 5, 3, 3, 5, 0.4), pillar(28, 15, 4, 1, 4), ball(26, 24, 8, 2))

@@ -137,6 +137,7 @@ def test_a_hundred_steps_agree_with_c_mujoco_within_a_millimetre(step):
         np.testing.assert_allclose(state.angular_velocity, speed[3:], atol=1e-3)
 
 
+@pytest.mark.slow
 def test_our_stages_are_the_whole_of_mjx_step(airframe, step):
     model, _ = drone_mujoco.load()
     whole_model, whole_data = mjx.put_model(model, impl="jax"), mjx.make_data(model, impl="jax")
@@ -158,6 +159,7 @@ def test_our_stages_are_the_whole_of_mjx_step(airframe, step):
         np.testing.assert_allclose(jnp.concatenate([ours.velocity, ours.angular_velocity]), data.qvel, atol=2e-5)
 
 
+@pytest.mark.slow
 def test_a_decision_is_its_physics_steps_one_by_one(decide, thrust_of, step):
     states = tilted(np.linspace(0, 0.5, BATCH), np.linspace(0, 6, BATCH))
     commands = jnp.asarray(manoeuvres(SPEED)[1], jnp.float32)

@@ -369,6 +369,7 @@ def same(a, b):
     jax.tree.map(np.testing.assert_array_equal, jax.tree.map(plain, a), jax.tree.map(plain, b))
 
 
+@pytest.mark.slow
 def test_a_fresh_environment_rests_at_its_start_and_faces_its_goal(reset):
     state, observation = reset(jax.random.key(0), MISSION["fence"])
     np.testing.assert_array_equal(state.drone.position, MISSIONS["fence"][0])
@@ -378,6 +379,7 @@ def test_a_fresh_environment_rests_at_its_start_and_faces_its_goal(reset):
     assert int(jnp.sum(observation.events.count)) == 0
 
 
+@pytest.mark.slow
 def test_a_flight_ahead_reaches_its_goal_and_the_next_step_is_the_reset(reset, step, world):
     state, steps = fly(reset, step, "short", [AHEAD] * 4)
     *before, last = steps
@@ -432,6 +434,7 @@ def test_the_limit_ends_an_episode_at_exactly_its_last_decision_without_cutting_
     assert not bool(env.is_terminal(steps[3].outcome))
 
 
+@pytest.mark.slow
 def test_events_are_those_between_the_configured_frames_of_the_flight(reset, step):
     _, steps = fly(reset, step, "wall", [action(0, 1, 1)] * 3)
     result = steps[-1]

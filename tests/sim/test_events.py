@@ -320,6 +320,7 @@ def test_frames_and_times_must_match():
 NOISY = EventsConfig(leak_rate_hz=20.0, shot_rate_hz=40.0, hot_pixel_fraction=0.1, hot_pixel_rate_hz=400.0)
 
 
+@pytest.mark.slow
 def test_noise_rates_are_the_configured_ones():
     size = 200
     memory = ev.reset_memory(NOISY, size, size, jax.random.key(1))

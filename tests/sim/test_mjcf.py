@@ -251,6 +251,7 @@ def assert_same_scene(ours, theirs):
             np.testing.assert_allclose(x, y, rtol=1e-6, atol=2e-6, err_msg=field.name)
 
 
+@pytest.mark.slow
 def test_a_random_world_survives_being_written(tmp_path):
     scene = random_scene("sparse", world_key("test", 3))
     write_scene(scene, tmp_path / "random.xml", title="random")

@@ -85,6 +85,7 @@ def test_a_worlds_key_depends_on_its_split_and_index_alone():
 
 
 @pytest.mark.parametrize(("density", "least", "most"), [("sparse", 12, 12), ("medium", 28, 30), ("dense", 54, 60)])
+@pytest.mark.slow
 def test_a_density_has_its_number_of_shapes(pools, density, least, most):
     counts = [obstacle_count(take_scene(pools[density], i)) for i in range(WORLDS)]
     assert least <= min(counts) and max(counts) <= most
@@ -117,6 +118,7 @@ def test_shapes_stand_on_the_ground_and_below_the_ceiling(pools, density):
 
 
 @pytest.mark.parametrize("density", SHAPES)
+@pytest.mark.slow
 def test_start_and_goal_are_free_and_far_apart(pools, density):
     pool = pools[density]
     missions = own_missions(pool)
@@ -128,6 +130,7 @@ def test_start_and_goal_are_free_and_far_apart(pools, density):
 
 
 @pytest.mark.parametrize("density", SHAPES)
+@pytest.mark.slow
 def test_there_is_a_path_in_every_random_world(pools, density):
     for i in range(2):
         scene = take_scene(pools[density], i)
@@ -147,6 +150,7 @@ def test_an_unknown_density_names_those_there_are():
         random_scene("thick", world_key("test", 0))
 
 
+@pytest.mark.slow
 def test_random_missions_fly_far_between_free_points_of_every_world(pools):
     pool = pools["dense"]
     missions = random_missions(pool, MISSIONS, jax.random.key(0))
