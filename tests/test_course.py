@@ -14,6 +14,7 @@ from edqn_jax.sim.mjcf import load_scene, resolve_world
 CONFIG = Config()
 
 
+@pytest.mark.slow
 def test_one_mission_in_a_file_is_its_own():
     course = load_course(CONFIG, "paper")
     np.testing.assert_allclose(course.world.missions.start, [[1, 1, 3]])
@@ -30,6 +31,7 @@ def test_many_missions_in_a_file_start_all_over_and_go_to_its_goal():
     assert not np.any(np.all(missions.start == others.start, axis=1))
 
 
+@pytest.mark.slow
 def test_start_and_goal_may_be_given():
     missions = load_course(CONFIG, "paper", start=(2, 3, 4), goal=(3, 100, 20)).world.missions
     np.testing.assert_allclose(missions.start, [[2, 3, 4]])

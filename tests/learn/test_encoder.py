@@ -81,6 +81,7 @@ def test_dense_encoder_equals_the_sum_over_single_events(kind):
         np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-3)
 
 
+@pytest.mark.slow
 def test_the_encoder_is_blind_to_the_order_of_events():
     config = EncoderConfig(features=8, hidden=16, code_size=5)
     params = fresh(config, SMALL, jax.random.key(0))
@@ -99,6 +100,7 @@ def test_time_in_the_window_changes_the_code():
     assert np.abs(embed(CONFIG, params, field) - embed(CONFIG, params, late)).max() > 0.01
 
 
+@pytest.mark.slow
 def test_a_batch_is_encoded_as_its_fields_are_one_by_one():
     params = fresh(CONFIG, SMALL, jax.random.key(0))
     batch = jax.tree.map(lambda *x: jnp.stack(x), *[ragged_field(k) for k in range(4)])

@@ -71,6 +71,7 @@ def test_memory_stacks_an_episode_as_the_replay_does(params, act):
         np.testing.assert_allclose(memory, trained_on, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_an_observation_is_the_scaled_code_and_the_own_state(params):
     one = observations(1)[0]
     flat = flatten(params.encoder, one)

@@ -102,6 +102,7 @@ def test_no_callback_to_the_host_hides_in_the_step(world: World) -> None:
     assert "callback" not in str(jaxpr)
 
 
+@pytest.mark.slow
 def test_rollouts_before_learning_are_the_same_on_one_device_and_two(on_one, on_two) -> None:
     # The first chunk is the warm-up: random manoeuvres, so nothing that was learnt has acted yet. XLA vectorises
     # another batch size differently, which moves the last bits of a position at 100 m.
@@ -118,6 +119,7 @@ def test_parameters_agree_on_one_device_and_two_after_the_first_updates(on_one, 
         np.testing.assert_allclose(one, two, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_the_acting_encoder_changes_once_at_the_end_of_the_warm_up(on_one) -> None:
     states = on_one[0]
     assert Plan.of(CONFIG).warmup == 4
@@ -140,6 +142,7 @@ def test_the_q_network_rests_until_there_is_enough_to_learn_from(on_one) -> None
     assert not _same(states[-1].learner.q, states[-1].learner.target)
 
 
+@pytest.mark.slow
 def test_the_replay_holds_what_the_environments_went_through(on_one) -> None:
     states, returned, _ = on_one
     plan, actors = Plan.of(CONFIG), states[-1].actors

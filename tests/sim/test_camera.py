@@ -321,6 +321,7 @@ def test_both_mounts_see_the_same_from_a_level_body(pools):
 
 
 @pytest.mark.parametrize("mount", ["level", "body"])
+@pytest.mark.slow
 def test_any_resolution_and_field_of_view(view, mount):
     config = CameraConfig(width=20, height=9, horizontal_fov_deg=60.0, mount=mount)
     ours = np.asarray(luma_of(config, *view))
@@ -353,6 +354,7 @@ def test_an_empty_world_is_sky():
     np.testing.assert_allclose(sky, np.broadcast_to((0.5, 0.25, 1.0), (24, 32, 3)), rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_a_still_camera_sees_the_same_twice_and_a_moving_one_does_not(view):
     scene, position, rotation = view
     see = partial(luma_and_colours, CameraConfig(), scene)

@@ -200,6 +200,7 @@ def test_a_heading_error_turns_the_drone_the_way_that_shrinks_it(thrust_of, erro
     assert abs(turning) > 1.0
 
 
+@pytest.mark.slow
 def test_the_setpoint_moves_at_its_rate_limit_by_the_shorter_way_and_the_drone_follows(decide):
     states = jax.vmap(hover)(jnp.zeros((BATCH, 3)), jnp.full(BATCH, 3.0))
     targets = jnp.linspace(-3.0, 2.0, BATCH)

@@ -404,6 +404,7 @@ def test_a_flight_ahead_reaches_its_goal_and_the_next_step_is_the_reset(reset, s
     np.testing.assert_allclose(back.observation.own, env.own_state(FLOWN.env, SCENE, goal, fresh.drone), atol=1e-6)
 
 
+@pytest.mark.slow
 def test_resets_draw_every_mission(reset, step):
     state, _ = fly(reset, step, "fence", [BACK] * 3)
     assert bool(state.ended)
