@@ -453,10 +453,10 @@ def measure(config: Config, repeats: int, parts: bool) -> dict[str, Any]:
         floor = part.floor(middle)
         beyond = {"over_floor": us / floor["floor_us"]} if floor else {}
         rows.append({"name": part.part.name, "us_per_decision": us, **floor, **beyond})
-    if timed:
+    if ENVIRONMENT in middle:
         inside = sum(middle[name] for name in ("physics", "outcome", "rendering", "events"))
         rows.append({"name": "resets_and_rest_of_environment", "us_per_decision": middle[ENVIRONMENT] - inside})
-        rows += [{"name": name, "per_device": middle[name]} for name in limits]
+    rows += [{"name": name, "per_device": middle[name]} for name in limits]
     return {
         "workload": {**workload(config, courses.scene), "world": config.world.name},
         "device": processor() if devices[0].platform == "cpu" else devices[0].device_kind,
