@@ -157,21 +157,13 @@ def test_the_replay_holds_what_the_environments_went_through(on_one) -> None:
 
 @pytest.mark.slow
 def test_training_two_seeds_at_once_is_training_each_alone(world: World) -> None:
-    keys = jax.random.split(jax.random.key(3), 2)
     steps = jnp.arange(8)
-
-    @jax.jit
-    def train(key: jax.Array):
-        return trainer.run_steps(CONFIG, world, trainer.init(CONFIG, world, key), steps)
-
-    @jax.jit
-    def train_both(keys: jax.Array):
-        states = jax.vmap(lambda k: trainer.init(CONFIG, world, k))(keys)
-        return jax.vmap(lambda s: trainer.run_steps(CONFIG, world, s, steps))(states)
-
-    together = train_both(keys)
+    init = jax.jit(lambda key: trainer.init(CONFIG, world, key))
+    states = [init(key) for key in jax.random.split(jax.random.key(3), 2)]
+    train = jax.jit(lambda state: trainer.run_steps(CONFIG, world, state, steps))
+    together = jax.jit(jax.vmap(train))(jax.tree.map(lambda *x: jnp.stack(x), *states))
     for index in range(2):
-        alone = train(keys[index])
+        alone = train(states[index])
         both = jax.tree.map(lambda x, i=index: x[i], together)
         # The warm-up's flights are exact; batched products round otherwise.
         np.testing.assert_array_equal(both[1][0].outcome[:4], alone[1][0].outcome[:4])
