@@ -7,6 +7,7 @@ import json
 from pathlib import Path
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -62,8 +63,8 @@ def test_a_run_stopped_before_any_validation_keeps_what_it_has_learnt(
     def chunk(self, state, first: int):
         """Stands for the compiled chunk: the policy's parameters grow by one, nothing else happens."""
         learner = dataclasses.replace(state.learner, average=jax.tree.map(lambda x: x + 1, state.learner.average))
-        steps, none = CONFIG.train.chunk_steps, np.zeros((CONFIG.train.chunk_steps, 8, 2))
-        losses = Losses(*[np.zeros(steps)] * len(dataclasses.fields(Losses)))
+        steps, none = CONFIG.train.chunk_steps, jnp.zeros((CONFIG.train.chunk_steps, 8, 2))
+        losses = Losses(*[jnp.zeros(steps)] * len(dataclasses.fields(Losses)))
         return dataclasses.replace(state, learner=learner), (Episodes(none, none, none), losses)
 
     monkeypatch.setattr(training.Trainer, "compile", lambda self, state: None)
