@@ -23,7 +23,8 @@ from typing import Any
 
 from edqn_jax.cli import parse_train
 from edqn_jax.devices import processor
-from edqn_jax.evaluate import wilson_interval, write_whole
+from edqn_jax.evaluate import wilson_interval
+from edqn_jax.files import write_whole
 from edqn_jax.resolve import to_yaml
 from edqn_jax.rundir import plain
 
@@ -92,7 +93,7 @@ class Ledger:
     def note(self, seed: int, wall_seconds: float, exit_code: int) -> None:
         self.seeds[str(seed)] = {"wall_seconds": wall_seconds, "exit_code": exit_code}
         kept = {"asked": self.asked, "seeds": self.seeds}
-        write_whole(self.file, (json.dumps(kept, indent=1) + "\n").encode())
+        write_whole(self.file, json.dumps(kept, indent=1) + "\n")
 
 
 def measure(args: argparse.Namespace) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
@@ -277,7 +278,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     report = report_of(args, rows, summaries)
     print(f"{table(rows)}\n\n{sentences(report['totals'])}\n{report['device']}")
     if args.json is not None:
-        write_whole(args.json, (json.dumps(plain(report), indent=1, allow_nan=False) + "\n").encode())
+        write_whole(args.json, json.dumps(plain(report), indent=1, allow_nan=False) + "\n")
     return 0
 
 

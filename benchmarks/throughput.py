@@ -36,7 +36,7 @@ from mujoco import rollout
 from edqn_jax.cli import parse_train
 from edqn_jax.config import Config, ConfigError
 from edqn_jax.devices import choose_devices, cores, processor, use_cpu_devices
-from edqn_jax.evaluate import check_can_write, write_whole
+from edqn_jax.files import check_can_write, write_whole
 from edqn_jax.learn import dqn, encoder, qnetwork, replay, trainer
 from edqn_jax.learn.trainer import AXIS, Trainer, TrainState
 from edqn_jax.run import lay_courses, versions, workload
@@ -526,7 +526,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 2
     print(table(report))
     if args.json is not None:
-        write_whole(args.json, (json.dumps(plain(report), indent=1, allow_nan=False) + "\n").encode())
+        write_whole(args.json, json.dumps(plain(report), indent=1, allow_nan=False) + "\n")
     return 0
 
 

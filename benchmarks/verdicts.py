@@ -23,7 +23,8 @@ from edqn_jax.agreement import CONTACT_TOLERANCE_M, Agreement, check_verdicts
 from edqn_jax.config import ConfigError
 from edqn_jax.course import load_course
 from edqn_jax.devices import use_cpu_devices
-from edqn_jax.evaluate import fly_on_all_devices, load_run, write_whole
+from edqn_jax.evaluate import fly_on_all_devices, load_run
+from edqn_jax.files import write_whole
 from edqn_jax.sim.env import Outcome
 
 
@@ -99,7 +100,7 @@ def main() -> int:
             "versions": {name: version(name) for name in ("jax", "mujoco", "mujoco-mjx")},
             "rows": rows,
         }
-        write_whole(args.json, (json.dumps(report, indent=1) + "\n").encode())
+        write_whole(args.json, json.dumps(report, indent=1) + "\n")
     return int(not all(result.agrees for result in results))
 
 

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
 import math
-import os
 import tempfile
 import time
 from pathlib import Path
@@ -22,6 +20,7 @@ from edqn_jax.baselines.astar import NoPathError, shortest_path
 from edqn_jax.checkpoint import load_policy
 from edqn_jax.config import Config, ConfigError
 from edqn_jax.course import Course, load_course
+from edqn_jax.files import check_can_write, write_whole
 from edqn_jax.flights import Flights, fly_missions
 from edqn_jax.learn import encoder, policy, qnetwork
 from edqn_jax.learn.policy import PolicyParams
@@ -241,7 +240,7 @@ def evaluate_command(args: EvaluateArgs) -> None:
     }
     Console().print(report(figures))
     if args.json is not None:
-        write_whole(args.json, (json.dumps(plain(figures), indent=2, allow_nan=False) + "\n").encode())
+        write_whole(args.json, json.dumps(plain(figures), indent=2, allow_nan=False) + "\n")
     if args.trajectories is not None:
         write_trajectories(config, course, flights, args.trajectories)
 
@@ -334,36 +333,3 @@ def write_trajectories(config: Config, course: Course, flights: Flights, file: P
         np.savez_compressed(buffer, **columns)
         buffer.seek(0)
         write_whole(file, buffer.read())
-
-
-def check_can_write(file: Path) -> None:
-    """Nothing if `write_whole` can write the file; found out before anything costs time.
-
-    Raises:
-        ConfigError: if it cannot.
-    """
-    folder = file.absolute().parent
-    if not folder.is_dir():
-        raise ConfigError(f"'{file}' cannot be written: there is no folder '{folder}'")
-    if file.is_dir():
-        raise ConfigError(f"'{file}' cannot be written: it is a folder")
-    try:
-        os.rmdir(tempfile.mkdtemp(dir=folder))
-    except OSError:
-        raise ConfigError(f"'{file}' cannot be written: nothing can be made in '{folder}'") from None
-
-
-def write_whole(file: Path, content: bytes) -> None:
-    """Writes a file whole or not at all.
-
-    Raises:
-        ConfigError: if it cannot be written.
-    """
-    partial = file.with_name(file.name + ".partial")
-    try:
-        partial.write_bytes(content)
-        partial.replace(file)
-    except OSError as error:
-        with contextlib.suppress(OSError):
-            partial.unlink(missing_ok=True)
-        raise ConfigError(f"'{file}' cannot be written: {error.strerror}") from None

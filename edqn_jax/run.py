@@ -189,7 +189,7 @@ def train_run(
         what `summary.json` holds.
 
     Raises:
-        ConfigError: before anything is written, if the run cannot be made.
+        ConfigError: before anything is written, if the run cannot be made; later, if one of its files cannot be.
         DivergedError: if a loss stops being finite.
         StoppedError: after saving the policy, if `stop_requested()` turned true.
     """

@@ -6,9 +6,7 @@ import csv
 import datetime
 import json
 import math
-import os
 import shutil
-import tempfile
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,6 +15,7 @@ from typing import Any, Literal
 import numpy as np
 
 from edqn_jax.config import Config, ConfigError
+from edqn_jax.files import check_can_make, unwritable, write_whole
 from edqn_jax.resolve import apply, load_layer, to_yaml
 
 Resume = Literal["auto", "never", "must"]
@@ -83,12 +82,12 @@ class RunDirectory:
             for folder in (self.figures, self.checkpoints):
                 shutil.rmtree(folder, ignore_errors=True)
                 folder.mkdir()
-            _write(self.config_file, to_yaml(config))
-            _write(self.episodes_file, ",".join(EPISODE_COLUMNS) + "\n")
+            write_whole(self.config_file, to_yaml(config))
+            write_whole(self.episodes_file, ",".join(EPISODE_COLUMNS) + "\n")
         except FileExistsError:
             raise ConfigError(f"another run has just taken '{self.path}'; start this one again") from None
         except OSError as error:
-            raise _unwritable(self.path, error.strerror) from None
+            raise unwritable(self.path, error.strerror) from None
 
     def append_metrics(self, metrics: Mapping[str, Any]) -> None:
         """Adds one line to `metrics.jsonl`."""
@@ -102,14 +101,22 @@ class RunDirectory:
             csv.writer(file, lineterminator="\n").writerows(rows)
 
     def write_summary(self, summary: Mapping[str, Any]) -> None:
-        """Writes `summary.json`, whole or not at all; it is what makes a run finished."""
-        _write(self.summary_file, json.dumps(plain(summary), indent=2, allow_nan=False) + "\n")
+        """Writes `summary.json`, whole or not at all; it is what makes a run finished.
+
+        Raises:
+            ConfigError: if it cannot be written.
+        """
+        write_whole(self.summary_file, json.dumps(plain(summary), indent=2, allow_nan=False) + "\n")
 
     def write_trajectory(self, columns: Mapping[str, np.ndarray]) -> None:
-        """Writes `trajectory.csv` from one [T] array for each of `TRAJECTORY_COLUMNS`."""
+        """Writes `trajectory.csv` from one [T] array for each of `TRAJECTORY_COLUMNS`.
+
+        Raises:
+            ConfigError: if it cannot be written.
+        """
         table = np.stack([np.asarray(columns[name], np.float64) for name in TRAJECTORY_COLUMNS], axis=1)
         lines = [",".join(TRAJECTORY_COLUMNS), *(",".join(f"{value:.7g}" for value in row) for row in table)]
-        _write(self.trajectory_file, "\n".join(lines) + "\n")
+        write_whole(self.trajectory_file, "\n".join(lines) + "\n")
 
     def read_metrics(self) -> list[dict[str, Any]]:
         """The lines of `metrics.jsonl`."""
@@ -146,7 +153,7 @@ def plan_run_directory(given: Path | None, config: Config, resume: Resume = "aut
     try:
         taken = given.exists()
     except OSError as error:  # a name that no file system takes
-        raise _unwritable(given, error.strerror) from None
+        raise unwritable(given, error.strerror) from None
     if taken and not given.is_dir():
         raise ConfigError(f"--run-dir '{given}' is a file; give a folder")
     occupied = taken and any(given.iterdir())
@@ -161,7 +168,7 @@ def plan_run_directory(given: Path | None, config: Config, resume: Resume = "aut
             f"--run-dir '{given}' holds an unfinished run, which this version cannot continue; "
             "give another folder, or --resume never to start it over"
         )
-    _check_writable(given)
+    check_can_make(given)
     return run
 
 
@@ -181,25 +188,13 @@ def plain(value: Any) -> Any:
 
 
 def _fresh(parent: Path, config: Config) -> Path:
-    _check_writable(parent)
+    check_can_make(parent)
     date = datetime.datetime.now().strftime("%Y-%m-%d")
     base = f"{date}-{Path(config.world.name).stem}-s{config.train.seed}"
     path, number = parent / base, 2
     while path.exists():
         path, number = parent / f"{base}-{number}", number + 1
     return path
-
-
-def _check_writable(path: Path) -> None:
-    there = path.absolute()
-    while not there.exists() and there != there.parent:
-        there = there.parent
-    if not there.is_dir():
-        raise _unwritable(path, f"'{there}' is not a folder")
-    try:  # by doing it: permissions do not tell for root, nor on every file system
-        os.rmdir(tempfile.mkdtemp(dir=there))
-    except OSError:
-        raise _unwritable(path, f"nothing can be made in '{there}'") from None
 
 
 def _is_ours(config_file: Path) -> bool:
@@ -209,14 +204,3 @@ def _is_ours(config_file: Path) -> bool:
     except ConfigError:
         return False
     return True
-
-
-def _unwritable(path: Path, reason: str | None) -> ConfigError:
-    return ConfigError(f"the run directory '{path}' cannot be written: {reason or 'unknown reason'}")
-
-
-def _write(file: Path, text: str) -> None:
-    # A reader, or a run that is killed here, sees the old file or the new one and never half of it.
-    partial = file.with_name(file.name + ".partial")
-    partial.write_text(text, encoding="utf-8")
-    partial.replace(file)

@@ -84,14 +84,16 @@ def test_a_file_in_the_way_is_named(below, tmp_path):
         plan_run_directory(tmp_path / below, Config())
 
 
-def test_a_folder_without_the_right_to_write_is_named(tmp_path, monkeypatch):
+@pytest.mark.parametrize("given", [Path("run"), None])
+def test_a_place_without_the_right_to_write_is_named(given, tmp_path, monkeypatch):
     # The tests may run as root, who may write anywhere; so the answer of the system is made up.
     def refuse(**_):
         raise PermissionError(13, "Permission denied")
 
-    monkeypatch.setattr("edqn_jax.rundir.tempfile.mkdtemp", refuse)
-    with pytest.raises(ConfigError, match="cannot be written"):
-        plan_run_directory(tmp_path / "run", Config())
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("edqn_jax.files.tempfile.mkdtemp", refuse)
+    with pytest.raises(ConfigError, match=f"'{given or 'runs'}' cannot be written: .*Permission denied"):
+        plan_run_directory(given, Config())
 
 
 def test_what_fails_only_when_made_is_a_sentence_too(tmp_path):
