@@ -24,7 +24,7 @@ from typing import Any
 from edqn_jax.cli import parse_train
 from edqn_jax.devices import processor
 from edqn_jax.evaluate import wilson_interval
-from edqn_jax.files import write_whole
+from edqn_jax.files import check_can_write, write_whole
 from edqn_jax.resolve import to_yaml
 from edqn_jax.rundir import plain
 
@@ -60,8 +60,6 @@ def parse(argv: Sequence[str] | None = None) -> argparse.Namespace:
         args.seeds, args.flags = min(args.seeds, 2), [*QUICK, *args.flags]
     if args.seeds < 1:
         parser.error(f"--seeds must be at least 1, not {args.seeds}")
-    if args.json is not None and not args.json.absolute().parent.is_dir():
-        parser.error(f"--json {args.json}: there is no folder '{args.json.absolute().parent}'")
     return args
 
 
@@ -271,6 +269,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Exit code 0 when all was measured, whatever came out; 2 for bad input."""
     args = parse(argv)
     try:
+        if args.json is not None:
+            check_can_write(args.json)
         rows, summaries = measure(args)
     except (OSError, ValueError) as error:
         print(error, file=sys.stderr)

@@ -12,7 +12,8 @@ import argparse
 import itertools
 import json
 import platform
-from collections.abc import Callable
+import sys
+from collections.abc import Callable, Sequence
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -21,7 +22,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from edqn_jax.config import Config, DroneConfig
+from edqn_jax.config import Config, ConfigError, DroneConfig
+from edqn_jax.files import check_can_write, write_whole
 from edqn_jax.sim.drone import DroneState, Flight, fly, hover, load_airframe, yaw_of
 
 Decide = Callable[[DroneState, jax.Array, jax.Array], tuple[DroneState, Flight]]
@@ -129,14 +131,21 @@ def table(rows: list[dict[str, Any]]) -> str:
     return "\n".join(lines)
 
 
-def main() -> None:
+def main(argv: Sequence[str] | None = None) -> int:
+    """Exit code 0 when all was measured, 2 for bad input."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--json", type=Path, help="write the rows to this file")
-    arguments = parser.parse_args()
+    args = parser.parse_args(argv)
+    try:
+        if args.json is not None:
+            check_can_write(args.json)
+    except ConfigError as error:
+        print(error, file=sys.stderr)
+        return 2
     config = Config()
     rows = measure(config.drone, config.env.speed_m_s, batched_fly(config.drone))
     print(table(rows))
-    if arguments.json:
+    if args.json is not None:
         workload = {
             "physics_steps_per_decision": config.drone.physics_steps,
             "physics_dt": config.drone.physics_dt_s,
@@ -149,8 +158,9 @@ def main() -> None:
             "versions": {name: version(name) for name in ("jax", "mujoco", "mujoco-mjx")},
             "rows": rows,
         }
-        arguments.json.write_text(json.dumps(report, indent=1) + "\n")
+        write_whole(args.json, json.dumps(report, indent=1) + "\n")
+    return 0
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

@@ -12,6 +12,7 @@ import argparse
 import json
 import platform
 import sys
+from collections.abc import Sequence
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -24,7 +25,7 @@ from edqn_jax.config import ConfigError
 from edqn_jax.course import load_course
 from edqn_jax.devices import use_cpu_devices
 from edqn_jax.evaluate import fly_on_all_devices, load_run
-from edqn_jax.files import write_whole
+from edqn_jax.files import check_can_write, write_whole
 from edqn_jax.sim.env import Outcome
 
 
@@ -63,16 +64,19 @@ def table(rows: list[dict[str, Any]]) -> str:
     return "\n".join(lines)
 
 
-def main() -> int:
+def main(argv: Sequence[str] | None = None) -> int:
+    """Exit code 0 when all verdicts agree, 1 when one differs, 2 for bad input."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("run", type=Path, help="folder of a run")
     parser.add_argument("--world", help="where to fly (default: the world of the run)")
     parser.add_argument("--missions", type=int, default=200, help="how many")
     parser.add_argument("--seed", type=int, default=0, help="seed of the missions")
     parser.add_argument("--json", type=Path, help="write the rows to this file")
-    args = parser.parse_args()
-    use_cpu_devices()
+    args = parser.parse_args(argv)
     try:
+        if args.json is not None:
+            check_can_write(args.json)
+        use_cpu_devices()
         config, params = load_run(args.run)
         course = load_course(config, args.world or config.world.name, args.missions, args.seed)
     except ConfigError as error:
@@ -85,7 +89,7 @@ def main() -> int:
     for result in results:
         if not result.agrees:
             print(f"mission {result.mission}: {result}")
-    if args.json:
+    if args.json is not None:
         report = {
             "workload": {
                 "physics_steps_per_decision": config.drone.physics_steps,

@@ -1,4 +1,7 @@
-"""The mission benchmark: what it runs, which seeds pass, what it adds up. Nothing is trained here."""
+"""The mission benchmark: what it runs, which seeds pass, what it adds up; and that no script measures in vain.
+
+Nothing is trained here.
+"""
 
 from __future__ import annotations
 
@@ -10,6 +13,8 @@ from types import ModuleType
 from typing import Any
 
 import pytest
+
+from benchmarks import tracking, verdicts
 
 FILE = Path(__file__).parents[1] / "benchmarks" / "mission.py"
 
@@ -59,11 +64,27 @@ def test_quick_is_at_most_two_seeds_and_own_flags_win(mission: ModuleType) -> No
     assert args.flags[-2:] == ["--total-steps", "1024"]
 
 
-@pytest.mark.parametrize("words", [["--seeds", "0"], ["--json", "no/such/folder/file.json"]])
-def test_bad_input_ends_with_exit_code_2(mission: ModuleType, words: list[str]) -> None:
+def test_bad_input_ends_with_exit_code_2(mission: ModuleType) -> None:
     with pytest.raises(SystemExit) as ending:
-        mission.parse(words)
+        mission.parse(["--seeds", "0"])
     assert ending.value.code == 2
+
+
+@pytest.mark.parametrize(("name", "works"), [("mission", "measure"), ("tracking", "measure"), ("verdicts", "load_run")])
+def test_a_file_that_cannot_be_written_is_named_before_anything_is_measured(
+    name: str,
+    works: str,
+    mission: ModuleType,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    script = {"mission": mission, "tracking": tracking, "verdicts": verdicts}[name]
+    monkeypatch.setattr(script, works, lambda *_: pytest.fail("it went to work"))
+    file = tmp_path / "nowhere" / "rows.json"
+    words = ["--json", str(file)] + (["run"] if name == "verdicts" else [])
+    assert script.main(words) == 2
+    assert capsys.readouterr().err == f"'{file}' cannot be written: there is no folder '{file.parent}'\n"
 
 
 def test_a_good_run_passes(mission: ModuleType) -> None:
