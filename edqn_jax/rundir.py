@@ -73,7 +73,7 @@ class RunDirectory:
         What an earlier run left in it goes; `plan_run_directory` has seen to it that this is meant.
 
         Raises:
-            ConfigError: if it cannot be written.
+            ConfigError: if it cannot be written, or `must_be_new` and it is there.
         """
         try:
             self.path.mkdir(parents=True, exist_ok=not self.must_be_new)
@@ -84,8 +84,10 @@ class RunDirectory:
                 folder.mkdir()
             write_whole(self.config_file, to_yaml(config))
             write_whole(self.episodes_file, ",".join(EPISODE_COLUMNS) + "\n")
-        except FileExistsError:
-            raise ConfigError(f"another run has just taken '{self.path}'; start this one again") from None
+        except FileExistsError as error:
+            if self.must_be_new:
+                raise ConfigError(f"another run has just taken '{self.path}'; start this one again") from None
+            raise unwritable(self.path, f"'{error.filename}' is in the way; move it away") from None
         except OSError as error:
             raise unwritable(self.path, error.strerror) from None
 

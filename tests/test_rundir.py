@@ -38,6 +38,16 @@ def test_a_fresh_folder_is_dated_names_world_and_seed_and_is_never_an_old_one(tm
     assert second.path.name == f"{first.path.name}-2"
 
 
+def test_of_two_runs_that_plan_the_same_fresh_folder_one_gets_it(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    run = plan_run_directory(None, Config())  # both of them, each before the other is there
+    run.create(Config())
+    run.append_metrics({"decisions": 1})
+    with pytest.raises(ConfigError, match=f"another run has just taken '{run.path}'; start this one again"):
+        run.create(Config())
+    assert run.read_metrics() == [{"decisions": 1}]
+
+
 def test_the_resolved_configuration_reads_back(run):
     assert resolve(file=run.config_file) == Config()
 
@@ -100,6 +110,17 @@ def test_what_fails_only_when_made_is_a_sentence_too(tmp_path):
     (tmp_path / "file").touch()
     with pytest.raises(ConfigError, match="cannot be written"):
         RunDirectory(tmp_path / "file" / "run").create(Config())
+
+
+@pytest.mark.parametrize("inside", ["", "figures"])
+def test_a_file_where_a_folder_must_be_is_named_and_left_alone(inside, tmp_path):
+    run = RunDirectory(tmp_path / "run")
+    file = run.path / inside
+    file.parent.mkdir(exist_ok=True)
+    file.write_text("years of work")
+    with pytest.raises(ConfigError, match=f"'{run.path}' cannot be written: '{file}' is in the way; move it away"):
+        run.create(Config())
+    assert file.read_text() == "years of work"
 
 
 def test_numbers_of_numpy_and_jax_become_json_and_what_is_not_finite_null(run):
