@@ -101,6 +101,8 @@ def test_a_whole_number_may_stand_for_a_float():
         ("world: {name: }", "'world.name' must be text, not nothing"),
         ("- 1", "must hold groups of keys such as 'agent:'"),
         ("agent: {n_step: 1, n_step: 2}", "is not valid YAML at line 1: the key 'n_step' stands twice"),
+        ("? [n_step, double]\n: 1", "is not valid YAML at line 1: a key must be a word"),
+        ("agent:\n  {n_step: 1}: 1", "is not valid YAML at line 2: a key must be a word"),
         ("agent: {", "is not valid YAML at line"),
     ],
 )

@@ -59,6 +59,15 @@ def test_a_foreign_folder_is_refused_and_left_alone(tmp_path):
     assert [file.name for file in tmp_path.iterdir()] == ["thesis.tex"]
 
 
+@pytest.mark.parametrize("theirs", ["model: {layers: 3}\n", "train: {optimiser: adam}\n", "train: {\n", "- 1\n"])
+@pytest.mark.parametrize("resume", ["auto", "never", "must"])
+def test_a_config_that_is_not_ours_makes_no_run(theirs, resume, tmp_path):
+    (tmp_path / "config.yaml").write_text(theirs)
+    with pytest.raises(ConfigError, match="no run of edqn"):
+        plan_run_directory(tmp_path, Config(), resume)
+    assert (tmp_path / "config.yaml").read_text() == theirs
+
+
 def test_a_finished_run_is_refused_whatever_resume_says(run):
     run.write_summary({"success": True})
     for resume in ("auto", "never", "must"):
