@@ -85,6 +85,16 @@ def test_a_random_world_brings_its_budget_and_a_flag_overrides_it(flag):
     assert parse_train([flag, "medium", "--total-steps", "2048"])[1].train.total_steps == 2048
 
 
+def test_a_world_from_a_file_is_found_again_from_any_folder(tmp_path):
+    (tmp_path / "mine.xml").touch()
+    assert parse_train(["--world", "mine.xml"])[1].world.name == str(tmp_path / "mine.xml")
+
+
+def test_a_random_world_is_not_a_file_of_its_name(tmp_path):
+    (tmp_path / "medium").touch()
+    assert parse_train(["--world", "medium"])[1].world.name == "medium"
+
+
 def test_every_kind_of_knob_can_be_a_flag():
     argv = [
         "--agent.hidden",
@@ -186,9 +196,11 @@ def test_evaluate_hands_on_what_was_asked_for(monkeypatch, tmp_path):
     monkeypatch.setattr(devices, "use_cpu_devices", lambda count=None: None)
     argv = [str(tmp_path), "--world", "dense", "--start", "1", "2", "3", "--goal", "-4", "5.5", "6"]
     assert main(["evaluate", *argv, "--missions", "9", "--seed", "2", "--json", "a.json"]) == 0
-    assert asked == [
-        cli.EvaluateArgs(tmp_path, "dense", (1.0, 2.0, 3.0), (-4.0, 5.5, 6.0), missions=9, seed=2, json=Path("a.json"))
-    ]
+    whole = cli.EvaluateArgs(
+        tmp_path, "dense", (1.0, 2.0, 3.0), (-4.0, 5.5, 6.0), missions=9, seed=2, json=Path("a.json")
+    )
+    assert main(["evaluate", str(tmp_path), "--shuffle-codes", "--trajectories", "a.npz"]) == 0
+    assert asked == [whole, cli.EvaluateArgs(tmp_path, shuffle_codes=True, trajectories=Path("a.npz"))]
 
 
 def test_help_lists_every_knob_and_does_not_start_jax():

@@ -9,9 +9,11 @@ import mujoco
 import numpy as np
 import pytest
 
+from edqn_jax import evaluate
 from edqn_jax.checkpoint import save_policy
 from edqn_jax.cli import EvaluateArgs
 from edqn_jax.config import Config, ConfigError
+from edqn_jax.course import Course
 from edqn_jax.evaluate import (
     decision_latency_ms,
     evaluate_command,
@@ -125,6 +127,25 @@ def test_a_file_that_cannot_be_written_is_named_before_anything_is_flown(run, tm
 def test_codes_are_shuffled_between_enough_missions(run):
     with pytest.raises(ConfigError, match="--shuffle-codes needs --missions of at least 4, not 1"):
         evaluate_command(EvaluateArgs(run, shuffle_codes=True))
+
+
+@pytest.mark.parametrize("shuffle_codes", [True, False])
+def test_the_command_shuffles_codes_only_when_asked_and_says_so(shuffle_codes, run, tmp_path, monkeypatch, capsys):
+    asked = []
+
+    def fly(*_: object, **options: object) -> Flights:
+        asked.append(options)
+        return four_flights()
+
+    # Stand-ins for what would compile.
+    monkeypatch.setattr(evaluate, "load_course", lambda *_: Course("paper", None, None))  # type: ignore[arg-type]
+    monkeypatch.setattr(evaluate, "fly_on_all_devices", fly)
+    monkeypatch.setattr(evaluate, "shortest_paths", lambda *_: np.full(4, 10.0))
+    monkeypatch.setattr(evaluate, "decision_latency_ms", lambda *_: {"median": 1.0, "p99": 2.0})
+    evaluate_command(EvaluateArgs(run, missions=4, shuffle_codes=shuffle_codes, json=tmp_path / "figures.json"))
+    assert asked == [{"record": False, "shuffle_codes": shuffle_codes}]
+    assert json.loads((tmp_path / "figures.json").read_text())["shuffled_codes"] is shuffle_codes
+    assert ("shuffled codes" in capsys.readouterr().out) is shuffle_codes
 
 
 def test_a_world_without_a_way_is_a_sentence(run, tmp_path):
