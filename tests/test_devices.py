@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import types
+from typing import Any
+
 import jax
 import pytest
 
+from edqn_jax import devices
 from edqn_jax.config import ConfigError
 from edqn_jax.devices import choose_devices, cores, most_that_divide, use_cpu_devices
 
@@ -34,3 +38,15 @@ def test_devices_cannot_be_made_once_jax_runs():
     jax.devices()
     with pytest.raises(RuntimeError):
         use_cpu_devices(2 + cores())
+
+
+@pytest.mark.parametrize(
+    ("version", "partitioner"),
+    [((0, 10, 2), {}), ((0, 11, 0), {"jax_use_shardy_partitioner": False}), ((0, 12, 0), {})],
+)
+def test_only_jax_0_11_is_told_to_use_the_old_partitioner(version, partitioner, monkeypatch):
+    told: dict[str, Any] = {}
+    config = types.SimpleNamespace(update=told.__setitem__)
+    monkeypatch.setattr(devices, "jax", types.SimpleNamespace(config=config, __version_info__=version))
+    use_cpu_devices(3)
+    assert told == {"jax_num_cpu_devices": 3, **partitioner}
