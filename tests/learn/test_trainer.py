@@ -119,6 +119,13 @@ def test_parameters_agree_on_one_device_and_two_after_the_first_updates(on_one, 
         np.testing.assert_allclose(one, two, atol=1e-5)
 
 
+@pytest.mark.parametrize(("warmup_decisions", "steps"), [(0, 0), (33, 3), (64, 4), (65, 4), (10**6, 4)])
+def test_the_warm_up_is_whole_steps_and_a_quarter_of_the_run_at_most(warmup_decisions: int, steps: int) -> None:
+    config = dataclasses.replace(CONFIG, encoder=dataclasses.replace(CONFIG.encoder, warmup_decisions=warmup_decisions))
+    plan = Plan.of(config)
+    assert (plan.total, plan.warmup, plan.learn_from) == (16, steps, steps + 5)  # n_step + history rows to learn from
+
+
 @pytest.mark.slow
 def test_the_acting_encoder_changes_once_at_the_end_of_the_warm_up(on_one) -> None:
     states = on_one[0]
