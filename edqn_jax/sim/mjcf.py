@@ -82,16 +82,14 @@ def resolve_world(name: str) -> Path:
     named = folder / f"{name}.xml"
     if path.name == name and named.is_file():
         return named
-    known = ", ".join(sorted(file.stem for file in folder.glob("*.xml"))) or "none"
+    scenes = sorted(file.stem for file in folder.glob("*.xml"))
+    known = f"scenes known by name: {', '.join(scenes) or 'none'}"
     if path.suffix == ".xml" or path.name != name:
         searched = path.parent.resolve()
-        raise SceneError(f"there is no scene file '{path.name}' in {searched}; scenes known by name: {known}")
-    close = difflib.get_close_matches(name, [*DENSITIES, *(file.stem for file in folder.glob("*.xml"))], n=1)
-    hint = f"did you mean '{close[0]}'? " if close else ""
-    raise SceneError(
-        f"there is no scene '{name}' in {folder}; {hint}The scenes there are: {known}; "
-        f"random worlds: {', '.join(DENSITIES)}"
-    )
+        raise SceneError(f"there is no scene file '{path.name}' in {searched}; {known}")
+    close = difflib.get_close_matches(name, [*DENSITIES, *scenes], n=1)
+    hint = f"; did you mean '{close[0]}'?" if close else ""
+    raise SceneError(f"there is no scene '{name}' in {folder}; {known}; random worlds: {', '.join(DENSITIES)}{hint}")
 
 
 def load_scene(path: str | Path) -> Scene:

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 from edqn_jax.config import ConfigError
+from edqn_jax.sim import mjcf
 from edqn_jax.sim.mjcf import (
     VOLUME_MARGIN,
     SceneError,
@@ -195,13 +196,26 @@ def test_a_file_that_does_not_parse_says_why_in_one_line(tmp_path, text):
     assert "broken.xml" in message(raised)
 
 
-def test_a_missing_scene_names_the_folder_searched_and_what_is_there(tmp_path):
+@pytest.mark.parametrize(
+    ("name", "hint"),
+    [("papr", "; did you mean 'paper'?"), ("meduim", "; did you mean 'medium'?"), ("qqqq", "")],
+)
+def test_a_missing_scene_names_what_there_is_and_what_was_meant(name, hint, tmp_path, monkeypatch):
+    monkeypatch.setattr(mjcf, "scenes_folder", lambda: tmp_path)
+    for scene in ("paper", "alley"):
+        (tmp_path / f"{scene}.xml").touch()
     with pytest.raises(SceneError) as raised:
-        resolve_world("papr")
-    assert str(scenes_folder()) in message(raised) and "paper" in message(raised)
+        resolve_world(name)
+    assert message(raised) == (
+        f"there is no scene '{name}' in {tmp_path}; scenes known by name: alley, paper; "
+        f"random worlds: sparse, medium, dense{hint}"
+    )
+
+
+def test_a_missing_scene_file_names_the_folder_searched(tmp_path):
     with pytest.raises(SceneError) as raised:
         resolve_world(str(tmp_path / "nowhere.xml"))
-    assert str(tmp_path) in message(raised)
+    assert f"there is no scene file 'nowhere.xml' in {tmp_path}; scenes known by name: " in message(raised)
 
 
 def test_a_world_is_found_by_its_name_and_by_its_path():
