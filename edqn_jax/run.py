@@ -12,7 +12,7 @@ import platform
 import time
 from collections.abc import Callable, Sequence
 from importlib import metadata
-from typing import Any
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -106,14 +106,19 @@ def _typed(missions: Missions) -> Missions:
     return dataclasses.replace(missions, scene=missions.scene.astype(jnp.int32))
 
 
-@dataclasses.dataclass
-class _Best:
-    """The parameters that a run would end with now, and where they come from."""
+@dataclasses.dataclass(frozen=True)
+class Candidate:
+    """Parameters that a run may end with, and what validation says of them; by default none yet."""
 
     params: PolicyParams
-    spl: float = -1.0
-    success: float = 0.0
-    decisions: int = 0
+    spl: float = -1.0  # below what any validation gives
+    success: float = 0.0  # share of validation missions
+    decisions: int = 0  # trained before that validation, of all environments
+
+
+def choose(keep: Literal["best", "last"], kept: Candidate, latest: Candidate) -> Candidate:
+    """Which of the two a run would end with: `best` by SPL, the latest among equals; `last` always the latest."""
+    return latest if keep == "last" or latest.spl >= kept.spl else kept
 
 
 class _Log:
@@ -206,7 +211,7 @@ def train_run(
 
     plan, envs, chunk = trainer.plan, config.train.num_envs, config.train.chunk_steps
     log = _Log(config, run, progress)
-    best = _Best(jax.tree.map(np.asarray, policy_of(state)))
+    kept = Candidate(jax.tree.map(np.asarray, policy_of(state)))
     mesh = Mesh(np.asarray(devices), ("mission",))
     progress.start(plan.total * envs)
     train_seconds, validated = 0.0, 0
@@ -233,24 +238,23 @@ def train_run(
             straight = _straight(courses.validation.missions, config.env.goal_radius_m)
             weighted = spl(np.asarray(flights.outcome) == Outcome.GOAL, np.asarray(flights.path_length_m), straight)
             metrics |= {"validation_success": rate, "validation_spl": weighted}
-            if config.train.keep == "last" or weighted >= best.spl:
-                best = _Best(params, weighted, rate, validated)
+            kept = choose(config.train.keep, kept, Candidate(params, weighted, rate, validated))
         run.append_metrics(metrics)
         progress.update(metrics)
         if stop_requested() and not finished:
-            chosen = config.train.keep == "best" and best.decisions > 0
-            save_policy(run.checkpoints, best.params if chosen else policy_of(state))
+            chosen = config.train.keep == "best" and kept.decisions > 0
+            save_policy(run.checkpoints, kept.params if chosen else policy_of(state))
             raise StoppedError(f"stopped after {done * envs:,} decisions; the policy is in '{run.checkpoints}'")
         if finished:
             break
     progress.stop()
-    save_policy(run.checkpoints, best.params)
+    save_policy(run.checkpoints, kept.params)
 
-    flights = _fly(config, courses.final, best.params, mesh)
+    flights = _fly(config, courses.final, kept.params, mesh)
     run.write_trajectory(trajectory(config, flights))
     scene = jax.tree.map(np.asarray, courses.scene)
     flight = flight_summary(flights)
-    draw_gallery(config, run, scene, best.params, np.asarray(courses.shortest.points), flight["outcome"])
+    draw_gallery(config, run, scene, kept.params, np.asarray(courses.shortest.points), flight["outcome"])
     since = first_success(log.validations)
     summary = {
         **flight,
@@ -265,9 +269,9 @@ def train_run(
         "episodes": log.episodes,
         "first_success_decisions": since[0],
         "first_success_seconds": since[1],
-        "validation_success": best.success,
-        "validation_spl": best.spl,
-        "parameters_from_decisions": best.decisions,
+        "validation_success": kept.success,
+        "validation_spl": kept.spl,
+        "parameters_from_decisions": kept.decisions,
         "workload": workload(config, scene),
         "devices": [str(device) for device in devices],
         "versions": versions(),

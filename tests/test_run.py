@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 from pathlib import Path
+from typing import Literal
 
 import jax
 import jax.numpy as jnp
@@ -15,9 +16,10 @@ from edqn_jax import run as training
 from edqn_jax.config import CameraConfig, Config, ConfigError, TrainConfig, WorldConfig
 from edqn_jax.endings import StoppedError
 from edqn_jax.evaluate import load_run
+from edqn_jax.learn.policy import PolicyParams
 from edqn_jax.learn.trainer import Episodes, Losses
 from edqn_jax.report.progress import Progress
-from edqn_jax.run import first_success, train_run
+from edqn_jax.run import Candidate, choose, first_success, train_run
 from edqn_jax.rundir import TRAJECTORY_COLUMNS, RunDirectory, plain
 from tests.learn.test_trainer import CONFIG as SMALL
 
@@ -89,6 +91,28 @@ def test_a_world_that_cannot_be_flown_leaves_nothing_behind(tmp_path: Path) -> N
     with pytest.raises(ConfigError, match="the start .* lies inside 'wall'"):
         train_run(config, run, Progress(), lambda: False)
     assert not run.path.exists()
+
+
+@pytest.mark.parametrize(
+    ("keep", "spls", "ends_with"),
+    [
+        ("best", [0.5, 0.9, 0.7], 200),
+        ("best", [0.9, 0.5, 0.9], 300),  # the latest among equals
+        ("best", [0.0], 100),  # what flies nowhere still comes before what was never flown
+        ("last", [0.5, 0.9, 0.7], 300),
+        ("best", [], 0),
+        ("last", [], 0),
+    ],
+)
+def test_a_run_ends_with_the_parameters_of_the_best_spl_or_the_last(
+    keep: Literal["best", "last"], spls: list[float], ends_with: int
+) -> None:
+    params = PolicyParams(encoder={}, q={})
+    kept = Candidate(params)
+    for number, weighted in enumerate(spls, 1):
+        # The success rate falls all the while: it must not count.
+        kept = choose(keep, kept, Candidate(params, weighted, 1 / number, 100 * number))
+    assert kept.decisions == ends_with
 
 
 def test_a_policy_counts_as_flying_from_when_it_kept_flying() -> None:
