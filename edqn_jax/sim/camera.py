@@ -8,12 +8,16 @@ box-filtered over the pixel (`texture.py`).
 
 from __future__ import annotations
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 from jax import Array
 
 from edqn_jax.config import CameraConfig
-from edqn_jax.sim import coverage, raycast
+from edqn_jax.sim import columns, coverage, raycast
+from edqn_jax.sim.columns import Frame
+from edqn_jax.sim.coverage import Layers
 from edqn_jax.sim.raycast import Rays, Values
 from edqn_jax.sim.scene import Scene
 from edqn_jax.sim.texture import texture
@@ -51,31 +55,36 @@ def _backdrop(config: CameraConfig, scene: Scene, origin: Array, rays: Rays, val
     return behind + share * (shown * factor - behind)
 
 
-def _picture(config: CameraConfig, scene: Scene, origin: Array, rotation: Array, weights: Array) -> Array:
-    """Brightness under `weights` [3] of RGB: [H, W]."""
-    value = raycast.albedo_values(scene, weights)
-    rays = raycast.camera_rays(config, rotation)
-    many = raycast.camera_rays(config, rotation, config.samples_across, config.samples_down)
-    layers = coverage.no_layers((config.height, config.width))
-    counted = raycast.other_surfaces(config, scene, origin, many, value)
-    if config.mount != "level":
-        counted += raycast.upright_surfaces(config, scene, origin, many, value)
-    for surfaces in counted:
-        layers = coverage.counted_layers(surfaces, many, layers)
-    layers = coverage.sphere_layers(config, scene, origin, rays, value, layers)
-    if config.mount == "level":
-        layers = coverage.upright_layers(config, scene, origin, rays, value, layers)
-    sky = jnp.sum(jnp.asarray(config.sky_rgb) * weights)
-    behind = _backdrop(config, scene, origin, rays, value, sky)
+def _blend(config: CameraConfig, frame: Frame, rays: Rays, layers: Layers) -> Array:
+    """Brightness of the layers over ground and sky: [H, W] of `rays`."""
+    behind = _backdrop(config, frame.scene, frame.origin, rays, frame.value, frame.sky)
     for layer in reversed(layers):
         met = layer.closeness > 0
         near = jnp.where(met, raycast.inverse(layer.closeness), 0.0)
         level = layer.slope == coverage.LEVEL_FACE
         right = jnp.where(level, 0.0, -near * near * layer.slope)
         up = jnp.where(level, -near * raycast.inverse(rays.dz) * rays.pitch, 0.0)
-        factor = texture(config, origin, rays, near, right, up)
+        factor = texture(config, frame.origin, rays, near, right, up)
         behind = behind + jnp.where(met, layer.value * factor - layer.coverage * behind, 0.0)
-    return coverage.materialised(behind)
+    return behind
+
+
+def _picture(config: CameraConfig, scene: Scene, origin: Array, rotation: Array, weights: Array) -> Array:
+    """Brightness under `weights` [3] of RGB: [H, W]."""
+    if config.mount == "level":
+        return columns.mapped(config, partial(_blend, config))(scene, origin, rotation, weights)
+    value = raycast.albedo_values(scene, weights)
+    rays = raycast.camera_rays(config, rotation)
+    many = raycast.camera_rays(config, rotation, config.samples_across, config.samples_down)
+    layers = coverage.no_layers((config.height, config.width))
+    counted = raycast.other_surfaces(config, scene, origin, many, value)
+    counted += raycast.upright_surfaces(config, scene, origin, many, value)
+    for surfaces in counted:
+        layers = coverage.counted_layers(surfaces, many, layers)
+    layers = coverage.sphere_layers(config, scene, origin, rays, value, layers)
+    sky = jnp.sum(jnp.asarray(config.sky_rgb) * weights)
+    frame = Frame(origin=origin, heading=rotation[:2, 0], scene=scene, value=value, sky=sky)
+    return coverage.materialised(_blend(config, frame, rays, layers))
 
 
 def luma(config: CameraConfig, scene: Scene, position: Array, rotation: Array) -> Array:

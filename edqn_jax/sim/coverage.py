@@ -7,6 +7,8 @@ pixel for everything else.
 
 from __future__ import annotations
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 from flax import struct
@@ -18,13 +20,15 @@ from edqn_jax.sim.raycast import (
     Rays,
     Surfaces,
     Values,
+    columns_of,
     for_shapes,
     inverse,
     per_shape,
+    pitch_of,
     shade,
     unit_ball,
 )
-from edqn_jax.sim.scene import Scene
+from edqn_jax.sim.scene import Scene, Spheres, UprightBoxes, UprightCylinders
 
 NEAR_M = 0.05
 """Shapes are clipped at this depth before they are projected; the body sphere is wider."""
@@ -58,10 +62,10 @@ Layers = tuple[Layer, ...]
 """The nearest layers of each pixel, nearest first."""
 
 
-def no_layers(shape: tuple[int, ...]) -> Layers:
-    """Nothing in sight."""
+def no_layers(shape: tuple[int, ...], depth: int = DEPTH_OF_LAYERS) -> Layers:
+    """Nothing in sight, and room for the `depth` nearest layers."""
     none = jnp.zeros(shape)
-    return (Layer(closeness=none, coverage=none, value=none, slope=none),) * DEPTH_OF_LAYERS
+    return (Layer(closeness=none, coverage=none, value=none, slope=none),) * depth
 
 
 def insert(layers: Layers, new: Layer) -> Layers:
@@ -87,9 +91,8 @@ def insert(layers: Layers, new: Layer) -> Layers:
     return tuple(kept)
 
 
-def _extent_of_boxes(scene: Scene, origin: Array, forward: tuple[Array, Array]) -> tuple[Array, Array]:
+def _extent_of_boxes(boxes: UprightBoxes, origin: Array, forward: Array) -> tuple[Array, Array]:
     """Leftmost and rightmost image-plane coordinate of each upright box: [N] each; empty if left > right."""
-    boxes = scene.boxes
     cos, sin = jnp.cos(boxes.yaw)[:, None], jnp.sin(boxes.yaw)[:, None]
     hx = boxes.half[:, 0:1] * jnp.asarray([[1.0, -1.0, -1.0, 1.0]])
     hy = boxes.half[:, 1:2] * jnp.asarray([[1.0, 1.0, -1.0, -1.0]])
@@ -105,154 +108,204 @@ def _extent_of_boxes(scene: Scene, origin: Array, forward: tuple[Array, Array]) 
     return jnp.min(jnp.where(shown, u, jnp.inf), axis=1), jnp.max(jnp.where(shown, u, -jnp.inf), axis=1)
 
 
-def _extent_of_cylinders(scene: Scene, origin: Array, forward: tuple[Array, Array]) -> tuple[Array, Array]:
+def _extent_of_cylinders(cylinders: UprightCylinders, origin: Array, forward: Array) -> tuple[Array, Array]:
     """The same for upright cylinders, by their two tangents from the camera."""
-    cylinders = scene.cylinders
-    x, y = cylinders.position[:, 0] - origin[0], cylinders.position[:, 1] - origin[1]
+    return _extent_of_discs(cylinders.position, cylinders.radius, origin, forward)
+
+
+def _extent_of_discs(position: Array, radius: Array, origin: Array, forward: Array) -> tuple[Array, Array]:
+    x, y = position[:, 0] - origin[0], position[:, 1] - origin[1]
     ahead, right = x * forward[0] + y * forward[1], x * forward[1] - y * forward[0]
     distance = jnp.sqrt(ahead**2 + right**2)
-    sine = jnp.minimum(cylinders.radius / jnp.maximum(distance, TINY), 1.0)
+    sine = jnp.minimum(radius / jnp.maximum(distance, TINY), 1.0)
     cosine = jnp.sqrt(1 - sine**2)
 
     def edge(sign: float) -> Array:
         f, r = ahead * cosine - sign * right * sine, right * cosine + sign * ahead * sine
         return jnp.where(f > NEAR_M * 1e-3, r / jnp.maximum(f, NEAR_M * 1e-3), sign * FAR_U)
 
-    behind = ahead + cylinders.radius <= 0
+    behind = ahead + radius <= 0
     return jnp.where(behind, jnp.inf, edge(-1.0)), jnp.where(behind, -jnp.inf, edge(1.0))
 
 
-def _column_shares(left: Array, right: Array, u: Array, pitch: float):
-    """Overlap of extents [N] with pixel columns centred at u [C]: coverage, low and high end; [N, C] each."""
-    u = u[None]
-    low = jnp.maximum(u - pitch / 2, left[:, None])
-    high = jnp.minimum(u + pitch / 2, right[:, None])
-    width = high - low
-    covered = width > 0
-    centre = jnp.broadcast_to(u, low.shape)
-    return (
-        jnp.where(covered, width / pitch, 0.0),
-        jnp.where(covered, low, centre),
-        jnp.where(covered, high, centre),
-    )
+BOX_VALUES, CYLINDER_VALUES = 9, 4
+"""Numbers that the sides of a box and of a cylinder need, besides their extent and heights."""
 
 
-def _box_columns(config: CameraConfig, scene: Scene, origin: Array, rays: Rays, u: Array, value: Array):
-    """Upright boxes per column, [N, C] each: coverage, entry and exit depth, brightness of the side and
-    change of its closeness per pixel.
+def upright_table(config: CameraConfig, scene: Scene, origin: Array, heading: Array, value: Values) -> Array:
+    """What a column must know of each upright shape, boxes first: [N + 1, F]; the last row covers nothing.
+
+    Args:
+        heading: [2] cosine and sine of the camera's.
     """
-    boxes = scene.boxes
-    forward = (-rays.right[1], rays.right[0])
-    coverage, low, high = _column_shares(*_extent_of_boxes(scene, origin, forward), u, rays.pitch)
+    parts = []
+    if scene.boxes.yaw.shape[0]:
+        parts.append(_boxes_in_table(config, scene.boxes, origin, heading, value.boxes))
+    if scene.cylinders.radius.shape[0]:
+        parts.append(_cylinders_in_table(config, scene.cylinders, origin, heading, value.cylinders))
+    width = max((part.shape[1] for part in parts), default=2)
+    parts = [jnp.pad(part, ((0, 0), (0, width - part.shape[1]))) for part in parts]
+    return jnp.concatenate([*parts, jnp.zeros((1, width)).at[0, :2].set(jnp.asarray([jnp.inf, -jnp.inf]))])
+
+
+def _boxes_in_table(config: CameraConfig, boxes: UprightBoxes, origin: Array, heading: Array, value: Array) -> Array:
+    left, right = _extent_of_boxes(boxes, origin, heading)
     cos, sin = jnp.cos(boxes.yaw), jnp.sin(boxes.yaw)
     ox, oy = origin[0] - boxes.position[:, 0], origin[1] - boxes.position[:, 1]
     bx, by = cos * ox + sin * oy, cos * oy - sin * ox
-    # Forward and right in each box's frame.
-    fx, fy = cos * forward[0] + sin * forward[1], cos * forward[1] - sin * forward[0]
-    rx, ry = fy, -fx
-
-    def slabs(at: Array):
-        dx, dy = fx[:, None] + at * rx[:, None], fy[:, None] + at * ry[:, None]
-        ix, iy = inverse(dx), inverse(dy)
-        mx, my = -bx[:, None] * ix, -by[:, None] * iy
-        hx, hy = boxes.half[:, 0:1] * jnp.abs(ix), boxes.half[:, 1:2] * jnp.abs(iy)
-        zero = jnp.zeros_like(cos)
-        x_faces = jnp.where(dx < 0, shade(config, cos, sin, zero)[:, None], shade(config, -cos, -sin, zero)[:, None])
-        y_faces = jnp.where(dy < 0, shade(config, -sin, cos, zero)[:, None], shade(config, sin, -cos, zero)[:, None])
-        near_x, near_y = mx - hx, my - hy
-        face = near_x > near_y
-        enter = jnp.maximum(near_x, near_y)
-        # On a face x = const of the box, 1/t = dx / const, so its change is 1/t times that of log dx.
-        slope = jnp.where(face, rx[:, None] * ix, ry[:, None] * iy)
-        return enter, jnp.minimum(mx + hx, my + hy), slope, face, jnp.where(face, x_faces, y_faces)
-
-    enter, leave, slope, _, _ = slabs((low + high) / 2)
-    _, _, _, face_left, shade_left = slabs(low)
-    _, _, _, face_right, shade_right = slabs(high)
-    # The edge between the two visible sides, where they meet inside a column.
-    sx, sy = jnp.sign(bx) * boxes.half[:, 0], jnp.sign(by) * boxes.half[:, 1]
-    corner_ahead = (sx - bx) * fx + (sy - by) * fy
-    corner_right = (sx - bx) * rx + (sy - by) * ry
-    corner = (corner_right * inverse(corner_ahead))[:, None]
-    share = jnp.clip((corner - low) * inverse(high - low), 0.0, 1.0)
-    side = jnp.where(
-        face_left == face_right,
-        (shade_left + shade_right) / 2,
-        share * shade_left + (1 - share) * shade_right,
-    )
-    side = side * value[:, None]
-    enter, leave = jnp.maximum(enter, NEAR_M), jnp.maximum(leave, NEAR_M)
-    return coverage, enter, leave, side, slope * rays.pitch / enter
+    # Forward in the box's frame; to the right of it is (fy, -fx).
+    fx, fy = cos * heading[0] + sin * heading[1], cos * heading[1] - sin * heading[0]
+    hx, hy, sx, sy, zero = boxes.half[:, 0], boxes.half[:, 1], jnp.sign(bx), jnp.sign(by), jnp.zeros_like(cos)
+    # Of two opposite faces a ray enters by the one on the eye's side.
+    x_face = value * shade(config, sx * cos, sx * sin, zero)
+    y_face = value * shade(config, -sy * sin, sy * cos, zero)
+    # The edge between the two.
+    ex, ey = sx * hx - bx, sy * hy - by
+    corner = (ex * fy - ey * fx) * inverse(ex * fx + ey * fy)
+    heights = _heights(config, boxes.position[:, 2] - origin[2], boxes.half[:, 2], value)
+    return jnp.stack([left, right, *heights, bx, by, fx, fy, hx, hy, x_face, y_face, corner], axis=1)
 
 
-def _cylinder_columns(config: CameraConfig, scene: Scene, origin: Array, rays: Rays, u: Array, value: Array):
-    """The same for upright cylinders."""
-    cylinders = scene.cylinders
-    forward = (-rays.right[1], rays.right[0])
-    coverage, low, high = _column_shares(*_extent_of_cylinders(scene, origin, forward), u, rays.pitch)
-    at = (low + high) / 2
-    dx, dy = forward[0] + at * rays.right[0], forward[1] + at * rays.right[1]
-    ox, oy = (origin[i] - cylinders.position[:, i : i + 1].T.reshape(-1, 1) for i in range(2))
-    a = dx**2 + dy**2
-    s = -(ox * dx + oy * dy) / a
-    inside = cylinders.radius[:, None] ** 2 - ((ox + s * dx) ** 2 + (oy + s * dy) ** 2)
-    reach = jnp.sqrt(jnp.maximum(inside, 0.0) / a)
-    enter, leave = s - reach, s + reach
-    per_radius = 1.0 / jnp.maximum(cylinders.radius[:, None], TINY)
-    nx, ny = (ox + enter * dx) * per_radius, (oy + enter * dy) * per_radius
-    side = shade(config, nx, ny, jnp.zeros_like(nx)) * value[:, None]
-    # On the tangent plane n . (t d) stays put, so 1/t changes like n . d.
-    slope = (nx * rays.right[0] + ny * rays.right[1]) * inverse(nx * dx + ny * dy)
-    enter, leave = jnp.maximum(enter, NEAR_M), jnp.maximum(leave, NEAR_M)
-    return coverage, enter, leave, side, slope * rays.pitch / enter
+def _cylinders_in_table(
+    config: CameraConfig, cylinders: UprightCylinders, origin: Array, heading: Array, value: Array
+) -> Array:
+    left, right = _extent_of_cylinders(cylinders, origin, heading)
+    heights = _heights(config, cylinders.position[:, 2] - origin[2], cylinders.half_height, value)
+    ox, oy = origin[0] - cylinders.position[:, 0], origin[1] - cylinders.position[:, 1]
+    return jnp.stack([left, right, *heights, ox, oy, cylinders.radius, value], axis=1)
 
 
-def upright_layers(
-    config: CameraConfig, scene: Scene, origin: Array, rays: Rays, value: Values, layers: Layers
-) -> Layers:
-    """Layers of upright boxes and cylinders under a level camera, in closed form."""
-    parts = []
-    u = (jnp.arange(config.width) + 0.5 - config.width / 2) * rays.pitch
-    if scene.boxes.yaw.shape[0]:
-        parts.append(_box_columns(config, scene, origin, rays, u, value.boxes))
-    if scene.cylinders.radius.shape[0]:
-        parts.append(_cylinder_columns(config, scene, origin, rays, u, value.cylinders))
-    if not parts:
-        return layers
-    share, enter, leave, side, slope = (jnp.concatenate(part) for part in zip(*parts, strict=True))
-    # One array, computed once: XLA would otherwise repeat all of the above for every row, and LLVM
-    # gives up vectorising a loop that reads from too many (docs/decisions).
-    columns = materialised(jnp.stack([share, side * share, 1.0 / enter, 1.0 / leave, slope], axis=1))
-
-    middle = jnp.concatenate([scene.boxes.position[:, 2], scene.cylinders.position[:, 2]]) - origin[2]
-    half = jnp.concatenate([scene.boxes.half[:, 2], scene.cylinders.half_height])
-    albedo = jnp.concatenate([value.boxes, value.cylinders])
+def _heights(config: CameraConfig, middle: Array, half: Array, value: Array) -> tuple[Array, ...]:
+    """Bottom, top and the horizontal face in view (0: none), each in rows x metres, and that face's brightness."""
+    bottom, top = (middle - half) / pitch_of(config), (middle + half) / pitch_of(config)
     zero = jnp.zeros(())
     above, below = shade(config, zero, zero, zero + 1), shade(config, zero, zero, zero - 1)
-    per_pitch = 1.0 / rays.pitch
-    bottom, top = (middle - half) * per_pitch, (middle + half) * per_pitch
-    # The horizontal face in view: the top from above, the bottom from below, none in between.
+    # The top from above, the bottom from below, none in between.
     cap = jnp.where(top < 0, top, jnp.maximum(bottom, 0.0))
-    shown = albedo * jnp.where(top < 0, above, below)
-    row = config.height / 2 - 0.5 - jnp.arange(config.height, dtype=jnp.float32)
-    low, high = (row - 0.5)[:, None], (row + 0.5)[:, None]
-    # Closeness of the cap in each row; where there is no cap, anything beyond the side's.
-    level = materialised(jnp.where(cap[:, None] == 0, 1.0 / NEAR_M, row[None] * inverse(cap)[:, None]))
-    for n in range(share.shape[0]):
-        covered, bright, near, far, lean = columns[n][:, None]
-        cap_near, cap_far = cap[n] * near, cap[n] * far
-        rows_side = jnp.minimum(top[n] * near, high) - jnp.maximum(bottom[n] * near, low)
-        rows_cap = jnp.minimum(jnp.maximum(cap_near, cap_far), high) - jnp.maximum(jnp.minimum(cap_near, cap_far), low)
-        rows_side, rows_cap = jnp.maximum(rows_side, 0.0), jnp.maximum(rows_cap, 0.0)
-        coverage = (rows_side + rows_cap) * covered
-        layer = Layer(
-            closeness=jnp.where(coverage > 0, jnp.clip(level[n][:, None], far, near), 0.0),
-            coverage=coverage,
-            value=rows_side * bright + rows_cap * (shown[n] * covered),
-            slope=jnp.where(rows_cap > rows_side, LEVEL_FACE, lean),
-        )
-        layers = insert(layers, layer)
+    return bottom, top, cap, value * jnp.where(top < 0, above, below)
+
+
+def _box_sides(values: tuple[Array, ...], low: Array, high: Array) -> tuple[Array, ...]:
+    """Entry and exit depth, brightness and lean of a box's sides between `low` and `high` of a column, all [...].
+
+    Lean is how closeness changes per unit of u, relative to closeness.
+    """
+    bx, by, fx, fy, hx, hy, x_face, y_face, corner = values
+
+    def slabs(u: Array) -> tuple[Array, ...]:
+        ix, iy = inverse(fx + u * fy), inverse(fy - u * fx)
+        return ix, iy, -bx * ix, -by * iy, hx * jnp.abs(ix), hy * jnp.abs(iy)
+
+    ix, iy, mx, my, reach_x, reach_y = slabs((low + high) / 2)
+    # On a face x = const of the box, 1/t = dx / const, so its change is 1/t times that of log dx.
+    lean = jnp.where(mx - reach_x > my - reach_y, fy * ix, -fx * iy)
+
+    def face(u: Array) -> Array:
+        _, _, mx, my, reach_x, reach_y = slabs(u)
+        return jnp.where(mx - reach_x > my - reach_y, x_face, y_face)
+
+    share = jnp.clip((corner - low) * inverse(high - low), 0.0, 1.0)
+    at_low, at_high = face(low), face(high)
+    side = jnp.where(at_low == at_high, at_low, share * at_low + (1 - share) * at_high)
+    return jnp.maximum(mx - reach_x, my - reach_y), jnp.minimum(mx + reach_x, my + reach_y), side, lean
+
+
+def _cylinder_sides(
+    config: CameraConfig, values: tuple[Array, ...], low: Array, high: Array, heading: Array
+) -> tuple[Array, ...]:
+    """The same of a cylinder's."""
+    ox, oy, radius, value = values
+    u, (cos, sin) = (low + high) / 2, heading[:, None]
+    dx, dy = cos + u * sin, sin - u * cos
+    a = dx**2 + dy**2
+    s = -(ox * dx + oy * dy) / a
+    inside = radius**2 - ((ox + s * dx) ** 2 + (oy + s * dy) ** 2)
+    reach = jnp.sqrt(jnp.maximum(inside, 0.0) / a)
+    enter = s - reach
+    per_radius = 1.0 / jnp.maximum(radius, TINY)
+    nx, ny = (ox + enter * dx) * per_radius, (oy + enter * dy) * per_radius
+    # On the tangent plane n . (t d) stays put, so 1/t changes like n . d.
+    lean = (nx * sin - ny * cos) * inverse(nx * dx + ny * dy)
+    return enter, s + reach, value * shade(config, nx, ny, jnp.zeros_like(nx)), lean
+
+
+def sides(config: CameraConfig, picked: Array, is_cylinder: Array | None, boxes: int, heading: Array, u: Array) -> Array:
+    """What the pixels of columns must know of the shapes picked for them: [B, K, 11].
+
+    Share of the column's width, bottom and top row of the side, lowest and highest of the cap, brightness of both
+    times share, least and greatest closeness, closeness per row on the cap, lean.
+
+    Args:
+        picked: [K, B, F] rows of `upright_table`.
+        is_cylinder: [K, B] bool.
+        boxes: how many boxes stand in the table before the cylinders, static.
+        heading: [B, 2].
+        u: [B] middle of each column.
+    """
+    pitch = pitch_of(config)
+    left, right, bottom, top, cap, shown, *values = jnp.moveaxis(picked, -1, 0)
+    u = u[None]
+    low, high = jnp.maximum(u - pitch / 2, left), jnp.minimum(u + pitch / 2, right)
+    share = jnp.maximum(high - low, 0.0) / pitch
+    low, high = jnp.where(share > 0, low, u), jnp.where(share > 0, high, u)
+    round_sides = partial(_cylinder_sides, config, tuple(values[:CYLINDER_VALUES]), low, high, heading.T)
+    if not boxes:
+        enter, leave, side, lean = round_sides()
+    else:
+        enter, leave, side, lean = _box_sides(tuple(values), low, high)
+        if is_cylinder is not None:
+            others = round_sides()
+            enter, leave, side, lean = (
+                jnp.where(is_cylinder, a, b) for a, b in zip(others, (enter, leave, side, lean), strict=True)
+            )
+    near, far = 1.0 / jnp.maximum(enter, NEAR_M), 1.0 / jnp.maximum(leave, NEAR_M)
+    cap_near, cap_far = cap * near, cap * far
+    found = [
+        share,
+        bottom * near,
+        top * near,
+        jnp.minimum(cap_near, cap_far),
+        jnp.maximum(cap_near, cap_far),
+        side * share,
+        shown * share,
+        jnp.where(cap == 0, near, far),  # without a cap, closeness is the side's
+        near,
+        inverse(cap),
+        lean * near * pitch,
+    ]
+    # Computed once: XLA would otherwise repeat all of it for every row.
+    return materialised(jnp.moveaxis(materialised(jnp.stack(found)), (0, 1, 2), (2, 1, 0)))
+
+
+def insert_sides(config: CameraConfig, layers: Layers, columns: Array) -> Layers:
+    """Add the shapes of one column, [K, 11] of `sides`, to the layers of its pixels [H, 1]."""
+    for column in columns:
+        layers = _insert_side(config, layers, column)
     return layers
+
+
+@partial(jax.jit, static_argnums=0)  # traced once for all slots
+def _insert_side(config: CameraConfig, layers: Layers, column: Array) -> Layers:
+    share, bottom, top, cap_low, cap_high, side, shown, far, near, per_row, lean = column
+    row = (config.height / 2 - 0.5 - jnp.arange(config.height, dtype=jnp.float32))[:, None]
+    rows_side = jnp.maximum(jnp.minimum(top, row + 0.5) - jnp.maximum(bottom, row - 0.5), 0.0)
+    rows_cap = jnp.maximum(jnp.minimum(cap_high, row + 0.5) - jnp.maximum(cap_low, row - 0.5), 0.0)
+    coverage = (rows_side + rows_cap) * share
+    layer = Layer(
+        closeness=jnp.where(coverage > 0, jnp.clip(row * per_row, far, near), 0.0),
+        coverage=coverage,
+        value=rows_side * side + rows_cap * shown,
+        slope=jnp.where(rows_cap > rows_side, LEVEL_FACE, lean),
+    )
+    return insert(layers, layer)
+
+
+def spheres_in_columns(config: CameraConfig, spheres: Spheres, origin: Array, heading: Array) -> Array:
+    """Whether any sphere may be seen in each column: [C]."""
+    # A silhouette fades over half a pixel on either side.
+    left, right = _extent_of_discs(spheres.position, spheres.radius, origin, heading)
+    u, pitch = columns_of(config)[None], pitch_of(config)
+    return jnp.any((u + 1.5 * pitch > left[:, None]) & (u - 1.5 * pitch < right[:, None]), axis=0)
 
 
 def sphere_layers(

@@ -251,7 +251,7 @@ def observe(
     Args:
         poses: [T, ...] the frames' poses, in order.
     """
-    frames = jnp.stack([view(config, scene, p, q) for p, q in zip(poses.position, poses.quaternion, strict=True)])
+    frames = jax.vmap(lambda p, q: view(config, scene, p, q))(poses.position, poses.quaternion)
     field, memory = events.events(config.events, memory, frames, config.events.frame_times_s, key)
     return Observation(events=field, own=own_state(config.env, scene, goal, state)), memory
 

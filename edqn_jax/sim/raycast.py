@@ -87,6 +87,43 @@ def image_plane(config: CameraConfig, across: int, down: int) -> tuple[np.ndarra
     return u.astype(np.float32), v.astype(np.float32)
 
 
+def pitch_of(config: CameraConfig) -> float:
+    """Width and height of a pixel in the image plane."""
+    return 2 * math.tan(math.radians(config.horizontal_fov_deg) / 2) / config.width
+
+
+def columns_of(config: CameraConfig) -> Array:
+    """Image-plane coordinate [W] of the middle of each column."""
+    return jnp.asarray(image_plane(config, 1, 1)[0])
+
+
+def column_rays(config: CameraConfig, heading: Array, u: Array, across: int = 1, down: int = 1) -> Rays:
+    """Rays [H * down, across] of one column of a level camera.
+
+    Args:
+        heading: [2] cosine and sine.
+        u: [] middle of the column in the image plane.
+        across, down: rays per pixel.
+    """
+    pitch = pitch_of(config)
+    at = u + pitch * ((np.arange(across, dtype=np.float32) + 0.5) / across - 0.5)
+    return _level_rays(config, *heading, at, image_plane(config, across, down)[1], across, down)
+
+
+def _level_rays(config: CameraConfig, cos: Array, sin: Array, u, v, across: int, down: int) -> Rays:
+    zero = jnp.zeros_like(cos)
+    return Rays(
+        dx=(cos + u * sin)[None, :],
+        dy=(sin - u * cos)[None, :],
+        dz=jnp.asarray(v)[:, None],
+        right=jnp.stack([sin, -cos, zero]),
+        up=jnp.stack([zero, zero, zero + 1]),
+        pitch=pitch_of(config),
+        across=across,
+        down=down,
+    )
+
+
 def camera_rays(config: CameraConfig, rotation: Array, across: int = 1, down: int = 1) -> Rays:
     """Rays of the camera for a body rotation.
 
@@ -96,17 +133,10 @@ def camera_rays(config: CameraConfig, rotation: Array, across: int = 1, down: in
         across, down: rays per pixel.
     """
     u, v = image_plane(config, across, down)
-    pitch = 2 * math.tan(math.radians(config.horizontal_fov_deg) / 2) / config.width
     if config.mount == "level":
         forward_x, forward_y = rotation[0, 0], rotation[1, 0]
         scale = lax.rsqrt(jnp.maximum(forward_x**2 + forward_y**2, TINY))
-        cos, sin = forward_x * scale, forward_y * scale
-        dx = (cos + u * sin)[None, :]
-        dy = (sin - u * cos)[None, :]
-        dz = jnp.asarray(v)[:, None]
-        zero = jnp.zeros_like(cos)
-        right, up = jnp.stack([sin, -cos, zero]), jnp.stack([zero, zero, zero + 1])
-        return Rays(dx=dx, dy=dy, dz=dz, right=right, up=up, pitch=pitch, across=across, down=down)
+        return _level_rays(config, forward_x * scale, forward_y * scale, u, v, across, down)
     forward, left, up = rotation[:, 0], rotation[:, 1], rotation[:, 2]
     components = [forward[i] - u[None, :] * left[i] + v[:, None] * up[i] for i in range(3)]
     return Rays(
@@ -115,7 +145,7 @@ def camera_rays(config: CameraConfig, rotation: Array, across: int = 1, down: in
         dz=components[2],
         right=-left,
         up=up,
-        pitch=pitch,
+        pitch=pitch_of(config),
         across=across,
         down=down,
     )

@@ -1,0 +1,227 @@
+"""Pictures of a level camera, image column by image column.
+
+Under a level camera an upright shape fills one interval of rows in each column that it covers, and few shapes
+cover any one column: two on average in a world of thirty, seldom more than eight. So the work is laid out by
+columns, not by frames: all columns of all frames of a batch are sorted by how many shapes cover them, and
+blocks of them are drawn with as many slots as the fullest of the block needs.
+
+M frames, C columns of H pixels in each, Q = M x C; N upright shapes; B columns in a block, K slots.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+from jax import Array, lax
+from jax.custom_batching import custom_vmap
+
+from edqn_jax.config import CameraConfig
+from edqn_jax.sim import coverage, raycast
+from edqn_jax.sim.coverage import Layers, materialised
+from edqn_jax.sim.raycast import Rays, Values
+from edqn_jax.sim.scene import Scene, UprightBoxes, UprightCylinders, no_shapes
+
+SLOTS = (0, 2, 4, 8)
+"""Shapes that the kinds of blocks have room for; fuller columns take one shape after another."""
+
+BLOCKS = 16
+"""Blocks that a batch is cut into."""
+
+SMALLEST_BLOCK = 128
+"""Columns that a block has at least: below, starting its operations costs more than what it saves."""
+
+WORD = 32
+"""Shapes whose presence one integer holds, a bit each."""
+
+@struct.dataclass
+class Frame:
+    """What all columns of a frame share."""
+
+    origin: Array  # [3] metres
+    heading: Array  # [2] cosine and sine
+    scene: Scene  # without the upright boxes and cylinders
+    value: Values
+    sky: Array  # []
+
+
+Finish = Callable[[Frame, Rays, Layers], Array]
+"""Blends the layers of [H, 1] pixels over what lies behind them."""
+
+
+def mapped(config: CameraConfig, finish: Finish) -> Callable[[Scene, Array, Array, Array], Array]:
+    """The camera for one frame, as a function of scene, origin [3], rotation [3, 3] and weights of RGB [3].
+
+    However it is mapped, all frames end up in one batch: only together can columns be sorted.
+    """
+
+    @custom_vmap
+    def many(scene: Scene, origin: Array, rotation: Array, weights: Array) -> Array:
+        return _pictures(config, finish, scene, origin, rotation, weights)
+
+    @many.def_vmap
+    def _(size: int, batched, *arguments):
+        whole = jax.tree.map(
+            lambda x, already: x if already else jnp.broadcast_to(x, (size, *x.shape)), arguments, tuple(batched)
+        )
+        frames = many(*jax.tree.map(lambda x: x.reshape(x.shape[0] * x.shape[1], *x.shape[2:]), whole))
+        return frames.reshape(size, -1, *frames.shape[1:]), True
+
+    return lambda *arguments: many(*jax.tree.map(lambda x: x[None], arguments))[0]
+
+
+def _pictures(
+    config: CameraConfig, finish: Finish, scene: Scene, origin: Array, rotation: Array, weights: Array
+) -> Array:
+    """Brightness [M, H, W]; every argument has a leading [M]."""
+    frames, tables = materialised(jax.vmap(partial(_frame, config))(scene, origin, rotation, weights))
+    words = jax.vmap(partial(_presence, config))(tables)
+    ways, way = _ways(config, frames, tables, words)
+
+    # Sorted by the way they need, in blocks of which each takes the way of its last, the fullest.
+    count, width = origin.shape[0], config.width
+    size = count * width
+    block = max(SMALLEST_BLOCK, -(-size // BLOCKS))
+    blocks = -(-size // block)
+    numbers = jnp.arange(size, dtype=jnp.int32)
+    order = jnp.sort(way * size + numbers) % size
+    padded = jnp.concatenate([order, jnp.broadcast_to(order[-1], (blocks * block - size,))])
+    drawn = lax.map(
+        lambda which: lax.switch(way[which[-1]], [partial(draw, config, finish) for draw in ways], which),
+        padded.reshape(blocks, block),
+    )
+    place = jnp.zeros(size, jnp.int32).at[order].set(numbers, unique_indices=True)
+    found = drawn.reshape(-1, config.height).at[place].get(mode="promise_in_bounds")
+    return materialised(found.reshape(count, width, config.height).swapaxes(1, 2))
+
+
+def _frame(
+    config: CameraConfig, scene: Scene, origin: Array, rotation: Array, weights: Array
+) -> tuple[Frame, Array]:
+    """One frame, and the table [N + 1, F] of its upright shapes."""
+    value = raycast.albedo_values(scene, weights)
+    forward_x, forward_y = rotation[0, 0], rotation[1, 0]
+    heading = jnp.stack([forward_x, forward_y]) * lax.rsqrt(jnp.maximum(forward_x**2 + forward_y**2, raycast.TINY))
+    rest = dataclasses.replace(scene, boxes=no_shapes(UprightBoxes), cylinders=no_shapes(UprightCylinders))
+    frame = Frame(
+        origin=origin, heading=heading, scene=rest, value=value, sky=jnp.sum(jnp.asarray(config.sky_rgb) * weights)
+    )
+    return frame, coverage.upright_table(config, scene, origin, heading, value)
+
+
+def _presence(config: CameraConfig, table: Array) -> Array:
+    """Which shapes of a frame's table cover each column, a bit each: [words, C]."""
+    u, pitch = raycast.columns_of(config)[None], raycast.pitch_of(config)
+    left, right = table[:-1, 0, None], table[:-1, 1, None]
+    covers = (jnp.minimum(u + pitch / 2, right) > jnp.maximum(u - pitch / 2, left)).astype(jnp.uint32)
+    shifts = jnp.arange(covers.shape[0], dtype=jnp.uint32) % WORD
+    bits = jnp.left_shift(covers, shifts[:, None])
+    words = [jnp.sum(bits[first : first + WORD], axis=0, dtype=jnp.uint32) for first in range(0, len(bits), WORD)]
+    return jnp.stack(words) if words else jnp.zeros((1, config.width), jnp.uint32)
+
+
+def _ways(
+    config: CameraConfig, frames: Frame, tables: Array, words: Array
+) -> tuple[list[Callable[[CameraConfig, Finish, Array], Array]], Array]:
+    """Ways to draw a block, each able to do what those before it can, and which of them columns need: [Q]."""
+    shapes, spheres = tables.shape[1] - 1, frames.scene.spheres.radius.shape[1]
+    room = [n for n in SLOTS if n < shapes] + ([shapes] if shapes <= SLOTS[-1] else [])
+    held = jnp.sum(lax.population_count(words), axis=1)
+    needed = jnp.sum(jnp.stack([held > n for n in room]), axis=0, dtype=jnp.int32)
+    draw = partial(_draw, frames, tables, words)
+    ways = [partial(draw, n, False) for n in room]
+    full = len(room)  # more than fit
+    if spheres:
+        ways.append(partial(draw, room[-1], True))
+        seen = jax.vmap(partial(coverage.spheres_in_columns, config))(frames.scene.spheres, frames.origin, frames.heading)
+        needed = jnp.where(needed == full, full + 1, jnp.where(seen, full, needed))
+    if shapes > room[-1]:
+        ways.append(partial(draw, None, True))
+    return ways, needed.reshape(-1)
+
+
+def _draw(
+    frames: Frame,
+    tables: Array,
+    words: Array,
+    slots: int | None,
+    spheres: bool,
+    config: CameraConfig,
+    finish: Finish,
+    which: Array,
+) -> Array:
+    """Brightness [B, H] of the columns numbered `which` [B].
+
+    Args:
+        slots: upright shapes that there is room for in each column; None has room for any number.
+        spheres: whether spheres can be seen.
+    """
+    number, column = which // config.width, which % config.width
+    frame = jax.tree.map(lambda x: x.at[number].get(mode="promise_in_bounds"), frames)
+    u = raycast.columns_of(config)[column]
+    held = [words[:, w].at[number, column].get(mode="promise_in_bounds") for w in range(words.shape[1])]
+    none = tables.shape[1] - 1
+    rows = tables.reshape(-1, tables.shape[-1])
+
+    def take(held: list[Array], count: int) -> tuple[list[Array], Array]:
+        picks = []
+        for _ in range(count):
+            pick, held = _take_one(held, none)
+            picks.append(pick)
+        index = jnp.stack(picks)
+        picked = rows.at[number[None] * (none + 1) + index].get(mode="promise_in_bounds")
+        boxes = frames.value.boxes.shape[1]
+        mixed = index >= boxes if boxes < none else None
+        return held, coverage.sides(config, picked, mixed, boxes, frame.heading, u)
+
+    def begin(frame: Frame, u: Array, depth: int) -> Layers:
+        layers = coverage.no_layers((config.height, 1), depth)
+        for surfaces in raycast.other_surfaces(config, frame.scene, frame.origin, _rays(config, frame, u, True), frame.value):
+            layers = coverage.counted_layers(surfaces, _rays(config, frame, u, True), layers)
+        if spheres:
+            layers = coverage.sphere_layers(config, frame.scene, frame.origin, _rays(config, frame, u), frame.value, layers)
+        return layers
+
+    def end(frame: Frame, u: Array, layers: Layers) -> Array:
+        return finish(frame, _rays(config, frame, u), layers)[:, 0]
+
+    others = sum(getattr(frames.value, kind).shape[1] for kind in ("tilted_boxes", "capsules", "tilted_cylinders"))
+    others += frames.value.spheres.shape[1] if spheres else 0
+    if slots is None:
+        layers = jax.vmap(lambda f, u: begin(f, u, coverage.DEPTH_OF_LAYERS))(frame, u)
+
+        def one_more(carry):
+            held, columns = take(carry[0], 1)
+            return held, jax.vmap(partial(coverage.insert_sides, config))(carry[1], columns)
+
+        _, layers = lax.while_loop(lambda carry: jnp.any(jnp.stack(carry[0]) != 0), one_more, (held, layers))
+        return jax.vmap(end)(frame, u, layers)
+
+    def one(frame: Frame, u: Array, columns: Array | None) -> Array:
+        layers = begin(frame, u, min(slots + others, coverage.DEPTH_OF_LAYERS))
+        if columns is not None:
+            layers = coverage.insert_sides(config, layers, columns)
+        return end(frame, u, layers)
+
+    return jax.vmap(one)(frame, u, take(held, slots)[1] if slots else None)
+
+
+def _rays(config: CameraConfig, frame: Frame, u: Array, many: bool = False) -> Rays:
+    """Rays of the column at `u` []: one a pixel, or as many as the configuration says."""
+    return raycast.column_rays(config, frame.heading, u, *((config.samples_across, config.samples_down) if many else (1, 1)))
+
+
+def _take_one(words: list[Array], none: int) -> tuple[Array, list[Array]]:
+    """The first shape [B] of each column (`none` where there is none), and `words` [B] without it."""
+    index, left, searching = jnp.full(words[0].shape, none), [], jnp.ones(words[0].shape, bool)
+    for first, word in zip(range(0, WORD * len(words), WORD), words, strict=True):
+        here = searching & (word != 0)
+        lowest = lax.population_count((word & (~word + 1)) - 1).astype(jnp.int32)
+        index = jnp.where(here, first + lowest, index)
+        left.append(jnp.where(here, word & (word - 1), word))
+        searching = searching & ~here
+    return index, left
