@@ -38,6 +38,7 @@ SMALLEST_BLOCK = 128
 WORD = 32
 """Shapes whose presence one integer holds, a bit each."""
 
+
 @struct.dataclass
 class Frame:
     """What all columns of a frame share."""
@@ -99,9 +100,7 @@ def _pictures(
     return materialised(found.reshape(count, width, config.height).swapaxes(1, 2))
 
 
-def _frame(
-    config: CameraConfig, scene: Scene, origin: Array, rotation: Array, weights: Array
-) -> tuple[Frame, Array]:
+def _frame(config: CameraConfig, scene: Scene, origin: Array, rotation: Array, weights: Array) -> tuple[Frame, Array]:
     """One frame, and the table [N + 1, F] of its upright shapes."""
     value = raycast.albedo_values(scene, weights)
     forward_x, forward_y = rotation[0, 0], rotation[1, 0]
@@ -137,7 +136,9 @@ def _ways(
     full = len(room)  # more than fit
     if spheres:
         ways.append(partial(draw, room[-1], True))
-        seen = jax.vmap(partial(coverage.spheres_in_columns, config))(frames.scene.spheres, frames.origin, frames.heading)
+        seen = jax.vmap(partial(coverage.spheres_in_columns, config))(
+            frames.scene.spheres, frames.origin, frames.heading
+        )
         needed = jnp.where(needed == full, full + 1, jnp.where(seen, full, needed))
     if shapes > room[-1]:
         ways.append(partial(draw, None, True))
@@ -180,10 +181,11 @@ def _draw(
 
     def begin(frame: Frame, u: Array, depth: int) -> Layers:
         layers = coverage.no_layers((config.height, 1), depth)
-        for surfaces in raycast.other_surfaces(config, frame.scene, frame.origin, _rays(config, frame, u, True), frame.value):
-            layers = coverage.counted_layers(surfaces, _rays(config, frame, u, True), layers)
+        many, rays = _rays(config, frame, u, config.samples_across, config.samples_down), _rays(config, frame, u)
+        for surfaces in raycast.other_surfaces(config, frame.scene, frame.origin, many, frame.value):
+            layers = coverage.counted_layers(surfaces, many, layers)
         if spheres:
-            layers = coverage.sphere_layers(config, frame.scene, frame.origin, _rays(config, frame, u), frame.value, layers)
+            layers = coverage.sphere_layers(config, frame.scene, frame.origin, rays, frame.value, layers)
         return layers
 
     def end(frame: Frame, u: Array, layers: Layers) -> Array:
@@ -210,9 +212,9 @@ def _draw(
     return jax.vmap(one)(frame, u, take(held, slots)[1] if slots else None)
 
 
-def _rays(config: CameraConfig, frame: Frame, u: Array, many: bool = False) -> Rays:
-    """Rays of the column at `u` []: one a pixel, or as many as the configuration says."""
-    return raycast.column_rays(config, frame.heading, u, *((config.samples_across, config.samples_down) if many else (1, 1)))
+def _rays(config: CameraConfig, frame: Frame, u: Array, across: int = 1, down: int = 1) -> Rays:
+    """Rays of the column at `u` []."""
+    return raycast.column_rays(config, frame.heading, u, across, down)
 
 
 def _take_one(words: list[Array], none: int) -> tuple[Array, list[Array]]:

@@ -122,7 +122,9 @@ def _extent_of_discs(position: Array, radius: Array, origin: Array, forward: Arr
 
     def edge(sign: float) -> Array:
         f, r = ahead * cosine - sign * right * sine, right * cosine + sign * ahead * sine
-        return jnp.where(f > NEAR_M * 1e-3, r / jnp.maximum(f, NEAR_M * 1e-3), sign * FAR_U)
+        # Above or below the disc itself there is no tangent, and it may be in any column.
+        ahead_of_eye = (f > NEAR_M * 1e-3) & (distance > radius)
+        return jnp.where(ahead_of_eye, r / jnp.maximum(f, NEAR_M * 1e-3), sign * FAR_U)
 
     behind = ahead + radius <= 0
     return jnp.where(behind, jnp.inf, edge(-1.0)), jnp.where(behind, -jnp.inf, edge(1.0))
@@ -229,7 +231,9 @@ def _cylinder_sides(
     return enter, s + reach, value * shade(config, nx, ny, jnp.zeros_like(nx)), lean
 
 
-def sides(config: CameraConfig, picked: Array, is_cylinder: Array | None, boxes: int, heading: Array, u: Array) -> Array:
+def sides(
+    config: CameraConfig, picked: Array, is_cylinder: Array | None, boxes: int, heading: Array, u: Array
+) -> Array:
     """What the pixels of columns must know of the shapes picked for them: [B, K, 11].
 
     Share of the column's width, bottom and top row of the side, lowest and highest of the cap, brightness of both
