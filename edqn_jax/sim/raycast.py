@@ -107,7 +107,7 @@ def column_rays(config: CameraConfig, heading: Array, u: Array, across: int = 1,
     """
     pitch = pitch_of(config)
     at = u + pitch * ((np.arange(across, dtype=np.float32) + 0.5) / across - 0.5)
-    return _level_rays(config, *heading, at, image_plane(config, across, down)[1], across, down)
+    return _level_rays(config, heading[0], heading[1], at, image_plane(config, across, down)[1], across, down)
 
 
 def _level_rays(config: CameraConfig, cos: Array, sin: Array, u, v, across: int, down: int) -> Rays:

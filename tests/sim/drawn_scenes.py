@@ -26,6 +26,8 @@ from edqn_jax.sim.scene import (
 VOLUME = np.array([[0.0, 0.0, 0.0], [60.0, 60.0, 25.0]])
 GROUND = Planes(position=np.zeros(3), normal=np.array([0.0, 0.0, 1.0]), albedo=np.array([0.37, 0.43, 0.35]))
 
+BROWN, BLUE = np.array([0.6, 0.5, 0.4]), np.array([0.2, 0.3, 0.7])
+
 
 def scene_of(*shapes: Shape, **capacities: int) -> Scene:
     return build_scene(shapes, volume=VOLUME, start=VOLUME[0], goal=VOLUME[1], capacities=capacities)
@@ -68,3 +70,15 @@ def free_points(scene: Scene, rng: np.random.Generator, count: int, clearance: f
     lower, upper = np.asarray(scene.volume)
     points = rng.uniform(lower + 1, upper - 1, (64 * count, 3)).astype(np.float32)
     return points[np.asarray(_distances(scene, jnp.asarray(points))) > clearance][:count]
+
+
+def box(x, y, z, hx, hy, hz, yaw=0.0):
+    return UprightBoxes(position=[x, y, z], half=[hx, hy, hz], yaw=yaw, albedo=BROWN)
+
+
+def pillar(x, y, z, radius, half_height):
+    return UprightCylinders(position=[x, y, z], radius=radius, half_height=half_height, albedo=BLUE)
+
+
+def ball(x, y, z, radius):
+    return Spheres(position=[x, y, z], radius=radius, albedo=BROWN)

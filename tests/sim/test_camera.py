@@ -24,7 +24,7 @@ from edqn_jax.sim.scene import (
     take_scene,
 )
 from tests.oracles import camera_plain
-from tests.sim.drawn_scenes import GROUND, every_kind, free_points, rotation_of, scene_of
+from tests.sim.drawn_scenes import GROUND, ball, box, every_kind, free_points, pillar, rotation_of, scene_of
 
 WINDOW_S = 0.04
 
@@ -200,21 +200,6 @@ def test_a_lone_silhouette_is_exact_to_a_hundredth(kind):
 def stack_scenes_of_one_capacity(scenes):
     """Unlike `stack_scenes` it keeps parked places."""
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *scenes)
-
-
-BROWN, BLUE = np.array([0.6, 0.5, 0.4]), np.array([0.2, 0.3, 0.7])
-
-
-def box(x, y, z, hx, hy, hz, yaw=0.0):
-    return UprightBoxes(position=[x, y, z], half=[hx, hy, hz], yaw=yaw, albedo=BROWN)
-
-
-def pillar(x, y, z, radius, half_height):
-    return UprightCylinders(position=[x, y, z], radius=radius, half_height=half_height, albedo=BLUE)
-
-
-def ball(x, y, z, radius):
-    return Spheres(position=[x, y, z], radius=radius, albedo=BROWN)
 
 
 ROOFS = [box(20, 20, 5, 6, 6, 5, 0.3), box(40, 20, 6, 3, 3, 6, 0.1)]

@@ -9,42 +9,29 @@ import pytest
 
 from edqn_jax.config import CameraConfig
 from edqn_jax.sim import camera, columns
-from edqn_jax.sim.scene import Spheres, UprightBoxes, UprightCylinders, stack_scenes, take_scene
+from edqn_jax.sim.scene import stack_scenes, take_scene
 from tests.oracles import camera_plain
-from tests.sim.drawn_scenes import GROUND, free_points, rotation_of, scene_of
+from tests.sim.drawn_scenes import GROUND, ball, box, free_points, pillar, rotation_of, scene_of
 
 CONFIG = CameraConfig(width=16, height=12)
-GREY = (0.5, 0.5, 0.5)
 ROUNDING = 2e-6
 """Ten times float32's own: compilers contract multiplications and additions differently in different programs."""
 
 
 def stairs(count):
     """Steps one behind the other, each a little higher: all of them in the same columns."""
-    return [
-        UprightBoxes(position=(8 + 1.5 * n, 20, 0.5 + 0.2 * n), half=(0.3, 6, 0.5 + 0.2 * n), yaw=0.0, albedo=GREY)
-        for n in range(count)
-    ]
+    return [box(8 + 1.5 * n, 20, 0.5 + 0.2 * n, 0.3, 6, 0.5 + 0.2 * n) for n in range(count)]
 
 
 def crowd(rng, boxes, cylinders, spheres):
     def places(count):
         return rng.uniform([10, 5, 2], [60, 55, 8], (count, 3))
 
-    def colour():
-        return rng.uniform(0.2, 0.9, 3)
-
     return scene_of(
         GROUND,
-        *(
-            UprightBoxes(position=p, half=rng.uniform(0.5, 3, 3), yaw=rng.uniform(-3, 3), albedo=colour())
-            for p in places(boxes)
-        ),
-        *(
-            UprightCylinders(position=p, radius=rng.uniform(0.3, 2), half_height=rng.uniform(1, 5), albedo=GREY)
-            for p in places(cylinders)
-        ),
-        *(Spheres(position=p, radius=rng.uniform(0.5, 2), albedo=GREY) for p in places(spheres)),
+        *(box(x, y, z, 2.0, 1.0, z, yaw) for yaw, (x, y, z) in enumerate(places(boxes))),
+        *(pillar(x, y, z, 0.8, z) for x, y, z in places(cylinders)),
+        *(ball(x, y, z, 1.5) for x, y, z in places(spheres)),
     )
 
 
