@@ -171,8 +171,10 @@ class EncoderConfig:
     """Sinusoid pairs of the temporal embedding; phi(t) has 1 + 2 x this many channels."""
     hidden: int = 128
     """Width of the ReLU layer between pooled features and code."""
-    decoder_hidden: tuple[int, ...] = (128, 256)
+    decoder_hidden: tuple[int, ...] = (128, 128)
     """Widths of the decoder's ReLU layers."""
+    decoder_bandwidth: float = 0.5
+    """Share of the image's standing waves, along each axis, that the decoder draws; 1 draws every pixel apart."""
     target_blur: int = 2
     """Times that the decoder's target is blurred by a binomial of three pixels; 0 is the sharp event image."""
     kl_weight: float = 0.05

@@ -93,6 +93,8 @@ def _encoder(encoder: EncoderConfig) -> None:
     _not_negative(encoder, "encoder", ["time_frequencies", "target_blur", "kl_weight", "warmup_decisions"])
     _positive(encoder, "encoder", ["warmup_updates_per_step"])
     _widths(encoder.decoder_hidden, "encoder.decoder_hidden")
+    share = encoder.decoder_bandwidth
+    _require(0 < share <= 1, "encoder.decoder_bandwidth", "more than 0 and at most 1", share)
 
 
 def _agent(agent: AgentConfig) -> None:

@@ -74,7 +74,9 @@ def _draw_what_it_sees(
         list(rows[:, -1] * config.drone.physics_dt_s),
     )
     wanted = encoder.target(config.encoder, fields)
-    made = encoder.decode(config.encoder, params.encoder, encoder.embed(config.encoder, params.encoder, fields))
+    made = encoder.decode(
+        config.encoder, config.camera, params.encoder, encoder.embed(config.encoder, params.encoder, fields)
+    )
     # ON and OFF together, as events per pixel again.
     seen, remembered = (np.expm1(np.asarray(x)).sum(-3) for x in (wanted, made))
     draw_reconstruction(seen, remembered, run.figures / "reconstruction.png")

@@ -21,7 +21,7 @@ from edqn_jax.config import Config, EnvConfig
 from edqn_jax.sim import camera, drone, events
 from edqn_jax.sim.drone import Airframe, DroneState, Flight
 from edqn_jax.sim.events import EventField, EventMemory
-from edqn_jax.sim.scene import Scene, scene_at, segment_contact, take_scene
+from edqn_jax.sim.scene import Scene, path_contact, scene_at, take_scene
 from edqn_jax.sim.worlds import Missions
 
 ACTIONS = np.stack(np.meshgrid(*[[-1, 0, 1]] * 3, indexing="ij"), -1).reshape(27, 3)
@@ -136,9 +136,7 @@ def judge(config: Config, scene: Scene, goal: Array, before: Array, flight: Flig
     """
     n = flight.position.shape[0]
     path = jnp.concatenate([before[None], flight.position])
-    touch, contact = jax.vmap(lambda a, b: segment_contact(scene, a, b, config.drone.body_radius_m))(
-        path[:-1], path[1:]
-    )
+    touch, contact = path_contact(scene, path, config.drone.body_radius_m)
     at = flight.position
     apart = at - goal[None]
     arrived = jnp.sum(apart * apart, axis=1) < config.env.goal_radius_m**2

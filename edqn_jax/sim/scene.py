@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 import numpy.typing as npt
 from flax import struct
-from jax import Array
+from jax import Array, lax
 from jax.typing import ArrayLike
 
 PARKED = 1e6
@@ -199,6 +199,35 @@ def segment_contact(scene: Scene, start: Array, end: Array, radius: ArrayLike, s
     entered = (gap[:-1] > 0) & (gap[1:] <= 0)
     fraction = jnp.min(jnp.where(entered, crossing, 1.0))
     return jnp.any(gap <= 0), jnp.where(gap[0] <= 0, 0.0, jnp.clip(fraction, 0.0, 1.0))
+
+
+def path_contact(scene: Scene, path: Array, radius: ArrayLike) -> tuple[Array, Array]:
+    """`segment_contact` of each segment of a path up to the first that touches.
+
+    One distance at each point proves most segments free (d0 + d1 > L + 2 r); the others are searched one by one,
+    so that the usual path costs an eighth.
+
+    Args:
+        path: [n + 1, 3] metres.
+        radius: metres.
+
+    Returns:
+        touch: [n] bool, True for the first segment that touches alone. fraction: [n], 1 where nothing touches.
+    """
+    gap = jax.vmap(lambda point: signed_distance(scene, point))(path) - radius
+    length = jnp.sqrt(jnp.sum((path[1:] - path[:-1]) ** 2, axis=1))
+    near = ~(gap[:-1] + gap[1:] > length)  # a path that is not finite is near everything
+    number = jnp.arange(length.shape[0])
+
+    def search(carry: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+        near, touch, fraction = carry
+        first = jnp.argmax(near)
+        touches, at = segment_contact(scene, path[first], path[first + 1], radius)
+        here = number == first
+        return near & ~here & ~touches, touch | (here & touches), jnp.where(here, at, fraction)
+
+    nothing = (near, jnp.zeros_like(near), jnp.ones_like(length))
+    return lax.while_loop(lambda carry: jnp.any(carry[0]), search, nothing)[1:]
 
 
 def _norm(*components: Array) -> Array:

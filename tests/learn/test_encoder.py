@@ -109,15 +109,15 @@ def test_a_batch_is_encoded_as_its_fields_are_one_by_one():
     assert whole.shape == (4, CONFIG.code_size)
     np.testing.assert_allclose(whole, mapped, rtol=1e-4, atol=1e-4)
     np.testing.assert_allclose(whole, jnp.stack(single), rtol=1e-4, atol=1e-4)
-    assert en.decode(CONFIG, params, whole).shape == (4, 2, SMALL.height, SMALL.width)
+    assert en.decode(CONFIG, SMALL, params, whole).shape == (4, 2, SMALL.height, SMALL.width)
 
 
 @pytest.mark.slow
 def test_the_untrained_decoder_is_linear_in_the_code():
     params = fresh(CONFIG, CAMERA, jax.random.key(0))
     a, b = jax.random.normal(jax.random.key(1), (2, CONFIG.code_size))
-    both = en.decode(CONFIG, params, a + b)
-    apart = en.decode(CONFIG, params, a) + en.decode(CONFIG, params, b)
+    both = en.decode(CONFIG, CAMERA, params, a + b)
+    apart = en.decode(CONFIG, CAMERA, params, a) + en.decode(CONFIG, CAMERA, params, b)
     np.testing.assert_allclose(both, apart, atol=1e-5)  # float32 sums of order 1
     assert np.abs(both).max() > 0.003
 
@@ -151,6 +151,19 @@ def test_the_loss_is_reconstruction_plus_weighted_kl():
     (loss, losses), _ = LOSS_AND_GRADIENT(config, params, batch, jax.random.key(0))
     np.testing.assert_allclose(loss, losses.reconstruction + 0.3 * losses.kl, rtol=1e-6)
     assert float(losses.kl) > 0.0 and float(losses.reconstruction) > 0.0
+
+
+@pytest.mark.parametrize("bandwidth", [0.5, 1.0])
+def test_the_error_over_waves_is_the_error_over_pixels(bandwidth):
+    config = dataclasses.replace(CONFIG, decoder_bandwidth=bandwidth)
+    params = fresh(config, SMALL, jax.random.key(0))
+    field = ragged_field(1)
+    _, losses = en.vae_loss(config, params, field, jax.random.key(2))
+    mean, log_variance = en.encode(config, params, field)
+    noise = jnp.exp(0.5 * log_variance) * jax.random.normal(jax.random.key(2), mean.shape)
+    image = en.decode(config, SMALL, params, mean + noise)
+    expected = jnp.sum(jnp.square(image - en.target(config, field)))
+    np.testing.assert_allclose(losses.reconstruction, expected, rtol=1e-5)
 
 
 def test_the_target_keeps_polarities_apart_and_compresses_counts():
@@ -192,7 +205,7 @@ def trained():
 
 @jax.jit
 def error_of(params, field):
-    image = en.decode(CONFIG, params, en.embed(CONFIG, params, field))
+    image = en.decode(CONFIG, CAMERA, params, en.embed(CONFIG, params, field))
     return jnp.mean(jnp.sum(jnp.square(image - en.target(CONFIG, field)), axis=(-3, -2, -1)))
 
 

@@ -25,6 +25,7 @@ from edqn_jax.sim.scene import (
     build_scene,
     obstacle_count,
     parked_shape,
+    path_contact,
     scene_shapes,
     segment_contact,
     shape_distances,
@@ -201,3 +202,20 @@ def test_a_segment_that_begins_in_contact_touches_at_once():
     ball = scene_of(Spheres(position=[5, 5, 5], radius=1, albedo=GREY))
     touch, fraction = segment_contact(ball, jnp.array([5.0, 5.0, 5.5]), jnp.array([5.0, 5.0, 9.0]), 0.36)
     assert touch and fraction == 0.0
+
+
+def test_a_path_is_searched_no_less_than_its_segments(world):
+    rng = np.random.default_rng(6)
+    begin = rng.uniform(-10, 10, (3000, 1, 3))
+    steps = rng.normal(size=(3000, 1, 3)) * 0.06 + rng.normal(size=(3000, 13, 3)) * 0.03
+    paths = jnp.asarray(np.concatenate([begin, begin + np.cumsum(steps, axis=1)], axis=1), jnp.float32)
+    touch, fraction = jax.jit(jax.vmap(lambda path: path_contact(world.scene, path, 0.36)))(paths)
+    segments = jax.vmap(lambda a, b: segment_contact(world.scene, a, b, 0.36))
+    each, at = jax.jit(jax.vmap(segments))(paths[:, :-1], paths[:, 1:])
+    some, first = np.asarray(each).any(axis=1), np.argmax(each, axis=1)
+    # Enough of both kinds, and contacts in the middle of a path.
+    assert 100 < some.sum() < 2900 and ((first > 0) & some).sum() > 50
+    np.testing.assert_array_equal(np.asarray(touch).any(axis=1), some)
+    rows = np.flatnonzero(some)
+    np.testing.assert_array_equal(np.argmax(touch, axis=1)[rows], first[rows])
+    np.testing.assert_allclose(np.asarray(fraction)[rows, first[rows]], np.asarray(at)[rows, first[rows]], atol=1e-5)
