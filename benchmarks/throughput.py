@@ -35,7 +35,7 @@ from mujoco import rollout
 
 from edqn_jax.cli import parse_train
 from edqn_jax.config import Config, ConfigError
-from edqn_jax.devices import choose_devices, cores, processor, use_cpu_devices
+from edqn_jax.devices import choose_devices, compiler_options, cores, processor, use_cpu_devices
 from edqn_jax.files import check_can_write, write_whole
 from edqn_jax.learn import dqn, encoder, qnetwork, replay, trainer
 from edqn_jax.learn.trainer import AXIS, Trainer, TrainState
@@ -285,7 +285,9 @@ class Timed:
 
         specs = (*part.specs, PartitionSpec())
         spread = jax.shard_map(scan, mesh=mesh, in_specs=specs, out_specs=part.specs[1], check_vma=False)
-        self.run = jax.jit(spread).lower(*self.inputs, jnp.int32(1)).compile()
+        self.run = (
+            jax.jit(spread).lower(*self.inputs, jnp.int32(1)).compile(compiler_options(mesh.devices.flat[0].platform))
+        )
         self.turns = 1
         first = min(self._seconds() for _ in range(2))
         self.turns = max(1, round(TURN_SECONDS / first))

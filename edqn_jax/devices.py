@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import os
 import platform
 from pathlib import Path
@@ -24,6 +25,21 @@ def use_cpu_devices(count: int | None = None) -> None:
         # Its new partitioner crashes on arrays without elements, which a scene without capsules has, where
         # `shard_map` and a loop meet. The old one does not.
         jax.config.update("jax_use_shardy_partitioner", False)
+
+
+@functools.cache
+def compiler_options(platform: str) -> dict[str, str]:
+    """What programs of ours are compiled with on a platform, beyond its defaults; for `jax.jit` and `compile`.
+
+    On CPUs XLA hands sums of products to a library that is made for large ones: one sum of 6 x 6 numbers in a
+    physics step then takes longer than the rest of the step. Matrix products stay with the library.
+    """
+    options = {"xla_cpu_experimental_ynn_fusion_type": "LIBRARY_FUSION_TYPE_DOT"} if platform == "cpu" else {}
+    try:
+        jax.jit(lambda: 0, compiler_options=options).lower().compile()
+    except (jax.errors.JaxRuntimeError, ValueError):  # another XLA, which has no such option
+        return {}
+    return options
 
 
 def cores() -> int:

@@ -50,3 +50,14 @@ def test_only_jax_0_11_is_told_to_use_the_old_partitioner(version, partitioner, 
     monkeypatch.setattr(devices, "jax", types.SimpleNamespace(config=config, __version_info__=version))
     use_cpu_devices(3)
     assert told == {"jax_num_cpu_devices": 3, **partitioner}
+
+
+def test_an_option_that_xla_does_not_know_is_left_out(monkeypatch):
+    devices.compiler_options.cache_clear()
+    assert devices.compiler_options("cpu") and not devices.compiler_options("tpu")
+    jit = jax.jit
+    misspelt = {"xla_cpu_of_another_century": "1"}
+    monkeypatch.setattr(jax, "jit", lambda f, compiler_options: jit(f, compiler_options=compiler_options and misspelt))
+    devices.compiler_options.cache_clear()
+    assert devices.compiler_options("cpu") == {}
+    devices.compiler_options.cache_clear()

@@ -24,6 +24,7 @@ from jax import Array, lax
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from edqn_jax.config import Config, ConfigError
+from edqn_jax.devices import compiler_options
 from edqn_jax.learn import dqn, encoder, qnetwork, replay
 from edqn_jax.learn.policy import PolicyParams, empty_memory, flatten, observation_size, remember
 from edqn_jax.learn.qnetwork import Params
@@ -396,7 +397,8 @@ class Trainer:
             check_vma=False,
         )
         jitted = jax.jit(run, donate_argnums=1)
-        self._chunk = jitted.lower(self.world, state, self._steps(0)).compile()
+        options = compiler_options(self.mesh.devices.flat[0].platform)
+        self._chunk = jitted.lower(self.world, state, self._steps(0)).compile(options)
 
     def _steps(self, first: int) -> Array:
         numbers = np.arange(first, first + self.config.train.chunk_steps, dtype=np.int32)
