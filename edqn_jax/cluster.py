@@ -91,5 +91,5 @@ def replicate(tree: Any, mesh: Mesh) -> Any:
 
 
 def fetch(tree: Tree) -> Tree:
-    """The whole of each array, on the host of every process; every process must call this."""
+    """The whole of each array of a mesh of all processes, on each one's host; every process must call this."""
     return multihost_utils.process_allgather(tree, tiled=True)
