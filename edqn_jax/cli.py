@@ -54,15 +54,14 @@ class TrainOptions:
     """What to do with an unfinished run in --run-dir. It cannot be continued yet: `auto` and `must` refuse it with a
     sentence, `never` starts it over."""
     distributed: Distributed = "auto"
-    """Train one policy in several processes, on one host or many? `auto` does where --coordinator-address is given or
-    Slurm's srun has started several tasks, `must` wherever JAX finds a cluster (Slurm, Open MPI, Kubernetes), `never`
-    not."""
+    """Whether to train together with other processes, on one host or many: `auto` where --coordinator-address is given
+    or Slurm's srun has started several tasks, `must` in any cluster that JAX finds, `never` not at all."""
     coordinator_address: Annotated[str | None, arg(metavar="HOST:PORT", help_behavior_hint="")] = None
-    """Where process 0 listens for the others; goes with the next two, and is given to every process."""
+    """Where process 0 listens for the others. Every process is given this and the next two."""
     num_processes: Annotated[int | None, arg(metavar="N", help_behavior_hint="")] = None
     """How many processes train together."""
     process_id: Annotated[int | None, arg(metavar="I", help_behavior_hint="")] = None
-    """Number of this process, from 0, which writes the run directory."""
+    """Number of this process; process 0 writes the run directory."""
 
 
 @dataclass(frozen=True)

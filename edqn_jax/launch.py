@@ -43,6 +43,8 @@ def how_to_join(
     if coordinator_address is not None and num_processes is not None and process_id is not None:
         if not coordinator_address.rpartition(":")[2].isdecimal():
             raise ConfigError(f"--coordinator-address must be HOST:PORT, not '{coordinator_address}'")
+        if num_processes < 1:
+            raise ConfigError(f"--num-processes must be at least 1, not {num_processes}")
         if not 0 <= process_id < num_processes:
             raise ConfigError(
                 f"--process-id must be from 0 to {num_processes - 1}, one less than --num-processes, not {process_id}"

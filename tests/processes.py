@@ -1,4 +1,4 @@
-"""Two processes on this machine that train together over loopback."""
+"""Processes on this machine that train together over loopback, or one alone."""
 
 from __future__ import annotations
 
@@ -10,16 +10,18 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from edqn_jax.config import Config
-from edqn_jax.resolve import to_yaml
-
 ROOT = Path(__file__).parents[1]
 
-PATIENCE_S = 600
+PATIENCE_S = 1200
 """What hangs for longer has failed."""
 
 LAUNCHERS = ("JAX_", "SLURM_", "OMPI_", "KUBERNETES_")
 """Beginnings of the variables that would tell a process that it is one of several."""
+
+FEWER_PASSES = "--xla_backend_optimization_level=0"
+"""Half the time to compile; what is computed once need not be fast."""
+
+Process = subprocess.Popen[str]
 
 Launcher = Callable[[int, int], tuple[list[str], dict[str, str]]]
 
@@ -43,41 +45,53 @@ def by_srun(port: int, number: int) -> tuple[list[str], dict[str, str]]:
 
 
 @contextmanager
-def two_processes(folder: Path, argv: list[str], launcher: Launcher = by_hand) -> Iterator[list[subprocess.Popen[str]]]:
-    """`tests/cluster_process.py` twice, in `folder`; whatever happens, neither outlives the block."""
+def two_processes(folder: Path, argv: list[str], launcher: Launcher = by_hand) -> Iterator[list[Process]]:
+    """`tests/cluster_process.py` twice, in `folder`, a device each; whatever happens, neither outlives the block.
+
+    Their notes are `note-0.json` and `note-1.json`.
+    """
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
-    alone = {name: value for name, value in os.environ.items() if not name.startswith(LAUNCHERS)}
     processes = []
     try:
         for number in range(2):
             flags, variables = launcher(port, number)
-            processes.append(
-                subprocess.Popen(
-                    [sys.executable, "-m", "tests.cluster_process", f"note-{number}.json", *argv, *flags],
-                    cwd=folder,
-                    env={**alone, "PYTHONPATH": str(ROOT), **variables},
-                    stdout=subprocess.PIPE,
-                    stderr=subprocess.STDOUT,
-                    text=True,
-                )
-            )
+            processes.append(_start(folder, [f"note-{number}.json", "1", *argv, *flags], variables))
         yield processes
     finally:
-        for process in processes:
-            process.kill()
-            process.communicate()
+        _end(processes)
 
 
-def to_the_end(processes: list[subprocess.Popen[str]]) -> list[tuple[int, str]]:
+@contextmanager
+def one_process(folder: Path, argv: list[str]) -> Iterator[Process]:
+    """`tests/cluster_process.py` alone, in `folder`, with two devices; its note is `note.json`."""
+    process = _start(folder, ["note.json", "2", *argv], {})
+    try:
+        yield process
+    finally:
+        _end([process])
+
+
+def to_the_end(*processes: Process) -> list[tuple[int, str]]:
     """Exit code and output of each."""
     outputs = [process.communicate(timeout=PATIENCE_S)[0] for process in processes]
     return [(process.returncode, output) for process, output in zip(processes, outputs, strict=True)]
 
 
-def arguments_for(config: Config, folder: Path) -> list[str]:
-    """Arguments of `edqn train` for this configuration, which is left in a file in `folder`."""
-    file = folder / "knobs.yaml"
-    file.write_text(to_yaml(config), encoding="utf-8")
-    return ["--config", str(file)]
+def _start(folder: Path, argv: list[str], variables: dict[str, str]) -> Process:
+    alone = {name: value for name, value in os.environ.items() if not name.startswith(LAUNCHERS)}
+    return subprocess.Popen(
+        [sys.executable, "-m", "tests.cluster_process", *argv],
+        cwd=folder,
+        env={**alone, "PYTHONPATH": str(ROOT), "XLA_FLAGS": FEWER_PASSES, **variables},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+    )
+
+
+def _end(processes: list[Process]) -> None:
+    for process in processes:
+        process.kill()
+        process.communicate()

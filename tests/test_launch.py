@@ -50,6 +50,7 @@ def test_flags_say_it_all_by_hand(address: str) -> None:
         ("must", {"num_processes": 2, "process_id": 0}, "go together; --coordinator-address is missing"),
         ("auto", {**BY_HAND, "coordinator_address": "node1"}, "must be HOST:PORT, not 'node1'"),
         ("auto", {**BY_HAND, "coordinator_address": "node1:http"}, "must be HOST:PORT, not 'node1:http'"),
+        ("auto", {**BY_HAND, "num_processes": 0}, "--num-processes must be at least 1, not 0"),
         ("auto", {**BY_HAND, "process_id": 2}, "--process-id must be from 0 to 1, .* not 2"),
         ("auto", {**BY_HAND, "process_id": -1}, "--process-id must be from 0 to 1, .* not -1"),
     ],
