@@ -22,7 +22,6 @@ from edqn_jax.report.progress import Progress
 from edqn_jax.run import Candidate, choose, first_success, train_run
 from edqn_jax.rundir import TRAJECTORY_COLUMNS, RunDirectory, plain
 from tests.learn.test_trainer import CONFIG as SMALL
-from tests.processes import arguments_for, to_the_end, two_processes
 
 CONFIG = dataclasses.replace(
     SMALL,
@@ -57,38 +56,6 @@ def test_a_run_leaves_what_the_readme_promises(whole: tuple[RunDirectory, dict])
     assert (summary["parameters_from_decisions"], summary["validation_spl"]) == (chosen, best)
     config, _ = load_run(run.path)
     assert config == CONFIG
-
-
-@pytest.mark.slow
-def test_two_processes_train_the_policy_that_one_process_trains_on_two_devices(
-    whole: tuple[RunDirectory, dict], tmp_path: Path
-) -> None:
-    with two_processes(tmp_path, arguments_for(CONFIG, tmp_path)) as processes:
-        for code, output in to_the_end(processes):
-            assert code == 0, output
-    notes = [json.loads((tmp_path / f"note-{number}.json").read_text()) for number in range(2)]
-    # The shards, and the environments in them, are shared out: none is flown twice.
-    assert [note["local_devices"] for note in notes] == [1, 1]
-    assert [note["shards"] for note in notes] == [[[0, 1, 2, 3]], [[4, 5, 6, 7]]]
-    assert [note["environments"] for note in notes] == [CONFIG.train.num_envs // 2] * 2
-    # Both end with one train state, to the last bit, and with the same flights.
-    first, second = (note["summary"] for note in notes)
-    assert first["state_digest"] == second["state_digest"]
-    assert first["devices"] == second["devices"] and len(set(first["devices"])) == 2
-    assert _without_times(first) == _without_times(second)
-    # One folder, by the first process.
-    (folder,) = (tmp_path / "runs").iterdir()
-    run = RunDirectory(folder)
-    assert json.loads(run.summary_file.read_text()) == first
-    assert [row["decisions"] for row in run.read_metrics()] == list(range(64, 513, 64))
-    assert len(run.read_episodes()["step"]) == first["episodes"]
-    # What they learnt is what one process learns.
-    for together, alone in zip(*(jax.tree.leaves(load_run(path)[1]) for path in (folder, whole[0].path)), strict=True):
-        np.testing.assert_allclose(together, alone, atol=1e-5)
-
-
-def _without_times(summary: dict) -> dict:
-    return {name: value for name, value in summary.items() if not name.endswith("seconds") and "per_second" not in name}
 
 
 @pytest.mark.slow
