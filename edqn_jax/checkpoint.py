@@ -25,10 +25,16 @@ COMMIT_MARKER = "commit_success.txt"
 def save_policy(folder: Path, params: PolicyParams) -> None:
     """Writes the policy into `folder`, a run's `checkpoints/`; one that is there already is replaced.
 
-    The arrays are saved from the host: how many devices they lay on leaves no trace.
+    The arrays are saved from the host: how many devices they lay on leaves no trace. The calling process saves
+    alone, whether it is one of several or not.
     """
     tree = jax.tree.map(np.asarray, {"encoder": params.encoder, "q": params.q})
-    ocp.PyTreeCheckpointer().save((folder / POLICY).absolute(), tree, force=True)
+    here = jax.process_index()
+    # Or Orbax would wait for the other processes.
+    alone = ocp.options.MultiprocessingOptions(primary_host=here, active_processes={here})
+    handler = ocp.PyTreeCheckpointHandler(multiprocessing_options=alone)
+    saver = ocp.Checkpointer(handler, multiprocessing_options=alone)
+    saver.save((folder / POLICY).absolute(), args=ocp.args.PyTreeSave(tree), force=True)
 
 
 def load_policy(folder: Path) -> PolicyParams:

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import tyro
+from rich.console import Console
 from tyro.conf import Positional, arg
 
 from edqn_jax.config import DENSITIES, Config, ConfigError
@@ -24,6 +25,7 @@ from edqn_jax.endings import (
     StoppedError,
     listening_for_sigterm,
 )
+from edqn_jax.launch import Distributed, how_to_join
 from edqn_jax.resolve import resolve
 from edqn_jax.rundir import Resume, plan_run_directory
 from edqn_jax.validate import validate
@@ -51,6 +53,15 @@ class TrainOptions:
     resume: Resume = "auto"
     """What to do with an unfinished run in --run-dir. It cannot be continued yet: `auto` and `must` refuse it with a
     sentence, `never` starts it over."""
+    distributed: Distributed = "auto"
+    """Whether to train together with other processes, on one host or many: `auto` where --coordinator-address is given
+    or Slurm's srun has started several tasks, `must` in any cluster that JAX finds, `never` not at all."""
+    coordinator_address: Annotated[str | None, arg(metavar="HOST:PORT", help_behavior_hint="")] = None
+    """Where process 0 listens for the others. Every process is given this and the next two."""
+    num_processes: Annotated[int | None, arg(metavar="N", help_behavior_hint="")] = None
+    """How many processes train together."""
+    process_id: Annotated[int | None, arg(metavar="I", help_behavior_hint="")] = None
+    """Number of this process; process 0 writes the run directory."""
 
 
 @dataclass(frozen=True)
@@ -143,14 +154,22 @@ def _parse_knobs(argv: Sequence[str], base: Config) -> Config:
 
 def _train(argv: Sequence[str]) -> int:
     options, config = parse_train(argv)
-    run = plan_run_directory(options.run_dir, config, options.resume)
+    several = options.coordinator_address, options.num_processes, options.process_id
+    arguments = how_to_join(options.distributed, *several, os.environ)
 
+    from edqn_jax import cluster
     from edqn_jax.devices import cores, most_that_divide, use_cpu_devices
     from edqn_jax.report.progress import Progress
     from edqn_jax.run import train_run
 
     use_cpu_devices(config.train.devices or most_that_divide(config.train.shards, cores()))
-    progress = Progress()
+    process = 0
+    if arguments is not None:
+        print("edqn: waiting for the other processes, five minutes at most", file=sys.stderr)
+        process = cluster.join(arguments)
+    writes = process == 0
+    run = cluster.together(lambda: plan_run_directory(options.run_dir, config, options.resume) if writes else None)
+    progress = Progress(Console(quiet=not writes))
     with listening_for_sigterm() as stop_requested:
         try:
             train_run(config, run, progress, stop_requested)

@@ -58,18 +58,25 @@ def processor() -> str:
 
 
 def choose_devices(requested: int, shards: int) -> list[jax.Device]:  # pyright: ignore[reportInvalidTypeForm]
-    """The devices that a run spreads over; JAX's default kind, so GPUs where there are any.
+    """The devices that a run spreads over, of all processes alike; JAX's default kind, so GPUs where there are any.
 
     Args:
         requested: how many; 0 is as many as divide the shards.
         shards: logical shards of environments and replay.
 
+    Returns:
+        the devices, those of process 0 first; every process has equally many of them.
+
     Raises:
-        ConfigError: if there are fewer than requested, or their number does not divide the shards.
+        ConfigError: if there are fewer than requested, or their number does not divide the shards, or the processes
+            cannot share them.
     """
     found = jax.devices()
+    processes = jax.process_count()
+    if shards % processes:
+        raise ConfigError(f"train.shards must be a multiple of the {processes} processes, not {shards}")
     if requested == 0:
-        return found[: most_that_divide(shards, len(found))]
+        requested = processes * most_that_divide(shards // processes, len(found) // processes)
     if requested > len(found):
         kind = found[0].platform.upper()
         raise ConfigError(
@@ -77,7 +84,10 @@ def choose_devices(requested: int, shards: int) -> list[jax.Device]:  # pyright:
         )
     if shards % requested:
         raise ConfigError(f"train.devices must be a divisor of train.shards ({shards}), not {requested}")
-    return found[:requested]
+    if requested % processes:
+        raise ConfigError(f"train.devices must be a multiple of the {processes} processes, not {requested}")
+    each = requested // processes
+    return [d for process in range(processes) for d in jax.local_devices(process)[:each]]
 
 
 def most_that_divide(shards: int, available: int) -> int:

@@ -2,6 +2,8 @@
 
 Run a chunk; fetch a handful of numbers; log, validate, save, draw progress; again. At the end the greedy
 policy flies the mission, and the pictures are drawn.
+
+Of several processes each runs this loop, on the same numbers; all fly, and one writes.
 """
 
 from __future__ import annotations
@@ -17,8 +19,9 @@ from typing import Any, Literal
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.sharding import Mesh, NamedSharding, PartitionSpec
+from jax.sharding import Mesh
 
+from edqn_jax import cluster
 from edqn_jax.baselines.astar import Path as ShortestPath
 from edqn_jax.baselines.astar import shortest_path
 from edqn_jax.checkpoint import save_policy
@@ -124,8 +127,8 @@ def choose(keep: Literal["best", "last"], kept: Candidate, latest: Candidate) ->
 class _Log:
     """What the host keeps of a run while it goes on."""
 
-    def __init__(self, config: Config, run: RunDirectory, progress: Progress) -> None:
-        self.config, self.run, self.progress = config, run, progress
+    def __init__(self, config: Config, run: RunDirectory | None) -> None:
+        self.config, self.run = config, run
         self.episodes = 0
         self.validations: list[tuple[int, float, float]] = []  # decisions, seconds, success rate
 
@@ -137,10 +140,11 @@ class _Log:
         )
         rows, columns = np.nonzero(outcome)
         kinds = outcome[rows, columns]
-        self.run.append_episodes(
-            (int((first + r + 1) * envs), float(gain[r, c]), int(length[r, c]), str(Outcome(int(k)).name.lower()))
-            for r, c, k in zip(rows, columns, kinds, strict=True)
-        )
+        if self.run is not None:
+            self.run.append_episodes(
+                (int((first + r + 1) * envs), float(gain[r, c]), int(length[r, c]), str(Outcome(int(k)).name.lower()))
+                for r, c, k in zip(rows, columns, kinds, strict=True)
+            )
         self.episodes += len(rows)
         plan = Plan.of(self.config)
         steps = len(outcome)
@@ -186,9 +190,15 @@ def _mean(values: Any) -> float | None:
 
 
 def train_run(
-    config: Config, run: RunDirectory, progress: Progress, stop_requested: Callable[[], bool]
+    config: Config, run: RunDirectory | None, progress: Progress, stop_requested: Callable[[], bool]
 ) -> dict[str, Any]:
     """Train, validate, fly, draw; everything lands in the run directory.
+
+    Args:
+        config: the same on every process.
+        run: None on a process that writes nothing, which is every one but the first of those that train together.
+        progress: where it is shown.
+        stop_requested: asked after each chunk; one process's yes stops all of them.
 
     Returns:
         what `summary.json` holds.
@@ -199,18 +209,18 @@ def train_run(
         StoppedError: after saving the policy, if `stop_requested()` turned true.
     """
     began = time.perf_counter()
-    courses = lay_courses(config)
     devices = choose_devices(config.train.devices, config.train.shards)
+    courses = cluster.together(lambda: lay_courses(config))  # a world's file may be missing on one host
     trainer = Trainer(config, courses.training, devices)
-    run.create(config)
-    progress.message(f"{config.world.name} world, {len(devices)} {devices[0].platform} devices; compiling")
+    cluster.together(lambda: None if run is None else run.create(config))
+    progress.message(f"{config.world.name} world, {_described(devices)}; compiling")
     state = trainer.init(config.train.seed)
     compiling = time.perf_counter()
     trainer.compile(state)
     compile_seconds = time.perf_counter() - compiling
 
     plan, envs, chunk = trainer.plan, config.train.num_envs, config.train.chunk_steps
-    log = _Log(config, run, progress)
+    log = _Log(config, run)
     kept = Candidate(jax.tree.map(np.asarray, policy_of(state)))
     mesh = Mesh(np.asarray(devices), ("mission",))
     progress.start(plan.total * envs)
@@ -222,7 +232,7 @@ def train_run(
         losses = jax.tree.map(np.asarray, losses)
         seconds = time.perf_counter() - started
         train_seconds += seconds
-        metrics = log.chunk(done, episodes, losses, seconds)
+        metrics = log.chunk(done, cluster.fetch(episodes), losses, seconds)
         done += chunk
         _check_finite(plan, done, losses)
         finished = done >= plan.total or 0 < config.train.max_episodes <= log.episodes
@@ -239,22 +249,29 @@ def train_run(
             weighted = spl(np.asarray(flights.outcome) == Outcome.GOAL, np.asarray(flights.path_length_m), straight)
             metrics |= {"validation_success": rate, "validation_spl": weighted}
             kept = choose(config.train.keep, kept, Candidate(params, weighted, rate, validated))
-        run.append_metrics(metrics)
+        if run is not None:
+            run.append_metrics(metrics)
         progress.update(metrics)
-        if stop_requested() and not finished:
+        if cluster.on_any(stop_requested()) and not finished:
             chosen = config.train.keep == "best" and kept.decisions > 0
+            stopped = f"stopped after {done * envs:,} decisions"
+            if run is None:
+                raise StoppedError(f"{stopped}; the first process saves the policy")
             save_policy(run.checkpoints, kept.params if chosen else policy_of(state))
-            raise StoppedError(f"stopped after {done * envs:,} decisions; the policy is in '{run.checkpoints}'")
+            raise StoppedError(f"{stopped}; the policy is in '{run.checkpoints}'")
         if finished:
             break
     progress.stop()
-    save_policy(run.checkpoints, kept.params)
+    if run is not None:
+        save_policy(run.checkpoints, kept.params)
 
     flights = _fly(config, courses.final, kept.params, mesh)
-    run.write_trajectory(trajectory(config, flights))
+    digest = state_digest(state)  # the last that all processes do together
     scene = jax.tree.map(np.asarray, courses.scene)
     flight = flight_summary(flights)
-    draw_gallery(config, run, scene, kept.params, np.asarray(courses.shortest.points), flight["outcome"])
+    if run is not None:
+        run.write_trajectory(trajectory(config, flights))
+        draw_gallery(config, run, scene, kept.params, np.asarray(courses.shortest.points), flight["outcome"])
     since = first_success(log.validations)
     summary = {
         **flight,
@@ -275,21 +292,25 @@ def train_run(
         "workload": workload(config, scene),
         "devices": [str(device) for device in devices],
         "versions": versions(),
-        "state_digest": state_digest(state),
+        "state_digest": digest,
     }
     if config.world.name in DENSITIES:
         summary["test"] = summarise(flights)
-    run.write_summary(summary)
-    progress.message(_verdict(summary, run))
+    if run is not None:
+        run.write_summary(summary)
+        progress.message(_verdict(summary, run))
     return summary
+
+
+def _described(devices: Sequence[jax.Device]) -> str:  # pyright: ignore[reportInvalidTypeForm]
+    processes = len({device.process_index for device in devices})
+    return f"{len(devices)} {devices[0].platform} devices" + (f" of {processes} processes" if processes > 1 else "")
 
 
 def _fly(config: Config, world: World, params: PolicyParams, mesh: Mesh) -> Flights:
     """The world's missions, flown and recorded; sensor noise is the same each time."""
-    everywhere = NamedSharding(mesh, PartitionSpec())
-    world, params, key = jax.device_put((world, params, jax.random.key(config.train.seed)), everywhere)
-    flights = fly_missions(config, world, params, key, record=True, mesh=mesh)
-    return jax.tree.map(np.asarray, flights)
+    world, params = cluster.replicate((world, params), mesh)
+    return cluster.fetch(fly_missions(config, world, params, jax.random.key(config.train.seed), record=True, mesh=mesh))
 
 
 def _straight(missions: Missions, goal_radius_m: float) -> np.ndarray:
@@ -352,11 +373,11 @@ def versions() -> dict[str, str]:
 
 
 def state_digest(state: TrainState) -> str:
-    """SHA-256 over the leaves of the train state in the order of the pytree."""
+    """SHA-256 over the leaves of the train state in the order of the pytree; every process must call this."""
     digest = hashlib.sha256()
     for leaf in jax.tree.leaves(state):
         raw = jax.random.key_data(leaf) if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key) else leaf
-        array = np.asarray(raw)
+        array = cluster.fetch(raw)
         digest.update(f"{array.dtype}{array.shape}".encode())
         digest.update(array.tobytes())
     return digest.hexdigest()

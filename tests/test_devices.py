@@ -34,6 +34,37 @@ def test_a_number_that_does_not_divide_the_shards_is_named():
         choose_devices(2, 7)
 
 
+@pytest.fixture
+def three_of_each_of_two(monkeypatch: pytest.MonkeyPatch) -> list[types.SimpleNamespace]:
+    """Two processes with three devices each, told in a mixed order."""
+    found = [types.SimpleNamespace(process_index=i % 2, id=i, platform="gpu") for i in range(6)]
+    monkeypatch.setattr(jax, "process_count", lambda: 2)
+    monkeypatch.setattr(jax, "devices", lambda: found)
+    monkeypatch.setattr(jax, "local_devices", lambda process: [d for d in found if d.process_index == process])
+    return found
+
+
+@pytest.mark.parametrize(
+    ("requested", "shards", "chosen"),
+    [(0, 8, [0, 2, 1, 3]), (0, 6, [0, 2, 4, 1, 3, 5]), (0, 10, [0, 1]), (2, 8, [0, 1])],
+)
+def test_every_process_brings_as_many_devices(three_of_each_of_two, requested, shards, chosen):
+    assert choose_devices(requested, shards) == [three_of_each_of_two[i] for i in chosen]
+
+
+@pytest.mark.parametrize(
+    ("requested", "shards", "says"),
+    [
+        (0, 7, "train.shards must be a multiple of the 2 processes, not 7"),
+        (1, 8, "train.devices must be a multiple of the 2 processes, not 1"),
+        (8, 8, "train.devices must be at most 6, the GPU devices that there are, not 8"),
+    ],
+)
+def test_what_processes_cannot_share_is_named(three_of_each_of_two, requested, shards, says):
+    with pytest.raises(ConfigError, match=says):
+        choose_devices(requested, shards)
+
+
 def test_devices_cannot_be_made_once_jax_runs():
     jax.devices()
     with pytest.raises(RuntimeError):

@@ -23,6 +23,7 @@ from flax import struct
 from jax import Array, lax
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
+from edqn_jax import cluster
 from edqn_jax.config import Config, ConfigError
 from edqn_jax.devices import compiler_options
 from edqn_jax.learn import dqn, encoder, qnetwork, replay
@@ -363,26 +364,27 @@ def policy_of(state: TrainState) -> PolicyParams:
 
 
 class Trainer:
-    """A compiled, donated chunk over a mesh of devices. The state goes in and comes out; nothing is kept here."""
+    """A compiled, donated chunk over a mesh of devices. The state goes in and comes out; nothing is kept here.
+
+    Where the devices are of several processes, each of them makes its own trainer of the same mesh, from the same
+    world and seed, and calls it alike; each holds the shards of its own devices.
+    """
 
     def __init__(self, config: Config, world: World, devices: Sequence[jax.Device]):  # pyright: ignore
         self.config = config
         self.plan = Plan.of(config)
         self.mesh = Mesh(np.asarray(devices), (AXIS,))
         self.replicated = NamedSharding(self.mesh, PartitionSpec())
-        self.world = jax.device_put(world, self.replicated)
+        self.world = cluster.replicate(world, self.mesh)
         self._chunk = None
 
     def init(self, seed: int) -> TrainState:
         """The state before the first step, laid out over the devices."""
         make = jax.jit(lambda world, key: init(self.config, world, key))
-        state = make(self.world, jax.random.key(seed))
-        spread = NamedSharding(self.mesh, PartitionSpec(AXIS))
-        return TrainState(
-            actors=jax.device_put(state.actors, spread),
-            learner=jax.device_put(state.learner, self.replicated),
-            step=jax.device_put(state.step, self.replicated),
-        )
+        spread, same = NamedSharding(self.mesh, PartitionSpec(AXIS)), self.replicated
+        layout: Any = TrainState(actors=spread, learner=same, step=same)  # pyright: ignore[reportArgumentType]
+        # Made whole and then cut: made in parts it would be rounded otherwise. `device_put` reaches no other process.
+        return jax.jit(lambda state: state, out_shardings=layout)(make(self.world, jax.random.key(seed)))
 
     def compile(self, state: TrainState) -> None:
         """Trace and compile the chunk, once."""
@@ -402,10 +404,14 @@ class Trainer:
 
     def _steps(self, first: int) -> Array:
         numbers = np.arange(first, first + self.config.train.chunk_steps, dtype=np.int32)
-        return jax.device_put(numbers, self.replicated)
+        return cluster.replicate(numbers, self.mesh)
 
     def chunk(self, state: TrainState, first: int) -> tuple[TrainState, tuple[Episodes, Losses]]:
-        """The training steps `first .. first + chunk_steps - 1`; `state` is donated."""
+        """The training steps `first .. first + chunk_steps - 1`; `state` is donated.
+
+        Returns:
+            state, (episodes [K, S, E], losses [K]); the episodes are spread over the devices as the shards are.
+        """
         if self._chunk is None:
             self.compile(state)
         assert self._chunk is not None

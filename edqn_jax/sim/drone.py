@@ -88,9 +88,10 @@ def load_airframe(config: DroneConfig) -> Airframe:
     arm = model.site_pos[model.actuator_trnid[:, 0]]
     push, twist = model.actuator_gear[:, 2], model.actuator_gear[:, 5]
     wrench_of_thrust = np.stack([push, arm[:, 1] * push, -arm[:, 0] * push, twist])
+    here = jax.local_devices()[0]  # MJX's own choice may be another process's
     return Airframe(
-        model=mjx.put_model(model, impl="jax"),
-        data=mjx.put_data(model, rest, impl="jax"),
+        model=mjx.put_model(model, device=here, impl="jax"),
+        data=mjx.put_data(model, rest, device=here, impl="jax"),
         mass=jnp.float32(model.body_mass[1]),
         inertia=jnp.asarray(model.body_inertia[1], jnp.float32),
         gravity=jnp.float32(-model.opt.gravity[2]),

@@ -1,0 +1,66 @@
+"""How a process was started: alone, or as one of several that train together. Needs no JAX."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, Literal
+
+from edqn_jax.config import ConfigError
+
+Distributed = Literal["auto", "never", "must"]
+
+
+def how_to_join(
+    distributed: Distributed,
+    coordinator_address: str | None,
+    num_processes: int | None,
+    process_id: int | None,
+    environment: Mapping[str, str],
+) -> dict[str, Any] | None:
+    """The arguments for `cluster.join`; None for a process that stays alone. Nothing is done yet.
+
+    Args:
+        distributed: `auto` joins where the next three are given or `srun` has started several tasks, `must` joins
+            whatever cluster JAX finds, `never` stays alone.
+        coordinator_address: host and port of process 0.
+        num_processes: of all hosts.
+        process_id: this one's number, from 0.
+        environment: variables of this process.
+
+    Raises:
+        ConfigError: if they contradict each other.
+    """
+    by_hand = {
+        "--coordinator-address": coordinator_address,
+        "--num-processes": num_processes,
+        "--process-id": process_id,
+    }
+    given = [name for name, value in by_hand.items() if value is not None]
+    if distributed == "never":
+        if given:
+            raise ConfigError(f"--distributed never joins no other process, so it takes no {given[0]}")
+        return None
+    if coordinator_address is not None and num_processes is not None and process_id is not None:
+        if not coordinator_address.rpartition(":")[2].isdecimal():
+            raise ConfigError(f"--coordinator-address must be HOST:PORT, not '{coordinator_address}'")
+        if num_processes < 1:
+            raise ConfigError(f"--num-processes must be at least 1, not {num_processes}")
+        if not 0 <= process_id < num_processes:
+            raise ConfigError(
+                f"--process-id must be from 0 to {num_processes - 1}, one less than --num-processes, not {process_id}"
+            )
+        return {
+            "coordinator_address": coordinator_address,
+            "num_processes": num_processes,
+            "process_id": process_id,
+            # Or JAX would still look for a cluster, to see which devices are this process's.
+            "cluster_detection_method": "deactivate",
+        }
+    if given:
+        missing = next(name for name in by_hand if name not in given)
+        raise ConfigError(f"{', '.join(by_hand)} go together; {missing} is missing")
+    # Tasks of this very step. SLURM_NTASKS, which JAX looks at, is the whole allocation's in an interactive shell:
+    # a program started there without `srun` would wait for tasks that nobody starts.
+    if distributed == "must" or int(environment.get("SLURM_STEP_NUM_TASKS", 1)) > 1:
+        return {}
+    return None

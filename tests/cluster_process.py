@@ -1,0 +1,80 @@
+"""`edqn train` as one of several processes that train together, or alone, and a note of what became of it.
+
+    python -m tests.cluster_process NOTE.json DEVICES [--no-learning] [arguments of edqn train]
+
+The process has DEVICES CPU devices. Its note holds the shards that it held and what `train_run` returned. To spare
+compiling, its camera sees waves that follow the pose, and it draws no pictures. `--no-learning` puts a state and
+chunks that do nothing in the place of the compiled ones, for tests of what processes tell one another.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from edqn_jax import cluster, devices, run
+from edqn_jax.cli import main
+from edqn_jax.config import CameraConfig
+from edqn_jax.learn import trainer
+from edqn_jax.learn.trainer import Episodes, Losses, Trainer, TrainState
+from edqn_jax.rundir import plain
+from edqn_jax.sim import camera
+from edqn_jax.sim.scene import Scene
+
+
+def waves(config: CameraConfig, scene: Scene, position: Array, rotation: Array) -> Array:
+    """Stands for `camera.luma`."""
+    del scene
+    across, down = jnp.arange(config.width), jnp.arange(config.height)[:, None]
+    return 0.5 + 0.4 * jnp.sin(across * position[0] + down * position[1] + rotation[0, 0])
+
+
+def only_a_policy(self: Trainer, seed: int) -> TrainState:
+    """Stands for the state before the first step: of all of it, parameters."""
+    learner = trainer._init_learner(self.config, jax.random.key(seed))
+    state = TrainState(actors=None, learner=learner, step=jnp.int32(0))  # type: ignore[arg-type]
+    return cluster.replicate(state, self.mesh)
+
+
+def no_learning(self: Trainer, state: TrainState, first: int) -> tuple[TrainState, tuple[Episodes, Losses]]:
+    """Stands for the compiled chunk, and takes long enough to be interrupted."""
+    del first
+    time.sleep(0.2)
+    train = self.config.train
+    none = jnp.zeros((train.chunk_steps, train.shards, train.num_envs // train.shards))
+    losses = Losses(*[jnp.zeros(train.chunk_steps)] * len(dataclasses.fields(Losses)))
+    return state, cluster.replicate((Episodes(none, none, none), losses), self.mesh)
+
+
+if __name__ == "__main__":
+    note, count, *argv = sys.argv[1:]
+    noted: dict[str, Any] = {}
+    init, train_run = Trainer.init, run.train_run
+
+    def noting_init(self: Trainer, seed: int) -> TrainState:
+        state = init(self, seed)
+        parts = state.actors.reward.addressable_shards
+        noted["shards"] = [list(range(8))[part.index[0]] for part in parts]
+        noted["environments"] = sum(part.data.size for part in parts)
+        return state
+
+    def noting_run(*arguments: Any) -> dict[str, Any]:
+        noted["summary"] = train_run(*arguments)
+        return noted["summary"]
+
+    devices.cores, camera.luma, run.draw_gallery = lambda: int(count), waves, lambda *_: None
+    Trainer.init, run.train_run = noting_init, noting_run
+    if argv[:1] == ["--no-learning"]:
+        del argv[0]
+        Trainer.init, Trainer.compile, Trainer.chunk = only_a_policy, lambda self, state: None, no_learning
+    code = main(["train", *argv])
+    Path(note).write_text(json.dumps(plain(noted)), encoding="utf-8")
+    sys.exit(code)
