@@ -40,6 +40,12 @@ class WholeStep:
         while self.done < self.trainer.plan.learn_from:
             self.turn()
 
+    @property
+    def temporary_bytes(self) -> int:
+        """What the compiled chunk needs on each device beside its inputs and outputs."""
+        chunk: Any = self.trainer._chunk
+        return chunk.memory_analysis().temp_size_in_bytes
+
     def turn(self) -> float:
         """Decisions per second of one more chunk."""
         began = time.perf_counter()
