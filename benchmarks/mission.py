@@ -21,12 +21,13 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import json_report
 from edqn_jax.cli import parse_train
 from edqn_jax.devices import processor
 from edqn_jax.evaluate import wilson_interval
 from edqn_jax.files import check_can_write, write_whole
 from edqn_jax.resolve import to_yaml
-from edqn_jax.rundir import plain
+from flags import split
 
 TRAIN = Path(__file__).resolve().parents[1] / "train.py"
 
@@ -43,8 +44,7 @@ QUICK = ("--total-steps", "49152", "--encoder.warmup-decisions", "16384")
 
 def parse(argv: Sequence[str] | None = None) -> argparse.Namespace:
     """The arguments; what follows `--` goes to `train.py` as it is, in `flags`."""
-    words = list(sys.argv[1:] if argv is None else argv)
-    cut = words.index("--") if "--" in words else len(words)
+    words, flags = split(sys.argv[1:] if argv is None else argv)
     parser = argparse.ArgumentParser(
         description=(__doc__ or "").partition("\n")[0], epilog="Flags after -- go to train.py."
     )
@@ -54,8 +54,8 @@ def parse(argv: Sequence[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--out", type=Path, default=Path("runs/mission"), help="folder of the runs")
     parser.add_argument("--json", type=Path, help="write the rows to this file")
     parser.add_argument("--quick", action="store_true", help="two seeds, too short to learn")
-    args = parser.parse_args(words[:cut])
-    args.flags = words[cut + 1 :]
+    args = parser.parse_args(words)
+    args.flags = flags
     if args.quick:
         args.seeds, args.flags = min(args.seeds, 2), [*QUICK, *args.flags]
     if args.seeds < 1:
@@ -278,7 +278,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     report = report_of(args, rows, summaries)
     print(f"{table(rows)}\n\n{sentences(report['totals'])}\n{report['device']}")
     if args.json is not None:
-        write_whole(args.json, json.dumps(plain(report), indent=1, allow_nan=False) + "\n")
+        json_report.write(args.json, report)
     return 0
 
 

@@ -78,7 +78,7 @@ def measure(config: DroneConfig, speed: float, decide: Decide) -> list[dict[str,
         level = before[i, 2] == after[i, 2] == 0
         height = position[i, begin:, 2] - position[i, begin, 2]
         row["height_change_m"] = float(np.abs(height).max()) if level else None
-        row["heading_change_deg"] = float(np.degrees(np.abs(np.asarray(yaw_of(quaternion[i, begin:]))).max()))
+        row["heading_change_deg"] = float(np.degrees(np.abs(yaw_of(jnp.asarray(quaternion[i, begin:]))).max()))
         row["drift_m"] = float(np.linalg.norm(position[i], axis=1).max()) if kind == "hover" else None
         rows.append(row)
     return rows
@@ -87,7 +87,7 @@ def measure(config: DroneConfig, speed: float, decide: Decide) -> list[dict[str,
 def response(velocity: np.ndarray, before: np.ndarray, after: np.ndarray, dt: float) -> dict[str, float | None]:
     """Step-response figures of velocity [n, 3] m/s, its first row flown just before the command changed."""
     steady = float(np.linalg.norm(velocity[-STEADY_STEPS:] - after, axis=1).max())
-    size = np.linalg.norm(after - before)
+    size = float(np.linalg.norm(after - before))
     if size == 0:
         return {"rise_s": None, "overshoot_percent": None, "steady_error_m_s": steady, "coupling_m_s": None}
     direction = (after - before) / size

@@ -5,7 +5,6 @@ Nothing is trained here.
 
 from __future__ import annotations
 
-import importlib.util
 import json
 import subprocess
 from pathlib import Path
@@ -14,18 +13,9 @@ from typing import Any
 
 import pytest
 
-from benchmarks import tracking, verdicts
-
-FILE = Path(__file__).parents[1] / "benchmarks" / "mission.py"
-
-
-@pytest.fixture(scope="module")
-def mission() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("mission", FILE)
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+import mission
+import tracking
+import verdicts
 
 
 def summary(**changes: Any) -> dict[str, Any]:
@@ -47,7 +37,7 @@ def summary(**changes: Any) -> dict[str, Any]:
     return good | changes
 
 
-def test_flags_after_two_dashes_go_to_training(mission: ModuleType) -> None:
+def test_flags_after_two_dashes_go_to_training() -> None:
     args = mission.parse(["--seeds", "3", "--", "--agent.n-step", "3"])
     assert args.seeds == 3
     words = mission.command(args, 7, Path("runs/s7"))
@@ -57,37 +47,39 @@ def test_flags_after_two_dashes_go_to_training(mission: ModuleType) -> None:
     assert words[-2:] == ["--agent.n-step", "3"]
 
 
-def test_quick_is_at_most_two_seeds_and_own_flags_win(mission: ModuleType) -> None:
+def test_quick_is_at_most_two_seeds_and_own_flags_win() -> None:
     args = mission.parse(["--quick", "--", "--total-steps", "1024"])
     assert args.seeds == 2
     # The last of two equal flags is the one that counts.
     assert args.flags[-2:] == ["--total-steps", "1024"]
 
 
-def test_bad_input_ends_with_exit_code_2(mission: ModuleType) -> None:
+def test_bad_input_ends_with_exit_code_2() -> None:
     with pytest.raises(SystemExit) as ending:
         mission.parse(["--seeds", "0"])
     assert ending.value.code == 2
 
 
-@pytest.mark.parametrize(("name", "works"), [("mission", "measure"), ("tracking", "measure"), ("verdicts", "load_run")])
+@pytest.mark.parametrize(
+    ("script", "works"),
+    [(mission, "measure"), (tracking, "measure"), (verdicts, "load_run")],
+    ids=["mission", "tracking", "verdicts"],
+)
 def test_a_file_that_cannot_be_written_is_named_before_anything_is_measured(
-    name: str,
+    script: ModuleType,
     works: str,
-    mission: ModuleType,
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    script = {"mission": mission, "tracking": tracking, "verdicts": verdicts}[name]
     monkeypatch.setattr(script, works, lambda *_: pytest.fail("it went to work"))
     file = tmp_path / "nowhere" / "rows.json"
-    words = ["--json", str(file)] + (["run"] if name == "verdicts" else [])
+    words = ["--json", str(file)] + (["run"] if script is verdicts else [])
     assert script.main(words) == 2
     assert capsys.readouterr().err == f"'{file}' cannot be written: there is no folder '{file.parent}'\n"
 
 
-def test_a_good_run_passes(mission: ModuleType) -> None:
+def test_a_good_run_passes() -> None:
     row = mission.row_of(0, summary(), 150.0)
     assert row["passes"]
     assert row["path_over_shortest"] == pytest.approx(1.1)
@@ -103,20 +95,18 @@ def test_a_good_run_passes(mission: ModuleType) -> None:
         ({}, None, {"time_ok"}),
     ],
 )
-def test_each_bar_fails_a_seed_alone(
-    mission: ModuleType, changes: dict[str, Any], wall: float | None, missed: set[str]
-) -> None:
+def test_each_bar_fails_a_seed_alone(changes: dict[str, Any], wall: float | None, missed: set[str]) -> None:
     row = mission.row_of(0, summary(**changes), wall)
     bars = ("goal", "decisions_ok", "path_ok", "time_ok")
     assert {bar for bar in bars if not row[bar]} == missed
     assert not row["passes"]
 
 
-def test_the_very_limits_still_pass(mission: ModuleType) -> None:
+def test_the_very_limits_still_pass() -> None:
     assert mission.row_of(0, summary(steps=188, path_length_m=115.0, shortest_path_m=100.0), 179.9)["passes"]
 
 
-def test_totals_count_failed_trainings_but_take_medians_of_flights(mission: ModuleType) -> None:
+def test_totals_count_failed_trainings_but_take_medians_of_flights() -> None:
     rows = [
         mission.row_of(0, summary(steps=140), 100.0),
         mission.row_of(1, summary(steps=160), 120.0),
@@ -134,7 +124,7 @@ def test_totals_count_failed_trainings_but_take_medians_of_flights(mission: Modu
 
 
 def test_no_seed_is_trained_twice_whether_it_ended_well_or_not(
-    mission: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     trained = []
 
@@ -160,7 +150,7 @@ def test_no_seed_is_trained_twice_whether_it_ended_well_or_not(
     assert "another --out" in capsys.readouterr().err
 
 
-def test_the_script_explains_itself(mission: ModuleType, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_script_explains_itself(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as ending:
         mission.parse(["--help"])
     assert ending.value.code == 0

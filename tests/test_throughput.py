@@ -2,33 +2,19 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
 import statistics
-import sys
-from pathlib import Path
-from types import ModuleType
 
 import pytest
 
-from edqn_jax.learn.trainer import Plan
-
-FILE = Path(__file__).parents[1] / "benchmarks" / "throughput.py"
-SMALL = ["--num-envs", "16", "--agent.batch-size", "16", "--agent.replay-size", "512", "--agent.learning-starts", "64"]
-SMALL += ["--camera.width", "8", "--camera.height", "6", "--train.validation-missions", "2", "--world.missions", "16"]
-
-
-@pytest.fixture(scope="module")
-def throughput() -> ModuleType:
-    spec = importlib.util.spec_from_file_location("throughput", FILE)
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module  # where dataclasses look their annotations up
-    spec.loader.exec_module(module)
-    return module
+import throughput
+from edqn_jax.learn.trainer import Plan, Trainer
+from edqn_jax.rundir import plain
+from parts import parts_of
+from tests.miniature import MINIATURE
 
 
-def test_the_vae_learns_throughout_and_four_samples_are_replayed(throughput: ModuleType) -> None:
+def test_the_vae_learns_throughout_and_four_samples_are_replayed() -> None:
     _, config = throughput.parse([])
     assert config.encoder.keep_learning
     assert config.agent.updates_per_step * config.agent.batch_size == 4 * config.train.num_envs
@@ -37,31 +23,28 @@ def test_the_vae_learns_throughout_and_four_samples_are_replayed(throughput: Mod
     assert plan.warmup == config.train.chunk_steps and plan.learn_from <= 2 * config.train.chunk_steps
 
 
-def test_flags_that_say_how_much_to_replay_are_obeyed(throughput: ModuleType) -> None:
+def test_flags_that_say_how_much_to_replay_are_obeyed() -> None:
     _, config = throughput.parse(["--", "--agent.updates-per-step", "7", "--num-envs", "64"])
     assert (config.agent.updates_per_step, config.train.num_envs) == (7, 64)
 
 
 @pytest.mark.slow
-def test_parts_are_timed_beside_their_floors_and_c_mujoco(
-    throughput: ModuleType, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_parts_are_timed_beside_their_floors_and_c_mujoco(monkeypatch: pytest.MonkeyPatch) -> None:
     class Whole:
         """Stands for the compiled chunk, which other tests compile."""
 
         compile_seconds = 1.0
 
         def __init__(self, config, world, devices) -> None:
-            self.state = throughput.Trainer(config, world, devices).init(0)
+            self.state = Trainer(config, world, devices).init(0)
 
         def turn(self) -> float:
             return 1000.0
 
-    every = throughput.parts_of
     monkeypatch.setattr(throughput, "WholeStep", Whole)
-    cheap = {"acting", "replay"}
-    monkeypatch.setattr(throughput, "parts_of", lambda *args: [part for part in every(*args) if part.name in cheap])
-    _, config = throughput.parse(["--quick", "--", *SMALL])
+    cheap = ("acting", "replay", "sampling")
+    monkeypatch.setattr(throughput, "parts_of", lambda *moment: parts_of(*moment, names=cheap))
+    _, config = throughput.parse(["--quick", "--", *MINIATURE])
     report = throughput.measure(config, 2, True)
     rows = {row["name"]: row for row in report["rows"]}
     for name in cheap:
@@ -73,6 +56,33 @@ def test_parts_are_timed_beside_their_floors_and_c_mujoco(
     turns = report["turns"]
     ratios = [13 * step / rollout for step, rollout in zip(turns["whole"], turns["c_mujoco_rollout"], strict=True)]
     assert rows["whole_training_step"]["over_c_mujoco_rollout"] == pytest.approx(statistics.median(ratios))
+    assert "dqn_update" not in rows  # what it is subtracted from was not timed
     assert report["workload"]["vae_samples_per_decision"] == 1
     assert "C MuJoCo rollout" in throughput.table(report)
-    assert json.dumps(throughput.plain(report), allow_nan=False)
+    assert json.dumps(plain(report), allow_nan=False)
+
+
+def test_rows_by_subtraction_say_so() -> None:
+    us = {"environment": 100.0, "environment_without_resets": 97.0, "dqn_update_and_sampling": 30.0, "sampling": 4.0}
+    rows = {row["name"]: row for row in throughput.differences(us)}
+    assert {name: row["us_per_decision"] for name, row in rows.items()} == {"resets": 3.0, "dqn_update": 26.0}
+    assert rows["dqn_update"]["by_subtraction"] == "dqn_update_and_sampling - sampling"
+    whole = {
+        "name": "whole_training_step",
+        "decisions_per_second": 7000.0,
+        "physics_steps_per_second": 91_000.0,
+        "us_per_decision": 286.0,
+        "over_c_mujoco_rollout": 0.1,
+    }
+    rollout = {"name": "c_mujoco_rollout", "physics_steps_per_second": 1e6, "threads": 2}
+    limits = [{"name": name, "per_device": 1e9} for name in ("product_flops", "vector_flops", "copy_bytes")]
+    report = {
+        "device": "a device",
+        "devices": ["cpu:0"],
+        "workload": {"num_envs": 256, "replayed_samples_per_decision": 4.0, "vae_samples_per_decision": 1.0},
+        "repeats": 5,
+        "compile_seconds": 20.0,
+        "rows": [whole, rollout, *rows.values(), *limits],
+    }
+    shown = throughput.table(report)
+    assert "| dqn update (by subtraction: dqn update and sampling − sampling) | 26.0 |  |  |" in shown

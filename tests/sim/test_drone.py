@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 from mujoco import mjx
 
-from benchmarks.tracking import Decide, batched_fly, manoeuvres, measure
 from edqn_jax.config import Config
 from edqn_jax.sim.drone import (
     Airframe,
@@ -25,6 +24,7 @@ from edqn_jax.sim.drone import (
     yaw_of,
 )
 from tests.oracles import drone_mujoco
+from tracking import Decide, batched_fly, manoeuvres, measure
 
 CONFIG = Config().drone
 SPEED = Config().env.speed_m_s

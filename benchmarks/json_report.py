@@ -1,0 +1,31 @@
+"""What a benchmark's JSON says beside its rows, and how it gets to the disk."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from edqn_jax.devices import processor
+from edqn_jax.files import write_whole
+from edqn_jax.run import versions
+from edqn_jax.rundir import plain
+
+
+def machine(devices: Sequence[Any]) -> dict[str, Any]:
+    """Device and versions that figures taken on `devices` are for."""
+    return {
+        "device": processor() if devices[0].platform == "cpu" else devices[0].device_kind,
+        "devices": [str(device) for device in devices],
+        "versions": versions(),
+    }
+
+
+def write(file: Path, report: dict[str, Any]) -> None:
+    """Writes the report whole or not at all.
+
+    Raises:
+        ConfigError: if it cannot be written.
+    """
+    write_whole(file, json.dumps(plain(report), indent=1, allow_nan=False) + "\n")

@@ -1,0 +1,414 @@
+"""How does the cost of a decision grow? Pixels, obstacles, environments, physics steps and devices, one at a time.
+
+Times the whole training step with the VAE learning all the time, as `throughput.py` does, at several sizes of
+each. The sizes of a curve take turns, forwards and backwards, each followed by C MuJoCo's threaded `rollout`, so
+that a slow minute hits all alike; a slope is the one between a curve's ends on logarithmic axes. Counts the bytes
+of an environment and of a slot of the replay as well.
+
+    python benchmarks/scaling.py --json scaling.json --figure scaling.png
+    python benchmarks/scaling.py --curves pixels obstacles -- --world medium
+
+Takes about 12 minutes on two cores, with --quick about 3: each size is a program of its own to compile. What
+stands after -- goes to the configuration as it would for train.py; sizes are multiples of what it says.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import math
+import statistics
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import json_report
+from boxes import world_of_boxes
+from ceilings import Rollout
+from edqn_jax.config import Config, ConfigError
+from edqn_jax.devices import choose_devices, use_cpu_devices
+from edqn_jax.files import check_can_write
+from edqn_jax.resolve import Layer, apply
+from edqn_jax.run import Courses, lay_courses, workload
+from edqn_jax.sim.mjcf import write_scene
+from edqn_jax.validate import validate
+from flags import configured, split
+from memory import StateBytes, state_bytes
+from scaling_figure import draw_scaling
+from whole import WholeStep, steady
+
+REPEATS, QUICK_REPEATS = 7, 3
+DECISIONS, QUICK_DECISIONS = 4096, 2048
+"""Decisions in a chunk, about."""
+BOXES = (8, 16, 30, 60)
+"""Obstacles; the random worlds have 12, 30 and 60."""
+TURN_SECONDS = 0.5
+"""What a point's turn takes at least."""
+MILLION = 1_000_000
+
+
+@dataclasses.dataclass(frozen=True)
+class Point:
+    """One size of what a curve is about."""
+
+    x: float
+    label: str
+    config: Config
+
+
+@dataclasses.dataclass(frozen=True)
+class Curve:
+    """The cost of a decision over something that grows."""
+
+    name: str
+    linear: float
+    """Slope of a decision's cost where everything is paid for each unit: 1, or 0 where units are decisions' own."""
+    points: tuple[Point, ...]
+
+
+# ---------------------------------------------------------------------------------- what is varied
+
+
+def pixels(base: Config, quick: bool, folder: Path) -> Curve:
+    """Frames from half to three times as wide and high."""
+    del folder
+    points = []
+    for times in (1, 2) if quick else (0.5, 1, 2, 3):
+        width, height = round(times * base.camera.width), round(times * base.camera.height)
+        points.append(
+            Point(width * height, f"{width} × {height}", _changed(base, camera={"width": width, "height": height}))
+        )
+    return Curve("pixels", 1.0, tuple(points))
+
+
+def obstacles(base: Config, quick: bool, folder: Path) -> Curve:
+    """Worlds of boxes; those of a world with fewer are among those of one with more."""
+    points = []
+    for count in BOXES[::3] if quick else BOXES:
+        file = folder / f"{count}-boxes.xml"
+        write_scene(world_of_boxes(count), file, title=f"{count} boxes")
+        points.append(Point(count, str(count), _changed(base, world={"name": str(file)})))
+    return Curve("obstacles", 1.0, tuple(points))
+
+
+def environments(base: Config, quick: bool, folder: Path) -> Curve:
+    """From a quarter to sixteen times as many, and as many updates in proportion."""
+    del folder
+    many = base.train.num_envs
+    counts = [many, 4 * many] if quick else [many // 4, many, 4 * many, 16 * many]
+    return Curve("environments", 0.0, tuple(Point(n, str(n), with_environments(base, n)) for n in counts))
+
+
+def physics_steps(base: Config, quick: bool, folder: Path) -> Curve:
+    """The same time between decisions in finer steps."""
+    del folder
+    points = []
+    for times in (1, 4) if quick else (1, 2, 4):
+        steps, dt = times * base.drone.physics_steps, base.drone.physics_dt_s / times
+        points.append(Point(steps, str(steps), _changed(base, drone={"physics_steps": steps, "physics_dt_s": dt})))
+    return Curve("physics steps", 1.0, tuple(points))
+
+
+def devices(base: Config, quick: bool, folder: Path) -> Curve:
+    """One, two, four devices, as many as the configuration has; each with as many environments."""
+    del quick, folder
+    each = base.train.num_envs // base.train.devices
+    counts = [count for count in (1, 2, 4, 8) if count <= base.train.devices and base.train.devices % count == 0]
+    return Curve(
+        "devices",
+        0.0,
+        tuple(Point(n, str(n), _changed(with_environments(base, n * each), train={"devices": n})) for n in counts),
+    )
+
+
+CURVES: dict[str, Callable[[Config, bool, Path], Curve]] = {
+    "pixels": pixels,
+    "obstacles": obstacles,
+    "environments": environments,
+    "physics_steps": physics_steps,
+    "devices": devices,
+}
+
+
+def with_environments(base: Config, count: int) -> Config:
+    """`base` with another number of environments and as many replayed samples for each decision."""
+    agent = base.agent
+    updates = max(1, round(agent.updates_per_step * count / base.train.num_envs))
+    return _changed(base, train={"num_envs": count}, agent={"updates_per_step": updates})
+
+
+def _changed(config: Config, **layer: Any) -> Config:
+    """`config` with the groups' keys replaced.
+
+    Raises:
+        ConfigError: if it cannot be run.
+    """
+    groups: Layer = layer
+    changed = apply(config, groups, "this size")
+    validate(changed)
+    return changed
+
+
+# --------------------------------------------------------------------------------- what is measured
+
+
+class Runner:
+    """A point's training step, compiled, and what its turns have brought."""
+
+    def __init__(self, config: Config, courses: Courses) -> None:
+        self.config, self.scene = config, courses.scene
+        self.devices = choose_devices(config.train.devices, config.train.shards)
+        self.whole = WholeStep(config, courses.training, self.devices)
+        self.chunks = math.ceil(TURN_SECONDS * self.whole.turn() / self.whole.decisions)
+
+    @property
+    def temporary_bytes_per_environment(self) -> float:
+        return self.whole.temporary_bytes * len(self.devices) / self.config.train.num_envs
+
+    def turn(self) -> tuple[float, float]:
+        """Seconds that a decision takes, and how many cores were busy meanwhile."""
+        began, busy = time.perf_counter(), time.process_time()
+        seconds = sum(self.whole.decisions / self.whole.turn() for _ in range(self.chunks))
+        cores = (time.process_time() - busy) / (time.perf_counter() - began)
+        return seconds / (self.chunks * self.whole.decisions), cores
+
+
+def chunked(config: Config, decisions: int) -> Config:
+    """The steady workload in chunks of about so many decisions, with a cheap beginning, which nobody times."""
+    config = steady(config, max(1, decisions // config.train.num_envs))
+    return dataclasses.replace(config, encoder=dataclasses.replace(config.encoder, warmup_updates_per_step=1))
+
+
+def measure(base: Config, names: Sequence[str], quick: bool, repeats: int) -> dict[str, Any]:
+    """Everything that `--json` holds.
+
+    Raises:
+        ConfigError: if a size cannot be run, or nothing is left to measure.
+    """
+    used = choose_devices(base.train.devices, base.train.shards)
+    base = _changed(base, train={"devices": len(used)})
+    decisions = QUICK_DECISIONS if quick else DECISIONS
+    rollout = Rollout(base)
+    rows, summaries = [], []
+    reference = lay_courses(base)
+    laid: dict[Any, Courses] = {(base.world, base.drone): reference}
+    temporary = None
+    runners: dict[Config, Runner] = {}
+    with tempfile.TemporaryDirectory() as folder:
+        curves = [CURVES[name](base, quick, Path(folder)) for name in names]
+        # A curve needs two ends; on one device there is nothing to say about devices.
+        curves = [curve for curve in curves if len(curve.points) > 1]
+        if not curves:
+            raise ConfigError("there is one device only, so there is no curve of devices")
+        for number, curve in enumerate(curves):
+            configs = [chunked(point.config, decisions) for point in curve.points]
+            for point, config in zip(curve.points, configs, strict=True):
+                where = (config.world, config.drone)
+                if where not in laid:
+                    laid[where] = lay_courses(config)
+                if config not in runners:
+                    print(f"{curve.name}: compiling {point.label}", file=sys.stderr, flush=True)
+                    runners[config] = Runner(config, laid[where])
+                if config == chunked(base, decisions):
+                    temporary = runners[config].temporary_bytes_per_environment
+            some, summary = _measure_curve(curve, [runners[config] for config in configs], rollout, repeats)
+            rows += some
+            summaries.append(summary)
+            # What later curves share is kept, the others' memory is given back.
+            later = {chunked(point.config, decisions) for after in curves[number + 1 :] for point in after.points}
+            runners = {config: runner for config, runner in runners.items() if config in later}
+    return {
+        "workload": {**workload(steady(base, 1), reference.scene), "world": base.world.name},
+        **json_report.machine(used),
+        "repeats": repeats,
+        "curves": summaries,
+        "memory": memory_of(state_bytes(base, reference.training), temporary),
+        "rows": rows,
+    }
+
+
+def _measure_curve(
+    curve: Curve, runners: Sequence[Runner], rollout: Rollout, repeats: int
+) -> tuple[list[dict[str, Any]], dict[str, Any]]:
+    """The curve's rows, and what they say together."""
+    count = len(runners)
+    seconds: list[list[float]] = [[] for _ in range(count)]
+    cores: list[list[float]] = [[] for _ in range(count)]
+    c_mujoco: list[list[float]] = [[] for _ in range(count)]
+    for repeat in range(repeats):
+        for place in range(count) if repeat % 2 == 0 else reversed(range(count)):
+            took, busy = runners[place].turn()
+            seconds[place].append(took)
+            cores[place].append(busy)
+            c_mujoco[place].append(rollout.turn())
+    rows = []
+    for place, (point, runner) in enumerate(zip(curve.points, runners, strict=True)):
+        many, stated = len(runner.devices), workload(runner.config, runner.scene)
+        us = [1e6 * many * each for each in seconds[place]]
+        as_steps = [each * rate for each, rate in zip(seconds[place], c_mujoco[place], strict=True)]
+        rows.append(
+            {
+                "name": f"{curve.name} {point.label}",
+                "curve": curve.name,
+                "x": point.x,
+                "label": point.label,
+                "us_per_decision": statistics.median(us),
+                "us_low": min(us),
+                "us_high": max(us),
+                "us_turns": us,
+                "decisions_per_second": 1.0 / statistics.median(seconds[place]),
+                "c_mujoco_steps_per_decision": statistics.median(as_steps),
+                "c_mujoco_steps_per_second": statistics.median(c_mujoco[place]),
+                "cores_busy": statistics.median(cores[place]),
+                "compile_seconds": runner.whole.compile_seconds,
+                "temporary_bytes_per_environment": runner.temporary_bytes_per_environment,
+                "devices": many,
+                "pixels": stated["width"] * stated["height"],
+                **{key: stated[key] for key in ("num_envs", "obstacles", "physics_steps_per_decision")},
+                "replayed_samples_per_decision": stated["replayed_samples_per_decision"],
+            }
+        )
+    return rows, summarise(curve.name, curve.linear, rows)
+
+
+def slope(x: Sequence[float], cost: Sequence[float]) -> float:
+    """Slope between the ends of a curve on logarithmic axes: 1 where twice the x costs twice as much."""
+    return math.log(cost[-1] / cost[0]) / math.log(x[-1] / x[0])
+
+
+def summarise(name: str, linear: float, rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """A curve's slope: of the medians, and the least and the largest of the turns' own."""
+    x = [row["x"] for row in rows]
+    turns = [slope(x, cost) for cost in zip(*(row["us_turns"] for row in rows), strict=True)]
+    return {
+        "name": name,
+        "slope": slope(x, [row["us_per_decision"] for row in rows]),
+        "slope_low": min(turns),
+        "slope_high": max(turns),
+        "slope_over_c_mujoco": slope(x, [row["c_mujoco_steps_per_decision"] for row in rows]),
+        "linear_slope": linear,
+        # Of all devices against as many times the first: as good as one, they all take its time for a decision.
+        "efficiency": rows[0]["us_per_decision"] / rows[-1]["us_per_decision"] if name == "devices" else None,
+    }
+
+
+def memory_of(counted: StateBytes, temporary: float | None) -> dict[str, Any]:
+    """The bytes that training takes; `temporary` are those of the compiled chunk for each environment."""
+    return {
+        "temporary_bytes_per_environment": temporary,
+        "bytes_per_environment": counted.environment,
+        "bytes_per_replay_slot": counted.replay_slot,
+        "bytes_of_a_million_transitions": MILLION * counted.replay_slot,
+        "bytes_of_the_rest": counted.rest,
+        "num_envs": counted.environments,
+        "replay_slots": counted.replay_slots,
+    }
+
+
+# ------------------------------------------------------------------------------------------- report
+
+
+def table(report: dict[str, Any]) -> str:
+    """The figures for people, in Markdown."""
+    stated = report["workload"]
+    lines = [
+        f"{report['device']}, {len(report['devices'])} devices; where nothing else is said {stated['num_envs']} "
+        f"environments, {stated['width']} × {stated['height']} pixels, {stated['obstacles']} obstacles, "
+        f"{stated['physics_steps_per_decision']} physics steps; medians of {report['repeats']}",
+    ]
+    for curve in report["curves"]:
+        lines += [
+            "",
+            f"| {curve['name']} | µs of one device a decision | least - most | C MuJoCo steps in that time "
+            "| decisions/s | cores busy | temporary kB an environment |",
+            "| ---: | ---: | ---: | ---: | ---: | ---: | ---: |",
+        ]
+        for row in report["rows"]:
+            if row["curve"] == curve["name"]:
+                lines.append(
+                    f"| {row['label']} | {row['us_per_decision']:.1f} | {row['us_low']:.1f} - {row['us_high']:.1f} "
+                    f"| {row['c_mujoco_steps_per_decision']:.0f} | {row['decisions_per_second']:,.0f} "
+                    f"| {row['cores_busy']:.2f} | {row['temporary_bytes_per_environment'] / 1e3:.1f} |"
+                )
+        lines += ["", sentence(curve)]
+    lines += ["", *memory_lines(report["memory"])]
+    return "\n".join(lines)
+
+
+def sentence(curve: dict[str, Any]) -> str:
+    """A curve's slope for people."""
+    text = (
+        f"{curve['name'].capitalize()}: slope {curve['slope']:.2f} ({curve['slope_low']:.2f} to "
+        f"{curve['slope_high']:.2f}), {curve['slope_over_c_mujoco']:.2f} in steps of C MuJoCo; "
+        f"linear growth would be {curve['linear_slope']:g}."
+    )
+    if curve["efficiency"] is not None:
+        text += f" All devices together do {curve['efficiency']:.0%} of what the first times their number would."
+    return text
+
+
+def memory_lines(memory: dict[str, Any]) -> list[str]:
+    """The bytes for people."""
+    temporary = memory["temporary_bytes_per_environment"]
+    lines = [
+        "| memory | bytes |",
+        "| --- | ---: |",
+        f"| state of one environment | {memory['bytes_per_environment']:,} |",
+        f"| one slot of the replay | {memory['bytes_per_replay_slot']:,} |",
+        f"| a replay of 1 000 000 transitions | {memory['bytes_of_a_million_transitions']:,} |",
+        f"| parameters, optimisers, keys | {memory['bytes_of_the_rest']:,} |",
+    ]
+    if temporary is not None:
+        lines.append(f"| temporary in the compiled chunk, for each environment | {temporary:,.0f} |")
+    return lines
+
+
+def parse(argv: Sequence[str] | None = None) -> tuple[argparse.Namespace, Config]:
+    """The arguments, and the configuration that sizes are multiples of.
+
+    Raises:
+        ConfigError: if the flags after -- cannot be run, or a file cannot be written.
+    """
+    words, flags = split(sys.argv[1:] if argv is None else argv)
+    parser = argparse.ArgumentParser(
+        description=(__doc__ or "").partition("\n")[0],
+        epilog="Takes about 12 minutes on two cores, with --quick about 3. Flags after -- are train.py's.",
+    )
+    parser.add_argument("--quick", action="store_true", help="fewer sizes and shorter turns")
+    parser.add_argument("--curves", nargs="+", choices=CURVES, default=list(CURVES), help="which (default: all)")
+    parser.add_argument("--repeats", type=int, help=f"turns of each size (default {REPEATS}, quick {QUICK_REPEATS})")
+    parser.add_argument("--json", type=Path, help="write the rows to this file")
+    parser.add_argument("--figure", type=Path, help="draw the curves into this PNG")
+    args = parser.parse_args(words)
+    if args.repeats is None:
+        args.repeats = QUICK_REPEATS if args.quick else REPEATS
+    if args.repeats < 1:
+        parser.error(f"--repeats must be at least 1, not {args.repeats}")
+    for file in (args.json, args.figure):
+        if file is not None:
+            check_can_write(file)
+    return args, configured(flags)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Exit code 0 when all was measured, 2 for bad input."""
+    use_cpu_devices()
+    try:
+        args, config = parse(argv)
+        report = measure(config, args.curves, args.quick, args.repeats)
+    except ConfigError as error:
+        print(error, file=sys.stderr)
+        return 2
+    print(table(report))
+    if args.json is not None:
+        json_report.write(args.json, report)
+    if args.figure is not None:
+        draw_scaling(report, args.figure)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

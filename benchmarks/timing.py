@@ -1,0 +1,123 @@
+"""How a part of the training step is timed, and the least that it could take."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
+
+from edqn_jax.devices import compiler_options
+from edqn_jax.learn.trainer import AXIS
+
+TURN_SECONDS = 0.4
+"""What a part's turn takes, about."""
+
+Body = Callable[[Any, Any], Any]
+"""(what stays, carry) -> carry"""
+
+
+@dataclasses.dataclass(frozen=True)
+class Part:
+    """A part of the step for the environments of one device: `body` maps `carry` to the next one."""
+
+    name: str
+    body: Body
+    stays: Any  # read in every turn
+    carry: Any  # read and written in every turn
+    specs: tuple[Any, Any] = (PartitionSpec(), PartitionSpec(AXIS))  # how both lie on the devices
+    scans: int = 1  # how often a scan inside repeats operations that are counted once
+    counted: Body | None = None  # whose operations are counted instead of the body's, `scans` times
+    products: bool = False  # whether its arithmetic is matrix products
+    floor: bool = True  # whether its operations can be counted: not where only some of them are in a scan
+    moved: int | None = None  # bytes that a turn reads and writes at the least; without it, the carry's twice
+
+
+def nudged(value: Array, *results: Any) -> Array:
+    """`value`, in a way that the compiler must compute all of `results` for it."""
+    total = sum(jnp.sum(leaf.astype(jnp.float32)) for leaf in jax.tree.leaves(results))
+    return jnp.where(total > 1e30, value + 1, value)
+
+
+class Timed:
+    """A part, compiled as a loop over all devices."""
+
+    def __init__(self, part: Part, mesh: Mesh, decisions: int) -> None:
+        self.part, self.decisions, self.devices = part, decisions, mesh.size
+        layout = partial(jax.tree.map, lambda spec: NamedSharding(mesh, spec), is_leaf=_is_spec)
+        self.inputs = tuple(_lay(x, layout(spec)) for x, spec in zip((part.stays, part.carry), part.specs, strict=True))
+
+        def loop(stays: Any, carry: Any, times: Array) -> Any:
+            return jax.lax.fori_loop(0, times, lambda _, c: part.body(stays, c), carry)
+
+        specs = (*part.specs, PartitionSpec())
+        spread = jax.shard_map(loop, mesh=mesh, in_specs=specs, out_specs=part.specs[1], check_vma=False)
+        options = compiler_options(mesh.devices.flat[0].platform)
+        self.loop = jax.jit(spread).lower(*self.inputs, jnp.int32(1)).compile(options)
+        first = min(self.seconds(1) for _ in range(2))
+        self.times = max(1, round(TURN_SECONDS / first))
+
+    def seconds(self, times: int) -> float:
+        """Seconds that the part takes `times` times in a row."""
+        began = time.perf_counter()
+        jax.block_until_ready(self.loop(*self.inputs, jnp.int32(times)))
+        return time.perf_counter() - began
+
+    def turn(self) -> float:
+        """Microseconds of one device that a decision takes."""
+        return 1e6 * self.seconds(self.times) * self.devices / (self.times * self.decisions)
+
+    def floor(self, ceilings: dict[str, float]) -> dict[str, float]:
+        """Operations and bytes of a decision, and the microseconds of one device that they take at the least.
+
+        Operations are XLA's count before any optimisation, a transcendental as one: what is written down, of
+        which a compiler may still save some, so that a part can come close to its floor. Bytes are what must
+        be read and written at the least: what the part is given and what it returns, each once.
+        """
+        part = self.part
+        once = operations(part) if part.floor else None
+        if once is None:
+            return {}
+        count = part.scans * once / self.decisions
+        size = (2 * size_of(part.carry) if part.moved is None else part.moved) / self.decisions
+        rate = ceilings["product_flops" if part.products else "vector_flops"]
+        floor = 1e6 * max(count / rate, size / ceilings["copy_bytes"])
+        return {"operations": count, "bytes": size, "floor_us": floor}
+
+
+def operations(part: Part) -> float | None:
+    """XLA's count for all decisions, what stands in a scan once; None where it does not count (on a GPU)."""
+    alone = Mesh(np.asarray(jax.devices()[:1]), (AXIS,))
+    body = part.counted or part.body
+    once = jax.shard_map(body, mesh=alone, in_specs=part.specs, out_specs=part.specs[1], check_vma=False)
+    shapes = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), (part.stays, part.carry))
+    counted: Any = jax.jit(once).lower(*shapes).cost_analysis()
+    return None if counted is None else counted.get("flops", 0.0) + counted.get("transcendentals", 0.0)
+
+
+def size_of(tree: Any) -> int:
+    """Bytes of all arrays of a tree, or of what `jax.eval_shape` says of them."""
+    shapes = jax.eval_shape(partial(jax.tree.map, _raw), tree)
+    return sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(shapes))
+
+
+def _raw(leaf: Array) -> Array:
+    return jax.random.key_data(leaf) if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key) else leaf
+
+
+def _is_spec(x: Any) -> bool:
+    return isinstance(x, PartitionSpec)
+
+
+def _lay(tree: Any, layout: Any) -> Any:
+    """`tree` on the devices; `layout` is a prefix of it."""
+    if isinstance(layout, tuple):
+        return tuple(_lay(x, y) for x, y in zip(tree, layout, strict=True))
+    return jax.device_put(tree, layout)

@@ -1,0 +1,59 @@
+"""The whole training step in steady state: its configuration, and a compiled chunk of it to be timed."""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from edqn_jax.config import Config
+from edqn_jax.learn.trainer import Trainer
+from edqn_jax.sim import env
+
+
+def steady(config: Config, chunk_steps: int) -> Config:
+    """`config` with the VAE learning throughout and a beginning of two chunks: what follows is all alike."""
+    decisions = chunk_steps * config.train.num_envs
+    return dataclasses.replace(
+        config,
+        encoder=dataclasses.replace(config.encoder, keep_learning=True, warmup_decisions=decisions),
+        agent=dataclasses.replace(config.agent, learning_starts=min(decisions, config.agent.learning_starts)),
+        train=dataclasses.replace(config.train, chunk_steps=chunk_steps, total_steps=1000 * decisions),
+    )
+
+
+class WholeStep:
+    """The training command's own compiled chunk, past its beginning."""
+
+    def __init__(self, config: Config, world: env.World, devices: Sequence[Any]) -> None:
+        self.trainer = Trainer(config, world, devices)
+        self.decisions = config.train.chunk_steps * config.train.num_envs
+        state = self.trainer.init(config.train.seed)
+        began = time.perf_counter()
+        self.trainer.compile(state)
+        self.compile_seconds = time.perf_counter() - began
+        self.done = 0
+        self.state = state
+        while self.done < self.trainer.plan.learn_from:
+            self.turn()
+
+    @property
+    def temporary_bytes(self) -> int:
+        """What the compiled chunk needs on each device beside its inputs and outputs."""
+        chunk: Any = self.trainer._chunk
+        return chunk.memory_analysis().temp_size_in_bytes
+
+    def turn(self) -> float:
+        """Decisions per second of one more chunk."""
+        began = time.perf_counter()
+        self.state, (_, losses) = self.trainer.chunk(self.state, self.done)
+        q_loss = np.asarray(losses.q_loss)
+        seconds = time.perf_counter() - began
+        learns = self.done >= self.trainer.plan.learn_from
+        self.done += len(q_loss)
+        if learns and not np.isfinite(np.concatenate([q_loss, np.asarray(losses.reconstruction)])).all():
+            raise RuntimeError("a timed chunk did not learn throughout")
+        return self.decisions / seconds

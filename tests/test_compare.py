@@ -1,0 +1,194 @@
+"""Two commits side by side: which commits may be compared, how turns are taken, what a ratio's interval is."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import compare
+import throughput
+from edqn_jax.config import ConfigError
+from tests.miniature import MINIATURE
+from worker import WHOLE
+
+ROOT = Path(__file__).parents[1]
+STUB = """
+from flags import configured, split
+
+class Part:
+    name = "acting"
+
+class WholeStep:
+    state = {{}}
+    def __init__(self, *given): pass
+    def turn(self): return 1e6 / {cost}
+
+class Timed:
+    def __init__(self, part, mesh, decisions): pass
+    def turn(self): return {cost} / 10
+
+def parse(words): return None, configured(split(words)[1])
+def parts_of(config, world, state): return [Part]
+"""
+
+
+def git(folder: Path, *words: str) -> str:
+    named = ["-c", "user.name=A Tester", "-c", "user.email=tester@example.org"]
+    return subprocess.run(
+        ["git", "-C", str(folder), *named, *words], check=True, capture_output=True, text=True
+    ).stdout.strip()
+
+
+def commit(folder: Path, message: str) -> None:
+    git(folder, "add", "--all")
+    git(folder, "commit", "--quiet", "--message", message)
+
+
+@pytest.fixture
+def repository(tmp_path: Path) -> Path:
+    """Three commits of this package: one without a throughput benchmark, one that is slow, one twice as fast."""
+    folder = tmp_path / "repository"
+    (folder / "benchmarks").mkdir(parents=True)
+    git(folder, "init", "--quiet")
+    for name in ("edqn_jax", "scenes"):
+        (folder / name).symlink_to(ROOT / name)
+    (folder / "benchmarks" / "flags.py").symlink_to(ROOT / "benchmarks" / "flags.py")
+    commit(folder, "nothing to time")
+    for tag, cost in (("slow", 80.0), ("fast", 40.0)):
+        (folder / "benchmarks" / "throughput.py").write_text(STUB.format(cost=cost))
+        commit(folder, tag)
+        git(folder, "tag", tag)
+    return folder
+
+
+def test_throughput_has_what_a_worker_asks_of_it() -> None:
+    assert all(callable(getattr(throughput, name)) for name in ("parse", "WholeStep", "parts_of", "Timed"))
+
+
+def test_an_unknown_commit_is_told_in_a_sentence(repository: Path) -> None:
+    assert compare.find_commit(repository, "fast") == git(repository, "rev-parse", "HEAD")
+    with pytest.raises(ConfigError, match="there is no commit 'slaw' in"):
+        compare.find_commit(repository, "slaw")
+    with pytest.raises(ConfigError, match="'fast~2' cannot be timed: it has no benchmarks/throughput.py"):
+        compare.find_commit(repository, "fast~2")
+
+
+def test_a_dirty_tree_matters_only_to_the_commit_that_is_checked_out(repository: Path) -> None:
+    slow, fast = (compare.find_commit(repository, name) for name in ("slow", "fast"))
+    compare.check_committed(repository, {"slow": slow, "HEAD": fast})
+    (repository / "notes.txt").write_text("nothing that is timed")
+    compare.check_committed(repository, {"slow": slow, "HEAD": fast})
+    (repository / "benchmarks" / "throughput.py").write_text("something else")
+    compare.check_committed(repository, {"slow": slow})
+    with pytest.raises(ConfigError, match="'HEAD' is checked out here with changes .* 'benchmarks/throughput.py'"):
+        compare.check_committed(repository, {"slow": slow, "HEAD": fast})
+
+
+def test_a_worktree_holds_the_commit_and_leaves_nothing_behind(repository: Path, tmp_path: Path) -> None:
+    slow = compare.find_commit(repository, "slow")
+    with compare.checked_out(repository, slow, tmp_path / "a") as checkout:
+        assert STUB.format(cost=80.0) == (checkout / "benchmarks" / "throughput.py").read_text()
+    assert not (tmp_path / "a").exists()
+    assert len(git(repository, "worktree", "list").splitlines()) == 1
+
+
+def test_workers_take_turns_there_and_back() -> None:
+    asked = []
+
+    class Fake(compare.Worker):
+        def __init__(self, name: str) -> None:
+            self.name = name
+
+        def ask(self, row: str) -> float:
+            asked.append(self.name + row)
+            return float(len(asked))
+
+    turns = compare.take_turns([Fake("A"), Fake("B")], ["x", "y"], 3)
+    assert asked == ["Ax", "Bx", "Ay", "By", "Bx", "Ax", "By", "Ay", "Ax", "Bx", "Ay", "By"]
+    assert turns == {"x": [[1.0, 6.0, 9.0], [2.0, 5.0, 10.0]], "y": [[3.0, 8.0, 11.0], [4.0, 7.0, 12.0]]}
+
+
+def test_a_ratio_is_the_median_of_pairs_so_a_slow_minute_that_hits_both_does_not_count() -> None:
+    row = compare.compared("physics", [10.0, 10.0, 30.0, 50.0, 10.0], [9.0, 9.0, 27.0, 45.0, 9.0])
+    assert (row["ratio"], row["ratio_low"], row["ratio_high"]) == pytest.approx((0.9, 0.9, 0.9))
+    assert (row["us_per_decision_a"], row["us_per_decision_b"]) == (10.0, 9.0)
+
+
+def test_an_interval_leaves_out_as_many_values_as_a_fair_coin_allows() -> None:
+    # Of ten tosses at most one is heads in 11 of 1024 cases, at most two in 56; of six none in 1 of 64.
+    assert compare.median_interval([3, 1, 2, 10, 9, 8, 4, 5, 6, 7]) == (2, 9)
+    assert compare.median_interval([6, 5, 4, 3, 2, 1]) == (1, 6)
+    assert compare.median_interval([2, 1, 3]) == (1, 3)
+    assert compare.median_interval([5]) == (5, 5)
+
+
+def test_an_interval_covers_the_true_ratio_at_least_nineteen_times_in_twenty() -> None:
+    draw = np.random.default_rng(1)
+
+    def covers(ratio: float) -> bool:
+        first, second = np.exp(draw.normal(0, 0.1, (2, 20)))
+        row = compare.compared("", first, ratio * second)
+        return row["ratio_low"] <= ratio <= row["ratio_high"]
+
+    # 95.9 % of 2000, give or take four standard errors.
+    assert 0.94 <= np.mean([covers(1.3) for _ in range(2000)]) <= 0.978
+
+
+def test_workloads_that_are_not_the_same_are_told() -> None:
+    first, second = {"workload": {"num_envs": 256, "width": 32}}, {"workload": {"num_envs": 512, "width": 32}}
+    assert compare.differing(first, first) == {}
+    assert compare.differing(first, second) == {"num_envs": [256, 512]}
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["a", "b", "--rows", "colours"], "there is no row 'colours'"),
+        (["a", "b", "--json", "no/such/folder/file.json"], "there is no folder"),
+        (["a", "b", "--", "--num-envs", "7"], "train.num_envs"),
+        (["slaw", "fast"], "there is no commit 'slaw'"),
+    ],
+)
+def test_bad_input_is_one_sentence_and_exit_code_2(
+    words: Sequence[str], message: str, repository: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert compare.main(words, repository) == 2
+    told = capsys.readouterr().err
+    assert message in told and told.count("\n") == 1
+
+
+@pytest.mark.slow
+def test_each_commit_is_timed_by_its_own_code(
+    repository: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "compare.json"
+    words = ["slow", "HEAD", "--repeats", "2", "--json", str(file), "--", *MINIATURE]
+    assert compare.main(words, repository) == 0
+    report = json.loads(file.read_text())
+    rows = {row["name"]: row for row in report["rows"]}
+    assert rows["acting"]["us_per_decision_a"] == 8.0 and rows["acting"]["us_per_decision_b"] == 4.0
+    assert rows[WHOLE]["ratio"] == rows["acting"]["ratio"] == pytest.approx(0.5)
+    assert report["workload"]["num_envs"] == 16 and report["differing"] == {}
+    assert "| acting | 8.0 | 4.0 | 0.500 | 0.500 - 0.500 |" in capsys.readouterr().out
+    assert len(git(repository, "worktree", "list").splitlines()) == 1
+
+
+@pytest.mark.slow
+def test_a_row_that_a_commit_does_not_have_is_told(repository: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert compare.main(["slow", "fast", "--rows", "acting", "sampling", "--", *MINIATURE], repository) == 2
+    assert capsys.readouterr().err == "commit 'slow' has no row 'sampling'\n"
+
+
+@pytest.mark.slow
+def test_a_commit_that_cannot_be_timed_is_told_with_its_reason(
+    repository: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (repository / "benchmarks" / "throughput.py").write_text("import no_such_thing")
+    commit(repository, "broken")
+    assert compare.main(["HEAD", "HEAD", "--rows", WHOLE, "--", *MINIATURE], repository) == 2
+    assert "cannot be timed: ModuleNotFoundError: No module named 'no_such_thing'" in capsys.readouterr().err

@@ -1,0 +1,73 @@
+"""The parts of the training step: how their operations are counted, and what they do."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import pytest
+
+from edqn_jax.learn.trainer import Plan, init
+from edqn_jax.run import lay_courses
+from flags import configured
+from parts import PARTS, Moment, parts_of
+from tests.miniature import MINIATURE
+from timing import Part, operations, size_of
+from whole import steady
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture(scope="module")
+def now() -> Moment:
+    """A fresh state that is told it is past the beginning."""
+    config = steady(configured(MINIATURE), 8)
+    world = lay_courses(config).training
+    state = jax.jit(lambda world, key: init(config, world, key))(world, jax.random.key(0))
+    return Moment(config, world, dataclasses.replace(state, step=jnp.int32(Plan.of(config).learn_from)))
+
+
+def with_steps(now: Moment, steps: int) -> Part:
+    """The physics of decisions of so many steps."""
+    drone = dataclasses.replace(now.config.drone, physics_steps=steps)
+    return PARTS["physics"](dataclasses.replace(now, config=dataclasses.replace(now.config, drone=drone)))
+
+
+def test_every_part_is_named_as_its_row(now: Moment) -> None:
+    assert [part.name for part in parts_of(now.config, now.world, now.state)] == list(PARTS)
+
+
+def test_a_scan_is_counted_once_so_physics_counts_one_step_and_multiplies(now: Moment) -> None:
+    part = with_steps(now, 26)
+    assert part.scans == 26
+    single = operations(part)
+    once, often = (operations(dataclasses.replace(with_steps(now, steps), counted=None)) for steps in (1, 26))
+    assert single is not None and once is not None and often is not None
+    # The single step is nearly all of a decision of one; 25 steps more add less than one step to the count.
+    assert 0.9 * once < single < once
+    assert often - once < single
+
+
+def test_environments_that_have_ended_fly_on_where_resets_are_left_out(now: Moment) -> None:
+    state = dataclasses.replace(now.environments, ended=jnp.ones(16, bool), decision=jnp.full(16, 7))
+    after, _ = jax.jit(PARTS["environment_without_resets"](now).body)(now.world, (state, now.moves))
+    assert after.decision.tolist() == 16 * [8]
+
+
+def test_sampling_is_a_part_of_what_the_replay_does(now: Moment) -> None:
+    sampling, replay = PARTS["sampling"](now), PARTS["replay"](now)
+    agent = now.config.agent
+    # 32 values of the code, 10 of the own state and the reward in four bytes each; outcome, reset and move in one.
+    row = (32 + 10 + 1) * 4 + 3
+    sampled = agent.updates_per_step * agent.batch_size * (agent.history + agent.n_step) * row
+    assert sampling.moved == sampled
+    assert replay.moved == sampled + 16 * row
+    counted = operations(sampling), operations(replay)
+    assert counted[0] is not None and counted[1] is not None and 0 < counted[0] <= counted[1]
+
+
+def test_bytes_are_those_of_the_arrays() -> None:
+    tree = {"a": jnp.zeros((3, 5)), "b": jnp.zeros(7, jnp.int8), "keys": jax.random.split(jax.random.key(0), 4)}
+    assert size_of(tree) == 3 * 5 * 4 + 7 + 4 * 2 * 4
+    assert size_of(jax.eval_shape(lambda: tree)) == size_of(tree)

@@ -1,0 +1,33 @@
+"""The training step that benchmarks time: past its beginning, and learning in every chunk."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+
+import jax
+import numpy as np
+import pytest
+
+from edqn_jax.run import lay_courses
+from flags import configured
+from tests.miniature import MINIATURE
+from whole import WholeStep, steady
+
+
+@pytest.mark.slow
+def test_what_is_timed_is_training_past_its_beginning(monkeypatch: pytest.MonkeyPatch) -> None:
+    config = steady(configured(MINIATURE), 4)
+    whole = WholeStep(config, lay_courses(config).training, jax.devices()[:2])
+    # Two chunks, to warm up and to fill the replay: what is timed from here on is all alike.
+    assert whole.done == 8 >= whole.trainer.plan.learn_from
+    before = jax.tree.map(np.asarray, (whole.state.learner.q, whole.state.learner.vae))
+    assert whole.turn() > 0
+    after = jax.tree.map(np.asarray, (whole.state.learner.q, whole.state.learner.vae))
+    assert all(jax.tree.leaves(jax.tree.map(lambda a, b: np.any(a != b), before, after)))
+    assert int(whole.state.step) == whole.done == 12
+    assert whole.temporary_bytes > 0
+    # A chunk in which nothing learnt must not pass for a fast one.
+    idle = SimpleNamespace(q_loss=np.array([np.nan]), reconstruction=np.array([1.0]))
+    monkeypatch.setattr(whole.trainer, "chunk", lambda state, first: (state, (None, idle)))
+    with pytest.raises(RuntimeError, match="did not learn throughout"):
+        whole.turn()
