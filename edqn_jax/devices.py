@@ -28,13 +28,15 @@ def use_cpu_devices(count: int | None = None) -> None:
 
 
 @functools.cache
-def compiler_options(platform: str) -> dict[str, str]:
+def compiler_options(platform: str) -> dict[str, str | bool]:
     """What programs of ours are compiled with on a platform, beyond its defaults; for `jax.jit` and `compile`.
 
     On CPUs XLA hands sums of products to a library that is made for large ones: one sum of 6 x 6 numbers in a
     physics step then takes longer than the rest of the step. Matrix products stay with the library.
     """
-    options = {"xla_cpu_experimental_ynn_fusion_type": "LIBRARY_FUSION_TYPE_DOT"} if platform == "cpu" else {}
+    options: dict[str, str | bool] = {}
+    if platform == "cpu":
+        options["xla_cpu_experimental_ynn_fusion_type"] = "LIBRARY_FUSION_TYPE_DOT"
     try:
         jax.jit(lambda: 0, compiler_options=options).lower().compile()
     except (jax.errors.JaxRuntimeError, ValueError):  # another XLA, which has no such option
