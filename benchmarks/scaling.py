@@ -8,7 +8,7 @@ of an environment and of a slot of the replay as well.
     python benchmarks/scaling.py --json scaling.json --figure scaling.png
     python benchmarks/scaling.py --curves pixels obstacles -- --world medium
 
-Takes about 12 minutes on two cores, with --quick about 3: each size is a program of its own to compile. What
+Takes about 12 minutes on two cores, with --quick about 4: each size is a program of its own to compile. What
 stands after -- goes to the configuration as it would for train.py; sizes are multiples of what it says.
 """
 
@@ -375,7 +375,7 @@ def parse(argv: Sequence[str] | None = None) -> tuple[argparse.Namespace, Config
     words, flags = split(sys.argv[1:] if argv is None else argv)
     parser = argparse.ArgumentParser(
         description=(__doc__ or "").partition("\n")[0],
-        epilog="Takes about 12 minutes on two cores, with --quick about 3. Flags after -- are train.py's.",
+        epilog="Takes about 12 minutes on two cores, with --quick about 4. Flags after -- are train.py's.",
     )
     parser.add_argument("--quick", action="store_true", help="fewer sizes and shorter turns")
     parser.add_argument("--curves", nargs="+", choices=CURVES, default=list(CURVES), help="which (default: all)")
