@@ -43,7 +43,7 @@ from whole import WholeStep, steady
 REPEATS, QUICK_REPEATS = 7, 3
 DECISIONS, QUICK_DECISIONS = 4096, 2048
 """Decisions in a chunk, about."""
-BOXES = (8, 16, 30, 60)
+BOXES = (8, 16, 30, 60, 120)
 """Obstacles; the random worlds have 12, 30 and 60."""
 TURN_SECONDS = 0.5
 """What a point's turn takes at least."""
@@ -87,7 +87,7 @@ def pixels(base: Config, quick: bool, folder: Path) -> Curve:
 def obstacles(base: Config, quick: bool, folder: Path) -> Curve:
     """Worlds of boxes; those of a world with fewer are among those of one with more."""
     points = []
-    for count in BOXES[::3] if quick else BOXES:
+    for count in BOXES[::4] if quick else BOXES:
         file = folder / f"{count}-boxes.xml"
         write_scene(world_of_boxes(count), file, title=f"{count} boxes")
         points.append(Point(count, str(count), _changed(base, world={"name": str(file)})))
