@@ -39,7 +39,7 @@ def join(arguments: Mapping[str, Any]) -> int:
     Raises:
         ConfigError: if there is no cluster to be found, or its processes differ in their number of devices.
     """
-    # Without it JAX would take SIGTERM for itself.
+    # Or JAX would take SIGTERM for itself, until somebody takes it back.
     jax.config.update("jax_enable_preemption_service", False)
     try:
         jax.distributed.initialize(**arguments)

@@ -121,9 +121,14 @@ def joined(monkeypatch: pytest.MonkeyPatch) -> list[dict]:
     return calls
 
 
-def test_processes_with_different_numbers_of_devices_are_refused(joined, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_process_joins_as_it_was_told_and_keeps_sigterm_for_itself(joined) -> None:
+    jax.config.update("jax_enable_preemption_service", True)
     assert cluster.join({"process_id": 0}) == 0
     assert joined == [{"process_id": 0}]
+    assert not jax.config.values["jax_enable_preemption_service"]
+
+
+def test_processes_with_different_numbers_of_devices_are_refused(joined, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(jax, "devices", lambda: [SimpleNamespace(process_index=process) for process in (0, 0, 1)])
     with pytest.raises(ConfigError, match="equally many devices, not 1 and 2; on CPUs --train.devices"):
         cluster.join({})
