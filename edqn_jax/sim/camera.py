@@ -8,8 +8,6 @@ box-filtered over the pixel (`texture.py`).
 
 from __future__ import annotations
 
-from functools import partial
-
 import jax
 import jax.numpy as jnp
 from jax import Array
@@ -72,7 +70,7 @@ def _blend(config: CameraConfig, frame: Frame, rays: Rays, layers: Layers) -> Ar
 def _picture(config: CameraConfig, scene: Scene, origin: Array, rotation: Array, weights: Array) -> Array:
     """Brightness under `weights` [3] of RGB: [H, W]."""
     if config.mount == "level":
-        return columns.mapped(config, partial(_blend, config))(scene, origin, rotation, weights)
+        return columns.picture(config, _blend, scene, origin, rotation, weights)
     value = raycast.albedo_values(scene, weights)
     rays = raycast.camera_rays(config, rotation)
     many = raycast.camera_rays(config, rotation, config.samples_across, config.samples_down)

@@ -11,14 +11,18 @@ M frames, C columns of H pixels in each, Q = M x C; N upright shapes; B columns 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import struct
 from jax import Array, lax
-from jax.custom_batching import custom_vmap
+from jax.core import ShapedArray
+from jax.extend.core import Primitive
+from jax.interpreters import batching, mlir
 
 from edqn_jax.config import CameraConfig
 from edqn_jax.sim import coverage, raycast
@@ -50,29 +54,52 @@ class Frame:
     sky: Array  # []
 
 
-Finish = Callable[[Frame, Rays, Layers], Array]
+Finish = Callable[[CameraConfig, Frame, Rays, Layers], Array]
 """Blends the layers of [H, 1] pixels over what lies behind them."""
 
 
-def mapped(config: CameraConfig, finish: Finish) -> Callable[[Scene, Array, Array, Array], Array]:
-    """The camera for one frame, as a function of scene, origin [3], rotation [3, 3] and weights of RGB [3].
+def picture(
+    config: CameraConfig, finish: Finish, scene: Scene, origin: Array, rotation: Array, weights: Array
+) -> Array:
+    """One frame, [H, W], of a scene from origin [3] and rotation [3, 3] under weights [3] of RGB.
 
     However it is mapped, all frames end up in one batch: only together can columns be sorted.
+
+    Args:
+        finish: a function of a module, not one made anew: what is compiled is kept by it.
     """
+    leaves, tree = jax.tree.flatten((scene, origin, rotation, weights))
+    return _pictures_p.bind(*(leaf[None] for leaf in leaves), config=config, finish=finish, tree=tree)[0]
 
-    @custom_vmap
-    def many(scene: Scene, origin: Array, rotation: Array, weights: Array) -> Array:
-        return _pictures(config, finish, scene, origin, rotation, weights)
 
-    @many.def_vmap
-    def _(size: int, batched, *arguments):
-        whole = jax.tree.map(
-            lambda x, already: x if already else jnp.broadcast_to(x, (size, *x.shape)), arguments, tuple(batched)
-        )
-        frames = many(*jax.tree.map(lambda x: x.reshape(x.shape[0] * x.shape[1], *x.shape[2:]), whole))
-        return frames.reshape(size, -1, *frames.shape[1:]), True
+# A primitive, so that the pictures are traced once, where a program is lowered, and not at every `vmap` on the way
+# there (docs/decisions/0010). Its arguments are the leaves of `_pictures`, its rule of mapping a reshape.
+_pictures_p = Primitive("pictures")
 
-    return lambda *arguments: many(*jax.tree.map(lambda x: x[None], arguments))[0]
+
+def _from_leaves(*leaves: Array, config: CameraConfig, finish: Finish, tree: Any) -> Array:
+    return _pictures(config, finish, *jax.tree.unflatten(tree, leaves))
+
+
+def _shape(*leaves: Any, config: CameraConfig, finish: Finish, tree: Any) -> ShapedArray:
+    return ShapedArray((leaves[0].shape[0], config.height, config.width), np.dtype(np.float32))
+
+
+def _map(leaves: Sequence[Array], axes: Sequence[int | None], **how: Any) -> tuple[Array, int]:
+    size = next(leaf.shape[axis] for leaf, axis in zip(leaves, axes, strict=True) if axis is not None)
+
+    def merged(leaf: Array, axis: int | None) -> Array:
+        whole = jnp.broadcast_to(leaf, (size, *leaf.shape)) if axis is None else jnp.moveaxis(leaf, axis, 0)
+        return whole.reshape(whole.shape[0] * whole.shape[1], *whole.shape[2:])
+
+    frames = _pictures_p.bind(*(merged(*each) for each in zip(leaves, axes, strict=True)), **how)
+    return frames.reshape(size, -1, *frames.shape[1:]), 0
+
+
+_pictures_p.def_abstract_eval(_shape)
+_pictures_p.def_impl(jax.jit(_from_leaves, static_argnames=("config", "finish", "tree")))
+batching.primitive_batchers[_pictures_p] = _map
+mlir.register_lowering(_pictures_p, mlir.lower_fun(_from_leaves, multiple_results=False))
 
 
 def _pictures(
@@ -189,7 +216,7 @@ def _draw(
         return layers
 
     def end(frame: Frame, u: Array, layers: Layers) -> Array:
-        return finish(frame, _rays(config, frame, u), layers)[:, 0]
+        return finish(config, frame, _rays(config, frame, u), layers)[:, 0]
 
     others = sum(getattr(frames.value, kind).shape[1] for kind in ("tilted_boxes", "capsules", "tilted_cylinders"))
     others += frames.value.spheres.shape[1] if spheres else 0

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import partial
 
+import jax
 import jax.numpy as jnp
 from jax import Array
 
@@ -42,6 +44,7 @@ def _box_filter(cycles: Array) -> Array:
     return (1.0 - x) * (1.0 - 0.55 * x)
 
 
+@partial(jax.jit, static_argnums=0)  # traced once for all layers
 def texture(
     config: CameraConfig, origin: Array, rays: Rays, depth: Array, slope_right: Array, slope_up: Array
 ) -> Array:
