@@ -213,7 +213,7 @@ def acting(now: Moment) -> Part:
         action = jax.vmap(lambda q, k: dqn.epsilon_greedy(q, jnp.float32(0.02), k))(q, keys)
         return nudged(memory, action), keys
 
-    carry = (_flat(now.actors.memory), now.keys(now.config.train.num_envs))
+    carry = (now.actors.memory, now.shard_keys)
     return Part("acting", body, now.learner.q, carry, products=True)
 
 

@@ -69,7 +69,7 @@ class _Flying:
     memory: Memory
     flights: Flights  # record not in it
     record: Record | None  # decision first: [D, M, ...]
-    decision: Array  # [] int32
+    decision: Array  # [] int32, -1 is the reset
     key: Array
 
 
@@ -86,7 +86,7 @@ def fly_missions(
     """Fly each of the world's M missions once, taking the best action each time.
 
     Mission i belongs to environment i; the last flight's end ends the program. Environments whose flight is
-    over go on with other missions, which count for nothing.
+    over begin it again, which counts for nothing.
 
     Compiled once for each configuration, choice of flags, mesh, and shapes and layout of the arrays.
 
@@ -157,7 +157,7 @@ def _fly(
             seen = dataclasses.replace(seen, events=events)
         act = partial(policy.act, config, params, key=act_key)  # the best action is no matter of chance
         action, memory = jax.vmap(act)(flying.memory, seen)
-        state, step = jax.vmap(partial(env.step, config, world))(flying.state, action)
+        state, step = jax.vmap(partial(env.step, config, world))(flying.state, action, number)
         flights, clearance = jax.vmap(partial(_tally, config, world))(flying.flights, flying.state, step)
         return _Flying(
             state=state,
@@ -169,15 +169,17 @@ def _fly(
             key=key,
         )
 
-    state, observation = jax.vmap(partial(env.reset, config, world))(keys, number)
+    # The first turn of the loop is every environment's reset: what it sees before, and does, counts for nothing.
+    state = jax.vmap(partial(env.ended, config, world))(keys, number)
+    seen = jax.eval_shape(jax.vmap(partial(env.step, config, world)), state, number)[1].observation
     memory = policy.empty_memory(config)
     flying = _Flying(
         state=state,
-        observation=observation,
+        observation=jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), seen),
         memory=jnp.broadcast_to(memory, (missions, *memory.shape)),
         flights=jax.vmap(partial(_at_start, config, world))(state),
         record=_blank(config, missions) if record else None,
-        decision=jnp.zeros((), jnp.int32),
+        decision=jnp.full((), -1),
         key=key,
     )
     flying = jax.lax.while_loop(lambda f: jnp.any(f.flights.outcome == Outcome.RUNNING), decide, flying)
@@ -210,7 +212,7 @@ def _at_start(config: Config, world: World, state: EnvState) -> Flights:
 
 def _tally(config: Config, world: World, flights: Flights, before: EnvState, step: Step) -> tuple[Flights, Array]:
     """The tallies of one flight after a decision, and the clearance [n] after each of its physics steps."""
-    running = flights.outcome == Outcome.RUNNING
+    running = (flights.outcome == Outcome.RUNNING) & ~step.is_reset
     steps = jnp.arange(config.drone.physics_steps)
     flown = steps < step.end_step
     share = jnp.where(steps == step.end_step - 1, step.contact, 1.0)
@@ -264,7 +266,7 @@ def _write(flying: _Flying, action: Array, step: Step, clearance: Array) -> Reco
     """The record with one more decision of the flights that are not over."""
     if flying.record is None:
         return None
-    running = flying.flights.outcome == Outcome.RUNNING
+    running = (flying.flights.outcome == Outcome.RUNNING) & ~step.is_reset
     steps = jnp.arange(clearance.shape[1])[None]
     flown = running[:, None] & (steps < step.end_step[:, None])
     row = Record(

@@ -64,10 +64,10 @@ def polyak(new: Params, old: Params, rate: float) -> Params:
 
 
 def epsilon_greedy(q: Array, epsilon: Array, key: Array) -> Array:
-    """The best action of `q` [A], or with probability `epsilon` [] a random one: [] int32."""
-    coin, draw = jax.random.split(key)
-    random = jax.random.randint(draw, (), 0, q.shape[-1])
-    return jnp.where(jax.random.uniform(coin) < epsilon, random, jnp.argmax(q)).astype(jnp.int32)
+    """The best action of `q` [..., A], or with probability `epsilon` [...] a random one: [...] int32."""
+    coin, draw = jax.random.uniform(key, (2, *q.shape[:-1]))
+    random = jnp.floor(draw * q.shape[-1])
+    return jnp.where(coin < epsilon, random, jnp.argmax(q, axis=-1)).astype(jnp.int32)
 
 
 def exploration(config: AgentConfig, decisions: Array, total: int, episodes: Array) -> Array:

@@ -56,4 +56,5 @@ def act(
     """The move [] int32 for one observation, and the memory with that observation in it."""
     memory = remember(memory, flatten(config, params.encoder, observation))
     q = q_values(config.agent, params.q, len(ACTIONS), memory)
-    return epsilon_greedy(q, jnp.float32(epsilon), key), memory
+    action = epsilon_greedy(q, jnp.float32(epsilon), key) if epsilon else jnp.argmax(q).astype(jnp.int32)
+    return action, memory

@@ -17,6 +17,7 @@ from flax import struct
 from jax import Array
 
 from edqn_jax.config import AgentConfig
+from edqn_jax.draws import integers
 from edqn_jax.sim.env import Outcome
 
 
@@ -86,8 +87,8 @@ def sample(config: AgentConfig, ring: Rows, time: Array, batch: int, key: Array)
     n, h = config.n_step, config.history
     age_key, env_key = jax.random.split(key)
     oldest = jnp.minimum(time + 1, length) - h
-    age = jax.random.randint(age_key, (batch,), n, jnp.maximum(oldest, n) + 1)
-    env = jax.random.randint(env_key, (batch,), 0, envs)
+    age = n + integers(age_key, (batch,), jnp.maximum(oldest, n) - n + 1)
+    env = integers(env_key, (batch,), envs)
     return jax.vmap(lambda a, e: _transition(config, ring, time - a, e))(age, env)
 
 

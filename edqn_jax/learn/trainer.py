@@ -128,17 +128,16 @@ def init(config: Config, world: World, key: Array) -> TrainState:
     # Keys follow the global number of an environment or shard, never a device's.
     env_keys = jax.vmap(lambda i: jax.random.fold_in(env_key, i))(jnp.arange(envs))
     shard_keys = jax.vmap(lambda i: jax.random.fold_in(shard_key, i))(jnp.arange(shards))
-    state, observation = jax.vmap(lambda k: env.reset(config, world, k))(env_keys)
+    # Nothing has been seen yet: the first step is every environment's reset.
+    state = jax.vmap(lambda k: env.ended(config, world, k))(env_keys)
     learner = _init_learner(config, learner_key)
-    fresh = jnp.broadcast_to(empty_memory(config), (envs, *empty_memory(config).shape))
-    memory = remember(fresh, flatten(config, learner.encoder, observation))
     size = observation_size(config)
     ring = replay.empty(config.agent, envs // shards, envs, size)
     flat = Actors(
         env=state,
-        memory=memory,
+        memory=jnp.broadcast_to(empty_memory(config), (envs, *empty_memory(config).shape)),
         reward=jnp.zeros(envs),
-        outcome=jnp.zeros(envs, jnp.int32),
+        outcome=jnp.full(envs, int(Outcome.TIME_OUT)),  # as before every reset: no transition starts here
         is_reset=jnp.ones(envs, bool),
         manoeuvre=jnp.zeros(envs, jnp.int32),
         episodes=jnp.zeros(envs, jnp.int32),
@@ -206,8 +205,7 @@ def train_step(
     total = (plan.total - plan.warmup) * config.train.num_envs
     epsilon = dqn.exploration(config.agent, decisions, total, actors.episodes)
     q = qnetwork.q_values(config.agent, learner.q, len(ACTIONS), actors.memory)
-    greedy_keys = jax.vmap(lambda k: jax.random.split(k, envs))(keys[:, 0])
-    chosen = jax.vmap(jax.vmap(dqn.epsilon_greedy))(q, epsilon, greedy_keys)
+    chosen = jax.vmap(dqn.epsilon_greedy)(q, epsilon, keys[:, 0])
     manoeuvre = jax.vmap(partial(_manoeuvre, config.encoder.hold_decisions))(actors.manoeuvre, keys[:, 1])
     action = jnp.where(warming, manoeuvre, chosen)
 
@@ -266,9 +264,8 @@ def train_step(
 
 def _manoeuvre(hold: int, held: Array, key: Array) -> Array:
     """Random moves [E] that are held for `hold` decisions on average."""
-    coin, draw = jax.random.split(key)
-    new = jax.random.randint(draw, held.shape, 0, len(ACTIONS))
-    return jnp.where(jax.random.uniform(coin, held.shape) < 1.0 / hold, new, held)
+    coin, draw = jax.random.uniform(key, (2, *held.shape))
+    return jnp.where(coin < 1.0 / hold, (draw * len(ACTIONS)).astype(held.dtype), held)
 
 
 def _publish(plan: Plan, learner: Learner, step: Array) -> Learner:

@@ -18,6 +18,7 @@ from flax import struct
 from jax import Array
 
 from edqn_jax.config import Config, EnvConfig
+from edqn_jax.draws import integers
 from edqn_jax.sim import camera, drone, events
 from edqn_jax.sim.drone import Airframe, DroneState, Flight
 from edqn_jax.sim.events import EventField, EventMemory
@@ -256,23 +257,33 @@ def observe(
 
 def reset(config: Config, world: World, key: Array, mission: Array | None = None) -> tuple[EnvState, Observation]:
     """A fresh environment on a mission drawn from the pool, or on the given one."""
-    key, draw, sensor, noise = jax.random.split(key, 4)
-    if mission is None:
-        mission = jax.random.randint(draw, (), 0, world.missions.scene.shape[0])
+    key, noise = jax.random.split(key)
+    state = dataclasses.replace(ended(config, world, key, mission), ended=jnp.zeros((), bool))
+    scene = scene_at(take_scene(world.pool, world.missions.scene[state.mission]), jnp.zeros(()))
+    still = _hold(state.drone, len(config.events.frame_times_s))
+    goal = world.missions.goal[state.mission]
+    observation, memory = observe(config, scene, goal, state.drone, still, state.memory, noise)
+    return dataclasses.replace(state, memory=memory), observation
+
+
+def ended(config: Config, world: World, key: Array, mission: Array | None = None) -> EnvState:
+    """An environment whose next step is a reset; it needs no picture. The mission is as in `reset`."""
+    key, draw, sensor = jax.random.split(key, 3)
+    mission = _drawn_mission(world, draw) if mission is None else mission
     body, memory = _start(config, world, mission, sensor)
-    state = EnvState(
+    return EnvState(
         drone=body,
         mission=mission.astype(jnp.int32),
         decision=jnp.zeros((), jnp.int32),
-        ended=jnp.zeros((), bool),
+        ended=jnp.ones((), bool),
         memory=memory,
         episode_return=jnp.zeros(()),
         key=key,
     )
-    scene = scene_at(take_scene(world.pool, world.missions.scene[mission]), jnp.zeros(()))
-    still = _hold(body, len(config.events.frame_times_s))
-    observation, memory = observe(config, scene, world.missions.goal[mission], body, still, memory, noise)
-    return dataclasses.replace(state, memory=memory), observation
+
+
+def _drawn_mission(world: World, key: Array) -> Array:
+    return integers(key, (), world.missions.scene.shape[0])
 
 
 def _hold(body: DroneState, n: int) -> Flight:
@@ -281,15 +292,18 @@ def _hold(body: DroneState, n: int) -> Flight:
     return Flight(position=repeat(body.position), quaternion=repeat(body.quaternion), velocity=repeat(body.velocity))
 
 
-def step(config: Config, world: World, state: EnvState, action: Array) -> tuple[EnvState, Step]:
+def step(
+    config: Config, world: World, state: EnvState, action: Array, mission: Array | None = None
+) -> tuple[EnvState, Step]:
     """One decision of one drone, or its reset if its episode has ended.
 
     Args:
         action: [] int, 0..26.
+        mission: [] int, which one a reset takes; None draws one.
     """
     key, draw, sensor, noise = jax.random.split(state.key, 4)
     is_reset = state.ended
-    fresh = jax.random.randint(draw, (), 0, world.missions.scene.shape[0])
+    fresh = _drawn_mission(world, draw) if mission is None else mission
     mission = jnp.where(is_reset, fresh, state.mission)
     goal = world.missions.goal[mission]
     time = state.decision * (config.drone.physics_steps * config.drone.physics_dt_s)
