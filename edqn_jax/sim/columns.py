@@ -22,6 +22,7 @@ from flax import struct
 from jax import Array, lax
 from jax.core import ShapedArray
 from jax.extend.core import Primitive
+from jax.flatten_util import ravel_pytree
 from jax.interpreters import batching, mlir
 
 from edqn_jax.config import CameraConfig
@@ -33,10 +34,10 @@ from edqn_jax.sim.scene import Scene, UprightBoxes, UprightCylinders, no_shapes
 SLOTS = (0, 2, 4, 8)
 """Shapes that the kinds of blocks have room for; fuller columns take one shape after another."""
 
-BLOCKS = 16
+BLOCKS = 64
 """Blocks that a batch is cut into."""
 
-SMALLEST_BLOCK = 128
+SMALLEST_BLOCK = 256
 """Columns that a block has at least: below, starting its operations costs more than what it saves."""
 
 WORD = 32
@@ -52,6 +53,23 @@ class Frame:
     scene: Scene  # without the upright boxes and cylinders
     value: Values
     sky: Array  # []
+
+
+@dataclasses.dataclass(frozen=True)
+class _Rows:
+    """Frames as rows of numbers, so that one is read at once."""
+
+    rows: Array  # [M, ...]
+    frame: Callable[[Array], Frame]  # of one row
+
+    @classmethod
+    def of(cls, frames: Frame) -> _Rows:
+        _, frame = ravel_pytree(jax.tree.map(lambda x: jnp.zeros(x.shape[1:]), frames))
+        return cls(materialised(jax.vmap(lambda one: ravel_pytree(one)[0])(frames)), frame)
+
+    def take(self, numbers: Array) -> Frame:
+        """The frames of these numbers, [B, ...]."""
+        return jax.vmap(self.frame)(self.rows.at[numbers].get(mode="promise_in_bounds"))
 
 
 Finish = Callable[[CameraConfig, Frame, Rays, Layers], Array]
@@ -158,22 +176,20 @@ def _ways(
     room = [n for n in SLOTS if n < shapes] + ([shapes] if shapes <= SLOTS[-1] else [])
     held = jnp.sum(lax.population_count(words), axis=1)
     needed = jnp.sum(jnp.stack([held > n for n in room]), axis=0, dtype=jnp.int32)
-    draw = partial(_draw, frames, tables, words)
-    ways = [partial(draw, n, False) for n in room]
-    full = len(room)  # more than fit
+    draw = partial(_draw, _Rows.of(frames), tables, words)
+    ways = [partial(draw, n, spheres > 0 and n == room[-1]) for n in room]
     if spheres:
-        ways.append(partial(draw, room[-1], True))
         seen = jax.vmap(partial(coverage.spheres_in_columns, config))(
             frames.scene.spheres, frames.origin, frames.heading
         )
-        needed = jnp.where(needed == full, full + 1, jnp.where(seen, full, needed))
+        needed = jnp.where(seen, jnp.maximum(needed, len(room) - 1), needed)
     if shapes > room[-1]:
         ways.append(partial(draw, None, True))
     return ways, needed.reshape(-1)
 
 
 def _draw(
-    frames: Frame,
+    frames: _Rows,
     tables: Array,
     words: Array,
     slots: int | None,
@@ -189,7 +205,7 @@ def _draw(
         spheres: whether spheres can be seen.
     """
     number, column = which // config.width, which % config.width
-    frame = jax.tree.map(lambda x: x.at[number].get(mode="promise_in_bounds"), frames)
+    frame = frames.take(number)
     u = raycast.columns_of(config)[column]
     held = [words[:, w].at[number, column].get(mode="promise_in_bounds") for w in range(words.shape[1])]
     none = tables.shape[1] - 1
@@ -202,7 +218,7 @@ def _draw(
             picks.append(pick)
         index = jnp.stack(picks)
         picked = rows.at[number[None] * (none + 1) + index].get(mode="promise_in_bounds")
-        boxes = frames.value.boxes.shape[1]
+        boxes = frame.value.boxes.shape[1]
         mixed = index >= boxes if boxes < none else None
         return held, coverage.sides(config, picked, mixed, boxes, frame.heading, u)
 
@@ -218,8 +234,8 @@ def _draw(
     def end(frame: Frame, u: Array, layers: Layers) -> Array:
         return finish(config, frame, _rays(config, frame, u), layers)[:, 0]
 
-    others = sum(getattr(frames.value, kind).shape[1] for kind in ("tilted_boxes", "capsules", "tilted_cylinders"))
-    others += frames.value.spheres.shape[1] if spheres else 0
+    others = sum(getattr(frame.value, kind).shape[1] for kind in ("tilted_boxes", "capsules", "tilted_cylinders"))
+    others += frame.value.spheres.shape[1] if spheres else 0
     if slots is None:
         layers = jax.vmap(lambda f, u: begin(f, u, coverage.DEPTH_OF_LAYERS))(frame, u)
 
