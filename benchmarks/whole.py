@@ -33,7 +33,7 @@ class WholeStep:
         self.decisions = config.train.chunk_steps * config.train.num_envs
         state = self.trainer.init(config.train.seed)
         began = time.perf_counter()
-        self.trainer.compile(state)
+        self.trainer.compile()
         self.compile_seconds = time.perf_counter() - began
         self.done = 0
         self.state = state

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from functools import partial
 
 import jax
@@ -12,6 +13,7 @@ from jax import Array
 from jax.sharding import Mesh, PartitionSpec
 
 from edqn_jax.config import Config
+from edqn_jax.devices import compiler_options
 from edqn_jax.learn import policy
 from edqn_jax.learn.policy import Memory, PolicyParams
 from edqn_jax.sim import env
@@ -104,11 +106,25 @@ def fly_missions(
     Raises:
         ValueError: if codes are to be shuffled and a device has only one mission.
     """
-    return _compiled(config, shuffle_codes, record, mesh, world, params, key)
+    return _program(mesh)(config, shuffle_codes, record, mesh, world, params, key)
 
 
-@partial(jax.jit, static_argnums=(0, 1, 2, 3))  # by position: a flag left out would be another program
-def _compiled(
+def prepare(config: Config, world: World, params: PolicyParams, key: Array, *, record: bool, mesh: Mesh) -> None:
+    """Compile what `fly_missions` of such arguments runs, so that its first call need not."""
+    _program(mesh).lower(config, False, record, mesh, world, params, key).compile()
+
+
+def _program(mesh: Mesh | None):
+    return _compiled((jax.devices()[0] if mesh is None else mesh.devices.flat[0]).platform)
+
+
+@functools.cache
+def _compiled(platform: str):
+    # Static by position: a flag left out would be another program.
+    return jax.jit(_fly_all, static_argnums=(0, 1, 2, 3), compiler_options=compiler_options(platform))
+
+
+def _fly_all(
     config: Config,
     shuffle_codes: bool,
     record: bool,

@@ -13,6 +13,7 @@ import hashlib
 import platform
 import time
 from collections.abc import Callable, Sequence
+from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from importlib import metadata
 from typing import Any, Literal
 
@@ -21,7 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh
 
-from edqn_jax import cluster
+from edqn_jax import cluster, flights
 from edqn_jax.baselines.astar import Path as ShortestPath
 from edqn_jax.baselines.astar import shortest_path
 from edqn_jax.checkpoint import save_policy
@@ -29,7 +30,7 @@ from edqn_jax.config import DENSITIES, Config
 from edqn_jax.devices import choose_devices
 from edqn_jax.endings import DivergedError, StoppedError
 from edqn_jax.evaluate import flight_summary, spl, summarise, trajectory
-from edqn_jax.flights import Flights, fly_missions
+from edqn_jax.flights import Flights
 from edqn_jax.learn.policy import PolicyParams
 from edqn_jax.learn.trainer import Episodes, Losses, Plan, Trainer, TrainState, policy_of
 from edqn_jax.report.gallery import draw_gallery
@@ -53,13 +54,20 @@ class Courses:
     validation: World
     final: World
     """Mission 0 is the one that is judged; nothing flies it before the end."""
-    shortest: ShortestPath
-    """A*'s path of that mission."""
 
     @property
     def scene(self) -> Scene:
         """The world of the mission that is judged."""
         return take_scene(self.final.pool, self.final.missions.scene[0])
+
+    def shortest(self, config: Config) -> ShortestPath:
+        """A*'s path of that mission.
+
+        Raises:
+            ConfigError: if there is none.
+        """
+        scene = self.scene
+        return shortest_path(scene, scene.start, scene.goal, config.drone.body_radius_m)
 
 
 def lay_courses(config: Config) -> Courses:
@@ -80,16 +88,13 @@ def lay_courses(config: Config) -> Courses:
         }
         training = worlds.random_missions(pools["training"], config.world.missions, training_key)
         validation, final = (worlds.own_missions(pools[split]) for split in ("validation", "test"))
-        judged = take_scene(pools["test"], 0)
         return Courses(
             training=World(airframe, pools["training"], training),
             validation=World(airframe, pools["validation"], validation),
             final=World(airframe, pools["test"], final),
-            shortest=shortest_path(judged, judged.start, judged.goal, radius),
         )
     loaded = load_world(resolve_world(config.world.name))
     check_scene(loaded.scene, radius, names=loaded.names, title=f"'{config.world.name}'")
-    shortest = shortest_path(loaded.scene, loaded.scene.start, loaded.scene.goal, radius)
     pool = stack_scenes([loaded.scene])
     spread, jitter = config.world.own_start_fraction, config.world.start_jitter_m
     training = worlds.spread_missions(pool, config.world.missions, spread, jitter, training_key)
@@ -101,7 +106,6 @@ def lay_courses(config: Config) -> Courses:
         training=World(airframe, pool, training),
         validation=World(airframe, pool, validation),
         final=World(airframe, pool, _typed(final)),
-        shortest=shortest,
     )
 
 
@@ -208,21 +212,55 @@ def train_run(
         DivergedError: if a loss stops being finite.
         StoppedError: after saving the policy, if `stop_requested()` turned true.
     """
+    pool = ThreadPoolExecutor(max_workers=1, thread_name_prefix="compiling")
+    try:
+        return _train(config, run, progress, stop_requested, pool)
+    finally:
+        pool.shutdown(cancel_futures=True)
+
+
+def _ahead(pool: Executor, work: Callable[[], None]) -> Future[float]:
+    """Does `work` beside what follows; its result are the seconds that it took.
+
+    Of several processes none works ahead: all must meet in one order.
+    """
+
+    def timed() -> float:
+        began = time.perf_counter()
+        work()
+        return time.perf_counter() - began
+
+    future = pool.submit(timed)
+    if jax.process_count() > 1:
+        future.result()
+    return future
+
+
+def _train(
+    config: Config,
+    run: RunDirectory | None,
+    progress: Progress,
+    stop_requested: Callable[[], bool],
+    pool: Executor,
+) -> dict[str, Any]:
+    """`train_run`, which compiles in the pool."""
     began = time.perf_counter()
     devices = choose_devices(config.train.devices, config.train.shards)
     courses = cluster.together(lambda: lay_courses(config))  # a world's file may be missing on one host
     trainer = Trainer(config, courses.training, devices)
-    cluster.together(lambda: None if run is None else run.create(config))
     progress.message(f"{config.world.name} world, {_described(devices)}; compiling")
+    compiled = _ahead(pool, trainer.compile)
+    shortest = cluster.together(lambda: courses.shortest(config))
+    cluster.together(lambda: None if run is None else run.create(config))
     state = trainer.init(config.train.seed)
-    compiling = time.perf_counter()
-    trainer.compile(state)
-    compile_seconds = time.perf_counter() - compiling
+    compile_seconds = compiled.result()
 
     plan, envs, chunk = trainer.plan, config.train.num_envs, config.train.chunk_steps
     log = _Log(config, run)
     kept = Candidate(jax.tree.map(np.asarray, policy_of(state)))
     mesh = Mesh(np.asarray(devices), ("mission",))
+    given = _placed(config, courses.validation, kept.params, mesh)
+    flyable = _ahead(pool, lambda: flights.prepare(config, *given, record=True, mesh=mesh))
     progress.start(plan.total * envs)
     train_seconds, validated = 0.0, 0
     done = 0
@@ -242,11 +280,12 @@ def train_run(
         if crossed or finished:
             validated = done * envs
             params = jax.tree.map(np.asarray, policy_of(state))
-            flights = _fly(config, courses.validation, params, mesh)
-            rate = float(np.mean(flights.outcome == Outcome.GOAL))
+            flyable.result()
+            flown = _fly(config, courses.validation, params, mesh)
+            rate = float(np.mean(flown.outcome == Outcome.GOAL))
             log.validations.append((validated, time.perf_counter() - began, rate))
             straight = _straight(courses.validation.missions, config.env.goal_radius_m)
-            weighted = spl(np.asarray(flights.outcome) == Outcome.GOAL, np.asarray(flights.path_length_m), straight)
+            weighted = spl(np.asarray(flown.outcome) == Outcome.GOAL, np.asarray(flown.path_length_m), straight)
             metrics |= {"validation_success": rate, "validation_spl": weighted}
             kept = choose(config.train.keep, kept, Candidate(params, weighted, rate, validated))
         if run is not None:
@@ -265,17 +304,17 @@ def train_run(
     if run is not None:
         save_policy(run.checkpoints, kept.params)
 
-    flights = _fly(config, courses.final, kept.params, mesh)
+    flown = _fly(config, courses.final, kept.params, mesh)
     digest = state_digest(state)  # the last that all processes do together
     scene = jax.tree.map(np.asarray, courses.scene)
-    flight = flight_summary(flights)
+    flight = flight_summary(flown)
     if run is not None:
-        run.write_trajectory(trajectory(config, flights))
-        draw_gallery(config, run, scene, kept.params, np.asarray(courses.shortest.points), flight["outcome"])
+        run.write_trajectory(trajectory(config, flown))
+        draw_gallery(config, run, scene, kept.params, np.asarray(shortest.points), flight["outcome"])
     since = first_success(log.validations)
     summary = {
         **flight,
-        "shortest_path_m": courses.shortest.length_m,
+        "shortest_path_m": shortest.length_m,
         "world": config.world.name,
         "seed": config.train.seed,
         "train_decisions": done * envs,
@@ -295,7 +334,7 @@ def train_run(
         "state_digest": digest,
     }
     if config.world.name in DENSITIES:
-        summary["test"] = summarise(flights)
+        summary["test"] = summarise(flown)
     if run is not None:
         run.write_summary(summary)
         progress.message(_verdict(summary, run))
@@ -309,8 +348,12 @@ def _described(devices: Sequence[jax.Device]) -> str:  # pyright: ignore[reportI
 
 def _fly(config: Config, world: World, params: PolicyParams, mesh: Mesh) -> Flights:
     """The world's missions, flown and recorded; sensor noise is the same each time."""
-    world, params = cluster.replicate((world, params), mesh)
-    return cluster.fetch(fly_missions(config, world, params, jax.random.key(config.train.seed), record=True, mesh=mesh))
+    return cluster.fetch(flights.fly_missions(config, *_placed(config, world, params, mesh), record=True, mesh=mesh))
+
+
+def _placed(config: Config, world: World, params: PolicyParams, mesh: Mesh) -> tuple[World, PolicyParams, jax.Array]:
+    """What `fly_missions` is given."""
+    return *cluster.replicate((world, params), mesh), jax.random.key(config.train.seed)
 
 
 def _straight(missions: Missions, goal_radius_m: float) -> np.ndarray:

@@ -164,9 +164,9 @@ def test_a_recorded_flight_becomes_columns_and_a_summary_and_compiles_nothing_an
     world, params = jax.device_put((course.world, always((1, 0, 0))), layout)
     key = jax.random.key(0)
     flown = fly_missions(CONFIG, world, params, key, record=True, mesh=mesh)
-    programs = flights._compiled._cache_size()  # type: ignore[attr-defined]
+    programs = flights._program(mesh)._cache_size()
     fly_missions(CONFIG, world, params, jax.random.key(1), record=True, mesh=mesh)
-    assert flights._compiled._cache_size() == programs  # type: ignore[attr-defined]
+    assert flights._program(mesh)._cache_size() == programs
     mission = int(np.flatnonzero(np.asarray(flown.outcome) == Outcome.COLLISION)[0])
     start = np.asarray(world.missions.start[mission])
     columns = trajectory(CONFIG, flown, mission)

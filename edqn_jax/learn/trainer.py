@@ -360,6 +360,10 @@ def policy_of(state: TrainState) -> PolicyParams:
     return PolicyParams(encoder=state.learner.encoder, q=state.learner.average)
 
 
+def _laid(shapes: Any, sharding: NamedSharding) -> Any:
+    return jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=sharding), shapes)
+
+
 class Trainer:
     """A compiled, donated chunk over a mesh of devices. The state goes in and comes out; nothing is kept here.
 
@@ -378,13 +382,23 @@ class Trainer:
     def init(self, seed: int) -> TrainState:
         """The state before the first step, laid out over the devices."""
         make = jax.jit(lambda world, key: init(self.config, world, key))
-        spread, same = NamedSharding(self.mesh, PartitionSpec(AXIS)), self.replicated
-        layout: Any = TrainState(actors=spread, learner=same, step=same)  # pyright: ignore[reportArgumentType]
         # Made whole and then cut: made in parts it would be rounded otherwise. `device_put` reaches no other process.
-        return jax.jit(lambda state: state, out_shardings=layout)(make(self.world, jax.random.key(seed)))
+        whole = make(self.world, jax.random.key(seed))
+        return jax.jit(lambda state: state, out_shardings=self._layout())(whole)
 
-    def compile(self, state: TrainState) -> None:
-        """Trace and compile the chunk, once."""
+    def _layout(self) -> Any:
+        spread, same = NamedSharding(self.mesh, PartitionSpec(AXIS)), self.replicated
+        return TrainState(actors=spread, learner=same, step=same)  # pyright: ignore[reportArgumentType]
+
+    def compile(self) -> None:
+        """Trace and compile the chunk, once; needs no state, so that it can go on while one is made."""
+        shapes = jax.eval_shape(partial(init, self.config), self.world, jax.random.key(0))
+        layout = self._layout()
+        state = TrainState(
+            actors=_laid(shapes.actors, layout.actors),
+            learner=_laid(shapes.learner, layout.learner),
+            step=_laid(shapes.step, layout.step),
+        )
         spread, same = PartitionSpec(AXIS), PartitionSpec()
         # One spec for each subtree: only environments and replay are spread, and what they return.
         specs: Any = TrainState(actors=spread, learner=same, step=same)  # pyright: ignore[reportArgumentType]
@@ -410,6 +424,6 @@ class Trainer:
             state, (episodes [K, S, E], losses [K]); the episodes are spread over the devices as the shards are.
         """
         if self._chunk is None:
-            self.compile(state)
+            self.compile()
         assert self._chunk is not None
         return self._chunk(self.world, state, self._steps(first))
