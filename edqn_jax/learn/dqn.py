@@ -91,4 +91,4 @@ def exploration(config: AgentConfig, decisions: Array, total: int, episodes: Arr
 def optimiser(config: AgentConfig, updates: int) -> optax.GradientTransformation:
     """Adam with a clipped global norm and a step size that falls linearly over `updates`."""
     rate = optax.linear_schedule(config.learning_rate, config.final_learning_rate, max(updates, 1))
-    return optax.chain(optax.clip_by_global_norm(config.max_gradient_norm), optax.adam(rate))
+    return optax.flatten(optax.chain(optax.clip_by_global_norm(config.max_gradient_norm), optax.adam(rate)))

@@ -166,7 +166,7 @@ def _init_learner(config: Config, key: Array) -> Learner:
 
 
 def _vae_optimiser(config: Config) -> optax.GradientTransformation:
-    return optax.adam(config.encoder.learning_rate)
+    return optax.flatten(optax.adam(config.encoder.learning_rate))
 
 
 def _q_optimiser(config: Config) -> optax.GradientTransformation:
