@@ -13,6 +13,7 @@ from __future__ import annotations
 import argparse
 import hashlib
 import json
+import math
 import statistics
 import subprocess
 import sys
@@ -148,12 +149,22 @@ def row_of(seed: int, summary: dict[str, Any], wall_seconds: float | None) -> di
         "wall_seconds": wall_seconds,
         "train_seconds": summary["train_seconds"],
         "compile_seconds": summary["compile_seconds"],
+        "flies_seconds": flies_seconds(summary, wall_seconds),
+        "flies_decisions": summary["first_success_decisions"],
         "decisions_per_second": summary["decisions_per_second"],
         "validation_success": summary["validation_success"],
         "test_success_rate": summary["test"]["success_rate"] if "test" in summary else None,
         **verdicts,
         "passes": all(verdicts.values()),
     }
+
+
+def flies_seconds(summary: dict[str, Any], wall_seconds: float | None) -> float | None:
+    """Seconds from typing the command to a policy that flies the mission: `run.first_success`."""
+    if wall_seconds is None or summary["first_success_seconds"] is None:
+        return None
+    # The run's own clock starts after the imports.
+    return summary["first_success_seconds"] + max(0.0, wall_seconds - summary["total_seconds"])
 
 
 def failed_row(seed: int, exit_code: int, wall_seconds: float) -> dict[str, Any]:
@@ -165,6 +176,8 @@ def failed_row(seed: int, exit_code: int, wall_seconds: float) -> dict[str, Any]
             "min_clearance_m",
             "train_seconds",
             "compile_seconds",
+            "flies_seconds",
+            "flies_decisions",
             "decisions_per_second",
             "validation_success",
             "test_success_rate",
@@ -203,8 +216,16 @@ def totals(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
         "median_path_over_shortest": middle("path_over_shortest", arrived),
         "median_min_clearance_m": middle("min_clearance_m", arrived),
         "median_wall_seconds": middle("wall_seconds", rows),
+        "median_compile_seconds": middle("compile_seconds", rows),
+        # Seeds that never fly it count as slower than any that do.
+        "median_flies_seconds": _median_or_never([row["flies_seconds"] for row in rows]),
         "median_decisions_per_second": middle("decisions_per_second", rows),
     }
+
+
+def _median_or_never(values: Sequence[float | None]) -> float | None:
+    median = statistics.median([math.inf if value is None else value for value in values] or [math.inf])
+    return median if math.isfinite(median) else None
 
 
 def table(rows: Sequence[dict[str, Any]]) -> str:
@@ -214,8 +235,9 @@ def table(rows: Sequence[dict[str, Any]]) -> str:
         return "" if value is None else format(value, form)
 
     lines = [
-        "| seed | outcome | decisions | path / shortest | clearance, m | wall, s | decisions/s | passes |",
-        "| ---: | --- | ---: | ---: | ---: | ---: | ---: | --- |",
+        "| seed | outcome | decisions | path / shortest | clearance, m | compiling, s | flies after, s | wall, s "
+        "| decisions/s | passes |",
+        "| ---: | --- | ---: | ---: | ---: | ---: | ---: | ---: | ---: | --- |",
     ]
     for row in rows:
         missed = [bar for bar in ("goal", "decisions_ok", "path_ok", "time_ok") if not row[bar]]
@@ -223,6 +245,7 @@ def table(rows: Sequence[dict[str, Any]]) -> str:
         lines.append(
             f"| {row['seed']} | {row['outcome'].replace('_', ' ')} | {shown(row['decisions'], 'd')} "
             f"| {shown(row['path_over_shortest'], '.3f')} | {shown(row['min_clearance_m'], '.2f')} "
+            f"| {shown(row['compile_seconds'], '.1f')} | {shown(row['flies_seconds'], '.0f')} "
             f"| {shown(row['wall_seconds'], '.0f')} | {shown(row['decisions_per_second'], ',.0f')} "
             f"| {verdict} |"
         )
@@ -246,6 +269,8 @@ def sentences(total: dict[str, Any]) -> str:
         )
     if total["median_wall_seconds"] is not None:
         text += f"\nMedian wall time: {total['median_wall_seconds']:.0f} s."
+    if total["median_flies_seconds"] is not None:
+        text += f"\nMedian time to a policy that flies the mission: {total['median_flies_seconds']:.0f} s."
     return text
 
 

@@ -28,17 +28,17 @@ def use_cpu_devices(count: int | None = None) -> None:
 
 
 @functools.cache
-def compiler_options(platform: str) -> dict[str, str | bool | int]:
+def compiler_options(platform: str) -> dict[str, str | bool]:
     """What programs of ours are compiled with on a platform, beyond its defaults; for `jax.jit` and `compile`.
 
     On CPUs XLA hands sums of products to a library that is made for large ones: one sum of 6 x 6 numbers in a
     physics step then takes longer than the rest of the step. Matrix products stay with the library. Of LLVM's
     optimisations the first level gives programs as fast as the third, and an eighth sooner.
     """
-    options: dict[str, str | bool | int] = {}
+    options: dict[str, str | bool] = {}
     if platform == "cpu":
         options["xla_cpu_experimental_ynn_fusion_type"] = "LIBRARY_FUSION_TYPE_DOT"
-        options["xla_backend_optimization_level"] = 1
+        options["xla_backend_optimization_level"] = "1"
     try:
         jax.jit(lambda: 0, compiler_options=options).lower().compile()
     except (jax.errors.JaxRuntimeError, ValueError):  # another XLA, which has no such option

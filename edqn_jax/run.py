@@ -42,8 +42,8 @@ from edqn_jax.sim.mjcf import check_scene, load_world, resolve_world
 from edqn_jax.sim.scene import Scene, obstacle_count, stack_scenes, take_scene
 from edqn_jax.sim.worlds import Missions
 
-FLIES = 0.8
-"""Share of validation missions from which on a policy counts as one that flies."""
+FLIES = 0.9
+"""Share of the validation missions that begin at or near a world's own start, with which a policy flies the mission."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -54,6 +54,15 @@ class Courses:
     validation: World
     final: World
     """Mission 0 is the one that is judged; nothing flies it before the end."""
+    jitter_m: float = 0.0
+    """How far, along each axis, validation missions near a world's own start may begin from it."""
+
+    @property
+    def from_start(self) -> np.ndarray:
+        """Which validation missions begin at or near their world's own start, and not anywhere: [M] bool."""
+        own = np.asarray(self.validation.pool.start)[np.asarray(self.validation.missions.scene)]
+        apart = np.abs(np.asarray(self.validation.missions.start) - own).max(axis=1)
+        return apart <= self.jitter_m + 1e-3  # positions are rounded to float32
 
     @property
     def scene(self) -> Scene:
@@ -99,13 +108,15 @@ def lay_courses(config: Config) -> Courses:
     spread, jitter = config.world.own_start_fraction, config.world.start_jitter_m
     training = worlds.spread_missions(pool, config.world.missions, spread, jitter, training_key)
     # Half of the validation begins near the start, but never at it.
-    validation = worlds.spread_missions(pool, count, 0.5, max(jitter, 0.5), validation_key)
+    near = max(jitter, 0.5)
+    validation = worlds.spread_missions(pool, count, 0.5, near, validation_key)
     own = worlds.own_missions(pool)
     final = jax.tree.map(lambda one, many: jnp.concatenate([one, many[1:]]), own, validation)
     return Courses(
         training=World(airframe, pool, training),
         validation=World(airframe, pool, validation),
         final=World(airframe, pool, _typed(final)),
+        jitter_m=near,
     )
 
 
@@ -134,7 +145,7 @@ class _Log:
     def __init__(self, config: Config, run: RunDirectory | None) -> None:
         self.config, self.run = config, run
         self.episodes = 0
-        self.validations: list[tuple[int, float, float]] = []  # decisions, seconds, success rate
+        self.validations: list[tuple[int, float, float]] = []  # decisions, seconds, success from the start
 
     def chunk(self, first: int, episodes: Episodes, losses: Losses, seconds: float) -> dict[str, Any]:
         """Writes what ended in a chunk and returns its metrics."""
@@ -169,21 +180,15 @@ class _Log:
 
 
 def first_success(validations: Sequence[tuple[int, float, float]]) -> tuple[int | None, float | None]:
-    """Decisions and seconds at the first validation from which `FLIES` of its missions were always flown.
+    """Decisions and seconds at the first validation in which the mission was flown.
 
     Args:
-        validations: decisions, seconds and success rate of each, in order.
+        validations: decisions, seconds and success rate, of missions from the start, of each, in order.
 
     Returns:
-        (None, None) if the last one was not.
+        (None, None) if none reached `FLIES`.
     """
-    since: tuple[int | None, float | None] = (None, None)
-    for decisions, seconds, rate in validations:
-        if rate < FLIES:
-            since = (None, None)
-        elif since[0] is None:
-            since = (decisions, seconds)
-    return since
+    return next(((decisions, seconds) for decisions, seconds, rate in validations if rate >= FLIES), (None, None))
 
 
 def _mean(values: Any) -> float | None:
@@ -262,7 +267,7 @@ def _train(
     given = _placed(config, courses.validation, kept.params, mesh)
     flyable = _ahead(pool, lambda: flights.prepare(config, *given, record=True, mesh=mesh))
     progress.start(plan.total * envs)
-    train_seconds, validated = 0.0, 0
+    train_seconds, validated, from_start = 0.0, 0, courses.from_start
     done = 0
     while done < plan.total:
         started = time.perf_counter()
@@ -282,11 +287,12 @@ def _train(
             params = jax.tree.map(np.asarray, policy_of(state))
             flyable.result()
             flown = _fly(config, courses.validation, params, mesh)
-            rate = float(np.mean(flown.outcome == Outcome.GOAL))
-            log.validations.append((validated, time.perf_counter() - began, rate))
+            arrived = np.asarray(flown.outcome) == Outcome.GOAL
+            rate, mission = float(np.mean(arrived)), float(np.mean(arrived[from_start]))
+            log.validations.append((validated, time.perf_counter() - began, mission))
             straight = _straight(courses.validation.missions, config.env.goal_radius_m)
-            weighted = spl(np.asarray(flown.outcome) == Outcome.GOAL, np.asarray(flown.path_length_m), straight)
-            metrics |= {"validation_success": rate, "validation_spl": weighted}
+            weighted = spl(arrived, np.asarray(flown.path_length_m), straight)
+            metrics |= {"validation_success": rate, "validation_mission": mission, "validation_spl": weighted}
             kept = choose(config.train.keep, kept, Candidate(params, weighted, rate, validated))
         if run is not None:
             run.append_metrics(metrics)

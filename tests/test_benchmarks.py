@@ -28,6 +28,9 @@ def summary(**changes: Any) -> dict[str, Any]:
         "min_clearance_m": 0.8,
         "train_seconds": 90.0,
         "compile_seconds": 20.0,
+        "total_seconds": 148.0,
+        "first_success_seconds": 60.0,
+        "first_success_decisions": 250_000,
         "decisions_per_second": 6000.0,
         "validation_success": 0.95,
         "workload": {"width": 32},
@@ -104,6 +107,14 @@ def test_each_bar_fails_a_seed_alone(changes: dict[str, Any], wall: float | None
 
 def test_the_very_limits_still_pass() -> None:
     assert mission.row_of(0, summary(steps=188, path_length_m=115.0, shortest_path_m=100.0), 179.9)["passes"]
+
+
+def test_the_time_to_a_policy_counts_from_typing_and_seeds_without_one() -> None:
+    flies = mission.row_of(0, summary(), 150.0)
+    assert flies["flies_seconds"] == pytest.approx(62.0)
+    never = mission.row_of(1, summary(first_success_seconds=None, first_success_decisions=None), 150.0)
+    assert mission.totals([flies, flies, never])["median_flies_seconds"] == pytest.approx(62.0)
+    assert mission.totals([flies, never, never])["median_flies_seconds"] is None
 
 
 def test_totals_count_failed_trainings_but_take_medians_of_flights() -> None:

@@ -19,7 +19,7 @@ from edqn_jax.evaluate import load_run
 from edqn_jax.learn.policy import PolicyParams
 from edqn_jax.learn.trainer import Episodes, Losses
 from edqn_jax.report.progress import Progress
-from edqn_jax.run import Candidate, choose, first_success, train_run
+from edqn_jax.run import Candidate, choose, first_success, lay_courses, train_run
 from edqn_jax.rundir import TRAJECTORY_COLUMNS, RunDirectory, plain
 from tests.learn.test_trainer import CONFIG as SMALL
 
@@ -69,7 +69,7 @@ def test_a_run_stopped_before_any_validation_keeps_what_it_has_learnt(
         losses = Losses(*[jnp.zeros(steps)] * len(dataclasses.fields(Losses)))
         return dataclasses.replace(state, learner=learner), (Episodes(none, none, none), losses)
 
-    monkeypatch.setattr(training.Trainer, "compile", lambda self, state: None)
+    monkeypatch.setattr(training.Trainer, "compile", lambda self: None)
     monkeypatch.setattr(training.Trainer, "chunk", chunk)
     config = dataclasses.replace(CONFIG, train=dataclasses.replace(CONFIG.train, validation_every=0))
     run = RunDirectory(tmp_path / "stopped")
@@ -115,8 +115,14 @@ def test_a_run_ends_with_the_parameters_of_the_best_spl_or_the_last(
     assert kept.decisions == ends_with
 
 
-def test_a_policy_counts_as_flying_from_when_it_kept_flying() -> None:
-    rates = [(100, 1.0, 0.9), (200, 2.0, 0.5), (300, 3.0, 0.8), (400, 4.0, 1.0)]
+def test_a_policy_flies_the_mission_from_its_first_good_validation() -> None:
+    rates = [(100, 1.0, 0.5), (200, 2.0, 0.89), (300, 3.0, 0.9), (400, 4.0, 0.8)]
     assert first_success(rates) == (300, 3.0)
     assert first_success(rates[:2]) == (None, None)
     assert first_success([]) == (None, None)
+
+
+def test_half_of_the_validation_begins_near_the_start_and_all_of_it_in_random_worlds() -> None:
+    own, random = Config(), Config(world=WorldConfig(name="sparse", pool_size=2, missions=8))
+    assert lay_courses(own).from_start.sum() == own.train.validation_missions // 2
+    assert lay_courses(random).from_start.all()

@@ -164,7 +164,7 @@ def test_the_step_size_falls_linearly_and_the_gradient_is_clipped():
     # Adam's step under a constant gradient is the step size.
     np.testing.assert_allclose(sizes, [0.1, 0.08, 0.06, 0.04, 0.02, 0.02], rtol=1e-4)
     moments: Any = state
-    first = moments[1][0].mu["w"]
+    first = moments[1][0].mu  # of all leaves as one vector
     np.testing.assert_allclose(first, (1 - 0.9**6) * np.array([0.6, 0.8]), rtol=1e-4)
 
 
