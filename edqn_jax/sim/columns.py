@@ -34,7 +34,7 @@ from edqn_jax.sim.scene import Scene, UprightBoxes, UprightCylinders, no_shapes
 SLOTS = (0, 2, 4, 8)
 """Shapes that the kinds of blocks have room for; fuller columns take one shape after another."""
 
-BLOCKS = 64
+BLOCKS = 32
 """Blocks that a batch is cut into."""
 
 SMALLEST_BLOCK = 256
