@@ -181,9 +181,9 @@ class EncoderConfig:
     """beta: weight of the KL term per image against the reconstruction error per image."""
     learning_rate: float = 2e-3
     """Adam step size of the VAE."""
-    warmup_decisions: int = 32_768
+    warmup_decisions: int = 16_384
     """Decisions of held random manoeuvres in which the VAE learns before the DQN starts; a quarter of all at most."""
-    warmup_updates_per_step: int = 8
+    warmup_updates_per_step: int = 12
     """VAE updates per training step of the warm-up, each on all new event fields."""
     hold_decisions: int = 4
     """Mean number of decisions for which a random manoeuvre of the warm-up is held."""
@@ -213,7 +213,7 @@ class AgentConfig:
     """gamma."""
     target_rate: float = 0.01
     """Polyak tau of the target network, per update."""
-    average_rate: float = 0.001
+    average_rate: float = 0.002
     """Polyak rate, per update, of the averaged parameters that evaluation flies; 1 flies the newest."""
     learning_rate: float = 1e-3
     """Adam step size at the start."""
@@ -239,7 +239,7 @@ class AgentConfig:
     """epsilon at first."""
     exploration_end: float = 0.02
     """epsilon at last."""
-    exploration_fraction: float = 0.15
+    exploration_fraction: float = 0.1
     """Share of the DQN phase over which epsilon falls linearly; unused when `exploration_episodes` > 0."""
     exploration_episodes: int = 0
     """Episodes per environment over which epsilon falls (`Max_eps_episode` of Table 1); 0 uses the fraction."""
