@@ -380,6 +380,18 @@ def test_a_fresh_environment_rests_at_its_start_and_faces_its_goal(reset):
 
 
 @pytest.mark.slow
+def test_the_first_step_of_an_ended_environment_shows_what_a_reset_shows(reset, world):
+    begun, seen = reset(jax.random.key(0), MISSION["fence"])
+    waiting = env.ended(FLOWN, world, jax.random.key(0))
+    state, first = jax.jit(lambda s: env.step(FLOWN, world, s, AHEAD, MISSION["fence"]))(waiting)
+    assert bool(first.is_reset) and not state.ended and state.mission == MISSION["fence"]
+    assert first.outcome == Outcome.RUNNING and first.reward == 0.0 and first.episode_length == 0
+    # Two programs, rounded apart.
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-5), first.observation, seen)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-5), state.drone, begun.drone)
+
+
+@pytest.mark.slow
 def test_a_flight_ahead_reaches_its_goal_and_the_next_step_is_the_reset(reset, step, world):
     state, steps = fly(reset, step, "short", [AHEAD] * 4)
     *before, last = steps
