@@ -18,16 +18,19 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import functools
 import itertools
 import math
 import sys
 import time
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from edqn_jax.baselines.planner import path_length, point_text
 from edqn_jax.config import Config, ConfigError
 from edqn_jax.sim.mjcf import check_scene, load_world, resolve_world
 from edqn_jax.sim.scene import Scene, segment_contact, signed_distance
@@ -67,17 +70,19 @@ def shortest_path(
     lattice = _Lattice(scene, start, radius, cell)
     for role, point in (("start", start), ("goal", goal)):
         if not np.all((point >= lattice.lower) & (point <= lattice.upper)):
-            raise NoPathError(f"there is no path: the {role} {_text(point)} lies outside the flight volume")
+            raise NoPathError(f"there is no path: the {role} {point_text(point)} lies outside the flight volume")
         if lattice.distances(point[None])[0] < radius:
-            raise NoPathError(f"there is no path: a sphere of {radius:g} m does not fit at the {role} {_text(point)}")
+            raise NoPathError(
+                f"there is no path: a sphere of {radius:g} m does not fit at the {role} {point_text(point)}"
+            )
     target = lattice.cell_near(goal)
     cells, length = _search(lattice, int(lattice.flat(lattice.origin)), target)
     points = start + cell * (lattice.index(cells) - lattice.origin)
     last = float(np.linalg.norm(goal - points[-1]))
     if last > 0.0:
         points = np.concatenate([points, goal[None]])
-    tight = _pull_tight(scene, points, radius)
-    return Path(tight, _length(tight), length + last)
+    tight = pull_tight(points, functools.partial(_leg_touches, scene, radius=radius))
+    return Path(tight, path_length(tight), length + last)
 
 
 class _Lattice:
@@ -118,7 +123,7 @@ class _Lattice:
         narrow = np.flatnonzero(passable & (room < 0))
         if narrow.size:
             ends = np.concatenate([self.middle(origins[narrow]), self.middle(cells[narrow])], axis=1)
-            passable[narrow] = ~_batched(_touches, self.scene, ends, self.radius)
+            passable[narrow] = ~_batched(_touches, self.scene, ends, self.radius + unseen_depth(self.cell, self.radius))
         return passable
 
     def cell_near(self, point: np.ndarray) -> int:
@@ -130,7 +135,7 @@ class _Lattice:
         for i in np.argsort(np.linalg.norm(middles - point, axis=1), kind="stable"):
             if not _leg_touches(self.scene, middles[i], point, self.radius):
                 return int(self.flat(corners[i]))
-        raise NoPathError(f"there is no path: the goal {_text(point)} is shut in within {self.cell:g} m")
+        raise NoPathError(f"there is no path: the goal {point_text(point)} is shut in within {self.cell:g} m")
 
 
 def _search(lattice: _Lattice, source: int, target: int) -> tuple[np.ndarray, float]:
@@ -178,7 +183,7 @@ def _search(lattice: _Lattice, source: int, target: int) -> tuple[np.ndarray, fl
         now = now[is_open[now]]
         later.append(cells[~soon])
     if not np.isfinite(g[target]):
-        ends = _text(lattice.middle(np.array(source))), _text(lattice.middle(np.array(target)))
+        ends = point_text(lattice.middle(np.array(source))), point_text(lattice.middle(np.array(target)))
         raise NoPathError(
             f"there is no path from {ends[0]} to {ends[1]} for a sphere of {lattice.radius:g} m: every way is blocked"
         )
@@ -195,17 +200,29 @@ def _free_length(index: np.ndarray, goal: np.ndarray, cell: float) -> np.ndarray
     return cell * (math.sqrt(3) * low + math.sqrt(2) * (middle - low) + (high - middle))
 
 
-def _pull_tight(scene: Scene, points: np.ndarray, radius: float) -> np.ndarray:
-    """Shorten a path by line of sight, cut its corners and shorten again, until less than 1 cm is gained."""
-    points = _skip_ahead(scene, points, radius)
+def unseen_depth(cell: float, radius: float) -> float:
+    """Metres that a sphere can sink in between two samples of an edge at most, (h / 2)^2 / 2 r: the edge's margin.
+
+    `segment_contact` takes 8 samples, so h is a seventh of the longest edge, sqrt(3) cells.
+    """
+    return (math.sqrt(3) * cell / 14) ** 2 / (2 * radius)
+
+
+Touches = Callable[[np.ndarray, np.ndarray], bool]
+"""Whether the sphere touches anything on the straight leg between two points [3]."""
+
+
+def pull_tight(points: np.ndarray, touches: Touches) -> np.ndarray:
+    """Shorten a path [K, 3] by line of sight, cut its corners and shorten again, until less than 1 cm is gained."""
+    points = _skip_ahead(points, touches)
     while True:
-        tighter = _skip_ahead(scene, _cut_corners(scene, points, radius), radius)
-        if _length(tighter) > _length(points) - 0.01:
+        tighter = _skip_ahead(_cut_corners(points, touches), touches)
+        if path_length(tighter) > path_length(points) - 0.01:
             return points
         points = tighter
 
 
-def _cut_corners(scene: Scene, points: np.ndarray, radius: float) -> np.ndarray:
+def _cut_corners(points: np.ndarray, touches: Touches) -> np.ndarray:
     """Cut each corner off as far up its two legs, half of each at most, as the short cut stays free."""
     kept = [points[0]]
     for before, corner, after in zip(points[:-2], points[1:-1], points[2:], strict=True):
@@ -213,7 +230,7 @@ def _cut_corners(scene: Scene, points: np.ndarray, radius: float) -> np.ndarray:
         for _ in range(7):  # to 1 % of the leg
             share = (free + blocked) / 2
             a, b = corner + share / 2 * (before - corner), corner + share / 2 * (after - corner)
-            if _leg_touches(scene, a, b, radius):
+            if touches(a, b):
                 blocked = share
             else:
                 free = share
@@ -224,12 +241,12 @@ def _cut_corners(scene: Scene, points: np.ndarray, radius: float) -> np.ndarray:
     return np.array([*kept, points[-1]])
 
 
-def _skip_ahead(scene: Scene, points: np.ndarray, radius: float) -> np.ndarray:
+def _skip_ahead(points: np.ndarray, touches: Touches) -> np.ndarray:
     """From each point go straight to the furthest later one that is in sight."""
     kept, here = [0], 0
     while here < len(points) - 1:
         there = len(points) - 1
-        while there > here + 1 and _leg_touches(scene, points[here], points[there], radius):
+        while there > here + 1 and touches(points[here], points[there]):
             there -= 1
         kept.append(there)
         here = there
@@ -280,14 +297,6 @@ def _batched(function, scene: Scene, rows: np.ndarray, *rest: float) -> np.ndarr
         parts.append(np.asarray(function(scene, padded, *map(np.float32, rest)))[: len(part)])
         done += len(part)
     return np.concatenate(parts)
-
-
-def _length(points: np.ndarray) -> float:
-    return float(np.linalg.norm(np.diff(points, axis=0), axis=1).sum())
-
-
-def _text(point: np.ndarray) -> str:
-    return "(" + ", ".join(f"{value:g}" for value in point) + ")"
 
 
 def main(arguments: list[str] | None = None) -> int:

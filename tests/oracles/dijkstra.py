@@ -9,6 +9,7 @@ import math
 import jax
 import numpy as np
 
+from edqn_jax.baselines.astar import unseen_depth
 from edqn_jax.sim.scene import Scene, segment_contact, signed_distance
 
 
@@ -30,7 +31,8 @@ def shortest_length(
     fits = _distances(scene, middle) >= radius
     free = dict(zip(cells, np.asarray(fits), strict=True))
     ends = lower + cell * np.array(edges, np.float32)
-    touch = _touches(scene, ends, radius)
+    # An edge is sampled, and keeps off by what the sphere can sink in unnoticed between two samples.
+    touch = _touches(scene, ends, radius + unseen_depth(cell, radius))
     neighbours = {a: [] for a in cells}
     for (a, b), touches in zip(edges, np.asarray(touch), strict=True):
         if free[a] and free[b] and not touches:

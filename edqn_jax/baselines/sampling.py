@@ -1,0 +1,103 @@
+"""RRT* and BIT*: sampling planners that keep shortening their path, by the library OMPL. They know the map.
+
+RRT*: Karaman and Frazzoli, "Sampling-based Algorithms for Optimal Motion Planning", Int. J. Robotics Research
+30(7), 2011. BIT*: Gammell, Srinivasa and Barfoot, "Batch Informed Trees", ICRA 2015. OMPL: Sucan, Moll and
+Kavraki, "The Open Motion Planning Library", IEEE Robotics & Automation Magazine 19(4), 2012; its own defaults
+apply.
+
+Both draw at random and never end by themselves: they use the whole budget, in seconds or in OMPL's iterations,
+whichever is spent first, and say when they knew a first path and how long the last one is. OMPL asks about legs,
+not points, and each question is answered by the scene's exact distances in compiled code.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+import time
+from typing import Any
+
+import numpy as np
+
+from edqn_jax.baselines.planner import MARGIN, Budget, Plan, Task, not_found, path_length, refusal, require
+from edqn_jax.baselines.solids import leg_free, solid_table
+
+base = require("ompl.base")
+geometric = require("ompl.geometric")
+util = require("ompl.util")
+
+
+class _Legs(base.MotionValidator):
+    """Whether the drone's sphere passes straight between two states."""
+
+    def __init__(self, information: Any, table: np.ndarray, radius: float):
+        super().__init__(information)
+        self.table, self.radius = table, radius
+
+    def checkMotion(self, start: Any, end: Any) -> bool:  # noqa: N802 (OMPL's name)
+        return leg_free(self.table, tuple(start[0:3]), tuple(end[0:3]), self.radius)
+
+
+def rrt_star(task: Task, budget: Budget = Budget(), seed: int = 0) -> Plan:  # noqa: B008 (it is frozen)
+    """The shortest path that RRT* knows when the budget is spent."""
+    return _plan(geometric.RRTstar, task, budget, seed)
+
+
+def bit_star(task: Task, budget: Budget = Budget(), seed: int = 0) -> Plan:  # noqa: B008
+    """The shortest path that BIT* knows when the budget is spent."""
+    return _plan(geometric.BITstar, task, budget, seed)
+
+
+def _plan(algorithm: Any, task: Task, budget: Budget, seed: int) -> Plan:
+    refused = refusal(task)
+    if refused:
+        return not_found(refused)
+    _compile()
+    util.setLogLevel(util.LOG_NONE)
+    util.RNG.setSeed(seed + 1)  # 0 is no seed to OMPL
+    began = time.perf_counter()
+    table, radius = solid_table(task.scene), task.body_radius + MARGIN
+    lower, upper = np.asarray(task.scene.volume, np.float64)
+    space, bounds = base.RealVectorStateSpace(3), base.RealVectorBounds(3)
+    bounds.low, bounds.high = lower.tolist(), upper.tolist()
+    space.setBounds(bounds)
+    information = base.SpaceInformation(space)
+    information.setStateValidityChecker(lambda state: leg_free(table, tuple(state[0:3]), tuple(state[0:3]), radius))
+    information.setMotionValidator(_Legs(information, table, radius))
+    information.setup()
+    problem = base.ProblemDefinition(information)
+    ends = space.allocState(), space.allocState()
+    for state, point in zip(ends, (task.start, task.goal), strict=True):
+        state[0:3] = point.tolist()
+    problem.setStartAndGoalStates(*ends)
+    problem.setOptimizationObjective(base.PathLengthOptimizationObjective(information))
+    planner = algorithm(information)
+    planner.setProblemDefinition(problem)
+    planner.setup()
+
+    first: list[float] = []
+    steps = math.inf if budget.steps is None else budget.steps
+
+    def spent() -> bool:
+        elapsed = time.perf_counter() - began
+        if not first:
+            best = planner.bestCost().value()
+            if math.isfinite(best):
+                first.extend((elapsed, best))
+        return elapsed >= budget.seconds or planner.numIterations() >= steps
+
+    planner.solve(base.PlannerTerminationCondition(spent))
+    seconds, taken = time.perf_counter() - began, planner.numIterations()
+    if not problem.hasExactSolution():
+        return not_found(f"none was found within {seconds:.3g} s and {taken} iterations", seconds, taken)
+    path = np.array([state[0:3] for state in problem.getSolutionPath().getStates()])
+    if not first:  # the path came with the last iteration
+        first = [seconds, path_length(path)]
+    return Plan(path, "", seconds, taken, first[0], first[1])
+
+
+@functools.lru_cache(maxsize=1)
+def _compile() -> None:
+    """Let numba compile before the clock starts."""
+    point = 0.0, 0.0, 0.0
+    leg_free(np.zeros((0, 17)), point, point, 0.0)

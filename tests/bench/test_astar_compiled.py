@@ -1,0 +1,75 @@
+"""The compiled A* against the plain one."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from edqn_jax.baselines import astar, astar_compiled, snn
+from edqn_jax.baselines.planner import Budget, Plan, Task
+from edqn_jax.baselines.solids import solid_table
+from edqn_jax.sim.mjcf import load_scene, resolve_world
+from edqn_jax.sim.worlds import random_scene, world_key
+from tests.baselines.rooms import RADIUS, assert_flyable, box, random_room, room
+
+
+def lattice_length(task: Task, cell: float = 0.5) -> float:
+    """Of the compiled search, the last leg to the goal included; infinite without a way."""
+    lower, upper = np.asarray(task.scene.volume, np.float64)
+    margin = astar.unseen_depth(cell, task.body_radius)
+    table = solid_table(task.scene)
+    limits = task.body_radius, margin, 10**9
+    _, points, length, _ = astar_compiled.search(table, task.start, task.goal, lower, upper, cell, *limits)
+    return length + np.linalg.norm(task.goal - points[-1]) if len(points) else np.inf
+
+
+def assert_like_the_plain_one(task: Task, plan: Plan) -> None:
+    try:
+        plain = astar.shortest_path(task.scene, task.start, task.goal, task.body_radius)
+    except astar.NoPathError:
+        assert not plan.found
+        assert lattice_length(task) == np.inf
+        return
+    # Ties are broken by a billionth of the length, and the plain one stops within as much.
+    assert lattice_length(task) == pytest.approx(plain.grid_length_m, abs=1e-6)
+    # 0.14 mm deeper in than the radius is what a stride of 2 cm may miss; the rest is float32.
+    assert_flyable(task, plan.path, tolerance=2e-4)
+    assert plan.length_m <= plain.grid_length_m + 1e-6
+    # Of many shortest lattice paths each takes one, and they are pulled tight to different lengths.
+    assert plan.length_m == pytest.approx(plain.length_m, rel=0.05)
+
+
+@settings(max_examples=60, deadline=None, derandomize=True)
+@given(seed=st.integers(0, 2**32 - 1), shapes=st.integers(0, 7))
+def test_in_random_rooms_the_lattice_path_is_as_short_as_the_plain_ones(seed, shapes):
+    task = random_room(seed, shapes)
+    assert_like_the_plain_one(task, astar_compiled.plan(task))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("world", ["paper", "medium 0", "medium 1", "dense 0"])
+def test_in_large_worlds_too(world):
+    name, *index = world.split()
+    scene = random_scene(name, world_key("test", int(index[0]))) if index else load_scene(resolve_world(name))
+    task = Task.of(scene, body_radius=RADIUS)
+    assert_like_the_plain_one(task, astar_compiled.plan(task))
+
+
+def test_no_other_planner_of_lattices_is_shorter():
+    task = room(box((5, 0, 0), (6, 9, 6)))
+    assert astar_compiled.plan(task).length_m <= snn.plan(task).length_m
+
+
+def test_ends_between_cells_are_met():
+    task = room(start=(2.13, 6.0, 3.0), goal=(9.87, 6.4, 3.3))
+    path = astar_compiled.plan(task).path
+    assert path is not None
+    np.testing.assert_allclose(path, [task.start, task.goal])
+
+
+def test_the_budget_ends_the_search():
+    plan = astar_compiled.plan(random_room(3), Budget(steps=5))
+    assert plan.reason == "no path: the goal was not reached within 5 cells"
+    assert plan.steps == 5

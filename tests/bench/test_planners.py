@@ -1,0 +1,56 @@
+"""What every planner that knows the map must hold to."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from edqn_jax.baselines.planner import PLANNERS, Budget, Task, load_planner
+from edqn_jax.sim.mjcf import load_scene, resolve_world
+from edqn_jax.sim.worlds import random_scene, world_key
+from tests.baselines.rooms import RADIUS, WITHOUT_A_WAY, assert_flyable, random_room, room
+
+# A* hugs what it passes: its legs are checked every 2 cm, which misses 0.14 mm, and the judge is float32.
+TOLERANCE = {"A*": 2e-4}
+BUDGET = Budget(seconds=1.0)
+
+
+@pytest.mark.parametrize("world", WITHOUT_A_WAY)
+@pytest.mark.parametrize("name", PLANNERS)
+def test_without_a_way_it_says_no_path(name, world):
+    plan = load_planner(name)(WITHOUT_A_WAY[world], BUDGET)
+    assert not plan.found and plan.path is None
+    assert plan.reason.startswith("no path: ")
+    assert np.isnan(plan.length_m) and np.isnan(plan.first_seconds)
+
+
+@pytest.mark.parametrize("name", PLANNERS)
+def test_a_goal_in_a_wall_is_no_path(name):
+    plan = load_planner(name)(room(goal=(10.0, 6.0, 0.1)), BUDGET)
+    assert plan.reason == "no path: a sphere of 0.36 m does not fit at the goal (10, 6, 0.1)"
+
+
+@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("name", PLANNERS)
+def test_every_path_in_a_small_room_is_free(name, seed):
+    task = random_room(seed)
+    plan = load_planner(name)(task, Budget(seconds=600.0, steps=2000 if name in ("RRT*", "BIT*") else None))
+    if name == "APF" and not plan.found:
+        assert "local minimum" in plan.reason or "drives the drone into" in plan.reason
+        return
+    assert_flyable(task, plan.path, TOLERANCE.get(name, 0.0))
+    assert plan.reason == ""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("world", ["paper", "medium 0", "medium 1", "dense 0"])
+@pytest.mark.parametrize("name", PLANNERS)
+def test_every_path_in_a_large_world_is_free(name, world):
+    kind, *index = world.split()
+    scene = random_scene(kind, world_key("test", int(index[0]))) if index else load_scene(resolve_world(kind))
+    task = Task.of(scene, body_radius=RADIUS)
+    plan = load_planner(name)(task, Budget(seconds=600.0, steps=4000 if name in ("RRT*", "BIT*") else None))
+    if name == "APF" and not plan.found:
+        assert "local minimum" in plan.reason or "drives the drone into" in plan.reason
+        return
+    assert_flyable(task, plan.path, TOLERANCE.get(name, 0.0))
