@@ -1,0 +1,88 @@
+"""How long does one decision take at deployment?
+
+An event field and the own state lie on the host, batch 1; the action comes back to the host; dispatch counts. The
+process keeps to one core, so one thread of it can run at a time.
+
+    python benchmarks/decision.py --json decision.json
+    python benchmarks/decision.py -- --preset paper
+
+What stands after -- goes to the configuration as it would for train.py; parameters are fresh, which costs the same.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import statistics
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+
+import json_report
+from edqn_jax.config import Config, ConfigError
+from edqn_jax.evaluate import decision_latency_ms, fresh_policy
+from edqn_jax.files import check_can_write
+from flags import configured, split
+
+REPEATS, CALLS = 5, 2000
+
+
+def parse(argv: Sequence[str] | None = None) -> tuple[argparse.Namespace, Config]:
+    """The arguments, and the configuration whose policy decides.
+
+    Raises:
+        ConfigError: if the flags after -- cannot be run, or the file cannot be written.
+    """
+    words, flags = split(sys.argv[1:] if argv is None else argv)
+    parser = argparse.ArgumentParser(
+        prog="python benchmarks/decision.py",
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("--quick", action="store_true", help=f"{CALLS // 10} decisions instead of {REPEATS} x {CALLS}")
+    parser.add_argument("--json", type=Path, help="write the figures to this file")
+    args = parser.parse_args(words)
+    if args.json is not None:
+        check_can_write(args.json)
+    return args, configured(flags)
+
+
+def measure(config: Config, repeats: int, calls: int) -> dict[str, Any]:
+    """Everything that `--json` holds: medians over `repeats` of the percentiles of `calls` decisions."""
+    params = fresh_policy(config, 0)
+    turns = [decision_latency_ms(config, params, calls) for _ in range(repeats)]
+    return {
+        **json_report.machine(jax.devices()),
+        "cores": 1,
+        "decisions": repeats * calls,
+        "rows": [
+            {"name": "one_decision", **{f"{key}_ms": statistics.median(turn[key] for turn in turns) for key in turns[0]}}
+        ],
+    }
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Exit code 0 when all was measured, 2 for bad input."""
+    try:
+        args, config = parse(argv)
+    except ConfigError as error:
+        print(error, file=sys.stderr)
+        return 2
+    if hasattr(os, "sched_setaffinity"):
+        os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})  # before JAX makes its threads
+    report = measure(config, *((1, CALLS // 10) if args.quick else (REPEATS, CALLS)))
+    row = report["rows"][0]
+    print(
+        f"One decision on one core: median {row['median_ms']:.2f} ms, 99th percentile {row['p99_ms']:.2f} ms "
+        f"({report['decisions']:,} decisions, {report['device']})"
+    )
+    if args.json is not None:
+        json_report.write(args.json, report)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,32 @@
+"""The benchmark of one decision: what it says, and that it keeps to one core."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+
+import pytest
+
+import decision
+
+
+def test_it_keeps_to_one_core_and_says_what_it_measured(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    kept_to: list[set[int]] = []
+    monkeypatch.setattr(os, "sched_setaffinity", lambda pid, cores: kept_to.append(cores), raising=False)
+    monkeypatch.setattr(os, "sched_getaffinity", lambda pid: {2, 3}, raising=False)
+    monkeypatch.setattr(decision, "decision_latency_ms", lambda *_: {"median": 0.5, "p99": 0.75})
+    file = tmp_path / "decision.json"
+    assert decision.main(["--quick", "--json", str(file)]) == 0
+    assert kept_to == [{2}]
+    assert "median 0.50 ms, 99th percentile 0.75 ms (200 decisions" in capsys.readouterr().out
+    report = json.loads(file.read_text())
+    assert report["rows"] == [{"name": "one_decision", "median_ms": 0.5, "p99_ms": 0.75}]
+    assert report["cores"] == 1 and report["versions"]["jax"]
+
+
+def test_bad_input_is_one_sentence(capsys: pytest.CaptureFixture[str]) -> None:
+    assert decision.main(["--", "--agent.batch-size", "0"]) == 2
+    assert capsys.readouterr().err.count("\n") == 1
