@@ -129,7 +129,9 @@ def pictures(request, sorts):
     ours = np.asarray(images(config, pool, *(np.concatenate(part) for part in zip(*flat, strict=True))))
     seen, done = {}, 0
     for sort, (which, *rest) in poses.items():
-        drawn = ours[done : done + len(which)], *(references(config, sorts[sort], which, *rest, n) for n in (8, 2))
+        positions, rotations = rest
+        drawn = [references(config, sorts[sort], which, positions, rotations, samples) for samples in (8, 2)]
+        drawn.insert(0, ours[done : done + len(which)])
         seen[sort] = [frames.reshape(-1, 2, config.height, config.width) for frames in drawn]
         done += len(which)
     return mount, seen
