@@ -59,7 +59,10 @@ def measure(config: Config, repeats: int, calls: int) -> dict[str, Any]:
         "cores": 1,
         "decisions": repeats * calls,
         "rows": [
-            {"name": "one_decision", **{f"{key}_ms": statistics.median(turn[key] for turn in turns) for key in turns[0]}}
+            {
+                "name": "one_decision",
+                **{f"{key}_ms": statistics.median(turn[key] for turn in turns) for key in turns[0]},
+            }
         ],
     }
 
