@@ -74,7 +74,7 @@ if __name__ == "__main__":
     Trainer.init, run.train_run = noting_init, noting_run
     if argv[:1] == ["--no-learning"]:
         del argv[0]
-        Trainer.init, Trainer.compile, Trainer.chunk = only_a_policy, lambda self, state: None, no_learning
+        Trainer.init, Trainer.compile, Trainer.chunk = only_a_policy, lambda self: None, no_learning
     code = main(["train", *argv])
     Path(note).write_text(json.dumps(plain(noted)), encoding="utf-8")
     sys.exit(code)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -164,9 +165,10 @@ def test_a_recorded_flight_becomes_columns_and_a_summary_and_compiles_nothing_an
     world, params = jax.device_put((course.world, always((1, 0, 0))), layout)
     key = jax.random.key(0)
     flown = fly_missions(CONFIG, world, params, key, record=True, mesh=mesh)
-    programs = flights._program(mesh)._cache_size()
+    program: Any = flights._program(mesh)
+    programs = program._cache_size()
     fly_missions(CONFIG, world, params, jax.random.key(1), record=True, mesh=mesh)
-    assert flights._program(mesh)._cache_size() == programs
+    assert program._cache_size() == programs
     mission = int(np.flatnonzero(np.asarray(flown.outcome) == Outcome.COLLISION)[0])
     start = np.asarray(world.missions.start[mission])
     columns = trajectory(CONFIG, flown, mission)
