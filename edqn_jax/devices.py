@@ -11,16 +11,23 @@ import jax
 
 from edqn_jax.config import ConfigError
 
+ALIKE = "--xla_backend_extra_options=xla_cpu_disable_loop_unrolling"
+"""XLA's flag under which programs for CPUs round alike whatever the size of a batch (docs/decisions/0006)."""
+
 
 def use_cpu_devices(count: int | None = None) -> None:
     """Lets JAX present the CPU as `count` devices; must be called before JAX is first used.
 
-    `None` means one per core. Has no effect on which accelerators JAX finds, and prefers.
+    `None` means one per core. Has no effect on which accelerators JAX finds, and prefers. Adds to `XLA_FLAGS` what
+    makes flights equal on any number of devices, unless extra options stand there already.
 
     Raises:
         RuntimeError: if JAX has been used already.
     """
     jax.config.update("jax_num_cpu_devices", cores() if count is None else count)
+    flags = os.environ.get("XLA_FLAGS", "")
+    if "xla_backend_extra_options" not in flags:
+        os.environ["XLA_FLAGS"] = f"{flags} {ALIKE}".strip()
     if jax.__version_info__[:2] == (0, 11):
         # Its new partitioner crashes on arrays without elements, which a scene without capsules has, where
         # `shard_map` and a loop meet. The old one does not.

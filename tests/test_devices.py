@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import types
 from typing import Any
 
@@ -81,6 +82,21 @@ def test_only_jax_0_11_is_told_to_use_the_old_partitioner(version, partitioner, 
     monkeypatch.setattr(devices, "jax", types.SimpleNamespace(config=config, __version_info__=version))
     use_cpu_devices(3)
     assert told == {"jax_num_cpu_devices": 3, **partitioner}
+
+
+@pytest.mark.parametrize(
+    ("given", "then"),
+    [
+        ("", devices.ALIKE),
+        ("--xla_cpu_max_isa=AVX", f"--xla_cpu_max_isa=AVX {devices.ALIKE}"),
+        ("--xla_backend_extra_options=a", "--xla_backend_extra_options=a"),
+    ],
+)
+def test_loops_are_left_as_they_are_unless_somebody_gave_options_of_their_own(given, then, monkeypatch):
+    monkeypatch.setattr(jax.config, "update", lambda *_: None)
+    monkeypatch.setenv("XLA_FLAGS", given)
+    use_cpu_devices(2)
+    assert os.environ["XLA_FLAGS"] == then
 
 
 def test_an_option_that_xla_does_not_know_is_left_out(monkeypatch):

@@ -11,7 +11,7 @@ import pytest
 
 from edqn_jax.sim.env import Outcome
 from tests.layout_process import CONFIG, DECISIONS, DEVICES
-from tests.processes import FEWER_PASSES, PATIENCE_S, ROOT
+from tests.processes import PATIENCE_S, ROOT
 
 pytestmark = pytest.mark.slow
 
@@ -20,14 +20,10 @@ Leaves = dict[str, np.ndarray]
 
 @pytest.fixture(scope="module")
 def layouts(tmp_path_factory: pytest.TempPathFactory) -> dict[int, Leaves]:
-    """What each number of devices came to.
-
-    Compiled without LLVM's optimisations: loops that it unrolls round MJX's rotor moments otherwise for another size
-    of the batch, in the last bit (docs/decisions/0006).
-    """
+    """What each number of devices came to."""
     folder = tmp_path_factory.mktemp("layouts")
     words = [sys.executable, "-m", "tests.layout_process", str(folder)]
-    variables = {**os.environ, "PYTHONPATH": str(ROOT), "XLA_FLAGS": FEWER_PASSES}
+    variables = {**os.environ, "PYTHONPATH": str(ROOT), "XLA_FLAGS": ""}  # the program that trains
     ended = subprocess.run(words, env=variables, capture_output=True, text=True, timeout=PATIENCE_S)
     assert ended.returncode == 0, ended.stderr
     return {count: dict(np.load(folder / f"{count}.npz")) for count in DEVICES}
