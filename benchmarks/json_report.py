@@ -9,7 +9,7 @@ from typing import Any
 
 from edqn_jax.devices import processor
 from edqn_jax.files import write_whole
-from edqn_jax.run import versions
+from edqn_jax.provenance import versions
 from edqn_jax.rundir import plain
 
 

@@ -9,17 +9,18 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 from jax.sharding import PartitionSpec
 
 from edqn_jax.config import Config
 from edqn_jax.learn import dqn, encoder, qnetwork, replay, trainer
 from edqn_jax.learn.trainer import AXIS, Actors, Learner, TrainState
-from edqn_jax.sim import drone, env, events
+from edqn_jax.sim import camera, columns, drone, env, events
 from edqn_jax.sim.drone import DroneState
 from edqn_jax.sim.env import EnvState, World
 from edqn_jax.sim.scene import take_scene
-from timing import Part, nudged, size_of
+from timing import Part, nudged, operations_of, size_of
 
 _ROWS, _SAME = PartitionSpec(AXIS), PartitionSpec()
 _LEARNER_AND_KEYS = (_ROWS, (_SAME, _ROWS))
@@ -147,7 +148,34 @@ def rendering(now: Moment) -> Part:
     poses = [
         jnp.stack([path[:, t - 1] for t in steps], 1) for path in (now.seen.flight.position, now.seen.flight.quaternion)
     ]
-    return Part("rendering", body, now.world, (*poses, now.scenes))
+    return Part("rendering", body, now.world, (*poses, now.scenes), by_hand=_drawing(now, *poses))
+
+
+def _drawing(now: Moment, position: Array, quaternion: Array) -> float | None:
+    """Operations that frames at poses [E, T, ...] take at the least, for each column those of the way that it needs.
+
+    XLA counts a loop's body once, and one block of columns needs another way than the next; so every way is counted
+    for one column, and the columns by the way that they need. None where nothing is counted: on a GPU, and for
+    cameras that do not draw by columns.
+    """
+    config = now.config.camera
+    if config.mount != "level":
+        return None
+    times = position.shape[1]
+    scene = jax.tree.map(
+        lambda leaf: jnp.repeat(leaf, times, axis=0), jax.vmap(partial(take_scene, now.world.pool))(now.scenes)
+    )
+    place = position.reshape(-1, 3)
+    turn = jax.vmap(partial(env.mount_rotation, now.config))(quaternion.reshape(-1, 4))
+    weights = jnp.broadcast_to(jnp.asarray(camera.LUMA), (len(place), 3))
+    given = (scene, place, turn, weights)
+    ways, way = columns.ways_to_draw(config, *given)
+    laid = operations_of(lambda *given: columns.ways_to_draw(config, *given)[1], *given)
+    each = [operations_of(partial(draw, config, camera.blend), jnp.zeros(1, jnp.int32)) for draw in ways]
+    if laid is None:
+        return None
+    needed = np.bincount(np.asarray(way), minlength=len(ways))
+    return laid + sum(count * cost for count, cost in zip(needed, each, strict=True) if cost is not None)
 
 
 def sensing(now: Moment) -> Part:

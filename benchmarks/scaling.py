@@ -31,8 +31,9 @@ from ceilings import Rollout
 from edqn_jax.config import Config, ConfigError
 from edqn_jax.devices import choose_devices, use_cpu_devices
 from edqn_jax.files import check_can_write
+from edqn_jax.provenance import workload
 from edqn_jax.resolve import Layer, apply
-from edqn_jax.run import Courses, lay_courses, workload
+from edqn_jax.run import Courses, lay_courses
 from edqn_jax.sim.mjcf import write_scene
 from edqn_jax.validate import validate
 from flags import configured, split
@@ -113,15 +114,17 @@ def physics_steps(base: Config, quick: bool, folder: Path) -> Curve:
 
 
 def devices(base: Config, quick: bool, folder: Path) -> Curve:
-    """One, two, four devices, as many as the configuration has; each with as many environments."""
+    """One, two, four devices, as many as the configuration has; each with as many environments and samples."""
     del quick, folder
-    each = base.train.num_envs // base.train.devices
-    counts = [count for count in (1, 2, 4, 8) if count <= base.train.devices and base.train.devices % count == 0]
-    return Curve(
-        "devices",
-        0.0,
-        tuple(Point(n, str(n), _changed(with_environments(base, n * each), train={"devices": n})) for n in counts),
-    )
+    most = base.train.devices
+    points = []
+    for count in (count for count in (1, 2, 4, 8) if most % count == 0):
+        envs, batch, replay = (
+            size * count // most for size in (base.train.num_envs, base.agent.batch_size, base.agent.replay_size)
+        )
+        agent = {"batch_size": batch, "replay_size": replay}
+        points.append(Point(count, str(count), _changed(base, train={"num_envs": envs, "devices": count}, agent=agent)))
+    return Curve("devices", 0.0, tuple(points))
 
 
 CURVES: dict[str, Callable[[Config, bool, Path], Curve]] = {
@@ -191,6 +194,8 @@ def measure(base: Config, names: Sequence[str], quick: bool, repeats: int) -> di
     used = choose_devices(base.train.devices, base.train.shards)
     base = _changed(base, train={"devices": len(used)})
     decisions = QUICK_DECISIONS if quick else DECISIONS
+    if used[0].platform != "cpu":  # starting a chunk is no small part of one as short
+        decisions = max(decisions, base.train.num_envs * base.train.chunk_steps)
     rollout = Rollout(base)
     rows, summaries = [], []
     reference = lay_courses(base)

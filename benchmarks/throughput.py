@@ -30,7 +30,8 @@ from edqn_jax.config import Config, ConfigError
 from edqn_jax.devices import choose_devices, cores, use_cpu_devices
 from edqn_jax.files import check_can_write
 from edqn_jax.learn.trainer import AXIS
-from edqn_jax.run import lay_courses, workload
+from edqn_jax.provenance import workload
+from edqn_jax.run import lay_courses
 from flags import configured, split
 from parts import parts_of
 from timing import Timed

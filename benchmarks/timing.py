@@ -36,6 +36,7 @@ class Part:
     scans: int = 1  # how often a scan inside repeats operations that are counted once
     counted: Body | None = None  # whose operations are counted instead of the body's, `scans` times
     products: bool = False  # whether its arithmetic is matrix products
+    by_hand: float | None = None  # operations of all decisions, where XLA cannot count them
     floor: bool = True  # whether its operations can be counted: not where only some of them are in a scan
     moved: int | None = None  # bytes that a turn reads and writes at the least; without it, the carry's twice
 
@@ -95,10 +96,17 @@ class Timed:
 def operations(part: Part) -> float | None:
     """XLA's count for all decisions, what stands in a scan once; None where it does not count (on a GPU)."""
     alone = Mesh(np.asarray(jax.devices()[:1]), (AXIS,))
+    if part.by_hand is not None:
+        return part.by_hand
     body = part.counted or part.body
     once = jax.shard_map(body, mesh=alone, in_specs=part.specs, out_specs=part.specs[1], check_vma=False)
-    shapes = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), (part.stays, part.carry))
-    counted: Any = jax.jit(once).lower(*shapes).cost_analysis()
+    return operations_of(once, part.stays, part.carry)
+
+
+def operations_of(function: Callable[..., Any], *inputs: Any) -> float | None:
+    """XLA's count of what a function does with such inputs, a transcendental as one; None where it does not count."""
+    shapes = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), inputs)
+    counted: Any = jax.jit(function).lower(*shapes).cost_analysis()
     return None if counted is None else counted.get("flops", 0.0) + counted.get("transcendentals", 0.0)
 
 

@@ -21,7 +21,8 @@ from jax.sharding import Mesh
 import edqn_jax
 from edqn_jax.devices import choose_devices, processor, use_cpu_devices
 from edqn_jax.learn.trainer import AXIS
-from edqn_jax.run import lay_courses, versions, workload
+from edqn_jax.provenance import versions, workload
+from edqn_jax.run import lay_courses
 
 WHOLE = "whole_training_step"
 

@@ -9,12 +9,9 @@ Of several processes each runs this loop, on the same numbers; all fly, and one 
 from __future__ import annotations
 
 import dataclasses
-import hashlib
-import platform
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
-from importlib import metadata
 from typing import Any, Literal
 
 import jax
@@ -32,14 +29,15 @@ from edqn_jax.endings import DivergedError, StoppedError
 from edqn_jax.evaluate import flight_summary, spl, summarise, trajectory
 from edqn_jax.flights import Flights
 from edqn_jax.learn.policy import PolicyParams
-from edqn_jax.learn.trainer import Episodes, Losses, Plan, Trainer, TrainState, policy_of
+from edqn_jax.learn.trainer import Episodes, Losses, Plan, Trainer, policy_of
+from edqn_jax.provenance import state_digest, versions, workload
 from edqn_jax.report.gallery import draw_gallery
 from edqn_jax.report.progress import Progress
 from edqn_jax.rundir import RunDirectory
 from edqn_jax.sim import drone, worlds
 from edqn_jax.sim.env import Outcome, World
 from edqn_jax.sim.mjcf import check_scene, load_world, resolve_world
-from edqn_jax.sim.scene import Scene, obstacle_count, stack_scenes, take_scene
+from edqn_jax.sim.scene import Scene, stack_scenes, take_scene
 from edqn_jax.sim.worlds import Missions
 
 FLIES = 0.9
@@ -221,7 +219,8 @@ def train_run(
     try:
         return _train(config, run, progress, stop_requested, pool)
     finally:
-        pool.shutdown(cancel_futures=True)
+        # Nobody waits for what is being compiled: where the loop ended with an error, its sentence comes at once.
+        pool.shutdown(wait=False, cancel_futures=True)
 
 
 def _ahead(pool: Executor, work: Callable[[], None]) -> Future[float]:
@@ -396,37 +395,3 @@ def _verdict(summary: dict[str, Any], run: RunDirectory) -> str:
             f"({test['success_rate']:.0%}, 95 % interval {low:.0%} to {high:.0%})."
         )
     return f"{text}\nTrained in {summary['train_seconds']:.0f} s; everything is in {run.path}"
-
-
-def workload(config: Config, scene: Scene) -> dict[str, Any]:
-    """The workload that a figure is for, as every JSON of ours states it."""
-    agent, envs = config.agent, config.train.num_envs
-    return {
-        "physics_steps_per_decision": config.drone.physics_steps,
-        "physics_dt": config.drone.physics_dt_s,
-        "width": config.camera.width,
-        "height": config.camera.height,
-        "frames_per_decision": len(config.events.frame_times_s),
-        "obstacles": obstacle_count(scene),
-        "replayed_samples_per_decision": agent.batch_size * agent.updates_per_step / envs,
-        "vae_samples_per_decision": 1.0 if config.encoder.keep_learning else 0.0,
-        "num_envs": envs,
-        "physics": "mjx",
-    }
-
-
-def versions() -> dict[str, str]:
-    """Versions of what a figure depends on."""
-    packages = ("jax", "mujoco", "mujoco-mjx", "flax", "optax", "numpy")
-    return {"python": platform.python_version(), **{name: metadata.version(name) for name in packages}}
-
-
-def state_digest(state: TrainState) -> str:
-    """SHA-256 over the leaves of the train state in the order of the pytree; every process must call this."""
-    digest = hashlib.sha256()
-    for leaf in jax.tree.leaves(state):
-        raw = jax.random.key_data(leaf) if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key) else leaf
-        array = cluster.fetch(raw)
-        digest.update(f"{array.dtype}{array.shape}".encode())
-        digest.update(array.tobytes())
-    return digest.hexdigest()

@@ -164,7 +164,12 @@ def test_a_recorded_flight_becomes_columns_and_a_summary_and_compiles_nothing_an
     layout = NamedSharding(mesh, PartitionSpec())
     world, params = jax.device_put((course.world, always((1, 0, 0))), layout)
     key = jax.random.key(0)
+    flights.prepare(CONFIG, world, params, key, record=True, mesh=mesh)
+    compiled: list[str] = []
+    jax.monitoring.register_event_duration_secs_listener(lambda event, *_, **__: compiled.append(event))
     flown = fly_missions(CONFIG, world, params, key, record=True, mesh=mesh)
+    jax.monitoring.clear_event_listeners()
+    assert "/jax/core/compile/backend_compile_duration" not in compiled
     program: Any = flights._program(mesh)
     programs = program._cache_size()
     fly_missions(CONFIG, world, params, jax.random.key(1), record=True, mesh=mesh)

@@ -53,7 +53,7 @@ def _backdrop(config: CameraConfig, scene: Scene, origin: Array, rays: Rays, val
     return behind + share * (shown * factor - behind)
 
 
-def _blend(config: CameraConfig, frame: Frame, rays: Rays, layers: Layers) -> Array:
+def blend(config: CameraConfig, frame: Frame, rays: Rays, layers: Layers) -> Array:
     """Brightness of the layers over ground and sky: [H, W] of `rays`."""
     behind = _backdrop(config, frame.scene, frame.origin, rays, frame.value, frame.sky)
     for layer in reversed(layers):
@@ -70,7 +70,7 @@ def _blend(config: CameraConfig, frame: Frame, rays: Rays, layers: Layers) -> Ar
 def _picture(config: CameraConfig, scene: Scene, origin: Array, rotation: Array, weights: Array) -> Array:
     """Brightness under `weights` [3] of RGB: [H, W]."""
     if config.mount == "level":
-        return columns.picture(config, _blend, scene, origin, rotation, weights)
+        return columns.picture(config, blend, scene, origin, rotation, weights)
     value = raycast.albedo_values(scene, weights)
     rays = raycast.camera_rays(config, rotation)
     many = raycast.camera_rays(config, rotation, config.samples_across, config.samples_down)
@@ -82,7 +82,7 @@ def _picture(config: CameraConfig, scene: Scene, origin: Array, rotation: Array,
     layers = coverage.sphere_layers(config, scene, origin, rays, value, layers)
     sky = jnp.sum(jnp.asarray(config.sky_rgb) * weights)
     frame = Frame(origin=origin, heading=rotation[:2, 0], scene=scene, value=value, sky=sky)
-    return coverage.materialised(_blend(config, frame, rays, layers))
+    return coverage.materialised(blend(config, frame, rays, layers))
 
 
 def luma(config: CameraConfig, scene: Scene, position: Array, rotation: Array) -> Array:

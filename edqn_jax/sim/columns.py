@@ -124,9 +124,7 @@ def _pictures(
     config: CameraConfig, finish: Finish, scene: Scene, origin: Array, rotation: Array, weights: Array
 ) -> Array:
     """Brightness [M, H, W]; every argument has a leading [M]."""
-    frames, tables = materialised(jax.vmap(partial(_frame, config))(scene, origin, rotation, weights))
-    words = jax.vmap(partial(_presence, config))(tables)
-    ways, way = _ways(config, frames, tables, words)
+    ways, way = ways_to_draw(config, scene, origin, rotation, weights)
 
     # Sorted by the way they need, in blocks of which each takes the way of its last, the fullest.
     count, width = origin.shape[0], config.width
@@ -143,6 +141,18 @@ def _pictures(
     place = jnp.zeros(size, jnp.int32).at[order].set(numbers, unique_indices=True)
     found = drawn.reshape(-1, config.height).at[place].get(mode="promise_in_bounds")
     return materialised(found.reshape(count, width, config.height).swapaxes(1, 2))
+
+
+def ways_to_draw(
+    config: CameraConfig, scene: Scene, origin: Array, rotation: Array, weights: Array
+) -> tuple[list[Callable[[CameraConfig, Finish, Array], Array]], Array]:
+    """Ways to draw columns numbered [B], brightness [B, H] each, and which of them each column needs: [Q].
+
+    A way can do what those before it can. Every argument has a leading [M].
+    """
+    frames, tables = materialised(jax.vmap(partial(_frame, config))(scene, origin, rotation, weights))
+    words = jax.vmap(partial(_presence, config))(tables)
+    return _ways(config, frames, tables, words)
 
 
 def _frame(config: CameraConfig, scene: Scene, origin: Array, rotation: Array, weights: Array) -> tuple[Frame, Array]:
@@ -171,7 +181,7 @@ def _presence(config: CameraConfig, table: Array) -> Array:
 def _ways(
     config: CameraConfig, frames: Frame, tables: Array, words: Array
 ) -> tuple[list[Callable[[CameraConfig, Finish, Array], Array]], Array]:
-    """Ways to draw a block, each able to do what those before it can, and which of them columns need: [Q]."""
+    """`ways_to_draw`, of frames that are laid out."""
     shapes, spheres = tables.shape[1] - 1, frames.scene.spheres.radius.shape[1]
     room = [n for n in SLOTS if n < shapes] + ([shapes] if shapes <= SLOTS[-1] else [])
     held = jnp.sum(lax.population_count(words), axis=1)

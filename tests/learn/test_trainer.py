@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -10,7 +11,7 @@ import numpy as np
 import pytest
 
 from edqn_jax.config import AgentConfig, CameraConfig, Config, ConfigError, EncoderConfig, TrainConfig
-from edqn_jax.learn import trainer
+from edqn_jax.learn import replay, trainer
 from edqn_jax.learn.trainer import Plan, Trainer, TrainState
 from edqn_jax.sim import drone, mjcf, worlds
 from edqn_jax.sim.env import Outcome, World
@@ -160,6 +161,31 @@ def test_the_replay_holds_what_the_environments_went_through(on_one) -> None:
     np.testing.assert_array_equal(replayed, flown[: stored - 1])
     after_an_end = np.roll(actors.replay.outcome, 1, axis=1)[:, 1:stored] != Outcome.RUNNING
     np.testing.assert_array_equal(actors.replay.is_reset[:, 1:stored], after_an_end)
+
+
+def test_nothing_is_learnt_from_what_stood_there_before_the_first_reset(world: World) -> None:
+    start = jax.jit(partial(trainer.init, CONFIG, world))(jax.random.key(0))
+    actors = jax.tree.map(lambda x: x[0], start.actors)
+    envs = actors.reward.shape[0]
+
+    def row(is_reset: bool, outcome: jax.Array) -> replay.Rows:
+        return replay.Rows(
+            observation=actors.memory[:, -1],
+            reward=actors.reward,
+            outcome=outcome,
+            is_reset=jnp.full(envs, is_reset),
+            action=jnp.zeros(envs, jnp.int32),
+        )
+
+    agent = dataclasses.replace(CONFIG.agent, history=1)
+    last = agent.n_step + 1  # room for two starts: the row before the first reset, and that reset
+    ring = replay.write(actors.replay, row(True, actors.outcome), jnp.int32(0))
+    for time in range(1, last + 1):
+        ring = replay.write(ring, row(time == 1, jnp.full(envs, int(Outcome.RUNNING))), jnp.int32(time))
+    batch = replay.sample(agent, ring, jnp.int32(last), 64, jax.random.key(1))
+    assert set(np.asarray(batch.weight)) == {0.0, 1.0}
+    oldest = replay.sample(agent, ring, jnp.int32(last - 1), 64, jax.random.key(1))
+    assert not np.any(oldest.weight)
 
 
 @pytest.mark.slow

@@ -1,0 +1,50 @@
+"""What a figure or a run is for and came from: its workload, its versions, its state."""
+
+from __future__ import annotations
+
+import hashlib
+import platform
+from importlib import metadata
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+
+from edqn_jax import cluster
+from edqn_jax.config import Config
+from edqn_jax.learn.trainer import TrainState
+from edqn_jax.sim.scene import Scene, obstacle_count
+
+
+def workload(config: Config, scene: Scene) -> dict[str, Any]:
+    """The workload that a figure is for, as every JSON of ours states it."""
+    agent, envs = config.agent, config.train.num_envs
+    return {
+        "physics_steps_per_decision": config.drone.physics_steps,
+        "physics_dt": config.drone.physics_dt_s,
+        "width": config.camera.width,
+        "height": config.camera.height,
+        "frames_per_decision": len(config.events.frame_times_s),
+        "obstacles": obstacle_count(scene),
+        "replayed_samples_per_decision": agent.batch_size * agent.updates_per_step / envs,
+        "vae_samples_per_decision": 1.0 if config.encoder.keep_learning else 0.0,
+        "num_envs": envs,
+        "physics": "mjx",
+    }
+
+
+def versions() -> dict[str, str]:
+    """Versions of what a figure depends on."""
+    packages = ("jax", "mujoco", "mujoco-mjx", "flax", "optax", "numpy")
+    return {"python": platform.python_version(), **{name: metadata.version(name) for name in packages}}
+
+
+def state_digest(state: TrainState) -> str:
+    """SHA-256 over the leaves of the train state in the order of the pytree; every process must call this."""
+    digest = hashlib.sha256()
+    for leaf in jax.tree.leaves(state):
+        raw = jax.random.key_data(leaf) if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key) else leaf
+        array = cluster.fetch(raw)
+        digest.update(f"{array.dtype}{array.shape}".encode())
+        digest.update(array.tobytes())
+    return digest.hexdigest()
