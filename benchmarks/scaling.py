@@ -334,7 +334,7 @@ def table(report: dict[str, Any]) -> str:
         for row in report["rows"]:
             if row["curve"] == curve["name"]:
                 lines.append(
-                    f"| {row['label']} | {row['us_per_decision']:.1f} | {row['us_low']:.1f} - {row['us_high']:.1f} "
+                    f"| {row['label']} | {row['us_per_decision']:.3g} | {row['us_low']:.3g} - {row['us_high']:.3g} "
                     f"| {row['c_mujoco_steps_per_decision']:.0f} | {row['decisions_per_second']:,.0f} "
                     f"| {row['cores_busy']:.2f} | {row['temporary_bytes_per_environment'] / 1e3:.1f} |"
                 )
@@ -347,10 +347,11 @@ def sentence(curve: dict[str, Any]) -> str:
     """A curve's slope for people."""
     text = (
         f"{curve['name'].capitalize()}: slope {curve['slope']:.2f} ({curve['slope_low']:.2f} to "
-        f"{curve['slope_high']:.2f}), {curve['slope_over_c_mujoco']:.2f} in steps of C MuJoCo; "
-        f"linear growth would be {curve['linear_slope']:g}."
+        f"{curve['slope_high']:.2f}); linear growth would be {curve['linear_slope']:g}."
     )
-    if curve["efficiency"] is not None:
+    if curve["efficiency"] is None:
+        text += f" In steps of C MuJoCo, which has all cores all the time, {curve['slope_over_c_mujoco']:.2f}."
+    else:
         text += f" All devices together do {curve['efficiency']:.0%} of what the first times their number would."
     return text
 

@@ -55,7 +55,7 @@ def _draw_curve(axes: Axes, curve: dict[str, Any], rows: list[dict[str, Any]]) -
     axes.plot(x, linear, color=MUTED, lw=1.0, ls=(0, (4, 3)), gid="linear")
     axes.errorbar(x, cost, [cost - low, high - cost], color=LINE, marker="o", ms=4, capsize=2, elinewidth=0.8)
     for at, value, least in zip(x, cost, low, strict=True):
-        text = f"{value:,.0f}"
+        text = f"{value:,.0f}" if value >= 10 else f"{value:.2g}"
         axes.annotate(text, (at, least), (0, -11), textcoords="offset points", ha="center", fontsize=7, color=INK)
     axes.set_xlim(x[0] / (x[-1] / x[0]) ** 0.15, x[-1] * (x[-1] / x[0]) ** 0.15)
     axes.xaxis.set_minor_locator(NullLocator())
