@@ -13,10 +13,10 @@ import numpy as np
 from jax import Array
 from jax.sharding import PartitionSpec
 
-from edqn_jax.config import Config
+from edqn_jax.config import Config, ConfigError
 from edqn_jax.learn import dqn, encoder, qnetwork, replay, trainer
 from edqn_jax.learn.trainer import AXIS, Actors, Learner, TrainState
-from edqn_jax.sim import camera, columns, drone, env, events
+from edqn_jax.sim import camera, columns, drone, env, events, sensor
 from edqn_jax.sim.drone import DroneState
 from edqn_jax.sim.env import EnvState, World
 from edqn_jax.sim.scene import take_scene
@@ -133,14 +133,14 @@ def outcome(now: Moment) -> Part:
 
 def rendering(now: Moment) -> Part:
     """A decision's frames."""
-    steps = env.frame_steps(now.config)
+    steps = sensor.frame_steps(now.config)
 
     def body(world: World, carry):
         position, quaternion, scene = carry
 
         def one(position: Array, quaternion: Array, scene: Array) -> list[Array]:
             here = take_scene(world.pool, scene)
-            return [env.view(now.config, here, position[t], quaternion[t]) for t in range(len(steps))]
+            return [sensor.view(now.config, here, position[t], quaternion[t]) for t in range(len(steps))]
 
         frames = jax.vmap(one)(position, quaternion, scene)
         return nudged(position, frames), quaternion, scene
@@ -166,7 +166,7 @@ def _drawing(now: Moment, position: Array, quaternion: Array) -> float | None:
         lambda leaf: jnp.repeat(leaf, times, axis=0), jax.vmap(partial(take_scene, now.world.pool))(now.scenes)
     )
     place = position.reshape(-1, 3)
-    turn = jax.vmap(partial(env.mount_rotation, now.config))(quaternion.reshape(-1, 4))
+    turn = jax.vmap(partial(sensor.mount_rotation, now.config))(quaternion.reshape(-1, 4))
     weights = jnp.broadcast_to(jnp.asarray(camera.LUMA), (len(place), 3))
     given = (scene, place, turn, weights)
     ways, way = columns.ways_to_draw(config, *given)
@@ -228,7 +228,7 @@ def encoding(now: Moment) -> Part:
         code = encoder.embed(now.config.encoder, params, field)
         return dataclasses.replace(field, count=nudged(field.count, code))
 
-    return Part("encoder", body, now.learner.encoder, now.seen.observation.events, products=True)
+    return Part("encoder", body, now.learner.encoder, now.seen.observation.sensed, products=True)
 
 
 def acting(now: Moment) -> Part:
@@ -295,7 +295,7 @@ def seeing(now: Moment) -> Part:
         _, learner = trainer.learn_to_see(now.config, AXIS, learner, field, keys, now.state.step)
         return learner, keys
 
-    field, carry = now.seen.observation.events, (now.learner, now.shard_keys)
+    field, carry = now.seen.observation.sensed, (now.learner, now.shard_keys)
     return Part("vae_update", body, field, carry, _LEARNER_AND_KEYS, products=True, moved=size_of(field))
 
 
@@ -347,6 +347,12 @@ PARTS: dict[str, Callable[[Moment], Part]] = {
 
 
 def parts_of(config: Config, world: World, state: TrainState, names: Sequence[str] = tuple(PARTS)) -> list[Part]:
-    """The named parts, on the state that training has come to."""
+    """The named parts, on the state that training has come to.
+
+    Raises:
+        ConfigError: for another sensor than events.
+    """
+    if config.env.sensor != "events":
+        raise ConfigError(f"the parts are those of env.sensor events; of {config.env.sensor} time the whole step alone")
     now = Moment(config, world, state)
     return [PARTS[name](now) for name in names]

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from edqn_jax.config import Config
+from edqn_jax.learn import embedding
 from edqn_jax.learn.trainer import Trainer
 from edqn_jax.sim import env
 
@@ -54,6 +55,7 @@ class WholeStep:
         seconds = time.perf_counter() - began
         learns = self.done >= self.trainer.plan.learn_from
         self.done += len(q_loss)
-        if learns and not np.isfinite(np.concatenate([q_loss, np.asarray(losses.reconstruction)])).all():
+        learnt = [q_loss, np.asarray(losses.reconstruction)] if embedding.has_code(self.trainer.config) else [q_loss]
+        if learns and not np.isfinite(np.concatenate(learnt)).all():
             raise RuntimeError("a timed chunk did not learn throughout")
         return self.decisions / seconds

@@ -89,7 +89,8 @@ class EvaluateArgs:
     seed: Annotated[int, arg(metavar="S")] = 0
     """Seed of the missions."""
     shuffle_codes: Annotated[bool, arg(help_behavior_hint="")] = False
-    """Give each drone the events of another one at each decision: how much does the policy fly by its events?"""
+    """Give each drone the events of another one at each decision: how much does the policy fly by its events? Of
+    a policy with another sensor, what that shows."""
     json: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
     """Also write the figures as JSON."""
     trajectories: Annotated[Path | None, arg(metavar="FILE.npz", help_behavior_hint="")] = None

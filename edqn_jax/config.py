@@ -131,8 +131,11 @@ class EventsConfig:
 
 @dataclass(frozen=True)
 class EnvConfig:
-    """Task: actions, outcomes, reward."""
+    """Task: what is seen, actions, outcomes, reward."""
 
+    sensor: Literal["events", "frames", "blind", "depth", "ranges"] = "events"
+    """What the drone sees beside its own state. `events`: the event camera. To compare with, `frames`: its newest
+    brightness frame; `blind`: nothing; `depth`: true depth; `ranges`: the true free way along each move."""
     speed_m_s: float = 4.0
     """Commanded speed per axis; an action is {-1, 0, 1}^3 times this, in the heading frame."""
     goal_radius_m: float = 2.0

@@ -22,14 +22,16 @@ from edqn_jax.config import Config, ConfigError
 from edqn_jax.course import Course, load_course
 from edqn_jax.files import check_can_write, write_whole
 from edqn_jax.flights import Flights, fly_missions
-from edqn_jax.learn import encoder, policy, qnetwork
+from edqn_jax.learn import embedding, policy, qnetwork
 from edqn_jax.learn.policy import PolicyParams
 from edqn_jax.resolve import apply, load_layer
 from edqn_jax.rundir import TRAJECTORY_COLUMNS, plain
 from edqn_jax.sim import env
 from edqn_jax.sim.env import Outcome, World
 from edqn_jax.sim.events import EventField
+from edqn_jax.sim.moves import DIRECTIONS
 from edqn_jax.sim.scene import take_scene
+from edqn_jax.sim.sensor import Sensed
 from edqn_jax.validate import validate
 
 if TYPE_CHECKING:
@@ -60,7 +62,7 @@ def fresh_policy(config: Config, seed: int = 0) -> PolicyParams:
     encoder_key, q_key = jax.random.split(jax.random.key(seed))
     size = policy.observation_size(config)
     return PolicyParams(
-        encoder=encoder.init_encoder(config.encoder, config.camera, encoder_key),
+        encoder=embedding.init(config, encoder_key),
         q=qnetwork.init_q(config.agent, size, len(env.ACTIONS), q_key),
     )
 
@@ -152,12 +154,7 @@ def summarise(flights: Flights, shortest: np.ndarray | None = None) -> dict[str,
 
 def decision_latency_ms(config: Config, params: PolicyParams, calls: int = 300) -> dict[str, float]:
     """Median and 99th percentile of the time that one decision takes, from host arrays to an action there."""
-    pixels = (max(len(config.events.frame_times_s) - 1, 1), config.camera.height, config.camera.width)
-    rng = np.random.default_rng(0)
-    count, times = jnp.asarray(rng.integers(0, 3, pixels), jnp.int32), jnp.zeros(pixels)
-    window = config.events.frame_times_s[-1] - config.events.frame_times_s[0]
-    field = EventField(count, jnp.sign(count).astype(jnp.int8), times, times, window_s=window)
-    seen = env.Observation(events=field, own=jnp.zeros(env.OWN_SIZE))
+    seen = env.Observation(sensed=_anything(config), own=jnp.zeros(env.OWN_SIZE))
     seen, memory = jax.tree.map(np.asarray, (seen, policy.empty_memory(config)))  # on the host
     act = jax.jit(lambda params, memory, seen, key: policy.act(config, params, memory, seen, key))
     params, key = jax.device_put(params), jax.random.key(0)
@@ -168,6 +165,21 @@ def decision_latency_ms(config: Config, params: PolicyParams, calls: int = 300) 
         seconds.append(time.perf_counter() - began)
     median, p99 = np.percentile(np.array(seconds[1:]) * 1e3, [50, 99])  # the first call compiled
     return {"median": float(median), "p99": float(p99)}
+
+
+def _anything(config: Config) -> Sensed:
+    """Something that the sensor might show."""
+    rng, height, width = np.random.default_rng(0), config.camera.height, config.camera.width
+    if config.env.sensor in ("frames", "depth"):
+        return jnp.asarray(rng.random((height, width), np.float32))
+    if config.env.sensor == "ranges":
+        return jnp.asarray(rng.random(len(DIRECTIONS), np.float32))
+    if config.env.sensor == "blind":
+        return None
+    pixels = (max(len(config.events.frame_times_s) - 1, 1), height, width)
+    count, times = jnp.asarray(rng.integers(0, 3, pixels), jnp.int32), jnp.zeros(pixels)
+    window = config.events.frame_times_s[-1] - config.events.frame_times_s[0]
+    return EventField(count, jnp.sign(count).astype(jnp.int8), times, times, window_s=window)
 
 
 # -------------------------------------------------------------------------------------- one flight
@@ -224,6 +236,8 @@ def evaluate_command(args: EvaluateArgs) -> None:
     if args.shuffle_codes and args.missions < least:
         raise ConfigError(f"--shuffle-codes needs --missions of at least {least}, not {args.missions}")
     config, params = load_run(args.run)
+    if args.shuffle_codes and config.env.sensor == "blind":
+        raise ConfigError(f"--shuffle-codes has nothing to shuffle: the policy of '{args.run}' sees nothing but itself")
     name = args.world or config.world.name
     course = load_course(config, name, args.missions, args.seed, args.start, args.goal)
     record = args.trajectories is not None

@@ -97,11 +97,11 @@ def fly_missions(
         world: whose missions are flown.
         params: whose policy flies.
         key: consumed; sensor noise and the shuffling depend on it.
-        shuffle_codes: give each environment the events of another one, anew at each decision, and leave it
-            its own state: how much does the policy fly by its events?
+        shuffle_codes: give each environment what another one's sensor shows, anew at each decision, and leave it
+            its own state: how much does the policy fly by its events, or whatever it sees?
         record: keep whole flights.
         mesh: devices, along one axis, to spread the missions over; the flights do not depend on it, except
-            for whose events are shuffled with whose.
+            for whose codes are shuffled with whose.
 
     Raises:
         ValueError: if codes are to be shuffled and a device has only one mission.
@@ -168,9 +168,9 @@ def _fly(
         seen = flying.observation
         if shuffle_codes:
             shift = jax.random.randint(shift_key, (), 1, missions)
-            # The code is a function of the events alone, so moving these moves the codes.
-            events = jax.tree.map(lambda x: jnp.roll(x, shift, axis=0), seen.events)
-            seen = dataclasses.replace(seen, events=events)
+            # The code is a function of what the sensor shows alone, so moving this moves the codes.
+            sensed = jax.tree.map(lambda x: jnp.roll(x, shift, axis=0), seen.sensed)
+            seen = dataclasses.replace(seen, sensed=sensed)
         act = partial(policy.act, config, params, key=act_key)  # the best action is no matter of chance
         action, memory = jax.vmap(act)(flying.memory, seen)
         state, step = jax.vmap(partial(env.step, config, world))(flying.state, action, number)

@@ -12,8 +12,10 @@ import jax.numpy as jnp
 
 from edqn_jax import cluster
 from edqn_jax.config import Config
+from edqn_jax.learn.embedding import has_code
 from edqn_jax.learn.trainer import TrainState
 from edqn_jax.sim.scene import Scene, obstacle_count
+from edqn_jax.sim.sensor import frames_per_decision
 
 
 def workload(config: Config, scene: Scene) -> dict[str, Any]:
@@ -24,10 +26,11 @@ def workload(config: Config, scene: Scene) -> dict[str, Any]:
         "physics_dt": config.drone.physics_dt_s,
         "width": config.camera.width,
         "height": config.camera.height,
-        "frames_per_decision": len(config.events.frame_times_s),
+        "sensor": config.env.sensor,
+        "frames_per_decision": frames_per_decision(config),
         "obstacles": obstacle_count(scene),
         "replayed_samples_per_decision": agent.batch_size * agent.updates_per_step / envs,
-        "vae_samples_per_decision": 1.0 if config.encoder.keep_learning else 0.0,
+        "vae_samples_per_decision": 1.0 if config.encoder.keep_learning and has_code(config) else 0.0,
         "num_envs": envs,
         "physics": "mjx",
     }

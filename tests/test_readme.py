@@ -33,7 +33,7 @@ def test_the_python_example_runs(capsys: pytest.CaptureFixture[str]) -> None:
     # Straight ahead from (1, 1, 3): both horizontal coordinates grow and the height is held.
     x, y, z = jax.device_get(step.flight.position[-1])
     assert x > 2.5 and y > 2.5 and abs(z - 3.0) < 0.1
-    assert int(step.observation.events.count.sum()) > 0
+    assert int(step.observation.sensed.count.sum()) > 0
     assert "(" in capsys.readouterr().out
 
 

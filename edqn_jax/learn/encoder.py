@@ -1,4 +1,4 @@
-"""The event VAE (section 3.2): a sum-pooled set encoder, a code, a decoder.
+"""The event VAE (section 3.2): a sum-pooled set encoder, a code, a decoder; and the same for pictures.
 
 An event is (x, y, t, p). The encoder's first layer is a sum over events, blind to their order,
 
@@ -10,6 +10,10 @@ closed form: the dense path costs the same for one event as for a thousand, and 
 
 Field arrays are `[..., F, H, W]`: any leading dimensions are the batch, carried into a few large matmuls.
 C is the number of temporal channels, 1 + 2 x `time_frequencies`.
+
+A picture `[..., H, W]` has one channel where a field has two, ON and OFF, and no time: it is pooled as
+sum over pixels of f(x, y) x value, over the root of their number, with C times the features, so that what is pooled,
+and all after it, is as wide.
 """
 
 from __future__ import annotations
@@ -42,6 +46,9 @@ OUTPUT_SCALE = 2.0
 
 POOL_SCALE = 1.0 / 8.0
 """Constant factor on the pooled sum: the root of some 64 events, so that the next layer sees unit scale."""
+
+EVENT_CHANNELS, PICTURE_CHANNELS = 2, 1
+"""ON and OFF events; brightness or nearness."""
 
 MAX_LOG_VARIANCE = 6.0
 """The log-variance lives in plus and minus this: its exponential cannot overflow."""
@@ -114,13 +121,14 @@ class PixelTable(nn.Module):
     features: int
     height: int
     width: int
+    channels: int = EVENT_CHANNELS
 
     def setup(self) -> None:
-        shape = (2, self.height * self.width, self.features)
+        shape = (self.channels, self.height * self.width, self.features)
         self.table = self.param("table", wave_table(self.height, self.width), shape)
 
     def everywhere(self) -> Array:
-        """`[2, H * W, features]`, ON first."""
+        """`[channels, H * W, features]`, ON first."""
         return self.table
 
     def at(self, x: Array, y: Array, p: Array) -> Array:
@@ -134,13 +142,14 @@ class PixelNetwork(nn.Module):
     features: int
     height: int
     width: int
+    channels: int = EVENT_CHANNELS
 
     def setup(self) -> None:
         self.layers = [nn.Dense(64), nn.Dense(64), nn.Dense(self.features)]
 
     def everywhere(self) -> Array:
         y, x = jnp.divmod(jnp.arange(self.height * self.width), self.width)
-        return jnp.stack([self.at(x, y, jnp.full_like(x, p)) for p in (1, -1)])
+        return jnp.stack([self.at(x, y, jnp.full_like(x, p)) for p in (1, -1)[: self.channels]])
 
     def at(self, x: Array, y: Array, p: Array) -> Array:
         place = positional_encoding(x.astype(jnp.float32), y.astype(jnp.float32), self.width, self.height)
@@ -180,7 +189,7 @@ def wave_table(height: int, width: int) -> Callable[..., Array]:
         mix = lecun_normal()
         odd = basis @ mix(key_odd, (basis.shape[1], shape[-1]))
         even = basis @ mix(key_even, (basis.shape[1], shape[-1]))
-        return jnp.stack([even + odd, even - odd])
+        return jnp.stack([even + odd, even - odd][: shape[0]])
 
     return init
 
@@ -206,7 +215,7 @@ def mirrored(*, inputs: bool, outputs: bool) -> Callable[..., Array]:
 
 
 def wave_images(height: int, width: int) -> Callable[..., Array]:
-    """Initialiser of the decoder's last layer, `[hidden, 2, P, Q]`: a little of the lowest waves, mirrored.
+    """Initialiser of the decoder's last layer, `[hidden, channels, P, Q]`: a little of the lowest waves, mirrored.
 
     Event images are smooth on average, white noise is not: from white noise the decoder needs thousands of
     updates to leave the blank image, from waves it leaves at once. Part of each wave is common to ON and OFF,
@@ -214,7 +223,7 @@ def wave_images(height: int, width: int) -> Callable[..., Array]:
     """
 
     def init(key: Array, shape: tuple[int, ...], dtype: Any = jnp.float32) -> Array:
-        size, _, rows, columns = shape
+        size, channels, rows, columns = shape
         lowest = lowest_waves(height, width, rows, columns)
         key_even, key_odd = jax.random.split(key)
         even, odd = (
@@ -225,22 +234,24 @@ def wave_images(height: int, width: int) -> Callable[..., Array]:
             * jnp.asarray(lowest * np.sqrt(lowest.size / lowest.sum()), dtype)
             for k in (key_even, key_odd)
         )
-        kernel = jnp.stack([even + odd, even - odd], axis=1)
+        kernel = jnp.stack([even + odd, even - odd][:channels], axis=1)
         return jnp.concatenate([kernel, -kernel])[:size]
 
     return init
 
 
 class Encoder(nn.Module):
-    """Sum-pooled set encoder. `dense` and `sparse` share their parameters and agree."""
+    """Sum-pooled set encoder. `dense` and `sparse` share their parameters and agree; `picture` has its own."""
 
     config: EncoderConfig
     height: int
     width: int
+    channels: int = EVENT_CHANNELS
 
     def setup(self) -> None:
         kind = {"table": PixelTable, "network": PixelNetwork}[self.config.pixel_features]
-        self.pixels = kind(self.config.features, self.height, self.width)
+        temporal = 1 + 2 * self.config.time_frequencies if self.channels == PICTURE_CHANNELS else 1
+        self.pixels = kind(temporal * self.config.features, self.height, self.width, self.channels)
         size = self.config.code_size
         self.hidden = nn.Dense(self.config.hidden, kernel_init=mirrored(inputs=False, outputs=True))
         self.mean = nn.Dense(size, kernel_init=mirrored(inputs=True, outputs=False))
@@ -256,34 +267,41 @@ class Encoder(nn.Module):
             phi_on = jnp.sum(jnp.where(field.polarity > 0, phi, 0.0), axis=-3).reshape(*batch, -1)
             phi_off = jnp.sum(jnp.where(field.polarity < 0, phi, 0.0), axis=-3).reshape(*batch, -1)
             pooled.append(phi_on @ on + phi_off @ off)
-        return self._head(jnp.concatenate(pooled, axis=-1))
+        return self._head(jnp.concatenate(pooled, axis=-1), POOL_SCALE)
 
     def sparse(self, x: Array, y: Array, tau: Array, p: Array) -> tuple[Array, Array]:
         """Events one by one, each `[..., N]`, to mean and log-variance; places with p = 0 hold no event."""
         place = self.pixels.at(x, y, p) * (p != 0)[..., None]
         phi = temporal_encoding(self.config.time_frequencies, tau)
         pooled = jnp.einsum("...nf,...nc->...cf", place, phi)
-        return self._head(pooled.reshape(*pooled.shape[:-2], -1))
+        return self._head(pooled.reshape(*pooled.shape[:-2], -1), POOL_SCALE)
 
-    def _head(self, pooled: Array) -> tuple[Array, Array]:
-        z = nn.relu(self.hidden(pooled * POOL_SCALE))
+    def picture(self, image: Array) -> tuple[Array, Array]:
+        """Pictures `[..., H, W]` to mean and log-variance `[..., code_size]`."""
+        (everywhere,) = self.pixels.everywhere()
+        flat = image.reshape(*image.shape[:-2], -1)
+        return self._head(flat @ everywhere, flat.shape[-1] ** -0.5)
+
+    def _head(self, pooled: Array, scale: float) -> tuple[Array, Array]:
+        z = nn.relu(self.hidden(pooled * scale))
         mean = jnp.clip(self.mean(z), -MAX_MEAN, MAX_MEAN)
         return mean, jnp.clip(self.log_variance(z), -MAX_LOG_VARIANCE, MAX_LOG_VARIANCE)
 
 
 class Decoder(nn.Module):
-    """Code `[..., code_size]` to the standing waves of the reconstruction, `[..., 2, P, Q]`."""
+    """Code `[..., code_size]` to the standing waves of the reconstruction, `[..., channels, P, Q]`."""
 
     config: EncoderConfig
     height: int
     width: int
+    channels: int = EVENT_CHANNELS
 
     @nn.compact
     def __call__(self, code: Array) -> Array:
         z = code
         for layer, size in enumerate(self.config.decoder_hidden):
             z = nn.relu(nn.Dense(size, kernel_init=mirrored(inputs=layer > 0, outputs=True))(z))
-        shape = (2, *_drawn(self.config, self.height, self.width))
+        shape = (self.channels, *_drawn(self.config, self.height, self.width))
         kernel = self.param("kernel", wave_images(self.height, self.width), (z.shape[-1], *shape))
         bias = self.param("bias", zeros, shape)
         amplitudes = z @ kernel.reshape(z.shape[-1], -1)
@@ -295,17 +313,21 @@ def _drawn(config: EncoderConfig, height: int, width: int) -> tuple[int, int]:
     return tuple(max(1, round(config.decoder_bandwidth * size)) for size in (height, width))  # type: ignore
 
 
-def target(config: EncoderConfig, field: EventField) -> Array:
-    """What the decoder must reconstruct, `[..., 2, H, W]`: log(1 + count) of ON and of OFF events, blurred.
+def target(config: EncoderConfig, sensed: EventField | Array) -> Array:
+    """What the decoder must reconstruct, `[..., channels, H, W]`, blurred: log(1 + count) of ON and of OFF events, or
+    the picture itself.
 
-    Two channels, because how many events there are says how near things are, and in a signed image the ON
+    Two channels of events, because how many events there are says how near things are, and in a signed image the ON
     and OFF of a textured wall cancel. The logarithm keeps one bright edge from drowning the rest; the blur (a
     binomial over 2 x `target_blur` + 1 pixels) makes an edge that is off by one pixel one small error, not two
     large ones.
     """
-    on = jnp.sum(jnp.where(field.polarity > 0, field.count, 0), axis=-3)
-    off = jnp.sum(jnp.where(field.polarity < 0, field.count, 0), axis=-3)
-    image = jnp.log1p(jnp.stack([on, off], axis=-3).astype(jnp.float32))
+    if isinstance(sensed, EventField):
+        on = jnp.sum(jnp.where(sensed.polarity > 0, sensed.count, 0), axis=-3)
+        off = jnp.sum(jnp.where(sensed.polarity < 0, sensed.count, 0), axis=-3)
+        image = jnp.log1p(jnp.stack([on, off], axis=-3).astype(jnp.float32))
+    else:
+        image = sensed[..., None, :, :]
     if config.target_blur == 0:
         return image
     height, width = image.shape[-2:]
@@ -320,27 +342,32 @@ def _blur(size: int, times: int) -> np.ndarray:
     return np.linalg.matrix_power(once, times).astype(np.float32)
 
 
-def init_encoder(config: EncoderConfig, camera: CameraConfig, key: Array) -> Params:
-    """Fresh parameters, `{"encoder": ..., "decoder": ...}`, for the camera's resolution."""
+def init_encoder(config: EncoderConfig, camera: CameraConfig, key: Array, *, pictures: bool = False) -> Params:
+    """Fresh parameters, `{"encoder": ..., "decoder": ...}`, for the camera's resolution, of events or of pictures."""
     key_encoder, key_decoder = jax.random.split(key)
-    shape = (1, camera.height, camera.width)
-    nothing, when = jnp.zeros(shape, jnp.int32), jnp.zeros(shape)
+    channels = PICTURE_CHANNELS if pictures else EVENT_CHANNELS
+    encoder = Encoder(config, camera.height, camera.width, channels)
+    decoder = Decoder(config, camera.height, camera.width, channels)
+    when = jnp.zeros((1, camera.height, camera.width))
+    nothing = when.astype(jnp.int32)
     silent = EventField(nothing, nothing.astype(jnp.int8), when, when, window_s=1.0)
-    encoder = Encoder(config, camera.height, camera.width)
-    decoder = Decoder(config, camera.height, camera.width)
+    blank, method = (when[0], Encoder.picture) if pictures else (silent, Encoder.dense)
     return {
-        "encoder": encoder.init(key_encoder, silent, method=Encoder.dense)["params"],
+        "encoder": encoder.init(key_encoder, blank, method=method)["params"],
         "decoder": decoder.init(key_decoder, jnp.zeros(config.code_size))["params"],
     }
 
 
-def encode(config: EncoderConfig, params: Params, field: EventField) -> tuple[Array, Array]:
-    """Fields `[..., F, H, W]` to the code's mean and log-variance, each `[..., code_size]`.
+def encode(config: EncoderConfig, params: Params, sensed: EventField | Array) -> tuple[Array, Array]:
+    """Fields `[..., F, H, W]` or pictures `[..., H, W]` to the code's mean and log-variance, each `[..., code_size]`.
 
     The code that the agent sees is the mean.
     """
-    height, width = field.count.shape[-2:]
-    return Encoder(config, height, width).apply({"params": params["encoder"]}, field, method=Encoder.dense)  # type: ignore
+    fields = isinstance(sensed, EventField)
+    height, width = (sensed.count if fields else sensed).shape[-2:]
+    encoder = Encoder(config, height, width, EVENT_CHANNELS if fields else PICTURE_CHANNELS)
+    method = Encoder.dense if fields else Encoder.picture
+    return encoder.apply({"params": params["encoder"]}, sensed, method=method)  # type: ignore
 
 
 def encode_events(
@@ -354,21 +381,22 @@ def encode_events(
     return encoder.apply({"params": params["encoder"]}, x, y, tau, p, method=Encoder.sparse)  # type: ignore
 
 
-def embed(config: EncoderConfig, params: Params, field: EventField) -> Array:
-    """The agent's code of fields `[..., F, H, W]`: the mean, `[..., code_size]`."""
-    return encode(config, params, field)[0]
+def embed(config: EncoderConfig, params: Params, sensed: EventField | Array) -> Array:
+    """The agent's code of fields `[..., F, H, W]` or pictures `[..., H, W]`: the mean, `[..., code_size]`."""
+    return encode(config, params, sensed)[0]
 
 
 def decode(config: EncoderConfig, camera: CameraConfig, params: Params, code: Array) -> Array:
-    """Code `[..., code_size]` to the reconstruction of `target`, `[..., 2, H, W]`."""
+    """Code `[..., code_size]` to the reconstruction of `target`, `[..., channels, H, W]`."""
     found = _waves_of(config, camera.height, camera.width, params, code)
     rows, columns = found.shape[-2:]
     return jnp.asarray(cosines(camera.height, rows).T) @ found @ jnp.asarray(cosines(camera.width, columns))
 
 
 def _waves_of(config: EncoderConfig, height: int, width: int, params: Params, code: Array) -> Array:
-    """Amplitudes `[..., 2, P, Q]` of the reconstruction's standing waves."""
-    return Decoder(config, height, width).apply({"params": params["decoder"]}, code)  # type: ignore
+    """Amplitudes `[..., channels, P, Q]` of the reconstruction's standing waves."""
+    channels = params["decoder"]["bias"].shape[-3]
+    return Decoder(config, height, width, channels).apply({"params": params["decoder"]}, code)  # type: ignore
 
 
 def kl_divergence(mean: Array, log_variance: Array) -> Array:
@@ -376,14 +404,14 @@ def kl_divergence(mean: Array, log_variance: Array) -> Array:
     return 0.5 * jnp.sum(jnp.square(mean) + jnp.exp(log_variance) - 1.0 - log_variance, axis=-1)
 
 
-def vae_loss(config: EncoderConfig, params: Params, field: EventField, key: Array) -> tuple[Array, Losses]:
+def vae_loss(config: EncoderConfig, params: Params, sensed: EventField | Array, key: Array) -> tuple[Array, Losses]:
     """Eq. 6: squared reconstruction error of an image + `kl_weight` x KL, averaged over the batch.
 
-    `field` is `[..., F, H, W]`; the key draws the codes (reparametrised).
+    `sensed` is a field `[..., F, H, W]` or a picture `[..., H, W]`; the key draws the codes (reparametrised).
     """
-    mean, log_variance = encode(config, params, field)
+    mean, log_variance = encode(config, params, sensed)
     code = mean + jnp.exp(0.5 * log_variance) * jax.random.normal(key, mean.shape)
-    image = target(config, field)
+    image = target(config, sensed)
     height, width = image.shape[-2:]
     drawn = _waves_of(config, height, width, params, code)
     # The waves are orthonormal, so squared errors add up over them as over pixels; what the decoder cannot

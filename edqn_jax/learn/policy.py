@@ -7,7 +7,7 @@ from flax import struct
 from jax import Array
 
 from edqn_jax.config import Config
-from edqn_jax.learn import encoder
+from edqn_jax.learn import embedding
 from edqn_jax.learn.dqn import epsilon_greedy
 from edqn_jax.learn.qnetwork import Params, q_values
 from edqn_jax.sim.env import ACTIONS, OWN_SIZE, Observation
@@ -20,13 +20,13 @@ Memory = Array
 class PolicyParams:
     """All that a policy knows."""
 
-    encoder: Params
+    encoder: Params  # {} where nothing is encoded
     q: Params
 
 
 def observation_size(config: Config) -> int:
-    """D: code and own state."""
-    return config.encoder.code_size + OWN_SIZE
+    """D: what is seen and the own state."""
+    return embedding.size(config) + OWN_SIZE
 
 
 def empty_memory(config: Config) -> Memory:
@@ -40,9 +40,9 @@ def remember(memory: Memory, flat: Array) -> Memory:
 
 
 def flatten(config: Config, params: Params, observation: Observation) -> Array:
-    """[..., D] code and own state of observations [...]."""
-    code = config.agent.code_scale * encoder.embed(config.encoder, params, observation.events)
-    return jnp.concatenate([code, observation.own], axis=-1)
+    """[..., D] what is seen, by default as a code, and own state of observations [...]."""
+    seen = embedding.embed(config, params, observation.sensed)
+    return observation.own if seen is None else jnp.concatenate([seen, observation.own], axis=-1)
 
 
 def act(

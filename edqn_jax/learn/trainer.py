@@ -26,7 +26,7 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from edqn_jax import cluster
 from edqn_jax.config import Config, ConfigError
 from edqn_jax.devices import compiler_options
-from edqn_jax.learn import dqn, encoder, qnetwork, replay
+from edqn_jax.learn import dqn, embedding, encoder, qnetwork, replay
 from edqn_jax.learn.policy import PolicyParams, empty_memory, flatten, observation_size, remember
 from edqn_jax.learn.qnetwork import Params
 from edqn_jax.sim import env
@@ -40,7 +40,7 @@ AXIS = "env"
 class Learner:
     """Parameters and optimisers; the same on every device."""
 
-    vae: Params  # what learns
+    vae: Params  # what learns; {} for a sensor whose image is not encoded
     vae_optimiser: Any
     encoder: Params  # what acts: the VAE as it was when the warm-up ended
     q: Params
@@ -103,10 +103,13 @@ class Plan:
 
     @classmethod
     def of(cls, config: Config) -> Plan:
-        """Total decisions round up to whole chunks, the warm-up to whole steps; it takes a quarter at most."""
+        """Total decisions round up to whole chunks, the warm-up to whole steps; it takes a quarter at most.
+
+        Where there is no VAE there is no warm-up: its decisions go to the DQN.
+        """
         envs = config.train.num_envs
         total = math.ceil(config.train.total_steps / envs / config.train.chunk_steps) * config.train.chunk_steps
-        warmup = min(math.ceil(config.encoder.warmup_decisions / envs), total // 4)
+        warmup = min(math.ceil(config.encoder.warmup_decisions / envs), total // 4) if embedding.has_code(config) else 0
         least = config.agent.n_step + config.agent.history
         learn_from = warmup + max(math.ceil(config.agent.learning_starts / envs), least)
         return cls(total=total, warmup=warmup, learn_from=learn_from)
@@ -152,11 +155,11 @@ def init(config: Config, world: World, key: Array) -> TrainState:
 
 def _init_learner(config: Config, key: Array) -> Learner:
     vae_key, q_key = jax.random.split(key)
-    vae = encoder.init_encoder(config.encoder, config.camera, vae_key)
+    vae = embedding.init(config, vae_key)
     q = qnetwork.init_q(config.agent, observation_size(config), len(ACTIONS), q_key)
     return Learner(
         vae=vae,
-        vae_optimiser=_vae_optimiser(config).init(vae),
+        vae_optimiser=_vae_optimiser(config).init(vae) if vae else None,
         encoder=vae,
         q=q,
         target=q,
@@ -222,8 +225,8 @@ def train_step(
 
     # Fly and see.
     flown, seen = jax.vmap(lambda s, a: env.step(config, world, s, a))(jax.tree.map(_flat, actors.env), _flat(action))
-    # Learn: the VAE from all new events, the Q-network from the replay.
-    vae_losses, learner = learn_to_see(config, axis, learner, seen.observation.events, keys[:, 2], step)
+    # Learn: the VAE from all that is newly seen, the Q-network from the replay.
+    vae_losses, learner = learn_to_see(config, axis, learner, seen.observation.sensed, keys[:, 2], step)
     q_losses, learner = learn_to_act(config, axis, learner, ring, time, keys[:, 3], step)
     learner = _publish(plan, learner, step)
 
@@ -276,12 +279,15 @@ def _publish(plan: Plan, learner: Learner, step: Array) -> Learner:
     )
 
 
-def learn_to_see(config: Config, axis: str | None, learner: Learner, fields, keys: Array, step: Array):
-    """VAE updates on this step's event fields: `(reconstruction, kl), learner`."""
+def learn_to_see(config: Config, axis: str | None, learner: Learner, sensed, keys: Array, step: Array):
+    """VAE updates on this step's event fields or pictures: `(reconstruction, kl), learner`."""
     plan = Plan.of(config)
+    nothing = jnp.float32(jnp.nan), jnp.float32(jnp.nan)
+    if not embedding.has_code(config):
+        return nothing, learner
     shards = keys.shape[0]
     # Each shard draws its own noise, so that the layout on devices does not change it.
-    split = jax.tree.map(lambda x: x.reshape(shards, -1, *x.shape[1:]), fields)
+    split = jax.tree.map(lambda x: x.reshape(shards, -1, *x.shape[1:]), sensed)
 
     def loss(params: Params, keys: Array):
         total, parts = jax.vmap(lambda f, k: encoder.vae_loss(config.encoder, params, f, k))(split, keys)
@@ -303,7 +309,7 @@ def learn_to_see(config: Config, axis: str | None, learner: Learner, fields, key
     def rest(learner: Learner):
         if config.encoder.keep_learning:
             return learn(learner, 1)
-        return (jnp.float32(jnp.nan), jnp.float32(jnp.nan)), learner
+        return nothing, learner
 
     return lax.cond(step < plan.warmup, lambda x: learn(x, config.encoder.warmup_updates_per_step), rest, learner)
 

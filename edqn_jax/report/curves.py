@@ -77,13 +77,14 @@ def draw_learning(metrics: Sequence[Mapping[str, Any]], file: Path) -> Figure:
         q_loss.set_title("Q loss (Eq. 9)")
         _line(vae, metrics, "reconstruction_loss", LINE, "reconstruction", marker=".")
         _line(vae, metrics, "kl", SECOND_LINE, "KL", marker=".")
-        vae.set_title("Event VAE (Eq. 6)")
+        vae.set_title("VAE (Eq. 6)")
         success.xaxis.set_major_formatter(EngFormatter(sep=""))
         for axes in (q_loss, vae):
             if any(np.any(np.asarray(line.get_ydata()) > 0) for line in axes.get_lines()):
                 axes.set_yscale("log")
             axes.set_xlabel("decisions")
             axes.xaxis.set_major_formatter(EngFormatter(sep=""))
+        vae.set_visible(bool(vae.get_lines()))  # not every sensor has one
         for axes in (success, vae):
             if axes.get_lines():
                 axes.legend(loc="best")

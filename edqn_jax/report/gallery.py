@@ -14,9 +14,9 @@ from edqn_jax.learn import encoder
 from edqn_jax.learn.policy import PolicyParams
 from edqn_jax.report.curves import draw_learning, draw_returns
 from edqn_jax.report.flights import draw_path, draw_world
-from edqn_jax.report.images import draw_events, draw_reconstruction
+from edqn_jax.report.images import LOOKS, draw_reconstruction, draw_sight
 from edqn_jax.rundir import TRAJECTORY_COLUMNS, RunDirectory
-from edqn_jax.sim import camera, env, events
+from edqn_jax.sim import camera, events, sensor
 from edqn_jax.sim.drone import Flight
 from edqn_jax.sim.scene import Scene
 
@@ -30,7 +30,9 @@ FINE = 8
 def draw_gallery(
     config: Config, run: RunDirectory, scene: Scene, params: PolicyParams, shortest: np.ndarray, outcome: str
 ) -> None:
-    """World, events, path, returns, learning and reconstruction into the run's `figures/`.
+    """World, path, returns, learning, what the drone sees and its reconstruction into the run's `figures/`.
+
+    What it sees is named after its sensor; `ranges` and `blind` show no image, and nothing is reconstructed.
 
     Args:
         scene: where the recorded flight was flown.
@@ -43,56 +45,77 @@ def draw_gallery(
     draw_path(scene, flown, shortest, run.figures / "path.png", outcome, config.env.goal_radius_m)
     draw_returns(run.read_episodes(), run.figures / "returns.png")
     draw_learning(run.read_metrics(), run.figures / "learning.png")
-    _draw_what_it_sees(config, run, scene, params, flown)
+    if config.env.sensor in LOOKS:
+        _draw_what_it_sees(config, run, scene, params, flown)
 
 
 def _draw_what_it_sees(
     config: Config, run: RunDirectory, scene: Scene, params: PolicyParams, flown: dict[str, np.ndarray]
 ) -> None:
-    """RGB beside events at moments of the flight, and what the VAE makes of those events."""
+    """RGB beside what the sensor shows at moments of the flight, and what the VAE makes of that."""
     n, steps = config.drone.physics_steps, len(flown["t"])
     decisions = np.arange(1, max(steps // n, 1) + 1)  # row k stands after physics step k + 1
-    offsets = np.array(env.frame_steps(config)) - n
+    offsets = np.array(sensor.frame_steps(config)) - n
     rows = np.clip(decisions[:, None] * n + offsets[None] - 1, 0, steps - 1)
     position = np.stack([flown[k] for k in ("x", "y", "z")], -1).astype(np.float32)
     quaternion = np.stack([flown[k] for k in ("qw", "qx", "qy", "qz")], -1).astype(np.float32)
 
-    def rgb(rows: np.ndarray, finer: int) -> np.ndarray:
-        return _rgb(config, scene, Flight(position[rows], quaternion[rows], np.zeros(0)), finer)  # type: ignore
+    def poses(rows: np.ndarray) -> Flight:
+        return Flight(position[rows], quaternion[rows], np.zeros(0))  # type: ignore
 
-    native = rgb(rows, 1)
-    frames = native[..., 0] * camera.LUMA[0] + native[..., 1] * camera.LUMA[1] + native[..., 2] * camera.LUMA[2]
-    fields = jax.vmap(lambda f: _field(config, f))(jnp.asarray(frames))
-    counts = np.asarray(jax.vmap(events.event_image)(fields))
-    shown = _busiest(np.abs(counts).sum((1, 2)), MOMENTS)
-    rows, native, counts, fields = rows[shown], native[shown], counts[shown], jax.tree.map(lambda x: x[shown], fields)
-    draw_events(
-        _display(rgb(rows[:, -1:], FINE)[:, -1]),
+    look, has_events = LOOKS[config.env.sensor], config.env.sensor == "events"
+    native = _rgb(config, scene, poses(rows), 1)
+    sensed = _sensed(config, scene, poses(rows[:, -1]), native)
+    images = np.asarray(jax.vmap(events.event_image)(sensed) if has_events else sensed)
+    shown = _busiest(np.abs(images).sum((1, 2)) if has_events else images.std((1, 2)), MOMENTS)
+    rows, native, images, sensed = rows[shown], native[shown], images[shown], jax.tree.map(lambda x: x[shown], sensed)
+    draw_sight(
+        _display(_rgb(config, scene, poses(rows[:, -1:]), FINE)[:, -1]),
         _display(native[:, -1]),
-        counts,
-        run.figures / "events.png",
+        images,
+        run.figures / f"{config.env.sensor}.png",
         list(rows[:, -1] * config.drone.physics_dt_s),
+        look,
     )
-    wanted = encoder.target(config.encoder, fields)
+    wanted = encoder.target(config.encoder, sensed)
     made = encoder.decode(
-        config.encoder, config.camera, params.encoder, encoder.embed(config.encoder, params.encoder, fields)
+        config.encoder, config.camera, params.encoder, encoder.embed(config.encoder, params.encoder, sensed)
     )
     # ON and OFF together, as events per pixel again.
-    seen, remembered = (np.expm1(np.asarray(x)).sum(-3) for x in (wanted, made))
-    draw_reconstruction(seen, remembered, run.figures / "reconstruction.png")
+    seen, remembered = ((np.expm1(x) if has_events else x).sum(-3) for x in (np.asarray(wanted), np.asarray(made)))
+    draw_reconstruction(seen, remembered, run.figures / "reconstruction.png", look)
 
 
 def _busiest(events: np.ndarray, parts: int) -> np.ndarray:
-    """Of each of `parts` equal parts of a flight the decision with the most events; fewer in a short flight."""
+    """Of each of `parts` equal parts of a flight the decision with the most to see; fewer in a short flight.
+
+    `events` [decisions] is how much each has, such as its number of events.
+    """
     numbers = np.array_split(np.arange(len(events)), parts)
     # Not from a part's rim, or neighbours in two parts would show one and the same thing.
     inner = [part[len(part) // 8 : len(part) - len(part) // 8] for part in numbers if len(part)]
     return np.array([part[np.argmax(events[part])] for part in inner])
 
 
+def _sensed(config: Config, scene: Scene, poses: Flight, frames: np.ndarray) -> Any:
+    """What the sensor shows at poses [M], whose frames [M, T, H, W, 3] are drawn already."""
+    if config.env.sensor == "depth":
+
+        @jax.jit
+        def depth(position: jax.Array, quaternion: jax.Array) -> jax.Array:
+            here = Flight(position[None], quaternion[None], jnp.zeros((1, 3)))
+            return sensor.sense(config, scene, here, None, jax.random.key(0))[0]  # type: ignore
+
+        return jnp.stack([depth(*pose) for pose in zip(poses.position, poses.quaternion, strict=True)])
+    luma = frames[..., 0] * camera.LUMA[0] + frames[..., 1] * camera.LUMA[1] + frames[..., 2] * camera.LUMA[2]
+    if config.env.sensor == "frames":
+        return sensor.brightness(config, jnp.asarray(luma[:, -1]))
+    return jax.vmap(lambda f: _field(config, f))(jnp.asarray(luma))
+
+
 def _field(config: Config, frames: Any) -> events.EventField:
-    sensor, noise = jax.random.split(jax.random.key(0))
-    memory = events.reset_memory(config.events, config.camera.height, config.camera.width, sensor)
+    key, noise = jax.random.split(jax.random.key(0))
+    memory = events.reset_memory(config.events, config.camera.height, config.camera.width, key)
     return events.events(config.events, memory, frames, config.events.frame_times_s, noise)[0]
 
 
@@ -102,7 +125,7 @@ def _rgb(config: Config, scene: Scene, poses: Flight, finer: int) -> np.ndarray:
 
     @jax.jit
     def picture(position: jax.Array, quaternion: jax.Array) -> jax.Array:
-        return camera.rgb(lens, scene, position, env.mount_rotation(config, quaternion))
+        return camera.rgb(lens, scene, position, sensor.mount_rotation(config, quaternion))
 
     moments = np.shape(poses.position)[:2]
     wanted = [(m, t) for m in range(moments[0]) for t in range(moments[1])]

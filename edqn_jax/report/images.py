@@ -1,76 +1,109 @@
-"""Pictures of what the drone sees: RGB beside events (Fig. 6 of the paper), and what its code keeps."""
+"""Pictures of what the drone sees: RGB beside what its sensor shows (Fig. 6 of the paper), and what its code keeps."""
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
-from matplotlib.colors import Normalize
+from matplotlib.colors import Colormap, Normalize
 from matplotlib.figure import Figure
 
 from edqn_jax.report.style import INK, MUTED, POLARITY, drawing
 
 
-def draw_events(
+@dataclasses.dataclass(frozen=True)
+class Look:
+    """How what a sensor shows is drawn."""
+
+    name: str
+    unit: str
+    colours: str | Colormap
+
+
+LOOKS = {
+    "events": Look("events", "events per pixel", POLARITY),
+    "frames": Look("log brightness", "log brightness + 1", "gray"),
+    "depth": Look("nearness", "nearness (3 is contact)", "gray"),
+}
+"""By the name of the sensor, those that show an image."""
+
+
+def draw_sight(
     rgb: np.ndarray,
     native_rgb: np.ndarray,
-    counts: np.ndarray,
+    shown: np.ndarray,
     file: Path,
     times_s: Sequence[float] | None = None,
+    look: Look = LOOKS["events"],
 ) -> Figure:
-    """RGB, fine and as the drone's camera has it, above the event image, one column a moment.
+    """RGB, fine and as the drone's camera has it, above what the sensor shows, one column a moment.
 
     Args:
         rgb: [M, H, W, 3] brightness in [0, 1] at any resolution.
         native_rgb: [M, h, w, 3] brightness in [0, 1] at the camera's own.
-        counts: [M, h, w] events, negative where it grew darker.
+        shown: [M, h, w] events, negative where it grew darker, or pictures.
         file: PNG to write.
         times_s: [M] seconds into the flight, for the titles.
+        look: of what is shown.
     """
-    height, width = np.shape(counts)[1:]
-    rows = [("RGB", rgb), (f"RGB, {width} × {height}", native_rgb), (f"events, {width} × {height}", counts)]
-    moments = len(counts)
-    scale = _symmetric(counts)
+    height, width = np.shape(shown)[1:]
+    size = f"{width} × {height}"
+    rows = [("RGB", rgb), (f"RGB, {size}", native_rgb), (f"{look.name}, {size}", shown)]
+    moments = len(shown)
+    scale = _scale(shown, look)
     with drawing(1.75 * moments + 0.9, 4.1, file) as figure:
         grid = figure.subplots(len(rows), moments, squeeze=False)
         for row, (name, pictures) in enumerate(rows):
             for column, picture in enumerate(np.asarray(pictures)):
                 axes = grid[row, column]
-                _show(axes, picture, scale)
+                _show(axes, picture, scale, look)
                 if row == 0 and times_s is not None:
                     axes.set_title(f"t = {times_s[column]:.1f} s", weight="normal", loc="center", fontsize=8)
-                if row == 2:
+                if row == 2 and _signed(look):
                     total = int(np.abs(picture).sum())
                     axes.set_xlabel(f"{total:,} events", fontsize=7, labelpad=2)
             grid[row, 0].set_ylabel(name, fontsize=8)
-        _colour_bar(figure, scale, grid, "events per pixel\n(− darker, + brighter)")
+        signs = "\n(− darker, + brighter)" if _signed(look) else ""
+        _colour_bar(figure, scale, grid, look, f"{look.unit}{signs}")
     return figure
 
 
-def draw_reconstruction(counts: np.ndarray, reconstructions: np.ndarray, file: Path) -> Figure:
-    """Event images above what the VAE makes of their codes, all on one colour scale.
+def draw_reconstruction(
+    shown: np.ndarray, reconstructions: np.ndarray, file: Path, look: Look = LOOKS["events"]
+) -> Figure:
+    """What the sensor showed above what the VAE makes of its codes, all on one colour scale.
 
     Args:
-        counts: [N, h, w] signed events.
+        shown: [N, h, w] signed events or pictures.
         reconstructions: [N, h, w] the decoder's, in the same units.
         file: PNG to write.
+        look: of what is shown.
     """
-    counts, reconstructions = np.asarray(counts), np.asarray(reconstructions)
-    scale = _symmetric(counts)
-    with drawing(1.35 * len(counts) + 0.9, 2.45, file) as figure:
-        grid = figure.subplots(2, len(counts), squeeze=False)
-        for row, (name, pictures) in enumerate((("events", counts), ("reconstruction", reconstructions))):
+    shown, reconstructions = np.asarray(shown), np.asarray(reconstructions)
+    scale = _scale(shown, look)
+    with drawing(1.35 * len(shown) + 0.9, 2.45, file) as figure:
+        grid = figure.subplots(2, len(shown), squeeze=False)
+        for row, (name, pictures) in enumerate(((look.name, shown), ("reconstruction", reconstructions))):
             for axes, picture in zip(grid[row], pictures, strict=True):
-                _show(axes, picture, scale)
+                _show(axes, picture, scale, look)
             grid[row, 0].set_ylabel(name, fontsize=8)
-        for axes, seen, made in zip(grid[1], counts, reconstructions, strict=True):
+        for axes, seen, made in zip(grid[1], shown, reconstructions, strict=True):
             error = float(np.sqrt(np.mean((seen - made) ** 2)))
             axes.set_xlabel(f"RMS error {error:.2f}", fontsize=7, labelpad=2)
-        _colour_bar(figure, scale, grid, "events per pixel")
+        _colour_bar(figure, scale, grid, look, look.unit)
     return figure
+
+
+def _signed(look: Look) -> bool:
+    return look is LOOKS["events"]
+
+
+def _scale(shown: np.ndarray, look: Look) -> Normalize:
+    return _symmetric(shown) if _signed(look) else Normalize(float(np.min(shown)), float(np.max(shown)))
 
 
 def _symmetric(counts: np.ndarray) -> Normalize:
@@ -80,11 +113,11 @@ def _symmetric(counts: np.ndarray) -> Normalize:
     return Normalize(-top, top)
 
 
-def _show(axes: Axes, picture: np.ndarray, scale: Normalize) -> None:
+def _show(axes: Axes, picture: np.ndarray, scale: Normalize, look: Look) -> None:
     if picture.ndim == 3:
         axes.imshow(np.clip(picture, 0.0, 1.0), interpolation="nearest")
     else:
-        axes.imshow(picture, cmap=POLARITY, norm=scale, interpolation="nearest")
+        axes.imshow(picture, cmap=look.colours, norm=scale, interpolation="nearest")
     axes.set_xticks([])
     axes.set_yticks([])
     axes.grid(False)
@@ -94,10 +127,10 @@ def _show(axes: Axes, picture: np.ndarray, scale: Normalize) -> None:
         spine.set_linewidth(0.5)
 
 
-def _colour_bar(figure: Figure, scale: Normalize, beside: np.ndarray, label: str) -> None:
+def _colour_bar(figure: Figure, scale: Normalize, beside: np.ndarray, look: Look, label: str) -> None:
     # As high as one row, at the foot of the grid, so that all rows keep one width.
     bar = figure.colorbar(
-        ScalarMappable(scale, POLARITY),
+        ScalarMappable(scale, look.colours),
         ax=beside.ravel().tolist(),
         shrink=0.9 / len(beside),
         anchor=(0.0, 0.03),
@@ -106,5 +139,7 @@ def _colour_bar(figure: Figure, scale: Normalize, beside: np.ndarray, label: str
         extend="both",
     )
     bar.set_label(label, color=INK, fontsize=7)
+    if not _signed(look):
+        return
     top = int(scale.vmax or 1)
     bar.set_ticks([-top, 0, top] if top < 2 else [-top, -(top // 2), 0, top // 2, top])

@@ -13,20 +13,18 @@ from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from flax import struct
 from jax import Array
 
 from edqn_jax.config import Config, EnvConfig
 from edqn_jax.draws import integers
-from edqn_jax.sim import camera, drone, events
+from edqn_jax.sim import drone, sensor
 from edqn_jax.sim.drone import Airframe, DroneState, Flight
-from edqn_jax.sim.events import EventField, EventMemory
+from edqn_jax.sim.events import EventMemory
+from edqn_jax.sim.moves import ACTIONS
 from edqn_jax.sim.scene import Scene, path_contact, scene_at, take_scene
+from edqn_jax.sim.sensor import Sensed, frame_steps
 from edqn_jax.sim.worlds import Missions
-
-ACTIONS = np.stack(np.meshgrid(*[[-1, 0, 1]] * 3, indexing="ij"), -1).reshape(27, 3)
-"""The 27 moves, {-1, 0, 1}^3: ahead, left, up in the heading frame."""
 
 OWN_SIZE = 10
 """Values of the drone's own state in an observation."""
@@ -54,9 +52,9 @@ class World:
 
 @struct.dataclass
 class Observation:
-    """What the agent may know: events of the window before the decision, and its own state."""
+    """What the agent may know: what its sensor shows, by default the events before the decision, and its own state."""
 
-    events: EventField
+    sensed: Sensed
     own: Array  # [OWN_SIZE], see `own_state`
 
 
@@ -68,7 +66,7 @@ class EnvState:
     mission: Array  # [] int32 index into the missions
     decision: Array  # [] int32 decisions taken in this episode
     ended: Array  # [] bool, the next step is a reset
-    memory: EventMemory
+    memory: EventMemory | None  # the sensor's
     episode_return: Array  # [] sum of rewards so far
     key: Array  # [] typed key
 
@@ -201,39 +199,11 @@ def is_terminal(outcome: Array) -> Array:
     return (outcome != Outcome.RUNNING) & (outcome != Outcome.TIME_OUT)
 
 
-def _start(config: Config, world: World, mission: Array, key: Array) -> tuple[DroneState, EventMemory]:
+def _start(config: Config, world: World, mission: Array, key: Array) -> tuple[DroneState, EventMemory | None]:
     """At rest at the mission's start, facing its goal, the sensor at rest."""
     start, goal = world.missions.start[mission], world.missions.goal[mission]
     yaw = jnp.arctan2(goal[1] - start[1], goal[0] - start[0])
-    memory = events.reset_memory(config.events, config.camera.height, config.camera.width, key)
-    return drone.hover(start, yaw), memory
-
-
-def frame_steps(config: Config) -> tuple[int, ...]:
-    """Physics steps of a decision, 0..n, at which frames are rendered."""
-    n = config.drone.physics_steps
-    return tuple(n + round(t / config.drone.physics_dt_s) for t in config.events.frame_times_s)
-
-
-def view(config: Config, scene: Scene, position: Array, quaternion: Array) -> Array:
-    """Luma frame [H, W] of the camera on a body at `position` [3] with attitude `quaternion` [4]."""
-    return camera.luma(config.camera, scene, position, mount_rotation(config, quaternion))
-
-
-def mount_rotation(config: Config, quaternion: Array) -> Array:
-    """[3, 3] body-to-world rotation of the camera: the heading alone when level, else the full attitude."""
-    if config.camera.mount == "level":
-        w, z = quaternion[0], quaternion[3]
-        scale = jax.lax.rsqrt(jnp.maximum(w * w + z * z, 1e-9))
-        quaternion = jnp.stack([w * scale, jnp.zeros_like(w), jnp.zeros_like(w), z * scale])
-    w, x, y, z = quaternion
-    return jnp.stack(
-        [
-            jnp.stack([1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)]),
-            jnp.stack([2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)]),
-            jnp.stack([2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)]),
-        ]
-    )
+    return drone.hover(start, yaw), sensor.at_rest(config, key)
 
 
 def observe(
@@ -242,17 +212,16 @@ def observe(
     goal: Array,
     state: DroneState,
     poses: Flight,
-    memory: EventMemory,
+    memory: EventMemory | None,
     key: Array,
-) -> tuple[Observation, EventMemory]:
-    """Events of the window that ends now, and the own state.
+) -> tuple[Observation, EventMemory | None]:
+    """What the sensor shows now, and the own state.
 
     Args:
-        poses: [T, ...] the frames' poses, in order.
+        poses, memory, key: as in `sensor.sense`.
     """
-    frames = jax.vmap(lambda p, q: view(config, scene, p, q))(poses.position, poses.quaternion)
-    field, memory = events.events(config.events, memory, frames, config.events.frame_times_s, key)
-    return Observation(events=field, own=own_state(config.env, scene, goal, state)), memory
+    sensed, memory = sensor.sense(config, scene, poses, memory, key)
+    return Observation(sensed=sensed, own=own_state(config.env, scene, goal, state)), memory
 
 
 def reset(config: Config, world: World, key: Array, mission: Array | None = None) -> tuple[EnvState, Observation]:
@@ -260,7 +229,7 @@ def reset(config: Config, world: World, key: Array, mission: Array | None = None
     key, noise = jax.random.split(key)
     state = dataclasses.replace(ended(config, world, key, mission), ended=jnp.zeros((), bool))
     scene = scene_at(take_scene(world.pool, world.missions.scene[state.mission]), jnp.zeros(()))
-    still = _hold(state.drone, len(config.events.frame_times_s))
+    still = _hold(state.drone, len(frame_steps(config)))
     goal = world.missions.goal[state.mission]
     observation, memory = observe(config, scene, goal, state.drone, still, state.memory, noise)
     return dataclasses.replace(state, memory=memory), observation
@@ -268,9 +237,9 @@ def reset(config: Config, world: World, key: Array, mission: Array | None = None
 
 def ended(config: Config, world: World, key: Array, mission: Array | None = None) -> EnvState:
     """An environment whose next step is a reset; it needs no picture. The mission is as in `reset`."""
-    key, draw, sensor = jax.random.split(key, 3)
+    key, draw, rest = jax.random.split(key, 3)
     mission = _drawn_mission(world, draw) if mission is None else mission
-    body, memory = _start(config, world, mission, sensor)
+    body, memory = _start(config, world, mission, rest)
     return EnvState(
         drone=body,
         mission=mission.astype(jnp.int32),
@@ -301,7 +270,7 @@ def step(
         action: [] int, 0..26.
         mission: [] int, which one a reset takes; None draws one.
     """
-    key, draw, sensor, noise = jax.random.split(state.key, 4)
+    key, draw, rest, noise = jax.random.split(state.key, 4)
     is_reset = state.ended
     fresh = _drawn_mission(world, draw) if mission is None else mission
     mission = jnp.where(is_reset, fresh, state.mission)
@@ -319,7 +288,7 @@ def step(
     moved = jnp.sqrt(jnp.sum((flown.position - before.position) ** 2))
     gained = reward(config.env, config.agent.discount, outcome, distances[0], distances[1], moved)
 
-    start, memory = _start(config, world, mission, sensor)
+    start, memory = _start(config, world, mission, rest)
     # A diverged body must not leave NaN in the last observation; it stays where it was.
     broken = ~jnp.all(jnp.isfinite(jnp.concatenate([flown.position, flown.quaternion, flown.velocity])))
     held = _hold(before, flight.position.shape[0])

@@ -40,7 +40,7 @@ def observations(count, seed=0):
     counts = rng.integers(-3, 4, (count, 6, 8)).astype(np.int8)
     own = rng.normal(size=(count, OWN_SIZE)).astype(np.float32)
     return [
-        Observation(events=field_of_counts(CONFIG.events, jnp.asarray(c)), own=jnp.asarray(o))
+        Observation(sensed=field_of_counts(CONFIG.events, jnp.asarray(c)), own=jnp.asarray(o))
         for c, o in zip(counts, own, strict=True)
     ]
 
@@ -76,7 +76,7 @@ def test_an_observation_is_the_scaled_code_and_the_own_state(params):
     one = observations(1)[0]
     flat = flatten(params.encoder, one)
     assert flat.shape == (SIZE,) == (5 + OWN_SIZE,)
-    code = encoder.embed(CONFIG.encoder, params.encoder, one.events)
+    code = encoder.embed(CONFIG.encoder, params.encoder, one.sensed)  # pyright: ignore[reportArgumentType]
     np.testing.assert_allclose(flat[:5], CONFIG.agent.code_scale * code, rtol=1e-6)
     np.testing.assert_array_equal(flat[5:], one.own)
 

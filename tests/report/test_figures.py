@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 
 from edqn_jax.report.curves import draw_learning, draw_returns, running_mean
 from edqn_jax.report.flights import draw_path, draw_world
-from edqn_jax.report.images import draw_events, draw_reconstruction
+from edqn_jax.report.images import draw_reconstruction, draw_sight
 from edqn_jax.report.solids import MAP, View, hidden, solids_of
 from edqn_jax.report.style import OUTCOME_COLOURS
 from edqn_jax.sim.scene import (
@@ -188,7 +188,7 @@ def test_events_stand_below_the_image_that_made_them(tmp_path):
     counts = np.zeros((3, 24, 32), np.int8)
     counts[1, 4, 5], counts[2, 6, 7] = 3, -2
     rgb = np.random.default_rng(0).random((3, 96, 128, 3))
-    figure = draw_events(rgb, rgb[:, ::4, ::4], counts, tmp_path / "events.png", times_s=[0.26, 1.3, 2.6])
+    figure = draw_sight(rgb, rgb[:, ::4, ::4], counts, tmp_path / "events.png", times_s=[0.26, 1.3, 2.6])
     assert is_png(tmp_path / "events.png")
     drawn = [np.asarray(axes.images[0].get_array()) for axes in figure.axes if axes.images]
     np.testing.assert_allclose(drawn[1], rgb[1])

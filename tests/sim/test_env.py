@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from edqn_jax.config import Config, EnvConfig, EventsConfig, preset
-from edqn_jax.sim import camera, drone, env, events
+from edqn_jax.sim import camera, drone, env, events, sensor
 from edqn_jax.sim.drone import DroneState, Flight
 from edqn_jax.sim.env import ACTIONS, Outcome
 from edqn_jax.sim.scene import UprightBoxes, build_scene, stack_scenes
@@ -282,7 +282,7 @@ def quaternion_of(roll, pitch, yaw):
 def test_a_body_camera_turns_with_the_quaternion():
     config = dataclasses.replace(CONFIG, camera=dataclasses.replace(CONFIG.camera, mount="body"))
     for angles in np.random.default_rng(0).uniform(-1, 1, (5, 3)) * np.array([0.6, 0.6, np.pi]):
-        rotation = env.mount_rotation(config, jnp.asarray(quaternion_of(*angles), jnp.float32))
+        rotation = sensor.mount_rotation(config, jnp.asarray(quaternion_of(*angles), jnp.float32))
         np.testing.assert_allclose(rotation, rotation_of(*angles), atol=1e-6)
 
 
@@ -290,17 +290,17 @@ def test_a_level_camera_turns_with_the_heading_alone():
     for yaw in (-3.0, 0.2, 2.0):
         # Undo the tilt the shortest way and the turn about z is what is left (drone.py).
         leaned = quaternion_of(0.0, 0.0, yaw)
-        rotation = env.mount_rotation(CONFIG, jnp.asarray(leaned, jnp.float32))
+        rotation = sensor.mount_rotation(CONFIG, jnp.asarray(leaned, jnp.float32))
         np.testing.assert_allclose(rotation, rotation_of(0, 0, yaw), atol=1e-6)
     tilted = jnp.asarray(quaternion_of(0.3, -0.4, 1.0), jnp.float32)
-    rotation = np.asarray(env.mount_rotation(CONFIG, tilted))
+    rotation = np.asarray(sensor.mount_rotation(CONFIG, tilted))
     np.testing.assert_allclose(rotation, rotation_of(0, 0, float(drone.yaw_of(tilted))), atol=1e-6)
 
 
 def test_frames_are_rendered_at_the_configured_physics_steps():
-    assert env.frame_steps(CONFIG) == (11, 13)
+    assert sensor.frame_steps(CONFIG) == (11, 13)
     many = dataclasses.replace(CONFIG, events=EventsConfig(frame_times_s=(-0.26, -0.14, -0.02, 0.0)))
-    assert env.frame_steps(many) == (0, 6, 12, 13)
+    assert sensor.frame_steps(many) == (0, 6, 12, 13)
 
 
 # ------------------------------------------------------------------------------------ flown missions
@@ -376,7 +376,7 @@ def test_a_fresh_environment_rests_at_its_start_and_faces_its_goal(reset):
     np.testing.assert_array_equal(state.drone.velocity, 0.0)
     np.testing.assert_allclose(abs(drone.yaw_of(state.drone.quaternion)), np.pi, atol=1e-6)
     assert not state.ended and state.decision == 0 and state.episode_return == 0.0
-    assert int(jnp.sum(observation.events.count)) == 0
+    assert int(jnp.sum(observation.sensed.count)) == 0
 
 
 @pytest.mark.slow
@@ -411,7 +411,7 @@ def test_a_flight_ahead_reaches_its_goal_and_the_next_step_is_the_reset(reset, s
     assert back.reward == 0.0 and back.episode_return == 0.0 and back.episode_length == 0
     np.testing.assert_array_equal(fresh.drone.position, world.missions.start[fresh.mission])
     np.testing.assert_array_equal(back.flight.position, np.tile(fresh.drone.position, (N, 1)))
-    assert int(jnp.sum(back.observation.events.count)) == 0  # at rest nothing moves
+    assert int(jnp.sum(back.observation.sensed.count)) == 0  # at rest nothing moves
     goal = world.missions.goal[fresh.mission]
     np.testing.assert_allclose(back.observation.own, env.own_state(FLOWN.env, SCENE, goal, fresh.drone), atol=1e-6)
 
@@ -451,11 +451,11 @@ def test_the_limit_ends_an_episode_at_exactly_its_last_decision_without_cutting_
 def test_events_are_those_between_the_configured_frames_of_the_flight(reset, step):
     _, steps = fly(reset, step, "wall", [action(0, 1, 1)] * 3)
     result = steps[-1]
-    see = jax.jit(lambda p, q: camera.luma(FLOWN.camera, SCENE, p, env.mount_rotation(FLOWN, q)))
+    see = jax.jit(lambda p, q: camera.luma(FLOWN.camera, SCENE, p, sensor.mount_rotation(FLOWN, q)))
     frames = jnp.stack([see(result.flight.position[i], result.flight.quaternion[i]) for i in (10, 12)])
     memory = events.reset_memory(FLOWN.events, 24, 32, jax.random.key(0))
     field, _ = events.events(FLOWN.events, memory, frames, (-0.04, 0.0), jax.random.key(1))
-    got = result.observation.events
+    got = result.observation.sensed
     assert int(jnp.sum(field.count)) > 20
     # Two compilations may differ in the last digit, and with it in a rare event on the threshold.
     assert np.mean(np.asarray(field.count * field.polarity != got.count * got.polarity)) < 0.005
@@ -509,7 +509,7 @@ def test_many_environments_at_once_are_the_same_as_one_by_one(reset, step):
             np.testing.assert_allclose(mine.flight.position, single.flight.position, atol=1e-4)
             np.testing.assert_allclose(mine.observation.own, single.observation.own, atol=1e-4)
             np.testing.assert_allclose(mine.reward, single.reward, atol=1e-3)
-            wrong = mine.observation.events.count != single.observation.events.count
+            wrong = mine.observation.sensed.count != single.observation.sensed.count
             assert np.mean(np.asarray(wrong)) < 0.01  # a rare event on the threshold
 
 

@@ -1,0 +1,199 @@
+"""What each sensor shows, held against other people's rays and a camera by brute force."""
+
+# pyright: reportArgumentType=false
+
+from __future__ import annotations
+
+import dataclasses
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from edqn_jax.config import CameraConfig, Config, EnvConfig
+from edqn_jax.sim import env, mjcf, sensor
+from edqn_jax.sim.drone import Flight, hover, load_airframe
+from edqn_jax.sim.events import EventField
+from edqn_jax.sim.moves import ACTIONS, DIRECTIONS
+from edqn_jax.sim.scene import stack_scenes
+from edqn_jax.sim.worlds import own_missions
+from tests.oracles import camera_plain
+from tests.oracles.mujoco_depth import RayCaster
+from tests.sim.drawn_scenes import every_kind, free_points, rotation_of, scene_of
+
+SENSORS = ("events", "frames", "depth", "ranges", "blind")
+CAMERA = CameraConfig(width=16, height=12)
+STAY = 13
+
+
+def config_of(name: str, **knobs) -> Config:
+    return Config(camera=CAMERA, env=EnvConfig(sensor=name, **knobs))  # type: ignore
+
+
+@partial(jax.jit, static_argnums=0)
+def shown(config, scene, positions, yaws):
+    """[M, ...] of what the sensor shows at rest."""
+
+    def one(position, yaw):
+        body = hover(position, yaw)
+        still = Flight(*(jnp.stack([x] * 2) for x in (body.position, body.quaternion, body.velocity)))
+        return sensor.sense(config, scene, still, sensor.at_rest(config, jax.random.key(0)), jax.random.key(1))[0]
+
+    return jax.vmap(one)(positions, yaws)
+
+
+def poses(scene, rng, count):
+    positions = free_points(scene, rng, count)
+    return positions, rng.uniform(-np.pi, np.pi, len(positions)).astype(np.float32)
+
+
+def turned(yaw: float) -> np.ndarray:
+    return rotation_of(0.0, 0.0, float(yaw))
+
+
+@pytest.fixture(scope="module")
+def scenes():
+    rng = np.random.default_rng(11)
+    return [mjcf.load_scene(mjcf.resolve_world("paper")), *(every_kind(rng) for _ in range(2))]
+
+
+@pytest.mark.slow
+def test_a_frame_is_the_logarithm_of_the_camera_by_brute_force(scenes) -> None:
+    config = config_of("frames")
+    for scene in scenes:
+        where = poses(scene, np.random.default_rng(1), 3)
+        ours = np.asarray(shown(config, scene, *where), np.float64)
+        plain = np.stack([camera_plain.luma(CAMERA, scene, p, turned(a)) for p, a in zip(*where, strict=True)])
+        assert ours.shape == (3, 12, 16)
+        # The level camera's own bar against 8 x 8 samples a pixel (tests/sim/test_camera.py).
+        assert np.sqrt(np.mean((np.exp(ours - 1.0) - config.events.log_epsilon - plain) ** 2)) < 0.014
+        assert np.ptp(plain) > 0.2  # there was something to see
+
+
+def test_depth_is_the_nearness_of_what_mujocos_rays_meet(scenes) -> None:
+    config = config_of("depth")
+    for scene in scenes:
+        where = poses(scene, np.random.default_rng(2), 4)
+        ours = np.asarray(shown(config, scene, *where), np.float64)
+        caster = RayCaster(scene)
+        rays = [camera_plain.directions(CAMERA, turned(yaw), 1) for yaw in where[1]]
+        metres = np.stack([caster.distance(p, d) for p, d in zip(where[0], rays, strict=True)])
+        wanted = 3.0 / (1.0 + metres / 4.0)  # MuJoCo's inf, the sky, is 0
+        # Metres agree to 1e-4 of themselves; rays along an edge may meet another surface.
+        wrong = np.abs(ours - wanted) > 3e-3
+        assert wrong.mean() < 0.005
+        assert ours.min() >= 0.0 and ours.max() <= 3.0 and np.ptp(wanted) > 0.3
+
+
+def free_way(config, scene, caster, position, yaw) -> np.ndarray:
+    """[26] metres along what each move commands, to a geom or to a face of the volume, by MuJoCo and by hand."""
+    found = []
+    for move in range(len(ACTIONS)):
+        command = np.asarray(env.velocity_command(config.env, move, yaw), np.float64)
+        if move == STAY:
+            assert not command.any()
+            continue
+        way = command / np.linalg.norm(command)
+        met = float(caster.distance(position, way))
+        for axis in range(3):
+            for face in np.asarray(scene.volume, np.float64)[:, axis]:
+                reach = (face - position[axis]) / way[axis] if way[axis] else np.inf
+                met = min(met, reach) if reach > 0 else met
+        found.append(met)
+    return np.array(found)
+
+
+def test_ranges_are_the_free_way_along_each_move_in_its_order(scenes) -> None:
+    config = config_of("ranges")
+    fenced = []
+    for scene in scenes:
+        positions, yaws = poses(scene, np.random.default_rng(3), 12)
+        yaws[:2] = 0.0, np.pi / 2  # along the axes
+        ours = np.asarray(shown(config, scene, positions, yaws), np.float64)
+        caster = RayCaster(scene)
+        metres = np.stack([free_way(config, scene, caster, p, a) for p, a in zip(positions, yaws, strict=True)])
+        assert ours.shape == metres.shape == (12, 26)
+        wrong = np.abs(ours - 1.0 / (1.0 + metres / 4.0)) > 1e-3
+        assert wrong.mean() < 0.005
+        lower, upper = np.asarray(scene.volume)
+        ends = positions + np.array([turned(a) @ DIRECTIONS.T for a in yaws]).transpose(2, 0, 1) * metres.T[..., None]
+        fenced.append(np.any((ends < lower + 0.01) | (ends > upper - 0.01), axis=-1))
+    share = np.mean([each.mean() for each in fenced])
+    assert 0.2 < share < 0.9  # some end at the volume, some at shapes
+
+
+def test_nothing_but_the_volume_bounds_the_way_in_an_empty_world() -> None:
+    scene = scene_of()  # 60 x 60 x 25 m
+    config = config_of("ranges")
+    near = np.asarray(shown(config, scene, jnp.array([[10.0, 20.0, 5.0]]), jnp.zeros(1)))[0]
+    metres = dict(zip([tuple(a) for a in ACTIONS if a.any()], 4.0 * (1.0 / near - 1.0), strict=True))
+    by_hand = {
+        (1, 0, 0): 50.0,
+        (-1, 0, 0): 10.0,
+        (0, 1, 0): 40.0,
+        (0, 0, -1): 5.0,
+        (1, 1, 0): 40.0 * np.sqrt(2),
+        (-1, -1, -1): 5.0 * np.sqrt(3),
+    }
+    for move, length in by_hand.items():
+        assert metres[move] == pytest.approx(length, rel=1e-4), move
+
+
+def test_nearness_is_bounded_and_falls_with_distance() -> None:
+    near = np.asarray(sensor.nearness(jnp.array([0.0, 0.36, 4.0, 12.0, jnp.inf])))
+    np.testing.assert_allclose(near, [1.0, 4 / 4.36, 0.5, 0.25, 0.0], atol=1e-6)
+
+
+@pytest.fixture(scope="module")
+def world():
+    pool = stack_scenes([mjcf.load_scene(mjcf.resolve_world("paper"))])
+    return env.World(load_airframe(Config().drone), pool, own_missions(pool))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["frames", "depth", "ranges"])
+def test_a_step_shows_what_is_seen_from_where_it_ends(world, name: str) -> None:
+    config = config_of(name)
+    state, _ = jax.jit(lambda key: env.reset(config, world, key))(jax.random.key(0))
+    state, step = jax.jit(lambda s: env.step(config, world, s, 26))(state)
+    assert not step.is_reset and state.memory is None
+    end = Flight(*(x[-1:] for x in (step.flight.position, step.flight.quaternion, step.flight.velocity)))
+    scene = jax.tree.map(lambda x: x[0], world.pool)
+    again = jax.jit(lambda p: sensor.sense(config, scene, p, None, jax.random.key(0))[0])(end)
+    np.testing.assert_allclose(step.observation.sensed, again, atol=1e-4)  # two programs
+    assert np.ptp(np.asarray(step.flight.position), axis=0).max() > 0.3  # elsewhere, another view
+
+
+@pytest.mark.parametrize(("name", "frames"), [("events", 2), ("frames", 1), ("depth", 1), ("ranges", 0), ("blind", 0)])
+def test_what_a_decision_draws(world, name: str, frames: int) -> None:
+    config = config_of(name)
+    assert sensor.frames_per_decision(config) == frames
+    state = jax.eval_shape(lambda key: env.ended(config, world, key), jax.random.key(0))
+    program = jax.make_jaxpr(lambda s: env.step(config, world, s, 0))(state)
+    drawn = [e.outvars[0].aval.shape for e in program.jaxpr.eqns if e.primitive.name == "pictures"]  # type: ignore
+    # Two frames of a window are drawn together.
+    assert drawn == ([(frames, 12, 16)] if name in ("events", "frames") else [])
+    sensed = jax.eval_shape(lambda s: env.step(config, world, s, 0), state)[1].observation.sensed
+    if name == "events":
+        assert isinstance(sensed, EventField)
+    else:
+        assert getattr(sensed, "shape", None) == {"ranges": (26,), "blind": None}.get(name, (12, 16))
+
+
+def test_a_camera_on_the_body_sees_the_ground_rise_and_ranges_do_not_care(world) -> None:
+    lean = rotation_of(0.0, 0.4, 0.0)  # nose down
+    w = np.sqrt(1 + np.trace(lean)) / 2
+    quaternion = jnp.array([w, 0.0, (lean[0, 2] - lean[2, 0]) / (4 * w), 0.0], jnp.float32)[None]
+    level = jnp.array([[1.0, 0.0, 0.0, 0.0]])
+    scene = jax.tree.map(lambda x: x[0], world.pool)
+    place = jnp.array([[5.0, 5.0, 3.0]])
+    found = {}
+    for name in ("depth", "ranges"):
+        config = dataclasses.replace(config_of(name), camera=dataclasses.replace(CAMERA, mount="body"))
+        see = jax.jit(lambda here, config=config: sensor.sense(config, scene, here, None, jax.random.key(0))[0])
+        for attitude in (level, quaternion):
+            found[name, attitude is level] = np.asarray(see(Flight(place, attitude, jnp.zeros((1, 3)))))
+    assert found["depth", False][:6].mean() > found["depth", True][:6].mean() + 0.02
+    np.testing.assert_allclose(found["ranges", False], found["ranges", True], atol=1e-6)
