@@ -76,13 +76,22 @@ def temporal_encoding(frequencies: int, tau: Array) -> Array:
     return jnp.stack(channels, axis=-1)
 
 
-def temporal_sums(frequencies: int, field: EventField) -> list[Array]:
+def temporal_sums(frequencies: int, field: EventField) -> list[Array | None]:
     """Sums of `temporal_encoding` over each pixel's events in closed form: C arrays `[..., F, H, W]`.
+
+    None stands for a sum that is zero whatever the events: n events that divide the window evenly add up to
+    the n-th roots of unity, which leave n where n divides the frequency, and nothing else.
 
     The geometric series of n phasors a step apart is Dirichlet's kernel, `sin(n x) / sin(x)`, times the
     middle phasor. Half turns are taken out of x first: the kernel is then stable where sin(x) vanishes.
     """
     n = field.count.astype(jnp.float32)
+    if field.divides_window:
+        sums: list[Array | None] = [n]
+        for k in range(1, frequencies + 1):
+            divides = sum((n == d) for d in range(1, k + 1) if k % d == 0)
+            sums += [n * divides, None]
+        return sums
     first, step = field.t_first / field.window_s, field.t_step / field.window_s
     sums = [n]
     for k in range(1, frequencies + 1):
@@ -264,6 +273,9 @@ class Encoder(nn.Module):
         batch = field.count.shape[:-3]
         pooled = []
         for phi in temporal_sums(self.config.time_frequencies, field):
+            if phi is None:
+                pooled.append(jnp.zeros((*batch, on.shape[-1])))
+                continue
             phi_on = jnp.sum(jnp.where(field.polarity > 0, phi, 0.0), axis=-3).reshape(*batch, -1)
             phi_off = jnp.sum(jnp.where(field.polarity < 0, phi, 0.0), axis=-3).reshape(*batch, -1)
             pooled.append(phi_on @ on + phi_off @ off)

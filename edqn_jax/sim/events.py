@@ -45,6 +45,8 @@ class EventField:
     t_first: Array  # [F, H, W] float32 seconds from the start of the window
     t_step: Array  # [F, H, W] float32 seconds between a pixel's events
     window_s: float = struct.field(pytree_node=False)  # length of the window, seconds
+    divides_window: bool = struct.field(pytree_node=False, default=False)
+    """Whether `t_first` is 0 and `t_step` the window over `count` everywhere: Eq. 5 between one pair of frames."""
 
 
 @struct.dataclass
@@ -179,7 +181,8 @@ def events(
         field = _frame_pairs(config, memory.gain, frames, times)
     if _has_noise(config):
         field = _join(field, _noise(config, memory.hot, field, times, key))
-    return dataclasses.replace(field, window_s=window_s), memory
+    one_pair = len(times) == 2 and config.law != "esim" and not _has_noise(config)
+    return dataclasses.replace(field, window_s=window_s, divides_window=one_pair), memory
 
 
 def signed_count(field: EventField) -> Array:
@@ -197,7 +200,7 @@ def field_of_counts(config: EventsConfig, counts: Array) -> EventField:
     window_s = config.frame_times_s[-1] - config.frame_times_s[0]
     count = jnp.abs(counts.astype(jnp.int32))[None]
     t_first, t_step = event_times(count, jnp.float32(0.0), jnp.float32(window_s))
-    return EventField(count, jnp.sign(counts).astype(jnp.int8)[None], t_first, t_step, window_s)
+    return EventField(count, jnp.sign(counts).astype(jnp.int8)[None], t_first, t_step, window_s, divides_window=True)
 
 
 def event_picture(image: NDArray, background: str = "white") -> NDArray[np.uint8]:

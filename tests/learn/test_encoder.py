@@ -52,12 +52,20 @@ def event_list(field: ev.EventField) -> tuple[jax.Array, ...]:
     return jnp.asarray(x), jnp.asarray(y), jnp.asarray(tau, jnp.float32), jnp.asarray(p)
 
 
+def even_field() -> ev.EventField:
+    """As the default law makes them of one pair of frames: counts 0 to 5, either polarity."""
+    rng = np.random.default_rng(4)
+    counts = rng.integers(-5, 6, (SMALL.height, SMALL.width)).astype(np.int8)
+    counts[0] = [0, 1, -1, 2, -2, 3]
+    return ev.field_of_counts(EventsConfig(), jnp.asarray(counts))
+
+
 @pytest.mark.parametrize("kind", ["table", "network"])
+@pytest.mark.parametrize("field", [ragged_field(1), even_field()], ids=["ragged", "even"])
 @pytest.mark.slow
-def test_dense_encoder_equals_the_sum_over_single_events(kind):
+def test_dense_encoder_equals_the_sum_over_single_events(kind, field):
     config = EncoderConfig(pixel_features=kind, time_frequencies=2, features=8, hidden=16, code_size=5)
     params = fresh(config, SMALL, jax.random.key(0))
-    field = ragged_field(1)
     x, y, tau, p = event_list(field)
     weights = jax.random.normal(jax.random.key(1), (2, 5))
 
@@ -79,6 +87,16 @@ def test_dense_encoder_equals_the_sum_over_single_events(kind):
         np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-4)
     for a, b in zip(jax.tree.leaves(gradient), jax.tree.leaves(plain_gradient), strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-3)
+
+
+def test_sums_of_events_that_divide_the_window_are_those_of_any_events():
+    field = even_field()
+    assert field.divides_window
+    known = en.temporal_sums(3, field)
+    sums = en.temporal_sums(3, dataclasses.replace(field, divides_window=False))
+    assert [k for k, phi in enumerate(known) if phi is None] == [2, 4, 6]
+    for phi, general in zip(known, sums, strict=True):
+        np.testing.assert_allclose(0.0 if phi is None else phi, general, atol=1e-5)  # float32 of five terms
 
 
 @pytest.mark.slow

@@ -300,6 +300,25 @@ def test_a_stored_signed_count_holds_the_whole_field_of_two_frames():
     assert field.window_s == again.window_s
 
 
+@pytest.mark.parametrize(
+    ("config", "frames", "divides"),
+    [
+        (PAPER, 2, True),
+        (dataclasses.replace(AIRSIM, airsim_tolerance=0.1), 2, True),
+        (PAPER, 3, False),
+        (ESIM, 2, False),
+        (dataclasses.replace(PAPER, leak_rate_hz=200.0), 2, False),
+    ],
+    ids=["paper", "airsim", "three frames", "esim", "noise"],
+)
+def test_a_field_says_that_events_divide_the_window_where_they_do(config, frames, divides):
+    field, _ = run(config, memory_of(config, 0), jnp.asarray(random_frames(5, frames)), TIMES[-frames:])
+    window = field.window_s
+    even = np.all(field.t_first == 0.0) and np.allclose(field.t_step, window / np.maximum(field.count, 1), rtol=1e-6)
+    assert np.any(field.count > 1)
+    assert field.divides_window == even == divides
+
+
 def test_the_event_picture_paints_on_red_and_off_blue():
     for background, blank in (("white", 255), ("black", 0)):
         picture = ev.event_picture(np.array([[3, -1, 0]]), background)
