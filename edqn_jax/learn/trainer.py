@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
 
@@ -21,6 +21,7 @@ import numpy as np
 import optax
 from flax import struct
 from jax import Array, lax
+from jax.flatten_util import ravel_pytree
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from edqn_jax import cluster
@@ -319,15 +320,19 @@ def learn_to_act(config: Config, axis: str | None, learner: Learner, ring, time:
     plan, agent = Plan.of(config), config.agent
     share = agent.batch_size // config.train.shards
 
-    def loss(params: Params, learner: Learner, batch: replay.Batch):
-        return dqn.batch_loss(agent, params, learner.target, len(ACTIONS), batch)
+    # All of a network as one vector: what is done to each number of it is one operation, and not one for each layer.
+    _, tree = ravel_pytree(learner.q)
+    vector = lambda params: ravel_pytree(params)[0]  # noqa: E731
+
+    def loss(q: Array, target: Array, batch: replay.Batch):
+        return dqn.batch_loss(agent, tree(q), tree(target), len(ACTIONS), batch)
 
     def update(learner: Learner, keys: Array):
         batch = jax.vmap(lambda r, k: replay.sample(agent, r, time, share, k))(ring, keys)
         batch = jax.tree.map(_flat, batch)
-        (total, (count, sum_q)), gradient = jax.value_and_grad(loss, has_aux=True)(learner.q, learner, batch)
+        (total, (count, sum_q)), gradient = jax.value_and_grad(loss, has_aux=True)(learner.q, learner.target, batch)
         gradient, total, count, sum_q = _all_sum((gradient, total, count, sum_q), axis)
-        gradient = jax.tree.map(lambda g: g / jnp.maximum(count, 1.0), gradient)
+        gradient = gradient / jnp.maximum(count, 1.0)
         change, optimiser = _q_optimiser(config).update(gradient, learner.q_optimiser, learner.q)
         q = optax.apply_updates(learner.q, change)
         learner = dataclasses.replace(
@@ -341,13 +346,20 @@ def learn_to_act(config: Config, axis: str | None, learner: Learner, ring, time:
 
     def learn(learner: Learner):
         many = jax.vmap(lambda k: jax.random.split(k, agent.updates_per_step))(keys).swapaxes(0, 1)
-        learner, losses = lax.scan(update, learner, many)
-        return jax.tree.map(jnp.mean, losses), learner
+        learner, losses = lax.scan(update, _each_network(vector, learner), many)
+        return jax.tree.map(jnp.mean, losses), _each_network(tree, learner)
 
     def rest(learner: Learner):
         return (jnp.float32(jnp.nan), jnp.float32(jnp.nan)), learner
 
     return lax.cond(step >= plan.learn_from, learn, rest, learner)
+
+
+def _each_network(change: Callable[[Any], Any], learner: Learner) -> Learner:
+    """`learner` with its three Q-networks changed."""
+    return dataclasses.replace(
+        learner, q=change(learner.q), target=change(learner.target), average=change(learner.average)
+    )
 
 
 def run_steps(
