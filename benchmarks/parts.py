@@ -13,7 +13,7 @@ import numpy as np
 from jax import Array
 from jax.sharding import PartitionSpec
 
-from edqn_jax.config import Config, ConfigError
+from edqn_jax.config import Config
 from edqn_jax.learn import dqn, encoder, qnetwork, replay, trainer
 from edqn_jax.learn.trainer import AXIS, Actors, Learner, TrainState
 from edqn_jax.sim import camera, columns, drone, env, events, sensor
@@ -347,12 +347,6 @@ PARTS: dict[str, Callable[[Moment], Part]] = {
 
 
 def parts_of(config: Config, world: World, state: TrainState, names: Sequence[str] = tuple(PARTS)) -> list[Part]:
-    """The named parts, on the state that training has come to.
-
-    Raises:
-        ConfigError: for another sensor than events.
-    """
-    if config.env.sensor != "events":
-        raise ConfigError(f"the parts are those of env.sensor events; of {config.env.sensor} time the whole step alone")
+    """The named parts, on the state that training has come to."""
     now = Moment(config, world, state)
     return [PARTS[name](now) for name in names]

@@ -67,6 +67,8 @@ def parse(argv: Sequence[str] | None = None) -> tuple[argparse.Namespace, Config
     if args.json is not None:
         check_can_write(args.json)
     config = configured(flags)
+    if config.env.sensor != "events" and not args.whole_only:
+        raise ConfigError(f"the parts are those of env.sensor events; {config.env.sensor} needs --whole-only")
     return args, steady(config, 8 if args.quick else config.train.chunk_steps)
 
 

@@ -162,7 +162,7 @@ class EnvConfig:
 
 @dataclass(frozen=True)
 class EncoderConfig:
-    """The event VAE (section 3.2) and when it learns."""
+    """The event VAE (section 3.2), or that of another sensor's pictures, and when it learns."""
 
     code_size: int = 32
     """Values in the code z."""
@@ -185,13 +185,15 @@ class EncoderConfig:
     learning_rate: float = 2e-3
     """Adam step size of the VAE."""
     warmup_decisions: int = 16_384
-    """Decisions of held random manoeuvres in which the VAE learns before the DQN starts; a quarter of all at most."""
+    """Decisions of held random manoeuvres in which the VAE learns before the DQN starts; a quarter of all at most.
+    None for the sensors `ranges` and `blind`, which have no VAE."""
     warmup_updates_per_step: int = 12
     """VAE updates per training step of the warm-up, each on all new event fields."""
     hold_decisions: int = 4
     """Mean number of decisions for which a random manoeuvre of the warm-up is held."""
     keep_learning: bool = False
-    """Go on training the VAE on every new field after the warm-up. The code that the agent sees stays the warm-up's."""
+    """Go on training the VAE on every new field after the warm-up. The code that the agent sees stays the warm-up's.
+    Nothing where there is no VAE."""
 
 
 @dataclass(frozen=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from pathlib import Path
 
@@ -17,6 +18,7 @@ from edqn_jax.course import Course
 from edqn_jax.evaluate import (
     decision_latency_ms,
     evaluate_command,
+    fresh_policy,
     load_run,
     spl,
     summarise,
@@ -127,6 +129,14 @@ def test_a_file_that_cannot_be_written_is_named_before_anything_is_flown(run, tm
 def test_codes_are_shuffled_between_enough_missions(run):
     with pytest.raises(ConfigError, match="--shuffle-codes needs --missions of at least 4, not 1"):
         evaluate_command(EvaluateArgs(run, shuffle_codes=True))
+
+
+def test_a_policy_that_sees_nothing_has_nothing_to_shuffle(tmp_path):
+    blind = dataclasses.replace(CONFIG, env=dataclasses.replace(CONFIG.env, sensor="blind"))
+    (tmp_path / "config.yaml").write_text(to_yaml(blind))
+    save_policy(tmp_path / "checkpoints", fresh_policy(blind))
+    with pytest.raises(ConfigError, match="--shuffle-codes has nothing to shuffle: the policy of .* sees nothing but"):
+        evaluate_command(EvaluateArgs(tmp_path, missions=4, shuffle_codes=True))
 
 
 @pytest.mark.parametrize("shuffle_codes", [True, False])

@@ -13,9 +13,10 @@ import numpy as np
 import pytest
 
 from edqn_jax import run as training
+from edqn_jax.cli import EvaluateArgs
 from edqn_jax.config import CameraConfig, Config, ConfigError, TrainConfig, WorldConfig
 from edqn_jax.endings import StoppedError
-from edqn_jax.evaluate import load_run
+from edqn_jax.evaluate import evaluate_command, load_run
 from edqn_jax.learn.policy import PolicyParams
 from edqn_jax.learn.trainer import Episodes, Losses
 from edqn_jax.report.progress import Progress
@@ -56,6 +57,32 @@ def test_a_run_leaves_what_the_readme_promises(whole: tuple[RunDirectory, dict])
     assert (summary["parameters_from_decisions"], summary["validation_spl"]) == (chosen, best)
     config, _ = load_run(run.path)
     assert config == CONFIG
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("sensor", "drawn"),
+    [
+        ("frames", {"frames", "reconstruction"}),
+        ("depth", {"depth", "reconstruction"}),
+        ("ranges", set()),
+        ("blind", set()),
+    ],
+)
+def test_a_run_with_another_sensor_leaves_the_same_and_is_evaluated(
+    sensor: Literal["frames", "depth", "ranges", "blind"], drawn: set[str], tmp_path: Path
+) -> None:
+    short = dataclasses.replace(CONFIG.train, total_steps=128)
+    config = dataclasses.replace(CONFIG, env=dataclasses.replace(CONFIG.env, sensor=sensor), train=short)
+    run = RunDirectory(tmp_path / sensor)
+    summary = train_run(config, run, Progress(), lambda: False)
+    assert json.loads(run.summary_file.read_text()) == plain(summary)
+    assert {file.stem for file in run.figures.glob("*.png")} == {"world", "path", "returns", "learning"} | drawn
+    assert summary["train_decisions"] == 128 and summary["workload"]["sensor"] == sensor
+    phases = [row["phase"] for row in run.read_metrics()]
+    assert phases == (["seeing", "flying"] if drawn else ["flying", "flying"])
+    evaluate_command(EvaluateArgs(run.path, missions=2, json=tmp_path / "figures.json"))
+    assert json.loads((tmp_path / "figures.json").read_text())["missions"] == 2
 
 
 @pytest.mark.slow

@@ -8,6 +8,7 @@ import statistics
 import pytest
 
 import throughput
+from edqn_jax.config import ConfigError
 from edqn_jax.learn.trainer import Plan, Trainer
 from edqn_jax.rundir import plain
 from parts import parts_of
@@ -26,6 +27,14 @@ def test_the_vae_learns_throughout_and_four_samples_are_replayed() -> None:
 def test_flags_that_say_how_much_to_replay_are_obeyed() -> None:
     _, config = throughput.parse(["--", "--agent.updates-per-step", "7", "--num-envs", "64"])
     assert (config.agent.updates_per_step, config.train.num_envs) == (7, 64)
+
+
+def test_another_sensor_is_timed_as_a_whole_only() -> None:
+    words = ["--", "--env.sensor", "blind"]
+    with pytest.raises(ConfigError, match="blind needs --whole-only"):
+        throughput.parse(words)
+    args, config = throughput.parse(["--whole-only", *words])
+    assert args.whole_only and config.env.sensor == "blind" and Plan.of(config).warmup == 0
 
 
 @pytest.mark.slow

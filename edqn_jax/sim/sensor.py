@@ -101,7 +101,8 @@ def sense(
 def brightness(config: Config, luma: Array) -> Array:
     """What `frames` shows of a luma frame [..., H, W]: log brightness (Eq. 1), of whose changes events are made.
 
-    In the logarithm a contrast is the same in light and in shade, and the VAE keeps more of it (docs/baselines.md).
+    In the logarithm a contrast is the same in light and in shade; brightness itself varies so little that the VAE
+    leaves part of its code unused (docs/baselines.md).
     """
     return events.log_brightness(config.events, luma) - MID_GREY
 
