@@ -13,6 +13,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from edqn_jax.config import CameraConfig
+from edqn_jax.fusion import materialised
 from edqn_jax.sim import columns, coverage, raycast
 from edqn_jax.sim.columns import Frame
 from edqn_jax.sim.coverage import Layers
@@ -82,7 +83,7 @@ def _picture(config: CameraConfig, scene: Scene, origin: Array, rotation: Array,
     layers = coverage.sphere_layers(config, scene, origin, rays, value, layers)
     sky = jnp.sum(jnp.asarray(config.sky_rgb) * weights)
     frame = Frame(origin=origin, heading=rotation[:2, 0], scene=scene, value=value, sky=sky)
-    return coverage.materialised(blend(config, frame, rays, layers))
+    return materialised(blend(config, frame, rays, layers))
 
 
 def luma(config: CameraConfig, scene: Scene, position: Array, rotation: Array) -> Array:

@@ -15,6 +15,7 @@ from flax import struct
 from jax import Array, lax
 
 from edqn_jax.config import CameraConfig
+from edqn_jax.fusion import materialised
 from edqn_jax.sim.raycast import (
     TINY,
     Rays,
@@ -41,11 +42,6 @@ LEVEL_FACE = 1e9
 
 DEPTH_OF_LAYERS = 3
 """Layers kept per pixel. With two, slivers of near corners hide what stands behind them (docs/decisions)."""
-
-
-def materialised(tree):
-    """The same arrays, computed once: an exact no-op that XLA does not fuse into (and repeat in) their consumers."""
-    return jax.tree.map(lambda x: lax.reduce_precision(x, exponent_bits=8, mantissa_bits=23), tree)
 
 
 @struct.dataclass

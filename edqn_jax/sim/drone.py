@@ -25,6 +25,7 @@ from flax import struct
 from jax import Array
 
 from edqn_jax.config import DroneConfig
+from edqn_jax.fusion import materialised
 
 with contextlib.redirect_stdout(io.StringIO()):  # it prints that Warp, an engine we do not use, is missing
     from mujoco import mjx
@@ -180,6 +181,9 @@ def _thrusts(
 
     # Collective thrust that gives the wanted vertical force at the tilt of this moment; none upside down.
     collective = airframe.mass * fz * jnp.maximum(up_z, 0.0) / jnp.maximum(up_z * up_z, _LEAST_LEVELNESS**2)
+
+    # Computed once, and not again for each rotor.
+    torque_x, torque_y, torque_z, collective = materialised(jnp.stack([torque_x, torque_y, torque_z, collective]))
 
     # Rotor limits, in order of importance.
     rotors = range(airframe.mixer.shape[0])
