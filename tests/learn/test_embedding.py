@@ -160,18 +160,16 @@ def test_the_code_of_a_picture_has_the_sizes_of_the_code_of_events(kind) -> None
 def test_a_picture_is_pooled_pixel_by_pixel(kind) -> None:
     config = EncoderConfig(pixel_features=kind, features=4, hidden=16, code_size=5)
     camera = CameraConfig(width=6, height=4)
-    params = encoder.init_encoder(config, camera, jax.random.key(0), pictures=True)
+    params = jax.jit(lambda key: encoder.init_encoder(config, camera, key, pictures=True))(jax.random.key(0))
     pictures = np.random.default_rng(0).normal(size=(2, 4, 6)).astype(np.float32)
-    mean, log_variance = encoder.encode(config, params, jnp.asarray(pictures))
+    mean, log_variance = jax.jit(partial(encoder.encode, config))(params, jnp.asarray(pictures))
     place = encoder.PixelTable if kind == "table" else encoder.PixelNetwork
-    pixels = place(12, 4, 6, 1)
+    y, x = np.mgrid[:4, :6]
     p = params["encoder"]
+    at = jax.jit(lambda *where: place(12, 4, 6, 1).apply({"params": p["pixels"]}, *where, method="at"))
+    features = np.asarray(at(x, y, np.ones_like(x)))
     for picture, code, spread in zip(pictures, mean, log_variance, strict=True):
-        pooled = np.zeros(12)
-        for y in range(4):
-            for x in range(6):
-                at = [jnp.array([v]) for v in (x, y, 1)]
-                pooled += picture[y, x] * np.asarray(pixels.apply({"params": p["pixels"]}, *at, method="at"))[0]
+        pooled = sum(picture[at] * features[at] for at in np.ndindex(4, 6))
         z = np.maximum(pooled / np.sqrt(24) @ p["hidden"]["kernel"] + p["hidden"]["bias"], 0.0)
         np.testing.assert_allclose(code, z @ p["mean"]["kernel"] + p["mean"]["bias"], rtol=1e-4, atol=1e-4)
         np.testing.assert_allclose(spread, -4.0, atol=1e-6)  # untrained
