@@ -33,7 +33,7 @@ with contextlib.redirect_stdout(io.StringIO()):  # it prints that Warp, an engin
 AIRFRAME_FILE = Path(__file__).with_name("skydio_x2.xml")
 """Mass, inertia and rotor layout."""
 
-_LEAST_LEVELNESS = 0.4
+LEAST_LEVELNESS = 0.4
 """Cosine of the tilt beyond which thrust no longer grows to hold the height."""
 
 
@@ -81,14 +81,19 @@ def c_model(config: DroneConfig) -> mujoco.MjModel:
     return spec.compile()
 
 
+def mixer_of(model: mujoco.MjModel) -> np.ndarray:
+    """Rotor thrusts per collective thrust (N) and torque about x, y, z (N m): [R, 4], of the model's rotor layout."""
+    arm = model.site_pos[model.actuator_trnid[:, 0]]
+    push, twist = model.actuator_gear[:, 2], model.actuator_gear[:, 5]
+    wrench_of_thrust = np.stack([push, arm[:, 1] * push, -arm[:, 0] * push, twist])
+    return np.linalg.inv(wrench_of_thrust)
+
+
 def load_airframe(config: DroneConfig) -> Airframe:
     """The Skydio X2 as MJX arrays, and the mixer that follows from its rotor layout."""
     model = c_model(config)
     rest = mujoco.MjData(model)
     mujoco.mj_forward(model, rest)
-    arm = model.site_pos[model.actuator_trnid[:, 0]]
-    push, twist = model.actuator_gear[:, 2], model.actuator_gear[:, 5]
-    wrench_of_thrust = np.stack([push, arm[:, 1] * push, -arm[:, 0] * push, twist])
     here = jax.local_devices()[0]  # MJX's own choice may be another process's
     return Airframe(
         model=mjx.put_model(model, device=here, impl="jax"),
@@ -97,7 +102,7 @@ def load_airframe(config: DroneConfig) -> Airframe:
         inertia=jnp.asarray(model.body_inertia[1], jnp.float32),
         gravity=jnp.float32(-model.opt.gravity[2]),
         max_thrust=jnp.float32(model.actuator_ctrlrange[0, 1]),
-        mixer=jnp.asarray(np.linalg.inv(wrench_of_thrust), jnp.float32),
+        mixer=jnp.asarray(mixer_of(model), jnp.float32),
     )
 
 
@@ -180,7 +185,7 @@ def _thrusts(
     torque_z = iz * config.yaw_rate_gain * (turn - r) + (iy - ix) * p * q
 
     # Collective thrust that gives the wanted vertical force at the tilt of this moment; none upside down.
-    collective = airframe.mass * fz * jnp.maximum(up_z, 0.0) / jnp.maximum(up_z * up_z, _LEAST_LEVELNESS**2)
+    collective = airframe.mass * fz * jnp.maximum(up_z, 0.0) / jnp.maximum(up_z * up_z, LEAST_LEVELNESS**2)
 
     # Computed once, and not again for each rotor.
     torque_x, torque_y, torque_z, collective = materialised(jnp.stack([torque_x, torque_y, torque_z, collective]))

@@ -151,7 +151,8 @@ def camera_rays(config: CameraConfig, rotation: Array, across: int = 1, down: in
     )
 
 
-def _sun(config: CameraConfig) -> tuple[float, float, float]:
+def sun_direction(config: CameraConfig) -> tuple[float, float, float]:
+    """Unit vector towards the sun, in the world's axes."""
     azimuth, elevation = math.radians(config.sun_azimuth_deg), math.radians(config.sun_elevation_deg)
     flat = math.cos(elevation)
     return flat * math.cos(azimuth), flat * math.sin(azimuth), math.sin(elevation)
@@ -159,7 +160,7 @@ def _sun(config: CameraConfig) -> tuple[float, float, float]:
 
 def shade(config: CameraConfig, nx: Array, ny: Array, nz: Array) -> Array:
     """Lambert shade of a unit normal under the sun: ambient + (1 - ambient) max(0, n . sun)."""
-    sx, sy, sz = _sun(config)
+    sx, sy, sz = sun_direction(config)
     return config.ambient + (1 - config.ambient) * jnp.maximum(nx * sx + ny * sy + nz * sz, 0.0)
 
 
