@@ -1,0 +1,150 @@
+"""How fast is the conventional stack, and where does its time go?
+
+Trains on the reference workload with C MuJoCo, numba, PyTorch and stable-baselines3, the VAE learning all the time,
+in one process and in two. The settings take turns, because a shared machine's speed moves; each row is the median
+of its turns.
+
+    python benchmarks/conventional.py --decisions 20480 --json conventional.json
+    python benchmarks/conventional.py -- --num-envs 256
+
+What stands after -- goes to the configuration as it would for train.py.
+"""
+
+from __future__ import annotations
+
+import argparse
+import statistics
+import sys
+from collections.abc import Sequence
+from contextlib import ExitStack
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import jax
+
+import json_report
+from edqn_jax.baselines.planner import MissingPackageError
+from edqn_jax.config import Config, ConfigError
+from edqn_jax.devices import use_cpu_devices
+from edqn_jax.files import check_can_write
+from edqn_jax.run import workload
+from edqn_jax.sim.mjcf import load_scene, resolve_world
+from flags import configured, split
+from whole import steady
+
+DRONES = 512
+"""Drones at once unless the flags say otherwise: with fewer, what PyTorch and Python cost once a step weighs more."""
+
+DECISIONS = 20_480
+REPEATS = 5
+
+PACKAGES = ("gymnasium", "numba", "stable-baselines3", "torch")
+"""What the extra brings, whose versions the figures depend on."""
+
+SETTINGS = ((1, 1), (2, 1), (2, 2))
+"""Processes that fly, and threads of PyTorch."""
+
+
+def parse(argv: Sequence[str] | None = None) -> tuple[argparse.Namespace, Config]:
+    """The arguments, and the configuration that is timed.
+
+    Raises:
+        ConfigError: if the flags after -- cannot be run, or the file cannot be written.
+    """
+    words, flags = split(sys.argv[1:] if argv is None else argv)
+    parser = argparse.ArgumentParser(
+        description=(__doc__ or "").partition("\n")[0], epilog="Flags after -- are train.py's."
+    )
+    parser.add_argument(
+        "--decisions", type=int, default=DECISIONS, help=f"decisions of each turn (default {DECISIONS})"
+    )
+    parser.add_argument("--repeats", type=int, default=REPEATS, help=f"turns of each row (default {REPEATS})")
+    parser.add_argument("--json", type=Path, help="write the rows to this file")
+    args = parser.parse_args(words)
+    for name in ("decisions", "repeats"):
+        if getattr(args, name) < 1:
+            parser.error(f"--{name} must be at least 1, not {getattr(args, name)}")
+    if args.json is not None:
+        check_can_write(args.json)
+    return args, steady(configured(["--num-envs", str(DRONES), *flags]), 4)
+
+
+def measure(config: Config, decisions: int, repeats: int) -> dict[str, Any]:
+    """Everything that `--json` holds.
+
+    Raises:
+        ConfigError: if the configuration asks for what this stack does not have.
+        MissingPackageError: if a package of the extra `bench` is not installed.
+    """
+    from edqn_jax.baselines.conventional.train import Steady, training_course
+
+    course = training_course(config)
+    turns: dict[tuple[int, int], list[float]] = {setting: [] for setting in SETTINGS}
+    with ExitStack() as stack:
+        runs = {setting: stack.enter_context(Steady(config, course, *setting)) for setting in SETTINGS}
+        for _ in range(repeats):  # in turns, so that a slow minute hits all alike
+            for setting, run in runs.items():
+                turns[setting].append(run.turn(decisions))
+        rows = [
+            {
+                "name": "conventional_stack",
+                "processes": processes,
+                "torch_threads": threads,
+                "decisions_per_second": statistics.median(turns[processes, threads]),
+                "shares": run.shares(),
+                "turns": turns[processes, threads],
+            }
+            for (processes, threads), run in runs.items()
+        ]
+    machine = json_report.machine(jax.devices())
+    machine["versions"] |= {name: metadata.version(name) for name in PACKAGES}
+    return {
+        "workload": {
+            **workload(config, load_scene(resolve_world(config.world.name))),
+            "physics": "c_mujoco",
+            "world": config.world.name,
+        },
+        **machine,
+        "decisions_per_second": max(row["decisions_per_second"] for row in rows),
+        "decisions_per_turn": decisions,
+        "repeats": repeats,
+        "rows": rows,
+    }
+
+
+def table(report: dict[str, Any]) -> str:
+    """The figures for people, in Markdown."""
+    stated, rows = report["workload"], report["rows"]
+    names = [f"{row['processes']} processes, PyTorch {row['torch_threads']} threads" for row in rows]
+    lines = [
+        f"{report['device']}, {stated['num_envs']} drones, {stated['replayed_samples_per_decision']:g} replayed and "
+        f"{stated['vae_samples_per_decision']:g} VAE samples per decision; medians of {report['repeats']}",
+        "",
+        f"| conventional stack | {' | '.join(names)} |",
+        f"| --- |{' ---: |' * len(rows)}",
+        f"| decisions/s | {' | '.join(format(row['decisions_per_second'], ',.0f') for row in rows)} |",
+    ]
+    for part in rows[0]["shares"]:
+        shares = " | ".join(format(row["shares"][part], ".1%") for row in rows)
+        lines.append(f"| {part.replace('_', ' ')} | {shares} |")
+    return "\n".join(lines)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Exit code 0 when all was measured, 2 for bad input."""
+    use_cpu_devices()
+    try:
+        args, config = parse(argv)
+        report = measure(config, args.decisions, args.repeats)
+    except (ConfigError, MissingPackageError) as error:
+        print(error, file=sys.stderr)
+        return 2
+    print(table(report))
+    if args.json is not None:
+        json_report.write(args.json, report)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

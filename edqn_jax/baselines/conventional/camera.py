@@ -1,0 +1,148 @@
+"""The level camera by `mj_multiRay`: one ray through the middle of each pixel, shade and texture in numba.
+
+Texture is box-filtered over the pixel's footprint as ours is; a silhouette is hard, because one ray a pixel is
+either on a shape or beside it.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edqn_jax.baselines.conventional.c_mujoco import mj_multi_ray
+from edqn_jax.baselines.planner import require
+from edqn_jax.config import CameraConfig
+from edqn_jax.sim.events import LUMA_WEIGHTS
+from edqn_jax.sim.raycast import HORIZON_M, image_plane, pitch_of, sun_direction
+from edqn_jax.sim.texture import WAVES
+
+numba = require("numba")
+
+
+class Optics(NamedTuple):
+    """The camera as plain numbers."""
+
+    u: NDArray[np.float64]  # [W] rightwards, at unit depth
+    v: NDArray[np.float64]  # [H] upwards
+    pitch: float
+    ambient: float
+    sun: NDArray[np.float64]  # [3] unit
+    sky: float  # luma
+    waves: NDArray[np.float64]  # [4, 3] cycles per metre
+    weights: NDArray[np.float64]  # [4] contrast of each
+
+
+def optics_of(config: CameraConfig) -> Optics:
+    """The camera of a configuration."""
+    u, v = image_plane(config, 1, 1)
+    per_metre = [np.array(wave.direction) / (config.texture_period_m * wave.octave) for wave in WAVES]
+    return Optics(
+        u=u.astype(np.float64),
+        v=v.astype(np.float64),
+        pitch=pitch_of(config),
+        ambient=config.ambient,
+        sun=np.array(sun_direction(config)),
+        sky=float(np.dot(config.sky_rgb, LUMA_WEIGHTS)),
+        waves=np.array(per_metre),
+        weights=config.texture_contrast * np.array([wave.weight for wave in WAVES]),
+    )
+
+
+class Hits(NamedTuple):
+    """What the rays of M frames met. P = H x W rays a frame, row by row from the top."""
+
+    ray: NDArray[np.float64]  # [M, P, 3] with unit forward component
+    geom: NDArray[np.int32]  # [M, P], -1 where nothing
+    depth: NDArray[np.float64]  # [M, P] along the optical axis, metres
+    normal: NDArray[np.float64]  # [M, P, 3] unit
+
+    @classmethod
+    def empty(cls, frames: int, pixels: int) -> Hits:
+        """Room for so many frames."""
+        shape = (frames, pixels)
+        return cls(np.empty((*shape, 3)), np.empty(shape, np.int32), np.empty(shape), np.empty((*shape, 3)))
+
+    def first(self, frames: int) -> Hits:
+        """Of so many frames, in the same memory."""
+        return Hits(self.ray[:frames], self.geom[:frames], self.depth[:frames], self.normal[:frames])
+
+
+@numba.njit(cache=True, inline="always")
+def _heading(pose):
+    """Cosine and sine of the heading of a pose [7]."""
+    w, z = pose[3], pose[6]
+    scale = 1.0 / max(w * w + z * z, 1e-9)
+    return (w * w - z * z) * scale, 2 * w * z * scale
+
+
+@numba.njit(cache=True, error_model="numpy")
+def cast(model, data, optics, pose, hits):
+    """The rays of M frames.
+
+    Args:
+        model, data: addresses of the world's.
+        pose: [M, 7] position and quaternion; roll and pitch are removed.
+        hits: of M frames, written.
+    """
+    width, height = len(optics.u), len(optics.v)
+    for m in range(len(pose)):
+        cos, sin = _heading(pose[m])
+        ray = hits.ray[m]
+        for row in range(height):
+            for column in range(width):
+                at = row * width + column
+                ray[at, 0] = cos + optics.u[column] * sin
+                ray[at, 1] = sin - optics.u[column] * cos
+                ray[at, 2] = optics.v[row]
+        mj_multi_ray(
+            model, data, pose[m].ctypes.data, ray.ctypes.data, 0, 1, -1,
+            hits.geom[m].ctypes.data, hits.depth[m].ctypes.data, hits.normal[m].ctypes.data,
+            width * height, HORIZON_M,
+        )  # fmt: skip
+
+
+@numba.njit(cache=True, inline="always")
+def _box_filter(cycles):
+    """What a box average over `cycles` periods leaves of a wave, as in `edqn_jax/sim/texture.py`."""
+    x = min(cycles * cycles, 1.0)
+    return (1.0 - x) * (1.0 - 0.55 * x)
+
+
+@numba.njit(cache=True, inline="always")
+def _wave(phase):
+    f = phase - math.floor(phase + 0.5)
+    return f * (8.0 - 16.0 * abs(f))
+
+
+@numba.njit(cache=True, error_model="numpy", fastmath=True)
+def shade(geoms, optics, pose, hits, luma):
+    """Luma [M, P] of M frames from what their rays met: albedo x Lambert shade x texture."""
+    for m in range(len(pose)):
+        cos, sin = _heading(pose[m])
+        ox, oy, oz = pose[m, 0], pose[m, 1], pose[m, 2]
+        for p in range(luma.shape[1]):
+            geom = hits.geom[m, p]
+            if geom < 0:
+                luma[m, p] = optics.sky
+                continue
+            t = hits.depth[m, p]
+            dx, dy, dz = hits.ray[m, p, 0], hits.ray[m, p, 1], hits.ray[m, p, 2]
+            nx, ny, nz = hits.normal[m, p, 0], hits.normal[m, p, 1], hits.normal[m, p, 2]
+            lit = nx * optics.sun[0] + ny * optics.sun[1] + nz * optics.sun[2]
+            bright = (optics.ambient + (1 - optics.ambient) * max(lit, 0.0)) * geoms.luma[geom]
+            # On a plane t = h / (n . d): how the depth changes from one side of the pixel to the other.
+            approach = nx * dx + ny * dy + nz * dz
+            relative = optics.pitch / (approach if abs(approach) > 1e-9 else -1e-9)
+            slope_right, slope_up = -t * relative * (nx * sin - ny * cos), -t * relative * nz
+            total = 1.0
+            for k in range(len(optics.weights)):
+                kx, ky, kz = optics.waves[k, 0], optics.waves[k, 1], optics.waves[k, 2]
+                along = kx * dx + ky * dy + kz * dz
+                right = t * (kx * sin - ky * cos) * optics.pitch + slope_right * along
+                up = t * kz * optics.pitch + slope_up * along
+                phase = kx * ox + ky * oy + kz * oz + t * along
+                total += optics.weights[k] * _box_filter(right) * _box_filter(up) * _wave(phase)
+            luma[m, p] = bright * total

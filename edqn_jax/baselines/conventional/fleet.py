@@ -1,0 +1,173 @@
+"""N drones of one process, stepped side by side: physics, outcome, rays, shade and events in compiled loops."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edqn_jax.baselines.conventional import camera, events, flight, task, world
+from edqn_jax.baselines.conventional.stopwatch import Stopwatch
+from edqn_jax.config import Config, ConfigError
+from edqn_jax.sim.env import ACTIONS, OWN_SIZE, frame_steps
+
+_BLOCK = 8
+"""Drones whose frames are cast and shaded at a time, so that their rays stay in the cache."""
+
+
+@dataclass(frozen=True)
+class Course:
+    """Where a fleet flies: one world, and missions to draw from."""
+
+    mjcf: str  # see `world.text_of`
+    start: NDArray[np.float64]  # [M, 3] metres
+    goal: NDArray[np.float64]  # [M, 3] metres
+
+
+@dataclass(frozen=True)
+class Record:
+    """What N drones bring back from a step; memory may be shared between processes."""
+
+    action: np.ndarray  # [N] int64 to be taken
+    events: np.ndarray  # [N, H, W] int8 signed counts of the window before the next decision
+    own: np.ndarray  # [N, 10] float32 see `edqn_jax.sim.env.own_state`
+    final_own: np.ndarray  # [N, 10] float32 the same before ended drones were started anew
+    reward: np.ndarray  # [N] float32
+    outcome: np.ndarray  # [N] int64 an `Outcome`; other than RUNNING, the drone has been started anew
+
+    @classmethod
+    def shapes(cls, config: Config, drones: int) -> dict[str, tuple[tuple[int, ...], str]]:
+        """Shape and type of every array."""
+        return {
+            "action": ((drones,), "i8"),
+            "events": ((drones, config.camera.height, config.camera.width), "i1"),
+            "own": ((drones, OWN_SIZE), "f4"),
+            "final_own": ((drones, OWN_SIZE), "f4"),
+            "reward": ((drones,), "f4"),
+            "outcome": ((drones,), "i8"),
+        }
+
+    @classmethod
+    def empty(cls, config: Config, drones: int) -> Record:
+        """In memory of this process's own."""
+        return cls(**{name: np.zeros(shape, kind) for name, (shape, kind) in cls.shapes(config, drones).items()})
+
+    def part(self, drones: slice) -> Record:
+        """Some of the drones, in the same memory."""
+        return Record(**{name: array[drones] for name, array in vars(self).items()})
+
+
+def check(config: Config) -> None:
+    """Raises ConfigError where the configuration asks for what this stack does not have."""
+    sensor = config.events
+    noisy = (sensor.threshold_mismatch, sensor.leak_rate_hz, sensor.shot_rate_hz, sensor.hot_pixel_fraction)
+    if sensor.law != "paper" or len(sensor.frame_times_s) != 2 or any(noisy):
+        raise ConfigError("the conventional stack has the noiseless 'paper' event law between two frames, and no other")
+    if config.camera.mount != "level":
+        raise ConfigError("the conventional stack has a level camera; set camera.mount to 'level'")
+
+
+class Fleet:
+    """The drones. `step` takes `record.action` and fills the rest of `record`."""
+
+    def __init__(self, config: Config, course: Course, record: Record, seed: int) -> None:
+        """Everything is allocated here; `record` holds one row for each drone.
+
+        Raises:
+            ConfigError: where the configuration asks for what this stack does not have.
+        """
+        check(config)
+        self.course, self.record = course, record
+        self.stopwatch = Stopwatch()
+        self.world = world.compiled(course.mjcf)
+        self.engine = flight.load_engine(config.drone)
+        self.airframe = flight.airframe_of(config.drone, self.engine.model)
+        self.command = flight.command_of(config, ACTIONS)
+        self.rules = task.rules_of(config)
+        self.optics = camera.optics_of(config.camera)
+        self.law = events.law_of(config.events)
+        self.random = np.random.default_rng(seed)
+
+        drones, steps = len(record.action), config.drone.physics_steps
+        self.state = np.zeros((drones, flight.STATE))
+        self.yaw_setpoint = np.zeros(drones)
+        self.goal = np.zeros((drones, 3))
+        self.decision = np.zeros(drones, np.int64)
+        self.path = np.zeros((drones, steps + 1, 7))
+        self.frames = frame_steps(config)
+        pixels = config.camera.height * config.camera.width
+        block = min(_BLOCK, drones)
+        self.poses = np.zeros((2, block, 7))
+        self.hits = [camera.Hits.empty(block, pixels) for _ in self.frames]
+        self.luma = np.zeros((2, block, pixels))
+        self.counts = record.events.reshape(drones, pixels)
+
+    def begin(self, drone: int, mission: int | None = None) -> None:
+        """A drone at rest at the start of a mission, facing its goal: of the given one, or of one drawn."""
+        if mission is None:
+            mission = int(self.random.integers(len(self.course.start)))
+        start, goal = self.course.start[mission], self.course.goal[mission]
+        yaw = math.atan2(goal[1] - start[1], goal[0] - start[0])
+        self.state[drone] = 0.0
+        self.state[drone, :3] = start
+        self.state[drone, 3], self.state[drone, 6] = math.cos(yaw / 2), math.sin(yaw / 2)
+        self.yaw_setpoint[drone] = yaw
+        self.goal[drone] = goal
+        self.decision[drone] = 0
+
+    def reset(self) -> None:
+        """Every drone on a new mission; who stands still sees no events."""
+        for drone in range(len(self.goal)):
+            self.begin(drone)
+        self.record.events[:] = 0
+        self.tell()
+
+    def step(self, restart: bool = True) -> None:
+        """One decision of every drone.
+
+        Args:
+            restart: whether drones whose episode ended are put on a new mission.
+        """
+        record, engine, seen = self.record, self.engine, self.world
+        with self.stopwatch.time("physics"):
+            flight.fly(
+                engine.model._address, engine.data._address, engine.data.qpos, engine.data.qvel, engine.data.ctrl,
+                self.airframe, self.command, record.action, self.goal, self.state, self.yaw_setpoint, self.path,
+            )  # fmt: skip
+        with self.stopwatch.time("outcome"):
+            task.judge(
+                seen.geoms, self.rules, self.goal, self.path, self.state, self.decision, record.outcome, record.reward
+            )
+            self._tell(record.final_own)
+        for first in range(0, len(self.goal), _BLOCK):
+            drones = slice(first, min(first + _BLOCK, len(self.goal)))
+            self._see(drones)
+        with self.stopwatch.time("outcome"):
+            if restart:
+                for drone in np.flatnonzero(record.outcome):
+                    self.begin(int(drone))
+            self.tell()
+
+    def tell(self) -> None:
+        """Own states as they are now, into `record.own`."""
+        self._tell(self.record.own)
+
+    def _tell(self, own: NDArray[np.float32]) -> None:
+        task.own_state(self.world.geoms, self.rules, self.goal, self.state, own)
+
+    def _see(self, drones: slice) -> None:
+        """Events of some drones."""
+        seen, count = self.world, drones.stop - drones.start
+        poses, luma = self.poses[:, :count], self.luma[:, :count]
+        hits = [frame.first(count) for frame in self.hits]
+        with self.stopwatch.time("rays"):
+            for at, frame in enumerate(self.frames):
+                poses[at] = self.path[drones, frame]
+                camera.cast(seen.model._address, seen.data._address, self.optics, poses[at], hits[at])
+        with self.stopwatch.time("shading"):
+            for at in range(2):
+                camera.shade(seen.geoms, self.optics, poses[at], hits[at], luma[at])
+        with self.stopwatch.time("events"):
+            events.signed_counts(self.law, luma[0], luma[1], self.counts[drones])

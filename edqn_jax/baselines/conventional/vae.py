@@ -1,0 +1,89 @@
+"""The event VAE in PyTorch: event counts of a window to a code of 32 numbers, and back."""
+
+from __future__ import annotations
+
+import copy
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edqn_jax.baselines.planner import require
+from edqn_jax.config import CameraConfig, EncoderConfig
+
+torch = require("torch")
+nn = torch.nn
+
+Tensor = Any
+"""A `torch.Tensor`; a type checker need not have PyTorch."""
+
+_MAX_LOG_VARIANCE = 6.0
+
+
+class EventVAE(nn.Module):
+    """Ordinary ReLU layers of the widths that ours has, over log(1 + count) of ON and OFF events, both ways."""
+
+    def __init__(self, config: EncoderConfig, camera: CameraConfig) -> None:
+        super().__init__()
+        self.config = config
+        pixels = 2 * camera.height * camera.width
+        self.encoder = _layers((pixels, config.hidden, 2 * config.code_size))
+        self.decoder = _layers((config.code_size, *config.decoder_hidden, pixels))
+        # Nearly noiseless codes at first; the KL term widens what it may.
+        with torch.no_grad():
+            self.encoder[-1].bias[config.code_size :] = -4.0
+
+    def encode(self, image: Tensor) -> tuple[Tensor, Tensor]:
+        """Images [B, 2 H W] to mean and log-variance, each [B, code_size]."""
+        mean, log_variance = self.encoder(image).chunk(2, dim=-1)
+        return mean, log_variance.clamp(-_MAX_LOG_VARIANCE, _MAX_LOG_VARIANCE)
+
+    def loss(self, image: Tensor) -> Tensor:
+        """Eq. 6: squared reconstruction error of an image + `kl_weight` x KL, averaged over the batch."""
+        mean, log_variance = self.encode(image)
+        code = mean + torch.exp(0.5 * log_variance) * torch.randn_like(mean)
+        error = nn.functional.mse_loss(self.decoder(code), image, reduction="sum")
+        kl = 0.5 * torch.sum(mean.square() + log_variance.exp() - 1.0 - log_variance)
+        return (error + self.config.kl_weight * kl) / len(image)
+
+
+def _layers(widths: tuple[int, ...]) -> Any:
+    layers: list[Any] = []
+    for inputs, outputs in zip(widths[:-1], widths[1:], strict=True):
+        layers += [nn.Linear(inputs, outputs), nn.ReLU()]
+    return nn.Sequential(*layers[:-1])
+
+
+def images(counts: NDArray[np.int8]) -> Tensor:
+    """Signed counts [B, H, W] to log(1 + count) of ON and of OFF events, [B, 2 H W]."""
+    signed = torch.from_numpy(counts).flatten(1).float()
+    return torch.cat([signed.clamp(min=0), (-signed).clamp(min=0)], dim=1).log1p_()
+
+
+class Learner:
+    """A VAE that learns, and the frozen copy whose code the agent sees."""
+
+    def __init__(self, config: EncoderConfig, camera: CameraConfig, seed: int) -> None:
+        torch.manual_seed(seed)
+        self.learning = EventVAE(config, camera)
+        self.optimiser = torch.optim.Adam(self.learning.parameters(), lr=config.learning_rate, fused=True)
+        self.samples = 0
+        self.publish()
+
+    def publish(self) -> None:
+        """From now on the agent sees the code of the VAE as it is: the replay must not mix two of them."""
+        self.acting = copy.deepcopy(self.learning).requires_grad_(False)
+
+    def update(self, image: Tensor) -> float:
+        """One Adam step on images [B, 2 H W]; its loss."""
+        self.optimiser.zero_grad()
+        loss = self.learning.loss(image)
+        loss.backward()
+        self.optimiser.step()
+        self.samples += len(image)
+        return loss.item()
+
+    def code(self, image: Tensor) -> NDArray[np.float32]:
+        """The agent's code of images [B, 2 H W]: the mean, [B, code_size]."""
+        with torch.inference_mode():
+            return self.acting.encode(image)[0].numpy()

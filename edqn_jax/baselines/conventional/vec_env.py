@@ -1,0 +1,105 @@
+"""All drones as one vectorised environment of stable-baselines3: codes and own states in, moves out."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from edqn_jax.baselines.conventional.vae import Learner, images
+from edqn_jax.baselines.conventional.workers import SpreadFleet
+from edqn_jax.baselines.planner import require
+from edqn_jax.config import Config
+from edqn_jax.sim.env import ACTIONS, OWN_SIZE, Outcome
+
+spaces = require("gymnasium").spaces
+vec_env = require("stable_baselines3.common.vec_env")
+
+
+class CodedDrones(vec_env.VecEnv):
+    """Every step trains the VAE on the new event fields and encodes them, in one batch for all drones.
+
+    Ended drones are started anew within the step, as stable-baselines3 has it: `infos[i]["terminal_observation"]`
+    is what the episode ended with.
+    """
+
+    render_mode = None
+
+    def __init__(self, config: Config, fleet: SpreadFleet, learner: Learner) -> None:
+        """Takes the fleet over: `close` ends it."""
+        self.config, self.fleet, self.learner = config, fleet, learner
+        self.stopwatch = fleet.stopwatch
+        self.updates = 1
+        self.episodes = dict.fromkeys(Outcome, 0)
+        size = config.encoder.code_size + OWN_SIZE
+        super().__init__(
+            num_envs=len(fleet.record.action),
+            observation_space=spaces.Box(-np.inf, np.inf, (size,), np.float32),
+            action_space=spaces.Discrete(len(ACTIONS)),
+        )
+
+    def reset(self) -> np.ndarray:
+        """Observations [N, code_size + 10] of new missions."""
+        self.fleet.reset()
+        record = self.fleet.record
+        return self._joined(self._codes(images(record.events)), record.own)
+
+    def step_async(self, actions: np.ndarray) -> None:
+        """Moves [N] to be taken."""
+        self.fleet.record.action[:] = actions
+
+    def step_wait(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[dict[str, Any]]]:
+        """Observations [N, code_size + 10], rewards [N] as scaled for learning, ends [N], infos."""
+        self.fleet.step()
+        record = self.fleet.record
+        with self.stopwatch.time("encoder"):
+            image = images(record.events)
+            codes = self._codes(image)
+        with self.stopwatch.time("vae_update"):
+            for _ in range(self.updates):
+                self.learner.update(image)
+        seen = self._joined(codes, record.own)
+        infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
+        ended = np.flatnonzero(record.outcome)
+        if len(ended):
+            final = self._joined(codes[ended], record.final_own[ended])
+            # A drone at the start of its mission sees nothing move.
+            seen[ended, :-OWN_SIZE] = self._codes(images(np.zeros_like(record.events[:1])))
+            for i, last in zip(ended, final, strict=True):
+                outcome = Outcome(int(record.outcome[i]))
+                self.episodes[outcome] += 1
+                infos[i] = {"terminal_observation": last, "TimeLimit.truncated": outcome is Outcome.TIME_OUT}
+        return seen, self.config.agent.reward_scale * record.reward, record.outcome != Outcome.RUNNING, infos
+
+    def _codes(self, image) -> np.ndarray:
+        return self.config.agent.code_scale * self.learner.code(image)
+
+    @staticmethod
+    def _joined(codes: np.ndarray, own: np.ndarray) -> np.ndarray:
+        return np.concatenate([codes, own], axis=1)
+
+    def close(self) -> None:
+        """Ends the fleet's processes."""
+        self.fleet.close()
+
+    # The rest of the interface is for environments that are objects of their own; the drones are none.
+
+    def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
+        """The same for every drone."""
+        return [getattr(self, attr_name)] * len(self._chosen(indices))
+
+    def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
+        """For all drones at once."""
+        setattr(self, attr_name, value)
+
+    def env_method(self, method_name: str, *method_args: Any, indices: Any = None, **method_kwargs: Any) -> list[Any]:
+        """None is there to be called."""
+        raise NotImplementedError(f"a drone has no method of its own, so no '{method_name}'")
+
+    def env_is_wrapped(self, wrapper_class: type, indices: Any = None) -> list[bool]:
+        """None is."""
+        return [False] * len(self._chosen(indices))
+
+    def _chosen(self, indices: Any) -> Sequence[int]:
+        return range(self.num_envs) if indices is None else np.atleast_1d(indices).tolist()

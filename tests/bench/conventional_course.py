@@ -1,0 +1,44 @@
+"""The paper's world, as our environment and as the conventional stack have it."""
+
+from __future__ import annotations
+
+import functools
+
+import jax.numpy as jnp
+import numpy as np
+from numpy.typing import NDArray
+
+from edqn_jax.baselines.conventional import world
+from edqn_jax.baselines.conventional.fleet import Course, Fleet, Record
+from edqn_jax.config import Config
+from edqn_jax.sim import drone, env, mjcf
+from edqn_jax.sim.scene import Scene, stack_scenes
+from edqn_jax.sim.worlds import Missions
+
+
+@functools.cache
+def paper() -> Scene:
+    return mjcf.load_scene(mjcf.resolve_world("paper"))
+
+
+def course_of(start: NDArray, goal: NDArray) -> Course:
+    """Missions [M, 3] in the paper's world."""
+    return Course(world.text_of(paper()), np.asarray(start, np.float64), np.asarray(goal, np.float64))
+
+
+def world_of(config: Config, start: NDArray, goal: NDArray) -> env.World:
+    """The same for our environment."""
+    missions = Missions(
+        scene=jnp.zeros(len(start), jnp.int32),
+        start=jnp.asarray(start, jnp.float32),
+        goal=jnp.asarray(goal, jnp.float32),
+    )
+    return env.World(drone.load_airframe(config.drone), stack_scenes([paper()]), missions)
+
+
+def fleet_of(config: Config, start: NDArray, goal: NDArray) -> Fleet:
+    """One drone on each mission."""
+    fleet = Fleet(config, course_of(start, goal), Record.empty(config, len(start)), seed=0)
+    for i in range(len(start)):
+        fleet.begin(i, i)
+    return fleet

@@ -1,0 +1,233 @@
+"""VAE, processes and DQN of the conventional stack, and the command that times them."""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib
+import json
+
+import numpy as np
+import pytest
+
+import conventional
+from edqn_jax.baselines.conventional.fleet import Record
+from edqn_jax.baselines.conventional.train import Steady, Training, training_course
+from edqn_jax.baselines.conventional.vae import EventVAE, Learner, images
+from edqn_jax.baselines.conventional.vec_env import CodedDrones
+from edqn_jax.baselines.conventional.workers import SpreadFleet
+from edqn_jax.baselines.planner import MissingPackageError, require
+from edqn_jax.config import Config, ConfigError
+from edqn_jax.rundir import plain
+from edqn_jax.sim.env import OWN_SIZE, Outcome
+from tests.baselines.uninstalled import hide
+from tests.bench.conventional_course import course_of
+from tests.miniature import MINIATURE
+
+torch = require("torch")
+torch.set_num_threads(1)  # beside other tests a second one costs more than it does
+
+CONFIG = Config()
+START, GOAL = np.array([[20.0, 40.0, 12.0]]), np.array([[90.0, 90.0, 10.0]])
+
+
+def blobs(count: int, seed: int) -> np.ndarray:
+    """Event windows with one blob of ON events and one of OFF."""
+    rng = np.random.default_rng(seed)
+    y, x = np.mgrid[:24, :32]
+    fields = np.zeros((count, 24, 32), np.int8)
+    for field in fields:
+        for sign in (1, -1):
+            cy, cx = rng.uniform((3, 3), (21, 29))
+            field[(y - cy) ** 2 + (x - cx) ** 2 < 9] = 3 * sign
+    return fields
+
+
+def test_images_are_logarithms_of_on_and_off_counts():
+    counts = np.array([[[2, 0], [-1, -127]]], np.int8)
+    expected = np.log1p([[2, 0, 0, 0, 0, 0, 1, 127]])
+    np.testing.assert_allclose(images(counts).numpy(), expected, rtol=1e-6)
+
+
+def test_the_loss_is_squared_error_and_kl_of_an_image():
+    torch.manual_seed(0)
+    vae = EventVAE(CONFIG.encoder, CONFIG.camera)
+    image = images(blobs(5, 0))
+    mean, log_variance = vae.encode(image)
+    torch.manual_seed(1)
+    loss = vae.loss(image)
+    torch.manual_seed(1)
+    code = mean + torch.exp(log_variance / 2) * torch.randn(5, 32)
+    error = ((vae.decoder(code) - image) ** 2).sum(1)
+    normal = torch.distributions.Normal
+    kl = torch.distributions.kl_divergence(normal(mean, torch.exp(log_variance / 2)), normal(0.0, 1.0)).sum(1)
+    np.testing.assert_allclose(loss.item(), (error + CONFIG.encoder.kl_weight * kl).mean().item(), rtol=1e-5)
+
+
+def test_the_vae_learns_where_events_are_and_the_agents_code_waits_to_be_published():
+    learner = Learner(CONFIG.encoder, CONFIG.camera, seed=0)
+    held_out = images(blobs(64, 1))
+    blank = held_out.square().sum(1).mean().item()
+    code = learner.code(held_out)
+    for step in range(300):
+        learner.update(images(blobs(64, 100 + step)))
+    np.testing.assert_array_equal(learner.code(held_out), code)
+    learner.publish()
+    assert not np.allclose(learner.code(held_out), code)
+    assert learner.samples == 300 * 64
+    with torch.no_grad():
+        drawn = learner.learning.decoder(torch.from_numpy(learner.code(held_out)))
+    assert (drawn - held_out).square().sum(1).mean().item() < 0.6 * blank
+
+
+@pytest.mark.parametrize("processes", [1, 2])
+def test_drones_fly_alike_in_one_process_and_in_two(processes):
+    course = course_of(START, GOAL)
+    fleet = SpreadFleet(CONFIG, course, 4, processes, seed=0)
+    alone = SpreadFleet(CONFIG, course, 1, 1, seed=0)
+    try:
+        fleet.reset()
+        for step in range(6):
+            actions = [(5 * step + 7 * drone) % 27 for drone in range(4)]
+            fleet.record.action[:] = actions
+            fleet.step()
+        for drone in range(4):
+            alone.reset()
+            for step in range(6):
+                alone.record.action[0] = (5 * step + 7 * drone) % 27
+                alone.step()
+            for name in ("events", "own", "reward", "outcome"):
+                np.testing.assert_array_equal(getattr(fleet.record, name)[drone], getattr(alone.record, name)[0])
+        assert fleet.record.events.any()
+    finally:
+        fleet.close()
+
+
+def test_drones_that_cannot_be_shared_out_are_named():
+    with pytest.raises(ValueError, match="5 drones cannot be shared out among 2 processes"):
+        SpreadFleet(CONFIG, course_of(START, GOAL), 5, 2, seed=0)
+
+
+def test_a_process_that_ended_is_noticed():
+    fleet = SpreadFleet(CONFIG, course_of(START, GOAL), 2, 2, seed=0)
+    fleet.reset()
+    process, _ = fleet.workers[0]
+    process.terminate()
+    process.join()
+    with pytest.raises((RuntimeError, BrokenPipeError)):
+        fleet.step()
+    fleet.close()
+
+
+class Still:
+    """A fleet whose record a test writes by hand."""
+
+    def __init__(self, drones: int) -> None:
+        from edqn_jax.baselines.conventional.stopwatch import Stopwatch
+
+        self.record = Record.empty(CONFIG, drones)
+        self.stopwatch = Stopwatch()
+
+    def step(self) -> None:
+        pass
+
+    reset = close = step
+
+
+def test_ended_drones_keep_their_last_observation_and_only_time_outs_are_truncated():
+    still = Still(4)
+    learner = Learner(CONFIG.encoder, CONFIG.camera, seed=0)
+    drones = CodedDrones(CONFIG, still, learner)  # type: ignore[arg-type]
+    drones.reset()
+    record = still.record
+    record.events[:] = blobs(4, 0)
+    record.own[:], record.final_own[:] = 1.0, 2.0
+    record.outcome[:] = [Outcome.RUNNING, Outcome.GOAL, Outcome.TIME_OUT, Outcome.COLLISION]
+    record.reward[:] = [1.0, 100.0, 0.0, -100.0]
+    seen, rewards, ends, infos = drones.step(np.zeros(4, np.int64))
+    np.testing.assert_allclose(rewards, CONFIG.agent.reward_scale * record.reward)
+    assert ends.tolist() == [False, True, True, True]
+    assert [info.get("TimeLimit.truncated") for info in infos] == [None, False, True, False]
+    codes = CONFIG.agent.code_scale * learner.code(images(record.events))
+    quiet = CONFIG.agent.code_scale * learner.code(images(np.zeros((1, 24, 32), np.int8)))[0]
+    # The frozen encoder's own code, whatever the VAE learned in this step.
+    np.testing.assert_allclose(seen[0, :-OWN_SIZE], codes[0], atol=1e-6)
+    for drone in (1, 2, 3):
+        np.testing.assert_allclose(seen[drone, :-OWN_SIZE], quiet, atol=1e-6)
+        np.testing.assert_allclose(infos[drone]["terminal_observation"][:-OWN_SIZE], codes[drone], atol=1e-6)
+        assert (infos[drone]["terminal_observation"][-OWN_SIZE:] == 2.0).all()
+    assert (seen[:, -OWN_SIZE:] == 1.0).all()
+    assert learner.samples == 4
+
+
+def test_random_worlds_are_declined_in_one_sentence():
+    config = dataclasses.replace(CONFIG, world=dataclasses.replace(CONFIG.world, name="medium"))
+    with pytest.raises(ConfigError, match="flies in one world"):
+        training_course(config)
+
+
+def miniature() -> Config:
+    return conventional.parse(["--", *MINIATURE])[1]
+
+
+def test_a_timed_turn_replays_four_samples_a_decision_and_shows_the_vae_each_field_once():
+    config = miniature()
+    with Steady(config, training_course(config), 1, 1) as run:
+        training = run.training
+        before = training.dqn._n_updates, training.learner.samples
+        assert run.turn(160) > 0
+        assert (training.dqn._n_updates - before[0]) * config.agent.batch_size == 4 * 160
+        assert training.learner.samples - before[1] == 160 == run.decisions
+        shares = run.shares()
+        assert sum(shares.values()) == pytest.approx(1.0) and min(shares.values()) >= 0
+        for part in ("physics", "rays", "shading", "events", "encoder", "vae_update", "acting", "dqn_update"):
+            assert shares[part] > 0
+
+
+def test_a_turn_that_does_not_learn_throughout_is_no_figure():
+    config = miniature()
+    with Steady(config, training_course(config), 1, 1) as run:
+        run.training.env.updates = 0
+        with pytest.raises(RuntimeError, match="did not learn throughout"):
+            run.turn(32)
+
+
+def test_the_warm_up_publishes_the_code_and_rests():
+    config = miniature()
+    config = dataclasses.replace(config, encoder=dataclasses.replace(config.encoder, keep_learning=False))
+    with Training(config, training_course(config)) as training:
+        field = images(blobs(3, 0)[:, :6, :8].copy())
+        before = training.learner.code(field)
+        training.warm_up()
+        assert training.learner.samples == config.encoder.warmup_updates_per_step * config.encoder.warmup_decisions
+        after = training.learner.code(field)
+        assert not np.array_equal(after, before)
+        training.learn(64)
+        np.testing.assert_array_equal(training.learner.code(field), after)
+        assert training.learner.samples == config.encoder.warmup_updates_per_step * config.encoder.warmup_decisions
+
+
+def test_the_command_says_what_it_measured(monkeypatch, tmp_path, capsys):
+    monkeypatch.setattr(conventional, "SETTINGS", ((1, 1), (2, 1)))
+    monkeypatch.setattr(conventional, "use_cpu_devices", lambda: None)  # this process has its devices already
+    file = tmp_path / "rows.json"
+    assert conventional.main(["--decisions", "32", "--repeats", "2", "--json", str(file), "--", *MINIATURE]) == 0
+    report = json.loads(file.read_text())
+    assert [row["processes"] for row in report["rows"]] == [1, 2]
+    assert report["decisions_per_second"] == max(row["decisions_per_second"] for row in report["rows"])
+    assert report["workload"]["replayed_samples_per_decision"] == 4 and report["workload"]["physics"] == "c_mujoco"
+    assert "torch" in report["versions"] and plain(report) == report
+    assert "| rays |" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("package", ["gymnasium", "numba", "stable_baselines3", "torch"])
+def test_without_a_package_it_says_how_to_install_it(package, monkeypatch):
+    hide(monkeypatch, package)
+    with pytest.raises(MissingPackageError, match=rf"^{package} is not installed; pip install 'edqn-jax\[bench\]'"):
+        importlib.import_module("edqn_jax.baselines.conventional.train")
+
+
+def test_without_a_package_the_command_ends_with_that_sentence(monkeypatch, capsys):
+    monkeypatch.setattr(conventional, "use_cpu_devices", lambda: None)
+    hide(monkeypatch, "stable_baselines3")
+    assert conventional.main(["--", *MINIATURE]) == 2
+    assert capsys.readouterr().err.startswith("stable_baselines3 is not installed")
