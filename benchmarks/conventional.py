@@ -28,7 +28,7 @@ from edqn_jax.baselines.planner import MissingPackageError
 from edqn_jax.config import Config, ConfigError
 from edqn_jax.devices import use_cpu_devices
 from edqn_jax.files import check_can_write
-from edqn_jax.run import workload
+from edqn_jax.run import lay_courses, workload
 from edqn_jax.sim.mjcf import load_scene, resolve_world
 from flags import configured, split
 from whole import steady
@@ -77,9 +77,10 @@ def measure(config: Config, decisions: int, repeats: int) -> dict[str, Any]:
         ConfigError: if the configuration asks for what this stack does not have.
         MissingPackageError: if a package of the extra `bench` is not installed.
     """
-    from edqn_jax.baselines.conventional.train import Steady, training_course
+    from edqn_jax.baselines.conventional.fleet import Course
+    from edqn_jax.baselines.conventional.train import Steady
 
-    course = training_course(config)
+    course = Course.of(lay_courses(config).training)
     turns: dict[tuple[int, int], list[float]] = {setting: [] for setting in SETTINGS}
     with ExitStack() as stack:
         runs = {setting: stack.enter_context(Steady(config, course, *setting)) for setting in SETTINGS}

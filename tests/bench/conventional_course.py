@@ -39,6 +39,5 @@ def world_of(config: Config, start: NDArray, goal: NDArray) -> env.World:
 def fleet_of(config: Config, start: NDArray, goal: NDArray) -> Fleet:
     """One drone on each mission."""
     fleet = Fleet(config, course_of(start, goal), Record.empty(config, len(start)), seed=0)
-    for i in range(len(start)):
-        fleet.begin(i, i)
+    fleet.reset(range(len(start)))
     return fleet

@@ -42,7 +42,8 @@ BORDER_M = 5 * POSITION_M
 def stepped(config, world, state, action):
     """Our environment's step, less the pictures: what is not returned is not computed."""
     state, step = jax.vmap(lambda s, a: env.step(config, world, s, a))(state, action)
-    return state, (step.flight, step.outcome, step.reward, step.observation.own)
+    ended = step.end_step - 1 + step.contact
+    return state, (step.flight, step.outcome, step.reward, step.observation.own, ended)
 
 
 def begun(bodies: DroneState, decision) -> EnvState:
@@ -91,9 +92,10 @@ def judged_with(fleet: Fleet, path: np.ndarray, margin: float) -> np.ndarray:
     rules = fleet.rules._replace(radius=fleet.rules.radius + margin, goal_radius=fleet.rules.goal_radius + margin)
     seen = fleet.world.geoms
     geoms = seen._replace(lower=seen.lower + margin, upper=seen.upper - margin)
-    outcome, reward = np.zeros(len(path), np.int64), np.zeros(len(path), np.float32)
+    outcome, end_step = np.zeros((2, len(path)), np.int64)
+    reward, contact = np.zeros((2, len(path)))
     decision = fleet.decision - 1
-    task.judge(geoms, rules, fleet.goal, path.copy(), fleet.state.copy(), decision, outcome, reward)
+    task.judge(geoms, rules, fleet.goal, path.copy(), fleet.state.copy(), decision, outcome, reward, end_step, contact)
     return outcome
 
 
@@ -111,7 +113,7 @@ def test_one_decision_from_any_state_ends_where_ours_does_and_is_judged_alike():
         yaw_setpoint=jnp.asarray(setpoint),
     )
     world = world_of(CONFIG, state[:, :3], goal)
-    after, (flight, outcome, reward, own) = stepped(CONFIG, world, begun(body, decision), jnp.asarray(action))
+    after, (flight, outcome, reward, own, ended) = stepped(CONFIG, world, begun(body, decision), jnp.asarray(action))
 
     fleet = fleet_of(CONFIG, state[:, :3], goal)
     fleet.state[:], fleet.yaw_setpoint[:], fleet.decision[:] = state, setpoint, decision
@@ -129,6 +131,8 @@ def test_one_decision_from_any_state_ends_where_ours_does_and_is_judged_alike():
     for ending in (Outcome.RUNNING, Outcome.GOAL, Outcome.COLLISION, Outcome.LEFT_VOLUME):
         assert np.sum(np.asarray(outcome)[sure] == ending) > 40, ending
     assert np.sum(np.asarray(outcome)[sure] == Outcome.TIME_OUT) > 0
+    # A physics step is some 10 cm long, so 10 POSITION_M is a hundredth of one where the way is steep enough.
+    np.testing.assert_allclose((fleet.end_step - 1 + fleet.contact)[sure], np.asarray(ended)[sure], atol=0.01)
     # Three metres' worth of reward a metre, from two rounded distances.
     np.testing.assert_allclose(fleet.record.reward[sure], np.asarray(reward)[sure], atol=10 * POSITION_M)
     # Velocities in units of 4 m/s; near the goal a metre is half of a unit.
@@ -163,7 +167,7 @@ def test_whole_flights_are_ours_until_they_end_and_end_alike(mission, legs):
     DRONE.reset(options={"mission": mission})
     fleet = DRONE.fleet
     for action in [action for action, times in legs for _ in range(times)]:
-        state, (flight, code, reward, _) = stepped(CONFIG, world, state, jnp.asarray([action]))
+        state, (flight, code, reward, *_) = stepped(CONFIG, world, state, jnp.asarray([action]))
         _, got, terminated, truncated, info = DRONE.step(action)
         # The controller holds the velocity, so differences add up to a drift and do not grow by themselves.
         np.testing.assert_allclose(fleet.path[0, 1:, :3], flight.position[0], atol=10 * POSITION_M)

@@ -11,7 +11,7 @@ import pytest
 
 import conventional
 from edqn_jax.baselines.conventional.fleet import Record
-from edqn_jax.baselines.conventional.train import Steady, Training, training_course
+from edqn_jax.baselines.conventional.train import Steady, Trained, Training, fly, train
 from edqn_jax.baselines.conventional.vae import EventVAE, Learner, images
 from edqn_jax.baselines.conventional.vec_env import CodedDrones
 from edqn_jax.baselines.conventional.workers import SpreadFleet
@@ -19,6 +19,7 @@ from edqn_jax.baselines.planner import MissingPackageError, require
 from edqn_jax.config import Config, ConfigError
 from edqn_jax.rundir import plain
 from edqn_jax.sim.env import OWN_SIZE, Outcome
+from flags import configured
 from tests.baselines.uninstalled import hide
 from tests.bench.conventional_course import course_of
 from tests.miniature import MINIATURE
@@ -159,19 +160,81 @@ def test_ended_drones_keep_their_last_observation_and_only_time_outs_are_truncat
     assert learner.samples == 4
 
 
-def test_random_worlds_are_declined_in_one_sentence():
-    config = dataclasses.replace(CONFIG, world=dataclasses.replace(CONFIG.world, name="medium"))
-    with pytest.raises(ConfigError, match="flies in one world"):
-        training_course(config)
-
-
 def miniature() -> Config:
     return conventional.parse(["--", *MINIATURE])[1]
 
 
+SHORT = configured(
+    [*MINIATURE, "--train.chunk-steps", "16", "--total-steps", "1024", "--train.validation-every", "300"]
+)
+"""A whole training: 256 decisions of warm-up, 768 of the DQN."""
+
+
+def replaced(config: Config, **knobs) -> Config:
+    return dataclasses.replace(config, train=dataclasses.replace(config.train, **knobs))
+
+
+def weights(trained: Trained) -> np.ndarray:
+    return np.concatenate([w.numpy().ravel() for w in (*trained.q.parameters(), *trained.vae.parameters())])
+
+
+def test_a_training_takes_its_decisions_in_pieces_as_in_one_and_its_seed_says_how():
+    course = course_of(START, GOAL)
+    watched: list[Trained] = []
+    whole = train(replaced(SHORT, validation_every=0), course)
+    pieces = train(SHORT, course, watch=watched.append)
+    assert [seen.decisions for seen in watched] == [560, 864, 1024]  # 300 more, in whole steps of 16 drones
+    assert [seen.seconds for seen in watched] == sorted(seen.seconds for seen in watched)
+    assert whole.decisions == pieces.decisions == 1024
+    np.testing.assert_array_equal(weights(pieces), weights(whole))
+    # What was shown earlier stays as it was.
+    assert not np.array_equal(weights(watched[0]), weights(pieces))
+    other = train(replaced(SHORT, seed=1), course)
+    assert not np.allclose(weights(other), weights(whole))
+
+
+def test_the_schedules_run_over_the_whole_training():
+    with Training(SHORT, course_of(START, GOAL)) as training:
+        training.warm_up()
+        assert training.decisions == 256  # a quarter, less than the configuration's warm-up
+        epsilon, rate = [], []
+        for _ in range(2):
+            training.learn(384)
+            epsilon.append(training.dqn.exploration_rate)
+            rate.append(training.dqn.policy.optimizer.param_groups[0]["lr"])
+        agent = SHORT.agent
+        assert epsilon == pytest.approx([agent.exploration_end] * 2)
+        middle = (agent.learning_rate + agent.final_learning_rate) / 2
+        assert rate == pytest.approx([middle, agent.final_learning_rate])
+
+
+def test_what_was_learnt_flies_by_the_best_value_of_what_it_sees():
+    course = course_of(START, GOAL)
+    trained = train(SHORT, course)
+    rng = np.random.default_rng(0)
+    events = rng.integers(-3, 4, (5, 6, 8)).astype(np.int8)
+    own = rng.normal(size=(5, OWN_SIZE)).astype(np.float32)
+    code = trained.vae.code(images(events)) * SHORT.agent.code_scale
+    values = trained.q(torch.from_numpy(np.concatenate([code, own], axis=1)))
+    np.testing.assert_array_equal(trained.act(events, own), values.numpy().argmax(1))
+    flights = fly(trained, course)
+    np.testing.assert_array_equal(flights.outcome != Outcome.RUNNING, [True])
+    again = fly(trained, course)
+    np.testing.assert_array_equal(flights.path_length_m, again.path_length_m)
+
+
+@pytest.mark.parametrize(
+    "change", [{"history": 2}, {"layer_norm": True}, {"huber_delta": 0.0}, {"exploration_episodes": 10}]
+)
+def test_a_dqn_that_stable_baselines3_does_not_have_is_declined(change):
+    config = dataclasses.replace(CONFIG, agent=dataclasses.replace(CONFIG.agent, **change))
+    with pytest.raises(ConfigError, match="the conventional stack's DQN has agent.history 1"):
+        train(config, course_of(START, GOAL))
+
+
 def test_a_timed_turn_replays_four_samples_a_decision_and_shows_the_vae_each_field_once():
     config = miniature()
-    with Steady(config, training_course(config), 1, 1) as run:
+    with Steady(config, course_of(START, GOAL), 1, 1) as run:
         training = run.training
         before = training.dqn._n_updates, training.learner.samples
         assert run.turn(160) > 0
@@ -185,7 +248,7 @@ def test_a_timed_turn_replays_four_samples_a_decision_and_shows_the_vae_each_fie
 
 def test_a_turn_that_does_not_learn_throughout_is_no_figure():
     config = miniature()
-    with Steady(config, training_course(config), 1, 1) as run:
+    with Steady(config, course_of(START, GOAL), 1, 1) as run:
         run.training.env.updates = 0
         with pytest.raises(RuntimeError, match="did not learn throughout"):
             run.turn(32)
@@ -194,7 +257,7 @@ def test_a_turn_that_does_not_learn_throughout_is_no_figure():
 def test_the_warm_up_publishes_the_code_and_rests():
     config = miniature()
     config = dataclasses.replace(config, encoder=dataclasses.replace(config.encoder, keep_learning=False))
-    with Training(config, training_course(config)) as training:
+    with Training(config, course_of(START, GOAL)) as training:
         field = images(blobs(3, 0)[:, :6, :8].copy())
         before = training.learner.code(field)
         training.warm_up()

@@ -49,10 +49,7 @@ class DroneEnv(gymnasium.Env):
         super().reset(seed=seed)
         if seed is not None:
             self.fleet.random = self.np_random
-        self.fleet.reset()
-        if options and "mission" in options:
-            self.fleet.begin(0, options["mission"])
-            self.fleet.tell()
+        self.fleet.reset([options["mission"]] if options and "mission" in options else None)
         return self._seen(self.record.own), {"outcome": Outcome.RUNNING.name}
 
     def step(self, action: int) -> tuple[dict, float, bool, bool, dict]:

@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
+import jax
 import numpy as np
 from numpy.typing import NDArray
 
 from edqn_jax.baselines.conventional import camera, events, flight, task, world
 from edqn_jax.baselines.conventional.stopwatch import Stopwatch
 from edqn_jax.config import Config, ConfigError
+from edqn_jax.sim import env
 from edqn_jax.sim.env import ACTIONS, OWN_SIZE, frame_steps
+from edqn_jax.sim.scene import take_scene
 
 _BLOCK = 8
 """Drones whose frames are cast and shaded at a time, so that their rays stay in the cache."""
@@ -24,6 +28,20 @@ class Course:
     mjcf: str  # see `world.text_of`
     start: NDArray[np.float64]  # [M, 3] metres
     goal: NDArray[np.float64]  # [M, 3] metres
+
+    @classmethod
+    def of(cls, flown: env.World) -> Course:
+        """The missions that our environments fly.
+
+        Raises:
+            ConfigError: if they are in several worlds.
+        """
+        worlds = flown.pool.start.shape[0]
+        if worlds != 1:
+            raise ConfigError(f"the conventional stack flies in one world, 'paper' or an MJCF file, not in {worlds}")
+        scene = jax.tree.map(np.asarray, take_scene(flown.pool, 0))
+        start, goal = (np.asarray(points, np.float64) for points in (flown.missions.start, flown.missions.goal))
+        return cls(mjcf=world.text_of(scene), start=start, goal=goal)
 
 
 @dataclass(frozen=True)
@@ -70,7 +88,10 @@ def check(config: Config) -> None:
 
 
 class Fleet:
-    """The drones. `step` takes `record.action` and fills the rest of `record`."""
+    """The drones. `step` takes `record.action` and fills the rest of `record`.
+
+    What was flown in it stays until the next: `path`, and as in `edqn_jax.sim.env.Step` `end_step` and `contact`.
+    """
 
     def __init__(self, config: Config, course: Course, record: Record, seed: int) -> None:
         """Everything is allocated here; `record` holds one row for each drone.
@@ -96,6 +117,7 @@ class Fleet:
         self.goal = np.zeros((drones, 3))
         self.decision = np.zeros(drones, np.int64)
         self.path = np.zeros((drones, steps + 1, 7))
+        self.end_step, self.contact = np.zeros(drones, np.int64), np.zeros(drones)
         self.frames = frame_steps(config)
         pixels = config.camera.height * config.camera.width
         block = min(_BLOCK, drones)
@@ -117,10 +139,10 @@ class Fleet:
         self.goal[drone] = goal
         self.decision[drone] = 0
 
-    def reset(self) -> None:
-        """Every drone on a new mission; who stands still sees no events."""
+    def reset(self, missions: Sequence[int] | None = None) -> None:
+        """Every drone on the given mission, or on one drawn; who stands still sees no events."""
         for drone in range(len(self.goal)):
-            self.begin(drone)
+            self.begin(drone, None if missions is None else missions[drone])
         self.record.events[:] = 0
         self.tell()
 
@@ -138,8 +160,9 @@ class Fleet:
             )  # fmt: skip
         with self.stopwatch.time("outcome"):
             task.judge(
-                seen.geoms, self.rules, self.goal, self.path, self.state, self.decision, record.outcome, record.reward
-            )
+                seen.geoms, self.rules, self.goal, self.path, self.state, self.decision, record.outcome, record.reward,
+                self.end_step, self.contact,
+            )  # fmt: skip
             self._tell(record.final_own)
         for first in range(0, len(self.goal), _BLOCK):
             drones = slice(first, min(first + _BLOCK, len(self.goal)))

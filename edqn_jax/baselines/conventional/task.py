@@ -99,8 +99,9 @@ def signed_distance(geoms, px, py, pz):
 
 
 @numba.njit(cache=True, error_model="numpy")
-def _touches(geoms, radius, start, end):
-    """Whether a sphere that moves straight from `start` [3] to `end` [3] touches anything."""
+def _contact(geoms, radius, start, end):
+    """Share of the way straight from `start` [3] to `end` [3] at which a sphere first touches; inf if it does not."""
+    before = 0.0
     for k in range(_SAMPLES):
         f = k / (_SAMPLES - 1)
         x, y, z = (
@@ -108,31 +109,39 @@ def _touches(geoms, radius, start, end):
             start[1] + f * (end[1] - start[1]),
             start[2] + f * (end[2] - start[2]),
         )
-        if signed_distance(geoms, x, y, z) - radius <= 0:
-            return True
-    return False
+        gap = signed_distance(geoms, x, y, z) - radius
+        if gap <= 0:
+            # Between the last free sample and this one, interpolated linearly.
+            return 0.0 if k == 0 else f - gap / (gap - before) / (_SAMPLES - 1)
+        before = gap
+    return math.inf
 
 
 @numba.njit(cache=True, error_model="numpy")
 def _first_verdict(geoms, rules, goal, path):
-    """The earliest physics step's verdict: not finite, contact, fence, goal, in this order; else RUNNING."""
+    """The earliest physics step's verdict: not finite, contact, fence, goal, in this order; else RUNNING.
+
+    With it that step, 1..n, and the share of it flown before a contact, as in `edqn_jax.sim.env.judge`.
+    """
     gap = signed_distance(geoms, path[0, 0], path[0, 1], path[0, 2]) - rules.radius
     for step in range(1, len(path)):
         x, y, z = path[step, 0], path[step, 1], path[step, 2]
         if not (math.isfinite(x) and math.isfinite(y) and math.isfinite(z)):
-            return DIVERGED
+            return DIVERGED, step, 1.0
         before, gap = gap, signed_distance(geoms, x, y, z) - rules.radius
         dx, dy, dz = x - path[step - 1, 0], y - path[step - 1, 1], z - path[step - 1, 2]
         # Two clearances that together exceed the way between prove it free.
         free = before + gap > math.sqrt(dx * dx + dy * dy + dz * dz)
-        if not free and _touches(geoms, rules.radius, path[step - 1], path[step]):
-            return COLLISION
+        if not free:
+            share = _contact(geoms, rules.radius, path[step - 1], path[step])
+            if share <= 1:
+                return COLLISION, step, share
         for axis in range(3):
             if path[step, axis] < geoms.lower[axis] or path[step, axis] > geoms.upper[axis]:
-                return LEFT_VOLUME
+                return LEFT_VOLUME, step, 1.0
         if (x - goal[0]) ** 2 + (y - goal[1]) ** 2 + (z - goal[2]) ** 2 < rules.goal_radius**2:
-            return GOAL
-    return RUNNING
+            return GOAL, step, 1.0
+    return RUNNING, len(path) - 1, 1.0
 
 
 @numba.njit(cache=True, error_model="numpy")
@@ -156,7 +165,7 @@ def reward_of(rules, outcome, before, after, flown):
 
 
 @numba.njit(cache=True, error_model="numpy")
-def judge(geoms, rules, goal, path, state, decision, outcome, reward):
+def judge(geoms, rules, goal, path, state, decision, outcome, reward, end_step, contact):
     """Outcome and reward of one decision of N drones.
 
     Args:
@@ -165,10 +174,11 @@ def judge(geoms, rules, goal, path, state, decision, outcome, reward):
         state: [N, 13]; likewise.
         decision: [N] decisions taken, counted up.
         outcome, reward: [N], written.
+        end_step, contact: [N], written: as in `edqn_jax.sim.env.Step`.
     """
     for i in range(len(decision)):
         decision[i] += 1
-        verdict = _first_verdict(geoms, rules, goal[i], path[i])
+        verdict, end_step[i], contact[i] = _first_verdict(geoms, rules, goal[i], path[i])
         if not np.all(np.isfinite(state[i])):
             verdict = DIVERGED
             state[i, :7], state[i, 7:] = path[i, 0], 0.0

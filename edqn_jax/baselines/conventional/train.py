@@ -1,30 +1,35 @@
-"""stable-baselines3's DQN on all drones, and how fast it is.
+"""stable-baselines3's DQN on all drones: trained, flown, and how fast it is.
 
-What the agent is: DQN with 128 x 128 ReLU units, n-step returns, a Huber loss, Adam and a Polyak-averaged target, at
-the sizes and rates of the configuration. Where ours goes beyond what stable-baselines3 has (double and dueling
-DQN), this one does not follow.
+What the agent is: DQN with ReLU layers, n-step returns, a Huber loss, Adam and a Polyak-averaged target, at the sizes
+and rates of the configuration. Where ours goes beyond what stable-baselines3 has (double and dueling DQN, averaged
+parameters), this one does not follow.
+
+trained = train(config, Course.of(world), processes=2)
+flights = fly(trained, Course.of(validation))
 """
 
 from __future__ import annotations
 
+import copy
 import time
+from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
-import jax
 import numpy as np
+from numpy.typing import NDArray
 
-from edqn_jax.baselines.conventional import world
 from edqn_jax.baselines.conventional.fleet import Course
+from edqn_jax.baselines.conventional.flights import fly_missions
 from edqn_jax.baselines.conventional.stopwatch import Stopwatch
-from edqn_jax.baselines.conventional.vae import Learner
-from edqn_jax.baselines.conventional.vec_env import CodedDrones
+from edqn_jax.baselines.conventional.vae import EventVAE, Learner, images
+from edqn_jax.baselines.conventional.vec_env import CodedDrones, observed
 from edqn_jax.baselines.conventional.workers import SpreadFleet
 from edqn_jax.baselines.planner import require
-from edqn_jax.config import DENSITIES, Config, ConfigError
+from edqn_jax.config import AgentConfig, Config, ConfigError
+from edqn_jax.flights import Flights
+from edqn_jax.learn.trainer import Plan
 from edqn_jax.sim.env import ACTIONS
-from edqn_jax.sim.mjcf import check_scene, load_world, resolve_world
-from edqn_jax.sim.scene import stack_scenes
-from edqn_jax.sim.worlds import spread_missions
 
 torch = require("torch")
 stable_baselines3 = require("stable_baselines3")
@@ -44,28 +49,80 @@ PARTS = (
 """What is timed apart; the rest of the time is stable-baselines3's own."""
 
 
-def training_course(config: Config) -> Course:
-    """The training missions of `python train.py` on a world from a file.
+@dataclass(frozen=True)
+class Trained:
+    """What a training has come to; it stays as it is when the training goes on."""
+
+    config: Config
+    vae: EventVAE
+    q: Any
+    """The network, observations to values: a PyTorch module."""
+    decisions: int
+    """Taken in all, those of the warm-up included."""
+    seconds: float
+    """Spent on them; starting processes is not counted."""
+
+    def act(self, events: NDArray[np.int8], own: NDArray[np.float32]) -> NDArray[np.int64]:
+        """The best moves [M] for event counts [M, H, W] and own states [M, 10]."""
+        seen = torch.from_numpy(observed(self.config, self.vae.code(images(events)), own))
+        with torch.inference_mode():
+            return self.q(seen).argmax(dim=1).numpy()
+
+
+def train(
+    config: Config,
+    course: Course,
+    processes: int = 1,
+    threads: int = 1,
+    watch: Callable[[Trained], None] | None = None,
+) -> Trained:
+    """Trains for `config.train.total_steps` decisions, warm-up included, with `config.train.seed`.
+
+    Args:
+        course: what missions are drawn from.
+        processes: that fly.
+        threads: of PyTorch, in the one that learns.
+        watch: shown what has been learnt after every `config.train.validation_every` decisions, and at the end; its
+            time does not count.
 
     Raises:
-        ConfigError: if the world is a random one, or cannot be flown in.
+        ConfigError: where the configuration asks for what this stack does not have.
+        ValueError: if the drones do not divide into the processes.
     """
-    name = config.world.name
-    if name in DENSITIES:
-        raise ConfigError(f"the conventional stack flies in one world; give 'paper' or an MJCF file, not '{name}'")
-    loaded = load_world(resolve_world(name))
-    check_scene(loaded.scene, config.drone.body_radius_m, names=loaded.names, title=f"'{name}'")
-    key = jax.random.fold_in(jax.random.key(config.train.seed), 1)
-    own, jitter = config.world.own_start_fraction, config.world.start_jitter_m
-    missions = spread_missions(stack_scenes([loaded.scene]), config.world.missions, own, jitter, key)
-    start, goal = (np.asarray(points, np.float64) for points in (missions.start, missions.goal))
-    return Course(mjcf=world.text_of(loaded.scene), start=start, goal=goal)
+    with Training(config, course, processes, threads) as training:
+        training.warm_up()
+        trained = training.trained()
+        while (left := training.total - training.decisions) > 0:
+            training.learn(min(config.train.validation_every or left, left))
+            trained = training.trained()
+            if watch is not None:
+                watch(trained)
+        return trained
+
+
+def fly(trained: Trained, course: Course) -> Flights:
+    """Flies each mission of the course once, taking the best move each time: see `flights.fly_missions`."""
+    return fly_missions(trained.config, course, trained.act)
+
+
+def check(config: AgentConfig) -> None:
+    """Raises ConfigError where the configuration asks for a DQN that stable-baselines3 does not have."""
+    if config.history != 1 or config.layer_norm or config.huber_delta != 1.0 or config.exploration_episodes > 0:
+        raise ConfigError(
+            "the conventional stack's DQN has agent.history 1, agent.layer_norm False, agent.huber_delta 1 and "
+            "agent.exploration_episodes 0, and no other"
+        )
 
 
 class TimedDQN(stable_baselines3.DQN):
     """stable-baselines3's DQN; what it does itself is timed apart from what it calls."""
 
     stopwatch: Stopwatch
+    planned: int
+    """Decisions over which the schedules run, in however many calls of `learn`."""
+
+    def _update_current_progress_remaining(self, num_timesteps: int, total_timesteps: int) -> None:
+        super()._update_current_progress_remaining(num_timesteps, self.planned)
 
     def train(self, gradient_steps: int, batch_size: int = 100) -> None:
         """The DQN's updates."""
@@ -88,7 +145,9 @@ class Training:
             ValueError: if the drones do not divide into the processes.
         """
         agent, drones = config.agent, config.train.num_envs
-        self.config, self.processes, self.threads = config, processes, threads
+        check(agent)
+        self.config, self.threads, self.plan = config, threads, Plan.of(config)
+        self.warm, self.seconds = 0, 0.0
         fleet = SpreadFleet(config, course, drones, processes, config.train.seed)
         self.learner = Learner(config.encoder, config.camera, config.train.seed)
         self.env = CodedDrones(config, fleet, self.learner)
@@ -119,20 +178,39 @@ class Training:
             device="cpu",
         )
         self.dqn.stopwatch = self.stopwatch
+        self.dqn.planned = self.total - self.plan.warmup * drones
+
+    @property
+    def total(self) -> int:
+        """Decisions that the whole training has."""
+        return self.plan.total * self.env.num_envs
+
+    @property
+    def decisions(self) -> int:
+        """Decisions taken so far."""
+        return self.warm + self.dqn.num_timesteps
+
+    def trained(self) -> Trained:
+        """What has been learnt so far."""
+        q = copy.deepcopy(self.dqn.q_net).requires_grad_(False)
+        return Trained(self.config, self.learner.acting, q, self.decisions, self.seconds)
 
     def warm_up(self) -> None:
         """Held random manoeuvres in which the VAE learns; then its code is the agent's."""
         torch.set_num_threads(self.threads)
+        began = time.perf_counter()
         config, env = self.config.encoder, self.env
         env.updates = config.warmup_updates_per_step
         env.reset()
         action = self.random.integers(len(ACTIONS), size=env.num_envs)
-        for _ in range(-(-config.warmup_decisions // env.num_envs)):
+        for _ in range(self.plan.warmup):
             new = self.random.random(env.num_envs) < 1.0 / config.hold_decisions
             action = np.where(new, self.random.integers(len(ACTIONS), size=env.num_envs), action)
             env.step(action)
         self.learner.publish()
         env.updates = 1 if config.keep_learning else 0
+        self.warm += self.plan.warmup * env.num_envs
+        self.seconds += time.perf_counter() - began
 
     def learn(self, decisions: int) -> float:
         """So many more decisions, rounded up to whole steps of all drones; decisions per second."""
@@ -140,7 +218,9 @@ class Training:
         before = self.dqn.num_timesteps
         began = time.perf_counter()
         self.dqn.learn(decisions, log_interval=None, reset_num_timesteps=before == 0)  # type: ignore[arg-type]
-        return (self.dqn.num_timesteps - before) / (time.perf_counter() - began)
+        seconds = time.perf_counter() - began
+        self.seconds += seconds
+        return (self.dqn.num_timesteps - before) / seconds
 
     def __enter__(self) -> Training:
         return self

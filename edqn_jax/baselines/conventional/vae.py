@@ -38,6 +38,11 @@ class EventVAE(nn.Module):
         mean, log_variance = self.encoder(image).chunk(2, dim=-1)
         return mean, log_variance.clamp(-_MAX_LOG_VARIANCE, _MAX_LOG_VARIANCE)
 
+    def code(self, image: Tensor) -> NDArray[np.float32]:
+        """What the agent sees of images [B, 2 H W]: the mean, [B, code_size]."""
+        with torch.inference_mode():
+            return self.encode(image)[0].numpy()
+
     def loss(self, image: Tensor) -> Tensor:
         """Eq. 6: squared reconstruction error of an image + `kl_weight` x KL, averaged over the batch."""
         mean, log_variance = self.encode(image)
@@ -85,5 +90,4 @@ class Learner:
 
     def code(self, image: Tensor) -> NDArray[np.float32]:
         """The agent's code of images [B, 2 H W]: the mean, [B, code_size]."""
-        with torch.inference_mode():
-            return self.acting.encode(image)[0].numpy()
+        return self.acting.code(image)

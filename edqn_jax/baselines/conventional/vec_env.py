@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from edqn_jax.baselines.conventional.vae import Learner, images
 from edqn_jax.baselines.conventional.workers import SpreadFleet
@@ -15,6 +16,11 @@ from edqn_jax.sim.env import ACTIONS, OWN_SIZE, Outcome
 
 spaces = require("gymnasium").spaces
 vec_env = require("stable_baselines3.common.vec_env")
+
+
+def observed(config: Config, code: NDArray[np.float32], own: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Codes [N, code_size] and own states [N, 10] as the network sees them: [N, code_size + 10]."""
+    return np.concatenate([config.agent.code_scale * code, own], axis=1, dtype=np.float32)
 
 
 class CodedDrones(vec_env.VecEnv):
@@ -31,7 +37,6 @@ class CodedDrones(vec_env.VecEnv):
         self.config, self.fleet, self.learner = config, fleet, learner
         self.stopwatch = fleet.stopwatch
         self.updates = 1
-        self.episodes = dict.fromkeys(Outcome, 0)
         size = config.encoder.code_size + OWN_SIZE
         super().__init__(
             num_envs=len(fleet.record.action),
@@ -43,7 +48,7 @@ class CodedDrones(vec_env.VecEnv):
         """Observations [N, code_size + 10] of new missions."""
         self.fleet.reset()
         record = self.fleet.record
-        return self._joined(self._codes(images(record.events)), record.own)
+        return observed(self.config, self.learner.code(images(record.events)), record.own)
 
     def step_async(self, actions: np.ndarray) -> None:
         """Moves [N] to be taken."""
@@ -55,29 +60,22 @@ class CodedDrones(vec_env.VecEnv):
         record = self.fleet.record
         with self.stopwatch.time("encoder"):
             image = images(record.events)
-            codes = self._codes(image)
+            codes = self.learner.code(image)
         with self.stopwatch.time("vae_update"):
             for _ in range(self.updates):
                 self.learner.update(image)
-        seen = self._joined(codes, record.own)
+        seen = observed(self.config, codes, record.own)
         infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
         ended = np.flatnonzero(record.outcome)
         if len(ended):
-            final = self._joined(codes[ended], record.final_own[ended])
+            final = observed(self.config, codes[ended], record.final_own[ended])
             # A drone at the start of its mission sees nothing move.
-            seen[ended, :-OWN_SIZE] = self._codes(images(np.zeros_like(record.events[:1])))
+            nothing = self.learner.code(images(np.zeros_like(record.events[:1])))
+            seen[ended] = observed(self.config, nothing.repeat(len(ended), axis=0), record.own[ended])
             for i, last in zip(ended, final, strict=True):
-                outcome = Outcome(int(record.outcome[i]))
-                self.episodes[outcome] += 1
-                infos[i] = {"terminal_observation": last, "TimeLimit.truncated": outcome is Outcome.TIME_OUT}
+                timed_out = bool(record.outcome[i] == Outcome.TIME_OUT)
+                infos[i] = {"terminal_observation": last, "TimeLimit.truncated": timed_out}
         return seen, self.config.agent.reward_scale * record.reward, record.outcome != Outcome.RUNNING, infos
-
-    def _codes(self, image) -> np.ndarray:
-        return self.config.agent.code_scale * self.learner.code(image)
-
-    @staticmethod
-    def _joined(codes: np.ndarray, own: np.ndarray) -> np.ndarray:
-        return np.concatenate([codes, own], axis=1)
 
     def close(self) -> None:
         """Ends the fleet's processes."""

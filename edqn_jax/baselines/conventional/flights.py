@@ -1,0 +1,80 @@
+"""Missions flown greedily, all side by side, judged and tallied as in `edqn_jax/flights.py`."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from edqn_jax.baselines.conventional.fleet import Course, Fleet, Record
+from edqn_jax.baselines.conventional.task import RUNNING, signed_distance
+from edqn_jax.baselines.planner import require
+from edqn_jax.config import Config
+from edqn_jax.flights import Closest, Flights
+
+numba = require("numba")
+
+Act = Callable[[NDArray[np.int8], NDArray[np.float32]], NDArray[np.int64]]
+"""From event counts [M, H, W] and own states [M, 10] to moves [M]."""
+
+
+def fly_missions(config: Config, course: Course, act: Act) -> Flights:
+    """Fly each of the course's M missions once. A drone whose flight is over goes on, which counts for nothing.
+
+    Returns:
+        what `edqn_jax.flights.fly_missions` returns, in NumPy and without a record: `evaluate.summarise` takes it.
+
+    Raises:
+        ConfigError: where the configuration asks for what this stack does not have.
+    """
+    missions = len(course.start)
+    record = Record.empty(config, missions)
+    fleet = Fleet(config, course, record, seed=0)
+    fleet.reset(range(missions))
+    geoms, radius, dt = fleet.world.geoms, fleet.rules.radius, fleet.airframe.physics_dt
+    gap = np.array([signed_distance(geoms, x, y, z) - radius for x, y, z in course.start])
+    nearest: Any = gap, np.zeros(missions), fleet.state[:, :3].copy(), fleet.state[:, 3:7].copy()
+    outcome, decisions, physics_steps = np.zeros((3, missions), np.int64)
+    episode_return, length, seconds = np.zeros((3, missions))
+    contact = np.ones(missions)
+    while np.any(running := outcome == RUNNING):
+        record.action[:] = act(record.events, record.own)
+        fleet.step()
+        _tally(geoms, radius, dt, running, fleet.path, fleet.end_step, fleet.contact, length, seconds, nearest)
+        decisions += running
+        physics_steps += running * fleet.end_step
+        episode_return += running * record.reward
+        contact = np.where(running, fleet.contact, contact)
+        outcome = np.where(running, record.outcome, outcome)
+    flown: Any = outcome, decisions, physics_steps, contact, episode_return, length, seconds
+    return Flights(*flown, closest=Closest(*nearest), record=None)
+
+
+@numba.njit(cache=True, error_model="numpy")
+def _tally(geoms, radius, dt, running, path, end_step, contact, length, seconds, nearest):
+    """Adds what was flown in one decision, up to its end: metres, seconds, and where a shape was nearest.
+
+    Args:
+        running: [M] bool; the others stay as they are.
+        path: [M, n + 1, 7].
+        end_step, contact: [M], as in `edqn_jax.sim.env.Step`.
+        length, seconds: [M], updated.
+        nearest: distance [M], time [M], position [M, 3] and quaternion [M, 4], updated.
+    """
+    distance, time, position, quaternion = nearest
+    for i in np.flatnonzero(running):
+        for step in range(1, end_step[i] + 1):
+            share = contact[i] if step == end_step[i] else 1.0
+            before, after = path[i, step - 1], path[i, step]
+            dx, dy, dz = after[0] - before[0], after[1] - before[1], after[2] - before[2]
+            x, y, z = before[0] + share * dx, before[1] + share * dy, before[2] + share * dz
+            length[i] += share * math.sqrt(dx * dx + dy * dy + dz * dz)
+            seconds[i] += share * dt
+            gap = signed_distance(geoms, x, y, z) - radius
+            if gap < distance[i]:
+                distance[i], time[i] = gap, seconds[i]
+                position[i, 0], position[i, 1], position[i, 2] = x, y, z
+                quaternion[i] = after[3:]
