@@ -17,8 +17,9 @@ from edqn_jax.devices import compiler_options
 from edqn_jax.learn import policy
 from edqn_jax.learn.policy import Memory, PolicyParams
 from edqn_jax.sim import env
+from edqn_jax.sim.drone import DroneState, Flight
 from edqn_jax.sim.env import EnvState, Observation, Outcome, Step, World
-from edqn_jax.sim.scene import scene_at, signed_distance, take_scene
+from edqn_jax.sim.scene import Scene, scene_at, signed_distance, take_scene
 
 
 @struct.dataclass
@@ -205,8 +206,12 @@ def _fly(
 
 def _at_start(config: Config, world: World, state: EnvState) -> Flights:
     """Tallies of one flight that has yet to begin."""
-    body = state.drone
     scene = scene_at(take_scene(world.pool, world.missions.scene[state.mission]), jnp.zeros(()))
+    return at_start(config, scene, state.drone)
+
+
+def at_start(config: Config, scene: Scene, body: DroneState) -> Flights:
+    """Tallies of one flight that begins with `body`."""
     zero, none = jnp.zeros(()), jnp.zeros((), jnp.int32)
     return Flights(
         outcome=none,
@@ -227,39 +232,70 @@ def _at_start(config: Config, world: World, state: EnvState) -> Flights:
 
 
 def _tally(config: Config, world: World, flights: Flights, before: EnvState, step: Step) -> tuple[Flights, Array]:
-    """The tallies of one flight after a decision, and the clearance [n] after each of its physics steps."""
+    """The tallies of one flight after a step, and the clearance [n] after each of its physics steps."""
     running = (flights.outcome == Outcome.RUNNING) & ~step.is_reset
+    time = before.decision * (config.drone.physics_steps * config.drone.physics_dt_s)
+    scene = scene_at(take_scene(world.pool, world.missions.scene[before.mission]), time)
+    verdict = step.outcome, step.end_step, step.contact
+    after, clearance = tally(config, scene, flights, before.drone.position, step.flight, *verdict)
+    after = dataclasses.replace(after, episode_return=step.episode_return)
+    return jax.tree.map(lambda new, old: jnp.where(running, new, old), after, flights), clearance
+
+
+def tally(
+    config: Config,
+    scene: Scene,
+    flights: Flights,
+    before: Array,
+    flight: Flight,
+    outcome: Array,
+    end_step: Array,
+    contact: Array,
+) -> tuple[Flights, Array]:
+    """The tallies of one flight after one more decision, its return aside.
+
+    Args:
+        config: body and physics.
+        scene: as it stands during the decision.
+        flights: of one flight that is not over.
+        before: [3] metres, position before the first physics step.
+        flight: n physics steps.
+        outcome: as `env.judge` has it, like the next two.
+        end_step: in 1..n.
+        contact: share of that step.
+
+    Returns:
+        the tallies, and the clearance [n] after each physics step, metres.
+    """
     steps = jnp.arange(config.drone.physics_steps)
-    flown = steps < step.end_step
-    share = jnp.where(steps == step.end_step - 1, step.contact, 1.0)
-    begin = jnp.concatenate([before.drone.position[None], step.flight.position[:-1]])
-    segment = share[:, None] * (step.flight.position - begin)
+    flown = steps < end_step
+    share = jnp.where(steps == end_step - 1, contact, 1.0)
+    begin = jnp.concatenate([before[None], flight.position[:-1]])
+    segment = share[:, None] * (flight.position - begin)
     end = begin + segment
     times = flights.flight_seconds + (steps + share) * config.drone.physics_dt_s
 
-    time = before.decision * (config.drone.physics_steps * config.drone.physics_dt_s)
-    scene = scene_at(take_scene(world.pool, world.missions.scene[before.mission]), time)
     clearance = jax.vmap(partial(signed_distance, scene))(end) - config.drone.body_radius_m
     least = jnp.argmin(jnp.where(flown, clearance, jnp.inf))
     closest = Closest(
         distance=clearance[least],
         time=times[least],
         position=end[least],
-        quaternion=step.flight.quaternion[least],
+        quaternion=flight.quaternion[least],
     )
     closer = closest.distance < flights.closest.distance
     after = Flights(
-        outcome=step.outcome,
-        decisions=step.episode_length,
-        physics_steps=flights.physics_steps + step.end_step,
-        contact=step.contact,
-        episode_return=step.episode_return,
+        outcome=outcome,
+        decisions=flights.decisions + 1,
+        physics_steps=flights.physics_steps + end_step,
+        contact=contact,
+        episode_return=flights.episode_return,
         path_length_m=flights.path_length_m + jnp.sum(jnp.where(flown, jnp.sqrt(jnp.sum(segment**2, axis=-1)), 0.0)),
-        flight_seconds=times[step.end_step - 1],
+        flight_seconds=times[end_step - 1],
         closest=jax.tree.map(lambda new, old: jnp.where(closer, new, old), closest, flights.closest),
         record=None,
     )
-    return jax.tree.map(lambda new, old: jnp.where(running, new, old), after, flights), clearance
+    return after, clearance
 
 
 def _blank(config: Config, missions: int) -> Record:

@@ -116,8 +116,8 @@ def own_state(config: EnvConfig, scene: Scene, goal: Array, state: DroneState) -
     )
 
 
-def _bearing(config: EnvConfig, state: DroneState, goal: Array) -> Array:
-    """Heading setpoint for the next decision: towards the goal, or held when it is (nearly) overhead."""
+def bearing(config: EnvConfig, state: DroneState, goal: Array) -> Array:
+    """Heading setpoint [] radians of the next decision: towards the goal [3], or held when it is (nearly) overhead."""
     ahead = goal - state.position
     near = ahead[0] ** 2 + ahead[1] ** 2 < config.heading_hold_m**2
     return jnp.where(near, state.yaw_setpoint, jnp.arctan2(ahead[1], ahead[0]))
@@ -281,7 +281,7 @@ def step(
     # The decision as flown; for an ended environment it is computed and dropped.
     before = state.drone
     command = velocity_command(config.env, action, drone.yaw_of(before.quaternion))
-    flown, flight = drone.fly(config.drone, world.airframe, before, command, _bearing(config.env, before, goal))
+    flown, flight = drone.fly(config.drone, world.airframe, before, command, bearing(config.env, before, goal))
     decision = state.decision + 1
     outcome, end_step, contact = judge(config, scene, goal, before.position, flight, decision)
     distances = [jnp.sqrt(jnp.sum((goal - p) ** 2)) for p in (before.position, flown.position)]

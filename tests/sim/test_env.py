@@ -259,7 +259,7 @@ def test_own_state_by_hand():
 
 
 def test_the_heading_setpoint_is_the_bearing_and_is_held_near_the_goal():
-    bearing = partial(env._bearing, CONFIG.env)
+    bearing = partial(env.bearing, CONFIG.env)
     np.testing.assert_allclose(bearing(body((50, 40, 5)), GOAL), np.pi / 2, atol=1e-6)
     np.testing.assert_allclose(bearing(body((55, 50, 20)), GOAL), np.pi, atol=1e-6)
     # 1.9 m beside it, however high above: what it was.

@@ -1,0 +1,137 @@
+"""A path, flown: the planners' counterpart of a learned policy.
+
+Every decision the follower commands a velocity towards a point ahead of it on the path, at most `env.speed_m_s`
+along each axis of the heading frame, as a learner's moves are: the same airframe, controller, period of decisions
+and judge. It goes towards the furthest point within reach for which the straight way there stays within a tolerance of
+the path. So it flies straight legs fast, slows down before corners, and cuts them by no more than planners leave
+room for: they are given `reserved` tasks. (Pure pursuit, Coulter, CMU-RI-TR-92-01, with a look-ahead that corners
+shorten.)
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from edqn_jax.baselines.planner import Task
+from edqn_jax.config import Config, EnvConfig
+from edqn_jax.flights import Flights, at_start, tally
+from edqn_jax.sim import drone
+from edqn_jax.sim.drone import Airframe, DroneState
+from edqn_jax.sim.env import Outcome, bearing, judge
+from edqn_jax.sim.scene import Scene
+
+SPACING_M = 0.1
+"""Metres between the points that a path is followed by."""
+_LANES = 2048  # points of a path are padded to a multiple of this, to compile few programs
+
+
+@dataclasses.dataclass(frozen=True)
+class FollowConfig:
+    """How closely and how fast a path is followed; all values are ours."""
+
+    reserve_m: float = 0.3
+    """What planners keep clear of beyond the body's radius, metres: room for the follower."""
+    tolerance_m: float = 0.2
+    """How far the straight way to the point ahead may be off the path, metres."""
+    reach_m: float = 3.0
+    """The point ahead is at most so far along the path, metres."""
+    window_m: float = 3.0
+    """The nearest point of the path is sought so far along it, metres."""
+    lag_s: float = 0.2
+    """Seconds for which the drone goes on as it flies before a command has its way."""
+    horizon_s: float = 0.25
+    """Seconds after that in which it would be at the point ahead."""
+
+
+def reserved(task: Task, config: FollowConfig = FollowConfig()) -> Task:  # noqa: B008 (it is frozen)
+    """The task of a planner whose path will be followed: a larger body, and a fence drawn in, ends excepted."""
+    lower, upper = np.asarray(task.scene.volume, np.float64)
+    lower = np.minimum(lower + config.reserve_m, np.minimum(task.start, task.goal))
+    upper = np.maximum(upper - config.reserve_m, np.maximum(task.start, task.goal))
+    # Rounded outwards, or an end that stands on the fence would be beyond it.
+    volume = np.stack([np.nextafter(np.float32(lower), -np.inf), np.nextafter(np.float32(upper), np.inf)])
+    scene = dataclasses.replace(task.scene, volume=volume)
+    return dataclasses.replace(task, scene=scene, body_radius=task.body_radius + config.reserve_m)
+
+
+def sampled(path: np.ndarray) -> np.ndarray:
+    """Points [K, 3] every `SPACING_M` along a path [N, 3], metres; the last repeats to fill K."""
+    along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))])
+    count = math.ceil(along[-1] / SPACING_M) + 1
+    at = np.minimum(SPACING_M * np.arange(-(-count // _LANES) * _LANES), along[-1])
+    return np.stack([np.interp(at, along, axis) for axis in path.T], axis=1).astype(np.float32)
+
+
+def steer(
+    config: EnvConfig, follow: FollowConfig, points: Array, nearest: Array, state: DroneState
+) -> tuple[Array, Array]:
+    """Where to fly next.
+
+    Args:
+        config: whose speed is the limit.
+        follow: how closely.
+        points: [K, 3] from `sampled`.
+        nearest: [] int32, the point that the drone was nearest to at the decision before; it never goes back.
+        state: of the drone.
+
+    Returns:
+        velocity [3] m/s, world; the point that the drone is nearest to now.
+    """
+    window, reach = (round(metres / SPACING_M) for metres in (follow.window_m, follow.reach_m))
+    last = points.shape[0] - 1
+    near = jnp.minimum(nearest + jnp.arange(window), last)
+    here = state.position
+    nearest = near[jnp.argmin(jnp.sum((points[near] - here[None]) ** 2, axis=1))]
+
+    ahead = points[jnp.minimum(nearest + 1 + jnp.arange(reach), last)] - here[None]  # [R, 3]
+    length = jnp.sqrt(jnp.sum(ahead**2, axis=1) + 1e-9)
+    along = (ahead @ ahead.T) / length[:, None]  # [to, of] of each point along the straight way to each
+    along = jnp.clip(along, 0.0, length[:, None])
+    off = ahead[None] - along[..., None] * (ahead / length[:, None])[:, None]
+    passed = jnp.tril(jnp.ones((reach, reach), bool))
+    worst = jnp.max(jnp.where(passed, jnp.sqrt(jnp.sum(off**2, axis=-1)), 0.0), axis=1)
+    # Off the path it must get back first: what it is off by now is no reason to stop.
+    allowed = worst <= jnp.maximum(follow.tolerance_m, worst[0])
+    furthest = jnp.max(jnp.where(allowed, jnp.arange(reach), 0))
+
+    wanted = (ahead[furthest] - follow.lag_s * state.velocity) / follow.horizon_s
+    speed = jnp.sqrt(jnp.sum(wanted**2) + 1e-9)
+    return wanted * jnp.minimum(1.0, config.speed_m_s / speed), nearest
+
+
+def fly_path(
+    config: Config, follow: FollowConfig, airframe: Airframe, scene: Scene, goal: Array, points: Array
+) -> Flights:
+    """One flight along points [K, 3] from `sampled`, from rest at the first, facing the goal [3].
+
+    Pure; `config` and `follow` are static. The scene's own start and goal do not matter.
+
+    Returns:
+        the tallies of that flight; there is no return and no record.
+    """
+    away = goal - points[0]
+    body = drone.hover(points[0], jnp.arctan2(away[1], away[0]))
+
+    def decide(flying: tuple[DroneState, Array, Flights]) -> tuple[DroneState, Array, Flights]:
+        state, nearest, flights = flying
+        command, nearest = steer(config.env, follow, points, nearest, state)
+        after, flight = drone.fly(config.drone, airframe, state, command, bearing(config.env, state, goal))
+        verdict = judge(config, scene, goal, state.position, flight, flights.decisions + 1)
+        flights, _ = tally(config, scene, flights, state.position, flight, *verdict)
+        return after, nearest, flights
+
+    flying = body, jnp.zeros((), jnp.int32), at_start(config, scene, body)
+    return jax.lax.while_loop(lambda f: f[2].outcome == Outcome.RUNNING, decide, flying)[2]
+
+
+@functools.cache
+def compiled_follower():
+    """`fly_path`, jitted; compiled once for each configuration and shape."""
+    return jax.jit(fly_path, static_argnums=(0, 1))
