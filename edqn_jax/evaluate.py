@@ -28,7 +28,7 @@ from edqn_jax.resolve import apply, load_layer
 from edqn_jax.rundir import TRAJECTORY_COLUMNS, plain
 from edqn_jax.sim import env
 from edqn_jax.sim.env import Outcome, World
-from edqn_jax.sim.events import EventField
+from edqn_jax.sim.events import EventField, divides_window
 from edqn_jax.sim.moves import DIRECTIONS
 from edqn_jax.sim.scene import take_scene
 from edqn_jax.sim.sensor import Sensed
@@ -154,6 +154,12 @@ def summarise(flights: Flights, shortest: np.ndarray | None = None) -> dict[str,
 
 def decision_latency_ms(config: Config, params: PolicyParams, calls: int = 300) -> dict[str, float]:
     """Median and 99th percentile of the time that one decision takes, from host arrays to an action there."""
+    median, p99 = np.percentile(1e3 * decision_seconds(config, params, calls), [50, 99])
+    return {"median": float(median), "p99": float(p99)}
+
+
+def decision_seconds(config: Config, params: PolicyParams, calls: int) -> np.ndarray:
+    """Seconds [calls] that each of so many decisions takes, from host arrays to an action there."""
     seen = env.Observation(sensed=_anything(config), own=jnp.zeros(env.OWN_SIZE))
     seen, memory = jax.tree.map(np.asarray, (seen, policy.empty_memory(config)))  # on the host
     act = jax.jit(lambda params, memory, seen, key: policy.act(config, params, memory, seen, key))
@@ -163,8 +169,7 @@ def decision_latency_ms(config: Config, params: PolicyParams, calls: int = 300) 
         began = time.perf_counter()
         int(act(params, memory, seen, key)[0])
         seconds.append(time.perf_counter() - began)
-    median, p99 = np.percentile(np.array(seconds[1:]) * 1e3, [50, 99])  # the first call compiled
-    return {"median": float(median), "p99": float(p99)}
+    return np.array(seconds[1:])  # the first call compiled
 
 
 def _anything(config: Config) -> Sensed:
@@ -179,7 +184,8 @@ def _anything(config: Config) -> Sensed:
     pixels = (max(len(config.events.frame_times_s) - 1, 1), height, width)
     count, times = jnp.asarray(rng.integers(0, 3, pixels), jnp.int32), jnp.zeros(pixels)
     window = config.events.frame_times_s[-1] - config.events.frame_times_s[0]
-    return EventField(count, jnp.sign(count).astype(jnp.int8), times, times, window_s=window)
+    even = divides_window(config.events, len(config.events.frame_times_s))
+    return EventField(count, jnp.sign(count).astype(jnp.int8), times, times, window, even)
 
 
 # -------------------------------------------------------------------------------------- one flight

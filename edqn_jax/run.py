@@ -132,6 +132,46 @@ class Candidate:
     decisions: int = 0  # trained before that validation, of all environments
 
 
+def is_due(config: Config, plan: Plan, checked: int, done: int) -> bool:
+    """Whether a validation is due after `done` training steps, the last one having been after `checked` decisions."""
+    every = config.train.validation_every
+    # On crossing a multiple, never on equality: right for any number of environments.
+    return every > 0 and done * config.train.num_envs // every > checked // every and done > plan.learn_from
+
+
+def check_finite(plan: Plan, done: int, losses: Losses) -> None:
+    """Nothing, if all losses of the chunk that ended with training step `done` are finite.
+
+    Raises:
+        DivergedError: if one is not.
+    """
+    learns = np.arange(done - len(losses.q_loss), done) >= plan.learn_from
+    bad = learns & ~np.isfinite(losses.q_loss)
+    if bad.any():
+        raise DivergedError(f"training diverged: the Q loss was {losses.q_loss[bad][0]} at training step {done}")
+
+
+def validated_by(
+    config: Config, courses: Courses, flown: Flights, params: PolicyParams, decisions: int
+) -> tuple[Candidate, float]:
+    """What the flights of a validation say of the parameters that flew them.
+
+    Returns:
+        the candidate, and the share of missions flown of those that begin at or near their world's own start.
+    """
+    arrived = np.asarray(flown.outcome) == Outcome.GOAL
+    straight = _straight(courses.validation.missions, config.env.goal_radius_m)
+    weighted = spl(arrived, np.asarray(flown.path_length_m), straight)
+    latest = Candidate(params, weighted, float(np.mean(arrived)), decisions)
+    return latest, float(np.mean(arrived[courses.from_start]))
+
+
+def _straight(missions: Missions, goal_radius_m: float) -> np.ndarray:
+    """[M] metres from each start straight to the goal's sphere: no flight is shorter, and nothing need be searched."""
+    apart = np.linalg.norm(np.asarray(missions.goal) - np.asarray(missions.start), axis=1)
+    return np.maximum(apart - goal_radius_m, 1e-3)
+
+
 def choose(keep: Literal["best", "last"], kept: Candidate, latest: Candidate) -> Candidate:
     """Which of the two a run would end with: `best` by SPL, the latest among equals; `last` always the latest."""
     return latest if keep == "last" or latest.spl >= kept.spl else kept
@@ -266,7 +306,7 @@ def _train(
     given = _placed(config, courses.validation, kept.params, mesh)
     flyable = _ahead(pool, lambda: flights.prepare(config, *given, record=True, mesh=mesh))
     progress.start(plan.total * envs)
-    train_seconds, validated, from_start = 0.0, 0, courses.from_start
+    train_seconds, checked = 0.0, 0
     done = 0
     while done < plan.total:
         started = time.perf_counter()
@@ -276,23 +316,22 @@ def _train(
         train_seconds += seconds
         metrics = log.chunk(done, cluster.fetch(episodes), losses, seconds)
         done += chunk
-        _check_finite(plan, done, losses)
+        check_finite(plan, done, losses)
         finished = done >= plan.total or 0 < config.train.max_episodes <= log.episodes
-        every = config.train.validation_every
-        # On crossing a multiple, never on equality: right for any number of environments.
-        crossed = every > 0 and done * envs // every > validated // every and done > plan.learn_from
-        if crossed or finished:
-            validated = done * envs
+        if finished or is_due(config, plan, checked, done):
+            checked = done * envs
             params = jax.tree.map(np.asarray, policy_of(state))
             flyable.result()
-            flown = _fly(config, courses.validation, params, mesh)
-            arrived = np.asarray(flown.outcome) == Outcome.GOAL
-            rate, mission = float(np.mean(arrived)), float(np.mean(arrived[from_start]))
-            log.validations.append((validated, time.perf_counter() - began, mission))
-            straight = _straight(courses.validation.missions, config.env.goal_radius_m)
-            weighted = spl(arrived, np.asarray(flown.path_length_m), straight)
-            metrics |= {"validation_success": rate, "validation_mission": mission, "validation_spl": weighted}
-            kept = choose(config.train.keep, kept, Candidate(params, weighted, rate, validated))
+            latest, mission = validated_by(
+                config, courses, _fly(config, courses.validation, params, mesh), params, checked
+            )
+            log.validations.append((checked, time.perf_counter() - began, mission))
+            metrics |= {
+                "validation_success": latest.success,
+                "validation_mission": mission,
+                "validation_spl": latest.spl,
+            }
+            kept = choose(config.train.keep, kept, latest)
         if run is not None:
             run.append_metrics(metrics)
         progress.update(metrics)
@@ -359,19 +398,6 @@ def _fly(config: Config, world: World, params: PolicyParams, mesh: Mesh) -> Flig
 def _placed(config: Config, world: World, params: PolicyParams, mesh: Mesh) -> tuple[World, PolicyParams, jax.Array]:
     """What `fly_missions` is given."""
     return *cluster.replicate((world, params), mesh), jax.random.key(config.train.seed)
-
-
-def _straight(missions: Missions, goal_radius_m: float) -> np.ndarray:
-    """[M] metres from each start straight to the goal's sphere: no flight is shorter, and nothing need be searched."""
-    apart = np.linalg.norm(np.asarray(missions.goal) - np.asarray(missions.start), axis=1)
-    return np.maximum(apart - goal_radius_m, 1e-3)
-
-
-def _check_finite(plan: Plan, done: int, losses: Losses) -> None:
-    learns = np.arange(done - len(losses.q_loss), done) >= plan.learn_from
-    bad = learns & ~np.isfinite(losses.q_loss)
-    if bad.any():
-        raise DivergedError(f"training diverged: the Q loss was {losses.q_loss[bad][0]} at training step {done}")
 
 
 def _verdict(summary: dict[str, Any], run: RunDirectory) -> str:

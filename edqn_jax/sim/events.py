@@ -181,8 +181,13 @@ def events(
         field = _frame_pairs(config, memory.gain, frames, times)
     if _has_noise(config):
         field = _join(field, _noise(config, memory.hot, field, times, key))
-    one_pair = len(times) == 2 and config.law != "esim" and not _has_noise(config)
-    return dataclasses.replace(field, window_s=window_s, divides_window=one_pair), memory
+    even = divides_window(config, len(times))
+    return dataclasses.replace(field, window_s=window_s, divides_window=even), memory
+
+
+def divides_window(config: EventsConfig, frames: int) -> bool:
+    """Whether each pixel's events divide a window of so many frames evenly, see `EventField`."""
+    return frames == 2 and config.law != "esim" and not _has_noise(config)
 
 
 def signed_count(field: EventField) -> Array:
