@@ -19,7 +19,6 @@ import argparse
 import contextlib
 import json
 import math
-import os
 import statistics
 import subprocess
 import sys
@@ -29,6 +28,7 @@ from pathlib import Path
 from typing import Any
 
 import json_report
+from child import Child, ChildEndedError
 from edqn_jax.config import ConfigError
 from edqn_jax.files import check_can_write
 from flags import configured, split
@@ -104,24 +104,12 @@ def _last_line(text: str) -> str:
 # ------------------------------------------------------------------------------------------ workers
 
 
-class Worker:
+class Worker(Child):
     """A process that times one commit, as `worker.py` says."""
 
     def __init__(self, checkout: Path, rows: Sequence[str], words: Sequence[str], complaints: Path) -> None:
-        self.checkout, self.complaints = checkout, complaints
-        path = os.pathsep.join([str(checkout), str(checkout / "benchmarks")])
-        # Two processes share the accelerator, if there is one.
-        environment = {"XLA_PYTHON_CLIENT_PREALLOCATE": "false", **os.environ, "PYTHONPATH": path}
-        with complaints.open("w", encoding="utf-8") as log:
-            self.process = subprocess.Popen(
-                [sys.executable, "-P", str(ROOT / "benchmarks" / "worker.py"), json.dumps(list(rows)), *words],
-                env=environment,
-                stdin=subprocess.PIPE,
-                stdout=subprocess.PIPE,
-                stderr=log,
-                text=True,
-                bufsize=1,
-            )
+        self.checkout = checkout
+        super().__init__(checkout, ROOT / "benchmarks" / "worker.py", [json.dumps(list(rows)), *words], complaints)
         self.about: dict[str, Any] = {}
 
     def wait_until_ready(self) -> None:
@@ -130,31 +118,20 @@ class Worker:
         Raises:
             ConfigError: if the commit cannot be timed.
         """
-        self.about = self._answer()
+        self.about = self.answer()
         if not Path(self.about["package"]).is_relative_to(self.checkout):
             raise ConfigError(f"the package was taken from '{self.about['package']}', not from '{self.checkout}'")
 
-    def ask(self, row: str) -> float:
-        """Microseconds of one device a decision, of one more turn."""
-        assert self.process.stdin is not None
-        with contextlib.suppress(BrokenPipeError):  # it has ended: there will be no answer
-            self.process.stdin.write(row + "\n")
-        return self._answer()
+    def answer(self) -> Any:
+        """What the worker says next: what it is, then microseconds of one device a decision.
 
-    def _answer(self) -> Any:
-        assert self.process.stdout is not None
-        line = self.process.stdout.readline()
-        if not line:
-            reason = _last_line(self.complaints.read_text(encoding="utf-8", errors="replace"))
-            raise ConfigError(f"commit {self.checkout.name} cannot be timed: {reason}")
-        return json.loads(line)
-
-    def __enter__(self) -> Worker:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.process.kill()
-        self.process.communicate()
+        Raises:
+            ConfigError: if the commit cannot be timed.
+        """
+        try:
+            return super().answer()
+        except ChildEndedError as error:
+            raise ConfigError(f"commit {self.checkout.name} cannot be timed: {error}") from None
 
 
 # ------------------------------------------------------------------------------------------ figures
