@@ -1,0 +1,64 @@
+"""Intervals of 95 % for success rates over seeds and missions.
+
+A single rate, of one seed or of one mission, has Wilson's. Where seeds fly the same missions the interval must
+hold for other seeds and other missions: a bootstrap draws seeds with replacement, and missions with replacement for
+all seeds alike, since what is hard is hard for every seed (Owen, "The pigeonhole bootstrap", Ann. Appl. Stat. 1(2),
+2007). Methods are its strata: each one's seeds are drawn from its own, the missions for all of them together.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from edqn_jax.evaluate import wilson_interval
+
+DRAWS = 10_000
+
+
+def rate_interval(success: np.ndarray) -> tuple[float, float]:
+    """The interval of a success rate; `success` is [S, M] bool, S seeds on the same M missions.
+
+    A rate of 0 or 1 has Wilson's interval of M missions: nothing can be drawn from it.
+    """
+    success = np.asarray(success, bool)
+    if min(success.shape) == 1:
+        return wilson_interval(int(success.sum()), success.size)
+    if success.all() or not success.any():
+        missions = success.shape[1]
+        return wilson_interval(missions * int(success.all()), missions)
+    return _percentiles(drawn_rates([success])[0])
+
+
+def difference_interval(first: np.ndarray, second: np.ndarray) -> tuple[float, float]:
+    """The interval of the first rate less the second; [S, M] and [T, M] bool, seeds of two methods on M missions.
+
+    Raises:
+        ValueError: if the missions are not as many.
+    """
+    rates = drawn_rates([first, second])
+    return _percentiles(rates[0] - rates[1])
+
+
+def drawn_rates(strata: list[np.ndarray], draws: int = DRAWS, seed: int = 0) -> np.ndarray:
+    """Success rates [strata, draws] of bootstrap draws; `strata` are [seeds, missions] bool, with equal missions.
+
+    Raises:
+        ValueError: if the missions are not as many.
+    """
+    missions = {np.shape(success)[1] for success in strata}
+    if len(missions) != 1:
+        raise ValueError(f"strata must have the same missions, not {sorted(missions)} of them")
+    (count,) = missions
+    random = np.random.default_rng(seed)
+    often = random.multinomial(count, np.full(count, 1 / count), size=draws)  # [draws, M]
+    rates = []
+    for success in strata:
+        seeds = len(success)
+        chosen = random.multinomial(seeds, np.full(seeds, 1 / seeds), size=draws)  # [draws, S]
+        rates.append(np.sum((chosen @ np.asarray(success, float)) * often, axis=1) / (seeds * count))
+    return np.array(rates)
+
+
+def _percentiles(values: np.ndarray) -> tuple[float, float]:
+    low, high = np.percentile(values, [2.5, 97.5])
+    return float(low), float(high)

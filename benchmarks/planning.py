@@ -1,0 +1,93 @@
+"""Planners in `runtime.py`: they plan on the map, and what they planned is flown."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import numpy as np
+
+import json_report
+from edqn_jax.baselines.follow import FollowConfig, compiled_follower, reserved, sampled
+from edqn_jax.baselines.planner import Budget, Task, load_planner
+from edqn_jax.config import DENSITIES, Config
+from edqn_jax.run import workload
+from edqn_jax.sim import worlds
+from edqn_jax.sim.drone import load_airframe
+from edqn_jax.sim.env import Outcome
+from edqn_jax.sim.mjcf import check_scene, load_world, resolve_world
+from edqn_jax.sim.scene import Scene, take_scene
+
+DRAWING = "RRT*", "BIT*"
+"""Planners that draw at random and shorten their path until the budget is spent; the others give one path."""
+
+NOT_FLOWN = {"outcome": "no_path", "decisions": 0, "flight_seconds": 0.0, "path_length_m": 0.0, "clearance_m": None}
+
+
+def judged_scenes(config: Config, count: int) -> list[Scene]:
+    """The worlds that are flown from their own start to their own goal: `count` test worlds, or the one of a file.
+
+    Raises:
+        ConfigError: if there is no such world, or no drone can stand where the mission starts or ends.
+    """
+    name, radius = config.world.name, config.drone.body_radius_m
+    if name in DENSITIES:
+        pool = jax.tree.map(np.asarray, worlds.random_pool(name, worlds.world_keys("test", count)))
+        return [take_scene(pool, index) for index in range(count)]
+    loaded = load_world(resolve_world(name))
+    check_scene(loaded.scene, radius, names=loaded.names, title=f"'{name}'")
+    return [loaded.scene]
+
+
+class Planning:
+    """A planner that knows the map, and the airframe that flies its paths."""
+
+    def __init__(self, name: str, config: Config, seconds: float, count: int) -> None:
+        """`seconds` is the budget of each plan; in random worlds `count` missions are planned and flown.
+
+        Raises:
+            MissingPackageError: if a package that it needs is not installed.
+            ConfigError: if the world cannot be flown in.
+        """
+        self.name, self.config, self.budget = name, config, Budget(seconds=seconds)
+        self.plan = load_planner(name)
+        self.scenes = judged_scenes(config, count)
+        self.airframe = load_airframe(config.drone)
+        self.follower = compiled_follower()
+        self.about = {**json_report.machine(jax.devices()), "workload": workload(config, self.scenes[0])}
+        self._mission(self.scenes[0], 0)  # compiles what the planner itself does not compile before its clock starts
+
+    def turn(self, seed: int) -> dict[str, Any]:
+        """Every mission planned and flown.
+
+        Returns:
+            `flights`: as of a learner, with the reason where there is no path. `planning_seconds` is when
+            the first path was known, `planned_m` is what was flown, `first_m` the first path's length.
+        """
+        count = len(self.scenes)
+        missions = [self._mission(scene, seed * count + index) for index, scene in enumerate(self.scenes)]
+        return {"seed": seed, "flights": {key: [mission[key] for mission in missions] for key in missions[0]}}
+
+    def _mission(self, scene: Scene, seed: int) -> dict[str, Any]:
+        config, follow = self.config, FollowConfig()
+        task = Task.of(scene, body_radius=config.drone.body_radius_m, goal_radius=config.env.goal_radius_m)
+        plan = self.plan(reserved(task, follow), self.budget, seed)
+        said = {
+            "reason": plan.reason,
+            "planning_seconds": plan.first_seconds if plan.found else plan.seconds,
+            "all_seconds": plan.seconds,
+            "first_m": plan.first_length_m,
+            "planned_m": plan.length_m,
+        }
+        if plan.path is None:
+            return {**NOT_FLOWN, **said, "first_m": None, "planned_m": None}
+        goal, points = np.float32(task.goal), sampled(plan.path)
+        flown = jax.device_get(self.follower(config, follow, self.airframe, scene, goal, points))
+        return {
+            "outcome": Outcome(int(flown.outcome)).name.lower(),
+            "decisions": int(flown.decisions),
+            "flight_seconds": float(flown.flight_seconds),
+            "path_length_m": float(flown.path_length_m),
+            "clearance_m": float(flown.closest.distance),
+            **said,
+        }

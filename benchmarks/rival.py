@@ -1,0 +1,68 @@
+"""One method on one world, kept alive: a child of `runtime.py`.
+
+Started as `python -P rival.py NAME CONFIG.yaml SECONDS MISSIONS`, the last two a planner's budget and how many
+missions it is given. It says what it is, or `reason`, why it is not there; then, for each seed that it is asked for,
+how that went.
+"""
+
+from __future__ import annotations
+
+import json
+import resource
+import sys
+from pathlib import Path
+from typing import Any, TextIO
+
+import jax
+
+from child import answers
+from edqn_jax.baselines.planner import PLANNERS, MissingPackageError
+from edqn_jax.config import Config, ConfigError
+from edqn_jax.devices import use_cpu_devices
+from edqn_jax.resolve import apply, load_layer
+from edqn_jax.rundir import plain
+from learners import Learner
+from planning import Planning
+
+
+def peak_bytes() -> dict[str, int | None]:
+    """The most memory that this process has held so far, and the most on an accelerator; None where there is none."""
+    unit = 1 if sys.platform == "darwin" else 1024
+    stats = jax.devices()[0].memory_stats() or {}
+    return {
+        "peak_bytes": unit * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss,
+        "device_peak_bytes": stats.get("peak_bytes_in_use"),
+    }
+
+
+def method(name: str, config: Config, seconds: float, missions: int) -> Learner | Planning:
+    """What the name stands for.
+
+    Raises:
+        ConfigError: if the configuration cannot be run.
+        MissingPackageError: if a package that it needs is not installed.
+    """
+    return Planning(name, config, seconds, missions) if name in PLANNERS else Learner(config)
+
+
+def main(stream: TextIO) -> None:
+    """Answers until the input ends."""
+    name, file, seconds, missions = sys.argv[1:]
+    config = apply(Config(), load_layer(Path(file)), file)
+    use_cpu_devices()
+
+    def say(what: dict[str, Any]) -> None:
+        print(json.dumps(plain(what), allow_nan=False), file=stream)
+
+    try:
+        rival = method(name, config, float(seconds), int(missions))
+    except (ConfigError, MissingPackageError) as error:
+        say({"reason": str(error)})
+        return
+    say(rival.about)
+    for line in sys.stdin:
+        say({**rival.turn(int(line)), **peak_bytes()})
+
+
+if __name__ == "__main__":
+    main(answers())

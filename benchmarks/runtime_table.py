@@ -1,0 +1,140 @@
+"""The tables of `runtime.py`: what each method came to, what events are worth, and the paper's own Table 3."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from rows import Row, Worth, figures, worth
+
+PAPER_SOURCE = "Chao, Dillmann, Roennau, Xiong, Biomimetics 2024, 9(4), 238, Table 3"
+PAPER_RUN_TIME_S = {"E-DQN": 41.364, "DQN": 161.88, "SNN": 155.4}
+"""Theirs, cited; one run each."""
+
+COLUMNS = (
+    "method",
+    "knows the map",
+    "trains, s (decisions)",
+    "plans, ms",
+    "flies, s",
+    "decisions",
+    "path / shortest",
+    "planned / shortest",
+    "success",
+    "least clearance, m",
+    "memory, MB",
+    "device",
+)
+
+EXPLAINED = """\
+- Trains: seconds of training, and decisions, until the first validation in which nine of ten missions from the
+  world's own start, or near it, are flown; medians over seeds, "never" where the median seed never does. Compilation
+  and validation are not counted.
+- Plans: computation from start to goal, without simulation and compilation. For a learner the sum over a flight of
+  its decisions, one by one, from an observation on the host to a move there; for a planner until its first path.
+- Flies (simulated seconds), decisions, path: medians of the flights that reached the goal, as is what is said of plans;
+  they end within its radius, the shortest path, A*'s, at the goal itself. Clearance is the least of these flights.
+- Planned: the path as drawn; for those that improve it the first one and the one at the end of the budget. Planners
+  keep a reserve beyond the body's radius, for the airframe that then flies their paths under the same judge.
+- Success: Wilson's interval, 95 %; over seeds and missions, a bootstrap of both. A planner that draws nothing counts
+  once.
+- Memory: the most that the method's own process held, plus what it held on an accelerator."""
+
+PARAGRAPH = """\
+The paper calls these figures "run time" and does not say what ran. 41.364 s over its flight of 188 steps is 0.22 s a
+step, so they are probably the time that it took to fly the plan through a simulator's API: nearer to "flies" than
+to "plans", and not the time to learn. A method would then be faster because its path is shorter or its simulator
+quicker, not because it computes less. They are of one run each, on the authors' map and machine, without an interval:
+they can stand beside ours, but no ratio of the two means anything."""
+
+
+def text(rows: Sequence[Row]) -> str:
+    """Everything, in Markdown."""
+    parts = []
+    for world in dict.fromkeys(row["world"] for row in rows):
+        own = [row for row in rows if row["world"] == world]
+        parts.append(f"## {world}\n\n{methods(own)}")
+    parts += [EXPLAINED, paper()]
+    parts += [worth_table(one) for one in worth(rows)]
+    return "\n\n".join(parts)
+
+
+def methods(rows: Sequence[Row]) -> str:
+    """The rows of one world as a table, and why a row is empty."""
+    lines = [f"| {' | '.join(COLUMNS)} |", "| --- | --- |" + " ---: |" * (len(COLUMNS) - 3) + " --- |"]
+    notes = []
+    for row in rows:
+        shown = figures(row)
+        name = row["name"] + (" (not converged)" if row["settings"].get("quick") and row["kind"] == "learner" else "")
+        if row["reason"] is not None:
+            notes.append(f"{row['name']}: {row['reason']}.")
+        elif shown["reasons"] and not shown["success"]:
+            notes.append(f"{row['name']}: {shown['reasons'][0]}.")
+        lines.append(f"| {name} | {'yes' if row['knows_map'] else 'no'} | {' | '.join(_cells(row, shown))} |")
+    return "\n".join([*lines, *([""] if notes else []), *(f"- {note}" for note in notes)])
+
+
+def _cells(row: Row, shown: dict[str, Any]) -> list[str]:
+    if not shown:
+        return ["–"] * (len(COLUMNS) - 3) + [row["device"] or "–"]
+    trains = "–"
+    if row["kind"] == "learner":
+        seconds, decisions = shown["train_seconds"], shown["train_decisions"]
+        trains = "never" if seconds is None else f"{seconds:.1f} ({decisions:,.0f})"
+    planned = _number(shown["planned_over_shortest"], "{:.3f}")
+    if row["name"] in ("RRT*", "BIT*") and shown["first_over_shortest"] is not None:
+        budget = row["settings"]["budget_seconds"]
+        planned = f"{shown['first_over_shortest']:.3f}, after {budget:g} s {planned}"
+    low, high = shown["interval"]
+    memory = f"{shown['peak_bytes'] / 1e6:,.0f}"
+    if shown["device_peak_bytes"]:
+        memory += f" + {shown['device_peak_bytes'] / 1e6:,.0f}"
+    return [
+        trains,
+        _number(shown["planning_seconds"], "{:,.1f}", 1e3),
+        _number(shown["flight_seconds"], "{:.1f}"),
+        _number(shown["decisions"], "{:g}"),
+        _number(shown["path_over_shortest"], "{:.3f}"),
+        planned,
+        f"{shown['successes']} of {shown['flights']}: {shown['success']:.0%} ({low:.0%} - {high:.0%})",
+        _number(shown["clearance_m"], "{:.2f}"),
+        memory,
+        row["device"],
+    ]
+
+
+def _number(value: float | None, form: str, scale: float = 1.0) -> str:
+    return "–" if value is None else form.format(scale * value)
+
+
+def paper() -> str:
+    """Table 3 of the paper, marked as theirs, and what it can mean."""
+    lines = ["## The paper's Table 3 (theirs)", "", "| method | run time, s |", "| --- | ---: |"]
+    lines += [f"| {name} | {seconds:g} |" for name, seconds in PAPER_RUN_TIME_S.items()]
+    return "\n".join([*lines, "", f"{PAPER_SOURCE}. {PARAGRAPH}"])
+
+
+def worth_table(one: Worth) -> str:
+    """What events are worth, for learners that can be compared."""
+    lines = [
+        f"## What events are worth: {one.world}, {one.device}",
+        "",
+        f"Equal decisions are {one.decisions:,}; equal wall time is {one.seconds:.1f} s of training, what the "
+        "fastest needed for them.",
+        "",
+        "| learner | seeds | at equal decisions | at equal wall time |",
+        "| --- | ---: | ---: | ---: |",
+    ]
+    cuts = "at_decisions", "at_seconds"
+    for rate in one.rates:
+        cells = [_rate(rate[at]["rate"], rate[at]["interval"]) for at in cuts]
+        lines.append(f"| {rate['name']} | {rate['seeds']} | {' | '.join(cells)} |")
+    for less in one.differences:
+        cells = [_rate(less[at]["difference"], less[at]["interval"], "+") for at in cuts]
+        lines.append(f"| E-DQN less {less['name']} | | {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
+def _rate(rate: float, interval: Sequence[float], sign: str = "") -> str:
+    low, high = interval
+    return f"{100 * rate:{sign}.1f} % ({100 * low:{sign}.1f} - {100 * high:{sign}.1f})"
