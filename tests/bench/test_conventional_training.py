@@ -197,6 +197,7 @@ def test_the_schedules_run_over_the_whole_training():
     with Training(SHORT, course_of(START, GOAL)) as training:
         training.warm_up()
         assert training.decisions == 256  # a quarter, less than the configuration's warm-up
+        assert training.learner.samples == SHORT.encoder.warmup_updates_per_step * 256
         epsilon, rate = [], []
         for _ in range(2):
             training.learn(384)
