@@ -1,8 +1,8 @@
 """A path, flown: the planners' counterpart of a learned policy.
 
-Every decision the follower commands a velocity towards a point ahead of it on the path, at most `env.speed_m_s`
-along each axis of the heading frame, as a learner's moves are: the same airframe, controller, period of decisions
-and judge. It goes towards the furthest point within reach for which the straight way there stays within a tolerance of
+Every decision the follower commands a velocity towards a point ahead of it on the path, of at most
+`env.speed_m_s`, which is what a learner has along each axis: the same airframe, controller, period of decisions and
+judge. It goes towards the furthest point within reach for which the straight way there stays within a tolerance of
 the path. So it flies straight legs fast, slows down before corners, and cuts them by no more than planners leave
 room for: they are given `reserved` tasks. (Pure pursuit, Coulter, CMU-RI-TR-92-01, with a look-ahead that corners
 shorten.)
@@ -21,6 +21,7 @@ from jax import Array
 
 from edqn_jax.baselines.planner import Task
 from edqn_jax.config import Config, EnvConfig
+from edqn_jax.devices import compiler_options
 from edqn_jax.flights import Flights, at_start, tally
 from edqn_jax.sim import drone
 from edqn_jax.sim.drone import Airframe, DroneState
@@ -40,11 +41,11 @@ class FollowConfig:
     """What planners keep clear of beyond the body's radius, metres: room for the follower."""
     tolerance_m: float = 0.2
     """How far the straight way to the point ahead may be off the path, metres."""
-    reach_m: float = 3.0
+    reach_m: float = 2.5
     """The point ahead is at most so far along the path, metres."""
     window_m: float = 3.0
     """The nearest point of the path is sought so far along it, metres."""
-    lag_s: float = 0.2
+    lag_s: float = 0.15
     """Seconds for which the drone goes on as it flies before a command has its way."""
     horizon_s: float = 0.25
     """Seconds after that in which it would be at the point ahead."""
@@ -134,4 +135,4 @@ def fly_path(
 @functools.cache
 def compiled_follower():
     """`fly_path`, jitted; compiled once for each configuration and shape."""
-    return jax.jit(fly_path, static_argnums=(0, 1))
+    return jax.jit(fly_path, static_argnums=(0, 1), compiler_options=compiler_options(jax.devices()[0].platform))
