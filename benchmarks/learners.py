@@ -16,6 +16,7 @@ from edqn_jax.evaluate import decision_seconds, fly_on_all_devices
 from edqn_jax.flights import Flights
 from edqn_jax.learn.policy import PolicyParams
 from edqn_jax.learn.trainer import Trainer, policy_of
+from edqn_jax.provenance import workload
 from edqn_jax.resolve import apply
 from edqn_jax.run import (
     Candidate,
@@ -25,7 +26,6 @@ from edqn_jax.run import (
     is_due,
     lay_courses,
     validated_by,
-    workload,
 )
 from edqn_jax.sim.env import Outcome, World
 from edqn_jax.validate import validate

@@ -124,8 +124,9 @@ def parse(argv: Sequence[str] | None = None) -> Asked:
     for file in (args.json, args.figure):
         if file is not None:
             check_can_write(file)
+    added = [read(file) for file in args.add]
     configs = {world: configured(world, flags, args.quick) for world in (args.worlds if args.seeds else [])}
-    return Asked(args, configs, [read(file) for file in args.add])
+    return Asked(args, configs, added)
 
 
 def configured(world: str, flags: Sequence[str], quick: bool) -> Config:
