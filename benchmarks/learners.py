@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -20,6 +21,7 @@ from edqn_jax.provenance import workload
 from edqn_jax.resolve import apply
 from edqn_jax.run import (
     Candidate,
+    Courses,
     check_finite,
     choose,
     first_success,
@@ -51,6 +53,74 @@ def flown_rows(flights: Flights, count: int) -> dict[str, list[Any]]:
     }
 
 
+class Watched:
+    """One training as it is validated: its curve, and what it would end with by now."""
+
+    def __init__(self, config: Config, courses: Courses, fly: Callable[[World, Any], Flights]) -> None:
+        """`fly` flies every mission of a world once, greedily, with parameters of whatever kind."""
+        self.config, self.courses, self.fly = config, courses, fly
+        self.judged = judged_of(config, courses)
+        self.kept: Candidate | None = None
+        self.curve: list[dict[str, Any]] = []
+
+    @property
+    def checked(self) -> int:
+        """Decisions before the last validation."""
+        return self.curve[-1]["decisions"] if self.curve else 0
+
+    def validate(self, params: Any, decisions: int, seconds: float) -> None:
+        """Flies the validation missions, and those that are judged if these parameters are kept."""
+        flown = self.fly(self.courses.validation, params)
+        latest, mission = validated_by(self.config, self.courses, flown, params, decisions)
+        before, self.kept = self.kept, choose(self.config.train.keep, self.kept or latest, latest)
+        if self.kept is not before:
+            self.flown = flown_rows(self.fly(self.courses.final, params), self.judged)
+        self.curve.append(
+            {
+                "decisions": decisions,
+                "seconds": seconds,
+                "validation_success": latest.success,
+                "validation_mission": mission,
+                "validation_spl": latest.spl,
+                "test": "".join("01"[outcome == "goal"] for outcome in self.flown["outcome"]),
+            }
+        )
+
+    def turn(
+        self, seed: int, decisions: int, seconds: float, think: Callable[[Any, int], np.ndarray]
+    ) -> dict[str, Any]:
+        """What came of it.
+
+        Args:
+            seed: of the training.
+            decisions, seconds: of all of it.
+            think: the seconds [n] that each of n decisions with such parameters takes.
+
+        Returns:
+            `train_seconds` and `decisions`; `curve`, a point for each validation, with `test`, which of the judged
+            missions the parameters kept by then fly, a digit each; the `first_success_*` of `run.first_success`, of
+            these seconds; the judged `flights`, with the seconds of computation of each (`planning_seconds`).
+        """
+        since = first_success([(p["decisions"], p["seconds"], p["validation_mission"]) for p in self.curve])
+        assert self.kept is not None
+        thinking = np.cumsum(think(self.kept.params, max(self.flown["decisions"])))
+        return {
+            "seed": seed,
+            "failure": None,
+            "decisions": decisions,
+            "train_seconds": seconds,
+            "first_success_decisions": since[0],
+            "first_success_seconds": since[1],
+            "curve": self.curve,
+            "flights": {**self.flown, "planning_seconds": [float(thinking[n - 1]) for n in self.flown["decisions"]]},
+        }
+
+
+def judged_of(config: Config, courses: Courses) -> int:
+    """How many of the final missions are judged: in a world from a file the others are validation's."""
+    return courses.final.missions.scene.shape[0] if config.world.name in DENSITIES else 1
+
+
 class Learner:
     """Trains from scratch for each seed, as `train.py` does, and flies the missions that are judged."""
 
@@ -60,10 +130,7 @@ class Learner:
         Raises:
             ConfigError: if the configuration cannot be trained.
         """
-        self.config = config
-        self.courses = lay_courses(config)
-        # In a world from a file only the first mission is judged: the others are validation's.
-        self.judged = self.courses.final.missions.scene.shape[0] if config.world.name in DENSITIES else 1
+        self.config, self.courses = config, lay_courses(config)
         devices = choose_devices(config.train.devices, config.train.shards)
         self.trainer = Trainer(config, self.courses.training, devices)
         began = time.perf_counter()
@@ -79,20 +146,11 @@ class Learner:
         return fly_on_all_devices(self.config, world, params, self.config.train.seed)
 
     def turn(self, seed: int) -> dict[str, Any]:
-        """One seed, trained and flown.
-
-        Returns:
-            `train_seconds` and `decisions` of training (the chunks alone); `curve`, a point for each validation, with
-            `test`, which of the judged missions the parameters kept by then fly, a digit each; the
-            `first_success_*` of `run.first_success`, of these seconds; the judged `flights`, with the seconds of
-            computation (`planning_seconds`) of each one's decisions.
-        """
+        """One seed, trained and flown: see `Watched.turn`. The seconds are of the chunks alone."""
         config, plan, envs = self.config, self.trainer.plan, self.config.train.num_envs
+        watched = Watched(config, self.courses, self._fly)
         state = self.trainer.init(seed)
-        kept = Candidate(jax.tree.map(np.asarray, policy_of(state)))
-        flown = self._fly(self.courses.final, kept.params)
-        curve: list[dict[str, Any]] = []
-        seconds, done, failure = 0.0, 0, None
+        seconds, done = 0.0, 0
         while done < plan.total:
             began = time.perf_counter()
             state, (_, losses) = self.trainer.chunk(state, done)
@@ -102,41 +160,31 @@ class Learner:
             try:
                 check_finite(plan, done, losses)
             except DivergedError as error:
-                failure = str(error)
-                break
-            if done >= plan.total or is_due(config, plan, curve[-1]["decisions"] if curve else 0, done):
-                params = jax.tree.map(np.asarray, policy_of(state))
-                checked = self._fly(self.courses.validation, params)
-                latest, mission = validated_by(config, self.courses, checked, params, done * envs)
-                kept, before = choose(config.train.keep, kept, latest), kept
-                if kept is not before:
-                    flown = self._fly(self.courses.final, kept.params)
-                arrived = np.asarray(flown.outcome)[: self.judged] == Outcome.GOAL
-                curve.append(
-                    {
-                        "decisions": done * envs,
-                        "seconds": seconds,
-                        "validation_success": latest.success,
-                        "validation_mission": mission,
-                        "validation_spl": latest.spl,
-                        "test": "".join("01"[int(one)] for one in arrived),
-                    }
-                )
-        since = first_success([(p["decisions"], p["seconds"], p["validation_mission"]) for p in curve])
-        rows = flown_rows(flown, self.judged)
-        if failure is not None:
-            rows["outcome"] = ["diverged"] * self.judged
-        thinking = np.cumsum(decision_seconds(config, kept.params, max(rows["decisions"])))
-        return {
-            "seed": seed,
-            "failure": failure,
-            "decisions": done * envs,
-            "train_seconds": seconds,
-            "first_success_decisions": since[0],
-            "first_success_seconds": since[1],
-            "curve": curve,
-            "flights": {**rows, "planning_seconds": [float(thinking[n - 1]) for n in rows["decisions"]]},
-        }
+                return diverged(seed, str(error), done * envs, seconds, watched)
+            if done >= plan.total or is_due(config, plan, watched.checked, done):
+                watched.validate(jax.tree.map(np.asarray, policy_of(state)), done * envs, seconds)
+        return watched.turn(seed, done * envs, seconds, lambda params, n: decision_seconds(config, params, n))
+
+
+def diverged(seed: int, failure: str, decisions: int, seconds: float, watched: Watched) -> dict[str, Any]:
+    """The turn of a seed whose training met numbers that are not finite: none of its missions is flown."""
+    nothing = {
+        "decisions": 0,
+        "flight_seconds": 0.0,
+        "path_length_m": 0.0,
+        "clearance_m": None,
+        "planning_seconds": 0.0,
+    }
+    return {
+        "seed": seed,
+        "failure": failure,
+        "decisions": decisions,
+        "train_seconds": seconds,
+        "first_success_decisions": None,
+        "first_success_seconds": None,
+        "curve": watched.curve,
+        "flights": {key: [value] * watched.judged for key, value in {"outcome": "diverged", **nothing}.items()},
+    }
 
 
 def sensing(config: Config, name: str) -> Config:

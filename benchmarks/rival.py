@@ -23,26 +23,30 @@ from edqn_jax.resolve import apply, load_layer
 from edqn_jax.rundir import plain
 from learners import Learner
 from planning import Planning
+from stack import STACK, STEADY, Stack
 
 
 def peak_bytes() -> dict[str, int | None]:
-    """The most memory that this process has held so far, and the most on an accelerator; None where there is none."""
+    """The most memory held so far, of this process and the largest that it started, and on an accelerator, if any."""
     unit = 1 if sys.platform == "darwin" else 1024
+    held = sum(resource.getrusage(who).ru_maxrss for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
     stats = jax.devices()[0].memory_stats() or {}
     return {
-        "peak_bytes": unit * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss,
+        "peak_bytes": unit * held,
         "device_peak_bytes": stats.get("peak_bytes_in_use"),
     }
 
 
-def method(name: str, config: Config, seconds: float, missions: int) -> Learner | Planning:
-    """What the name stands for.
+def method(name: str, config: Config, seconds: float, missions: int) -> Any:
+    """What the name stands for: something with `about` and `turn`.
 
     Raises:
         ConfigError: if the configuration cannot be run.
         MissingPackageError: if a package that it needs is not installed.
     """
-    return Planning(name, config, seconds, missions) if name in PLANNERS else Learner(config)
+    if name in PLANNERS:
+        return Planning(name, config, seconds, missions)
+    return {STACK: Stack, **STEADY}.get(name, Learner)(config)
 
 
 def main(stream: TextIO) -> None:

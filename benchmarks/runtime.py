@@ -22,7 +22,7 @@ import json
 import sys
 import tempfile
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -39,15 +39,18 @@ from edqn_jax.devices import cores
 from edqn_jax.files import check_can_write
 from edqn_jax.resolve import nearest, to_yaml
 from edqn_jax.sim.scene import Scene
+from flags import configured as for_timing
 from flags import split
 from learners import LEARNERS, sensing
 from planning import judged_scenes
 from rows import Row, joined
 from runtime_figure import draw_runtime
+from stack import STACK, STEADY
+from whole import steady
 
 ROOT = Path(__file__).resolve().parents[1]
 WORLDS = ("paper", "medium")
-METHODS = (*LEARNERS, *PLANNERS)
+METHODS = (*LEARNERS, *PLANNERS, STACK)
 SEEDS, QUICK_SEEDS = 5, 2
 POINTS = 20
 """Validations of a training, unless the flags say otherwise: points of the learning curve."""
@@ -61,6 +64,11 @@ QUICK = (
 )
 """Flags of `--quick`: long enough to run every part, too short to learn; and fewer worlds, which take time to draw."""
 
+RATE_ENVS = 512
+"""Environments where training rates are compared: with fewer, what PyTorch and Python cost once a step weighs more."""
+TURNS, QUICK_TURNS = 5, 2
+"""Of training rates."""
+
 GUESS = 6_000.0
 """Decisions/s of two cores, for the length that is told before anything is measured."""
 
@@ -72,16 +80,10 @@ class Asked:
     words: argparse.Namespace
     configs: dict[str, Config]
     """By world, as E-DQN's."""
+    flags: list[str]
+    """Those after --."""
     added: list[dict[str, Any]]
     """Reports of earlier runs."""
-
-    @property
-    def budget(self) -> float:
-        return self.words.budget
-
-    @property
-    def settings(self) -> dict[str, Any]:
-        return {"quick": self.words.quick}
 
 
 def parse(argv: Sequence[str] | None = None) -> Asked:
@@ -126,7 +128,7 @@ def parse(argv: Sequence[str] | None = None) -> Asked:
             check_can_write(file)
     added = [read(file) for file in args.add]
     configs = {world: configured(world, flags, args.quick) for world in (args.worlds if args.seeds else [])}
-    return Asked(args, configs, added)
+    return Asked(args, configs, flags, added)
 
 
 def configured(world: str, flags: Sequence[str], quick: bool) -> Config:
@@ -175,63 +177,86 @@ def shortest_of(config: Config, scenes: Sequence[Scene]) -> list[float | None]:
     return [length(scene) for scene in scenes]
 
 
-@contextlib.contextmanager
-def started(asked: Asked, world: str, has_way: bool) -> Iterator[tuple[list[Row], dict[str, Child]]]:
-    """A row for each method, and the child of each that can run; as many compile at once as there are cores."""
-    count = missions_of(asked, world)
-    rows = [
-        {
-            "name": name,
-            "world": Path(world).name,
-            "kind": "planner" if name in PLANNERS else "learner",
-            "knows_map": name in PLANNERS,
-            "settings": {
-                **asked.settings,
-                **({"budget_seconds": asked.budget} if name in PLANNERS else {}),
-            },
-            "reason": None,
-            "turns": [],
-        }
-        for name in asked.words.methods
-    ]
-    with contextlib.ExitStack() as stack:
-        folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
-        children: dict[str, Child] = {}
-        waiting: list[Row] = []
+def launched(
+    stack: contextlib.ExitStack, wanted: dict[str, Config], budget: float = 0.0, count: int = 0
+) -> tuple[dict[str, Child], dict[str, dict[str, Any]]]:
+    """A child for each name, ready to be asked; as many get ready at once as there are cores.
 
-        def settle(row: Row) -> None:
-            try:
-                about = children[row["name"]].answer()
-                row |= about
-            except ChildEndedError as error:
-                row["reason"] = f"it ended: {error}"
-            if row["reason"] is not None:
-                del children[row["name"]]
+    Args:
+        stack: at whose end they end.
+        wanted: the configuration of each.
+        budget: seconds of a plan.
+        count: missions of a planner.
 
-        for number, row in enumerate(rows):
-            row |= {"device": None, "devices": [], "versions": {}, "workload": {}}
-            try:
-                if row["kind"] == "learner" and not has_way:
-                    raise ConfigError("there is no way from start to goal, so train.py refuses this world")
-                config = (
-                    asked.configs[world] if row["kind"] == "planner" else sensing(asked.configs[world], row["name"])
-                )
-            except ConfigError as error:
-                row["reason"] = str(error)
-                continue
-            if row["kind"] == "learner":
-                row["settings"] |= {"decisions": config.train.total_steps, "num_envs": config.train.num_envs}
-            file = folder / f"{number}.yaml"
-            file.write_text(to_yaml(config), encoding="utf-8")
-            words = [row["name"], str(file), str(asked.budget), str(count)]
-            child = Child(ROOT, ROOT / "benchmarks" / "rival.py", words, folder / f"{number}.log")
-            children[row["name"]] = stack.enter_context(child)
-            waiting.append(row)
-            if len(waiting) >= cores():
-                settle(waiting.pop(0))
-        for row in waiting:
-            settle(row)
-        yield rows, children
+    Returns:
+        the children that can run; what each of the wanted said of itself, or `reason`, why it cannot run.
+    """
+    folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
+    children: dict[str, Child] = {}
+    said: dict[str, dict[str, Any]] = {}
+    waiting: list[str] = []
+
+    def settle(name: str) -> None:
+        try:
+            said[name] = children[name].answer()
+        except ChildEndedError as error:
+            said[name] = {"reason": f"it ended: {error}"}
+        if "reason" in said[name]:
+            del children[name]
+
+    for number, (name, config) in enumerate(wanted.items()):
+        file = folder / f"{number}.yaml"
+        file.write_text(to_yaml(config), encoding="utf-8")
+        words = [name, str(file), str(budget), str(count)]
+        child = Child(ROOT, ROOT / "benchmarks" / "rival.py", words, folder / f"{number}.log")
+        children[name] = stack.enter_context(child)
+        waiting.append(name)
+        if len(waiting) >= cores():
+            settle(waiting.pop(0))
+    for name in waiting:
+        settle(name)
+    return children, said
+
+
+def blank(asked: Asked, world: str, name: str) -> Row:
+    """The row of a method that has not run."""
+    planner, config = name in PLANNERS, asked.configs[world]
+    own = (
+        {"budget_seconds": asked.words.budget}
+        if planner
+        else {"decisions": config.train.total_steps, "num_envs": config.train.num_envs}
+    )
+    return {
+        "name": name,
+        "world": Path(world).name,
+        "kind": "planner" if planner else "learner",
+        "knows_map": planner,
+        "settings": {"quick": asked.words.quick, **own},
+        "device": None,
+        "devices": [],
+        "versions": {},
+        "workload": {},
+        "reason": None,
+        "turns": [],
+    }
+
+
+def config_of(asked: Asked, world: str, name: str, has_way: bool) -> Config:
+    """What a method is run with on a world.
+
+    Raises:
+        ConfigError: if it cannot be run there; the message says why.
+    """
+    config = asked.configs[world]
+    if name in PLANNERS:
+        return config
+    if not has_way:
+        raise ConfigError("there is no way from start to goal, so train.py refuses this world")
+    if name == STACK:
+        if asked.words.quick:
+            raise ConfigError("--quick does not train it, only times it")
+        return config
+    return sensing(config, name)
 
 
 def missions_of(asked: Asked, world: str) -> int:
@@ -243,33 +268,69 @@ def missions_of(asked: Asked, world: str) -> int:
 
 
 def measure(asked: Asked) -> list[Row]:
-    """The rows, method by method, world by world."""
+    """The rows, world by world; within one the methods take turns, seed by seed."""
     rows: list[Row] = []
-    args, clock = asked.words, time.perf_counter()
-    for world, config in asked.configs.items():
-        tell(f"{world}: {expected(asked, world)}")
-        scenes = judged_scenes(config, config.train.validation_missions)
-        shortest = shortest_of(config, scenes)
-        with started(asked, world, shortest[0] is not None) as (new, children):
-            rows += new
-            ready = time.perf_counter()
-            for seed in range(args.first_seed, args.first_seed + args.seeds):
-                for row in new:
-                    if row["name"] not in children:
-                        continue
-                    try:
-                        turn = children[row["name"]].ask(str(seed))
-                    except ChildEndedError as error:
-                        row["reason"] = f"it ended in seed {seed}: {error}"
-                        del children[row["name"]]
-                        continue
-                    flown = turn["flights"]
-                    flown["shortest_m"] = shortest[: len(flown["outcome"])]
-                    row["turns"].append(turn)
-                done = seed - args.first_seed + 1
-                left = (time.perf_counter() - ready) / done * (args.seeds - done)
-                tell(f"{world}: seed {seed} done after {time.perf_counter() - clock:.0f} s, {left / 60:.0f} min to go")
+    for world in asked.configs:
+        rows += measure_world(asked, world)
     return rows
+
+
+def measure_world(asked: Asked, world: str) -> list[Row]:
+    """The rows of one world."""
+    args, config = asked.words, asked.configs[world]
+    tell(f"{world}: {expected(asked, world)}")
+    shortest = shortest_of(config, judged_scenes(config, config.train.validation_missions))
+    rows, wanted = {name: blank(asked, world, name) for name in args.methods}, {}
+    for name, row in rows.items():
+        try:
+            wanted[name] = config_of(asked, world, name, shortest[0] is not None)
+        except ConfigError as error:
+            row["reason"] = str(error)
+    with contextlib.ExitStack() as stack:
+        children, said = launched(stack, wanted, args.budget, missions_of(asked, world))
+        for name, about in said.items():
+            rows[name] |= about
+        began = time.perf_counter()
+        for seed in range(args.first_seed, args.first_seed + args.seeds):
+            for name, child in list(children.items()):
+                try:
+                    turn = child.ask(str(seed))
+                except ChildEndedError as error:
+                    rows[name]["reason"] = f"it ended in seed {seed}: {error}"
+                    del children[name]
+                    continue
+                turn["flights"]["shortest_m"] = shortest[: len(turn["flights"]["outcome"])]
+                rows[name]["turns"].append(turn)
+            done = seed - args.first_seed + 1
+            left = (time.perf_counter() - began) / done * (args.seeds - done)
+            tell(f"{world}: seed {seed} is done, about {left / 60:.0f} min to go")
+    return list(rows.values())
+
+
+def measure_rates(asked: Asked) -> dict[str, Any] | None:
+    """Decisions per second of E-DQN's whole step and of the conventional stack, in turns; None if not asked for.
+
+    Both at the replay ratio of `flags.SAMPLES`, the VAE learning throughout, on the paper's world.
+    """
+    args = asked.words
+    if "paper" not in asked.configs or not {"E-DQN", STACK} <= set(args.methods):
+        return None
+    config = for_timing(["--world", "paper", "--num-envs", str(RATE_ENVS), *asked.flags])
+    ours, theirs = STEADY
+    # Its beginning is short for the stack, to which a chunk of ours would be minutes.
+    wanted = {theirs: steady(config, 4), ours: steady(config, config.train.chunk_steps)}
+    with contextlib.ExitStack() as stack:
+        children, said = launched(stack, wanted)
+        report: dict[str, Any] = {"turns": {}, "reason": None, **said[ours]}
+        for name in STEADY:
+            if name not in children:
+                report["reason"] = f"{name.partition(',')[0]}: {said[name]['reason']}"
+                return report
+        for number in range(QUICK_TURNS if args.quick else TURNS):
+            for name, child in children.items():
+                for setting, rate in child.ask(str(number))["decisions_per_second"].items():
+                    report["turns"].setdefault(f"{name.partition(',')[0]}, {setting}", []).append(rate)
+    return report
 
 
 def expected(asked: Asked, world: str) -> str:
@@ -278,7 +339,7 @@ def expected(asked: Asked, world: str) -> str:
     learners = [name for name in args.methods if name in LEARNERS]
     drawing = [name for name in args.methods if name in ("RRT*", "BIT*")]
     decisions = args.seeds * len(learners) * asked.configs[world].train.total_steps
-    planning = args.seeds * len(drawing) * missions_of(asked, world) * asked.budget
+    planning = args.seeds * len(drawing) * missions_of(asked, world) * args.budget
     return (
         f"{decisions:,} decisions to train and {planning:.0f} s to plan, "
         f"about {(decisions / GUESS + planning) / 60 + len(learners):.0f} min at {GUESS:,.0f} decisions/s"
@@ -290,7 +351,7 @@ def tell(text: str) -> None:
     print(text, file=sys.stderr, flush=True)
 
 
-def report_of(rows: Sequence[Row]) -> dict[str, Any]:
+def report_of(rows: Sequence[Row], rates: Sequence[dict[str, Any]]) -> dict[str, Any]:
     """What `--json` holds."""
     ran = next((row for row in rows if row["turns"]), None)
     return {
@@ -300,6 +361,7 @@ def report_of(rows: Sequence[Row]) -> dict[str, Any]:
         "devices": ran["devices"] if ran else [],
         "versions": ran["versions"] if ran else {},
         "rows": [{**row, **runtime_table.figures(row)} for row in rows],
+        "rates": list(rates),
         "worth": [dataclasses.asdict(one) for one in runtime_table.worth(rows)],
         "paper": {"source": runtime_table.PAPER_SOURCE, "run_time_s": runtime_table.PAPER_RUN_TIME_S},
     }
@@ -311,12 +373,14 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         asked = parse(argv)
         rows = joined([*measure(asked), *(row for report in asked.added for row in report["rows"])])
+        measured = measure_rates(asked)
     except ConfigError as error:
         print(error, file=sys.stderr)
         return 2
-    print(runtime_table.text(rows))
+    rates = [*([measured] if measured else []), *(rate for report in asked.added for rate in report["rates"])]
+    print(runtime_table.text(rows, rates))
     if asked.words.json is not None:
-        json_report.write(asked.words.json, report_of(rows))
+        json_report.write(asked.words.json, report_of(rows, rates))
     if asked.words.figure is not None:
         draw_runtime(rows, asked.words.figure)
     return 0

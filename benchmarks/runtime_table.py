@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import statistics
 from collections.abc import Sequence
 from typing import Any
 
 from rows import Row, Worth, figures, worth
+from stack import STACK
 
 PAPER_SOURCE = "Chao, Dillmann, Roennau, Xiong, Biomimetics 2024, 9(4), 238, Table 3"
 PAPER_RUN_TIME_S = {"E-DQN": 41.364, "DQN": 161.88, "SNN": 155.4}
@@ -48,7 +50,7 @@ quicker, not because it computes less. They are of one run each, on the authors'
 they can stand beside ours, but no ratio of the two means anything."""
 
 
-def text(rows: Sequence[Row]) -> str:
+def text(rows: Sequence[Row], rates: Sequence[dict[str, Any]]) -> str:
     """Everything, in Markdown."""
     parts = []
     for world in dict.fromkeys(row["world"] for row in rows):
@@ -56,6 +58,7 @@ def text(rows: Sequence[Row]) -> str:
         parts.append(f"## {world}\n\n{methods(own)}")
     parts += [EXPLAINED, paper()]
     parts += [worth_table(one) for one in worth(rows)]
+    parts += [rates_table(one) for one in rates]
     return "\n\n".join(parts)
 
 
@@ -132,6 +135,29 @@ def worth_table(one: Worth) -> str:
     for less in one.differences:
         cells = [_rate(less[at]["difference"], less[at]["interval"], "+") for at in cuts]
         lines.append(f"| E-DQN less {less['name']} | | {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
+def rates_table(one: dict[str, Any]) -> str:
+    """Training rates in turns, and the ratio of the medians: E-DQN's to the best setting of the conventional stack."""
+    title = f"## Training rates: {one.get('device') or 'not measured'}"
+    if one["reason"] is not None:
+        return f"{title}\n\n- {one['reason']}."
+    medians = {name: statistics.median(turns) for name, turns in one["turns"].items()}
+    ours, theirs = (max(v for n, v in medians.items() if n.startswith(f"{who},")) for who in ("E-DQN", STACK))
+    stated = one["workload"]
+    lines = [
+        title,
+        "",
+        f"Steady training on the paper's world, {stated['num_envs']} environments, "
+        f"{stated['replayed_samples_per_decision']:g} replayed and {stated['vae_samples_per_decision']:g} VAE samples "
+        "a decision; medians of turns.",
+        "",
+        "| what | decisions/s |",
+        "| --- | ---: |",
+        *(f"| {name} | {rate:,.0f} |" for name, rate in medians.items()),
+        f"| E-DQN / {STACK}, its best | {ours / theirs:.1f} |",
+    ]
     return "\n".join(lines)
 
 

@@ -19,8 +19,9 @@ import rival
 import rows
 import runtime
 import runtime_table
+import stack
 from child import Child, ChildEndedError
-from edqn_jax.baselines.planner import PLANNERS
+from edqn_jax.baselines.planner import PLANNERS, MissingPackageError
 from edqn_jax.cli import parse_train
 from edqn_jax.config import Config, ConfigError
 from edqn_jax.resolve import to_yaml
@@ -164,6 +165,9 @@ def test_learners_of_other_devices_or_budgets_are_not_compared() -> None:
 # ---------------------------------------------------------------------------------------- in turns
 
 
+SETTINGS = {"one process": 290.0, "two processes": 300.0}
+
+
 class Fake:
     """Stands for a child: a method that always arrives."""
 
@@ -175,11 +179,14 @@ class Fake:
     def answer(self) -> dict[str, Any]:
         if self.name == "BIT*":
             return {"reason": "ompl is not installed; pip install 'edqn-jax[bench]' brings it"}
-        return {"device": "a machine", "devices": ["cpu:0"], "versions": {"jax": "0"}, "workload": {"width": 32}}
+        workload = {"width": 32, "num_envs": 512, "replayed_samples_per_decision": 4, "vae_samples_per_decision": 1}
+        return {"device": "a machine", "devices": ["cpu:0"], "versions": {"jax": "0"}, "workload": workload}
 
     def ask(self, line: str) -> dict[str, Any]:
         if self.name == "APF":
             raise ChildEndedError("Killed")
+        if self.name in stack.STEADY:
+            return {"decisions_per_second": {"a setting": 9000.0 + int(line)} if "E-DQN" in self.name else SETTINGS}
         self.asked.append((self.name, line))
         outcome, extra = "goal", {}
         if self.name in PLANNERS:
@@ -224,7 +231,7 @@ def test_methods_take_turns_seed_by_seed_and_all_of_it_is_told(
     assert runtime.main(words) == 0
     assert faked.asked == [(name, seed) for seed in "01" for name in ("E-DQN", "A*", "RRT*")]
     shown, told = capsys.readouterr()
-    assert "1,000,000 decisions to train and 20 s to plan" in told and "seed 1 done" in told
+    assert "1,000,000 decisions to train and 20 s to plan" in told and "seed 1 is done" in told
     assert "| E-DQN | no | 40.0 (1,000) | 60.0 | 31.0 | 120 | " in shown
     assert ", after 5 s " in shown and "2 of 2: 100% (34% - 100%)" in shown
     assert "- BIT*: ompl is not installed; pip install 'edqn-jax[bench]' brings it." in shown
@@ -245,6 +252,31 @@ def test_methods_take_turns_seed_by_seed_and_all_of_it_is_told(
     more = ["--worlds", str(clear), "--methods", "E-DQN", "--seeds", "1", "--first-seed", "2", "--add", str(file)]
     assert runtime.main(more) == 0
     assert "3 of 3: 100%" in capsys.readouterr().out
+
+
+def test_training_rates_are_taken_in_turns_and_the_best_setting_counts(
+    faked: type[Fake], tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(runtime, "measure_world", lambda asked, world: [])
+    file = tmp_path / "rates.json"
+    words = ["--quick", "--worlds", "paper", "--methods", "E-DQN", "Conventional stack", "--json", str(file)]
+    assert runtime.main(words) == 0
+    shown = capsys.readouterr().out
+    assert "| E-DQN / Conventional stack, its best | 30.0 |" in shown
+    assert "| Conventional stack, one process | 290 |" in shown
+    (rates,) = json.loads(file.read_text())["rates"]
+    assert rates["turns"]["E-DQN, a setting"] == [9000.0, 9001.0]
+    # Read again they are shown again.
+    assert runtime.main(["--seeds", "0", "--add", str(file)]) == 0
+    assert capsys.readouterr().out == shown
+
+
+def test_without_the_stack_its_row_and_the_rates_say_why(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "edqn_jax.baselines.conventional", None)
+    with pytest.raises(MissingPackageError, match="^the conventional stack is not part of this version$"):
+        stack.part_of_stack("train")
+    shown = runtime_table.rates_table({"turns": {}, "reason": "Conventional stack: torch is not installed"})
+    assert shown.endswith("- Conventional stack: torch is not installed.")
 
 
 def test_quick_rows_are_marked_as_not_converged(
@@ -341,8 +373,8 @@ def test_the_judged_worlds_are_those_that_training_ends_with() -> None:
 
 
 @pytest.mark.slow
-def test_a_learner_compiles_once_and_a_seed_comes_to_the_same_whatever_came_before() -> None:
-    _, config = parse_train(["--world", "paper", *TINY])
+def test_a_learner_compiles_once_and_a_seed_comes_to_the_same_whatever_came_before(clear: Path) -> None:
+    _, config = parse_train(["--world", str(clear), *TINY])
     learner = learners.Learner(config)
     first, second, again = (learner.turn(seed) for seed in (0, 1, 0))
     assert first["decisions"] == 512 and len(first["curve"]) == 2

@@ -1,0 +1,146 @@
+"""The conventional stack in `runtime.py`: trained and flown as the learners are, and both timed in steady training.
+
+The settings of its processes and threads are all timed, and the fastest counts.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import importlib
+import time
+from typing import Any
+
+import numpy as np
+
+import json_report
+from edqn_jax.baselines.planner import MissingPackageError
+from edqn_jax.config import Config
+from edqn_jax.devices import choose_devices
+from edqn_jax.flights import Flights
+from edqn_jax.provenance import workload
+from edqn_jax.run import lay_courses
+from edqn_jax.sim.env import OWN_SIZE, World
+from learners import Watched
+from whole import WholeStep, steady
+
+STACK = "Conventional stack"
+SETTINGS = ((1, 1), (2, 1), (2, 2))
+"""Processes that fly, and threads of PyTorch."""
+DECISIONS = 8192
+"""Of a timed turn, about."""
+
+
+def part_of_stack(module: str) -> Any:
+    """A module of the conventional stack.
+
+    Raises:
+        MissingPackageError: if it, or a package that it needs, is not here.
+    """
+    package = "edqn_jax.baselines.conventional"
+    try:
+        return importlib.import_module(f"{package}.{module}")
+    except ModuleNotFoundError as error:
+        if error.name is None or not error.name.startswith(package):
+            raise
+        raise MissingPackageError("the conventional stack is not part of this version") from error
+
+
+class Stack:
+    """Trains from scratch for each seed and flies the missions that are judged."""
+
+    def __init__(self, config: Config) -> None:
+        """Times every setting in a short training, to choose one.
+
+        Raises:
+            MissingPackageError: if a package that it needs is not installed.
+            ConfigError: if the configuration asks for what this stack does not have.
+        """
+        self.config, self.courses = config, lay_courses(config)
+        self.training, fleet = part_of_stack("train"), part_of_stack("fleet")
+        self.course = fleet.Course
+        self.setting = self._fastest()
+        self.about = {
+            **json_report.machine(choose_devices(1, config.train.shards)),
+            "workload": {**workload(config, self.courses.scene), "physics": "c_mujoco"},
+            "processes": self.setting[0],
+            "torch_threads": self.setting[1],
+        }
+
+    def _fastest(self) -> tuple[int, int]:
+        timed = SteadyStack(steady(self.config, 4), 2 * self.config.train.num_envs)
+        with timed:
+            rates = timed.turn(0)["decisions_per_second"]
+        return SETTINGS[int(np.argmax(list(rates.values())))]
+
+    def _fly(self, world: World, trained: Any) -> Flights:
+        return self.training.fly(trained, self.course.of(world))
+
+    def turn(self, seed: int) -> dict[str, Any]:
+        """One seed, trained and flown: see `Watched.turn`."""
+        config = dataclasses.replace(self.config, train=dataclasses.replace(self.config.train, seed=seed))
+        watched = Watched(config, self.courses, self._fly)
+        trained = self.training.train(
+            config,
+            self.course.of(self.courses.training),
+            *self.setting,
+            lambda trained: watched.validate(trained, trained.decisions, trained.seconds),
+        )
+        return watched.turn(seed, trained.decisions, trained.seconds, self._decision_seconds)
+
+    def _decision_seconds(self, trained: Any, calls: int) -> np.ndarray:
+        """Seconds [calls] of each decision of one drone, from arrays on the host to a move."""
+        random, shape = np.random.default_rng(0), (1, self.config.camera.height, self.config.camera.width)
+        seen = random.integers(-2, 3, shape, dtype=np.int8), np.zeros((1, OWN_SIZE), np.float32)
+        seconds = []
+        for _ in range(calls + 1):
+            began = time.perf_counter()
+            int(trained.act(*seen)[0])
+            seconds.append(time.perf_counter() - began)
+        return np.array(seconds[1:])  # the first call is slower by what it sets up
+
+
+class SteadyStack(contextlib.ExitStack):
+    """The conventional stack in steady training, in every setting. A context."""
+
+    def __init__(self, config: Config, decisions: int = DECISIONS) -> None:
+        """`config` has the VAE learn throughout.
+
+        Raises:
+            MissingPackageError: if a package that it needs is not installed.
+            ConfigError: if the configuration asks for what this stack does not have.
+        """
+        super().__init__()
+        training, course = part_of_stack("train"), part_of_stack("fleet").Course.of(lay_courses(config).training)
+        self.decisions = decisions
+        self.runs = {setting: self.enter_context(training.Steady(config, course, *setting)) for setting in SETTINGS}
+        self.about: dict[str, Any] = {}
+
+    def turn(self, number: int) -> dict[str, Any]:
+        """Decisions per second of each setting."""
+        del number
+        return {
+            "decisions_per_second": {
+                f"{processes} processes, {threads} threads of PyTorch": run.turn(self.decisions)
+                for (processes, threads), run in self.runs.items()
+            }
+        }
+
+
+class SteadyStep:
+    """E-DQN's whole training step, likewise."""
+
+    def __init__(self, config: Config) -> None:
+        """`config` has the VAE learn throughout."""
+        devices, courses = choose_devices(config.train.devices, config.train.shards), lay_courses(config)
+        self.whole = WholeStep(config, courses.training, devices)
+        self.about = {**json_report.machine(devices), "workload": workload(config, courses.scene)}
+
+    def turn(self, number: int) -> dict[str, Any]:
+        """Decisions per second of one chunk."""
+        del number
+        return {"decisions_per_second": {"one program": self.whole.turn()}}
+
+
+STEADY = {"E-DQN, steady": SteadyStep, f"{STACK}, steady": SteadyStack}
+"""What is timed for the ratio of training rates."""
