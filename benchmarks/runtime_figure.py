@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import EngFormatter, FuncFormatter, LogLocator, NullLocator, PercentFormatter
+from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator, PercentFormatter
 
 from edqn_jax.report.style import INK, LINE, MUTED, SECOND_LINE, drawing
 from rows import Row, figures
@@ -64,24 +64,26 @@ def _draw_world(line: Sequence[Axes], world: str, rows: Sequence[Row]) -> None:
     for place, row, figure in zip(places, rows, shown, strict=True):
         colour = PLANNER if row["kind"] == "planner" else LEARNER
         if not figure:
-            planning.annotate(
-                "not measured", (0, place), (4, 0), ("axes fraction", "data"), "offset points",
-                fontsize=7, color=MUTED, va="center",
-            )  # fmt: skip
+            _aside(planning, place, "not measured")
             continue
-        if figure["planning_seconds"] is not None:
+        if figure["planning_seconds"] is None:
+            _aside(planning, place, "never arrived")
+        else:
             _dot(planning, figure["planning_seconds"], place, colour, _time(figure["planning_seconds"]))
         if figure["path_over_shortest"] is not None:
             _dot(path, figure["path_over_shortest"], place, colour, f"{figure['path_over_shortest']:.2f}")
         low, high = figure["interval"]
         success.plot([low, high], [place, place], color=colour, lw=3.0, alpha=0.35, solid_capstyle="butt")
         success.plot(figure["success"], place, "o", color=colour, ms=4.5)
+        count = f"{figure['successes']} of {figure['flights']}"
+        success.annotate(count, (1.06, place), fontsize=7, color=MUTED, va="center")
     planning.set_xscale("log")
     planning.xaxis.set_major_locator(LogLocator())
     planning.xaxis.set_minor_locator(NullLocator())
     planning.xaxis.set_major_formatter(FuncFormatter(lambda value, _: _time(value)))
     _widen(planning, path)
-    success.set_xlim(-0.03, 1.03)
+    success.set_xlim(-0.03, 1.36)
+    success.set_xticks([0.0, 0.25, 0.5, 0.75, 1.0])
     success.xaxis.set_major_formatter(PercentFormatter(1.0))
     _draw_curves(curves, rows)
 
@@ -89,6 +91,11 @@ def _draw_world(line: Sequence[Axes], world: str, rows: Sequence[Row]) -> None:
 def _dot(axes: Axes, value: float, place: float, colour: str, text: str) -> None:
     axes.plot(value, place, "o", color=colour, ms=4.5)
     axes.annotate(text, (value, place), (6, 0), textcoords="offset points", fontsize=7, color=INK, va="center")
+
+
+def _aside(axes: Axes, place: float, text: str) -> None:
+    """What stands in the place of a dot."""
+    axes.text(0.02, place, text, transform=axes.get_yaxis_transform(), fontsize=7, color=MUTED, va="center")
 
 
 def _time(seconds: float) -> str:
@@ -111,7 +118,6 @@ def _draw_curves(axes: Axes, rows: Sequence[Row]) -> None:
     axes.set_title("Learning: validation missions flown")
     axes.set_ylim(-0.03, 1.03)
     axes.yaxis.set_major_formatter(PercentFormatter(1.0))
-    axes.xaxis.set_major_formatter(EngFormatter(sep=""))
     axes.set_xlabel("seconds of training")
     for row in rows:
         if row["kind"] != "learner" or not row["turns"]:
