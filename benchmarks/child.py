@@ -28,7 +28,9 @@ class Child:
         Its standard error goes to the file `complaints`.
         """
         self.complaints = complaints
-        path = os.pathsep.join([str(checkout), str(checkout / "benchmarks")])
+        # Before all else the checkout's own; what else this process was given comes after.
+        own = (str(checkout), str(checkout / "benchmarks"))
+        path = os.pathsep.join(filter(None, (*own, os.environ.get("PYTHONPATH"))))
         # Several processes share the accelerator, if there is one.
         environment = {"XLA_PYTHON_CLIENT_PREALLOCATE": "false", **os.environ, "PYTHONPATH": path}
         with complaints.open("w", encoding="utf-8") as log:
