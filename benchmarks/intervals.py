@@ -32,11 +32,22 @@ def rate_interval(success: np.ndarray) -> tuple[float, float]:
 def difference_interval(first: np.ndarray, second: np.ndarray) -> tuple[float, float]:
     """The interval of the first rate less the second; [S, M] and [T, M] bool, seeds of two methods on M missions.
 
+    Where one of the rates is 0 or 1 nothing can be drawn from it; both rates' own intervals then make that of the
+    difference (Newcombe, Statistics in Medicine 17, 1998, method 10).
+
     Raises:
         ValueError: if the missions are not as many.
     """
-    rates = drawn_rates([first, second])
-    return _percentiles(rates[0] - rates[1])
+    drawn = drawn_rates([first, second])
+    if all(0 < np.mean(success) < 1 for success in (first, second)):
+        return _percentiles(drawn[0] - drawn[1])
+    (a, b), (low_a, high_a), (low_b, high_b) = (
+        map(np.mean, (first, second)),
+        rate_interval(first),
+        rate_interval(second),
+    )
+    below, above = np.hypot(a - low_a, high_b - b), np.hypot(high_a - a, b - low_b)
+    return float(a - b - below), float(a - b + above)
 
 
 def drawn_rates(strata: list[np.ndarray], draws: int = DRAWS, seed: int = 0) -> np.ndarray:

@@ -11,6 +11,7 @@ import json_report
 from edqn_jax.baselines.follow import FollowConfig, compiled_follower, reserved, sampled
 from edqn_jax.baselines.planner import Budget, Task, load_planner
 from edqn_jax.config import DENSITIES, Config
+from edqn_jax.devices import processor
 from edqn_jax.provenance import workload
 from edqn_jax.sim import worlds
 from edqn_jax.sim.drone import load_airframe
@@ -54,7 +55,10 @@ class Planning:
         self.scenes = judged_scenes(config, count)
         self.airframe = load_airframe(config.drone)
         self.follower = compiled_follower()
-        self.about = {**json_report.machine(jax.devices()), "workload": workload(config, self.scenes[0])}
+        machine = json_report.machine(jax.devices())
+        if name != "SNN":  # the others compute on the CPU, whatever JAX prefers
+            machine |= {"device": processor(), "devices": []}
+        self.about = {**machine, "workload": workload(config, self.scenes[0])}
         self._mission(self.scenes[0], 0)  # compiles what the planner itself does not compile before its clock starts
 
     def turn(self, seed: int) -> dict[str, Any]:

@@ -10,7 +10,8 @@ once; they take turns, seed by seed, so that a slow minute hits all alike.
     python benchmarks/runtime.py --seeds 0 --add cpu.json gpu.json --figure both.png
 
 What stands after -- goes to the learners' configuration as it would for train.py. The full run, five seeds on both
-worlds, takes about five hours on two cores, nearly all of it training on medium worlds; --quick less than ten minutes.
+worlds, takes about five hours on two cores, four of them to train learners on medium worlds. --quick takes less than
+ten minutes.
 """
 
 from __future__ import annotations
@@ -42,7 +43,7 @@ from edqn_jax.sim.scene import Scene
 from flags import configured as for_timing
 from flags import split
 from learners import LEARNERS, sensing
-from planning import judged_scenes
+from planning import DRAWING, judged_scenes
 from rows import Row, joined
 from runtime_figure import draw_runtime
 from stack import STACK, STEADY
@@ -69,8 +70,8 @@ RATE_ENVS = 512
 TURNS, QUICK_TURNS = 5, 2
 """Of training rates."""
 
-GUESS = 6_000.0
-"""Decisions/s of two cores, for the length that is told before anything is measured."""
+GUESS, STACK_GUESS = 6_000.0, 2_500.0
+"""Decisions/s of two cores, the learners' and the conventional stack's: for the length that is told beforehand."""
 
 
 @dataclasses.dataclass
@@ -334,15 +335,16 @@ def measure_rates(asked: Asked) -> dict[str, Any] | None:
 
 
 def expected(asked: Asked, world: str) -> str:
-    """How long it will be, before anything is measured."""
+    """How long it will be, before anything is measured; compiling is taken for a minute a learner."""
     args = asked.words
     learners = [name for name in args.methods if name in LEARNERS]
-    drawing = [name for name in args.methods if name in ("RRT*", "BIT*")]
-    decisions = args.seeds * len(learners) * asked.configs[world].train.total_steps
+    drawing = [name for name in args.methods if name in DRAWING]
+    each = args.seeds * asked.configs[world].train.total_steps
+    stack = STACK in args.methods and world not in DENSITIES and not args.quick
     planning = args.seeds * len(drawing) * missions_of(asked, world) * args.budget
+    seconds = each * len(learners) / GUESS + each * stack / STACK_GUESS + planning + 60 * len(learners)
     return (
-        f"{decisions:,} decisions to train and {planning:.0f} s to plan, "
-        f"about {(decisions / GUESS + planning) / 60 + len(learners):.0f} min at {GUESS:,.0f} decisions/s"
+        f"{each * (len(learners) + stack):,} decisions to train, {planning:.0f} s to plan; about {seconds / 60:.0f} min"
     )
 
 

@@ -10,6 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator, PercentFormatter
 
+from edqn_jax.config import DENSITIES
 from edqn_jax.report.style import INK, LINE, MUTED, SECOND_LINE, drawing
 from rows import Row, figures
 
@@ -27,28 +28,38 @@ CURVES = {
 
 def draw_runtime(rows: Sequence[Row], file: Path) -> Figure:
     """The rows as a PNG: a line of panels for each world."""
-    worlds = list(dict.fromkeys(row["world"] for row in rows))
+    worlds = list(dict.fromkeys(row["world"] for row in rows)) or ["no"]
     most = max((len([row for row in rows if row["world"] == world]) for world in worlds), default=1)
-    with drawing(11.0, 0.7 + len(worlds) * (1.0 + 0.22 * most), file) as figure:
-        grid = figure.subplots(len(worlds), 4, squeeze=False, width_ratios=(1.2, 0.9, 0.9, 1.2))
-        for line, world in zip(grid, worlds, strict=True):
-            _draw_world(line, world, [row for row in rows if row["world"] == world])
-        figure.suptitle(_title(rows), fontsize=8, color=MUTED, x=0.01, ha="left")
+    with drawing(11.0, 0.4 + len(worlds) * (1.2 + 0.21 * most), file) as figure:
+        parts = figure.subfigures(len(worlds), 1, squeeze=False)[:, 0]
+        for part, world in zip(parts, worlds, strict=True):
+            part.suptitle(_name(world), fontsize=11, fontweight="bold", x=0.01, ha="left")
+            line = part.subplots(1, 4, width_ratios=(1.2, 0.9, 1.1, 1.2))
+            _draw_world(line, [row for row in rows if row["world"] == world])
+        figure.supxlabel(_caption(rows), fontsize=7, color=MUTED, x=0.01, ha="left")
     return figure
 
 
-def _title(rows: Sequence[Row]) -> str:
+def _name(world: str) -> str:
+    if world.endswith(".xml"):
+        return world
+    return f"Unseen {world} worlds" if world in DENSITIES else f"The {world}'s world"
+
+
+def _caption(rows: Sequence[Row]) -> str:
     devices = ", ".join(dict.fromkeys(row["device"] for row in rows if row["device"]))
     seeds = max((len(row["turns"]) for row in rows), default=0)
-    quick = "; a quick run, learners have not converged" if any(row["settings"].get("quick") for row in rows) else ""
-    return f"{devices}; {seeds} seeds{quick}. Blue: learns, has no map. Orange: plans on the map."
+    quick = ", too short to converge" if any(row["settings"].get("quick") for row in rows) else ""
+    return (
+        f"{devices}; {seeds} seeds{quick}. Blue learns and has no map, orange plans on the map. "
+        "Planning: computation alone; medians of flights that arrived. Bars: 95 % intervals."
+    )
 
 
-def _draw_world(line: Sequence[Axes], world: str, rows: Sequence[Row]) -> None:
-    names, shown = [], [figures(row) for row in rows]
+def _draw_world(line: Sequence[Axes], rows: Sequence[Row]) -> None:
+    shown = [figures(row) for row in rows]
     several = len({row["device"] for row in rows if row["device"]}) > 1
-    for row in rows:
-        names.append(f"{row['name']}, {row['device']}" if several and row["device"] else row["name"])
+    names = [f"{row['name']}, {row['device']}" if several and row["device"] else row["name"] for row in rows]
     planning, path, success, curves = line
     places = np.arange(len(rows))[::-1]
     for axes in (planning, path, success):
@@ -57,8 +68,7 @@ def _draw_world(line: Sequence[Axes], world: str, rows: Sequence[Row]) -> None:
         axes.tick_params(axis="y", length=0)
     for label, row in zip(planning.get_yticklabels(), rows, strict=True):
         label.set_fontweight("bold" if row["name"] == OURS else "normal")
-    title = f"{world} world" if not world.endswith(".xml") else world
-    planning.set_title(f"{title}: planning, start to goal")
+    planning.set_title("Planning, start to goal")
     path.set_title("Flown path / shortest")
     success.set_title("Success")
     for place, row, figure in zip(places, rows, shown, strict=True):
@@ -99,6 +109,8 @@ def _aside(axes: Axes, place: float, text: str) -> None:
 
 
 def _time(seconds: float) -> str:
+    if seconds >= 999.5:
+        return f"{seconds:,.0f} s"
     for unit, scale in (("s", 1.0), ("ms", 1e3)):
         if seconds * scale >= 0.9995:
             return f"{seconds * scale:.3g} {unit}"
@@ -114,18 +126,24 @@ def _widen(planning: Axes, path: Axes) -> None:
 
 
 def _draw_curves(axes: Axes, rows: Sequence[Row]) -> None:
-    """Share of validation missions flown after so many seconds of training, a thin line a seed."""
-    axes.set_title("Learning: validation missions flown")
+    """Share of validation missions flown after so many seconds of training, a line a seed."""
+    axes.set_title("Validation missions flown")
     axes.set_ylim(-0.03, 1.03)
     axes.yaxis.set_major_formatter(PercentFormatter(1.0))
-    axes.set_xlabel("seconds of training")
+    axes.set_xlabel("training, logarithmic")
     for row in rows:
-        if row["kind"] != "learner" or not row["turns"]:
-            continue
-        colour = CURVES.get(row["name"], INK)
-        for number, turn in enumerate(row["turns"]):
-            points = [(0.0, 0.0), *((point["seconds"], point["validation_success"]) for point in turn["curve"])]
-            label = row["name"] if number == 0 else None
-            axes.plot(*np.array(points).T, color=colour, lw=1.6 if row["name"] == OURS else 1.0, alpha=0.8, label=label)
+        colour, number = CURVES.get(row["name"], INK), 0
+        for turn in row["turns"] if row["kind"] == "learner" else []:
+            points = np.array([(point["seconds"], point["validation_success"]) for point in turn["curve"]])
+            if len(points):
+                label = row["name"] if number == 0 else None
+                width = 1.6 if row["name"] == OURS else 1.0
+                axes.plot(*points.T, ".-", color=colour, lw=width, ms=3, alpha=0.8, label=label)
+                number += 1
     if axes.get_lines():
-        axes.legend(loc="lower right")
+        axes.set_xscale("log")
+        low, high = axes.get_xlim()
+        axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if high < 50 * low else (1.0,)))
+        axes.xaxis.set_minor_locator(NullLocator())
+        axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: _time(value)))
+        axes.legend(loc="best")

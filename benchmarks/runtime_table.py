@@ -40,7 +40,8 @@ EXPLAINED = """\
   keep a reserve beyond the body's radius, for the airframe that then flies their paths under the same judge.
 - Success: Wilson's interval, 95 %; over seeds and missions, a bootstrap of both. A planner that draws nothing counts
   once.
-- Memory: the most that the method's own process held, plus what it held on an accelerator."""
+- Memory: the most that the method's own process held, JAX and the airframe included, plus what it held on an
+  accelerator."""
 
 PARAGRAPH = """\
 The paper calls these figures "run time" and does not say what ran. 41.364 s over its flight of 188 steps is 0.22 s a

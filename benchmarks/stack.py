@@ -121,7 +121,7 @@ class SteadyStack(contextlib.ExitStack):
         del number
         return {
             "decisions_per_second": {
-                f"{processes} processes, {threads} threads of PyTorch": run.turn(self.decisions)
+                f"processes: {processes}, threads of PyTorch: {threads}": run.turn(self.decisions)
                 for (processes, threads), run in self.runs.items()
             }
         }

@@ -50,6 +50,14 @@ def test_missions_are_drawn_for_both_methods_alike_and_seeds_for_each() -> None:
     assert (low, high) == pytest.approx((1 / 6 - half, 1 / 6 + half), abs=0.03)
 
 
+def test_where_one_flies_all_or_nothing_the_difference_is_newcombes() -> None:
+    # Ten of ten less none of ten, his method 10: from 0.6075 to 1; here ten missions of three seeds.
+    low, high = difference_interval(np.ones((3, 10), bool), np.zeros((2, 10), bool))
+    assert (low, high) == pytest.approx((0.6075, 1.0), abs=2e-4)
+    low, high = difference_interval(np.zeros((3, 10), bool), np.zeros((2, 10), bool))
+    assert low < 0.0 < high  # that neither flies does not prove them alike
+
+
 def test_an_interval_over_seeds_and_missions_covers_the_true_rate() -> None:
     draw = np.random.default_rng(1)
 
