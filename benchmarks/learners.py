@@ -191,10 +191,8 @@ def sensing(config: Config, name: str) -> Config:
     """`config` as the learner of that name has it.
 
     Raises:
-        ConfigError: if there is no such sensor.
+        ConfigError: if the rest of it does not go with that sensor.
     """
-    if getattr(config.env, "sensor", "events") == LEARNERS[name]:
-        return config
     config = apply(config, {"env": {"sensor": LEARNERS[name]}}, name)
     validate(config)
     return config

@@ -22,6 +22,8 @@ Row = dict[str, Any]
 def joined(rows: Iterable[Row]) -> list[Row]:
     """Rows of one method, world, device and setting as one row with the seeds of all.
 
+    Of a method that ran in one place and could not in another the row that says why is left out.
+
     Raises:
         ConfigError: if a seed is there twice.
     """
@@ -37,8 +39,9 @@ def joined(rows: Iterable[Row]) -> list[Row]:
             if turn["seed"] in seeds:
                 raise ConfigError(f"seed {turn['seed']} of {row['name']} on {row['world']} is there twice")
             first["turns"].append(turn)
-        first["reason"] = first["reason"] if not first["turns"] else None
-    return list(together.values())
+        first["reason"] = first["reason"] or row["reason"]
+    ran = {(row["name"], row["world"]) for row in together.values() if row["turns"]}
+    return [row for row in together.values() if row["turns"] or (row["name"], row["world"]) not in ran]
 
 
 def success(row: Row) -> np.ndarray:

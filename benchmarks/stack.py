@@ -7,16 +7,16 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import importlib
 import time
+from importlib import metadata
 from typing import Any
 
 import numpy as np
 
 import json_report
-from edqn_jax.baselines.planner import MissingPackageError
+from conventional import PACKAGES, SETTINGS
 from edqn_jax.config import Config
-from edqn_jax.devices import choose_devices
+from edqn_jax.devices import choose_devices, processor
 from edqn_jax.flights import Flights
 from edqn_jax.provenance import workload
 from edqn_jax.run import lay_courses
@@ -25,25 +25,8 @@ from learners import Watched
 from whole import WholeStep, steady
 
 STACK = "Conventional stack"
-SETTINGS = ((1, 1), (2, 1), (2, 2))
-"""Processes that fly, and threads of PyTorch."""
 DECISIONS = 8192
 """Of a timed turn, about."""
-
-
-def part_of_stack(module: str) -> Any:
-    """A module of the conventional stack.
-
-    Raises:
-        MissingPackageError: if it, or a package that it needs, is not here.
-    """
-    package = "edqn_jax.baselines.conventional"
-    try:
-        return importlib.import_module(f"{package}.{module}")
-    except ModuleNotFoundError as error:
-        if error.name is None or not error.name.startswith(package):
-            raise
-        raise MissingPackageError("the conventional stack is not part of this version") from error
 
 
 class Stack:
@@ -56,12 +39,16 @@ class Stack:
             MissingPackageError: if a package that it needs is not installed.
             ConfigError: if the configuration asks for what this stack does not have.
         """
+        from edqn_jax.baselines.conventional import fleet, train
+
         self.config, self.courses = config, lay_courses(config)
-        self.training, fleet = part_of_stack("train"), part_of_stack("fleet")
-        self.course = fleet.Course
+        self.stack, self.course = train, fleet.Course.of
         self.setting = self._fastest()
+        machine = json_report.machine(choose_devices(1, config.train.shards))
+        machine |= {"device": processor()}  # whatever JAX prefers
+        machine["versions"] |= {name: metadata.version(name) for name in PACKAGES}
         self.about = {
-            **json_report.machine(choose_devices(1, config.train.shards)),
+            **machine,
             "workload": {**workload(config, self.courses.scene), "physics": "c_mujoco"},
             "processes": self.setting[0],
             "torch_threads": self.setting[1],
@@ -74,15 +61,15 @@ class Stack:
         return SETTINGS[int(np.argmax(list(rates.values())))]
 
     def _fly(self, world: World, trained: Any) -> Flights:
-        return self.training.fly(trained, self.course.of(world))
+        return self.stack.fly(trained, self.course(world))
 
     def turn(self, seed: int) -> dict[str, Any]:
         """One seed, trained and flown: see `Watched.turn`."""
         config = dataclasses.replace(self.config, train=dataclasses.replace(self.config.train, seed=seed))
         watched = Watched(config, self.courses, self._fly)
-        trained = self.training.train(
+        trained = self.stack.train(
             config,
-            self.course.of(self.courses.training),
+            self.course(self.courses.training),
             *self.setting,
             lambda trained: watched.validate(trained, trained.decisions, trained.seconds),
         )
@@ -110,10 +97,13 @@ class SteadyStack(contextlib.ExitStack):
             MissingPackageError: if a package that it needs is not installed.
             ConfigError: if the configuration asks for what this stack does not have.
         """
+        from edqn_jax.baselines.conventional.fleet import Course
+        from edqn_jax.baselines.conventional.train import Steady
+
         super().__init__()
-        training, course = part_of_stack("train"), part_of_stack("fleet").Course.of(lay_courses(config).training)
+        course = Course.of(lay_courses(config).training)
         self.decisions = decisions
-        self.runs = {setting: self.enter_context(training.Steady(config, course, *setting)) for setting in SETTINGS}
+        self.runs = {setting: self.enter_context(Steady(config, course, *setting)) for setting in SETTINGS}
         self.about: dict[str, Any] = {}
 
     def turn(self, number: int) -> dict[str, Any]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import io
 import json
 import statistics
@@ -21,7 +22,7 @@ import runtime
 import runtime_table
 import stack
 from child import Child, ChildEndedError
-from edqn_jax.baselines.planner import PLANNERS, MissingPackageError
+from edqn_jax.baselines.planner import PLANNERS
 from edqn_jax.cli import parse_train
 from edqn_jax.config import Config, ConfigError
 from edqn_jax.resolve import to_yaml
@@ -126,6 +127,13 @@ def test_rows_of_several_files_become_one_with_the_seeds_of_all() -> None:
     assert len(parts[0]["turns"]) == 1  # what was read stays as it was
     with pytest.raises(ConfigError, match="seed 0 of E-DQN on medium is there twice"):
         rows.joined([parts[0], parts[0]])
+
+
+def test_a_row_that_could_not_run_gives_way_to_one_that_ran_elsewhere() -> None:
+    missing = row("A*", [], device=None, reason="numba is not installed")
+    assert rows.joined([missing, row("SNN", [])]) == [missing, row("SNN", [])]
+    ran = row("A*", [turn(0, flights("goal"))])
+    assert rows.joined([missing, ran]) == [ran]
 
 
 def test_events_are_worth_what_flies_at_equal_decisions_and_at_equal_wall_time() -> None:
@@ -257,7 +265,7 @@ def test_methods_take_turns_seed_by_seed_and_all_of_it_is_told(
 def test_training_rates_are_taken_in_turns_and_the_best_setting_counts(
     faked: type[Fake], tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(runtime, "measure_world", lambda asked, world: [])
+    monkeypatch.setattr(runtime, "measure_world", lambda asked, world: iter(()))
     file = tmp_path / "rates.json"
     words = ["--quick", "--worlds", "paper", "--methods", "E-DQN", "Conventional stack", "--json", str(file)]
     assert runtime.main(words) == 0
@@ -271,12 +279,25 @@ def test_training_rates_are_taken_in_turns_and_the_best_setting_counts(
     assert capsys.readouterr().out == shown
 
 
-def test_without_the_stack_its_row_and_the_rates_say_why(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "edqn_jax.baselines.conventional", None)
-    with pytest.raises(MissingPackageError, match="^the conventional stack is not part of this version$"):
-        stack.part_of_stack("train")
+def test_rates_that_could_not_be_measured_say_why() -> None:
     shown = runtime_table.rates_table({"turns": {}, "reason": "Conventional stack: torch is not installed"})
     assert shown.endswith("- Conventional stack: torch is not installed.")
+
+
+def test_what_has_been_measured_is_on_the_disk_after_each_seed(
+    faked: type[Fake], clear: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Doomed(Fake):
+        def ask(self, line: str) -> dict[str, Any]:
+            if line == "1":
+                raise KeyboardInterrupt
+            return super().ask(line)
+
+    monkeypatch.setattr(runtime, "Child", Doomed)
+    file = tmp_path / "rows.json"
+    with pytest.raises(KeyboardInterrupt):
+        runtime.main(["--worlds", str(clear), "--seeds", "2", "--methods", "E-DQN", "A*", "--json", str(file)])
+    assert [[one["seed"] for one in row["turns"]] for row in json.loads(file.read_text())["rows"]] == [[0], [0]]
 
 
 def test_quick_rows_are_marked_as_not_converged(
@@ -340,9 +361,10 @@ def answers_of(name: str, config: Config, tmp_path: Path, monkeypatch: pytest.Mo
     return [json.loads(line) for line in stream.getvalue().splitlines()]
 
 
-def test_a_missing_package_is_a_reason(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("name", ["RRT*", "Conventional stack", "Conventional stack, steady"])
+def test_a_missing_package_is_a_reason(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     hide(monkeypatch, "numba", "ompl")
-    (said,) = answers_of("RRT*", Config(), tmp_path, monkeypatch, "0\n")
+    (said,) = answers_of(name, parse_train(MINIATURE)[1], tmp_path, monkeypatch, "0\n")
     assert said == {"reason": "numba is not installed; pip install 'edqn-jax[bench]' brings it"}
 
 
@@ -375,7 +397,8 @@ def test_the_judged_worlds_are_those_that_training_ends_with() -> None:
 @pytest.mark.slow
 def test_a_learner_compiles_once_and_a_seed_comes_to_the_same_whatever_came_before(clear: Path) -> None:
     _, config = parse_train(["--world", str(clear), *TINY])
-    learner = learners.Learner(config)
+    # Blind, since it compiles soonest: it has no camera and no VAE.
+    learner = learners.Learner(learners.sensing(config, "DQN blind"))
     first, second, again = (learner.turn(seed) for seed in (0, 1, 0))
     assert first["decisions"] == 512 and len(first["curve"]) == 2
     assert [point["decisions"] for point in first["curve"]] == [256, 512]
@@ -389,9 +412,12 @@ def test_a_learner_compiles_once_and_a_seed_comes_to_the_same_whatever_came_befo
     assert len(first["flights"]["outcome"]) == len(first["curve"][0]["test"]) == 1
 
 
-def test_a_learner_whose_sensor_is_unknown_is_told_in_a_sentence() -> None:
-    _, config = parse_train(MINIATURE)
-    assert learners.sensing(config, "E-DQN") == config
+def test_learners_differ_in_what_they_see_and_in_nothing_else() -> None:
+    _, config = parse_train([*MINIATURE, "--env.sensor", "depth"])
+    seen = [learners.sensing(config, name) for name in learners.LEARNERS]
+    assert [one.env.sensor for one in seen] == ["events", "frames", "blind", "depth", "ranges"]
+    same = [dataclasses.replace(one, env=dataclasses.replace(one.env, sensor="depth")) for one in seen]
+    assert all(one == config for one in same)
 
 
 # ------------------------------------------------------------------------------------------- child
