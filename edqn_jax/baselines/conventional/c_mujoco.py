@@ -11,8 +11,8 @@ import mujoco
 
 from edqn_jax.baselines.planner import require
 
-llvm = require("llvmlite.binding")
 types = require("numba").types
+llvm = require("llvmlite.binding")  # comes with numba
 
 # The bindings have loaded this very file; loading it again only makes its names known to the linker.
 llvm.load_library_permanently(str(next(Path(mujoco.__file__).parent.glob("libmujoco*"))))
