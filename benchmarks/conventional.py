@@ -28,7 +28,8 @@ from edqn_jax.baselines.planner import MissingPackageError
 from edqn_jax.config import Config, ConfigError
 from edqn_jax.devices import use_cpu_devices
 from edqn_jax.files import check_can_write
-from edqn_jax.run import lay_courses, workload
+from edqn_jax.provenance import workload
+from edqn_jax.run import lay_courses
 from edqn_jax.sim.mjcf import load_scene, resolve_world
 from flags import configured, split
 from whole import steady
