@@ -15,7 +15,6 @@ from edqn_jax.baselines.conventional.flights import fly_missions
 from edqn_jax.config import CameraConfig, Config, ConfigError, EnvConfig
 from edqn_jax.evaluate import summarise
 from edqn_jax.learn.policy import PolicyParams
-from edqn_jax.sim import env as our_env
 from edqn_jax.sim.env import Outcome
 from edqn_jax.sim.scene import stack_scenes
 from tests.bench.conventional_course import course_of, paper, world_of
@@ -46,9 +45,9 @@ def test_outcome_path_clearance_and_time_are_ours(monkeypatch):
 
     monkeypatch.setattr(our_flights.policy, "act", act)
     # This policy does not look, so its pictures need not be compiled.
-    monkeypatch.setattr(our_env, "view", lambda config, *_: jnp.zeros((config.camera.height, config.camera.width)))
+    blind = dataclasses.replace(CONFIG, env=dataclasses.replace(CONFIG.env, sensor="blind"))
     world = world_of(CONFIG, STARTS, GOALS)
-    ours = our_flights.fly_missions(CONFIG, world, PolicyParams(encoder=None, q=None), jax.random.key(0))
+    ours = our_flights.fly_missions(blind, world, PolicyParams(encoder=None, q=None), jax.random.key(0))
     got = fly_missions(CONFIG, course_of(STARTS, GOALS), lambda events, own: towards_the_goal(np, own))
     assert {Outcome.GOAL, Outcome.COLLISION, Outcome.TIME_OUT, Outcome.LEFT_VOLUME} == set(map(Outcome, got.outcome))
     for name in ("outcome", "decisions", "physics_steps"):
