@@ -8,6 +8,7 @@ import jax
 import numpy as np
 
 import json_report
+from edqn_jax.baselines.astar import NoPathError, shortest_path
 from edqn_jax.baselines.follow import FollowConfig, compiled_follower, reserved, sampled
 from edqn_jax.baselines.planner import Budget, Task, load_planner
 from edqn_jax.config import DENSITIES, Config
@@ -38,6 +39,14 @@ def judged_scenes(config: Config, count: int) -> list[Scene]:
     loaded = load_world(resolve_world(name))
     check_scene(loaded.scene, radius, names=loaded.names, title=f"'{name}'")
     return [loaded.scene]
+
+
+def shortest_length(radius: float, scene: Scene) -> float | None:
+    """Length of A*'s path for a sphere of that radius from start to goal, metres; None where there is none."""
+    try:
+        return shortest_path(scene, scene.start, scene.goal, radius).length_m
+    except NoPathError:
+        return None
 
 
 class Planning:

@@ -19,12 +19,15 @@ from __future__ import annotations
 import argparse
 import contextlib
 import dataclasses
+import functools
 import hashlib
 import json
+import multiprocessing
 import sys
 import tempfile
 import time
 from collections.abc import Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -34,7 +37,6 @@ import json_report
 import runtime_table
 from child import Child, ChildEndedError
 from conventional import DRONES
-from edqn_jax.baselines.astar import NoPathError, shortest_path
 from edqn_jax.baselines.planner import PLANNERS
 from edqn_jax.cli import parse_train
 from edqn_jax.config import DENSITIES, Config, ConfigError
@@ -45,7 +47,7 @@ from edqn_jax.sim.scene import Scene
 from flags import configured as for_timing
 from flags import split
 from learners import LEARNERS, sensing
-from planning import DRAWING, judged_scenes
+from planning import DRAWING, judged_scenes, shortest_length
 from rows import Row, joined
 from runtime_figure import draw_runtime
 from stack import STACK, STEADY
@@ -60,6 +62,8 @@ POINTS = 20
 BUDGET_SECONDS, QUICK_BUDGET_SECONDS = 5.0, 1.0
 PLANNED, QUICK_PLANNED = 32, 8
 """Missions that planners are given in random worlds, the first of those that learners are judged by."""
+MANY = 64
+"""Worlds whose shortest paths are worth other processes."""
 
 QUICK = (
     *("--total-steps", "60000", "--train.validation-missions", "32", "--train.validation-every", "15000"),
@@ -167,16 +171,19 @@ def read(file: Path) -> dict[str, Any]:
 # ------------------------------------------------------------------------------------------ running
 
 
+def keep_to_cpu() -> None:
+    """The accelerator, if there is one, is the children's."""
+    jax.config.update("jax_platforms", "cpu")
+
+
 def shortest_of(config: Config, scenes: Sequence[Scene]) -> list[float | None]:
-    """Length of A*'s path in each world, metres; None where there is none."""
-
-    def length(scene: Scene) -> float | None:
-        try:
-            return shortest_path(scene, scene.start, scene.goal, config.drone.body_radius_m).length_m
-        except NoPathError:
-            return None
-
-    return [length(scene) for scene in scenes]
+    """Length of A*'s path in each world, metres; None where there is none. Many worlds on all cores."""
+    length = functools.partial(shortest_length, config.drone.body_radius_m)
+    if len(scenes) < MANY:
+        return [length(scene) for scene in scenes]
+    fresh = multiprocessing.get_context("spawn")  # JAX's threads would not survive a fork
+    with ProcessPoolExecutor(cores(), fresh, initializer=keep_to_cpu) as pool:
+        return list(pool.map(length, scenes, chunksize=8))
 
 
 def launched(
@@ -381,7 +388,7 @@ def report_of(rows: Sequence[Row], rates: Sequence[dict[str, Any]]) -> dict[str,
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Exit code 0 when all was measured, whatever came out; 2 for bad input."""
-    jax.config.update("jax_platforms", "cpu")  # the children's is the accelerator, if there is one
+    keep_to_cpu()
     try:
         asked = parse(argv)
         rows = joined([*measure(asked), *(row for report in asked.added for row in report["rows"])])

@@ -395,6 +395,15 @@ def test_the_judged_worlds_are_those_that_training_ends_with() -> None:
 
 
 @pytest.mark.slow
+def test_many_worlds_have_the_shortest_paths_of_each_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    scenes = [room().scene, WITHOUT_A_WAY["wall across"].scene, room().scene]
+    alone = runtime.shortest_of(Config(), scenes)
+    monkeypatch.setattr(runtime, "MANY", 2)
+    assert runtime.shortest_of(Config(), scenes) == alone
+    assert alone[1] is None and alone[0] == alone[2] and alone[0] is not None
+
+
+@pytest.mark.slow
 def test_a_learner_compiles_once_and_a_seed_comes_to_the_same_whatever_came_before(clear: Path) -> None:
     _, config = parse_train(["--world", str(clear), *TINY])
     # Blind, since it compiles soonest: it has no camera and no VAE.
