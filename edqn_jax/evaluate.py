@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import math
 import tempfile
@@ -52,9 +53,18 @@ def load_run(folder: Path) -> tuple[Config, PolicyParams]:
     config = apply(Config(), load_layer(file), str(file))
     validate(config)
     params = load_policy(folder / "checkpoints")
-    if jax.tree.map(np.shape, params) != jax.tree.map(np.shape, jax.eval_shape(lambda: fresh_policy(config))):
+    fresh = jax.eval_shape(lambda: fresh_policy(config))
+    # As policies were saved before their pixel features were written out.
+    learnt = jax.eval_shape(lambda: embedding.init(config, jax.random.key(0)))
+    if _shapes(params) == _shapes(dataclasses.replace(fresh, encoder=learnt)):
+        params = dataclasses.replace(params, encoder=jax.tree.map(np.asarray, embedding.acting(config, params.encoder)))
+    if _shapes(params) != _shapes(fresh):
         raise ConfigError(f"the policy in '{folder}' does not have the shapes that its config.yaml asks for")
     return config, params
+
+
+def _shapes(params: PolicyParams) -> PolicyParams:
+    return jax.tree.map(np.shape, params)
 
 
 def fresh_policy(config: Config, seed: int = 0) -> PolicyParams:
@@ -62,7 +72,7 @@ def fresh_policy(config: Config, seed: int = 0) -> PolicyParams:
     encoder_key, q_key = jax.random.split(jax.random.key(seed))
     size = policy.observation_size(config)
     return PolicyParams(
-        encoder=embedding.init(config, encoder_key),
+        encoder=embedding.acting(config, embedding.init(config, encoder_key)),
         q=qnetwork.init_q(config.agent, size, len(env.ACTIONS), q_key),
     )
 

@@ -31,6 +31,11 @@ def init(config: Config, key: Array) -> Params:
     return encoder.init_encoder(config.encoder, config.camera, key, pictures=config.env.sensor != "events")
 
 
+def acting(config: Config, params: Params) -> Params:
+    """Parameters that learn no more, as `embed` has least to do with them; {} where there are none."""
+    return encoder.tabulated(config.encoder, config.camera, params) if params else {}
+
+
 def embed(config: Config, params: Params, sensed: Sensed) -> Array | None:
     """[..., size] of what the sensor shows, of order 1: the scaled code, or ranges as they are; None of nothing."""
     if sensed is None:

@@ -161,7 +161,7 @@ def _init_learner(config: Config, key: Array) -> Learner:
     return Learner(
         vae=vae,
         vae_optimiser=_vae_optimiser(config).init(vae) if vae else None,
-        encoder=vae,
+        encoder=embedding.acting(config, vae),
         q=q,
         target=q,
         average=q,
@@ -229,7 +229,7 @@ def train_step(
     # Learn: the VAE from all that is newly seen, the Q-network from the replay.
     vae_losses, learner = learn_to_see(config, axis, learner, seen.observation.sensed, keys[:, 2], step)
     q_losses, learner = learn_to_act(config, axis, learner, ring, time, keys[:, 3], step)
-    learner = _publish(plan, learner, step)
+    learner = _publish(config, learner, step)
 
     # Encode once, and remember; a new episode, or a new encoder, begins with an empty memory.
     code = flatten(config, learner.encoder, seen.observation)
@@ -272,12 +272,14 @@ def _manoeuvre(hold: int, held: Array, key: Array) -> Array:
     return jnp.where(coin < 1.0 / hold, (draw * len(ACTIONS)).astype(held.dtype), held)
 
 
-def _publish(plan: Plan, learner: Learner, step: Array) -> Learner:
+def _publish(config: Config, learner: Learner, step: Array) -> Learner:
     """The code that the agent sees changes once: when the warm-up ends, before the replay begins."""
-    publish = step + 1 == plan.warmup
-    return dataclasses.replace(
-        learner, encoder=jax.tree.map(lambda new, old: jnp.where(publish, new, old), learner.vae, learner.encoder)
+    encoder = lax.cond(
+        step + 1 == Plan.of(config).warmup,
+        lambda: embedding.acting(config, learner.vae),
+        lambda: learner.encoder,
     )
+    return dataclasses.replace(learner, encoder=encoder)
 
 
 def learn_to_see(config: Config, axis: str | None, learner: Learner, sensed, keys: Array, step: Array):

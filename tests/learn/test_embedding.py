@@ -47,7 +47,8 @@ def world() -> World:
 @pytest.mark.slow
 @pytest.mark.parametrize("name", SENSORS[1:])
 def test_the_training_step_learns_from_every_sensor(world: World, name: str) -> None:
-    config = with_sensor(name)
+    network = dataclasses.replace(CONFIG.encoder, pixel_features="network")
+    config = with_sensor(name, dataclasses.replace(CONFIG, encoder=network))
     plan = Plan.of(config)
     before = jax.jit(lambda key: trainer.init(config, world, key))(jax.random.key(0))
     train = jax.jit(lambda state: trainer.run_steps(config, world, state, jnp.arange(STEPS)))
@@ -63,7 +64,8 @@ def test_the_training_step_learns_from_every_sensor(world: World, name: str) -> 
     np.testing.assert_array_equal(np.isfinite(losses.reconstruction), sees)
     if name in CODED:
         assert plan.warmup == 4 and moved(before.learner.vae, after.learner.vae)
-        assert not moved(after.learner.vae, after.learner.encoder)  # what was learnt acts
+        learnt = embedding.acting(config, after.learner.vae)  # what was learnt acts
+        jax.tree.map(partial(np.testing.assert_allclose, atol=1e-6), learnt, after.learner.encoder)
     else:
         assert plan.warmup == 0 and after.learner.vae == after.learner.encoder == {}
 
@@ -228,6 +230,17 @@ def test_a_policy_saved_before_there_were_other_sensors_still_loads(tmp_path: Pa
     save_policy(tmp_path / "checkpoints", params)
     config, loaded = load_run(tmp_path)
     assert config == CONFIG and not moved(params, loaded)
+
+
+def test_a_policy_saved_before_pixel_features_were_written_out_still_loads(tmp_path: Path) -> None:
+    asked = dataclasses.replace(CONFIG, encoder=dataclasses.replace(CONFIG.encoder, pixel_features="network"))
+    (tmp_path / "config.yaml").write_text(to_yaml(asked))
+    learnt = embedding.init(asked, jax.random.key(5))
+    assert "layers_0" in learnt["encoder"]["pixels"]
+    save_policy(tmp_path / "checkpoints", dataclasses.replace(fresh_policy(asked), encoder=learnt))
+    _, loaded = load_run(tmp_path)
+    assert shapes(loaded.encoder) == SAVED
+    assert not moved(loaded.encoder, embedding.acting(asked, learnt))
 
 
 @pytest.mark.parametrize("name", SENSORS[1:])

@@ -89,6 +89,26 @@ def test_dense_encoder_equals_the_sum_over_single_events(kind, field):
         np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-3)
 
 
+@pytest.mark.parametrize("pictures", [False, True], ids=["events", "pictures"])
+@pytest.mark.parametrize("kind", ["table", "network"])
+def test_pixel_features_written_out_give_the_same_codes(kind, pictures):
+    config = EncoderConfig(pixel_features=kind, features=8, hidden=16, code_size=5)
+    params = en.init_encoder(config, SMALL, jax.random.key(0), pictures=pictures)
+    table = en.tabulated(config, SMALL, params)
+    assert "table" in table["encoder"]["pixels"] and table["decoder"] is params["decoder"]
+    field, picture = ragged_field(6), jax.random.normal(jax.random.key(1), (SMALL.height, SMALL.width))
+    sensed = picture if pictures else field
+    # One and the same product of the same numbers, but for what is fused into it.
+    for one, two in zip(en.encode(config, params, sensed), en.encode(config, table, sensed), strict=True):
+        np.testing.assert_allclose(one, two, rtol=1e-5, atol=1e-5)
+    if not pictures:
+        events = event_list(field)
+        codes = (en.encode_events(config, p, SMALL, *events)[0] for p in (params, table))
+        np.testing.assert_allclose(*codes, rtol=1e-5, atol=1e-5)
+    again = en.tabulated(config, SMALL, table)
+    assert jax.tree.all(jax.tree.map(np.array_equal, table, again))
+
+
 def test_sums_of_events_that_divide_the_window_are_those_of_any_events():
     field = even_field()
     assert field.divides_window
