@@ -24,7 +24,7 @@ from typing import Any
 import jax
 
 import json_report
-from edqn_jax.baselines.planner import MissingPackageError
+from edqn_jax.baselines.packages import MissingPackageError
 from edqn_jax.config import Config, ConfigError
 from edqn_jax.devices import use_cpu_devices
 from edqn_jax.files import check_can_write

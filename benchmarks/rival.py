@@ -16,7 +16,8 @@ from typing import Any, TextIO
 import jax
 
 from child import answers
-from edqn_jax.baselines.planner import PLANNERS, MissingPackageError
+from edqn_jax.baselines.packages import MissingPackageError
+from edqn_jax.baselines.planner import PLANNERS
 from edqn_jax.config import Config, ConfigError
 from edqn_jax.devices import use_cpu_devices
 from edqn_jax.resolve import apply, load_layer

@@ -65,7 +65,8 @@ def _draw_curve(axes: Axes, curve: dict[str, Any], rows: list[dict[str, Any]]) -
     axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,g}"))
     axes.set_xlabel(curve["name"])
     axes.set_title(f"{x[-1] / x[0]:.3g} × {curve['name']}, {cost[-1] / cost[0]:.3g} × cost")
-    axes.text(0.03, 0.97, _verdict(curve), transform=axes.transAxes, va="top", fontsize=7, color=MUTED)
+    ground = {"facecolor": axes.get_facecolor(), "edgecolor": "none", "pad": 1.5}  # or the line goes through it
+    axes.text(0.03, 0.97, _verdict(curve), transform=axes.transAxes, va="top", fontsize=7, color=MUTED, bbox=ground)
 
 
 def _verdict(curve: dict[str, Any]) -> str:

@@ -15,7 +15,8 @@ import time
 import numpy as np
 
 from edqn_jax.baselines.astar import pull_tight, unseen_depth
-from edqn_jax.baselines.planner import Budget, Plan, Task, found, not_found, refusal, require
+from edqn_jax.baselines.packages import require
+from edqn_jax.baselines.planner import Budget, Plan, Task, found, not_found, refusal
 from edqn_jax.baselines.solids import distance, leg_free, solid_table
 
 numba = require("numba")

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import importlib
-from typing import Any, Protocol
+from typing import Protocol
 
 import jax
 import numpy as np
@@ -17,10 +17,6 @@ from edqn_jax.sim.scene import Scene, signed_distance
 
 MARGIN = 1e-3
 """Metres that paths stay off contact, so that no judge's sampling or float32 finds one."""
-
-
-class MissingPackageError(ImportError):
-    """A planner's package is not installed; the message is one sentence for people."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -103,21 +99,6 @@ def load_planner(name: str) -> Planner:
     """
     module, function = PLANNERS[name].split(".")
     return getattr(importlib.import_module(f"edqn_jax.baselines.{module}"), function)
-
-
-def require(package: str) -> Any:
-    """A package or module of the extra `bench`, imported.
-
-    Raises:
-        MissingPackageError: if it is not installed.
-    """
-    try:
-        return importlib.import_module(package)
-    except ModuleNotFoundError as error:
-        name = package.split(".")[0]
-        if error.name is None or error.name.split(".")[0] != name:
-            raise
-        raise MissingPackageError(f"{name} is not installed; pip install 'edqn-jax[bench]' brings it") from error
 
 
 def found(path: npt.ArrayLike, seconds: float, steps: int) -> Plan:

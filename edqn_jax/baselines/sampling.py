@@ -19,7 +19,8 @@ from typing import Any
 
 import numpy as np
 
-from edqn_jax.baselines.planner import MARGIN, Budget, Plan, Task, not_found, path_length, refusal, require
+from edqn_jax.baselines.packages import require
+from edqn_jax.baselines.planner import MARGIN, Budget, Plan, Task, not_found, path_length, refusal
 from edqn_jax.baselines.solids import leg_free, solid_table
 
 base = require("ompl.base")

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from edqn_jax.baselines import snn
-from edqn_jax.baselines.planner import PLANNERS, MissingPackageError, load_planner, refusal, require
+from edqn_jax.baselines.packages import MissingPackageError, require
+from edqn_jax.baselines.planner import PLANNERS, load_planner, refusal
 from tests.baselines.rooms import box, room
 from tests.baselines.uninstalled import hide
 

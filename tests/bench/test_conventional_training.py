@@ -15,7 +15,7 @@ from edqn_jax.baselines.conventional.train import Steady, Trained, Training, fly
 from edqn_jax.baselines.conventional.vae import EventVAE, Learner, images
 from edqn_jax.baselines.conventional.vec_env import CodedDrones
 from edqn_jax.baselines.conventional.workers import SpreadFleet
-from edqn_jax.baselines.planner import MissingPackageError, require
+from edqn_jax.baselines.packages import MissingPackageError, require
 from edqn_jax.config import Config, ConfigError
 from edqn_jax.rundir import plain
 from edqn_jax.sim.env import OWN_SIZE, Outcome

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from edqn_jax.baselines.planner import Budget, MissingPackageError, load_planner
+from edqn_jax.baselines.packages import MissingPackageError
+from edqn_jax.baselines.planner import Budget, load_planner
 from tests.baselines.rooms import WITHOUT_A_WAY, assert_flyable, box, room
 from tests.baselines.uninstalled import hide
 

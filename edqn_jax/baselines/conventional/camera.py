@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edqn_jax.baselines.conventional.c_mujoco import mj_multi_ray
-from edqn_jax.baselines.planner import require
+from edqn_jax.baselines.packages import require
 from edqn_jax.config import CameraConfig
 from edqn_jax.sim.events import LUMA_WEIGHTS
 from edqn_jax.sim.raycast import HORIZON_M, image_plane, pitch_of, sun_direction

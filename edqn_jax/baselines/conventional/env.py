@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from edqn_jax.baselines.conventional.fleet import Course, Fleet, Record
-from edqn_jax.baselines.planner import require
+from edqn_jax.baselines.packages import require
 from edqn_jax.config import Config
 from edqn_jax.sim.env import ACTIONS, OWN_SIZE, Outcome
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-from edqn_jax.baselines.planner import require
+from edqn_jax.baselines.packages import require
 from edqn_jax.config import EventsConfig
 from edqn_jax.sim.events import max_events
 

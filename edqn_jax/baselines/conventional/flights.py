@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from edqn_jax.baselines.conventional.fleet import Course, Fleet, Record
 from edqn_jax.baselines.conventional.task import RUNNING, signed_distance
-from edqn_jax.baselines.planner import require
+from edqn_jax.baselines.packages import require
 from edqn_jax.config import Config
 from edqn_jax.flights import Closest, Flights
 

@@ -9,7 +9,7 @@ import mujoco
 import numpy as np
 
 from edqn_jax.baselines.conventional.flight import wrap_angle
-from edqn_jax.baselines.planner import require
+from edqn_jax.baselines.packages import require
 from edqn_jax.config import Config
 from edqn_jax.sim.env import Outcome
 

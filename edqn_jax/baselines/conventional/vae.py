@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from edqn_jax.baselines.planner import require
+from edqn_jax.baselines.packages import require
 from edqn_jax.config import CameraConfig, EncoderConfig
 
 torch = require("torch")

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from edqn_jax.baselines.conventional.vae import Learner, images
 from edqn_jax.baselines.conventional.workers import SpreadFleet
-from edqn_jax.baselines.planner import require
+from edqn_jax.baselines.packages import require
 from edqn_jax.config import Config
 from edqn_jax.sim.env import ACTIONS, OWN_SIZE, Outcome
 
