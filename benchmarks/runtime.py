@@ -321,8 +321,8 @@ def measure_world(asked: Asked, world: str) -> Iterator[list[Row]]:
                 rows[name]["turns"].append(turn)
             done = seed - args.first_seed + 1
             left = (time.perf_counter() - began) / done * (args.seeds - done)
-            tell(f"{world}: seed {seed} is done, about {left / 60:.0f} min to go")
             yield list(rows.values())
+            tell(f"{world}: seed {seed} is done, about {left / 60:.0f} min to go")
 
 
 def measure_rates(asked: Asked) -> dict[str, Any] | None:
@@ -361,7 +361,8 @@ def expected(asked: Asked, world: str) -> str:
     planning = args.seeds * len(drawing) * missions_of(asked, world) * args.budget
     seconds = each * len(learners) / GUESS + each * stack / STACK_GUESS + planning + 60 * len(learners)
     return (
-        f"{each * (len(learners) + stack):,} decisions to train, {planning:.0f} s to plan; about {seconds / 60:.0f} min"
+        f"{each * (len(learners) + stack):,} decisions to train, {planning:.0f} s to plan; "
+        f"about {seconds / 60:.0f} min on two cores"
     )
 
 

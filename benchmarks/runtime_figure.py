@@ -33,11 +33,20 @@ def draw_runtime(rows: Sequence[Row], file: Path) -> Figure:
     with drawing(11.0, 0.4 + len(worlds) * (1.2 + 0.21 * most), file) as figure:
         parts = figure.subfigures(len(worlds), 1, squeeze=False)[:, 0]
         for part, world in zip(parts, worlds, strict=True):
-            part.suptitle(_name(world), fontsize=11, fontweight="bold", x=0.01, ha="left")
-            line = part.subplots(1, 4, width_ratios=(1.2, 0.9, 1.1, 1.2))
-            _draw_world(line, [row for row in rows if row["world"] == world])
+            there = [row for row in rows if row["world"] == world]
+            part.suptitle(_title(world, there), fontsize=11, fontweight="bold", x=0.01, ha="left")
+            line = part.subplots(1, 4, width_ratios=(1.2, 1.0, 1.1, 1.5))
+            _draw_world(line, there)
         figure.supxlabel(_caption(rows), fontsize=7, color=MUTED, x=0.01, ha="left")
     return figure
+
+
+def _title(world: str, rows: Sequence[Row]) -> str:
+    seeds = [len(row["turns"]) for row in rows if row["turns"]]
+    if not seeds:
+        return _name(world)
+    fewest, most = min(seeds), max(seeds)
+    return f"{_name(world)}, {most if fewest == most else f'{fewest} to {most}'} seed{'s' if most > 1 else ''}"
 
 
 def _name(world: str) -> str:
@@ -48,10 +57,9 @@ def _name(world: str) -> str:
 
 def _caption(rows: Sequence[Row]) -> str:
     devices = ", ".join(dict.fromkeys(row["device"] for row in rows if row["device"]))
-    seeds = max((len(row["turns"]) for row in rows), default=0)
-    quick = ", too short to converge" if any(row["settings"].get("quick") for row in rows) else ""
+    quick = "; too short to converge" if any(row["settings"].get("quick") for row in rows) else ""
     return (
-        f"{devices}; {seeds} seeds{quick}. Blue learns and has no map, orange plans on the map. "
+        f"{devices}{quick}. Blue learns and has no map, orange plans on the map. "
         "Planning: computation alone; medians of flights that arrived. Bars: 95 % intervals."
     )
 
@@ -69,7 +77,7 @@ def _draw_world(line: Sequence[Axes], rows: Sequence[Row]) -> None:
     for label, row in zip(planning.get_yticklabels(), rows, strict=True):
         label.set_fontweight("bold" if row["name"] == OURS else "normal")
     planning.set_title("Planning, start to goal")
-    path.set_title("Flown path / shortest")
+    path.set_title("Path / shortest")
     success.set_title("Success")
     for place, row, figure in zip(places, rows, shown, strict=True):
         colour = PLANNER if row["kind"] == "planner" else LEARNER
@@ -88,10 +96,8 @@ def _draw_world(line: Sequence[Axes], rows: Sequence[Row]) -> None:
         count = f"{figure['successes']} of {figure['flights']}"
         success.annotate(count, (1.06, place), fontsize=7, color=MUTED, va="center")
     planning.set_xscale("log")
-    planning.xaxis.set_major_locator(LogLocator())
-    planning.xaxis.set_minor_locator(NullLocator())
-    planning.xaxis.set_major_formatter(FuncFormatter(lambda value, _: _time(value)))
     _widen(planning, path)
+    _tick_times(planning)
     success.set_xlim(-0.03, 1.36)
     success.set_xticks([0.0, 0.25, 0.5, 0.75, 1.0])
     success.xaxis.set_major_formatter(PercentFormatter(1.0))
@@ -117,9 +123,18 @@ def _time(seconds: float) -> str:
     return f"{seconds * 1e6:.3g} µs"
 
 
+def _tick_times(axes: Axes) -> None:
+    """Two ticks at least on a logarithmic axis of seconds."""
+    low, high = axes.get_xlim()
+    axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if high < 50 * low else (1.0,)))
+    axes.xaxis.set_minor_locator(NullLocator())
+    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: _time(value)))
+
+
 def _widen(planning: Axes, path: Axes) -> None:
-    """Room on the right for what stands beside the dots."""
+    """Room on the right for what stands beside the dots; a decade at least, or like times look apart."""
     low, high = planning.get_xlim()
+    low = min(low, high / 10)
     planning.set_xlim(low, high * (high / low) ** 0.3)
     low, high = path.get_xlim()
     path.set_xlim(low, high + 0.3 * (high - low))
@@ -142,8 +157,6 @@ def _draw_curves(axes: Axes, rows: Sequence[Row]) -> None:
                 number += 1
     if axes.get_lines():
         axes.set_xscale("log")
-        low, high = axes.get_xlim()
-        axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if high < 50 * low else (1.0,)))
-        axes.xaxis.set_minor_locator(NullLocator())
-        axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: _time(value)))
-        axes.legend(loc="best")
+        _tick_times(axes)
+        # Beside the panel: within it lines end anywhere.
+        axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0))
