@@ -25,6 +25,8 @@ import json_report
 from edqn_jax.config import Config, ConfigError
 from edqn_jax.evaluate import decision_latency_ms, fresh_policy
 from edqn_jax.files import check_can_write
+from edqn_jax.provenance import workload
+from edqn_jax.run import lay_courses
 from flags import configured, split
 
 REPEATS, CALLS = 5, 2000
@@ -55,6 +57,7 @@ def measure(config: Config, repeats: int, calls: int) -> dict[str, Any]:
     params = fresh_policy(config, 0)
     turns = [decision_latency_ms(config, params, calls) for _ in range(repeats)]
     return {
+        "workload": workload(config, lay_courses(config).scene),
         **json_report.machine(jax.devices()),
         "cores": 1,
         "decisions": repeats * calls,

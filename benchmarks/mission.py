@@ -101,8 +101,8 @@ def measure(args: argparse.Namespace) -> tuple[list[dict[str, Any]], list[dict[s
     Raises:
         ValueError: if the folder holds runs of other flags.
     """
+    asked = {"world": args.world, "flags": args.flags, "knobs": knobs(args)}  # or a sentence, and no folder
     args.out.mkdir(parents=True, exist_ok=True)
-    asked = {"world": args.world, "flags": args.flags, "knobs": knobs(args)}
     ledger = Ledger(args.out / "ledger.json", asked)
     rows, summaries = [], []
     for seed in range(args.first_seed, args.first_seed + args.seeds):

@@ -20,7 +20,7 @@ from edqn_jax.sim import camera, columns, drone, env, events, sensor
 from edqn_jax.sim.drone import DroneState
 from edqn_jax.sim.env import EnvState, World
 from edqn_jax.sim.scene import take_scene
-from timing import Part, nudged, operations_of, size_of
+from timing import Part, held, nudged, operations_of, size_of
 
 _ROWS, _SAME = PartitionSpec(AXIS), PartitionSpec()
 _LEARNER_AND_KEYS = (_ROWS, (_SAME, _ROWS))
@@ -195,12 +195,12 @@ def sensing(now: Moment) -> Part:
 
 
 def environment(now: Moment) -> Part:
-    """All of the environment's step."""
+    """All of the environment's step, always from where training has come to."""
 
     def body(world: World, carry):
         state, move = carry
-        state, step = jax.vmap(lambda s, a: env.step(now.config, world, s, a))(state, move)
-        return state, nudged(move, step.observation, step.reward)
+        flown, step = jax.vmap(lambda s, a: env.step(now.config, world, s, a))(state, move)
+        return held(state, flown, move), nudged(move, step.observation, step.reward)
 
     return Part("environment", body, now.world, (now.environments, now.moves), floor=False)
 
@@ -214,8 +214,8 @@ def environment_without_resets(now: Moment) -> Part:
         def go_on(state: EnvState, move: Array):
             return env.step(now.config, world, dataclasses.replace(state, ended=jnp.zeros((), bool)), move)
 
-        state, step = jax.vmap(go_on)(state, move)
-        return state, nudged(move, step.observation, step.reward)
+        flown, step = jax.vmap(go_on)(state, move)
+        return held(state, flown, move), nudged(move, step.observation, step.reward)
 
     carry = (now.environments, now.moves)
     return Part("environment_without_resets", body, now.world, carry, floor=False)

@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import itertools
 import math
 import statistics
 import sys
@@ -293,6 +294,7 @@ def summarise(name: str, linear: float, rows: Sequence[dict[str, Any]]) -> dict[
         "slope": slope(x, [row["us_per_decision"] for row in rows]),
         "slope_low": min(turns),
         "slope_high": max(turns),
+        "steepest": max(map(slope, itertools.pairwise(x), itertools.pairwise(row["us_per_decision"] for row in rows))),
         "slope_over_c_mujoco": slope(x, [row["c_mujoco_steps_per_decision"] for row in rows]),
         "linear_slope": linear,
         # Of all devices against as many times the first: as good as one, they all take its time for a decision.
@@ -347,7 +349,8 @@ def sentence(curve: dict[str, Any]) -> str:
     """A curve's slope for people."""
     text = (
         f"{curve['name'].capitalize()}: slope {curve['slope']:.2f} ({curve['slope_low']:.2f} to "
-        f"{curve['slope_high']:.2f}); linear growth would be {curve['linear_slope']:g}."
+        f"{curve['slope_high']:.2f}), between neighbours {curve['steepest']:.2f} at most; linear growth would be "
+        f"{curve['linear_slope']:g}."
     )
     if curve["efficiency"] is None:
         text += f" In steps of C MuJoCo, which has all cores all the time, {curve['slope_over_c_mujoco']:.2f}."

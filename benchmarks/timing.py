@@ -47,6 +47,12 @@ def nudged(value: Array, *results: Any) -> Array:
     return jnp.where(total > 1e30, value + 1, value)
 
 
+def held(before: Any, after: Any, value: Array) -> Any:
+    """`before`, in a way that the compiler must compute all of `after` for it; `value` is nowhere negative."""
+    never = jnp.any(value < 0)
+    return jax.tree.map(lambda old, new: jnp.where(never, new, old), before, after)
+
+
 class Timed:
     """A part, compiled as a loop over all devices."""
 
@@ -55,8 +61,12 @@ class Timed:
         layout = partial(jax.tree.map, lambda spec: NamedSharding(mesh, spec), is_leaf=_is_spec)
         self.inputs = tuple(_lay(x, layout(spec)) for x, spec in zip((part.stays, part.carry), part.specs, strict=True))
 
+        def turn(stays: Any, _: Any, carry: Any) -> Any:
+            # Or what does not change from turn to turn would be computed once, before them all.
+            return part.body(*jax.lax.optimization_barrier((stays, carry)))
+
         def loop(stays: Any, carry: Any, times: Array) -> Any:
-            return jax.lax.fori_loop(0, times, lambda _, c: part.body(stays, c), carry)
+            return jax.lax.fori_loop(0, times, partial(turn, stays), carry)
 
         specs = (*part.specs, PartitionSpec())
         spread = jax.shard_map(loop, mesh=mesh, in_specs=specs, out_specs=part.specs[1], check_vma=False)

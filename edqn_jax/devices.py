@@ -42,15 +42,22 @@ def compiler_options(platform: str) -> dict[str, str | bool]:
     physics step then takes longer than the rest of the step. Matrix products stay with the library. Of LLVM's
     optimisations the first level gives programs as fast as the third, and an eighth sooner.
     """
-    options: dict[str, str | bool] = {}
-    if platform == "cpu":
-        options["xla_cpu_experimental_ynn_fusion_type"] = "LIBRARY_FUSION_TYPE_DOT"
-        options["xla_backend_optimization_level"] = "1"
-    try:
-        jax.jit(lambda: 0, compiler_options=options).lower().compile()
-    except (jax.errors.JaxRuntimeError, ValueError):  # another XLA, which has no such option
+    if platform != "cpu":
         return {}
-    return options
+    wanted = {
+        "xla_cpu_experimental_ynn_fusion_type": "LIBRARY_FUSION_TYPE_DOT",
+        "xla_backend_optimization_level": "1",
+    }
+    return {name: value for name, value in wanted.items() if _has_option(name, value)}
+
+
+def _has_option(name: str, value: str) -> bool:
+    """Whether this XLA knows it; another need not."""
+    try:
+        jax.jit(lambda: 0, compiler_options={name: value}).lower().compile()
+    except (jax.errors.JaxRuntimeError, ValueError):
+        return False
+    return True
 
 
 def cores() -> int:

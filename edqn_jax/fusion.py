@@ -11,5 +11,5 @@ Tree = TypeVar("Tree")
 
 
 def materialised(tree: Tree) -> Tree:
-    """The same arrays, computed once: an exact no-op that XLA does not fuse into (and repeat in) their consumers."""
+    """The same float32 arrays, computed once: an exact no-op that XLA does not fuse into their consumers."""
     return jax.tree.map(lambda x: lax.reduce_precision(x, exponent_bits=8, mantissa_bits=23), tree)

@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import pytest
+from jax import Array
+from jax.sharding import Mesh
 
-from edqn_jax.learn.trainer import Plan, init
+from edqn_jax.learn.trainer import AXIS, Plan, init
 from edqn_jax.run import lay_courses
 from flags import configured
 from parts import PARTS, Moment, parts_of
 from tests.miniature import MINIATURE
-from timing import Part, operations, size_of
+from timing import Part, Timed, nudged, operations, size_of
 from whole import steady
 
 pytestmark = pytest.mark.slow
@@ -51,8 +55,30 @@ def test_a_scan_is_counted_once_so_physics_counts_one_step_and_multiplies(now: M
 
 def test_environments_that_have_ended_fly_on_where_resets_are_left_out(now: Moment) -> None:
     state = dataclasses.replace(now.environments, ended=jnp.ones(16, bool), decision=jnp.full(16, 7))
-    after, _ = jax.jit(PARTS["environment_without_resets"](now).body)(now.world, (state, now.moves))
+    body = jax.jit(PARTS["environment_without_resets"](now).body)
+    after, _ = body(now.world, (state, now.moves))
+    assert after.decision.tolist() == 16 * [7]  # always from where training has come to
+    after, _ = body(now.world, (state, jnp.full_like(now.moves, -1)))  # a move that there is not shows what was flown
     assert after.decision.tolist() == 16 * [8]
+
+
+def test_what_does_not_change_is_computed_in_every_turn_all_the_same() -> None:
+    def body(stays: Array, carry: tuple[Array, Array]) -> tuple[Array, Array]:
+        same, result = carry
+        return same, nudged(result, jnp.sin(stays), jnp.tan(same))
+
+    mesh = Mesh(np.asarray(jax.devices()[:1]), (AXIS,))
+    part = Part("constant", body, jnp.ones(64), (jnp.ones(64), jnp.zeros(64)))
+    program = str(Timed(part, mesh, 64).loop.as_text())
+    found = dict(re.findall(r"^(?:ENTRY )?%?([\w.-]+) \(.*?\{\n(.*?)^\}", program, re.M | re.S))
+    (entry,) = (name for name in found if name.startswith("main"))
+    once, new = {entry}, {entry}
+    while new:  # all that is called from there, but for the loop
+        new = {name for at in new for name in re.findall(r"(?:calls|to_apply)=%?([\w.-]+)", found[at])} - once
+        once |= new
+    for operation in (" sine(", " tan("):
+        places = {name for name, text in found.items() if operation in text}
+        assert places and not places & once
 
 
 def test_sampling_is_a_part_of_what_the_replay_does(now: Moment) -> None:

@@ -378,7 +378,7 @@ def encode(config: EncoderConfig, params: Params, sensed: EventField | Array) ->
     """
     fields = isinstance(sensed, EventField)
     height, width = (sensed.count if fields else sensed).shape[-2:]
-    encoder = Encoder(_as_saved(config, params), height, width, EVENT_CHANNELS if fields else PICTURE_CHANNELS)
+    encoder = Encoder(_of_kind(config, params), height, width, EVENT_CHANNELS if fields else PICTURE_CHANNELS)
     method = Encoder.dense if fields else Encoder.picture
     return encoder.apply({"params": params["encoder"]}, sensed, method=method)  # type: ignore
 
@@ -390,7 +390,7 @@ def encode_events(
 
     `tau` is 0 at the window's start and 1 at its end; p = 0 marks a place without event.
     """
-    encoder = Encoder(_as_saved(config, params), camera.height, camera.width)
+    encoder = Encoder(_of_kind(config, params), camera.height, camera.width)
     return encoder.apply({"params": params["encoder"]}, x, y, tau, p, method=Encoder.sparse)  # type: ignore
 
 
@@ -400,13 +400,13 @@ def tabulated(config: EncoderConfig, camera: CameraConfig, params: Params) -> Pa
     What no longer learns need not compute them anew from each field or picture.
     """
     channels = params["decoder"]["bias"].shape[-3]
-    encoder = Encoder(_as_saved(config, params), camera.height, camera.width, channels)
+    encoder = Encoder(_of_kind(config, params), camera.height, camera.width, channels)
     table = encoder.apply({"params": params["encoder"]}, method=lambda encoder: encoder.pixels.everywhere())
     return {**params, "encoder": {**params["encoder"], "pixels": {"table": table}}}
 
 
-def _as_saved(config: EncoderConfig, params: Params) -> EncoderConfig:
-    """`config` with the pixel features that the parameters are of: those that act are tables."""
+def _of_kind(config: EncoderConfig, params: Params) -> EncoderConfig:
+    """`config` with the kind of pixel features that these parameters have: of what acts they are a table."""
     tables = "table" in params["encoder"]["pixels"]
     return dataclasses.replace(config, pixel_features="table") if tables else config
 

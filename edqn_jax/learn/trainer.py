@@ -43,7 +43,7 @@ class Learner:
 
     vae: Params  # what learns; {} for a sensor whose image is not encoded
     vae_optimiser: Any
-    encoder: Params  # what acts: the VAE as it was when the warm-up ended
+    encoder: Params  # what acts: the VAE as the warm-up left it, its pixel features a table
     q: Params
     target: Params
     average: Params  # Polyak average that evaluation flies
@@ -324,7 +324,9 @@ def learn_to_act(config: Config, axis: str | None, learner: Learner, ring, time:
 
     # All of a network as one vector: what is done to each number of it is one operation, and not one for each layer.
     _, tree = ravel_pytree(learner.q)
-    vector = lambda params: ravel_pytree(params)[0]  # noqa: E731
+
+    def vector(params: Params) -> Array:
+        return ravel_pytree(params)[0]
 
     def loss(q: Array, target: Array, batch: replay.Batch):
         return dqn.batch_loss(agent, tree(q), tree(target), len(ACTIONS), batch)

@@ -92,7 +92,7 @@ def picture(
 
 
 # A primitive, so that the pictures are traced once, where a program is lowered, and not at every `vmap` on the way
-# there (docs/decisions/0010). Its arguments are the leaves of `_pictures`, its rule of mapping a reshape.
+# there (docs/decisions/0011). Its arguments are the leaves of `_pictures`, its rule of mapping a reshape.
 _pictures_p = Primitive("pictures")
 
 
