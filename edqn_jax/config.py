@@ -187,7 +187,7 @@ class EncoderConfig:
     warmup_decisions: int = 16_384
     """Decisions of held random manoeuvres in which the VAE learns before the DQN starts; a quarter of all at most.
     None for the sensors `ranges` and `blind`, which have no VAE."""
-    warmup_updates_per_step: int = 12
+    warmup_updates_per_step: int = 6
     """VAE updates per training step of the warm-up, each on all new event fields."""
     hold_decisions: int = 4
     """Mean number of decisions for which a random manoeuvre of the warm-up is held."""
@@ -220,7 +220,7 @@ class AgentConfig:
     """Polyak tau of the target network, per update."""
     average_rate: float = 0.002
     """Polyak rate, per update, of the averaged parameters that evaluation flies; 1 flies the newest."""
-    learning_rate: float = 1e-3
+    learning_rate: float = 2e-3
     """Adam step size at the start."""
     final_learning_rate: float = 1e-4
     """Adam step size at the end of training (linear decay)."""
@@ -312,6 +312,7 @@ def preset(name: str) -> Config:
         return dataclasses.replace(
             Config(),
             events=EventsConfig(threshold=0.1, tolerance=0.1, contrast_on=0.1, contrast_off=0.1),
+            encoder=EncoderConfig(warmup_updates_per_step=12),
             env=EnvConfig(
                 reward="sparse", progress_weight=1.0, path_weight=0.0, left_volume_reward=0.0, step_reward=0.0
             ),

@@ -23,11 +23,12 @@ Layer = Mapping[str, Mapping[str, Any]]
 
 RANDOM_WORLDS: Layer = {
     "train": {"total_steps": 3_200_000},
-    "agent": {"updates_per_step": 4, "target_rate": 0.02},
+    "encoder": {"warmup_updates_per_step": 12},
+    "agent": {"updates_per_step": 4, "target_rate": 0.02, "learning_rate": 1e-3},
     "events": {"threshold": 0.03, "tolerance": 0.03},
 }
-"""What random worlds ask for: more decisions, fewer updates for each, and a sensor that sees fainter edges,
-since there only events tell where obstacles are."""
+"""What random worlds ask for: more decisions, fewer and smaller updates for each, and a sensor that sees fainter
+edges and a VAE that has learnt longer, since there only events tell where obstacles are."""
 
 
 def world_layer(world: str) -> Layer:
