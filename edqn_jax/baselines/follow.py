@@ -3,9 +3,9 @@
 Every decision the follower commands a velocity towards a point ahead of it on the path, of at most
 `env.speed_m_s`, which is what a learner has along each axis: the same airframe, controller, period of decisions and
 judge. It goes towards the furthest point within reach for which the straight way there stays within a tolerance of
-the path. So it flies straight legs fast, slows down before corners, and cuts them by no more than planners leave
-room for: they are given `reserved` tasks. (Pure pursuit, Coulter, CMU-RI-TR-92-01, with a look-ahead that corners
-shorten.)
+the path, or no further off it than the drone is by now. So it flies straight legs fast, slows down before corners,
+and cuts them by no more than planners leave room for: they are given `reserved` tasks. (Pure pursuit, Coulter,
+CMU-RI-TR-92-01, with a look-ahead that corners shorten.)
 """
 
 from __future__ import annotations
@@ -89,7 +89,8 @@ def steer(
     last = points.shape[0] - 1
     near = jnp.minimum(nearest + jnp.arange(window), last)
     here = state.position
-    nearest = near[jnp.argmin(jnp.sum((points[near] - here[None]) ** 2, axis=1))]
+    away = jnp.sqrt(jnp.sum((points[near] - here[None]) ** 2, axis=1))
+    nearest = near[jnp.argmin(away)]
 
     ahead = points[jnp.minimum(nearest + 1 + jnp.arange(reach), last)] - here[None]  # [R, 3]
     length = jnp.sqrt(jnp.sum(ahead**2, axis=1) + 1e-9)
@@ -98,8 +99,8 @@ def steer(
     off = ahead[None] - along[..., None] * (ahead / length[:, None])[:, None]
     passed = jnp.tril(jnp.ones((reach, reach), bool))
     worst = jnp.max(jnp.where(passed, jnp.sqrt(jnp.sum(off**2, axis=-1)), 0.0), axis=1)
-    # Off the path it must get back first: what it is off by now is no reason to stop.
-    allowed = worst <= jnp.maximum(follow.tolerance_m, worst[0])
+    # Off the path it comes back at a slant, not squarely: what it is off by now is no reason to turn.
+    allowed = worst <= jnp.maximum(follow.tolerance_m, jnp.min(away))
     furthest = jnp.max(jnp.where(allowed, jnp.arange(reach), 0))
 
     wanted = (ahead[furthest] - follow.lag_s * state.velocity) / follow.horizon_s

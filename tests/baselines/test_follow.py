@@ -51,6 +51,20 @@ def test_through_gaps_it_stays_on_the_path_as_closely_as_the_reserve_asks():
     assert flight.closest.distance > 0.1
 
 
+def test_beside_a_straight_path_it_comes_back_without_crossing_it_by_more_than_the_tolerance():
+    points = sampled(np.array([(0.0, 6.0, 3.0), (12.0, 6.0, 3.0)]))
+    fly = jax.jit(lambda state, command: drone.fly(CONFIG.drone, AIRFRAME, state, command, jnp.zeros(())))
+    state, nearest = drone.hover(jnp.array([1.0, 7.0, 3.0]), jnp.array(0.0)), np.int32(0)
+    beside = []
+    while nearest < 100 and len(beside) < 40:
+        command, nearest = _steer()(points, nearest, state)
+        state, flight = fly(state, command)
+        beside += [float(y) - 6.0 for y in flight.position[:, 1]]
+    assert nearest >= 100  # it has not stopped beside the path
+    assert min(beside) > -FOLLOW.tolerance_m
+    assert abs(beside[-1]) < FOLLOW.tolerance_m
+
+
 def test_a_path_through_a_wall_is_a_collision_at_the_wall():
     flight = flown(CHICANE, [CHICANE.start, CHICANE.goal])
     assert flight.outcome == Outcome.COLLISION
