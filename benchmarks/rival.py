@@ -8,7 +8,6 @@ how that went.
 from __future__ import annotations
 
 import json
-import resource
 import sys
 from pathlib import Path
 from typing import Any, TextIO
@@ -24,18 +23,14 @@ from edqn_jax.resolve import apply, load_layer
 from edqn_jax.rundir import plain
 from learners import Learner
 from planning import Planning
+from resident import peak_of
 from stack import STACK, STEADY, Stack
 
 
-def peak_bytes() -> dict[str, int | None]:
-    """The most memory held so far, of this process and the largest that it started, and on an accelerator, if any."""
-    unit = 1 if sys.platform == "darwin" else 1024
-    held = sum(resource.getrusage(who).ru_maxrss for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
+def peak_bytes(workers: int) -> dict[str, int | None]:
+    """The most memory held so far, by this process and the `workers` bytes of others, and on an accelerator, if any."""
     stats = jax.devices()[0].memory_stats() or {}
-    return {
-        "peak_bytes": unit * held,
-        "device_peak_bytes": stats.get("peak_bytes_in_use"),
-    }
+    return {"peak_bytes": (peak_of() or 0) + workers, "device_peak_bytes": stats.get("peak_bytes_in_use")}
 
 
 def method(name: str, config: Config, seconds: float, missions: int) -> Any:
@@ -66,7 +61,9 @@ def main(stream: TextIO) -> None:
         return
     say(rival.about)
     for line in sys.stdin:
-        say({**rival.turn(int(line)), **peak_bytes()})
+        turn = rival.turn(int(line))
+        workers = turn.pop("workers_peak_bytes", 0)
+        say({**turn, **peak_bytes(workers)})
 
 
 if __name__ == "__main__":

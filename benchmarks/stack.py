@@ -22,6 +22,7 @@ from edqn_jax.provenance import workload
 from edqn_jax.run import lay_courses
 from edqn_jax.sim.env import OWN_SIZE, World
 from learners import Watched
+from resident import peak_of_workers
 from whole import WholeStep, steady
 
 STACK = "Conventional stack"
@@ -64,16 +65,19 @@ class Stack:
         return self.stack.fly(trained, self.course(world))
 
     def turn(self, seed: int) -> dict[str, Any]:
-        """One seed, trained and flown: see `Watched.turn`."""
+        """One seed, trained and flown: see `Watched.turn`; and `workers_peak_bytes`, of its other processes."""
         config = dataclasses.replace(self.config, train=dataclasses.replace(self.config.train, seed=seed))
         watched = Watched(config, self.courses, self._fly)
-        trained = self.stack.train(
-            config,
-            self.course(self.courses.training),
-            *self.setting,
-            lambda trained: watched.validate(trained, trained.decisions, trained.seconds),
-        )
-        return watched.turn(seed, trained.decisions, trained.seconds, self._decision_seconds)
+        workers = 0
+
+        def watch(trained: Any) -> None:
+            nonlocal workers
+            workers = peak_of_workers()  # while they run: after the training they are gone
+            watched.validate(trained, trained.decisions, trained.seconds)
+
+        trained = self.stack.train(config, self.course(self.courses.training), *self.setting, watch)
+        turn = watched.turn(seed, trained.decisions, trained.seconds, self._decision_seconds)
+        return {**turn, "workers_peak_bytes": workers}
 
     def _decision_seconds(self, trained: Any, calls: int) -> np.ndarray:
         """Seconds [calls] of each decision of one drone, from arrays on the host to a move."""

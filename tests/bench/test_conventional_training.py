@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import conventional
+import stack
 from edqn_jax.baselines.conventional.fleet import Record
 from edqn_jax.baselines.conventional.train import Steady, Trained, Training, fly, train
 from edqn_jax.baselines.conventional.vae import EventVAE, Learner, images
@@ -281,6 +282,15 @@ def test_the_command_says_what_it_measured(monkeypatch, tmp_path, capsys):
     assert report["workload"]["replayed_samples_per_decision"] == 4 and report["workload"]["physics"] == "c_mujoco"
     assert "torch" in report["versions"] and plain(report) == report
     assert "| rays |" in capsys.readouterr().out
+
+
+@pytest.mark.slow
+def test_beside_its_flights_a_seed_tells_what_its_other_processes_held(monkeypatch):
+    monkeypatch.setattr(stack.Stack, "_fastest", lambda self: (2, 1))
+    turn = stack.Stack(SHORT).turn(0)
+    assert turn["decisions"] == 1024 and len(turn["flights"]["outcome"]) == 1
+    # Another process that has imported JAX, MuJoCo and numba.
+    assert turn["workers_peak_bytes"] > 50e6
 
 
 @pytest.mark.parametrize("package", ["gymnasium", "numba", "stable_baselines3", "torch"])
