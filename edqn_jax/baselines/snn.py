@@ -341,7 +341,10 @@ def solve(
     network = synapses(scene, radius, shape, cell)
     near_start, near_goal = (cells_at(scene, network, point, radius, cell) for point in (start, goal))
     hops, taken = spike_wave(config, network, near_goal, near_start, steps)
-    first = jnp.argmin(jnp.where(near_start & (hops >= 0), hops, jnp.iinfo(hops.dtype).max))
+    # Several cells are as few hops away: of these the one that lies most on the way, or the path may begin backwards.
+    heard = jnp.where(near_start & (hops >= 0), hops, jnp.iinfo(hops.dtype).max)
+    detour = sum(jnp.sqrt(jnp.sum((network.middles - end[None, None, None]) ** 2, axis=-1)) for end in (start, goal))
+    first = jnp.argmin(jnp.where(heard == jnp.min(heard), detour, jnp.inf))
     begin = jnp.stack(jnp.unravel_index(first, shape)).astype(jnp.int32)
     cells, count, arrived = follow(config, network, hops, begin, near_goal)
     return Walk(network.middles[tuple(cells.T)], count, arrived, jnp.any(near_start & (hops >= 0)), taken)

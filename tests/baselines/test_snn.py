@@ -196,6 +196,16 @@ def test_every_path_in_a_small_room_is_free(seed):
     assert len(plan.path) == plan.steps + 3
 
 
+# In both the hops count along x alone; in the second the start is as far from all cells around it.
+@pytest.mark.parametrize(("start", "goal"), [((2.4, 2.4, 2.9), (10.4, 8.4, 2.9)), ((2.0, 2.0, 3.0), (10.0, 8.0, 3.0))])
+def test_the_path_does_not_begin_backwards(start, goal):
+    task = room(start=start, goal=goal)
+    path = snn.plan(task).path
+    assert path is not None
+    assert np.linalg.norm(task.goal - path[1]) < np.linalg.norm(task.goal - task.start)
+    assert np.all(path[1, :2] > task.start[:2])
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("world", ["paper", "medium 0", "medium 1", "dense 0", "dense 1", "dense 2"])
 def test_every_path_in_a_large_world_is_free(world):
