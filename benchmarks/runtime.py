@@ -22,6 +22,7 @@ import dataclasses
 import functools
 import hashlib
 import json
+import math
 import multiprocessing
 import sys
 import tempfile
@@ -107,7 +108,7 @@ def parse(argv: Sequence[str] | None = None) -> Asked:
     parser.add_argument("--methods", nargs="+", default=list(METHODS), metavar="NAME", help=f"of {', '.join(METHODS)}")
     parser.add_argument("--worlds", nargs="+", default=list(WORLDS), metavar="WORLD", help="as --world of train.py")
     parser.add_argument("--seeds", type=int, help=f"how many (default {SEEDS}, quick {QUICK_SEEDS}); 0 runs nothing")
-    parser.add_argument("--first-seed", type=int, default=0, metavar="SEED")
+    parser.add_argument("--first-seed", type=int, default=0, metavar="SEED", help="the others follow it (default 0)")
     parser.add_argument(
         "--budget", type=float, metavar="SECONDS", help=f"of a plan (default {BUDGET_SECONDS}, quick "
         f"{QUICK_BUDGET_SECONDS}); only RRT* and BIT* use it up",
@@ -126,8 +127,11 @@ def parse(argv: Sequence[str] | None = None) -> Asked:
     for name in ("seeds", "first_seed"):
         if getattr(args, name) < 0:
             raise ConfigError(f"--{name.replace('_', '-')} must be at least 0, not {getattr(args, name)}")
-    if not args.budget > 0:
-        raise ConfigError(f"--budget must be more than 0 seconds, not {args.budget:g}")
+    if not 0 < args.budget < math.inf:
+        raise ConfigError(f"--budget must be a finite number of seconds, more than 0, not {args.budget:g}")
+    check_worlds(args.worlds)
+    if args.figure is not None and args.figure.suffix != ".png":
+        raise ConfigError(f"--figure must end in .png, not '{args.figure}'")
     for file in (args.json, args.figure):
         if file is not None:
             check_can_write(file)
@@ -135,6 +139,15 @@ def parse(argv: Sequence[str] | None = None) -> Asked:
     joined(row for report in added for row in report["rows"])  # or a sentence, before anything is measured
     configs = {world: configured(world, flags, args.quick) for world in (args.worlds if args.seeds else [])}
     return Asked(args, configs, flags, added)
+
+
+def check_worlds(worlds: Sequence[str]) -> None:
+    """Raises ConfigError where two worlds would have rows of the same name."""
+    named: dict[str, str] = {}
+    for world in worlds:
+        other = named.setdefault(Path(world).name, world)
+        if other != world:
+            raise ConfigError(f"'{other}' and '{world}' would have rows of the same name; rename one of the files")
 
 
 def configured(world: str, flags: Sequence[str], quick: bool) -> Config:
@@ -159,7 +172,7 @@ def read(file: Path) -> dict[str, Any]:
     """
     try:
         report = json.loads(file.read_text(encoding="utf-8"))
-        if report["benchmark"] == "runtime":
+        if report["benchmark"] == "runtime" and all(isinstance(report[part], list) for part in ("rows", "rates")):
             return report
     except OSError as error:
         raise ConfigError(f"'{file}' cannot be read: {error.strerror}") from None
@@ -230,19 +243,20 @@ def launched(
 def blank(asked: Asked, world: str, name: str) -> Row:
     """The row of a method that has not run."""
     planner, config = name in PLANNERS, asked.configs[world]
-    # Rows of other knobs are other rows, whatever their name.
-    knobs = hashlib.sha256(to_yaml(config).encode()).hexdigest()[:16]
     own = (
         {"budget_seconds": asked.words.budget, "missions": missions_of(asked, world)}
         if planner
-        else {"decisions": config.train.total_steps, "num_envs": config.train.num_envs, "knobs": knobs}
+        else {"decisions": config.train.total_steps, "num_envs": config.train.num_envs}
     )
+    # Rows of other knobs are other rows, whatever their name. A planner has no agent, camera or encoder.
+    of_flight = dataclasses.replace(Config(), world=config.world, drone=config.drone, env=config.env)
+    knobs = hashlib.sha256(to_yaml(of_flight if planner else config).encode()).hexdigest()[:16]
     return {
         "name": name,
         "world": Path(world).name,
         "kind": "planner" if planner else "learner",
         "knows_map": planner,
-        "settings": {"quick": asked.words.quick, **own},
+        "settings": {"quick": asked.words.quick, **own, "knobs": knobs},
         "device": None,
         "devices": [],
         "versions": {},
@@ -346,8 +360,14 @@ def measure_rates(asked: Asked) -> dict[str, Any] | None:
                 return report
         for number in range(QUICK_TURNS if args.quick else TURNS):
             for name, child in children.items():
-                for setting, rate in child.ask(str(number))["decisions_per_second"].items():
-                    report["turns"].setdefault(f"{name.partition(',')[0]}, {setting}", []).append(rate)
+                method = name.partition(",")[0]
+                try:
+                    rates = child.ask(str(number))["decisions_per_second"]
+                except ChildEndedError as error:
+                    report["reason"] = f"{method}: it ended in turn {number}: {error}"
+                    return report
+                for setting, rate in rates.items():
+                    report["turns"].setdefault(f"{method}, {setting}", []).append(rate)
     return report
 
 

@@ -282,6 +282,22 @@ def test_training_rates_are_taken_in_turns_and_the_best_setting_counts(
     assert capsys.readouterr().out == shown
 
 
+def test_a_child_that_ends_while_rates_are_taken_is_told_and_the_table_is_still_there(
+    faked: type[Fake], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Doomed(Fake):
+        def ask(self, line: str) -> dict[str, Any]:
+            if self.name in stack.STEADY and line == "1":
+                raise ChildEndedError("Killed")
+            return super().ask(line)
+
+    monkeypatch.setattr(runtime, "Child", Doomed)
+    monkeypatch.setattr(runtime, "measure_world", lambda asked, world: iter([[row("A*", [turn(0, flights("goal"))])]]))
+    assert runtime.main(["--worlds", "paper", "--methods", "E-DQN", "Conventional stack"]) == 0
+    shown = capsys.readouterr().out
+    assert "| A* |" in shown and "- Conventional stack: it ended in turn 1: Killed." in shown
+
+
 def test_rates_that_could_not_be_measured_say_why() -> None:
     shown = runtime_table.rates_table({"turns": {}, "reason": "Conventional stack: torch is not installed"})
     assert shown.endswith("- Conventional stack: torch is not installed.")
@@ -326,7 +342,10 @@ def test_where_there_is_no_way_learners_are_not_trained(
         (["--methods", "A"], "there is no method 'A'; did you mean 'A*'?"),
         (["--worlds", "papper"], "papper"),
         (["--seeds", "-1"], "--seeds must be at least 0, not -1"),
-        (["--budget", "0"], "--budget must be more than 0 seconds, not 0"),
+        (["--budget", "0"], "--budget must be a finite number of seconds, more than 0, not 0"),
+        (["--budget", "inf"], "--budget must be a finite number of seconds, more than 0, not inf"),
+        (["--worlds", "a/w.xml", "b/w.xml"], "'a/w.xml' and 'b/w.xml' would have rows of the same name"),
+        (["--figure", "rows.pdf"], "--figure must end in .png, not 'rows.pdf'"),
         (["--json", "no/such/folder/file.json"], "there is no folder"),
         (["--add", "no_such_file.json"], "'no_such_file.json' cannot be read: No such file"),
         (["--seeds", "0", "--add", __file__], "holds no rows of this benchmark"),
@@ -340,6 +359,29 @@ def test_bad_input_is_one_sentence_and_exit_code_2(
     told = capsys.readouterr().err
     assert message in told and told.count("\n") == 1
     assert not faked.asked
+
+
+@pytest.mark.parametrize("report", [{}, {"rows": []}, {"rows": {}, "rates": []}])
+def test_a_report_without_rows_is_none_of_this_benchmark(
+    report: dict[str, Any], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = tmp_path / "rows.json"
+    file.write_text(json.dumps({"benchmark": "runtime", **report}))
+    assert runtime.main(["--seeds", "0", "--add", str(file)]) == 2
+    assert capsys.readouterr().err == f"'{file}' holds no rows of this benchmark\n"
+
+
+def test_rows_of_other_knobs_are_other_rows(clear: Path) -> None:
+    def settings(name: str, *flags: str) -> dict[str, Any]:
+        return runtime.blank(runtime.parse(["--worlds", str(clear), "--", *flags]), str(clear), name)["settings"]
+
+    body, agent = ("--drone.body-radius-m", "0.3"), ("--agent.learning-rate", "0.003")
+    for name in ("A*", "E-DQN"):
+        assert settings(name) == settings(name)
+        assert settings(name, *body) != settings(name)
+        assert settings(name, "--env.goal-radius-m", "3.0") != settings(name)
+    assert settings("E-DQN", *agent) != settings("E-DQN")
+    assert settings("A*", *agent) == settings("A*")  # it has none
 
 
 def test_the_script_states_its_length(capsys: pytest.CaptureFixture[str]) -> None:
