@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import io
 import json
@@ -296,6 +297,23 @@ def test_a_child_that_ends_while_rates_are_taken_is_told_and_the_table_is_still_
     assert runtime.main(["--worlds", "paper", "--methods", "E-DQN", "Conventional stack"]) == 0
     shown = capsys.readouterr().out
     assert "| A* |" in shown and "- Conventional stack: it ended in turn 1: Killed." in shown
+
+
+def test_one_slow_turn_does_not_choose_the_setting_of_the_conventional_stack(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Timed(contextlib.ExitStack):
+        rates = ((2000.0, 3000.0, 3300.0), (9000.0, 3100.0, 3200.0), (2000.0, 3000.0, 100.0))
+
+        def __init__(self, config: Config, decisions: int) -> None:
+            super().__init__()
+
+        def turn(self, number: int) -> dict[str, Any]:
+            return {"decisions_per_second": dict(zip("abc", self.rates[number], strict=True))}
+
+    monkeypatch.setattr(stack, "SteadyStack", Timed)
+    method = object.__new__(stack.Stack)
+    method.config = Config()
+    # Medians are 2000, 3000 and 3200; the first turn alone, the best, and the mean would choose others.
+    assert method._fastest() == stack.SETTINGS[2]
 
 
 def test_rates_that_could_not_be_measured_say_why() -> None:
