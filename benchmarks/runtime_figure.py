@@ -60,7 +60,8 @@ def _caption(rows: Sequence[Row]) -> str:
     quick = "; too short to converge" if any(row["settings"].get("quick") for row in rows) else ""
     return (
         f"{devices}{quick}. Blue learns and has no map, orange plans on the map. "
-        "Planning: computation alone; medians of flights that arrived. Bars: 95 % intervals."
+        "Planning: computation alone; medians of flights that arrived. Bars: 95 % intervals.\n"
+        "DQN depth and DQN ranges have true sensors: upper bounds. The paper's world is our reconstruction."
     )
 
 
@@ -145,7 +146,7 @@ def _draw_curves(axes: Axes, rows: Sequence[Row]) -> None:
     axes.set_title("Validation missions flown")
     axes.set_ylim(-0.03, 1.03)
     axes.yaxis.set_major_formatter(PercentFormatter(1.0))
-    axes.set_xlabel("training, logarithmic")
+    axes.set_xlabel("training time (log scale)")
     for row in rows:
         colour, number = CURVES.get(row["name"], INK), 0
         for turn in row["turns"] if row["kind"] == "learner" else []:

@@ -32,23 +32,27 @@ EXPLAINED = """\
 - Trains: seconds of training, and decisions, until the first validation in which nine of ten missions from the
   world's own start, or near it, are flown; medians over seeds, "never" where the median seed never does. Compilation
   and validation are not counted.
+- DQN depth and DQN ranges have true sensors, which no drone has: they are upper bounds.
 - Plans: computation from start to goal, without simulation and compilation. For a learner the sum over a flight of
   its decisions, one by one, from an observation on the host to a move there; for a planner until its first path.
 - Flies (simulated seconds), decisions, path: medians of the flights that reached the goal, as is what is said of plans;
   they end within its radius, the shortest path, A*'s, at the goal itself. Clearance is the least of these flights.
+  Planners' paths are flown at 4 m/s at most in all, learners fly up to 4 m/s along each axis, 6.9 m/s along a diagonal
+  of all three: times of flight compare only with that in mind.
 - Planned: the path as drawn; for those that improve it the first one and the one at the end of the budget. Planners
   keep a reserve beyond the body's radius, for the airframe that then flies their paths under the same judge.
 - Success: Wilson's interval, 95 %; over seeds and missions, a bootstrap of both. A planner that draws nothing counts
   once.
-- Memory: the most that the method's own process held, JAX and the airframe included, plus what it held on an
-  accelerator."""
+- Memory: the most that the method's own process and its workers, if any, held, JAX and the airframe included, plus
+  what it held on an accelerator."""
 
 PARAGRAPH = """\
-The paper calls these figures "run time" and does not say what ran. 41.364 s over its flight of 188 steps is 0.22 s a
-step, so they are probably the time that it took to fly the plan through a simulator's API: nearer to "flies" than
-to "plans", and not the time to learn. A method would then be faster because its path is shorter or its simulator
-quicker, not because it computes less. They are of one run each, on the authors' map and machine, without an interval:
-they can stand beside ours, but no ratio of the two means anything."""
+The paper says that "the running time of the entire planning process was 41.364 s" and calls these figures
+path-planning time, but not what was computed in it. Over its flight of 188 steps 41.364 s is 0.22 s a step, so
+probably the time that it took to fly the plan through a simulator's API is in it: it is then nearer to "flies" than
+to "plans", and a method is faster because its path is shorter or its simulator quicker, not because it computes
+less. The time to learn it can hardly be. The figures are of one run each, on the authors' map and machine, without
+an interval: they can stand beside ours, but no ratio of the two means anything."""
 
 
 def text(rows: Sequence[Row], rates: Sequence[dict[str, Any]]) -> str:
@@ -124,7 +128,8 @@ def worth_table(one: Worth) -> str:
         f"## What events are worth: {one.world}, {one.device}",
         "",
         f"Equal decisions are {one.decisions:,}; equal wall time is {one.seconds:.1f} s of training, what the "
-        "fastest needed for them.",
+        "fastest needed for them, without compilation. It stops the slower ones in the middle of their schedules of "
+        "exploration and learning rate, which are laid over all decisions.",
         "",
         "| learner | seeds | at equal decisions | at equal wall time |",
         "| --- | ---: | ---: | ---: |",
