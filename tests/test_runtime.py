@@ -277,7 +277,7 @@ def test_training_rates_are_taken_in_turns_and_the_best_setting_counts(
     assert "| E-DQN / Conventional stack, its best | 30.0 |" in shown
     assert "| Conventional stack, one process | 290 |" in shown
     (rates,) = json.loads(file.read_text())["rates"]
-    assert rates["turns"]["E-DQN, a setting"] == [9000.0, 9001.0]
+    assert rates["turns"]["E-DQN, a setting"] == [9000.0]
     # Read again they are shown again.
     assert runtime.main(["--seeds", "0", "--add", str(file)]) == 0
     assert capsys.readouterr().out == shown
@@ -340,10 +340,11 @@ def test_what_has_been_measured_is_on_the_disk_after_each_seed(
 def test_quick_rows_are_marked_as_not_converged(
     faked: type[Fake], clear: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert runtime.main(["--quick", "--worlds", str(clear), "--methods", "E-DQN", "A*"]) == 0
+    assert runtime.main(["--quick", "--worlds", str(clear), "--methods", "E-DQN", "A*", "Conventional stack"]) == 0
     shown, told = capsys.readouterr()
-    assert "120,000 decisions to train" in told
+    assert "240,000 decisions to train" in told
     assert "| E-DQN (not converged) |" in shown and "| A* |" in shown
+    assert "| Conventional stack (not converged) | no | 40.0 (1,000) |" in shown
 
 
 def test_where_there_is_no_way_learners_are_not_trained(
