@@ -161,6 +161,14 @@ def test_ended_drones_keep_their_last_observation_and_only_time_outs_are_truncat
     assert learner.samples == 4
 
 
+def test_drones_answer_for_all_at_once_and_have_no_methods_of_their_own():
+    drones = CodedDrones(CONFIG, Still(4), Learner(CONFIG.encoder, CONFIG.camera, seed=0))  # type: ignore[arg-type]
+    drones.set_attr("updates", 3)
+    assert drones.get_attr("updates", indices=[0, 2]) == [3, 3] and drones.get_attr("updates") == [3] * 4
+    with pytest.raises(AttributeError, match="^a drone has no method of its own, so no 'land'$"):
+        drones.env_method("land")
+
+
 def miniature() -> Config:
     return conventional.parse(["--", *MINIATURE])[1]
 

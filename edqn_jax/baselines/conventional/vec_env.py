@@ -92,8 +92,12 @@ class CodedDrones(vec_env.VecEnv):
         setattr(self, attr_name, value)
 
     def env_method(self, method_name: str, *method_args: Any, indices: Any = None, **method_kwargs: Any) -> list[Any]:
-        """None is there to be called."""
-        raise NotImplementedError(f"a drone has no method of its own, so no '{method_name}'")
+        """None is there to be called.
+
+        Raises:
+            AttributeError: always, as `get_attr` does for what is not there.
+        """
+        raise AttributeError(f"a drone has no method of its own, so no '{method_name}'")
 
     def env_is_wrapped(self, wrapper_class: type, indices: Any = None) -> list[bool]:
         """None is."""
