@@ -20,8 +20,11 @@ from edqn_jax.sim.env import Outcome
 from edqn_jax.sim.mjcf import check_scene, load_world, resolve_world
 from edqn_jax.sim.scene import Scene, take_scene
 
-DRAWING = "RRT*", "BIT*"
-"""Planners that draw at random and shorten their path until the budget is spent; the others give one path."""
+IMPROVING = "RRT*", "BIT*"
+"""Planners that shorten their path until the budget is spent; the others give one path."""
+
+DRAWING = (*IMPROVING, "RRT* first path", "BIT* first path")
+"""Planners that draw at random."""
 
 NOT_FLOWN = {"outcome": "no_path", "decisions": 0, "flight_seconds": 0.0, "path_length_m": 0.0, "clearance_m": None}
 
@@ -74,8 +77,8 @@ class Planning:
         """Every mission planned and flown.
 
         Returns:
-            `flights`: as of a learner, with the reason where there is no path. `planning_seconds` is when
-            the first path was known, `planned_m` is what was flown, `first_m` the first path's length.
+            `flights`: as of a learner, with the reason where there is no path. `planning_seconds` is what it
+            took to plan what was flown, `planned_m` how long that path is as drawn.
         """
         count = len(self.scenes)
         missions = [self._mission(scene, seed * count + index) for index, scene in enumerate(self.scenes)]
@@ -85,15 +88,9 @@ class Planning:
         config, follow = self.config, FollowConfig()
         task = Task.of(scene, body_radius=config.drone.body_radius_m, goal_radius=config.env.goal_radius_m)
         plan = self.plan(reserved(task, follow), self.budget, seed)
-        said = {
-            "reason": plan.reason,
-            "planning_seconds": plan.first_seconds if plan.found else plan.seconds,
-            "all_seconds": plan.seconds,
-            "first_m": plan.first_length_m,
-            "planned_m": plan.length_m,
-        }
+        said = {"reason": plan.reason, "planning_seconds": plan.seconds}
         if plan.path is None:
-            return {**NOT_FLOWN, **said, "first_m": None, "planned_m": None}
+            return {**NOT_FLOWN, **said, "planned_m": None}
         goal, points = np.float32(task.goal), sampled(plan.path)
         flown = jax.device_get(self.follower(config, follow, self.airframe, scene, goal, points))
         return {
@@ -103,4 +100,5 @@ class Planning:
             "path_length_m": float(flown.path_length_m),
             "clearance_m": float(flown.closest.distance),
             **said,
+            "planned_m": plan.length_m,
         }

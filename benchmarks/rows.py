@@ -82,7 +82,6 @@ def figures(row: Row) -> dict[str, Any]:
         "flight_seconds": _median([flight["flight_seconds"] for flight in good]),
         "decisions": _median([flight["decisions"] for flight in good]),
         "path_over_shortest": _median([_ratio(flight, "path_length_m") for flight in good]),
-        "first_over_shortest": _median([_ratio(flight, "first_m") for flight in planned]),
         "planned_over_shortest": _median([_ratio(flight, "planned_m") for flight in planned]),
         "clearance_m": min((flight["clearance_m"] for flight in good), default=None),
         "peak_bytes": max(turn["peak_bytes"] for turn in turns),

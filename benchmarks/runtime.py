@@ -48,7 +48,7 @@ from edqn_jax.sim.scene import Scene
 from flags import configured as for_timing
 from flags import split
 from learners import LEARNERS, sensing
-from planning import DRAWING, judged_scenes, shortest_length
+from planning import IMPROVING, judged_scenes, shortest_length
 from rows import Row, joined
 from runtime_figure import draw_runtime
 from stack import STACK, STEADY
@@ -371,10 +371,10 @@ def expected(asked: Asked, world: str) -> str:
     """How long it will be, before anything is measured; compiling is taken for a minute a learner."""
     args = asked.words
     learners = [name for name in args.methods if name in LEARNERS]
-    drawing = [name for name in args.methods if name in DRAWING]
+    improving = [name for name in args.methods if name in IMPROVING]
     each = args.seeds * asked.configs[world].train.total_steps
     stack = STACK in args.methods and world not in DENSITIES  # it flies in one world
-    planning = args.seeds * len(drawing) * missions_of(asked, world) * args.budget
+    planning = args.seeds * len(improving) * missions_of(asked, world) * args.budget
     seconds = each * len(learners) / GUESS + each * stack / STACK_GUESS + planning + 60 * len(learners)
     return (
         f"{each * (len(learners) + stack):,} decisions to train, {planning:.0f} s to plan; "

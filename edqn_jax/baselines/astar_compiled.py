@@ -21,8 +21,8 @@ from edqn_jax.baselines.solids import distance, leg_free, solid_table
 
 numba = require("numba")
 
-CELL_M = 0.5
-"""Cell of the lattice, metres."""
+CELL_M, COARSE_CELL_M = 0.5, 1.0
+"""Cell of the lattice, metres; the coarse one is that of the SNN."""
 
 _FOUND, _BLOCKED, _SHUT_IN, _SPENT = range(4)
 _KNOWN, _OPENED = 1, 2
@@ -192,6 +192,11 @@ def plan(
         _SPENT: f"the goal was not reached within {expanded} cells",
     }
     return not_found(why[how], seconds, expanded)
+
+
+def plan_coarse(task: Task, budget: Budget = Budget(), seed: int = 0) -> Plan:  # noqa: B008
+    """The shortest path on a lattice of `COARSE_CELL_M`, pulled tight: sooner there, and a little longer."""
+    return plan(task, budget, seed, COARSE_CELL_M)
 
 
 @functools.lru_cache(maxsize=1)

@@ -83,8 +83,11 @@ class Planner(Protocol):
 PLANNERS = {
     "SNN": "snn.plan",
     "A*": "astar_compiled.plan",
+    "A* 1 m": "astar_compiled.plan_coarse",
     "RRT*": "sampling.rrt_star",
+    "RRT* first path": "sampling.rrt_star_first",
     "BIT*": "sampling.bit_star",
+    "BIT* first path": "sampling.bit_star_first",
     "APF": "potential_field.plan",
 }
 """Where each is: module and function within `edqn_jax.baselines`."""

@@ -6,7 +6,8 @@ Kavraki, "The Open Motion Planning Library", IEEE Robotics & Automation Magazine
 apply.
 
 Both draw at random and never end by themselves: they use the whole budget, in seconds or in OMPL's iterations,
-whichever is spent first, and say when they knew a first path and how long the last one is. OMPL asks about legs,
+whichever is spent first, and say when they knew a first path and how long the last one is; or, asked for the first
+path, they end with it. OMPL asks about legs,
 not points, and each question is answered by the scene's exact distances in compiled code.
 """
 
@@ -44,12 +45,22 @@ def rrt_star(task: Task, budget: Budget = Budget(), seed: int = 0) -> Plan:  # n
     return _plan(geometric.RRTstar, task, budget, seed)
 
 
+def rrt_star_first(task: Task, budget: Budget = Budget(), seed: int = 0) -> Plan:  # noqa: B008
+    """The first path that RRT* finds within the budget."""
+    return _plan(geometric.RRTstar, task, budget, seed, ends_with_first=True)
+
+
 def bit_star(task: Task, budget: Budget = Budget(), seed: int = 0) -> Plan:  # noqa: B008
     """The shortest path that BIT* knows when the budget is spent."""
     return _plan(geometric.BITstar, task, budget, seed)
 
 
-def _plan(algorithm: Any, task: Task, budget: Budget, seed: int) -> Plan:
+def bit_star_first(task: Task, budget: Budget = Budget(), seed: int = 0) -> Plan:  # noqa: B008
+    """The first path that BIT* finds within the budget."""
+    return _plan(geometric.BITstar, task, budget, seed, ends_with_first=True)
+
+
+def _plan(algorithm: Any, task: Task, budget: Budget, seed: int, ends_with_first: bool = False) -> Plan:
     refused = refusal(task)
     if refused:
         return not_found(refused)
@@ -85,7 +96,8 @@ def _plan(algorithm: Any, task: Task, budget: Budget, seed: int) -> Plan:
             best = planner.bestCost().value()
             if math.isfinite(best):
                 first.extend((elapsed, best))
-        return elapsed >= budget.seconds or planner.numIterations() >= steps
+        done = bool(first) and ends_with_first
+        return done or elapsed >= budget.seconds or planner.numIterations() >= steps
 
     planner.solve(base.PlannerTerminationCondition(spent))
     seconds, taken = time.perf_counter() - began, planner.numIterations()

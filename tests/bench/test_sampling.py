@@ -38,6 +38,15 @@ def test_more_steps_shorten_the_path(planner):
     assert short.first_length_m == long.first_length_m
 
 
+def test_asked_for_the_first_path_it_ends_with_it(planner, request):
+    task, budget = room(box((5, 0, 0), (6, 9, 6))), Budget(LONG, 5000)
+    first = load_planner(f"{request.node.callspec.params['planner']} first path")(task, budget, 0)
+    whole = planner(task, budget, 0)
+    assert_flyable(task, first.path)
+    assert first.length_m == first.first_length_m == whole.first_length_m > whole.length_m
+    assert first.steps < whole.steps
+
+
 def test_a_budget_in_seconds_ends_it(planner):
     plan = planner(WITHOUT_A_WAY["wall across"], Budget(seconds=0.3))
     assert plan.seconds >= 0.3 and plan.steps > 0
