@@ -29,12 +29,14 @@ class WorldConfig:
 
 @dataclass(frozen=True)
 class DroneConfig:
-    """The airframe's inner loops: velocity, attitude and body rate, all at the physics rate."""
+    """The airframe and its inner loops: velocity, attitude and body rate, all at the physics rate."""
 
+    physics: Literal["mjx", "rigid_body"] = "mjx"
+    """What moves the body. `rigid_body`: the closed form that MJX comes to for this airframe, several times as fast."""
     physics_dt_s: float = 0.02
-    """MJX step, seconds."""
+    """Physics step, seconds."""
     physics_steps: int = 13
-    """MJX steps per decision: 13 x 0.02 s = 0.26 s."""
+    """Physics steps per decision: 13 x 0.02 s = 0.26 s."""
     body_radius_m: float = 0.36
     """Radius of the sphere that must not touch anything, metres."""
     velocity_gain: float = 4.5

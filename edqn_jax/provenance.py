@@ -32,7 +32,7 @@ def workload(config: Config, scene: Scene) -> dict[str, Any]:
         "replayed_samples_per_decision": agent.batch_size * agent.updates_per_step / envs,
         "vae_samples_per_decision": 1.0 if config.encoder.keep_learning and has_code(config) else 0.0,
         "num_envs": envs,
-        "physics": "mjx",
+        "physics": config.drone.physics,
     }
 
 

@@ -46,7 +46,7 @@ def _world(world: WorldConfig) -> None:
 
 
 def _drone(drone: DroneConfig) -> None:
-    _positive(drone, "drone", [field.name for field in dataclasses.fields(drone)])
+    _positive(drone, "drone", [field.name for field in dataclasses.fields(drone) if field.name != "physics"])
     tilt, descent = drone.max_tilt_rad, drone.max_descent_m_s2
     _require(tilt < math.pi / 2, "drone.max_tilt_rad", "less than pi/2", tilt)
     _require(descent < 9.81, "drone.max_descent_m_s2", "less than gravity, 9.81", descent)

@@ -115,9 +115,7 @@ def test_most_seeds_that_never_fly_make_the_training_time_never() -> None:
 
 
 def test_a_planner_that_draws_nothing_counts_once_but_is_timed_every_time() -> None:
-    turns = [
-        turn(seed, flights("goal", planning_seconds=float(seed), planned_m=130.0)) for seed in (1, 2, 3)
-    ]
+    turns = [turn(seed, flights("goal", planning_seconds=float(seed), planned_m=130.0)) for seed in (1, 2, 3)]
     certain, drawing = rows.figures(row("A*", turns, "paper")), rows.figures(row("RRT*", turns, "paper"))
     assert (certain["flights"], drawing["flights"]) == (1, 3)
     assert certain["planning_seconds"] == drawing["planning_seconds"] == 2.0

@@ -1,4 +1,5 @@
-"""The drone: MJX dynamics and a cascaded controller, velocity -> attitude -> body rate -> rotor thrust.
+"""The drone: dynamics, by MJX unless asked otherwise, and a cascaded controller, velocity -> attitude -> body rate ->
+rotor thrust.
 
 Frames: the world has z up; the body has x ahead, y left, z up and stands at the centre of mass. A
 quaternion (w, x, y, z) turns body vectors into world vectors.
@@ -26,6 +27,7 @@ from jax import Array
 
 from edqn_jax.config import DroneConfig
 from edqn_jax.fusion import materialised
+from edqn_jax.sim.rigid_body import rigid_body_step
 
 with contextlib.redirect_stdout(io.StringIO()):  # it prints that Warp, an engine we do not use, is missing
     from mujoco import mjx
@@ -47,7 +49,8 @@ class Airframe:
     inertia: Array  # [3] kg m^2 about the body's axes
     gravity: Array  # [] m/s^2
     max_thrust: Array  # [] newtons of one rotor
-    mixer: Array  # [R, 4] rotor thrusts per collective thrust (N) and torque about x, y, z (N m)
+    wrench: Array  # [4, R] collective thrust (N) and torque about x, y, z (N m) per rotor thrust (N)
+    mixer: Array  # [R, 4] its inverse
 
 
 @struct.dataclass
@@ -81,12 +84,16 @@ def c_model(config: DroneConfig) -> mujoco.MjModel:
     return spec.compile()
 
 
-def mixer_of(model: mujoco.MjModel) -> np.ndarray:
-    """Rotor thrusts per collective thrust (N) and torque about x, y, z (N m): [R, 4], of the model's rotor layout."""
+def wrench_of_thrust(model: mujoco.MjModel) -> np.ndarray:
+    """Collective thrust and torque about x, y, z (N m) per rotor thrust: [4, R], of the model's rotor layout."""
     arm = model.site_pos[model.actuator_trnid[:, 0]]
     push, twist = model.actuator_gear[:, 2], model.actuator_gear[:, 5]
-    wrench_of_thrust = np.stack([push, arm[:, 1] * push, -arm[:, 0] * push, twist])
-    return np.linalg.inv(wrench_of_thrust)
+    return np.stack([push, arm[:, 1] * push, -arm[:, 0] * push, twist])
+
+
+def mixer_of(model: mujoco.MjModel) -> np.ndarray:
+    """Rotor thrusts per collective thrust (N) and torque about x, y, z (N m): [R, 4], of the model's rotor layout."""
+    return np.linalg.inv(wrench_of_thrust(model))
 
 
 def load_airframe(config: DroneConfig) -> Airframe:
@@ -102,6 +109,7 @@ def load_airframe(config: DroneConfig) -> Airframe:
         inertia=jnp.asarray(model.body_inertia[1], jnp.float32),
         gravity=jnp.float32(-model.opt.gravity[2]),
         max_thrust=jnp.float32(model.actuator_ctrlrange[0, 1]),
+        wrench=jnp.asarray(wrench_of_thrust(model), jnp.float32),
         mixer=jnp.asarray(mixer_of(model), jnp.float32),
     )
 
@@ -204,6 +212,14 @@ def _thrusts(
     return jnp.stack([jnp.clip(t + spins[i] * turning, 0.0, limit) for i, t in enumerate(levelled)])
 
 
+def _dot(row: Array, column: Array) -> Array:
+    """Products summed one by one: XLA makes a call of its own of a sum along an axis."""
+    total = row[0] * column[0]
+    for index in range(1, row.shape[0]):
+        total = total + row[index] * column[index]
+    return total
+
+
 def _least(values: list[Array]) -> Array:
     least = values[0]
     for value in values[1:]:
@@ -212,12 +228,27 @@ def _least(values: list[Array]) -> Array:
 
 
 def physics_step(config: DroneConfig, airframe: Airframe, state: DroneState, thrust: Array) -> DroneState:
-    """One MJX step under rotor thrusts [4] newtons; only position and velocity are carried over.
+    """One step of `config.physics` under rotor thrusts [4] newtons; only position and velocity are carried over."""
+    if config.physics == "rigid_body":
+        moved = rigid_body_step(
+            *(config.physics_dt_s, airframe.mass, airframe.inertia, airframe.gravity),
+            jnp.stack([_dot(row, thrust) for row in airframe.wrench]),
+            *(state.position, state.quaternion, state.velocity, state.angular_velocity),
+        )
+    else:
+        moved = _mjx_step(airframe, state, thrust)
+    position, quaternion, velocity, angular_velocity = moved
+    return dataclasses.replace(
+        state, position=position, quaternion=quaternion, velocity=velocity, angular_velocity=angular_velocity
+    )
+
+
+def _mjx_step(airframe: Airframe, state: DroneState, thrust: Array) -> tuple[Array, Array, Array, Array]:
+    """Position, quaternion, velocity and angular velocity after one MJX step.
 
     These are the stages of `mjx.step` for this model: with the body frame at the centre of mass and no joint
     below it, the mass matrix is the template's for ever, and nothing collides, constrains or dampens.
     """
-    del config  # the time step is in the model
     model = airframe.model
     data = airframe.data.replace(
         qpos=jnp.concatenate([state.position, state.quaternion]),
@@ -229,13 +260,7 @@ def physics_step(config: DroneConfig, airframe: Airframe, state: DroneState, thr
         data = mjx.rne(model, mjx.com_vel(model, data))
         data = mjx.fwd_acceleration(model, mjx.fwd_actuation(model, data))
         data = mjx.euler(model, data.replace(qacc=data.qacc_smooth))
-    return dataclasses.replace(
-        state,
-        position=data.qpos[:3],
-        quaternion=data.qpos[3:],
-        velocity=data.qvel[:3],
-        angular_velocity=data.qvel[3:],
-    )
+    return data.qpos[:3], data.qpos[3:], data.qvel[:3], data.qvel[3:]
 
 
 def fly(
