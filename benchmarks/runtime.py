@@ -414,11 +414,11 @@ def main(argv: Sequence[str] | None = None) -> int:
         print(error, file=sys.stderr)
         return 2
     rates = [*([measured] if measured else []), *(rate for report in asked.added for rate in report["rates"])]
-    print(runtime_table.text(rows, rates))
     if asked.words.json is not None:
         json_report.write(asked.words.json, report_of(rows, rates))
     if asked.words.figure is not None:
         draw_runtime(rows, asked.words.figure)
+    print(runtime_table.text(rows, rates))  # last, for whoever reads may have left
     return 0
 
 
