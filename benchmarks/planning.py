@@ -20,12 +20,6 @@ from edqn_jax.sim.env import Outcome
 from edqn_jax.sim.mjcf import check_scene, load_world, resolve_world
 from edqn_jax.sim.scene import Scene, take_scene
 
-IMPROVING = "RRT*", "BIT*"
-"""Planners that shorten their path until the budget is spent; the others give one path."""
-
-DRAWING = (*IMPROVING, "RRT* first path", "BIT* first path")
-"""Planners that draw at random."""
-
 NOT_FLOWN = {"outcome": "no_path", "decisions": 0, "flight_seconds": 0.0, "path_length_m": 0.0, "clearance_m": None}
 
 

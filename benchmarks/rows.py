@@ -12,9 +12,9 @@ from typing import Any
 
 import numpy as np
 
+from edqn_jax.baselines.planner import DRAWING
 from edqn_jax.config import ConfigError
 from intervals import difference_interval, rate_interval
-from planning import DRAWING
 
 Row = dict[str, Any]
 
@@ -119,7 +119,7 @@ class Worth:
     seconds: float
     """What the fastest learner needed for its budget: median over its seeds."""
     rates: list[dict[str, Any]]
-    """For each learner `name`, and rate and interval `at_decisions` and `at_seconds`."""
+    """For each learner `name`, `seconds` of its whole training, and rate and interval `at_decisions`, `at_seconds`."""
     differences: list[dict[str, Any]]
     """E-DQN less each other one, likewise."""
 
@@ -139,10 +139,11 @@ def worth(rows: Sequence[Row]) -> list[Worth]:
 
 
 def _worth(rows: Sequence[Row]) -> Worth:
-    seconds = min(statistics.median(turn["train_seconds"] for turn in row["turns"]) for row in rows)
+    whole = {row["name"]: statistics.median(turn["train_seconds"] for turn in row["turns"]) for row in rows}
+    seconds = min(whole.values())
     flown = {row["name"]: {"at_decisions": success(row), "at_seconds": kept_by(row, seconds)} for row in rows}
     rates = [
-        {"name": name, "seeds": len(cut["at_decisions"])}
+        {"name": name, "seeds": len(cut["at_decisions"]), "seconds": whole[name]}
         | {at: {"rate": float(bits.mean()), "interval": rate_interval(bits)} for at, bits in cut.items()}
         for name, cut in flown.items()
     ]

@@ -6,6 +6,7 @@ import statistics
 from collections.abc import Sequence
 from typing import Any
 
+from edqn_jax.baselines.planner import IMPROVING
 from rows import Row, Worth, figures, worth
 from stack import STACK
 
@@ -35,7 +36,8 @@ EXPLAINED = """\
 - DQN depth and DQN ranges have true sensors, which no drone has: they are upper bounds.
 - Plans: computation from start to goal, without simulation and compilation. For a learner the sum over a flight of
   its decisions, one by one, from an observation on the host to a move there; for a planner until the path that is
-  flown. RRT* and BIT* use their whole budget; in the rows "first path" they end with the first that they find.
+  flown. RRT* and BIT* use their whole budget, which stands beside their name, unless they have found the straight way;
+  in the rows "first path" they end with the first that they find.
 - Flies (simulated seconds), decisions, path: medians of the flights that reached the goal, as is what is said of plans;
   they end within its radius, the shortest path, A*'s, at the goal itself. Clearance is the least of these flights.
   Planners' paths are flown at 4 m/s at most in all, learners fly up to 4 m/s along each axis, 6.9 m/s along a diagonal
@@ -74,7 +76,11 @@ def methods(rows: Sequence[Row]) -> str:
     notes = []
     for row in rows:
         shown = figures(row)
-        name = row["name"] + (" (not converged)" if row["settings"].get("quick") and row["kind"] == "learner" else "")
+        name = row["name"]
+        if row["kind"] == "learner" and row["settings"].get("quick"):
+            name += " (not converged)"
+        elif name in IMPROVING:
+            name += f", {row['settings']['budget_seconds']:g} s"
         if row["reason"] is not None:
             notes.append(f"{row['name']}: {row['reason']}.")
         elif shown["reasons"] and not shown["success"]:
@@ -128,16 +134,16 @@ def worth_table(one: Worth) -> str:
         "fastest needed for them, without compilation. It stops the slower ones in the middle of their schedules of "
         "exploration and learning rate, which are laid over all decisions.",
         "",
-        "| learner | seeds | at equal decisions | at equal wall time |",
-        "| --- | ---: | ---: | ---: |",
+        "| learner | seeds | trains in all, s | at equal decisions | at equal wall time |",
+        "| --- | ---: | ---: | ---: | ---: |",
     ]
     cuts = "at_decisions", "at_seconds"
     for rate in one.rates:
         cells = [_rate(rate[at]["rate"], rate[at]["interval"]) for at in cuts]
-        lines.append(f"| {rate['name']} | {rate['seeds']} | {' | '.join(cells)} |")
+        lines.append(f"| {rate['name']} | {rate['seeds']} | {rate['seconds']:.1f} | {' | '.join(cells)} |")
     for less in one.differences:
         cells = [_rate(less[at]["difference"], less[at]["interval"], "+") for at in cuts]
-        lines.append(f"| E-DQN less {less['name']} | | {' | '.join(cells)} |")
+        lines.append(f"| E-DQN less {less['name']} | | | {' | '.join(cells)} |")
     return "\n".join(lines)
 
 

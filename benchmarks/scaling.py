@@ -324,7 +324,7 @@ def table(report: dict[str, Any]) -> str:
     lines = [
         f"{report['device']}, {len(report['devices'])} devices; where nothing else is said {stated['num_envs']} "
         f"environments, {stated['width']} × {stated['height']} pixels, {stated['obstacles']} obstacles, "
-        f"{stated['physics_steps_per_decision']} physics steps; medians of {report['repeats']}",
+        f"{stated['physics_steps_per_decision']} physics steps by {stated['physics']}; medians of {report['repeats']}",
     ]
     for curve in report["curves"]:
         lines += [

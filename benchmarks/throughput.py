@@ -144,7 +144,7 @@ def table(report: dict[str, Any]) -> str:
     lines = [
         f"{report['device']}, {len(report['devices'])} devices, {stated['num_envs']} environments, "
         f"{stated['replayed_samples_per_decision']:g} replayed and {stated['vae_samples_per_decision']:g} VAE samples "
-        f"per decision; medians of {report['repeats']}",
+        f"per decision, physics by {stated['physics']}; medians of {report['repeats']}",
         "",
         "| what | measured |",
         "| --- | ---: |",

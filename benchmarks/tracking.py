@@ -150,7 +150,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             "physics_steps_per_decision": config.drone.physics_steps,
             "physics_dt": config.drone.physics_dt_s,
             "num_envs": len(rows),
-            "physics": "mjx",
+            "physics": config.drone.physics,
         }
         report = {
             "workload": workload,

@@ -98,7 +98,7 @@ def main(argv: Sequence[str] | None = None) -> int:
                 "seed": args.seed,
                 "world": course.name,
                 "contact_tolerance_m": CONTACT_TOLERANCE_M,
-                "physics": "mjx",
+                "physics": config.drone.physics,
             },
             "device": f"{jax.devices()[0].device_kind} ({platform.machine()})",
             "versions": {name: version(name) for name in ("jax", "mujoco", "mujoco-mjx")},

@@ -51,6 +51,12 @@ def test_a_random_world_brings_its_own_budget(world):
     assert resolve(world=world).train.total_steps == RANDOM_WORLDS["train"]["total_steps"]
 
 
+def test_what_the_stated_figures_of_random_worlds_and_of_the_papers_preset_were_measured_with_stays():
+    """They came before the default's last step size and warm-up (docs/decisions/0011)."""
+    for config, rate in ((resolve(world="medium"), 1e-3), (preset("paper"), 4e-4)):
+        assert (config.agent.learning_rate, config.encoder.warmup_updates_per_step) == (rate, 12)
+
+
 def test_a_random_world_in_the_file_brings_its_budget_too(tmp_path):
     assert (
         resolve(file=write(tmp_path, "world: {name: dense}\n")).train.total_steps

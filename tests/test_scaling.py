@@ -48,6 +48,15 @@ def test_a_curve_says_how_its_turns_differ_and_devices_how_good_they_are() -> No
     assert scaling.summarise("pixels", 1.0, rows)["efficiency"] is None
 
 
+def test_a_curve_that_bends_upwards_cannot_hide_it_between_its_ends() -> None:
+    alike = {"us_turns": [1.0], "c_mujoco_steps_per_decision": 1.0}
+    rows = [{"x": x, "us_per_decision": cost, **alike} for x, cost in ((1, 4.0), (2, 2.0), (4, 8.0), (8, 8.0))]
+    summary = scaling.summarise("pixels", 1.0, rows)
+    assert summary["slope"] == pytest.approx(1 / 3)
+    assert summary["steepest"] == pytest.approx(2.0)
+    assert "between neighbours 2.00 at most" in scaling.sentence({"name": "pixels", **summary})
+
+
 @pytest.mark.parametrize("quick", [True, False])
 def test_each_curve_changes_one_thing_in_multiples_of_what_was_asked_for(quick: bool, tmp_path: Path) -> None:
     curves = {name: make(BASE, quick, tmp_path) for name, make in scaling.CURVES.items()}

@@ -88,10 +88,14 @@ def test_rows_by_subtraction_say_so() -> None:
     report = {
         "device": "a device",
         "devices": ["cpu:0"],
-        "workload": {"num_envs": 256, "replayed_samples_per_decision": 4.0, "vae_samples_per_decision": 1.0},
+        "workload": {
+            **{"num_envs": 256, "replayed_samples_per_decision": 4.0, "vae_samples_per_decision": 1.0},
+            "physics": "rigid_body",
+        },
         "repeats": 5,
         "compile_seconds": 20.0,
         "rows": [whole, rollout, *rows.values(), *limits],
     }
     shown = throughput.table(report)
+    assert "physics by rigid_body" in shown  # the bar is on MJX
     assert "| dqn update (by subtraction: dqn update and sampling − sampling) | 26.0 |  |  |" in shown

@@ -22,7 +22,7 @@ from edqn_jax.baselines.solids import distance, leg_free, solid_table
 numba = require("numba")
 
 CELL_M, COARSE_CELL_M = 0.5, 1.0
-"""Cell of the lattice, metres; the coarse one is that of the SNN."""
+"""Cell of the lattice, metres; the coarse one is as large as the SNN's."""
 
 _FOUND, _BLOCKED, _SHUT_IN, _SPENT = range(4)
 _KNOWN, _OPENED = 1, 2
@@ -195,7 +195,7 @@ def plan(
 
 
 def plan_coarse(task: Task, budget: Budget = Budget(), seed: int = 0) -> Plan:  # noqa: B008
-    """The shortest path on a lattice of `COARSE_CELL_M`, pulled tight: sooner there, and a little longer."""
+    """The shortest path on a lattice of `COARSE_CELL_M`, pulled tight: with an eighth of the cells."""
     return plan(task, budget, seed, COARSE_CELL_M)
 
 

@@ -92,6 +92,12 @@ PLANNERS = {
 }
 """Where each is: module and function within `edqn_jax.baselines`."""
 
+IMPROVING = "RRT*", "BIT*"
+"""Those that go on after their first path, until the budget is spent."""
+
+DRAWING = (*IMPROVING, "RRT* first path", "BIT* first path")
+"""Those that draw at random, so that another seed is another path."""
+
 
 def load_planner(name: str) -> Planner:
     """The planner of that name.

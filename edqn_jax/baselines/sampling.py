@@ -5,9 +5,9 @@ RRT*: Karaman and Frazzoli, "Sampling-based Algorithms for Optimal Motion Planni
 Kavraki, "The Open Motion Planning Library", IEEE Robotics & Automation Magazine 19(4), 2012; its own defaults
 apply.
 
-Both draw at random and never end by themselves: they use the whole budget, in seconds or in OMPL's iterations,
-whichever is spent first, and say when they knew a first path and how long the last one is; or, asked for the first
-path, they end with it. OMPL asks about legs,
+Both draw at random and use the whole budget, in seconds or in OMPL's iterations, whichever is spent first, and say
+when they knew a first path and how long the last one is; BIT* ends sooner where nothing can be gained. Asked for the
+first path, they end with it. OMPL asks about legs,
 not points, and each question is answered by the scene's exact distances in compiled code.
 """
 

@@ -25,7 +25,7 @@ import numpy as np
 from flax import struct
 from jax import Array
 
-from edqn_jax.config import DroneConfig
+from edqn_jax.config import ConfigError, DroneConfig
 from edqn_jax.fusion import materialised
 from edqn_jax.sim.rigid_body import rigid_body_step
 
@@ -97,8 +97,13 @@ def mixer_of(model: mujoco.MjModel) -> np.ndarray:
 
 
 def load_airframe(config: DroneConfig) -> Airframe:
-    """The Skydio X2 as MJX arrays, and the mixer that follows from its rotor layout."""
+    """The Skydio X2 as MJX arrays, and the mixer that follows from its rotor layout.
+
+    Raises:
+        ConfigError: if the airframe's file holds something that a physics step would leave out without a word.
+    """
     model = c_model(config)
+    _check(model)
     rest = mujoco.MjData(model)
     mujoco.mj_forward(model, rest)
     here = jax.local_devices()[0]  # MJX's own choice may be another process's
@@ -112,6 +117,19 @@ def load_airframe(config: DroneConfig) -> Airframe:
         wrench=jnp.asarray(wrench_of_thrust(model), jnp.float32),
         mixer=jnp.asarray(mixer_of(model), jnp.float32),
     )
+
+
+def _check(model: mujoco.MjModel) -> None:
+    free = model.nq == 7 and model.nv == 6 and not model.ngeom
+    in_vacuum = not model.opt.density and not model.opt.viscosity and not model.opt.wind.any()
+    centred = np.allclose(model.body_ipos[1], 0.0) and np.allclose(np.abs(model.body_iquat[1]), [1, 0, 0, 0])
+    rotors = model.actuator_trnid[:, 0]
+    upright = not model.actuator_gear[:, [0, 1, 3, 4]].any() and np.allclose(model.site_quat[rotors], [1, 0, 0, 0])
+    if not (free and in_vacuum and centred and upright):
+        raise ConfigError(
+            f"'{AIRFRAME_FILE.name}' must be one free body in a vacuum, its frame at the centre of mass and along the "
+            "principal axes of inertia, under rotors that push along its z; edqn_jax/sim/drone.py flies nothing else"
+        )
 
 
 def hover(position: Array, yaw: Array) -> DroneState:

@@ -25,15 +25,15 @@ def lattice_length(task: Task, cell: float = 0.5) -> float:
     return length + np.linalg.norm(task.goal - points[-1]) if len(points) else np.inf
 
 
-def assert_like_the_plain_one(task: Task, plan: Plan) -> None:
+def assert_like_the_plain_one(task: Task, plan: Plan, cell: float = 0.5) -> None:
     try:
-        plain = astar.shortest_path(task.scene, task.start, task.goal, task.body_radius)
+        plain = astar.shortest_path(task.scene, task.start, task.goal, task.body_radius, cell)
     except astar.NoPathError:
         assert not plan.found
-        assert lattice_length(task) == np.inf
+        assert lattice_length(task, cell) == np.inf
         return
     # Ties are broken by a billionth of the length, and the plain one stops within as much.
-    assert lattice_length(task) == pytest.approx(plain.grid_length_m, abs=1e-6)
+    assert lattice_length(task, cell) == pytest.approx(plain.grid_length_m, abs=1e-6)
     # 0.14 mm deeper in than the radius is what a stride of 2 cm may miss; the rest is float32.
     assert_flyable(task, plan.path, tolerance=2e-4)
     assert plan.length_m <= plain.grid_length_m + 1e-6
@@ -55,6 +55,14 @@ def test_in_large_worlds_too(world):
     scene = random_scene(name, world_key("test", int(index[0]))) if index else load_scene(resolve_world(name))
     task = Task.of(scene, body_radius=RADIUS)
     assert_like_the_plain_one(task, astar_compiled.plan(task))
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_coarse_one_searches_a_lattice_of_a_metre(seed):
+    task = random_room(seed)
+    coarse, fine = astar_compiled.plan_coarse(task), astar_compiled.plan(task)
+    assert_like_the_plain_one(task, coarse, cell=1.0)
+    assert 0 < coarse.steps < fine.steps
 
 
 def test_no_other_planner_of_lattices_is_shorter():

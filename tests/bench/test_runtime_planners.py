@@ -32,6 +32,8 @@ def test_a_planned_path_is_flown_to_the_goal(name: str, tmp_path: Path) -> None:
     assert 0.0 < flown["planning_seconds"][0]
     if name.endswith("first path"):
         assert flown["planning_seconds"][0] < BUDGET_SECONDS
+    if name == "RRT*":  # BIT* ends when it has found the straight way
+        assert flown["planning_seconds"][0] >= BUDGET_SECONDS
     # From start to goal there are 8 m; the flight ends within the goal's radius.
     assert 8.0 <= flown["planned_m"][0]
     assert 5.9 < flown["path_length_m"][0] < 12.0
