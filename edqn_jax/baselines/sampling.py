@@ -7,8 +7,8 @@ apply.
 
 Both draw at random and use the whole budget, in seconds or in OMPL's iterations, whichever is spent first, and say
 when they knew a first path and how long the last one is; BIT* ends sooner where nothing can be gained. Asked for the
-first path, they end with it. OMPL asks about legs,
-not points, and each question is answered by the scene's exact distances in compiled code.
+first path, they end with it. OMPL asks about legs, not points, and each question is answered by the scene's exact
+distances in compiled code.
 """
 
 from __future__ import annotations
