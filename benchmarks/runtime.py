@@ -11,7 +11,7 @@ once; they take turns, seed by seed, so that a slow minute hits all alike.
 
 What stands after -- goes to the learners' configuration as it would for train.py. The full run, five seeds on both
 worlds, takes about five hours on two cores: one for the paper's world, four and a quarter for medium worlds. All
-methods of a world stay in memory, 17 GB together. --quick takes less than ten minutes.
+methods of a world stay in memory, 15 GB together. --quick takes less than ten minutes.
 """
 
 from __future__ import annotations
