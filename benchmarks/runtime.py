@@ -11,7 +11,8 @@ once; they take turns, seed by seed, so that a slow minute hits all alike.
 
 What stands after -- goes to the learners' configuration as it would for train.py. The full run, five seeds on both
 worlds, takes about five hours on two cores: one for the paper's world, four and a quarter for medium worlds. All
-methods of a world stay in memory, 15 GB together. --quick takes less than ten minutes.
+methods of a world stay in memory, 15 GB together. --quick, unless told otherwise of the paper's world alone, takes
+less than ten minutes.
 """
 
 from __future__ import annotations
@@ -55,7 +56,7 @@ from stack import STACK, STEADY
 from whole import steady
 
 ROOT = Path(__file__).resolve().parents[1]
-WORLDS = ("paper", "medium")
+WORLDS, QUICK_WORLDS = ("paper", "medium"), ("paper",)
 METHODS = (*LEARNERS, *PLANNERS, STACK)
 SEEDS, QUICK_SEEDS = 5, 2
 POINTS = 20
@@ -104,9 +105,13 @@ def parse(argv: Sequence[str] | None = None) -> Asked:
         description=__doc__,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("--quick", action="store_true", help="60 000 decisions, two seeds: nothing converges")
+    parser.add_argument(
+        "--quick", action="store_true", help="60 000 decisions, two seeds, the paper's world: nothing converges"
+    )
     parser.add_argument("--methods", nargs="+", default=list(METHODS), metavar="NAME", help=f"of {', '.join(METHODS)}")
-    parser.add_argument("--worlds", nargs="+", default=list(WORLDS), metavar="WORLD", help="as --world of train.py")
+    parser.add_argument(
+        "--worlds", nargs="+", metavar="WORLD", help="as --world of train.py (default paper and medium, quick paper)"
+    )
     parser.add_argument("--seeds", type=int, help=f"how many (default {SEEDS}, quick {QUICK_SEEDS}); 0 runs nothing")
     parser.add_argument("--first-seed", type=int, default=0, metavar="SEED", help="the others follow it (default 0)")
     parser.add_argument(
@@ -117,6 +122,8 @@ def parse(argv: Sequence[str] | None = None) -> Asked:
     parser.add_argument("--json", type=Path, help="write the rows to this file")
     parser.add_argument("--figure", type=Path, metavar="FILE.png", help="draw the rows")
     args = parser.parse_args(words)
+    if args.worlds is None:
+        args.worlds = list(QUICK_WORLDS if args.quick else WORLDS)
     if args.seeds is None:
         args.seeds = QUICK_SEEDS if args.quick else SEEDS
     if args.budget is None:

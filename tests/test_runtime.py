@@ -225,6 +225,12 @@ def test_what_has_been_measured_is_on_the_disk_after_each_seed(
     assert [[one["seed"] for one in row["turns"]] for row in json.loads(file.read_text())["rows"]] == [[0], [0]]
 
 
+def test_quick_is_of_the_papers_world_unless_told_otherwise() -> None:
+    assert list(runtime.parse(["--quick"]).configs) == ["paper"]
+    assert runtime.parse(["--seeds", "0"]).words.worlds == ["paper", "medium"]
+    assert runtime.parse(["--quick", "--seeds", "0", "--worlds", "dense"]).words.worlds == ["dense"]
+
+
 def test_quick_rows_are_marked_as_not_converged(
     faked: type[Fake], clear: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
