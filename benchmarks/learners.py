@@ -18,7 +18,7 @@ from edqn_jax.flights import Flights
 from edqn_jax.learn.policy import PolicyParams
 from edqn_jax.learn.trainer import Trainer, policy_of
 from edqn_jax.provenance import workload
-from edqn_jax.resolve import apply
+from edqn_jax.config.loading import apply
 from edqn_jax.run import (
     Candidate,
     Courses,
@@ -30,7 +30,7 @@ from edqn_jax.run import (
     validated_by,
 )
 from edqn_jax.sim.env import Outcome, World
-from edqn_jax.validate import validate
+from edqn_jax.config.limits import validate
 
 LEARNERS = {
     "E-DQN": "events",

@@ -26,9 +26,9 @@ from edqn_jax.endings import (
     listening_for_sigterm,
 )
 from edqn_jax.launch import Distributed, how_to_join
-from edqn_jax.resolve import resolve
+from edqn_jax.config.loading import resolve
 from edqn_jax.rundir import Resume, plan_run_directory
-from edqn_jax.validate import validate
+from edqn_jax.config.limits import validate
 
 Point = tuple[float, float, float]
 

@@ -16,7 +16,7 @@ import numpy as np
 
 from edqn_jax.config import Config, ConfigError
 from edqn_jax.files import check_can_make, unwritable, write_whole
-from edqn_jax.resolve import apply, load_layer, to_yaml
+from edqn_jax.config.loading import apply, load_layer, to_yaml
 
 Resume = Literal["auto", "never", "must"]
 

@@ -16,7 +16,7 @@ import pytest
 from edqn_jax import cluster
 from edqn_jax.checkpoint import load_policy
 from edqn_jax.config import Config, ConfigError
-from edqn_jax.resolve import to_yaml
+from edqn_jax.config.loading import to_yaml
 from edqn_jax.rundir import RunDirectory
 from tests.processes import PATIENCE_S, by_srun, one_process, to_the_end, two_processes
 from tests.test_run import CONFIG

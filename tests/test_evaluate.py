@@ -25,7 +25,7 @@ from edqn_jax.evaluate import (
     wilson_interval,
 )
 from edqn_jax.flights import Closest, Flights
-from edqn_jax.resolve import to_yaml
+from edqn_jax.config.loading import to_yaml
 from edqn_jax.sim.env import Outcome
 from edqn_jax.verdict import load_judge, replay_contact
 from tests.policies import CONFIG, always

@@ -19,7 +19,7 @@ import runtime
 import runtime_table
 from edqn_jax.cli import parse_train
 from edqn_jax.config import Config
-from edqn_jax.resolve import to_yaml
+from edqn_jax.config.loading import to_yaml
 from edqn_jax.sim.mjcf import write_scene
 from tests.baselines.rooms import WITHOUT_A_WAY, room
 from tests.baselines.uninstalled import hide

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from edqn_jax.config import Config, ConfigError
-from edqn_jax.resolve import resolve
+from edqn_jax.config.loading import resolve
 from edqn_jax.rundir import TRAJECTORY_COLUMNS, RunDirectory, plan_run_directory
 
 

@@ -1,4 +1,4 @@
-"""The limits of every knob: what cannot be run is named before anything is made."""
+"""Limits of every option, checked before anything is written."""
 
 from __future__ import annotations
 
@@ -6,11 +6,10 @@ import dataclasses
 import math
 from collections.abc import Iterable
 
-from edqn_jax.config import (
+from edqn_jax.config.options import (
     AgentConfig,
     CameraConfig,
     Config,
-    ConfigError,
     DroneConfig,
     EncoderConfig,
     EnvConfig,
@@ -18,13 +17,14 @@ from edqn_jax.config import (
     TrainConfig,
     WorldConfig,
 )
+from edqn_jax.errors import ConfigError
 
 
 def validate(config: Config) -> None:
-    """Nothing if the configuration can be run.
+    """Raises ConfigError if the configuration is invalid.
 
     Raises:
-        ConfigError: one sentence naming the first knob that is out of its limits, and the limits.
+        ConfigError: names the first option that is out of its limits, and the limits.
     """
     _world(config.world)
     _drone(config.drone)

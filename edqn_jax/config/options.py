@@ -1,12 +1,11 @@
-"""Every knob of the project: one frozen dataclass per room, nested into one `Config`.
+"""Every option of the project: one frozen dataclass per module, nested into one `Config`.
 
-The defaults below are the `default` preset: the best that we know. `preset("paper")` is Table 1 of the
-paper to the letter. A string under a field is its help text on the command line.
+The defaults are the `default` preset, the best that we know. The string under a field is its help text on the
+command line.
 """
 
 from __future__ import annotations
 
-import dataclasses
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -280,7 +279,7 @@ class TrainConfig:
 
 @dataclass(frozen=True)
 class Config:
-    """All knobs."""
+    """All options."""
 
     world: WorldConfig = field(default_factory=WorldConfig)
     drone: DroneConfig = field(default_factory=DroneConfig)
@@ -292,52 +291,5 @@ class Config:
     train: TrainConfig = field(default_factory=TrainConfig)
 
 
-class ConfigError(ValueError):
-    """A configuration that cannot be run; the message is one sentence for people."""
-
-
 DENSITIES = ("sparse", "medium", "dense")
 """Names of the random worlds."""
-
-PRESETS = ("default", "paper")
-
-
-def preset(name: str) -> Config:
-    """The named preset.
-
-    Raises:
-        ConfigError: if there is none of that name.
-    """
-    if name == "default":
-        return Config()
-    if name == "paper":
-        return dataclasses.replace(
-            Config(),
-            events=EventsConfig(threshold=0.1, tolerance=0.1, contrast_on=0.1, contrast_off=0.1),
-            encoder=EncoderConfig(warmup_updates_per_step=12),
-            env=EnvConfig(
-                reward="sparse", progress_weight=1.0, path_weight=0.0, left_volume_reward=0.0, step_reward=0.0
-            ),
-            agent=AgentConfig(
-                hidden=(16, 16),
-                dueling=False,
-                double=False,
-                n_step=1,
-                discount=0.99,
-                target_rate=0.005,
-                learning_rate=4e-4,
-                final_learning_rate=4e-4,
-                max_gradient_norm=float("inf"),
-                average_rate=1.0,
-                huber_delta=0.0,
-                reward_scale=1.0,
-                batch_size=128,
-                updates_per_step=1,
-                learning_starts=1024,
-                exploration_end=0.01,
-                exploration_episodes=10,
-            ),
-            train=TrainConfig(num_envs=16, total_steps=500_000, max_episodes=40_000, chunk_steps=512, keep="last"),
-            world=WorldConfig(own_start_fraction=1.0, start_jitter_m=0.0),
-        )
-    raise ConfigError(f"there is no preset '{name}'; the presets are {', '.join(PRESETS)}")

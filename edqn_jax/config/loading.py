@@ -17,7 +17,9 @@ from typing import Any, Literal
 
 import yaml
 
-from edqn_jax.config import DENSITIES, Config, ConfigError, preset
+from edqn_jax.config.options import DENSITIES, Config
+from edqn_jax.config.presets import preset
+from edqn_jax.errors import ConfigError
 
 Layer = Mapping[str, Mapping[str, Any]]
 

@@ -1,0 +1,32 @@
+"""Every option, its default and its limits, and how a configuration is loaded."""
+
+from edqn_jax.config.options import (
+    DENSITIES,
+    AgentConfig,
+    CameraConfig,
+    Config,
+    DroneConfig,
+    EncoderConfig,
+    EnvConfig,
+    EventsConfig,
+    TrainConfig,
+    WorldConfig,
+)
+from edqn_jax.config.presets import PRESETS, preset
+from edqn_jax.errors import ConfigError
+
+__all__ = [
+    "DENSITIES",
+    "PRESETS",
+    "AgentConfig",
+    "CameraConfig",
+    "Config",
+    "ConfigError",
+    "DroneConfig",
+    "EncoderConfig",
+    "EnvConfig",
+    "EventsConfig",
+    "TrainConfig",
+    "WorldConfig",
+    "preset",
+]
