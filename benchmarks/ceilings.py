@@ -15,7 +15,7 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from mujoco import rollout
 
 from edqn_jax.config import Config
-from edqn_jax.devices import cores
+from edqn_jax.parallel.devices import cores
 from edqn_jax.learn.trainer import AXIS
 from edqn_jax.sim import drone
 

@@ -26,7 +26,7 @@ import jax
 import json_report
 from edqn_jax.baselines.packages import MissingPackageError
 from edqn_jax.config import Config, ConfigError
-from edqn_jax.devices import use_cpu_devices
+from edqn_jax.parallel.devices import use_cpu_devices
 from edqn_jax.files import check_can_write
 from edqn_jax.provenance import workload
 from edqn_jax.run import lay_courses

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from edqn_jax.devices import processor
+from edqn_jax.parallel.devices import processor
 from edqn_jax.files import write_whole
 from edqn_jax.provenance import versions
 from edqn_jax.rundir import plain

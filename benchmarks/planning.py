@@ -12,7 +12,7 @@ from edqn_jax.baselines.astar import NoPathError, shortest_path
 from edqn_jax.baselines.follow import FollowConfig, compiled_follower, reserved, sampled
 from edqn_jax.baselines.planner import Budget, Task, load_planner
 from edqn_jax.config import DENSITIES, Config
-from edqn_jax.devices import processor
+from edqn_jax.parallel.devices import processor
 from edqn_jax.provenance import workload
 from edqn_jax.sim import worlds
 from edqn_jax.sim.drone import load_airframe

@@ -18,8 +18,8 @@ from child import answers
 from edqn_jax.baselines.packages import MissingPackageError
 from edqn_jax.baselines.planner import PLANNERS
 from edqn_jax.config import Config, ConfigError
-from edqn_jax.devices import use_cpu_devices
 from edqn_jax.config.loading import apply, load_layer
+from edqn_jax.parallel.devices import use_cpu_devices
 from edqn_jax.rundir import plain
 from learners import Learner
 from planning import Planning

@@ -42,9 +42,9 @@ from conventional import DRONES
 from edqn_jax.baselines.planner import IMPROVING, PLANNERS
 from edqn_jax.cli import parse_train
 from edqn_jax.config import DENSITIES, Config, ConfigError
-from edqn_jax.devices import cores
-from edqn_jax.files import check_can_write
 from edqn_jax.config.loading import nearest, to_yaml
+from edqn_jax.parallel.devices import cores
+from edqn_jax.files import check_can_write
 from edqn_jax.sim.scene import Scene
 from flags import configured as for_timing
 from flags import split

@@ -30,13 +30,13 @@ import json_report
 from boxes import world_of_boxes
 from ceilings import Rollout
 from edqn_jax.config import Config, ConfigError
-from edqn_jax.devices import choose_devices, use_cpu_devices
+from edqn_jax.config.limits import validate
+from edqn_jax.config.loading import Layer, apply
+from edqn_jax.parallel.devices import choose_devices, use_cpu_devices
 from edqn_jax.files import check_can_write
 from edqn_jax.provenance import workload
-from edqn_jax.config.loading import Layer, apply
 from edqn_jax.run import Courses, lay_courses
 from edqn_jax.sim.mjcf import write_scene
-from edqn_jax.config.limits import validate
 from flags import configured, split
 from memory import StateBytes, state_bytes
 from scaling_figure import draw_scaling

@@ -16,7 +16,7 @@ import numpy as np
 import json_report
 from conventional import PACKAGES, SETTINGS
 from edqn_jax.config import Config
-from edqn_jax.devices import choose_devices, processor
+from edqn_jax.parallel.devices import choose_devices, processor
 from edqn_jax.flights import Flights
 from edqn_jax.provenance import workload
 from edqn_jax.run import lay_courses

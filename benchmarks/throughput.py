@@ -27,7 +27,7 @@ from jax.sharding import Mesh
 import json_report
 from ceilings import Rollout, ceilings
 from edqn_jax.config import Config, ConfigError
-from edqn_jax.devices import choose_devices, cores, use_cpu_devices
+from edqn_jax.parallel.devices import choose_devices, cores, use_cpu_devices
 from edqn_jax.files import check_can_write
 from edqn_jax.learn.trainer import AXIS
 from edqn_jax.provenance import workload

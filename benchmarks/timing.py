@@ -14,7 +14,7 @@ import numpy as np
 from jax import Array
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
-from edqn_jax.devices import compiler_options
+from edqn_jax.parallel.devices import compiler_options
 from edqn_jax.learn.trainer import AXIS
 
 TURN_SECONDS = 0.4

@@ -15,6 +15,8 @@ from rich.console import Console
 from tyro.conf import Positional, arg
 
 from edqn_jax.config import DENSITIES, Config, ConfigError
+from edqn_jax.config.limits import validate
+from edqn_jax.config.loading import resolve
 from edqn_jax.endings import (
     BAD_INPUT,
     DIVERGED,
@@ -25,10 +27,8 @@ from edqn_jax.endings import (
     StoppedError,
     listening_for_sigterm,
 )
-from edqn_jax.launch import Distributed, how_to_join
-from edqn_jax.config.loading import resolve
+from edqn_jax.parallel.launch import Distributed, how_to_join
 from edqn_jax.rundir import Resume, plan_run_directory
-from edqn_jax.config.limits import validate
 
 Point = tuple[float, float, float]
 
@@ -158,8 +158,8 @@ def _train(argv: Sequence[str]) -> int:
     several = options.coordinator_address, options.num_processes, options.process_id
     arguments = how_to_join(options.distributed, *several, os.environ)
 
-    from edqn_jax import cluster
-    from edqn_jax.devices import cores, most_that_divide, use_cpu_devices
+    from edqn_jax.parallel import processes
+    from edqn_jax.parallel.devices import cores, most_that_divide, use_cpu_devices
     from edqn_jax.report.progress import Progress
     from edqn_jax.run import train_run
 
@@ -167,9 +167,9 @@ def _train(argv: Sequence[str]) -> int:
     process = 0
     if arguments is not None:
         print("edqn: waiting for the other processes, five minutes at most", file=sys.stderr)
-        process = cluster.join(arguments)
+        process = processes.join(arguments)
     writes = process == 0
-    run = cluster.together(lambda: plan_run_directory(options.run_dir, config, options.resume) if writes else None)
+    run = processes.together(lambda: plan_run_directory(options.run_dir, config, options.resume) if writes else None)
     progress = Progress(Console(quiet=not writes))
     with listening_for_sigterm() as stop_requested:
         try:
@@ -186,7 +186,7 @@ def _evaluate(argv: Sequence[str]) -> int:
     if not (args.run / "config.yaml").is_file():
         raise ConfigError(f"there is no run in '{args.run}': it holds no config.yaml")
 
-    from edqn_jax.devices import use_cpu_devices
+    from edqn_jax.parallel.devices import use_cpu_devices
     from edqn_jax.evaluate import evaluate_command
 
     use_cpu_devices()

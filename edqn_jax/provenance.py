@@ -10,7 +10,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from edqn_jax import cluster
+from edqn_jax.parallel import processes
 from edqn_jax.config import Config
 from edqn_jax.learn.embedding import has_code
 from edqn_jax.learn.trainer import TrainState
@@ -47,7 +47,7 @@ def state_digest(state: TrainState) -> str:
     digest = hashlib.sha256()
     for leaf in jax.tree.leaves(state):
         raw = jax.random.key_data(leaf) if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key) else leaf
-        array = cluster.fetch(raw)
+        array = processes.fetch(raw)
         digest.update(f"{array.dtype}{array.shape}".encode())
         digest.update(array.tobytes())
     return digest.hexdigest()

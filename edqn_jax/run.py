@@ -19,12 +19,13 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh
 
-from edqn_jax import cluster, flights
+from edqn_jax import flights
+from edqn_jax.parallel import processes
 from edqn_jax.baselines.astar import Path as ShortestPath
 from edqn_jax.baselines.astar import shortest_path
 from edqn_jax.checkpoint import save_policy
 from edqn_jax.config import DENSITIES, Config
-from edqn_jax.devices import choose_devices
+from edqn_jax.parallel.devices import choose_devices
 from edqn_jax.endings import DivergedError, StoppedError
 from edqn_jax.evaluate import flight_summary, spl, summarise, trajectory
 from edqn_jax.flights import Flights
@@ -290,12 +291,12 @@ def _train(
     """`train_run`, which compiles in the pool."""
     began = time.perf_counter()
     devices = choose_devices(config.train.devices, config.train.shards)
-    courses = cluster.together(lambda: lay_courses(config))  # a world's file may be missing on one host
+    courses = processes.together(lambda: lay_courses(config))  # a world's file may be missing on one host
     trainer = Trainer(config, courses.training, devices)
     progress.message(f"{config.world.name} world, {_described(devices)}; compiling")
     compiled = _ahead(pool, trainer.compile)
-    shortest = cluster.together(lambda: courses.shortest(config))
-    cluster.together(lambda: None if run is None else run.create(config))
+    shortest = processes.together(lambda: courses.shortest(config))
+    processes.together(lambda: None if run is None else run.create(config))
     state = trainer.init(config.train.seed)
     compile_seconds = compiled.result()
 
@@ -314,7 +315,7 @@ def _train(
         losses = jax.tree.map(np.asarray, losses)
         seconds = time.perf_counter() - started
         train_seconds += seconds
-        metrics = log.chunk(done, cluster.fetch(episodes), losses, seconds)
+        metrics = log.chunk(done, processes.fetch(episodes), losses, seconds)
         done += chunk
         check_finite(plan, done, losses)
         finished = done >= plan.total or 0 < config.train.max_episodes <= log.episodes
@@ -335,7 +336,7 @@ def _train(
         if run is not None:
             run.append_metrics(metrics)
         progress.update(metrics)
-        if cluster.on_any(stop_requested()) and not finished:
+        if processes.on_any(stop_requested()) and not finished:
             chosen = config.train.keep == "best" and kept.decisions > 0
             stopped = f"stopped after {done * envs:,} decisions"
             if run is None:
@@ -392,12 +393,12 @@ def _described(devices: Sequence[jax.Device]) -> str:  # pyright: ignore[reportI
 
 def _fly(config: Config, world: World, params: PolicyParams, mesh: Mesh) -> Flights:
     """The world's missions, flown and recorded; sensor noise is the same each time."""
-    return cluster.fetch(flights.fly_missions(config, *_placed(config, world, params, mesh), record=True, mesh=mesh))
+    return processes.fetch(flights.fly_missions(config, *_placed(config, world, params, mesh), record=True, mesh=mesh))
 
 
 def _placed(config: Config, world: World, params: PolicyParams, mesh: Mesh) -> tuple[World, PolicyParams, jax.Array]:
     """What `fly_missions` is given."""
-    return *cluster.replicate((world, params), mesh), jax.random.key(config.train.seed)
+    return *processes.replicate((world, params), mesh), jax.random.key(config.train.seed)
 
 
 def _verdict(summary: dict[str, Any], run: RunDirectory) -> str:

@@ -20,7 +20,9 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from edqn_jax import cluster, devices, run
+from edqn_jax import run
+from edqn_jax.parallel import processes
+from edqn_jax.parallel import devices
 from edqn_jax.cli import main
 from edqn_jax.config import CameraConfig
 from edqn_jax.learn import trainer
@@ -41,7 +43,7 @@ def only_a_policy(self: Trainer, seed: int) -> TrainState:
     """Stands for the state before the first step: of all of it, parameters."""
     learner = trainer._init_learner(self.config, jax.random.key(seed))
     state = TrainState(actors=None, learner=learner, step=jnp.int32(0))  # type: ignore[arg-type]
-    return cluster.replicate(state, self.mesh)
+    return processes.replicate(state, self.mesh)
 
 
 def no_learning(self: Trainer, state: TrainState, first: int) -> tuple[TrainState, tuple[Episodes, Losses]]:
@@ -51,7 +53,7 @@ def no_learning(self: Trainer, state: TrainState, first: int) -> tuple[TrainStat
     train = self.config.train
     none = jnp.zeros((train.chunk_steps, train.shards, train.num_envs // train.shards))
     losses = Losses(*[jnp.zeros(train.chunk_steps)] * len(dataclasses.fields(Losses)))
-    return state, cluster.replicate((Episodes(none, none, none), losses), self.mesh)
+    return state, processes.replicate((Episodes(none, none, none), losses), self.mesh)
 
 
 if __name__ == "__main__":

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 import jax
 import pytest
 
-from edqn_jax.devices import use_cpu_devices
+from edqn_jax.parallel.devices import use_cpu_devices
 
 use_cpu_devices(2)
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import ceilings
-from edqn_jax.devices import cores
+from edqn_jax.parallel.devices import cores
 from flags import configured
 
 

@@ -11,11 +11,12 @@ from pathlib import Path
 
 import pytest
 
-from edqn_jax import cli, devices
+from edqn_jax import cli
+from edqn_jax.parallel import devices
 from edqn_jax.cli import main, parse_train
 from edqn_jax.config import Config, ConfigError, preset
-from edqn_jax.endings import DivergedError, StoppedError
 from edqn_jax.config.loading import RANDOM_WORLDS
+from edqn_jax.endings import DivergedError, StoppedError
 from edqn_jax.sim.mjcf import SceneError
 
 ROOT = Path(__file__).parents[1]

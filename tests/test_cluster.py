@@ -13,7 +13,7 @@ import jax
 import numpy as np
 import pytest
 
-from edqn_jax import cluster
+from edqn_jax.parallel import processes
 from edqn_jax.checkpoint import load_policy
 from edqn_jax.config import Config, ConfigError
 from edqn_jax.config.loading import to_yaml
@@ -107,10 +107,10 @@ def test_a_process_alone_does_its_work_and_hears_itself() -> None:
     def fail() -> None:
         raise ConfigError("a world that is missing")
 
-    assert cluster.together(lambda: 3) == 3
+    assert processes.together(lambda: 3) == 3
     with pytest.raises(ConfigError, match="a world that is missing"):
-        cluster.together(fail)
-    assert cluster.on_any(True) and not cluster.on_any(False)
+        processes.together(fail)
+    assert processes.on_any(True) and not processes.on_any(False)
 
 
 @pytest.fixture
@@ -123,7 +123,7 @@ def joined(monkeypatch: pytest.MonkeyPatch) -> list[dict]:
 
 def test_a_process_joins_as_it_was_told_and_keeps_sigterm_for_itself(joined) -> None:
     jax.config.update("jax_enable_preemption_service", True)
-    assert cluster.join({"process_id": 0}) == 0
+    assert processes.join({"process_id": 0}) == 0
     assert joined == [{"process_id": 0}]
     assert not jax.config.values["jax_enable_preemption_service"]
 
@@ -131,7 +131,7 @@ def test_a_process_joins_as_it_was_told_and_keeps_sigterm_for_itself(joined) -> 
 def test_processes_with_different_numbers_of_devices_are_refused(joined, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(jax, "devices", lambda: [SimpleNamespace(process_index=process) for process in (0, 0, 1)])
     with pytest.raises(ConfigError, match="equally many devices, not 1 and 2; on CPUs --train.devices"):
-        cluster.join({})
+        processes.join({})
 
 
 def test_where_there_is_no_cluster_the_flags_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -140,4 +140,4 @@ def test_where_there_is_no_cluster_the_flags_are_named(monkeypatch: pytest.Monke
 
     monkeypatch.setattr(jax.distributed, "initialize", initialize)
     with pytest.raises(ConfigError, match="no cluster to join here; give --coordinator-address, .*should be defined"):
-        cluster.join({})
+        processes.join({})

@@ -11,7 +11,7 @@ import pytest
 import yaml
 
 from edqn_jax.cli import parse_train
-from edqn_jax.launch import how_to_join
+from edqn_jax.parallel.launch import how_to_join
 
 PAGE = (Path(__file__).parents[1] / "docs" / "cluster.md").read_text(encoding="utf-8")
 

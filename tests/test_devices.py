@@ -9,9 +9,9 @@ from typing import Any
 import jax
 import pytest
 
-from edqn_jax import devices
+from edqn_jax.parallel import devices
 from edqn_jax.config import ConfigError
-from edqn_jax.devices import choose_devices, cores, most_that_divide, use_cpu_devices
+from edqn_jax.parallel.devices import choose_devices, cores, most_that_divide, use_cpu_devices
 
 
 @pytest.mark.parametrize(("shards", "available", "used"), [(8, 2, 2), (8, 3, 2), (8, 7, 4), (8, 64, 8), (6, 4, 3)])

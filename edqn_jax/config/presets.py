@@ -4,7 +4,15 @@ from __future__ import annotations
 
 import dataclasses
 
-from edqn_jax.config.options import AgentConfig, Config, EncoderConfig, EnvConfig, EventsConfig, TrainConfig, WorldConfig
+from edqn_jax.config.options import (
+    AgentConfig,
+    Config,
+    EncoderConfig,
+    EnvConfig,
+    EventsConfig,
+    TrainConfig,
+    WorldConfig,
+)
 from edqn_jax.errors import ConfigError
 
 PRESETS = ("default", "paper")

@@ -24,9 +24,9 @@ from jax import Array, lax
 from jax.flatten_util import ravel_pytree
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
-from edqn_jax import cluster
+from edqn_jax.parallel import processes
 from edqn_jax.config import Config, ConfigError
-from edqn_jax.devices import compiler_options
+from edqn_jax.parallel.devices import compiler_options
 from edqn_jax.learn import dqn, embedding, encoder, qnetwork, replay
 from edqn_jax.learn.policy import PolicyParams, empty_memory, flatten, observation_size, remember
 from edqn_jax.learn.qnetwork import Params
@@ -398,7 +398,7 @@ class Trainer:
         self.plan = Plan.of(config)
         self.mesh = Mesh(np.asarray(devices), (AXIS,))
         self.replicated = NamedSharding(self.mesh, PartitionSpec())
-        self.world = cluster.replicate(world, self.mesh)
+        self.world = processes.replicate(world, self.mesh)
         self._chunk = None
 
     def init(self, seed: int) -> TrainState:
@@ -437,7 +437,7 @@ class Trainer:
 
     def _steps(self, first: int) -> Array:
         numbers = np.arange(first, first + self.config.train.chunk_steps, dtype=np.int32)
-        return cluster.replicate(numbers, self.mesh)
+        return processes.replicate(numbers, self.mesh)
 
     def chunk(self, state: TrainState, first: int) -> tuple[TrainState, tuple[Episodes, Losses]]:
         """The training steps `first .. first + chunk_steps - 1`; `state` is donated.

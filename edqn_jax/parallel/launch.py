@@ -17,7 +17,7 @@ def how_to_join(
     process_id: int | None,
     environment: Mapping[str, str],
 ) -> dict[str, Any] | None:
-    """The arguments for `cluster.join`; None for a process that stays alone. Nothing is done yet.
+    """The arguments for `processes.join`; None for a process that stays alone. Nothing is done yet.
 
     Args:
         distributed: `auto` joins where the next three are given or `srun` has started several tasks, `must` joins

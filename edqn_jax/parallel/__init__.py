@@ -1,0 +1,1 @@
+"""Devices, how a process was started, and what processes exchange."""
