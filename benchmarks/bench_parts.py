@@ -19,8 +19,8 @@ import pytest
 from jax.sharding import Mesh
 from pytest_benchmark.fixture import BenchmarkFixture
 
-from edqn_jax.parallel.devices import choose_devices, use_cpu_devices
 from edqn_jax.learn.trainer import AXIS, Plan, Trainer
+from edqn_jax.parallel.devices import choose_devices, use_cpu_devices
 from edqn_jax.run import lay_courses
 from flags import configured
 from parts import PARTS, Moment

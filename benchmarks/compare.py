@@ -29,8 +29,8 @@ from typing import Any
 
 import json_report
 from child import Child, ChildEndedError
-from edqn_jax.config import ConfigError
-from edqn_jax.files import check_can_write
+from edqn_jax.errors import ConfigError
+from edqn_jax.runs.files import check_can_write
 from flags import configured, split
 from parts import PARTS
 from worker import WHOLE

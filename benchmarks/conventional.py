@@ -25,11 +25,12 @@ import jax
 
 import json_report
 from edqn_jax.baselines.packages import MissingPackageError
-from edqn_jax.config import Config, ConfigError
+from edqn_jax.config import Config
+from edqn_jax.errors import ConfigError
 from edqn_jax.parallel.devices import use_cpu_devices
-from edqn_jax.files import check_can_write
-from edqn_jax.provenance import workload
 from edqn_jax.run import lay_courses
+from edqn_jax.runs.files import check_can_write
+from edqn_jax.runs.provenance import workload
 from edqn_jax.sim.mjcf import load_scene, resolve_world
 from flags import configured, split
 from whole import steady

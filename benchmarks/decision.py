@@ -22,11 +22,12 @@ from typing import Any
 import jax
 
 import json_report
-from edqn_jax.config import Config, ConfigError
+from edqn_jax.config import Config
+from edqn_jax.errors import ConfigError
 from edqn_jax.evaluate import decision_latency_ms, fresh_policy
-from edqn_jax.files import check_can_write
-from edqn_jax.provenance import workload
 from edqn_jax.run import lay_courses
+from edqn_jax.runs.files import check_can_write
+from edqn_jax.runs.provenance import workload
 from flags import configured, split
 
 REPEATS, CALLS = 5, 2000

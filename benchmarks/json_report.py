@@ -8,9 +8,9 @@ from pathlib import Path
 from typing import Any
 
 from edqn_jax.parallel.devices import processor
-from edqn_jax.files import write_whole
-from edqn_jax.provenance import versions
-from edqn_jax.rundir import plain
+from edqn_jax.runs.directory import plain
+from edqn_jax.runs.files import write_whole
+from edqn_jax.runs.provenance import versions
 
 
 def machine(devices: Sequence[Any]) -> dict[str, Any]:

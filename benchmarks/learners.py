@@ -13,13 +13,12 @@ import json_report
 from edqn_jax.config import DENSITIES, Config
 from edqn_jax.config.limits import validate
 from edqn_jax.config.loading import apply
-from edqn_jax.parallel.devices import choose_devices
-from edqn_jax.endings import DivergedError
+from edqn_jax.errors import DivergedError
 from edqn_jax.evaluate import decision_seconds, fly_on_all_devices
 from edqn_jax.flights import Flights
 from edqn_jax.learn.policy import PolicyParams
 from edqn_jax.learn.trainer import Trainer, policy_of
-from edqn_jax.provenance import workload
+from edqn_jax.parallel.devices import choose_devices
 from edqn_jax.run import (
     Candidate,
     Courses,
@@ -30,6 +29,7 @@ from edqn_jax.run import (
     lay_courses,
     validated_by,
 )
+from edqn_jax.runs.provenance import workload
 from edqn_jax.sim.env import Outcome, World
 
 LEARNERS = {

@@ -13,7 +13,7 @@ from edqn_jax.baselines.follow import FollowConfig, compiled_follower, reserved,
 from edqn_jax.baselines.planner import Budget, Task, load_planner
 from edqn_jax.config import DENSITIES, Config
 from edqn_jax.parallel.devices import processor
-from edqn_jax.provenance import workload
+from edqn_jax.runs.provenance import workload
 from edqn_jax.sim import worlds
 from edqn_jax.sim.drone import load_airframe
 from edqn_jax.sim.env import Outcome

@@ -17,10 +17,11 @@ import jax
 from child import answers
 from edqn_jax.baselines.packages import MissingPackageError
 from edqn_jax.baselines.planner import PLANNERS
-from edqn_jax.config import Config, ConfigError
+from edqn_jax.config import Config
 from edqn_jax.config.loading import apply, load_layer
+from edqn_jax.errors import ConfigError
 from edqn_jax.parallel.devices import use_cpu_devices
-from edqn_jax.rundir import plain
+from edqn_jax.runs.directory import plain
 from learners import Learner
 from planning import Planning
 from resident import peak_of

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from edqn_jax.baselines.planner import DRAWING
-from edqn_jax.config import ConfigError
+from edqn_jax.errors import ConfigError
 from intervals import difference_interval, rate_interval
 
 Row = dict[str, Any]

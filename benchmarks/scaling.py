@@ -29,13 +29,14 @@ from typing import Any
 import json_report
 from boxes import world_of_boxes
 from ceilings import Rollout
-from edqn_jax.config import Config, ConfigError
+from edqn_jax.config import Config
 from edqn_jax.config.limits import validate
 from edqn_jax.config.loading import Layer, apply
+from edqn_jax.errors import ConfigError
 from edqn_jax.parallel.devices import choose_devices, use_cpu_devices
-from edqn_jax.files import check_can_write
-from edqn_jax.provenance import workload
 from edqn_jax.run import Courses, lay_courses
+from edqn_jax.runs.files import check_can_write
+from edqn_jax.runs.provenance import workload
 from edqn_jax.sim.mjcf import write_scene
 from flags import configured, split
 from memory import StateBytes, state_bytes

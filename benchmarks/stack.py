@@ -16,10 +16,10 @@ import numpy as np
 import json_report
 from conventional import PACKAGES, SETTINGS
 from edqn_jax.config import Config
-from edqn_jax.parallel.devices import choose_devices, processor
 from edqn_jax.flights import Flights
-from edqn_jax.provenance import workload
+from edqn_jax.parallel.devices import choose_devices, processor
 from edqn_jax.run import lay_courses
+from edqn_jax.runs.provenance import workload
 from edqn_jax.sim.env import OWN_SIZE, World
 from learners import Watched
 from resident import peak_of_workers

@@ -26,12 +26,13 @@ from jax.sharding import Mesh
 
 import json_report
 from ceilings import Rollout, ceilings
-from edqn_jax.config import Config, ConfigError
-from edqn_jax.parallel.devices import choose_devices, cores, use_cpu_devices
-from edqn_jax.files import check_can_write
+from edqn_jax.config import Config
+from edqn_jax.errors import ConfigError
 from edqn_jax.learn.trainer import AXIS
-from edqn_jax.provenance import workload
+from edqn_jax.parallel.devices import choose_devices, cores, use_cpu_devices
 from edqn_jax.run import lay_courses
+from edqn_jax.runs.files import check_can_write
+from edqn_jax.runs.provenance import workload
 from flags import configured, split
 from parts import parts_of
 from timing import Timed

@@ -21,11 +21,11 @@ import jax
 import numpy as np
 
 from edqn_jax.agreement import CONTACT_TOLERANCE_M, Agreement, check_verdicts
-from edqn_jax.config import ConfigError
 from edqn_jax.course import load_course
-from edqn_jax.parallel.devices import use_cpu_devices
+from edqn_jax.errors import ConfigError
 from edqn_jax.evaluate import fly_on_all_devices, load_run
-from edqn_jax.files import check_can_write, write_whole
+from edqn_jax.parallel.devices import use_cpu_devices
+from edqn_jax.runs.files import check_can_write, write_whole
 from edqn_jax.sim.env import Outcome
 
 

@@ -19,10 +19,10 @@ import numpy as np
 from jax.sharding import Mesh
 
 import edqn_jax
-from edqn_jax.parallel.devices import choose_devices, processor, use_cpu_devices
 from edqn_jax.learn.trainer import AXIS
-from edqn_jax.provenance import versions, workload
+from edqn_jax.parallel.devices import choose_devices, processor, use_cpu_devices
 from edqn_jax.run import lay_courses
+from edqn_jax.runs.provenance import versions, workload
 
 WHOLE = "whole_training_step"
 

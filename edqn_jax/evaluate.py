@@ -18,16 +18,17 @@ from rich.console import Console
 from rich.table import Table
 
 from edqn_jax.baselines.astar import NoPathError, shortest_path
-from edqn_jax.checkpoint import load_policy
-from edqn_jax.config import Config, ConfigError
+from edqn_jax.config import Config
 from edqn_jax.config.limits import validate
 from edqn_jax.config.loading import apply, load_layer
 from edqn_jax.course import Course, load_course
-from edqn_jax.files import check_can_write, write_whole
+from edqn_jax.errors import ConfigError
 from edqn_jax.flights import Flights, fly_missions
 from edqn_jax.learn import embedding, policy, qnetwork
 from edqn_jax.learn.policy import PolicyParams
-from edqn_jax.rundir import TRAJECTORY_COLUMNS, plain
+from edqn_jax.runs.checkpoints import load_policy
+from edqn_jax.runs.directory import TRAJECTORY_COLUMNS, plain
+from edqn_jax.runs.files import check_can_write, write_whole
 from edqn_jax.sim import env
 from edqn_jax.sim.env import Outcome, World
 from edqn_jax.sim.events import EventField, divides_window
@@ -36,7 +37,7 @@ from edqn_jax.sim.scene import take_scene
 from edqn_jax.sim.sensor import Sensed
 
 if TYPE_CHECKING:
-    from edqn_jax.cli import EvaluateArgs
+    from edqn_jax.cli.arguments import EvaluateArgs
 
 # ------------------------------------------------------------------------------------------- runs
 

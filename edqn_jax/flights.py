@@ -13,9 +13,9 @@ from jax import Array
 from jax.sharding import Mesh, PartitionSpec
 
 from edqn_jax.config import Config
-from edqn_jax.parallel.devices import compiler_options
 from edqn_jax.learn import policy
 from edqn_jax.learn.policy import Memory, PolicyParams
+from edqn_jax.parallel.devices import compiler_options
 from edqn_jax.sim import env
 from edqn_jax.sim.drone import DroneState, Flight
 from edqn_jax.sim.env import EnvState, Observation, Outcome, Step, World

@@ -20,21 +20,21 @@ import numpy as np
 from jax.sharding import Mesh
 
 from edqn_jax import flights
-from edqn_jax.parallel import processes
 from edqn_jax.baselines.astar import Path as ShortestPath
 from edqn_jax.baselines.astar import shortest_path
-from edqn_jax.checkpoint import save_policy
 from edqn_jax.config import DENSITIES, Config
-from edqn_jax.parallel.devices import choose_devices
-from edqn_jax.endings import DivergedError, StoppedError
+from edqn_jax.errors import DivergedError, StoppedError
 from edqn_jax.evaluate import flight_summary, spl, summarise, trajectory
 from edqn_jax.flights import Flights
 from edqn_jax.learn.policy import PolicyParams
 from edqn_jax.learn.trainer import Episodes, Losses, Plan, Trainer, policy_of
-from edqn_jax.provenance import state_digest, versions, workload
+from edqn_jax.parallel import processes
+from edqn_jax.parallel.devices import choose_devices
 from edqn_jax.report.gallery import draw_gallery
 from edqn_jax.report.progress import Progress
-from edqn_jax.rundir import RunDirectory
+from edqn_jax.runs.checkpoints import save_policy
+from edqn_jax.runs.directory import RunDirectory
+from edqn_jax.runs.provenance import state_digest, versions, workload
 from edqn_jax.sim import drone, worlds
 from edqn_jax.sim.env import Outcome, World
 from edqn_jax.sim.mjcf import check_scene, load_world, resolve_world

@@ -21,13 +21,12 @@ import jax.numpy as jnp
 from jax import Array
 
 from edqn_jax import run
-from edqn_jax.parallel import processes
-from edqn_jax.parallel import devices
 from edqn_jax.cli import main
 from edqn_jax.config import CameraConfig
 from edqn_jax.learn import trainer
 from edqn_jax.learn.trainer import Episodes, Losses, Trainer, TrainState
-from edqn_jax.rundir import plain
+from edqn_jax.parallel import devices, processes
+from edqn_jax.runs.directory import plain
 from edqn_jax.sim import camera
 from edqn_jax.sim.scene import Scene
 

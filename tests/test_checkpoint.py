@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
-from edqn_jax.checkpoint import COMMIT_MARKER, POLICY, load_policy, save_policy
-from edqn_jax.config import ConfigError
+from edqn_jax.errors import ConfigError
 from edqn_jax.learn.policy import PolicyParams
+from edqn_jax.runs.checkpoints import COMMIT_MARKER, POLICY, load_policy, save_policy
 
 
 def some_policy(value: float = 1.0) -> PolicyParams:

@@ -11,12 +11,13 @@ from pathlib import Path
 
 import pytest
 
-from edqn_jax import cli
-from edqn_jax.parallel import devices
-from edqn_jax.cli import main, parse_train
-from edqn_jax.config import Config, ConfigError, preset
+from edqn_jax.cli import arguments
+from edqn_jax.cli import main
+from edqn_jax.cli.arguments import parse_train
+from edqn_jax.config import Config, preset
 from edqn_jax.config.loading import RANDOM_WORLDS
-from edqn_jax.endings import DivergedError, StoppedError
+from edqn_jax.errors import ConfigError, DivergedError, StoppedError
+from edqn_jax.parallel import devices
 from edqn_jax.sim.mjcf import SceneError
 
 ROOT = Path(__file__).parents[1]
@@ -191,17 +192,17 @@ def test_sigterm_reaches_training_as_a_wish_to_stop(trainer):
 def test_evaluate_hands_on_what_was_asked_for(monkeypatch, tmp_path):
     (tmp_path / "config.yaml").touch()
     stand_in = types.ModuleType("edqn_jax.evaluate")
-    asked: list[cli.EvaluateArgs] = []
+    asked: list[arguments.EvaluateArgs] = []
     stand_in.__dict__["evaluate_command"] = asked.append
     monkeypatch.setitem(sys.modules, "edqn_jax.evaluate", stand_in)
     monkeypatch.setattr(devices, "use_cpu_devices", lambda count=None: None)
     argv = [str(tmp_path), "--world", "dense", "--start", "1", "2", "3", "--goal", "-4", "5.5", "6"]
     assert main(["evaluate", *argv, "--missions", "9", "--seed", "2", "--json", "a.json"]) == 0
-    whole = cli.EvaluateArgs(
+    whole = arguments.EvaluateArgs(
         tmp_path, "dense", (1.0, 2.0, 3.0), (-4.0, 5.5, 6.0), missions=9, seed=2, json=Path("a.json")
     )
     assert main(["evaluate", str(tmp_path), "--shuffle-codes", "--trajectories", "a.npz"]) == 0
-    assert asked == [whole, cli.EvaluateArgs(tmp_path, shuffle_codes=True, trajectories=Path("a.npz"))]
+    assert asked == [whole, arguments.EvaluateArgs(tmp_path, shuffle_codes=True, trajectories=Path("a.npz"))]
 
 
 def test_help_lists_every_knob_and_does_not_start_jax():

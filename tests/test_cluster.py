@@ -13,11 +13,12 @@ import jax
 import numpy as np
 import pytest
 
-from edqn_jax.parallel import processes
-from edqn_jax.checkpoint import load_policy
-from edqn_jax.config import Config, ConfigError
+from edqn_jax.config import Config
 from edqn_jax.config.loading import to_yaml
-from edqn_jax.rundir import RunDirectory
+from edqn_jax.errors import ConfigError
+from edqn_jax.parallel import processes
+from edqn_jax.runs.checkpoints import load_policy
+from edqn_jax.runs.directory import RunDirectory
 from tests.processes import PATIENCE_S, by_srun, one_process, to_the_end, two_processes
 from tests.test_run import CONFIG
 

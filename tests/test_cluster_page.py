@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from edqn_jax.cli import parse_train
+from edqn_jax.cli.arguments import parse_train
 from edqn_jax.parallel.launch import how_to_join
 
 PAGE = (Path(__file__).parents[1] / "docs" / "cluster.md").read_text(encoding="utf-8")

@@ -12,7 +12,7 @@ import pytest
 
 import compare
 import throughput
-from edqn_jax.config import ConfigError
+from edqn_jax.errors import ConfigError
 from tests.miniature import MINIATURE
 from worker import WHOLE
 

@@ -8,9 +8,10 @@ from typing import Any
 
 import pytest
 
-from edqn_jax.config import DENSITIES, PRESETS, Config, ConfigError, preset
+from edqn_jax.config import DENSITIES, PRESETS, Config, preset
 from edqn_jax.config.limits import validate
 from edqn_jax.config.loading import RANDOM_WORLDS, apply, load_layer, resolve, to_yaml
+from edqn_jax.errors import ConfigError
 
 
 def write(tmp_path: Path, text: str) -> Path:

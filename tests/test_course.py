@@ -6,8 +6,9 @@ import mujoco
 import numpy as np
 import pytest
 
-from edqn_jax.config import Config, ConfigError
+from edqn_jax.config import Config
 from edqn_jax.course import load_course
+from edqn_jax.errors import ConfigError
 from edqn_jax.sim import worlds
 from edqn_jax.sim.mjcf import load_scene, resolve_world
 

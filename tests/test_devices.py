@@ -9,8 +9,8 @@ from typing import Any
 import jax
 import pytest
 
+from edqn_jax.errors import ConfigError
 from edqn_jax.parallel import devices
-from edqn_jax.config import ConfigError
 from edqn_jax.parallel.devices import choose_devices, cores, most_that_divide, use_cpu_devices
 
 

@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 
 from edqn_jax import evaluate
-from edqn_jax.checkpoint import save_policy
-from edqn_jax.cli import EvaluateArgs
-from edqn_jax.config import Config, ConfigError
+from edqn_jax.cli.arguments import EvaluateArgs
+from edqn_jax.config import Config
 from edqn_jax.config.loading import to_yaml
 from edqn_jax.course import Course
+from edqn_jax.errors import ConfigError
 from edqn_jax.evaluate import (
     decision_latency_ms,
     evaluate_command,
@@ -26,6 +26,7 @@ from edqn_jax.evaluate import (
     wilson_interval,
 )
 from edqn_jax.flights import Closest, Flights
+from edqn_jax.runs.checkpoints import save_policy
 from edqn_jax.sim.env import Outcome
 from edqn_jax.verdict import load_judge, replay_contact
 from tests.policies import CONFIG, always

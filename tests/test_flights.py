@@ -16,7 +16,7 @@ from edqn_jax.agreement import check_verdicts
 from edqn_jax.course import Course, load_course
 from edqn_jax.evaluate import flight_summary, fly_on_all_devices, trajectory
 from edqn_jax.flights import Flights, fly_missions
-from edqn_jax.rundir import TRAJECTORY_COLUMNS
+from edqn_jax.runs.directory import TRAJECTORY_COLUMNS
 from edqn_jax.sim.env import Outcome
 from edqn_jax.sim.scene import signed_distance, take_scene
 from tests.policies import CONFIG, always, that_sees

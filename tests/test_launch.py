@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from edqn_jax.config import ConfigError
+from edqn_jax.errors import ConfigError
 from edqn_jax.parallel.launch import Distributed, how_to_join
 
 SRUN = {"SLURM_JOB_ID": "7", "SLURM_NTASKS": "4", "SLURM_STEP_NUM_TASKS": "4", "SLURM_PROCID": "1"}

@@ -17,7 +17,7 @@ import planning
 import rival
 import runtime
 import runtime_table
-from edqn_jax.cli import parse_train
+from edqn_jax.cli.arguments import parse_train
 from edqn_jax.config import Config
 from edqn_jax.config.loading import to_yaml
 from edqn_jax.sim.mjcf import write_scene

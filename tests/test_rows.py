@@ -10,7 +10,7 @@ import pytest
 import rows
 import runtime_table
 from edqn_jax.baselines.planner import PLANNERS
-from edqn_jax.config import ConfigError
+from edqn_jax.errors import ConfigError
 from tests.turns import flights, row, turn
 
 

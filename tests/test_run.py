@@ -13,15 +13,15 @@ import numpy as np
 import pytest
 
 from edqn_jax import run as training
-from edqn_jax.cli import EvaluateArgs
-from edqn_jax.config import CameraConfig, Config, ConfigError, TrainConfig, WorldConfig
-from edqn_jax.endings import StoppedError
+from edqn_jax.cli.arguments import EvaluateArgs
+from edqn_jax.config import CameraConfig, Config, TrainConfig, WorldConfig
+from edqn_jax.errors import ConfigError, StoppedError
 from edqn_jax.evaluate import evaluate_command, load_run
 from edqn_jax.learn.policy import PolicyParams
 from edqn_jax.learn.trainer import Episodes, Losses
 from edqn_jax.report.progress import Progress
 from edqn_jax.run import Candidate, choose, first_success, lay_courses, train_run
-from edqn_jax.rundir import TRAJECTORY_COLUMNS, RunDirectory, plain
+from edqn_jax.runs.directory import TRAJECTORY_COLUMNS, RunDirectory, plain
 from tests.learn.test_trainer import CONFIG as SMALL
 
 CONFIG = dataclasses.replace(

@@ -9,9 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from edqn_jax.config import Config, ConfigError
+from edqn_jax.config import Config
 from edqn_jax.config.loading import resolve
-from edqn_jax.rundir import TRAJECTORY_COLUMNS, RunDirectory, plan_run_directory
+from edqn_jax.errors import ConfigError
+from edqn_jax.runs.directory import TRAJECTORY_COLUMNS, RunDirectory, plan_run_directory
 
 
 @pytest.fixture
@@ -110,7 +111,7 @@ def test_a_place_without_the_right_to_write_is_named(given, tmp_path, monkeypatc
         raise PermissionError(13, "Permission denied")
 
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("edqn_jax.files.tempfile.mkdtemp", refuse)
+    monkeypatch.setattr("edqn_jax.runs.files.tempfile.mkdtemp", refuse)
     with pytest.raises(ConfigError, match=f"'{given or 'runs'}' cannot be written: .*Permission denied"):
         plan_run_directory(given, Config())
 

@@ -12,11 +12,12 @@ import pytest
 
 import scaling
 from boxes import MOST, world_of_boxes
-from edqn_jax.config import Config, ConfigError
+from edqn_jax.config import Config
 from edqn_jax.config.loading import apply
+from edqn_jax.errors import ConfigError
 from edqn_jax.learn import trainer
 from edqn_jax.run import lay_courses
-from edqn_jax.rundir import plain
+from edqn_jax.runs.directory import plain
 from edqn_jax.sim.mjcf import check_scene, load_scene
 from edqn_jax.sim.scene import obstacle_count
 from flags import configured

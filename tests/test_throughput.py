@@ -8,9 +8,9 @@ import statistics
 import pytest
 
 import throughput
-from edqn_jax.config import ConfigError
+from edqn_jax.errors import ConfigError
 from edqn_jax.learn.trainer import Plan, Trainer
-from edqn_jax.rundir import plain
+from edqn_jax.runs.directory import plain
 from parts import parts_of
 from tests.miniature import MINIATURE
 

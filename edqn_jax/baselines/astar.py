@@ -31,7 +31,8 @@ import numpy as np
 from jax import Array
 
 from edqn_jax.baselines.planner import path_length, point_text
-from edqn_jax.config import Config, ConfigError
+from edqn_jax.config import Config
+from edqn_jax.errors import ConfigError
 from edqn_jax.sim.mjcf import check_scene, load_world, resolve_world
 from edqn_jax.sim.scene import Scene, segment_contact, signed_distance
 from edqn_jax.sim.worlds import SHAPES, random_scene, world_key

@@ -13,7 +13,6 @@ from edqn_jax.config.options import (
     WorldConfig,
 )
 from edqn_jax.config.presets import PRESETS, preset
-from edqn_jax.errors import ConfigError
 
 __all__ = [
     "DENSITIES",
@@ -21,7 +20,6 @@ __all__ = [
     "AgentConfig",
     "CameraConfig",
     "Config",
-    "ConfigError",
     "DroneConfig",
     "EncoderConfig",
     "EnvConfig",

@@ -17,7 +17,7 @@ from flax import struct
 from jax import Array
 
 from edqn_jax.config import AgentConfig
-from edqn_jax.draws import integers
+from edqn_jax.random import integers
 from edqn_jax.sim.env import Outcome
 
 

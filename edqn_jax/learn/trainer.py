@@ -24,12 +24,13 @@ from jax import Array, lax
 from jax.flatten_util import ravel_pytree
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
-from edqn_jax.parallel import processes
-from edqn_jax.config import Config, ConfigError
-from edqn_jax.parallel.devices import compiler_options
+from edqn_jax.config import Config
+from edqn_jax.errors import ConfigError
 from edqn_jax.learn import dqn, embedding, encoder, qnetwork, replay
 from edqn_jax.learn.policy import PolicyParams, empty_memory, flatten, observation_size, remember
 from edqn_jax.learn.qnetwork import Params
+from edqn_jax.parallel import processes
+from edqn_jax.parallel.devices import compiler_options
 from edqn_jax.sim import env
 from edqn_jax.sim.env import ACTIONS, EnvState, Outcome, World
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import jax
 
-from edqn_jax.config import ConfigError
+from edqn_jax.errors import ConfigError
 
 ALIKE = "--xla_backend_extra_options=xla_cpu_disable_loop_unrolling"
 """XLA's flag under which programs for CPUs round alike whatever the size of a batch (docs/decisions/0006)."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, Literal
 
-from edqn_jax.config import ConfigError
+from edqn_jax.errors import ConfigError
 
 Distributed = Literal["auto", "never", "must"]
 

@@ -15,7 +15,7 @@ import numpy as np
 from jax.experimental import multihost_utils
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
-from edqn_jax.config import ConfigError
+from edqn_jax.errors import ConfigError
 
 T = TypeVar("T")
 Tree = TypeVar("Tree")

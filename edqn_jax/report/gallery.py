@@ -15,7 +15,7 @@ from edqn_jax.learn.policy import PolicyParams
 from edqn_jax.report.curves import draw_learning, draw_returns
 from edqn_jax.report.flights import draw_path, draw_world
 from edqn_jax.report.images import LOOKS, draw_reconstruction, draw_sight
-from edqn_jax.rundir import TRAJECTORY_COLUMNS, RunDirectory
+from edqn_jax.runs.directory import TRAJECTORY_COLUMNS, RunDirectory
 from edqn_jax.sim import camera, events, sensor
 from edqn_jax.sim.drone import Flight
 from edqn_jax.sim.scene import Scene

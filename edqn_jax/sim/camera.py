@@ -13,13 +13,13 @@ import jax.numpy as jnp
 from jax import Array
 
 from edqn_jax.config import CameraConfig
-from edqn_jax.fusion import materialised
 from edqn_jax.sim import columns, coverage, raycast
 from edqn_jax.sim.columns import Frame
 from edqn_jax.sim.coverage import Layers
 from edqn_jax.sim.raycast import Rays, Values
 from edqn_jax.sim.scene import Scene
 from edqn_jax.sim.texture import texture
+from edqn_jax.sim.xla import materialised
 
 LUMA = (0.299, 0.587, 0.114)
 """Weights of R, G and B in Eq. 1."""

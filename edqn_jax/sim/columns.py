@@ -26,11 +26,11 @@ from jax.flatten_util import ravel_pytree
 from jax.interpreters import batching, mlir
 
 from edqn_jax.config import CameraConfig
-from edqn_jax.fusion import materialised
 from edqn_jax.sim import coverage, raycast
 from edqn_jax.sim.coverage import Layers
 from edqn_jax.sim.raycast import Rays, Values
 from edqn_jax.sim.scene import Scene, UprightBoxes, UprightCylinders, no_shapes
+from edqn_jax.sim.xla import materialised
 
 SLOTS = (0, 2, 4, 8)
 """Shapes that the kinds of blocks have room for; fuller columns take one shape after another."""

@@ -15,7 +15,6 @@ from flax import struct
 from jax import Array, lax
 
 from edqn_jax.config import CameraConfig
-from edqn_jax.fusion import materialised
 from edqn_jax.sim.raycast import (
     TINY,
     Rays,
@@ -30,6 +29,7 @@ from edqn_jax.sim.raycast import (
     unit_ball,
 )
 from edqn_jax.sim.scene import Scene, Spheres, UprightBoxes, UprightCylinders
+from edqn_jax.sim.xla import materialised
 
 NEAR_M = 0.05
 """Shapes are clipped at this depth before they are projected; the body sphere is wider."""

@@ -25,9 +25,10 @@ import numpy as np
 from flax import struct
 from jax import Array
 
-from edqn_jax.config import ConfigError, DroneConfig
-from edqn_jax.fusion import materialised
+from edqn_jax.config import DroneConfig
+from edqn_jax.errors import ConfigError
 from edqn_jax.sim.rigid_body import rigid_body_step
+from edqn_jax.sim.xla import materialised
 
 with contextlib.redirect_stdout(io.StringIO()):  # it prints that Warp, an engine we do not use, is missing
     from mujoco import mjx

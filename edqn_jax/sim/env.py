@@ -17,7 +17,7 @@ from flax import struct
 from jax import Array
 
 from edqn_jax.config import Config, EnvConfig
-from edqn_jax.draws import integers
+from edqn_jax.random import integers
 from edqn_jax.sim import drone, sensor
 from edqn_jax.sim.drone import Airframe, DroneState, Flight
 from edqn_jax.sim.events import EventMemory

@@ -25,7 +25,8 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from edqn_jax.config import DENSITIES, ConfigError
+from edqn_jax.config import DENSITIES
+from edqn_jax.errors import ConfigError
 from edqn_jax.sim.scene import (
     KINDS,
     Capsules,

@@ -12,7 +12,8 @@ from flax import struct
 from jax import Array
 from jax.typing import ArrayLike
 
-from edqn_jax.config import DENSITIES, ConfigError
+from edqn_jax.config import DENSITIES
+from edqn_jax.errors import ConfigError
 from edqn_jax.sim.scene import (
     PARKED,
     Capsules,

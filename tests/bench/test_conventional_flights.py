@@ -12,7 +12,8 @@ import pytest
 from edqn_jax import flights as our_flights
 from edqn_jax.baselines.conventional.fleet import Course
 from edqn_jax.baselines.conventional.flights import fly_missions
-from edqn_jax.config import CameraConfig, Config, ConfigError, EnvConfig
+from edqn_jax.config import CameraConfig, Config, EnvConfig
+from edqn_jax.errors import ConfigError
 from edqn_jax.evaluate import summarise
 from edqn_jax.learn.policy import PolicyParams
 from edqn_jax.sim.env import Outcome

@@ -17,8 +17,9 @@ from edqn_jax.baselines.conventional.vae import EventVAE, Learner, images
 from edqn_jax.baselines.conventional.vec_env import CodedDrones
 from edqn_jax.baselines.conventional.workers import SpreadFleet
 from edqn_jax.baselines.packages import MissingPackageError, require
-from edqn_jax.config import Config, ConfigError
-from edqn_jax.rundir import plain
+from edqn_jax.config import Config
+from edqn_jax.errors import ConfigError
+from edqn_jax.runs.directory import plain
 from edqn_jax.sim.env import OWN_SIZE, Outcome
 from flags import configured
 from tests.baselines.uninstalled import hide

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from edqn_jax.baselines.planner import PLANNERS
-from edqn_jax.cli import parse_train
+from edqn_jax.cli.arguments import parse_train
 from edqn_jax.config import Config
 from edqn_jax.sim.mjcf import write_scene
 from planning import Planning

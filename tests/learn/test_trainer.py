@@ -10,7 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from edqn_jax.config import AgentConfig, CameraConfig, Config, ConfigError, EncoderConfig, TrainConfig
+from edqn_jax.config import AgentConfig, CameraConfig, Config, EncoderConfig, TrainConfig
+from edqn_jax.errors import ConfigError
 from edqn_jax.learn import replay, trainer
 from edqn_jax.learn.trainer import Plan, Trainer, TrainState
 from edqn_jax.sim import drone, mjcf, worlds

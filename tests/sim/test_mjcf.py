@@ -13,7 +13,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from edqn_jax.config import ConfigError
+from edqn_jax.errors import ConfigError
 from edqn_jax.sim import mjcf
 from edqn_jax.sim.mjcf import (
     VOLUME_MARGIN,

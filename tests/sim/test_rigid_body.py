@@ -11,9 +11,10 @@ import mujoco
 import numpy as np
 import pytest
 
-from edqn_jax.cli import parse_train
-from edqn_jax.config import Config, ConfigError
-from edqn_jax.provenance import workload
+from edqn_jax.cli.arguments import parse_train
+from edqn_jax.config import Config
+from edqn_jax.errors import ConfigError
+from edqn_jax.runs.provenance import workload
 from edqn_jax.sim import drone
 from edqn_jax.sim.drone import AIRFRAME_FILE, DroneState, hover, load_airframe, physics_step
 from edqn_jax.sim.mjcf import load_scene, resolve_world

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from edqn_jax.baselines.conventional import camera, events, flight, task, world
 from edqn_jax.baselines.conventional.stopwatch import Stopwatch
-from edqn_jax.config import Config, ConfigError
+from edqn_jax.config import Config
+from edqn_jax.errors import ConfigError
 from edqn_jax.sim import env
 from edqn_jax.sim.env import ACTIONS, OWN_SIZE, frame_steps
 from edqn_jax.sim.scene import take_scene

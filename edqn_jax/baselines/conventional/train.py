@@ -26,7 +26,8 @@ from edqn_jax.baselines.conventional.vae import EventVAE, Learner, images
 from edqn_jax.baselines.conventional.vec_env import CodedDrones, observed
 from edqn_jax.baselines.conventional.workers import SpreadFleet
 from edqn_jax.baselines.packages import require
-from edqn_jax.config import AgentConfig, Config, ConfigError
+from edqn_jax.config import AgentConfig, Config
+from edqn_jax.errors import ConfigError
 from edqn_jax.flights import Flights
 from edqn_jax.learn.trainer import Plan
 from edqn_jax.sim.env import ACTIONS

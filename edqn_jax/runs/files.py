@@ -7,7 +7,7 @@ import os
 import tempfile
 from pathlib import Path
 
-from edqn_jax.config import ConfigError
+from edqn_jax.errors import ConfigError
 
 
 def write_whole(file: Path, content: str | bytes) -> None:

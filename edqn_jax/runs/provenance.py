@@ -10,10 +10,10 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 
-from edqn_jax.parallel import processes
 from edqn_jax.config import Config
 from edqn_jax.learn.embedding import has_code
 from edqn_jax.learn.trainer import TrainState
+from edqn_jax.parallel import processes
 from edqn_jax.sim.scene import Scene, obstacle_count
 from edqn_jax.sim.sensor import frames_per_decision
 

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from edqn_jax.draws import integers
+from edqn_jax.random import integers
 
 
 @pytest.mark.parametrize("below", [1, 2, 27, 1000])

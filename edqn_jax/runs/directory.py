@@ -14,9 +14,10 @@ from typing import Any, Literal
 
 import numpy as np
 
-from edqn_jax.config import Config, ConfigError
+from edqn_jax.config import Config
 from edqn_jax.config.loading import apply, load_layer, to_yaml
-from edqn_jax.files import check_can_make, unwritable, write_whole
+from edqn_jax.errors import ConfigError
+from edqn_jax.runs.files import check_can_make, unwritable, write_whole
 
 Resume = Literal["auto", "never", "must"]
 

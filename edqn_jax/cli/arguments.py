@@ -1,34 +1,22 @@
-"""The command line: `edqn train` and `edqn evaluate`. Argument parsing and exit codes, nothing else."""
+"""Arguments of the commands; a string under a field is its help text."""
 
 from __future__ import annotations
 
 import dataclasses
-import os
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Literal
 
 import tyro
-from rich.console import Console
 from tyro.conf import Positional, arg
 
-from edqn_jax.config import DENSITIES, Config, ConfigError
+from edqn_jax.config import DENSITIES, Config
 from edqn_jax.config.limits import validate
 from edqn_jax.config.loading import resolve
-from edqn_jax.endings import (
-    BAD_INPUT,
-    DIVERGED,
-    DONE,
-    INTERRUPTED,
-    TERMINATED,
-    DivergedError,
-    StoppedError,
-    listening_for_sigterm,
-)
-from edqn_jax.parallel.launch import Distributed, how_to_join
-from edqn_jax.rundir import Resume, plan_run_directory
+from edqn_jax.errors import ConfigError
+from edqn_jax.parallel.launch import Distributed
+from edqn_jax.runs.directory import Resume
 
 Point = tuple[float, float, float]
 
@@ -98,26 +86,6 @@ class EvaluateArgs:
 
 
 TRAIN = "edqn train"
-COMMANDS = {"train": TrainCommand, "evaluate": EvaluateArgs}
-
-
-def main(argv: Sequence[str] | None = None) -> int:
-    """Runs one command and returns its exit code: 0 done, 2 bad input, 3 diverged, 143 stopped by SIGTERM."""
-    argv = list(sys.argv[1:] if argv is None else argv)
-    # XLA's errors are for people, its warnings for those who write XLA; read when JAX is first imported.
-    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")
-    try:
-        if argv[:1] == ["train"]:
-            return _train(argv[1:])
-        if argv[:1] == ["evaluate"]:
-            return _evaluate(argv[1:])
-        tyro.extras.subcommand_cli_from_dict(COMMANDS, prog="edqn", args=argv[:1] or ["--help"])
-    except SystemExit as ending:  # tyro has printed the help, or what is wrong
-        return int(ending.code or DONE)
-    except (ConfigError, DivergedError, StoppedError, KeyboardInterrupt) as ending:
-        return _explain(ending)
-    return BAD_INPUT
-
 
 def parse_train(argv: Sequence[str]) -> tuple[TrainOptions, Config]:
     """The options and the checked configuration that the arguments of `edqn train` ask for.
@@ -153,48 +121,16 @@ def _parse_knobs(argv: Sequence[str], base: Config) -> Config:
     return tyro.cli(TrainCommand, args=argv, prog=TRAIN, description=description, default=default).knobs
 
 
-def _train(argv: Sequence[str]) -> int:
-    options, config = parse_train(argv)
-    several = options.coordinator_address, options.num_processes, options.process_id
-    arguments = how_to_join(options.distributed, *several, os.environ)
+def parse_evaluate(argv: Sequence[str]) -> EvaluateArgs:
+    """Returns the checked arguments of `edqn evaluate`.
 
-    from edqn_jax.parallel import processes
-    from edqn_jax.parallel.devices import cores, most_that_divide, use_cpu_devices
-    from edqn_jax.report.progress import Progress
-    from edqn_jax.run import train_run
-
-    use_cpu_devices(config.train.devices or most_that_divide(config.train.shards, cores()))
-    process = 0
-    if arguments is not None:
-        print("edqn: waiting for the other processes, five minutes at most", file=sys.stderr)
-        process = processes.join(arguments)
-    writes = process == 0
-    run = processes.together(lambda: plan_run_directory(options.run_dir, config, options.resume) if writes else None)
-    progress = Progress(Console(quiet=not writes))
-    with listening_for_sigterm() as stop_requested:
-        try:
-            train_run(config, run, progress, stop_requested)
-        finally:
-            progress.stop()
-    return DONE
-
-
-def _evaluate(argv: Sequence[str]) -> int:
+    Raises:
+        ConfigError: if one is out of its limits.
+        SystemExit: after printing, for --help and for what does not parse.
+    """
     args = tyro.cli(EvaluateArgs, args=argv, prog="edqn evaluate")
     if args.missions < 1:
         raise ConfigError(f"--missions must be at least 1, not {args.missions}")
     if not (args.run / "config.yaml").is_file():
         raise ConfigError(f"there is no run in '{args.run}': it holds no config.yaml")
-
-    from edqn_jax.parallel.devices import use_cpu_devices
-    from edqn_jax.evaluate import evaluate_command
-
-    use_cpu_devices()
-    evaluate_command(args)
-    return DONE
-
-
-def _explain(ending: BaseException) -> int:
-    print(f"edqn: {str(ending) or 'interrupted'}", file=sys.stderr)
-    codes = {ConfigError: BAD_INPUT, DivergedError: DIVERGED, StoppedError: TERMINATED}
-    return next((code for kind, code in codes.items() if isinstance(ending, kind)), INTERRUPTED)
+    return args

@@ -12,7 +12,7 @@ import jax
 import numpy as np
 import orbax.checkpoint as ocp
 
-from edqn_jax.config import ConfigError
+from edqn_jax.errors import ConfigError
 from edqn_jax.learn.policy import PolicyParams
 
 POLICY = "policy"

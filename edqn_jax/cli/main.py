@@ -1,0 +1,57 @@
+"""Dispatch of `edqn`'s commands, and exit codes."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Sequence
+
+import tyro
+
+from edqn_jax.cli.arguments import EvaluateArgs, TrainCommand, parse_evaluate
+from edqn_jax.cli.train import train_command
+from edqn_jax.errors import ConfigError, DivergedError, StoppedError
+
+DONE = 0
+BAD_INPUT = 2
+DIVERGED = 3
+INTERRUPTED = 130
+TERMINATED = 143
+
+COMMANDS = {"train": TrainCommand, "evaluate": EvaluateArgs}
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Runs one command and returns its exit code: 0 done, 2 bad input, 3 diverged, 143 stopped by SIGTERM."""
+    argv = list(sys.argv[1:] if argv is None else argv)
+    # XLA's errors are for people, its warnings for those who write XLA; read when JAX is first imported.
+    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")
+    try:
+        if argv[:1] == ["train"]:
+            train_command(argv[1:])
+            return DONE
+        if argv[:1] == ["evaluate"]:
+            return _evaluate(argv[1:])
+        tyro.extras.subcommand_cli_from_dict(COMMANDS, prog="edqn", args=argv[:1] or ["--help"])
+    except SystemExit as ending:  # tyro has printed the help, or what is wrong
+        return int(ending.code or DONE)
+    except (ConfigError, DivergedError, StoppedError, KeyboardInterrupt) as ending:
+        return _explain(ending)
+    return BAD_INPUT
+
+
+def _evaluate(argv: Sequence[str]) -> int:
+    args = parse_evaluate(argv)
+
+    from edqn_jax.evaluate import evaluate_command
+    from edqn_jax.parallel.devices import use_cpu_devices
+
+    use_cpu_devices()
+    evaluate_command(args)
+    return DONE
+
+
+def _explain(ending: BaseException) -> int:
+    print(f"edqn: {str(ending) or 'interrupted'}", file=sys.stderr)
+    codes = {ConfigError: BAD_INPUT, DivergedError: DIVERGED, StoppedError: TERMINATED}
+    return next((code for kind, code in codes.items() if isinstance(ending, kind)), INTERRUPTED)

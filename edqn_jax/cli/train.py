@@ -1,0 +1,45 @@
+"""`edqn train`: from arguments to a trained, flown and drawn run."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Sequence
+
+from rich.console import Console
+
+from edqn_jax.cli.arguments import parse_train
+from edqn_jax.cli.signals import listening_for_sigterm
+from edqn_jax.parallel.launch import how_to_join
+from edqn_jax.runs.directory import plan_run_directory
+
+
+def train_command(argv: Sequence[str]) -> None:
+    """Runs `edqn train` with these arguments.
+
+    Raises:
+        ConfigError: if the input is invalid.
+        DivergedError, StoppedError: as `training.train`.
+    """
+    options, config = parse_train(argv)
+    several = options.coordinator_address, options.num_processes, options.process_id
+    arguments = how_to_join(options.distributed, *several, os.environ)
+
+    from edqn_jax.parallel import processes
+    from edqn_jax.parallel.devices import cores, most_that_divide, use_cpu_devices
+    from edqn_jax.report.progress import Progress
+    from edqn_jax.run import train_run
+
+    use_cpu_devices(config.train.devices or most_that_divide(config.train.shards, cores()))
+    process = 0
+    if arguments is not None:
+        print("edqn: waiting for the other processes, five minutes at most", file=sys.stderr)
+        process = processes.join(arguments)
+    writes = process == 0
+    run = processes.together(lambda: plan_run_directory(options.run_dir, config, options.resume) if writes else None)
+    progress = Progress(Console(quiet=not writes))
+    with listening_for_sigterm() as stop_requested:
+        try:
+            train_run(config, run, progress, stop_requested)
+        finally:
+            progress.stop()
