@@ -24,10 +24,10 @@ from typing import Any
 import jax
 
 import json_report
-from edqn_jax.baselines.packages import MissingPackageError
 from edqn_jax.config import Config
 from edqn_jax.errors import ConfigError
 from edqn_jax.parallel.devices import use_cpu_devices
+from edqn_jax.planners.packages import MissingPackageError
 from edqn_jax.run import lay_courses
 from edqn_jax.runs.files import check_can_write
 from edqn_jax.runs.provenance import workload
@@ -79,8 +79,8 @@ def measure(config: Config, decisions: int, repeats: int) -> dict[str, Any]:
         ConfigError: if the configuration asks for what this stack does not have.
         MissingPackageError: if a package of the extra `bench` is not installed.
     """
-    from edqn_jax.baselines.conventional.fleet import Course
-    from edqn_jax.baselines.conventional.train import Steady
+    from conventional_stack.fleet import Course
+    from conventional_stack.train import Steady
 
     course = Course.of(lay_courses(config).training)
     turns: dict[tuple[int, int], list[float]] = {setting: [] for setting in SETTINGS}

@@ -8,11 +8,11 @@ import jax
 import numpy as np
 
 import json_report
-from edqn_jax.baselines.astar import NoPathError, shortest_path
-from edqn_jax.baselines.follow import FollowConfig, compiled_follower, reserved, sampled
-from edqn_jax.baselines.planner import Budget, Task, load_planner
 from edqn_jax.config import DENSITIES, Config
 from edqn_jax.parallel.devices import processor
+from edqn_jax.planners.astar import NoPathError, shortest_path
+from edqn_jax.planners.follow import FollowConfig, compiled_follower, reserved, sampled
+from edqn_jax.planners.planner import Budget, Task, load_planner
 from edqn_jax.runs.provenance import workload
 from edqn_jax.sim import worlds
 from edqn_jax.sim.drone import load_airframe

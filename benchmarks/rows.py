@@ -12,8 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from edqn_jax.baselines.planner import DRAWING
 from edqn_jax.errors import ConfigError
+from edqn_jax.planners.planner import DRAWING
 from intervals import difference_interval, rate_interval
 
 Row = dict[str, Any]

@@ -39,12 +39,12 @@ import json_report
 import runtime_table
 from child import Child, ChildEndedError
 from conventional import DRONES
-from edqn_jax.baselines.planner import IMPROVING, PLANNERS
 from edqn_jax.cli.arguments import parse_train
 from edqn_jax.config import DENSITIES, Config
 from edqn_jax.config.loading import nearest, to_yaml
 from edqn_jax.errors import ConfigError
 from edqn_jax.parallel.devices import cores
+from edqn_jax.planners.planner import IMPROVING, PLANNERS
 from edqn_jax.runs.files import check_can_write
 from edqn_jax.sim.scene import Scene
 from flags import configured as for_timing

@@ -6,7 +6,7 @@ import statistics
 from collections.abc import Sequence
 from typing import Any
 
-from edqn_jax.baselines.planner import IMPROVING
+from edqn_jax.planners.planner import IMPROVING
 from rows import Row, Worth, figures, worth
 from stack import STACK
 

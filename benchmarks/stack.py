@@ -42,7 +42,7 @@ class Stack:
             MissingPackageError: if a package that it needs is not installed.
             ConfigError: if the configuration asks for what this stack does not have.
         """
-        from edqn_jax.baselines.conventional import fleet, train
+        from conventional_stack import fleet, train
 
         self.config, self.courses = config, lay_courses(config)
         self.stack, self.course = train, fleet.Course.of
@@ -103,8 +103,8 @@ class SteadyStack(contextlib.ExitStack):
             MissingPackageError: if a package that it needs is not installed.
             ConfigError: if the configuration asks for what this stack does not have.
         """
-        from edqn_jax.baselines.conventional.fleet import Course
-        from edqn_jax.baselines.conventional.train import Steady
+        from conventional_stack.fleet import Course
+        from conventional_stack.train import Steady
 
         super().__init__()
         course = Course.of(lay_courses(config).training)

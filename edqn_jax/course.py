@@ -10,9 +10,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from edqn_jax.baselines.astar import shortest_path
 from edqn_jax.config import DENSITIES, Config
 from edqn_jax.errors import ConfigError
+from edqn_jax.planners.astar import shortest_path
 from edqn_jax.sim import drone, worlds
 from edqn_jax.sim.env import World
 from edqn_jax.sim.mjcf import check_scene, load_world, resolve_world, write_scene

@@ -17,7 +17,6 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from rich.console import Console
 from rich.table import Table
 
-from edqn_jax.baselines.astar import NoPathError, shortest_path
 from edqn_jax.config import Config
 from edqn_jax.config.limits import validate
 from edqn_jax.config.loading import apply, load_layer
@@ -26,6 +25,7 @@ from edqn_jax.errors import ConfigError
 from edqn_jax.flights import Flights, fly_missions
 from edqn_jax.learn import embedding, policy, qnetwork
 from edqn_jax.learn.policy import PolicyParams
+from edqn_jax.planners.astar import NoPathError, shortest_path
 from edqn_jax.runs.checkpoints import load_policy
 from edqn_jax.runs.directory import TRAJECTORY_COLUMNS, plain
 from edqn_jax.runs.files import check_can_write, write_whole

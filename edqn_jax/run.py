@@ -20,8 +20,6 @@ import numpy as np
 from jax.sharding import Mesh
 
 from edqn_jax import flights
-from edqn_jax.baselines.astar import Path as ShortestPath
-from edqn_jax.baselines.astar import shortest_path
 from edqn_jax.config import DENSITIES, Config
 from edqn_jax.errors import DivergedError, StoppedError
 from edqn_jax.evaluate import flight_summary, spl, summarise, trajectory
@@ -30,6 +28,8 @@ from edqn_jax.learn.policy import PolicyParams
 from edqn_jax.learn.trainer import Episodes, Losses, Plan, Trainer, policy_of
 from edqn_jax.parallel import processes
 from edqn_jax.parallel.devices import choose_devices
+from edqn_jax.planners.astar import Path as ShortestPath
+from edqn_jax.planners.astar import shortest_path
 from edqn_jax.report.gallery import draw_gallery
 from edqn_jax.report.progress import Progress
 from edqn_jax.runs.checkpoints import save_policy

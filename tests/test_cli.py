@@ -11,8 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from edqn_jax.cli import arguments
-from edqn_jax.cli import main
+from edqn_jax.cli import arguments, main
 from edqn_jax.cli.arguments import parse_train
 from edqn_jax.config import Config, preset
 from edqn_jax.config.loading import RANDOM_WORLDS

@@ -21,9 +21,9 @@ from edqn_jax.cli.arguments import parse_train
 from edqn_jax.config import Config
 from edqn_jax.config.loading import to_yaml
 from edqn_jax.sim.mjcf import write_scene
-from tests.baselines.rooms import WITHOUT_A_WAY, room
-from tests.baselines.uninstalled import hide
 from tests.miniature import MINIATURE
+from tests.planners.rooms import WITHOUT_A_WAY, room
+from tests.planners.uninstalled import hide
 from tests.turns import row
 
 TINY = (*MINIATURE, "--total-steps", "512", "--train.chunk-steps", "8", "--train.validation-every", "256")

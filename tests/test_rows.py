@@ -9,8 +9,8 @@ import pytest
 
 import rows
 import runtime_table
-from edqn_jax.baselines.planner import PLANNERS
 from edqn_jax.errors import ConfigError
+from edqn_jax.planners.planner import PLANNERS
 from tests.turns import flights, row, turn
 
 

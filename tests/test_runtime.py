@@ -14,11 +14,11 @@ import runtime
 import runtime_table
 import stack
 from child import ChildEndedError
-from edqn_jax.baselines.planner import PLANNERS
 from edqn_jax.config import Config
 from edqn_jax.errors import ConfigError
+from edqn_jax.planners.planner import PLANNERS
 from edqn_jax.sim.mjcf import write_scene
-from tests.baselines.rooms import WITHOUT_A_WAY, room
+from tests.planners.rooms import WITHOUT_A_WAY, room
 from tests.turns import flights, row, turn
 
 

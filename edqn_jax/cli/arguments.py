@@ -87,6 +87,7 @@ class EvaluateArgs:
 
 TRAIN = "edqn train"
 
+
 def parse_train(argv: Sequence[str]) -> tuple[TrainOptions, Config]:
     """The options and the checked configuration that the arguments of `edqn train` ask for.
 

@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
-from edqn_jax.baselines.conventional import world
-from edqn_jax.baselines.conventional.fleet import Course, Fleet, Record
+from conventional_stack import world
+from conventional_stack.fleet import Course, Fleet, Record
 from edqn_jax.config import Config
 from edqn_jax.sim import drone, env, mjcf
 from edqn_jax.sim.scene import Scene, stack_scenes

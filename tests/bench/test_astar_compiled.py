@@ -7,12 +7,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from edqn_jax.baselines import astar, astar_compiled, snn
-from edqn_jax.baselines.planner import Budget, Plan, Task
-from edqn_jax.baselines.solids import solid_table
+from edqn_jax.planners import astar, astar_compiled, snn
+from edqn_jax.planners.planner import Budget, Plan, Task
+from edqn_jax.planners.solids import solid_table
 from edqn_jax.sim.mjcf import load_scene, resolve_world
 from edqn_jax.sim.worlds import random_scene, world_key
-from tests.baselines.rooms import RADIUS, assert_flyable, box, random_room, room
+from tests.planners.rooms import RADIUS, assert_flyable, box, random_room, room
 
 
 def lattice_length(task: Task, cell: float = 0.5) -> float:

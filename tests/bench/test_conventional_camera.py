@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from edqn_jax.baselines.conventional import camera, events, task, world
+from conventional_stack import camera, events, task, world
 from edqn_jax.config import CameraConfig, Config, EventsConfig
 from edqn_jax.sim import camera as our_camera
 from edqn_jax.sim import env as our_env

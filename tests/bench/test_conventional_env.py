@@ -12,12 +12,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from edqn_jax.baselines.conventional import task
-from edqn_jax.baselines.conventional.env import DroneEnv
-from edqn_jax.baselines.conventional.fleet import Fleet, Record
-from edqn_jax.baselines.packages import require
+from conventional_stack import task
+from conventional_stack.env import DroneEnv
+from conventional_stack.fleet import Fleet, Record
 from edqn_jax.config import CameraConfig, Config, DroneConfig, EnvConfig, EventsConfig
 from edqn_jax.errors import ConfigError
+from edqn_jax.planners.packages import require
 from edqn_jax.sim import drone, env, events
 from edqn_jax.sim.drone import DroneState
 from edqn_jax.sim.env import EnvState, Outcome

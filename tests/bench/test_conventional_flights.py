@@ -9,9 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from conventional_stack.fleet import Course
+from conventional_stack.flights import fly_missions
 from edqn_jax import flights as our_flights
-from edqn_jax.baselines.conventional.fleet import Course
-from edqn_jax.baselines.conventional.flights import fly_missions
 from edqn_jax.config import CameraConfig, Config, EnvConfig
 from edqn_jax.errors import ConfigError
 from edqn_jax.evaluate import summarise

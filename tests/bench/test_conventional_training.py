@@ -11,20 +11,20 @@ import pytest
 
 import conventional
 import stack
-from edqn_jax.baselines.conventional.fleet import Record
-from edqn_jax.baselines.conventional.train import Steady, Trained, Training, fly, train
-from edqn_jax.baselines.conventional.vae import EventVAE, Learner, images
-from edqn_jax.baselines.conventional.vec_env import CodedDrones
-from edqn_jax.baselines.conventional.workers import SpreadFleet
-from edqn_jax.baselines.packages import MissingPackageError, require
+from conventional_stack.fleet import Record
+from conventional_stack.train import Steady, Trained, Training, fly, train
+from conventional_stack.vae import EventVAE, Learner, images
+from conventional_stack.vec_env import CodedDrones
+from conventional_stack.workers import SpreadFleet
 from edqn_jax.config import Config
 from edqn_jax.errors import ConfigError
+from edqn_jax.planners.packages import MissingPackageError, require
 from edqn_jax.runs.directory import plain
 from edqn_jax.sim.env import OWN_SIZE, Outcome
 from flags import configured
-from tests.baselines.uninstalled import hide
 from tests.bench.conventional_course import course_of
 from tests.miniature import MINIATURE
+from tests.planners.uninstalled import hide
 
 torch = require("torch")
 torch.set_num_threads(1)  # beside other tests a second one costs more than it does
@@ -125,7 +125,7 @@ class Still:
     """A fleet whose record a test writes by hand."""
 
     def __init__(self, drones: int) -> None:
-        from edqn_jax.baselines.conventional.stopwatch import Stopwatch
+        from conventional_stack.stopwatch import Stopwatch
 
         self.record = Record.empty(CONFIG, drones)
         self.stopwatch = Stopwatch()
@@ -306,7 +306,7 @@ def test_beside_its_flights_a_seed_tells_what_its_other_processes_held(monkeypat
 def test_without_a_package_it_says_how_to_install_it(package, monkeypatch):
     hide(monkeypatch, package)
     with pytest.raises(MissingPackageError, match=rf"^{package} is not installed; pip install 'edqn-jax\[bench\]'"):
-        importlib.import_module("edqn_jax.baselines.conventional.train")
+        importlib.import_module("conventional_stack.train")
 
 
 def test_without_a_package_the_command_ends_with_that_sentence(monkeypatch, capsys):

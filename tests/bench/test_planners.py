@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from edqn_jax.baselines.planner import PLANNERS, Budget, Task, load_planner
+from edqn_jax.planners.planner import PLANNERS, Budget, Task, load_planner
 from edqn_jax.sim.mjcf import load_scene, resolve_world
 from edqn_jax.sim.worlds import random_scene, world_key
-from tests.baselines.rooms import RADIUS, WITHOUT_A_WAY, assert_flyable, random_room, room
+from tests.planners.rooms import RADIUS, WITHOUT_A_WAY, assert_flyable, random_room, room
 
 # A* hugs what it passes: its legs are checked every 2 cm, which misses 0.14 mm, and the judge is float32.
 TOLERANCE = {"A*": 2e-4, "A* 1 m": 2e-4}

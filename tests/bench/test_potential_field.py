@@ -7,11 +7,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from edqn_jax.baselines import potential_field
-from edqn_jax.baselines.planner import Budget
-from edqn_jax.baselines.solids import solid_table
+from edqn_jax.planners import potential_field
+from edqn_jax.planners.planner import Budget
+from edqn_jax.planners.solids import solid_table
 from edqn_jax.sim.scene import shape_distances
-from tests.baselines.rooms import RADIUS, assert_flyable, box, room
+from tests.planners.rooms import RADIUS, assert_flyable, box, room
 
 CONFIG = potential_field.ApfConfig()
 

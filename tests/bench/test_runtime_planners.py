@@ -6,12 +6,12 @@ from pathlib import Path
 
 import pytest
 
-from edqn_jax.baselines.planner import PLANNERS
 from edqn_jax.cli.arguments import parse_train
 from edqn_jax.config import Config
+from edqn_jax.planners.planner import PLANNERS
 from edqn_jax.sim.mjcf import write_scene
 from planning import Planning
-from tests.baselines.rooms import WITHOUT_A_WAY, box, room
+from tests.planners.rooms import WITHOUT_A_WAY, box, room
 
 BUDGET_SECONDS = 0.5
 MISSIONS = {"open": room(box((4, -1, 0), (6, 5, 7))), **WITHOUT_A_WAY}

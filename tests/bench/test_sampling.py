@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from edqn_jax.baselines.packages import MissingPackageError
-from edqn_jax.baselines.planner import Budget, load_planner
-from tests.baselines.rooms import WITHOUT_A_WAY, assert_flyable, box, room
-from tests.baselines.uninstalled import hide
+from edqn_jax.planners.packages import MissingPackageError
+from edqn_jax.planners.planner import Budget, load_planner
+from tests.planners.rooms import WITHOUT_A_WAY, assert_flyable, box, room
+from tests.planners.uninstalled import hide
 
 LONG = 600.0  # seconds; the steps end it
 

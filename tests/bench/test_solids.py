@@ -10,9 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from edqn_jax.baselines.solids import distance, leg_free, shape_distance, solid_table
+from edqn_jax.planners.solids import distance, leg_free, shape_distance, solid_table
 from edqn_jax.sim.scene import PARKED, scene_shapes, shape_distances
-from tests.baselines.rooms import box, room, true_distances
+from tests.planners.rooms import box, room, true_distances
 from tests.sim.drawn_scenes import ball, every_kind, scene_of
 
 

@@ -12,8 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from edqn_jax.baselines.astar import shortest_path
 from edqn_jax.errors import ConfigError
+from edqn_jax.planners.astar import shortest_path
 from edqn_jax.sim.mjcf import check_scene, load_scene, resolve_world
 from edqn_jax.sim.scene import (
     PARKED,

@@ -8,10 +8,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from edqn_jax.baselines.conventional.vae import Learner, images
-from edqn_jax.baselines.conventional.workers import SpreadFleet
-from edqn_jax.baselines.packages import require
+from conventional_stack.vae import Learner, images
+from conventional_stack.workers import SpreadFleet
 from edqn_jax.config import Config
+from edqn_jax.planners.packages import require
 from edqn_jax.sim.env import ACTIONS, OWN_SIZE, Outcome
 
 spaces = require("gymnasium").spaces

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from edqn_jax.baselines.conventional.fleet import Course, Fleet, Record
+from conventional_stack.fleet import Course, Fleet, Record
 from edqn_jax.config import Config
 
 _RESET, _STEP = b"reset", b"step"

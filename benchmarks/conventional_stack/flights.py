@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from edqn_jax.baselines.conventional.fleet import Course, Fleet, Record
-from edqn_jax.baselines.conventional.task import RUNNING, signed_distance
-from edqn_jax.baselines.packages import require
+from conventional_stack.fleet import Course, Fleet, Record
+from conventional_stack.task import RUNNING, signed_distance
 from edqn_jax.config import Config
 from edqn_jax.flights import Closest, Flights
+from edqn_jax.planners.packages import require
 
 numba = require("numba")
 

@@ -19,17 +19,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from edqn_jax.baselines.conventional.fleet import Course
-from edqn_jax.baselines.conventional.flights import fly_missions
-from edqn_jax.baselines.conventional.stopwatch import Stopwatch
-from edqn_jax.baselines.conventional.vae import EventVAE, Learner, images
-from edqn_jax.baselines.conventional.vec_env import CodedDrones, observed
-from edqn_jax.baselines.conventional.workers import SpreadFleet
-from edqn_jax.baselines.packages import require
+from conventional_stack.fleet import Course
+from conventional_stack.flights import fly_missions
+from conventional_stack.stopwatch import Stopwatch
+from conventional_stack.vae import EventVAE, Learner, images
+from conventional_stack.vec_env import CodedDrones, observed
+from conventional_stack.workers import SpreadFleet
 from edqn_jax.config import AgentConfig, Config
 from edqn_jax.errors import ConfigError
 from edqn_jax.flights import Flights
 from edqn_jax.learn.trainer import Plan
+from edqn_jax.planners.packages import require
 from edqn_jax.sim.env import ACTIONS
 
 torch = require("torch")

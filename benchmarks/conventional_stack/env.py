@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from edqn_jax.baselines.conventional.fleet import Course, Fleet, Record
-from edqn_jax.baselines.packages import require
+from conventional_stack.fleet import Course, Fleet, Record
 from edqn_jax.config import Config
+from edqn_jax.planners.packages import require
 from edqn_jax.sim.env import ACTIONS, OWN_SIZE, Outcome
 
 gymnasium = require("gymnasium")

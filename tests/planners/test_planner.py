@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from edqn_jax.baselines import snn
-from edqn_jax.baselines.packages import MissingPackageError, require
-from edqn_jax.baselines.planner import PLANNERS, load_planner, refusal
-from tests.baselines.rooms import box, room
-from tests.baselines.uninstalled import hide
+from edqn_jax.planners import snn
+from edqn_jax.planners.packages import MissingPackageError, require
+from edqn_jax.planners.planner import PLANNERS, load_planner, refusal
+from tests.planners.rooms import box, room
+from tests.planners.uninstalled import hide
 
 
 def test_a_planner_of_the_core_needs_nothing_else():

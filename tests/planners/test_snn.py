@@ -12,12 +12,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from edqn_jax.baselines import snn
-from edqn_jax.baselines.planner import MARGIN, Budget, Task
+from edqn_jax.planners import snn
+from edqn_jax.planners.planner import MARGIN, Budget, Task
 from edqn_jax.sim.mjcf import load_scene, resolve_world
 from edqn_jax.sim.worlds import random_scene, world_key
-from tests.baselines.rooms import RADIUS, WITHOUT_A_WAY, assert_flyable, box, random_room, room, true_distances
 from tests.oracles.breadth_first import hop_counts
+from tests.planners.rooms import RADIUS, WITHOUT_A_WAY, assert_flyable, box, random_room, room, true_distances
 from tests.sim.drawn_scenes import every_kind
 
 CONFIG = snn.SnnConfig()

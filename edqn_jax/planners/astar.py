@@ -11,7 +11,7 @@ a cell may then be improved after it was expanded, and the search ends only when
 improve the goal. That is as exact as the textbook's one entry at a time. Distances are computed only for
 cells that the search reaches.
 
-    python -m edqn_jax.baselines.astar [--world NAME]
+    python -m edqn_jax.planners.astar [--world NAME]
 """
 
 from __future__ import annotations
@@ -30,9 +30,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from edqn_jax.baselines.planner import path_length, point_text
 from edqn_jax.config import Config
 from edqn_jax.errors import ConfigError
+from edqn_jax.planners.planner import path_length, point_text
 from edqn_jax.sim.mjcf import check_scene, load_world, resolve_world
 from edqn_jax.sim.scene import Scene, segment_contact, signed_distance
 from edqn_jax.sim.worlds import SHAPES, random_scene, world_key
@@ -302,7 +302,7 @@ def _batched(function, scene: Scene, rows: np.ndarray, *rest: float) -> np.ndarr
 
 def main(arguments: list[str] | None = None) -> int:
     """Print the shortest path of a world."""
-    parser = argparse.ArgumentParser(prog="python -m edqn_jax.baselines.astar", description=main.__doc__)
+    parser = argparse.ArgumentParser(prog="python -m edqn_jax.planners.astar", description=main.__doc__)
     parser.add_argument("--world", default="paper", help="paper, sparse, medium, dense or an MJCF file")
     parser.add_argument("--index", type=int, default=0, help="which test world, for random worlds")
     options = parser.parse_args(arguments)

@@ -20,9 +20,9 @@ from typing import Any
 
 import numpy as np
 
-from edqn_jax.baselines.packages import require
-from edqn_jax.baselines.planner import MARGIN, Budget, Plan, Task, not_found, path_length, refusal
-from edqn_jax.baselines.solids import leg_free, solid_table
+from edqn_jax.planners.packages import require
+from edqn_jax.planners.planner import MARGIN, Budget, Plan, Task, not_found, path_length, refusal
+from edqn_jax.planners.solids import leg_free, solid_table
 
 base = require("ompl.base")
 geometric = require("ompl.geometric")

@@ -8,9 +8,9 @@ from typing import NamedTuple
 import mujoco
 import numpy as np
 
-from edqn_jax.baselines.conventional.flight import wrap_angle
-from edqn_jax.baselines.packages import require
+from conventional_stack.flight import wrap_angle
 from edqn_jax.config import Config
+from edqn_jax.planners.packages import require
 from edqn_jax.sim.env import Outcome
 
 numba = require("numba")

@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from edqn_jax.baselines.packages import require
 from edqn_jax.config import CameraConfig, EncoderConfig
+from edqn_jax.planners.packages import require
 
 torch = require("torch")
 nn = torch.nn

@@ -12,8 +12,8 @@ import jax
 import numpy as np
 import pytest
 
-from edqn_jax.baselines.astar import NoPathError, main, shortest_path
 from edqn_jax.errors import ConfigError
+from edqn_jax.planners.astar import NoPathError, main, shortest_path
 from edqn_jax.sim.scene import (
     Scene,
     Shape,

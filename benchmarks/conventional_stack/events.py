@@ -8,8 +8,8 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-from edqn_jax.baselines.packages import require
 from edqn_jax.config import EventsConfig
+from edqn_jax.planners.packages import require
 from edqn_jax.sim.events import max_events
 
 numba = require("numba")

@@ -9,9 +9,9 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from edqn_jax.baselines.conventional.c_mujoco import mj_step
-from edqn_jax.baselines.packages import require
+from conventional_stack.c_mujoco import mj_step
 from edqn_jax.config import Config, DroneConfig
+from edqn_jax.planners.packages import require
 from edqn_jax.sim.drone import LEAST_LEVELNESS, c_model, mixer_of
 
 numba = require("numba")

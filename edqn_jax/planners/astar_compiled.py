@@ -14,10 +14,10 @@ import time
 
 import numpy as np
 
-from edqn_jax.baselines.astar import pull_tight, unseen_depth
-from edqn_jax.baselines.packages import require
-from edqn_jax.baselines.planner import Budget, Plan, Task, found, not_found, refusal
-from edqn_jax.baselines.solids import distance, leg_free, solid_table
+from edqn_jax.planners.astar import pull_tight, unseen_depth
+from edqn_jax.planners.packages import require
+from edqn_jax.planners.planner import Budget, Plan, Task, found, not_found, refusal
+from edqn_jax.planners.solids import distance, leg_free, solid_table
 
 numba = require("numba")
 

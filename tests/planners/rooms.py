@@ -11,7 +11,7 @@ import jax
 import numpy as np
 from numpy.typing import NDArray
 
-from edqn_jax.baselines.planner import Task
+from edqn_jax.planners.planner import Task
 from edqn_jax.sim.scene import Planes, Scene, Shape, UprightBoxes, build_scene, signed_distance
 
 RADIUS = 0.36

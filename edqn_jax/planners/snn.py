@@ -35,7 +35,7 @@ from flax import struct
 from jax import Array, lax
 from jax.typing import ArrayLike
 
-from edqn_jax.baselines.planner import MARGIN, Budget, Plan, Task, found, not_found, refusal
+from edqn_jax.planners.planner import MARGIN, Budget, Plan, Task, found, not_found, refusal
 from edqn_jax.sim.scene import Scene, segment_contact, shape_distances, signed_distance
 
 DIRECTIONS = np.array([step for step in itertools.product((-1, 0, 1), repeat=3) if any(step)])

@@ -19,10 +19,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from edqn_jax.baselines.planner import Task
 from edqn_jax.config import Config, EnvConfig
 from edqn_jax.flights import Flights, at_start, tally
 from edqn_jax.parallel.devices import compiler_options
+from edqn_jax.planners.planner import Task
 from edqn_jax.sim import drone
 from edqn_jax.sim.drone import Airframe, DroneState
 from edqn_jax.sim.env import Outcome, bearing, judge

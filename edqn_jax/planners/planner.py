@@ -90,7 +90,7 @@ PLANNERS = {
     "BIT* first path": "sampling.bit_star_first",
     "APF": "potential_field.plan",
 }
-"""Where each is: module and function within `edqn_jax.baselines`."""
+"""Where each is: module and function within `edqn_jax.planners`."""
 
 IMPROVING = "RRT*", "BIT*"
 """Those that go on after their first path, until the budget is spent."""
@@ -107,7 +107,7 @@ def load_planner(name: str) -> Planner:
         MissingPackageError: if a package of the extra `bench` that it needs is not installed.
     """
     module, function = PLANNERS[name].split(".")
-    return getattr(importlib.import_module(f"edqn_jax.baselines.{module}"), function)
+    return getattr(importlib.import_module(f"edqn_jax.planners.{module}"), function)
 
 
 def found(path: npt.ArrayLike, seconds: float, steps: int) -> Plan:

@@ -10,8 +10,8 @@ import jax
 import numpy as np
 from numpy.typing import NDArray
 
-from edqn_jax.baselines.conventional import camera, events, flight, task, world
-from edqn_jax.baselines.conventional.stopwatch import Stopwatch
+from conventional_stack import camera, events, flight, task, world
+from conventional_stack.stopwatch import Stopwatch
 from edqn_jax.config import Config
 from edqn_jax.errors import ConfigError
 from edqn_jax.sim import env

@@ -1,1 +1,0 @@
-"""Rivals and references, one file each, each runnable alone."""
