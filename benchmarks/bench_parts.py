@@ -19,9 +19,9 @@ import pytest
 from jax.sharding import Mesh
 from pytest_benchmark.fixture import BenchmarkFixture
 
+from edqn_jax.evaluation.missions import run_missions
 from edqn_jax.learn.trainer import AXIS, Plan, Trainer
 from edqn_jax.parallel.devices import choose_devices, use_cpu_devices
-from edqn_jax.run import lay_courses
 from flags import configured
 from parts import PARTS, Moment
 from timing import Timed
@@ -41,7 +41,7 @@ def now() -> Moment:
     """
     config = configured(os.environ.get("EDQN_FLAGS", "").split())
     config = steady(config, config.train.chunk_steps)
-    world = lay_courses(config).training
+    world = run_missions(config).training.world
     state = Trainer(config, world, jax.devices()[:1]).init(config.train.seed)
     return Moment(config, world, dataclasses.replace(state, step=jnp.int32(Plan.of(config).learn_from)))
 

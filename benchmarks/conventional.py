@@ -26,9 +26,9 @@ import jax
 import json_report
 from edqn_jax.config import Config
 from edqn_jax.errors import ConfigError
+from edqn_jax.evaluation.missions import run_missions
 from edqn_jax.parallel.devices import use_cpu_devices
 from edqn_jax.planners.packages import MissingPackageError
-from edqn_jax.run import lay_courses
 from edqn_jax.runs.files import check_can_write
 from edqn_jax.runs.provenance import workload
 from edqn_jax.sim.mjcf import load_scene, resolve_world
@@ -82,7 +82,7 @@ def measure(config: Config, decisions: int, repeats: int) -> dict[str, Any]:
     from conventional_stack.fleet import Course
     from conventional_stack.train import Steady
 
-    course = Course.of(lay_courses(config).training)
+    course = Course.of(run_missions(config).training.world)
     turns: dict[tuple[int, int], list[float]] = {setting: [] for setting in SETTINGS}
     with ExitStack() as stack:
         runs = {setting: stack.enter_context(Steady(config, course, *setting)) for setting in SETTINGS}

@@ -24,8 +24,9 @@ import jax
 import json_report
 from edqn_jax.config import Config
 from edqn_jax.errors import ConfigError
-from edqn_jax.evaluate import decision_latency_ms, fresh_policy
-from edqn_jax.run import lay_courses
+from edqn_jax.evaluation.latency import decision_latency_ms
+from edqn_jax.evaluation.missions import run_missions
+from edqn_jax.learn.policy import fresh_policy
 from edqn_jax.runs.files import check_can_write
 from edqn_jax.runs.provenance import workload
 from flags import configured, split
@@ -58,7 +59,7 @@ def measure(config: Config, repeats: int, calls: int) -> dict[str, Any]:
     params = fresh_policy(config, 0)
     turns = [decision_latency_ms(config, params, calls) for _ in range(repeats)]
     return {
-        "workload": workload(config, lay_courses(config).scene),
+        "workload": workload(config, run_missions(config).scene),
         **json_report.machine(jax.devices()),
         "cores": 1,
         "decisions": repeats * calls,

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from edqn_jax.evaluate import wilson_interval
+from edqn_jax.evaluation.metrics import wilson_interval
 
 DRAWS = 10_000
 

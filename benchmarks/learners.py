@@ -14,23 +14,18 @@ from edqn_jax.config import DENSITIES, Config
 from edqn_jax.config.limits import validate
 from edqn_jax.config.loading import apply
 from edqn_jax.errors import DivergedError
-from edqn_jax.evaluate import decision_seconds, fly_on_all_devices
-from edqn_jax.flights import Flights
+from edqn_jax.evaluation.latency import decision_seconds
+from edqn_jax.evaluation.missions import RunMissions, run_missions
+from edqn_jax.evaluation.rollouts import fly_on_all_devices
 from edqn_jax.learn.policy import PolicyParams
 from edqn_jax.learn.trainer import Trainer, policy_of
 from edqn_jax.parallel.devices import choose_devices
-from edqn_jax.run import (
-    Candidate,
-    Courses,
-    check_finite,
-    choose,
-    first_success,
-    is_due,
-    lay_courses,
-    validated_by,
-)
 from edqn_jax.runs.provenance import workload
-from edqn_jax.sim.env import Outcome, World
+from edqn_jax.sim.env import World
+from edqn_jax.sim.flights import Flights
+from edqn_jax.sim.outcomes import Outcome
+from edqn_jax.training.history import check_finite
+from edqn_jax.training.selection import Candidate, choose, first_success, is_due, validated
 
 LEARNERS = {
     "E-DQN": "events",
@@ -56,10 +51,10 @@ def flown_rows(flights: Flights, count: int) -> dict[str, list[Any]]:
 class Watched:
     """One training as it is validated: its curve, and what it would end with by now."""
 
-    def __init__(self, config: Config, courses: Courses, fly: Callable[[World, Any], Flights]) -> None:
+    def __init__(self, config: Config, missions: RunMissions, fly: Callable[[World, Any], Flights]) -> None:
         """`fly` flies every mission of a world once, greedily, with parameters of whatever kind."""
-        self.config, self.courses, self.fly = config, courses, fly
-        self.judged = judged_of(config, courses)
+        self.config, self.missions, self.fly = config, missions, fly
+        self.judged = judged_of(config, missions)
         self.kept: Candidate | None = None
         self.curve: list[dict[str, Any]] = []
 
@@ -70,17 +65,17 @@ class Watched:
 
     def validate(self, params: Any, decisions: int, seconds: float) -> None:
         """Flies the validation missions, and those that are judged if these parameters are kept."""
-        flown = self.fly(self.courses.validation, params)
-        latest, mission = validated_by(self.config, self.courses, flown, params, decisions)
+        flown = self.fly(self.missions.validation.world, params)
+        latest = validated(self.config, self.missions, flown, params, decisions)
         before, self.kept = self.kept, choose(self.config.train.keep, self.kept or latest, latest)
         if self.kept is not before:
-            self.flown = flown_rows(self.fly(self.courses.final, params), self.judged)
+            self.flown = flown_rows(self.fly(self.missions.final.world, params), self.judged)
         self.curve.append(
             {
                 "decisions": decisions,
                 "seconds": seconds,
                 "validation_success": latest.success,
-                "validation_mission": mission,
+                "validation_mission": latest.success_near_start,
                 "validation_spl": latest.spl,
                 "test": "".join("01"[outcome == "goal"] for outcome in self.flown["outcome"]),
             }
@@ -116,9 +111,9 @@ class Watched:
         }
 
 
-def judged_of(config: Config, courses: Courses) -> int:
+def judged_of(config: Config, missions: RunMissions) -> int:
     """How many of the final missions are judged: in a world from a file the others are validation's."""
-    return courses.final.missions.scene.shape[0] if config.world.name in DENSITIES else 1
+    return missions.final.world.missions.scene.shape[0] if config.world.name in DENSITIES else 1
 
 
 class Learner:
@@ -130,15 +125,15 @@ class Learner:
         Raises:
             ConfigError: if the configuration cannot be trained.
         """
-        self.config, self.courses = config, lay_courses(config)
+        self.config, self.missions = config, run_missions(config)
         devices = choose_devices(config.train.devices, config.train.shards)
-        self.trainer = Trainer(config, self.courses.training, devices)
+        self.trainer = Trainer(config, self.missions.training.world, devices)
         began = time.perf_counter()
         self.trainer.compile()
-        self._fly(self.courses.final, jax.tree.map(np.asarray, policy_of(self.trainer.init(0))))
+        self._fly(self.missions.final.world, jax.tree.map(np.asarray, policy_of(self.trainer.init(0))))
         self.about = {
             **json_report.machine(devices),
-            "workload": workload(config, self.courses.scene),
+            "workload": workload(config, self.missions.scene),
             "compile_seconds": time.perf_counter() - began,
         }
 
@@ -148,7 +143,7 @@ class Learner:
     def turn(self, seed: int) -> dict[str, Any]:
         """One seed, trained and flown: see `Watched.turn`. The seconds are of the chunks alone."""
         config, plan, envs = self.config, self.trainer.plan, self.config.train.num_envs
-        watched = Watched(config, self.courses, self._fly)
+        watched = Watched(config, self.missions, self._fly)
         state = self.trainer.init(seed)
         seconds, done = 0.0, 0
         while done < plan.total:

@@ -25,7 +25,7 @@ from typing import Any
 import json_report
 from edqn_jax.cli.arguments import parse_train
 from edqn_jax.config.loading import to_yaml
-from edqn_jax.evaluate import wilson_interval
+from edqn_jax.evaluation.metrics import wilson_interval
 from edqn_jax.parallel.devices import processor
 from edqn_jax.runs.files import check_can_write, write_whole
 from flags import split

@@ -16,8 +16,8 @@ from edqn_jax.planners.planner import Budget, Task, load_planner
 from edqn_jax.runs.provenance import workload
 from edqn_jax.sim import worlds
 from edqn_jax.sim.drone import load_airframe
-from edqn_jax.sim.env import Outcome
 from edqn_jax.sim.mjcf import check_scene, load_world, resolve_world
+from edqn_jax.sim.outcomes import Outcome
 from edqn_jax.sim.scene import Scene, take_scene
 
 NOT_FLOWN = {"outcome": "no_path", "decisions": 0, "flight_seconds": 0.0, "path_length_m": 0.0, "clearance_m": None}

@@ -33,8 +33,8 @@ from edqn_jax.config import Config
 from edqn_jax.config.limits import validate
 from edqn_jax.config.loading import Layer, apply
 from edqn_jax.errors import ConfigError
+from edqn_jax.evaluation.missions import RunMissions, run_missions
 from edqn_jax.parallel.devices import choose_devices, use_cpu_devices
-from edqn_jax.run import Courses, lay_courses
 from edqn_jax.runs.files import check_can_write
 from edqn_jax.runs.provenance import workload
 from edqn_jax.sim.mjcf import write_scene
@@ -163,10 +163,10 @@ def _changed(config: Config, **layer: Any) -> Config:
 class Runner:
     """A point's training step, compiled, and what its turns have brought."""
 
-    def __init__(self, config: Config, courses: Courses) -> None:
-        self.config, self.scene = config, courses.scene
+    def __init__(self, config: Config, missions: RunMissions) -> None:
+        self.config, self.scene = config, missions.scene
         self.devices = choose_devices(config.train.devices, config.train.shards)
-        self.whole = WholeStep(config, courses.training, self.devices)
+        self.whole = WholeStep(config, missions.training.world, self.devices)
         self.chunks = math.ceil(TURN_SECONDS * self.whole.turn() / self.whole.decisions)
 
     @property
@@ -200,8 +200,8 @@ def measure(base: Config, names: Sequence[str], quick: bool, repeats: int) -> di
         decisions = max(decisions, base.train.num_envs * base.train.chunk_steps)
     rollout = Rollout(base)
     rows, summaries = [], []
-    reference = lay_courses(base)
-    laid: dict[Any, Courses] = {(base.world, base.drone): reference}
+    reference = run_missions(base)
+    laid: dict[Any, RunMissions] = {(base.world, base.drone): reference}
     temporary = None
     runners: dict[Config, Runner] = {}
     with tempfile.TemporaryDirectory() as folder:
@@ -215,7 +215,7 @@ def measure(base: Config, names: Sequence[str], quick: bool, repeats: int) -> di
             for point, config in zip(curve.points, configs, strict=True):
                 where = (config.world, config.drone)
                 if where not in laid:
-                    laid[where] = lay_courses(config)
+                    laid[where] = run_missions(config)
                 if config not in runners:
                     print(f"{curve.name}: compiling {point.label}", file=sys.stderr, flush=True)
                     runners[config] = Runner(config, laid[where])
@@ -232,7 +232,7 @@ def measure(base: Config, names: Sequence[str], quick: bool, repeats: int) -> di
         **json_report.machine(used),
         "repeats": repeats,
         "curves": summaries,
-        "memory": memory_of(state_bytes(base, reference.training), temporary),
+        "memory": memory_of(state_bytes(base, reference.training.world), temporary),
         "rows": rows,
     }
 

@@ -16,11 +16,11 @@ import numpy as np
 import json_report
 from conventional import PACKAGES, SETTINGS
 from edqn_jax.config import Config
-from edqn_jax.flights import Flights
+from edqn_jax.evaluation.missions import run_missions
 from edqn_jax.parallel.devices import choose_devices, processor
-from edqn_jax.run import lay_courses
 from edqn_jax.runs.provenance import workload
 from edqn_jax.sim.env import OWN_SIZE, World
+from edqn_jax.sim.flights import Flights
 from learners import Watched
 from resident import peak_of_workers
 from whole import WholeStep, steady
@@ -44,7 +44,7 @@ class Stack:
         """
         from conventional_stack import fleet, train
 
-        self.config, self.courses = config, lay_courses(config)
+        self.config, self.missions = config, run_missions(config)
         self.stack, self.course = train, fleet.Course.of
         self.setting = self._fastest()
         machine = json_report.machine(choose_devices(1, config.train.shards))
@@ -52,7 +52,7 @@ class Stack:
         machine["versions"] |= {name: metadata.version(name) for name in PACKAGES}
         self.about = {
             **machine,
-            "workload": {**workload(config, self.courses.scene), "physics": "c_mujoco"},
+            "workload": {**workload(config, self.missions.scene), "physics": "c_mujoco"},
             "processes": self.setting[0],
             "torch_threads": self.setting[1],
         }
@@ -69,7 +69,7 @@ class Stack:
     def turn(self, seed: int) -> dict[str, Any]:
         """One seed, trained and flown: see `Watched.turn`; and `workers_peak_bytes`, of its other processes."""
         config = dataclasses.replace(self.config, train=dataclasses.replace(self.config.train, seed=seed))
-        watched = Watched(config, self.courses, self._fly)
+        watched = Watched(config, self.missions, self._fly)
         workers = 0
 
         def watch(trained: Any) -> None:
@@ -77,7 +77,7 @@ class Stack:
             workers = peak_of_workers()  # while they run: after the training they are gone
             watched.validate(trained, trained.decisions, trained.seconds)
 
-        trained = self.stack.train(config, self.course(self.courses.training), *self.setting, watch)
+        trained = self.stack.train(config, self.course(self.missions.training.world), *self.setting, watch)
         turn = watched.turn(seed, trained.decisions, trained.seconds, self._decision_seconds)
         return {**turn, "workers_peak_bytes": workers}
 
@@ -107,7 +107,7 @@ class SteadyStack(contextlib.ExitStack):
         from conventional_stack.train import Steady
 
         super().__init__()
-        course = Course.of(lay_courses(config).training)
+        course = Course.of(run_missions(config).training.world)
         self.decisions = decisions
         self.runs = {setting: self.enter_context(Steady(config, course, *setting)) for setting in SETTINGS}
         self.about: dict[str, Any] = {}
@@ -128,9 +128,9 @@ class SteadyStep:
 
     def __init__(self, config: Config) -> None:
         """`config` has the VAE learn throughout."""
-        devices, courses = choose_devices(config.train.devices, config.train.shards), lay_courses(config)
-        self.whole = WholeStep(config, courses.training, devices)
-        self.about = {**json_report.machine(devices), "workload": workload(config, courses.scene)}
+        devices, missions = choose_devices(config.train.devices, config.train.shards), run_missions(config)
+        self.whole = WholeStep(config, missions.training.world, devices)
+        self.about = {**json_report.machine(devices), "workload": workload(config, missions.scene)}
 
     def turn(self, number: int) -> dict[str, Any]:
         """Decisions per second of one chunk."""

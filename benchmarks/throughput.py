@@ -28,9 +28,9 @@ import json_report
 from ceilings import Rollout, ceilings
 from edqn_jax.config import Config
 from edqn_jax.errors import ConfigError
+from edqn_jax.evaluation.missions import run_missions
 from edqn_jax.learn.trainer import AXIS
 from edqn_jax.parallel.devices import choose_devices, cores, use_cpu_devices
-from edqn_jax.run import lay_courses
 from edqn_jax.runs.files import check_can_write
 from edqn_jax.runs.provenance import workload
 from flags import configured, split
@@ -75,14 +75,16 @@ def parse(argv: Sequence[str] | None = None) -> tuple[argparse.Namespace, Config
 
 def measure(config: Config, repeats: int, parts: bool) -> dict[str, Any]:
     """Everything that `--json` holds."""
-    courses = lay_courses(config)
+    missions = run_missions(config)
     devices = choose_devices(config.train.devices, config.train.shards)
     mesh = Mesh(np.asarray(devices), (AXIS,))
-    whole = WholeStep(config, courses.training, devices)
+    whole = WholeStep(config, missions.training.world, devices)
     # A copy: the next chunk is given the state itself.
     host = jax.tree.map(lambda x: jax.device_put(x, devices[0]).copy(), whole.state)
     timed = (
-        [Timed(part, mesh, config.train.num_envs) for part in parts_of(config, courses.training, host)] if parts else []
+        [Timed(part, mesh, config.train.num_envs) for part in parts_of(config, missions.training.world, host)]
+        if parts
+        else []
     )
     limits = ceilings(mesh) if parts else {}
     c_mujoco = Rollout(config)
@@ -117,7 +119,7 @@ def measure(config: Config, repeats: int, parts: bool) -> dict[str, Any]:
     rows += differences(middle)
     rows += [{"name": name, "per_device": middle[name]} for name in limits]
     return {
-        "workload": {**workload(config, courses.scene), "world": config.world.name},
+        "workload": {**workload(config, missions.scene), "world": config.world.name},
         **json_report.machine(devices),
         "decisions_per_second": rate,
         "compile_seconds": whole.compile_seconds,

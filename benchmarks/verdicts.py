@@ -20,13 +20,14 @@ from typing import Any
 import jax
 import numpy as np
 
-from edqn_jax.agreement import CONTACT_TOLERANCE_M, Agreement, check_verdicts
-from edqn_jax.course import load_course
 from edqn_jax.errors import ConfigError
-from edqn_jax.evaluate import fly_on_all_devices, load_run
+from edqn_jax.evaluation.missions import load_missions
+from edqn_jax.evaluation.rollouts import fly_on_all_devices
+from edqn_jax.evaluation.verdicts import CONTACT_TOLERANCE_M, Agreement, check_verdicts
 from edqn_jax.parallel.devices import use_cpu_devices
 from edqn_jax.runs.files import check_can_write, write_whole
-from edqn_jax.sim.env import Outcome
+from edqn_jax.runs.policies import load_run
+from edqn_jax.sim.outcomes import Outcome
 
 
 def rows_of(results: list[Agreement]) -> list[dict[str, Any]]:
@@ -78,7 +79,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             check_can_write(args.json)
         use_cpu_devices()
         config, params = load_run(args.run)
-        course = load_course(config, args.world or config.world.name, args.missions, args.seed)
+        course = load_missions(config, args.world or config.world.name, args.missions, args.seed)
     except ConfigError as error:
         print(error, file=sys.stderr)
         return 2

@@ -19,9 +19,9 @@ import numpy as np
 from jax.sharding import Mesh
 
 import edqn_jax
+from edqn_jax.evaluation.missions import run_missions
 from edqn_jax.learn.trainer import AXIS
 from edqn_jax.parallel.devices import choose_devices, processor, use_cpu_devices
-from edqn_jax.run import lay_courses
 from edqn_jax.runs.provenance import versions, workload
 
 WHOLE = "whole_training_step"
@@ -32,21 +32,21 @@ def prepare(wanted: Sequence[str], words: Sequence[str]) -> tuple[dict[str, Any]
     import throughput  # the commit's own, so it must not be looked up before this is a worker
 
     _, config = throughput.parse(words)
-    courses = lay_courses(config)
+    missions = run_missions(config)
     devices = choose_devices(config.train.devices, config.train.shards)
-    whole = throughput.WholeStep(config, courses.training, devices)
+    whole = throughput.WholeStep(config, missions.training.world, devices)
     turns: dict[str, Callable[[], float]] = {WHOLE: lambda: 1e6 * len(devices) / whole.turn()}
     if set(wanted) != {WHOLE}:
         # A copy: the next chunk is given the state itself.
         state = jax.tree.map(lambda x: jax.device_put(x, devices[0]).copy(), whole.state)
         mesh = Mesh(np.asarray(devices), (AXIS,))
-        for part in throughput.parts_of(config, courses.training, state):
+        for part in throughput.parts_of(config, missions.training.world, state):
             if not wanted or part.name in wanted:
                 turns[part.name] = throughput.Timed(part, mesh, config.train.num_envs).turn
     about = {
         "package": edqn_jax.__file__,
         "rows": [name for name in turns if not wanted or name in wanted],
-        "workload": {**workload(config, courses.scene), "world": config.world.name},
+        "workload": {**workload(config, missions.scene), "world": config.world.name},
         "device": processor() if devices[0].platform == "cpu" else devices[0].device_kind,
         "devices": [str(device) for device in devices],
         "versions": versions(),

@@ -20,7 +20,6 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from edqn_jax import run
 from edqn_jax.cli import main
 from edqn_jax.config import CameraConfig
 from edqn_jax.learn import trainer
@@ -29,6 +28,7 @@ from edqn_jax.parallel import devices, processes
 from edqn_jax.runs.directory import plain
 from edqn_jax.sim import camera
 from edqn_jax.sim.scene import Scene
+from edqn_jax.training import run
 
 
 def waves(config: CameraConfig, scene: Scene, position: Array, rotation: Array) -> Array:

@@ -10,9 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from edqn_jax.config import AgentConfig, CameraConfig, Config, EncoderConfig
-from edqn_jax.evaluate import fresh_policy
-from edqn_jax.learn.policy import PolicyParams, observation_size
-from edqn_jax.sim.env import ACTIONS
+from edqn_jax.learn.policy import PolicyParams, fresh_policy, observation_size
+from edqn_jax.sim.moves import ACTIONS
 
 CONFIG = dataclasses.replace(
     Config(),

@@ -31,7 +31,7 @@ def elsewhere(tmp_path, monkeypatch):
 @pytest.fixture
 def trainer(monkeypatch):
     """Stands in for training: a function to set, and the calls that reached it."""
-    stand_in = types.ModuleType("edqn_jax.run")
+    stand_in = types.ModuleType("edqn_jax.training.run")
     calls: list[tuple] = []
     behaviour = types.SimpleNamespace(calls=calls, act=lambda *call: None)
 
@@ -40,7 +40,7 @@ def trainer(monkeypatch):
         return behaviour.act(*call)
 
     stand_in.__dict__["train_run"] = train_run
-    monkeypatch.setitem(sys.modules, "edqn_jax.run", stand_in)
+    monkeypatch.setitem(sys.modules, "edqn_jax.training.run", stand_in)
     monkeypatch.setattr(devices, "use_cpu_devices", lambda count=None: None)
     return behaviour
 
@@ -50,7 +50,7 @@ def test_no_argument_is_the_default_preset():
 
 
 def test_flags_win_over_the_file_and_the_file_over_the_preset(tmp_path):
-    file = tmp_path / "knobs.yaml"
+    file = tmp_path / "options.yaml"
     file.write_text("agent: {batch_size: 256, n_step: 3}\n")
     _, config = parse_train(["--preset", "paper", "--config", str(file), "--agent.n-step", "7"])
     assert (config.agent.batch_size, config.agent.n_step) == (256, 7)
@@ -190,10 +190,10 @@ def test_sigterm_reaches_training_as_a_wish_to_stop(trainer):
 
 def test_evaluate_hands_on_what_was_asked_for(monkeypatch, tmp_path):
     (tmp_path / "config.yaml").touch()
-    stand_in = types.ModuleType("edqn_jax.evaluate")
+    stand_in = types.ModuleType("edqn_jax.cli.evaluate")
     asked: list[arguments.EvaluateArgs] = []
     stand_in.__dict__["evaluate_command"] = asked.append
-    monkeypatch.setitem(sys.modules, "edqn_jax.evaluate", stand_in)
+    monkeypatch.setitem(sys.modules, "edqn_jax.cli.evaluate", stand_in)
     monkeypatch.setattr(devices, "use_cpu_devices", lambda count=None: None)
     argv = [str(tmp_path), "--world", "dense", "--start", "1", "2", "3", "--goal", "-4", "5.5", "6"]
     assert main(["evaluate", *argv, "--missions", "9", "--seed", "2", "--json", "a.json"]) == 0

@@ -10,25 +10,21 @@ import mujoco
 import numpy as np
 import pytest
 
-from edqn_jax import evaluate
+from edqn_jax.cli import evaluate
 from edqn_jax.cli.arguments import EvaluateArgs
+from edqn_jax.cli.evaluate import evaluate_command
 from edqn_jax.config import Config
 from edqn_jax.config.loading import to_yaml
-from edqn_jax.course import Course
 from edqn_jax.errors import ConfigError
-from edqn_jax.evaluate import (
-    decision_latency_ms,
-    evaluate_command,
-    fresh_policy,
-    load_run,
-    spl,
-    summarise,
-    wilson_interval,
-)
-from edqn_jax.flights import Closest, Flights
+from edqn_jax.evaluation.judge import load_judge, replay_contact
+from edqn_jax.evaluation.latency import decision_latency_ms
+from edqn_jax.evaluation.metrics import spl, summarise, wilson_interval
+from edqn_jax.evaluation.missions import MissionSet
+from edqn_jax.learn.policy import fresh_policy
 from edqn_jax.runs.checkpoints import save_policy
-from edqn_jax.sim.env import Outcome
-from edqn_jax.verdict import load_judge, replay_contact
+from edqn_jax.runs.policies import load_run
+from edqn_jax.sim.flights import Closest, Flights
+from edqn_jax.sim.outcomes import Outcome
 from tests.policies import CONFIG, always
 
 
@@ -149,7 +145,7 @@ def test_the_command_shuffles_codes_only_when_asked_and_says_so(shuffle_codes, r
         return four_flights()
 
     # Stand-ins for what would compile.
-    monkeypatch.setattr(evaluate, "load_course", lambda *_: Course("paper", None, None))  # type: ignore[arg-type]
+    monkeypatch.setattr(evaluate, "load_missions", lambda *_: MissionSet("paper", None, None))  # type: ignore[arg-type]
     monkeypatch.setattr(evaluate, "fly_on_all_devices", fly)
     monkeypatch.setattr(evaluate, "shortest_paths", lambda *_: np.full(4, 10.0))
     monkeypatch.setattr(evaluate, "decision_latency_ms", lambda *_: {"median": 1.0, "p99": 2.0})

@@ -11,13 +11,15 @@ import numpy as np
 import pytest
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
-from edqn_jax import flights
-from edqn_jax.agreement import check_verdicts
-from edqn_jax.course import Course, load_course
-from edqn_jax.evaluate import flight_summary, fly_on_all_devices, trajectory
-from edqn_jax.flights import Flights, fly_missions
+from edqn_jax.evaluation import rollouts
+from edqn_jax.evaluation.metrics import flight_summary
+from edqn_jax.evaluation.missions import MissionSet, load_missions
+from edqn_jax.evaluation.rollouts import fly_missions, fly_on_all_devices
+from edqn_jax.evaluation.trajectories import trajectory
+from edqn_jax.evaluation.verdicts import check_verdicts
 from edqn_jax.runs.directory import TRAJECTORY_COLUMNS
-from edqn_jax.sim.env import Outcome
+from edqn_jax.sim.flights import Flights
+from edqn_jax.sim.outcomes import Outcome
 from edqn_jax.sim.scene import signed_distance, take_scene
 from tests.policies import CONFIG, always, that_sees
 
@@ -29,9 +31,9 @@ N = CONFIG.drone.physics_steps
 
 
 @pytest.fixture(scope="module")
-def course() -> Course:
+def course() -> MissionSet:
     """The paper's world, each mission level with the goal: straight ahead is the goal, or a block first."""
-    course = load_course(CONFIG, "paper", MISSIONS)
+    course = load_missions(CONFIG, "paper", MISSIONS)
     missions = course.world.missions
     level = dataclasses.replace(missions, start=missions.start.at[:, 2].set(missions.goal[:, 2]))
     # A lowered or raised start may stand in a block: such a flight collides at once, which is a case as well.
@@ -164,13 +166,13 @@ def test_a_recorded_flight_becomes_columns_and_a_summary_and_compiles_nothing_an
     layout = NamedSharding(mesh, PartitionSpec())
     world, params = jax.device_put((course.world, always((1, 0, 0))), layout)
     key = jax.random.key(0)
-    flights.prepare(CONFIG, world, params, key, record=True, mesh=mesh)
+    rollouts.prepare(CONFIG, world, params, key, record=True, mesh=mesh)
     compiled: list[str] = []
     jax.monitoring.register_event_duration_secs_listener(lambda event, *_, **__: compiled.append(event))
     flown = fly_missions(CONFIG, world, params, key, record=True, mesh=mesh)
     jax.monitoring.clear_event_listeners()
     assert "/jax/core/compile/backend_compile_duration" not in compiled
-    program: Any = flights._program(mesh)
+    program: Any = rollouts._program(mesh)
     programs = program._cache_size()
     fly_missions(CONFIG, world, params, jax.random.key(1), record=True, mesh=mesh)
     assert program._cache_size() == programs

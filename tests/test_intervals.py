@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from edqn_jax.evaluate import wilson_interval
+from edqn_jax.evaluation.metrics import wilson_interval
 from intervals import difference_interval, drawn_rates, rate_interval
 
 

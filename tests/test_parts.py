@@ -12,8 +12,8 @@ import pytest
 from jax import Array
 from jax.sharding import Mesh
 
+from edqn_jax.evaluation.missions import run_missions
 from edqn_jax.learn.trainer import AXIS, Plan, init
-from edqn_jax.run import lay_courses
 from flags import configured
 from parts import PARTS, Moment, parts_of
 from tests.miniature import MINIATURE
@@ -27,7 +27,7 @@ pytestmark = pytest.mark.slow
 def now() -> Moment:
     """A fresh state that is told it is past the beginning."""
     config = steady(configured(MINIATURE), 8)
-    world = lay_courses(config).training
+    world = run_missions(config).training.world
     state = jax.jit(lambda world, key: init(config, world, key))(world, jax.random.key(0))
     return Moment(config, world, dataclasses.replace(state, step=jnp.int32(Plan.of(config).learn_from)))
 

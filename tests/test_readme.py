@@ -10,8 +10,8 @@ import jax
 import pytest
 
 from edqn_jax.config import Config
-from edqn_jax.sim.env import Outcome
 from edqn_jax.sim.mjcf import check_scene, load_world
+from edqn_jax.sim.outcomes import Outcome
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")

@@ -12,16 +12,19 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from edqn_jax import run as training
 from edqn_jax.cli.arguments import EvaluateArgs
+from edqn_jax.cli.evaluate import evaluate_command
 from edqn_jax.config import CameraConfig, Config, TrainConfig, WorldConfig
 from edqn_jax.errors import ConfigError, StoppedError
-from edqn_jax.evaluate import evaluate_command, load_run
+from edqn_jax.evaluation.missions import run_missions
+from edqn_jax.learn import trainer
 from edqn_jax.learn.policy import PolicyParams
 from edqn_jax.learn.trainer import Episodes, Losses
 from edqn_jax.report.progress import Progress
-from edqn_jax.run import Candidate, choose, first_success, lay_courses, train_run
 from edqn_jax.runs.directory import TRAJECTORY_COLUMNS, RunDirectory, plain
+from edqn_jax.runs.policies import load_run
+from edqn_jax.training.run import train_run
+from edqn_jax.training.selection import Candidate, choose, first_success
 from tests.learn.test_trainer import CONFIG as SMALL
 
 CONFIG = dataclasses.replace(
@@ -79,7 +82,7 @@ def test_a_run_with_another_sensor_leaves_the_same_and_is_evaluated(
     assert {file.stem for file in run.figures.glob("*.png")} == {"world", "path", "returns", "learning"} | drawn
     assert summary["train_decisions"] == 256 and summary["workload"]["sensor"] == sensor
     phases = [row["phase"] for row in run.read_metrics()]
-    assert phases == ["seeing" if drawn else "flying", "flying", "flying", "flying"]
+    assert phases == ["warm-up" if drawn else "training", "training", "training", "training"]
     evaluate_command(EvaluateArgs(run.path, missions=2, json=tmp_path / "figures.json"))
     assert json.loads((tmp_path / "figures.json").read_text())["missions"] == 2
 
@@ -95,8 +98,8 @@ def test_a_run_stopped_before_any_validation_keeps_what_it_has_learnt(
         losses = Losses(*[jnp.zeros(steps)] * len(dataclasses.fields(Losses)))
         return dataclasses.replace(state, learner=learner), (Episodes(none, none, none), losses)
 
-    monkeypatch.setattr(training.Trainer, "compile", lambda self: None)
-    monkeypatch.setattr(training.Trainer, "chunk", chunk)
+    monkeypatch.setattr(trainer.Trainer, "compile", lambda self: None)
+    monkeypatch.setattr(trainer.Trainer, "chunk", chunk)
     config = dataclasses.replace(CONFIG, train=dataclasses.replace(CONFIG.train, validation_every=0))
     run = RunDirectory(tmp_path / "stopped")
     with pytest.raises(StoppedError, match="stopped after 256 decisions"):
@@ -137,7 +140,7 @@ def test_a_run_ends_with_the_parameters_of_the_best_spl_or_the_last(
     kept = Candidate(params)
     for number, weighted in enumerate(spls, 1):
         # The success rate falls all the while: it must not count.
-        kept = choose(keep, kept, Candidate(params, weighted, 1 / number, 100 * number))
+        kept = choose(keep, kept, Candidate(params, weighted, 1 / number, decisions=100 * number))
     assert kept.decisions == ends_with
 
 
@@ -150,5 +153,5 @@ def test_a_policy_flies_the_mission_from_its_first_good_validation() -> None:
 
 def test_half_of_the_validation_begins_near_the_start_and_all_of_it_in_random_worlds() -> None:
     own, random = Config(), Config(world=WorldConfig(name="sparse", pool_size=2, missions=8))
-    assert lay_courses(own).from_start.sum() == own.train.validation_missions // 2
-    assert lay_courses(random).from_start.all()
+    assert run_missions(own).near_start.sum() == own.train.validation_missions // 2
+    assert run_missions(random).near_start.all()

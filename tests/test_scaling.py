@@ -15,8 +15,8 @@ from boxes import MOST, world_of_boxes
 from edqn_jax.config import Config
 from edqn_jax.config.loading import apply
 from edqn_jax.errors import ConfigError
+from edqn_jax.evaluation.missions import run_missions
 from edqn_jax.learn import trainer
-from edqn_jax.run import lay_courses
 from edqn_jax.runs.directory import plain
 from edqn_jax.sim.mjcf import check_scene, load_scene
 from edqn_jax.sim.scene import obstacle_count
@@ -109,7 +109,7 @@ def test_there_is_a_way_between_any_two_boxes() -> None:
 @pytest.mark.slow
 def test_state_bytes_are_exactly_those_of_the_arrays() -> None:
     config = configured(MINIATURE)
-    world = lay_courses(config).training
+    world = run_missions(config).training.world
     counted = state_bytes(config, world)
     state = jax.eval_shape(lambda world, key: trainer.init(config, world, key), world, jax.random.key(0))
     flown, stored = counted.environments * counted.environment, counted.replay_slots * counted.replay_slot

@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from edqn_jax.verdict import Judge, clearance, load_judge, replay_contact
+from edqn_jax.evaluation.judge import Judge, clearance, load_judge, replay_contact
 
 RADIUS = 0.36
 MILLIMETRE = 1e-3

@@ -8,7 +8,7 @@ import jax
 import numpy as np
 import pytest
 
-from edqn_jax.run import lay_courses
+from edqn_jax.evaluation.missions import run_missions
 from flags import configured
 from tests.miniature import MINIATURE
 from whole import WholeStep, steady
@@ -17,7 +17,7 @@ from whole import WholeStep, steady
 @pytest.mark.slow
 def test_what_is_timed_is_training_past_its_beginning(monkeypatch: pytest.MonkeyPatch) -> None:
     config = steady(configured(MINIATURE), 4)
-    whole = WholeStep(config, lay_courses(config).training, jax.devices()[:2])
+    whole = WholeStep(config, run_missions(config).training.world, jax.devices()[:2])
     # Two chunks, to warm up and to fill the replay: what is timed from here on is all alike.
     assert whole.done == 8 >= whole.trainer.plan.learn_from
     before = jax.tree.map(np.asarray, (whole.state.learner.q, whole.state.learner.vae))

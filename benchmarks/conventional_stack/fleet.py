@@ -15,8 +15,10 @@ from conventional_stack.stopwatch import Stopwatch
 from edqn_jax.config import Config
 from edqn_jax.errors import ConfigError
 from edqn_jax.sim import env
-from edqn_jax.sim.env import ACTIONS, OWN_SIZE, frame_steps
+from edqn_jax.sim.env import OWN_SIZE
+from edqn_jax.sim.moves import ACTIONS
 from edqn_jax.sim.scene import take_scene
+from edqn_jax.sim.sensor import frame_steps
 
 _BLOCK = 8
 """Drones whose frames are cast and shaded at a time, so that their rays stay in the cache."""

@@ -1,4 +1,4 @@
-"""Missions flown greedily, all side by side, judged and tallied as in `edqn_jax/flights.py`."""
+"""Missions flown greedily, all side by side, judged and tallied as in `edqn_jax/evaluation/rollouts.py`."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from conventional_stack.fleet import Course, Fleet, Record
 from conventional_stack.task import RUNNING, signed_distance
 from edqn_jax.config import Config
-from edqn_jax.flights import Closest, Flights
 from edqn_jax.planners.packages import require
+from edqn_jax.sim.flights import Closest, Flights
 
 numba = require("numba")
 
@@ -25,7 +25,7 @@ def fly_missions(config: Config, course: Course, act: Act) -> Flights:
     """Fly each of the course's M missions once. A drone whose flight is over goes on, which counts for nothing.
 
     Returns:
-        what `edqn_jax.flights.fly_missions` returns, in NumPy and without a record: `evaluate.summarise` takes it.
+        what `evaluation.rollouts.fly_missions` returns, in NumPy and without a record, for `metrics.summarise`.
 
     Raises:
         ConfigError: where the configuration asks for what this stack does not have.

@@ -12,7 +12,9 @@ from conventional_stack.vae import Learner, images
 from conventional_stack.workers import SpreadFleet
 from edqn_jax.config import Config
 from edqn_jax.planners.packages import require
-from edqn_jax.sim.env import ACTIONS, OWN_SIZE, Outcome
+from edqn_jax.sim.env import OWN_SIZE
+from edqn_jax.sim.moves import ACTIONS
+from edqn_jax.sim.outcomes import Outcome
 
 spaces = require("gymnasium").spaces
 vec_env = require("stable_baselines3.common.vec_env")

@@ -43,7 +43,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _evaluate(argv: Sequence[str]) -> int:
     args = parse_evaluate(argv)
 
-    from edqn_jax.evaluate import evaluate_command
+    from edqn_jax.cli.evaluate import evaluate_command
     from edqn_jax.parallel.devices import use_cpu_devices
 
     use_cpu_devices()

@@ -28,7 +28,7 @@ def train_command(argv: Sequence[str]) -> None:
     from edqn_jax.parallel import processes
     from edqn_jax.parallel.devices import cores, most_that_divide, use_cpu_devices
     from edqn_jax.report.progress import Progress
-    from edqn_jax.run import train_run
+    from edqn_jax.training.run import train_run
 
     use_cpu_devices(config.train.devices or most_that_divide(config.train.shards, cores()))
     process = 0

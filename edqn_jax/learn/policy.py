@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import dataclasses
+import functools
+
+import jax
 import jax.numpy as jnp
 from flax import struct
 from jax import Array
@@ -9,8 +13,9 @@ from jax import Array
 from edqn_jax.config import Config
 from edqn_jax.learn import embedding
 from edqn_jax.learn.dqn import epsilon_greedy
-from edqn_jax.learn.qnetwork import Params, q_values
-from edqn_jax.sim.env import ACTIONS, OWN_SIZE, Observation
+from edqn_jax.learn.qnetwork import Params, init_q, q_values
+from edqn_jax.sim.env import OWN_SIZE, Observation
+from edqn_jax.sim.moves import ACTIONS
 
 Memory = Array
 """[H, D] the newest observations as the network sees them, newest last; zeros before an episode began."""
@@ -29,6 +34,16 @@ def observation_size(config: Config) -> int:
     return embedding.size(config) + OWN_SIZE
 
 
+def fresh_policy(config: Config, seed: int = 0) -> PolicyParams:
+    """A policy that has learnt nothing."""
+    encoder_key, q_key = jax.random.split(jax.random.key(seed))
+    size = observation_size(config)
+    return PolicyParams(
+        encoder=embedding.acting(config, embedding.init(config, encoder_key)),
+        q=init_q(config.agent, size, len(ACTIONS), q_key),
+    )
+
+
 def empty_memory(config: Config) -> Memory:
     """The memory at the beginning of an episode."""
     return jnp.zeros((config.agent.history, observation_size(config)))
@@ -45,16 +60,52 @@ def flatten(config: Config, params: Params, observation: Observation) -> Array:
     return observation.own if seen is None else jnp.concatenate([seen, observation.own], axis=-1)
 
 
+def see(config: Config, params: Params, memory: Memory, observation: Observation) -> Memory:
+    """Returns the memory [..., H, D] with the encoded observation [...] at its end."""
+    return remember(memory, flatten(config, params, observation))
+
+
+def choose(config: Config, params: Params, memory: Memory, key: Array, epsilon: Array | None = None) -> Array:
+    """Returns the move [...] int32 that the Q-network prefers for memories [..., H, D].
+
+    Args:
+        params: of the Q-network.
+        key: consumed where epsilon is given.
+        epsilon: [...] probability of a random move; None is greedy.
+    """
+    q = q_values(config.agent, params, len(ACTIONS), memory)
+    if epsilon is None:
+        return jnp.argmax(q, axis=-1).astype(jnp.int32)
+    return epsilon_greedy(q, epsilon, key)
+
+
 def act(
-    config: Config,
-    params: PolicyParams,
-    memory: Memory,
-    observation: Observation,
-    key: Array,
-    epsilon: float = 0.0,
+    config: Config, params: PolicyParams, memory: Memory, observation: Observation, key: Array
 ) -> tuple[Array, Memory]:
-    """The move [] int32 for one observation, and the memory with that observation in it."""
-    memory = remember(memory, flatten(config, params.encoder, observation))
-    q = q_values(config.agent, params.q, len(ACTIONS), memory)
-    action = epsilon_greedy(q, jnp.float32(epsilon), key) if epsilon else jnp.argmax(q).astype(jnp.int32)
-    return action, memory
+    """Returns the greedy move [] int32 for one observation, and the memory with that observation in it."""
+    memory = see(config, params.encoder, memory, observation)
+    return choose(config, params.q, memory, key), memory
+
+
+@dataclasses.dataclass(frozen=True)
+class Policy:
+    """A policy that can fly: its configuration and its parameters."""
+
+    config: Config
+    params: PolicyParams
+
+    def act(self, observation: Observation, memory: Memory | None = None) -> tuple[Array, Memory]:
+        """Returns the greedy move [] int32 (0..26) for one observation, and the memory for the next call.
+
+        Args:
+            observation: of one drone, as `Environment.reset` and `step` return it.
+            memory: from the call before; None at the start of an episode.
+        """
+        if memory is None:
+            memory = empty_memory(self.config)
+        return _act(self.config, self.params, memory, observation)
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _act(config: Config, params: PolicyParams, memory: Memory, observation: Observation) -> tuple[Array, Memory]:
+    return act(config, params, memory, observation, jax.random.key(0))  # greedy, so the key does not matter

@@ -18,7 +18,7 @@ from jax import Array
 
 from edqn_jax.config import AgentConfig
 from edqn_jax.random import integers
-from edqn_jax.sim.env import Outcome
+from edqn_jax.sim.outcomes import Outcome
 
 
 @struct.dataclass

@@ -26,13 +26,15 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from edqn_jax.config import Config
 from edqn_jax.errors import ConfigError
-from edqn_jax.learn import dqn, embedding, encoder, qnetwork, replay
+from edqn_jax.learn import dqn, embedding, encoder, policy, qnetwork, replay
 from edqn_jax.learn.policy import PolicyParams, empty_memory, flatten, observation_size, remember
 from edqn_jax.learn.qnetwork import Params
 from edqn_jax.parallel import processes
 from edqn_jax.parallel.devices import compiler_options
 from edqn_jax.sim import env
-from edqn_jax.sim.env import ACTIONS, EnvState, Outcome, World
+from edqn_jax.sim.env import EnvState, World
+from edqn_jax.sim.moves import ACTIONS
+from edqn_jax.sim.outcomes import Outcome
 
 AXIS = "env"
 """Name of the mesh axis that shards are spread over."""
@@ -209,8 +211,7 @@ def train_step(
     # Act (Algorithm 1, step 5): held random manoeuvres in the warm-up, then epsilon-greedy.
     total = (plan.total - plan.warmup) * config.train.num_envs
     epsilon = dqn.exploration(config.agent, decisions, total, actors.episodes)
-    q = qnetwork.q_values(config.agent, learner.q, len(ACTIONS), actors.memory)
-    chosen = jax.vmap(dqn.epsilon_greedy)(q, epsilon, keys[:, 0])
+    chosen = jax.vmap(partial(policy.choose, config, learner.q))(actors.memory, keys[:, 0], epsilon)
     manoeuvre = jax.vmap(partial(_manoeuvre, config.encoder.hold_decisions))(actors.manoeuvre, keys[:, 1])
     action = jnp.where(warming, manoeuvre, chosen)
 

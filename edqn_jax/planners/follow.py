@@ -20,12 +20,13 @@ import numpy as np
 from jax import Array
 
 from edqn_jax.config import Config, EnvConfig
-from edqn_jax.flights import Flights, at_start, tally
 from edqn_jax.parallel.devices import compiler_options
 from edqn_jax.planners.planner import Task
 from edqn_jax.sim import drone
 from edqn_jax.sim.drone import Airframe, DroneState
-from edqn_jax.sim.env import Outcome, bearing, judge
+from edqn_jax.sim.env import bearing
+from edqn_jax.sim.flights import Flights, at_start, tally
+from edqn_jax.sim.outcomes import Outcome, judge
 from edqn_jax.sim.scene import Scene
 
 SPACING_M = 0.1

@@ -1,4 +1,4 @@
-"""What a person sees while a drone learns: a live panel on a terminal, a line now and then elsewhere."""
+"""What a run shows while it goes on: a live panel on a terminal, a line now and then elsewhere."""
 
 from __future__ import annotations
 
@@ -26,40 +26,48 @@ SHOWN = {
 }
 """Metrics that are shown, in this order: name in `metrics.jsonl`, label and format."""
 
+LASTING = ("episodes", "success_rate", "validation_success", "mean_return")
+"""Metrics that stay on show until a newer value comes; the others vanish where a chunk has none."""
+
 
 class Progress:
-    """Live display of a run's metrics; a metric stays on show until a newer value comes."""
+    """Shows the phases of a run, each with a clock, and the metrics of its training."""
 
     def __init__(self, console: Console | None = None, every_s: float = 2.0) -> None:
-        """Writes to `console`, or standard output; without a terminal, a line each `every_s` seconds."""
+        """Writes to `console`, or standard output; without a terminal, a line for each phase and each `every_s`."""
         self._console = console or Console()
         self._every_s = every_s
         self._live: Live | None = None
         self._metrics: dict[str, Any] = {}
-        self._total = 0
-        self._started = self._printed = time.monotonic()
+        self._phase, self._total = "starting", 0
+        self._started = self._phase_started = time.monotonic()
+        self._printed = self._started - every_s
         self._first: tuple[float, int] | None = None
 
-    def start(self, total: int) -> None:
-        """Begins to show progress towards `total` decisions."""
-        self._total = total
-        self._started = time.monotonic()
-        self._printed = self._started - self._every_s
+    @property
+    def elapsed_s(self) -> float:
+        """Seconds since this was made."""
+        return time.monotonic() - self._started
+
+    def phase(self, name: str, *, total: int = 0) -> None:
+        """Shows that the phase `name` begins; `total` is the number of decisions if it is training."""
+        returning = total == 0 and name == "training"  # from a validation
+        self._phase, self._phase_started = name, time.monotonic()
+        self._total = total or self._total
+        if total:
+            self._first = (time.monotonic(), self._decisions())
         if self._console.is_terminal:
-            live = Live(self._panel(), console=self._console, refresh_per_second=4)
-            live.start()
-            self._live = live
+            self._start_live()
+        elif not returning:
+            self.message(f"[{clock(self.elapsed_s)}] {name}")
 
     def update(self, metrics: Mapping[str, Any]) -> None:
         """Takes in new values: `phase`, `decisions`, and any of `SHOWN`; others are not shown."""
-        changed_phase = "phase" in metrics and metrics["phase"] != self._metrics.get("phase")
-        self._metrics.update({key: value for key, value in metrics.items() if value is not None})
+        lasting = {key: self._metrics[key] for key in LASTING if key in self._metrics}
+        self._metrics = lasting | {key: value for key, value in metrics.items() if value is not None}
+        self._phase = str(metrics.get("phase", self._phase))
         now = time.monotonic()
-        if self._first is None and "decisions" in metrics:
-            self._first = (now, int(metrics["decisions"]))
-        if self._live is not None:
-            self._live.update(self._panel())
-        elif changed_phase or now - self._printed >= self._every_s:
+        if self._live is None and now - self._printed >= self._every_s:
             self._printed = now
             self.message(self._line())
 
@@ -73,11 +81,17 @@ class Progress:
             self._live.stop()
             self._live = None
 
+    def _start_live(self) -> None:
+        if self._live is None:
+            # Drawn anew by a thread of its own, so that the clock runs on while the host waits.
+            self._live = Live(get_renderable=self._panel, console=self._console, refresh_per_second=4)
+            self._live.start()
+
     def _decisions(self) -> int:
         return int(self._metrics.get("decisions", 0))
 
     def _remaining(self) -> str:
-        # From the first report on: compiling came before it and does not come again.
+        """Time that the rest of training takes at the rate so far, validations included."""
         if self._first is None or self._decisions() <= self._first[1]:
             return "–"
         rate = (self._decisions() - self._first[1]) / max(time.monotonic() - self._first[0], 1e-9)
@@ -91,23 +105,25 @@ class Progress:
         ]
 
     def _line(self) -> str:
-        elapsed = clock(time.monotonic() - self._started)
         share = self._decisions() / self._total if self._total else 0.0
-        head = f"[{elapsed}] {self._metrics.get('phase', 'training')} {self._decisions():,} ({share:.0%})"
+        head = f"[{clock(self.elapsed_s)}] {self._phase} {self._decisions():,} ({share:.0%})"
         values = "".join(f"  {label} {value}" for label, value in self._values())
-        return f"{head}{values}  left {self._remaining()}"
+        return f"{head}{values}  training left {self._remaining()}"
 
     def _panel(self) -> Panel:
         head = Table.grid(expand=True, padding=(0, 2))
         head.add_column()
         head.add_column(ratio=1)
         head.add_column(justify="right")
-        elapsed = clock(time.monotonic() - self._started)
-        head.add_row(
-            Text(str(self._metrics.get("phase", "compiling")), style="bold"),
-            ProgressBar(total=max(self._total, 1), completed=self._decisions()),
-            f"{self._decisions():,} / {self._total:,}   {elapsed}   left {self._remaining()}",
-        )
+        phase = Text(f"{self._phase} {clock(time.monotonic() - self._phase_started)}", style="bold")
+        total = f"{clock(self.elapsed_s)} in all"
+        if self._total:
+            bar = ProgressBar(total=self._total, completed=self._decisions())
+            done = f"{self._decisions():,} / {self._total:,}"
+            left = f"training left {self._remaining()}" if self._decisions() < self._total else "trained"
+            head.add_row(phase, bar, f"{done}   {left}   {total}")
+        else:
+            head.add_row(phase, "", total)
         values = Table.grid(expand=True, padding=(0, 1))
         shown = self._values()
         for _ in shown:
@@ -119,7 +135,7 @@ class Progress:
 
 
 def clock(seconds: float) -> str:
-    """`m:ss`, or `h:mm:ss` from an hour on."""
+    """Returns `m:ss`, or `h:mm:ss` from an hour on."""
     minutes, rest = divmod(int(seconds), 60)
     hours, minutes = divmod(minutes, 60)
     return f"{hours}:{minutes:02}:{rest:02}" if hours else f"{minutes}:{rest:02}"

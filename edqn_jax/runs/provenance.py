@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import inspect
 import platform
 from importlib import metadata
 from typing import Any
@@ -14,6 +15,7 @@ from edqn_jax.config import Config
 from edqn_jax.learn.embedding import has_code
 from edqn_jax.learn.trainer import TrainState
 from edqn_jax.parallel import processes
+from edqn_jax.sim.reward import Reward
 from edqn_jax.sim.scene import Scene, obstacle_count
 from edqn_jax.sim.sensor import frames_per_decision
 
@@ -51,3 +53,18 @@ def state_digest(state: TrainState) -> str:
         digest.update(f"{array.dtype}{array.shape}".encode())
         digest.update(array.tobytes())
     return digest.hexdigest()
+
+
+def reward_record(config: Config, reward: Reward | None) -> dict[str, str | None]:
+    """Returns what a run says of its reward: the name, and for a user's own a SHA-256 digest of its source.
+
+    The digest is None for the configured rewards, and where Python cannot find the source.
+    """
+    if reward is None:
+        return {"name": config.env.reward, "source_sha256": None}
+    name = getattr(reward, "__qualname__", type(reward).__qualname__)
+    try:
+        source = inspect.getsource(reward if inspect.isroutine(reward) else type(reward))
+    except (OSError, TypeError):
+        return {"name": name, "source_sha256": None}
+    return {"name": name, "source_sha256": hashlib.sha256(source.encode()).hexdigest()}

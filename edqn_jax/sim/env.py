@@ -8,7 +8,6 @@ observation, every observation is rendered and encoded once, and nothing else is
 from __future__ import annotations
 
 import dataclasses
-import enum
 from collections.abc import Callable
 
 import jax
@@ -22,23 +21,14 @@ from edqn_jax.sim import drone, sensor
 from edqn_jax.sim.drone import Airframe, DroneState, Flight
 from edqn_jax.sim.events import EventMemory
 from edqn_jax.sim.moves import ACTIONS
-from edqn_jax.sim.scene import Scene, path_contact, scene_at, take_scene
+from edqn_jax.sim.outcomes import Outcome, judge
+from edqn_jax.sim.reward import Reward, Transition, configured_reward
+from edqn_jax.sim.scene import Scene, scene_at, signed_distance, take_scene
 from edqn_jax.sim.sensor import Sensed, frame_steps
 from edqn_jax.sim.worlds import Missions
 
 OWN_SIZE = 10
 """Values of the drone's own state in an observation."""
-
-
-class Outcome(enum.IntEnum):
-    """How an episode stands. Everything but RUNNING ends it; only TIME_OUT is a truncation."""
-
-    RUNNING = 0
-    GOAL = 1
-    COLLISION = 2
-    LEFT_VOLUME = 3
-    TIME_OUT = 4
-    DIVERGED = 5
 
 
 @struct.dataclass
@@ -48,6 +38,7 @@ class World:
     airframe: Airframe
     pool: Scene  # every array with a leading [P]
     missions: Missions
+    reward: Reward | None = struct.field(pytree_node=False, default=None)  # in place of the configured one
 
 
 @struct.dataclass
@@ -123,82 +114,6 @@ def bearing(config: EnvConfig, state: DroneState, goal: Array) -> Array:
     return jnp.where(near, state.yaw_setpoint, jnp.arctan2(ahead[1], ahead[0]))
 
 
-def judge(config: Config, scene: Scene, goal: Array, before: Array, flight: Flight, decision: Array):
-    """Outcome of one decision: the earliest physics step wins, and at the same step a collision wins.
-
-    Args:
-        before: [3] position before the first physics step.
-        decision: decisions taken, this one included.
-
-    Returns:
-        outcome, end_step in 1..n, contact: as in `Step`.
-    """
-    n = flight.position.shape[0]
-    path = jnp.concatenate([before[None], flight.position])
-    touch, contact = path_contact(scene, path, config.drone.body_radius_m)
-    at = flight.position
-    apart = at - goal[None]
-    arrived = jnp.sum(apart * apart, axis=1) < config.env.goal_radius_m**2
-    outside = jnp.any((at < scene.volume[0][None]) | (at > scene.volume[1][None]), axis=1)
-    broken = ~jnp.all(jnp.isfinite(at), axis=1)
-    # Per physics step, the verdicts in order of precedence.
-    verdict = jnp.select(
-        [broken, touch, outside, arrived],
-        [
-            jnp.full(n, int(Outcome.DIVERGED)),
-            jnp.full(n, int(Outcome.COLLISION)),
-            jnp.full(n, int(Outcome.LEFT_VOLUME)),
-            jnp.full(n, int(Outcome.GOAL)),
-        ],
-        jnp.full(n, int(Outcome.RUNNING)),
-    )
-    first = jnp.argmax(verdict != Outcome.RUNNING)
-    outcome = verdict[first]
-    running = outcome == Outcome.RUNNING
-    timed_out = running & (decision >= config.env.max_decisions)
-    outcome = jnp.where(timed_out, int(Outcome.TIME_OUT), outcome).astype(jnp.int32)
-    end_step = jnp.where(running, n, first + 1).astype(jnp.int32)
-    return outcome, end_step, jnp.where(outcome == Outcome.COLLISION, contact[first], 1.0)
-
-
-def reward(
-    config: EnvConfig,
-    discount: float,
-    outcome: Array,
-    before: Array,
-    after: Array,
-    flown: Array | float = 0.0,
-) -> Array:
-    """Reward of one decision.
-
-    `sparse` is Eq. 8. `progress` adds the metres gained towards the goal, times a weight, and
-    takes something for each metre flown. `potential` adds
-    gamma * Phi(s') - Phi(s) with Phi = -weight * distance, and Phi = 0 at terminal states: the form that leaves the
-    optimal policy unchanged (Ng et al. 1999).
-
-    Args:
-        before, after: distances to the goal, metres.
-        flown: metres flown.
-    """
-    at_end = jnp.select(
-        [outcome == Outcome.GOAL, outcome == Outcome.COLLISION, outcome == Outcome.LEFT_VOLUME],
-        [config.goal_reward, config.collision_reward, config.left_volume_reward],
-        0.0,
-    )
-    total = at_end + config.step_reward
-    if config.reward == "progress":
-        total = total + config.progress_weight * (before - after) - config.path_weight * flown
-    elif config.reward == "potential":
-        terminal = is_terminal(outcome)
-        total = total + config.progress_weight * (before - jnp.where(terminal, 0.0, discount * after))
-    return jnp.where(outcome == Outcome.DIVERGED, 0.0, total)
-
-
-def is_terminal(outcome: Array) -> Array:
-    """Whether the outcome cuts the bootstrap: every end but a time-out."""
-    return (outcome != Outcome.RUNNING) & (outcome != Outcome.TIME_OUT)
-
-
 def _start(config: Config, world: World, mission: Array, key: Array) -> tuple[DroneState, EventMemory | None]:
     """At rest at the mission's start, facing its goal, the sensor at rest."""
     start, goal = world.missions.start[mission], world.missions.goal[mission]
@@ -228,7 +143,7 @@ def reset(config: Config, world: World, key: Array, mission: Array | None = None
     """A fresh environment on a mission drawn from the pool, or on the given one."""
     key, noise = jax.random.split(key)
     state = dataclasses.replace(ended(config, world, key, mission), ended=jnp.zeros((), bool))
-    scene = scene_at(take_scene(world.pool, world.missions.scene[state.mission]), jnp.zeros(()))
+    scene = _scene_of(config, world, state.mission, state.decision)
     still = _hold(state.drone, len(frame_steps(config)))
     goal = world.missions.goal[state.mission]
     observation, memory = observe(config, scene, goal, state.drone, still, state.memory, noise)
@@ -261,10 +176,22 @@ def _hold(body: DroneState, n: int) -> Flight:
     return Flight(position=repeat(body.position), quaternion=repeat(body.quaternion), velocity=repeat(body.velocity))
 
 
+@struct.dataclass
+class _Decision:
+    """What a decision, or the reset in its place, comes to. n physics steps."""
+
+    drone: DroneState
+    flight: Flight  # [n, ...]
+    outcome: Array
+    end_step: Array
+    contact: Array
+    reward: Array
+
+
 def step(
     config: Config, world: World, state: EnvState, action: Array, mission: Array | None = None
 ) -> tuple[EnvState, Step]:
-    """One decision of one drone, or its reset if its episode has ended.
+    """Takes one decision of one drone, or its reset if its episode has ended.
 
     Args:
         action: [] int, 0..26.
@@ -273,62 +200,111 @@ def step(
     key, draw, rest, noise = jax.random.split(state.key, 4)
     is_reset = state.ended
     fresh = _drawn_mission(world, draw) if mission is None else mission
-    mission = jnp.where(is_reset, fresh, state.mission)
+    mission = jnp.where(is_reset, fresh, state.mission).astype(jnp.int32)
     goal = world.missions.goal[mission]
-    time = state.decision * (config.drone.physics_steps * config.drone.physics_dt_s)
-    scene = scene_at(take_scene(world.pool, world.missions.scene[mission]), time)
+    scene = _scene_of(config, world, mission, state.decision)
 
-    # The decision as flown; for an ended environment it is computed and dropped.
+    # For an ended environment the decision is computed and dropped.
+    start, rested = _start(config, world, mission, rest)
+    flown = _fly(config, world, scene, goal, state, action)
+    done = _choose(is_reset, _reset_in_place_of(flown, start), flown)
+
+    poses = _poses_seen(config, _choose(is_reset, start, state.drone), done.flight)
+    memory = _choose(is_reset, rested, state.memory)
+    observation, memory = observe(config, scene, goal, done.drone, poses, memory, noise)
+    after = EnvState(
+        drone=done.drone,
+        mission=mission,
+        decision=jnp.where(is_reset, 0, state.decision + 1),
+        ended=done.outcome != Outcome.RUNNING,
+        memory=memory,
+        episode_return=jnp.where(is_reset, 0.0, state.episode_return + done.reward),
+        key=key,
+    )
+    return after, Step(
+        observation=observation,
+        reward=done.reward,
+        outcome=done.outcome,
+        is_reset=is_reset,
+        episode_return=after.episode_return,
+        episode_length=after.decision,
+        flight=done.flight,
+        end_step=done.end_step,
+        contact=done.contact,
+    )
+
+
+def _scene_of(config: Config, world: World, mission: Array, decision: Array) -> Scene:
+    """The mission's world as it stands at this decision of the episode."""
+    time = decision * (config.drone.physics_steps * config.drone.physics_dt_s)
+    return scene_at(take_scene(world.pool, world.missions.scene[mission]), time)
+
+
+def _fly(config: Config, world: World, scene: Scene, goal: Array, state: EnvState, action: Array) -> _Decision:
+    """The decision as flown and judged; a diverged body stays where it was, so that no NaN reaches an observation."""
     before = state.drone
     command = velocity_command(config.env, action, drone.yaw_of(before.quaternion))
-    flown, flight = drone.fly(config.drone, world.airframe, before, command, bearing(config.env, before, goal))
-    decision = state.decision + 1
-    outcome, end_step, contact = judge(config, scene, goal, before.position, flight, decision)
-    distances = [jnp.sqrt(jnp.sum((goal - p) ** 2)) for p in (before.position, flown.position)]
-    moved = jnp.sqrt(jnp.sum((flown.position - before.position) ** 2))
-    gained = reward(config.env, config.agent.discount, outcome, distances[0], distances[1], moved)
+    after, flight = drone.fly(config.drone, world.airframe, before, command, bearing(config.env, before, goal))
+    outcome, end_step, contact = judge(config, scene, goal, before.position, flight, state.decision + 1)
+    reward = _reward(config, world, scene, goal, before, after, action, outcome)
+    broken = ~jnp.all(jnp.isfinite(jnp.concatenate([after.position, after.quaternion, after.velocity])))
+    return _Decision(
+        drone=_choose(broken, before, after),
+        flight=_choose(broken, _hold(before, flight.position.shape[0]), flight),
+        outcome=jnp.where(broken, int(Outcome.DIVERGED), outcome).astype(jnp.int32),
+        end_step=end_step,
+        contact=contact,
+        reward=jnp.where(broken, 0.0, reward),
+    )
 
-    start, memory = _start(config, world, mission, rest)
-    # A diverged body must not leave NaN in the last observation; it stays where it was.
-    broken = ~jnp.all(jnp.isfinite(jnp.concatenate([flown.position, flown.quaternion, flown.velocity])))
-    held = _hold(before, flight.position.shape[0])
-    body = _choose(is_reset, start, _choose(broken, before, flown))
-    memory = _choose(is_reset, memory, state.memory)
-    flight = _choose(is_reset, _hold(start, flight.position.shape[0]), _choose(broken, held, flight))
-    outcome = jnp.where(is_reset, int(Outcome.RUNNING), jnp.where(broken, int(Outcome.DIVERGED), outcome))
 
-    first = _choose(is_reset, start, before)
+def _reward(
+    config: Config,
+    world: World,
+    scene: Scene,
+    goal: Array,
+    before: DroneState,
+    after: DroneState,
+    action: Array,
+    outcome: Array,
+) -> Array:
+    """The configured reward, or that of the world's own function."""
+    distances = [jnp.sqrt(jnp.sum((goal - p) ** 2)) for p in (before.position, after.position)]
+    moved = jnp.sqrt(jnp.sum((after.position - before.position) ** 2))
+    configured = configured_reward(config.env, config.agent.discount, outcome, distances[0], distances[1], moved)
+    if world.reward is None:
+        return configured
+    transition = Transition(
+        before=before.position,
+        after=after.position,
+        goal=goal,
+        clearance=signed_distance(scene, after.position) - config.drone.body_radius_m,
+        move=jnp.asarray(action, jnp.int32),
+        outcome=outcome,
+        configured=configured,
+    )
+    return jnp.asarray(world.reward(transition), jnp.float32)
+
+
+def _reset_in_place_of(flown: _Decision, start: DroneState) -> _Decision:
+    """A reset with the arrays of a decision: at `start` throughout, with no reward."""
+    return dataclasses.replace(
+        flown,
+        drone=start,
+        flight=_hold(start, flown.flight.position.shape[0]),
+        outcome=jnp.full((), int(Outcome.RUNNING), jnp.int32),
+        reward=jnp.zeros(()),
+    )
+
+
+def _poses_seen(config: Config, first: DroneState, flight: Flight) -> Flight:
+    """Poses [T] at which the sensor looks, of those before the first and after each physics step."""
     path = jax.tree.map(
         lambda a, b: jnp.concatenate([a[None], b]),
         Flight(position=first.position, quaternion=first.quaternion, velocity=first.velocity),
         flight,
     )
-    poses = jax.tree.map(lambda x: jnp.stack([x[i] for i in frame_steps(config)]), path)
-    observation, memory = observe(config, scene, goal, body, poses, memory, noise)
-
-    gained = jnp.where(is_reset, 0.0, jnp.where(broken, 0.0, gained))
-    episode_return = jnp.where(is_reset, 0.0, state.episode_return + gained)
-    decision = jnp.where(is_reset, 0, decision)
-    after = EnvState(
-        drone=body,
-        mission=mission.astype(jnp.int32),
-        decision=decision,
-        ended=outcome != Outcome.RUNNING,
-        memory=memory,
-        episode_return=episode_return,
-        key=key,
-    )
-    return after, Step(
-        observation=observation,
-        reward=gained,
-        outcome=outcome.astype(jnp.int32),
-        is_reset=is_reset,
-        episode_return=episode_return,
-        episode_length=decision,
-        flight=flight,
-        end_step=end_step,
-        contact=contact,
-    )
+    return jax.tree.map(lambda x: jnp.stack([x[i] for i in frame_steps(config)]), path)
 
 
 def _choose(condition: Array, yes, no):

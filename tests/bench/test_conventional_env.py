@@ -18,9 +18,11 @@ from conventional_stack.fleet import Fleet, Record
 from edqn_jax.config import CameraConfig, Config, DroneConfig, EnvConfig, EventsConfig
 from edqn_jax.errors import ConfigError
 from edqn_jax.planners.packages import require
-from edqn_jax.sim import drone, env, events
+from edqn_jax.sim import drone, env, events, outcomes
 from edqn_jax.sim.drone import DroneState
-from edqn_jax.sim.env import EnvState, Outcome
+from edqn_jax.sim.env import EnvState
+from edqn_jax.sim.outcomes import Outcome
+from edqn_jax.sim.reward import configured_reward
 from tests.bench.conventional_course import course_of, fleet_of, paper, world_of
 
 gymnasium_check = require("gymnasium.utils.env_checker")
@@ -146,7 +148,7 @@ def test_every_reward_is_ours_for_every_outcome(name):
     rules, rng = task.rules_of(config), np.random.default_rng(0)
     for outcome in Outcome:
         before, after, flown = rng.uniform(0, 100, 3)
-        ours = env.reward(
+        ours = configured_reward(
             config.env, config.agent.discount, jnp.int32(outcome), jnp.float32(before), jnp.float32(after), flown
         )
         np.testing.assert_allclose(
@@ -177,7 +179,7 @@ def test_whole_flights_are_ours_until_they_end_and_end_alike(mission, legs):
             return
         outcome = Outcome(int(code[0]))
         assert info["outcome"] == outcome.name
-        assert terminated == bool(env.is_terminal(jnp.int32(outcome))) and not truncated
+        assert terminated == bool(outcomes.is_terminal(jnp.int32(outcome))) and not truncated
         np.testing.assert_allclose(got, reward[0], atol=0.01)
         if outcome is not Outcome.RUNNING:
             return

@@ -11,12 +11,12 @@ import pytest
 
 from conventional_stack.fleet import Course
 from conventional_stack.flights import fly_missions
-from edqn_jax import flights as our_flights
 from edqn_jax.config import CameraConfig, Config, EnvConfig
 from edqn_jax.errors import ConfigError
-from edqn_jax.evaluate import summarise
+from edqn_jax.evaluation import rollouts as our_flights
+from edqn_jax.evaluation.metrics import summarise
 from edqn_jax.learn.policy import PolicyParams
-from edqn_jax.sim.env import Outcome
+from edqn_jax.sim.outcomes import Outcome
 from edqn_jax.sim.scene import stack_scenes
 from tests.bench.conventional_course import course_of, paper, world_of
 

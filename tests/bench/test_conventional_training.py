@@ -20,7 +20,8 @@ from edqn_jax.config import Config
 from edqn_jax.errors import ConfigError
 from edqn_jax.planners.packages import MissingPackageError, require
 from edqn_jax.runs.directory import plain
-from edqn_jax.sim.env import OWN_SIZE, Outcome
+from edqn_jax.sim.env import OWN_SIZE
+from edqn_jax.sim.outcomes import Outcome
 from flags import configured
 from tests.bench.conventional_course import course_of
 from tests.miniature import MINIATURE

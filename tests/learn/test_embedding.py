@@ -14,10 +14,12 @@ import pytest
 
 from edqn_jax.config import CameraConfig, Config, EncoderConfig
 from edqn_jax.config.loading import to_yaml
-from edqn_jax.evaluate import decision_latency_ms, fresh_policy, load_run
+from edqn_jax.evaluation.latency import decision_latency_ms
 from edqn_jax.learn import embedding, encoder, policy, trainer
+from edqn_jax.learn.policy import fresh_policy
 from edqn_jax.learn.trainer import Plan
 from edqn_jax.runs.checkpoints import save_policy
+from edqn_jax.runs.policies import load_run
 from edqn_jax.runs.provenance import workload
 from edqn_jax.sim import drone, mjcf, worlds
 from edqn_jax.sim.env import Observation, World

@@ -11,8 +11,9 @@ import pytest
 
 from edqn_jax.config import AgentConfig, CameraConfig, Config, EncoderConfig
 from edqn_jax.learn import encoder, policy, qnetwork, replay
-from edqn_jax.sim.env import ACTIONS, OWN_SIZE, Observation
+from edqn_jax.sim.env import OWN_SIZE, Observation
 from edqn_jax.sim.events import field_of_counts
+from edqn_jax.sim.moves import ACTIONS
 
 CONFIG = Config(
     camera=CameraConfig(width=8, height=6),
@@ -106,7 +107,7 @@ def test_the_table_of_the_paper_has_a_state_of_42():
 @pytest.mark.usefixtures("strict_jax")
 def test_the_policy_is_strict(params):
     one = observations(1)[0]
-    move, memory = jax.jit(lambda *inputs: policy.act(CONFIG, *inputs, epsilon=0.5))(
+    move, memory = jax.jit(lambda *inputs: policy.act(CONFIG, *inputs))(
         params, policy.empty_memory(CONFIG), one, jax.random.key(3)
     )
     assert memory.shape == (3, SIZE) and move.shape == ()

@@ -15,7 +15,8 @@ from edqn_jax.errors import ConfigError
 from edqn_jax.learn import replay, trainer
 from edqn_jax.learn.trainer import Plan, Trainer, TrainState
 from edqn_jax.sim import drone, mjcf, worlds
-from edqn_jax.sim.env import Outcome, World
+from edqn_jax.sim.env import World
+from edqn_jax.sim.outcomes import Outcome
 from edqn_jax.sim.scene import stack_scenes
 
 CONFIG = Config(

@@ -13,12 +13,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from edqn_jax.config import Config
-from edqn_jax.flights import Flights
 from edqn_jax.planners import snn
 from edqn_jax.planners.follow import SPACING_M, FollowConfig, compiled_follower, reserved, sampled, steer
 from edqn_jax.planners.planner import Task, path_length
 from edqn_jax.sim import drone
-from edqn_jax.sim.env import Outcome
+from edqn_jax.sim.flights import Flights
+from edqn_jax.sim.outcomes import Outcome
 from tests.planners.rooms import RADIUS, SIZE, assert_flyable, box, closet, random_room, room
 
 CONFIG, FOLLOW = Config(), FollowConfig()

@@ -13,9 +13,12 @@ from edqn_jax.report.progress import Progress, clock
 def shown(terminal: bool, every_s: float) -> str:
     out = io.StringIO()
     progress = Progress(Console(file=out, force_terminal=terminal, width=120), every_s)
-    progress.start(1000)
+    progress.phase("compiling")
+    progress.phase("training", total=1000)
     for decisions in (100, 200, 300):
-        progress.update({"phase": "learning", "decisions": decisions, "success_rate": 0.25, "q_loss": None})
+        progress.update({"phase": "training", "decisions": decisions, "success_rate": 0.25, "q_loss": None})
+        progress.phase("validating")
+        progress.phase("training")
     progress.message("flown: [goal]")
     progress.stop()
     return out.getvalue()
@@ -23,18 +26,30 @@ def shown(terminal: bool, every_s: float) -> str:
 
 def test_without_a_terminal_there_are_plain_lines():
     lines = shown(terminal=False, every_s=0.0).splitlines()
-    assert len(lines) == 4
-    assert "learning 300 (30%)  success 25.0%" in lines[2]
+    assert lines[:2] == ["[0:00] compiling", "[0:00] training"]
+    assert [line.split()[1] for line in lines[2:-1]] == ["training", "validating"] * 3
+    assert "training 300 (30%)  success 25.0%" in lines[6]
     assert "\x1b" not in "".join(lines)
 
 
-def test_lines_keep_their_distance_in_time():
-    assert len(shown(terminal=False, every_s=1000.0).splitlines()) == 2
+def test_lines_of_metrics_keep_their_distance_in_time():
+    assert sum("(" in line for line in shown(terminal=False, every_s=1000.0).splitlines()) == 1
 
 
 def test_a_terminal_shows_the_last_values_and_keeps_messages():
     out = shown(terminal=True, every_s=0.0)
-    assert "300 / 1,000" in out and "25.0%" in out and "flown: [goal]" in out
+    assert "300 / 1,000" in out and "25.0%" in out and "flown: [goal]" in out and "in all" in out
+
+
+def test_a_loss_that_a_chunk_does_not_have_is_not_shown_again():
+    out = io.StringIO()
+    progress = Progress(Console(file=out), every_s=0.0)
+    progress.phase("training", total=1000)
+    progress.update({"decisions": 100, "kl": 3.0, "validation_success": 0.5})
+    progress.update({"decisions": 200, "kl": None})
+    first, second = out.getvalue().splitlines()[1:]
+    assert "KL 3" in first and "KL" not in second
+    assert "validation 50.0%" in second
 
 
 def test_stopping_what_never_started_is_harmless():

@@ -13,9 +13,11 @@ import numpy as np
 import pytest
 
 from edqn_jax.config import Config, EnvConfig, EventsConfig, preset
-from edqn_jax.sim import camera, drone, env, events, sensor
+from edqn_jax.sim import camera, drone, env, events, outcomes, sensor
 from edqn_jax.sim.drone import DroneState, Flight
-from edqn_jax.sim.env import ACTIONS, Outcome
+from edqn_jax.sim.moves import ACTIONS
+from edqn_jax.sim.outcomes import Outcome
+from edqn_jax.sim.reward import configured_reward
 from edqn_jax.sim.scene import UprightBoxes, build_scene, stack_scenes
 from edqn_jax.sim.worlds import Missions
 from tests.sim.drawn_scenes import GROUND, rotation_of
@@ -136,7 +138,7 @@ def test_time_runs_out_at_the_limit_and_not_before_and_only_if_nothing_else_happ
 
 
 def test_only_a_time_out_is_a_truncation():
-    ends = {outcome: bool(env.is_terminal(jnp.int32(outcome))) for outcome in Outcome}
+    ends = {outcome: bool(outcomes.is_terminal(jnp.int32(outcome))) for outcome in Outcome}
     assert ends == {
         Outcome.RUNNING: False,
         Outcome.GOAL: True,
@@ -151,7 +153,7 @@ def test_only_a_time_out_is_a_truncation():
 
 
 def rewarded(config, outcome, before, after, discount=0.99):
-    return float(env.reward(config, discount, jnp.int32(outcome), jnp.float32(before), jnp.float32(after)))
+    return float(configured_reward(config, discount, jnp.int32(outcome), jnp.float32(before), jnp.float32(after)))
 
 
 def test_the_papers_reward_is_eq_8_to_the_letter():
@@ -173,7 +175,7 @@ def test_progress_charges_for_the_metres_flown_and_the_other_forms_do_not():
         config = EnvConfig(reward=form, path_weight=0.5)
         distances = jnp.float32(9.0), jnp.float32(5.0)
         still, moved = (
-            env.reward(config, 0.99, jnp.int32(Outcome.RUNNING), *distances, jnp.float32(metres))
+            configured_reward(config, 0.99, jnp.int32(Outcome.RUNNING), *distances, jnp.float32(metres))
             for metres in (0.0, 6.0)
         )
         assert still - moved == pytest.approx(cost)
@@ -444,7 +446,7 @@ def test_the_limit_ends_an_episode_at_exactly_its_last_decision_without_cutting_
     assert [int(s.outcome) for s in steps] == [0, 0, 0, Outcome.TIME_OUT, 0, 0]
     assert [bool(s.is_reset) for s in steps] == [False] * 4 + [True, False]
     assert [int(s.episode_length) for s in steps] == [1, 2, 3, 4, 0, 1]
-    assert not bool(env.is_terminal(steps[3].outcome))
+    assert not bool(outcomes.is_terminal(steps[3].outcome))
 
 
 @pytest.mark.slow

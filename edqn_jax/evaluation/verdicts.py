@@ -9,10 +9,10 @@ import mujoco
 import numpy as np
 
 from edqn_jax.config import Config
-from edqn_jax.course import Course
-from edqn_jax.flights import Flights
-from edqn_jax.sim.env import Outcome
-from edqn_jax.verdict import Judge, load_judge, replay_contact
+from edqn_jax.evaluation.judge import Judge, load_judge, replay_contact
+from edqn_jax.evaluation.missions import MissionSet
+from edqn_jax.sim.flights import Flights
+from edqn_jax.sim.outcomes import Outcome
 
 CONTACT_TOLERANCE_M = 0.01
 """How far apart along the path the two may see the same contact. `segment_contact` takes the distance seven
@@ -44,7 +44,7 @@ class Agreement:
         return self.apart_m <= CONTACT_TOLERANCE_M
 
 
-def check_verdicts(config: Config, course: Course, flights: Flights) -> list[Agreement]:
+def check_verdicts(config: Config, course: MissionSet, flights: Flights) -> list[Agreement]:
     """Every recorded flight replayed in C MuJoCo, along the segments between physics steps.
 
     Args:

@@ -8,59 +8,20 @@ from functools import partial
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import struct
 from jax import Array
-from jax.sharding import Mesh, PartitionSpec
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from edqn_jax.config import Config
 from edqn_jax.learn import policy
 from edqn_jax.learn.policy import Memory, PolicyParams
 from edqn_jax.parallel.devices import compiler_options
 from edqn_jax.sim import env
-from edqn_jax.sim.drone import DroneState, Flight
-from edqn_jax.sim.env import EnvState, Observation, Outcome, Step, World
-from edqn_jax.sim.scene import Scene, scene_at, signed_distance, take_scene
-
-
-@struct.dataclass
-class Closest:
-    """Where a flight came closest to a shape, its start and end included. M missions."""
-
-    distance: Array  # [M] metres between the body's sphere and the shape
-    time: Array  # [M] seconds since the start
-    position: Array  # [M, 3] metres
-    quaternion: Array  # [M, 4]
-
-
-@struct.dataclass
-class Record:
-    """Whole flights, a row per physics step, taken after it. T = decision limit x physics steps a decision.
-
-    Rows after a flight's end are NaN. The last row of a collision stands beyond the contact: what the physics
-    computed without knowing of it.
-    """
-
-    position: Array  # [M, T, 3] metres
-    quaternion: Array  # [M, T, 4]
-    velocity: Array  # [M, T, 3] m/s
-    clearance: Array  # [M, T] metres from the body's sphere to the nearest shape, at a contact cut off there
-    action: Array  # [M, D] int32, one a decision; -1 after the end
-    reward: Array  # [M, D] of each decision
-
-
-@struct.dataclass
-class Flights:
-    """How M missions went. A flight ends with the physics step of its outcome, a collision at the contact."""
-
-    outcome: Array  # [M] int32, an `Outcome`
-    decisions: Array  # [M] int32
-    physics_steps: Array  # [M] int32, the one of the outcome included
-    contact: Array  # [M] share of the last physics step flown before a collision touched, 1 otherwise
-    episode_return: Array  # [M] undiscounted
-    path_length_m: Array  # [M]
-    flight_seconds: Array  # [M]
-    closest: Closest
-    record: Record | None
+from edqn_jax.sim.env import EnvState, Observation, Step, World
+from edqn_jax.sim.flights import Flights, Record, at_start, tally
+from edqn_jax.sim.outcomes import Outcome
+from edqn_jax.sim.scene import scene_at, take_scene
 
 
 @struct.dataclass
@@ -108,6 +69,24 @@ def fly_missions(
         ValueError: if codes are to be shuffled and a device has only one mission.
     """
     return _program(mesh)(config, shuffle_codes, record, mesh, world, params, key)
+
+
+def fly_on_all_devices(
+    config: Config,
+    world: World,
+    params: PolicyParams,
+    seed: int = 0,
+    *,
+    record: bool = False,
+    shuffle_codes: bool = False,
+) -> Flights:
+    """`fly_missions` on all devices that there are; the flights come back to the host."""
+    mesh = Mesh(np.asarray(jax.devices()), ("mission",))
+    world, params = jax.device_put((world, params), NamedSharding(mesh, PartitionSpec()))
+    flights = fly_missions(
+        config, world, params, jax.random.key(seed), record=record, shuffle_codes=shuffle_codes, mesh=mesh
+    )
+    return jax.tree.map(np.asarray, flights)
 
 
 def prepare(config: Config, world: World, params: PolicyParams, key: Array, *, record: bool, mesh: Mesh) -> None:
@@ -210,27 +189,6 @@ def _at_start(config: Config, world: World, state: EnvState) -> Flights:
     return at_start(config, scene, state.drone)
 
 
-def at_start(config: Config, scene: Scene, body: DroneState) -> Flights:
-    """Tallies of one flight that begins with `body`."""
-    zero, none = jnp.zeros(()), jnp.zeros((), jnp.int32)
-    return Flights(
-        outcome=none,
-        decisions=none,
-        physics_steps=none,
-        contact=jnp.ones(()),
-        episode_return=zero,
-        path_length_m=zero,
-        flight_seconds=zero,
-        closest=Closest(
-            distance=signed_distance(scene, body.position) - config.drone.body_radius_m,
-            time=zero,
-            position=body.position,
-            quaternion=body.quaternion,
-        ),
-        record=None,
-    )
-
-
 def _tally(config: Config, world: World, flights: Flights, before: EnvState, step: Step) -> tuple[Flights, Array]:
     """The tallies of one flight after a step, and the clearance [n] after each of its physics steps."""
     running = (flights.outcome == Outcome.RUNNING) & ~step.is_reset
@@ -240,62 +198,6 @@ def _tally(config: Config, world: World, flights: Flights, before: EnvState, ste
     after, clearance = tally(config, scene, flights, before.drone.position, step.flight, *verdict)
     after = dataclasses.replace(after, episode_return=step.episode_return)
     return jax.tree.map(lambda new, old: jnp.where(running, new, old), after, flights), clearance
-
-
-def tally(
-    config: Config,
-    scene: Scene,
-    flights: Flights,
-    before: Array,
-    flight: Flight,
-    outcome: Array,
-    end_step: Array,
-    contact: Array,
-) -> tuple[Flights, Array]:
-    """The tallies of one flight after one more decision, its return aside.
-
-    Args:
-        config: body and physics.
-        scene: as it stands during the decision.
-        flights: of one flight that is not over.
-        before: [3] metres, position before the first physics step.
-        flight: n physics steps.
-        outcome: as `env.judge` has it, like the next two.
-        end_step: in 1..n.
-        contact: share of that step.
-
-    Returns:
-        the tallies, and the clearance [n] after each physics step, metres.
-    """
-    steps = jnp.arange(config.drone.physics_steps)
-    flown = steps < end_step
-    share = jnp.where(steps == end_step - 1, contact, 1.0)
-    begin = jnp.concatenate([before[None], flight.position[:-1]])
-    segment = share[:, None] * (flight.position - begin)
-    end = begin + segment
-    times = flights.flight_seconds + (steps + share) * config.drone.physics_dt_s
-
-    clearance = jax.vmap(partial(signed_distance, scene))(end) - config.drone.body_radius_m
-    least = jnp.argmin(jnp.where(flown, clearance, jnp.inf))
-    closest = Closest(
-        distance=clearance[least],
-        time=times[least],
-        position=end[least],
-        quaternion=flight.quaternion[least],
-    )
-    closer = closest.distance < flights.closest.distance
-    after = Flights(
-        outcome=outcome,
-        decisions=flights.decisions + 1,
-        physics_steps=flights.physics_steps + end_step,
-        contact=contact,
-        episode_return=flights.episode_return,
-        path_length_m=flights.path_length_m + jnp.sum(jnp.where(flown, jnp.sqrt(jnp.sum(segment**2, axis=-1)), 0.0)),
-        flight_seconds=times[end_step - 1],
-        closest=jax.tree.map(lambda new, old: jnp.where(closer, new, old), closest, flights.closest),
-        record=None,
-    )
-    return after, clearance
 
 
 def _blank(config: Config, missions: int) -> Record:

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from edqn_jax.config import Config
-from edqn_jax.course import load_course
 from edqn_jax.errors import ConfigError
+from edqn_jax.evaluation.missions import load_missions
 from edqn_jax.sim import worlds
 from edqn_jax.sim.mjcf import load_scene, resolve_world
 
@@ -17,7 +17,7 @@ CONFIG = Config()
 
 @pytest.mark.slow
 def test_one_mission_in_a_file_is_its_own():
-    course = load_course(CONFIG, "paper")
+    course = load_missions(CONFIG, "paper")
     np.testing.assert_allclose(course.world.missions.start, [[1, 1, 3]])
     np.testing.assert_allclose(course.world.missions.goal, [[90, 90, 10]])
     assert course.mjcf() == [resolve_world("paper").read_text()]
@@ -25,24 +25,24 @@ def test_one_mission_in_a_file_is_its_own():
 
 @pytest.mark.slow
 def test_many_missions_in_a_file_start_all_over_and_go_to_its_goal():
-    missions = load_course(CONFIG, "paper", 50).world.missions
+    missions = load_missions(CONFIG, "paper", 50).world.missions
     np.testing.assert_allclose(missions.goal, np.tile([90, 90, 10], (50, 1)))
     assert np.all(np.std(np.asarray(missions.start), axis=0) > [20, 20, 4])  # uniform: 31, 31 and 6.4 m
-    others = load_course(CONFIG, "paper", 50, seed=1).world.missions
+    others = load_missions(CONFIG, "paper", 50, seed=1).world.missions
     assert not np.any(np.all(missions.start == others.start, axis=1))
 
 
 @pytest.mark.slow
 def test_start_and_goal_may_be_given():
-    missions = load_course(CONFIG, "paper", start=(2, 3, 4), goal=(3, 100, 20)).world.missions
+    missions = load_missions(CONFIG, "paper", start=(2, 3, 4), goal=(3, 100, 20)).world.missions
     np.testing.assert_allclose(missions.start, [[2, 3, 4]])
     np.testing.assert_allclose(missions.goal, [[3, 100, 20]])
-    many = load_course(CONFIG, "paper", 5, goal=(3, 100, 20)).world.missions
+    many = load_missions(CONFIG, "paper", 5, goal=(3, 100, 20)).world.missions
     np.testing.assert_allclose(many.goal, np.tile([3, 100, 20], (5, 1)))
 
 
 def test_random_worlds_are_the_test_split_and_each_has_one_mission():
-    course = load_course(CONFIG, "sparse", 4, seed=2)
+    course = load_missions(CONFIG, "sparse", 4, seed=2)
     pool, missions = course.world.pool, course.world.missions
     assert missions.scene.tolist() == [0, 1, 2, 3]
     np.testing.assert_array_equal(missions.start, pool.start)
@@ -51,7 +51,7 @@ def test_random_worlds_are_the_test_split_and_each_has_one_mission():
 
 
 def test_a_random_world_as_mjcf_is_the_world_that_was_flown():
-    course = load_course(CONFIG, "sparse", 4, seed=2)
+    course = load_missions(CONFIG, "sparse", 4, seed=2)
     texts = course.mjcf()
     assert len(texts) == 4
     model = mujoco.MjSpec.from_string(texts[3]).compile()
@@ -78,15 +78,15 @@ def inside_a_block() -> tuple[float, float, float]:
 )
 def test_what_cannot_be_flown_is_a_sentence(arguments, says):
     with pytest.raises(ConfigError, match=says):
-        load_course(CONFIG, **arguments)
+        load_missions(CONFIG, **arguments)
 
 
 @pytest.mark.parametrize("missions", [1, 3])
 def test_a_goal_inside_a_wall_names_the_wall(missions):
     with pytest.raises(ConfigError, match=r"the goal .* lies inside '\w+'"):
-        load_course(CONFIG, "paper", missions, goal=inside_a_block())
+        load_missions(CONFIG, "paper", missions, goal=inside_a_block())
 
 
 def test_a_start_inside_a_wall_names_the_wall():
     with pytest.raises(ConfigError, match=r"the start .* lies inside '\w+'"):
-        load_course(CONFIG, "paper", start=inside_a_block())
+        load_missions(CONFIG, "paper", start=inside_a_block())

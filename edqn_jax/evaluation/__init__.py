@@ -1,0 +1,1 @@
+"""Missions flown greedily, measured, and judged again by C MuJoCo."""

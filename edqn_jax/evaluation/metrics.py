@@ -1,0 +1,112 @@
+"""Figures of a set of flights: success with its interval, SPL, path, time and clearance."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import jax
+import numpy as np
+
+from edqn_jax.config import Config
+from edqn_jax.planners.astar import NoPathError, shortest_path
+from edqn_jax.sim.env import World
+from edqn_jax.sim.flights import Flights
+from edqn_jax.sim.outcomes import Outcome
+from edqn_jax.sim.scene import take_scene
+
+
+def wilson_interval(successes: int, missions: int, z: float = 1.959964) -> tuple[float, float]:
+    """Wilson's score interval of a success rate; 95 % for the default `z` (Wilson 1927)."""
+    if missions == 0:
+        return 0.0, 1.0
+    rate = successes / missions
+    scale = 1.0 + z * z / missions
+    middle = (rate + z * z / (2 * missions)) / scale
+    half = z / scale * math.sqrt(rate * (1 - rate) / missions + z * z / (4 * missions**2))
+    return max(0.0, middle - half), min(1.0, middle + half)
+
+
+def spl(success: np.ndarray, flown: np.ndarray, shortest: np.ndarray) -> float:
+    """Success weighted by path length (Anderson et al. 2018): mean of S l / max(p, l) over missions [M].
+
+    A failure's shortest path does not matter and may be NaN.
+    """
+    weight = shortest[success] / np.maximum(flown[success], shortest[success])
+    return float(np.sum(weight) / len(success))
+
+
+def shortest_paths(config: Config, world: World, wanted: np.ndarray) -> np.ndarray:
+    """Length [M] of A*'s path for each of the `wanted` [M] missions, metres; NaN for the others."""
+    scene_of, starts, goals = (np.asarray(x) for x in (world.missions.scene, world.missions.start, world.missions.goal))
+    pool = jax.tree.map(np.asarray, world.pool)
+    lengths = np.full(len(starts), np.nan)
+    for i in np.flatnonzero(wanted):
+        try:
+            scene = take_scene(pool, scene_of[i])
+            lengths[i] = shortest_path(scene, starts[i], goals[i], config.drone.body_radius_m).length_m
+        except NoPathError:
+            continue  # a way that the half-metre lattice has no room for
+    return lengths
+
+
+def summarise(flights: Flights, shortest: np.ndarray | None = None) -> dict[str, Any]:
+    """The figures of a set of flights.
+
+    Args:
+        flights: M of them.
+        shortest: [M] lengths of the shortest paths, metres, NaN where not known; without them there is no
+            `spl` and no `path_over_shortest`.
+
+    Returns:
+        What `edqn evaluate --json` holds, less world, seed and latency. `spl` and the mean `return` are of
+        all flights; the means of path, decisions and seconds, and the least clearance, of those that reached
+        the goal (None if there is none). A flight ends at the goal's radius, the shortest path at the goal.
+    """
+    outcome = np.asarray(flights.outcome)
+    counts = {kind: int(np.sum(outcome == kind)) for kind in Outcome}
+    success = outcome == Outcome.GOAL
+    low, high = wilson_interval(counts[Outcome.GOAL], len(outcome))
+    flown = np.asarray(flights.path_length_m, np.float64)
+
+    def mean(values: Any, over: np.ndarray) -> float | None:
+        chosen = np.asarray(values, np.float64)[over]
+        return float(np.mean(chosen)) if chosen.size else None
+
+    figures: dict[str, Any] = {
+        "missions": len(outcome),
+        "successes": counts[Outcome.GOAL],
+        "success_rate": counts[Outcome.GOAL] / len(outcome),
+        "interval": [low, high],
+        "collisions": counts[Outcome.COLLISION],
+        "left_volume": counts[Outcome.LEFT_VOLUME],
+        "timeouts": counts[Outcome.TIME_OUT],
+        "diverged": counts[Outcome.DIVERGED],
+        "spl": None,
+        "path_over_shortest": None,
+        "decisions": mean(flights.decisions, success),
+        "flight_seconds": mean(flights.flight_seconds, success),
+        "path_length_m": mean(flown, success),
+        "return": mean(flights.episode_return, np.ones_like(success)),
+        "min_clearance_m": float(np.min(flights.closest.distance[success])) if success.any() else None,
+    }
+    if shortest is not None:
+        known = success & np.isfinite(shortest)
+        # A success whose shortest path is not known counts as flown no better than it was.
+        figures["spl"] = spl(success, flown, np.where(np.isfinite(shortest), shortest, flown))
+        figures["path_over_shortest"] = mean(flown / np.where(known, shortest, 1.0), known)
+    return figures
+
+
+def flight_summary(flights: Flights, mission: int = 0) -> dict[str, Any]:
+    """What `summary.json` says of one flight, the shortest path aside."""
+    outcome = Outcome(int(flights.outcome[mission]))
+    return {
+        "success": outcome == Outcome.GOAL,
+        "outcome": outcome.name.lower(),
+        "steps": int(flights.decisions[mission]),
+        "path_length_m": float(flights.path_length_m[mission]),
+        "return": float(flights.episode_return[mission]),
+        "min_clearance_m": float(flights.closest.distance[mission]),
+        "flight_seconds": float(flights.flight_seconds[mission]),
+    }

@@ -1,0 +1,209 @@
+"""Missions: from the name of a world to where drones train, are validated and are evaluated."""
+
+from __future__ import annotations
+
+import dataclasses
+import tempfile
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from edqn_jax.config import DENSITIES, Config
+from edqn_jax.errors import ConfigError
+from edqn_jax.planners.astar import shortest_path
+from edqn_jax.sim import drone, worlds
+from edqn_jax.sim.env import World
+from edqn_jax.sim.mjcf import check_scene, load_world, resolve_world, write_scene
+from edqn_jax.sim.reward import Reward
+from edqn_jax.sim.scene import Scene, stack_scenes, take_scene
+from edqn_jax.sim.worlds import Missions
+
+Point = tuple[float, float, float]
+
+_MISSION_SEED = 7_919
+"""Root of the keys of evaluation missions in worlds from files; training derives its keys from other roots."""
+
+
+@dataclasses.dataclass(frozen=True)
+class MissionSet:
+    """Missions in one or more worlds."""
+
+    name: str
+    """What the world was asked for by."""
+    world: World
+    file: Path | None = None
+    """MJCF file of the only world; None for random ones."""
+
+    def scene(self, mission: int = 0) -> Scene:
+        """Returns the world of one mission."""
+        return take_scene(self.world.pool, self.world.missions.scene[mission])
+
+    def rewarded_by(self, reward: Reward | None) -> MissionSet:
+        """Returns the same missions with this reward; None is the configured one."""
+        return dataclasses.replace(self, world=dataclasses.replace(self.world, reward=reward))
+
+    def mjcf(self) -> list[str]:
+        """Returns every world of the pool as MJCF: the file it was read from, or written from the arrays."""
+        if self.file is not None:
+            return [self.file.read_text(encoding="utf-8")]
+        pool = jax.tree.map(np.asarray, self.world.pool)
+        with tempfile.TemporaryDirectory() as folder:
+            written = Path(folder) / "world.xml"
+            texts = []
+            for index in range(pool.start.shape[0]):
+                write_scene(take_scene(pool, index), written, title=f"{self.name} {index}")
+                texts.append(written.read_text(encoding="utf-8"))
+        return texts
+
+
+@dataclasses.dataclass(frozen=True)
+class RunMissions:
+    """Missions of a training run. Validation and final ones have the same shape: one program flies both."""
+
+    training: MissionSet
+    validation: MissionSet
+    final: MissionSet
+    """Mission 0 is the one that the run is judged by; nothing flies it before the end."""
+    near_start: np.ndarray
+    """[M] bool, which validation missions begin at or near their world's own start."""
+
+    @property
+    def scene(self) -> Scene:
+        """The world of the mission that the run is judged by."""
+        return self.final.scene()
+
+
+def run_missions(config: Config, reward: Reward | None = None) -> RunMissions:
+    """Returns the missions of a training run; they follow from the configuration's world and seed.
+
+    Args:
+        config: of the run.
+        reward: of every decision in them, in place of the configured one.
+
+    Raises:
+        ConfigError: if a drone of this radius cannot fly in the world.
+    """
+    root = jax.random.key(config.train.seed)
+    training_key, validation_key = (jax.random.fold_in(root, purpose) for purpose in (1, 2))
+    if config.world.name in DENSITIES:
+        missions = _random_run_missions(config, training_key)
+    else:
+        missions = _file_run_missions(config, training_key, validation_key)
+    return dataclasses.replace(
+        missions, **{name: getattr(missions, name).rewarded_by(reward) for name in ("training", "validation", "final")}
+    )
+
+
+def _random_run_missions(config: Config, training_key: jax.Array) -> RunMissions:
+    """Every validation and final mission has a world of its own, from its own start to its own goal."""
+    name, count = config.world.name, config.train.validation_missions
+    airframe = drone.load_airframe(config.drone)
+    training_pool = worlds.random_pool(name, worlds.world_keys("training", config.world.pool_size))
+    training = worlds.random_missions(training_pool, config.world.missions, training_key)
+    validation, test = (worlds.random_pool(name, worlds.world_keys(split, count)) for split in ("validation", "test"))
+    return RunMissions(
+        training=MissionSet(name, World(airframe, training_pool, training)),
+        validation=MissionSet(name, World(airframe, validation, worlds.own_missions(validation))),
+        final=MissionSet(name, World(airframe, test, worlds.own_missions(test))),
+        near_start=np.ones(count, bool),
+    )
+
+
+def _file_run_missions(config: Config, training_key: jax.Array, validation_key: jax.Array) -> RunMissions:
+    """All missions are in one world and end at its goal; the final one begins at its start."""
+    name, count = config.world.name, config.train.validation_missions
+    airframe, file = drone.load_airframe(config.drone), resolve_world(name)
+    loaded = load_world(file)
+    check_scene(loaded.scene, config.drone.body_radius_m, names=loaded.names, title=f"'{name}'")
+    pool = stack_scenes([loaded.scene])
+    spread, jitter = config.world.own_start_fraction, config.world.start_jitter_m
+    training = worlds.spread_missions(pool, config.world.missions, spread, jitter, training_key)
+    # Half of the validation begins near the start, but never at it.
+    near = max(jitter, 0.5)
+    validation = worlds.spread_missions(pool, count, 0.5, near, validation_key)
+    own = worlds.own_missions(pool)
+    final = jax.tree.map(lambda one, many: jnp.concatenate([one, many[1:]]), own, validation)
+    final = dataclasses.replace(final, scene=final.scene.astype(jnp.int32))
+    return RunMissions(
+        training=MissionSet(name, World(airframe, pool, training), file),
+        validation=MissionSet(name, World(airframe, pool, validation), file),
+        final=MissionSet(name, World(airframe, pool, final), file),
+        near_start=_near(validation, np.asarray(loaded.scene.start), near),
+    )
+
+
+def _near(missions: Missions, start: np.ndarray, jitter_m: float) -> np.ndarray:
+    """Returns [M] whether each mission begins within `jitter_m` of `start` [3] along each axis."""
+    apart = np.abs(np.asarray(missions.start) - start).max(axis=1)
+    return apart <= jitter_m + 1e-3  # positions are rounded to float32
+
+
+def load_missions(
+    config: Config,
+    name: str,
+    missions: int = 1,
+    seed: int = 0,
+    start: Point | None = None,
+    goal: Point | None = None,
+) -> MissionSet:
+    """Returns the missions of an evaluation.
+
+    In a world from a file, one mission is from its own start to its own goal, more are from random free
+    starts all over the volume to its goal. In random worlds each mission has a test world of its own, which
+    training never uses. `start` and `goal`, metres, replace the world's.
+
+    Args:
+        config: of the policy that will fly.
+        name: `sparse`, `medium`, `dense`, the name of a scene or an MJCF file.
+        missions: how many.
+        seed: which; the missions of two seeds differ.
+        start: of every mission.
+        goal: of every mission.
+
+    Raises:
+        ConfigError: if there is no such world, the drone does not fit where a mission starts or ends, or there is
+            no path for the only mission.
+    """
+    if missions < 1:
+        raise ConfigError(f"--missions must be at least 1, not {missions}")
+    if seed < 0 or (seed + 1) * missions >= 2**31:
+        last = 2**31 // missions - 2
+        raise ConfigError(f"--seed must be from 0 to {last} for {missions} missions, not {seed}")
+    moved = {k: jnp.asarray(v, jnp.float32) for k, v in (("start", start), ("goal", goal)) if v is not None}
+    if name in DENSITIES:
+        return _random_missions(config, name, missions, seed, moved)
+    if missions > 1 and start is not None:
+        raise ConfigError(f"--start with --missions {missions}: in '{name}' all would be one and the same flight")
+    return _file_missions(config, name, missions, seed, moved)
+
+
+def _random_missions(config: Config, name: str, missions: int, seed: int, moved: dict[str, jax.Array]) -> MissionSet:
+    """One mission in each of so many test worlds."""
+    pool = worlds.random_pool(name, worlds.world_keys("test", missions, first=seed * missions))
+    if moved:
+        many = {key: jnp.broadcast_to(value, (missions, 3)) for key, value in moved.items()}
+        pool = dataclasses.replace(pool, **many)
+        for index in range(missions):
+            title = f"test world {seed * missions + index} ({name})"
+            check_scene(take_scene(pool, index), config.drone.body_radius_m, title=title)
+    return MissionSet(name, World(drone.load_airframe(config.drone), pool, worlds.own_missions(pool)))
+
+
+def _file_missions(config: Config, name: str, missions: int, seed: int, moved: dict[str, jax.Array]) -> MissionSet:
+    """One mission from start to goal of a world from a file, or many from random free starts."""
+    radius, airframe, file = config.drone.body_radius_m, drone.load_airframe(config.drone), resolve_world(name)
+    loaded = load_world(file)
+    scene = dataclasses.replace(loaded.scene, **moved)
+    if missions == 1:
+        check_scene(scene, radius, names=loaded.names, title=f"'{name}'")
+        shortest_path(scene, scene.start, scene.goal, radius)  # raises where there is no path
+        pool = stack_scenes([scene])
+        return MissionSet(name, World(airframe, pool, worlds.own_missions(pool)), file)
+    probe_key, missions_key = jax.random.split(jax.random.fold_in(jax.random.key(_MISSION_SEED), seed))
+    # The world's own start does not matter, any free point will do; the goal does.
+    standing = dataclasses.replace(scene, start=worlds.free_point(scene, probe_key))
+    check_scene(standing, radius, names=loaded.names, title=f"'{name}'")
+    pool = stack_scenes([scene])
+    return MissionSet(name, World(airframe, pool, worlds.spread_missions(pool, missions, 0.0, 0.0, missions_key)), file)

@@ -1,0 +1,79 @@
+"""Recorded flights as tables: a row per physics step, for `trajectory.csv` and for `.npz` files."""
+
+from __future__ import annotations
+
+import tempfile
+from pathlib import Path
+
+import jax
+import numpy as np
+
+from edqn_jax.config import Config
+from edqn_jax.evaluation.missions import MissionSet
+from edqn_jax.runs.directory import TRAJECTORY_COLUMNS
+from edqn_jax.runs.files import write_whole
+from edqn_jax.sim.flights import Flights
+from edqn_jax.sim.outcomes import Outcome
+
+
+def trajectory(config: Config, flights: Flights, mission: int = 0) -> dict[str, np.ndarray]:
+    """One recorded flight as the columns of `trajectory.csv`, each [T]: a row after each physics step."""
+    if flights.record is None:
+        raise ValueError("these flights were not recorded")
+    steps = int(flights.physics_steps[mission])
+    whole = jax.tree.map(lambda leaf: np.asarray(leaf[mission]), flights.record)
+    decision = np.arange(steps) // config.drone.physics_steps
+    values = np.column_stack(
+        [
+            config.drone.physics_dt_s * np.arange(1, steps + 1),
+            whole.position[:steps],
+            whole.quaternion[:steps],
+            whole.velocity[:steps],
+            whole.action[decision],
+            whole.reward[decision],
+            whole.clearance[:steps],
+        ]
+    )
+    return dict(zip(TRAJECTORY_COLUMNS, values.T, strict=True))
+
+
+def write_trajectories(config: Config, course: MissionSet, flights: Flights, file: Path) -> None:
+    """All flights as one `.npz`, enough to check every verdict in another physics engine.
+
+    Row 0 of each flight is its start, row k stands after physics step k; rows after the end are NaN.
+    `lengths` is the number of rows of each flight. A collision touches within the last segment, `contact` of
+    the way along it. `mjcf[scene[i]]` is the world of mission i.
+    """
+    record = flights.record
+    if record is None:
+        raise ValueError("these flights were not recorded")
+    missions = jax.tree.map(np.asarray, course.world.missions)
+    heading = np.arctan2(*(missions.goal - missions.start)[:, 1::-1].T)
+    level = np.zeros_like(heading)
+    facing = np.column_stack([np.cos(heading / 2), level, level, np.sin(heading / 2)])
+    longest = int(np.max(flights.physics_steps))
+    columns = {
+        "positions": np.concatenate([missions.start[:, None], record.position[:, :longest]], axis=1),
+        "attitudes": np.concatenate([facing[:, None], record.quaternion[:, :longest]], axis=1),
+        "times": config.drone.physics_dt_s * np.arange(longest + 1),
+        "lengths": flights.physics_steps + 1,
+        "actions": record.action,
+        "rewards": record.reward,
+        "outcome": np.array([Outcome(int(kind)).name.lower() for kind in flights.outcome]),
+        "contact": flights.contact,
+        "flight_seconds": flights.flight_seconds,
+        "closest_distance": flights.closest.distance,
+        "closest_time": flights.closest.time,
+        "closest_position": flights.closest.position,
+        "closest_attitude": flights.closest.quaternion,
+        "scene": missions.scene,
+        "start": missions.start,
+        "goal": missions.goal,
+        "mjcf": np.array(course.mjcf()),
+        "body_radius_m": np.float64(config.drone.body_radius_m),
+        "physics_dt_s": np.float64(config.drone.physics_dt_s),
+    }
+    with tempfile.SpooledTemporaryFile() as buffer:
+        np.savez_compressed(buffer, **columns)
+        buffer.seek(0)
+        write_whole(file, buffer.read())

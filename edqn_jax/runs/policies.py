@@ -1,0 +1,43 @@
+"""A saved run as configuration and policy."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import jax
+import numpy as np
+
+from edqn_jax.config import Config
+from edqn_jax.config.limits import validate
+from edqn_jax.config.loading import apply, load_layer
+from edqn_jax.errors import ConfigError
+from edqn_jax.learn import embedding
+from edqn_jax.learn.policy import PolicyParams, fresh_policy
+from edqn_jax.runs.checkpoints import load_policy
+
+
+def load_run(folder: Path) -> tuple[Config, PolicyParams]:
+    """Configuration and policy of a run, or of any folder with its `config.yaml` and `checkpoints/`.
+
+    Raises:
+        ConfigError: if there is none, or its parts are incomplete or do not fit each other.
+    """
+    file = folder / "config.yaml"
+    if not file.is_file():
+        raise ConfigError(f"there is no run in '{folder}': it holds no config.yaml")
+    config = apply(Config(), load_layer(file), str(file))
+    validate(config)
+    params = load_policy(folder / "checkpoints")
+    fresh = jax.eval_shape(lambda: fresh_policy(config))
+    # As policies were saved before their pixel features were written out.
+    learnt = jax.eval_shape(lambda: embedding.init(config, jax.random.key(0)))
+    if _shapes(params) == _shapes(dataclasses.replace(fresh, encoder=learnt)):
+        params = dataclasses.replace(params, encoder=jax.tree.map(np.asarray, embedding.acting(config, params.encoder)))
+    if _shapes(params) != _shapes(fresh):
+        raise ConfigError(f"the policy in '{folder}' does not have the shapes that its config.yaml asks for")
+    return config, params
+
+
+def _shapes(params: PolicyParams) -> PolicyParams:
+    return jax.tree.map(np.shape, params)

@@ -1,0 +1,106 @@
+"""What the host keeps of a run while it trains: metrics of each chunk, ended episodes, validations."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import numpy as np
+
+from edqn_jax.config import Config
+from edqn_jax.errors import DivergedError
+from edqn_jax.learn.trainer import Episodes, Losses, Plan
+from edqn_jax.sim.outcomes import Outcome
+
+
+@dataclasses.dataclass(frozen=True)
+class EndedEpisodes:
+    """Episodes that ended in a chunk, in order. E of them."""
+
+    step: np.ndarray  # [E] int, decisions of all environments when it ended
+    episode_return: np.ndarray  # [E] undiscounted
+    length: np.ndarray  # [E] int, decisions
+    outcome: np.ndarray  # [E] int, an `Outcome`
+
+    @classmethod
+    def of(cls, episodes: Episodes, first: int, envs: int) -> EndedEpisodes:
+        """Picks out of a chunk that began with training step `first` what ended in it."""
+        outcome, length, gain = (
+            np.asarray(x).reshape(len(x), -1) for x in (episodes.outcome, episodes.length, episodes.episode_return)
+        )
+        rows, columns = np.nonzero(outcome)
+        return cls((first + rows + 1) * envs, gain[rows, columns], length[rows, columns], outcome[rows, columns])
+
+    def named(self) -> list[str]:
+        """Returns the outcomes in words."""
+        return [Outcome(int(kind)).name.lower() for kind in self.outcome]
+
+
+@dataclasses.dataclass
+class History:
+    """A run so far."""
+
+    metrics: list[dict[str, Any]] = dataclasses.field(default_factory=list)
+    """One dictionary a chunk, as in `metrics.jsonl`."""
+    episodes: list[EndedEpisodes] = dataclasses.field(default_factory=list)
+    """What ended in each chunk."""
+    validations: list[tuple[int, float, float]] = dataclasses.field(default_factory=list)
+    """Decisions, seconds since the start and success rate near the start of each validation."""
+
+    @property
+    def episode_count(self) -> int:
+        """How many episodes have ended."""
+        return sum(len(ended.step) for ended in self.episodes)
+
+    def column(self, name: str) -> tuple[np.ndarray, np.ndarray]:
+        """Returns decisions and values, each [n], of the chunks that have the metric `name`."""
+        rows = [(row["decisions"], row[name]) for row in self.metrics if row.get(name) is not None]
+        return np.array([d for d, _ in rows]), np.array([v for _, v in rows])
+
+
+def chunk_metrics(
+    config: Config, first: int, ended: EndedEpisodes, losses: Losses, seconds: float, episodes: int
+) -> dict[str, Any]:
+    """Returns the metrics of a chunk, None for what did not happen in it.
+
+    Args:
+        first: number of the chunk's first training step.
+        ended: what ended in the chunk.
+        losses: [K] each.
+        seconds: that the chunk took.
+        episodes: ended in all, this chunk included.
+    """
+    envs, steps = config.train.num_envs, len(losses.q_loss)
+    any_ended = len(ended.step) > 0
+    return {
+        "phase": "warm-up" if first + steps <= Plan.of(config).warmup else "training",
+        "decisions": (first + steps) * envs,
+        "decisions_per_second": steps * envs / seconds,
+        "episodes": episodes,
+        "success_rate": float(np.mean(ended.outcome == Outcome.GOAL)) if any_ended else None,
+        "mean_return": float(np.mean(ended.episode_return)) if any_ended else None,
+        "epsilon": float(losses.epsilon[-1]),
+        "q_loss": _mean(losses.q_loss),
+        "mean_q": _mean(losses.mean_q),
+        "reconstruction_loss": _mean(losses.reconstruction),
+        "kl": _mean(losses.kl),
+    }
+
+
+def check_finite(plan: Plan, done: int, losses: Losses) -> None:
+    """Raises if a loss of the chunk that ended with training step `done` is NaN or Inf.
+
+    Raises:
+        DivergedError: names the loss and the step.
+    """
+    learns = np.arange(done - len(losses.q_loss), done) >= plan.learn_from
+    bad = learns & ~np.isfinite(losses.q_loss)
+    if bad.any():
+        raise DivergedError(f"training diverged: the Q loss was {losses.q_loss[bad][0]} at training step {done}")
+
+
+def _mean(values: Any) -> float | None:
+    """Mean over the steps of a chunk that learnt; None if none did."""
+    finite = np.asarray(values)
+    finite = finite[~np.isnan(finite)]
+    return float(np.mean(finite)) if len(finite) else None

@@ -1,0 +1,155 @@
+"""A recorded run: trained, flown once by the result, drawn, and written to a run directory."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import jax
+import numpy as np
+
+from edqn_jax.config import DENSITIES, Config
+from edqn_jax.errors import StoppedError
+from edqn_jax.evaluation.metrics import flight_summary, summarise
+from edqn_jax.evaluation.trajectories import trajectory
+from edqn_jax.parallel import processes
+from edqn_jax.report.gallery import draw_gallery
+from edqn_jax.report.progress import Progress
+from edqn_jax.runs.checkpoints import save_policy
+from edqn_jax.runs.directory import RunDirectory
+from edqn_jax.runs.provenance import reward_record, state_digest, versions, workload
+from edqn_jax.sim.flights import Flights
+from edqn_jax.sim.reward import Reward
+from edqn_jax.training.loop import Chunk, Preparation, TrainingResult, prepared, run_chunks
+from edqn_jax.training.selection import first_success
+
+
+def train_run(
+    config: Config,
+    run: RunDirectory | None,
+    progress: Progress,
+    stop_requested: Callable[[], bool],
+    reward: Reward | None = None,
+) -> dict[str, Any]:
+    """Trains, validates, flies and draws; everything is written to the run directory.
+
+    Args:
+        config: the same on every process.
+        run: None on a process that writes nothing, which is every one but the first of those that train together.
+        progress: where it is shown.
+        stop_requested: asked after each chunk; one process's yes stops all of them.
+        reward: as in `train`.
+
+    Returns:
+        what `summary.json` holds.
+
+    Raises:
+        ConfigError: before anything is written, if the run cannot be made; later, if one of its files cannot be.
+        DivergedError: if a loss becomes NaN or Inf.
+        StoppedError: after saving the policy, if `stop_requested()` turned true.
+    """
+    with prepared(config, reward, progress) as preparation:
+        progress.message(f"{config.world.name} world, {_described(preparation.devices)}")
+        processes.together(lambda: None if run is None else run.create(config))
+        result = run_chunks(preparation, lambda chunk: _record(run, chunk) or stop_requested())
+        if run is not None:
+            save_policy(run.checkpoints, result.policy.params)
+        if result.stopped:
+            stopped = f"stopped after {result.decisions:,} decisions"
+            raise StoppedError(f"{stopped}; " + _where_saved(run))
+        progress.phase("flying the mission")
+        flights = preparation.fly(preparation.missions.final, result.policy.params)
+        digest = state_digest(result.state)  # the last that all processes do together
+        summary = _summary(preparation, result, flights, digest, reward)
+        if run is not None:
+            progress.phase("drawing")
+            _draw(run, preparation, result, flights)
+            summary["total_seconds"] = time.perf_counter() - preparation.began
+            run.write_summary(summary)
+            progress.stop()
+            progress.message(_verdict(summary, run))
+    return summary
+
+
+def _record(run: RunDirectory | None, chunk: Chunk) -> None:
+    """Appends a chunk to the files of the run."""
+    if run is None:
+        return
+    ended = chunk.episodes
+    run.append_episodes(zip(ended.step, ended.episode_return, ended.length, ended.named(), strict=True))
+    run.append_metrics(chunk.metrics)
+
+
+def _where_saved(run: RunDirectory | None) -> str:
+    return "the first process saves the policy" if run is None else f"the policy is in '{run.checkpoints}'"
+
+
+def _summary(
+    preparation: Preparation, result: TrainingResult, flights: Flights, digest: str, reward: Reward | None
+) -> dict[str, Any]:
+    """What `summary.json` holds."""
+    config, scene = preparation.config, preparation.missions.scene
+    since = first_success(result.history.validations)
+    summary = {
+        **flight_summary(flights),
+        "shortest_path_m": preparation.shortest.length_m,
+        "world": config.world.name,
+        "seed": config.train.seed,
+        "train_decisions": result.decisions,
+        "train_seconds": result.train_seconds,
+        "compile_seconds": result.compile_seconds,
+        "total_seconds": time.perf_counter() - preparation.began,
+        "decisions_per_second": result.decisions / result.train_seconds,
+        "episodes": result.history.episode_count,
+        "first_success_decisions": since[0],
+        "first_success_seconds": since[1],
+        "validation_success": result.kept.success,
+        "validation_spl": result.kept.spl,
+        "parameters_from_decisions": result.kept.decisions,
+        "reward": reward_record(config, reward),
+        "workload": workload(config, scene),
+        "devices": [str(device) for device in preparation.devices],
+        "versions": versions(),
+        "state_digest": digest,
+    }
+    if config.world.name in DENSITIES:
+        summary["test"] = summarise(flights)
+    return summary
+
+
+def _draw(run: RunDirectory, preparation: Preparation, result: TrainingResult, flights: Flights) -> None:
+    """Writes the flight of the mission that the run is judged by, and all pictures."""
+    config = preparation.config
+    run.write_trajectory(trajectory(config, flights))
+    scene = jax.tree.map(np.asarray, preparation.missions.scene)
+    outcome = flight_summary(flights)["outcome"]
+    draw_gallery(config, run, scene, result.policy.params, np.asarray(preparation.shortest.points), outcome)
+
+
+def _described(devices: Sequence[jax.Device]) -> str:  # pyright: ignore[reportInvalidTypeForm]
+    count = len({device.process_index for device in devices})
+    return f"{len(devices)} {devices[0].platform} devices" + (f" of {count} processes" if count > 1 else "")
+
+
+def _verdict(summary: dict[str, Any], run: RunDirectory) -> str:
+    ending = {
+        "goal": "reached the goal",
+        "collision": "hit something",
+        "left_volume": "left the flight volume",
+        "time_out": "ran out of time",
+        "diverged": "left the range of numbers",
+    }[summary["outcome"]]
+    text = (
+        f"The greedy flight {ending} after {summary['steps']} decisions ({summary['flight_seconds']:.1f} s), "
+        f"{summary['path_length_m']:.1f} m flown where the shortest path is {summary['shortest_path_m']:.1f} m, "
+        f"never nearer than {summary['min_clearance_m']:.2f} m to anything."
+    )
+    if "test" in summary:
+        test = summary["test"]
+        low, high = test["interval"]
+        text += (
+            f"\nUnseen test worlds: {test['successes']} of {test['missions']} "
+            f"({test['success_rate']:.0%}, 95 % interval {low:.0%} to {high:.0%})."
+        )
+    return f"{text}\nTrained in {summary['train_seconds']:.0f} s; everything is in {run.path}"

@@ -1,0 +1,78 @@
+"""Validation: when it is due, what its flights say of the parameters, and which parameters a run ends with."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Literal
+
+import numpy as np
+
+from edqn_jax.config import Config
+from edqn_jax.evaluation.metrics import spl
+from edqn_jax.evaluation.missions import RunMissions
+from edqn_jax.learn.policy import PolicyParams
+from edqn_jax.learn.trainer import Plan
+from edqn_jax.sim.flights import Flights
+from edqn_jax.sim.outcomes import Outcome
+from edqn_jax.sim.worlds import Missions
+
+FLIES = 0.9
+"""Success rate, in the validation missions that begin at or near a world's own start, from which a policy is said to
+fly the mission."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Candidate:
+    """Parameters that a run may end with, and their validation; by default none yet."""
+
+    params: PolicyParams
+    spl: float = -1.0  # below what any validation gives
+    success: float = 0.0  # share of validation missions
+    success_near_start: float = 0.0  # share of those that begin at or near their world's own start
+    decisions: int = 0  # trained before that validation, in all environments
+
+
+def is_due(config: Config, plan: Plan, checked: int, done: int) -> bool:
+    """Returns whether a validation is due after `done` training steps, the last one after `checked` decisions."""
+    every = config.train.validation_every
+    # On crossing a multiple, never on equality: right for any number of environments.
+    return every > 0 and done * config.train.num_envs // every > checked // every and done > plan.learn_from
+
+
+def validated(
+    config: Config, missions: RunMissions, flights: Flights, params: PolicyParams, decisions: int
+) -> Candidate:
+    """Returns the candidate that the flights of a validation make of the parameters that flew them."""
+    arrived = np.asarray(flights.outcome) == Outcome.GOAL
+    straight = _straight(missions.validation.world.missions, config.env.goal_radius_m)
+    return Candidate(
+        params,
+        spl=spl(arrived, np.asarray(flights.path_length_m), straight),
+        success=float(np.mean(arrived)),
+        success_near_start=float(np.mean(arrived[missions.near_start])),
+        decisions=decisions,
+    )
+
+
+def _straight(missions: Missions, goal_radius_m: float) -> np.ndarray:
+    """[M] metres from each start straight to the goal's sphere: a lower bound that needs no search."""
+    apart = np.linalg.norm(np.asarray(missions.goal) - np.asarray(missions.start), axis=1)
+    return np.maximum(apart - goal_radius_m, 1e-3)
+
+
+def choose(keep: Literal["best", "last"], kept: Candidate, latest: Candidate) -> Candidate:
+    """Returns which of the two a run would end with: `best` by SPL, the latest among equals; `last` the latest."""
+    return latest if keep == "last" or latest.spl >= kept.spl else kept
+
+
+def first_success(validations: Sequence[tuple[int, float, float]]) -> tuple[int | None, float | None]:
+    """Returns decisions and seconds at the first validation in which the mission was flown.
+
+    Args:
+        validations: decisions, seconds and success rate near the start of each, in order.
+
+    Returns:
+        (None, None) if none reached `FLIES`.
+    """
+    return next(((decisions, seconds) for decisions, seconds, rate in validations if rate >= FLIES), (None, None))
