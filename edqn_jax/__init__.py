@@ -1,1 +1,91 @@
-"""E-DQN in one compiled JAX program: a drone learns to fly through unmapped obstacles from events."""
+"""Train drones to fly through unknown obstacles from simulated events, in one compiled JAX program.
+
+The names below are public; they are loaded when first used, so that importing this package imports neither JAX nor
+MuJoCo and configures nothing. Everything else may change between versions.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from edqn_jax.config import Config
+    from edqn_jax.config.loading import make_config
+    from edqn_jax.errors import ConfigError, DivergedError, StoppedError
+    from edqn_jax.evaluation.evaluate import Evaluation, evaluate
+    from edqn_jax.learn.policy import Policy
+    from edqn_jax.parallel.devices import use_cpu_devices
+    from edqn_jax.runs.policies import load_policy, save_policy
+    from edqn_jax.sim.environment import Environment, make
+    from edqn_jax.sim.moves import move_name, move_number
+    from edqn_jax.sim.outcomes import Outcome
+    from edqn_jax.sim.reward import Transition
+    from edqn_jax.training.loop import Chunk, TrainingResult, train
+
+_MODULES = {
+    "Chunk": "training.loop",
+    "Config": "config",
+    "ConfigError": "errors",
+    "DivergedError": "errors",
+    "Environment": "sim.environment",
+    "Evaluation": "evaluation.evaluate",
+    "Outcome": "sim.outcomes",
+    "Policy": "learn.policy",
+    "StoppedError": "errors",
+    "TrainingResult": "training.loop",
+    "Transition": "sim.reward",
+    "evaluate": "evaluation.evaluate",
+    "load_policy": "runs.policies",
+    "make": "sim.environment",
+    "make_config": "config.loading",
+    "move_name": "sim.moves",
+    "move_number": "sim.moves",
+    "save_policy": "runs.policies",
+    "train": "training.loop",
+    "use_cpu_devices": "parallel.devices",
+}
+"""The module of each public name."""
+
+__all__ = [
+    "Chunk",
+    "Config",
+    "ConfigError",
+    "DivergedError",
+    "Environment",
+    "Evaluation",
+    "Outcome",
+    "Policy",
+    "StoppedError",
+    "TrainingResult",
+    "Transition",
+    "__version__",
+    "evaluate",
+    "load_policy",
+    "make",
+    "make_config",
+    "move_name",
+    "move_number",
+    "save_policy",
+    "train",
+    "use_cpu_devices",
+]
+
+__version__: str
+
+
+def __getattr__(name: str) -> Any:
+    """Loads a public name when it is first used (PEP 562)."""
+    from importlib import import_module, metadata
+
+    if name == "__version__":
+        value: Any = metadata.version("edqn-jax")
+    elif name in _MODULES:
+        value = getattr(import_module(f"{__name__}.{_MODULES[name]}"), name)
+    else:
+        raise AttributeError(f"module '{__name__}' has no attribute '{name}'")
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

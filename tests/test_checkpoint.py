@@ -10,7 +10,7 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from edqn_jax.errors import ConfigError
 from edqn_jax.learn.policy import PolicyParams
-from edqn_jax.runs.checkpoints import COMMIT_MARKER, POLICY, load_policy, save_policy
+from edqn_jax.runs.checkpoints import COMMIT_MARKER, POLICY, load_params, save_params
 
 
 def some_policy(value: float = 1.0) -> PolicyParams:
@@ -27,39 +27,39 @@ def same(one: PolicyParams, other: PolicyParams) -> bool:
 
 def test_a_policy_comes_back_bit_for_bit(tmp_path):
     params = some_policy(0.1)
-    save_policy(tmp_path, params)
-    assert same(load_policy(tmp_path), params)
+    save_params(tmp_path, params)
+    assert same(load_params(tmp_path), params)
 
 
 def test_saving_again_replaces_the_policy(tmp_path):
-    save_policy(tmp_path, some_policy(1.0))
-    save_policy(tmp_path, some_policy(2.0))
-    assert same(load_policy(tmp_path), some_policy(2.0))
+    save_params(tmp_path, some_policy(1.0))
+    save_params(tmp_path, some_policy(2.0))
+    assert same(load_params(tmp_path), some_policy(2.0))
 
 
 def test_a_policy_from_two_devices_comes_back_on_the_host(tmp_path):
     mesh = Mesh(np.asarray(jax.devices()[:2]), ("env",))
-    save_policy(tmp_path, jax.device_put(some_policy(), NamedSharding(mesh, PartitionSpec())))
-    loaded = load_policy(tmp_path)
+    save_params(tmp_path, jax.device_put(some_policy(), NamedSharding(mesh, PartitionSpec())))
+    loaded = load_params(tmp_path)
     assert same(loaded, some_policy())
     assert all(isinstance(leaf, np.ndarray) for leaf in jax.tree.leaves(loaded))
 
 
 def test_no_policy_is_a_sentence(tmp_path):
     with pytest.raises(ConfigError, match=f"there is no policy in '{tmp_path}'"):
-        load_policy(tmp_path)
+        load_params(tmp_path)
 
 
 def test_a_policy_without_its_commit_marker_does_not_exist(tmp_path):
-    save_policy(tmp_path, some_policy())
+    save_params(tmp_path, some_policy())
     (tmp_path / POLICY / COMMIT_MARKER).unlink()
     with pytest.raises(ConfigError, match="incomplete: saving it was interrupted"):
-        load_policy(tmp_path)
+        load_params(tmp_path)
 
 
 def test_a_damaged_policy_is_one_sentence(tmp_path):
-    save_policy(tmp_path, some_policy())
+    save_params(tmp_path, some_policy())
     (tmp_path / POLICY / "_METADATA").unlink()
     with pytest.raises(ConfigError, match="cannot be read") as refusal:
-        load_policy(tmp_path)
+        load_params(tmp_path)
     assert "\n" not in str(refusal.value)

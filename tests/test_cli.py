@@ -7,6 +7,7 @@ import signal
 import subprocess
 import sys
 import types
+from importlib import metadata
 from pathlib import Path
 
 import pytest
@@ -126,7 +127,11 @@ def test_every_kind_of_knob_can_be_a_flag():
         (["train", "--resume", "must"], "--resume must needs --run-dir"),
         (["evaluate"], "RUN"),
         (["evaluate", "nowhere"], "there is no run in 'nowhere'"),
-        (["fly"], "train, evaluate"),
+        (["fly"], "there is no command 'fly'; known are train, evaluate"),
+        (["trian"], "did you mean 'train'?"),
+        (["train", "--nun-envs", "64"], "there is no option '--nun-envs'; did you mean '--num-envs'?"),
+        (["evaluate", "runs", "--misions=3"], "there is no option '--misions'; did you mean '--missions'?"),
+        (["train", "--zzz"], "there is no option '--zzz'; 'edqn train --help' lists what there is"),
     ],
 )
 def test_bad_input_ends_with_2_a_sentence_and_nothing_made(argv, says, capsys, tmp_path, trainer):
@@ -219,6 +224,18 @@ def test_help_lists_every_knob_and_does_not_start_jax():
     assert "--agent.batch-size INT" in shown and "Replayed samples per update." in shown
     assert "--events.frame-times-s" in shown and f"(default: {RANDOM_WORLDS['train']['total_steps']})" in shown
     assert "--num-envs for --train.num-envs" in shown
+
+
+def test_the_version_is_the_packages(capsys):
+    assert main(["--version"]) == 0
+    assert capsys.readouterr().out == f"edqn-jax {metadata.version('edqn-jax')}\n"
+
+
+def test_the_module_is_the_command():
+    shown = subprocess.run(
+        [sys.executable, "-m", "edqn_jax", "trian"], cwd=ROOT, capture_output=True, text=True, check=False
+    )
+    assert shown.returncode == 2 and "did you mean 'train'?" in shown.stderr
 
 
 def test_train_py_is_the_train_command():

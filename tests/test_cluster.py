@@ -17,7 +17,7 @@ from edqn_jax.config import Config
 from edqn_jax.config.loading import to_yaml
 from edqn_jax.errors import ConfigError
 from edqn_jax.parallel import processes
-from edqn_jax.runs.checkpoints import load_policy
+from edqn_jax.runs.checkpoints import load_params
 from edqn_jax.runs.directory import RunDirectory
 from tests.processes import PATIENCE_S, by_srun, one_process, to_the_end, two_processes
 from tests.test_run import CONFIG
@@ -65,7 +65,7 @@ def test_two_processes_train_the_policy_that_one_process_trains_on_two_devices(t
     assert len(run.read_episodes()["step"]) == first["episodes"]
     # What they have learnt is what one process learns.
     assert json.loads((alone / "note.json").read_text())["shards"] == [[0, 1, 2, 3], [4, 5, 6, 7]]
-    learnt, expected = (load_policy(RunDirectory(folder / "run").checkpoints) for folder in (together, alone))
+    learnt, expected = (load_params(RunDirectory(folder / "run").checkpoints) for folder in (together, alone))
     for ours, theirs in zip(jax.tree.leaves(learnt), jax.tree.leaves(expected), strict=True):
         np.testing.assert_allclose(ours, theirs, atol=1e-5)
 
@@ -90,7 +90,7 @@ def test_sigterm_for_one_process_of_slurms_stops_both_and_one_saves(tmp_path: Pa
     assert (first, second) == (143, 143), said + echoed
     assert "the policy is in 'run/checkpoints'" in said
     assert "the first process saves the policy" in echoed
-    load_policy(run.checkpoints)
+    load_params(run.checkpoints)
     assert not run.summary_file.exists()
 
 

@@ -16,12 +16,13 @@ from edqn_jax.cli.evaluate import evaluate_command
 from edqn_jax.config import Config
 from edqn_jax.config.loading import to_yaml
 from edqn_jax.errors import ConfigError
+from edqn_jax.evaluation import evaluate as evaluation
 from edqn_jax.evaluation.judge import load_judge, replay_contact
 from edqn_jax.evaluation.latency import decision_latency_ms
 from edqn_jax.evaluation.metrics import spl, summarise, wilson_interval
 from edqn_jax.evaluation.missions import MissionSet
 from edqn_jax.learn.policy import fresh_policy
-from edqn_jax.runs.checkpoints import save_policy
+from edqn_jax.runs.checkpoints import save_params
 from edqn_jax.runs.policies import load_run
 from edqn_jax.sim.flights import Closest, Flights
 from edqn_jax.sim.outcomes import Outcome
@@ -32,7 +33,7 @@ from tests.policies import CONFIG, always
 def run(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("run")
     (folder / "config.yaml").write_text(to_yaml(CONFIG))
-    save_policy(folder / "checkpoints", always((1, 0, 0)))
+    save_params(folder / "checkpoints", always((1, 0, 0)))
     return folder
 
 
@@ -131,8 +132,8 @@ def test_codes_are_shuffled_between_enough_missions(run):
 def test_a_policy_that_sees_nothing_has_nothing_to_shuffle(tmp_path):
     blind = dataclasses.replace(CONFIG, env=dataclasses.replace(CONFIG.env, sensor="blind"))
     (tmp_path / "config.yaml").write_text(to_yaml(blind))
-    save_policy(tmp_path / "checkpoints", fresh_policy(blind))
-    with pytest.raises(ConfigError, match="--shuffle-codes has nothing to shuffle: the policy of .* sees nothing but"):
+    save_params(tmp_path / "checkpoints", fresh_policy(blind))
+    with pytest.raises(ConfigError, match="--shuffle-codes has nothing to shuffle: the policy's sensor is 'blind'"):
         evaluate_command(EvaluateArgs(tmp_path, missions=4, shuffle_codes=True))
 
 
@@ -145,9 +146,9 @@ def test_the_command_shuffles_codes_only_when_asked_and_says_so(shuffle_codes, r
         return four_flights()
 
     # Stand-ins for what would compile.
-    monkeypatch.setattr(evaluate, "load_missions", lambda *_: MissionSet("paper", None, None))  # type: ignore[arg-type]
-    monkeypatch.setattr(evaluate, "fly_on_all_devices", fly)
-    monkeypatch.setattr(evaluate, "shortest_paths", lambda *_: np.full(4, 10.0))
+    monkeypatch.setattr(evaluation, "load_missions", lambda *_: MissionSet("paper", None, None))  # type: ignore[arg-type]
+    monkeypatch.setattr(evaluation, "fly_on_all_devices", fly)
+    monkeypatch.setattr(evaluation, "shortest_paths", lambda *_: np.full(4, 10.0))
     monkeypatch.setattr(evaluate, "decision_latency_ms", lambda *_: {"median": 1.0, "p99": 2.0})
     evaluate_command(EvaluateArgs(run, missions=4, shuffle_codes=shuffle_codes, json=tmp_path / "figures.json"))
     assert asked == [{"record": False, "shuffle_codes": shuffle_codes}]

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+import difflib
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Literal
@@ -85,7 +86,7 @@ class EvaluateArgs:
     """Also write every flight, a pose per physics step."""
 
 
-TRAIN = "edqn train"
+TRAIN, EVALUATE = "edqn train", "edqn evaluate"
 
 
 def parse_train(argv: Sequence[str]) -> tuple[TrainOptions, Config]:
@@ -95,6 +96,7 @@ def parse_train(argv: Sequence[str]) -> tuple[TrainOptions, Config]:
         ConfigError: if the preset, the file or a limit is not met.
         SystemExit: after printing, for --help and for what does not parse.
     """
+    check_flags(argv, train_flags(), TRAIN)
     argv = [_long_name(word) for word in argv]
     # Preset, file and world decide the defaults that the other flags change and that --help shows.
     early = [word for word in argv if word not in ("-h", "--help")]
@@ -108,6 +110,40 @@ def parse_train(argv: Sequence[str]) -> tuple[TrainOptions, Config]:
         world = dataclasses.replace(config.world, name=str(Path(config.world.name).resolve()))
         config = dataclasses.replace(config, world=world)
     return options, config
+
+
+def check_flags(argv: Sequence[str], known: Iterable[str], command: str) -> None:
+    """Raises if a word that begins with `--` is no flag of the command.
+
+    Raises:
+        ConfigError: names the flag and the nearest one that there is.
+    """
+    known = {"--help", *known}
+    for word in argv:
+        flag = word.partition("=")[0].replace("_", "-")
+        if flag.startswith("--") and flag not in known:
+            close = difflib.get_close_matches(flag, known, n=1, cutoff=0.5)
+            hint = f"did you mean '{close[0]}'?" if close else f"'{command} --help' lists what there is"
+            raise ConfigError(f"there is no option '{flag}'; {hint}")
+
+
+def train_flags() -> set[str]:
+    """Returns every flag of `edqn train`."""
+    flags = {_flag(option.name) for option in dataclasses.fields(TrainOptions)} | set(SHORT_NAMES)
+    for group in dataclasses.fields(Config):
+        for option in dataclasses.fields(getattr(Config(), group.name)):
+            names = [option.name, f"no-{option.name}"] if option.type == "bool" else [option.name]
+            flags |= {f"--{group.name}.{name.replace('_', '-')}" for name in names}
+    return flags
+
+
+def evaluate_flags() -> set[str]:
+    """Returns every flag of `edqn evaluate`."""
+    return {_flag(option.name) for option in dataclasses.fields(EvaluateArgs)} | {"--no-shuffle-codes"}
+
+
+def _flag(name: str) -> str:
+    return f"--{name.replace('_', '-')}"
 
 
 def _long_name(word: str) -> str:
@@ -129,7 +165,8 @@ def parse_evaluate(argv: Sequence[str]) -> EvaluateArgs:
         ConfigError: if one is out of its limits.
         SystemExit: after printing, for --help and for what does not parse.
     """
-    args = tyro.cli(EvaluateArgs, args=argv, prog="edqn evaluate")
+    check_flags(argv, evaluate_flags(), EVALUATE)
+    args = tyro.cli(EvaluateArgs, args=argv, prog=EVALUATE)
     if args.missions < 1:
         raise ConfigError(f"--missions must be at least 1, not {args.missions}")
     if not (args.run / "config.yaml").is_file():

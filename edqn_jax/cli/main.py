@@ -5,11 +5,13 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Sequence
+from importlib import metadata
 
 import tyro
 
 from edqn_jax.cli.arguments import EvaluateArgs, TrainCommand, parse_evaluate
 from edqn_jax.cli.train import train_command
+from edqn_jax.config.loading import nearest
 from edqn_jax.errors import ConfigError, DivergedError, StoppedError
 
 DONE = 0
@@ -27,20 +29,29 @@ def main(argv: Sequence[str] | None = None) -> int:
     # XLA's errors are for people, its warnings for those who write XLA; read when JAX is first imported.
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")
     try:
-        if argv[:1] == ["train"]:
-            train_command(argv[1:])
-            return DONE
-        if argv[:1] == ["evaluate"]:
-            return _evaluate(argv[1:])
-        tyro.extras.subcommand_cli_from_dict(COMMANDS, prog="edqn", args=argv[:1] or ["--help"])
+        return _dispatch(argv)
     except SystemExit as ending:  # tyro has printed the help, or what is wrong
         return int(ending.code or DONE)
     except (ConfigError, DivergedError, StoppedError, KeyboardInterrupt) as ending:
         return _explain(ending)
-    return BAD_INPUT
 
 
-def _evaluate(argv: Sequence[str]) -> int:
+def _dispatch(argv: Sequence[str]) -> int:
+    command, rest = argv[0] if argv else "--help", argv[1:]
+    if command == "train":
+        train_command(rest)
+    elif command == "evaluate":
+        _evaluate(rest)
+    elif command == "--version":
+        print(f"edqn-jax {metadata.version('edqn-jax')}")
+    elif command in ("-h", "--help"):
+        tyro.extras.subcommand_cli_from_dict(COMMANDS, prog="edqn", args=["--help"])
+    else:
+        raise ConfigError(f"there is no command '{command}'{nearest(command, [*COMMANDS, '--help', '--version'])}")
+    return DONE
+
+
+def _evaluate(argv: Sequence[str]) -> None:
     args = parse_evaluate(argv)
 
     from edqn_jax.cli.evaluate import evaluate_command
@@ -48,7 +59,6 @@ def _evaluate(argv: Sequence[str]) -> int:
 
     use_cpu_devices()
     evaluate_command(args)
-    return DONE
 
 
 def _explain(ending: BaseException) -> int:

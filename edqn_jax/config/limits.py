@@ -144,7 +144,7 @@ def _replay(agent: AgentConfig, train: TrainConfig) -> None:
 
 def _require(holds: bool, name: str, limits: str, value: object) -> None:
     if not holds:
-        shown = ", ".join(f"{item:g}" for item in value) if isinstance(value, tuple) else value
+        shown = (", ".join(f"{item:g}" for item in value) or "an empty list") if isinstance(value, tuple) else value
         raise ConfigError(f"{name} must be {limits}, not {shown}")
 
 

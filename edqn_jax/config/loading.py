@@ -17,8 +17,9 @@ from typing import Any, Literal
 
 import yaml
 
+from edqn_jax.config.limits import validate
 from edqn_jax.config.options import DENSITIES, Config
-from edqn_jax.config.presets import preset
+from edqn_jax.config.presets import preset as named_preset
 from edqn_jax.errors import ConfigError
 
 Layer = Mapping[str, Mapping[str, Any]]
@@ -50,13 +51,34 @@ def resolve(preset_name: str = "default", file: Path | None = None, world: str |
         ConfigError: one sentence naming the key or the file, and what would be right.
     """
     layer = load_layer(file) if file is not None else {}
-    config = apply(preset(preset_name), layer, str(file))
+    config = apply(named_preset(preset_name), layer, str(file))
     if world is not None:
         config = apply(config, {"world": {"name": world}}, "the command line")
     if preset_name != "default":
         return config
-    for_world = apply(preset(preset_name), world_layer(config.world.name), "the world")
+    for_world = apply(named_preset(preset_name), world_layer(config.world.name), "the world")
     return dataclasses.replace(apply(for_world, layer, str(file)), world=config.world)
+
+
+def make_config(
+    world: str | None = None, *, preset: str = "default", file: str | Path | None = None, **groups: Mapping[str, Any]
+) -> Config:
+    """Returns a checked configuration: preset < what the world asks for < file < `groups`.
+
+        make_config("medium", train={"total_steps": 100_000}, agent={"n_step": 5})
+
+    Args:
+        world: `paper`, `sparse`, `medium`, `dense` or an MJCF file; None leaves it to file and preset.
+        preset: one of `config.PRESETS`.
+        file: a YAML file with groups of options.
+        groups: options by group, as in a file.
+
+    Raises:
+        ConfigError: names the option and what would be right.
+    """
+    config = apply(resolve(preset, None if file is None else Path(file), world), groups, "make_config")
+    validate(config)
+    return config
 
 
 def load_layer(file: Path) -> Layer:

@@ -15,6 +15,9 @@ from edqn_jax.sim.flights import Flights
 from edqn_jax.sim.outcomes import Outcome
 from edqn_jax.sim.scene import take_scene
 
+EMPTY_M = 1e5
+"""A clearance beyond this is that of a world without shapes, metres: absent shapes are parked further away."""
+
 
 def wilson_interval(successes: int, missions: int, z: float = 1.959964) -> tuple[float, float]:
     """Wilson's score interval of a success rate; 95 % for the default `z` (Wilson 1927)."""
@@ -96,6 +99,15 @@ def summarise(flights: Flights, shortest: np.ndarray | None = None) -> dict[str,
         figures["spl"] = spl(success, flown, np.where(np.isfinite(shortest), shortest, flown))
         figures["path_over_shortest"] = mean(flown / np.where(known, shortest, 1.0), known)
     return figures
+
+
+def clearance_text(metres: float | None) -> str:
+    """Returns a clearance for people: metres, or words where there is none, or nothing to hit."""
+    if metres is None:
+        return "–"
+    if metres > EMPTY_M:
+        return "unlimited: nothing to hit"
+    return f"{max(metres, 0.0):.2f} m"
 
 
 def flight_summary(flights: Flights, mission: int = 0) -> dict[str, Any]:

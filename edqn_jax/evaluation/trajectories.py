@@ -37,7 +37,7 @@ def trajectory(config: Config, flights: Flights, mission: int = 0) -> dict[str, 
     return dict(zip(TRAJECTORY_COLUMNS, values.T, strict=True))
 
 
-def write_trajectories(config: Config, course: MissionSet, flights: Flights, file: Path) -> None:
+def write_trajectories(config: Config, missions: MissionSet, flights: Flights, file: Path) -> None:
     """All flights as one `.npz`, enough to check every verdict in another physics engine.
 
     Row 0 of each flight is its start, row k stands after physics step k; rows after the end are NaN.
@@ -47,13 +47,13 @@ def write_trajectories(config: Config, course: MissionSet, flights: Flights, fil
     record = flights.record
     if record is None:
         raise ValueError("these flights were not recorded")
-    missions = jax.tree.map(np.asarray, course.world.missions)
-    heading = np.arctan2(*(missions.goal - missions.start)[:, 1::-1].T)
+    flown = jax.tree.map(np.asarray, missions.world.missions)
+    heading = np.arctan2(*(flown.goal - flown.start)[:, 1::-1].T)
     level = np.zeros_like(heading)
     facing = np.column_stack([np.cos(heading / 2), level, level, np.sin(heading / 2)])
     longest = int(np.max(flights.physics_steps))
     columns = {
-        "positions": np.concatenate([missions.start[:, None], record.position[:, :longest]], axis=1),
+        "positions": np.concatenate([flown.start[:, None], record.position[:, :longest]], axis=1),
         "attitudes": np.concatenate([facing[:, None], record.quaternion[:, :longest]], axis=1),
         "times": config.drone.physics_dt_s * np.arange(longest + 1),
         "lengths": flights.physics_steps + 1,
@@ -66,10 +66,10 @@ def write_trajectories(config: Config, course: MissionSet, flights: Flights, fil
         "closest_time": flights.closest.time,
         "closest_position": flights.closest.position,
         "closest_attitude": flights.closest.quaternion,
-        "scene": missions.scene,
-        "start": missions.start,
-        "goal": missions.goal,
-        "mjcf": np.array(course.mjcf()),
+        "scene": flown.scene,
+        "start": flown.start,
+        "goal": flown.goal,
+        "mjcf": np.array(missions.mjcf()),
         "body_radius_m": np.float64(config.drone.body_radius_m),
         "physics_dt_s": np.float64(config.drone.physics_dt_s),
     }

@@ -44,12 +44,12 @@ class Agreement:
         return self.apart_m <= CONTACT_TOLERANCE_M
 
 
-def check_verdicts(config: Config, course: MissionSet, flights: Flights) -> list[Agreement]:
+def check_verdicts(config: Config, missions: MissionSet, flights: Flights) -> list[Agreement]:
     """Every recorded flight replayed in C MuJoCo, along the segments between physics steps.
 
     Args:
         config: for the radius of the body.
-        course: whose missions were flown; a world from a file is judged by the very file.
+        missions: that were flown; a world from a file is judged by that file.
         flights: recorded.
 
     Raises:
@@ -57,9 +57,9 @@ def check_verdicts(config: Config, course: MissionSet, flights: Flights) -> list
     """
     if flights.record is None:
         raise ValueError("these flights were not recorded")
-    judges = [_judge(text, course.file, config.drone.body_radius_m) for text in course.mjcf()]
-    missions = course.world.missions
-    scenes, starts = np.asarray(missions.scene), np.asarray(missions.start)
+    judges = [_judge(text, missions.file, config.drone.body_radius_m) for text in missions.mjcf()]
+    flown = missions.world.missions
+    scenes, starts = np.asarray(flown.scene), np.asarray(flown.start)
     positions = np.asarray(flights.record.position)
     outcomes, steps = np.asarray(flights.outcome), np.asarray(flights.physics_steps)
     results = []

@@ -1,6 +1,6 @@
 """What a run keeps on disk to be flown again: the policy, as an Orbax checkpoint.
 
-Saved synchronously: when `save_policy` returns, the checkpoint is there and carries its commit marker. One
+Saved synchronously: when `save_params` returns, the checkpoint is there and carries its commit marker. One
 without the marker does not exist.
 """
 
@@ -22,7 +22,7 @@ COMMIT_MARKER = "commit_success.txt"
 """What Orbax writes into a checkpoint last of all."""
 
 
-def save_policy(folder: Path, params: PolicyParams) -> None:
+def save_params(folder: Path, params: PolicyParams) -> None:
     """Writes the policy into `folder`, a run's `checkpoints/`; one that is there already is replaced.
 
     The arrays are saved from the host: how many devices they lay on leaves no trace. The calling process saves
@@ -37,7 +37,7 @@ def save_policy(folder: Path, params: PolicyParams) -> None:
     saver.save((folder / POLICY).absolute(), args=ocp.args.PyTreeSave(tree), force=True)
 
 
-def load_policy(folder: Path) -> PolicyParams:
+def load_params(folder: Path) -> PolicyParams:
     """The policy saved in `folder`, a run's `checkpoints/`; arrays on the host.
 
     Raises:

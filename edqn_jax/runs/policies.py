@@ -10,11 +10,36 @@ import numpy as np
 
 from edqn_jax.config import Config
 from edqn_jax.config.limits import validate
-from edqn_jax.config.loading import apply, load_layer
+from edqn_jax.config.loading import apply, load_layer, to_yaml
 from edqn_jax.errors import ConfigError
 from edqn_jax.learn import embedding
-from edqn_jax.learn.policy import PolicyParams, fresh_policy
-from edqn_jax.runs.checkpoints import load_policy
+from edqn_jax.learn.policy import Policy, PolicyParams, fresh_policy
+from edqn_jax.runs.checkpoints import load_params, save_params
+from edqn_jax.runs.files import check_can_make, write_whole
+
+
+def load_policy(run: str | Path) -> Policy:
+    """Returns the policy of a run directory, or of a folder that `save_policy` wrote.
+
+    Raises:
+        ConfigError: if there is none, or its parts are incomplete or do not fit each other.
+    """
+    return Policy(*load_run(Path(run)))
+
+
+def save_policy(policy: Policy, folder: str | Path) -> None:
+    """Writes a policy into `folder`, for `load_policy` and `edqn evaluate`; the folder must be new or empty.
+
+    Raises:
+        ConfigError: if the folder holds files already, or cannot be written.
+    """
+    folder = Path(folder)
+    check_can_make(folder)
+    if folder.is_dir() and any(folder.iterdir()):
+        raise ConfigError(f"'{folder}' holds files already; give a new or empty folder")
+    folder.mkdir(parents=True, exist_ok=True)
+    save_params(folder / "checkpoints", policy.params)
+    write_whole(folder / "config.yaml", to_yaml(policy.config))
 
 
 def load_run(folder: Path) -> tuple[Config, PolicyParams]:
@@ -28,7 +53,7 @@ def load_run(folder: Path) -> tuple[Config, PolicyParams]:
         raise ConfigError(f"there is no run in '{folder}': it holds no config.yaml")
     config = apply(Config(), load_layer(file), str(file))
     validate(config)
-    params = load_policy(folder / "checkpoints")
+    params = load_params(folder / "checkpoints")
     fresh = jax.eval_shape(lambda: fresh_policy(config))
     # As policies were saved before their pixel features were written out.
     learnt = jax.eval_shape(lambda: embedding.init(config, jax.random.key(0)))

@@ -11,12 +11,12 @@ import numpy as np
 
 from edqn_jax.config import DENSITIES, Config
 from edqn_jax.errors import StoppedError
-from edqn_jax.evaluation.metrics import flight_summary, summarise
+from edqn_jax.evaluation.metrics import clearance_text, flight_summary, summarise
 from edqn_jax.evaluation.trajectories import trajectory
 from edqn_jax.parallel import processes
 from edqn_jax.report.gallery import draw_gallery
-from edqn_jax.report.progress import Progress
-from edqn_jax.runs.checkpoints import save_policy
+from edqn_jax.report.progress import Progress, clock
+from edqn_jax.runs.checkpoints import save_params
 from edqn_jax.runs.directory import RunDirectory
 from edqn_jax.runs.provenance import reward_record, state_digest, versions, workload
 from edqn_jax.sim.flights import Flights
@@ -54,7 +54,7 @@ def train_run(
         processes.together(lambda: None if run is None else run.create(config))
         result = run_chunks(preparation, lambda chunk: _record(run, chunk) or stop_requested())
         if run is not None:
-            save_policy(run.checkpoints, result.policy.params)
+            save_params(run.checkpoints, result.policy.params)
         if result.stopped:
             stopped = f"stopped after {result.decisions:,} decisions"
             raise StoppedError(f"{stopped}; " + _where_saved(run))
@@ -133,23 +133,39 @@ def _described(devices: Sequence[jax.Device]) -> str:  # pyright: ignore[reportI
 
 
 def _verdict(summary: dict[str, Any], run: RunDirectory) -> str:
+    """What the last lines on the screen say."""
     ending = {
         "goal": "reached the goal",
-        "collision": "hit something",
+        "collision": "ended in a collision",
         "left_volume": "left the flight volume",
         "time_out": "ran out of time",
-        "diverged": "left the range of numbers",
+        "diverged": "diverged",
     }[summary["outcome"]]
     text = (
-        f"The greedy flight {ending} after {summary['steps']} decisions ({summary['flight_seconds']:.1f} s), "
-        f"{summary['path_length_m']:.1f} m flown where the shortest path is {summary['shortest_path_m']:.1f} m, "
-        f"never nearer than {summary['min_clearance_m']:.2f} m to anything."
+        f"The greedy flight {ending} after {count(summary['steps'], 'decision')} ({summary['flight_seconds']:.1f} s): "
+        f"{summary['path_length_m']:.1f} m flown, shortest path {summary['shortest_path_m']:.1f} m. "
+        f"{_nearest(summary)}"
     )
     if "test" in summary:
         test = summary["test"]
         low, high = test["interval"]
         text += (
-            f"\nUnseen test worlds: {test['successes']} of {test['missions']} "
-            f"({test['success_rate']:.0%}, 95 % interval {low:.0%} to {high:.0%})."
+            f"\nUnseen test worlds: {test['successes']} of {test['missions']} reached the goal "
+            f"({test['success_rate']:.0%}, 95 % Wilson interval {low:.0%} to {high:.0%})."
         )
-    return f"{text}\nTrained in {summary['train_seconds']:.0f} s; everything is in {run.path}"
+    return (
+        f"{text}\nTook {clock(summary['total_seconds'])} in all, {clock(summary['train_seconds'])} of it training. "
+        f"Everything is in {run.path}"
+    )
+
+
+def _nearest(summary: dict[str, Any]) -> str:
+    """The closest approach as a sentence."""
+    if summary["outcome"] == "collision":
+        return "It touched an obstacle or the ground."
+    return f"The least clearance was {clearance_text(summary['min_clearance_m'])}."
+
+
+def count(number: int, noun: str) -> str:
+    """Returns `1 decision`, `2 decisions`."""
+    return f"{number:,} {noun}" + ("" if number == 1 else "s")

@@ -18,7 +18,7 @@ from edqn_jax.evaluation.latency import decision_latency_ms
 from edqn_jax.learn import embedding, encoder, policy, trainer
 from edqn_jax.learn.policy import fresh_policy
 from edqn_jax.learn.trainer import Plan
-from edqn_jax.runs.checkpoints import save_policy
+from edqn_jax.runs.checkpoints import save_params
 from edqn_jax.runs.policies import load_run
 from edqn_jax.runs.provenance import workload
 from edqn_jax.sim import drone, mjcf, worlds
@@ -229,7 +229,7 @@ def test_a_policy_saved_before_there_were_other_sensors_still_loads(tmp_path: Pa
     (tmp_path / "config.yaml").write_text(now.replace("sensor: events, ", ""))
     params = fresh_policy(CONFIG)
     assert shapes(params.encoder) == SAVED
-    save_policy(tmp_path / "checkpoints", params)
+    save_params(tmp_path / "checkpoints", params)
     config, loaded = load_run(tmp_path)
     assert config == CONFIG and not moved(params, loaded)
 
@@ -239,7 +239,7 @@ def test_a_policy_saved_before_pixel_features_were_written_out_still_loads(tmp_p
     (tmp_path / "config.yaml").write_text(to_yaml(asked))
     learnt = embedding.init(asked, jax.random.key(5))
     assert "layers_0" in learnt["encoder"]["pixels"]
-    save_policy(tmp_path / "checkpoints", dataclasses.replace(fresh_policy(asked), encoder=learnt))
+    save_params(tmp_path / "checkpoints", dataclasses.replace(fresh_policy(asked), encoder=learnt))
     _, loaded = load_run(tmp_path)
     assert shapes(loaded.encoder) == SAVED
     assert not moved(loaded.encoder, embedding.acting(asked, learnt))
@@ -249,7 +249,7 @@ def test_a_policy_saved_before_pixel_features_were_written_out_still_loads(tmp_p
 def test_the_policy_of_any_sensor_comes_back(tmp_path: Path, name: str) -> None:
     config = with_sensor(name)
     (tmp_path / "config.yaml").write_text(to_yaml(config))
-    save_policy(tmp_path / "checkpoints", fresh_policy(config, seed=3))
+    save_params(tmp_path / "checkpoints", fresh_policy(config, seed=3))
     found, params = load_run(tmp_path)
     assert found == config and not moved(params, fresh_policy(config, seed=3))
     assert jax.tree.structure(params) == jax.tree.structure(fresh_policy(config))

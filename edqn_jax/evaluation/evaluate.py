@@ -1,0 +1,93 @@
+"""A policy, flown greedily on missions of any world and measured."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from edqn_jax.errors import ConfigError
+from edqn_jax.evaluation.metrics import shortest_paths, summarise
+from edqn_jax.evaluation.missions import MissionSet, Point, load_missions
+from edqn_jax.evaluation.rollouts import fly_on_all_devices
+from edqn_jax.learn.policy import Policy
+from edqn_jax.sim.flights import Flights
+from edqn_jax.sim.outcomes import Outcome
+
+
+@dataclasses.dataclass(frozen=True)
+class Evaluation:
+    """Flights of M missions, and their figures."""
+
+    missions: MissionSet
+    flights: Flights
+    """Arrays on the host: outcome [M], decisions [M], path_length_m [M] and so on; `record` has every pose, positions
+    [M, T, 3] metres, NaN after a flight's end, if it was asked for."""
+    figures: dict[str, Any]
+    """Success rate with its 95 % Wilson interval, SPL, collisions and so on; see `evaluation.metrics.summarise`."""
+
+    @property
+    def success_rate(self) -> float:
+        """Share of the missions that reached the goal."""
+        return self.figures["success_rate"]
+
+    @property
+    def outcomes(self) -> list[str]:
+        """How each flight ended: `goal`, `collision`, `left_volume`, `time_out` or `diverged`."""
+        return [Outcome(int(kind)).name.lower() for kind in self.flights.outcome]
+
+    def path(self, mission: int = 0) -> np.ndarray:
+        """Returns the positions [T, 3] metres of one recorded flight, one after each physics step.
+
+        Raises:
+            ConfigError: if the flights were not recorded.
+        """
+        if self.flights.record is None:
+            raise ConfigError("these flights were not recorded; evaluate with record=True")
+        return np.asarray(self.flights.record.position[mission])[: int(self.flights.physics_steps[mission])]
+
+
+def evaluate(
+    policy: Policy,
+    world: str | Path | None = None,
+    *,
+    missions: int = 1,
+    seed: int = 0,
+    start: Point | None = None,
+    goal: Point | None = None,
+    record: bool = False,
+    shuffle_codes: bool = False,
+) -> Evaluation:
+    """Flies a policy greedily, every mission once, and measures.
+
+    Args:
+        policy: from `train` or `load_policy`.
+        world: `paper`, `sparse`, `medium`, `dense` or an MJCF file; None is the policy's own.
+        missions: how many. One in a world from a file goes from its start to its goal, more begin at random free
+            points; in random worlds each has a test world of its own, which training never uses.
+        seed: which missions.
+        start, goal: of every mission, metres, in place of the world's.
+        record: keep every pose.
+        shuffle_codes: give each drone the observation of another one's sensor at each decision.
+
+    Raises:
+        ConfigError: if there is no such world, the missions cannot be flown, or there is nothing to shuffle.
+    """
+    config = policy.config
+    if shuffle_codes:
+        _check_can_shuffle(policy, missions)
+    flown = load_missions(config, str(world or config.world.name), missions, seed, start, goal)
+    flights = fly_on_all_devices(config, flown.world, policy.params, seed, record=record, shuffle_codes=shuffle_codes)
+    shortest = shortest_paths(config, flown.world, np.asarray(flights.outcome) == Outcome.GOAL)
+    return Evaluation(flown, flights, summarise(flights, shortest))
+
+
+def _check_can_shuffle(policy: Policy, missions: int) -> None:
+    least = 2 * len(jax.devices())
+    if missions < least:
+        raise ConfigError(f"--shuffle-codes needs --missions of at least {least}, not {missions}")
+    if policy.config.env.sensor == "blind":
+        raise ConfigError("--shuffle-codes has nothing to shuffle: the policy's sensor is 'blind'")

@@ -1,0 +1,163 @@
+"""An environment for people: made from the name of a world; reset, step and see as pure functions.
+
+environment = make("medium")
+state, observation = environment.reset()
+state, step = environment.step(state, "ahead")
+environment.events(step.observation)
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jax.typing import ArrayLike
+
+from edqn_jax.config import DENSITIES, Config
+from edqn_jax.config.loading import make_config
+from edqn_jax.errors import ConfigError
+from edqn_jax.sim import camera, drone, env, events, sensor
+from edqn_jax.sim.env import EnvState, Observation, Step, World
+from edqn_jax.sim.events import EventField
+from edqn_jax.sim.mjcf import check_scene, load_world, resolve_world
+from edqn_jax.sim.moves import move_number
+from edqn_jax.sim.reward import Reward
+from edqn_jax.sim.scene import Scene, stack_scenes, take_scene
+from edqn_jax.sim.worlds import own_missions, random_pool, world_keys
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Environment:
+    """One or more worlds, a mission in each, and the functions of one drone in them.
+
+    `reset` and `step` are compiled when first called, and may be called within `jax.jit` and `jax.vmap`.
+    """
+
+    config: Config
+    world: World
+
+    @property
+    def missions(self) -> int:
+        """How many missions there are."""
+        return self.world.missions.scene.shape[0]
+
+    def scene(self, mission: int = 0) -> Scene:
+        """Returns the world of a mission: its shapes, flight volume, start and goal."""
+        return take_scene(self.world.pool, self.world.missions.scene[mission])
+
+    def reset(self, key: int | Array = 0, mission: int | Array | None = None) -> tuple[EnvState, Observation]:
+        """Returns the state at the start of a mission, at rest and facing the goal, and what is observed there.
+
+        Args:
+            key: a typed JAX key, consumed, or a seed.
+            mission: [] int, which one; None draws one.
+        """
+        key = jax.random.key(key) if isinstance(key, int) else key
+        return _reset(self.config, self.world, key, None if mission is None else jnp.asarray(mission, jnp.int32))
+
+    def step(self, state: EnvState, move: str | ArrayLike) -> tuple[EnvState, Step]:
+        """Flies one decision (0.26 s), or resets to a drawn mission where the episode has ended.
+
+        Args:
+            state: as `reset` or `step` returned it.
+            move: number 0..26, vector [3] of -1, 0 and 1 (ahead, left, up in the heading frame), or name such as
+                `ahead`, `left up` or `hover`.
+
+        Raises:
+            ConfigError: if there is no such move.
+        """
+        return _step(self.config, self.world, state, move_number(move))
+
+    def events(self, observation: Observation) -> np.ndarray:
+        """Returns the events of one drone's observation, sorted by time.
+
+        A structured array [N]: `t` int64 microseconds from the window's start, `x` and `y` uint16 pixels, `p` int8
+        polarity, -1 or 1.
+
+        Raises:
+            ConfigError: if the sensor is not the event camera.
+        """
+        return events.expand(self._field(observation))
+
+    def event_image(self, observation: Observation) -> np.ndarray:
+        """Returns the signed number of events of each pixel, [H, W] int32.
+
+        Raises:
+            ConfigError: if the sensor is not the event camera.
+        """
+        return np.asarray(events.event_image(self._field(observation)))
+
+    def picture(self, state: EnvState, scale: int = 8) -> np.ndarray:
+        """Returns what a person would see from the drone's camera: [H * scale, W * scale, 3] sRGB in [0, 1]."""
+        scene = take_scene(self.world.pool, self.world.missions.scene[state.mission])
+        body = state.drone
+        return np.asarray(_picture(self.config, scale, scene, body.position, body.quaternion))
+
+    def _field(self, observation: Observation) -> EventField:
+        if not isinstance(observation.sensed, EventField):
+            raise ConfigError(f"the sensor '{self.config.env.sensor}' makes no events; env.sensor must be 'events'")
+        return observation.sensed
+
+
+def make(
+    world: str | Path | None = None,
+    config: Config | None = None,
+    *,
+    worlds: int = 1,
+    seed: int = 0,
+    reward: Reward | None = None,
+) -> Environment:
+    """Makes an environment.
+
+    Args:
+        world: `paper`, a random density (`sparse`, `medium`, `dense`), or an MJCF file; None takes that of `config`.
+        config: of drone, camera, events and task; without it the default for that world.
+        worlds: how many random worlds, each with a mission of its own; 1 for a world from a file.
+        seed: which random worlds, of those that training draws from.
+        reward: of every decision, in place of the configured one: a function of a `Transition`.
+
+    Raises:
+        ConfigError: if there is no such world, or the drone does not fit at its start or goal.
+    """
+    name = str(world) if world is not None else (config or Config()).world.name
+    config = make_config(name) if config is None else config
+    pool = _random_pool(name, worlds, seed) if name in DENSITIES else _file_pool(config, name, worlds)
+    return Environment(config, World(drone.load_airframe(config.drone), pool, own_missions(pool), reward))
+
+
+def _random_pool(name: str, count: int, seed: int) -> Scene:
+    if count < 1 or seed < 0:
+        raise ConfigError(f"worlds must be at least 1 and seed at least 0, not {count} and {seed}")
+    return random_pool(name, world_keys("training", count, first=seed * count))
+
+
+def _file_pool(config: Config, name: str, count: int) -> Scene:
+    if count != 1:
+        raise ConfigError(f"worlds must be 1 for '{name}', which is one world, not {count}")
+    loaded = load_world(resolve_world(name))
+    check_scene(loaded.scene, config.drone.body_radius_m, names=loaded.names, title=f"'{name}'")
+    return stack_scenes([loaded.scene])
+
+
+_reset = jax.jit(env.reset, static_argnums=0)
+_step = jax.jit(env.step, static_argnums=0)
+
+
+@functools.partial(jax.jit, static_argnums=(0, 1))
+def _picture(config: Config, scale: int, scene: Scene, position: Array, quaternion: Array) -> Array:
+    # The body-mounted camera's program is the smaller one; given the mount's rotation it sees the same.
+    rotation = sensor.mount_rotation(config, quaternion)
+    lens = dataclasses.replace(
+        config.camera,
+        width=config.camera.width * scale,
+        height=config.camera.height * scale,
+        mount="body",
+        samples_across=1,
+        samples_down=1,
+    )
+    return jnp.clip(camera.rgb(lens, scene, position, rotation), 0.0, 1.0) ** (1 / 2.2)

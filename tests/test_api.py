@@ -1,0 +1,129 @@
+"""The public names: loaded lazily, documented on one page, and enough for what people do in a notebook."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+
+import edqn_jax
+from edqn_jax.sim.moves import ACTIONS
+from tests.policies import CONFIG, always
+
+ROOT = Path(__file__).parents[1]
+
+
+@pytest.mark.parametrize(
+    "command", ["import edqn_jax; dir(edqn_jax)", "from edqn_jax.cli import main; main(['--help'])"]
+)
+def test_neither_importing_nor_help_imports_jax_or_mujoco(command: str) -> None:
+    script = f"import sys\n{command}\nsys.exit(bool({{'jax', 'mujoco'}} & set(sys.modules)))"
+    done = subprocess.run([sys.executable, "-c", script], cwd=ROOT, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+
+
+def test_every_public_name_can_be_loaded_and_no_other() -> None:
+    assert set(edqn_jax.__all__) == {*edqn_jax._MODULES, "__version__"} == set(dir(edqn_jax))
+    for name in edqn_jax.__all__:
+        assert getattr(edqn_jax, name) is not None
+    with pytest.raises(AttributeError, match="has no attribute 'trian'"):
+        edqn_jax.trian  # noqa: B018  # pyright: ignore[reportAttributeAccessIssue]
+
+
+def test_the_page_of_the_api_has_every_public_name() -> None:
+    page = (ROOT / "docs" / "api.md").read_text(encoding="utf-8")
+    assert [name for name in edqn_jax.__all__ if f"`{name}" not in page] == []
+
+
+@pytest.mark.parametrize(
+    ("move", "number"),
+    [("ahead", 22), ((1, 0, 0), 22), (22, 22), ("hover", 13), ("right-down back", 0), (np.array([1, 1, 1]), 26)],
+)
+def test_a_move_has_a_number_a_vector_and_a_name(move: object, number: int) -> None:
+    assert int(edqn_jax.move_number(move)) == number  # type: ignore[arg-type]
+
+
+def test_names_of_moves_lead_back_to_their_numbers() -> None:
+    names = [edqn_jax.move_name(number) for number in range(len(ACTIONS))]
+    assert len(set(names)) == len(ACTIONS)
+    assert [int(edqn_jax.move_number(name)) for name in names] == list(range(len(ACTIONS)))
+
+
+@pytest.mark.parametrize(
+    ("move", "message"),
+    [
+        ("ahed", "did you mean 'ahead'"),
+        ("ahead back", "same axis twice"),
+        (27, "number from 0 to 26"),
+        ((2, 0, 0), "vec"),
+    ],
+)
+def test_a_move_that_is_none_is_named(move: object, message: str) -> None:
+    with pytest.raises(edqn_jax.ConfigError, match=message):
+        edqn_jax.move_number(move)  # type: ignore[arg-type]
+
+
+def test_options_are_given_by_group_and_the_world_brings_its_own() -> None:
+    config = edqn_jax.make_config("medium", train={"num_envs": 64}, agent={"n_step": 5})
+    assert (config.world.name, config.train.num_envs, config.agent.n_step) == ("medium", 64, 5)
+    assert config.events.threshold == 0.03 != edqn_jax.make_config().events.threshold
+    with pytest.raises(edqn_jax.ConfigError, match="agent.n_stp.*did you mean 'n_step'"):
+        edqn_jax.make_config(agent={"n_stp": 5})
+    with pytest.raises(edqn_jax.ConfigError, match="train.num_envs must be a multiple"):
+        edqn_jax.make_config(train={"num_envs": 12})
+
+
+def test_an_environment_is_made_from_a_density_or_a_file(tmp_path: Path) -> None:
+    two, other = edqn_jax.make("sparse", CONFIG, worlds=2), edqn_jax.make("sparse", CONFIG, worlds=2, seed=1)
+    assert two.missions == 2 and not np.array_equal(two.world.pool.start, other.world.pool.start)
+    with pytest.raises(edqn_jax.ConfigError, match="worlds must be 1 for 'paper'"):
+        edqn_jax.make("paper", CONFIG, worlds=2)
+    file = tmp_path / "open.xml"
+    file.write_text(
+        '<mujoco><worldbody><geom type="plane" size="0 0 1"/>'
+        '<site name="start" pos="2 2 3"/><site name="goal" pos="20 2 3"/></worldbody></mujoco>'
+    )
+    np.testing.assert_allclose(edqn_jax.make(file, CONFIG).scene().goal, [20, 2, 3])
+
+
+@pytest.mark.slow
+def test_an_environment_is_reset_stepped_and_seen() -> None:
+    environment = edqn_jax.make("paper", CONFIG)
+    state, observation = environment.reset()
+    np.testing.assert_allclose(state.drone.position, [1, 1, 3])
+    assert len(environment.events(observation)) == 0  # at rest nothing changes
+    for _ in range(3):
+        state, step = environment.step(state, "ahead")
+    assert float(state.drone.position[0]) > 2 and float(state.drone.position[1]) > 2  # the goal lies that way
+    stream = environment.events(step.observation)
+    assert len(stream) == np.abs(environment.event_image(step.observation)).sum() > 0
+    picture = environment.picture(state)
+    assert picture.shape == (48, 64, 3) and 0 <= picture.min() < picture.max() <= 1
+
+
+@pytest.mark.slow
+def test_many_drones_are_a_vmap() -> None:
+    environment = edqn_jax.make("paper", CONFIG)
+    states, _ = jax.vmap(environment.reset)(jax.random.split(jax.random.key(0), 3))
+    vectors = np.array([[1, 0, 0], [0, 0, 1], [0, 0, 0]])
+    states, _ = jax.vmap(environment.step)(states, vectors)
+    alone, _ = environment.step(environment.reset(jax.random.split(jax.random.key(0), 3)[1])[0], "up")
+    np.testing.assert_allclose(states.drone.position[1], alone.drone.position, atol=1e-4)
+
+
+@pytest.mark.slow
+def test_a_policy_acts_is_saved_and_is_evaluated(tmp_path: Path) -> None:
+    policy = edqn_jax.Policy(CONFIG, always((1, 0, 0)))
+    move, memory = policy.act(edqn_jax.make("paper", CONFIG).reset()[1])
+    assert edqn_jax.move_name(move) == "ahead" and memory.shape[0] == CONFIG.agent.history
+    edqn_jax.save_policy(policy, tmp_path / "policy")
+    with pytest.raises(edqn_jax.ConfigError, match="holds files already"):
+        edqn_jax.save_policy(policy, tmp_path / "policy")
+    flown = edqn_jax.evaluate(edqn_jax.load_policy(tmp_path / "policy"), missions=2, record=True)
+    assert flown.success_rate == flown.outcomes.count("goal") / 2
+    path = flown.path(1)
+    assert path.shape == (int(flown.flights.physics_steps[1]), 3) and np.isfinite(path).all()
