@@ -13,7 +13,7 @@ import dataclasses
 import math
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -27,7 +27,7 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from edqn_jax.config import Config
 from edqn_jax.errors import ConfigError
 from edqn_jax.learn import dqn, embedding, encoder, policy, qnetwork, replay
-from edqn_jax.learn.policy import PolicyParams, empty_memory, flatten, observation_size, remember
+from edqn_jax.learn.policy import PolicyParams, empty_memory, observation_size
 from edqn_jax.learn.qnetwork import Params
 from edqn_jax.parallel import processes
 from edqn_jax.parallel.devices import compiler_options
@@ -191,73 +191,59 @@ def _all_sum(x, axis: str | None):
     return lax.psum(x, axis) if axis is not None else x
 
 
+class ShardKeys(NamedTuple):
+    """What the keys [S] of the shards are split into in each step; every one is consumed."""
+
+    act: Array
+    manoeuvre: Array
+    vae: Array
+    dqn: Array
+    next: Array
+
+    @classmethod
+    def split(cls, keys: Array) -> ShardKeys:
+        """Splits the keys [S] of the shards, the same way whatever device they are on."""
+        parts = jax.vmap(lambda key: jax.random.split(key, len(cls._fields)))(keys)
+        return cls(*(parts[:, number] for number in range(len(cls._fields))))
+
+
 def train_step(
     config: Config, world: World, axis: str | None, state: TrainState, step: Array
 ) -> tuple[TrainState, tuple[Episodes, Losses]]:
-    """One decision of every environment, and the learning that goes with it.
+    """Takes one decision in every environment, and learns (Algorithm 1).
 
     Args:
         axis: name of the mesh axis over which the shards of `state.actors` are spread; None on one device.
         step: [] int32, the number of this step from 0; steers the phases.
     """
-    plan = Plan.of(config)
-    actors, learner = state.actors, state.learner
-    shards, envs = actors.reward.shape
-    keys = jax.vmap(lambda k: jax.random.split(k, 5))(actors.key)
+    plan, actors, learner = Plan.of(config), state.actors, state.learner
+    keys = ShardKeys.split(actors.key)
     warming = step < plan.warmup
-    # Decisions of the DQN phase, in all environments of all devices.
-    decisions = jnp.maximum(step - plan.warmup, 0) * config.train.num_envs
+    time = jnp.maximum(step - plan.warmup, 0)  # in steps since the replay began
 
-    # Act (Algorithm 1, step 5): held random manoeuvres in the warm-up, then epsilon-greedy.
-    total = (plan.total - plan.warmup) * config.train.num_envs
-    epsilon = dqn.exploration(config.agent, decisions, total, actors.episodes)
-    chosen = jax.vmap(partial(policy.choose, config, learner.q))(actors.memory, keys[:, 0], epsilon)
-    manoeuvre = jax.vmap(partial(_manoeuvre, config.encoder.hold_decisions))(actors.manoeuvre, keys[:, 1])
-    action = jnp.where(warming, manoeuvre, chosen)
-
-    # Store where we are and what we do there.
-    rows = replay.Rows(
-        observation=actors.memory[..., -1, :],
-        reward=actors.reward,
-        outcome=actors.outcome,
-        is_reset=actors.is_reset,
-        action=action,
-    )
-    time = jnp.maximum(step - plan.warmup, 0)
-    ring = jax.vmap(replay.write, in_axes=(0, 0, None))(actors.replay, rows, time)
-
-    # Fly and see.
-    flown, seen = jax.vmap(lambda s, a: env.step(config, world, s, a))(jax.tree.map(_flat, actors.env), _flat(action))
-    # Learn: the VAE from all that is newly seen, the Q-network from the replay.
-    vae_losses, learner = learn_to_see(config, axis, learner, seen.observation.sensed, keys[:, 2], step)
-    q_losses, learner = learn_to_act(config, axis, learner, ring, time, keys[:, 3], step)
+    action, manoeuvre, epsilon = _act(config, learner, actors, keys, time, warming)
+    ring = _store(actors, action, time)
+    flown, seen = _fly(config, world, actors, action)
+    vae_losses, learner = learn_to_see(config, axis, learner, seen.observation.sensed, keys.vae, step)
+    q_losses, learner = learn_to_act(config, axis, learner, ring, time, keys.dqn, step)
     learner = _publish(config, learner, step)
+    memory = _remember(config, learner, actors, seen, step)
 
-    # Encode once, and remember; a new episode, or a new encoder, begins with an empty memory.
-    code = flatten(config, learner.encoder, seen.observation)
-    forget = seen.is_reset | (step + 1 == plan.warmup)
-    memory = remember(jnp.where(forget[:, None, None], 0.0, _flat(actors.memory)), code)
-
-    def shaped(tree):
-        return jax.tree.map(lambda x: x.reshape(shards, envs, *x.shape[1:]), tree)
-
-    ended = shaped(seen.outcome) != Outcome.RUNNING
+    shaped = partial(_shaped, actors.reward.shape)
+    outcome, reward = shaped(seen.outcome), shaped(seen.reward)
     actors = Actors(
         env=shaped(flown),
         memory=shaped(memory),
-        reward=shaped(seen.reward),
-        outcome=shaped(seen.outcome),
+        reward=reward,
+        outcome=outcome,
         is_reset=shaped(seen.is_reset),
         manoeuvre=manoeuvre,
-        episodes=actors.episodes + (ended & ~warming),
+        episodes=actors.episodes + ((outcome != Outcome.RUNNING) & ~warming),
         replay=ring,
-        key=keys[:, 4],
+        key=keys.next,
     )
-    episodes = Episodes(
-        outcome=shaped(seen.outcome),
-        length=shaped(seen.episode_length),
-        episode_return=shaped(seen.episode_return),
-    )
+    episodes = Episodes(outcome=outcome, length=shaped(seen.episode_length), episode_return=shaped(seen.episode_return))
+    shards = epsilon.shape[0]
     losses = Losses(
         q_loss=q_losses[0],
         mean_q=q_losses[1],
@@ -266,6 +252,50 @@ def train_step(
         epsilon=jnp.where(warming, 1.0, _all_sum(jnp.mean(epsilon) * shards, axis) / config.train.shards),
     )
     return TrainState(actors=actors, learner=learner, step=step + 1), (episodes, losses)
+
+
+def _act(
+    config: Config, learner: Learner, actors: Actors, keys: ShardKeys, time: Array, warming: Array
+) -> tuple[Array, Array, Array]:
+    """Moves [S, E]: held random manoeuvres in the warm-up, then epsilon-greedy (Algorithm 1, step 5).
+
+    Returns:
+        action, the held manoeuvres, epsilon; each [S, E].
+    """
+    plan, envs = Plan.of(config), config.train.num_envs
+    epsilon = dqn.exploration(config.agent, time * envs, (plan.total - plan.warmup) * envs, actors.episodes)
+    chosen = jax.vmap(partial(policy.choose, config, learner.q))(actors.memory, keys.act, epsilon)
+    manoeuvre = jax.vmap(partial(_manoeuvre, config.encoder.hold_decisions))(actors.manoeuvre, keys.manoeuvre)
+    return jnp.where(warming, manoeuvre, chosen), manoeuvre, epsilon
+
+
+def _store(actors: Actors, action: Array, time: Array) -> replay.Rows:
+    """The replay with where every environment is and what it does there."""
+    rows = replay.Rows(
+        observation=actors.memory[..., -1, :],
+        reward=actors.reward,
+        outcome=actors.outcome,
+        is_reset=actors.is_reset,
+        action=action,
+    )
+    return jax.vmap(replay.write, in_axes=(0, 0, None))(actors.replay, rows, time)
+
+
+def _fly(config: Config, world: World, actors: Actors, action: Array) -> tuple[EnvState, env.Step]:
+    """Steps all environments, [S * E, ...]."""
+    return jax.vmap(lambda s, a: env.step(config, world, s, a))(jax.tree.map(_flat, actors.env), _flat(action))
+
+
+def _remember(config: Config, learner: Learner, actors: Actors, seen: env.Step, step: Array) -> Array:
+    """Memories [S * E, H, D] with the new observations, encoded once; a new episode or encoder begins empty."""
+    forget = seen.is_reset | (step + 1 == Plan.of(config).warmup)
+    memory = jnp.where(forget[:, None, None], 0.0, _flat(actors.memory))
+    return policy.see(config, learner.encoder, memory, seen.observation)
+
+
+def _shaped(shape: tuple[int, ...], tree: Any) -> Any:
+    """[S * E, ...] -> [S, E, ...]"""
+    return jax.tree.map(lambda x: x.reshape(*shape, *x.shape[1:]), tree)
 
 
 def _manoeuvre(hold: int, held: Array, key: Array) -> Array:
