@@ -101,7 +101,7 @@ def test_what_the_first_process_may_not_write_stops_both_with_its_sentence(tmp_p
     with two_processes(tmp_path, ["--run-dir", "run"]) as processes:
         for code, output in to_the_end(*processes):
             assert code == 2, output
-            assert "edqn: --run-dir 'run' holds files that are no run of edqn" in output
+            assert "edqn: --run-dir 'run' holds files that are not an edqn run" in output
 
 
 def test_a_process_alone_does_its_work_and_hears_itself() -> None:

@@ -44,7 +44,7 @@ def test_of_two_runs_that_plan_the_same_fresh_folder_one_gets_it(tmp_path, monke
     run = plan_run_directory(None, Config())  # both of them, each before the other is there
     run.create(Config())
     run.append_metrics({"decisions": 1})
-    with pytest.raises(ConfigError, match=f"another run has just taken '{run.path}'; start this one again"):
+    with pytest.raises(ConfigError, match=f"another run has just created '{run.path}'; start this one again"):
         run.create(Config())
     assert run.read_metrics() == [{"decisions": 1}]
 

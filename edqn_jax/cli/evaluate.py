@@ -18,7 +18,7 @@ from edqn_jax.evaluation.missions import load_missions
 from edqn_jax.evaluation.rollouts import fly_on_all_devices
 from edqn_jax.evaluation.trajectories import write_trajectories
 from edqn_jax.runs.directory import plain
-from edqn_jax.runs.files import check_can_write, write_whole
+from edqn_jax.runs.files import check_can_write, write_atomically
 from edqn_jax.runs.policies import load_run
 from edqn_jax.sim.outcomes import Outcome
 
@@ -54,7 +54,7 @@ def evaluate_command(args: EvaluateArgs) -> None:
     }
     Console().print(report(figures))
     if args.json is not None:
-        write_whole(args.json, json.dumps(plain(figures), indent=2, allow_nan=False) + "\n")
+        write_atomically(args.json, json.dumps(plain(figures), indent=2, allow_nan=False) + "\n")
     if args.trajectories is not None:
         write_trajectories(config, course, flights, args.trajectories)
 

@@ -11,7 +11,7 @@ import numpy as np
 from edqn_jax.config import Config
 from edqn_jax.evaluation.missions import MissionSet
 from edqn_jax.runs.directory import TRAJECTORY_COLUMNS
-from edqn_jax.runs.files import write_whole
+from edqn_jax.runs.files import write_atomically
 from edqn_jax.sim.flights import Flights
 from edqn_jax.sim.outcomes import Outcome
 
@@ -76,4 +76,4 @@ def write_trajectories(config: Config, course: MissionSet, flights: Flights, fil
     with tempfile.SpooledTemporaryFile() as buffer:
         np.savez_compressed(buffer, **columns)
         buffer.seek(0)
-        write_whole(file, buffer.read())
+        write_atomically(file, buffer.read())
