@@ -55,7 +55,7 @@ def test_the_resolved_configuration_reads_back(run):
 
 def test_a_foreign_folder_is_refused_and_left_alone(tmp_path):
     (tmp_path / "thesis.tex").write_text("years of work")
-    with pytest.raises(ConfigError, match="no run of edqn"):
+    with pytest.raises(ConfigError, match="not an edqn run"):
         plan_run_directory(tmp_path, Config())
     assert [file.name for file in tmp_path.iterdir()] == ["thesis.tex"]
 
@@ -64,7 +64,7 @@ def test_a_foreign_folder_is_refused_and_left_alone(tmp_path):
 @pytest.mark.parametrize("resume", ["auto", "never", "must"])
 def test_a_config_that_is_not_ours_makes_no_run(theirs, resume, tmp_path):
     (tmp_path / "config.yaml").write_text(theirs)
-    with pytest.raises(ConfigError, match="no run of edqn"):
+    with pytest.raises(ConfigError, match="not an edqn run"):
         plan_run_directory(tmp_path, Config(), resume)
     assert (tmp_path / "config.yaml").read_text() == theirs
 

@@ -1,4 +1,4 @@
-"""Recorded flights as tables: a row per physics step, for `trajectory.csv` and for `.npz` files."""
+"""Recorded flights as tables with one row per physics step, for `trajectory.csv` and `.npz` files."""
 
 from __future__ import annotations
 
@@ -17,9 +17,13 @@ from edqn_jax.sim.outcomes import Outcome
 
 
 def trajectory(config: Config, flights: Flights, mission: int = 0) -> dict[str, np.ndarray]:
-    """One recorded flight as the columns of `trajectory.csv`, each [T]: a row after each physics step."""
+    """Returns one recorded flight as the columns of `trajectory.csv`, each [T], one row after each physics step.
+
+    Raises:
+        ValueError: if the flights were not recorded.
+    """
     if flights.record is None:
-        raise ValueError("these flights were not recorded")
+        raise ValueError("the flights were not recorded; fly them with record=True")
     steps = int(flights.physics_steps[mission])
     whole = jax.tree.map(lambda leaf: np.asarray(leaf[mission]), flights.record)
     decision = np.arange(steps) // config.drone.physics_steps
@@ -37,17 +41,21 @@ def trajectory(config: Config, flights: Flights, mission: int = 0) -> dict[str, 
     return dict(zip(TRAJECTORY_COLUMNS, values.T, strict=True))
 
 
-def write_trajectories(config: Config, course: MissionSet, flights: Flights, file: Path) -> None:
-    """All flights as one `.npz`, enough to check every verdict in another physics engine.
+def write_trajectories(config: Config, mission_set: MissionSet, flights: Flights, file: Path) -> None:
+    """Writes all flights as one `.npz`, with all that another physics engine needs to check the verdicts.
 
-    Row 0 of each flight is its start, row k stands after physics step k; rows after the end are NaN.
-    `lengths` is the number of rows of each flight. A collision touches within the last segment, `contact` of
-    the way along it. `mjcf[scene[i]]` is the world of mission i.
+    Row 0 of each flight is its start, row k its pose after physics step k; rows after the end are NaN.
+    `lengths` is the number of rows of each flight. The contact of a collision is in the last segment, at the
+    fraction `contact` of it. `mjcf[scene[i]]` is the world of mission i.
+
+    Raises:
+        ConfigError: if the file cannot be written.
+        ValueError: if the flights were not recorded.
     """
     record = flights.record
     if record is None:
-        raise ValueError("these flights were not recorded")
-    missions = jax.tree.map(np.asarray, course.world.missions)
+        raise ValueError("the flights were not recorded; fly them with record=True")
+    missions = jax.tree.map(np.asarray, mission_set.world.missions)
     heading = np.arctan2(*(missions.goal - missions.start)[:, 1::-1].T)
     level = np.zeros_like(heading)
     facing = np.column_stack([np.cos(heading / 2), level, level, np.sin(heading / 2)])
@@ -69,7 +77,7 @@ def write_trajectories(config: Config, course: MissionSet, flights: Flights, fil
         "scene": missions.scene,
         "start": missions.start,
         "goal": missions.goal,
-        "mjcf": np.array(course.mjcf()),
+        "mjcf": np.array(mission_set.mjcf()),
         "body_radius_m": np.float64(config.drone.body_radius_m),
         "physics_dt_s": np.float64(config.drone.physics_dt_s),
     }
