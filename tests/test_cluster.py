@@ -140,5 +140,5 @@ def test_where_there_is_no_cluster_the_flags_are_named(monkeypatch: pytest.Monke
         raise ValueError("coordinator_address should be defined.")
 
     monkeypatch.setattr(jax.distributed, "initialize", initialize)
-    with pytest.raises(ConfigError, match="no cluster to join here; give --coordinator-address, .*should be defined"):
+    with pytest.raises(ConfigError, match="no cluster to join; give --coordinator-address, .*should be defined"):
         processes.join({})
