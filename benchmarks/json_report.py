@@ -9,7 +9,7 @@ from typing import Any
 
 from edqn_jax.parallel.devices import processor
 from edqn_jax.runs.directory import plain
-from edqn_jax.runs.files import write_whole
+from edqn_jax.runs.files import write_atomically
 from edqn_jax.runs.provenance import versions
 
 
@@ -28,4 +28,4 @@ def write(file: Path, report: dict[str, Any]) -> None:
     Raises:
         ConfigError: if it cannot be written.
     """
-    write_whole(file, json.dumps(plain(report), indent=1, allow_nan=False) + "\n")
+    write_atomically(file, json.dumps(plain(report), indent=1, allow_nan=False) + "\n")

@@ -27,7 +27,7 @@ from edqn_jax.cli.arguments import parse_train
 from edqn_jax.config.loading import to_yaml
 from edqn_jax.evaluation.metrics import wilson_interval
 from edqn_jax.parallel.devices import processor
-from edqn_jax.runs.files import check_can_write, write_whole
+from edqn_jax.runs.files import check_can_write, write_atomically
 from flags import split
 
 TRAIN = Path(__file__).resolve().parents[1] / "train.py"
@@ -92,7 +92,7 @@ class Ledger:
     def note(self, seed: int, wall_seconds: float, exit_code: int) -> None:
         self.seeds[str(seed)] = {"wall_seconds": wall_seconds, "exit_code": exit_code}
         kept = {"asked": self.asked, "seeds": self.seeds}
-        write_whole(self.file, json.dumps(kept, indent=1) + "\n")
+        write_atomically(self.file, json.dumps(kept, indent=1) + "\n")
 
 
 def measure(args: argparse.Namespace) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:

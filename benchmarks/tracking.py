@@ -24,7 +24,7 @@ import numpy as np
 
 from edqn_jax.config import Config, DroneConfig
 from edqn_jax.errors import ConfigError
-from edqn_jax.runs.files import check_can_write, write_whole
+from edqn_jax.runs.files import check_can_write, write_atomically
 from edqn_jax.sim.drone import DroneState, Flight, fly, hover, load_airframe, yaw_of
 
 Decide = Callable[[DroneState, jax.Array, jax.Array], tuple[DroneState, Flight]]
@@ -159,7 +159,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             "versions": {name: version(name) for name in ("jax", "mujoco", "mujoco-mjx")},
             "rows": rows,
         }
-        write_whole(args.json, json.dumps(report, indent=1) + "\n")
+        write_atomically(args.json, json.dumps(report, indent=1) + "\n")
     return 0
 
 

@@ -25,7 +25,7 @@ from edqn_jax.evaluation.missions import load_missions
 from edqn_jax.evaluation.rollouts import fly_on_all_devices
 from edqn_jax.evaluation.verdicts import CONTACT_TOLERANCE_M, Agreement, check_verdicts
 from edqn_jax.parallel.devices import use_cpu_devices
-from edqn_jax.runs.files import check_can_write, write_whole
+from edqn_jax.runs.files import check_can_write, write_atomically
 from edqn_jax.runs.policies import load_run
 from edqn_jax.sim.outcomes import Outcome
 
@@ -105,7 +105,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             "versions": {name: version(name) for name in ("jax", "mujoco", "mujoco-mjx")},
             "rows": rows,
         }
-        write_whole(args.json, json.dumps(report, indent=1) + "\n")
+        write_atomically(args.json, json.dumps(report, indent=1) + "\n")
     return int(not all(result.agrees for result in results))
 
 

@@ -97,7 +97,7 @@ def test_a_random_world_is_not_a_file_of_its_name(tmp_path):
     assert parse_train(["--world", "medium"])[1].world.name == "medium"
 
 
-def test_every_kind_of_knob_can_be_a_flag():
+def test_every_kind_of_option_can_be_a_flag():
     argv = [
         "--agent.hidden",
         "32",
@@ -209,7 +209,7 @@ def test_evaluate_hands_on_what_was_asked_for(monkeypatch, tmp_path):
     assert asked == [whole, arguments.EvaluateArgs(tmp_path, shuffle_codes=True, trajectories=Path("a.npz"))]
 
 
-def test_help_lists_every_knob_and_does_not_start_jax():
+def test_help_lists_every_option_and_does_not_start_jax():
     script = (
         "import sys; from edqn_jax.cli import main; code = main(['train', '--world', 'medium', '--help']);"
         "sys.exit(code or 'jax' in sys.modules)"

@@ -101,7 +101,7 @@ def test_what_the_first_process_may_not_write_stops_both_with_its_sentence(tmp_p
     with two_processes(tmp_path, ["--run-dir", "run"]) as processes:
         for code, output in to_the_end(*processes):
             assert code == 2, output
-            assert "edqn: --run-dir 'run' holds files that are no run of edqn" in output
+            assert "edqn: --run-dir 'run' holds files that are not an edqn run" in output
 
 
 def test_a_process_alone_does_its_work_and_hears_itself() -> None:
@@ -140,5 +140,5 @@ def test_where_there_is_no_cluster_the_flags_are_named(monkeypatch: pytest.Monke
         raise ValueError("coordinator_address should be defined.")
 
     monkeypatch.setattr(jax.distributed, "initialize", initialize)
-    with pytest.raises(ConfigError, match="no cluster to join here; give --coordinator-address, .*should be defined"):
+    with pytest.raises(ConfigError, match="no cluster to join; give --coordinator-address, .*should be defined"):
         processes.join({})

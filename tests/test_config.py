@@ -15,14 +15,14 @@ from edqn_jax.errors import ConfigError
 
 
 def write(tmp_path: Path, text: str) -> Path:
-    file = tmp_path / "knobs.yaml"
+    file = tmp_path / "options.yaml"
     file.write_text(text)
     return file
 
 
-def changed(group: str, **knobs: Any) -> Config:
+def changed(group: str, **options: Any) -> Config:
     config = Config()
-    return dataclasses.replace(config, **{group: dataclasses.replace(getattr(config, group), **knobs)})
+    return dataclasses.replace(config, **{group: dataclasses.replace(getattr(config, group), **options)})
 
 
 @pytest.mark.parametrize("name", PRESETS)
@@ -52,8 +52,8 @@ def test_a_random_world_brings_its_own_budget(world):
     assert resolve(world=world).train.total_steps == RANDOM_WORLDS["train"]["total_steps"]
 
 
-def test_what_the_stated_figures_of_random_worlds_and_of_the_papers_preset_were_measured_with_stays():
-    """They came before the default's last step size and warm-up (docs/decisions/0011)."""
+def test_random_worlds_and_the_papers_preset_keep_their_own_step_size_and_warmup():
+    """The default's step size and warm-up were chosen on the paper's world alone (docs/decisions/0011)."""
     for config, rate in ((resolve(world="medium"), 1e-3), (preset("paper"), 4e-4)):
         assert (config.agent.learning_rate, config.encoder.warmup_updates_per_step) == (rate, 12)
 
@@ -101,13 +101,13 @@ def test_a_whole_number_may_stand_for_a_float():
         ("agent: {hidden: 16}", "'agent.hidden' must be a list of whole numbers, not 16"),
         (
             "agent: {hidden: [16, x]}",
-            "each of knobs.yaml: 'agent.hidden' must be a whole number, not the text 'x'",
+            "each of options.yaml: 'agent.hidden' must be a whole number, not the text 'x'",
         ),
         ("camera: {sky_rgb: [1, 1]}", "'camera.sky_rgb' must be a list of 3 numbers, not a list of 2"),
         ("events: {law: esmi}", "'events.law' must be one of paper, airsim, esim, not the text 'esmi'"),
         ("world: {name: }", "'world.name' must be text, not nothing"),
         ("- 1", "must hold groups of keys such as 'agent:'"),
-        ("agent: {n_step: 1, n_step: 2}", "is not valid YAML at line 1: the key 'n_step' stands twice"),
+        ("agent: {n_step: 1, n_step: 2}", "is not valid YAML at line 1: the key 'n_step' is given twice"),
         ("? [n_step, double]\n: 1", "is not valid YAML at line 1: a key must be a word"),
         ("agent:\n  {n_step: 1}: 1", "is not valid YAML at line 2: a key must be a word"),
         ("agent: {", "is not valid YAML at line"),
@@ -115,9 +115,9 @@ def test_a_whole_number_may_stand_for_a_float():
 )
 def test_a_mistake_in_the_file_is_named_with_what_would_be_right(text, says, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    Path("knobs.yaml").write_text(text)
+    Path("options.yaml").write_text(text)
     with pytest.raises(ConfigError) as error:
-        resolve(file=Path("knobs.yaml"))
+        resolve(file=Path("options.yaml"))
     assert says in str(error.value)
     assert "\n" not in str(error.value)
 
@@ -134,24 +134,24 @@ def test_a_file_that_is_not_text_is_named(tmp_path):
         resolve(file=file)
 
 
-def numeric_knobs() -> list[tuple[str, str, object]]:
+def numeric_options() -> list[tuple[str, str, object]]:
     nonsense = {int: -(10**9), float: float("nan")}
     return [
-        (group.name, knob.name, nonsense[type(value)])
+        (group.name, option.name, nonsense[type(value)])
         for group in dataclasses.fields(Config)
-        for knob in dataclasses.fields(getattr(Config(), group.name))
-        if type(value := getattr(getattr(Config(), group.name), knob.name)) in nonsense
+        for option in dataclasses.fields(getattr(Config(), group.name))
+        if type(value := getattr(getattr(Config(), group.name), option.name)) in nonsense
     ]
 
 
-@pytest.mark.parametrize(("group", "knob", "nonsense"), numeric_knobs())
-def test_every_numeric_knob_has_limits(group, knob, nonsense):
-    with pytest.raises(ConfigError, match=f"{group}.{knob} must be"):
-        validate(changed(group, **{knob: nonsense}))
+@pytest.mark.parametrize(("group", "option", "nonsense"), numeric_options())
+def test_every_numeric_option_has_limits(group, option, nonsense):
+    with pytest.raises(ConfigError, match=f"{group}.{option} must be"):
+        validate(changed(group, **{option: nonsense}))
 
 
 @pytest.mark.parametrize(
-    ("group", "knobs", "says"),
+    ("group", "options", "says"),
     [
         ("train", {"num_envs": 0}, "train.num_envs must be at least 1, not 0"),
         ("train", {"num_envs": 12}, r"must be a multiple of train.shards \(8\), such as 16, not 12"),
@@ -186,9 +186,9 @@ def test_every_numeric_knob_has_limits(group, knob, nonsense):
         ("camera", {"sky_rgb": (0.5, 0.5, 1.5)}, "camera.sky_rgb must be three shares"),
     ],
 )
-def test_what_cannot_be_run_is_named_with_its_limits(group, knobs, says):
+def test_what_cannot_be_run_is_named_with_its_limits(group, options, says):
     with pytest.raises(ConfigError, match=says):
-        validate(changed(group, **knobs))
+        validate(changed(group, **options))
 
 
 def test_frames_may_fill_the_whole_decision():

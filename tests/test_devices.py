@@ -26,7 +26,7 @@ def test_no_request_takes_what_divides_and_a_request_takes_just_that():
 
 
 def test_more_devices_than_there_are_is_named():
-    with pytest.raises(ConfigError, match="train.devices must be at most 2, the CPU devices that there are, not 4"):
+    with pytest.raises(ConfigError, match="train.devices must be at most 2, the number of CPU devices found, not 4"):
         choose_devices(4, 8)
 
 
@@ -58,7 +58,7 @@ def test_every_process_brings_as_many_devices(three_of_each_of_two, requested, s
     [
         (0, 7, "train.shards must be a multiple of the 2 processes, not 7"),
         (1, 8, "train.devices must be a multiple of the 2 processes, not 1"),
-        (8, 8, "train.devices must be at most 6, the GPU devices that there are, not 8"),
+        (8, 8, "train.devices must be at most 6, the number of GPU devices found, not 8"),
     ],
 )
 def test_what_processes_cannot_share_is_named(three_of_each_of_two, requested, shards, says):

@@ -45,9 +45,13 @@ def test_flags_say_it_all_by_hand(address: str) -> None:
 @pytest.mark.parametrize(
     ("distributed", "given", "says"),
     [
-        ("never", {"process_id": 0}, "--distributed never joins no other process, so it takes no --process-id"),
-        ("auto", {"coordinator_address": "node1:1234", "process_id": 0}, "go together; --num-processes is missing"),
-        ("must", {"num_processes": 2, "process_id": 0}, "go together; --coordinator-address is missing"),
+        ("never", {"process_id": 0}, "--distributed never joins no other process; leave out --process-id"),
+        (
+            "auto",
+            {"coordinator_address": "node1:1234", "process_id": 0},
+            "must be given together; --num-processes is missing",
+        ),
+        ("must", {"num_processes": 2, "process_id": 0}, "must be given together; --coordinator-address is missing"),
         ("auto", {**BY_HAND, "coordinator_address": "node1"}, "must be HOST:PORT, not 'node1'"),
         ("auto", {**BY_HAND, "coordinator_address": "node1:http"}, "must be HOST:PORT, not 'node1:http'"),
         ("auto", {**BY_HAND, "num_processes": 0}, "--num-processes must be at least 1, not 0"),

@@ -72,7 +72,7 @@ def inside_a_block() -> tuple[float, float, float]:
         ({"name": "paper", "seed": -1}, "--seed must be from 0"),
         ({"name": "sparse", "missions": 4, "seed": 2**30}, "--seed must be from 0"),
         ({"name": "paper", "start": (1, 1, 30)}, "lies outside the flight volume"),
-        ({"name": "paper", "missions": 3, "start": (1, 1, 3)}, "one and the same flight"),
+        ({"name": "paper", "missions": 3, "start": (1, 1, 3)}, "all flights would be equal"),
         ({"name": "sparse", "missions": 4, "goal": (5, 5, -1)}, "test world 0"),
     ],
 )

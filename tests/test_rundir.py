@@ -44,7 +44,7 @@ def test_of_two_runs_that_plan_the_same_fresh_folder_one_gets_it(tmp_path, monke
     run = plan_run_directory(None, Config())  # both of them, each before the other is there
     run.create(Config())
     run.append_metrics({"decisions": 1})
-    with pytest.raises(ConfigError, match=f"another run has just taken '{run.path}'; start this one again"):
+    with pytest.raises(ConfigError, match=f"another run has just created '{run.path}'; start this one again"):
         run.create(Config())
     assert run.read_metrics() == [{"decisions": 1}]
 
@@ -55,7 +55,7 @@ def test_the_resolved_configuration_reads_back(run):
 
 def test_a_foreign_folder_is_refused_and_left_alone(tmp_path):
     (tmp_path / "thesis.tex").write_text("years of work")
-    with pytest.raises(ConfigError, match="no run of edqn"):
+    with pytest.raises(ConfigError, match="not an edqn run"):
         plan_run_directory(tmp_path, Config())
     assert [file.name for file in tmp_path.iterdir()] == ["thesis.tex"]
 
@@ -64,7 +64,7 @@ def test_a_foreign_folder_is_refused_and_left_alone(tmp_path):
 @pytest.mark.parametrize("resume", ["auto", "never", "must"])
 def test_a_config_that_is_not_ours_makes_no_run(theirs, resume, tmp_path):
     (tmp_path / "config.yaml").write_text(theirs)
-    with pytest.raises(ConfigError, match="no run of edqn"):
+    with pytest.raises(ConfigError, match="not an edqn run"):
         plan_run_directory(tmp_path, Config(), resume)
     assert (tmp_path / "config.yaml").read_text() == theirs
 

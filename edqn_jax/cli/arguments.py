@@ -28,42 +28,42 @@ SHORT_NAMES = {
     "--total-steps": "--train.total-steps",
     "--seed": "--train.seed",
 }
-"""What people reach for first, and the knob that it stands for."""
+"""Short names of common options."""
 
 
 @dataclass(frozen=True)
 class TrainOptions:
     preset: Literal["default", "paper"] = "default"
-    """`default`: the best that we know. `paper`: Table 1 to the letter."""
+    """`default`: the best agent known to us. `paper`: exactly Table 1 of the paper."""
     config: Annotated[Path | None, arg(metavar="FILE.yaml", help_behavior_hint="")] = None
-    """Knobs by group; the file wins over the preset, flags win over the file."""
+    """YAML file of options by group; overrides the preset, and flags override the file."""
     run_dir: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="")] = None
-    """What the run leaves behind goes here (default: a fresh, dated folder under runs/)."""
+    """Folder for the files of the run (default: a new, dated folder under runs/)."""
     resume: Resume = "auto"
-    """What to do with an unfinished run in --run-dir. It cannot be continued yet: `auto` and `must` refuse it with a
-    sentence, `never` starts it over."""
+    """What to do with an unfinished run in --run-dir. Runs cannot be continued yet: `auto` and `must` refuse it,
+    `never` restarts it."""
     distributed: Distributed = "auto"
     """Whether to train together with other processes, on one host or many: `auto` where --coordinator-address is given
     or Slurm's srun has started several tasks, `must` in any cluster that JAX finds, `never` not at all."""
     coordinator_address: Annotated[str | None, arg(metavar="HOST:PORT", help_behavior_hint="")] = None
-    """Where process 0 listens for the others. Every process is given this and the next two."""
+    """Address of process 0. Give this and the next two options to every process."""
     num_processes: Annotated[int | None, arg(metavar="N", help_behavior_hint="")] = None
-    """How many processes train together."""
+    """Number of processes that train together."""
     process_id: Annotated[int | None, arg(metavar="I", help_behavior_hint="")] = None
-    """Number of this process; process 0 writes the run directory."""
+    """Number of this process, from 0; process 0 writes the run directory."""
 
 
 @dataclass(frozen=True)
 class TrainCommand:
-    """Train a drone to fly from events, fly the result, draw it."""
+    """Train a drone to fly from events, evaluate it and draw figures."""
 
     options: Annotated[TrainOptions, arg(name="")] = field(default_factory=TrainOptions)
-    knobs: Annotated[Config, arg(name="")] = field(default_factory=Config)
+    config: Annotated[Config, arg(name="")] = field(default_factory=Config)
 
 
 @dataclass(frozen=True)
 class EvaluateArgs:
-    """Fly a saved run greedily on missions of any world, and measure."""
+    """Fly a saved policy greedily on missions in any world and print metrics."""
 
     run: Annotated[Positional[Path], arg(metavar="RUN")]
     """Folder of the run."""
@@ -74,27 +74,27 @@ class EvaluateArgs:
     goal: Annotated[Point | None, arg(metavar="X Y Z", help_behavior_hint="")] = None
     """Goal of every mission, metres (default: the world's; random free ones on random worlds)."""
     missions: Annotated[int, arg(metavar="N")] = 1
-    """How many missions."""
+    """Number of missions."""
     seed: Annotated[int, arg(metavar="S")] = 0
     """Seed of the missions."""
     shuffle_codes: Annotated[bool, arg(help_behavior_hint="")] = False
-    """Give each drone the events of another one at each decision: how much does the policy fly by its events? Of
-    a policy with another sensor, what that shows."""
+    """Give each drone the events of another one at each decision, which measures how much the policy depends on its
+    events. For other sensors, permutes that observation."""
     json: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
-    """Also write the figures as JSON."""
+    """Also write the metrics as JSON."""
     trajectories: Annotated[Path | None, arg(metavar="FILE.npz", help_behavior_hint="")] = None
-    """Also write every flight, a pose per physics step."""
+    """Also write every flight, one pose per physics step."""
 
 
 TRAIN, EVALUATE = "edqn train", "edqn evaluate"
 
 
 def parse_train(argv: Sequence[str]) -> tuple[TrainOptions, Config]:
-    """The options and the checked configuration that the arguments of `edqn train` ask for.
+    """Returns the options and the checked configuration of the arguments of `edqn train`.
 
     Raises:
-        ConfigError: if the preset, the file or a limit is not met.
-        SystemExit: after printing, for --help and for what does not parse.
+        ConfigError: if the preset, the file or a value is invalid.
+        SystemExit: after printing, for --help and for arguments that do not parse.
     """
     check_flags(argv, train_flags(), TRAIN)
     argv = [_long_name(word) for word in argv]
@@ -102,8 +102,8 @@ def parse_train(argv: Sequence[str]) -> tuple[TrainOptions, Config]:
     early = [word for word in argv if word not in ("-h", "--help")]
     options, _ = tyro.cli(TrainOptions, args=early, prog=TRAIN, return_unknown_args=True, add_help=False)
     base = resolve(options.preset, options.config)
-    world = _parse_knobs(early, base).world.name
-    config = _parse_knobs(argv, resolve(options.preset, options.config, world))
+    world = _parse_config(early, base).world.name
+    config = _parse_config(argv, resolve(options.preset, options.config, world))
     validate(config)
     # A file must be found again from any folder.
     if config.world.name not in DENSITIES and Path(config.world.name).is_file():
@@ -151,19 +151,19 @@ def _long_name(word: str) -> str:
     return SHORT_NAMES.get(name.replace("_", "-"), name) + equals + value
 
 
-def _parse_knobs(argv: Sequence[str], base: Config) -> Config:
+def _parse_config(argv: Sequence[str], base: Config) -> Config:
     names = ", ".join(f"{short} for {long}" for short, long in SHORT_NAMES.items())
-    description = f"{TrainCommand.__doc__}\n\nEvery knob is a flag. Short names: {names}."
-    default = TrainCommand(knobs=base)
-    return tyro.cli(TrainCommand, args=argv, prog=TRAIN, description=description, default=default).knobs
+    description = f"{TrainCommand.__doc__}\n\nEvery option is a flag. Short names: {names}."
+    default = TrainCommand(config=base)
+    return tyro.cli(TrainCommand, args=argv, prog=TRAIN, description=description, default=default).config
 
 
 def parse_evaluate(argv: Sequence[str]) -> EvaluateArgs:
     """Returns the checked arguments of `edqn evaluate`.
 
     Raises:
-        ConfigError: if one is out of its limits.
-        SystemExit: after printing, for --help and for what does not parse.
+        ConfigError: if one is out of its limits, or there is no such run.
+        SystemExit: after printing, for --help and for arguments that do not parse.
     """
     check_flags(argv, evaluate_flags(), EVALUATE)
     args = tyro.cli(EvaluateArgs, args=argv, prog=EVALUATE)

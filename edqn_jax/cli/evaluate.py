@@ -14,7 +14,7 @@ from edqn_jax.evaluation.latency import decision_latency_ms
 from edqn_jax.evaluation.metrics import clearance_text
 from edqn_jax.evaluation.trajectories import write_trajectories
 from edqn_jax.runs.directory import plain
-from edqn_jax.runs.files import check_can_write, write_whole
+from edqn_jax.runs.files import check_can_write, write_atomically
 from edqn_jax.runs.policies import load_policy
 
 
@@ -47,7 +47,7 @@ def evaluate_command(args: EvaluateArgs) -> None:
     }
     Console().print(report(figures))
     if args.json is not None:
-        write_whole(args.json, json.dumps(plain(figures), indent=2, allow_nan=False) + "\n")
+        write_atomically(args.json, json.dumps(plain(figures), indent=2, allow_nan=False) + "\n")
     if args.trajectories is not None:
         write_trajectories(policy.config, evaluation.missions, evaluation.flights, args.trajectories)
 

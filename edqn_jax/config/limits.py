@@ -42,7 +42,7 @@ def _world(world: WorldConfig) -> None:
     _share(world, "world", ["own_start_fraction"])
     _not_negative(world, "world", ["start_jitter_m"])
     if not world.name:
-        raise ConfigError("world.name must name a world, not be empty")
+        raise ConfigError("world.name must be the name of a world, not empty")
 
 
 def _drone(drone: DroneConfig) -> None:
@@ -76,7 +76,7 @@ def _events(events: EventsConfig, drone: DroneConfig) -> None:
     _require(times[-1] == 0, name, "times that end at 0, the decision", times)
     rising = all(earlier < later for earlier, later in zip(times, times[1:], strict=False))
     _require(rising, name, "times in rising order", times)
-    # The floats of 0.02 and 0.26 miss their ratio by some 1e-16; a thousandth of a step is far above that.
+    # 0.26 / 0.02 is not exactly 13 in floating point, so a thousandth of a step is allowed.
     whole = all(abs(time / dt - round(time / dt)) < 1e-3 for time in times)
     _require(whole, name, f"multiples of drone.physics_dt_s ({dt:g} s)", times)
     _require(times[0] >= -window - 1e-3 * dt, name, f"within the decision's {window:g} s", times)
@@ -135,7 +135,7 @@ def _replay(agent: AgentConfig, train: TrainConfig) -> None:
     shards = train.shards
     multiple = f"a multiple of train.shards ({shards}), such as {-(-batch // shards) * shards}"
     _require(batch % shards == 0, "agent.batch_size", multiple, batch)
-    # A sample reads its history, its n steps and the observation after them from one environment's rows.
+    # A sample reads its history, its n steps and the observation after them from the rows of one environment.
     rows = agent.history + agent.n_step + 1
     needed = rows * train.num_envs
     limit = f"at least {needed}: {rows} observations for each of the {train.num_envs} environments"

@@ -1,4 +1,4 @@
-"""From defaults, preset and file to one `Config`: strict about every key and every type.
+"""Merging defaults, preset and file into one `Config`; unknown keys and wrong types are errors.
 
 Precedence: defaults < preset < what the world asks for < file, and flags over all of them. A layer is a
 nested dict, `{"agent": {"batch_size": 512}}`, that names only what it changes.
@@ -30,25 +30,25 @@ RANDOM_WORLDS: Layer = {
     "agent": {"updates_per_step": 4, "target_rate": 0.02, "learning_rate": 1e-3},
     "events": {"threshold": 0.03, "tolerance": 0.03},
 }
-"""What random worlds ask for: more decisions, fewer and smaller updates for each, and a sensor that sees fainter
-edges and a VAE that has learnt longer, since there only events tell where obstacles are."""
+"""What random worlds change in the `default` preset: more decisions, fewer and smaller updates for each, lower event
+thresholds and more VAE updates, since there only events tell where obstacles are."""
 
 
 def world_layer(world: str) -> Layer:
-    """What a world asks of the `default` preset."""
+    """Returns what a world changes in the `default` preset."""
     return RANDOM_WORLDS if world in DENSITIES else {}
 
 
 def resolve(preset_name: str = "default", file: Path | None = None, world: str | None = None) -> Config:
-    """The named preset under what the world asks for and under the file; types checked, ranges not.
+    """Returns the named preset, changed first by the world and then by the file; checks types, not limits.
 
     Args:
-        preset_name: one of `config.PRESETS`; only `default` gives way to the world.
+        preset_name: one of `config.PRESETS`; the world changes only `default`.
         file: a YAML file.
-        world: the world's name where flags decide it; None leaves it to file and preset.
+        world: name of the world given by a flag; None takes that of the file or the preset.
 
     Raises:
-        ConfigError: one sentence naming the key or the file, and what would be right.
+        ConfigError: names the key or the file, and what would be right.
     """
     layer = load_layer(file) if file is not None else {}
     config = apply(named_preset(preset_name), layer, str(file))
@@ -82,7 +82,7 @@ def make_config(
 
 
 def load_layer(file: Path) -> Layer:
-    """The layer that a YAML file holds; {} for an empty file.
+    """Returns the layer that a YAML file holds; {} for an empty file.
 
     Raises:
         ConfigError: if it cannot be read, is not YAML, or names a key twice.
@@ -90,7 +90,7 @@ def load_layer(file: Path) -> Layer:
     try:
         layer = yaml.load(file.read_text(encoding="utf-8"), Loader=_StrictLoader)
     except (OSError, UnicodeDecodeError) as error:
-        reason = getattr(error, "strerror", None) or "it is not text"
+        reason = getattr(error, "strerror", None) or "it is not UTF-8 text"
         raise ConfigError(f"cannot read the configuration file '{file}': {reason}") from None
     except yaml.YAMLError as error:
         mark = getattr(error, "problem_mark", None)
@@ -105,10 +105,10 @@ def load_layer(file: Path) -> Layer:
 
 
 def apply(config: Config, layer: Layer, source: str) -> Config:
-    """`config` with every key that the layer names replaced.
+    """Returns `config` with every key of the layer replaced.
 
     Raises:
-        ConfigError: at an unknown group or key (naming its nearest neighbour) or a wrong type.
+        ConfigError: if a group or key is unknown (names the nearest known one) or a type is wrong.
     """
     groups = [field.name for field in dataclasses.fields(config)]
     changed = {}
@@ -132,9 +132,9 @@ def apply(config: Config, layer: Layer, source: str) -> Config:
 
 
 def typed(value: Any, hint: Any, name: str) -> Any:
-    """`value` as the type that `hint` asks for.
+    """Returns `value` as the type `hint`.
 
-    A whole number may stand for a float and a list for a tuple; nothing else is converted.
+    Converts whole numbers to floats and lists to tuples, and nothing else.
 
     Raises:
         ConfigError: `<name> must be <what would be right>, not <what it is>`.
@@ -156,7 +156,7 @@ def typed(value: Any, hint: Any, name: str) -> Any:
 
 
 def to_yaml(config: Config) -> str:
-    """The whole configuration as YAML that `load_layer` reads back to the same."""
+    """Returns the whole configuration as YAML; `load_layer` reads it back unchanged."""
     plain = dataclasses.asdict(
         config, dict_factory=lambda items: {k: list(v) if isinstance(v, tuple) else v for k, v in items}
     )
@@ -164,14 +164,14 @@ def to_yaml(config: Config) -> str:
 
 
 def nearest(word: object, known: Iterable[str]) -> str:
-    """`; did you mean '...'?` for the known word that is closest, else a list of what is known."""
+    """Returns `; did you mean '...'?` with the closest known word, else a list of the known words."""
     known = list(known)
     close = difflib.get_close_matches(str(word), known, n=1, cutoff=0.5)
     return f"; did you mean '{close[0]}'?" if close else f"; known are {', '.join(known)}"
 
 
 class _StrictLoader(yaml.SafeLoader):
-    """YAML in which a key stands once and 1e-3 is a number, as everywhere else."""
+    """YAML in which a repeated key is an error and 1e-3 is a number."""
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
         seen = set()
@@ -183,7 +183,7 @@ class _StrictLoader(yaml.SafeLoader):
             key = key_node.value
             if key in seen:
                 raise yaml.constructor.ConstructorError(
-                    problem=f"the key '{key}' stands twice", problem_mark=key_node.start_mark
+                    problem=f"the key '{key}' is given twice", problem_mark=key_node.start_mark
                 )
             seen.add(key)
         return super().construct_mapping(node, deep)

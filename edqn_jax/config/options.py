@@ -17,9 +17,9 @@ class WorldConfig:
     name: str = "paper"
     """`paper`, a random density (`sparse`, `medium`, `dense`), or the path of an MJCF file."""
     pool_size: int = 1024
-    """Random training worlds that are prepared before training (random densities only)."""
+    """Random training worlds, generated before training (random densities only)."""
     missions: int = 8192
-    """Prepared (world, start, goal) triples that resets draw from."""
+    """(world, start, goal) triples, generated before training, that resets draw from."""
     own_start_fraction: float = 0.25
     """Share of training missions that begin within `start_jitter_m` of the world's own start."""
     start_jitter_m: float = 1.0
@@ -31,7 +31,7 @@ class DroneConfig:
     """The airframe and its inner loops: velocity, attitude and body rate, all at the physics rate."""
 
     physics: Literal["mjx", "rigid_body"] = "mjx"
-    """What moves the body. `rigid_body`: the closed form that MJX comes to for this airframe, several times as fast."""
+    """Physics engine. `rigid_body`: the closed form of MJX's equations for this airframe, several times as fast."""
     physics_dt_s: float = 0.02
     """Physics step, seconds."""
     physics_steps: int = 13
@@ -51,19 +51,19 @@ class DroneConfig:
     yaw_rate_gain: float = 10.0
     """Commanded angular acceleration per error of the rate about z, 1/s."""
     max_body_rate_rad_s: float = 6.0
-    """Largest rate about x and y together that the attitude loop may ask for, rad/s."""
+    """Largest combined rate about x and y that the attitude loop may command, rad/s."""
     max_tilt_rad: float = 1.15
-    """Largest tilt that the velocity loop may ask for, radians."""
+    """Largest tilt that the velocity loop may command, radians."""
     max_horizontal_m_s2: float = 12.0
-    """Largest horizontal acceleration that the velocity loop may ask for, m/s^2."""
+    """Largest horizontal acceleration that the velocity loop may command, m/s^2."""
     max_climb_m_s2: float = 10.0
-    """Largest upward acceleration that the velocity loop may ask for, m/s^2."""
+    """Largest upward acceleration that the velocity loop may command, m/s^2."""
     max_descent_m_s2: float = 6.5
-    """Largest downward acceleration that the velocity loop may ask for, m/s^2; below gravity."""
+    """Largest downward acceleration that the velocity loop may command, m/s^2; below gravity."""
     max_tilt_share: float = 0.8
-    """Share of a rotor's range that torque about x and y may claim; the rest keeps collective thrust steerable."""
+    """Share of a rotor's range that torque about x and y may use; the rest is left to collective thrust."""
     max_yaw_rate_rad_s: float = 2.0
-    """Rate limit of the yaw setpoint, and largest yaw rate that the heading loop may ask for, rad/s."""
+    """Rate limit of the yaw setpoint, and largest yaw rate that the heading loop may command, rad/s."""
 
 
 @dataclass(frozen=True)
@@ -101,7 +101,7 @@ class EventsConfig:
     """From a pair of log-brightness frames to events (Eq. 2-5)."""
 
     law: Literal["paper", "airsim", "esim"] = "paper"
-    """Which event law: the paper's, AirSim's own to the event, or a sensor with memory."""
+    """Event law: the paper's, AirSim's (equal to its simulator event by event), or ESIM's, a sensor with memory."""
     frame_times_s: tuple[float, ...] = (-0.04, 0.0)
     """When frames are rendered relative to the decision, seconds; each must be a physics step."""
     threshold: float = 0.05
@@ -121,22 +121,22 @@ class EventsConfig:
     threshold_mismatch: float = 0.0
     """Standard deviation of the per-pixel threshold relative to the threshold; 0 is a perfect sensor."""
     leak_rate_hz: float = 0.0
-    """ON events a pixel makes by leakage, per second."""
+    """Leakage noise: ON events per pixel and second."""
     shot_rate_hz: float = 0.0
-    """Events of either polarity a pixel makes by shot noise, per second."""
+    """Shot noise: events of either polarity per pixel and second."""
     hot_pixel_fraction: float = 0.0
-    """Share of pixels that fire on their own at `hot_pixel_rate_hz`."""
+    """Share of pixels that are hot: they fire at `hot_pixel_rate_hz` without any change of brightness."""
     hot_pixel_rate_hz: float = 50.0
-    """Events a hot pixel makes, per second."""
+    """Events per second of a hot pixel."""
 
 
 @dataclass(frozen=True)
 class EnvConfig:
-    """Task: what is seen, actions, outcomes, reward."""
+    """The task: sensor, actions, outcomes, reward."""
 
     sensor: Literal["events", "frames", "blind", "depth", "ranges"] = "events"
-    """What the drone sees beside its own state. `events`: the event camera. To compare with, `frames`: its newest
-    brightness frame; `blind`: nothing; `depth`: true depth; `ranges`: the true free way along each move."""
+    """What the drone observes besides its own state. `events`: the event camera. For comparison, `frames`: the newest
+    brightness frame; `blind`: nothing; `depth`: true depth; `ranges`: the true free distance along each move."""
     speed_m_s: float = 4.0
     """Commanded speed per axis; an action is {-1, 0, 1}^3 times this, in the heading frame."""
     goal_radius_m: float = 2.0
@@ -150,7 +150,7 @@ class EnvConfig:
     progress_weight: float = 3.0
     """Reward per metre gained towards the goal (`progress`, `potential`)."""
     path_weight: float = 1.5
-    """Reward lost per metre flown (`progress`), so that weaving on the way is not free."""
+    """Reward lost per metre flown (`progress`), so that detours cost something."""
     goal_reward: float = 100.0
     """Reward at the goal (Eq. 8)."""
     collision_reward: float = -100.0
@@ -163,14 +163,14 @@ class EnvConfig:
 
 @dataclass(frozen=True)
 class EncoderConfig:
-    """The event VAE (section 3.2), or that of another sensor's pictures, and when it learns."""
+    """The event VAE (section 3.2), or the VAE of another sensor's pictures, and when it learns."""
 
     code_size: int = 32
     """Values in the code z."""
     features: int = 48
     """Sum-pooled features per temporal channel."""
     pixel_features: Literal["table", "network"] = "network"
-    """f(x, y, p): a free table over pixels and polarities, or a ReLU network on a positional encoding."""
+    """f(x, y, p): a learned table over pixels and polarities, or a ReLU network on a positional encoding."""
     time_frequencies: int = 1
     """Sinusoid pairs of the temporal embedding; phi(t) has 1 + 2 x this many channels."""
     hidden: int = 128
@@ -178,23 +178,23 @@ class EncoderConfig:
     decoder_hidden: tuple[int, ...] = (128, 128)
     """Widths of the decoder's ReLU layers."""
     decoder_bandwidth: float = 0.5
-    """Share of the image's standing waves, along each axis, that the decoder draws; 1 draws every pixel apart."""
+    """Share of the image's standing waves, along each axis, that the decoder draws; 1 draws all of them."""
     target_blur: int = 2
-    """Times that the decoder's target is blurred by a binomial of three pixels; 0 is the sharp event image."""
+    """How many times the decoder's target is blurred by a binomial of three pixels; 0 is the sharp event image."""
     kl_weight: float = 0.05
     """beta: weight of the KL term per image against the reconstruction error per image."""
     learning_rate: float = 2e-3
     """Adam step size of the VAE."""
     warmup_decisions: int = 16_384
-    """Decisions of held random manoeuvres in which the VAE learns before the DQN starts; a quarter of all at most.
-    None for the sensors `ranges` and `blind`, which have no VAE."""
+    """Decisions of the warm-up, random manoeuvres from which the VAE learns before the DQN starts; at most a quarter of
+    all decisions. Unused by the sensors `ranges` and `blind`, which have no VAE."""
     warmup_updates_per_step: int = 6
-    """VAE updates per training step of the warm-up, each on all new event fields."""
+    """VAE updates per training step of the warm-up, each on the new event fields of all environments."""
     hold_decisions: int = 4
-    """Mean number of decisions for which a random manoeuvre of the warm-up is held."""
+    """Mean length of a random manoeuvre of the warm-up, decisions."""
     keep_learning: bool = False
-    """Go on training the VAE on every new field after the warm-up. The code that the agent sees stays the warm-up's.
-    Nothing where there is no VAE."""
+    """Go on training the VAE on every new field after the warm-up. The agent still uses the encoder of the warm-up.
+    Unused where there is no VAE."""
 
 
 @dataclass(frozen=True)
@@ -204,9 +204,9 @@ class AgentConfig:
     hidden: tuple[int, ...] = (128, 128)
     """Widths of the hidden layers."""
     history: int = 1
-    """Observations that the network sees at once, the newest included."""
+    """Observations in the Q-network's input, the newest included."""
     code_scale: float = 0.5
-    """The code is multiplied by this before the network sees it, so that it does not drown the own state."""
+    """Factor on the code before the Q-network, so that it does not outweigh the own state."""
     layer_norm: bool = False
     """Layer normalisation after each hidden layer."""
     dueling: bool = True
@@ -220,15 +220,15 @@ class AgentConfig:
     target_rate: float = 0.01
     """Polyak tau of the target network, per update."""
     average_rate: float = 0.002
-    """Polyak rate, per update, of the averaged parameters that evaluation flies; 1 flies the newest."""
+    """Polyak rate, per update, of the averaged parameters that evaluation uses; 1 uses the newest parameters."""
     learning_rate: float = 2e-3
     """Adam step size at the start."""
     final_learning_rate: float = 1e-4
     """Adam step size at the end of training (linear decay)."""
     max_gradient_norm: float = 10.0
-    """Global gradient norm is clipped here."""
+    """The global gradient norm is clipped to this."""
     huber_delta: float = 1.0
-    """Errors beyond this grow linearly, in units of scaled reward; 0 means the pure square of Eq. 9."""
+    """TD errors beyond this, in units of scaled reward, enter the loss linearly; 0 is the pure square of Eq. 9."""
     reward_scale: float = 0.02
     """Rewards are multiplied by this before learning."""
     batch_size: int = 256
@@ -240,11 +240,11 @@ class AgentConfig:
     learning_starts: int = 8192
     """Observations in the replay before the first update."""
     random_decisions: int = 1000
-    """Random decisions, in all, before epsilon begins to fall."""
+    """Random decisions, of all environments together, before epsilon begins to fall."""
     exploration_start: float = 1.0
-    """epsilon at first."""
+    """epsilon at the start."""
     exploration_end: float = 0.02
-    """epsilon at last."""
+    """epsilon at the end."""
     exploration_fraction: float = 0.1
     """Share of the DQN phase over which epsilon falls linearly; unused when `exploration_episodes` > 0."""
     exploration_episodes: int = 0
@@ -253,10 +253,10 @@ class AgentConfig:
 
 @dataclass(frozen=True)
 class TrainConfig:
-    """The run."""
+    """The training run."""
 
     num_envs: int = 256
-    """Environments that fly at once; a multiple of `shards`."""
+    """Parallel environments; a multiple of `shards`."""
     total_steps: int = 500_000
     """Decisions in all, warm-up included; rounded up to whole chunks."""
     max_episodes: int = 0
@@ -266,15 +266,15 @@ class TrainConfig:
     shards: int = 8
     """Logical shards of environments and replay; the number of devices must divide it."""
     devices: int = 0
-    """Devices to use; 0 is as many as divide the shards."""
+    """Devices to use; 0 uses the largest number that divides the shards."""
     seed: int = 0
-    """Seed of everything."""
+    """Random seed of the run."""
     validation_every: int = 65_536
-    """Decisions between validations, rounded up to whole chunks; 0 is none but the last."""
+    """Decisions between validations, rounded up to whole chunks; 0 validates only at the end."""
     validation_missions: int = 128
-    """Validation missions flown each time; half of those in the paper's world begin near its start."""
+    """Missions of each validation; in worlds from a file half of them begin near the world's start."""
     keep: Literal["best", "last"] = "best"
-    """Parameters that a run ends with: those of the best validation (by SPL; the latest among equals), or the last."""
+    """Parameters that the run keeps: those of the best validation (by SPL, the latest of equal ones), or the last."""
 
 
 @dataclass(frozen=True)

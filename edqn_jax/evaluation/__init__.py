@@ -1,1 +1,1 @@
-"""Missions flown greedily, measured, and judged again by C MuJoCo."""
+"""Missions, greedy rollouts, metrics, decision latency, and verdicts by C MuJoCo."""

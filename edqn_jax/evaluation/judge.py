@@ -1,9 +1,8 @@
-"""Flights judged by another engine: C MuJoCo moves the body sphere through the original MJCF.
+"""Contacts of a flight by C MuJoCo, which moves the body sphere through the original MJCF.
 
-Nothing here shares code with the signed distance that training uses. A probe sphere of the body's radius is
-added to the world; along the straight segments between physics steps it advances by the clearance that
-`mj_geomDistance` reports, which no solid can be nearer than: nothing is skipped, neither a thin wall between
-two steps nor a graze within one.
+Shares no code with the signed distance that training uses. A probe sphere of the body's radius is added to the
+world. Along the straight segments between physics steps it advances by the clearance that `mj_geomDistance`
+reports; no solid is nearer than that, so the search misses neither a thin wall between two steps nor a graze.
 """
 
 from __future__ import annotations
@@ -19,7 +18,7 @@ PROBE_NAME = "edqn_body_sphere"
 """Name of the sphere that is added to the world."""
 
 HIDDEN_GROUP = 3
-"""Geoms of this group and above that MuJoCo collides with nothing are notes to the reader, not solids."""
+"""Geoms of this group and above without collision bits are annotations, not solids."""
 
 _SHORTEST_ADVANCE_M = 1e-4  # a graze shorter than this is at most 4 nanometres deep for a 0.36 m sphere
 _DEPTH_SPACING_M = 5e-3
@@ -28,7 +27,7 @@ _FARTHEST_M = 1e3
 
 @dataclass(frozen=True)
 class Contact:
-    """The first moment at which a flight touches something."""
+    """The first contact of a flight."""
 
     segment: int
     """The contact lies between positions[segment] and positions[segment + 1]."""
@@ -44,23 +43,23 @@ class Contact:
 
 @dataclass(frozen=True)
 class Judge:
-    """A compiled world with a probe in it. Build it with `load_judge`, once per world."""
+    """A compiled world with the probe sphere. Build it with `load_judge`, once per world."""
 
     model: mujoco.MjModel
     data: mujoco.MjData
     probe: int
     """Geom number of the probe."""
     solids: NDArray[np.int64]
-    """[N] geom numbers of what can be touched."""
+    """[N] geom numbers of the solids."""
     reach: NDArray[np.float64]
     """[N] radius of each solid's bounding sphere, metres; inf for planes."""
 
 
 def load_judge(world: str | Path | mujoco.MjSpec, radius: float) -> Judge:
-    """The world of an MJCF file (or a spec) and a sphere of `radius` metres to fly through it.
+    """Returns the world of an MJCF file (or a spec) with a probe sphere of `radius` metres.
 
     Raises:
-        ValueError: if the file is no MJCF, or the radius is not positive.
+        ValueError: if the file is not MJCF, or the radius is not positive.
     """
     if not radius > 0:
         raise ValueError(f"the body radius must be positive, not {radius}")
@@ -81,7 +80,7 @@ def load_judge(world: str | Path | mujoco.MjSpec, radius: float) -> Judge:
 
 
 def clearance(judge: Judge, position: ArrayLike) -> tuple[float, str]:
-    """Distance from the body sphere at `position` [3] to the nearest solid, and that solid's name.
+    """Returns the distance from the body sphere at `position` [3] to the nearest solid, and that solid's name.
 
     Metres, negative where they overlap; inf and "" in an empty world.
     """
@@ -103,16 +102,16 @@ def clearance(judge: Judge, position: ArrayLike) -> tuple[float, str]:
 
 
 def replay_contact(judge: Judge, positions: ArrayLike) -> Contact | None:
-    """The first contact of the body sphere along the straight segments between `positions` [n, 3], n >= 2.
+    """Returns the first contact of the body sphere along the segments between `positions` [n, 3], n >= 2, or None.
 
-    The first row is where the flight starts, every further one stands after a physics step.
+    Row 0 is the start of the flight, row k the position after physics step k, metres.
 
     Raises:
-        ValueError: if `positions` is no list of at least two finite points.
+        ValueError: if `positions` is not an array of at least two finite points.
     """
     points = np.asarray(positions, dtype=np.float64)
     if points.ndim != 2 or points.shape[1] != 3 or len(points) < 2 or not np.isfinite(points).all():
-        raise ValueError(f"a flight is [n, 3] finite metres, n >= 2; this array is {points.shape}")
+        raise ValueError(f"positions must be finite metres of shape [n, 3] with n >= 2, not of shape {points.shape}")
     steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
     travelled = np.concatenate([[0.0], np.cumsum(steps)])
 

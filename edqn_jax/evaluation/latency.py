@@ -1,4 +1,4 @@
-"""How long one decision takes."""
+"""Latency of one decision."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ from edqn_jax.sim.sensor import Sensed
 
 
 def decision_latency_ms(config: Config, params: PolicyParams, calls: int = 300) -> dict[str, float]:
-    """Median and 99th percentile of the time that one decision takes, from host arrays to an action there."""
+    """Returns the median and 99th percentile latency of a decision, from host arrays to an action on the host, ms."""
     median, p99 = np.percentile(1e3 * decision_seconds(config, params, calls), [50, 99])
     return {"median": float(median), "p99": float(p99)}
 
 
 def decision_seconds(config: Config, params: PolicyParams, calls: int) -> np.ndarray:
-    """Seconds [calls] that each of so many decisions takes, from host arrays to an action there."""
+    """Returns the latency [calls] of each of `calls` decisions, from host arrays to an action on the host, seconds."""
     seen = env.Observation(sensed=_anything(config), own=jnp.zeros(env.OWN_SIZE))
     seen, memory = jax.tree.map(np.asarray, (seen, policy.empty_memory(config)))  # on the host
     act = jax.jit(lambda params, memory, seen, key: policy.act(config, params, memory, seen, key))
@@ -34,7 +34,7 @@ def decision_seconds(config: Config, params: PolicyParams, calls: int) -> np.nda
         began = time.perf_counter()
         int(act(params, memory, seen, key)[0])
         seconds.append(time.perf_counter() - began)
-    return np.array(seconds[1:])  # the first call compiled
+    return np.array(seconds[1:])  # the first call compiles
 
 
 def _anything(config: Config) -> Sensed:

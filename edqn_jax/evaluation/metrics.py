@@ -1,4 +1,4 @@
-"""Figures of a set of flights: success with its interval, SPL, path, time and clearance."""
+"""Metrics of a set of flights: success with its interval, SPL, path, time and clearance."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ EMPTY_M = 1e5
 
 
 def wilson_interval(successes: int, missions: int, z: float = 1.959964) -> tuple[float, float]:
-    """Wilson's score interval of a success rate; 95 % for the default `z` (Wilson 1927)."""
+    """Returns the Wilson score interval of a success rate; 95 % for the default `z` (Wilson 1927)."""
     if missions == 0:
         return 0.0, 1.0
     rate = successes / missions
@@ -31,16 +31,16 @@ def wilson_interval(successes: int, missions: int, z: float = 1.959964) -> tuple
 
 
 def spl(success: np.ndarray, flown: np.ndarray, shortest: np.ndarray) -> float:
-    """Success weighted by path length (Anderson et al. 2018): mean of S l / max(p, l) over missions [M].
+    """Returns success weighted by path length (Anderson et al. 2018): mean of S l / max(p, l) over missions [M].
 
-    A failure's shortest path does not matter and may be NaN.
+    The shortest path of a failed mission is not used and may be NaN.
     """
     weight = shortest[success] / np.maximum(flown[success], shortest[success])
     return float(np.sum(weight) / len(success))
 
 
 def shortest_paths(config: Config, world: World, wanted: np.ndarray) -> np.ndarray:
-    """Length [M] of A*'s path for each of the `wanted` [M] missions, metres; NaN for the others."""
+    """Returns the length [M] of A*'s path for each of the `wanted` [M] missions, metres; NaN for the others."""
     scene_of, starts, goals = (np.asarray(x) for x in (world.missions.scene, world.missions.start, world.missions.goal))
     pool = jax.tree.map(np.asarray, world.pool)
     lengths = np.full(len(starts), np.nan)
@@ -49,22 +49,22 @@ def shortest_paths(config: Config, world: World, wanted: np.ndarray) -> np.ndarr
             scene = take_scene(pool, scene_of[i])
             lengths[i] = shortest_path(scene, starts[i], goals[i], config.drone.body_radius_m).length_m
         except NoPathError:
-            continue  # a way that the half-metre lattice has no room for
+            continue  # a gap too narrow for the half-metre lattice
     return lengths
 
 
 def summarise(flights: Flights, shortest: np.ndarray | None = None) -> dict[str, Any]:
-    """The figures of a set of flights.
+    """Returns the metrics of a set of flights.
 
     Args:
-        flights: M of them.
-        shortest: [M] lengths of the shortest paths, metres, NaN where not known; without them there is no
-            `spl` and no `path_over_shortest`.
+        flights: M flights.
+        shortest: [M] lengths of the shortest paths, metres, NaN where unknown; without them `spl` and
+            `path_over_shortest` are None.
 
     Returns:
-        What `edqn evaluate --json` holds, less world, seed and latency. `spl` and the mean `return` are of
-        all flights; the means of path, decisions and seconds, and the least clearance, of those that reached
-        the goal (None if there is none). A flight ends at the goal's radius, the shortest path at the goal.
+        The content of `edqn evaluate --json` without world, seed and latency. `spl` and the mean `return` are
+        over all flights; the means of path, decisions and seconds, and the least clearance, over successes
+        only (None if there is none). A flight ends at the goal's radius, the shortest path at the goal.
     """
     outcome = np.asarray(flights.outcome)
     counts = {kind: int(np.sum(outcome == kind)) for kind in Outcome}
@@ -95,7 +95,7 @@ def summarise(flights: Flights, shortest: np.ndarray | None = None) -> dict[str,
     }
     if shortest is not None:
         known = success & np.isfinite(shortest)
-        # A success whose shortest path is not known counts as flown no better than it was.
+        # Where the shortest path of a success is unknown, its flown length stands in: a weight of 1.
         figures["spl"] = spl(success, flown, np.where(np.isfinite(shortest), shortest, flown))
         figures["path_over_shortest"] = mean(flown / np.where(known, shortest, 1.0), known)
     return figures
@@ -111,7 +111,7 @@ def clearance_text(metres: float | None) -> str:
 
 
 def flight_summary(flights: Flights, mission: int = 0) -> dict[str, Any]:
-    """What `summary.json` says of one flight, the shortest path aside."""
+    """Returns what `summary.json` holds of one flight, without the shortest path."""
     outcome = Outcome(int(flights.outcome[mission]))
     return {
         "success": outcome == Outcome.GOAL,

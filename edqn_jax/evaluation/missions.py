@@ -1,4 +1,4 @@
-"""Missions: from the name of a world to where drones train, are validated and are evaluated."""
+"""Missions of training, validation and evaluation, from the name of a world."""
 
 from __future__ import annotations
 
@@ -31,10 +31,10 @@ class MissionSet:
     """Missions in one or more worlds."""
 
     name: str
-    """What the world was asked for by."""
+    """Name that the world was asked for by."""
     world: World
     file: Path | None = None
-    """MJCF file of the only world; None for random ones."""
+    """MJCF file of the only world; None for random worlds."""
 
     def scene(self, mission: int = 0) -> Scene:
         """Returns the world of one mission."""
@@ -60,30 +60,30 @@ class MissionSet:
 
 @dataclasses.dataclass(frozen=True)
 class RunMissions:
-    """Missions of a training run. Validation and final ones have the same shape: one program flies both."""
+    """Missions of a training run. Validation and final missions have the same shape, so one program flies both."""
 
     training: MissionSet
     validation: MissionSet
     final: MissionSet
-    """Mission 0 is the one that the run is judged by; nothing flies it before the end."""
+    """Mission 0 decides the run's verdict; it is not flown before the end."""
     near_start: np.ndarray
-    """[M] bool, which validation missions begin at or near their world's own start."""
+    """[M] bool: which validation missions begin at or near their world's own start."""
 
     @property
     def scene(self) -> Scene:
-        """The world of the mission that the run is judged by."""
+        """The world of the final mission 0."""
         return self.final.scene()
 
 
 def run_missions(config: Config, reward: Reward | None = None) -> RunMissions:
-    """Returns the missions of a training run; they follow from the configuration's world and seed.
+    """Returns the missions of a training run, which depend on the configuration's world and seed alone.
 
     Args:
         config: of the run.
-        reward: of every decision in them, in place of the configured one.
+        reward: reward function in place of the configured one.
 
     Raises:
-        ConfigError: if a drone of this radius cannot fly in the world.
+        ConfigError: if a drone of this radius does not fit at the world's start or goal.
     """
     root = jax.random.key(config.train.seed)
     training_key, validation_key = (jax.random.fold_in(root, purpose) for purpose in (1, 2))
@@ -97,7 +97,7 @@ def run_missions(config: Config, reward: Reward | None = None) -> RunMissions:
 
 
 def _random_run_missions(config: Config, training_key: jax.Array) -> RunMissions:
-    """Every validation and final mission has a world of its own, from its own start to its own goal."""
+    """Returns missions of random worlds; every validation and final mission has a world of its own."""
     name, count = config.world.name, config.train.validation_missions
     airframe = drone.load_airframe(config.drone)
     training_pool = worlds.random_pool(name, worlds.world_keys("training", config.world.pool_size))
@@ -112,7 +112,7 @@ def _random_run_missions(config: Config, training_key: jax.Array) -> RunMissions
 
 
 def _file_run_missions(config: Config, training_key: jax.Array, validation_key: jax.Array) -> RunMissions:
-    """All missions are in one world and end at its goal; the final one begins at its start."""
+    """Returns missions of a world from a file: all end at its goal, the final one begins at its start."""
     name, count = config.world.name, config.train.validation_missions
     airframe, file = drone.load_airframe(config.drone), resolve_world(name)
     loaded = load_world(file)
@@ -150,17 +150,17 @@ def load_missions(
 ) -> MissionSet:
     """Returns the missions of an evaluation.
 
-    In a world from a file, one mission is from its own start to its own goal, more are from random free
+    In a world from a file a single mission goes from its start to its goal; several go from random free
     starts all over the volume to its goal. In random worlds each mission has a test world of its own, which
-    training never uses. `start` and `goal`, metres, replace the world's.
+    training never uses. `start` and `goal` replace those of the world.
 
     Args:
-        config: of the policy that will fly.
+        config: configuration of the policy.
         name: `sparse`, `medium`, `dense`, the name of a scene or an MJCF file.
-        missions: how many.
-        seed: which; the missions of two seeds differ.
-        start: of every mission.
-        goal: of every mission.
+        missions: number of missions.
+        seed: seed of the missions.
+        start: start of every mission, metres.
+        goal: goal of every mission, metres.
 
     Raises:
         ConfigError: if there is no such world, the drone does not fit where a mission starts or ends, or there is
@@ -175,12 +175,14 @@ def load_missions(
     if name in DENSITIES:
         return _random_missions(config, name, missions, seed, moved)
     if missions > 1 and start is not None:
-        raise ConfigError(f"--start with --missions {missions}: in '{name}' all would be one and the same flight")
+        raise ConfigError(
+            f"--start with --missions {missions}: in '{name}' all flights would be equal; give only one of the two"
+        )
     return _file_missions(config, name, missions, seed, moved)
 
 
 def _random_missions(config: Config, name: str, missions: int, seed: int, moved: dict[str, jax.Array]) -> MissionSet:
-    """One mission in each of so many test worlds."""
+    """Returns one mission in each of `missions` test worlds."""
     pool = worlds.random_pool(name, worlds.world_keys("test", missions, first=seed * missions))
     if moved:
         many = {key: jnp.broadcast_to(value, (missions, 3)) for key, value in moved.items()}
@@ -192,7 +194,7 @@ def _random_missions(config: Config, name: str, missions: int, seed: int, moved:
 
 
 def _file_missions(config: Config, name: str, missions: int, seed: int, moved: dict[str, jax.Array]) -> MissionSet:
-    """One mission from start to goal of a world from a file, or many from random free starts."""
+    """Returns one mission from start to goal of a world from a file, or many from random free starts."""
     radius, airframe, file = config.drone.body_radius_m, drone.load_airframe(config.drone), resolve_world(name)
     loaded = load_world(file)
     scene = dataclasses.replace(loaded.scene, **moved)

@@ -1,4 +1,4 @@
-"""Missions flown greedily: every mission once, all at once, in one compiled program."""
+"""Greedy rollouts: every mission once, all in parallel, in one compiled program."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from edqn_jax.sim.scene import scene_at, take_scene
 
 @struct.dataclass
 class _Flying:
-    """What the loop over decisions carries."""
+    """Carry of the loop over decisions."""
 
     state: EnvState
     observation: Observation
@@ -47,23 +47,26 @@ def fly_missions(
     record: bool = False,
     mesh: Mesh | None = None,
 ) -> Flights:
-    """Fly each of the world's M missions once, taking the best action each time.
+    """Flies each of the world's M missions once, greedily.
 
-    Mission i belongs to environment i; the last flight's end ends the program. Environments whose flight is
-    over begin it again, which counts for nothing.
+    Environment i flies mission i; the program ends with the last flight. Environments whose flight has ended
+    fly it again, which is not counted.
 
-    Compiled once for each configuration, choice of flags, mesh, and shapes and layout of the arrays.
+    Compiles once for each configuration, choice of flags, mesh, and shapes and layout of the arrays.
 
     Args:
-        config: of the policy and its world.
-        world: whose missions are flown.
-        params: whose policy flies.
+        config: configuration of the policy and its world.
+        world: the missions.
+        params: parameters of the policy.
         key: consumed; sensor noise and the shuffling depend on it.
-        shuffle_codes: give each environment what another one's sensor shows, anew at each decision, and leave it
-            its own state: how much does the policy fly by its events, or whatever it sees?
-        record: keep whole flights.
-        mesh: devices, along one axis, to spread the missions over; the flights do not depend on it, except
-            for whose codes are shuffled with whose.
+        shuffle_codes: give each environment the sensor's output of another one, permuted anew at each decision,
+            but its own state: measures how much the policy depends on its sensor.
+        record: keep every pose of the flights.
+        mesh: devices, along one axis, to spread the missions over; flights do not depend on it, except for
+            which codes are exchanged.
+
+    Returns:
+        Flights of the M missions, on the devices.
 
     Raises:
         ValueError: if codes are to be shuffled and a device has only one mission.
@@ -80,7 +83,7 @@ def fly_on_all_devices(
     record: bool = False,
     shuffle_codes: bool = False,
 ) -> Flights:
-    """`fly_missions` on all devices that there are; the flights come back to the host."""
+    """Runs `fly_missions` on all devices and returns the flights on the host."""
     mesh = Mesh(np.asarray(jax.devices()), ("mission",))
     world, params = jax.device_put((world, params), NamedSharding(mesh, PartitionSpec()))
     flights = fly_missions(
@@ -90,7 +93,7 @@ def fly_on_all_devices(
 
 
 def prepare(config: Config, world: World, params: PolicyParams, key: Array, *, record: bool, mesh: Mesh) -> None:
-    """Compile what `fly_missions` of such arguments runs, so that its first call need not."""
+    """Compiles the program that `fly_missions` runs for such arguments, ahead of its first call."""
     _program(mesh).lower(config, False, record, mesh, world, params, key).compile()
 
 
@@ -100,7 +103,7 @@ def _program(mesh: Mesh | None):
 
 @functools.cache
 def _compiled(platform: str):
-    # Static by position: a flag left out would be another program.
+    # Static by position: a flag passed by name would compile another program.
     return jax.jit(_fly_all, static_argnums=(0, 1, 2, 3), compiler_options=compiler_options(platform))
 
 
@@ -116,10 +119,10 @@ def _fly_all(
     missions = world.missions.scene.shape[0]
     devices = 1 if mesh is None else mesh.size
     reset_key, loop_key = jax.random.split(key)
-    # Every device flies equally many missions; those too many are the first ones again.
+    # Every device flies equally many missions; the first ones are repeated to fill up.
     number = jnp.arange(-(-missions // devices) * devices) % missions
     if shuffle_codes and number.shape[0] // devices < 2:
-        raise ValueError("codes can be shuffled between environments only where there are two or more")
+        raise ValueError("shuffling codes needs at least two missions on each device")
     keys = jax.vmap(partial(jax.random.fold_in, reset_key))(number)
     fly = partial(_fly, config, shuffle_codes, record)
     if mesh is not None:
@@ -140,7 +143,7 @@ def _fly(
     keys: Array,
     key: Array,
 ) -> Flights:
-    """`fly_missions` on one device: missions `number` [M] with the environments' keys [M]."""
+    """Runs `fly_missions` on one device: missions `number` [M] with the environments' keys [M]."""
     missions = number.shape[0]
 
     def decide(flying: _Flying) -> _Flying:
@@ -148,10 +151,10 @@ def _fly(
         seen = flying.observation
         if shuffle_codes:
             shift = jax.random.randint(shift_key, (), 1, missions)
-            # The code is a function of what the sensor shows alone, so moving this moves the codes.
+            # The code depends on the sensor's output alone, so permuting that permutes the codes.
             sensed = jax.tree.map(lambda x: jnp.roll(x, shift, axis=0), seen.sensed)
             seen = dataclasses.replace(seen, sensed=sensed)
-        act = partial(policy.act, config, params, key=act_key)  # the best action is no matter of chance
+        act = partial(policy.act, config, params, key=act_key)  # greedy: the key has no effect
         action, memory = jax.vmap(act)(flying.memory, seen)
         state, step = jax.vmap(partial(env.step, config, world))(flying.state, action, number)
         flights, clearance = jax.vmap(partial(_tally, config, world))(flying.flights, flying.state, step)
@@ -165,7 +168,7 @@ def _fly(
             key=key,
         )
 
-    # The first turn of the loop is every environment's reset: what it sees before, and does, counts for nothing.
+    # The first iteration resets every environment: the observation and the action before it are not used.
     state = jax.vmap(partial(env.ended, config, world))(keys, number)
     seen = jax.eval_shape(jax.vmap(partial(env.step, config, world)), state, number)[1].observation
     memory = policy.empty_memory(config)
@@ -184,13 +187,13 @@ def _fly(
 
 
 def _at_start(config: Config, world: World, state: EnvState) -> Flights:
-    """Tallies of one flight that has yet to begin."""
+    """Returns the tallies of one flight before its first step."""
     scene = scene_at(take_scene(world.pool, world.missions.scene[state.mission]), jnp.zeros(()))
     return at_start(config, scene, state.drone)
 
 
 def _tally(config: Config, world: World, flights: Flights, before: EnvState, step: Step) -> tuple[Flights, Array]:
-    """The tallies of one flight after a step, and the clearance [n] after each of its physics steps."""
+    """Returns the tallies of one flight after a step, and the clearance [n] after each of its physics steps."""
     running = (flights.outcome == Outcome.RUNNING) & ~step.is_reset
     time = before.decision * (config.drone.physics_steps * config.drone.physics_dt_s)
     scene = scene_at(take_scene(world.pool, world.missions.scene[before.mission]), time)
@@ -217,7 +220,7 @@ def _blank(config: Config, missions: int) -> Record:
 
 
 def _write(flying: _Flying, action: Array, step: Step, clearance: Array) -> Record | None:
-    """The record with one more decision of the flights that are not over."""
+    """Returns the record with one more decision of the running flights."""
     if flying.record is None:
         return None
     running = (flying.flights.outcome == Outcome.RUNNING) & ~step.is_reset
@@ -235,7 +238,7 @@ def _write(flying: _Flying, action: Array, step: Step, clearance: Array) -> Reco
 
 
 def _by_mission(record: Record) -> Record:
-    """[D, M, n, ...] to [M, D n, ...]."""
+    """Reshapes every field from [D, M, n, ...] to [M, D n, ...]."""
 
     def joined(leaf: Array) -> Array:
         leaf = jnp.moveaxis(leaf, 1, 0)

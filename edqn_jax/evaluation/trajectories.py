@@ -1,4 +1,4 @@
-"""Recorded flights as tables: a row per physics step, for `trajectory.csv` and for `.npz` files."""
+"""Recorded flights as tables with one row per physics step, for `trajectory.csv` and `.npz` files."""
 
 from __future__ import annotations
 
@@ -11,15 +11,19 @@ import numpy as np
 from edqn_jax.config import Config
 from edqn_jax.evaluation.missions import MissionSet
 from edqn_jax.runs.directory import TRAJECTORY_COLUMNS
-from edqn_jax.runs.files import write_whole
+from edqn_jax.runs.files import write_atomically
 from edqn_jax.sim.flights import Flights
 from edqn_jax.sim.outcomes import Outcome
 
 
 def trajectory(config: Config, flights: Flights, mission: int = 0) -> dict[str, np.ndarray]:
-    """One recorded flight as the columns of `trajectory.csv`, each [T]: a row after each physics step."""
+    """Returns one recorded flight as the columns of `trajectory.csv`, each [T], one row after each physics step.
+
+    Raises:
+        ValueError: if the flights were not recorded.
+    """
     if flights.record is None:
-        raise ValueError("these flights were not recorded")
+        raise ValueError("the flights were not recorded; fly them with record=True")
     steps = int(flights.physics_steps[mission])
     whole = jax.tree.map(lambda leaf: np.asarray(leaf[mission]), flights.record)
     decision = np.arange(steps) // config.drone.physics_steps
@@ -37,23 +41,27 @@ def trajectory(config: Config, flights: Flights, mission: int = 0) -> dict[str, 
     return dict(zip(TRAJECTORY_COLUMNS, values.T, strict=True))
 
 
-def write_trajectories(config: Config, missions: MissionSet, flights: Flights, file: Path) -> None:
-    """All flights as one `.npz`, enough to check every verdict in another physics engine.
+def write_trajectories(config: Config, mission_set: MissionSet, flights: Flights, file: Path) -> None:
+    """Writes all flights as one `.npz`, with all that another physics engine needs to check the verdicts.
 
-    Row 0 of each flight is its start, row k stands after physics step k; rows after the end are NaN.
-    `lengths` is the number of rows of each flight. A collision touches within the last segment, `contact` of
-    the way along it. `mjcf[scene[i]]` is the world of mission i.
+    Row 0 of each flight is its start, row k its pose after physics step k; rows after the end are NaN.
+    `lengths` is the number of rows of each flight. The contact of a collision is in the last segment, at the
+    fraction `contact` of it. `mjcf[scene[i]]` is the world of mission i.
+
+    Raises:
+        ConfigError: if the file cannot be written.
+        ValueError: if the flights were not recorded.
     """
     record = flights.record
     if record is None:
-        raise ValueError("these flights were not recorded")
-    flown = jax.tree.map(np.asarray, missions.world.missions)
-    heading = np.arctan2(*(flown.goal - flown.start)[:, 1::-1].T)
+        raise ValueError("the flights were not recorded; fly them with record=True")
+    missions = jax.tree.map(np.asarray, mission_set.world.missions)
+    heading = np.arctan2(*(missions.goal - missions.start)[:, 1::-1].T)
     level = np.zeros_like(heading)
     facing = np.column_stack([np.cos(heading / 2), level, level, np.sin(heading / 2)])
     longest = int(np.max(flights.physics_steps))
     columns = {
-        "positions": np.concatenate([flown.start[:, None], record.position[:, :longest]], axis=1),
+        "positions": np.concatenate([missions.start[:, None], record.position[:, :longest]], axis=1),
         "attitudes": np.concatenate([facing[:, None], record.quaternion[:, :longest]], axis=1),
         "times": config.drone.physics_dt_s * np.arange(longest + 1),
         "lengths": flights.physics_steps + 1,
@@ -66,14 +74,14 @@ def write_trajectories(config: Config, missions: MissionSet, flights: Flights, f
         "closest_time": flights.closest.time,
         "closest_position": flights.closest.position,
         "closest_attitude": flights.closest.quaternion,
-        "scene": flown.scene,
-        "start": flown.start,
-        "goal": flown.goal,
-        "mjcf": np.array(missions.mjcf()),
+        "scene": missions.scene,
+        "start": missions.start,
+        "goal": missions.goal,
+        "mjcf": np.array(mission_set.mjcf()),
         "body_radius_m": np.float64(config.drone.body_radius_m),
         "physics_dt_s": np.float64(config.drone.physics_dt_s),
     }
     with tempfile.SpooledTemporaryFile() as buffer:
         np.savez_compressed(buffer, **columns)
         buffer.seek(0)
-        write_whole(file, buffer.read())
+        write_atomically(file, buffer.read())

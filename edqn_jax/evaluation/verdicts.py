@@ -1,4 +1,4 @@
-"""Our verdicts on recorded flights held against C MuJoCo's, on the worlds' MJCF."""
+"""Comparison of the simulator's verdicts on recorded flights with C MuJoCo's, on the worlds' MJCF."""
 
 from __future__ import annotations
 
@@ -15,51 +15,51 @@ from edqn_jax.sim.flights import Flights
 from edqn_jax.sim.outcomes import Outcome
 
 CONTACT_TOLERANCE_M = 0.01
-"""How far apart along the path the two may see the same contact. `segment_contact` takes the distance seven
-times a segment and interpolates: it may overlook a graze 0.1 mm deep, which at a grazing angle is
+"""Largest distance along the path between the two moments of one contact. `segment_contact` samples the distance
+seven times a segment and interpolates: it may miss a graze 0.1 mm deep, which at a grazing angle is
 sqrt(2 x 0.36 m x 0.1 mm) = 8.5 mm of path."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Agreement:
-    """One flight, judged twice. A moment is a number of physics steps, with its fraction."""
+    """Both verdicts on one flight. A moment is a number of physics steps, with its fraction."""
 
     mission: int
     outcome: Outcome
-    """Ours."""
+    """Verdict of the simulator."""
     stated: float | None
-    """Moment of the contact by our verdict; None where it is no collision."""
+    """Moment of the contact by the simulator's verdict; None if it is not a collision."""
     found: float | None
-    """Moment of the first contact that the other engine finds; None where it finds none."""
+    """Moment of the first contact that C MuJoCo finds; None if it finds none."""
     apart_m: float | None
-    """Metres of path between the two moments; None unless there are both."""
+    """Metres of path between the two moments; None unless both exist."""
     touched: str
-    """What the other engine finds touched."""
+    """Name of the geom that C MuJoCo finds touched; empty without a contact."""
 
     @property
     def agrees(self) -> bool:
-        """Whether there is a contact where we state one, then, and none where we do not."""
+        """Whether both find a contact at the same moment, or neither finds one."""
         if self.apart_m is None:
             return self.stated is self.found  # neither
         return self.apart_m <= CONTACT_TOLERANCE_M
 
 
-def check_verdicts(config: Config, missions: MissionSet, flights: Flights) -> list[Agreement]:
-    """Every recorded flight replayed in C MuJoCo, along the segments between physics steps.
+def check_verdicts(config: Config, mission_set: MissionSet, flights: Flights) -> list[Agreement]:
+    """Replays every recorded flight in C MuJoCo, along the segments between physics steps, and compares.
 
     Args:
-        config: for the radius of the body.
-        missions: that were flown; a world from a file is judged by that file.
-        flights: recorded.
+        config: gives the radius of the body.
+        mission_set: the missions that were flown; a world from a file is judged by that file.
+        flights: recorded flights of these missions.
 
     Raises:
         ValueError: if the flights were not recorded.
     """
     if flights.record is None:
-        raise ValueError("these flights were not recorded")
-    judges = [_judge(text, missions.file, config.drone.body_radius_m) for text in missions.mjcf()]
-    flown = missions.world.missions
-    scenes, starts = np.asarray(flown.scene), np.asarray(flown.start)
+        raise ValueError("the flights were not recorded; fly them with record=True")
+    judges = [_judge(text, mission_set.file, config.drone.body_radius_m) for text in mission_set.mjcf()]
+    missions = mission_set.world.missions
+    scenes, starts = np.asarray(missions.scene), np.asarray(missions.start)
     positions = np.asarray(flights.record.position)
     outcomes, steps = np.asarray(flights.outcome), np.asarray(flights.physics_steps)
     results = []
@@ -78,5 +78,5 @@ def check_verdicts(config: Config, missions: MissionSet, flights: Flights) -> li
 
 
 def _judge(text: str, file: Path | None, radius: float) -> Judge:
-    # From the file where there is one: it may include others that lie beside it.
+    # From the file where there is one: it may include files beside it.
     return load_judge(file if file is not None else mujoco.MjSpec.from_string(text), radius)

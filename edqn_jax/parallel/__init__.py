@@ -1,1 +1,1 @@
-"""Devices, how a process was started, and what processes exchange."""
+"""Devices, the launch of one of several processes, and collectives."""

@@ -1,4 +1,4 @@
-"""How many devices there are, and how many of them a run uses."""
+"""Devices: how many JAX presents, how many a run uses, compiler options."""
 
 from __future__ import annotations
 
@@ -12,35 +12,35 @@ import jax
 from edqn_jax.errors import ConfigError
 
 ALIKE = "--xla_backend_extra_options=xla_cpu_disable_loop_unrolling"
-"""XLA's flag under which programs for CPUs round alike whatever the size of a batch (docs/decisions/0006)."""
+"""XLA flag that makes CPU programs round equally for every batch size (docs/decisions/0006)."""
 
 
 def use_cpu_devices(count: int | None = None) -> None:
-    """Lets JAX present the CPU as `count` devices; must be called before JAX is first used.
+    """Makes JAX present the CPU as `count` devices; must be called before JAX is first used.
 
-    `None` means one per core. Has no effect on which accelerators JAX finds, and prefers. Adds to `XLA_FLAGS` what
-    makes flights equal on any number of devices, unless extra options stand there already.
+    None means one per core. Accelerators are found and preferred as before. Also adds `ALIKE` to `XLA_FLAGS`, so that
+    flights are equal on any number of devices, unless `XLA_FLAGS` already holds extra backend options.
 
     Raises:
-        RuntimeError: if JAX has been used already.
+        RuntimeError: if JAX has already been used.
     """
     jax.config.update("jax_num_cpu_devices", cores() if count is None else count)
     flags = os.environ.get("XLA_FLAGS", "")
     if "xla_backend_extra_options" not in flags:
         os.environ["XLA_FLAGS"] = f"{flags} {ALIKE}".strip()
     if jax.__version_info__[:2] == (0, 11):
-        # Its new partitioner crashes on arrays without elements, which a scene without capsules has, where
-        # `shard_map` and a loop meet. The old one does not.
+        # Its new partitioner crashes where `shard_map` and a loop handle arrays without elements, as of a scene
+        # without capsules. The old one does not.
         jax.config.update("jax_use_shardy_partitioner", False)
 
 
 @functools.cache
 def compiler_options(platform: str) -> dict[str, str | bool]:
-    """What programs of ours are compiled with on a platform, beyond its defaults; for `jax.jit` and `compile`.
+    """Returns the compiler options for a platform beyond XLA's defaults, for `jax.jit` and `compile`.
 
-    On CPUs XLA hands sums of products to a library that is made for large ones: one sum of 6 x 6 numbers in a
-    physics step then takes longer than the rest of the step. Matrix products stay with the library. Of LLVM's
-    optimisations the first level gives programs as fast as the third, and an eighth sooner.
+    By default XLA on CPUs calls a library for sums of products that is made for large ones: one sum of 6 x 6 numbers
+    in a physics step then takes longer than the rest of the step. Matrix products still use the library. LLVM's
+    first optimisation level gives programs as fast as its third and compiles an eighth faster.
     """
     if platform != "cpu":
         return {}
@@ -52,7 +52,7 @@ def compiler_options(platform: str) -> dict[str, str | bool]:
 
 
 def _has_option(name: str, value: str) -> bool:
-    """Whether this XLA knows it; another need not."""
+    """Returns whether the installed XLA knows the option."""
     try:
         jax.jit(lambda: 0, compiler_options={name: value}).lower().compile()
     except (jax.errors.JaxRuntimeError, ValueError):
@@ -61,14 +61,14 @@ def _has_option(name: str, value: str) -> bool:
 
 
 def cores() -> int:
-    """Cores that this process may run on."""
+    """Returns the number of cores that this process may run on."""
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
 
 
 def processor() -> str:
-    """The CPU's model name and how many cores this process may use, for whoever reads a figure."""
+    """Returns the CPU's model name and the number of cores that this process may use."""
     cpuinfo = Path("/proc/cpuinfo")
     lines = cpuinfo.read_text(encoding="utf-8").splitlines() if cpuinfo.is_file() else []
     named = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
@@ -76,18 +76,18 @@ def processor() -> str:
 
 
 def choose_devices(requested: int, shards: int) -> list[jax.Device]:  # pyright: ignore[reportInvalidTypeForm]
-    """The devices that a run spreads over, of all processes alike; JAX's default kind, so GPUs where there are any.
+    """Returns the devices that a run uses, of all processes; JAX's default kind, so GPUs where there are any.
 
     Args:
-        requested: how many; 0 is as many as divide the shards.
+        requested: how many; 0 uses the largest number that divides the shards.
         shards: logical shards of environments and replay.
 
     Returns:
-        the devices, those of process 0 first; every process has equally many of them.
+        the devices, those of process 0 first; equally many of each process.
 
     Raises:
-        ConfigError: if there are fewer than requested, or their number does not divide the shards, or the processes
-            cannot share them.
+        ConfigError: if there are fewer than requested, or their number does not divide the shards, or is no
+            multiple of the number of processes.
     """
     found = jax.devices()
     processes = jax.process_count()
@@ -98,7 +98,7 @@ def choose_devices(requested: int, shards: int) -> list[jax.Device]:  # pyright:
     if requested > len(found):
         kind = found[0].platform.upper()
         raise ConfigError(
-            f"train.devices must be at most {len(found)}, the {kind} devices that there are, not {requested}"
+            f"train.devices must be at most {len(found)}, the number of {kind} devices found, not {requested}"
         )
     if shards % requested:
         raise ConfigError(f"train.devices must be a divisor of train.shards ({shards}), not {requested}")
@@ -109,5 +109,5 @@ def choose_devices(requested: int, shards: int) -> list[jax.Device]:  # pyright:
 
 
 def most_that_divide(shards: int, available: int) -> int:
-    """The largest divisor of `shards` that is at most `available`."""
+    """Returns the largest divisor of `shards` that is at most `available`."""
     return max(count for count in range(1, available + 1) if shards % count == 0)

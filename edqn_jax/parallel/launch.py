@@ -1,4 +1,4 @@
-"""How a process was started: alone, or as one of several that train together. Needs no JAX."""
+"""How a process was started: alone, or as one of several that train one policy. Does not import JAX."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ def how_to_join(
     process_id: int | None,
     environment: Mapping[str, str],
 ) -> dict[str, Any] | None:
-    """The arguments for `processes.join`; None for a process that stays alone. Nothing is done yet.
+    """Returns the arguments for `processes.join`, or None for a process that trains alone.
 
     Args:
-        distributed: `auto` joins where the next three are given or `srun` has started several tasks, `must` joins
-            whatever cluster JAX finds, `never` stays alone.
+        distributed: `auto` joins if the next three are given or `srun` has started several tasks, `must` joins
+            any cluster that JAX detects, `never` trains alone.
         coordinator_address: host and port of process 0.
-        num_processes: of all hosts.
-        process_id: this one's number, from 0.
-        environment: variables of this process.
+        num_processes: number of processes on all hosts.
+        process_id: number of this process, from 0.
+        environment: environment variables of this process.
 
     Raises:
         ConfigError: if they contradict each other.
@@ -38,7 +38,7 @@ def how_to_join(
     given = [name for name, value in by_hand.items() if value is not None]
     if distributed == "never":
         if given:
-            raise ConfigError(f"--distributed never joins no other process, so it takes no {given[0]}")
+            raise ConfigError(f"--distributed never joins no other process; leave out {given[0]}")
         return None
     if coordinator_address is not None and num_processes is not None and process_id is not None:
         if not coordinator_address.rpartition(":")[2].isdecimal():
@@ -53,14 +53,14 @@ def how_to_join(
             "coordinator_address": coordinator_address,
             "num_processes": num_processes,
             "process_id": process_id,
-            # Or JAX would still look for a cluster, to see which devices are this process's.
+            # Without this JAX still detects a cluster, to choose this process's devices.
             "cluster_detection_method": "deactivate",
         }
     if given:
         missing = next(name for name in by_hand if name not in given)
-        raise ConfigError(f"{', '.join(by_hand)} go together; {missing} is missing")
-    # Tasks of this very step. SLURM_NTASKS, which JAX looks at, is the whole allocation's in an interactive shell:
-    # a program started there without `srun` would wait for tasks that nobody starts.
+        raise ConfigError(f"{', '.join(by_hand)} must be given together; {missing} is missing")
+    # Tasks of this job step. SLURM_NTASKS, which JAX reads, counts the whole allocation in an interactive shell:
+    # a program started there without `srun` would wait for tasks that are never started.
     if distributed == "must" or int(environment.get("SLURM_STEP_NUM_TASKS", 1)) > 1:
         return {}
     return None

@@ -1,7 +1,7 @@
-"""Several processes that train one policy: how they find each other, and what they tell one another.
+"""Several processes that train one policy: joining them, and collectives on the host.
 
-Each process runs the same program on its own devices, and JAX joins all devices into one mesh. So whatever steers
-the host loop must be decided alike everywhere: a process that goes another way leaves the others waiting for it.
+Each process runs the same program on its own devices, and JAX joins all devices into one mesh. So every process must
+take the same branches in the host loop: one that takes another branch leaves the others waiting for it.
 """
 
 from __future__ import annotations
@@ -21,47 +21,47 @@ T = TypeVar("T")
 Tree = TypeVar("Tree")
 
 LONGEST_SENTENCE = 1024
-"""Bytes of an error that the other processes are told."""
+"""Bytes of an error message that are sent to the other processes."""
 
 
 def join(arguments: Mapping[str, Any]) -> int:
-    """Waits for all processes, at most five minutes, and becomes one of them; before JAX is first used.
+    """Joins the other processes, waiting at most five minutes; must be called before JAX is first used.
 
-    JAX ends the program, without an exception, if they do not all come.
+    JAX ends the program, without an exception, if a process is missing.
 
     Args:
-        arguments: of `jax.distributed.initialize`; what is missing JAX finds in Slurm's, Open MPI's or
-            Kubernetes' variables.
+        arguments: of `jax.distributed.initialize`; JAX takes missing ones from the variables of Slurm, Open MPI
+            or Kubernetes.
 
     Returns:
-        this process's number; number 0 is the one that writes.
+        the number of this process; process 0 writes the run directory.
 
     Raises:
-        ConfigError: if there is no cluster to be found, or its processes differ in their number of devices.
+        ConfigError: if no cluster is detected, or its processes have different numbers of devices.
     """
-    # Or JAX would take SIGTERM for itself, until somebody takes it back.
+    # Otherwise JAX installs its own handler of SIGTERM.
     jax.config.update("jax_enable_preemption_service", False)
     try:
         jax.distributed.initialize(**arguments)
     except ValueError as error:
         raise ConfigError(
-            "JAX finds no cluster to join here; give --coordinator-address, --num-processes and --process-id, "
+            "JAX detects no cluster to join; give --coordinator-address, --num-processes and --process-id, "
             f"or --distributed never ({error})"
         ) from None
     counts = Counter(device.process_index for device in jax.devices())
     if len(set(counts.values())) > 1:
         raise ConfigError(
             f"every process must have equally many devices, not {min(counts.values())} and {max(counts.values())}; "
-            "on CPUs --train.devices gives all of them as many"
+            "on CPUs --train.devices sets the same number for all"
         )
     return jax.process_index()
 
 
 def together(work: Callable[[], T]) -> T:
-    """What `work()` returns; every process must call this, and none goes on if one of them cannot.
+    """Returns `work()`, or raises on every process if it fails on one; every process must call this.
 
     Raises:
-        ConfigError: on every process, if `work` raises it on any; the words are those of the first that did.
+        ConfigError: on every process, if `work` raises it on any; the message is that of the first such process.
     """
     if not jax.distributed.is_initialized():
         return work()
@@ -80,16 +80,16 @@ def together(work: Callable[[], T]) -> T:
 
 
 def on_any(flag: bool) -> bool:
-    """Whether `flag` is true on any process; every process must call this."""
+    """Returns whether `flag` is true on any process; every process must call this."""
     return bool(np.any(multihost_utils.process_allgather(np.asarray(flag))))
 
 
 def replicate(tree: Any, mesh: Mesh) -> Any:
-    """The arrays of `tree`, the same on every process, onto every device of a mesh that may span processes."""
-    # By way of the host: MJX commits its arrays to one device, and an array leaves that for no other process.
+    """Copies arrays that are equal on every process to every device of a mesh, which may span processes."""
+    # Through the host: MJX commits its arrays to one device, and JAX cannot move them to another process from there.
     return jax.device_put(jax.tree.map(np.asarray, tree), NamedSharding(mesh, PartitionSpec()))
 
 
 def fetch(tree: Tree) -> Tree:
-    """The whole of each array of a mesh of all processes, on each one's host; every process must call this."""
+    """Returns each array of a mesh of all processes, gathered on the host; every process must call this."""
     return multihost_utils.process_allgather(tree, tiled=True)

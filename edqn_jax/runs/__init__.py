@@ -1,1 +1,1 @@
-"""What a run keeps on disk: its directory, its policy, its provenance; files written atomically."""
+"""Run directories, saved policies, provenance, files written atomically."""

@@ -1,7 +1,7 @@
-"""What a run keeps on disk to be flown again: the policy, as an Orbax checkpoint.
+"""Policies on disk, as Orbax checkpoints.
 
-Saved synchronously: when `save_params` returns, the checkpoint is there and carries its commit marker. One
-without the marker does not exist.
+Saving is synchronous: when `save_params` returns, the checkpoint is complete and holds its commit marker. A
+checkpoint without the marker is refused.
 """
 
 from __future__ import annotations
@@ -19,18 +19,18 @@ POLICY = "policy"
 """The policy's folder within `checkpoints/`."""
 
 COMMIT_MARKER = "commit_success.txt"
-"""What Orbax writes into a checkpoint last of all."""
+"""File that Orbax writes last; a checkpoint without it is incomplete."""
 
 
 def save_params(folder: Path, params: PolicyParams) -> None:
-    """Writes the policy into `folder`, a run's `checkpoints/`; one that is there already is replaced.
+    """Writes the policy into `folder`, a run's `checkpoints/`; replaces an existing one.
 
-    The arrays are saved from the host: how many devices they lay on leaves no trace. The calling process saves
-    alone, whether it is one of several or not.
+    Arrays are saved from the host, so the file does not depend on the number of devices. Only the calling
+    process saves, even if it is one of several.
     """
     tree = jax.tree.map(np.asarray, {"encoder": params.encoder, "q": params.q})
     here = jax.process_index()
-    # Or Orbax would wait for the other processes.
+    # Without this Orbax waits for the other processes.
     alone = ocp.options.MultiprocessingOptions(primary_host=here, active_processes={here})
     handler = ocp.PyTreeCheckpointHandler(multiprocessing_options=alone)
     saver = ocp.Checkpointer(handler, multiprocessing_options=alone)
@@ -38,10 +38,10 @@ def save_params(folder: Path, params: PolicyParams) -> None:
 
 
 def load_params(folder: Path) -> PolicyParams:
-    """The policy saved in `folder`, a run's `checkpoints/`; arrays on the host.
+    """Returns the policy saved in `folder`, a run's `checkpoints/`; arrays on the host.
 
     Raises:
-        ConfigError: if there is none, or it is incomplete.
+        ConfigError: if there is none, or it is incomplete or unreadable.
     """
     saved = (folder / POLICY).absolute()
     if not saved.is_dir():

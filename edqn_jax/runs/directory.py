@@ -1,4 +1,4 @@
-"""The folder that a run leaves behind: what its files are called, and when a folder may be written into."""
+"""Run directories: the names of their files, and when a run may write into a folder."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ import numpy as np
 from edqn_jax.config import Config
 from edqn_jax.config.loading import apply, load_layer, to_yaml
 from edqn_jax.errors import ConfigError
-from edqn_jax.runs.files import check_can_make, unwritable, write_whole
+from edqn_jax.runs.files import check_can_make, unwritable, write_atomically
 
 Resume = Literal["auto", "never", "must"]
 
@@ -34,11 +34,11 @@ decisions of the episode, and how it ended."""
 
 @dataclass(frozen=True)
 class RunDirectory:
-    """A run's folder. Nothing is on disk before `create`."""
+    """A run directory. `create` makes it on disk."""
 
     path: Path
     must_be_new: bool = False
-    """Whether `create` refuses a folder that is there already: another run may have taken the name since."""
+    """Whether `create` refuses an existing folder: another run may have created it meanwhile."""
 
     @property
     def config_file(self) -> Path:
@@ -69,12 +69,12 @@ class RunDirectory:
         return self.path / "checkpoints"
 
     def create(self, config: Config) -> None:
-        """Makes the folder, empty but for `config.yaml` and the header of `episodes.csv`.
+        """Creates the folder with `config.yaml` and the header of `episodes.csv`.
 
-        What an earlier run left in it goes; `plan_run_directory` has seen to it that this is meant.
+        Deletes the files of an earlier run in it; `plan_run_directory` has checked that this is wanted.
 
         Raises:
-            ConfigError: if it cannot be written, or `must_be_new` and it is there.
+            ConfigError: if it cannot be written, or exists although it `must_be_new`.
         """
         try:
             self.path.mkdir(parents=True, exist_ok=not self.must_be_new)
@@ -83,11 +83,11 @@ class RunDirectory:
             for folder in (self.figures, self.checkpoints):
                 shutil.rmtree(folder, ignore_errors=True)
                 folder.mkdir()
-            write_whole(self.config_file, to_yaml(config))
-            write_whole(self.episodes_file, ",".join(EPISODE_COLUMNS) + "\n")
+            write_atomically(self.config_file, to_yaml(config))
+            write_atomically(self.episodes_file, ",".join(EPISODE_COLUMNS) + "\n")
         except FileExistsError as error:
             if self.must_be_new:
-                raise ConfigError(f"another run has just taken '{self.path}'; start this one again") from None
+                raise ConfigError(f"another run has just created '{self.path}'; start this one again") from None
             raise unwritable(self.path, f"'{error.filename}' is in the way; move it away") from None
         except OSError as error:
             raise unwritable(self.path, error.strerror) from None
@@ -104,12 +104,12 @@ class RunDirectory:
             csv.writer(file, lineterminator="\n").writerows(rows)
 
     def write_summary(self, summary: Mapping[str, Any]) -> None:
-        """Writes `summary.json`, whole or not at all; it is what makes a run finished.
+        """Writes `summary.json` atomically; a run that has one is finished.
 
         Raises:
             ConfigError: if it cannot be written.
         """
-        write_whole(self.summary_file, json.dumps(plain(summary), indent=2, allow_nan=False) + "\n")
+        write_atomically(self.summary_file, json.dumps(plain(summary), indent=2, allow_nan=False) + "\n")
 
     def write_trajectory(self, columns: Mapping[str, np.ndarray]) -> None:
         """Writes `trajectory.csv` from one [T] array for each of `TRAJECTORY_COLUMNS`.
@@ -119,14 +119,14 @@ class RunDirectory:
         """
         table = np.stack([np.asarray(columns[name], np.float64) for name in TRAJECTORY_COLUMNS], axis=1)
         lines = [",".join(TRAJECTORY_COLUMNS), *(",".join(f"{value:.7g}" for value in row) for row in table)]
-        write_whole(self.trajectory_file, "\n".join(lines) + "\n")
+        write_atomically(self.trajectory_file, "\n".join(lines) + "\n")
 
     def read_metrics(self) -> list[dict[str, Any]]:
-        """The lines of `metrics.jsonl`."""
+        """Returns the lines of `metrics.jsonl`."""
         return [json.loads(line) for line in self.metrics_file.read_text(encoding="utf-8").splitlines()]
 
     def read_episodes(self) -> dict[str, np.ndarray]:
-        """The columns of `episodes.csv`, each [episodes]."""
+        """Returns the columns of `episodes.csv`, each [episodes]."""
         with self.episodes_file.open(encoding="utf-8", newline="") as file:
             rows = list(csv.reader(file))[1:]
         kinds = (np.int64, np.float64, np.int64, np.str_)
@@ -137,16 +137,16 @@ class RunDirectory:
 
 
 def plan_run_directory(given: Path | None, config: Config, resume: Resume = "auto") -> RunDirectory:
-    """The folder that a run may write into; nothing is made yet.
+    """Returns the folder that a run may write into, without creating it.
 
     Args:
-        given: the folder asked for; None is a fresh, dated one under `runs/`.
-        config: names the world and the seed of a fresh one.
-        resume: `never` starts an unfinished run of ours over; `auto` and `must` would continue it.
+        given: the folder asked for; None is a new, dated one under `runs/`.
+        config: gives the world and the seed for the name of a new folder.
+        resume: `never` restarts an unfinished run; `auto` and `must` refuse it, since it cannot be continued yet.
 
     Raises:
-        ConfigError: if the folder is foreign, holds a finished run, cannot be written, or holds no run to
-            continue where there must be one.
+        ConfigError: if the folder holds other files or a finished run, cannot be written, or holds no run
+            although `resume` is `must`.
     """
     if given is None:
         if resume == "must":
@@ -155,13 +155,13 @@ def plan_run_directory(given: Path | None, config: Config, resume: Resume = "aut
     run = RunDirectory(given)
     try:
         taken = given.exists()
-    except OSError as error:  # a name that no file system takes
+    except OSError as error:  # a name that the file system does not accept
         raise unwritable(given, error.strerror) from None
     if taken and not given.is_dir():
         raise ConfigError(f"--run-dir '{given}' is a file; give a folder")
     occupied = taken and any(given.iterdir())
     if occupied and not _is_ours(run.config_file):
-        raise ConfigError(f"--run-dir '{given}' holds files that are no run of edqn; give a new or empty folder")
+        raise ConfigError(f"--run-dir '{given}' holds files that are not an edqn run; give a new or empty folder")
     if run.summary_file.is_file():
         raise ConfigError(f"--run-dir '{given}' holds a finished run; give another folder")
     if resume == "must" and not occupied:
@@ -176,7 +176,7 @@ def plan_run_directory(given: Path | None, config: Config, resume: Resume = "aut
 
 
 def plain(value: Any) -> Any:
-    """`value` as JSON has it: arrays of NumPy and JAX as numbers and lists, what is not finite as None."""
+    """Returns `value` as plain JSON data: NumPy and JAX arrays as numbers and lists, NaN and Inf as None."""
     if isinstance(value, Mapping):
         return {str(key): plain(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
@@ -201,7 +201,7 @@ def _fresh(parent: Path, config: Config) -> Path:
 
 
 def _is_ours(config_file: Path) -> bool:
-    """Whether a folder's `config.yaml` is one of ours."""
+    """Returns whether `config.yaml` is a configuration of this package."""
     try:
         apply(Config(), load_layer(config_file), str(config_file))
     except ConfigError:

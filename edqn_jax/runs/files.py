@@ -1,4 +1,4 @@
-"""Files that a command leaves behind: checked before anything costs time, written whole or not at all."""
+"""Files that a command leaves behind: checked before anything costs time, written atomically."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from pathlib import Path
 from edqn_jax.errors import ConfigError
 
 
-def write_whole(file: Path, content: str | bytes) -> None:
-    """Writes a file, text as UTF-8; whoever reads it, even after a kill, finds the old one or the new one, never half.
+def write_atomically(file: Path, content: str | bytes) -> None:
+    """Writes a file atomically, text as UTF-8: after an interruption the old or the new content is there, never a part.
 
     Raises:
         ConfigError: if it cannot be written.
@@ -27,10 +27,10 @@ def write_whole(file: Path, content: str | bytes) -> None:
 
 
 def check_can_write(file: Path) -> None:
-    """Nothing if `write_whole` can write the file, in a folder that is there.
+    """Raises ConfigError if `write_atomically` cannot write the file. Its folder must exist.
 
     Raises:
-        ConfigError: if it cannot.
+        ConfigError: says why the file cannot be written.
     """
     folder = file.absolute().parent
     if not os.path.isdir(folder):
@@ -41,10 +41,10 @@ def check_can_write(file: Path) -> None:
 
 
 def check_can_make(folder: Path) -> None:
-    """Nothing if the folder can be written into, or can be made together with those above it that are missing.
+    """Raises ConfigError if the folder is not writable, and cannot be created together with missing parents.
 
     Raises:
-        ConfigError: if it cannot.
+        ConfigError: says why it cannot be written.
     """
     there = folder.absolute()
     while not there.exists() and there != there.parent:
@@ -55,13 +55,14 @@ def check_can_make(folder: Path) -> None:
 
 
 def unwritable(path: Path, reason: str | None) -> ConfigError:
-    """The error for a file or folder that cannot be written; `reason` is None where the system gives none."""
+    """Returns the error for a file or folder that cannot be written; `reason` is None where the system gives none."""
     return ConfigError(f"'{path}' cannot be written: {reason or 'unknown reason'}")
 
 
 def _check_can_make(path: Path, there: Path, name: str = "") -> None:
-    # By doing it: permissions do not tell for root, nor on every file system. `name` grows as in `write_whole`.
+    # Tries it: permission bits say nothing for root or on some file systems. `name` is lengthened as in
+    # `write_atomically`.
     try:
         os.rmdir(tempfile.mkdtemp(prefix=name, dir=there))
     except OSError as error:
-        raise unwritable(path, f"nothing can be made in '{there}' ({error.strerror or 'unknown reason'})") from None
+        raise unwritable(path, f"nothing can be created in '{there}' ({error.strerror or 'unknown reason'})") from None

@@ -1,4 +1,4 @@
-"""A saved run as configuration and policy."""
+"""Loading a saved run: its configuration and its policy."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from edqn_jax.errors import ConfigError
 from edqn_jax.learn import embedding
 from edqn_jax.learn.policy import Policy, PolicyParams, fresh_policy
 from edqn_jax.runs.checkpoints import load_params, save_params
-from edqn_jax.runs.files import check_can_make, write_whole
+from edqn_jax.runs.files import check_can_make, write_atomically
 
 
 def load_policy(run: str | Path) -> Policy:
@@ -39,14 +39,14 @@ def save_policy(policy: Policy, folder: str | Path) -> None:
         raise ConfigError(f"'{folder}' holds files already; give a new or empty folder")
     folder.mkdir(parents=True, exist_ok=True)
     save_params(folder / "checkpoints", policy.params)
-    write_whole(folder / "config.yaml", to_yaml(policy.config))
+    write_atomically(folder / "config.yaml", to_yaml(policy.config))
 
 
 def load_run(folder: Path) -> tuple[Config, PolicyParams]:
-    """Configuration and policy of a run, or of any folder with its `config.yaml` and `checkpoints/`.
+    """Returns the configuration and the policy of a run, or of any folder with `config.yaml` and `checkpoints/`.
 
     Raises:
-        ConfigError: if there is none, or its parts are incomplete or do not fit each other.
+        ConfigError: if there is none, or its parts are incomplete or do not match.
     """
     file = folder / "config.yaml"
     if not file.is_file():
@@ -55,7 +55,7 @@ def load_run(folder: Path) -> tuple[Config, PolicyParams]:
     validate(config)
     params = load_params(folder / "checkpoints")
     fresh = jax.eval_shape(lambda: fresh_policy(config))
-    # As policies were saved before their pixel features were written out.
+    # Older policies hold the pixel network itself in place of its table.
     learnt = jax.eval_shape(lambda: embedding.init(config, jax.random.key(0)))
     if _shapes(params) == _shapes(dataclasses.replace(fresh, encoder=learnt)):
         params = dataclasses.replace(params, encoder=jax.tree.map(np.asarray, embedding.acting(config, params.encoder)))

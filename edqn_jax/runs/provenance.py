@@ -1,4 +1,4 @@
-"""What a figure or a run is for and came from: its workload, its versions, its state."""
+"""Provenance of a run or a measured figure: workload, versions, digest of the state, reward."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from edqn_jax.sim.sensor import frames_per_decision
 
 
 def workload(config: Config, scene: Scene) -> dict[str, Any]:
-    """The workload that a figure is for, as every JSON of ours states it."""
+    """Returns the workload that a figure was measured for, as in the JSON of runs and benchmarks."""
     agent, envs = config.agent, config.train.num_envs
     return {
         "physics_steps_per_decision": config.drone.physics_steps,
@@ -39,13 +39,13 @@ def workload(config: Config, scene: Scene) -> dict[str, Any]:
 
 
 def versions() -> dict[str, str]:
-    """Versions of what a figure depends on."""
+    """Returns the versions of Python and of the packages that figures depend on."""
     packages = ("jax", "mujoco", "mujoco-mjx", "flax", "optax", "numpy")
     return {"python": platform.python_version(), **{name: metadata.version(name) for name in packages}}
 
 
 def state_digest(state: TrainState) -> str:
-    """SHA-256 over the leaves of the train state in the order of the pytree; every process must call this."""
+    """Returns the SHA-256 of the train state's leaves in pytree order; every process must call this."""
     digest = hashlib.sha256()
     for leaf in jax.tree.leaves(state):
         raw = jax.random.key_data(leaf) if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key) else leaf
@@ -56,7 +56,7 @@ def state_digest(state: TrainState) -> str:
 
 
 def reward_record(config: Config, reward: Reward | None) -> dict[str, str | None]:
-    """Returns what a run says of its reward: the name, and for a user's own a SHA-256 digest of its source.
+    """Returns a reward's name, and for a reward function the SHA-256 of its source.
 
     The digest is None for the configured rewards, and where Python cannot find the source.
     """
