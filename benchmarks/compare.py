@@ -27,13 +27,13 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import json_report
-from child import Child, ChildEndedError
 from edqn_jax.errors import ConfigError
 from edqn_jax.runs.files import check_can_write
-from flags import configured, split
-from parts import PARTS
-from worker import WHOLE
+from measurement import json_report
+from measurement.child import Child, ChildEndedError
+from measurement.flags import configured, split
+from measurement.parts import PARTS
+from measurement.worker import WHOLE
 
 ROOT = Path(__file__).resolve().parents[1]
 REPEATS, QUICK_REPEATS = 10, 6
@@ -109,7 +109,8 @@ class Worker(Child):
 
     def __init__(self, checkout: Path, rows: Sequence[str], words: Sequence[str], complaints: Path) -> None:
         self.checkout = checkout
-        super().__init__(checkout, ROOT / "benchmarks" / "worker.py", [json.dumps(list(rows)), *words], complaints)
+        script = ROOT / "benchmarks" / "measurement" / "worker.py"
+        super().__init__(checkout, script, [json.dumps(list(rows)), *words], complaints)
         self.about: dict[str, Any] = {}
 
     def wait_until_ready(self) -> None:

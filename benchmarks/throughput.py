@@ -24,8 +24,6 @@ import jax
 import numpy as np
 from jax.sharding import Mesh
 
-import json_report
-from ceilings import Rollout, ceilings
 from edqn_jax.config import Config
 from edqn_jax.errors import ConfigError
 from edqn_jax.evaluation.missions import run_missions
@@ -33,10 +31,12 @@ from edqn_jax.learn.trainer import AXIS
 from edqn_jax.parallel.devices import choose_devices, cores, use_cpu_devices
 from edqn_jax.runs.files import check_can_write
 from edqn_jax.runs.provenance import workload
-from flags import configured, split
-from parts import parts_of
-from timing import Timed
-from whole import WholeStep, steady
+from measurement import json_report
+from measurement.ceilings import Rollout, ceilings
+from measurement.flags import configured, split
+from measurement.parts import parts_of
+from measurement.timing import Timed
+from measurement.whole import WholeStep, steady
 
 REPEATS = 5
 

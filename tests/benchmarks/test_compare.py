@@ -13,12 +13,12 @@ import pytest
 import compare
 import throughput
 from edqn_jax.errors import ConfigError
-from tests.miniature import MINIATURE
-from worker import WHOLE
+from measurement.worker import WHOLE
+from tests.benchmarks.miniature import MINIATURE
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 STUB = """
-from flags import configured, split
+from measurement.flags import configured, split
 
 class Part:
     name = "acting"
@@ -57,7 +57,7 @@ def repository(tmp_path: Path) -> Path:
     git(folder, "init", "--quiet")
     for name in ("edqn_jax", "scenes"):
         (folder / name).symlink_to(ROOT / name)
-    (folder / "benchmarks" / "flags.py").symlink_to(ROOT / "benchmarks" / "flags.py")
+    (folder / "benchmarks" / "measurement").symlink_to(ROOT / "benchmarks" / "measurement")
     commit(folder, "nothing to time")
     for tag, cost in (("slow", 80.0), ("fast", 40.0)):
         (folder / "benchmarks" / "throughput.py").write_text(STUB.format(cost=cost))
