@@ -1,6 +1,6 @@
-"""A process that a benchmark keeps alive and asks in turns: what each side of the conversation needs.
+"""A process that a benchmark keeps running and sends requests to: both ends of the pipe.
 
-The child says one line of JSON when it is ready, and one for each line that it is asked, until its input ends.
+The child prints one line of JSON when it is ready and one in answer to each line of its input, until the input ends.
 """
 
 from __future__ import annotations
@@ -16,56 +16,59 @@ from typing import Any, TextIO
 
 
 class ChildEndedError(RuntimeError):
-    """The child has ended instead of answering; the message is the last that it said on its standard error."""
+    """The child ended instead of answering; the message is the last line of its standard error."""
 
 
 class Child:
-    """The asking side. A context, at whose end the process ends."""
+    """The parent's end. A context manager; the child is killed when the block ends."""
 
-    def __init__(self, checkout: Path, script: Path, words: Sequence[str], complaints: Path) -> None:
-        """Starts `script` with `words`, with the package and the benchmarks of `checkout`.
+    def __init__(self, checkout: Path, script: Path, words: Sequence[str], log: Path) -> None:
+        """Starts a script that imports the package and the benchmarks of a checkout.
 
-        Its standard error goes to the file `complaints`.
+        Args:
+            checkout: folder that has `edqn_jax` and `benchmarks`.
+            script: what Python runs.
+            words: its arguments.
+            log: file for its standard error.
         """
-        self.complaints = complaints
-        # Before all else the checkout's own; what else this process was given comes after.
+        self.log = log
         own = (str(checkout), str(checkout / "benchmarks"))
         path = os.pathsep.join(filter(None, (*own, os.environ.get("PYTHONPATH"))))
-        # Several processes share the accelerator, if there is one.
+        # Without preallocation, because several processes share the accelerator if there is one.
         environment = {"XLA_PYTHON_CLIENT_PREALLOCATE": "false", **os.environ, "PYTHONPATH": path}
-        with complaints.open("w", encoding="utf-8") as log:
+        with log.open("w", encoding="utf-8") as errors:
             self.process = subprocess.Popen(
                 [sys.executable, "-P", str(script), *words],
                 env=environment,
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
-                stderr=log,
+                stderr=errors,
                 text=True,
                 bufsize=1,
             )
 
     def ask(self, line: str) -> Any:
-        """What the child answers to `line`.
+        """Sends one line and returns the answer.
 
         Raises:
-            ChildEndedError: if it does not.
+            ChildEndedError: if there is no answer.
         """
         assert self.process.stdin is not None
-        with contextlib.suppress(BrokenPipeError):  # it has ended: there will be no answer
+        with contextlib.suppress(BrokenPipeError):  # it has ended; `answer` says so
             self.process.stdin.write(line + "\n")
         return self.answer()
 
     def answer(self) -> Any:
-        """The next thing that the child says.
+        """Returns the next line that the child prints, parsed.
 
         Raises:
-            ChildEndedError: if it has ended.
+            ChildEndedError: if the child has ended.
         """
         assert self.process.stdout is not None
         line = self.process.stdout.readline()
         if not line:
-            said = self.complaints.read_text(encoding="utf-8", errors="replace").strip().splitlines()
-            raise ChildEndedError(said[-1] if said else "it said nothing")
+            errors = self.log.read_text(encoding="utf-8", errors="replace").strip().splitlines()
+            raise ChildEndedError(errors[-1] if errors else "it printed no error")
         return json.loads(line)
 
     def __enter__(self) -> Child:
@@ -77,7 +80,7 @@ class Child:
 
 
 def answers() -> TextIO:
-    """Where the child's answers go; from here on whatever else prints goes to its standard error."""
+    """Returns the stream for the child's answers; all other output goes to standard error from here on."""
     stream = os.fdopen(os.dup(1), "w", buffering=1)
     os.dup2(2, 1)
     return stream
