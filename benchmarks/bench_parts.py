@@ -22,10 +22,10 @@ from pytest_benchmark.fixture import BenchmarkFixture
 from edqn_jax.evaluation.missions import run_missions
 from edqn_jax.learn.trainer import AXIS, Plan, Trainer
 from edqn_jax.parallel.devices import choose_devices, use_cpu_devices
-from flags import configured
-from parts import PARTS, Moment
-from timing import Timed
-from whole import steady
+from measurement.flags import configured
+from measurement.parts import PARTS, Moment
+from measurement.timing import Timed
+from measurement.whole import steady
 
 STEPS = 20
 """Enough that starting a compiled program does not pass for a small part's own time."""

@@ -1,16 +1,20 @@
-"""Which of two commits is faster, and by how much? Both timed in one run, turn by turn.
+"""Which of two commits is faster, and by how much? Both are timed in one run, in turns.
 
-Each commit is checked out into a temporary folder and timed by a process of its own, with its own package and its
-own `benchmarks/throughput.py`. Both processes stay alive and are asked in turns, A B, B A, A B ..., one row at a
-time, so that a slow minute hits both alike. The ratio is the median of the pairs' ratios. Its interval holds the
-true median in at least 95 of 100 runs, from six turns on; with fewer it is the least and the largest ratio. Compare
-a commit with itself to see what two processes of the same code differ by. A row whose meaning changed between the
-commits compares two things.
+Each commit is checked out into a temporary folder and timed by a process of its own that runs the commit's own package
+and benchmarks. The two processes take turns, A B, B A, A B ..., one row at a time, so that a change in the machine's
+speed affects both. The ratio is the median of the ratios of the pairs. With at least six turns its interval contains
+the true median with a probability of at least 95 %; with fewer it is the smallest and the largest ratio. Compare a
+commit with itself to see the difference between two processes of the same code. If the meaning of a row changed between
+the commits, its ratio compares two different things.
 
     python benchmarks/compare.py main HEAD
     python benchmarks/compare.py v1 HEAD --rows whole_training_step rendering -- --num-envs 1024
 
-What stands after -- goes to both commits' configuration as it would for train.py.
+A commit can be compared if it has a worker, benchmarks/measurement/worker.py or, in older commits,
+benchmarks/worker.py: that is every commit since this script was added. The layout of the rest of the commit does not
+matter, because its own worker times it. Both commits must run with the packages that are installed here.
+
+Arguments after -- are options of train.py; both commits are timed with them, so both must have them.
 """
 
 from __future__ import annotations
@@ -27,62 +31,64 @@ from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import json_report
-from child import Child, ChildEndedError
 from edqn_jax.errors import ConfigError
 from edqn_jax.runs.files import check_can_write
-from flags import configured, split
-from parts import PARTS
-from worker import WHOLE
+from measurement import json_report
+from measurement.child import Child, ChildEndedError
+from measurement.flags import configured, split
+from measurement.parts import PARTS
+from measurement.whole import WHOLE
 
 ROOT = Path(__file__).resolve().parents[1]
 REPEATS, QUICK_REPEATS = 10, 6
 TIMED = ("edqn_jax", "benchmarks", "scenes")
-"""What of a checkout decides about its speed."""
+"""Folders of a checkout whose content affects what is timed."""
+WORKERS = ("benchmarks/measurement/worker.py", "benchmarks/worker.py")
+"""Where a commit has its worker: in its present place or its older one. The interface of all workers is the same."""
 
 # ------------------------------------------------------------------------------------------ commits
 
 
 def find_commit(root: Path, name: str) -> str:
-    """The commit's full name.
+    """Returns the full hash of a commit.
 
     Raises:
-        ConfigError: if there is none of that name, or nothing in it to time it with.
+        ConfigError: if there is no such commit, or it has no worker.
     """
     found = _git(root, "rev-parse", "--verify", "--quiet", "--end-of-options", f"{name}^{{commit}}")
-    commit = found.stdout.strip()
     if found.returncode:
         raise ConfigError(f"there is no commit '{name}' in '{root}'")
-    if _git(root, "cat-file", "-e", f"{commit}:benchmarks/throughput.py").returncode:
-        raise ConfigError(f"commit '{name}' cannot be timed: it has no benchmarks/throughput.py")
+    commit = found.stdout.strip()
+    if all(_git(root, "cat-file", "-e", f"{commit}:{worker}").returncode for worker in WORKERS):
+        raise ConfigError(
+            f"commit '{name}' cannot be compared: it is older than compare.py, with neither {' nor '.join(WORKERS)}"
+        )
     return commit
 
 
 def check_committed(root: Path, commits: Mapping[str, str]) -> None:
-    """Nothing, unless one of the commits is checked out here and the working tree is not that commit.
+    """Raises ConfigError if a commit is checked out at `root` and the working tree differs from it.
 
     Args:
-        commits: the names that were asked for, and the commits' full ones.
-
-    Raises:
-        ConfigError: since what would be timed is not what is on the disk.
+        root: the repository.
+        commits: full hashes by the names that the user gave.
     """
     head = _git(root, "rev-parse", "HEAD").stdout.strip()
     changed = _git(root, "status", "--porcelain", "--", *TIMED).stdout.splitlines()
     for name, commit in commits.items():
         if commit == head and changed:
             raise ConfigError(
-                f"'{name}' is checked out here with changes that are in no commit, such as in "
-                f"'{changed[0][3:]}'; commit or stash them, for only commits are timed"
+                f"'{name}' is checked out here with uncommitted changes, such as in '{changed[0][3:]}'; "
+                "commit or stash them, because only commits are timed"
             )
 
 
 @contextlib.contextmanager
 def checked_out(root: Path, commit: str, folder: Path) -> Iterator[Path]:
-    """A worktree of the commit at `folder`, gone after the block.
+    """Checks the commit out into a worktree at `folder`, which is removed after the block.
 
     Raises:
-        ConfigError: if git cannot make it.
+        ConfigError: if git cannot create the worktree.
     """
     made = _git(root, "worktree", "add", "--quiet", "--detach", str(folder), commit)
     if made.returncode:
@@ -98,32 +104,33 @@ def _git(root: Path, *words: str) -> subprocess.CompletedProcess[str]:
 
 
 def _last_line(text: str) -> str:
-    return (text.strip().splitlines() or ["it said nothing"])[-1]
+    return (text.strip().splitlines() or ["git printed no error"])[-1]
 
 
 # ------------------------------------------------------------------------------------------ workers
 
 
 class Worker(Child):
-    """A process that times one commit, as `worker.py` says."""
+    """The process that times one commit: the commit's own `worker.py`."""
 
-    def __init__(self, checkout: Path, rows: Sequence[str], words: Sequence[str], complaints: Path) -> None:
+    def __init__(self, checkout: Path, rows: Sequence[str], words: Sequence[str], log: Path) -> None:
         self.checkout = checkout
-        super().__init__(checkout, ROOT / "benchmarks" / "worker.py", [json.dumps(list(rows)), *words], complaints)
+        script = next(file for worker in WORKERS if (file := checkout / worker).is_file())
+        super().__init__(checkout, script, [json.dumps(list(rows)), *words], log)
         self.about: dict[str, Any] = {}
 
     def wait_until_ready(self) -> None:
-        """Until everything is compiled.
+        """Waits until everything is compiled.
 
         Raises:
             ConfigError: if the commit cannot be timed.
         """
         self.about = self.answer()
         if not Path(self.about["package"]).is_relative_to(self.checkout):
-            raise ConfigError(f"the package was taken from '{self.about['package']}', not from '{self.checkout}'")
+            raise ConfigError(f"edqn_jax was imported from '{self.about['package']}', not from '{self.checkout}'")
 
     def answer(self) -> Any:
-        """What the worker says next: what it is, then microseconds of one device a decision.
+        """Returns the worker's next answer: first its description, then microseconds of one device per decision.
 
         Raises:
             ConfigError: if the commit cannot be timed.
@@ -138,7 +145,7 @@ class Worker(Child):
 
 
 def take_turns(workers: Sequence[Worker], rows: Sequence[str], repeats: int) -> dict[str, list[list[float]]]:
-    """For each row the turns of both workers: A B, then B A, and so on."""
+    """Returns the measurements of both workers for each row, taken in the order A B, B A, A B ..."""
     turns: dict[str, list[list[float]]] = {row: [[] for _ in workers] for row in rows}
     for repeat in range(repeats):
         sides = list(range(len(workers)))
@@ -149,10 +156,11 @@ def take_turns(workers: Sequence[Worker], rows: Sequence[str], repeats: int) -> 
 
 
 def compared(name: str, first: Sequence[float], second: Sequence[float]) -> dict[str, Any]:
-    """A row: medians of both, and the ratio of the second to the first with its interval.
+    """Returns a row: the median of each commit, and the ratio of the second to the first with its interval.
 
     Args:
-        first, second: costs; those in one place were taken one after the other.
+        name: of the row.
+        first, second: costs by turn; those at the same index were measured one after the other.
     """
     ratios = sorted(b / a for a, b in zip(first, second, strict=True))
     low, high = median_interval(ratios)
@@ -169,10 +177,11 @@ def compared(name: str, first: Sequence[float], second: Sequence[float]) -> dict
 
 
 def median_interval(values: Sequence[float]) -> tuple[float, float]:
-    """An interval of 95 % at least for the median of what `values` are draws of, whatever its distribution.
+    """Returns a 95 % confidence interval for the median of the distribution that `values` were drawn from.
 
-    Between two of the values, as far in as a fair coin allows: the median lies below the k-th smallest of n only
-    if fewer than k of n tosses are heads. Fewer than six values cannot be that sure; it is then all of their range.
+    The interval is distribution-free: the median is below the k-th smallest of n values with the probability that
+    fewer than k of n tosses of a fair coin are heads. Fewer than six values cannot reach 95 %; the interval is then
+    their range.
     """
     ordered, count = sorted(values), len(values)
     left_out = 0
@@ -184,10 +193,10 @@ def median_interval(values: Sequence[float]) -> tuple[float, float]:
 def measure(
     root: Path, names: Sequence[str], rows: Sequence[str], repeats: int, words: Sequence[str]
 ) -> dict[str, Any]:
-    """Everything that `--json` holds.
+    """Times both commits and returns the report that `--json` writes.
 
     Raises:
-        ConfigError: if one of the commits is none, or cannot be timed.
+        ConfigError: if a commit does not exist or cannot be timed.
     """
     commits = [find_commit(root, name) for name in names]
     check_committed(root, dict(zip(names, commits, strict=True)))
@@ -219,20 +228,20 @@ def measure(
 
 
 def differing(first: Mapping[str, Any], second: Mapping[str, Any]) -> dict[str, list[Any]]:
-    """What the workloads do not have in common: both values of each. A ratio then compares two workloads."""
+    """Returns the entries in which the two workloads differ, as [first, second] by key."""
     a, b = first["workload"], second["workload"]
     return {key: [a.get(key), b.get(key)] for key in sorted(a.keys() | b.keys()) if a.get(key) != b.get(key)}
 
 
 def table(report: dict[str, Any]) -> str:
-    """The figures for people, in Markdown."""
+    """Returns the report as a Markdown table."""
     a, b = report["commits"]
     lines = [
         f"A is {a['name']} ({a['commit'][:10]}), B is {b['name']} ({b['commit'][:10]}); {report['device']}, "
         f"{len(report['devices'])} devices, {report['workload']['num_envs']} environments; {report['repeats']} turns "
         "each. Below 1, B is faster.",
         "",
-        "| µs of one device a decision | A | B | B / A | interval |",
+        "| µs of one device per decision | A | B | B / A | interval |",
         "| --- | ---: | ---: | ---: | ---: |",
     ]
     for row in report["rows"]:
@@ -247,22 +256,24 @@ def table(report: dict[str, Any]) -> str:
 
 
 def parse(argv: Sequence[str] | None = None) -> tuple[argparse.Namespace, list[str]]:
-    """The arguments, and the words that both workers give to their `throughput.py`.
+    """Returns the parsed arguments, and the arguments that both workers pass to their `throughput.py`.
 
     Raises:
-        ConfigError: if a row is unknown, the flags after -- cannot be run, or the file cannot be written.
+        ConfigError: if a row is unknown, the options after -- are invalid, or the file cannot be written.
     """
     words, flags = split(sys.argv[1:] if argv is None else argv)
     parser = argparse.ArgumentParser(
-        description=(__doc__ or "").partition("\n")[0],
-        epilog="All rows take about five minutes on two cores. Flags after -- are train.py's.",
+        prog="python benchmarks/compare.py",
+        description=__doc__,
+        epilog="All rows take about five minutes on two cores.",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("a", metavar="COMMIT_A", help="what is compared with")
-    parser.add_argument("b", metavar="COMMIT_B", help="what is compared")
-    parser.add_argument("--rows", nargs="+", default=[], metavar="ROW", help="which (default: all that both have)")
+    parser.add_argument("a", metavar="COMMIT_A", help="the commit to compare with")
+    parser.add_argument("b", metavar="COMMIT_B", help="the commit to compare")
+    parser.add_argument("--rows", nargs="+", default=[], metavar="ROW", help="rows to time (default: all common rows)")
     parser.add_argument("--repeats", type=int, help=f"turns of each row (default {REPEATS}, quick {QUICK_REPEATS})")
     parser.add_argument("--quick", action="store_true", help="fewer and shorter turns")
-    parser.add_argument("--json", type=Path, help="write the rows to this file")
+    parser.add_argument("--json", type=Path, help="write the report to this file")
     args = parser.parse_args(words)
     if args.repeats is None:
         args.repeats = QUICK_REPEATS if args.quick else REPEATS
@@ -273,12 +284,12 @@ def parse(argv: Sequence[str] | None = None) -> tuple[argparse.Namespace, list[s
             raise ConfigError(f"there is no row '{row}'; there are {', '.join((WHOLE, *PARTS))}")
     if args.json is not None:
         check_can_write(args.json)
-    configured(flags)  # or a sentence, before anything is checked out
+    configured(flags)  # raises before anything is checked out
     return args, [*(["--quick"] if args.quick else []), "--", *flags]
 
 
 def main(argv: Sequence[str] | None = None, root: Path = ROOT) -> int:
-    """Exit code 0 when both were measured, 2 for bad input."""
+    """Returns exit code 0 after both commits were timed, 2 for invalid input."""
     try:
         args, words = parse(argv)
         report = measure(root, [args.a, args.b], args.rows, args.repeats, words)

@@ -23,7 +23,7 @@ from typing import Any
 
 import jax
 
-import json_report
+from conventional_stack.settings import DRONES, PACKAGES, SETTINGS
 from edqn_jax.config import Config
 from edqn_jax.errors import ConfigError
 from edqn_jax.evaluation.missions import run_missions
@@ -32,20 +32,12 @@ from edqn_jax.planners.packages import MissingPackageError
 from edqn_jax.runs.files import check_can_write
 from edqn_jax.runs.provenance import workload
 from edqn_jax.sim.mjcf import load_scene, resolve_world
-from flags import configured, split
-from whole import steady
-
-DRONES = 512
-"""Drones at once unless the flags say otherwise: with fewer, what PyTorch and Python cost once a step weighs more."""
+from measurement import json_report
+from measurement.flags import configured, split
+from measurement.whole import steady
 
 DECISIONS = 20_480
 REPEATS = 5
-
-PACKAGES = ("gymnasium", "numba", "stable-baselines3", "torch")
-"""What the extra brings, whose versions the figures depend on."""
-
-SETTINGS = ((1, 1), (2, 1), (2, 2))
-"""Processes that fly, and threads of PyTorch."""
 
 
 def parse(argv: Sequence[str] | None = None) -> tuple[argparse.Namespace, Config]:

@@ -21,7 +21,6 @@ from typing import Any
 
 import jax
 
-import json_report
 from edqn_jax.config import Config
 from edqn_jax.errors import ConfigError
 from edqn_jax.evaluation.latency import decision_latency_ms
@@ -29,7 +28,8 @@ from edqn_jax.evaluation.missions import run_missions
 from edqn_jax.learn.policy import fresh_policy
 from edqn_jax.runs.files import check_can_write
 from edqn_jax.runs.provenance import workload
-from flags import configured, split
+from measurement import json_report
+from measurement.flags import configured, split
 
 REPEATS, CALLS = 5, 2000
 

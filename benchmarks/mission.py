@@ -22,13 +22,13 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import json_report
 from edqn_jax.cli.arguments import parse_train
 from edqn_jax.config.loading import to_yaml
 from edqn_jax.evaluation.metrics import wilson_interval
 from edqn_jax.parallel.devices import processor
 from edqn_jax.runs.files import check_can_write, write_atomically
-from flags import split
+from measurement import json_report
+from measurement.flags import split
 
 TRAIN = Path(__file__).resolve().parents[1] / "train.py"
 

@@ -35,10 +35,7 @@ from typing import Any
 
 import jax
 
-import json_report
-import runtime_table
-from child import Child, ChildEndedError
-from conventional import DRONES
+from conventional_stack.settings import DRONES
 from edqn_jax.cli.arguments import parse_train
 from edqn_jax.config import DENSITIES, Config
 from edqn_jax.config.loading import nearest, to_yaml
@@ -47,14 +44,17 @@ from edqn_jax.parallel.devices import cores
 from edqn_jax.planners.planner import IMPROVING, PLANNERS
 from edqn_jax.runs.files import check_can_write
 from edqn_jax.sim.scene import Scene
-from flags import configured as for_timing
-from flags import split
-from learners import LEARNERS, sensing
-from planning import judged_scenes, shortest_length
-from rows import Row, joined
-from runtime_figure import draw_runtime
-from stack import STACK, STEADY
-from whole import steady
+from measurement import json_report
+from measurement.child import Child, ChildEndedError
+from measurement.flags import configured as for_timing
+from measurement.flags import split
+from measurement.whole import steady
+from rivals import table
+from rivals.figure import draw_runtime
+from rivals.learners import LEARNERS, sensing
+from rivals.planning import judged_scenes, shortest_length
+from rivals.rows import Row, figures, joined, worth
+from rivals.stack import STACK, STEADY
 
 ROOT = Path(__file__).resolve().parents[1]
 WORLDS, QUICK_WORLDS = ("paper", "medium"), ("paper",)
@@ -238,7 +238,7 @@ def launched(
         file = folder / f"{number}.yaml"
         file.write_text(to_yaml(config), encoding="utf-8")
         words = [name, str(file), str(budget), str(count)]
-        child = Child(ROOT, ROOT / "benchmarks" / "rival.py", words, folder / f"{number}.log")
+        child = Child(ROOT, ROOT / "benchmarks" / "rivals" / "rival.py", words, folder / f"{number}.log")
         children[name] = stack.enter_context(child)
         waiting.append(name)
         if len(waiting) >= cores():
@@ -404,10 +404,10 @@ def report_of(rows: Sequence[Row], rates: Sequence[dict[str, Any]]) -> dict[str,
         "device": ran["device"] if ran else None,
         "devices": ran["devices"] if ran else [],
         "versions": ran["versions"] if ran else {},
-        "rows": [{**row, **runtime_table.figures(row)} for row in rows],
+        "rows": [{**row, **figures(row)} for row in rows],
         "rates": list(rates),
-        "worth": [dataclasses.asdict(one) for one in runtime_table.worth(rows)],
-        "paper": {"source": runtime_table.PAPER_SOURCE, "run_time_s": runtime_table.PAPER_RUN_TIME_S},
+        "worth": [dataclasses.asdict(one) for one in worth(rows)],
+        "paper": {"source": table.PAPER_SOURCE, "run_time_s": table.PAPER_RUN_TIME_S},
     }
 
 
@@ -436,7 +436,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         complaints.append(str(error))
     for complaint in complaints:
         tell(complaint)
-    print(runtime_table.text(rows, rates))  # last: a closed pipe must not cost the files
+    print(table.text(rows, rates))  # last: a closed pipe must not cost the files
     return 2 if complaints else 0
 
 

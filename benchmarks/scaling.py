@@ -22,139 +22,30 @@ import statistics
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-import json_report
-from boxes import world_of_boxes
-from ceilings import Rollout
+from curves.figure import draw_scaling
+from curves.sizes import CURVES, Curve, changed
+from curves.state_bytes import StateBytes, state_bytes
 from edqn_jax.config import Config
-from edqn_jax.config.limits import validate
-from edqn_jax.config.loading import Layer, apply
 from edqn_jax.errors import ConfigError
 from edqn_jax.evaluation.missions import RunMissions, run_missions
 from edqn_jax.parallel.devices import choose_devices, use_cpu_devices
 from edqn_jax.runs.files import check_can_write
 from edqn_jax.runs.provenance import workload
-from edqn_jax.sim.mjcf import write_scene
-from flags import configured, split
-from memory import StateBytes, state_bytes
-from scaling_figure import draw_scaling
-from whole import WholeStep, steady
+from measurement import json_report
+from measurement.ceilings import Rollout
+from measurement.flags import configured, split
+from measurement.whole import WholeStep, steady
 
 REPEATS, QUICK_REPEATS = 7, 3
 DECISIONS, QUICK_DECISIONS = 4096, 2048
 """Decisions in a chunk, about."""
-BOXES = (8, 16, 30, 60, 120)
-"""Obstacles; the random worlds have 12, 30 and 60."""
 TURN_SECONDS = 0.5
 """What a point's turn takes at least."""
 MILLION = 1_000_000
-
-
-@dataclasses.dataclass(frozen=True)
-class Point:
-    """One size of what a curve is about."""
-
-    x: float
-    label: str
-    config: Config
-
-
-@dataclasses.dataclass(frozen=True)
-class Curve:
-    """The cost of a decision over something that grows."""
-
-    name: str
-    linear: float
-    """Slope of a decision's cost where everything is paid for each unit: 1, or 0 where units are decisions' own."""
-    points: tuple[Point, ...]
-
-
-# ---------------------------------------------------------------------------------- what is varied
-
-
-def pixels(base: Config, quick: bool, folder: Path) -> Curve:
-    """Frames from half to three times as wide and high."""
-    del folder
-    points = []
-    for times in (1, 2) if quick else (0.5, 1, 2, 3):
-        width, height = round(times * base.camera.width), round(times * base.camera.height)
-        points.append(
-            Point(width * height, f"{width} × {height}", _changed(base, camera={"width": width, "height": height}))
-        )
-    return Curve("pixels", 1.0, tuple(points))
-
-
-def obstacles(base: Config, quick: bool, folder: Path) -> Curve:
-    """Worlds of boxes; those of a world with fewer are among those of one with more."""
-    points = []
-    for count in BOXES[::4] if quick else BOXES:
-        file = folder / f"{count}-boxes.xml"
-        write_scene(world_of_boxes(count), file, title=f"{count} boxes")
-        points.append(Point(count, str(count), _changed(base, world={"name": str(file)})))
-    return Curve("obstacles", 1.0, tuple(points))
-
-
-def environments(base: Config, quick: bool, folder: Path) -> Curve:
-    """From a quarter to sixteen times as many, and as many updates in proportion."""
-    del folder
-    many = base.train.num_envs
-    counts = [many, 4 * many] if quick else [many // 4, many, 4 * many, 16 * many]
-    return Curve("environments", 0.0, tuple(Point(n, str(n), with_environments(base, n)) for n in counts))
-
-
-def physics_steps(base: Config, quick: bool, folder: Path) -> Curve:
-    """The same time between decisions in finer steps."""
-    del folder
-    points = []
-    for times in (1, 4) if quick else (1, 2, 4):
-        steps, dt = times * base.drone.physics_steps, base.drone.physics_dt_s / times
-        points.append(Point(steps, str(steps), _changed(base, drone={"physics_steps": steps, "physics_dt_s": dt})))
-    return Curve("physics steps", 1.0, tuple(points))
-
-
-def devices(base: Config, quick: bool, folder: Path) -> Curve:
-    """One, two, four devices, as many as the configuration has; each with as many environments and samples."""
-    del quick, folder
-    most = base.train.devices
-    points = []
-    for count in (count for count in (1, 2, 4, 8) if most % count == 0):
-        envs, batch, replay = (
-            size * count // most for size in (base.train.num_envs, base.agent.batch_size, base.agent.replay_size)
-        )
-        agent = {"batch_size": batch, "replay_size": replay}
-        points.append(Point(count, str(count), _changed(base, train={"num_envs": envs, "devices": count}, agent=agent)))
-    return Curve("devices", 0.0, tuple(points))
-
-
-CURVES: dict[str, Callable[[Config, bool, Path], Curve]] = {
-    "pixels": pixels,
-    "obstacles": obstacles,
-    "environments": environments,
-    "physics_steps": physics_steps,
-    "devices": devices,
-}
-
-
-def with_environments(base: Config, count: int) -> Config:
-    """`base` with another number of environments and as many replayed samples for each decision."""
-    agent = base.agent
-    updates = max(1, round(agent.updates_per_step * count / base.train.num_envs))
-    return _changed(base, train={"num_envs": count}, agent={"updates_per_step": updates})
-
-
-def _changed(config: Config, **layer: Any) -> Config:
-    """`config` with the groups' keys replaced.
-
-    Raises:
-        ConfigError: if it cannot be run.
-    """
-    groups: Layer = layer
-    changed = apply(config, groups, "this size")
-    validate(changed)
-    return changed
 
 
 # --------------------------------------------------------------------------------- what is measured
@@ -194,7 +85,7 @@ def measure(base: Config, names: Sequence[str], quick: bool, repeats: int) -> di
         ConfigError: if a size cannot be run, or nothing is left to measure.
     """
     used = choose_devices(base.train.devices, base.train.shards)
-    base = _changed(base, train={"devices": len(used)})
+    base = changed(base, train={"devices": len(used)})
     decisions = QUICK_DECISIONS if quick else DECISIONS
     if used[0].platform != "cpu":  # starting a chunk is no small part of one as short
         decisions = max(decisions, base.train.num_envs * base.train.chunk_steps)

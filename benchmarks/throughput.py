@@ -24,8 +24,6 @@ import jax
 import numpy as np
 from jax.sharding import Mesh
 
-import json_report
-from ceilings import Rollout, ceilings
 from edqn_jax.config import Config
 from edqn_jax.errors import ConfigError
 from edqn_jax.evaluation.missions import run_missions
@@ -33,10 +31,12 @@ from edqn_jax.learn.trainer import AXIS
 from edqn_jax.parallel.devices import choose_devices, cores, use_cpu_devices
 from edqn_jax.runs.files import check_can_write
 from edqn_jax.runs.provenance import workload
-from flags import configured, split
-from parts import parts_of
-from timing import Timed
-from whole import WholeStep, steady
+from measurement import json_report
+from measurement.ceilings import Rollout, ceilings
+from measurement.flags import configured, split
+from measurement.parts import parts_of
+from measurement.timing import Timed
+from measurement.whole import WHOLE, WholeStep, steady
 
 REPEATS = 5
 
@@ -103,7 +103,7 @@ def measure(config: Config, repeats: int, parts: bool) -> dict[str, Any]:
     ratios = [physics * a / b for a, b in zip(turns["whole"], turns["c_mujoco_rollout"], strict=True)]
     rows: list[dict[str, Any]] = [
         {
-            "name": "whole_training_step",
+            "name": WHOLE,
             "decisions_per_second": rate,
             "physics_steps_per_second": physics * rate,
             "us_per_decision": 1e6 * len(devices) / rate,
@@ -142,7 +142,7 @@ def differences(us: dict[str, float]) -> list[dict[str, Any]]:
 def table(report: dict[str, Any]) -> str:
     """The figures for people, in Markdown."""
     rows = {row["name"]: row for row in report["rows"]}
-    whole, rollout_row = rows["whole_training_step"], rows["c_mujoco_rollout"]
+    whole, rollout_row = rows[WHOLE], rows["c_mujoco_rollout"]
     stated = report["workload"]
     lines = [
         f"{report['device']}, {len(report['devices'])} devices, {stated['num_envs']} environments, "

@@ -10,7 +10,6 @@ import numpy as np
 import pytest
 
 import conventional
-import stack
 from conventional_stack.fleet import Record
 from conventional_stack.train import Steady, Trained, Training, fly, train
 from conventional_stack.vae import EventVAE, Learner, images
@@ -22,9 +21,10 @@ from edqn_jax.planners.packages import MissingPackageError, require
 from edqn_jax.runs.directory import plain
 from edqn_jax.sim.env import OWN_SIZE
 from edqn_jax.sim.outcomes import Outcome
-from flags import configured
+from measurement.flags import configured
+from rivals import stack
 from tests.bench.conventional_course import course_of
-from tests.miniature import MINIATURE
+from tests.benchmarks.miniature import MINIATURE
 from tests.planners.uninstalled import hide
 
 torch = require("torch")

@@ -10,7 +10,7 @@ from edqn_jax.cli.arguments import parse_train
 from edqn_jax.config import Config
 from edqn_jax.planners.planner import PLANNERS
 from edqn_jax.sim.mjcf import write_scene
-from planning import Planning
+from rivals.planning import Planning
 from tests.planners.rooms import WITHOUT_A_WAY, box, room
 
 BUDGET_SECONDS = 0.5

@@ -9,7 +9,6 @@ from typing import Any
 import jax
 import numpy as np
 
-import json_report
 from edqn_jax.config import DENSITIES, Config
 from edqn_jax.config.limits import validate
 from edqn_jax.config.loading import apply
@@ -26,6 +25,7 @@ from edqn_jax.sim.flights import Flights
 from edqn_jax.sim.outcomes import Outcome
 from edqn_jax.training.history import check_finite
 from edqn_jax.training.selection import Candidate, choose, first_success, is_due, validated
+from measurement import json_report
 
 LEARNERS = {
     "E-DQN": "events",

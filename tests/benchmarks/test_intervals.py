@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from edqn_jax.evaluation.metrics import wilson_interval
-from intervals import difference_interval, drawn_rates, rate_interval
+from rivals.intervals import difference_interval, drawn_rates, rate_interval
 
 
 def test_a_single_rate_has_wilsons_interval() -> None:

@@ -8,17 +8,17 @@ from pathlib import Path
 
 import pytest
 
-import resident
-from child import Child, ChildEndedError
+from measurement import peak_memory
+from measurement.child import Child, ChildEndedError
 
-ROOT = Path(__file__).resolve().parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 
 
 def test_a_child_answers_in_turns_and_its_end_is_told_with_its_last_words(tmp_path: Path) -> None:
     script = tmp_path / "echo.py"
     script.write_text(
         "import sys\n"
-        "from child import answers\n"
+        "from measurement.child import answers\n"
         "stream = answers()\n"
         "print('not an answer')\n"
         "print('{\"ready\": 1}', file=stream)\n"
@@ -38,8 +38,8 @@ def test_the_memory_of_a_child_is_not_what_its_parent_held_before(tmp_path: Path
     script = tmp_path / "light.py"
     script.write_text(
         "import sys\n"
-        "from child import answers\n"
-        "from resident import peak_of\n"
+        "from measurement.child import answers\n"
+        "from measurement.peak_memory import peak_of\n"
         "stream = answers()\n"
         "for line in sys.stdin:\n"
         "    own = bytearray(b'1') * int(line)\n"
@@ -54,12 +54,12 @@ def test_the_memory_of_a_child_is_not_what_its_parent_held_before(tmp_path: Path
 
 
 def test_the_memory_of_other_processes_is_counted_while_they_run() -> None:
-    assert resident.peak_of_workers() == 0
+    assert peak_memory.peak_of_workers() == 0
     worker = multiprocessing.get_context("spawn").Process(target=time.sleep, args=(60,))
     worker.start()
     try:
-        assert 0 < resident.peak_of_workers() <= (resident.peak_of(worker.pid or 0) or 0)
+        assert 0 < peak_memory.peak_of_workers() <= (peak_memory.peak_of(worker.pid or 0) or 0)
     finally:
         worker.kill()
         worker.join()
-    assert resident.peak_of_workers() == 0
+    assert peak_memory.peak_of_workers() == 0

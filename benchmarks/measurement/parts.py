@@ -20,7 +20,7 @@ from edqn_jax.sim import camera, columns, drone, env, events, sensor
 from edqn_jax.sim.drone import DroneState
 from edqn_jax.sim.env import EnvState, World
 from edqn_jax.sim.scene import take_scene
-from timing import Part, held, nudged, operations_of, size_of
+from measurement.timing import Part, held, nudged, operations_of, size_of
 
 _ROWS, _SAME = PartitionSpec(AXIS), PartitionSpec()
 _LEARNER_AND_KEYS = (_ROWS, (_SAME, _ROWS))

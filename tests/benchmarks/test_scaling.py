@@ -11,7 +11,9 @@ import numpy as np
 import pytest
 
 import scaling
-from boxes import MOST, world_of_boxes
+from curves.boxes import MOST, world_of_boxes
+from curves.figure import draw_scaling
+from curves.state_bytes import StateBytes, state_bytes
 from edqn_jax.config import Config
 from edqn_jax.config.loading import apply
 from edqn_jax.errors import ConfigError
@@ -20,11 +22,9 @@ from edqn_jax.learn import trainer
 from edqn_jax.runs.directory import plain
 from edqn_jax.sim.mjcf import check_scene, load_scene
 from edqn_jax.sim.scene import obstacle_count
-from flags import configured
-from memory import StateBytes, state_bytes
-from scaling_figure import draw_scaling
-from tests.miniature import MINIATURE
-from timing import size_of
+from measurement.flags import configured
+from measurement.timing import size_of
+from tests.benchmarks.miniature import MINIATURE
 
 BASE = apply(configured([]), {"train": {"devices": 2}}, "the test")
 

@@ -9,10 +9,10 @@ from pathlib import Path
 
 import pytest
 
-from parts import PARTS
-from tests.miniature import MINIATURE
+from measurement.parts import PARTS
+from tests.benchmarks.miniature import MINIATURE
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 
 
 @pytest.mark.slow

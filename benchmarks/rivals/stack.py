@@ -13,17 +13,17 @@ from typing import Any
 
 import numpy as np
 
-import json_report
-from conventional import PACKAGES, SETTINGS
+from conventional_stack.settings import PACKAGES, SETTINGS
 from edqn_jax.config import Config
 from edqn_jax.evaluation.missions import run_missions
 from edqn_jax.parallel.devices import choose_devices, processor
 from edqn_jax.runs.provenance import workload
 from edqn_jax.sim.env import OWN_SIZE, World
 from edqn_jax.sim.flights import Flights
-from learners import Watched
-from resident import peak_of_workers
-from whole import WholeStep, steady
+from measurement import json_report
+from measurement.peak_memory import peak_of_workers
+from measurement.whole import WholeStep, steady
+from rivals.learners import Watched
 
 STACK = "Conventional stack"
 DECISIONS = 8192

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from edqn_jax.evaluation.missions import run_missions
-from flags import configured
-from tests.miniature import MINIATURE
-from whole import WholeStep, steady
+from measurement.flags import configured
+from measurement.whole import WholeStep, steady
+from tests.benchmarks.miniature import MINIATURE
 
 
 @pytest.mark.slow

@@ -9,7 +9,7 @@ import jax
 from edqn_jax.config import Config
 from edqn_jax.learn import trainer
 from edqn_jax.sim.env import World
-from timing import size_of
+from measurement.timing import size_of
 
 
 @dataclasses.dataclass(frozen=True)

@@ -12,7 +12,7 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator, PercentFor
 
 from edqn_jax.config import DENSITIES
 from edqn_jax.report.style import INK, LINE, MUTED, SECOND_LINE, drawing
-from rows import Row, figures
+from rivals.rows import Row, figures
 
 OURS = "E-DQN"
 LEARNER, PLANNER = LINE, SECOND_LINE

@@ -14,7 +14,6 @@ from typing import Any, TextIO
 
 import jax
 
-from child import answers
 from edqn_jax.config import Config
 from edqn_jax.config.loading import apply, load_layer
 from edqn_jax.errors import ConfigError
@@ -22,10 +21,11 @@ from edqn_jax.parallel.devices import use_cpu_devices
 from edqn_jax.planners.packages import MissingPackageError
 from edqn_jax.planners.planner import PLANNERS
 from edqn_jax.runs.directory import plain
-from learners import Learner
-from planning import Planning
-from resident import peak_of
-from stack import STACK, STEADY, Stack
+from measurement.child import answers
+from measurement.peak_memory import peak_of
+from rivals.learners import Learner
+from rivals.planning import Planning
+from rivals.stack import STACK, STEADY, Stack
 
 
 def peak_bytes(workers: int) -> dict[str, int | None]:

@@ -6,35 +6,41 @@ import json
 import subprocess
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 import compare
-import throughput
 from edqn_jax.errors import ConfigError
-from tests.miniature import MINIATURE
-from worker import WHOLE
+from edqn_jax.learn.trainer import Trainer
+from measurement import worker
+from measurement.whole import WHOLE
+from tests.benchmarks.miniature import MINIATURE
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).resolve().parents[2]
 STUB = """
-from flags import configured, split
+import json
+import sys
 
-class Part:
-    name = "acting"
+import edqn_jax
 
-class WholeStep:
-    state = {{}}
-    def __init__(self, *given): pass
-    def turn(self): return 1e6 / {cost}
-
-class Timed:
-    def __init__(self, part, mesh, decisions): pass
-    def turn(self): return {cost} / 10
-
-def parse(words): return None, configured(split(words)[1])
-def parts_of(config, world, state): return [Part]
+wanted, costs = json.loads(sys.argv[1]), {costs}
+about = {{
+    "package": edqn_jax.__file__,
+    "rows": [row for row in costs if not wanted or row in wanted],
+    "workload": {{"num_envs": int(sys.argv[sys.argv.index("--num-envs") + 1])}},
+    "device": "a machine",
+    "devices": ["cpu:0"],
+    "versions": {{}},
+}}
+print(json.dumps(about), flush=True)
+for line in sys.stdin:
+    print(costs[line.strip()], flush=True)
 """
+"""A worker that compiles nothing."""
+
+OLD, NEW = (Path(worker) for worker in ("benchmarks/worker.py", "benchmarks/measurement/worker.py"))
 
 
 def git(folder: Path, *words: str) -> str:
@@ -51,30 +57,27 @@ def commit(folder: Path, message: str) -> None:
 
 @pytest.fixture
 def repository(tmp_path: Path) -> Path:
-    """Three commits of this package: one without a throughput benchmark, one that is slow, one twice as fast."""
+    """Three commits: without a worker, with a slow one in its older place, with one in its new place, twice as fast."""
     folder = tmp_path / "repository"
-    (folder / "benchmarks").mkdir(parents=True)
+    (folder / NEW.parent).mkdir(parents=True)
     git(folder, "init", "--quiet")
     for name in ("edqn_jax", "scenes"):
         (folder / name).symlink_to(ROOT / name)
-    (folder / "benchmarks" / "flags.py").symlink_to(ROOT / "benchmarks" / "flags.py")
-    commit(folder, "nothing to time")
-    for tag, cost in (("slow", 80.0), ("fast", 40.0)):
-        (folder / "benchmarks" / "throughput.py").write_text(STUB.format(cost=cost))
+    commit(folder, "no worker")
+    for tag, place, cost in (("slow", OLD, 80.0), ("fast", NEW, 40.0)):
+        for old in (OLD, NEW):
+            (folder / old).unlink(missing_ok=True)
+        (folder / place).write_text(STUB.format(costs={WHOLE: cost, "acting": cost / 10}))
         commit(folder, tag)
         git(folder, "tag", tag)
     return folder
-
-
-def test_throughput_has_what_a_worker_asks_of_it() -> None:
-    assert all(callable(getattr(throughput, name)) for name in ("parse", "WholeStep", "parts_of", "Timed"))
 
 
 def test_an_unknown_commit_is_told_in_a_sentence(repository: Path) -> None:
     assert compare.find_commit(repository, "fast") == git(repository, "rev-parse", "HEAD")
     with pytest.raises(ConfigError, match="there is no commit 'slaw' in"):
         compare.find_commit(repository, "slaw")
-    with pytest.raises(ConfigError, match="'fast~2' cannot be timed: it has no benchmarks/throughput.py"):
+    with pytest.raises(ConfigError, match="'fast~2' cannot be compared: it is older than compare.py"):
         compare.find_commit(repository, "fast~2")
 
 
@@ -83,16 +86,16 @@ def test_a_dirty_tree_matters_only_to_the_commit_that_is_checked_out(repository:
     compare.check_committed(repository, {"slow": slow, "HEAD": fast})
     (repository / "notes.txt").write_text("nothing that is timed")
     compare.check_committed(repository, {"slow": slow, "HEAD": fast})
-    (repository / "benchmarks" / "throughput.py").write_text("something else")
+    (repository / NEW).write_text("something else")
     compare.check_committed(repository, {"slow": slow})
-    with pytest.raises(ConfigError, match="'HEAD' is checked out here with changes .* 'benchmarks/throughput.py'"):
+    with pytest.raises(ConfigError, match="'HEAD' is checked out here with uncommitted changes, .*worker.py'"):
         compare.check_committed(repository, {"slow": slow, "HEAD": fast})
 
 
 def test_a_worktree_holds_the_commit_and_leaves_nothing_behind(repository: Path, tmp_path: Path) -> None:
     slow = compare.find_commit(repository, "slow")
     with compare.checked_out(repository, slow, tmp_path / "a") as checkout:
-        assert STUB.format(cost=80.0) == (checkout / "benchmarks" / "throughput.py").read_text()
+        assert (checkout / OLD).is_file() and not (checkout / NEW).exists()
     assert not (tmp_path / "a").exists()
     assert len(git(repository, "worktree", "list").splitlines()) == 1
 
@@ -162,8 +165,7 @@ def test_bad_input_is_one_sentence_and_exit_code_2(
     assert message in told and told.count("\n") == 1
 
 
-@pytest.mark.slow
-def test_each_commit_is_timed_by_its_own_code(
+def test_each_commit_is_timed_by_its_own_worker_wherever_that_is(
     repository: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     file = tmp_path / "compare.json"
@@ -178,17 +180,37 @@ def test_each_commit_is_timed_by_its_own_code(
     assert len(git(repository, "worktree", "list").splitlines()) == 1
 
 
-@pytest.mark.slow
 def test_a_row_that_a_commit_does_not_have_is_told(repository: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert compare.main(["slow", "fast", "--rows", "acting", "sampling", "--", *MINIATURE], repository) == 2
     assert capsys.readouterr().err == "commit 'slow' has no row 'sampling'\n"
 
 
-@pytest.mark.slow
 def test_a_commit_that_cannot_be_timed_is_told_with_its_reason(
     repository: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    (repository / "benchmarks" / "throughput.py").write_text("import no_such_thing")
+    (repository / NEW).write_text("import no_such_thing")
     commit(repository, "broken")
     assert compare.main(["HEAD", "HEAD", "--rows", WHOLE, "--", *MINIATURE], repository) == 2
     assert "cannot be timed: ModuleNotFoundError: No module named 'no_such_thing'" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_this_commits_worker_describes_and_measures_the_wanted_rows(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Whole:
+        """Stands for the compiled chunk, which other tests compile."""
+
+        def __init__(self, config: Any, world: Any, devices: Any) -> None:
+            self.state = Trainer(config, world, devices).init(0)
+
+        def turn(self) -> float:
+            return 1000.0
+
+    monkeypatch.setattr(worker, "WholeStep", Whole)
+    words = ["--quick", "--", *MINIATURE]
+    about, turns = worker.prepare([WHOLE, "acting", "colours"], words)
+    assert about["rows"] == [WHOLE, "acting"] == list(turns)
+    assert Path(about["package"]).parent == ROOT / "edqn_jax"
+    assert about["workload"]["num_envs"] == 16 and about["device"] and about["versions"]
+    assert turns[WHOLE]() == 1e6 * len(about["devices"]) / 1000.0
+    assert turns["acting"]() > 0
+    assert json.dumps(about)

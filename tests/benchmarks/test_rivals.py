@@ -12,19 +12,16 @@ from typing import Any
 import numpy as np
 import pytest
 
-import learners
-import planning
-import rival
 import runtime
-import runtime_table
 from edqn_jax.cli.arguments import parse_train
 from edqn_jax.config import Config
 from edqn_jax.config.loading import to_yaml
 from edqn_jax.sim.mjcf import write_scene
-from tests.miniature import MINIATURE
+from rivals import learners, planning, rival, table
+from tests.benchmarks.miniature import MINIATURE
+from tests.benchmarks.turns import row
 from tests.planners.rooms import WITHOUT_A_WAY, room
 from tests.planners.uninstalled import hide
-from tests.turns import row
 
 TINY = (*MINIATURE, "--total-steps", "512", "--train.chunk-steps", "8", "--train.validation-every", "256")
 
@@ -60,7 +57,7 @@ def test_a_planner_says_no_path_where_there_is_none(tmp_path: Path, monkeypatch:
         assert one["flights"]["reason"][0].startswith("no path")
         assert one["peak_bytes"] > 10**7
         one["flights"]["shortest_m"] = [None]
-    shown = runtime_table.methods([row("SNN", turns, "shut.xml")])
+    shown = table.methods([row("SNN", turns, "shut.xml")])
     assert "| 0 of 1: 0% (" in shown and "- SNN: no path: the wave does not reach the start." in shown
 
 

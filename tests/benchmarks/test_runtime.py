@@ -11,15 +11,14 @@ from typing import Any
 import pytest
 
 import runtime
-import runtime_table
-import stack
-from child import ChildEndedError
 from edqn_jax.config import Config
 from edqn_jax.errors import ConfigError
 from edqn_jax.planners.planner import PLANNERS
 from edqn_jax.sim.mjcf import write_scene
+from measurement.child import ChildEndedError
+from rivals import stack, table
+from tests.benchmarks.turns import flights, row, turn
 from tests.planners.rooms import WITHOUT_A_WAY, room
-from tests.turns import flights, row, turn
 
 
 @pytest.fixture
@@ -146,7 +145,7 @@ def test_a_closed_pipe_costs_no_file_and_a_full_disk_no_table(
         raise BrokenPipeError
 
     with monkeypatch.context() as patch:
-        patch.setattr(runtime_table, "text", closed)
+        patch.setattr(table, "text", closed)
         with pytest.raises(BrokenPipeError):
             runtime.main(words)
     monkeypatch.setattr(runtime, "draw_runtime", lambda rows, picture: (_ for _ in ()).throw(ConfigError("it is full")))
@@ -206,7 +205,7 @@ def test_one_slow_turn_does_not_choose_the_setting_of_the_conventional_stack(mon
 
 
 def test_rates_that_could_not_be_measured_say_why() -> None:
-    shown = runtime_table.rates_table({"turns": {}, "reason": "Conventional stack: torch is not installed"})
+    shown = table.rates_table({"turns": {}, "reason": "Conventional stack: torch is not installed"})
     assert shown.endswith("- Conventional stack: torch is not installed.")
 
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from edqn_jax.errors import ConfigError
 from edqn_jax.planners.planner import DRAWING
-from intervals import difference_interval, rate_interval
+from rivals.intervals import difference_interval, rate_interval
 
 Row = dict[str, Any]
 

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from typing import Any
 
 from edqn_jax.planners.planner import IMPROVING
-from rows import Row, Worth, figures, worth
-from stack import STACK
+from rivals.rows import Row, Worth, figures, worth
+from rivals.stack import STACK
 
 PAPER_SOURCE = "Chao, Dillmann, Roennau, Xiong, Biomimetics 2024, 9(4), 238, Table 3"
 PAPER_RUN_TIME_S = {"E-DQN": 41.364, "DQN": 161.88, "SNN": 155.4}

@@ -7,11 +7,10 @@ from typing import Any
 
 import pytest
 
-import rows
-import runtime_table
 from edqn_jax.errors import ConfigError
 from edqn_jax.planners.planner import PLANNERS
-from tests.turns import flights, row, turn
+from rivals import rows, table
+from tests.benchmarks.turns import flights, row, turn
 
 
 def test_figures_are_of_flights_that_arrived_and_success_is_of_all() -> None:
@@ -32,7 +31,7 @@ def test_most_seeds_that_never_fly_make_the_training_time_never() -> None:
     assert rows.figures(row("E-DQN", some))["train_seconds"] == 40.0
     lost = row("E-DQN", [some[0], turn(1, flights("collision"), **never), some[2]])
     assert rows.figures(lost)["train_seconds"] is None
-    assert "| never |" in runtime_table.methods([lost])
+    assert "| never |" in table.methods([lost])
 
 
 @pytest.mark.parametrize("name", PLANNERS)
@@ -77,7 +76,7 @@ def test_events_are_worth_what_flies_at_equal_decisions_and_at_equal_wall_time()
     assert (less["at_decisions"]["difference"], less["at_seconds"]["difference"]) == (0.5, -0.25)
     low, high = less["at_decisions"]["interval"]
     assert 0.0 <= low < 0.5 < high <= 1.0
-    shown = runtime_table.worth_table(one)
+    shown = table.worth_table(one)
     assert "10.0 s of training" in shown and "| E-DQN less DQN blind | | | +50.0 % (" in shown
     assert "| E-DQN | 3 | 18.0 | 75.0 % (" in shown
 

@@ -7,7 +7,6 @@ from typing import Any
 import jax
 import numpy as np
 
-import json_report
 from edqn_jax.config import DENSITIES, Config
 from edqn_jax.parallel.devices import processor
 from edqn_jax.planners.astar import NoPathError, shortest_path
@@ -19,6 +18,7 @@ from edqn_jax.sim.drone import load_airframe
 from edqn_jax.sim.mjcf import check_scene, load_world, resolve_world
 from edqn_jax.sim.outcomes import Outcome
 from edqn_jax.sim.scene import Scene, take_scene
+from measurement import json_report
 
 NOT_FLOWN = {"outcome": "no_path", "decisions": 0, "flight_seconds": 0.0, "path_length_m": 0.0, "clearance_m": None}
 

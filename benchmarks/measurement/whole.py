@@ -14,6 +14,9 @@ from edqn_jax.learn import embedding
 from edqn_jax.learn.trainer import Trainer
 from edqn_jax.sim import env
 
+WHOLE = "whole_training_step"
+"""Name of the row of the whole step."""
+
 
 def steady(config: Config, chunk_steps: int) -> Config:
     """`config` with the VAE learning throughout and a beginning of two chunks: what follows is all alike."""

@@ -14,11 +14,11 @@ from jax.sharding import Mesh
 
 from edqn_jax.evaluation.missions import run_missions
 from edqn_jax.learn.trainer import AXIS, Plan, init
-from flags import configured
-from parts import PARTS, Moment, parts_of
-from tests.miniature import MINIATURE
-from timing import Part, Timed, nudged, operations, size_of
-from whole import steady
+from measurement.flags import configured
+from measurement.parts import PARTS, Moment, parts_of
+from measurement.timing import Part, Timed, nudged, operations, size_of
+from measurement.whole import steady
+from tests.benchmarks.miniature import MINIATURE
 
 pytestmark = pytest.mark.slow
 

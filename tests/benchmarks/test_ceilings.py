@@ -6,9 +6,9 @@ import mujoco
 import numpy as np
 import pytest
 
-import ceilings
 from edqn_jax.parallel.devices import cores
-from flags import configured
+from measurement import ceilings
+from measurement.flags import configured
 
 
 def test_c_mujoco_flies_the_same_airframe_on_every_core_and_every_step_is_counted(

@@ -1,0 +1,1 @@
+"""What the benchmarks share: the steady training step, its parts, how they are timed, and how reports are written."""

@@ -1,0 +1,1 @@
+"""The methods that `runtime.py` compares: how each is run, and the tables and the picture of the results."""
