@@ -41,7 +41,7 @@ def trajectory(config: Config, flights: Flights, mission: int = 0) -> dict[str, 
     return dict(zip(TRAJECTORY_COLUMNS, values.T, strict=True))
 
 
-def write_trajectories(config: Config, mission_set: MissionSet, flights: Flights, file: Path) -> None:
+def write_trajectories(config: Config, missions: MissionSet, flights: Flights, file: Path) -> None:
     """Writes all flights as one `.npz`, with all that another physics engine needs to check the verdicts.
 
     Row 0 of each flight is its start, row k its pose after physics step k; rows after the end are NaN.
@@ -55,13 +55,13 @@ def write_trajectories(config: Config, mission_set: MissionSet, flights: Flights
     record = flights.record
     if record is None:
         raise ValueError("the flights were not recorded; fly them with record=True")
-    missions = jax.tree.map(np.asarray, mission_set.world.missions)
-    heading = np.arctan2(*(missions.goal - missions.start)[:, 1::-1].T)
+    flown = jax.tree.map(np.asarray, missions.world.missions)
+    heading = np.arctan2(*(flown.goal - flown.start)[:, 1::-1].T)
     level = np.zeros_like(heading)
     facing = np.column_stack([np.cos(heading / 2), level, level, np.sin(heading / 2)])
     longest = int(np.max(flights.physics_steps))
     columns = {
-        "positions": np.concatenate([missions.start[:, None], record.position[:, :longest]], axis=1),
+        "positions": np.concatenate([flown.start[:, None], record.position[:, :longest]], axis=1),
         "attitudes": np.concatenate([facing[:, None], record.quaternion[:, :longest]], axis=1),
         "times": config.drone.physics_dt_s * np.arange(longest + 1),
         "lengths": flights.physics_steps + 1,
@@ -74,10 +74,10 @@ def write_trajectories(config: Config, mission_set: MissionSet, flights: Flights
         "closest_time": flights.closest.time,
         "closest_position": flights.closest.position,
         "closest_attitude": flights.closest.quaternion,
-        "scene": missions.scene,
-        "start": missions.start,
-        "goal": missions.goal,
-        "mjcf": np.array(mission_set.mjcf()),
+        "scene": flown.scene,
+        "start": flown.start,
+        "goal": flown.goal,
+        "mjcf": np.array(missions.mjcf()),
         "body_radius_m": np.float64(config.drone.body_radius_m),
         "physics_dt_s": np.float64(config.drone.physics_dt_s),
     }

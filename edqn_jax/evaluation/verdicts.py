@@ -44,12 +44,12 @@ class Agreement:
         return self.apart_m <= CONTACT_TOLERANCE_M
 
 
-def check_verdicts(config: Config, mission_set: MissionSet, flights: Flights) -> list[Agreement]:
+def check_verdicts(config: Config, missions: MissionSet, flights: Flights) -> list[Agreement]:
     """Replays every recorded flight in C MuJoCo, along the segments between physics steps, and compares.
 
     Args:
         config: gives the radius of the body.
-        mission_set: the missions that were flown; a world from a file is judged by that file.
+        missions: that were flown; a world from a file is judged by that file.
         flights: recorded flights of these missions.
 
     Raises:
@@ -57,9 +57,9 @@ def check_verdicts(config: Config, mission_set: MissionSet, flights: Flights) ->
     """
     if flights.record is None:
         raise ValueError("the flights were not recorded; fly them with record=True")
-    judges = [_judge(text, mission_set.file, config.drone.body_radius_m) for text in mission_set.mjcf()]
-    missions = mission_set.world.missions
-    scenes, starts = np.asarray(missions.scene), np.asarray(missions.start)
+    judges = [_judge(text, missions.file, config.drone.body_radius_m) for text in missions.mjcf()]
+    flown = missions.world.missions
+    scenes, starts = np.asarray(flown.scene), np.asarray(flown.start)
     positions = np.asarray(flights.record.position)
     outcomes, steps = np.asarray(flights.outcome), np.asarray(flights.physics_steps)
     results = []
