@@ -21,6 +21,7 @@ from edqn_jax.runs.directory import plain
 from edqn_jax.runs.files import check_can_write, write_whole
 from edqn_jax.runs.policies import load_run
 from edqn_jax.sim.outcomes import Outcome
+from edqn_jax.sim.sensor import Form, sensor_of
 
 
 def evaluate_command(args: EvaluateArgs) -> None:
@@ -36,7 +37,7 @@ def evaluate_command(args: EvaluateArgs) -> None:
     if args.shuffle_codes and args.missions < least:
         raise ConfigError(f"--shuffle-codes needs --missions of at least {least}, not {args.missions}")
     config, params = load_run(args.run)
-    if args.shuffle_codes and config.env.sensor == "blind":
+    if args.shuffle_codes and sensor_of(config).form is Form.NOTHING:
         raise ConfigError(f"--shuffle-codes has nothing to shuffle: the policy of '{args.run}' sees nothing but itself")
     name = args.world or config.world.name
     course = load_missions(config, name, args.missions, args.seed, args.start, args.goal)

@@ -208,6 +208,15 @@ def field_of_counts(config: EventsConfig, counts: Array) -> EventField:
     return EventField(count, jnp.sign(counts).astype(jnp.int8)[None], t_first, t_step, window_s, divides_window=True)
 
 
+def random_field(config: EventsConfig, height: int, width: int, rng: np.random.Generator) -> EventField:
+    """Returns a field [F, H, W] of 0 to 2 events per pixel and frame pair, all at time 0; for measurements."""
+    shape = (max(len(config.frame_times_s) - 1, 1), height, width)
+    count, times = jnp.asarray(rng.integers(0, 3, shape), jnp.int32), jnp.zeros(shape)
+    window_s = config.frame_times_s[-1] - config.frame_times_s[0]
+    even = divides_window(config, len(config.frame_times_s))
+    return EventField(count, jnp.sign(count).astype(jnp.int8), times, times, window_s, even)
+
+
 def event_picture(image: NDArray, background: str = "white") -> NDArray[np.uint8]:
     """Red-blue picture of a signed event image (Fig. 6): `[H, W]` to `[H, W, 3]`, ON red and OFF blue.
 
