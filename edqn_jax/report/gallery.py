@@ -102,8 +102,8 @@ def _sensed(config: Config, scene: Scene, poses: Flight, frames: np.ndarray) -> 
     key, noise = jax.random.split(jax.random.key(0))
     of_frames, memory = sensor.sensor_of(config).of_frames, sensor.at_rest(config, key)
     if of_frames is not None:
-        luma = frames[..., 0] * camera.LUMA[0] + frames[..., 1] * camera.LUMA[1] + frames[..., 2] * camera.LUMA[2]
-        return jax.vmap(lambda f: of_frames(config, f, memory, noise)[0])(jnp.asarray(luma))
+        luma = jnp.asarray(events.luma(frames))
+        return jax.vmap(lambda f: of_frames(config, f, memory, noise)[0])(luma)
 
     @jax.jit
     def show(position: jax.Array, quaternion: jax.Array) -> Any:

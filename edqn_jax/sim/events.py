@@ -26,6 +26,7 @@ STREAM_DTYPE = np.dtype([("t", "<i8"), ("x", "<u2"), ("y", "<u2"), ("p", "i1")])
 """One event of a stream: time in microseconds, column, row, polarity in {-1, +1}."""
 
 LUMA_WEIGHTS = (0.299, 0.587, 0.114)
+"""Weights of R, G and B in Eq. 1."""
 
 AIRSIM_EPSILON = 0.001
 """What AirSim adds to the 8-bit grey value before the logarithm."""
@@ -60,7 +61,7 @@ class EventMemory:
 
 
 def luma(rgb: Array) -> Array:
-    """The grey value inside Eq. 1: `[..., 3]` linear RGB to `[...]`."""
+    """Returns the grey value inside Eq. 1: `[..., 3]` linear RGB to `[...]`."""
     red, green, blue = LUMA_WEIGHTS
     return red * rgb[..., 0] + green * rgb[..., 1] + blue * rgb[..., 2]
 
