@@ -133,7 +133,7 @@ def test_a_policy_that_sees_nothing_has_nothing_to_shuffle(tmp_path):
     blind = dataclasses.replace(CONFIG, env=dataclasses.replace(CONFIG.env, sensor="blind"))
     (tmp_path / "config.yaml").write_text(to_yaml(blind))
     save_params(tmp_path / "checkpoints", fresh_policy(blind))
-    with pytest.raises(ConfigError, match="--shuffle-codes has nothing to shuffle: the policy's sensor is 'blind'"):
+    with pytest.raises(ConfigError, match="--shuffle-codes has nothing to shuffle: the sensor 'blind' shows nothing"):
         evaluate_command(EvaluateArgs(tmp_path, missions=4, shuffle_codes=True))
 
 

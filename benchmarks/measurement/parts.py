@@ -167,7 +167,7 @@ def _drawing(now: Moment, position: Array, quaternion: Array) -> float | None:
     )
     place = position.reshape(-1, 3)
     turn = jax.vmap(partial(sensor.mount_rotation, now.config))(quaternion.reshape(-1, 4))
-    weights = jnp.broadcast_to(jnp.asarray(camera.LUMA), (len(place), 3))
+    weights = jnp.broadcast_to(jnp.asarray(events.LUMA_WEIGHTS), (len(place), 3))
     given = (scene, place, turn, weights)
     ways, way = columns.ways_to_draw(config, *given)
     laid = operations_of(lambda *given: columns.ways_to_draw(config, *given)[1], *given)

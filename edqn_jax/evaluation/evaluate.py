@@ -16,6 +16,7 @@ from edqn_jax.evaluation.rollouts import fly_on_all_devices
 from edqn_jax.learn.policy import Policy
 from edqn_jax.sim.flights import Flights
 from edqn_jax.sim.outcomes import Outcome
+from edqn_jax.sim.sensor import Form, sensor_of
 
 
 @dataclasses.dataclass(frozen=True)
@@ -89,5 +90,5 @@ def _check_can_shuffle(policy: Policy, missions: int) -> None:
     least = 2 * len(jax.devices())
     if missions < least:
         raise ConfigError(f"--shuffle-codes needs --missions of at least {least}, not {missions}")
-    if policy.config.env.sensor == "blind":
-        raise ConfigError("--shuffle-codes has nothing to shuffle: the policy's sensor is 'blind'")
+    if sensor_of(policy.config).form is Form.NOTHING:
+        raise ConfigError(f"--shuffle-codes has nothing to shuffle: the sensor '{policy.config.env.sensor}' shows nothing")

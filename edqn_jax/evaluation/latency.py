@@ -1,4 +1,4 @@
-"""Latency of one decision."""
+"""Decision latency: the time from an observation to an action."""
 
 from __future__ import annotations
 
@@ -12,20 +12,18 @@ from edqn_jax.config import Config
 from edqn_jax.learn import policy
 from edqn_jax.learn.policy import PolicyParams
 from edqn_jax.sim import env
-from edqn_jax.sim.events import EventField, divides_window
-from edqn_jax.sim.moves import DIRECTIONS
-from edqn_jax.sim.sensor import Sensed
+from edqn_jax.sim.sensor import sensor_of
 
 
 def decision_latency_ms(config: Config, params: PolicyParams, calls: int = 300) -> dict[str, float]:
-    """Returns the median and 99th percentile latency of a decision, from host arrays to an action on the host, ms."""
+    """Returns the median and 99th percentile of `decision_seconds`, in milliseconds: `median`, `p99`."""
     median, p99 = np.percentile(1e3 * decision_seconds(config, params, calls), [50, 99])
     return {"median": float(median), "p99": float(p99)}
 
 
 def decision_seconds(config: Config, params: PolicyParams, calls: int) -> np.ndarray:
-    """Returns the latency [calls] of each of `calls` decisions, from host arrays to an action on the host, seconds."""
-    seen = env.Observation(sensed=_anything(config), own=jnp.zeros(env.OWN_SIZE))
+    """Returns the seconds [calls] that each of `calls` decisions takes, from arrays on the host to an action there."""
+    seen = env.Observation(sensed=sensor_of(config).example(config), own=jnp.zeros(env.OWN_SIZE))
     seen, memory = jax.tree.map(np.asarray, (seen, policy.empty_memory(config)))  # on the host
     act = jax.jit(lambda params, memory, seen, key: policy.act(config, params, memory, seen, key))
     params, key = jax.device_put(params), jax.random.key(0)
@@ -34,20 +32,4 @@ def decision_seconds(config: Config, params: PolicyParams, calls: int) -> np.nda
         began = time.perf_counter()
         int(act(params, memory, seen, key)[0])
         seconds.append(time.perf_counter() - began)
-    return np.array(seconds[1:])  # the first call compiles
-
-
-def _anything(config: Config) -> Sensed:
-    """Something that the sensor might show."""
-    rng, height, width = np.random.default_rng(0), config.camera.height, config.camera.width
-    if config.env.sensor in ("frames", "depth"):
-        return jnp.asarray(rng.random((height, width), np.float32))
-    if config.env.sensor == "ranges":
-        return jnp.asarray(rng.random(len(DIRECTIONS), np.float32))
-    if config.env.sensor == "blind":
-        return None
-    pixels = (max(len(config.events.frame_times_s) - 1, 1), height, width)
-    count, times = jnp.asarray(rng.integers(0, 3, pixels), jnp.int32), jnp.zeros(pixels)
-    window = config.events.frame_times_s[-1] - config.events.frame_times_s[0]
-    even = divides_window(config.events, len(config.events.frame_times_s))
-    return EventField(count, jnp.sign(count).astype(jnp.int8), times, times, window, even)
+    return np.array(seconds[1:])  # the first call compiled

@@ -1,4 +1,4 @@
-"""From what the sensor shows to what the Q-network sees of it: a learned code, the values themselves, or nothing."""
+"""Embeds what the sensor shows for the Q-network: a learned code, the values themselves, or nothing."""
 
 from __future__ import annotations
 
@@ -8,38 +8,35 @@ from jax import Array
 from edqn_jax.config import Config
 from edqn_jax.learn import encoder
 from edqn_jax.learn.encoder import Params
-from edqn_jax.sim.moves import DIRECTIONS
-from edqn_jax.sim.sensor import Sensed
+from edqn_jax.sim.sensor import Sensed, sensor_of
 
 
 def has_code(config: Config) -> bool:
-    """Whether the sensor's image goes through a VAE, which then has a warm-up to learn in."""
-    return config.env.sensor in ("events", "frames", "depth")
+    """Returns whether a VAE embeds what the sensor shows; it then learns in a warm-up."""
+    return sensor_of(config).form in encoder.CHANNELS
 
 
 def size(config: Config) -> int:
-    """Values that the Q-network sees of what the sensor shows."""
-    if has_code(config):
-        return config.encoder.code_size
-    return len(DIRECTIONS) if config.env.sensor == "ranges" else 0
+    """Returns the number of values that the Q-network sees of what the sensor shows."""
+    return config.encoder.code_size if has_code(config) else sensor_of(config).values(config)
 
 
 def init(config: Config, key: Array) -> Params:
-    """Fresh parameters of the VAE; {} where there is none."""
+    """Returns fresh parameters of the VAE; {} where there is none."""
     if not has_code(config):
         return {}
-    return encoder.init_encoder(config.encoder, config.camera, key, pictures=config.env.sensor != "events")
+    return encoder.init_encoder(config.encoder, config.camera, key, form=sensor_of(config).form)
 
 
 def acting(config: Config, params: Params) -> Params:
-    """Parameters that learn no more, as `embed` has least to do with them; {} where there are none."""
+    """Returns the parameters in the form that `embed` evaluates fastest, no longer trainable; {} of {}."""
     return encoder.tabulated(config.encoder, config.camera, params) if params else {}
 
 
 def embed(config: Config, params: Params, sensed: Sensed) -> Array | None:
-    """[..., size] of what the sensor shows, of order 1: the scaled code, or ranges as they are; None of nothing."""
+    """Returns [..., size] of order 1: the scaled code, or values as they are; None of None."""
     if sensed is None:
         return None
-    if config.env.sensor == "ranges":
+    if not has_code(config):
         return jnp.asarray(sensed)
     return config.agent.code_scale * encoder.embed(config.encoder, params, sensed)

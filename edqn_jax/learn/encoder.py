@@ -32,6 +32,7 @@ from jax.nn.initializers import constant, lecun_normal, zeros
 
 from edqn_jax.config import CameraConfig, EncoderConfig
 from edqn_jax.sim.events import EventField
+from edqn_jax.sim.sensor import Form
 
 Params = Any
 """Nested dictionaries of arrays."""
@@ -50,6 +51,9 @@ POOL_SCALE = 1.0 / 8.0
 
 EVENT_CHANNELS, PICTURE_CHANNELS = 2, 1
 """ON and OFF events; brightness or nearness."""
+
+CHANNELS = {Form.EVENTS: EVENT_CHANNELS, Form.PICTURE: PICTURE_CHANNELS}
+"""Channels of the forms that the VAE embeds."""
 
 MAX_LOG_VARIANCE = 6.0
 """The log-variance lives in plus and minus this: its exponential cannot overflow."""
@@ -355,16 +359,20 @@ def _blur(size: int, times: int) -> np.ndarray:
     return np.linalg.matrix_power(once, times).astype(np.float32)
 
 
-def init_encoder(config: EncoderConfig, camera: CameraConfig, key: Array, *, pictures: bool = False) -> Params:
-    """Fresh parameters, `{"encoder": ..., "decoder": ...}`, for the camera's resolution, of events or of pictures."""
+def init_encoder(config: EncoderConfig, camera: CameraConfig, key: Array, *, form: Form = Form.EVENTS) -> Params:
+    """Returns fresh parameters, `{"encoder": ..., "decoder": ...}`, for the camera's resolution.
+
+    Args:
+        form: of what is encoded; a key of `CHANNELS`.
+    """
     key_encoder, key_decoder = jax.random.split(key)
-    channels = PICTURE_CHANNELS if pictures else EVENT_CHANNELS
+    channels = CHANNELS[form]
     encoder = Encoder(config, camera.height, camera.width, channels)
     decoder = Decoder(config, camera.height, camera.width, channels)
     when = jnp.zeros((1, camera.height, camera.width))
     nothing = when.astype(jnp.int32)
     silent = EventField(nothing, nothing.astype(jnp.int8), when, when, window_s=1.0)
-    blank, method = (when[0], Encoder.picture) if pictures else (silent, Encoder.dense)
+    blank, method = (silent, Encoder.dense) if form is Form.EVENTS else (when[0], Encoder.picture)
     return {
         "encoder": encoder.init(key_encoder, blank, method=method)["params"],
         "decoder": decoder.init(key_decoder, jnp.zeros(config.code_size))["params"],

@@ -45,7 +45,7 @@ def draw_gallery(
     draw_path(scene, flown, shortest, run.figures / "path.png", outcome, config.env.goal_radius_m)
     draw_returns(run.read_episodes(), run.figures / "returns.png")
     draw_learning(run.read_metrics(), run.figures / "learning.png")
-    if config.env.sensor in LOOKS:
+    if sensor.sensor_of(config).image is not None:
         _draw_what_it_sees(config, run, scene, params, flown)
 
 
@@ -63,9 +63,9 @@ def _draw_what_it_sees(
     def poses(rows: np.ndarray) -> Flight:
         return Flight(position[rows], quaternion[rows], np.zeros(0))  # type: ignore
 
-    look, has_events = LOOKS[config.env.sensor], config.env.sensor == "events"
+    look, has_events = LOOKS[config.env.sensor], sensor.sensor_of(config).form is sensor.Form.EVENTS
     native = _rgb(config, scene, poses(rows), 1)
-    sensed = _sensed(config, scene, poses(rows[:, -1]), native)
+    sensed = _sensed(config, scene, poses(rows), native)
     images = np.asarray(jax.vmap(events.event_image)(sensed) if has_events else sensed)
     shown = _busiest(np.abs(images).sum((1, 2)) if has_events else images.std((1, 2)), MOMENTS)
     rows, native, images, sensed = rows[shown], native[shown], images[shown], jax.tree.map(lambda x: x[shown], sensed)
@@ -98,25 +98,19 @@ def _busiest(events: np.ndarray, parts: int) -> np.ndarray:
 
 
 def _sensed(config: Config, scene: Scene, poses: Flight, frames: np.ndarray) -> Any:
-    """What the sensor shows at poses [M], whose frames [M, T, H, W, 3] are drawn already."""
-    if config.env.sensor == "depth":
-
-        @jax.jit
-        def depth(position: jax.Array, quaternion: jax.Array) -> jax.Array:
-            here = Flight(position[None], quaternion[None], jnp.zeros((1, 3)))
-            return sensor.sense(config, scene, here, None, jax.random.key(0))[0]  # type: ignore
-
-        return jnp.stack([depth(*pose) for pose in zip(poses.position, poses.quaternion, strict=True)])
-    luma = frames[..., 0] * camera.LUMA[0] + frames[..., 1] * camera.LUMA[1] + frames[..., 2] * camera.LUMA[2]
-    if config.env.sensor == "frames":
-        return sensor.brightness(config, jnp.asarray(luma[:, -1]))
-    return jax.vmap(lambda f: _field(config, f))(jnp.asarray(luma))
-
-
-def _field(config: Config, frames: Any) -> events.EventField:
+    """Returns what the sensor shows at poses [M, T], whose frames [M, T, H, W, 3] are drawn already."""
     key, noise = jax.random.split(jax.random.key(0))
-    memory = events.reset_memory(config.events, config.camera.height, config.camera.width, key)
-    return events.events(config.events, memory, frames, config.events.frame_times_s, noise)[0]
+    of_frames, memory = sensor.sensor_of(config).of_frames, sensor.at_rest(config, key)
+    if of_frames is not None:
+        luma = jnp.asarray(events.luma(frames))
+        return jax.vmap(lambda f: of_frames(config, f, memory, noise)[0])(luma)
+
+    @jax.jit
+    def show(position: jax.Array, quaternion: jax.Array) -> Any:
+        return sensor.sense(config, scene, Flight(position, quaternion, jnp.zeros_like(position)), memory, noise)[0]
+
+    shown = [show(*pose) for pose in zip(poses.position, poses.quaternion, strict=True)]
+    return jax.tree.map(lambda *each: jnp.stack(each), *shown)
 
 
 def _rgb(config: Config, scene: Scene, poses: Flight, finer: int) -> np.ndarray:

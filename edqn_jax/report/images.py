@@ -13,6 +13,7 @@ from matplotlib.colors import Colormap, Normalize
 from matplotlib.figure import Figure
 
 from edqn_jax.report.style import INK, MUTED, POLARITY, drawing
+from edqn_jax.sim.sensor import SENSORS
 
 
 @dataclasses.dataclass(frozen=True)
@@ -22,12 +23,13 @@ class Look:
     name: str
     unit: str
     colours: str | Colormap
+    signed: bool  # colours are symmetric about 0
 
 
 LOOKS = {
-    "events": Look("events", "events per pixel", POLARITY),
-    "frames": Look("log brightness", "log brightness + 1", "gray"),
-    "depth": Look("nearness", "nearness (3 is contact)", "gray"),
+    name: Look(sensor.image.label, sensor.image.unit, POLARITY if sensor.image.signed else "gray", sensor.image.signed)
+    for name, sensor in SENSORS.items()
+    if sensor.image is not None
 }
 """By the name of the sensor, those that show an image."""
 
@@ -99,7 +101,7 @@ def draw_reconstruction(
 
 
 def _signed(look: Look) -> bool:
-    return look is LOOKS["events"]
+    return look.signed
 
 
 def _scale(shown: np.ndarray, look: Look) -> Normalize:

@@ -16,13 +16,11 @@ from edqn_jax.config import CameraConfig
 from edqn_jax.sim import columns, coverage, raycast
 from edqn_jax.sim.columns import Frame
 from edqn_jax.sim.coverage import Layers
+from edqn_jax.sim.events import LUMA_WEIGHTS
 from edqn_jax.sim.raycast import Rays, Values
 from edqn_jax.sim.scene import Scene
 from edqn_jax.sim.texture import texture
 from edqn_jax.sim.xla import materialised
-
-LUMA = (0.299, 0.587, 0.114)
-"""Weights of R, G and B in Eq. 1."""
 
 
 def _backdrop(config: CameraConfig, scene: Scene, origin: Array, rays: Rays, value: Values, sky: Array) -> Array:
@@ -99,7 +97,7 @@ def luma(config: CameraConfig, scene: Scene, position: Array, rotation: Array) -
     Returns:
         [H, W] in [0, 1], row 0 at the top.
     """
-    return _picture(config, scene, position, rotation, jnp.asarray(LUMA))
+    return _picture(config, scene, position, rotation, jnp.asarray(LUMA_WEIGHTS))
 
 
 def rgb(config: CameraConfig, scene: Scene, position: Array, rotation: Array) -> Array:

@@ -26,6 +26,7 @@ STREAM_DTYPE = np.dtype([("t", "<i8"), ("x", "<u2"), ("y", "<u2"), ("p", "i1")])
 """One event of a stream: time in microseconds, column, row, polarity in {-1, +1}."""
 
 LUMA_WEIGHTS = (0.299, 0.587, 0.114)
+"""Weights of R, G and B in Eq. 1."""
 
 AIRSIM_EPSILON = 0.001
 """What AirSim adds to the 8-bit grey value before the logarithm."""
@@ -60,7 +61,7 @@ class EventMemory:
 
 
 def luma(rgb: Array) -> Array:
-    """The grey value inside Eq. 1: `[..., 3]` linear RGB to `[...]`."""
+    """Returns the grey value inside Eq. 1: `[..., 3]` linear RGB to `[...]`."""
     red, green, blue = LUMA_WEIGHTS
     return red * rgb[..., 0] + green * rgb[..., 1] + blue * rgb[..., 2]
 
@@ -206,6 +207,15 @@ def field_of_counts(config: EventsConfig, counts: Array) -> EventField:
     count = jnp.abs(counts.astype(jnp.int32))[None]
     t_first, t_step = event_times(count, jnp.float32(0.0), jnp.float32(window_s))
     return EventField(count, jnp.sign(counts).astype(jnp.int8)[None], t_first, t_step, window_s, divides_window=True)
+
+
+def random_field(config: EventsConfig, height: int, width: int, rng: np.random.Generator) -> EventField:
+    """Returns a field [F, H, W] of 0 to 2 events per pixel and frame pair, all at time 0; for measurements."""
+    shape = (max(len(config.frame_times_s) - 1, 1), height, width)
+    count, times = jnp.asarray(rng.integers(0, 3, shape), jnp.int32), jnp.zeros(shape)
+    window_s = config.frame_times_s[-1] - config.frame_times_s[0]
+    even = divides_window(config, len(config.frame_times_s))
+    return EventField(count, jnp.sign(count).astype(jnp.int8), times, times, window_s, even)
 
 
 def event_picture(image: NDArray, background: str = "white") -> NDArray[np.uint8]:

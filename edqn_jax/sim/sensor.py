@@ -1,13 +1,17 @@
-"""What a drone is shown of the world around it: events, or what its rivals see in their place.
+"""Sensors: what a drone sees of the world around it. `SENSORS` has one entry for each choice of `env.sensor`.
 
-`events` is the method's sensor. `frames` is the newest brightness frame of the same camera, `depth` its true depth,
-`ranges` the true free way along each move, `blind` nothing at all: for comparison at the same budget.
+A new sensor is an entry here and a choice in `config/options.py`; all other code asks the entry.
 """
 
 from __future__ import annotations
 
+import dataclasses
+import enum
+from collections.abc import Callable
+
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
 from edqn_jax.config import CameraConfig, Config
@@ -19,38 +23,113 @@ from edqn_jax.sim.raycast import Rays
 from edqn_jax.sim.scene import Scene
 
 Sensed = EventField | Array | None
-"""What the sensor shows: an event field, a picture [H, W] of `frames` or `depth`, the nearness [26] of what lies along
-each of `moves.DIRECTIONS`, or None for `blind`. All but events is of order 1."""
+"""What a sensor shows, see `Form`."""
+
+SensorMemory = EventMemory | None
+"""What a sensor carries from one decision to the next."""
 
 MID_GREY = -1.0
-"""Log brightness that is 0 in a frame: about the middle of what there is to see."""
+"""Log brightness that `frames` shows as 0: about the middle of the range in a scene."""
 
 HALF_NEAR_M = 4.0
-"""Distance of nearness a half, metres: what a drone flies along an axis in a second."""
+"""Distance at which nearness is one half, metres: what a drone flies along an axis in a second."""
 
 DEPTH_SCALE = 3.0
-"""What depth shows at contact: its pictures then vary as much as frames do, and the VAE weighs both alike."""
+"""Value of `depth` at contact: its pictures then vary as much as frames do, and the VAE weighs both alike."""
+
+
+class Form(enum.Enum):
+    """Form of what a sensor shows. It decides how the observation is embedded and drawn."""
+
+    EVENTS = enum.auto()
+    """An event field at the camera's resolution; the VAE embeds it."""
+    PICTURE = enum.auto()
+    """An array [H, W] of order 1 at the camera's resolution; the VAE embeds it."""
+    VALUES = enum.auto()
+    """An array [V] of order 1; the Q-network sees it as it is."""
+    NOTHING = enum.auto()
+    """None; the Q-network sees only the drone's own state."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Image:
+    """How a sensor's image is labelled and coloured in figures."""
+
+    label: str
+    unit: str
+    signed: bool = False
+    """Whether it holds signed event counts: the colours are symmetric about 0. Otherwise they span the values."""
+
+
+def _now(config: Config) -> tuple[float, ...]:
+    return (0.0,)
+
+
+def _no_values(config: Config) -> int:
+    return 0
+
+
+def _no_memory(config: Config, key: Array) -> SensorMemory:
+    return None
+
+
+@dataclasses.dataclass(frozen=True)
+class Sensor:
+    """Everything that the rest of the code asks about one sensor. T frame times."""
+
+    show: Callable[[Config, Scene, Flight, SensorMemory, Array], tuple[Sensed, SensorMemory]]
+    """As `sense`."""
+    form: Form
+    values: Callable[[Config], int] = _no_values
+    """V of `Form.VALUES`."""
+    frame_times_s: Callable[[Config], tuple[float, ...]] = _now
+    """Times of the T poses that `show` needs, seconds relative to the end of a decision; each is a physics step."""
+    draws_frames: bool = False
+    """Whether `show` draws a picture at each of these times."""
+    of_frames: Callable[[Config, Array, SensorMemory, Array], tuple[Sensed, SensorMemory]] | None = None
+    """As `show`, from luma frames [T, H, W] that are drawn already; None where these do not suffice."""
+    at_rest: Callable[[Config, Array], SensorMemory] = _no_memory
+    """Memory before the first decision, from a key; None where nothing is carried from one decision to the next."""
+    image: Image | None = None
+    """How what is shown is drawn; None where it is no image."""
+
+    def example(self, config: Config) -> Sensed:
+        """Returns random data of the form that the sensor shows, the same at every call."""
+        rng, shape = np.random.default_rng(0), (config.camera.height, config.camera.width)
+        match self.form:
+            case Form.NOTHING:
+                return None
+            case Form.VALUES:
+                return jnp.asarray(rng.random(self.values(config), np.float32))
+            case Form.PICTURE:
+                return jnp.asarray(rng.random(shape, np.float32))
+            case Form.EVENTS:
+                return events.random_field(config.events, *shape, rng)
+
+
+def sensor_of(config: Config) -> Sensor:
+    """Returns the entry of `SENSORS` that `config` names."""
+    return SENSORS[config.env.sensor]
 
 
 def frame_steps(config: Config) -> tuple[int, ...]:
-    """Physics steps of a decision, 0..n, after which the sensor looks."""
+    """Returns the physics steps of a decision, 0..n, after which the sensor needs a pose."""
     n = config.drone.physics_steps
-    times = config.events.frame_times_s if config.env.sensor == "events" else (0.0,)
-    return tuple(n + round(t / config.drone.physics_dt_s) for t in times)
+    return tuple(n + round(t / config.drone.physics_dt_s) for t in sensor_of(config).frame_times_s(config))
 
 
 def frames_per_decision(config: Config) -> int:
-    """Pictures that are drawn for one decision."""
-    return 0 if config.env.sensor in ("ranges", "blind") else len(frame_steps(config))
+    """Returns the number of pictures that are drawn for one decision."""
+    return len(frame_steps(config)) if sensor_of(config).draws_frames else 0
 
 
 def view(config: Config, scene: Scene, position: Array, quaternion: Array) -> Array:
-    """Luma frame [H, W] of the camera on a body at `position` [3] with attitude `quaternion` [4]."""
+    """Returns the luma frame [H, W] of the camera on a body at `position` [3] with attitude `quaternion` [4]."""
     return camera.luma(config.camera, scene, position, mount_rotation(config, quaternion))
 
 
 def mount_rotation(config: Config, quaternion: Array) -> Array:
-    """[3, 3] body-to-world rotation of the camera: the heading alone when level, else the full attitude."""
+    """Returns the camera's [3, 3] body-to-world rotation: the heading alone when level, else the full attitude."""
     if config.camera.mount == "level":
         w, z = quaternion[0], quaternion[3]
         scale = jax.lax.rsqrt(jnp.maximum(w * w + z * z, 1e-9))
@@ -65,41 +144,50 @@ def mount_rotation(config: Config, quaternion: Array) -> Array:
     )
 
 
-def at_rest(config: Config, key: Array) -> EventMemory | None:
-    """What the sensor carries from one window to the next, before the first; None where it carries nothing."""
-    if config.env.sensor != "events":
-        return None
-    return events.reset_memory(config.events, config.camera.height, config.camera.width, key)
+def at_rest(config: Config, key: Array) -> SensorMemory:
+    """Returns the sensor's memory before the first decision; None where it has none."""
+    return sensor_of(config).at_rest(config, key)
 
 
-def sense(
-    config: Config, scene: Scene, poses: Flight, memory: EventMemory | None, key: Array
-) -> tuple[Sensed, EventMemory | None]:
-    """What the sensor shows at the end of a decision, and its memory after it.
+def sense(config: Config, scene: Scene, poses: Flight, memory: SensorMemory, key: Array) -> tuple[Sensed, SensorMemory]:
+    """Returns what the sensor shows at the end of a decision, and its memory after it.
 
     Args:
         poses: [T, ...] after the physics steps of `frame_steps`, in order.
         memory: from `at_rest` or the decision before.
         key: consumed only by noise events.
     """
-    if config.env.sensor == "events":
-        assert memory is not None
-        frames = jax.vmap(lambda p, q: view(config, scene, p, q))(poses.position, poses.quaternion)
-        return events.events(config.events, memory, frames, config.events.frame_times_s, key)
-    position, quaternion = poses.position[-1], poses.quaternion[-1]
-    match config.env.sensor:
-        case "frames":
-            return brightness(config, view(config, scene, position, quaternion)), None
-        case "depth":
-            metres = camera.depth(config.camera, scene, position, mount_rotation(config, quaternion))
-            return DEPTH_SCALE * nearness(metres), None
-        case "ranges":
-            return nearness(ranges(config.camera, scene, position, drone.yaw_of(quaternion))), None
-    return None, None
+    return sensor_of(config).show(config, scene, poses, memory, key)
+
+
+def _show_events(
+    config: Config, scene: Scene, poses: Flight, memory: SensorMemory, key: Array
+) -> tuple[Sensed, SensorMemory]:
+    frames = jax.vmap(lambda p, q: view(config, scene, p, q))(poses.position, poses.quaternion)
+    return _events_of_frames(config, frames, memory, key)
+
+
+def _events_of_frames(config: Config, frames: Array, memory: SensorMemory, key: Array) -> tuple[Sensed, SensorMemory]:
+    assert memory is not None
+    return events.events(config.events, memory, frames, config.events.frame_times_s, key)
+
+
+def _event_memory(config: Config, key: Array) -> SensorMemory:
+    return events.reset_memory(config.events, config.camera.height, config.camera.width, key)
+
+
+def _show_frame(
+    config: Config, scene: Scene, poses: Flight, memory: SensorMemory, key: Array
+) -> tuple[Sensed, SensorMemory]:
+    return brightness(config, view(config, scene, poses.position[-1], poses.quaternion[-1])), None
+
+
+def _newest_frame(config: Config, frames: Array, memory: SensorMemory, key: Array) -> tuple[Sensed, SensorMemory]:
+    return brightness(config, frames[-1]), None
 
 
 def brightness(config: Config, luma: Array) -> Array:
-    """What `frames` shows of a luma frame [..., H, W]: log brightness (Eq. 1), of whose changes events are made.
+    """Returns what `frames` shows of a luma frame [..., H, W]: log brightness (Eq. 1), whose changes make events.
 
     In the logarithm a contrast is the same in light and in shade; brightness itself varies so little that the VAE
     leaves part of its code unused (docs/baselines.md).
@@ -107,33 +195,88 @@ def brightness(config: Config, luma: Array) -> Array:
     return events.log_brightness(config.events, luma) - MID_GREY
 
 
+def _show_depth(
+    config: Config, scene: Scene, poses: Flight, memory: SensorMemory, key: Array
+) -> tuple[Sensed, SensorMemory]:
+    position, quaternion = poses.position[-1], poses.quaternion[-1]
+    metres = camera.depth(config.camera, scene, position, mount_rotation(config, quaternion))
+    return DEPTH_SCALE * nearness(metres), None
+
+
+def _show_ranges(
+    config: Config, scene: Scene, poses: Flight, memory: SensorMemory, key: Array
+) -> tuple[Sensed, SensorMemory]:
+    position, quaternion = poses.position[-1], poses.quaternion[-1]
+    return nearness(ranges(config.camera, scene, position, drone.yaw_of(quaternion))), None
+
+
 def nearness(distance: Array) -> Array:
-    """`1 / (1 + distance / HALF_NEAR_M)`: 1 at contact, 0 at infinity, steepest where it matters."""
+    """Returns `1 / (1 + distance / HALF_NEAR_M)` of metres [...]: 1 at contact, 0 at infinity, steepest near 0."""
     return 1.0 / (1.0 + distance / HALF_NEAR_M)
 
 
 def ranges(config: CameraConfig, scene: Scene, position: Array, yaw: Array) -> Array:
-    """Metres [26] from `position` [3] to the nearest shape or the end of the flight volume along each move.
+    """Returns metres [26] from `position` [3] to the nearest shape or face of the flight volume along each move.
 
-    Exact rays from the body's centre along `moves.DIRECTIONS` at heading `yaw`, for a centre that is in the volume and
-    in no shape.
+    Exact rays from the body's centre along `moves.DIRECTIONS` at heading `yaw` [] radians. The centre must be inside
+    the volume and outside all shapes.
     """
     cos, sin = jnp.cos(yaw), jnp.sin(yaw)
     ahead, left, up = jnp.asarray(DIRECTIONS.T)
-    way = jnp.stack([cos * ahead - sin * left, sin * ahead + cos * left, up])
-    # One row of rays; what belongs to a pixel's area does not matter for where they meet a shape.
+    direction = jnp.stack([cos * ahead - sin * left, sin * ahead + cos * left, up])
+    # One row of rays; the fields that describe a pixel's area do not affect where rays meet shapes.
     rays = Rays(
-        dx=way[None, 0],
-        dy=way[None, 1],
-        dz=way[None, 2],
+        dx=direction[None, 0],
+        dy=direction[None, 1],
+        dz=direction[None, 2],
         right=jnp.zeros(3),
         up=jnp.zeros(3),
         pitch=0.0,
         across=1,
         down=1,
     )
-    met = raycast.nearest_depth(config, scene, position, rays)[0]
+    to_shape = raycast.nearest_depth(config, scene, position, rays)[0]
     lower, upper = (jnp.abs(corner - position)[:, None] for corner in scene.volume)
-    along = jnp.where(way > 0, upper, lower) / jnp.maximum(jnp.abs(way), raycast.TINY)
-    fence = jnp.min(jnp.where(jnp.abs(way) > raycast.TINY, along, jnp.inf), axis=0)
-    return jnp.minimum(met, fence)
+    along = jnp.where(direction > 0, upper, lower) / jnp.maximum(jnp.abs(direction), raycast.TINY)
+    to_face = jnp.min(jnp.where(jnp.abs(direction) > raycast.TINY, along, jnp.inf), axis=0)
+    return jnp.minimum(to_shape, to_face)
+
+
+def _show_nothing(
+    config: Config, scene: Scene, poses: Flight, memory: SensorMemory, key: Array
+) -> tuple[Sensed, SensorMemory]:
+    return None, None
+
+
+SENSORS: dict[str, Sensor] = {
+    # The method's sensor.
+    "events": Sensor(
+        show=_show_events,
+        form=Form.EVENTS,
+        frame_times_s=lambda config: config.events.frame_times_s,
+        draws_frames=True,
+        of_frames=_events_of_frames,
+        at_rest=_event_memory,
+        image=Image("events", "events per pixel", signed=True),
+    ),
+    # The newest brightness frame of the same camera.
+    "frames": Sensor(
+        show=_show_frame,
+        form=Form.PICTURE,
+        draws_frames=True,
+        of_frames=_newest_frame,
+        image=Image("log brightness", "log brightness + 1"),
+    ),
+    # True depth.
+    "depth": Sensor(
+        show=_show_depth,
+        form=Form.PICTURE,
+        draws_frames=True,
+        image=Image("nearness", "nearness (3 is contact)"),
+    ),
+    # True free distance along each move, as nearness.
+    "ranges": Sensor(show=_show_ranges, form=Form.VALUES, values=lambda config: len(DIRECTIONS)),
+    # Nothing but the drone's own state.
+    "blind": Sensor(show=_show_nothing, form=Form.NOTHING),
+}
+"""By `env.sensor`. `events` is the method's; the others are compared with it at the same budget."""

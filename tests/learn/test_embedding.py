@@ -24,6 +24,7 @@ from edqn_jax.runs.provenance import workload
 from edqn_jax.sim import drone, mjcf, worlds
 from edqn_jax.sim.env import Observation, World
 from edqn_jax.sim.scene import stack_scenes
+from edqn_jax.sim.sensor import Form
 from tests.learn.moving_boxes import frames
 from tests.learn.test_trainer import CONFIG
 
@@ -164,7 +165,7 @@ def test_the_code_of_a_picture_has_the_sizes_of_the_code_of_events(kind) -> None
 def test_a_picture_is_pooled_pixel_by_pixel(kind) -> None:
     config = EncoderConfig(pixel_features=kind, features=4, hidden=16, code_size=5)
     camera = CameraConfig(width=6, height=4)
-    params = jax.jit(lambda key: encoder.init_encoder(config, camera, key, pictures=True))(jax.random.key(0))
+    params = jax.jit(lambda key: encoder.init_encoder(config, camera, key, form=Form.PICTURE))(jax.random.key(0))
     pictures = np.random.default_rng(0).normal(size=(2, 4, 6)).astype(np.float32)
     mean, log_variance = jax.jit(partial(encoder.encode, config))(params, jnp.asarray(pictures))
     place = encoder.PixelTable if kind == "table" else encoder.PixelNetwork
@@ -184,7 +185,7 @@ def test_the_code_of_pictures_is_learnt() -> None:
     config, camera = EncoderConfig(), CameraConfig()
     draw = jax.jit(jax.vmap(lambda key: jnp.log(frames(camera, key)[1] + 1e-3) + 1.0))
     pictures = draw(jax.random.split(jax.random.key(1), 1024))
-    params = encoder.init_encoder(config, camera, jax.random.key(0), pictures=True)
+    params = encoder.init_encoder(config, camera, jax.random.key(0), form=Form.PICTURE)
     optimiser = optax.adam(config.learning_rate)
 
     def update(carry, key):

@@ -14,6 +14,7 @@ import pytest
 from edqn_jax.config import CameraConfig, EncoderConfig, EventsConfig
 from edqn_jax.learn import encoder as en
 from edqn_jax.sim import events as ev
+from edqn_jax.sim.sensor import Form
 from tests.learn.moving_boxes import fields
 
 CAMERA = CameraConfig()
@@ -89,19 +90,19 @@ def test_dense_encoder_equals_the_sum_over_single_events(kind, field):
         np.testing.assert_allclose(a, b, rtol=1e-3, atol=1e-3)
 
 
-@pytest.mark.parametrize("pictures", [False, True], ids=["events", "pictures"])
+@pytest.mark.parametrize("form", [Form.EVENTS, Form.PICTURE], ids=["events", "pictures"])
 @pytest.mark.parametrize("kind", ["table", "network"])
-def test_pixel_features_written_out_give_the_same_codes(kind, pictures):
+def test_pixel_features_written_out_give_the_same_codes(kind, form):
     config = EncoderConfig(pixel_features=kind, features=8, hidden=16, code_size=5)
-    params = en.init_encoder(config, SMALL, jax.random.key(0), pictures=pictures)
+    params = en.init_encoder(config, SMALL, jax.random.key(0), form=form)
     table = en.tabulated(config, SMALL, params)
     assert "table" in table["encoder"]["pixels"] and table["decoder"] is params["decoder"]
     field, picture = ragged_field(6), jax.random.normal(jax.random.key(1), (SMALL.height, SMALL.width))
-    sensed = picture if pictures else field
+    sensed = field if form is Form.EVENTS else picture
     # One and the same product of the same numbers, but for what is fused into it.
     for one, two in zip(en.encode(config, params, sensed), en.encode(config, table, sensed), strict=True):
         np.testing.assert_allclose(one, two, rtol=1e-5, atol=1e-5)
-    if not pictures:
+    if form is Form.EVENTS:
         events = event_list(field)
         codes = (en.encode_events(config, p, SMALL, *events)[0] for p in (params, table))
         np.testing.assert_allclose(*codes, rtol=1e-5, atol=1e-5)

@@ -13,23 +13,28 @@ import numpy as np
 import pytest
 
 from edqn_jax.config import CameraConfig, Config, EnvConfig
+from edqn_jax.evaluation.latency import decision_latency_ms
+from edqn_jax.learn import embedding, policy, trainer
+from edqn_jax.learn.trainer import Plan
+from edqn_jax.runs.provenance import workload
 from edqn_jax.sim import env, mjcf, sensor
 from edqn_jax.sim.drone import Flight, hover, load_airframe
 from edqn_jax.sim.events import EventField
 from edqn_jax.sim.moves import ACTIONS, DIRECTIONS
 from edqn_jax.sim.scene import stack_scenes
+from edqn_jax.sim.sensor import Form, Sensor
 from edqn_jax.sim.worlds import own_missions
+from tests.learn.test_trainer import CONFIG as MINIATURE
 from tests.oracles import camera_plain
 from tests.oracles.mujoco_depth import RayCaster
 from tests.sim.drawn_scenes import every_kind, free_points, rotation_of, scene_of
 
-SENSORS = ("events", "frames", "depth", "ranges", "blind")
 CAMERA = CameraConfig(width=16, height=12)
 STAY = 13
 
 
-def config_of(name: str, **knobs) -> Config:
-    return Config(camera=CAMERA, env=EnvConfig(sensor=name, **knobs))  # type: ignore
+def config_of(name: str, **options) -> Config:
+    return Config(camera=CAMERA, env=EnvConfig(sensor=name, **options))  # type: ignore
 
 
 @partial(jax.jit, static_argnums=0)
@@ -197,3 +202,69 @@ def test_a_camera_on_the_body_sees_the_ground_rise_and_ranges_do_not_care(world)
             found[name, attitude is level] = np.asarray(see(Flight(place, attitude, jnp.zeros((1, 3)))))
     assert found["depth", False][:6].mean() > found["depth", True][:6].mean() + 0.02
     np.testing.assert_allclose(found["ranges", False], found["ranges", True], atol=1e-6)
+
+
+# ------------------------------------------------------------------------------------- a new sensor
+
+
+def _show_row_means(config, scene, poses, memory, key):
+    """Mean brightness of each row of the newest frame, and the number of decisions."""
+    frame = sensor.view(config, scene, poses.position[-1], poses.quaternion[-1])
+    return jnp.mean(sensor.brightness(config, frame), axis=-1), memory + 1
+
+
+def _show_negative(config, scene, poses, memory, key):
+    frame = sensor.view(config, scene, poses.position[-1], poses.quaternion[-1])
+    return -sensor.brightness(config, frame), memory
+
+
+NEW = {
+    "row_means": Sensor(
+        show=_show_row_means,
+        form=Form.VALUES,
+        values=lambda config: config.camera.height,
+        draws_frames=True,
+        at_rest=lambda config, key: jnp.zeros(()),
+    ),
+    "negative": Sensor(show=_show_negative, form=Form.PICTURE, draws_frames=True),
+}
+
+
+@pytest.fixture(params=NEW)
+def with_new_sensor(request, monkeypatch) -> Config:
+    """A miniature that trains with a sensor that only the table knows."""
+    monkeypatch.setitem(sensor.SENSORS, request.param, NEW[request.param])
+    return dataclasses.replace(
+        MINIATURE,
+        env=dataclasses.replace(MINIATURE.env, sensor=request.param),
+        drone=dataclasses.replace(MINIATURE.drone, physics="rigid_body"),  # compiles faster
+    )
+
+
+def test_a_new_sensor_needs_only_its_entry_to_act(with_new_sensor, world) -> None:
+    config = with_new_sensor
+    state = jax.eval_shape(lambda key: env.ended(config, world, key), jax.random.key(0))
+    state, step = jax.eval_shape(lambda s: env.step(config, world, s, 0), state)
+    shown = sensor.sensor_of(config).example(config)
+    assert step.observation.sensed.shape == shown.shape  # type: ignore
+    assert workload(config, jax.tree.map(lambda x: x[0], world.pool))["frames_per_decision"] == 1
+    params = policy.fresh_policy(config)
+    code = embedding.embed(config, params.encoder, shown)
+    assert code is not None and code.shape == (embedding.size(config),)
+    if sensor.sensor_of(config).form is Form.VALUES:
+        np.testing.assert_array_equal(code, shown)
+        assert state.memory.shape == () and not params.encoder
+    assert decision_latency_ms(config, params, calls=1)["median"] > 0.0
+
+
+@pytest.mark.slow
+def test_a_new_sensor_needs_only_its_entry_to_train(with_new_sensor, world) -> None:
+    config = with_new_sensor
+    steps = Plan.of(config).learn_from + 2
+    before = jax.jit(lambda key: trainer.init(config, world, key))(jax.random.key(0))
+    after, (_, losses) = jax.jit(lambda s: trainer.run_steps(config, world, s, jnp.arange(steps)))(before)
+    assert np.isfinite(np.asarray(losses.q_loss)[-1])
+    assert np.isfinite(np.asarray(losses.reconstruction)).sum() == Plan.of(config).warmup
+    if sensor.sensor_of(config).form is Form.VALUES:
+        np.testing.assert_array_equal(after.actors.env.memory >= 1, True)  # what it carries is carried
+    assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(after.learner))
