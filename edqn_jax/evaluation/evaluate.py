@@ -91,4 +91,6 @@ def _check_can_shuffle(policy: Policy, missions: int) -> None:
     if missions < least:
         raise ConfigError(f"--shuffle-codes needs --missions of at least {least}, not {missions}")
     if sensor_of(policy.config).form is Form.NOTHING:
-        raise ConfigError(f"--shuffle-codes has nothing to shuffle: the sensor '{policy.config.env.sensor}' shows nothing")
+        raise ConfigError(
+            f"--shuffle-codes has nothing to shuffle: the sensor '{policy.config.env.sensor}' shows nothing"
+        )

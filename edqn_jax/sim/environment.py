@@ -11,6 +11,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 from pathlib import Path
+from typing import Literal
 
 import jax
 import jax.numpy as jnp
@@ -22,6 +23,7 @@ from edqn_jax.config import DENSITIES, Config
 from edqn_jax.config.loading import make_config
 from edqn_jax.errors import ConfigError
 from edqn_jax.sim import camera, drone, env, events, sensor
+from edqn_jax.sim.drone import Flight
 from edqn_jax.sim.env import EnvState, Observation, Step, World
 from edqn_jax.sim.events import EventField
 from edqn_jax.sim.mjcf import check_scene, load_world, resolve_world
@@ -92,6 +94,20 @@ class Environment:
         """
         return np.asarray(events.event_image(self._field(observation)))
 
+    def stream(self, flight: Flight, mission: int = 0, law: Literal["paper", "airsim", "esim"] = "esim") -> np.ndarray:
+        """Returns the events of a camera that watches a whole flight, with a frame at every physics step.
+
+        Args:
+            flight: poses [T] of consecutive physics steps, such as the `flight` of steps, concatenated.
+            mission: in whose world it was flown.
+            law: of the events; `esim` remembers each pixel's level from frame to frame.
+
+        Returns:
+            a structured array as `events` returns it; `t` counts from the first pose.
+        """
+        sees = dataclasses.replace(self.config, events=dataclasses.replace(self.config.events, law=law))
+        return events.expand(_stream(sees, self.scene(mission), flight))
+
     def picture(self, state: EnvState, scale: int = 8) -> np.ndarray:
         """Returns what a person would see from the drone's camera: [H * scale, W * scale, 3] sRGB in [0, 1]."""
         scene = take_scene(self.world.pool, self.world.missions.scene[state.mission])
@@ -146,6 +162,15 @@ def _file_pool(config: Config, name: str, count: int) -> Scene:
 
 _reset = jax.jit(env.reset, static_argnums=0)
 _step = jax.jit(env.step, static_argnums=0)
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _stream(config: Config, scene: Scene, flight: Flight) -> EventField:
+    frames = jax.lax.map(lambda pose: sensor.view(config, scene, pose.position, pose.quaternion), flight)
+    times = tuple(config.drone.physics_dt_s * np.arange(frames.shape[0]))
+    key, noise = jax.random.split(jax.random.key(0))
+    memory = events.reset_memory(config.events, config.camera.height, config.camera.width, key)
+    return events.events(config.events, memory, frames, times, noise, continuous=True)[0]
 
 
 @functools.partial(jax.jit, static_argnums=(0, 1))

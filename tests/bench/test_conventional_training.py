@@ -24,7 +24,7 @@ from edqn_jax.sim.outcomes import Outcome
 from measurement.flags import configured
 from rivals import stack
 from tests.bench.conventional_course import course_of
-from tests.benchmarks.miniature import MINIATURE
+from tests.miniature import MINIATURE
 from tests.planners.uninstalled import hide
 
 torch = require("torch")

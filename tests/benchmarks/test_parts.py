@@ -18,7 +18,7 @@ from measurement.flags import configured
 from measurement.parts import PARTS, Moment, parts_of
 from measurement.timing import Part, Timed, nudged, operations, size_of
 from measurement.whole import steady
-from tests.benchmarks.miniature import MINIATURE
+from tests.miniature import MINIATURE
 
 pytestmark = pytest.mark.slow
 

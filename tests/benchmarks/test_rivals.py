@@ -18,8 +18,8 @@ from edqn_jax.config import Config
 from edqn_jax.config.loading import to_yaml
 from edqn_jax.sim.mjcf import write_scene
 from rivals import learners, planning, rival, table
-from tests.benchmarks.miniature import MINIATURE
 from tests.benchmarks.turns import row
+from tests.miniature import MINIATURE
 from tests.planners.rooms import WITHOUT_A_WAY, room
 from tests.planners.uninstalled import hide
 

@@ -24,7 +24,7 @@ from edqn_jax.sim.mjcf import check_scene, load_scene
 from edqn_jax.sim.scene import obstacle_count
 from measurement.flags import configured
 from measurement.timing import size_of
-from tests.benchmarks.miniature import MINIATURE
+from tests.miniature import MINIATURE
 
 BASE = apply(configured([]), {"train": {"devices": 2}}, "the test")
 

@@ -12,7 +12,7 @@ from edqn_jax.errors import ConfigError
 from edqn_jax.learn.trainer import Plan, Trainer
 from edqn_jax.runs.directory import plain
 from measurement.parts import parts_of
-from tests.benchmarks.miniature import MINIATURE
+from tests.miniature import MINIATURE
 
 
 def test_the_vae_learns_throughout_and_four_samples_are_replayed() -> None:

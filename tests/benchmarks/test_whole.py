@@ -11,7 +11,7 @@ import pytest
 from edqn_jax.evaluation.missions import run_missions
 from measurement.flags import configured
 from measurement.whole import WholeStep, steady
-from tests.benchmarks.miniature import MINIATURE
+from tests.miniature import MINIATURE
 
 
 @pytest.mark.slow
