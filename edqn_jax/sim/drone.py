@@ -156,12 +156,16 @@ def yaw_of(quaternion: Array) -> Array:
     return wrap_angle(2 * jnp.arctan2(quaternion[..., 3], quaternion[..., 0]))
 
 
-def thrusts(config: DroneConfig, airframe: Airframe, state: DroneState, velocity_command: Array) -> Array:
-    """Rotor thrusts [4] newtons towards `velocity_command` [3] m/s (world) and the state's yaw setpoint.
+Scalars = tuple[Array, Array, Array]
+"""One vector, a scalar [] for each coordinate."""
 
-    Velocity error gives a wanted acceleration, that a wanted direction of the body's z axis; the turn still
-    missing gives wanted body rates, their error a wanted torque. Within the rotors' limits torque about x
-    and y comes first, then collective thrust, then torque about z.
+
+def thrusts(config: DroneConfig, airframe: Airframe, state: DroneState, velocity_command: Array) -> Array:
+    """Returns rotor thrusts [4] newtons towards `velocity_command` [3] m/s (world) and the state's yaw setpoint.
+
+    The velocity error gives a wanted specific force, its direction a wanted tilt of the body, the missing turn wanted
+    body rates, their error a wanted torque. Within the rotors' limits torque about x and y comes first, then
+    collective thrust, then torque about z.
     """
     half_yaw = state.yaw_setpoint / 2
     return _thrusts(config, airframe, state, velocity_command, jnp.cos(half_yaw), jnp.sin(half_yaw))
@@ -179,45 +183,91 @@ def _thrusts(
     p, q, r = state.angular_velocity
     vx, vy, vz = velocity_command - state.velocity
 
-    # Velocity -> specific force (acceleration plus gravity), within the largest accelerations and tilt.
+    force = _wanted_force(config, airframe, (vx, vy, vz))
+    axes = _body_axes(w, x, y, z)
+    direction = _in_body_frame(axes, force)
+    turn = _wanted_yaw_rate(config, w, z, cos_half_yaw, sin_half_yaw)
+    rates = _wanted_rates(config, direction, turn)
+    torque = _torque(config, airframe, rates, (p, q, r))
+    collective = _collective_thrust(airframe, force[2], axes[2][2])
+    # Computed once, and not again for each rotor.
+    return _allocate(config, airframe, *materialised(jnp.stack([*torque, collective])))
+
+
+def _wanted_force(config: DroneConfig, airframe: Airframe, error: Scalars) -> Scalars:
+    """Returns the wanted specific force m/s^2 (world): acceleration plus gravity, for a velocity `error` m/s.
+
+    Within the largest accelerations and the largest tilt.
+    """
+    vx, vy, vz = error
     fz = airframe.gravity + jnp.clip(config.climb_gain * vz, -config.max_descent_m_s2, config.max_climb_m_s2)
     fx, fy = config.velocity_gain * vx, config.velocity_gain * vy
     most = jnp.minimum(config.max_horizontal_m_s2, float(np.tan(config.max_tilt_rad)) * fz)
-    lean = jnp.minimum(1.0, most * jax.lax.rsqrt(fx * fx + fy * fy + 1e-9))
-    fx, fy = fx * lean, fy * lean
+    scale = jnp.minimum(1.0, most * jax.lax.rsqrt(fx * fx + fy * fy + 1e-9))
+    return fx * scale, fy * scale, fz
+
+
+def _body_axes(w: Array, x: Array, y: Array, z: Array) -> tuple[Scalars, Scalars, Scalars]:
+    """Returns the world's x, y and z axis in the body frame, for the attitude quaternion w, x, y, z."""
+    up = 2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)
+    ahead = 1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)
+    left = 2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)
+    return ahead, left, up
+
+
+def _in_body_frame(axes: tuple[Scalars, Scalars, Scalars], force: Scalars) -> Scalars:
+    """Returns the unit direction of `force` in the body frame; its x and y are the tilt that is still missing."""
+    (ahead_x, ahead_y, ahead_z), (left_x, left_y, left_z), (up_x, up_y, up_z) = axes
+    fx, fy, fz = force
     norm = jax.lax.rsqrt(fx * fx + fy * fy + fz * fz)
+    return (
+        (ahead_x * fx + left_x * fy + up_x * fz) * norm,
+        (ahead_y * fx + left_y * fy + up_y * fz) * norm,
+        (ahead_z * fx + left_z * fy + up_z * fz) * norm,
+    )
 
-    # Its direction in the body frame: how much tilt is still missing, and towards where.
-    up_x, up_y, up_z = 2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)
-    ahead_x, ahead_y, ahead_z = 1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)
-    left_x, left_y, left_z = 2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)
-    ex = (ahead_x * fx + left_x * fy + up_x * fz) * norm
-    ey = (ahead_y * fx + left_y * fy + up_y * fz) * norm
-    ez = (ahead_z * fx + left_z * fy + up_z * fz) * norm
 
-    # Attitude -> body rates. 2 sin(angle / 2) stands for the angle: no arc functions, strong to 180 degrees.
-    tilt = jnp.minimum(
+def _wanted_rates(config: DroneConfig, direction: Scalars, yaw_rate: Array) -> Scalars:
+    """Returns wanted body rates rad/s that turn the body's z axis to `direction` (body frame).
+
+    2 sin(angle / 2) stands for the angle: no arc functions, strong up to 180 degrees.
+    """
+    ex, ey, ez = direction
+    gain = jnp.minimum(
         config.attitude_gain * jax.lax.rsqrt(jnp.maximum(0.5 + 0.5 * ez, 1e-2)),
         config.max_body_rate_rad_s * jax.lax.rsqrt(ex * ex + ey * ey + 1e-9),
     )
+    return -gain * ey, gain * ex, yaw_rate
+
+
+def _wanted_yaw_rate(config: DroneConfig, w: Array, z: Array, cos_half_yaw: Array, sin_half_yaw: Array) -> Array:
+    """Returns the wanted rate about z [] rad/s from the heading error, 2 sin(angle / 2) for the angle as above."""
     cos_error = w * cos_half_yaw + z * sin_half_yaw
     sin_error = w * sin_half_yaw - z * cos_half_yaw
-    turn = 2 * config.yaw_gain * sin_error * jnp.sign(cos_error) * jax.lax.rsqrt(w * w + z * z + 1e-6)
-    turn = jnp.clip(turn, -config.max_yaw_rate_rad_s, config.max_yaw_rate_rad_s)
+    rate = 2 * config.yaw_gain * sin_error * jnp.sign(cos_error) * jax.lax.rsqrt(w * w + z * z + 1e-6)
+    return jnp.clip(rate, -config.max_yaw_rate_rad_s, config.max_yaw_rate_rad_s)
 
-    # Body rates -> torque, gyroscopic torque included.
+
+def _torque(config: DroneConfig, airframe: Airframe, wanted: Scalars, rates: Scalars) -> Scalars:
+    """Returns the torque N m (body) from rates to `wanted` rates rad/s, gyroscopic torque included."""
+    (wanted_p, wanted_q, wanted_r), (p, q, r) = wanted, rates
     ix, iy, iz = airframe.inertia
-    torque_x = ix * config.rate_gain * (-tilt * ey - p) + (iz - iy) * q * r
-    torque_y = iy * config.rate_gain * (tilt * ex - q) + (ix - iz) * p * r
-    torque_z = iz * config.yaw_rate_gain * (turn - r) + (iy - ix) * p * q
+    return (
+        ix * config.rate_gain * (wanted_p - p) + (iz - iy) * q * r,
+        iy * config.rate_gain * (wanted_q - q) + (ix - iz) * p * r,
+        iz * config.yaw_rate_gain * (wanted_r - r) + (iy - ix) * p * q,
+    )
 
-    # Collective thrust that gives the wanted vertical force at the tilt of this moment; none upside down.
-    collective = airframe.mass * fz * jnp.maximum(up_z, 0.0) / jnp.maximum(up_z * up_z, LEAST_LEVELNESS**2)
 
-    # Computed once, and not again for each rotor.
-    torque_x, torque_y, torque_z, collective = materialised(jnp.stack([torque_x, torque_y, torque_z, collective]))
+def _collective_thrust(airframe: Airframe, fz: Array, levelness: Array) -> Array:
+    """Returns the thrust [] newtons with vertical specific force `fz` at cos(tilt) `levelness`; 0 upside down."""
+    return airframe.mass * fz * jnp.maximum(levelness, 0.0) / jnp.maximum(levelness * levelness, LEAST_LEVELNESS**2)
 
-    # Rotor limits, in order of importance.
+
+def _allocate(
+    config: DroneConfig, airframe: Airframe, torque_x: Array, torque_y: Array, torque_z: Array, collective: Array
+) -> Array:
+    """Returns rotor thrusts [4] newtons within their limits: torque about x and y, then collective, then torque z."""
     rotors = range(airframe.mixer.shape[0])
     mixer, limit = airframe.mixer, airframe.max_thrust
     tilting = [mixer[i, 1] * torque_x + mixer[i, 2] * torque_y for i in rotors]
@@ -225,8 +275,8 @@ def _thrusts(
     scale = jnp.minimum(1.0, config.max_tilt_share * limit / (high - low + 1e-9))
     shared = jnp.clip(mixer[0, 0] * collective, -scale * low, limit - scale * high)
     levelled = [shared + scale * t for t in tilting]
-    room = jnp.maximum(0.0, _least([jnp.minimum(t, limit - t) for t in levelled]))
-    turning = jnp.clip(jnp.abs(mixer[0, 3]) * torque_z, -room, room)
+    margin = jnp.maximum(0.0, _least([jnp.minimum(t, limit - t) for t in levelled]))
+    turning = jnp.clip(jnp.abs(mixer[0, 3]) * torque_z, -margin, margin)
     spins = [jnp.sign(mixer[i, 3]) for i in rotors]
     return jnp.stack([jnp.clip(t + spins[i] * turning, 0.0, limit) for i, t in enumerate(levelled)])
 
