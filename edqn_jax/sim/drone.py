@@ -1,14 +1,13 @@
-"""The drone: dynamics, by MJX unless asked otherwise, and a cascaded controller, velocity -> attitude -> body rate ->
-rotor thrust.
+"""The drone: dynamics, by MJX by default, and a cascaded controller: velocity -> attitude -> body rate -> rotor thrust.
 
-Frames: the world has z up; the body has x ahead, y left, z up and stands at the centre of mass. A
+Frames: the world has z up; the body has x ahead, y left, z up, its origin at the centre of mass. A
 quaternion (w, x, y, z) turns body vectors into world vectors.
 
 Heading is the quaternion's turn about the world's z, 2 atan2(z, w): what remains when the tilt is undone by
-the shortest way, as a gimbal does. Unlike the Euler angle it does not move when a drone merely leans.
+the shortest rotation, as a gimbal does. Unlike the Euler angle it does not change when a drone only tilts.
 
-Inside the scan everything but MJX is written in scalars, one per coordinate: mapped over environments they
-become contiguous rows that XLA fuses into a few loops.
+Inside the scan everything but MJX is computed in scalars, one per coordinate: mapped over environments they
+are contiguous rows that XLA fuses into a few loops.
 """
 
 from __future__ import annotations
@@ -30,19 +29,19 @@ from edqn_jax.errors import ConfigError
 from edqn_jax.sim.rigid_body import rigid_body_step
 from edqn_jax.sim.xla import materialised
 
-with contextlib.redirect_stdout(io.StringIO()):  # it prints that Warp, an engine we do not use, is missing
+with contextlib.redirect_stdout(io.StringIO()):  # it prints that Warp, which is not used here, is missing
     from mujoco import mjx
 
 AIRFRAME_FILE = Path(__file__).with_name("skydio_x2.xml")
 """Mass, inertia and rotor layout."""
 
 LEAST_LEVELNESS = 0.4
-"""Cosine of the tilt beyond which thrust no longer grows to hold the height."""
+"""Cosine of the tilt beyond which thrust no longer increases to hold the height."""
 
 
 @struct.dataclass
 class Airframe:
-    """What never changes in flight. R = 4 rotors."""
+    """Constants of the airframe. R = 4 rotors."""
 
     model: mjx.Model
     data: mjx.Data  # a template that holds the factored mass matrix
@@ -56,7 +55,7 @@ class Airframe:
 
 @struct.dataclass
 class DroneState:
-    """What the future of a flight depends on."""
+    """State of the body and of its heading setpoint."""
 
     position: Array  # [3] of the centre of mass, metres, world
     quaternion: Array  # [4] w, x, y, z; body to world
@@ -67,7 +66,7 @@ class DroneState:
 
 @struct.dataclass
 class Flight:
-    """What was flown in one decision: n physics steps, each entry taken after its step."""
+    """Poses and velocities of one decision: n physics steps, each entry taken after its step."""
 
     position: Array  # [n, 3] metres, world
     quaternion: Array  # [n, 4]
@@ -75,7 +74,7 @@ class Flight:
 
 
 def c_model(config: DroneConfig) -> mujoco.MjModel:
-    """The Skydio X2 as C MuJoCo compiles it, without the shapes that only a viewer needs."""
+    """Returns the Skydio X2 as C MuJoCo compiles it, without the shapes that only a viewer needs."""
     spec = mujoco.MjSpec.from_file(str(AIRFRAME_FILE))
     spec.option.timestep = config.physics_dt_s
     # MJX solves a sparse mass matrix by unrolled arithmetic, a dense one by a LAPACK call per environment.
@@ -86,22 +85,22 @@ def c_model(config: DroneConfig) -> mujoco.MjModel:
 
 
 def wrench_of_thrust(model: mujoco.MjModel) -> np.ndarray:
-    """Collective thrust and torque about x, y, z (N m) per rotor thrust: [4, R], of the model's rotor layout."""
+    """Returns the [4, R] collective thrust and torque about x, y, z (N m) per rotor thrust (N) of the rotor layout."""
     arm = model.site_pos[model.actuator_trnid[:, 0]]
     push, twist = model.actuator_gear[:, 2], model.actuator_gear[:, 5]
     return np.stack([push, arm[:, 1] * push, -arm[:, 0] * push, twist])
 
 
 def mixer_of(model: mujoco.MjModel) -> np.ndarray:
-    """Rotor thrusts per collective thrust (N) and torque about x, y, z (N m): [R, 4], of the model's rotor layout."""
+    """Returns the [R, 4] rotor thrusts per collective thrust (N) and torque about x, y, z (N m) of the rotor layout."""
     return np.linalg.inv(wrench_of_thrust(model))
 
 
 def load_airframe(config: DroneConfig) -> Airframe:
-    """The Skydio X2 as MJX arrays, and the mixer that follows from its rotor layout.
+    """Returns the Skydio X2 as MJX arrays, and the mixer that follows from its rotor layout.
 
     Raises:
-        ConfigError: if the airframe's file holds something that a physics step would leave out without a word.
+        ConfigError: if the airframe's file has something that a physics step would ignore.
     """
     model = c_model(config)
     _check(model)
@@ -129,12 +128,12 @@ def _check(model: mujoco.MjModel) -> None:
     if not (free and in_vacuum and centred and upright):
         raise ConfigError(
             f"'{AIRFRAME_FILE.name}' must be one free body in a vacuum, its frame at the centre of mass and along the "
-            "principal axes of inertia, under rotors that push along its z; edqn_jax/sim/drone.py flies nothing else"
+            "principal axes of inertia, under rotors that push along its z; no other model is supported"
         )
 
 
 def hover(position: Array, yaw: Array) -> DroneState:
-    """At rest and level at `position` [3] metres, nose and setpoint at `yaw` [] radians."""
+    """Returns the state at rest and level at `position` [3] metres, nose and setpoint at `yaw` [] radians."""
     zero = jnp.zeros((), jnp.float32)
     yaw = jnp.asarray(yaw, jnp.float32)
     return DroneState(
@@ -147,12 +146,12 @@ def hover(position: Array, yaw: Array) -> DroneState:
 
 
 def wrap_angle(angle: Array) -> Array:
-    """The same angle within [-pi, pi], radians, any shape."""
+    """Returns the same angle within [-pi, pi], radians, any shape."""
     return angle - 2 * jnp.pi * jnp.round(angle / (2 * jnp.pi))
 
 
 def yaw_of(quaternion: Array) -> Array:
-    """Heading [...] in [-pi, pi] of quaternions [..., 4], radians (see the module's text)."""
+    """Returns the heading [...] in [-pi, pi] of quaternions [..., 4], radians (see the module docstring)."""
     return wrap_angle(2 * jnp.arctan2(quaternion[..., 3], quaternion[..., 0]))
 
 
@@ -282,7 +281,7 @@ def _allocate(
 
 
 def _dot(row: Array, column: Array) -> Array:
-    """Products summed one by one: XLA makes a call of its own of a sum along an axis."""
+    """Returns a dot product, summed term by term: XLA compiles a sum along an axis to a separate call."""
     total = row[0] * column[0]
     for index in range(1, row.shape[0]):
         total = total + row[index] * column[index]
@@ -297,7 +296,10 @@ def _least(values: list[Array]) -> Array:
 
 
 def physics_step(config: DroneConfig, airframe: Airframe, state: DroneState, thrust: Array) -> DroneState:
-    """One step of `config.physics` under rotor thrusts [4] newtons; only position and velocity are carried over."""
+    """Returns the state after one step of `config.physics` under rotor thrusts [4] newtons.
+
+    Only position and velocity are carried from step to step.
+    """
     if config.physics == "rigid_body":
         moved = rigid_body_step(
             *(config.physics_dt_s, airframe.mass, airframe.inertia, airframe.gravity),
@@ -313,10 +315,10 @@ def physics_step(config: DroneConfig, airframe: Airframe, state: DroneState, thr
 
 
 def _mjx_step(airframe: Airframe, state: DroneState, thrust: Array) -> tuple[Array, Array, Array, Array]:
-    """Position, quaternion, velocity and angular velocity after one MJX step.
+    """Returns position, quaternion, velocity and angular velocity after one MJX step.
 
     These are the stages of `mjx.step` for this model: with the body frame at the centre of mass and no joint
-    below it, the mass matrix is the template's for ever, and nothing collides, constrains or dampens.
+    below it, the mass matrix is constant, the template's, and there are no collisions, constraints or damping.
     """
     model = airframe.model
     data = airframe.data.replace(
@@ -335,9 +337,9 @@ def _mjx_step(airframe: Airframe, state: DroneState, thrust: Array) -> tuple[Arr
 def fly(
     config: DroneConfig, airframe: Airframe, state: DroneState, velocity_command: Array, target_yaw: Array
 ) -> tuple[DroneState, Flight]:
-    """One decision: `physics_steps` steps at a held `velocity_command` [3] m/s (world).
+    """Flies one decision: `physics_steps` steps at a held `velocity_command` [3] m/s (world).
 
-    The yaw setpoint moves towards `target_yaw` [] radians the shorter way, at most `max_yaw_rate_rad_s` fast.
+    The yaw setpoint moves towards `target_yaw` [] radians in the shorter direction, at most `max_yaw_rate_rad_s` fast.
     """
     steps = jnp.arange(1, config.physics_steps + 1, dtype=jnp.float32)
     most = config.max_yaw_rate_rad_s * config.physics_dt_s * steps
