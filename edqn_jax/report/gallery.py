@@ -102,7 +102,7 @@ def _sensed(config: Config, scene: Scene, poses: Flight, frames: np.ndarray) -> 
     key, noise = jax.random.split(jax.random.key(0))
     of_frames, memory = sensor.sensor_of(config).of_frames, sensor.at_rest(config, key)
     if of_frames is not None:
-        luma = jnp.asarray(events.luma(frames))
+        luma = events.luma(jnp.asarray(frames))
         return jax.vmap(lambda f: of_frames(config, f, memory, noise)[0])(luma)
 
     @jax.jit
