@@ -152,11 +152,11 @@ def rendering(now: Moment) -> Part:
 
 
 def _drawing(now: Moment, position: Array, quaternion: Array) -> float | None:
-    """Operations that frames at poses [E, T, ...] take at the least, for each column those of the way that it needs.
+    """Operations that frames at poses [E, T, ...] take at the least, for each column those of the branch that it needs.
 
-    XLA counts a loop's body once, and one block of columns needs another way than the next; so every way is counted
-    for one column, and the columns by the way that they need. None where nothing is counted: on a GPU, and for
-    cameras that do not draw by columns.
+    XLA counts a loop's body once, and one block of columns needs another branch than the next; so every branch is
+    counted for one column, and the columns by the branch that they need. None where nothing is counted: on a GPU, and
+    for cameras that do not draw by columns.
     """
     config = now.config.camera
     if config.mount != "level":
@@ -169,12 +169,12 @@ def _drawing(now: Moment, position: Array, quaternion: Array) -> float | None:
     turn = jax.vmap(partial(sensor.mount_rotation, now.config))(quaternion.reshape(-1, 4))
     weights = jnp.broadcast_to(jnp.asarray(events.LUMA_WEIGHTS), (len(place), 3))
     given = (scene, place, turn, weights)
-    ways, way = columns.ways_to_draw(config, *given)
-    laid = operations_of(lambda *given: columns.ways_to_draw(config, *given)[1], *given)
-    each = [operations_of(partial(draw, config, camera.blend), jnp.zeros(1, jnp.int32)) for draw in ways]
+    branches, branch = columns.draw_branches(config, *given)
+    laid = operations_of(lambda *given: columns.draw_branches(config, *given)[1], *given)
+    each = [operations_of(partial(draw, config, camera.blend), jnp.zeros(1, jnp.int32)) for draw in branches]
     if laid is None:
         return None
-    needed = np.bincount(np.asarray(way), minlength=len(ways))
+    needed = np.bincount(np.asarray(branch), minlength=len(branches))
     return laid + sum(count * cost for count, cost in zip(needed, each, strict=True) if cost is not None)
 
 

@@ -1,10 +1,10 @@
-"""The event VAE (section 3.2): a sum-pooled set encoder, a code, a decoder; and the same for pictures.
+"""The event VAE (section 3.2): a sum-pooled set encoder, a code, a decoder of ReLU layers (Eq. 6); also for pictures.
 
-An event is (x, y, t, p). The encoder's first layer is a sum over events, blind to their order,
+An event is (x, y, t, p). The encoder's first layer is a sum over events, independent of their order,
 
     pooled = sum over events of f(x, y, p) outer phi(t),
 
-with a learned feature f of where and which sign, and a sinusoidal phi of when. All events of a pixel between
+with a learned feature f of position and polarity, and a sinusoidal phi of time. All events of a pixel between
 two frames share x, y and p, so the sum over them reaches only phi, where it is a geometric series with a
 closed form: the dense path costs the same for one event as for a thousand, and it is exact.
 
@@ -12,8 +12,8 @@ Field arrays are `[..., F, H, W]`: any leading dimensions are the batch, carried
 C is the number of temporal channels, 1 + 2 x `time_frequencies`.
 
 A picture `[..., H, W]` has one channel where a field has two, ON and OFF, and no time: it is pooled as
-sum over pixels of f(x, y) x value, over the root of their number, with C times the features, so that what is pooled,
-and all after it, is as wide.
+sum over pixels of f(x, y) x value, divided by the root of their number. It has C times the features, so that the
+pooled vector, and all later layers, have the same size as for events.
 """
 
 from __future__ import annotations
@@ -41,10 +41,10 @@ POSITION_OCTAVES = 4
 """Sine-cosine pairs per image axis in the positional encoding; the finest period is a quarter image."""
 
 WAVES = 48
-"""Standing waves of the image that the first and last layer begin with."""
+"""Number of standing waves of the image that the first and last layer are initialised with."""
 
 OUTPUT_SCALE = 2.0
-"""Constant factor on the decoder's amplitudes; with it the VAE learns as fast as one that draws single pixels."""
+"""Constant factor on the decoder's amplitudes; with it the VAE learns as fast as one that decodes single pixels."""
 
 POOL_SCALE = 1.0 / 8.0
 """Constant factor on the pooled sum: the root of some 64 events, so that the next layer sees unit scale."""
@@ -56,22 +56,22 @@ CHANNELS = {Form.EVENTS: EVENT_CHANNELS, Form.PICTURE: PICTURE_CHANNELS}
 """Channels of the forms that the VAE embeds."""
 
 MAX_LOG_VARIANCE = 6.0
-"""The log-variance lives in plus and minus this: its exponential cannot overflow."""
+"""Bound of the log-variance's magnitude: its exponential cannot overflow."""
 
 MAX_MEAN = 1e3
-"""Codes live in plus and minus this: their square cannot overflow."""
+"""Bound of a code value's magnitude: its square cannot overflow."""
 
 
 @struct.dataclass
 class Losses:
-    """Both sums over the image or the code, averaged over the batch; scalars."""
+    """Terms of the VAE loss: sums over the image and over the code, averaged over the batch; scalars."""
 
     reconstruction: Array
     kl: Array
 
 
 def temporal_encoding(frequencies: int, tau: Array) -> Array:
-    """`phi(t) = [1, cos(2 pi k tau), sin(2 pi k tau), ...]` for k = 1 .. frequencies: `[...]` to `[..., C]`.
+    """Returns `phi(t) = [1, cos(2 pi k tau), sin(2 pi k tau), ...]` for k = 1 .. frequencies: `[...]` to `[..., C]`.
 
     `tau` is the time normalised to the window: 0 at its start, 1 at its end.
     """
@@ -82,13 +82,13 @@ def temporal_encoding(frequencies: int, tau: Array) -> Array:
 
 
 def temporal_sums(frequencies: int, field: EventField) -> list[Array | None]:
-    """Sums of `temporal_encoding` over each pixel's events in closed form: C arrays `[..., F, H, W]`.
+    """Returns the sums of `temporal_encoding` over each pixel's events in closed form: C arrays `[..., F, H, W]`.
 
-    None stands for a sum that is zero whatever the events: n events that divide the window evenly add up to
+    None stands for a sum that is always zero: n events that divide the window evenly add up to
     the n-th roots of unity, which leave n where n divides the frequency, and nothing else.
 
     The geometric series of n phasors a step apart is Dirichlet's kernel, `sin(n x) / sin(x)`, times the
-    middle phasor. Half turns are taken out of x first: the kernel is then stable where sin(x) vanishes.
+    middle phasor. Half turns are subtracted from x first: the kernel is then stable where sin(x) vanishes.
     """
     n = field.count.astype(jnp.float32)
     if field.divides_window:
@@ -110,7 +110,7 @@ def temporal_sums(frequencies: int, field: EventField) -> list[Array | None]:
 
 
 def _sin_pi(z: Array) -> Array:
-    """`sin(pi z)` to 1e-7, exact at integers: a polynomial, three times as fast as XLA's sine on a CPU."""
+    """Returns `sin(pi z)` to 1e-7, exact at integers: a polynomial, three times as fast as XLA's sine on a CPU."""
     turns = jnp.round(z)
     x = jnp.pi * (z - turns)
     y = x * x
@@ -119,7 +119,7 @@ def _sin_pi(z: Array) -> Array:
 
 
 def positional_encoding(x: Array, y: Array, width: int, height: int) -> Array:
-    """Sines and cosines of a pixel's place, `[...]` to `[..., 4 * POSITION_OCTAVES + 2]`."""
+    """Returns sines and cosines of a pixel's position, `[...]` to `[..., 4 * POSITION_OCTAVES + 2]`."""
     u, v = (x + 0.5) / width * 2.0 - 1.0, (y + 0.5) / height * 2.0 - 1.0
     channels = [u, v]
     for octave in range(POSITION_OCTAVES):
@@ -142,11 +142,11 @@ class PixelTable(nn.Module):
         self.table = self.param("table", wave_table(self.height, self.width), shape)
 
     def everywhere(self) -> Array:
-        """`[channels, H * W, features]`, ON first."""
+        """Returns f of every pixel, `[channels, H * W, features]`, ON first."""
         return self.table
 
     def at(self, x: Array, y: Array, p: Array) -> Array:
-        """`[..., features]` at columns x, rows y, polarities p."""
+        """Returns f, `[..., features]`, at columns x, rows y, polarities p."""
         return self.table[(p < 0).astype(jnp.int32), y * self.width + x]
 
 
@@ -174,7 +174,7 @@ class PixelNetwork(nn.Module):
 
 
 def cosines(size: int, count: int) -> np.ndarray:
-    """The `count` lowest standing waves of `size` pixels as orthonormal rows: `[count, size]` (the DCT-II)."""
+    """Returns the `count` lowest standing waves of `size` pixels as orthonormal rows: `[count, size]` (the DCT-II)."""
     place = (np.arange(size) + 0.5) / size
     rows = np.cos(np.pi * np.arange(count)[:, None] * place) * np.sqrt(2.0 / size)
     rows[0] /= np.sqrt(2.0)
@@ -182,20 +182,20 @@ def cosines(size: int, count: int) -> np.ndarray:
 
 
 def lowest_waves(height: int, width: int, rows: int, columns: int) -> np.ndarray:
-    """Which of the image's first `rows` x `columns` standing waves are among its `WAVES` lowest: `[rows, columns]`."""
+    """Returns which of the first `rows` x `columns` standing waves are among the `WAVES` lowest: `[rows, columns]`."""
     frequency = np.hypot(np.arange(rows)[:, None] / height, np.arange(columns) / width)
     return np.argsort(np.argsort(frequency, axis=None, kind="stable")).reshape(rows, columns) < WAVES
 
 
 def waves(height: int, width: int) -> Array:
-    """The `WAVES` lowest standing waves of the image (products of cosines), rms 1: `[WAVES, H, W]`."""
+    """Returns the `WAVES` lowest standing waves of the image (products of cosines), rms 1: `[WAVES, H, W]`."""
     down, across = np.nonzero(lowest_waves(height, width, height, width))
     image = cosines(height, height)[down][:, :, None] * cosines(width, width)[across][:, None, :]
     return jnp.asarray(image * np.sqrt(height * width), jnp.float32)
 
 
 def wave_table(height: int, width: int) -> Callable[..., Array]:
-    """Initialiser of `PixelTable`: mixtures of waves, half of each odd in the polarity, half even."""
+    """Returns the initialiser of `PixelTable`: mixtures of waves, half of each odd in the polarity, half even."""
 
     def init(key: Array, shape: tuple[int, ...]) -> Array:
         key_odd, key_even = jax.random.split(key)
@@ -209,10 +209,10 @@ def wave_table(height: int, width: int) -> Callable[..., Array]:
 
 
 def mirrored(*, inputs: bool, outputs: bool) -> Callable[..., Array]:
-    """Initialiser of ReLU layers that makes the untrained network linear.
+    """Returns an initialiser of ReLU layers that makes the untrained network linear.
 
-    Units come in pairs of opposite sign and are read in pairs of opposite sign: relu(a) - relu(-a) = a. Where
-    the events are then reaches the code, and the code the image, from the first update on.
+    Units come in pairs of opposite sign and are read in pairs of opposite sign: relu(a) - relu(-a) = a. The positions
+    of events then affect the code, and the code affects the image, from the first update on.
     """
 
     def init(key: Array, shape: tuple[int, ...], dtype: Any = jnp.float32) -> Array:
@@ -229,11 +229,11 @@ def mirrored(*, inputs: bool, outputs: bool) -> Callable[..., Array]:
 
 
 def wave_images(height: int, width: int) -> Callable[..., Array]:
-    """Initialiser of the decoder's last layer, `[hidden, channels, P, Q]`: a little of the lowest waves, mirrored.
+    """Returns the initialiser of the decoder's last layer, `[hidden, channels, P, Q]`: small lowest waves, mirrored.
 
-    Event images are smooth on average, white noise is not: from white noise the decoder needs thousands of
-    updates to leave the blank image, from waves it leaves at once. Part of each wave is common to ON and OFF,
-    part of opposite sign.
+    Event images are smooth on average, white noise is not: initialised with white noise the decoder outputs a blank
+    image for thousands of updates, with waves it does not. Part of each wave is common to ON and OFF, part of
+    opposite sign.
     """
 
     def init(key: Array, shape: tuple[int, ...], dtype: Any = jnp.float32) -> Array:
@@ -269,11 +269,11 @@ class Encoder(nn.Module):
         size = self.config.code_size
         self.hidden = nn.Dense(self.config.hidden, kernel_init=mirrored(inputs=False, outputs=True))
         self.mean = nn.Dense(size, kernel_init=mirrored(inputs=True, outputs=False))
-        # Nearly noiseless codes at first; the KL term widens what it may.
+        # Nearly noiseless codes at first; the KL term increases the variance.
         self.log_variance = nn.Dense(size, kernel_init=zeros, bias_init=constant(-4.0))
 
     def dense(self, field: EventField) -> tuple[Array, Array]:
-        """Fields `[..., F, H, W]` to mean and log-variance `[..., code_size]`."""
+        """Returns mean and log-variance `[..., code_size]` of fields `[..., F, H, W]`."""
         on, off = self.pixels.everywhere()
         batch = field.count.shape[:-3]
         pooled = []
@@ -287,14 +287,14 @@ class Encoder(nn.Module):
         return self._head(jnp.concatenate(pooled, axis=-1), POOL_SCALE)
 
     def sparse(self, x: Array, y: Array, tau: Array, p: Array) -> tuple[Array, Array]:
-        """Events one by one, each `[..., N]`, to mean and log-variance; places with p = 0 hold no event."""
+        """Returns mean and log-variance of event lists, each `[..., N]`; entries with p = 0 are no events."""
         place = self.pixels.at(x, y, p) * (p != 0)[..., None]
         phi = temporal_encoding(self.config.time_frequencies, tau)
         pooled = jnp.einsum("...nf,...nc->...cf", place, phi)
         return self._head(pooled.reshape(*pooled.shape[:-2], -1), POOL_SCALE)
 
     def picture(self, image: Array) -> tuple[Array, Array]:
-        """Pictures `[..., H, W]` to mean and log-variance `[..., code_size]`."""
+        """Returns mean and log-variance `[..., code_size]` of pictures `[..., H, W]`."""
         (everywhere,) = self.pixels.everywhere()
         flat = image.reshape(*image.shape[:-2], -1)
         return self._head(flat @ everywhere, flat.shape[-1] ** -0.5)
@@ -306,7 +306,7 @@ class Encoder(nn.Module):
 
 
 class Decoder(nn.Module):
-    """Code `[..., code_size]` to the standing waves of the reconstruction, `[..., channels, P, Q]`."""
+    """Decodes a code `[..., code_size]` to the standing waves of the reconstruction, `[..., channels, P, Q]`."""
 
     config: EncoderConfig
     height: int
@@ -326,16 +326,16 @@ class Decoder(nn.Module):
 
 
 def _drawn(config: EncoderConfig, height: int, width: int) -> tuple[int, int]:
-    """P and Q, how many standing waves down and across the decoder draws."""
+    """Returns P and Q, the number of standing waves down and across that the decoder outputs."""
     return tuple(max(1, round(config.decoder_bandwidth * size)) for size in (height, width))  # type: ignore
 
 
 def target(config: EncoderConfig, sensed: EventField | Array) -> Array:
-    """What the decoder must reconstruct, `[..., channels, H, W]`, blurred: log(1 + count) of ON and of OFF events, or
-    the picture itself.
+    """Returns what the decoder must reconstruct, `[..., channels, H, W]`, blurred: log(1 + count) of ON and of OFF
+    events, or the picture itself.
 
-    Two channels of events, because how many events there are says how near things are, and in a signed image the ON
-    and OFF of a textured wall cancel. The logarithm keeps one bright edge from drowning the rest; the blur (a
+    Events have two channels because their number shows how near things are, and in a signed image the ON and OFF
+    events of a textured wall cancel. The logarithm keeps one bright edge from dominating the loss; the blur (a
     binomial over 2 x `target_blur` + 1 pixels) makes an edge that is off by one pixel one small error, not two
     large ones.
     """
@@ -352,7 +352,7 @@ def target(config: EncoderConfig, sensed: EventField | Array) -> Array:
 
 
 def _blur(size: int, times: int) -> np.ndarray:
-    """`[size, size]`: the kernel (1, 2, 1) / 4 as a matrix, edges repeated, applied `times` times."""
+    """Returns `[size, size]`: the kernel (1, 2, 1) / 4 as a matrix, edges repeated, applied `times` times."""
     once = 0.5 * np.eye(size) + 0.25 * (np.eye(size, k=1) + np.eye(size, k=-1))
     once[0, 0] += 0.25
     once[-1, -1] += 0.25
@@ -380,7 +380,7 @@ def init_encoder(config: EncoderConfig, camera: CameraConfig, key: Array, *, for
 
 
 def encode(config: EncoderConfig, params: Params, sensed: EventField | Array) -> tuple[Array, Array]:
-    """Fields `[..., F, H, W]` or pictures `[..., H, W]` to the code's mean and log-variance, each `[..., code_size]`.
+    """Returns mean and log-variance, each `[..., code_size]`, of fields `[..., F, H, W]` or pictures `[..., H, W]`.
 
     The code that the agent sees is the mean.
     """
@@ -394,18 +394,18 @@ def encode(config: EncoderConfig, params: Params, sensed: EventField | Array) ->
 def encode_events(
     config: EncoderConfig, params: Params, camera: CameraConfig, x: Array, y: Array, tau: Array, p: Array
 ) -> tuple[Array, Array]:
-    """The same as `encode` from a list of events, `[..., N]` each: column, row, time in the window, polarity.
+    """Returns the same as `encode` from a list of events, `[..., N]` each: column, row, time in the window, polarity.
 
-    `tau` is 0 at the window's start and 1 at its end; p = 0 marks a place without event.
+    `tau` is 0 at the window's start and 1 at its end; p = 0 marks an empty entry.
     """
     encoder = Encoder(_of_kind(config, params), camera.height, camera.width)
     return encoder.apply({"params": params["encoder"]}, x, y, tau, p, method=Encoder.sparse)  # type: ignore
 
 
 def tabulated(config: EncoderConfig, camera: CameraConfig, params: Params) -> Params:
-    """The same encoder with its pixel features written out as a table, for the camera's resolution.
+    """Returns the same encoder with its pixel features tabulated for the camera's resolution.
 
-    What no longer learns need not compute them anew from each field or picture.
+    A frozen encoder need not compute them again for each field or picture.
     """
     channels = params["decoder"]["bias"].shape[-3]
     encoder = Encoder(_of_kind(config, params), camera.height, camera.width, channels)
@@ -414,46 +414,50 @@ def tabulated(config: EncoderConfig, camera: CameraConfig, params: Params) -> Pa
 
 
 def _of_kind(config: EncoderConfig, params: Params) -> EncoderConfig:
-    """`config` with the kind of pixel features that these parameters have: of what acts they are a table."""
+    """Returns `config` with the kind of pixel features that these parameters have: a table in a frozen encoder."""
     tables = "table" in params["encoder"]["pixels"]
     return dataclasses.replace(config, pixel_features="table") if tables else config
 
 
 def embed(config: EncoderConfig, params: Params, sensed: EventField | Array) -> Array:
-    """The agent's code of fields `[..., F, H, W]` or pictures `[..., H, W]`: the mean, `[..., code_size]`."""
+    """Returns the agent's code of fields `[..., F, H, W]` or pictures `[..., H, W]`: the mean, `[..., code_size]`."""
     return encode(config, params, sensed)[0]
 
 
 def decode(config: EncoderConfig, camera: CameraConfig, params: Params, code: Array) -> Array:
-    """Code `[..., code_size]` to the reconstruction of `target`, `[..., channels, H, W]`."""
+    """Returns the reconstruction of `target`, `[..., channels, H, W]`, from a code `[..., code_size]`."""
     found = _waves_of(config, camera.height, camera.width, params, code)
     rows, columns = found.shape[-2:]
     return jnp.asarray(cosines(camera.height, rows).T) @ found @ jnp.asarray(cosines(camera.width, columns))
 
 
 def _waves_of(config: EncoderConfig, height: int, width: int, params: Params, code: Array) -> Array:
-    """Amplitudes `[..., channels, P, Q]` of the reconstruction's standing waves."""
+    """Returns the amplitudes `[..., channels, P, Q]` of the reconstruction's standing waves."""
     channels = params["decoder"]["bias"].shape[-3]
     return Decoder(config, height, width, channels).apply({"params": params["decoder"]}, code)  # type: ignore
 
 
 def kl_divergence(mean: Array, log_variance: Array) -> Array:
-    """KL of N(mean, variance) from N(0, 1), summed over the code: `[..., code_size]` to `[...]`."""
+    """Returns KL(N(mean, variance) || N(0, 1)), summed over the code: `[..., code_size]` to `[...]`."""
     return 0.5 * jnp.sum(jnp.square(mean) + jnp.exp(log_variance) - 1.0 - log_variance, axis=-1)
 
 
 def vae_loss(config: EncoderConfig, params: Params, sensed: EventField | Array, key: Array) -> tuple[Array, Losses]:
-    """Eq. 6: squared reconstruction error of an image + `kl_weight` x KL, averaged over the batch.
+    """Returns the VAE loss, squared reconstruction error + `kl_weight` x KL, averaged over the batch, and its terms.
 
-    `sensed` is a field `[..., F, H, W]` or a picture `[..., H, W]`; the key draws the codes (reparametrised).
+    The paper states it in section 3.2 without a number.
+
+    Args:
+        sensed: field `[..., F, H, W]` or picture `[..., H, W]`.
+        key: draws the codes (reparametrised).
     """
     mean, log_variance = encode(config, params, sensed)
     code = mean + jnp.exp(0.5 * log_variance) * jax.random.normal(key, mean.shape)
     image = target(config, sensed)
     height, width = image.shape[-2:]
     drawn = _waves_of(config, height, width, params, code)
-    # The waves are orthonormal, so squared errors add up over them as over pixels; what the decoder cannot
-    # draw is the same whatever it draws.
+    # The waves are orthonormal, so squared errors add up over them as over pixels; the error in waves
+    # beyond the decoder's is a constant.
     rows, columns = drawn.shape[-2:]
     wanted = jnp.asarray(cosines(height, rows)) @ image @ jnp.asarray(cosines(width, columns).T)
     beyond = jnp.sum(jnp.square(image), axis=(-3, -2, -1)) - jnp.sum(jnp.square(wanted), axis=(-3, -2, -1))

@@ -24,7 +24,7 @@ from edqn_jax.sim.xla import materialised
 
 
 def _backdrop(config: CameraConfig, scene: Scene, origin: Array, rays: Rays, value: Values, sky: Array) -> Array:
-    """Ground and other planes, textured, before the sky: [H, W]."""
+    """Returns brightness [H, W] of textured ground and other planes before the sky."""
     shape = jnp.broadcast_shapes(rays.dx.shape, rays.dz.shape)
     behind = jnp.broadcast_to(sky, shape)
     if scene.planes.normal.shape[0] == 0:
@@ -35,7 +35,7 @@ def _backdrop(config: CameraConfig, scene: Scene, origin: Array, rays: Rays, val
         normal = scene.planes.normal[n]
         height = jnp.dot(origin - scene.planes.position[n], normal)
         across, along = jnp.dot(normal, rays.right) * rays.pitch, jnp.dot(normal, rays.up) * rays.pitch
-        # The plane's horizon is the line n . d = 0; below it lies the part of the pixel that the plane covers.
+        # The plane's horizon is the line n . d = 0; the part of the pixel below it is covered by the plane.
         approach = normal[0] * rays.dx + normal[1] * rays.dy + normal[2] * rays.dz
         spread = jnp.abs(across) + jnp.abs(along)
         covered = jnp.clip(0.5 - approach * raycast.inverse(spread), 0.0, 1.0)
@@ -53,7 +53,7 @@ def _backdrop(config: CameraConfig, scene: Scene, origin: Array, rays: Rays, val
 
 
 def blend(config: CameraConfig, frame: Frame, rays: Rays, layers: Layers) -> Array:
-    """Brightness of the layers over ground and sky: [H, W] of `rays`."""
+    """Returns brightness [H, W] of the layers over ground and sky."""
     behind = _backdrop(config, frame.scene, frame.origin, rays, frame.value, frame.sky)
     for layer in reversed(layers):
         met = layer.closeness > 0
@@ -67,7 +67,7 @@ def blend(config: CameraConfig, frame: Frame, rays: Rays, layers: Layers) -> Arr
 
 
 def _picture(config: CameraConfig, scene: Scene, origin: Array, rotation: Array, weights: Array) -> Array:
-    """Brightness under `weights` [3] of RGB: [H, W]."""
+    """Returns brightness [H, W] under `weights` [3] of RGB."""
     if config.mount == "level":
         return columns.picture(config, blend, scene, origin, rotation, weights)
     value = raycast.albedo_values(scene, weights)
@@ -85,7 +85,7 @@ def _picture(config: CameraConfig, scene: Scene, origin: Array, rotation: Array,
 
 
 def luma(config: CameraConfig, scene: Scene, position: Array, rotation: Array) -> Array:
-    """Linear luma of the scene, each pixel the average over its area.
+    """Returns linear luma of the scene, each pixel the average over its area.
 
     Shade and texture multiply R, G and B alike, so the luma of Eq. 1 needs one channel, not three.
 
@@ -101,13 +101,13 @@ def luma(config: CameraConfig, scene: Scene, position: Array, rotation: Array) -
 
 
 def rgb(config: CameraConfig, scene: Scene, position: Array, rotation: Array) -> Array:
-    """Linear RGB of the scene: [H, W, 3] in [0, 1]; `luma` is Eq. 1's weighting of it."""
+    """Returns linear RGB of the scene: [H, W, 3] in [0, 1]; `luma` is its weighted sum in Eq. 1."""
     channels = jax.vmap(lambda weights: _picture(config, scene, position, rotation, weights))(jnp.eye(3))
     return jnp.moveaxis(channels, 0, -1)
 
 
 def depth(config: CameraConfig, scene: Scene, position: Array, rotation: Array) -> Array:
-    """Distance along each pixel's central ray: [H, W] metres, inf where the ray meets nothing."""
+    """Returns the distance along each pixel's central ray: [H, W] metres, inf where the ray meets nothing."""
     rays = raycast.camera_rays(config, rotation)
     nearest = raycast.nearest_depth(config, scene, position, rays)
     return nearest * jnp.sqrt(rays.dx**2 + rays.dy**2 + rays.dz**2)

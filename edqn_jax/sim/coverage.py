@@ -1,8 +1,8 @@
-"""How much of each pixel each shape covers, and the nearest few such layers.
+"""The share of each pixel that each shape covers, kept as the few nearest layers.
 
-Exact for the sides and caps of upright boxes and cylinders under a level camera, where sides project to
-vertical lines and, within a column, each shape fills one interval of rows; counted over a few rays per
-pixel for everything else.
+Coverage is exact for the sides and caps of upright boxes and cylinders under a level camera, where sides project to
+vertical lines and, within a column, each shape fills one interval of rows; for all other shapes it is counted over
+a few rays per pixel.
 """
 
 from __future__ import annotations
@@ -34,14 +34,14 @@ from edqn_jax.sim.xla import materialised
 NEAR_M = 0.05
 """Shapes are clipped at this depth before they are projected; the body sphere is wider."""
 FAR_U = 1e3
-"""Image-plane coordinate that stands for beyond the edge of any image."""
+"""Image-plane coordinate beyond the edge of any image."""
 
 
 LEVEL_FACE = 1e9
-"""Stands in `Layer.slope` for a face whose closeness changes with the row only."""
+"""Value of `Layer.slope` for a face whose closeness changes with the row only."""
 
 DEPTH_OF_LAYERS = 3
-"""Layers kept per pixel. With two, slivers of near corners hide what stands behind them (docs/decisions)."""
+"""Layers kept per pixel. With two, slivers of near corners hide the shapes behind them (docs/decisions)."""
 
 
 @struct.dataclass
@@ -59,13 +59,13 @@ Layers = tuple[Layer, ...]
 
 
 def no_layers(shape: tuple[int, ...], depth: int = DEPTH_OF_LAYERS) -> Layers:
-    """Nothing in sight, and room for the `depth` nearest layers."""
+    """Returns `depth` empty layers of pixels [H, W] = `shape`."""
     none = jnp.zeros(shape)
     return (Layer(closeness=none, coverage=none, value=none, slope=none),) * depth
 
 
 def insert(layers: Layers, new: Layer) -> Layers:
-    """Add one shape's layer, keeping the nearest at every pixel. Where its coverage is 0 its closeness must be 0."""
+    """Adds one shape's layer and keeps the nearest at every pixel. Where its coverage is 0 its closeness must be 0."""
     kept = []
     for old in layers:
         nearer = new.closeness > old.closeness
@@ -77,7 +77,7 @@ def insert(layers: Layers, new: Layer) -> Layers:
                 slope=jnp.where(nearer, new.slope, old.slope),
             )
         )
-        # The farther of the two goes on to compete for the next place.
+        # The farther of the two is compared with the next layer.
         new = Layer(
             closeness=jnp.minimum(new.closeness, old.closeness),
             coverage=jnp.where(nearer, old.coverage, new.coverage),
@@ -88,7 +88,7 @@ def insert(layers: Layers, new: Layer) -> Layers:
 
 
 def _extent_of_boxes(boxes: UprightBoxes, origin: Array, forward: Array) -> tuple[Array, Array]:
-    """Leftmost and rightmost image-plane coordinate of each upright box: [N] each; empty if left > right."""
+    """Returns the least and greatest image-plane coordinate of each upright box: [N] each; empty if left > right."""
     cos, sin = jnp.cos(boxes.yaw)[:, None], jnp.sin(boxes.yaw)[:, None]
     hx = boxes.half[:, 0:1] * jnp.asarray([[1.0, -1.0, -1.0, 1.0]])
     hy = boxes.half[:, 1:2] * jnp.asarray([[1.0, 1.0, -1.0, -1.0]])
@@ -105,7 +105,7 @@ def _extent_of_boxes(boxes: UprightBoxes, origin: Array, forward: Array) -> tupl
 
 
 def _extent_of_cylinders(cylinders: UprightCylinders, origin: Array, forward: Array) -> tuple[Array, Array]:
-    """The same for upright cylinders, by their two tangents from the camera."""
+    """Returns the same for upright cylinders, from their two tangents through the camera."""
     return _extent_of_discs(cylinders.position, cylinders.radius, origin, forward)
 
 
@@ -131,7 +131,7 @@ BOX_VALUES, CYLINDER_VALUES = 9, 4
 
 
 def upright_table(config: CameraConfig, scene: Scene, origin: Array, heading: Array, value: Values) -> Array:
-    """What a column must know of each upright shape, boxes first: [N + 1, F]; the last row covers nothing.
+    """Returns what columns need of each upright shape, boxes first: [N + 1, F]; the last row covers nothing.
 
     Args:
         heading: [2] cosine and sine of the camera's.
@@ -174,7 +174,7 @@ def _cylinders_in_table(
 
 
 def _heights(config: CameraConfig, middle: Array, half: Array, value: Array) -> tuple[Array, ...]:
-    """Bottom, top and the horizontal face in view (0: none), each in rows x metres, and that face's brightness."""
+    """Returns bottom, top and visible horizontal face (0: none), each in rows x metres, and the face's brightness."""
     bottom, top = (middle - half) / pitch_of(config), (middle + half) / pitch_of(config)
     zero = jnp.zeros(())
     above, below = shade(config, zero, zero, zero + 1), shade(config, zero, zero, zero - 1)
@@ -184,9 +184,9 @@ def _heights(config: CameraConfig, middle: Array, half: Array, value: Array) -> 
 
 
 def _box_sides(values: tuple[Array, ...], low: Array, high: Array) -> tuple[Array, ...]:
-    """Entry and exit depth, brightness and lean of a box's sides between `low` and `high` of a column, all [...].
+    """Returns entry and exit depth, brightness and lean of a box's sides from `low` to `high` of a column, all [...].
 
-    Lean is how closeness changes per unit of u, relative to closeness.
+    Lean is the change of closeness per unit of u, relative to closeness.
     """
     bx, by, fx, fy, hx, hy, x_face, y_face, corner = values
 
@@ -211,7 +211,7 @@ def _box_sides(values: tuple[Array, ...], low: Array, high: Array) -> tuple[Arra
 def _cylinder_sides(
     config: CameraConfig, values: tuple[Array, ...], low: Array, high: Array, heading: Array
 ) -> tuple[Array, ...]:
-    """The same of a cylinder's."""
+    """Returns the same of a cylinder's side."""
     ox, oy, radius, value = values
     u, (cos, sin) = (low + high) / 2, heading[:, None]
     dx, dy = cos + u * sin, sin - u * cos
@@ -222,7 +222,7 @@ def _cylinder_sides(
     enter = s - reach
     per_radius = 1.0 / jnp.maximum(radius, TINY)
     nx, ny = (ox + enter * dx) * per_radius, (oy + enter * dy) * per_radius
-    # On the tangent plane n . (t d) stays put, so 1/t changes like n . d.
+    # On the tangent plane n . (t d) is constant, so 1/t changes like n . d.
     lean = (nx * sin - ny * cos) * inverse(nx * dx + ny * dy)
     return enter, s + reach, value * shade(config, nx, ny, jnp.zeros_like(nx)), lean
 
@@ -230,7 +230,7 @@ def _cylinder_sides(
 def sides(
     config: CameraConfig, picked: Array, is_cylinder: Array | None, boxes: int, heading: Array, u: Array
 ) -> Array:
-    """What the pixels of columns must know of the shapes picked for them: [B, K, 11].
+    """Returns what the pixels of columns need of the shapes picked for them: [B, K, 11].
 
     Share of the column's width, bottom and top row of the side, lowest and highest of the cap, brightness of both
     times share, least and greatest closeness, closeness per row on the cap, lean.
@@ -238,7 +238,7 @@ def sides(
     Args:
         picked: [K, B, F] rows of `upright_table`.
         is_cylinder: [K, B] bool.
-        boxes: how many boxes stand in the table before the cylinders, static.
+        boxes: number of boxes in the table, before the cylinders, static.
         heading: [B, 2].
         u: [B] middle of each column.
     """
@@ -278,7 +278,7 @@ def sides(
 
 
 def insert_sides(config: CameraConfig, layers: Layers, columns: Array) -> Layers:
-    """Add the shapes of one column, [K, 11] of `sides`, to the layers of its pixels [H, 1]."""
+    """Adds the shapes of one column, [K, 11] of `sides`, to the layers of its pixels [H, 1]."""
     for column in columns:
         layers = _insert_side(config, layers, column)
     return layers
@@ -301,7 +301,7 @@ def _insert_side(config: CameraConfig, layers: Layers, column: Array) -> Layers:
 
 
 def spheres_in_columns(config: CameraConfig, spheres: Spheres, origin: Array, heading: Array) -> Array:
-    """Whether any sphere may be seen in each column: [C]."""
+    """Returns whether any sphere may be visible in each column: [C] bool."""
     # A silhouette fades over half a pixel on either side.
     left, right = _extent_of_discs(spheres.position, spheres.radius, origin, heading)
     u, pitch = columns_of(config)[None], pitch_of(config)
@@ -311,7 +311,7 @@ def spheres_in_columns(config: CameraConfig, spheres: Spheres, origin: Array, he
 def sphere_layers(
     config: CameraConfig, scene: Scene, origin: Array, rays: Rays, value: Values, layers: Layers
 ) -> Layers:
-    """Layers of spheres for any camera: coverage falls linearly over the pixel that the silhouette crosses."""
+    """Adds layers of spheres, for any camera: coverage falls linearly over the pixel that the silhouette crosses."""
     spheres, rays = scene.spheres, for_shapes(rays)
     if spheres.radius.shape[0] == 0:
         return layers
@@ -333,7 +333,7 @@ def sphere_layers(
 
 
 def counted_layers(surfaces: Surfaces, rays: Rays, layers: Layers) -> Layers:
-    """Layers of any shapes from `across` x `down` rays per pixel: the share of rays that meet the shape."""
+    """Adds layers of any shapes from `across` x `down` rays per pixel: the share of rays that meet the shape."""
     shape = jnp.broadcast_shapes(rays.dx.shape, rays.dz.shape)
     rows, columns = shape[0] // rays.down, shape[1] // rays.across
 

@@ -1,14 +1,13 @@
-"""The drone: dynamics, by MJX unless asked otherwise, and a cascaded controller, velocity -> attitude -> body rate ->
-rotor thrust.
+"""The drone: dynamics, by MJX by default, and a cascaded controller: velocity -> attitude -> body rate -> rotor thrust.
 
-Frames: the world has z up; the body has x ahead, y left, z up and stands at the centre of mass. A
+Frames: the world has z up; the body has x ahead, y left, z up, its origin at the centre of mass. A
 quaternion (w, x, y, z) turns body vectors into world vectors.
 
 Heading is the quaternion's turn about the world's z, 2 atan2(z, w): what remains when the tilt is undone by
-the shortest way, as a gimbal does. Unlike the Euler angle it does not move when a drone merely leans.
+the shortest rotation, as a gimbal does. Unlike the Euler angle it does not change when a drone only tilts.
 
-Inside the scan everything but MJX is written in scalars, one per coordinate: mapped over environments they
-become contiguous rows that XLA fuses into a few loops.
+Inside the scan everything but MJX is computed in scalars, one per coordinate: mapped over environments they
+are contiguous rows that XLA fuses into a few loops.
 """
 
 from __future__ import annotations
@@ -30,19 +29,19 @@ from edqn_jax.errors import ConfigError
 from edqn_jax.sim.rigid_body import rigid_body_step
 from edqn_jax.sim.xla import materialised
 
-with contextlib.redirect_stdout(io.StringIO()):  # it prints that Warp, an engine we do not use, is missing
+with contextlib.redirect_stdout(io.StringIO()):  # it prints that Warp, which is not used here, is missing
     from mujoco import mjx
 
 AIRFRAME_FILE = Path(__file__).with_name("skydio_x2.xml")
 """Mass, inertia and rotor layout."""
 
 LEAST_LEVELNESS = 0.4
-"""Cosine of the tilt beyond which thrust no longer grows to hold the height."""
+"""Cosine of the tilt beyond which thrust no longer increases to hold the height."""
 
 
 @struct.dataclass
 class Airframe:
-    """What never changes in flight. R = 4 rotors."""
+    """Constants of the airframe. R = 4 rotors."""
 
     model: mjx.Model
     data: mjx.Data  # a template that holds the factored mass matrix
@@ -56,7 +55,7 @@ class Airframe:
 
 @struct.dataclass
 class DroneState:
-    """What the future of a flight depends on."""
+    """State of the body and of its heading setpoint."""
 
     position: Array  # [3] of the centre of mass, metres, world
     quaternion: Array  # [4] w, x, y, z; body to world
@@ -67,7 +66,7 @@ class DroneState:
 
 @struct.dataclass
 class Flight:
-    """What was flown in one decision: n physics steps, each entry taken after its step."""
+    """Poses and velocities of one decision: n physics steps, each entry taken after its step."""
 
     position: Array  # [n, 3] metres, world
     quaternion: Array  # [n, 4]
@@ -75,7 +74,7 @@ class Flight:
 
 
 def c_model(config: DroneConfig) -> mujoco.MjModel:
-    """The Skydio X2 as C MuJoCo compiles it, without the shapes that only a viewer needs."""
+    """Returns the Skydio X2 as C MuJoCo compiles it, without the shapes that only a viewer needs."""
     spec = mujoco.MjSpec.from_file(str(AIRFRAME_FILE))
     spec.option.timestep = config.physics_dt_s
     # MJX solves a sparse mass matrix by unrolled arithmetic, a dense one by a LAPACK call per environment.
@@ -86,22 +85,22 @@ def c_model(config: DroneConfig) -> mujoco.MjModel:
 
 
 def wrench_of_thrust(model: mujoco.MjModel) -> np.ndarray:
-    """Collective thrust and torque about x, y, z (N m) per rotor thrust: [4, R], of the model's rotor layout."""
+    """Returns the [4, R] collective thrust and torque about x, y, z (N m) per rotor thrust (N) of the rotor layout."""
     arm = model.site_pos[model.actuator_trnid[:, 0]]
     push, twist = model.actuator_gear[:, 2], model.actuator_gear[:, 5]
     return np.stack([push, arm[:, 1] * push, -arm[:, 0] * push, twist])
 
 
 def mixer_of(model: mujoco.MjModel) -> np.ndarray:
-    """Rotor thrusts per collective thrust (N) and torque about x, y, z (N m): [R, 4], of the model's rotor layout."""
+    """Returns the [R, 4] rotor thrusts per collective thrust (N) and torque about x, y, z (N m) of the rotor layout."""
     return np.linalg.inv(wrench_of_thrust(model))
 
 
 def load_airframe(config: DroneConfig) -> Airframe:
-    """The Skydio X2 as MJX arrays, and the mixer that follows from its rotor layout.
+    """Returns the Skydio X2 as MJX arrays, and the mixer that follows from its rotor layout.
 
     Raises:
-        ConfigError: if the airframe's file holds something that a physics step would leave out without a word.
+        ConfigError: if the airframe's file has something that a physics step would ignore.
     """
     model = c_model(config)
     _check(model)
@@ -129,12 +128,12 @@ def _check(model: mujoco.MjModel) -> None:
     if not (free and in_vacuum and centred and upright):
         raise ConfigError(
             f"'{AIRFRAME_FILE.name}' must be one free body in a vacuum, its frame at the centre of mass and along the "
-            "principal axes of inertia, under rotors that push along its z; edqn_jax/sim/drone.py flies nothing else"
+            "principal axes of inertia, under rotors that push along its z; no other model is supported"
         )
 
 
 def hover(position: Array, yaw: Array) -> DroneState:
-    """At rest and level at `position` [3] metres, nose and setpoint at `yaw` [] radians."""
+    """Returns the state at rest and level at `position` [3] metres, nose and setpoint at `yaw` [] radians."""
     zero = jnp.zeros((), jnp.float32)
     yaw = jnp.asarray(yaw, jnp.float32)
     return DroneState(
@@ -147,21 +146,25 @@ def hover(position: Array, yaw: Array) -> DroneState:
 
 
 def wrap_angle(angle: Array) -> Array:
-    """The same angle within [-pi, pi], radians, any shape."""
+    """Returns the same angle within [-pi, pi], radians, any shape."""
     return angle - 2 * jnp.pi * jnp.round(angle / (2 * jnp.pi))
 
 
 def yaw_of(quaternion: Array) -> Array:
-    """Heading [...] in [-pi, pi] of quaternions [..., 4], radians (see the module's text)."""
+    """Returns the heading [...] in [-pi, pi] of quaternions [..., 4], radians (see the module docstring)."""
     return wrap_angle(2 * jnp.arctan2(quaternion[..., 3], quaternion[..., 0]))
 
 
-def thrusts(config: DroneConfig, airframe: Airframe, state: DroneState, velocity_command: Array) -> Array:
-    """Rotor thrusts [4] newtons towards `velocity_command` [3] m/s (world) and the state's yaw setpoint.
+Scalars = tuple[Array, Array, Array]
+"""One vector, a scalar [] for each coordinate."""
 
-    Velocity error gives a wanted acceleration, that a wanted direction of the body's z axis; the turn still
-    missing gives wanted body rates, their error a wanted torque. Within the rotors' limits torque about x
-    and y comes first, then collective thrust, then torque about z.
+
+def thrusts(config: DroneConfig, airframe: Airframe, state: DroneState, velocity_command: Array) -> Array:
+    """Returns rotor thrusts [4] newtons towards `velocity_command` [3] m/s (world) and the state's yaw setpoint.
+
+    The velocity error gives a wanted specific force, its direction a wanted tilt of the body, the missing turn wanted
+    body rates, their error a wanted torque. Within the rotors' limits torque about x and y comes first, then
+    collective thrust, then torque about z.
     """
     half_yaw = state.yaw_setpoint / 2
     return _thrusts(config, airframe, state, velocity_command, jnp.cos(half_yaw), jnp.sin(half_yaw))
@@ -179,45 +182,91 @@ def _thrusts(
     p, q, r = state.angular_velocity
     vx, vy, vz = velocity_command - state.velocity
 
-    # Velocity -> specific force (acceleration plus gravity), within the largest accelerations and tilt.
+    force = _wanted_force(config, airframe, (vx, vy, vz))
+    axes = _body_axes(w, x, y, z)
+    direction = _in_body_frame(axes, force)
+    turn = _wanted_yaw_rate(config, w, z, cos_half_yaw, sin_half_yaw)
+    rates = _wanted_rates(config, direction, turn)
+    torque = _torque(config, airframe, rates, (p, q, r))
+    collective = _collective_thrust(airframe, force[2], axes[2][2])
+    # Computed once, and not again for each rotor.
+    return _allocate(config, airframe, *materialised(jnp.stack([*torque, collective])))
+
+
+def _wanted_force(config: DroneConfig, airframe: Airframe, error: Scalars) -> Scalars:
+    """Returns the wanted specific force m/s^2 (world): acceleration plus gravity, for a velocity `error` m/s.
+
+    Within the largest accelerations and the largest tilt.
+    """
+    vx, vy, vz = error
     fz = airframe.gravity + jnp.clip(config.climb_gain * vz, -config.max_descent_m_s2, config.max_climb_m_s2)
     fx, fy = config.velocity_gain * vx, config.velocity_gain * vy
     most = jnp.minimum(config.max_horizontal_m_s2, float(np.tan(config.max_tilt_rad)) * fz)
-    lean = jnp.minimum(1.0, most * jax.lax.rsqrt(fx * fx + fy * fy + 1e-9))
-    fx, fy = fx * lean, fy * lean
+    scale = jnp.minimum(1.0, most * jax.lax.rsqrt(fx * fx + fy * fy + 1e-9))
+    return fx * scale, fy * scale, fz
+
+
+def _body_axes(w: Array, x: Array, y: Array, z: Array) -> tuple[Scalars, Scalars, Scalars]:
+    """Returns the world's x, y and z axis in the body frame, for the attitude quaternion w, x, y, z."""
+    up = 2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)
+    ahead = 1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)
+    left = 2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)
+    return ahead, left, up
+
+
+def _in_body_frame(axes: tuple[Scalars, Scalars, Scalars], force: Scalars) -> Scalars:
+    """Returns the unit direction of `force` in the body frame; its x and y are the tilt that is still missing."""
+    (ahead_x, ahead_y, ahead_z), (left_x, left_y, left_z), (up_x, up_y, up_z) = axes
+    fx, fy, fz = force
     norm = jax.lax.rsqrt(fx * fx + fy * fy + fz * fz)
+    return (
+        (ahead_x * fx + left_x * fy + up_x * fz) * norm,
+        (ahead_y * fx + left_y * fy + up_y * fz) * norm,
+        (ahead_z * fx + left_z * fy + up_z * fz) * norm,
+    )
 
-    # Its direction in the body frame: how much tilt is still missing, and towards where.
-    up_x, up_y, up_z = 2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)
-    ahead_x, ahead_y, ahead_z = 1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)
-    left_x, left_y, left_z = 2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)
-    ex = (ahead_x * fx + left_x * fy + up_x * fz) * norm
-    ey = (ahead_y * fx + left_y * fy + up_y * fz) * norm
-    ez = (ahead_z * fx + left_z * fy + up_z * fz) * norm
 
-    # Attitude -> body rates. 2 sin(angle / 2) stands for the angle: no arc functions, strong to 180 degrees.
-    tilt = jnp.minimum(
+def _wanted_rates(config: DroneConfig, direction: Scalars, yaw_rate: Array) -> Scalars:
+    """Returns wanted body rates rad/s that turn the body's z axis to `direction` (body frame).
+
+    2 sin(angle / 2) stands for the angle: no arc functions, strong up to 180 degrees.
+    """
+    ex, ey, ez = direction
+    gain = jnp.minimum(
         config.attitude_gain * jax.lax.rsqrt(jnp.maximum(0.5 + 0.5 * ez, 1e-2)),
         config.max_body_rate_rad_s * jax.lax.rsqrt(ex * ex + ey * ey + 1e-9),
     )
+    return -gain * ey, gain * ex, yaw_rate
+
+
+def _wanted_yaw_rate(config: DroneConfig, w: Array, z: Array, cos_half_yaw: Array, sin_half_yaw: Array) -> Array:
+    """Returns the wanted rate about z [] rad/s from the heading error, 2 sin(angle / 2) for the angle as above."""
     cos_error = w * cos_half_yaw + z * sin_half_yaw
     sin_error = w * sin_half_yaw - z * cos_half_yaw
-    turn = 2 * config.yaw_gain * sin_error * jnp.sign(cos_error) * jax.lax.rsqrt(w * w + z * z + 1e-6)
-    turn = jnp.clip(turn, -config.max_yaw_rate_rad_s, config.max_yaw_rate_rad_s)
+    rate = 2 * config.yaw_gain * sin_error * jnp.sign(cos_error) * jax.lax.rsqrt(w * w + z * z + 1e-6)
+    return jnp.clip(rate, -config.max_yaw_rate_rad_s, config.max_yaw_rate_rad_s)
 
-    # Body rates -> torque, gyroscopic torque included.
+
+def _torque(config: DroneConfig, airframe: Airframe, wanted: Scalars, rates: Scalars) -> Scalars:
+    """Returns the torque N m (body) from rates to `wanted` rates rad/s, gyroscopic torque included."""
+    (wanted_p, wanted_q, wanted_r), (p, q, r) = wanted, rates
     ix, iy, iz = airframe.inertia
-    torque_x = ix * config.rate_gain * (-tilt * ey - p) + (iz - iy) * q * r
-    torque_y = iy * config.rate_gain * (tilt * ex - q) + (ix - iz) * p * r
-    torque_z = iz * config.yaw_rate_gain * (turn - r) + (iy - ix) * p * q
+    return (
+        ix * config.rate_gain * (wanted_p - p) + (iz - iy) * q * r,
+        iy * config.rate_gain * (wanted_q - q) + (ix - iz) * p * r,
+        iz * config.yaw_rate_gain * (wanted_r - r) + (iy - ix) * p * q,
+    )
 
-    # Collective thrust that gives the wanted vertical force at the tilt of this moment; none upside down.
-    collective = airframe.mass * fz * jnp.maximum(up_z, 0.0) / jnp.maximum(up_z * up_z, LEAST_LEVELNESS**2)
 
-    # Computed once, and not again for each rotor.
-    torque_x, torque_y, torque_z, collective = materialised(jnp.stack([torque_x, torque_y, torque_z, collective]))
+def _collective_thrust(airframe: Airframe, fz: Array, levelness: Array) -> Array:
+    """Returns the thrust [] newtons with vertical specific force `fz` at cos(tilt) `levelness`; 0 upside down."""
+    return airframe.mass * fz * jnp.maximum(levelness, 0.0) / jnp.maximum(levelness * levelness, LEAST_LEVELNESS**2)
 
-    # Rotor limits, in order of importance.
+
+def _allocate(
+    config: DroneConfig, airframe: Airframe, torque_x: Array, torque_y: Array, torque_z: Array, collective: Array
+) -> Array:
+    """Returns rotor thrusts [4] newtons within their limits: torque about x and y, then collective, then torque z."""
     rotors = range(airframe.mixer.shape[0])
     mixer, limit = airframe.mixer, airframe.max_thrust
     tilting = [mixer[i, 1] * torque_x + mixer[i, 2] * torque_y for i in rotors]
@@ -225,14 +274,14 @@ def _thrusts(
     scale = jnp.minimum(1.0, config.max_tilt_share * limit / (high - low + 1e-9))
     shared = jnp.clip(mixer[0, 0] * collective, -scale * low, limit - scale * high)
     levelled = [shared + scale * t for t in tilting]
-    room = jnp.maximum(0.0, _least([jnp.minimum(t, limit - t) for t in levelled]))
-    turning = jnp.clip(jnp.abs(mixer[0, 3]) * torque_z, -room, room)
+    margin = jnp.maximum(0.0, _least([jnp.minimum(t, limit - t) for t in levelled]))
+    turning = jnp.clip(jnp.abs(mixer[0, 3]) * torque_z, -margin, margin)
     spins = [jnp.sign(mixer[i, 3]) for i in rotors]
     return jnp.stack([jnp.clip(t + spins[i] * turning, 0.0, limit) for i, t in enumerate(levelled)])
 
 
 def _dot(row: Array, column: Array) -> Array:
-    """Products summed one by one: XLA makes a call of its own of a sum along an axis."""
+    """Returns a dot product, summed term by term: XLA compiles a sum along an axis to a separate call."""
     total = row[0] * column[0]
     for index in range(1, row.shape[0]):
         total = total + row[index] * column[index]
@@ -247,7 +296,10 @@ def _least(values: list[Array]) -> Array:
 
 
 def physics_step(config: DroneConfig, airframe: Airframe, state: DroneState, thrust: Array) -> DroneState:
-    """One step of `config.physics` under rotor thrusts [4] newtons; only position and velocity are carried over."""
+    """Returns the state after one step of `config.physics` under rotor thrusts [4] newtons.
+
+    Only position and velocity are carried from step to step.
+    """
     if config.physics == "rigid_body":
         moved = rigid_body_step(
             *(config.physics_dt_s, airframe.mass, airframe.inertia, airframe.gravity),
@@ -263,10 +315,10 @@ def physics_step(config: DroneConfig, airframe: Airframe, state: DroneState, thr
 
 
 def _mjx_step(airframe: Airframe, state: DroneState, thrust: Array) -> tuple[Array, Array, Array, Array]:
-    """Position, quaternion, velocity and angular velocity after one MJX step.
+    """Returns position, quaternion, velocity and angular velocity after one MJX step.
 
     These are the stages of `mjx.step` for this model: with the body frame at the centre of mass and no joint
-    below it, the mass matrix is the template's for ever, and nothing collides, constrains or dampens.
+    below it, the mass matrix is constant, the template's, and there are no collisions, constraints or damping.
     """
     model = airframe.model
     data = airframe.data.replace(
@@ -285,9 +337,9 @@ def _mjx_step(airframe: Airframe, state: DroneState, thrust: Array) -> tuple[Arr
 def fly(
     config: DroneConfig, airframe: Airframe, state: DroneState, velocity_command: Array, target_yaw: Array
 ) -> tuple[DroneState, Flight]:
-    """One decision: `physics_steps` steps at a held `velocity_command` [3] m/s (world).
+    """Flies one decision: `physics_steps` steps at a held `velocity_command` [3] m/s (world).
 
-    The yaw setpoint moves towards `target_yaw` [] radians the shorter way, at most `max_yaw_rate_rad_s` fast.
+    The yaw setpoint moves towards `target_yaw` [] radians in the shorter direction, at most `max_yaw_rate_rad_s` fast.
     """
     steps = jnp.arange(1, config.physics_steps + 1, dtype=jnp.float32)
     most = config.max_yaw_rate_rad_s * config.physics_dt_s * steps

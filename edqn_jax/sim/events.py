@@ -1,4 +1,4 @@
-"""From brightness frames to events: Eq. 1-5 of the paper, in its order, under three event laws.
+"""Events from brightness frames: Eq. 1-5 of the paper, in its order, under three event laws.
 
 Inside the compiled step events are never a list. Between two frames a pixel's events all have one polarity
 and even spacing, so `EventField` holds them exactly; `expand` turns it into the `(t, x, y, p)` stream that
@@ -52,7 +52,7 @@ class EventField:
 
 @struct.dataclass
 class EventMemory:
-    """What a law carries from one window to the next; what a configuration does not need is None."""
+    """State that a law carries from one window to the next; None for what a configuration does not need."""
 
     residual: Array | None  # [H, W] esim: log brightness of the last frame minus the pixel's reference level
     last_event: Array | None  # [H, W] esim: time of the last event, seconds from the end of the last window
@@ -67,7 +67,7 @@ def luma(rgb: Array) -> Array:
 
 
 def log_brightness(config: EventsConfig, intensity: Array) -> Array:
-    """Eq. 1: `L = log(intensity + epsilon)` of linear luma `[...]` in [0, 1].
+    """Returns Eq. 1: `L = log(intensity + epsilon)` of linear luma `[...]` in [0, 1].
 
     The paper's logarithm has no epsilon; without one a black pixel would make infinitely many events.
     """
@@ -75,7 +75,7 @@ def log_brightness(config: EventsConfig, intensity: Array) -> Array:
 
 
 def airsim_log_brightness(intensity: Array) -> Array:
-    """Eq. 1 as AirSim computes it: the logarithm of the 8-bit grey value + 0.001, in float32.
+    """Returns Eq. 1 as AirSim computes it: the logarithm of the 8-bit grey value + 0.001, in float32.
 
     The 256 possible values are tabulated, so that no compiler's logarithm can move an event.
     """
@@ -85,25 +85,25 @@ def airsim_log_brightness(intensity: Array) -> Array:
 
 
 def event_polarity(change: Array, threshold: Array | float) -> Array:
-    """Eq. 2: +1 or -1 where the log brightness changed by more than the threshold, else 0. `[...]` int8."""
+    """Returns Eq. 2: +1 or -1 where the log brightness changed by more than the threshold, else 0. `[...]` int8."""
     return jnp.where(jnp.abs(change) > threshold, jnp.sign(change), 0.0).astype(jnp.int8)
 
 
 def max_events(config: EventsConfig, interval_s: float) -> int:
-    """Eq. 3: `N_max`, the events that the refractory period leaves room for between two frames."""
+    """Returns Eq. 3: `N_max`, the most events that the refractory period allows between two frames."""
     if config.refractory_ns <= 0.0:
         return np.iinfo(np.int32).max
-    interval_us = round(interval_s * 1e9) * 1e-3  # whole nanoseconds: no float dust before int()
+    interval_us = round(interval_s * 1e9) * 1e-3  # whole nanoseconds: no rounding error before int()
     return int(interval_us / (config.refractory_ns * 1e-3))
 
 
 def event_count(change: Array, tolerance: Array | float, limit: Array | int) -> Array:
-    """Eq. 4: `N_e = min(N_max, floor(|change| / TOL))`, `[...]` int32."""
+    """Returns Eq. 4: `N_e = min(N_max, floor(|change| / TOL))`, `[...]` int32."""
     return jnp.minimum(jnp.floor(jnp.abs(change) / tolerance).astype(jnp.int32), limit)
 
 
 def airsim_count(before: Array, after: Array, tolerance: Array | float, limit: Array | int) -> Array:
-    """AirSim's number of events: `floor(|change| / TOL) - 1`, and none up to twice the tolerance.
+    """Returns AirSim's number of events: `floor(|change| / TOL) - 1`, and none up to twice the tolerance.
 
     It counts from the first crossing rather than to it; the float32 rounding of that crossing is kept.
     """
@@ -115,14 +115,15 @@ def airsim_count(before: Array, after: Array, tolerance: Array | float, limit: A
 
 
 def event_times(count: Array, starts: Array, intervals: Array) -> tuple[Array, Array]:
-    """Eq. 5: `t_k = t_prev + k dT / N_e`, k = 0 .. N_e - 1, as `(t_first, t_step)` `[F, H, W]`, seconds."""
+    """Returns Eq. 5: `t_k = t_prev + k dT / N_e`, k = 0 .. N_e - 1, as `(t_first, t_step)` `[F, H, W]`, seconds."""
     return jnp.broadcast_to(starts, count.shape), intervals / jnp.maximum(count, 1).astype(jnp.float32)
 
 
 def reset_memory(config: EventsConfig, height: int, width: int, key: Array) -> EventMemory:
-    """A sensor at rest: esim's residuals are uniform in (-C-, C+); mismatch and hot pixels are drawn.
+    """Returns the memory of a sensor at rest.
 
-    The same key makes the same sensor.
+    esim's residuals are uniform in (-C-, C+); threshold mismatch and hot pixels are drawn. The same key gives the same
+    sensor.
     """
     key_residual, key_gain, key_hot = jax.random.split(key, 3)
     gain = None
@@ -153,7 +154,7 @@ def events(
     *,
     continuous: bool = False,
 ) -> tuple[EventField, EventMemory]:
-    """Events of one window.
+    """Returns the events of one window, and the memory after it.
 
     Args:
         memory: from `reset_memory` or the window before.
@@ -161,7 +162,7 @@ def events(
         frame_times: T times in seconds, rising; only their differences matter. Known when tracing.
         key: consumed only by noise events.
         continuous: the first frame is the previous window's last one (`stream` mode), so that esim's
-            refractory clock runs on. Otherwise time has passed unseen: esim's reference is re-anchored at the
+            refractory clock runs on. Otherwise there is a gap between the windows: esim's reference is set at the
             first frame, keeping each pixel's sub-threshold residual.
 
     Raises:
@@ -187,22 +188,22 @@ def events(
 
 
 def divides_window(config: EventsConfig, frames: int) -> bool:
-    """Whether each pixel's events divide a window of so many frames evenly, see `EventField`."""
+    """Returns whether each pixel's events divide a window of so many frames evenly, see `EventField`."""
     return frames == 2 and config.law != "esim" and not _has_noise(config)
 
 
 def signed_count(field: EventField) -> Array:
-    """ON minus OFF events per pixel over the window, clipped to `[H, W]` int8."""
+    """Returns ON minus OFF events per pixel over the window, clipped to `[H, W]` int8."""
     return jnp.clip(event_image(field), -127, 127).astype(jnp.int8)
 
 
 def event_image(field: EventField) -> Array:
-    """ON minus OFF events per pixel over the window, `[H, W]` int32."""
+    """Returns ON minus OFF events per pixel over the window, `[H, W]` int32."""
     return jnp.sum(field.count * field.polarity, axis=-3)
 
 
 def field_of_counts(config: EventsConfig, counts: Array) -> EventField:
-    """The field behind a stored `[H, W]` signed count; exact for two frames under `paper` or `airsim`."""
+    """Returns the field of a stored `[H, W]` signed count; exact for two frames under `paper` or `airsim`."""
     window_s = config.frame_times_s[-1] - config.frame_times_s[0]
     count = jnp.abs(counts.astype(jnp.int32))[None]
     t_first, t_step = event_times(count, jnp.float32(0.0), jnp.float32(window_s))
@@ -219,7 +220,7 @@ def random_field(config: EventsConfig, height: int, width: int, rng: np.random.G
 
 
 def event_picture(image: NDArray, background: str = "white") -> NDArray[np.uint8]:
-    """Red-blue picture of a signed event image (Fig. 6): `[H, W]` to `[H, W, 3]`, ON red and OFF blue.
+    """Returns a red-blue picture of a signed event image (Fig. 6): `[H, W]` to `[H, W, 3]`, ON red and OFF blue.
 
     One event already has half the colour's strength; more events approach it.
 
@@ -236,7 +237,7 @@ def event_picture(image: NDArray, background: str = "white") -> NDArray[np.uint8
 
 
 def expand(field: EventField, window_start_us: int = 0) -> NDArray:
-    """The stream of a field: structured array of `STREAM_DTYPE`, sorted by time (host side, NumPy).
+    """Returns the stream of a field: structured array of `STREAM_DTYPE`, sorted by time (host side, NumPy).
 
     Times are rounded to the microsecond. Ties keep the order row, column.
     """
@@ -257,7 +258,7 @@ def expand(field: EventField, window_start_us: int = 0) -> NDArray:
 def collect(
     stream: NDArray, frame_times: Sequence[float], height: int, width: int, window_start_us: int = 0
 ) -> EventField:
-    """The field behind a stream: the inverse of `expand` for a field without noise (host side, NumPy).
+    """Returns the field of a stream: the inverse of `expand` for a field without noise (host side, NumPy).
 
     Lossless in this sense: `expand(collect(s)) == s` event by event, and `collect(expand(f))` has f's counts
     and polarities exactly and every event within a microsecond. Times come back as float64.
@@ -278,8 +279,8 @@ def collect(
     first, step, width_us = _line_through(t, index, pixel, begin, number)
     if np.any(sign != sign[begin][pixel]) or np.any(width_us >= 1.0 + 1e-6):
         raise ValueError(
-            "the stream is no noiseless event field: between two frames a pixel has events of both "
-            "polarities or unevenly spaced ones"
+            "the stream is not a noiseless event field: between two frames a pixel has events of both "
+            "polarities or unevenly spaced ones; each pixel must have one polarity and even spacing"
         )
     count, polarity = np.zeros(shape, np.int32), np.zeros(shape, np.int8)
     t_first, t_step = np.zeros(shape), np.zeros(shape)
@@ -291,10 +292,10 @@ def collect(
 def _line_through(
     t: NDArray, index: NDArray, pixel: NDArray, begin: NDArray, number: NDArray
 ) -> tuple[NDArray, NDArray, NDArray]:
-    """Per pixel the line `first + index * step` whose largest distance from the stamps `t` is least.
+    """Returns, per pixel, the line `first + index * step` whose largest distance from the times `t` is least.
 
-    The width of the strip around the stamps is convex in the slope, so a ternary search finds it. Stamps that
-    are a rounded line lie in a strip narrower than one microsecond, and its middle rounds to them again.
+    The width of the strip around the times is convex in the slope, so a ternary search finds it. Times that
+    are a rounded line are in a strip narrower than one microsecond, and its middle rounds to them again.
     """
     if t.size == 0:
         return np.zeros(0), np.zeros(0), np.zeros(0)
@@ -317,14 +318,14 @@ def _line_through(
 
 
 def _both(gain: Array | None, on: float, off: float) -> tuple[Array, Array]:
-    """ON and OFF thresholds, each a scalar or `[H, W]` with the sensor's mismatch."""
+    """Returns ON and OFF thresholds, each a scalar or `[H, W]` with the sensor's mismatch."""
     if gain is None:
         return jnp.float32(on), jnp.float32(off)
     return gain[0] * on, gain[1] * off
 
 
 def _frame_pairs(config: EventsConfig, gain: Array | None, frames: Array, times: NDArray) -> EventField:
-    """The memoryless laws, `paper` and `airsim`."""
+    """Returns the events of the memoryless laws, `paper` and `airsim`."""
     intervals = np.diff(times)
     limit = jnp.array([max_events(config, dt) for dt in intervals], jnp.int32)[:, None, None]
     level = log_brightness(config, frames) if config.law == "paper" else airsim_log_brightness(frames)
@@ -345,7 +346,7 @@ def _frame_pairs(config: EventsConfig, gain: Array | None, frames: Array, times:
 def _esim(
     config: EventsConfig, memory: EventMemory, level: Array, times: NDArray, continuous: bool
 ) -> tuple[EventField, EventMemory]:
-    """The law of a sensor with memory, over the window's frame pairs one after another."""
+    """Returns the events of a sensor with memory, over the window's frame pairs one after another."""
     assert memory.residual is not None and memory.last_event is not None
     last_event = memory.last_event if continuous else jnp.full_like(memory.last_event, -jnp.inf)
     starts, ends = jnp.asarray(times[:-1], jnp.float32), jnp.asarray(times[1:], jnp.float32)
@@ -370,7 +371,7 @@ def _esim_pair(
     carry: tuple[Array, Array],
     pair: tuple[Array, ...],
 ) -> tuple[tuple[Array, Array], EventField]:
-    """Crossings of the reference's next levels while brightness moves straight from frame to frame."""
+    """Returns crossings of the reference's next levels while brightness changes linearly between two frames."""
     residual, last_event = carry
     before, after, start, end = pair
     change = after - before
@@ -389,7 +390,7 @@ def _esim_pair(
     count = crossings
     if config.refractory_ns > 0.0:
         refractory = config.refractory_ns * 1e-9
-        # Evenly spaced crossings leave evenly spaced events: skip the first few, then take every stride-th.
+        # Evenly spaced crossings give evenly spaced events: skip the first few, then take every stride-th.
         spacing = jnp.maximum(step, 1e-12)
         skipped = jnp.maximum(jnp.ceil((last_event + refractory - first) / spacing), 0.0)
         stride = jnp.maximum(jnp.ceil(refractory / spacing), 1.0)
@@ -407,10 +408,10 @@ def _has_noise(config: EventsConfig) -> bool:
 
 
 def _noise(config: EventsConfig, hot: Array | None, field: EventField, times: NDArray, key: Array) -> EventField:
-    """Noise events of every frame pair: Poisson counts, evenly spaced from a random phase.
+    """Returns the noise events of every frame pair: Poisson counts, evenly spaced from a random phase.
 
-    A pixel's noise events between two frames share one polarity, drawn by the rates: exact while they seldom
-    are more than one. They neither move esim's reference nor wait for the refractory period.
+    A pixel's noise events between two frames share one polarity, drawn by the rates: exact as long as
+    there is at most one. They neither change esim's reference nor obey the refractory period.
     """
     key_count, key_polarity, key_phase = jax.random.split(key, 3)
     shape = field.count.shape
@@ -428,5 +429,5 @@ def _noise(config: EventsConfig, hot: Array | None, field: EventField, times: ND
 
 
 def _join(signal: EventField, noise: EventField) -> EventField:
-    """Signal rows, then noise rows."""
+    """Returns the signal rows, then the noise rows."""
     return jax.tree.map(lambda a, b: jnp.concatenate([a, b]), signal, noise)

@@ -1,13 +1,13 @@
-"""Worlds in and out of MJCF, MuJoCo's own file format.
+"""Reads and writes worlds as MJCF, MuJoCo's file format.
 
-Any MJCF will do. A world for the drone is made of
+Any MJCF file can be read. A world for the drone consists of
 
 * its static geoms (on the world body or on bodies welded to it): boxes, spheres, capsules, cylinders at
-  any rotation, and planes, which are solid below and endless. A geom is taken if a person sees it in
-  MuJoCo's viewer (groups 0 to 2) or if MuJoCo would collide with it (contype or conaffinity set): what
-  is seen is solid, and what is solid is seen. Colour is the material's or the geom's own `rgba`; alpha
+  any rotation, and planes, which are solid below and infinite. A geom is read if it is visible in
+  MuJoCo's viewer (groups 0 to 2) or if MuJoCo would collide with it (contype or conaffinity set): every
+  visible geom is solid, and every solid geom is visible. Colour is the material's or the geom's own `rgba`; alpha
   and textures are ignored.
-* two sites `start` and `goal`, anywhere; their positions count.
+* two sites `start` and `goal`, of which only the positions are read.
 * a box site `volume`, not rotated: the space that the drone may fly in. Without one, the box around all
   shapes and sites, `VOLUME_MARGIN` wider on every side, but not below a level plane.
 """
@@ -50,12 +50,12 @@ _LEVEL = 1e-6  # an axis this near to vertical (sine of the angle) is vertical: 
 
 
 class SceneError(ConfigError):
-    """A world that cannot be flown; the message is one sentence for people."""
+    """A world that cannot be flown; the message says what to change."""
 
 
 @dataclasses.dataclass(frozen=True)
 class LoadedWorld:
-    """A scene and what its shapes are called."""
+    """A scene and the names of its shapes."""
 
     scene: Scene
     names: Mapping[str, tuple[str, ...]]
@@ -64,17 +64,17 @@ class LoadedWorld:
 
 
 def scenes_folder() -> Path:
-    """Where the worlds that come with the project lie: beside the package in a checkout, in it in a wheel."""
+    """Returns the folder of the project's own worlds: beside the package in a checkout, inside it in a wheel."""
     package = Path(__file__).resolve().parents[1]
     packed = package / "scenes"
     return packed if packed.is_dir() else package.parent / "scenes"
 
 
 def resolve_world(name: str) -> Path:
-    """The MJCF file of a world that a person named by its path or by its name in `scenes/`.
+    """Returns the MJCF file of a world, given by its path or by its name in `scenes/`.
 
     Raises:
-        SceneError: if there is none.
+        SceneError: if the file does not exist.
     """
     path = Path(name).expanduser()
     if path.is_file():
@@ -94,18 +94,18 @@ def resolve_world(name: str) -> Path:
 
 
 def load_scene(path: str | Path) -> Scene:
-    """`load_world(path).scene`."""
+    """Returns `load_world(path).scene`."""
     return load_world(path).scene
 
 
 def load_world(path: str | Path) -> LoadedWorld:
-    """Read a world from an MJCF file.
+    """Reads a world from an MJCF file.
 
-    Where the file has no site `start` or `goal`, that point is NaN in the scene; `check_scene` complains
+    Where the file has no site `start` or `goal`, that point is NaN in the scene; `check_scene` raises an error
     unless the caller has replaced it.
 
     Raises:
-        SceneError: if the file is missing or does not parse, or has a geom that cannot be taken.
+        SceneError: if the file is missing or does not parse, or has an unsupported geom.
     """
     path = Path(path)
     if not path.is_file():
@@ -144,13 +144,13 @@ def check_scene(
     names: Mapping[str, tuple[str, ...]] | None = None,
     title: str = "the world",
 ) -> None:
-    """Make sure that a drone of this radius can stand at the start and at the goal.
+    """Checks that a drone of this radius fits at the start and at the goal.
 
     Args:
         scene: one world.
         body_radius: metres.
         names: as in `LoadedWorld`, for the message.
-        title: what to call the world in the message.
+        title: name of the world in the message.
 
     Raises:
         SceneError: if either is missing, outside the flight volume or too close to a shape.
@@ -184,9 +184,9 @@ def check_scene(
 
 
 def write_scene(scene: Scene, path: str | Path, *, title: str = "world") -> None:
-    """Write one world as MJCF that MuJoCo opens and that loads back to the same scene.
+    """Writes one world as MJCF that MuJoCo opens and that loads back to the same scene.
 
-    Parked shapes are left out. A tilted shape that happens to stand upright loads back as an upright one.
+    Parked shapes are left out. A tilted shape that is upright loads back as an upright one.
     """
     root = ElementTree.Element("mujoco", model=title)
     ElementTree.SubElement(root, "compiler", angle="radian")
@@ -208,7 +208,7 @@ def write_scene(scene: Scene, path: str | Path, *, title: str = "world") -> None
         if np.all(np.isfinite(where)):
             colour = "0.1 0.6 1 1" if role == "start" else "0.1 0.8 0.2 1"
             ElementTree.SubElement(world, "site", name=role, pos=_numbers(where), size="0.5", rgba=colour)
-    # Group 3 is hidden in the viewer until asked for.
+    # Group 3 is hidden in the viewer by default.
     ElementTree.SubElement(
         world, "site", name="volume", type="box", group="3", pos=_numbers(middle), size=_numbers(half),
         rgba="0.2 0.4 1 0.1",
@@ -232,7 +232,7 @@ def _kind_name(kind: mujoco.mjtGeom) -> str:
 
 
 def _shape(model: mujoco.MjModel, data: mujoco.MjData, geom: int, path: Path) -> Shape:
-    """Geom `geom` as a single shape, in the world's frame."""
+    """Returns geom `geom` as a single shape, in the world's frame."""
     kind = mujoco.mjtGeom(model.geom_type[geom])
     name = _geom_name(model, geom)
     body = model.geom_bodyid[geom]
@@ -260,13 +260,13 @@ def _shape(model: mujoco.MjModel, data: mujoco.MjData, geom: int, path: Path) ->
         case mujoco.mjtGeom.mjGEOM_PLANE:
             return Planes(position=position, normal=axis, albedo=albedo)
     raise SceneError(
-        f"{path}: geom '{name}' cannot be taken because it is of kind {_kind_name(kind)}; use boxes, "
+        f"{path}: geom '{name}' is of the unsupported kind {_kind_name(kind)}; use boxes, "
         "spheres, capsules, cylinders or planes, or hide it in group 3 with contype and conaffinity 0"
     )
 
 
 def _box(position: np.ndarray, rotation: np.ndarray, size: np.ndarray, albedo: np.ndarray) -> Shape:
-    """Upright if any of the box's own axes is vertical, whichever it is."""
+    """Returns an upright box if any of its axes is vertical, else a tilted one."""
     for vertical in (2, 0, 1):
         if math.hypot(rotation[0, vertical], rotation[1, vertical]) < _LEVEL:
             across, deep = ((0, 1), (1, 2), (0, 2))[(2, 0, 1).index(vertical)]
@@ -293,7 +293,7 @@ def _volume(model: mujoco.MjModel, data: mujoco.MjData, shapes: list[Shape], pat
         reach = _reach(shape)
         corners += [shape.position - reach, shape.position + reach]
     if not corners:
-        raise SceneError(f"{path}: nothing says how large the world is; add a box site named 'volume'")
+        raise SceneError(f"{path}: the size of the world is unknown; add a box site named 'volume'")
     lower, upper = np.min(corners, axis=0) - VOLUME_MARGIN, np.max(corners, axis=0) + VOLUME_MARGIN
     if floors:
         lower[2] = max(lower[2], max(floors))
@@ -301,7 +301,7 @@ def _volume(model: mujoco.MjModel, data: mujoco.MjData, shapes: list[Shape], pat
 
 
 def _reach(shape: Shape) -> np.ndarray:
-    """Half extents [3] of the axis-aligned box around a shape."""
+    """Returns the half extents [3] of the axis-aligned box around a shape."""
     match shape:
         case UprightBoxes():
             c, s = abs(math.cos(shape.yaw)), abs(math.sin(shape.yaw))
@@ -318,11 +318,11 @@ def _reach(shape: Shape) -> np.ndarray:
         case TiltedCylinders():
             across = np.sqrt(np.maximum(1.0 - np.asarray(shape.axis) ** 2, 0.0))
             return np.asarray(np.abs(shape.axis) * shape.half_length + across * shape.radius)
-    raise TypeError(f"a {type(shape).__name__} has no end")
+    raise TypeError(f"a {type(shape).__name__} has no finite extent")
 
 
 def _attributes(shape: Shape) -> dict[str, str]:
-    """The MJCF attributes of a geom."""
+    """Returns the MJCF attributes of a geom."""
     common = {"pos": _numbers(shape.position), "rgba": _numbers([*np.asarray(shape.albedo), 1.0])}
     match shape:
         case UprightBoxes():
@@ -347,7 +347,7 @@ def _attributes(shape: Shape) -> dict[str, str]:
 
 
 def _numbers(values: object) -> str:
-    """Enough digits for a float32 to survive."""
+    """Formats numbers with enough digits to restore a float32."""
     return " ".join(f"{float(value):.9g}" for value in np.asarray(values).ravel())
 
 

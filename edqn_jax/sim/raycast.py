@@ -1,4 +1,4 @@
-"""Rays against shapes: where each ray of a pinhole camera meets each shape, and how bright that surface is.
+"""Ray casting: the depth at which each ray of a pinhole camera meets each shape, and the brightness there.
 
 A ray is `origin + t * (dx, dy, dz)` with a unit forward component, so `t` is the depth along the optical
 axis. For a level camera `dx, dy` depend on the image column only and `dz` on the row only; they are passed
@@ -21,7 +21,7 @@ from edqn_jax.sim.scene import Capsules, Scene, TiltedCylinders
 
 TINY = 1e-9
 HORIZON_M = 1e5
-"""Nothing is seen beyond this depth: what lies there is parked, or rounding at the horizon."""
+"""Depth beyond which nothing is drawn: parked shapes and rounding at the horizon."""
 
 
 @struct.dataclass
@@ -42,14 +42,14 @@ class Rays:
 class Surfaces:
     """N surfaces under every ray; fields broadcast to [N, R, C]."""
 
-    depth: Array  # t of the first meeting
+    depth: Array  # t of the first intersection
     hit: Array  # whether there is one, in front of the camera
     value: Array  # brightness there: albedo value times shade, no texture
 
 
 @struct.dataclass
 class Values:
-    """What is to be seen of each shape, one number per shape: its luma, or one of its colours."""
+    """Albedo of each shape as one number per shape: its luma, or one of its colours."""
 
     boxes: Array
     cylinders: Array
@@ -61,7 +61,7 @@ class Values:
 
 
 def albedo_values(scene: Scene, weights: Array) -> Values:
-    """Albedo of every shape, weighted over RGB by `weights` [3]."""
+    """Returns the albedo of every shape, weighted over RGB by `weights` [3]."""
     return Values(
         boxes=scene.boxes.albedo @ weights,
         cylinders=scene.cylinders.albedo @ weights,
@@ -74,10 +74,10 @@ def albedo_values(scene: Scene, weights: Array) -> Values:
 
 
 def image_plane(config: CameraConfig, across: int, down: int) -> tuple[np.ndarray, np.ndarray]:
-    """Image-plane coordinates at unit depth: u [across * W] rightwards, v [down * H] upwards.
+    """Returns image-plane coordinates at unit depth: u [across * W] rightwards, v [down * H] upwards.
 
-    A pixel's rays stand one image apart (first ray of every pixel, second ray of every pixel, ...), so
-    that averaging them adds whole images and stays vectorised.
+    A pixel's rays are one image apart in the arrays (first ray of every pixel, second ray of every pixel, ...), so
+    that averaging them adds images and is vectorised.
     """
     half = math.tan(math.radians(config.horizontal_fov_deg) / 2)
     columns, rows = config.width * across, config.height * down
@@ -88,17 +88,17 @@ def image_plane(config: CameraConfig, across: int, down: int) -> tuple[np.ndarra
 
 
 def pitch_of(config: CameraConfig) -> float:
-    """Width and height of a pixel in the image plane."""
+    """Returns the width, and height, of a pixel in the image plane."""
     return 2 * math.tan(math.radians(config.horizontal_fov_deg) / 2) / config.width
 
 
 def columns_of(config: CameraConfig) -> Array:
-    """Image-plane coordinate [W] of the middle of each column."""
+    """Returns the image-plane coordinate [W] of the middle of each column."""
     return jnp.asarray(image_plane(config, 1, 1)[0])
 
 
 def column_rays(config: CameraConfig, heading: Array, u: Array, across: int = 1, down: int = 1) -> Rays:
-    """Rays [H * down, across] of one column of a level camera.
+    """Returns the rays [H * down, across] of one column of a level camera.
 
     Args:
         heading: [2] cosine and sine.
@@ -125,7 +125,7 @@ def _level_rays(config: CameraConfig, cos: Array, sin: Array, u, v, across: int,
 
 
 def camera_rays(config: CameraConfig, rotation: Array, across: int = 1, down: int = 1) -> Rays:
-    """Rays of the camera for a body rotation.
+    """Returns the rays of the camera for a body rotation.
 
     Args:
         rotation: [3, 3] body-to-world; the camera looks along body x, body z is up. A level mount keeps
@@ -152,35 +152,38 @@ def camera_rays(config: CameraConfig, rotation: Array, across: int = 1, down: in
 
 
 def sun_direction(config: CameraConfig) -> tuple[float, float, float]:
-    """Unit vector towards the sun, in the world's axes."""
+    """Returns the unit vector towards the sun, in the world's axes."""
     azimuth, elevation = math.radians(config.sun_azimuth_deg), math.radians(config.sun_elevation_deg)
     flat = math.cos(elevation)
     return flat * math.cos(azimuth), flat * math.sin(azimuth), math.sin(elevation)
 
 
 def shade(config: CameraConfig, nx: Array, ny: Array, nz: Array) -> Array:
-    """Lambert shade of a unit normal under the sun: ambient + (1 - ambient) max(0, n . sun)."""
+    """Returns the Lambert shade of a unit normal under the sun: ambient + (1 - ambient) max(0, n . sun)."""
     sx, sy, sz = sun_direction(config)
     return config.ambient + (1 - config.ambient) * jnp.maximum(nx * sx + ny * sy + nz * sz, 0.0)
 
 
 def inverse(x: Array) -> Array:
-    """1 / x, finite at 0."""
+    """Returns 1 / x, finite at 0."""
     return 1.0 / jnp.where(jnp.abs(x) < TINY, TINY, x)
 
 
 def per_shape(x: Array) -> Array:
-    """[N] -> [N, 1, 1], to broadcast against [N, R, C]."""
+    """Reshapes [N] to [N, 1, 1], to broadcast against [N, R, C]."""
     return x[:, None, None]
 
 
 def for_shapes(rays: Rays) -> Rays:
-    """The same rays with components [1, R, C], to broadcast against [N, 1, 1]."""
+    """Returns the same rays with components [1, R, C], to broadcast against [N, 1, 1]."""
     return dataclasses.replace(rays, dx=rays.dx[None], dy=rays.dy[None], dz=rays.dz[None])
 
 
 def unit_ball(ox: Array, oy: Array, oz: Array, radius: Array, rays: Rays) -> tuple[Array, Array, Array]:
-    """Rays (`for_shapes`) against spheres at `origin - centre`: depth of entry, depth and distance of the miss."""
+    """Returns the depth at which rays (`for_shapes`) enter spheres, and depth and distance of closest approach.
+
+    ox, oy, oz: `origin - centre` of each sphere.
+    """
     a = rays.dx**2 + rays.dy**2 + rays.dz**2
     s = -(ox * rays.dx + oy * rays.dy + oz * rays.dz) / a
     # Through the ray's nearest point, not b^2 - a c, whose cancellation costs 1e-3 at 100 m.
@@ -227,7 +230,10 @@ def _tilted_box_surfaces(config: CameraConfig, origin: Array, rays: Rays, scene:
 
 
 def _slabs(config: CameraConfig, o, d, half: Array, axes, value: Array) -> Surfaces:
-    """Box as three slabs: `o`, `d` are origin and direction in the box's frame, `axes` its axes in the world."""
+    """Returns surfaces of boxes, each three slabs.
+
+    `o`, `d` are origin and direction in the box's frame, `axes` its axes in the world.
+    """
     enter, leave = jnp.asarray(-jnp.inf), jnp.asarray(jnp.inf)
     bright = jnp.asarray(0.0)
     for i in range(3):
@@ -248,7 +254,7 @@ def _tube_surfaces(
     value: Array,
     capped: bool,
 ) -> Surfaces:
-    """Round sides of capsules, or (`capped`) cylinders with flat ends."""
+    """Returns surfaces of the round sides of capsules, or (`capped`) of cylinders with flat ends."""
     ox, oy, oz = (per_shape(origin[i] - part.position[:, i]) for i in range(3))
     ax, ay, az = (per_shape(part.axis[:, i]) for i in range(3))
     axis_o, axis_d = ox * ax + oy * ay + oz * az, rays.dx * ax + rays.dy * ay + rays.dz * az
@@ -274,7 +280,7 @@ def _tube_surfaces(
 
 
 def plane_surfaces(config: CameraConfig, scene: Scene, origin: Array, rays: Rays, value: Values) -> Surfaces:
-    """Half-spaces, seen from their free side."""
+    """Returns surfaces of half-spaces, visible from their free side."""
     planes, rays = scene.planes, for_shapes(rays)
     nx, ny, nz = (per_shape(planes.normal[:, i]) for i in range(3))
     height = per_shape(jnp.sum((origin[None] - planes.position) * planes.normal, axis=-1))
@@ -285,7 +291,7 @@ def plane_surfaces(config: CameraConfig, scene: Scene, origin: Array, rays: Rays
 
 
 def upright_surfaces(config: CameraConfig, scene: Scene, origin: Array, rays: Rays, value: Values) -> list[Surfaces]:
-    """Upright boxes and cylinders, kinds with capacity 0 left out."""
+    """Returns surfaces of upright boxes and cylinders, without kinds of capacity 0."""
     found, rays = [], for_shapes(rays)
     if scene.boxes.yaw.shape[0]:
         found.append(_upright_box_surfaces(config, origin, rays, scene, value))
@@ -304,9 +310,9 @@ def upright_surfaces(config: CameraConfig, scene: Scene, origin: Array, rays: Ra
 
 
 def other_surfaces(config: CameraConfig, scene: Scene, origin: Array, rays: Rays, value: Values) -> list[Surfaces]:
-    """Tilted boxes and cylinders and capsules, kinds with capacity 0 left out.
+    """Returns surfaces of tilted boxes, tilted cylinders and capsules, without kinds of capacity 0.
 
-    A capsule is three surfaces of one shape: they are returned as three, each with the ray's own nearest.
+    A capsule is one surface: the nearest of its side and its two half spheres.
     """
     found, rays = [], for_shapes(rays)
     if scene.tilted_boxes.half.shape[0]:
@@ -326,7 +332,7 @@ def other_surfaces(config: CameraConfig, scene: Scene, origin: Array, rays: Rays
 
 
 def sphere_surfaces(config: CameraConfig, scene: Scene, origin: Array, rays: Rays, value: Values) -> list[Surfaces]:
-    """Spheres, or nothing when the capacity is 0."""
+    """Returns surfaces of spheres; an empty list when the capacity is 0."""
     spheres = scene.spheres
     if not spheres.radius.shape[0]:
         return []
@@ -335,7 +341,7 @@ def sphere_surfaces(config: CameraConfig, scene: Scene, origin: Array, rays: Ray
 
 
 def _nearer_of(a: Surfaces, b: Surfaces) -> Surfaces:
-    """Union of two surfaces of the same shapes: whichever each ray meets first."""
+    """Returns the union of two surfaces of the same shapes: the one that each ray meets first."""
     take_b = b.hit & (~a.hit | (b.depth < a.depth))
     return Surfaces(
         depth=jnp.where(take_b, b.depth, a.depth),
@@ -345,7 +351,7 @@ def _nearer_of(a: Surfaces, b: Surfaces) -> Surfaces:
 
 
 def nearest_depth(config: CameraConfig, scene: Scene, origin: Array, rays: Rays) -> Array:
-    """Depth of the nearest surface along each ray: [R, C], inf where there is none."""
+    """Returns the depth of the nearest surface along each ray: [R, C], inf where there is none."""
     value = albedo_values(scene, jnp.ones(3))
     shape = jnp.broadcast_shapes(rays.dx.shape, rays.dz.shape)
     nearest = jnp.full(shape, jnp.inf)

@@ -1,4 +1,4 @@
-"""A free rigid body in closed form: what an MJX step comes to for an airframe without joints, contacts or drag.
+"""A free rigid body in closed form: equal to an MJX step for an airframe without joints, contacts or drag.
 
 Newton's and Euler's equations about the centre of mass, with axes along the principal ones, integrated as MuJoCo's
 semi-implicit Euler does (MuJoCo's documentation, "Computation: numerical integration"): forces of the state before
@@ -23,7 +23,7 @@ def rigid_body_step(
     velocity: Array,
     angular_velocity: Array,
 ) -> tuple[Array, Array, Array, Array]:
-    """The body after `dt_s` seconds.
+    """Returns the body's state after `dt_s` seconds.
 
     Args:
         dt_s: length of the step, seconds.
@@ -37,7 +37,7 @@ def rigid_body_step(
         angular_velocity: [3] rad/s, body.
 
     Returns:
-        the last four, likewise; the quaternion has length 1.
+        position, quaternion, velocity, angular_velocity after the step; the quaternion has length 1.
     """
     force, torque_x, torque_y, torque_z = wrench
     w, x, y, z = quaternion

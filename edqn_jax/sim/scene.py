@@ -1,8 +1,8 @@
 """A world as padded arrays, one per kind of shape, and its signed distance.
 
 The same arrays are what the drone collides with and what the camera sees. Every kind has a static
-capacity; places that hold no shape are parked `PARKED` metres away with zero size, so that no ray
-meets them and no distance notices them, and no code needs a mask.
+capacity; unused entries are parked `PARKED` metres away with zero size, so that no ray
+meets them, they affect no distance, and no code needs a mask.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ from jax import Array, lax
 from jax.typing import ArrayLike
 
 PARKED = 1e6
-"""Where absent shapes stand, metres along each axis."""
+"""Coordinate of absent shapes, metres along each axis."""
 
 
 @struct.dataclass
 class UprightBoxes:
-    """Boxes that stand upright. N is the capacity."""
+    """Boxes rotated about the vertical only. N is the capacity."""
 
     position: Array  # [N, 3] centre, metres
     half: Array  # [N, 3] half extents, metres
@@ -125,7 +125,7 @@ _TINY = 1e-20  # under a square root, so that its gradient is finite; 1e-10 m is
 
 
 def scene_at(scene: Scene, time: Array) -> Scene:
-    """The world as it stands at `time` (seconds). Every world is static today; what moves enters here."""
+    """Returns the world at `time` (seconds): the identity while every world is static; moving shapes belong here."""
     del time
     return scene
 
@@ -134,7 +134,7 @@ def scene_at(scene: Scene, time: Array) -> Scene:
 
 
 def shape_distances(scene: Scene, point: Array) -> dict[str, Array]:
-    """Signed distance from `point` to every single shape.
+    """Returns the signed distance from `point` to every single shape.
 
     Args:
         scene: one world.
@@ -162,7 +162,7 @@ def shape_distances(scene: Scene, point: Array) -> dict[str, Array]:
 
 
 def signed_distance(scene: Scene, point: Array) -> Array:
-    """Metres from `point` [3] to the nearest surface of the scene, negative inside a shape.
+    """Returns metres from `point` [3] to the nearest surface of the scene, negative inside a shape.
 
     Exact outside. Where shapes overlap, the depth inside is that of the shape whose own surface is
     furthest away, a lower bound of the depth in the union. A scene without shapes is `PARKED` away.
@@ -174,11 +174,11 @@ def signed_distance(scene: Scene, point: Array) -> Array:
 
 
 def segment_contact(scene: Scene, start: Array, end: Array, radius: ArrayLike, samples: int = 8) -> tuple[Array, Array]:
-    """Whether a sphere that moves straight from `start` to `end` touches anything, and where first.
+    """Returns whether a sphere that moves straight from `start` to `end` touches anything, and where first.
 
     The distance is taken at `samples` points, both ends included. Along a line the distance to a convex
     shape is convex and at distance r bends by at most 1/r, so between two points h apart the sphere can
-    sink in unnoticed by at most (h / 2)^2 / 2 r: 0.09 mm for a step of 0.11 m and r = 0.36 m. Wherever
+    penetrate undetected by at most (h / 2)^2 / 2 r: 0.09 mm for a step of 0.11 m and r = 0.36 m. Wherever
     the two ends alone prove the segment free (d0 + d1 > L + 2 r) all samples agree.
 
     Args:
@@ -202,7 +202,7 @@ def segment_contact(scene: Scene, start: Array, end: Array, radius: ArrayLike, s
 
 
 def path_contact(scene: Scene, path: Array, radius: ArrayLike) -> tuple[Array, Array]:
-    """`segment_contact` of each segment of a path up to the first that touches.
+    """Returns `segment_contact` of each segment of a path up to the first that touches.
 
     One distance at each point proves most segments free (d0 + d1 > L + 2 r); the others are searched one by one,
     so that the usual path costs an eighth.
@@ -235,7 +235,7 @@ def _norm(*components: Array) -> Array:
 
 
 def _solid(*gaps: Array) -> Array:
-    """Signed distance from how far the point lies beyond each pair of faces (negative: within)."""
+    """Returns the signed distance, given the distances beyond each pair of faces (negative: within)."""
     outside = _norm(*(jnp.maximum(gap, 0.0) for gap in gaps))
     deepest = gaps[0]
     for gap in gaps[1:]:
@@ -296,7 +296,7 @@ def _planes(planes: Planes, x: Array, y: Array, z: Array) -> Array:
 
 
 def parked_shape(kind: type[S]) -> S:
-    """One absent shape of the kind (its dataclass): out of sight, out of reach, no size."""
+    """Returns one absent shape of the kind (its dataclass): parked far away, with zero size."""
     names = [field.name for field in dataclasses.fields(kind)]
     values: dict[str, Any] = {name: np.float32(0.0) for name in names} | {
         "position": np.array([0.0, 0.0, -PARKED]) if "normal" in names else np.full(3, PARKED),
@@ -310,7 +310,7 @@ def parked_shape(kind: type[S]) -> S:
 
 
 def no_shapes(kind: type[S]) -> S:
-    """The kind's dataclass with capacity 0."""
+    """Returns the kind's dataclass with capacity 0."""
     return jax.tree.map(lambda leaf: jnp.zeros((0, *np.shape(leaf)), jnp.float32), parked_shape(kind))
 
 
@@ -322,15 +322,14 @@ def build_scene(
     goal: npt.ArrayLike,
     capacities: Mapping[str, int] | None = None,
 ) -> Scene:
-    """A scene from a list of single shapes, on the host.
+    """Returns a scene from a list of single shapes, on the host.
 
     Args:
         shapes: of any kinds in any order; within a kind the order is kept.
         volume: [2, 3] lower and upper corner, metres.
         start: [3] metres.
         goal: [3] metres.
-        capacities: places per kind, by the name of its field in `Scene`; a kind that is not named gets
-            as many as it needs.
+        capacities: by the name of the kind's field in `Scene`; the default is the number of its shapes.
 
     Raises:
         ValueError: if a kind has more shapes than its capacity.
@@ -340,12 +339,14 @@ def build_scene(
         members = [shape for shape in shapes if isinstance(shape, dataclass)]
         capacity = (capacities or {}).get(kind, len(members))
         if len(members) > capacity:
-            raise ValueError(f"{len(members)} {kind} do not fit into {capacity} places")
+            raise ValueError(
+                f"{len(members)} {kind} exceed the capacity of {capacity}; it must be at least their number"
+            )
         members += [parked_shape(dataclass)] * (capacity - len(members))
         if not members:
             fields[kind] = no_shapes(dataclass)
             continue
-        # jax.tree would take a position given as a list for a branch, so the fields are stacked by name.
+        # jax.tree would treat a position given as a list as a subtree, so the fields are stacked by name.
         fields[kind] = dataclass(
             **{
                 field.name: jnp.asarray(np.stack([getattr(m, field.name) for m in members]), jnp.float32)
@@ -361,7 +362,7 @@ def build_scene(
 
 
 def scene_shapes(scene: Scene) -> list[Shape]:
-    """The shapes of one world that are not parked, kind by kind, as single shapes on the host."""
+    """Returns the shapes of one world that are not parked, kind by kind, as single shapes on the host."""
     shapes: list[Shape] = []
     for kind in KINDS:
         arrays = jax.tree.map(np.asarray, getattr(scene, kind))
@@ -372,12 +373,12 @@ def scene_shapes(scene: Scene) -> list[Shape]:
 
 
 def obstacle_count(scene: Scene) -> int:
-    """How many shapes stand in one world, ground and other planes not counted. On the host."""
+    """Returns the number of shapes in one world without ground and other planes. On the host."""
     return sum(not isinstance(shape, Planes) for shape in scene_shapes(scene))
 
 
 def stack_scenes(scenes: Sequence[Scene]) -> Scene:
-    """A pool of worlds: the scenes with a leading axis, each kind padded to its largest capacity."""
+    """Returns a pool of worlds: the scenes with a leading axis, each kind padded to its largest capacity."""
     capacities = {kind: max(getattr(s, kind).position.shape[0] for s in scenes) for kind in KINDS}
     padded = [
         build_scene(scene_shapes(s), volume=s.volume, start=s.start, goal=s.goal, capacities=capacities) for s in scenes
@@ -386,5 +387,5 @@ def stack_scenes(scenes: Sequence[Scene]) -> Scene:
 
 
 def take_scene(pool: Scene, index: ArrayLike) -> Scene:
-    """World `index` of a pool."""
+    """Returns world `index` of a pool."""
     return jax.tree.map(lambda leaf: leaf[index], pool)

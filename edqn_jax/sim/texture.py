@@ -33,13 +33,13 @@ WAVES = (
 
 
 def wave(phase: Array) -> Array:
-    """A smooth wave of period 1 between -1 and 1: the parabola that stands in for sin(2 pi phase)."""
+    """Returns a smooth wave of period 1 in [-1, 1]: parabolas that approximate sin(2 pi phase)."""
     f = phase - jnp.round(phase)
     return f * (8.0 - 16.0 * jnp.abs(f))
 
 
 def _box_filter(cycles: Array) -> Array:
-    """What a box average over `cycles` periods leaves of a wave: sinc, to 1 % below one period, then 0."""
+    """Returns the amplitude of a wave after a box average over `cycles` periods: sinc to 1 % below one, then 0."""
     x = jnp.minimum(cycles * cycles, 1.0)
     return (1.0 - x) * (1.0 - 0.55 * x)
 
@@ -48,9 +48,9 @@ def _box_filter(cycles: Array) -> Array:
 def texture(
     config: CameraConfig, origin: Array, rays: Rays, depth: Array, slope_right: Array, slope_up: Array
 ) -> Array:
-    """Factor that the solid texture puts on each pixel's brightness: [H, W], 1 on average.
+    """Returns the texture's factor on each pixel's brightness: [H, W], 1 on average.
 
-    The texture is a sum of plane waves in world space, which no static surface moves through. Along a ray
+    The texture is a sum of plane waves in world space, fixed to static surfaces. Along a ray
     the point is o + t d; over a pixel its phase changes by k . (t d' + t' d), and the box average of a wave
     over that many cycles is a sinc.
 

@@ -1,4 +1,4 @@
-"""Random worlds, where their seeds come from, and missions: which world, from where, to where."""
+"""Random worlds and their seeds, and missions: a world, a start and a goal."""
 
 from __future__ import annotations
 
@@ -32,24 +32,24 @@ from edqn_jax.sim.scene import (
 SIZE = (110.0, 110.0, 25.0)
 """Flight volume of a random world, metres: the paper's."""
 SHAPES = {"sparse": (8, 2, 2), "medium": (22, 5, 3), "dense": (44, 10, 6)}
-"""How many blocks, pillars and balls a random world has places for. Medium is the paper's density."""
+"""Capacities of a random world: blocks, pillars and balls. Medium is the paper's density."""
 HALF_WIDTHS = {"sparse": (2.0, 5.5), "medium": (2.0, 5.5), "dense": (1.5, 4.0)}
 """Range of a block's half width and half depth, metres."""
 GAP = 3.0
-"""Metres that stay free between the footprints of any two shapes, and between them and the fence."""
+"""Free metres between the footprints of any two shapes, and between them and the faces of the volume."""
 CLEARANCE = 1.0
 """Metres between a random start or goal and the nearest surface."""
 FAR = 40.0
-"""Metres that a random start and a random goal are apart at least."""
+"""Least distance between a random start and a random goal, metres."""
 AWAY = 5.0
-"""Metres between a random start and a goal that is given, at least."""
+"""Least distance between a random start and a given goal, metres."""
 GROUND_RGB = (0.37, 0.43, 0.35)
 """Albedo of the ground."""
 
 _ALTITUDES = (1.5, 20.0)  # of the start and goal of a random world, metres
 _FENCE = ((1.0, 1.0, 1.0), (1.0, 1.0, 2.0))  # between random points and the volume's lower and upper faces
 _TRIES = 64  # candidates for each free point; the chance that all fail is below 1e-13 in a dense world
-_PLACES = 64  # candidate places for each shape
+_PLACES = 64  # candidate positions for each shape
 
 # ------------------------------------------------------------------------------------------- seeds
 
@@ -61,12 +61,12 @@ _ROOT_SEED = 2024
 
 
 def world_key(split: Split, index: ArrayLike) -> Array:
-    """Key of world `index` (any non-negative integer) of a split."""
+    """Returns the key of world `index` (any non-negative integer) of a split."""
     return jax.random.fold_in(jax.random.fold_in(jax.random.key(_ROOT_SEED), SPLITS[split]), index)
 
 
 def world_keys(split: Split, count: int, first: int = 0) -> Array:
-    """Keys [count] of worlds `first`, `first + 1`, ... of a split."""
+    """Returns the keys [count] of worlds `first`, `first + 1`, ... of a split."""
     return jax.vmap(partial(world_key, split))(first + jnp.arange(count))
 
 
@@ -75,10 +75,10 @@ def world_keys(split: Split, count: int, first: int = 0) -> Array:
 
 @partial(jax.jit, static_argnums=0)
 def random_scene(density: str, key: Array) -> Scene:
-    """A random world: blocks, pillars and balls over level ground, a start and a goal.
+    """Returns a random world: blocks, pillars and balls over level ground, a start and a goal.
 
-    The free space is connected by construction, so there is always a way from start to goal. The
-    footprints' bounding circles stay `GAP` apart and `GAP` inside the fence; grown by the drone's radius
+    The free space is connected by construction, so there is always a path from start to goal. The
+    footprints' bounding circles are `GAP` apart and `GAP` inside the volume; grown by the drone's radius
     (0.36 m) they are still disjoint discs inside the rectangle, and a rectangle without finitely many
     disjoint discs in its interior is connected. That holds at every altitude, since no shape is wider
     anywhere than its footprint. A point above or below a shape is no exception: moving level and straight
@@ -90,13 +90,13 @@ def random_scene(density: str, key: Array) -> Scene:
         key: consumed.
 
     Raises:
-        ConfigError: if there is no such density.
+        ConfigError: if the density is unknown.
     """
     if density not in SHAPES:
-        raise ConfigError(f"there is no density '{density}'; the densities are {', '.join(DENSITIES)}")
+        raise ConfigError(f"unknown density '{density}'; the densities are {', '.join(DENSITIES)}")
     blocks, pillars, balls = SHAPES[density]
     count = blocks + pillars + balls
-    # One draw for everything: on CPU every draw of its own costs half a second of compilation.
+    # One draw for all: on CPU each separate draw costs half a second of compilation.
     draws = jax.random.uniform(key, (count * (4 + 2 * _PLACES + 5) + 2 * _TRIES * 3,))
     sizes, places, colours, ends = jnp.split(
         draws, [count * 4, count * (4 + 2 * _PLACES), count * (4 + 2 * _PLACES + 5)]
@@ -147,16 +147,16 @@ def random_scene(density: str, key: Array) -> Scene:
 
 @partial(jax.jit, static_argnums=0)
 def random_pool(density: str, keys: Array) -> Scene:
-    """A pool of random worlds, one for each of `keys` [P]."""
+    """Returns a pool of random worlds, one for each of `keys` [P]."""
     return jax.vmap(partial(random_scene, density))(keys)
 
 
 def _place(reach: Array, draw: Array) -> tuple[Array, Array, Array]:
-    """Places for discs that stay `GAP` apart and `GAP` inside the fence, one after the other.
+    """Returns positions for discs that are `GAP` apart and `GAP` inside the volume, chosen one after the other.
 
     Args:
         reach: [N] radii, metres.
-        draw: [N, K, 2] uniform in [0, 1), K candidate places for each.
+        draw: [N, K, 2] uniform in [0, 1), K candidate positions for each.
 
     Returns:
         x, y: [N] metres. placed: [N] bool; a disc for which no candidate was free is not.
@@ -173,18 +173,18 @@ def _place(reach: Array, draw: Array) -> tuple[Array, Array, Array]:
         free = jnp.all(apart >= radius + taken[None] + GAP, axis=1)
         chosen = places[jnp.argmax(free)]
         found = jnp.any(free)
-        # A disc without a place stands aside, where it is in nobody's way.
+        # A disc without a free position is parked.
         x = x.at[number].set(jnp.where(found, chosen[0], PARKED))
         y = y.at[number].set(jnp.where(found, chosen[1], PARKED))
         return (x, y, taken.at[number].set(radius)), found
 
-    nobody = jnp.full(count, PARKED)
-    (x, y, _), placed = jax.lax.scan(place, (nobody, nobody, jnp.zeros(count)), (jnp.arange(count), reach, candidates))
+    parked = jnp.full(count, PARKED)
+    (x, y, _), placed = jax.lax.scan(place, (parked, parked, jnp.zeros(count)), (jnp.arange(count), reach, candidates))
     return x, y, placed
 
 
 def _colours(draw: Array) -> Array:
-    """Albedos [N, 3] from uniform draws [N, 5]: greys of all values, about half of them with a tint."""
+    """Returns albedos [N, 3] from uniform draws [N, 5]: greys of all values, about half of them with a tint."""
     grey = 0.15 + 0.7 * draw[:, :1]
     tint = 0.5 * draw[:, 1:4] - 0.25
     return jnp.clip(grey + jnp.where(draw[:, 4:] < 0.5, tint, 0.0), 0.05, 0.95)
@@ -202,18 +202,18 @@ def free_point(
     away_from: Array | None = None,
     distance: float = 0.0,
 ) -> Array:
-    """A random free point of the flight volume, uniform up to the conditions.
+    """Returns a random free point of the flight volume, uniform up to the conditions.
 
-    The first of `_TRIES` uniform candidates that meets the conditions; if none does, the one that misses
-    them by least.
+    It is the first of `_TRIES` uniform candidates that meets the conditions; if none does, the one that violates
+    them least.
 
     Args:
         scene: one world.
         key: consumed.
         clearance: metres to the nearest surface, at least.
-        altitudes: lowest and highest z, metres; without it the whole volume.
-        away_from: [3] a point to keep away from.
-        distance: how far, metres.
+        altitudes: lowest and highest z, metres; None is the full height of the volume.
+        away_from: [3] metres, a point to keep a distance from.
+        distance: least distance to it, metres.
 
     Returns:
         [3] metres.
@@ -230,7 +230,7 @@ def start_goal(
     distance: float = FAR,
     altitudes: tuple[float, float] | None = _ALTITUDES,
 ) -> tuple[Array, Array]:
-    """A random free start and goal, each [3], at least `distance` metres apart, as in `free_point`."""
+    """Returns a random free start and goal, each [3], at least `distance` metres apart, as in `free_point`."""
     draw = jax.random.uniform(key, (2, _TRIES, 3))
     return _far_apart(scene, draw, clearance=clearance, distance=distance, altitudes=altitudes)
 
@@ -249,7 +249,7 @@ def _far_apart(
 
 
 def _scatter(scene: Scene, draw: Array, altitudes: tuple[float, float] | None = None) -> Array:
-    """Points [K, 3] of the flight volume from uniform draws [K, 3], a little inside the fence."""
+    """Returns points [K, 3] of the flight volume, a margin inside its faces, from uniform draws [K, 3]."""
     lower, upper = scene.volume[0] + jnp.array(_FENCE[0]), scene.volume[1] - jnp.array(_FENCE[1])
     if altitudes is not None:
         lower = lower.at[2].max(altitudes[0])
@@ -260,7 +260,7 @@ def _scatter(scene: Scene, draw: Array, altitudes: tuple[float, float] | None = 
 def _first_free(
     scene: Scene, points: Array, clearance: float, away_from: Array | None = None, distance: float = 0.0
 ) -> Array:
-    """The first of `points` [K, 3] that meets the conditions, or the one that misses them by least."""
+    """Returns the first of `points` [K, 3] that meets the conditions, or the one that violates them least."""
     short = jnp.minimum(jax.vmap(partial(signed_distance, scene))(points) - clearance, 0.0)
     if away_from is not None:
         apart = jnp.sqrt(jnp.sum((points - away_from[None]) ** 2, axis=1))
@@ -273,7 +273,7 @@ def _first_free(
 
 @struct.dataclass
 class Missions:
-    """What to fly. M is the number of missions."""
+    """M missions: in which world, from where, to where."""
 
     scene: Array  # [M] int32, index into the pool of worlds
     start: Array  # [M, 3] metres
@@ -281,13 +281,13 @@ class Missions:
 
 
 def own_missions(pool: Scene) -> Missions:
-    """One mission for each world of the pool [P]: from its own start to its own goal."""
+    """Returns one mission for each world of the pool [P]: from its own start to its own goal."""
     return Missions(scene=jnp.arange(pool.start.shape[0]), start=pool.start, goal=pool.goal)
 
 
 @partial(jax.jit, static_argnums=1)
 def random_missions(pool: Scene, count: int, key: Array) -> Missions:
-    """Missions in random worlds of the pool between random free points at least `FAR` metres apart."""
+    """Returns missions in random worlds of the pool between random free points at least `FAR` metres apart."""
 
     def mission(index: Array, draw: Array) -> Missions:
         start, goal = _far_apart(take_scene(pool, index), draw)
@@ -300,18 +300,18 @@ def random_missions(pool: Scene, count: int, key: Array) -> Missions:
 
 @partial(jax.jit, static_argnums=1)
 def spread_missions(pool: Scene, count: int, own_start_fraction: ArrayLike, jitter: ArrayLike, key: Array) -> Missions:
-    """Missions to the worlds' own goals, from starts spread over the whole volume.
+    """Returns missions to the worlds' own goals, from starts spread over the volume.
+
+    The other starts are free points, at least `AWAY` metres from the goal. In worlds with closed spaces there may be
+    no path from some starts; none of the provided worlds has any.
 
     Args:
         pool: worlds [P]; missions draw from them at random.
         count: M.
         own_start_fraction: share of missions that begin near the world's own start.
-        jitter: half width, metres, of the box around the own start that those draw from, cut off 0.5 m
-            inside the fence; 0 is the start itself.
+        jitter: half width, metres, of the box around the own start that these are drawn from, cut off 0.5 m
+            inside the volume; 0 is the start itself.
         key: consumed.
-
-    The other starts are free points, at least `AWAY` metres from the goal. Worlds with closed rooms can
-    have starts from which there is no way: none of ours does.
     """
 
     def mission(own: Array, index: Array, draw: Array) -> Missions:
@@ -319,7 +319,7 @@ def spread_missions(pool: Scene, count: int, own_start_fraction: ArrayLike, jitt
         anywhere = _first_free(scene, _scatter(scene, draw[0]), CLEARANCE, scene.goal, AWAY)
         lower = jnp.minimum(scene.volume[0] + 0.5, scene.start)
         upper = jnp.maximum(scene.volume[1] - 0.5, scene.start)
-        # The start itself comes last: it is taken if nothing else around it is free.
+        # The start itself comes last: it is chosen if no other candidate is free.
         shift = (jnp.asarray(jitter) * (2.0 * draw[1] - 1.0)).at[-1].set(0.0)
         near = jnp.clip(scene.start[None] + shift, lower[None], upper[None])
         start = jnp.where(own, _first_free(scene, near, CLEARANCE), anywhere)

@@ -1,4 +1,4 @@
-"""Where XLA may not fuse: what several operations read is computed once."""
+"""Prevents XLA from fusing, so that a value with several readers is computed once."""
 
 from __future__ import annotations
 
@@ -11,5 +11,5 @@ Tree = TypeVar("Tree")
 
 
 def materialised(tree: Tree) -> Tree:
-    """The same float32 arrays, computed once: an exact no-op that XLA does not fuse into their consumers."""
+    """Returns the same float32 arrays, computed once: an exact no-op that XLA does not fuse into their consumers."""
     return jax.tree.map(lambda x: lax.reduce_precision(x, exponent_bits=8, mantissa_bits=23), tree)

@@ -35,9 +35,9 @@ def crowd(rng, boxes, cylinders, spheres):
     )
 
 
-@pytest.mark.parametrize("count", [10, 40], ids=["more than there is room for", "more than a word holds"])
+@pytest.mark.parametrize("count", [10, 40], ids=["more than any capacity", "more than a word holds"])
 @pytest.mark.slow
-def test_columns_that_are_fuller_than_any_block_are_seen_whole(count):
+def test_columns_with_more_shapes_than_any_capacity_are_drawn_completely(count):
     scene, position, rotation = scene_of(GROUND, *stairs(count)), (4.0, 20.0, 9.0), rotation_of(0, 0, 0.05)
     seen = jax.jit(partial(camera.luma, CONFIG))(scene, jnp.asarray(position), jnp.asarray(rotation, jnp.float32))
     plain = camera_plain.luma(CONFIG, scene, np.array(position), rotation, samples=8)

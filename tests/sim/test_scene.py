@@ -149,7 +149,7 @@ def test_the_gradient_is_the_direction_away_from_the_surface_and_finite_everywhe
 
 def test_too_many_shapes_for_a_capacity_are_refused():
     ball = Spheres(position=[5, 5, 5], radius=1, albedo=GREY)
-    with pytest.raises(ValueError, match="2 spheres do not fit into 1"):
+    with pytest.raises(ValueError, match="2 spheres exceed the capacity of 1"):
         scene_of(ball, ball, spheres=1)
 
 

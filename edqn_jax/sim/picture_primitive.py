@@ -1,0 +1,66 @@
+"""A JAX primitive that draws pictures in one batch, however many `vmap`s they are mapped by.
+
+It is traced once, where a program is lowered; `jax.custom_batching.custom_vmap` traces again at every `vmap`
+(docs/decisions/0011). M pictures of H x W pixels.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Hashable, Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jax.core import ShapedArray
+from jax.extend.core import Primitive
+from jax.interpreters import batching, mlir
+
+Static = tuple[Hashable, ...]
+
+
+def draw_in_one_batch(
+    draw: Callable[..., Array], static: Static, arguments: tuple[Any, ...], shape: tuple[int, int]
+) -> Array:
+    """Returns one picture, [H, W] float32; all pictures that it is mapped to are drawn by one call of `draw`.
+
+    Args:
+        draw: `draw(*static, *arguments)` returns pictures [M, H, W] of arguments with a leading [M]. A function of a
+            module, not one made for the call: compiled programs are cached by its identity.
+        static: arguments that are known when tracing.
+        arguments: pytrees of arrays, of one picture.
+        shape: H, W.
+    """
+    leaves, tree = jax.tree.flatten(arguments)
+    return _pictures_p.bind(*(leaf[None] for leaf in leaves), draw=draw, static=static, tree=tree, shape=shape)[0]
+
+
+_pictures_p = Primitive("pictures")
+"""Its operands are the leaves of the arguments, each with a leading [M]; its result is [M, H, W]."""
+
+
+def _draw(*leaves: Array, draw: Callable[..., Array], static: Static, tree: Any, shape: tuple[int, int]) -> Array:
+    return draw(*static, *jax.tree.unflatten(tree, leaves))
+
+
+def _abstract(*leaves: Any, shape: tuple[int, int], **_: Any) -> ShapedArray:
+    return ShapedArray((leaves[0].shape[0], *shape), np.dtype(np.float32))
+
+
+def _batch(leaves: Sequence[Array], axes: Sequence[int | None], **parameters: Any) -> tuple[Array, int]:
+    """Merges a mapped axis into the leading [M]: the rule for `vmap`."""
+    size = next(leaf.shape[axis] for leaf, axis in zip(leaves, axes, strict=True) if axis is not None)
+
+    def merged(leaf: Array, axis: int | None) -> Array:
+        mapped = jnp.broadcast_to(leaf, (size, *leaf.shape)) if axis is None else jnp.moveaxis(leaf, axis, 0)
+        return mapped.reshape(mapped.shape[0] * mapped.shape[1], *mapped.shape[2:])
+
+    pictures = _pictures_p.bind(*(merged(*each) for each in zip(leaves, axes, strict=True)), **parameters)
+    return pictures.reshape(size, -1, *pictures.shape[1:]), 0
+
+
+_pictures_p.def_abstract_eval(_abstract)
+_pictures_p.def_impl(jax.jit(_draw, static_argnames=("draw", "static", "tree", "shape")))
+batching.primitive_batchers[_pictures_p] = _batch
+mlir.register_lowering(_pictures_p, mlir.lower_fun(_draw, multiple_results=False))
