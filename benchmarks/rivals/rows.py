@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from edqn_jax.errors import ConfigError
-from edqn_jax.planners.planner import DRAWING
+from edqn_jax.planners.planner import SAMPLING
 from rivals.intervals import difference_interval, rate_interval
 
 Row = dict[str, Any]
@@ -46,7 +46,7 @@ def joined(rows: Iterable[Row]) -> list[Row]:
 
 def success(row: Row) -> np.ndarray:
     """Which flights reached the goal: [seeds, missions] bool. Of a planner that draws nothing one seed is all."""
-    turns = row["turns"][:1] if row["kind"] == "planner" and row["name"] not in DRAWING else row["turns"]
+    turns = row["turns"][:1] if row["kind"] == "planner" and row["name"] not in SAMPLING else row["turns"]
     return np.array([[outcome == "goal" for outcome in turn["flights"]["outcome"]] for turn in turns], bool)
 
 
