@@ -44,7 +44,7 @@ class EventVAE(nn.Module):
             return self.encode(image)[0].numpy()
 
     def loss(self, image: Tensor) -> Tensor:
-        """Eq. 6: squared reconstruction error of an image + `kl_weight` x KL, averaged over the batch."""
+        """Returns the VAE loss: squared reconstruction error of an image + `kl_weight` x KL, averaged over the batch."""
         mean, log_variance = self.encode(image)
         code = mean + torch.exp(0.5 * log_variance) * torch.randn_like(mean)
         error = nn.functional.mse_loss(self.decoder(code), image, reduction="sum")

@@ -95,7 +95,7 @@ def physics(now: Moment) -> Part:
 
     def one(world: World, body: DroneState, move: Array, goal: Array):
         command = env.velocity_command(config.env, move, drone.yaw_of(body.quaternion))
-        bearing = jnp.arctan2(goal[1] - body.position[1], goal[0] - body.position[0])
+        bearing = env.bearing(config.env, body, goal)
         flown, flight = drone.fly(config.drone, world.airframe, body, command, bearing)
         return flown, flight.position
 
