@@ -1,10 +1,10 @@
-"""pytest-benchmark over the parts of a training step: a call is what a part does in `STEPS` steps of the workload.
+"""Times the parts of a training step with pytest-benchmark; a call runs a part for `STEPS` steps of the workload.
 
     pytest -n0 benchmarks/bench_parts.py
     pytest -n0 benchmarks/bench_parts.py -k "physics or rendering" --benchmark-autosave --benchmark-compare
 
-Ordinary test runs leave it alone but for one part, which they run untimed. Timings are of all devices at once, on a
-fresh state: `throughput.py` times the same parts on a trained one, per decision and beside their floors.
+The tests run one part without timing. Times are of all devices together and of an untrained state; `throughput.py`
+times the same parts of a trained state, per decision and with their minimum times.
 """
 
 from __future__ import annotations
@@ -28,16 +28,16 @@ from measurement.timing import Timed
 from measurement.whole import steady
 
 STEPS = 20
-"""Enough that starting a compiled program does not pass for a small part's own time."""
+"""Enough that the start of a compiled program is a small share of the time of a small part."""
 
 use_cpu_devices()
 
 
 @pytest.fixture(scope="session")
 def now() -> Moment:
-    """The state before the first step, told that it is past the beginning, so that everything learns.
+    """Returns the state before the first step, with the step number after the warm-up, so that everything learns.
 
-    EDQN_FLAGS, train.py's, say of which workload; without it the reference.
+    The environment variable EDQN_FLAGS sets options of train.py; without it the reference workload is timed.
     """
     config = configured(os.environ.get("EDQN_FLAGS", "").split())
     config = steady(config, config.train.chunk_steps)

@@ -1,13 +1,13 @@
 """How fast is the conventional stack, and where does its time go?
 
-Trains on the reference workload with C MuJoCo, numba, PyTorch and stable-baselines3, the VAE learning all the time,
-in one process and in two. The settings take turns, because a shared machine's speed moves; each row is the median
-of its turns.
+Trains on the reference workload with C MuJoCo, numba, PyTorch and stable-baselines3, with the VAE learning throughout,
+in one process and in two. The settings take turns, because the speed of a shared machine changes; each row is the
+median of its turns.
 
     python benchmarks/conventional.py --decisions 20480 --json conventional.json
     python benchmarks/conventional.py -- --num-envs 256
 
-What stands after -- goes to the configuration as it would for train.py.
+Arguments after -- are options of train.py.
 """
 
 from __future__ import annotations
@@ -41,20 +41,22 @@ REPEATS = 5
 
 
 def parse(argv: Sequence[str] | None = None) -> tuple[argparse.Namespace, Config]:
-    """The arguments, and the configuration that is timed.
+    """Returns the parsed arguments, and the configuration that is timed.
 
     Raises:
-        ConfigError: if the flags after -- cannot be run, or the file cannot be written.
+        ConfigError: if the options after -- are invalid, or the file cannot be written.
     """
     words, flags = split(sys.argv[1:] if argv is None else argv)
     parser = argparse.ArgumentParser(
-        description=(__doc__ or "").partition("\n")[0], epilog="Flags after -- are train.py's."
+        prog="python benchmarks/conventional.py",
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument(
         "--decisions", type=int, default=DECISIONS, help=f"decisions of each turn (default {DECISIONS})"
     )
     parser.add_argument("--repeats", type=int, default=REPEATS, help=f"turns of each row (default {REPEATS})")
-    parser.add_argument("--json", type=Path, help="write the rows to this file")
+    parser.add_argument("--json", type=Path, help="write the report to this file")
     args = parser.parse_args(words)
     for name in ("decisions", "repeats"):
         if getattr(args, name) < 1:
@@ -65,10 +67,10 @@ def parse(argv: Sequence[str] | None = None) -> tuple[argparse.Namespace, Config
 
 
 def measure(config: Config, decisions: int, repeats: int) -> dict[str, Any]:
-    """Everything that `--json` holds.
+    """Measures and returns the report that `--json` writes.
 
     Raises:
-        ConfigError: if the configuration asks for what this stack does not have.
+        ConfigError: if this stack does not support the configuration.
         MissingPackageError: if a package of the extra `bench` is not installed.
     """
     from conventional_stack.fleet import Course
@@ -78,7 +80,7 @@ def measure(config: Config, decisions: int, repeats: int) -> dict[str, Any]:
     turns: dict[tuple[int, int], list[float]] = {setting: [] for setting in SETTINGS}
     with ExitStack() as stack:
         runs = {setting: stack.enter_context(Steady(config, course, *setting)) for setting in SETTINGS}
-        for _ in range(repeats):  # in turns, so that a slow minute hits all alike
+        for _ in range(repeats):  # in turns, so that a change in the machine's speed affects all settings
             for setting, run in runs.items():
                 turns[setting].append(run.turn(decisions))
         rows = [
@@ -109,7 +111,7 @@ def measure(config: Config, decisions: int, repeats: int) -> dict[str, Any]:
 
 
 def table(report: dict[str, Any]) -> str:
-    """The figures for people, in Markdown."""
+    """Returns the report as Markdown."""
     stated, rows = report["workload"], report["rows"]
     names = [f"{row['processes']} processes, PyTorch {row['torch_threads']} threads" for row in rows]
     lines = [
@@ -127,7 +129,7 @@ def table(report: dict[str, Any]) -> str:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Exit code 0 when all was measured, 2 for bad input."""
+    """Returns exit code 0 after the measurement, 2 for invalid input."""
     use_cpu_devices()
     try:
         args, config = parse(argv)

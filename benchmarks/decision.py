@@ -1,12 +1,12 @@
 """How long does one decision take at deployment?
 
-An event field and the own state lie on the host, batch 1; the action comes back to the host; dispatch counts. The
-process keeps to one core, so one thread of it can run at a time.
+The time is measured from an event field and the own state on the host, batch 1, to the action on the host, with
+dispatch. The process is restricted to one core, so only one of its threads runs at a time.
 
     python benchmarks/decision.py --json decision.json
     python benchmarks/decision.py -- --preset paper
 
-What stands after -- goes to the configuration as it would for train.py; parameters are fresh, which costs the same.
+Arguments after -- are options of train.py. Parameters are untrained, which does not change the time.
 """
 
 from __future__ import annotations
@@ -35,10 +35,10 @@ REPEATS, CALLS = 5, 2000
 
 
 def parse(argv: Sequence[str] | None = None) -> tuple[argparse.Namespace, Config]:
-    """The arguments, and the configuration whose policy decides.
+    """Returns the parsed arguments, and the configuration of the policy.
 
     Raises:
-        ConfigError: if the flags after -- cannot be run, or the file cannot be written.
+        ConfigError: if the options after -- are invalid, or the file cannot be written.
     """
     words, flags = split(sys.argv[1:] if argv is None else argv)
     parser = argparse.ArgumentParser(
@@ -47,7 +47,7 @@ def parse(argv: Sequence[str] | None = None) -> tuple[argparse.Namespace, Config
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("--quick", action="store_true", help=f"{CALLS // 10} decisions instead of {REPEATS} x {CALLS}")
-    parser.add_argument("--json", type=Path, help="write the figures to this file")
+    parser.add_argument("--json", type=Path, help="write the report to this file")
     args = parser.parse_args(words)
     if args.json is not None:
         check_can_write(args.json)
@@ -55,7 +55,7 @@ def parse(argv: Sequence[str] | None = None) -> tuple[argparse.Namespace, Config
 
 
 def measure(config: Config, repeats: int, calls: int) -> dict[str, Any]:
-    """Everything that `--json` holds: medians over `repeats` of the percentiles of `calls` decisions."""
+    """Returns the report that `--json` writes: medians over `repeats` of the percentiles of `calls` decisions."""
     params = fresh_policy(config, 0)
     turns = [decision_latency_ms(config, params, calls) for _ in range(repeats)]
     return {
@@ -73,14 +73,14 @@ def measure(config: Config, repeats: int, calls: int) -> dict[str, Any]:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Exit code 0 when all was measured, 2 for bad input."""
+    """Returns exit code 0 after the measurement, 2 for invalid input."""
     try:
         args, config = parse(argv)
     except ConfigError as error:
         print(error, file=sys.stderr)
         return 2
     if hasattr(os, "sched_setaffinity"):
-        os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})  # before JAX makes its threads
+        os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})  # before JAX starts its threads
     report = measure(config, *((1, CALLS // 10) if args.quick else (REPEATS, CALLS)))
     row = report["rows"][0]
     print(

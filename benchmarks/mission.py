@@ -1,11 +1,13 @@
-"""Does it learn, for any seed? `train.py` from typing to the last picture, one seed after another.
+"""Does training succeed for every seed? Runs `train.py` for one seed after another.
 
-Each seed is a process of its own, timed by the clock on the wall. A seed passes if its one greedy flight
-reaches the goal in at most 188 decisions and 1.15 times A*'s path, and all of it took under three minutes.
-Nothing is tried twice: a seed that has been run is only read, and one whose training failed counts as failed.
-The flight ends at the goal's radius, A*'s path at the goal itself.
+Each seed runs in a process of its own, and the wall time of the whole command is measured. A seed passes if its greedy
+flight reaches the goal in at most 188 decisions and with at most 1.15 times the length of A*'s path, and the command
+took less than three minutes. No seed is run twice: results of earlier runs in the same folder are read, and a seed
+whose training failed counts as failed. The flight ends within the goal's radius, A*'s path at the goal itself.
 
     python benchmarks/mission.py --seeds 20 --out runs/mission --json mission.json
+
+Arguments after -- are options of train.py.
 """
 
 from __future__ import annotations
@@ -33,27 +35,29 @@ from measurement.flags import split
 TRAIN = Path(__file__).resolve().parents[1] / "train.py"
 
 MOST_DECISIONS = 188
-"""What the paper's own flight took."""
+"""Decisions of the flight in the paper."""
 MOST_PATH = 1.15
-"""Flown path over A*'s."""
+"""Length of the flight over that of A*'s path."""
 MOST_SECONDS = 180.0
-"""From typing to the last picture."""
+"""Wall time of the whole command."""
 
 QUICK = ("--total-steps", "49152", "--encoder.warmup-decisions", "16384")
-"""Flags of `--quick`: long enough to run every part, far too short to learn."""
+"""Options of train.py for `--quick`: long enough to run every part, too short to learn."""
 
 
 def parse(argv: Sequence[str] | None = None) -> argparse.Namespace:
-    """The arguments; what follows `--` goes to `train.py` as it is, in `flags`."""
+    """Returns the parsed arguments; `flags` are those after --, for train.py."""
     words, flags = split(sys.argv[1:] if argv is None else argv)
     parser = argparse.ArgumentParser(
-        description=(__doc__ or "").partition("\n")[0], epilog="Flags after -- go to train.py."
+        prog="python benchmarks/mission.py", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
-    parser.add_argument("--seeds", type=int, default=20, help="how many")
-    parser.add_argument("--first-seed", type=int, default=0)
-    parser.add_argument("--world", default="paper", help="as for train.py")
-    parser.add_argument("--out", type=Path, default=Path("runs/mission"), help="folder of the runs")
-    parser.add_argument("--json", type=Path, help="write the rows to this file")
+    parser.add_argument("--seeds", type=int, default=20, help="number of seeds (default 20)")
+    parser.add_argument("--first-seed", type=int, default=0, help="the first seed (default 0)")
+    parser.add_argument("--world", default="paper", help="--world of train.py (default paper)")
+    parser.add_argument(
+        "--out", type=Path, default=Path("runs/mission"), help="folder of the runs (default runs/mission)"
+    )
+    parser.add_argument("--json", type=Path, help="write the report to this file")
     parser.add_argument("--quick", action="store_true", help="two seeds, too short to learn")
     args = parser.parse_args(words)
     args.flags = flags
@@ -65,20 +69,20 @@ def parse(argv: Sequence[str] | None = None) -> argparse.Namespace:
 
 
 def command(args: argparse.Namespace, seed: int, folder: Path) -> list[str]:
-    """What is run for a seed."""
-    # A run that was cut off is started over: this measures whole runs.
+    """Returns the command for a seed."""
+    # An interrupted run starts from the beginning, because whole runs are measured.
     options = ["--seed", str(seed), "--world", args.world, "--run-dir", str(folder), "--resume", "never"]
     return [sys.executable, str(TRAIN), *options, *args.flags]
 
 
-def knobs(args: argparse.Namespace) -> str:
-    """A digest of every knob but the seed, so that runs of other defaults are not taken for these."""
+def options_digest(args: argparse.Namespace) -> str:
+    """Returns a digest of all options but the seed, to recognise runs with other options."""
     _, config = parse_train(command(args, 0, args.out)[2:])
     return hashlib.sha256(to_yaml(config).encode()).hexdigest()[:16]
 
 
 class Ledger:
-    """How long each seed took by the clock on the wall and how it ended, kept beside the runs."""
+    """Wall time and exit code of each seed, in a file in the folder of the runs."""
 
     def __init__(self, file: Path, asked: dict[str, Any]) -> None:
         self.file, self.asked = file, asked
@@ -86,7 +90,7 @@ class Ledger:
         if file.is_file():
             kept = json.loads(file.read_text(encoding="utf-8"))
             if kept["asked"] != asked:
-                raise ValueError(f"the runs in '{file.parent}' were made with {kept['asked']}; give another --out")
+                raise ValueError(f"the runs in '{file.parent}' were made with {kept['asked']}; choose another --out")
             self.seeds = kept["seeds"]
 
     def note(self, seed: int, wall_seconds: float, exit_code: int) -> None:
@@ -96,12 +100,16 @@ class Ledger:
 
 
 def measure(args: argparse.Namespace) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
-    """Trains every seed that has not been run yet: `(rows, summaries of the complete runs)`.
+    """Trains every seed that has not been run yet and returns `(rows, summaries of the complete runs)`.
 
     Raises:
-        ValueError: if the folder holds runs of other flags.
+        ValueError: if the folder contains runs with other options.
     """
-    asked = {"world": args.world, "flags": args.flags, "knobs": knobs(args)}  # or a sentence, and no folder
+    asked = {
+        "world": args.world,
+        "flags": args.flags,
+        "options": options_digest(args),
+    }  # raises before the folder exists
     args.out.mkdir(parents=True, exist_ok=True)
     ledger = Ledger(args.out / "ledger.json", asked)
     rows, summaries = [], []
@@ -124,11 +132,12 @@ def measure(args: argparse.Namespace) -> tuple[list[dict[str, Any]], list[dict[s
 
 
 def row_of(seed: int, summary: dict[str, Any], wall_seconds: float | None) -> dict[str, Any]:
-    """One seed's figures and verdicts.
+    """Returns the row of a seed that was trained.
 
     Args:
-        summary: what its `summary.json` holds.
-        wall_seconds: None if nobody measured them; such a seed does not pass.
+        seed: of the run.
+        summary: content of its `summary.json`.
+        wall_seconds: None if they were not measured; the seed then does not pass.
     """
     ratio = summary["path_length_m"] / summary["shortest_path_m"]
     goal = summary["outcome"] == "goal"
@@ -160,15 +169,15 @@ def row_of(seed: int, summary: dict[str, Any], wall_seconds: float | None) -> di
 
 
 def flies_seconds(summary: dict[str, Any], wall_seconds: float | None) -> float | None:
-    """Seconds from typing the command to a policy that flies the mission: `run.first_success`."""
+    """Returns the seconds from the start of the command to the first success of the policy; None without one."""
     if wall_seconds is None or summary["first_success_seconds"] is None:
         return None
-    # The run's own clock starts after the imports.
+    # The run measures its time from after the imports.
     return summary["first_success_seconds"] + max(0.0, wall_seconds - summary["total_seconds"])
 
 
 def failed_row(seed: int, exit_code: int, wall_seconds: float) -> dict[str, Any]:
-    """The row of a seed whose training did not end well: it passes nothing."""
+    """Returns the row of a seed whose training failed: it meets no criterion."""
     nothing = dict.fromkeys(
         [
             "decisions",
@@ -196,9 +205,9 @@ def failed_row(seed: int, exit_code: int, wall_seconds: float) -> dict[str, Any]
 
 
 def totals(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """How many seeds meet each bar, Wilson's interval of those that meet all, and medians.
+    """Returns how many seeds meet each criterion, Wilson's interval of the share that meets all, and medians.
 
-    The medians of decisions and path are of the flights that reached the goal.
+    The medians of decisions and path are over the flights that reached the goal.
     """
     counts = {key: sum(row[key] for row in rows) for key in ("goal", "decisions_ok", "path_ok", "time_ok", "passes")}
     arrived = [row for row in rows if row["goal"]]
@@ -217,7 +226,7 @@ def totals(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
         "median_min_clearance_m": middle("min_clearance_m", arrived),
         "median_wall_seconds": middle("wall_seconds", rows),
         "median_compile_seconds": middle("compile_seconds", rows),
-        # Seeds that never fly it count as slower than any that do.
+        # Seeds without a success count as slower than all others.
         "median_flies_seconds": _median_or_never([row["flies_seconds"] for row in rows]),
         "median_decisions_per_second": middle("decisions_per_second", rows),
     }
@@ -229,7 +238,7 @@ def _median_or_never(values: Sequence[float | None]) -> float | None:
 
 
 def table(rows: Sequence[dict[str, Any]]) -> str:
-    """The rows as a Markdown table."""
+    """Returns the rows as a Markdown table."""
 
     def shown(value: float | None, form: str) -> str:
         return "" if value is None else format(value, form)
@@ -253,7 +262,7 @@ def table(rows: Sequence[dict[str, Any]]) -> str:
 
 
 def sentences(total: dict[str, Any]) -> str:
-    """The totals for people."""
+    """Returns the totals as sentences."""
     low, high = total["passes_interval"]
     text = (
         f"{total['passes']} of {total['seeds']} seeds pass (95 % interval {low:.0%} to {high:.0%}): "
@@ -277,21 +286,21 @@ def sentences(total: dict[str, Any]) -> str:
 def report_of(
     args: argparse.Namespace, rows: Sequence[dict[str, Any]], summaries: Sequence[dict[str, Any]]
 ) -> dict[str, Any]:
-    """What `--json` holds; workload and versions are those that the runs themselves state."""
+    """Returns the report that `--json` writes; workload and versions are those of the runs."""
     stated = summaries[0] if summaries else {"workload": {}, "versions": {}, "devices": []}
     return {
         "workload": {**stated["workload"], "world": args.world, "flags": args.flags},
         "device": processor(),
         "devices": stated["devices"],
         "versions": stated["versions"],
-        "bars": {"decisions": MOST_DECISIONS, "path_over_shortest": MOST_PATH, "wall_seconds": MOST_SECONDS},
+        "criteria": {"decisions": MOST_DECISIONS, "path_over_shortest": MOST_PATH, "wall_seconds": MOST_SECONDS},
         "totals": totals(rows),
         "rows": list(rows),
     }
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Exit code 0 when all was measured, whatever came out; 2 for bad input."""
+    """Returns exit code 0 after the measurement, whatever the results; 2 for invalid input."""
     args = parse(argv)
     try:
         if args.json is not None:

@@ -1,18 +1,17 @@
-"""Table 3 measured: E-DQN beside everything that a user might pick instead, on the same worlds in the same run.
+"""Compares E-DQN with other learners and with planners, as Table 3 of the paper, on the same worlds in the same run.
 
-Three times are kept apart: training (to a policy that flies), planning (computation from start to goal; simulation
-and compilation are not counted) and flight (simulated seconds). Each method is a process of its own that compiles
-once; they take turns, seed by seed, so that a slow minute hits all alike.
+Three times are measured: training (until the policy succeeds), planning (computation from start to goal, without
+simulation and compilation) and flight (simulated seconds). Each method runs in a process of its own that compiles once.
+The methods take turns, seed by seed, so that a change in the machine's speed affects all of them.
 
     python benchmarks/runtime.py --json runtime.json --figure runtime.png
     python benchmarks/runtime.py --quick
     python benchmarks/runtime.py --worlds medium --methods E-DQN "DQN blind" --seeds 2 -- --total-steps 1000000
     python benchmarks/runtime.py --seeds 0 --add cpu.json gpu.json --figure both.png
 
-What stands after -- goes to the learners' configuration as it would for train.py. The full run, five seeds on both
-worlds, takes about five hours on two cores: one for the paper's world, four and a quarter for medium worlds. All
-methods of a world stay in memory, 15 GB together. --quick, unless told otherwise of the paper's world alone, takes
-less than ten minutes.
+Arguments after -- are options of train.py for the learners. The full run, five seeds on both worlds, takes about five
+hours on two cores: one for the paper's world, four and a quarter for medium worlds. All methods of a world are kept in
+memory, about 15 GB. --quick takes less than ten minutes; its default is the paper's world alone.
 """
 
 from __future__ import annotations
@@ -61,44 +60,44 @@ WORLDS, QUICK_WORLDS = ("paper", "medium"), ("paper",)
 METHODS = (*LEARNERS, *PLANNERS, STACK)
 SEEDS, QUICK_SEEDS = 5, 2
 POINTS = 20
-"""Validations of a training, unless the flags say otherwise: points of the learning curve."""
+"""Number of validations in a training, the points of the learning curve, unless --train.validation-every is given."""
 BUDGET_SECONDS, QUICK_BUDGET_SECONDS = 5.0, 1.0
 PLANNED, QUICK_PLANNED = 32, 4
-"""Missions that planners are given in random worlds, the first of those that learners are judged by."""
+"""Number of missions for planners in random worlds, the first of the test missions of learners."""
 MANY = 64
-"""Worlds whose shortest paths are worth other processes."""
+"""Number of worlds from which on shortest paths are computed in several processes."""
 
 QUICK = (
     *("--total-steps", "60000", "--train.validation-missions", "32", "--train.validation-every", "15000"),
     *("--world.pool-size", "128", "--world.missions", "1024"),
 )
-"""Flags of `--quick`: long enough to run every part, too short to learn; and fewer worlds, which take time to draw."""
+"""Options for `--quick`: long enough to run every part, too short to learn, with fewer worlds to generate."""
 
 TURNS, QUICK_TURNS = 5, 1
-"""Of training rates."""
+"""Turns of the training rates."""
 
 GUESS, STACK_GUESS = 6_000.0, 2_500.0
-"""Decisions/s of two cores, the learners' and the conventional stack's: for the length that is told beforehand."""
+"""Assumed decisions/s on two cores of learners and of the conventional stack, to estimate the duration."""
 
 
 @dataclasses.dataclass
 class Asked:
-    """The arguments, checked."""
+    """The checked arguments."""
 
     words: argparse.Namespace
     configs: dict[str, Config]
-    """By world, as E-DQN's."""
+    """Configuration of E-DQN by world."""
     flags: list[str]
-    """Those after --."""
+    """Arguments after --."""
     added: list[dict[str, Any]]
     """Reports of earlier runs."""
 
 
 def parse(argv: Sequence[str] | None = None) -> Asked:
-    """The arguments.
+    """Parses and checks the arguments.
 
     Raises:
-        ConfigError: if a method or a world is unknown, the flags cannot be run, or a file cannot be read or written.
+        ConfigError: if a method or world is unknown, options are invalid, or a file cannot be read or written.
     """
     words, flags = split(sys.argv[1:] if argv is None else argv)
     parser = argparse.ArgumentParser(
@@ -107,21 +106,31 @@ def parse(argv: Sequence[str] | None = None) -> Asked:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument(
-        "--quick", action="store_true", help="60 000 decisions, two seeds, the paper's world: nothing converges"
+        "--quick", action="store_true", help="60 000 decisions, two seeds, the paper's world: learners do not converge"
     )
-    parser.add_argument("--methods", nargs="+", default=list(METHODS), metavar="NAME", help=f"of {', '.join(METHODS)}")
     parser.add_argument(
-        "--worlds", nargs="+", metavar="WORLD", help="as --world of train.py (default paper and medium, quick paper)"
+        "--methods",
+        nargs="+",
+        default=list(METHODS),
+        metavar="NAME",
+        help=f"methods to run (default: all): {', '.join(METHODS)}",
     )
-    parser.add_argument("--seeds", type=int, help=f"how many (default {SEEDS}, quick {QUICK_SEEDS}); 0 runs nothing")
-    parser.add_argument("--first-seed", type=int, default=0, metavar="SEED", help="the others follow it (default 0)")
     parser.add_argument(
-        "--budget", type=float, metavar="SECONDS", help=f"of a plan (default {BUDGET_SECONDS}, quick "
-        f"{QUICK_BUDGET_SECONDS}); only RRT* and BIT* use it up",
+        "--worlds", nargs="+", metavar="WORLD", help="--world of train.py (default paper and medium, quick paper)"
+    )
+    parser.add_argument(
+        "--seeds", type=int, help=f"number of seeds (default {SEEDS}, quick {QUICK_SEEDS}); 0 runs nothing"
+    )
+    parser.add_argument("--first-seed", type=int, default=0, metavar="SEED", help="the first seed (default 0)")
+    parser.add_argument(
+        "--budget", type=float, metavar="SECONDS", help=f"time for one plan (default {BUDGET_SECONDS}, quick "
+        f"{QUICK_BUDGET_SECONDS}); only RRT* and BIT* always use it",
     )  # fmt: skip
-    parser.add_argument("--add", nargs="+", type=Path, default=[], metavar="FILE.json", help="rows of earlier runs")
-    parser.add_argument("--json", type=Path, help="write the rows to this file")
-    parser.add_argument("--figure", type=Path, metavar="FILE.png", help="draw the rows")
+    parser.add_argument(
+        "--add", nargs="+", type=Path, default=[], metavar="FILE.json", help="add the rows of earlier reports"
+    )
+    parser.add_argument("--json", type=Path, help="write the report to this file")
+    parser.add_argument("--figure", type=Path, metavar="FILE.png", help="write a picture of the rows to this file")
     args = parser.parse_args(words)
     if args.worlds is None:
         args.worlds = list(QUICK_WORLDS if args.quick else WORLDS)
@@ -144,7 +153,7 @@ def parse(argv: Sequence[str] | None = None) -> Asked:
         if file is not None:
             check_can_write(file)
     added = [read(file) for file in args.add]
-    joined(row for report in added for row in report["rows"])  # or a sentence, before anything is measured
+    joined(row for report in added for row in report["rows"])  # raises before anything is measured
     configs = {world: configured(world, flags, args.quick) for world in (args.worlds if args.seeds else [])}
     return Asked(args, configs, flags, added)
 
@@ -159,24 +168,24 @@ def check_worlds(worlds: Sequence[str]) -> None:
 
 
 def configured(world: str, flags: Sequence[str], quick: bool) -> Config:
-    """What `train.py` would run on that world, validated `POINTS` times.
+    """Returns the configuration of `train.py` for that world, with `POINTS` validations.
 
     Raises:
-        ConfigError: if it cannot be run.
+        ConfigError: if it is invalid.
     """
     _, config = parse_train(["--world", world, *(QUICK if quick else ()), *flags])
     if not quick and not any(flag.replace("_", "-").startswith("--train.validation-every") for flag in flags):
         every = -(-config.train.total_steps // POINTS)
         config = dataclasses.replace(config, train=dataclasses.replace(config.train, validation_every=every))
-    judged_scenes(config, 1)  # or a sentence
+    judged_scenes(config, 1)  # raises if the world cannot be used
     return config
 
 
 def read(file: Path) -> dict[str, Any]:
-    """The report of an earlier run.
+    """Returns the report of an earlier run.
 
     Raises:
-        ConfigError: if it is none.
+        ConfigError: if the file is not a report of this benchmark.
     """
     try:
         report = json.loads(file.read_text(encoding="utf-8"))
@@ -186,23 +195,23 @@ def read(file: Path) -> dict[str, Any]:
         raise ConfigError(f"'{file}' cannot be read: {error.strerror}") from None
     except (ValueError, KeyError, TypeError):
         pass
-    raise ConfigError(f"'{file}' holds no rows of this benchmark")
+    raise ConfigError(f"'{file}' is not a report of this benchmark")
 
 
 # ------------------------------------------------------------------------------------------ running
 
 
 def keep_to_cpu() -> None:
-    """The accelerator, if there is one, is the children's."""
+    """Restricts JAX to the CPU, because the children use the accelerator if there is one."""
     jax.config.update("jax_platforms", "cpu")
 
 
 def shortest_of(config: Config, scenes: Sequence[Scene]) -> list[float | None]:
-    """Length of A*'s path in each world, metres; None where there is none. Many worlds on all cores."""
+    """Returns the length of A*'s path in each world, metres, None without a path. Uses all cores for many worlds."""
     length = functools.partial(shortest_length, config.drone.body_radius_m)
     if len(scenes) < MANY:
         return [length(scene) for scene in scenes]
-    fresh = multiprocessing.get_context("spawn")  # JAX's threads would not survive a fork
+    fresh = multiprocessing.get_context("spawn")  # because JAX's threads do not survive a fork
     with ProcessPoolExecutor(cores(), fresh, initializer=keep_to_cpu) as pool:
         return list(pool.map(length, scenes, chunksize=8))
 
@@ -210,16 +219,16 @@ def shortest_of(config: Config, scenes: Sequence[Scene]) -> list[float | None]:
 def launched(
     stack: contextlib.ExitStack, wanted: dict[str, Config], budget: float = 0.0, count: int = 0
 ) -> tuple[dict[str, Child], dict[str, dict[str, Any]]]:
-    """A child for each name, ready to be asked; as many get ready at once as there are cores.
+    """Starts a child for each method and waits until they are ready; as many start at once as there are cores.
 
     Args:
-        stack: at whose end they end.
-        wanted: the configuration of each.
-        budget: seconds of a plan.
-        count: missions of a planner.
+        stack: ends the children when it is closed.
+        wanted: configuration by method.
+        budget: seconds for one plan.
+        count: number of missions of a planner.
 
     Returns:
-        the children that can run; what each of the wanted said of itself, or `reason`, why it cannot run.
+        the children that can run; the description of each method, or `reason`, why it cannot run.
     """
     folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
     children: dict[str, Child] = {}
@@ -230,7 +239,7 @@ def launched(
         try:
             said[name] = children[name].answer()
         except ChildEndedError as error:
-            said[name] = {"reason": f"it ended: {error}"}
+            said[name] = {"reason": f"its process ended: {error}"}
         if "reason" in said[name]:
             del children[name]
 
@@ -249,22 +258,22 @@ def launched(
 
 
 def blank(asked: Asked, world: str, name: str) -> Row:
-    """The row of a method that has not run."""
+    """Returns the row of a method before it has run."""
     planner, config = name in PLANNERS, asked.configs[world]
     own = (
         {"budget_seconds": asked.words.budget, "missions": missions_of(asked, world)}
         if planner
         else {"decisions": config.train.total_steps, "num_envs": config.train.num_envs}
     )
-    # Rows of other knobs are other rows, whatever their name. A planner has no agent, camera or encoder.
+    # Rows with other options must not be joined with this one. A planner has no agent, camera or encoder.
     of_flight = dataclasses.replace(Config(), world=config.world, drone=config.drone, env=config.env)
-    knobs = hashlib.sha256(to_yaml(of_flight if planner else config).encode()).hexdigest()[:16]
+    options = hashlib.sha256(to_yaml(of_flight if planner else config).encode()).hexdigest()[:16]
     return {
         "name": name,
         "world": Path(world).name,
         "kind": "planner" if planner else "learner",
         "knows_map": planner,
-        "settings": {"quick": asked.words.quick, **own, "knobs": knobs},
+        "settings": {"quick": asked.words.quick, **own, "options": options},
         "device": None,
         "devices": [],
         "versions": {},
@@ -274,22 +283,22 @@ def blank(asked: Asked, world: str, name: str) -> Row:
     }
 
 
-def config_of(asked: Asked, world: str, name: str, has_way: bool) -> Config:
-    """What a method is run with on a world.
+def config_of(asked: Asked, world: str, name: str, has_path: bool) -> Config:
+    """Returns the configuration of a method on a world.
 
     Raises:
-        ConfigError: if it cannot be run there; the message says why.
+        ConfigError: if the method cannot run there.
     """
     config = asked.configs[world]
     if name in PLANNERS:
         return config
-    if not has_way:
-        raise ConfigError("there is no way from start to goal, so train.py refuses this world")
+    if not has_path:
+        raise ConfigError("there is no path from start to goal, so train.py rejects this world")
     return config if name == STACK else sensing(config, name)
 
 
 def missions_of(asked: Asked, world: str) -> int:
-    """How many missions planners are given."""
+    """Returns the number of missions for planners."""
     if world not in DENSITIES:
         return 1
     most = asked.configs[world].train.validation_missions
@@ -297,9 +306,9 @@ def missions_of(asked: Asked, world: str) -> int:
 
 
 def measure(asked: Asked) -> list[Row]:
-    """The rows, world by world; within one the methods take turns, seed by seed.
+    """Measures and returns the rows of all worlds, one world after the other.
 
-    After each seed `--json` holds what has been measured: a full run takes hours.
+    The report is written after each seed, because a full run takes hours.
     """
     rows: list[Row] = []
     for world in asked.configs:
@@ -312,7 +321,7 @@ def measure(asked: Asked) -> list[Row]:
 
 
 def measure_world(asked: Asked, world: str) -> Iterator[list[Row]]:
-    """The rows of one world, after each seed."""
+    """Yields the rows of one world after each seed; the methods take turns, seed by seed."""
     args, config = asked.words, asked.configs[world]
     tell(f"{world}: {expected(asked, world)}")
     shortest = shortest_of(config, judged_scenes(config, config.train.validation_missions))
@@ -332,7 +341,7 @@ def measure_world(asked: Asked, world: str) -> Iterator[list[Row]]:
                 try:
                     turn = child.ask(str(seed))
                 except ChildEndedError as error:
-                    rows[name]["reason"] = f"it ended in seed {seed}: {error}"
+                    rows[name]["reason"] = f"its process ended in seed {seed}: {error}"
                     del children[name]
                     continue
                 turn["flights"]["shortest_m"] = shortest[: len(turn["flights"]["outcome"])]
@@ -340,20 +349,23 @@ def measure_world(asked: Asked, world: str) -> Iterator[list[Row]]:
             done = seed - args.first_seed + 1
             left = (time.perf_counter() - began) / done * (args.seeds - done)
             yield list(rows.values())
-            tell(f"{world}: seed {seed} is done, about {left / 60:.0f} min to go")
+            tell(f"{world}: seed {seed} is done, about {left / 60:.0f} min left")
 
 
 def measure_rates(asked: Asked) -> dict[str, Any] | None:
-    """Decisions per second of E-DQN's whole step and of the conventional stack, in turns; None if not asked for.
+    """Measures decisions per second of E-DQN's whole step and of the conventional stack, in turns.
 
-    Both at the replay ratio of `flags.SAMPLES`, the VAE learning throughout, on the paper's world.
+    Both have the replay ratio `flags.SAMPLES` and the VAE learning throughout, on the paper's world.
+
+    Returns:
+        `turns` by method and setting, and `reason`, why they could not be measured; None if they were not requested.
     """
     args = asked.words
     if "paper" not in asked.configs or not {"E-DQN", STACK} <= set(args.methods):
         return None
     config = for_timing(["--world", "paper", "--num-envs", str(DRONES), *asked.flags])
     ours, theirs = STEADY
-    # Its beginning is short for the stack, to which a chunk of ours would be minutes.
+    # A short warm-up for the conventional stack, for which the decisions of one of our chunks take minutes.
     wanted = {theirs: steady(config, 4), ours: steady(config, config.train.chunk_steps)}
     with contextlib.ExitStack() as stack:
         children, said = launched(stack, wanted)
@@ -368,7 +380,7 @@ def measure_rates(asked: Asked) -> dict[str, Any] | None:
                 try:
                     rates = child.ask(str(number))["decisions_per_second"]
                 except ChildEndedError as error:
-                    report["reason"] = f"{method}: it ended in turn {number}: {error}"
+                    report["reason"] = f"{method}: its process ended in turn {number}: {error}"
                     return report
                 for setting, rate in rates.items():
                     report["turns"].setdefault(f"{method}, {setting}", []).append(rate)
@@ -376,12 +388,12 @@ def measure_rates(asked: Asked) -> dict[str, Any] | None:
 
 
 def expected(asked: Asked, world: str) -> str:
-    """How long it will be, before anything is measured; compiling is taken for a minute a learner."""
+    """Returns the estimated duration as a sentence, with one minute per learner for compilation."""
     args = asked.words
     learners = [name for name in args.methods if name in LEARNERS]
     improving = [name for name in args.methods if name in IMPROVING]
     each = args.seeds * asked.configs[world].train.total_steps
-    stack = STACK in args.methods and world not in DENSITIES  # it flies in one world
+    stack = STACK in args.methods and world not in DENSITIES  # it supports only one world
     planning = args.seeds * len(improving) * missions_of(asked, world) * args.budget
     seconds = each * len(learners) / GUESS + each * stack / STACK_GUESS + planning + 60 * len(learners)
     return (
@@ -391,12 +403,12 @@ def expected(asked: Asked, world: str) -> str:
 
 
 def tell(text: str) -> None:
-    """Progress, which is no part of the table."""
+    """Prints progress to standard error."""
     print(text, file=sys.stderr, flush=True)
 
 
 def report_of(rows: Sequence[Row], rates: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """What `--json` holds."""
+    """Returns the report that `--json` writes."""
     ran = next((row for row in rows if row["turns"]), None)
     return {
         "benchmark": "runtime",
@@ -412,7 +424,7 @@ def report_of(rows: Sequence[Row], rates: Sequence[dict[str, Any]]) -> dict[str,
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Exit code 0 when all was measured, whatever came out; 2 for bad input."""
+    """Returns exit code 0 after the measurement, whatever the results; 2 for invalid input."""
     keep_to_cpu()
     try:
         asked = parse(argv)
@@ -425,7 +437,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     complaints = []
     try:
         rows = joined([*rows, *(row for report in asked.added for row in report["rows"])])
-    except ConfigError as error:  # of what took hours nothing is lost
+    except ConfigError as error:  # the new rows must not be lost
         complaints.append(f"{error}; the added rows are left out")
     try:
         if asked.words.json is not None:
@@ -436,7 +448,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         complaints.append(str(error))
     for complaint in complaints:
         tell(complaint)
-    print(table.text(rows, rates))  # last: a closed pipe must not cost the files
+    print(table.text(rows, rates))  # after the files are written, because the pipe may be closed
     return 2 if complaints else 0
 
 

@@ -1,15 +1,15 @@
-"""How does the cost of a decision grow? Pixels, obstacles, environments, physics steps and devices, one at a time.
+"""How does the cost of a decision grow? Varies pixels, obstacles, environments, physics steps and devices in turn.
 
-Times the whole training step with the VAE learning all the time, as `throughput.py` does, at several sizes of
-each. The sizes of a curve take turns, forwards and backwards, each followed by C MuJoCo's threaded `rollout`, so
-that a slow minute hits all alike; a slope is the one between a curve's ends on logarithmic axes. Counts the bytes
-of an environment and of a slot of the replay as well.
+Times the whole training step with the VAE learning throughout, as `throughput.py` does, at several sizes of each. The
+sizes of a curve take turns, forwards and backwards, each followed by C MuJoCo's threaded rollout, so that a change in
+the machine's speed affects all of them. The slope of a curve is that between its ends on logarithmic axes. The bytes of
+an environment and of a slot of the replay are counted as well.
 
     python benchmarks/scaling.py --json scaling.json --figure scaling.png
     python benchmarks/scaling.py --curves pixels obstacles -- --world medium
 
-Takes about 12 minutes on two cores, with --quick about 4: each size is a program of its own to compile. What
-stands after -- goes to the configuration as it would for train.py; sizes are multiples of what it says.
+Takes about 12 minutes on two cores, with --quick about 4, because each size is compiled. Arguments after -- are
+options of train.py; sizes are multiples of the values that they set.
 """
 
 from __future__ import annotations
@@ -42,9 +42,9 @@ from measurement.whole import WholeStep, steady
 
 REPEATS, QUICK_REPEATS = 7, 3
 DECISIONS, QUICK_DECISIONS = 4096, 2048
-"""Decisions in a chunk, about."""
+"""Approximate number of decisions in a chunk."""
 TURN_SECONDS = 0.5
-"""What a point's turn takes at least."""
+"""Minimum duration of a turn of one size."""
 MILLION = 1_000_000
 
 
@@ -52,7 +52,7 @@ MILLION = 1_000_000
 
 
 class Runner:
-    """A point's training step, compiled, and what its turns have brought."""
+    """The compiled training step of one point of a curve."""
 
     def __init__(self, config: Config, missions: RunMissions) -> None:
         self.config, self.scene = config, missions.scene
@@ -65,7 +65,7 @@ class Runner:
         return self.whole.temporary_bytes * len(self.devices) / self.config.train.num_envs
 
     def turn(self) -> tuple[float, float]:
-        """Seconds that a decision takes, and how many cores were busy meanwhile."""
+        """Returns the seconds of a decision, and the average number of busy cores."""
         began, busy = time.perf_counter(), time.process_time()
         seconds = sum(self.whole.decisions / self.whole.turn() for _ in range(self.chunks))
         cores = (time.process_time() - busy) / (time.perf_counter() - began)
@@ -73,21 +73,21 @@ class Runner:
 
 
 def chunked(config: Config, decisions: int) -> Config:
-    """The steady workload in chunks of about so many decisions, with a cheap beginning, which nobody times."""
+    """Returns the steady workload in chunks of about `decisions`, with a short warm-up, which is not timed."""
     config = steady(config, max(1, decisions // config.train.num_envs))
     return dataclasses.replace(config, encoder=dataclasses.replace(config.encoder, warmup_updates_per_step=1))
 
 
 def measure(base: Config, names: Sequence[str], quick: bool, repeats: int) -> dict[str, Any]:
-    """Everything that `--json` holds.
+    """Measures and returns the report that `--json` writes.
 
     Raises:
-        ConfigError: if a size cannot be run, or nothing is left to measure.
+        ConfigError: if a size is invalid, or there is nothing to measure.
     """
     used = choose_devices(base.train.devices, base.train.shards)
     base = changed(base, train={"devices": len(used)})
     decisions = QUICK_DECISIONS if quick else DECISIONS
-    if used[0].platform != "cpu":  # starting a chunk is no small part of one as short
+    if used[0].platform != "cpu":  # the start of a chunk this short would take a large part of its time
         decisions = max(decisions, base.train.num_envs * base.train.chunk_steps)
     rollout = Rollout(base)
     rows, summaries = [], []
@@ -97,10 +97,10 @@ def measure(base: Config, names: Sequence[str], quick: bool, repeats: int) -> di
     runners: dict[Config, Runner] = {}
     with tempfile.TemporaryDirectory() as folder:
         curves = [CURVES[name](base, quick, Path(folder)) for name in names]
-        # A curve needs two ends; on one device there is nothing to say about devices.
+        # A curve needs two points; one device gives only one.
         curves = [curve for curve in curves if len(curve.points) > 1]
         if not curves:
-            raise ConfigError("there is one device only, so there is no curve of devices")
+            raise ConfigError("there is only one device, so there is no curve of devices")
         for number, curve in enumerate(curves):
             configs = [chunked(point.config, decisions) for point in curve.points]
             for point, config in zip(curve.points, configs, strict=True):
@@ -115,7 +115,7 @@ def measure(base: Config, names: Sequence[str], quick: bool, repeats: int) -> di
             some, summary = _measure_curve(curve, [runners[config] for config in configs], rollout, repeats)
             rows += some
             summaries.append(summary)
-            # What later curves share is kept, the others' memory is given back.
+            # Runners that later curves share are kept; the memory of the others is freed.
             later = {chunked(point.config, decisions) for after in curves[number + 1 :] for point in after.points}
             runners = {config: runner for config, runner in runners.items() if config in later}
     return {
@@ -131,7 +131,7 @@ def measure(base: Config, names: Sequence[str], quick: bool, repeats: int) -> di
 def _measure_curve(
     curve: Curve, runners: Sequence[Runner], rollout: Rollout, repeats: int
 ) -> tuple[list[dict[str, Any]], dict[str, Any]]:
-    """The curve's rows, and what they say together."""
+    """Returns the curve's rows and its summary."""
     count = len(runners)
     seconds: list[list[float]] = [[] for _ in range(count)]
     cores: list[list[float]] = [[] for _ in range(count)]
@@ -173,12 +173,12 @@ def _measure_curve(
 
 
 def slope(x: Sequence[float], cost: Sequence[float]) -> float:
-    """Slope between the ends of a curve on logarithmic axes: 1 where twice the x costs twice as much."""
+    """Returns the slope between the ends of a curve on logarithmic axes: 1 if twice the x costs twice as much."""
     return math.log(cost[-1] / cost[0]) / math.log(x[-1] / x[0])
 
 
 def summarise(name: str, linear: float, rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
-    """A curve's slope: of the medians, and the least and the largest of the turns' own."""
+    """Returns a curve's slopes: of the medians, and the smallest and largest of single turns."""
     x = [row["x"] for row in rows]
     turns = [slope(x, cost) for cost in zip(*(row["us_turns"] for row in rows), strict=True)]
     return {
@@ -189,13 +189,13 @@ def summarise(name: str, linear: float, rows: Sequence[dict[str, Any]]) -> dict[
         "steepest": max(map(slope, itertools.pairwise(x), itertools.pairwise(row["us_per_decision"] for row in rows))),
         "slope_over_c_mujoco": slope(x, [row["c_mujoco_steps_per_decision"] for row in rows]),
         "linear_slope": linear,
-        # Of all devices against as many times the first: as good as one, they all take its time for a decision.
+        # Rate of all devices over that of one device times their number.
         "efficiency": rows[0]["us_per_decision"] / rows[-1]["us_per_decision"] if name == "devices" else None,
     }
 
 
 def memory_of(counted: StateBytes, temporary: float | None) -> dict[str, Any]:
-    """The bytes that training takes; `temporary` are those of the compiled chunk for each environment."""
+    """Returns the bytes that training takes; `temporary` are those of the compiled chunk for each environment."""
     return {
         "temporary_bytes_per_environment": temporary,
         "bytes_per_environment": counted.environment,
@@ -211,18 +211,18 @@ def memory_of(counted: StateBytes, temporary: float | None) -> dict[str, Any]:
 
 
 def table(report: dict[str, Any]) -> str:
-    """The figures for people, in Markdown."""
+    """Returns the report as Markdown."""
     stated = report["workload"]
     lines = [
-        f"{report['device']}, {len(report['devices'])} devices; where nothing else is said {stated['num_envs']} "
+        f"{report['device']}, {len(report['devices'])} devices; unless stated otherwise {stated['num_envs']} "
         f"environments, {stated['width']} × {stated['height']} pixels, {stated['obstacles']} obstacles, "
         f"{stated['physics_steps_per_decision']} physics steps by {stated['physics']}; medians of {report['repeats']}",
     ]
     for curve in report["curves"]:
         lines += [
             "",
-            f"| {curve['name']} | µs of one device a decision | least - most | C MuJoCo steps in that time "
-            "| decisions/s | cores busy | temporary kB an environment |",
+            f"| {curve['name']} | µs of one device per decision | smallest - largest | C MuJoCo steps in that time "
+            "| decisions/s | cores busy | temporary kB per environment |",
             "| ---: | ---: | ---: | ---: | ---: | ---: | ---: |",
         ]
         for row in report["rows"]:
@@ -238,21 +238,21 @@ def table(report: dict[str, Any]) -> str:
 
 
 def sentence(curve: dict[str, Any]) -> str:
-    """A curve's slope for people."""
+    """Returns a curve's slope as a sentence."""
     text = (
         f"{curve['name'].capitalize()}: slope {curve['slope']:.2f} ({curve['slope_low']:.2f} to "
-        f"{curve['slope_high']:.2f}), between neighbours {curve['steepest']:.2f} at most; linear growth would be "
+        f"{curve['slope_high']:.2f}), at most {curve['steepest']:.2f} between neighbours; linear growth would be "
         f"{curve['linear_slope']:g}."
     )
     if curve["efficiency"] is None:
-        text += f" In steps of C MuJoCo, which has all cores all the time, {curve['slope_over_c_mujoco']:.2f}."
+        text += f" Measured in steps of C MuJoCo, which uses all cores, {curve['slope_over_c_mujoco']:.2f}."
     else:
-        text += f" All devices together do {curve['efficiency']:.0%} of what the first times their number would."
+        text += f" All devices together reach {curve['efficiency']:.0%} of the rate of one device times their number."
     return text
 
 
 def memory_lines(memory: dict[str, Any]) -> list[str]:
-    """The bytes for people."""
+    """Returns the bytes as lines of a Markdown table."""
     temporary = memory["temporary_bytes_per_environment"]
     lines = [
         "| memory | bytes |",
@@ -263,26 +263,29 @@ def memory_lines(memory: dict[str, Any]) -> list[str]:
         f"| parameters, optimisers, keys | {memory['bytes_of_the_rest']:,} |",
     ]
     if temporary is not None:
-        lines.append(f"| temporary in the compiled chunk, for each environment | {temporary:,.0f} |")
+        lines.append(f"| temporary in the compiled chunk, per environment | {temporary:,.0f} |")
     return lines
 
 
 def parse(argv: Sequence[str] | None = None) -> tuple[argparse.Namespace, Config]:
-    """The arguments, and the configuration that sizes are multiples of.
+    """Returns the parsed arguments, and the configuration whose values the sizes are multiples of.
 
     Raises:
-        ConfigError: if the flags after -- cannot be run, or a file cannot be written.
+        ConfigError: if the options after -- are invalid, or a file cannot be written.
     """
     words, flags = split(sys.argv[1:] if argv is None else argv)
     parser = argparse.ArgumentParser(
-        description=(__doc__ or "").partition("\n")[0],
-        epilog="Takes about 12 minutes on two cores, with --quick about 4. Flags after -- are train.py's.",
+        prog="python benchmarks/scaling.py",
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("--quick", action="store_true", help="fewer sizes and shorter turns")
-    parser.add_argument("--curves", nargs="+", choices=CURVES, default=list(CURVES), help="which (default: all)")
+    parser.add_argument(
+        "--curves", nargs="+", choices=CURVES, default=list(CURVES), help="curves to measure (default: all)"
+    )
     parser.add_argument("--repeats", type=int, help=f"turns of each size (default {REPEATS}, quick {QUICK_REPEATS})")
-    parser.add_argument("--json", type=Path, help="write the rows to this file")
-    parser.add_argument("--figure", type=Path, help="draw the curves into this PNG")
+    parser.add_argument("--json", type=Path, help="write the report to this file")
+    parser.add_argument("--figure", type=Path, help="write a picture of the curves to this PNG file")
     args = parser.parse_args(words)
     if args.repeats is None:
         args.repeats = QUICK_REPEATS if args.quick else REPEATS
@@ -295,7 +298,7 @@ def parse(argv: Sequence[str] | None = None) -> tuple[argparse.Namespace, Config
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Exit code 0 when all was measured, 2 for bad input."""
+    """Returns exit code 0 after the measurement, 2 for invalid input."""
     use_cpu_devices()
     try:
         args, config = parse(argv)

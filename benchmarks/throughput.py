@@ -1,14 +1,14 @@
 """How fast is training, and where does its time go?
 
-Times the whole training step of the reference workload, with the VAE learning all the time, and each of its
-parts alone, beside the least time that the part's arithmetic and memory traffic could take on this machine.
-C MuJoCo's own threaded `rollout` of the same airframe takes turns with them, because a shared machine's speed
-moves: every row is the median of repeats in which each row ran once.
+Times the whole training step of the reference workload, with the VAE learning throughout, and each of its parts alone,
+with the minimum time that the part's arithmetic and memory traffic would take on this machine. C MuJoCo's threaded
+rollout of the same airframe is timed as well. The rows take turns, because the speed of a shared machine changes: every
+row is the median of repeats in each of which every row ran once.
 
     python benchmarks/throughput.py --json throughput.json
     python benchmarks/throughput.py -- --num-envs 1024 --agent.updates-per-step 16
 
-What stands after -- goes to the configuration as it would for train.py.
+Arguments after -- are options of train.py.
 """
 
 from __future__ import annotations
@@ -45,23 +45,25 @@ DIFFERENCES: dict[str, tuple[str, ...]] = {
     "resets_and_rest_of_environment": ("environment", "physics", "outcome", "rendering", "events"),
     "dqn_update": ("dqn_update_and_sampling", "sampling"),
 }
-"""Rows that cannot run alone: the first one's time less the others'."""
+"""Rows that cannot run alone: the time of the first part minus the times of the others."""
 
 
 def parse(argv: Sequence[str] | None = None) -> tuple[argparse.Namespace, Config]:
-    """The arguments, and the configuration that is timed.
+    """Returns the parsed arguments, and the configuration that is timed.
 
     Raises:
-        ConfigError: if the flags after -- cannot be run, or the file cannot be written.
+        ConfigError: if the options after -- are invalid, or the file cannot be written.
     """
     words, flags = split(sys.argv[1:] if argv is None else argv)
     parser = argparse.ArgumentParser(
-        description=(__doc__ or "").partition("\n")[0], epilog="Flags after -- are train.py's."
+        prog="python benchmarks/throughput.py",
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("--repeats", type=int, default=REPEATS, help=f"turns of each row (default {REPEATS})")
     parser.add_argument("--quick", action="store_true", help="one short turn of each row")
-    parser.add_argument("--whole-only", action="store_true", help="leave out the parts and their floors")
-    parser.add_argument("--json", type=Path, help="write the rows to this file")
+    parser.add_argument("--whole-only", action="store_true", help="do not time the parts")
+    parser.add_argument("--json", type=Path, help="write the report to this file")
     args = parser.parse_args(words)
     if args.repeats < 1:
         parser.error(f"--repeats must be at least 1, not {args.repeats}")
@@ -69,17 +71,17 @@ def parse(argv: Sequence[str] | None = None) -> tuple[argparse.Namespace, Config
         check_can_write(args.json)
     config = configured(flags)
     if config.env.sensor != "events" and not args.whole_only:
-        raise ConfigError(f"the parts are those of env.sensor events; {config.env.sensor} needs --whole-only")
+        raise ConfigError(f"parts can be timed only for env.sensor events; {config.env.sensor} needs --whole-only")
     return args, steady(config, 8 if args.quick else config.train.chunk_steps)
 
 
 def measure(config: Config, repeats: int, parts: bool) -> dict[str, Any]:
-    """Everything that `--json` holds."""
+    """Measures and returns the report that `--json` writes."""
     missions = run_missions(config)
     devices = choose_devices(config.train.devices, config.train.shards)
     mesh = Mesh(np.asarray(devices), (AXIS,))
     whole = WholeStep(config, missions.training.world, devices)
-    # A copy: the next chunk is given the state itself.
+    # A copy, because the next chunk is given the state itself.
     host = jax.tree.map(lambda x: jax.device_put(x, devices[0]).copy(), whole.state)
     timed = (
         [Timed(part, mesh, config.train.num_envs) for part in parts_of(config, missions.training.world, host)]
@@ -90,7 +92,7 @@ def measure(config: Config, repeats: int, parts: bool) -> dict[str, Any]:
     c_mujoco = Rollout(config)
 
     turns: dict[str, list[float]] = {}
-    for _ in range(repeats):  # in turns, so that a slow minute hits all alike
+    for _ in range(repeats):  # in turns, so that a change in the machine's speed affects all rows
         turns.setdefault("whole", []).append(whole.turn())
         turns.setdefault("c_mujoco_rollout", []).append(c_mujoco.turn())
         for name, turn in limits.items():
@@ -130,7 +132,7 @@ def measure(config: Config, repeats: int, parts: bool) -> dict[str, Any]:
 
 
 def differences(us: dict[str, float]) -> list[dict[str, Any]]:
-    """The rows of `DIFFERENCES` whose terms were all timed."""
+    """Returns the rows of `DIFFERENCES` whose terms were all timed."""
     rows = []
     for name, (first, *others) in DIFFERENCES.items():
         if {first, *others} <= us.keys():
@@ -140,7 +142,7 @@ def differences(us: dict[str, float]) -> list[dict[str, Any]]:
 
 
 def table(report: dict[str, Any]) -> str:
-    """The figures for people, in Markdown."""
+    """Returns the report as Markdown."""
     rows = {row["name"]: row for row in report["rows"]}
     whole, rollout_row = rows[WHOLE], rows["c_mujoco_rollout"]
     stated = report["workload"]
@@ -162,7 +164,7 @@ def table(report: dict[str, Any]) -> str:
     if len(parts) > 1:
         lines += [
             "",
-            "| part | µs of one device a decision | floor, µs | times the floor |",
+            "| part | µs of one device per decision | minimum, µs | times the minimum |",
             "| --- | ---: | ---: | ---: |",
         ]
         for row in parts:
@@ -173,7 +175,7 @@ def table(report: dict[str, Any]) -> str:
             lines.append(f"| {name} | {row['us_per_decision']:.1f} | {floor} |")
         lines += [
             "",
-            "One device at best, with all of them busy: "
+            "Highest rates of one device with all devices busy: "
             + ", ".join(
                 f"{rows[name]['per_device'] / 1e9:.1f} {unit}"
                 for name, unit in (
@@ -188,7 +190,7 @@ def table(report: dict[str, Any]) -> str:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Exit code 0 when all was measured, 2 for bad input."""
+    """Returns exit code 0 after the measurement, 2 for invalid input."""
     use_cpu_devices()
     try:
         args, config = parse(argv)

@@ -1,7 +1,7 @@
-"""How well does the drone hold a commanded velocity?
+"""How well does the drone follow a commanded velocity?
 
-Steps from rest to every action, reversals along the axes, and a hover, all through `fly`, the function that
-training uses. Prints a Markdown table; `--json FILE` writes it as well.
+Simulates steps from rest to every action, reversals along the axes, and a hover with `fly`, the function that training
+uses. Prints a Markdown table.
 
     python benchmarks/tracking.py
 """
@@ -30,15 +30,15 @@ from edqn_jax.sim.drone import DroneState, Flight, fly, hover, load_airframe, ya
 Decide = Callable[[DroneState, jax.Array, jax.Array], tuple[DroneState, Flight]]
 
 SETTLE_DECISIONS = 12
-"""Decisions flown at the first command before the step."""
+"""Decisions with the first command, before the step."""
 RESPONSE_DECISIONS = 12
-"""Decisions measured after it (3.1 s)."""
+"""Decisions measured after the step (3.1 s)."""
 STEADY_STEPS = 25
 """The steady error is the largest one over this many last physics steps."""
 
 
 def manoeuvres(speed: float) -> tuple[np.ndarray, np.ndarray]:
-    """Velocities before and after the step, each [33, 3] m/s: 26 actions from rest, 6 reversals, 1 hover."""
+    """Returns the commands before and after the step, each [33, 3] m/s: 26 actions from rest, 6 reversals, 1 hover."""
     grid = [c for c in itertools.product((-1.0, 0.0, 1.0), repeat=3) if any(c)]
     actions = speed * np.array(sorted(grid, key=lambda c: (np.abs(c).sum(), np.abs(c).tolist())))
     axes = actions[:6]
@@ -48,14 +48,14 @@ def manoeuvres(speed: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 def batched_fly(config: DroneConfig) -> Decide:
-    """`fly` for a batch of drones, compiled."""
+    """Returns `fly` for a batch of drones, compiled."""
     airframe = load_airframe(config)
     mapped = jax.vmap(fly, (None, None, 0, 0, 0))
     return jax.jit(lambda state, command, yaw: mapped(config, airframe, state, command, yaw))
 
 
 def measure(config: DroneConfig, speed: float, decide: Decide) -> list[dict[str, Any]]:
-    """One flat row per manoeuvre."""
+    """Simulates every manoeuvre and returns a flat row for each."""
     before, after = manoeuvres(speed)
     batch = len(before)
     yaw = jnp.zeros(batch)
@@ -86,7 +86,7 @@ def measure(config: DroneConfig, speed: float, decide: Decide) -> list[dict[str,
 
 
 def response(velocity: np.ndarray, before: np.ndarray, after: np.ndarray, dt: float) -> dict[str, float | None]:
-    """Step-response figures of velocity [n, 3] m/s, its first row flown just before the command changed."""
+    """Returns step-response figures of velocity [n, 3] m/s, whose first row is from just before the command changed."""
     steady = float(np.linalg.norm(velocity[-STEADY_STEPS:] - after, axis=1).max())
     size = float(np.linalg.norm(after - before))
     if size == 0:
@@ -103,7 +103,7 @@ def response(velocity: np.ndarray, before: np.ndarray, after: np.ndarray, dt: fl
 
 
 def _crossing(values: np.ndarray, level: float) -> float:
-    """Where `values` first reach `level`, in samples, interpolated; inf if never."""
+    """Returns the interpolated sample at which `values` first reach `level`; inf if never."""
     reached = np.flatnonzero(values >= level)
     if not len(reached):
         return float("inf")
@@ -123,7 +123,7 @@ COLUMNS = {
 
 
 def table(rows: list[dict[str, Any]]) -> str:
-    """The rows as a Markdown table."""
+    """Returns the rows as a Markdown table."""
     lines = ["| manoeuvre, m/s | " + " | ".join(title for title, _ in COLUMNS.values()) + " |"]
     lines.append("| --- |" + " ---: |" * len(COLUMNS))
     for row in rows:
@@ -133,9 +133,11 @@ def table(rows: list[dict[str, Any]]) -> str:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Exit code 0 when all was measured, 2 for bad input."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("--json", type=Path, help="write the rows to this file")
+    """Returns exit code 0 after the measurement, 2 for invalid input."""
+    parser = argparse.ArgumentParser(
+        prog="python benchmarks/tracking.py", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--json", type=Path, help="write the report to this file")
     args = parser.parse_args(argv)
     try:
         if args.json is not None:

@@ -1,7 +1,7 @@
-"""Is the verdict right? A run's flights replayed in C MuJoCo, which shares no code with our distances.
+"""Are the outcomes right? Replays a run's flights in C MuJoCo, which shares no code with our distances.
 
-Prints for each outcome how many flights C MuJoCo judges alike: a contact at the stated moment where we say
-collision, none anywhere else. `--json FILE` writes it as well. Exit code 1 if a single verdict differs.
+Prints for each outcome how many flights C MuJoCo confirms: a contact at the stated time for a collision, and no contact
+for any other outcome. The exit code is 1 if one outcome differs.
 
     python benchmarks/verdicts.py RUN --missions 200
 """
@@ -31,7 +31,7 @@ from edqn_jax.sim.outcomes import Outcome
 
 
 def rows_of(results: list[Agreement]) -> list[dict[str, Any]]:
-    """One row for each outcome that occurs."""
+    """Returns a row for each outcome that occurs."""
     rows = []
     for outcome in Outcome:
         same = [result for result in results if result.outcome == outcome]
@@ -51,9 +51,9 @@ def rows_of(results: list[Agreement]) -> list[dict[str, Any]]:
 
 
 def table(rows: list[dict[str, Any]]) -> str:
-    """The rows as a Markdown table."""
+    """Returns the rows as a Markdown table."""
     lines = [
-        "| our verdict | flights | C MuJoCo agrees | contacts it finds | largest distance apart, mm |",
+        "| our outcome | flights | C MuJoCo agrees | contacts it finds | largest difference, mm |",
         "| --- | ---: | ---: | ---: | ---: |",
     ]
     for row in rows:
@@ -66,13 +66,15 @@ def table(rows: list[dict[str, Any]]) -> str:
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Exit code 0 when all verdicts agree, 1 when one differs, 2 for bad input."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    """Returns exit code 0 if all outcomes agree, 1 if one differs, 2 for invalid input."""
+    parser = argparse.ArgumentParser(
+        prog="python benchmarks/verdicts.py", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
     parser.add_argument("run", type=Path, help="folder of a run")
-    parser.add_argument("--world", help="where to fly (default: the world of the run)")
-    parser.add_argument("--missions", type=int, default=200, help="how many")
-    parser.add_argument("--seed", type=int, default=0, help="seed of the missions")
-    parser.add_argument("--json", type=Path, help="write the rows to this file")
+    parser.add_argument("--world", help="--world of train.py (default: that of the run)")
+    parser.add_argument("--missions", type=int, default=200, help="number of missions (default 200)")
+    parser.add_argument("--seed", type=int, default=0, help="seed of the missions (default 0)")
+    parser.add_argument("--json", type=Path, help="write the report to this file")
     args = parser.parse_args(argv)
     try:
         if args.json is not None:

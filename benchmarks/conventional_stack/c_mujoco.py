@@ -1,4 +1,4 @@
-"""MuJoCo's own C functions, callable from compiled loops without going through Python.
+"""MuJoCo's C functions, callable from compiled loops without going through Python.
 
 A model or data is passed as its address, `model._address`; an array as `array.ctypes.data`.
 """
@@ -14,7 +14,7 @@ from edqn_jax.planners.packages import require
 types = require("numba").types
 llvm = require("llvmlite.binding")  # comes with numba
 
-# The bindings have loaded this very file; loading it again only makes its names known to the linker.
+# The bindings have loaded this file already; loading it again makes its symbols known to the linker.
 llvm.load_library_permanently(str(next(Path(mujoco.__file__).parent.glob("libmujoco*"))))
 
 mj_step = types.ExternalFunction("mj_step", types.void(types.uintp, types.uintp))
@@ -28,6 +28,6 @@ mj_multi_ray = types.ExternalFunction(
         *(types.int32,) * 2,  # whether static geoms count, body left out or -1
         *(types.uintp,) * 3,  # geom, distance and normal of each ray
         types.int32,  # number of rays
-        types.float64,  # distance beyond which nothing is met
+        types.float64,  # maximum distance of a hit
     ),
 )

@@ -1,7 +1,7 @@
 """The level camera by `mj_multiRay`: one ray through the middle of each pixel, shade and texture in numba.
 
-Texture is box-filtered over the pixel's footprint as ours is; a silhouette is hard, because one ray a pixel is
-either on a shape or beside it.
+Texture is box-filtered over the pixel's footprint as in our camera; silhouettes are hard, because there is one ray per
+pixel.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ class Optics(NamedTuple):
 
 
 def optics_of(config: CameraConfig) -> Optics:
-    """The camera of a configuration."""
+    """Returns the camera of a configuration."""
     u, v = image_plane(config, 1, 1)
     per_metre = [np.array(wave.direction) / (config.texture_period_m * wave.octave) for wave in WAVES]
     return Optics(
@@ -52,27 +52,27 @@ def optics_of(config: CameraConfig) -> Optics:
 
 
 class Hits(NamedTuple):
-    """What the rays of M frames met. P = H x W rays a frame, row by row from the top."""
+    """Ray hits of M frames. P = H x W rays per frame, row by row from the top."""
 
     ray: NDArray[np.float64]  # [M, P, 3] with unit forward component
-    geom: NDArray[np.int32]  # [M, P], -1 where nothing
+    geom: NDArray[np.int32]  # [M, P], -1 without a hit
     depth: NDArray[np.float64]  # [M, P] along the optical axis, metres
     normal: NDArray[np.float64]  # [M, P, 3] unit
 
     @classmethod
     def empty(cls, frames: int, pixels: int) -> Hits:
-        """Room for so many frames."""
+        """Allocates arrays for so many frames."""
         shape = (frames, pixels)
         return cls(np.empty((*shape, 3)), np.empty(shape, np.int32), np.empty(shape), np.empty((*shape, 3)))
 
     def first(self, frames: int) -> Hits:
-        """Of so many frames, in the same memory."""
+        """Returns the hits of the first frames, as views."""
         return Hits(self.ray[:frames], self.geom[:frames], self.depth[:frames], self.normal[:frames])
 
 
 @numba.njit(cache=True, inline="always")
 def _heading(pose):
-    """Cosine and sine of the heading of a pose [7]."""
+    """Returns cosine and sine of the heading of a pose [7]."""
     w, z = pose[3], pose[6]
     scale = 1.0 / max(w * w + z * z, 1e-9)
     return (w * w - z * z) * scale, 2 * w * z * scale
@@ -80,12 +80,12 @@ def _heading(pose):
 
 @numba.njit(cache=True, error_model="numpy")
 def cast(model, data, optics, pose, hits):
-    """The rays of M frames.
+    """Casts the rays of M frames.
 
     Args:
-        model, data: addresses of the world's.
+        model, data: addresses of those of the world.
         pose: [M, 7] position and quaternion; roll and pitch are removed.
-        hits: of M frames, written.
+        hits: of M frames, output.
     """
     width, height = len(optics.u), len(optics.v)
     for m in range(len(pose)):
@@ -106,7 +106,7 @@ def cast(model, data, optics, pose, hits):
 
 @numba.njit(cache=True, inline="always")
 def _box_filter(cycles):
-    """What a box average over `cycles` periods leaves of a wave, as in `edqn_jax/sim/texture.py`."""
+    """Returns the factor of a wave's amplitude after a box average over `cycles` periods, as `edqn_jax/sim/texture.py`."""
     x = min(cycles * cycles, 1.0)
     return (1.0 - x) * (1.0 - 0.55 * x)
 
@@ -119,7 +119,7 @@ def _wave(phase):
 
 @numba.njit(cache=True, error_model="numpy", fastmath=True)
 def shade(geoms, optics, pose, hits, luma):
-    """Luma [M, P] of M frames from what their rays met: albedo x Lambert shade x texture."""
+    """Computes the luma [M, P] of M frames from their ray hits: albedo x Lambert shade x texture."""
     for m in range(len(pose)):
         cos, sin = _heading(pose[m])
         ox, oy, oz = pose[m, 0], pose[m, 1], pose[m, 2]
@@ -133,7 +133,7 @@ def shade(geoms, optics, pose, hits, luma):
             nx, ny, nz = hits.normal[m, p, 0], hits.normal[m, p, 1], hits.normal[m, p, 2]
             lit = nx * optics.sun[0] + ny * optics.sun[1] + nz * optics.sun[2]
             bright = (optics.ambient + (1 - optics.ambient) * max(lit, 0.0)) * geoms.luma[geom]
-            # On a plane t = h / (n . d): how the depth changes from one side of the pixel to the other.
+            # On a plane t = h / (n . d), which gives the change of depth across the pixel.
             approach = nx * dx + ny * dy + nz * dz
             relative = optics.pitch / (approach if abs(approach) > 1e-9 else -1e-9)
             slope_right, slope_up = -t * relative * (nx * sin - ny * cos), -t * relative * nz

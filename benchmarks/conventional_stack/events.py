@@ -1,6 +1,6 @@
 """The event simulator under the paper's law (Eq. 1-4), in numba.
 
-Between two frames a pixel's events share one polarity and even spacing (Eq. 5), so the signed count says it all.
+Between two frames the events of a pixel have one polarity and equal spacing (Eq. 5), so the signed count defines them.
 """
 
 from __future__ import annotations
@@ -25,18 +25,18 @@ class Law(NamedTuple):
 
 
 def law_of(config: EventsConfig) -> Law:
-    """The law of a configuration with two frames."""
+    """Returns the law of a configuration with two frames."""
     first, second = config.frame_times_s
     return Law(config.threshold, config.tolerance, max_events(config, second - first), config.log_epsilon)
 
 
 @numba.njit(cache=True, error_model="numpy")
 def signed_counts(law, before, after, counts):
-    """Events of each pixel between two frames, ON positive and OFF negative, cut to what int8 holds.
+    """Computes the events of each pixel between two frames, ON positive and OFF negative, limited to int8.
 
     Args:
         before, after: [N, P] linear luma in [0, 1].
-        counts: [N, P] int8, written.
+        counts: [N, P] int8, output.
     """
     for i in range(len(counts)):
         for p in range(counts.shape[1]):

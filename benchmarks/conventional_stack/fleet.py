@@ -1,4 +1,4 @@
-"""N drones of one process, stepped side by side: physics, outcome, rays, shade and events in compiled loops."""
+"""N drones in one process: physics, outcome, rays, shading and events of all of them in compiled loops."""
 
 from __future__ import annotations
 
@@ -21,46 +21,46 @@ from edqn_jax.sim.scene import take_scene
 from edqn_jax.sim.sensor import frame_steps
 
 _BLOCK = 8
-"""Drones whose frames are cast and shaded at a time, so that their rays stay in the cache."""
+"""Drones whose frames are rendered together, so that their rays stay in the cache."""
 
 
 @dataclass(frozen=True)
 class Course:
-    """Where a fleet flies: one world, and missions to draw from."""
+    """One world, and the missions that are drawn from."""
 
     mjcf: str  # see `world.text_of`
     start: NDArray[np.float64]  # [M, 3] metres
     goal: NDArray[np.float64]  # [M, 3] metres
 
     @classmethod
-    def of(cls, flown: env.World) -> Course:
-        """The missions that our environments fly.
+    def of(cls, ours: env.World) -> Course:
+        """Returns the missions of our environments.
 
         Raises:
             ConfigError: if they are in several worlds.
         """
-        worlds = flown.pool.start.shape[0]
+        worlds = ours.pool.start.shape[0]
         if worlds != 1:
-            raise ConfigError(f"the conventional stack flies in one world, 'paper' or an MJCF file, not in {worlds}")
-        scene = jax.tree.map(np.asarray, take_scene(flown.pool, 0))
-        start, goal = (np.asarray(points, np.float64) for points in (flown.missions.start, flown.missions.goal))
+            raise ConfigError(f"the conventional stack supports one world, 'paper' or an MJCF file, not {worlds}")
+        scene = jax.tree.map(np.asarray, take_scene(ours.pool, 0))
+        start, goal = (np.asarray(points, np.float64) for points in (ours.missions.start, ours.missions.goal))
         return cls(mjcf=world.text_of(scene), start=start, goal=goal)
 
 
 @dataclass(frozen=True)
 class Record:
-    """What N drones bring back from a step; memory may be shared between processes."""
+    """Actions and results of a step of N drones; the arrays may be shared between processes."""
 
-    action: np.ndarray  # [N] int64 to be taken
+    action: np.ndarray  # [N] int64 of the next step
     events: np.ndarray  # [N, H, W] int8 signed counts of the window before the next decision
     own: np.ndarray  # [N, 10] float32 see `edqn_jax.sim.env.own_state`
-    final_own: np.ndarray  # [N, 10] float32 the same before ended drones were started anew
+    final_own: np.ndarray  # [N, 10] float32 the same before drones whose episode ended were reset
     reward: np.ndarray  # [N] float32
-    outcome: np.ndarray  # [N] int64 an `Outcome`; other than RUNNING, the drone has been started anew
+    outcome: np.ndarray  # [N] int64 an `Outcome`; other than RUNNING, the drone has been reset
 
     @classmethod
     def shapes(cls, config: Config, drones: int) -> dict[str, tuple[tuple[int, ...], str]]:
-        """Shape and type of every array."""
+        """Returns shape and type of every array."""
         return {
             "action": ((drones,), "i8"),
             "events": ((drones, config.camera.height, config.camera.width), "i1"),
@@ -72,35 +72,35 @@ class Record:
 
     @classmethod
     def empty(cls, config: Config, drones: int) -> Record:
-        """In memory of this process's own."""
+        """Allocates the arrays in this process."""
         return cls(**{name: np.zeros(shape, kind) for name, (shape, kind) in cls.shapes(config, drones).items()})
 
     def part(self, drones: slice) -> Record:
-        """Some of the drones, in the same memory."""
+        """Returns the record of some drones, as views."""
         return Record(**{name: array[drones] for name, array in vars(self).items()})
 
 
 def check(config: Config) -> None:
-    """Raises ConfigError where the configuration asks for what this stack does not have."""
+    """Raises ConfigError if this stack does not support the configuration."""
     sensor = config.events
     noisy = (sensor.threshold_mismatch, sensor.leak_rate_hz, sensor.shot_rate_hz, sensor.hot_pixel_fraction)
     if sensor.law != "paper" or len(sensor.frame_times_s) != 2 or any(noisy):
-        raise ConfigError("the conventional stack has the noiseless 'paper' event law between two frames, and no other")
+        raise ConfigError("the conventional stack supports only the noiseless 'paper' event law between two frames")
     if config.camera.mount != "level":
-        raise ConfigError("the conventional stack has a level camera; set camera.mount to 'level'")
+        raise ConfigError("the conventional stack supports only a level camera; set camera.mount to 'level'")
 
 
 class Fleet:
-    """The drones. `step` takes `record.action` and fills the rest of `record`.
+    """N drones. `step` reads `record.action` and fills the rest of `record`.
 
-    What was flown in it stays until the next: `path`, and as in `edqn_jax.sim.env.Step` `end_step` and `contact`.
+    Until the next step `path` holds the poses, and `end_step` and `contact` are as in `edqn_jax.sim.env.Step`.
     """
 
     def __init__(self, config: Config, course: Course, record: Record, seed: int) -> None:
-        """Everything is allocated here; `record` holds one row for each drone.
+        """Allocates all arrays; `record` has one row for each drone.
 
         Raises:
-            ConfigError: where the configuration asks for what this stack does not have.
+            ConfigError: if this stack does not support the configuration.
         """
         check(config)
         self.course, self.record = course, record
@@ -130,7 +130,7 @@ class Fleet:
         self.counts = record.events.reshape(drones, pixels)
 
     def begin(self, drone: int, mission: int | None = None) -> None:
-        """A drone at rest at the start of a mission, facing its goal: of the given one, or of one drawn."""
+        """Puts a drone at rest at the start of a mission, facing its goal; draws the mission if None."""
         if mission is None:
             mission = int(self.random.integers(len(self.course.start)))
         start, goal = self.course.start[mission], self.course.goal[mission]
@@ -143,19 +143,19 @@ class Fleet:
         self.decision[drone] = 0
 
     def reset(self, missions: Sequence[int] | None = None) -> None:
-        """Every drone on the given mission, or on one drawn; who stands still sees no events."""
+        """Starts the given or drawn mission for every drone, without events, because the drones are at rest."""
         for drone in range(len(self.goal)):
             self.begin(drone, None if missions is None else missions[drone])
         self.record.events[:] = 0
-        self.tell()
+        self.write_own_states()
 
     def step(self, restart: bool = True) -> None:
-        """One decision of every drone.
+        """Simulates one decision of every drone.
 
         Args:
-            restart: whether drones whose episode ended are put on a new mission.
+            restart: whether drones whose episode ended start a new mission.
         """
-        record, engine, seen = self.record, self.engine, self.world
+        record, engine, geoms = self.record, self.engine, self.world.geoms
         with self.stopwatch.time("physics"):
             flight.fly(
                 engine.model._address, engine.data._address, engine.data.qpos, engine.data.qvel, engine.data.ctrl,
@@ -163,37 +163,37 @@ class Fleet:
             )  # fmt: skip
         with self.stopwatch.time("outcome"):
             task.judge(
-                seen.geoms, self.rules, self.goal, self.path, self.state, self.decision, record.outcome, record.reward,
+                geoms, self.rules, self.goal, self.path, self.state, self.decision, record.outcome, record.reward,
                 self.end_step, self.contact,
             )  # fmt: skip
-            self._tell(record.final_own)
+            self._write_own_states(record.final_own)
         for first in range(0, len(self.goal), _BLOCK):
             drones = slice(first, min(first + _BLOCK, len(self.goal)))
-            self._see(drones)
+            self._render_events(drones)
         with self.stopwatch.time("outcome"):
             if restart:
                 for drone in np.flatnonzero(record.outcome):
                     self.begin(int(drone))
-            self.tell()
+            self.write_own_states()
 
-    def tell(self) -> None:
-        """Own states as they are now, into `record.own`."""
-        self._tell(self.record.own)
+    def write_own_states(self) -> None:
+        """Writes the present own states into `record.own`."""
+        self._write_own_states(self.record.own)
 
-    def _tell(self, own: NDArray[np.float32]) -> None:
+    def _write_own_states(self, own: NDArray[np.float32]) -> None:
         task.own_state(self.world.geoms, self.rules, self.goal, self.state, own)
 
-    def _see(self, drones: slice) -> None:
-        """Events of some drones."""
-        seen, count = self.world, drones.stop - drones.start
+    def _render_events(self, drones: slice) -> None:
+        """Computes the events of some drones."""
+        world, count = self.world, drones.stop - drones.start
         poses, luma = self.poses[:, :count], self.luma[:, :count]
         hits = [frame.first(count) for frame in self.hits]
         with self.stopwatch.time("rays"):
             for at, frame in enumerate(self.frames):
                 poses[at] = self.path[drones, frame]
-                camera.cast(seen.model._address, seen.data._address, self.optics, poses[at], hits[at])
+                camera.cast(world.model._address, world.data._address, self.optics, poses[at], hits[at])
         with self.stopwatch.time("shading"):
             for at in range(2):
-                camera.shade(seen.geoms, self.optics, poses[at], hits[at], luma[at])
+                camera.shade(world.geoms, self.optics, poses[at], hits[at], luma[at])
         with self.stopwatch.time("events"):
             events.signed_counts(self.law, luma[0], luma[1], self.counts[drones])

@@ -1,4 +1,4 @@
-"""The drone in C MuJoCo, flown by the same cascaded controller as in `edqn_jax/sim/drone.py`, in numba."""
+"""The drone in C MuJoCo with the cascaded controller of `edqn_jax/sim/drone.py`, in numba."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from edqn_jax.sim.drone import LEAST_LEVELNESS, c_model, mixer_of
 numba = require("numba")
 
 STATE = 13
-"""Values of a drone's state: qpos (position, quaternion), qvel (velocity in the world, rates in the body)."""
+"""Number of values of a drone's state: qpos (position, quaternion), qvel (velocity in the world, rates in the body)."""
 
 
 class Airframe(NamedTuple):
-    """Gains, limits and what follows from the model; the names are those of `DroneConfig`."""
+    """Gains and limits, with the names of `DroneConfig`, and values of the model."""
 
     velocity_gain: float
     climb_gain: float
@@ -45,29 +45,29 @@ class Airframe(NamedTuple):
 
 
 class Command(NamedTuple):
-    """From a move to what the controller is asked for."""
+    """Converts an action to a command of the controller."""
 
     moves: NDArray[np.float64]  # [27, 3] m/s in the heading frame
     heading_hold: float  # metres
 
 
 class Engine(NamedTuple):
-    """The airframe's compiled model, and the one data that all drones of a process take turns in."""
+    """The airframe's compiled model, and its data, which the drones of a process use one after another."""
 
     model: mujoco.MjModel
     data: mujoco.MjData
 
 
 def load_engine(config: DroneConfig) -> Engine:
-    """The Skydio X2 without contacts and constraints."""
+    """Returns the Skydio X2 without contacts and constraints."""
     model = c_model(config)
-    # A body that has diverged is to be seen as such, not set back to the origin.
+    # Without reset to the origin, so that divergence can be detected.
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET | mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
     return Engine(model, mujoco.MjData(model))
 
 
 def airframe_of(config: DroneConfig, model: mujoco.MjModel) -> Airframe:
-    """What the compiled loops need of configuration and model."""
+    """Returns the values of configuration and model for the compiled loops."""
     return Airframe(
         velocity_gain=config.velocity_gain,
         climb_gain=config.climb_gain,
@@ -92,7 +92,7 @@ def airframe_of(config: DroneConfig, model: mujoco.MjModel) -> Airframe:
 
 
 def command_of(config: Config, actions: NDArray[np.int64]) -> Command:
-    """The table of moves [27, 3] times the commanded speed."""
+    """Returns the table of actions [27, 3] times the commanded speed."""
     return Command(moves=(actions * config.env.speed_m_s).astype(np.float64), heading_hold=config.env.heading_hold_m)
 
 
@@ -103,13 +103,13 @@ def clip(x, low, high):
 
 @numba.njit(cache=True)
 def wrap_angle(angle):
-    """The same angle within [-pi, pi], radians."""
+    """Returns the same angle within [-pi, pi], radians."""
     return angle - 2 * math.pi * round(angle / (2 * math.pi))
 
 
 @numba.njit(cache=True, error_model="numpy")
 def control(airframe, state, vx, vy, vz, cos_half_yaw, sin_half_yaw, thrust):
-    """Rotor thrusts [4] newtons into `thrust`: `edqn_jax.sim.drone.thrusts`, line by line.
+    """Computes rotor thrusts as `edqn_jax.sim.drone.thrusts` does, line by line.
 
     Args:
         state: [13].
@@ -162,32 +162,32 @@ def control(airframe, state, vx, vy, vz, cos_half_yaw, sin_half_yaw, thrust):
         low, high = min(low, thrust[i]), max(high, thrust[i])
     scale = min(1.0, airframe.max_tilt_share * limit / (high - low + 1e-9))
     shared = clip(mixer[0, 0] * collective, -scale * low, limit - scale * high)
-    room = math.inf
+    reserve = math.inf
     for i in range(4):
         thrust[i] = shared + scale * thrust[i]
-        room = min(room, thrust[i], limit - thrust[i])
-    room = max(room, 0.0)
-    turning = clip(abs(mixer[0, 3]) * torque_z, -room, room)
+        reserve = min(reserve, thrust[i], limit - thrust[i])
+    reserve = max(reserve, 0.0)
+    turning = clip(abs(mixer[0, 3]) * torque_z, -reserve, reserve)
     for i in range(4):
         thrust[i] = clip(thrust[i] + math.copysign(turning, turning * mixer[i, 3]), 0.0, limit)
 
 
 @numba.njit(cache=True, error_model="numpy")
 def fly(model, data, qpos, qvel, ctrl, airframe, command, action, goal, state, yaw_setpoint, path):
-    """One decision of N drones: the controller and `mj_step`, n times each.
+    """Simulates one decision of N drones: controller and `mj_step`, n times each.
 
     Args:
-        model, data: addresses of the engine's; qpos [7], qvel [6], ctrl [4]: that data's own arrays.
+        model, data: addresses of those of the engine; qpos [7], qvel [6], ctrl [4]: arrays of that data.
         action: [N] int.
         goal: [N, 3] metres.
         state: [N, 13], updated.
         yaw_setpoint: [N] radians, updated.
-        path: [N, n + 1, 7] positions and quaternions, written: before the first physics step and after each.
+        path: [N, n + 1, 7] positions and quaternions before the first physics step and after each, output.
     """
     for i in range(len(action)):
         qpos[:], qvel[:] = state[i, :7], state[i, 7:]
         path[i, 0] = qpos
-        # The move in the heading frame, and the heading's setpoint: towards the goal, held when it is overhead.
+        # Command in the heading frame; the heading setpoint is towards the goal, or held when the goal is overhead.
         heading = wrap_angle(2 * math.atan2(qpos[6], qpos[3]))
         cos, sin = math.cos(heading), math.sin(heading)
         ahead, left, vz = command.moves[action[i]]

@@ -1,4 +1,4 @@
-"""Missions flown greedily, all side by side, judged and tallied as in `edqn_jax/evaluation/rollouts.py`."""
+"""Greedy flights of missions in parallel, with outcomes and figures as in `edqn_jax/evaluation/rollouts.py`."""
 
 from __future__ import annotations
 
@@ -18,17 +18,17 @@ from edqn_jax.sim.flights import Closest, Flights
 numba = require("numba")
 
 Act = Callable[[NDArray[np.int8], NDArray[np.float32]], NDArray[np.int64]]
-"""From event counts [M, H, W] and own states [M, 10] to moves [M]."""
+"""Returns the actions [M] for event counts [M, H, W] and own states [M, 10]."""
 
 
 def fly_missions(config: Config, course: Course, act: Act) -> Flights:
-    """Fly each of the course's M missions once. A drone whose flight is over goes on, which counts for nothing.
+    """Flies each of the course's M missions once; a drone whose flight has ended continues without being counted.
 
     Returns:
-        what `evaluation.rollouts.fly_missions` returns, in NumPy and without a record, for `metrics.summarise`.
+        the result of `evaluation.rollouts.fly_missions` in NumPy without a record, for `metrics.summarise`.
 
     Raises:
-        ConfigError: where the configuration asks for what this stack does not have.
+        ConfigError: if this stack does not support the configuration.
     """
     missions = len(course.start)
     record = Record.empty(config, missions)
@@ -49,16 +49,16 @@ def fly_missions(config: Config, course: Course, act: Act) -> Flights:
         episode_return += running * record.reward
         contact = np.where(running, fleet.contact, contact)
         outcome = np.where(running, record.outcome, outcome)
-    flown: Any = outcome, decisions, physics_steps, contact, episode_return, length, seconds
-    return Flights(*flown, closest=Closest(*nearest), record=None)
+    figures: Any = outcome, decisions, physics_steps, contact, episode_return, length, seconds
+    return Flights(*figures, closest=Closest(*nearest), record=None)
 
 
 @numba.njit(cache=True, error_model="numpy")
 def _tally(geoms, radius, dt, running, path, end_step, contact, length, seconds, nearest):
-    """Adds what was flown in one decision, up to its end: metres, seconds, and where a shape was nearest.
+    """Adds length and time of one decision up to the end of the episode, and updates the closest approach.
 
     Args:
-        running: [M] bool; the others stay as they are.
+        running: [M] bool; the others are not changed.
         path: [M, n + 1, 7].
         end_step, contact: [M], as in `edqn_jax.sim.env.Step`.
         length, seconds: [M], updated.

@@ -1,4 +1,4 @@
-"""Where the time goes: seconds by part."""
+"""Seconds by part of the program."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ from contextlib import contextmanager
 
 
 class Stopwatch:
-    """Sums up the seconds of named parts; parts do not nest."""
+    """Sums the seconds of named parts, which must not be nested."""
 
     def __init__(self) -> None:
         self.seconds: dict[str, float] = {}
 
     @contextmanager
     def time(self, part: str) -> Iterator[None]:
-        """Counts the block to `part`."""
+        """Adds the time of the block to `part`."""
         began = time.perf_counter()
         yield
         self.seconds[part] = self.seconds.get(part, 0.0) + time.perf_counter() - began

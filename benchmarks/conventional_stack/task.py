@@ -28,13 +28,13 @@ _PLANE, _SPHERE, _CAPSULE, _CYLINDER = (
 )
 
 _SAMPLES = 8
-"""Points at which a segment is searched, as in `scene.segment_contact`."""
+"""Points at which a segment is checked, as in `scene.segment_contact`."""
 
 _REWARDS = ("sparse", "progress", "potential")
 
 
 class Rules(NamedTuple):
-    """What `judge` needs of the configuration; the names are those of `EnvConfig`."""
+    """The options that `judge` needs, with the names of `EnvConfig`."""
 
     radius: float
     goal_radius: float
@@ -51,7 +51,7 @@ class Rules(NamedTuple):
 
 
 def rules_of(config: Config) -> Rules:
-    """The rules as plain numbers."""
+    """Returns the rules of a configuration."""
     return Rules(
         radius=config.drone.body_radius_m,
         goal_radius=config.env.goal_radius_m,
@@ -70,7 +70,7 @@ def rules_of(config: Config) -> Rules:
 
 @numba.njit(cache=True, error_model="numpy")
 def signed_distance(geoms, px, py, pz):
-    """Metres from a point to the nearest geom, negative inside one; inf in an empty world."""
+    """Returns metres from a point to the nearest geom, negative inside one; inf in an empty world."""
     nearest = math.inf
     for g in range(len(geoms.kind)):
         kind, axes, size = geoms.kind[g], geoms.axes[g], geoms.size[g]
@@ -100,7 +100,7 @@ def signed_distance(geoms, px, py, pz):
 
 @numba.njit(cache=True, error_model="numpy")
 def _contact(geoms, radius, start, end):
-    """Share of the way straight from `start` [3] to `end` [3] at which a sphere first touches; inf if it does not."""
+    """Returns the fraction of the line from `start` [3] to `end` [3] at which a sphere first touches; inf if never."""
     before = 0.0
     for k in range(_SAMPLES):
         f = k / (_SAMPLES - 1)
@@ -119,9 +119,10 @@ def _contact(geoms, radius, start, end):
 
 @numba.njit(cache=True, error_model="numpy")
 def _first_verdict(geoms, rules, goal, path):
-    """The earliest physics step's verdict: not finite, contact, fence, goal, in this order; else RUNNING.
+    """Returns the outcome of the first physics step that ends the episode, else RUNNING.
 
-    With it that step, 1..n, and the share of it flown before a contact, as in `edqn_jax.sim.env.judge`.
+    Within a step the order is: not finite, contact, outside the volume, goal. Also returns that step, 1..n, and the
+    fraction of it before a contact, as `edqn_jax.sim.outcomes.judge`.
     """
     gap = signed_distance(geoms, path[0, 0], path[0, 1], path[0, 2]) - rules.radius
     for step in range(1, len(path)):
@@ -130,12 +131,12 @@ def _first_verdict(geoms, rules, goal, path):
             return DIVERGED, step, 1.0
         before, gap = gap, signed_distance(geoms, x, y, z) - rules.radius
         dx, dy, dz = x - path[step - 1, 0], y - path[step - 1, 1], z - path[step - 1, 2]
-        # Two clearances that together exceed the way between prove it free.
+        # Two clearances whose sum exceeds the distance prove the segment free.
         free = before + gap > math.sqrt(dx * dx + dy * dy + dz * dz)
         if not free:
-            share = _contact(geoms, rules.radius, path[step - 1], path[step])
-            if share <= 1:
-                return COLLISION, step, share
+            fraction = _contact(geoms, rules.radius, path[step - 1], path[step])
+            if fraction <= 1:
+                return COLLISION, step, fraction
         for axis in range(3):
             if path[step, axis] < geoms.lower[axis] or path[step, axis] > geoms.upper[axis]:
                 return LEFT_VOLUME, step, 1.0
@@ -145,8 +146,8 @@ def _first_verdict(geoms, rules, goal, path):
 
 
 @numba.njit(cache=True, error_model="numpy")
-def reward_of(rules, outcome, before, after, flown):
-    """Reward of one decision from the distances to the goal before and after it and the metres flown."""
+def reward_of(rules, outcome, before, after, displacement):
+    """Returns the reward of one decision from the distances to the goal before and after it and the displacement."""
     if outcome == DIVERGED:
         return 0.0
     total = rules.step_reward
@@ -157,7 +158,7 @@ def reward_of(rules, outcome, before, after, flown):
     elif outcome == LEFT_VOLUME:
         total += rules.left_volume_reward
     if rules.reward == 1:
-        total += rules.progress_weight * (before - after) - rules.path_weight * flown
+        total += rules.progress_weight * (before - after) - rules.path_weight * displacement
     elif rules.reward == 2:
         ended = outcome != RUNNING and outcome != TIME_OUT
         total += rules.progress_weight * (before - (0.0 if ended else rules.discount * after))
@@ -166,15 +167,15 @@ def reward_of(rules, outcome, before, after, flown):
 
 @numba.njit(cache=True, error_model="numpy")
 def judge(geoms, rules, goal, path, state, decision, outcome, reward, end_step, contact):
-    """Outcome and reward of one decision of N drones.
+    """Computes outcome and reward of one decision of N drones.
 
     Args:
         goal: [N, 3] metres.
-        path: [N, n + 1, 7] as flown; that of a body that diverged is put back to where it began.
-        state: [N, 13]; likewise.
-        decision: [N] decisions taken, counted up.
-        outcome, reward: [N], written.
-        end_step, contact: [N], written: as in `edqn_jax.sim.env.Step`.
+        path: [N, n + 1, 7] poses; if a drone diverged, all of its poses are set to the first.
+        state: [N, 13]; if a drone diverged, set to its first pose at rest.
+        decision: [N] number of decisions, increased by 1.
+        outcome, reward: [N], output.
+        end_step, contact: [N], output, as in `edqn_jax.sim.env.Step`.
     """
     for i in range(len(decision)):
         decision[i] += 1
@@ -187,17 +188,17 @@ def judge(geoms, rules, goal, path, state, decision, outcome, reward, end_step, 
             verdict = TIME_OUT
         outcome[i] = verdict
         start, end = path[i, 0, :3], path[i, -1, :3]
-        before, after, flown = 0.0, 0.0, 0.0
+        before, after, displacement = 0.0, 0.0, 0.0
         for axis in range(3):
             before += (goal[i, axis] - start[axis]) ** 2
             after += (goal[i, axis] - end[axis]) ** 2
-            flown += (end[axis] - start[axis]) ** 2
-        reward[i] = reward_of(rules, verdict, math.sqrt(before), math.sqrt(after), math.sqrt(flown))
+            displacement += (end[axis] - start[axis]) ** 2
+        reward[i] = reward_of(rules, verdict, math.sqrt(before), math.sqrt(after), math.sqrt(displacement))
 
 
 @numba.njit(cache=True, error_model="numpy")
 def own_state(geoms, rules, goal, state, own):
-    """The drones' own ten values, as `edqn_jax.sim.env.own_state` defines them, into `own` [N, 10]."""
+    """Computes the drones' own states as `edqn_jax.sim.env.own_state`, into `own` [N, 10]."""
     for i in range(len(state)):
         yaw = wrap_angle(2 * math.atan2(state[i, 6], state[i, 3]))
         cos, sin = math.cos(yaw), math.sin(yaw)

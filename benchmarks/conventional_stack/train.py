@@ -1,8 +1,7 @@
-"""stable-baselines3's DQN on all drones: trained, flown, and how fast it is.
+"""stable-baselines3's DQN on all drones: training, flights and speed.
 
-What the agent is: DQN with ReLU layers, n-step returns, a Huber loss, Adam and a Polyak-averaged target, at the sizes
-and rates of the configuration. Where ours goes beyond what stable-baselines3 has (double and dueling DQN, averaged
-parameters), this one does not follow.
+The agent is a DQN with ReLU layers, n-step returns, a Huber loss, Adam and a Polyak-averaged target, with the sizes and
+rates of the configuration. It does not have what stable-baselines3 lacks: double and dueling DQN, averaged parameters.
 
 trained = train(config, Course.of(world), processes=2)
 flights = fly(trained, Course.of(validation))
@@ -47,27 +46,27 @@ PARTS = (
     "acting",
     "dqn_update",
 )
-"""What is timed apart; the rest of the time is stable-baselines3's own."""
+"""Parts that are timed; the rest of the time is spent in stable-baselines3."""
 
 
 @dataclass(frozen=True)
 class Trained:
-    """What a training has come to; it stays as it is when the training goes on."""
+    """The result of a training, which does not change when the training continues."""
 
     config: Config
     vae: EventVAE
     q: Any
-    """The network, observations to values: a PyTorch module."""
+    """The Q-network, a PyTorch module."""
     decisions: int
-    """Taken in all, those of the warm-up included."""
+    """All decisions, with those of the warm-up."""
     seconds: float
-    """Spent on them; starting processes is not counted."""
+    """Time of these decisions, without the start of processes."""
 
     def act(self, events: NDArray[np.int8], own: NDArray[np.float32]) -> NDArray[np.int64]:
-        """The best moves [M] for event counts [M, H, W] and own states [M, 10]."""
-        seen = torch.from_numpy(observed(self.config, self.vae.code(images(events)), own))
+        """Returns the best actions [M] for event counts [M, H, W] and own states [M, 10]."""
+        observation = torch.from_numpy(observed(self.config, self.vae.code(images(events)), own))
         with torch.inference_mode():
-            return self.q(seen).argmax(dim=1).numpy()
+            return self.q(observation).argmax(dim=1).numpy()
 
 
 def train(
@@ -80,15 +79,15 @@ def train(
     """Trains for `config.train.total_steps` decisions, warm-up included, with `config.train.seed`.
 
     Args:
-        course: what missions are drawn from.
-        processes: that fly.
-        threads: of PyTorch, in the one that learns.
-        watch: shown what has been learnt after every `config.train.validation_every` decisions, and at the end; its
-            time does not count.
+        course: world and missions.
+        processes: number of simulating processes.
+        threads: of PyTorch in the process that learns.
+        watch: called with the result after every `config.train.validation_every` decisions and at the end; its time
+            does not count.
 
     Raises:
-        ConfigError: where the configuration asks for what this stack does not have.
-        ValueError: if the drones do not divide into the processes.
+        ConfigError: if this stack does not support the configuration.
+        ValueError: if the number of drones is not a multiple of the number of processes.
     """
     with Training(config, course, processes, threads) as training:
         training.warm_up()
@@ -102,31 +101,31 @@ def train(
 
 
 def fly(trained: Trained, course: Course) -> Flights:
-    """Flies each mission of the course once, taking the best move each time: see `flights.fly_missions`."""
+    """Flies each mission of the course once with the best actions, see `flights.fly_missions`."""
     return fly_missions(trained.config, course, trained.act)
 
 
 def check(config: AgentConfig) -> None:
-    """Raises ConfigError where the configuration asks for a DQN that stable-baselines3 does not have."""
+    """Raises ConfigError if stable-baselines3's DQN does not support the configuration."""
     if config.history != 1 or config.layer_norm or config.huber_delta != 1.0 or config.exploration_episodes > 0:
         raise ConfigError(
-            "the conventional stack's DQN has agent.history 1, agent.layer_norm False, agent.huber_delta 1 and "
-            "agent.exploration_episodes 0, and no other"
+            "the conventional stack's DQN supports only agent.history 1, agent.layer_norm False, agent.huber_delta 1 "
+            "and agent.exploration_episodes 0"
         )
 
 
 class TimedDQN(stable_baselines3.DQN):
-    """stable-baselines3's DQN; what it does itself is timed apart from what it calls."""
+    """stable-baselines3's DQN with its updates and actions timed."""
 
     stopwatch: Stopwatch
     planned: int
-    """Decisions over which the schedules run, in however many calls of `learn`."""
+    """Decisions over which the schedules extend, over all calls of `learn`."""
 
     def _update_current_progress_remaining(self, num_timesteps: int, total_timesteps: int) -> None:
         super()._update_current_progress_remaining(num_timesteps, self.planned)
 
     def train(self, gradient_steps: int, batch_size: int = 100) -> None:
-        """The DQN's updates."""
+        """Runs and times the DQN's updates."""
         with self.stopwatch.time("dqn_update"):
             super().train(gradient_steps, batch_size)
 
@@ -136,14 +135,14 @@ class TimedDQN(stable_baselines3.DQN):
 
 
 class Training:
-    """Drones, VAE and DQN as `config` has them; a context, at whose end its other processes end."""
+    """Drones, VAE and DQN of a configuration. A context manager, which ends the other processes."""
 
     def __init__(self, config: Config, course: Course, processes: int = 1, threads: int = 1) -> None:
-        """`config.train.num_envs` drones in so many processes, PyTorch with so many threads.
+        """Starts `config.train.num_envs` drones in `processes` processes and PyTorch with `threads` threads.
 
         Raises:
-            ConfigError: where the configuration asks for what this stack does not have.
-            ValueError: if the drones do not divide into the processes.
+            ConfigError: if this stack does not support the configuration.
+            ValueError: if the number of drones is not a multiple of the number of processes.
         """
         agent, drones = config.agent, config.train.num_envs
         check(agent)
@@ -167,7 +166,7 @@ class Training:
             n_steps=agent.n_step,
             train_freq=1,  # a step of all drones
             gradient_steps=agent.updates_per_step,
-            # It moves its target once a step of all drones, ours once an update: the same way in all.
+            # It updates its target once per step of all drones, ours once per update; the product is the same.
             tau=1 - (1 - agent.target_rate) ** agent.updates_per_step,
             target_update_interval=drones,
             exploration_fraction=agent.exploration_fraction,
@@ -183,21 +182,21 @@ class Training:
 
     @property
     def total(self) -> int:
-        """Decisions that the whole training has."""
+        """Returns the number of decisions of the whole training."""
         return self.plan.total * self.env.num_envs
 
     @property
     def decisions(self) -> int:
-        """Decisions taken so far."""
+        """Returns the number of decisions so far."""
         return self.warm + self.dqn.num_timesteps
 
     def trained(self) -> Trained:
-        """What has been learnt so far."""
+        """Returns the result so far."""
         q = copy.deepcopy(self.dqn.q_net).requires_grad_(False)
         return Trained(self.config, self.learner.acting, q, self.decisions, self.seconds)
 
     def warm_up(self) -> None:
-        """Held random manoeuvres in which the VAE learns; then its code is the agent's."""
+        """Trains the VAE on held random actions, then copies it for the agent."""
         torch.set_num_threads(self.threads)
         began = time.perf_counter()
         config, env = self.config.encoder, self.env
@@ -214,7 +213,7 @@ class Training:
         self.seconds += time.perf_counter() - began
 
     def learn(self, decisions: int) -> float:
-        """So many more decisions, rounded up to whole steps of all drones; decisions per second."""
+        """Trains for more decisions, rounded up to whole steps of all drones; returns decisions per second."""
         torch.set_num_threads(self.threads)
         before = self.dqn.num_timesteps
         began = time.perf_counter()
@@ -231,10 +230,10 @@ class Training:
 
 
 class Steady:
-    """A training past its beginning, to be timed turn by turn: the counterpart of `benchmarks/whole.py`. A context."""
+    """A training after its warm-up, for timing: the counterpart of `measurement.whole.WholeStep`. A context manager."""
 
     def __init__(self, config: Config, course: Course, processes: int, threads: int) -> None:
-        """Warms up, compiles, and fills the replay until updates begin. `config` has the VAE learn throughout."""
+        """Warms up, compiles, and fills the replay until updates begin; `config` must let the VAE learn throughout."""
         self.training = Training(config, course, processes, threads)
         self.training.warm_up()
         self.training.learn(config.agent.learning_starts + config.train.num_envs)
@@ -248,28 +247,28 @@ class Steady:
         self.training.__exit__(*reason)
 
     def turn(self, decisions: int) -> float:
-        """Decisions per second of so many more.
+        """Trains for more decisions and returns decisions per second.
 
         Raises:
-            RuntimeError: if the agent or the VAE did not learn from as many samples as the configuration says.
+            RuntimeError: if the agent or the VAE did not learn from all samples that the configuration requires.
         """
         training, config = self.training, self.training.config
         before = training.dqn.num_timesteps, training.dqn._n_updates, training.learner.samples
         rate = training.learn(decisions)
-        done, updates, seen = (
+        done, updates, samples = (
             now - then
             for now, then in zip(
                 (training.dqn.num_timesteps, training.dqn._n_updates, training.learner.samples), before, strict=True
             )
         )
-        if updates * config.train.num_envs != done * config.agent.updates_per_step or seen != done:
+        if updates * config.train.num_envs != done * config.agent.updates_per_step or samples != done:
             raise RuntimeError("a timed turn did not learn throughout")
         self.decisions += done
         self.seconds += done / rate
         return rate
 
     def shares(self) -> dict[str, float]:
-        """Share of all turns' time by part, of this process; what is left is `stable_baselines3`."""
+        """Returns the share of time of each part in this process; the rest is `stable_baselines3`."""
         spent = self.training.stopwatch.seconds
         shares = {part: spent.get(part, 0.0) / self.seconds for part in PARTS}
         return {**shares, "stable_baselines3": 1.0 - sum(shares.values())}

@@ -1,4 +1,4 @@
-"""The event VAE in PyTorch: event counts of a window to a code of 32 numbers, and back."""
+"""The event VAE in PyTorch: encodes the event counts of a window into a code, and decodes it."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _MAX_LOG_VARIANCE = 6.0
 
 
 class EventVAE(nn.Module):
-    """Ordinary ReLU layers of the widths that ours has, over log(1 + count) of ON and OFF events, both ways."""
+    """Encoder and decoder with ReLU layers of our widths, over log(1 + count) of ON and OFF events."""
 
     def __init__(self, config: EncoderConfig, camera: CameraConfig) -> None:
         super().__init__()
@@ -29,22 +29,22 @@ class EventVAE(nn.Module):
         pixels = 2 * camera.height * camera.width
         self.encoder = _layers((pixels, config.hidden, 2 * config.code_size))
         self.decoder = _layers((config.code_size, *config.decoder_hidden, pixels))
-        # Nearly noiseless codes at first; the KL term widens what it may.
+        # Codes are nearly noiseless at first; the KL term increases the variance.
         with torch.no_grad():
             self.encoder[-1].bias[config.code_size :] = -4.0
 
     def encode(self, image: Tensor) -> tuple[Tensor, Tensor]:
-        """Images [B, 2 H W] to mean and log-variance, each [B, code_size]."""
+        """Returns mean and log-variance, each [B, code_size], of images [B, 2 H W]."""
         mean, log_variance = self.encoder(image).chunk(2, dim=-1)
         return mean, log_variance.clamp(-_MAX_LOG_VARIANCE, _MAX_LOG_VARIANCE)
 
     def code(self, image: Tensor) -> NDArray[np.float32]:
-        """What the agent sees of images [B, 2 H W]: the mean, [B, code_size]."""
+        """Returns the code of images [B, 2 H W] for the agent: the mean, [B, code_size]."""
         with torch.inference_mode():
             return self.encode(image)[0].numpy()
 
     def loss(self, image: Tensor) -> Tensor:
-        """Eq. 6: squared reconstruction error of an image + `kl_weight` x KL, averaged over the batch."""
+        """Returns squared reconstruction error of an image + `kl_weight` x KL, averaged over the batch."""
         mean, log_variance = self.encode(image)
         code = mean + torch.exp(0.5 * log_variance) * torch.randn_like(mean)
         error = nn.functional.mse_loss(self.decoder(code), image, reduction="sum")
@@ -60,13 +60,13 @@ def _layers(widths: tuple[int, ...]) -> Any:
 
 
 def images(counts: NDArray[np.int8]) -> Tensor:
-    """Signed counts [B, H, W] to log(1 + count) of ON and of OFF events, [B, 2 H W]."""
+    """Returns log(1 + count) of ON and of OFF events, [B, 2 H W], of signed counts [B, H, W]."""
     signed = torch.from_numpy(counts).flatten(1).float()
     return torch.cat([signed.clamp(min=0), (-signed).clamp(min=0)], dim=1).log1p_()
 
 
 class Learner:
-    """A VAE that learns, and the frozen copy whose code the agent sees."""
+    """A VAE that learns, and the frozen copy that encodes for the agent."""
 
     def __init__(self, config: EncoderConfig, camera: CameraConfig, seed: int) -> None:
         torch.manual_seed(seed)
@@ -76,11 +76,11 @@ class Learner:
         self.publish()
 
     def publish(self) -> None:
-        """From now on the agent sees the code of the VAE as it is: the replay must not mix two of them."""
+        """Copies the VAE for the agent. Codes of different copies must not be mixed in the replay."""
         self.acting = copy.deepcopy(self.learning).requires_grad_(False)
 
     def update(self, image: Tensor) -> float:
-        """One Adam step on images [B, 2 H W]; its loss."""
+        """Takes one Adam step on images [B, 2 H W] and returns the loss."""
         self.optimiser.zero_grad()
         loss = self.learning.loss(image)
         loss.backward()
@@ -89,5 +89,5 @@ class Learner:
         return loss.item()
 
     def code(self, image: Tensor) -> NDArray[np.float32]:
-        """The agent's code of images [B, 2 H W]: the mean, [B, code_size]."""
+        """Returns the agent's code of images [B, 2 H W]: the mean, [B, code_size]."""
         return self.acting.code(image)

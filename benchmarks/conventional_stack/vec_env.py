@@ -1,4 +1,4 @@
-"""All drones as one vectorised environment of stable-baselines3: codes and own states in, moves out."""
+"""All drones as one vectorised environment of stable-baselines3, which observes codes and own states."""
 
 from __future__ import annotations
 
@@ -21,21 +21,21 @@ vec_env = require("stable_baselines3.common.vec_env")
 
 
 def observed(config: Config, code: NDArray[np.float32], own: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Codes [N, code_size] and own states [N, 10] as the network sees them: [N, code_size + 10]."""
+    """Returns observations [N, code_size + 10] of codes [N, code_size] and own states [N, 10]."""
     return np.concatenate([config.agent.code_scale * code, own], axis=1, dtype=np.float32)
 
 
 class CodedDrones(vec_env.VecEnv):
-    """Every step trains the VAE on the new event fields and encodes them, in one batch for all drones.
+    """A step trains the VAE on the new event fields and encodes them, in one batch for all drones.
 
-    Ended drones are started anew within the step, as stable-baselines3 has it: `infos[i]["terminal_observation"]`
-    is what the episode ended with.
+    Drones whose episode ended are reset within the step, as stable-baselines3 requires;
+    `infos[i]["terminal_observation"]` is the last observation of the episode.
     """
 
     render_mode = None
 
     def __init__(self, config: Config, fleet: SpreadFleet, learner: Learner) -> None:
-        """Takes the fleet over: `close` ends it."""
+        """Takes ownership of the fleet; `close` ends it."""
         self.config, self.fleet, self.learner = config, fleet, learner
         self.stopwatch = fleet.stopwatch
         self.updates = 1
@@ -47,17 +47,17 @@ class CodedDrones(vec_env.VecEnv):
         )
 
     def reset(self) -> np.ndarray:
-        """Observations [N, code_size + 10] of new missions."""
+        """Starts new missions and returns the observations [N, code_size + 10]."""
         self.fleet.reset()
         record = self.fleet.record
         return observed(self.config, self.learner.code(images(record.events)), record.own)
 
     def step_async(self, actions: np.ndarray) -> None:
-        """Moves [N] to be taken."""
+        """Sets the actions [N] of the next step."""
         self.fleet.record.action[:] = actions
 
     def step_wait(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[dict[str, Any]]]:
-        """Observations [N, code_size + 10], rewards [N] as scaled for learning, ends [N], infos."""
+        """Returns observations [N, code_size + 10], rewards [N] as scaled for learning, ends [N], infos."""
         self.fleet.step()
         record = self.fleet.record
         with self.stopwatch.time("encoder"):
@@ -66,43 +66,43 @@ class CodedDrones(vec_env.VecEnv):
         with self.stopwatch.time("vae_update"):
             for _ in range(self.updates):
                 self.learner.update(image)
-        seen = observed(self.config, codes, record.own)
+        observations = observed(self.config, codes, record.own)
         infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
         ended = np.flatnonzero(record.outcome)
         if len(ended):
             final = observed(self.config, codes[ended], record.final_own[ended])
-            # A drone at the start of its mission sees nothing move.
+            # There are no events at the start of a mission.
             nothing = self.learner.code(images(np.zeros_like(record.events[:1])))
-            seen[ended] = observed(self.config, nothing.repeat(len(ended), axis=0), record.own[ended])
+            observations[ended] = observed(self.config, nothing.repeat(len(ended), axis=0), record.own[ended])
             for i, last in zip(ended, final, strict=True):
                 timed_out = bool(record.outcome[i] == Outcome.TIME_OUT)
                 infos[i] = {"terminal_observation": last, "TimeLimit.truncated": timed_out}
-        return seen, self.config.agent.reward_scale * record.reward, record.outcome != Outcome.RUNNING, infos
+        return observations, self.config.agent.reward_scale * record.reward, record.outcome != Outcome.RUNNING, infos
 
     def close(self) -> None:
         """Ends the fleet's processes."""
         self.fleet.close()
 
-    # The rest of the interface is for environments that are objects of their own; the drones are none.
+    # The rest of the interface is for environments that are separate objects, which the drones are not.
 
     def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
-        """The same for every drone."""
+        """Returns the attribute, which is the same for every drone."""
         return [getattr(self, attr_name)] * len(self._chosen(indices))
 
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
-        """For all drones at once."""
+        """Sets the attribute for all drones."""
         setattr(self, attr_name, value)
 
     def env_method(self, method_name: str, *method_args: Any, indices: Any = None, **method_kwargs: Any) -> list[Any]:
-        """None is there to be called.
+        """Raises AttributeError, because a drone has no methods.
 
         Raises:
-            AttributeError: always, as `get_attr` does for what is not there.
+            AttributeError: always.
         """
-        raise AttributeError(f"a drone has no method of its own, so no '{method_name}'")
+        raise AttributeError(f"a drone has no method '{method_name}'")
 
     def env_is_wrapped(self, wrapper_class: type, indices: Any = None) -> list[bool]:
-        """None is."""
+        """Returns False for every drone."""
         return [False] * len(self._chosen(indices))
 
     def _chosen(self, indices: Any) -> Sequence[int]:

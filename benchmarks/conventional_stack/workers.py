@@ -1,4 +1,4 @@
-"""A fleet spread over processes: this one flies the first share, the others theirs, all in one shared memory."""
+"""A fleet spread over processes with one shared memory; this process simulates the first share."""
 
 from __future__ import annotations
 
@@ -19,15 +19,17 @@ class SpreadFleet:
     """`drones` drones in `processes` processes; `record` holds all of them."""
 
     def __init__(self, config: Config, course: Course, drones: int, processes: int, seed: int) -> None:
-        """The other processes are started here; `close` ends them.
+        """Starts the other processes; `close` ends them.
 
         Raises:
-            ConfigError: where the configuration asks for what this stack does not have.
-            ValueError: if the drones do not divide into the processes.
+            ConfigError: if this stack does not support the configuration.
+            ValueError: if the number of drones is not a multiple of the number of processes.
         """
         if drones < 1 or processes < 1 or drones % processes:
-            raise ValueError(f"{drones} drones cannot be shared out among {processes} processes; take a multiple")
-        # Spawned, not forked: JAX and PyTorch have threads, which a fork would leave behind.
+            raise ValueError(
+                f"{drones} drones cannot be divided among {processes} processes; the number must be a multiple"
+            )
+        # Spawned, not forked, because the threads of JAX and PyTorch do not survive a fork.
         context = multiprocessing.get_context("spawn")
         shared = {
             name: (context.RawArray(ctypes.c_byte, int(np.prod(shape)) * np.dtype(kind).itemsize), shape, kind)
@@ -49,11 +51,11 @@ class SpreadFleet:
         self.stopwatch = self.fleet.stopwatch
 
     def reset(self) -> None:
-        """Every drone on a new mission."""
+        """Starts a new mission for every drone."""
         self._together(_RESET, self.fleet.reset)
 
     def step(self) -> None:
-        """One decision of every drone; who ended is put on a new mission."""
+        """Simulates one decision of every drone; drones whose episode ended start a new mission."""
         self._together(_STEP, self.fleet.step)
 
     def _together(self, word: bytes, own_share) -> None:
@@ -82,13 +84,13 @@ def _mapped(shared: dict[str, Any]) -> Record:
 
 
 def _serve(pipe: Connection, config: Config, course: Course, shared: dict[str, Any], share: slice, seed: int) -> None:
-    """Another process: does what it is told until the pipe is closed."""
+    """Runs in another process: executes requests until the pipe is closed."""
     fleet = Fleet(config, course, _mapped(shared).part(share), seed)
-    does = {_RESET: fleet.reset, _STEP: fleet.step}
+    requests = {_RESET: fleet.reset, _STEP: fleet.step}
     while True:
         try:
             word = pipe.recv_bytes()
         except EOFError:
             return
-        does[word]()
+        requests[word]()
         pipe.send_bytes(word)

@@ -1,4 +1,4 @@
-"""One world as C MuJoCo compiles it, and the same geoms as plain arrays for compiled loops."""
+"""A world compiled by C MuJoCo, and its geoms as plain arrays for compiled loops."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ from edqn_jax.sim.scene import Scene
 
 
 class Geoms(NamedTuple):
-    """G static geoms and the space around them."""
+    """G static geoms and the flight volume."""
 
     kind: NDArray[np.int64]
     """[G] `mjtGeom`."""
     position: NDArray[np.float64]
     """[G, 3] metres."""
     axes: NDArray[np.float64]
-    """[G, 3, 3] rows are the geom's own axes in the world."""
+    """[G, 3, 3] rows are the geom's axes in the world frame."""
     size: NDArray[np.float64]
-    """[G, 3] as MuJoCo has it for the kind, metres."""
+    """[G, 3] metres, with MuJoCo's meaning for the kind."""
     luma: NDArray[np.float64]
     """[G] of the albedo."""
     lower: NDArray[np.float64]
@@ -42,7 +42,7 @@ class World(NamedTuple):
 
 
 def text_of(scene: Scene) -> str:
-    """The MJCF of a scene: what another process needs to compile it."""
+    """Returns the MJCF of a scene, from which another process can compile it."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "scene.xml"
         write_scene(scene, path)
@@ -50,7 +50,7 @@ def text_of(scene: Scene) -> str:
 
 
 def compiled(text: str) -> World:
-    """The world of an MJCF that `text_of` wrote."""
+    """Compiles an MJCF from `text_of`."""
     model = mujoco.MjModel.from_xml_string(text)
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)

@@ -1,4 +1,4 @@
-"""Worlds with any number of boxes, for questions in which nothing but their number may change."""
+"""Worlds that differ only in their number of boxes."""
 
 from __future__ import annotations
 
@@ -10,28 +10,28 @@ from edqn_jax.sim.scene import Planes, Scene, UprightBoxes, build_scene
 from edqn_jax.sim.worlds import GROUND_RGB, SIZE
 
 CELL = 10.0
-"""Metres of a square cell of the ground; a cell holds one box at most."""
+"""Size of a square cell of the ground, metres; a cell contains at most one box."""
 REACH = 4.0
-"""Metres around a cell's middle that a box stays within, so that there is a way between any two."""
+"""Metres around the centre of a cell within which its box stays, so that there is a gap between any two boxes."""
 MOST = int(SIZE[0] // CELL) * int(SIZE[1] // CELL)
-"""Boxes that there is a cell for."""
-_CORNER = np.array([1.0, 1.0, 3.0])  # of the start, and how far the goal is from the opposite corner
+"""Maximum number of boxes: one for each cell."""
+_CORNER = np.array([1.0, 1.0, 3.0])  # the start, and the distance of the goal from the opposite corner, metres
 
 
 def world_of_boxes(count: int) -> Scene:
-    """`count` upright boxes over level ground in the volume of random worlds, on the way from corner to corner.
+    """Returns a world of `count` upright boxes on level ground, with the volume of random worlds.
 
-    A world of fewer boxes has the first ones of a world of more.
+    Start and goal are in opposite corners. The boxes of a smaller world are the first ones of a larger world.
 
     Raises:
-        ValueError: if there is no cell for so many.
+        ValueError: if there are fewer cells than boxes.
     """
     if not 0 <= count <= MOST:
-        raise ValueError(f"a world holds from 0 to {MOST} boxes, not {count}")
+        raise ValueError(f"a world has from 0 to {MOST} boxes, not {count}")
     columns = int(SIZE[0] // CELL)
     draw = np.random.default_rng(0)
     cells = draw.permutation(MOST)[:count]
-    # Drawn for every cell, so that a box does not depend on how many there are.
+    # Drawn for every cell, so that a box does not depend on their number.
     width, depth, height, yaw, shift, towards, grey = draw.random((7, MOST))[:, :count]
     half = np.stack([1.0 + 1.5 * width, 1.0 + 1.5 * depth, 2.0 + 10.0 * height], axis=1)
     away = shift * (REACH - np.hypot(half[:, 0], half[:, 1]))

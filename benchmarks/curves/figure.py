@@ -1,4 +1,4 @@
-"""The picture of `scaling.py`: one small panel for each curve, and the bytes."""
+"""The picture of `scaling.py`: a panel for each curve, and one for the bytes."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 from edqn_jax.report.style import INK, LINE, MUTED, SECOND_LINE, drawing
 
 COLUMNS = 3
-COST = "µs of one device a decision"
+COST = "µs of one device per decision"
 
 
 def draw_scaling(report: dict[str, Any], file: Path) -> Figure:
-    """What `scaling.measure` returned, as a PNG."""
+    """Writes the report of `scaling.measure` as a PNG and returns the figure."""
     curves = report["curves"]
     rows = math.ceil((len(curves) + 1) / COLUMNS)
     with drawing(8.4, 0.5 + 2.5 * rows, file) as figure:
         grid = figure.subplots(rows, COLUMNS, squeeze=False).ravel()
-        # One range of costs for all: a panel must not make a small step look like a large one.
+        # The same range of costs in all panels, so that they can be compared.
         costs = [row[key] for row in report["rows"] for key in ("us_low", "us_high")]
         for number, (axes, curve) in enumerate(zip(grid, curves, strict=False)):
             _draw_curve(axes, curve, [row for row in report["rows"] if row["curve"] == curve["name"]])
@@ -40,14 +40,14 @@ def draw_scaling(report: dict[str, Any], file: Path) -> Figure:
 def _title(report: dict[str, Any]) -> str:
     stated = report["workload"]
     return (
-        f"{report['device']}, {len(report['devices'])} devices. Where a panel says nothing else: "
+        f"{report['device']}, {len(report['devices'])} devices. Unless stated otherwise: "
         f"{stated['width']} × {stated['height']} pixels, {stated['obstacles']} obstacles, {stated['num_envs']} "
-        f"environments, {stated['physics_steps_per_decision']} physics steps a decision."
+        f"environments, {stated['physics_steps_per_decision']} physics steps per decision."
     )
 
 
 def _draw_curve(axes: Axes, curve: dict[str, Any], rows: list[dict[str, Any]]) -> None:
-    """Medians with the least and the largest turn, and the line of linear growth through the first."""
+    """Draws medians with the smallest and largest turn, and the line of linear growth through the first."""
     x, cost, low, high = (np.array([row[key] for row in rows]) for key in ("x", "us_per_decision", "us_low", "us_high"))
     linear = cost[0] * (x / x[0]) ** curve["linear_slope"]
     axes.set_xscale("log")
@@ -65,7 +65,7 @@ def _draw_curve(axes: Axes, curve: dict[str, Any], rows: list[dict[str, Any]]) -
     axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,g}"))
     axes.set_xlabel(curve["name"])
     axes.set_title(f"{x[-1] / x[0]:.3g} × {curve['name']}, {cost[-1] / cost[0]:.3g} × cost")
-    ground = {"facecolor": axes.get_facecolor(), "edgecolor": "none", "pad": 1.5}  # or the line goes through it
+    ground = {"facecolor": axes.get_facecolor(), "edgecolor": "none", "pad": 1.5}  # covers the line behind the text
     axes.text(0.03, 0.97, _verdict(curve), transform=axes.transAxes, va="top", fontsize=7, color=MUTED, bbox=ground)
 
 
@@ -75,14 +75,14 @@ def _verdict(curve: dict[str, Any]) -> str:
 
 
 def _draw_memory(axes: Axes, report: dict[str, Any]) -> None:
-    """Bytes on a logarithmic axis, each written beside its point."""
+    """Draws the bytes on a logarithmic axis, with their values."""
     memory = report["memory"]
     named = {
         "a replay of 1 000 000 transitions": memory["bytes_of_a_million_transitions"],
         "parameters, optimisers, keys": memory["bytes_of_the_rest"],
-        "an environment, in the compiled step": memory["temporary_bytes_per_environment"],
-        "an environment, between steps": memory["bytes_per_environment"],
-        "a slot of the replay": memory["bytes_per_replay_slot"],
+        "one environment, in the compiled step": memory["temporary_bytes_per_environment"],
+        "one environment, between steps": memory["bytes_per_environment"],
+        "one slot of the replay": memory["bytes_per_replay_slot"],
     }
     shown = {name: value for name, value in named.items() if value is not None}
     lowest, highest = min(shown.values()) / 4, max(shown.values()) * 60
@@ -101,7 +101,7 @@ def _draw_memory(axes: Axes, report: dict[str, Any]) -> None:
 
 
 def _bytes(value: float) -> str:
-    """`value` with three digits, in bytes, kB, MB or GB."""
+    """Returns `value` with three digits, in bytes, kB, MB or GB."""
     for unit in ("B", "kB", "MB"):
         if value < 1000:
             return f"{value:.3g} {unit}"

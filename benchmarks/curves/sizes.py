@@ -14,12 +14,12 @@ from edqn_jax.config.loading import Layer, apply
 from edqn_jax.sim.mjcf import write_scene
 
 BOXES = (8, 16, 30, 60, 120)
-"""Obstacles; the random worlds have 12, 30 and 60."""
+"""Numbers of obstacles; random worlds have 12, 30 and 60."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Point:
-    """One size of what a curve is about."""
+    """One size of the quantity that a curve varies."""
 
     x: float
     label: str
@@ -28,16 +28,16 @@ class Point:
 
 @dataclasses.dataclass(frozen=True)
 class Curve:
-    """The cost of a decision over something that grows."""
+    """The sizes at which the cost of a decision is measured."""
 
     name: str
     linear: float
-    """Slope of a decision's cost where everything is paid for each unit: 1, or 0 where units are decisions' own."""
+    """Slope of linear growth: 1, or 0 if the number of decisions grows with the size."""
     points: tuple[Point, ...]
 
 
 def pixels(base: Config, quick: bool, folder: Path) -> Curve:
-    """Frames from half to three times as wide and high."""
+    """Varies the width and height of frames from half to three times the base."""
     del folder
     points = []
     for times in (1, 2) if quick else (0.5, 1, 2, 3):
@@ -49,7 +49,7 @@ def pixels(base: Config, quick: bool, folder: Path) -> Curve:
 
 
 def obstacles(base: Config, quick: bool, folder: Path) -> Curve:
-    """Worlds of boxes; those of a world with fewer are among those of one with more."""
+    """Varies the number of boxes; a smaller world has the first boxes of a larger one."""
     points = []
     for count in BOXES[::4] if quick else BOXES:
         file = folder / f"{count}-boxes.xml"
@@ -59,7 +59,7 @@ def obstacles(base: Config, quick: bool, folder: Path) -> Curve:
 
 
 def environments(base: Config, quick: bool, folder: Path) -> Curve:
-    """From a quarter to sixteen times as many, and as many updates in proportion."""
+    """Varies the number of environments from a quarter to sixteen times the base, and the updates in proportion."""
     del folder
     many = base.train.num_envs
     counts = [many, 4 * many] if quick else [many // 4, many, 4 * many, 16 * many]
@@ -67,7 +67,7 @@ def environments(base: Config, quick: bool, folder: Path) -> Curve:
 
 
 def physics_steps(base: Config, quick: bool, folder: Path) -> Curve:
-    """The same time between decisions in finer steps."""
+    """Varies the number of physics steps per decision, with the same time between decisions."""
     del folder
     points = []
     for times in (1, 4) if quick else (1, 2, 4):
@@ -77,7 +77,7 @@ def physics_steps(base: Config, quick: bool, folder: Path) -> Curve:
 
 
 def devices(base: Config, quick: bool, folder: Path) -> Curve:
-    """One, two, four devices, as many as the configuration has; each with as many environments and samples."""
+    """Varies the number of devices up to that of the base, with equal environments and samples per device."""
     del quick, folder
     most = base.train.devices
     points = []
@@ -100,17 +100,17 @@ CURVES: dict[str, Callable[[Config, bool, Path], Curve]] = {
 
 
 def with_environments(base: Config, count: int) -> Config:
-    """`base` with another number of environments and as many replayed samples for each decision."""
+    """Returns `base` with another number of environments and the same replayed samples per decision."""
     agent = base.agent
     updates = max(1, round(agent.updates_per_step * count / base.train.num_envs))
     return changed(base, train={"num_envs": count}, agent={"updates_per_step": updates})
 
 
 def changed(config: Config, **layer: Any) -> Config:
-    """`config` with the groups' keys replaced.
+    """Returns `config` with the given options of its groups replaced.
 
     Raises:
-        ConfigError: if it cannot be run.
+        ConfigError: if the result is invalid.
     """
     groups: Layer = layer
     changed = apply(config, groups, "this size")

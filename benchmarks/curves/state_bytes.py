@@ -1,4 +1,4 @@
-"""How many bytes training takes, counted from the shapes of its state; nothing is allocated."""
+"""The bytes of the train state, computed from its shapes without allocating it."""
 
 from __future__ import annotations
 
@@ -14,25 +14,25 @@ from measurement.timing import size_of
 
 @dataclasses.dataclass(frozen=True)
 class StateBytes:
-    """What the train state is made of: environments x each + slots x each + the rest, to the byte."""
+    """The bytes of the train state: environments x `environment` + replay_slots x `replay_slot` + `rest`, exactly."""
 
     environment: int
-    """One environment: body, mission, sensor, what it remembers."""
+    """Of one environment: drone, mission, sensor and the policy's memory."""
     replay_slot: int
-    """One observation in the replay, with what is stored beside it."""
+    """Of one observation in the replay with action, reward and outcome."""
     rest: int
-    """Parameters, optimisers, keys of the shards, the step; whatever the number of environments."""
+    """Of parameters, optimisers, keys of the shards and the step, independent of the number of environments."""
     environments: int
     replay_slots: int
 
 
 def state_bytes(config: Config, world: World) -> StateBytes:
-    """The bytes of the state that training with this configuration carries from step to step."""
+    """Returns the bytes of the train state for a configuration."""
     state = jax.eval_shape(lambda world, key: trainer.init(config, world, key), world, jax.random.key(0))
     actors, ring = state.actors, state.actors.replay
-    flown = size_of(dataclasses.replace(actors, replay=None, key=None))
+    environments = size_of(dataclasses.replace(actors, replay=None, key=None))
     return StateBytes(
-        environment=flown // config.train.num_envs,
+        environment=environments // config.train.num_envs,
         replay_slot=size_of(ring) // ring.reward.size,
         rest=size_of((state.learner, actors.key, state.step)),
         environments=config.train.num_envs,

@@ -1,4 +1,4 @@
-"""What a benchmark's figures are held beside: C MuJoCo's rollout, and what a device reaches at best."""
+"""References for a benchmark's figures: C MuJoCo's rollout, and the highest rates of a device."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ from edqn_jax.parallel.devices import cores
 from edqn_jax.sim import drone
 
 ROLLOUT_STEPS = 130
-"""Physics steps of C MuJoCo in one call, for each drone: ten decisions."""
+"""Physics steps of C MuJoCo in one call for each drone: ten decisions."""
 TURN_SECONDS = 0.5
-"""What a turn of it takes at least."""
+"""Minimum duration of a turn of C MuJoCo."""
 
 
 class Rollout:
-    """C MuJoCo's threaded rollout: the same airframe, constraints disabled, every core, hovering thrust."""
+    """C MuJoCo's threaded rollout of the same airframe on every core, with hover thrust and constraints disabled."""
 
     def __init__(self, config: Config) -> None:
         model = drone.c_model(config.drone)
@@ -43,7 +43,7 @@ class Rollout:
         self.pool = rollout.Rollout(nthread=threads)
 
     def turn(self) -> float:
-        """Physics steps per second."""
+        """Returns physics steps per second."""
         began, steps = time.perf_counter(), 0
         while (passed := time.perf_counter() - began) < TURN_SECONDS:
             self.pool.rollout(self.model, self.data, self.start, self.control)
@@ -52,7 +52,10 @@ class Rollout:
 
 
 def ceilings(mesh: Mesh) -> dict[str, Callable[[], float]]:
-    """What one device reaches at best while all are busy: products, fused arithmetic (flop/s), copies (bytes/s)."""
+    """Returns functions that measure the highest rates of one device while all devices are busy.
+
+    Matrix products and fused arithmetic are in flop/s, copies in bytes/s.
+    """
     spread = NamedSharding(mesh, PartitionSpec(AXIS))
     side, length, chains, rounds = 512, 2048, 8, 32
 
@@ -60,7 +63,7 @@ def ceilings(mesh: Mesh) -> dict[str, Callable[[], float]]:
         return jax.lax.fori_loop(0, 8, lambda _, y: jnp.clip(x @ y, -1.0, 1.0), x)
 
     def vector(x: Array) -> Array:
-        # In cache; every element goes through independent chains of multiplications and additions.
+        # In cache; independent chains of multiplications and additions for every element.
         def body(_: Any, y: Array) -> Array:
             parts = [y * (0.1 * (k + 1)) for k in range(chains)]
             for _ in range(rounds):
@@ -70,7 +73,7 @@ def ceilings(mesh: Mesh) -> dict[str, Callable[[], float]]:
         return jax.lax.fori_loop(0, 256, body, x)
 
     def timed(function: Callable[[Array], Array], shape: tuple[int, ...], work: float) -> Callable[[], float]:
-        # Into the memory that it came from: new pages would be timed as well.
+        # The input is donated, because new memory pages would be timed as well.
         run = jax.jit(
             jax.shard_map(
                 lambda x: function(x[0])[None], mesh=mesh, in_specs=PartitionSpec(AXIS), out_specs=PartitionSpec(AXIS)

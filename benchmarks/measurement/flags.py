@@ -1,4 +1,4 @@
-"""What a benchmark is asked for in train.py's own words, which stand after --."""
+"""Options of train.py in the arguments of a benchmark, after --."""
 
 from __future__ import annotations
 
@@ -10,21 +10,21 @@ from edqn_jax.cli.arguments import parse_train
 from edqn_jax.config import Config
 
 SAMPLES = 4
-"""Replayed samples per decision unless the flags say otherwise."""
+"""Replayed samples per decision unless the options set another number."""
 
 
 def split(words: Sequence[str]) -> tuple[list[str], list[str]]:
-    """A benchmark's own words, and those after -- that are train.py's."""
+    """Returns the arguments of the benchmark, and those after --, which are options of train.py."""
     words = list(words)
     cut = words.index("--") if "--" in words else len(words)
     return words[:cut], words[cut + 1 :]
 
 
 def configured(flags: Sequence[str]) -> Config:
-    """The configuration that train.py's flags ask for, with `SAMPLES` unless they say how much to replay.
+    """Returns the configuration of train.py with these options, with `SAMPLES` unless they set the updates per step.
 
     Raises:
-        ConfigError: if it cannot be run.
+        ConfigError: if it is invalid.
     """
     _, config = parse_train(flags)
     if any(flag.replace("_", "-").startswith(("--agent.updates-per-step", "--config")) for flag in flags):

@@ -1,4 +1,4 @@
-"""What a benchmark's JSON says beside its rows, and how it gets to the disk."""
+"""The entries that the JSON reports of all benchmarks share, and how reports are written."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from edqn_jax.runs.provenance import versions
 
 
 def machine(devices: Sequence[Any]) -> dict[str, Any]:
-    """Device and versions that figures taken on `devices` are for."""
+    """Returns device and versions for a report measured on `devices`."""
     return {
         "device": processor() if devices[0].platform == "cpu" else devices[0].device_kind,
         "devices": [str(device) for device in devices],
@@ -23,9 +23,9 @@ def machine(devices: Sequence[Any]) -> dict[str, Any]:
 
 
 def write(file: Path, report: dict[str, Any]) -> None:
-    """Writes the report whole or not at all.
+    """Writes the report atomically.
 
     Raises:
-        ConfigError: if it cannot be written.
+        ConfigError: if the file cannot be written.
     """
     write_atomically(file, json.dumps(plain(report), indent=1, allow_nan=False) + "\n")

@@ -1,4 +1,4 @@
-"""The parts that a training step is made of, each cut out of it by the function that training itself calls."""
+"""The parts of a training step, each timed through the function that training calls."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from edqn_jax.sim import camera, columns, drone, env, events, sensor
 from edqn_jax.sim.drone import DroneState
 from edqn_jax.sim.env import EnvState, World
 from edqn_jax.sim.scene import take_scene
-from measurement.timing import Part, held, nudged, operations_of, size_of
+from measurement.timing import Part, depending_on, operations_of, size_of, unchanged
 
 _ROWS, _SAME = PartitionSpec(AXIS), PartitionSpec()
 _LEARNER_AND_KEYS = (_ROWS, (_SAME, _ROWS))
@@ -28,7 +28,7 @@ _LEARNER_AND_KEYS = (_ROWS, (_SAME, _ROWS))
 
 @dataclasses.dataclass(frozen=True)
 class Moment:
-    """The state that training has come to, from which the parts take what they are given."""
+    """The state of a training, from which the parts take their inputs."""
 
     config: Config
     world: World
@@ -59,26 +59,26 @@ class Moment:
         return self.world.missions.goal[self.environments.mission]
 
     @cached_property
-    def seen(self) -> env.Step:
-        """What the next decision leads to."""
+    def next_step(self) -> env.Step:
+        """Returns the result of the next decision."""
         step = jax.jit(jax.vmap(lambda s, a: env.step(self.config, self.world, s, a)))
         return step(self.environments, self.moves)[1]
 
     @property
     def newest(self) -> Array:
-        """The replay's newest row."""
+        """Returns the number of the newest row of the replay."""
         return jnp.int32(self.state.step - trainer.Plan.of(self.config).warmup)
 
     @property
     def sampled(self) -> int:
-        """Bytes that sampling reads at the least: a row for each step of a sample's history and of its return."""
+        """Returns the minimum bytes that sampling reads: a row for each step of a sample's history and return."""
         agent = self.config.agent
         each = (agent.history + agent.n_step) * self.row // self.config.train.num_envs
         return agent.updates_per_step * agent.batch_size * each
 
     @property
     def row(self) -> int:
-        """Bytes of the replay's rows of one decision of all environments."""
+        """Returns the bytes in the replay of one decision of all environments."""
         return size_of(jax.tree.map(lambda leaf: leaf[:, 0], self.actors.replay))
 
     def keys(self, count: int) -> Array:
@@ -90,26 +90,26 @@ class Moment:
 
 
 def physics(now: Moment) -> Part:
-    """A decision's physics steps with their controller; nothing is looked at."""
+    """Returns the part of a decision's physics steps with the controller, without camera and outcome."""
     config = now.config
 
     def one(world: World, body: DroneState, move: Array, goal: Array):
         command = env.velocity_command(config.env, move, drone.yaw_of(body.quaternion))
-        bearing = jnp.arctan2(goal[1] - body.position[1], goal[0] - body.position[0])
-        flown, flight = drone.fly(config.drone, world.airframe, body, command, bearing)
-        return flown, flight.position
+        bearing = env.bearing(config.env, body, goal)
+        after, flight = drone.fly(config.drone, world.airframe, body, command, bearing)
+        return after, flight.position
 
     def body(world: World, carry):
         state, move, goal = carry
-        flown, path = jax.vmap(partial(one, world))(state, move, goal)
-        return flown, nudged(move, path), goal
+        after, path = jax.vmap(partial(one, world))(state, move, goal)
+        return after, depending_on(move, path), goal
 
     def single(world: World, carry):
-        """One physics step alone: a scan of any length is counted as one step and what stands around it."""
+        """One physics step without the scan, of which XLA counts one iteration and what is around it."""
         state, move, goal = carry
 
         def step(state: DroneState, goal: Array) -> DroneState:
-            thrust = drone.thrusts(config.drone, world.airframe, state, goal)  # any three numbers are a velocity
+            thrust = drone.thrusts(config.drone, world.airframe, state, goal)  # the goal stands for the velocity
             return drone.physics_step(config.drone, world.airframe, state, thrust)
 
         return jax.vmap(step)(state, goal), move, goal
@@ -119,20 +119,22 @@ def physics(now: Moment) -> Part:
 
 
 def outcome(now: Moment) -> Part:
-    """What the flown path touched or reached."""
+    """Returns the part that determines the outcome of a decision."""
 
     def body(world: World, carry):
         before, flight, scene, goal = carry
         judged = jax.vmap(lambda b, f, s, g: env.judge(now.config, take_scene(world.pool, s), g, b, f, jnp.int32(1)))(
             before, flight, scene, goal
         )
-        return nudged(before, judged), flight, scene, goal
+        return depending_on(before, judged), flight, scene, goal
 
-    return Part("outcome", body, now.world, (now.environments.drone.position, now.seen.flight, now.scenes, now.goals))
+    return Part(
+        "outcome", body, now.world, (now.environments.drone.position, now.next_step.flight, now.scenes, now.goals)
+    )
 
 
 def rendering(now: Moment) -> Part:
-    """A decision's frames."""
+    """Returns the part that renders the frames of a decision."""
     steps = sensor.frame_steps(now.config)
 
     def body(world: World, carry):
@@ -143,20 +145,21 @@ def rendering(now: Moment) -> Part:
             return [sensor.view(now.config, here, position[t], quaternion[t]) for t in range(len(steps))]
 
         frames = jax.vmap(one)(position, quaternion, scene)
-        return nudged(position, frames), quaternion, scene
+        return depending_on(position, frames), quaternion, scene
 
     poses = [
-        jnp.stack([path[:, t - 1] for t in steps], 1) for path in (now.seen.flight.position, now.seen.flight.quaternion)
+        jnp.stack([path[:, t - 1] for t in steps], 1)
+        for path in (now.next_step.flight.position, now.next_step.flight.quaternion)
     ]
     return Part("rendering", body, now.world, (*poses, now.scenes), by_hand=_drawing(now, *poses))
 
 
 def _drawing(now: Moment, position: Array, quaternion: Array) -> float | None:
-    """Operations that frames at poses [E, T, ...] take at the least, for each column those of the branch that it needs.
+    """Returns the minimum operations to render frames at poses [E, T, ...]; None if they cannot be counted.
 
-    XLA counts a loop's body once, and one block of columns needs another branch than the next; so every branch is
-    counted for one column, and the columns by the branch that they need. None where nothing is counted: on a GPU, and
-    for cameras that do not draw by columns.
+    XLA counts the body of a loop once, and blocks of columns differ in the branch that draws them. So the operations of
+    every branch are counted for one column, and the columns by the branch that they need. They cannot be counted on a
+    GPU and for cameras that do not draw by columns.
     """
     config = now.config.camera
     if config.mount != "level":
@@ -167,19 +170,19 @@ def _drawing(now: Moment, position: Array, quaternion: Array) -> float | None:
     )
     place = position.reshape(-1, 3)
     turn = jax.vmap(partial(sensor.mount_rotation, now.config))(quaternion.reshape(-1, 4))
-    weights = jnp.broadcast_to(jnp.asarray(events.LUMA_WEIGHTS), (len(place), 3))
+    weights = jnp.broadcast_to(jnp.asarray(camera.LUMA), (len(place), 3))
     given = (scene, place, turn, weights)
-    branches, branch = columns.draw_branches(config, *given)
-    laid = operations_of(lambda *given: columns.draw_branches(config, *given)[1], *given)
-    each = [operations_of(partial(draw, config, camera.blend), jnp.zeros(1, jnp.int32)) for draw in branches]
+    ways, way = columns.ways_to_draw(config, *given)
+    laid = operations_of(lambda *given: columns.ways_to_draw(config, *given)[1], *given)
+    each = [operations_of(partial(draw, config, camera.blend), jnp.zeros(1, jnp.int32)) for draw in ways]
     if laid is None:
         return None
-    needed = np.bincount(np.asarray(branch), minlength=len(branches))
+    needed = np.bincount(np.asarray(way), minlength=len(ways))
     return laid + sum(count * cost for count, cost in zip(needed, each, strict=True) if cost is not None)
 
 
 def sensing(now: Moment) -> Part:
-    """From frames to events."""
+    """Returns the part that computes events from frames."""
     config = now.config
 
     def body(_: None, carry):
@@ -187,7 +190,7 @@ def sensing(now: Moment) -> Part:
         field, memory = jax.vmap(lambda f, m, k: events.events(config.events, m, f, config.events.frame_times_s, k))(
             frames, memory, keys
         )
-        return nudged(frames, field), memory, keys
+        return depending_on(frames, field), memory, keys
 
     shape = (len(config.events.frame_times_s), config.camera.height, config.camera.width)
     frames = jax.random.uniform(jax.random.key(1), (config.train.num_envs, *shape))
@@ -195,18 +198,18 @@ def sensing(now: Moment) -> Part:
 
 
 def environment(now: Moment) -> Part:
-    """All of the environment's step, always from where training has come to."""
+    """Returns the part of the environment's whole step, always from the same state."""
 
     def body(world: World, carry):
         state, move = carry
-        flown, step = jax.vmap(lambda s, a: env.step(now.config, world, s, a))(state, move)
-        return held(state, flown, move), nudged(move, step.observation, step.reward)
+        after, step = jax.vmap(lambda s, a: env.step(now.config, world, s, a))(state, move)
+        return unchanged(state, after, move), depending_on(move, step.observation, step.reward)
 
-    return Part("environment", body, now.world, (now.environments, now.moves), floor=False)
+    return Part("environment", body, now.world, (now.environments, now.moves), countable=False)
 
 
 def environment_without_resets(now: Moment) -> Part:
-    """The same for environments that never end: the compiler leaves out all that a reset needs."""
+    """Returns the same for environments that never end, from which the compiler removes the resets."""
 
     def body(world: World, carry):
         state, move = carry
@@ -214,39 +217,39 @@ def environment_without_resets(now: Moment) -> Part:
         def go_on(state: EnvState, move: Array):
             return env.step(now.config, world, dataclasses.replace(state, ended=jnp.zeros((), bool)), move)
 
-        flown, step = jax.vmap(go_on)(state, move)
-        return held(state, flown, move), nudged(move, step.observation, step.reward)
+        after, step = jax.vmap(go_on)(state, move)
+        return unchanged(state, after, move), depending_on(move, step.observation, step.reward)
 
     carry = (now.environments, now.moves)
-    return Part("environment_without_resets", body, now.world, carry, floor=False)
+    return Part("environment_without_resets", body, now.world, carry, countable=False)
 
 
 def encoding(now: Moment) -> Part:
-    """From events to codes."""
+    """Returns the part that encodes events."""
 
     def body(params: Any, field: events.EventField) -> events.EventField:
         code = encoder.embed(now.config.encoder, params, field)
-        return dataclasses.replace(field, count=nudged(field.count, code))
+        return dataclasses.replace(field, count=depending_on(field.count, code))
 
-    return Part("encoder", body, now.learner.encoder, now.seen.observation.sensed, products=True)
+    return Part("encoder", body, now.learner.encoder, now.next_step.observation.sensed, products=True)
 
 
 def acting(now: Moment) -> Part:
-    """Q-values of what is remembered, and a move for each environment."""
+    """Returns the part that computes the Q-values of the policy's memory and an action for each environment."""
 
     def body(params: Any, carry):
         memory, keys = carry
         q = qnetwork.q_values(now.config.agent, params, len(env.ACTIONS), memory)
         keys = _next(keys)
         action = jax.vmap(lambda q, k: dqn.epsilon_greedy(q, jnp.float32(0.02), k))(q, keys)
-        return nudged(memory, action), keys
+        return depending_on(memory, action), keys
 
     carry = (now.actors.memory, now.shard_keys)
     return Part("acting", body, now.learner.q, carry, products=True)
 
 
 def _draw(now: Moment, ring: replay.Rows, keys: Array) -> tuple[Array, Any]:
-    """A training step's batches from the replay: the keys after it, and what depends on all that was drawn."""
+    """Draws a training step's batches from the replay; returns the next keys, and sums over all that was drawn."""
     agent, newest = now.config.agent, now.newest
     share = agent.batch_size // now.config.train.shards
 
@@ -259,12 +262,12 @@ def _draw(now: Moment, ring: replay.Rows, keys: Array) -> tuple[Array, Any]:
 
 
 def sampling(now: Moment) -> Part:
-    """Reading a training step's batches from the replay."""
+    """Returns the part that reads a training step's batches from the replay."""
 
     def body(ring: replay.Rows, carry):
         keys, result = carry
         keys, sums = _draw(now, ring, keys)
-        return keys, nudged(result, sums)
+        return keys, depending_on(result, sums)
 
     carry = (now.shard_keys, jnp.zeros(now.config.train.shards))
     updates = now.config.agent.updates_per_step
@@ -272,22 +275,22 @@ def sampling(now: Moment) -> Part:
 
 
 def replaying(now: Moment) -> Part:
-    """Writing a row into the replay, and reading batches from it."""
+    """Returns the part that writes a row into the replay and reads a training step's batches."""
 
     def body(_: None, carry):
         ring, keys = carry
         row = jax.tree.map(lambda leaf: leaf[:, 0], ring)
         ring = jax.vmap(replay.write, in_axes=(0, 0, None))(ring, row, now.newest)
         keys, sums = _draw(now, ring, keys)
-        return dataclasses.replace(ring, reward=nudged(ring.reward, sums)), keys
+        return dataclasses.replace(ring, reward=depending_on(ring.reward, sums)), keys
 
     carry = (now.actors.replay, now.shard_keys)
     updates = now.config.agent.updates_per_step
     return Part("replay", body, None, carry, scans=updates, moved=now.sampled + now.row)
 
 
-def seeing(now: Moment) -> Part:
-    """A VAE update on the events that have just been seen."""
+def vae_updating(now: Moment) -> Part:
+    """Returns the part of a VAE update on the newest events."""
 
     def body(field: events.EventField, carry):
         learner, keys = carry
@@ -295,12 +298,12 @@ def seeing(now: Moment) -> Part:
         _, learner = trainer.learn_to_see(now.config, AXIS, learner, field, keys, now.state.step)
         return learner, keys
 
-    field, carry = now.seen.observation.sensed, (now.learner, now.shard_keys)
+    field, carry = now.next_step.observation.sensed, (now.learner, now.shard_keys)
     return Part("vae_update", body, field, carry, _LEARNER_AND_KEYS, products=True, moved=size_of(field))
 
 
 def learning(now: Moment) -> Part:
-    """A training step's DQN updates and what they sample."""
+    """Returns the part of a training step's DQN updates with their sampling."""
 
     def body(ring: replay.Rows, carry):
         learner, keys = carry
@@ -340,13 +343,13 @@ PARTS: dict[str, Callable[[Moment], Part]] = {
     "acting": acting,
     "replay": replaying,
     "sampling": sampling,
-    "vae_update": seeing,
+    "vae_update": vae_updating,
     "dqn_update_and_sampling": learning,
 }
-"""Every part by the name of its row."""
+"""Parts by the name of their row."""
 
 
 def parts_of(config: Config, world: World, state: TrainState, names: Sequence[str] = tuple(PARTS)) -> list[Part]:
-    """The named parts, on the state that training has come to."""
+    """Returns the named parts on a state of the training."""
     now = Moment(config, world, state)
     return [PARTS[name](now) for name in names]

@@ -1,4 +1,4 @@
-"""Memory that processes have held."""
+"""Peak memory of processes."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from pathlib import Path
 
 
 def peak_of(process: int | str = "self") -> int | None:
-    """The most bytes that a running process has held since its program began; None where that cannot be known.
+    """Returns the peak memory of a running process since its program started, bytes; None if it is not available.
 
-    `ru_maxrss` of a process on Linux begins at what its parent held before it, so it is for other systems, where
-    only this process's own is known.
+    On Linux `ru_maxrss` starts at the memory of the parent process, so it is used only on other systems, where the
+    value is available only for this process.
     """
     try:
         status = Path(f"/proc/{process}/status").read_text(encoding="utf-8")
@@ -21,9 +21,9 @@ def peak_of(process: int | str = "self") -> int | None:
             return None
         return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * (1 if sys.platform == "darwin" else 1024)
     peaks = [int(line.split()[1]) * 1024 for line in status.splitlines() if line.startswith("VmHWM:")]
-    return peaks[0] if peaks else None  # one that has ended has none
+    return peaks[0] if peaks else None  # none for a process that has ended
 
 
 def peak_of_workers() -> int:
-    """The sum of `peak_of` the processes that this one has started through `multiprocessing` and that run."""
+    """Returns the sum of `peak_of` over the running processes that this one has started with `multiprocessing`."""
     return sum(peak_of(worker.pid) or 0 for worker in multiprocessing.active_children() if worker.pid is not None)

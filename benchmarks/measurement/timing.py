@@ -1,4 +1,4 @@
-"""How a part of the training step is timed, and the least that it could take."""
+"""How a part of the training step is timed, and the minimum time that it could take."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ from edqn_jax.learn.trainer import AXIS
 from edqn_jax.parallel.devices import compiler_options
 
 TURN_SECONDS = 0.4
-"""What a part's turn takes, about."""
+"""Approximate duration of a turn of a part."""
 
 Body = Callable[[Any, Any], Any]
-"""(what stays, carry) -> carry"""
+"""(constant, carry) -> carry"""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -30,43 +30,45 @@ class Part:
 
     name: str
     body: Body
-    stays: Any  # read in every turn
-    carry: Any  # read and written in every turn
-    specs: tuple[Any, Any] = (PartitionSpec(), PartitionSpec(AXIS))  # how both lie on the devices
-    scans: int = 1  # how often a scan inside repeats operations that are counted once
-    counted: Body | None = None  # whose operations are counted instead of the body's, `scans` times
-    products: bool = False  # whether its arithmetic is matrix products
-    by_hand: float | None = None  # operations of all decisions, where XLA cannot count them
-    floor: bool = True  # whether its operations can be counted: not where only some of them are in a scan
-    moved: int | None = None  # bytes that a turn reads and writes at the least; without it, the carry's twice
+    constant: Any  # read in every iteration
+    carry: Any  # read and written in every iteration
+    specs: tuple[Any, Any] = (PartitionSpec(), PartitionSpec(AXIS))  # layout of both on the devices
+    scans: int = 1  # iterations of a scan inside whose operations are counted once
+    counted: Body | None = None  # its operations are counted instead of those of `body`, `scans` times
+    products: bool = False  # whether its arithmetic consists of matrix products
+    by_hand: float | None = None  # operations of all decisions, if XLA cannot count them
+    countable: bool = True  # whether its operations can be counted: not if only some of them are in a scan
+    moved: int | None = None  # minimum bytes that an iteration reads and writes; None for twice those of the carry
 
 
-def nudged(value: Array, *results: Any) -> Array:
-    """`value`, in a way that the compiler must compute all of `results` for it."""
+def depending_on(value: Array, *results: Any) -> Array:
+    """Returns `value` so that the compiler must compute all of `results`."""
     total = sum(jnp.sum(leaf.astype(jnp.float32)) for leaf in jax.tree.leaves(results))
     return jnp.where(total > 1e30, value + 1, value)
 
 
-def held(before: Any, after: Any, value: Array) -> Any:
-    """`before`, in a way that the compiler must compute all of `after` for it; `value` is nowhere negative."""
+def unchanged(before: Any, after: Any, value: Array) -> Any:
+    """Returns `before` so that the compiler must compute all of `after`; `value` must not be negative anywhere."""
     never = jnp.any(value < 0)
     return jax.tree.map(lambda old, new: jnp.where(never, new, old), before, after)
 
 
 class Timed:
-    """A part, compiled as a loop over all devices."""
+    """A part, compiled as a loop on all devices."""
 
     def __init__(self, part: Part, mesh: Mesh, decisions: int) -> None:
         self.part, self.decisions, self.devices = part, decisions, mesh.size
         layout = partial(jax.tree.map, lambda spec: NamedSharding(mesh, spec), is_leaf=_is_spec)
-        self.inputs = tuple(_lay(x, layout(spec)) for x, spec in zip((part.stays, part.carry), part.specs, strict=True))
+        self.inputs = tuple(
+            _lay(x, layout(spec)) for x, spec in zip((part.constant, part.carry), part.specs, strict=True)
+        )
 
-        def turn(stays: Any, _: Any, carry: Any) -> Any:
-            # Or what does not change from turn to turn would be computed once, before them all.
-            return part.body(*jax.lax.optimization_barrier((stays, carry)))
+        def turn(constant: Any, _: Any, carry: Any) -> Any:
+            # The barrier keeps constant computations in the loop.
+            return part.body(*jax.lax.optimization_barrier((constant, carry)))
 
-        def loop(stays: Any, carry: Any, times: Array) -> Any:
-            return jax.lax.fori_loop(0, times, partial(turn, stays), carry)
+        def loop(constant: Any, carry: Any, times: Array) -> Any:
+            return jax.lax.fori_loop(0, times, partial(turn, constant), carry)
 
         specs = (*part.specs, PartitionSpec())
         spread = jax.shard_map(loop, mesh=mesh, in_specs=specs, out_specs=part.specs[1], check_vma=False)
@@ -76,24 +78,23 @@ class Timed:
         self.times = max(1, round(TURN_SECONDS / first))
 
     def seconds(self, times: int) -> float:
-        """Seconds that the part takes `times` times in a row."""
+        """Returns the seconds of `times` iterations."""
         began = time.perf_counter()
         jax.block_until_ready(self.loop(*self.inputs, jnp.int32(times)))
         return time.perf_counter() - began
 
     def turn(self) -> float:
-        """Microseconds of one device that a decision takes."""
+        """Returns the microseconds of one device per decision."""
         return 1e6 * self.seconds(self.times) * self.devices / (self.times * self.decisions)
 
     def floor(self, ceilings: dict[str, float]) -> dict[str, float]:
-        """Operations and bytes of a decision, and the microseconds of one device that they take at the least.
+        """Returns operations and bytes of a decision, and the minimum time they take, in microseconds of one device.
 
-        Operations are XLA's count before any optimisation, a transcendental as one: what is written down, of
-        which a compiler may still save some, so that a part can come close to its floor. Bytes are what must
-        be read and written at the least: what the part is given and what it returns, each once.
+        Operations are XLA's count before optimisation, with a transcendental as one; the compiler may remove some of
+        them. Bytes are those of the part's inputs and outputs, each once.
         """
         part = self.part
-        once = operations(part) if part.floor else None
+        once = operations(part) if part.countable else None
         if once is None:
             return {}
         count = part.scans * once / self.decisions
@@ -104,24 +105,24 @@ class Timed:
 
 
 def operations(part: Part) -> float | None:
-    """XLA's count for all decisions, what stands in a scan once; None where it does not count (on a GPU)."""
+    """Returns XLA's count for all decisions, with the body of a scan once; None if XLA does not count (on a GPU)."""
     alone = Mesh(np.asarray(jax.devices()[:1]), (AXIS,))
     if part.by_hand is not None:
         return part.by_hand
     body = part.counted or part.body
     once = jax.shard_map(body, mesh=alone, in_specs=part.specs, out_specs=part.specs[1], check_vma=False)
-    return operations_of(once, part.stays, part.carry)
+    return operations_of(once, part.constant, part.carry)
 
 
 def operations_of(function: Callable[..., Any], *inputs: Any) -> float | None:
-    """XLA's count of what a function does with such inputs, a transcendental as one; None where it does not count."""
+    """Returns XLA's count of a function's operations, with a transcendental as one; None if XLA does not count."""
     shapes = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype), inputs)
     counted: Any = jax.jit(function).lower(*shapes).cost_analysis()
     return None if counted is None else counted.get("flops", 0.0) + counted.get("transcendentals", 0.0)
 
 
 def size_of(tree: Any) -> int:
-    """Bytes of all arrays of a tree, or of what `jax.eval_shape` says of them."""
+    """Returns the bytes of all arrays, or of all shapes from `jax.eval_shape`, in a tree."""
     shapes = jax.eval_shape(partial(jax.tree.map, _raw), tree)
     return sum(leaf.size * leaf.dtype.itemsize for leaf in jax.tree.leaves(shapes))
 
@@ -135,7 +136,7 @@ def _is_spec(x: Any) -> bool:
 
 
 def _lay(tree: Any, layout: Any) -> Any:
-    """`tree` on the devices; `layout` is a prefix of it."""
+    """Returns `tree` on the devices; `layout` is a prefix of it."""
     if isinstance(layout, tuple):
         return tuple(_lay(x, y) for x, y in zip(tree, layout, strict=True))
     return jax.device_put(tree, layout)

@@ -1,4 +1,4 @@
-"""The whole training step in steady state: its configuration, and a compiled chunk of it to be timed."""
+"""The whole training step in steady state: its configuration, and a compiled chunk of it for timing."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ WHOLE = "whole_training_step"
 
 
 def steady(config: Config, chunk_steps: int) -> Config:
-    """`config` with the VAE learning throughout and a beginning of two chunks: what follows is all alike."""
+    """Returns `config` with the VAE learning throughout and two chunks of warm-up, after which all chunks are alike."""
     decisions = chunk_steps * config.train.num_envs
     return dataclasses.replace(
         config,
@@ -30,7 +30,7 @@ def steady(config: Config, chunk_steps: int) -> Config:
 
 
 class WholeStep:
-    """The training command's own compiled chunk, past its beginning."""
+    """The compiled chunk of the training command, after the warm-up."""
 
     def __init__(self, config: Config, world: env.World, devices: Sequence[Any]) -> None:
         self.trainer = Trainer(config, world, devices)
@@ -46,12 +46,16 @@ class WholeStep:
 
     @property
     def temporary_bytes(self) -> int:
-        """What the compiled chunk needs on each device beside its inputs and outputs."""
+        """Returns the bytes that the compiled chunk needs on each device besides its inputs and outputs."""
         chunk: Any = self.trainer._chunk
         return chunk.memory_analysis().temp_size_in_bytes
 
     def turn(self) -> float:
-        """Decisions per second of one more chunk."""
+        """Runs one more chunk and returns its decisions per second.
+
+        Raises:
+            RuntimeError: if Q-network or VAE did not learn in the whole chunk.
+        """
         began = time.perf_counter()
         self.state, (_, losses) = self.trainer.chunk(self.state, self.done)
         q_loss = np.asarray(losses.q_loss)

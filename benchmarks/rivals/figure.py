@@ -1,4 +1,4 @@
-"""The picture of `runtime.py`: for each world how long each method plans, how far it flies and how often it arrives."""
+"""The picture of `runtime.py`: planning time, path length and success of each method for each world."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ CURVES = {
     "DQN depth": "#009e73",
     "DQN ranges": "#cc79a7",
 }
-"""Okabe and Ito's colours again."""
+"""Colours of Okabe and Ito."""
 
 
 def draw_runtime(rows: Sequence[Row], file: Path) -> Figure:
-    """The rows as a PNG: a line of panels for each world."""
+    """Writes the rows as a PNG, with a line of panels for each world, and returns the figure."""
     worlds = list(dict.fromkeys(row["world"] for row in rows)) or ["no"]
     most = max((len([row for row in rows if row["world"] == world]) for world in worlds), default=1)
     with drawing(11.0, 0.4 + len(worlds) * (1.2 + 0.21 * most), file) as figure:
@@ -59,9 +59,9 @@ def _caption(rows: Sequence[Row]) -> str:
     devices = ", ".join(dict.fromkeys(row["device"] for row in rows if row["device"]))
     quick = "; too short to converge" if any(row["settings"].get("quick") for row in rows) else ""
     return (
-        f"{devices}{quick}. Blue learns and has no map, orange plans on the map. "
+        f"{devices}{quick}. Blue: learners, without a map. Orange: planners, with the map. "
         "Planning: computation alone; medians of flights that arrived. Bars: 95 % intervals.\n"
-        "DQN depth and DQN ranges have true sensors: upper bounds. The paper's world is our reconstruction."
+        "DQN depth and DQN ranges have exact sensors: upper bounds. The paper's world is our reconstruction."
     )
 
 
@@ -111,7 +111,7 @@ def _dot(axes: Axes, value: float, place: float, colour: str, text: str) -> None
 
 
 def _aside(axes: Axes, place: float, text: str) -> None:
-    """What stands in the place of a dot."""
+    """Writes a text in place of a dot."""
     axes.text(0.02, place, text, transform=axes.get_yaxis_transform(), fontsize=7, color=MUTED, va="center")
 
 
@@ -125,7 +125,7 @@ def _time(seconds: float) -> str:
 
 
 def _tick_times(axes: Axes) -> None:
-    """Two ticks at least on a logarithmic axis of seconds."""
+    """Sets at least two ticks on a logarithmic axis of seconds."""
     low, high = axes.get_xlim()
     axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if high < 50 * low else (1.0,)))
     axes.xaxis.set_minor_locator(NullLocator())
@@ -133,7 +133,7 @@ def _tick_times(axes: Axes) -> None:
 
 
 def _widen(planning: Axes, path: Axes) -> None:
-    """Room on the right for what stands beside the dots; a decade at least, or like times look apart."""
+    """Extends both axes to the right for the texts beside the dots; that of times covers at least a decade."""
     low, high = planning.get_xlim()
     low = min(low, high / 10)
     planning.set_xlim(low, high * (high / low) ** 0.3)
@@ -142,8 +142,8 @@ def _widen(planning: Axes, path: Axes) -> None:
 
 
 def _draw_curves(axes: Axes, rows: Sequence[Row]) -> None:
-    """Share of validation missions flown after so many seconds of training, a line a seed."""
-    axes.set_title("Validation missions flown")
+    """Draws the validation success over training time, a line for each seed."""
+    axes.set_title("Validation success")
     axes.set_ylim(-0.03, 1.03)
     axes.yaxis.set_major_formatter(PercentFormatter(1.0))
     axes.set_xlabel("training time (log scale)")
@@ -159,5 +159,5 @@ def _draw_curves(axes: Axes, rows: Sequence[Row]) -> None:
     if axes.get_lines():
         axes.set_xscale("log")
         _tick_times(axes)
-        # Beside the panel: within it lines end anywhere.
+        # Beside the panel, because within it the legend would cover lines.
         axes.legend(loc="upper left", bbox_to_anchor=(1.0, 1.0))

@@ -1,9 +1,10 @@
-"""Intervals of 95 % for success rates over seeds and missions.
+"""95 % confidence intervals of success rates over seeds and missions.
 
-A single rate, of one seed or of one mission, has Wilson's. Where seeds fly the same missions the interval must
-hold for other seeds and other missions: a bootstrap draws seeds with replacement, and missions with replacement for
-all seeds alike, since what is hard is hard for every seed (Owen, "The pigeonhole bootstrap", Ann. Appl. Stat. 1(2),
-2007). Methods are its strata: each one's seeds are drawn from its own, the missions for all of them together.
+The rate of a single seed or a single mission has Wilson's interval. If several seeds fly the same missions, the
+interval must hold for other seeds and other missions: a bootstrap draws seeds with replacement and missions with
+replacement, the same missions for all seeds, because a difficult mission is difficult for every seed (Owen, "The
+pigeonhole bootstrap", Ann. Appl. Stat. 1(2), 2007). Methods are strata: seeds are drawn within a method, missions for
+all methods together.
 """
 
 from __future__ import annotations
@@ -16,9 +17,9 @@ DRAWS = 10_000
 
 
 def rate_interval(success: np.ndarray) -> tuple[float, float]:
-    """The interval of a success rate; `success` is [S, M] bool, S seeds on the same M missions.
+    """Returns the interval of a success rate; `success` is [S, M] bool, S seeds on the same M missions.
 
-    A rate of 0 or 1 has Wilson's interval of M missions: nothing can be drawn from it.
+    A rate of 0 or 1 has Wilson's interval of M missions, because its bootstrap does not vary.
     """
     success = np.asarray(success, bool)
     if min(success.shape) == 1:
@@ -30,13 +31,13 @@ def rate_interval(success: np.ndarray) -> tuple[float, float]:
 
 
 def difference_interval(first: np.ndarray, second: np.ndarray) -> tuple[float, float]:
-    """The interval of the first rate less the second; [S, M] and [T, M] bool, seeds of two methods on M missions.
+    """Returns the interval of the first rate minus the second; [S, M] and [T, M] bool, of the same M missions.
 
-    Where one of the rates is 0 or 1 nothing can be drawn from it; both rates' own intervals then make that of the
-    difference (Newcombe, Statistics in Medicine 17, 1998, method 10).
+    If one of the rates is 0 or 1, its bootstrap does not vary; the interval is then computed from those of both rates
+    (Newcombe, Statistics in Medicine 17, 1998, method 10).
 
     Raises:
-        ValueError: if the missions are not as many.
+        ValueError: if the numbers of missions differ.
     """
     drawn = drawn_rates([first, second])
     if all(0 < np.mean(success) < 1 for success in (first, second)):
@@ -51,22 +52,22 @@ def difference_interval(first: np.ndarray, second: np.ndarray) -> tuple[float, f
 
 
 def drawn_rates(strata: list[np.ndarray], draws: int = DRAWS, seed: int = 0) -> np.ndarray:
-    """Success rates [strata, draws] of bootstrap draws; `strata` are [seeds, missions] bool, with equal missions.
+    """Returns success rates [strata, draws] of bootstrap draws; `strata` are [seeds, missions] bool, of equal missions.
 
     Raises:
-        ValueError: if the missions are not as many.
+        ValueError: if the numbers of missions differ.
     """
     missions = {np.shape(success)[1] for success in strata}
     if len(missions) != 1:
         raise ValueError(f"strata must have the same missions, not {sorted(missions)} of them")
     (count,) = missions
     random = np.random.default_rng(seed)
-    often = random.multinomial(count, np.full(count, 1 / count), size=draws)  # [draws, M]
+    times = random.multinomial(count, np.full(count, 1 / count), size=draws)  # [draws, M]
     rates = []
     for success in strata:
         seeds = len(success)
         chosen = random.multinomial(seeds, np.full(seeds, 1 / seeds), size=draws)  # [draws, S]
-        rates.append(np.sum((chosen @ np.asarray(success, float)) * often, axis=1) / (seeds * count))
+        rates.append(np.sum((chosen @ np.asarray(success, float)) * times, axis=1) / (seeds * count))
     return np.array(rates)
 
 

@@ -1,4 +1,4 @@
-"""Learners in `runtime.py`: one program, compiled once, trains seed after seed and flies what was learnt."""
+"""Learners in `runtime.py`: a program that is compiled once trains one seed after another and flies each policy."""
 
 from __future__ import annotations
 
@@ -34,11 +34,11 @@ LEARNERS = {
     "DQN depth": "depth",
     "DQN ranges": "ranges",
 }
-"""What each sees, `env.sensor`; in all else they are alike."""
+"""`env.sensor` by learner; everything else is the same."""
 
 
-def flown_rows(flights: Flights, count: int) -> dict[str, list[Any]]:
-    """The first `count` flights, a list for each figure."""
+def flight_columns(flights: Flights, count: int) -> dict[str, list[Any]]:
+    """Returns the first `count` flights as a list for each figure."""
     return {
         "outcome": [Outcome(int(kind)).name.lower() for kind in flights.outcome[:count]],
         "decisions": [int(n) for n in flights.decisions[:count]],
@@ -48,11 +48,11 @@ def flown_rows(flights: Flights, count: int) -> dict[str, list[Any]]:
     }
 
 
-class Watched:
-    """One training as it is validated: its curve, and what it would end with by now."""
+class Validation:
+    """The validations of one training: its learning curve and the parameters that would be kept so far."""
 
     def __init__(self, config: Config, missions: RunMissions, fly: Callable[[World, Any], Flights]) -> None:
-        """`fly` flies every mission of a world once, greedily, with parameters of whatever kind."""
+        """`fly(world, params)` flies every mission of a world once, greedily."""
         self.config, self.missions, self.fly = config, missions, fly
         self.judged = judged_of(config, missions)
         self.kept: Candidate | None = None
@@ -60,16 +60,16 @@ class Watched:
 
     @property
     def checked(self) -> int:
-        """Decisions before the last validation."""
+        """Returns the number of decisions at the last validation."""
         return self.curve[-1]["decisions"] if self.curve else 0
 
     def validate(self, params: Any, decisions: int, seconds: float) -> None:
-        """Flies the validation missions, and those that are judged if these parameters are kept."""
-        flown = self.fly(self.missions.validation.world, params)
-        latest = validated(self.config, self.missions, flown, params, decisions)
+        """Flies the validation missions and, if these parameters are kept, the test missions."""
+        flights = self.fly(self.missions.validation.world, params)
+        latest = validated(self.config, self.missions, flights, params, decisions)
         before, self.kept = self.kept, choose(self.config.train.keep, self.kept or latest, latest)
         if self.kept is not before:
-            self.flown = flown_rows(self.fly(self.missions.final.world, params), self.judged)
+            self.flights = flight_columns(self.fly(self.missions.final.world, params), self.judged)
         self.curve.append(
             {
                 "decisions": decisions,
@@ -77,28 +77,29 @@ class Watched:
                 "validation_success": latest.success,
                 "validation_mission": latest.success_near_start,
                 "validation_spl": latest.spl,
-                "test": "".join("01"[outcome == "goal"] for outcome in self.flown["outcome"]),
+                "test": "".join("01"[outcome == "goal"] for outcome in self.flights["outcome"]),
             }
         )
 
-    def turn(
-        self, seed: int, decisions: int, seconds: float, think: Callable[[Any, int], np.ndarray]
+    def result(
+        self, seed: int, decisions: int, seconds: float, decision_seconds: Callable[[Any, int], np.ndarray]
     ) -> dict[str, Any]:
-        """What came of it.
+        """Returns the result of a training.
 
         Args:
             seed: of the training.
-            decisions, seconds: of all of it.
-            think: the seconds [n] that each of n decisions with such parameters takes.
+            decisions, seconds: of the whole training.
+            decision_seconds: returns the seconds [n] of n decisions with given parameters.
 
         Returns:
-            `train_seconds` and `decisions`; `curve`, a point for each validation, with `test`, which of the judged
-            missions the parameters kept by then fly, a digit each; the `first_success_*` of `run.first_success`, of
-            these seconds; the judged `flights`, with the seconds of computation of each (`planning_seconds`).
+            `train_seconds` and `decisions`; `curve`, a point for each validation, whose `test` is a digit for each test
+            mission, 1 if the parameters kept so far reach the goal; `first_success_*` of
+            `training.selection.first_success`; `flights` of the test missions, with the seconds of computation of each
+            (`planning_seconds`).
         """
         since = first_success([(p["decisions"], p["seconds"], p["validation_mission"]) for p in self.curve])
         assert self.kept is not None
-        thinking = np.cumsum(think(self.kept.params, max(self.flown["decisions"])))
+        elapsed = np.cumsum(decision_seconds(self.kept.params, max(self.flights["decisions"])))
         return {
             "seed": seed,
             "failure": None,
@@ -107,20 +108,20 @@ class Watched:
             "first_success_decisions": since[0],
             "first_success_seconds": since[1],
             "curve": self.curve,
-            "flights": {**self.flown, "planning_seconds": [float(thinking[n - 1]) for n in self.flown["decisions"]]},
+            "flights": {**self.flights, "planning_seconds": [float(elapsed[n - 1]) for n in self.flights["decisions"]]},
         }
 
 
 def judged_of(config: Config, missions: RunMissions) -> int:
-    """How many of the final missions are judged: in a world from a file the others are validation's."""
+    """Returns the number of test missions: in a world from a file only one, the others are for validation."""
     return missions.final.world.missions.scene.shape[0] if config.world.name in DENSITIES else 1
 
 
 class Learner:
-    """Trains from scratch for each seed, as `train.py` does, and flies the missions that are judged."""
+    """Trains from scratch for each seed, as `train.py` does, and flies the test missions."""
 
     def __init__(self, config: Config) -> None:
-        """Compiles all that training and flying need.
+        """Compiles training and flights.
 
         Raises:
             ConfigError: if the configuration cannot be trained.
@@ -141,9 +142,9 @@ class Learner:
         return fly_on_all_devices(self.config, world, params, self.config.train.seed)
 
     def turn(self, seed: int) -> dict[str, Any]:
-        """One seed, trained and flown: see `Watched.turn`. The seconds are of the chunks alone."""
+        """Trains and flies one seed and returns `Validation.result`. Seconds are of the chunks alone."""
         config, plan, envs = self.config, self.trainer.plan, self.config.train.num_envs
-        watched = Watched(config, self.missions, self._fly)
+        validation = Validation(config, self.missions, self._fly)
         state = self.trainer.init(seed)
         seconds, done = 0.0, 0
         while done < plan.total:
@@ -155,14 +156,14 @@ class Learner:
             try:
                 check_finite(plan, done, losses)
             except DivergedError as error:
-                return diverged(seed, str(error), done * envs, seconds, watched)
-            if done >= plan.total or is_due(config, plan, watched.checked, done):
-                watched.validate(jax.tree.map(np.asarray, policy_of(state)), done * envs, seconds)
-        return watched.turn(seed, done * envs, seconds, lambda params, n: decision_seconds(config, params, n))
+                return diverged(seed, str(error), done * envs, seconds, validation)
+            if done >= plan.total or is_due(config, plan, validation.checked, done):
+                validation.validate(jax.tree.map(np.asarray, policy_of(state)), done * envs, seconds)
+        return validation.result(seed, done * envs, seconds, lambda params, n: decision_seconds(config, params, n))
 
 
-def diverged(seed: int, failure: str, decisions: int, seconds: float, watched: Watched) -> dict[str, Any]:
-    """The turn of a seed whose training met numbers that are not finite: none of its missions is flown."""
+def diverged(seed: int, failure: str, decisions: int, seconds: float, validation: Validation) -> dict[str, Any]:
+    """Returns the result of a seed whose training diverged: no mission is flown."""
     nothing = {
         "decisions": 0,
         "flight_seconds": 0.0,
@@ -177,16 +178,16 @@ def diverged(seed: int, failure: str, decisions: int, seconds: float, watched: W
         "train_seconds": seconds,
         "first_success_decisions": None,
         "first_success_seconds": None,
-        "curve": watched.curve,
-        "flights": {key: [value] * watched.judged for key, value in {"outcome": "diverged", **nothing}.items()},
+        "curve": validation.curve,
+        "flights": {key: [value] * validation.judged for key, value in {"outcome": "diverged", **nothing}.items()},
     }
 
 
 def sensing(config: Config, name: str) -> Config:
-    """`config` as the learner of that name has it.
+    """Returns `config` with the sensor of that learner.
 
     Raises:
-        ConfigError: if the rest of it does not go with that sensor.
+        ConfigError: if other options cannot be combined with that sensor.
     """
     config = apply(config, {"env": {"sensor": LEARNERS[name]}}, name)
     validate(config)

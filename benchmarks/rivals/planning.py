@@ -1,4 +1,4 @@
-"""Planners in `runtime.py`: they plan on the map, and what they planned is flown."""
+"""Planners in `runtime.py`: they plan on the map, and the follower flies the path."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ NOT_FLOWN = {"outcome": "no_path", "decisions": 0, "flight_seconds": 0.0, "path_
 
 
 def judged_scenes(config: Config, count: int) -> list[Scene]:
-    """The worlds that are flown from their own start to their own goal: `count` test worlds, or the one of a file.
+    """Returns the worlds of the test missions: `count` random test worlds, or the one world of a file.
 
     Raises:
-        ConfigError: if there is no such world, or no drone can stand where the mission starts or ends.
+        ConfigError: if there is no such world, or its start or goal is not free.
     """
     name, radius = config.world.name, config.drone.body_radius_m
     if name in DENSITIES:
@@ -39,7 +39,7 @@ def judged_scenes(config: Config, count: int) -> list[Scene]:
 
 
 def shortest_length(radius: float, scene: Scene) -> float | None:
-    """Length of A*'s path for a sphere of that radius from start to goal, metres; None where there is none."""
+    """Returns the length of A*'s path from start to goal for a sphere of that radius, metres; None without a path."""
     try:
         return shortest_path(scene, scene.start, scene.goal, radius).length_m
     except NoPathError:
@@ -47,14 +47,14 @@ def shortest_length(radius: float, scene: Scene) -> float | None:
 
 
 class Planning:
-    """A planner that knows the map, and the airframe that flies its paths."""
+    """A planner, and the follower that flies its paths."""
 
     def __init__(self, name: str, config: Config, seconds: float, count: int) -> None:
-        """`seconds` is the budget of each plan; in random worlds `count` missions are planned and flown.
+        """Loads the planner. `seconds` is the budget of a plan, `count` the number of missions in random worlds.
 
         Raises:
             MissingPackageError: if a package that it needs is not installed.
-            ConfigError: if the world cannot be flown in.
+            ConfigError: if the world cannot be used.
         """
         self.name, self.config, self.budget = name, config, Budget(seconds=seconds)
         self.plan = load_planner(name)
@@ -62,17 +62,17 @@ class Planning:
         self.airframe = load_airframe(config.drone)
         self.follower = compiled_follower()
         machine = json_report.machine(jax.devices())
-        if name != "SNN":  # the others compute on the CPU, whatever JAX prefers
+        if name != "SNN":  # the others run on the CPU, whatever JAX's default device
             machine |= {"device": processor(), "devices": []}
         self.about = {**machine, "workload": workload(config, self.scenes[0])}
-        self._mission(self.scenes[0], 0)  # compiles what the planner itself does not compile before its clock starts
+        self._mission(self.scenes[0], 0)  # compiles what the planner does not compile before it measures time
 
     def turn(self, seed: int) -> dict[str, Any]:
-        """Every mission planned and flown.
+        """Plans and flies every mission.
 
         Returns:
-            `flights`: as of a learner, with the reason where there is no path. `planning_seconds` is what it
-            took to plan what was flown, `planned_m` how long that path is as drawn.
+            `flights` as of a learner, with the `reason` where there is no path. `planning_seconds` is the time of the
+            plan, `planned_m` the length of the planned path.
         """
         count = len(self.scenes)
         missions = [self._mission(scene, seed * count + index) for index, scene in enumerate(self.scenes)]
@@ -86,13 +86,13 @@ class Planning:
         if plan.path is None:
             return {**NOT_FLOWN, **said, "planned_m": None}
         goal, points = np.float32(task.goal), sampled(plan.path)
-        flown = jax.device_get(self.follower(config, follow, self.airframe, scene, goal, points))
+        flight = jax.device_get(self.follower(config, follow, self.airframe, scene, goal, points))
         return {
-            "outcome": Outcome(int(flown.outcome)).name.lower(),
-            "decisions": int(flown.decisions),
-            "flight_seconds": float(flown.flight_seconds),
-            "path_length_m": float(flown.path_length_m),
-            "clearance_m": float(flown.closest.distance),
+            "outcome": Outcome(int(flight.outcome)).name.lower(),
+            "decisions": int(flight.decisions),
+            "flight_seconds": float(flight.flight_seconds),
+            "path_length_m": float(flight.path_length_m),
+            "clearance_m": float(flight.closest.distance),
             **said,
             "planned_m": plan.length_m,
         }

@@ -1,8 +1,8 @@
-"""One method on one world, kept alive: a child of `runtime.py`.
+"""The process of `runtime.py` that runs one method on one world.
 
-Started as `python -P rival.py NAME CONFIG.yaml SECONDS MISSIONS`, the last two a planner's budget and how many
-missions it is given. It says what it is, or `reason`, why it is not there; then, for each seed that it is asked for,
-how that went.
+Started as `python -P rival.py NAME CONFIG.yaml SECONDS MISSIONS`; the last two are the budget and the number of
+missions of a planner. It prints a description of the method, or `reason`, why it cannot run; then, for each seed in
+its input, the result.
 """
 
 from __future__ import annotations
@@ -29,17 +29,17 @@ from rivals.stack import STACK, STEADY, Stack
 
 
 def peak_bytes(workers: int) -> dict[str, int | None]:
-    """The most memory held so far, by this process and the `workers` bytes of others, and on an accelerator, if any."""
+    """Returns the peak memory so far of this process plus `workers` bytes of others, and of the accelerator if any."""
     stats = jax.devices()[0].memory_stats() or {}
     return {"peak_bytes": (peak_of() or 0) + workers, "device_peak_bytes": stats.get("peak_bytes_in_use")}
 
 
 def method(name: str, config: Config, seconds: float, missions: int) -> Any:
-    """What the name stands for: something with `about` and `turn`.
+    """Returns the method of that name, which has `about` and `turn`.
 
     Raises:
-        ConfigError: if the configuration cannot be run.
-        MissingPackageError: if a package that it needs is not installed.
+        ConfigError: if the configuration is invalid.
+        MissingPackageError: if a required package is not installed.
     """
     if name in PLANNERS:
         return Planning(name, config, seconds, missions)
@@ -52,19 +52,19 @@ def main(stream: TextIO) -> None:
     config = apply(Config(), load_layer(Path(file)), file)
     use_cpu_devices()
 
-    def say(what: dict[str, Any]) -> None:
+    def send(what: dict[str, Any]) -> None:
         print(json.dumps(plain(what), allow_nan=False), file=stream)
 
     try:
         rival = method(name, config, float(seconds), int(missions))
     except (ConfigError, MissingPackageError) as error:
-        say({"reason": str(error)})
+        send({"reason": str(error)})
         return
-    say(rival.about)
+    send(rival.about)
     for line in sys.stdin:
         turn = rival.turn(int(line))
         workers = turn.pop("workers_peak_bytes", 0)
-        say({**turn, **peak_bytes(workers)})
+        send({**turn, **peak_bytes(workers)})
 
 
 if __name__ == "__main__":

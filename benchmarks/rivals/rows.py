@@ -1,6 +1,6 @@
-"""The rows of `runtime.py`: turns of one method on one world, and the figures that they come to.
+"""The rows of `runtime.py`: the results of one method on one world, one for each seed, and the figures of them all.
 
-A row keeps its turns, one for each seed, so that rows of several files can be put together.
+A row keeps the result of each seed (`turns`), so that rows of several files can be joined.
 """
 
 from __future__ import annotations
@@ -13,19 +13,19 @@ from typing import Any
 import numpy as np
 
 from edqn_jax.errors import ConfigError
-from edqn_jax.planners.planner import DRAWING
+from edqn_jax.planners.planner import SAMPLING
 from rivals.intervals import difference_interval, rate_interval
 
 Row = dict[str, Any]
 
 
 def joined(rows: Iterable[Row]) -> list[Row]:
-    """Rows of one method, world, device and setting as one row with the seeds of all.
+    """Joins the rows of the same method, world, device and settings into one row with all seeds.
 
-    Of a method that ran in one place and could not in another the row that says why is left out.
+    A row of a method that could not run is left out if the method ran in another row of that world.
 
     Raises:
-        ConfigError: if a seed is there twice.
+        ConfigError: if a seed occurs twice.
     """
     together: dict[str, Row] = {}
     for row in rows:
@@ -37,7 +37,7 @@ def joined(rows: Iterable[Row]) -> list[Row]:
         seeds = {turn["seed"] for turn in first["turns"]}
         for turn in row["turns"]:
             if turn["seed"] in seeds:
-                raise ConfigError(f"seed {turn['seed']} of {row['name']} on {row['world']} is there twice")
+                raise ConfigError(f"seed {turn['seed']} of {row['name']} on {row['world']} occurs twice")
             first["turns"].append(turn)
         first["reason"] = first["reason"] or row["reason"]
     ran = {(row["name"], row["world"]) for row in together.values() if row["turns"]}
@@ -45,16 +45,16 @@ def joined(rows: Iterable[Row]) -> list[Row]:
 
 
 def success(row: Row) -> np.ndarray:
-    """Which flights reached the goal: [seeds, missions] bool. Of a planner that draws nothing one seed is all."""
-    turns = row["turns"][:1] if row["kind"] == "planner" and row["name"] not in DRAWING else row["turns"]
+    """Returns which flights reached the goal, [seeds, missions] bool; of a deterministic planner only one seed."""
+    turns = row["turns"][:1] if row["kind"] == "planner" and row["name"] not in SAMPLING else row["turns"]
     return np.array([[outcome == "goal" for outcome in turn["flights"]["outcome"]] for turn in turns], bool)
 
 
 def figures(row: Row) -> dict[str, Any]:
-    """What a row's turns come to; None where there is nothing to tell.
+    """Returns the figures of a row; None where there is no value.
 
-    Times, decisions, paths and clearance are medians (clearance the least) of the flights that reached the goal;
-    the planned path's are of all that were planned. Seeds that never flew nine of ten count as slower than any.
+    Times, decisions and path lengths are medians, and clearance the minimum, of the flights that reached the goal;
+    planned lengths are of all planned paths. Training times of seeds without a first success count as infinite.
     """
     turns = row["turns"]
     if not turns:
@@ -106,29 +106,29 @@ def _median_or_never(values: Sequence[float | None]) -> float | None:
     return float(median) if np.isfinite(median) else None
 
 
-# ------------------------------------------------------------------------- what events are worth
+# ------------------------------------------------------------------------ learners at equal budget
 
 
 @dataclasses.dataclass(frozen=True)
 class Worth:
-    """Learners on the same missions, with the same budget, on the same device."""
+    """Learners compared on the same missions, with the same budget, on the same device."""
 
     world: str
     device: str
     decisions: int
     seconds: float
-    """What the fastest learner needed for its budget: median over its seeds."""
+    """Training time of the fastest learner: median over its seeds."""
     rates: list[dict[str, Any]]
     """For each learner `name`, `seconds` of its whole training, and rate and interval `at_decisions`, `at_seconds`."""
     differences: list[dict[str, Any]]
-    """E-DQN less each other one, likewise."""
+    """The same for E-DQN minus each other learner."""
 
 
 def worth(rows: Sequence[Row]) -> list[Worth]:
-    """What events are worth, for each set of learners' rows that can be compared.
+    """Compares the learners of each set of rows that can be compared.
 
-    At equal decisions each learner flies what it ends with. At equal wall time it flies what it had kept by then:
-    the last point of its curve that lies within the time the fastest one needed; before its first it has nothing.
+    At equal decisions each learner flies its final parameters. At equal wall time it flies those that it had kept when
+    the fastest learner ended: the last point of its curve within that time. Before its first point it has no success.
     """
     sets: dict[tuple[str, str, str], list[Row]] = {}
     for row in rows:
@@ -141,13 +141,13 @@ def worth(rows: Sequence[Row]) -> list[Worth]:
 def _worth(rows: Sequence[Row]) -> Worth:
     whole = {row["name"]: statistics.median(turn["train_seconds"] for turn in row["turns"]) for row in rows}
     seconds = min(whole.values())
-    flown = {row["name"]: {"at_decisions": success(row), "at_seconds": kept_by(row, seconds)} for row in rows}
+    successes = {row["name"]: {"at_decisions": success(row), "at_seconds": kept_by(row, seconds)} for row in rows}
     rates = [
         {"name": name, "seeds": len(cut["at_decisions"]), "seconds": whole[name]}
         | {at: {"rate": float(bits.mean()), "interval": rate_interval(bits)} for at, bits in cut.items()}
-        for name, cut in flown.items()
+        for name, cut in successes.items()
     ]
-    ours = flown.get("E-DQN")
+    ours = successes.get("E-DQN")
     differences = [
         {"name": name}
         | {
@@ -157,7 +157,7 @@ def _worth(rows: Sequence[Row]) -> Worth:
             }
             for at in ours
         }
-        for name, cut in flown.items()
+        for name, cut in successes.items()
         if ours is not None and name != "E-DQN"
     ]
     first = rows[0]
@@ -165,7 +165,7 @@ def _worth(rows: Sequence[Row]) -> Worth:
 
 
 def kept_by(row: Row, seconds: float) -> np.ndarray:
-    """Which judged missions [seeds, missions] a learner flies with what it has after so many seconds of training."""
+    """Returns which test missions a learner completes after so many seconds of training, [seeds, missions] bool."""
     missions = len(row["turns"][0]["flights"]["outcome"])
     bits = []
     for turn in row["turns"]:

@@ -1,6 +1,6 @@
-"""The conventional stack in `runtime.py`: trained and flown as the learners are, and both timed in steady training.
+"""The conventional stack in `runtime.py`, trained and flown as the learners are, and the steady training of both.
 
-The settings of its processes and threads are all timed, and the fastest counts.
+All settings of processes and threads are timed; the results are of the fastest.
 """
 
 from __future__ import annotations
@@ -23,24 +23,24 @@ from edqn_jax.sim.flights import Flights
 from measurement import json_report
 from measurement.peak_memory import peak_of_workers
 from measurement.whole import WholeStep, steady
-from rivals.learners import Watched
+from rivals.learners import Validation
 
 STACK = "Conventional stack"
 DECISIONS = 8192
-"""Of a timed turn, about."""
+"""Approximate number of decisions in a timed turn."""
 CHOOSING_TURNS = 3
-"""Of which the median chooses the setting: a turn is short, and a moment's pause may double it."""
+"""Turns whose median chooses the setting: a turn is short, and a pause of the machine may double it."""
 
 
 class Stack:
-    """Trains from scratch for each seed and flies the missions that are judged."""
+    """Trains from scratch for each seed and flies the test missions."""
 
     def __init__(self, config: Config) -> None:
-        """Times every setting in a short training, to choose one.
+        """Times every setting in a short training and chooses the fastest.
 
         Raises:
-            MissingPackageError: if a package that it needs is not installed.
-            ConfigError: if the configuration asks for what this stack does not have.
+            MissingPackageError: if a required package is not installed.
+            ConfigError: if this stack does not support the configuration.
         """
         from conventional_stack import fleet, train
 
@@ -48,7 +48,7 @@ class Stack:
         self.stack, self.course = train, fleet.Course.of
         self.setting = self._fastest()
         machine = json_report.machine(choose_devices(1, config.train.shards))
-        machine |= {"device": processor()}  # whatever JAX prefers
+        machine |= {"device": processor()}  # whatever JAX's default device
         machine["versions"] |= {name: metadata.version(name) for name in PACKAGES}
         self.about = {
             **machine,
@@ -67,41 +67,41 @@ class Stack:
         return self.stack.fly(trained, self.course(world))
 
     def turn(self, seed: int) -> dict[str, Any]:
-        """One seed, trained and flown: see `Watched.turn`; and `workers_peak_bytes`, of its other processes."""
+        """Trains and flies one seed; returns `Validation.result` and `workers_peak_bytes` of its other processes."""
         config = dataclasses.replace(self.config, train=dataclasses.replace(self.config.train, seed=seed))
-        watched = Watched(config, self.missions, self._fly)
+        validation = Validation(config, self.missions, self._fly)
         workers = 0
 
-        def watch(trained: Any) -> None:
+        def validate(trained: Any) -> None:
             nonlocal workers
-            workers = peak_of_workers()  # while they run: after the training they are gone
-            watched.validate(trained, trained.decisions, trained.seconds)
+            workers = peak_of_workers()  # during training, because they end with it
+            validation.validate(trained, trained.decisions, trained.seconds)
 
-        trained = self.stack.train(config, self.course(self.missions.training.world), *self.setting, watch)
-        turn = watched.turn(seed, trained.decisions, trained.seconds, self._decision_seconds)
+        trained = self.stack.train(config, self.course(self.missions.training.world), *self.setting, validate)
+        turn = validation.result(seed, trained.decisions, trained.seconds, self._decision_seconds)
         return {**turn, "workers_peak_bytes": workers}
 
     def _decision_seconds(self, trained: Any, calls: int) -> np.ndarray:
-        """Seconds [calls] of each decision of one drone, from arrays on the host to a move."""
+        """Returns the seconds [calls] of each decision of one drone, from arrays on the host to the action."""
         random, shape = np.random.default_rng(0), (1, self.config.camera.height, self.config.camera.width)
-        seen = random.integers(-2, 3, shape, dtype=np.int8), np.zeros((1, OWN_SIZE), np.float32)
+        observation = random.integers(-2, 3, shape, dtype=np.int8), np.zeros((1, OWN_SIZE), np.float32)
         seconds = []
         for _ in range(calls + 1):
             began = time.perf_counter()
-            int(trained.act(*seen)[0])
+            int(trained.act(*observation)[0])
             seconds.append(time.perf_counter() - began)
-        return np.array(seconds[1:])  # the first call is slower by what it sets up
+        return np.array(seconds[1:])  # the first call includes initialisation
 
 
 class SteadyStack(contextlib.ExitStack):
-    """The conventional stack in steady training, in every setting. A context."""
+    """The conventional stack in steady training, in every setting. A context manager."""
 
     def __init__(self, config: Config, decisions: int = DECISIONS) -> None:
-        """`config` has the VAE learn throughout.
+        """Starts every setting; `config` must let the VAE learn throughout.
 
         Raises:
-            MissingPackageError: if a package that it needs is not installed.
-            ConfigError: if the configuration asks for what this stack does not have.
+            MissingPackageError: if a required package is not installed.
+            ConfigError: if this stack does not support the configuration.
         """
         from conventional_stack.fleet import Course
         from conventional_stack.train import Steady
@@ -113,7 +113,7 @@ class SteadyStack(contextlib.ExitStack):
         self.about: dict[str, Any] = {}
 
     def turn(self, number: int) -> dict[str, Any]:
-        """Decisions per second of each setting."""
+        """Returns the decisions per second of each setting."""
         del number
         return {
             "decisions_per_second": {
@@ -124,19 +124,19 @@ class SteadyStack(contextlib.ExitStack):
 
 
 class SteadyStep:
-    """E-DQN's whole training step, likewise."""
+    """E-DQN's whole training step in steady training."""
 
     def __init__(self, config: Config) -> None:
-        """`config` has the VAE learn throughout."""
+        """Compiles; `config` must let the VAE learn throughout."""
         devices, missions = choose_devices(config.train.devices, config.train.shards), run_missions(config)
         self.whole = WholeStep(config, missions.training.world, devices)
         self.about = {**json_report.machine(devices), "workload": workload(config, missions.scene)}
 
     def turn(self, number: int) -> dict[str, Any]:
-        """Decisions per second of one chunk."""
+        """Returns the decisions per second of one chunk."""
         del number
         return {"decisions_per_second": {"one program": self.whole.turn()}}
 
 
 STEADY = {"E-DQN, steady": SteadyStep, f"{STACK}, steady": SteadyStack}
-"""What is timed for the ratio of training rates."""
+"""The methods that are timed for the ratio of training rates."""

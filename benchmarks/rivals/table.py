@@ -1,4 +1,4 @@
-"""The tables of `runtime.py`: what each method came to, what events are worth, and the paper's own Table 3."""
+"""The tables of `runtime.py`: results of each method, learners at equal budget, and the paper's Table 3."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from rivals.stack import STACK
 
 PAPER_SOURCE = "Chao, Dillmann, Roennau, Xiong, Biomimetics 2024, 9(4), 238, Table 3"
 PAPER_RUN_TIME_S = {"E-DQN": 41.364, "DQN": 161.88, "SNN": 155.4}
-"""Theirs, cited; one run each."""
+"""Figures of the paper; one run each."""
 
 COLUMNS = (
     "method",
@@ -30,36 +30,36 @@ COLUMNS = (
 )
 
 EXPLAINED = """\
-- Trains: seconds of training, and decisions, until the first validation in which nine of ten missions from the
-  world's own start, or near it, are flown; medians over seeds, "never" where the median seed never does. Compilation
-  and validation are not counted.
-- DQN depth and DQN ranges have true sensors, which no drone has: they are upper bounds.
-- Plans: computation from start to goal, without simulation and compilation. For a learner the sum over a flight of
-  its decisions, one by one, from an observation on the host to a move there; for a planner until the path that is
-  flown. RRT* and BIT* use their whole budget, which stands beside their name, unless they have found the straight way;
-  in the rows "first path" they end with the first that they find.
-- Flies (simulated seconds), decisions, path: medians of the flights that reached the goal, as is what is said of plans;
-  they end within its radius, the shortest path, A*'s, at the goal itself. Clearance is the least of these flights.
-  Planners' paths are flown at 4 m/s at most in all, learners fly up to 4 m/s along each axis, 6.9 m/s along a diagonal
-  of all three: times of flight compare only with that in mind.
-- Planned: the path as drawn. Planners keep a reserve beyond the body's radius, for the airframe that then flies
-  their paths under the same judge.
-- Success: Wilson's interval, 95 %; over seeds and missions, a bootstrap of both. A planner that draws nothing counts
-  once.
-- Memory: the most that the method's own process and its workers, if any, held, JAX and the airframe included, plus
-  what it held on an accelerator."""
+- Trains: seconds of training, and decisions, until the first validation in which nine of ten missions from the world's
+  start, or near it, succeed; medians over seeds, "never" if the median seed never does. Compilation and validation are
+  not counted.
+- DQN depth and DQN ranges have exact sensors, which no real drone has: they are upper bounds.
+- Plans: computation from start to goal, without simulation and compilation. For a learner the sum over the decisions of
+  a flight, each from an observation on the host to the action on the host; for a planner the time until the path that
+  is flown. RRT* and BIT* use their whole budget, given after their name, unless they find the straight line; in the
+  rows "first path" they end with their first path.
+- Flies (simulated seconds), decisions, path, plans: medians of the flights that reached the goal. A flight ends within
+  the goal's radius, the shortest path (A*'s) at the goal itself. Clearance is the minimum of these flights. Planned
+  paths are flown at 4 m/s at most; learners fly up to 4 m/s along each axis, 6.9 m/s along the diagonal of all three.
+  This limits the comparison of flight times.
+- Planned: length of the planned path. Planners keep a reserve beyond the body's radius for the follower, whose flights
+  are judged by the same rules.
+- Success: with Wilson's 95 % interval; over seeds and missions, with a bootstrap of both. A deterministic planner
+  counts once.
+- Memory: peak memory of the method's process and its workers, with JAX and the airframe, plus that of the
+  accelerator."""
 
 PARAGRAPH = """\
 The paper says that "the running time of the entire planning process was 41.364 s" and calls these figures
-path-planning time, but not what was computed in it. Over its flight of 188 steps 41.364 s is 0.22 s a step, so
-probably the time that it took to fly the plan through a simulator's API is in it: it is then nearer to "flies" than
-to "plans", and a method is faster because its path is shorter or its simulator quicker, not because it computes
-less. The time to learn it can hardly be. The figures are of one run each, on the authors' map and machine, without
-an interval: they can stand beside ours, but no ratio of the two means anything."""
+path-planning time, but does not say what was computed in it. For its flight of 188 steps 41.364 s is 0.22 s per step,
+so it probably includes the time to fly the plan through the API of a simulator. It then corresponds to "flies" rather
+than to "plans": a method is faster because its path is shorter or its simulator faster, not because it computes less.
+It is unlikely to be the time to learn. The figures are of one run each, on the authors' map and machine, without an
+interval, so their ratio to ours has no meaning."""
 
 
 def text(rows: Sequence[Row], rates: Sequence[dict[str, Any]]) -> str:
-    """Everything, in Markdown."""
+    """Returns all tables as Markdown."""
     parts = []
     for world in dict.fromkeys(row["world"] for row in rows):
         own = [row for row in rows if row["world"] == world]
@@ -71,7 +71,7 @@ def text(rows: Sequence[Row], rates: Sequence[dict[str, Any]]) -> str:
 
 
 def methods(rows: Sequence[Row]) -> str:
-    """The rows of one world as a table, and why a row is empty."""
+    """Returns the rows of one world as a table, with the reasons of empty rows."""
     lines = [f"| {' | '.join(COLUMNS)} |", "| --- | --- |" + " ---: |" * (len(COLUMNS) - 3) + " --- |"]
     notes = []
     for row in rows:
@@ -119,22 +119,22 @@ def _number(value: float | None, form: str, scale: float = 1.0) -> str:
 
 
 def paper() -> str:
-    """Table 3 of the paper, marked as theirs, and what it can mean."""
-    lines = ["## The paper's Table 3 (theirs)", "", "| method | run time, s |", "| --- | ---: |"]
+    """Returns Table 3 of the paper, with its interpretation."""
+    lines = ["## Table 3 of the paper (its authors' figures)", "", "| method | run time, s |", "| --- | ---: |"]
     lines += [f"| {name} | {seconds:g} |" for name, seconds in PAPER_RUN_TIME_S.items()]
     return "\n".join([*lines, "", f"{PAPER_SOURCE}. {PARAGRAPH}"])
 
 
 def worth_table(one: Worth) -> str:
-    """What events are worth, for learners that can be compared."""
+    """Returns the comparison of learners at equal decisions and equal wall time."""
     lines = [
-        f"## What events are worth: {one.world}, {one.device}",
+        f"## Learners at equal budget: {one.world}, {one.device}",
         "",
-        f"Equal decisions are {one.decisions:,}; equal wall time is {one.seconds:.1f} s of training, what the "
-        "fastest needed for them, without compilation. It stops the slower ones in the middle of their schedules of "
-        "exploration and learning rate, which are laid over all decisions.",
+        f"Equal decisions are {one.decisions:,}; equal wall time is {one.seconds:.1f} s of training, the time of the "
+        "fastest learner without compilation. The slower ones are then in the middle of their schedules of "
+        "exploration and learning rate, which extend over all decisions.",
         "",
-        "| learner | seeds | trains in all, s | at equal decisions | at equal wall time |",
+        "| learner | seeds | whole training, s | at equal decisions | at equal wall time |",
         "| --- | ---: | ---: | ---: | ---: |",
     ]
     cuts = "at_decisions", "at_seconds"
@@ -143,12 +143,12 @@ def worth_table(one: Worth) -> str:
         lines.append(f"| {rate['name']} | {rate['seeds']} | {rate['seconds']:.1f} | {' | '.join(cells)} |")
     for less in one.differences:
         cells = [_rate(less[at]["difference"], less[at]["interval"], "+") for at in cuts]
-        lines.append(f"| E-DQN less {less['name']} | | | {' | '.join(cells)} |")
+        lines.append(f"| E-DQN minus {less['name']} | | | {' | '.join(cells)} |")
     return "\n".join(lines)
 
 
 def rates_table(one: dict[str, Any]) -> str:
-    """Training rates in turns, and the ratio of the medians: E-DQN's to the best setting of the conventional stack."""
+    """Returns the training rates, and the ratio of E-DQN's median to that of the best conventional setting."""
     title = f"## Training rates: {one.get('device') or 'not measured'}"
     if one["reason"] is not None:
         return f"{title}\n\n- {one['reason']}."
@@ -160,12 +160,12 @@ def rates_table(one: dict[str, Any]) -> str:
         "",
         f"Steady training on the paper's world, {stated['num_envs']} environments, "
         f"{stated['replayed_samples_per_decision']:g} replayed and {stated['vae_samples_per_decision']:g} VAE samples "
-        "a decision; medians of turns.",
+        "per decision; medians of turns.",
         "",
-        "| what | decisions/s |",
+        "| method | decisions/s |",
         "| --- | ---: |",
         *(f"| {name} | {rate:,.0f} |" for name, rate in medians.items()),
-        f"| E-DQN / {STACK}, its best | {ours / theirs:.1f} |",
+        f"| E-DQN / {STACK}, best setting | {ours / theirs:.1f} |",
     ]
     return "\n".join(lines)
 

@@ -1,1 +1,1 @@
-"""Planners that know the map, and a follower that flies their paths; one file each."""
+"""Planners that know the map, and a follower that flies their paths; one module each."""

@@ -1,15 +1,14 @@
-"""A*: the shortest path of a drone that knows the map. What the learned flights are measured against.
+"""A*: the shortest path of a drone that knows the map, the reference for the paths of learned flights.
 
-A lattice of 0.5 m cells fills the flight volume, with a cell at the start; a cell is free if a sphere of
-the body's radius fits around its middle, and two of the 26 neighbours are joined if the sphere passes
-straight between them. The heuristic, the length of the shortest lattice path if nothing were in the way,
-is consistent, so the lattice path is the shortest there is. It is then pulled tight: cut short wherever
-the straight line is free, checked along its whole length.
+A lattice of 0.5 m cells fills the flight volume, with a cell at the start. A cell is free if a sphere of the body's
+radius fits around its middle, and two of the 26 neighbours are joined if the sphere passes straight between them. The
+heuristic, the length of the shortest lattice path without obstacles, is consistent, so the path found is the shortest
+on the lattice. It is then shortened wherever the straight line is free, checked along its whole length.
 
-The open list is taken in waves, all entries up to a bound on g + h at once, so that NumPy does the work;
-a cell may then be improved after it was expanded, and the search ends only when no open entry could still
-improve the goal. That is as exact as the textbook's one entry at a time. Distances are computed only for
-cells that the search reaches.
+The open list is expanded in batches, all entries up to a bound on g + h at once, which NumPy computes quickly. A cell
+may then be improved after it was expanded, so the search ends only when no open entry could still improve the goal:
+the result is as exact as that of expanding one entry at a time. Distances are computed only for cells that the search
+reaches.
 
     python -m edqn_jax.planners.astar [--world NAME]
 """
@@ -38,13 +37,13 @@ from edqn_jax.sim.scene import Scene, segment_contact, signed_distance
 from edqn_jax.sim.worlds import SHAPES, random_scene, world_key
 
 _STEPS = np.array([step for step in itertools.product((-1, 0, 1), repeat=3) if any(step)])  # [26, 3]
-_SLACK = 1.0  # a wave takes entries up to this many cells above the best: fewer waves, a few cells too many
-_STRIDE = 0.02  # metres; the sphere sinks in unnoticed by at most 0.01^2 / 2 r = 0.14 mm
+_SLACK = 1.0  # a batch holds entries up to this many cells above the best: fewer batches, a few cells too many
+_STRIDE = 0.02  # metres; undetected penetration of at most 0.01^2 / 2 r = 0.14 mm
 _LANES = (64, 512, 4096, 32768)  # batches are padded to one of these, to compile few programs
 
 
 class NoPathError(ConfigError):
-    """There is no way from start to goal; the message is one sentence for people."""
+    """There is no path from start to goal; the message says why."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -52,9 +51,9 @@ class Path:
     """A collision-free path."""
 
     points: np.ndarray
-    """[K, 3] metres, from start to goal; straight between."""
+    """[K, 3] metres, from start to goal; straight between the points."""
     length_m: float
-    """Length after pulling tight."""
+    """Length after shortening."""
     grid_length_m: float
     """Length of the shortest path on the lattice, the last leg from the lattice to the goal included."""
 
@@ -62,10 +61,10 @@ class Path:
 def shortest_path(
     scene: Scene, start: np.ndarray | Array, goal: np.ndarray | Array, radius: float, cell: float = 0.5
 ) -> Path:
-    """The shortest way for a sphere from `start` [3] to `goal` [3]; these, `radius` and `cell` in metres.
+    """Returns the shortest path of a sphere from `start` [3] to `goal` [3]; these, `radius` and `cell` in metres.
 
     Raises:
-        NoPathError: if there is none, or the sphere does not fit at the start or the goal.
+        NoPathError: if there is no path, or the sphere does not fit at the start or the goal.
     """
     start, goal = np.asarray(start, np.float64), np.asarray(goal, np.float64)
     lattice = _Lattice(scene, start, radius, cell)
@@ -82,17 +81,17 @@ def shortest_path(
     last = float(np.linalg.norm(goal - points[-1]))
     if last > 0.0:
         points = np.concatenate([points, goal[None]])
-    tight = pull_tight(points, functools.partial(_leg_touches, scene, radius=radius))
+    tight = shorten(points, functools.partial(_leg_touches, scene, radius=radius))
     return Path(tight, path_length(tight), length + last)
 
 
 class _Lattice:
-    """Cells of the volume by flat index, with what is known of each so far."""
+    """Cells of the volume by flat index, with the distances computed so far."""
 
     def __init__(self, scene: Scene, start: np.ndarray, radius: float, cell: float):
         self.scene, self.radius, self.cell, self.start = scene, radius, cell, start
         self.lower, self.upper = np.asarray(scene.volume, np.float64)
-        # A point on the fence belongs to the volume, whatever the last digit of its float32 says.
+        # Rounded up a little: float32 may put a point on the boundary just outside the volume.
         self.origin = np.floor((start - self.lower) / cell + 1e-5).astype(np.int64)
         self.shape = self.origin + np.floor((self.upper - start) / cell + 1e-5).astype(np.int64) + 1
         self.distance = np.full(int(np.prod(np.maximum(self.shape, 1))), np.nan, np.float32)
@@ -109,26 +108,30 @@ class _Lattice:
     def distances(self, points: np.ndarray) -> np.ndarray:
         return _batched(_signed_distances, self.scene, points)
 
-    def learn(self, cells: np.ndarray) -> None:
-        """Compute the distances of those cells that are not known yet."""
+    def compute_distances(self, cells: np.ndarray) -> None:
+        """Computes the distances of those cells that are not known yet."""
         unknown = np.unique(cells[np.isnan(self.distance[cells])])
         if unknown.size:
             self.distance[unknown] = self.distances(self.middle(unknown))
 
     def passable(self, origins: np.ndarray, cells: np.ndarray, lengths: np.ndarray) -> np.ndarray:
-        """Whether the sphere fits at `cells` [E] and passes from `origins` [E] to them."""
-        self.learn(cells)
+        """Returns whether the sphere fits at `cells` [E] and passes from `origins` [E] to them, [E] bool."""
+        self.compute_distances(cells)
         passable = self.distance[cells] >= self.radius
-        # The distance changes by at most a metre a metre, which proves most edges free.
-        room = self.distance[origins] + self.distance[cells] - lengths - 2 * self.radius
-        narrow = np.flatnonzero(passable & (room < 0))
+        # The distance changes by at most one metre per metre, which proves most edges free.
+        slack = self.distance[origins] + self.distance[cells] - lengths - 2 * self.radius
+        narrow = np.flatnonzero(passable & (slack < 0))
         if narrow.size:
             ends = np.concatenate([self.middle(origins[narrow]), self.middle(cells[narrow])], axis=1)
-            passable[narrow] = ~_batched(_touches, self.scene, ends, self.radius + unseen_depth(self.cell, self.radius))
+            passable[narrow] = ~_batched(_touches, self.scene, ends, self.radius + edge_margin(self.cell, self.radius))
         return passable
 
     def cell_near(self, point: np.ndarray) -> int:
-        """The nearest cell from which the sphere passes straight to the point."""
+        """Returns the nearest cell from which the sphere passes straight to the point.
+
+        Raises:
+            NoPathError: if there is none.
+        """
         base = np.floor((point - self.start) / self.cell + 1e-5).astype(np.int64) + self.origin
         corners = base + np.array(list(itertools.product((0, 1), repeat=3)))
         corners = corners[np.all((corners >= 0) & (corners < self.shape), axis=1)]
@@ -136,11 +139,15 @@ class _Lattice:
         for i in np.argsort(np.linalg.norm(middles - point, axis=1), kind="stable"):
             if not _leg_touches(self.scene, middles[i], point, self.radius):
                 return int(self.flat(corners[i]))
-        raise NoPathError(f"there is no path: the goal {point_text(point)} is shut in within {self.cell:g} m")
+        raise NoPathError(f"there is no path: the goal {point_text(point)} is enclosed within {self.cell:g} m")
 
 
 def _search(lattice: _Lattice, source: int, target: int) -> tuple[np.ndarray, float]:
-    """Exact A* over waves of the open list: flat cells from source to target, and the length in metres."""
+    """Returns the flat cells of the shortest path from source to target, and its length in metres.
+
+    Raises:
+        NoPathError: if there is no path.
+    """
     lengths = lattice.cell * np.linalg.norm(_STEPS, axis=1)
     offsets = (_STEPS[:, 0] * lattice.shape[1] + _STEPS[:, 1]) * lattice.shape[2] + _STEPS[:, 2]
     goal = lattice.index(np.array(target))
@@ -148,7 +155,7 @@ def _search(lattice: _Lattice, source: int, target: int) -> tuple[np.ndarray, fl
     g = np.full(lattice.distance.size, np.inf)
     parent = np.full(lattice.distance.size, -1, np.int32)
     is_open = np.zeros(lattice.distance.size, bool)
-    lattice.learn(np.array([source]))
+    lattice.compute_distances(np.array([source]))
     g[source], is_open[source] = 0.0, True
     now, later, bound = np.array([source]), [], -np.inf
     while True:
@@ -174,7 +181,7 @@ def _search(lattice: _Lattice, source: int, target: int) -> tuple[np.ndarray, fl
         better = estimate < g[target] - tiny if np.isfinite(g[target]) else np.ones(cells.size, bool)
         better[better] = lattice.passable(origins[better], cells[better], lengths[step[better]])
         origins, cells, reached, estimate = origins[better], cells[better], reached[better], estimate[better]
-        # Of several ways into a cell the best is written last, and stays.
+        # If a cell is reached several times, the shortest path is written last and stays.
         order = np.argsort(-reached, kind="stable")
         g[cells[order]], parent[cells[order]] = reached[order], origins[order]
         is_open[cells] = True
@@ -186,7 +193,7 @@ def _search(lattice: _Lattice, source: int, target: int) -> tuple[np.ndarray, fl
     if not np.isfinite(g[target]):
         ends = point_text(lattice.middle(np.array(source))), point_text(lattice.middle(np.array(target)))
         raise NoPathError(
-            f"there is no path from {ends[0]} to {ends[1]} for a sphere of {lattice.radius:g} m: every way is blocked"
+            f"there is no path from {ends[0]} to {ends[1]} for a sphere of {lattice.radius:g} m: every path is blocked"
         )
     cells = [target]
     while cells[-1] != source:
@@ -195,26 +202,27 @@ def _search(lattice: _Lattice, source: int, target: int) -> tuple[np.ndarray, fl
 
 
 def _free_length(index: np.ndarray, goal: np.ndarray, cell: float) -> np.ndarray:
-    """Length of the shortest lattice path from cells [..., 3] to the goal [3] where nothing is in the way."""
+    """Returns the length of the shortest lattice path without obstacles from cells [..., 3] to the goal [3], metres."""
     apart = np.abs(index - goal)
     low, middle, high = apart.min(axis=-1), np.median(apart, axis=-1), apart.max(axis=-1)
     return cell * (math.sqrt(3) * low + math.sqrt(2) * (middle - low) + (high - middle))
 
 
-def unseen_depth(cell: float, radius: float) -> float:
-    """Metres that a sphere can sink in between two samples of an edge at most, (h / 2)^2 / 2 r: the edge's margin.
+def edge_margin(cell: float, radius: float) -> float:
+    """Returns the metres by which a sphere can penetrate between two samples of an edge at most, (h / 2)^2 / 2 r.
 
-    `segment_contact` takes 8 samples, so h is a seventh of the longest edge, sqrt(3) cells.
+    Edges are checked with a radius that is larger by this margin. `segment_contact` takes 8 samples, so h is a seventh
+    of the longest edge, sqrt(3) cells.
     """
     return (math.sqrt(3) * cell / 14) ** 2 / (2 * radius)
 
 
 Touches = Callable[[np.ndarray, np.ndarray], bool]
-"""Whether the sphere touches anything on the straight leg between two points [3]."""
+"""Returns whether the sphere touches anything on the straight line between two points [3]."""
 
 
-def pull_tight(points: np.ndarray, touches: Touches) -> np.ndarray:
-    """Shorten a path [K, 3] by line of sight, cut its corners and shorten again, until less than 1 cm is gained."""
+def shorten(points: np.ndarray, touches: Touches) -> np.ndarray:
+    """Shortens a path [K, 3] by line of sight and by cutting corners until a round gains less than 1 cm."""
     points = _skip_ahead(points, touches)
     while True:
         tighter = _skip_ahead(_cut_corners(points, touches), touches)
@@ -224,7 +232,7 @@ def pull_tight(points: np.ndarray, touches: Touches) -> np.ndarray:
 
 
 def _cut_corners(points: np.ndarray, touches: Touches) -> np.ndarray:
-    """Cut each corner off as far up its two legs, half of each at most, as the short cut stays free."""
+    """Cuts off each corner as far up its two legs, at most half of each, as the short cut stays free."""
     kept = [points[0]]
     for before, corner, after in zip(points[:-2], points[1:-1], points[2:], strict=True):
         free, blocked = 0.0, 1.0
@@ -243,7 +251,7 @@ def _cut_corners(points: np.ndarray, touches: Touches) -> np.ndarray:
 
 
 def _skip_ahead(points: np.ndarray, touches: Touches) -> np.ndarray:
-    """From each point go straight to the furthest later one that is in sight."""
+    """Keeps, after each kept point, only the furthest later point to which the straight line is free."""
     kept, here = [0], 0
     while here < len(points) - 1:
         there = len(points) - 1
@@ -260,7 +268,7 @@ def _leg_touches(scene: Scene, start: np.ndarray, end: np.ndarray, radius: float
 
 @jax.jit
 def _long_touches(scene: Scene, start: Array, end: Array, radius: Array) -> Array:
-    """Whether the sphere touches anything on a straight leg of any length: walk on by as much as is free."""
+    """Returns whether the sphere touches anything on a straight leg of any length, in steps of the clearance."""
     length = jnp.sqrt(jnp.sum((end - start) ** 2))
     direction = (end - start) / jnp.maximum(length, 1e-9)
 
@@ -288,7 +296,7 @@ def _touches(scene: Scene, ends: Array, radius: Array) -> Array:
 
 
 def _batched(function, scene: Scene, rows: np.ndarray, *rest: float) -> np.ndarray:
-    """`function(scene, rows, *rest)` in batches of a few fixed sizes."""
+    """Returns `function(scene, rows, *rest)`, computed in batches of a few fixed sizes."""
     parts, done = [], 0
     while done < len(rows):
         part = rows[done : done + _LANES[-1]]
@@ -322,8 +330,8 @@ def main(arguments: list[str] | None = None) -> int:
         return 2
     straight = float(np.linalg.norm(np.asarray(scene.goal) - np.asarray(scene.start)))
     print(f"straight line      {straight:8.2f} m")
-    print(f"shortest on grid   {path.grid_length_m:8.2f} m")
-    print(f"pulled tight       {path.length_m:8.2f} m, {len(path.points)} points, found in {seconds:.2f} s")
+    print(f"lattice path       {path.grid_length_m:8.2f} m")
+    print(f"shortened          {path.length_m:8.2f} m, {len(path.points)} points, found in {seconds:.2f} s")
     for point in path.points:
         print("  " + "  ".join(f"{value:7.2f}" for value in point))
     return 0

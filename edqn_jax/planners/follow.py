@@ -1,11 +1,10 @@
-"""A path, flown: the planners' counterpart of a learned policy.
+"""Flies the drone along a planned path: pure pursuit (Coulter, CMU-RI-TR-92-01) with a look-ahead that corners shorten.
 
-Every decision the follower commands a velocity towards a point ahead of it on the path, of at most
-`env.speed_m_s`, which is what a learner has along each axis: the same airframe, controller, period of decisions and
-judge. It goes towards the furthest point within reach for which the straight way there stays within a tolerance of
-the path, or no further off it than the drone is by now. So it flies straight legs fast, slows down before corners,
-and cuts them by no more than planners leave room for: they are given `reserved` tasks. (Pure pursuit, Coulter,
-CMU-RI-TR-92-01, with a look-ahead that corners shorten.)
+Airframe, controller, decision period and rules of the outcome are those of a learned policy. At every decision the
+follower commands a velocity towards a point ahead on the path, of at most `env.speed_m_s`, a learned policy's speed
+along each axis. The point is the furthest within reach for which the straight line there stays within a tolerance of
+the path, or no further from it than the drone is now. Straight legs are therefore flown fast, and the follower slows
+down before corners and cuts them by less than the reserve that `reserved` tasks make planners keep.
 """
 
 from __future__ import annotations
@@ -30,41 +29,41 @@ from edqn_jax.sim.outcomes import Outcome, judge
 from edqn_jax.sim.scene import Scene
 
 SPACING_M = 0.1
-"""Metres between the points that a path is followed by."""
+"""Metres between the points of a sampled path."""
 _LANES = 2048  # points of a path are padded to a multiple of this, to compile few programs
 
 
 @dataclasses.dataclass(frozen=True)
 class FollowConfig:
-    """How closely and how fast a path is followed; all values are ours."""
+    """How closely and how fast a path is followed; the values are not from a publication."""
 
     reserve_m: float = 0.3
-    """What planners keep clear of beyond the body's radius, metres: room for the follower."""
+    """Clearance beyond the body's radius that planners keep for the follower, metres."""
     tolerance_m: float = 0.2
-    """How far the straight way to the point ahead may be off the path, metres."""
+    """Largest distance between the path and the straight line to the point ahead, metres."""
     reach_m: float = 2.5
-    """The point ahead is at most so far along the path, metres."""
+    """Largest distance of the point ahead along the path, metres."""
     window_m: float = 3.0
-    """The nearest point of the path is sought so far along it, metres."""
+    """Length of the path in which the nearest point is searched, metres."""
     lag_s: float = 0.15
-    """Seconds for which the drone goes on as it flies before a command has its way."""
+    """Delay until the velocity follows a command, seconds."""
     horizon_s: float = 0.25
-    """Seconds after that in which it would be at the point ahead."""
+    """Time after the delay in which the commanded velocity would reach the point ahead, seconds."""
 
 
 def reserved(task: Task, config: FollowConfig = FollowConfig()) -> Task:  # noqa: B008 (it is frozen)
-    """The task of a planner whose path will be followed: a larger body, and a fence drawn in, ends excepted."""
+    """Returns the task with a larger body and a smaller volume, by the reserve; start and goal stay in the volume."""
     lower, upper = np.asarray(task.scene.volume, np.float64)
     lower = np.minimum(lower + config.reserve_m, np.minimum(task.start, task.goal))
     upper = np.maximum(upper - config.reserve_m, np.maximum(task.start, task.goal))
-    # Rounded outwards, or an end that stands on the fence would be beyond it.
+    # Rounded outwards, because float32 could put a start or goal on the boundary outside.
     volume = np.stack([np.nextafter(np.float32(lower), -np.inf), np.nextafter(np.float32(upper), np.inf)])
     scene = dataclasses.replace(task.scene, volume=volume)
     return dataclasses.replace(task, scene=scene, body_radius=task.body_radius + config.reserve_m)
 
 
 def sampled(path: np.ndarray) -> np.ndarray:
-    """Points [K, 3] every `SPACING_M` along a path [N, 3], metres; the last repeats to fill K."""
+    """Returns points [K, 3] every `SPACING_M` along a path [N, 3], metres; the last is repeated to fill K."""
     along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))])
     count = math.ceil(along[-1] / SPACING_M) + 1
     at = np.minimum(SPACING_M * np.arange(-(-count // _LANES) * _LANES), along[-1])
@@ -74,17 +73,17 @@ def sampled(path: np.ndarray) -> np.ndarray:
 def steer(
     config: EnvConfig, follow: FollowConfig, points: Array, nearest: Array, state: DroneState
 ) -> tuple[Array, Array]:
-    """Where to fly next.
+    """Returns the velocity to command next.
 
     Args:
-        config: whose speed is the limit.
-        follow: how closely.
-        points: [K, 3] from `sampled`.
-        nearest: [] int32, the point that the drone was nearest to at the decision before; it never goes back.
+        config: for the speed limit.
+        follow: how closely and how fast.
+        points: [K, 3] from `sampled`, metres.
+        nearest: [] int32, index of the nearest point at the previous decision; the search starts there.
         state: of the drone.
 
     Returns:
-        velocity [3] m/s, world; the point that the drone is nearest to now.
+        velocity [3] m/s, world; index of the nearest point now.
     """
     window, reach = (round(metres / SPACING_M) for metres in (follow.window_m, follow.reach_m))
     last = points.shape[0] - 1
@@ -95,12 +94,12 @@ def steer(
 
     ahead = points[jnp.minimum(nearest + 1 + jnp.arange(reach), last)] - here[None]  # [R, 3]
     length = jnp.sqrt(jnp.sum(ahead**2, axis=1) + 1e-9)
-    along = (ahead @ ahead.T) / length[:, None]  # [to, of] of each point along the straight way to each
+    along = (ahead @ ahead.T) / length[:, None]  # [to, of] position of each point along the straight line to each
     along = jnp.clip(along, 0.0, length[:, None])
     off = ahead[None] - along[..., None] * (ahead / length[:, None])[:, None]
     passed = jnp.tril(jnp.ones((reach, reach), bool))
     worst = jnp.max(jnp.where(passed, jnp.sqrt(jnp.sum(off**2, axis=-1)), 0.0), axis=1)
-    # Off the path it comes back at a slant, not squarely: what it is off by now is no reason to turn.
+    # The present distance from the path is allowed, so that the drone returns to it gradually.
     allowed = worst <= jnp.maximum(follow.tolerance_m, jnp.min(away))
     furthest = jnp.max(jnp.where(allowed, jnp.arange(reach), 0))
 
@@ -112,12 +111,12 @@ def steer(
 def fly_path(
     config: Config, follow: FollowConfig, airframe: Airframe, scene: Scene, goal: Array, points: Array
 ) -> Flights:
-    """One flight along points [K, 3] from `sampled`, from rest at the first, facing the goal [3].
+    """Flies once along points [K, 3] from `sampled`, from rest at the first, facing the goal [3].
 
-    Pure; `config` and `follow` are static. The scene's own start and goal do not matter.
+    Pure; `config` and `follow` are static. The scene's own start and goal are not used.
 
     Returns:
-        the tallies of that flight; there is no return and no record.
+        the figures of the flight, without return and record.
     """
     away = goal - points[0]
     body = drone.hover(points[0], jnp.arctan2(away[1], away[0]))
@@ -136,5 +135,5 @@ def fly_path(
 
 @functools.cache
 def compiled_follower():
-    """`fly_path`, jitted; compiled once for each configuration and shape."""
+    """Returns `fly_path`, jitted; compiled once for each configuration and shape."""
     return jax.jit(fly_path, static_argnums=(0, 1), compiler_options=compiler_options(jax.devices()[0].platform))

@@ -1,4 +1,4 @@
-"""Packages of the extra `bench`, which are there or are asked for in a sentence."""
+"""Import of packages that only the extra `bench` installs."""
 
 from __future__ import annotations
 
@@ -7,11 +7,11 @@ from typing import Any
 
 
 class MissingPackageError(ImportError):
-    """A package of the extra `bench` is not installed; the message is one sentence for people."""
+    """A package of the extra `bench` is not installed; the message names the command that installs it."""
 
 
 def require(package: str) -> Any:
-    """A package or module of the extra `bench`, imported.
+    """Imports and returns a package or module of the extra `bench`.
 
     Raises:
         MissingPackageError: if it is not installed.
@@ -22,4 +22,4 @@ def require(package: str) -> Any:
         name = package.split(".")[0]
         if error.name is None or error.name.split(".")[0] != name:
             raise
-        raise MissingPackageError(f"{name} is not installed; pip install 'edqn-jax[bench]' brings it") from error
+        raise MissingPackageError(f"{name} is not installed; run pip install 'edqn-jax[bench]'") from error

@@ -1,4 +1,4 @@
-"""What every planner that knows the map takes and gives back, and the planners by name.
+"""The interface of planners that know the map, and the planners by name.
 
 plan = load_planner("A*")(Task.of(scene, body_radius=0.36), Budget(), seed=0)
 """
@@ -16,66 +16,66 @@ import numpy.typing as npt
 from edqn_jax.sim.scene import Scene, signed_distance
 
 MARGIN = 1e-3
-"""Metres that paths stay off contact, so that no judge's sampling or float32 finds one."""
+"""Metres of clearance beyond the body, so that neither sampling nor float32 of a check finds a contact."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Task:
-    """Fly a sphere through a known world; its middle stays within the scene's flight volume."""
+    """Find a path for a sphere through a known world; its centre stays within the scene's flight volume."""
 
     scene: Scene
     start: np.ndarray  # [3] metres
     goal: np.ndarray  # [3] metres
     body_radius: float
-    """Metres; nothing may be nearer."""
+    """Radius of the sphere, metres."""
     goal_radius: float
-    """Metres. A planner that need not come to rest on the goal is done this near, if nothing is between."""
+    """Metres. A planner that need not end at the goal itself may end this near, if the straight line there is free."""
 
     @classmethod
     def of(cls, scene: Scene, *, body_radius: float, goal_radius: float = 2.0) -> Task:
-        """The scene's own start and goal."""
+        """Returns the task from the scene's own start to its goal; radii in metres."""
         start, goal = (np.asarray(point, np.float64) for point in (scene.start, scene.goal))
         return cls(scene, start, goal, body_radius, goal_radius)
 
 
 @dataclasses.dataclass(frozen=True)
 class Budget:
-    """Where a planner gives up. Each module says what its step is; only sampling planners watch the clock."""
+    """When a planner stops. Each module defines its step; only sampling planners use `seconds`."""
 
     seconds: float = 5.0
     steps: int | None = None
-    """None is the planner's own limit."""
+    """None for the planner's own limit."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Plan:
-    """What came of it. Seconds are of the wall clock; compilation is not counted, reading the map is."""
+    """The result of a planner. Seconds are of wall time, with reading the map and without compilation."""
 
     path: np.ndarray | None
-    """[N, 3] metres from start to goal, straight between; None if none was found."""
+    """[N, 3] metres from start to goal, straight between the points; None if no path was found."""
     reason: str
-    """Why there is none, one sentence that begins with "no path"; empty if there is one."""
+    """Why there is no path, a sentence that begins with "no path"; empty if there is a path."""
     seconds: float
     steps: int
-    """How much of the budget's steps was used."""
+    """Steps used."""
     first_seconds: float
-    """When the first path was known; `seconds` for planners that know one only. Not a number without a path."""
+    """Time to the first path; equals `seconds` for planners that find only one. NaN without a path."""
     first_length_m: float
-    """Length of that path."""
+    """Length of the first path. NaN without a path."""
 
     @property
     def found(self) -> bool:
-        """Whether there is a path."""
+        """Returns whether there is a path."""
         return self.path is not None
 
     @property
     def length_m(self) -> float:
-        """Metres; not a number without a path."""
+        """Returns the length of the path in metres, NaN without a path."""
         return float("nan") if self.path is None else path_length(self.path)
 
 
 class Planner(Protocol):
-    """From a task to a plan. The seed matters to planners that draw; the others give one plan for all seeds."""
+    """Returns a plan for a task. Only planners that sample use the seed."""
 
     def __call__(self, task: Task, budget: Budget = ..., seed: int = ...) -> Plan: ...
 
@@ -90,20 +90,20 @@ PLANNERS = {
     "BIT* first path": "sampling.bit_star_first",
     "APF": "potential_field.plan",
 }
-"""Where each is: module and function within `edqn_jax.planners`."""
+"""Module and function within `edqn_jax.planners` by name."""
 
 IMPROVING = "RRT*", "BIT*"
-"""Those that go on after their first path, until the budget is spent."""
+"""Planners that go on after their first path until the budget is used up."""
 
-DRAWING = (*IMPROVING, "RRT* first path", "BIT* first path")
-"""Those that draw at random, so that another seed is another path."""
+SAMPLING = (*IMPROVING, "RRT* first path", "BIT* first path")
+"""Planners that sample at random, so that the path depends on the seed."""
 
 
 def load_planner(name: str) -> Planner:
-    """The planner of that name.
+    """Returns the planner of that name.
 
     Raises:
-        KeyError: if there is none.
+        KeyError: if there is no such planner.
         MissingPackageError: if a package of the extra `bench` that it needs is not installed.
     """
     module, function = PLANNERS[name].split(".")
@@ -111,18 +111,18 @@ def load_planner(name: str) -> Planner:
 
 
 def found(path: npt.ArrayLike, seconds: float, steps: int) -> Plan:
-    """The plan of a planner that finds one path only."""
+    """Returns the plan of a planner that finds only one path."""
     path = np.asarray(path, np.float64)
     return Plan(path, "", seconds, steps, seconds, path_length(path))
 
 
 def not_found(why: str, seconds: float = 0.0, steps: int = 0) -> Plan:
-    """No path, and why."""
+    """Returns a plan without a path; `why` follows "no path: "."""
     return Plan(None, f"no path: {why}", seconds, steps, float("nan"), float("nan"))
 
 
 def refusal(task: Task) -> str | None:
-    """Why there cannot be a path, as seen from the two ends alone; None if they are free."""
+    """Returns why there cannot be a path if start or goal is outside the volume or not free, else None."""
     lower, upper = np.asarray(task.scene.volume, np.float64)
     for role, point in (("start", task.start), ("goal", task.goal)):
         if not np.all((point >= lower) & (point <= upper)):
@@ -133,12 +133,12 @@ def refusal(task: Task) -> str | None:
 
 
 def path_length(points: np.ndarray) -> float:
-    """Metres along points [N, 3]."""
+    """Returns the length of the line through points [N, 3], metres."""
     return float(np.linalg.norm(np.diff(points, axis=0), axis=1).sum())
 
 
 def point_text(point: np.ndarray) -> str:
-    """A point [3] for people."""
+    """Returns a point [3] as text, "(x, y, z)"."""
     return "(" + ", ".join(f"{value:g}" for value in point) + ")"
 
 

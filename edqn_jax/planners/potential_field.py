@@ -1,14 +1,14 @@
-"""APF: the artificial potential field. It knows the map.
+"""APF: a planner that descends an artificial potential field.
 
 Khatib, "Real-Time Obstacle Avoidance for Manipulators and Mobile Robots", Int. J. Robotics Research 5(1), 1986:
-the goal attracts with 1/2 k rho_goal^2, every shape within `influence_m` repels with
-1/2 eta (1 / rho - 1 / rho_0)^2, rho the distance between its surface and the drone's, and the drone goes where
-the sum of the forces pushes it. Beyond `conic_m` from the goal the attraction is constant, as is usual, so that
-far goals do not push through walls.
+the goal attracts with the potential 1/2 k rho_goal^2, and every shape within `influence_m` repels with
+1/2 eta (1 / rho - 1 / rho_0)^2, where rho is the distance between its surface and that of the drone. The path follows
+the sum of the forces. Beyond `conic_m` from the goal the attraction is constant, as is usual, so that it does not
+exceed the repulsion of obstacles when the goal is far away.
 
-The path is followed in steps of equal length. A field of this kind has local minima: if the drone has come nowhere
-in `patience` steps, or a step would hit something, the planner says "no path", though there may well be one.
-The budget's step is one step of the path.
+The path consists of steps of equal length. Such a field has local minima: if the drone moves less than `progress_m` in
+`patience` steps, or a step would touch an obstacle, the planner reports "no path", although there may be one. The
+budget's step is one step of the path.
 """
 
 from __future__ import annotations
@@ -27,15 +27,15 @@ from edqn_jax.planners.solids import leg_free, shape_distance, solid_table
 numba = require("numba")
 
 STEPS = 20_000
-"""Steps at most, unless the budget says otherwise."""
+"""Maximum number of steps unless the budget sets another."""
 
 _ARRIVED, _MINIMUM, _HIT, _SPENT = range(4)
-_NUDGE = 1e-5  # metres, of the central differences
+_DIFFERENCE = 1e-5  # metres, of the central differences
 
 
 @dataclasses.dataclass(frozen=True)
 class ApfConfig:
-    """The field and how it is followed; all values are ours."""
+    """The field and how it is followed; the values are not from a publication."""
 
     attraction: float = 1.0
     """k, force per metre from the goal."""
@@ -48,14 +48,14 @@ class ApfConfig:
     step_m: float = 0.1
     """Length of a step."""
     patience: int = 100
-    """Steps after which the drone must have come somewhere."""
-    somewhere_m: float = 0.5
-    """How far that is."""
+    """Steps in which the drone must move by `progress_m`."""
+    progress_m: float = 0.5
+    """Metres from the point `patience` steps before."""
 
 
 @numba.njit
 def force(table, x, y, z, goal, radius, attraction, repulsion, influence, conic):
-    """The force (x, y, z) at a point: minus the gradient of both potentials."""
+    """Returns the force (x, y, z) at a point: the negative gradient of both potentials."""
     rx, ry, rz = goal[0] - x, goal[1] - y, goal[2] - z
     apart = math.sqrt(rx * rx + ry * ry + rz * rz)
     pull = attraction * min(1.0, conic / max(apart, 1e-12))
@@ -65,20 +65,30 @@ def force(table, x, y, z, goal, radius, attraction, repulsion, influence, conic)
         rho = shape_distance(row, x, y, z) - radius
         if rho >= influence:
             continue
-        gx = shape_distance(row, x + _NUDGE, y, z) - shape_distance(row, x - _NUDGE, y, z)
-        gy = shape_distance(row, x, y + _NUDGE, z) - shape_distance(row, x, y - _NUDGE, z)
-        gz = shape_distance(row, x, y, z + _NUDGE) - shape_distance(row, x, y, z - _NUDGE)
+        gx = shape_distance(row, x + _DIFFERENCE, y, z) - shape_distance(row, x - _DIFFERENCE, y, z)
+        gy = shape_distance(row, x, y + _DIFFERENCE, z) - shape_distance(row, x, y - _DIFFERENCE, z)
+        gz = shape_distance(row, x, y, z + _DIFFERENCE) - shape_distance(row, x, y, z - _DIFFERENCE)
         rho = max(rho, 1e-6)
-        push = repulsion * (1.0 / rho - 1.0 / influence) / (rho * rho) / (2.0 * _NUDGE)
+        push = repulsion * (1.0 / rho - 1.0 / influence) / (rho * rho) / (2.0 * _DIFFERENCE)
         fx, fy, fz = fx + push * gx, fy + push * gy, fz + push * gz
     return fx, fy, fz
 
 
 @numba.njit
-def descend(table, start, goal, volume, radius, goal_radius, gains, step, patience, somewhere, steps):
-    """Follow the force from `start` [3]: how it ended, the points [n, 3] and n.
+def descend(table, start, goal, volume, radius, goal_radius, gains, step, patience, progress, steps):
+    """Follows the force from `start` [3].
 
-    `gains` are attraction, repulsion, influence and the conic distance; `volume` [2, 3] holds the drone in.
+    Args:
+        table: [N, 17] from `solid_table`.
+        start, goal: [3] metres.
+        volume: [2, 3] metres, the path stays within.
+        radius, goal_radius: metres.
+        gains: [4] attraction, repulsion, influence and conic distance of `ApfConfig`.
+        step, patience, progress: as in `ApfConfig`.
+        steps: maximum number of steps.
+
+    Returns:
+        how it ended; an array [steps + 1, 3] whose first rows are the path's points, metres; the number of these rows.
     """
     points = np.empty((steps + 1, 3))
     points[0] = start
@@ -89,7 +99,7 @@ def descend(table, start, goal, volume, radius, goal_radius, gains, step, patien
             return _ARRIVED, points, n + 1
         if n >= patience:
             past = points[n - patience]
-            if (here[0] - past[0]) ** 2 + (here[1] - past[1]) ** 2 + (here[2] - past[2]) ** 2 < somewhere**2:
+            if (here[0] - past[0]) ** 2 + (here[1] - past[1]) ** 2 + (here[2] - past[2]) ** 2 < progress**2:
                 return _MINIMUM, points, n + 1
         fx, fy, fz = force(table, here[0], here[1], here[2], goal, radius, gains[0], gains[1], gains[2], gains[3])
         strength = math.sqrt(fx * fx + fy * fy + fz * fz)
@@ -114,7 +124,7 @@ def plan(
     seed: int = 0,
     config: ApfConfig = ApfConfig(),  # noqa: B008
 ) -> Plan:
-    """The path downhill, or where it got stuck. `seed` does nothing, descent is deterministic."""
+    """Returns the path along the force, or where it got stuck. The descent is deterministic: `seed` is unused."""
     del seed
     refused = refusal(task)
     if refused:
@@ -133,7 +143,7 @@ def plan(
         gains,
         config.step_m,
         config.patience,
-        config.somewhere_m,
+        config.progress_m,
         steps,
     )
     seconds, taken = time.perf_counter() - began, count - 1
@@ -142,7 +152,7 @@ def plan(
     last = point_text(np.round(points[count - 1], 1))
     why = {
         _MINIMUM: f"a local minimum of the potential at {last}",
-        _HIT: f"the force drives the drone into something at {last}",
+        _HIT: f"the force drives the drone into an obstacle at {last}",
         _SPENT: f"the goal was not reached within {steps} steps",
     }
     return not_found(why[how], seconds, taken)
@@ -150,6 +160,6 @@ def plan(
 
 @functools.lru_cache(maxsize=1)
 def _compile() -> None:
-    """Let numba compile before the clock starts."""
+    """Makes numba compile before time is measured."""
     there = np.ones(3)
     descend(np.zeros((0, 17)), np.zeros(3), there, np.array([there, there]), 0.1, 0.1, np.ones(4), 0.1, 1, 0.1, 1)

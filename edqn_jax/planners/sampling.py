@@ -1,14 +1,12 @@
-"""RRT* and BIT*: sampling planners that keep shortening their path, by the library OMPL. They know the map.
+"""RRT* and BIT*: sampling planners that keep shortening their path, from the library OMPL.
 
 RRT*: Karaman and Frazzoli, "Sampling-based Algorithms for Optimal Motion Planning", Int. J. Robotics Research
 30(7), 2011. BIT*: Gammell, Srinivasa and Barfoot, "Batch Informed Trees", ICRA 2015. OMPL: Sucan, Moll and
-Kavraki, "The Open Motion Planning Library", IEEE Robotics & Automation Magazine 19(4), 2012; its own defaults
-apply.
+Kavraki, "The Open Motion Planning Library", IEEE Robotics & Automation Magazine 19(4), 2012, with its default settings.
 
-Both draw at random and use the whole budget, in seconds or in OMPL's iterations, whichever is spent first, and say
-when they knew a first path and how long the last one is; BIT* ends sooner where nothing can be gained. Asked for the
-first path, they end with it. OMPL asks about legs, not points, and each question is answered by the scene's exact
-distances in compiled code.
+Both use the whole budget, in seconds or in OMPL's iterations, whichever ends first; BIT* ends earlier if its path
+cannot be shortened. The variants `*_first` end with the first path. OMPL checks segments instead of points; each check
+uses the exact distances of the scene in compiled code.
 """
 
 from __future__ import annotations
@@ -30,7 +28,7 @@ util = require("ompl.util")
 
 
 class _Legs(base.MotionValidator):
-    """Whether the drone's sphere passes straight between two states."""
+    """Checks whether the drone's sphere passes straight between two states."""
 
     def __init__(self, information: Any, table: np.ndarray, radius: float):
         super().__init__(information)
@@ -41,22 +39,22 @@ class _Legs(base.MotionValidator):
 
 
 def rrt_star(task: Task, budget: Budget = Budget(), seed: int = 0) -> Plan:  # noqa: B008 (it is frozen)
-    """The shortest path that RRT* knows when the budget is spent."""
+    """Returns the shortest path that RRT* finds within the budget."""
     return _plan(geometric.RRTstar, task, budget, seed)
 
 
 def rrt_star_first(task: Task, budget: Budget = Budget(), seed: int = 0) -> Plan:  # noqa: B008
-    """The first path that RRT* finds within the budget."""
+    """Returns the first path that RRT* finds within the budget."""
     return _plan(geometric.RRTstar, task, budget, seed, ends_with_first=True)
 
 
 def bit_star(task: Task, budget: Budget = Budget(), seed: int = 0) -> Plan:  # noqa: B008
-    """The shortest path that BIT* knows when the budget is spent."""
+    """Returns the shortest path that BIT* finds within the budget."""
     return _plan(geometric.BITstar, task, budget, seed)
 
 
 def bit_star_first(task: Task, budget: Budget = Budget(), seed: int = 0) -> Plan:  # noqa: B008
-    """The first path that BIT* finds within the budget."""
+    """Returns the first path that BIT* finds within the budget."""
     return _plan(geometric.BITstar, task, budget, seed, ends_with_first=True)
 
 
@@ -66,7 +64,7 @@ def _plan(algorithm: Any, task: Task, budget: Budget, seed: int, ends_with_first
         return not_found(refused)
     _compile()
     util.setLogLevel(util.LOG_NONE)
-    util.RNG.setSeed(seed + 1)  # 0 is no seed to OMPL
+    util.RNG.setSeed(seed + 1)  # OMPL does not accept 0
     began = time.perf_counter()
     table, radius = solid_table(task.scene), task.body_radius + MARGIN
     lower, upper = np.asarray(task.scene.volume, np.float64)
@@ -90,7 +88,7 @@ def _plan(algorithm: Any, task: Task, budget: Budget, seed: int, ends_with_first
     first: list[float] = []
     steps = math.inf if budget.steps is None else budget.steps
 
-    def spent() -> bool:
+    def is_over() -> bool:
         elapsed = time.perf_counter() - began
         if not first:
             best = planner.bestCost().value()
@@ -99,18 +97,18 @@ def _plan(algorithm: Any, task: Task, budget: Budget, seed: int, ends_with_first
         done = bool(first) and ends_with_first
         return done or elapsed >= budget.seconds or planner.numIterations() >= steps
 
-    planner.solve(base.PlannerTerminationCondition(spent))
+    planner.solve(base.PlannerTerminationCondition(is_over))
     seconds, taken = time.perf_counter() - began, planner.numIterations()
     if not problem.hasExactSolution():
-        return not_found(f"none was found within {seconds:.3g} s and {taken} iterations", seconds, taken)
+        return not_found(f"none found within {seconds:.3g} s and {taken} iterations", seconds, taken)
     path = np.array([state[0:3] for state in problem.getSolutionPath().getStates()])
-    if not first:  # the path came with the last iteration
+    if not first:  # found by the last iteration
         first = [seconds, path_length(path)]
     return Plan(path, "", seconds, taken, first[0], first[1])
 
 
 @functools.lru_cache(maxsize=1)
 def _compile() -> None:
-    """Let numba compile before the clock starts."""
+    """Makes numba compile before time is measured."""
     point = 0.0, 0.0, 0.0
     leg_free(np.zeros((0, 17)), point, point, 0.0)

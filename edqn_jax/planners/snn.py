@@ -1,22 +1,21 @@
-"""SNN: a wave of spikes through a lattice of place cells. It knows the map.
+"""SNN: a planner by a wave of spikes through a lattice of place cells.
 
-The method is that of the paper's rival (its Table 2; Chao et al., Front. Neurorobotics 2023, 17:1111861) after
-Ponulak and Hopfield (Front. Comput. Neurosci. 2013, 7:98). A leaky integrate-and-fire place cell stands in the
-middle of every cube of 1 m. Cells where the drone does not fit never fire. The cells at the goal are made to
-fire; each spike fires the resting neighbours, so a wave runs out from the goal. Every pair of neighbours then
-changes its two synapses by spike-timing-dependent plasticity, which leaves them asymmetric, and the synaptic
-vector field sum_j (w_ij - w_ji) (x_j - x_i) points to where the wave came from. From the start the path goes
-from cell to cell, each time over the strengthened synapse that lies closest to the field.
+The method is that of the SNN which the paper compares with (its Table 2; Chao et al., Front. Neurorobotics 2023,
+17:1111861) after Ponulak and Hopfield (Front. Comput. Neurosci. 2013, 7:98). There is a leaky integrate-and-fire place
+cell in the middle of every cube of 1 m. Cells where the drone does not fit never fire. The cells at the goal are made
+to fire; each spike makes the resting neighbours fire, so that a wave spreads from the goal. Every pair of neighbours
+then changes its two synapses by spike-timing-dependent plasticity, which makes them asymmetric, and the synaptic vector
+field sum_j (w_ij - w_ji) (x_j - x_i) points to where the wave came from. The path goes from the start from cell to
+cell, each time over the strengthened synapse that is closest to the direction of the field.
 
-Neighbours are the 26 of the surrounding cube: the path consists of steps between neighbours, and with 6 it would
-be sqrt(3) times too long along a diagonal. A synapse exists only if the drone's sphere passes straight between
-its two cells, so no path cuts a corner.
+Neighbours are the 26 of the surrounding cube: with 6 the path would be sqrt(3) times too long along a diagonal. A
+synapse exists only if the drone's sphere passes straight between its two cells, so no path cuts a corner.
 
-A cell fires once (the refractory time is longer than the wave), so that pairwise plasticity is a function of the
-two cells' spike times and is computed where it is asked for. A time step is the delay of a synapse, and one
-spike is enough for a neighbour: arrival counts hops, exactly as a breadth-first search does.
+A cell fires once (the refractory time is longer than the wave), so that pairwise plasticity is a function of the two
+cells' spike times and is computed where it is needed. A time step is the delay of a synapse, and one spike is enough to
+make a neighbour fire, so the spike time is the number of hops, as in a breadth-first search.
 
-The budget's step is one time step of the wave; each fires a cell at least, so that the wave ends by itself.
+The budget's step is one time step of the wave. At least one cell fires in each, so the wave ends.
 """
 
 from __future__ import annotations
@@ -42,16 +41,16 @@ DIRECTIONS = np.array([step for step in itertools.product((-1, 0, 1), repeat=3) 
 """[26, 3] from a cell to its neighbours; the opposite of direction k is 25 - k."""
 
 _CORNERS = np.array(list(itertools.product((0, 1), repeat=3)))  # [8, 3]
-_CHUNK = 4096  # cells near a surface that are looked at together: their distances to all shapes fit into the cache
-_LEG_SAMPLES = 128  # of a leg of at most sqrt(3) cells: the sphere sinks in unnoticed by at most 0.07 mm
+_CHUNK = 4096  # cells near a surface that are checked together: their distances to all shapes fit into the cache
+_LEG_SAMPLES = 128  # of a segment of at most sqrt(3) cells: undetected penetration of at most 0.07 mm
 
 
 @dataclasses.dataclass(frozen=True)
 class SnnConfig:
-    """Table 2 of the paper; the three values that it does not give are ours.
+    """Table 2 of the paper; it does not give the threshold, the synaptic current and the time step.
 
     Raises:
-        ValueError: if one spike does not make a neighbour fire, so that there would be no wave.
+        ValueError: if one spike does not make a neighbour fire, because then there is no wave.
     """
 
     membrane_time_s: float = 0.002
@@ -59,17 +58,17 @@ class SnnConfig:
     resistance_ohm: float = 20e6
     """Membrane resistance; the rest potential is 0 mV."""
     threshold_v: float = 0.010
-    """Potential at which a cell fires; ours."""
+    """Potential at which a cell fires; not in Table 2."""
     synaptic_current_a: float = 2e-9
-    """Current that one spike drives through a synapse for one time step; ours, enough for the threshold."""
+    """Current that one spike drives through a synapse for one time step; not in Table 2, enough for the threshold."""
     step_s: float = 0.001
-    """Time step and synaptic delay; ours."""
+    """Time step and synaptic delay; not in Table 2."""
     strengthening: float = 1.0
     """Change of a synapse at zero lag if its source fires first ("pre-amplitude")."""
     weakening: float = 1.0
     """The same if its target fires first ("post-amplitude")."""
     strengthening_time_s: float = 0.0168
-    """How fast the change fades with the lag ("pre-time constant")."""
+    """Time constant of the change over the lag ("pre-time constant")."""
     weakening_time_s: float = 0.0337
     """The same if the target fires first ("post-time constant")."""
 
@@ -77,12 +76,12 @@ class SnnConfig:
         reached = self.resistance_ohm * self.synaptic_current_a * (1 - self.kept)
         if reached < self.threshold_v:
             raise ValueError(
-                f"one spike lifts a place cell to {reached:g} V, below its threshold: {self.threshold_v:g} V"
+                f"one spike raises a place cell to {reached:g} V, below its threshold of {self.threshold_v:g} V"
             )
 
     @property
     def kept(self) -> float:
-        """Share of the potential that is left after a time step."""
+        """Returns the fraction of the potential that remains after a time step."""
         return math.exp(-self.step_s / self.membrane_time_s)
 
 
@@ -99,7 +98,7 @@ class Synapses:
 
 
 def lattice_shape(volume: np.ndarray, cell: float = 1.0) -> tuple[int, int, int]:
-    """Cells of `cell` metres along each axis of a volume [2, 3]; what is left over is spread around them.
+    """Returns the number of cells of `cell` metres along each axis of a volume [2, 3].
 
     Raises:
         ValueError: if the volume is narrower than one cell.
@@ -111,16 +110,16 @@ def lattice_shape(volume: np.ndarray, cell: float = 1.0) -> tuple[int, int, int]
 
 
 def synapses(scene: Scene, radius: ArrayLike, shape: tuple[int, int, int], cell: float = 1.0) -> Synapses:
-    """Which cells are free, and which neighbours a sphere passes straight between.
+    """Returns which cells are free, and between which neighbours a sphere passes straight.
 
-    The distance to a convex shape is convex, so its tangent at a cell bounds it from below all along the half
-    of the edge that begins there. Both halves' bounds must leave room. Along flat walls that is exact; around
-    corners it refuses some edges that are free by little, and accepts none that is not.
+    The distance to a convex shape is convex, so its tangent at a cell is a lower bound along the half of the edge that
+    begins there. An edge is accepted if the bounds of both halves are at least the radius. Along flat walls that is
+    exact; around corners it rejects some edges that are just free, and accepts none that is not.
 
     Args:
         scene: one world.
         radius: of the sphere, metres.
-        shape: of the lattice, static; it stands in the middle of the scene's volume.
+        shape: of the lattice, static; it is centred in the scene's volume.
         cell: metres, static.
     """
     lower = (scene.volume[0] + scene.volume[1] - cell * jnp.array(shape, jnp.float32)) / 2
@@ -129,21 +128,21 @@ def synapses(scene: Scene, radius: ArrayLike, shape: tuple[int, int, int], cell:
     points = middles.reshape(-1, 3)
     distance = jax.vmap(lambda point: signed_distance(scene, point))(points)
     free = distance >= radius
-    # Half an edge is shorter than sqrt(3) / 2 cells: where there is that much room nothing needs a closer look.
+    # Half an edge is at most sqrt(3) / 2 cells long: cells with more clearance need no check of their edges.
     near = free & (distance < radius + math.sqrt(3) / 2 * cell)
     where = jnp.nonzero(near, size=points.shape[0], fill_value=points.shape[0])[0]
     where = jnp.concatenate([where, jnp.full(_CHUNK, points.shape[0], where.dtype)])
 
-    def look(state: tuple[Array, Array]) -> tuple[Array, Array]:
+    def check(state: tuple[Array, Array]) -> tuple[Array, Array]:
         first, leaves = state
         cells = lax.dynamic_slice_in_dim(where, first, _CHUNK)
-        ways = _free_halves(scene, points.at[cells].get(mode="clip"), radius, cell)
-        return first + _CHUNK, leaves.at[cells].set(ways, mode="drop")
+        halves = _free_halves(scene, points.at[cells].get(mode="clip"), radius, cell)
+        return first + _CHUNK, leaves.at[cells].set(halves, mode="drop")
 
     everything = (1 << len(DIRECTIONS)) - 1
     leaves = jnp.where(free, everything, 0)
     count = jnp.sum(near)
-    _, leaves = lax.while_loop(lambda state: state[0] < count, look, (jnp.zeros((), where.dtype), leaves))
+    _, leaves = lax.while_loop(lambda state: state[0] < count, check, (jnp.zeros((), where.dtype), leaves))
     leaves = leaves.reshape(shape)
     back = [_shift(leaves, step) >> (25 - k) & 1 for k, step in enumerate(DIRECTIONS)]
     arrives = functools.reduce(jnp.bitwise_or, (bit << k for k, bit in enumerate(back)))
@@ -151,7 +150,7 @@ def synapses(scene: Scene, radius: ArrayLike, shape: tuple[int, int, int], cell:
 
 
 def _free_halves(scene: Scene, points: Array, radius: ArrayLike, cell: float) -> Array:
-    """[C] int32: bit k is set if the first half of the edge from `points` [C, 3] in direction k is free."""
+    """Returns [C] int32: bit k is set if the first half of the edge from `points` [C, 3] in direction k is free."""
     if not shape_distances(scene, points[0]):
         return jnp.full(points.shape[0], (1 << len(DIRECTIONS)) - 1)
 
@@ -172,7 +171,7 @@ def _free_halves(scene: Scene, points: Array, radius: ArrayLike, cell: float) ->
 
 
 def _shift(field: Array, step: np.ndarray) -> Array:
-    """The field [X, Y, Z] as seen from each cell's neighbour one `step` [3] on; zero beyond the lattice."""
+    """Returns, for each cell, the field [X, Y, Z] at its neighbour one `step` [3] on; zero outside the lattice."""
     padded = jnp.pad(field, 1)
     x, y, z = (int(s) + 1 for s in step)
     nx, ny, nz = field.shape
@@ -180,14 +179,14 @@ def _shift(field: Array, step: np.ndarray) -> Array:
 
 
 def cells_at(scene: Scene, network: Synapses, point: Array, radius: ArrayLike, cell: float = 1.0) -> Array:
-    """[X, Y, Z] bool: the cells around a point [3] that the sphere passes straight from or to, 8 at most."""
+    """Returns [X, Y, Z] bool: the cells around a point [3], at most 8, to which the sphere passes straight from it."""
     base = jnp.floor((point - network.middles[0, 0, 0]) / cell).astype(jnp.int32)
     corners = jnp.clip(base[None] + _CORNERS, 0, np.array([network.free.shape]) - 1)
     x, y, z = corners.T
     ends = network.middles[x, y, z]
     touch = jax.vmap(lambda end: segment_contact(scene, point, end, radius, samples=_LEG_SAMPLES)[0])(ends)
-    seen = network.free[x, y, z] & ~touch
-    return jnp.zeros(network.free.shape, bool).at[x, y, z].max(seen)
+    passable = network.free[x, y, z] & ~touch
+    return jnp.zeros(network.free.shape, bool).at[x, y, z].max(passable)
 
 
 # --------------------------------------------------------------------------------------------- wave
@@ -196,31 +195,31 @@ def cells_at(scene: Scene, network: Synapses, point: Array, radius: ArrayLike, c
 def spike_wave(
     config: SnnConfig, network: Synapses, goal: Array, start: Array | None = None, steps: ArrayLike = 2**30
 ) -> tuple[Array, Array]:
-    """Spike times of the wave that the cells at the goal send out.
+    """Returns the spike times of the wave that starts from the cells at the goal.
 
-    tau dV/dt = -V + R I is solved exactly over each time step, in which the current is constant.
+    The current is constant within a time step, over which tau dV/dt = -V + R I is solved exactly.
 
     Args:
         config: of the cells.
         network: the lattice.
         goal: [X, Y, Z] bool, cells that fire at time 0.
-        start: [X, Y, Z] bool, cells whose first spike ends the wave; without it, it runs out.
-        steps: time steps at most.
+        start: [X, Y, Z] bool, cells whose first spike ends the wave; None for the whole wave.
+        steps: maximum number of time steps.
 
     Returns:
-        hops: [X, Y, Z] int32, time step in which each cell fired; -1 where it did not. taken: time steps.
+        hops: [X, Y, Z] int32, time step in which each cell fired, -1 if it did not. taken: number of time steps.
     """
     ends = jnp.zeros_like(goal) if start is None else start
 
     def step(state: tuple[Array, Array, Array, Array]) -> tuple[Array, Array, Array, Array]:
         now, spikes, potential, hops = state
         arriving = jnp.zeros(spikes.shape, jnp.int32)
-        seen = spikes.astype(jnp.int32)
+        active = spikes.astype(jnp.int32)
         for k, direction in enumerate(DIRECTIONS):
-            arriving += _shift(seen, direction) & (network.joined >> k)
+            arriving += _shift(active, direction) & (network.joined >> k)
         driven = config.resistance_ohm * config.synaptic_current_a * arriving
         potential = config.kept * potential + (1 - config.kept) * driven
-        fired = (potential >= config.threshold_v) & (hops < 0)  # nothing drives a cell without synapses
+        fired = (potential >= config.threshold_v) & (hops < 0)  # a cell without synapses gets no current
         return now + 1, fired, jnp.where(fired, 0.0, potential), jnp.where(fired, now + 1, hops)
 
     def goes_on(state: tuple[Array, Array, Array, Array]) -> Array:
@@ -237,9 +236,9 @@ def spike_wave(
 
 
 def stdp(config: SnnConfig, lag: Array) -> Array:
-    """Change of a synapse whose target fired `lag` seconds after its source: the pairwise window.
+    """Returns the change of a synapse whose target fired `lag` seconds after its source, for each pair of spikes.
 
-    A+ exp(-lag / tau+) if the source was first, -A- exp(lag / tau-) if the target was, nothing at the same time.
+    A+ exp(-lag / tau+) if the source fired first, -A- exp(lag / tau-) if the target did, 0 for the same time.
     """
     strengthened = config.strengthening * jnp.exp(-jnp.abs(lag) / config.strengthening_time_s)
     weakened = -config.weakening * jnp.exp(-jnp.abs(lag) / config.weakening_time_s)
@@ -247,9 +246,9 @@ def stdp(config: SnnConfig, lag: Array) -> Array:
 
 
 def asymmetry(config: SnnConfig, network: Synapses, hops: Array, cell: Array) -> Array:
-    """w_ij - w_ji of a cell i with its 26 neighbours j; w_ij is the synapse from j to i.
+    """Returns w_ij - w_ji of a cell i with its 26 neighbours j; w_ij is the synapse from j to i.
 
-    All synapses begin alike. Where one of the two cells did not fire, or there is no synapse, it is 0.
+    All synapses are equal at first. The difference is 0 without a synapse or if one of the two cells did not fire.
 
     Args:
         config: of the plasticity.
@@ -269,15 +268,15 @@ def asymmetry(config: SnnConfig, network: Synapses, hops: Array, cell: Array) ->
 
 
 def synaptic_field(asymmetries: Array) -> Array:
-    """The synaptic vector field [3] of one cell, in cells: sum_j (w_ij - w_ji) (x_j - x_i)."""
+    """Returns the synaptic vector field [3] of one cell, in cells: sum_j (w_ij - w_ji) (x_j - x_i)."""
     return asymmetries @ DIRECTIONS.astype(np.float32)
 
 
 def follow(config: SnnConfig, network: Synapses, hops: Array, start: Array, goal: Array) -> tuple[Array, Array, Array]:
-    """Follow the synaptic vector field from cell to cell.
+    """Follows the synaptic vector field from cell to cell.
 
-    Of the neighbours j with w_ij > w_ji the one that lies closest to the field's direction is next. Their
-    spikes came earlier, so the path ends after as many steps as the start's spike counts hops.
+    The next cell is the neighbour j with w_ij > w_ji that is closest to the direction of the field. Such neighbours
+    fired earlier, so the path has at most as many steps as the start has hops.
 
     Args:
         config: of the plasticity.
@@ -287,8 +286,8 @@ def follow(config: SnnConfig, network: Synapses, hops: Array, start: Array, goal
         goal: [X, Y, Z] bool, where the path may end.
 
     Returns:
-        cells: [X * Y * Z, 3] index of the path's cells, the rest is the last one. count: how many.
-        arrived: bool, whether the last lies at the goal.
+        cells: [X * Y * Z, 3] index of the path's cells, the last repeated. count: number of cells on the path.
+        arrived: bool, whether the last is at the goal.
     """
     unit = DIRECTIONS / np.linalg.norm(DIRECTIONS, axis=1, keepdims=True)
     most = hops.size
@@ -317,10 +316,10 @@ def follow(config: SnnConfig, network: Synapses, hops: Array, start: Array, goal
 
 @struct.dataclass
 class Walk:
-    """What comes out of `solve`."""
+    """The result of `solve`."""
 
-    points: Array  # [X * Y * Z, 3] metres, middles of the path's cells; the rest repeats the last
-    count: Array  # [] int32, how many
+    points: Array  # [X * Y * Z, 3] metres, middles of the path's cells, the last repeated
+    count: Array  # [] int32, number of cells on the path
     arrived: Array  # [] bool
     fired: Array  # [] bool, whether the wave reached the start
     taken: Array  # [] int32, time steps of the wave
@@ -337,14 +336,14 @@ def solve(
     shape: tuple[int, int, int],
     cell: float = 1.0,
 ) -> Walk:
-    """Lattice, wave, plasticity and path, from `start` [3] to `goal` [3], metres; `config` is static."""
+    """Returns the path from `start` [3] to `goal` [3], metres, by lattice, wave and plasticity; `config` is static."""
     network = synapses(scene, radius, shape, cell)
     near_start, near_goal = (cells_at(scene, network, point, radius, cell) for point in (start, goal))
     hops, taken = spike_wave(config, network, near_goal, near_start, steps)
-    # Several cells are as few hops away: of these the one that lies most on the way, or the path may begin backwards.
-    heard = jnp.where(near_start & (hops >= 0), hops, jnp.iinfo(hops.dtype).max)
+    # Of several cells with the fewest hops the one with the shortest detour, because others may lead backwards.
+    hops_near_start = jnp.where(near_start & (hops >= 0), hops, jnp.iinfo(hops.dtype).max)
     detour = sum(jnp.sqrt(jnp.sum((network.middles - end[None, None, None]) ** 2, axis=-1)) for end in (start, goal))
-    first = jnp.argmin(jnp.where(heard == jnp.min(heard), detour, jnp.inf))
+    first = jnp.argmin(jnp.where(hops_near_start == jnp.min(hops_near_start), detour, jnp.inf))
     begin = jnp.stack(jnp.unravel_index(first, shape)).astype(jnp.int32)
     cells, count, arrived = follow(config, network, hops, begin, near_goal)
     return Walk(network.middles[tuple(cells.T)], count, arrived, jnp.any(near_start & (hops >= 0)), taken)
@@ -352,7 +351,7 @@ def solve(
 
 @functools.lru_cache(maxsize=8)
 def _compiled(config: SnnConfig, shape: tuple[int, int, int], cell: float, structure: Any, leaves: Any) -> Any:
-    """`solve` for scenes of these capacities."""
+    """Returns `solve`, compiled for scenes of these capacities."""
     scene = jax.tree.unflatten(structure, [jax.ShapeDtypeStruct(leaf, jnp.float32) for leaf in leaves])
     point, number = jax.ShapeDtypeStruct((3,), jnp.float32), jax.ShapeDtypeStruct((), jnp.float32)
     program = jax.jit(functools.partial(solve, config, shape=shape, cell=cell))
@@ -366,7 +365,7 @@ def plan(
     config: SnnConfig = SnnConfig(),  # noqa: B008
     cell: float = 1.0,
 ) -> Plan:
-    """The path that the synaptic vector field leads along. `seed` does nothing, the wave is deterministic.
+    """Returns the path along the synaptic vector field. The wave is deterministic: `seed` is unused.
 
     Raises:
         ValueError: if the flight volume is narrower than one cell.

@@ -1,8 +1,8 @@
-"""A scene's distances compiled with numba, for planners that ask for one point or one leg at a time.
+"""Distances to a scene compiled with numba, for planners that query one point or one segment at a time.
 
-A jitted JAX call costs more than the distances of a whole small scene. Here a scene is one table, a row per
-shape, and all kinds of `sim.scene` become four: a box, a cylinder, a capsule (a sphere is one without length)
-and a plane, at any rotation.
+The call of a jitted JAX function takes longer than the distances of a small scene. Here a scene is one table with a row
+for each shape, and the shapes of `sim.scene` are reduced to four kinds with any rotation: box, cylinder, capsule (a
+sphere is a capsule of length 0) and plane.
 """
 
 from __future__ import annotations
@@ -29,15 +29,16 @@ from edqn_jax.sim.scene import (
 numba = require("numba")
 
 _BOX, _CYLINDER, _CAPSULE, _PLANE = range(4)
-_STRIDE = 0.02  # metres; the sphere sinks in unnoticed by at most 0.01^2 / 2 r = 0.14 mm
+_STRIDE = 0.02  # metres; undetected penetration of at most 0.01^2 / 2 r = 0.14 mm
 _UP = np.array([0.0, 0.0, 1.0])
 
 
 def solid_table(scene: Scene) -> np.ndarray:
-    """The shapes of one world, [N, 17] float64: kind, radius of the ball around it, middle [3], sizes [3], axes [9].
+    """Returns the shapes of one world as a table [N, 17] float64.
 
-    Sizes are a box's half extents; half length and radius of a cylinder or capsule. The axes are a box's three;
-    the others' direction, or a plane's normal, comes first.
+    Columns: kind, radius of the bounding sphere, centre [3], sizes [3], axes [9]. Sizes are the half extents of a box,
+    or half length and radius of a cylinder or capsule. Axes are the three of a box; for other shapes the first is the
+    direction, for a plane the normal, and the others are 0.
     """
     return np.array([_row(shape) for shape in scene_shapes(scene)], np.float64).reshape(-1, 17)
 
@@ -69,7 +70,7 @@ def _row(shape: Shape) -> np.ndarray:
 
 @numba.njit
 def shape_distance(row, x, y, z):
-    """Signed distance in metres from a point to the shape of one row [17] of the table."""
+    """Returns the signed distance in metres from a point to the shape of one row [17] of the table."""
     dx, dy, dz = x - row[2], y - row[3], z - row[4]
     along = dx * row[8] + dy * row[9] + dz * row[10]
     if row[0] == _PLANE:
@@ -93,12 +94,12 @@ def shape_distance(row, x, y, z):
 
 @numba.njit
 def distance(table, x, y, z):
-    """Metres from a point to the nearest surface, negative inside a shape: `sim.scene.signed_distance`."""
+    """Returns metres from a point to the nearest surface, negative inside a shape: `sim.scene.signed_distance`."""
     nearest = PARKED
     for i in range(table.shape[0]):
         row = table[i]
         within = nearest + row[1]
-        # The ball around a shape is no further away than the shape.
+        # The bounding sphere of a shape is no further away than the shape.
         if within > 0.0 and (x - row[2]) ** 2 + (y - row[3]) ** 2 + (z - row[4]) ** 2 >= within**2:
             continue
         nearest = min(nearest, shape_distance(row, x, y, z))
@@ -107,7 +108,7 @@ def distance(table, x, y, z):
 
 @numba.njit
 def leg_free(table, start, end, radius):
-    """Whether a sphere passes straight from `start` [3] to `end` [3]: walk on by as much as is free."""
+    """Returns whether a sphere passes straight from `start` [3] to `end` [3], by steps as long as the clearance."""
     length = math.sqrt((end[0] - start[0]) ** 2 + (end[1] - start[1]) ** 2 + (end[2] - start[2]) ** 2)
     along = 0.0
     while True:

@@ -8,7 +8,7 @@ import pytest
 from edqn_jax.planners.planner import PLANNERS, Budget, Task, load_planner
 from edqn_jax.sim.mjcf import load_scene, resolve_world
 from edqn_jax.sim.worlds import random_scene, world_key
-from tests.planners.rooms import RADIUS, WITHOUT_A_WAY, assert_flyable, random_room, room
+from tests.planners.small_worlds import RADIUS, WITHOUT_A_WAY, assert_flyable, random_small_world, small_world
 
 # A* hugs what it passes: its legs are checked every 2 cm, which misses 0.14 mm, and the judge is float32.
 TOLERANCE = {"A*": 2e-4, "A* 1 m": 2e-4}
@@ -26,14 +26,14 @@ def test_without_a_way_it_says_no_path(name, world):
 
 @pytest.mark.parametrize("name", PLANNERS)
 def test_a_goal_in_a_wall_is_no_path(name):
-    plan = load_planner(name)(room(goal=(10.0, 6.0, 0.1)), BUDGET)
+    plan = load_planner(name)(small_world(goal=(10.0, 6.0, 0.1)), BUDGET)
     assert plan.reason == "no path: a sphere of 0.36 m does not fit at the goal (10, 6, 0.1)"
 
 
 @pytest.mark.parametrize("seed", range(6))
 @pytest.mark.parametrize("name", PLANNERS)
-def test_every_path_in_a_small_room_is_free(name, seed):
-    task = random_room(seed)
+def test_every_path_in_a_small_world_is_free(name, seed):
+    task = random_small_world(seed)
     plan = load_planner(name)(task, Budget(seconds=600.0, steps=2000 if name in ("RRT*", "BIT*") else None))
     if name == "APF" and not plan.found:
         assert "local minimum" in plan.reason or "drives the drone into" in plan.reason

@@ -11,7 +11,7 @@ from edqn_jax.planners import potential_field
 from edqn_jax.planners.planner import Budget
 from edqn_jax.planners.solids import solid_table
 from edqn_jax.sim.scene import shape_distances
-from tests.planners.rooms import RADIUS, assert_flyable, box, room
+from tests.planners.small_worlds import RADIUS, assert_flyable, box, small_world
 
 CONFIG = potential_field.ApfConfig()
 
@@ -31,7 +31,7 @@ def potential(task, point):
 
 @pytest.mark.parametrize("point", [(2.0, 3.0, 3.0), (4.1, 5.5, 2.0), (7.5, 7.9, 1.5), (9.0, 6.0, 4.0)])
 def test_the_force_is_the_downward_slope_of_khatibs_potentials(point):
-    task = room(box((5, 5, 0), (6, 7, 5)), box((7, 9, 1), (9, 10, 6)))
+    task = small_world(box((5, 5, 0), (6, 7, 5)), box((7, 9, 1), (9, 10, 6)))
     gains = CONFIG.attraction, CONFIG.repulsion, CONFIG.influence_m, CONFIG.conic_m
     force = potential_field.force(solid_table(task.scene), *point, task.goal, RADIUS, *gains)
     h = 1e-2  # the scene's distances are float32
@@ -43,32 +43,35 @@ def test_the_force_is_the_downward_slope_of_khatibs_potentials(point):
 
 
 def test_in_the_open_it_goes_straight():
-    task = room(goal=(10.0, 7.0, 3.5))
+    task = small_world(goal=(10.0, 7.0, 3.5))
     plan = potential_field.plan(task)
     assert_flyable(task, plan.path)
     assert plan.length_m == pytest.approx(np.linalg.norm(task.goal - task.start), rel=0.01)
 
 
 def test_it_goes_around_what_it_does_not_face():
-    task = room(box((5.5, 6.5, 0), (6.5, 8.5, 6)))
+    task = small_world(box((5.5, 6.5, 0), (6.5, 8.5, 6)))
     plan = potential_field.plan(task)
     assert_flyable(task, plan.path)
     assert plan.length_m > 8.0
 
 
 def test_it_is_stuck_before_a_wide_wall_though_there_is_a_way():
-    task = room(box((6, 1.5, 0), (6.5, 10.5, 6)))
+    task = small_world(box((6, 1.5, 0), (6.5, 10.5, 6)))
     plan = potential_field.plan(task)
     assert plan.reason.startswith("no path: a local minimum of the potential at (")
     assert plan.steps < 1000
 
 
 def test_the_budget_ends_it():
-    assert potential_field.plan(room(), Budget(steps=7)).reason == "no path: the goal was not reached within 7 steps"
+    assert (
+        potential_field.plan(small_world(), Budget(steps=7)).reason
+        == "no path: the goal was not reached within 7 steps"
+    )
 
 
 def test_a_step_into_something_is_no_path():
-    task = room(box((6, 0, 0), (6.5, 12, 6)))
+    task = small_world(box((6, 0, 0), (6.5, 12, 6)))
     plan = potential_field.plan(task, config=potential_field.ApfConfig(repulsion=0.0))
     # Nothing pushes back, so it comes within a step of the wall, which begins 0.361 m before x = 6.
-    assert plan.reason == "no path: the force drives the drone into something at (5.6, 6, 3)"
+    assert plan.reason == "no path: the force drives the drone into an obstacle at (5.6, 6, 3)"

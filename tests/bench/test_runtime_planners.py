@@ -11,10 +11,10 @@ from edqn_jax.config import Config
 from edqn_jax.planners.planner import PLANNERS
 from edqn_jax.sim.mjcf import write_scene
 from rivals.planning import Planning
-from tests.planners.rooms import WITHOUT_A_WAY, box, room
+from tests.planners.small_worlds import WITHOUT_A_WAY, box, small_world
 
 BUDGET_SECONDS = 0.5
-MISSIONS = {"open": room(box((4, -1, 0), (6, 5, 7))), **WITHOUT_A_WAY}
+MISSIONS = {"open": small_world(box((4, -1, 0), (6, 5, 7))), **WITHOUT_A_WAY}
 """A wall beside the straight line, and worlds without a way."""
 
 

@@ -7,7 +7,7 @@ import pytest
 
 from edqn_jax.planners.packages import MissingPackageError
 from edqn_jax.planners.planner import Budget, load_planner
-from tests.planners.rooms import WITHOUT_A_WAY, assert_flyable, box, room
+from tests.planners.small_worlds import WITHOUT_A_WAY, assert_flyable, box, small_world
 from tests.planners.uninstalled import hide
 
 LONG = 600.0  # seconds; the steps end it
@@ -19,14 +19,14 @@ def planner(request):
 
 
 def test_a_seed_is_a_path_and_another_is_another(planner):
-    task, budget = room(box((5, 0, 0), (6, 9, 6))), Budget(LONG, 1500)
+    task, budget = small_world(box((5, 0, 0), (6, 9, 6))), Budget(LONG, 1500)
     first, again, other = (planner(task, budget, seed).path for seed in (0, 0, 1))
     np.testing.assert_array_equal(first, again)
     assert first.shape != other.shape or np.any(first != other)
 
 
 def test_more_steps_shorten_the_path(planner):
-    task = room(box((5, 0, 0), (6, 9, 6)))
+    task = small_world(box((5, 0, 0), (6, 9, 6)))
     short, long = (planner(task, Budget(LONG, steps), 0) for steps in (500, 5000))
     assert long.length_m < short.length_m
     assert short.steps <= 501 and long.steps > 4000
@@ -39,7 +39,7 @@ def test_more_steps_shorten_the_path(planner):
 
 
 def test_asked_for_the_first_path_it_ends_with_it(planner, request):
-    task, budget = room(box((5, 0, 0), (6, 9, 6))), Budget(LONG, 5000)
+    task, budget = small_world(box((5, 0, 0), (6, 9, 6))), Budget(LONG, 5000)
     first = load_planner(f"{request.node.callspec.params['planner']} first path")(task, budget, 0)
     whole = planner(task, budget, 0)
     assert_flyable(task, first.path)
@@ -52,11 +52,11 @@ def test_asked_for_the_first_path_it_ends_with_it(planner, request):
 def test_a_budget_in_seconds_ends_it(planner):
     plan = planner(WITHOUT_A_WAY["wall across"], Budget(seconds=0.3))
     assert plan.seconds >= 0.3 and plan.steps > 0
-    assert plan.reason.startswith("no path: none was found within 0.")
+    assert plan.reason.startswith("no path: none found within 0.")
 
 
 @pytest.mark.parametrize("name", ["RRT*", "BIT*"])
 def test_without_ompl_it_says_how_to_install_it(name, monkeypatch):
     hide(monkeypatch, "ompl")
-    with pytest.raises(MissingPackageError, match=r"ompl is not installed; pip install 'edqn-jax\[bench\]' brings it"):
+    with pytest.raises(MissingPackageError, match=r"ompl is not installed; run pip install 'edqn-jax\[bench\]'"):
         load_planner(name)

@@ -12,7 +12,7 @@ import pytest
 
 from edqn_jax.planners.solids import distance, leg_free, shape_distance, solid_table
 from edqn_jax.sim.scene import PARKED, scene_shapes, shape_distances
-from tests.planners.rooms import box, room, true_distances
+from tests.planners.small_worlds import box, small_world, true_distances
 from tests.sim.drawn_scenes import ball, every_kind, scene_of
 
 
@@ -64,7 +64,7 @@ def test_a_leg_is_free_if_every_point_of_it_is(seed):
 
 
 def test_a_leg_without_length_is_its_point():
-    table = solid_table(room(box((4, 4, 0), (6, 6, 3))).scene)
+    table = solid_table(small_world(box((4, 4, 0), (6, 6, 3))).scene)
     point = np.array([6.5, 5.0, 1.0])
     assert leg_free(table, point, point, 0.49)
     assert not leg_free(table, point, point, 0.51)

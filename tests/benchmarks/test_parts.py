@@ -16,7 +16,7 @@ from edqn_jax.evaluation.missions import run_missions
 from edqn_jax.learn.trainer import AXIS, Plan, init
 from measurement.flags import configured
 from measurement.parts import PARTS, Moment, parts_of
-from measurement.timing import Part, Timed, nudged, operations, size_of
+from measurement.timing import Part, Timed, depending_on, operations, size_of
 from measurement.whole import steady
 from tests.miniature import MINIATURE
 
@@ -63,9 +63,9 @@ def test_environments_that_have_ended_fly_on_where_resets_are_left_out(now: Mome
 
 
 def test_what_does_not_change_is_computed_in_every_turn_all_the_same() -> None:
-    def body(stays: Array, carry: tuple[Array, Array]) -> tuple[Array, Array]:
+    def body(constant: Array, carry: tuple[Array, Array]) -> tuple[Array, Array]:
         same, result = carry
-        return same, nudged(result, jnp.sin(stays), jnp.tan(same))
+        return same, depending_on(result, jnp.sin(constant), jnp.tan(same))
 
     mesh = Mesh(np.asarray(jax.devices()[:1]), (AXIS,))
     part = Part("constant", body, jnp.ones(64), (jnp.ones(64), jnp.zeros(64)))

@@ -20,7 +20,7 @@ from edqn_jax.sim.mjcf import write_scene
 from rivals import learners, planning, rival, table
 from tests.benchmarks.turns import row
 from tests.miniature import MINIATURE
-from tests.planners.rooms import WITHOUT_A_WAY, room
+from tests.planners.small_worlds import WITHOUT_A_WAY, small_world
 from tests.planners.uninstalled import hide
 
 TINY = (*MINIATURE, "--total-steps", "512", "--train.chunk-steps", "8", "--train.validation-every", "256")
@@ -42,7 +42,7 @@ def answers_of(name: str, config: Config, tmp_path: Path, monkeypatch: pytest.Mo
 def test_a_missing_package_is_a_reason(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     hide(monkeypatch, "numba", "ompl")
     (said,) = answers_of(name, parse_train(MINIATURE)[1], tmp_path, monkeypatch, "0\n")
-    assert said == {"reason": "numba is not installed; pip install 'edqn-jax[bench]' brings it"}
+    assert said == {"reason": "numba is not installed; run pip install 'edqn-jax[bench]'"}
 
 
 def test_a_planner_says_no_path_where_there_is_none(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -73,7 +73,7 @@ def test_the_judged_worlds_are_those_that_training_ends_with() -> None:
 
 @pytest.mark.slow
 def test_many_worlds_have_the_shortest_paths_of_each_alone(monkeypatch: pytest.MonkeyPatch) -> None:
-    scenes = [room().scene, WITHOUT_A_WAY["wall across"].scene, room().scene]
+    scenes = [small_world().scene, WITHOUT_A_WAY["wall across"].scene, small_world().scene]
     alone = runtime.shortest_of(Config(), scenes)
     monkeypatch.setattr(runtime, "MANY", 2)
     assert runtime.shortest_of(Config(), scenes) == alone
@@ -83,7 +83,7 @@ def test_many_worlds_have_the_shortest_paths_of_each_alone(monkeypatch: pytest.M
 @pytest.mark.slow
 def test_a_learner_compiles_once_and_a_seed_comes_to_the_same_whatever_came_before(tmp_path: Path) -> None:
     clear = tmp_path / "clear.xml"
-    write_scene(room().scene, clear, title="clear")
+    write_scene(small_world().scene, clear, title="clear")
     _, config = parse_train(["--world", str(clear), *TINY])
     # Blind, since it compiles soonest: it has no camera and no VAE.
     learner = learners.Learner(learners.sensing(config, "DQN blind"))

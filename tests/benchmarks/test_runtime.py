@@ -18,7 +18,7 @@ from edqn_jax.sim.mjcf import write_scene
 from measurement.child import ChildEndedError
 from rivals import stack, table
 from tests.benchmarks.turns import flights, row, turn
-from tests.planners.rooms import WITHOUT_A_WAY, room
+from tests.planners.small_worlds import WITHOUT_A_WAY, small_world
 
 
 @pytest.fixture
@@ -33,7 +33,7 @@ def shut(tmp_path: Path) -> Path:
 def clear(tmp_path: Path) -> Path:
     """A small world as a file, with nothing in the way."""
     file = tmp_path / "clear.xml"
-    write_scene(room().scene, file, title="clear")
+    write_scene(small_world().scene, file, title="clear")
     return file
 
 
@@ -50,7 +50,7 @@ class Fake:
 
     def answer(self) -> dict[str, Any]:
         if self.name == "BIT*":
-            return {"reason": "ompl is not installed; pip install 'edqn-jax[bench]' brings it"}
+            return {"reason": "ompl is not installed; run pip install 'edqn-jax[bench]'"}
         workload = {"width": 32, "num_envs": 512, "replayed_samples_per_decision": 4, "vae_samples_per_decision": 1}
         return {"device": "a machine", "devices": ["cpu:0"], "versions": {"jax": "0"}, "workload": workload}
 
@@ -106,7 +106,7 @@ def test_methods_take_turns_seed_by_seed_and_all_of_it_is_told(
     assert "1,000,000 decisions to train, 20 s to plan" in told and "seed 1 is done" in told
     assert "| E-DQN | no | 40.0 (1,000) | 60.0 | 31.0 | 120 | " in shown
     assert "| RRT*, 5 s | yes | " in shown and "2 of 2: 100% (34% - 100%)" in shown
-    assert "- BIT*: ompl is not installed; pip install 'edqn-jax[bench]' brings it." in shown
+    assert "- BIT*: ompl is not installed; run pip install 'edqn-jax[bench]'." in shown
     assert "- APF: it ended in seed 0: Killed." in shown
     # The paper's own figures stand apart and are marked as theirs.
     assert shown.index("Table 3 (theirs)") < shown.index("41.364")

@@ -9,7 +9,7 @@ import math
 import jax
 import numpy as np
 
-from edqn_jax.planners.astar import unseen_depth
+from edqn_jax.planners.astar import edge_margin
 from edqn_jax.sim.scene import Scene, segment_contact, signed_distance
 
 
@@ -32,7 +32,7 @@ def shortest_length(
     free = dict(zip(cells, np.asarray(fits), strict=True))
     ends = lower + cell * np.array(edges, np.float32)
     # An edge is sampled, and keeps off by what the sphere can sink in unnoticed between two samples.
-    touch = _touches(scene, ends, radius + unseen_depth(cell, radius))
+    touch = _touches(scene, ends, radius + edge_margin(cell, radius))
     neighbours = {a: [] for a in cells}
     for (a, b), touches in zip(edges, np.asarray(touch), strict=True):
         if free[a] and free[b] and not touches:

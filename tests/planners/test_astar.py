@@ -30,7 +30,7 @@ GREY = np.full(3, 0.5)
 CAPACITIES = {"boxes": 6, "cylinders": 2, "spheres": 2}  # the same in every test: one compilation
 
 
-def room(*shapes, size=(10.0, 10.0, 4.0)) -> Scene:
+def small_world(*shapes, size=(10.0, 10.0, 4.0)) -> Scene:
     return build_scene(shapes, volume=[(0, 0, 0), size], start=[0, 0, 0], goal=size, capacities=CAPACITIES)
 
 
@@ -40,7 +40,7 @@ def box(lower, upper) -> UprightBoxes:
 
 
 def test_in_the_open_the_path_is_the_straight_line():
-    path = shortest_path(room(), np.array([1.0, 1, 1]), np.array([9.0, 7.0, 3.0]), RADIUS)
+    path = shortest_path(small_world(), np.array([1.0, 1, 1]), np.array([9.0, 7.0, 3.0]), RADIUS)
     # 16 x 12 x 4 cells: 4 space diagonals, 8 plane diagonals, 4 straight steps.
     assert path.grid_length_m == pytest.approx(0.5 * (4 * math.sqrt(3) + 8 * math.sqrt(2) + 4))
     assert path.length_m == pytest.approx(math.sqrt(8**2 + 6**2 + 2**2), rel=1e-6)
@@ -49,7 +49,7 @@ def test_in_the_open_the_path_is_the_straight_line():
 
 def test_around_a_wall_it_is_the_taut_string():
     wall = box((4.9, 0, 0), (5.1, 7, 4))
-    path = shortest_path(room(wall), np.array([2.0, 5, 2]), np.array([8.0, 5, 2]), RADIUS)
+    path = shortest_path(small_world(wall), np.array([2.0, 5, 2]), np.array([8.0, 5, 2]), RADIUS)
     # Two tangents to the circle of the body's radius around the wall's edge, two arcs, the wall's thickness.
     reach = math.hypot(2.9, 2.0)
     arc = math.pi / 2 + math.atan2(2.0, 2.9) - math.acos(RADIUS / reach)
@@ -60,7 +60,7 @@ def test_around_a_wall_it_is_the_taut_string():
 
 
 def test_every_point_of_the_path_is_free():
-    scene = room(box((4, 0, 0), (6, 6, 4)), box((7, 4, 0), (8, 10, 3)), box((2, 3, 0), (3, 10, 4)))
+    scene = small_world(box((4, 0, 0), (6, 6, 4)), box((7, 4, 0), (8, 10, 3)), box((2, 3, 0), (3, 10, 4)))
     path = shortest_path(scene, np.array([1.0, 9, 1]), np.array([9.0, 9, 1]), RADIUS)
     distance = jax.jit(jax.vmap(lambda point: signed_distance(scene, point)))
     legs = [a + np.linspace(0, 1, 2000)[:, None] * (b - a) for a, b in itertools.pairwise(path.points)]
@@ -80,7 +80,7 @@ def test_the_grid_path_is_as_short_as_dijkstras(seed):
     ]
     shapes.append(Spheres(position=rng.uniform(1, size - 1), radius=0.7, albedo=GREY))
     shapes.append(UprightCylinders(position=size / 2, radius=0.1, half_height=1.5, albedo=GREY))
-    scene = room(*shapes, size=size)
+    scene = small_world(*shapes, size=size)
     expected = dijkstra.shortest_length(scene, (0, 0, 1), (10, 10, 5), RADIUS, cell)
     start, goal = np.array([0, 0, 0.5]), np.array([5.0, 5.0, 2.5])
     if math.isinf(expected):
@@ -93,29 +93,29 @@ def test_the_grid_path_is_as_short_as_dijkstras(seed):
 
 
 def test_a_goal_between_cells_is_reached_exactly():
-    path = shortest_path(room(), np.array([1.0, 1, 1]), np.array([8.73, 6.11, 2.9]), RADIUS)
+    path = shortest_path(small_world(), np.array([1.0, 1, 1]), np.array([8.73, 6.11, 2.9]), RADIUS)
     np.testing.assert_allclose(path.points[-1], [8.73, 6.11, 2.9])
     assert path.length_m == pytest.approx(np.linalg.norm([7.73, 5.11, 1.9]), rel=1e-6)
 
 
 def test_a_wall_across_leaves_no_path():
     wall = box((4.9, 0, 0), (5.1, 10, 4))
-    with pytest.raises(NoPathError, match="every way is blocked") as raised:
-        shortest_path(room(wall), np.array([2.0, 5, 2]), np.array([8.0, 5, 2]), RADIUS)
+    with pytest.raises(NoPathError, match="every path is blocked") as raised:
+        shortest_path(small_world(wall), np.array([2.0, 5, 2]), np.array([8.0, 5, 2]), RADIUS)
     assert isinstance(raised.value, ConfigError)
 
 
 def test_a_door_is_passed_only_by_what_fits():
     door = [box((4.9, 0, 0), (5.1, 4.5, 4)), box((4.9, 5.5, 0), (5.1, 10, 4))]
     start, goal = np.array([2.0, 5, 2]), np.array([8.0, 5, 2])
-    assert shortest_path(room(*door), start, goal, 0.45).length_m == pytest.approx(6.0, rel=1e-6)
+    assert shortest_path(small_world(*door), start, goal, 0.45).length_m == pytest.approx(6.0, rel=1e-6)
     with pytest.raises(NoPathError):
-        shortest_path(room(*door), start, goal, 0.55)
+        shortest_path(small_world(*door), start, goal, 0.55)
 
 
 @pytest.mark.parametrize(("start", "said"), [([5.0, 5, 2], "does not fit"), ([-1.0, 5, 2], "outside")])
 def test_a_bad_start_says_so(start, said):
-    scene = room(box((4, 4, 0), (6, 6, 4)))
+    scene = small_world(box((4, 4, 0), (6, 6, 4)))
     with pytest.raises(NoPathError, match=said):
         shortest_path(scene, np.array(start), np.array([8.0, 5, 2]), RADIUS)
 

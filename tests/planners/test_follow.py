@@ -1,4 +1,4 @@
-"""The follower: it arrives where there is room, and a path that goes wrong is flown wrong."""
+"""The follower: it arrives where there is enough clearance, and a path into a wall is flown into it."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from edqn_jax.planners.planner import Task, path_length
 from edqn_jax.sim import drone
 from edqn_jax.sim.flights import Flights
 from edqn_jax.sim.outcomes import Outcome
-from tests.planners.rooms import RADIUS, SIZE, assert_flyable, box, closet, random_room, room
+from tests.planners.small_worlds import RADIUS, SIZE, assert_flyable, box, enclosure, random_small_world, small_world
 
 CONFIG, FOLLOW = Config(), FollowConfig()
 AIRFRAME = drone.load_airframe(CONFIG.drone)
@@ -31,7 +31,7 @@ def flown(task: Task, path) -> Flights:
 
 
 def test_in_the_open_it_flies_straight_to_the_goal_about_as_fast_as_a_learner_may():
-    task = room()
+    task = small_world()
     flight = flown(task, [task.start, task.goal])
     assert flight.outcome == Outcome.GOAL
     # 8 m less the goal's radius; it takes part of a second to be as fast as it may.
@@ -40,8 +40,8 @@ def test_in_the_open_it_flies_straight_to_the_goal_about_as_fast_as_a_learner_ma
     assert (flight.decisions - 1) * 0.26 < flight.flight_seconds <= flight.decisions * 0.26 + 1e-5
 
 
-# Two walls across the room that are open at opposite sides, 2 m wide: room for a body of 0.36 m and its reserve.
-CHICANE = room(box((3.6, -1, -1), (4.2, 10, 7)), box((7.2, 2, -1), (7.8, 13, 7)))
+# Two walls across the world that are open at opposite sides, 2 m wide: enough for a body of 0.36 m and its reserve.
+CHICANE = small_world(box((3.6, -1, -1), (4.2, 10, 7)), box((7.2, 2, -1), (7.8, 13, 7)))
 
 
 def test_through_gaps_it_stays_on_the_path_as_closely_as_the_reserve_asks():
@@ -74,7 +74,7 @@ def test_a_path_through_a_wall_is_a_collision_at_the_wall():
 
 
 def test_a_path_out_of_the_volume_leaves_it_and_one_that_ends_early_runs_out_of_time():
-    task = room()
+    task = small_world()
     assert flown(task, [task.start, (2.0, 14.0, 3.0)]).outcome == Outcome.LEFT_VOLUME
     waiting = flown(task, [task.start, (5.0, 6.0, 3.0)])
     assert waiting.outcome == Outcome.TIME_OUT and waiting.decisions == CONFIG.env.max_decisions
@@ -83,7 +83,7 @@ def test_a_path_out_of_the_volume_leaves_it_and_one_that_ends_early_runs_out_of_
 
 @pytest.mark.parametrize("seed", range(4))
 def test_what_a_planner_draws_with_the_reserve_is_flown_without_contact(seed):
-    task = random_room(seed, shapes=3)
+    task = random_small_world(seed, shapes=3)
     held = reserved(task, FOLLOW)
     plan = snn.plan(held)
     if plan.path is None:
@@ -95,7 +95,7 @@ def test_what_a_planner_draws_with_the_reserve_is_flown_without_contact(seed):
 
 
 def test_the_reserve_enlarges_the_body_and_draws_in_the_fence_but_for_the_ends():
-    task = room(start=(0.1, 6.0, 3.0), goal=(10.0, 12.0, 3.0))
+    task = small_world(start=(0.1, 6.0, 3.0), goal=(10.0, 12.0, 3.0))
     held = reserved(task, FOLLOW)
     assert held.body_radius == pytest.approx(RADIUS + FOLLOW.reserve_m)
     lower, upper = np.asarray(held.scene.volume)
@@ -105,7 +105,7 @@ def test_the_reserve_enlarges_the_body_and_draws_in_the_fence_but_for_the_ends()
 
 
 def test_a_goal_that_only_the_reserve_does_not_fit_at_is_refused_in_a_sentence():
-    task = room(*closet((10.0, 6.0, 3.0), inner=0.5))
+    task = small_world(*enclosure((10.0, 6.0, 3.0), inner=0.5))
     assert snn.plan(reserved(task, FOLLOW)).reason.startswith("no path: a sphere of 0.66 m does not fit at the goal")
 
 

@@ -8,7 +8,7 @@ import pytest
 from edqn_jax.planners import snn
 from edqn_jax.planners.packages import MissingPackageError, require
 from edqn_jax.planners.planner import PLANNERS, load_planner, refusal
-from tests.planners.rooms import box, room
+from tests.planners.small_worlds import box, small_world
 from tests.planners.uninstalled import hide
 
 
@@ -21,7 +21,7 @@ def test_without_its_package_a_planner_says_how_to_install_it(name, monkeypatch)
     hide(monkeypatch, "numba", "ompl")
     with pytest.raises(MissingPackageError) as raised:
         load_planner(name)
-    assert str(raised.value) == "numba is not installed; pip install 'edqn-jax[bench]' brings it"
+    assert str(raised.value) == "numba is not installed; run pip install 'edqn-jax[bench]'"
 
 
 def test_a_broken_package_is_not_a_missing_one(tmp_path, monkeypatch):
@@ -42,7 +42,7 @@ def test_a_broken_package_is_not_a_missing_one(tmp_path, monkeypatch):
     ],
 )
 def test_ends_where_nothing_can_stand_are_refused(ends, said):
-    task = room(box((4, 5, 0), (6, 7, 4)), **ends)
+    task = small_world(box((4, 5, 0), (6, 7, 4)), **ends)
     answer = refusal(task)
     if said is None:
         assert answer is None

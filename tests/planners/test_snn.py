@@ -17,7 +17,15 @@ from edqn_jax.planners.planner import MARGIN, Budget, Task
 from edqn_jax.sim.mjcf import load_scene, resolve_world
 from edqn_jax.sim.worlds import random_scene, world_key
 from tests.oracles.breadth_first import hop_counts
-from tests.planners.rooms import RADIUS, WITHOUT_A_WAY, assert_flyable, box, random_room, room, true_distances
+from tests.planners.small_worlds import (
+    RADIUS,
+    WITHOUT_A_WAY,
+    assert_flyable,
+    box,
+    random_small_world,
+    small_world,
+    true_distances,
+)
 from tests.sim.drawn_scenes import every_kind
 
 CONFIG = snn.SnnConfig()
@@ -42,7 +50,7 @@ def test_the_whole_volume_of_the_paper_is_one_lattice_of_metres():
 
 
 def test_cells_stand_in_the_middle_of_their_cubes():
-    middles = _synapses(room().scene, RADIUS, SMALL, 1.0).middles
+    middles = _synapses(small_world().scene, RADIUS, SMALL, 1.0).middles
     np.testing.assert_allclose(middles[0, 0, 0], [0.5, 0.5, 0.5])
     np.testing.assert_allclose(middles[3, 4, 5], [3.5, 4.5, 5.5])
 
@@ -54,7 +62,7 @@ def test_a_volume_without_room_for_a_cell_says_so():
 
 def test_along_the_ground_every_edge_is_there():
     # The lowest cells stand 0.5 m over the ground: only an edge's own course says that it is free.
-    network = _synapses(room().scene, RADIUS, SMALL, 1.0)
+    network = _synapses(small_world().scene, RADIUS, SMALL, 1.0)
     assert bool(network.free.all())
     inner = np.asarray(network.joined)[1:-1, 1:-1, 1:-1]
     assert np.all(inner == 2**26 - 1)
@@ -64,7 +72,7 @@ def test_along_the_ground_every_edge_is_there():
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_no_edge_touches_anything_and_none_with_room_is_missing(seed):
+def test_no_edge_touches_anything_and_none_with_clearance_is_missing(seed):
     rng = np.random.default_rng(seed)
     scene = every_kind(rng)
     network = jax.device_get(_synapses(scene, RADIUS, (60, 60, 25), 1.0))
@@ -88,14 +96,14 @@ def test_no_edge_touches_anything_and_none_with_room_is_missing(seed):
 
 @pytest.mark.parametrize("seed", range(4))
 def test_synapses_come_in_pairs(seed):
-    joined = np.asarray(_synapses(random_room(seed).scene, RADIUS, SMALL, 1.0).joined)
+    joined = np.asarray(_synapses(random_small_world(seed).scene, RADIUS, SMALL, 1.0).joined)
     for k, step in enumerate(snn.DIRECTIONS):
         for cell in np.argwhere(joined >> k & 1)[::17]:
             assert joined[tuple(cell + step)] >> (25 - k) & 1
 
 
 def test_a_point_belongs_to_the_cells_that_it_sees():
-    task = room(box((5.9, 0, 0), (6.1, 12, 6)))
+    task = small_world(box((5.9, 0, 0), (6.1, 12, 6)))
     network = _synapses(task.scene, 0.1, SMALL, 1.0)
     seen = snn.cells_at(task.scene, network, jnp.array([5.5, 6.0, 3.0]), 0.1)
     # Around (5.5, 6, 3) stand cells at x = 5.5 and, beyond the wall, x = 6.5.
@@ -108,7 +116,7 @@ def test_a_point_belongs_to_the_cells_that_it_sees():
 
 @pytest.mark.parametrize("seed", range(8))
 def test_the_wave_arrives_in_the_order_of_breadth_first_hops(seed):
-    scene = random_room(seed).scene
+    scene = random_small_world(seed).scene
     network = _synapses(scene, RADIUS, SMALL, 1.0)
     goal = np.asarray(snn.cells_at(scene, network, scene.goal, RADIUS))
     hops, _ = _wave(CONFIG, network, goal)
@@ -125,7 +133,7 @@ def test_the_wave_arrives_in_the_order_of_breadth_first_hops(seed):
 
 
 def test_a_blocked_cell_never_fires():
-    network = _synapses(room(box((5.2, 0, 0), (6.8, 12, 6))).scene, RADIUS, SMALL, 1.0)
+    network = _synapses(small_world(box((5.2, 0, 0), (6.8, 12, 6))).scene, RADIUS, SMALL, 1.0)
     hops, _ = _wave(CONFIG, network, one_cell(9, 6, 3))
     assert np.all(np.asarray(hops)[~np.asarray(network.free)] == -1)
     assert np.all(np.asarray(hops)[:5] == -1)
@@ -133,7 +141,7 @@ def test_a_blocked_cell_never_fires():
 
 
 def test_the_wave_ends_where_it_is_told_to():
-    network = _synapses(room().scene, RADIUS, SMALL, 1.0)
+    network = _synapses(small_world().scene, RADIUS, SMALL, 1.0)
     hops, taken = _wave(CONFIG, network, one_cell(0, 6, 3), one_cell(4, 6, 3))
     assert (int(taken), int(hops.max()), int(hops[4, 6, 3])) == (4, 4, 4)
     hops, taken = _wave(CONFIG, network, one_cell(0, 6, 3), one_cell(11, 6, 3), 3)
@@ -143,7 +151,7 @@ def test_the_wave_ends_where_it_is_told_to():
 def test_cells_that_one_spike_cannot_fire_are_refused():
     # 40 mV drive a resting cell to 40 (1 - exp(-1/2)) = 15.7 mV within a time step of 1 ms.
     snn.SnnConfig(threshold_v=0.0157)
-    with pytest.raises(ValueError, match=r"lifts a place cell to 0\.0157388 V, below its threshold: 0\.0158 V"):
+    with pytest.raises(ValueError, match=r"raises a place cell to 0\.0157388 V, below its threshold of 0\.0158 V"):
         snn.SnnConfig(threshold_v=0.0158)
 
 
@@ -157,7 +165,7 @@ def test_the_window_strengthens_what_fired_before_and_weakens_what_fired_after()
 
 
 def test_in_the_open_the_field_points_along_the_wave():
-    network = _synapses(room().scene, RADIUS, SMALL, 1.0)
+    network = _synapses(small_world().scene, RADIUS, SMALL, 1.0)
     hops, _ = _wave(CONFIG, network, one_cell(1, 6, 3))
     asymmetries = snn.asymmetry(CONFIG, network, hops, jnp.array([8, 6, 3]))
     # Nine neighbours fired a step before and nine a step after, each one cell along x.
@@ -166,7 +174,7 @@ def test_in_the_open_the_field_points_along_the_wave():
 
 
 def test_the_path_takes_as_many_steps_as_the_wave():
-    network = _synapses(room().scene, RADIUS, SMALL, 1.0)
+    network = _synapses(small_world().scene, RADIUS, SMALL, 1.0)
     goal = one_cell(1, 2, 3)
     hops, _ = _wave(CONFIG, network, goal)
     cells, count, arrived = _follow(CONFIG, network, hops, jnp.array([10, 6, 3]), goal)
@@ -181,14 +189,14 @@ def test_with_the_window_upside_down_no_path_is_found(monkeypatch):
     right = snn.stdp
     monkeypatch.setattr(snn, "stdp", lambda config, lag: -right(config, lag))
     snn._compiled.cache_clear()
-    plan = snn.plan(room())
+    plan = snn.plan(small_world())
     snn._compiled.cache_clear()
     assert plan.reason == "no path: the synaptic vector field does not lead to the goal"
 
 
 @pytest.mark.parametrize("seed", range(12))
-def test_every_path_in_a_small_room_is_free(seed):
-    task = random_room(seed)
+def test_every_path_in_a_small_world_is_free(seed):
+    task = random_small_world(seed)
     plan = snn.plan(task)
     assert_flyable(task, plan.path)
     assert plan.length_m == plan.first_length_m
@@ -199,7 +207,7 @@ def test_every_path_in_a_small_room_is_free(seed):
 # In both the hops count along x alone; in the second the start is as far from all cells around it.
 @pytest.mark.parametrize(("start", "goal"), [((2.4, 2.4, 2.9), (10.4, 8.4, 2.9)), ((2.0, 2.0, 3.0), (10.0, 8.0, 3.0))])
 def test_the_path_does_not_begin_backwards(start, goal):
-    task = room(start=start, goal=goal)
+    task = small_world(start=start, goal=goal)
     path = snn.plan(task).path
     assert path is not None
     assert np.linalg.norm(task.goal - path[1]) < np.linalg.norm(task.goal - task.start)
@@ -226,12 +234,12 @@ def test_without_a_way_it_says_so(world):
 
 
 def test_the_budget_ends_the_wave():
-    plan = snn.plan(room(), Budget(steps=3))
+    plan = snn.plan(small_world(), Budget(steps=3))
     assert plan.reason == "no path: no spike reached the start within 3 time steps"
 
 
 def test_it_is_strict(strict_jax):
-    task = random_room(0)
+    task = random_small_world(0)
     solve = jax.jit(partial(snn.solve, CONFIG, shape=SMALL))
     ends = jnp.asarray(task.start, jnp.float32), jnp.asarray(task.goal, jnp.float32)
     walk = solve(task.scene, *ends, jnp.float32(RADIUS + MARGIN), jnp.int32(100))

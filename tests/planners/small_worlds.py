@@ -20,7 +20,7 @@ GROUND = Planes(position=np.zeros(3), normal=np.array([0.0, 0.0, 1.0]), albedo=G
 SIZE = (12.0, 12.0, 6.0)
 
 
-def room(*shapes: Shape, start=(2.0, 6.0, 3.0), goal=(10.0, 6.0, 3.0)) -> Task:
+def small_world(*shapes: Shape, start=(2.0, 6.0, 3.0), goal=(10.0, 6.0, 3.0)) -> Task:
     """A task in a small volume over level ground; its capacities never vary, so that it compiles once."""
     volume = [(0.0, 0.0, 0.0), SIZE]
     scene = build_scene([GROUND, *shapes], volume=volume, start=start, goal=goal, capacities={"boxes": 8})
@@ -32,7 +32,7 @@ def box(lower, upper) -> UprightBoxes:
     return UprightBoxes(position=(lower + upper) / 2, half=(upper - lower) / 2, yaw=np.float32(0), albedo=GREY)
 
 
-def closet(middle, inner: float = 1.0, wall: float = 0.2) -> list[Shape]:
+def enclosure(middle, inner: float = 1.0, wall: float = 0.2) -> list[Shape]:
     """Six walls around a cube of half width `inner`; a sphere fits in, and never out."""
     middle, outer = np.array(middle), inner + wall
     walls: list[Shape] = []
@@ -45,13 +45,13 @@ def closet(middle, inner: float = 1.0, wall: float = 0.2) -> list[Shape]:
 
 
 WITHOUT_A_WAY = {
-    "goal shut in": room(*closet((10.0, 6.0, 3.0))),
-    "start shut in": room(*closet((2.0, 6.0, 3.0))),
-    "wall across": room(box((5.5, -1, -1), (6.5, 13, 7))),
+    "goal enclosed": small_world(*enclosure((10.0, 6.0, 3.0))),
+    "start enclosed": small_world(*enclosure((2.0, 6.0, 3.0))),
+    "wall across": small_world(box((5.5, -1, -1), (6.5, 13, 7))),
 }
 
 
-def random_room(seed: int, shapes: int = 7) -> Task:
+def random_small_world(seed: int, shapes: int = 7) -> Task:
     """Turned blocks at random around a free start and goal; there need not be a way."""
     rng = np.random.default_rng(seed)
     ends = np.array([(1.0, 1.0, 1.0), (11.0, 11.0, 5.0)])
@@ -60,7 +60,7 @@ def random_room(seed: int, shapes: int = 7) -> Task:
         place, half = rng.uniform((1, 1, 0), (11, 11, 6)), rng.uniform(0.3, 2.0, 3)
         if np.all(np.linalg.norm(ends - place, axis=1) > np.linalg.norm(half) + RADIUS + 0.1):
             blocks.append(UprightBoxes(position=place, half=half, yaw=rng.uniform(0, 3), albedo=GREY))
-    return room(*blocks, start=tuple(ends[0]), goal=tuple(ends[1]))
+    return small_world(*blocks, start=tuple(ends[0]), goal=tuple(ends[1]))
 
 
 _distances = jax.jit(lambda scene, points: jax.vmap(lambda point: signed_distance(scene, point))(points))
