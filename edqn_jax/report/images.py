@@ -22,10 +22,12 @@ class Look:
     name: str
     unit: str
     colours: str | Colormap
+    signed: bool = False
+    """Whether what is shown is negative where it grew darker."""
 
 
 LOOKS = {
-    "events": Look("events", "events per pixel", POLARITY),
+    "events": Look("events", "events per pixel", POLARITY, signed=True),
     "frames": Look("log brightness", "log brightness + 1", "gray"),
     "depth": Look("nearness", "nearness (3 is contact)", "gray"),
 }
@@ -63,11 +65,11 @@ def draw_sight(
                 _show(axes, picture, scale, look)
                 if row == 0 and times_s is not None:
                     axes.set_title(f"t = {times_s[column]:.1f} s", weight="normal", loc="center", fontsize=8)
-                if row == 2 and _signed(look):
+                if row == 2 and look.signed:
                     total = int(np.abs(picture).sum())
                     axes.set_xlabel(f"{total:,} events", fontsize=7, labelpad=2)
             grid[row, 0].set_ylabel(name, fontsize=8)
-        signs = "\n(− darker, + brighter)" if _signed(look) else ""
+        signs = "\n(− darker, + brighter)" if look.signed else ""
         _colour_bar(figure, scale, grid, look, f"{look.unit}{signs}")
     return figure
 
@@ -98,12 +100,8 @@ def draw_reconstruction(
     return figure
 
 
-def _signed(look: Look) -> bool:
-    return look is LOOKS["events"]
-
-
 def _scale(shown: np.ndarray, look: Look) -> Normalize:
-    return _symmetric(shown) if _signed(look) else Normalize(float(np.min(shown)), float(np.max(shown)))
+    return _symmetric(shown) if look.signed else Normalize(float(np.min(shown)), float(np.max(shown)))
 
 
 def _symmetric(counts: np.ndarray) -> Normalize:
@@ -139,7 +137,7 @@ def _colour_bar(figure: Figure, scale: Normalize, beside: np.ndarray, look: Look
         extend="both",
     )
     bar.set_label(label, color=INK, fontsize=7)
-    if not _signed(look):
+    if not look.signed:
         return
     top = int(scale.vmax or 1)
     bar.set_ticks([-top, 0, top] if top < 2 else [-top, -(top // 2), 0, top // 2, top])
