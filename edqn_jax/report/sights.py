@@ -30,11 +30,12 @@ FINE = 8
 class Shown:
     """What the sensor shows at D decisions, and the VAE's part in it."""
 
-    image: np.ndarray  # [D, H, W] ON minus OFF events per pixel, or the picture
-    target: (
-        np.ndarray
-    )  # [D, H, W] what it must reconstruct: ON plus OFF events per pixel, or the picture, blurred
-    reconstruction: np.ndarray  # [D, H, W] what it makes of its code, in the same units
+    image: np.ndarray
+    """[D, H, W] ON minus OFF events per pixel, or the picture."""
+    target: np.ndarray
+    """[D, H, W] what the VAE must reconstruct: ON plus OFF events per pixel, or the picture; blurred."""
+    reconstruction: np.ndarray
+    """[D, H, W] what the VAE makes of its code, in the same units."""
 
 
 _Images = tuple[Array, Array, Array]

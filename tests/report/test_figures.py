@@ -179,6 +179,16 @@ def test_learning_shows_each_metric_where_a_line_has_it(tmp_path):
     }
 
 
+def test_the_warm_up_is_a_curve_of_its_training_steps(tmp_path):
+    steps = {"decisions": [10, 20, 30], "reconstruction_loss": [9.0, 6.0, 4.0], "kl": [1.0, 2.0, 3.0]}
+    metrics = [{"decisions": 40, "reconstruction_loss": 6.3, "kl": 2.0, "warm_up": steps}]
+    metrics += [{"decisions": 80, "reconstruction_loss": 3.0, "kl": 3.5, "warm_up": None}]
+    figure = draw_learning(metrics, tmp_path / "learning.png")
+    lines = {line.get_gid(): line for axes in figure.axes for line in axes.get_lines()}
+    assert list(np.asarray(lines["reconstruction_loss"].get_xdata())) == [10, 20, 30, 80]
+    assert list(np.asarray(lines["kl"].get_ydata())) == [1.0, 2.0, 3.0, 3.5]
+
+
 def test_learning_can_be_drawn_before_anything_was_learned(tmp_path):
     draw_learning([], tmp_path / "learning.png")
     assert is_png(tmp_path / "learning.png")
