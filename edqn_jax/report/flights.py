@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Circle
 
-from edqn_jax.report.solids import GROUND, MAP, Solid, View, draw_shadows, draw_solids, hidden, solids_of
+from edqn_jax.report.solids import GROUND, MAP, Solid, View, cut_open, draw_outlines, draw_shadows, draw_solids, hidden
 from edqn_jax.report.style import INK, MUTED, OUTCOME_COLOURS, OUTCOME_LABELS, drawing
 from edqn_jax.sim.scene import Scene
 
@@ -36,10 +36,8 @@ def draw_world(scene: Scene, file: Path) -> Figure:
     volume = np.asarray(scene.volume, np.float64)
     with drawing(7.0, 4.0, file) as figure:
         axes = figure.add_subplot()
-        solids = solids_of(scene)
         _draw_ground(axes, OBLIQUE, volume)
-        draw_shadows(axes, OBLIQUE, solids, _corners(volume))
-        draw_solids(axes, OBLIQUE, solids)
+        _draw_obstacles(axes, OBLIQUE, scene)
         for point, name, colour in ((start, "start", START_COLOUR), (goal, "goal", GOAL_COLOUR)):
             _draw_stem(axes, OBLIQUE, point, colour)
             x, y = OBLIQUE.project(point)
@@ -86,14 +84,12 @@ def draw_path(
     scale = Normalize(0.0, max(float(np.ceil(speed.max())), 1.0))
     start, goal = points[0], _ends(scene)[1]
     volume = np.asarray(scene.volume, np.float64)
-    solids = solids_of(scene)
     with drawing(9.6, 3.9, file) as figure:
         oblique, above = figure.subplots(1, 2, width_ratios=(1.75, 1.0))
         for axes, view in ((oblique, OBLIQUE), (above, MAP)):
             _draw_ground(axes, view, volume)
-            draw_solids(axes, view, solids)
+            solids = _draw_obstacles(axes, view, scene)
             if view is OBLIQUE:
-                draw_shadows(axes, view, solids, _corners(volume))
                 floor = view.project(points * [1, 1, 0])
                 axes.plot(*floor.T, color=MUTED, lw=0.7, alpha=0.7, zorder=1.5)
                 _draw_stem(axes, view, goal, GOAL_COLOUR)
@@ -118,6 +114,18 @@ def draw_path(
         bar.outline.set_visible(False)  # pyright: ignore[reportCallIssue]
         figure.legend(handles=_path_legend(shortest is not None, outcome), loc="outside lower center", ncols=5)
     return figure
+
+
+def _draw_obstacles(axes: Axes, view: View, scene: Scene) -> list[Solid]:
+    """Draws the world without what would hide it, says so, and returns the solids that hide what is behind them."""
+    world = cut_open(scene, view)
+    if view is not MAP:
+        draw_shadows(axes, view, world.shown, _corners(np.asarray(scene.volume, np.float64)))
+    draw_solids(axes, view, world.shown)
+    draw_outlines(axes, view, world.near_walls)
+    if world.note:
+        axes.set_title(world.note, fontsize=7, weight="normal", color=MUTED)
+    return world.shown
 
 
 def _ends(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
@@ -145,7 +153,8 @@ def _draw_ground(axes: Axes, view: View, volume: np.ndarray) -> None:
     if not from_above:
         post = view.project(np.array([[x0, y0, 0], [x0, y0, top]], np.float64))
         axes.plot(*post.T, color=MUTED, lw=0.8, zorder=3)
-        for z in np.arange(10, top + 1e-6, 10):
+        ticks = next(step for step in (1, 2, 5, 10, 20, 50, 100) if step == 100 or top / step < 4)
+        for z in np.arange(ticks, top + 1e-6, ticks):
             x, y = view.project(np.array([x0, y0, z]))
             axes.plot([x - 0.6 * out, x], [y, y], color=MUTED, lw=0.8, zorder=3)
             axes.text(x - 1.4 * out, y, f"{z:g}", **TICK)
