@@ -89,18 +89,19 @@ def chunk_metrics(
 
 
 def _warm_up(config: Config, first: int, losses: Losses) -> dict[str, Any] | None:
-    """Returns the VAE's losses after each training step of the warm-up; None if the chunk has none of them.
+    """Returns the VAE's losses at each training step of the warm-up; None if the chunk has none of them.
 
-    The warm-up is a chunk or two, of which the means alone would show nothing.
+    The warm-up is a chunk or two, whose means alone show nothing. The run's first step is left out: all environments
+    begin in it, and nothing moves.
     """
     steps = np.arange(first, first + len(losses.kl))
-    steps = steps[steps < Plan.of(config).warmup]
-    if len(steps) == 0:
+    wanted = (steps > 0) & (steps < Plan.of(config).warmup)
+    if not wanted.any():
         return None
     return {
-        "decisions": ((steps + 1) * config.train.num_envs).tolist(),
-        "reconstruction_loss": np.asarray(losses.reconstruction)[: len(steps)].astype(float).tolist(),
-        "kl": np.asarray(losses.kl)[: len(steps)].astype(float).tolist(),
+        "decisions": ((steps[wanted] + 1) * config.train.num_envs).tolist(),
+        "reconstruction_loss": np.asarray(losses.reconstruction)[wanted].astype(float).tolist(),
+        "kl": np.asarray(losses.kl)[wanted].astype(float).tolist(),
     }
 
 

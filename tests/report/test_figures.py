@@ -260,7 +260,7 @@ def test_reconstructions_share_the_colours_of_the_events(tmp_path):
     figure = draw_reconstruction(counts, counts * 0.5, tmp_path / "reconstruction.png")
     assert is_png(tmp_path / "reconstruction.png")
     limits = {axes.images[0].get_clim() for axes in figure.axes[:4]}
-    assert limits == {(-4.0, 4.0)}
+    assert limits == {(0.0, 4.0)}
     expected = np.sqrt(6 * 2.0**2 / (24 * 32))
     assert figure.axes[2].get_xlabel() == f"RMS error {expected:.2f}"
 
