@@ -8,7 +8,7 @@ from collections.abc import Sequence
 
 import tyro
 
-from edqn_jax.cli.arguments import EvaluateArgs, TrainCommand, parse_evaluate
+from edqn_jax.cli.arguments import EvaluateArgs, RecordArgs, TrainCommand, parse_evaluate, parse_record
 from edqn_jax.cli.train import train_command
 from edqn_jax.errors import ConfigError, DivergedError, StoppedError
 
@@ -18,7 +18,7 @@ DIVERGED = 3
 INTERRUPTED = 130
 TERMINATED = 143
 
-COMMANDS = {"train": TrainCommand, "evaluate": EvaluateArgs}
+COMMANDS = {"train": TrainCommand, "evaluate": EvaluateArgs, "record": RecordArgs}
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -32,6 +32,8 @@ def main(argv: Sequence[str] | None = None) -> int:
             return DONE
         if argv[:1] == ["evaluate"]:
             return _evaluate(argv[1:])
+        if argv[:1] == ["record"]:
+            return _record(argv[1:])
         tyro.extras.subcommand_cli_from_dict(COMMANDS, prog="edqn", args=argv[:1] or ["--help"])
     except SystemExit as ending:  # tyro has printed the help, or what is wrong
         return int(ending.code or DONE)
@@ -48,6 +50,17 @@ def _evaluate(argv: Sequence[str]) -> int:
 
     use_cpu_devices()
     evaluate_command(args)
+    return DONE
+
+
+def _record(argv: Sequence[str]) -> int:
+    args = parse_record(argv)
+
+    from edqn_jax.cli.record import record_command
+    from edqn_jax.parallel.devices import use_cpu_devices
+
+    use_cpu_devices()
+    record_command(args)
     return DONE
 
 

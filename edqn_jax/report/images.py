@@ -59,7 +59,7 @@ def draw_sight(
     size = f"{width} × {height}"
     rows = [("RGB", rgb), (f"RGB, {size}", native_rgb), (f"{look.name}, {size}", shown)]
     moments = len(shown)
-    scale = _scale(shown, look)
+    scale = scale_of(shown, look)
     with drawing(1.75 * moments + 0.9, 4.1, file) as figure:
         grid = figure.subplots(len(rows), moments, squeeze=False)
         for row, (name, pictures) in enumerate(rows):
@@ -89,7 +89,7 @@ def draw_reconstruction(
         look: of what the sensor shows.
     """
     shown, reconstructions = np.asarray(shown), np.asarray(reconstructions)
-    scale = Normalize(0.0, _largest(shown)) if look.signed else _scale(shown, look)
+    scale = Normalize(0.0, _largest(shown)) if look.signed else scale_of(shown, look)
     look = RECONSTRUCTED_EVENTS if look.signed else look
     with drawing(1.35 * len(shown) + 0.9, 2.45, file) as figure:
         grid = figure.subplots(2, len(shown), squeeze=False)
@@ -104,7 +104,8 @@ def draw_reconstruction(
     return figure
 
 
-def _scale(shown: np.ndarray, look: Look) -> Normalize:
+def scale_of(shown: np.ndarray, look: Look) -> Normalize:
+    """Returns one colour scale for all of `shown` [M, h, w]: around 0 for signed events, else from least to most."""
     if look.signed:
         return Normalize(-_largest(shown), _largest(shown))
     return Normalize(float(np.min(shown)), float(np.max(shown)))
