@@ -71,7 +71,8 @@ if __name__ == "__main__":
         noted["summary"] = train_run(*arguments)
         return noted["summary"]
 
-    devices.cores, camera.luma, run.draw_gallery = lambda: int(count), waves, lambda *_: None
+    devices.cores, camera.luma = lambda: int(count), waves
+    run.Sights, run.draw_gallery = lambda *_: object(), lambda *_: None
     Trainer.init, run.train_run = noting_init, noting_run
     if argv[:1] == ["--no-learning"]:
         del argv[0]

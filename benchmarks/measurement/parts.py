@@ -170,14 +170,14 @@ def _drawing(now: Moment, position: Array, quaternion: Array) -> float | None:
     )
     place = position.reshape(-1, 3)
     turn = jax.vmap(partial(sensor.mount_rotation, now.config))(quaternion.reshape(-1, 4))
-    weights = jnp.broadcast_to(jnp.asarray(camera.LUMA), (len(place), 3))
+    weights = jnp.broadcast_to(jnp.asarray(events.LUMA_WEIGHTS), (len(place), 3))
     given = (scene, place, turn, weights)
-    ways, way = columns.ways_to_draw(config, *given)
-    laid = operations_of(lambda *given: columns.ways_to_draw(config, *given)[1], *given)
-    each = [operations_of(partial(draw, config, camera.blend), jnp.zeros(1, jnp.int32)) for draw in ways]
+    branches, branch = columns.draw_branches(config, *given)
+    laid = operations_of(lambda *given: columns.draw_branches(config, *given)[1], *given)
+    each = [operations_of(partial(draw, config, camera.blend), jnp.zeros(1, jnp.int32)) for draw in branches]
     if laid is None:
         return None
-    needed = np.bincount(np.asarray(way), minlength=len(ways))
+    needed = np.bincount(np.asarray(branch), minlength=len(branches))
     return laid + sum(count * cost for count, cost in zip(needed, each, strict=True) if cost is not None)
 
 

@@ -86,7 +86,25 @@ class EvaluateArgs:
     """Also write every flight, one pose per physics step."""
 
 
-TRAIN, EVALUATE = "edqn train", "edqn evaluate"
+@dataclass(frozen=True)
+class RecordArgs:
+    """Fly a saved run once and write the flight as an animated GIF: the view, what the drone sees, and its path."""
+
+    run: Annotated[Positional[Path], arg(metavar="RUN")]
+    """Folder of the run."""
+    file: Annotated[Positional[Path], arg(metavar="FILE.gif")]
+    """GIF to write; it replaces a file of that name."""
+    world: Annotated[str | None, arg(metavar="paper|sparse|medium|dense|FILE.xml", help_behavior_hint="")] = None
+    """Where to fly (default: the world of the run)."""
+    start: Annotated[Point | None, arg(metavar="X Y Z", help_behavior_hint="")] = None
+    """Start of the flight, metres (default: the world's)."""
+    goal: Annotated[Point | None, arg(metavar="X Y Z", help_behavior_hint="")] = None
+    """Goal of the flight, metres (default: the world's)."""
+    seed: Annotated[int, arg(metavar="S")] = 0
+    """Number of the test world of a random density; elsewhere it only changes the sensor's noise."""
+
+
+TRAIN, EVALUATE, RECORD = "edqn train", "edqn evaluate", "edqn record"
 
 
 def parse_train(argv: Sequence[str]) -> tuple[TrainOptions, Config]:
@@ -142,6 +160,11 @@ def evaluate_flags() -> set[str]:
     return {_flag(option.name) for option in dataclasses.fields(EvaluateArgs)} | {"--no-shuffle-codes"}
 
 
+def record_flags() -> set[str]:
+    """Returns every flag of `edqn record`."""
+    return {_flag(option.name) for option in dataclasses.fields(RecordArgs)}
+
+
 def _flag(name: str) -> str:
     return f"--{name.replace('_', '-')}"
 
@@ -169,6 +192,25 @@ def parse_evaluate(argv: Sequence[str]) -> EvaluateArgs:
     args = tyro.cli(EvaluateArgs, args=argv, prog=EVALUATE)
     if args.missions < 1:
         raise ConfigError(f"--missions must be at least 1, not {args.missions}")
-    if not (args.run / "config.yaml").is_file():
-        raise ConfigError(f"there is no run in '{args.run}': it holds no config.yaml")
+    _check_run(args.run)
     return args
+
+
+def parse_record(argv: Sequence[str]) -> RecordArgs:
+    """Returns the checked arguments of `edqn record`.
+
+    Raises:
+        ConfigError: if the file is no GIF, or there is no run.
+        SystemExit: after printing, for --help and for what does not parse.
+    """
+    check_flags(argv, record_flags(), RECORD)
+    args = tyro.cli(RecordArgs, args=argv, prog=RECORD)
+    if args.file.suffix.lower() != ".gif":
+        raise ConfigError(f"'{args.file}' must end in .gif; only animated GIFs are written")
+    _check_run(args.run)
+    return args
+
+
+def _check_run(folder: Path) -> None:
+    if not (folder / "config.yaml").is_file():
+        raise ConfigError(f"there is no run in '{folder}': it holds no config.yaml")

@@ -9,7 +9,7 @@ from importlib import metadata
 
 import tyro
 
-from edqn_jax.cli.arguments import EvaluateArgs, TrainCommand, parse_evaluate
+from edqn_jax.cli.arguments import EvaluateArgs, RecordArgs, TrainCommand, parse_evaluate, parse_record
 from edqn_jax.cli.train import train_command
 from edqn_jax.config.loading import nearest
 from edqn_jax.errors import ConfigError, DivergedError, StoppedError
@@ -20,7 +20,7 @@ DIVERGED = 3
 INTERRUPTED = 130
 TERMINATED = 143
 
-COMMANDS = {"train": TrainCommand, "evaluate": EvaluateArgs}
+COMMANDS = {"train": TrainCommand, "evaluate": EvaluateArgs, "record": RecordArgs}
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -42,6 +42,8 @@ def _dispatch(argv: Sequence[str]) -> int:
         train_command(rest)
     elif command == "evaluate":
         _evaluate(rest)
+    elif command == "record":
+        _record(rest)
     elif command == "--version":
         print(f"edqn-jax {metadata.version('edqn-jax')}")
     elif command in ("-h", "--help"):
@@ -59,6 +61,16 @@ def _evaluate(argv: Sequence[str]) -> None:
 
     use_cpu_devices()
     evaluate_command(args)
+
+
+def _record(argv: Sequence[str]) -> None:
+    args = parse_record(argv)
+
+    from edqn_jax.cli.record import record_command
+    from edqn_jax.parallel.devices import use_cpu_devices
+
+    use_cpu_devices()
+    record_command(args)
 
 
 def _explain(ending: BaseException) -> int:

@@ -16,7 +16,7 @@ from edqn_jax.report.style import INK, LINE, OUTCOME_COLOURS, OUTCOME_LABELS, SE
 
 
 def draw_returns(episodes: Mapping[str, np.ndarray], file: Path) -> Figure:
-    """Return against episode, a point each in its outcome's colour, with the running mean and the shares.
+    """Draws return against episode, a point each in its outcome's colour, with the running mean and the shares.
 
     Args:
         episodes: columns `return` and `outcome`, each [episodes], in the order in which they ended.
@@ -53,11 +53,11 @@ def draw_returns(episodes: Mapping[str, np.ndarray], file: Path) -> Figure:
 
 
 def draw_learning(metrics: Sequence[Mapping[str, Any]], file: Path) -> Figure:
-    """Success, exploration and losses over decisions, written to `file` as PNG.
+    """Draws success, exploration and losses over decisions, written to `file` as PNG.
 
     Args:
         metrics: the lines of `metrics.jsonl`: `decisions`, and whatever a line has of `success_rate`,
-            `validation_success`, `epsilon`, `q_loss`, `reconstruction_loss` and `kl`.
+            `validation_success`, `epsilon`, `q_loss`, `reconstruction_loss`, `kl` and `warm_up`.
         file: PNG to write.
     """
     with drawing(7.0, 4.4, file) as figure:
@@ -75,9 +75,10 @@ def draw_learning(metrics: Sequence[Mapping[str, Any]], file: Path) -> Figure:
         exploration.set_ylim(-0.03, 1.03)
         _line(q_loss, metrics, "q_loss", LINE, "Q-network")
         q_loss.set_title("Q loss (Eq. 9)")
-        _line(vae, metrics, "reconstruction_loss", LINE, "reconstruction", marker=".")
-        _line(vae, metrics, "kl", SECOND_LINE, "KL", marker=".")
-        vae.set_title("VAE (Eq. 6)")
+        fine = _each_step(metrics)
+        _line(vae, fine, "reconstruction_loss", LINE, "reconstruction")
+        _line(vae, fine, "kl", SECOND_LINE, "KL, before its weight")
+        vae.set_title("VAE loss (reconstruction + KL)")
         success.xaxis.set_major_formatter(EngFormatter(sep=""))
         for axes in (q_loss, vae):
             if any(np.any(np.asarray(line.get_ydata()) > 0) for line in axes.get_lines()):
@@ -92,13 +93,13 @@ def draw_learning(metrics: Sequence[Mapping[str, Any]], file: Path) -> Figure:
 
 
 def running_mean(values: np.ndarray, window: int) -> np.ndarray:
-    """Means of every `window` neighbours, [len(values) - window + 1]."""
+    """Returns the means of every `window` neighbours, [len(values) - window + 1]."""
     sums = np.cumsum(np.concatenate([[0.0], values]))
     return (sums[window:] - sums[:-window]) / window
 
 
 def _draw_shares(axes: Axes, outcomes: np.ndarray) -> None:
-    """Stacked shares of the outcomes in up to 120 equal stretches of the run."""
+    """Draws stacked shares of the outcomes in up to 120 equal stretches of the run."""
     stretches = np.array_split(outcomes, min(120, max(len(outcomes), 1)))
     edges = np.cumsum([0, *(len(stretch) for stretch in stretches)])
     lower = np.zeros(len(stretches))
@@ -112,10 +113,22 @@ def _draw_shares(axes: Axes, outcomes: np.ndarray) -> None:
     axes.grid(False)
 
 
+def _each_step(metrics: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
+    """Returns the metrics with each chunk of the warm-up as its training steps."""
+    rows: list[Mapping[str, Any]] = []
+    for row in metrics:
+        steps = row.get("warm_up")
+        if steps is None:
+            rows.append(row)
+        else:
+            rows += [dict(zip(steps, values, strict=True)) for values in zip(*steps.values(), strict=True)]
+    return rows
+
+
 def _line(
     axes: Axes, metrics: Sequence[Mapping[str, Any]], name: str, colour: str, label: str, marker: str = ""
 ) -> None:
-    """The metric over decisions, of the lines that have it."""
+    """Draws the metric over decisions, of the lines that have it."""
     points = [(row["decisions"], row[name]) for row in metrics if row.get(name) is not None]
     if points:
         axes.plot(*np.array(points, np.float64).T, color=colour, label=label, marker=marker, ms=4, lw=1.1, gid=name)

@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Circle
 
-from edqn_jax.report.solids import GROUND, MAP, Solid, View, draw_shadows, draw_solids, hidden, solids_of
+from edqn_jax.report.solids import GROUND, MAP, Solid, View, cut_open, draw_outlines, draw_shadows, draw_solids, hidden
 from edqn_jax.report.style import INK, MUTED, OUTCOME_COLOURS, OUTCOME_LABELS, drawing
 from edqn_jax.sim.scene import Scene
 
@@ -31,15 +31,13 @@ PATH_POINTS = 1500
 
 
 def draw_world(scene: Scene, file: Path) -> Figure:
-    """The world's blocks and ball with start and goal, in proportion, written to `file` as PNG."""
+    """Draws the world's solids with start and goal, in proportion, written to `file` as PNG."""
     start, goal = _ends(scene)
     volume = np.asarray(scene.volume, np.float64)
     with drawing(7.0, 4.0, file) as figure:
         axes = figure.add_subplot()
-        solids = solids_of(scene)
         _draw_ground(axes, OBLIQUE, volume)
-        draw_shadows(axes, OBLIQUE, solids, _corners(volume))
-        draw_solids(axes, OBLIQUE, solids)
+        _draw_obstacles(axes, OBLIQUE, scene)
         for point, name, colour in ((start, "start", START_COLOUR), (goal, "goal", GOAL_COLOUR)):
             _draw_stem(axes, OBLIQUE, point, colour)
             x, y = OBLIQUE.project(point)
@@ -55,7 +53,7 @@ def draw_world(scene: Scene, file: Path) -> Figure:
                 bbox={"boxstyle": "round,pad=0.2", "fc": "white", "ec": "none", "alpha": 0.8},
                 zorder=9,
             )
-        _draw_end_marks(axes, OBLIQUE, start, goal)
+        draw_end_marks(axes, OBLIQUE, start, goal)
     return figure
 
 
@@ -67,9 +65,9 @@ def draw_path(
     outcome: str = "goal",
     goal_radius_m: float = 2.0,
 ) -> Figure:
-    """The flown path in 3-D and from above, coloured by speed, written to `file` as PNG.
+    """Draws the flown path in 3-D and from above, coloured by speed, written to `file` as PNG.
 
-    What a solid hides is drawn faintly; the shortest path is dashed.
+    What a solid hides is faint; the shortest path is dashed.
 
     Args:
         scene: one world.
@@ -85,25 +83,17 @@ def draw_path(
     points, speed = points[thin], np.linalg.norm(velocity[thin], axis=1)
     scale = Normalize(0.0, max(float(np.ceil(speed.max())), 1.0))
     start, goal = points[0], _ends(scene)[1]
-    volume = np.asarray(scene.volume, np.float64)
-    solids = solids_of(scene)
     with drawing(9.6, 3.9, file) as figure:
         oblique, above = figure.subplots(1, 2, width_ratios=(1.75, 1.0))
         for axes, view in ((oblique, OBLIQUE), (above, MAP)):
-            _draw_ground(axes, view, volume)
-            draw_solids(axes, view, solids)
+            solids = draw_stage(axes, view, scene, goal_radius_m)
             if view is OBLIQUE:
-                draw_shadows(axes, view, solids, _corners(volume))
                 floor = view.project(points * [1, 1, 0])
                 axes.plot(*floor.T, color=MUTED, lw=0.7, alpha=0.7, zorder=1.5)
-                _draw_stem(axes, view, goal, GOAL_COLOUR)
-            else:
-                circle = Circle((goal[0], goal[1]), goal_radius_m, fill=False, ec=GOAL_COLOUR, lw=0.8)
-                axes.add_patch(circle).set_zorder(6)
             if shortest is not None:
                 _draw_shortest(axes, view, np.asarray(shortest, np.float64), solids)
             _draw_flown(axes, view, points, speed, scale, solids)
-            _draw_end_marks(axes, view, start, goal)
+            draw_end_marks(axes, view, start, goal)
             if outcome != "goal":
                 x, y = view.project(points[-1])
                 axes.plot(x, y, "X", ms=8, mfc=OUTCOME_COLOURS[outcome], mec="white", mew=0.8, zorder=10)
@@ -120,12 +110,44 @@ def draw_path(
     return figure
 
 
+def draw_stage(axes: Axes, view: View, scene: Scene, goal_radius_m: float) -> list[Solid]:
+    """Draws the world in which a flight is shown, its goal marked; returns the solids that hide what is behind them.
+
+    Args:
+        axes: to draw on.
+        view: `OBLIQUE` or `solids.MAP`.
+        scene: one world.
+        goal_radius_m: the circle around the goal on the map.
+    """
+    goal = _ends(scene)[1]
+    _draw_ground(axes, view, np.asarray(scene.volume, np.float64))
+    solids = _draw_obstacles(axes, view, scene)
+    if view is MAP:
+        circle = Circle((goal[0], goal[1]), goal_radius_m, fill=False, ec=GOAL_COLOUR, lw=0.8)
+        axes.add_patch(circle).set_zorder(6)
+    else:
+        _draw_stem(axes, view, goal, GOAL_COLOUR)
+    return solids
+
+
+def _draw_obstacles(axes: Axes, view: View, scene: Scene) -> list[Solid]:
+    """Draws the world without what would hide it, says so, and returns the solids that hide what is behind them."""
+    world = cut_open(scene, view)
+    if view is not MAP:
+        draw_shadows(axes, view, world.shown, _corners(np.asarray(scene.volume, np.float64)))
+    draw_solids(axes, view, world.shown)
+    draw_outlines(axes, view, world.near_walls)
+    if world.note:
+        axes.set_title(world.note, fontsize=7, weight="normal", color=MUTED)
+    return world.shown
+
+
 def _ends(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
     return np.asarray(scene.start, np.float64), np.asarray(scene.goal, np.float64)
 
 
 def _draw_ground(axes: Axes, view: View, volume: np.ndarray) -> None:
-    """The volume's floor with a 10 m grid, labelled edges and a scale of height."""
+    """Draws the volume's floor with a 10 m grid, labelled edges and a scale of height."""
     (x0, y0, _), (x1, y1, top) = volume
     floor = [view.project(_corners(volume))]
     axes.add_collection(PolyCollection(floor, facecolors=GROUND, edgecolors=MUTED, linewidths=0.6, zorder=0))
@@ -145,7 +167,8 @@ def _draw_ground(axes: Axes, view: View, volume: np.ndarray) -> None:
     if not from_above:
         post = view.project(np.array([[x0, y0, 0], [x0, y0, top]], np.float64))
         axes.plot(*post.T, color=MUTED, lw=0.8, zorder=3)
-        for z in np.arange(10, top + 1e-6, 10):
+        ticks = next(step for step in (1, 2, 5, 10, 20, 50, 100) if step == 100 or top / step < 4)
+        for z in np.arange(ticks, top + 1e-6, ticks):
             x, y = view.project(np.array([x0, y0, z]))
             axes.plot([x - 0.6 * out, x], [y, y], color=MUTED, lw=0.8, zorder=3)
             axes.text(x - 1.4 * out, y, f"{z:g}", **TICK)
@@ -162,7 +185,7 @@ def _label(axes: Axes, view: View, point: np.ndarray, text: str) -> None:
 
 
 def _corners(volume: np.ndarray) -> np.ndarray:
-    """The floor's corners, [4, 3]."""
+    """Returns the floor's corners, [4, 3]."""
     (x0, y0, _), (x1, y1, _) = volume
     return np.array([[x0, y0, 0.0], [x1, y0, 0.0], [x1, y1, 0.0], [x0, y1, 0.0]])
 
@@ -177,7 +200,8 @@ def _draw_stem(axes: Axes, view: View, point: np.ndarray, colour: str) -> None:
     axes.plot(*stem[0], "o", ms=2.0, color=colour, zorder=8)
 
 
-def _draw_end_marks(axes: Axes, view: View, start: np.ndarray, goal: np.ndarray) -> None:
+def draw_end_marks(axes: Axes, view: View, start: np.ndarray, goal: np.ndarray) -> None:
+    """Marks start and goal, each [3] metres, above all else."""
     axes.plot(*view.project(start), "o", ms=6, mfc="white", mec=START_COLOUR, mew=1.8, zorder=9)
     axes.plot(*view.project(goal), "*", ms=12, mfc=GOAL_COLOUR, mec="white", mew=0.8, zorder=9)
 

@@ -12,7 +12,7 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Colormap, Normalize
 from matplotlib.figure import Figure
 
-from edqn_jax.report.style import INK, MUTED, POLARITY, drawing
+from edqn_jax.report.style import COUNTS, INK, MUTED, POLARITY, drawing
 from edqn_jax.sim.sensor import SENSORS
 
 
@@ -23,7 +23,8 @@ class Look:
     name: str
     unit: str
     colours: str | Colormap
-    signed: bool  # colours are symmetric about 0
+    signed: bool = False
+    """Whether what is shown is negative where it became darker."""
 
 
 LOOKS = {
@@ -32,6 +33,9 @@ LOOKS = {
     if sensor.image is not None
 }
 """By the name of the sensor, those that show an image."""
+
+RECONSTRUCTED_EVENTS = Look("events", "events per pixel\n(ON + OFF)", COUNTS)
+"""What the VAE reconstructs of events: how many there are of either sign."""
 
 
 def draw_sight(
@@ -42,7 +46,7 @@ def draw_sight(
     times_s: Sequence[float] | None = None,
     look: Look = LOOKS["events"],
 ) -> Figure:
-    """RGB, fine and as the drone's camera has it, above what the sensor shows, one column a moment.
+    """Draws RGB, fine and as the drone's camera has it, above what the sensor shows, one column a moment.
 
     Args:
         rgb: [M, H, W, 3] brightness in [0, 1] at any resolution.
@@ -56,7 +60,7 @@ def draw_sight(
     size = f"{width} × {height}"
     rows = [("RGB", rgb), (f"RGB, {size}", native_rgb), (f"{look.name}, {size}", shown)]
     moments = len(shown)
-    scale = _scale(shown, look)
+    scale = scale_of(shown, look)
     with drawing(1.75 * moments + 0.9, 4.1, file) as figure:
         grid = figure.subplots(len(rows), moments, squeeze=False)
         for row, (name, pictures) in enumerate(rows):
@@ -65,11 +69,11 @@ def draw_sight(
                 _show(axes, picture, scale, look)
                 if row == 0 and times_s is not None:
                     axes.set_title(f"t = {times_s[column]:.1f} s", weight="normal", loc="center", fontsize=8)
-                if row == 2 and _signed(look):
+                if row == 2 and look.signed:
                     total = int(np.abs(picture).sum())
                     axes.set_xlabel(f"{total:,} events", fontsize=7, labelpad=2)
             grid[row, 0].set_ylabel(name, fontsize=8)
-        signs = "\n(− darker, + brighter)" if _signed(look) else ""
+        signs = "\n(− darker, + brighter)" if look.signed else ""
         _colour_bar(figure, scale, grid, look, f"{look.unit}{signs}")
     return figure
 
@@ -77,19 +81,20 @@ def draw_sight(
 def draw_reconstruction(
     shown: np.ndarray, reconstructions: np.ndarray, file: Path, look: Look = LOOKS["events"]
 ) -> Figure:
-    """What the sensor showed above what the VAE makes of its codes, all on one colour scale.
+    """Draws what the VAE must reconstruct above what it makes of its codes, all on one colour scale.
 
     Args:
-        shown: [N, h, w] signed events or pictures.
+        shown: [N, h, w] blurred events, ON plus OFF, or blurred pictures.
         reconstructions: [N, h, w] the decoder's, in the same units.
         file: PNG to write.
-        look: of what is shown.
+        look: of what the sensor shows.
     """
     shown, reconstructions = np.asarray(shown), np.asarray(reconstructions)
-    scale = _scale(shown, look)
+    scale = Normalize(0.0, _largest(shown)) if look.signed else scale_of(shown, look)
+    look = RECONSTRUCTED_EVENTS if look.signed else look
     with drawing(1.35 * len(shown) + 0.9, 2.45, file) as figure:
         grid = figure.subplots(2, len(shown), squeeze=False)
-        for row, (name, pictures) in enumerate(((look.name, shown), ("reconstruction", reconstructions))):
+        for row, (name, pictures) in enumerate(((f"{look.name}, blurred", shown), ("reconstruction", reconstructions))):
             for axes, picture in zip(grid[row], pictures, strict=True):
                 _show(axes, picture, scale, look)
             grid[row, 0].set_ylabel(name, fontsize=8)
@@ -100,19 +105,17 @@ def draw_reconstruction(
     return figure
 
 
-def _signed(look: Look) -> bool:
-    return look.signed
+def scale_of(shown: np.ndarray, look: Look) -> Normalize:
+    """Returns one colour scale for all of `shown` [M, h, w]: around 0 for signed events, else from least to most."""
+    if look.signed:
+        return Normalize(-_largest(shown), _largest(shown))
+    return Normalize(float(np.min(shown)), float(np.max(shown)))
 
 
-def _scale(shown: np.ndarray, look: Look) -> Normalize:
-    return _symmetric(shown) if _signed(look) else Normalize(float(np.min(shown)), float(np.max(shown)))
-
-
-def _symmetric(counts: np.ndarray) -> Normalize:
-    """A scale around 0 that a few hot pixels do not flatten."""
+def _largest(counts: np.ndarray) -> float:
+    """Returns the end of a scale of event counts that a few hot pixels do not flatten."""
     busy = np.abs(counts[counts != 0])
-    top = float(np.ceil(np.percentile(busy, 98))) if busy.size else 1.0
-    return Normalize(-top, top)
+    return float(np.ceil(np.percentile(busy, 98))) if busy.size else 1.0
 
 
 def _show(axes: Axes, picture: np.ndarray, scale: Normalize, look: Look) -> None:
@@ -138,10 +141,10 @@ def _colour_bar(figure: Figure, scale: Normalize, beside: np.ndarray, look: Look
         anchor=(0.0, 0.03),
         aspect=14,
         pad=0.01,
-        extend="both",
+        extend="max" if scale.vmin == 0 else "both",
     )
     bar.set_label(label, color=INK, fontsize=7)
-    if not _signed(look):
+    if not look.signed:
         return
     top = int(scale.vmax or 1)
     bar.set_ticks([-top, 0, top] if top < 2 else [-top, -(top // 2), 0, top // 2, top])

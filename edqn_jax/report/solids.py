@@ -19,6 +19,9 @@ SUN = np.array([-0.45, -0.6, 0.66])
 """Direction towards the light of the pictures; a unit vector, near enough."""
 GROUND = "#f4f3ef"
 SHADOW = "#dedcd5"
+OUTLINE = "#a8a8a4"
+NEARLY_ALL = 0.75
+"""Share of the volume's width that a ceiling or an outer wall covers."""
 
 
 @dataclass(frozen=True)
@@ -89,10 +92,73 @@ def solids_of(scene: Scene) -> list[Solid]:
     return found
 
 
+@dataclass(frozen=True)
+class CutOpen:
+    """A world's solids for one view, sorted into what is drawn and what would hide all the rest."""
+
+    shown: list[Solid]
+    near_walls: list[Solid]
+    """Walls along the rim of the volume, on the side of the eye: drawn as outlines."""
+    has_ceiling: bool
+    """Whether a ceiling was left out."""
+
+    @property
+    def note(self) -> str:
+        """What was cut away, for a reader of the picture; empty if nothing was."""
+        parts = [name for name, cut in (("ceiling", self.has_ceiling), ("near walls", self.near_walls)) if cut]
+        return f"{' and '.join(parts)} cut away" if parts else ""
+
+
+def cut_open(scene: Scene, view: View) -> CutOpen:
+    """Returns a world as it is drawn: without its ceiling, and without the outer walls before the eye.
+
+    A ceiling is a box or another shape in the upper half of the volume that covers nearly all of it, or a plane
+    that looks down there; an outer wall runs along nearly a whole side of the volume.
+    """
+    lower, upper = np.asarray(scene.volume, np.float64)
+    middle = (lower[2] + upper[2]) / 2
+    planes = zip(np.asarray(scene.planes.position), np.asarray(scene.planes.normal), strict=True)
+    has_ceiling = any(normal[2] < -0.9 and middle < position[2] < PARKED / 10 for position, normal in planes)
+    shown, near_walls = [], []
+    for solid in solids_of(scene):
+        low, high = solid.corners.min(0), solid.corners.max(0)
+        covered = (np.minimum(high, upper) - np.maximum(low, lower)) / (upper - lower) > NEARLY_ALL
+        before_eye = [
+            covered[1 - axis] and _at_rim(axis, np.sign(view.towards[axis]), low, high, lower, upper)
+            for axis in (0, 1)
+            if abs(view.towards[axis]) > 1e-6
+        ]
+        if covered[:2].all() and low[2] >= middle:
+            has_ceiling = True
+        elif any(before_eye) and high[2] > middle:
+            near_walls.append(solid)
+        else:
+            shown.append(solid)
+    return CutOpen(shown, near_walls, has_ceiling)
+
+
+def _at_rim(axis: int, side: float, low: np.ndarray, high: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> bool:
+    """Whether a solid from `low` to `high` lies wholly at the volume's rim on the `side` of an axis."""
+    within = 0.1 * (upper - lower)[axis]
+    return bool(low[axis] >= upper[axis] - within if side > 0 else high[axis] <= lower[axis] + within)
+
+
+def draw_outlines(axes: Axes, view: View, solids: Sequence[Solid]) -> None:
+    """Draws the edges of the faces that look at the eye, so that the view goes through."""
+    rings = [
+        view.project(face)
+        for solid in solids
+        for face, normal in zip(solid.faces, solid.outward, strict=True)
+        if normal @ view.towards > 0
+    ]
+    edges = PolyCollection(rings, facecolors="none", edgecolors=OUTLINE, linewidths=0.6, zorder=3)
+    axes.add_collection(edges)
+
+
 def draw_solids(axes: Axes, view: View, solids: Sequence[Solid]) -> None:
     """Draws the solids, the far ones first, each as its faces that look at the eye."""
     rings, colours = [], []
-    for solid in sorted(solids, key=lambda solid: _nearness(solid, view)):
+    for solid in far_to_near(solids, view):
         normals = solid.outward
         for face, normal in zip(solid.faces, normals, strict=True):
             if normal @ view.towards > 0:
@@ -193,6 +259,32 @@ def _ring_normal(face: np.ndarray) -> np.ndarray:
 def _shadow(face: np.ndarray) -> np.ndarray:
     fallen = face - face[:, 2:] / SUN[2] * SUN
     return fallen * np.array([1.0, 1.0, 0.0])
+
+
+def far_to_near(solids: Sequence[Solid], view: View) -> list[Solid]:
+    """Returns the solids in an order in which each may be painted over those before it.
+
+    Of two convex bodies that a plane separates, the one on the eye's side is painted later. The planes tried are those
+    of the flat-sided solids' faces and of the axes; where none decides, the nearer middle is painted later.
+    """
+    if not solids:
+        return []
+    flat = [solid.outward for solid in solids if len(solid.faces) == 6]
+    directions = np.unique(np.concatenate([np.eye(3), -np.eye(3), *flat]).round(6) + 0.0, axis=0)
+    directions = directions[directions @ view.towards > 1e-6]
+    reach = [solid.corners @ directions.T for solid in solids]
+    near, far = (np.stack([pick(along, axis=0) for along in reach]) for pick in (np.max, np.min))
+    beyond = (far[:, None] >= near[None] - 1e-6).any(-1)  # [i, j]: i lies on the eye's side of a plane, j behind it
+    hides = beyond & ~beyond.T
+    nearness = np.array([_nearness(solid, view) for solid in solids])
+    left, order = np.ones(len(solids), bool), []
+    while left.any():
+        free = left & ~(hides & left[None]).any(1)  # nothing that they hide is still to be painted
+        candidates = np.flatnonzero(free if free.any() else left)
+        chosen = candidates[np.argmin(nearness[candidates])]
+        left[chosen] = False
+        order.append(solids[chosen])
+    return order
 
 
 def _nearness(solid: Solid, view: View) -> float:

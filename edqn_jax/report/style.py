@@ -1,4 +1,4 @@
-"""How every picture of the project looks: one set of type, lines and colours, and one way to the disk."""
+"""Type, lines and colours of every picture of the project, and how a picture is written to a file."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ OUTCOME_COLOURS = {
     "time_out": "#e69f00",
     "diverged": "#000000",
 }
-"""Colour of each outcome: Okabe and Ito's, which colour-blind readers can tell apart."""
+"""Colour of each outcome, of Okabe and Ito's palette, which colour-blind readers can tell apart."""
 
 OUTCOME_LABELS = {
     "goal": "goal",
@@ -36,6 +36,9 @@ SECOND_LINE = "#d55e00"
 
 POLARITY = LinearSegmentedColormap.from_list("polarity", ["#1f4fb4", "#8fb0e6", "#ffffff", "#f0988b", "#c4221f"])
 """Signed event counts: blue darker, white nothing, red brighter."""
+
+COUNTS = LinearSegmentedColormap.from_list("counts", ["#ffffff", "#c5b3d9", "#6a3d9a", "#2d1245"])
+"""Event counts whatever their sign: white nothing, violet many."""
 
 STYLE: dict[Any, Any] = {
     "font.family": "DejaVu Sans",
@@ -71,7 +74,7 @@ DOTS_PER_INCH = 220
 
 @contextmanager
 def drawing(width: float, height: float, file: Path) -> Iterator[Figure]:
-    """A figure of `width` x `height` inches in the house style, written to `file` at the end of the block."""
+    """Makes a figure of `width` x `height` inches in the project's style, written to `file` at the end of the block."""
     with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(width, height), layout="constrained")
         FigureCanvasAgg(figure)

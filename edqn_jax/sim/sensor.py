@@ -86,8 +86,6 @@ class Sensor:
     """Times of the T poses that `show` needs, seconds relative to the end of a decision; each is a physics step."""
     draws_frames: bool = False
     """Whether `show` draws a picture at each of these times."""
-    of_frames: Callable[[Config, Array, SensorMemory, Array], tuple[Sensed, SensorMemory]] | None = None
-    """As `show`, from luma frames [T, H, W] that are drawn already; None where these do not suffice."""
     at_rest: Callable[[Config, Array], SensorMemory] = _no_memory
     """Memory before the first decision, from a key; None where nothing is carried from one decision to the next."""
     image: Image | None = None
@@ -164,10 +162,6 @@ def _show_events(
     config: Config, scene: Scene, poses: Flight, memory: SensorMemory, key: Array
 ) -> tuple[Sensed, SensorMemory]:
     frames = jax.vmap(lambda p, q: view(config, scene, p, q))(poses.position, poses.quaternion)
-    return _events_of_frames(config, frames, memory, key)
-
-
-def _events_of_frames(config: Config, frames: Array, memory: SensorMemory, key: Array) -> tuple[Sensed, SensorMemory]:
     assert memory is not None
     return events.events(config.events, memory, frames, config.events.frame_times_s, key)
 
@@ -180,10 +174,6 @@ def _show_frame(
     config: Config, scene: Scene, poses: Flight, memory: SensorMemory, key: Array
 ) -> tuple[Sensed, SensorMemory]:
     return brightness(config, view(config, scene, poses.position[-1], poses.quaternion[-1])), None
-
-
-def _newest_frame(config: Config, frames: Array, memory: SensorMemory, key: Array) -> tuple[Sensed, SensorMemory]:
-    return brightness(config, frames[-1]), None
 
 
 def brightness(config: Config, luma: Array) -> Array:
@@ -255,7 +245,6 @@ SENSORS: dict[str, Sensor] = {
         form=Form.EVENTS,
         frame_times_s=lambda config: config.events.frame_times_s,
         draws_frames=True,
-        of_frames=_events_of_frames,
         at_rest=_event_memory,
         image=Image("events", "events per pixel", signed=True),
     ),
@@ -264,7 +253,6 @@ SENSORS: dict[str, Sensor] = {
         show=_show_frame,
         form=Form.PICTURE,
         draws_frames=True,
-        of_frames=_newest_frame,
         image=Image("log brightness", "log brightness + 1"),
     ),
     # True depth.

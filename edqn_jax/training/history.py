@@ -61,7 +61,7 @@ class History:
 def chunk_metrics(
     config: Config, first: int, ended: EndedEpisodes, losses: Losses, seconds: float, episodes: int
 ) -> dict[str, Any]:
-    """Returns the metrics of a chunk, None for what did not happen in it.
+    """Returns the metrics of a chunk, None for what did not happen in it: a line of `metrics.jsonl`.
 
     Args:
         first: number of the chunk's first training step.
@@ -84,6 +84,24 @@ def chunk_metrics(
         "mean_q": _mean(losses.mean_q),
         "reconstruction_loss": _mean(losses.reconstruction),
         "kl": _mean(losses.kl),
+        "warm_up": _warm_up(config, first, losses),
+    }
+
+
+def _warm_up(config: Config, first: int, losses: Losses) -> dict[str, Any] | None:
+    """Returns the VAE's losses at each training step of the warm-up; None if the chunk has none of them.
+
+    The warm-up is a chunk or two, whose means alone show nothing. The run's first step is left out: all environments
+    begin in it, and nothing moves.
+    """
+    steps = np.arange(first, first + len(losses.kl))
+    wanted = (steps > 0) & (steps < Plan.of(config).warmup)
+    if not wanted.any():
+        return None
+    return {
+        "decisions": ((steps[wanted] + 1) * config.train.num_envs).tolist(),
+        "reconstruction_loss": np.asarray(losses.reconstruction)[wanted].astype(float).tolist(),
+        "kl": np.asarray(losses.kl)[wanted].astype(float).tolist(),
     }
 
 

@@ -100,7 +100,7 @@ class Preparation:
             ConfigError: if the configuration is invalid or the world cannot be flown.
         """
         validate(config)
-        self.config, self.display, self.began = config, display, time.perf_counter()
+        self.config, self.display, self.pool, self.began = config, display, pool, time.perf_counter()
         display.phase("preparing worlds")
         self.devices = choose_devices(config.train.devices, config.train.shards)
         # A world's file may be missing on one host.

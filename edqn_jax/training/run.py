@@ -16,6 +16,7 @@ from edqn_jax.evaluation.trajectories import trajectory
 from edqn_jax.parallel import processes
 from edqn_jax.report.gallery import draw_gallery
 from edqn_jax.report.progress import Progress, clock
+from edqn_jax.report.sights import Sights
 from edqn_jax.runs.checkpoints import save_params
 from edqn_jax.runs.directory import RunDirectory
 from edqn_jax.runs.provenance import reward_record, state_digest, versions, workload
@@ -59,12 +60,13 @@ def train_run(
             stopped = f"stopped after {result.decisions:,} decisions"
             raise StoppedError(f"{stopped}; " + _where_saved(run))
         progress.phase("flying the mission")
+        sights = None if run is None else _sights(preparation)
         flights = preparation.fly(preparation.missions.final, result.policy.params)
         digest = state_digest(result.state)  # the last that all processes do together
         summary = _summary(preparation, result, flights, digest, reward)
-        if run is not None:
+        if run is not None and sights is not None:
             progress.phase("drawing")
-            _draw(run, preparation, result, flights)
+            _draw(run, preparation, sights, result, flights)
             summary["total_seconds"] = time.perf_counter() - preparation.began
             run.write_summary(summary)
             progress.stop()
@@ -118,13 +120,19 @@ def _summary(
     return summary
 
 
-def _draw(run: RunDirectory, preparation: Preparation, result: TrainingResult, flights: Flights) -> None:
-    """Writes the flight of the mission that the run is judged by, and all pictures."""
-    config = preparation.config
-    run.write_trajectory(trajectory(config, flights))
+def _sights(preparation: Preparation) -> Sights:
+    """Begins to compile what draws the final flight's sights, while that is flown."""
     scene = jax.tree.map(np.asarray, preparation.missions.scene)
+    return Sights(preparation.config, scene, preparation.pool)
+
+
+def _draw(
+    run: RunDirectory, preparation: Preparation, sights: Sights, result: TrainingResult, flights: Flights
+) -> None:
+    """Writes the flight of the mission that the run is judged by, and all pictures."""
+    run.write_trajectory(trajectory(preparation.config, flights))
     outcome = flight_summary(flights)["outcome"]
-    draw_gallery(config, run, scene, result.policy.params, np.asarray(preparation.shortest.points), outcome)
+    draw_gallery(run, sights, result.policy.params, np.asarray(preparation.shortest.points), outcome)
 
 
 def _described(devices: Sequence[jax.Device]) -> str:  # pyright: ignore[reportInvalidTypeForm]

@@ -13,9 +13,9 @@ from matplotlib.colors import to_rgba
 from matplotlib.figure import Figure
 
 from edqn_jax.report.curves import draw_learning, draw_returns, running_mean
-from edqn_jax.report.flights import draw_path, draw_world
+from edqn_jax.report.flights import OBLIQUE, draw_path, draw_world
 from edqn_jax.report.images import draw_reconstruction, draw_sight
-from edqn_jax.report.solids import MAP, View, hidden, solids_of
+from edqn_jax.report.solids import MAP, View, cut_open, far_to_near, hidden, solids_of
 from edqn_jax.report.style import OUTCOME_COLOURS
 from edqn_jax.sim.scene import (
     PARKED,
@@ -27,6 +27,7 @@ from edqn_jax.sim.scene import (
     TiltedCylinders,
     UprightBoxes,
     UprightCylinders,
+    build_scene,
 )
 
 
@@ -107,6 +108,53 @@ def test_a_solid_hides_what_is_behind_it_and_nothing_else():
     ]
 
 
+def a_hall(*more: UprightBoxes) -> Scene:
+    """Four outer walls around a box, and more."""
+    walls = [((15, -0.5), (15, 0.5)), ((15, 20.5), (15, 0.5)), ((-0.5, 10), (0.5, 10)), ((30.5, 10), (0.5, 10))]
+    shapes = [a_box((*at, 3), (*half, 3)) for at, half in walls]
+    shapes = [*shapes, a_box((15, 10, 1), (2, 2, 1)), *more]
+    return build_scene(shapes, volume=[[0, 0, 0], [30, 20, 6]], start=[2, 2, 2], goal=[28, 18, 2])
+
+
+def a_box(position: tuple[float, ...], half: tuple[float, ...]) -> UprightBoxes:
+    grey = np.full(3, 0.5)
+    return UprightBoxes(np.asarray(position), np.asarray(half), np.float64(0), grey)  # pyright: ignore
+
+
+CEILING = a_box((15, 10, 6.2), (16, 11, 0.2))
+BEAM = a_box((15, 10, 5.5), (15, 1, 0.5))
+
+
+def test_a_ceiling_and_the_walls_before_the_eye_are_cut_away():
+    hall = a_hall(CEILING)
+    oblique, above = cut_open(hall, OBLIQUE), cut_open(hall, MAP)
+    assert (len(oblique.shown), len(oblique.near_walls), oblique.note) == (3, 2, "ceiling and near walls cut away")
+    assert (len(above.shown), len(above.near_walls), above.note) == (5, 0, "ceiling cut away")
+
+
+def test_nothing_is_cut_away_in_the_open():
+    assert cut_open(a_scene(), OBLIQUE).note == cut_open(a_scene(), MAP).note == ""
+    assert len(cut_open(a_scene(), OBLIQUE).shown) == 6
+
+
+def test_a_beam_is_no_ceiling():
+    assert cut_open(a_hall(BEAM), MAP).note == ""
+
+
+def test_a_picture_says_what_was_cut_away(tmp_path):
+    figure = draw_world(a_hall(CEILING), tmp_path / "world.png")
+    assert is_png(tmp_path / "world.png")
+    assert figure.axes[0].get_title(loc="left") == "ceiling and near walls cut away"
+
+
+def test_a_long_wall_is_painted_between_what_is_behind_and_before_it():
+    # The eye looks from the south-east; the middle of the wall is nearer to it than the box before the wall's west end.
+    boxes = a_box((25, 10, 2), (25, 0.2, 2)), a_box((45, 14, 1), (1, 1, 1)), a_box((3, 7, 1), (1, 1, 1))
+    scene = build_scene(boxes, volume=[[0, 0, 0], [50, 20, 6]], start=[2, 2, 2], goal=[28, 18, 2])
+    wall, behind, before = solids_of(scene)
+    assert far_to_near([before, wall, behind], OBLIQUE) == [behind, wall, before]
+
+
 def test_a_map_has_x_to_the_right_and_y_up():
     np.testing.assert_allclose(MAP.project(np.array([[3.0, 7.0, 9.0]])), [[3.0, 7.0]], atol=1e-9)
 
@@ -179,6 +227,16 @@ def test_learning_shows_each_metric_where_a_line_has_it(tmp_path):
     }
 
 
+def test_the_warm_up_is_a_curve_of_its_training_steps(tmp_path):
+    steps = {"decisions": [10, 20, 30], "reconstruction_loss": [9.0, 6.0, 4.0], "kl": [1.0, 2.0, 3.0]}
+    metrics = [{"decisions": 40, "reconstruction_loss": 6.3, "kl": 2.0, "warm_up": steps}]
+    metrics += [{"decisions": 80, "reconstruction_loss": 3.0, "kl": 3.5, "warm_up": None}]
+    figure = draw_learning(metrics, tmp_path / "learning.png")
+    lines = {line.get_gid(): line for axes in figure.axes for line in axes.get_lines()}
+    assert list(np.asarray(lines["reconstruction_loss"].get_xdata())) == [10, 20, 30, 80]
+    assert list(np.asarray(lines["kl"].get_ydata())) == [1.0, 2.0, 3.0, 3.5]
+
+
 def test_learning_can_be_drawn_before_anything_was_learned(tmp_path):
     draw_learning([], tmp_path / "learning.png")
     assert is_png(tmp_path / "learning.png")
@@ -202,7 +260,7 @@ def test_reconstructions_share_the_colours_of_the_events(tmp_path):
     figure = draw_reconstruction(counts, counts * 0.5, tmp_path / "reconstruction.png")
     assert is_png(tmp_path / "reconstruction.png")
     limits = {axes.images[0].get_clim() for axes in figure.axes[:4]}
-    assert limits == {(-4.0, 4.0)}
+    assert limits == {(0.0, 4.0)}
     expected = np.sqrt(6 * 2.0**2 / (24 * 32))
     assert figure.axes[2].get_xlabel() == f"RMS error {expected:.2f}"
 

@@ -1,0 +1,44 @@
+"""`edqn record`: flies a saved policy once and writes the flight as an animated GIF."""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+import jax
+import numpy as np
+from rich.console import Console
+
+from edqn_jax.cli.arguments import RecordArgs
+from edqn_jax.evaluation.missions import load_missions
+from edqn_jax.evaluation.rollouts import fly_on_all_devices
+from edqn_jax.evaluation.trajectories import trajectory
+from edqn_jax.report.animation import animate
+from edqn_jax.report.sights import Sights
+from edqn_jax.report.style import OUTCOME_LABELS
+from edqn_jax.runs.files import check_can_write, write_atomically
+from edqn_jax.runs.policies import load_run
+from edqn_jax.sim.outcomes import Outcome
+
+
+def record_command(args: RecordArgs) -> None:
+    """Runs `edqn record` with these arguments.
+
+    Raises:
+        ConfigError: if the run, the world or the file to write is not as it should be.
+    """
+    check_can_write(args.file)
+    config, params = load_run(args.run)
+    missions = load_missions(config, args.world or config.world.name, 1, args.seed, args.start, args.goal)
+    scene = jax.tree.map(np.asarray, missions.scene())
+    with ThreadPoolExecutor(2, thread_name_prefix="compiling") as pool:
+        sights = Sights(config, scene, pool)
+        flights = fly_on_all_devices(config, missions.world, params, args.seed, record=True)
+        outcome = Outcome(int(flights.outcome[0])).name.lower()
+        name = missions.name if missions.file is None else Path(missions.name).stem
+        gif = animate(sights, params, trajectory(config, flights), outcome, title=f"world '{name}'")
+    write_atomically(args.file, gif)
+    flown = f"{OUTCOME_LABELS[outcome]} after {float(flights.flight_seconds[0]):.1f} s"
+    Console().print(
+        f"{flown}; '{args.file}' has {len(gif) / 1e6:.1f} MB", soft_wrap=True, markup=False, highlight=False
+    )

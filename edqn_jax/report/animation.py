@@ -1,0 +1,214 @@
+"""A flight as an animated GIF: what a person would see, what the sensor shows, and the path so far."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Mapping
+from typing import Any
+
+import matplotlib
+import numpy as np
+from matplotlib.artist import Artist
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.patches import Wedge
+from PIL import Image
+
+from edqn_jax.learn.policy import PolicyParams
+from edqn_jax.report.flights import OBLIQUE, draw_end_marks, draw_stage
+from edqn_jax.report.images import LOOKS, scale_of
+from edqn_jax.report.sights import Sights, decision_rows, on_screen, poses
+from edqn_jax.report.solids import MAP, View, hidden
+from edqn_jax.report.style import INK, LINE, MUTED, OUTCOME_COLOURS, OUTCOME_LABELS, STYLE
+
+SIZE = (800, 540)
+"""Width and height of the GIF, pixels."""
+FRAME_S = 0.1
+"""Seconds for which a frame is shown."""
+LAST_FRAME_S = 2.5
+"""Seconds for which the last frame is shown, with the outcome."""
+MOST_FRAMES = 120
+"""Frames of the longest GIF but for the last; a longer flight shows every other decision, or fewer."""
+COLOURS = 128
+"""Colours of all frames together; more make the file larger and no better to look at."""
+DOTS_PER_INCH = 100
+SIGHT_M = 9.0
+"""Length of the field of view on the map, metres, in a volume of 100 m; it is as much shorter in a smaller one."""
+
+
+def animate(sights: Sights, params: PolicyParams, flown: Mapping[str, np.ndarray], outcome: str, title: str) -> bytes:
+    """Returns a flight as an animated GIF of `SIZE`, which repeats for ever.
+
+    Args:
+        sights: of the world in which the flight was flown.
+        params: of the policy that flew.
+        flown: the columns of `trajectory.csv`, each [rows].
+        outcome: how the flight ended, a key of `OUTCOME_LABELS`.
+        title: stands above the world.
+    """
+    rows = decision_rows(sights.config, flown)[:, -1]
+    every = -(-len(rows) // MOST_FRAMES)
+    shown = np.arange(every - 1, len(rows), every)
+    speed_up = every * sights.config.drone.physics_steps * sights.config.drone.physics_dt_s / FRAME_S
+    with matplotlib.rc_context(STYLE):
+        stage = _Stage(sights, params, flown, f"{title}, {speed_up:.1f} times as fast as flown")
+        frames = [stage.frame(int(number), int(rows[number])) for number in shown]
+        frames.append(stage.frame(len(rows) - 1, len(flown["t"]) - 1, outcome))
+    return _gif(frames, [FRAME_S] * len(shown) + [LAST_FRAME_S])
+
+
+class _Stage:
+    """The figure of which all frames are pictures; what moves is drawn over a background that is drawn once."""
+
+    def __init__(self, sights: Sights, params: PolicyParams, flown: Mapping[str, np.ndarray], title: str) -> None:
+        self._sights, self._flown = sights, flown
+        self._points = np.stack([flown[name] for name in ("x", "y", "z")], axis=-1).astype(np.float64)
+        self._figure = Figure(figsize=(SIZE[0] / DOTS_PER_INCH, SIZE[1] / DOTS_PER_INCH), dpi=DOTS_PER_INCH)
+        self._canvas = FigureCanvasAgg(self._figure)
+        self._moving: list[Artist] = []
+        self._add_pictures(params)
+        self._oblique = self._add_view((0.425, 0.475, 0.57, 0.465), OBLIQUE)
+        self._map = self._add_view((0.44, 0.045, 0.29, 0.40), MAP)
+        self._figure.text(0.43, 0.958, title, fontsize=9, color=MUTED)
+        self._add_sight()
+        self._text = self._words(0.77, 0.37, fontsize=12, va="top", linespacing=1.6)
+        self._ending = self._words(0.77, 0.10, fontsize=14, weight="bold")
+        self._canvas.draw()
+        self._background = self._canvas.copy_from_bbox(self._figure.bbox)
+
+    def frame(self, decision: int, row: int, outcome: str = "") -> Image.Image:
+        """Returns the picture of a decision, with the path up to a row of the trajectory."""
+        seen_at = decision_rows(self._sights.config, self._flown)[decision, -1]
+        self._rgb.set_data(on_screen(self._sights.rgb(*poses(self._flown, seen_at))))
+        if self._shown is not None:
+            self._sensed.set_data(self._shown[decision])
+        for view in (self._oblique, self._map):
+            view.advance(row)
+        self._sight.set_center(tuple(self._points[row, :2]))
+        heading = _heading_deg(*(self._flown[name][row] for name in ("qw", "qz")))
+        half = self._sights.config.camera.horizontal_fov_deg / 2
+        self._sight.set_theta1(heading - half)
+        self._sight.set_theta2(heading + half)
+        self._text.set_text(self._state(row))
+        self._ending.set_text(OUTCOME_LABELS.get(outcome, ""))
+        self._ending.set_color(OUTCOME_COLOURS.get(outcome, INK))
+        return self._picture()
+
+    def _picture(self) -> Image.Image:
+        self._canvas.restore_region(self._background)
+        for artist in sorted(self._moving, key=lambda artist: artist.get_zorder()):
+            self._figure.draw_artist(artist)
+        return Image.fromarray(np.asarray(self._canvas.buffer_rgba())[..., :3])
+
+    def _state(self, row: int) -> str:
+        flown = self._flown
+        speed = np.linalg.norm([flown[name][row] for name in ("vx", "vy", "vz")])
+        away = np.linalg.norm(self._points[row] - np.asarray(self._sights.scene.goal))
+        return f"time  {flown['t'][row]:.1f} s\nspeed  {speed:.1f} m/s\nto the goal  {away:.0f} m"
+
+    def _words(self, x: float, y: float, **style: Any) -> Any:
+        text = self._figure.text(x, y, "", color=INK, animated=True, **style)
+        self._moving.append(text)
+        return text
+
+    def _add_pictures(self, params: PolicyParams) -> None:
+        """Adds the view for people above what the sensor shows."""
+        sights, camera = self._sights, self._sights.config.camera
+        above, below = (self._figure.add_axes((0.015, y, 0.395, 0.439)) for y in (0.515, 0.022))
+        for axes in (above, below):
+            axes.set(xticks=[], yticks=[])
+            axes.grid(False)
+            for spine in axes.spines.values():
+                spine.set(visible=True, color=MUTED, linewidth=0.5)
+        above.set_title("What a person would see", fontsize=10)
+        self._rgb = above.imshow(np.zeros((2, 2, 3)), animated=True, aspect="auto", interpolation="antialiased")
+        self._moving.append(self._rgb)
+        self._shown = None
+        name = sights.config.env.sensor
+        if not sights.has_image:
+            below.set_title("What the drone sees", fontsize=10)
+            below.text(
+                0.5, 0.5, f"no image: its sensor is '{name}'", ha="center", fontsize=10, transform=below.transAxes
+            )
+            return
+        look = LOOKS[name]
+        below.set_title(f"What the drone sees: {look.name}, {camera.width} × {camera.height}", fontsize=10)
+        self._shown = sights.shown(params, self._flown).image
+        scale = scale_of(self._shown, look)
+        self._sensed = below.imshow(
+            self._shown[0], cmap=look.colours, norm=scale, animated=True, aspect="auto", interpolation="nearest"
+        )
+        self._moving.append(self._sensed)
+
+    def _add_view(self, place: tuple[float, float, float, float], view: View) -> _PathView:
+        axes = self._figure.add_axes(place)
+        path = _PathView(axes, view, self._sights, self._points)
+        self._moving += path.moving
+        return path
+
+    def _add_sight(self) -> None:
+        """Adds the field of view to the map."""
+        lower, upper = np.asarray(self._sights.scene.volume, np.float64)
+        reach = SIGHT_M * float((upper - lower)[:2].max()) / 100
+        self._sight = Wedge((0, 0), reach, 0, 90, color=LINE, alpha=0.25, lw=0, animated=True, zorder=6.5)
+        self._map.axes.add_patch(self._sight)
+        self._moving.append(self._sight)
+
+
+class _PathView:
+    """The world from one side, and the path so far in it: faint where a solid hides it."""
+
+    def __init__(self, axes: Axes, view: View, sights: Sights, points: np.ndarray) -> None:
+        self.axes = axes
+        solids = draw_stage(axes, view, sights.scene, sights.config.env.goal_radius_m)
+        draw_end_marks(axes, view, points[0], np.asarray(sights.scene.goal, np.float64))
+        axes.set_aspect("equal", anchor="C")
+        self._flat = view.project(points)
+        covered = hidden(points, solids, view)[:, None]
+        self._visible = np.where(covered, np.nan, self._flat)
+        styles = ({"lw": 1.4, "alpha": 0.4, "color": LINE}, {"lw": 4.4, "color": "white"}, {"lw": 2.4, "color": LINE})
+        self._lines = [
+            axes.plot([], [], animated=True, zorder=7 + 0.1 * order, solid_capstyle="round", **style)[0]
+            for order, style in enumerate(styles)
+        ]
+        (self._drone,) = axes.plot([], [], "o", ms=8, mfc=LINE, mec="white", mew=1.5, animated=True, zorder=9.5)
+        self.moving: list[Artist] = [*self._lines, self._drone]
+
+    def advance(self, row: int) -> None:
+        """Draws the path up to a row of the trajectory."""
+        for line, points in zip(self._lines, (self._flat, self._visible, self._visible), strict=True):
+            line.set_data(*points[: row + 1].T)
+        self._drone.set_data(*self._flat[row : row + 1].T)
+
+
+def _heading_deg(w: float, z: float) -> float:
+    """Returns the heading of an attitude, degrees from +x: its twist about z."""
+    return float(np.degrees(2 * np.arctan2(z, w)))
+
+
+def _gif(frames: list[Image.Image], seconds: list[float]) -> bytes:
+    """Returns the frames as a GIF with one palette, of which each frame stores what has changed."""
+    palette = _montage(frames).quantize(COLOURS, dither=Image.Dither.NONE)
+    first, *others = (frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames)
+    file = io.BytesIO()
+    first.save(
+        file,
+        format="GIF",
+        save_all=True,
+        append_images=others,
+        duration=[round(1000 * each) for each in seconds],
+        loop=0,
+        disposal=1,
+        optimize=True,
+    )
+    return file.getvalue()
+
+
+def _montage(frames: list[Image.Image], many: int = 8) -> Image.Image:
+    """Returns some of the frames below each other, for a palette that suits all."""
+    chosen = [frames[i] for i in np.unique(np.linspace(0, len(frames) - 1, many).round().astype(int))]
+    whole = Image.new("RGB", (SIZE[0], SIZE[1] * len(chosen)))
+    for number, frame in enumerate(chosen):
+        whole.paste(frame, (0, SIZE[1] * number))
+    return whole

@@ -1,0 +1,158 @@
+"""What there is to see at poses of a flight: RGB for people, what the sensor shows, and the VAE's reconstruction."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from concurrent.futures import Executor
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jax.stages import Compiled
+
+from edqn_jax.config import Config
+from edqn_jax.learn import encoder
+from edqn_jax.learn.policy import PolicyParams, fresh_policy
+from edqn_jax.parallel.devices import compiler_options
+from edqn_jax.sim import camera, events, sensor
+from edqn_jax.sim.drone import Flight
+from edqn_jax.sim.events import EventField
+from edqn_jax.sim.scene import Scene
+
+FINE = 8
+"""How much finer than the drone's camera the RGB pictures for people are, per axis."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Shown:
+    """What the sensor shows at D decisions, and the VAE's part in it."""
+
+    image: np.ndarray
+    """[D, H, W] ON minus OFF events per pixel, or the picture."""
+    target: np.ndarray
+    """[D, H, W] what the VAE must reconstruct: ON plus OFF events per pixel, or the picture; blurred."""
+    reconstruction: np.ndarray
+    """[D, H, W] what the VAE makes of its code, in the same units."""
+
+
+_Images = tuple[Array, Array, Array]
+"""As the fields of `Shown`."""
+
+
+class Sights:
+    """Programs that draw what there is to see in one world; compiled in the background, as that takes seconds."""
+
+    def __init__(self, config: Config, scene: Scene, pool: Executor) -> None:
+        """Compiles in `pool`; `shown` and `rgb` wait for it.
+
+        Args:
+            config: of the policy that flies.
+            scene: one world.
+            pool: with two threads, both programs are compiled at once.
+        """
+        self.config, self.scene = config, scene
+        self.has_image = sensor.sensor_of(config).image is not None
+        """Whether the sensor shows an image; without one there is only `rgb`."""
+        self._shown = pool.submit(self._compile_shown) if self.has_image else None
+        self._rgb = pool.submit(self._compile_rgb)
+
+    def shown(self, params: PolicyParams, flown: Mapping[str, np.ndarray]) -> Shown:
+        """Returns what the sensor shows at each decision of a flight, and what the VAE makes of it.
+
+        Args:
+            params: whose VAE.
+            flown: the columns of `trajectory.csv`, as `decision_rows`.
+        """
+        assert self._shown is not None, "this sensor shows no image"
+        rows = decision_rows(self.config, flown)
+        padded = np.pad(rows, ((0, self.config.env.max_decisions - len(rows)), (0, 0)), mode="edge")
+        found = self._shown.result()(self.scene, params, *poses(flown, padded))
+        return Shown(*(np.asarray(leaf)[: len(rows)] for leaf in found))
+
+    def rgb(self, position: np.ndarray, quaternion: np.ndarray) -> np.ndarray:
+        """Returns the linear RGB [FINE H, FINE W, 3] of the drone's camera at a pose, a ray per pixel."""
+        return np.asarray(self._rgb.result()(self.scene, position, quaternion))
+
+    def _compile_shown(self) -> Compiled:
+        config, decisions = self.config, self.config.env.max_decisions
+        looks = len(sensor.frame_steps(config))
+        params = jax.eval_shape(lambda: fresh_policy(config))
+        return _compiled(self._all_shown, self.scene, params, *_blank_poses(decisions, looks))
+
+    def _all_shown(self, scene: Scene, params: PolicyParams, position: Array, quaternion: Array) -> _Images:
+        """The images of `shown` at [D, T, ...] poses; the sensor carries its memory from each decision to the next."""
+        config = self.config
+        start, rest = jax.random.split(jax.random.key(0))
+
+        def one(memory: Any, given: tuple[Array, Array, Array]) -> tuple[Any, _Images]:
+            position, quaternion, key = given
+            here = Flight(position, quaternion, jnp.zeros_like(position))
+            sensed, memory = sensor.sense(config, scene, here, memory, key)
+            assert isinstance(sensed, EventField | Array)
+            code = encoder.embed(config.encoder, params.encoder, sensed)
+            image = events.event_image(sensed) if isinstance(sensed, EventField) else sensed
+            target = encoder.target(config.encoder, sensed)
+            made = encoder.decode(config.encoder, config.camera, params.encoder, code)
+            return memory, (image, _per_pixel(sensed, target), _per_pixel(sensed, made))
+
+        keys = jax.random.split(rest, len(position))
+        return jax.lax.scan(one, sensor.at_rest(config, start), (position, quaternion, keys))[1]
+
+    def _compile_rgb(self) -> Compiled:
+        wide, high = self.config.camera.width * FINE, self.config.camera.height * FINE
+        # With a ray for each pixel there is nothing to gain from the level camera's columns, which compile slowly.
+        lens = dataclasses.replace(
+            self.config.camera, width=wide, height=high, mount="body", samples_across=1, samples_down=1
+        )
+
+        def picture(scene: Scene, position: Array, quaternion: Array) -> Array:
+            return camera.rgb(lens, scene, position, sensor.mount_rotation(self.config, quaternion))
+
+        return _compiled(picture, self.scene, *_blank_poses())
+
+
+def decision_rows(config: Config, flown: Mapping[str, np.ndarray]) -> np.ndarray:
+    """Returns the rows [D, T] of a trajectory at which the sensor looks, T of them for each whole decision.
+
+    Args:
+        flown: the columns of `trajectory.csv`, each [rows]; row k stands after physics step k + 1.
+    """
+    n, steps = config.drone.physics_steps, len(flown["t"])
+    decisions = np.arange(max(steps // n, 1))[:, None]
+    return np.clip(decisions * n + np.array(sensor.frame_steps(config)) - 1, 0, steps - 1)
+
+
+def poses(flown: Mapping[str, np.ndarray], rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Returns positions [..., 3] in metres and attitudes [..., 4] of a trajectory at rows [...]."""
+    position = np.stack([flown[name] for name in ("x", "y", "z")], axis=-1)
+    quaternion = np.stack([flown[name] for name in ("qw", "qx", "qy", "qz")], axis=-1)
+    return position[rows].astype(np.float32), quaternion[rows].astype(np.float32)
+
+
+def coarse(picture: np.ndarray) -> np.ndarray:
+    """Returns a linear RGB picture [..., FINE H, FINE W, 3] at the drone's resolution, [..., H, W, 3]."""
+    *many, height, width, channels = picture.shape
+    blocks = picture.reshape(*many, height // FINE, FINE, width // FINE, FINE, channels)
+    return blocks.mean(axis=(-4, -2))
+
+
+def on_screen(linear: np.ndarray) -> np.ndarray:
+    """Returns linear brightness as screens show it (gamma 2.2), in [0, 1]."""
+    return np.clip(linear, 0.0, 1.0) ** (1 / 2.2)
+
+
+def _compiled(program: Any, *arguments: Any) -> Compiled:
+    return jax.jit(program).lower(*arguments).compile(compiler_options(jax.default_backend()))
+
+
+def _blank_poses(*shape: int) -> tuple[jax.ShapeDtypeStruct, jax.ShapeDtypeStruct]:
+    position, quaternion = (jax.ShapeDtypeStruct((*shape, size), np.float32) for size in (3, 4))
+    return position, quaternion
+
+
+def _per_pixel(sensed: EventField | Array, image: Array) -> Array:
+    """What `encoder.target` makes of `sensed`, [C, H, W], back in the units of what is seen: [H, W]."""
+    return jnp.sum(jnp.expm1(image) if isinstance(sensed, EventField) else image, axis=-3)

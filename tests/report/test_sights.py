@@ -1,0 +1,94 @@
+"""What there is to see along a flight: the same as the drone saw."""
+
+from __future__ import annotations
+
+import dataclasses
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from edqn_jax.config import CameraConfig, Config
+from edqn_jax.learn.policy import fresh_policy
+from edqn_jax.report.sights import FINE, Sights, coarse, decision_rows, poses
+from edqn_jax.sim import camera, drone, env, events, sensor, worlds
+from edqn_jax.sim.moves import ACTIONS
+from edqn_jax.sim.scene import Planes, Scene, UprightBoxes, build_scene, stack_scenes
+from tests.policies import CONFIG
+
+SMALL = dataclasses.replace(
+    CONFIG, camera=CameraConfig(), drone=dataclasses.replace(CONFIG.drone, physics="rigid_body")
+)
+HEIGHT, WIDTH = SMALL.camera.height, SMALL.camera.width
+MOVES = [(1, 0, 0), (1, 0, 0), (1, 1, 0), (1, 0, 1), (1, -1, 0), (1, 0, 0)]
+
+
+def world_with_a_box() -> Scene:
+    shapes = [
+        UprightBoxes(*map(np.asarray, ([12.0, 1, 4], [2.0, 2, 4], 0.3, [0.9] * 3))),  # pyright: ignore
+        Planes(*map(np.asarray, ([0.0] * 3, [0.0, 0, 1], [0.4] * 3))),  # pyright: ignore
+    ]
+    return build_scene(shapes, volume=[[-9, -9, 0], [40, 9, 20]], start=[0, 0, 4], goal=[30, 0, 4])
+
+
+def sights_of(config: Config) -> Sights:
+    with ThreadPoolExecutor(2) as threads:
+        return Sights(config, world_with_a_box(), threads)
+
+
+@pytest.fixture(scope="module")
+def flight() -> tuple[dict[str, np.ndarray], env.Step]:
+    """A flight as the columns of a trajectory, and as the steps that the drone took."""
+    pool = stack_scenes([world_with_a_box()])
+    world = env.World(drone.load_airframe(SMALL.drone), pool, worlds.own_missions(pool))
+    state, _ = env.reset(SMALL, world, jax.random.key(3), jnp.asarray(0))
+    actions = jnp.array([np.flatnonzero((ACTIONS == move).all(axis=1))[0] for move in MOVES])
+    _, steps = jax.jit(lambda state: jax.lax.scan(partial(env.step, SMALL, world), state, actions))(state)
+    columns = np.concatenate([steps.flight.position, steps.flight.quaternion], -1).reshape(-1, 7).T
+    flown = dict(zip(("x", "y", "z", "qw", "qx", "qy", "qz"), columns, strict=True))
+    return flown | {"t": SMALL.drone.physics_dt_s * np.arange(1, columns.shape[1] + 1)}, steps
+
+
+@pytest.fixture(scope="module")
+def sights() -> Sights:
+    return sights_of(SMALL)
+
+
+def test_the_events_are_those_that_the_drone_got(sights, flight):
+    flown, steps = flight
+    shown = sights.shown(fresh_policy(SMALL), flown)
+    seen = np.asarray(jax.vmap(events.event_image)(steps.observation.sensed))
+    assert np.abs(seen).sum() > 500
+    np.testing.assert_array_equal(shown.image, seen)
+    assert shown.target.shape == shown.reconstruction.shape == (len(MOVES), HEIGHT, WIDTH)
+    assert shown.target.min() > -1e-5
+
+
+def test_a_fine_picture_is_the_drones_own_with_smaller_pixels(sights, flight):
+    flown, _ = flight
+    pose = poses(flown, decision_rows(SMALL, flown)[-1, -1])
+    fine = sights.rgb(*pose)
+    assert fine.shape == (HEIGHT * FINE, WIDTH * FINE, 3)
+    position, quaternion = map(jnp.asarray, pose)
+    own = camera.rgb(SMALL.camera, sights.scene, position, sensor.mount_rotation(SMALL, quaternion))
+    assert np.abs(coarse(fine) - own).mean() < 0.01
+
+
+def test_the_rows_of_a_decision_are_where_the_sensor_looks():
+    steps = 2 * SMALL.drone.physics_steps + 5  # the third decision is not whole
+    rows = decision_rows(SMALL, {"t": np.zeros(steps)})
+    assert rows.tolist() == [[10, 12], [23, 25]]
+
+
+def test_a_flight_shorter_than_a_decision_has_one():
+    assert decision_rows(SMALL, {"t": np.zeros(3)}).tolist() == [[2, 2]]
+
+
+def test_a_sensor_without_an_image_has_rgb_only():
+    blind = sights_of(dataclasses.replace(SMALL, env=dataclasses.replace(SMALL.env, sensor="blind")))
+    assert not blind.has_image
+    position, quaternion = np.array([0, 0, 4], np.float32), np.array([1, 0, 0, 0], np.float32)
+    assert blind.rgb(position, quaternion).shape == (HEIGHT * FINE, WIDTH * FINE, 3)
