@@ -72,9 +72,9 @@ class _Stage:
         self._canvas = FigureCanvasAgg(self._figure)
         self._moving: list[Artist] = []
         self._add_pictures(params)
-        self._oblique = self._add_view((0.405, 0.475, 0.59, 0.465), OBLIQUE)
+        self._oblique = self._add_view((0.405, 0.47, 0.59, 0.435), OBLIQUE)
         self._map = self._add_view((0.44, 0.045, 0.29, 0.40), MAP)
-        self._figure.text(0.41, 0.958, title, fontsize=9, color=MUTED)
+        self._figure.text(0.41, 0.963, title, fontsize=9, color=MUTED)
         self._add_sight()
         self._text = self._words(0.77, 0.37, fontsize=12, va="top", linespacing=1.6)
         self._ending = self._words(0.77, 0.10, fontsize=14, weight="bold")
