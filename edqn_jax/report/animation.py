@@ -32,6 +32,10 @@ MOST_FRAMES = 120
 """Frames of the longest GIF but for the last; a longer flight shows every other decision, or fewer."""
 COLOURS = 128
 """Colours of all frames together; more make the file larger and no better to look at."""
+VIVID_COLOURS = 48
+"""Those of them that are kept for vivid colours."""
+VIVID = 60
+"""Difference of the channels, of 255, from which on a colour is vivid."""
 DOTS_PER_INCH = 100
 SIGHT_M = 9.0
 """Length of the field of view on the map, metres, in a volume of 100 m; it is as much shorter in a smaller one."""
@@ -68,9 +72,9 @@ class _Stage:
         self._canvas = FigureCanvasAgg(self._figure)
         self._moving: list[Artist] = []
         self._add_pictures(params)
-        self._oblique = self._add_view((0.425, 0.475, 0.57, 0.465), OBLIQUE)
+        self._oblique = self._add_view((0.405, 0.47, 0.59, 0.435), OBLIQUE)
         self._map = self._add_view((0.44, 0.045, 0.29, 0.40), MAP)
-        self._figure.text(0.43, 0.958, title, fontsize=9, color=MUTED)
+        self._figure.text(0.41, 0.963, title, fontsize=9, color=MUTED)
         self._add_sight()
         self._text = self._words(0.77, 0.37, fontsize=12, va="top", linespacing=1.6)
         self._ending = self._words(0.77, 0.10, fontsize=14, weight="bold")
@@ -91,7 +95,7 @@ class _Stage:
         self._sight.set_theta1(heading - half)
         self._sight.set_theta2(heading + half)
         self._text.set_text(self._state(row))
-        self._ending.set_text(OUTCOME_LABELS.get(outcome, ""))
+        self._ending.set_text("goal reached" if outcome == "goal" else OUTCOME_LABELS.get(outcome, ""))
         self._ending.set_color(OUTCOME_COLOURS.get(outcome, INK))
         return self._picture()
 
@@ -115,12 +119,13 @@ class _Stage:
     def _add_pictures(self, params: PolicyParams) -> None:
         """Adds the view for people above what the sensor shows."""
         sights, camera = self._sights, self._sights.config.camera
-        above, below = (self._figure.add_axes((0.015, y, 0.395, 0.439)) for y in (0.515, 0.022))
+        above, below = (self._figure.add_axes((0.015, y, 0.375, 0.415)) for y in (0.533, 0.06))
         for axes in (above, below):
             axes.set(xticks=[], yticks=[])
             axes.grid(False)
             for spine in axes.spines.values():
-                spine.set(visible=True, color=MUTED, linewidth=0.5)
+                spine.set(visible=True, color=MUTED, linewidth=0.8, animated=True, zorder=2.5)
+                self._moving.append(spine)
         above.set_title("What a person would see", fontsize=10)
         self._rgb = above.imshow(np.zeros((2, 2, 3)), animated=True, aspect="auto", interpolation="antialiased")
         self._moving.append(self._rgb)
@@ -135,7 +140,9 @@ class _Stage:
         look = LOOKS[name]
         below.set_title(f"What the drone sees: {look.name}, {camera.width} × {camera.height}", fontsize=10)
         self._shown = sights.shown(params, self._flown).image
-        scale = scale_of(self._shown, look)
+        if look.signed:
+            below.set_xlabel("red where it grows brighter, blue where darker", color=MUTED, fontsize=8, labelpad=3)
+        scale = scale_of(self._shown, look, share=0.75)  # quiet moments are to be seen, too
         self._sensed = below.imshow(
             self._shown[0], cmap=look.colours, norm=scale, animated=True, aspect="auto", interpolation="nearest"
         )
@@ -189,7 +196,7 @@ def _heading_deg(w: float, z: float) -> float:
 
 def _gif(frames: list[Image.Image], seconds: list[float]) -> bytes:
     """Returns the frames as a GIF with one palette, of which each frame stores what has changed."""
-    palette = _montage(frames).quantize(COLOURS, dither=Image.Dither.NONE)
+    palette = _palette(frames)
     first, *others = (frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames)
     file = io.BytesIO()
     first.save(
@@ -205,10 +212,23 @@ def _gif(frames: list[Image.Image], seconds: list[float]) -> bytes:
     return file.getvalue()
 
 
-def _montage(frames: list[Image.Image], many: int = 8) -> Image.Image:
-    """Returns some of the frames below each other, for a palette that suits all."""
-    chosen = [frames[i] for i in np.unique(np.linspace(0, len(frames) - 1, many).round().astype(int))]
-    whole = Image.new("RGB", (SIZE[0], SIZE[1] * len(chosen)))
-    for number, frame in enumerate(chosen):
-        whole.paste(frame, (0, SIZE[1] * number))
-    return whole
+def _palette(frames: list[Image.Image], many: int = 8) -> Image.Image:
+    """Returns an image with the palette of all frames.
+
+    Vivid colours have a share of their own: they are few pixels, but marks, events and paths are made of them.
+    """
+    chosen = np.unique(np.linspace(0, len(frames) - 1, many).round().astype(int))
+    pixels = np.concatenate([np.asarray(frames[i]).reshape(-1, 3) for i in chosen])
+    vivid = np.ptp(pixels.astype(int), axis=1) > VIVID
+    colours = [_main_colours(pixels[vivid], VIVID_COLOURS), _main_colours(pixels[~vivid], COLOURS - VIVID_COLOURS)]
+    palette = Image.new("P", (1, 1))
+    palette.putpalette(np.concatenate(colours).astype(np.uint8).tobytes())
+    return palette
+
+
+def _main_colours(pixels: np.ndarray, many: int) -> np.ndarray:
+    """Returns at most `many` colours [n, 3] that stand for the pixels [P, 3], by median cut."""
+    if len(pixels) == 0:
+        return np.zeros((0, 3), np.uint8)
+    palette = Image.fromarray(pixels[None]).quantize(many, dither=Image.Dither.NONE).getpalette()
+    return np.unique(np.array(palette, np.uint8).reshape(-1, 3)[:many], axis=0)

@@ -105,17 +105,20 @@ def draw_reconstruction(
     return figure
 
 
-def scale_of(shown: np.ndarray, look: Look) -> Normalize:
-    """Returns one colour scale for all of `shown` [M, h, w]: around 0 for signed events, else from least to most."""
+def scale_of(shown: np.ndarray, look: Look, share: float = 0.98) -> Normalize:
+    """Returns one colour scale for all of `shown` [M, h, w]: around 0 for signed events, else from least to most.
+
+    `share` of the pixels with events are within it.
+    """
     if look.signed:
-        return Normalize(-_largest(shown), _largest(shown))
+        return Normalize(-_largest(shown, share), _largest(shown, share))
     return Normalize(float(np.min(shown)), float(np.max(shown)))
 
 
-def _largest(counts: np.ndarray) -> float:
+def _largest(counts: np.ndarray, share: float = 0.98) -> float:
     """Returns the end of a scale of event counts that a few hot pixels do not flatten."""
     busy = np.abs(counts[counts != 0])
-    return float(np.ceil(np.percentile(busy, 98))) if busy.size else 1.0
+    return float(np.ceil(np.quantile(busy, share))) if busy.size else 1.0
 
 
 def _show(axes: Axes, picture: np.ndarray, scale: Normalize, look: Look) -> None:

@@ -1,4 +1,4 @@
-"""What a run shows while it goes on: a live panel on a terminal, a line now and then elsewhere."""
+"""Progress of a run: a live panel on a terminal, a line every few seconds elsewhere."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ class Progress:
         self._console.print(text, soft_wrap=True, markup=False, highlight=False)
 
     def stop(self) -> None:
-        """Leaves the last state standing; harmless when nothing was started."""
+        """Ends the live panel and leaves its last state on the terminal; does nothing if none was started."""
         if self._live is not None:
             self._live.stop()
             self._live = None
@@ -91,7 +91,7 @@ class Progress:
         return int(self._metrics.get("decisions", 0))
 
     def _remaining(self) -> str:
-        """Time that the rest of training takes at the rate so far, validations included."""
+        """Returns the time that the rest of training takes at the rate so far, validations included, as text."""
         if self._first is None or self._decisions() <= self._first[1]:
             return "–"
         rate = (self._decisions() - self._first[1]) / max(time.monotonic() - self._first[0], 1e-9)

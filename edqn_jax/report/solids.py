@@ -47,7 +47,7 @@ class Solid:
 
 @dataclass(frozen=True)
 class View:
-    """Looking at the world from far away. Angles in degrees; elevation 90 is a map with x to the right."""
+    """An orthographic view of the world. Angles in degrees; elevation 90 is a map with x to the right."""
 
     azimuth: float
     elevation: float
@@ -59,7 +59,7 @@ class View:
         return np.array([np.cos(e) * np.cos(a), np.cos(e) * np.sin(a), np.sin(e)])
 
     def project(self, points: np.ndarray) -> np.ndarray:
-        """[..., 3] metres in the world to [..., 2] metres on the picture, x to the right and y up."""
+        """Returns points [..., 3] of the world, metres, on the picture: [..., 2] metres, x to the right and y up."""
         a, e = np.radians([self.azimuth, self.elevation])
         right = np.array([-np.sin(a), np.cos(a), 0.0])
         up = np.array([-np.sin(e) * np.cos(a), -np.sin(e) * np.sin(a), np.cos(e)])
@@ -71,7 +71,7 @@ MAP = View(azimuth=-90.0, elevation=90.0)
 
 
 def solids_of(scene: Scene) -> list[Solid]:
-    """Every shape of one world that is not parked; planes are left out, the ground is drawn by itself."""
+    """Returns every shape of one world that is not parked; planes are left out, the ground is drawn by itself."""
     found: list[Solid] = []
     for position, half, yaw, albedo in _present(scene.boxes, "position", "half", "yaw", "albedo"):
         found.append(Solid(_box(position, half, _about_z(float(yaw))), albedo))
@@ -178,7 +178,7 @@ def draw_shadows(axes: Axes, view: View, solids: Sequence[Solid], floor: np.ndar
 
 
 def hidden(points: np.ndarray, solids: Sequence[Solid], view: View) -> np.ndarray:
-    """Which of the [P, 3] points a solid hides from the eye, [P] bool: rays clipped by each convex body."""
+    """Returns which of the points [P, 3] a solid hides from the eye, [P] bool: rays clipped by each convex body."""
     covered = np.zeros(len(points), bool)
     for solid in solids:
         normals = solid.outward
@@ -220,7 +220,7 @@ def _box(position: np.ndarray, half: np.ndarray, rotation: np.ndarray) -> list[n
 
 
 def _rings(position: np.ndarray, axis: np.ndarray, radii: np.ndarray, along: np.ndarray) -> np.ndarray:
-    """Circles around an axis, [circles, AROUND, 3]."""
+    """Returns circles around an axis, [circles, AROUND, 3]."""
     aside = np.eye(3)[np.argmin(np.abs(axis))]
     one = np.cross(axis, aside)
     one /= np.linalg.norm(one)
@@ -231,7 +231,7 @@ def _rings(position: np.ndarray, axis: np.ndarray, radii: np.ndarray, along: np.
 
 
 def _between(rings: np.ndarray) -> list[np.ndarray]:
-    """Four-cornered faces between neighbouring circles."""
+    """Returns the four-cornered faces between neighbouring circles."""
     following = np.roll(rings, -1, axis=1)
     corners = np.stack([rings[:-1], following[:-1], following[1:], rings[1:]], axis=2)
     return list(corners.reshape(-1, 4, 3))
@@ -243,7 +243,7 @@ def _tube(position: np.ndarray, axis: np.ndarray, radius: float, half: float) ->
 
 
 def _round(position: np.ndarray, axis: np.ndarray, radius: float, half: float) -> list[np.ndarray]:
-    """A capsule, or a sphere where `half` is 0; the poles are cut flat so that no face is degenerate."""
+    """Returns the faces of a capsule, or of a sphere where `half` is 0; poles are flat, so that no face is degenerate."""
     angle = np.linspace(-np.pi / 2 + 0.05, np.pi / 2 - 0.05, 18)
     along = radius * np.sin(angle) + half * np.sign(angle)
     rings = _rings(position, axis, radius * np.cos(angle), along)

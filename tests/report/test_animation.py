@@ -1,0 +1,123 @@
+"""A flight as an animated GIF, and `edqn record` from a run to its file."""
+
+from __future__ import annotations
+
+import dataclasses
+import io
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from edqn_jax.cli import main
+from edqn_jax.config.loading import to_yaml
+from edqn_jax.learn.policy import PolicyParams, fresh_policy
+from edqn_jax.report.animation import LAST_FRAME_S, MOST_FRAMES, SIZE, animate
+from edqn_jax.report.sights import FINE, Shown
+from edqn_jax.report.style import OUTCOME_COLOURS
+from edqn_jax.runs.checkpoints import save_policy
+from edqn_jax.sim.mjcf import write_scene
+from tests.policies import always
+from tests.report.test_sights import SMALL, world_with_a_box
+
+
+class Drawn:
+    """Sights that need no compiling."""
+
+    config, scene, has_image = SMALL, world_with_a_box(), True
+
+    def rgb(self, position: np.ndarray, quaternion: np.ndarray) -> np.ndarray:
+        return np.full((SMALL.camera.height * FINE, SMALL.camera.width * FINE, 3), 0.2 + 0.02 * position[0])
+
+    def shown(self, params: object, flown: dict[str, np.ndarray]) -> Shown:
+        counts = np.random.default_rng(0).integers(-3, 4, (len(flown["t"]) // 13, 24, 32))
+        return Shown(counts, counts, counts)
+
+
+def a_flight(decisions: float) -> dict[str, np.ndarray]:
+    t = 0.02 * np.arange(1, round(13 * decisions) + 1)
+    still = dict.fromkeys(("y", "qx", "qy", "qz", "vy", "vz"), 0 * t)
+    return {"t": t, "x": t, "z": 0 * t + 4, "qw": 0 * t + 1, "vx": 0 * t + 1} | still
+
+
+def recorded(sights: Any, decisions: float, outcome: str = "goal") -> Image.Image:
+    gif = animate(sights, fresh_policy(SMALL), a_flight(decisions), outcome, title="a box")
+    return Image.open(io.BytesIO(gif))
+
+
+def frames(image: Image.Image) -> int:
+    return getattr(image, "n_frames", 1)
+
+
+def pixels_like(image: Image.Image, frame: int, colour: str) -> int:
+    image.seek(frame)
+    wanted = [int(colour[i : i + 2], 16) for i in (1, 3, 5)]
+    return int((np.abs(np.asarray(image.convert("RGB")).astype(int) - wanted).max(axis=-1) < 25).sum())
+
+
+def test_there_is_a_frame_for_each_decision_and_one_for_the_end():
+    gif = recorded(Drawn(), 6.4)
+    assert (gif.format, gif.size, frames(gif)) == ("GIF", SIZE, 7)
+    gif.seek(6)
+    assert gif.info["duration"] == 1000 * LAST_FRAME_S
+
+
+def test_a_long_flight_leaves_decisions_out():
+    assert frames(recorded(Drawn(), MOST_FRAMES + 10)) == (MOST_FRAMES + 10) // 2 + 1
+
+
+def test_the_last_frame_says_how_the_flight_ended_in_its_colour():
+    gif = recorded(Drawn(), 4, outcome="collision")
+    colour = OUTCOME_COLOURS["collision"]
+    assert pixels_like(gif, 4, colour) > pixels_like(gif, 3, colour) + 100
+
+
+def test_a_sensor_without_an_image_is_said_to_have_none():
+    class Blind(Drawn):
+        has_image = False
+
+    assert frames(recorded(Blind(), 3)) == 4
+
+
+def always_ahead() -> PolicyParams:
+    """A policy for the camera of `SMALL` that flies ahead whatever it sees."""
+    return dataclasses.replace(fresh_policy(SMALL), q=always((1, 0, 0)).q)
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("run")
+    (folder / "config.yaml").write_text(to_yaml(SMALL))
+    save_policy(folder / "checkpoints", always_ahead())
+    return folder
+
+
+def test_a_saved_run_is_recorded_on_another_world(run, tmp_path, capsys):
+    world, file = tmp_path / "box.xml", tmp_path / "flight.gif"
+    write_scene(world_with_a_box(), world)
+    assert main(["record", str(run), str(file), "--world", str(world)]) == 0
+    assert "collision after 2.7 s" in capsys.readouterr().out
+    with Image.open(file) as gif:
+        assert (gif.size, frames(gif)) == (SIZE, 11)
+    assert file.stat().st_size < 3e6
+
+
+@pytest.mark.parametrize(
+    ("file", "says"),
+    [
+        ("flight.mp4", "must end in .gif"),
+        ("missing/flight.gif", "cannot be written: there is no folder"),
+    ],
+)
+def test_a_file_that_cannot_be_written_is_refused_at_once(file, says, run, tmp_path, capsys):
+    assert main(["record", str(run), str(tmp_path / file)]) == 2
+    error = capsys.readouterr().err
+    assert says in error and error.count("\n") == 1
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_folder_without_a_run_is_refused(tmp_path, capsys):
+    assert main(["record", str(tmp_path), str(tmp_path / "flight.gif")]) == 2
+    assert "there is no run in" in capsys.readouterr().err
