@@ -17,7 +17,7 @@ from edqn_jax.learn.policy import PolicyParams, fresh_policy
 from edqn_jax.report.animation import LAST_FRAME_S, MOST_FRAMES, SIZE, animate
 from edqn_jax.report.sights import FINE, Shown
 from edqn_jax.report.style import OUTCOME_COLOURS
-from edqn_jax.runs.checkpoints import save_policy
+from edqn_jax.runs.checkpoints import save_params
 from edqn_jax.sim.mjcf import write_scene
 from tests.policies import always
 from tests.report.test_sights import SMALL, world_with_a_box
@@ -90,7 +90,7 @@ def always_ahead() -> PolicyParams:
 def run(tmp_path_factory) -> Path:
     folder = tmp_path_factory.mktemp("run")
     (folder / "config.yaml").write_text(to_yaml(SMALL))
-    save_policy(folder / "checkpoints", always_ahead())
+    save_params(folder / "checkpoints", always_ahead())
     return folder
 
 
