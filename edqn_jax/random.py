@@ -1,10 +1,33 @@
-"""Random numbers from as few calls as may be: each call is its own small program on a CPU."""
+"""Random keys by purpose, and integers from few random bits."""
 
 from __future__ import annotations
+
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax import Array
+
+_RUN = 0xED09_0000
+"""Folded into the key of every run's seed. Roots that are folded with counters, such as those of the test worlds, never
+reach it: these stay below 2^31. (`split(key, n)[i]` equals `fold_in(key, i)`.)"""
+
+
+class RunStreams(NamedTuple):
+    """Keys of a run's independent random streams; each is consumed once."""
+
+    learning: Array
+    """Parameters, environments and shards of the training state."""
+    training_missions: Array
+    validation_missions: Array
+    flights: Array
+    """Sensor noise of validation and evaluation flights."""
+
+
+def run_streams(seed: int) -> RunStreams:
+    """Returns the keys of a run with this seed; no other code derives keys from a run's seed."""
+    root = jax.random.fold_in(jax.random.key(seed), _RUN)
+    return RunStreams(*jax.random.split(root, len(RunStreams._fields)))
 
 
 def integers(key: Array, shape: tuple[int, ...], below: int | Array) -> Array:

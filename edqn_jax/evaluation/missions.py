@@ -13,6 +13,7 @@ import numpy as np
 from edqn_jax.config import DENSITIES, Config
 from edqn_jax.errors import ConfigError
 from edqn_jax.planners.astar import shortest_path
+from edqn_jax.random import run_streams
 from edqn_jax.sim import drone, worlds
 from edqn_jax.sim.env import World
 from edqn_jax.sim.mjcf import check_scene, load_world, resolve_world, write_scene
@@ -85,12 +86,11 @@ def run_missions(config: Config, reward: Reward | None = None) -> RunMissions:
     Raises:
         ConfigError: if a drone of this radius does not fit at the world's start or goal.
     """
-    root = jax.random.key(config.train.seed)
-    training_key, validation_key = (jax.random.fold_in(root, purpose) for purpose in (1, 2))
+    keys = run_streams(config.train.seed)
     if config.world.name in DENSITIES:
-        missions = _random_run_missions(config, training_key)
+        missions = _random_run_missions(config, keys.training_missions)
     else:
-        missions = _file_run_missions(config, training_key, validation_key)
+        missions = _file_run_missions(config, keys.training_missions, keys.validation_missions)
     return dataclasses.replace(
         missions, **{name: getattr(missions, name).rewarded_by(reward) for name in ("training", "validation", "final")}
     )
@@ -193,6 +193,11 @@ def _random_missions(config: Config, name: str, missions: int, seed: int, moved:
     return MissionSet(name, World(drone.load_airframe(config.drone), pool, worlds.own_missions(pool)))
 
 
+def mission_key(seed: int) -> jax.Array:
+    """Returns the key of the evaluation missions `seed` in worlds from files; the same in every version."""
+    return jax.random.fold_in(jax.random.key(_MISSION_SEED), seed)
+
+
 def _file_missions(config: Config, name: str, missions: int, seed: int, moved: dict[str, jax.Array]) -> MissionSet:
     """Returns one mission from start to goal of a world from a file, or many from random free starts."""
     radius, airframe, file = config.drone.body_radius_m, drone.load_airframe(config.drone), resolve_world(name)
@@ -203,7 +208,7 @@ def _file_missions(config: Config, name: str, missions: int, seed: int, moved: d
         shortest_path(scene, scene.start, scene.goal, radius)  # raises where there is no path
         pool = stack_scenes([scene])
         return MissionSet(name, World(airframe, pool, worlds.own_missions(pool)), file)
-    probe_key, missions_key = jax.random.split(jax.random.fold_in(jax.random.key(_MISSION_SEED), seed))
+    probe_key, missions_key = jax.random.split(mission_key(seed))
     # The world's own start does not matter, any free point will do; the goal does.
     standing = dataclasses.replace(scene, start=worlds.free_point(scene, probe_key))
     check_scene(standing, radius, names=loaded.names, title=f"'{name}'")

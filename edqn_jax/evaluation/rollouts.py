@@ -17,6 +17,7 @@ from edqn_jax.config import Config
 from edqn_jax.learn import policy
 from edqn_jax.learn.policy import Memory, PolicyParams
 from edqn_jax.parallel.devices import compiler_options
+from edqn_jax.random import run_streams
 from edqn_jax.sim import env
 from edqn_jax.sim.env import EnvState, Observation, Step, World
 from edqn_jax.sim.flights import Flights, Record, at_start, tally
@@ -87,7 +88,7 @@ def fly_on_all_devices(
     mesh = Mesh(np.asarray(jax.devices()), ("mission",))
     world, params = jax.device_put((world, params), NamedSharding(mesh, PartitionSpec()))
     flights = fly_missions(
-        config, world, params, jax.random.key(seed), record=record, shuffle_codes=shuffle_codes, mesh=mesh
+        config, world, params, run_streams(seed).flights, record=record, shuffle_codes=shuffle_codes, mesh=mesh
     )
     return jax.tree.map(np.asarray, flights)
 
@@ -95,6 +96,12 @@ def fly_on_all_devices(
 def prepare(config: Config, world: World, params: PolicyParams, key: Array, *, record: bool, mesh: Mesh) -> None:
     """Compiles the program that `fly_missions` runs for such arguments, ahead of its first call."""
     _program(mesh).lower(config, False, record, mesh, world, params, key).compile()
+
+
+def flight_keys(key: Array, missions: int) -> tuple[Array, Array]:
+    """Returns the keys [M] of the missions' environments, and that of the loop; `key` is consumed."""
+    reset_key, loop_key = jax.random.split(key)
+    return jax.vmap(partial(jax.random.fold_in, reset_key))(jnp.arange(missions)), loop_key
 
 
 def _program(mesh: Mesh | None):
@@ -118,12 +125,12 @@ def _fly_all(
 ) -> Flights:
     missions = world.missions.scene.shape[0]
     devices = 1 if mesh is None else mesh.size
-    reset_key, loop_key = jax.random.split(key)
+    reset_keys, loop_key = flight_keys(key, missions)
     # Every device flies equally many missions; the first ones are repeated to fill up.
     number = jnp.arange(-(-missions // devices) * devices) % missions
     if shuffle_codes and number.shape[0] // devices < 2:
         raise ValueError("shuffling codes needs at least two missions on each device")
-    keys = jax.vmap(partial(jax.random.fold_in, reset_key))(number)
+    keys = reset_keys[number]
     fly = partial(_fly, config, shuffle_codes, record)
     if mesh is not None:
         (axis,) = mesh.axis_names

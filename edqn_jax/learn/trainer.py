@@ -31,6 +31,7 @@ from edqn_jax.learn.policy import PolicyParams, empty_memory, observation_size
 from edqn_jax.learn.qnetwork import Params
 from edqn_jax.parallel import processes
 from edqn_jax.parallel.devices import compiler_options
+from edqn_jax.random import run_streams
 from edqn_jax.sim import env
 from edqn_jax.sim.env import EnvState, World
 from edqn_jax.sim.moves import ACTIONS
@@ -119,6 +120,24 @@ class Plan:
         return cls(total=total, warmup=warmup, learn_from=learn_from)
 
 
+class InitialKeys(NamedTuple):
+    """What the key of a run's learning is split into."""
+
+    learner: Array
+    environments: Array  # [N] by the environment's global number
+    shards: Array  # [S] by the shard's global number, never a device's
+
+    @classmethod
+    def split(cls, key: Array, envs: int, shards: int) -> InitialKeys:
+        """Splits `key`, which is consumed."""
+        learner, environments, of_shards = jax.random.split(key, 3)
+        return cls(
+            learner,
+            jax.vmap(partial(jax.random.fold_in, environments))(jnp.arange(envs)),
+            jax.vmap(partial(jax.random.fold_in, of_shards))(jnp.arange(shards)),
+        )
+
+
 def init(config: Config, world: World, key: Array) -> TrainState:
     """The state before the first step; a pure function of the key, so it can be `vmap`ped over seeds.
 
@@ -131,13 +150,10 @@ def init(config: Config, world: World, key: Array) -> TrainState:
             f"train.num_envs ({envs}) and agent.batch_size ({config.agent.batch_size}) "
             f"must be multiples of train.shards ({shards})"
         )
-    learner_key, env_key, shard_key = jax.random.split(key, 3)
-    # Keys follow the global number of an environment or shard, never a device's.
-    env_keys = jax.vmap(lambda i: jax.random.fold_in(env_key, i))(jnp.arange(envs))
-    shard_keys = jax.vmap(lambda i: jax.random.fold_in(shard_key, i))(jnp.arange(shards))
+    keys = InitialKeys.split(key, envs, shards)
     # Nothing has been seen yet: the first step is every environment's reset.
-    state = jax.vmap(lambda k: env.ended(config, world, k))(env_keys)
-    learner = _init_learner(config, learner_key)
+    state = jax.vmap(lambda k: env.ended(config, world, k))(keys.environments)
+    learner = _init_learner(config, keys.learner)
     size = observation_size(config)
     ring = replay.empty(config.agent, envs // shards, envs, size)
     flat = Actors(
@@ -152,7 +168,7 @@ def init(config: Config, world: World, key: Array) -> TrainState:
         key=jnp.zeros(envs),
     )
     actors = jax.tree.map(lambda x: x.reshape(shards, envs // shards, *x.shape[1:]), flat).replace(
-        replay=jax.tree.map(lambda x: jnp.broadcast_to(x, (shards, *x.shape)), ring), key=shard_keys
+        replay=jax.tree.map(lambda x: jnp.broadcast_to(x, (shards, *x.shape)), ring), key=keys.shards
     )
     return TrainState(actors=actors, learner=learner, step=jnp.zeros((), jnp.int32))
 
@@ -437,7 +453,7 @@ class Trainer:
         """The state before the first step, laid out over the devices."""
         make = jax.jit(lambda world, key: init(self.config, world, key))
         # Made whole and then cut: made in parts it would be rounded otherwise. `device_put` reaches no other process.
-        whole = make(self.world, jax.random.key(seed))
+        whole = make(self.world, run_streams(seed).learning)
         return jax.jit(lambda state: state, out_shardings=self._layout())(whole)
 
     def _layout(self) -> Any:

@@ -27,6 +27,7 @@ from edqn_jax.parallel import processes
 from edqn_jax.parallel.devices import choose_devices
 from edqn_jax.planners.astar import Path as ShortestPath
 from edqn_jax.planners.astar import shortest_path
+from edqn_jax.random import run_streams
 from edqn_jax.sim.env import World
 from edqn_jax.sim.flights import Flights
 from edqn_jax.sim.reward import Reward
@@ -127,7 +128,7 @@ class Preparation:
 
     def _placed(self, missions: MissionSet, params: PolicyParams) -> tuple[World, PolicyParams, jax.Array]:
         """World, parameters and key as `fly_missions` takes them."""
-        return *processes.replicate((missions.world, params), self.mesh), jax.random.key(self.config.train.seed)
+        return *processes.replicate((missions.world, params), self.mesh), run_streams(self.config.train.seed).flights
 
 
 @contextlib.contextmanager
