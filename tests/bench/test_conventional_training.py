@@ -240,7 +240,7 @@ def test_what_was_learnt_flies_by_the_best_value_of_what_it_sees():
 )
 def test_a_dqn_that_stable_baselines3_does_not_have_is_declined(change):
     config = dataclasses.replace(CONFIG, agent=dataclasses.replace(CONFIG.agent, **change))
-    with pytest.raises(ConfigError, match="the conventional stack's DQN has agent.history 1"):
+    with pytest.raises(ConfigError, match="the conventional stack's DQN supports only agent.history 1"):
         train(config, course_of(START, GOAL))
 
 
@@ -306,7 +306,7 @@ def test_beside_its_flights_a_seed_tells_what_its_other_processes_held(monkeypat
 @pytest.mark.parametrize("package", ["gymnasium", "numba", "stable_baselines3", "torch"])
 def test_without_a_package_it_says_how_to_install_it(package, monkeypatch):
     hide(monkeypatch, package)
-    with pytest.raises(MissingPackageError, match=rf"^{package} is not installed; pip install 'edqn-jax\[bench\]'"):
+    with pytest.raises(MissingPackageError, match=rf"^{package} is not installed; run pip install 'edqn-jax\[bench\]'"):
         importlib.import_module("conventional_stack.train")
 
 
