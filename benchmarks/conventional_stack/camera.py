@@ -106,7 +106,7 @@ def cast(model, data, optics, pose, hits):
 
 @numba.njit(cache=True, inline="always")
 def _box_filter(cycles):
-    """Returns the factor of a wave's amplitude after a box average over `cycles` periods, as `sim.texture`."""
+    """Returns the factor of a wave's amplitude after a box average over `cycles` periods, as `sim/texture.py`."""
     x = min(cycles * cycles, 1.0)
     return (1.0 - x) * (1.0 - 0.55 * x)
 

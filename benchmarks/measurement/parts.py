@@ -105,7 +105,7 @@ def physics(now: Moment) -> Part:
         return after, depending_on(move, path), goal
 
     def single(world: World, carry):
-        """One physics step without the scan, of which XLA counts one iteration and what is around it."""
+        """Takes one physics step without the scan, of which XLA counts one iteration and what is around it."""
         state, move, goal = carry
 
         def step(state: DroneState, goal: Array) -> DroneState:
@@ -328,7 +328,7 @@ def _next(keys: Array) -> Array:
 
 
 def _flat(tree: Any) -> Any:
-    """[S, E, ...] -> [S * E, ...]"""
+    """Joins shards and environments: [S, E, ...] to [S * E, ...]."""
     return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), tree)
 
 

@@ -52,7 +52,7 @@ class Validation:
     """The validations of one training: its learning curve and the parameters that would be kept so far."""
 
     def __init__(self, config: Config, missions: RunMissions, fly: Callable[[World, Any], Flights]) -> None:
-        """`fly(world, params)` flies every mission of a world once, greedily."""
+        """Starts without validations; `fly(world, params)` flies every mission of a world once, greedily."""
         self.config, self.missions, self.fly = config, missions, fly
         self.judged = judged_of(config, missions)
         self.kept: Candidate | None = None

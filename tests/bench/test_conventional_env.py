@@ -243,7 +243,7 @@ def test_who_ended_starts_anew_within_the_step():
 )
 def test_what_this_stack_does_not_have_is_said_before_it_flies(change):
     config = dataclasses.replace(CONFIG, **change)
-    with pytest.raises(ConfigError, match="the conventional stack has"):
+    with pytest.raises(ConfigError, match="the conventional stack supports only"):
         Fleet(config, course_of(np.zeros((1, 3)), np.ones((1, 3))), Record.empty(config, 1), seed=0)
 
 

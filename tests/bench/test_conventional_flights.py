@@ -84,5 +84,5 @@ def test_a_course_is_our_missions():
 
 def test_missions_in_several_worlds_are_declined_in_one_sentence():
     world = dataclasses.replace(world_of(CONFIG, STARTS, GOALS), pool=stack_scenes([paper(), paper()]))
-    with pytest.raises(ConfigError, match="flies in one world, 'paper' or an MJCF file, not in 2"):
+    with pytest.raises(ConfigError, match="supports one world, 'paper' or an MJCF file, not 2"):
         Course.of(world)

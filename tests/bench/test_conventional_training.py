@@ -107,7 +107,7 @@ def test_drones_fly_alike_in_one_process_and_in_two(processes):
 
 
 def test_drones_that_cannot_be_shared_out_are_named():
-    with pytest.raises(ValueError, match="5 drones cannot be shared out among 2 processes"):
+    with pytest.raises(ValueError, match="5 drones cannot be divided among 2 processes"):
         SpreadFleet(CONFIG, course_of(START, GOAL), 5, 2, seed=0)
 
 
@@ -167,7 +167,7 @@ def test_drones_answer_for_all_at_once_and_have_no_methods_of_their_own():
     drones = CodedDrones(CONFIG, Still(4), Learner(CONFIG.encoder, CONFIG.camera, seed=0))  # type: ignore[arg-type]
     drones.set_attr("updates", 3)
     assert drones.get_attr("updates", indices=[0, 2]) == [3, 3] and drones.get_attr("updates") == [3] * 4
-    with pytest.raises(AttributeError, match="^a drone has no method of its own, so no 'land'$"):
+    with pytest.raises(AttributeError, match="^a drone has no method 'land'$"):
         drones.env_method("land")
 
 
@@ -181,8 +181,8 @@ SHORT = configured(
 """A whole training: 256 decisions of warm-up, 768 of the DQN."""
 
 
-def replaced(config: Config, **knobs) -> Config:
-    return dataclasses.replace(config, train=dataclasses.replace(config.train, **knobs))
+def replaced(config: Config, **options) -> Config:
+    return dataclasses.replace(config, train=dataclasses.replace(config.train, **options))
 
 
 def weights(trained: Trained) -> np.ndarray:
@@ -240,7 +240,7 @@ def test_what_was_learnt_flies_by_the_best_value_of_what_it_sees():
 )
 def test_a_dqn_that_stable_baselines3_does_not_have_is_declined(change):
     config = dataclasses.replace(CONFIG, agent=dataclasses.replace(CONFIG.agent, **change))
-    with pytest.raises(ConfigError, match="the conventional stack's DQN has agent.history 1"):
+    with pytest.raises(ConfigError, match="the conventional stack's DQN supports only agent.history 1"):
         train(config, course_of(START, GOAL))
 
 
@@ -306,7 +306,7 @@ def test_beside_its_flights_a_seed_tells_what_its_other_processes_held(monkeypat
 @pytest.mark.parametrize("package", ["gymnasium", "numba", "stable_baselines3", "torch"])
 def test_without_a_package_it_says_how_to_install_it(package, monkeypatch):
     hide(monkeypatch, package)
-    with pytest.raises(MissingPackageError, match=rf"^{package} is not installed; pip install 'edqn-jax\[bench\]'"):
+    with pytest.raises(MissingPackageError, match=rf"^{package} is not installed; run pip install 'edqn-jax\[bench\]'"):
         importlib.import_module("conventional_stack.train")
 
 

@@ -48,7 +48,7 @@ def test_rows_of_several_files_become_one_with_the_seeds_of_all() -> None:
     joined = rows.joined([*parts, elsewhere])
     assert [[one["seed"] for one in row["turns"]] for row in joined] == [[0, 1], [0]]
     assert len(parts[0]["turns"]) == 1  # what was read stays as it was
-    with pytest.raises(ConfigError, match="seed 0 of E-DQN on medium is there twice"):
+    with pytest.raises(ConfigError, match="seed 0 of E-DQN on medium occurs twice"):
         rows.joined([parts[0], parts[0]])
 
 
@@ -77,7 +77,7 @@ def test_events_are_worth_what_flies_at_equal_decisions_and_at_equal_wall_time()
     low, high = less["at_decisions"]["interval"]
     assert 0.0 <= low < 0.5 < high <= 1.0
     shown = table.worth_table(one)
-    assert "10.0 s of training" in shown and "| E-DQN less DQN blind | | | +50.0 % (" in shown
+    assert "10.0 s of training" in shown and "| E-DQN minus DQN blind | | | +50.0 % (" in shown
     assert "| E-DQN | 3 | 18.0 | 75.0 % (" in shown
 
 

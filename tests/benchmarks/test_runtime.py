@@ -107,9 +107,9 @@ def test_methods_take_turns_seed_by_seed_and_all_of_it_is_told(
     assert "| E-DQN | no | 40.0 (1,000) | 60.0 | 31.0 | 120 | " in shown
     assert "| RRT*, 5 s | yes | " in shown and "2 of 2: 100% (34% - 100%)" in shown
     assert "- BIT*: ompl is not installed; run pip install 'edqn-jax[bench]'." in shown
-    assert "- APF: it ended in seed 0: Killed." in shown
+    assert "- APF: its process ended in seed 0: Killed." in shown
     # The paper's own figures stand apart and are marked as theirs.
-    assert shown.index("Table 3 (theirs)") < shown.index("41.364")
+    assert shown.index("Table 3 of the paper") < shown.index("41.364")
     report = json.loads(file.read_text())
     assert [row["name"] for row in report["rows"]] == list(METHODS)
     assert report["workload"]["width"] == 32 and report["device"] == "a machine" and report["versions"]
@@ -122,7 +122,7 @@ def test_methods_take_turns_seed_by_seed_and_all_of_it_is_told(
     words[words.index("--seeds") + 1] = "1"
     assert runtime.main([*words, "--add", str(file)]) == 2
     shown_again, told = capsys.readouterr()
-    assert "seed 0 of E-DQN on clear.xml is there twice; the added rows are left out\n" in told
+    assert "seed 0 of E-DQN on clear.xml occurs twice; the added rows are left out\n" in told
     assert "1 of 1: 100%" in shown_again
     file.write_text(json.dumps(report))
 
@@ -162,7 +162,7 @@ def test_training_rates_are_taken_in_turns_and_the_best_setting_counts(
     words = ["--quick", "--worlds", "paper", "--methods", "E-DQN", "Conventional stack", "--json", str(file)]
     assert runtime.main(words) == 0
     shown = capsys.readouterr().out
-    assert "| E-DQN / Conventional stack, its best | 30.0 |" in shown
+    assert "| E-DQN / Conventional stack, best setting | 30.0 |" in shown
     assert "| Conventional stack, one process | 290 |" in shown
     (rates,) = json.loads(file.read_text())["rates"]
     assert rates["turns"]["E-DQN, a setting"] == [9000.0]
@@ -184,7 +184,7 @@ def test_a_child_that_ends_while_rates_are_taken_is_told_and_the_table_is_still_
     monkeypatch.setattr(runtime, "measure_world", lambda asked, world: iter([[row("A*", [turn(0, flights("goal"))])]]))
     assert runtime.main(["--worlds", "paper", "--methods", "E-DQN", "Conventional stack"]) == 0
     shown = capsys.readouterr().out
-    assert "| A* |" in shown and "- Conventional stack: it ended in turn 1: Killed." in shown
+    assert "| A* |" in shown and "- Conventional stack: its process ended in turn 1: Killed." in shown
 
 
 def test_one_slow_turn_does_not_choose_the_setting_of_the_conventional_stack(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -246,7 +246,7 @@ def test_where_there_is_no_way_learners_are_not_trained(
 ) -> None:
     assert runtime.main(["--worlds", str(shut), "--seeds", "1", "--methods", "E-DQN", "A*"]) == 0
     assert faked.asked == [("A*", "0")]
-    assert "- E-DQN: there is no way from start to goal, so train.py refuses this world." in capsys.readouterr().out
+    assert "- E-DQN: there is no path from start to goal, so train.py rejects this world." in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(
@@ -261,7 +261,7 @@ def test_where_there_is_no_way_learners_are_not_trained(
         (["--figure", "rows.pdf"], "--figure must end in .png, not 'rows.pdf'"),
         (["--json", "no/such/folder/file.json"], "there is no folder"),
         (["--add", "no_such_file.json"], "'no_such_file.json' cannot be read: No such file"),
-        (["--seeds", "0", "--add", __file__], "holds no rows of this benchmark"),
+        (["--seeds", "0", "--add", __file__], "is not a report of this benchmark"),
         (["--worlds", "paper", "--", "--num-envs", "7"], "train.num_envs"),
     ],
 )
@@ -281,10 +281,10 @@ def test_a_report_without_rows_is_none_of_this_benchmark(
     file = tmp_path / "rows.json"
     file.write_text(json.dumps({"benchmark": "runtime", **report}))
     assert runtime.main(["--seeds", "0", "--add", str(file)]) == 2
-    assert capsys.readouterr().err == f"'{file}' holds no rows of this benchmark\n"
+    assert capsys.readouterr().err == f"'{file}' is not a report of this benchmark\n"
 
 
-def test_rows_of_other_knobs_are_other_rows(clear: Path) -> None:
+def test_rows_with_other_options_are_other_rows(clear: Path) -> None:
     def settings(name: str, *flags: str) -> dict[str, Any]:
         return runtime.blank(runtime.parse(["--worlds", str(clear), "--", *flags]), str(clear), name)["settings"]
 

@@ -55,7 +55,7 @@ def test_a_curve_that_bends_upwards_cannot_hide_it_between_its_ends() -> None:
     summary = scaling.summarise("pixels", 1.0, rows)
     assert summary["slope"] == pytest.approx(1 / 3)
     assert summary["steepest"] == pytest.approx(2.0)
-    assert "between neighbours 2.00 at most" in scaling.sentence({"name": "pixels", **summary})
+    assert "at most 2.00 between neighbours" in scaling.sentence({"name": "pixels", **summary})
 
 
 @pytest.mark.parametrize("quick", [True, False])
@@ -86,7 +86,7 @@ def test_a_size_that_cannot_be_run_is_told_in_a_sentence(tmp_path: Path) -> None
 
 
 def test_one_device_has_no_curve_of_devices() -> None:
-    with pytest.raises(ConfigError, match="one device only"):
+    with pytest.raises(ConfigError, match="only one device"):
         scaling.measure(configured([*MINIATURE, "--train.devices", "1"]), ["devices"], True, 1)
 
 
@@ -99,7 +99,7 @@ def test_worlds_of_fewer_boxes_are_a_part_of_those_of_more_and_can_be_flown() ->
         world_of_boxes(MOST + 1)
 
 
-def test_there_is_a_way_between_any_two_boxes() -> None:
+def test_there_is_a_gap_between_any_two_boxes() -> None:
     boxes = jax.tree.map(np.asarray, world_of_boxes(MOST).boxes)
     reach = np.hypot(boxes.half[:, 0], boxes.half[:, 1])
     gap = np.linalg.norm(boxes.position[:, None, :2] - boxes.position[None, :, :2], axis=-1) - reach - reach[:, None]
@@ -168,7 +168,7 @@ def test_sizes_take_turns_and_the_report_says_what_came_of_them(
     assert report["workload"]["vae_samples_per_decision"] == 1
     assert json.dumps(plain(report), allow_nan=False)
     shown = scaling.table(report)
-    assert "Pixels: slope 1.00" in shown and "All devices together do 50%" in shown
+    assert "Pixels: slope 1.00" in shown and "All devices together reach 50%" in shown
     drawn = draw_scaling(report, figure)
     assert figure.stat().st_size > 10_000
     titles = [axes.get_title(loc="left") for axes in drawn.axes]
