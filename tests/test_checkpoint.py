@@ -8,9 +8,11 @@ import numpy as np
 import pytest
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
+from edqn_jax.config import Config
 from edqn_jax.errors import ConfigError
-from edqn_jax.learn.policy import PolicyParams
+from edqn_jax.learn.policy import Policy, PolicyParams
 from edqn_jax.runs.checkpoints import COMMIT_MARKER, POLICY, load_params, save_params
+from edqn_jax.runs.policies import save_policy
 
 
 def some_policy(value: float = 1.0) -> PolicyParams:
@@ -55,6 +57,15 @@ def test_a_policy_without_its_commit_marker_does_not_exist(tmp_path):
     (tmp_path / POLICY / COMMIT_MARKER).unlink()
     with pytest.raises(ConfigError, match="incomplete: saving it was interrupted"):
         load_params(tmp_path)
+
+
+def test_a_policy_is_saved_into_no_folder_that_holds_files(tmp_path):
+    (tmp_path / "thesis.tex").write_text("years of work")
+    with pytest.raises(ConfigError, match="holds files already"):
+        save_policy(Policy(Config(), some_policy()), tmp_path)
+    assert [file.name for file in tmp_path.iterdir()] == ["thesis.tex"]
+    save_policy(Policy(Config(), some_policy()), tmp_path / "new")
+    assert same(load_params(tmp_path / "new" / "checkpoints"), some_policy())
 
 
 def test_a_damaged_policy_is_one_sentence(tmp_path):

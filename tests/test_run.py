@@ -19,12 +19,12 @@ from edqn_jax.errors import ConfigError, StoppedError
 from edqn_jax.evaluation.missions import run_missions
 from edqn_jax.learn import trainer
 from edqn_jax.learn.policy import PolicyParams
-from edqn_jax.learn.trainer import Episodes, Losses
+from edqn_jax.learn.trainer import Episodes, Losses, Plan
 from edqn_jax.report.progress import Progress
 from edqn_jax.runs.directory import TRAJECTORY_COLUMNS, RunDirectory, plain
 from edqn_jax.runs.policies import load_run
 from edqn_jax.training.run import train_run
-from edqn_jax.training.selection import Candidate, choose, first_success
+from edqn_jax.training.selection import Candidate, choose, first_success, is_due
 from tests.learn.test_trainer import CONFIG as SMALL
 
 CONFIG = dataclasses.replace(
@@ -149,6 +149,26 @@ def test_a_policy_flies_the_mission_from_its_first_good_validation() -> None:
     assert first_success(rates) == (300, 3.0)
     assert first_success(rates[:2]) == (None, None)
     assert first_success([]) == (None, None)
+
+
+@pytest.mark.parametrize(
+    ("every", "checked", "done", "due"),
+    [
+        (100, 96, 6, False),  # 96 decisions of 16 environments
+        (100, 96, 7, True),  # 112: a multiple is crossed, though not met
+        (100, 112, 12, False),
+        (100, 112, 13, True),
+        (100, 0, 5, False),  # nothing is learnt before step 5
+        (64, 0, 5, False),
+        (64, 0, 6, True),
+        (0, 96, 100, False),
+    ],
+)
+def test_a_validation_is_due_where_a_multiple_is_crossed_once_there_was_learning(
+    every: int, checked: int, done: int, due: bool
+) -> None:
+    config = Config(train=TrainConfig(num_envs=16, validation_every=every))
+    assert is_due(config, Plan(total=200, warmup=0, learn_from=5), checked, done) is due
 
 
 def test_half_of_the_validation_begins_near_the_start_and_all_of_it_in_random_worlds() -> None:

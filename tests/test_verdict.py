@@ -7,6 +7,8 @@ import numpy as np
 import pytest
 
 from edqn_jax.evaluation.judge import Judge, clearance, load_judge, replay_contact
+from edqn_jax.evaluation.verdicts import CONTACT_TOLERANCE_M, Agreement
+from edqn_jax.sim.outcomes import Outcome
 
 RADIUS = 0.36
 MILLIMETRE = 1e-3
@@ -158,3 +160,19 @@ def test_what_is_no_flight_is_refused(judge, flight):
 def test_a_radius_of_nothing_is_refused():
     with pytest.raises(ValueError, match="radius must be positive"):
         load_judge(mujoco.MjSpec.from_string(WORLD), 0.0)
+
+
+@pytest.mark.parametrize(
+    ("stated", "found", "apart_m", "agrees"),
+    [
+        (None, None, None, True),
+        (3.5, None, None, False),
+        (None, 3.5, None, False),
+        (3.5, 3.5, 0.0, True),
+        (3.5, 3.6, CONTACT_TOLERANCE_M, True),
+        (3.5, 3.7, 1.1 * CONTACT_TOLERANCE_M, False),
+    ],
+)
+def test_verdicts_agree_on_the_same_contact_or_on_none(stated, found, apart_m, agrees):
+    outcome = Outcome.GOAL if stated is None else Outcome.COLLISION
+    assert Agreement(0, outcome, stated, found, apart_m, touched="").agrees is agrees

@@ -129,8 +129,8 @@ def test_every_row_that_can_start_a_transition_is_drawn_and_no_other(form, decis
 
 
 def by_hand(outcome: Outcome) -> replay.Batch:
-    """Rewards 1, 2, 4, 8 and an end at the second; n = 3: the sample that begins at the first row."""
-    config = FORMS["stacked"]
+    """Rewards 1, 2, 4, 8 and an end at the second; n = 4 reaches the third: the sample before the first."""
+    config = agent(4, 2)
     rows = []
     for time, reward in enumerate([0.0, 0.0, 1.0, 2.0, 0.0, 4.0, 8.0]):
         rows.append(
@@ -162,7 +162,7 @@ def test_a_time_out_bootstraps_from_the_final_observation():
 
 def test_without_an_end_the_bootstrap_is_n_steps_away():
     one = by_hand(Outcome.RUNNING)  # the reset behind row 3 then only blanks the history
-    assert one.returns == pytest.approx(1 + 0.9 * 2 + 0.81 * 0) and one.discount == pytest.approx(0.9**3)
+    assert one.returns == pytest.approx(1 + 0.9 * 2 + 0.81 * 0 + 0.729 * 4) and one.discount == pytest.approx(0.9**4)
 
 
 def test_history_is_blank_before_a_reset():

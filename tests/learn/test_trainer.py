@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import dataclasses
 from functools import partial
+from types import SimpleNamespace
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -15,7 +17,7 @@ from edqn_jax.errors import ConfigError
 from edqn_jax.learn import replay, trainer
 from edqn_jax.learn.trainer import Plan, Trainer, TrainState
 from edqn_jax.sim import drone, mjcf, worlds
-from edqn_jax.sim.env import World
+from edqn_jax.sim.env import OWN_SIZE, Observation, World
 from edqn_jax.sim.outcomes import Outcome
 from edqn_jax.sim.scene import stack_scenes
 
@@ -188,6 +190,17 @@ def test_nothing_is_learnt_from_what_stood_there_before_the_first_reset(world: W
     assert set(np.asarray(batch.weight)) == {0.0, 1.0}
     oldest = replay.sample(agent, ring, jnp.int32(last - 1), 64, jax.random.key(1))
     assert not np.any(oldest.weight)
+
+
+def test_a_new_episode_begins_with_an_empty_memory() -> None:
+    config = dataclasses.replace(CONFIG, env=dataclasses.replace(CONFIG.env, sensor="blind"))
+    own = jnp.arange(1.0, 1.0 + 2 * OWN_SIZE).reshape(2, OWN_SIZE)
+    seen: Any = SimpleNamespace(is_reset=jnp.array([True, False]), observation=Observation(sensed=None, own=own))
+    actors: Any = SimpleNamespace(memory=jnp.full((1, 2, config.agent.history, OWN_SIZE), 7.0))
+    learner: Any = SimpleNamespace(encoder={})
+    fresh, running = trainer._remember(config, learner, actors, seen, jnp.int32(Plan.of(config).warmup + 5))
+    np.testing.assert_array_equal(fresh, [np.zeros(OWN_SIZE), own[0]])
+    np.testing.assert_array_equal(running, [np.full(OWN_SIZE, 7.0), own[1]])
 
 
 @pytest.mark.slow

@@ -23,6 +23,7 @@ from edqn_jax.sim.scene import (
     stack_scenes,
     take_scene,
 )
+from edqn_jax.sim.texture import _box_filter
 from tests.oracles import camera_plain
 from tests.sim.drawn_scenes import GROUND, ball, box, every_kind, free_points, pillar, rotation_of, scene_of
 
@@ -386,6 +387,12 @@ def test_distant_texture_fades_to_the_plain_surface():
     pose = jnp.array([0.0, 0.0, 2000.0]), jnp.asarray(rotation_of(0, 1.2, 0), jnp.float32)
     textured, plain = (luma_of(CameraConfig(mount="body", texture_contrast=c), scene, *pose) for c in (0.35, 0.0))
     np.testing.assert_allclose(textured, plain, atol=1e-6)
+
+
+def test_the_texture_filter_is_a_sinc_below_one_period_and_zero_beyond():
+    cycles = np.linspace(-1.0, 1.0, 201, dtype=np.float32)
+    np.testing.assert_allclose(_box_filter(jnp.asarray(cycles)), np.sinc(cycles), atol=0.0105)
+    np.testing.assert_array_equal(_box_filter(jnp.array([1.0, 1.5, -30.0])), 0.0)
 
 
 @pytest.mark.parametrize("mount", ["level", "body"])

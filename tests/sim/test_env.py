@@ -305,6 +305,23 @@ def test_frames_are_rendered_at_the_configured_physics_steps():
     assert sensor.frame_steps(many) == (0, 6, 12, 13)
 
 
+def test_a_reset_is_at_the_start_and_earns_nothing():
+    start = body((5, 5, 5))
+    still = Flight(position=jnp.ones((N, 3)), quaternion=jnp.zeros((N, 4)), velocity=jnp.ones((N, 3)))
+    flown = env._Decision(
+        drone=body((9, 9, 9)),
+        flight=still,
+        outcome=jnp.int32(Outcome.COLLISION),
+        end_step=jnp.int32(3),
+        contact=jnp.float32(0.5),
+        reward=jnp.float32(-100.0),
+    )
+    fresh = env._reset_in_place_of(flown, start)
+    assert fresh.reward == 0.0 and fresh.outcome == Outcome.RUNNING
+    np.testing.assert_array_equal(fresh.flight.position, np.full((N, 3), 5.0))
+    np.testing.assert_array_equal(fresh.flight.velocity, np.zeros((N, 3)))
+
+
 # ------------------------------------------------------------------------------------ flown missions
 
 MISSIONS = {

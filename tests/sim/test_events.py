@@ -148,6 +148,13 @@ def test_paper_counts_whole_tolerances_over_the_threshold_up_to_the_cap(change, 
     assert np.all(np.asarray(field.count) == count)
 
 
+def test_a_change_must_exceed_the_threshold():
+    threshold = jnp.float32(0.1)
+    change = jnp.nextafter(threshold, jnp.array([0.0, 0.1, 1.0], jnp.float32))
+    np.testing.assert_array_equal(ev.event_polarity(change, threshold), [0, 0, 1])
+    np.testing.assert_array_equal(ev.event_polarity(-change, threshold), [0, 0, -1])
+
+
 @pytest.mark.parametrize(("refractory_ns", "limit"), [(1000.0, 40_000), (6e6, 6), (1e8, 0), (0.0, 2**31 - 1)])
 def test_the_cap_is_the_window_over_the_refractory_period(refractory_ns, limit):
     assert ev.max_events(EventsConfig(refractory_ns=refractory_ns), 0.0 - -0.04) == limit
