@@ -15,7 +15,7 @@ ROOT = Path(__file__).parents[1]
 PATIENCE_S = 1200
 """What hangs for longer has failed."""
 
-LAUNCHERS = ("JAX_", "SLURM_", "OMPI_", "KUBERNETES_")
+LAUNCHERS = ("JAX_COORDINATOR", "JAX_NUM_PROCESSES", "JAX_PROCESS_ID", "SLURM_", "OMPI_", "KUBERNETES_")
 """Beginnings of the variables that would tell a process that it is one of several."""
 
 FEWER_PASSES = "--xla_backend_optimization_level=0"

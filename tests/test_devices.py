@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import types
+from collections.abc import Iterator
 from typing import Any
 
 import jax
@@ -99,12 +100,30 @@ def test_loops_are_left_as_they_are_unless_somebody_gave_options_of_their_own(gi
     assert os.environ["XLA_FLAGS"] == then
 
 
-def test_an_option_that_xla_does_not_know_is_left_out(monkeypatch):
+@pytest.fixture
+def asked_anew(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """No flags are given, as where users train, and what XLA knows is found out again."""
+    monkeypatch.setenv("XLA_FLAGS", "")
     devices.compiler_options.cache_clear()
-    assert devices.compiler_options("cpu") and not devices.compiler_options("tpu")
+    yield
+    devices.compiler_options.cache_clear()
+
+
+OPTIONS = {"xla_cpu_experimental_ynn_fusion_type", "xla_backend_optimization_level"}
+
+
+def test_xla_knows_our_options_and_accelerators_have_none(asked_anew):
+    assert set(devices.compiler_options("cpu")) == OPTIONS
+    assert devices.compiler_options("tpu") == {}
+
+
+def test_what_somebodys_flags_name_is_left_to_them(asked_anew, monkeypatch):
+    monkeypatch.setenv("XLA_FLAGS", "--xla_backend_optimization_level=3")
+    assert set(devices.compiler_options("cpu")) == OPTIONS - {"xla_backend_optimization_level"}
+
+
+def test_an_option_that_xla_does_not_know_is_left_out(asked_anew, monkeypatch):
     jit = jax.jit
     misspelt = {"xla_cpu_of_another_century": "1"}
     monkeypatch.setattr(jax, "jit", lambda f, compiler_options: jit(f, compiler_options=compiler_options and misspelt))
-    devices.compiler_options.cache_clear()
     assert devices.compiler_options("cpu") == {}
-    devices.compiler_options.cache_clear()
