@@ -16,14 +16,13 @@ import time
 from pathlib import Path
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 from jax import Array
 
 from edqn_jax.cli import main
 from edqn_jax.config import CameraConfig
-from edqn_jax.learn import trainer
-from edqn_jax.learn.trainer import Episodes, Losses, Trainer, TrainState
+from edqn_jax.learn.policy import fresh_policy
+from edqn_jax.learn.trainer import Episodes, Learner, Losses, Trainer, TrainState
 from edqn_jax.parallel import devices, processes
 from edqn_jax.runs.directory import plain
 from edqn_jax.sim import camera
@@ -40,7 +39,16 @@ def waves(config: CameraConfig, scene: Scene, position: Array, rotation: Array) 
 
 def only_a_policy(self: Trainer, seed: int) -> TrainState:
     """Stands for the state before the first step: of all of it, parameters."""
-    learner = trainer._init_learner(self.config, jax.random.key(seed))
+    params = fresh_policy(self.config, seed)
+    learner = Learner(
+        vae={},
+        vae_optimiser=None,
+        encoder=params.encoder,
+        q=params.q,
+        target=params.q,
+        average=params.q,
+        q_optimiser=None,
+    )
     state = TrainState(actors=None, learner=learner, step=jnp.int32(0))  # type: ignore[arg-type]
     return processes.replicate(state, self.mesh)
 

@@ -18,9 +18,9 @@ CACHE = {
     "jax_persistent_cache_min_compile_time_secs": 0.0,
     "jax_persistent_cache_min_entry_size_bytes": -1,
 }
-"""Options of JAX's compilation cache; the folder is made for each session unless JAX_COMPILATION_CACHE_DIR names one."""
+"""Options of JAX's compilation cache; its folder is made for a session unless JAX_COMPILATION_CACHE_DIR names one."""
 
-QUICK_TO_COMPILE = "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false"
+QUICK_TO_COMPILE = "--xla_backend_optimization_level=1 --xla_cpu_use_fusion_emitters=false"
 """XLA's flags with which a program compiles in less than half the time: what runs once need not be fast."""
 
 # For children too. Whoever gives flags gets these alone: `XLA_FLAGS= pytest` compiles everything as users do.
