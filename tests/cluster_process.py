@@ -4,7 +4,8 @@
 
 The process has DEVICES CPU devices. Its note holds the shards that it held and what `train_run` returned. To spare
 compiling, its camera sees waves that follow the pose, and it draws no pictures. `--no-learning` puts a state and
-chunks that do nothing in the place of the compiled ones, for tests of what processes tell one another.
+chunks that do nothing in the place of the compiled ones and compiles no rollouts, for tests of what processes tell
+one another.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ from jax import Array
 
 from edqn_jax.cli import main
 from edqn_jax.config import CameraConfig
+from edqn_jax.evaluation import rollouts
 from edqn_jax.learn.policy import fresh_policy
 from edqn_jax.learn.trainer import Episodes, Learner, Losses, Trainer, TrainState
 from edqn_jax.parallel import devices, processes
@@ -84,6 +86,7 @@ if __name__ == "__main__":
     if argv[:1] == ["--no-learning"]:
         del argv[0]
         Trainer.init, Trainer.compile, Trainer.chunk = only_a_policy, lambda self: None, no_learning
+        rollouts.prepare = lambda *_, **__: None
     code = main(["train", *argv])
     Path(note).write_text(json.dumps(plain(noted)), encoding="utf-8")
     sys.exit(code)

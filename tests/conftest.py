@@ -20,10 +20,14 @@ CACHE = {
 }
 """Options of JAX's compilation cache; its folder is made for a session unless JAX_COMPILATION_CACHE_DIR names one."""
 
-QUICK_TO_COMPILE = "--xla_backend_optimization_level=1 --xla_cpu_use_fusion_emitters=false"
-"""XLA's flags with which a program compiles in less than half the time: what runs once need not be fast."""
+QUICK_TO_COMPILE = "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false"
+"""XLA's flags with which a program compiles in less than half the time: what runs once need not be fast.
 
-# For children too. Whoever gives flags gets these alone: `XLA_FLAGS= pytest` compiles everything as users do.
+What the package compiles with options of its own (`compiler_options`) keeps their level of optimisation.
+"""
+
+# For the processes that tests start as well. Whoever gives flags gets these alone: `XLA_FLAGS= pytest` compiles
+# everything as users do.
 os.environ.setdefault("XLA_FLAGS", QUICK_TO_COMPILE)
 use_cpu_devices(2)
 

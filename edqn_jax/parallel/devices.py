@@ -40,8 +40,7 @@ def compiler_options(platform: str) -> dict[str, str | bool]:
 
     On CPUs XLA hands sums of products to a library that is made for large ones: one sum of 6 x 6 numbers in a
     physics step then takes longer than the rest of the step. Matrix products stay with the library. Of LLVM's
-    optimisations the first level gives programs as fast as the third, and an eighth sooner. Whatever `XLA_FLAGS`
-    names is left to it.
+    optimisations the first level gives programs as fast as the third, and an eighth sooner.
     """
     if platform != "cpu":
         return {}
@@ -49,8 +48,7 @@ def compiler_options(platform: str) -> dict[str, str | bool]:
         "xla_cpu_experimental_ynn_fusion_type": "LIBRARY_FUSION_TYPE_DOT",
         "xla_backend_optimization_level": "1",
     }
-    given = os.environ.get("XLA_FLAGS", "")
-    return {name: value for name, value in wanted.items() if name not in given and _has_option(name, value)}
+    return {name: value for name, value in wanted.items() if _has_option(name, value)}
 
 
 def _has_option(name: str, value: str) -> bool:
