@@ -4,7 +4,8 @@
 
 The process has DEVICES CPU devices. Its note holds the shards that it held and what `train_run` returned. To spare
 compiling, its camera sees waves that follow the pose, and it draws no pictures. `--no-learning` puts a state and
-chunks that do nothing in the place of the compiled ones, for tests of what processes tell one another.
+chunks that do nothing in the place of the compiled ones and compiles no rollouts, for tests of what processes tell
+one another.
 """
 
 from __future__ import annotations
@@ -16,14 +17,14 @@ import time
 from pathlib import Path
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 from jax import Array
 
 from edqn_jax.cli import main
 from edqn_jax.config import CameraConfig
-from edqn_jax.learn import trainer
-from edqn_jax.learn.trainer import Episodes, Losses, Trainer, TrainState
+from edqn_jax.evaluation import rollouts
+from edqn_jax.learn.policy import fresh_policy
+from edqn_jax.learn.trainer import Episodes, Learner, Losses, Trainer, TrainState
 from edqn_jax.parallel import devices, processes
 from edqn_jax.runs.directory import plain
 from edqn_jax.sim import camera
@@ -40,7 +41,16 @@ def waves(config: CameraConfig, scene: Scene, position: Array, rotation: Array) 
 
 def only_a_policy(self: Trainer, seed: int) -> TrainState:
     """Stands for the state before the first step: of all of it, parameters."""
-    learner = trainer._init_learner(self.config, jax.random.key(seed))
+    params = fresh_policy(self.config, seed)
+    learner = Learner(
+        vae={},
+        vae_optimiser=None,
+        encoder=params.encoder,
+        q=params.q,
+        target=params.q,
+        average=params.q,
+        q_optimiser=None,
+    )
     state = TrainState(actors=None, learner=learner, step=jnp.int32(0))  # type: ignore[arg-type]
     return processes.replicate(state, self.mesh)
 
@@ -77,6 +87,7 @@ if __name__ == "__main__":
     if argv[:1] == ["--no-learning"]:
         del argv[0]
         Trainer.init, Trainer.compile, Trainer.chunk = only_a_policy, lambda self: None, no_learning
+        rollouts.prepare = lambda *_, **__: None
     code = main(["train", *argv])
     Path(note).write_text(json.dumps(plain(noted)), encoding="utf-8")
     sys.exit(code)

@@ -1,8 +1,11 @@
-"""Two simulated CPU devices for every test, and strictness for those that ask for it."""
+"""Two simulated CPU devices for every test, compiled programs that all processes of a session share, strictness."""
 
 from __future__ import annotations
 
 import contextlib
+import os
+import shutil
+import tempfile
 from collections.abc import Iterator
 
 import jax
@@ -10,7 +13,39 @@ import pytest
 
 from edqn_jax.parallel.devices import use_cpu_devices
 
+CACHE = {
+    "jax_compilation_cache_dir": "",
+    "jax_persistent_cache_min_compile_time_secs": 0.0,
+    "jax_persistent_cache_min_entry_size_bytes": -1,
+}
+"""Options of JAX's compilation cache; its folder is made for a session unless JAX_COMPILATION_CACHE_DIR names one."""
+
+QUICK_TO_COMPILE = "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false"
+"""XLA's flags with which a program compiles in less than half the time: what runs once need not be fast.
+
+What the package compiles with options of its own (`compiler_options`) keeps their level of optimisation.
+"""
+
+# For the processes that tests start as well. Whoever gives flags gets these alone: `XLA_FLAGS= pytest` compiles
+# everything as users do.
+os.environ.setdefault("XLA_FLAGS", QUICK_TO_COMPILE)
 use_cpu_devices(2)
+
+
+def pytest_configure(config: pytest.Config) -> None:
+    """Shares compiled programs between the processes of this session, and those that tests start.
+
+    Most of a session's time is XLA's, and many tests compile the same. An entry's key holds the whole program, its
+    options and XLA's flags, so a program that has changed is compiled again.
+    """
+    folder = os.environ.get("JAX_COMPILATION_CACHE_DIR")
+    if folder is None:
+        folder = tempfile.mkdtemp(prefix="edqn-tests-")
+        config.add_cleanup(lambda: shutil.rmtree(folder, ignore_errors=True))
+    for name, value in (CACHE | {"jax_compilation_cache_dir": folder}).items():
+        # Workers and children read the variables when they import JAX; this process has imported it.
+        os.environ[name.upper()] = str(value)
+        jax.config.update(name, value)
 
 
 @pytest.fixture

@@ -15,11 +15,8 @@ ROOT = Path(__file__).parents[1]
 PATIENCE_S = 1200
 """What hangs for longer has failed."""
 
-LAUNCHERS = ("JAX_", "SLURM_", "OMPI_", "KUBERNETES_")
+LAUNCHERS = ("JAX_COORDINATOR", "JAX_NUM_PROCESSES", "JAX_PROCESS_ID", "SLURM_", "OMPI_", "KUBERNETES_")
 """Beginnings of the variables that would tell a process that it is one of several."""
-
-FEWER_PASSES = "--xla_backend_optimization_level=0"
-"""Half the time to compile; what is computed once need not be fast."""
 
 Process = subprocess.Popen[str]
 
@@ -84,7 +81,7 @@ def _start(folder: Path, argv: list[str], variables: dict[str, str]) -> Process:
     return subprocess.Popen(
         [sys.executable, "-m", "tests.cluster_process", *argv],
         cwd=folder,
-        env={**alone, "PYTHONPATH": str(ROOT), "XLA_FLAGS": FEWER_PASSES, **variables},
+        env={**alone, "PYTHONPATH": str(ROOT), **variables},
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         text=True,

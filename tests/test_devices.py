@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import types
+from collections.abc import Iterator
 from typing import Any
 
 import jax
@@ -99,12 +100,22 @@ def test_loops_are_left_as_they_are_unless_somebody_gave_options_of_their_own(gi
     assert os.environ["XLA_FLAGS"] == then
 
 
-def test_an_option_that_xla_does_not_know_is_left_out(monkeypatch):
+@pytest.fixture
+def asked_anew() -> Iterator[None]:
+    """What XLA knows is found out again."""
     devices.compiler_options.cache_clear()
-    assert devices.compiler_options("cpu") and not devices.compiler_options("tpu")
+    yield
+    devices.compiler_options.cache_clear()
+
+
+def test_xla_knows_our_options_and_accelerators_have_none(asked_anew):
+    known = {"xla_cpu_experimental_ynn_fusion_type", "xla_backend_optimization_level"}
+    assert set(devices.compiler_options("cpu")) == known
+    assert devices.compiler_options("tpu") == {}
+
+
+def test_an_option_that_xla_does_not_know_is_left_out(asked_anew, monkeypatch):
     jit = jax.jit
     misspelt = {"xla_cpu_of_another_century": "1"}
     monkeypatch.setattr(jax, "jit", lambda f, compiler_options: jit(f, compiler_options=compiler_options and misspelt))
-    devices.compiler_options.cache_clear()
     assert devices.compiler_options("cpu") == {}
-    devices.compiler_options.cache_clear()

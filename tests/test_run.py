@@ -46,6 +46,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> tuple[RunDirectory, dict]
 def test_a_run_leaves_what_the_readme_promises(whole: tuple[RunDirectory, dict]) -> None:
     run, summary = whole
     assert json.loads(run.summary_file.read_text()) == plain(summary)
+    assert summary["reward"] == {"name": CONFIG.env.reward, "source_sha256": None}
     figures = {file.stem for file in run.figures.glob("*.png")}
     assert figures == {"world", "events", "path", "returns", "learning", "reconstruction"}
     assert summary["train_decisions"] == 512 and summary["outcome"] in {"time_out", "collision", "left_volume"}
@@ -83,8 +84,12 @@ def test_a_run_with_another_sensor_leaves_the_same_and_is_evaluated(
     assert summary["train_decisions"] == 256 and summary["workload"]["sensor"] == sensor
     phases = [row["phase"] for row in run.read_metrics()]
     assert phases == ["warm-up" if drawn else "training", "training", "training", "training"]
-    evaluate_command(EvaluateArgs(run.path, missions=2, json=tmp_path / "figures.json"))
-    assert json.loads((tmp_path / "figures.json").read_text())["missions"] == 2
+    # As many missions as in a validation, and recorded: the program that has flown those flies these.
+    figures, flights = tmp_path / "figures.json", tmp_path / "flights.npz"
+    missions = config.train.validation_missions
+    evaluate_command(EvaluateArgs(run.path, missions=missions, json=figures, trajectories=flights))
+    assert json.loads(figures.read_text())["missions"] == missions
+    assert len(np.load(flights)["outcome"]) == missions
 
 
 @pytest.mark.slow
@@ -171,6 +176,7 @@ def test_a_validation_is_due_where_a_multiple_is_crossed_once_there_was_learning
     assert is_due(config, Plan(total=200, warmup=0, learn_from=5), checked, done) is due
 
 
+@pytest.mark.slow
 def test_half_of_the_validation_begins_near_the_start_and_all_of_it_in_random_worlds() -> None:
     own, random = Config(), Config(world=WorldConfig(name="sparse", pool_size=2, missions=8))
     assert run_missions(own).near_start.sum() == own.train.validation_missions // 2
