@@ -32,11 +32,11 @@ WORLD = """<mujoco><worldbody>
 
 def arguments_for(config: Config, folder: Path) -> list[str]:
     """Arguments of `edqn train` for this configuration in a small world; both are left in files in `folder`."""
-    world, knobs = folder / "sphere.xml", folder / "knobs.yaml"
+    world, options = folder / "sphere.xml", folder / "options.yaml"
     world.write_text(WORLD, encoding="utf-8")
     config = dataclasses.replace(config, world=dataclasses.replace(config.world, name=str(world)))
-    knobs.write_text(to_yaml(config), encoding="utf-8")
-    return ["--config", str(knobs), "--run-dir", "run"]
+    options.write_text(to_yaml(config), encoding="utf-8")
+    return ["--config", str(options), "--run-dir", "run"]
 
 
 @pytest.mark.slow

@@ -163,7 +163,7 @@ def test_the_papers_reward_is_eq_8_to_the_letter():
         assert rewarded(config, outcome, 9.0, 5.0) == expected.get(outcome, 0.0)
 
 
-def test_knobs_add_to_eq_8():
+def test_the_options_add_to_eq_8():
     config = CONFIG.env
     assert rewarded(config, Outcome.RUNNING, 9.0, 5.0) == -0.25
     assert rewarded(config, Outcome.LEFT_VOLUME, 9.0, 5.0) == -70.25
