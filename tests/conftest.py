@@ -26,6 +26,21 @@ QUICK_TO_COMPILE = "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emit
 What the package compiles with options of its own (`compiler_options`) keeps their level of optimisation.
 """
 
+LONGEST = (
+    "test_run",
+    "test_layout",
+    "test_cluster",
+    "test_trainer",
+    "test_embedding",
+    "test_rivals",
+    "test_flights",
+    "test_evaluate",
+    "test_sensor",
+    "test_compare",
+    "test_loop",
+)
+"""Files of half a minute and more, which go first: a long one begun last would leave the other process idle."""
+
 # For the processes that tests start as well. Whoever gives flags gets these alone: `XLA_FLAGS= pytest` compiles
 # everything as users do.
 os.environ.setdefault("XLA_FLAGS", QUICK_TO_COMPILE)
@@ -46,6 +61,12 @@ def pytest_configure(config: pytest.Config) -> None:
         # Workers and children read the variables when they import JAX; this process has imported it.
         os.environ[name.upper()] = str(value)
         jax.config.update(name, value)
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Puts the longest files first; `--no-loadscope-reorder` keeps them there."""
+    rank = {name: number for number, name in enumerate(LONGEST)}
+    items.sort(key=lambda item: rank.get(item.path.stem, len(LONGEST)))
 
 
 @pytest.fixture
