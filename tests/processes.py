@@ -43,7 +43,7 @@ def by_srun(port: int, number: int) -> tuple[list[str], dict[str, str]]:
 
 @contextmanager
 def two_processes(folder: Path, argv: list[str], launcher: Launcher = by_hand) -> Iterator[list[Process]]:
-    """`tests/cluster_process.py` twice, in `folder`, a device each; whatever happens, neither outlives the block.
+    """`tests/parallel/cluster_process.py` twice, in `folder`, a device each; neither outlives the block.
 
     Their notes are `note-0.json` and `note-1.json`.
     """
@@ -62,7 +62,7 @@ def two_processes(folder: Path, argv: list[str], launcher: Launcher = by_hand) -
 
 @contextmanager
 def one_process(folder: Path, argv: list[str]) -> Iterator[Process]:
-    """`tests/cluster_process.py` alone, in `folder`, with two devices; its note is `note.json`."""
+    """`tests/parallel/cluster_process.py` alone, in `folder`, with two devices; its note is `note.json`."""
     process = _start(folder, ["note.json", "2", *argv], {})
     try:
         yield process
@@ -79,7 +79,7 @@ def to_the_end(*processes: Process) -> list[tuple[int, str]]:
 def _start(folder: Path, argv: list[str], variables: dict[str, str]) -> Process:
     alone = {name: value for name, value in os.environ.items() if not name.startswith(LAUNCHERS)}
     return subprocess.Popen(
-        [sys.executable, "-m", "tests.cluster_process", *argv],
+        [sys.executable, "-m", "tests.parallel.cluster_process", *argv],
         cwd=folder,
         env={**alone, "PYTHONPATH": str(ROOT), **variables},
         stdout=subprocess.PIPE,

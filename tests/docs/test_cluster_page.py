@@ -13,7 +13,7 @@ import yaml
 from edqn_jax.cli.arguments import parse_train
 from edqn_jax.parallel.launch import how_to_join
 
-PAGE = (Path(__file__).parents[1] / "docs" / "cluster.md").read_text(encoding="utf-8")
+PAGE = (Path(__file__).parents[2] / "docs" / "cluster.md").read_text(encoding="utf-8")
 
 
 def block(language: str) -> str:

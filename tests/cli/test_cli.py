@@ -20,7 +20,7 @@ from edqn_jax.errors import ConfigError, DivergedError, StoppedError
 from edqn_jax.parallel import devices
 from edqn_jax.sim.mjcf import SceneError
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 
 
 @pytest.fixture(autouse=True)

@@ -8,7 +8,7 @@ import nbformat
 import pytest
 from nbclient import NotebookClient
 
-NOTEBOOK = Path(__file__).parents[1] / "notebooks" / "flight_and_events.ipynb"
+NOTEBOOK = Path(__file__).parents[2] / "notebooks" / "flight_and_events.ipynb"
 
 
 @pytest.mark.slow

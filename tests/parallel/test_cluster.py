@@ -20,7 +20,7 @@ from edqn_jax.parallel import processes
 from edqn_jax.runs.checkpoints import load_params
 from edqn_jax.runs.directory import RunDirectory
 from tests.processes import PATIENCE_S, by_srun, one_process, to_the_end, two_processes
-from tests.test_run import CONFIG
+from tests.training.test_run import CONFIG
 
 WORLD = """<mujoco><worldbody>
   <site name="start" pos="2 2 3"/><site name="goal" pos="20 10 6"/>

@@ -16,7 +16,7 @@ from edqn_jax.sim.mjcf import check_scene, load_world
 from edqn_jax.sim.outcomes import Outcome
 from tests.miniature import MINIATURE
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 
 
