@@ -96,11 +96,14 @@ def test_an_environment_is_reset_stepped_and_seen() -> None:
     state, observation = environment.reset()
     np.testing.assert_allclose(state.drone.position, [1, 1, 3])
     assert len(environment.events(observation)) == 0  # at rest nothing changes
-    for _ in range(3):
+    streams, images = [], []
+    for _ in range(8):
         state, step = environment.step(state, "ahead")
+        streams.append(environment.events(step.observation))
+        images.append(environment.event_image(step.observation))
     assert float(state.drone.position[0]) > 2 and float(state.drone.position[1]) > 2  # the goal lies that way
-    stream = environment.events(step.observation)
-    assert len(stream) == np.abs(environment.event_image(step.observation)).sum() > 0
+    assert [len(stream) for stream in streams] == [np.abs(image).sum() for image in images]
+    assert sum(len(stream) for stream in streams) > 0
     picture = environment.picture(state)
     assert picture.shape == (48, 64, 3) and 0 <= picture.min() < picture.max() <= 1
 

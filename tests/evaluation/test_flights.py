@@ -156,7 +156,7 @@ def test_shuffling_moves_the_codes_and_nothing_else(course):
 def test_one_mission_has_nobody_to_shuffle_with(course):
     world = course.world
     alone = dataclasses.replace(world, missions=jax.tree.map(lambda leaf: leaf[:1], world.missions))
-    with pytest.raises(ValueError, match="two or more"):
+    with pytest.raises(ValueError, match="at least two missions"):
         fly_missions(CONFIG, alone, always((0, 0, 0)), jax.random.key(0), shuffle_codes=True)
 
 

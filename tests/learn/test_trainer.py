@@ -16,6 +16,7 @@ from edqn_jax.config import AgentConfig, CameraConfig, Config, EncoderConfig, Tr
 from edqn_jax.errors import ConfigError
 from edqn_jax.learn import replay, trainer
 from edqn_jax.learn.trainer import Plan, Trainer, TrainState
+from edqn_jax.random import run_streams
 from edqn_jax.sim import drone, mjcf, worlds
 from edqn_jax.sim.env import OWN_SIZE, Observation, World
 from edqn_jax.sim.outcomes import Outcome
@@ -210,7 +211,7 @@ def test_training_two_seeds_at_once_is_training_each_alone(on_one, world: World)
     steps = jnp.arange(CONFIG.train.chunk_steps)
     assert len(steps) == made.plan.warmup == 4
     init = jax.jit(lambda key: trainer.init(CONFIG, world, key))
-    states = [init(jax.random.key(seed)) for seed in (0, 1)]
+    states = [init(run_streams(seed).learning) for seed in (0, 1)]
     train = jax.jit(jax.vmap(lambda state: trainer.run_steps(CONFIG, world, state, steps)))
     together = train(jax.tree.map(lambda *x: jnp.stack(x), *states))
     for index in range(2):

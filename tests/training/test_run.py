@@ -67,13 +67,12 @@ def test_a_run_leaves_what_the_readme_promises(whole: tuple[RunDirectory, dict])
 @pytest.mark.parametrize(
     ("sensor", "drawn"),
     [
-        ("frames", {"frames", "reconstruction"}),
         ("depth", {"depth", "reconstruction"}),
         ("blind", set()),
     ],
 )
 def test_a_run_with_another_sensor_leaves_the_same_and_is_evaluated(
-    sensor: Literal["frames", "depth", "blind"], drawn: set[str], tmp_path: Path
+    sensor: Literal["depth", "blind"], drawn: set[str], tmp_path: Path
 ) -> None:
     short = dataclasses.replace(CONFIG.train, total_steps=256)
     config = dataclasses.replace(CONFIG, env=dataclasses.replace(CONFIG.env, sensor=sensor), train=short)
