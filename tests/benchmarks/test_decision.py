@@ -11,6 +11,7 @@ import pytest
 import decision
 
 
+@pytest.mark.slow
 def test_it_keeps_to_one_core_and_says_what_it_measured(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

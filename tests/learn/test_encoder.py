@@ -92,6 +92,7 @@ def test_dense_encoder_equals_the_sum_over_single_events(kind, field):
 
 @pytest.mark.parametrize("form", [Form.EVENTS, Form.PICTURE], ids=["events", "pictures"])
 @pytest.mark.parametrize("kind", ["table", "network"])
+@pytest.mark.slow
 def test_pixel_features_written_out_give_the_same_codes(kind, form):
     config = EncoderConfig(pixel_features=kind, features=8, hidden=16, code_size=5)
     params = en.init_encoder(config, SMALL, jax.random.key(0), form=form)
@@ -173,6 +174,7 @@ LOSS_AND_GRADIENT = jax.jit(jax.value_and_grad(en.vae_loss, argnums=1, has_aux=T
 
 
 @pytest.mark.parametrize("scale", [1e6, -1e6])
+@pytest.mark.slow
 def test_losses_and_gradients_stay_finite_under_huge_activations(scale):
     params = fresh(CONFIG, SMALL, jax.random.key(0))
     params["encoder"] = jax.tree.map(lambda x: x * scale, params["encoder"])

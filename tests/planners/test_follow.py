@@ -30,6 +30,7 @@ def flown(task: Task, path) -> Flights:
     return jax.device_get(compiled_follower()(CONFIG, FOLLOW, AIRFRAME, task.scene, goal, points))
 
 
+@pytest.mark.slow
 def test_in_the_open_it_flies_straight_to_the_goal_about_as_fast_as_a_learner_may():
     task = small_world()
     flight = flown(task, [task.start, task.goal])

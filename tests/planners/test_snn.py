@@ -72,6 +72,7 @@ def test_along_the_ground_every_edge_is_there():
 
 
 @pytest.mark.parametrize("seed", range(3))
+@pytest.mark.slow
 def test_no_edge_touches_anything_and_none_with_clearance_is_missing(seed):
     rng = np.random.default_rng(seed)
     scene = every_kind(rng)
@@ -102,6 +103,7 @@ def test_synapses_come_in_pairs(seed):
             assert joined[tuple(cell + step)] >> (25 - k) & 1
 
 
+@pytest.mark.slow
 def test_a_point_belongs_to_the_cells_that_it_sees():
     task = small_world(box((5.9, 0, 0), (6.1, 12, 6)))
     network = _synapses(task.scene, 0.1, SMALL, 1.0)

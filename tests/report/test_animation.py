@@ -64,6 +64,7 @@ def test_there_is_a_frame_for_each_decision_and_one_for_the_end():
     assert gif.info["duration"] == 1000 * LAST_FRAME_S
 
 
+@pytest.mark.slow
 def test_a_long_flight_leaves_decisions_out():
     assert frames(recorded(Drawn(), MOST_FRAMES + 10)) == (MOST_FRAMES + 10) // 2 + 1
 
@@ -94,6 +95,7 @@ def run(tmp_path_factory) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_a_saved_run_is_recorded_on_another_world(run, tmp_path, capsys):
     world, file = tmp_path / "box.xml", tmp_path / "flight.gif"
     write_scene(world_with_a_box(), world)

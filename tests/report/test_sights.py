@@ -57,6 +57,7 @@ def sights() -> Sights:
     return sights_of(SMALL)
 
 
+@pytest.mark.slow
 def test_the_events_are_those_that_the_drone_got(sights, flight):
     flown, steps = flight
     shown = sights.shown(fresh_policy(SMALL), flown)

@@ -254,6 +254,7 @@ def rows(decide):
     return measure(CONFIG, SPEED, decide)
 
 
+@pytest.mark.slow
 def test_every_action_is_reached_in_six_tenths_of_a_second_without_overshoot_beyond_a_tenth(rows):
     actions = [row for row in rows if row["kind"] == "from rest"]
     assert len(actions) == 26

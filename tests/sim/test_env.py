@@ -447,6 +447,7 @@ def test_resets_draw_every_mission(reset, step):
     assert drawn == set(range(len(MISSIONS)))
 
 
+@pytest.mark.slow
 def test_a_flight_into_a_wall_is_a_collision_and_one_over_the_fence_leaves(reset, step):
     # 2.64 m of free way before the wall: a decision to get going and 1 m with every other.
     _, steps = fly(reset, step, "wall", [AHEAD] * 4)
