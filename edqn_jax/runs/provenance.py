@@ -2,14 +2,20 @@
 
 from __future__ import annotations
 
+import contextlib
+import functools
 import hashlib
 import inspect
 import platform
+import re
+from collections.abc import Iterator
 from importlib import metadata
+from pathlib import Path
 from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from edqn_jax.config import Config
 from edqn_jax.learn.embedding import has_code
@@ -56,15 +62,82 @@ def state_digest(state: TrainState) -> str:
 
 
 def reward_record(config: Config, reward: Reward | None) -> dict[str, str | None]:
-    """Returns a reward's name, and for a reward function the SHA-256 of its source.
+    """Returns a reward's name, and for a reward function the SHA-256 of its source and of the values bound to it.
 
-    The digest is None for the configured rewards, and where Python cannot find the source.
+    Bound are the arguments of a `functools.partial`, defaults, variables of an enclosing function, and the attributes
+    of an object that is called or whose method is. The digest is None for the configured rewards, and where Python
+    cannot find the source.
     """
     if reward is None:
         return {"name": config.env.reward, "source_sha256": None}
-    name = getattr(reward, "__qualname__", type(reward).__qualname__)
+    name, digest = type(reward).__qualname__, None
+    # Attributes and `repr` of foreign objects may raise anything; a run must not end without its summary for that.
+    with contextlib.suppress(Exception):
+        name = _name(reward)
+        digest = hashlib.sha256("".join(_parts(reward)).encode()).hexdigest()
+    return {"name": name, "source_sha256": digest}
+
+
+def _name(reward: Any) -> str:
+    """Returns the name of a reward function; of a lambda, also where it stands."""
+    inner = reward.func if isinstance(reward, functools.partial) else _unwrapped(reward)
+    if inner is not reward:
+        return _name(inner)
+    name = getattr(reward, "__qualname__", None)
+    if not isinstance(name, str):
+        return type(reward).__qualname__
+    code = getattr(reward, "__code__", None)
+    if code is not None and name.endswith("<lambda>"):
+        return f"{name} ({Path(code.co_filename).name}:{code.co_firstlineno})"
+    return name
+
+
+def _parts(reward: Any) -> Iterator[str]:
+    """Yields the source of a reward function, and what is bound to it.
+
+    Raises:
+        OSError, TypeError: if Python cannot find the source.
+    """
+    reward = _unwrapped(reward)
+    if isinstance(reward, functools.partial):
+        yield from _parts(reward.func)
+        yield _text((reward.args, sorted(reward.keywords.items())))
+    elif inspect.isfunction(reward):
+        yield inspect.getsource(reward)
+        bound = [cell.cell_contents for cell in reward.__closure__ or ()]
+        bound += [*(reward.__defaults__ or ()), *sorted((reward.__kwdefaults__ or {}).items())]
+        if bound:
+            yield _text(bound)
+    elif inspect.ismethod(reward):
+        yield reward.__name__
+        yield from _parts_of_object(reward.__self__)
+    else:
+        yield from _parts_of_object(reward)
+
+
+def _parts_of_object(thing: Any) -> Iterator[str]:
+    """Yields the source of an object's class, or of a class, and the object's attributes."""
+    if isinstance(thing, type):
+        yield inspect.getsource(thing)
+        return
+    yield inspect.getsource(type(thing))
+    attributes = getattr(thing, "__dict__", {})
+    if attributes:
+        yield _text(sorted(attributes.items()))
+
+
+def _unwrapped(reward: Any) -> Any:
+    """Returns the function that `jax.jit` or another decorator wraps."""
     try:
-        source = inspect.getsource(reward if inspect.isroutine(reward) else type(reward))
-    except (OSError, TypeError):
-        return {"name": name, "source_sha256": None}
-    return {"name": name, "source_sha256": hashlib.sha256(source.encode()).hexdigest()}
+        return inspect.unwrap(reward)
+    except ValueError:  # wrapped by itself
+        return reward
+
+
+def _text(bound: Any) -> str:
+    """Returns values as text that is the same in every process; arrays in full."""
+    leaves, tree = jax.tree.flatten(bound)
+    arrays = [x for x in leaves if isinstance(x, np.ndarray | jax.Array)]
+    texts = [f"{x.dtype}{x.shape}{np.asarray(x).tobytes().hex()}" for x in arrays]
+    others = [repr(x) for x in leaves if not isinstance(x, np.ndarray | jax.Array)]
+    return re.sub(r" at 0x[0-9a-fA-F]+", "", f"{tree}{others}") + "".join(texts)
