@@ -76,8 +76,8 @@ DOTS_PER_INCH = 220
 def drawing(width: float, height: float, file: Path) -> Iterator[Figure]:
     """Makes a figure of `width` x `height` inches in the project's style, written to `file` at the end of the block."""
     with matplotlib.rc_context(STYLE):
-        figure = Figure(figsize=(width, height), layout="constrained")
-        FigureCanvasAgg(figure)
+        figure = Figure(figsize=(width, height), dpi=DOTS_PER_INCH, layout="constrained")
+        canvas = FigureCanvasAgg(figure)
         yield figure
         file.parent.mkdir(parents=True, exist_ok=True)
-        figure.savefig(file, dpi=DOTS_PER_INCH, format="png")
+        canvas.print_png(file)  # `savefig` lays everything out twice
