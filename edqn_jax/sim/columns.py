@@ -4,7 +4,8 @@ Under a level camera an upright shape fills one interval of rows in each column 
 cover any one column: two on average in a world of thirty, seldom more than eight. So columns are the unit of work,
 not frames: all columns of all frames of a batch are sorted by the number of shapes that cover them and cut into
 blocks. Each block is drawn by one of a few branches, each with slots for a fixed number of shapes: the smallest
-branch that is large enough for all columns of the block. Draw branches are ordered by capacity.
+branch that is large enough for all columns of the block. Draw branches are ordered by capacity. A batch that is too
+small to be cut is drawn by the last branch.
 
 M frames, C columns of H pixels in each, Q = M x C; N upright shapes; B columns in a block.
 """
@@ -104,6 +105,10 @@ def _pictures(
     block = max(SMALLEST_BLOCK, -(-size // BLOCKS))
     blocks = -(-size // block)
     numbers = jnp.arange(size, dtype=jnp.int32)
+    if blocks == 1:
+        # There is nothing to sort, and the last branch alone compiles several times faster than all of them.
+        drawn = branches[-1](config, finish, numbers)
+        return materialised(drawn.reshape(count, width, config.height).swapaxes(1, 2))
     order = jnp.sort(branch * size + numbers) % size
     padded = jnp.concatenate([order, jnp.broadcast_to(order[-1], (blocks * block - size,))])
     drawn = lax.map(
