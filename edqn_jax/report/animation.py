@@ -18,9 +18,10 @@ from PIL import Image
 from edqn_jax.learn.policy import PolicyParams
 from edqn_jax.report.flights import OBLIQUE, draw_end_marks, draw_stage
 from edqn_jax.report.images import LOOKS, scale_of
-from edqn_jax.report.sights import Sights, decision_rows, on_screen, poses
+from edqn_jax.report.sights import Sights, decision_rows, poses
 from edqn_jax.report.solids import MAP, View, hidden
 from edqn_jax.report.style import INK, LINE, MUTED, OUTCOME_COLOURS, OUTCOME_LABELS, STYLE
+from edqn_jax.sim.camera import on_screen
 
 SIZE = (800, 540)
 """Width and height of the GIF, pixels."""

@@ -8,8 +8,9 @@ from edqn_jax.learn.policy import PolicyParams
 from edqn_jax.report.curves import draw_learning, draw_returns
 from edqn_jax.report.flights import draw_path, draw_world
 from edqn_jax.report.images import LOOKS, draw_reconstruction, draw_sight
-from edqn_jax.report.sights import Sights, coarse, decision_rows, on_screen, poses
+from edqn_jax.report.sights import Sights, coarse, decision_rows, poses
 from edqn_jax.runs.directory import TRAJECTORY_COLUMNS, RunDirectory
+from edqn_jax.sim.camera import on_screen
 
 MOMENTS = 5
 """Moments of the flight that are shown."""

@@ -16,7 +16,7 @@ from jax.stages import Compiled
 from edqn_jax.config import Config
 from edqn_jax.learn import encoder
 from edqn_jax.learn.policy import PolicyParams, fresh_policy
-from edqn_jax.parallel.devices import compiler_options
+from edqn_jax.parallel.devices import quick_compiler_options
 from edqn_jax.sim import camera, events, sensor
 from edqn_jax.sim.drone import Flight
 from edqn_jax.sim.events import EventField
@@ -102,14 +102,9 @@ class Sights:
         return jax.lax.scan(one, sensor.at_rest(config, start), (position, quaternion, keys))[1]
 
     def _compile_rgb(self) -> Compiled:
-        wide, high = self.config.camera.width * FINE, self.config.camera.height * FINE
-        # With a ray for each pixel there is nothing to gain from the level camera's columns, which compile slowly.
-        lens = dataclasses.replace(
-            self.config.camera, width=wide, height=high, mount="body", samples_across=1, samples_down=1
-        )
-
         def picture(scene: Scene, position: Array, quaternion: Array) -> Array:
-            return camera.rgb(lens, scene, position, sensor.mount_rotation(self.config, quaternion))
+            rotation = sensor.mount_rotation(self.config, quaternion)
+            return camera.fine_rgb(self.config.camera, FINE, scene, position, rotation)
 
         return _compiled(picture, self.scene, *_blank_poses())
 
@@ -139,13 +134,8 @@ def coarse(picture: np.ndarray) -> np.ndarray:
     return blocks.mean(axis=(-4, -2))
 
 
-def on_screen(linear: np.ndarray) -> np.ndarray:
-    """Returns linear brightness as screens show it (gamma 2.2), in [0, 1]."""
-    return np.clip(linear, 0.0, 1.0) ** (1 / 2.2)
-
-
 def _compiled(program: Any, *arguments: Any) -> Compiled:
-    return jax.jit(program).lower(*arguments).compile(compiler_options(jax.default_backend()))
+    return jax.jit(program).lower(*arguments).compile(quick_compiler_options(jax.default_backend()))
 
 
 def _blank_poses(*shape: int) -> tuple[jax.ShapeDtypeStruct, jax.ShapeDtypeStruct]:

@@ -8,8 +8,12 @@ box-filtered over the pixel (`texture.py`).
 
 from __future__ import annotations
 
+import dataclasses
+from typing import TypeVar
+
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 
 from edqn_jax.config import CameraConfig
@@ -21,6 +25,8 @@ from edqn_jax.sim.raycast import Rays, Values
 from edqn_jax.sim.scene import Scene
 from edqn_jax.sim.texture import texture
 from edqn_jax.sim.xla import materialised
+
+Pixels = TypeVar("Pixels", Array, np.ndarray)
 
 
 def _backdrop(config: CameraConfig, scene: Scene, origin: Array, rays: Rays, value: Values, sky: Array) -> Array:
@@ -104,6 +110,23 @@ def rgb(config: CameraConfig, scene: Scene, position: Array, rotation: Array) ->
     """Returns linear RGB of the scene: [H, W, 3] in [0, 1]; `luma` is its weighted sum in Eq. 1."""
     channels = jax.vmap(lambda weights: _picture(config, scene, position, rotation, weights))(jnp.eye(3))
     return jnp.moveaxis(channels, 0, -1)
+
+
+def fine_rgb(config: CameraConfig, scale: int, scene: Scene, position: Array, rotation: Array) -> Array:
+    """Returns linear RGB [scale H, scale W, 3] for people: the same view in pixels `scale` times finer per axis.
+
+    Args:
+        rotation: [3, 3] of the camera itself, body-to-world; the mount is not applied.
+    """
+    # Fine pixels need only one ray each, and the body-mounted camera's program is the quickest to compile.
+    size = {"width": config.width * scale, "height": config.height * scale}
+    lens = dataclasses.replace(config, **size, mount="body", samples_across=1, samples_down=1)
+    return rgb(lens, scene, position, rotation)
+
+
+def on_screen(linear: Pixels) -> Pixels:
+    """Returns linear brightness as screens show it (gamma 2.2), in [0, 1]."""
+    return linear.clip(0.0, 1.0) ** (1 / 2.2)
 
 
 def depth(config: CameraConfig, scene: Scene, position: Array, rotation: Array) -> Array:

@@ -175,14 +175,5 @@ def _stream(config: Config, scene: Scene, flight: Flight) -> EventField:
 
 @functools.partial(jax.jit, static_argnums=(0, 1))
 def _picture(config: Config, scale: int, scene: Scene, position: Array, quaternion: Array) -> Array:
-    # The body-mounted camera's program is the smaller one; given the mount's rotation it sees the same.
     rotation = sensor.mount_rotation(config, quaternion)
-    lens = dataclasses.replace(
-        config.camera,
-        width=config.camera.width * scale,
-        height=config.camera.height * scale,
-        mount="body",
-        samples_across=1,
-        samples_down=1,
-    )
-    return jnp.clip(camera.rgb(lens, scene, position, rotation), 0.0, 1.0) ** (1 / 2.2)
+    return camera.on_screen(camera.fine_rgb(config.camera, scale, scene, position, rotation))
