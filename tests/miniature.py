@@ -1,4 +1,4 @@
-"""A workload that is trained as any other, on a postage stamp."""
+"""A small workload that is trained as any other."""
 
 from __future__ import annotations
 

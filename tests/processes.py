@@ -71,7 +71,7 @@ def one_process(folder: Path, argv: list[str]) -> Iterator[Process]:
 
 
 def to_the_end(*processes: Process) -> list[tuple[int, str]]:
-    """Exit code and output of each."""
+    """Waits for the processes and returns the exit code and output of each."""
     outputs = [process.communicate(timeout=PATIENCE_S)[0] for process in processes]
     return [(process.returncode, output) for process, output in zip(processes, outputs, strict=True)]
 

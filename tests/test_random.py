@@ -75,7 +75,7 @@ def test_runs_of_two_seeds_share_no_stream_but_worlds_and_evaluation_missions() 
 
 @pytest.mark.slow
 def test_a_run_derives_its_keys_from_its_streams_alone() -> None:
-    """What the environments of a run begin with is what the list above has of them."""
+    """The environments of a run begin with the keys of the list above."""
     config = parse_train(MINIATURE)[1]
     world = run_missions(config).training.world
     state = init(config, world, run_streams(5).learning)

@@ -1,4 +1,4 @@
-"""The paper's world, as our environment and as the conventional stack have it."""
+"""The paper's world for our environment and for the conventional stack."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def course_of(start: NDArray, goal: NDArray) -> Course:
 
 
 def world_of(config: Config, start: NDArray, goal: NDArray) -> env.World:
-    """The same for our environment."""
+    """Returns the same missions for our environment."""
     missions = Missions(
         scene=jnp.zeros(len(start), jnp.int32),
         start=jnp.asarray(start, jnp.float32),
@@ -37,7 +37,7 @@ def world_of(config: Config, start: NDArray, goal: NDArray) -> env.World:
 
 
 def fleet_of(config: Config, start: NDArray, goal: NDArray) -> Fleet:
-    """One drone on each mission."""
+    """Returns a fleet with one drone on each mission."""
     fleet = Fleet(config, course_of(start, goal), Record.empty(config, len(start)), seed=0)
     fleet.reset(range(len(start)))
     return fleet

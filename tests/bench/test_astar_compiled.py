@@ -1,4 +1,4 @@
-"""The compiled A* against the plain one."""
+"""Compares the compiled A* with the plain one."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from tests.planners.small_worlds import RADIUS, assert_flyable, box, random_smal
 
 
 def lattice_length(task: Task, cell: float = 0.5) -> float:
-    """Of the compiled search, the last leg to the goal included; infinite without a way."""
+    """Returns the length of the compiled search's path, including the last leg to the goal; inf if there is no path."""
     lower, upper = np.asarray(task.scene.volume, np.float64)
     margin = astar.edge_margin(cell, task.body_radius)
     table = solid_table(task.scene)

@@ -43,14 +43,14 @@ BORDER_M = 5 * POSITION_M
 
 @partial(jax.jit, static_argnums=0)
 def stepped(config, world, state, action):
-    """Our environment's step, less the pictures: what is not returned is not computed."""
+    """Our environment's step without the pictures: what is not returned is not computed."""
     state, step = jax.vmap(lambda s, a: env.step(config, world, s, a))(state, action)
     ended = step.end_step - 1 + step.contact
     return state, (step.flight, step.outcome, step.reward, step.observation.own, ended)
 
 
 def begun(bodies: DroneState, decision) -> EnvState:
-    """Our environments, drone i on mission i."""
+    """Returns our environments at their start, drone i on mission i."""
     count = len(decision)
     return EnvState(
         drone=bodies,

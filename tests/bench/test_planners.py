@@ -1,4 +1,4 @@
-"""What every planner that knows the map must hold to."""
+"""Properties of every planner that knows the map."""
 
 from __future__ import annotations
 

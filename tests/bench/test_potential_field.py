@@ -1,4 +1,4 @@
-"""The potential field: its force is a gradient, it passes what it can, and it knows when it is stuck."""
+"""The potential field: its force is a gradient, it flies around obstacles, and it reports when it is stuck."""
 
 # pyright: reportArgumentType=false
 
@@ -17,7 +17,7 @@ CONFIG = potential_field.ApfConfig()
 
 
 def potential(task, point):
-    """Khatib's two potentials, written down."""
+    """Returns the sum of Khatib's two potentials."""
     apart = np.linalg.norm(task.goal - point)
     far = CONFIG.conic_m
     value = CONFIG.attraction * (apart**2 / 2 if apart <= far else far * apart - far**2 / 2)

@@ -1,4 +1,4 @@
-"""Every planner as a row of the rivals' benchmark: what it plans is flown, and where there is no way it says so."""
+"""Every planner as a row of the rivals' benchmark: what it plans is flown, and a missing path is reported."""
 
 from __future__ import annotations
 

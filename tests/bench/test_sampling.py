@@ -1,4 +1,4 @@
-"""RRT* and BIT*: seeds, budgets, and what more of the budget brings."""
+"""RRT* and BIT*: seeds, budgets, and the effect of a larger budget."""
 
 from __future__ import annotations
 

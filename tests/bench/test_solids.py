@@ -1,4 +1,4 @@
-"""The compiled distances against `sim.scene`'s, every kind of shape among them."""
+"""Compares the compiled distances with those of `sim.scene`, for every kind of shape."""
 
 # pyright: reportArgumentType=false
 

@@ -1,4 +1,4 @@
-"""Missions flown at once: what is counted, what is not, and what the judge of another engine says."""
+"""Missions flown in parallel: what is counted, what is not, and the verdict of another engine."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The judge of flights, on flights made by hand."""
+"""The verdict on flights made by hand."""
 
 from __future__ import annotations
 
@@ -109,7 +109,7 @@ def flying_sphere() -> mujoco.MjModel:
 
 
 def first_collision(model: mujoco.MjModel, points: np.ndarray, spacing: float) -> float | None:
-    """The plain twin: does MuJoCo find a contact every `spacing` metres? Metres flown until then."""
+    """Plain reference: returns the metres flown until MuJoCo finds a contact, asked every `spacing` metres."""
     data = mujoco.MjData(model)
     flown = 0.0
     for begin, end in zip(points[:-1], points[1:], strict=True):

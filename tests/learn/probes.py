@@ -1,4 +1,4 @@
-"""Tiny tasks whose values are known exactly, and the learner of the project run on them.
+"""Small tasks whose values are known exactly, and the project's learner run on them.
 
 A task has two states, shown as one-hot observations, and two actions. They follow the protocol of the drone's
 environment: an ended episode spends its next step on being reset.

@@ -1,4 +1,4 @@
-"""The flying policy sees what the replay trained it on."""
+"""The policy is given the same observations in flight as in training."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The replay against a plain list of everything that ever happened."""
+"""Compares the replay with a plain list of all transitions."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ FORMS = {"plain": agent(1, 1), "stacked": agent(3, 2), "long": agent(5, 4)}
 
 
 def lives(rng: np.random.Generator, decisions: int, end_chance: float) -> list[list[replay_plain.Row]]:
-    """What E environments go through; every observation tells its own time and environment."""
+    """Returns the rows of E environments; every observation holds its own time and environment."""
     found = []
     for env in range(ENVS):
         rows: list[replay_plain.Row] = []

@@ -1,4 +1,4 @@
-"""The textbook's breadth-first search over a lattice: one queue, one cell at a time."""
+"""Textbook breadth-first search over a lattice: one queue, one cell at a time."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ Cell = tuple[int, ...]
 
 
 def hop_counts(sources: Iterable[Cell], neighbours: Callable[[Cell], Iterable[Cell]]) -> dict[Cell, int]:
-    """Hops from the nearest source to every cell that can be reached."""
+    """Returns the hops from the nearest source to every cell that can be reached."""
     hops = dict.fromkeys(sources, 0)
     queue = deque(hops)
     while queue:

@@ -1,4 +1,4 @@
-"""The textbook's shortest path on a small 26-connected lattice: every cell, every edge, one heap."""
+"""Textbook shortest path on a small 26-connected lattice: every cell, every edge, one heap."""
 
 from __future__ import annotations
 

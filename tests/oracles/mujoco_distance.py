@@ -1,4 +1,4 @@
-"""Signed distances by MuJoCo itself: a probe sphere is moved about and asked how far it is from each geom."""
+"""Signed distances by MuJoCo: from a probe sphere, moved from point to point, to each geom."""
 
 from __future__ import annotations
 

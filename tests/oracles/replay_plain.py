@@ -1,4 +1,4 @@
-"""Replay as a plain list of all that ever happened, and n-step transitions found by walking along it."""
+"""Replay as a plain list of all transitions; n-step transitions are found by walking along it."""
 
 from __future__ import annotations
 

@@ -102,7 +102,7 @@ def test_loops_are_left_as_they_are_unless_somebody_gave_options_of_their_own(gi
 
 @pytest.fixture
 def asked_anew() -> Iterator[None]:
-    """What XLA knows is found out again."""
+    """Clears the cached set of options that XLA knows."""
     devices.compiler_options.cache_clear()
     yield
     devices.compiler_options.cache_clear()

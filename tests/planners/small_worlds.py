@@ -1,4 +1,4 @@
-"""Small worlds for planners, some without a way, and what a path must hold to."""
+"""Small worlds for planners, some without a path, and the properties of a valid path."""
 
 # pyright: reportArgumentType=false
 # Single shapes are written with plain numbers here.

@@ -1,4 +1,4 @@
-"""The follower: it arrives where there is enough clearance, and a path into a wall is flown into it."""
+"""The follower: it arrives where there is enough clearance, and collides on a path that leads into a wall."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Planners by name, and what they say where a package is missing."""
+"""Planners by name, and the message where a package is missing."""
 
 from __future__ import annotations
 

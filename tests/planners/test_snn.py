@@ -1,4 +1,4 @@
-"""The wave against breadth-first search, the lattice against true distances, and the paths in both."""
+"""Compares the wave with breadth-first search and the lattice with true distances; checks the paths of both."""
 
 # pyright: reportArgumentType=false
 

@@ -8,7 +8,7 @@ import pytest
 
 
 def hide(monkeypatch: pytest.MonkeyPatch, *packages: str) -> None:
-    """Until the test ends, neither these packages nor modules of ours that have imported them are there."""
+    """Hides these packages, and our modules that import them, until the test ends."""
     for module in list(sys.modules):
         name = module.split(".")
         ours = name[0] == "conventional_stack" or name[:2] == ["edqn_jax", "planners"] and name[-1] in _NEED_BENCH

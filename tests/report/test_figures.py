@@ -1,4 +1,4 @@
-"""The pictures of a run: that they show what they were given."""
+"""The figures of a run show the data that they were given."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a person sees while a drone learns."""
+"""The progress display of a run."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What there is to see along a flight: the same as the drone saw."""
+"""The images along a flight are those that the drone's sensor showed."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Files that a command leaves behind: checked before, written whole or not at all."""
+"""Files that a command writes: checked beforehand, written atomically."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What says where a figure comes from."""
+"""Provenance of figures: workload, versions and digests."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Scenes and poses drawn at random, every kind of shape among them."""
+"""Random scenes and poses, with every kind of shape."""
 
 # pyright: reportArgumentType=false
 

@@ -1,4 +1,4 @@
-"""The task: outcomes, rewards, own state, resets; by hand where a hand can, by a flown mission elsewhere."""
+"""The task: outcomes, rewards, own state, resets; checked by hand where possible, elsewhere on a flown mission."""
 
 # pyright: reportArgumentType=false
 

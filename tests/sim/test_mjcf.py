@@ -1,4 +1,4 @@
-"""Worlds in and out of MJCF, and what people are told when a world will not do."""
+"""Reading and writing worlds as MJCF, and the messages for invalid worlds."""
 
 # pyright: reportArgumentType=false
 # Single shapes are written with plain numbers here.

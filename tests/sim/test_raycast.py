@@ -1,4 +1,4 @@
-"""Depth along the camera's rays, held against MuJoCo's ray caster."""
+"""Compares depth along the camera's rays with MuJoCo's ray caster."""
 
 # pyright: reportArgumentType=false
 

@@ -1,4 +1,4 @@
-"""The closed form beside MJX and C MuJoCo, from any state, for a step and for a flight; and what neither would fly."""
+"""Compares the closed form with MJX and C MuJoCo, from any state, for a step and for a flight."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Signed distance and contact, held against MuJoCo and against numbers worked out by hand."""
+"""Compares signed distance and contact with MuJoCo and with numbers worked out by hand."""
 
 # pyright: reportArgumentType=false
 # Single shapes are written with plain numbers here.
