@@ -53,7 +53,7 @@ class _Obstacles(NamedTuple):
 
 
 class _Cells(NamedTuple):
-    """What the search knows of each cell, by flat index [C]."""
+    """State of the search for each cell, by flat index [C]."""
 
     state: np.ndarray  # uint8: `_KNOWN` if the clearance is computed, `_REACHED` if there is a path
     clearance: np.ndarray  # metres from the middle of the cell to the nearest surface

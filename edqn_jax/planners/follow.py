@@ -35,7 +35,7 @@ _LANES = 2048  # points of a path are padded to a multiple of this, to compile f
 
 @dataclasses.dataclass(frozen=True)
 class FollowConfig:
-    """How closely and how fast a path is followed; the values are not from a publication."""
+    """Limits of following a path; the values are not from a publication."""
 
     reserve_m: float = 0.3
     """Clearance beyond the body's radius that planners keep for the follower, metres."""

@@ -18,13 +18,13 @@ from edqn_jax.sim.sensor import SENSORS
 
 @dataclasses.dataclass(frozen=True)
 class Look:
-    """How what a sensor shows is drawn."""
+    """Label, unit and colours of a sensor's image in figures."""
 
     name: str
     unit: str
     colours: str | Colormap
     signed: bool = False
-    """Whether what is shown is negative where it became darker."""
+    """Whether values are negative where the image became darker."""
 
 
 LOOKS = {
@@ -35,7 +35,7 @@ LOOKS = {
 """By the name of the sensor, those that show an image."""
 
 RECONSTRUCTED_EVENTS = Look("events", "events per pixel\n(ON + OFF)", COUNTS)
-"""What the VAE reconstructs of events: how many there are of either sign."""
+"""The VAE's reconstruction of events: their number per pixel, whatever the sign."""
 
 
 def draw_sight(

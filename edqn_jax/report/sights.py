@@ -1,4 +1,4 @@
-"""What there is to see at poses of a flight: RGB for people, what the sensor shows, and the VAE's reconstruction."""
+"""Images at poses of a flight: RGB for people, the sensor's image, and the VAE's reconstruction."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ FINE = 8
 
 @dataclasses.dataclass(frozen=True)
 class Shown:
-    """What the sensor shows at D decisions, and the VAE's part in it."""
+    """The sensor's images at D decisions, with the VAE's targets and reconstructions."""
 
     image: np.ndarray
     """[D, H, W] ON minus OFF events per pixel, or the picture."""
     target: np.ndarray
-    """[D, H, W] what the VAE must reconstruct: ON plus OFF events per pixel, or the picture; blurred."""
+    """[D, H, W] target of the VAE: ON plus OFF events per pixel, or the picture; blurred."""
     reconstruction: np.ndarray
-    """[D, H, W] what the VAE makes of its code, in the same units."""
+    """[D, H, W] decoded from the VAE's code, in the same units."""
 
 
 _Images = tuple[Array, Array, Array]
@@ -43,7 +43,7 @@ _Images = tuple[Array, Array, Array]
 
 
 class Sights:
-    """Programs that draw what there is to see in one world; compiled in the background, as that takes seconds."""
+    """Programs that draw images in one world; compiled in the background, since that takes seconds."""
 
     def __init__(self, config: Config, scene: Scene, pool: Executor) -> None:
         """Compiles in `pool`; `shown` and `rgb` wait for it.
@@ -144,5 +144,5 @@ def _blank_poses(*shape: int) -> tuple[jax.ShapeDtypeStruct, jax.ShapeDtypeStruc
 
 
 def _per_pixel(sensed: EventField | Array, image: Array) -> Array:
-    """What `encoder.target` makes of `sensed`, [C, H, W], back in the units of what is seen: [H, W]."""
+    """Returns a target or reconstruction [C, H, W] in the units of `sensed`, summed over channels: [H, W]."""
     return jnp.sum(jnp.expm1(image) if isinstance(sensed, EventField) else image, axis=-3)

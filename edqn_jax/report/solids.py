@@ -104,7 +104,7 @@ class CutOpen:
 
     @property
     def note(self) -> str:
-        """What was cut away, for a reader of the picture; empty if nothing was."""
+        """Note on what was cut away, for the figure; empty if nothing was."""
         parts = [name for name, cut in (("ceiling", self.has_ceiling), ("near walls", self.near_walls)) if cut]
         return f"{' and '.join(parts)} cut away" if parts else ""
 

@@ -45,7 +45,7 @@ WORD = 32
 
 @struct.dataclass
 class Frame:
-    """What all columns of a frame share."""
+    """Values that all columns of a frame share."""
 
     origin: Array  # [3] metres
     heading: Array  # [2] cosine and sine
@@ -175,7 +175,7 @@ def _branches(config: CameraConfig, frames: Frame, tables: Array, words: Array) 
 
 @dataclasses.dataclass(frozen=True)
 class _Batch:
-    """What every branch reads."""
+    """Arrays that every branch reads."""
 
     frames: _Rows
     tables: Array  # [M, N + 1, F] upright shapes, and last one that covers nothing

@@ -45,7 +45,7 @@ class Environment:
 
     @property
     def missions(self) -> int:
-        """How many missions there are."""
+        """Returns the number of missions."""
         return self.world.missions.scene.shape[0]
 
     def scene(self, mission: int = 0) -> Scene:

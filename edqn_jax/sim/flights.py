@@ -1,4 +1,4 @@
-"""How flights went: outcome, decisions, path, time and closest approach, added up decision by decision."""
+"""Tallies of flights: outcome, decisions, path, time and closest approach, added up decision by decision."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class Record:
 
 @struct.dataclass
 class Flights:
-    """How M missions went. A flight ends with the physics step of its outcome, a collision at the contact."""
+    """Tallies of M missions. A flight ends with the physics step of its outcome, a collision at the contact."""
 
     outcome: Array  # [M] int32, an `Outcome`
     decisions: Array  # [M] int32

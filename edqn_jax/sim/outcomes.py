@@ -1,4 +1,4 @@
-"""How an episode ends, and at which physics step."""
+"""Outcome of an episode, and the physics step at which it ends."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from edqn_jax.sim.scene import Scene, path_contact
 
 
 class Outcome(enum.IntEnum):
-    """How an episode stands. Everything but RUNNING ends it; only TIME_OUT is a truncation."""
+    """Outcome of an episode. All but RUNNING end it; only TIME_OUT is a truncation."""
 
     RUNNING = 0
     GOAL = 1

@@ -1,4 +1,4 @@
-"""What a decision is worth: Eq. 8 of the paper, its shaped forms, and rewards that users write."""
+"""Reward of a decision: Eq. 8 of the paper, its shaped forms, and reward functions of users."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from edqn_jax.sim.outcomes import Outcome, is_terminal
 
 @struct.dataclass
 class Transition:
-    """What one decision of one drone did; what a user's reward is given."""
+    """One decision of one drone: the argument of a user's reward function."""
 
     before: Array  # [3] metres, position when it was taken
     after: Array  # [3] metres, position 0.26 s later

@@ -1,4 +1,4 @@
-"""What the host keeps of a run while it trains: metrics of each chunk, ended episodes, validations."""
+"""History of a run on the host: metrics of each chunk, ended episodes, validations."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class EndedEpisodes:
 
     @classmethod
     def of(cls, episodes: Episodes, first: int, envs: int) -> EndedEpisodes:
-        """Picks out of a chunk that began with training step `first` what ended in it."""
+        """Returns the episodes that ended in a chunk whose first training step is `first`."""
         outcome, length, gain = (
             np.asarray(x).reshape(len(x), -1) for x in (episodes.outcome, episodes.length, episodes.episode_return)
         )
@@ -49,7 +49,7 @@ class History:
 
     @property
     def episode_count(self) -> int:
-        """How many episodes have ended."""
+        """Returns the number of episodes that have ended."""
         return sum(len(ended.step) for ended in self.episodes)
 
     def column(self, name: str) -> tuple[np.ndarray, np.ndarray]:

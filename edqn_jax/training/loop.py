@@ -37,12 +37,12 @@ from edqn_jax.training.selection import Candidate, choose, is_due, validated
 
 @dataclasses.dataclass(frozen=True)
 class Chunk:
-    """What a callback is given after each chunk."""
+    """Argument of the callback, after each chunk."""
 
     metrics: dict[str, Any]
     """As a line of `metrics.jsonl`: `decisions`, `success_rate`, `q_loss` and so on; None for what did not happen."""
     episodes: EndedEpisodes
-    """What ended in it."""
+    """Episodes that ended in the chunk."""
     kept: Candidate
     """Parameters that the run would end with by now, and their validation."""
     policy: Callable[[], Policy]
@@ -54,13 +54,13 @@ Callback = Callable[[Chunk], bool | None]
 
 
 class Display(Protocol):
-    """Where progress is shown."""
+    """Interface of a progress display."""
 
     def phase(self, name: str, *, total: int = 0) -> None:
-        """Says what is done now; `total` decisions if it is training."""
+        """Shows that the phase `name` begins; `total` is the number of decisions if it is training."""
 
     def update(self, metrics: dict[str, Any]) -> None:
-        """Takes in the metrics of a chunk."""
+        """Shows the metrics of a chunk."""
 
 
 class Silent:
@@ -75,7 +75,7 @@ class Silent:
 
 @dataclasses.dataclass(frozen=True)
 class TrainingResult:
-    """What training returns."""
+    """Result of training."""
 
     policy: Policy
     """With the parameters that `train.keep` asks for."""
@@ -83,7 +83,7 @@ class TrainingResult:
     kept: Candidate
     """The policy's parameters, and their validation."""
     state: TrainState
-    """As it stood after the last chunk."""
+    """Train state after the last chunk."""
     decisions: int
     stopped: bool
     """Whether a callback ended it early."""
@@ -95,7 +95,7 @@ class Preparation:
     """Devices, missions, programs and the first state of a run; made by `prepared`."""
 
     def __init__(self, config: Config, reward: Reward | None, display: Display, pool: Executor) -> None:
-        """Compiles in the background of searching the shortest path and making the first state.
+        """Compiles in the background while the shortest path is searched and the first state is made.
 
         Raises:
             ConfigError: if the configuration is invalid or the world cannot be flown.
@@ -206,7 +206,7 @@ def run_chunks(preparation: Preparation, callback: Callback | None = None) -> Tr
 
 
 class _Loop:
-    """What changes from chunk to chunk on the host."""
+    """State of the host loop, which changes from chunk to chunk."""
 
     def __init__(self, preparation: Preparation, callback: Callback | None, first: Candidate) -> None:
         self.preparation, self.callback = preparation, callback
@@ -218,7 +218,7 @@ class _Loop:
 
     @property
     def finished(self) -> bool:
-        """Whether the decisions or the episodes that were asked for are done."""
+        """Whether the requested number of decisions or episodes is reached."""
         most = self.config.train.max_episodes
         return self.done >= self.plan.total or 0 < most <= self.history.episode_count
 
@@ -228,11 +228,11 @@ class _Loop:
 
     @property
     def keeps_validated(self) -> bool:
-        """Whether the run ends with validated parameters, and not with whatever it has come to."""
+        """Whether the run ends with validated parameters instead of the newest."""
         return not self.stopped or (self.config.train.keep == "best" and self.kept.decisions > 0)
 
     def advance(self, state: TrainState) -> TrainState:
-        """Runs one chunk and all that follows from it."""
+        """Runs one chunk; validates, reports and calls the callback where due."""
         state, ended, metrics = self._run(state)
         if self.finished or is_due(self.config, self.plan, self.checked, self.done):
             metrics |= self._validate(_on_host(policy_of(state)))

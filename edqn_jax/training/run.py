@@ -33,17 +33,17 @@ def train_run(
     stop_requested: Callable[[], bool],
     reward: Reward | None = None,
 ) -> dict[str, Any]:
-    """Trains, validates, flies and draws; everything is written to the run directory.
+    """Trains, validates, flies and draws; writes everything to the run directory.
 
     Args:
         config: the same on every process.
         run: None on a process that writes nothing, which is every one but the first of those that train together.
-        progress: where it is shown.
-        stop_requested: asked after each chunk; one process's yes stops all of them.
+        progress: display of the progress.
+        stop_requested: called after each chunk; if it returns True on one process, all processes stop.
         reward: as in `train`.
 
     Returns:
-        what `summary.json` holds.
+        the content of `summary.json`.
 
     Raises:
         ConfigError: before anything is written, if the run cannot be made; later, if one of its files cannot be.
@@ -90,7 +90,7 @@ def _where_saved(run: RunDirectory | None) -> str:
 def _summary(
     preparation: Preparation, result: TrainingResult, flights: Flights, digest: str, reward: Reward | None
 ) -> dict[str, Any]:
-    """What `summary.json` holds."""
+    """Returns the content of `summary.json`."""
     config, scene = preparation.config, preparation.missions.scene
     since = first_success(result.history.validations)
     summary = {
@@ -121,7 +121,7 @@ def _summary(
 
 
 def _sights(preparation: Preparation) -> Sights:
-    """Begins to compile what draws the final flight's sights, while that is flown."""
+    """Starts to compile the programs that draw the final flight's images, while it is flown."""
     scene = jax.tree.map(np.asarray, preparation.missions.scene)
     return Sights(preparation.config, scene, preparation.pool)
 
@@ -141,7 +141,7 @@ def _described(devices: Sequence[jax.Device]) -> str:  # pyright: ignore[reportI
 
 
 def _verdict(summary: dict[str, Any], run: RunDirectory) -> str:
-    """What the last lines on the screen say."""
+    """Returns the last lines on the screen."""
     ending = {
         "goal": "reached the goal",
         "collision": "ended in a collision",
@@ -168,7 +168,7 @@ def _verdict(summary: dict[str, Any], run: RunDirectory) -> str:
 
 
 def _nearest(summary: dict[str, Any]) -> str:
-    """The closest approach as a sentence."""
+    """Returns the closest approach as a sentence."""
     if summary["outcome"] == "collision":
         return "It touched an obstacle or the ground."
     return f"The least clearance was {clearance_text(summary['min_clearance_m'])}."
