@@ -21,12 +21,12 @@ from edqn_jax.learn.trainer import Plan
 from edqn_jax.runs.checkpoints import save_params
 from edqn_jax.runs.policies import load_run
 from edqn_jax.runs.provenance import workload
-from edqn_jax.sim import drone, mjcf, worlds
+from edqn_jax.sim import mjcf
 from edqn_jax.sim.env import Observation, World
-from edqn_jax.sim.scene import stack_scenes
 from edqn_jax.sim.sensor import Form
 from tests.learn.moving_boxes import frames
 from tests.learn.test_trainer import CONFIG
+from tests.miniature import miniature_world
 
 SENSORS = ("events", "frames", "depth", "ranges", "blind")
 CODED = SENSORS[:3]
@@ -39,9 +39,7 @@ def with_sensor(name: str, config: Config = CONFIG) -> Config:
 
 @pytest.fixture(scope="module")
 def world() -> World:
-    pool = stack_scenes([mjcf.load_scene(mjcf.resolve_world("paper"))])
-    missions = worlds.spread_missions(pool, 64, 0.25, 1.0, jax.random.key(1))
-    return World(airframe=drone.load_airframe(CONFIG.drone), pool=pool, missions=missions)
+    return miniature_world(CONFIG)
 
 
 # ------------------------------------------------------------------------------------------ the whole

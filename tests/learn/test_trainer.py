@@ -17,10 +17,9 @@ from edqn_jax.errors import ConfigError
 from edqn_jax.learn import replay, trainer
 from edqn_jax.learn.trainer import Plan, Trainer, TrainState
 from edqn_jax.random import run_streams
-from edqn_jax.sim import drone, mjcf, worlds
 from edqn_jax.sim.env import OWN_SIZE, Observation, World
 from edqn_jax.sim.outcomes import Outcome
-from edqn_jax.sim.scene import stack_scenes
+from tests.miniature import miniature_world
 
 CONFIG = Config(
     camera=CameraConfig(width=8, height=6),
@@ -48,9 +47,7 @@ CONFIG = Config(
 
 @pytest.fixture(scope="module")
 def world() -> World:
-    pool = stack_scenes([mjcf.load_scene(mjcf.resolve_world("paper"))])
-    missions = worlds.spread_missions(pool, 64, 0.25, 1.0, jax.random.key(1))
-    return World(airframe=drone.load_airframe(CONFIG.drone), pool=pool, missions=missions)
+    return miniature_world(CONFIG)
 
 
 def run(config: Config, world: World, devices: int) -> tuple[list[TrainState], list, int, Trainer]:

@@ -25,6 +25,7 @@ from edqn_jax.sim.scene import stack_scenes
 from edqn_jax.sim.sensor import Form, Sensor
 from edqn_jax.sim.worlds import own_missions
 from tests.learn.test_trainer import CONFIG as MINIATURE
+from tests.miniature import WORLD
 from tests.oracles import camera_plain
 from tests.oracles.mujoco_depth import RayCaster
 from tests.sim.drawn_scenes import every_kind, free_points, rotation_of, scene_of
@@ -153,7 +154,7 @@ def test_nearness_is_bounded_and_falls_with_distance() -> None:
 
 @pytest.fixture(scope="module")
 def world():
-    pool = stack_scenes([mjcf.load_scene(mjcf.resolve_world("paper"))])
+    pool = stack_scenes([mjcf.load_scene(WORLD)])
     return env.World(load_airframe(Config().drone), pool, own_missions(pool))
 
 
