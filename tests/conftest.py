@@ -29,17 +29,24 @@ What the package compiles with options of its own (`compiler_options`) keeps the
 LONGEST = (
     "test_run",
     "test_layout",
-    "test_cluster",
-    "test_trainer",
-    "test_embedding",
-    "test_rivals",
     "test_flights",
+    "test_cluster",
+    "test_notebook",
+    "test_trainer",
     "test_evaluate",
+    "test_embedding",
+    "test_camera",
     "test_sensor",
-    "test_compare",
+    "test_encoder",
+    "test_api",
+    "test_rivals",
+    "test_parts",
     "test_loop",
 )
-"""Files of half a minute and more, which go first: a long one begun last would leave the other process idle."""
+"""Files that take longest, which go first: a long one begun last would leave the other process idle.
+
+`test_evaluate` flies what `test_flights` flies, so it stands some places after it and finds the program compiled.
+"""
 
 # For the processes that tests start as well. Whoever gives flags gets these alone: `XLA_FLAGS= pytest` compiles
 # everything as users do.
