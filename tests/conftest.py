@@ -20,8 +20,12 @@ CACHE = {
 }
 """Options of JAX's compilation cache; its folder is made for a session unless JAX_COMPILATION_CACHE_DIR names one."""
 
-QUICK_TO_COMPILE = "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false"
+QUICK_TO_COMPILE = (
+    "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_count=1"
+)
 """XLA's flags with which a program compiles in less than half the time: what runs once need not be fast.
+
+A program is not cut up for several threads either, as the other cores compile for the other tests.
 
 What the package compiles with options of its own (`compiler_options`) keeps their level of optimisation.
 """
