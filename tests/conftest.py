@@ -25,9 +25,8 @@ QUICK_TO_COMPILE = (
 )
 """XLA's flags with which a program compiles in less than half the time: what runs once need not be fast.
 
-A program is not cut up for several threads either, as the other cores compile for the other tests.
-
-What the package compiles with options of its own (`compiler_options`) keeps their level of optimisation.
+Nor is it cut up for several threads, since each core has another process. What the package compiles with options of
+its own (`compiler_options`) keeps their level of optimisation.
 """
 
 LONGEST = (
