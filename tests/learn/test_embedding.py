@@ -91,6 +91,7 @@ def test_only_a_sensor_with_an_image_has_one_in_its_program_and_a_vae(world: Wor
 
 
 @pytest.mark.parametrize("name", SENSORS)
+@pytest.mark.slow
 def test_training_can_be_mapped_over_seeds(world: World, name: str) -> None:
     config = with_sensor(name, QUICK)
     states = jax.eval_shape(jax.vmap(lambda key: trainer.init(config, world, key)), jax.random.split(jax.random.key(0)))

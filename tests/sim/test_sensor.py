@@ -115,6 +115,7 @@ def free_way(config, scene, caster, position, yaw) -> np.ndarray:
     return np.array(found)
 
 
+@pytest.mark.slow
 def test_ranges_are_the_free_way_along_each_move_in_its_order(scenes) -> None:
     config = config_of("ranges")
     fenced = []
@@ -246,6 +247,7 @@ def with_new_sensor(request, monkeypatch) -> Config:
     )
 
 
+@pytest.mark.slow
 def test_a_new_sensor_needs_only_its_entry_to_act(with_new_sensor, world) -> None:
     config = with_new_sensor
     state = jax.eval_shape(lambda key: env.ended(config, world, key), jax.random.key(0))
