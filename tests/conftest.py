@@ -20,26 +20,36 @@ CACHE = {
 }
 """Options of JAX's compilation cache; its folder is made for a session unless JAX_COMPILATION_CACHE_DIR names one."""
 
-QUICK_TO_COMPILE = "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false"
+QUICK_TO_COMPILE = (
+    "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_count=1"
+)
 """XLA's flags with which a program compiles in less than half the time: what runs once need not be fast.
 
-What the package compiles with options of its own (`compiler_options`) keeps their level of optimisation.
+Nor is it cut up for several threads, since each core has another process. What the package compiles with options of
+its own (`compiler_options`) keeps their level of optimisation.
 """
 
 LONGEST = (
     "test_run",
     "test_layout",
-    "test_cluster",
-    "test_trainer",
-    "test_embedding",
-    "test_rivals",
     "test_flights",
+    "test_cluster",
+    "test_notebook",
+    "test_trainer",
     "test_evaluate",
+    "test_embedding",
+    "test_camera",
     "test_sensor",
-    "test_compare",
+    "test_encoder",
+    "test_api",
+    "test_rivals",
+    "test_parts",
     "test_loop",
 )
-"""Files of half a minute and more, which go first: a long one begun last would leave the other process idle."""
+"""Files that take longest, which go first: a long one begun last would leave the other process idle.
+
+`test_evaluate` flies what `test_flights` flies, so it stands some places after it and finds the program compiled.
+"""
 
 # For the processes that tests start as well. Whoever gives flags gets these alone: `XLA_FLAGS= pytest` compiles
 # everything as users do.

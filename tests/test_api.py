@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import subprocess
 import sys
 from pathlib import Path
@@ -12,9 +13,17 @@ import pytest
 
 import edqn_jax
 from edqn_jax.sim.moves import ACTIONS
+from tests.miniature import WORLD
 from tests.policies import CONFIG, always
 
 ROOT = Path(__file__).parents[1]
+
+QUICK = dataclasses.replace(
+    CONFIG,
+    drone=dataclasses.replace(CONFIG.drone, physics="rigid_body"),
+    world=dataclasses.replace(CONFIG.world, name=str(WORLD)),
+)
+"""Compiles in less time, for what depends neither on the physics nor on the world."""
 
 
 @pytest.mark.parametrize(
@@ -110,7 +119,7 @@ def test_an_environment_is_reset_stepped_and_seen() -> None:
 
 @pytest.mark.slow
 def test_many_drones_are_a_vmap() -> None:
-    environment = edqn_jax.make("paper", CONFIG)
+    environment = edqn_jax.make(WORLD, QUICK)
     states, _ = jax.vmap(environment.reset)(jax.random.split(jax.random.key(0), 3))
     vectors = np.array([[1, 0, 0], [0, 0, 1], [0, 0, 0]])
     states, _ = jax.vmap(environment.step)(states, vectors)
@@ -120,9 +129,9 @@ def test_many_drones_are_a_vmap() -> None:
 
 @pytest.mark.slow
 def test_a_policy_acts_is_saved_and_is_evaluated(tmp_path: Path) -> None:
-    policy = edqn_jax.Policy(CONFIG, always((1, 0, 0)))
-    move, memory = policy.act(edqn_jax.make("paper", CONFIG).reset()[1])
-    assert edqn_jax.move_name(move) == "ahead" and memory.shape[0] == CONFIG.agent.history
+    policy = edqn_jax.Policy(QUICK, always((1, 0, 0)))
+    move, memory = policy.act(edqn_jax.make(WORLD, QUICK).reset()[1])
+    assert edqn_jax.move_name(move) == "ahead" and memory.shape[0] == QUICK.agent.history
     edqn_jax.save_policy(policy, tmp_path / "policy")
     with pytest.raises(edqn_jax.ConfigError, match="holds files already"):
         edqn_jax.save_policy(policy, tmp_path / "policy")

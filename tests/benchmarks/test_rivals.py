@@ -23,7 +23,10 @@ from tests.miniature import MINIATURE
 from tests.planners.small_worlds import WITHOUT_A_WAY, small_world
 from tests.planners.uninstalled import hide
 
-TINY = (*MINIATURE, "--total-steps", "512", "--train.chunk-steps", "8", "--train.validation-every", "256")
+TINY = (
+    *(*MINIATURE, "--total-steps", "512", "--train.chunk-steps", "8", "--train.validation-every", "256"),
+    *("--drone.physics", "rigid_body"),  # compiles sooner
+)
 
 
 def answers_of(name: str, config: Config, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, asked: str) -> list[Any]:

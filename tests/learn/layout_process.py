@@ -20,9 +20,8 @@ import numpy as np
 from edqn_jax.config import AgentConfig, CameraConfig, Config, EncoderConfig, EnvConfig, TrainConfig
 from edqn_jax.learn.trainer import Plan, Trainer
 from edqn_jax.parallel.devices import use_cpu_devices
-from edqn_jax.sim import drone, mjcf, worlds
 from edqn_jax.sim.env import World
-from edqn_jax.sim.scene import stack_scenes
+from tests.miniature import miniature_world
 
 DEVICES = (1, 2, 8)
 
@@ -52,13 +51,6 @@ warm-up, in which the VAE learns, the next ones only fly, and from `learn_from` 
 """
 
 
-def paper_world(config: Config) -> World:
-    """The paper's world, with starts all over it."""
-    pool = stack_scenes([mjcf.load_scene(mjcf.resolve_world("paper"))])
-    missions = worlds.spread_missions(pool, 64, 0.0, 1.0, jax.random.key(1))
-    return World(airframe=drone.load_airframe(config.drone), pool=pool, missions=missions)
-
-
 def leaves_of(name: str, tree: Any) -> dict[str, np.ndarray]:
     """The leaves by their paths, copied, so that donation does not take them away; keys as their data."""
 
@@ -78,7 +70,7 @@ def fly_and_learn(config: Config, world: World, devices: int) -> dict[str, np.nd
     for number in range(1, plan.learn_from):
         state, (seen, _) = made.chunk(state, number)
         came_to |= leaves_of(f"flown/{number}", state.actors) | leaves_of(f"seen/{number}", seen)
-    again = jax.tree.map(jnp.copy, state)
+    again = jax.jit(lambda tree: jax.tree.map(jnp.copy, tree))(state)  # one program, not one for each leaf
     for name, number, moment in (("dqn", plan.learn_from, state), ("vae", 0, again)):
         came_to |= leaves_of(f"{name}/before", moment.learner)
         learnt, _ = made.chunk(moment, number)
@@ -88,6 +80,6 @@ def fly_and_learn(config: Config, world: World, devices: int) -> dict[str, np.nd
 
 if __name__ == "__main__":
     use_cpu_devices(max(DEVICES))
-    folder, world = Path(sys.argv[1]), paper_world(CONFIG)
+    folder, world = Path(sys.argv[1]), miniature_world(CONFIG, own_start_fraction=0.0)  # starts all over it
     for count in DEVICES:
         np.savez(folder / f"{count}.npz", **fly_and_learn(CONFIG, world, count))  # pyright: ignore[reportArgumentType]

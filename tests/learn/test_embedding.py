@@ -21,12 +21,15 @@ from edqn_jax.learn.trainer import Plan
 from edqn_jax.runs.checkpoints import save_params
 from edqn_jax.runs.policies import load_run
 from edqn_jax.runs.provenance import workload
-from edqn_jax.sim import drone, mjcf, worlds
+from edqn_jax.sim import mjcf
 from edqn_jax.sim.env import Observation, World
-from edqn_jax.sim.scene import stack_scenes
 from edqn_jax.sim.sensor import Form
 from tests.learn.moving_boxes import frames
 from tests.learn.test_trainer import CONFIG
+from tests.miniature import miniature_world
+
+QUICK = dataclasses.replace(CONFIG, drone=dataclasses.replace(CONFIG.drone, physics="rigid_body"))
+"""Sensors do not depend on the physics, and these compile in less time; `test_trainer` trains with the default ones."""
 
 SENSORS = ("events", "frames", "depth", "ranges", "blind")
 CODED = SENSORS[:3]
@@ -39,9 +42,7 @@ def with_sensor(name: str, config: Config = CONFIG) -> Config:
 
 @pytest.fixture(scope="module")
 def world() -> World:
-    pool = stack_scenes([mjcf.load_scene(mjcf.resolve_world("paper"))])
-    missions = worlds.spread_missions(pool, 64, 0.25, 1.0, jax.random.key(1))
-    return World(airframe=drone.load_airframe(CONFIG.drone), pool=pool, missions=missions)
+    return miniature_world(CONFIG)
 
 
 # ------------------------------------------------------------------------------------------ the whole
@@ -50,8 +51,8 @@ def world() -> World:
 @pytest.mark.slow
 @pytest.mark.parametrize("name", SENSORS[1:])
 def test_the_training_step_learns_from_every_sensor(world: World, name: str) -> None:
-    network = dataclasses.replace(CONFIG.encoder, pixel_features="network")
-    config = with_sensor(name, dataclasses.replace(CONFIG, encoder=network))
+    network = dataclasses.replace(QUICK.encoder, pixel_features="network")
+    config = with_sensor(name, dataclasses.replace(QUICK, encoder=network))
     plan = Plan.of(config)
     before = jax.jit(lambda key: trainer.init(config, world, key))(jax.random.key(0))
     train = jax.jit(lambda state: trainer.run_steps(config, world, state, jnp.arange(STEPS)))
@@ -80,7 +81,7 @@ def moved(one, two) -> bool:
 
 @pytest.mark.parametrize("name", SENSORS)
 def test_only_a_sensor_with_an_image_has_one_in_its_program_and_a_vae(world: World, name: str) -> None:
-    config = dataclasses.replace(with_sensor(name), camera=CameraConfig(width=11, height=7))
+    config = dataclasses.replace(with_sensor(name, QUICK), camera=CameraConfig(width=11, height=7))
     state = jax.eval_shape(lambda key: trainer.init(config, world, key), jax.random.key(0))
     program = str(jax.make_jaxpr(lambda s, n: trainer.run_steps(config, world, s, n))(state, jnp.arange(2)))
     assert ("pictures[" in program) is (name in ("events", "frames"))
@@ -90,8 +91,9 @@ def test_only_a_sensor_with_an_image_has_one_in_its_program_and_a_vae(world: Wor
 
 
 @pytest.mark.parametrize("name", SENSORS)
+@pytest.mark.slow
 def test_training_can_be_mapped_over_seeds(world: World, name: str) -> None:
-    config = with_sensor(name)
+    config = with_sensor(name, QUICK)
     states = jax.eval_shape(jax.vmap(lambda key: trainer.init(config, world, key)), jax.random.split(jax.random.key(0)))
     train = jax.vmap(lambda state: trainer.run_steps(config, world, state, jnp.arange(4)))
     after, (episodes, losses) = jax.eval_shape(train, states)

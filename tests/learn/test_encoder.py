@@ -200,10 +200,10 @@ def test_the_error_over_waves_is_the_error_over_pixels(bandwidth):
     config = dataclasses.replace(CONFIG, decoder_bandwidth=bandwidth)
     params = fresh(config, SMALL, jax.random.key(0))
     field = ragged_field(1)
-    _, losses = en.vae_loss(config, params, field, jax.random.key(2))
-    mean, log_variance = en.encode(config, params, field)
+    _, losses = jax.jit(en.vae_loss, static_argnums=0)(config, params, field, jax.random.key(2))
+    mean, log_variance = jax.jit(en.encode, static_argnums=0)(config, params, field)
     noise = jnp.exp(0.5 * log_variance) * jax.random.normal(jax.random.key(2), mean.shape)
-    image = en.decode(config, SMALL, params, mean + noise)
+    image = jax.jit(en.decode, static_argnums=(0, 1))(config, SMALL, params, mean + noise)
     expected = jnp.sum(jnp.square(image - en.target(config, field)))
     np.testing.assert_allclose(losses.reconstruction, expected, rtol=1e-5)
 

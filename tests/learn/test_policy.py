@@ -105,6 +105,7 @@ def test_the_table_of_the_paper_has_a_state_of_42():
 
 
 @pytest.mark.usefixtures("strict_jax")
+@pytest.mark.slow
 def test_the_policy_is_strict(params):
     one = observations(1)[0]
     move, memory = jax.jit(lambda *inputs: policy.act(CONFIG, *inputs))(

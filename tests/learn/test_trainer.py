@@ -17,10 +17,9 @@ from edqn_jax.errors import ConfigError
 from edqn_jax.learn import replay, trainer
 from edqn_jax.learn.trainer import Plan, Trainer, TrainState
 from edqn_jax.random import run_streams
-from edqn_jax.sim import drone, mjcf, worlds
 from edqn_jax.sim.env import OWN_SIZE, Observation, World
 from edqn_jax.sim.outcomes import Outcome
-from edqn_jax.sim.scene import stack_scenes
+from tests.miniature import miniature_world
 
 CONFIG = Config(
     camera=CameraConfig(width=8, height=6),
@@ -48,9 +47,7 @@ CONFIG = Config(
 
 @pytest.fixture(scope="module")
 def world() -> World:
-    pool = stack_scenes([mjcf.load_scene(mjcf.resolve_world("paper"))])
-    missions = worlds.spread_missions(pool, 64, 0.25, 1.0, jax.random.key(1))
-    return World(airframe=drone.load_airframe(CONFIG.drone), pool=pool, missions=missions)
+    return miniature_world(CONFIG)
 
 
 def run(config: Config, world: World, devices: int) -> tuple[list[TrainState], list, int, Trainer]:
@@ -185,12 +182,13 @@ def test_nothing_is_learnt_from_what_stood_there_before_the_first_reset(world: W
 
     agent = dataclasses.replace(CONFIG.agent, history=1)
     last = agent.n_step + 1  # room for two starts: the row before the first reset, and that reset
-    ring = replay.write(actors.replay, row(True, actors.outcome), jnp.int32(0))
+    write, sample = jax.jit(replay.write), jax.jit(partial(replay.sample, agent), static_argnums=2)
+    ring = write(actors.replay, row(True, actors.outcome), jnp.int32(0))
     for time in range(1, last + 1):
-        ring = replay.write(ring, row(time == 1, jnp.full(envs, int(Outcome.RUNNING))), jnp.int32(time))
-    batch = replay.sample(agent, ring, jnp.int32(last), 64, jax.random.key(1))
+        ring = write(ring, row(time == 1, jnp.full(envs, int(Outcome.RUNNING))), jnp.int32(time))
+    batch = sample(ring, jnp.int32(last), 64, jax.random.key(1))
     assert set(np.asarray(batch.weight)) == {0.0, 1.0}
-    oldest = replay.sample(agent, ring, jnp.int32(last - 1), 64, jax.random.key(1))
+    oldest = sample(ring, jnp.int32(last - 1), 64, jax.random.key(1))
     assert not np.any(oldest.weight)
 
 

@@ -34,7 +34,11 @@ def arguments_for(config: Config, folder: Path) -> list[str]:
     """Arguments of `edqn train` for this configuration in a small world; both are left in files in `folder`."""
     world, options = folder / "sphere.xml", folder / "options.yaml"
     world.write_text(WORLD, encoding="utf-8")
-    config = dataclasses.replace(config, world=dataclasses.replace(config.world, name=str(world)))
+    config = dataclasses.replace(
+        config,
+        drone=dataclasses.replace(config.drone, physics="rigid_body"),  # quicker to compile as well
+        world=dataclasses.replace(config.world, name=str(world)),
+    )
     options.write_text(to_yaml(config), encoding="utf-8")
     return ["--config", str(options), "--run-dir", "run"]
 

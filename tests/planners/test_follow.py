@@ -45,6 +45,7 @@ def test_in_the_open_it_flies_straight_to_the_goal_about_as_fast_as_a_learner_ma
 CHICANE = small_world(box((3.6, -1, -1), (4.2, 10, 7)), box((7.2, 2, -1), (7.8, 13, 7)))
 
 
+@pytest.mark.slow
 def test_through_gaps_it_stays_on_the_path_as_closely_as_the_reserve_asks():
     flight = flown(CHICANE, [CHICANE.start, (3.0, 10.8, 3), (4.8, 10.8, 3), (6.6, 1.2, 3), (8.4, 1.2, 3), CHICANE.goal])
     assert flight.outcome == Outcome.GOAL
@@ -52,6 +53,7 @@ def test_through_gaps_it_stays_on_the_path_as_closely_as_the_reserve_asks():
     assert flight.closest.distance > 0.1
 
 
+@pytest.mark.slow
 def test_beside_a_straight_path_it_comes_back_without_crossing_it_by_more_than_the_tolerance():
     points = sampled(np.array([(0.0, 6.0, 3.0), (12.0, 6.0, 3.0)]))
     fly = jax.jit(lambda state, command: drone.fly(CONFIG.drone, AIRFRAME, state, command, jnp.zeros(())))
@@ -83,6 +85,7 @@ def test_a_path_out_of_the_volume_leaves_it_and_one_that_ends_early_runs_out_of_
 
 
 @pytest.mark.parametrize("seed", range(4))
+@pytest.mark.slow
 def test_what_a_planner_draws_with_the_reserve_is_flown_without_contact(seed):
     task = random_small_world(seed, shapes=3)
     held = reserved(task, FOLLOW)

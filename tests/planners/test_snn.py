@@ -117,6 +117,7 @@ def test_a_point_belongs_to_the_cells_that_it_sees():
 
 
 @pytest.mark.parametrize("seed", range(8))
+@pytest.mark.slow
 def test_the_wave_arrives_in_the_order_of_breadth_first_hops(seed):
     scene = random_small_world(seed).scene
     network = _synapses(scene, RADIUS, SMALL, 1.0)
@@ -240,6 +241,7 @@ def test_the_budget_ends_the_wave():
     assert plan.reason == "no path: no spike reached the start within 3 time steps"
 
 
+@pytest.mark.slow
 def test_it_is_strict(strict_jax):
     task = random_small_world(0)
     solve = jax.jit(partial(snn.solve, CONFIG, shape=SMALL))

@@ -57,6 +57,7 @@ def pixels_like(image: Image.Image, frame: int, colour: str) -> int:
     return int((np.abs(np.asarray(image.convert("RGB")).astype(int) - wanted).max(axis=-1) < 25).sum())
 
 
+@pytest.mark.slow
 def test_there_is_a_frame_for_each_decision_and_one_for_the_end():
     gif = recorded(Drawn(), 6.4)
     assert (gif.format, gif.size, frames(gif)) == ("GIF", SIZE, 7)

@@ -68,6 +68,7 @@ def test_the_events_are_those_that_the_drone_got(sights, flight):
     assert shown.target.min() > -1e-5
 
 
+@pytest.mark.slow
 def test_a_fine_picture_is_the_drones_own_with_smaller_pixels(sights, flight):
     flown, _ = flight
     pose = poses(flown, decision_rows(SMALL, flown)[-1, -1])

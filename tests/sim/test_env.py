@@ -459,6 +459,7 @@ def test_a_flight_into_a_wall_is_a_collision_and_one_over_the_fence_leaves(reset
     assert [int(s.outcome) for s in steps] == [0, 0, Outcome.LEFT_VOLUME]
 
 
+@pytest.mark.slow
 def test_the_limit_ends_an_episode_at_exactly_its_last_decision_without_cutting_the_bootstrap(reset, step):
     state, steps = fly(reset, step, "long", [STAY] * 6)
     assert [int(s.outcome) for s in steps] == [0, 0, 0, Outcome.TIME_OUT, 0, 0]

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from edqn_jax.config import CameraConfig, Config, EnvConfig
+from edqn_jax.config import CameraConfig, Config, DroneConfig, EnvConfig
 from edqn_jax.evaluation.latency import decision_latency_ms
 from edqn_jax.learn import embedding, policy, trainer
 from edqn_jax.learn.trainer import Plan
@@ -21,10 +21,11 @@ from edqn_jax.sim import env, mjcf, sensor
 from edqn_jax.sim.drone import Flight, hover, load_airframe
 from edqn_jax.sim.events import EventField
 from edqn_jax.sim.moves import ACTIONS, DIRECTIONS
-from edqn_jax.sim.scene import stack_scenes
+from edqn_jax.sim.scene import stack_scenes, take_scene
 from edqn_jax.sim.sensor import Form, Sensor
 from edqn_jax.sim.worlds import own_missions
 from tests.learn.test_trainer import CONFIG as MINIATURE
+from tests.miniature import WORLD
 from tests.oracles import camera_plain
 from tests.oracles.mujoco_depth import RayCaster
 from tests.sim.drawn_scenes import every_kind, free_points, rotation_of, scene_of
@@ -34,7 +35,8 @@ STAY = 13
 
 
 def config_of(name: str, **options) -> Config:
-    return Config(camera=CAMERA, env=EnvConfig(sensor=name, **options))  # type: ignore
+    # What is seen does not depend on the physics; these are quicker to trace and to compile.
+    return Config(camera=CAMERA, drone=DroneConfig(physics="rigid_body"), env=EnvConfig(sensor=name, **options))  # type: ignore
 
 
 @partial(jax.jit, static_argnums=0)
@@ -60,16 +62,19 @@ def turned(yaw: float) -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def scenes():
+    """Worlds, and the same with equally many places for shapes of each kind, so that one program shows them all."""
     rng = np.random.default_rng(11)
-    return [mjcf.load_scene(mjcf.resolve_world("paper")), *(every_kind(rng) for _ in range(2))]
+    drawn = [mjcf.load_scene(mjcf.resolve_world("paper")), *(every_kind(rng) for _ in range(2))]
+    pool = stack_scenes(drawn)
+    return [(scene, take_scene(pool, index)) for index, scene in enumerate(drawn)]
 
 
 @pytest.mark.slow
 def test_a_frame_is_the_logarithm_of_the_camera_by_brute_force(scenes) -> None:
     config = config_of("frames")
-    for scene in scenes:
+    for scene, padded in scenes:
         where = poses(scene, np.random.default_rng(1), 3)
-        ours = np.asarray(shown(config, scene, *where), np.float64)
+        ours = np.asarray(shown(config, padded, *where), np.float64)
         plain = np.stack([camera_plain.luma(CAMERA, scene, p, turned(a)) for p, a in zip(*where, strict=True)])
         assert ours.shape == (3, 12, 16)
         # The level camera's own bar against 8 x 8 samples a pixel (tests/sim/test_camera.py).
@@ -79,9 +84,9 @@ def test_a_frame_is_the_logarithm_of_the_camera_by_brute_force(scenes) -> None:
 
 def test_depth_is_the_nearness_of_what_mujocos_rays_meet(scenes) -> None:
     config = config_of("depth")
-    for scene in scenes:
+    for scene, padded in scenes:
         where = poses(scene, np.random.default_rng(2), 4)
-        ours = np.asarray(shown(config, scene, *where), np.float64)
+        ours = np.asarray(shown(config, padded, *where), np.float64)
         caster = RayCaster(scene)
         rays = [camera_plain.directions(CAMERA, turned(yaw), 1) for yaw in where[1]]
         metres = np.stack([caster.distance(p, d) for p, d in zip(where[0], rays, strict=True)])
@@ -95,8 +100,8 @@ def test_depth_is_the_nearness_of_what_mujocos_rays_meet(scenes) -> None:
 def free_way(config, scene, caster, position, yaw) -> np.ndarray:
     """[26] metres along what each move commands, to a geom or to a face of the volume, by MuJoCo and by hand."""
     found = []
-    for move in range(len(ACTIONS)):
-        command = np.asarray(env.velocity_command(config.env, move, yaw), np.float64)
+    commands = jax.vmap(lambda move: env.velocity_command(config.env, move, yaw))(jnp.arange(len(ACTIONS)))
+    for move, command in enumerate(np.asarray(commands, np.float64)):
         if move == STAY:
             assert not command.any()
             continue
@@ -110,13 +115,14 @@ def free_way(config, scene, caster, position, yaw) -> np.ndarray:
     return np.array(found)
 
 
+@pytest.mark.slow
 def test_ranges_are_the_free_way_along_each_move_in_its_order(scenes) -> None:
     config = config_of("ranges")
     fenced = []
-    for scene in scenes:
+    for scene, padded in scenes:
         positions, yaws = poses(scene, np.random.default_rng(3), 12)
         yaws[:2] = 0.0, np.pi / 2  # along the axes
-        ours = np.asarray(shown(config, scene, positions, yaws), np.float64)
+        ours = np.asarray(shown(config, padded, positions, yaws), np.float64)
         caster = RayCaster(scene)
         metres = np.stack([free_way(config, scene, caster, p, a) for p, a in zip(positions, yaws, strict=True)])
         assert ours.shape == metres.shape == (12, 26)
@@ -153,7 +159,7 @@ def test_nearness_is_bounded_and_falls_with_distance() -> None:
 
 @pytest.fixture(scope="module")
 def world():
-    pool = stack_scenes([mjcf.load_scene(mjcf.resolve_world("paper"))])
+    pool = stack_scenes([mjcf.load_scene(WORLD)])
     return env.World(load_airframe(Config().drone), pool, own_missions(pool))
 
 
@@ -241,6 +247,7 @@ def with_new_sensor(request, monkeypatch) -> Config:
     )
 
 
+@pytest.mark.slow
 def test_a_new_sensor_needs_only_its_entry_to_act(with_new_sensor, world) -> None:
     config = with_new_sensor
     state = jax.eval_shape(lambda key: env.ended(config, world, key), jax.random.key(0))
