@@ -7,6 +7,7 @@ import os
 import shutil
 import tempfile
 from collections.abc import Iterator
+from pathlib import Path
 
 import jax
 import pytest
@@ -18,7 +19,10 @@ CACHE = {
     "jax_persistent_cache_min_compile_time_secs": 0.0,
     "jax_persistent_cache_min_entry_size_bytes": -1,
 }
-"""Options of JAX's compilation cache; its folder is made for a session unless JAX_COMPILATION_CACHE_DIR names one."""
+"""Options of JAX's compilation cache; JAX_COMPILATION_CACHE_DIR names another folder than pytest's own cache."""
+
+MOST_CACHED_BYTES = 2**30
+"""The cache of compiled programs is emptied at the start of a session when it has grown beyond this."""
 
 QUICK_TO_COMPILE = (
     "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_count=1"
@@ -58,19 +62,33 @@ use_cpu_devices(2)
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Shares compiled programs between the processes of this session, and those that tests start.
+    """Shares compiled programs between the processes of a session, those that tests start, and the next session.
 
-    Most of a session's time is XLA's, and many tests compile the same. An entry's key holds the whole program, its
-    options and XLA's flags, so a program that has changed is compiled again.
+    Most of a session's time is XLA's, many tests compile the same, and from one session to the next few programs
+    change. An entry's key holds the whole program, its options and XLA's flags, so a program that has changed is
+    compiled again. `pytest --cache-clear` empties the cache.
     """
-    folder = os.environ.get("JAX_COMPILATION_CACHE_DIR")
-    if folder is None:
-        folder = tempfile.mkdtemp(prefix="edqn-tests-")
-        config.add_cleanup(lambda: shutil.rmtree(folder, ignore_errors=True))
+    if hasattr(config, "workerinput"):
+        return  # started by a process that has done this
+    folder = os.environ.get("JAX_COMPILATION_CACHE_DIR") or str(_programs(config))
     for name, value in (CACHE | {"jax_compilation_cache_dir": folder}).items():
         # Workers and children read the variables when they import JAX; this process has imported it.
         os.environ[name.upper()] = str(value)
         jax.config.update(name, value)
+
+
+def _programs(config: pytest.Config) -> Path:
+    """Returns the folder of compiled programs within pytest's cache, or a temporary one where pytest has none."""
+    cache = getattr(config, "cache", None)
+    if cache is None:
+        folder = tempfile.mkdtemp(prefix="edqn-tests-")
+        config.add_cleanup(lambda: shutil.rmtree(folder, ignore_errors=True))
+        return Path(folder)
+    folder = cache.mkdir("programs")
+    if sum(file.stat().st_size for file in folder.iterdir()) > MOST_CACHED_BYTES:
+        shutil.rmtree(folder)
+        folder = cache.mkdir("programs")
+    return folder
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -21,10 +21,14 @@ CONFIG = dataclasses.replace(
 )
 
 
+fresh = jax.jit(fresh_policy, static_argnums=(0, 1))
+"""Untrained parameters by one program; operation by operation takes seconds to compile."""
+
+
 @functools.cache
 def always(move: tuple[int, int, int]) -> PolicyParams:
     """A policy that takes the same move (ahead, left, up) whatever it sees."""
-    params = fresh_policy(CONFIG)
+    params = fresh(CONFIG, 0)
     q = jax.tree.map(jnp.zeros_like, params.q)
     (action,) = np.flatnonzero((ACTIONS == move).all(axis=1))
     # The head's first output is the state's value, the others are the advantages of the moves.
@@ -34,7 +38,7 @@ def always(move: tuple[int, int, int]) -> PolicyParams:
 
 def that_sees(codes: bool, own: bool) -> PolicyParams:
     """An untrained policy whose first layer is cut off from the codes, or from the drone's own state."""
-    params = fresh_policy(CONFIG, seed=1)
+    params = fresh(CONFIG, 1)
     size = CONFIG.encoder.code_size
     column = np.arange(CONFIG.agent.history * observation_size(CONFIG)) % observation_size(CONFIG)
     seen = np.where(column < size, codes, own)

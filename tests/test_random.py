@@ -57,6 +57,7 @@ def keys_of_a_run(seed: int) -> dict[str, jax.Array]:
 
 # 2024 and 7919 are the seeds of the roots of worlds and of evaluation missions.
 @pytest.mark.parametrize("seed", [0, 1, 2024, 7919])
+@pytest.mark.slow
 def test_no_two_streams_of_a_run_are_equal(seed: int) -> None:
     owners: dict[bytes, str] = {}
     for stream, keys in keys_of_a_run(seed).items():

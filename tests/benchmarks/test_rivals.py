@@ -48,6 +48,7 @@ def test_a_missing_package_is_a_reason(name: str, tmp_path: Path, monkeypatch: p
     assert said == {"reason": "numba is not installed; run pip install 'edqn-jax[bench]'"}
 
 
+@pytest.mark.slow
 def test_a_planner_says_no_path_where_there_is_none(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     shut = tmp_path / "shut.xml"
     write_scene(WITHOUT_A_WAY["wall across"].scene, shut, title="shut")

@@ -84,6 +84,7 @@ def faked(monkeypatch: pytest.MonkeyPatch) -> type[Fake]:
 METHODS = ("E-DQN", "A*", "RRT*", "BIT*", "APF")
 
 
+@pytest.mark.slow
 def test_methods_take_turns_seed_by_seed_and_all_of_it_is_told(
     faked: type[Fake], clear: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -284,6 +285,7 @@ def test_a_report_without_rows_is_none_of_this_benchmark(
     assert capsys.readouterr().err == f"'{file}' is not a report of this benchmark\n"
 
 
+@pytest.mark.slow
 def test_rows_with_other_options_are_other_rows(clear: Path) -> None:
     def settings(name: str, *flags: str) -> dict[str, Any]:
         return runtime.blank(runtime.parse(["--worlds", str(clear), "--", *flags]), str(clear), name)["settings"]

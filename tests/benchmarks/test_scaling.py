@@ -85,6 +85,7 @@ def test_a_size_that_cannot_be_run_is_told_in_a_sentence(tmp_path: Path) -> None
         scaling.CURVES["pixels"](odd, False, tmp_path)
 
 
+@pytest.mark.slow
 def test_one_device_has_no_curve_of_devices() -> None:
     with pytest.raises(ConfigError, match="only one device"):
         scaling.measure(configured([*MINIATURE, "--train.devices", "1"]), ["devices"], True, 1)

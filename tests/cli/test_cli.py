@@ -238,6 +238,7 @@ def test_the_module_is_the_command():
     assert shown.returncode == 2 and "did you mean 'train'?" in shown.stderr
 
 
+@pytest.mark.slow
 def test_train_py_is_the_train_command():
     shown = subprocess.run(
         [sys.executable, str(ROOT / "train.py"), "--num-envs", "0"],

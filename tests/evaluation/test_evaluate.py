@@ -156,6 +156,7 @@ def test_the_command_shuffles_codes_only_when_asked_and_says_so(shuffle_codes, r
     assert ("shuffled codes" in capsys.readouterr().out) is shuffle_codes
 
 
+@pytest.mark.slow
 def test_a_world_without_a_way_is_a_sentence(run, tmp_path):
     walls = {"9 5 2": ".1 4 2", "1 5 2": ".1 4 2", "5 1 2": "4 .1 2", "5 9 2": "4 .1 2", "5 5 4": "4.2 4.2 .1"}
     geoms = "".join(f'<geom type="box" pos="{pos}" size="{size}"/>' for pos, size in walls.items())

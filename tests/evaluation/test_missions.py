@@ -76,12 +76,14 @@ def inside_a_block() -> tuple[float, float, float]:
         ({"name": "sparse", "missions": 4, "goal": (5, 5, -1)}, "test world 0"),
     ],
 )
+@pytest.mark.slow
 def test_what_cannot_be_flown_is_a_sentence(arguments, says):
     with pytest.raises(ConfigError, match=says):
         load_missions(CONFIG, **arguments)
 
 
 @pytest.mark.parametrize("missions", [1, 3])
+@pytest.mark.slow
 def test_a_goal_inside_a_wall_names_the_wall(missions):
     with pytest.raises(ConfigError, match=r"the goal .* lies inside '\w+'"):
         load_missions(CONFIG, "paper", missions, goal=inside_a_block())

@@ -124,6 +124,7 @@ def first_collision(model: mujoco.MjModel, points: np.ndarray, spacing: float) -
     return None
 
 
+@pytest.mark.slow
 def test_random_flights_are_judged_as_the_collision_pipeline_judges_them_at_every_two_millimetres(judge):
     model = flying_sphere()
     rng = np.random.default_rng(0)

@@ -94,6 +94,7 @@ def test_polyak_moves_by_its_rate():
     np.testing.assert_allclose(dqn.polyak(new, old, 0.25)["a"], [1.0, 6.0])
 
 
+@pytest.mark.slow
 def test_dueling_heads_have_no_mean_advantage():
     config = AgentConfig(hidden=(8,), history=2, dueling=True)
     params = jax.jit(partial(qnetwork.init_q, config, 3, 5))(jax.random.key(0))

@@ -80,6 +80,7 @@ def moved(one, two) -> bool:
 
 
 @pytest.mark.parametrize("name", SENSORS)
+@pytest.mark.slow
 def test_only_a_sensor_with_an_image_has_one_in_its_program_and_a_vae(world: World, name: str) -> None:
     config = dataclasses.replace(with_sensor(name, QUICK), camera=CameraConfig(width=11, height=7))
     state = jax.eval_shape(lambda key: trainer.init(config, world, key), jax.random.key(0))
@@ -131,6 +132,7 @@ def test_the_q_network_sees_a_code_or_the_ranges_or_only_the_own_state() -> None
 
 
 @pytest.mark.parametrize("name", SENSORS)
+@pytest.mark.slow
 def test_a_decision_of_any_sensor_can_be_timed(name: str) -> None:
     config = with_sensor(name)
     taken = decision_latency_ms(config, fresh_policy(config), calls=3)
@@ -164,6 +166,7 @@ def test_the_code_of_a_picture_has_the_sizes_of_the_code_of_events(kind) -> None
 
 
 @pytest.mark.parametrize("kind", ["network", "table"])
+@pytest.mark.slow
 def test_a_picture_is_pooled_pixel_by_pixel(kind) -> None:
     config = EncoderConfig(pixel_features=kind, features=4, hidden=16, code_size=5)
     camera = CameraConfig(width=6, height=4)
@@ -226,6 +229,7 @@ SAVED = {
 """Names and shapes of the VAE in policies saved before there was a choice of sensor."""
 
 
+@pytest.mark.slow
 def test_a_policy_saved_before_there_were_other_sensors_still_loads(tmp_path: Path) -> None:
     now = to_yaml(CONFIG)
     assert now.count("sensor: events, ") == 1
@@ -237,6 +241,7 @@ def test_a_policy_saved_before_there_were_other_sensors_still_loads(tmp_path: Pa
     assert config == CONFIG and not moved(params, loaded)
 
 
+@pytest.mark.slow
 def test_a_policy_saved_before_pixel_features_were_written_out_still_loads(tmp_path: Path) -> None:
     asked = dataclasses.replace(CONFIG, encoder=dataclasses.replace(CONFIG.encoder, pixel_features="network"))
     (tmp_path / "config.yaml").write_text(to_yaml(asked))

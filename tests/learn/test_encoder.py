@@ -196,6 +196,7 @@ def test_the_loss_is_reconstruction_plus_weighted_kl():
 
 
 @pytest.mark.parametrize("bandwidth", [0.5, 1.0])
+@pytest.mark.slow
 def test_the_error_over_waves_is_the_error_over_pixels(bandwidth):
     config = dataclasses.replace(CONFIG, decoder_bandwidth=bandwidth)
     params = fresh(config, SMALL, jax.random.key(0))

@@ -185,6 +185,7 @@ def test_the_ring_is_as_long_as_its_share_and_never_too_short_for_a_transition()
 
 
 @pytest.mark.usefixtures("strict_jax")
+@pytest.mark.slow
 def test_the_replay_is_strict():
     config = agent(3, 2)
     ring = replay.empty(config, ENVS, ENVS, 5)

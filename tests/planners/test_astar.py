@@ -59,6 +59,7 @@ def test_around_a_wall_it_is_the_taut_string():
     assert path.length_m <= path.grid_length_m
 
 
+@pytest.mark.slow
 def test_every_point_of_the_path_is_free():
     scene = small_world(box((4, 0, 0), (6, 6, 4)), box((7, 4, 0), (8, 10, 3)), box((2, 3, 0), (3, 10, 4)))
     path = shortest_path(scene, np.array([1.0, 9, 1]), np.array([9.0, 9, 1]), RADIUS)
@@ -70,6 +71,7 @@ def test_every_point_of_the_path_is_free():
 
 
 @pytest.mark.parametrize("seed", range(16))
+@pytest.mark.slow
 def test_the_grid_path_is_as_short_as_dijkstras(seed):
     rng = np.random.default_rng(seed)
     size, cell = np.array([5.0, 5.0, 3.0]), 0.5
@@ -120,6 +122,7 @@ def test_a_bad_start_says_so(start, said):
         shortest_path(scene, np.array(start), np.array([8.0, 5, 2]), RADIUS)
 
 
+@pytest.mark.slow
 def test_it_runs_alone(capsys, tmp_path):
     world = tmp_path / "small.xml"
     world.write_text(

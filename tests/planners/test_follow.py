@@ -68,6 +68,7 @@ def test_beside_a_straight_path_it_comes_back_without_crossing_it_by_more_than_t
     assert abs(beside[-1]) < FOLLOW.tolerance_m
 
 
+@pytest.mark.slow
 def test_a_path_through_a_wall_is_a_collision_at_the_wall():
     flight = flown(CHICANE, [CHICANE.start, CHICANE.goal])
     assert flight.outcome == Outcome.COLLISION
@@ -76,6 +77,7 @@ def test_a_path_through_a_wall_is_a_collision_at_the_wall():
     assert flight.closest.distance == pytest.approx(0.0, abs=0.01)
 
 
+@pytest.mark.slow
 def test_a_path_out_of_the_volume_leaves_it_and_one_that_ends_early_runs_out_of_time():
     task = small_world()
     assert flown(task, [task.start, (2.0, 14.0, 3.0)]).outcome == Outcome.LEFT_VOLUME
@@ -137,6 +139,7 @@ def _steer():
 
 @settings(max_examples=50, deadline=None)
 @given(POINT, POINT, st.integers(0, 60))
+@pytest.mark.slow
 def test_it_is_never_faster_than_a_learner_along_an_axis_and_never_goes_back(at, velocity, nearest):
     points = sampled(np.array([(1.0, 1.0, 1.0), (6.0, 1.0, 1.0), (6.0, 6.0, 5.0)]))
     state = drone.hover(jnp.array(at), jnp.array(0.3))

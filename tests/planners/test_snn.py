@@ -49,6 +49,7 @@ def test_the_whole_volume_of_the_paper_is_one_lattice_of_metres():
     assert snn.lattice_shape(np.array([(0, 0, 0), (110, 110, 25)], np.float32)) == (110, 110, 25)
 
 
+@pytest.mark.slow
 def test_cells_stand_in_the_middle_of_their_cubes():
     middles = _synapses(small_world().scene, RADIUS, SMALL, 1.0).middles
     np.testing.assert_allclose(middles[0, 0, 0], [0.5, 0.5, 0.5])
@@ -188,6 +189,7 @@ def test_the_path_takes_as_many_steps_as_the_wave():
     assert length == pytest.approx(5 + 4 * np.sqrt(2))
 
 
+@pytest.mark.slow
 def test_with_the_window_upside_down_no_path_is_found(monkeypatch):
     right = snn.stdp
     monkeypatch.setattr(snn, "stdp", lambda config, lag: -right(config, lag))
@@ -198,6 +200,7 @@ def test_with_the_window_upside_down_no_path_is_found(monkeypatch):
 
 
 @pytest.mark.parametrize("seed", range(12))
+@pytest.mark.slow
 def test_every_path_in_a_small_world_is_free(seed):
     task = random_small_world(seed)
     plan = snn.plan(task)
@@ -209,6 +212,7 @@ def test_every_path_in_a_small_world_is_free(seed):
 
 # In both the hops count along x alone; in the second the start is as far from all cells around it.
 @pytest.mark.parametrize(("start", "goal"), [((2.4, 2.4, 2.9), (10.4, 8.4, 2.9)), ((2.0, 2.0, 3.0), (10.0, 8.0, 3.0))])
+@pytest.mark.slow
 def test_the_path_does_not_begin_backwards(start, goal):
     task = small_world(start=start, goal=goal)
     path = snn.plan(task).path

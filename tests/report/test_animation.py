@@ -70,12 +70,14 @@ def test_a_long_flight_leaves_decisions_out():
     assert frames(recorded(Drawn(), MOST_FRAMES + 10)) == (MOST_FRAMES + 10) // 2 + 1
 
 
+@pytest.mark.slow
 def test_the_last_frame_says_how_the_flight_ended_in_its_colour():
     gif = recorded(Drawn(), 4, outcome="collision")
     colour = OUTCOME_COLOURS["collision"]
     assert pixels_like(gif, 4, colour) > pixels_like(gif, 3, colour) + 100
 
 
+@pytest.mark.slow
 def test_a_sensor_without_an_image_is_said_to_have_none():
     class Blind(Drawn):
         has_image = False

@@ -166,6 +166,7 @@ def test_the_world_is_drawn_in_proportion_with_start_and_goal(tmp_path):
     assert "start (1, 1, 3)" in texts(figure) and "goal (90, 90, 10)" in texts(figure)
 
 
+@pytest.mark.slow
 def test_the_path_is_drawn_whole_in_both_views(tmp_path):
     figure = draw_path(a_scene(), a_flight(), np.array([[1, 1, 3], [90, 90, 10.0]]), tmp_path / "path.png")
     assert is_png(tmp_path / "path.png")
@@ -182,6 +183,7 @@ def test_a_flight_that_fails_says_how(tmp_path):
     assert "collision" in texts(figure) and "shortest path" not in texts(figure)
 
 
+@pytest.mark.slow
 def test_a_flight_of_one_step_can_be_drawn(tmp_path):
     draw_path(a_scene(), a_flight(1), None, tmp_path / "path.png", outcome="left_volume")
     assert is_png(tmp_path / "path.png")
@@ -209,6 +211,7 @@ def test_the_running_mean_is_the_mean_of_each_window():
     np.testing.assert_allclose(running_mean(values, 2), [1.5, 4.0, 4.5])
 
 
+@pytest.mark.slow
 def test_learning_shows_each_metric_where_a_line_has_it(tmp_path):
     metrics = [{"decisions": 100 * i, "reconstruction_loss": 1.0 / i, "kl": 2.0} for i in range(1, 5)]
     metrics += [{"decisions": 100 * i, "q_loss": 0.1, "epsilon": 0.5, "success_rate": 0.2} for i in range(5, 9)]

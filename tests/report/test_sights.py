@@ -89,6 +89,7 @@ def test_a_flight_shorter_than_a_decision_has_one():
     assert decision_rows(SMALL, {"t": np.zeros(3)}).tolist() == [[2, 2]]
 
 
+@pytest.mark.slow
 def test_a_sensor_without_an_image_has_rgb_only():
     blind = sights_of(dataclasses.replace(SMALL, env=dataclasses.replace(SMALL.env, sensor="blind")))
     assert not blind.has_image

@@ -122,6 +122,7 @@ def test_the_mixer_gives_the_wrench_asked_for_in_c_mujoco(airframe):
 # MJX
 
 
+@pytest.mark.slow
 def test_a_hundred_steps_agree_with_c_mujoco_within_a_millimetre(step):
     rng = np.random.default_rng(1)
     sequence = np.clip(3.25 + rng.normal(0, 0.4, (100, 4)), 0, MAX_THRUST)
@@ -181,6 +182,7 @@ def test_a_decision_is_its_physics_steps_one_by_one(decide, thrust_of, step):
 # Heading
 
 
+@pytest.mark.slow
 def test_heading_is_the_yaw_of_a_level_drone_and_a_lean_does_not_move_it():
     yaws = jnp.linspace(-3.1, 3.1, 7)
     np.testing.assert_allclose(jax.vmap(lambda yaw: yaw_of(hover(jnp.zeros(3), yaw).quaternion))(yaws), yaws, atol=1e-6)

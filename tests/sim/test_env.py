@@ -482,6 +482,7 @@ def test_events_are_those_between_the_configured_frames_of_the_flight(reset, ste
     assert np.mean(np.asarray(field.count * field.polarity != got.count * got.polarity)) < 0.005
 
 
+@pytest.mark.slow
 def test_the_action_is_taken_in_the_heading_at_the_decision_and_the_nose_turns_to_the_goal(reset, step):
     state, _ = reset(jax.random.key(0), MISSION["long"])
     # Turned away by a quarter: ahead is where the nose was, though it turns while flying.
@@ -496,6 +497,7 @@ def test_the_action_is_taken_in_the_heading_at_the_decision_and_the_nose_turns_t
     assert away > float(drone.yaw_of(after.drone.quaternion)) > bearing
 
 
+@pytest.mark.slow
 def test_a_diverged_flight_ends_with_finite_numbers(reset, step):
     state, _ = reset(jax.random.key(0), MISSION["long"])
     # So fast a spin overflows in the first physics step.
@@ -535,6 +537,7 @@ def test_many_environments_at_once_are_the_same_as_one_by_one(reset, step):
 
 
 @pytest.mark.parametrize("law", ["paper", "esim"])
+@pytest.mark.slow
 def test_no_key_is_used_twice_and_no_rank_is_promoted(world, law):
     # Leak checks do not get past MJX. Tracing is enough: both checks are made there.
     config = dataclasses.replace(FLOWN, events=EventsConfig(law=law, threshold_mismatch=0.1))

@@ -59,6 +59,7 @@ def compare(config, scene, positions, rotations):
 
 
 @pytest.mark.parametrize("mount", MOUNTS)
+@pytest.mark.slow
 def test_depth_agrees_with_mujoco_among_shapes_of_every_kind(mount):
     rng = np.random.default_rng(0)
     config = CameraConfig(mount=mount)
@@ -132,6 +133,7 @@ def test_columns_run_to_the_right_and_rows_down():
     assert abs(column - 7.5) <= 1 and abs(row - 17.9) <= 1
 
 
+@pytest.mark.slow
 def test_an_empty_scene_is_infinitely_deep_and_parked_shapes_are_never_met():
     nobody = scene_of(**dict.fromkeys(("boxes", "cylinders", "spheres", "tilted_boxes", "capsules"), 2))
     config = CameraConfig(mount="body")

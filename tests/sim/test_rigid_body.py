@@ -43,6 +43,7 @@ def assert_close(ours: DroneState, theirs: DroneState, **tolerances: float) -> N
 
 
 @pytest.mark.parametrize("dt", [0.02, 0.004])
+@pytest.mark.slow
 def test_from_any_state_a_step_is_that_of_mjx(dt: float) -> None:
     rng = np.random.default_rng(0)
     states = tumbling(rng)

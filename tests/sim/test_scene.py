@@ -137,6 +137,7 @@ def test_parked_shapes_change_nothing():
         assert obstacle_count(scene_of(parked_shape(dataclass))) == 0
 
 
+@pytest.mark.slow
 def test_the_gradient_is_the_direction_away_from_the_surface_and_finite_everywhere(world):
     gradient = jax.jit(jax.vmap(jax.grad(lambda p: signed_distance(world.scene, p))))
     points = np.random.default_rng(3).uniform(-12, 12, (400, 3)).astype(np.float32)
@@ -171,6 +172,7 @@ def test_a_pool_gives_every_world_back():
             jax.tree.map(np.testing.assert_array_equal, ours, theirs)
 
 
+@pytest.mark.slow
 def test_contact_is_reported_where_it_happens():
     wall = scene_of(UprightBoxes(position=[5, 5, 5], half=[1, 5, 5], yaw=0.0, albedo=GREY))
     touch, fraction = segment_contact(wall, jnp.array([3.0, 5.0, 5.0]), jnp.array([4.0, 5.0, 5.0]), 0.36)
@@ -204,6 +206,7 @@ def test_a_segment_that_begins_in_contact_touches_at_once():
     assert touch and fraction == 0.0
 
 
+@pytest.mark.slow
 def test_a_path_is_searched_no_less_than_its_segments(world):
     rng = np.random.default_rng(6)
     begin = rng.uniform(-10, 10, (3000, 1, 3))

@@ -82,6 +82,7 @@ def test_a_frame_is_the_logarithm_of_the_camera_by_brute_force(scenes) -> None:
         assert np.ptp(plain) > 0.2  # there was something to see
 
 
+@pytest.mark.slow
 def test_depth_is_the_nearness_of_what_mujocos_rays_meet(scenes) -> None:
     config = config_of("depth")
     for scene, padded in scenes:
