@@ -16,7 +16,7 @@ from edqn_jax.sim.moves import ACTIONS
 CONFIG = dataclasses.replace(
     Config(),
     camera=CameraConfig(width=8, height=6),
-    encoder=EncoderConfig(hidden=16, features=8, decoder_hidden=(16,)),
+    encoder=EncoderConfig(patch_layers=(8, 4), joint_layers=(16,), decoder_hidden=(16,)),
     agent=AgentConfig(hidden=(16,), history=2),
 )
 

@@ -14,7 +14,8 @@ from jax import Array
 from jax.sharding import PartitionSpec
 
 from edqn_jax.config import Config
-from edqn_jax.learn import dqn, encoder, qnetwork, replay, trainer
+from edqn_jax.learn import dqn, qnetwork, replay, trainer, vae
+from edqn_jax.learn.samples import Samples
 from edqn_jax.learn.trainer import AXIS, Actors, Learner, TrainState
 from edqn_jax.sim import camera, columns, drone, env, events, sensor
 from edqn_jax.sim.drone import DroneState
@@ -227,11 +228,13 @@ def environment_without_resets(now: Moment) -> Part:
 def encoding(now: Moment) -> Part:
     """Returns the part that encodes events."""
 
-    def body(params: Any, field: events.EventField) -> events.EventField:
-        code = encoder.embed(now.config.encoder, params, field)
-        return dataclasses.replace(field, count=depending_on(field.count, code))
+    def body(params: Any, carry):
+        field, motion = carry
+        code = vae.embed(now.config.encoder, params, field, motion)
+        return dataclasses.replace(field, count=depending_on(field.count, code)), motion
 
-    return Part("encoder", body, now.learner.encoder, now.next_step.observation.sensed, products=True)
+    seen = now.next_step.observation
+    return Part("encoder", body, now.learner.encoder, (seen.sensed, seen.motion), products=True)
 
 
 def acting(now: Moment) -> Part:
@@ -290,16 +293,18 @@ def replaying(now: Moment) -> Part:
 
 
 def vae_updating(now: Moment) -> Part:
-    """Returns the part of a VAE update on the newest events."""
+    """Returns the part of a VAE update with drawing its batch."""
 
-    def body(field: events.EventField, carry):
+    def body(album: Samples, carry):
         learner, keys = carry
         keys = _next(keys)
-        _, learner = trainer.learn_to_see(now.config, AXIS, learner, field, keys, now.state.step)
+        _, learner = trainer.learn_to_see(now.config, AXIS, learner, album, keys, now.state.step)
         return learner, keys
 
-    field, carry = now.next_step.observation.sensed, (now.learner, now.shard_keys)
-    return Part("vae_update", body, field, carry, _LEARNER_AND_KEYS, products=True, moved=size_of(field))
+    album, carry = now.actors.samples, (now.learner, now.shard_keys)
+    each = size_of(jax.tree.map(lambda leaf: leaf[0, 0, 0], album))
+    moved = now.config.encoder.batch_size * each
+    return Part("vae_update", body, album, carry, _LEARNER_AND_KEYS, products=True, moved=moved)
 
 
 def learning(now: Moment) -> Part:

@@ -35,6 +35,7 @@ def validate(config: Config) -> None:
     _agent(config.agent)
     _train(config.train)
     _replay(config.agent, config.train)
+    _samples(config.encoder, config.train)
 
 
 def _world(world: WorldConfig) -> None:
@@ -91,8 +92,14 @@ def _env(env: EnvConfig) -> None:
 def _encoder(encoder: EncoderConfig) -> None:
     _positive(encoder, "encoder", ["code_size", "features", "hidden", "learning_rate", "hold_decisions"])
     _not_negative(encoder, "encoder", ["time_frequencies", "target_blur", "kl_weight", "warmup_decisions"])
-    _positive(encoder, "encoder", ["warmup_updates_per_step"])
-    _widths(encoder.decoder_hidden, "encoder.decoder_hidden")
+    _positive(encoder, "encoder", ["warmup_updates_per_step", "patch_pixels", "batch_size", "replay_size"])
+    _positive(encoder, "encoder", ["retrain_decisions"])
+    times = encoder.retrain_at
+    rising = all(earlier < later for earlier, later in zip(times, times[1:], strict=False))
+    inside = rising and all(0 < time < 1 for time in times)
+    _require(inside, "encoder.retrain_at", "shares between 0 and 1 in rising order", times)
+    for key in ("patch_layers", "joint_layers", "decoder_hidden"):
+        _widths(getattr(encoder, key), f"encoder.{key}")
     share = encoder.decoder_bandwidth
     _require(0 < share <= 1, "encoder.decoder_bandwidth", "more than 0 and at most 1", share)
 
@@ -140,6 +147,12 @@ def _replay(agent: AgentConfig, train: TrainConfig) -> None:
     needed = rows * train.num_envs
     limit = f"at least {needed}: {rows} observations for each of the {train.num_envs} environments"
     _require(size >= needed, "agent.replay_size", limit, size)
+
+
+def _samples(encoder: EncoderConfig, train: TrainConfig) -> None:
+    batch, shards = encoder.batch_size, train.shards
+    multiple = f"a multiple of train.shards ({shards}), such as {-(-batch // shards) * shards}"
+    _require(batch % shards == 0, "encoder.batch_size", multiple, batch)
 
 
 def _require(holds: bool, name: str, limits: str, value: object) -> None:

@@ -26,12 +26,18 @@ Layer = Mapping[str, Mapping[str, Any]]
 
 RANDOM_WORLDS: Layer = {
     "train": {"total_steps": 3_200_000},
-    "encoder": {"warmup_updates_per_step": 12},
+    "encoder": {
+        "warmup_decisions": 131_072,
+        "replay_size": 65_536,
+        "retrain_at": (0.15,),
+        "retrain_decisions": 131_072,
+    },
     "agent": {"updates_per_step": 4, "target_rate": 0.02, "learning_rate": 1e-3},
-    "events": {"threshold": 0.03, "tolerance": 0.03},
+    "events": {"threshold": 0.03, "tolerance": 0.03, "frame_times_s": (-0.08, 0.0)},
 }
-"""What random worlds change in the `default` preset: more decisions, fewer and smaller updates for each, lower event
-thresholds and more VAE updates, since there only events tell where obstacles are."""
+"""What random worlds change in the `default` preset: more decisions, fewer and smaller updates for each, a longer
+window of events with lower thresholds, and an encoder that learns from more, and again from flights of the policy, since
+there only events tell where obstacles are."""
 
 
 def world_layer(world: str) -> Layer:
@@ -61,7 +67,7 @@ def resolve(preset_name: str = "default", file: Path | None = None, world: str |
 
 
 def make_config(
-    world: str | None = None, *, preset: str = "default", file: str | Path | None = None, **groups: Mapping[str, Any]
+    world: str | None = None, /, *, preset: str = "default", file: str | Path | None = None, **groups: Mapping[str, Any]
 ) -> Config:
     """Returns a checked configuration: preset < what the world asks for < file < `groups`.
 
@@ -114,8 +120,8 @@ def apply(config: Config, layer: Layer, source: str) -> Config:
     changed = {}
     for group, values in layer.items():
         if group not in groups:
-            owner = [name for name in groups if str(group) in _keys(getattr(config, name))]
-            hint = f"; it belongs under '{owner[0]}:'" if owner else nearest(group, groups)
+            owners = [f"'{name}:'" for name in groups if str(group) in _keys(getattr(config, name))]
+            hint = f"; it belongs under {' or '.join(owners)}" if owners else nearest(group, groups)
             raise ConfigError(f"{source}: there is no group '{group}'{hint}")
         if not isinstance(values, Mapping):
             raise ConfigError(

@@ -165,16 +165,28 @@ class EnvConfig:
 class EncoderConfig:
     """The event VAE (section 3.2), or the VAE of another sensor's pictures, and when it learns."""
 
+    architecture: Literal["patches", "pooled"] = "patches"
+    """`patches`: events are counted per pixel, pixels are read in patches together with the own motion, patches are
+    joined. `pooled`: the paper's sum over all events, without the own motion."""
+    target: Literal["nearness", "sensed", "both"] = "nearness"
+    """What the decoder draws. `nearness`: how near things are, a label of the simulator that only training needs;
+    `sensed`: what the sensor shows, as in the paper; `both`."""
     code_size: int = 32
     """Values in the code z."""
+    patch_pixels: int = 4
+    """Side of a square patch, pixels (`patches`)."""
+    patch_layers: tuple[int, ...] = (32, 16)
+    """Widths of the ReLU layers that all patches share (`patches`)."""
+    joint_layers: tuple[int, ...] = (128, 128)
+    """Widths of the ReLU layers between joined patches and code (`patches`)."""
     features: int = 48
-    """Sum-pooled features per temporal channel."""
+    """Sum-pooled features per temporal channel (`pooled`)."""
     pixel_features: Literal["table", "network"] = "network"
-    """f(x, y, p): a learned table over pixels and polarities, or a ReLU network on a positional encoding."""
+    """f(x, y, p): a learned table over pixels and polarities, or a ReLU network on a positional encoding (`pooled`)."""
     time_frequencies: int = 1
-    """Sinusoid pairs of the temporal embedding; phi(t) has 1 + 2 x this many channels."""
+    """Sinusoid pairs of the temporal embedding; phi(t) has 1 + 2 x this many channels (`pooled`)."""
     hidden: int = 128
-    """Width of the ReLU layer between pooled features and code."""
+    """Width of the ReLU layer between pooled features and code (`pooled`)."""
     decoder_hidden: tuple[int, ...] = (128, 128)
     """Widths of the decoder's ReLU layers."""
     decoder_bandwidth: float = 0.5
@@ -189,9 +201,20 @@ class EncoderConfig:
     """Decisions of the warm-up, random manoeuvres from which the VAE learns before the DQN starts; at most a quarter of
     all decisions. Unused by the sensors `ranges` and `blind`, which have no VAE."""
     warmup_updates_per_step: int = 6
-    """VAE updates per training step of the warm-up, each on the new event fields of all environments."""
+    """VAE updates per training step of the warm-up."""
+    batch_size: int = 256
+    """Observations in a VAE update, drawn from the newest `replay_size`; a multiple of `train.shards`."""
+    replay_size: int = 16_384
+    """Observations that the VAE learns from, with what its decoder must draw of each."""
+    mirror: bool = True
+    """Mirror each observation of a VAE update left to right with probability one half."""
     hold_decisions: int = 4
     """Mean length of a random manoeuvre of the warm-up, decisions."""
+    retrain_at: tuple[float, ...] = ()
+    """Shares of all decisions at which the VAE is trained again, now on flights of the policy. The agent then uses the
+    new encoder, and the replay starts anew, so that codes of two encoders are never mixed."""
+    retrain_decisions: int = 65_536
+    """Decisions of each such training."""
     keep_learning: bool = False
     """Go on training the VAE on every new field after the warm-up. The agent still uses the encoder of the warm-up.
     Unused where there is no VAE."""

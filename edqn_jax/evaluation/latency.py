@@ -23,7 +23,9 @@ def decision_latency_ms(config: Config, params: PolicyParams, calls: int = 300) 
 
 def decision_seconds(config: Config, params: PolicyParams, calls: int) -> np.ndarray:
     """Returns the seconds [calls] that each of `calls` decisions takes, from arrays on the host to an action there."""
-    seen = env.Observation(sensed=sensor_of(config).example(config), own=jnp.zeros(env.OWN_SIZE))
+    seen = env.Observation(
+        sensed=sensor_of(config).example(config), own=jnp.zeros(env.OWN_SIZE), motion=jnp.zeros(env.MOTION_SIZE)
+    )
     seen, memory = jax.tree.map(np.asarray, (seen, policy.empty_memory(config)))  # on the host
     act = jax.jit(lambda params, memory, seen, key: policy.act(config, params, memory, seen, key))
     params, key = jax.device_put(params), jax.random.key(0)

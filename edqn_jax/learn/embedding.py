@@ -6,14 +6,20 @@ import jax.numpy as jnp
 from jax import Array
 
 from edqn_jax.config import Config
-from edqn_jax.learn import encoder
-from edqn_jax.learn.encoder import Params
-from edqn_jax.sim.sensor import Sensed, sensor_of
+from edqn_jax.learn import vae
+from edqn_jax.learn.code import CHANNELS, Params
+from edqn_jax.sim.env import Observation
+from edqn_jax.sim.sensor import sensor_of
 
 
 def has_code(config: Config) -> bool:
     """Returns whether a VAE embeds what the sensor shows; it then learns in a warm-up."""
-    return sensor_of(config).form in encoder.CHANNELS
+    return sensor_of(config).form in CHANNELS
+
+
+def needs_nearness(config: Config) -> bool:
+    """Returns whether the VAE learns to draw how near things are, a label that the simulator renders for training."""
+    return has_code(config) and vae.needs_nearness(config.encoder)
 
 
 def size(config: Config) -> int:
@@ -25,18 +31,20 @@ def init(config: Config, key: Array) -> Params:
     """Returns fresh parameters of the VAE; {} where there is none."""
     if not has_code(config):
         return {}
-    return encoder.init_encoder(config.encoder, config.camera, key, form=sensor_of(config).form)
+    windows = len(config.events.frame_times_s) - 1
+    return vae.init_vae(config.encoder, config.camera, key, form=sensor_of(config).form, windows=windows)
 
 
 def acting(config: Config, params: Params) -> Params:
     """Returns the parameters in the form that `embed` evaluates fastest, no longer trainable; {} of {}."""
-    return encoder.tabulated(config.encoder, config.camera, params) if params else {}
+    return vae.frozen(config.encoder, config.camera, params, form=sensor_of(config).form) if params else {}
 
 
-def embed(config: Config, params: Params, sensed: Sensed) -> Array | None:
-    """Returns [..., size] of order 1: the scaled code, or values as they are; None of None."""
-    if sensed is None:
+def embed(config: Config, params: Params, observation: Observation) -> Array | None:
+    """Returns [..., size] of order 1: the scaled code, or values as they are; None where the sensor shows nothing."""
+    if observation.sensed is None:
         return None
     if not has_code(config):
-        return jnp.asarray(sensed)
-    return config.agent.code_scale * encoder.embed(config.encoder, params, sensed)
+        return jnp.asarray(observation.sensed)
+    code = vae.embed(config.encoder, params, observation.sensed, observation.motion)  # type: ignore[arg-type]
+    return config.agent.code_scale * code

@@ -56,7 +56,7 @@ def remember(memory: Memory, flat: Array) -> Memory:
 
 def flatten(config: Config, params: Params, observation: Observation) -> Array:
     """[..., D] what is seen, by default as a code, and own state of observations [...]."""
-    seen = embedding.embed(config, params, observation.sensed)
+    seen = embedding.embed(config, params, observation)
     return observation.own if seen is None else jnp.concatenate([seen, observation.own], axis=-1)
 
 

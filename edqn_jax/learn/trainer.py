@@ -26,14 +26,16 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from edqn_jax.config import Config
 from edqn_jax.errors import ConfigError
-from edqn_jax.learn import dqn, embedding, encoder, policy, qnetwork, replay
+from edqn_jax.learn import dqn, embedding, policy, qnetwork, replay, samples, vae
 from edqn_jax.learn.policy import PolicyParams, empty_memory, observation_size
 from edqn_jax.learn.qnetwork import Params
+from edqn_jax.learn.samples import Samples
 from edqn_jax.parallel import processes
 from edqn_jax.parallel.devices import compiler_options
 from edqn_jax.random import run_streams
 from edqn_jax.sim import env
-from edqn_jax.sim.env import EnvState, World
+from edqn_jax.sim.env import EnvState, Observation, World
+from edqn_jax.sim.events import EventField
 from edqn_jax.sim.moves import ACTIONS
 from edqn_jax.sim.outcomes import Outcome
 
@@ -66,6 +68,7 @@ class Actors:
     manoeuvre: Array  # [S, E] the held move of the warm-up
     episodes: Array  # [S, E] episodes finished since the DQN started
     replay: replay.Rows  # [S, L, E, ...]
+    samples: Samples | None  # [S, L, E, ...] what the VAE learns from; None where there is none
     key: Array  # [S] typed keys of the shards
 
 
@@ -104,7 +107,10 @@ class Plan:
 
     total: int
     warmup: int
-    learn_from: int
+    starts: int
+    """Steps of a replay before the first update of the DQN."""
+    lessons: tuple[tuple[int, int], ...]
+    """First step, and step after the last, of each time in which the VAE learns; the first is the warm-up."""
 
     @classmethod
     def of(cls, config: Config) -> Plan:
@@ -116,8 +122,51 @@ class Plan:
         total = math.ceil(config.train.total_steps / envs / config.train.chunk_steps) * config.train.chunk_steps
         warmup = min(math.ceil(config.encoder.warmup_decisions / envs), total // 4) if embedding.has_code(config) else 0
         least = config.agent.n_step + config.agent.history
-        learn_from = warmup + max(math.ceil(config.agent.learning_starts / envs), least)
-        return cls(total=total, warmup=warmup, learn_from=learn_from)
+        starts = max(math.ceil(config.agent.learning_starts / envs), least)
+        lessons = [(0, warmup)] if warmup else []
+        if warmup:
+            length = math.ceil(config.encoder.retrain_decisions / envs)
+            lessons += [(round(share * total), round(share * total) + length) for share in config.encoder.retrain_at]
+        return cls(total=total, warmup=warmup, starts=starts, lessons=tuple(lessons))
+
+    @property
+    def learn_from(self) -> int:
+        """Step of the DQN's first update."""
+        return self.warmup + self.starts
+
+    def teaching(self, step: Array) -> Array:
+        """Returns whether the VAE learns in steps `[...]`, bool."""
+        teaching = jnp.zeros(jnp.shape(step), bool)
+        for first, end in self.lessons:
+            teaching |= (first <= step) & (step < end)
+        return teaching
+
+    def kept(self, config: Config, step: Array) -> Array:
+        """Returns how many steps before steps `[...]` gave the VAE something to learn from, int32."""
+        if config.encoder.keep_learning:
+            return step
+        kept = jnp.zeros(jnp.shape(step), jnp.int32)
+        for first, end in self.lessons:
+            kept += jnp.clip(step - first, 0, end - first)
+        return kept
+
+    def publishing(self, step: Array) -> Array:
+        """Returns whether the agent's encoder changes at the end of steps `[...]`, bool."""
+        publishing = jnp.zeros(jnp.shape(step), bool)
+        for _, end in self.lessons:
+            publishing |= step + 1 == end
+        return publishing
+
+    def replay_time(self, step: Array | np.ndarray) -> Array:
+        """Returns the number of steps `[...]` since the replay began; 0 in the warm-up."""
+        began = jnp.full(jnp.shape(step), self.warmup, jnp.int32)
+        for _, end in self.lessons:
+            began = jnp.where(step >= end, end, began)
+        return jnp.maximum(step - began, 0)
+
+    def learning(self, step: Array | np.ndarray) -> Array:
+        """Returns whether the DQN learns in steps `[...]`, bool."""
+        return jnp.asarray(step >= self.warmup) & (self.replay_time(step) >= self.starts)
 
 
 class InitialKeys(NamedTuple):
@@ -165,12 +214,39 @@ def init(config: Config, world: World, key: Array) -> TrainState:
         manoeuvre=jnp.zeros(envs, jnp.int32),
         episodes=jnp.zeros(envs, jnp.int32),
         replay=jnp.zeros(envs),  # type: ignore[arg-type]
+        samples=None,
         key=jnp.zeros(envs),
     )
     actors = jax.tree.map(lambda x: x.reshape(shards, envs // shards, *x.shape[1:]), flat).replace(
-        replay=jax.tree.map(lambda x: jnp.broadcast_to(x, (shards, *x.shape)), ring), key=keys.shards
+        replay=jax.tree.map(lambda x: jnp.broadcast_to(x, (shards, *x.shape)), ring),
+        samples=_empty_samples(config, world, state),
+        key=keys.shards,
     )
     return TrainState(actors=actors, learner=learner, step=jnp.zeros((), jnp.int32))
+
+
+def _empty_samples(config: Config, world: World, state: EnvState) -> Samples | None:
+    """Returns the rings [S, L, E, ...] of what the VAE learns from; None where there is no VAE."""
+    if not embedding.has_code(config):
+        return None
+    shards, envs = config.train.shards, config.train.num_envs
+
+    def one(state: EnvState) -> Samples:
+        observation = env.step(config, world, state, jnp.zeros((), jnp.int32))[1].observation
+        return _samples_of(config, observation, env.nearness(config, world, state))
+
+    shapes = jax.eval_shape(one, jax.tree.map(lambda x: x[0], state))
+    ring = samples.empty(config.encoder, shapes, envs // shards, envs)
+    return jax.tree.map(lambda x: jnp.broadcast_to(x, (shards, *x.shape)), ring)
+
+
+def _samples_of(config: Config, observation: Observation, nearness: Array | None) -> Samples:
+    return samples.samples_of(config.encoder, observation, _target_of(config, observation, nearness))
+
+
+def _target_of(config: Config, observation: Observation, nearness: Array | None) -> vae.Target:
+    assert isinstance(observation.sensed, EventField | Array)
+    return samples.target_of(config.encoder, observation.sensed, nearness)
 
 
 def _init_learner(config: Config, key: Array) -> Learner:
@@ -235,12 +311,13 @@ def train_step(
     plan, actors, learner = Plan.of(config), state.actors, state.learner
     keys = ShardKeys.split(actors.key)
     warming = step < plan.warmup
-    time = jnp.maximum(step - plan.warmup, 0)  # in steps since the replay began
+    time = plan.replay_time(step)
 
-    action, manoeuvre, epsilon = _act(config, learner, actors, keys, time, warming)
+    action, manoeuvre, epsilon = _act(config, learner, actors, keys, jnp.maximum(step - plan.warmup, 0), warming)
     ring = _store(actors, action, time)
     flown, seen = _fly(config, world, actors, action)
-    vae_losses, learner = learn_to_see(config, axis, learner, seen.observation.sensed, keys.vae, step)
+    album = _keep(config, world, actors, flown, seen.observation, step)
+    vae_losses, learner = learn_to_see(config, axis, learner, album, keys.vae, step)
     q_losses, learner = learn_to_act(config, axis, learner, ring, time, keys.dqn, step)
     learner = _publish(config, learner, step)
     memory = _remember(config, learner, actors, seen, step)
@@ -256,6 +333,7 @@ def train_step(
         manoeuvre=manoeuvre,
         episodes=actors.episodes + ((outcome != Outcome.RUNNING) & ~warming),
         replay=ring,
+        samples=album,
         key=keys.next,
     )
     episodes = Episodes(outcome=outcome, length=shaped(seen.episode_length), episode_return=shaped(seen.episode_return))
@@ -304,7 +382,7 @@ def _fly(config: Config, world: World, actors: Actors, action: Array) -> tuple[E
 
 def _remember(config: Config, learner: Learner, actors: Actors, seen: env.Step, step: Array) -> Array:
     """Memories [S * E, H, D] with the new observations, encoded once; a new episode or encoder begins empty."""
-    forget = seen.is_reset | (step + 1 == Plan.of(config).warmup)
+    forget = seen.is_reset | Plan.of(config).publishing(step)
     memory = jnp.where(forget[:, None, None], 0.0, _flat(actors.memory))
     return policy.see(config, learner.encoder, memory, seen.observation)
 
@@ -321,31 +399,59 @@ def _manoeuvre(hold: int, held: Array, key: Array) -> Array:
 
 
 def _publish(config: Config, learner: Learner, step: Array) -> Learner:
-    """The code that the agent sees changes once: when the warm-up ends, before the replay begins."""
+    """The code that the agent sees changes when a lesson of the VAE ends, before a replay begins."""
     encoder = lax.cond(
-        step + 1 == Plan.of(config).warmup,
+        Plan.of(config).publishing(step),
         lambda: embedding.acting(config, learner.vae),
         lambda: learner.encoder,
     )
     return dataclasses.replace(learner, encoder=encoder)
 
 
-def learn_to_see(config: Config, axis: str | None, learner: Learner, sensed, keys: Array, step: Array):
-    """VAE updates on this step's event fields or pictures: `(reconstruction, kl), learner`."""
+def _keep(
+    config: Config, world: World, actors: Actors, flown: EnvState, observation: Observation, step: Array
+) -> Samples | None:
+    """The rings with this step's observations [S * E, ...], if the VAE learns in it; only then are labels rendered."""
+    if actors.samples is None:
+        return None
+    plan = Plan.of(config)
+    keep = plan.teaching(step) | config.encoder.keep_learning
+
+    def target() -> vae.Target:
+        near = None
+        if embedding.needs_nearness(config):
+            near = jax.vmap(partial(env.nearness, config, world))(flown)
+        return _target_of(config, observation, near)
+
+    nothing = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(target))
+    wanted = lax.cond(keep, target, lambda: nothing)
+    rows = samples.samples_of(config.encoder, observation, wanted)
+    write = jax.vmap(samples.write, in_axes=(0, 0, None, None))
+    return write(actors.samples, _shaped(actors.reward.shape, rows), plan.kept(config, step), keep)
+
+
+def learn_to_see(config: Config, axis: str | None, learner: Learner, album: Samples | None, keys: Array, step: Array):
+    """VAE updates on samples of the rings [S, L, E, ...]: `(reconstruction, kl), learner`."""
     plan = Plan.of(config)
     nothing = jnp.float32(jnp.nan), jnp.float32(jnp.nan)
-    if not embedding.has_code(config):
+    if album is None:
         return nothing, learner
-    shards = keys.shape[0]
-    # Each shard draws its own noise, so that the layout on devices does not change it.
-    split = jax.tree.map(lambda x: x.reshape(shards, -1, *x.shape[1:]), sensed)
+    share = config.encoder.batch_size // config.train.shards
+    kept = plan.kept(config, step) + 1
 
-    def loss(params: Params, keys: Array):
-        total, parts = jax.vmap(lambda f, k: encoder.vae_loss(config.encoder, params, f, k))(split, keys)
+    def loss(params: Params, batch: Samples, keys: Array):
+        # Each shard draws its own noise, so that the layout on devices does not change it.
+        def one(batch: Samples, key: Array):
+            sensed = samples.read(batch)
+            return vae.vae_loss(config.encoder, params, sensed, batch.motion, batch.wanted, key)
+
+        total, parts = jax.vmap(one)(batch, keys)
         return jnp.sum(total) / config.train.shards, parts
 
     def update(learner: Learner, keys: Array):
-        gradient, parts = jax.grad(loss, has_aux=True)(learner.vae, keys)
+        draw_keys, noise_keys = jax.vmap(jax.random.split)(keys).swapaxes(0, 1)
+        batch = jax.vmap(lambda ring, key: samples.draw(config.encoder, ring, kept, share, key))(album, draw_keys)
+        gradient, parts = jax.grad(loss, has_aux=True)(learner.vae, batch, noise_keys)
         gradient = _all_sum(gradient, axis)
         change, optimiser = _vae_optimiser(config).update(gradient, learner.vae_optimiser, learner.vae)
         learner = dataclasses.replace(learner, vae=optax.apply_updates(learner.vae, change), vae_optimiser=optimiser)
@@ -362,7 +468,7 @@ def learn_to_see(config: Config, axis: str | None, learner: Learner, sensed, key
             return learn(learner, 1)
         return nothing, learner
 
-    return lax.cond(step < plan.warmup, lambda x: learn(x, config.encoder.warmup_updates_per_step), rest, learner)
+    return lax.cond(plan.teaching(step), lambda x: learn(x, config.encoder.warmup_updates_per_step), rest, learner)
 
 
 def learn_to_act(config: Config, axis: str | None, learner: Learner, ring, time: Array, keys: Array, step: Array):
@@ -404,7 +510,7 @@ def learn_to_act(config: Config, axis: str | None, learner: Learner, ring, time:
     def rest(learner: Learner):
         return (jnp.float32(jnp.nan), jnp.float32(jnp.nan)), learner
 
-    return lax.cond(step >= plan.learn_from, learn, rest, learner)
+    return lax.cond(plan.learning(step), learn, rest, learner)
 
 
 def _each_network(change: Callable[[Any], Any], learner: Learner) -> Learner:

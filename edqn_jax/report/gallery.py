@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
+from edqn_jax.learn import embedding
 from edqn_jax.learn.policy import PolicyParams
 from edqn_jax.report.curves import draw_learning, draw_returns
 from edqn_jax.report.flights import draw_path, draw_world
-from edqn_jax.report.images import LOOKS, draw_reconstruction, draw_sight
+from edqn_jax.report.images import LOOKS, RECONSTRUCTED_EVENTS, draw_reconstruction, draw_sight
 from edqn_jax.report.sights import Sights, coarse, decision_rows, poses
 from edqn_jax.runs.directory import TRAJECTORY_COLUMNS, RunDirectory
 from edqn_jax.sim.camera import on_screen
@@ -55,7 +56,11 @@ def _draw_what_it_sees(run: RunDirectory, sights: Sights, params: PolicyParams, 
         look,
     )
     file = run.figures / "reconstruction.png"
-    draw_reconstruction(shown.target[moments], shown.reconstruction[moments], file, look)
+    draws_nearness = embedding.needs_nearness(config)
+    drawn = LOOKS["depth"] if draws_nearness else RECONSTRUCTED_EVENTS if look.signed else look
+    # A target made of what is shown says nothing more than that.
+    seen = (shown.image[moments], look) if draws_nearness else None
+    draw_reconstruction(shown.target[moments], shown.reconstruction[moments], file, drawn, seen)
 
 
 def _busiest(events: np.ndarray, parts: int) -> np.ndarray:

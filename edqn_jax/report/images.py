@@ -79,27 +79,35 @@ def draw_sight(
 
 
 def draw_reconstruction(
-    shown: np.ndarray, reconstructions: np.ndarray, file: Path, look: Look = LOOKS["events"]
+    targets: np.ndarray,
+    drawn: np.ndarray,
+    file: Path,
+    look: Look = RECONSTRUCTED_EVENTS,
+    seen: tuple[np.ndarray, Look] | None = None,
 ) -> Figure:
-    """Draws what the VAE must reconstruct above what it makes of its codes, all on one colour scale.
+    """Draws what the decoder must draw above what it draws from the code, on one colour scale.
 
     Args:
-        shown: [N, h, w] blurred events, ON plus OFF, or blurred pictures.
-        reconstructions: [N, h, w] the decoder's, in the same units.
+        targets: [N, h, w] blurred events, ON plus OFF, blurred pictures or blurred nearness.
+        drawn: [N, h, w] by the decoder, in the same units.
         file: PNG to write.
-        look: of what the sensor shows.
+        look: of both.
+        seen: [N, h, w] what the sensor showed, and its look, for a row above.
     """
-    shown, reconstructions = np.asarray(shown), np.asarray(reconstructions)
-    scale = Normalize(0.0, _largest(shown)) if look.signed else scale_of(shown, look)
-    look = RECONSTRUCTED_EVENTS if look.signed else look
-    with drawing(1.35 * len(shown) + 0.9, 2.45, file) as figure:
-        grid = figure.subplots(2, len(shown), squeeze=False)
-        for row, (name, pictures) in enumerate(((f"{look.name}, blurred", shown), ("reconstruction", reconstructions))):
-            for axes, picture in zip(grid[row], pictures, strict=True):
-                _show(axes, picture, scale, look)
-            grid[row, 0].set_ylabel(name, fontsize=8)
-        for axes, seen, made in zip(grid[1], shown, reconstructions, strict=True):
-            error = float(np.sqrt(np.mean((seen - made) ** 2)))
+    targets, drawn = np.asarray(targets), np.asarray(drawn)
+    scale = Normalize(0.0, _largest(targets)) if look is RECONSTRUCTED_EVENTS else scale_of(targets, look)
+    true = "true nearness" if seen is not None else look.name
+    rows = [(f"{true}, blurred", targets, scale, look), ("from the code", drawn, scale, look)]
+    if seen is not None:
+        rows.insert(0, (seen[1].name, np.asarray(seen[0]), scale_of(seen[0], seen[1]), seen[1]))
+    with drawing(1.35 * len(targets) + 0.9, 1.15 * len(rows) + 0.15, file) as figure:
+        grid = figure.subplots(len(rows), len(targets), squeeze=False)
+        for line, (name, pictures, colours, row_look) in zip(grid, rows, strict=True):
+            for axes, picture in zip(line, pictures, strict=True):
+                _show(axes, picture, colours, row_look)
+            line[0].set_ylabel(name, fontsize=8)
+        for axes, wanted, made in zip(grid[-1], targets, drawn, strict=True):
+            error = float(np.sqrt(np.mean((wanted - made) ** 2)))
             axes.set_xlabel(f"RMS error {error:.2f}", fontsize=7, labelpad=2)
         _colour_bar(figure, scale, grid, look, look.unit)
     return figure

@@ -14,12 +14,14 @@ from jax import Array
 from jax.stages import Compiled
 
 from edqn_jax.config import Config
-from edqn_jax.learn import encoder
+from edqn_jax.learn import embedding, vae
 from edqn_jax.learn.policy import PolicyParams, fresh_policy
 from edqn_jax.parallel.devices import quick_compiler_options
-from edqn_jax.sim import camera, events, sensor
+from edqn_jax.sim import camera, drone, env, events, sensor
 from edqn_jax.sim.drone import Flight
+from edqn_jax.sim.env import MOTION_SIZE
 from edqn_jax.sim.events import EventField
+from edqn_jax.sim.moves import ACTIONS
 from edqn_jax.sim.scene import Scene
 
 FINE = 8
@@ -33,9 +35,9 @@ class Shown:
     image: np.ndarray
     """[D, H, W] ON minus OFF events per pixel, or the picture."""
     target: np.ndarray
-    """[D, H, W] target of the VAE: ON plus OFF events per pixel, or the picture; blurred."""
+    """[D, H, W] what the decoder must draw, blurred: nearness, or ON plus OFF events per pixel, or the picture."""
     reconstruction: np.ndarray
-    """[D, H, W] decoded from the VAE's code, in the same units."""
+    """[D, H, W] what it draws from the code, in the same units."""
 
 
 _Images = tuple[Array, Array, Array]
@@ -69,7 +71,7 @@ class Sights:
         assert self._shown is not None, "this sensor shows no image"
         rows = decision_rows(self.config, flown)
         padded = np.pad(rows, ((0, self.config.env.max_decisions - len(rows)), (0, 0)), mode="edge")
-        found = self._shown.result()(self.scene, params, *poses(flown, padded))
+        found = self._shown.result()(self.scene, params, *poses(flown, padded), own_motions(self.config, flown, padded))
         return Shown(*(np.asarray(leaf)[: len(rows)] for leaf in found))
 
     def rgb(self, position: np.ndarray, quaternion: np.ndarray) -> np.ndarray:
@@ -80,26 +82,36 @@ class Sights:
         config, decisions = self.config, self.config.env.max_decisions
         looks = len(sensor.frame_steps(config))
         params = jax.eval_shape(lambda: fresh_policy(config))
-        return _compiled(self._all_shown, self.scene, params, *_blank_poses(decisions, looks))
+        motion = jax.ShapeDtypeStruct((decisions, MOTION_SIZE), np.float32)
+        return _compiled(self._all_shown, self.scene, params, *_blank_poses(decisions, looks), motion)
 
-    def _all_shown(self, scene: Scene, params: PolicyParams, position: Array, quaternion: Array) -> _Images:
-        """The images of `shown` at [D, T, ...] poses; the sensor carries its memory from each decision to the next."""
+    def _all_shown(
+        self, scene: Scene, params: PolicyParams, position: Array, quaternion: Array, motion: Array
+    ) -> _Images:
+        """The images of `shown` at [D, T, ...] poses with own motions [D, MOTION_SIZE].
+
+        The sensor carries its memory from each decision to the next.
+        """
         config = self.config
         start, rest = jax.random.split(jax.random.key(0))
 
-        def one(memory: Any, given: tuple[Array, Array, Array]) -> tuple[Any, _Images]:
-            position, quaternion, key = given
+        def one(memory: Any, given: tuple[Array, ...]) -> tuple[Any, _Images]:
+            position, quaternion, motion, key = given
             here = Flight(position, quaternion, jnp.zeros_like(position))
             sensed, memory = sensor.sense(config, scene, here, memory, key)
             assert isinstance(sensed, EventField | Array)
-            code = encoder.embed(config.encoder, params.encoder, sensed)
+            nearness = None
+            if embedding.needs_nearness(config):
+                nearness = sensor.nearness_image(config, scene, position[-1], quaternion[-1])
+            code = vae.embed(config.encoder, params.encoder, sensed, motion)
             image = events.event_image(sensed) if isinstance(sensed, EventField) else sensed
-            target = encoder.target(config.encoder, sensed)
-            made = encoder.decode(config.encoder, config.camera, params.encoder, code)
-            return memory, (image, _per_pixel(sensed, target), _per_pixel(sensed, made))
+            target = vae.target(config.encoder, sensed, nearness)
+            made = vae.decode(config.encoder, config.camera, params.encoder, code)
+            drawn = (_drawn(config, sensed, channels) for channels in (target, made))
+            return memory, (image, *drawn)  # type: ignore[return-value]
 
         keys = jax.random.split(rest, len(position))
-        return jax.lax.scan(one, sensor.at_rest(config, start), (position, quaternion, keys))[1]
+        return jax.lax.scan(one, sensor.at_rest(config, start), (position, quaternion, motion, keys))[1]
 
     def _compile_rgb(self) -> Compiled:
         def picture(scene: Scene, position: Array, quaternion: Array) -> Array:
@@ -134,6 +146,21 @@ def coarse(picture: np.ndarray) -> np.ndarray:
     return blocks.mean(axis=(-4, -2))
 
 
+def own_motions(config: Config, flown: Mapping[str, np.ndarray], rows: np.ndarray) -> np.ndarray:
+    """Returns the own motions [D, MOTION_SIZE] at the last of each decision's rows [D, T], as `env.own_motion`.
+
+    The yaw rate is that of the heading between the last two rows, which a trajectory holds.
+    """
+    last = rows[:, -1]
+    (_, now), (_, before) = poses(flown, last), poses(flown, np.maximum(last - 1, 0))
+    yaw = drone.yaw_of(jnp.asarray(now))
+    rate = drone.wrap_angle(yaw - drone.yaw_of(jnp.asarray(before))) / config.drone.physics_dt_s
+    velocity = np.stack([flown[name] for name in ("vx", "vy", "vz")], axis=-1)[last]
+    ahead = env.heading_velocity(config.env, yaw, jnp.asarray(velocity))
+    moves = ACTIONS[flown["action"][last].astype(int)]
+    return np.concatenate([ahead, np.asarray(rate)[:, None], moves], axis=-1).astype(np.float32)
+
+
 def _compiled(program: Any, *arguments: Any) -> Compiled:
     return jax.jit(program).lower(*arguments).compile(quick_compiler_options(jax.default_backend()))
 
@@ -143,6 +170,8 @@ def _blank_poses(*shape: int) -> tuple[jax.ShapeDtypeStruct, jax.ShapeDtypeStruc
     return position, quaternion
 
 
-def _per_pixel(sensed: EventField | Array, image: Array) -> Array:
-    """Returns a target or reconstruction [C, H, W] in the units of `sensed`, summed over channels: [H, W]."""
-    return jnp.sum(jnp.expm1(image) if isinstance(sensed, EventField) else image, axis=-3)
+def _drawn(config: Config, sensed: EventField | Array, channels: Array) -> Array:
+    """Returns what there is to look at in a target [C, H, W] of `vae.target`: [H, W], in the units of what is shown."""
+    if embedding.needs_nearness(config):
+        return channels[-1]
+    return jnp.sum(jnp.expm1(channels) if isinstance(sensed, EventField) else channels, axis=-3)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from pathlib import Path
 
 import jax
@@ -12,7 +11,6 @@ from edqn_jax.config import Config
 from edqn_jax.config.limits import validate
 from edqn_jax.config.loading import apply, load_layer, to_yaml
 from edqn_jax.errors import ConfigError
-from edqn_jax.learn import embedding
 from edqn_jax.learn.policy import Policy, PolicyParams, fresh_policy
 from edqn_jax.runs.checkpoints import load_params, save_params
 from edqn_jax.runs.files import check_can_make, write_atomically
@@ -55,10 +53,6 @@ def load_run(folder: Path) -> tuple[Config, PolicyParams]:
     validate(config)
     params = load_params(folder / "checkpoints")
     fresh = jax.eval_shape(lambda: fresh_policy(config))
-    # Older policies hold the pixel network itself in place of its table.
-    learnt = jax.eval_shape(lambda: embedding.init(config, jax.random.key(0)))
-    if _shapes(params) == _shapes(dataclasses.replace(fresh, encoder=learnt)):
-        params = dataclasses.replace(params, encoder=jax.tree.map(np.asarray, embedding.acting(config, params.encoder)))
     if _shapes(params) != _shapes(fresh):
         raise ConfigError(f"the policy in '{folder}' does not have the shapes that its config.yaml asks for")
     return config, params

@@ -38,7 +38,9 @@ def workload(config: Config, scene: Scene) -> dict[str, Any]:
         "frames_per_decision": frames_per_decision(config),
         "obstacles": obstacle_count(scene),
         "replayed_samples_per_decision": agent.batch_size * agent.updates_per_step / envs,
-        "vae_samples_per_decision": 1.0 if config.encoder.keep_learning and has_code(config) else 0.0,
+        "vae_samples_per_decision": (
+            config.encoder.batch_size / envs if config.encoder.keep_learning and has_code(config) else 0.0
+        ),
         "num_envs": envs,
         "physics": config.drone.physics,
     }

@@ -155,6 +155,14 @@ def yaw_of(quaternion: Array) -> Array:
     return wrap_angle(2 * jnp.arctan2(quaternion[..., 3], quaternion[..., 0]))
 
 
+def yaw_rate_of(state: DroneState) -> Array:
+    """Returns the rate [] of the heading of `yaw_of`, rad/s; of a level body, its angular velocity about z."""
+    w, x, y, z = state.quaternion
+    p, q, r = state.angular_velocity
+    turn = w * (w * r + x * q - y * p) + z * (x * p + y * q + z * r)
+    return turn / jnp.maximum(w * w + z * z, 1e-9)
+
+
 Scalars = tuple[Array, Array, Array]
 """One vector, a scalar [] for each coordinate."""
 

@@ -30,6 +30,12 @@ from edqn_jax.sim.worlds import Missions
 OWN_SIZE = 10
 """Values of the drone's own state in an observation."""
 
+MOTION_SIZE = 7
+"""Values of the drone's own motion in an observation."""
+
+MIRRORED_MOTION = (1.0, -1.0, 1.0, -1.0, 1.0, -1.0, 1.0)
+"""Factors [MOTION_SIZE] on the own motion when left and right are exchanged."""
+
 
 @struct.dataclass
 class World:
@@ -47,6 +53,7 @@ class Observation:
 
     sensed: Sensed
     own: Array  # [OWN_SIZE], see `own_state`
+    motion: Array  # [MOTION_SIZE], see `own_motion`; only the encoder sees it
 
 
 @struct.dataclass
@@ -85,26 +92,43 @@ def velocity_command(config: EnvConfig, action: Array, yaw: Array) -> Array:
 
 
 def own_state(config: EnvConfig, scene: Scene, goal: Array, state: DroneState) -> Array:
-    """The drone's own ten values [10], each of order 1.
+    """Returns the drone's own ten values [OWN_SIZE], each of order 1.
 
     Horizontal distance and height to the goal (asinh(d / 2 m) / 2 and asinh(h / 2 m): metres count near the
     goal, powers of ten far away), cosine and sine of the heading, own position scaled to [-1, 1] in the
     flight volume (3), own velocity in the heading frame (3, in commanded speeds).
     """
     yaw = drone.yaw_of(state.quaternion)
-    cos, sin = jnp.cos(yaw), jnp.sin(yaw)
     ahead = goal - state.position
     distance = jnp.sqrt(ahead[0] ** 2 + ahead[1] ** 2)
     lower, upper = scene.volume[0], scene.volume[1]
     position = 2 * (state.position - lower) / (upper - lower) - 1
-    vx, vy, vz = state.velocity / config.speed_m_s
     return jnp.concatenate(
         [
-            jnp.stack([jnp.arcsinh(distance / 2.0) / 2.0, jnp.arcsinh(ahead[2] / 2.0), cos, sin]),
+            jnp.stack([jnp.arcsinh(distance / 2.0) / 2.0, jnp.arcsinh(ahead[2] / 2.0), jnp.cos(yaw), jnp.sin(yaw)]),
             position,
-            jnp.stack([cos * vx + sin * vy, cos * vy - sin * vx, vz]),
+            heading_velocity(config, yaw, state.velocity),
         ]
     )
+
+
+def own_motion(config: EnvConfig, state: DroneState, move: Array) -> Array:
+    """Returns what the drone knows of its own motion [MOTION_SIZE], each value of order 1.
+
+    Velocity in the heading frame (3, in commanded speeds), yaw rate (rad/s), last move (3).
+
+    Args:
+        move: [3] of the last decision, of -1, 0 and 1 in the heading frame; zeros at a start.
+    """
+    velocity = heading_velocity(config, drone.yaw_of(state.quaternion), state.velocity)
+    return jnp.concatenate([velocity, drone.yaw_rate_of(state)[None], move])
+
+
+def heading_velocity(config: EnvConfig, yaw: Array, velocity: Array) -> Array:
+    """Returns velocities [..., 3] m/s in the frame of headings [...] radians, in commanded speeds."""
+    vx, vy, vz = jnp.moveaxis(velocity / config.speed_m_s, -1, 0)
+    cos, sin = jnp.cos(yaw), jnp.sin(yaw)
+    return jnp.stack([cos * vx + sin * vy, cos * vy - sin * vx, vz], axis=-1)
 
 
 def bearing(config: EnvConfig, state: DroneState, goal: Array) -> Array:
@@ -126,17 +150,29 @@ def observe(
     scene: Scene,
     goal: Array,
     state: DroneState,
+    move: Array,
     poses: Flight,
     memory: EventMemory | None,
     key: Array,
 ) -> tuple[Observation, EventMemory | None]:
-    """What the sensor shows now, and the own state.
+    """What the sensor shows now, the own state and the own motion.
 
     Args:
+        move: as in `own_motion`.
         poses, memory, key: as in `sensor.sense`.
     """
     sensed, memory = sensor.sense(config, scene, poses, memory, key)
-    return Observation(sensed=sensed, own=own_state(config.env, scene, goal, state)), memory
+    own, motion = own_state(config.env, scene, goal, state), own_motion(config.env, state, move)
+    return Observation(sensed=sensed, own=own, motion=motion), memory
+
+
+def nearness(config: Config, world: World, state: EnvState) -> Array:
+    """Returns what the sensor `depth` would show of an environment now, [H, W].
+
+    A label for training: no observation holds it.
+    """
+    scene = _scene_of(config, world, state.mission, jnp.maximum(state.decision - 1, 0))
+    return sensor.nearness_image(config, scene, state.drone.position, state.drone.quaternion)
 
 
 def reset(config: Config, world: World, key: Array, mission: Array | None = None) -> tuple[EnvState, Observation]:
@@ -146,7 +182,7 @@ def reset(config: Config, world: World, key: Array, mission: Array | None = None
     scene = _scene_of(config, world, state.mission, state.decision)
     still = _hold(state.drone, len(frame_steps(config)))
     goal = world.missions.goal[state.mission]
-    observation, memory = observe(config, scene, goal, state.drone, still, state.memory, noise)
+    observation, memory = observe(config, scene, goal, state.drone, jnp.zeros(3), still, state.memory, noise)
     return dataclasses.replace(state, memory=memory), observation
 
 
@@ -211,7 +247,8 @@ def step(
 
     poses = _poses_seen(config, _choose(is_reset, start, state.drone), done.flight)
     memory = _choose(is_reset, rested, state.memory)
-    observation, memory = observe(config, scene, goal, done.drone, poses, memory, noise)
+    move = jnp.where(is_reset, 0.0, jnp.asarray(ACTIONS, jnp.float32)[action])
+    observation, memory = observe(config, scene, goal, done.drone, move, poses, memory, noise)
     after = EnvState(
         drone=done.drone,
         mission=mission,

@@ -48,6 +48,8 @@ class EventField:
     window_s: float = struct.field(pytree_node=False)  # length of the window, seconds
     divides_window: bool = struct.field(pytree_node=False, default=False)
     """Whether `t_first` is 0 and `t_step` the window over `count` everywhere: Eq. 5 between one pair of frames."""
+    with_noise: bool = struct.field(pytree_node=False, default=False)
+    """Whether the second half of the rows are noise events of the frame pairs of the first half."""
 
 
 @struct.dataclass
@@ -184,7 +186,8 @@ def events(
     if _has_noise(config):
         field = _join(field, _noise(config, memory.hot, field, times, key))
     even = divides_window(config, len(times))
-    return dataclasses.replace(field, window_s=window_s, divides_window=even), memory
+    noisy = _has_noise(config)
+    return dataclasses.replace(field, window_s=window_s, divides_window=even, with_noise=noisy), memory
 
 
 def divides_window(config: EventsConfig, frames: int) -> bool:

@@ -188,9 +188,13 @@ def brightness(config: Config, luma: Array) -> Array:
 def _show_depth(
     config: Config, scene: Scene, poses: Flight, memory: SensorMemory, key: Array
 ) -> tuple[Sensed, SensorMemory]:
-    position, quaternion = poses.position[-1], poses.quaternion[-1]
+    return nearness_image(config, scene, poses.position[-1], poses.quaternion[-1]), None
+
+
+def nearness_image(config: Config, scene: Scene, position: Array, quaternion: Array) -> Array:
+    """Returns what `depth` shows [H, W] from a body at `position` [3] with attitude `quaternion` [4]."""
     metres = camera.depth(config.camera, scene, position, mount_rotation(config, quaternion))
-    return DEPTH_SCALE * nearness(metres), None
+    return DEPTH_SCALE * nearness(metres)
 
 
 def _show_ranges(

@@ -111,7 +111,7 @@ def check_finite(plan: Plan, done: int, losses: Losses) -> None:
     Raises:
         DivergedError: names the loss and the step.
     """
-    learns = np.arange(done - len(losses.q_loss), done) >= plan.learn_from
+    learns = np.asarray(plan.learning(np.arange(done - len(losses.q_loss), done)))
     bad = learns & ~np.isfinite(losses.q_loss)
     if bad.any():
         raise DivergedError(f"training diverged: the Q loss was {losses.q_loss[bad][0]} at training step {done}")

@@ -54,8 +54,11 @@ def test_a_random_world_brings_its_own_budget(world):
 
 def test_random_worlds_and_the_papers_preset_keep_their_own_step_size_and_warmup():
     """The default's step size and warm-up were chosen on the paper's world alone (docs/decisions/0011)."""
-    for config, rate in ((resolve(world="medium"), 1e-3), (preset("paper"), 4e-4)):
-        assert (config.agent.learning_rate, config.encoder.warmup_updates_per_step) == (rate, 12)
+    medium, paper = resolve(world="medium"), preset("paper")
+    assert (medium.agent.learning_rate, paper.agent.learning_rate) == (1e-3, 4e-4)
+    assert (medium.encoder.warmup_decisions, medium.encoder.retrain_at) == (131_072, (0.15,))
+    assert (paper.encoder.warmup_updates_per_step, paper.encoder.retrain_at) == (12, ())
+    assert (paper.encoder.architecture, paper.encoder.target) == ("pooled", "sensed")
 
 
 def test_a_random_world_in_the_file_brings_its_budget_too(tmp_path):
@@ -90,7 +93,7 @@ def test_a_whole_number_may_stand_for_a_float():
     [
         ("agent: {bach_size: 3}", "there is no key 'agent.bach_size'; did you mean 'batch_size'?"),
         ("agnet: {batch_size: 3}", "there is no group 'agnet'; did you mean 'agent'?"),
-        ("batch_size: 3", "there is no group 'batch_size'; it belongs under 'agent:'"),
+        ("batch_size: 3", "there is no group 'batch_size'; it belongs under 'encoder:' or 'agent:'"),
         ("zzz: {a: 1}", "known are world, drone, camera"),
         ("agent: 3", "'agent' must hold keys such as"),
         ("agent: {batch_size: big}", "'agent.batch_size' must be a whole number, not the text 'big'"),

@@ -32,7 +32,14 @@ CONFIG = Config(
     camera=CameraConfig(width=8, height=6),
     env=EnvConfig(max_decisions=5),  # so that every environment is reset at least once
     encoder=EncoderConfig(
-        code_size=8, features=8, hidden=16, decoder_hidden=(16,), warmup_decisions=64, warmup_updates_per_step=1
+        code_size=8,
+        patch_layers=(8, 4),
+        joint_layers=(16,),
+        decoder_hidden=(16,),
+        warmup_decisions=64,
+        warmup_updates_per_step=1,
+        batch_size=64,
+        replay_size=64,
     ),
     agent=AgentConfig(
         hidden=(16, 16),

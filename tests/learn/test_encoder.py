@@ -1,4 +1,4 @@
-"""The event VAE: the dense factorisation, its losses, and that it learns."""
+"""The event VAE with the pooled encoder: the dense factorisation, its losses, and that it learns."""
 
 from __future__ import annotations
 
@@ -12,20 +12,37 @@ import optax
 import pytest
 
 from edqn_jax.config import CameraConfig, EncoderConfig, EventsConfig
-from edqn_jax.learn import encoder as en
+from edqn_jax.learn import pooled_encoder, vae
+from edqn_jax.learn.code import kl_divergence
 from edqn_jax.sim import events as ev
+from edqn_jax.sim.env import MOTION_SIZE
 from edqn_jax.sim.sensor import Form
 from tests.learn.moving_boxes import fields
 
 CAMERA = CameraConfig()
 SMALL = CameraConfig(width=6, height=4)
-CONFIG = EncoderConfig()
+CONFIG = EncoderConfig(architecture="pooled", target="sensed")
+STILL = jnp.zeros(MOTION_SIZE)
 WINDOWS = 4096
 UPDATES = 300
 
 
-fresh = jax.jit(en.init_encoder, static_argnums=(0, 1))
-embed = jax.jit(en.embed, static_argnums=0)
+fresh = jax.jit(vae.init_vae, static_argnums=(0, 1))
+
+
+@partial(jax.jit, static_argnums=0)
+def embed(config, params, sensed):
+    return vae.embed(config, params, sensed, STILL)
+
+
+def encode(config, params, sensed):
+    return vae.encode(config, params, sensed, STILL)
+
+
+def loss_of(config, params, sensed, key):
+    """The loss of fields whose own motion does not matter."""
+    wanted = vae.in_waves(config, vae.target(config, sensed))
+    return vae.vae_loss(config, params, sensed, STILL, wanted, key)
 
 
 def ragged_field(seed: int, frame_pairs: int = 3) -> ev.EventField:
@@ -65,7 +82,7 @@ def even_field() -> ev.EventField:
 @pytest.mark.parametrize("field", [ragged_field(1), even_field()], ids=["ragged", "even"])
 @pytest.mark.slow
 def test_dense_encoder_equals_the_sum_over_single_events(kind, field):
-    config = EncoderConfig(pixel_features=kind, time_frequencies=2, features=8, hidden=16, code_size=5)
+    config = dataclasses.replace(CONFIG, pixel_features=kind, time_frequencies=2, features=8, hidden=16, code_size=5)
     params = fresh(config, SMALL, jax.random.key(0))
     x, y, tau, p = event_list(field)
     weights = jax.random.normal(jax.random.key(1), (2, 5))
@@ -75,10 +92,10 @@ def test_dense_encoder_equals_the_sum_over_single_events(kind, field):
         return jnp.sum(weights[0] * mean + weights[1] * log_variance), (mean, log_variance)
 
     def dense(params):
-        return en.encode(config, params, field)
+        return encode(config, params, field)
 
     def sparse(params):
-        return en.encode_events(config, params, SMALL, x, y, tau, p)
+        return vae.encode_events(config, params, SMALL, x, y, tau, p)
 
     graded = partial(jax.value_and_grad, has_aux=True)
     (_, codes), gradient = jax.jit(graded(partial(score, dense)))(params)
@@ -94,28 +111,28 @@ def test_dense_encoder_equals_the_sum_over_single_events(kind, field):
 @pytest.mark.parametrize("kind", ["table", "network"])
 @pytest.mark.slow
 def test_pixel_features_written_out_give_the_same_codes(kind, form):
-    config = EncoderConfig(pixel_features=kind, features=8, hidden=16, code_size=5)
-    params = en.init_encoder(config, SMALL, jax.random.key(0), form=form)
-    table = en.tabulated(config, SMALL, params)
+    config = dataclasses.replace(CONFIG, pixel_features=kind, features=8, hidden=16, code_size=5)
+    params = vae.init_vae(config, SMALL, jax.random.key(0), form=form)
+    table = vae.frozen(config, SMALL, params, form=form)
     assert "table" in table["encoder"]["pixels"] and table["decoder"] is params["decoder"]
     field, picture = ragged_field(6), jax.random.normal(jax.random.key(1), (SMALL.height, SMALL.width))
     sensed = field if form is Form.EVENTS else picture
     # One and the same product of the same numbers, but for what is fused into it.
-    for one, two in zip(en.encode(config, params, sensed), en.encode(config, table, sensed), strict=True):
+    for one, two in zip(encode(config, params, sensed), encode(config, table, sensed), strict=True):
         np.testing.assert_allclose(one, two, rtol=1e-5, atol=1e-5)
     if form is Form.EVENTS:
         events = event_list(field)
-        codes = (en.encode_events(config, p, SMALL, *events)[0] for p in (params, table))
+        codes = (vae.encode_events(config, p, SMALL, *events)[0] for p in (params, table))
         np.testing.assert_allclose(*codes, rtol=1e-5, atol=1e-5)
-    again = en.tabulated(config, SMALL, table)
+    again = vae.frozen(config, SMALL, table, form=form)
     assert jax.tree.all(jax.tree.map(np.array_equal, table, again))
 
 
 def test_sums_of_events_that_divide_the_window_are_those_of_any_events():
     field = even_field()
     assert field.divides_window
-    known = en.temporal_sums(3, field)
-    sums = en.temporal_sums(3, dataclasses.replace(field, divides_window=False))
+    known = pooled_encoder.temporal_sums(3, field)
+    sums = pooled_encoder.temporal_sums(3, dataclasses.replace(field, divides_window=False))
     assert [k for k, phi in enumerate(known) if phi is None] == [2, 4, 6]
     for phi, general in zip(known, sums, strict=True):
         assert general is not None
@@ -124,12 +141,12 @@ def test_sums_of_events_that_divide_the_window_are_those_of_any_events():
 
 @pytest.mark.slow
 def test_the_encoder_is_blind_to_the_order_of_events():
-    config = EncoderConfig(features=8, hidden=16, code_size=5)
+    config = dataclasses.replace(CONFIG, features=8, hidden=16, code_size=5)
     params = fresh(config, SMALL, jax.random.key(0))
     columns = event_list(ragged_field(2))
     shuffle = np.random.default_rng(0).permutation(len(columns[0]))
-    mean, _ = en.encode_events(config, params, SMALL, *columns)
-    again, _ = en.encode_events(config, params, SMALL, *(column[shuffle] for column in columns))
+    mean, _ = vae.encode_events(config, params, SMALL, *columns)
+    again, _ = vae.encode_events(config, params, SMALL, *(column[shuffle] for column in columns))
     np.testing.assert_allclose(mean, again, rtol=1e-4, atol=1e-4)  # float32 sums in another order
 
 
@@ -150,27 +167,27 @@ def test_a_batch_is_encoded_as_its_fields_are_one_by_one():
     assert whole.shape == (4, CONFIG.code_size)
     np.testing.assert_allclose(whole, mapped, rtol=1e-4, atol=1e-4)
     np.testing.assert_allclose(whole, jnp.stack(single), rtol=1e-4, atol=1e-4)
-    assert en.decode(CONFIG, SMALL, params, whole).shape == (4, 2, SMALL.height, SMALL.width)
+    assert vae.decode(CONFIG, SMALL, params, whole).shape == (4, 2, SMALL.height, SMALL.width)
 
 
 @pytest.mark.slow
 def test_the_untrained_decoder_is_linear_in_the_code():
     params = fresh(CONFIG, CAMERA, jax.random.key(0))
     a, b = jax.random.normal(jax.random.key(1), (2, CONFIG.code_size))
-    both = en.decode(CONFIG, CAMERA, params, a + b)
-    apart = en.decode(CONFIG, CAMERA, params, a) + en.decode(CONFIG, CAMERA, params, b)
+    both = vae.decode(CONFIG, CAMERA, params, a + b)
+    apart = vae.decode(CONFIG, CAMERA, params, a) + vae.decode(CONFIG, CAMERA, params, b)
     np.testing.assert_allclose(both, apart, atol=1e-5)  # float32 sums of order 1
     assert np.abs(both).max() > 0.003
 
 
 def test_kl_is_the_textbook_value_and_zero_for_the_prior():
-    assert float(en.kl_divergence(jnp.zeros(4), jnp.zeros(4))) == 0.0
+    assert float(kl_divergence(jnp.zeros(4), jnp.zeros(4))) == 0.0
     # One dimension, N(1, 2) from N(0, 1): (1 + 2 - 1 - log 2) / 2.
-    value = en.kl_divergence(jnp.ones(1), jnp.log(2.0) * jnp.ones(1))
+    value = kl_divergence(jnp.ones(1), jnp.log(2.0) * jnp.ones(1))
     np.testing.assert_allclose(value, 0.5 * (2.0 - np.log(2.0)), rtol=1e-6)
 
 
-LOSS_AND_GRADIENT = jax.jit(jax.value_and_grad(en.vae_loss, argnums=1, has_aux=True), static_argnums=0)
+LOSS_AND_GRADIENT = jax.jit(jax.value_and_grad(loss_of, argnums=1, has_aux=True), static_argnums=0)
 
 
 @pytest.mark.parametrize("scale", [1e6, -1e6])
@@ -178,7 +195,7 @@ LOSS_AND_GRADIENT = jax.jit(jax.value_and_grad(en.vae_loss, argnums=1, has_aux=T
 def test_losses_and_gradients_stay_finite_under_huge_activations(scale):
     params = fresh(CONFIG, SMALL, jax.random.key(0))
     params["encoder"] = jax.tree.map(lambda x: x * scale, params["encoder"])
-    params["encoder"]["log_variance"]["bias"] += scale
+    params["encoder"]["code"]["log_variance"]["bias"] += scale
     batch = jax.tree.map(lambda x: x[None], ragged_field(1))
     (loss, losses), gradient = LOSS_AND_GRADIENT(CONFIG, params, batch, jax.random.key(0))
     assert np.isfinite(loss) and np.isfinite(losses.kl) and np.isfinite(losses.reconstruction)
@@ -201,11 +218,11 @@ def test_the_error_over_waves_is_the_error_over_pixels(bandwidth):
     config = dataclasses.replace(CONFIG, decoder_bandwidth=bandwidth)
     params = fresh(config, SMALL, jax.random.key(0))
     field = ragged_field(1)
-    _, losses = jax.jit(en.vae_loss, static_argnums=0)(config, params, field, jax.random.key(2))
-    mean, log_variance = jax.jit(en.encode, static_argnums=0)(config, params, field)
+    _, losses = jax.jit(loss_of, static_argnums=0)(config, params, field, jax.random.key(2))
+    mean, log_variance = jax.jit(encode, static_argnums=0)(config, params, field)
     noise = jnp.exp(0.5 * log_variance) * jax.random.normal(jax.random.key(2), mean.shape)
-    image = jax.jit(en.decode, static_argnums=(0, 1))(config, SMALL, params, mean + noise)
-    expected = jnp.sum(jnp.square(image - en.target(config, field)))
+    image = jax.jit(vae.decode, static_argnums=(0, 1))(config, SMALL, params, mean + noise)
+    expected = jnp.sum(jnp.square(image - vae.target(config, field)))
     np.testing.assert_allclose(losses.reconstruction, expected, rtol=1e-5)
 
 
@@ -213,10 +230,10 @@ def test_the_target_keeps_polarities_apart_and_compresses_counts():
     image = np.zeros((1, SMALL.height, SMALL.width), np.int8)
     image[0, 2, 3], image[0, 0, 0] = 7, -1
     field = ev.field_of_counts(EventsConfig(), jnp.asarray(image[0]))
-    sharp = en.target(dataclasses.replace(CONFIG, target_blur=0), field)
+    sharp = vae.target(dataclasses.replace(CONFIG, target_blur=0), field)
     expected = np.log1p(np.stack([np.maximum(image[0], 0), np.maximum(-image[0], 0)]).astype(np.float32))
     np.testing.assert_allclose(sharp, expected, rtol=1e-6)
-    blurred = en.target(dataclasses.replace(CONFIG, target_blur=1), field)
+    blurred = vae.target(dataclasses.replace(CONFIG, target_blur=1), field)
     np.testing.assert_allclose(blurred.sum(), sharp.sum(), rtol=1e-5)
     np.testing.assert_allclose(blurred[0, 2, 3], sharp[0, 2, 3] / 4.0, rtol=1e-5)
 
@@ -233,7 +250,7 @@ def trained():
         key_batch, key_code = jax.random.split(key)
         index = jax.random.randint(key_batch, (256,), 0, WINDOWS)
         batch = jax.tree.map(lambda x: x[index], seen)
-        gradient, losses = jax.grad(lambda p: en.vae_loss(CONFIG, p, batch, key_code), has_aux=True)(params)
+        gradient, losses = jax.grad(lambda p: loss_of(CONFIG, p, batch, key_code), has_aux=True)(params)
         change, state = optimiser.update(gradient, state)
         return (optax.apply_updates(params, change), state), losses
 
@@ -248,14 +265,14 @@ def trained():
 
 @jax.jit
 def error_of(params, field):
-    image = en.decode(CONFIG, CAMERA, params, en.embed(CONFIG, params, field))
-    return jnp.mean(jnp.sum(jnp.square(image - en.target(CONFIG, field)), axis=(-3, -2, -1)))
+    image = vae.decode(CONFIG, CAMERA, params, embed(CONFIG, params, field))
+    return jnp.mean(jnp.sum(jnp.square(image - vae.target(CONFIG, field)), axis=(-3, -2, -1)))
 
 
 @pytest.mark.slow
 def test_training_reconstructs_unseen_windows_better_than_any_constant(trained):
     before, after, losses, unseen = trained
-    target = en.target(CONFIG, unseen)
+    target = vae.target(CONFIG, unseen)
     constant = float(jnp.mean(jnp.sum(jnp.square(target - target.mean(0)), axis=(-3, -2, -1))))
     assert float(error_of(after, unseen)) < 0.8 * constant
     assert float(error_of(after, unseen)) < 0.8 * float(error_of(before, unseen))

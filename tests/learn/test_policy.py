@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 
 from edqn_jax.config import AgentConfig, CameraConfig, Config, EncoderConfig
-from edqn_jax.learn import encoder, policy, qnetwork, replay
-from edqn_jax.sim.env import OWN_SIZE, Observation
+from edqn_jax.learn import policy, qnetwork, replay, vae
+from edqn_jax.sim.env import MOTION_SIZE, OWN_SIZE, Observation
 from edqn_jax.sim.events import field_of_counts
 from edqn_jax.sim.moves import ACTIONS
 
 CONFIG = Config(
     camera=CameraConfig(width=8, height=6),
-    encoder=EncoderConfig(code_size=5, features=4, hidden=8, decoder_hidden=(8,)),
+    encoder=EncoderConfig(code_size=5, patch_layers=(4, 3), joint_layers=(8,), decoder_hidden=(8,)),
     agent=AgentConfig(history=3, hidden=(16,)),
 )
 SIZE = policy.observation_size(CONFIG)
@@ -29,7 +29,7 @@ def params():
     def fresh(key):
         code_key, q_key = jax.random.split(key)
         return policy.PolicyParams(
-            encoder=encoder.init_encoder(CONFIG.encoder, CONFIG.camera, code_key),
+            encoder=vae.init_vae(CONFIG.encoder, CONFIG.camera, code_key),
             q=qnetwork.init_q(CONFIG.agent, SIZE, len(ACTIONS), q_key),
         )
 
@@ -40,9 +40,10 @@ def observations(count, seed=0):
     rng = np.random.default_rng(seed)
     counts = rng.integers(-3, 4, (count, 6, 8)).astype(np.int8)
     own = rng.normal(size=(count, OWN_SIZE)).astype(np.float32)
+    motion = rng.normal(size=(count, MOTION_SIZE)).astype(np.float32)
     return [
-        Observation(sensed=field_of_counts(CONFIG.events, jnp.asarray(c)), own=jnp.asarray(o))
-        for c, o in zip(counts, own, strict=True)
+        Observation(sensed=field_of_counts(CONFIG.events, jnp.asarray(c)), own=jnp.asarray(o), motion=jnp.asarray(m))
+        for c, o, m in zip(counts, own, motion, strict=True)
     ]
 
 
@@ -77,7 +78,7 @@ def test_an_observation_is_the_scaled_code_and_the_own_state(params):
     one = observations(1)[0]
     flat = flatten(params.encoder, one)
     assert flat.shape == (SIZE,) == (5 + OWN_SIZE,)
-    code = encoder.embed(CONFIG.encoder, params.encoder, one.sensed)  # pyright: ignore[reportArgumentType]
+    code = vae.embed(CONFIG.encoder, params.encoder, one.sensed, one.motion)  # pyright: ignore[reportArgumentType]
     np.testing.assert_allclose(flat[:5], CONFIG.agent.code_scale * code, rtol=1e-6)
     np.testing.assert_array_equal(flat[5:], one.own)
 

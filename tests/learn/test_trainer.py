@@ -17,7 +17,8 @@ from edqn_jax.errors import ConfigError
 from edqn_jax.learn import replay, trainer
 from edqn_jax.learn.trainer import Plan, Trainer, TrainState
 from edqn_jax.random import run_streams
-from edqn_jax.sim.env import OWN_SIZE, Observation, World
+from edqn_jax.sim import env
+from edqn_jax.sim.env import MOTION_SIZE, OWN_SIZE, Observation, World
 from edqn_jax.sim.outcomes import Outcome
 from tests.miniature import miniature_world
 
@@ -25,12 +26,13 @@ CONFIG = Config(
     camera=CameraConfig(width=8, height=6),
     encoder=EncoderConfig(
         code_size=4,
-        features=8,
-        pixel_features="table",
-        hidden=16,
+        patch_layers=(8, 4),
+        joint_layers=(16,),
         decoder_hidden=(16,),
         warmup_decisions=64,
         warmup_updates_per_step=1,
+        batch_size=16,
+        replay_size=48,
     ),
     agent=AgentConfig(
         hidden=(16,),
@@ -195,12 +197,64 @@ def test_nothing_is_learnt_from_what_stood_there_before_the_first_reset(world: W
 def test_a_new_episode_begins_with_an_empty_memory() -> None:
     config = dataclasses.replace(CONFIG, env=dataclasses.replace(CONFIG.env, sensor="blind"))
     own = jnp.arange(1.0, 1.0 + 2 * OWN_SIZE).reshape(2, OWN_SIZE)
-    seen: Any = SimpleNamespace(is_reset=jnp.array([True, False]), observation=Observation(sensed=None, own=own))
+    seen: Any = SimpleNamespace(
+        is_reset=jnp.array([True, False]), observation=Observation(None, own, own[:, :MOTION_SIZE])
+    )
     actors: Any = SimpleNamespace(memory=jnp.full((1, 2, config.agent.history, OWN_SIZE), 7.0))
     learner: Any = SimpleNamespace(encoder={})
     fresh, running = trainer._remember(config, learner, actors, seen, jnp.int32(Plan.of(config).warmup + 5))
     np.testing.assert_array_equal(fresh, [np.zeros(OWN_SIZE), own[0]])
     np.testing.assert_array_equal(running, [np.full(OWN_SIZE, 7.0), own[1]])
+
+
+def test_a_retrained_encoder_begins_a_replay_of_its_own() -> None:
+    """Total 16 steps, warm-up 4, a lesson in steps 8 and 9; the replay holds 5 steps before the DQN learns."""
+    encoder = dataclasses.replace(CONFIG.encoder, retrain_at=(0.5,), retrain_decisions=32)
+    plan = Plan.of(dataclasses.replace(CONFIG, encoder=encoder))
+    steps = jnp.arange(16)
+    assert (plan.total, plan.lessons, plan.starts) == (16, ((0, 4), (8, 10)), 5)
+    assert np.flatnonzero(plan.teaching(steps)).tolist() == [0, 1, 2, 3, 8, 9]
+    assert np.flatnonzero(plan.publishing(steps)).tolist() == [3, 9]
+    assert plan.replay_time(steps).tolist() == [0, 0, 0, 0, 0, 1, 2, 3, 4, 5, 0, 1, 2, 3, 4, 5]
+    assert np.flatnonzero(plan.learning(steps)).tolist() == [9, 15]
+
+
+@pytest.mark.slow
+def test_the_encoder_that_acts_changes_at_the_end_of_each_lesson_and_never_else(world: World) -> None:
+    encoder = dataclasses.replace(CONFIG.encoder, retrain_at=(0.5,), retrain_decisions=32)
+    config = dataclasses.replace(CONFIG, encoder=encoder, drone=dataclasses.replace(CONFIG.drone, physics="rigid_body"))
+    state = jax.jit(lambda key: trainer.init(config, world, key))(jax.random.key(0))
+    step = jax.jit(lambda state, number: trainer.train_step(config, world, None, state, number))
+    changed, learnt = [], []
+    for number in range(12):
+        before = state
+        state, (_, losses) = step(state, jnp.int32(number))
+        changed += [number] * (not _same(before.learner.encoder, state.learner.encoder))
+        learnt += [number] * bool(np.isfinite(losses.reconstruction))
+        if number in (3, 9):  # nothing that was encoded with the old one is left in a memory
+            memory = np.asarray(state.actors.memory)
+            assert not memory[:, :, :-1].any() and memory[:, :, -1].any()
+    assert changed == [3, 9] and learnt == [0, 1, 2, 3, 8, 9]
+
+
+@pytest.mark.slow
+def test_labels_reach_the_encoder_in_lessons_and_nothing_else(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
+    config = dataclasses.replace(CONFIG, drone=dataclasses.replace(CONFIG.drone, physics="rigid_body"))
+    warmup = Plan.of(config).warmup
+    steps = jnp.arange(warmup, warmup + 8)
+
+    def trained(state: TrainState, steps) -> tuple:
+        return jax.jit(lambda state: trainer.run_steps(config, world, state, steps))(state)
+
+    fresh = jax.jit(lambda key: trainer.init(config, world, key))(jax.random.key(0))
+    warm, _ = trained(fresh, jnp.arange(warmup))
+    after = trained(warm, steps)
+    true = env.nearness
+    monkeypatch.setattr(env, "nearness", lambda *given: 3.0 - true(*given))
+    assert not _same(trained(fresh, jnp.arange(warmup))[0].learner.vae, warm.learner.vae)
+    again = trained(warm, steps)
+    assert np.isfinite(again[1][1].q_loss).any()
+    assert _same(_told(after), _told(again))
 
 
 @pytest.mark.slow
@@ -229,6 +283,12 @@ def test_environments_that_do_not_divide_into_shards_are_refused_with_a_sentence
 def test_totals_round_up_to_whole_chunks() -> None:
     config = dataclasses.replace(CONFIG, train=dataclasses.replace(CONFIG.train, total_steps=257))
     assert Plan.of(config).total == 20
+
+
+def _told(trained: tuple) -> tuple:
+    """What a chunk learnt, saw, did and how its episodes ended."""
+    state, (episodes, _) = trained
+    return state.learner, state.actors.memory, state.actors.replay, episodes
 
 
 def _same(one, two) -> bool:

@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 
 from edqn_jax.report.curves import draw_learning, draw_returns, running_mean
 from edqn_jax.report.flights import OBLIQUE, draw_path, draw_world
-from edqn_jax.report.images import draw_reconstruction, draw_sight
+from edqn_jax.report.images import LOOKS, draw_reconstruction, draw_sight
 from edqn_jax.report.solids import MAP, View, cut_open, far_to_near, hidden, solids_of
 from edqn_jax.report.style import OUTCOME_COLOURS
 from edqn_jax.sim.scene import (
@@ -266,6 +266,19 @@ def test_reconstructions_share_the_colours_of_the_events(tmp_path):
     assert limits == {(0.0, 4.0)}
     expected = np.sqrt(6 * 2.0**2 / (24 * 32))
     assert figure.axes[2].get_xlabel() == f"RMS error {expected:.2f}"
+
+
+def test_nearness_is_drawn_below_the_events_that_it_was_told_from(tmp_path):
+    counts, near = np.zeros((2, 24, 32)), np.full((2, 24, 32), 0.5)
+    counts[:, 3:9, 10], near[:, 3:9, 8:14] = -4, 2.0
+    seen = (counts, LOOKS["events"])
+    figure = draw_reconstruction(near, near * 0.75, tmp_path / "reconstruction.png", LOOKS["depth"], seen)
+    assert is_png(tmp_path / "reconstruction.png")
+    pictures = [np.asarray(axes.images[0].get_array()) for axes in figure.axes[:6]]
+    for row, expected in enumerate((counts, near, near * 0.75)):
+        np.testing.assert_array_equal(np.stack(pictures[2 * row : 2 * row + 2]), expected)
+    assert [axes.get_ylabel() for axes in figure.axes[:6:2]] == ["events", "true nearness, blurred", "from the code"]
+    assert {axes.images[0].get_clim() for axes in figure.axes[2:6]} == {(0.5, 2.0)}
 
 
 def test_silent_windows_can_be_drawn(tmp_path):

@@ -12,8 +12,9 @@ import numpy as np
 import pytest
 
 from edqn_jax.config import CameraConfig, Config
+from edqn_jax.learn import vae
 from edqn_jax.learn.policy import fresh_policy
-from edqn_jax.report.sights import FINE, Sights, coarse, decision_rows, poses
+from edqn_jax.report.sights import FINE, Sights, coarse, decision_rows, own_motions, poses
 from edqn_jax.sim import camera, drone, env, events, sensor, worlds
 from edqn_jax.sim.moves import ACTIONS
 from edqn_jax.sim.scene import Planes, Scene, UprightBoxes, build_scene, stack_scenes
@@ -47,9 +48,14 @@ def flight() -> tuple[dict[str, np.ndarray], env.Step]:
     state, _ = env.reset(SMALL, world, jax.random.key(3), jnp.asarray(0))
     actions = jnp.array([np.flatnonzero((ACTIONS == move).all(axis=1))[0] for move in MOVES])
     _, steps = jax.jit(lambda state: jax.lax.scan(partial(env.step, SMALL, world), state, actions))(state)
-    columns = np.concatenate([steps.flight.position, steps.flight.quaternion], -1).reshape(-1, 7).T
-    flown = dict(zip(("x", "y", "z", "qw", "qx", "qy", "qz"), columns, strict=True))
-    return flown | {"t": SMALL.drone.physics_dt_s * np.arange(1, columns.shape[1] + 1)}, steps
+    columns = (
+        np.concatenate([steps.flight.position, steps.flight.quaternion, steps.flight.velocity], -1).reshape(-1, 10).T
+    )
+    names = ("x", "y", "z", "qw", "qx", "qy", "qz", "vx", "vy", "vz")
+    flown: dict[str, np.ndarray] = dict(zip(names, columns, strict=True))
+    flown["t"] = SMALL.drone.physics_dt_s * np.arange(1, columns.shape[1] + 1)
+    flown["action"] = np.repeat(actions, SMALL.drone.physics_steps)
+    return flown, steps
 
 
 @pytest.fixture(scope="module")
@@ -66,6 +72,28 @@ def test_the_events_are_those_that_the_drone_got(sights, flight):
     np.testing.assert_array_equal(shown.image, seen)
     assert shown.target.shape == shown.reconstruction.shape == (len(MOVES), HEIGHT, WIDTH)
     assert shown.target.min() > -1e-5
+
+
+def test_own_motions_are_those_that_the_drone_knew(flight):
+    flown, steps = flight
+    motion = own_motions(SMALL, flown, decision_rows(SMALL, flown))
+    # The yaw rate is the mean of the last 0.02 s, not that at their end.
+    np.testing.assert_allclose(motion, steps.observation.motion, atol=0.02)
+    np.testing.assert_allclose(
+        motion[:, [0, 1, 2, 4, 5, 6]], steps.observation.motion[:, [0, 1, 2, 4, 5, 6]], atol=1e-5
+    )
+    assert np.abs(motion[:, 3]).max() > 0.01
+
+
+@pytest.mark.slow
+def test_the_true_nearness_is_what_the_sensor_depth_would_show(sights, flight):
+    flown, _ = flight
+    shown = sights.shown(fresh_policy(SMALL), flown)
+    position, quaternion = poses(flown, decision_rows(SMALL, flown)[:, -1])
+    true = jax.vmap(lambda p, q: sensor.nearness_image(SMALL, sights.scene, p, q))(position, quaternion)
+    wanted = vae.target(SMALL.encoder, jnp.zeros((len(MOVES), HEIGHT, WIDTH)), true)[:, 0]
+    np.testing.assert_allclose(shown.target, wanted, atol=1e-4)  # another program rounds otherwise
+    assert shown.target.std() > 0.05 and shown.reconstruction.std() < shown.target.std()
 
 
 @pytest.mark.slow

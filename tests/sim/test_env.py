@@ -9,6 +9,7 @@ from functools import partial
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 import pytest
 
@@ -260,6 +261,31 @@ def test_own_state_by_hand():
     np.testing.assert_allclose(own, expected, atol=1e-6)
 
 
+def test_own_motion_by_hand():
+    # Nose north, 2 m/s west, 1 m/s up, turning left at 0.7 rad/s; the last move was ahead and down.
+    state = body((20, 10, 5), np.pi / 2, velocity=(-2.0, 0.0, 1.0))
+    state = dataclasses.replace(state, angular_velocity=jnp.array([0.3, -0.2, 0.7]))
+    motion = env.own_motion(CONFIG.env, state, jnp.array([1.0, 0.0, -1.0]))
+    assert motion.shape == (env.MOTION_SIZE,)
+    np.testing.assert_allclose(motion, [0.0, 0.5, 0.25, 0.7, 1.0, 0.0, -1.0], atol=1e-6)
+
+
+def test_the_yaw_rate_is_that_of_the_heading_however_the_drone_leans():
+    # Turned by a small rotation in the body's frame, as in 1e-3 s at this angular velocity.
+    rng, step_s = np.random.default_rng(2), 1e-3
+    for _ in range(5):
+        attitude, rates = rng.normal(size=4) + [3, 0, 0, 0], rng.normal(size=3)
+        attitude /= np.linalg.norm(attitude)
+        after = np.zeros(4)
+        half = np.concatenate([[1.0], rates * step_s / 2])
+        mujoco.mju_mulQuat(after, attitude, half / np.linalg.norm(half))
+        turned = 2 * (np.arctan2(after[3], after[0]) - np.arctan2(attitude[3], attitude[0]))
+        state = dataclasses.replace(
+            body((0, 0, 5)), quaternion=jnp.asarray(attitude), angular_velocity=jnp.asarray(rates)
+        )
+        np.testing.assert_allclose(drone.yaw_rate_of(state), turned / step_s, atol=5e-3)  # of first order in 1e-3 s
+
+
 def test_the_heading_setpoint_is_the_bearing_and_is_held_near_the_goal():
     bearing = partial(env.bearing, CONFIG.env)
     np.testing.assert_allclose(bearing(body((50, 40, 5)), GOAL), np.pi / 2, atol=1e-6)
@@ -433,6 +459,8 @@ def test_a_flight_ahead_reaches_its_goal_and_the_next_step_is_the_reset(reset, s
     assert int(jnp.sum(back.observation.sensed.count)) == 0  # at rest nothing moves
     goal = world.missions.goal[fresh.mission]
     np.testing.assert_allclose(back.observation.own, env.own_state(FLOWN.env, SCENE, goal, fresh.drone), atol=1e-6)
+    np.testing.assert_array_equal(back.observation.motion, np.zeros(env.MOTION_SIZE))  # at rest, after no move
+    np.testing.assert_array_equal(last.observation.motion[4:], env.ACTIONS[AHEAD])
 
 
 @pytest.mark.slow

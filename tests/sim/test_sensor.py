@@ -176,6 +176,9 @@ def test_a_step_shows_what_is_seen_from_where_it_ends(world, name: str) -> None:
     again = jax.jit(lambda p: sensor.sense(config, scene, p, None, jax.random.key(0))[0])(end)
     np.testing.assert_allclose(step.observation.sensed, again, atol=1e-4)  # two programs
     assert np.ptp(np.asarray(step.flight.position), axis=0).max() > 0.3  # elsewhere, another view
+    if name == "depth":  # which is the label of every other sensor
+        label = jax.jit(lambda s: env.nearness(config_of("frames"), world, s))(state)
+        np.testing.assert_allclose(label, step.observation.sensed, atol=1e-4)
 
 
 @pytest.mark.parametrize(("name", "frames"), [("events", 2), ("frames", 1), ("depth", 1), ("ranges", 0), ("blind", 0)])
@@ -257,7 +260,8 @@ def test_a_new_sensor_needs_only_its_entry_to_act(with_new_sensor, world) -> Non
     assert step.observation.sensed.shape == shown.shape  # type: ignore
     assert workload(config, jax.tree.map(lambda x: x[0], world.pool))["frames_per_decision"] == 1
     params = policy.fresh_policy(config)
-    code = embedding.embed(config, params.encoder, shown)
+    observation = env.Observation(shown, jnp.zeros(env.OWN_SIZE), jnp.zeros(env.MOTION_SIZE))
+    code = embedding.embed(config, params.encoder, observation)
     assert code is not None and code.shape == (embedding.size(config),)
     if sensor.sensor_of(config).form is Form.VALUES:
         np.testing.assert_array_equal(code, shown)

@@ -12,7 +12,7 @@ from edqn_jax.learn.trainer import Episodes, Losses, Plan
 from edqn_jax.sim.outcomes import Outcome
 from edqn_jax.training.history import EndedEpisodes, check_finite
 
-PLAN = Plan(total=100, warmup=4, learn_from=10)
+PLAN = Plan(total=100, warmup=4, starts=6, lessons=((0, 4),))
 
 
 def losses(*q_loss: float) -> Losses:

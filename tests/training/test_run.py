@@ -179,7 +179,7 @@ def test_a_validation_is_due_where_a_multiple_is_crossed_once_there_was_learning
     every: int, checked: int, done: int, due: bool
 ) -> None:
     config = Config(train=TrainConfig(num_envs=16, validation_every=every))
-    assert is_due(config, Plan(total=200, warmup=0, learn_from=5), checked, done) is due
+    assert is_due(config, Plan(total=200, warmup=0, starts=5, lessons=()), checked, done) is due
 
 
 @pytest.mark.slow

@@ -1,0 +1,93 @@
+"""The patch encoder: events are summed per pixel, pixels are read together in patches, patches are joined to a code.
+
+An event tells distance only together with the motion that made it, and only beside its neighbours. So the layers
+before the join are shared by all patches, and each sees the patch's place in the image and the drone's own motion.
+
+N is the number of patches, K the number of pixels in one.
+"""
+
+from __future__ import annotations
+
+import flax.linen as nn
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from edqn_jax.config import EncoderConfig
+from edqn_jax.learn.code import CodeHead
+from edqn_jax.sim.events import EventField
+
+
+def log_counts(field: EventField) -> list[Array]:
+    """Returns log(1 + count) of ON and of OFF events of each pixel, of each pair of frames: 2 F arrays [..., H, W].
+
+    Noise events of a pixel are added to those of the same frame pair and polarity, which no sensor could tell apart.
+    """
+    signs = (field.polarity > 0, field.polarity < 0)
+    if not field.with_noise:
+        # A pixel's events between two frames have one polarity, so one logarithm serves both channels.
+        level = jnp.log(1.0 + field.count.astype(jnp.float32))
+        pairs = [jnp.where(sign, level, 0.0) for sign in signs]
+    else:
+        *batch, rows, height, width = field.count.shape
+        split = (*batch, 2, rows // 2, height, width)
+        counts = [jnp.sum(jnp.where(sign, field.count, 0).reshape(split), axis=-4) for sign in signs]
+        pairs = [jnp.log(1.0 + count.astype(jnp.float32)) for count in counts]
+    return [pair[..., row, :, :] for row in range(pairs[0].shape[-3]) for pair in pairs]
+
+
+def patches(image: Array, pixels: int) -> Array:
+    """Cuts images `[..., H, W]` into square patches of `pixels` x `pixels`: `[..., N, K]`, row by row.
+
+    Images whose sides are no multiples of `pixels` are padded with zeros at the right and at the bottom.
+    """
+    *batch, height, width = image.shape
+    rows, columns = -(-height // pixels), -(-width // pixels)
+    missing = rows * pixels - height, columns * pixels - width
+    if any(missing):
+        image = jnp.pad(image, [(0, 0)] * len(batch) + [(0, size) for size in missing])
+    cut = image.reshape(*batch, rows, pixels, columns, pixels).swapaxes(-3, -2)
+    return cut.reshape(*batch, rows * columns, pixels * pixels)
+
+
+def patch_places(height: int, width: int, pixels: int) -> np.ndarray:
+    """Returns the centres of the patches, `[N, 2]`: across and down, each from -1 to 1 over the image."""
+    rows, columns = -(-height // pixels), -(-width // pixels)
+    down, across = np.divmod(np.arange(rows * columns), columns)
+    middle = np.stack([(across + 0.5) * pixels / width, (down + 0.5) * pixels / height], axis=-1)
+    return (2.0 * middle - 1.0).astype(np.float32)
+
+
+class PatchEncoder(nn.Module):
+    """Layers shared by all patches, layers over all patches joined, and the code."""
+
+    config: EncoderConfig
+    height: int
+    width: int
+
+    @nn.compact
+    def __call__(self, sensed: EventField | Array, motion: Array) -> tuple[Array, Array]:
+        """Returns mean and log-variance `[..., code_size]` of fields `[..., F, H, W]` or pictures `[..., H, W]`.
+
+        Args:
+            motion: `[..., MOTION_SIZE]` own motion, see `sim.env.own_state`.
+        """
+        images = log_counts(sensed) if isinstance(sensed, EventField) else [sensed]
+        first, *later = self.config.patch_layers
+        # One product for each channel: joined to one array first, they take twice as long on a CPU.
+        products = [
+            nn.Dense(first, use_bias=number == 0, name=f"channel_{number}")(patches(image, self.config.patch_pixels))
+            for number, image in enumerate(images)
+        ]
+        z = sum(products[1:], products[0])
+        # A layer over patch, place and motion together; what all patches or all fields share is computed once.
+        place = patch_places(self.height, self.width, self.config.patch_pixels)
+        z += nn.Dense(first, use_bias=False, name="place")(jnp.asarray(place))
+        z += nn.Dense(first, use_bias=False, name="motion")(motion)[..., None, :]
+        z = nn.relu(z)
+        for number, size in enumerate(later, start=1):
+            z = nn.relu(nn.Dense(size, name=f"patch_{number}")(z))
+        z = jnp.concatenate([z.reshape(*z.shape[:-2], -1), motion], axis=-1)
+        for number, size in enumerate(self.config.joint_layers):
+            z = nn.relu(nn.Dense(size, name=f"joint_{number}")(z))
+        return CodeHead(self.config.code_size, name="code")(z)

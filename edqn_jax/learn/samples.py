@@ -1,0 +1,138 @@
+"""What the VAE learns from: observations and what the decoder must draw of each, in a ring per logical shard.
+
+Consecutive observations of one flight are alike, and so are those of all flights in one place. So the VAE does not
+learn from the newest ones alone, but from batches drawn from the last `encoder.replay_size`, half of them mirrored left
+to right: the physics of drone and light know no left or right, but for the place of the sun.
+
+L is the ring's length in decisions, E the environments of the shard. Events are stored as signed counts wherever
+nothing else of them is read.
+"""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jax import Array
+
+from edqn_jax.config import EncoderConfig
+from edqn_jax.learn import vae
+from edqn_jax.learn.vae import Target
+from edqn_jax.random import integers
+from edqn_jax.sim.env import MIRRORED_MOTION, Observation
+from edqn_jax.sim.events import EventField
+
+MOST_EVENTS = 2**15 - 1
+"""More events of a pixel than this are stored as this many."""
+
+
+@struct.dataclass
+class Counts:
+    """An event field of which the times are not read."""
+
+    signed: Array  # [..., F, H, W] int16 count x polarity
+    window_s: float = struct.field(pytree_node=False)
+    divides_window: bool = struct.field(pytree_node=False)
+    with_noise: bool = struct.field(pytree_node=False)
+
+
+@struct.dataclass
+class Samples:
+    """What a VAE update is given, or a ring of it with leading [L, E]."""
+
+    sensed: Counts | EventField | Array  # a picture is an array
+    motion: Array  # [..., MOTION_SIZE]
+    wanted: Target
+
+
+def samples_of(config: EncoderConfig, observation: Observation, wanted: Target) -> Samples:
+    """Returns observations and their targets in the form in which they are stored."""
+    sensed = observation.sensed
+    assert isinstance(sensed, EventField | Array)
+    return Samples(_stored(config, sensed), observation.motion, wanted)
+
+
+def empty(config: EncoderConfig, one: Samples, envs: int, total_envs: int) -> Samples:
+    """Returns a ring for one shard's `envs` of `total_envs` environments, like `one` sample, which may be a shape.
+
+    Its last row is not part of the ring: what must not be kept is written there.
+    """
+    length = ring_length(config, total_envs) + 1
+    return jax.tree.map(lambda leaf: jnp.zeros((length, envs, *leaf.shape), leaf.dtype), one)
+
+
+def ring_length(config: EncoderConfig, total_envs: int) -> int:
+    """Returns the decisions that the ring holds."""
+    return max(config.replay_size // total_envs, 1)
+
+
+def write(ring: Samples, rows: Samples, time: Array, keep: Array) -> Samples:
+    """Returns the ring with the samples [E, ...] of one decision.
+
+    Args:
+        time: [] int32, how many decisions have been kept before.
+        keep: [] bool, whether these are kept.
+    """
+    length = ring.motion.shape[0] - 1
+    at = jnp.where(keep, time % length, length)
+    return jax.tree.map(lambda old, new: old.at[at].set(new), ring, rows)
+
+
+def draw(config: EncoderConfig, ring: Samples, time: Array, count: int, key: Array) -> Samples:
+    """Returns `count` samples of one shard, uniform over those in the ring.
+
+    Args:
+        time: [] int32, how many decisions have been kept, at least 1.
+        key: consumed.
+    """
+    rows, envs = ring.motion.shape[:2]
+    row_key, env_key, mirror_key = jax.random.split(key, 3)
+    row = integers(row_key, (count,), jnp.minimum(time, rows - 1))
+    env = integers(env_key, (count,), envs)
+    drawn = jax.tree.map(lambda leaf: leaf[row, env], ring)
+    if not config.mirror:
+        return drawn
+    coin = jax.random.bernoulli(mirror_key, shape=(count,))
+    return jax.tree.map(
+        lambda kept, turned: jnp.where(coin.reshape(-1, *[1] * (kept.ndim - 1)), turned, kept), drawn, mirrored(drawn)
+    )
+
+
+def mirrored(samples: Samples) -> Samples:
+    """Returns samples [...] as they would be with left and right exchanged."""
+    # The standing waves across the image that change their sign are the odd ones.
+    amplitudes = samples.wanted.amplitudes
+    signs = jnp.asarray(1.0 - 2.0 * (np.arange(amplitudes.shape[-1]) % 2), jnp.float32)
+    return Samples(
+        sensed=jax.tree.map(lambda image: jnp.flip(image, axis=-1), samples.sensed),
+        motion=samples.motion * jnp.asarray(MIRRORED_MOTION),
+        wanted=Target(amplitudes * signs, samples.wanted.beyond),
+    )
+
+
+def read(samples: Samples) -> EventField | Array:
+    """Returns what the sensor showed in samples, as the encoder takes it."""
+    stored = samples.sensed
+    if not isinstance(stored, Counts):
+        return stored
+    count, polarity = jnp.abs(stored.signed).astype(jnp.int32), jnp.sign(stored.signed).astype(jnp.int8)
+    unread = jnp.zeros(count.shape)
+    return EventField(count, polarity, unread, unread, stored.window_s, stored.divides_window, stored.with_noise)
+
+
+def _stored(config: EncoderConfig, sensed: EventField | Array) -> Counts | EventField | Array:
+    if not isinstance(sensed, EventField) or not _counts_alone(config, sensed):
+        return sensed
+    signed = (jnp.minimum(sensed.count, MOST_EVENTS) * sensed.polarity).astype(jnp.int16)
+    return Counts(signed, sensed.window_s, sensed.divides_window, sensed.with_noise)
+
+
+def _counts_alone(config: EncoderConfig, field: EventField) -> bool:
+    """Returns whether the encoder reads signed counts and no times of such fields."""
+    return config.architecture == "patches" or field.divides_window
+
+
+def target_of(config: EncoderConfig, sensed: EventField | Array, nearness: Array | None) -> Target:
+    """Returns what the decoder must draw of observations `[..., H, W]`, see `vae.target`."""
+    return vae.in_waves(config, vae.target(config, sensed, nearness))
