@@ -36,8 +36,8 @@ RANDOM_WORLDS: Layer = {
     "events": {"threshold": 0.03, "tolerance": 0.03, "frame_times_s": (-0.08, 0.0)},
 }
 """What random worlds change in the `default` preset: more decisions, fewer and smaller updates for each, a longer
-window of events with lower thresholds, and an encoder that learns from more, and again from flights of the policy, since
-there only events tell where obstacles are."""
+window of events with lower thresholds, and an encoder that learns from more, and again from flights of the policy,
+since there only events tell where obstacles are."""
 
 
 def world_layer(world: str) -> Layer:
