@@ -86,6 +86,8 @@ def check(config: Config) -> None:
     noisy = (sensor.threshold_mismatch, sensor.leak_rate_hz, sensor.shot_rate_hz, sensor.hot_pixel_fraction)
     if sensor.law != "paper" or len(sensor.frame_times_s) != 2 or any(noisy):
         raise ConfigError("the conventional stack supports only the noiseless 'paper' event law between two frames")
+    if config.encoder.retrain_at:
+        raise ConfigError("the conventional stack trains its VAE once; set encoder.retrain_at to an empty list")
     if config.camera.mount != "level":
         raise ConfigError("the conventional stack supports only a level camera; set camera.mount to 'level'")
 

@@ -21,7 +21,7 @@ class StateBytes:
     replay_slot: int
     """Of one observation in the replay with action, reward and outcome."""
     rest: int
-    """Of parameters, optimisers, keys of the shards and the step, independent of the number of environments."""
+    """Of parameters, optimisers, what the VAE learns from, keys of the shards and the step."""
     environments: int
     replay_slots: int
 
@@ -30,11 +30,11 @@ def state_bytes(config: Config, world: World) -> StateBytes:
     """Returns the bytes of the train state for a configuration."""
     state = jax.eval_shape(lambda world, key: trainer.init(config, world, key), world, jax.random.key(0))
     actors, ring = state.actors, state.actors.replay
-    environments = size_of(dataclasses.replace(actors, replay=None, key=None))
+    environments = size_of(dataclasses.replace(actors, replay=None, samples=None, key=None))
     return StateBytes(
         environment=environments // config.train.num_envs,
         replay_slot=size_of(ring) // ring.reward.size,
-        rest=size_of((state.learner, actors.key, state.step)),
+        rest=size_of((state.learner, actors.samples, actors.key, state.step)),
         environments=config.train.num_envs,
         replay_slots=ring.reward.size,
     )

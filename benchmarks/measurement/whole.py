@@ -19,11 +19,17 @@ WHOLE = "whole_training_step"
 
 
 def steady(config: Config, chunk_steps: int) -> Config:
-    """Returns `config` with the VAE learning throughout and two chunks of warm-up, after which all chunks are alike."""
+    """Returns `config` with a VAE sample a decision throughout and two chunks of warm-up; all later ones are alike."""
     decisions = chunk_steps * config.train.num_envs
     return dataclasses.replace(
         config,
-        encoder=dataclasses.replace(config.encoder, keep_learning=True, warmup_decisions=decisions),
+        encoder=dataclasses.replace(
+            config.encoder,
+            keep_learning=True,
+            warmup_decisions=decisions,
+            batch_size=config.train.num_envs,
+            retrain_at=(),
+        ),
         agent=dataclasses.replace(config.agent, learning_starts=min(decisions, config.agent.learning_starts)),
         train=dataclasses.replace(config.train, chunk_steps=chunk_steps, total_steps=1000 * decisions),
     )

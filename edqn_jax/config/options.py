@@ -211,13 +211,14 @@ class EncoderConfig:
     hold_decisions: int = 4
     """Mean length of a random manoeuvre of the warm-up, decisions."""
     retrain_at: tuple[float, ...] = ()
-    """Shares of all decisions at which the VAE is trained again, now on flights of the policy. The agent then uses the
-    new encoder, and the replay starts anew, so that codes of two encoders are never mixed."""
+    """Shares of all decisions at which the VAE is trained again, on flights of the policy and at first on what is left
+    of those before. The agent then uses the new encoder, and the replay starts anew, so that codes of two encoders are
+    never mixed. A retraining that would leave the DQN less than a quarter of the run is left out."""
     retrain_decisions: int = 65_536
-    """Decisions of each such training."""
+    """Decisions of each such training; at most an eighth of all decisions."""
     keep_learning: bool = False
-    """Go on training the VAE on every new field after the warm-up. The agent still uses the encoder of the warm-up.
-    Unused where there is no VAE."""
+    """Go on training the VAE after the warm-up, one update a training step. The agent does not use what it learns then,
+    unless `retrain_at` says so. Unused where there is no VAE."""
 
 
 @dataclass(frozen=True)

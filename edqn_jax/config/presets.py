@@ -30,7 +30,14 @@ def preset(name: str) -> Config:
         return dataclasses.replace(
             Config(),
             events=EventsConfig(threshold=0.1, tolerance=0.1, contrast_on=0.1, contrast_off=0.1),
-            encoder=EncoderConfig(architecture="pooled", target="sensed", warmup_updates_per_step=12),
+            encoder=EncoderConfig(
+                architecture="pooled",
+                target="sensed",
+                warmup_updates_per_step=12,
+                batch_size=16,
+                replay_size=16,
+                mirror=False,
+            ),
             env=EnvConfig(
                 reward="sparse", progress_weight=1.0, path_weight=0.0, left_volume_reward=0.0, step_reward=0.0
             ),

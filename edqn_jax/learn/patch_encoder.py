@@ -70,7 +70,7 @@ class PatchEncoder(nn.Module):
         """Returns mean and log-variance `[..., code_size]` of fields `[..., F, H, W]` or pictures `[..., H, W]`.
 
         Args:
-            motion: `[..., MOTION_SIZE]` own motion, see `sim.env.own_state`.
+            motion: `[..., MOTION_SIZE]` own motion, see `sim.env.own_motion`.
         """
         images = log_counts(sensed) if isinstance(sensed, EventField) else [sensed]
         first, *later = self.config.patch_layers

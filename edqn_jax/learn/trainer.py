@@ -49,7 +49,7 @@ class Learner:
 
     vae: Params  # what learns; {} for a sensor whose image is not encoded
     vae_optimiser: Any
-    encoder: Params  # what acts: the VAE as the warm-up left it, its pixel features a table
+    encoder: Params  # frozen encoder used for acting
     q: Params
     target: Params
     average: Params  # Polyak average that evaluation flies
@@ -123,11 +123,8 @@ class Plan:
         warmup = min(math.ceil(config.encoder.warmup_decisions / envs), total // 4) if embedding.has_code(config) else 0
         least = config.agent.n_step + config.agent.history
         starts = max(math.ceil(config.agent.learning_starts / envs), least)
-        lessons = [(0, warmup)] if warmup else []
-        if warmup:
-            length = math.ceil(config.encoder.retrain_decisions / envs)
-            lessons += [(round(share * total), round(share * total) + length) for share in config.encoder.retrain_at]
-        return cls(total=total, warmup=warmup, starts=starts, lessons=tuple(lessons))
+        lessons = _lessons(config, total, warmup, starts) if warmup else ()
+        return cls(total=total, warmup=warmup, starts=starts, lessons=lessons)
 
     @property
     def learn_from(self) -> int:
@@ -169,6 +166,21 @@ class Plan:
         return jnp.asarray(step >= self.warmup) & (self.replay_time(step) >= self.starts)
 
 
+def _lessons(config: Config, total: int, warmup: int, starts: int) -> tuple[tuple[int, int], ...]:
+    """Returns the warm-up and each retraining that leaves the DQN at least a quarter of the run after it.
+
+    A retraining takes an eighth of the run at most, begins when the DQN has learnt for as long as that, and never
+    before another has ended.
+    """
+    length = min(math.ceil(config.encoder.retrain_decisions / config.train.num_envs), total // 8)
+    lessons = [(0, warmup)]
+    for share in config.encoder.retrain_at:
+        first = max(round(share * total), lessons[-1][1] + starts + length)
+        if length and total - (first + length) - starts >= total // 4:
+            lessons.append((first, first + length))
+    return tuple(lessons)
+
+
 class InitialKeys(NamedTuple):
     """What the key of a run's learning is split into."""
 
@@ -194,10 +206,10 @@ def init(config: Config, world: World, key: Array) -> TrainState:
         ConfigError: if the environments or the batch do not divide into the shards.
     """
     shards, envs = config.train.shards, config.train.num_envs
-    if envs % shards or config.agent.batch_size % shards:
+    if envs % shards or config.agent.batch_size % shards or config.encoder.batch_size % shards:
         raise ConfigError(
-            f"train.num_envs ({envs}) and agent.batch_size ({config.agent.batch_size}) "
-            f"must be multiples of train.shards ({shards})"
+            f"train.num_envs ({envs}), agent.batch_size ({config.agent.batch_size}) and encoder.batch_size "
+            f"({config.encoder.batch_size}) must be multiples of train.shards ({shards})"
         )
     keys = InitialKeys.split(key, envs, shards)
     # Nothing has been seen yet: the first step is every environment's reset.

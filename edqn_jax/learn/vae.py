@@ -165,7 +165,7 @@ def encode(config: EncoderConfig, params: Params, sensed: EventField | Array, mo
     The code that the agent sees is the mean.
 
     Args:
-        motion: `[..., MOTION_SIZE]` own motion, see `sim.env.own_state`.
+        motion: `[..., MOTION_SIZE]` own motion, see `sim.env.own_motion`.
     """
     fields = isinstance(sensed, EventField)
     height, width = (sensed.count if fields else sensed).shape[-2:]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from importlib.metadata import version
 from pathlib import Path
 
 import jax
@@ -54,7 +55,10 @@ def load_run(folder: Path) -> tuple[Config, PolicyParams]:
     params = load_params(folder / "checkpoints")
     fresh = jax.eval_shape(lambda: fresh_policy(config))
     if _shapes(params) != _shapes(fresh):
-        raise ConfigError(f"the policy in '{folder}' does not have the shapes that its config.yaml asks for")
+        raise ConfigError(
+            f"the policy in '{folder}' does not have the shapes that its config.yaml asks for in edqn_jax "
+            f"{version('edqn-jax')}; fly it with the version that trained it, or train it anew"
+        )
     return config, params
 
 

@@ -33,6 +33,9 @@ OWN_SIZE = 10
 MOTION_SIZE = 7
 """Values of the drone's own motion in an observation."""
 
+MOST_YAW_RATE = 10.0
+"""Bound of the yaw rate in an observation, rad/s."""
+
 MIRRORED_MOTION = (1.0, -1.0, 1.0, -1.0, 1.0, -1.0, 1.0)
 """Factors [MOTION_SIZE] on the own motion when left and right are exchanged."""
 
@@ -115,13 +118,15 @@ def own_state(config: EnvConfig, scene: Scene, goal: Array, state: DroneState) -
 def own_motion(config: EnvConfig, state: DroneState, move: Array) -> Array:
     """Returns what the drone knows of its own motion [MOTION_SIZE], each value of order 1.
 
-    Velocity in the heading frame (3, in commanded speeds), yaw rate (rad/s), last move (3).
+    Velocity in the heading frame (3, in commanded speeds), yaw rate (rad/s, at most `MOST_YAW_RATE`), last move (3).
 
     Args:
         move: [3] of the last decision, of -1, 0 and 1 in the heading frame; zeros at a start.
     """
     velocity = heading_velocity(config, drone.yaw_of(state.quaternion), state.velocity)
-    return jnp.concatenate([velocity, drone.yaw_rate_of(state)[None], move])
+    # Of a drone on its back the heading turns at any rate.
+    rate = jnp.clip(drone.yaw_rate_of(state), -MOST_YAW_RATE, MOST_YAW_RATE)
+    return jnp.concatenate([velocity, rate[None], move])
 
 
 def heading_velocity(config: EnvConfig, yaw: Array, velocity: Array) -> Array:
@@ -284,7 +289,8 @@ def _fly(config: Config, world: World, scene: Scene, goal: Array, state: EnvStat
     after, flight = drone.fly(config.drone, world.airframe, before, command, bearing(config.env, before, goal))
     outcome, end_step, contact = judge(config, scene, goal, before.position, flight, state.decision + 1)
     reward = _reward(config, world, scene, goal, before, after, action, outcome)
-    broken = ~jnp.all(jnp.isfinite(jnp.concatenate([after.position, after.quaternion, after.velocity])))
+    numbers = jnp.concatenate([after.position, after.quaternion, after.velocity, after.angular_velocity])
+    broken = ~jnp.all(jnp.isfinite(numbers))
     return _Decision(
         drone=_choose(broken, before, after),
         flight=_choose(broken, _hold(before, flight.position.shape[0]), flight),

@@ -52,8 +52,8 @@ def test_a_random_world_brings_its_own_budget(world):
     assert resolve(world=world).train.total_steps == RANDOM_WORLDS["train"]["total_steps"]
 
 
-def test_random_worlds_and_the_papers_preset_keep_their_own_step_size_and_warmup():
-    """The default's step size and warm-up were chosen on the paper's world alone (docs/decisions/0011)."""
+def test_random_worlds_and_the_papers_preset_have_their_own_step_size_and_encoder():
+    """The default's were chosen on the paper's world alone (docs/decisions/0011)."""
     medium, paper = resolve(world="medium"), preset("paper")
     assert (medium.agent.learning_rate, paper.agent.learning_rate) == (1e-3, 4e-4)
     assert (medium.encoder.warmup_decisions, medium.encoder.retrain_at) == (131_072, (0.15,))

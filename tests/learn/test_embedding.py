@@ -110,11 +110,11 @@ def test_decisions_that_others_warm_up_in_are_learnt_in() -> None:
 
 def test_the_workload_says_what_is_drawn_and_learnt_from() -> None:
     scene = mjcf.load_scene(mjcf.resolve_world("paper"))
-    always = dataclasses.replace(CONFIG, encoder=dataclasses.replace(CONFIG.encoder, keep_learning=True))
+    always = dataclasses.replace(CONFIG, encoder=dataclasses.replace(CONFIG.encoder, keep_learning=True, batch_size=32))
     found = {name: workload(with_sensor(name, always), scene) for name in SENSORS}
     assert [found[name]["sensor"] for name in SENSORS] == list(SENSORS)
     assert [found[name]["frames_per_decision"] for name in SENSORS] == [2, 1, 1, 0, 0]
-    assert [found[name]["vae_samples_per_decision"] for name in SENSORS] == [1, 1, 1, 0, 0]
+    assert [found[name]["vae_samples_per_decision"] for name in SENSORS] == [2, 2, 2, 0, 0]
 
 
 # ------------------------------------------------------------------------------------- what is seen

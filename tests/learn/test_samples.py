@@ -95,7 +95,8 @@ def test_half_of_what_is_drawn_is_mirrored() -> None:
     ring, time = ring_after([True] * 3)
     mirror = jax.jit(partial(samples.draw, dataclasses.replace(CONFIG, mirror=True)), static_argnums=2)
     turned = np.asarray(mirror(ring, jnp.int32(time), 256, jax.random.key(2)).motion[:, 1]) < 0.0
-    assert 96 < turned.sum() < 160  # 128, four standard deviations of 8
+    # Half of 256 but for the ninth of them whose motion is 0, which are the same either way: 114, five deviations of 8.
+    assert 74 < turned.sum() < 154
 
 
 def test_a_mirrored_sample_is_that_of_the_mirrored_image() -> None:

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from edqn_jax.config import AgentConfig, CameraConfig, Config, EncoderConfig, TrainConfig
+from edqn_jax.config.loading import make_config
 from edqn_jax.errors import ConfigError
 from edqn_jax.learn import replay, trainer
 from edqn_jax.learn.trainer import Plan, Trainer, TrainState
@@ -207,54 +208,90 @@ def test_a_new_episode_begins_with_an_empty_memory() -> None:
     np.testing.assert_array_equal(running, [np.full(OWN_SIZE, 7.0), own[1]])
 
 
+def retrained(**options: Any) -> Config:
+    """64 steps, a warm-up of 4, a retraining of 2; the replay holds 5 steps before the DQN learns."""
+    encoder = dataclasses.replace(CONFIG.encoder, retrain_decisions=32, **options)
+    return dataclasses.replace(
+        CONFIG,
+        encoder=encoder,
+        drone=dataclasses.replace(CONFIG.drone, physics="rigid_body"),
+        train=dataclasses.replace(CONFIG.train, total_steps=1024),
+    )
+
+
 def test_a_retrained_encoder_begins_a_replay_of_its_own() -> None:
-    """Total 16 steps, warm-up 4, a lesson in steps 8 and 9; the replay holds 5 steps before the DQN learns."""
-    encoder = dataclasses.replace(CONFIG.encoder, retrain_at=(0.5,), retrain_decisions=32)
-    plan = Plan.of(dataclasses.replace(CONFIG, encoder=encoder))
-    steps = jnp.arange(16)
-    assert (plan.total, plan.lessons, plan.starts) == (16, ((0, 4), (8, 10)), 5)
-    assert np.flatnonzero(plan.teaching(steps)).tolist() == [0, 1, 2, 3, 8, 9]
-    assert np.flatnonzero(plan.publishing(steps)).tolist() == [3, 9]
-    assert plan.replay_time(steps).tolist() == [0, 0, 0, 0, 0, 1, 2, 3, 4, 5, 0, 1, 2, 3, 4, 5]
-    assert np.flatnonzero(plan.learning(steps)).tolist() == [9, 15]
+    config = retrained(retrain_at=(0.25,))
+    plan, steps = Plan.of(config), jnp.arange(24)
+    assert (plan.total, plan.lessons, plan.starts) == (64, ((0, 4), (16, 18)), 5)
+    assert np.flatnonzero(plan.teaching(steps)).tolist() == [0, 1, 2, 3, 16, 17]
+    assert np.flatnonzero(plan.publishing(steps)).tolist() == [3, 17]
+    assert plan.replay_time(steps).tolist() == [*[0] * 4, *range(14), *range(6)]
+    assert np.flatnonzero(plan.learning(steps)).tolist() == [*range(9, 18), 23]
+    # Every step in which the VAE learns adds a row to its ring, and no other does.
+    assert plan.kept(config, steps).tolist() == [0, 1, 2, 3, *[4] * 13, 5, *[6] * 6]
+    always = dataclasses.replace(config, encoder=dataclasses.replace(config.encoder, keep_learning=True))
+    assert plan.kept(always, steps).tolist() == list(range(24))
+
+
+@pytest.mark.parametrize(
+    ("retrain_at", "retrain_decisions", "lessons"),
+    [
+        ((0.01,), 32, ((0, 4), (11, 13))),  # not before the DQN has learnt for as long as it takes
+        ((0.25, 0.26), 32, ((0, 4), (16, 18), (25, 27))),  # one after another
+        ((0.25,), 10_000, ((0, 4), (17, 25))),  # an eighth of the run at most
+        ((0.7,), 32, ((0, 4),)),  # too late for the DQN to learn again
+    ],
+)
+def test_retrainings_leave_the_dqn_time(retrain_at, retrain_decisions, lessons) -> None:
+    config = retrained(retrain_at=retrain_at)
+    encoder = dataclasses.replace(config.encoder, retrain_decisions=retrain_decisions)
+    assert Plan.of(dataclasses.replace(config, encoder=encoder)).lessons == lessons
+
+
+@pytest.mark.parametrize("decisions", [10_000, 60_000, 100_000, 200_000, 874_000, 3_200_000])
+def test_whatever_the_length_of_a_run_its_encoders_never_learn_at_once_or_in_vain(decisions: int) -> None:
+    plan = Plan.of(make_config("medium", train={"total_steps": decisions}))
+    ends = [0]
+    for first, end in plan.lessons:
+        assert ends[-1] <= first < end
+        ends.append(end)
+    assert plan.total - ends[-1] >= plan.total // 4 or len(plan.lessons) == 1
+    assert plan.lessons[0] == (0, plan.warmup)
 
 
 @pytest.mark.slow
 def test_the_encoder_that_acts_changes_at_the_end_of_each_lesson_and_never_else(world: World) -> None:
-    encoder = dataclasses.replace(CONFIG.encoder, retrain_at=(0.5,), retrain_decisions=32)
-    config = dataclasses.replace(CONFIG, encoder=encoder, drone=dataclasses.replace(CONFIG.drone, physics="rigid_body"))
+    config = retrained(retrain_at=(0.01,))
     state = jax.jit(lambda key: trainer.init(config, world, key))(jax.random.key(0))
     step = jax.jit(lambda state, number: trainer.train_step(config, world, None, state, number))
     changed, learnt = [], []
-    for number in range(12):
+    for number in range(15):
         before = state
         state, (_, losses) = step(state, jnp.int32(number))
         changed += [number] * (not _same(before.learner.encoder, state.learner.encoder))
         learnt += [number] * bool(np.isfinite(losses.reconstruction))
-        if number in (3, 9):  # nothing that was encoded with the old one is left in a memory
+        if number in (3, 12):  # nothing that was encoded with the old one is left in a memory
             memory = np.asarray(state.actors.memory)
             assert not memory[:, :, :-1].any() and memory[:, :, -1].any()
-    assert changed == [3, 9] and learnt == [0, 1, 2, 3, 8, 9]
+    assert changed == [3, 12] and learnt == [0, 1, 2, 3, 11, 12]
 
 
 @pytest.mark.slow
-def test_labels_reach_the_encoder_in_lessons_and_nothing_else(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
-    config = dataclasses.replace(CONFIG, drone=dataclasses.replace(CONFIG.drone, physics="rigid_body"))
-    warmup = Plan.of(config).warmup
-    steps = jnp.arange(warmup, warmup + 8)
+def test_labels_reach_the_vae_and_nothing_that_acts_before_it_does(world: World, monkeypatch) -> None:
+    """With other labels in a retraining the VAE learns something else; all that is seen and done stays as it was."""
+    config = retrained(retrain_at=(0.01,))
+    (_, warmup), (first, end) = Plan.of(config).lessons
 
-    def trained(state: TrainState, steps) -> tuple:
-        return jax.jit(lambda state: trainer.run_steps(config, world, state, steps))(state)
+    def trained(state: TrainState, start: int, stop: int) -> tuple:
+        return jax.jit(lambda state: trainer.run_steps(config, world, state, jnp.arange(start, stop)))(state)
 
-    fresh = jax.jit(lambda key: trainer.init(config, world, key))(jax.random.key(0))
-    warm, _ = trained(fresh, jnp.arange(warmup))
-    after = trained(warm, steps)
+    state, _ = trained(jax.jit(lambda key: trainer.init(config, world, key))(jax.random.key(0)), 0, first)
+    truly = trained(state, first, end - 1)
     true = env.nearness
     monkeypatch.setattr(env, "nearness", lambda *given: 3.0 - true(*given))
-    assert not _same(trained(fresh, jnp.arange(warmup))[0].learner.vae, warm.learner.vae)
-    again = trained(warm, steps)
-    assert np.isfinite(again[1][1].q_loss).any()
-    assert _same(_told(after), _told(again))
+    falsely = trained(state, first, end - 1)
+    assert warmup < first and not _same(truly[0].learner.vae, falsely[0].learner.vae)
+    assert _same(_told(truly), _told(falsely))
 
 
 @pytest.mark.slow
@@ -286,9 +323,9 @@ def test_totals_round_up_to_whole_chunks() -> None:
 
 
 def _told(trained: tuple) -> tuple:
-    """What a chunk learnt, saw, did and how its episodes ended."""
+    """What the agent of a chunk knew, saw and did, and how its episodes ended; all but the VAE that learns."""
     state, (episodes, _) = trained
-    return state.learner, state.actors.memory, state.actors.replay, episodes
+    return state.learner.encoder, state.learner.q, state.actors.memory, state.actors.replay, episodes
 
 
 def _same(one, two) -> bool:
