@@ -217,6 +217,7 @@ def test_the_code_of_pictures_is_learnt() -> None:
 
 
 @pytest.mark.parametrize("name", SENSORS[1:])
+@pytest.mark.slow
 def test_the_policy_of_any_sensor_comes_back(tmp_path: Path, name: str) -> None:
     config = with_sensor(name)
     (tmp_path / "config.yaml").write_text(to_yaml(config))

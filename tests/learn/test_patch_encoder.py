@@ -56,6 +56,7 @@ def single_events(field: ev.EventField, pairs: int) -> list[patch_encoder_plain.
 
 
 @pytest.mark.parametrize(("pairs", "noise"), [(1, False), (2, False), (1, True), (2, True)])
+@pytest.mark.slow
 def test_dense_codes_are_those_of_single_events(pairs: int, noise: bool) -> None:
     params = shaken(fresh(CONFIG, SMALL, jax.random.key(0), windows=pairs))
     field = random_field(pairs, pairs, noise=noise)
@@ -104,6 +105,7 @@ def test_a_batch_is_encoded_as_its_fields_are_one_by_one() -> None:
         np.testing.assert_allclose(got, np.stack(expected), rtol=1e-4, atol=1e-4)
 
 
+@pytest.mark.slow
 def test_a_picture_is_read_as_one_channel_of_events_is() -> None:
     params = shaken(fresh(CONFIG, SMALL, jax.random.key(0), form=Form.PICTURE))
     field = random_field(1, 1)
@@ -127,6 +129,7 @@ def test_a_picture_is_read_as_one_channel_of_events_is() -> None:
         ("both", Form.PICTURE, 2),
     ],
 )
+@pytest.mark.slow
 def test_the_decoder_draws_what_the_target_holds(target, form, channels) -> None:
     config = dataclasses.replace(CONFIG, target=target, target_blur=0)
     params = fresh(config, SMALL, jax.random.key(0), form=form)

@@ -54,6 +54,7 @@ def ring_after(kept: list[bool]) -> tuple[samples.Samples, int]:
         ([True, False] * 6, {4, 6, 8, 10}),
     ],
 )
+@pytest.mark.slow
 def test_what_was_kept_last_is_drawn_and_nothing_else(kept, expected) -> None:
     ring, time = ring_after(kept)
     drawn = draw(ring, jnp.int32(time), 256, jax.random.key(0))
@@ -76,6 +77,7 @@ def test_what_is_drawn_belongs_together() -> None:
     ("architecture", "even", "alone"),
     [("patches", True, True), ("patches", False, True), ("pooled", True, True), ("pooled", False, False)],
 )
+@pytest.mark.slow
 def test_what_is_stored_is_encoded_as_what_was_seen(architecture, even, alone) -> None:
     config = EncoderConfig(architecture=architecture, code_size=4, replay_size=64, target="sensed", features=4)
     field = jax.vmap(lambda c: ev.field_of_counts(EventsConfig(), c))(
@@ -117,6 +119,7 @@ def test_a_mirrored_sample_is_that_of_the_mirrored_image() -> None:
     jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, atol=1e-5), got, expected)
 
 
+@pytest.mark.slow
 def test_a_flight_to_the_right_is_the_mirror_of_one_to_the_left() -> None:
     """In a world that is its own mirror: what is seen and known of one's motion, the signs of `MIRRORED_MOTION`."""
     config = Config(

@@ -234,6 +234,7 @@ def test_every_path_in_a_large_world_is_free(world):
 
 
 @pytest.mark.parametrize("world", WITHOUT_A_WAY)
+@pytest.mark.slow
 def test_without_a_way_it_says_so(world):
     plan = snn.plan(WITHOUT_A_WAY[world])
     assert not plan.found and plan.path is None and np.isnan(plan.length_m)
