@@ -15,6 +15,7 @@ from jax.sharding import PartitionSpec
 
 from edqn_jax.config import Config
 from edqn_jax.learn import dqn, qnetwork, replay, trainer, vae
+from edqn_jax.learn.plan import Plan
 from edqn_jax.learn.samples import Samples
 from edqn_jax.learn.trainer import AXIS, Actors, Learner, TrainState
 from edqn_jax.sim import camera, columns, drone, env, events, sensor
@@ -68,7 +69,7 @@ class Moment:
     @property
     def newest(self) -> Array:
         """Returns the number of the newest row of the replay."""
-        return jnp.int32(self.state.step - trainer.Plan.of(self.config).warmup)
+        return jnp.int32(self.state.step - Plan.of(self.config).warmup)
 
     @property
     def sampled(self) -> int:
@@ -295,16 +296,16 @@ def replaying(now: Moment) -> Part:
 def vae_updating(now: Moment) -> Part:
     """Returns the part of a VAE update with drawing its batch."""
 
-    def body(album: Samples, carry):
+    def body(rings: Samples, carry):
         learner, keys = carry
         keys = _next(keys)
-        _, learner = trainer.learn_to_see(now.config, AXIS, learner, album, keys, now.state.step)
+        _, learner = trainer.learn_to_see(now.config, AXIS, learner, rings, keys, now.state.step)
         return learner, keys
 
-    album, carry = now.actors.samples, (now.learner, now.shard_keys)
-    each = size_of(jax.tree.map(lambda leaf: leaf[0, 0, 0], album))
+    rings, carry = now.actors.samples, (now.learner, now.shard_keys)
+    each = size_of(jax.tree.map(lambda leaf: leaf[0, 0, 0], rings))
     moved = now.config.encoder.batch_size * each
-    return Part("vae_update", body, album, carry, _LEARNER_AND_KEYS, products=True, moved=moved)
+    return Part("vae_update", body, rings, carry, _LEARNER_AND_KEYS, products=True, moved=moved)
 
 
 def learning(now: Moment) -> Part:

@@ -98,6 +98,10 @@ def _encoder(encoder: EncoderConfig) -> None:
     rising = all(earlier < later for earlier, later in zip(times, times[1:], strict=False))
     inside = rising and all(0 < time < 1 for time in times)
     _require(inside, "encoder.retrain_at", "shares between 0 and 1 in rising order", times)
+    warmed = not times or encoder.warmup_decisions > 0
+    _require(
+        warmed, "encoder.warmup_decisions", "at least 1 where encoder.retrain_at is given", encoder.warmup_decisions
+    )
     for key in ("patch_layers", "joint_layers", "decoder_hidden"):
         _widths(getattr(encoder, key), f"encoder.{key}")
     share = encoder.decoder_bandwidth

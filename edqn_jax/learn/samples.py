@@ -1,4 +1,4 @@
-"""What the VAE learns from: observations and what the decoder must draw of each, in a ring per logical shard.
+"""Samples that the VAE learns from: observations with the decoder's targets, in a ring per logical shard.
 
 Consecutive observations of one flight are alike, and so are those of all flights in one place. So the VAE does not
 learn from the newest ones alone, but from batches drawn from the last `encoder.replay_size`, half of them mirrored left
@@ -133,6 +133,7 @@ def _counts_alone(config: EncoderConfig, field: EventField) -> bool:
     return config.architecture == "patches" or field.divides_window
 
 
-def target_of(config: EncoderConfig, sensed: EventField | Array, nearness: Array | None) -> Target:
-    """Returns what the decoder must draw of observations `[..., H, W]`, see `vae.target`."""
-    return vae.in_waves(config, vae.target(config, sensed, nearness))
+def target_of(config: EncoderConfig, observation: Observation, nearness: Array | None) -> Target:
+    """Returns what the decoder must draw of observations, see `vae.target`."""
+    assert isinstance(observation.sensed, EventField | Array)
+    return vae.in_waves(config, vae.target(config, observation.sensed, nearness))

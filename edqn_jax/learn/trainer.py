@@ -10,7 +10,6 @@ unbatched when training is `vmap`ped over seeds.
 from __future__ import annotations
 
 import dataclasses
-import math
 from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any, NamedTuple
@@ -27,6 +26,7 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from edqn_jax.config import Config
 from edqn_jax.errors import ConfigError
 from edqn_jax.learn import dqn, embedding, policy, qnetwork, replay, samples, vae
+from edqn_jax.learn.plan import Plan
 from edqn_jax.learn.policy import PolicyParams, empty_memory, observation_size
 from edqn_jax.learn.qnetwork import Params
 from edqn_jax.learn.samples import Samples
@@ -35,7 +35,6 @@ from edqn_jax.parallel.devices import compiler_options
 from edqn_jax.random import run_streams
 from edqn_jax.sim import env
 from edqn_jax.sim.env import EnvState, Observation, World
-from edqn_jax.sim.events import EventField
 from edqn_jax.sim.moves import ACTIONS
 from edqn_jax.sim.outcomes import Outcome
 
@@ -99,86 +98,6 @@ class Losses:
     reconstruction: Array
     kl: Array
     epsilon: Array
-
-
-@dataclasses.dataclass(frozen=True)
-class Plan:
-    """Numbers of training steps that follow from a configuration; static."""
-
-    total: int
-    warmup: int
-    starts: int
-    """Steps of a replay before the first update of the DQN."""
-    lessons: tuple[tuple[int, int], ...]
-    """First step, and step after the last, of each time in which the VAE learns; the first is the warm-up."""
-
-    @classmethod
-    def of(cls, config: Config) -> Plan:
-        """Total decisions round up to whole chunks, the warm-up to whole steps; it takes a quarter at most.
-
-        Where there is no VAE there is no warm-up: its decisions go to the DQN.
-        """
-        envs = config.train.num_envs
-        total = math.ceil(config.train.total_steps / envs / config.train.chunk_steps) * config.train.chunk_steps
-        warmup = min(math.ceil(config.encoder.warmup_decisions / envs), total // 4) if embedding.has_code(config) else 0
-        least = config.agent.n_step + config.agent.history
-        starts = max(math.ceil(config.agent.learning_starts / envs), least)
-        lessons = _lessons(config, total, warmup, starts) if warmup else ()
-        return cls(total=total, warmup=warmup, starts=starts, lessons=lessons)
-
-    @property
-    def learn_from(self) -> int:
-        """Step of the DQN's first update."""
-        return self.warmup + self.starts
-
-    def teaching(self, step: Array) -> Array:
-        """Returns whether the VAE learns in steps `[...]`, bool."""
-        teaching = jnp.zeros(jnp.shape(step), bool)
-        for first, end in self.lessons:
-            teaching |= (first <= step) & (step < end)
-        return teaching
-
-    def kept(self, config: Config, step: Array) -> Array:
-        """Returns how many steps before steps `[...]` gave the VAE something to learn from, int32."""
-        if config.encoder.keep_learning:
-            return step
-        kept = jnp.zeros(jnp.shape(step), jnp.int32)
-        for first, end in self.lessons:
-            kept += jnp.clip(step - first, 0, end - first)
-        return kept
-
-    def publishing(self, step: Array) -> Array:
-        """Returns whether the agent's encoder changes at the end of steps `[...]`, bool."""
-        publishing = jnp.zeros(jnp.shape(step), bool)
-        for _, end in self.lessons:
-            publishing |= step + 1 == end
-        return publishing
-
-    def replay_time(self, step: Array | np.ndarray) -> Array:
-        """Returns the number of steps `[...]` since the replay began; 0 in the warm-up."""
-        began = jnp.full(jnp.shape(step), self.warmup, jnp.int32)
-        for _, end in self.lessons:
-            began = jnp.where(step >= end, end, began)
-        return jnp.maximum(step - began, 0)
-
-    def learning(self, step: Array | np.ndarray) -> Array:
-        """Returns whether the DQN learns in steps `[...]`, bool."""
-        return jnp.asarray(step >= self.warmup) & (self.replay_time(step) >= self.starts)
-
-
-def _lessons(config: Config, total: int, warmup: int, starts: int) -> tuple[tuple[int, int], ...]:
-    """Returns the warm-up and each retraining that leaves the DQN at least a quarter of the run after it.
-
-    A retraining takes an eighth of the run at most, begins when the DQN has learnt for as long as that, and never
-    before another has ended.
-    """
-    length = min(math.ceil(config.encoder.retrain_decisions / config.train.num_envs), total // 8)
-    lessons = [(0, warmup)]
-    for share in config.encoder.retrain_at:
-        first = max(round(share * total), lessons[-1][1] + starts + length)
-        if length and total - (first + length) - starts >= total // 4:
-            lessons.append((first, first + length))
-    return tuple(lessons)
 
 
 class InitialKeys(NamedTuple):
@@ -245,20 +164,12 @@ def _empty_samples(config: Config, world: World, state: EnvState) -> Samples | N
 
     def one(state: EnvState) -> Samples:
         observation = env.step(config, world, state, jnp.zeros((), jnp.int32))[1].observation
-        return _samples_of(config, observation, env.nearness(config, world, state))
+        wanted = samples.target_of(config.encoder, observation, env.nearness(config, world, state))
+        return samples.samples_of(config.encoder, observation, wanted)
 
     shapes = jax.eval_shape(one, jax.tree.map(lambda x: x[0], state))
     ring = samples.empty(config.encoder, shapes, envs // shards, envs)
     return jax.tree.map(lambda x: jnp.broadcast_to(x, (shards, *x.shape)), ring)
-
-
-def _samples_of(config: Config, observation: Observation, nearness: Array | None) -> Samples:
-    return samples.samples_of(config.encoder, observation, _target_of(config, observation, nearness))
-
-
-def _target_of(config: Config, observation: Observation, nearness: Array | None) -> vae.Target:
-    assert isinstance(observation.sensed, EventField | Array)
-    return samples.target_of(config.encoder, observation.sensed, nearness)
 
 
 def _init_learner(config: Config, key: Array) -> Learner:
@@ -328,8 +239,8 @@ def train_step(
     action, manoeuvre, epsilon = _act(config, learner, actors, keys, jnp.maximum(step - plan.warmup, 0), warming)
     ring = _store(actors, action, time)
     flown, seen = _fly(config, world, actors, action)
-    album = _keep(config, world, actors, flown, seen.observation, step)
-    vae_losses, learner = learn_to_see(config, axis, learner, album, keys.vae, step)
+    rings = _keep(config, world, actors, flown, seen.observation, step)
+    vae_losses, learner = learn_to_see(config, axis, learner, rings, keys.vae, step)
     q_losses, learner = learn_to_act(config, axis, learner, ring, time, keys.dqn, step)
     learner = _publish(config, learner, step)
     memory = _remember(config, learner, actors, seen, step)
@@ -345,7 +256,7 @@ def train_step(
         manoeuvre=manoeuvre,
         episodes=actors.episodes + ((outcome != Outcome.RUNNING) & ~warming),
         replay=ring,
-        samples=album,
+        samples=rings,
         key=keys.next,
     )
     episodes = Episodes(outcome=outcome, length=shaped(seen.episode_length), episode_return=shaped(seen.episode_return))
@@ -394,7 +305,7 @@ def _fly(config: Config, world: World, actors: Actors, action: Array) -> tuple[E
 
 def _remember(config: Config, learner: Learner, actors: Actors, seen: env.Step, step: Array) -> Array:
     """Memories [S * E, H, D] with the new observations, encoded once; a new episode or encoder begins empty."""
-    forget = seen.is_reset | Plan.of(config).publishing(step)
+    forget = seen.is_reset | Plan.of(config).replaces_encoder(step)
     memory = jnp.where(forget[:, None, None], 0.0, _flat(actors.memory))
     return policy.see(config, learner.encoder, memory, seen.observation)
 
@@ -411,9 +322,9 @@ def _manoeuvre(hold: int, held: Array, key: Array) -> Array:
 
 
 def _publish(config: Config, learner: Learner, step: Array) -> Learner:
-    """The code that the agent sees changes when a lesson of the VAE ends, before a replay begins."""
+    """Copies the VAE to the encoder that acts, in the step after which the replay begins anew."""
     encoder = lax.cond(
-        Plan.of(config).publishing(step),
+        Plan.of(config).replaces_encoder(step),
         lambda: embedding.acting(config, learner.vae),
         lambda: learner.encoder,
     )
@@ -423,33 +334,36 @@ def _publish(config: Config, learner: Learner, step: Array) -> Learner:
 def _keep(
     config: Config, world: World, actors: Actors, flown: EnvState, observation: Observation, step: Array
 ) -> Samples | None:
-    """The rings with this step's observations [S * E, ...], if the VAE learns in it; only then are labels rendered."""
+    """Returns the VAE's rings [S, L, E, ...], with this step's observations [S * E, ...] if the VAE learns in it.
+
+    Only then are labels rendered. None where there is no VAE.
+    """
     if actors.samples is None:
         return None
     plan = Plan.of(config)
-    keep = plan.teaching(step) | config.encoder.keep_learning
+    keep = plan.trains_vae(step) | config.encoder.keep_learning
 
     def target() -> vae.Target:
         near = None
         if embedding.needs_nearness(config):
             near = jax.vmap(partial(env.nearness, config, world))(flown)
-        return _target_of(config, observation, near)
+        return samples.target_of(config.encoder, observation, near)
 
     nothing = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(target))
     wanted = lax.cond(keep, target, lambda: nothing)
     rows = samples.samples_of(config.encoder, observation, wanted)
     write = jax.vmap(samples.write, in_axes=(0, 0, None, None))
-    return write(actors.samples, _shaped(actors.reward.shape, rows), plan.kept(config, step), keep)
+    return write(actors.samples, _shaped(actors.reward.shape, rows), plan.samples_kept(config, step), keep)
 
 
-def learn_to_see(config: Config, axis: str | None, learner: Learner, album: Samples | None, keys: Array, step: Array):
-    """VAE updates on samples of the rings [S, L, E, ...]: `(reconstruction, kl), learner`."""
+def learn_to_see(config: Config, axis: str | None, learner: Learner, rings: Samples | None, keys: Array, step: Array):
+    """Updates the VAE on samples of the rings [S, L, E, ...]; returns `(reconstruction, kl), learner`."""
     plan = Plan.of(config)
     nothing = jnp.float32(jnp.nan), jnp.float32(jnp.nan)
-    if album is None:
+    if rings is None:
         return nothing, learner
     share = config.encoder.batch_size // config.train.shards
-    kept = plan.kept(config, step) + 1
+    kept = plan.samples_kept(config, step) + 1
 
     def loss(params: Params, batch: Samples, keys: Array):
         # Each shard draws its own noise, so that the layout on devices does not change it.
@@ -462,7 +376,7 @@ def learn_to_see(config: Config, axis: str | None, learner: Learner, album: Samp
 
     def update(learner: Learner, keys: Array):
         draw_keys, noise_keys = jax.vmap(jax.random.split)(keys).swapaxes(0, 1)
-        batch = jax.vmap(lambda ring, key: samples.draw(config.encoder, ring, kept, share, key))(album, draw_keys)
+        batch = jax.vmap(lambda ring, key: samples.draw(config.encoder, ring, kept, share, key))(rings, draw_keys)
         gradient, parts = jax.grad(loss, has_aux=True)(learner.vae, batch, noise_keys)
         gradient = _all_sum(gradient, axis)
         change, optimiser = _vae_optimiser(config).update(gradient, learner.vae_optimiser, learner.vae)
@@ -480,7 +394,7 @@ def learn_to_see(config: Config, axis: str | None, learner: Learner, album: Samp
             return learn(learner, 1)
         return nothing, learner
 
-    return lax.cond(plan.teaching(step), lambda x: learn(x, config.encoder.warmup_updates_per_step), rest, learner)
+    return lax.cond(plan.trains_vae(step), lambda x: learn(x, config.encoder.warmup_updates_per_step), rest, learner)
 
 
 def learn_to_act(config: Config, axis: str | None, learner: Learner, ring, time: Array, keys: Array, step: Array):
@@ -522,7 +436,7 @@ def learn_to_act(config: Config, axis: str | None, learner: Learner, ring, time:
     def rest(learner: Learner):
         return (jnp.float32(jnp.nan), jnp.float32(jnp.nan)), learner
 
-    return lax.cond(plan.learning(step), learn, rest, learner)
+    return lax.cond(plan.trains_q(step), learn, rest, learner)
 
 
 def _each_network(change: Callable[[Any], Any], learner: Learner) -> Learner:

@@ -76,8 +76,8 @@ def draw_learning(metrics: Sequence[Mapping[str, Any]], file: Path) -> Figure:
         _line(q_loss, metrics, "q_loss", LINE, "Q-network")
         q_loss.set_title("Q loss (Eq. 9)")
         fine = _each_step(metrics)
-        _line(vae, fine, "reconstruction_loss", LINE, "reconstruction")
-        _line(vae, fine, "kl", SECOND_LINE, "KL, before its weight")
+        _line(vae, fine, "reconstruction_loss", LINE, "reconstruction", broken=True)
+        _line(vae, fine, "kl", SECOND_LINE, "KL, before its weight", broken=True)
         vae.set_title("VAE loss (reconstruction + KL)")
         success.xaxis.set_major_formatter(EngFormatter(sep=""))
         for axes in (q_loss, vae):
@@ -126,9 +126,23 @@ def _each_step(metrics: Sequence[Mapping[str, Any]]) -> list[Mapping[str, Any]]:
 
 
 def _line(
-    axes: Axes, metrics: Sequence[Mapping[str, Any]], name: str, colour: str, label: str, marker: str = ""
+    axes: Axes,
+    metrics: Sequence[Mapping[str, Any]],
+    name: str,
+    colour: str,
+    label: str,
+    marker: str = "",
+    *,
+    broken: bool = False,
 ) -> None:
-    """Draws the metric over decisions, of the lines that have it."""
-    points = [(row["decisions"], row[name]) for row in metrics if row.get(name) is not None]
-    if points:
-        axes.plot(*np.array(points, np.float64).T, color=colour, label=label, marker=marker, ms=4, lw=1.1, gid=name)
+    """Draws the metric over decisions, of the rows that have it; `broken` leaves gaps where rows do not."""
+    points = [(row["decisions"], np.nan if row.get(name) is None else row[name]) for row in metrics]
+    found = np.array(points, np.float64).reshape(-1, 2)
+    has = ~np.isnan(found[:, 1])
+    if not has.any():
+        return
+    if broken:
+        found = found[: np.flatnonzero(has)[-1] + 1]
+    else:
+        found = found[has]
+    axes.plot(*found.T, color=colour, label=label, marker=marker, ms=4, lw=1.1, gid=name)

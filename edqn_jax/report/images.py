@@ -96,8 +96,8 @@ def draw_reconstruction(
     """
     targets, drawn = np.asarray(targets), np.asarray(drawn)
     scale = Normalize(0.0, _largest(targets)) if look is RECONSTRUCTED_EVENTS else scale_of(targets, look)
-    true = "true nearness" if seen is not None else look.name
-    rows = [(f"{true}, blurred", targets, scale, look), ("from the code", drawn, scale, look)]
+    name = look.name if seen is None else f"true {look.name}"
+    rows = [(f"{name}, blurred", targets, scale, look), ("from the code", drawn, scale, look)]
     if seen is not None:
         rows.insert(0, (seen[1].name, np.asarray(seen[0]), scale_of(seen[0], seen[1]), seen[1]))
     with drawing(1.35 * len(targets) + 0.9, 1.15 * len(rows) + 0.15, file) as figure:

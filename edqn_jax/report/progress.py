@@ -42,7 +42,8 @@ class Progress:
         self._phase, self._total = "starting", 0
         self._started = self._phase_started = time.monotonic()
         self._printed = self._started - every_s
-        self._first: tuple[float, int] | None = None
+        self._updated: tuple[float, int] | None = None  # when, and after how many decisions
+        self._measured_s, self._measured = 0.0, 0  # seconds and decisions that the rate is made of
 
     @property
     def elapsed_s(self) -> float:
@@ -55,7 +56,7 @@ class Progress:
         self._phase, self._phase_started = name, time.monotonic()
         self._total = total or self._total
         if total:
-            self._first = (time.monotonic(), self._decisions())
+            self._updated = (time.monotonic(), self._decisions())
         if self._console.is_terminal:
             self._start_live()
         elif not returning:
@@ -67,6 +68,7 @@ class Progress:
         self._metrics = lasting | {key: value for key, value in metrics.items() if value is not None}
         self._phase = str(metrics.get("phase", self._phase))
         now = time.monotonic()
+        self._measure(now)
         if self._live is None and now - self._printed >= self._every_s:
             self._printed = now
             self.message(self._line())
@@ -90,12 +92,22 @@ class Progress:
     def _decisions(self) -> int:
         return int(self._metrics.get("decisions", 0))
 
+    def _measure(self, now: float) -> None:
+        """Adds the newest decisions to the rate, unless the VAE was trained too: they then take several times as long."""
+        if self._updated is not None and self._phase not in ("warm-up", "retraining"):
+            self._measured_s += now - self._updated[0]
+            self._measured += self._decisions() - self._updated[1]
+        self._updated = (now, self._decisions())
+
     def _remaining(self) -> str:
-        """Returns the time that the rest of training takes at the rate so far, validations included, as text."""
-        if self._first is None or self._decisions() <= self._first[1]:
+        """Returns the time that the rest of training takes at the rate so far, validations included, as text.
+
+        Nothing is known in the warm-up, and a retraining of the VAE that is still to come is not in it.
+        """
+        if self._measured <= 0:
             return "–"
-        rate = (self._decisions() - self._first[1]) / max(time.monotonic() - self._first[0], 1e-9)
-        return clock(max(self._total - self._decisions(), 0) / rate)
+        left = max(self._total - self._decisions(), 0) * self._measured_s / self._measured
+        return clock(max(left - (time.monotonic() - (self._updated or (0.0, 0))[0]), 0.0))
 
     def _values(self) -> list[tuple[str, str]]:
         return [

@@ -9,7 +9,8 @@ import numpy as np
 
 from edqn_jax.config import Config
 from edqn_jax.errors import DivergedError
-from edqn_jax.learn.trainer import Episodes, Losses, Plan
+from edqn_jax.learn.plan import Plan
+from edqn_jax.learn.trainer import Episodes, Losses
 from edqn_jax.sim.outcomes import Outcome
 
 
@@ -73,7 +74,7 @@ def chunk_metrics(
     envs, steps = config.train.num_envs, len(losses.q_loss)
     any_ended = len(ended.step) > 0
     return {
-        "phase": "warm-up" if first + steps <= Plan.of(config).warmup else "training",
+        "phase": _phase(Plan.of(config), first + steps - 1),
         "decisions": (first + steps) * envs,
         "decisions_per_second": steps * envs / seconds,
         "episodes": episodes,
@@ -86,6 +87,13 @@ def chunk_metrics(
         "kl": _mean(losses.kl),
         "warm_up": _warm_up(config, first, losses),
     }
+
+
+def _phase(plan: Plan, step: int) -> str:
+    """Returns the name of what training step `step` belongs to."""
+    if step < plan.warmup:
+        return "warm-up"
+    return "retraining" if bool(plan.trains_vae(np.asarray(step))) else "training"
 
 
 def _warm_up(config: Config, first: int, losses: Losses) -> dict[str, Any] | None:
@@ -111,7 +119,7 @@ def check_finite(plan: Plan, done: int, losses: Losses) -> None:
     Raises:
         DivergedError: names the loss and the step.
     """
-    learns = np.asarray(plan.learning(np.arange(done - len(losses.q_loss), done)))
+    learns = np.asarray(plan.trains_q(np.arange(done - len(losses.q_loss), done)))
     bad = learns & ~np.isfinite(losses.q_loss)
     if bad.any():
         raise DivergedError(f"training diverged: the Q loss was {losses.q_loss[bad][0]} at training step {done}")

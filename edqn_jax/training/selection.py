@@ -11,8 +11,8 @@ import numpy as np
 from edqn_jax.config import Config
 from edqn_jax.evaluation.metrics import spl
 from edqn_jax.evaluation.missions import RunMissions
+from edqn_jax.learn.plan import Plan
 from edqn_jax.learn.policy import PolicyParams
-from edqn_jax.learn.trainer import Plan
 from edqn_jax.sim.flights import Flights
 from edqn_jax.sim.outcomes import Outcome
 from edqn_jax.sim.worlds import Missions

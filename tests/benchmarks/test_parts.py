@@ -13,7 +13,8 @@ from jax import Array
 from jax.sharding import Mesh
 
 from edqn_jax.evaluation.missions import run_missions
-from edqn_jax.learn.trainer import AXIS, Plan, init
+from edqn_jax.learn.plan import Plan
+from edqn_jax.learn.trainer import AXIS, init
 from measurement.flags import configured
 from measurement.parts import PARTS, Moment, parts_of
 from measurement.timing import Part, Timed, depending_on, operations, size_of

@@ -9,7 +9,8 @@ import pytest
 
 import throughput
 from edqn_jax.errors import ConfigError
-from edqn_jax.learn.trainer import Plan, Trainer
+from edqn_jax.learn.plan import Plan
+from edqn_jax.learn.trainer import Trainer
 from edqn_jax.runs.directory import plain
 from measurement.parts import parts_of
 from tests.miniature import MINIATURE

@@ -10,7 +10,7 @@ import pytest
 
 from edqn_jax.config import DENSITIES, PRESETS, Config, preset
 from edqn_jax.config.limits import validate
-from edqn_jax.config.loading import RANDOM_WORLDS, apply, load_layer, resolve, to_yaml
+from edqn_jax.config.loading import RANDOM_WORLDS, apply, load_layer, make_config, resolve, to_yaml
 from edqn_jax.errors import ConfigError
 
 
@@ -178,6 +178,12 @@ def test_every_numeric_option_has_limits(group, option, nonsense):
             "must be at most agent.exploration_start",
         ),
         ("events", {"frame_times_s": (0.0,)}, "at least two times"),
+        ("encoder", {"retrain_at": (0.5, 0.2)}, r"encoder.retrain_at must be shares .* in rising order, not 0.5, 0.2"),
+        ("encoder", {"retrain_at": (1.0,)}, "encoder.retrain_at must be shares between 0 and 1"),
+        ("encoder", {"retrain_at": (0.5,), "warmup_decisions": 0}, "warmup_decisions must be at least 1 where"),
+        ("encoder", {"batch_size": 12}, r"encoder.batch_size must be a multiple of train.shards \(8\), such as 16"),
+        ("encoder", {"patch_layers": ()}, "encoder.patch_layers must be one or more widths"),
+        ("encoder", {"joint_layers": (8, 0)}, "encoder.joint_layers must be one or more widths"),
         ("events", {"frame_times_s": (-0.04, -0.02)}, "end at 0"),
         ("events", {"frame_times_s": (-0.02, -0.04, 0.0)}, "rising order"),
         (
@@ -197,3 +203,10 @@ def test_what_cannot_be_run_is_named_with_its_limits(group, options, says):
 def test_frames_may_fill_the_whole_decision():
     steps = tuple(round(-0.02 * step, 2) for step in range(13, -1, -1))
     validate(changed("events", frame_times_s=steps))
+
+
+def test_options_of_the_world_are_a_group_like_any_other() -> None:
+    config = make_config("medium", world={"pool_size": 7}, train={"seed": 3})
+    assert (config.world.name, config.world.pool_size, config.train.seed) == ("medium", 7, 3)
+    with pytest.raises(ConfigError, match="'world' must hold keys such as"):
+        make_config(world="medium")  # type: ignore[arg-type]

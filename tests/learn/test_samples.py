@@ -32,8 +32,8 @@ def decision(number: int, config: EncoderConfig = CONFIG, *, even: bool = True) 
     field = jax.vmap(lambda c: ev.field_of_counts(EventsConfig(), c))(jnp.asarray(counts))
     field = dataclasses.replace(field, divides_window=even)
     motion = jnp.full((ENVS, MOTION_SIZE), float(number)) + jnp.arange(ENVS)[:, None] / 10.0
-    wanted = samples.target_of(config, field, None)
-    return samples.samples_of(config, Observation(field, jnp.zeros((ENVS, 10)), motion), wanted)
+    observation = Observation(field, jnp.zeros((ENVS, 10)), motion)
+    return samples.samples_of(config, observation, samples.target_of(config, observation, None))
 
 
 def ring_after(kept: list[bool]) -> tuple[samples.Samples, int]:
@@ -85,7 +85,8 @@ def test_what_is_stored_is_encoded_as_what_was_seen(architecture, even, alone) -
     )
     field = dataclasses.replace(field, divides_window=even)
     motion = jnp.asarray(np.random.default_rng(4).normal(size=(ENVS, MOTION_SIZE)), jnp.float32)
-    stored = samples.samples_of(config, Observation(field, motion, motion), samples.target_of(config, field, None))
+    observation = Observation(field, motion, motion)
+    stored = samples.samples_of(config, observation, samples.target_of(config, observation, None))
     assert isinstance(stored.sensed, samples.Counts) == alone
     params = vae.init_vae(config, SMALL, jax.random.key(0))
     read, shown = (vae.encode(config, params, sensed, motion) for sensed in (samples.read(stored), field))
@@ -110,8 +111,8 @@ def test_a_mirrored_sample_is_that_of_the_mirrored_image() -> None:
 
     def sample(counts: np.ndarray, near: jax.Array, motion: jax.Array) -> samples.Samples:
         field = ev.field_of_counts(EventsConfig(), jnp.asarray(counts))
-        wanted = samples.target_of(config, field, near)
-        return samples.samples_of(config, Observation(field, motion, motion), wanted)
+        observation = Observation(field, motion, motion)
+        return samples.samples_of(config, observation, samples.target_of(config, observation, near))
 
     got = samples.mirrored(sample(counts, near, motion))
     # To the left, turning left and the move to the left become those to the right.
@@ -142,7 +143,7 @@ def test_a_flight_to_the_right_is_the_mirror_of_one_to_the_left() -> None:
         for move in ((1, side, 0), (1, side, 1)):
             number = np.flatnonzero((env.ACTIONS == move).all(axis=1))[0]
             state, seen = step(state, jnp.asarray(number))
-        wanted = samples.target_of(EncoderConfig(), seen.observation.sensed, env.nearness(config, world, state))
+        wanted = samples.target_of(EncoderConfig(), seen.observation, env.nearness(config, world, state))
         return samples.samples_of(EncoderConfig(), seen.observation, wanted)
 
     left, right = flown(1), samples.mirrored(flown(-1))

@@ -16,7 +16,8 @@ from edqn_jax.config import AgentConfig, CameraConfig, Config, EncoderConfig, Tr
 from edqn_jax.config.loading import make_config
 from edqn_jax.errors import ConfigError
 from edqn_jax.learn import replay, trainer
-from edqn_jax.learn.trainer import Plan, Trainer, TrainState
+from edqn_jax.learn.plan import Plan
+from edqn_jax.learn.trainer import Trainer, TrainState
 from edqn_jax.random import run_streams
 from edqn_jax.sim import env
 from edqn_jax.sim.env import MOTION_SIZE, OWN_SIZE, Observation, World
@@ -222,19 +223,19 @@ def retrained(**options: Any) -> Config:
 def test_a_retrained_encoder_begins_a_replay_of_its_own() -> None:
     config = retrained(retrain_at=(0.25,))
     plan, steps = Plan.of(config), jnp.arange(24)
-    assert (plan.total, plan.lessons, plan.starts) == (64, ((0, 4), (16, 18)), 5)
-    assert np.flatnonzero(plan.teaching(steps)).tolist() == [0, 1, 2, 3, 16, 17]
-    assert np.flatnonzero(plan.publishing(steps)).tolist() == [3, 17]
+    assert (plan.total, plan.vae_training, plan.starts) == (64, ((0, 4), (16, 18)), 5)
+    assert np.flatnonzero(plan.trains_vae(steps)).tolist() == [0, 1, 2, 3, 16, 17]
+    assert np.flatnonzero(plan.replaces_encoder(steps)).tolist() == [3, 17]
     assert plan.replay_time(steps).tolist() == [*[0] * 4, *range(14), *range(6)]
-    assert np.flatnonzero(plan.learning(steps)).tolist() == [*range(9, 18), 23]
+    assert np.flatnonzero(plan.trains_q(steps)).tolist() == [*range(9, 18), 23]
     # Every step in which the VAE learns adds a row to its ring, and no other does.
-    assert plan.kept(config, steps).tolist() == [0, 1, 2, 3, *[4] * 13, 5, *[6] * 6]
+    assert plan.samples_kept(config, steps).tolist() == [0, 1, 2, 3, *[4] * 13, 5, *[6] * 6]
     always = dataclasses.replace(config, encoder=dataclasses.replace(config.encoder, keep_learning=True))
-    assert plan.kept(always, steps).tolist() == list(range(24))
+    assert plan.samples_kept(always, steps).tolist() == list(range(24))
 
 
 @pytest.mark.parametrize(
-    ("retrain_at", "retrain_decisions", "lessons"),
+    ("retrain_at", "retrain_decisions", "times"),
     [
         ((0.01,), 32, ((0, 4), (11, 13))),  # not before the DQN has learnt for as long as it takes
         ((0.25, 0.26), 32, ((0, 4), (16, 18), (25, 27))),  # one after another
@@ -242,25 +243,25 @@ def test_a_retrained_encoder_begins_a_replay_of_its_own() -> None:
         ((0.7,), 32, ((0, 4),)),  # too late for the DQN to learn again
     ],
 )
-def test_retrainings_leave_the_dqn_time(retrain_at, retrain_decisions, lessons) -> None:
+def test_retrainings_leave_the_dqn_time(retrain_at, retrain_decisions, times) -> None:
     config = retrained(retrain_at=retrain_at)
     encoder = dataclasses.replace(config.encoder, retrain_decisions=retrain_decisions)
-    assert Plan.of(dataclasses.replace(config, encoder=encoder)).lessons == lessons
+    assert Plan.of(dataclasses.replace(config, encoder=encoder)).vae_training == times
 
 
 @pytest.mark.parametrize("decisions", [10_000, 60_000, 100_000, 200_000, 874_000, 3_200_000])
 def test_whatever_the_length_of_a_run_its_encoders_never_learn_at_once_or_in_vain(decisions: int) -> None:
     plan = Plan.of(make_config("medium", train={"total_steps": decisions}))
     ends = [0]
-    for first, end in plan.lessons:
+    for first, end in plan.vae_training:
         assert ends[-1] <= first < end
         ends.append(end)
-    assert plan.total - ends[-1] >= plan.total // 4 or len(plan.lessons) == 1
-    assert plan.lessons[0] == (0, plan.warmup)
+    assert plan.total - ends[-1] >= plan.total // 4 or len(plan.vae_training) == 1
+    assert plan.vae_training[0] == (0, plan.warmup)
 
 
 @pytest.mark.slow
-def test_the_encoder_that_acts_changes_at_the_end_of_each_lesson_and_never_else(world: World) -> None:
+def test_the_encoder_that_acts_changes_when_the_vae_has_been_trained_and_never_else(world: World) -> None:
     config = retrained(retrain_at=(0.01,))
     state = jax.jit(lambda key: trainer.init(config, world, key))(jax.random.key(0))
     step = jax.jit(lambda state, number: trainer.train_step(config, world, None, state, number))
@@ -280,7 +281,7 @@ def test_the_encoder_that_acts_changes_at_the_end_of_each_lesson_and_never_else(
 def test_labels_reach_the_vae_and_nothing_that_acts_before_it_does(world: World, monkeypatch) -> None:
     """With other labels in a retraining the VAE learns something else; all that is seen and done stays as it was."""
     config = retrained(retrain_at=(0.01,))
-    (_, warmup), (first, end) = Plan.of(config).lessons
+    (_, warmup), (first, end) = Plan.of(config).vae_training
 
     def trained(state: TrainState, start: int, stop: int) -> tuple:
         return jax.jit(lambda state: trainer.run_steps(config, world, state, jnp.arange(start, stop)))(state)

@@ -240,6 +240,16 @@ def test_the_warm_up_is_a_curve_of_its_training_steps(tmp_path):
     assert list(np.asarray(lines["kl"].get_ydata())) == [1.0, 2.0, 3.0, 3.5]
 
 
+def test_the_vae_has_no_line_where_it_did_not_learn(tmp_path):
+    metrics = [
+        {"decisions": 100 * i, "reconstruction_loss": None if 3 <= i < 6 else 1.0, "q_loss": 0.1} for i in range(9)
+    ]
+    metrics += [{"decisions": 900, "reconstruction_loss": None}]
+    figure = draw_learning(metrics, tmp_path / "learning.png")
+    (line,) = (line for axes in figure.axes for line in axes.get_lines() if line.get_gid() == "reconstruction_loss")
+    assert np.isfinite(np.asarray(line.get_ydata(), float)).tolist() == [True] * 3 + [False] * 3 + [True] * 3
+
+
 def test_learning_can_be_drawn_before_anything_was_learned(tmp_path):
     draw_learning([], tmp_path / "learning.png")
     assert is_png(tmp_path / "learning.png")

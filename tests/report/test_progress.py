@@ -52,6 +52,21 @@ def test_a_loss_that_a_chunk_does_not_have_is_not_shown_again():
     assert "validation 50.0%" in second
 
 
+def test_the_estimate_is_made_of_training_alone(monkeypatch):
+    """A warm-up at 1 decision a second and a retraining at 2 do not count: 600 decisions left at 10 a second."""
+    now, out = [0.0], io.StringIO()
+    monkeypatch.setattr("edqn_jax.report.progress.time.monotonic", lambda: now[0])
+    progress = Progress(Console(file=out, width=200), every_s=0.0)
+    progress.phase("training", total=1000)
+    for seconds, decisions, phase in ((100, 100, "warm-up"), (110, 200, "training"), (160, 300, "retraining")):
+        now[0] = seconds
+        progress.update({"phase": phase, "decisions": decisions})
+    now[0] = 170.0
+    progress.update({"phase": "training", "decisions": 400})
+    warm_up, training, retraining, last = (line.split("training left ")[1] for line in out.getvalue().splitlines()[1:])
+    assert (warm_up, training, retraining, last) == ("–", "1:20", "1:10", "1:00")
+
+
 def test_stopping_what_never_started_is_harmless():
     Progress(Console(file=io.StringIO())).stop()
 

@@ -286,6 +286,13 @@ def test_the_yaw_rate_is_that_of_the_heading_however_the_drone_leans():
         np.testing.assert_allclose(drone.yaw_rate_of(state), turned / step_s, atol=5e-3)  # of first order in 1e-3 s
 
 
+def test_the_yaw_rate_of_a_drone_on_its_back_is_bounded():
+    over = jnp.array([1e-3, 0.0, 1.0, 0.0], jnp.float32)  # pitched by nearly half a turn, and rolling
+    state = dataclasses.replace(body((0, 0, 5)), quaternion=over, angular_velocity=jnp.array([3.0, 0.0, 0.0]))
+    assert float(drone.yaw_rate_of(state)) < -1000.0
+    np.testing.assert_array_equal(env.own_motion(CONFIG.env, state, jnp.zeros(3))[3], -env.MOST_YAW_RATE)
+
+
 def test_the_heading_setpoint_is_the_bearing_and_is_held_near_the_goal():
     bearing = partial(env.bearing, CONFIG.env)
     np.testing.assert_allclose(bearing(body((50, 40, 5)), GOAL), np.pi / 2, atol=1e-6)

@@ -18,8 +18,9 @@ from edqn_jax.config import CameraConfig, Config, TrainConfig, WorldConfig
 from edqn_jax.errors import ConfigError, StoppedError
 from edqn_jax.evaluation.missions import run_missions
 from edqn_jax.learn import trainer
+from edqn_jax.learn.plan import Plan
 from edqn_jax.learn.policy import PolicyParams
-from edqn_jax.learn.trainer import Episodes, Losses, Plan
+from edqn_jax.learn.trainer import Episodes, Losses
 from edqn_jax.report.progress import Progress
 from edqn_jax.runs.directory import TRAJECTORY_COLUMNS, RunDirectory, plain
 from edqn_jax.runs.policies import load_run
@@ -179,7 +180,7 @@ def test_a_validation_is_due_where_a_multiple_is_crossed_once_there_was_learning
     every: int, checked: int, done: int, due: bool
 ) -> None:
     config = Config(train=TrainConfig(num_envs=16, validation_every=every))
-    assert is_due(config, Plan(total=200, warmup=0, starts=5, lessons=()), checked, done) is due
+    assert is_due(config, Plan(total=200, warmup=0, starts=5, vae_training=()), checked, done) is due
 
 
 @pytest.mark.slow
