@@ -93,7 +93,7 @@ class Progress:
         return int(self._metrics.get("decisions", 0))
 
     def _measure(self, now: float) -> None:
-        """Adds the newest decisions to the rate, unless the VAE was trained too: they then take several times as long."""
+        """Adds the newest decisions to the rate, unless the VAE was trained, too: then they take much longer."""
         if self._updated is not None and self._phase not in ("warm-up", "retraining"):
             self._measured_s += now - self._updated[0]
             self._measured += self._decisions() - self._updated[1]

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from conventional_stack import task
 from conventional_stack.env import DroneEnv
 from conventional_stack.fleet import Fleet, Record
-from edqn_jax.config import CameraConfig, Config, DroneConfig, EnvConfig, EventsConfig
+from edqn_jax.config import CameraConfig, Config, DroneConfig, EncoderConfig, EnvConfig, EventsConfig
 from edqn_jax.errors import ConfigError
 from edqn_jax.planners.packages import require
 from edqn_jax.sim import drone, env, events, outcomes
@@ -239,6 +239,7 @@ def test_who_ended_starts_anew_within_the_step():
         {"events": EventsConfig(shot_rate_hz=1.0)},
         {"events": EventsConfig(frame_times_s=(-0.08, -0.04, 0.0))},
         {"camera": CameraConfig(mount="body")},
+        {"encoder": EncoderConfig(retrain_at=(0.5,))},
     ],
 )
 def test_what_this_stack_does_not_have_is_said_before_it_flies(change):
