@@ -87,7 +87,9 @@ def check(config: Config) -> None:
     if sensor.law != "paper" or len(sensor.frame_times_s) != 2 or any(noisy):
         raise ConfigError("the conventional stack supports only the noiseless 'paper' event law between two frames")
     if config.encoder.retrain_at:
-        raise ConfigError("the conventional stack supports only a VAE that is trained once; leave encoder.retrain_at empty")
+        raise ConfigError(
+            "the conventional stack supports only a VAE that is trained once; leave encoder.retrain_at empty"
+        )
     if config.camera.mount != "level":
         raise ConfigError("the conventional stack supports only a level camera; set camera.mount to 'level'")
 
