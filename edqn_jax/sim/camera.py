@@ -20,6 +20,7 @@ from edqn_jax.config import CameraConfig
 from edqn_jax.sim import columns, coverage, raycast
 from edqn_jax.sim.columns import Frame
 from edqn_jax.sim.coverage import Layers
+from edqn_jax.sim.depth import nearest_depth
 from edqn_jax.sim.events import LUMA_WEIGHTS
 from edqn_jax.sim.raycast import Rays, Values
 from edqn_jax.sim.scene import Scene
@@ -132,5 +133,5 @@ def on_screen(linear: Pixels) -> Pixels:
 def depth(config: CameraConfig, scene: Scene, position: Array, rotation: Array) -> Array:
     """Returns the distance along each pixel's central ray: [H, W] metres, inf where the ray meets nothing."""
     rays = raycast.camera_rays(config, rotation)
-    nearest = raycast.nearest_depth(config, scene, position, rays)
+    nearest = nearest_depth(config, scene, position, rays)
     return nearest * jnp.sqrt(rays.dx**2 + rays.dy**2 + rays.dz**2)

@@ -348,18 +348,3 @@ def _nearer_of(a: Surfaces, b: Surfaces) -> Surfaces:
         hit=a.hit | b.hit,
         value=jnp.where(take_b, b.value, a.value),
     )
-
-
-def nearest_depth(config: CameraConfig, scene: Scene, origin: Array, rays: Rays) -> Array:
-    """Returns the depth of the nearest surface along each ray: [R, C], inf where there is none."""
-    value = albedo_values(scene, jnp.ones(3))
-    shape = jnp.broadcast_shapes(rays.dx.shape, rays.dz.shape)
-    nearest = jnp.full(shape, jnp.inf)
-    kinds = [plane_surfaces(config, scene, origin, rays, value)] if scene.planes.normal.shape[0] else []
-    kinds += upright_surfaces(config, scene, origin, rays, value)
-    kinds += sphere_surfaces(config, scene, origin, rays, value)
-    kinds += other_surfaces(config, scene, origin, rays, value)
-    for surfaces in kinds:
-        depth = jnp.where(surfaces.hit, surfaces.depth, jnp.inf)
-        nearest = jnp.minimum(nearest, jnp.min(jnp.broadcast_to(depth, depth.shape[:1] + shape), axis=0))
-    return nearest

@@ -16,6 +16,7 @@ from jax import Array
 
 from edqn_jax.config import CameraConfig, Config
 from edqn_jax.sim import camera, drone, events, raycast
+from edqn_jax.sim.depth import nearest_depth
 from edqn_jax.sim.drone import Flight
 from edqn_jax.sim.events import EventField, EventMemory
 from edqn_jax.sim.moves import DIRECTIONS
@@ -229,7 +230,7 @@ def ranges(config: CameraConfig, scene: Scene, position: Array, yaw: Array) -> A
         across=1,
         down=1,
     )
-    to_shape = raycast.nearest_depth(config, scene, position, rays)[0]
+    to_shape = nearest_depth(config, scene, position, rays)[0]
     lower, upper = (jnp.abs(corner - position)[:, None] for corner in scene.volume)
     along = jnp.where(direction > 0, upper, lower) / jnp.maximum(jnp.abs(direction), raycast.TINY)
     to_face = jnp.min(jnp.where(jnp.abs(direction) > raycast.TINY, along, jnp.inf), axis=0)
