@@ -67,7 +67,7 @@ class EvaluateArgs:
 
     run: Annotated[Positional[Path], arg(metavar="RUN")]
     """Folder of the run."""
-    world: Annotated[str | None, arg(metavar="paper|sparse|medium|dense|FILE.xml", help_behavior_hint="")] = None
+    world: Annotated[str | None, arg(metavar="paper|sparse|medium|dense|mixed|FILE.xml", help_behavior_hint="")] = None
     """Where to fly (default: the world of the run)."""
     start: Annotated[Point | None, arg(metavar="X Y Z", help_behavior_hint="")] = None
     """Start of every mission, metres (default: the world's; random free ones with --missions)."""
@@ -94,7 +94,7 @@ class RecordArgs:
     """Folder of the run."""
     file: Annotated[Positional[Path], arg(metavar="FILE.gif")]
     """GIF to write; it replaces a file of that name."""
-    world: Annotated[str | None, arg(metavar="paper|sparse|medium|dense|FILE.xml", help_behavior_hint="")] = None
+    world: Annotated[str | None, arg(metavar="paper|sparse|medium|dense|mixed|FILE.xml", help_behavior_hint="")] = None
     """Where to fly (default: the world of the run)."""
     start: Annotated[Point | None, arg(metavar="X Y Z", help_behavior_hint="")] = None
     """Start of the flight, metres (default: the world's)."""

@@ -74,7 +74,7 @@ def make_config(
         make_config("medium", train={"total_steps": 100_000}, agent={"n_step": 5})
 
     Args:
-        world: `paper`, `sparse`, `medium`, `dense` or an MJCF file; None leaves it to file and preset.
+        world: `paper`, `sparse`, `medium`, `dense`, `mixed` or an MJCF file; None leaves it to file and preset.
         preset: one of `config.PRESETS`.
         file: a YAML file with groups of options.
         groups: options by group, as in a file.

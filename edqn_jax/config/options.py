@@ -15,7 +15,7 @@ class WorldConfig:
     """Where to fly."""
 
     name: str = "paper"
-    """`paper`, a random density (`sparse`, `medium`, `dense`), or the path of an MJCF file."""
+    """`paper`, a random density (`sparse`, `medium`, `dense`, or `mixed`: all three), or the path of an MJCF file."""
     pool_size: int = 1024
     """Random training worlds, generated before training (random densities only)."""
     missions: int = 8192
@@ -315,5 +315,5 @@ class Config:
     train: TrainConfig = field(default_factory=TrainConfig)
 
 
-DENSITIES = ("sparse", "medium", "dense")
-"""Names of the random worlds."""
+DENSITIES = ("sparse", "medium", "dense", "mixed")
+"""Names of the random worlds; of `mixed` ones each has one of the three densities."""

@@ -66,7 +66,7 @@ def evaluate(
 
     Args:
         policy: from `train` or `load_policy`.
-        world: `paper`, `sparse`, `medium`, `dense` or an MJCF file; None is the policy's own.
+        world: `paper`, `sparse`, `medium`, `dense`, `mixed` or an MJCF file; None is the policy's own.
         missions: how many. One in a world from a file goes from its start to its goal, more begin at random free
             points; in random worlds each has a test world of its own, which training never uses.
         seed: which missions.

@@ -29,12 +29,12 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from edqn_jax.config import Config
+from edqn_jax.config import DENSITIES, Config
 from edqn_jax.errors import ConfigError
 from edqn_jax.planners.planner import path_length, point_text
 from edqn_jax.sim.mjcf import check_scene, load_world, resolve_world
 from edqn_jax.sim.scene import Scene, segment_contact, signed_distance
-from edqn_jax.sim.worlds import SHAPES, random_scene, world_key
+from edqn_jax.sim.worlds import random_scene, world_key
 
 _STEPS = np.array([step for step in itertools.product((-1, 0, 1), repeat=3) if any(step)])  # [26, 3]
 _SLACK = 1.0  # a batch holds entries up to this many cells above the best: fewer batches, a few cells too many
@@ -311,12 +311,12 @@ def _batched(function, scene: Scene, rows: np.ndarray, *rest: float) -> np.ndarr
 def main(arguments: list[str] | None = None) -> int:
     """Print the shortest path of a world."""
     parser = argparse.ArgumentParser(prog="python -m edqn_jax.planners.astar", description=main.__doc__)
-    parser.add_argument("--world", default="paper", help="paper, sparse, medium, dense or an MJCF file")
+    parser.add_argument("--world", default="paper", help="paper, sparse, medium, dense, mixed or an MJCF file")
     parser.add_argument("--index", type=int, default=0, help="which test world, for random worlds")
     options = parser.parse_args(arguments)
     radius = Config().drone.body_radius_m
     try:
-        if options.world in SHAPES:
+        if options.world in DENSITIES:
             scene = random_scene(options.world, world_key("test", options.index))
         else:
             world = load_world(resolve_world(options.world))

@@ -14,6 +14,7 @@ from jax.typing import ArrayLike
 
 from edqn_jax.config import DENSITIES
 from edqn_jax.errors import ConfigError
+from edqn_jax.random import integers
 from edqn_jax.sim.scene import (
     PARKED,
     Capsules,
@@ -32,7 +33,9 @@ from edqn_jax.sim.scene import (
 SIZE = (110.0, 110.0, 25.0)
 """Flight volume of a random world, metres: the paper's."""
 SHAPES = {"sparse": (8, 2, 2), "medium": (22, 5, 3), "dense": (44, 10, 6)}
-"""Capacities of a random world: blocks, pillars and balls. Medium is the paper's density."""
+"""Blocks, pillars and balls of a random world, if all find a place. Medium is the paper's density."""
+MIXED = "mixed"
+"""Name of random worlds each of which has one of the three densities, with equal chances."""
 HALF_WIDTHS = {"sparse": (2.0, 5.5), "medium": (2.0, 5.5), "dense": (1.5, 4.0)}
 """Range of a block's half width and half depth, metres."""
 GAP = 3.0
@@ -48,6 +51,7 @@ GROUND_RGB = (0.37, 0.43, 0.35)
 
 _ALTITUDES = (1.5, 20.0)  # of the start and goal of a random world, metres
 _FENCE = ((1.0, 1.0, 1.0), (1.0, 1.0, 2.0))  # between random points and the volume's lower and upper faces
+_DENSITY = 1_000_003  # folded into the key of a mixed world to draw its density
 _TRIES = 64  # candidates for each free point; the chance that all fail is below 1e-13 in a dense world
 _PLACES = 64  # candidate positions for each shape
 
@@ -86,16 +90,17 @@ def random_scene(density: str, key: Array) -> Scene:
     any other disc begins. So every free point is connected to the free space between the discs.
 
     Args:
-        density: `sparse`, `medium` or `dense`.
+        density: `sparse`, `medium`, `dense`, or `mixed`.
         key: consumed.
 
     Raises:
         ConfigError: if the density is unknown.
     """
-    if density not in SHAPES:
+    if density not in DENSITIES:
         raise ConfigError(f"unknown density '{density}'; the densities are {', '.join(DENSITIES)}")
-    blocks, pillars, balls = SHAPES[density]
+    blocks, pillars, balls = capacities(density)
     count = blocks + pillars + balls
+    wanted, (narrow, wide) = _shapes_wanted(density, key)
     # One draw for all: on CPU each separate draw costs half a second of compilation.
     draws = jax.random.uniform(key, (count * (4 + 2 * _PLACES + 5) + 2 * _TRIES * 3,))
     sizes, places, colours, ends = jnp.split(
@@ -103,7 +108,6 @@ def random_scene(density: str, key: Array) -> Scene:
     )
     draw = sizes.reshape(count, 4)
     first, second = blocks, blocks + pillars
-    narrow, wide = HALF_WIDTHS[density]
     sides = narrow + (wide - narrow) * draw[:first, :2]
     block_height = 4.0 + 20.0 * draw[:first, 2]
     yaw = jnp.pi * draw[:first, 3]
@@ -113,7 +117,7 @@ def random_scene(density: str, key: Array) -> Scene:
     ball_height = ball_radius + draw[second:, 1] * (SIZE[2] - 2.0 - 2.0 * ball_radius)
 
     reach = jnp.concatenate([jnp.hypot(sides[:, 0], sides[:, 1]), pillar_radius, ball_radius])
-    x, y, placed = _place(reach, places.reshape(count, _PLACES, 2))
+    x, y, placed = _place(reach, places.reshape(count, _PLACES, 2), wanted)
     z = jnp.concatenate([block_height / 2, pillar_height / 2, ball_height])
     position = jnp.where(placed[:, None], jnp.stack([x, y, z], axis=1), PARKED)
     albedo = _colours(colours.reshape(count, 5))
@@ -145,18 +149,38 @@ def random_scene(density: str, key: Array) -> Scene:
     return dataclasses.replace(scene, start=start, goal=goal)
 
 
+def capacities(density: str) -> tuple[int, int, int]:
+    """Returns the most blocks, pillars and balls of a random world."""
+    if density == MIXED:
+        blocks, pillars, balls = zip(*SHAPES.values(), strict=True)
+        return max(blocks), max(pillars), max(balls)
+    return SHAPES[density]
+
+
+def _shapes_wanted(density: str, key: Array) -> tuple[Array, Array]:
+    """Returns which shapes [N] a world shall have, and the range [2] of its blocks' half widths."""
+    most = capacities(density)
+    if density != MIXED:
+        return jnp.ones(sum(most), bool), jnp.asarray(HALF_WIDTHS[density])
+    kind = integers(jax.random.fold_in(key, _DENSITY), (), len(SHAPES))
+    counts = jnp.asarray(list(SHAPES.values()))[kind]
+    wanted = [jnp.arange(capacity) < counts[number] for number, capacity in enumerate(most)]
+    return jnp.concatenate(wanted), jnp.asarray([HALF_WIDTHS[name] for name in SHAPES])[kind]
+
+
 @partial(jax.jit, static_argnums=0)
 def random_pool(density: str, keys: Array) -> Scene:
     """Returns a pool of random worlds, one for each of `keys` [P]."""
     return jax.vmap(partial(random_scene, density))(keys)
 
 
-def _place(reach: Array, draw: Array) -> tuple[Array, Array, Array]:
+def _place(reach: Array, draw: Array, wanted: Array) -> tuple[Array, Array, Array]:
     """Returns positions for discs that are `GAP` apart and `GAP` inside the volume, chosen one after the other.
 
     Args:
         reach: [N] radii, metres.
         draw: [N, K, 2] uniform in [0, 1), K candidate positions for each.
+        wanted: [N] bool, which discs are to be placed.
 
     Returns:
         x, y: [N] metres. placed: [N] bool; a disc for which no candidate was free is not.
@@ -166,20 +190,21 @@ def _place(reach: Array, draw: Array) -> tuple[Array, Array, Array]:
     upper = jnp.array(SIZE[:2])[None, None] - lower
     candidates = lower + draw * (upper - lower)
 
-    def place(discs: tuple[Array, Array, Array], item: tuple[Array, Array, Array]):
+    def place(discs: tuple[Array, Array, Array], item: tuple[Array, Array, Array, Array]):
         x, y, taken = discs
-        number, radius, places = item
+        number, radius, places, wanted = item
         apart = jnp.hypot(places[:, 0, None] - x[None], places[:, 1, None] - y[None])
         free = jnp.all(apart >= radius + taken[None] + GAP, axis=1)
         chosen = places[jnp.argmax(free)]
-        found = jnp.any(free)
+        found = jnp.any(free) & wanted
         # A disc without a free position is parked.
         x = x.at[number].set(jnp.where(found, chosen[0], PARKED))
         y = y.at[number].set(jnp.where(found, chosen[1], PARKED))
         return (x, y, taken.at[number].set(radius)), found
 
     parked = jnp.full(count, PARKED)
-    (x, y, _), placed = jax.lax.scan(place, (parked, parked, jnp.zeros(count)), (jnp.arange(count), reach, candidates))
+    discs = jnp.arange(count), reach, candidates, wanted
+    (x, y, _), placed = jax.lax.scan(place, (parked, parked, jnp.zeros(count)), discs)
     return x, y, placed
 
 

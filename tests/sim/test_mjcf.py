@@ -208,7 +208,7 @@ def test_a_missing_scene_names_what_there_is_and_what_was_meant(name, hint, tmp_
         resolve_world(name)
     assert message(raised) == (
         f"there is no scene '{name}' in {tmp_path}; scenes known by name: alley, paper; "
-        f"random worlds: sparse, medium, dense{hint}"
+        f"random worlds: sparse, medium, dense, mixed{hint}"
     )
 
 

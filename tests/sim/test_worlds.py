@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from edqn_jax.config import DENSITIES
 from edqn_jax.errors import ConfigError
 from edqn_jax.planners.astar import shortest_path
 from edqn_jax.sim.mjcf import check_scene, load_scene, resolve_world
@@ -32,7 +33,7 @@ from edqn_jax.sim.worlds import (
     CLEARANCE,
     FAR,
     GAP,
-    SHAPES,
+    HALF_WIDTHS,
     SIZE,
     SPLITS,
     free_point,
@@ -52,7 +53,7 @@ MISSIONS = 512
 
 @pytest.fixture(scope="module")
 def pools():
-    return {density: random_pool(density, world_keys("validation", WORLDS)) for density in SHAPES}
+    return {density: random_pool(density, world_keys("validation", WORLDS)) for density in DENSITIES}
 
 
 @pytest.fixture(scope="module")
@@ -91,7 +92,22 @@ def test_a_density_has_its_number_of_shapes(pools, density, least, most):
     assert least <= min(counts) and max(counts) <= most
 
 
-@pytest.mark.parametrize("density", SHAPES)
+@pytest.mark.slow
+def test_mixed_worlds_are_of_every_density(pools):
+    ranges = {"sparse": range(12, 13), "medium": range(28, 31), "dense": range(54, 61)}
+    seen = dict.fromkeys(ranges, 0)
+    for i in range(WORLDS):
+        scene = take_scene(pools["mixed"], i)
+        (density,) = [name for name, counts in ranges.items() if obstacle_count(scene) in counts]
+        seen[density] += 1
+        widths = np.asarray(scene.boxes.half)[np.asarray(scene.boxes.position[:, 2]) < PARKED / 2, :2]
+        narrow, wide = HALF_WIDTHS[density]
+        assert widths.min() >= narrow and widths.max() <= wide
+    # Of 24 worlds 8 are expected of each density; 2 or fewer come once in 200 draws of keys, which are fixed.
+    assert min(seen.values()) > 2, seen
+
+
+@pytest.mark.parametrize("density", DENSITIES)
 def test_footprints_keep_their_gap_so_that_free_space_is_connected(pools, density):
     for i in range(WORLDS):
         shapes = [s for s in scene_shapes(take_scene(pools[density], i)) if not isinstance(s, Planes)]
@@ -102,7 +118,7 @@ def test_footprints_keep_their_gap_so_that_free_space_is_connected(pools, densit
             assert min(x, y, SIZE[0] - x, SIZE[1] - y) - r > GAP - 1e-3
 
 
-@pytest.mark.parametrize("density", SHAPES)
+@pytest.mark.parametrize("density", DENSITIES)
 def test_shapes_stand_on_the_ground_and_below_the_ceiling(pools, density):
     pool = pools[density]
     for position, half in (
@@ -117,7 +133,7 @@ def test_shapes_stand_on_the_ground_and_below_the_ceiling(pools, density):
     assert (np.asarray(low)[present] > -1e-4).all()
 
 
-@pytest.mark.parametrize("density", SHAPES)
+@pytest.mark.parametrize("density", DENSITIES)
 @pytest.mark.slow
 def test_start_and_goal_are_free_and_far_apart(pools, density):
     pool = pools[density]
@@ -129,7 +145,7 @@ def test_start_and_goal_are_free_and_far_apart(pools, density):
         check_scene(take_scene(pool, i), RADIUS)
 
 
-@pytest.mark.parametrize("density", SHAPES)
+@pytest.mark.parametrize("density", DENSITIES)
 @pytest.mark.slow
 def test_there_is_a_path_in_every_random_world(pools, density):
     for i in range(2):
@@ -146,7 +162,7 @@ def test_a_key_makes_one_world_and_another_key_another(pools):
 
 
 def test_an_unknown_density_names_those_there_are():
-    with pytest.raises(ConfigError, match="'thick'; the densities are sparse, medium, dense"):
+    with pytest.raises(ConfigError, match="'thick'; the densities are sparse, medium, dense, mixed"):
         random_scene("thick", world_key("test", 0))
 
 
