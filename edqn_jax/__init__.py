@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from edqn_jax.sim.moves import move_name, move_number
     from edqn_jax.sim.outcomes import Outcome
     from edqn_jax.sim.reward import Transition
-    from edqn_jax.training.loop import Chunk, TrainingResult, train
+    from edqn_jax.training.loop import Chunk, TrainingResult, train, train_seeds
 
 _MODULES = {
     "Chunk": "training.loop",
@@ -42,6 +42,7 @@ _MODULES = {
     "move_number": "sim.moves",
     "save_policy": "runs.policies",
     "train": "training.loop",
+    "train_seeds": "training.loop",
     "use_cpu_devices": "parallel.devices",
 }
 """The module of each public name."""
@@ -67,6 +68,7 @@ __all__ = [
     "move_number",
     "save_policy",
     "train",
+    "train_seeds",
     "use_cpu_devices",
 ]
 

@@ -154,7 +154,7 @@ class Learner:
             seconds += time.perf_counter() - began
             done += config.train.chunk_steps
             try:
-                check_finite(plan, done, losses)
+                check_finite(plan, done, losses, seed)
             except DivergedError as error:
                 return diverged(seed, str(error), done * envs, seconds, validation)
             if done >= plan.total or is_due(config, plan, validation.checked, done):

@@ -13,8 +13,8 @@ from typing import Any
 import numpy as np
 
 from edqn_jax.errors import ConfigError
+from edqn_jax.evaluation.intervals import difference_interval, rate_interval
 from edqn_jax.planners.planner import SAMPLING
-from rivals.intervals import difference_interval, rate_interval
 
 Row = dict[str, Any]
 

@@ -37,6 +37,9 @@ class TrainOptions:
     """`default`: the best agent known to us. `paper`: exactly Table 1 of the paper."""
     config: Annotated[Path | None, arg(metavar="FILE.yaml", help_behavior_hint="")] = None
     """YAML file of options by group; overrides the preset, and flags override the file."""
+    seeds: Annotated[int | None, arg(metavar="K", help_behavior_hint="")] = None
+    """Train K policies, of the seeds from --seed on, side by side in one program; each gets a folder `seed-N` in the
+    folder of the run, whose summary has every seed's success and their interquartile mean."""
     run_dir: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="")] = None
     """Folder for the files of the run (default: a new, dated folder under runs/)."""
     resume: Resume = "auto"

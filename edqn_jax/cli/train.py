@@ -29,6 +29,7 @@ def train_command(argv: Sequence[str]) -> None:
     from edqn_jax.parallel.devices import cores, most_that_divide, use_cpu_devices
     from edqn_jax.report.progress import Progress
     from edqn_jax.training.run import train_run
+    from edqn_jax.training.seeds import train_seeds_run
 
     use_cpu_devices(config.train.devices or most_that_divide(config.train.shards, cores()))
     process = 0
@@ -40,6 +41,9 @@ def train_command(argv: Sequence[str]) -> None:
     progress = Progress(Console(quiet=not writes))
     with listening_for_sigterm() as stop_requested:
         try:
-            train_run(config, run, progress, stop_requested)
+            if options.seeds is None:
+                train_run(config, run, progress, stop_requested)
+            else:
+                train_seeds_run(config, options.seeds, run, progress, stop_requested)
         finally:
             progress.stop()

@@ -110,10 +110,10 @@ def _encoder(encoder: EncoderConfig) -> None:
 
 def _agent(agent: AgentConfig) -> None:
     _positive(agent, "agent", ["history", "n_step", "batch_size", "updates_per_step", "replay_size"])
-    _positive(agent, "agent", ["learning_rate", "reward_scale", "code_scale"])
+    _positive(agent, "agent", ["learning_rate", "reward_scale", "code_scale", "munchausen_temperature"])
     _not_negative(agent, "agent", ["final_learning_rate", "huber_delta"])
     _not_negative(agent, "agent", ["learning_starts", "random_decisions", "exploration_episodes"])
-    _share(agent, "agent", ["discount", "exploration_start", "exploration_end", "exploration_fraction"])
+    _share(agent, "agent", ["discount", "munchausen", "exploration_start", "exploration_end", "exploration_fraction"])
     for key in ("target_rate", "average_rate"):
         rate = getattr(agent, key)
         _require(0 < rate <= 1, f"agent.{key}", "more than 0 and at most 1", rate)

@@ -237,6 +237,10 @@ class AgentConfig:
     """Dueling heads (Wang et al. 2016)."""
     double: bool = True
     """Double DQN targets (van Hasselt et al. 2016)."""
+    munchausen: float = 0.0
+    """Weight of the log-policy in the reward (Munchausen DQN, Vieillard et al. 2020); above 0 it replaces `double`."""
+    munchausen_temperature: float = 0.03
+    """Temperature of that policy, in units of scaled reward."""
     n_step: int = 3
     """Steps of the return before the bootstrap."""
     discount: float = 0.97

@@ -473,42 +473,70 @@ class Trainer:
     world and seed, and calls it alike; each holds the shards of its own devices.
     """
 
-    def __init__(self, config: Config, world: World, devices: Sequence[jax.Device]):  # pyright: ignore
+    def __init__(
+        self,
+        config: Config,
+        world: World | Sequence[World],
+        devices: Sequence[jax.Device],  # pyright: ignore[reportInvalidTypeForm]
+    ):
+        """Prepares one agent, or as many as there are worlds: they learn side by side in one program.
+
+        Args:
+            config: of all agents.
+            world: of the one agent, or one for each of K agents, which may differ in their missions alone. States,
+                episodes and losses of several agents have a leading [K].
+            devices: over which the environments of every agent are spread.
+        """
         self.config = config
         self.plan = Plan.of(config)
+        self.agents = None if isinstance(world, World) else len(world)
         self.mesh = Mesh(np.asarray(devices), (AXIS,))
         self.replicated = NamedSharding(self.mesh, PartitionSpec())
-        self.world = processes.replicate(world, self.mesh)
+        self.world = processes.replicate(world if isinstance(world, World) else _joined(world), self.mesh)
         self._chunk = None
 
-    def init(self, seed: int) -> TrainState:
-        """The state before the first step, laid out over the devices."""
-        make = jax.jit(lambda world, key: init(self.config, world, key))
+    def init(self, seed: int | Sequence[int]) -> TrainState:
+        """The state before the first step, laid out over the devices; of several agents, one seed for each."""
+        make = jax.jit(self._each(lambda world, key: init(self.config, world, key), 0))
+        keys = [run_streams(number).learning for number in ([seed] if isinstance(seed, int) else seed)]
         # Made whole and then cut: made in parts it would be rounded otherwise. `device_put` reaches no other process.
-        whole = make(self.world, run_streams(seed).learning)
+        whole = make(self.world, keys[0] if self.agents is None else jnp.stack(keys))
         return jax.jit(lambda state: state, out_shardings=self._layout())(whole)
 
+    def _each(self, function: Callable[..., Any], *axes: int | None) -> Callable[..., Any]:
+        """Returns `function(world, *arguments)` for all agents; `axes` are those of the other arguments."""
+        if self.agents is None:
+            return function
+        missions = dataclasses.replace(self.world, airframe=None, pool=None, missions=0)
+        return jax.vmap(function, in_axes=(missions, *axes))
+
+    def _spread(self, *before: None) -> PartitionSpec:
+        """Returns how arrays [K, *before, S, ...] are laid out."""
+        return PartitionSpec(*([] if self.agents is None else [None]), *before, AXIS)
+
     def _layout(self) -> Any:
-        spread, same = NamedSharding(self.mesh, PartitionSpec(AXIS)), self.replicated
+        spread, same = NamedSharding(self.mesh, self._spread()), self.replicated
         return TrainState(actors=spread, learner=same, step=same)  # pyright: ignore[reportArgumentType]
 
     def compile(self) -> None:
         """Trace and compile the chunk, once; needs no state, so that it can go on while one is made."""
-        shapes = jax.eval_shape(partial(init, self.config), self.world, jax.random.key(0))
+        key = jax.random.key(0)
+        keys = key if self.agents is None else jax.random.split(key, self.agents)
+        shapes = jax.eval_shape(self._each(partial(init, self.config), 0), self.world, keys)
         layout = self._layout()
         state = TrainState(
             actors=_laid(shapes.actors, layout.actors),
             learner=_laid(shapes.learner, layout.learner),
             step=_laid(shapes.step, layout.step),
         )
-        spread, same = PartitionSpec(AXIS), PartitionSpec()
         # One spec for each subtree: only environments and replay are spread, and what they return.
+        spread, same = self._spread(), PartitionSpec()
         specs: Any = TrainState(actors=spread, learner=same, step=same)  # pyright: ignore[reportArgumentType]
         run = jax.shard_map(
-            lambda world, state, steps: run_steps(self.config, world, state, steps, AXIS),
+            self._each(lambda world, state, steps: run_steps(self.config, world, state, steps, AXIS), 0, None),
             mesh=self.mesh,
             in_specs=(same, specs, same),
-            out_specs=(specs, (PartitionSpec(None, AXIS), same)),
+            out_specs=(specs, (self._spread(None), same)),
             check_vma=False,
         )
         jitted = jax.jit(run, donate_argnums=1)
@@ -523,9 +551,23 @@ class Trainer:
         """The training steps `first .. first + chunk_steps - 1`; `state` is donated.
 
         Returns:
-            state, (episodes [K, S, E], losses [K]); the episodes are spread over the devices as the shards are.
+            state, (episodes [T, S, E], losses [T]) of the chunk's T steps; of several agents with a leading [K]. The
+            episodes are spread over the devices as the shards are.
         """
         if self._chunk is None:
             self.compile()
         assert self._chunk is not None
         return self._chunk(self.world, state, self._steps(first))
+
+    def each(self, tree: Any) -> list[Any]:
+        """Returns the arrays of each agent, of arrays that have a leading [K] if there are several."""
+        if self.agents is None:
+            return [tree]
+        return [jax.tree.map(lambda leaf, number=number: leaf[number], tree) for number in range(self.agents)]
+
+
+def _joined(worlds: Sequence[World]) -> World:
+    """Returns the first world with the missions of all, [K, M]."""
+    return dataclasses.replace(
+        worlds[0], missions=jax.tree.map(lambda *leaves: jnp.stack(leaves), *(w.missions for w in worlds))
+    )

@@ -7,7 +7,7 @@ import datetime
 import json
 import math
 import shutil
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
@@ -30,6 +30,10 @@ number, the reward of the decision and the distance of the body's sphere from th
 EPISODE_COLUMNS = ("step", "return", "length", "outcome")
 """Columns of `episodes.csv`: decisions of all environments when the episode ended, undiscounted return,
 decisions of the episode, and how it ended."""
+
+
+SEED_FOLDER = "seed-"
+"""Beginning of the name of a seed's folder within that of several."""
 
 
 @dataclass(frozen=True)
@@ -67,6 +71,29 @@ class RunDirectory:
     @property
     def checkpoints(self) -> Path:
         return self.path / "checkpoints"
+
+    def of_seed(self, seed: int) -> RunDirectory:
+        """Returns the folder of one seed's run, where several are trained in one program."""
+        return RunDirectory(self.path / f"{SEED_FOLDER}{seed}")
+
+    def create_for_seeds(self, configs: Sequence[Config]) -> None:
+        """Creates the folder with the first seed's `config.yaml`, and that of every seed within it, as `create`.
+
+        Raises:
+            ConfigError: as `create`.
+        """
+        try:
+            self.path.mkdir(parents=True, exist_ok=not self.must_be_new)
+            self.summary_file.unlink(missing_ok=True)
+            for folder in self.path.glob(f"{SEED_FOLDER}*"):
+                shutil.rmtree(folder, ignore_errors=True)
+            write_atomically(self.config_file, to_yaml(configs[0]))
+        except FileExistsError:
+            raise ConfigError(f"another run has just created '{self.path}'; start this one again") from None
+        except OSError as error:
+            raise unwritable(self.path, error.strerror) from None
+        for config in configs:
+            self.of_seed(config.train.seed).create(config)
 
     def create(self, config: Config) -> None:
         """Creates the folder with `config.yaml` and the header of `episodes.csv`.

@@ -14,6 +14,7 @@ from edqn_jax.config.loading import apply, load_layer, to_yaml
 from edqn_jax.errors import ConfigError
 from edqn_jax.learn.policy import Policy, PolicyParams, fresh_policy
 from edqn_jax.runs.checkpoints import load_params, save_params
+from edqn_jax.runs.directory import SEED_FOLDER
 from edqn_jax.runs.files import check_can_make, write_atomically
 
 
@@ -50,6 +51,9 @@ def load_run(folder: Path) -> tuple[Config, PolicyParams]:
     file = folder / "config.yaml"
     if not file.is_file():
         raise ConfigError(f"there is no run in '{folder}': it holds no config.yaml")
+    seeds = sorted(folder.glob(f"{SEED_FOLDER}*/"))
+    if seeds:
+        raise ConfigError(f"'{folder}' holds the runs of {len(seeds)} seeds; name one of them, such as '{seeds[0]}'")
     config = apply(Config(), load_layer(file), str(file))
     validate(config)
     params = load_params(folder / "checkpoints")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -89,6 +90,19 @@ def chunk_metrics(
     }
 
 
+def mean_metrics(agents: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """Returns the metrics of a chunk, averaged over agents: numbers over those that have them, others of the first."""
+    first, *others = agents
+    if not others:
+        return first
+    means = {}
+    for name, value in first.items():
+        values = [agent[name] for agent in agents if agent[name] is not None]
+        numbers = values and all(isinstance(value, int | float) for value in values)
+        means[name] = float(np.mean(values)) if numbers else value
+    return means
+
+
 def _phase(plan: Plan, step: int) -> str:
     """Returns the name of what training step `step` belongs to."""
     if step < plan.warmup:
@@ -113,16 +127,18 @@ def _warm_up(config: Config, first: int, losses: Losses) -> dict[str, Any] | Non
     }
 
 
-def check_finite(plan: Plan, done: int, losses: Losses) -> None:
+def check_finite(plan: Plan, done: int, losses: Losses, seed: int) -> None:
     """Raises if a loss of the chunk that ended with training step `done` is NaN or Inf.
 
     Raises:
-        DivergedError: names the loss and the step.
+        DivergedError: names the loss, the step and the run's seed.
     """
     learns = np.asarray(plan.trains_q(np.arange(done - len(losses.q_loss), done)))
     bad = learns & ~np.isfinite(losses.q_loss)
     if bad.any():
-        raise DivergedError(f"training diverged: the Q loss was {losses.q_loss[bad][0]} at training step {done}")
+        raise DivergedError(
+            f"training with seed {seed} diverged: the Q loss was {losses.q_loss[bad][0]} at training step {done}"
+        )
 
 
 def _mean(values: Any) -> float | None:

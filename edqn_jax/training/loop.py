@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import functools
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Executor, Future, ThreadPoolExecutor
 from typing import Any, Protocol
 
@@ -19,8 +20,9 @@ from jax.sharding import Mesh
 
 from edqn_jax.config import Config
 from edqn_jax.config.limits import validate
+from edqn_jax.errors import ConfigError
 from edqn_jax.evaluation import rollouts
-from edqn_jax.evaluation.missions import MissionSet, run_missions
+from edqn_jax.evaluation.missions import MissionSet, RunMissions, run_missions
 from edqn_jax.learn.policy import Policy, PolicyParams, fresh_policy
 from edqn_jax.learn.trainer import Trainer, TrainState, policy_of
 from edqn_jax.parallel import processes
@@ -31,7 +33,7 @@ from edqn_jax.random import run_streams
 from edqn_jax.sim.env import World
 from edqn_jax.sim.flights import Flights
 from edqn_jax.sim.reward import Reward
-from edqn_jax.training.history import EndedEpisodes, History, check_finite, chunk_metrics
+from edqn_jax.training.history import EndedEpisodes, History, check_finite, chunk_metrics, mean_metrics
 from edqn_jax.training.selection import Candidate, choose, is_due, validated
 
 
@@ -47,6 +49,8 @@ class Chunk:
     """Parameters that the run would end with by now, and their validation."""
     policy: Callable[[], Policy]
     """Returns the newest policy; to be called during the callback only, the state is donated to the next chunk."""
+    agent: int = 0
+    """Which of the agents that train in one program."""
 
 
 Callback = Callable[[Chunk], bool | None]
@@ -83,7 +87,7 @@ class TrainingResult:
     kept: Candidate
     """The policy's parameters, and their validation."""
     state: TrainState
-    """Train state after the last chunk."""
+    """Train state after the last chunk; of several agents, of all of them."""
     decisions: int
     stopped: bool
     """Whether a callback ended it early."""
@@ -94,53 +98,82 @@ class TrainingResult:
 class Preparation:
     """Devices, missions, programs and the first state of a run; made by `prepared`."""
 
-    def __init__(self, config: Config, reward: Reward | None, display: Display, pool: Executor) -> None:
+    def __init__(
+        self, config: Config, reward: Reward | None, display: Display, pool: Executor, agents: int | None
+    ) -> None:
         """Compiles in the background while the shortest path is searched and the first state is made.
 
         Raises:
             ConfigError: if the configuration is invalid or the world cannot be flown.
         """
-        validate(config)
+        self.configs = _of_agents(config, agents)
+        for each in self.configs:
+            validate(each)
         self.config, self.display, self.pool, self.began = config, display, pool, time.perf_counter()
         display.phase("preparing worlds")
         self.devices = choose_devices(config.train.devices, config.train.shards)
         # A world's file may be missing on one host.
-        self.missions = processes.together(lambda: run_missions(config, reward))
-        self.trainer = Trainer(config, self.missions.training.world, self.devices)
+        self.missions = processes.together(lambda: [run_missions(each, reward) for each in self.configs])
+        worlds = [missions.training.world for missions in self.missions]
+        self.trainer = Trainer(config, worlds[0] if agents is None else worlds, self.devices)
         self.mesh = Mesh(np.asarray(self.devices), ("mission",))
         display.phase("compiling")
         self.compiled = _in_background(pool, self.trainer.compile)
         self.rollouts_compiled = _in_background(pool, self._compile_rollouts)
         self.shortest = processes.together(self._shortest)
 
-    def fly(self, missions: MissionSet, params: PolicyParams) -> Flights:
+    def init(self) -> TrainState:
+        """Returns the state before the first step."""
+        seeds = [config.train.seed for config in self.configs]
+        return self.trainer.init(seeds[0] if self.trainer.agents is None else seeds)
+
+    def fly(self, missions: MissionSet, params: PolicyParams, agent: int = 0) -> Flights:
         """Returns the missions, flown greedily and recorded; sensor noise is the same each time."""
-        placed = self._placed(missions, params)
+        placed = self._placed(missions, params, agent)
         return processes.fetch(rollouts.fly_missions(self.config, *placed, record=True, mesh=self.mesh))
 
     def _shortest(self) -> ShortestPath:
-        scene = self.missions.scene
+        scene = self.missions[0].scene
         return shortest_path(scene, scene.start, scene.goal, self.config.drone.body_radius_m)
 
     def _compile_rollouts(self) -> None:
-        placed = self._placed(self.missions.validation, fresh_policy(self.config))
+        placed = self._placed(self.missions[0].validation, fresh_policy(self.config), 0)
         rollouts.prepare(self.config, *placed, record=True, mesh=self.mesh)
 
-    def _placed(self, missions: MissionSet, params: PolicyParams) -> tuple[World, PolicyParams, jax.Array]:
+    def _placed(self, missions: MissionSet, params: PolicyParams, agent: int) -> tuple[World, PolicyParams, jax.Array]:
         """World, parameters and key as `fly_missions` takes them."""
-        return *processes.replicate((missions.world, params), self.mesh), run_streams(self.config.train.seed).flights
+        key = run_streams(self.configs[agent].train.seed).flights
+        return *processes.replicate((missions.world, params), self.mesh), key
+
+
+def _of_agents(config: Config, agents: int | None) -> list[Config]:
+    """Returns the configuration of each agent: the seeds of several are those from the configured one on."""
+    if agents is None:
+        return [config]
+    if agents < 1:
+        raise ConfigError(f"the number of agents must be at least 1, not {agents}")
+    seeds = range(config.train.seed, config.train.seed + agents)
+    return [dataclasses.replace(config, train=dataclasses.replace(config.train, seed=seed)) for seed in seeds]
 
 
 @contextlib.contextmanager
-def prepared(config: Config, reward: Reward | None = None, display: Display | None = None) -> Iterator[Preparation]:
+def prepared(
+    config: Config, reward: Reward | None = None, display: Display | None = None, agents: int | None = None
+) -> Iterator[Preparation]:
     """Prepares a run; where the block ends with an error, nobody waits for what is still being compiled.
+
+    Args:
+        config: of the run; its seed is that of the first agent.
+        reward: as in `train`.
+        display: of the progress.
+        agents: how many are trained in one program; None is one, compiled as such.
 
     Raises:
         ConfigError: if the configuration is invalid or the world cannot be flown.
     """
     pool = ThreadPoolExecutor(max_workers=2, thread_name_prefix="compiling")
     try:
-        yield Preparation(config, reward, display or Silent(), pool)
+        yield Preparation(config, reward, display or Silent(), pool, agents)
     finally:
         pool.shutdown(wait=False, cancel_futures=True)
 
@@ -177,103 +210,146 @@ def train(
         DivergedError: if a loss becomes NaN or Inf.
     """
     with prepared(config or Config(), reward) as preparation:
+        return run_chunks(preparation, callback)[0]
+
+
+def train_seeds(
+    seeds: int, config: Config | None = None, *, reward: Reward | None = None, callback: Callback | None = None
+) -> list[TrainingResult]:
+    """Trains one policy for each of several seeds, in one compiled program; arguments and errors as `train`.
+
+    Args:
+        seeds: how many; they are `train.seed`, `train.seed + 1` and so on.
+    """
+    with prepared(config or Config(), reward, agents=seeds) as preparation:
         return run_chunks(preparation, callback)
 
 
-def run_chunks(preparation: Preparation, callback: Callback | None = None) -> TrainingResult:
-    """Trains what was prepared, chunk after chunk.
+def run_chunks(preparation: Preparation, callback: Callback | None = None) -> list[TrainingResult]:
+    """Trains what was prepared, chunk after chunk; returns the result of each agent.
 
     Raises:
         DivergedError: if a loss becomes NaN or Inf.
     """
-    config, trainer = preparation.config, preparation.trainer
-    state = trainer.init(config.train.seed)
+    trainer = preparation.trainer
+    state = preparation.init()
     compile_seconds = preparation.compiled.result()
-    loop = _Loop(preparation, callback, Candidate(_on_host(policy_of(state))))
-    preparation.display.phase("training", total=trainer.plan.total * config.train.num_envs)
+    loop = _Loop(preparation, callback, [Candidate(params) for params in _policies(trainer, state)])
+    preparation.display.phase("training", total=trainer.plan.total * preparation.config.train.num_envs)
     while not loop.ended:
         state = loop.advance(state)
-    return TrainingResult(
-        policy=Policy(config, loop.kept.params if loop.keeps_validated else _on_host(policy_of(state))),
-        history=loop.history,
-        kept=loop.kept,
-        state=state,
-        decisions=loop.done * config.train.num_envs,
-        stopped=loop.stopped,
-        train_seconds=loop.train_seconds,
-        compile_seconds=compile_seconds,
-    )
+    return [
+        TrainingResult(
+            policy=Policy(agent.config, agent.kept.params if loop.keeps_validated(agent) else newest),
+            history=agent.history,
+            kept=agent.kept,
+            state=state,
+            decisions=loop.done * agent.config.train.num_envs,
+            stopped=loop.stopped,
+            train_seconds=loop.train_seconds,
+            compile_seconds=compile_seconds,
+        )
+        for agent, newest in zip(loop.agents, _policies(trainer, state), strict=True)
+    ]
+
+
+@dataclasses.dataclass
+class _Agent:
+    """What the host keeps of an agent."""
+
+    config: Config
+    missions: RunMissions
+    kept: Candidate
+    history: History = dataclasses.field(default_factory=History)
 
 
 class _Loop:
     """State of the host loop, which changes from chunk to chunk."""
 
-    def __init__(self, preparation: Preparation, callback: Callback | None, first: Candidate) -> None:
+    def __init__(self, preparation: Preparation, callback: Callback | None, first: Sequence[Candidate]) -> None:
         self.preparation, self.callback = preparation, callback
         self.config, self.plan = preparation.config, preparation.trainer.plan
-        self.history, self.kept = History(), first
+        self.agents = [_Agent(*each) for each in zip(preparation.configs, preparation.missions, first, strict=True)]
         self.done, self.checked = 0, 0  # training steps; decisions before the last validation
         self.train_seconds = 0.0
         self.stopped = False
 
     @property
     def finished(self) -> bool:
-        """Whether the requested number of decisions or episodes is reached."""
+        """Whether the requested number of decisions, or of episodes by every agent, is reached."""
         most = self.config.train.max_episodes
-        return self.done >= self.plan.total or 0 < most <= self.history.episode_count
+        return self.done >= self.plan.total or 0 < most <= min(agent.history.episode_count for agent in self.agents)
 
     @property
     def ended(self) -> bool:
         return self.finished or self.stopped
 
-    @property
-    def keeps_validated(self) -> bool:
+    def keeps_validated(self, agent: _Agent) -> bool:
         """Whether the run ends with validated parameters instead of the newest."""
-        return not self.stopped or (self.config.train.keep == "best" and self.kept.decisions > 0)
+        return not self.stopped or (self.config.train.keep == "best" and agent.kept.decisions > 0)
 
     def advance(self, state: TrainState) -> TrainState:
         """Runs one chunk; validates, reports and calls the callback where due."""
-        state, ended, metrics = self._run(state)
+        state, chunks = self._run(state)
+        policies = functools.cache(lambda: _policies(self.preparation.trainer, state))
+        metrics = [measured for _, measured in chunks]
         if self.finished or is_due(self.config, self.plan, self.checked, self.done):
-            metrics |= self._validate(_on_host(policy_of(state)))
-        self.history.metrics.append(metrics)
-        self.preparation.display.update(metrics)
-        newest = Chunk(metrics, ended, self.kept, lambda: Policy(self.config, _on_host(policy_of(state))))
-        stop = self.callback is not None and self.callback(newest) is True
+            metrics = [before | found for before, found in zip(metrics, self._validate(policies()), strict=True)]
+        self.preparation.display.update(mean_metrics(metrics))
+        stop = False
+        for number, agent in enumerate(self.agents):
+            agent.history.metrics.append(metrics[number])
+            if self.callback is not None:
+                newest = functools.partial(
+                    lambda agent, number: Policy(agent.config, policies()[number]), agent, number
+                )
+                stop |= self.callback(Chunk(metrics[number], chunks[number][0], agent.kept, newest, number)) is True
         self.stopped = processes.on_any(stop) and not self.finished
         return state
 
-    def _run(self, state: TrainState) -> tuple[TrainState, EndedEpisodes, dict[str, Any]]:
-        """Runs the compiled chunk; returns the state, what ended, and its metrics."""
-        first, began = self.done, time.perf_counter()
-        state, (episodes, losses) = self.preparation.trainer.chunk(state, first)
+    def _run(self, state: TrainState) -> tuple[TrainState, list[tuple[EndedEpisodes, dict[str, Any]]]]:
+        """Runs the compiled chunk; returns the state, and of each agent what ended and its metrics."""
+        first, began, trainer = self.done, time.perf_counter(), self.preparation.trainer
+        state, (episodes, losses) = trainer.chunk(state, first)
         losses = jax.tree.map(np.asarray, losses)
         seconds = time.perf_counter() - began
         self.train_seconds += seconds
         self.done += self.config.train.chunk_steps
-        ended = EndedEpisodes.of(processes.fetch(episodes), first, self.config.train.num_envs)
-        self.history.episodes.append(ended)
-        check_finite(self.plan, self.done, losses)
-        return state, ended, chunk_metrics(self.config, first, ended, losses, seconds, self.history.episode_count)
+        chunks = []
+        for agent, ended, lost in zip(
+            self.agents, trainer.each(processes.fetch(episodes)), trainer.each(losses), strict=True
+        ):
+            ended = EndedEpisodes.of(ended, first, self.config.train.num_envs)
+            agent.history.episodes.append(ended)
+            check_finite(self.plan, self.done, lost, agent.config.train.seed)
+            count = agent.history.episode_count
+            chunks.append((ended, chunk_metrics(self.config, first, ended, lost, seconds, count)))
+        return state, chunks
 
-    def _validate(self, params: PolicyParams) -> dict[str, Any]:
-        """Flies the validation missions, keeps the better parameters, and returns the metrics."""
+    def _validate(self, policies: Sequence[PolicyParams]) -> list[dict[str, Any]]:
+        """Flies the validation missions, keeps the better parameters of each agent, and returns the metrics."""
         preparation = self.preparation
         preparation.display.phase("validating")
         preparation.rollouts_compiled.result()
         self.checked = self.done * self.config.train.num_envs
-        flights = preparation.fly(preparation.missions.validation, params)
-        latest = validated(self.config, preparation.missions, flights, params, self.checked)
-        self.kept = choose(self.config.train.keep, self.kept, latest)
-        since = time.perf_counter() - preparation.began
-        self.history.validations.append((self.checked, since, latest.success_near_start))
+        metrics = []
+        for number, (agent, params) in enumerate(zip(self.agents, policies, strict=True)):
+            flights = preparation.fly(agent.missions.validation, params, number)
+            latest = validated(self.config, agent.missions, flights, params, self.checked)
+            agent.kept = choose(self.config.train.keep, agent.kept, latest)
+            since = time.perf_counter() - preparation.began
+            agent.history.validations.append((self.checked, since, latest.success_near_start))
+            metrics.append(
+                {
+                    "validation_success": latest.success,
+                    "validation_mission": latest.success_near_start,
+                    "validation_spl": latest.spl,
+                }
+            )
         preparation.display.phase("training")
-        return {
-            "validation_success": latest.success,
-            "validation_mission": latest.success_near_start,
-            "validation_spl": latest.spl,
-        }
+        return metrics
 
 
-def _on_host(params: PolicyParams) -> PolicyParams:
-    return jax.tree.map(np.asarray, params)
+def _policies(trainer: Trainer, state: TrainState) -> list[PolicyParams]:
+    """Returns the newest policy of each agent, on the host."""
+    return trainer.each(jax.tree.map(np.asarray, policy_of(state)))

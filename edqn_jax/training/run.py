@@ -51,22 +51,22 @@ def train_run(
         StoppedError: after saving the policy, if `stop_requested()` turned true.
     """
     with prepared(config, reward, progress) as preparation:
-        progress.message(f"{config.world.name} world, {_described(preparation.devices)}")
+        progress.message(f"{config.world.name} world, {described(preparation.devices)}")
         processes.together(lambda: None if run is None else run.create(config))
-        result = run_chunks(preparation, lambda chunk: _record(run, chunk) or stop_requested())
+        (result,) = run_chunks(preparation, lambda chunk: record(run, chunk) or stop_requested())
         if run is not None:
             save_params(run.checkpoints, result.policy.params)
         if result.stopped:
             stopped = f"stopped after {result.decisions:,} decisions"
-            raise StoppedError(f"{stopped}; " + _where_saved(run))
+            raise StoppedError(f"{stopped}; " + where_saved(run))
         progress.phase("flying the mission")
-        sights = None if run is None else _sights(preparation)
-        flights = preparation.fly(preparation.missions.final, result.policy.params)
+        sights = None if run is None else sights_of(preparation)
+        flights = preparation.fly(preparation.missions[0].final, result.policy.params)
         digest = state_digest(result.state)  # the last that all processes do together
-        summary = _summary(preparation, result, flights, digest, reward)
+        summary = summary_of(preparation, result, flights, digest, reward)
         if run is not None and sights is not None:
             progress.phase("drawing")
-            _draw(run, preparation, sights, result, flights)
+            draw(run, preparation, sights, result, flights)
             summary["total_seconds"] = time.perf_counter() - preparation.began
             run.write_summary(summary)
             progress.stop()
@@ -74,7 +74,7 @@ def train_run(
     return summary
 
 
-def _record(run: RunDirectory | None, chunk: Chunk) -> None:
+def record(run: RunDirectory | None, chunk: Chunk) -> None:
     """Appends a chunk to the files of the run."""
     if run is None:
         return
@@ -83,15 +83,15 @@ def _record(run: RunDirectory | None, chunk: Chunk) -> None:
     run.append_metrics(chunk.metrics)
 
 
-def _where_saved(run: RunDirectory | None) -> str:
+def where_saved(run: RunDirectory | None) -> str:
     return "the first process saves the policy" if run is None else f"the policy is in '{run.checkpoints}'"
 
 
-def _summary(
+def summary_of(
     preparation: Preparation, result: TrainingResult, flights: Flights, digest: str, reward: Reward | None
 ) -> dict[str, Any]:
     """Returns the content of `summary.json`."""
-    config, scene = preparation.config, preparation.missions.scene
+    config, scene = result.policy.config, preparation.missions[0].scene
     since = first_success(result.history.validations)
     summary = {
         **flight_summary(flights),
@@ -120,22 +120,20 @@ def _summary(
     return summary
 
 
-def _sights(preparation: Preparation) -> Sights:
+def sights_of(preparation: Preparation) -> Sights:
     """Starts to compile the programs that draw the final flight's images, while it is flown."""
-    scene = jax.tree.map(np.asarray, preparation.missions.scene)
+    scene = jax.tree.map(np.asarray, preparation.missions[0].scene)
     return Sights(preparation.config, scene, preparation.pool)
 
 
-def _draw(
-    run: RunDirectory, preparation: Preparation, sights: Sights, result: TrainingResult, flights: Flights
-) -> None:
+def draw(run: RunDirectory, preparation: Preparation, sights: Sights, result: TrainingResult, flights: Flights) -> None:
     """Writes the flight of the mission that the run is judged by, and all pictures."""
     run.write_trajectory(trajectory(preparation.config, flights))
     outcome = flight_summary(flights)["outcome"]
     draw_gallery(run, sights, result.policy.params, np.asarray(preparation.shortest.points), outcome)
 
 
-def _described(devices: Sequence[jax.Device]) -> str:  # pyright: ignore[reportInvalidTypeForm]
+def described(devices: Sequence[jax.Device]) -> str:  # pyright: ignore[reportInvalidTypeForm]
     count = len({device.process_index for device in devices})
     return f"{len(devices)} {devices[0].platform} devices" + (f" of {count} processes" if count > 1 else "")
 

@@ -26,11 +26,11 @@ def losses(*q_loss: float) -> Losses:
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
 def test_a_loss_that_is_not_finite_is_named_once_there_is_learning(bad: float) -> None:
     # A chunk of the steps 8 to 11; nothing is learnt in 8 and 9, whose loss is NaN.
-    check_finite(PLAN, 12, losses(np.nan, np.nan, 0.5, 0.4))
+    check_finite(PLAN, 12, losses(np.nan, np.nan, 0.5, 0.4), 3)
     with pytest.raises(DivergedError, match=f"the Q loss was {bad} at training step 12"):
-        check_finite(PLAN, 12, losses(np.nan, np.nan, 0.5, bad))
+        check_finite(PLAN, 12, losses(np.nan, np.nan, 0.5, bad), 3)
     with pytest.raises(DivergedError):
-        check_finite(PLAN, 12, losses(np.nan, np.nan, bad, 0.5))
+        check_finite(PLAN, 12, losses(np.nan, np.nan, bad, 0.5), 3)
 
 
 def test_ended_episodes_are_those_with_an_outcome_counted_in_decisions_of_all_environments() -> None:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from edqn_jax.evaluation.intervals import difference_interval, drawn_rates, rate_interval
 from edqn_jax.evaluation.metrics import wilson_interval
-from rivals.intervals import difference_interval, drawn_rates, rate_interval
 
 
 def test_a_single_rate_has_wilsons_interval() -> None:

@@ -10,10 +10,16 @@ all methods together.
 from __future__ import annotations
 
 import numpy as np
+from scipy.stats import trim_mean
 
 from edqn_jax.evaluation.metrics import wilson_interval
 
 DRAWS = 10_000
+
+
+def interquartile_mean(values: np.ndarray) -> float:
+    """Returns the mean of the middle half of values [N] (Agarwal et al. 2021); of fewer than four, of all of them."""
+    return float(trim_mean(np.asarray(values, float), 0.25))
 
 
 def rate_interval(success: np.ndarray) -> tuple[float, float]:

@@ -1,0 +1,111 @@
+"""Several recorded runs in one program: a run of each seed, and what all of them say together."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from edqn_jax.config import DENSITIES, Config
+from edqn_jax.errors import StoppedError
+from edqn_jax.evaluation.intervals import interquartile_mean, rate_interval
+from edqn_jax.parallel import processes
+from edqn_jax.report.progress import Progress, clock
+from edqn_jax.runs.checkpoints import save_params
+from edqn_jax.runs.directory import RunDirectory
+from edqn_jax.runs.provenance import state_digest
+from edqn_jax.sim.flights import Flights
+from edqn_jax.sim.outcomes import Outcome
+from edqn_jax.sim.reward import Reward
+from edqn_jax.training.loop import prepared, run_chunks
+from edqn_jax.training.run import described, draw, record, sights_of, summary_of
+
+
+def train_seeds_run(
+    config: Config,
+    seeds: int,
+    run: RunDirectory | None,
+    progress: Progress,
+    stop_requested: Callable[[], bool],
+    reward: Reward | None = None,
+) -> dict[str, Any]:
+    """Trains an agent of each seed in one program; writes a run of each, and a summary of all.
+
+    Args:
+        config: of the first seed.
+        seeds: how many agents; their seeds count up from `train.seed`.
+        run, progress, stop_requested, reward: as in `train_run`; `run` is the folder that holds those of the seeds.
+
+    Returns:
+        the content of the `summary.json` of all.
+
+    Raises:
+        ConfigError, DivergedError, StoppedError: as `train_run`.
+    """
+    with prepared(config, reward, progress, agents=seeds) as preparation:
+        configs, agents = preparation.configs, range(seeds)
+        progress.message(f"{config.world.name} world, {seeds} seeds, {described(preparation.devices)}")
+        processes.together(lambda: None if run is None else run.create_for_seeds(configs))
+        folders = [None if run is None else run.of_seed(each.train.seed) for each in configs]
+        results = run_chunks(preparation, lambda chunk: record(folders[chunk.agent], chunk) or stop_requested())
+        for folder, result in zip(folders, results, strict=True):
+            if folder is not None:
+                save_params(folder.checkpoints, result.policy.params)
+        if results[0].stopped:
+            where = "the first process saves the policies" if run is None else f"the policies are in '{run.path}'"
+            raise StoppedError(f"stopped after {results[0].decisions:,} decisions; {where}")
+        progress.phase("flying the missions")
+        flights = [preparation.fly(preparation.missions[k].final, results[k].policy.params, k) for k in agents]
+        states = preparation.trainer.each(results[0].state)
+        digests = [state_digest(state) for state in states]  # the last that all processes do together
+        summaries = [summary_of(preparation, results[k], flights[k], digests[k], reward) for k in agents]
+        whole = _summary_of_all(config, flights, summaries)
+        if run is not None:
+            progress.phase("drawing")
+            sights = sights_of(preparation)
+            for folder, result, flown, summary in zip(folders, results, flights, summaries, strict=True):
+                assert folder is not None
+                draw(folder, preparation, sights, result, flown)
+                folder.write_summary(summary)
+            whole["total_seconds"] = time.perf_counter() - preparation.began
+            run.write_summary(whole)
+            progress.stop()
+            progress.message(_verdict(whole, run))
+    return whole
+
+
+def _summary_of_all(config: Config, flights: list[Flights], summaries: list[dict[str, Any]]) -> dict[str, Any]:
+    """Returns what the seeds say together: in random worlds of all test missions, elsewhere of the one mission."""
+    arrived = np.array([np.asarray(flown.outcome) == Outcome.GOAL for flown in flights])
+    if config.world.name not in DENSITIES:
+        arrived = arrived[:, :1]
+    rates = arrived.mean(axis=1)
+    return {
+        "world": config.world.name,
+        "seeds": [summary["seed"] for summary in summaries],
+        "missions": arrived.shape[1],
+        "success_rates": rates.tolist(),
+        "success_iqm": interquartile_mean(rates),
+        "success_mean": float(rates.mean()),
+        "success_interval": list(rate_interval(arrived)),
+        "train_decisions": summaries[0]["train_decisions"],
+        "train_seconds": summaries[0]["train_seconds"],
+        "total_seconds": summaries[0]["total_seconds"],
+    }
+
+
+def _verdict(summary: dict[str, Any], run: RunDirectory) -> str:
+    """Returns the last lines on the screen."""
+    low, high = summary["success_interval"]
+    each = ", ".join(
+        f"seed {seed}: {rate:.1%}" for seed, rate in zip(summary["seeds"], summary["success_rates"], strict=True)
+    )
+    missions = "unseen test worlds" if summary["missions"] > 1 else "the mission"
+    return (
+        f"Reached the goal in {missions}: {each}.\nInterquartile mean {summary['success_iqm']:.1%}, mean "
+        f"{summary['success_mean']:.1%} (95 % bootstrap interval over seeds and missions {low:.1%} to {high:.1%}).\n"
+        f"Took {clock(summary['total_seconds'])} in all, {clock(summary['train_seconds'])} of it training. Each seed's "
+        f"run is in {run.path}"
+    )

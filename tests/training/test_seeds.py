@@ -1,0 +1,98 @@
+"""Several seeds in one program: a run of each, as if trained alone, and what they say together."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+
+import jax
+import numpy as np
+import pytest
+
+from edqn_jax.errors import ConfigError, DivergedError, StoppedError
+from edqn_jax.learn import trainer
+from edqn_jax.report.progress import Progress
+from edqn_jax.runs.directory import RunDirectory, plain
+from edqn_jax.runs.policies import load_policy
+from edqn_jax.training.history import mean_metrics
+from edqn_jax.training.loop import train, train_seeds
+from edqn_jax.training.seeds import train_seeds_run
+from tests.training.test_loop import SMALL
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory: pytest.TempPathFactory) -> tuple[RunDirectory, dict]:
+    run = RunDirectory(tmp_path_factory.mktemp("runs") / "seeds")
+    return run, train_seeds_run(SMALL, 2, run, Progress(), lambda: False)
+
+
+@pytest.mark.slow
+def test_each_seed_leaves_a_run_and_all_of_them_a_summary(runs: tuple[RunDirectory, dict]) -> None:
+    run, summary = runs
+    assert json.loads(run.summary_file.read_text()) == plain(summary)
+    assert summary["seeds"] == [0, 1] and summary["missions"] == 1 and len(summary["success_rates"]) == 2
+    for seed in summary["seeds"]:
+        own = run.of_seed(seed)
+        assert load_policy(own.path).config.train.seed == seed
+        assert json.loads(own.summary_file.read_text())["seed"] == seed
+        assert len(own.read_metrics()) == 4 and (own.figures / "learning.png").is_file()
+    assert not np.array_equal(*(run.of_seed(seed).read_episodes()["return"][:8] for seed in (0, 1)))
+
+
+@pytest.mark.slow
+def test_a_seed_among_others_learns_what_it_learns_alone(runs: tuple[RunDirectory, dict]) -> None:
+    alone = train(dataclasses.replace(SMALL, train=dataclasses.replace(SMALL.train, seed=1)))
+    together = load_policy(runs[0].of_seed(1).path)
+    # Batched products round otherwise.
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-4), alone.policy.params, together.params)
+    (own,) = [ended.step for ended in alone.history.episodes[:1]]
+    np.testing.assert_array_equal(own, runs[0].of_seed(1).read_episodes()["step"][: len(own)])
+
+
+@pytest.mark.slow
+def test_the_folder_of_several_seeds_is_no_policy(runs: tuple[RunDirectory, dict]) -> None:
+    with pytest.raises(ConfigError, match="holds the runs of 2 seeds; name one of them, such as '.*seed-0'"):
+        load_policy(runs[0].path)
+
+
+@pytest.mark.slow
+def test_stopping_stops_every_seed_and_keeps_their_policies(tmp_path: Path) -> None:
+    run = RunDirectory(tmp_path / "stopped")
+    with pytest.raises(StoppedError, match="stopped after 64 decisions; the policies are in"):
+        train_seeds_run(SMALL, 2, run, Progress(), lambda: True)
+    assert [load_policy(run.of_seed(seed).path).config.train.seed for seed in (0, 1)] == [0, 1]
+    assert not run.summary_file.exists()
+
+
+def test_no_agent_is_none_to_train() -> None:
+    with pytest.raises(ConfigError, match="must be at least 1, not 0"):
+        train_seeds(0, SMALL)
+
+
+@pytest.mark.slow
+def test_a_seed_that_diverges_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    chunk = trainer.Trainer.chunk
+
+    def poisoned(self, state, first: int):
+        state, (episodes, losses) = chunk(self, state, first)
+        return state, (episodes, dataclasses.replace(losses, q_loss=losses.q_loss.at[1].set(np.nan)))
+
+    monkeypatch.setattr(trainer.Trainer, "chunk", poisoned)
+    with pytest.raises(DivergedError, match="seed 1 diverged"):
+        train_seeds(2, SMALL)
+
+
+def test_what_is_shown_of_several_agents_is_their_mean() -> None:
+    first = {"phase": "training", "decisions": 64, "success_rate": 0.5, "q_loss": None, "warm_up": None}
+    second = {"phase": "training", "decisions": 64, "success_rate": None, "q_loss": 0.1, "warm_up": None}
+    third = {"phase": "training", "decisions": 64, "success_rate": 0.7, "q_loss": 0.3, "warm_up": None}
+    mean = mean_metrics([first, second, third])
+    assert mean == {
+        "phase": "training",
+        "decisions": 64.0,
+        "success_rate": pytest.approx(0.6),
+        "q_loss": pytest.approx(0.2),
+        "warm_up": None,
+    }
+    assert mean_metrics([first]) is first
