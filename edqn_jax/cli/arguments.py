@@ -16,6 +16,7 @@ from edqn_jax.config import DENSITIES, Config
 from edqn_jax.config.limits import validate
 from edqn_jax.config.loading import resolve
 from edqn_jax.errors import ConfigError
+from edqn_jax.parallel.hardware import hardware
 from edqn_jax.parallel.launch import Distributed
 from edqn_jax.runs.directory import Resume
 
@@ -35,6 +36,9 @@ SHORT_NAMES = {
 class TrainOptions:
     preset: Literal["default", "paper"] = "default"
     """`default`: the best agent known to us. `paper`: exactly Table 1 of the paper."""
+    tuned_for: Literal["auto", "cpu", "gpu"] = "auto"
+    """Hardware that the defaults of environments, batches, networks and decisions are chosen for; `auto`: a GPU where
+    there is one that JAX can use. Preset `paper` is the same on both."""
     config: Annotated[Path | None, arg(metavar="FILE.yaml", help_behavior_hint="")] = None
     """YAML file of options by group; overrides the preset, and flags override the file."""
     seeds: Annotated[int | None, arg(metavar="K", help_behavior_hint="")] = None
@@ -111,7 +115,7 @@ TRAIN, EVALUATE, RECORD = "edqn train", "edqn evaluate", "edqn record"
 
 
 def parse_train(argv: Sequence[str]) -> tuple[TrainOptions, Config]:
-    """Returns the options and the checked configuration of the arguments of `edqn train`.
+    """Returns the options, hardware decided, and the checked configuration of the arguments of `edqn train`.
 
     Raises:
         ConfigError: if the preset, the file or a value is invalid.
@@ -122,9 +126,11 @@ def parse_train(argv: Sequence[str]) -> tuple[TrainOptions, Config]:
     # Preset, file and world decide the defaults that the other flags change and that --help shows.
     early = [word for word in argv if word not in ("-h", "--help")]
     options, _ = tyro.cli(TrainOptions, args=early, prog=TRAIN, return_unknown_args=True, add_help=False)
+    if options.tuned_for == "auto":
+        options = dataclasses.replace(options, tuned_for=hardware())
     base = resolve(options.preset, options.config)
     world = _parse_config(early, base).world.name
-    config = _parse_config(argv, resolve(options.preset, options.config, world))
+    config = _parse_config(argv, resolve(options.preset, options.config, world, options.tuned_for))
     validate(config)
     # A file must be found again from any folder.
     if config.world.name not in DENSITIES and Path(config.world.name).is_file():

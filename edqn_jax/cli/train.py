@@ -10,6 +10,8 @@ from rich.console import Console
 
 from edqn_jax.cli.arguments import parse_train
 from edqn_jax.cli.signals import listening_for_sigterm
+from edqn_jax.config import Config
+from edqn_jax.errors import ConfigError
 from edqn_jax.parallel.launch import how_to_join
 from edqn_jax.runs.directory import plan_run_directory
 
@@ -28,8 +30,6 @@ def train_command(argv: Sequence[str]) -> None:
     from edqn_jax.parallel import processes
     from edqn_jax.parallel.devices import cores, most_that_divide, use_cpu_devices
     from edqn_jax.report.progress import Progress
-    from edqn_jax.training.run import train_run
-    from edqn_jax.training.seeds import train_seeds_run
 
     use_cpu_devices(config.train.devices or most_that_divide(config.train.shards, cores()))
     process = 0
@@ -39,11 +39,42 @@ def train_command(argv: Sequence[str]) -> None:
     writes = process == 0
     run = processes.together(lambda: plan_run_directory(options.run_dir, config, options.resume) if writes else None)
     progress = Progress(Console(quiet=not writes))
+    if options.tuned_for == "gpu":
+        _check_gpu()
+        progress.message(_chosen(config))
     with listening_for_sigterm() as stop_requested:
         try:
             if options.seeds is None:
+                from edqn_jax.training.run import train_run
+
                 train_run(config, run, progress, stop_requested)
             else:
+                from edqn_jax.training.seeds import train_seeds_run
+
                 train_seeds_run(config, options.seeds, run, progress, stop_requested)
         finally:
             progress.stop()
+
+
+def _check_gpu() -> None:
+    """Raises where a GPU was found or asked for, and JAX runs on the CPU.
+
+    Raises:
+        ConfigError: says what to do.
+    """
+    import jax
+
+    if jax.default_backend() == "cpu":
+        raise ConfigError(
+            "the options are tuned for a GPU, but JAX can use none here; install its plugin with "
+            "pip install 'jax[cuda13]', or give --tuned-for cpu"
+        )
+
+
+def _chosen(config: Config) -> str:
+    """Returns what was chosen for a GPU, as a line for the screen."""
+    train, agent = config.train, config.agent
+    return (
+        f"Tuned for a GPU: {train.num_envs:,} environments, {agent.updates_per_step} updates of {agent.batch_size:,} "
+        f"a step, a replay of {agent.replay_size:,}, {train.total_steps:,} decisions; flags override any of them"
+    )

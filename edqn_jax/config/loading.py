@@ -1,6 +1,6 @@
 """Merging defaults, preset and file into one `Config`; unknown keys and wrong types are errors.
 
-Precedence: defaults < preset < what the world asks for < file, and flags over all of them. A layer is a
+Precedence: defaults < preset < what world and hardware ask for < file, and flags over all of them. A layer is a
 nested dict, `{"agent": {"batch_size": 512}}`, that names only what it changes.
 """
 
@@ -24,6 +24,9 @@ from edqn_jax.errors import ConfigError
 
 Layer = Mapping[str, Mapping[str, Any]]
 
+Hardware = Literal["cpu", "gpu"]
+"""What defaults are chosen for."""
+
 RANDOM_WORLDS: Layer = {
     "train": {"total_steps": 3_200_000},
     "encoder": {
@@ -40,18 +43,63 @@ window of events with lower thresholds, and an encoder that learns from more, an
 since there only events tell where obstacles are."""
 
 
-def world_layer(world: str) -> Layer:
-    """Returns what a world changes in the `default` preset."""
-    return RANDOM_WORLDS if world in DENSITIES else {}
+GPU: Layer = {
+    "train": {
+        "num_envs": 16_384,
+        "chunk_steps": 16,
+        "total_steps": 12_000_000,
+        "validation_every": 2_097_152,
+        "validation_missions": 512,
+    },
+    "encoder": {
+        "code_size": 64,
+        "patch_layers": (64, 16),
+        "joint_layers": (256, 128),
+        "warmup_decisions": 2_097_152,
+        "warmup_updates_per_step": 48,
+        "batch_size": 4096,
+        "replay_size": 524_288,
+    },
+    "agent": {
+        "hidden": (256, 256),
+        "history": 3,
+        "batch_size": 4096,
+        "updates_per_step": 16,
+        "target_rate": 0.01,
+        "learning_rate": 1e-3,
+        "replay_size": 1_048_576,
+        "exploration_end": 0.005,
+    },
+}
+"""What a GPU changes in the `default` preset: as many environments as fill it, and larger networks and updates."""
+
+GPU_RANDOM_WORLDS: Layer = {
+    "train": {"total_steps": 45_000_000},
+    "encoder": {"retrain_at": (0.2, 0.5), "retrain_decisions": 2_097_152},
+    "events": {"frame_times_s": (-0.16, -0.08, 0.0)},
+}
+"""What a GPU changes further for random worlds."""
 
 
-def resolve(preset_name: str = "default", file: Path | None = None, world: str | None = None) -> Config:
-    """Returns the named preset, changed first by the world and then by the file; checks types, not limits.
+def world_layers(world: str, tuned_for: Hardware) -> list[Layer]:
+    """Returns what a world and the hardware change in the `default` preset; later ones replace earlier ones."""
+    random = world in DENSITIES
+    layers = [RANDOM_WORLDS] if random else []
+    if tuned_for == "gpu":
+        layers += [GPU, GPU_RANDOM_WORLDS] if random else [GPU]
+    return layers
+
+
+def resolve(
+    preset_name: str = "default", file: Path | None = None, world: str | None = None, tuned_for: Hardware = "cpu"
+) -> Config:
+    """Returns the named preset, changed first by world and hardware and then by the file; checks types, not limits.
 
     Args:
-        preset_name: one of `config.PRESETS`; the world changes only `default`.
+        preset_name: one of `config.PRESETS`; world and hardware change only `default`.
         file: a YAML file.
         world: name of the world given by a flag; None takes that of the file or the preset.
+        tuned_for: hardware that the defaults are chosen for.
 
     Raises:
         ConfigError: names the key or the file, and what would be right.
@@ -62,27 +110,38 @@ def resolve(preset_name: str = "default", file: Path | None = None, world: str |
         config = apply(config, {"world": {"name": world}}, "the command line")
     if preset_name != "default":
         return config
-    for_world = apply(named_preset(preset_name), world_layer(config.world.name), "the world")
-    return dataclasses.replace(apply(for_world, layer, str(file)), world=config.world)
+    tuned = named_preset(preset_name)
+    for changes in world_layers(config.world.name, tuned_for):
+        tuned = apply(tuned, changes, "the world")
+    return dataclasses.replace(apply(tuned, layer, str(file)), world=config.world)
 
 
 def make_config(
-    world: str | None = None, /, *, preset: str = "default", file: str | Path | None = None, **groups: Mapping[str, Any]
+    world: str | None = None,
+    /,
+    *,
+    preset: str = "default",
+    tuned_for: Hardware = "cpu",
+    file: str | Path | None = None,
+    **groups: Mapping[str, Any],
 ) -> Config:
-    """Returns a checked configuration: preset < what the world asks for < file < `groups`.
+    """Returns a checked configuration: preset < what world and hardware ask for < file < `groups`.
 
         make_config("medium", train={"total_steps": 100_000}, agent={"n_step": 5})
 
     Args:
         world: `paper`, `sparse`, `medium`, `dense`, `mixed` or an MJCF file; None leaves it to file and preset.
         preset: one of `config.PRESETS`.
+        tuned_for: `cpu` or `gpu`: what environments, batches, networks and decisions are chosen for.
         file: a YAML file with groups of options.
         groups: options by group, as in a file.
 
     Raises:
         ConfigError: names the option and what would be right.
     """
-    config = apply(resolve(preset, None if file is None else Path(file), world), groups, "make_config")
+    if tuned_for not in typing.get_args(Hardware):
+        raise ConfigError(f"make_config: tuned_for must be 'cpu' or 'gpu', not {tuned_for!r}")
+    config = apply(resolve(preset, None if file is None else Path(file), world, tuned_for), groups, "make_config")
     validate(config)
     return config
 

@@ -52,6 +52,20 @@ def test_a_random_world_brings_its_own_budget(world):
     assert resolve(world=world).train.total_steps == RANDOM_WORLDS["train"]["total_steps"]
 
 
+def test_a_gpu_brings_its_own_sizes_and_files_and_the_papers_preset_keep_theirs(tmp_path):
+    medium, scene = resolve(world="medium", tuned_for="gpu"), resolve(tuned_for="gpu")
+    validate(medium)
+    validate(scene)
+    assert medium.train.num_envs == scene.train.num_envs == 16_384
+    assert medium.events.threshold == RANDOM_WORLDS["events"]["threshold"]  # of random worlds on any hardware
+    assert medium.train.total_steps > scene.train.total_steps
+    file = write(tmp_path, "train: {num_envs: 64}\n")
+    assert resolve(file=file, world="medium", tuned_for="gpu").train.num_envs == 64
+    assert resolve("paper", tuned_for="gpu") == preset("paper")
+    with pytest.raises(ConfigError, match="must be 'cpu' or 'gpu', not 'tpu'"):
+        make_config("medium", tuned_for="tpu")  # type: ignore[arg-type]
+
+
 def test_random_worlds_and_the_papers_preset_have_their_own_step_size_and_encoder():
     """The default's were chosen on the paper's world alone (docs/decisions/0011)."""
     medium, paper = resolve(world="medium"), preset("paper")
