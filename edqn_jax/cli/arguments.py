@@ -18,6 +18,7 @@ from edqn_jax.config.loading import resolve
 from edqn_jax.errors import ConfigError
 from edqn_jax.parallel.hardware import hardware
 from edqn_jax.parallel.launch import Distributed
+from edqn_jax.policies import policy_folder
 from edqn_jax.runs.directory import Resume
 
 Point = tuple[float, float, float]
@@ -73,7 +74,7 @@ class EvaluateArgs:
     """Fly a saved policy greedily on missions in any world and print metrics."""
 
     run: Annotated[Positional[Path], arg(metavar="RUN")]
-    """Folder of the run."""
+    """Folder of the run, or `pretrained`: the policy that comes with the package."""
     world: Annotated[str | None, arg(metavar="paper|sparse|medium|dense|mixed|FILE.xml", help_behavior_hint="")] = None
     """Where to fly (default: the world of the run)."""
     start: Annotated[Point | None, arg(metavar="X Y Z", help_behavior_hint="")] = None
@@ -98,7 +99,7 @@ class RecordArgs:
     """Fly a saved run once and write the flight as an animated GIF: the view, what the drone sees, and its path."""
 
     run: Annotated[Positional[Path], arg(metavar="RUN")]
-    """Folder of the run."""
+    """Folder of the run, or `pretrained`: the policy that comes with the package."""
     file: Annotated[Positional[Path], arg(metavar="FILE.gif")]
     """GIF to write; it replaces a file of that name."""
     world: Annotated[str | None, arg(metavar="paper|sparse|medium|dense|mixed|FILE.xml", help_behavior_hint="")] = None
@@ -221,5 +222,5 @@ def parse_record(argv: Sequence[str]) -> RecordArgs:
 
 
 def _check_run(folder: Path) -> None:
-    if not (folder / "config.yaml").is_file():
+    if not (policy_folder(folder) / "config.yaml").is_file():
         raise ConfigError(f"there is no run in '{folder}': it holds no config.yaml")

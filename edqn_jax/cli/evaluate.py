@@ -45,6 +45,8 @@ def evaluate_command(args: EvaluateArgs) -> None:
         **evaluation.figures,
         "decision_latency_ms": decision_latency_ms(policy.config, policy.params),
     }
+    if evaluation.missions.note is not None:
+        Console().print(evaluation.missions.note, soft_wrap=True, markup=False, highlight=False)
     Console().print(report(figures))
     if args.json is not None:
         write_atomically(args.json, json.dumps(plain(figures), indent=2, allow_nan=False) + "\n")

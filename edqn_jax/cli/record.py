@@ -38,6 +38,8 @@ def record_command(args: RecordArgs) -> None:
         name = missions.name if missions.file is None else Path(missions.name).stem
         gif = animate(sights, params, trajectory(config, flights), outcome, title=f"world '{name}'")
     write_atomically(args.file, gif)
+    if missions.note is not None:
+        Console().print(missions.note, soft_wrap=True, markup=False, highlight=False)
     flown = f"{OUTCOME_LABELS[outcome]} after {float(flights.flight_seconds[0]):.1f} s"
     Console().print(
         f"{flown}; '{args.file}' has {len(gif) / 1e6:.1f} MB", soft_wrap=True, markup=False, highlight=False

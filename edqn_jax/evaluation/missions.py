@@ -16,7 +16,7 @@ from edqn_jax.planners.astar import shortest_path
 from edqn_jax.random import run_streams
 from edqn_jax.sim import drone, worlds
 from edqn_jax.sim.env import World
-from edqn_jax.sim.mjcf import check_scene, load_world, resolve_world, write_scene
+from edqn_jax.sim.mjcf import check_scene, load_world, resolve_world, widened, write_scene
 from edqn_jax.sim.reward import Reward
 from edqn_jax.sim.scene import Scene, stack_scenes, take_scene
 from edqn_jax.sim.worlds import Missions
@@ -36,6 +36,8 @@ class MissionSet:
     world: World
     file: Path | None = None
     """MJCF file of the only world; None for random worlds."""
+    note: str | None = None
+    """What was decided for the user, as a sentence."""
 
     def scene(self, mission: int = 0) -> Scene:
         """Returns the world of one mission."""
@@ -202,15 +204,28 @@ def _file_missions(config: Config, name: str, missions: int, seed: int, moved: d
     """Returns one mission from start to goal of a world from a file, or many from random free starts."""
     radius, airframe, file = config.drone.body_radius_m, drone.load_airframe(config.drone), resolve_world(name)
     loaded = load_world(file)
-    scene = dataclasses.replace(loaded.scene, **moved)
+    scene, note = dataclasses.replace(loaded.scene, **moved), None
+    if moved and not loaded.has_volume:
+        wider = widened(scene, moved.values())
+        if not np.array_equal(wider.volume, scene.volume):
+            scene, note = (
+                wider,
+                f"'{name}' names no flight volume: it is flown in {_box(wider)}, which holds all shapes",
+            )
     if missions == 1:
         check_scene(scene, radius, names=loaded.names, title=f"'{name}'")
         shortest_path(scene, scene.start, scene.goal, radius)  # raises where there is no path
         pool = stack_scenes([scene])
-        return MissionSet(name, World(airframe, pool, worlds.own_missions(pool)), file)
+        return MissionSet(name, World(airframe, pool, worlds.own_missions(pool)), file, note)
     probe_key, missions_key = jax.random.split(mission_key(seed))
     # The world's own start does not matter, any free point will do; the goal does.
     standing = dataclasses.replace(scene, start=worlds.free_point(scene, probe_key))
     check_scene(standing, radius, names=loaded.names, title=f"'{name}'")
     pool = stack_scenes([scene])
-    return MissionSet(name, World(airframe, pool, worlds.spread_missions(pool, missions, 0.0, 0.0, missions_key)), file)
+    many = worlds.spread_missions(pool, missions, 0.0, 0.0, missions_key)
+    return MissionSet(name, World(airframe, pool, many), file, note)
+
+
+def _box(scene: Scene) -> str:
+    lower, upper = np.asarray(scene.volume)
+    return "x, y, z = " + ", ".join(f"{low:g} to {high:g}" for low, high in zip(lower, upper, strict=True)) + " m"

@@ -11,11 +11,14 @@ from flax import struct
 from jax import Array
 
 from edqn_jax.config import Config
+from edqn_jax.errors import ConfigError
 from edqn_jax.learn import embedding
 from edqn_jax.learn.dqn import epsilon_greedy
 from edqn_jax.learn.qnetwork import Params, init_q, q_values
 from edqn_jax.sim.env import OWN_SIZE, Observation
+from edqn_jax.sim.events import EventField
 from edqn_jax.sim.moves import ACTIONS
+from edqn_jax.sim.sensor import Sensed, sensor_of
 
 Memory = Array
 """[H, D] the newest observations as the network sees them, newest last; zeros before an episode began."""
@@ -100,10 +103,50 @@ class Policy:
         Args:
             observation: of one drone, as `Environment.reset` and `step` return it.
             memory: from the call before; None at the start of an episode.
+
+        Raises:
+            ConfigError: if the observation is of another sensor, size or window than the policy was trained with.
         """
+        _check_fits(self.config, observation)
         if memory is None:
             memory = empty_memory(self.config)
         return _act(self.config, self.params, memory, observation)
+
+
+def _check_fits(config: Config, observation: Observation) -> None:
+    """Raises unless an observation is what the sensor of `config` shows.
+
+    Raises:
+        ConfigError: names both.
+    """
+    trained, given = _kind(_example(config)), _kind(observation.sensed)
+    if trained != given:
+        raise ConfigError(
+            f"this policy was trained with the sensor '{config.env.sensor}', which shows {_described(trained)}; this "
+            f"observation is {_described(given)}; make the environment with the policy's `config`"
+        )
+
+
+@functools.cache
+def _example(config: Config) -> Sensed:
+    return sensor_of(config).example(config)
+
+
+def _kind(sensed: Sensed) -> tuple[tuple[int, ...] | None, float | None]:
+    """Returns the shape of what a sensor shows, and of events the length of the window in seconds."""
+    if isinstance(sensed, EventField):
+        # Noise events stand in rows of their own.
+        rows, *size = sensed.count.shape
+        return (rows // 2 if sensed.with_noise else rows, *size), round(sensed.window_s, 6)
+    return (None if sensed is None else sensed.shape), None
+
+
+def _described(kind: tuple[tuple[int, ...] | None, float | None]) -> str:
+    shape, window_s = kind
+    if shape is None:
+        return "nothing"
+    size = " x ".join(str(side) for side in shape)
+    return f"{size} numbers" if window_s is None else f"events of {size} frame pairs and pixels in {window_s:g} s"
 
 
 @functools.partial(jax.jit, static_argnums=0)

@@ -9,6 +9,7 @@ import math
 import shutil
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Literal
 
@@ -31,6 +32,9 @@ EPISODE_COLUMNS = ("step", "return", "length", "outcome")
 """Columns of `episodes.csv`: decisions of all environments when the episode ended, undiscounted return,
 decisions of the episode, and how it ended."""
 
+
+_VERSION = "# edqn_jax "
+"""Beginning of the first line of a `config.yaml`."""
 
 SEED_FOLDER = "seed-"
 """Beginning of the name of a seed's folder within that of several."""
@@ -87,7 +91,7 @@ class RunDirectory:
             self.summary_file.unlink(missing_ok=True)
             for folder in self.path.glob(f"{SEED_FOLDER}*"):
                 shutil.rmtree(folder, ignore_errors=True)
-            write_atomically(self.config_file, to_yaml(configs[0]))
+            write_atomically(self.config_file, config_text(configs[0]))
         except FileExistsError:
             raise ConfigError(f"another run has just created '{self.path}'; start this one again") from None
         except OSError as error:
@@ -110,7 +114,7 @@ class RunDirectory:
             for folder in (self.figures, self.checkpoints):
                 shutil.rmtree(folder, ignore_errors=True)
                 folder.mkdir()
-            write_atomically(self.config_file, to_yaml(config))
+            write_atomically(self.config_file, config_text(config))
             write_atomically(self.episodes_file, ",".join(EPISODE_COLUMNS) + "\n")
         except FileExistsError as error:
             if self.must_be_new:
@@ -200,6 +204,17 @@ def plan_run_directory(given: Path | None, config: Config, resume: Resume = "aut
         )
     check_can_make(given)
     return run
+
+
+def config_text(config: Config) -> str:
+    """Returns the content of a run's `config.yaml`: the version of this package, and every option."""
+    return f"{_VERSION}{version('edqn-jax')}\n{to_yaml(config)}"
+
+
+def version_of(config_file: Path) -> str | None:
+    """Returns the version of this package that wrote a `config.yaml`; None where it does not say."""
+    first = config_file.read_text(encoding="utf-8").partition("\n")[0]
+    return first.removeprefix(_VERSION).strip() if first.startswith(_VERSION) else None
 
 
 def plain(value: Any) -> Any:

@@ -10,16 +10,17 @@ import numpy as np
 
 from edqn_jax.config import Config
 from edqn_jax.config.limits import validate
-from edqn_jax.config.loading import apply, load_layer, to_yaml
+from edqn_jax.config.loading import apply, load_layer
 from edqn_jax.errors import ConfigError
 from edqn_jax.learn.policy import Policy, PolicyParams, fresh_policy
+from edqn_jax.policies import policy_folder
 from edqn_jax.runs.checkpoints import load_params, save_params
-from edqn_jax.runs.directory import SEED_FOLDER
+from edqn_jax.runs.directory import SEED_FOLDER, config_text, version_of
 from edqn_jax.runs.files import check_can_make, write_atomically
 
 
 def load_policy(run: str | Path) -> Policy:
-    """Returns the policy of a run directory, or of a folder that `save_policy` wrote.
+    """Returns the policy of a run directory, of a folder that `save_policy` wrote, or `pretrained`.
 
     Raises:
         ConfigError: if there is none, or its parts are incomplete or do not fit each other.
@@ -39,21 +40,37 @@ def save_policy(policy: Policy, folder: str | Path) -> None:
         raise ConfigError(f"'{folder}' holds files already; give a new or empty folder")
     folder.mkdir(parents=True, exist_ok=True)
     save_params(folder / "checkpoints", policy.params)
-    write_atomically(folder / "config.yaml", to_yaml(policy.config))
+    write_atomically(folder / "config.yaml", config_text(policy.config))
 
 
 def load_run(folder: Path) -> tuple[Config, PolicyParams]:
     """Returns the configuration and the policy of a run, or of any folder with `config.yaml` and `checkpoints/`.
 
+    Args:
+        folder: of the run, or the name of a policy that comes with the package.
+
     Raises:
-        ConfigError: if there is none, or its parts are incomplete or do not match.
+        ConfigError: if there is none, or its parts are incomplete, do not match, or do not fit this version.
     """
+    folder = policy_folder(folder)
     file = folder / "config.yaml"
     if not file.is_file():
         raise ConfigError(f"there is no run in '{folder}': it holds no config.yaml")
     seeds = sorted(folder.glob(f"{SEED_FOLDER}*/"))
     if seeds:
         raise ConfigError(f"'{folder}' holds the runs of {len(seeds)} seeds; name one of them, such as '{seeds[0]}'")
+    try:
+        return _loaded(folder, file)
+    except ConfigError as error:
+        writer, here = version_of(file), version("edqn-jax")
+        if writer in (None, here):
+            raise
+        raise ConfigError(
+            f"the policy in '{folder}' was saved by edqn_jax {writer} and does not fit edqn_jax {here}: {error}"
+        ) from None
+
+
+def _loaded(folder: Path, file: Path) -> tuple[Config, PolicyParams]:
     config = apply(Config(), load_layer(file), str(file))
     validate(config)
     params = load_params(folder / "checkpoints")

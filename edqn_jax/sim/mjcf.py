@@ -18,12 +18,13 @@ import dataclasses
 import difflib
 import math
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 import jax.numpy as jnp
 import mujoco
 import numpy as np
+from jax.typing import ArrayLike
 
 from edqn_jax.config import DENSITIES
 from edqn_jax.errors import ConfigError
@@ -61,6 +62,8 @@ class LoadedWorld:
     names: Mapping[str, tuple[str, ...]]
     """For every kind (field of `Scene`), the name of each of its shapes, in order."""
     path: Path
+    has_volume: bool
+    """Whether the file says where the drone may fly."""
 
 
 def scenes_folder() -> Path:
@@ -134,7 +137,17 @@ def load_world(path: str | Path) -> LoadedWorld:
         start=sites.get("start", unknown),
         goal=sites.get("goal", unknown),
     )
-    return LoadedWorld(scene, {kind: tuple(members) for kind, members in names.items()}, path)
+    return LoadedWorld(scene, {kind: tuple(members) for kind, members in names.items()}, path, "volume" in sites)
+
+
+def widened(scene: Scene, points: Iterable[ArrayLike]) -> Scene:
+    """Returns a scene whose flight volume also holds `points`, each [3], with `VOLUME_MARGIN` around those outside."""
+    lower, upper = np.asarray(scene.volume)
+    for point in points:
+        place = np.asarray(point)
+        lower = np.where(place < lower, place - VOLUME_MARGIN, lower)
+        upper = np.where(place > upper, place + VOLUME_MARGIN, upper)
+    return dataclasses.replace(scene, volume=jnp.asarray(np.stack([lower, upper]), jnp.float32))
 
 
 def check_scene(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+from importlib.metadata import version
 from pathlib import Path
 
 import mujoco
@@ -116,6 +117,18 @@ def test_no_run_an_empty_one_and_one_that_does_not_fit_are_sentences(tmp_path, r
         load_run(tmp_path)
     (tmp_path / "checkpoints").symlink_to(run / "checkpoints")
     with pytest.raises(ConfigError, match="does not have the shapes that its config.yaml asks for"):
+        load_run(tmp_path)
+
+
+def test_a_policy_of_another_version_that_does_not_fit_names_both(tmp_path, run):
+    (tmp_path / "checkpoints").symlink_to(run / "checkpoints")
+    (tmp_path / "config.yaml").write_text("# edqn_jax 9.8.7\nencoder: {waves: 3}\n")
+    with pytest.raises(
+        ConfigError, match=f"saved by edqn_jax 9.8.7 and does not fit edqn_jax {version('edqn-jax')}: .*waves"
+    ):
+        load_run(tmp_path)
+    (tmp_path / "config.yaml").write_text("# edqn_jax 9.8.7\n" + to_yaml(Config()))
+    with pytest.raises(ConfigError, match="saved by edqn_jax 9.8.7 .* does not have the shapes"):
         load_run(tmp_path)
 
 

@@ -92,3 +92,25 @@ def test_a_goal_inside_a_wall_names_the_wall(missions):
 def test_a_start_inside_a_wall_names_the_wall():
     with pytest.raises(ConfigError, match=r"the start .* lies inside '\w+'"):
         load_missions(CONFIG, "paper", start=inside_a_block())
+
+
+def test_a_world_without_a_volume_is_flown_in_the_box_that_holds_start_and_goal(tmp_path):
+    file = tmp_path / "open.xml"
+    file.write_text(
+        '<mujoco><worldbody><geom type="plane" size="0 0 1"/><geom type="box" pos="20 0 5" size="2 2 5"/>'
+        '<site name="start" pos="0 0 2"/><site name="goal" pos="40 0 2"/></worldbody></mujoco>'
+    )
+    own = load_missions(CONFIG, str(file))
+    assert own.note is None
+    course = load_missions(CONFIG, str(file), start=(-30, 0, 2), goal=(40, 3, 12))
+    lower, upper = np.asarray(course.scene().volume)
+    np.testing.assert_allclose(lower, [-35.0, own.scene().volume[0, 1], 0.0])
+    np.testing.assert_allclose(upper, own.scene().volume[1])
+    assert course.note is not None and "names no flight volume: it is flown in x, y, z = -35 to 45" in course.note
+    # A volume that the file names is kept to.
+    bounded = file.read_text().replace(
+        "</worldbody>", '<site name="volume" type="box" pos="20 0 5" size="25 9 5"/></worldbody>'
+    )
+    file.write_text(bounded)
+    with pytest.raises(ConfigError, match="outside the flight volume"):
+        load_missions(CONFIG, str(file), start=(-30, 0, 2))

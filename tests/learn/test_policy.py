@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from functools import partial
 
 import jax
@@ -9,7 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from edqn_jax.config import AgentConfig, CameraConfig, Config, EncoderConfig
+import edqn_jax
+from edqn_jax.config import AgentConfig, CameraConfig, Config, EncoderConfig, EventsConfig
+from edqn_jax.errors import ConfigError
 from edqn_jax.learn import policy, qnetwork, replay, vae
 from edqn_jax.sim.env import MOTION_SIZE, OWN_SIZE, Observation
 from edqn_jax.sim.events import field_of_counts
@@ -113,3 +116,33 @@ def test_the_policy_is_strict(params):
         params, policy.empty_memory(CONFIG), one, jax.random.key(3)
     )
     assert memory.shape == (3, SIZE) and move.shape == ()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("seen", "says"),
+    [
+        (jnp.zeros((6, 8)), r"events of 1 x 6 x 8 .* in 0.04 s; this observation is 6 x 8 numbers"),
+        (None, "this observation is nothing"),
+        (field_of_counts(CONFIG.events, jnp.zeros((12, 8), jnp.int8)), "this observation is events of 1 x 12 x 8"),
+        (
+            field_of_counts(EventsConfig(frame_times_s=(-0.08, 0.0)), jnp.zeros((6, 8), jnp.int8)),
+            "this observation is events of 1 x 6 x 8 frame pairs and pixels in 0.08 s",
+        ),
+    ],
+)
+def test_an_observation_of_another_sensor_is_refused_with_a_sentence_that_names_both(seen, says, params):
+    flies = policy.Policy(CONFIG, params)
+    fitting = observations(1)[0]
+    flies.act(fitting)
+    with pytest.raises(ConfigError, match=f"trained with the sensor 'events'.*{says}"):
+        flies.act(dataclasses.replace(fitting, sensed=seen))
+
+
+@pytest.mark.slow
+def test_noise_changes_the_form_of_events_and_not_whether_they_fit():
+    noisy = dataclasses.replace(CONFIG, events=EventsConfig(leak_rate_hz=0.2))
+    environment = edqn_jax.make("sparse", noisy)
+    _, observation = environment.reset(jax.random.key(0))
+    policy.Policy(noisy, policy.fresh_policy(noisy)).act(observation)
+    policy.Policy(CONFIG, policy.fresh_policy(CONFIG)).act(observation)
