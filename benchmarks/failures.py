@@ -1,0 +1,219 @@
+"""What do failed flights have in common? Looks back from each collision of a run.
+
+For each: what was hit, on which side of the drone, how long it had been in view, and how many events it made in the
+last second.
+
+    python benchmarks/failures.py RUN --world medium --missions 3000 --flights 50
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections import Counter
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from edqn_jax.config import Config
+from edqn_jax.errors import ConfigError
+from edqn_jax.evaluation.missions import MissionSet, load_missions
+from edqn_jax.evaluation.rollouts import fly_on_all_devices
+from edqn_jax.parallel.devices import use_cpu_devices
+from edqn_jax.runs.files import check_can_write
+from edqn_jax.runs.policies import load_run
+from edqn_jax.sim import camera, sensor
+from edqn_jax.sim.drone import Flight, yaw_of
+from edqn_jax.sim.events import EventField
+from edqn_jax.sim.flights import Flights
+from edqn_jax.sim.outcomes import Outcome
+from edqn_jax.sim.scene import KINDS, Scene, parked_shape, shape_distances, signed_distance
+from measurement import json_report
+
+NAMES = {
+    "boxes": "block",
+    "tilted_boxes": "block",
+    "cylinders": "pillar",
+    "tilted_cylinders": "pillar",
+    "capsules": "capsule",
+    "spheres": "ball",
+    "planes": "ground",
+}
+"""What people call a shape of each kind."""
+
+SAME_M = 1e-3
+"""Depths closer than this are of one surface: float32 has 1e-5 m at 100 m."""
+
+LOOK_BACK = 40
+"""Decisions before the collision that are looked at."""
+
+SHORTLY_S = 1.0
+"""Time before the collision in which events are counted."""
+
+
+def what_was_hit(scene: Scene, point: np.ndarray, yaw: float) -> tuple[str, int, str]:
+    """Returns kind and index of the shape nearest to `point` [3], and on which side of a drone heading `yaw` it is."""
+    distances = {kind: np.asarray(each) for kind, each in shape_distances(scene, jnp.asarray(point)).items()}
+    kind = min(distances, key=lambda name: distances[name].min())
+    towards = -np.asarray(jax.grad(lambda at: signed_distance(scene, at))(jnp.asarray(point)))
+    cos, sin = np.cos(yaw), np.sin(yaw)
+    ahead, left, up = cos * towards[0] + sin * towards[1], cos * towards[1] - sin * towards[0], towards[2]
+    sides = {"ahead": ahead, "behind": -ahead, "left": left, "right": -left, "above": up, "below": -up}
+    return kind, int(np.argmin(distances[kind])), max(sides, key=lambda name: sides[name])
+
+
+def alone(scene: Scene, kind: str, index: int) -> Scene:
+    """Returns the scene with one shape; all others are parked."""
+    shapes: dict[str, Any] = {}
+    for name, dataclass in KINDS.items():
+        kept = np.arange(getattr(scene, name).position.shape[0]) == (index if name == kind else -1)
+        away = parked_shape(dataclass)
+        shapes[name] = jax.tree.map(
+            lambda own, none, kept=kept: jnp.where(kept.reshape(-1, *[1] * (own.ndim - 1)), own, none),
+            getattr(scene, name),
+            away,
+        )
+    return scene.replace(**shapes)  # type: ignore[attr-defined]
+
+
+@partial(jax.jit, static_argnums=0)
+def seen_of_it(config: Config, scene: Scene, only: Scene, poses: Flight) -> tuple[jax.Array, jax.Array]:
+    """Returns how many pixels show the shape at each of K decisions, and how many events these pixels have: [K] each.
+
+    Args:
+        scene, only: the world, and the same with one shape alone.
+        poses: [K, T] at the sensor's frame times, the decision last.
+    """
+
+    def one(poses: Flight) -> tuple[jax.Array, jax.Array]:
+        position, rotation = poses.position[-1], sensor.mount_rotation(config, poses.quaternion[-1])
+        whole, own = (camera.depth(config.camera, each, position, rotation) for each in (scene, only))
+        shows = jnp.isfinite(own) & (own < whole + SAME_M)
+        key = jax.random.key(0)
+        field, _ = sensor.sense(config, scene, poses, sensor.at_rest(config, key), key)
+        events = jnp.sum(jnp.where(shows, field.count, 0)) if isinstance(field, EventField) else jnp.zeros((), int)
+        return jnp.sum(shows), events
+
+    return jax.vmap(one)(poses)
+
+
+def poses_of(config: Config, position: np.ndarray, quaternion: np.ndarray, decisions: int) -> Flight:
+    """Returns the poses [LOOK_BACK, T] that the sensor saw before the last decisions of a flight; the last is the last.
+
+    Where the flight is shorter, the first look is repeated.
+
+    Args:
+        position: [steps, 3] after each physics step. quaternion: [steps, 4].
+        decisions: that the flight took.
+    """
+    n = config.drone.physics_steps
+    # What the last decision was taken on was seen at the end of the one before.
+    ends = np.maximum(np.arange(decisions - LOOK_BACK, decisions), 1) * n
+    rows = np.maximum(ends[:, None] - n + np.asarray(sensor.frame_steps(config))[None] - 1, 0)
+    at, turned = jnp.asarray(position[rows]), jnp.asarray(quaternion[rows])
+    return Flight(position=at, quaternion=turned, velocity=jnp.zeros_like(at))
+
+
+def look_back(config: Config, missions: MissionSet, flights: Flights, mission: int) -> dict[str, Any]:
+    """Returns a row about one collision."""
+    assert flights.record is not None
+    steps, decisions = int(flights.physics_steps[mission]), int(flights.decisions[mission])
+    position = np.asarray(flights.record.position[mission])[:steps]
+    quaternion = np.asarray(flights.record.quaternion[mission])[:steps]
+    before = position[-2] if steps > 1 else position[-1]
+    point = before + float(flights.contact[mission]) * (position[-1] - before)
+    scene = missions.scene(mission)
+    kind, index, side = what_was_hit(scene, point, float(yaw_of(jnp.asarray(quaternion[-1]))))
+    pixels, events = (
+        np.asarray(values)
+        for values in seen_of_it(
+            config, scene, alone(scene, kind, index), poses_of(config, position, quaternion, decisions)
+        )
+    )
+    seconds = config.drone.physics_steps * config.drone.physics_dt_s
+    looked = min(decisions - 1, LOOK_BACK)
+    pixels, events = pixels[LOOK_BACK - looked :], events[LOOK_BACK - looked :]
+    last = max(round(SHORTLY_S / seconds), 1)
+    in_view = np.flatnonzero(pixels > 0)
+    return {
+        "mission": mission,
+        "hit": NAMES[kind],
+        "side": side,
+        "first_in_view_s": float((looked - in_view[0]) * seconds) if len(in_view) else 0.0,
+        "in_view_at_last": bool(looked and pixels[-1] > 0),
+        "share_in_view_shortly": float(np.mean(pixels[-last:] > 0)) if looked else 0.0,
+        "pixels_at_last": int(pixels[-1]) if looked else 0,
+        "events_shortly": int(events[-last:].sum()),
+        "speed_m_s": float(np.linalg.norm(np.asarray(flights.record.velocity[mission])[steps - 1])),
+    }
+
+
+def table(rows: Sequence[dict[str, Any]]) -> str:
+    """Returns what the rows have in common, as Markdown tables."""
+
+    def counted(name: str) -> str:
+        return ", ".join(f"{what} {count}" for what, count in Counter(row[name] for row in rows).most_common())
+
+    def quartiles(name: str) -> str:
+        low, middle, high = np.percentile([row[name] for row in rows], [25, 50, 75])
+        return f"{middle:.3g} ({low:.3g} to {high:.3g})"
+
+    unseen = sum(not row["in_view_at_last"] for row in rows)
+    never = sum(row["first_in_view_s"] == 0.0 for row in rows)
+    silent = sum(row["events_shortly"] == 0 for row in rows)
+    lines = [
+        f"| of {len(rows)} collisions | |",
+        "| --- | --- |",
+        f"| what was hit | {counted('hit')} |",
+        f"| on which side | {counted('side')} |",
+        f"| out of view when the last move was chosen | {unseen} |",
+        f"| never in view in the last {LOOK_BACK} decisions | {never} |",
+        f"| in view since, s before the collision, median (quartiles) | {quartiles('first_in_view_s')} |",
+        f"| pixels that showed it when the last move was chosen | {quartiles('pixels_at_last')} |",
+        f"| its events in the last {SHORTLY_S:g} s | {quartiles('events_shortly')} |",
+        f"| without any event in the last {SHORTLY_S:g} s | {silent} |",
+        f"| speed, m/s | {quartiles('speed_m_s')} |",
+    ]
+    return "\n".join(lines)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Returns exit code 0; 2 for invalid input."""
+    parser = argparse.ArgumentParser(
+        prog="python benchmarks/failures.py", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("run", type=Path, help="folder of a run, or pretrained")
+    parser.add_argument("--world", help="--world of train.py (default: that of the run)")
+    parser.add_argument("--missions", type=int, default=1000, help="number of missions (default 1000)")
+    parser.add_argument("--seed", type=int, default=0, help="seed of the missions (default 0)")
+    parser.add_argument("--flights", type=int, default=50, help="most collisions to look at (default 50)")
+    parser.add_argument("--json", type=Path, help="write a row for each collision to this file")
+    args = parser.parse_args(argv)
+    try:
+        if args.json is not None:
+            check_can_write(args.json)
+        use_cpu_devices()
+        config, params = load_run(args.run)
+        missions = load_missions(config, args.world or config.world.name, args.missions, args.seed)
+    except ConfigError as error:
+        print(error, file=sys.stderr)
+        return 2
+    flights = jax.tree.map(np.asarray, fly_on_all_devices(config, missions.world, params, args.seed, record=True))
+    (collided,) = np.nonzero(flights.outcome == Outcome.COLLISION)
+    rows = [look_back(config, missions, flights, int(mission)) for mission in collided[: args.flights]]
+    counts = Counter(Outcome(int(kind)).name.lower() for kind in flights.outcome)
+    print(", ".join(f"{count} {name}" for name, count in counts.most_common()))
+    print(table(rows) if rows else "no flight collided")
+    if args.json is not None:
+        report = {"benchmark": "failures", "world": missions.name, "seed": args.seed, "outcomes": counts, "rows": rows}
+        json_report.write(args.json, report | json_report.machine(jax.devices()))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
