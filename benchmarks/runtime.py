@@ -19,20 +19,15 @@ from __future__ import annotations
 import argparse
 import contextlib
 import dataclasses
-import functools
 import hashlib
 import json
 import math
-import multiprocessing
 import sys
 import tempfile
 import time
 from collections.abc import Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import Any
-
-import jax
 
 from conventional_stack.settings import DRONES
 from edqn_jax.cli.arguments import parse_train
@@ -42,7 +37,6 @@ from edqn_jax.errors import ConfigError
 from edqn_jax.parallel.devices import cores
 from edqn_jax.planners.planner import IMPROVING, PLANNERS
 from edqn_jax.runs.files import check_can_write
-from edqn_jax.sim.scene import Scene
 from measurement import json_report
 from measurement.child import Child, ChildEndedError
 from measurement.flags import configured as for_timing
@@ -51,7 +45,7 @@ from measurement.whole import steady
 from rivals import table
 from rivals.figure import draw_runtime
 from rivals.learners import LEARNERS, sensing
-from rivals.planning import judged_scenes, shortest_length
+from rivals.planning import judged_scenes, keep_to_cpu, shortest_lengths
 from rivals.rows import Row, figures, joined, worth
 from rivals.stack import STACK, STEADY
 
@@ -64,9 +58,6 @@ POINTS = 20
 BUDGET_SECONDS, QUICK_BUDGET_SECONDS = 5.0, 1.0
 PLANNED, QUICK_PLANNED = 32, 4
 """Number of missions for planners in random worlds, the first of the test missions of learners."""
-MANY = 64
-"""Number of worlds from which on shortest paths are computed in several processes."""
-
 QUICK = (
     *("--total-steps", "60000", "--train.validation-missions", "32", "--train.validation-every", "15000"),
     *("--world.pool-size", "128", "--world.missions", "1024"),
@@ -201,21 +192,6 @@ def read(file: Path) -> dict[str, Any]:
 # ------------------------------------------------------------------------------------------ running
 
 
-def keep_to_cpu() -> None:
-    """Restricts JAX to the CPU, because the children use the accelerator if there is one."""
-    jax.config.update("jax_platforms", "cpu")
-
-
-def shortest_of(config: Config, scenes: Sequence[Scene]) -> list[float | None]:
-    """Returns the length of A*'s path in each world, metres, None without a path. Uses all cores for many worlds."""
-    length = functools.partial(shortest_length, config.drone.body_radius_m)
-    if len(scenes) < MANY:
-        return [length(scene) for scene in scenes]
-    fresh = multiprocessing.get_context("spawn")  # because JAX's threads do not survive a fork
-    with ProcessPoolExecutor(cores(), fresh, initializer=keep_to_cpu) as pool:
-        return list(pool.map(length, scenes, chunksize=8))
-
-
 def launched(
     stack: contextlib.ExitStack, wanted: dict[str, Config], budget: float = 0.0, count: int = 0
 ) -> tuple[dict[str, Child], dict[str, dict[str, Any]]]:
@@ -324,7 +300,7 @@ def measure_world(asked: Asked, world: str) -> Iterator[list[Row]]:
     """Yields the rows of one world after each seed; the methods take turns, seed by seed."""
     args, config = asked.words, asked.configs[world]
     tell(f"{world}: {expected(asked, world)}")
-    shortest = shortest_of(config, judged_scenes(config, config.train.validation_missions))
+    shortest = shortest_lengths(config, judged_scenes(config, config.train.validation_missions))
     rows, wanted = {name: blank(asked, world, name) for name in args.methods}, {}
     for name, row in rows.items():
         try:

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import multiprocessing
+from collections.abc import Sequence
+from concurrent.futures import ProcessPoolExecutor
+from functools import partial
 from typing import Any
 
 import jax
 import numpy as np
 
 from edqn_jax.config import DENSITIES, Config
-from edqn_jax.parallel.devices import processor
+from edqn_jax.parallel.devices import cores, processor
 from edqn_jax.planners.astar import NoPathError, shortest_path
 from edqn_jax.planners.follow import FollowConfig, compiled_follower, reserved, sampled
 from edqn_jax.planners.planner import Budget, Task, load_planner
@@ -19,6 +23,9 @@ from edqn_jax.sim.mjcf import check_scene, load_world, resolve_world
 from edqn_jax.sim.outcomes import Outcome
 from edqn_jax.sim.scene import Scene, take_scene
 from measurement import json_report
+
+MANY = 64
+"""Number of worlds from which on shortest paths are computed in several processes."""
 
 NOT_FLOWN = {"outcome": "no_path", "decisions": 0, "flight_seconds": 0.0, "path_length_m": 0.0, "clearance_m": None}
 
@@ -38,12 +45,27 @@ def judged_scenes(config: Config, count: int) -> list[Scene]:
     return [loaded.scene]
 
 
-def shortest_length(radius: float, scene: Scene) -> float | None:
+def _shortest_length(radius: float, scene: Scene) -> float | None:
     """Returns the length of A*'s path from start to goal for a sphere of that radius, metres; None without a path."""
     try:
         return shortest_path(scene, scene.start, scene.goal, radius).length_m
     except NoPathError:
         return None
+
+
+def keep_to_cpu() -> None:
+    """Restricts JAX to the CPU, because the children use the accelerator if there is one."""
+    jax.config.update("jax_platforms", "cpu")
+
+
+def shortest_lengths(config: Config, scenes: Sequence[Scene]) -> list[float | None]:
+    """Returns the length of A*'s path in each world, metres, None without a path. Uses all cores for many worlds."""
+    length = partial(_shortest_length, config.drone.body_radius_m)
+    if len(scenes) < MANY:
+        return [length(scene) for scene in scenes]
+    fresh = multiprocessing.get_context("spawn")  # because JAX's threads do not survive a fork
+    with ProcessPoolExecutor(cores(), fresh, initializer=keep_to_cpu) as pool:
+        return list(pool.map(length, scenes, chunksize=8))
 
 
 class Planning:

@@ -62,10 +62,9 @@ GPU: Layer = {
     },
     "agent": {
         "hidden": (256, 256),
-        "history": 3,
+        "history": 2,
         "batch_size": 4096,
         "updates_per_step": 16,
-        "target_rate": 0.01,
         "learning_rate": 1e-3,
         "replay_size": 1_048_576,
         "exploration_end": 0.005,
@@ -74,11 +73,11 @@ GPU: Layer = {
 """What a GPU changes in the `default` preset: as many environments as fill it, and larger networks and updates."""
 
 GPU_RANDOM_WORLDS: Layer = {
+    "world": {"pool_size": 16_384, "missions": 131_072},
     "train": {"total_steps": 45_000_000},
     "encoder": {"retrain_at": (0.2, 0.5), "retrain_decisions": 2_097_152},
-    "events": {"frame_times_s": (-0.16, -0.08, 0.0)},
 }
-"""What a GPU changes further for random worlds."""
+"""What a GPU changes further for random worlds: among others a larger pool, since a small one is learnt by heart."""
 
 
 def world_layers(world: str, tuned_for: Hardware) -> list[Layer]:
@@ -113,7 +112,8 @@ def resolve(
     tuned = named_preset(preset_name)
     for changes in world_layers(config.world.name, tuned_for):
         tuned = apply(tuned, changes, "the world")
-    return dataclasses.replace(apply(tuned, layer, str(file)), world=config.world)
+    tuned = apply(tuned, layer, str(file))
+    return dataclasses.replace(tuned, world=dataclasses.replace(tuned.world, name=config.world.name))
 
 
 def make_config(

@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-import runtime
 from edqn_jax.cli.arguments import parse_train
 from edqn_jax.config import Config
 from edqn_jax.config.loading import to_yaml
@@ -78,9 +77,9 @@ def test_the_judged_worlds_are_those_that_training_ends_with() -> None:
 @pytest.mark.slow
 def test_many_worlds_have_the_shortest_paths_of_each_alone(monkeypatch: pytest.MonkeyPatch) -> None:
     scenes = [small_world().scene, WITHOUT_A_WAY["wall across"].scene, small_world().scene]
-    alone = runtime.shortest_of(Config(), scenes)
-    monkeypatch.setattr(runtime, "MANY", 2)
-    assert runtime.shortest_of(Config(), scenes) == alone
+    alone = planning.shortest_lengths(Config(), scenes)
+    monkeypatch.setattr(planning, "MANY", 2)
+    assert planning.shortest_lengths(Config(), scenes) == alone
     assert alone[1] is None and alone[0] == alone[2] and alone[0] is not None
 
 

@@ -59,6 +59,7 @@ def test_a_gpu_brings_its_own_sizes_and_files_and_the_papers_preset_keep_theirs(
     assert medium.train.num_envs == scene.train.num_envs == 16_384
     assert medium.events.threshold == RANDOM_WORLDS["events"]["threshold"]  # of random worlds on any hardware
     assert medium.train.total_steps > scene.train.total_steps
+    assert medium.world.name == "medium" and medium.world.pool_size > scene.world.pool_size
     file = write(tmp_path, "train: {num_envs: 64}\n")
     assert resolve(file=file, world="medium", tuned_for="gpu").train.num_envs == 64
     assert resolve("paper", tuned_for="gpu") == preset("paper")

@@ -1,0 +1,88 @@
+"""Rows of success: measured once, found again, and as many as there is time for."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import success
+from edqn_jax.runs.policies import load_policy
+
+SMALL = (
+    *("--num-envs", "16", "--train.chunk-steps", "4", "--total-steps", "256", "--agent.batch-size", "16"),
+    *("--agent.replay-size", "512", "--agent.learning-starts", "64", "--camera.width", "8", "--camera.height", "6"),
+    *("--world.pool-size", "4", "--world.missions", "16", "--drone.physics", "rigid_body"),
+    *("--env.max-decisions", "12"),
+)
+
+
+def call(out: Path, *words: str) -> int:
+    arguments = ["--out", str(out), "--worlds", "sparse", "--sensors", "blind", "--seeds", "2", "--missions", "3"]
+    return success.main([*arguments, *words, "--", *SMALL])
+
+
+@pytest.mark.slow
+def test_a_row_is_measured_once_and_then_read(tmp_path: Path, monkeypatch, capsys) -> None:
+    monkeypatch.setattr(success, "use_cpu_devices", lambda count: None)
+    # There is no time for a row: nothing is begun, and the exit code says so.
+    assert call(tmp_path, "--minutes", "0.01", "--no-spl") == 3
+    assert "1 rows are left" in capsys.readouterr().err and not list(tmp_path.glob("*.json"))
+    assert call(tmp_path) == 0
+    shown = capsys.readouterr().out
+    (file,) = tmp_path.glob("sparse-blind-*.json")
+    row = json.loads(file.read_text())
+    assert [turn["seed"] for turn in row["turns"]] == [0, 1] and len(row["turns"][1]["flights"]["outcome"]) == 3
+    assert load_policy(tmp_path / "policies" / file.stem / "seed-1").config.train.seed == 1
+    assert "| sparse | blind | 2 x 3 | 0.00% |" in shown
+    assert len(json.loads((tmp_path / "shortest_sparse_3.json").read_text())["lengths"]) == 3
+    monkeypatch.setattr(success, "measure", None)  # it would not be called
+    assert call(tmp_path) == 0 and capsys.readouterr().out == shown
+
+
+def test_other_options_make_another_row() -> None:
+    config = success.config_of("sparse", "blind", SMALL)
+    assert config.train.keep == "last" and config.train.validation_every == 0
+    names = {
+        success.row_file(Path("x"), config, 5, 1000).name,
+        success.row_file(Path("x"), config, 4, 1000).name,
+        success.row_file(Path("x"), success.config_of("sparse", "depth", SMALL), 5, 1000).name,
+        success.row_file(
+            Path("x"), success.config_of("sparse", "blind", [*SMALL, "--agent.n-step", "2"]), 5, 1000
+        ).name,
+    }
+    assert len(names) == 4
+
+
+def test_figures_are_of_all_seeds_and_missions() -> None:
+    flights = [
+        {"outcome": ["goal", "goal", "collision", "goal"], "path_length_m": [50.0, 60.0, 10.0, 40.0]},
+        {"outcome": ["goal", "collision", "collision", "goal"], "path_length_m": [55.0, 9.0, 10.0, 80.0]},
+    ]
+    row = {"turns": [{"seed": k, "flights": columns} for k, columns in enumerate(flights)]}
+    found = success.figures(row, np.array([50.0, 50.0, 50.0, np.nan]))
+    assert found["success"] == pytest.approx(0.625) and found["rates"] == [0.75, 0.5]
+    # Where the shortest path is unknown, the flown one stands in for it.
+    assert found["spl"] == pytest.approx(((1 + 50 / 60 + 1) / 4 + (50 / 55 + 1) / 4) / 2)
+    assert success.figures(row, None)["spl"] is None
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        (["--out", "here", "--", "--no-such-flag"], "there is no option '--no-such-flag'"),
+        (["--out", "here", "--", "--num-envs", "-1"], "train.num_envs"),
+    ],
+)
+def test_bad_options_are_a_sentence(words: list[str], says: str, tmp_path: Path, monkeypatch, capsys) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert success.main(words) == 2
+    assert says in capsys.readouterr().err and not list(tmp_path.iterdir())
+
+
+def test_a_foreign_file_among_the_rows_is_named(tmp_path: Path, capsys) -> None:
+    (tmp_path / "a-b-c.json").write_text("not json")
+    assert success.main(["--out", str(tmp_path), "--report"]) == 2
+    assert "is not a row that this benchmark wrote" in capsys.readouterr().err
