@@ -56,7 +56,7 @@ GPU: Layer = {
         "patch_layers": (64, 16),
         "joint_layers": (256, 128),
         "warmup_decisions": 2_097_152,
-        "warmup_updates_per_step": 48,
+        "warmup_updates_per_step": 24,
         "batch_size": 4096,
         "replay_size": 524_288,
     },
@@ -64,7 +64,7 @@ GPU: Layer = {
         "hidden": (256, 256),
         "history": 2,
         "batch_size": 4096,
-        "updates_per_step": 16,
+        "updates_per_step": 8,
         "learning_rate": 1e-3,
         "replay_size": 1_048_576,
         "exploration_end": 0.005,
@@ -74,7 +74,7 @@ GPU: Layer = {
 
 GPU_RANDOM_WORLDS: Layer = {
     "world": {"pool_size": 16_384, "missions": 131_072},
-    "train": {"total_steps": 45_000_000},
+    "train": {"total_steps": 60_000_000},
     "encoder": {"retrain_at": (0.2, 0.5), "retrain_decisions": 2_097_152},
 }
 """What a GPU changes further for random worlds: among others a larger pool, since a small one is learnt by heart."""
