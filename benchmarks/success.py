@@ -8,16 +8,19 @@ not measured again: a command that was stopped goes on where it was. No row is b
     python benchmarks/success.py --out runs/success --report
 
 Arguments after -- are options of train.py; defaults are those of the hardware. The interval is a bootstrap over seeds
-and missions. A* for the SPL takes 0.4 s a world and core, once for each density; --no-spl leaves it out.
+and missions. A* for the SPL takes 0.4 s a world and core, once for each density, when there is time after the rows;
+--no-spl leaves it out.
 """
 
 from __future__ import annotations
 
 import argparse
 import dataclasses
+import functools
 import hashlib
 import json
 import shutil
+import subprocess
 import sys
 import time
 from collections.abc import Sequence
@@ -32,7 +35,7 @@ from edqn_jax.config import DENSITIES, Config
 from edqn_jax.config.loading import to_yaml
 from edqn_jax.errors import ConfigError
 from edqn_jax.evaluation.intervals import interquartile_mean, rate_interval
-from edqn_jax.evaluation.metrics import spl
+from edqn_jax.evaluation.metrics import known_lengths, spl
 from edqn_jax.evaluation.missions import load_missions
 from edqn_jax.evaluation.rollouts import fly_on_all_devices
 from edqn_jax.learn.policy import Policy
@@ -87,9 +90,20 @@ def config_of(world: str, sensor: str, flags: Sequence[str]) -> Config:
 
 
 def row_file(out: Path, config: Config, seeds: int, missions: int) -> Path:
-    """Returns the file of a row; rows with other options, seeds or missions have other names."""
-    digest = hashlib.sha256(f"{seeds} {missions}\n{to_yaml(config)}".encode()).hexdigest()[:10]
+    """Returns the file of a row; rows with other options, seeds or missions, or of another commit, have other names."""
+    measured = f"{seeds} {missions} {_commit()}\n{to_yaml(config)}"
+    digest = hashlib.sha256(measured.encode()).hexdigest()[:10]
     return out / f"{config.world.name}-{config.env.sensor}-{digest}.json"
+
+
+@functools.cache
+def _commit() -> str | None:
+    """Returns the commit of this checkout; None where git does not say."""
+    try:
+        said = subprocess.run(["git", "rev-parse", "HEAD"], cwd=Path(__file__).parent, capture_output=True, text=True)
+    except OSError:
+        return None
+    return said.stdout.strip() or None
 
 
 def read_rows(out: Path) -> list[Row]:
@@ -129,17 +143,27 @@ def measure(config: Config, seeds: int, missions: int, policies: Path) -> Row:
         "train_seconds": results[0].train_seconds,
         "compile_seconds": results[0].compile_seconds,
         "row_seconds": time.perf_counter() - began,
+        "commit": _commit(),
         "options": to_yaml(config),
         "turns": turns,
         **json_report.machine(jax.devices()),
     }
 
 
-def shortest_paths(out: Path, config: Config, missions: int) -> np.ndarray:
-    """Returns the lengths [M] of A*'s paths of the test missions, NaN without a path; searched once, then read."""
-    file = out / f"shortest_{config.world.name}_{missions}.json"
+def shortest_paths(out: Path, config: Config, missions: int, search: bool) -> np.ndarray | None:
+    """Returns the lengths [M] of A*'s paths of the test missions, NaN without a path; None if not yet searched.
+
+    Args:
+        out: folder of rows.
+        config: gives world and body.
+        missions: M.
+        search: whether to search where no earlier call has.
+    """
+    file = out / f"shortest_{config.world.name}_{missions}_{config.drone.body_radius_m:g}.json"
     if file.is_file():
         return np.array(json.loads(file.read_text(encoding="utf-8"))["lengths"], float)
+    if not search:
+        return None
     lengths = shortest_lengths(config, judged_scenes(config, missions))
     json_report.write(file, {"world": config.world.name, "lengths": lengths})
     return np.array(lengths, float)
@@ -152,8 +176,7 @@ def figures(row: Row, shortest: np.ndarray | None) -> dict[str, Any]:
     rates = arrived.mean(axis=1)
     weights = None
     if shortest is not None:
-        known = np.where(np.isfinite(shortest), shortest, flown)
-        weights = [spl(arrived[k], flown[k], known[k]) for k in range(len(arrived))]
+        weights = [spl(arrived[k], flown[k], known_lengths(shortest, flown[k])) for k in range(len(arrived))]
     return {
         "success": float(rates.mean()),
         "interval": rate_interval(arrived),
@@ -163,7 +186,7 @@ def figures(row: Row, shortest: np.ndarray | None) -> dict[str, Any]:
     }
 
 
-def table(rows: Sequence[Row], shortest: dict[str, np.ndarray]) -> str:
+def table(rows: Sequence[Row], shortest: dict[str, np.ndarray | None]) -> str:
     """Returns the rows as a Markdown table."""
     lines = [
         "| world | sensor | seeds x missions | success | 95 % interval | interquartile mean | each seed | SPL "
@@ -210,10 +233,13 @@ def main(argv: Sequence[str] | None = None) -> int:
         longest = max(row["row_seconds"] for row in rows[-len(files) :])
         left.pop(0)
         print(f"{file.name}: {figures(row, None)['success']:.2%}, {row['row_seconds']:.0f} s", file=sys.stderr)
-    shortest = {}
-    if not args.no_spl:
-        for config in wanted:
-            shortest[f"{config.world.name} {args.missions}"] = shortest_paths(args.out, config, args.missions)
+    shortest: dict[str, np.ndarray | None] = {}
+    for config in [] if args.no_spl else wanted:
+        # Two cores search 1 000 worlds in 200 s.
+        in_time = time.perf_counter() - began + 0.4 * args.missions / cores() < 60 * args.minutes
+        shortest[f"{config.world.name} {args.missions}"] = shortest_paths(
+            args.out, config, args.missions, search=in_time and not args.report
+        )
     print(table(rows, shortest))
     if left:
         print(f"{len(left)} rows are left; the same command goes on with them", file=sys.stderr)

@@ -49,7 +49,8 @@ flies it, `edqn_jax.load_policy("pretrained")` loads it.
 | sees | events of the last {window:g} s (threshold {threshold:g}), its own state and motion |
 | camera | level, {width} x {height} pixels, {fov:g} degrees across |
 | format | configuration in `config.yaml`, parameters as an Orbax checkpoint (arrays, no pickle) |
-| made by | `scripts/pretrain.py` at commit `{commit}`, edqn_jax {version} |
+| trained at | commit `{commit}`, with the options in `config.yaml` |
+| made by | `scripts/pretrain.py`, which trains with these options, edqn_jax {version} |
 
 ## Measured
 
@@ -63,13 +64,13 @@ The paper's own map, never trained on: {paper}
 
 ## Limits
 
-- One training seed: another one flies about half a point more or less.
+- One training seed; another one flies half a point to a point more or less ([ablation](../../../docs/ablation.md)).
 - Simulated events from rendered brightness: no noise, no lens, uniform thresholds, static worlds, no wind. It has not
   been flown on a real drone, and must not be.
 - The map's bounds matter: the own position is given relative to the flight volume, and worlds of other sizes than
   110 x 110 x 25 m have not been measured.
-- Most failures are collisions with obstacles in full view, or with tops and sides just outside of the camera's view
-  (`benchmarks/failures.py pretrained --world medium`).
+- It collides with obstacles in full view and with ones just outside of the camera's view:
+  `benchmarks/failures.py pretrained --world medium` lists them.
 """
 
 
@@ -82,10 +83,16 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--out", type=Path, required=True, help="folder of policy and card; replaced")
     parser.add_argument("--missions", type=int, default=MISSIONS, help=f"test worlds of a density (default {MISSIONS})")
     parser.add_argument("--trained", help="where and how long the run was trained, if its summary.json does not say")
-    parser.add_argument("--commit", help="commit that the run was trained at (default: that of this checkout)")
+    parser.add_argument("--commit", help="commit that the run was trained at; needed if it is not trained now")
     args = parser.parse_args(argv)
+    if args.missions < 1:
+        parser.error(f"--missions must be at least 1, not {args.missions}")
+    trained = (args.run / "checkpoints" / "policy").is_dir()
+    if trained and args.commit is None:
+        parser.error(f"'{args.run}' was trained before; say with --commit at which commit")
     try:
-        if not (args.run / "checkpoints" / "policy").is_dir():
+        _check_replaceable(args.out)
+        if not trained:
             _train(args.run)
         use_cpu_devices()
         policy = load_policy(args.run)
@@ -150,7 +157,24 @@ def _paper(figures: dict[str, Any], radius: float) -> str:
 
 
 def _train(run: Path) -> None:
-    subprocess.run([sys.executable, str(ROOT / "train.py"), *FLAGS, "--run-dir", str(run)], check=True)
+    code = subprocess.run([sys.executable, str(ROOT / "train.py"), *FLAGS, "--run-dir", str(run)]).returncode
+    if code:
+        raise ConfigError(f"the training in '{run}' ended with exit code {code}; what it printed says why")
+
+
+def _check_replaceable(folder: Path) -> None:
+    """Raises unless a folder is new, or holds a policy alone.
+
+    Raises:
+        ConfigError: names what else is in it.
+    """
+    others = (
+        {file.name for file in folder.iterdir()} - {"config.yaml", "checkpoints", "README.md"}
+        if folder.is_dir()
+        else set()
+    )
+    if others:
+        raise ConfigError(f"'{folder}' holds other files, such as '{min(others)}'; give a folder that can be replaced")
 
 
 def _trained(run: Path) -> str:

@@ -38,8 +38,8 @@ class TrainOptions:
     preset: Literal["default", "paper"] = "default"
     """`default`: the best agent known to us. `paper`: exactly Table 1 of the paper."""
     tuned_for: Literal["auto", "cpu", "gpu"] = "auto"
-    """Hardware that the defaults of environments, batches, networks and decisions are chosen for; `auto`: a GPU where
-    there is one that JAX can use. Preset `paper` is the same on both."""
+    """Hardware that environments, batches, networks and decisions are chosen for on random worlds; `auto`: a GPU where
+    a card and JAX's plugin for it are found. Other worlds and the preset `paper` are the same on both."""
     config: Annotated[Path | None, arg(metavar="FILE.yaml", help_behavior_hint="")] = None
     """YAML file of options by group; overrides the preset, and flags override the file."""
     seeds: Annotated[int | None, arg(metavar="K", help_behavior_hint="")] = None
@@ -127,6 +127,8 @@ def parse_train(argv: Sequence[str]) -> tuple[TrainOptions, Config]:
     # Preset, file and world decide the defaults that the other flags change and that --help shows.
     early = [word for word in argv if word not in ("-h", "--help")]
     options, _ = tyro.cli(TrainOptions, args=early, prog=TRAIN, return_unknown_args=True, add_help=False)
+    if options.seeds is not None and options.seeds < 1:
+        raise ConfigError(f"--seeds must be at least 1, not {options.seeds}")
     if options.tuned_for == "auto":
         options = dataclasses.replace(options, tuned_for=hardware())
     base = resolve(options.preset, options.config)

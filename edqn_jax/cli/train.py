@@ -8,9 +8,10 @@ from collections.abc import Sequence
 
 from rich.console import Console
 
-from edqn_jax.cli.arguments import parse_train
+from edqn_jax.cli.arguments import TrainOptions, parse_train
 from edqn_jax.cli.signals import listening_for_sigterm
 from edqn_jax.config import Config
+from edqn_jax.config.loading import gpu_layers, to_yaml
 from edqn_jax.errors import ConfigError
 from edqn_jax.parallel.launch import how_to_join
 from edqn_jax.runs.directory import plan_run_directory
@@ -36,11 +37,12 @@ def train_command(argv: Sequence[str]) -> None:
     if arguments is not None:
         print("edqn: waiting for the other processes, five minutes at most", file=sys.stderr)
         process = processes.join(arguments)
+    processes.together(lambda: _check_gpu() if tuned_for_gpu(options, config) else None)
+    processes.check_alike(to_yaml(config))
     writes = process == 0
     run = processes.together(lambda: plan_run_directory(options.run_dir, config, options.resume) if writes else None)
     progress = Progress(Console(quiet=not writes))
-    if options.tuned_for == "gpu":
-        _check_gpu()
+    if tuned_for_gpu(options, config):
         progress.message(_chosen(config))
     with listening_for_sigterm() as stop_requested:
         try:
@@ -54,6 +56,11 @@ def train_command(argv: Sequence[str]) -> None:
                 train_seeds_run(config, options.seeds, run, progress, stop_requested)
         finally:
             progress.stop()
+
+
+def tuned_for_gpu(options: TrainOptions, config: Config) -> bool:
+    """Returns whether defaults were chosen for a GPU."""
+    return options.preset == "default" and bool(gpu_layers(config.world.name, options.tuned_for))
 
 
 def _check_gpu() -> None:

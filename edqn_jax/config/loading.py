@@ -28,26 +28,27 @@ Hardware = Literal["cpu", "gpu"]
 """What defaults are chosen for."""
 
 RANDOM_WORLDS: Layer = {
-    "train": {"total_steps": 3_200_000},
+    "world": {"pool_size": 4096, "missions": 32_768},
+    "train": {"total_steps": 5_000_000, "validation_every": 1_000_000, "validation_missions": 1024},
     "encoder": {
         "warmup_decisions": 131_072,
         "replay_size": 65_536,
         "retrain_at": (0.15,),
         "retrain_decisions": 131_072,
     },
-    "agent": {"updates_per_step": 4, "target_rate": 0.02, "learning_rate": 1e-3},
+    "agent": {"history": 2, "updates_per_step": 4, "target_rate": 0.02, "learning_rate": 1e-3},
     "events": {"threshold": 0.03, "tolerance": 0.03, "frame_times_s": (-0.08, 0.0)},
 }
-"""What random worlds change in the `default` preset: more decisions, fewer and smaller updates for each, a longer
-window of events with lower thresholds, and an encoder that learns from more, and again from flights of the policy,
-since there only events tell where obstacles are."""
-
+"""What random worlds change in the `default` preset: more decisions in more worlds, fewer and smaller updates for each,
+two observations, a longer window of events with lower thresholds, and an encoder that learns from more, and again from
+flights of the policy, since there only events tell where obstacles are."""
 
 GPU: Layer = {
+    "world": {"pool_size": 16_384, "missions": 131_072},
     "train": {
         "num_envs": 16_384,
         "chunk_steps": 16,
-        "total_steps": 12_000_000,
+        "total_steps": 60_000_000,
         "validation_every": 2_097_152,
         "validation_missions": 512,
     },
@@ -59,10 +60,11 @@ GPU: Layer = {
         "warmup_updates_per_step": 24,
         "batch_size": 4096,
         "replay_size": 524_288,
+        "retrain_at": (0.2, 0.5),
+        "retrain_decisions": 2_097_152,
     },
     "agent": {
         "hidden": (256, 256),
-        "history": 2,
         "batch_size": 4096,
         "updates_per_step": 8,
         "learning_rate": 1e-3,
@@ -70,23 +72,18 @@ GPU: Layer = {
         "exploration_end": 0.005,
     },
 }
-"""What a GPU changes in the `default` preset: as many environments as fill it, and larger networks and updates."""
-
-GPU_RANDOM_WORLDS: Layer = {
-    "world": {"pool_size": 16_384, "missions": 131_072},
-    "train": {"total_steps": 60_000_000},
-    "encoder": {"retrain_at": (0.2, 0.5), "retrain_decisions": 2_097_152},
-}
-"""What a GPU changes further for random worlds: among others a larger pool, since a small one is learnt by heart."""
+"""What a GPU changes further for random worlds: as many environments as fill it, larger networks and updates, and a
+larger pool of worlds, since a small one is learnt by heart (docs/ablation.md)."""
 
 
 def world_layers(world: str, tuned_for: Hardware) -> list[Layer]:
     """Returns what a world and the hardware change in the `default` preset; later ones replace earlier ones."""
-    random = world in DENSITIES
-    layers = [RANDOM_WORLDS] if random else []
-    if tuned_for == "gpu":
-        layers += [GPU, GPU_RANDOM_WORLDS] if random else [GPU]
-    return layers
+    return [*([RANDOM_WORLDS] if world in DENSITIES else []), *gpu_layers(world, tuned_for)]
+
+
+def gpu_layers(world: str, tuned_for: Hardware | Literal["auto"]) -> list[Layer]:
+    """Returns what a GPU changes for a world; nothing has been chosen for worlds from files."""
+    return [GPU] if tuned_for == "gpu" and world in DENSITIES else []
 
 
 def resolve(

@@ -39,6 +39,11 @@ def spl(success: np.ndarray, flown: np.ndarray, shortest: np.ndarray) -> float:
     return float(np.sum(weight) / len(success))
 
 
+def known_lengths(shortest: np.ndarray, flown: np.ndarray) -> np.ndarray:
+    """Returns lengths [M] of shortest paths, where unknown those flown, which have a weight of 1 in the SPL."""
+    return np.where(np.isfinite(shortest), shortest, flown)
+
+
 def shortest_paths(config: Config, world: World, wanted: np.ndarray) -> np.ndarray:
     """Returns the length [M] of A*'s path for each of the `wanted` [M] missions, metres; NaN for the others."""
     scene_of, starts, goals = (np.asarray(x) for x in (world.missions.scene, world.missions.start, world.missions.goal))
@@ -95,8 +100,7 @@ def summarise(flights: Flights, shortest: np.ndarray | None = None) -> dict[str,
     }
     if shortest is not None:
         known = success & np.isfinite(shortest)
-        # Where the shortest path of a success is unknown, its flown length stands in: a weight of 1.
-        figures["spl"] = spl(success, flown, np.where(np.isfinite(shortest), shortest, flown))
+        figures["spl"] = spl(success, flown, known_lengths(shortest, flown))
         figures["path_over_shortest"] = mean(flown / np.where(known, shortest, 1.0), known)
     return figures
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import tempfile
+from collections.abc import Sequence
 from pathlib import Path
 
 import jax
@@ -96,6 +97,24 @@ def run_missions(config: Config, reward: Reward | None = None) -> RunMissions:
     return dataclasses.replace(
         missions, **{name: getattr(missions, name).rewarded_by(reward) for name in ("training", "validation", "final")}
     )
+
+
+def missions_of_runs(configs: Sequence[Config], reward: Reward | None = None) -> list[RunMissions]:
+    """Returns `run_missions` of runs that differ in their seeds alone; they share the worlds.
+
+    Raises:
+        ConfigError: as `run_missions`.
+    """
+    first = run_missions(configs[0], reward)
+    if configs[0].world.name not in DENSITIES:
+        return [first, *(run_missions(config, reward) for config in configs[1:])]
+    others = []
+    for config in configs[1:]:
+        key, world = run_streams(config.train.seed).training_missions, first.training.world
+        missions = worlds.random_missions(world.pool, config.world.missions, key)
+        training = dataclasses.replace(first.training, world=dataclasses.replace(world, missions=missions))
+        others.append(dataclasses.replace(first, training=training))
+    return [first, *others]
 
 
 def _random_run_missions(config: Config, training_key: jax.Array) -> RunMissions:
@@ -206,12 +225,9 @@ def _file_missions(config: Config, name: str, missions: int, seed: int, moved: d
     loaded = load_world(file)
     scene, note = dataclasses.replace(loaded.scene, **moved), None
     if moved and not loaded.has_volume:
-        wider = widened(scene, moved.values())
-        if not np.array_equal(wider.volume, scene.volume):
-            scene, note = (
-                wider,
-                f"'{name}' names no flight volume: it is flown in {_box(wider)}, which holds all shapes",
-            )
+        scene = widened(scene, moved, f"'{name}'")
+        if not np.array_equal(scene.volume, loaded.scene.volume):
+            note = f"'{name}' names no flight volume: it is flown in {_box(scene)}, around its shapes, start and goal"
     if missions == 1:
         check_scene(scene, radius, names=loaded.names, title=f"'{name}'")
         shortest_path(scene, scene.start, scene.goal, radius)  # raises where there is no path

@@ -39,10 +39,10 @@ def soft_value(q: Array, temperature: float) -> Array:
 
 
 def munchausen_bonus(config: AgentConfig, q: Array, a: Array) -> Array:
-    """Returns the scaled log-probability [] of the action taken, at least -1 (Vieillard et al. 2020, Eq. 1).
+    """Returns `munchausen` x max(t log pi(a|s), -1) [], with pi = softmax(q / t) (Vieillard et al. 2020, Eq. 1).
 
     Args:
-        q: [A] target network at s. a: [] action taken.
+        q: [A] target network at s, in units of scaled reward. a: [] action taken.
     """
     log_policy = jax.nn.log_softmax(q / config.munchausen_temperature)[a]
     return config.munchausen * jnp.clip(config.munchausen_temperature * log_policy, -1.0, 0.0)

@@ -105,7 +105,7 @@ class Policy:
             memory: from the call before; None at the start of an episode.
 
         Raises:
-            ConfigError: if the observation is of another sensor, size or window than the policy was trained with.
+            ConfigError: if the observation has another form, size or window than the policy was trained with.
         """
         _check_fits(self.config, observation)
         if memory is None:

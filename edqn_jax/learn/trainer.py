@@ -561,13 +561,14 @@ class Trainer:
 
     def each(self, tree: Any) -> list[Any]:
         """Returns the arrays of each agent, of arrays that have a leading [K] if there are several."""
-        if self.agents is None:
-            return [tree]
-        return [jax.tree.map(lambda leaf, number=number: leaf[number], tree) for number in range(self.agents)]
+        return [self.of_agent(tree, number) for number in range(self.agents or 1)]
+
+    def of_agent(self, tree: Any, number: int) -> Any:
+        """Returns the arrays of one agent, of arrays that have a leading [K] if there are several."""
+        return tree if self.agents is None else jax.tree.map(lambda leaf: leaf[number], tree)
 
 
 def _joined(worlds: Sequence[World]) -> World:
     """Returns the first world with the missions of all, [K, M]."""
-    return dataclasses.replace(
-        worlds[0], missions=jax.tree.map(lambda *leaves: jnp.stack(leaves), *(w.missions for w in worlds))
-    )
+    missions = jax.tree.map(lambda *leaves: jnp.stack(leaves), *(world.missions for world in worlds))
+    return dataclasses.replace(worlds[0], missions=missions)

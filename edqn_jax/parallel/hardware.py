@@ -12,6 +12,10 @@ HIDDEN = ("", "-1", "none", "nodevfiles")
 """Values of CUDA_VISIBLE_DEVICES that hide every GPU."""
 
 
+CARDS = {"jax_cuda": ("nvidia[0-9]*", "dxg"), "jax_rocm": ("kfd",)}
+"""Device files of the cards that each of JAX's plugins drives, by the beginning of its name."""
+
+
 def hardware(environ: Mapping[str, str] = os.environ, devices: Path = Path("/dev")) -> Literal["cpu", "gpu"]:
     """Returns `gpu` where there is a GPU, JAX's plugin for it is installed, and the environment does not hide it.
 
@@ -19,15 +23,17 @@ def hardware(environ: Mapping[str, str] = os.environ, devices: Path = Path("/dev
         environ: environment variables; JAX_PLATFORMS and CUDA_VISIBLE_DEVICES are read.
         devices: folder of device files.
     """
-    platforms = environ.get("JAX_PLATFORMS", "").lower()
-    if platforms and not any(name in platforms for name in ("cuda", "gpu", "rocm")):
+    first = environ.get("JAX_PLATFORMS", "").lower().split(",")[0].strip()
+    if first and first not in ("cuda", "gpu", "rocm"):
         return "cpu"
     if environ.get("CUDA_VISIBLE_DEVICES", "all").lower() in HIDDEN:
         return "cpu"
-    cards = [*devices.glob("nvidia[0-9]*"), *devices.glob("kfd"), *devices.glob("dxg")]
-    return "gpu" if cards and _has_plugin() else "cpu"
+    for plugin, patterns in CARDS.items():
+        if any(next(devices.glob(pattern), None) for pattern in patterns) and _has_plugin(plugin):
+            return "gpu"
+    return "cpu"
 
 
-def _has_plugin() -> bool:
+def _has_plugin(plugin: str) -> bool:
     names = [module.name for module in pkgutil.iter_modules()]
-    return any(name.startswith(("jax_cuda", "jax_rocm")) and name.endswith("_plugin") for name in names)
+    return any(name.startswith(plugin) and name.endswith("_plugin") for name in names)

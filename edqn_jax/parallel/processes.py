@@ -6,6 +6,7 @@ take the same branches in the host loop: one that takes another branch leaves th
 
 from __future__ import annotations
 
+import hashlib
 from collections import Counter
 from collections.abc import Callable, Mapping
 from typing import Any, TypeVar
@@ -77,6 +78,21 @@ def together(work: Callable[[], T]) -> T:
         if told.any():
             raise ConfigError(told.tobytes().rstrip(b"\0").decode(errors="ignore"))
     return result  # type: ignore[return-value]
+
+
+def check_alike(text: str) -> None:
+    """Raises on every process unless all have the same text, such as their options; every process must call this.
+
+    Raises:
+        ConfigError: if one differs.
+    """
+    if not jax.distributed.is_initialized():
+        return
+    digest = np.frombuffer(hashlib.sha256(text.encode()).digest(), np.uint8)
+    if len({row.tobytes() for row in multihost_utils.process_allgather(digest)}) > 1:
+        raise ConfigError(
+            "the processes have different options; give all of them the same ones, --tuned-for cpu or gpu included"
+        )
 
 
 def on_any(flag: bool) -> bool:

@@ -11,6 +11,6 @@ PRETRAINED = "pretrained"
 def policy_folder(run: Path) -> Path:
     """Returns the folder of a policy that comes with the package for its name, and any other folder as it is.
 
-    A folder of that name in the current one goes first.
+    A folder of that name in the current one takes precedence.
     """
     return Path(__file__).parent / PRETRAINED if str(run) == PRETRAINED and not run.is_dir() else run

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import datetime
 import json
 import math
 import shutil
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -86,16 +87,8 @@ class RunDirectory:
         Raises:
             ConfigError: as `create`.
         """
-        try:
-            self.path.mkdir(parents=True, exist_ok=not self.must_be_new)
-            self.summary_file.unlink(missing_ok=True)
-            for folder in self.path.glob(f"{SEED_FOLDER}*"):
-                shutil.rmtree(folder, ignore_errors=True)
+        with self._made():
             write_atomically(self.config_file, config_text(configs[0]))
-        except FileExistsError:
-            raise ConfigError(f"another run has just created '{self.path}'; start this one again") from None
-        except OSError as error:
-            raise unwritable(self.path, error.strerror) from None
         for config in configs:
             self.of_seed(config.train.seed).create(config)
 
@@ -107,15 +100,26 @@ class RunDirectory:
         Raises:
             ConfigError: if it cannot be written, or exists although it `must_be_new`.
         """
-        try:
-            self.path.mkdir(parents=True, exist_ok=not self.must_be_new)
-            for file in (self.metrics_file, self.summary_file, self.trajectory_file):
-                file.unlink(missing_ok=True)
+        with self._made():
             for folder in (self.figures, self.checkpoints):
-                shutil.rmtree(folder, ignore_errors=True)
                 folder.mkdir()
             write_atomically(self.config_file, config_text(config))
             write_atomically(self.episodes_file, ",".join(EPISODE_COLUMNS) + "\n")
+
+    @contextlib.contextmanager
+    def _made(self) -> Iterator[None]:
+        """Makes the folder, without what an earlier run of one seed or several left in it.
+
+        Raises:
+            ConfigError: if it, or what the block makes in it, cannot be made.
+        """
+        try:
+            self.path.mkdir(parents=True, exist_ok=not self.must_be_new)
+            for file in (self.metrics_file, self.episodes_file, self.summary_file, self.trajectory_file):
+                file.unlink(missing_ok=True)
+            for folder in (self.figures, self.checkpoints, *self.path.glob(f"{SEED_FOLDER}*")):
+                shutil.rmtree(folder, ignore_errors=True)
+            yield
         except FileExistsError as error:
             if self.must_be_new:
                 raise ConfigError(f"another run has just created '{self.path}'; start this one again") from None
@@ -213,7 +217,10 @@ def config_text(config: Config) -> str:
 
 def version_of(config_file: Path) -> str | None:
     """Returns the version of this package that wrote a `config.yaml`; None where it does not say."""
-    first = config_file.read_text(encoding="utf-8").partition("\n")[0]
+    try:
+        first = config_file.read_text(encoding="utf-8").partition("\n")[0]
+    except (OSError, UnicodeDecodeError):
+        return None
     return first.removeprefix(_VERSION).strip() if first.startswith(_VERSION) else None
 
 

@@ -1,8 +1,8 @@
-"""Depth of the nearest surface along rays: what true depth, labels and free distances are made of.
+"""Depth of the nearest surface along rays, for the sensors `depth` and `ranges` and for the encoder's labels.
 
 Whether a ray passes over or under an upright shape depends on its row alone under a level camera, and whether it
 passes beside the shape on its column alone. So both are computed once per row and column, and each pixel only compares
-them, one shape after another; 30 times as fast as meeting every shape at every pixel.
+them, one shape after another (docs/performance.md has the times).
 
 N upright shapes; rays as in `raycast`.
 """
@@ -27,7 +27,7 @@ UNROLLED = 4
 class _Intervals:
     """Depths between which each ray is beside an upright shape's axis, and between its bottom and its top.
 
-    Fields broadcast to [N, R, C]; an interval whose end is before its beginning is empty.
+    Fields broadcast to [N, R, C]; an interval that ends before it begins is empty.
     """
 
     beside_from: Array
@@ -56,18 +56,19 @@ def nearest_depth(config: CameraConfig, scene: Scene, origin: Array, rays: Rays)
         uprights.append(_cylinders(scene.cylinders, origin, raycast.for_shapes(rays)))
     if not uprights:
         return nearest
-    joined = jax.tree.map(lambda *kinds: jnp.concatenate(kinds), *uprights)
+    joined = jax.tree.map(lambda *parts: jnp.concatenate(parts), *uprights)
     return lax.scan(_with_one_more, nearest, joined, unroll=UNROLLED)[0]
 
 
-def _with_one_more(nearest: Array, shape: _Intervals) -> tuple[Array, None]:
-    """Returns the nearest depth [R, C] with one more upright shape."""
-    enter = jnp.maximum(shape.beside_from, shape.level_from)
-    leave = jnp.minimum(shape.beside_to, shape.level_to)
+def _with_one_more(nearest: Array, intervals: _Intervals) -> tuple[Array, None]:
+    """Returns the nearest depth [R, C] with one more upright shape, of which fields broadcast to [R, C]."""
+    enter = jnp.maximum(intervals.beside_from, intervals.level_from)
+    leave = jnp.minimum(intervals.beside_to, intervals.level_to)
     return jnp.minimum(nearest, jnp.where((enter < leave) & (enter > 0), enter, jnp.inf)), None
 
 
 def _boxes(boxes: UprightBoxes, origin: Array, rays: Rays) -> _Intervals:
+    """Returns the intervals of upright boxes: beside its axis a ray is between two pairs of parallel faces."""
     cos, sin = per_shape(jnp.cos(boxes.yaw)), per_shape(jnp.sin(boxes.yaw))
     x, y = (per_shape(boxes.position[:, axis] - origin[axis]) for axis in range(2))
     per_x, per_y = inverse(cos * rays.dx + sin * rays.dy), inverse(cos * rays.dy - sin * rays.dx)
@@ -81,6 +82,7 @@ def _boxes(boxes: UprightBoxes, origin: Array, rays: Rays) -> _Intervals:
 
 
 def _cylinders(cylinders: UprightCylinders, origin: Array, rays: Rays) -> _Intervals:
+    """Returns the intervals of upright cylinders: beside its axis a ray is within the circle."""
     ox, oy = (per_shape(origin[axis] - cylinders.position[:, axis]) for axis in range(2))
     flat = jnp.maximum(rays.dx**2 + rays.dy**2, raycast.TINY)
     nearest = -(ox * rays.dx + oy * rays.dy) / flat

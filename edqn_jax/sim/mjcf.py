@@ -9,7 +9,8 @@ Any MJCF file can be read. A world for the drone consists of
   and textures are ignored.
 * two sites `start` and `goal`, of which only the positions are read.
 * a box site `volume`, not rotated: the space that the drone may fly in. Without one, the box around all
-  shapes and sites, `VOLUME_MARGIN` wider on every side, but not below a level plane.
+  shapes and sites, `VOLUME_MARGIN` wider on every side, but not below a level plane; an evaluation whose start or goal
+  lies outside that box widens it (`widened`).
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ import dataclasses
 import difflib
 import math
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 
 import jax.numpy as jnp
@@ -46,6 +47,9 @@ from edqn_jax.sim.scene import (
 
 VOLUME_MARGIN = 5.0
 """Metres around shapes and sites where a world names no `volume`."""
+
+LONGEST_VOLUME = 500.0
+"""Most metres along an axis of a flight volume that is widened for a start or goal; A*'s lattice must hold it."""
 
 _LEVEL = 1e-6  # an axis this near to vertical (sine of the angle) is vertical: 0.1 mm over 100 m
 
@@ -140,13 +144,27 @@ def load_world(path: str | Path) -> LoadedWorld:
     return LoadedWorld(scene, {kind: tuple(members) for kind, members in names.items()}, path, "volume" in sites)
 
 
-def widened(scene: Scene, points: Iterable[ArrayLike]) -> Scene:
-    """Returns a scene whose flight volume also holds `points`, each [3], with `VOLUME_MARGIN` around those outside."""
+def widened(scene: Scene, points: Mapping[str, ArrayLike], title: str) -> Scene:
+    """Returns a scene whose flight volume also holds `points`, each [3], with `VOLUME_MARGIN` around those outside.
+
+    Args:
+        scene: one world.
+        points: by what they are, for the message.
+        title: name of the world in the message.
+
+    Raises:
+        SceneError: if the volume would be longer than `LONGEST_VOLUME` along an axis.
+    """
     lower, upper = np.asarray(scene.volume)
-    for point in points:
+    for role, point in points.items():
         place = np.asarray(point)
         lower = np.where(place < lower, place - VOLUME_MARGIN, lower)
         upper = np.where(place > upper, place + VOLUME_MARGIN, upper)
+        if not np.all(upper - lower <= LONGEST_VOLUME):
+            raise SceneError(
+                f"the {role} {_point(place)} is too far from the shapes of {title}; its flight volume would be longer "
+                f"than {LONGEST_VOLUME:g} m"
+            )
     return dataclasses.replace(scene, volume=jnp.asarray(np.stack([lower, upper]), jnp.float32))
 
 

@@ -22,7 +22,7 @@ from edqn_jax.config import Config
 from edqn_jax.config.limits import validate
 from edqn_jax.errors import ConfigError
 from edqn_jax.evaluation import rollouts
-from edqn_jax.evaluation.missions import MissionSet, RunMissions, run_missions
+from edqn_jax.evaluation.missions import MissionSet, RunMissions, missions_of_runs
 from edqn_jax.learn.policy import Policy, PolicyParams, fresh_policy
 from edqn_jax.learn.trainer import Trainer, TrainState, policy_of
 from edqn_jax.parallel import processes
@@ -113,7 +113,7 @@ class Preparation:
         display.phase("preparing worlds")
         self.devices = choose_devices(config.train.devices, config.train.shards)
         # A world's file may be missing on one host.
-        self.missions = processes.together(lambda: [run_missions(each, reward) for each in self.configs])
+        self.missions = processes.together(lambda: missions_of_runs(self.configs, reward))
         worlds = [missions.training.world for missions in self.missions]
         self.trainer = Trainer(config, worlds[0] if agents is None else worlds, self.devices)
         self.mesh = Mesh(np.asarray(self.devices), ("mission",))

@@ -58,9 +58,10 @@ def train_seeds_run(
             raise StoppedError(f"stopped after {results[0].decisions:,} decisions; {where}")
         progress.phase("flying the missions")
         flights = [preparation.fly(preparation.missions[k].final, results[k].policy.params, k) for k in agents]
-        states = preparation.trainer.each(results[0].state)
-        digests = [state_digest(state) for state in states]  # the last that all processes do together
-        summaries = [summary_of(preparation, results[k], flights[k], digests[k], reward) for k in agents]
+        # One after the other: a state may be large. The last that all processes do together.
+        digests = [state_digest(preparation.trainer.of_agent(results[0].state, k)) for k in agents]
+        together = {"trained_together": seeds}
+        summaries = [summary_of(preparation, results[k], flights[k], digests[k], reward) | together for k in agents]
         whole = _summary_of_all(config, flights, summaries)
         if run is not None:
             progress.phase("drawing")
@@ -68,6 +69,7 @@ def train_seeds_run(
             for folder, result, flown, summary in zip(folders, results, flights, summaries, strict=True):
                 assert folder is not None
                 draw(folder, preparation, sights, result, flown)
+                summary["total_seconds"] = time.perf_counter() - preparation.began
                 folder.write_summary(summary)
             whole["total_seconds"] = time.perf_counter() - preparation.began
             run.write_summary(whole)
@@ -105,7 +107,7 @@ def _verdict(summary: dict[str, Any], run: RunDirectory) -> str:
     missions = "unseen test worlds" if summary["missions"] > 1 else "the mission"
     return (
         f"Reached the goal in {missions}: {each}.\nInterquartile mean {summary['success_iqm']:.1%}, mean "
-        f"{summary['success_mean']:.1%} (95 % bootstrap interval over seeds and missions {low:.1%} to {high:.1%}).\n"
+        f"{summary['success_mean']:.1%} (95 % interval {low:.1%} to {high:.1%}).\n"
         f"Took {clock(summary['total_seconds'])} in all, {clock(summary['train_seconds'])} of it training. Each seed's "
         f"run is in {run.path}"
     )

@@ -42,12 +42,12 @@ def flown(course, move: tuple[int, int, int]) -> dict:
 def test_a_wall_straight_ahead_was_in_view_all_the_way(course) -> None:
     row = flown(course, (1, 0, 0))
     assert (row["hit"], row["side"]) == ("block", "ahead")
-    assert row["in_view_at_last"] and row["share_in_view_shortly"] == 1.0
+    assert row["in_view_at_last"] and row["share_in_view_lately"] == 1.0
     assert row["pixels_at_last"] == CONFIG.camera.width * CONFIG.camera.height  # less than a decision away
     assert row["speed_m_s"] == pytest.approx(4.0, abs=0.2)
     # 18.6 m at 4 m/s, and the start from rest; the last move was chosen one decision before.
-    assert row["first_in_view_s"] == pytest.approx(5.0, abs=0.6)
-    assert row["events_shortly"] > 0
+    assert row["first_seen_s"] == pytest.approx(5.0, abs=0.6)
+    assert row["events_lately"] > 0
 
 
 @pytest.mark.slow
@@ -73,18 +73,22 @@ def test_the_table_counts_what_rows_have_in_common() -> None:
         "mission": 0,
         "hit": "block",
         "side": "ahead",
-        "first_in_view_s": 2.0,
+        "first_seen_s": 2.0,
         "in_view_at_last": True,
-        "share_in_view_shortly": 1.0,
+        "share_in_view_lately": 1.0,
         "pixels_at_last": 9,
-        "events_shortly": 4,
+        "events_lately": 4,
         "speed_m_s": 4.0,
     }
-    other = {**one, "side": "below", "in_view_at_last": False, "events_shortly": 0, "first_in_view_s": 0.0}
+    other = {**one, "side": "below", "in_view_at_last": False, "events_lately": 0, "first_seen_s": None}
     shown = failures.table([one, one, other])
     assert "| what was hit | block 3 |" in shown and "| on which side | ahead 2, below 1 |" in shown
     assert "| out of view when the last move was chosen | 1 |" in shown
-    assert "| without any event in the last 1 s | 1 |" in shown
+    assert (
+        "| without any event in these windows | 1 |" in shown
+        and "| never in view in the last 40 decisions | 1 |" in shown
+    )
+    assert "median (quartiles) | 2 (2 to 2) |" in shown  # of those that were seen
 
 
 def test_a_run_that_is_none_is_a_sentence(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -37,9 +37,12 @@ def test_a_row_is_measured_once_and_then_read(tmp_path: Path, monkeypatch, capsy
     assert [turn["seed"] for turn in row["turns"]] == [0, 1] and len(row["turns"][1]["flights"]["outcome"]) == 3
     assert load_policy(tmp_path / "policies" / file.stem / "seed-1").config.train.seed == 1
     assert "| sparse | blind | 2 x 3 | 0.00% |" in shown
-    assert len(json.loads((tmp_path / "shortest_sparse_3.json").read_text())["lengths"]) == 3
+    assert len(json.loads((tmp_path / "shortest_sparse_3_0.36.json").read_text())["lengths"]) == 3
     monkeypatch.setattr(success, "measure", None)  # it would not be called
     assert call(tmp_path) == 0 and capsys.readouterr().out == shown
+    # A row of other code is another row.
+    monkeypatch.setattr(success, "_commit", lambda: "0123456")
+    assert call(tmp_path, "--minutes", "0.01", "--no-spl") == 3
 
 
 def test_other_options_make_another_row() -> None:

@@ -40,13 +40,16 @@ def trainer(monkeypatch):
         calls.append(call)
         return behaviour.act(*call)
 
-    stand_in.__dict__["train_run"] = train_run
+    seeds = types.ModuleType("edqn_jax.training.seeds")
+    stand_in.__dict__["train_run"] = seeds.__dict__["train_seeds_run"] = train_run
     monkeypatch.setitem(sys.modules, "edqn_jax.training.run", stand_in)
+    monkeypatch.setitem(sys.modules, "edqn_jax.training.seeds", seeds)
+    monkeypatch.setattr(arguments, "hardware", lambda: "cpu")
     monkeypatch.setattr(devices, "use_cpu_devices", lambda count=None: None)
     return behaviour
 
 
-def test_no_argument_is_the_default_preset():
+def test_no_argument_is_the_default_preset(trainer):
     assert parse_train([])[1] == Config()
 
 
@@ -121,6 +124,7 @@ def test_every_kind_of_option_can_be_a_flag():
         (["train", "--agent.replay-size", "64"], "agent.replay_size must be at least agent.batch_size"),
         (["train", "--agent.bach-size", "64"], "--agent.batch-size"),
         (["train", "--train.num-envs", "many"], "--train.num-envs"),
+        (["train", "--seeds", "0"], "--seeds must be at least 1, not 0"),
         (["train", "--preset", "best"], "invalid choice 'best'"),
         (["train", "--events.law", "esmi"], "invalid choice 'esmi'"),
         (["train", "--config", "nowhere.yaml"], "nowhere.yaml"),
@@ -159,6 +163,40 @@ def test_training_gets_the_configuration_and_a_folder_that_is_not_made_yet(train
     config, run = trainer.calls[0][:2]
     assert config.train.seed == 3
     assert run.path == Path("here") and not run.path.exists()
+
+
+def test_several_seeds_are_trained_together(trainer):
+    assert main(["train", "--seeds", "4", "--seed", "3", "--run-dir", "here"]) == 0
+    config, seeds, run = trainer.calls[0][:3]
+    assert (config.train.seed, seeds, run.path) == (3, 4, Path("here"))
+
+
+@pytest.mark.parametrize(
+    ("argv", "envs"),
+    [
+        (["--world", "medium"], 16_384),
+        (["--world", "medium", "--tuned-for", "cpu"], 256),
+        (["--world", "medium", "--num-envs", "64"], 64),
+        (["--world", "paper"], 256),
+        (["--world", "medium", "--preset", "paper"], 16),
+    ],
+)
+def test_random_worlds_are_tuned_for_a_gpu_where_there_is_one(argv, envs, monkeypatch):
+    monkeypatch.setattr(arguments, "hardware", lambda: "gpu")
+    assert parse_train(argv)[1].train.num_envs == envs
+
+
+def test_what_was_chosen_for_a_gpu_is_printed(trainer, monkeypatch, capsys):
+    monkeypatch.setattr("jax.default_backend", lambda: "gpu")
+    assert main(["train", "--tuned-for", "gpu", "--world", "medium", "--run-dir", "here"]) == 0
+    assert "Tuned for a GPU: 16,384 environments, 8 updates of 4,096 a step" in capsys.readouterr().out
+    assert main(["train", "--tuned-for", "gpu", "--run-dir", "there"]) == 0
+    assert "Tuned" not in capsys.readouterr().out  # nothing is chosen for the paper's world
+
+
+def test_a_gpu_that_jax_cannot_use_is_one_sentence(trainer, capsys):
+    assert main(["train", "--tuned-for", "gpu", "--world", "medium", "--run-dir", "here"]) == 2
+    assert "JAX can use none here" in capsys.readouterr().err and not trainer.calls
 
 
 @pytest.mark.parametrize(

@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import dataclasses
+
+import jax
 import mujoco
 import numpy as np
 import pytest
 
 from edqn_jax.config import Config
+from edqn_jax.config.loading import make_config
 from edqn_jax.errors import ConfigError
-from edqn_jax.evaluation.missions import load_missions
+from edqn_jax.evaluation.missions import load_missions, missions_of_runs, run_missions
 from edqn_jax.sim import worlds
 from edqn_jax.sim.mjcf import load_scene, resolve_world
 
@@ -107,6 +111,8 @@ def test_a_world_without_a_volume_is_flown_in_the_box_that_holds_start_and_goal(
     np.testing.assert_allclose(lower, [-35.0, own.scene().volume[0, 1], 0.0])
     np.testing.assert_allclose(upper, own.scene().volume[1])
     assert course.note is not None and "names no flight volume: it is flown in x, y, z = -35 to 45" in course.note
+    with pytest.raises(ConfigError, match="the goal .* is too far from the shapes of '.*open.xml'"):
+        load_missions(CONFIG, str(file), goal=(1e6, 0.0, 2.0))
     # A volume that the file names is kept to.
     bounded = file.read_text().replace(
         "</worldbody>", '<site name="volume" type="box" pos="20 0 5" size="25 9 5"/></worldbody>'
@@ -114,3 +120,16 @@ def test_a_world_without_a_volume_is_flown_in_the_box_that_holds_start_and_goal(
     file.write_text(bounded)
     with pytest.raises(ConfigError, match="outside the flight volume"):
         load_missions(CONFIG, str(file), start=(-30, 0, 2))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["sparse", "paper"])
+def test_runs_of_several_seeds_have_the_missions_of_each_alone(name):
+    config = make_config(name, world={"pool_size": 4, "missions": 8}, train={"validation_missions": 3})
+    configs = [dataclasses.replace(config, train=dataclasses.replace(config.train, seed=seed)) for seed in (0, 5)]
+    together = missions_of_runs(configs)
+    for own, alone in zip(together, map(run_missions, configs), strict=True):
+        for kind in ("training", "validation", "final"):
+            jax.tree.map(np.testing.assert_array_equal, getattr(own, kind).world, getattr(alone, kind).world)
+    first, second = (each.training.world.missions.start for each in together)
+    assert not np.array_equal(first, second)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -10,26 +11,38 @@ from edqn_jax.parallel import hardware as module
 from edqn_jax.parallel.hardware import hardware
 
 
+def installed(monkeypatch: pytest.MonkeyPatch, *names: str) -> None:
+    """Makes these the only modules that can be imported, as far as `hardware` looks."""
+    modules = [SimpleNamespace(name=name) for name in names]
+    monkeypatch.setattr(module.pkgutil, "iter_modules", lambda: modules)
+
+
 @pytest.fixture
 def with_card(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     (tmp_path / "nvidia0").touch()
-    monkeypatch.setattr(module, "_has_plugin", lambda: True)
+    installed(monkeypatch, "jax", "jax_cuda13_plugin")
     return tmp_path
 
 
-@pytest.mark.parametrize("card", ["nvidia0", "nvidia3", "kfd", "dxg"])
-def test_a_card_with_its_plugin_is_a_gpu(card: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+    ("card", "plugin", "found"),
+    [
+        ("nvidia0", "jax_cuda12_plugin", "gpu"),
+        ("nvidia3", "jax_cuda13_plugin", "gpu"),
+        ("dxg", "jax_cuda13_plugin", "gpu"),
+        ("kfd", "jax_rocm7_plugin", "gpu"),
+        ("kfd", "jax_cuda13_plugin", "cpu"),
+        ("nvidia0", "jax_rocm7_plugin", "cpu"),
+        ("nvidia0", "jax", "cpu"),
+        ("nvidiactl", "jax_cuda13_plugin", "cpu"),
+    ],
+)
+def test_a_card_with_its_plugin_is_a_gpu(
+    card: str, plugin: str, found: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     (tmp_path / card).touch()
-    monkeypatch.setattr(module, "_has_plugin", lambda: True)
-    assert hardware({}, tmp_path) == "gpu"
-    monkeypatch.setattr(module, "_has_plugin", lambda: False)
-    assert hardware({}, tmp_path) == "cpu"
-
-
-def test_a_plugin_without_a_card_is_no_gpu(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (tmp_path / "nvidiactl").touch()
-    monkeypatch.setattr(module, "_has_plugin", lambda: True)
-    assert hardware({}, tmp_path) == "cpu"
+    installed(monkeypatch, plugin)
+    assert hardware({}, tmp_path) == found
 
 
 @pytest.mark.parametrize(
@@ -37,6 +50,7 @@ def test_a_plugin_without_a_card_is_no_gpu(tmp_path: Path, monkeypatch: pytest.M
     [
         ({"JAX_PLATFORMS": "cpu"}, "cpu"),
         ({"JAX_PLATFORMS": "cuda,cpu"}, "gpu"),
+        ({"JAX_PLATFORMS": "cpu,cuda"}, "cpu"),
         ({"JAX_PLATFORMS": ""}, "gpu"),
         ({"CUDA_VISIBLE_DEVICES": ""}, "cpu"),
         ({"CUDA_VISIBLE_DEVICES": "-1"}, "cpu"),
@@ -45,11 +59,3 @@ def test_a_plugin_without_a_card_is_no_gpu(tmp_path: Path, monkeypatch: pytest.M
 )
 def test_the_environment_can_hide_it(environ: dict[str, str], found: str, with_card: Path) -> None:
     assert hardware(environ, with_card) == found
-
-
-def test_a_plugin_is_a_module_of_that_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert not module._has_plugin()  # the project does not depend on one
-    (tmp_path / "jax_cuda13_plugin").mkdir()
-    (tmp_path / "jax_cuda13_plugin" / "__init__.py").touch()
-    monkeypatch.syspath_prepend(tmp_path)
-    assert module._has_plugin()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from importlib.metadata import version
 from pathlib import Path
 
 import jax.numpy as jnp
@@ -12,7 +13,7 @@ import pytest
 from edqn_jax.config import Config
 from edqn_jax.config.loading import resolve
 from edqn_jax.errors import ConfigError
-from edqn_jax.runs.directory import TRAJECTORY_COLUMNS, RunDirectory, plan_run_directory
+from edqn_jax.runs.directory import TRAJECTORY_COLUMNS, RunDirectory, plan_run_directory, version_of
 
 
 @pytest.fixture
@@ -162,3 +163,21 @@ def test_a_summary_that_cannot_be_written_leaves_the_old_one(run):
     with pytest.raises(TypeError):
         run.write_summary({"success": object()})
     assert json.loads(run.summary_file.read_text()) == {"success": True}
+
+
+def test_one_seed_and_several_leave_nothing_of_each_other(tmp_path):
+    run, configs = RunDirectory(tmp_path / "run"), [Config(), Config()]
+    run.create(Config())
+    run.append_metrics({"decisions": 1})
+    run.create_for_seeds(configs)
+    assert sorted(file.name for file in run.path.iterdir()) == ["config.yaml", "seed-0"]
+    assert run.of_seed(0).figures.is_dir()
+    run.create(Config())
+    assert not list(run.path.glob("seed-*")) and run.checkpoints.is_dir()
+
+
+def test_a_configuration_says_which_version_wrote_it(run, tmp_path):
+    run.create(Config())
+    assert version_of(run.config_file) == version("edqn-jax")
+    run.config_file.write_bytes(b"\xff\xfe")
+    assert version_of(run.config_file) is None and version_of(tmp_path / "nothing") is None

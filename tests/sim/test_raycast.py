@@ -13,6 +13,7 @@ import pytest
 
 from edqn_jax.config import CameraConfig
 from edqn_jax.sim import camera, mjcf, raycast
+from edqn_jax.sim.depth import nearest_depth
 from edqn_jax.sim.scene import (
     Capsules,
     Planes,
@@ -140,6 +141,22 @@ def test_an_empty_scene_is_infinitely_deep_and_parked_shapes_are_never_met():
     rotations = np.stack([rotation_of(0.1, -0.6, 0.7853), np.eye(3)]).astype(np.float32)
     # The first looks straight at where absent shapes are parked.
     assert np.isinf(depths(config, nobody, np.full((2, 3), 20.0, np.float32), rotations)).all()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["box", "cylinder"])
+def test_exactly_vertical_rays_meet_what_stands_straight_below_and_above(kind):
+    if kind == "box":
+        shape = UprightBoxes(np.array([10.0, 20.0, 3.0]), np.array([2.0, 1.0, 3.0]), np.float32(0.0), ALBEDO)
+    else:
+        shape = UprightCylinders(np.array([10.0, 20.0, 3.0]), np.float32(2.0), np.float32(3.0), ALBEDO)
+    scene = scene_of(shape)
+    # Over its middle, near its rim, beside it, and under it.
+    origins = jnp.array([[10.0, 20.0, 15.0], [11.9, 20.0, 15.0], [12.1, 20.0, 15.0], [10.0, 20.0, -5.0]])
+    flat, ways = jnp.zeros((1, 2)), jnp.array([[-1.0, 1.0]])  # down and up
+    rays = raycast.Rays(flat, flat, ways, right=jnp.zeros(3), up=jnp.zeros(3), pitch=0.0, across=1, down=1)
+    found = jax.jit(jax.vmap(lambda origin: nearest_depth(CameraConfig(), scene, origin, rays)))(origins)[:, 0]
+    np.testing.assert_allclose(found, [[9.0, np.inf], [9.0, np.inf], [np.inf, np.inf], [np.inf, 5.0]], rtol=1e-6)
 
 
 def test_shade_is_brightest_towards_the_sun_and_ambient_behind():

@@ -1,0 +1,46 @@
+"""The policy that comes with the package: found by its name, small, described, and able to fly."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+
+import edqn_jax
+from edqn_jax.policies import PRETRAINED, policy_folder
+from edqn_jax.runs.directory import version_of
+
+FOLDER = policy_folder(Path(PRETRAINED))
+
+
+def test_it_is_small_has_no_pickle_and_says_who_wrote_it() -> None:
+    files = [file for file in FOLDER.rglob("*") if file.is_file()]
+    assert sum(file.stat().st_size for file in files) < 5e6
+    # A pickle of protocol 2 or later begins with 0x80 and its protocol.
+    assert not [file for file in files if file.read_bytes()[:2] in (b"\x80\x02", b"\x80\x03", b"\x80\x04", b"\x80\x05")]
+    assert version_of(FOLDER / "config.yaml") is not None
+
+
+def test_a_folder_of_that_name_goes_first(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert policy_folder(Path(PRETRAINED)) == FOLDER
+    (tmp_path / PRETRAINED).mkdir()
+    assert policy_folder(Path(PRETRAINED)) == Path(PRETRAINED)
+    assert policy_folder(Path("runs/other")) == Path("runs/other")
+
+
+def test_its_card_tells_of_its_training() -> None:
+    card, config = (FOLDER / "README.md").read_text(), edqn_jax.load_policy(PRETRAINED).config
+    assert f"{config.train.total_steps:,} decisions" in card and f"seed {config.train.seed}" in card
+    assert f"{config.world.pool_size:,} random worlds" in card and config.world.name == "mixed"
+    for density in ("sparse", "medium", "dense"):
+        assert re.search(rf"^\| {density} \| 1000 \| (9\d|100)\.\d% \| ", card, re.MULTILINE), density
+
+
+@pytest.mark.slow
+def test_it_flies_the_papers_world_which_it_was_not_trained_on() -> None:
+    policy = edqn_jax.load_policy(PRETRAINED)
+    figures = edqn_jax.evaluate(policy, "paper").figures
+    assert figures["success_rate"] == 1.0 and figures["decisions"] <= 188
+    assert figures["min_clearance_m"] >= 1.5 * policy.config.drone.body_radius_m
