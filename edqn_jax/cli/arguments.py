@@ -129,11 +129,11 @@ def parse_train(argv: Sequence[str]) -> tuple[TrainOptions, Config]:
     options, _ = tyro.cli(TrainOptions, args=early, prog=TRAIN, return_unknown_args=True, add_help=False)
     if options.seeds is not None and options.seeds < 1:
         raise ConfigError(f"--seeds must be at least 1, not {options.seeds}")
-    if options.tuned_for == "auto":
-        options = dataclasses.replace(options, tuned_for=hardware())
+    tuned_for = hardware() if options.tuned_for == "auto" else options.tuned_for
+    options = dataclasses.replace(options, tuned_for=tuned_for)
     base = resolve(options.preset, options.config)
     world = _parse_config(early, base).world.name
-    config = _parse_config(argv, resolve(options.preset, options.config, world, options.tuned_for))
+    config = _parse_config(argv, resolve(options.preset, options.config, world, tuned_for))
     validate(config)
     # A file must be found again from any folder.
     if config.world.name not in DENSITIES and Path(config.world.name).is_file():

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -60,7 +61,7 @@ def test_the_ground_is_below(course) -> None:
 def test_a_shape_alone_is_all_that_is_left(course) -> None:
     scene = course.scene()
     only = failures.alone(scene, "spheres", 0)
-    at, level = np.array([50.0, 30.0, 3.0]), np.eye(3)
+    at, level = jnp.array([50.0, 30.0, 3.0]), jnp.eye(3)
     image = np.asarray(camera.depth(CONFIG.camera, only, at, level))
     assert np.isfinite(image).any() and np.isinf(image).any()
     # The rays beside the middle, atan(1 / 8) off along both axes, meet the ball 1.741 m beside its centre.

@@ -108,7 +108,7 @@ def test_a_world_without_a_volume_is_flown_in_the_box_that_holds_start_and_goal(
     assert own.note is None
     course = load_missions(CONFIG, str(file), start=(-30, 0, 2), goal=(40, 3, 12))
     lower, upper = np.asarray(course.scene().volume)
-    np.testing.assert_allclose(lower, [-35.0, own.scene().volume[0, 1], 0.0])
+    np.testing.assert_allclose(lower, [-35.0, float(own.scene().volume[0, 1]), 0.0])
     np.testing.assert_allclose(upper, own.scene().volume[1])
     assert course.note is not None and "names no flight volume: it is flown in x, y, z = -35 to 45" in course.note
     with pytest.raises(ConfigError, match="the goal .* is too far from the shapes of '.*open.xml'"):

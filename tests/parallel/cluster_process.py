@@ -14,6 +14,7 @@ import dataclasses
 import json
 import sys
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -39,8 +40,9 @@ def waves(config: CameraConfig, scene: Scene, position: Array, rotation: Array) 
     return 0.5 + 0.4 * jnp.sin(across * position[0] + down * position[1] + rotation[0, 0])
 
 
-def only_a_policy(self: Trainer, seed: int) -> TrainState:
+def only_a_policy(self: Trainer, seed: int | Sequence[int]) -> TrainState:
     """Stands for the state before the first step: of all of it, parameters."""
+    assert isinstance(seed, int)
     params = fresh_policy(self.config, seed)
     learner = Learner(
         vae={},
@@ -70,7 +72,7 @@ if __name__ == "__main__":
     noted: dict[str, Any] = {}
     init, train_run = Trainer.init, run.train_run
 
-    def noting_init(self: Trainer, seed: int) -> TrainState:
+    def noting_init(self: Trainer, seed: int | Sequence[int]) -> TrainState:
         state = init(self, seed)
         parts = state.actors.reward.addressable_shards
         noted["shards"] = [list(range(8))[part.index[0]] for part in parts]

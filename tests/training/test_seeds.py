@@ -37,7 +37,8 @@ def test_each_seed_leaves_a_run_and_all_of_them_a_summary(runs: tuple[RunDirecto
         assert load_policy(own.path).config.train.seed == seed
         assert json.loads(own.summary_file.read_text())["seed"] == seed
         assert len(own.read_metrics()) == 4 and (own.figures / "learning.png").is_file()
-    assert not np.array_equal(*(run.of_seed(seed).read_episodes()["return"][:8] for seed in (0, 1)))
+    first, second = (run.of_seed(seed).read_episodes()["return"][:8] for seed in (0, 1))
+    assert not np.array_equal(first, second)
 
 
 @pytest.mark.slow
