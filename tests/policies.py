@@ -9,12 +9,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from edqn_jax.config import AgentConfig, CameraConfig, Config, EncoderConfig
+from edqn_jax.config import AgentConfig, CameraConfig, Config, DroneConfig, EncoderConfig
 from edqn_jax.learn.policy import PolicyParams, fresh_policy, observation_size
 from edqn_jax.sim.moves import ACTIONS
 
 CONFIG = dataclasses.replace(
     Config(),
+    drone=DroneConfig(physics="rigid_body"),  # compiles in less time
     camera=CameraConfig(width=8, height=6),
     encoder=EncoderConfig(patch_layers=(8, 4), joint_layers=(16,), decoder_hidden=(16,)),
     agent=AgentConfig(hidden=(16,), history=2),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from pathlib import Path
 
@@ -9,7 +10,12 @@ import numpy as np
 import pytest
 
 import success
+from edqn_jax.config import Config
+from edqn_jax.learn.policy import Policy, fresh_policy
 from edqn_jax.runs.policies import load_policy
+from edqn_jax.training.history import History
+from edqn_jax.training.loop import TrainingResult
+from edqn_jax.training.selection import Candidate
 
 SMALL = (
     *("--num-envs", "16", "--train.chunk-steps", "4", "--total-steps", "256", "--agent.batch-size", "16"),
@@ -24,9 +30,20 @@ def call(out: Path, *words: str) -> int:
     return success.main([*arguments, *words, "--", *SMALL])
 
 
+def untrained(seeds: int, config: Config) -> list[TrainingResult]:
+    """Stands for training, which has tests of its own."""
+    results = []
+    for seed in range(seeds):
+        own = dataclasses.replace(config, train=dataclasses.replace(config.train, seed=seed))
+        policy = Policy(own, fresh_policy(own, seed))
+        results.append(TrainingResult(policy, History(), Candidate(policy.params), None, 256, False, 1.5, 2.5))  # type: ignore[arg-type]
+    return results
+
+
 @pytest.mark.slow
 def test_a_row_is_measured_once_and_then_read(tmp_path: Path, monkeypatch, capsys) -> None:
     monkeypatch.setattr(success, "use_cpu_devices", lambda count: None)
+    monkeypatch.setattr(success, "train_seeds", untrained)
     # There is no time for a row: nothing is begun, and the exit code says so.
     assert call(tmp_path, "--minutes", "0.01", "--no-spl") == 3
     assert "1 rows are left" in capsys.readouterr().err and not list(tmp_path.glob("*.json"))

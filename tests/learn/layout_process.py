@@ -1,4 +1,4 @@
-"""The same training on 1, 2 and 8 simulated devices, and notes of what came of it.
+"""The same training on 1 and 8 simulated devices, and notes of what came of it.
 
     python -m tests.learn.layout_process FOLDER
 
@@ -24,7 +24,7 @@ from edqn_jax.parallel.devices import use_cpu_devices
 from edqn_jax.sim.env import World
 from tests.miniature import miniature_world
 
-DEVICES = (1, 2, 8)
+DEVICES = (1, 8)
 
 DECISIONS = 12
 """Decisions without learning."""

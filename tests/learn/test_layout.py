@@ -1,4 +1,4 @@
-"""One device, two and eight: the same flights to the last bit, and the same parameters after one update."""
+"""One device and eight: the same flights to the last bit, and the same parameters after one update."""
 
 from __future__ import annotations
 

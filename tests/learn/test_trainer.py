@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from edqn_jax.config import AgentConfig, CameraConfig, Config, EncoderConfig, TrainConfig
+from edqn_jax.config import AgentConfig, CameraConfig, Config, DroneConfig, EncoderConfig, TrainConfig
 from edqn_jax.config.loading import make_config
 from edqn_jax.errors import ConfigError
 from edqn_jax.learn import replay, trainer
@@ -24,6 +24,7 @@ from edqn_jax.sim.outcomes import Outcome
 from tests.miniature import miniature_world
 
 CONFIG = Config(
+    drone=DroneConfig(physics="rigid_body"),  # compiles in less time; the layout's tests fly with MJX
     camera=CameraConfig(width=8, height=6),
     encoder=EncoderConfig(
         code_size=4,

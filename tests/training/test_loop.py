@@ -19,8 +19,7 @@ from tests.training.test_run import CONFIG
 
 SMALL = dataclasses.replace(
     CONFIG,
-    # These physics, this sensor and this world are the quickest to compile.
-    drone=dataclasses.replace(CONFIG.drone, physics="rigid_body"),
+    # This sensor and this world are the quickest to compile.
     env=dataclasses.replace(CONFIG.env, sensor="blind"),
     world=dataclasses.replace(CONFIG.world, name=str(WORLD)),
     train=dataclasses.replace(CONFIG.train, total_steps=256, validation_every=0),

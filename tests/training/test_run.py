@@ -79,7 +79,6 @@ def test_a_run_with_another_sensor_leaves_the_same_and_is_evaluated(
     short = dataclasses.replace(CONFIG.train, total_steps=256)
     config = dataclasses.replace(
         CONFIG,
-        drone=dataclasses.replace(CONFIG.drone, physics="rigid_body"),  # compiles in less time
         env=dataclasses.replace(CONFIG.env, sensor=sensor),
         world=dataclasses.replace(CONFIG.world, name=str(MINIATURE_WORLD)),
         train=short,
