@@ -27,7 +27,7 @@ pytestmark = pytest.mark.slow
 @pytest.fixture(scope="module")
 def now() -> Moment:
     """A fresh state that is told it is past the beginning."""
-    config = steady(configured(MINIATURE), 8)
+    config = steady(configured((*MINIATURE, "--drone.physics", "mjx")), 8)
     world = run_missions(config).training.world
     state = jax.jit(lambda world, key: init(config, world, key))(world, jax.random.key(0))
     return Moment(config, world, dataclasses.replace(state, step=jnp.int32(Plan.of(config).learn_from)))
