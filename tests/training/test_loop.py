@@ -14,14 +14,12 @@ from edqn_jax.learn.policy import Policy, PolicyParams
 from edqn_jax.sim.outcomes import Outcome
 from edqn_jax.sim.reward import Transition
 from edqn_jax.training.loop import Chunk, TrainingResult, train
-from tests.miniature import WORLD
 from tests.training.test_run import CONFIG
 
 SMALL = dataclasses.replace(
     CONFIG,
-    # This sensor and this world are the quickest to compile.
+    # This sensor is the quickest to compile.
     env=dataclasses.replace(CONFIG.env, sensor="blind"),
-    world=dataclasses.replace(CONFIG.world, name=str(WORLD)),
     train=dataclasses.replace(CONFIG.train, total_steps=256, validation_every=0),
 )
 CHUNK = SMALL.train.num_envs * SMALL.train.chunk_steps

@@ -19,6 +19,7 @@ from edqn_jax.training.history import mean_metrics
 from edqn_jax.training.loop import train, train_seeds
 from edqn_jax.training.seeds import train_seeds_run
 from tests.training.test_loop import SMALL
+from tests.training.test_run import FIGURES
 
 
 @pytest.fixture(scope="module")
@@ -36,7 +37,8 @@ def test_each_seed_leaves_a_run_and_all_of_them_a_summary(runs: tuple[RunDirecto
         own = run.of_seed(seed)
         assert load_policy(own.path).config.train.seed == seed
         assert json.loads(own.summary_file.read_text())["seed"] == seed
-        assert len(own.read_metrics()) == 4 and (own.figures / "learning.png").is_file()
+        assert [row["phase"] for row in own.read_metrics()] == ["training"] * 4
+        assert {file.stem for file in own.figures.glob("*.png")} == FIGURES  # this sensor shows nothing
     first, second = (run.of_seed(seed).read_episodes()["return"][:8] for seed in (0, 1))
     assert not np.array_equal(first, second)
 
