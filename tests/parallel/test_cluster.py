@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 import json
 import signal
 import time
@@ -116,6 +117,20 @@ def test_a_process_alone_does_its_work_and_hears_itself() -> None:
     with pytest.raises(ConfigError, match="a world that is missing"):
         processes.together(fail)
     assert processes.on_any(True) and not processes.on_any(False)
+
+
+@pytest.mark.parametrize(("theirs", "alike"), [("train: {seed: 0}", True), ("train: {seed: 1}", False)])
+def test_processes_with_different_options_all_hear_of_it(theirs: str, alike: bool, monkeypatch) -> None:
+    ours = "train: {seed: 0}"
+    processes.check_alike(ours)  # alone there is nobody to differ from
+    digest = np.frombuffer(hashlib.sha256(theirs.encode()).digest(), np.uint8)
+    monkeypatch.setattr(jax.distributed, "is_initialized", lambda: True)
+    monkeypatch.setattr(processes.multihost_utils, "process_allgather", lambda own: np.stack([own, digest]))
+    if alike:
+        processes.check_alike(ours)
+    else:
+        with pytest.raises(ConfigError, match="the processes have different options"):
+            processes.check_alike(ours)
 
 
 @pytest.fixture
