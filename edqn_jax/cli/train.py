@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import dataclasses
+import hashlib
 import os
 import sys
 from collections.abc import Sequence
+from pathlib import Path
 
 from rich.console import Console
 
 from edqn_jax.cli.arguments import TrainOptions, parse_train
 from edqn_jax.cli.signals import listening_for_sigterm
-from edqn_jax.config import Config
+from edqn_jax.config import DENSITIES, Config
 from edqn_jax.config.loading import gpu_layers, to_yaml
 from edqn_jax.errors import ConfigError
 from edqn_jax.parallel.launch import how_to_join
@@ -38,7 +41,7 @@ def train_command(argv: Sequence[str]) -> None:
         print("edqn: waiting for the other processes, five minutes at most", file=sys.stderr)
         process = processes.join(arguments)
     processes.together(lambda: _check_gpu() if tuned_for_gpu(options, config) else None)
-    processes.check_alike(to_yaml(config))
+    processes.check_alike(processes.together(lambda: said_by_all(config)))
     writes = process == 0
     run = processes.together(lambda: plan_run_directory(options.run_dir, config, options.resume) if writes else None)
     progress = Progress(Console(quiet=not writes))
@@ -61,6 +64,23 @@ def train_command(argv: Sequence[str]) -> None:
 def tuned_for_gpu(options: TrainOptions, config: Config) -> bool:
     """Returns whether defaults were chosen for a GPU."""
     return options.preset == "default" and bool(gpu_layers(config.world.name, options.tuned_for))
+
+
+def said_by_all(config: Config) -> str:
+    """Returns what processes must have alike: all options, and what a world file holds but not where it is.
+
+    Raises:
+        ConfigError: if the file cannot be read.
+    """
+    file = Path(config.world.name)
+    if config.world.name in DENSITIES or not file.is_file():
+        return to_yaml(config)
+    try:
+        held = file.read_bytes()
+    except OSError as error:
+        raise ConfigError(f"cannot read the world '{file}': {error.strerror}") from None
+    world = dataclasses.replace(config.world, name=hashlib.sha256(held).hexdigest())
+    return to_yaml(dataclasses.replace(config, world=world))
 
 
 def _check_gpu() -> None:

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from jax import Array
 from jax.nn.initializers import constant, lecun_normal, zeros
 
+from edqn_jax.learn.layers import Dense
 from edqn_jax.sim.sensor import Form
 
 Params = Any
@@ -37,9 +38,9 @@ class CodeHead(nn.Module):
     @nn.compact
     def __call__(self, z: Array) -> tuple[Array, Array]:
         """Returns mean and log-variance, each `[..., size]`, of the last hidden layer `[..., Z]`."""
-        mean = nn.Dense(self.size, kernel_init=self.mean_init, name="mean")(z)
+        mean = Dense(self.size, kernel_init=self.mean_init, name="mean")(z)
         # Nearly noiseless codes at first; the KL term increases the variance.
-        log_variance = nn.Dense(self.size, kernel_init=zeros, bias_init=constant(-4.0), name="log_variance")(z)
+        log_variance = Dense(self.size, kernel_init=zeros, bias_init=constant(-4.0), name="log_variance")(z)
         return jnp.clip(mean, -MAX_MEAN, MAX_MEAN), jnp.clip(log_variance, -MAX_LOG_VARIANCE, MAX_LOG_VARIANCE)
 
 

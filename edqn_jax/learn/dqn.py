@@ -19,7 +19,7 @@ from edqn_jax.learn.replay import Batch
 
 
 def target(returns: Array, discount: Array, q_next: Array, q_select: Array) -> Array:
-    """Eq. 7 and 10: y = r + gamma max_a Q(s', a) (1 - done), or its n-step and double forms.
+    """Returns Eq. 7 and 10, y = r + gamma max_a Q(s', a) (1 - done), or its n-step and double forms.
 
     Args:
         returns: [] r, or the discounted sum of n rewards.
@@ -49,7 +49,7 @@ def munchausen_bonus(config: AgentConfig, q: Array, a: Array) -> Array:
 
 
 def td_loss(q: Array, a: Array, y: Array, huber_delta: float) -> Array:
-    """Eq. 9: half the squared TD error; beyond `huber_delta` > 0 it grows linearly.
+    """Returns Eq. 9, half the squared TD error; beyond `huber_delta` > 0 it grows linearly.
 
     Args:
         q: [A] online network at s. a: [] action taken. y: [] target, held constant.
@@ -62,7 +62,7 @@ def td_loss(q: Array, a: Array, y: Array, huber_delta: float) -> Array:
 
 
 def batch_loss(config: AgentConfig, params: Params, target_params: Params, actions: int, batch: Batch):
-    """Sum of Eq. 9 over a batch, and what goes with it.
+    """Returns the sum of Eq. 9 over a batch, and what goes with it.
 
     Returns:
         loss: [] summed over the samples; (count, mean_q): [] samples and sum of Q(s, a).
@@ -85,19 +85,19 @@ def batch_loss(config: AgentConfig, params: Params, target_params: Params, actio
 
 
 def polyak(new: Params, old: Params, rate: float) -> Params:
-    """Old + rate (new - old), leaf by leaf: the target network's soft update, tau of Table 1."""
+    """Returns old + rate (new - old), leaf by leaf: the target network's soft update, tau of Table 1."""
     return optax.incremental_update(new, old, rate)
 
 
 def epsilon_greedy(q: Array, epsilon: Array, key: Array) -> Array:
-    """The best action of `q` [..., A], or with probability `epsilon` [...] a random one: [...] int32."""
+    """Chooses the best action of `q` [..., A], or with probability `epsilon` [...] a random one: [...] int32."""
     coin, draw = jax.random.uniform(key, (2, *q.shape[:-1]))
     random = jnp.floor(draw * q.shape[-1])
     return jnp.where(coin < epsilon, random, jnp.argmax(q, axis=-1)).astype(jnp.int32)
 
 
 def exploration(config: AgentConfig, decisions: Array, total: int, episodes: Array) -> Array:
-    """Epsilon [...]: random at first, then falling linearly.
+    """Returns epsilon [...]: random at first, then falling linearly.
 
     Args:
         decisions: [] decisions of the DQN phase so far, in all environments.
@@ -115,6 +115,6 @@ def exploration(config: AgentConfig, decisions: Array, total: int, episodes: Arr
 
 
 def optimiser(config: AgentConfig, updates: int) -> optax.GradientTransformation:
-    """Adam with a clipped global norm and a step size that falls linearly over `updates`."""
+    """Returns Adam with a clipped global norm and a step size that falls linearly over `updates`."""
     rate = optax.linear_schedule(config.learning_rate, config.final_learning_rate, max(updates, 1))
     return optax.flatten(optax.chain(optax.clip_by_global_norm(config.max_gradient_norm), optax.adam(rate)))

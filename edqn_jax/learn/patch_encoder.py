@@ -15,6 +15,7 @@ from jax import Array
 
 from edqn_jax.config import EncoderConfig
 from edqn_jax.learn.code import CodeHead
+from edqn_jax.learn.layers import Dense, added
 from edqn_jax.sim.events import EventField
 
 
@@ -76,18 +77,18 @@ class PatchEncoder(nn.Module):
         first, *later = self.config.patch_layers
         # One product for each channel: joined to one array first, they take twice as long on a CPU.
         products = [
-            nn.Dense(first, use_bias=number == 0, name=f"channel_{number}")(patches(image, self.config.patch_pixels))
+            Dense(first, use_bias=number == 0, name=f"channel_{number}")(patches(image, self.config.patch_pixels))
             for number, image in enumerate(images)
         ]
         z = sum(products[1:], products[0])
         # A layer over patch, place and motion together; what all patches or all fields share is computed once.
         place = patch_places(self.height, self.width, self.config.patch_pixels)
-        z += nn.Dense(first, use_bias=False, name="place")(jnp.asarray(place))
-        z += nn.Dense(first, use_bias=False, name="motion")(motion)[..., None, :]
+        z = added(z, Dense(first, use_bias=False, name="place")(jnp.asarray(place)))
+        z += Dense(first, use_bias=False, name="motion")(motion)[..., None, :]
         z = nn.relu(z)
         for number, size in enumerate(later, start=1):
-            z = nn.relu(nn.Dense(size, name=f"patch_{number}")(z))
+            z = nn.relu(Dense(size, name=f"patch_{number}")(z))
         z = jnp.concatenate([z.reshape(*z.shape[:-2], -1), motion], axis=-1)
         for number, size in enumerate(self.config.joint_layers):
-            z = nn.relu(nn.Dense(size, name=f"joint_{number}")(z))
+            z = nn.relu(Dense(size, name=f"joint_{number}")(z))
         return CodeHead(self.config.code_size, name="code")(z)

@@ -33,12 +33,12 @@ class PolicyParams:
 
 
 def observation_size(config: Config) -> int:
-    """D: what is seen and the own state."""
+    """Returns D, the length of what is seen and the own state."""
     return embedding.size(config) + OWN_SIZE
 
 
 def fresh_policy(config: Config, seed: int = 0) -> PolicyParams:
-    """A policy that has learnt nothing."""
+    """Returns a policy that has learnt nothing."""
     encoder_key, q_key = jax.random.split(jax.random.key(seed))
     size = observation_size(config)
     return PolicyParams(
@@ -48,17 +48,17 @@ def fresh_policy(config: Config, seed: int = 0) -> PolicyParams:
 
 
 def empty_memory(config: Config) -> Memory:
-    """The memory at the beginning of an episode."""
+    """Returns the memory at the beginning of an episode."""
     return jnp.zeros((config.agent.history, observation_size(config)))
 
 
 def remember(memory: Memory, flat: Array) -> Memory:
-    """The memory [..., H, D] with a new observation [..., D] at its end."""
+    """Returns the memory [..., H, D] with a new observation [..., D] at its end."""
     return jnp.concatenate([memory[..., 1:, :], flat[..., None, :]], axis=-2)
 
 
 def flatten(config: Config, params: Params, observation: Observation) -> Array:
-    """[..., D] what is seen, by default as a code, and own state of observations [...]."""
+    """Returns [..., D]: what is seen, by default as a code, and own state of observations [...]."""
     seen = embedding.embed(config, params, observation)
     return observation.own if seen is None else jnp.concatenate([seen, observation.own], axis=-1)
 

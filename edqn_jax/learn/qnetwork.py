@@ -22,7 +22,7 @@ class QNetwork(nn.Module):
 
     @nn.compact
     def __call__(self, x: Array) -> Array:
-        """Values [..., actions] of stacked observations `x` [..., history * observation]."""
+        """Returns values [..., actions] of stacked observations `x` [..., history * observation]."""
         for width in self.config.hidden:
             x = nn.Dense(width)(x)
             if self.config.layer_norm:
@@ -37,12 +37,12 @@ class QNetwork(nn.Module):
 
 
 def init_q(config: AgentConfig, observation_size: int, actions: int, key: Array) -> Params:
-    """Fresh parameters."""
+    """Returns fresh parameters."""
     inputs = jnp.zeros(config.history * observation_size)
     return QNetwork(config, actions).init(key, inputs)["params"]
 
 
 def q_values(config: AgentConfig, params: Params, actions: int, history: Array) -> Array:
-    """Values [..., actions] of observation histories [..., history, observation], newest last."""
+    """Returns values [..., actions] of observation histories [..., history, observation], newest last."""
     flat = history.reshape(*history.shape[:-2], -1)
     return QNetwork(config, actions).apply({"params": params}, flat)  # type: ignore[return-value]

@@ -45,7 +45,7 @@ class Batch:
 
 
 def empty(config: AgentConfig, envs: int, total_envs: int, observation_size: int) -> Rows:
-    """A ring for one shard's `envs` environments of `total_envs`."""
+    """Returns a ring for one shard's `envs` environments of `total_envs`."""
     length = ring_length(config, total_envs)
     return Rows(
         observation=jnp.zeros((length, envs, observation_size)),
@@ -57,18 +57,18 @@ def empty(config: AgentConfig, envs: int, total_envs: int, observation_size: int
 
 
 def ring_length(config: AgentConfig, total_envs: int) -> int:
-    """Decisions that the ring holds: at least enough to sample one n-step transition."""
+    """Returns the decisions that the ring holds: at least enough to sample one n-step transition."""
     return max(config.replay_size // total_envs, config.n_step + config.history + 1)
 
 
 def write(ring: Rows, rows: Rows, time: Array) -> Rows:
-    """Store one decision; `time` [] int32 counts decisions since the replay began, from 0."""
+    """Stores one decision; `time` [] int32 counts decisions since the replay began, from 0."""
     at = time % ring.reward.shape[0]
     return jax.tree.map(lambda old, new: old.at[at].set(new.astype(old.dtype)), ring, rows)
 
 
 def stacked(rows: Array, is_reset: Array) -> Array:
-    """Observations [H, D] in time order with those of earlier episodes zeroed; `is_reset` [H]."""
+    """Returns observations [H, D] in time order with those of earlier episodes zeroed; `is_reset` [H]."""
     # An observation belongs to the newest one's episode if no reset comes after it.
     later = jnp.cumsum(is_reset[::-1].astype(jnp.int32))[::-1]
     after = jnp.concatenate([later[1:], jnp.zeros(1, jnp.int32)])
@@ -76,7 +76,7 @@ def stacked(rows: Array, is_reset: Array) -> Array:
 
 
 def sample(config: AgentConfig, ring: Rows, time: Array, batch: int, key: Array) -> Batch:
-    """B = `batch` transitions of one shard, uniform over the rows that can start one.
+    """Draws B = `batch` transitions of one shard, uniform over the rows that can start one.
 
     Args:
         ring: [L, E, ...].
@@ -93,7 +93,7 @@ def sample(config: AgentConfig, ring: Rows, time: Array, batch: int, key: Array)
 
 
 def _transition(config: AgentConfig, ring: Rows, start: Array, env: Array) -> Batch:
-    """The n-step transition that begins at row `start` (counted like `write`'s time) of one environment."""
+    """Returns the n-step transition that begins at row `start` (counted like `write`'s time) of one environment."""
     length = ring.reward.shape[0]
     n, h = config.n_step, config.history
     # Rows start-h+1 .. start+n; the last n are what the start's action led to.

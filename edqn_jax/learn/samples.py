@@ -87,16 +87,14 @@ def draw(config: EncoderConfig, ring: Samples, time: Array, count: int, key: Arr
         key: consumed.
     """
     rows, envs = ring.motion.shape[:2]
-    row_key, env_key, mirror_key = jax.random.split(key, 3)
+    row_key, env_key = jax.random.split(key)
     row = integers(row_key, (count,), jnp.minimum(time, rows - 1))
     env = integers(env_key, (count,), envs)
     drawn = jax.tree.map(lambda leaf: leaf[row, env], ring)
     if not config.mirror:
         return drawn
-    coin = jax.random.bernoulli(mirror_key, shape=(count,))
-    return jax.tree.map(
-        lambda kept, turned: jnp.where(coin.reshape(-1, *[1] * (kept.ndim - 1)), turned, kept), drawn, mirrored(drawn)
-    )
+    half = count // 2
+    return jax.tree.map(lambda turned, kept: jnp.concatenate([turned[:half], kept[half:]]), mirrored(drawn), drawn)
 
 
 def mirrored(samples: Samples) -> Samples:

@@ -119,7 +119,7 @@ class InitialKeys(NamedTuple):
 
 
 def init(config: Config, world: World, key: Array) -> TrainState:
-    """The state before the first step; a pure function of the key, so it can be `vmap`ped over seeds.
+    """Returns the state before the first step; a pure function of the key, so it can be `vmap`ped over seeds.
 
     Raises:
         ConfigError: if the environments or the batch do not divide into the shards.
@@ -197,12 +197,12 @@ def _q_optimiser(config: Config) -> optax.GradientTransformation:
 
 
 def _flat(x: Array) -> Array:
-    """[S, E, ...] -> [S * E, ...]"""
+    """Returns [S * E, ...] of [S, E, ...]."""
     return x.reshape(-1, *x.shape[2:])
 
 
 def _all_sum(x, axis: str | None):
-    """Sum over the devices that share the work, if there are any."""
+    """Returns the sum over the devices that share the work, if there are any."""
     return lax.psum(x, axis) if axis is not None else x
 
 
@@ -274,7 +274,7 @@ def train_step(
 def _act(
     config: Config, learner: Learner, actors: Actors, keys: ShardKeys, time: Array, warming: Array
 ) -> tuple[Array, Array, Array]:
-    """Moves [S, E]: held random manoeuvres in the warm-up, then epsilon-greedy (Algorithm 1, step 5).
+    """Chooses moves [S, E]: held random manoeuvres in the warm-up, then epsilon-greedy (Algorithm 1, step 5).
 
     Returns:
         action, the held manoeuvres, epsilon; each [S, E].
@@ -287,7 +287,7 @@ def _act(
 
 
 def _store(actors: Actors, action: Array, time: Array) -> replay.Rows:
-    """The replay with where every environment is and what it does there."""
+    """Returns the replay with where every environment is and what it does there."""
     rows = replay.Rows(
         observation=actors.memory[..., -1, :],
         reward=actors.reward,
@@ -304,19 +304,19 @@ def _fly(config: Config, world: World, actors: Actors, action: Array) -> tuple[E
 
 
 def _remember(config: Config, learner: Learner, actors: Actors, seen: env.Step, step: Array) -> Array:
-    """Memories [S * E, H, D] with the new observations, encoded once; a new episode or encoder begins empty."""
+    """Returns memories [S * E, H, D] with the new observations, encoded once; new episodes or encoders begin empty."""
     forget = seen.is_reset | Plan.of(config).replaces_encoder(step)
     memory = jnp.where(forget[:, None, None], 0.0, _flat(actors.memory))
     return policy.see(config, learner.encoder, memory, seen.observation)
 
 
 def _shaped(shape: tuple[int, ...], tree: Any) -> Any:
-    """[S * E, ...] -> [S, E, ...]"""
+    """Returns [S, E, ...] of [S * E, ...]."""
     return jax.tree.map(lambda x: x.reshape(*shape, *x.shape[1:]), tree)
 
 
 def _manoeuvre(hold: int, held: Array, key: Array) -> Array:
-    """Random moves [E] that are held for `hold` decisions on average."""
+    """Returns random moves [E] that are held for `hold` decisions on average."""
     coin, draw = jax.random.uniform(key, (2, *held.shape))
     return jnp.where(coin < 1.0 / hold, (draw * len(ACTIONS)).astype(held.dtype), held)
 
@@ -364,29 +364,29 @@ def learn_to_see(config: Config, axis: str | None, learner: Learner, rings: Samp
         return nothing, learner
     share = config.encoder.batch_size // config.train.shards
     kept = plan.samples_kept(config, step) + 1
+    part = keys.shape[0] / config.train.shards  # of all shards, on this device
 
-    def loss(params: Params, batch: Samples, keys: Array):
-        # Each shard draws its own noise, so that the layout on devices does not change it.
-        def one(batch: Samples, key: Array):
-            sensed = samples.read(batch)
-            return vae.vae_loss(config.encoder, params, sensed, batch.motion, batch.wanted, key)
-
-        total, parts = jax.vmap(one)(batch, keys)
-        return jnp.sum(total) / config.train.shards, parts
+    def loss(params: Params, batch: Samples, noise: Array):
+        sensed = samples.read(batch)
+        total, parts = vae.vae_loss(config.encoder, params, sensed, batch.motion, batch.wanted, noise)
+        return total * part, parts
 
     def update(learner: Learner, keys: Array):
         draw_keys, noise_keys = jax.vmap(jax.random.split)(keys).swapaxes(0, 1)
         batch = jax.vmap(lambda ring, key: samples.draw(config.encoder, ring, kept, share, key))(rings, draw_keys)
-        gradient, parts = jax.grad(loss, has_aux=True)(learner.vae, batch, noise_keys)
+        # Each shard draws its own noise, so that the layout on devices does not change it.
+        noise = jax.vmap(lambda key: jax.random.normal(key, (share, config.encoder.code_size)))(noise_keys)
+        batch, noise = jax.tree.map(_flat, (batch, noise))
+        gradient, parts = jax.grad(loss, has_aux=True)(learner.vae, batch, noise)
         gradient = _all_sum(gradient, axis)
         change, optimiser = _vae_optimiser(config).update(gradient, learner.vae_optimiser, learner.vae)
         learner = dataclasses.replace(learner, vae=optax.apply_updates(learner.vae, change), vae_optimiser=optimiser)
-        return learner, (jnp.sum(parts.reconstruction), jnp.sum(parts.kl))
+        return learner, (parts.reconstruction, parts.kl)
 
     def learn(learner: Learner, updates: int):
         many = jax.vmap(lambda k: jax.random.split(k, updates))(keys).swapaxes(0, 1)
         learner, sums = lax.scan(update, learner, many)
-        means = jax.tree.map(lambda x: _all_sum(jnp.mean(x), axis) / config.train.shards, sums)
+        means = jax.tree.map(lambda x: _all_sum(jnp.mean(x) * part, axis), sums)
         return means, learner
 
     def rest(learner: Learner):
@@ -398,7 +398,7 @@ def learn_to_see(config: Config, axis: str | None, learner: Learner, rings: Samp
 
 
 def learn_to_act(config: Config, axis: str | None, learner: Learner, ring, time: Array, keys: Array, step: Array):
-    """DQN updates from the replay (Algorithm 1, steps 7-9): `(loss, mean Q), learner`."""
+    """Updates the DQN from the replay (Algorithm 1, steps 7-9); returns `(loss, mean Q), learner`."""
     plan, agent = Plan.of(config), config.agent
     share = agent.batch_size // config.train.shards
 
@@ -440,7 +440,7 @@ def learn_to_act(config: Config, axis: str | None, learner: Learner, ring, time:
 
 
 def _each_network(change: Callable[[Any], Any], learner: Learner) -> Learner:
-    """`learner` with its three Q-networks changed."""
+    """Returns `learner` with its three Q-networks changed."""
     return dataclasses.replace(
         learner, q=change(learner.q), target=change(learner.target), average=change(learner.average)
     )
@@ -449,7 +449,7 @@ def _each_network(change: Callable[[Any], Any], learner: Learner) -> Learner:
 def run_steps(
     config: Config, world: World, state: TrainState, steps: Array, axis: str | None = None
 ) -> tuple[TrainState, tuple[Episodes, Losses]]:
-    """A chunk: the training steps numbered `steps` [K], scanned. Pure; `vmap` it over states for many seeds.
+    """Takes a chunk: the training steps numbered `steps` [K], scanned. Pure; `vmap` it over states for many seeds.
 
     Returns:
         state, (episodes [K, S, E], losses [K]).
@@ -458,7 +458,7 @@ def run_steps(
 
 
 def policy_of(state: TrainState) -> PolicyParams:
-    """What evaluation flies: the acting encoder and the averaged Q-network."""
+    """Returns what evaluation flies: the acting encoder and the averaged Q-network."""
     return PolicyParams(encoder=state.learner.encoder, q=state.learner.average)
 
 
@@ -496,7 +496,7 @@ class Trainer:
         self._chunk = None
 
     def init(self, seed: int | Sequence[int]) -> TrainState:
-        """The state before the first step, laid out over the devices; of several agents, one seed for each."""
+        """Returns the state before the first step, laid out over the devices; of several agents, one seed for each."""
         make = jax.jit(self._each(lambda world, key: init(self.config, world, key), 0))
         keys = [run_streams(number).learning for number in ([seed] if isinstance(seed, int) else seed)]
         # Made whole and then cut: made in parts it would be rounded otherwise. `device_put` reaches no other process.
@@ -519,7 +519,7 @@ class Trainer:
         return TrainState(actors=spread, learner=same, step=same)  # pyright: ignore[reportArgumentType]
 
     def compile(self) -> None:
-        """Trace and compile the chunk, once; needs no state, so that it can go on while one is made."""
+        """Traces and compiles the chunk, once; needs no state, so that it can go on while one is made."""
         key = jax.random.key(0)
         keys = key if self.agents is None else jax.random.split(key, self.agents)
         shapes = jax.eval_shape(self._each(partial(init, self.config), 0), self.world, keys)
@@ -548,7 +548,7 @@ class Trainer:
         return processes.replicate(numbers, self.mesh)
 
     def chunk(self, state: TrainState, first: int) -> tuple[TrainState, tuple[Episodes, Losses]]:
-        """The training steps `first .. first + chunk_steps - 1`; `state` is donated.
+        """Takes the training steps `first .. first + chunk_steps - 1`; `state` is donated.
 
         Returns:
             state, (episodes [T, S, E], losses [T]) of the chunk's T steps; of several agents with a leading [K]. The

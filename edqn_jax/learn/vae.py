@@ -18,6 +18,7 @@ from jax.nn.initializers import zeros
 
 from edqn_jax.config import CameraConfig, EncoderConfig
 from edqn_jax.learn.code import CHANNELS, Params, kl_divergence
+from edqn_jax.learn.layers import Dense
 from edqn_jax.learn.patch_encoder import PatchEncoder
 from edqn_jax.learn.pooled_encoder import PooledEncoder
 from edqn_jax.learn.waves import OUTPUT_SCALE, cosines, mirrored, wave_images
@@ -54,7 +55,7 @@ class Decoder(nn.Module):
     def __call__(self, code: Array) -> Array:
         z = code
         for layer, size in enumerate(self.config.decoder_hidden):
-            z = nn.relu(nn.Dense(size, kernel_init=mirrored(inputs=layer > 0, outputs=True))(z))
+            z = nn.relu(Dense(size, kernel_init=mirrored(inputs=layer > 0, outputs=True))(z))
         shape = (self.channels, *_drawn(self.config, self.height, self.width))
         kernel = self.param("kernel", wave_images(self.height, self.width), (z.shape[-1], *shape))
         bias = self.param("bias", zeros, shape)
@@ -228,7 +229,7 @@ def _waves_of(config: EncoderConfig, height: int, width: int, params: Params, co
 
 
 def vae_loss(
-    config: EncoderConfig, params: Params, sensed: EventField | Array, motion: Array, wanted: Target, key: Array
+    config: EncoderConfig, params: Params, sensed: EventField | Array, motion: Array, wanted: Target, noise: Array
 ) -> tuple[Array, Losses]:
     """Returns the VAE loss, squared reconstruction error + `kl_weight` x KL, averaged over the batch, and its terms.
 
@@ -238,10 +239,10 @@ def vae_loss(
         sensed: field `[..., F, H, W]` or picture `[..., H, W]`.
         motion: `[..., MOTION_SIZE]` own motion.
         wanted: what the decoder must draw, see `target` and `in_waves`.
-        key: draws the codes (reparametrised).
+        noise: `[..., code_size]` standard normal, which draws the codes (reparametrised).
     """
     mean, log_variance = encode(config, params, sensed, motion)
-    code = mean + jnp.exp(0.5 * log_variance) * jax.random.normal(key, mean.shape)
+    code = mean + jnp.exp(0.5 * log_variance) * noise
     height, width = (sensed.count if isinstance(sensed, EventField) else sensed).shape[-2:]
     drawn = _waves_of(config, height, width, params, code)
     error = jnp.sum(jnp.square(drawn - wanted.amplitudes), axis=(-3, -2, -1)) + wanted.beyond

@@ -91,7 +91,8 @@ def check_alike(text: str) -> None:
     digest = np.frombuffer(hashlib.sha256(text.encode()).digest(), np.uint8)
     if len({row.tobytes() for row in multihost_utils.process_allgather(digest)}) > 1:
         raise ConfigError(
-            "the processes have different options; give all of them the same ones, --tuned-for cpu or gpu included"
+            "the processes have different options or world files; give all of them the same ones, --tuned-for "
+            "cpu or gpu included"
         )
 
 

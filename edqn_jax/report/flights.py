@@ -151,16 +151,18 @@ def _draw_ground(axes: Axes, view: View, volume: np.ndarray) -> None:
     (x0, y0, _), (x1, y1, top) = volume
     floor = [view.project(_corners(volume))]
     axes.add_collection(PolyCollection(floor, facecolors=GROUND, edgecolors=MUTED, linewidths=0.6, zorder=0))
-    lines = [[[x, y0, 0], [x, y1, 0]] for x in _tens(x0, x1)] + [[[x0, y, 0], [x1, y, 0]] for y in _tens(y0, y1)]
+    lines = [[[x, y0, 0], [x, y1, 0]] for x in _ticks(x0, x1, 10)] + [
+        [[x0, y, 0], [x1, y, 0]] for y in _ticks(y0, y1, 10)
+    ]
     grid = LineCollection(list(view.project(np.array(lines, np.float64))), colors="white", linewidths=0.7, zorder=0.5)
     axes.add_collection(grid)
     step = 20 if max(x1 - x0, y1 - y0) > 60 else 10
     out = 0.022 * (x1 - x0)
     from_above = view.elevation >= 89
     y_edge, outwards = (x0, -1.4 * out) if from_above else (x1, 1.4 * out)
-    for x in np.arange(np.ceil(x0 / step) * step, x1 + 1e-6, step):
+    for x in _ticks(x0, x1, step):
         _label(axes, view, np.array([x, y0 - 1.4 * out, 0]), f"{x:g}")
-    for y in np.arange(np.ceil(y0 / step) * step, y1 + 1e-6, step):
+    for y in _ticks(y0, y1, step):
         _label(axes, view, np.array([y_edge + outwards, y, 0]), f"{y:g}")
     _label(axes, view, np.array([(x0 + x1) / 2, y0 - 4 * out, 0]), "x, m")
     _label(axes, view, np.array([y_edge + 2.9 * outwards, (y0 + y1) / 2, 0]), "y, m")
@@ -179,6 +181,11 @@ def _draw_ground(axes: Axes, view: View, volume: np.ndarray) -> None:
     axes.autoscale_view()
 
 
+def _ticks(low: float, high: float, step: float) -> np.ndarray:
+    """Returns the multiples of `step` from `low` to `high`; + 0.0 makes -0.0, which would be written so, a 0."""
+    return np.arange(np.ceil(low / step) * step, high + 1e-6, step) + 0.0
+
+
 def _label(axes: Axes, view: View, point: np.ndarray, text: str) -> None:
     x, y = view.project(point)
     axes.text(x, y, text, **TICK)
@@ -188,10 +195,6 @@ def _corners(volume: np.ndarray) -> np.ndarray:
     """Returns the floor's corners, [4, 3]."""
     (x0, y0, _), (x1, y1, _) = volume
     return np.array([[x0, y0, 0.0], [x1, y0, 0.0], [x1, y1, 0.0], [x0, y1, 0.0]])
-
-
-def _tens(low: float, high: float) -> np.ndarray:
-    return np.arange(np.ceil(low / 10) * 10, high + 1e-6, 10)
 
 
 def _draw_stem(axes: Axes, view: View, point: np.ndarray, colour: str) -> None:

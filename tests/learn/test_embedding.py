@@ -199,7 +199,8 @@ def test_the_code_of_pictures_is_learnt() -> None:
         pick_key, noise_key = jax.random.split(key)
         some = pictures[jax.random.randint(pick_key, (64,), 0, 1024)]
         wanted = vae.in_waves(config, vae.target(config, some))
-        gradient = jax.grad(lambda p: vae.vae_loss(config, p, some, still, wanted, noise_key)[0])(params)
+        noise = jax.random.normal(noise_key, (64, config.code_size))
+        gradient = jax.grad(lambda p: vae.vae_loss(config, p, some, still, wanted, noise)[0])(params)
         change, state = optimiser.update(gradient, state, params)
         return (optax.apply_updates(params, change), state), None
 

@@ -42,7 +42,8 @@ def encode(config, params, sensed):
 def loss_of(config, params, sensed, key):
     """The loss of fields whose own motion does not matter."""
     wanted = vae.in_waves(config, vae.target(config, sensed))
-    return vae.vae_loss(config, params, sensed, STILL, wanted, key)
+    noise = jax.random.normal(key, (*wanted.beyond.shape, config.code_size))
+    return vae.vae_loss(config, params, sensed, STILL, wanted, noise)
 
 
 def ragged_field(seed: int, frame_pairs: int = 3) -> ev.EventField:

@@ -170,7 +170,8 @@ def test_nearness_is_learnt_from_events_and_motion_and_not_from_events_alone() -
 
         def update(carry, key):
             params, state = carry
-            gradient = jax.grad(lambda p: vae.vae_loss(config, p, fields, motion, wanted, key)[0])(params)
+            noise = jax.random.normal(key, (*wanted.beyond.shape, config.code_size))
+            gradient = jax.grad(lambda p: vae.vae_loss(config, p, fields, motion, wanted, noise)[0])(params)
             change, state = optimiser.update(gradient, state)
             return (optax.apply_updates(params, change), state), None
 

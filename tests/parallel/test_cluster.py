@@ -14,6 +14,8 @@ import jax
 import numpy as np
 import pytest
 
+from edqn_jax.cli.arguments import parse_train
+from edqn_jax.cli.train import said_by_all
 from edqn_jax.config import Config
 from edqn_jax.config.loading import to_yaml
 from edqn_jax.errors import ConfigError
@@ -129,8 +131,20 @@ def test_processes_with_different_options_all_hear_of_it(theirs: str, alike: boo
     if alike:
         processes.check_alike(ours)
     else:
-        with pytest.raises(ConfigError, match="the processes have different options"):
+        with pytest.raises(ConfigError, match="the processes have different options or world files"):
             processes.check_alike(ours)
+
+
+def test_processes_may_keep_a_world_file_in_different_folders_but_not_another_world(tmp_path: Path) -> None:
+    def said(folder: str, text: str) -> str:
+        file = tmp_path / folder / "map.xml"
+        file.parent.mkdir()
+        file.write_text(text)
+        return said_by_all(parse_train(["--world", str(file), "--tuned-for", "cpu"])[1])
+
+    here = said("here", WORLD)
+    assert said("there", WORLD) == here
+    assert said("elsewhere", WORLD.replace('pos="10 15 5"', 'pos="11 15 5"')) != here
 
 
 @pytest.fixture
