@@ -5,11 +5,12 @@ not measured again: a command that was stopped goes on where it was. No row is b
 
     python benchmarks/success.py --out runs/success
     python benchmarks/success.py --out runs/success --worlds medium --sensors events depth -- --total-steps 9000000
+    python benchmarks/success.py --out runs/success --runs runs/seed-0 runs/seed-1 --worlds medium
     python benchmarks/success.py --out runs/success --report
 
-Arguments after -- are options of train.py; defaults are those of the hardware. The interval is a bootstrap over seeds
-and missions. A* for the SPL takes 0.4 s a world and core, once for each density, when there is time after the rows;
---no-spl leaves it out.
+With --runs nothing is trained: the policies of these runs, which differ in their seeds alone, fly. Arguments after --
+are options of train.py; defaults are those of the hardware. The interval is a bootstrap over seeds and missions. A* for
+the SPL takes 0.4 s a world and core, once for each density, when there is time after the rows; --no-spl leaves it out.
 """
 
 from __future__ import annotations
@@ -23,16 +24,17 @@ import shutil
 import subprocess
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
+import yaml
 
 from edqn_jax.cli.arguments import parse_train
 from edqn_jax.config import DENSITIES, Config
-from edqn_jax.config.loading import to_yaml
+from edqn_jax.config.loading import apply, to_yaml
 from edqn_jax.errors import ConfigError
 from edqn_jax.evaluation.intervals import interquartile_mean, rate_interval
 from edqn_jax.evaluation.metrics import known_lengths, spl
@@ -41,7 +43,7 @@ from edqn_jax.evaluation.rollouts import fly_on_all_devices
 from edqn_jax.learn.policy import Policy
 from edqn_jax.parallel.devices import cores, most_that_divide, use_cpu_devices
 from edqn_jax.runs.files import check_can_make
-from edqn_jax.runs.policies import save_policy
+from edqn_jax.runs.policies import load_policy, save_policy
 from edqn_jax.training.loop import train_seeds
 from measurement import json_report
 from measurement.flags import split
@@ -65,12 +67,15 @@ def parse(argv: Sequence[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--worlds", nargs="+", default=worlds, choices=DENSITIES, help="(default sparse medium dense)")
     parser.add_argument("--sensors", nargs="+", default=["events"], help="env.sensor of each row (default events)")
     parser.add_argument("--seeds", type=int, default=5, help="training seeds, in one program (default 5)")
+    parser.add_argument("--runs", nargs="+", type=Path, help="fly the policies of these runs instead of training")
     parser.add_argument("--missions", type=int, default=1000, help="test missions of each seed (default 1000)")
     parser.add_argument("--minutes", type=float, default=9.0, help="begin no row that would end later (default 9)")
     parser.add_argument("--no-spl", action="store_true", help="do not search shortest paths")
-    parser.add_argument("--report", action="store_true", help="only print the rows that there are")
+    parser.add_argument("--report", action="store_true", help="measure no row, only print those that there are")
     args = parser.parse_args(words)
     args.flags = flags
+    if args.runs and flags:
+        parser.error("options of train.py do not change the policies of --runs; leave them out")
     for name in ("seeds", "missions"):
         if getattr(args, name) < 1:
             parser.error(f"--{name} must be at least 1, not {getattr(args, name)}")
@@ -89,11 +94,40 @@ def config_of(world: str, sensor: str, flags: Sequence[str]) -> Config:
     return dataclasses.replace(config, train=train)
 
 
-def row_file(out: Path, config: Config, seeds: int, missions: int) -> Path:
-    """Returns the file of a row; rows with other options, seeds or missions, or of another commit, have other names."""
-    measured = f"{seeds} {missions} {_commit()}\n{to_yaml(config)}"
-    digest = hashlib.sha256(measured.encode()).hexdigest()[:10]
+def config_of_runs(world: str, policies: Sequence[Policy]) -> Config:
+    """Returns the configuration of a row that flies policies of one training.
+
+    Raises:
+        ConfigError: if their options differ in more than the seed.
+    """
+    first = policies[0].config
+    for other in policies[1:]:
+        seed = dataclasses.replace(other.config.train, seed=first.train.seed)
+        if dataclasses.replace(other.config, train=seed) != first:
+            raise ConfigError("the runs of a row must have the same options but train.seed; these differ in others")
+    return dataclasses.replace(first, world=dataclasses.replace(first.world, name=world))
+
+
+def row_file(out: Path, config: Config, missions: int, measured: str) -> Path:
+    """Returns the file of a row; rows with other options or missions, or of another commit, have other names.
+
+    Args:
+        out: folder of rows.
+        config: of the first seed.
+        missions: of each seed.
+        measured: what else tells rows apart.
+    """
+    text = f"{measured} {missions} {_commit()}\n{to_yaml(config)}"
+    digest = hashlib.sha256(text.encode()).hexdigest()[:10]
     return out / f"{config.world.name}-{config.env.sensor}-{digest}.json"
+
+
+def digest_of(policies: Sequence[Policy]) -> str:
+    """Returns a digest of the parameters of policies."""
+    digest = hashlib.sha256()
+    for leaf in jax.tree.leaves([policy.params for policy in policies]):
+        digest.update(np.asarray(leaf).tobytes())
+    return digest.hexdigest()
 
 
 @functools.cache
@@ -122,26 +156,54 @@ def read_rows(out: Path) -> list[Row]:
     return rows
 
 
-def measure(config: Config, seeds: int, missions: int, policies: Path) -> Row:
-    """Trains the seeds of a row, saves their policies, flies the test missions, and returns the row."""
+def train_row(config: Config, seeds: int, missions: int, folder: Path) -> Row:
+    """Trains the seeds of a row, saves their policies in `folder`, flies the test missions, and returns the row."""
     began = time.perf_counter()
-    shutil.rmtree(policies, ignore_errors=True)  # of a row that was cut short
+    shutil.rmtree(folder, ignore_errors=True)  # of a row that was cut short
     results = train_seeds(seeds, config)
+    policies = [Policy(result.policy.config, result.policy.params) for result in results]
+    for policy in policies:
+        save_policy(policy, folder / f"seed-{policy.config.train.seed}")
+    first = results[0]
+    took = {"train_seconds": first.train_seconds, "compile_seconds": first.compile_seconds}
+    return _row(config, policies, missions, first.decisions, took, began)
+
+
+def fly_row(config: Config, policies: Sequence[Policy], runs: Sequence[Path], missions: int) -> Row:
+    """Flies policies of runs through the test missions, and returns the row; what their training took is added up.
+
+    Raises:
+        ConfigError: if a run has no summary.
+    """
+    began = time.perf_counter()
+    summaries = [_summary(run) for run in runs]
+    took = {key: sum(summary[key] for summary in summaries) for key in ("train_seconds", "compile_seconds")}
+    return _row(config, policies, missions, summaries[0]["train_decisions"], took, began)
+
+
+def _summary(run: Path) -> dict[str, Any]:
+    file = run / "summary.json"
+    if not file.is_file():
+        raise ConfigError(f"'{run}' holds no summary.json, so it is no finished run of train.py")
+    return json.loads(file.read_text(encoding="utf-8"))
+
+
+def _row(
+    config: Config, policies: Sequence[Policy], missions: int, decisions: int, took: dict[str, float], began: float
+) -> Row:
+    """Flies the test missions and returns the row."""
     course = load_missions(config, config.world.name, missions)
     turns = []
-    for result in results:
-        seed = result.policy.config.train.seed
-        save_policy(Policy(result.policy.config, result.policy.params), policies / f"seed-{seed}")
-        flights = fly_on_all_devices(config, course.world, result.policy.params)
-        turns.append({"seed": seed, "flights": flight_columns(flights, missions)})
+    for policy in policies:
+        flights = fly_on_all_devices(config, course.world, policy.params)
+        turns.append({"seed": policy.config.train.seed, "flights": flight_columns(flights, missions)})
     return {
         "benchmark": "success",
         "world": config.world.name,
         "sensor": config.env.sensor,
         "missions": missions,
-        "decisions": results[0].decisions,
-        "train_seconds": results[0].train_seconds,
-        "compile_seconds": results[0].compile_seconds,
+        "decisions": decisions,
+        **took,
         "row_seconds": time.perf_counter() - began,
         "commit": _commit(),
         "options": to_yaml(config),
@@ -194,7 +256,7 @@ def table(rows: Sequence[Row], shortest: dict[str, np.ndarray | None]) -> str:
         "| --- | --- | ---: | ---: | ---: | ---: | --- | ---: | ---: | ---: |",
     ]
     for row in rows:
-        found = figures(row, shortest.get(f"{row['world']} {row['missions']}"))
+        found = figures(row, shortest.get(_course(row)))
         low, high = found["interval"]
         each = ", ".join(f"{100 * rate:.1f}" for rate in found["rates"])
         weight = "–" if found["spl"] is None else f"{found['spl']:.3f}"
@@ -206,39 +268,79 @@ def table(rows: Sequence[Row], shortest: dict[str, np.ndarray | None]) -> str:
     return "\n".join(lines)
 
 
+@dataclasses.dataclass(frozen=True)
+class Wanted:
+    """A row that was asked for."""
+
+    file: Path
+    measure: Callable[[], Row]
+
+
+def _wanted(args: argparse.Namespace) -> list[Wanted]:
+    """Returns the rows that the arguments ask for, and makes JAX present as many devices as they use.
+
+    Raises:
+        ConfigError: if an option is invalid, or a run cannot be flown.
+    """
+    if args.runs:
+        use_cpu_devices(cores())
+        policies = [load_policy(run) for run in args.runs]
+        configs = [config_of_runs(world, policies) for world in args.worlds]
+        files = [row_file(args.out, config, args.missions, digest_of(policies)) for config in configs]
+        return [
+            Wanted(file, functools.partial(fly_row, config, policies, args.runs, args.missions))
+            for file, config in zip(files, configs, strict=True)
+        ]
+    configs = [config_of(world, sensor, args.flags) for world in args.worlds for sensor in args.sensors]
+    use_cpu_devices(most_that_divide(configs[0].train.shards, cores()))
+    files = [row_file(args.out, config, args.missions, str(args.seeds)) for config in configs]
+    return [
+        Wanted(file, functools.partial(train_row, config, args.seeds, args.missions, args.out / "policies" / file.stem))
+        for file, config in zip(files, configs, strict=True)
+    ]
+
+
+def _config_in(row: Row) -> Config:
+    """Returns the configuration that a row was measured with."""
+    return apply(Config(), yaml.safe_load(row["options"]), "a row")
+
+
+def _course(row: Row) -> str:
+    """Returns what tells the test worlds of a row from others."""
+    return f"{row['world']} {row['missions']}"
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Returns exit code 0 when every row is there, 3 when rows are left for another call, 2 for invalid input."""
     began = time.perf_counter()
     args = parse(argv)
     try:
         check_can_make(args.out)
-        wanted = [config_of(world, sensor, args.flags) for world in args.worlds for sensor in args.sensors]
         rows = read_rows(args.out)
+        wanted = [] if args.report else _wanted(args)
     except ConfigError as error:
         print(error, file=sys.stderr)
         return 2
-    use_cpu_devices(most_that_divide(wanted[0].train.shards, cores()))
-    files = [row_file(args.out, config, args.seeds, args.missions) for config in wanted]
-    left = [] if args.report else [at for at, file in enumerate(files) if not file.is_file()]
+    left = [one for one in wanted if not one.file.is_file()]
     longest = FIRST_ROW_S
     while left and (time.perf_counter() - began + longest < 60 * args.minutes):
-        config, file = wanted[left[0]], files[left[0]]
         try:
-            row = measure(config, args.seeds, args.missions, args.out / "policies" / file.stem)
-            json_report.write(file, row)
+            row = left[0].measure()
+            args.out.mkdir(parents=True, exist_ok=True)
+            json_report.write(left[0].file, row)
         except ConfigError as error:
             print(error, file=sys.stderr)
             return 2
         rows.append(row)
-        longest = max(row["row_seconds"] for row in rows[-len(files) :])
+        longest = max(row["row_seconds"] for row in rows[-len(wanted) :])
+        print(f"{left[0].file.name}: {figures(row, None)['success']:.2%}, {row['row_seconds']:.0f} s", file=sys.stderr)
         left.pop(0)
-        print(f"{file.name}: {figures(row, None)['success']:.2%}, {row['row_seconds']:.0f} s", file=sys.stderr)
     shortest: dict[str, np.ndarray | None] = {}
-    for config in [] if args.no_spl else wanted:
+    for row in [] if args.no_spl else rows:
         # Two cores search 1 000 worlds in 200 s.
-        in_time = time.perf_counter() - began + 0.4 * args.missions / cores() < 60 * args.minutes
-        shortest[f"{config.world.name} {args.missions}"] = shortest_paths(
-            args.out, config, args.missions, search=in_time and not args.report
+        in_time = time.perf_counter() - began + 0.4 * row["missions"] / cores() < 60 * args.minutes
+        shortest[_course(row)] = shortest_paths(
+            args.out, config_of(row["world"], "blind", []), row["missions"], in_time
         )
     print(table(rows, shortest))
     if left:

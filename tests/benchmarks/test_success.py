@@ -12,7 +12,7 @@ import pytest
 import success
 from edqn_jax.config import Config
 from edqn_jax.learn.policy import Policy, fresh_policy
-from edqn_jax.runs.policies import load_policy
+from edqn_jax.runs.policies import load_policy, save_policy
 from edqn_jax.training.history import History
 from edqn_jax.training.loop import TrainingResult
 from edqn_jax.training.selection import Candidate
@@ -55,7 +55,7 @@ def test_a_row_is_measured_once_and_then_read(tmp_path: Path, monkeypatch, capsy
     assert load_policy(tmp_path / "policies" / file.stem / "seed-1").config.train.seed == 1
     assert "| sparse | blind | 2 x 3 | 0.00% |" in shown
     assert len(json.loads((tmp_path / "shortest_sparse_3_0.36.json").read_text())["lengths"]) == 3
-    monkeypatch.setattr(success, "measure", None)  # it would not be called
+    monkeypatch.setattr(success, "train_row", lambda *_: pytest.fail("measured again"))
     assert call(tmp_path) == 0 and capsys.readouterr().out == shown
     # A row of other code is another row.
     monkeypatch.setattr(success, "_commit", lambda: "0123456")
@@ -65,15 +65,45 @@ def test_a_row_is_measured_once_and_then_read(tmp_path: Path, monkeypatch, capsy
 def test_other_options_make_another_row() -> None:
     config = success.config_of("sparse", "blind", SMALL)
     assert config.train.keep == "last" and config.train.validation_every == 0
+    other = success.config_of("sparse", "blind", [*SMALL, "--agent.n-step", "2"])
     names = {
-        success.row_file(Path("x"), config, 5, 1000).name,
-        success.row_file(Path("x"), config, 4, 1000).name,
-        success.row_file(Path("x"), success.config_of("sparse", "depth", SMALL), 5, 1000).name,
-        success.row_file(
-            Path("x"), success.config_of("sparse", "blind", [*SMALL, "--agent.n-step", "2"]), 5, 1000
-        ).name,
+        success.row_file(Path("x"), config, 1000, "5").name,
+        success.row_file(Path("x"), config, 1000, "4").name,
+        success.row_file(Path("x"), config, 100, "5").name,
+        success.row_file(Path("x"), success.config_of("sparse", "depth", SMALL), 1000, "5").name,
+        success.row_file(Path("x"), other, 1000, "5").name,
     }
-    assert len(names) == 4
+    assert len(names) == 5
+
+
+@pytest.mark.slow
+def test_runs_that_there_are_make_a_row_of_their_own(tmp_path: Path, monkeypatch, capsys) -> None:
+    monkeypatch.setattr(success, "use_cpu_devices", lambda count: None)
+    trained = success.config_of("sparse", "blind", SMALL)
+    runs = [tmp_path / f"seed-{seed}" for seed in (0, 1)]
+    for seed, run in enumerate(runs):
+        own = dataclasses.replace(trained, train=dataclasses.replace(trained.train, seed=seed))
+        save_policy(Policy(own, fresh_policy(own, seed)), run)
+    words = ["--out", str(tmp_path / "rows"), "--missions", "3", "--no-spl", "--worlds", "medium", "--runs"]
+    assert success.main([*words, str(runs[0])]) == 2
+    assert f"'{runs[0]}' holds no summary.json" in capsys.readouterr().err
+    for run in runs:
+        took = {"train_seconds": 2.0, "compile_seconds": 1.0, "train_decisions": 256}
+        (run / "summary.json").write_text(json.dumps(took))
+    code = success.main([*words, *map(str, runs)])
+    assert code == 0, capsys.readouterr().err
+    assert "| medium | blind | 2 x 3 | 0.00% |" in capsys.readouterr().out
+    (file,) = (tmp_path / "rows").glob("medium-blind-*.json")
+    row = json.loads(file.read_text())
+    assert [turn["seed"] for turn in row["turns"]] == [0, 1] and row["train_seconds"] == 4.0
+    # Other policies are another row, and policies of another training are none at all.
+    assert success.main([*words, str(runs[1])]) == 0
+    assert len(list((tmp_path / "rows").glob("medium-*.json"))) == 2
+    other = dataclasses.replace(trained, agent=dataclasses.replace(trained.agent, n_step=2))
+    save_policy(Policy(other, fresh_policy(other, 0)), tmp_path / "other")
+    capsys.readouterr()
+    assert success.main([*words, str(runs[0]), str(tmp_path / "other")]) == 2
+    assert "must have the same options but train.seed" in capsys.readouterr().err
 
 
 def test_figures_are_of_all_seeds_and_missions() -> None:
