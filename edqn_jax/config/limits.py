@@ -93,7 +93,10 @@ def _encoder(encoder: EncoderConfig) -> None:
     _positive(encoder, "encoder", ["code_size", "features", "hidden", "learning_rate", "hold_decisions"])
     _not_negative(encoder, "encoder", ["time_frequencies", "target_blur", "kl_weight", "warmup_decisions"])
     _positive(encoder, "encoder", ["warmup_updates_per_step", "patch_pixels", "batch_size", "replay_size"])
-    _positive(encoder, "encoder", ["retrain_decisions"])
+    _positive(encoder, "encoder", ["retrain_decisions", "sequence_decisions"])
+    remembers = encoder.sequence_decisions == 1 or encoder.architecture == "patches"
+    needed = "1 unless encoder.architecture is patches"
+    _require(remembers, "encoder.sequence_decisions", needed, encoder.sequence_decisions)
     times = encoder.retrain_at
     rising = all(earlier < later for earlier, later in zip(times, times[1:], strict=False))
     inside = rising and all(0 < time < 1 for time in times)
@@ -154,9 +157,12 @@ def _replay(agent: AgentConfig, train: TrainConfig) -> None:
 
 
 def _samples(encoder: EncoderConfig, train: TrainConfig) -> None:
-    batch, shards = encoder.batch_size, train.shards
-    multiple = f"a multiple of train.shards ({shards}), such as {-(-batch // shards) * shards}"
-    _require(batch % shards == 0, "encoder.batch_size", multiple, batch)
+    batch, unit, named = encoder.batch_size, train.shards, f"train.shards ({train.shards})"
+    if encoder.sequence_decisions > 1:
+        unit *= encoder.sequence_decisions
+        named += f" x encoder.sequence_decisions ({encoder.sequence_decisions})"
+    multiple = f"a multiple of {named}, such as {-(-batch // unit) * unit}"
+    _require(batch % unit == 0, "encoder.batch_size", multiple, batch)
 
 
 def _require(holds: bool, name: str, limits: str, value: object) -> None:

@@ -203,11 +203,15 @@ class EncoderConfig:
     warmup_updates_per_step: int = 6
     """VAE updates per training step of the warm-up."""
     batch_size: int = 256
-    """Observations in a VAE update, drawn from the newest `replay_size`; a multiple of `train.shards`."""
+    """Observations in a VAE update, drawn from the newest `replay_size`; a multiple of `train.shards` x
+    `sequence_decisions`."""
     replay_size: int = 16_384
     """Observations that the VAE learns from, with what its decoder must draw of each."""
     mirror: bool = True
-    """Mirror each observation of a VAE update left to right with probability one half."""
+    """Mirror half of the observations of a VAE update left to right."""
+    sequence_decisions: int = 1
+    """Decisions in a row that a VAE update takes from a flight (`patches`). With more than 1 the encoder is recurrent:
+    a code also depends on the one before, and is trained through as many."""
     hold_decisions: int = 4
     """Mean length of a random manoeuvre of the warm-up, decisions."""
     retrain_at: tuple[float, ...] = ()

@@ -40,11 +40,16 @@ def acting(config: Config, params: Params) -> Params:
     return vae.frozen(config.encoder, config.camera, params, form=sensor_of(config).form) if params else {}
 
 
-def embed(config: Config, params: Params, observation: Observation) -> Array | None:
-    """Returns [..., size] of order 1: the scaled code, or values as they are; None where the sensor shows nothing."""
+def embed(config: Config, params: Params, observation: Observation, previous: Array) -> Array | None:
+    """Returns [..., size] of order 1: the scaled code, or values as they are; None where the sensor shows nothing.
+
+    Args:
+        previous: `[..., size]` what this returned for the decision before; 0 at the start of an episode.
+    """
     if observation.sensed is None:
         return None
     if not has_code(config):
         return jnp.asarray(observation.sensed)
-    code = vae.embed(config.encoder, params, observation.sensed, observation.motion)  # type: ignore[arg-type]
-    return config.agent.code_scale * code
+    scale = config.agent.code_scale
+    code = vae.embed(config.encoder, params, observation.sensed, observation.motion, previous / scale)  # type: ignore[arg-type]
+    return scale * code

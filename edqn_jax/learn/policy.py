@@ -57,15 +57,15 @@ def remember(memory: Memory, flat: Array) -> Memory:
     return jnp.concatenate([memory[..., 1:, :], flat[..., None, :]], axis=-2)
 
 
-def flatten(config: Config, params: Params, observation: Observation) -> Array:
-    """Returns [..., D]: what is seen, by default as a code, and own state of observations [...]."""
-    seen = embedding.embed(config, params, observation)
+def flatten(config: Config, params: Params, memory: Memory, observation: Observation) -> Array:
+    """Returns [..., D]: what is seen, by default as a code, and own state of observations [...] after a memory."""
+    seen = embedding.embed(config, params, observation, memory[..., -1, : embedding.size(config)])
     return observation.own if seen is None else jnp.concatenate([seen, observation.own], axis=-1)
 
 
 def see(config: Config, params: Params, memory: Memory, observation: Observation) -> Memory:
     """Returns the memory [..., H, D] with the encoded observation [...] at its end."""
-    return remember(memory, flatten(config, params, observation))
+    return remember(memory, flatten(config, params, memory, observation))
 
 
 def choose(config: Config, params: Params, memory: Memory, key: Array, epsilon: Array | None = None) -> Array:

@@ -10,6 +10,8 @@ nothing else of them is read.
 
 from __future__ import annotations
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -44,13 +46,14 @@ class Samples:
     sensed: Counts | EventField | Array  # a picture is an array
     motion: Array  # [..., MOTION_SIZE]
     wanted: Target
+    begins: Array  # [...] bool, whether the row before is not the decision before
 
 
-def samples_of(config: EncoderConfig, observation: Observation, wanted: Target) -> Samples:
+def samples_of(config: EncoderConfig, observation: Observation, wanted: Target, begins: Array) -> Samples:
     """Returns observations and their targets in the form in which they are stored."""
     sensed = observation.sensed
     assert isinstance(sensed, EventField | Array)
-    return Samples(_stored(config, sensed), observation.motion, wanted)
+    return Samples(_stored(config, sensed), observation.motion, wanted, begins)
 
 
 def empty(config: EncoderConfig, one: Samples, envs: int, total_envs: int) -> Samples:
@@ -63,8 +66,8 @@ def empty(config: EncoderConfig, one: Samples, envs: int, total_envs: int) -> Sa
 
 
 def ring_length(config: EncoderConfig, total_envs: int) -> int:
-    """Returns the decisions that the ring holds."""
-    return max(config.replay_size // total_envs, 1)
+    """Returns the decisions that the ring holds: at least what one update takes in a row."""
+    return max(config.replay_size // total_envs, config.sequence_decisions)
 
 
 def write(ring: Samples, rows: Samples, time: Array, keep: Array) -> Samples:
@@ -80,21 +83,25 @@ def write(ring: Samples, rows: Samples, time: Array, keep: Array) -> Samples:
 
 
 def draw(config: EncoderConfig, ring: Samples, time: Array, count: int, key: Array) -> Samples:
-    """Returns `count` samples of one shard, uniform over those in the ring.
+    """Returns `count` samples of one shard, [T, count / T, ...]: T in a row, uniform over those in the ring.
 
     Args:
-        time: [] int32, how many decisions have been kept, at least 1.
+        time: [] int32, how many decisions have been kept, at least 1. Before there are T, the last is repeated.
         key: consumed.
     """
     rows, envs = ring.motion.shape[:2]
+    length, flights = config.sequence_decisions, count // config.sequence_decisions
     row_key, env_key = jax.random.split(key)
-    row = integers(row_key, (count,), jnp.minimum(time, rows - 1))
-    env = integers(env_key, (count,), envs)
+    oldest = jnp.maximum(time - (rows - 1), 0)
+    first = oldest + integers(row_key, (flights,), jnp.maximum(time - oldest - length, 0) + 1)
+    row = jnp.minimum(first + jnp.arange(length)[:, None], time - 1) % (rows - 1)
+    env = integers(env_key, (flights,), envs)
     drawn = jax.tree.map(lambda leaf: leaf[row, env], ring)
     if not config.mirror:
         return drawn
-    half = count // 2
-    return jax.tree.map(lambda turned, kept: jnp.concatenate([turned[:half], kept[half:]]), mirrored(drawn), drawn)
+    half = flights // 2
+    join = partial(jnp.concatenate, axis=1)
+    return jax.tree.map(lambda turned, kept: join([turned[:, :half], kept[:, half:]]), mirrored(drawn), drawn)
 
 
 def mirrored(samples: Samples) -> Samples:
@@ -106,6 +113,7 @@ def mirrored(samples: Samples) -> Samples:
         sensed=jax.tree.map(lambda image: jnp.flip(image, axis=-1), samples.sensed),
         motion=samples.motion * jnp.asarray(MIRRORED_MOTION),
         wanted=Target(amplitudes * signs, samples.wanted.beyond),
+        begins=samples.begins,
     )
 
 

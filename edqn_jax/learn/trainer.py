@@ -34,7 +34,7 @@ from edqn_jax.parallel import processes
 from edqn_jax.parallel.devices import compiler_options
 from edqn_jax.random import run_streams
 from edqn_jax.sim import env
-from edqn_jax.sim.env import EnvState, Observation, World
+from edqn_jax.sim.env import EnvState, World
 from edqn_jax.sim.moves import ACTIONS
 from edqn_jax.sim.outcomes import Outcome
 
@@ -165,7 +165,7 @@ def _empty_samples(config: Config, world: World, state: EnvState) -> Samples | N
     def one(state: EnvState) -> Samples:
         observation = env.step(config, world, state, jnp.zeros((), jnp.int32))[1].observation
         wanted = samples.target_of(config.encoder, observation, env.nearness(config, world, state))
-        return samples.samples_of(config.encoder, observation, wanted)
+        return samples.samples_of(config.encoder, observation, wanted, jnp.zeros((), bool))
 
     shapes = jax.eval_shape(one, jax.tree.map(lambda x: x[0], state))
     ring = samples.empty(config.encoder, shapes, envs // shards, envs)
@@ -199,6 +199,11 @@ def _q_optimiser(config: Config) -> optax.GradientTransformation:
 def _flat(x: Array) -> Array:
     """Returns [S * E, ...] of [S, E, ...]."""
     return x.reshape(-1, *x.shape[2:])
+
+
+def _side_by_side(x: Array) -> Array:
+    """Returns [T, S * B, ...] of [S, T, B, ...]."""
+    return jnp.moveaxis(x, 0, 1).reshape(x.shape[1], -1, *x.shape[3:])
 
 
 def _all_sum(x, axis: str | None):
@@ -239,7 +244,7 @@ def train_step(
     action, manoeuvre, epsilon = _act(config, learner, actors, keys, jnp.maximum(step - plan.warmup, 0), warming)
     ring = _store(actors, action, time)
     flown, seen = _fly(config, world, actors, action)
-    rings = _keep(config, world, actors, flown, seen.observation, step)
+    rings = _keep(config, world, actors, flown, seen, step)
     vae_losses, learner = learn_to_see(config, axis, learner, rings, keys.vae, step)
     q_losses, learner = learn_to_act(config, axis, learner, ring, time, keys.dqn, step)
     learner = _publish(config, learner, step)
@@ -331,9 +336,7 @@ def _publish(config: Config, learner: Learner, step: Array) -> Learner:
     return dataclasses.replace(learner, encoder=encoder)
 
 
-def _keep(
-    config: Config, world: World, actors: Actors, flown: EnvState, observation: Observation, step: Array
-) -> Samples | None:
+def _keep(config: Config, world: World, actors: Actors, flown: EnvState, seen: env.Step, step: Array) -> Samples | None:
     """Returns the VAE's rings [S, L, E, ...], with this step's observations [S * E, ...] if the VAE learns in it.
 
     Only then are labels rendered. None where there is no VAE.
@@ -347,11 +350,12 @@ def _keep(
         near = None
         if embedding.needs_nearness(config):
             near = jax.vmap(partial(env.nearness, config, world))(flown)
-        return samples.target_of(config.encoder, observation, near)
+        return samples.target_of(config.encoder, seen.observation, near)
 
     nothing = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(target))
     wanted = lax.cond(keep, target, lambda: nothing)
-    rows = samples.samples_of(config.encoder, observation, wanted)
+    begins = seen.is_reset | plan.begins_to_keep(step)
+    rows = samples.samples_of(config.encoder, seen.observation, wanted, begins)
     write = jax.vmap(samples.write, in_axes=(0, 0, None, None))
     return write(actors.samples, _shaped(actors.reward.shape, rows), plan.samples_kept(config, step), keep)
 
@@ -368,15 +372,16 @@ def learn_to_see(config: Config, axis: str | None, learner: Learner, rings: Samp
 
     def loss(params: Params, batch: Samples, noise: Array):
         sensed = samples.read(batch)
-        total, parts = vae.vae_loss(config.encoder, params, sensed, batch.motion, batch.wanted, noise)
+        total, parts = vae.vae_loss(config.encoder, params, sensed, batch.motion, batch.wanted, noise, batch.begins)
         return total * part, parts
 
     def update(learner: Learner, keys: Array):
         draw_keys, noise_keys = jax.vmap(jax.random.split)(keys).swapaxes(0, 1)
         batch = jax.vmap(lambda ring, key: samples.draw(config.encoder, ring, kept, share, key))(rings, draw_keys)
         # Each shard draws its own noise, so that the layout on devices does not change it.
-        noise = jax.vmap(lambda key: jax.random.normal(key, (share, config.encoder.code_size)))(noise_keys)
-        batch, noise = jax.tree.map(_flat, (batch, noise))
+        shape = *batch.motion.shape[1:-1], config.encoder.code_size
+        noise = jax.vmap(lambda key: jax.random.normal(key, shape))(noise_keys)
+        batch, noise = jax.tree.map(_side_by_side, (batch, noise))
         gradient, parts = jax.grad(loss, has_aux=True)(learner.vae, batch, noise)
         gradient = _all_sum(gradient, axis)
         change, optimiser = _vae_optimiser(config).update(gradient, learner.vae_optimiser, learner.vae)

@@ -19,7 +19,7 @@ from jax.nn.initializers import zeros
 from edqn_jax.config import CameraConfig, EncoderConfig
 from edqn_jax.learn.code import CHANNELS, Params, kl_divergence
 from edqn_jax.learn.layers import Dense
-from edqn_jax.learn.patch_encoder import PatchEncoder
+from edqn_jax.learn.patch_encoder import PatchEncoder, is_recurrent
 from edqn_jax.learn.pooled_encoder import PooledEncoder
 from edqn_jax.learn.waves import OUTPUT_SCALE, cosines, mirrored, wave_images
 from edqn_jax.sim.env import MOTION_SIZE
@@ -148,8 +148,9 @@ def init_vae(
     silent = EventField(nothing, nothing.astype(jnp.int8), when, when, window_s=1.0)
     encoder = _encoder(config, camera.height, camera.width, form)
     blank = silent if form is Form.EVENTS else when[0]
+    memory = [jnp.zeros(config.code_size)] if is_recurrent(config) else []
     return {
-        "encoder": encoder.init(key_encoder, blank, jnp.zeros(MOTION_SIZE))["params"],
+        "encoder": encoder.init(key_encoder, blank, jnp.zeros(MOTION_SIZE), *memory)["params"],
         "decoder": decoder.init(key_decoder, jnp.zeros(config.code_size))["params"],
     }
 
@@ -160,18 +161,27 @@ def _encoder(config: EncoderConfig, height: int, width: int, form: Form) -> Patc
     return PooledEncoder(config, height, width, CHANNELS[form])
 
 
-def encode(config: EncoderConfig, params: Params, sensed: EventField | Array, motion: Array) -> tuple[Array, Array]:
+def encode(
+    config: EncoderConfig,
+    params: Params,
+    sensed: EventField | Array,
+    motion: Array,
+    previous: Array | None = None,
+    begins: Array | None = None,
+) -> tuple[Array, Array]:
     """Returns mean and log-variance, each `[..., code_size]`, of fields `[..., F, H, W]` or pictures `[..., H, W]`.
 
     The code that the agent sees is the mean.
 
     Args:
         motion: `[..., MOTION_SIZE]` own motion, see `sim.env.own_motion`.
+        previous, begins: what a recurrent encoder remembers, see `PatchEncoder`; None of another.
     """
     fields = isinstance(sensed, EventField)
     height, width = (sensed.count if fields else sensed).shape[-2:]
     encoder = _encoder(_of_kind(config, params), height, width, Form.EVENTS if fields else Form.PICTURE)
-    return encoder.apply({"params": params["encoder"]}, sensed, motion)  # type: ignore
+    memory = (previous, begins) if is_recurrent(config) else ()
+    return encoder.apply({"params": params["encoder"]}, sensed, motion, *memory)  # type: ignore
 
 
 def encode_events(
@@ -210,9 +220,11 @@ def _of_kind(config: EncoderConfig, params: Params) -> EncoderConfig:
     return dataclasses.replace(config, pixel_features="table") if tables else config
 
 
-def embed(config: EncoderConfig, params: Params, sensed: EventField | Array, motion: Array) -> Array:
+def embed(
+    config: EncoderConfig, params: Params, sensed: EventField | Array, motion: Array, previous: Array | None = None
+) -> Array:
     """Returns the agent's code, the mean `[..., code_size]`; arguments as `encode`."""
-    return encode(config, params, sensed, motion)[0]
+    return encode(config, params, sensed, motion, previous)[0]
 
 
 def decode(config: EncoderConfig, camera: CameraConfig, params: Params, code: Array) -> Array:
@@ -229,7 +241,13 @@ def _waves_of(config: EncoderConfig, height: int, width: int, params: Params, co
 
 
 def vae_loss(
-    config: EncoderConfig, params: Params, sensed: EventField | Array, motion: Array, wanted: Target, noise: Array
+    config: EncoderConfig,
+    params: Params,
+    sensed: EventField | Array,
+    motion: Array,
+    wanted: Target,
+    noise: Array,
+    begins: Array | None = None,
 ) -> tuple[Array, Losses]:
     """Returns the VAE loss, squared reconstruction error + `kl_weight` x KL, averaged over the batch, and its terms.
 
@@ -240,8 +258,9 @@ def vae_loss(
         motion: `[..., MOTION_SIZE]` own motion.
         wanted: what the decoder must draw, see `target` and `in_waves`.
         noise: `[..., code_size]` standard normal, which draws the codes (reparametrised).
+        begins: see `PatchEncoder`; None if the encoder is not recurrent.
     """
-    mean, log_variance = encode(config, params, sensed, motion)
+    mean, log_variance = encode(config, params, sensed, motion, begins=begins)
     code = mean + jnp.exp(0.5 * log_variance) * noise
     height, width = (sensed.count if isinstance(sensed, EventField) else sensed).shape[-2:]
     drawn = _waves_of(config, height, width, params, code)

@@ -90,12 +90,13 @@ class Sights:
     ) -> _Images:
         """The images of `shown` at [D, T, ...] poses with own motions [D, MOTION_SIZE].
 
-        The sensor carries its memory from each decision to the next.
+        The sensor carries its memory from each decision to the next, and so does a recurrent encoder.
         """
         config = self.config
         start, rest = jax.random.split(jax.random.key(0))
 
-        def one(memory: Any, given: tuple[Array, ...]) -> tuple[Any, _Images]:
+        def one(before: tuple[Any, Array], given: tuple[Array, ...]) -> tuple[tuple[Any, Array], _Images]:
+            memory, code = before
             position, quaternion, motion, key = given
             here = Flight(position, quaternion, jnp.zeros_like(position))
             sensed, memory = sensor.sense(config, scene, here, memory, key)
@@ -103,15 +104,16 @@ class Sights:
             nearness = None
             if embedding.needs_nearness(config):
                 nearness = sensor.nearness_image(config, scene, position[-1], quaternion[-1])
-            code = vae.embed(config.encoder, params.encoder, sensed, motion)
+            code = vae.embed(config.encoder, params.encoder, sensed, motion, code)
             image = events.event_image(sensed) if isinstance(sensed, EventField) else sensed
             target = vae.target(config.encoder, sensed, nearness)
             made = vae.decode(config.encoder, config.camera, params.encoder, code)
             drawn = (_drawn(config, sensed, channels) for channels in (target, made))
-            return memory, (image, *drawn)  # type: ignore[return-value]
+            return (memory, code), (image, *drawn)  # type: ignore[return-value]
 
         keys = jax.random.split(rest, len(position))
-        return jax.lax.scan(one, sensor.at_rest(config, start), (position, quaternion, motion, keys))[1]
+        before = sensor.at_rest(config, start), jnp.zeros(config.encoder.code_size)
+        return jax.lax.scan(one, before, (position, quaternion, motion, keys))[1]
 
     def _compile_rgb(self) -> Compiled:
         def picture(scene: Scene, position: Array, quaternion: Array) -> Array:

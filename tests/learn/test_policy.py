@@ -61,8 +61,8 @@ flatten = jax.jit(partial(policy.flatten, CONFIG))
 @pytest.mark.slow
 def test_memory_stacks_an_episode_as_the_replay_does(params, act):
     seen = observations(5)
-    flat = np.stack([flatten(params.encoder, each) for each in seen])
     memory = policy.empty_memory(CONFIG)
+    flat = np.stack([flatten(params.encoder, memory, each) for each in seen])
     history = CONFIG.agent.history
     # The replay's rows: an older episode's observations before this one's first, which is a reset.
     rows = np.concatenate([np.full((history, SIZE), 9.0, np.float32), flat])
@@ -79,7 +79,7 @@ def test_memory_stacks_an_episode_as_the_replay_does(params, act):
 @pytest.mark.slow
 def test_an_observation_is_the_scaled_code_and_the_own_state(params):
     one = observations(1)[0]
-    flat = flatten(params.encoder, one)
+    flat = flatten(params.encoder, policy.empty_memory(CONFIG), one)
     assert flat.shape == (SIZE,) == (5 + OWN_SIZE,)
     code = vae.embed(CONFIG.encoder, params.encoder, one.sensed, one.motion)  # pyright: ignore[reportArgumentType]
     np.testing.assert_allclose(flat[:5], CONFIG.agent.code_scale * code, rtol=1e-6)
