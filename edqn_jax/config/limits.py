@@ -7,6 +7,7 @@ import math
 from collections.abc import Iterable
 
 from edqn_jax.config.options import (
+    DENSITIES,
     AgentConfig,
     CameraConfig,
     Config,
@@ -36,6 +37,8 @@ def validate(config: Config) -> None:
     _train(config.train)
     _replay(config.agent, config.train)
     _samples(config.encoder, config.train)
+    turns = not config.agent.turn or config.world.name in DENSITIES
+    _require(turns, "agent.turn", f"false in the world '{config.world.name}', which is not random", config.agent.turn)
 
 
 def _world(world: WorldConfig) -> None:

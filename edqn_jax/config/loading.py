@@ -36,12 +36,21 @@ RANDOM_WORLDS: Layer = {
         "retrain_at": (0.15,),
         "retrain_decisions": 131_072,
     },
-    "agent": {"history": 2, "updates_per_step": 4, "target_rate": 0.02, "learning_rate": 1e-3},
+    "agent": {
+        "history": 2,
+        "updates_per_step": 4,
+        "target_rate": 0.02,
+        "learning_rate": 1e-3,
+        "huber_delta": 0.0,
+        "turn": True,
+    },
     "events": {"threshold": 0.03, "tolerance": 0.03, "frame_times_s": (-0.08, 0.0)},
 }
 """What random worlds change in the `default` preset: more decisions in more worlds, fewer and smaller updates for each,
 two observations, a longer window of events with lower thresholds, and an encoder that learns from more, and again from
-flights of the policy, since there only events tell where obstacles are."""
+flights of the policy, since there only events tell where obstacles are. Collisions are rare there and cost much, so the
+loss is squared: a Huber loss counts them for a fraction of their cost. No direction is preferred, so what is replayed is
+turned (docs/ablation.md)."""
 
 GPU: Layer = {
     "world": {"pool_size": 16_384, "missions": 131_072},
@@ -52,6 +61,7 @@ GPU: Layer = {
         "validation_every": 2_097_152,
         "validation_missions": 512,
     },
+    "env": {"collision_reward": -300.0, "left_volume_reward": -300.0},
     "encoder": {
         "code_size": 64,
         "patch_layers": (64, 16),
@@ -72,8 +82,9 @@ GPU: Layer = {
         "exploration_end": 0.005,
     },
 }
-"""What a GPU changes further for random worlds: as many environments as fill it, larger networks and updates, and a
-larger pool of worlds, since a small one is learnt by heart (docs/ablation.md)."""
+"""What a GPU changes further for random worlds: as many environments as fill it, larger networks and updates, a larger
+pool of worlds, since a small one is learnt by heart, and collisions that cost more, which takes more decisions to learn
+(docs/ablation.md)."""
 
 
 def world_layers(world: str, tuned_for: Hardware) -> list[Layer]:

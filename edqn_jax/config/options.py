@@ -269,6 +269,9 @@ class AgentConfig:
     """Updates per training step (a training step is one decision of every environment)."""
     replay_size: int = 262_144
     """Observations that the replay holds."""
+    turn: bool = False
+    """Turn what is drawn from the replay by random quarter turns about the vertical, drone and world alike. Only for
+    random worlds, which have no preferred direction but the sun's; a map that stays the same would be blurred."""
     learning_starts: int = 8192
     """Observations in the replay before the first update."""
     random_decisions: int = 1000

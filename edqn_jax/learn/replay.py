@@ -11,6 +11,8 @@ of the shard, D the size of an observation.
 
 from __future__ import annotations
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 from flax import struct
@@ -18,6 +20,7 @@ from jax import Array
 
 from edqn_jax.config import AgentConfig
 from edqn_jax.random import integers
+from edqn_jax.sim.env import OWN_SIZE, turned
 from edqn_jax.sim.outcomes import Outcome
 
 
@@ -85,11 +88,23 @@ def sample(config: AgentConfig, ring: Rows, time: Array, batch: int, key: Array)
     """
     length, envs = ring.reward.shape
     n, h = config.n_step, config.history
-    age_key, env_key = jax.random.split(key)
+    age_key, env_key, *turn_key = jax.random.split(key, 3 if config.turn else 2)
     oldest = jnp.minimum(time + 1, length) - h
     age = n + integers(age_key, (batch,), jnp.maximum(oldest, n) - n + 1)
     env = integers(env_key, (batch,), envs)
-    return jax.vmap(lambda a, e: _transition(config, ring, time - a, e))(age, env)
+    drawn = jax.vmap(lambda a, e: _transition(config, ring, time - a, e))(age, env)
+    if not config.turn:
+        return drawn
+    quarters = jnp.broadcast_to(integers(*turn_key, (batch, 1), 4), (batch, h))
+    return dataclasses.replace(
+        drawn, history=_turned(drawn.history, quarters), next_history=_turned(drawn.next_history, quarters)
+    )
+
+
+def _turned(history: Array, quarters: Array) -> Array:
+    """Returns observations [B, H, D] with own states turned by quarters [B, H]; those before an episode stay zero."""
+    seen, own = jnp.split(history, [history.shape[-1] - OWN_SIZE], axis=-1)
+    return jnp.concatenate([seen, turned(own, quarters)], axis=-1)
 
 
 def _transition(config: AgentConfig, ring: Rows, start: Array, env: Array) -> Batch:

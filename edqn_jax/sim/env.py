@@ -115,6 +115,21 @@ def own_state(config: EnvConfig, scene: Scene, goal: Array, state: DroneState) -
     )
 
 
+def turned(own: Array, quarters: Array) -> Array:
+    """Returns own states [..., OWN_SIZE] as they would be with world and drone turned about the volume's middle.
+
+    Args:
+        own: in a volume that is as long as it is wide.
+        quarters: [...] int32, quarter turns to the left.
+    """
+    cos, sin = jnp.array([1.0, 0.0, -1.0, 0.0])[quarters], jnp.array([0.0, 1.0, 0.0, -1.0])[quarters]
+    towards_x, towards_y = own[..., 2:6:2], own[..., 3:6:2]  # of the heading, and of the position in the volume
+    x = cos[..., None] * towards_x - sin[..., None] * towards_y
+    y = sin[..., None] * towards_x + cos[..., None] * towards_y
+    pairs = jnp.stack([x, y], axis=-1).reshape(*x.shape[:-1], 4)
+    return jnp.concatenate([own[..., :2], pairs, own[..., 6:]], axis=-1)
+
+
 def own_motion(config: EnvConfig, state: DroneState, move: Array) -> Array:
     """Returns what the drone knows of its own motion [MOTION_SIZE], each value of order 1.
 

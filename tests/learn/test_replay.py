@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections import Counter
 from functools import partial
 
@@ -14,6 +15,7 @@ from hypothesis import strategies as st
 
 from edqn_jax.config import AgentConfig
 from edqn_jax.learn import replay
+from edqn_jax.sim.env import OWN_SIZE, turned
 from edqn_jax.sim.outcomes import Outcome
 from tests.oracles import replay_plain
 
@@ -193,3 +195,32 @@ def test_the_replay_is_strict():
     ring = jax.jit(replay.write)(ring, rows, jnp.int32(20))
     batch = sampled(config, ring, jnp.int32(20), 8, jax.random.key(0))
     assert batch.history.shape == (8, 2, 5) and batch.action.dtype == jnp.int32
+
+
+def test_what_is_drawn_is_turned_in_whole_quarters_and_only_the_own_state_is() -> None:
+    rng, config = np.random.default_rng(5), dataclasses.replace(agent(3, 2), turn=True)
+    ring = replay.empty(config, ENVS, ENVS, 3 + OWN_SIZE)
+    for time in range(LENGTH):
+        rows = replay.Rows(
+            observation=jnp.asarray(rng.normal(size=(ENVS, 3 + OWN_SIZE)), jnp.float32),
+            reward=jnp.zeros(ENVS),
+            outcome=jnp.full(ENVS, int(Outcome.RUNNING)),
+            is_reset=jnp.full(ENVS, time % 5 == 0),
+            action=jnp.zeros(ENVS, jnp.int32),
+        )
+        ring = replay.write(ring, rows, jnp.int32(time))
+    drawn = replay.sample(config, ring, jnp.int32(LENGTH - 1), 256, jax.random.key(0))
+    kept = {row.tobytes(): row for row in np.asarray(ring.observation).reshape(-1, 3 + OWN_SIZE)}
+    turns = Counter()
+    for history, later in zip(np.asarray(drawn.history), np.asarray(drawn.next_history), strict=True):
+        found = set()
+        for seen in (*history, *later):
+            if not seen.any():
+                continue  # from before the episode
+            (source,) = [row for row in kept.values() if (row[:3] == seen[:3]).all()]
+            quarters = [k for k in range(4) if np.allclose(turned(source[3:], jnp.int32(k)), seen[3:], atol=1e-6)]
+            found.update(quarters)
+        assert len(found) == 1, "one transition is turned as a whole"
+        turns.update(found)
+    # A quarter of 256 each: 64, five deviations of 7.
+    assert set(turns) == set(range(4)) and min(turns.values()) > 29

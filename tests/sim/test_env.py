@@ -261,6 +261,22 @@ def test_own_state_by_hand():
     np.testing.assert_allclose(own, expected, atol=1e-6)
 
 
+@pytest.mark.parametrize("quarters", range(4))
+def test_a_turned_own_state_is_that_of_the_turned_world(quarters):
+    angle = np.pi / 2 * quarters
+    turn = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
+    middle = np.array([30.0, 30.0, 0.0])  # of a volume of 60 x 60 x 25 m
+
+    def own(position, goal, yaw, velocity):
+        state = body(position, yaw, velocity=velocity)
+        return env.own_state(CONFIG.env, SCENE, jnp.asarray(goal, jnp.float32), state)
+
+    position, goal, velocity = np.array([20.0, 10, 5]), np.array([50.0, 45, 8]), np.array([-2.0, 0.5, 1.0])
+    there = turn @ (position - middle) + middle, turn @ (goal - middle) + middle, 0.4 + angle, turn @ velocity
+    found = env.turned(own(position, goal, 0.4, velocity), jnp.int32(quarters))
+    np.testing.assert_allclose(found, own(*there), atol=2e-6)
+
+
 def test_own_motion_by_hand():
     # Nose north, 2 m/s west, 1 m/s up, turning left at 0.7 rad/s; the last move was ahead and down.
     state = body((20, 10, 5), np.pi / 2, velocity=(-2.0, 0.0, 1.0))
