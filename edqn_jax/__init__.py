@@ -80,7 +80,10 @@ def __getattr__(name: str) -> Any:
     from importlib import import_module, metadata
 
     if name == "__version__":
-        value: Any = metadata.version("edqn-jax")
+        try:
+            value: Any = metadata.version("edqn-jax")
+        except metadata.PackageNotFoundError:  # run from a checkout that is not installed
+            value = "0+unknown"
     elif name in _MODULES:
         value = getattr(import_module(f"{__name__}.{_MODULES[name]}"), name)
     else:

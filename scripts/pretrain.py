@@ -14,10 +14,10 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Sequence
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+import edqn_jax
 from edqn_jax.errors import ConfigError
 from edqn_jax.evaluation.evaluate import Evaluation, evaluate
 from edqn_jax.learn.policy import Policy
@@ -140,7 +140,7 @@ def card_of(policy: Policy, flown: dict[str, Evaluation], paper: Evaluation, tra
         threshold=config.events.threshold,
         window=-config.events.frame_times_s[0],
         commit=commit,
-        version=version("edqn-jax"),
+        version=edqn_jax.__version__,
         rows="\n".join(rows),
         paper=_paper(paper.figures, config.drone.body_radius_m),
     )

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import subprocess
 import sys
+from importlib import metadata
 from pathlib import Path
 
 import jax
@@ -41,6 +42,18 @@ def test_every_public_name_can_be_loaded_and_no_other() -> None:
         assert getattr(edqn_jax, name) is not None
     with pytest.raises(AttributeError, match="has no attribute 'trian'"):
         edqn_jax.trian  # noqa: B018  # pyright: ignore[reportAttributeAccessIssue]
+
+
+def test_a_checkout_that_is_not_installed_has_no_version(monkeypatch: pytest.MonkeyPatch) -> None:
+    def missing(name: str) -> str:
+        raise metadata.PackageNotFoundError(name)
+
+    monkeypatch.delitem(vars(edqn_jax), "__version__", raising=False)
+    with monkeypatch.context() as patched:
+        patched.setattr(metadata, "version", missing)
+        assert edqn_jax.__version__ == "0+unknown"
+    del edqn_jax.__version__
+    assert edqn_jax.__version__ == metadata.version("edqn-jax")
 
 
 def test_the_page_of_the_api_has_every_public_name() -> None:

@@ -5,10 +5,10 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Sequence
-from importlib import metadata
 
 import tyro
 
+import edqn_jax
 from edqn_jax.cli.arguments import EvaluateArgs, RecordArgs, TrainCommand, parse_evaluate, parse_record
 from edqn_jax.cli.train import train_command
 from edqn_jax.config.loading import nearest
@@ -45,7 +45,7 @@ def _dispatch(argv: Sequence[str]) -> int:
     elif command == "record":
         _record(rest)
     elif command == "--version":
-        print(f"edqn-jax {metadata.version('edqn-jax')}")
+        print(f"edqn-jax {edqn_jax.__version__}")
     elif command in ("-h", "--help"):
         tyro.extras.subcommand_cli_from_dict(COMMANDS, prog="edqn", args=["--help"])
     else:

@@ -49,8 +49,8 @@ RANDOM_WORLDS: Layer = {
 """What random worlds change in the `default` preset: more decisions in more worlds, fewer and smaller updates for each,
 two observations, a longer window of events with lower thresholds, and an encoder that learns from more, and again from
 flights of the policy, since there only events tell where obstacles are. Collisions are rare there and cost much, so the
-loss is squared: a Huber loss counts them for a fraction of their cost. No direction is preferred, so what is replayed is
-turned (docs/ablation.md)."""
+loss is squared: a Huber loss counts them for a fraction of their cost. No direction is preferred, so what is replayed
+is turned (docs/ablation.md)."""
 
 GPU: Layer = {
     "world": {"pool_size": 16_384, "missions": 131_072},

@@ -10,12 +10,12 @@ import math
 import shutil
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 
+import edqn_jax
 from edqn_jax.config import Config
 from edqn_jax.config.loading import apply, load_layer, to_yaml
 from edqn_jax.errors import ConfigError
@@ -212,7 +212,7 @@ def plan_run_directory(given: Path | None, config: Config, resume: Resume = "aut
 
 def config_text(config: Config) -> str:
     """Returns the content of a run's `config.yaml`: the version of this package, and every option."""
-    return f"{_VERSION}{version('edqn-jax')}\n{to_yaml(config)}"
+    return f"{_VERSION}{edqn_jax.__version__}\n{to_yaml(config)}"
 
 
 def version_of(config_file: Path) -> str | None:

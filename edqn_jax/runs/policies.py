@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from importlib.metadata import version
 from pathlib import Path
 
 import jax
 import numpy as np
 
+import edqn_jax
 from edqn_jax.config import Config
 from edqn_jax.config.limits import validate
 from edqn_jax.config.loading import apply, load_layer
@@ -62,7 +62,7 @@ def load_run(folder: Path) -> tuple[Config, PolicyParams]:
     try:
         return _loaded(folder, file)
     except ConfigError as error:
-        writer, here = version_of(file), version("edqn-jax")
+        writer, here = version_of(file), edqn_jax.__version__
         if writer in (None, here):
             raise
         raise ConfigError(
@@ -78,7 +78,7 @@ def _loaded(folder: Path, file: Path) -> tuple[Config, PolicyParams]:
     if _shapes(params) != _shapes(fresh):
         raise ConfigError(
             f"the policy in '{folder}' does not have the shapes that its config.yaml asks for in edqn_jax "
-            f"{version('edqn-jax')}; fly it with the version that trained it, or train it anew"
+            f"{edqn_jax.__version__}; fly it with the version that trained it, or train it anew"
         )
     return config, params
 
