@@ -24,7 +24,7 @@ import shutil
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -71,11 +71,13 @@ def parse(argv: Sequence[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--missions", type=int, default=1000, help="test missions of each seed (default 1000)")
     parser.add_argument("--minutes", type=float, default=9.0, help="begin no row that would end later (default 9)")
     parser.add_argument("--no-spl", action="store_true", help="do not search shortest paths")
-    parser.add_argument("--report", action="store_true", help="measure no row, only print those that there are")
+    parser.add_argument("--report", action="store_true", help="measure no row, print those in --out, with SPL")
     args = parser.parse_args(words)
     args.flags = flags
-    if args.runs and flags:
-        parser.error("options of train.py do not change the policies of --runs; leave them out")
+    if args.runs and (flags or args.sensors != ["events"]):
+        parser.error("--runs have their own sensor and options; leave out --sensors and the arguments after --")
+    if args.runs and args.report:
+        parser.error("--report measures nothing; leave out --runs")
     for name in ("seeds", "missions"):
         if getattr(args, name) < 1:
             parser.error(f"--{name} must be at least 1, not {getattr(args, name)}")
@@ -108,16 +110,16 @@ def config_of_runs(world: str, policies: Sequence[Policy]) -> Config:
     return dataclasses.replace(first, world=dataclasses.replace(first.world, name=world))
 
 
-def row_file(out: Path, config: Config, missions: int, measured: str) -> Path:
+def row_file(out: Path, config: Config, missions: int, identity: str) -> Path:
     """Returns the file of a row; rows with other options or missions, or of another commit, have other names.
 
     Args:
         out: folder of rows.
         config: of the first seed.
         missions: of each seed.
-        measured: what else tells rows apart.
+        identity: what else tells rows apart.
     """
-    text = f"{measured} {missions} {_commit()}\n{to_yaml(config)}"
+    text = f"{identity} {missions} {_commit()}\n{to_yaml(config)}"
     digest = hashlib.sha256(text.encode()).hexdigest()[:10]
     return out / f"{config.world.name}-{config.env.sensor}-{digest}.json"
 
@@ -177,8 +179,13 @@ def fly_row(config: Config, policies: Sequence[Policy], runs: Sequence[Path], mi
     """
     began = time.perf_counter()
     summaries = [_summary(run) for run in runs]
-    took = {key: sum(summary[key] for summary in summaries) for key in ("train_seconds", "compile_seconds")}
-    return _row(config, policies, missions, summaries[0]["train_decisions"], took, began)
+    # Runs that were trained together have the times of all of them.
+    took = {
+        key: sum(summary[key] / summary.get("trained_together", 1) for summary in summaries)
+        for key in ("train_seconds", "compile_seconds")
+    }
+    row = _row(config, policies, missions, summaries[0]["train_decisions"], took, began)
+    return row | {"runs": [str(run) for run in runs], "trained_in": policies[0].config.world.name}
 
 
 def _summary(run: Path) -> dict[str, Any]:
@@ -189,7 +196,7 @@ def _summary(run: Path) -> dict[str, Any]:
 
 
 def _row(
-    config: Config, policies: Sequence[Policy], missions: int, decisions: int, took: dict[str, float], began: float
+    config: Config, policies: Sequence[Policy], missions: int, decisions: int, took: Mapping[str, float], began: float
 ) -> Row:
     """Flies the test missions and returns the row."""
     course = load_missions(config, config.world.name, missions)
@@ -260,8 +267,11 @@ def table(rows: Sequence[Row], shortest: dict[str, np.ndarray | None]) -> str:
         low, high = found["interval"]
         each = ", ".join(f"{100 * rate:.1f}" for rate in found["rates"])
         weight = "–" if found["spl"] is None else f"{found['spl']:.3f}"
+        world = row["world"]
+        if row.get("trained_in", world) != world:
+            world += f", trained in {row['trained_in']}"
         lines.append(
-            f"| {row['world']} | {row['sensor']} | {len(row['turns'])} x {row['missions']} | {found['success']:.2%} "
+            f"| {world} | {row['sensor']} | {len(row['turns'])} x {row['missions']} | {found['success']:.2%} "
             f"| {low:.2%} to {high:.2%} | {found['iqm']:.2%} | {each} | {weight} "
             f"| {row['decisions']:,} | {row['train_seconds']:.0f} |"
         )
@@ -284,11 +294,13 @@ def _wanted(args: argparse.Namespace) -> list[Wanted]:
     """
     if args.runs:
         use_cpu_devices(cores())
-        policies = [load_policy(run) for run in args.runs]
+        runs = {run: load_policy(run) for run in args.runs}
+        by_seed = sorted(runs, key=lambda run: runs[run].config.train.seed)
+        policies = [runs[run] for run in by_seed]
         configs = [config_of_runs(world, policies) for world in args.worlds]
         files = [row_file(args.out, config, args.missions, digest_of(policies)) for config in configs]
         return [
-            Wanted(file, functools.partial(fly_row, config, policies, args.runs, args.missions))
+            Wanted(file, functools.partial(fly_row, config, policies, by_seed, args.missions))
             for file, config in zip(files, configs, strict=True)
         ]
     configs = [config_of(world, sensor, args.flags) for world in args.worlds for sensor in args.sensors]
@@ -306,8 +318,8 @@ def _config_in(row: Row) -> Config:
 
 
 def _course(row: Row) -> str:
-    """Returns what tells the test worlds of a row from others."""
-    return f"{row['world']} {row['missions']}"
+    """Returns what decides the shortest paths of a row: test worlds and body."""
+    return f"{row['world']} {row['missions']} {_config_in(row).drone.body_radius_m:g}"
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -339,9 +351,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     for row in [] if args.no_spl else rows:
         # Two cores search 1 000 worlds in 200 s.
         in_time = time.perf_counter() - began + 0.4 * row["missions"] / cores() < 60 * args.minutes
-        shortest[_course(row)] = shortest_paths(
-            args.out, config_of(row["world"], "blind", []), row["missions"], in_time
-        )
+        shortest[_course(row)] = shortest_paths(args.out, _config_in(row), row["missions"], in_time)
     print(table(rows, shortest))
     if left:
         print(f"{len(left)} rows are left; the same command goes on with them", file=sys.stderr)

@@ -7,7 +7,6 @@ import hashlib
 import os
 import sys
 from collections.abc import Sequence
-from pathlib import Path
 
 from rich.console import Console
 
@@ -41,7 +40,7 @@ def train_command(argv: Sequence[str]) -> None:
         print("edqn: waiting for the other processes, five minutes at most", file=sys.stderr)
         process = processes.join(arguments)
     processes.together(lambda: _check_gpu() if tuned_for_gpu(options, config) else None)
-    processes.check_alike(processes.together(lambda: said_by_all(config)))
+    processes.check_alike(processes.together(lambda: options_to_compare(config)))
     writes = process == 0
     run = processes.together(lambda: plan_run_directory(options.run_dir, config, options.resume) if writes else None)
     progress = Progress(Console(quiet=not writes))
@@ -66,15 +65,17 @@ def tuned_for_gpu(options: TrainOptions, config: Config) -> bool:
     return options.preset == "default" and bool(gpu_layers(config.world.name, options.tuned_for))
 
 
-def said_by_all(config: Config) -> str:
-    """Returns what processes must have alike: all options, and what a world file holds but not where it is.
+def options_to_compare(config: Config) -> str:
+    """Returns what processes must have alike: all options, and in place of a world file's path what it holds.
 
     Raises:
-        ConfigError: if the file cannot be read.
+        ConfigError: if there is no such file, or it cannot be read.
     """
-    file = Path(config.world.name)
-    if config.world.name in DENSITIES or not file.is_file():
+    from edqn_jax.sim.mjcf import resolve_world
+
+    if config.world.name in DENSITIES:
         return to_yaml(config)
+    file = resolve_world(config.world.name)
     try:
         held = file.read_bytes()
     except OSError as error:

@@ -37,8 +37,11 @@ def validate(config: Config) -> None:
     _train(config.train)
     _replay(config.agent, config.train)
     _samples(config.encoder, config.train)
-    turns = not config.agent.turn or config.world.name in DENSITIES
-    _require(turns, "agent.turn", f"false in the world '{config.world.name}', which is not random", config.agent.turn)
+    if config.agent.turn and config.world.name not in DENSITIES:
+        raise ConfigError(
+            f"agent.turn needs a random world ({', '.join(DENSITIES)}), not '{config.world.name}': "
+            "give --agent.no-turn, or turn: false in a file"
+        )
 
 
 def _world(world: WorldConfig) -> None:
@@ -162,8 +165,13 @@ def _replay(agent: AgentConfig, train: TrainConfig) -> None:
 def _samples(encoder: EncoderConfig, train: TrainConfig) -> None:
     batch, unit, named = encoder.batch_size, train.shards, f"train.shards ({train.shards})"
     if encoder.sequence_decisions > 1:
-        unit *= encoder.sequence_decisions
-        named += f" x encoder.sequence_decisions ({encoder.sequence_decisions})"
+        length = encoder.sequence_decisions
+        _require(length <= 64, "encoder.sequence_decisions", "at most 64", length)
+        needed = length * train.num_envs
+        limit = f"at least {needed}: {length} observations for each of the {train.num_envs} environments"
+        _require(encoder.replay_size >= needed, "encoder.replay_size", limit, encoder.replay_size)
+        unit *= length
+        named += f" x encoder.sequence_decisions ({length})"
     multiple = f"a multiple of {named}, such as {-(-batch // unit) * unit}"
     _require(batch % unit == 0, "encoder.batch_size", multiple, batch)
 

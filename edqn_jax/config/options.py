@@ -154,7 +154,7 @@ class EnvConfig:
     goal_reward: float = 100.0
     """Reward at the goal (Eq. 8)."""
     collision_reward: float = -100.0
-    """Reward at a collision (Eq. 8)."""
+    """Reward at a collision (Eq. 8); random worlds on a GPU have -300."""
     left_volume_reward: float = -100.0
     """Reward for leaving the flight volume; Eq. 8 says 0, and the `paper` preset does too."""
     step_reward: float = -0.2
@@ -210,8 +210,8 @@ class EncoderConfig:
     mirror: bool = True
     """Mirror half of the observations of a VAE update left to right."""
     sequence_decisions: int = 1
-    """Decisions in a row that a VAE update takes from a flight (`patches`). With more than 1 the encoder is recurrent:
-    a code also depends on the one before, and is trained through as many."""
+    """Decisions in a row that a VAE update takes from a flight (`patches`), at most 64. With more than 1 the encoder is
+    recurrent: a code also depends on the one before, and is trained through as many."""
     hold_decisions: int = 4
     """Mean length of a random manoeuvre of the warm-up, decisions."""
     retrain_at: tuple[float, ...] = ()
@@ -271,7 +271,8 @@ class AgentConfig:
     """Observations that the replay holds."""
     turn: bool = False
     """Turn what is drawn from the replay by random quarter turns about the vertical, drone and world alike. Only for
-    random worlds, which have no preferred direction but the sun's; a map that stays the same would be blurred."""
+    random worlds, which have no preferred direction but the sun's; a map that stays the same would be blurred. Off
+    where a reward function of one's own is given, which may prefer one."""
     learning_starts: int = 8192
     """Observations in the replay before the first update."""
     random_decisions: int = 1000

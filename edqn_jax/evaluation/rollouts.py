@@ -158,7 +158,7 @@ def _fly(
         seen = flying.observation
         if shuffle_codes:
             shift = jax.random.randint(shift_key, (), 1, missions)
-            # The code depends on the sensor's output alone, so permuting that permutes the codes.
+            # What a code tells of obstacles is in the sensor's output alone; the own motion stays.
             sensed = jax.tree.map(lambda x: jnp.roll(x, shift, axis=0), seen.sensed)
             seen = dataclasses.replace(seen, sensed=sensed)
         act = partial(policy.act, config, params, key=act_key)  # greedy: the key has no effect

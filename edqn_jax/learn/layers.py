@@ -1,7 +1,8 @@
 """Linear layers whose gradients cost what their products do.
 
 XLA turns the gradient of a kernel that many rows share into a product of transposed copies, and that of a bias into a
-sum that a CPU takes slowly. Both are written as plain products here: a VAE update takes two thirds of the time.
+sum that a CPU takes slowly. Both are written as plain products here: on CPU cores a VAE update takes two thirds of the
+time.
 """
 
 from __future__ import annotations
@@ -16,8 +17,9 @@ import jax.numpy as jnp
 from jax import Array
 from jax.nn.initializers import lecun_normal, zeros
 
-MOST_ROWS = 16_384
-"""Rows that one product sums over in a kernel's gradient; a longer sum is cut into parts that a GPU takes at once."""
+ROWS_OF_A_PART = 16_384
+"""Rows that a part of a kernel's gradient sums over: a GPU takes several parts at once. Where the rows do not divide
+into as many parts, there are fewer, longer ones."""
 
 
 class Dense(nn.Module):
@@ -48,7 +50,7 @@ def _product(x: Array, kernel: Array) -> tuple[Array, tuple[Array, Array]]:
 def _product_gradient(kept: tuple[Array, Array], change: Array) -> tuple[Array, Array]:
     x, kernel = kept
     rows = math.prod(x.shape[:-1])
-    groups = math.gcd(rows, max(1, rows // MOST_ROWS))
+    groups = math.gcd(rows, max(1, rows // ROWS_OF_A_PART))
     parts = jnp.einsum("gmk,gmf->gkf", x.reshape(groups, -1, x.shape[-1]), change.reshape(groups, -1, change.shape[-1]))
     return change @ kernel.T, jnp.sum(parts, axis=0)
 

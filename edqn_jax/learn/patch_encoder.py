@@ -118,6 +118,7 @@ class PatchEncoder(nn.Module):
         # Nothing is remembered at first, so that codes are not random functions of random codes.
         remembered = Dense(widths[0], use_bias=False, kernel_init=zeros, name="previous")
         if begins is None:
+            assert previous is not None, "a recurrent encoder needs the code before"
             return code_of(z + remembered(previous))
         codes = [code_of(z[0])]
         for now in range(1, len(z)):

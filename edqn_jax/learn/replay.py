@@ -88,14 +88,14 @@ def sample(config: AgentConfig, ring: Rows, time: Array, batch: int, key: Array)
     """
     length, envs = ring.reward.shape
     n, h = config.n_step, config.history
-    age_key, env_key, *turn_key = jax.random.split(key, 3 if config.turn else 2)
+    age_key, env_key, *more = jax.random.split(key, 3 if config.turn else 2)
     oldest = jnp.minimum(time + 1, length) - h
     age = n + integers(age_key, (batch,), jnp.maximum(oldest, n) - n + 1)
     env = integers(env_key, (batch,), envs)
     drawn = jax.vmap(lambda a, e: _transition(config, ring, time - a, e))(age, env)
     if not config.turn:
         return drawn
-    quarters = jnp.broadcast_to(integers(*turn_key, (batch, 1), 4), (batch, h))
+    quarters = jnp.broadcast_to(integers(more[0], (batch, 1), 4), (batch, h))
     return dataclasses.replace(
         drawn, history=_turned(drawn.history, quarters), next_history=_turned(drawn.next_history, quarters)
     )

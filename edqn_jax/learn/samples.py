@@ -66,8 +66,8 @@ def empty(config: EncoderConfig, one: Samples, envs: int, total_envs: int) -> Sa
 
 
 def ring_length(config: EncoderConfig, total_envs: int) -> int:
-    """Returns the decisions that the ring holds: at least what one update takes in a row."""
-    return max(config.replay_size // total_envs, config.sequence_decisions)
+    """Returns the decisions that the ring holds."""
+    return max(config.replay_size // total_envs, 1)
 
 
 def write(ring: Samples, rows: Samples, time: Array, keep: Array) -> Samples:
@@ -83,7 +83,7 @@ def write(ring: Samples, rows: Samples, time: Array, keep: Array) -> Samples:
 
 
 def draw(config: EncoderConfig, ring: Samples, time: Array, count: int, key: Array) -> Samples:
-    """Returns `count` samples of one shard, [T, count / T, ...]: T in a row, uniform over those in the ring.
+    """Returns `count` samples of one shard, [T, count / T, ...]: T in a row, of which the first is uniform.
 
     Args:
         time: [] int32, how many decisions have been kept, at least 1. Before there are T, the last is repeated.
@@ -91,7 +91,7 @@ def draw(config: EncoderConfig, ring: Samples, time: Array, count: int, key: Arr
     """
     rows, envs = ring.motion.shape[:2]
     length, flights = config.sequence_decisions, count // config.sequence_decisions
-    row_key, env_key = jax.random.split(key)
+    row_key, env_key, *coin_key = jax.random.split(key, 2 + flights % 2)
     oldest = jnp.maximum(time - (rows - 1), 0)
     first = oldest + integers(row_key, (flights,), jnp.maximum(time - oldest - length, 0) + 1)
     row = jnp.minimum(first + jnp.arange(length)[:, None], time - 1) % (rows - 1)
@@ -99,9 +99,16 @@ def draw(config: EncoderConfig, ring: Samples, time: Array, count: int, key: Arr
     drawn = jax.tree.map(lambda leaf: leaf[row, env], ring)
     if not config.mirror:
         return drawn
+    # Half of them; of an odd number the one in the middle is mirrored or not.
     half = flights // 2
+    turned = jax.tree.map(lambda leaf: leaf[:, : half + 1 if coin_key else half], mirrored(drawn))
+    if coin_key:
+        middle = jax.random.bernoulli(*coin_key)
+        turned = jax.tree.map(
+            lambda new, old: new.at[:, half].set(jnp.where(middle, new[:, half], old[:, half])), turned, drawn
+        )
     join = partial(jnp.concatenate, axis=1)
-    return jax.tree.map(lambda turned, kept: join([turned[:, :half], kept[:, half:]]), mirrored(drawn), drawn)
+    return jax.tree.map(lambda new, old: join([new, old[:, new.shape[1] :]]), turned, drawn)
 
 
 def mirrored(samples: Samples) -> Samples:

@@ -354,7 +354,7 @@ def _keep(config: Config, world: World, actors: Actors, flown: EnvState, seen: e
 
     nothing = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(target))
     wanted = lax.cond(keep, target, lambda: nothing)
-    begins = seen.is_reset | plan.begins_to_keep(step)
+    begins = seen.is_reset | plan.begins_to_keep(config, step)
     rows = samples.samples_of(config.encoder, seen.observation, wanted, begins)
     write = jax.vmap(samples.write, in_axes=(0, 0, None, None))
     return write(actors.samples, _shaped(actors.reward.shape, rows), plan.samples_kept(config, step), keep)
@@ -390,8 +390,8 @@ def learn_to_see(config: Config, axis: str | None, learner: Learner, rings: Samp
 
     def learn(learner: Learner, updates: int):
         many = jax.vmap(lambda k: jax.random.split(k, updates))(keys).swapaxes(0, 1)
-        learner, sums = lax.scan(update, learner, many)
-        means = jax.tree.map(lambda x: _all_sum(jnp.mean(x) * part, axis), sums)
+        learner, found = lax.scan(update, learner, many)
+        means = jax.tree.map(lambda x: _all_sum(jnp.mean(x) * part, axis), found)
         return means, learner
 
     def rest(learner: Learner):

@@ -175,7 +175,8 @@ def encode(
 
     Args:
         motion: `[..., MOTION_SIZE]` own motion, see `sim.env.own_motion`.
-        previous, begins: what a recurrent encoder remembers, see `PatchEncoder`; None of another.
+        previous, begins: what a recurrent encoder remembers, see `PatchEncoder`, which needs one of them; None if the
+            encoder is not recurrent.
     """
     fields = isinstance(sensed, EventField)
     height, width = (sensed.count if fields else sensed).shape[-2:]

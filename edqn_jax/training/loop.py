@@ -106,6 +106,7 @@ class Preparation:
         Raises:
             ConfigError: if the configuration is invalid or the world cannot be flown.
         """
+        config = config_for_reward(config, reward)
         self.configs = _of_agents(config, agents)
         for each in self.configs:
             validate(each)
@@ -144,6 +145,13 @@ class Preparation:
         """World, parameters and key as `fly_missions` takes them."""
         key = run_streams(self.configs[agent].train.seed).flights
         return *processes.replicate((missions.world, params), self.mesh), key
+
+
+def config_for_reward(config: Config, reward: Reward | None) -> Config:
+    """Returns the configuration that a run with a reward of one's own has: the reward may prefer a direction."""
+    if reward is None or not config.agent.turn:
+        return config
+    return dataclasses.replace(config, agent=dataclasses.replace(config.agent, turn=False))
 
 
 def _of_agents(config: Config, agents: int | None) -> list[Config]:

@@ -77,7 +77,7 @@ def test_other_options_make_another_row() -> None:
 
 
 @pytest.mark.slow
-def test_runs_that_there_are_make_a_row_of_their_own(tmp_path: Path, monkeypatch, capsys) -> None:
+def test_existing_runs_make_a_row_of_their_own(tmp_path: Path, monkeypatch, capsys) -> None:
     monkeypatch.setattr(success, "use_cpu_devices", lambda count: None)
     trained = success.config_of("sparse", "blind", SMALL)
     runs = [tmp_path / f"seed-{seed}" for seed in (0, 1)]
@@ -92,10 +92,23 @@ def test_runs_that_there_are_make_a_row_of_their_own(tmp_path: Path, monkeypatch
         (run / "summary.json").write_text(json.dumps(took))
     code = success.main([*words, *map(str, runs)])
     assert code == 0, capsys.readouterr().err
-    assert "| medium | blind | 2 x 3 | 0.00% |" in capsys.readouterr().out
+    assert "| medium, trained in sparse | blind | 2 x 3 | 0.00% |" in capsys.readouterr().out
     (file,) = (tmp_path / "rows").glob("medium-blind-*.json")
     row = json.loads(file.read_text())
     assert [turn["seed"] for turn in row["turns"]] == [0, 1] and row["train_seconds"] == 4.0
+    assert row["trained_in"] == "sparse" and row["runs"] == [str(run) for run in runs]
+    # Runs of one program have its time, and are the same row in another order.
+    together = [{"train_seconds": 9.0, "compile_seconds": 1.0, "trained_together": 2}] * 2
+    monkeypatch.setattr(success, "_summary", lambda run: {**together[0], "train_decisions": 256})
+    assert success.fly_row(success.config_of("medium", "blind", SMALL), [load_policy(r) for r in runs], runs, 3)[
+        "train_seconds"
+    ] == pytest.approx(9.0)
+    monkeypatch.undo()
+    monkeypatch.setattr(success, "use_cpu_devices", lambda count: None)
+    monkeypatch.setattr(success, "fly_row", lambda *_: pytest.fail("measured again"))
+    assert success.main([*words, *map(str, reversed(runs))]) == 0
+    monkeypatch.undo()
+    monkeypatch.setattr(success, "use_cpu_devices", lambda count: None)
     # Other policies are another row, and policies of another training are none at all.
     assert success.main([*words, str(runs[1])]) == 0
     assert len(list((tmp_path / "rows").glob("medium-*.json"))) == 2

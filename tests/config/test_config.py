@@ -196,6 +196,23 @@ def test_every_numeric_option_has_limits(group, option, nonsense):
         ("encoder", {"retrain_at": (1.0,)}, "encoder.retrain_at must be shares between 0 and 1"),
         ("encoder", {"retrain_at": (0.5,), "warmup_decisions": 0}, "warmup_decisions must be at least 1 where"),
         ("encoder", {"batch_size": 12}, r"encoder.batch_size must be a multiple of train.shards \(8\), such as 16"),
+        (
+            "encoder",
+            {"sequence_decisions": 5},
+            r"train.shards \(8\) x encoder.sequence_decisions \(5\), such as 280, not 256",
+        ),
+        ("encoder", {"sequence_decisions": 65}, "encoder.sequence_decisions must be at most 64, not 65"),
+        (
+            "encoder",
+            {"sequence_decisions": 2, "architecture": "pooled"},
+            "must be 1 unless encoder.architecture is patches",
+        ),
+        (
+            "encoder",
+            {"sequence_decisions": 2, "replay_size": 511},
+            "encoder.replay_size must be at least 512: 2 observations for each of the 256 environments, not 511",
+        ),
+        ("agent", {"turn": True}, r"agent.turn needs a random world \(sparse, .*\), not 'paper': give --agent.no-turn"),
         ("encoder", {"patch_layers": ()}, "encoder.patch_layers must be one or more widths"),
         ("encoder", {"joint_layers": (8, 0)}, "encoder.joint_layers must be one or more widths"),
         ("events", {"frame_times_s": (-0.04, -0.02)}, "end at 0"),

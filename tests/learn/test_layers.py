@@ -11,7 +11,7 @@ import pytest
 from edqn_jax.learn import layers
 
 
-@pytest.mark.parametrize("rows", [(), (3,), (4, 5), (2 * layers.MOST_ROWS + 6,)])
+@pytest.mark.parametrize("rows", [(), (3,), (4, 5), (2 * layers.ROWS_OF_A_PART + 6,)])
 @pytest.mark.parametrize("use_bias", [True, False])
 def test_a_layer_is_that_of_flax_with_its_gradients(rows: tuple[int, ...], use_bias: bool) -> None:
     keys = jax.random.split(jax.random.key(0), 3)
@@ -21,7 +21,9 @@ def test_a_layer_is_that_of_flax_with_its_gradients(rows: tuple[int, ...], use_b
     assert jax.tree.all(jax.tree.map(np.array_equal, ours.init(keys[2], x), params))
 
     def gradients(layer: nn.Module):
-        return jax.grad(lambda p, x: jnp.sum(weight * jnp.square(layer.apply(p, x))), argnums=(0, 1))(params, x)
+        return jax.grad(lambda p, x: jnp.sum(weight * jnp.square(jnp.asarray(layer.apply(p, x)))), argnums=(0, 1))(
+            params, x
+        )
 
     for found, wanted in zip(jax.tree.leaves(gradients(ours)), jax.tree.leaves(gradients(theirs)), strict=True):
         # Sums of up to 32 774 terms in float32, in another order.

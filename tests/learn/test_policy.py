@@ -76,6 +76,23 @@ def test_memory_stacks_an_episode_as_the_replay_does(params, act):
         np.testing.assert_allclose(memory, trained_on, atol=1e-5)
 
 
+def test_a_recurrent_policy_remembers_what_its_encoder_was_trained_to() -> None:
+    config = dataclasses.replace(CONFIG, encoder=dataclasses.replace(CONFIG.encoder, sequence_decisions=4))
+    encoder = vae.init_vae(config.encoder, config.camera, jax.random.key(2))
+    previous = encoder["encoder"]["previous"]
+    previous["kernel"] = jax.random.normal(jax.random.key(3), previous["kernel"].shape)  # at first it remembers nothing
+    seen = observations(5)
+    together = jax.tree.map(lambda *leaves: jnp.stack(leaves), *seen)
+    codes, _ = vae.encode(config.encoder, encoder, together.sensed, together.motion, begins=jnp.zeros(5, bool))  # pyright: ignore[reportArgumentType]
+    memory = policy.empty_memory(config)
+    see = jax.jit(partial(policy.see, config))
+    for number, each in enumerate(seen):
+        memory = see(encoder, memory, each)
+        np.testing.assert_allclose(memory[-1, :5], config.agent.code_scale * codes[number], atol=1e-5)
+    alone = vae.encode(config.encoder, encoder, seen[-1].sensed, seen[-1].motion, jnp.zeros(5))[0]  # pyright: ignore[reportArgumentType]
+    assert np.abs(alone - codes[-1]).max() > 0.01
+
+
 @pytest.mark.slow
 def test_an_observation_is_the_scaled_code_and_the_own_state(params):
     one = observations(1)[0]

@@ -210,16 +210,22 @@ def test_what_is_drawn_is_turned_in_whole_quarters_and_only_the_own_state_is() -
         )
         ring = replay.write(ring, rows, jnp.int32(time))
     drawn = replay.sample(config, ring, jnp.int32(LENGTH - 1), 256, jax.random.key(0))
-    kept = {row.tobytes(): row for row in np.asarray(ring.observation).reshape(-1, 3 + OWN_SIZE)}
+    rows = np.asarray(ring.observation).reshape(-1, 3 + OWN_SIZE)
+    turned_rows = {row[:3].tobytes(): [] for row in rows}
+    for quarters in range(4):
+        for row, own in zip(
+            rows, np.asarray(turned(jnp.asarray(rows[:, 3:]), jnp.full(len(rows), quarters))), strict=True
+        ):
+            turned_rows[row[:3].tobytes()].append(own)
     turns = Counter()
-    for history, later in zip(np.asarray(drawn.history), np.asarray(drawn.next_history), strict=True):
-        found = set()
-        for seen in (*history, *later):
-            if not seen.any():
-                continue  # from before the episode
-            (source,) = [row for row in kept.values() if (row[:3] == seen[:3]).all()]
-            quarters = [k for k in range(4) if np.allclose(turned(source[3:], jnp.int32(k)), seen[3:], atol=1e-6)]
-            found.update(quarters)
+    for transition in np.concatenate([drawn.history, drawn.next_history], axis=1):
+        seen = [each for each in transition if each.any()]  # the others are from before the episode
+        found = {
+            quarters
+            for each in seen
+            for quarters, own in enumerate(turned_rows[each[:3].tobytes()])
+            if np.allclose(own, each[3:], atol=1e-6)
+        }
         assert len(found) == 1, "one transition is turned as a whole"
         turns.update(found)
     # A quarter of 256 each: 64, five deviations of 7.

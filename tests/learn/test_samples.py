@@ -105,14 +105,14 @@ def test_half_of_what_is_drawn_is_mirrored() -> None:
     assert (turned[:128] < 0.0).sum() > 90 and (turned[128:] > 0.0).sum() > 90
 
 
-@pytest.mark.parametrize(("kept", "lengths"), [(3, {0}), (9, {5, 6}), (10, {6, 7})])
-def test_decisions_in_a_row_are_of_one_flight(kept: int, lengths: set[int]) -> None:
+@pytest.mark.parametrize(("kept", "firsts"), [(3, {0}), (9, {5, 6}), (10, {6, 7})])
+def test_decisions_in_a_row_are_of_one_flight(kept: int, firsts: set[int]) -> None:
     config = dataclasses.replace(CONFIG, sequence_decisions=3)
     ring, time = ring_after([True] * kept)
     drawn = samples.draw(config, ring, jnp.int32(time), 3 * 64, jax.random.key(1))
     assert drawn.motion.shape == (3, 64, MOTION_SIZE)
     numbers, envs = np.divmod(np.rint(10 * np.asarray(drawn.motion[..., 0])).astype(int), 10)
-    assert set(numbers[0]) == lengths and (envs == envs[0]).all()
+    assert set(numbers[0]) == firsts and (envs == envs[0]).all()
     np.testing.assert_array_equal(numbers, numbers[0] + np.arange(3)[:, None])
     np.testing.assert_array_equal(drawn.begins, numbers % 2 == 0)
 

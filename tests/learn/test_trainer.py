@@ -232,6 +232,9 @@ def test_a_retrained_encoder_begins_a_replay_of_its_own() -> None:
     assert plan.samples_kept(config, steps).tolist() == [0, 1, 2, 3, *[4] * 13, 5, *[6] * 6]
     always = dataclasses.replace(config, encoder=dataclasses.replace(config.encoder, keep_learning=True))
     assert plan.samples_kept(always, steps).tolist() == list(range(24))
+    # The first row of a training does not go on from the last one of the training before.
+    assert np.flatnonzero(plan.begins_to_keep(config, steps)).tolist() == [0, 16]
+    assert np.flatnonzero(plan.begins_to_keep(always, steps)).tolist() == [0]
 
 
 @pytest.mark.parametrize(

@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 
 from edqn_jax.cli.arguments import parse_train
-from edqn_jax.cli.train import said_by_all
+from edqn_jax.cli.train import options_to_compare
 from edqn_jax.config import Config
 from edqn_jax.config.loading import to_yaml
 from edqn_jax.errors import ConfigError
@@ -140,7 +140,7 @@ def test_processes_may_keep_a_world_file_in_different_folders_but_not_another_wo
         file = tmp_path / folder / "map.xml"
         file.parent.mkdir()
         file.write_text(text)
-        return said_by_all(parse_train(["--world", str(file), "--tuned-for", "cpu"])[1])
+        return options_to_compare(parse_train(["--world", str(file), "--tuned-for", "cpu"])[1])
 
     here = said("here", WORLD)
     assert said("there", WORLD) == here

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import dataclasses
 import re
+from importlib import import_module
 from pathlib import Path
 
 import pytest
 
 import edqn_jax
+from edqn_jax.cli.arguments import parse_train
 from edqn_jax.policies import PRETRAINED, policy_folder
 from edqn_jax.runs.directory import version_of
 
@@ -36,6 +39,15 @@ def test_its_card_tells_of_its_training() -> None:
     assert f"{config.world.pool_size:,} random worlds" in card and config.world.name == "mixed"
     for density in ("sparse", "medium", "dense"):
         assert re.search(rf"^\| {density} \| 1000 \| (9\d|100)\.\d% \| ", card, re.MULTILINE), density
+
+
+def test_its_script_trains_with_its_options(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(str(Path(__file__).parents[2] / "scripts"))
+    options = edqn_jax.load_policy(PRETRAINED).config
+    _, asked = parse_train(import_module("pretrain").FLAGS)
+    # Validation changes nothing where the last parameters are kept; this policy was trained before its script.
+    train = {name: getattr(options.train, name) for name in ("validation_every", "validation_missions", "keep")}
+    assert dataclasses.replace(asked, train=dataclasses.replace(asked.train, **train)) == options
 
 
 @pytest.mark.slow

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 from edqn_jax.config import Config
+from edqn_jax.config.loading import make_config
 from edqn_jax.evaluation.judge import clearance, load_judge
 from edqn_jax.evaluation.missions import load_missions
 from edqn_jax.runs.provenance import reward_record
@@ -21,6 +22,7 @@ from edqn_jax.sim import env
 from edqn_jax.sim.moves import ACTIONS
 from edqn_jax.sim.outcomes import Outcome
 from edqn_jax.sim.reward import Reward, Transition
+from edqn_jax.training.loop import config_for_reward
 
 CONFIG = dataclasses.replace(Config(), env=dataclasses.replace(Config().env, sensor="blind"))
 
@@ -105,3 +107,11 @@ def test_a_reward_without_a_source_has_no_digest() -> None:
 def test_the_configured_reward_has_its_own_name() -> None:
     shaped = dataclasses.replace(Config(), env=dataclasses.replace(Config().env, reward="potential"))
     assert reward_record(shaped, None) == {"name": "potential", "source_sha256": None}
+
+
+def test_a_reward_of_ones_own_may_prefer_a_direction() -> None:
+    turning = make_config("medium")
+    assert turning.agent.turn and config_for_reward(turning, None) == turning
+    straight = config_for_reward(turning, lambda transition: -transition.after[0])
+    assert not straight.agent.turn
+    assert dataclasses.replace(straight, agent=turning.agent) == turning
