@@ -24,7 +24,7 @@ from tests.policies import CONFIG, always, that_sees
 
 pytestmark = pytest.mark.slow
 
-MISSIONS = 200
+MISSIONS = 80
 DT = CONFIG.drone.physics_dt_s
 N = CONFIG.drone.physics_steps
 

@@ -198,7 +198,7 @@ def test_the_replay_is_strict():
 
 
 def test_what_is_drawn_is_turned_in_whole_quarters_and_only_the_own_state_is() -> None:
-    rng, config = np.random.default_rng(5), dataclasses.replace(agent(3, 2), turn=True)
+    rng, config, write = np.random.default_rng(5), dataclasses.replace(agent(3, 2), turn=True), jax.jit(replay.write)
     ring = replay.empty(config, ENVS, ENVS, 3 + OWN_SIZE)
     for time in range(LENGTH):
         rows = replay.Rows(
@@ -208,8 +208,8 @@ def test_what_is_drawn_is_turned_in_whole_quarters_and_only_the_own_state_is() -
             is_reset=jnp.full(ENVS, time % 5 == 0),
             action=jnp.zeros(ENVS, jnp.int32),
         )
-        ring = replay.write(ring, rows, jnp.int32(time))
-    drawn = replay.sample(config, ring, jnp.int32(LENGTH - 1), 256, jax.random.key(0))
+        ring = write(ring, rows, jnp.int32(time))
+    drawn = jax.jit(replay.sample, static_argnums=(0, 3))(config, ring, jnp.int32(LENGTH - 1), 256, jax.random.key(0))
     rows = np.asarray(ring.observation).reshape(-1, 3 + OWN_SIZE)
     turned_rows = {row[:3].tobytes(): [] for row in rows}
     for quarters in range(4):
