@@ -1,8 +1,8 @@
 """Linear layers whose gradients cost what their products do.
 
 XLA turns the gradient of a kernel that many rows share into a product of transposed copies, and that of a bias into a
-sum that a CPU takes slowly. Both are written as plain products here: on CPU cores a VAE update takes two thirds of the
-time.
+sum that a CPU takes slowly. Both are written as plain products here: on CPU cores a VAE update takes seven tenths of
+the time.
 """
 
 from __future__ import annotations
