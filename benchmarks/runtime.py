@@ -159,12 +159,13 @@ def check_worlds(worlds: Sequence[str]) -> None:
 
 
 def configured(world: str, flags: Sequence[str], quick: bool) -> Config:
-    """Returns the configuration of `train.py` for that world, with `POINTS` validations.
+    """Returns the configuration of `train.py` for that world, with `POINTS` validations and test missions alone.
 
     Raises:
         ConfigError: if it is invalid.
     """
     _, config = parse_train(["--world", world, *(QUICK if quick else ()), *flags])
+    config = dataclasses.replace(config, world=dataclasses.replace(config.world, flown=""))
     if not quick and not any(flag.replace("_", "-").startswith("--train.validation-every") for flag in flags):
         every = -(-config.train.total_steps // POINTS)
         config = dataclasses.replace(config, train=dataclasses.replace(config.train, validation_every=every))

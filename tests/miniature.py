@@ -12,6 +12,7 @@ from edqn_jax.sim.env import World
 from edqn_jax.sim.scene import stack_scenes
 
 MINIATURE = (
+    *("--world", "paper"),
     *("--num-envs", "16", "--agent.batch-size", "16", "--agent.replay-size", "512", "--agent.learning-starts", "64"),
     *("--camera.width", "8", "--camera.height", "6", "--train.validation-missions", "2", "--world.missions", "16"),
     *("--drone.physics", "rigid_body"),  # compiles in less time

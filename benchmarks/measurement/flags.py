@@ -23,10 +23,13 @@ def split(words: Sequence[str]) -> tuple[list[str], list[str]]:
 def configured(flags: Sequence[str]) -> Config:
     """Returns the configuration of train.py with these options, with `SAMPLES` unless they set the updates per step.
 
+    Without a world or a file among them it is the reference workload: the paper's world.
+
     Raises:
         ConfigError: if it is invalid.
     """
-    _, config = parse_train(flags)
+    named = any(flag.partition("=")[0] in ("--world", "--world.name", "--config") for flag in flags)
+    _, config = parse_train(flags if named else ["--world", "paper", *flags])
     if any(flag.replace("_", "-").startswith(("--agent.updates-per-step", "--config")) for flag in flags):
         return config
     updates = math.ceil(SAMPLES * config.train.num_envs / config.agent.batch_size)

@@ -9,7 +9,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from edqn_jax.config import DENSITIES, Config
+from edqn_jax.config import Config
 from edqn_jax.config.limits import validate
 from edqn_jax.config.loading import apply
 from edqn_jax.errors import DivergedError
@@ -54,7 +54,7 @@ class Validation:
     def __init__(self, config: Config, missions: RunMissions, fly: Callable[[World, Any], Flights]) -> None:
         """Starts without validations; `fly(world, params)` flies every mission of a world once, greedily."""
         self.config, self.missions, self.fly = config, missions, fly
-        self.judged = judged_of(config, missions)
+        self.judged = missions.tests or 1
         self.kept: Candidate | None = None
         self.curve: list[dict[str, Any]] = []
 
@@ -110,11 +110,6 @@ class Validation:
             "curve": self.curve,
             "flights": {**self.flights, "planning_seconds": [float(elapsed[n - 1]) for n in self.flights["decisions"]]},
         }
-
-
-def judged_of(config: Config, missions: RunMissions) -> int:
-    """Returns the number of test missions: in a world from a file only one, the others are for validation."""
-    return missions.final.world.missions.scene.shape[0] if config.world.name in DENSITIES else 1
 
 
 class Learner:

@@ -135,11 +135,13 @@ def parse_train(argv: Sequence[str]) -> tuple[TrainOptions, Config]:
     world = _parse_config(early, base).world.name
     config = _parse_config(argv, resolve(options.preset, options.config, world, tuned_for))
     validate(config)
-    # A file must be found again from any folder.
-    if config.world.name not in DENSITIES and Path(config.world.name).is_file():
-        world = dataclasses.replace(config.world, name=str(Path(config.world.name).resolve()))
-        config = dataclasses.replace(config, world=world)
-    return options, config
+    world = dataclasses.replace(config.world, name=_found(config.world.name), flown=_found(config.world.flown))
+    return options, dataclasses.replace(config, world=world)
+
+
+def _found(world: str) -> str:
+    """Returns the name of a world; of a file, its whole path, by which it is found again from any folder."""
+    return str(Path(world).resolve()) if world not in DENSITIES and Path(world).is_file() else world
 
 
 def check_flags(argv: Sequence[str], known: Iterable[str], command: str) -> None:

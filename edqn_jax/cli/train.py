@@ -71,17 +71,25 @@ def options_to_compare(config: Config) -> str:
     Raises:
         ConfigError: if there is no such file, or it cannot be read.
     """
+    world = dataclasses.replace(config.world, name=_held(config.world.name), flown=_held(config.world.flown))
+    return to_yaml(dataclasses.replace(config, world=world))
+
+
+def _held(world: str) -> str:
+    """Returns the name of a random world or of none, and of a file the SHA-256 of what it holds.
+
+    Raises:
+        ConfigError: as `options_to_compare`.
+    """
     from edqn_jax.sim.mjcf import resolve_world
 
-    if config.world.name in DENSITIES:
-        return to_yaml(config)
-    file = resolve_world(config.world.name)
+    if not world or world in DENSITIES:
+        return world
+    file = resolve_world(world)
     try:
-        held = file.read_bytes()
+        return hashlib.sha256(file.read_bytes()).hexdigest()
     except OSError as error:
         raise ConfigError(f"cannot read the world '{file}': {error.strerror}") from None
-    world = dataclasses.replace(config.world, name=hashlib.sha256(held).hexdigest())
-    return to_yaml(dataclasses.replace(config, world=world))
 
 
 def _check_gpu() -> None:

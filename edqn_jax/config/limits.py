@@ -50,6 +50,13 @@ def _world(world: WorldConfig) -> None:
     _not_negative(world, "world", ["start_jitter_m"])
     if not world.name:
         raise ConfigError("world.name must be the name of a world, not empty")
+    if world.flown and world.name not in DENSITIES:
+        raise ConfigError(
+            f"world.flown needs training in random worlds ({', '.join(DENSITIES)}), not in '{world.name}', "
+            "which is flown itself"
+        )
+    if world.flown in DENSITIES:
+        raise ConfigError(f"world.flown must be `paper` or an MJCF file, not the random world '{world.flown}'")
 
 
 def _drone(drone: DroneConfig) -> None:

@@ -27,14 +27,17 @@ Layer = Mapping[str, Mapping[str, Any]]
 Hardware = Literal["cpu", "gpu"]
 """What defaults are chosen for."""
 
+WORLD = "medium"
+"""World of the `default` preset where nothing names one."""
+
 RANDOM_WORLDS: Layer = {
-    "world": {"pool_size": 4096, "missions": 32_768},
-    "train": {"total_steps": 5_000_000, "validation_every": 1_000_000, "validation_missions": 1024},
+    "world": {"flown": "paper", "pool_size": 4096, "missions": 32_768},
+    "train": {"total_steps": 1_500_000, "validation_every": 1_500_000, "validation_missions": 1024},
     "encoder": {
-        "warmup_decisions": 131_072,
+        "warmup_decisions": 65_536,
         "replay_size": 65_536,
         "retrain_at": (0.15,),
-        "retrain_decisions": 131_072,
+        "retrain_decisions": 65_536,
     },
     "agent": {
         "history": 2,
@@ -105,7 +108,8 @@ def resolve(
     Args:
         preset_name: one of `config.PRESETS`; world and hardware change only `default`.
         file: a YAML file.
-        world: name of the world given by a flag; None takes that of the file or the preset.
+        world: name of the world given by a flag; None takes that of the file, else `WORLD` (the paper's, in the preset
+            `paper`).
         tuned_for: hardware that the defaults are chosen for.
 
     Raises:
@@ -113,6 +117,8 @@ def resolve(
     """
     layer = load_layer(file) if file is not None else {}
     config = apply(named_preset(preset_name), layer, str(file))
+    if world is None and preset_name == "default" and "name" not in layer.get("world", {}):
+        world = WORLD
     if world is not None:
         config = apply(config, {"world": {"name": world}}, "the command line")
     if preset_name != "default":
@@ -138,7 +144,8 @@ def make_config(
         make_config("medium", train={"total_steps": 100_000}, agent={"n_step": 5})
 
     Args:
-        world: `paper`, `sparse`, `medium`, `dense`, `mixed` or an MJCF file; None leaves it to file and preset.
+        world: `paper`, `sparse`, `medium`, `dense`, `mixed` or an MJCF file; None leaves it to the file, else it is
+            `medium` (`paper` in the preset of that name).
         preset: one of `config.PRESETS`.
         tuned_for: `cpu` or `gpu`: what environments, batches, networks and decisions are chosen for.
         file: a YAML file with groups of options.

@@ -15,7 +15,11 @@ class WorldConfig:
     """Where to fly."""
 
     name: str = "paper"
-    """`paper`, a random density (`sparse`, `medium`, `dense`, or `mixed`: all three), or the path of an MJCF file."""
+    """Where to train: `paper`, a random density (`sparse`, `medium`, `dense`, or `mixed`: all three), or the path of an
+    MJCF file."""
+    flown: str = ""
+    """World of the flight that a run in random worlds ends with: `paper`, or the path of an MJCF file, which training
+    never uses. Empty: a test world, or the file that was trained in."""
     pool_size: int = 1024
     """Random training worlds, generated before training (random densities only)."""
     missions: int = 8192

@@ -19,7 +19,7 @@ from edqn_jax.sim import drone, worlds
 from edqn_jax.sim.env import World
 from edqn_jax.sim.mjcf import check_scene, load_world, resolve_world, widened, write_scene
 from edqn_jax.sim.reward import Reward
-from edqn_jax.sim.scene import Scene, stack_scenes, take_scene
+from edqn_jax.sim.scene import Scene, stack_scenes, take_scene, with_equal_capacities
 from edqn_jax.sim.worlds import Missions
 
 Point = tuple[float, float, float]
@@ -72,6 +72,8 @@ class RunMissions:
     """Mission 0 decides the run's verdict; it is not flown before the end."""
     near_start: np.ndarray
     """[M] bool: which validation missions begin at or near their world's own start."""
+    tests: int
+    """How many of the final missions, counted from the last, judge the policy in unseen random worlds."""
 
     @property
     def scene(self) -> Scene:
@@ -118,27 +120,43 @@ def missions_of_runs(configs: Sequence[Config], reward: Reward | None = None) ->
 
 
 def _random_run_missions(config: Config, training_key: jax.Array) -> RunMissions:
-    """Returns missions of random worlds; every validation and final mission has a world of its own."""
-    name, count = config.world.name, config.train.validation_missions
+    """Returns missions of random worlds; every validation and final mission has a world of its own.
+
+    Where `world.flown` names a world, the first final mission is that world's own.
+    """
+    name, flown, count = config.world.name, config.world.flown, config.train.validation_missions
     airframe = drone.load_airframe(config.drone)
     training_pool = worlds.random_pool(name, worlds.world_keys("training", config.world.pool_size))
     training = worlds.random_missions(training_pool, config.world.missions, training_key)
     validation, test = (worlds.random_pool(name, worlds.world_keys(split, count)) for split in ("validation", "test"))
+    if flown:
+        validation, test, own = with_equal_capacities([validation, test, _pool_of(flown, config)])
+        test = jax.tree.map(lambda one, many: jnp.concatenate([one, many[:-1]]), own, test)
     return RunMissions(
         training=MissionSet(name, World(airframe, training_pool, training)),
         validation=MissionSet(name, World(airframe, validation, worlds.own_missions(validation))),
         final=MissionSet(name, World(airframe, test, worlds.own_missions(test))),
         near_start=np.ones(count, bool),
+        tests=count - 1 if flown else count,
     )
+
+
+def _pool_of(name: str, config: Config) -> Scene:
+    """Returns the pool of the one world of a file.
+
+    Raises:
+        ConfigError: if the file is no world, or the drone does not fit where its mission starts or ends.
+    """
+    loaded = load_world(resolve_world(name))
+    check_scene(loaded.scene, config.drone.body_radius_m, names=loaded.names, title=f"'{name}'")
+    return stack_scenes([loaded.scene])
 
 
 def _file_run_missions(config: Config, training_key: jax.Array, validation_key: jax.Array) -> RunMissions:
     """Returns missions of a world from a file: all end at its goal, the final one begins at its start."""
     name, count = config.world.name, config.train.validation_missions
     airframe, file = drone.load_airframe(config.drone), resolve_world(name)
-    loaded = load_world(file)
-    check_scene(loaded.scene, config.drone.body_radius_m, names=loaded.names, title=f"'{name}'")
-    pool = stack_scenes([loaded.scene])
+    pool = _pool_of(name, config)
     spread, jitter = config.world.own_start_fraction, config.world.start_jitter_m
     training = worlds.spread_missions(pool, config.world.missions, spread, jitter, training_key)
     # Half of the validation begins near the start, but never at it.
@@ -151,7 +169,8 @@ def _file_run_missions(config: Config, training_key: jax.Array, validation_key: 
         training=MissionSet(name, World(airframe, pool, training), file),
         validation=MissionSet(name, World(airframe, pool, validation), file),
         final=MissionSet(name, World(airframe, pool, final), file),
-        near_start=_near(validation, np.asarray(loaded.scene.start), near),
+        near_start=_near(validation, np.asarray(pool.start[0]), near),
+        tests=0,
     )
 
 

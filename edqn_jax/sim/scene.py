@@ -386,6 +386,22 @@ def stack_scenes(scenes: Sequence[Scene]) -> Scene:
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *padded)
 
 
+def with_equal_capacities(pools: Sequence[Scene]) -> list[Scene]:
+    """Returns the pools, every kind of shape padded to its largest capacity in any of them."""
+
+    def padded(kind: str, pool: Scene) -> Shape:
+        shapes = getattr(pool, kind)
+        worlds, capacity = shapes.position.shape[:2]
+        missing = max(getattr(other, kind).position.shape[1] for other in pools) - capacity
+        absent = jax.tree.map(
+            lambda leaf: jnp.broadcast_to(jnp.asarray(leaf, jnp.float32), (worlds, missing, *np.shape(leaf))),
+            parked_shape(KINDS[kind]),
+        )
+        return jax.tree.map(lambda *parts: jnp.concatenate(parts, axis=1), shapes, absent)
+
+    return [dataclasses.replace(pool, **{kind: padded(kind, pool) for kind in KINDS}) for pool in pools]
+
+
 def take_scene(pool: Scene, index: ArrayLike) -> Scene:
     """Returns world `index` of a pool."""
     return jax.tree.map(lambda leaf: leaf[index], pool)

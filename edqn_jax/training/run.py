@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import time
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -9,7 +10,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from edqn_jax.config import DENSITIES, Config
+from edqn_jax.config import Config
 from edqn_jax.errors import StoppedError
 from edqn_jax.evaluation.metrics import clearance_text, flight_summary, summarise
 from edqn_jax.evaluation.trajectories import trajectory
@@ -97,6 +98,7 @@ def summary_of(
         **flight_summary(flights),
         "shortest_path_m": preparation.shortest.length_m,
         "world": config.world.name,
+        "flown": config.world.flown or config.world.name,
         "seed": config.train.seed,
         "train_decisions": result.decisions,
         "train_seconds": result.train_seconds,
@@ -115,8 +117,9 @@ def summary_of(
         "versions": versions(),
         "state_digest": digest,
     }
-    if config.world.name in DENSITIES:
-        summary["test"] = summarise(flights)
+    tests = preparation.missions[0].tests
+    if tests:
+        summary["test"] = summarise(jax.tree.map(lambda x: x[-tests:], dataclasses.replace(flights, record=None)))
     return summary
 
 
@@ -148,7 +151,7 @@ def _verdict(summary: dict[str, Any], run: RunDirectory) -> str:
         "diverged": "diverged",
     }[summary["outcome"]]
     text = (
-        f"The greedy flight {ending} after {count(summary['steps'], 'decision')} ({summary['flight_seconds']:.1f} s): "
+        f"{_flight(summary)} {ending} after {count(summary['steps'], 'decision')} ({summary['flight_seconds']:.1f} s): "
         f"{summary['path_length_m']:.1f} m flown, shortest path {summary['shortest_path_m']:.1f} m. "
         f"{_nearest(summary)}"
     )
@@ -163,6 +166,14 @@ def _verdict(summary: dict[str, Any], run: RunDirectory) -> str:
         f"{text}\nTook {clock(summary['total_seconds'])} in all, {clock(summary['train_seconds'])} of it training. "
         f"Everything is in {run.path}"
     )
+
+
+def _flight(summary: dict[str, Any]) -> str:
+    """Returns which flight the verdict is about."""
+    if summary["flown"] == summary["world"]:
+        return "The greedy flight"
+    where = "the paper's map" if summary["flown"] == "paper" else f"'{summary['flown']}'"
+    return f"The greedy flight through {where}, which training never used,"
 
 
 def _nearest(summary: dict[str, Any]) -> str:

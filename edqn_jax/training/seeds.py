@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from edqn_jax.config import DENSITIES, Config
+from edqn_jax.config import Config
 from edqn_jax.errors import StoppedError
 from edqn_jax.evaluation.intervals import interquartile_mean, rate_interval
 from edqn_jax.parallel import processes
@@ -62,7 +62,7 @@ def train_seeds_run(
         digests = [state_digest(preparation.trainer.of_agent(results[0].state, k)) for k in agents]
         together = {"trained_together": seeds}
         summaries = [summary_of(preparation, results[k], flights[k], digests[k], reward) | together for k in agents]
-        whole = _summary_of_all(config, flights, summaries)
+        whole = _summary_of_all(config, preparation.missions[0].tests, flights, summaries)
         if run is not None:
             progress.phase("drawing")
             sights = sights_of(preparation)
@@ -78,11 +78,12 @@ def train_seeds_run(
     return whole
 
 
-def _summary_of_all(config: Config, flights: list[Flights], summaries: list[dict[str, Any]]) -> dict[str, Any]:
+def _summary_of_all(
+    config: Config, tests: int, flights: list[Flights], summaries: list[dict[str, Any]]
+) -> dict[str, Any]:
     """Returns what the seeds say together: in random worlds of all test missions, elsewhere of the one mission."""
     arrived = np.array([np.asarray(flown.outcome) == Outcome.GOAL for flown in flights])
-    if config.world.name not in DENSITIES:
-        arrived = arrived[:, :1]
+    arrived = arrived[:, -tests:] if tests else arrived[:, :1]
     rates = arrived.mean(axis=1)
     return {
         "world": config.world.name,

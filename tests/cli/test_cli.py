@@ -49,8 +49,16 @@ def trainer(monkeypatch):
     return behaviour
 
 
-def test_no_argument_is_the_default_preset(trainer):
-    assert parse_train([])[1] == Config()
+def test_no_argument_trains_in_random_worlds_and_flies_the_papers(trainer):
+    _, config = parse_train([])
+    assert (config.world.name, config.world.flown) == ("medium", "paper")
+    assert config == parse_train(["--world", "medium"])[1] == make_config()
+
+
+def test_the_world_of_a_file_stands_without_a_flag(tmp_path, trainer):
+    file = tmp_path / "options.yaml"
+    file.write_text("world: {name: paper}\n")
+    assert parse_train(["--config", str(file)])[1] == parse_train(["--world", "paper"])[1] == Config()
 
 
 def test_flags_win_over_the_file_and_the_file_over_the_preset(tmp_path):

@@ -44,7 +44,7 @@ def test_the_file_wins_over_the_preset_and_leaves_the_rest(tmp_path):
 
 
 def test_an_empty_file_changes_nothing(tmp_path):
-    assert resolve(file=write(tmp_path, "# nothing\n")) == Config()
+    assert resolve(file=write(tmp_path, "# nothing\n")) == resolve()
 
 
 @pytest.mark.parametrize("world", DENSITIES)
