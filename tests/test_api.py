@@ -92,7 +92,7 @@ def test_a_move_that_is_none_is_named(move: object, message: str) -> None:
 def test_options_are_given_by_group_and_the_world_brings_its_own() -> None:
     config = edqn_jax.make_config("medium", train={"num_envs": 64}, agent={"n_step": 5})
     assert (config.world.name, config.train.num_envs, config.agent.n_step) == ("medium", 64, 5)
-    assert config.events.threshold == 0.03 != edqn_jax.make_config().events.threshold
+    assert config.events.threshold == 0.03 != edqn_jax.make_config("paper").events.threshold
     with pytest.raises(edqn_jax.ConfigError, match="agent.n_stp.*did you mean 'n_step'"):
         edqn_jax.make_config(agent={"n_stp": 5})
     with pytest.raises(edqn_jax.ConfigError, match="train.num_envs must be a multiple"):

@@ -10,7 +10,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from edqn_jax.config import Config
+from edqn_jax.config import DENSITIES, Config
 from edqn_jax.errors import StoppedError
 from edqn_jax.evaluation.metrics import clearance_text, flight_summary, summarise
 from edqn_jax.evaluation.trajectories import trajectory
@@ -52,7 +52,7 @@ def train_run(
         StoppedError: after saving the policy, if `stop_requested()` turned true.
     """
     with prepared(config, reward, progress) as preparation:
-        progress.message(f"{config.world.name} world, {described(preparation.devices)}")
+        progress.message(f"{trained_in(config)}, {described(preparation.devices)}")
         processes.together(lambda: None if run is None else run.create(config))
         (result,) = run_chunks(preparation, lambda chunk: record(run, chunk) or stop_requested())
         if run is not None:
@@ -134,6 +134,12 @@ def draw(run: RunDirectory, preparation: Preparation, sights: Sights, result: Tr
     run.write_trajectory(trajectory(preparation.config, flights))
     outcome = flight_summary(flights)["outcome"]
     draw_gallery(run, sights, result.policy.params, np.asarray(preparation.shortest.points), outcome)
+
+
+def trained_in(config: Config) -> str:
+    """Returns what the training worlds are, for the screen."""
+    name = config.world.name
+    return f"{config.world.pool_size:,} random {name} worlds" if name in DENSITIES else f"world '{name}'"
 
 
 def described(devices: Sequence[jax.Device]) -> str:  # pyright: ignore[reportInvalidTypeForm]

@@ -20,7 +20,7 @@ from edqn_jax.sim.flights import Flights
 from edqn_jax.sim.outcomes import Outcome
 from edqn_jax.sim.reward import Reward
 from edqn_jax.training.loop import prepared, run_chunks
-from edqn_jax.training.run import described, draw, record, sights_of, summary_of
+from edqn_jax.training.run import described, draw, record, sights_of, summary_of, trained_in
 
 
 def train_seeds_run(
@@ -46,7 +46,7 @@ def train_seeds_run(
     """
     with prepared(config, reward, progress, agents=seeds) as preparation:
         configs, agents = preparation.configs, range(seeds)
-        progress.message(f"{config.world.name} world, {seeds} seeds, {described(preparation.devices)}")
+        progress.message(f"{trained_in(config)}, {seeds} seeds, {described(preparation.devices)}")
         processes.together(lambda: None if run is None else run.create_for_seeds(configs))
         folders = [None if run is None else run.of_seed(each.train.seed) for each in configs]
         results = run_chunks(preparation, lambda chunk: record(folders[chunk.agent], chunk) or stop_requested())

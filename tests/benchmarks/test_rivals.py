@@ -66,7 +66,7 @@ def test_a_planner_says_no_path_where_there_is_none(tmp_path: Path, monkeypatch:
 
 @pytest.mark.slow
 def test_the_judged_worlds_are_those_that_training_ends_with() -> None:
-    _, config = parse_train(["--world", "medium", *MINIATURE, "--world.pool-size", "4"])
+    _, config = parse_train([*MINIATURE, "--world", "medium", "--world.flown", "", "--world.pool-size", "4"])
     scenes = planning.judged_scenes(config, 2)
     final = learners.run_missions(config).final.world
     for index, scene in enumerate(scenes):
@@ -87,7 +87,7 @@ def test_many_worlds_have_the_shortest_paths_of_each_alone(monkeypatch: pytest.M
 def test_a_learner_compiles_once_and_a_seed_comes_to_the_same_whatever_came_before(tmp_path: Path) -> None:
     clear = tmp_path / "clear.xml"
     write_scene(small_world().scene, clear, title="clear")
-    _, config = parse_train(["--world", str(clear), *TINY])
+    _, config = parse_train([*TINY, "--world", str(clear)])
     # Blind, since it compiles soonest: it has no camera and no VAE.
     learner = learners.Learner(learners.sensing(config, "DQN blind"))
     first, second, again = (learner.turn(seed) for seed in (0, 1, 0))

@@ -15,7 +15,7 @@ import pytest
 from edqn_jax.cli import arguments, main
 from edqn_jax.cli.arguments import parse_train
 from edqn_jax.config import Config, preset
-from edqn_jax.config.loading import RANDOM_WORLDS
+from edqn_jax.config.loading import RANDOM_WORLDS, make_config
 from edqn_jax.errors import ConfigError, DivergedError, StoppedError
 from edqn_jax.parallel import devices
 from edqn_jax.sim.mjcf import SceneError
@@ -198,7 +198,7 @@ def test_what_was_chosen_for_a_gpu_is_printed(trainer, monkeypatch, capsys):
     monkeypatch.setattr("jax.default_backend", lambda: "gpu")
     assert main(["train", "--tuned-for", "gpu", "--world", "medium", "--run-dir", "here"]) == 0
     assert "Tuned for a GPU: 16,384 environments, 8 updates of 4,096 a step" in capsys.readouterr().out
-    assert main(["train", "--tuned-for", "gpu", "--run-dir", "there"]) == 0
+    assert main(["train", "--tuned-for", "gpu", "--world", "paper", "--run-dir", "there"]) == 0
     assert "Tuned" not in capsys.readouterr().out  # nothing is chosen for the paper's world
 
 

@@ -58,7 +58,7 @@ def test_a_gpu_brings_its_own_sizes_and_files_and_the_papers_preset_keep_theirs(
     assert medium.train.num_envs == 16_384
     assert medium.events.threshold == RANDOM_WORLDS["events"]["threshold"]  # of random worlds on any hardware
     assert medium.world.name == "medium" and medium.world.pool_size > Config().world.pool_size
-    assert resolve(tuned_for="gpu") == Config()  # nothing has been chosen for worlds from files
+    assert resolve(world="paper", tuned_for="gpu") == Config()  # nothing has been chosen for worlds from files
     file = write(tmp_path, "train: {num_envs: 64}\n")
     assert resolve(file=file, world="medium", tuned_for="gpu").train.num_envs == 64
     assert resolve("paper", tuned_for="gpu") == preset("paper")
@@ -70,7 +70,7 @@ def test_random_worlds_and_the_papers_preset_have_their_own_step_size_and_encode
     """The default's were chosen on the paper's world alone (docs/decisions/0011)."""
     medium, paper = resolve(world="medium"), preset("paper")
     assert (medium.agent.learning_rate, paper.agent.learning_rate) == (1e-3, 4e-4)
-    assert (medium.encoder.warmup_decisions, medium.encoder.retrain_at) == (131_072, (0.15,))
+    assert (medium.encoder.warmup_decisions, medium.encoder.retrain_at) == (65_536, (0.15,))
     assert (paper.encoder.warmup_updates_per_step, paper.encoder.retrain_at) == (12, ())
     assert (paper.encoder.architecture, paper.encoder.target) == ("pooled", "sensed")
 
@@ -213,6 +213,12 @@ def test_every_numeric_option_has_limits(group, option, nonsense):
             "encoder.replay_size must be at least 512: 2 observations for each of the 256 environments, not 511",
         ),
         ("agent", {"turn": True}, r"agent.turn needs a random world \(sparse, .*\), not 'paper': give --agent.no-turn"),
+        ("world", {"flown": "my.xml"}, r"world.flown needs training in random worlds \(sparse, .*\), not in 'paper'"),
+        (
+            "world",
+            {"name": "sparse", "flown": "dense"},
+            "must be `paper` or an MJCF file, not the random world 'dense'",
+        ),
         ("encoder", {"patch_layers": ()}, "encoder.patch_layers must be one or more widths"),
         ("encoder", {"joint_layers": (8, 0)}, "encoder.joint_layers must be one or more widths"),
         ("events", {"frame_times_s": (-0.04, -0.02)}, "end at 0"),

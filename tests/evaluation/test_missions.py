@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 
 import jax
+import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from edqn_jax.errors import ConfigError
 from edqn_jax.evaluation.missions import load_missions, missions_of_runs, run_missions
 from edqn_jax.sim import worlds
 from edqn_jax.sim.mjcf import load_scene, resolve_world
+from edqn_jax.sim.scene import signed_distance
 
 CONFIG = Config()
 
@@ -120,6 +122,24 @@ def test_a_world_without_a_volume_is_flown_in_the_box_that_holds_start_and_goal(
     file.write_text(bounded)
     with pytest.raises(ConfigError, match="outside the flight volume"):
         load_missions(CONFIG, str(file), start=(-30, 0, 2))
+
+
+@pytest.mark.slow
+def test_a_run_in_random_worlds_ends_with_the_world_that_is_to_be_flown_and_then_the_test_worlds():
+    sizes = {"world": {"pool_size": 2, "missions": 4}, "train": {"validation_missions": 3}}
+    here, there = (run_missions(make_config("sparse", **sizes | {"world": w})) for w in ({"flown": ""}, sizes["world"]))
+    assert (here.tests, there.tests) == (3, 2)
+    city, flown = load_scene(resolve_world("paper")), there.final.world
+    np.testing.assert_array_equal(flown.missions.start[0], city.start)
+    np.testing.assert_array_equal(flown.missions.goal[0], city.goal)
+    point = jnp.array([31.0, 33.0, 4.0])
+    assert signed_distance(there.scene, point) == pytest.approx(float(signed_distance(city, point)), abs=1e-5)
+    # The others are the test worlds, and validation is what it was.
+    np.testing.assert_array_equal(flown.missions.start[1:], here.final.world.missions.start[:2])
+    np.testing.assert_array_equal(flown.pool.spheres.position[1:], here.final.world.pool.spheres.position[:2])
+    np.testing.assert_array_equal(flown.missions.scene, range(3))
+    np.testing.assert_array_equal(there.validation.world.missions.start, here.validation.world.missions.start)
+    jax.tree.map(lambda a, b: np.testing.assert_array_equal(a.shape, b.shape), there.validation.world, flown)
 
 
 @pytest.mark.slow

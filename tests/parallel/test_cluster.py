@@ -136,15 +136,16 @@ def test_processes_with_different_options_all_hear_of_it(theirs: str, alike: boo
 
 
 def test_processes_may_keep_a_world_file_in_different_folders_but_not_another_world(tmp_path: Path) -> None:
-    def said(folder: str, text: str) -> str:
+    def said(folder: str, text: str, *words: str) -> str:
         file = tmp_path / folder / "map.xml"
-        file.parent.mkdir()
+        file.parent.mkdir(exist_ok=True)
         file.write_text(text)
-        return options_to_compare(parse_train(["--world", str(file), "--tuned-for", "cpu"])[1])
+        return options_to_compare(parse_train([*words, str(file), "--tuned-for", "cpu"])[1])
 
-    here = said("here", WORLD)
-    assert said("there", WORLD) == here
-    assert said("elsewhere", WORLD.replace('pos="10 15 5"', 'pos="11 15 5"')) != here
+    for words in (["--world"], ["--world", "medium", "--world.flown"]):
+        here = said("here", WORLD, *words)
+        assert said("there", WORLD, *words) == here
+        assert said("elsewhere", WORLD.replace('pos="10 15 5"', 'pos="11 15 5"'), *words) != here
 
 
 @pytest.fixture

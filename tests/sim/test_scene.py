@@ -32,6 +32,7 @@ from edqn_jax.sim.scene import (
     signed_distance,
     stack_scenes,
     take_scene,
+    with_equal_capacities,
 )
 from tests.oracles import mujoco_distance
 
@@ -146,6 +147,19 @@ def test_the_gradient_is_the_direction_away_from_the_surface_and_finite_everywhe
     # On axes and at centres there is no direction away; what comes back must still be a number.
     points[:3] = [[0.0, 6.0, 4.0], [-4.0, -3.0, 3.0], [3.0, 1.0, 3.0]]
     assert np.isfinite(gradient(points)).all()
+
+
+def test_pools_of_equal_capacities_hold_the_worlds_that_they_held(world):
+    ball = Spheres(position=[5, 5, 5], radius=1, albedo=GREY)
+    city, balls = stack_scenes([world.scene] * 2), stack_scenes([scene_of(ball, spheres=9)])
+    grown = with_equal_capacities([city, balls])
+    joined = jax.tree.map(lambda *parts: jnp.concatenate(parts), *grown)  # equal capacities, or this would not do
+    points = np.random.default_rng(2).uniform(0, 10, (20, 3)).astype(np.float32)
+    for index, alone in enumerate([world.scene, world.scene, scene_of(ball)]):
+        found = take_scene(joined, index)
+        np.testing.assert_allclose(distances_at(found, points), distances_at(alone, points), atol=1e-5)
+        assert obstacle_count(found) == obstacle_count(alone)
+        np.testing.assert_array_equal(found.volume, alone.volume)
 
 
 def test_too_many_shapes_for_a_capacity_are_refused():

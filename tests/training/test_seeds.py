@@ -10,6 +10,7 @@ import jax
 import numpy as np
 import pytest
 
+from edqn_jax.config import WorldConfig
 from edqn_jax.errors import ConfigError, DivergedError, StoppedError
 from edqn_jax.learn import trainer
 from edqn_jax.report.progress import Progress
@@ -18,25 +19,36 @@ from edqn_jax.runs.policies import load_policy
 from edqn_jax.training.history import mean_metrics
 from edqn_jax.training.loop import train, train_seeds
 from edqn_jax.training.seeds import train_seeds_run
+from tests.miniature import WORLD as MINIATURE_WORLD
 from tests.training.test_loop import SMALL
 from tests.training.test_run import FIGURES
+
+RANDOM = dataclasses.replace(
+    SMALL, world=WorldConfig(name="sparse", flown=str(MINIATURE_WORLD), pool_size=2, missions=8)
+)
 
 
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory: pytest.TempPathFactory) -> tuple[RunDirectory, dict]:
     run = RunDirectory(tmp_path_factory.mktemp("runs") / "seeds")
-    return run, train_seeds_run(SMALL, 2, run, Progress(), lambda: False)
+    return run, train_seeds_run(RANDOM, 2, run, Progress(), lambda: False)
 
 
 @pytest.mark.slow
 def test_each_seed_leaves_a_run_and_all_of_them_a_summary(runs: tuple[RunDirectory, dict]) -> None:
     run, summary = runs
     assert json.loads(run.summary_file.read_text()) == plain(summary)
-    assert summary["seeds"] == [0, 1] and summary["missions"] == 1 and len(summary["success_rates"]) == 2
+    assert summary["seeds"] == [0, 1] and len(summary["success_rates"]) == 2
+    # All but the world that is flown at the end are test worlds.
+    assert summary["missions"] == SMALL.train.validation_missions - 1
     for seed in summary["seeds"]:
         own = run.of_seed(seed)
         assert load_policy(own.path).config.train.seed == seed
-        assert json.loads(own.summary_file.read_text())["seed"] == seed
+        found = json.loads(own.summary_file.read_text())
+        assert (found["seed"], found["world"], found["flown"]) == (seed, "sparse", str(MINIATURE_WORLD))
+        assert found["test"]["missions"] == summary["missions"]
+        assert found["test"]["success_rate"] == summary["success_rates"][seed]
+        assert found["shortest_path_m"] == pytest.approx(23.8, abs=0.5)  # of the miniature
         assert [row["phase"] for row in own.read_metrics()] == ["training"] * 4
         assert {file.stem for file in own.figures.glob("*.png")} == FIGURES  # this sensor shows nothing
     first, second = (run.of_seed(seed).read_episodes()["return"][:8] for seed in (0, 1))
@@ -45,7 +57,7 @@ def test_each_seed_leaves_a_run_and_all_of_them_a_summary(runs: tuple[RunDirecto
 
 @pytest.mark.slow
 def test_a_seed_among_others_learns_what_it_learns_alone(runs: tuple[RunDirectory, dict]) -> None:
-    alone = train(dataclasses.replace(SMALL, train=dataclasses.replace(SMALL.train, seed=1)))
+    alone = train(dataclasses.replace(RANDOM, train=dataclasses.replace(SMALL.train, seed=1)))
     together = load_policy(runs[0].of_seed(1).path)
     # Batched products round otherwise.
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-4), alone.policy.params, together.params)
