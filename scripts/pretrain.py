@@ -31,7 +31,7 @@ FLAGS = (
     *("--tuned-for", "gpu", "--world", "mixed", "--total-steps", "60000000", "--train.keep", "last"),
     *("--agent.updates-per-step", "16", "--encoder.warmup-updates-per-step", "48"),
     *("--agent.huber-delta", "1", "--env.collision-reward", "-100", "--env.left-volume-reward", "-100"),
-    "--agent.no-turn",
+    *("--agent.no-turn", "--world.flown", ""),
 )
 """Options of train.py: the defaults of a GPU when the policy was trained, with more updates."""
 

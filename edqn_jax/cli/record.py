@@ -29,9 +29,8 @@ def record_command(args: RecordArgs) -> None:
     """
     check_can_write(args.file)
     config, params = load_run(args.run)
-    missions = load_missions(
-        config, args.world or config.world.flown or config.world.name, 1, args.seed, args.start, args.goal
-    )
+    world = args.world or config.world.flown or config.world.name
+    missions = load_missions(config, world, 1, args.seed, args.start, args.goal)
     scene = jax.tree.map(np.asarray, missions.scene())
     with ThreadPoolExecutor(2, thread_name_prefix="compiling") as pool:
         sights = Sights(config, scene, pool)

@@ -235,7 +235,7 @@ class AgentConfig:
 
     hidden: tuple[int, ...] = (128, 128)
     """Widths of the hidden layers."""
-    history: int = 1
+    history: int = 2
     """Observations in the Q-network's input, the newest included."""
     code_scale: float = 0.5
     """Factor on the code before the Q-network, so that it does not outweigh the own state."""
@@ -253,17 +253,17 @@ class AgentConfig:
     """Steps of the return before the bootstrap."""
     discount: float = 0.97
     """gamma."""
-    target_rate: float = 0.01
+    target_rate: float = 0.02
     """Polyak tau of the target network, per update."""
     average_rate: float = 0.002
     """Polyak rate, per update, of the averaged parameters that evaluation uses; 1 uses the newest parameters."""
-    learning_rate: float = 2e-3
+    learning_rate: float = 1e-3
     """Adam step size at the start."""
     final_learning_rate: float = 1e-4
     """Adam step size at the end of training (linear decay)."""
     max_gradient_norm: float = 10.0
     """The global gradient norm is clipped to this."""
-    huber_delta: float = 1.0
+    huber_delta: float = 0.0
     """TD errors beyond this, in units of scaled reward, enter the loss linearly; 0 is the pure square of Eq. 9."""
     reward_scale: float = 0.02
     """Rewards are multiplied by this before learning."""

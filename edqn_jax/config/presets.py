@@ -43,6 +43,7 @@ def preset(name: str) -> Config:
             ),
             agent=AgentConfig(
                 hidden=(16, 16),
+                history=1,
                 dueling=False,
                 double=False,
                 n_step=1,
