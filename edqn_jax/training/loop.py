@@ -20,6 +20,7 @@ from jax.sharding import Mesh
 
 from edqn_jax.config import Config
 from edqn_jax.config.limits import validate
+from edqn_jax.config.loading import make_config
 from edqn_jax.errors import ConfigError
 from edqn_jax.evaluation import rollouts
 from edqn_jax.evaluation.missions import MissionSet, RunMissions, missions_of_runs
@@ -209,7 +210,7 @@ def train(
     """Trains a policy and returns it with the history of its training; nothing is written.
 
     Args:
-        config: the `default` preset without it; `edqn_jax.make_config` makes one.
+        config: without it what `train.py` trains without flags, on a CPU; `edqn_jax.make_config` makes others.
         reward: replaces the configured reward; see `sim.reward.Transition` for what it is given.
         callback: called after each chunk; training stops where it returns True.
 
@@ -217,7 +218,7 @@ def train(
         ConfigError: if the configuration is invalid or the world cannot be flown.
         DivergedError: if a loss becomes NaN or Inf.
     """
-    with prepared(config or Config(), reward) as preparation:
+    with prepared(config or make_config(), reward) as preparation:
         return run_chunks(preparation, callback)[0]
 
 
@@ -229,7 +230,7 @@ def train_seeds(
     Args:
         seeds: how many; they are `train.seed`, `train.seed + 1` and so on.
     """
-    with prepared(config or Config(), reward, agents=seeds) as preparation:
+    with prepared(config or make_config(), reward, agents=seeds) as preparation:
         return run_chunks(preparation, callback)
 
 
