@@ -23,7 +23,7 @@ from typing import Any
 
 import jax
 
-from conventional_stack.settings import DRONES, PACKAGES, SETTINGS
+from conventional_stack.settings import DRONES, PACKAGES, SETTINGS, supported
 from edqn_jax.config import Config
 from edqn_jax.errors import ConfigError
 from edqn_jax.evaluation.missions import run_missions
@@ -63,7 +63,7 @@ def parse(argv: Sequence[str] | None = None) -> tuple[argparse.Namespace, Config
             parser.error(f"--{name} must be at least 1, not {getattr(args, name)}")
     if args.json is not None:
         check_can_write(args.json)
-    return args, steady(configured(["--num-envs", str(DRONES), *flags]), 4)
+    return args, steady(supported(configured(["--num-envs", str(DRONES), *flags])), 4)
 
 
 def measure(config: Config, decisions: int, repeats: int) -> dict[str, Any]:

@@ -9,8 +9,8 @@ The methods take turns, seed by seed, so that a change in the machine's speed af
     python benchmarks/runtime.py --worlds medium --methods E-DQN "DQN blind" --seeds 2 -- --total-steps 1000000
     python benchmarks/runtime.py --seeds 0 --add cpu.json gpu.json --figure both.png
 
-Arguments after -- are options of train.py for the learners. The full run, five seeds on both worlds, takes about five
-hours on two cores: one for the paper's world, four and a quarter for medium worlds. All methods of a world are kept in
+Arguments after -- are options of train.py for the learners. The full run, five seeds on both worlds, takes about three
+and a quarter hours on two cores: one for the paper's world, the rest for medium worlds. All methods of a world are kept in
 memory, about 15 GB. --quick takes less than ten minutes; its default is the paper's world alone.
 """
 
@@ -29,7 +29,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from conventional_stack.settings import DRONES
+from conventional_stack.settings import DRONES, supported
 from edqn_jax.cli.arguments import parse_train
 from edqn_jax.config import DENSITIES, Config
 from edqn_jax.config.loading import nearest, to_yaml
@@ -40,7 +40,7 @@ from edqn_jax.runs.files import check_can_write
 from measurement import json_report
 from measurement.child import Child, ChildEndedError
 from measurement.flags import configured as for_timing
-from measurement.flags import split
+from measurement.flags import judged_in_tests, split
 from measurement.whole import steady
 from rivals import table
 from rivals.figure import draw_runtime
@@ -164,8 +164,7 @@ def configured(world: str, flags: Sequence[str], quick: bool) -> Config:
     Raises:
         ConfigError: if it is invalid.
     """
-    _, config = parse_train(["--world", world, *(QUICK if quick else ()), *flags])
-    config = dataclasses.replace(config, world=dataclasses.replace(config.world, flown=""))
+    config = judged_in_tests(parse_train(["--world", world, *(QUICK if quick else ()), *flags])[1])
     if not quick and not any(flag.replace("_", "-").startswith("--train.validation-every") for flag in flags):
         every = -(-config.train.total_steps // POINTS)
         config = dataclasses.replace(config, train=dataclasses.replace(config.train, validation_every=every))
@@ -271,7 +270,7 @@ def config_of(asked: Asked, world: str, name: str, has_path: bool) -> Config:
         return config
     if not has_path:
         raise ConfigError("there is no path from start to goal, so train.py rejects this world")
-    return config if name == STACK else sensing(config, name)
+    return supported(config) if name == STACK else sensing(config, name)
 
 
 def missions_of(asked: Asked, world: str) -> int:
@@ -343,7 +342,7 @@ def measure_rates(asked: Asked) -> dict[str, Any] | None:
     config = for_timing(["--world", "paper", "--num-envs", str(DRONES), *asked.flags])
     ours, theirs = STEADY
     # A short warm-up for the conventional stack, for which the decisions of one of our chunks take minutes.
-    wanted = {theirs: steady(config, 4), ours: steady(config, config.train.chunk_steps)}
+    wanted = {theirs: steady(supported(config), 4), ours: steady(config, config.train.chunk_steps)}
     with contextlib.ExitStack() as stack:
         children, said = launched(stack, wanted)
         report: dict[str, Any] = {"turns": {}, "reason": None, **said[ours]}

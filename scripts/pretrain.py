@@ -33,7 +33,8 @@ FLAGS = (
     *("--agent.huber-delta", "1", "--env.collision-reward", "-100", "--env.left-volume-reward", "-100"),
     *("--agent.no-turn", "--world.flown", ""),
 )
-"""Options of train.py: the defaults of a GPU when the policy was trained, with more updates."""
+"""Options of train.py: the defaults of a GPU when the policy was trained, with more updates. They are named where they
+have changed since, so that the configuration is the shipped one."""
 
 DENSITIES = ("sparse", "medium", "dense")
 MISSIONS = 1000

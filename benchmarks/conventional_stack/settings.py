@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import dataclasses
+
+from edqn_jax.config import AgentConfig, Config
+
 DRONES = 512
 """Drones simulated together by default: with fewer, the cost of PyTorch and Python for each step weighs more."""
 
@@ -10,3 +14,14 @@ PACKAGES = ("gymnasium", "numba", "stable-baselines3", "torch")
 
 SETTINGS = ((1, 1), (2, 1), (2, 2))
 """Settings that are timed: number of simulating processes, number of PyTorch threads."""
+
+AGENT = {"history": 1, "huber_delta": 1.0, "learning_rate": 2e-3, "target_rate": 0.01}
+"""Options of the agent: stable-baselines3's DQN has a Huber loss and sees one observation, and learns with these rates
+as E-DQN did while it was such an agent."""
+
+
+def supported(config: Config) -> Config:
+    """Returns the configuration with `AGENT` in place of what is E-DQN's default; what was set otherwise stays."""
+    default = AgentConfig()
+    changes = {name: value for name, value in AGENT.items() if getattr(config.agent, name) == getattr(default, name)}
+    return dataclasses.replace(config, agent=dataclasses.replace(config.agent, **changes))

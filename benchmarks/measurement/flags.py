@@ -20,6 +20,11 @@ def split(words: Sequence[str]) -> tuple[list[str], list[str]]:
     return words[:cut], words[cut + 1 :]
 
 
+def judged_in_tests(config: Config) -> Config:
+    """Returns the configuration with test worlds alone at the end of a run in random worlds."""
+    return dataclasses.replace(config, world=dataclasses.replace(config.world, flown=""))
+
+
 def configured(flags: Sequence[str]) -> Config:
     """Returns the configuration of train.py with these options, with `SAMPLES` unless they set the updates per step.
 
@@ -30,6 +35,7 @@ def configured(flags: Sequence[str]) -> Config:
     """
     named = any(flag.partition("=")[0] in ("--world", "--world.name", "--config") for flag in flags)
     _, config = parse_train(flags if named else ["--world", "paper", *flags])
+    config = judged_in_tests(config)
     if any(flag.replace("_", "-").startswith(("--agent.updates-per-step", "--config")) for flag in flags):
         return config
     updates = math.ceil(SAMPLES * config.train.num_envs / config.agent.batch_size)

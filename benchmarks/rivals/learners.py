@@ -52,7 +52,10 @@ class Validation:
     """The validations of one training: its learning curve and the parameters that would be kept so far."""
 
     def __init__(self, config: Config, missions: RunMissions, fly: Callable[[World, Any], Flights]) -> None:
-        """Starts without validations; `fly(world, params)` flies every mission of a world once, greedily."""
+        """Starts without validations; `fly(world, params)` flies every mission of a world once, greedily.
+
+        In random worlds `world.flown` must be empty, so that all final missions are tests.
+        """
         self.config, self.missions, self.fly = config, missions, fly
         self.judged = missions.tests or 1
         self.kept: Candidate | None = None

@@ -76,7 +76,7 @@ class EvaluateArgs:
     run: Annotated[Positional[Path], arg(metavar="RUN")]
     """Folder of the run, or `pretrained`: the policy that comes with the package."""
     world: Annotated[str | None, arg(metavar="paper|sparse|medium|dense|mixed|FILE.xml", help_behavior_hint="")] = None
-    """Where to fly (default: the world that was trained in)."""
+    """Where to fly (default: where training was; for a random density its test worlds)."""
     start: Annotated[Point | None, arg(metavar="X Y Z", help_behavior_hint="")] = None
     """Start of every mission, metres (default: the world's; random free ones with --missions)."""
     goal: Annotated[Point | None, arg(metavar="X Y Z", help_behavior_hint="")] = None
@@ -103,7 +103,7 @@ class RecordArgs:
     file: Annotated[Positional[Path], arg(metavar="FILE.gif")]
     """GIF to write; it replaces a file of that name."""
     world: Annotated[str | None, arg(metavar="paper|sparse|medium|dense|mixed|FILE.xml", help_behavior_hint="")] = None
-    """Where to fly (default: the world that the run was flown in at its end)."""
+    """Where to fly (default: the world of the run's last flight)."""
     start: Annotated[Point | None, arg(metavar="X Y Z", help_behavior_hint="")] = None
     """Start of the flight, metres (default: the world's)."""
     goal: Annotated[Point | None, arg(metavar="X Y Z", help_behavior_hint="")] = None

@@ -52,8 +52,8 @@ def _world(world: WorldConfig) -> None:
         raise ConfigError("world.name must be the name of a world, not empty")
     if world.flown and world.name not in DENSITIES:
         raise ConfigError(
-            f"world.flown needs training in random worlds ({', '.join(DENSITIES)}), not in '{world.name}', "
-            "which is flown itself"
+            f"world.flown is for random worlds ({', '.join(DENSITIES)}) alone, '{world.name}' is flown itself: "
+            "give --world.flown '', or flown: '' in a file"
         )
     if world.flown in DENSITIES:
         raise ConfigError(f"world.flown must be `paper` or an MJCF file, not the random world '{world.flown}'")

@@ -145,6 +145,9 @@ def make_config(
     Raises:
         ConfigError: names the option and what would be right.
     """
+    given = groups.get("world")
+    if world is None and isinstance(given, Mapping) and isinstance(given.get("name"), str):
+        world = given["name"]
     if tuned_for not in typing.get_args(Hardware):
         raise ConfigError(f"make_config: tuned_for must be 'cpu' or 'gpu', not {tuned_for!r}")
     config = apply(resolve(preset, None if file is None else Path(file), world, tuned_for), groups, "make_config")

@@ -1,6 +1,7 @@
 """Every option of the project: one frozen dataclass per module, nested into one `Config`.
 
-The defaults are the `default` preset, the best that we know. The string under a field is its help text on the
+The defaults are the `default` preset in a world from a file, the best that we know; `loading` has what random worlds and
+a GPU change. The string under a field is its help text on the
 command line.
 """
 
@@ -18,8 +19,8 @@ class WorldConfig:
     """Where to train: `paper`, a random density (`sparse`, `medium`, `dense`, or `mixed`: all three), or the path of an
     MJCF file."""
     flown: str = ""
-    """World of the flight that a run in random worlds ends with: `paper`, or the path of an MJCF file, which training
-    never uses. Empty: a test world, or the file that was trained in."""
+    """World of the flight at the end of a run in random worlds: `paper` or the path of an MJCF file; training never
+    uses it. Empty: the first test world. A world from a file is flown itself."""
     pool_size: int = 1024
     """Random training worlds, generated before training (random densities only)."""
     missions: int = 8192
@@ -312,7 +313,8 @@ class TrainConfig:
     validation_every: int = 65_536
     """Decisions between validations, rounded up to whole chunks; 0 validates only at the end."""
     validation_missions: int = 128
-    """Missions of each validation; in worlds from a file half of them begin near the world's start."""
+    """Missions of each validation, and of the flights at the end, the first of which is in `world.flown`; in worlds
+    from a file half of them begin near the world's start."""
     keep: Literal["best", "last"] = "best"
     """Parameters that the run keeps: those of the best validation (by SPL, the latest of equal ones), or the last."""
 

@@ -66,7 +66,8 @@ def evaluate(
 
     Args:
         policy: from `train` or `load_policy`.
-        world: `paper`, `sparse`, `medium`, `dense`, `mixed` or an MJCF file; None is the policy's own.
+        world: `paper`, `sparse`, `medium`, `dense`, `mixed` or an MJCF file; None is where it was
+            trained, of a random density its test worlds.
         missions: how many. One in a world from a file goes from its start to its goal, more begin at random free
             points; in random worlds each has a test world of its own, which training never uses.
         seed: which missions.

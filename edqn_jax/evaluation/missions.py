@@ -131,7 +131,7 @@ def _random_run_missions(config: Config, training_key: jax.Array) -> RunMissions
     validation, test = (worlds.random_pool(name, worlds.world_keys(split, count)) for split in ("validation", "test"))
     if flown:
         validation, test, own = with_equal_capacities([validation, test, _pool_of(flown, config)])
-        test = jax.tree.map(lambda one, many: jnp.concatenate([one, many[:-1]]), own, test)
+        test = jax.tree.map(lambda one, many: jnp.asarray(np.concatenate([one, many])[:-1]), own, test)
     return RunMissions(
         training=MissionSet(name, World(airframe, training_pool, training)),
         validation=MissionSet(name, World(airframe, validation, worlds.own_missions(validation))),

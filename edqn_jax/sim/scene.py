@@ -387,17 +387,18 @@ def stack_scenes(scenes: Sequence[Scene]) -> Scene:
 
 
 def with_equal_capacities(pools: Sequence[Scene]) -> list[Scene]:
-    """Returns the pools, every kind of shape padded to its largest capacity in any of them."""
+    """Returns the pools, every kind of shape padded to its largest capacity in any of them. On the host."""
 
     def padded(kind: str, pool: Scene) -> Shape:
         shapes = getattr(pool, kind)
         worlds, capacity = shapes.position.shape[:2]
         missing = max(getattr(other, kind).position.shape[1] for other in pools) - capacity
-        absent = jax.tree.map(
-            lambda leaf: jnp.broadcast_to(jnp.asarray(leaf, jnp.float32), (worlds, missing, *np.shape(leaf))),
-            parked_shape(KINDS[kind]),
-        )
-        return jax.tree.map(lambda *parts: jnp.concatenate(parts, axis=1), shapes, absent)
+
+        def joined(here: Array, absent: npt.ArrayLike) -> Array:
+            more = np.broadcast_to(np.asarray(absent, np.float32), (worlds, missing, *np.shape(absent)))
+            return jnp.asarray(np.concatenate([np.asarray(here), more], axis=1))
+
+        return jax.tree.map(joined, shapes, parked_shape(KINDS[kind]))
 
     return [dataclasses.replace(pool, **{kind: padded(kind, pool) for kind in KINDS}) for pool in pools]
 

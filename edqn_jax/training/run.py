@@ -92,7 +92,7 @@ def summary_of(
     preparation: Preparation, result: TrainingResult, flights: Flights, digest: str, reward: Reward | None
 ) -> dict[str, Any]:
     """Returns the content of `summary.json`."""
-    config, scene = result.policy.config, preparation.missions[0].scene
+    config = result.policy.config
     since = first_success(result.history.validations)
     summary = {
         **flight_summary(flights),
@@ -112,7 +112,7 @@ def summary_of(
         "validation_spl": result.kept.spl,
         "parameters_from_decisions": result.kept.decisions,
         "reward": reward_record(config, reward),
-        "workload": workload(config, scene),
+        "workload": workload(config, preparation.missions[0].training.scene()),
         "devices": [str(device) for device in preparation.devices],
         "versions": versions(),
         "state_digest": digest,
@@ -178,8 +178,13 @@ def _flight(summary: dict[str, Any]) -> str:
     """Returns which flight the verdict is about."""
     if summary["flown"] == summary["world"]:
         return "The greedy flight"
+    return f"The greedy flight through {unseen(summary)},"
+
+
+def unseen(summary: dict[str, Any]) -> str:
+    """Returns what the world of the last flight of a run in random worlds is, for the screen."""
     where = "the paper's map" if summary["flown"] == "paper" else f"'{summary['flown']}'"
-    return f"The greedy flight through {where}, which training never used,"
+    return f"{where}, which training never used"
 
 
 def _nearest(summary: dict[str, Any]) -> str:

@@ -20,7 +20,7 @@ from edqn_jax.sim.flights import Flights
 from edqn_jax.sim.outcomes import Outcome
 from edqn_jax.sim.reward import Reward
 from edqn_jax.training.loop import prepared, run_chunks
-from edqn_jax.training.run import described, draw, record, sights_of, summary_of, trained_in
+from edqn_jax.training.run import described, draw, record, sights_of, summary_of, trained_in, unseen
 
 
 def train_seeds_run(
@@ -87,6 +87,8 @@ def _summary_of_all(
     rates = arrived.mean(axis=1)
     return {
         "world": config.world.name,
+        "flown": summaries[0]["flown"],
+        "flown_successes": sum(summary["success"] for summary in summaries),
         "seeds": [summary["seed"] for summary in summaries],
         "missions": arrived.shape[1],
         "success_rates": rates.tolist(),
@@ -105,10 +107,12 @@ def _verdict(summary: dict[str, Any], run: RunDirectory) -> str:
     each = ", ".join(
         f"seed {seed}: {rate:.1%}" for seed, rate in zip(summary["seeds"], summary["success_rates"], strict=True)
     )
-    missions = "unseen test worlds" if summary["missions"] > 1 else "the mission"
+    flown = summary["flown"] != summary["world"]
+    missions = "unseen test worlds" if summary["missions"] > 1 or flown else "the mission"
+    last = f"\n{summary['flown_successes']} of {len(summary['seeds'])} reached the goal of {unseen(summary)}."
     return (
         f"Reached the goal in {missions}: {each}.\nInterquartile mean {summary['success_iqm']:.1%}, mean "
-        f"{summary['success_mean']:.1%} (95 % interval {low:.1%} to {high:.1%}).\n"
+        f"{summary['success_mean']:.1%} (95 % interval {low:.1%} to {high:.1%}).{last if flown else ''}\n"
         f"Took {clock(summary['total_seconds'])} in all, {clock(summary['train_seconds'])} of it training. Each seed's "
         f"run is in {run.path}"
     )

@@ -11,6 +11,7 @@ import pytest
 
 import conventional
 from conventional_stack.fleet import Record
+from conventional_stack.settings import supported
 from conventional_stack.train import Steady, Trained, Training, fly, train
 from conventional_stack.vae import EventVAE, Learner, images
 from conventional_stack.vec_env import CodedDrones
@@ -30,7 +31,7 @@ from tests.planners.uninstalled import hide
 torch = require("torch")
 torch.set_num_threads(1)  # beside other tests a second one costs more than it does
 
-CONFIG = Config()
+CONFIG = supported(Config())
 START, GOAL = np.array([[20.0, 40.0, 12.0]]), np.array([[90.0, 90.0, 10.0]])
 
 
@@ -175,8 +176,8 @@ def miniature() -> Config:
     return conventional.parse(["--", *MINIATURE])[1]
 
 
-SHORT = configured(
-    [*MINIATURE, "--train.chunk-steps", "16", "--total-steps", "1024", "--train.validation-every", "300"]
+SHORT = supported(
+    configured([*MINIATURE, "--train.chunk-steps", "16", "--total-steps", "1024", "--train.validation-every", "300"])
 )
 """A whole training: 256 decisions of warm-up, 768 of the DQN."""
 

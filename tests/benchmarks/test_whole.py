@@ -19,8 +19,8 @@ def test_what_is_timed_is_training_past_its_beginning(monkeypatch: pytest.Monkey
     quick = ("--drone.physics", "rigid_body", "--world", str(WORLD))  # what is timed is no claim about these
     config = steady(configured((*MINIATURE, *quick)), 4)
     whole = WholeStep(config, run_missions(config).training.world, jax.devices()[:2])
-    # Two chunks, to warm up and to fill the replay: what is timed from here on is all alike.
-    assert whole.done == 8 >= whole.trainer.plan.learn_from
+    # Three chunks, to warm up and to fill the replay: what is timed from here on is all alike.
+    assert whole.done == 12 >= whole.trainer.plan.learn_from
     before = jax.tree.map(np.asarray, (whole.state.learner.q, whole.state.learner.vae))
     assert whole.turn() > 0
     after = jax.tree.map(np.asarray, (whole.state.learner.q, whole.state.learner.vae))

@@ -66,10 +66,9 @@ def test_a_gpu_brings_its_own_sizes_and_files_and_the_papers_preset_keep_theirs(
         make_config("medium", tuned_for="tpu")  # type: ignore[arg-type]
 
 
-def test_random_worlds_and_the_papers_preset_have_their_own_step_size_and_encoder():
-    """The default's were chosen on the paper's world alone (docs/decisions/0011)."""
+def test_random_worlds_have_their_own_warm_up_and_the_papers_preset_its_own_agent():
     medium, paper = resolve(world="medium"), preset("paper")
-    assert (medium.agent.learning_rate, paper.agent.learning_rate) == (1e-3, 4e-4)
+    assert (medium.agent.learning_rate, paper.agent.learning_rate, paper.agent.history) == (1e-3, 4e-4, 1)
     assert (medium.encoder.warmup_decisions, medium.encoder.retrain_at) == (65_536, (0.15,))
     assert (paper.encoder.warmup_updates_per_step, paper.encoder.retrain_at) == (12, ())
     assert (paper.encoder.architecture, paper.encoder.target) == ("pooled", "sensed")
@@ -213,7 +212,7 @@ def test_every_numeric_option_has_limits(group, option, nonsense):
             "encoder.replay_size must be at least 512: 2 observations for each of the 256 environments, not 511",
         ),
         ("agent", {"turn": True}, r"agent.turn needs a random world \(sparse, .*\), not 'paper': give --agent.no-turn"),
-        ("world", {"flown": "my.xml"}, r"world.flown needs training in random worlds \(sparse, .*\), not in 'paper'"),
+        ("world", {"flown": "my.xml"}, r"world.flown is for random worlds \(.*\) alone, 'paper' is flown itself: give"),
         (
             "world",
             {"name": "sparse", "flown": "dense"},
@@ -245,5 +244,6 @@ def test_frames_may_fill_the_whole_decision():
 def test_options_of_the_world_are_a_group_like_any_other() -> None:
     config = make_config("medium", world={"pool_size": 7}, train={"seed": 3})
     assert (config.world.name, config.world.pool_size, config.train.seed) == ("medium", 7, 3)
+    assert make_config(world={"name": "paper"}) == make_config("paper")
     with pytest.raises(ConfigError, match="'world' must hold keys such as"):
         make_config(world="medium")  # type: ignore[arg-type]

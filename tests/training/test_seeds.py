@@ -28,6 +28,10 @@ RANDOM = dataclasses.replace(
 )
 
 
+def read(run: RunDirectory) -> dict:
+    return json.loads(run.summary_file.read_text())
+
+
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory: pytest.TempPathFactory) -> tuple[RunDirectory, dict]:
     run = RunDirectory(tmp_path_factory.mktemp("runs") / "seeds")
@@ -37,14 +41,15 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> tuple[RunDirectory, dict]:
 @pytest.mark.slow
 def test_each_seed_leaves_a_run_and_all_of_them_a_summary(runs: tuple[RunDirectory, dict]) -> None:
     run, summary = runs
-    assert json.loads(run.summary_file.read_text()) == plain(summary)
+    assert read(run) == plain(summary)
     assert summary["seeds"] == [0, 1] and len(summary["success_rates"]) == 2
+    assert summary["flown_successes"] == sum(load["success"] for load in map(read, (run.of_seed(0), run.of_seed(1))))
     # All but the world that is flown at the end are test worlds.
     assert summary["missions"] == SMALL.train.validation_missions - 1
     for seed in summary["seeds"]:
         own = run.of_seed(seed)
         assert load_policy(own.path).config.train.seed == seed
-        found = json.loads(own.summary_file.read_text())
+        found = read(own)
         assert (found["seed"], found["world"], found["flown"]) == (seed, "sparse", str(MINIATURE_WORLD))
         assert found["test"]["missions"] == summary["missions"]
         assert found["test"]["success_rate"] == summary["success_rates"][seed]
