@@ -10,8 +10,8 @@ The methods take turns, seed by seed, so that a change in the machine's speed af
     python benchmarks/runtime.py --seeds 0 --add cpu.json gpu.json --figure both.png
 
 Arguments after -- are options of train.py for the learners. The full run, five seeds on both worlds, takes about three
-and a quarter hours on two cores: one for the paper's world, the rest for medium worlds. All methods of a world are kept in
-memory, about 15 GB. --quick takes less than ten minutes; its default is the paper's world alone.
+and a quarter hours on two cores: one for the paper's world, the rest for medium worlds. All methods of a world are kept
+in memory, about 15 GB. --quick takes less than ten minutes; its default is the paper's world alone.
 """
 
 from __future__ import annotations

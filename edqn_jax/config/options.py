@@ -1,8 +1,7 @@
 """Every option of the project: one frozen dataclass per module, nested into one `Config`.
 
-The defaults are the `default` preset in a world from a file, the best that we know; `loading` has what random worlds and
-a GPU change. The string under a field is its help text on the
-command line.
+The defaults are the `default` preset in a world from a file, the best that we know; `loading` has what random worlds
+and a GPU change. The string under a field is its help text on the command line.
 """
 
 from __future__ import annotations

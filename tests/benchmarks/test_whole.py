@@ -25,7 +25,7 @@ def test_what_is_timed_is_training_past_its_beginning(monkeypatch: pytest.Monkey
     assert whole.turn() > 0
     after = jax.tree.map(np.asarray, (whole.state.learner.q, whole.state.learner.vae))
     assert all(jax.tree.leaves(jax.tree.map(lambda a, b: np.any(a != b), before, after)))
-    assert int(whole.state.step) == whole.done == 12
+    assert int(whole.state.step) == whole.done == 16
     assert whole.temporary_bytes > 0
     # A chunk in which nothing learnt must not pass for a fast one.
     idle = SimpleNamespace(q_loss=np.array([np.nan]), reconstruction=np.array([1.0]))
