@@ -1,11 +1,12 @@
-"""Policies on disk, as Orbax checkpoints.
+"""Policies on disk, as Orbax checkpoints with checksums.
 
-Saving is synchronous: when `save_params` returns, the checkpoint is complete and holds its commit marker. A
-checkpoint without the marker is refused.
+Saving is synchronous: when `save_params` returns, the checkpoint is complete and on the disk, and has taken the place
+of the one before, which is whole until then. A checkpoint without its manifest, or with a changed bit, is refused.
 """
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import jax
@@ -14,19 +15,29 @@ import orbax.checkpoint as ocp
 
 from edqn_jax.errors import ConfigError
 from edqn_jax.learn.policy import PolicyParams
+from edqn_jax.runs import manifest
+from edqn_jax.runs.files import unwritable
 
 POLICY = "policy"
 """The policy's folder within `checkpoints/`."""
 
-COMMIT_MARKER = "commit_success.txt"
-"""File that Orbax writes last; a checkpoint without it is incomplete."""
+CONFIG = "config_sha256"
+"""The fact of a policy's manifest that says which `config.yaml` it was saved with."""
 
 
-def save_params(folder: Path, params: PolicyParams) -> None:
+def save_params(folder: Path, params: PolicyParams, config_file: Path | None = None) -> None:
     """Writes the policy into `folder`, a run's `checkpoints/`; replaces an existing one.
 
     Arrays are saved from the host, so the file does not depend on the number of devices. Only the calling
     process saves, even if it is one of several.
+
+    Args:
+        folder: of the checkpoints.
+        params: of the policy.
+        config_file: `config.yaml` that the policy belongs to; its digest is kept.
+
+    Raises:
+        ConfigError: if it cannot be written; a policy that was there is there still.
     """
     tree = jax.tree.map(np.asarray, {"encoder": params.encoder, "q": params.q})
     here = jax.process_index()
@@ -34,23 +45,47 @@ def save_params(folder: Path, params: PolicyParams) -> None:
     alone = ocp.options.MultiprocessingOptions(primary_host=here, active_processes={here})
     handler = ocp.PyTreeCheckpointHandler(multiprocessing_options=alone)
     saver = ocp.Checkpointer(handler, multiprocessing_options=alone)
-    saver.save((folder / POLICY).absolute(), args=ocp.args.PyTreeSave(tree), force=True)
+    saved, partial, replaced = _places(folder.absolute())
+    try:
+        shutil.rmtree(partial, ignore_errors=True)
+        saver.save(partial, args=ocp.args.PyTreeSave(tree))
+        manifest.seal(partial, {} if config_file is None else {CONFIG: manifest.digest(config_file)})
+        shutil.rmtree(replaced, ignore_errors=True)
+        if saved.exists():
+            saved.rename(replaced)
+        partial.rename(saved)
+        shutil.rmtree(replaced, ignore_errors=True)
+    except (OSError, ValueError, RuntimeError) as error:  # Orbax passes on what TensorStore raises
+        shutil.rmtree(partial, ignore_errors=True)
+        raise unwritable(saved, getattr(error, "strerror", None) or " ".join(str(error).split())[:200]) from None
 
 
-def load_params(folder: Path) -> PolicyParams:
+def load_params(folder: Path, config_file: Path | None = None) -> PolicyParams:
     """Returns the policy saved in `folder`, a run's `checkpoints/`; arrays on the host.
 
+    Args:
+        folder: of the checkpoints.
+        config_file: `config.yaml` beside it; refused if it is not the one that the policy was saved with.
+
     Raises:
-        ConfigError: if there is none, or it is incomplete or unreadable.
+        ConfigError: if there is none, or it is incomplete, damaged or unreadable.
     """
-    saved = (folder / POLICY).absolute()
+    saved, _, replaced = _places(folder.absolute())
+    if not saved.is_dir() and replaced.is_dir():  # the process ended between two renames
+        saved = replaced
     if not saved.is_dir():
         raise ConfigError(f"there is no policy in '{folder}'; a run saves one when its training ends")
-    if not (saved / COMMIT_MARKER).is_file():
-        raise ConfigError(f"the policy in '{saved}' is incomplete: saving it was interrupted")
+    facts = manifest.check(saved)
+    if config_file is not None and CONFIG in facts and facts[CONFIG] != manifest.digest(config_file):
+        raise ConfigError(f"'{config_file}' has changed since the policy beside it was saved; put the old one back")
     try:
         tree = ocp.PyTreeCheckpointer().restore(saved)
         return PolicyParams(encoder=tree["encoder"], q=tree["q"])
     except (OSError, ValueError, KeyError) as error:
         reason = " ".join(str(error).split())[:200]
         raise ConfigError(f"the policy in '{saved}' cannot be read: {reason}") from None
+
+
+def _places(folder: Path) -> tuple[Path, Path, Path]:
+    """Returns where a policy is, where it is while it is written, and where the one before is while it is replaced."""
+    return folder / POLICY, folder / f"{POLICY}.partial", folder / f"{POLICY}.replaced"

@@ -39,8 +39,8 @@ def save_policy(policy: Policy, folder: str | Path) -> None:
     if folder.is_dir() and any(folder.iterdir()):
         raise ConfigError(f"'{folder}' holds files already; give a new or empty folder")
     folder.mkdir(parents=True, exist_ok=True)
-    save_params(folder / "checkpoints", policy.params)
     write_atomically(folder / "config.yaml", config_text(policy.config))
+    save_params(folder / "checkpoints", policy.params, folder / "config.yaml")
 
 
 def load_run(folder: Path) -> tuple[Config, PolicyParams]:
@@ -73,7 +73,7 @@ def load_run(folder: Path) -> tuple[Config, PolicyParams]:
 def _loaded(folder: Path, file: Path) -> tuple[Config, PolicyParams]:
     config = apply(Config(), load_layer(file), str(file))
     validate(config)
-    params = load_params(folder / "checkpoints")
+    params = load_params(folder / "checkpoints", file)
     fresh = jax.eval_shape(lambda: fresh_policy(config))
     if _shapes(params) != _shapes(fresh):
         raise ConfigError(

@@ -56,7 +56,7 @@ def train_run(
         processes.together(lambda: None if run is None else run.create(config))
         (result,) = run_chunks(preparation, lambda chunk: record(run, chunk) or stop_requested())
         if run is not None:
-            save_params(run.checkpoints, result.policy.params)
+            save_params(run.checkpoints, result.policy.params, run.config_file)
         if result.stopped:
             stopped = f"stopped after {result.decisions:,} decisions"
             raise StoppedError(f"{stopped}; " + where_saved(run))

@@ -52,7 +52,7 @@ def train_seeds_run(
         results = run_chunks(preparation, lambda chunk: record(folders[chunk.agent], chunk) or stop_requested())
         for folder, result in zip(folders, results, strict=True):
             if folder is not None:
-                save_params(folder.checkpoints, result.policy.params)
+                save_params(folder.checkpoints, result.policy.params, folder.config_file)
         if results[0].stopped:
             where = "the first process saves the policies" if run is None else f"the policies are in '{run.path}'"
             raise StoppedError(f"stopped after {results[0].decisions:,} decisions; {where}")

@@ -11,7 +11,8 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from edqn_jax.config import Config
 from edqn_jax.errors import ConfigError
 from edqn_jax.learn.policy import Policy, PolicyParams
-from edqn_jax.runs.checkpoints import COMMIT_MARKER, POLICY, load_params, save_params
+from edqn_jax.runs import checkpoints, manifest
+from edqn_jax.runs.checkpoints import POLICY, load_params, save_params
 from edqn_jax.runs.policies import save_policy
 
 
@@ -52,11 +53,45 @@ def test_no_policy_is_a_sentence(tmp_path):
         load_params(tmp_path)
 
 
-def test_a_policy_without_its_commit_marker_does_not_exist(tmp_path):
+def test_a_policy_whose_saving_was_interrupted_does_not_exist(tmp_path):
     save_params(tmp_path, some_policy())
-    (tmp_path / POLICY / COMMIT_MARKER).unlink()
-    with pytest.raises(ConfigError, match="incomplete: saving it was interrupted"):
+    (tmp_path / POLICY / manifest.MANIFEST).unlink()
+    with pytest.raises(ConfigError, match="incomplete: it has no manifest.json, so saving it was interrupted"):
         load_params(tmp_path)
+
+
+@pytest.mark.parametrize("fails", ["rename", "seal"])
+def test_a_policy_is_there_until_the_next_one_is_whole(tmp_path, monkeypatch, fails):
+    save_params(tmp_path, some_policy(1.0))
+
+    def full(*arguments):
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as broken:
+        broken.setattr(*((type(tmp_path), "rename") if fails == "rename" else (checkpoints.manifest, "seal")), full)
+        with pytest.raises(ConfigError, match="cannot be written: No space left on device"):
+            save_params(tmp_path, some_policy(2.0))
+    assert same(load_params(tmp_path), some_policy(1.0))
+    assert [path.name for path in tmp_path.iterdir()] == [POLICY]
+
+
+def test_a_policy_that_was_just_being_replaced_is_found(tmp_path):
+    save_params(tmp_path, some_policy(1.0))
+    (tmp_path / POLICY).rename(tmp_path / f"{POLICY}.replaced")  # and then the process was killed
+    assert same(load_params(tmp_path), some_policy(1.0))
+    save_params(tmp_path, some_policy(2.0))
+    assert same(load_params(tmp_path), some_policy(2.0))
+    assert [path.name for path in tmp_path.iterdir()] == [POLICY]
+
+
+def test_a_configuration_that_was_changed_afterwards_is_refused(tmp_path):
+    file = tmp_path / "config.yaml"
+    file.write_text("events: {threshold: 0.03}")
+    save_params(tmp_path, some_policy(), file)
+    load_params(tmp_path, file)
+    file.write_text("events: {threshold: 0.02}")
+    with pytest.raises(ConfigError, match="config.yaml' has changed since the policy beside it was saved"):
+        load_params(tmp_path, file)
 
 
 def test_a_policy_is_saved_into_no_folder_that_holds_files(tmp_path):
@@ -71,6 +106,6 @@ def test_a_policy_is_saved_into_no_folder_that_holds_files(tmp_path):
 def test_a_damaged_policy_is_one_sentence(tmp_path):
     save_params(tmp_path, some_policy())
     (tmp_path / POLICY / "_METADATA").unlink()
-    with pytest.raises(ConfigError, match="cannot be read") as refusal:
+    with pytest.raises(ConfigError, match="'_METADATA' is missing") as refusal:
         load_params(tmp_path)
     assert "\n" not in str(refusal.value)
