@@ -20,6 +20,7 @@ from edqn_jax.config import Config
 from edqn_jax.config.loading import apply, load_layer, to_yaml
 from edqn_jax.errors import ConfigError
 from edqn_jax.runs.files import check_can_make, unwritable, write_atomically
+from edqn_jax.runs.lock import LOCK, Lock
 
 Resume = Literal["auto", "never", "must"]
 
@@ -81,45 +82,51 @@ class RunDirectory:
         """Returns the folder of one seed's run, where several are trained in one program."""
         return RunDirectory(self.path / f"{SEED_FOLDER}{seed}")
 
-    def create_for_seeds(self, configs: Sequence[Config]) -> None:
+    def create_for_seeds(self, configs: Sequence[Config]) -> Lock:
         """Creates the folder with the first seed's `config.yaml`, and that of every seed within it, as `create`.
 
         Raises:
             ConfigError: as `create`.
         """
-        with self._made():
+        with self._made() as lock:
             write_atomically(self.config_file, config_text(configs[0]))
         for config in configs:
-            self.of_seed(config.train.seed).create(config)
+            with self.of_seed(config.train.seed).create(config):
+                pass  # the lock of all is enough
+        return lock
 
-    def create(self, config: Config) -> None:
-        """Creates the folder with `config.yaml` and the header of `episodes.csv`.
+    def create(self, config: Config) -> Lock:
+        """Creates the folder with `config.yaml` and the header of `episodes.csv`, and locks it for this run.
 
         Deletes the files of an earlier run in it; `plan_run_directory` has checked that this is wanted.
 
         Raises:
-            ConfigError: if it cannot be written, or exists although it `must_be_new`.
+            ConfigError: if it cannot be written, exists although it `must_be_new`, or another run goes on in it.
         """
-        with self._made():
+        with self._made() as lock:
             for folder in (self.figures, self.checkpoints):
                 folder.mkdir()
             write_atomically(self.config_file, config_text(config))
             write_atomically(self.episodes_file, ",".join(EPISODE_COLUMNS) + "\n")
+        return lock
 
     @contextlib.contextmanager
-    def _made(self) -> Iterator[None]:
-        """Makes the folder, without what an earlier run of one seed or several left in it.
+    def _made(self) -> Iterator[Lock]:
+        """Makes and locks the folder, without what an earlier run of one seed or several left in it.
 
         Raises:
-            ConfigError: if it, or what the block makes in it, cannot be made.
+            ConfigError: if it, or what the block makes in it, cannot be made, or another run goes on in it.
         """
         try:
             self.path.mkdir(parents=True, exist_ok=not self.must_be_new)
-            for file in (self.metrics_file, self.episodes_file, self.summary_file, self.trajectory_file):
-                file.unlink(missing_ok=True)
-            for folder in (self.figures, self.checkpoints, *self.path.glob(f"{SEED_FOLDER}*")):
-                shutil.rmtree(folder, ignore_errors=True)
-            yield
+            with contextlib.ExitStack() as unlocked_on_error:
+                lock = unlocked_on_error.enter_context(Lock(self.path))
+                for file in (self.metrics_file, self.episodes_file, self.summary_file, self.trajectory_file):
+                    file.unlink(missing_ok=True)
+                for folder in (self.figures, self.checkpoints, *self.path.glob(f"{SEED_FOLDER}*")):
+                    shutil.rmtree(folder, ignore_errors=True)
+                yield lock
+                unlocked_on_error.pop_all()
         except FileExistsError as error:
             if self.must_be_new:
                 raise ConfigError(f"another run has just created '{self.path}'; start this one again") from None
@@ -194,7 +201,7 @@ def plan_run_directory(given: Path | None, config: Config, resume: Resume = "aut
         raise unwritable(given, error.strerror) from None
     if taken and not given.is_dir():
         raise ConfigError(f"--run-dir '{given}' is a file; give a folder")
-    occupied = taken and any(given.iterdir())
+    occupied = taken and any(path.name != LOCK for path in given.iterdir())
     if occupied and not _is_ours(run.config_file):
         raise ConfigError(f"--run-dir '{given}' holds files that are not an edqn run; give a new or empty folder")
     if run.summary_file.is_file():

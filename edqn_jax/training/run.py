@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import time
 from collections.abc import Callable, Sequence
@@ -51,9 +52,9 @@ def train_run(
         DivergedError: if a loss becomes NaN or Inf.
         StoppedError: after saving the policy, if `stop_requested()` turned true.
     """
-    with prepared(config, reward, progress) as preparation:
+    with prepared(config, reward, progress) as preparation, contextlib.ExitStack() as held:
         progress.message(f"{trained_in(config)}, {described(preparation.devices)}")
-        processes.together(lambda: None if run is None else run.create(config))
+        processes.together(lambda: None if run is None else held.enter_context(run.create(config)))
         (result,) = run_chunks(preparation, lambda chunk: record(run, chunk) or stop_requested())
         if run is not None:
             save_params(run.checkpoints, result.policy.params, run.config_file)

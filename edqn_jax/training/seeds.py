@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import time
 from collections.abc import Callable
 from typing import Any
@@ -44,10 +45,10 @@ def train_seeds_run(
     Raises:
         ConfigError, DivergedError, StoppedError: as `train_run`.
     """
-    with prepared(config, reward, progress, agents=seeds) as preparation:
+    with prepared(config, reward, progress, agents=seeds) as preparation, contextlib.ExitStack() as held:
         configs, agents = preparation.configs, range(seeds)
         progress.message(f"{trained_in(config)}, {seeds} seeds, {described(preparation.devices)}")
-        processes.together(lambda: None if run is None else run.create_for_seeds(configs))
+        processes.together(lambda: None if run is None else held.enter_context(run.create_for_seeds(configs)))
         folders = [None if run is None else run.of_seed(each.train.seed) for each in configs]
         results = run_chunks(preparation, lambda chunk: record(folders[chunk.agent], chunk) or stop_requested())
         for folder, result in zip(folders, results, strict=True):

@@ -14,6 +14,7 @@ from edqn_jax.config import Config
 from edqn_jax.config.loading import resolve
 from edqn_jax.errors import ConfigError
 from edqn_jax.runs.directory import TRAJECTORY_COLUMNS, RunDirectory, plan_run_directory, version_of
+from edqn_jax.runs.lock import LOCK
 
 
 @pytest.fixture
@@ -170,7 +171,7 @@ def test_one_seed_and_several_leave_nothing_of_each_other(tmp_path):
     run.create(Config())
     run.append_metrics({"decisions": 1})
     run.create_for_seeds(configs)
-    assert sorted(file.name for file in run.path.iterdir()) == ["config.yaml", "seed-0"]
+    assert sorted(file.name for file in run.path.iterdir()) == ["config.yaml", LOCK, "seed-0"]
     assert run.of_seed(0).figures.is_dir()
     run.create(Config())
     assert not list(run.path.glob("seed-*")) and run.checkpoints.is_dir()

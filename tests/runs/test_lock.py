@@ -1,0 +1,60 @@
+"""Two runs never write into one folder."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from edqn_jax.config import Config
+from edqn_jax.errors import ConfigError
+from edqn_jax.runs.directory import RunDirectory, plan_run_directory
+from edqn_jax.runs.lock import LOCK, Lock
+from tests.processes import PATIENCE_S
+
+HOLDER = """
+import sys, time
+from pathlib import Path
+from edqn_jax.runs.lock import Lock
+with Lock(Path(sys.argv[1])):
+    print("locked", flush=True)
+    time.sleep(600)
+"""
+
+
+def test_a_folder_that_a_run_holds_is_refused_whole_and_free_when_it_has_ended(tmp_path: Path) -> None:
+    run = RunDirectory(tmp_path / "run")
+    with run.create(Config()):
+        run.append_metrics({"decisions": 1})
+        again = plan_run_directory(run.path, Config(), "never")
+        with pytest.raises(ConfigError, match=r"run' is in use: process \d+ on .* writes a run there; give another"):
+            again.create(Config())
+        assert run.read_metrics() == [{"decisions": 1}]
+    assert not (run.path / LOCK).exists()
+    with again.create(Config()):
+        assert not run.metrics_file.exists()
+
+
+def test_a_process_that_is_killed_leaves_no_lock(tmp_path: Path) -> None:
+    words = [sys.executable, "-c", HOLDER, str(tmp_path)]
+    with subprocess.Popen(words, stdout=subprocess.PIPE, text=True) as holder:
+        assert holder.stdout is not None and holder.stdout.readline() == "locked\n"
+        with pytest.raises(ConfigError, match=f"process {holder.pid} on"):
+            Lock(tmp_path)
+        holder.kill()
+        holder.wait(PATIENCE_S)
+    assert (tmp_path / LOCK).exists()  # the file, but nobody holds it
+    assert plan_run_directory(tmp_path, Config()).path == tmp_path  # nor does it make the folder somebody's
+    with Lock(tmp_path):
+        pass
+    assert not (tmp_path / LOCK).exists()
+
+
+def test_a_lock_on_a_file_that_has_been_removed_is_none(tmp_path: Path) -> None:
+    first = Lock(tmp_path)
+    (tmp_path / LOCK).unlink()
+    with Lock(tmp_path) as second, pytest.raises(ConfigError, match="is in use"):
+        assert second.file == first.file
+        Lock(tmp_path)
