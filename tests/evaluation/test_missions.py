@@ -126,9 +126,10 @@ def test_a_world_without_a_volume_is_flown_in_the_box_that_holds_start_and_goal(
 
 @pytest.mark.slow
 def test_a_run_in_random_worlds_ends_with_the_world_that_is_to_be_flown_and_then_the_test_worlds():
-    sizes = {"world": {"pool_size": 2, "missions": 4}, "train": {"validation_missions": 3}}
-    worlds_asked = sizes["world"] | {"flown": ""}, sizes["world"]
-    here, there = (run_missions(make_config("sparse", **sizes | {"world": asked})) for asked in worlds_asked)
+    sizes, count = {"pool_size": 2, "missions": 4}, {"validation_missions": 3}
+    here, there = (
+        run_missions(make_config("sparse", world={**sizes, "flown": flown}, train=count)) for flown in ("", "paper")
+    )
     assert (here.tests, there.tests) == (3, 2)
     city, flown = load_scene(resolve_world("paper")), there.final.world
     np.testing.assert_array_equal(flown.missions.start[0], city.start)
