@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import fcntl
 import subprocess
 import sys
 from pathlib import Path
@@ -52,9 +53,19 @@ def test_a_process_that_is_killed_leaves_no_lock(tmp_path: Path) -> None:
     assert not (tmp_path / LOCK).exists()
 
 
-def test_a_lock_on_a_file_that_has_been_removed_is_none(tmp_path: Path) -> None:
-    first = Lock(tmp_path)
-    (tmp_path / LOCK).unlink()
-    with Lock(tmp_path) as second, pytest.raises(ConfigError, match="is in use"):
-        assert second.file == first.file
-        Lock(tmp_path)
+def test_a_lock_is_on_the_file_that_is_in_the_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The holder before may remove its file between the moments at which another opens and locks it."""
+    locked: list[int] = []
+
+    def removed_meanwhile(opened: int, operation: int) -> None:
+        locked.append(opened)
+        if len(locked) == 1:
+            (tmp_path / LOCK).unlink()
+        flock(opened, operation)
+
+    flock = fcntl.flock
+    monkeypatch.setattr(fcntl, "flock", removed_meanwhile)
+    with Lock(tmp_path):
+        assert len(locked) == 2 and (tmp_path / LOCK).exists()
+        with pytest.raises(ConfigError, match="is in use"):
+            Lock(tmp_path)
