@@ -9,6 +9,7 @@ from rich.console import Console
 from rich.table import Table
 
 from edqn_jax.cli.arguments import EvaluateArgs
+from edqn_jax.errors import ConfigError
 from edqn_jax.evaluation.evaluate import evaluate
 from edqn_jax.evaluation.latency import decision_latency_ms
 from edqn_jax.evaluation.metrics import clearance_text
@@ -27,6 +28,8 @@ def evaluate_command(args: EvaluateArgs) -> None:
     for file in (args.json, args.trajectories):
         if file is not None:
             check_can_write(file)
+    if args.json is not None and args.trajectories is not None and args.json.resolve() == args.trajectories.resolve():
+        raise ConfigError(f"--json and --trajectories are both '{args.json}'; give two files")
     policy = load_policy(args.run)
     evaluation = evaluate(
         policy,

@@ -46,6 +46,7 @@ def validate(config: Config) -> None:
 
 def _world(world: WorldConfig) -> None:
     _positive(world, "world", ["pool_size", "missions"])
+    _at_most(world, "world", ["pool_size", "missions"], 1_000_000)
     _share(world, "world", ["own_start_fraction"])
     _not_negative(world, "world", ["start_jitter_m"])
     if not world.name:
@@ -68,6 +69,8 @@ def _drone(drone: DroneConfig) -> None:
 
 def _camera(camera: CameraConfig) -> None:
     _positive(camera, "camera", ["width", "height", "samples_across", "samples_down", "texture_period_m"])
+    _at_most(camera, "camera", ["width", "height"], 1024)
+    _at_most(camera, "camera", ["samples_across", "samples_down"], 16)
     _share(camera, "camera", ["ambient"])
     _within(camera, "camera", ["horizontal_fov_deg"], 1.0, 170.0)
     _within(camera, "camera", ["sun_elevation_deg"], 0.0, 90.0)
@@ -145,6 +148,8 @@ def _train(train: TrainConfig) -> None:
     _positive(train, "train", ["num_envs", "total_steps", "chunk_steps", "shards"])
     _not_negative(train, "train", ["max_episodes", "devices", "validation_every", "seed"])
     _positive(train, "train", ["validation_missions"])
+    _at_most(train, "train", ["num_envs", "shards"], 1_000_000)
+    _at_most(train, "train", ["validation_missions", "chunk_steps"], 100_000)
     _require(train.seed < 2**32, "train.seed", "less than 2**32", train.seed)
     shards, envs = train.shards, train.num_envs
     multiple = f"a multiple of train.shards ({shards}), such as {-(-envs // shards) * shards}"
@@ -185,8 +190,18 @@ def _samples(encoder: EncoderConfig, train: TrainConfig) -> None:
 
 def _require(holds: bool, name: str, limits: str, value: object) -> None:
     if not holds:
-        shown = (", ".join(f"{item:g}" for item in value) or "an empty list") if isinstance(value, tuple) else value
-        raise ConfigError(f"{name} must be {limits}, not {shown}")
+        said = ", ".join(map(_short, value)) or "an empty list" if isinstance(value, tuple) else shown(value)
+        raise ConfigError(f"{name} must be {limits}, not {said}")
+
+
+def shown(value: object) -> str:
+    """Returns a value as text; a whole number of very many digits without them."""
+    return "a huge number" if isinstance(value, int) and abs(value) >= 10**18 else str(value)
+
+
+def _short(value: object) -> str:
+    """Returns an item of a list as text."""
+    return f"{value:g}" if isinstance(value, float) else shown(value)
 
 
 def _positive(section: object, group: str, keys: Iterable[str]) -> None:
@@ -194,6 +209,13 @@ def _positive(section: object, group: str, keys: Iterable[str]) -> None:
         value = getattr(section, key)
         limits = "at least 1" if isinstance(value, int) else "more than 0"
         _require(0 < value < math.inf, f"{group}.{key}", limits, value)
+
+
+def _at_most(section: object, group: str, keys: Iterable[str], most: int) -> None:
+    """Refuses sizes that no machine has memory for, before anything of them is made."""
+    for key in keys:
+        value = getattr(section, key)
+        _require(value <= most, f"{group}.{key}", f"at most {most}", value)
 
 
 def _not_negative(section: object, group: str, keys: Iterable[str]) -> None:

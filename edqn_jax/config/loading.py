@@ -6,6 +6,7 @@ nested dict, `{"agent": {"batch_size": 512}}`, that names only what it changes.
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import difflib
 import re
@@ -17,7 +18,7 @@ from typing import Any, Literal
 
 import yaml
 
-from edqn_jax.config.limits import validate
+from edqn_jax.config.limits import shown, validate
 from edqn_jax.config.options import DENSITIES, Config
 from edqn_jax.config.presets import preset as named_preset
 from edqn_jax.errors import ConfigError
@@ -171,6 +172,10 @@ def load_layer(file: Path) -> Layer:
         where = f" at line {mark.line + 1}" if mark else ""
         problem = getattr(error, "problem", None) or "it does not parse"
         raise ConfigError(f"'{file}' is not valid YAML{where}: {problem}") from None
+    except RecursionError:
+        raise ConfigError(f"'{file}' is nested too deeply for a file of options") from None
+    except ValueError as error:  # of a number or a date that YAML knows and Python does not
+        raise ConfigError(f"'{file}' is not valid YAML: {error}") from None
     if layer is None:
         return {}
     if not isinstance(layer, dict):
@@ -217,7 +222,8 @@ def typed(value: Any, hint: Any, name: str) -> Any:
     if origin is Literal and value in arguments:
         return value
     if hint is float and isinstance(value, int | float) and not isinstance(value, bool):
-        return float(value)
+        with contextlib.suppress(OverflowError):  # a whole number may be too large
+            return float(value)
     if hint in (int, str, bool) and type(value) is hint:
         return value
     if origin is tuple and isinstance(value, list | tuple):
@@ -298,4 +304,4 @@ def _describe(value: Any) -> str:
         return "a group of keys"
     if isinstance(value, list | tuple):
         return f"a list of {len(value)}"
-    return f"the text '{value}'" if isinstance(value, str) else str(value)
+    return f"the text '{value}'" if isinstance(value, str) else shown(value)

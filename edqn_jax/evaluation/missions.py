@@ -148,7 +148,8 @@ def _pool_of(name: str, config: Config) -> Scene:
         ConfigError: if the file is no world, or the drone does not fit where its mission starts or ends.
     """
     loaded = load_world(resolve_world(name))
-    check_scene(loaded.scene, config.drone.body_radius_m, names=loaded.names, title=f"'{name}'")
+    radii = config.drone.body_radius_m, config.env.goal_radius_m
+    check_scene(loaded.scene, radii[0], names=loaded.names, title=f"'{name}'", goal_radius=radii[1])
     return stack_scenes([loaded.scene])
 
 
@@ -211,6 +212,9 @@ def load_missions(
     if seed < 0 or (seed + 1) * missions >= 2**31:
         last = 2**31 // missions - 2
         raise ConfigError(f"--seed must be from 0 to {last} for {missions} missions, not {seed}")
+    for role, point in (("start", start), ("goal", goal)):
+        if point is not None and not np.all(np.isfinite(point)):
+            raise ConfigError(f"--{role} must be three finite numbers, metres, not {' '.join(f'{x:g}' for x in point)}")
     moved = {k: jnp.asarray(v, jnp.float32) for k, v in (("start", start), ("goal", goal)) if v is not None}
     if name in DENSITIES:
         return _random_missions(config, name, missions, seed, moved)
@@ -248,7 +252,7 @@ def _file_missions(config: Config, name: str, missions: int, seed: int, moved: d
         if not np.array_equal(scene.volume, loaded.scene.volume):
             note = f"'{name}' names no flight volume: it is flown in {_box(scene)}, around its shapes, start and goal"
     if missions == 1:
-        check_scene(scene, radius, names=loaded.names, title=f"'{name}'")
+        check_scene(scene, radius, names=loaded.names, title=f"'{name}'", goal_radius=config.env.goal_radius_m)
         shortest_path(scene, scene.start, scene.goal, radius)  # raises where there is no path
         pool = stack_scenes([scene])
         return MissionSet(name, World(airframe, pool, worlds.own_missions(pool)), file, note)

@@ -49,7 +49,7 @@ VOLUME_MARGIN = 5.0
 """Metres around shapes and sites where a world names no `volume`."""
 
 LONGEST_VOLUME = 500.0
-"""Most metres along an axis of a flight volume that is widened for a start or goal; A*'s lattice must hold it."""
+"""Most metres along an axis of a flight volume; A*'s lattice must hold it."""
 
 _LEVEL = 1e-6  # an axis this near to vertical (sine of the angle) is vertical: 0.1 mm over 100 m
 
@@ -134,6 +134,9 @@ def load_world(path: str | Path) -> LoadedWorld:
         kind = next(kind for kind, dataclass in KINDS.items() if isinstance(shape, dataclass))
         names[kind].append(_geom_name(model, geom))
     sites = {model.site(i).name: data.site_xpos[i] for i in range(model.nsite)}
+    for name, where in sites.items():
+        if not np.all(np.isfinite(where)):
+            raise SceneError(f"{path}: the site '{name}' stands at no finite point; give its pos three numbers")
     unknown = np.full(3, np.nan)
     scene = build_scene(
         shapes,
@@ -174,6 +177,7 @@ def check_scene(
     *,
     names: Mapping[str, tuple[str, ...]] | None = None,
     title: str = "the world",
+    goal_radius: float | None = None,
 ) -> None:
     """Checks that a drone of this radius fits at the start and at the goal.
 
@@ -182,13 +186,19 @@ def check_scene(
         body_radius: metres.
         names: as in `LoadedWorld`, for the message.
         title: name of the world in the message.
+        goal_radius: metres within which a drone has arrived; None if it does not matter where the start is.
 
     Raises:
-        SceneError: if either is missing, outside the flight volume or too close to a shape.
+        SceneError: if either is missing, outside the flight volume or too close to a shape, if the start is at the goal
+            already, or if the volume is empty or longer than `LONGEST_VOLUME` along an axis.
     """
     lower, upper = np.asarray(scene.volume)
     if not np.all(upper > lower):
         raise SceneError(f"the flight volume of {title}, {_point(lower)} to {_point(upper)}, is empty")
+    if not np.all(upper - lower <= LONGEST_VOLUME):
+        raise SceneError(
+            f"the flight volume of {title}, {_point(lower)} to {_point(upper)}, is longer than {LONGEST_VOLUME:g} m"
+        )
     for role, where in (("start", scene.start), ("goal", scene.goal)):
         point = np.asarray(where)
         if not np.all(np.isfinite(point)):
@@ -212,6 +222,13 @@ def check_scene(
                 f"the {role} {_point(point)} of {title} is {distance:.2f} m from {name}, "
                 f"closer than the drone's radius of {body_radius:g} m"
             )
+
+    apart = float(np.linalg.norm(np.asarray(scene.goal) - np.asarray(scene.start)))
+    if goal_radius is not None and apart <= goal_radius:
+        raise SceneError(
+            f"the start {_point(np.asarray(scene.start))} of {title} is {apart:.2f} m from the goal, where a drone has "
+            f"arrived within {goal_radius:g} m; move either"
+        )
 
 
 def write_scene(scene: Scene, path: str | Path, *, title: str = "world") -> None:
@@ -275,6 +292,8 @@ def _shape(model: mujoco.MjModel, data: mujoco.MjData, geom: int, path: Path) ->
     material = model.geom_matid[geom]
     albedo = (model.geom_rgba[geom] if material < 0 else model.mat_rgba[material])[:3]
     position, rotation, size = data.geom_xpos[geom], data.geom_xmat[geom].reshape(3, 3), model.geom_size[geom]
+    if not all(np.all(np.isfinite(values)) for values in (position, rotation, size)):
+        raise SceneError(f"{path}: geom '{name}' has a place or a size that is not finite; give it numbers")
     axis = rotation[:, 2]
     upright = math.hypot(axis[0], axis[1]) < _LEVEL
     match kind:

@@ -122,6 +122,10 @@ def test_a_whole_number_may_stand_for_a_float():
         ("camera: {sky_rgb: [1, 1]}", "'camera.sky_rgb' must be a list of 3 numbers, not a list of 2"),
         ("events: {law: esmi}", "'events.law' must be one of paper, airsim, esim, not the text 'esmi'"),
         ("world: {name: }", "'world.name' must be text, not nothing"),
+        ("agent: {learning_rate: 1" + 400 * "0" + "}", "'agent.learning_rate' must be a number, not a huge number"),
+        ("agent: {n_step: 1" + 5000 * "0" + "}", "is not valid YAML: Exceeds the limit"),
+        ("train: {num_envs: " + 5000 * "[" + 5000 * "]" + "}", "is nested too deeply for a file of options"),
+        ("train: !!python/object/apply:os.system [ls]", "is not valid YAML at line 1: could not determine"),
         ("- 1", "must hold groups of keys such as 'agent:'"),
         ("agent: {n_step: 1, n_step: 2}", "is not valid YAML at line 1: the key 'n_step' is given twice"),
         ("? [n_step, double]\n: 1", "is not valid YAML at line 1: a key must be a word"),
@@ -170,6 +174,11 @@ def test_every_numeric_option_has_limits(group, option, nonsense):
     ("group", "options", "says"),
     [
         ("train", {"num_envs": 0}, "train.num_envs must be at least 1, not 0"),
+        ("train", {"num_envs": 10**9}, "train.num_envs must be at most 1000000, not 1000000000"),
+        ("train", {"num_envs": 10**400}, "train.num_envs must be at most 1000000, not a huge number"),
+        ("train", {"validation_missions": 10**9}, "train.validation_missions must be at most 100000"),
+        ("world", {"missions": 10**9}, "world.missions must be at most 1000000"),
+        ("camera", {"width": 100_000}, "camera.width must be at most 1024, not 100000"),
         ("train", {"num_envs": 12}, r"must be a multiple of train.shards \(8\), such as 16, not 12"),
         ("train", {"devices": 3}, "train.devices must be 0 or a divisor of train.shards"),
         (

@@ -77,6 +77,13 @@ def inside_a_block() -> tuple[float, float, float]:
         ({"name": "paper", "missions": 0}, "--missions must be at least 1"),
         ({"name": "paper", "seed": -1}, "--seed must be from 0"),
         ({"name": "sparse", "missions": 4, "seed": 2**30}, "--seed must be from 0"),
+        ({"name": "paper", "start": (float("nan"), 1, 3)}, "--start must be three finite numbers, metres, not nan 1 3"),
+        ({"name": "paper", "goal": (1, 1, float("inf"))}, "--goal must be three finite numbers, metres, not 1 1 inf"),
+        (
+            {"name": "paper", "start": (1, 1, 3), "goal": (1, 1, 3)},
+            "is 0.00 m from the goal, where a drone has arrived",
+        ),
+        ({"name": "paper", "start": (89, 90, 10)}, r"is 1.00 m from the goal, .* within 2 m; move either"),
         ({"name": "paper", "start": (1, 1, 30)}, "lies outside the flight volume"),
         ({"name": "paper", "missions": 3, "start": (1, 1, 3)}, "all flights would be equal"),
         ({"name": "sparse", "missions": 4, "goal": (5, 5, -1)}, "test world 0"),

@@ -182,6 +182,25 @@ def test_a_mocap_body_counts_as_moving(world_of):
         world_of(ENDS + '<body name="lift" mocap="true"><geom name="door" size="1"/></body>')
 
 
+@pytest.mark.parametrize(
+    ("content", "says"),
+    [
+        ('<geom name="door" type="box" pos="nan 0 5" size="2 2 5"/>', "geom 'door' has a place or a size that is not"),
+        ('<geom name="door" type="box" pos="20 0 5" size="2 inf 5"/>', "geom 'door' has a place or a size that is not"),
+        ('<site name="gate" pos="0 nan 2"/>', "the site 'gate' stands at no finite point"),
+    ],
+)
+def test_what_is_not_finite_is_named(world_of, content, says):
+    with pytest.raises(SceneError, match=says):
+        world_of(ENDS + content)
+
+
+def test_a_volume_that_no_search_could_hold_is_refused(world_of):
+    world = world_of(ENDS + '<site name="volume" type="box" size="1e6 9 9"/>')
+    with pytest.raises(SceneError, match="is longer than 500 m"):
+        check_scene(world.scene, RADIUS)
+
+
 def test_a_turned_volume_is_refused(world_of):
     with pytest.raises(SceneError, match="'volume' must be a box that is not rotated"):
         world_of(ENDS + '<site name="volume" type="box" size="9 9 9" euler="0 0 10"/>')
