@@ -50,10 +50,11 @@ def save_params(folder: Path, params: PolicyParams, config_file: Path | None = N
         shutil.rmtree(partial, ignore_errors=True)
         saver.save(partial, args=ocp.args.PyTreeSave(tree))
         manifest.seal(partial, {} if config_file is None else {CONFIG: manifest.digest(config_file)})
-        shutil.rmtree(replaced, ignore_errors=True)
-        if saved.exists():
+        if saved.exists():  # if not, what is in the other place may be the only policy
+            shutil.rmtree(replaced, ignore_errors=True)
             saved.rename(replaced)
         partial.rename(saved)
+        manifest.sync(saved.parent)
         shutil.rmtree(replaced, ignore_errors=True)
     except (OSError, ValueError, RuntimeError) as error:  # Orbax passes on what TensorStore raises
         shutil.rmtree(partial, ignore_errors=True)

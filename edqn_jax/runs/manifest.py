@@ -33,9 +33,9 @@ def seal(folder: Path, facts: dict[str, str] | None = None) -> None:
     with (folder / MANIFEST).open("w", encoding="utf-8") as file:
         file.write(text)
     for name in (*files, MANIFEST):
-        _sync(folder / name)
+        sync(folder / name)
     for path in (*(path for path in folder.rglob("*") if path.is_dir()), folder):
-        _sync(path)
+        sync(path)
 
 
 def check(folder: Path) -> dict[str, str]:
@@ -81,6 +81,15 @@ def digest(file: Path) -> str:
     return summed.hexdigest()
 
 
+def sync(path: Path) -> None:
+    """Writes what the system still holds of a file or folder to the disk."""
+    opened = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(opened)
+    finally:
+        os.close(opened)
+
+
 def _files(folder: Path) -> Iterator[str]:
     """Yields the names, relative to the folder, of all files below it but the manifest.
 
@@ -102,12 +111,3 @@ def _text(content: dict[str, Any]) -> str:
     """Returns the manifest's text, with the SHA-256 of everything else in it."""
     summed = hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
     return json.dumps({**content, "sha256": summed}, indent=1, sort_keys=True) + "\n"
-
-
-def _sync(path: Path) -> None:
-    """Writes what the system still holds of a file or folder to the disk."""
-    opened = os.open(path, os.O_RDONLY)
-    try:
-        os.fsync(opened)
-    finally:
-        os.close(opened)
