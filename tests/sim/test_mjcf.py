@@ -190,7 +190,8 @@ def test_a_mocap_body_counts_as_moving(world_of):
         ('<site name="gate" pos="0 nan 2"/>', "the site 'gate' stands at no finite point"),
     ],
 )
-def test_what_is_not_finite_is_named(world_of, content, says):
+def test_what_is_not_finite_is_named(world_of, content, says, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)  # MuJoCo writes its warning into a file there
     with pytest.raises(SceneError, match=says):
         world_of(ENDS + content)
 
