@@ -46,7 +46,7 @@ from edqn_jax.runs.files import check_can_make
 from edqn_jax.runs.policies import load_policy, save_policy
 from edqn_jax.training.loop import train_seeds
 from measurement import json_report
-from measurement.flags import split
+from measurement.flags import judged_in_tests, split
 from rivals.learners import flight_columns
 from rivals.planning import judged_scenes, shortest_lengths
 
@@ -90,7 +90,7 @@ def config_of(world: str, sensor: str, flags: Sequence[str]) -> Config:
     Raises:
         ConfigError: if the options are invalid.
     """
-    _, config = parse_train(["--world", world, "--env.sensor", sensor, *flags])
+    config = judged_in_tests(parse_train(["--world", world, "--env.sensor", sensor, *flags])[1])
     # What is flown at the end is what was learnt at the end: no choice by validation, no time for it.
     train = dataclasses.replace(config.train, validation_every=0, validation_missions=1, keep="last")
     return dataclasses.replace(config, train=train)

@@ -14,6 +14,7 @@ import pytest
 
 import edqn_jax
 from edqn_jax.sim.moves import ACTIONS
+from edqn_jax.training import loop
 from tests.miniature import WORLD
 from tests.policies import CONFIG, always
 
@@ -87,6 +88,20 @@ def test_names_of_moves_lead_back_to_their_numbers() -> None:
 def test_a_move_that_is_none_is_named(move: object, message: str) -> None:
     with pytest.raises(edqn_jax.ConfigError, match=message):
         edqn_jax.move_number(move)  # type: ignore[arg-type]
+
+
+def test_without_a_configuration_what_is_trained_is_that_of_the_command(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked: list[edqn_jax.Config] = []
+
+    def prepared(config: edqn_jax.Config, *_: object, **__: object) -> None:
+        asked.append(config)
+        raise InterruptedError
+
+    monkeypatch.setattr(loop, "prepared", prepared)
+    for train in (edqn_jax.train, lambda: edqn_jax.train_seeds(2)):
+        with pytest.raises(InterruptedError):
+            train()
+    assert asked == [edqn_jax.make_config()] * 2 and asked[0].world.flown == "paper"
 
 
 def test_options_are_given_by_group_and_the_world_brings_its_own() -> None:

@@ -37,6 +37,9 @@ def validate(config: Config) -> None:
     _train(config.train)
     _replay(config.agent, config.train)
     _samples(config.encoder, config.train)
+    judged = not config.world.flown or config.train.validation_missions >= 2
+    limit = "at least 2 with world.flown, whose flight takes the place of one test world"
+    _require(judged, "train.validation_missions", limit, config.train.validation_missions)
     if config.agent.turn and config.world.name not in DENSITIES:
         raise ConfigError(
             f"agent.turn needs a random world ({', '.join(DENSITIES)}), not '{config.world.name}': "

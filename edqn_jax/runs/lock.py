@@ -24,20 +24,24 @@ class Lock(contextlib.AbstractContextManager["Lock"]):
             ConfigError: if a run that goes on holds it.
             OSError: if the lock's file cannot be made.
         """
+        self._held: int | None = None  # descriptor of the file
         self.file = folder / LOCK
-        self._held: int | None = None
         while self._held is None:  # whoever held it before may just have removed the file
             self._held = _taken(self.file)
 
     def __exit__(self, *_: object) -> None:
         if self._held is not None:
             self.file.unlink(missing_ok=True)
-        self.__del__()
+            self._unlock()
 
     def __del__(self) -> None:
         if self._held is not None:
-            os.close(self._held)
-            self._held = None
+            self._unlock()
+
+    def _unlock(self) -> None:
+        held, self._held = self._held, None
+        assert held is not None
+        os.close(held)
 
 
 def _taken(file: Path) -> int | None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import json
 from collections.abc import Sequence
 from pathlib import Path
@@ -11,6 +12,7 @@ from typing import Any
 import pytest
 
 import runtime
+from conventional_stack.settings import supported
 from edqn_jax.config import Config
 from edqn_jax.errors import ConfigError
 from edqn_jax.planners.planner import PLANNERS
@@ -297,6 +299,20 @@ def test_rows_with_other_options_are_other_rows(clear: Path) -> None:
         assert settings(name, "--env.goal-radius-m", "3.0") != settings(name)
     assert settings("E-DQN", *agent) != settings("E-DQN")
     assert settings("A*", *agent) == settings("A*")  # it has none
+
+
+def test_rivals_are_judged_in_test_worlds_and_timed_in_the_papers() -> None:
+    assert runtime.configured("medium", [], quick=True).world.flown == ""
+    assert runtime.for_timing([]).world.name == "paper"
+    assert runtime.for_timing(["--world", "medium"]).world.flown == ""
+
+
+def test_the_conventional_stack_has_its_own_agent_unless_told_otherwise() -> None:
+    ours = Config()
+    theirs = supported(ours).agent
+    assert (theirs.history, theirs.huber_delta) == (1, 1.0) and theirs.hidden == ours.agent.hidden
+    told = dataclasses.replace(ours, agent=dataclasses.replace(ours.agent, learning_rate=5e-4))
+    assert supported(told).agent.learning_rate == 5e-4
 
 
 def test_the_script_states_its_length(capsys: pytest.CaptureFixture[str]) -> None:

@@ -245,6 +245,13 @@ def test_what_cannot_be_run_is_named_with_its_limits(group, options, says):
         validate(changed(group, **options))
 
 
+def test_the_flight_through_another_world_leaves_a_test_world_to_judge_by():
+    make_config("medium", train={"validation_missions": 2})
+    make_config("medium", world={"flown": ""}, train={"validation_missions": 1})
+    with pytest.raises(ConfigError, match="validation_missions must be at least 2 with world.flown, .*, not 1"):
+        make_config("medium", train={"validation_missions": 1})
+
+
 def test_frames_may_fill_the_whole_decision():
     steps = tuple(round(-0.02 * step, 2) for step in range(13, -1, -1))
     validate(changed("events", frame_times_s=steps))

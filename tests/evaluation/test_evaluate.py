@@ -137,6 +137,13 @@ def test_a_file_that_cannot_be_written_is_named_before_anything_is_flown(run, tm
         evaluate_command(EvaluateArgs(run, json=tmp_path / "nowhere" / "figures.json"))
 
 
+def test_one_file_is_not_asked_for_twice(run, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(ConfigError, match="--json and --trajectories are both 'flights'; give two files"):
+        evaluate_command(EvaluateArgs(run, json=Path("flights"), trajectories=tmp_path / "flights"))
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_codes_are_shuffled_between_enough_missions(run):
     with pytest.raises(ConfigError, match="--shuffle-codes needs --missions of at least 4, not 1"):
         evaluate_command(EvaluateArgs(run, shuffle_codes=True))

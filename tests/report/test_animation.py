@@ -11,8 +11,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from edqn_jax.cli import main
+from edqn_jax.cli import main, record
+from edqn_jax.config import WorldConfig
 from edqn_jax.config.loading import to_yaml
+from edqn_jax.errors import ConfigError
 from edqn_jax.learn.policy import PolicyParams, fresh_policy
 from edqn_jax.report.animation import LAST_FRAME_S, MOST_FRAMES, SIZE, animate
 from edqn_jax.report.sights import FINE, Shown
@@ -107,6 +109,22 @@ def test_a_saved_run_is_recorded_on_another_world(run, tmp_path, capsys):
     with Image.open(file) as gif:
         assert (gif.size, frames(gif)) == (SIZE, 11)
     assert file.stat().st_size < 3e6
+
+
+@pytest.mark.parametrize(
+    ("flown", "asked", "world"), [("paper", [], "paper"), ("", [], "sparse"), ("paper", ["--world", "dense"], "dense")]
+)
+def test_a_run_is_recorded_where_its_last_flight_was(flown, asked, world, tmp_path, monkeypatch, capsys):
+    trained = dataclasses.replace(SMALL, world=WorldConfig(name="sparse", flown=flown))
+    (tmp_path / "config.yaml").write_text(to_yaml(trained))
+    save_params(tmp_path / "checkpoints", always_ahead())
+
+    def named(config, name, *_):
+        raise ConfigError(f"asked for {name}")
+
+    monkeypatch.setattr(record, "load_missions", named)
+    assert main(["record", str(tmp_path), str(tmp_path / "flight.gif"), *asked]) == 2
+    assert f"asked for {world}" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
