@@ -29,6 +29,17 @@ def main(argv: Sequence[str] | None = None) -> int:
     # XLA's errors are for people, its warnings for those who write XLA; read when JAX is first imported.
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")
     try:
+        code = _dispatched(argv)
+        sys.stdout.flush()
+        return code
+    except BrokenPipeError:  # whoever reads, such as `head`, has enough; Python would try once more at its end
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return DONE
+
+
+def _dispatched(argv: list[str]) -> int:
+    """Runs one command and returns the exit code of its ending."""
+    try:
         return _dispatch(argv)
     except SystemExit as ending:  # tyro has printed the help, or what is wrong
         return int(ending.code or DONE)

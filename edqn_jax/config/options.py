@@ -12,7 +12,7 @@ from typing import Literal
 
 @dataclass(frozen=True)
 class WorldConfig:
-    """Where to fly."""
+    """Where to train and to fly."""
 
     name: str = "paper"
     """Where to train: `paper`, a random density (`sparse`, `medium`, `dense`, or `mixed`: all three), or the path of an

@@ -19,6 +19,7 @@ from edqn_jax.config.loading import RANDOM_WORLDS, make_config
 from edqn_jax.errors import ConfigError, DivergedError, StoppedError
 from edqn_jax.parallel import devices
 from edqn_jax.sim.mjcf import SceneError
+from tests.processes import PATIENCE_S
 
 ROOT = Path(__file__).parents[2]
 
@@ -294,3 +295,12 @@ def test_train_py_is_the_train_command():
     )
     assert shown.returncode == 2
     assert shown.stderr == "edqn: train.num_envs must be at least 1, not 0\n"
+
+
+def test_a_reader_that_has_enough_is_no_error() -> None:
+    reads, writes = os.pipe()
+    os.close(reads)
+    words = [sys.executable, "-m", "edqn_jax", "train", "--help"]
+    with os.fdopen(writes, "wb") as closed:
+        ended = subprocess.run(words, cwd=ROOT, stdout=closed, stderr=subprocess.PIPE, text=True, timeout=PATIENCE_S)
+    assert (ended.returncode, ended.stderr) == (0, "")

@@ -133,7 +133,7 @@ def test_a_world_without_a_volume_is_flown_in_the_box_that_holds_start_and_goal(
 
 @pytest.mark.slow
 def test_a_run_in_random_worlds_ends_with_the_world_that_is_to_be_flown_and_then_the_test_worlds():
-    sizes, count = {"pool_size": 2, "missions": 4}, {"validation_missions": 3}
+    sizes, count = {"pool_size": 3, "missions": 8}, {"validation_missions": 3}
     here, there = (
         run_missions(make_config("sparse", world={**sizes, "flown": flown}, train=count)) for flown in ("", "paper")
     )
@@ -154,7 +154,7 @@ def test_a_run_in_random_worlds_ends_with_the_world_that_is_to_be_flown_and_then
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["sparse", "paper"])
 def test_runs_of_several_seeds_have_the_missions_of_each_alone(name):
-    config = make_config(name, world={"pool_size": 4, "missions": 8}, train={"validation_missions": 3})
+    config = make_config(name, world={"pool_size": 3, "missions": 8}, train={"validation_missions": 3})
     configs = [dataclasses.replace(config, train=dataclasses.replace(config.train, seed=seed)) for seed in (0, 5)]
     together = missions_of_runs(configs)
     for own, alone in zip(together, map(run_missions, configs), strict=True):
