@@ -19,6 +19,7 @@ from edqn_jax.errors import ConfigError
 from edqn_jax.parallel.hardware import hardware
 from edqn_jax.parallel.launch import Distributed
 from edqn_jax.policies import policy_folder
+from edqn_jax.runs.continuation import begun, continued
 from edqn_jax.runs.directory import Resume
 
 Point = tuple[float, float, float]
@@ -38,8 +39,8 @@ class TrainOptions:
     preset: Literal["default", "paper"] = "default"
     """`default`: the best agent known to us. `paper`: exactly Table 1 of the paper."""
     tuned_for: Literal["auto", "cpu", "gpu"] = "auto"
-    """Hardware that environments, batches, networks and decisions are chosen for on random worlds; `auto`: a GPU where
-    a card and JAX's plugin for it are found. Other worlds and the preset `paper` are the same on both."""
+    """Hardware that environments, batches, networks and decisions are chosen for; `auto`: a GPU where a card and JAX's
+    plugin for it are found. The preset `paper` is the same on both."""
     config: Annotated[Path | None, arg(metavar="FILE.yaml", help_behavior_hint="")] = None
     """YAML file of options by group; overrides the preset, and flags override the file."""
     seeds: Annotated[int | None, arg(metavar="K", help_behavior_hint="")] = None
@@ -48,8 +49,9 @@ class TrainOptions:
     run_dir: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="")] = None
     """Folder for the files of the run (default: a new, dated folder under runs/)."""
     resume: Resume = "auto"
-    """What to do with an unfinished run in --run-dir. Runs cannot be continued yet: `auto` and `must` refuse it,
-    `never` restarts it."""
+    """What to do with a run in --run-dir: `auto` continues it from its newest checkpoint, `must` refuses to begin one,
+    `never` starts an unfinished one over. A run goes on with its own options; those that are given must be the same,
+    but for --total-steps, which may be more."""
     distributed: Distributed = "auto"
     """Whether to train together with other processes, on one host or many: `auto` where --coordinator-address is given
     or Slurm's srun has started several tasks, `must` in any cluster that JAX finds, `never` not at all."""
@@ -131,12 +133,29 @@ def parse_train(argv: Sequence[str]) -> tuple[TrainOptions, Config]:
         raise ConfigError(f"--seeds must be at least 1, not {options.seeds}")
     tuned_for = hardware() if options.tuned_for == "auto" else options.tuned_for
     options = dataclasses.replace(options, tuned_for=tuned_for)
-    base = resolve(options.preset, options.config)
-    world = _parse_config(early, base).world.name
-    config = _parse_config(argv, resolve(options.preset, options.config, world, tuned_for))
+    folder = None if options.resume == "never" else options.run_dir
+    run = None if folder is None else begun(folder)
+    if run is not None and not _names_defaults(early):
+        config = _found_worlds(_parse_config(argv, run.config))
+    else:
+        world = _parse_config(early, resolve(options.preset, options.config)).world.name
+        config = _found_worlds(_parse_config(argv, resolve(options.preset, options.config, world, tuned_for)))
     validate(config)
+    if run is not None and folder is not None:
+        options = dataclasses.replace(options, seeds=run.seeds if options.seeds is None else options.seeds)
+        config = continued(folder, run, config, options.seeds)
+    return options, config
+
+
+def _names_defaults(argv: Sequence[str]) -> bool:
+    """Returns whether the words of a command say what options begin with, instead of those of the run."""
+    return any(word.partition("=")[0] in ("--preset", "--config", "--tuned-for", "--tuned_for") for word in argv)
+
+
+def _found_worlds(config: Config) -> Config:
+    """Returns the configuration with whole paths of its worlds' files."""
     world = dataclasses.replace(config.world, name=_found(config.world.name), flown=_found(config.world.flown))
-    return options, dataclasses.replace(config, world=world)
+    return dataclasses.replace(config, world=world)
 
 
 def _found(world: str) -> str:

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from rich.console import Console
 
 from edqn_jax.cli.arguments import TrainOptions, parse_train
-from edqn_jax.cli.signals import listening_for_sigterm
+from edqn_jax.cli.signals import Stops
 from edqn_jax.config import DENSITIES, Config
 from edqn_jax.config.loading import gpu_layers, to_yaml
 from edqn_jax.errors import ConfigError
@@ -19,7 +19,7 @@ from edqn_jax.parallel.launch import how_to_join
 from edqn_jax.runs.directory import plan_run_directory
 
 
-def train_command(argv: Sequence[str]) -> None:
+def train_command(argv: Sequence[str], stops: Stops) -> None:
     """Runs `edqn train` with these arguments.
 
     Raises:
@@ -33,6 +33,7 @@ def train_command(argv: Sequence[str]) -> None:
     from edqn_jax.parallel import processes
     from edqn_jax.parallel.devices import cores, most_that_divide, use_cpu_devices
     from edqn_jax.report.progress import Progress
+    from edqn_jax.training.stopping import Stop
 
     use_cpu_devices(config.train.devices or most_that_divide(config.train.shards, cores()))
     process = 0
@@ -46,18 +47,18 @@ def train_command(argv: Sequence[str]) -> None:
     progress = Progress(Console(quiet=not writes))
     if tuned_for_gpu(options, config):
         progress.message(_chosen(config))
-    with listening_for_sigterm() as stop_requested:
-        try:
-            if options.seeds is None:
-                from edqn_jax.training.run import train_run
+    stop = Stop(stops.requested, lambda: stops.obeyed(progress.message))
+    try:
+        if options.seeds is None:
+            from edqn_jax.training.run import train_run
 
-                train_run(config, run, progress, stop_requested)
-            else:
-                from edqn_jax.training.seeds import train_seeds_run
+            train_run(config, run, progress, stop)
+        else:
+            from edqn_jax.training.seeds import train_seeds_run
 
-                train_seeds_run(config, options.seeds, run, progress, stop_requested)
-        finally:
-            progress.stop()
+            train_seeds_run(config, options.seeds, run, progress, stop)
+    finally:
+        progress.stop()
 
 
 def tuned_for_gpu(options: TrainOptions, config: Config) -> bool:

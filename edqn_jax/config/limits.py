@@ -149,10 +149,13 @@ def _agent(agent: AgentConfig) -> None:
 
 def _train(train: TrainConfig) -> None:
     _positive(train, "train", ["num_envs", "total_steps", "chunk_steps", "shards"])
-    _not_negative(train, "train", ["max_episodes", "devices", "validation_every", "seed"])
-    _positive(train, "train", ["validation_missions"])
+    _not_negative(train, "train", ["max_episodes", "devices", "validation_every", "seed", "schedule_steps"])
+    _not_negative(train, "train", ["checkpoint_every_s"])
+    _positive(train, "train", ["validation_missions", "checkpoints"])
     _at_most(train, "train", ["num_envs", "shards"], 1_000_000)
     _at_most(train, "train", ["validation_missions", "chunk_steps"], 100_000)
+    limit = f"0 or at most train.total_steps ({train.total_steps})"
+    _require(train.schedule_steps <= train.total_steps, "train.schedule_steps", limit, train.schedule_steps)
     _require(train.seed < 2**32, "train.seed", "less than 2**32", train.seed)
     shards, envs = train.shards, train.num_envs
     multiple = f"a multiple of train.shards ({shards}), such as {-(-envs // shards) * shards}"

@@ -82,14 +82,35 @@ pool of worlds, since a small one is learnt by heart, and collisions that cost m
 (docs/ablation.md)."""
 
 
+GPU_FROM_FILE: Layer = {
+    "train": {"num_envs": 2048, "chunk_steps": 32, "total_steps": 6_000_000, "validation_every": 2_000_000},
+    "encoder": {
+        "warmup_decisions": 131_072,
+        "warmup_updates_per_step": 12,
+        "batch_size": 1024,
+        "replay_size": 131_072,
+    },
+    "agent": {
+        "hidden": (256, 256),
+        "batch_size": 1024,
+        "replay_size": 1_048_576,
+        "learning_starts": 65_536,
+        "random_decisions": 16_384,
+    },
+}
+"""What a GPU changes for a world from a file: more environments and larger batches (docs/results.md)."""
+
+
 def world_layers(world: str, tuned_for: Hardware) -> list[Layer]:
     """Returns what a world and the hardware change in the `default` preset; later ones replace earlier ones."""
     return [*([RANDOM_WORLDS] if world in DENSITIES else []), *gpu_layers(world, tuned_for)]
 
 
 def gpu_layers(world: str, tuned_for: Hardware | Literal["auto"]) -> list[Layer]:
-    """Returns what a GPU changes for a world; nothing has been chosen for worlds from files."""
-    return [GPU] if tuned_for == "gpu" and world in DENSITIES else []
+    """Returns what a GPU changes for a world."""
+    if tuned_for != "gpu":
+        return []
+    return [GPU if world in DENSITIES else GPU_FROM_FILE]
 
 
 def resolve(

@@ -299,6 +299,9 @@ class TrainConfig:
     """Parallel environments; a multiple of `shards`."""
     total_steps: int = 500_000
     """Decisions in all, warm-up included; rounded up to whole chunks."""
+    schedule_steps: int = 0
+    """Decisions that exploration, step size and retraining are planned for; what comes after them goes on as at their
+    end. 0 is `total_steps`; a run that is continued beyond its end has its first total here."""
     max_episodes: int = 0
     """Stop after this many episodes as well (`Num_episodes` of Table 1); 0 is no limit."""
     chunk_steps: int = 64
@@ -316,6 +319,11 @@ class TrainConfig:
     from a file half of them begin near the world's start."""
     keep: Literal["best", "last"] = "best"
     """Parameters that the run keeps: those of the best validation (by SPL, the latest of equal ones), or the last."""
+    checkpoint_every_s: float = 15.0
+    """Seconds between checkpoints, from which an interrupted run is continued; more where saving one takes longer than
+    3 % of that. There is one at the end, too; 0 saves none."""
+    checkpoints: int = 2
+    """Newest checkpoints that are kept."""
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from edqn_jax.config import Config
+from edqn_jax.config import Config, TrainConfig
 from edqn_jax.learn import embedding
 
 
@@ -22,6 +22,8 @@ class Plan:
     """Numbers of training steps; static."""
 
     total: int
+    scheduled: int
+    """Steps that exploration, step size and retraining are planned for; fewer than `total` in an extended run."""
     warmup: int
     starts: int
     """Steps of a replay before the first update of the DQN."""
@@ -36,12 +38,14 @@ class Plan:
         Where there is no VAE there is no warm-up: its decisions go to the DQN.
         """
         envs = config.train.num_envs
-        total = math.ceil(config.train.total_steps / envs / config.train.chunk_steps) * config.train.chunk_steps
-        warmup = min(math.ceil(config.encoder.warmup_decisions / envs), total // 4) if embedding.has_code(config) else 0
+        total = _whole_chunks(config.train, config.train.total_steps)
+        scheduled = _whole_chunks(config.train, config.train.schedule_steps or config.train.total_steps)
+        most = scheduled // 4 if embedding.has_code(config) else 0
+        warmup = min(math.ceil(config.encoder.warmup_decisions / envs), most)
         least = config.agent.n_step + config.agent.history
         starts = max(math.ceil(config.agent.learning_starts / envs), least)
-        vae_training = _vae_training(config, total, warmup, starts) if warmup else ()
-        return cls(total=total, warmup=warmup, starts=starts, vae_training=vae_training)
+        vae_training = _vae_training(config, scheduled, warmup, starts) if warmup else ()
+        return cls(total=total, scheduled=scheduled, warmup=warmup, starts=starts, vae_training=vae_training)
 
     @property
     def learn_from(self) -> int:
@@ -80,6 +84,10 @@ class Plan:
             replaced |= step + 1 == end
         return replaced
 
+    def reads_samples(self, config: Config, done: int) -> bool:
+        """Returns whether the VAE learns again after `done` steps, so that what it has kept is still needed."""
+        return config.encoder.keep_learning or any(done < end for _, end in self.vae_training)
+
     def replay_time(self, step: Array | np.ndarray) -> Array:
         """Returns the number of steps `[...]` since the replay began; 0 in the warm-up."""
         began = jnp.full(jnp.shape(step), self.warmup, jnp.int32)
@@ -90,6 +98,11 @@ class Plan:
     def trains_q(self, step: Array | np.ndarray) -> Array:
         """Returns whether the DQN learns in steps `[...]`, bool."""
         return jnp.asarray(step >= self.warmup) & (self.replay_time(step) >= self.starts)
+
+
+def _whole_chunks(train: TrainConfig, decisions: int) -> int:
+    """Returns the training steps of whole chunks that take at least so many decisions."""
+    return math.ceil(decisions / train.num_envs / train.chunk_steps) * train.chunk_steps
 
 
 def _vae_training(config: Config, total: int, warmup: int, starts: int) -> tuple[tuple[int, int], ...]:

@@ -193,7 +193,7 @@ def _vae_optimiser(config: Config) -> optax.GradientTransformation:
 
 def _q_optimiser(config: Config) -> optax.GradientTransformation:
     plan = Plan.of(config)
-    return dqn.optimiser(config.agent, (plan.total - plan.learn_from) * config.agent.updates_per_step)
+    return dqn.optimiser(config.agent, (plan.scheduled - plan.learn_from) * config.agent.updates_per_step)
 
 
 def _flat(x: Array) -> Array:
@@ -285,7 +285,7 @@ def _act(
         action, the held manoeuvres, epsilon; each [S, E].
     """
     plan, envs = Plan.of(config), config.train.num_envs
-    epsilon = dqn.exploration(config.agent, time * envs, (plan.total - plan.warmup) * envs, actors.episodes)
+    epsilon = dqn.exploration(config.agent, time * envs, (plan.scheduled - plan.warmup) * envs, actors.episodes)
     chosen = jax.vmap(partial(policy.choose, config, learner.q))(actors.memory, keys.act, epsilon)
     manoeuvre = jax.vmap(partial(_manoeuvre, config.encoder.hold_decisions))(actors.manoeuvre, keys.manoeuvre)
     return jnp.where(warming, manoeuvre, chosen), manoeuvre, epsilon
@@ -523,17 +523,21 @@ class Trainer:
         spread, same = NamedSharding(self.mesh, self._spread()), self.replicated
         return TrainState(actors=spread, learner=same, step=same)  # pyright: ignore[reportArgumentType]
 
-    def compile(self) -> None:
-        """Traces and compiles the chunk, once; needs no state, so that it can go on while one is made."""
+    def shapes(self) -> TrainState:
+        """Returns shape, type and layout of every array of a state."""
         key = jax.random.key(0)
         keys = key if self.agents is None else jax.random.split(key, self.agents)
         shapes = jax.eval_shape(self._each(partial(init, self.config), 0), self.world, keys)
         layout = self._layout()
-        state = TrainState(
+        return TrainState(
             actors=_laid(shapes.actors, layout.actors),
             learner=_laid(shapes.learner, layout.learner),
             step=_laid(shapes.step, layout.step),
         )
+
+    def compile(self) -> None:
+        """Traces and compiles the chunk, once; needs no state, so that it can go on while one is made."""
+        state = self.shapes()
         # One spec for each subtree: only environments and replay are spread, and what they return.
         spread, same = self._spread(), PartitionSpec()
         specs: Any = TrainState(actors=spread, learner=same, step=same)  # pyright: ignore[reportArgumentType]

@@ -96,6 +96,16 @@ def check_alike(text: str) -> None:
         )
 
 
+def of_first(content: bytes | None) -> bytes:
+    """Returns what process 0 gives, on every process; every process must call this, all but that one with None."""
+    if not jax.distributed.is_initialized():
+        assert content is not None
+        return content
+    length = int(multihost_utils.broadcast_one_to_all(np.asarray(len(content or b""))))
+    sent = np.frombuffer(content, np.uint8) if content is not None else np.zeros(length, np.uint8)
+    return np.asarray(multihost_utils.broadcast_one_to_all(sent)).tobytes()
+
+
 def on_any(flag: bool) -> bool:
     """Returns whether `flag` is true on any process; every process must call this."""
     return bool(np.any(multihost_utils.process_allgather(np.asarray(flag))))

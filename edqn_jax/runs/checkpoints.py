@@ -1,7 +1,7 @@
-"""Policies on disk, as Orbax checkpoints with checksums.
+"""Policies on disk, with checksums.
 
-Saving is synchronous: when `save_params` returns, the checkpoint is complete and on the disk, and has taken the place
-of the one before, which is whole until then. A checkpoint without its manifest, or with a changed bit, is refused.
+When `save_params` returns, the policy is complete and on the disk, and has taken the place of the one before, which is
+whole until then. A policy without its manifest, or with a changed bit, is refused.
 """
 
 from __future__ import annotations
@@ -9,13 +9,9 @@ from __future__ import annotations
 import shutil
 from pathlib import Path
 
-import jax
-import numpy as np
-import orbax.checkpoint as ocp
-
 from edqn_jax.errors import ConfigError
 from edqn_jax.learn.policy import PolicyParams
-from edqn_jax.runs import manifest
+from edqn_jax.runs import arrays, manifest
 from edqn_jax.runs.files import unwritable
 
 POLICY = "policy"
@@ -28,8 +24,7 @@ CONFIG = "config_sha256"
 def save_params(folder: Path, params: PolicyParams, config_file: Path | None = None) -> None:
     """Writes the policy into `folder`, a run's `checkpoints/`; replaces an existing one.
 
-    Arrays are saved from the host, so the file does not depend on the number of devices. Only the calling
-    process saves, even if it is one of several.
+    Arrays are saved from the host, so the file does not depend on the number of devices.
 
     Args:
         folder: of the checkpoints.
@@ -39,26 +34,20 @@ def save_params(folder: Path, params: PolicyParams, config_file: Path | None = N
     Raises:
         ConfigError: if it cannot be written; a policy that was there is there still.
     """
-    tree = jax.tree.map(np.asarray, {"encoder": params.encoder, "q": params.q})
-    here = jax.process_index()
-    # Without this Orbax waits for the other processes.
-    alone = ocp.options.MultiprocessingOptions(primary_host=here, active_processes={here})
-    handler = ocp.PyTreeCheckpointHandler(multiprocessing_options=alone)
-    saver = ocp.Checkpointer(handler, multiprocessing_options=alone)
     saved, partial, replaced = _places(folder.absolute())
+    arrays.clear(partial)
+    facts = {} if config_file is None else {CONFIG: manifest.digest(config_file)}
+    arrays.write(partial, {"encoder": params.encoder, "q": params.q}, facts)
     try:
-        shutil.rmtree(partial, ignore_errors=True)
-        saver.save(partial, args=ocp.args.PyTreeSave(tree))
-        manifest.seal(partial, {} if config_file is None else {CONFIG: manifest.digest(config_file)})
         if saved.exists():  # if not, what is in the other place may be the only policy
             shutil.rmtree(replaced, ignore_errors=True)
             saved.rename(replaced)
         partial.rename(saved)
         manifest.sync(saved.parent)
         shutil.rmtree(replaced, ignore_errors=True)
-    except (OSError, ValueError, RuntimeError) as error:  # Orbax passes on what TensorStore raises
+    except OSError as error:
         shutil.rmtree(partial, ignore_errors=True)
-        raise unwritable(saved, getattr(error, "strerror", None) or " ".join(str(error).split())[:200]) from None
+        raise unwritable(saved, error.strerror) from None
 
 
 def load_params(folder: Path, config_file: Path | None = None) -> PolicyParams:
@@ -79,12 +68,10 @@ def load_params(folder: Path, config_file: Path | None = None) -> PolicyParams:
     facts = manifest.check(saved)
     if config_file is not None and CONFIG in facts and facts[CONFIG] != manifest.digest(config_file):
         raise ConfigError(f"'{config_file}' has changed since the policy beside it was saved; put the old one back")
-    try:
-        tree = ocp.PyTreeCheckpointer().restore(saved)
-        return PolicyParams(encoder=tree["encoder"], q=tree["q"])
-    except (OSError, ValueError, KeyError) as error:
-        reason = " ".join(str(error).split())[:200]
-        raise ConfigError(f"the policy in '{saved}' cannot be read: {reason}") from None
+    tree = arrays.read(saved)
+    if not isinstance(tree, dict) or set(tree) != {"encoder", "q"}:
+        raise ConfigError(f"'{saved}' holds no policy: it has no encoder or no Q-network")
+    return PolicyParams(encoder=tree["encoder"], q=tree["q"])
 
 
 def _places(folder: Path) -> tuple[Path, Path, Path]:

@@ -44,11 +44,13 @@ SEED_FOLDER = "seed-"
 
 @dataclass(frozen=True)
 class RunDirectory:
-    """A run directory. `create` makes it on disk."""
+    """A run directory. `locked` makes it on disk, `begin` writes what a run begins with."""
 
     path: Path
     must_be_new: bool = False
-    """Whether `create` refuses an existing folder: another run may have created it meanwhile."""
+    """Whether `locked` refuses an existing folder: another run may have created it meanwhile."""
+    resume: Resume = "never"
+    """Whether a run in it is continued: `must` refuses to begin one anew."""
 
     @property
     def config_file(self) -> Path:
@@ -82,55 +84,75 @@ class RunDirectory:
         """Returns the folder of one seed's run, where several are trained in one program."""
         return RunDirectory(self.path / f"{SEED_FOLDER}{seed}")
 
-    def create_for_seeds(self, configs: Sequence[Config]) -> Lock:
-        """Creates the folder with the first seed's `config.yaml`, and that of every seed within it, as `create`.
-
-        Raises:
-            ConfigError: as `create`.
-        """
-        with self._made() as lock:
-            write_atomically(self.config_file, config_text(configs[0]))
-        for config in configs:
-            with self.of_seed(config.train.seed).create(config):
-                pass  # the lock of all is enough
-        return lock
-
-    def create(self, config: Config) -> Lock:
-        """Creates the folder with `config.yaml` and the header of `episodes.csv`, and locks it for this run.
-
-        Deletes the files of an earlier run in it; `plan_run_directory` has checked that this is wanted.
-
-        Raises:
-            ConfigError: if it cannot be written, exists although it `must_be_new`, or another run goes on in it.
-        """
-        with self._made() as lock:
-            for folder in (self.figures, self.checkpoints):
-                folder.mkdir()
-            write_atomically(self.config_file, config_text(config))
-            write_atomically(self.episodes_file, ",".join(EPISODE_COLUMNS) + "\n")
-        return lock
-
     @contextlib.contextmanager
-    def _made(self) -> Iterator[Lock]:
-        """Makes and locks the folder, without what an earlier run of one seed or several left in it.
+    def locked(self) -> Iterator[None]:
+        """Makes the folder if there is none, and locks it until the end of the `with` block.
 
         Raises:
-            ConfigError: if it, or what the block makes in it, cannot be made, or another run goes on in it.
+            ConfigError: if it cannot be made, exists although it `must_be_new`, or another run goes on in it.
+        """
+        with contextlib.ExitStack() as held:
+            try:
+                self.path.mkdir(parents=True, exist_ok=not self.must_be_new)
+                held.enter_context(Lock(self.path))
+            except FileExistsError as error:
+                if self.must_be_new:
+                    raise ConfigError(f"another run has just created '{self.path}'; start this one again") from None
+                raise unwritable(self.path, f"'{error.filename}' is in the way; move it away") from None
+            except OSError as error:
+                raise unwritable(self.path, error.strerror) from None
+            yield
+
+    def begin(self, configs: Sequence[Config], seeds: bool = False) -> None:
+        """Deletes the files of an earlier run in the locked folder, and writes those that a new one begins with.
+
+        Args:
+            configs: of each agent.
+            seeds: whether each agent has a folder of its own within this one.
+
+        Raises:
+            ConfigError: if they cannot be written.
         """
         try:
-            self.path.mkdir(parents=True, exist_ok=not self.must_be_new)
-            with contextlib.ExitStack() as unlocked_on_error:
-                lock = unlocked_on_error.enter_context(Lock(self.path))
-                for file in (self.metrics_file, self.episodes_file, self.summary_file, self.trajectory_file):
-                    file.unlink(missing_ok=True)
-                for folder in (self.figures, self.checkpoints, *self.path.glob(f"{SEED_FOLDER}*")):
-                    shutil.rmtree(folder, ignore_errors=True)
-                yield lock
-                unlocked_on_error.pop_all()
+            for file in (self.metrics_file, self.episodes_file, self.summary_file, self.trajectory_file):
+                file.unlink(missing_ok=True)
+            for folder in (self.figures, self.checkpoints, *self.path.glob(f"{SEED_FOLDER}*")):
+                shutil.rmtree(folder, ignore_errors=True)
+            self.checkpoints.mkdir()
+            write_atomically(self.config_file, config_text(configs[0]))
+            for config in configs:
+                (self.of_seed(config.train.seed) if seeds else self)._begin_agent(config)
         except FileExistsError as error:
-            if self.must_be_new:
-                raise ConfigError(f"another run has just created '{self.path}'; start this one again") from None
             raise unwritable(self.path, f"'{error.filename}' is in the way; move it away") from None
+        except OSError as error:
+            raise unwritable(self.path, error.strerror) from None
+
+    def _begin_agent(self, config: Config) -> None:
+        """Makes the folders of an agent's run, `config.yaml` and the header of `episodes.csv`."""
+        for folder in (self.figures, self.checkpoints):
+            folder.mkdir(parents=True, exist_ok=folder == self.checkpoints)
+        write_atomically(self.config_file, config_text(config))
+        write_atomically(self.episodes_file, ",".join(EPISODE_COLUMNS) + "\n")
+
+    def reopen(self, configs: Sequence[Config], seeds: bool = False) -> None:
+        """Prepares the locked folder of a run that is continued; what it has stays.
+
+        Only a run that is continued beyond its end has other options, and a summary that is none any more.
+
+        Args:
+            configs, seeds: as in `begin`.
+
+        Raises:
+            ConfigError: if a file cannot be written.
+        """
+        runs = [self.of_seed(config.train.seed) for config in configs] if seeds else [self]
+        try:
+            for run, config in ((self, configs[0]), *zip(runs, configs, strict=True)):
+                run.summary_file.unlink(missing_ok=True)
+                if run.config_file.read_text(encoding="utf-8") != config_text(config):
+                    write_atomically(run.config_file, config_text(config))
+            for run in runs:
+                run.figures.mkdir(exist_ok=True)
         except OSError as error:
             raise unwritable(self.path, error.strerror) from None
 
@@ -184,7 +206,8 @@ def plan_run_directory(given: Path | None, config: Config, resume: Resume = "aut
     Args:
         given: the folder asked for; None is a new, dated one under `runs/`.
         config: gives the world and the seed for the name of a new folder.
-        resume: `never` restarts an unfinished run; `auto` and `must` refuse it, since it cannot be continued yet.
+        resume: `auto` continues an unfinished run, or a finished one of fewer decisions, and begins one where there is
+            none; `must` begins none; `never` starts an unfinished run over.
 
     Raises:
         ConfigError: if the folder holds other files or a finished run, cannot be written, or holds no run
@@ -204,17 +227,19 @@ def plan_run_directory(given: Path | None, config: Config, resume: Resume = "aut
     occupied = taken and any(path.name != LOCK for path in given.iterdir())
     if occupied and not _is_ours(run.config_file):
         raise ConfigError(f"--run-dir '{given}' holds files that are not an edqn run; give a new or empty folder")
-    if run.summary_file.is_file():
-        raise ConfigError(f"--run-dir '{given}' holds a finished run; give another folder")
+    if run.summary_file.is_file() and (resume == "never" or not _asks_for_more(run, config)):
+        more = "" if resume == "never" else ", or more decisions with --total-steps to continue it"
+        raise ConfigError(f"--run-dir '{given}' holds a finished run; give another folder{more}")
     if resume == "must" and not occupied:
         raise ConfigError(f"--resume must: there is no run to continue in '{given}'")
-    if occupied and resume != "never":
-        raise ConfigError(
-            f"--run-dir '{given}' holds an unfinished run, which this version cannot continue; "
-            "give another folder, or --resume never to start it over"
-        )
     check_can_make(given)
-    return run
+    return RunDirectory(given, resume=resume if occupied else "never")
+
+
+def _asks_for_more(run: RunDirectory, config: Config) -> bool:
+    """Returns whether a finished run is to take more decisions than it has."""
+    before = apply(Config(), load_layer(run.config_file), str(run.config_file))
+    return config.train.total_steps > before.train.total_steps
 
 
 def config_text(config: Config) -> str:

@@ -5,9 +5,13 @@ from __future__ import annotations
 import contextlib
 import os
 import tempfile
+import threading
 from pathlib import Path
 
 from edqn_jax.errors import ConfigError
+
+whole_files = threading.Lock()
+"""Held while a file is written: whoever holds it finds none half-written by this process."""
 
 
 def write_atomically(file: Path, content: str | bytes) -> None:
@@ -17,13 +21,14 @@ def write_atomically(file: Path, content: str | bytes) -> None:
         ConfigError: if it cannot be written.
     """
     partial = file.with_name(file.name + ".partial")
-    try:
-        partial.write_bytes(content.encode() if isinstance(content, str) else content)
-        partial.replace(file)
-    except OSError as error:
-        with contextlib.suppress(OSError):
-            partial.unlink(missing_ok=True)
-        raise unwritable(file, error.strerror) from None
+    with whole_files:
+        try:
+            partial.write_bytes(content.encode() if isinstance(content, str) else content)
+            partial.replace(file)
+        except OSError as error:
+            with contextlib.suppress(OSError):
+                partial.unlink(missing_ok=True)
+            raise unwritable(file, error.strerror) from None
 
 
 def check_can_write(file: Path) -> None:

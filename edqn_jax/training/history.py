@@ -49,10 +49,13 @@ class History:
     validations: list[tuple[int, float, float]] = dataclasses.field(default_factory=list)
     """Decisions, seconds since the start and success rate near the start of each validation."""
 
+    earlier_episodes: int = 0
+    """Episodes that had ended when the run was continued; neither they nor the metrics before are held here."""
+
     @property
     def episode_count(self) -> int:
         """Returns the number of episodes that have ended."""
-        return sum(len(ended.step) for ended in self.episodes)
+        return self.earlier_episodes + sum(len(ended.step) for ended in self.episodes)
 
     def column(self, name: str) -> tuple[np.ndarray, np.ndarray]:
         """Returns decisions and values, each [n], of the chunks that have the metric `name`."""

@@ -79,6 +79,44 @@ class Silent:
 
 
 @dataclasses.dataclass(frozen=True)
+class AgentStanding:
+    """What the host knows of an agent after a chunk."""
+
+    kept: Candidate
+    episodes: int
+    """That have ended."""
+    validations: list[tuple[int, float, float]]
+    """As in `History`."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Standing:
+    """Where a run stands after a chunk: everything that its rest depends on."""
+
+    state: TrainState
+    done: int
+    """Training steps."""
+    checked: int
+    """Decisions before the last validation."""
+    train_seconds: float
+    elapsed_s: float
+    """Since the run began, interruptions left out."""
+    agents: list[AgentStanding]
+
+    def policies(self, trainer: Trainer, configs: Sequence[Config]) -> list[PolicyParams]:
+        """Returns the parameters that each agent would end with if nothing came after this chunk."""
+        newest = _policies(trainer, self.state)
+        return [
+            agent.kept.params if config.train.keep == "best" and agent.kept.decisions > 0 else params
+            for config, agent, params in zip(configs, self.agents, newest, strict=True)
+        ]
+
+
+Saver = Callable[[Standing, bool], None]
+"""Called after each chunk with where the run stands, and whether the chunk was the last; every process calls it."""
+
+
+@dataclasses.dataclass(frozen=True)
 class TrainingResult:
     """Result of training."""
 
@@ -234,19 +272,37 @@ def train_seeds(
         return run_chunks(preparation, callback)
 
 
-def run_chunks(preparation: Preparation, callback: Callback | None = None) -> list[TrainingResult]:
+def run_chunks(
+    preparation: Preparation,
+    callback: Callback | None = None,
+    saver: Saver | None = None,
+    begin: Standing | None = None,
+) -> list[TrainingResult]:
     """Trains what was prepared, chunk after chunk; returns the result of each agent.
+
+    Args:
+        preparation: of the run.
+        callback: as in `train`.
+        saver: may save where the run stands.
+        begin: where a run stood that is continued; None begins one.
 
     Raises:
         DivergedError: if a loss becomes NaN or Inf.
     """
     trainer = preparation.trainer
-    state = preparation.init()
+    if begin is None:
+        state = preparation.init()
+        loop = _Loop(preparation, callback, [Candidate(params) for params in _policies(trainer, state)])
+    else:
+        state = begin.state
+        loop = _Loop.continued(preparation, callback, begin)
+        del begin  # its state is donated
     compile_seconds = preparation.compiled.result()
-    loop = _Loop(preparation, callback, [Candidate(params) for params in _policies(trainer, state)])
     preparation.display.phase("training", total=trainer.plan.total * preparation.config.train.num_envs)
     while not loop.ended:
         state = loop.advance(state)
+        if saver is not None:
+            saver(loop.standing(state), loop.ended)
     return [
         TrainingResult(
             policy=Policy(agent.config, agent.kept.params if loop.keeps_validated(agent) else newest),
@@ -282,6 +338,30 @@ class _Loop:
         self.done, self.checked = 0, 0  # training steps; decisions before the last validation
         self.train_seconds = 0.0
         self.stopped = False
+
+    @classmethod
+    def continued(cls, preparation: Preparation, callback: Callback | None, begin: Standing) -> _Loop:
+        """Returns the loop as it was where a run stood."""
+        loop = cls(preparation, callback, [agent.kept for agent in begin.agents])
+        loop.done, loop.checked, loop.train_seconds = begin.done, begin.checked, begin.train_seconds
+        preparation.began -= begin.elapsed_s
+        for agent, stood in zip(loop.agents, begin.agents, strict=True):
+            agent.history = History(validations=list(stood.validations), earlier_episodes=stood.episodes)
+        return loop
+
+    def standing(self, state: TrainState) -> Standing:
+        """Returns where the run stands."""
+        return Standing(
+            state=state,
+            done=self.done,
+            checked=self.checked,
+            train_seconds=self.train_seconds,
+            elapsed_s=time.perf_counter() - self.preparation.began,
+            agents=[
+                AgentStanding(agent.kept, agent.history.episode_count, list(agent.history.validations))
+                for agent in self.agents
+            ],
+        )
 
     @property
     def finished(self) -> bool:

@@ -5,16 +5,19 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import jax
 import numpy as np
 
 from edqn_jax.config import DENSITIES, Config
-from edqn_jax.errors import StoppedError
+from edqn_jax.errors import ConfigError, StoppedError
 from edqn_jax.evaluation.metrics import clearance_text, flight_summary, summarise
 from edqn_jax.evaluation.trajectories import trajectory
+from edqn_jax.learn import saved_state
+from edqn_jax.learn.plan import Plan
+from edqn_jax.learn.trainer import Trainer, TrainState
 from edqn_jax.parallel import processes
 from edqn_jax.report.gallery import draw_gallery
 from edqn_jax.report.progress import Progress, clock
@@ -24,15 +27,17 @@ from edqn_jax.runs.directory import RunDirectory
 from edqn_jax.runs.provenance import reward_record, state_digest, versions, workload
 from edqn_jax.sim.flights import Flights
 from edqn_jax.sim.reward import Reward
-from edqn_jax.training.loop import Chunk, Preparation, TrainingResult, prepared, run_chunks
+from edqn_jax.training.keeper import Keeper
+from edqn_jax.training.loop import Chunk, Preparation, Standing, TrainingResult, prepared, run_chunks
 from edqn_jax.training.selection import first_success
+from edqn_jax.training.stopping import Stop
 
 
 def train_run(
     config: Config,
     run: RunDirectory | None,
     progress: Progress,
-    stop_requested: Callable[[], bool],
+    stop: Stop,
     reward: Reward | None = None,
 ) -> dict[str, Any]:
     """Trains, validates, flies and draws; writes everything to the run directory.
@@ -41,7 +46,7 @@ def train_run(
         config: the same on every process.
         run: None on a process that writes nothing, which is every one but the first of those that train together.
         progress: display of the progress.
-        stop_requested: called after each chunk; if it returns True on one process, all processes stop.
+        stop: asked after each chunk; where one process is to stop, all do.
         reward: as in `train`.
 
     Returns:
@@ -50,22 +55,25 @@ def train_run(
     Raises:
         ConfigError: before anything is written, if the run cannot be made; later, if one of its files cannot be.
         DivergedError: if a loss becomes NaN or Inf.
-        StoppedError: after saving the policy, if `stop_requested()` turned true.
+        StoppedError: after saving the policy, if it was asked to.
     """
     with prepared(config, reward, progress) as preparation, contextlib.ExitStack() as held:
         progress.message(f"{trained_in(config)}, {described(preparation.devices)}")
-        processes.together(lambda: None if run is None else held.enter_context(run.create(config)))
-        (result,) = run_chunks(preparation, lambda chunk: record(run, chunk) or stop_requested())
-        if run is not None:
-            save_params(run.checkpoints, result.policy.params, run.config_file)
-        if result.stopped:
-            stopped = f"stopped after {result.decisions:,} decisions"
-            raise StoppedError(f"{stopped}; " + where_saved(run))
+        keeper = Keeper(preparation, run, [run], reward, progress.message)
+        begin = opened(preparation, run, keeper, held, progress)
+        with stop.obeyed():
+            (result,) = run_chunks(
+                preparation, lambda chunk: record(run, chunk) or stop.requested(), keeper.save_if_due, begin
+            )
+            if run is not None:
+                save_params(run.checkpoints, result.policy.params, run.config_file)
+        if processes.on_any(result.stopped or stop.requested()):
+            raise StoppedError(f"stopped after {result.decisions:,} decisions; {where_saved(run)}")
         progress.phase("flying the mission")
         sights = None if run is None else sights_of(preparation)
         flights = preparation.fly(preparation.missions[0].final, result.policy.params)
-        digest = state_digest(result.state)  # the last that all processes do together
-        summary = summary_of(preparation, result, flights, digest, reward)
+        digest = state_digest(needed(preparation.trainer, result))  # the last that all processes do together
+        summary = summary_of(preparation, result, flights, digest, reward) | keeper.facts
         if run is not None and sights is not None:
             progress.phase("drawing")
             draw(run, preparation, sights, result, flights)
@@ -74,6 +82,59 @@ def train_run(
             progress.stop()
             progress.message(_verdict(summary, run))
     return summary
+
+
+def opened(
+    preparation: Preparation,
+    run: RunDirectory | None,
+    keeper: Keeper,
+    held: contextlib.ExitStack,
+    progress: Progress,
+    seeds: bool = False,
+) -> Standing | None:
+    """Locks the run's folder, until `held` ends; returns where its run stood if it is continued, else begins it.
+
+    Raises:
+        ConfigError: if the folder cannot be written, another run goes on in it, or its run cannot be continued.
+    """
+    configs = preparation.configs
+    processes.together(lambda: None if run is None else held.enter_context(run.locked()))
+    begin = None
+    if processes.on_any(run is not None and run.resume != "never"):
+        begin = keeper.restored()
+
+    def prepare() -> None:
+        if run is None:
+            return
+        if begin is not None:
+            run.reopen(configs, seeds)
+            keeper.save_policies(begin)  # they belong to the options, which may be others now
+        elif run.resume == "must":
+            raise ConfigError(
+                f"--resume must: the run in '{run.path}' was interrupted before its first checkpoint; --resume never "
+                "starts it over"
+            )
+        else:
+            run.begin(configs, seeds)
+
+    processes.together(prepare)
+    if begin is not None:
+        progress.message(_continued(preparation.trainer.plan, begin.done, preparation.config))
+    elif run is not None and run.resume != "never":
+        progress.message("there is no checkpoint of the interrupted run; it begins anew")
+    return begin
+
+
+def _continued(plan: Plan, done: int, config: Config) -> str:
+    """Returns that a run goes on, and what that means for its schedules, as lines for the screen."""
+    envs = config.train.num_envs
+    text = f"continued after {done * envs:,} of {plan.total * envs:,} decisions"
+    if plan.scheduled < plan.total:
+        text += (
+            f"; exploration and step size were planned for {plan.scheduled * envs:,} and stay from there on what they "
+            "are at that end, and the encoder is not trained again"
+        )
+    return text
 
 
 def record(run: RunDirectory | None, chunk: Chunk) -> None:
@@ -135,6 +196,11 @@ def draw(run: RunDirectory, preparation: Preparation, sights: Sights, result: Tr
     run.write_trajectory(trajectory(preparation.config, flights))
     outcome = flight_summary(flights)["outcome"]
     draw_gallery(run, sights, result.policy.params, np.asarray(preparation.shortest.points), outcome)
+
+
+def needed(trainer: Trainer, result: TrainingResult) -> TrainState:
+    """Returns the last state of a run without what no later step would read."""
+    return saved_state.needed(trainer, result.state, result.decisions // trainer.config.train.num_envs)
 
 
 def trained_in(config: Config) -> str:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import time
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -20,8 +19,10 @@ from edqn_jax.runs.provenance import state_digest
 from edqn_jax.sim.flights import Flights
 from edqn_jax.sim.outcomes import Outcome
 from edqn_jax.sim.reward import Reward
+from edqn_jax.training.keeper import Keeper
 from edqn_jax.training.loop import prepared, run_chunks
-from edqn_jax.training.run import described, draw, record, sights_of, summary_of, trained_in, unseen
+from edqn_jax.training.run import described, draw, needed, opened, record, sights_of, summary_of, trained_in, unseen
+from edqn_jax.training.stopping import Stop
 
 
 def train_seeds_run(
@@ -29,7 +30,7 @@ def train_seeds_run(
     seeds: int,
     run: RunDirectory | None,
     progress: Progress,
-    stop_requested: Callable[[], bool],
+    stop: Stop,
     reward: Reward | None = None,
 ) -> dict[str, Any]:
     """Trains an agent of each seed in one program; writes a run of each, and a summary of all.
@@ -37,7 +38,7 @@ def train_seeds_run(
     Args:
         config: of the first seed.
         seeds: how many agents; their seeds count up from `train.seed`.
-        run, progress, stop_requested, reward: as in `train_run`; `run` is the folder that holds those of the seeds.
+        run, progress, stop, reward: as in `train_run`; `run` is the folder that holds those of the seeds.
 
     Returns:
         the content of the `summary.json` of all.
@@ -48,20 +49,28 @@ def train_seeds_run(
     with prepared(config, reward, progress, agents=seeds) as preparation, contextlib.ExitStack() as held:
         configs, agents = preparation.configs, range(seeds)
         progress.message(f"{trained_in(config)}, {seeds} seeds, {described(preparation.devices)}")
-        processes.together(lambda: None if run is None else held.enter_context(run.create_for_seeds(configs)))
         folders = [None if run is None else run.of_seed(each.train.seed) for each in configs]
-        results = run_chunks(preparation, lambda chunk: record(folders[chunk.agent], chunk) or stop_requested())
-        for folder, result in zip(folders, results, strict=True):
-            if folder is not None:
-                save_params(folder.checkpoints, result.policy.params, folder.config_file)
-        if results[0].stopped:
+        keeper = Keeper(preparation, run, folders, reward, progress.message)
+        begin = opened(preparation, run, keeper, held, progress, seeds=True)
+        with stop.obeyed():
+            results = run_chunks(
+                preparation,
+                lambda chunk: record(folders[chunk.agent], chunk) or stop.requested(),
+                keeper.save_if_due,
+                begin,
+            )
+            for folder, result in zip(folders, results, strict=True):
+                if folder is not None:
+                    save_params(folder.checkpoints, result.policy.params, folder.config_file)
+        if processes.on_any(results[0].stopped or stop.requested()):
             where = "the first process saves the policies" if run is None else f"the policies are in '{run.path}'"
             raise StoppedError(f"stopped after {results[0].decisions:,} decisions; {where}")
         progress.phase("flying the missions")
         flights = [preparation.fly(preparation.missions[k].final, results[k].policy.params, k) for k in agents]
         # One after the other: a state may be large. The last that all processes do together.
-        digests = [state_digest(preparation.trainer.of_agent(results[0].state, k)) for k in agents]
-        together = {"trained_together": seeds}
+        state = needed(preparation.trainer, results[0])
+        digests = [state_digest(preparation.trainer.of_agent(state, k)) for k in agents]
+        together = {"trained_together": seeds, **keeper.facts}
         summaries = [summary_of(preparation, results[k], flights[k], digests[k], reward) | together for k in agents]
         whole = _summary_of_all(config, preparation.missions[0].tests, flights, summaries)
         if run is not None:

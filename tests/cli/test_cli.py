@@ -6,6 +6,7 @@ import os
 import signal
 import subprocess
 import sys
+import time
 import types
 from importlib import metadata
 from pathlib import Path
@@ -186,11 +187,11 @@ def test_several_seeds_are_trained_together(trainer):
         (["--world", "medium"], 16_384),
         (["--world", "medium", "--tuned-for", "cpu"], 256),
         (["--world", "medium", "--num-envs", "64"], 64),
-        (["--world", "paper"], 256),
+        (["--world", "paper"], 2048),
         (["--world", "medium", "--preset", "paper"], 16),
     ],
 )
-def test_random_worlds_are_tuned_for_a_gpu_where_there_is_one(argv, envs, monkeypatch):
+def test_worlds_are_tuned_for_a_gpu_where_there_is_one(argv, envs, monkeypatch):
     monkeypatch.setattr(arguments, "hardware", lambda: "gpu")
     assert parse_train(argv)[1].train.num_envs == envs
 
@@ -200,7 +201,9 @@ def test_what_was_chosen_for_a_gpu_is_printed(trainer, monkeypatch, capsys):
     assert main(["train", "--tuned-for", "gpu", "--world", "medium", "--run-dir", "here"]) == 0
     assert "Tuned for a GPU: 16,384 environments, 8 updates of 4,096 a step" in capsys.readouterr().out
     assert main(["train", "--tuned-for", "gpu", "--world", "paper", "--run-dir", "there"]) == 0
-    assert "Tuned" not in capsys.readouterr().out  # nothing is chosen for the paper's world
+    assert "Tuned for a GPU: 2,048 environments, 8 updates of 1,024 a step" in capsys.readouterr().out
+    assert main(["train", "--tuned-for", "gpu", "--preset", "paper", "--run-dir", "again"]) == 0
+    assert "Tuned" not in capsys.readouterr().out  # it is the paper's
 
 
 def test_a_gpu_that_jax_cannot_use_is_one_sentence(trainer, capsys):
@@ -215,7 +218,6 @@ def test_a_gpu_that_jax_cannot_use_is_one_sentence(trainer, capsys):
         (SceneError("a start inside a wall"), 2),
         (DivergedError("the Q loss is not finite"), 3),
         (StoppedError("stopped after saving"), 143),
-        (KeyboardInterrupt(), 130),
     ],
 )
 def test_each_ending_of_training_has_its_exit_code(ending, code, trainer, capsys):
@@ -227,17 +229,21 @@ def test_each_ending_of_training_has_its_exit_code(ending, code, trainer, capsys
     assert capsys.readouterr().err.count("\n") == 1
 
 
-def test_sigterm_reaches_training_as_a_wish_to_stop(trainer):
-    def act(config, run, progress, stop_requested):
-        assert not stop_requested()
-        os.kill(os.getpid(), signal.SIGTERM)
-        if stop_requested():
-            raise StoppedError("stopped after saving")
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 143), (signal.SIGINT, 130)])
+def test_a_signal_reaches_training_as_a_wish_to_stop(number, code, trainer, capsys):
+    def act(config, run, progress, stop):
+        assert not stop.requested()
+        with stop.obeyed():
+            os.kill(os.getpid(), number)
+            while not stop.requested():
+                time.sleep(0.01)
+        raise StoppedError("stopped after saving")
 
     trainer.act = act
-    before = signal.getsignal(signal.SIGTERM)
-    assert main(["train", "--run-dir", "here"]) == 143
-    assert signal.getsignal(signal.SIGTERM) is before
+    before = signal.getsignal(number)
+    assert main(["train", "--run-dir", "here"]) == code
+    assert signal.getsignal(number) is before
+    assert "stopping after this chunk; a second signal ends at once" in capsys.readouterr().out
 
 
 def test_evaluate_hands_on_what_was_asked_for(monkeypatch, tmp_path):

@@ -58,7 +58,8 @@ def test_a_gpu_brings_its_own_sizes_and_files_and_the_papers_preset_keep_theirs(
     assert medium.train.num_envs == 16_384
     assert medium.events.threshold == RANDOM_WORLDS["events"]["threshold"]  # of random worlds on any hardware
     assert medium.world.name == "medium" and medium.world.pool_size > Config().world.pool_size
-    assert resolve(world="paper", tuned_for="gpu") == Config()  # nothing has been chosen for worlds from files
+    own = resolve(world="paper", tuned_for="gpu")
+    assert (own.train.num_envs, own.agent.batch_size, own.events) == (2048, 1024, Config().events)
     file = write(tmp_path, "train: {num_envs: 64}\n")
     assert resolve(file=file, world="medium", tuned_for="gpu").train.num_envs == 64
     assert resolve("paper", tuned_for="gpu") == preset("paper")

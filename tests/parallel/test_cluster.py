@@ -83,7 +83,9 @@ def _without_times(summary: dict) -> dict:
 
 @pytest.mark.slow
 def test_sigterm_for_one_process_of_slurms_stops_both_and_one_saves(tmp_path: Path) -> None:
-    config = dataclasses.replace(CONFIG, train=dataclasses.replace(CONFIG.train, total_steps=10**6, validation_every=0))
+    config = dataclasses.replace(
+        CONFIG, train=dataclasses.replace(CONFIG.train, total_steps=10**6, validation_every=0, checkpoint_every_s=0.0)
+    )
     argv = ["--no-learning", *arguments_for(config, tmp_path)]
     with two_processes(tmp_path, argv, by_srun) as processes:
         run, begun = RunDirectory(tmp_path / "run"), time.monotonic()

@@ -27,15 +27,16 @@ with Lock(Path(sys.argv[1])):
 
 def test_a_folder_that_a_run_holds_is_refused_whole_and_free_when_it_has_ended(tmp_path: Path) -> None:
     run = RunDirectory(tmp_path / "run")
-    with run.create(Config()):
+    with run.locked():
+        run.begin([Config()])
         run.append_metrics({"decisions": 1})
         again = plan_run_directory(run.path, Config(), "never")
         with pytest.raises(ConfigError, match=r"run' is in use: process \d+ on .* writes a run there; give another"):
-            again.create(Config())
+            again.locked().__enter__()
         assert run.read_metrics() == [{"decisions": 1}]
     assert not (run.path / LOCK).exists()
-    with again.create(Config()):
-        assert not run.metrics_file.exists()
+    with again.locked():
+        pass
 
 
 def test_a_process_that_is_killed_leaves_no_lock(tmp_path: Path) -> None:

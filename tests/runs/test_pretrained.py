@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 import re
 from importlib import import_module
 from pathlib import Path
@@ -35,7 +36,7 @@ def test_a_folder_of_that_name_goes_first(tmp_path: Path, monkeypatch: pytest.Mo
 
 def test_its_card_tells_of_its_training() -> None:
     card, config = (FOLDER / "README.md").read_text(), edqn_jax.load_policy(PRETRAINED).config
-    assert f"{config.train.total_steps:,} decisions" in card and f"seed {config.train.seed}" in card
+    assert f"{config.train.total_steps:,} decisions" in card and f"| seed | {config.train.seed}, " in card
     assert f"{config.world.pool_size:,} random worlds" in card and config.world.name == "mixed"
     for density in ("sparse", "medium", "dense"):
         assert re.search(rf"^\| {density} \| 1000 \| (9\d|100)\.\d% \| ", card, re.MULTILINE), density
@@ -45,9 +46,22 @@ def test_its_script_trains_with_its_options(monkeypatch: pytest.MonkeyPatch) -> 
     monkeypatch.syspath_prepend(str(Path(__file__).parents[2] / "scripts"))
     options = edqn_jax.load_policy(PRETRAINED).config
     _, asked = parse_train(import_module("pretrain").FLAGS)
-    # Validation changes nothing where the last parameters are kept; this policy was trained before its script.
-    train = {name: getattr(options.train, name) for name in ("validation_every", "validation_missions", "keep")}
-    assert dataclasses.replace(asked, train=dataclasses.replace(asked.train, **train)) == options
+    assert dataclasses.replace(asked, train=dataclasses.replace(asked.train, seed=options.train.seed)) == options
+
+
+def test_the_best_seed_is_that_of_the_validation_worlds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.syspath_prepend(str(Path(__file__).parents[2] / "scripts"))
+    best_of = import_module("pretrain").best_of
+    with pytest.raises(edqn_jax.ConfigError, match="holds no finished run of a seed"):
+        best_of(tmp_path)
+    for seed, success, spl in ((0, 0.98, 0.99), (1, 0.99, 0.90), (2, 0.99, 0.91), (3, 0.97, 1.0)):
+        run = tmp_path / f"seed-{seed}"
+        run.mkdir()
+        test = {"success_rate": 1.0 - success}  # has no say
+        (run / "summary.json").write_text(
+            json.dumps({"validation_success": success, "validation_spl": spl, "test": test})
+        )
+    assert best_of(tmp_path).name == "seed-2"
 
 
 @pytest.mark.slow

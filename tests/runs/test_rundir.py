@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from importlib.metadata import version
 from pathlib import Path
@@ -10,17 +11,21 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from edqn_jax.config import Config
+from edqn_jax.config import Config, TrainConfig
 from edqn_jax.config.loading import resolve
 from edqn_jax.errors import ConfigError
 from edqn_jax.runs.directory import TRAJECTORY_COLUMNS, RunDirectory, plan_run_directory, version_of
-from edqn_jax.runs.lock import LOCK
+
+
+def begin(run: RunDirectory, seeds: list[Config] | None = None) -> None:
+    with run.locked():
+        run.begin(seeds or [Config()], seeds is not None)
 
 
 @pytest.fixture
 def run(tmp_path) -> RunDirectory:
     run = plan_run_directory(tmp_path / "run", Config())
-    run.create(Config())
+    begin(run)
     return run
 
 
@@ -35,7 +40,7 @@ def test_a_fresh_folder_is_dated_names_world_and_seed_and_is_never_an_old_one(tm
     monkeypatch.chdir(tmp_path)
     config = resolve(world="medium")
     first = plan_run_directory(None, config)
-    first.create(config)
+    begin(first)
     second = plan_run_directory(None, config)
     assert first.path.parent == Path("runs") and first.path.name.endswith("-medium-s0")
     assert second.path.name == f"{first.path.name}-2"
@@ -44,10 +49,10 @@ def test_a_fresh_folder_is_dated_names_world_and_seed_and_is_never_an_old_one(tm
 def test_of_two_runs_that_plan_the_same_fresh_folder_one_gets_it(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     run = plan_run_directory(None, Config())  # both of them, each before the other is there
-    run.create(Config())
+    begin(run)
     run.append_metrics({"decisions": 1})
     with pytest.raises(ConfigError, match=f"another run has just created '{run.path}'; start this one again"):
-        run.create(Config())
+        begin(run)
     assert run.read_metrics() == [{"decisions": 1}]
 
 
@@ -78,16 +83,24 @@ def test_a_finished_run_is_refused_whatever_resume_says(run):
             plan_run_directory(run.path, Config(), resume)
 
 
-def test_an_unfinished_run_is_started_over_only_when_asked(run):
+def test_an_unfinished_run_is_continued_unless_it_is_to_be_started_over(run):
     run.append_metrics({"decisions": 1})
     run.append_episodes([(10, 1.0, 5, "goal")])
-    with pytest.raises(ConfigError, match="unfinished run"):
-        plan_run_directory(run.path, Config())
+    assert [plan_run_directory(run.path, Config(), resume).resume for resume in ("auto", "must")] == ["auto", "must"]
     again = plan_run_directory(run.path, Config(), "never")
-    assert again.metrics_file.exists()
-    again.create(Config())
+    assert again.resume == "never" and again.metrics_file.exists()
+    begin(again)
     assert not again.metrics_file.exists()
     assert len(again.read_episodes()["step"]) == 0
+
+
+def test_a_finished_run_is_continued_for_more_decisions(run):
+    run.write_summary({"success": True})
+    more = dataclasses.replace(Config(), train=TrainConfig(total_steps=10**6))
+    assert plan_run_directory(run.path, more).resume == "auto"
+    with run.locked():
+        run.reopen([more])
+    assert not run.summary_file.exists() and resolve(file=run.config_file) == more
 
 
 def test_resume_must_needs_a_run(tmp_path):
@@ -121,7 +134,7 @@ def test_a_place_without_the_right_to_write_is_named(given, tmp_path, monkeypatc
 def test_what_fails_only_when_made_is_a_sentence_too(tmp_path):
     (tmp_path / "file").touch()
     with pytest.raises(ConfigError, match="cannot be written"):
-        RunDirectory(tmp_path / "file" / "run").create(Config())
+        begin(RunDirectory(tmp_path / "file" / "run"))
 
 
 @pytest.mark.parametrize("inside", ["", "figures"])
@@ -131,7 +144,7 @@ def test_a_file_where_a_folder_must_be_is_named_and_left_alone(inside, tmp_path)
     file.parent.mkdir(exist_ok=True)
     file.write_text("years of work")
     with pytest.raises(ConfigError, match=f"'{run.path}' cannot be written: '{file}' is in the way; move it away"):
-        run.create(Config())
+        begin(run)
     assert file.read_text() == "years of work"
 
 
@@ -167,18 +180,18 @@ def test_a_summary_that_cannot_be_written_leaves_the_old_one(run):
 
 
 def test_one_seed_and_several_leave_nothing_of_each_other(tmp_path):
-    run, configs = RunDirectory(tmp_path / "run"), [Config(), Config()]
-    run.create(Config())
+    run, configs = RunDirectory(tmp_path / "run"), [Config(train=TrainConfig(seed=seed)) for seed in (0, 1)]
+    begin(run)
     run.append_metrics({"decisions": 1})
-    run.create_for_seeds(configs)
-    assert sorted(file.name for file in run.path.iterdir()) == ["config.yaml", LOCK, "seed-0"]
+    begin(run, configs)
+    assert sorted(file.name for file in run.path.iterdir()) == ["checkpoints", "config.yaml", "seed-0", "seed-1"]
     assert run.of_seed(0).figures.is_dir()
-    run.create(Config())
+    begin(run)
     assert not list(run.path.glob("seed-*")) and run.checkpoints.is_dir()
 
 
 def test_a_configuration_says_which_version_wrote_it(run, tmp_path):
-    run.create(Config())
+    begin(run)
     assert version_of(run.config_file) == version("edqn-jax")
     run.config_file.write_bytes(b"\xff\xfe")
     assert version_of(run.config_file) is None and version_of(tmp_path / "nothing") is None

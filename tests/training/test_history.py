@@ -14,7 +14,7 @@ from edqn_jax.learn.trainer import Episodes, Losses
 from edqn_jax.sim.outcomes import Outcome
 from edqn_jax.training.history import EndedEpisodes, check_finite, chunk_metrics
 
-PLAN = Plan(total=100, warmup=4, starts=6, vae_training=((0, 4),))
+PLAN = Plan(total=100, scheduled=100, warmup=4, starts=6, vae_training=((0, 4),))
 
 
 def losses(*q_loss: float) -> Losses:

@@ -26,6 +26,7 @@ from edqn_jax.runs.directory import TRAJECTORY_COLUMNS, RunDirectory, plain
 from edqn_jax.runs.policies import load_run
 from edqn_jax.training.run import train_run
 from edqn_jax.training.selection import Candidate, choose, first_success, is_due
+from edqn_jax.training.stopping import Stop
 from tests.learn.test_trainer import CONFIG as SMALL
 from tests.miniature import WORLD as MINIATURE_WORLD
 
@@ -45,7 +46,7 @@ FIGURES = {"world", "path", "returns", "learning"}
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory: pytest.TempPathFactory) -> tuple[RunDirectory, dict]:
     run = RunDirectory(tmp_path_factory.mktemp("runs") / "whole")
-    return run, train_run(CONFIG, run, Progress(), lambda: False)
+    return run, train_run(CONFIG, run, Progress(), Stop())
 
 
 @pytest.mark.slow
@@ -78,7 +79,7 @@ def test_a_run_with_another_sensor_leaves_the_same_and_is_evaluated(tmp_path: Pa
         train=short,
     )
     run = RunDirectory(tmp_path / "depth")
-    summary = train_run(config, run, Progress(), lambda: False)
+    summary = train_run(config, run, Progress(), Stop())
     assert json.loads(run.summary_file.read_text()) == plain(summary)
     assert {file.stem for file in run.figures.glob("*.png")} == FIGURES | {"depth", "reconstruction"}
     assert summary["train_decisions"] == 256 and summary["workload"]["sensor"] == "depth"
@@ -108,10 +109,40 @@ def test_a_run_stopped_before_any_validation_keeps_what_it_has_learnt(
     config = dataclasses.replace(CONFIG, train=dataclasses.replace(CONFIG.train, validation_every=0))
     run = RunDirectory(tmp_path / "stopped")
     with pytest.raises(StoppedError, match="stopped after 256 decisions"):
-        train_run(config, run, Progress(), lambda: len(run.read_metrics()) == 4)
+        train_run(config, run, Progress(), Stop(lambda: len(run.read_metrics()) == 4))
     _, params = load_run(run.path)
     np.testing.assert_array_equal(params.q["Dense_0"]["bias"], 4.0)  # it began at zero and grew in four chunks
     assert not run.summary_file.exists()
+
+
+@pytest.mark.slow
+def test_an_interrupted_run_that_is_continued_is_the_run_that_was_not(
+    whole: tuple[RunDirectory, dict], tmp_path: Path
+) -> None:
+    uninterrupted, expected = whole
+    run = RunDirectory(tmp_path / "cut")
+    with pytest.raises(StoppedError, match="stopped after 192 decisions"):
+        train_run(CONFIG, run, Progress(), Stop(lambda: len(run.read_metrics()) == 3))
+    # As if it had gone on after its last checkpoint, until it was killed while it wrote.
+    run.append_episodes([(256, 1.0, 5, "goal")])
+    with run.metrics_file.open("a") as file:
+        file.write('{"decisions": 25')
+    (run.checkpoints / "step-000000016.partial").mkdir()
+    summary = train_run(CONFIG, dataclasses.replace(run, resume="must"), Progress(), Stop())
+    assert summary["resumed_at_decisions"] == [192]
+    clocks = [name for name in summary if "seconds" in name or name == "resumed_at_decisions"]
+    for name in [*clocks, "decisions_per_second"]:
+        assert name == "flight_seconds" or (summary.pop(name), expected.get(name)) is not None
+    assert summary == {name: expected[name] for name in summary}  # the state's digest among them
+    assert run.episodes_file.read_bytes() == uninterrupted.episodes_file.read_bytes()
+    assert _without_clocks(run) == _without_clocks(uninterrupted)
+    ended = [load_run(folder.path)[1] for folder in (run, uninterrupted)]
+    jax.tree.map(np.testing.assert_array_equal, *ended)
+    assert [place.name for place in sorted(run.checkpoints.iterdir())] == ["policy", "step-000000012", "step-000000032"]
+
+
+def _without_clocks(run: RunDirectory) -> list[dict]:
+    return [{name: value for name, value in row.items() if "second" not in name} for row in run.read_metrics()]
 
 
 def test_a_world_that_cannot_be_flown_leaves_nothing_behind(tmp_path: Path) -> None:
@@ -123,7 +154,7 @@ def test_a_world_that_cannot_be_flown_leaves_nothing_behind(tmp_path: Path) -> N
     run = RunDirectory(tmp_path / "run")
     config = Config(world=WorldConfig(name=str(file)))
     with pytest.raises(ConfigError, match="the start .* lies inside 'wall'"):
-        train_run(config, run, Progress(), lambda: False)
+        train_run(config, run, Progress(), Stop())
     assert not run.path.exists()
 
 
@@ -173,7 +204,7 @@ def test_a_validation_is_due_where_a_multiple_is_crossed_once_there_was_learning
     every: int, checked: int, done: int, due: bool
 ) -> None:
     config = Config(train=TrainConfig(num_envs=16, validation_every=every))
-    assert is_due(config, Plan(total=200, warmup=0, starts=5, vae_training=()), checked, done) is due
+    assert is_due(config, Plan(total=200, scheduled=200, warmup=0, starts=5, vae_training=()), checked, done) is due
 
 
 @pytest.mark.slow

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 import sys
 from collections.abc import Sequence
 
@@ -10,6 +11,7 @@ import tyro
 
 import edqn_jax
 from edqn_jax.cli.arguments import EvaluateArgs, RecordArgs, TrainCommand, parse_evaluate, parse_record
+from edqn_jax.cli.signals import Stops
 from edqn_jax.cli.train import train_command
 from edqn_jax.config.loading import nearest
 from edqn_jax.errors import ConfigError, DivergedError, StoppedError
@@ -17,19 +19,22 @@ from edqn_jax.errors import ConfigError, DivergedError, StoppedError
 DONE = 0
 BAD_INPUT = 2
 DIVERGED = 3
-INTERRUPTED = 130
-TERMINATED = 143
+BY_SIGNAL = 128
+"""What the number of a signal is added to: 130 for SIGINT, 143 for SIGTERM."""
 
 COMMANDS = {"train": TrainCommand, "evaluate": EvaluateArgs, "record": RecordArgs}
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Runs one command and returns its exit code: 0 done, 2 bad input, 3 diverged, 143 stopped by SIGTERM."""
+def run(argv: Sequence[str] | None, stops: Stops) -> int:
+    """Runs one command and returns its exit code.
+
+    0 is done, 2 bad input, 3 diverged, 130 stopped by SIGINT, and 143 by SIGTERM.
+    """
     argv = list(sys.argv[1:] if argv is None else argv)
     # XLA's errors are for people, its warnings for those who write XLA; read when JAX is first imported.
     os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")
     try:
-        code = _dispatched(argv)
+        code = _dispatched(argv, stops)
         sys.stdout.flush()
         return code
     except BrokenPipeError:  # whoever reads, such as `head`, has enough; Python would try once more at its end
@@ -37,20 +42,23 @@ def main(argv: Sequence[str] | None = None) -> int:
         return DONE
 
 
-def _dispatched(argv: list[str]) -> int:
+def _dispatched(argv: list[str], stops: Stops) -> int:
     """Runs one command and returns the exit code of its ending."""
     try:
-        return _dispatch(argv)
+        return _dispatch(argv, stops)
     except SystemExit as ending:  # tyro has printed the help, or what is wrong
         return int(ending.code or DONE)
-    except (ConfigError, DivergedError, StoppedError, KeyboardInterrupt) as ending:
-        return _explain(ending)
+    except (ConfigError, DivergedError, StoppedError) as ending:
+        print(f"edqn: {ending}", file=sys.stderr)
+        if isinstance(ending, StoppedError):  # by a signal to this process, or to another of the cluster
+            return BY_SIGNAL + (stops.number or signal.SIGTERM)
+        return BAD_INPUT if isinstance(ending, ConfigError) else DIVERGED
 
 
-def _dispatch(argv: Sequence[str]) -> int:
+def _dispatch(argv: Sequence[str], stops: Stops) -> int:
     command, rest = argv[0] if argv else "--help", argv[1:]
     if command == "train":
-        train_command(rest)
+        train_command(rest, stops)
     elif command == "evaluate":
         _evaluate(rest)
     elif command == "record":
@@ -82,9 +90,3 @@ def _record(argv: Sequence[str]) -> None:
 
     use_cpu_devices()
     record_command(args)
-
-
-def _explain(ending: BaseException) -> int:
-    print(f"edqn: {str(ending) or 'interrupted'}", file=sys.stderr)
-    codes = {ConfigError: BAD_INPUT, DivergedError: DIVERGED, StoppedError: TERMINATED}
-    return next((code for kind, code in codes.items() if isinstance(ending, kind)), INTERRUPTED)

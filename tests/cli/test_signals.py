@@ -1,0 +1,60 @@
+"""What a signal does to a command: while it works, while it is asked to stop, and while it compiles."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+
+from edqn_jax.cli.signals import ONE_S
+from tests.processes import PATIENCE_S
+
+WORK = """
+import hashlib, sys, threading
+from edqn_jax.cli.signals import heard
+
+def unheard():
+    "Gives no signal handler of Python's a chance, as XLA while it compiles."
+    print("ready", flush=True)
+    hashlib.pbkdf2_hmac("sha256", b"", b"", 2**31 - 1)
+
+with heard() as stops:
+    if sys.argv[1] == "obeyed":
+        with stops.obeyed(lambda text: print(text, flush=True)):
+            unheard()
+    unheard()
+"""
+
+
+def working(phase: str) -> subprocess.Popen[str]:
+    process = subprocess.Popen(
+        [sys.executable, "-c", WORK, phase], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
+    assert process.stdout is not None and process.stdout.readline() == "ready\n"
+    return process
+
+
+@pytest.mark.parametrize(
+    ("number", "code", "says"), [(signal.SIGINT, 130, "interrupted"), (signal.SIGTERM, 143, "terminated")]
+)
+def test_the_first_signal_ends_what_has_nothing_to_save(number: int, code: int, says: str) -> None:
+    with working("alone") as process:
+        process.send_signal(number)
+        assert process.communicate(timeout=PATIENCE_S) == ("", f"edqn: {says}\n")
+    assert process.returncode == code
+
+
+def test_a_second_signal_ends_what_obeys_the_first() -> None:
+    with working("obeyed") as process:
+        process.send_signal(signal.SIGTERM)
+        assert process.stdout is not None
+        assert process.stdout.readline() == "terminated: stopping after this chunk; a second signal ends at once\n"
+        process.send_signal(signal.SIGTERM)  # as `timeout` does, to the process and to its group
+        time.sleep(1.5 * ONE_S)
+        assert process.poll() is None
+        process.send_signal(signal.SIGINT)
+        assert process.communicate(timeout=PATIENCE_S)[1] == "edqn: interrupted\n"
+    assert process.returncode == 130
