@@ -8,7 +8,7 @@ class ConfigError(ValueError):
 
 
 class DivergedError(RuntimeError):
-    """A loss became NaN or Inf; the message says which one and at which step."""
+    """Nothing is learnt any more because numbers are not finite; the message says which were first, and when."""
 
 
 class StoppedError(RuntimeError):

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
+from typing import Any
 
 import jax
+import numpy as np
 
 from edqn_jax.config import Config
+from edqn_jax.learn.trainer import Health, Losses
 from edqn_jax.sim import drone, mjcf, worlds
 from edqn_jax.sim.env import World
 from edqn_jax.sim.scene import stack_scenes
@@ -21,6 +25,14 @@ MINIATURE = (
 
 WORLD = Path(__file__).with_name("miniature.xml")
 """Ground, blocks and a ball, as in the paper's world, but few: a training step compiles in two thirds of the time."""
+
+
+def no_losses(steps: int) -> Losses:
+    """Stands for what training steps return in which nothing was learnt."""
+    zeros: Any = np.zeros(steps)
+    health = Health(*[zeros] * len(dataclasses.fields(Health)))
+    numbers = {field.name: zeros for field in dataclasses.fields(Losses)}
+    return Losses(**{**numbers, "health": health})
 
 
 def miniature_world(config: Config, own_start_fraction: float = 0.25) -> World:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import time
 from collections.abc import Callable
 from typing import Any
@@ -23,7 +24,7 @@ from edqn_jax.runs.provenance import workload
 from edqn_jax.sim.env import World
 from edqn_jax.sim.flights import Flights
 from edqn_jax.sim.outcomes import Outcome
-from edqn_jax.training.history import check_finite
+from edqn_jax.training.history import Watch
 from edqn_jax.training.selection import Candidate, choose, first_success, is_due, validated
 from measurement import json_report
 
@@ -144,7 +145,8 @@ class Learner:
         config, plan, envs = self.config, self.trainer.plan, self.config.train.num_envs
         validation = Validation(config, self.missions, self._fly)
         state = self.trainer.init(seed)
-        seconds, done = 0.0, 0
+        seconds, done, watch = 0.0, 0, Watch()
+        seeded = dataclasses.replace(config, train=dataclasses.replace(config.train, seed=seed))
         while done < plan.total:
             began = time.perf_counter()
             state, (_, losses) = self.trainer.chunk(state, done)
@@ -152,7 +154,7 @@ class Learner:
             seconds += time.perf_counter() - began
             done += config.train.chunk_steps
             try:
-                check_finite(plan, done, losses, seed)
+                watch.check(plan, seeded, done, losses)
             except DivergedError as error:
                 return diverged(seed, str(error), done * envs, seconds, validation)
             if done >= plan.total or is_due(config, plan, validation.checked, done):

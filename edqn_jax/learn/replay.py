@@ -44,7 +44,7 @@ class Batch:
     returns: Array  # [B] discounted rewards until the end or n steps
     discount: Array  # [B] gamma^m for the bootstrap, 0 after a terminal outcome
     next_history: Array  # [B, H, D] observations up to where the bootstrap is taken
-    weight: Array  # [B] 1 for a sample, 0 for a row that starts nothing (an episode's last)
+    weight: Array  # [B] 1 for a sample, 0 for a row that starts nothing (an episode's last) or led to a divergence
 
 
 def empty(config: AgentConfig, envs: int, total_envs: int, observation_size: int) -> Rows:
@@ -127,5 +127,8 @@ def _transition(config: AgentConfig, ring: Rows, start: Array, env: Array) -> Ba
         returns=jnp.sum(running * discounts * rewards[h:]),
         discount=jnp.where(terminal, 0.0, config.discount**steps),
         next_history=stacked(newest(observations, steps, h), newest(resets, steps, h)),
-        weight=(outcomes[h - 1] == Outcome.RUNNING).astype(jnp.float32),
+        # Of what diverged, nobody knows where the action led to.
+        weight=((outcomes[h - 1] == Outcome.RUNNING) & (outcomes[h + steps - 1] != Outcome.DIVERGED)).astype(
+            jnp.float32
+        ),
     )

@@ -90,14 +90,31 @@ class Episodes:
 
 
 @struct.dataclass
+class Health:
+    """How often a quantity was not finite in one training step, in the order in which one spoils the next; [] int32."""
+
+    physics_state: Array
+    """Environments, which were reset."""
+    observation: Array
+    reward: Array
+    parameters: Array
+    """1 if a number of any network was not finite before the updates."""
+    loss: Array
+    """Updates."""
+    gradient: Array
+    """Updates, which were skipped."""
+
+
+@struct.dataclass
 class Losses:
-    """One training step's means; NaN for what did not learn in it."""
+    """One training step's means over its updates that had a finite loss; NaN for what did not learn in it."""
 
     q_loss: Array
     mean_q: Array
     reconstruction: Array
     kl: Array
     epsilon: Array
+    health: Health
 
 
 class InitialKeys(NamedTuple):
@@ -188,12 +205,19 @@ def _init_learner(config: Config, key: Array) -> Learner:
 
 
 def _vae_optimiser(config: Config) -> optax.GradientTransformation:
-    return optax.flatten(optax.adam(config.encoder.learning_rate))
+    return _unless_broken(optax.flatten(optax.adam(config.encoder.learning_rate)))
+
+
+def _unless_broken(optimiser: optax.GradientTransformation) -> optax.GradientTransformation:
+    """Returns an optimiser that changes nothing where a gradient is not finite, however often."""
+    return optax.apply_if_finite(optimiser, max_consecutive_errors=2**31 - 1)
 
 
 def _q_optimiser(config: Config) -> optax.GradientTransformation:
     plan = Plan.of(config)
-    return dqn.optimiser(config.agent, (plan.scheduled - plan.learn_from) * config.agent.updates_per_step)
+    return _unless_broken(
+        dqn.optimiser(config.agent, (plan.scheduled - plan.learn_from) * config.agent.updates_per_step)
+    )
 
 
 def _flat(x: Array) -> Array:
@@ -245,6 +269,7 @@ def train_step(
     ring = _store(actors, action, time)
     flown, seen = _fly(config, world, actors, action)
     rings = _keep(config, world, actors, flown, seen, step)
+    spoilt = ~_is_finite((learner.vae, learner.encoder, learner.q))
     vae_losses, learner = learn_to_see(config, axis, learner, rings, keys.vae, step)
     q_losses, learner = learn_to_act(config, axis, learner, ring, time, keys.dqn, step)
     learner = _publish(config, learner, step)
@@ -267,13 +292,53 @@ def train_step(
     episodes = Episodes(outcome=outcome, length=shaped(seen.episode_length), episode_return=shaped(seen.episode_return))
     shards = epsilon.shape[0]
     losses = Losses(
-        q_loss=q_losses[0],
-        mean_q=q_losses[1],
-        reconstruction=vae_losses[0],
-        kl=vae_losses[1],
+        q_loss=q_losses.means[0],
+        mean_q=q_losses.means[1],
+        reconstruction=vae_losses.means[0],
+        kl=vae_losses.means[1],
         epsilon=jnp.where(warming, 1.0, _all_sum(jnp.mean(epsilon) * shards, axis) / config.train.shards),
+        health=Health(
+            **{name: _all_sum(jnp.sum(getattr(seen.broken, name), dtype=jnp.int32), axis) for name in _OF_A_DECISION},
+            parameters=spoilt.astype(jnp.int32),
+            loss=q_losses.broken[0] + vae_losses.broken[0],
+            gradient=q_losses.broken[1] + vae_losses.broken[1],
+        ),
     )
     return TrainState(actors=actors, learner=learner, step=step + 1), (episodes, losses)
+
+
+_OF_A_DECISION = ("physics_state", "observation", "reward")
+
+
+class _Learnt(NamedTuple):
+    """What the updates of one training step come to."""
+
+    means: tuple[Array, Array]
+    """Loss and what goes with it, over the updates with a finite loss; NaN if there was none."""
+    broken: tuple[Array, Array]
+    """Updates whose loss, and whose gradient, was not finite; int32."""
+
+    @classmethod
+    def none(cls) -> _Learnt:
+        nothing, never = jnp.float32(jnp.nan), jnp.int32(0)
+        return cls((nothing, nothing), (never, never))
+
+    @classmethod
+    def of(cls, loss: Array, other: Array, gradient_is_finite: Array) -> _Learnt:
+        """Returns what updates [U] with these losses and gradients come to."""
+        finite = jnp.isfinite(loss)
+        count = jnp.sum(finite)
+        loss, other = (jnp.sum(jnp.where(finite, x, 0.0)) / count for x in (loss, other))
+        return cls((loss, other), (_count(~finite), _count(~gradient_is_finite)))
+
+
+def _count(flags: Array) -> Array:
+    return jnp.sum(flags, dtype=jnp.int32)
+
+
+def _is_finite(tree: Any) -> Array:
+    """Returns whether every number of a tree is finite, [] bool."""
+    return jnp.isfinite(sum(jnp.sum(leaf) for leaf in jax.tree.leaves(tree)))
 
 
 def _act(
@@ -361,11 +426,10 @@ def _keep(config: Config, world: World, actors: Actors, flown: EnvState, seen: e
 
 
 def learn_to_see(config: Config, axis: str | None, learner: Learner, rings: Samples | None, keys: Array, step: Array):
-    """Updates the VAE on samples of the rings [S, L, E, ...]; returns `(reconstruction, kl), learner`."""
+    """Updates the VAE on samples of the rings [S, L, E, ...]; returns reconstruction and KL, and the learner."""
     plan = Plan.of(config)
-    nothing = jnp.float32(jnp.nan), jnp.float32(jnp.nan)
     if rings is None:
-        return nothing, learner
+        return _Learnt.none(), learner
     share = config.encoder.batch_size // config.train.shards
     kept = plan.samples_kept(config, step) + 1
     part = keys.shape[0] / config.train.shards  # of all shards, on this device
@@ -383,27 +447,26 @@ def learn_to_see(config: Config, axis: str | None, learner: Learner, rings: Samp
         noise = jax.vmap(lambda key: jax.random.normal(key, shape))(noise_keys)
         batch, noise = jax.tree.map(_side_by_side, (batch, noise))
         gradient, parts = jax.grad(loss, has_aux=True)(learner.vae, batch, noise)
-        gradient = _all_sum(gradient, axis)
+        gradient, parts = _all_sum((gradient, jax.tree.map(lambda x: jnp.mean(x) * part, parts)), axis)
         change, optimiser = _vae_optimiser(config).update(gradient, learner.vae_optimiser, learner.vae)
         learner = dataclasses.replace(learner, vae=optax.apply_updates(learner.vae, change), vae_optimiser=optimiser)
-        return learner, (parts.reconstruction, parts.kl)
+        return learner, (parts.reconstruction, parts.kl, _is_finite(gradient))
 
     def learn(learner: Learner, updates: int):
         many = jax.vmap(lambda k: jax.random.split(k, updates))(keys).swapaxes(0, 1)
         learner, found = lax.scan(update, learner, many)
-        means = jax.tree.map(lambda x: _all_sum(jnp.mean(x) * part, axis), found)
-        return means, learner
+        return _Learnt.of(*found), learner
 
     def rest(learner: Learner):
         if config.encoder.keep_learning:
             return learn(learner, 1)
-        return nothing, learner
+        return _Learnt.none(), learner
 
     return lax.cond(plan.trains_vae(step), lambda x: learn(x, config.encoder.warmup_updates_per_step), rest, learner)
 
 
 def learn_to_act(config: Config, axis: str | None, learner: Learner, ring, time: Array, keys: Array, step: Array):
-    """Updates the DQN from the replay (Algorithm 1, steps 7-9); returns `(loss, mean Q), learner`."""
+    """Updates the DQN from the replay (Algorithm 1, steps 7-9); returns loss and mean Q, and the learner."""
     plan, agent = Plan.of(config), config.agent
     share = agent.batch_size // config.train.shards
 
@@ -423,23 +486,29 @@ def learn_to_act(config: Config, axis: str | None, learner: Learner, ring, time:
         gradient, total, count, sum_q = _all_sum((gradient, total, count, sum_q), axis)
         gradient = gradient / jnp.maximum(count, 1.0)
         change, optimiser = _q_optimiser(config).update(gradient, learner.q_optimiser, learner.q)
-        q = optax.apply_updates(learner.q, change)
+        q, finite = optax.apply_updates(learner.q, change), _is_finite(gradient)
+
+        def followed(old: Array, rate: float) -> Array:
+            """Follows `q`, unless it may be `q` that is not finite."""
+            return jnp.where(finite, dqn.polyak(q, old, rate), old)
+
         learner = dataclasses.replace(
             learner,
             q=q,
             q_optimiser=optimiser,
-            target=dqn.polyak(q, learner.target, agent.target_rate),
-            average=dqn.polyak(q, learner.average, agent.average_rate),
+            target=followed(learner.target, agent.target_rate),
+            average=followed(learner.average, agent.average_rate),
         )
-        return learner, (total / jnp.maximum(count, 1.0), sum_q / jnp.maximum(count, 1.0))
+        count = jnp.maximum(count, 1.0)
+        return learner, (total / count, sum_q / count, finite)
 
     def learn(learner: Learner):
         many = jax.vmap(lambda k: jax.random.split(k, agent.updates_per_step))(keys).swapaxes(0, 1)
         learner, losses = lax.scan(update, _each_network(vector, learner), many)
-        return jax.tree.map(jnp.mean, losses), _each_network(tree, learner)
+        return _Learnt.of(*losses), _each_network(tree, learner)
 
     def rest(learner: Learner):
-        return (jnp.float32(jnp.nan), jnp.float32(jnp.nan)), learner
+        return _Learnt.none(), learner
 
     return lax.cond(plan.trains_q(step), learn, rest, learner)
 

@@ -73,6 +73,15 @@ class EnvState:
 
 
 @struct.dataclass
+class Broken:
+    """What was not finite in a decision, which has therefore diverged: [] bool each."""
+
+    physics_state: Array
+    observation: Array
+    reward: Array
+
+
+@struct.dataclass
 class Step:
     """What one decision led to. n physics steps."""
 
@@ -85,6 +94,7 @@ class Step:
     flight: Flight  # [n, ...] after each physics step; for a reset, the new start throughout
     end_step: Array  # [] int32, physics step (1..n) at which the outcome fell; n while running
     contact: Array  # [] share of that step flown before a collision touched, 1 otherwise
+    broken: Broken
 
 
 def velocity_command(config: EnvConfig, action: Array, yaw: Array) -> Array:
@@ -242,6 +252,8 @@ class _Decision:
     end_step: Array
     contact: Array
     reward: Array
+    broken: Array  # [] bool, the body was not finite
+    unrewarded: Array  # [] bool, the reward was not, although the body was
 
 
 def step(
@@ -269,6 +281,9 @@ def step(
     memory = _choose(is_reset, rested, state.memory)
     move = jnp.where(is_reset, 0.0, jnp.asarray(ACTIONS, jnp.float32)[action])
     observation, memory = observe(config, scene, goal, done.drone, move, poses, memory, noise)
+    unseen = ~_is_finite(observation)
+    observation = _choose(unseen, jax.tree.map(jnp.zeros_like, observation), observation)
+    done = dataclasses.replace(done, outcome=jnp.where(unseen, int(Outcome.DIVERGED), done.outcome))
     after = EnvState(
         drone=done.drone,
         mission=mission,
@@ -288,6 +303,14 @@ def step(
         flight=done.flight,
         end_step=done.end_step,
         contact=done.contact,
+        broken=Broken(physics_state=done.broken, observation=unseen, reward=done.unrewarded),
+    )
+
+
+def _is_finite(tree: object) -> Array:
+    """Returns whether every number of a tree's arrays is finite; whole numbers are."""
+    return jnp.isfinite(
+        sum(jnp.sum(leaf) for leaf in jax.tree.leaves(tree) if jnp.issubdtype(leaf.dtype, jnp.floating))
     )
 
 
@@ -298,7 +321,11 @@ def _scene_of(config: Config, world: World, mission: Array, decision: Array) -> 
 
 
 def _fly(config: Config, world: World, scene: Scene, goal: Array, state: EnvState, action: Array) -> _Decision:
-    """The decision as flown and judged; a diverged body stays where it was, so that no NaN reaches an observation."""
+    """The decision as flown and judged.
+
+    A diverged body stays where it was, so that no NaN reaches an observation; a decision without a finite reward has
+    diverged, too.
+    """
     before = state.drone
     command = velocity_command(config.env, action, drone.yaw_of(before.quaternion))
     after, flight = drone.fly(config.drone, world.airframe, before, command, bearing(config.env, before, goal))
@@ -306,13 +333,16 @@ def _fly(config: Config, world: World, scene: Scene, goal: Array, state: EnvStat
     reward = _reward(config, world, scene, goal, before, after, action, outcome)
     numbers = jnp.concatenate([after.position, after.quaternion, after.velocity, after.angular_velocity])
     broken = ~jnp.all(jnp.isfinite(numbers))
+    unrewarded = ~broken & ~jnp.isfinite(reward)
     return _Decision(
         drone=_choose(broken, before, after),
         flight=_choose(broken, _hold(before, flight.position.shape[0]), flight),
-        outcome=jnp.where(broken, int(Outcome.DIVERGED), outcome).astype(jnp.int32),
+        outcome=jnp.where(broken | unrewarded, int(Outcome.DIVERGED), outcome).astype(jnp.int32),
         end_step=end_step,
         contact=contact,
-        reward=jnp.where(broken, 0.0, reward),
+        reward=jnp.where(broken | unrewarded, 0.0, reward),
+        broken=broken,
+        unrewarded=unrewarded,
     )
 
 
@@ -352,6 +382,8 @@ def _reset_in_place_of(flown: _Decision, start: DroneState) -> _Decision:
         flight=_hold(start, flown.flight.position.shape[0]),
         outcome=jnp.full((), int(Outcome.RUNNING), jnp.int32),
         reward=jnp.zeros(()),
+        broken=jnp.zeros((), bool),
+        unrewarded=jnp.zeros((), bool),
     )
 
 

@@ -11,8 +11,11 @@ import numpy as np
 from edqn_jax.config import Config
 from edqn_jax.errors import DivergedError
 from edqn_jax.learn.plan import Plan
-from edqn_jax.learn.trainer import Episodes, Losses
+from edqn_jax.learn.trainer import Episodes, Health, Losses
 from edqn_jax.sim.outcomes import Outcome
+
+MOST_ILL_STEPS = 100
+"""Training steps without a useful update, or with as many diverged decisions, after which a run is given up."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -76,14 +79,16 @@ def chunk_metrics(
         episodes: ended in all, this chunk included.
     """
     envs, steps = config.train.num_envs, len(losses.q_loss)
-    any_ended = len(ended.step) > 0
+    whole = ended.episode_return[ended.outcome != Outcome.DIVERGED]
     return {
         "phase": _phase(Plan.of(config), first + steps - 1),
         "decisions": (first + steps) * envs,
         "decisions_per_second": steps * envs / seconds,
         "episodes": episodes,
-        "success_rate": float(np.mean(ended.outcome == Outcome.GOAL)) if any_ended else None,
-        "mean_return": float(np.mean(ended.episode_return)) if any_ended else None,
+        "success_rate": float(np.mean(ended.outcome == Outcome.GOAL)) if len(ended.outcome) else None,
+        "mean_return": float(np.mean(whole)) if len(whole) else None,
+        "diverged": int(np.sum(ended.outcome == Outcome.DIVERGED)),
+        "skipped_updates": int(np.sum(losses.health.gradient)),
         "epsilon": float(losses.epsilon[-1]),
         "q_loss": _mean(losses.q_loss),
         "mean_q": _mean(losses.mean_q),
@@ -130,18 +135,51 @@ def _warm_up(config: Config, first: int, losses: Losses) -> dict[str, Any] | Non
     }
 
 
-def check_finite(plan: Plan, done: int, losses: Losses, seed: int) -> None:
-    """Raises if a loss of the chunk that ended with training step `done` is NaN or Inf.
+class Watch:
+    """Counts how long a run has learnt nothing because numbers were not finite."""
 
-    Raises:
-        DivergedError: names the loss, the step and the run's seed.
-    """
-    learns = np.asarray(plan.trains_q(np.arange(done - len(losses.q_loss), done)))
-    bad = learns & ~np.isfinite(losses.q_loss)
-    if bad.any():
-        raise DivergedError(
-            f"training with seed {seed} diverged: the Q loss was {losses.q_loss[bad][0]} at training step {done}"
-        )
+    def __init__(self) -> None:
+        """Begins with a healthy run."""
+        self._ill_steps = 0
+        self._first = ""  # quantity and training step
+
+    def check(self, plan: Plan, config: Config, done: int, losses: Losses) -> None:
+        """Takes in a chunk that ended with training step `done`.
+
+        A chunk is ill if every update in it was skipped, or if a quarter of its decisions diverged.
+
+        Raises:
+            DivergedError: after `MOST_ILL_STEPS` training steps of ill chunks in a row; names the quantity that was the
+                first not to be finite, the step and the run's seed.
+        """
+        steps, health = len(losses.q_loss), losses.health
+        numbers = np.arange(done - steps, done)
+        updates = np.asarray(plan.trains_q(numbers)) * config.agent.updates_per_step
+        trained = np.asarray(plan.trains_vae(numbers))
+        rest = int(config.encoder.keep_learning and bool(plan.vae_training))
+        updates = updates + np.where(trained, config.encoder.warmup_updates_per_step, rest)
+        skipped = int(np.sum(health.gradient))
+        diverged = int(np.sum(health.physics_state) + np.sum(health.observation) + np.sum(health.reward))
+        useless = 0 < int(np.sum(updates)) <= skipped
+        if not useless and 4 * diverged < steps * config.train.num_envs:
+            self._ill_steps = 0
+            return
+        if self._ill_steps == 0:
+            self._first = _first_broken(health, numbers)
+        self._ill_steps += steps
+        if self._ill_steps >= MOST_ILL_STEPS:
+            raise DivergedError(
+                f"training with seed {config.train.seed} diverged: {self._first}, and nothing was learnt in "
+                f"{self._ill_steps} training steps after it"
+            )
+
+
+def _first_broken(health: Health, steps: np.ndarray) -> str:
+    """Returns which quantity was the first not to be finite, and when: of one step, the one that spoils the others."""
+    counts = {field.name: np.asarray(getattr(health, field.name)) for field in dataclasses.fields(health)}
+    begins = {name: int(np.argmax(count > 0)) for name, count in counts.items() if np.any(count > 0)}
+    name = min(begins, key=lambda name: begins[name])  # of equals the first
+    return f"NaN or Inf in the {name.replace('_', ' ')} at training step {steps[begins[name]]}"
 
 
 def _mean(values: Any) -> float | None:

@@ -34,7 +34,7 @@ from edqn_jax.random import run_streams
 from edqn_jax.sim.env import World
 from edqn_jax.sim.flights import Flights
 from edqn_jax.sim.reward import Reward
-from edqn_jax.training.history import EndedEpisodes, History, check_finite, chunk_metrics, mean_metrics
+from edqn_jax.training.history import EndedEpisodes, History, Watch, chunk_metrics, mean_metrics
 from edqn_jax.training.selection import Candidate, choose, is_due, validated
 
 
@@ -254,7 +254,7 @@ def train(
 
     Raises:
         ConfigError: if the configuration is invalid or the world cannot be flown.
-        DivergedError: if a loss becomes NaN or Inf.
+        DivergedError: if numbers are not finite for so long that nothing is learnt any more.
     """
     with prepared(config or make_config(), reward) as preparation:
         return run_chunks(preparation, callback)[0]
@@ -287,7 +287,7 @@ def run_chunks(
         begin: where a run stood that is continued; None begins one.
 
     Raises:
-        DivergedError: if a loss becomes NaN or Inf.
+        DivergedError: if numbers are not finite for so long that nothing is learnt any more.
     """
     trainer = preparation.trainer
     if begin is None:
@@ -326,6 +326,7 @@ class _Agent:
     missions: RunMissions
     kept: Candidate
     history: History = dataclasses.field(default_factory=History)
+    watch: Watch = dataclasses.field(default_factory=Watch)
 
 
 class _Loop:
@@ -410,7 +411,7 @@ class _Loop:
         ):
             ended = EndedEpisodes.of(ended, first, self.config.train.num_envs)
             agent.history.episodes.append(ended)
-            check_finite(self.plan, self.done, lost, agent.config.train.seed)
+            agent.watch.check(self.plan, agent.config, self.done, lost)
             count = agent.history.episode_count
             chunks.append((ended, chunk_metrics(self.config, first, ended, lost, seconds, count)))
         return state, chunks

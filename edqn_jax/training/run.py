@@ -54,7 +54,7 @@ def train_run(
 
     Raises:
         ConfigError: before anything is written, if the run cannot be made; later, if one of its files cannot be.
-        DivergedError: if a loss becomes NaN or Inf.
+        DivergedError: as `train`; the policy of the last checkpoint stays.
         StoppedError: after saving the policy, if it was asked to.
     """
     with prepared(config, reward, progress) as preparation, contextlib.ExitStack() as held:

@@ -126,6 +126,79 @@ def test_parameters_agree_on_one_device_and_two_after_the_first_updates(on_one, 
         np.testing.assert_allclose(one, two, atol=1e-5)
 
 
+def flown_on(made: Trainer, chunks: int, poison: Any = None) -> tuple[TrainState, Any]:
+    """The state after so many chunks and the last one's losses; `poison` changes the state before the last."""
+    state, losses = made.init(CONFIG.train.seed), None
+    for number in range(chunks):
+        if poison is not None and number == chunks - 1:
+            state = poison(state)
+        state, (_, losses) = made.chunk(state, number * CONFIG.train.chunk_steps)
+    assert losses is not None
+    return _host(state), jax.tree.map(np.asarray, losses)
+
+
+def finite(tree: Any) -> bool:
+    return all(np.isfinite(np.asarray(leaf, np.float64)).all() for leaf in jax.tree.leaves(tree))
+
+
+def changed(state: TrainState, path: str, change: Any) -> TrainState:
+    """The state with the array at a path such as `actors.replay.reward` changed; of several, the first."""
+    first, _, rest = path.partition(".")
+    held = getattr(state, first)
+    if rest:
+        return dataclasses.replace(state, **{first: changed(held, rest, change)})
+    leaves, tree = jax.tree.flatten(held)
+    return dataclasses.replace(state, **{first: tree.unflatten([change(leaves[0]), *leaves[1:]])})
+
+
+@pytest.mark.slow
+def test_a_poisoned_parameter_stops_all_updates_and_spoils_no_saved_policy(on_one) -> None:
+    made, steps, updates = on_one[3], CONFIG.train.chunk_steps, CONFIG.agent.updates_per_step
+    clean, _ = flown_on(made, 3)
+    state, losses = flown_on(
+        made, 4, lambda state: changed(state, "learner.q", lambda x: x.at[(0,) * x.ndim].set(np.nan))
+    )
+    health = losses.health
+    np.testing.assert_array_equal(health.parameters, np.ones(steps))
+    np.testing.assert_array_equal(health.gradient, np.full(steps, updates))
+    assert np.isnan(losses.q_loss).all() and not health.physics_state.any()
+    # What is flown and saved is the average, which stays; so does the optimiser.
+    assert _same(state.learner.average, clean.learner.average) and _same(state.learner.target, clean.learner.target)
+    assert finite(state.learner.q_optimiser) and finite(state.actors.replay)
+
+
+@pytest.mark.slow
+def test_a_poisoned_transition_costs_the_updates_that_meet_it_and_nothing_else(on_one) -> None:
+    made, plan = on_one[3], Plan.of(CONFIG)
+    written = 2 * CONFIG.train.chunk_steps - plan.warmup  # rows before the last chunk
+
+    def poison(state: TrainState) -> TrainState:
+        return changed(state, "actors.replay.reward", lambda x: x.at[0, written - 1, 0].set(np.nan))
+
+    state, losses = flown_on(made, 3, poison)
+    skipped = losses.health.gradient.sum()
+    assert 0 < skipped < CONFIG.train.chunk_steps * CONFIG.agent.updates_per_step
+    np.testing.assert_array_equal(losses.health.loss, losses.health.gradient)
+    assert not losses.health.parameters.any() and finite(state.learner)
+
+
+@pytest.mark.slow
+def test_drones_whose_physics_blows_up_are_reset_and_counted_and_the_others_fly_on(on_one) -> None:
+    made, running = on_one[3], []
+    clean, before = flown_on(made, 3)
+
+    def poison(state: TrainState) -> TrainState:
+        running.append(int(np.sum(~np.asarray(state.actors.env.ended)[:4])))
+        return changed(state, "actors.env.drone.angular_velocity", lambda x: x.at[:4].set(1e30))
+
+    state, losses = flown_on(made, 3, poison)
+    assert losses.health.physics_state.tolist() == [*running, 0, 0, 0] and running[0] > 4
+    assert before.health.physics_state.sum() == 0
+    assert finite(state.actors) and finite(state.learner) and not losses.health.gradient.any()
+    one, other = (np.asarray(x.actors.env.drone.position)[4:] for x in (state, clean))
+    np.testing.assert_allclose(one, other, atol=1e-3)  # the Q-network is hardly another one by now
+
+
 @pytest.mark.parametrize(("warmup_decisions", "steps"), [(0, 0), (33, 3), (64, 4), (65, 4), (10**6, 4)])
 def test_the_warm_up_is_whole_steps_and_a_quarter_of_the_run_at_most(warmup_decisions: int, steps: int) -> None:
     config = dataclasses.replace(CONFIG, encoder=dataclasses.replace(CONFIG.encoder, warmup_decisions=warmup_decisions))

@@ -58,5 +58,5 @@ def transition(rows: list[Row], start: int, n: int, discount: float, history: in
         returns=total,
         discount=0.0 if terminal else discount ** (now - start),
         next_history=seen(rows, now, history),
-        weight=float(rows[start].outcome == Outcome.RUNNING),
+        weight=float(rows[start].outcome == Outcome.RUNNING and rows[now].outcome != Outcome.DIVERGED),
     )

@@ -10,7 +10,6 @@ one another.
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import sys
 import time
@@ -31,6 +30,7 @@ from edqn_jax.runs.directory import plain
 from edqn_jax.sim import camera
 from edqn_jax.sim.scene import Scene
 from edqn_jax.training import run
+from tests.miniature import no_losses
 
 
 def waves(config: CameraConfig, scene: Scene, position: Array, rotation: Array) -> Array:
@@ -63,7 +63,7 @@ def no_learning(self: Trainer, state: TrainState, first: int) -> tuple[TrainStat
     time.sleep(0.2)
     train = self.config.train
     none = jnp.zeros((train.chunk_steps, train.shards, train.num_envs // train.shards))
-    losses = Losses(*[jnp.zeros(train.chunk_steps)] * len(dataclasses.fields(Losses)))
+    losses = no_losses(train.chunk_steps)
     return state, processes.replicate((Episodes(none, none, none), losses), self.mesh)
 
 

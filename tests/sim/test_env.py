@@ -364,9 +364,11 @@ def test_a_reset_is_at_the_start_and_earns_nothing():
         end_step=jnp.int32(3),
         contact=jnp.float32(0.5),
         reward=jnp.float32(-100.0),
+        broken=jnp.ones((), bool),
+        unrewarded=jnp.ones((), bool),
     )
     fresh = env._reset_in_place_of(flown, start)
-    assert fresh.reward == 0.0 and fresh.outcome == Outcome.RUNNING
+    assert fresh.reward == 0.0 and fresh.outcome == Outcome.RUNNING and not (fresh.broken | fresh.unrewarded)
     np.testing.assert_array_equal(fresh.flight.position, np.full((N, 3), 5.0))
     np.testing.assert_array_equal(fresh.flight.velocity, np.zeros((N, 3)))
 
@@ -562,6 +564,33 @@ def test_a_diverged_flight_ends_with_finite_numbers(reset, step):
     fresh, back = step(after, AHEAD)
     assert bool(back.is_reset) and not fresh.ended
     np.testing.assert_array_equal(fresh.drone.angular_velocity, 0.0)
+
+
+@pytest.mark.slow
+def test_what_cannot_be_seen_or_rewarded_has_diverged_and_is_told_apart(world, reset, monkeypatch):
+    own_state = env.own_state
+
+    def unseen(config, scene, goal, state):  # beyond 100 m
+        return jnp.where(state.position[0] > 100.0, jnp.nan, own_state(config, scene, goal, state))
+
+    monkeypatch.setattr(env, "own_state", unseen)
+    unpaid = dataclasses.replace(world, reward=lambda t: jnp.where(t.move == BACK, jnp.inf, 1.0))
+    broken_step = jax.jit(lambda state, action: env.step(FLOWN, unpaid, state, action))
+    state, _ = reset(jax.random.key(0), MISSION["long"])
+    far = dataclasses.replace(state, drone=body((105.0, 20.0, 10.0)))
+    for start, move, names in (
+        (state, AHEAD, []),
+        (state, BACK, ["reward"]),
+        (far, AHEAD, ["observation"]),
+        (far, BACK, ["observation", "reward"]),
+    ):
+        after, result = broken_step(start, move)
+        found = [field.name for field in dataclasses.fields(result.broken) if getattr(result.broken, field.name)]
+        assert found == names
+        assert (result.outcome == Outcome.DIVERGED) == bool(names) == bool(after.ended)
+        assert result.reward == (0.0 if "reward" in names else 1.0)
+        for leaf in jax.tree.leaves((result, after.drone, after.episode_return)):
+            assert np.isfinite(np.asarray(leaf, np.float64)).all()
 
 
 @pytest.mark.slow

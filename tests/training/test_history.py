@@ -12,25 +12,73 @@ from edqn_jax.errors import DivergedError
 from edqn_jax.learn.plan import Plan
 from edqn_jax.learn.trainer import Episodes, Losses
 from edqn_jax.sim.outcomes import Outcome
-from edqn_jax.training.history import EndedEpisodes, check_finite, chunk_metrics
+from edqn_jax.training.history import EndedEpisodes, Watch, chunk_metrics
+from tests.miniature import no_losses
 
 PLAN = Plan(total=100, scheduled=100, warmup=4, starts=6, vae_training=((0, 4),))
 
 
-def losses(*q_loss: float) -> Losses:
-    blank = np.zeros(len(q_loss))
-    fields = {field.name: blank for field in dataclasses.fields(Losses)} | {"q_loss": np.array(q_loss)}
-    return Losses(**fields)  # type: ignore[arg-type]
+CONFIG = Config(
+    encoder=EncoderConfig(warmup_updates_per_step=2),
+    agent=AgentConfig(updates_per_step=4),
+    train=TrainConfig(num_envs=8, chunk_steps=40, seed=3),
+)
 
 
-@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
-def test_a_loss_that_is_not_finite_is_named_once_there_is_learning(bad: float) -> None:
-    # A chunk of the steps 8 to 11; nothing is learnt in 8 and 9, whose loss is NaN.
-    check_finite(PLAN, 12, losses(np.nan, np.nan, 0.5, 0.4), 3)
-    with pytest.raises(DivergedError, match=f"the Q loss was {bad} at training step 12"):
-        check_finite(PLAN, 12, losses(np.nan, np.nan, 0.5, bad), 3)
-    with pytest.raises(DivergedError):
-        check_finite(PLAN, 12, losses(np.nan, np.nan, bad, 0.5), 3)
+def ill(step: int = 0, **counts: int) -> Losses:
+    """Losses of 40 training steps in each of which, from `step` on, these quantities were not finite."""
+    found = no_losses(40)
+    health = {name: np.where(np.arange(40) >= step, count, 0) for name, count in counts.items()}
+    return dataclasses.replace(found, health=dataclasses.replace(found.health, **health))
+
+
+@pytest.mark.parametrize(
+    ("first", "then", "says"),
+    [
+        ({"parameters": 1, "loss": 4, "gradient": 4}, {}, "NaN or Inf in the parameters at training step 120"),
+        ({"loss": 4, "gradient": 4}, {"parameters": 1}, "NaN or Inf in the loss at training step 120"),
+        ({"gradient": 4}, {}, "NaN or Inf in the gradient at training step 120"),
+        ({"physics_state": 4, "reward": 1}, {}, "NaN or Inf in the physics state at training step 120"),
+        ({"observation": 3}, {"physics_state": 8}, "NaN or Inf in the observation at training step 120"),
+        ({"reward": 4}, {}, "NaN or Inf in the reward at training step 120"),
+    ],
+)
+def test_what_learns_nothing_for_a_hundred_steps_is_given_up_and_what_spoilt_it_is_named(
+    first: dict[str, int], then: dict[str, int], says: str
+) -> None:
+    watch = Watch()
+    watch.check(PLAN, CONFIG, 120, no_losses(40))
+    watch.check(PLAN, CONFIG, 160, ill(**first))
+    watch.check(PLAN, CONFIG, 200, ill(**(first | then)))
+    with pytest.raises(DivergedError, match=f"seed 3 diverged: {says}, and nothing was learnt in 120 training steps"):
+        watch.check(PLAN, CONFIG, 240, ill(**(first | then)))
+
+
+@pytest.mark.parametrize(
+    "mild", [{"loss": 3, "gradient": 3}, {"physics_state": 1}, {"reward": 1}, {"gradient": 4, "step": 1}]
+)
+def test_what_still_learns_goes_on(mild: dict[str, int]) -> None:
+    watch = Watch()
+    for done in range(120, 600, 40):
+        watch.check(PLAN, CONFIG, done, ill(**mild))
+    for done in range(600, 1200, 80):  # ill chunks, but never in a row
+        watch.check(PLAN, CONFIG, done, ill(gradient=4))
+        watch.check(PLAN, CONFIG, done + 40, ill(**mild))
+
+
+def test_an_idle_warm_up_is_not_ill() -> None:
+    plan = dataclasses.replace(PLAN, total=1000, warmup=900, vae_training=())
+    for done in range(40, 800, 40):
+        Watch().check(plan, CONFIG, done, no_losses(40))
+
+
+def test_what_diverged_is_counted_and_not_averaged() -> None:
+    outcome = np.array([[[Outcome.GOAL, Outcome.DIVERGED]]])
+    episodes = Episodes(outcome, np.ones((1, 1, 2), int), np.array([[[8.0, 999.0]]]))  # type: ignore[arg-type]
+    ended = EndedEpisodes.of(episodes, first=0, envs=2)
+    found = chunk_metrics(CONFIG, 0, ended, ill(gradient=2), 1.0, 2)
+    assert (found["diverged"], found["mean_return"], found["success_rate"]) == (1, 8.0, 0.5)
+    assert found["skipped_updates"] == 80
 
 
 def test_ended_episodes_are_those_with_an_outcome_counted_in_decisions_of_all_environments() -> None:
@@ -51,7 +99,7 @@ def test_every_phase_of_a_run_has_its_name() -> None:
     config = Config(encoder=encoder, agent=AgentConfig(learning_starts=64), train=train)
     assert Plan.of(config).vae_training == ((0, 16), (32, 40))
     ended = EndedEpisodes.of(Episodes(*np.zeros((3, 1, 1, 16), int)), first=0, envs=16)  # type: ignore[arg-type]
-    chunks = [chunk_metrics(config, first, ended, losses(*[0.0] * 8), 1.0, 0) for first in range(0, 64, 8)]
+    chunks = [chunk_metrics(config, first, ended, no_losses(8), 1.0, 0) for first in range(0, 64, 8)]
     assert [chunk["phase"] for chunk in chunks] == ["warm-up"] * 2 + ["training"] * 2 + ["retraining"] + [
         "training"
     ] * 3

@@ -20,7 +20,7 @@ from edqn_jax.evaluation.missions import run_missions
 from edqn_jax.learn import trainer
 from edqn_jax.learn.plan import Plan
 from edqn_jax.learn.policy import PolicyParams
-from edqn_jax.learn.trainer import Episodes, Losses
+from edqn_jax.learn.trainer import Episodes
 from edqn_jax.report.progress import Progress
 from edqn_jax.runs.directory import TRAJECTORY_COLUMNS, RunDirectory, plain
 from edqn_jax.runs.policies import load_run
@@ -29,6 +29,7 @@ from edqn_jax.training.selection import Candidate, choose, first_success, is_due
 from edqn_jax.training.stopping import Stop
 from tests.learn.test_trainer import CONFIG as SMALL
 from tests.miniature import WORLD as MINIATURE_WORLD
+from tests.miniature import no_losses
 
 CONFIG = dataclasses.replace(
     SMALL,
@@ -101,8 +102,7 @@ def test_a_run_stopped_before_any_validation_keeps_what_it_has_learnt(
         """Stands for the compiled chunk: the policy's parameters grow by one, nothing else happens."""
         learner = dataclasses.replace(state.learner, average=jax.tree.map(lambda x: x + 1, state.learner.average))
         steps, none = CONFIG.train.chunk_steps, jnp.zeros((CONFIG.train.chunk_steps, 8, 2))
-        losses = Losses(*[jnp.zeros(steps)] * len(dataclasses.fields(Losses)))
-        return dataclasses.replace(state, learner=learner), (Episodes(none, none, none), losses)
+        return dataclasses.replace(state, learner=learner), (Episodes(none, none, none), no_losses(steps))
 
     monkeypatch.setattr(trainer.Trainer, "compile", lambda self: None)
     monkeypatch.setattr(trainer.Trainer, "chunk", chunk)

@@ -16,6 +16,7 @@ from edqn_jax.learn import trainer
 from edqn_jax.report.progress import Progress
 from edqn_jax.runs.directory import RunDirectory, plain
 from edqn_jax.runs.policies import load_policy
+from edqn_jax.training import history
 from edqn_jax.training.history import mean_metrics
 from edqn_jax.training.loop import train, train_seeds
 from edqn_jax.training.seeds import train_seeds_run
@@ -97,8 +98,10 @@ def test_a_seed_that_diverges_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
 
     def poisoned(self, state, first: int):
         state, (episodes, losses) = chunk(self, state, first)
-        return state, (episodes, dataclasses.replace(losses, q_loss=losses.q_loss.at[1].set(np.nan)))
+        health = dataclasses.replace(losses.health, gradient=losses.health.gradient.at[1].set(999))
+        return state, (episodes, dataclasses.replace(losses, health=health))
 
+    monkeypatch.setattr(history, "MOST_ILL_STEPS", 1)
     monkeypatch.setattr(trainer.Trainer, "chunk", poisoned)
     with pytest.raises(DivergedError, match="seed 1 diverged"):
         train_seeds(2, SMALL)
