@@ -16,7 +16,8 @@ from edqn_jax.evaluation.metrics import clearance_text
 from edqn_jax.evaluation.trajectories import write_trajectories
 from edqn_jax.runs.directory import plain
 from edqn_jax.runs.files import check_can_write, write_atomically
-from edqn_jax.runs.policies import load_policy
+from edqn_jax.runs.policies import load_policy, policy_digest, worlds_replaced
+from edqn_jax.runs.provenance import versions
 
 
 def evaluate_command(args: EvaluateArgs) -> None:
@@ -42,14 +43,18 @@ def evaluate_command(args: EvaluateArgs) -> None:
         shuffle_codes=args.shuffle_codes,
     )
     figures = {
+        "run": str(args.run),
+        "policy_sha256": policy_digest(args.run),
+        "versions": versions(),
         "world": evaluation.missions.name,
         "seed": args.seed,
         "shuffled_codes": args.shuffle_codes,
         **evaluation.figures,
         "decision_latency_ms": decision_latency_ms(policy.config, policy.params),
     }
-    if evaluation.missions.note is not None:
-        Console().print(evaluation.missions.note, soft_wrap=True, markup=False, highlight=False)
+    notes = [] if args.world is not None else worlds_replaced(args.run)
+    for note in (*notes, *([evaluation.missions.note] if evaluation.missions.note is not None else [])):
+        Console().print(note, soft_wrap=True, markup=False, highlight=False)
     Console().print(report(figures))
     if args.json is not None:
         write_atomically(args.json, json.dumps(plain(figures), indent=2, allow_nan=False) + "\n")

@@ -17,7 +17,7 @@ from edqn_jax.report.animation import animate
 from edqn_jax.report.sights import Sights
 from edqn_jax.report.style import OUTCOME_LABELS
 from edqn_jax.runs.files import check_can_write, write_atomically
-from edqn_jax.runs.policies import load_run
+from edqn_jax.runs.policies import load_run, worlds_replaced
 from edqn_jax.sim.outcomes import Outcome
 
 
@@ -39,8 +39,9 @@ def record_command(args: RecordArgs) -> None:
         name = missions.name if missions.file is None else Path(missions.name).stem
         gif = animate(sights, params, trajectory(config, flights), outcome, title=f"world '{name}'")
     write_atomically(args.file, gif)
-    if missions.note is not None:
-        Console().print(missions.note, soft_wrap=True, markup=False, highlight=False)
+    notes = [] if args.world is not None else worlds_replaced(args.run)
+    for note in (*notes, *([missions.note] if missions.note is not None else [])):
+        Console().print(note, soft_wrap=True, markup=False, highlight=False)
     flown = f"{OUTCOME_LABELS[outcome]} after {float(flights.flight_seconds[0]):.1f} s"
     Console().print(
         f"{flown}; '{args.file}' has {len(gif) / 1e6:.1f} MB", soft_wrap=True, markup=False, highlight=False

@@ -157,15 +157,21 @@ class RunDirectory:
             raise unwritable(self.path, error.strerror) from None
 
     def append_metrics(self, metrics: Mapping[str, Any]) -> None:
-        """Adds one line to `metrics.jsonl`."""
-        with self.metrics_file.open("a", encoding="utf-8") as file:
-            file.write(json.dumps(plain(metrics), allow_nan=False) + "\n")
+        """Adds one line to `metrics.jsonl`.
+
+        Raises:
+            ConfigError: if it cannot be written.
+        """
+        _append(self.metrics_file, json.dumps(plain(metrics), allow_nan=False) + "\n")
 
     def append_episodes(self, episodes: Iterable[tuple[int, float, int, str]]) -> None:
-        """Adds rows of `EPISODE_COLUMNS` to `episodes.csv`."""
-        with self.episodes_file.open("a", encoding="utf-8", newline="") as file:
-            rows = ((int(step), f"{gain:.6g}", int(length), outcome) for step, gain, length, outcome in episodes)
-            csv.writer(file, lineterminator="\n").writerows(rows)
+        """Adds rows of `EPISODE_COLUMNS` to `episodes.csv`.
+
+        Raises:
+            ConfigError: if they cannot be written.
+        """
+        rows = (f"{int(step)},{gain:.6g},{int(length)},{outcome}\n" for step, gain, length, outcome in episodes)
+        _append(self.episodes_file, "".join(rows))
 
     def write_summary(self, summary: Mapping[str, Any]) -> None:
         """Writes `summary.json` atomically; a run that has one is finished.
@@ -269,6 +275,14 @@ def plain(value: Any) -> Any:
     if isinstance(value, float) and not math.isfinite(value):
         return None
     return value
+
+
+def _append(file: Path, text: str) -> None:
+    try:
+        with file.open("a", encoding="utf-8", newline="") as opened:
+            opened.write(text)
+    except OSError as error:
+        raise unwritable(file, error.strerror) from None
 
 
 def _fresh(parent: Path, config: Config) -> Path:

@@ -14,7 +14,8 @@ from edqn_jax.config.loading import apply, load_layer
 from edqn_jax.errors import ConfigError
 from edqn_jax.learn.policy import Policy, PolicyParams, fresh_policy
 from edqn_jax.policies import policy_folder
-from edqn_jax.runs.checkpoints import load_params, save_params
+from edqn_jax.runs import manifest, world_copy
+from edqn_jax.runs.checkpoints import POLICY, load_params, save_params
 from edqn_jax.runs.directory import SEED_FOLDER, config_text, version_of
 from edqn_jax.runs.files import check_can_make, write_atomically
 
@@ -46,6 +47,8 @@ def save_policy(policy: Policy, folder: str | Path) -> None:
 def load_run(folder: Path) -> tuple[Config, PolicyParams]:
     """Returns the configuration and the policy of a run, or of any folder with `config.yaml` and `checkpoints/`.
 
+    Where the file of its world is missing or another one now, the configuration names the run's own copy.
+
     Args:
         folder: of the run, or the name of a policy that comes with the package.
 
@@ -71,7 +74,10 @@ def load_run(folder: Path) -> tuple[Config, PolicyParams]:
 
 
 def _loaded(folder: Path, file: Path) -> tuple[Config, PolicyParams]:
-    config = apply(Config(), load_layer(file), str(file))
+    layer = load_layer(file)
+    if not layer:
+        raise ConfigError(f"'{file}' is empty: it does not say what the policy beside it is")
+    config = apply(Config(), layer, str(file))
     validate(config)
     params = load_params(folder / "checkpoints", file)
     fresh = jax.eval_shape(lambda: fresh_policy(config))
@@ -80,7 +86,23 @@ def _loaded(folder: Path, file: Path) -> tuple[Config, PolicyParams]:
             f"the policy in '{folder}' does not have the shapes that its config.yaml asks for in edqn_jax "
             f"{edqn_jax.__version__}; fly it with the version that trained it, or train it anew"
         )
-    return config, params
+    return world_copy.flown_in(folder, config)[0], params
+
+
+def worlds_replaced(run: Path) -> list[str]:
+    """Returns a sentence for each world that a run's own copy is flown in place of.
+
+    Raises:
+        ConfigError: if the run's configuration or its copies are damaged.
+    """
+    folder = policy_folder(run)
+    config = apply(Config(), load_layer(folder / "config.yaml"), str(folder / "config.yaml"))
+    return world_copy.flown_in(folder, config)[1]
+
+
+def policy_digest(run: Path) -> str:
+    """Returns the SHA-256 of a policy's manifest, which has those of all its files."""
+    return manifest.digest(policy_folder(run) / "checkpoints" / POLICY / manifest.MANIFEST)
 
 
 def _shapes(params: PolicyParams) -> PolicyParams:

@@ -28,7 +28,7 @@ import numpy as np
 from jax.typing import ArrayLike
 
 from edqn_jax.config import DENSITIES
-from edqn_jax.errors import ConfigError
+from edqn_jax.sim.mjcf_files import SceneError, files_of
 from edqn_jax.sim.scene import (
     KINDS,
     Capsules,
@@ -51,11 +51,10 @@ VOLUME_MARGIN = 5.0
 LONGEST_VOLUME = 500.0
 """Most metres along an axis of a flight volume; A*'s lattice must hold it."""
 
+MOST_SHAPES = 500
+"""Geoms of a world: 2 000 of them take 8 GB to train in."""
+
 _LEVEL = 1e-6  # an axis this near to vertical (sine of the angle) is vertical: 0.1 mm over 100 m
-
-
-class SceneError(ConfigError):
-    """A world that cannot be flown; the message says what to change."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -117,11 +116,14 @@ def load_world(path: str | Path) -> LoadedWorld:
     path = Path(path)
     if not path.is_file():
         raise SceneError(f"there is no scene file '{path.name}' in {path.parent.resolve()}")
+    files_of(path)  # none of them is foreign or huge
     try:
         model = mujoco.MjModel.from_xml_path(str(path))
     except ValueError as error:
         reason = " ".join(str(error).split())
         raise SceneError(f"{path} is not an MJCF that MuJoCo can read: {reason}") from None
+    if model.ngeom > MOST_SHAPES:
+        raise SceneError(f"{path} has {model.ngeom:,} geoms; a world may have {MOST_SHAPES}")
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
     shapes: list[Shape] = []

@@ -22,6 +22,7 @@ from edqn_jax.parallel import processes
 from edqn_jax.report.gallery import draw_gallery
 from edqn_jax.report.progress import Progress, clock
 from edqn_jax.report.sights import Sights
+from edqn_jax.runs import world_copy
 from edqn_jax.runs.checkpoints import save_params
 from edqn_jax.runs.directory import RunDirectory
 from edqn_jax.runs.provenance import reward_record, state_digest, versions, workload
@@ -76,9 +77,7 @@ def train_run(
         summary = summary_of(preparation, result, flights, digest, reward) | keeper.facts
         if run is not None and sights is not None:
             progress.phase("drawing")
-            draw(run, preparation, sights, result, flights)
-            summary["total_seconds"] = time.perf_counter() - preparation.began
-            run.write_summary(summary)
+            finish(run, preparation, sights, result, flights, summary, progress)
             progress.stop()
             progress.message(_verdict(summary, run))
     return summary
@@ -99,8 +98,9 @@ def opened(
     """
     configs = preparation.configs
     processes.together(lambda: None if run is None else held.enter_context(run.locked()))
-    begin = None
-    if processes.on_any(run is not None and run.resume != "never"):
+    begin, folder = None, run.path if run is not None and run.resume != "never" else None
+    if processes.on_any(folder is not None):
+        processes.together(lambda: None if folder is None else world_copy.check_unchanged(folder, preparation.config))
         begin = keeper.restored()
 
     def prepare() -> None:
@@ -116,6 +116,10 @@ def opened(
             )
         else:
             run.begin(configs, seeds)
+            world_copy.keep(run.path, preparation.config)
+            for folder in keeper.folders if seeds else []:
+                assert folder is not None
+                world_copy.keep(folder.path, preparation.config)
 
     processes.together(prepare)
     if begin is not None:
@@ -191,11 +195,37 @@ def sights_of(preparation: Preparation) -> Sights:
     return Sights(preparation.config, scene, preparation.pool)
 
 
-def draw(run: RunDirectory, preparation: Preparation, sights: Sights, result: TrainingResult, flights: Flights) -> None:
-    """Writes the flight of the mission that the run is judged by, and all pictures."""
+def finish(
+    run: RunDirectory,
+    preparation: Preparation,
+    sights: Sights,
+    result: TrainingResult,
+    flights: Flights,
+    summary: dict[str, Any],
+    progress: Progress,
+) -> None:
+    """Writes the flight of the mission that the run is judged by, the summary and all pictures.
+
+    Whatever keeps pictures from being drawn, the run is finished and its summary is there.
+
+    Raises:
+        ConfigError: if flight or summary cannot be written.
+    """
     run.write_trajectory(trajectory(preparation.config, flights))
-    outcome = flight_summary(flights)["outcome"]
-    draw_gallery(run, sights, result.policy.params, np.asarray(preparation.shortest.points), outcome)
+    summary["total_seconds"] = time.perf_counter() - preparation.began
+    run.write_summary(summary)
+    try:
+        draw_gallery(
+            run,
+            sights,
+            result.policy.params,
+            np.asarray(preparation.shortest.points),
+            flight_summary(flights)["outcome"],
+        )
+        summary["total_seconds"] = time.perf_counter() - preparation.began
+        run.write_summary(summary)
+    except (OSError, ConfigError) as error:
+        progress.message(f"the figures are incomplete: {error}; everything else is in '{run.path}'")
 
 
 def needed(trainer: Trainer, result: TrainingResult) -> TrainState:

@@ -21,7 +21,7 @@ from edqn_jax.sim.outcomes import Outcome
 from edqn_jax.sim.reward import Reward
 from edqn_jax.training.keeper import Keeper
 from edqn_jax.training.loop import prepared, run_chunks
-from edqn_jax.training.run import described, draw, needed, opened, record, sights_of, summary_of, trained_in, unseen
+from edqn_jax.training.run import described, finish, needed, opened, record, sights_of, summary_of, trained_in, unseen
 from edqn_jax.training.stopping import Stop
 
 
@@ -78,9 +78,7 @@ def train_seeds_run(
             sights = sights_of(preparation)
             for folder, result, flown, summary in zip(folders, results, flights, summaries, strict=True):
                 assert folder is not None
-                draw(folder, preparation, sights, result, flown)
-                summary["total_seconds"] = time.perf_counter() - preparation.began
-                folder.write_summary(summary)
+                finish(folder, preparation, sights, result, flown, summary, progress)
             whole["total_seconds"] = time.perf_counter() - preparation.began
             run.write_summary(whole)
             progress.stop()
