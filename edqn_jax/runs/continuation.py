@@ -25,7 +25,6 @@ class Begun:
     config: Config
     seeds: int | None
     """Agents with folders of their own; None for a run of one agent."""
-    finished: bool
 
 
 def begun(folder: Path) -> Begun | None:
@@ -46,7 +45,7 @@ def begun(folder: Path) -> Begun | None:
         raise ConfigError(f"'{run.config_file}' is empty: it does not say what the run in '{folder}' is")
     config = apply(Config(), layer, str(run.config_file))
     validate(config)
-    return Begun(config, seeds or None, run.summary_file.is_file())
+    return Begun(config, seeds or None)
 
 
 def continued(folder: Path, run: Begun, config: Config, seeds: int | None) -> Config:

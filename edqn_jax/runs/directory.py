@@ -38,6 +38,9 @@ decisions of the episode, and how it ended."""
 _VERSION = "# edqn_jax "
 """Beginning of the first line of a `config.yaml`."""
 
+TO_BE_DRAWN = "to be drawn"
+"""What `summary.json` says of figures until they are there."""
+
 SEED_FOLDER = "seed-"
 """Beginning of the name of a seed's folder within that of several."""
 
@@ -79,6 +82,16 @@ class RunDirectory:
     @property
     def checkpoints(self) -> Path:
         return self.path / "checkpoints"
+
+    @property
+    def finished(self) -> bool:
+        """Whether the run has nothing left to do: it has a summary, and its figures are drawn or cannot be."""
+        try:
+            return json.loads(self.summary_file.read_text(encoding="utf-8")).get("figures") != TO_BE_DRAWN
+        except FileNotFoundError:
+            return False
+        except (OSError, ValueError, AttributeError):
+            return True  # whatever it is, it is not begun anew
 
     def of_seed(self, seed: int) -> RunDirectory:
         """Returns the folder of one seed's run, where several are trained in one program."""
@@ -174,7 +187,7 @@ class RunDirectory:
         _append(self.episodes_file, "".join(rows))
 
     def write_summary(self, summary: Mapping[str, Any]) -> None:
-        """Writes `summary.json` atomically; a run that has one is finished.
+        """Writes `summary.json` atomically.
 
         Raises:
             ConfigError: if it cannot be written.
@@ -233,7 +246,7 @@ def plan_run_directory(given: Path | None, config: Config, resume: Resume = "aut
     occupied = taken and any(path.name != LOCK for path in given.iterdir())
     if occupied and not _is_ours(run.config_file):
         raise ConfigError(f"--run-dir '{given}' holds files that are not an edqn run; give a new or empty folder")
-    if run.summary_file.is_file() and (resume == "never" or not _asks_for_more(run, config)):
+    if run.finished and (resume == "never" or not _asks_for_more(run, config)):
         more = "" if resume == "never" else ", or more decisions with --total-steps to continue it"
         raise ConfigError(f"--run-dir '{given}' holds a finished run; give another folder{more}")
     if resume == "must" and not occupied:

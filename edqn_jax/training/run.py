@@ -24,7 +24,7 @@ from edqn_jax.report.progress import Progress, clock
 from edqn_jax.report.sights import Sights
 from edqn_jax.runs import world_copy
 from edqn_jax.runs.checkpoints import save_params
-from edqn_jax.runs.directory import RunDirectory
+from edqn_jax.runs.directory import TO_BE_DRAWN, RunDirectory
 from edqn_jax.runs.provenance import reward_record, state_digest, versions, workload
 from edqn_jax.sim.flights import Flights
 from edqn_jax.sim.reward import Reward
@@ -213,7 +213,7 @@ def finish(
     """
     run.write_trajectory(trajectory(preparation.config, flights))
     summary["total_seconds"] = time.perf_counter() - preparation.began
-    run.write_summary(summary)
+    run.write_summary({**summary, "figures": TO_BE_DRAWN})
     try:
         draw_gallery(
             run,
@@ -222,10 +222,12 @@ def finish(
             np.asarray(preparation.shortest.points),
             flight_summary(flights)["outcome"],
         )
-        summary["total_seconds"] = time.perf_counter() - preparation.began
-        run.write_summary(summary)
+        summary["figures"] = "drawn"
     except (OSError, ConfigError) as error:
+        summary["figures"] = f"incomplete: {error}"
         progress.message(f"the figures are incomplete: {error}; everything else is in '{run.path}'")
+    summary["total_seconds"] = time.perf_counter() - preparation.began
+    run.write_summary(summary)
 
 
 def needed(trainer: Trainer, result: TrainingResult) -> TrainState:

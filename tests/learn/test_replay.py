@@ -156,6 +156,10 @@ def test_a_terminal_end_cuts_the_bootstrap_and_the_rewards_behind_it():
     np.testing.assert_array_equal(one.history[:, 0], [1, 2])
 
 
+def test_what_led_to_a_divergence_is_not_learnt_from():
+    assert by_hand(Outcome.DIVERGED).weight == 0.0 and by_hand(Outcome.COLLISION).weight == 1.0
+
+
 def test_a_time_out_bootstraps_from_the_final_observation():
     one = by_hand(Outcome.TIME_OUT)
     assert one.returns == pytest.approx(1 + 0.9 * 2) and one.discount == pytest.approx(0.9**2)

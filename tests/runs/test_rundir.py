@@ -14,7 +14,7 @@ import pytest
 from edqn_jax.config import Config, TrainConfig
 from edqn_jax.config.loading import resolve
 from edqn_jax.errors import ConfigError
-from edqn_jax.runs.directory import TRAJECTORY_COLUMNS, RunDirectory, plan_run_directory, version_of
+from edqn_jax.runs.directory import TO_BE_DRAWN, TRAJECTORY_COLUMNS, RunDirectory, plan_run_directory, version_of
 
 
 def begin(run: RunDirectory, seeds: list[Config] | None = None) -> None:
@@ -77,7 +77,7 @@ def test_a_config_that_is_not_ours_makes_no_run(theirs, resume, tmp_path):
 
 
 def test_a_finished_run_is_refused_whatever_resume_says(run):
-    run.write_summary({"success": True})
+    run.write_summary({"success": True, "figures": "drawn"})
     for resume in ("auto", "never", "must"):
         with pytest.raises(ConfigError, match="finished run"):
             plan_run_directory(run.path, Config(), resume)
@@ -94,8 +94,16 @@ def test_an_unfinished_run_is_continued_unless_it_is_to_be_started_over(run):
     assert len(again.read_episodes()["step"]) == 0
 
 
+def test_a_run_that_ended_before_its_figures_were_drawn_is_continued(run):
+    run.write_summary({"success": True, "figures": TO_BE_DRAWN})
+    assert plan_run_directory(run.path, Config()).resume == "auto"
+    run.summary_file.write_text("{")  # nobody knows what it was: it stays
+    with pytest.raises(ConfigError, match="finished run"):
+        plan_run_directory(run.path, Config(), "never")
+
+
 def test_a_finished_run_is_continued_for_more_decisions(run):
-    run.write_summary({"success": True})
+    run.write_summary({"success": True, "figures": "drawn"})
     more = dataclasses.replace(Config(), train=TrainConfig(total_steps=10**6))
     assert plan_run_directory(run.path, more).resume == "auto"
     with run.locked():
