@@ -30,6 +30,8 @@ def train_command(argv: Sequence[str], stops: Stops) -> None:
     several = options.coordinator_address, options.num_processes, options.process_id
     arguments = how_to_join(options.distributed, *several, os.environ)
 
+    import jax
+
     from edqn_jax.parallel import processes
     from edqn_jax.parallel.devices import cores, most_that_divide, use_cpu_devices
     from edqn_jax.report.progress import Progress
@@ -57,6 +59,10 @@ def train_command(argv: Sequence[str], stops: Stops) -> None:
             from edqn_jax.training.seeds import train_seeds_run
 
             train_seeds_run(config, options.seeds, run, progress, stop)
+    except jax.errors.JaxRuntimeError as error:
+        if arguments is None:
+            raise
+        processes.leave(error)
     finally:
         progress.stop()
 

@@ -7,9 +7,11 @@ take the same branches in the host loop: one that takes another branch leaves th
 from __future__ import annotations
 
 import hashlib
+import os
+import sys
 from collections import Counter
 from collections.abc import Callable, Mapping
-from typing import Any, TypeVar
+from typing import Any, NoReturn, TypeVar
 
 import jax
 import numpy as np
@@ -20,6 +22,9 @@ from edqn_jax.errors import ConfigError
 
 T = TypeVar("T")
 Tree = TypeVar("Tree")
+
+HEARTBEAT_S = 40
+"""Silence of a process after which the others end; less than a minute, more than a busy host's pauses."""
 
 LONGEST_SENTENCE = 1024
 """Bytes of an error message that are sent to the other processes."""
@@ -43,7 +48,7 @@ def join(arguments: Mapping[str, Any]) -> int:
     # Otherwise JAX installs its own handler of SIGTERM.
     jax.config.update("jax_enable_preemption_service", False)
     try:
-        jax.distributed.initialize(**arguments)
+        jax.distributed.initialize(**arguments, heartbeat_timeout_seconds=HEARTBEAT_S)
     except ValueError as error:
         raise ConfigError(
             "JAX detects no cluster to join; give --coordinator-address, --num-processes and --process-id, "
@@ -56,6 +61,20 @@ def join(arguments: Mapping[str, Any]) -> int:
             "on CPUs --train.devices sets the same number for all"
         )
     return jax.process_index()
+
+
+def leave(error: Exception) -> NoReturn:
+    """Ends this process, with a sentence and exit code 1, after an error that others of the cluster may have caused.
+
+    At once: JAX would wait at the exit for those that are gone.
+    """
+    reason = " ".join(str(error).split())[:200]
+    print(
+        f"edqn: another process of the cluster has ended or cannot be reached; the run can be continued ({reason})",
+        file=sys.stderr,
+        flush=True,
+    )
+    os._exit(1)
 
 
 def together(work: Callable[[], T]) -> T:

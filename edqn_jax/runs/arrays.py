@@ -36,15 +36,10 @@ def write(
         ConfigError: if it cannot be written, or the disk has too little space for it.
     """
     tree = jax.tree.map(np.asarray, tree)
-    here = jax.process_index()
-    # Without this Orbax waits for the other processes.
-    alone = ocp.options.MultiprocessingOptions(primary_host=here, active_processes={here})
-    # Compressing takes longer than writing what it saves.
-    handler = ocp.PyTreeCheckpointHandler(use_compression=False, multiprocessing_options=alone)
     try:
         folder.parent.mkdir(parents=True, exist_ok=True)
         _check_space(folder.parent, sum(leaf.nbytes for leaf in jax.tree.leaves(tree)))
-        ocp.Checkpointer(handler, multiprocessing_options=alone).save(folder, args=ocp.args.PyTreeSave(tree))
+        _alone()[1].save(folder, args=ocp.args.PyTreeSave(tree))
         for name, text in (texts or {}).items():
             write_atomically(folder / name, text)
         manifest.seal(folder, dict(facts or {}))
@@ -69,13 +64,23 @@ def read(folder: Path) -> Any:
         ConfigError: if they cannot be read.
     """
     try:
-        handler = ocp.PyTreeCheckpointHandler()
+        handler, reader = _alone()
+        folder = folder.absolute()
         described = handler.metadata(folder).tree  # pyright: ignore[reportArgumentType]
         restored = jax.tree.map(lambda _: ocp.RestoreArgs(restore_type=np.ndarray), described, is_leaf=_is_leaf)
         _check_sizes(folder, described)
-        return ocp.Checkpointer(handler).restore(folder, args=ocp.args.PyTreeRestore(restore_args=restored))
+        return reader.restore(folder, args=ocp.args.PyTreeRestore(restore_args=restored))
     except (OSError, ValueError, KeyError, TypeError, AttributeError, RuntimeError) as error:
         raise ConfigError(f"'{folder}' cannot be read: {_short(error)}") from None
+
+
+def _alone() -> tuple[ocp.PyTreeCheckpointHandler, ocp.Checkpointer]:
+    """Returns a handler and a checkpointer of this process; Orbax would otherwise wait for the others of a cluster."""
+    here = jax.process_index()
+    alone = ocp.options.MultiprocessingOptions(primary_host=here, active_processes={here})
+    # Compressing takes longer than writing what it saves.
+    handler = ocp.PyTreeCheckpointHandler(use_compression=False, multiprocessing_options=alone)
+    return handler, ocp.Checkpointer(handler, multiprocessing_options=alone)
 
 
 def _check_space(folder: Path, needed: int) -> None:

@@ -106,5 +106,6 @@ def _difference(name: str, copy: Path) -> str | None:
     except SceneError:
         return "is missing or no world any more"
     there = {str(each.relative_to(file.parent)): manifest.digest(each) for each in files}
-    here = {str(each.relative_to(copy.parent)): manifest.digest(each) for each in files_of(copy)}
+    folder = copy.resolve().parent
+    here = {str(each.relative_to(folder)): manifest.digest(each) for each in files_of(copy)}
     return None if there == here else "has changed since the run began"

@@ -161,7 +161,7 @@ def joined(monkeypatch: pytest.MonkeyPatch) -> list[dict]:
 def test_a_process_joins_as_it_was_told_and_keeps_sigterm_for_itself(joined) -> None:
     jax.config.update("jax_enable_preemption_service", True)
     assert processes.join({"process_id": 0}) == 0
-    assert joined == [{"process_id": 0}]
+    assert joined == [{"process_id": 0, "heartbeat_timeout_seconds": processes.HEARTBEAT_S}]
     assert not jax.config.values["jax_enable_preemption_service"]
 
 
@@ -172,7 +172,7 @@ def test_processes_with_different_numbers_of_devices_are_refused(joined, monkeyp
 
 
 def test_where_there_is_no_cluster_the_flags_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    def initialize() -> None:
+    def initialize(**_: int) -> None:
         raise ValueError("coordinator_address should be defined.")
 
     monkeypatch.setattr(jax.distributed, "initialize", initialize)

@@ -39,9 +39,12 @@ def flip(file: Path, bit: int) -> None:
     file.write_bytes(content)
 
 
-def test_a_checkpoint_comes_back_bit_for_bit(tmp_path: Path) -> None:
-    saved(tmp_path, 7)
-    found, said = newest(tmp_path)
+@pytest.mark.parametrize("relative", [False, True])
+def test_a_checkpoint_comes_back_bit_for_bit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, relative: bool) -> None:
+    monkeypatch.chdir(tmp_path)
+    folder = Path("run") if relative else tmp_path / "run"
+    saved(folder, 7)
+    found, said = newest(folder)
     assert found is not None and not said
     assert (found.host, found.config, found.facts) == ({"done": 7}, "train: {}\n", {"reward": "r"})
     for name, array in ARRAYS.items():

@@ -25,11 +25,13 @@ def world(tmp_path: Path) -> Path:
     return file
 
 
-def test_what_is_unchanged_is_flown_where_it_is(tmp_path: Path, world: Path) -> None:
+def test_what_is_unchanged_is_flown_where_it_is(tmp_path: Path, world: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     config = make_config("sparse", world={"flown": str(world)})
-    world_copy.keep(tmp_path, config)
-    assert world_copy.flown_in(tmp_path, config) == (config, [])
-    world_copy.check_unchanged(tmp_path, config)
+    monkeypatch.chdir(tmp_path)
+    for folder in (tmp_path, Path()):
+        world_copy.keep(folder, config)
+        assert world_copy.flown_in(folder, config) == (config, [])
+        world_copy.check_unchanged(folder, config)
     assert (tmp_path / "world" / "flown" / "part.xml").read_bytes() == WORLD.read_bytes()
 
 
