@@ -66,13 +66,17 @@ class Keeper:
         return {"resumed_at_decisions": self.resumed_at, "checkpoint_seconds": self.seconds}
 
     def save_if_due(self, standing: Standing, last: bool) -> None:
-        """Saves a checkpoint if it is time or `last`; every process must call this after each chunk.
+        """Saves checkpoint and policies if it is time or `last`; every process must call this after each chunk.
+
+        Where no checkpoints are asked for, the policies are saved at the end all the same.
 
         Raises:
             ConfigError: if the last one cannot be saved; of others there is a message, and the run goes on.
         """
         every = self.config.train.checkpoint_every_s
         if every == 0:
+            if last:
+                processes.together(lambda: self.save_policies(standing))
             return
         since = time.monotonic() - self._saved_at
         if not (last or processes.on_any(since >= max(every, self._took / MOST_OVERHEAD))):

@@ -23,7 +23,6 @@ from edqn_jax.report.gallery import draw_gallery
 from edqn_jax.report.progress import Progress, clock
 from edqn_jax.report.sights import Sights
 from edqn_jax.runs import world_copy
-from edqn_jax.runs.checkpoints import save_params
 from edqn_jax.runs.directory import TO_BE_DRAWN, RunDirectory
 from edqn_jax.runs.provenance import reward_record, state_digest, versions, workload
 from edqn_jax.sim.flights import Flights
@@ -66,8 +65,6 @@ def train_run(
             (result,) = run_chunks(
                 preparation, lambda chunk: record(run, chunk) or stop.requested(), keeper.save_if_due, begin
             )
-            if run is not None:
-                save_params(run.checkpoints, result.policy.params, run.config_file)
         if processes.on_any(result.stopped or stop.requested()):
             raise StoppedError(f"stopped after {result.decisions:,} decisions; {where_saved(run)}")
         progress.phase("flying the mission")

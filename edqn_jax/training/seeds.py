@@ -13,7 +13,6 @@ from edqn_jax.errors import StoppedError
 from edqn_jax.evaluation.intervals import interquartile_mean, rate_interval
 from edqn_jax.parallel import processes
 from edqn_jax.report.progress import Progress, clock
-from edqn_jax.runs.checkpoints import save_params
 from edqn_jax.runs.directory import RunDirectory
 from edqn_jax.runs.provenance import state_digest
 from edqn_jax.sim.flights import Flights
@@ -59,9 +58,6 @@ def train_seeds_run(
                 keeper.save_if_due,
                 begin,
             )
-            for folder, result in zip(folders, results, strict=True):
-                if folder is not None:
-                    save_params(folder.checkpoints, result.policy.params, folder.config_file)
         if processes.on_any(results[0].stopped or stop.requested()):
             where = "the first process saves the policies" if run is None else f"the policies are in '{run.path}'"
             raise StoppedError(f"stopped after {results[0].decisions:,} decisions; {where}")

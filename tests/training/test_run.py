@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 import json
 from pathlib import Path
 from typing import Literal
@@ -72,26 +73,17 @@ def test_a_run_leaves_what_the_readme_promises(whole: tuple[RunDirectory, dict])
 
 
 @pytest.mark.slow
-def test_a_run_with_another_sensor_leaves_the_same_and_is_evaluated(tmp_path: Path) -> None:
-    short = dataclasses.replace(CONFIG.train, total_steps=256)
-    config = dataclasses.replace(
-        CONFIG,
-        env=dataclasses.replace(CONFIG.env, sensor="depth"),
-        train=short,
-    )
-    run = RunDirectory(tmp_path / "depth")
-    summary = train_run(config, run, Progress(), Stop())
-    assert json.loads(run.summary_file.read_text()) == plain(summary)
-    assert {file.stem for file in run.figures.glob("*.png")} == FIGURES | {"depth", "reconstruction"}
-    assert summary["train_decisions"] == 256 and summary["workload"]["sensor"] == "depth"
-    phases = [row["phase"] for row in run.read_metrics()]
-    assert phases == ["warm-up", "training", "training", "training"]
+def test_a_run_is_evaluated_and_says_what_was_flown(whole: tuple[RunDirectory, dict], tmp_path: Path) -> None:
+    run, summary = whole
     # As many missions as in a validation, and recorded: the program that has flown those flies these.
     figures, flights = tmp_path / "figures.json", tmp_path / "flights.npz"
-    missions = config.train.validation_missions
+    missions = CONFIG.train.validation_missions
     evaluate_command(EvaluateArgs(run.path, missions=missions, json=figures, trajectories=flights))
-    assert json.loads(figures.read_text())["missions"] == missions
-    assert len(np.load(flights)["outcome"]) == missions
+    found = json.loads(figures.read_text())
+    assert found["missions"] == missions and len(np.load(flights)["outcome"]) == missions
+    assert (found["run"], found["versions"]) == (str(run.path), summary["versions"])
+    sealed = run.checkpoints / "policy" / "manifest.json"
+    assert found["policy_sha256"] == hashlib.sha256(sealed.read_bytes()).hexdigest()
 
 
 @pytest.mark.slow
