@@ -7,6 +7,10 @@ class ConfigError(ValueError):
     """The input is invalid; the message names what is wrong and what would be right."""
 
 
+class DamagedError(ConfigError):
+    """What was saved is not what is there now; the message names the file."""
+
+
 class DivergedError(RuntimeError):
     """Nothing is learnt any more because numbers are not finite; the message says which were first, and when."""
 

@@ -103,7 +103,9 @@ def interrupted(run: Path, most: int, seconds: float, draw: random.Random, name:
             break  # before its moment came
         except subprocess.TimeoutExpired:
             process.send_signal(getattr(signal, f"SIG{name}"))
-            process.wait()
+            code, number = process.wait(), getattr(signal, f"SIG{name}")
+            if code not in (-number, 128 + number, 0):  # 0: it ended just then
+                raise SystemExit(f"'{run.name}' ended with exit code {code}") from None
         names = sorted(place.name for place in run.glob("checkpoints/step-*") if place.name[-1].isdigit())
         saved.append(names[-1] if names else "the beginning")
     return len(saved), saved

@@ -176,11 +176,13 @@ def seeds_of(folder: Path) -> list[Path]:
     """Returns the runs of the seeds that a folder holds.
 
     Raises:
-        ConfigError: if there is none that is finished.
+        ConfigError: if fewer than `SEEDS` are finished.
     """
     runs = sorted(file.parent for file in folder.glob("seed-*/summary.json"))
-    if not runs:
-        raise ConfigError(f"'{folder}' holds no finished run of a seed; give a folder that can be trained in")
+    if len(runs) < SEEDS:
+        raise ConfigError(
+            f"'{folder}' holds {len(runs)} finished seeds of {SEEDS}; continue it with train.py --run-dir"
+        )
     return runs
 
 

@@ -31,7 +31,7 @@ def evaluate_command(args: EvaluateArgs) -> None:
             check_can_write(file)
     if args.json is not None and args.trajectories is not None and args.json.resolve() == args.trajectories.resolve():
         raise ConfigError(f"--json and --trajectories are both '{args.json}'; give two files")
-    policy = load_policy(args.run)
+    policy, digest = load_policy(args.run), policy_digest(args.run)
     evaluation = evaluate(
         policy,
         args.world,
@@ -44,7 +44,7 @@ def evaluate_command(args: EvaluateArgs) -> None:
     )
     figures = {
         "run": str(args.run),
-        "policy_sha256": policy_digest(args.run),
+        "policy_sha256": digest,
         "versions": versions(),
         "world": evaluation.missions.name,
         "seed": args.seed,

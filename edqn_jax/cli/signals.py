@@ -64,7 +64,9 @@ class Stops:
             if tell is None or self.number is not None:
                 _end(number)
             self.number, self._heard_at = number, time.monotonic()
-        tell(f"{_NAMES[signal.Signals(number)]}: stopping after this chunk; a second signal ends at once")
+        text = f"{_NAMES[signal.Signals(number)]}: stopping after this chunk; a second signal ends at once"
+        # Whoever reads what is printed may not read: this thread must go on listening.
+        threading.Thread(target=_suppressed, args=(tell, text), name="telling", daemon=True).start()
 
 
 @contextlib.contextmanager
@@ -95,6 +97,11 @@ def heard() -> Iterator[Stops]:
         for number, handler in before.items():
             signal.signal(number, handler)
         written.close()  # ends the thread
+
+
+def _suppressed(tell: Callable[[str], None], text: str) -> None:
+    with contextlib.suppress(Exception):
+        tell(text)
 
 
 def _end(number: int) -> NoReturn:

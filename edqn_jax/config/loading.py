@@ -184,23 +184,34 @@ def load_layer(file: Path) -> Layer:
         ConfigError: if it cannot be read, is not YAML, or names a key twice.
     """
     try:
-        layer = yaml.load(file.read_text(encoding="utf-8"), Loader=_StrictLoader)
+        text = file.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:
         reason = getattr(error, "strerror", None) or "it is not UTF-8 text"
         raise ConfigError(f"cannot read the configuration file '{file}': {reason}") from None
+    return parse_layer(text, f"'{file}'")
+
+
+def parse_layer(text: str, source: str) -> Layer:
+    """Returns the layer that YAML holds; {} for an empty text.
+
+    Raises:
+        ConfigError: as `load_layer`.
+    """
+    try:
+        layer = yaml.load(text, Loader=_StrictLoader)
     except yaml.YAMLError as error:
         mark = getattr(error, "problem_mark", None)
         where = f" at line {mark.line + 1}" if mark else ""
         problem = getattr(error, "problem", None) or "it does not parse"
-        raise ConfigError(f"'{file}' is not valid YAML{where}: {problem}") from None
+        raise ConfigError(f"{source} is not valid YAML{where}: {problem}") from None
     except RecursionError:
-        raise ConfigError(f"'{file}' is nested too deeply for a file of options") from None
+        raise ConfigError(f"{source} is nested too deeply for a file of options") from None
     except ValueError as error:  # of a number or a date that YAML knows and Python does not
-        raise ConfigError(f"'{file}' is not valid YAML: {error}") from None
+        raise ConfigError(f"{source} is not valid YAML: {error}") from None
     if layer is None:
         return {}
     if not isinstance(layer, dict):
-        raise ConfigError(f"'{file}' must hold groups of keys such as 'agent:', not {_describe(layer)}")
+        raise ConfigError(f"{source} must hold groups of keys such as 'agent:', not {_describe(layer)}")
     return layer
 
 

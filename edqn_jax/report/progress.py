@@ -50,12 +50,13 @@ class Progress:
         """Seconds since this was made."""
         return time.monotonic() - self._started
 
-    def phase(self, name: str, *, total: int = 0) -> None:
-        """Shows that the phase `name` begins; `total` is the number of decisions if it is training."""
+    def phase(self, name: str, *, total: int = 0, done: int = 0) -> None:
+        """Shows that the phase `name` begins; if it is training, with the decisions in all and those taken before."""
         returning = total == 0 and name == "training"  # from a validation
         self._phase, self._phase_started = name, time.monotonic()
         self._total = total or self._total
         if total:
+            self._metrics.setdefault("decisions", done)
             self._updated = (time.monotonic(), self._decisions())
         if self._console.is_terminal:
             self._start_live()

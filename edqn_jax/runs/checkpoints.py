@@ -60,11 +60,7 @@ def load_params(folder: Path, config_file: Path | None = None) -> PolicyParams:
     Raises:
         ConfigError: if there is none, or it is incomplete, damaged or unreadable.
     """
-    saved, _, replaced = _places(folder.absolute())
-    if not saved.is_dir() and replaced.is_dir():  # the process ended between two renames
-        saved = replaced
-    if not saved.is_dir():
-        raise ConfigError(f"there is no policy in '{folder}'; a run saves one when its training ends")
+    saved = saved_at(folder)
     facts = manifest.check(saved)
     if config_file is not None and CONFIG in facts and facts[CONFIG] != manifest.digest(config_file):
         raise ConfigError(f"'{config_file}' has changed since the policy beside it was saved; put the old one back")
@@ -72,6 +68,20 @@ def load_params(folder: Path, config_file: Path | None = None) -> PolicyParams:
     if not isinstance(tree, dict) or set(tree) != {"encoder", "q"}:
         raise ConfigError(f"'{saved}' holds no policy: it has no encoder or no Q-network")
     return PolicyParams(encoder=tree["encoder"], q=tree["q"])
+
+
+def saved_at(folder: Path) -> Path:
+    """Returns the folder of the policy in a run's `checkpoints/`.
+
+    Raises:
+        ConfigError: if there is none.
+    """
+    saved, _, replaced = _places(folder.absolute())
+    if not saved.is_dir() and replaced.is_dir():  # the process ended between two renames
+        saved = replaced
+    if not saved.is_dir():
+        raise ConfigError(f"there is no policy in '{folder}'; a run saves one with its checkpoints and at its end")
+    return saved
 
 
 def _places(folder: Path) -> tuple[Path, Path, Path]:

@@ -12,7 +12,7 @@ from edqn_jax.errors import ConfigError
 from edqn_jax.runs.directory import SEED_FOLDER, RunDirectory
 
 MAY_CHANGE = (
-    *("train.total_steps", "train.schedule_steps", "train.max_episodes", "train.devices"),
+    *("train.total_steps", "train.schedule_steps", "train.devices"),
     *("train.checkpoint_every_s", "train.checkpoints"),
 )
 """Options that a run may be continued with other values of; the rest decides what it is."""

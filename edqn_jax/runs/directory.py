@@ -54,6 +54,8 @@ class RunDirectory:
     """Whether `locked` refuses an existing folder: another run may have created it meanwhile."""
     resume: Resume = "never"
     """Whether a run in it is continued: `must` refuses to begin one anew."""
+    was_empty: bool = False
+    """Whether `locked` refuses a folder with a run in it: none was there before."""
 
     @property
     def config_file(self) -> Path:
@@ -93,6 +95,12 @@ class RunDirectory:
         except (OSError, ValueError, AttributeError):
             return True  # whatever it is, it is not begun anew
 
+    @property
+    def holds_results(self) -> bool:
+        """Whether something would be lost if a run were begun here anew: a summary, a policy or a checkpoint."""
+        folders = (self.checkpoints, *self.path.glob(f"{SEED_FOLDER}*/checkpoints"))
+        return self.summary_file.exists() or any(any(folder.iterdir()) for folder in folders if folder.is_dir())
+
     def of_seed(self, seed: int) -> RunDirectory:
         """Returns the folder of one seed's run, where several are trained in one program."""
         return RunDirectory(self.path / f"{SEED_FOLDER}{seed}")
@@ -108,6 +116,8 @@ class RunDirectory:
             try:
                 self.path.mkdir(parents=True, exist_ok=not self.must_be_new)
                 held.enter_context(Lock(self.path))
+                if (self.finished and self.resume == "never") or (self.was_empty and self.config_file.exists()):
+                    raise ConfigError(f"another run was made in '{self.path}' meanwhile; give another folder")
             except FileExistsError as error:
                 if self.must_be_new:
                     raise ConfigError(f"another run has just created '{self.path}'; start this one again") from None
@@ -132,9 +142,12 @@ class RunDirectory:
             for folder in (self.figures, self.checkpoints, *self.path.glob(f"{SEED_FOLDER}*")):
                 shutil.rmtree(folder, ignore_errors=True)
             self.checkpoints.mkdir()
+            runs = [self.of_seed(config.train.seed) if seeds else self for config in configs]
+            for run in runs:  # first: how many there are says how many seeds the run has
+                run.path.mkdir(exist_ok=True)
             write_atomically(self.config_file, config_text(configs[0]))
-            for config in configs:
-                (self.of_seed(config.train.seed) if seeds else self)._begin_agent(config)
+            for run, config in zip(runs, configs, strict=True):
+                run._begin_agent(config)
         except FileExistsError as error:
             raise unwritable(self.path, f"'{error.filename}' is in the way; move it away") from None
         except OSError as error:
@@ -252,7 +265,7 @@ def plan_run_directory(given: Path | None, config: Config, resume: Resume = "aut
     if resume == "must" and not occupied:
         raise ConfigError(f"--resume must: there is no run to continue in '{given}'")
     check_can_make(given)
-    return RunDirectory(given, resume=resume if occupied else "never")
+    return RunDirectory(given, resume=resume if occupied else "never", was_empty=not occupied)
 
 
 def _asks_for_more(run: RunDirectory, config: Config) -> bool:

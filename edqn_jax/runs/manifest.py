@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from edqn_jax.errors import ConfigError
+from edqn_jax.errors import ConfigError, DamagedError
 
 MANIFEST = "manifest.json"
 """File with the checksums, which is written last: a folder without it is incomplete."""
@@ -42,11 +42,12 @@ def check(folder: Path) -> dict[str, str]:
     """Returns the facts of a folder's manifest if its files are those that were sealed, to the last bit.
 
     Raises:
-        ConfigError: names the folder and the first file that is missing, changed or not of it.
+        DamagedError: names the folder and the first file that is missing, changed or not of it.
+        ConfigError: if a file cannot be read.
     """
     file = folder / MANIFEST
     if not file.is_file():
-        raise ConfigError(f"'{folder}' is incomplete: it has no {MANIFEST}, so saving it was interrupted")
+        raise DamagedError(f"'{folder}' is incomplete: it has no {MANIFEST}, so saving it was interrupted")
     try:
         if file.stat().st_size > _MOST_BYTES:
             raise ValueError
@@ -57,16 +58,16 @@ def check(folder: Path) -> dict[str, str]:
         if held != _text({"facts": dict(facts), "files": dict(files)}):
             raise ValueError
     except (ValueError, KeyError, TypeError, RecursionError):
-        raise ConfigError(f"'{file}' is damaged: it is not as it was saved") from None
+        raise DamagedError(f"'{file}' is damaged: it is not as it was saved") from None
     try:
         here = set(_files(folder))
         for name in sorted(here | set(files)):
             if name not in here:
-                raise ConfigError(f"'{folder}' is damaged: '{name}' is missing")
+                raise DamagedError(f"'{folder}' is damaged: '{name}' is missing")
             if name not in files:
-                raise ConfigError(f"'{folder}' is damaged: '{name}' was not saved with it")
+                raise DamagedError(f"'{folder}' is damaged: '{name}' was not saved with it")
             if _described(folder / name) != files[name]:
-                raise ConfigError(f"'{folder}' is damaged: '{name}' is not as it was saved")
+                raise DamagedError(f"'{folder}' is damaged: '{name}' is not as it was saved")
     except OSError as error:
         raise ConfigError(f"'{folder}' cannot be read: {error.strerror or 'unknown reason'}") from None
     return facts
@@ -98,7 +99,7 @@ def _files(folder: Path) -> Iterator[str]:
     """
     for path in sorted(folder.rglob("*")):
         if path.is_symlink() or not (path.is_file() or path.is_dir()):
-            raise ConfigError(f"'{folder}' is damaged: '{path.relative_to(folder)}' is neither a file nor a folder")
+            raise DamagedError(f"'{folder}' is damaged: '{path.relative_to(folder)}' is neither a file nor a folder")
         if path.is_file() and path != folder / MANIFEST:
             yield path.relative_to(folder).as_posix()
 

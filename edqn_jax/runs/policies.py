@@ -15,7 +15,7 @@ from edqn_jax.errors import ConfigError
 from edqn_jax.learn.policy import Policy, PolicyParams, fresh_policy
 from edqn_jax.policies import policy_folder
 from edqn_jax.runs import manifest, world_copy
-from edqn_jax.runs.checkpoints import POLICY, load_params, save_params
+from edqn_jax.runs.checkpoints import load_params, save_params, saved_at
 from edqn_jax.runs.directory import SEED_FOLDER, config_text, version_of
 from edqn_jax.runs.files import check_can_make, write_atomically
 
@@ -101,8 +101,12 @@ def worlds_replaced(run: Path) -> list[str]:
 
 
 def policy_digest(run: Path) -> str:
-    """Returns the SHA-256 of a policy's manifest, which has those of all its files."""
-    return manifest.digest(policy_folder(run) / "checkpoints" / POLICY / manifest.MANIFEST)
+    """Returns the SHA-256 of a policy's manifest, which has those of all its files.
+
+    Raises:
+        ConfigError: if there is no policy.
+    """
+    return manifest.digest(saved_at(policy_folder(run) / "checkpoints") / manifest.MANIFEST)
 
 
 def _shapes(params: PolicyParams) -> PolicyParams:

@@ -19,7 +19,7 @@ import jax
 import numpy as np
 
 import edqn_jax
-from edqn_jax.errors import ConfigError
+from edqn_jax.errors import ConfigError, DamagedError
 from edqn_jax.runs import arrays, manifest
 from edqn_jax.runs.files import unwritable
 
@@ -74,9 +74,9 @@ def save(folder: Path, step: int, checkpoint: Checkpoint, keep: int) -> Path:
 
 
 def newest(folder: Path, usable: Callable[[Checkpoint], None], message: Callable[[str], None]) -> Checkpoint | None:
-    """Returns the newest checkpoint that is undamaged and usable; None if there is none at all.
+    """Returns the newest checkpoint that is undamaged and usable; None if there never was one.
 
-    Damaged ones are renamed, so that nothing of them is read again.
+    Damaged ones are renamed, so that nothing of them is read again; others are passed over.
 
     Args:
         folder: a run's `checkpoints/`.
@@ -84,19 +84,19 @@ def newest(folder: Path, usable: Callable[[Checkpoint], None], message: Callable
         message: told of each that is set aside.
 
     Raises:
-        ConfigError: if there are some and all of them are damaged, or cannot be read.
+        ConfigError: if there are some and none can be used.
     """
-    why = None
     for step, place in list(_newest_first(folder)):
         try:
             checkpoint = _read(place)
             usable(checkpoint)
             return checkpoint
-        except ConfigError as error:
-            why = error
+        except DamagedError as error:
             _set_aside(place)
             message(f"the checkpoint after training step {step:,} is set aside: {error}")
-    if why is not None:
+        except ConfigError as error:
+            message(f"the checkpoint after training step {step:,} is passed over: {error}")
+    if any(folder.glob("step-*")):
         raise ConfigError(f"no checkpoint in '{folder}' can be used; --resume never begins the run anew")
     return None
 

@@ -1,7 +1,7 @@
 """A run's own copy of the world files that it trains and flies in, so that what it was measured in stays.
 
-`world/name/` and `world/flown/` hold the files of `world.name` and `world.flown`, where these are no random worlds; a
-manifest in `world/` has their digests.
+`world/name.xml` and `world/flown.xml` are the files of `world.name` and `world.flown`, where these are no random
+worlds; a manifest beside them has their digests.
 """
 
 from __future__ import annotations
@@ -15,7 +15,6 @@ from edqn_jax.errors import ConfigError
 from edqn_jax.runs import manifest
 from edqn_jax.runs.files import unwritable
 from edqn_jax.sim.mjcf import SceneError, resolve_world
-from edqn_jax.sim.mjcf_files import files_of
 
 WORLD = "world"
 """The folder of the copies within that of a run."""
@@ -24,24 +23,23 @@ _ROLES = ("name", "flown")
 
 
 def keep(folder: Path, config: Config) -> None:
-    """Copies the files of a run's worlds into its folder; what was there is replaced.
+    """Copies the files of a run's worlds into its folder; what was there is replaced by the whole of it.
 
     Raises:
         ConfigError: if a world has no file, or a copy cannot be written.
     """
     copies = folder / WORLD
+    partial = copies.with_name(f"{WORLD}.partial")
     try:
-        shutil.rmtree(copies, ignore_errors=True)
-        facts = {}
-        for role in _roles(config.world):
-            world = resolve_world(getattr(config.world, role)).resolve()
-            facts[role] = world.name
-            for file in files_of(world):
-                copy = copies / role / file.relative_to(world.parent)
-                copy.parent.mkdir(parents=True, exist_ok=True)
-                shutil.copyfile(file, copy)
-        if facts:
-            manifest.seal(copies, facts)
+        for place in (partial, copies):
+            shutil.rmtree(place, ignore_errors=True)
+        roles = _roles(config.world)
+        if roles:
+            partial.mkdir()
+            for role in roles:
+                shutil.copyfile(resolve_world(getattr(config.world, role)), partial / f"{role}.xml")
+            manifest.seal(partial)
+            partial.rename(copies)
     except OSError as error:
         raise unwritable(copies, error.strerror) from None
 
@@ -82,30 +80,20 @@ def _changed(folder: Path, config: Config) -> list[tuple[str, str, Path]]:
     """Returns of each world that differs from its copy its role, how it differs, and the copy."""
     if not (folder / WORLD).is_dir():
         return []
-    facts, changed = manifest.check(folder / WORLD), []
+    manifest.check(folder / WORLD)
+    found = []
     for role in _roles(config.world):
-        if role not in facts:
-            raise ConfigError(f"'{folder / WORLD}' has no copy of the world '{getattr(config.world, role)}'")
-        copy = folder / WORLD / role / facts[role]
-        why = _difference(getattr(config.world, role), copy)
-        if why is not None:
-            changed.append((role, why, copy))
-    return changed
+        name, copy = getattr(config.world, role), folder / WORLD / f"{role}.xml"
+        if not copy.is_file():
+            raise ConfigError(f"'{folder / WORLD}' has no copy of the world '{name}'")
+        try:
+            if resolve_world(name).read_bytes() != copy.read_bytes():
+                found.append((role, "has changed since the run began", copy))
+        except (SceneError, OSError):
+            found.append((role, "is missing", copy))
+    return found
 
 
 def _roles(world: WorldConfig) -> list[str]:
     """Returns which of a run's worlds come from files."""
     return [role for role in _ROLES if getattr(world, role) and getattr(world, role) not in DENSITIES]
-
-
-def _difference(name: str, copy: Path) -> str | None:
-    """Returns how a world on the disk differs from a copy of it; None if it does not."""
-    try:
-        file = resolve_world(name).resolve()
-        files = files_of(file)
-    except SceneError:
-        return "is missing or no world any more"
-    there = {str(each.relative_to(file.parent)): manifest.digest(each) for each in files}
-    folder = copy.resolve().parent
-    here = {str(each.relative_to(folder)): manifest.digest(each) for each in files_of(copy)}
-    return None if there == here else "has changed since the run began"

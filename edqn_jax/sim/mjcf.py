@@ -1,6 +1,6 @@
 """Reads and writes worlds as MJCF, MuJoCo's file format.
 
-Any MJCF file can be read. A world for the drone consists of
+An MJCF file that names no other file can be read. A world for the drone consists of
 
 * its static geoms (on the world body or on bodies welded to it): boxes, spheres, capsules, cylinders at
   any rotation, and planes, which are solid below and infinite. A geom is read if it is visible in
@@ -28,7 +28,7 @@ import numpy as np
 from jax.typing import ArrayLike
 
 from edqn_jax.config import DENSITIES
-from edqn_jax.sim.mjcf_files import SceneError, files_of
+from edqn_jax.sim.mjcf_files import SceneError, checked_text
 from edqn_jax.sim.scene import (
     KINDS,
     Capsules,
@@ -116,9 +116,9 @@ def load_world(path: str | Path) -> LoadedWorld:
     path = Path(path)
     if not path.is_file():
         raise SceneError(f"there is no scene file '{path.name}' in {path.parent.resolve()}")
-    files_of(path)  # none of them is foreign or huge
+    text = checked_text(path)
     try:
-        model = mujoco.MjModel.from_xml_path(str(path))
+        model = mujoco.MjModel.from_xml_string(text)
     except ValueError as error:
         reason = " ".join(str(error).split())
         raise SceneError(f"{path} is not an MJCF that MuJoCo can read: {reason}") from None

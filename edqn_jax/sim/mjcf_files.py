@@ -1,117 +1,107 @@
-"""The files that an MJCF world is made of, checked before MuJoCo opens any of them.
+"""The text of an MJCF world, checked before MuJoCo reads it.
 
-A world may come from a stranger: what it includes must lie in its own folder, and what it declares must be small enough
-to be held.
+A world may come from a stranger, so it is one file that names no other, and it declares nothing that takes much memory.
+MuJoCo is given the text that was checked, never a path.
 """
 
 from __future__ import annotations
 
 import math
+import re
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Iterator
 from pathlib import Path
 
 from edqn_jax.errors import ConfigError
 
 MOST_BYTES = 20_000_000
-"""Of a world's files together."""
+"""Of a world's file."""
 
 MOST_COPIES = 10_000
 """That `replicate` elements within each other may ask for."""
+
+MOST_PIXELS = 4096
+"""Width and height of a texture, which is not drawn."""
+
+FOREIGN = ("include", "model", "attach", "plugin", "extension", "flexcomp", "composite", "hfield", "skin", "size")
+"""Elements that name other files, run other code or make much of little; a static world needs none of them."""
 
 
 class SceneError(ConfigError):
     """A world that cannot be flown; the message says what to change."""
 
 
-def files_of(path: Path) -> list[Path]:
-    """Returns the file of a world, and every file that it includes or names, each once.
+def checked_text(path: Path) -> str:
+    """Returns the text of a world's file.
 
     Raises:
-        SceneError: if one lies outside the world's folder, is missing or no XML, or all are too large.
+        SceneError: if there is no such file, it is too large or no XML, or it asks for what a world may not have.
     """
-    root = path.resolve().parent
-    found: dict[Path, None] = {}
-    _collect(path.resolve(), root, found)
-    size = sum(file.stat().st_size for file in found)
-    if size > MOST_BYTES:
-        raise SceneError(f"'{path}' and what it includes have {size:,} bytes; a world may have {MOST_BYTES:,}")
-    return list(found)
-
-
-def _collect(file: Path, root: Path, found: dict[Path, None]) -> None:
-    """Adds a file of MJCF and all that it names."""
-    if file in found:
-        return
-    if not file.is_file():
-        raise SceneError(f"there is no file '{file}'")
-    if file.stat().st_size > MOST_BYTES:
-        raise SceneError(f"'{file}' has {file.stat().st_size:,} bytes; a world may have {MOST_BYTES:,}")
-    found[file] = None
     try:
-        tree = ElementTree.parse(file).getroot()
-    except (ElementTree.ParseError, UnicodeDecodeError, ValueError, OSError) as error:
-        raise SceneError(f"{file} is not an MJCF that MuJoCo can read: {error}") from None
+        size = path.stat().st_size
+        if size > MOST_BYTES:
+            raise SceneError(f"'{path}' has {size:,} bytes; a world may have {MOST_BYTES:,}")
+        text = path.read_bytes().decode()
+    except UnicodeDecodeError:
+        raise SceneError(f"{path} is not an MJCF that MuJoCo can read: it is not UTF-8 text") from None
+    except (OSError, RuntimeError) as error:
+        raise SceneError(f"cannot read the world '{path}': {getattr(error, 'strerror', None) or error}") from None
+    if re.search(r"<!(?!--)", text):  # parsers differ in what a declaration is
+        raise SceneError(f"{path} has a <!DOCTYPE> or another declaration; a world needs none")
+    try:
+        tree = ElementTree.fromstring(text)
+    except (ElementTree.ParseError, ValueError) as error:
+        raise SceneError(f"{path} is not an MJCF that MuJoCo can read: {error}") from None
     except RecursionError:
-        raise SceneError(f"{file} is nested too deeply for a world") from None
-    _check_copies(tree, file)
-    folders = {"": Path(), **dict(_folders(tree))}
-    for element in tree.iter():
-        named = element.get("file")
-        if named is None:
-            continue
-        inside = _inside(file.parent / folders.get(_kind(element), folders["asset"]) / named, root, file)
-        if element.tag in ("include", "model"):
-            _collect(inside, root, found)
-        elif inside.is_file():  # MuJoCo says best what is wrong with those that are not
-            found[inside] = None
+        raise SceneError(f"{path} is nested too deeply for a world") from None
+    if tree.tag != "mujoco":
+        raise SceneError(f"{path} is not an MJCF that MuJoCo can read: it begins with <{tree.tag}>, not <mujoco>")
+    _check_elements(tree, path)
+    _check_copies(tree, path)
+    return text
 
 
-def _folders(tree: ElementTree.Element) -> Iterator[tuple[str, Path]]:
-    """Yields the folders of a `compiler` element by the kind of asset that they are for."""
-    yield "asset", Path()
-    for element in tree.iter("compiler"):
-        for kind in ("asset", "mesh", "texture"):
-            folder = element.get(f"{kind}dir")
-            if folder is not None:
-                yield kind, Path(folder)
-
-
-def _kind(element: ElementTree.Element) -> str:
-    """Returns which of the compiler's folders an element's file is in; none for included files."""
-    if element.tag in ("include", "model"):
-        return ""
-    return {"mesh": "mesh", "hfield": "mesh", "texture": "texture"}.get(element.tag, "asset")
-
-
-def _inside(named: Path, root: Path, file: Path) -> Path:
-    """Returns the whole path of a named file.
+def _check_elements(tree: ElementTree.Element, path: Path) -> None:
+    """Raises if an element names a file, or is none of a static world.
 
     Raises:
-        SceneError: if it is not in the world's folder, links included.
+        SceneError: names the element.
     """
-    whole = named.resolve()
-    if not whole.is_relative_to(root):
-        raise SceneError(f"'{file}' names '{named}', which is outside of the world's folder '{root}'")
-    return whole
+    for element in tree.iter():
+        if element.tag in FOREIGN:
+            raise SceneError(f"{path} has <{element.tag}>; a world is one file of static geoms and sites")
+        named = [name for name in element.keys() if name.startswith("file")]  # noqa: SIM118
+        if named:
+            raise SceneError(
+                f"{path} names the file '{element.get(named[0])}' in <{element.tag}>; a world is one file, and colours "
+                "are those of its geoms"
+            )
+        if element.tag in ("texture", "numeric"):
+            for name in ("width", "height", "size"):
+                if _number(element.get(name)) > MOST_PIXELS:
+                    raise SceneError(f"{path} has <{element.tag} {name}=...> of more than {MOST_PIXELS}")
 
 
-def _check_copies(tree: ElementTree.Element, file: Path) -> None:
+def _check_copies(tree: ElementTree.Element, path: Path) -> None:
     """Raises if `replicate` elements ask for more copies than a world can have.
 
     Raises:
         SceneError: says how many.
     """
-    pending = [(tree, 1.0)]
-    total = 0.0
+    pending, total = [(tree, 1.0)], 0.0
     while pending:
         element, copies = pending.pop()
         if element.tag == "replicate":
-            try:
-                copies *= max(float(element.get("count", "1")), 1.0)
-            except ValueError:
-                copies = math.nan  # MuJoCo says what is wrong
-            total += 0.0 if math.isnan(copies) else copies
+            copies *= max(_number(element.get("count")), 1.0)
+            total += copies
         if total > MOST_COPIES:
-            raise SceneError(f"'{file}' asks for {total:,.0f} copies by replicate; a world may have {MOST_COPIES:,}")
+            raise SceneError(f"{path} asks for {total:,.0f} copies by replicate; a world may have {MOST_COPIES:,}")
         pending += [(child, copies) for child in element]
+
+
+def _number(text: str | None) -> float:
+    """Returns an attribute as a number; 0 if it is missing or none, which MuJoCo says better."""
+    try:
+        value = float(text or 0)
+    except ValueError:
+        return 0.0
+    return 0.0 if math.isnan(value) else value

@@ -143,6 +143,11 @@ class Watch:
         self._ill_steps = 0
         self._first = ""  # quantity and training step
 
+    @property
+    def healthy(self) -> bool:
+        """Whether something was learnt in the newest chunk."""
+        return self._ill_steps == 0
+
     def check(self, plan: Plan, config: Config, done: int, losses: Losses) -> None:
         """Takes in a chunk that ended with training step `done`.
 

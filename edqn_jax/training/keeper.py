@@ -11,12 +11,15 @@ from typing import Any
 import jax
 import numpy as np
 
+from edqn_jax.config import Config
+from edqn_jax.config.loading import apply, parse_layer
 from edqn_jax.errors import ConfigError
 from edqn_jax.learn import saved_state
 from edqn_jax.learn.policy import PolicyParams
 from edqn_jax.parallel import processes
-from edqn_jax.runs import states
+from edqn_jax.runs import states, world_copy
 from edqn_jax.runs.checkpoints import save_params
+from edqn_jax.runs.continuation import MAY_CHANGE, differences
 from edqn_jax.runs.directory import RunDirectory, config_text
 from edqn_jax.runs.provenance import reward_record
 from edqn_jax.runs.states import Checkpoint
@@ -78,6 +81,8 @@ class Keeper:
             if last:
                 processes.together(lambda: self.save_policies(standing))
             return
+        if not (last or standing.healthy):
+            return  # the checkpoints from before are worth more
         since = time.monotonic() - self._saved_at
         if not (last or processes.on_any(since >= max(every, self._took / MOST_OVERHEAD))):
             return
@@ -103,8 +108,13 @@ class Keeper:
         found: list[Checkpoint | None] = [None]
 
         def read() -> None:
-            if self.run is not None:
-                found[0] = self._read(self.run)
+            try:
+                if self.run is not None:
+                    found[0] = self._read(self.run)
+            except (KeyError, TypeError, ValueError, AttributeError) as error:
+                if isinstance(error, ConfigError):
+                    raise
+                raise ConfigError(f"a checkpoint does not hold what it must: {error!r}"[:300]) from None
 
         processes.together(read)
         checkpoint = found[0]
@@ -115,8 +125,7 @@ class Keeper:
         if host is None:
             return None
         arrays = self._of_all(checkpoint, host["done"])
-        if self.run is not None:
-            states.cut_back(self._files(), host["files"])
+        processes.together(lambda: None if self.run is None else states.cut_back(self._files(), host["files"]))
         return self._standing(host, arrays)
 
     def save_policies(self, standing: Standing) -> None:
@@ -136,7 +145,6 @@ class Keeper:
         def write() -> None:
             if self.run is None:
                 return
-            self.save_policies(standing)
             kept = _named_kept([agent.kept.params for agent in standing.agents])
             checkpoint = Checkpoint(
                 arrays={name: array for name, array in {**arrays, **kept}.items() if array.size},
@@ -145,6 +153,7 @@ class Keeper:
                 facts={**states.versions(), "reward": json.dumps(self.reward, sort_keys=True)},
             )
             states.save(self.run.checkpoints, standing.done, checkpoint, self.config.train.checkpoints)
+            self.save_policies(standing)
 
         processes.together(write)
 
@@ -192,6 +201,7 @@ class Keeper:
         checkpoint = states.newest(run.checkpoints, usable, self.message)
         if checkpoint is None:
             return None
+        world_copy.check_unchanged(run.path, self.config)
         where = f"the checkpoint in '{checkpoint.folder}'"
         wrote, here = checkpoint.facts.get("edqn_jax"), states.versions()
         if wrote != here["edqn_jax"]:
@@ -201,6 +211,10 @@ class Keeper:
             )
         if checkpoint.facts.get("jax") != here["jax"]:
             self.message(f"jax is {here['jax']} and was {checkpoint.facts.get('jax')}: rounding may differ")
+        own = apply(Config(), parse_layer(checkpoint.config, where), where)
+        differ = [name for name in differences(own, self.config) if name not in MAY_CHANGE]
+        if differ:
+            raise ConfigError(f"{where} is of a run with other options: {', '.join(differ)}")
         rewarded = json.loads(checkpoint.facts.get("reward", "null"))
         if rewarded != self.reward:
             raise ConfigError(

@@ -61,8 +61,8 @@ Callback = Callable[[Chunk], bool | None]
 class Display(Protocol):
     """Interface of a progress display."""
 
-    def phase(self, name: str, *, total: int = 0) -> None:
-        """Shows that the phase `name` begins; `total` is the number of decisions if it is training."""
+    def phase(self, name: str, *, total: int = 0, done: int = 0) -> None:
+        """Shows that the phase `name` begins; if it is training, with the decisions in all and those taken before."""
 
     def update(self, metrics: dict[str, Any]) -> None:
         """Shows the metrics of a chunk."""
@@ -71,7 +71,7 @@ class Display(Protocol):
 class Silent:
     """Shows nothing."""
 
-    def phase(self, name: str, *, total: int = 0) -> None:
+    def phase(self, name: str, *, total: int = 0, done: int = 0) -> None:
         pass
 
     def update(self, metrics: dict[str, Any]) -> None:
@@ -102,6 +102,8 @@ class Standing:
     elapsed_s: float
     """Since the run began, interruptions left out."""
     agents: list[AgentStanding]
+    healthy: bool = True
+    """Whether every agent learnt something in the chunk."""
 
     def policies(self, trainer: Trainer, configs: Sequence[Config]) -> list[PolicyParams]:
         """Returns the parameters that each agent would end with if nothing came after this chunk."""
@@ -287,6 +289,7 @@ def run_chunks(
         begin: where a run stood that is continued; None begins one.
 
     Raises:
+        ConfigError: if `saver` raises it.
         DivergedError: if numbers are not finite for so long that nothing is learnt any more.
     """
     trainer = preparation.trainer
@@ -298,7 +301,8 @@ def run_chunks(
         loop = _Loop.continued(preparation, callback, begin)
         del begin  # its state is donated
     compile_seconds = preparation.compiled.result()
-    preparation.display.phase("training", total=trainer.plan.total * preparation.config.train.num_envs)
+    envs = preparation.config.train.num_envs
+    preparation.display.phase("training", total=trainer.plan.total * envs, done=loop.done * envs)
     while not loop.ended:
         state = loop.advance(state)
         if saver is not None:
@@ -358,6 +362,7 @@ class _Loop:
             checked=self.checked,
             train_seconds=self.train_seconds,
             elapsed_s=time.perf_counter() - self.preparation.began,
+            healthy=all(agent.watch.healthy for agent in self.agents),
             agents=[
                 AgentStanding(agent.kept, agent.history.episode_count, list(agent.history.validations))
                 for agent in self.agents

@@ -61,6 +61,7 @@ def train_run(
         progress.message(f"{trained_in(config)}, {described(preparation.devices)}")
         keeper = Keeper(preparation, run, [run], reward, progress.message)
         begin = opened(preparation, run, keeper, held, progress)
+        preparation.compiled.result()  # until then a signal ends the command: nothing is lost yet
         with stop.obeyed():
             (result,) = run_chunks(
                 preparation, lambda chunk: record(run, chunk) or stop.requested(), keeper.save_if_due, begin
@@ -95,9 +96,8 @@ def opened(
     """
     configs = preparation.configs
     processes.together(lambda: None if run is None else held.enter_context(run.locked()))
-    begin, folder = None, run.path if run is not None and run.resume != "never" else None
-    if processes.on_any(folder is not None):
-        processes.together(lambda: None if folder is None else world_copy.check_unchanged(folder, preparation.config))
+    begin = None
+    if processes.on_any(run is not None and run.resume != "never"):
         begin = keeper.restored()
 
     def prepare() -> None:
@@ -110,6 +110,11 @@ def opened(
             raise ConfigError(
                 f"--resume must: the run in '{run.path}' was interrupted before its first checkpoint; --resume never "
                 "starts it over"
+            )
+        elif run.resume != "never" and run.holds_results:
+            raise ConfigError(
+                f"the run in '{run.path}' has no checkpoint to go on from, and what it holds would be lost; give "
+                "another folder, or --resume never to start an unfinished run over"
             )
         else:
             run.begin(configs, seeds)
@@ -139,7 +144,11 @@ def _continued(plan: Plan, done: int, config: Config) -> str:
 
 
 def record(run: RunDirectory | None, chunk: Chunk) -> None:
-    """Appends a chunk to the files of the run."""
+    """Appends a chunk to the files of the run.
+
+    Raises:
+        ConfigError: if one cannot be written.
+    """
     if run is None:
         return
     ended = chunk.episodes
@@ -179,6 +188,7 @@ def summary_of(
         "devices": [str(device) for device in preparation.devices],
         "versions": versions(),
         "state_digest": digest,
+        "figures": "drawn",  # by the time that anybody reads it
     }
     tests = preparation.missions[0].tests
     if tests:
@@ -219,7 +229,6 @@ def finish(
             np.asarray(preparation.shortest.points),
             flight_summary(flights)["outcome"],
         )
-        summary["figures"] = "drawn"
     except (OSError, ConfigError) as error:
         summary["figures"] = f"incomplete: {error}"
         progress.message(f"the figures are incomplete: {error}; everything else is in '{run.path}'")

@@ -26,7 +26,7 @@ def begin(run: RunDirectory, seeds: list[Config] | None = None) -> None:
 def run(tmp_path) -> RunDirectory:
     run = plan_run_directory(tmp_path / "run", Config())
     begin(run)
-    return run
+    return RunDirectory(run.path)
 
 
 def test_planning_makes_nothing(tmp_path, monkeypatch):
@@ -102,11 +102,30 @@ def test_a_run_that_ended_before_its_figures_were_drawn_is_continued(run):
         plan_run_directory(run.path, Config(), "never")
 
 
+def test_what_another_run_made_meanwhile_is_not_deleted(tmp_path):
+    config = Config()
+    first, second = (plan_run_directory(tmp_path, config, resume) for resume in ("auto", "never"))
+    begin(first)
+    for late in (first, second):
+        with pytest.raises(ConfigError, match="another run was made in .* meanwhile; give another folder"):
+            begin(late)
+    over = plan_run_directory(tmp_path, config, "never")
+    first.write_summary({"success": True})
+    with pytest.raises(ConfigError, match="another run was made"):
+        begin(over)
+
+
+def test_a_run_holds_results_once_there_is_anything_of_it(run):
+    assert not run.holds_results
+    (run.checkpoints / "step-000000001.damaged").mkdir()
+    assert run.holds_results
+
+
 def test_a_finished_run_is_continued_for_more_decisions(run):
     run.write_summary({"success": True, "figures": "drawn"})
     more = dataclasses.replace(Config(), train=TrainConfig(total_steps=10**6))
     assert plan_run_directory(run.path, more).resume == "auto"
-    with run.locked():
+    with dataclasses.replace(run, resume="auto").locked():
         run.reopen([more])
     assert not run.summary_file.exists() and resolve(file=run.config_file) == more
 

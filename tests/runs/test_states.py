@@ -95,8 +95,22 @@ def test_no_flipped_bit_and_no_cut_file_is_loaded_and_the_one_before_is_used(tmp
 
 def test_where_all_are_damaged_the_run_is_not_quietly_begun_anew(tmp_path: Path) -> None:
     (saved(tmp_path, 1) / manifest.MANIFEST).unlink()
-    with pytest.raises(ConfigError, match="no checkpoint in .* can be used; --resume never begins the run anew"):
-        newest(tmp_path)
+    for _ in range(2):  # nor at the next start
+        with pytest.raises(ConfigError, match="no checkpoint in .* can be used; --resume never begins the run anew"):
+            newest(tmp_path)
+
+
+def test_a_checkpoint_that_is_whole_keeps_its_name_whatever_else_is_wrong(tmp_path: Path) -> None:
+    saved(tmp_path, 1)
+    said: list[str] = []
+
+    def unusable(checkpoint: Checkpoint) -> None:
+        raise ConfigError("'metrics.jsonl' is lost")
+
+    with pytest.raises(ConfigError, match="can be used"):
+        states.newest(tmp_path, unusable, said.append)
+    assert said == ["the checkpoint after training step 1 is passed over: 'metrics.jsonl' is lost"]
+    assert newest(tmp_path)[0] is not None
 
 
 def test_a_disk_with_too_little_space_is_noticed_before_anything_is_written(

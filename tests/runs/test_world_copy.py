@@ -16,13 +16,7 @@ from tests.miniature import WORLD
 
 @pytest.fixture
 def world(tmp_path: Path) -> Path:
-    """A world of two files."""
-    folder = tmp_path / "worlds"
-    folder.mkdir()
-    shutil.copy(WORLD, folder / "part.xml")
-    file = folder / "mine.xml"
-    file.write_text('<mujoco><include file="part.xml"/></mujoco>')
-    return file
+    return Path(shutil.copy(WORLD, tmp_path / "mine.xml"))
 
 
 def test_what_is_unchanged_is_flown_where_it_is(tmp_path: Path, world: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -32,23 +26,21 @@ def test_what_is_unchanged_is_flown_where_it_is(tmp_path: Path, world: Path, mon
         world_copy.keep(folder, config)
         assert world_copy.flown_in(folder, config) == (config, [])
         world_copy.check_unchanged(folder, config)
-    assert (tmp_path / "world" / "flown" / "part.xml").read_bytes() == WORLD.read_bytes()
+    assert (tmp_path / "world" / "flown.xml").read_bytes() == WORLD.read_bytes()
 
 
-@pytest.mark.parametrize("change", ["missing", "mine.xml", "part.xml"])
-def test_what_is_missing_or_another_one_is_flown_from_the_copy(tmp_path: Path, world: Path, change: str) -> None:
+@pytest.mark.parametrize("missing", [False, True])
+def test_what_is_missing_or_another_one_is_flown_from_the_copy(tmp_path: Path, world: Path, missing: bool) -> None:
     config = make_config(str(world))
     world_copy.keep(tmp_path, config)
-    if change == "missing":
-        shutil.rmtree(world.parent)
+    if missing:
+        world.unlink()
     else:
-        changed = world.parent / change
-        changed.write_text(changed.read_text() + "\n<!-- another one -->")
+        world.write_text(world.read_text() + "\n<!-- another one -->")
     found, (note,) = world_copy.flown_in(tmp_path, config)
-    copy = tmp_path / "world" / "name" / "mine.xml"
-    why = "is missing or no world any more" if change == "missing" else "has changed since the run began"
+    copy, why = tmp_path / "world" / "name.xml", "is missing" if missing else "has changed since the run began"
     assert note == f"the world '{world}' {why}; the run's own copy is flown, '{copy}'"
-    assert found.world.name == str(copy) and copy.is_file()
+    assert found.world.name == str(copy) and copy.read_bytes() == WORLD.read_bytes()
     with pytest.raises(ConfigError, match=re.escape(f"{why}; put back the run's own copy, '{copy}'")):
         world_copy.check_unchanged(tmp_path, config)
 
@@ -56,13 +48,13 @@ def test_what_is_missing_or_another_one_is_flown_from_the_copy(tmp_path: Path, w
 def test_a_damaged_copy_is_refused(tmp_path: Path, world: Path) -> None:
     config = make_config(str(world))
     world_copy.keep(tmp_path, config)
-    (tmp_path / "world" / "name" / "part.xml").unlink()
-    with pytest.raises(ConfigError, match="is damaged: 'name/part.xml' is missing"):
+    (tmp_path / "world" / "name.xml").unlink()
+    with pytest.raises(ConfigError, match=r"is damaged: 'name\.xml' is missing"):
         world_copy.flown_in(tmp_path, config)
 
 
 def test_random_worlds_have_no_copy_and_old_runs_need_none(tmp_path: Path, world: Path) -> None:
     random = make_config("sparse", world={"flown": ""})
     world_copy.keep(tmp_path, random)
-    assert not list(tmp_path.glob("world/*"))
+    assert not list(tmp_path.glob("world*"))
     assert world_copy.flown_in(tmp_path, make_config(str(world)))[1] == []

@@ -1,4 +1,4 @@
-"""What a world's files may be: in its own folder, and small enough."""
+"""What a world's file may hold: nothing of other files, and nothing huge."""
 
 from __future__ import annotations
 
@@ -8,70 +8,68 @@ import pytest
 
 from edqn_jax.sim import mjcf_files
 from edqn_jax.sim.mjcf import MOST_SHAPES, SceneError, load_world
-from edqn_jax.sim.mjcf_files import files_of
 
 SITES = '<site name="start" pos="1 1 2"/><site name="goal" pos="9 1 2"/>'
 
 
-def world(folder: Path, inside: str, name: str = "world.xml") -> Path:
-    file = folder / name
-    file.parent.mkdir(parents=True, exist_ok=True)
-    file.write_text(f"<mujoco>{inside}</mujoco>")
+def world(folder: Path, inside: str) -> Path:
+    file = folder / "world.xml"
+    file.write_text(f"<mujoco>{inside}<worldbody>{SITES}</worldbody></mujoco>")
     return file
 
 
-def test_a_world_may_be_made_of_several_files_in_its_folder(tmp_path: Path) -> None:
-    part = world(tmp_path, '<worldbody><geom name="ball" size="1" pos="5 1 2"/></worldbody>', "parts/ball.xml")
-    file = world(tmp_path, f'<include file="parts/ball.xml"/><worldbody>{SITES}</worldbody>')
-    assert files_of(file) == [file, part]
-    assert load_world(file).names["spheres"] == ("ball",)
+@pytest.mark.parametrize(
+    ("inside", "says"),
+    [
+        ('<include file="../secret.xml"/>', "has <include>; a world is one file"),
+        ('<asset><model name="a" file="secret.xml"/></asset>', "has <model>"),
+        ('<asset><texture type="2d" name="a" file="secret.png"/></asset>', "names the file 'secret.png' in <texture>"),
+        ('<asset><texture type="cube" name="a" fileright="x.png"/></asset>', "names the file 'x.png' in <texture>"),
+        ('<asset><mesh name="a" file="secret.stl"/></asset>', "names the file 'secret.stl' in <mesh>"),
+        ('<extension><plugin plugin="mujoco.sdf.bolt"/></extension>', "has <extension>"),
+        ('<asset><hfield name="a" nrow="99999" ncol="99999" size="1 1 1 1"/></asset>', "has <hfield>"),
+        ('<size memory="900G"/>', "has <size>"),
+        (
+            '<asset><texture type="2d" builtin="flat" width="100000" height="9"/></asset>',
+            "width=...> of more than 4096",
+        ),
+        ('<custom><numeric name="a" size="900000000"/></custom>', "size=...> of more than 4096"),
+        ('<worldbody><flexcomp name="a" type="grid" count="60 60 60"/></worldbody>', "has <flexcomp>"),
+    ],
+)
+def test_what_a_static_world_does_not_need_is_refused_before_mujoco_sees_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, inside: str, says: str
+) -> None:
+    monkeypatch.setattr("edqn_jax.sim.mjcf.mujoco.MjModel.from_xml_string", None)
+    with pytest.raises(SceneError, match=says):
+        load_world(world(tmp_path, inside))
 
 
 @pytest.mark.parametrize(
-    "inside",
+    "text",
     [
-        '<include file="../secret.xml"/>',
-        '<include file="{outside}/secret.xml"/>',
-        '<include file="linked.xml"/>',
-        '<asset><texture type="2d" file="../secret.xml"/></asset>',
-        '<compiler meshdir=".."/><asset><mesh file="secret.xml"/></asset>',
-        '<compiler assetdir="{outside}"/><asset><hfield file="secret.xml"/></asset>',
-        '<asset><model file="../secret.xml"/></asset>',
-        '<include file="parts/part.xml"/>',
+        # One parser ends the declaration at its first '>', another at its last.
+        "<!DOCTYPE mujoco [<!ENTITY a \"><mujoco><include file='x.xml'/></mujoco><!--\">]><mujoco/> <!-- -->",
+        '<!DOCTYPE mujoco [<!ENTITY a "haha"><!ENTITY b "&a;&a;&a;">]><mujoco model="&b;"/>',
+        '<robot name="a"><link name="b"/></robot>',
+        "<mujoco>" * 100_000,
+        "<mujoco>\udcff</mujoco>",
     ],
 )
-def test_what_lies_outside_of_its_folder_is_refused_before_it_is_opened(tmp_path: Path, inside: str) -> None:
-    (tmp_path / "secret.xml").write_text("<mujoco>password</mujoco>")
-    folder = tmp_path / "worlds"
-    file = world(folder, inside.format(outside=tmp_path) + f"<worldbody>{SITES}</worldbody>")
-    world(folder, '<include file="../../secret.xml"/>', "parts/part.xml")
-    (folder / "linked.xml").symlink_to(tmp_path / "secret.xml")
-    with pytest.raises(SceneError, match=r"names '.*secret.xml'|names '.*linked.xml'") as refused:
+def test_what_parsers_may_read_differently_is_refused(tmp_path: Path, text: str) -> None:
+    file = tmp_path / "world.xml"
+    file.write_bytes(text.encode(errors="surrogateescape"))
+    with pytest.raises(SceneError, match="world.xml (is not an MJCF|has a <!DOCTYPE>)"):
         load_world(file)
-    assert f"outside of the world's folder '{folder}'" in str(refused.value) and "password" not in str(refused.value)
 
 
 def test_copies_and_sizes_have_limits(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     copies = '<replicate count="2000" offset="1 0 0">' * 2 + '<geom size="1"/>' + "</replicate>" * 2
     with pytest.raises(SceneError, match=r"asks for 4,00\d,000 copies by replicate; a world may have 10,000"):
-        load_world(world(tmp_path, f"<worldbody>{SITES}{copies}</worldbody>"))
+        load_world(world(tmp_path, f"<worldbody>{copies}</worldbody>"))
     many = "".join(f'<geom size="0.1" pos="{x} 0 0"/>' for x in range(MOST_SHAPES + 1))
     with pytest.raises(SceneError, match=f"has {MOST_SHAPES + 1} geoms; a world may have {MOST_SHAPES}"):
-        load_world(world(tmp_path, f"<worldbody>{SITES}{many}</worldbody>"))
+        load_world(world(tmp_path, f"<worldbody>{many}</worldbody>"))
     monkeypatch.setattr(mjcf_files, "MOST_BYTES", 100)
-    with pytest.raises(SceneError, match=r"has 2\d\d bytes; a world may have 100"):
-        load_world(world(tmp_path, f"<worldbody>{SITES}</worldbody>" + " " * 100))
-
-
-def test_entities_that_multiply_are_refused(tmp_path: Path) -> None:
-    layers = "".join(f'<!ENTITY e{n} "{f"&e{n - 1};" * 10}">' for n in range(1, 12))
-    file = tmp_path / "bomb.xml"
-    file.write_text(f'<!DOCTYPE mujoco [<!ENTITY e0 "ha">{layers}]><mujoco model="&e11;"/>')
-    with pytest.raises(SceneError, match="is not an MJCF"):
-        load_world(file)
-
-
-def test_files_that_include_each_other_end(tmp_path: Path) -> None:
-    one = world(tmp_path, '<include file="two.xml"/>', "one.xml")
-    two = world(tmp_path, '<include file="one.xml"/>', "two.xml")
-    assert files_of(one) == [one, two]
+    with pytest.raises(SceneError, match=r"has 1\d\d bytes; a world may have 100"):
+        load_world(world(tmp_path, ""))

@@ -136,7 +136,7 @@ def test_where_a_file_of_the_run_was_changed_the_checkpoint_before_is_used(tmp_p
     made.run.metrics_file.write_text('{"decisions": 2}\n')
     again, said = kept(tmp_path)
     found = again.restored()
-    assert found is not None and found.done == 1 and "is set aside: " in said[0]
+    assert found is not None and found.done == 1 and "is passed over: " in said[0]
     assert not made.run.metrics_file.exists()  # there was none then
 
 
