@@ -281,8 +281,10 @@ def step(
     memory = _choose(is_reset, rested, state.memory)
     move = jnp.where(is_reset, 0.0, jnp.asarray(ACTIONS, jnp.float32)[action])
     observation, memory = observe(config, scene, goal, done.drone, move, poses, memory, noise)
-    unseen = ~_is_finite(observation)
-    observation = _choose(unseen, jax.tree.map(jnp.zeros_like, observation), observation)
+    # Own state and motion are of a finite body; counts of events are whole numbers, and nothing is checked.
+    unseen = ~_is_finite(observation.sensed)
+    if _has_floats(observation.sensed):
+        observation = _choose(unseen, jax.tree.map(jnp.zeros_like, observation), observation)
     done = dataclasses.replace(done, outcome=jnp.where(unseen, int(Outcome.DIVERGED), done.outcome))
     after = EnvState(
         drone=done.drone,
@@ -307,11 +309,14 @@ def step(
     )
 
 
+def _has_floats(tree: object) -> bool:
+    return any(jnp.issubdtype(leaf.dtype, jnp.floating) for leaf in jax.tree.leaves(tree))
+
+
 def _is_finite(tree: object) -> Array:
     """Returns whether every number of a tree's arrays is finite; whole numbers are."""
-    return jnp.isfinite(
-        sum(jnp.sum(leaf) for leaf in jax.tree.leaves(tree) if jnp.issubdtype(leaf.dtype, jnp.floating))
-    )
+    sums = [jnp.sum(leaf) for leaf in jax.tree.leaves(tree) if jnp.issubdtype(leaf.dtype, jnp.floating)]
+    return jnp.isfinite(sum(sums, jnp.zeros(())))
 
 
 def _scene_of(config: Config, world: World, mission: Array, decision: Array) -> Scene:

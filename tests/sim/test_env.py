@@ -568,12 +568,10 @@ def test_a_diverged_flight_ends_with_finite_numbers(reset, step):
 
 @pytest.mark.slow
 def test_what_cannot_be_seen_or_rewarded_has_diverged_and_is_told_apart(world, reset, monkeypatch):
-    own_state = env.own_state
+    def ill(config, scene, poses, memory, key):  # beyond 100 m
+        return jnp.where(poses.position[-1, 0] > 100.0, jnp.nan, jnp.ones((2, 3))), memory
 
-    def unseen(config, scene, goal, state):  # beyond 100 m
-        return jnp.where(state.position[0] > 100.0, jnp.nan, own_state(config, scene, goal, state))
-
-    monkeypatch.setattr(env, "own_state", unseen)
+    monkeypatch.setattr(env.sensor, "sense", ill)
     unpaid = dataclasses.replace(world, reward=lambda t: jnp.where(t.move == BACK, jnp.inf, 1.0))
     broken_step = jax.jit(lambda state, action: env.step(FLOWN, unpaid, state, action))
     state, _ = reset(jax.random.key(0), MISSION["long"])
