@@ -269,7 +269,7 @@ def train_step(
     ring = _store(actors, action, time)
     flown, seen = _fly(config, world, actors, action)
     rings = _keep(config, world, actors, flown, seen, step)
-    spoilt = ~_is_finite((learner.vae, learner.encoder, learner.q))
+    spoilt = ~env.is_finite((learner.vae, learner.encoder, learner.q))
     vae_losses, learner = learn_to_see(config, axis, learner, rings, keys.vae, step)
     q_losses, learner = learn_to_act(config, axis, learner, ring, time, keys.dqn, step)
     learner = _publish(config, learner, step)
@@ -334,11 +334,6 @@ class _Learnt(NamedTuple):
 
 def _count(flags: Array) -> Array:
     return jnp.sum(flags, dtype=jnp.int32)
-
-
-def _is_finite(tree: Any) -> Array:
-    """Returns whether every number of a tree is finite, [] bool."""
-    return jnp.isfinite(sum(jnp.sum(leaf) for leaf in jax.tree.leaves(tree)))
 
 
 def _act(
@@ -450,7 +445,7 @@ def learn_to_see(config: Config, axis: str | None, learner: Learner, rings: Samp
         gradient, parts = _all_sum((gradient, jax.tree.map(lambda x: jnp.mean(x) * part, parts)), axis)
         change, optimiser = _vae_optimiser(config).update(gradient, learner.vae_optimiser, learner.vae)
         learner = dataclasses.replace(learner, vae=optax.apply_updates(learner.vae, change), vae_optimiser=optimiser)
-        return learner, (parts.reconstruction, parts.kl, _is_finite(gradient))
+        return learner, (parts.reconstruction, parts.kl, env.is_finite(gradient))
 
     def learn(learner: Learner, updates: int):
         many = jax.vmap(lambda k: jax.random.split(k, updates))(keys).swapaxes(0, 1)
@@ -486,7 +481,7 @@ def learn_to_act(config: Config, axis: str | None, learner: Learner, ring, time:
         gradient, total, count, sum_q = _all_sum((gradient, total, count, sum_q), axis)
         gradient = gradient / jnp.maximum(count, 1.0)
         change, optimiser = _q_optimiser(config).update(gradient, learner.q_optimiser, learner.q)
-        q, finite = optax.apply_updates(learner.q, change), _is_finite(gradient)
+        q, finite = optax.apply_updates(learner.q, change), env.is_finite(gradient)
 
         def followed(old: Array, rate: float) -> Array:
             """Follows `q`, unless it may be `q` that is not finite."""

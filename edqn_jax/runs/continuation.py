@@ -61,8 +61,8 @@ def continued(folder: Path, run: Begun, config: Config, seeds: int | None) -> Co
     """
     if seeds != run.seeds:
         raise ConfigError(
-            f"'{folder}' holds {_described(run.seeds)}, not {_described(seeds)}; give the same --seeds, or another "
-            "folder"
+            f"'{folder}' holds {_described(run.seeds)}, not {_described(seeds)}; leave --seeds out to continue it, or "
+            "give another folder"
         )
     differ = [name for name in differences(run.config, config) if name not in MAY_CHANGE]
     if differ:

@@ -39,7 +39,7 @@ class Checkpoint:
     config: str
     """Content of the run's `config.yaml`."""
     facts: dict[str, str]
-    """Of the manifest: versions, digest of the configuration, reward."""
+    """Of the manifest: versions and reward. Its checksums have the digest of the configuration."""
     folder: Path = Path()
     """Where it was read from."""
 

@@ -282,7 +282,7 @@ def step(
     move = jnp.where(is_reset, 0.0, jnp.asarray(ACTIONS, jnp.float32)[action])
     observation, memory = observe(config, scene, goal, done.drone, move, poses, memory, noise)
     # Own state and motion are of a finite body; counts of events are whole numbers, and nothing is checked.
-    unseen = ~_is_finite(observation.sensed)
+    unseen = ~is_finite(observation.sensed)
     if _has_floats(observation.sensed):
         observation = _choose(unseen, jax.tree.map(jnp.zeros_like, observation), observation)
     done = dataclasses.replace(done, outcome=jnp.where(unseen, int(Outcome.DIVERGED), done.outcome))
@@ -313,7 +313,7 @@ def _has_floats(tree: object) -> bool:
     return any(jnp.issubdtype(leaf.dtype, jnp.floating) for leaf in jax.tree.leaves(tree))
 
 
-def _is_finite(tree: object) -> Array:
+def is_finite(tree: object) -> Array:
     """Returns whether every number of a tree's arrays is finite; whole numbers are."""
     sums = [jnp.sum(leaf) for leaf in jax.tree.leaves(tree) if jnp.issubdtype(leaf.dtype, jnp.floating)]
     return jnp.isfinite(sum(sums, jnp.zeros(())))

@@ -83,7 +83,7 @@ def test_the_number_of_seeds_is_the_runs(tmp_path: Path) -> None:
     with run.locked():
         run.begin(configs, seeds=True)
     assert parse_train(["--run-dir", str(run.path)])[0].seeds == 2
-    with pytest.raises(ConfigError, match="holds runs of 2 seeds, not runs of 3 seeds; give the same --seeds"):
+    with pytest.raises(ConfigError, match="holds runs of 2 seeds, not runs of 3 seeds; leave --seeds out to continue"):
         parse_train(["--run-dir", str(run.path), "--seeds", "3"])
 
 
