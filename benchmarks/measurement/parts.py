@@ -14,10 +14,11 @@ from jax import Array
 from jax.sharding import PartitionSpec
 
 from edqn_jax.config import Config
-from edqn_jax.learn import dqn, qnetwork, replay, trainer, vae
+from edqn_jax.learn import dqn, qnetwork, replay, updates, vae
 from edqn_jax.learn.plan import Plan
 from edqn_jax.learn.samples import Samples
-from edqn_jax.learn.trainer import AXIS, Actors, Learner, TrainState
+from edqn_jax.learn.trainer import AXIS, Actors, TrainState
+from edqn_jax.learn.updates import Learner
 from edqn_jax.sim import camera, columns, drone, env, events, sensor
 from edqn_jax.sim.drone import DroneState
 from edqn_jax.sim.env import EnvState, World
@@ -300,7 +301,7 @@ def vae_updating(now: Moment) -> Part:
     def body(rings: Samples, carry):
         learner, keys = carry
         keys = _next(keys)
-        _, learner = trainer.learn_to_see(now.config, AXIS, learner, rings, keys, now.state.step)
+        _, learner = updates.learn_to_see(now.config, AXIS, learner, rings, keys, now.state.step)
         return learner, keys
 
     rings, carry = now.actors.samples, (now.learner, now.shard_keys)
@@ -315,7 +316,7 @@ def learning(now: Moment) -> Part:
     def body(ring: replay.Rows, carry):
         learner, keys = carry
         keys = _next(keys)
-        _, learner = trainer.learn_to_act(now.config, AXIS, learner, ring, now.newest, keys, now.state.step)
+        _, learner = updates.learn_to_act(now.config, AXIS, learner, ring, now.newest, keys, now.state.step)
         return learner, keys
 
     return Part(

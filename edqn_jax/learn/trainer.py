@@ -17,19 +17,17 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-import optax
 from flax import struct
 from jax import Array, lax
-from jax.flatten_util import ravel_pytree
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from edqn_jax.config import Config
 from edqn_jax.errors import ConfigError
-from edqn_jax.learn import dqn, embedding, policy, qnetwork, replay, samples, vae
+from edqn_jax.learn import dqn, embedding, policy, replay, samples, vae
 from edqn_jax.learn.plan import Plan
 from edqn_jax.learn.policy import PolicyParams, empty_memory, observation_size
-from edqn_jax.learn.qnetwork import Params
 from edqn_jax.learn.samples import Samples
+from edqn_jax.learn.updates import Learner, all_sum, flat, init_learner, learn_to_act, learn_to_see
 from edqn_jax.parallel import processes
 from edqn_jax.parallel.devices import compiler_options
 from edqn_jax.random import run_streams
@@ -40,19 +38,6 @@ from edqn_jax.sim.outcomes import Outcome
 
 AXIS = "env"
 """Name of the mesh axis that shards are spread over."""
-
-
-@struct.dataclass
-class Learner:
-    """Parameters and optimisers; the same on every device."""
-
-    vae: Params  # what learns; {} for a sensor whose image is not encoded
-    vae_optimiser: Any
-    encoder: Params  # frozen encoder used for acting
-    q: Params
-    target: Params
-    average: Params  # Polyak average that evaluation flies
-    q_optimiser: Any
 
 
 @struct.dataclass
@@ -150,7 +135,7 @@ def init(config: Config, world: World, key: Array) -> TrainState:
     keys = InitialKeys.split(key, envs, shards)
     # Nothing has been seen yet: the first step is every environment's reset.
     state = jax.vmap(lambda k: env.ended(config, world, k))(keys.environments)
-    learner = _init_learner(config, keys.learner)
+    learner = init_learner(config, keys.learner)
     size = observation_size(config)
     ring = replay.empty(config.agent, envs // shards, envs, size)
     flat = Actors(
@@ -187,52 +172,6 @@ def _empty_samples(config: Config, world: World, state: EnvState) -> Samples | N
     shapes = jax.eval_shape(one, jax.tree.map(lambda x: x[0], state))
     ring = samples.empty(config.encoder, shapes, envs // shards, envs)
     return jax.tree.map(lambda x: jnp.broadcast_to(x, (shards, *x.shape)), ring)
-
-
-def _init_learner(config: Config, key: Array) -> Learner:
-    vae_key, q_key = jax.random.split(key)
-    vae = embedding.init(config, vae_key)
-    q = qnetwork.init_q(config.agent, observation_size(config), len(ACTIONS), q_key)
-    return Learner(
-        vae=vae,
-        vae_optimiser=_vae_optimiser(config).init(vae) if vae else None,
-        encoder=embedding.acting(config, vae),
-        q=q,
-        target=q,
-        average=q,
-        q_optimiser=_q_optimiser(config).init(q),
-    )
-
-
-def _vae_optimiser(config: Config) -> optax.GradientTransformation:
-    return _unless_broken(optax.flatten(optax.adam(config.encoder.learning_rate)))
-
-
-def _unless_broken(optimiser: optax.GradientTransformation) -> optax.GradientTransformation:
-    """Returns an optimiser that changes nothing where a gradient is not finite, however often."""
-    return optax.apply_if_finite(optimiser, max_consecutive_errors=2**31 - 1)
-
-
-def _q_optimiser(config: Config) -> optax.GradientTransformation:
-    plan = Plan.of(config)
-    return _unless_broken(
-        dqn.optimiser(config.agent, (plan.scheduled - plan.learn_from) * config.agent.updates_per_step)
-    )
-
-
-def _flat(x: Array) -> Array:
-    """Returns [S * E, ...] of [S, E, ...]."""
-    return x.reshape(-1, *x.shape[2:])
-
-
-def _side_by_side(x: Array) -> Array:
-    """Returns [T, S * B, ...] of [S, T, B, ...]."""
-    return jnp.moveaxis(x, 0, 1).reshape(x.shape[1], -1, *x.shape[3:])
-
-
-def _all_sum(x, axis: str | None):
-    """Returns the sum over the devices that share the work, if there are any."""
-    return lax.psum(x, axis) if axis is not None else x
 
 
 class ShardKeys(NamedTuple):
@@ -296,9 +235,9 @@ def train_step(
         mean_q=q_losses.means[1],
         reconstruction=vae_losses.means[0],
         kl=vae_losses.means[1],
-        epsilon=jnp.where(warming, 1.0, _all_sum(jnp.mean(epsilon) * shards, axis) / config.train.shards),
+        epsilon=jnp.where(warming, 1.0, all_sum(jnp.mean(epsilon) * shards, axis) / config.train.shards),
         health=Health(
-            **{name: _all_sum(jnp.sum(getattr(seen.broken, name), dtype=jnp.int32), axis) for name in _OF_A_DECISION},
+            **{name: all_sum(jnp.sum(getattr(seen.broken, name), dtype=jnp.int32), axis) for name in _OF_A_DECISION},
             parameters=spoilt.astype(jnp.int32),
             loss=q_losses.broken[0] + vae_losses.broken[0],
             gradient=q_losses.broken[1] + vae_losses.broken[1],
@@ -308,32 +247,6 @@ def train_step(
 
 
 _OF_A_DECISION = ("physics_state", "observation", "reward")
-
-
-class _Learnt(NamedTuple):
-    """What the updates of one training step come to."""
-
-    means: tuple[Array, Array]
-    """Loss and what goes with it, over the updates with a finite loss; NaN if there was none."""
-    broken: tuple[Array, Array]
-    """Updates whose loss, and whose gradient, was not finite; int32."""
-
-    @classmethod
-    def none(cls) -> _Learnt:
-        nothing, never = jnp.float32(jnp.nan), jnp.int32(0)
-        return cls((nothing, nothing), (never, never))
-
-    @classmethod
-    def of(cls, loss: Array, other: Array, gradient_is_finite: Array) -> _Learnt:
-        """Returns what updates [U] with these losses and gradients come to."""
-        finite = jnp.isfinite(loss)
-        count = jnp.sum(finite)
-        loss, other = (jnp.sum(jnp.where(finite, x, 0.0)) / count for x in (loss, other))
-        return cls((loss, other), (_count(~finite), _count(~gradient_is_finite)))
-
-
-def _count(flags: Array) -> Array:
-    return jnp.sum(flags, dtype=jnp.int32)
 
 
 def _act(
@@ -365,13 +278,13 @@ def _store(actors: Actors, action: Array, time: Array) -> replay.Rows:
 
 def _fly(config: Config, world: World, actors: Actors, action: Array) -> tuple[EnvState, env.Step]:
     """Steps all environments, [S * E, ...]."""
-    return jax.vmap(lambda s, a: env.step(config, world, s, a))(jax.tree.map(_flat, actors.env), _flat(action))
+    return jax.vmap(lambda s, a: env.step(config, world, s, a))(jax.tree.map(flat, actors.env), flat(action))
 
 
 def _remember(config: Config, learner: Learner, actors: Actors, seen: env.Step, step: Array) -> Array:
     """Returns memories [S * E, H, D] with the new observations, encoded once; new episodes or encoders begin empty."""
     forget = seen.is_reset | Plan.of(config).replaces_encoder(step)
-    memory = jnp.where(forget[:, None, None], 0.0, _flat(actors.memory))
+    memory = jnp.where(forget[:, None, None], 0.0, flat(actors.memory))
     return policy.see(config, learner.encoder, memory, seen.observation)
 
 
@@ -418,101 +331,6 @@ def _keep(config: Config, world: World, actors: Actors, flown: EnvState, seen: e
     rows = samples.samples_of(config.encoder, seen.observation, wanted, begins)
     write = jax.vmap(samples.write, in_axes=(0, 0, None, None))
     return write(actors.samples, _shaped(actors.reward.shape, rows), plan.samples_kept(config, step), keep)
-
-
-def learn_to_see(config: Config, axis: str | None, learner: Learner, rings: Samples | None, keys: Array, step: Array):
-    """Updates the VAE on samples of the rings [S, L, E, ...]; returns reconstruction and KL, and the learner."""
-    plan = Plan.of(config)
-    if rings is None:
-        return _Learnt.none(), learner
-    share = config.encoder.batch_size // config.train.shards
-    kept = plan.samples_kept(config, step) + 1
-    part = keys.shape[0] / config.train.shards  # of all shards, on this device
-
-    def loss(params: Params, batch: Samples, noise: Array):
-        sensed = samples.read(batch)
-        total, parts = vae.vae_loss(config.encoder, params, sensed, batch.motion, batch.wanted, noise, batch.begins)
-        return total * part, parts
-
-    def update(learner: Learner, keys: Array):
-        draw_keys, noise_keys = jax.vmap(jax.random.split)(keys).swapaxes(0, 1)
-        batch = jax.vmap(lambda ring, key: samples.draw(config.encoder, ring, kept, share, key))(rings, draw_keys)
-        # Each shard draws its own noise, so that the layout on devices does not change it.
-        shape = *batch.motion.shape[1:-1], config.encoder.code_size
-        noise = jax.vmap(lambda key: jax.random.normal(key, shape))(noise_keys)
-        batch, noise = jax.tree.map(_side_by_side, (batch, noise))
-        gradient, parts = jax.grad(loss, has_aux=True)(learner.vae, batch, noise)
-        gradient, parts = _all_sum((gradient, jax.tree.map(lambda x: jnp.mean(x) * part, parts)), axis)
-        change, optimiser = _vae_optimiser(config).update(gradient, learner.vae_optimiser, learner.vae)
-        learner = dataclasses.replace(learner, vae=optax.apply_updates(learner.vae, change), vae_optimiser=optimiser)
-        return learner, (parts.reconstruction, parts.kl, env.is_finite(gradient))
-
-    def learn(learner: Learner, updates: int):
-        many = jax.vmap(lambda k: jax.random.split(k, updates))(keys).swapaxes(0, 1)
-        learner, found = lax.scan(update, learner, many)
-        return _Learnt.of(*found), learner
-
-    def rest(learner: Learner):
-        if config.encoder.keep_learning:
-            return learn(learner, 1)
-        return _Learnt.none(), learner
-
-    return lax.cond(plan.trains_vae(step), lambda x: learn(x, config.encoder.warmup_updates_per_step), rest, learner)
-
-
-def learn_to_act(config: Config, axis: str | None, learner: Learner, ring, time: Array, keys: Array, step: Array):
-    """Updates the DQN from the replay (Algorithm 1, steps 7-9); returns loss and mean Q, and the learner."""
-    plan, agent = Plan.of(config), config.agent
-    share = agent.batch_size // config.train.shards
-
-    # All of a network as one vector: what is done to each number of it is one operation, and not one for each layer.
-    _, tree = ravel_pytree(learner.q)
-
-    def vector(params: Params) -> Array:
-        return ravel_pytree(params)[0]
-
-    def loss(q: Array, target: Array, batch: replay.Batch):
-        return dqn.batch_loss(agent, tree(q), tree(target), len(ACTIONS), batch)
-
-    def update(learner: Learner, keys: Array):
-        batch = jax.vmap(lambda r, k: replay.sample(agent, r, time, share, k))(ring, keys)
-        batch = jax.tree.map(_flat, batch)
-        (total, (count, sum_q)), gradient = jax.value_and_grad(loss, has_aux=True)(learner.q, learner.target, batch)
-        gradient, total, count, sum_q = _all_sum((gradient, total, count, sum_q), axis)
-        gradient = gradient / jnp.maximum(count, 1.0)
-        change, optimiser = _q_optimiser(config).update(gradient, learner.q_optimiser, learner.q)
-        q, finite = optax.apply_updates(learner.q, change), env.is_finite(gradient)
-
-        def followed(old: Array, rate: float) -> Array:
-            """Follows `q`, unless it may be `q` that is not finite."""
-            return jnp.where(finite, dqn.polyak(q, old, rate), old)
-
-        learner = dataclasses.replace(
-            learner,
-            q=q,
-            q_optimiser=optimiser,
-            target=followed(learner.target, agent.target_rate),
-            average=followed(learner.average, agent.average_rate),
-        )
-        count = jnp.maximum(count, 1.0)
-        return learner, (total / count, sum_q / count, finite)
-
-    def learn(learner: Learner):
-        many = jax.vmap(lambda k: jax.random.split(k, agent.updates_per_step))(keys).swapaxes(0, 1)
-        learner, losses = lax.scan(update, _each_network(vector, learner), many)
-        return _Learnt.of(*losses), _each_network(tree, learner)
-
-    def rest(learner: Learner):
-        return _Learnt.none(), learner
-
-    return lax.cond(plan.trains_q(step), learn, rest, learner)
-
-
-def _each_network(change: Callable[[Any], Any], learner: Learner) -> Learner:
-    """Returns `learner` with its three Q-networks changed."""
-    return dataclasses.replace(
-        learner, q=change(learner.q), target=change(learner.target), average=change(learner.average)
-    )
 
 
 def run_steps(

@@ -24,7 +24,8 @@ from edqn_jax.cli import main
 from edqn_jax.config import CameraConfig
 from edqn_jax.evaluation import rollouts
 from edqn_jax.learn.policy import fresh_policy
-from edqn_jax.learn.trainer import Episodes, Learner, Losses, Trainer, TrainState
+from edqn_jax.learn.trainer import Episodes, Losses, Trainer, TrainState
+from edqn_jax.learn.updates import Learner
 from edqn_jax.parallel import devices, processes
 from edqn_jax.runs.directory import plain
 from edqn_jax.sim import camera
