@@ -15,5 +15,9 @@ class DivergedError(RuntimeError):
     """Nothing is learnt any more because numbers are not finite; the message says which were first, and when."""
 
 
+class CheckError(RuntimeError):
+    """A check of `--debug` failed; the message says which, and where."""
+
+
 class StoppedError(RuntimeError):
     """Training stopped on request, after saving; the message says where."""

@@ -41,3 +41,10 @@ def integers(key: Array, shape: tuple[int, ...], below: int | Array) -> Array:
     """
     bits = jax.random.bits(key, shape, jnp.uint32)
     return (bits % jnp.asarray(below, jnp.uint32)).astype(jnp.int32)
+
+
+def split_each(keys: Array, count: int) -> Array:
+    """Splits each of `keys` [S], which are consumed, into `count`: [count, S]."""
+    # As data, because JAX's check for keys that are used twice takes a transposed array of keys for used.
+    data = jax.random.key_data(jax.vmap(lambda key: jax.random.split(key, count))(keys))
+    return jax.random.wrap_key_data(jnp.swapaxes(data, 0, 1), impl=jax.random.key_impl(keys))

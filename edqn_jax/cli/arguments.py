@@ -30,6 +30,7 @@ SHORT_NAMES = {
     "--num-envs": "--train.num-envs",
     "--total-steps": "--train.total-steps",
     "--seed": "--train.seed",
+    "--debug": "--train.debug",
 }
 """Short names of common options."""
 

@@ -14,9 +14,10 @@ from edqn_jax.cli.arguments import EvaluateArgs, RecordArgs, TrainCommand, parse
 from edqn_jax.cli.signals import Stops
 from edqn_jax.cli.train import train_command
 from edqn_jax.config.loading import nearest
-from edqn_jax.errors import ConfigError, DivergedError, StoppedError
+from edqn_jax.errors import CheckError, ConfigError, DivergedError, StoppedError
 
 DONE = 0
+FAILED = 1
 BAD_INPUT = 2
 DIVERGED = 3
 BY_SIGNAL = 128
@@ -28,7 +29,7 @@ COMMANDS = {"train": TrainCommand, "evaluate": EvaluateArgs, "record": RecordArg
 def run(argv: Sequence[str] | None, stops: Stops) -> int:
     """Runs one command and returns its exit code.
 
-    0 is done, 2 bad input, 3 diverged, 130 stopped by SIGINT, and 143 by SIGTERM.
+    0 is done, 1 a check failed, 2 bad input, 3 diverged, 130 stopped by SIGINT, and 143 by SIGTERM.
     """
     argv = list(sys.argv[1:] if argv is None else argv)
     # XLA's errors are for people, its warnings for those who write XLA; read when JAX is first imported.
@@ -48,10 +49,12 @@ def _dispatched(argv: list[str], stops: Stops) -> int:
         return _dispatch(argv, stops)
     except SystemExit as ending:  # tyro has printed the help, or what is wrong
         return int(ending.code or DONE)
-    except (ConfigError, DivergedError, StoppedError) as ending:
+    except (CheckError, ConfigError, DivergedError, StoppedError) as ending:
         print(f"edqn: {ending}", file=sys.stderr)
         if isinstance(ending, StoppedError):  # by a signal to this process, or to another of the cluster
             return BY_SIGNAL + (stops.number or signal.SIGTERM)
+        if isinstance(ending, CheckError):
+            return FAILED
         return BAD_INPUT if isinstance(ending, ConfigError) else DIVERGED
 
 

@@ -37,7 +37,8 @@ def train_command(argv: Sequence[str], stops: Stops) -> None:
     from edqn_jax.report.progress import Progress
     from edqn_jax.training.stopping import Stop
 
-    use_cpu_devices(config.train.devices or most_that_divide(config.train.shards, cores()))
+    most = 1 if config.train.debug else most_that_divide(config.train.shards, cores())
+    use_cpu_devices(config.train.devices or most)
     process = 0
     if arguments is not None:
         print("edqn: waiting for the other processes, five minutes at most", file=sys.stderr)

@@ -163,6 +163,7 @@ def _train(train: TrainConfig) -> None:
     if train.devices:
         divides = f"0 or a divisor of train.shards ({shards})"
         _require(shards % train.devices == 0, "train.devices", divides, train.devices)
+    _require(not train.debug or train.devices <= 1, "train.devices", "0 or 1 with train.debug", train.devices)
 
 
 def _replay(agent: AgentConfig, train: TrainConfig) -> None:

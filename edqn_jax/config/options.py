@@ -324,6 +324,9 @@ class TrainConfig:
     3 % of that. There is one at the end, too; 0 saves none."""
     checkpoints: int = 2
     """Newest checkpoints that are kept."""
+    debug: bool = False
+    """Check every index, number, random key and shape of training; the first fault ends the run and is named. One
+    device, and slower by a hundred times and more: for few environments and decisions."""
 
 
 @dataclass(frozen=True)

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import optax
 from jax import Array
 
+from edqn_jax.checks import check_index
 from edqn_jax.config import AgentConfig
 from edqn_jax.learn.qnetwork import Params, q_values
 from edqn_jax.learn.replay import Batch
@@ -67,6 +68,7 @@ def batch_loss(config: AgentConfig, params: Params, target_params: Params, actio
     Returns:
         loss: [] summed over the samples; (count, mean_q): [] samples and sum of Q(s, a).
     """
+    check_index(batch.action, actions, "the moves")
     q = q_values(config, params, actions, batch.history)
     q_next = q_values(config, target_params, actions, batch.next_history)
     q_select = q_values(config, params, actions, batch.next_history) if config.double else q_next

@@ -18,6 +18,7 @@ import jax.numpy as jnp
 from flax import struct
 from jax import Array
 
+from edqn_jax.checks import check_index
 from edqn_jax.config import AgentConfig
 from edqn_jax.random import integers
 from edqn_jax.sim.env import OWN_SIZE, turned
@@ -92,6 +93,8 @@ def sample(config: AgentConfig, ring: Rows, time: Array, batch: int, key: Array)
     oldest = jnp.minimum(time + 1, length) - h
     age = n + integers(age_key, (batch,), jnp.maximum(oldest, n) - n + 1)
     env = integers(env_key, (batch,), envs)
+    check_index(env, envs, "the replay's environments")
+    check_index(age - n, oldest - n + 1, "the decisions that can start a transition")
     drawn = jax.vmap(lambda a, e: _transition(config, ring, time - a, e))(age, env)
     if not config.turn:
         return drawn

@@ -18,6 +18,7 @@ import numpy as np
 from flax import struct
 from jax import Array
 
+from edqn_jax.checks import check_index
 from edqn_jax.config import EncoderConfig
 from edqn_jax.learn import vae
 from edqn_jax.learn.vae import Target
@@ -96,6 +97,8 @@ def draw(config: EncoderConfig, ring: Samples, time: Array, count: int, key: Arr
     first = oldest + integers(row_key, (flights,), jnp.maximum(time - oldest - length, 0) + 1)
     row = jnp.minimum(first + jnp.arange(length)[:, None], time - 1) % (rows - 1)
     env = integers(env_key, (flights,), envs)
+    check_index(env, envs, "the samples' environments")
+    check_index(row, jnp.minimum(time, rows - 1), "the samples that have been kept")
     drawn = jax.tree.map(lambda leaf: leaf[row, env], ring)
     if not config.mirror:
         return drawn

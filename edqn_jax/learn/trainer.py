@@ -24,6 +24,7 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from edqn_jax.config import Config
 from edqn_jax.errors import ConfigError
 from edqn_jax.learn import dqn, embedding, policy, replay, samples, vae
+from edqn_jax.learn.checked import CheckedChunk, one_by_one
 from edqn_jax.learn.plan import Plan
 from edqn_jax.learn.policy import PolicyParams, empty_memory, observation_size
 from edqn_jax.learn.samples import Samples
@@ -278,7 +279,8 @@ def _store(actors: Actors, action: Array, time: Array) -> replay.Rows:
 
 def _fly(config: Config, world: World, actors: Actors, action: Array) -> tuple[EnvState, env.Step]:
     """Steps all environments, [S * E, ...]."""
-    return jax.vmap(lambda s, a: env.step(config, world, s, a))(jax.tree.map(flat, actors.env), flat(action))
+    each = one_by_one if config.train.debug else jax.vmap
+    return each(lambda s, a: env.step(config, world, s, a))(jax.tree.map(flat, actors.env), flat(action))
 
 
 def _remember(config: Config, learner: Learner, actors: Actors, seen: env.Step, step: Array) -> Array:
@@ -418,7 +420,17 @@ class Trainer:
         )
 
     def compile(self) -> None:
-        """Traces and compiles the chunk, once; needs no state, so that it can go on while one is made."""
+        """Traces and compiles the chunk, once; needs no state, so that it can go on while one is made.
+
+        With `train.debug` the chunk is of one agent on one device.
+
+        Raises:
+            CheckError: with `train.debug`, if a random key is used twice.
+        """
+        if self.config.train.debug:
+            run = partial(run_steps, self.config)
+            self._chunk = CheckedChunk(self.config, run, self.world, self.shapes(), self._steps(0))
+            return
         state = self.shapes()
         # One spec for each subtree: only environments and replay are spread, and what they return.
         spread, same = self._spread(), PartitionSpec()
@@ -444,6 +456,9 @@ class Trainer:
         Returns:
             state, (episodes [T, S, E], losses [T]) of the chunk's T steps; of several agents with a leading [K]. The
             episodes are spread over the devices as the shards are.
+
+        Raises:
+            CheckError: with `train.debug`, at the first fault; `state` is not donated then.
         """
         if self._chunk is None:
             self.compile()

@@ -22,6 +22,7 @@ from edqn_jax.learn.plan import Plan
 from edqn_jax.learn.policy import observation_size
 from edqn_jax.learn.qnetwork import Params
 from edqn_jax.learn.samples import Samples
+from edqn_jax.random import split_each
 from edqn_jax.sim.env import is_finite
 from edqn_jax.sim.moves import ACTIONS
 
@@ -121,7 +122,7 @@ def learn_to_see(
         return total * part, parts
 
     def update(learner: Learner, keys: Array):
-        draw_keys, noise_keys = jax.vmap(jax.random.split)(keys).swapaxes(0, 1)
+        draw_keys, noise_keys = split_each(keys, 2)
         batch = jax.vmap(lambda ring, key: samples.draw(config.encoder, ring, kept, share, key))(rings, draw_keys)
         # Each shard draws its own noise, so that the layout on devices does not change it.
         shape = *batch.motion.shape[1:-1], config.encoder.code_size
@@ -134,8 +135,7 @@ def learn_to_see(
         return learner, (parts.reconstruction, parts.kl, is_finite(gradient))
 
     def learn(learner: Learner, updates: int):
-        many = jax.vmap(lambda k: jax.random.split(k, updates))(keys).swapaxes(0, 1)
-        learner, found = lax.scan(update, learner, many)
+        learner, found = lax.scan(update, learner, split_each(keys, updates))
         return Learnt.of(*found), learner
 
     def rest(learner: Learner):
@@ -191,7 +191,7 @@ def learn_to_act(
         return learner, (total / count, sum_q / count, finite)
 
     def learn(learner: Learner):
-        many = jax.vmap(lambda k: jax.random.split(k, agent.updates_per_step))(keys).swapaxes(0, 1)
+        many = split_each(keys, agent.updates_per_step)
         learner, losses = lax.scan(update, _each_network(vector, learner), many)
         return Learnt.of(*losses), _each_network(tree, learner)
 

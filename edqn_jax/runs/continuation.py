@@ -13,7 +13,7 @@ from edqn_jax.runs.directory import SEED_FOLDER, RunDirectory
 
 MAY_CHANGE = (
     *("train.total_steps", "train.schedule_steps", "train.devices"),
-    *("train.checkpoint_every_s", "train.checkpoints"),
+    *("train.checkpoint_every_s", "train.checkpoints", "train.debug"),
 )
 """Options that a run may be continued with other values of; the rest decides what it is."""
 

@@ -15,6 +15,7 @@ import jax.numpy as jnp
 from flax import struct
 from jax import Array
 
+from edqn_jax.checks import check_index
 from edqn_jax.config import Config, EnvConfig
 from edqn_jax.random import integers
 from edqn_jax.sim import drone, sensor
@@ -269,6 +270,8 @@ def step(
     is_reset = state.ended
     fresh = _drawn_mission(world, draw) if mission is None else mission
     mission = jnp.where(is_reset, fresh, state.mission).astype(jnp.int32)
+    check_index(action, len(ACTIONS), "the moves")
+    check_index(mission, world.missions.scene.shape[0], "the missions")
     goal = world.missions.goal[mission]
     scene = _scene_of(config, world, mission, state.decision)
 

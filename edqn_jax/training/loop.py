@@ -153,7 +153,7 @@ class Preparation:
             validate(each)
         self.config, self.display, self.pool, self.began = config, display, pool, time.perf_counter()
         display.phase("preparing worlds")
-        self.devices = choose_devices(config.train.devices, config.train.shards)
+        self.devices = choose_devices(1 if config.train.debug else config.train.devices, config.train.shards)
         # A world's file may be missing on one host.
         self.missions = processes.together(lambda: missions_of_runs(self.configs, reward))
         worlds = [missions.training.world for missions in self.missions]
@@ -201,6 +201,8 @@ def _of_agents(config: Config, agents: int | None) -> list[Config]:
         return [config]
     if agents < 1:
         raise ConfigError(f"the number of agents must be at least 1, not {agents}")
+    if config.train.debug:
+        raise ConfigError("--debug trains one agent; leave --seeds out")
     seeds = range(config.train.seed, config.train.seed + agents)
     return [dataclasses.replace(config, train=dataclasses.replace(config.train, seed=seed)) for seed in seeds]
 
@@ -257,6 +259,7 @@ def train(
     Raises:
         ConfigError: if the configuration is invalid or the world cannot be flown.
         DivergedError: if numbers are not finite for so long that nothing is learnt any more.
+        CheckError: with `train.debug`, at the first fault.
     """
     with prepared(config or make_config(), reward) as preparation:
         return run_chunks(preparation, callback)[0]

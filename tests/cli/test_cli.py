@@ -17,7 +17,7 @@ from edqn_jax.cli import arguments, main
 from edqn_jax.cli.arguments import parse_train
 from edqn_jax.config import Config, preset
 from edqn_jax.config.loading import RANDOM_WORLDS, make_config
-from edqn_jax.errors import ConfigError, DivergedError, StoppedError
+from edqn_jax.errors import CheckError, ConfigError, DivergedError, StoppedError
 from edqn_jax.parallel import devices
 from edqn_jax.sim.mjcf import SceneError
 from tests.processes import PATIENCE_S
@@ -217,6 +217,7 @@ def test_a_gpu_that_jax_cannot_use_is_one_sentence(trainer, capsys):
         (ConfigError("a replay that is too small"), 2),
         (SceneError("a start inside a wall"), 2),
         (DivergedError("the Q loss is not finite"), 3),
+        (CheckError("--debug: an index is out of bounds"), 1),
         (StoppedError("stopped after saving"), 143),
     ],
 )

@@ -1,0 +1,20 @@
+"""Checks inside compiled programs, which only `--debug` makes; otherwise they leave nothing in the program."""
+
+from __future__ import annotations
+
+import jax.numpy as jnp
+from jax import Array
+from jax.experimental import checkify
+
+
+def check_index(index: Array, below: int | Array, of: str) -> None:
+    """Checks that every index [...] is at least 0 and less than `below`; JAX would take the nearest that is.
+
+    Args:
+        index: of any shape, whole numbers.
+        below: [] or broadcast against `index`.
+        of: what is indexed, for the message.
+    """
+    wrong = (index < 0) | (index >= below)
+    first = jnp.ravel(index)[jnp.argmax(wrong)]
+    checkify.debug_check(~jnp.any(wrong), f"index {{index}} of {of} is out of bounds", index=first)
