@@ -115,7 +115,17 @@ class RecordArgs:
     """Number of the test world of a random density; elsewhere it only changes the sensor's noise."""
 
 
-TRAIN, EVALUATE, RECORD = "edqn train", "edqn evaluate", "edqn record"
+@dataclass(frozen=True)
+class VerifyArgs:
+    """Verify a finished run: derive its summary from its raw files, fly its flights again, have C MuJoCo judge them."""
+
+    run: Annotated[Positional[Path], arg(metavar="RUN")]
+    """Folder of the run, or of the runs of several seeds."""
+    json: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
+    """Also write what was found as JSON."""
+
+
+TRAIN, EVALUATE, RECORD, VERIFY = "edqn train", "edqn evaluate", "edqn record", "edqn verify"
 
 
 def parse_train(argv: Sequence[str]) -> tuple[TrainOptions, Config]:
@@ -242,6 +252,20 @@ def parse_record(argv: Sequence[str]) -> RecordArgs:
     if args.file.suffix.lower() != ".gif":
         raise ConfigError(f"'{args.file}' must end in .gif; only animated GIFs are written")
     _check_run(args.run)
+    return args
+
+
+def parse_verify(argv: Sequence[str]) -> VerifyArgs:
+    """Returns the arguments of `edqn verify`.
+
+    Raises:
+        ConfigError: if there is no run.
+        SystemExit: after printing, for --help and for what does not parse.
+    """
+    check_flags(argv, {_flag(option.name) for option in dataclasses.fields(VerifyArgs)}, VERIFY)
+    args = tyro.cli(VerifyArgs, args=argv, prog=VERIFY)
+    if not (args.run / "config.yaml").is_file():
+        raise ConfigError(f"there is no run in '{args.run}': it holds no config.yaml")
     return args
 
 

@@ -10,7 +10,15 @@ from collections.abc import Sequence
 import tyro
 
 import edqn_jax
-from edqn_jax.cli.arguments import EvaluateArgs, RecordArgs, TrainCommand, parse_evaluate, parse_record
+from edqn_jax.cli.arguments import (
+    EvaluateArgs,
+    RecordArgs,
+    TrainCommand,
+    VerifyArgs,
+    parse_evaluate,
+    parse_record,
+    parse_verify,
+)
 from edqn_jax.cli.signals import Stops
 from edqn_jax.cli.train import train_command
 from edqn_jax.config.loading import nearest
@@ -23,7 +31,7 @@ DIVERGED = 3
 BY_SIGNAL = 128
 """What the number of a signal is added to: 130 for SIGINT, 143 for SIGTERM."""
 
-COMMANDS = {"train": TrainCommand, "evaluate": EvaluateArgs, "record": RecordArgs}
+COMMANDS = {"train": TrainCommand, "evaluate": EvaluateArgs, "record": RecordArgs, "verify": VerifyArgs}
 
 
 def run(argv: Sequence[str] | None, stops: Stops) -> int:
@@ -66,6 +74,8 @@ def _dispatch(argv: Sequence[str], stops: Stops) -> int:
         _evaluate(rest)
     elif command == "record":
         _record(rest)
+    elif command == "verify":
+        _verify(rest)
     elif command == "--version":
         print(f"edqn-jax {edqn_jax.__version__}")
     elif command in ("-h", "--help"):
@@ -93,3 +103,13 @@ def _record(argv: Sequence[str]) -> None:
 
     use_cpu_devices()
     record_command(args)
+
+
+def _verify(argv: Sequence[str]) -> None:
+    args = parse_verify(argv)
+
+    from edqn_jax.cli.verify import verify_command
+    from edqn_jax.parallel.devices import use_cpu_devices
+
+    use_cpu_devices()
+    verify_command(args)

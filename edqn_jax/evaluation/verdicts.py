@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from pathlib import Path
 
 import mujoco
 import numpy as np
@@ -57,7 +56,7 @@ def check_verdicts(config: Config, missions: MissionSet, flights: Flights) -> li
     """
     if flights.record is None:
         raise ValueError("the flights were not recorded; fly them with record=True")
-    judges = [_judge(text, missions.file, config.drone.body_radius_m) for text in missions.mjcf()]
+    judges = judges_of(config, missions)
     flown = missions.world.missions
     scenes, starts = np.asarray(flown.scene), np.asarray(flown.start)
     positions = np.asarray(flights.record.position)
@@ -77,6 +76,6 @@ def check_verdicts(config: Config, missions: MissionSet, flights: Flights) -> li
     return results
 
 
-def _judge(text: str, file: Path | None, radius: float) -> Judge:
-    # From the file where there is one: it may include files beside it.
-    return load_judge(file if file is not None else mujoco.MjSpec.from_string(text), radius)
+def judges_of(config: Config, missions: MissionSet) -> list[Judge]:
+    """Returns the worlds of missions in C MuJoCo, each with a probe of the drone's radius."""
+    return [load_judge(mujoco.MjSpec.from_string(text), config.drone.body_radius_m) for text in missions.mjcf()]

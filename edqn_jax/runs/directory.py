@@ -221,6 +221,19 @@ class RunDirectory:
         """Returns the lines of `metrics.jsonl`."""
         return [json.loads(line) for line in self.metrics_file.read_text(encoding="utf-8").splitlines()]
 
+    def read_trajectory(self) -> dict[str, np.ndarray]:
+        """Returns the columns of `trajectory.csv`, each [T].
+
+        Raises:
+            ValueError: if it has other columns, or something that is no number.
+        """
+        with self.trajectory_file.open(encoding="utf-8", newline="") as file:
+            header, *rows = csv.reader(file)
+        if tuple(header) != TRAJECTORY_COLUMNS or not rows:
+            raise ValueError("it does not have the columns of a flight")
+        table = np.array(rows, dtype=np.float64)
+        return dict(zip(TRAJECTORY_COLUMNS, table.T, strict=True))
+
     def read_episodes(self) -> dict[str, np.ndarray]:
         """Returns the columns of `episodes.csv`, each [episodes]."""
         with self.episodes_file.open(encoding="utf-8", newline="") as file:

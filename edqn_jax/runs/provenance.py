@@ -8,7 +8,7 @@ import hashlib
 import inspect
 import platform
 import re
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -54,10 +54,17 @@ def versions() -> dict[str, str]:
 
 def state_digest(state: TrainState) -> str:
     """Returns the SHA-256 of the train state's leaves in pytree order; every process must call this."""
+    leaves = (
+        jax.random.key_data(leaf) if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key) else leaf
+        for leaf in jax.tree.leaves(state)
+    )
+    return digest_of(np.asarray(processes.fetch(leaf)) for leaf in leaves)
+
+
+def digest_of(arrays: Iterable[np.ndarray]) -> str:
+    """Returns the SHA-256 of arrays with their shapes and types, in this order."""
     digest = hashlib.sha256()
-    for leaf in jax.tree.leaves(state):
-        raw = jax.random.key_data(leaf) if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key) else leaf
-        array = processes.fetch(raw)
+    for array in arrays:
         digest.update(f"{array.dtype}{array.shape}".encode())
         digest.update(array.tobytes())
     return digest.hexdigest()

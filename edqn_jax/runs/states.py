@@ -73,7 +73,9 @@ def save(folder: Path, step: int, checkpoint: Checkpoint, keep: int) -> Path:
     return place
 
 
-def newest(folder: Path, usable: Callable[[Checkpoint], None], message: Callable[[str], None]) -> Checkpoint | None:
+def newest(
+    folder: Path, usable: Callable[[Checkpoint], None], message: Callable[[str], None], *, set_aside: bool = True
+) -> Checkpoint | None:
     """Returns the newest checkpoint that is undamaged and usable; None if there never was one.
 
     Damaged ones are renamed, so that nothing of them is read again; others are passed over.
@@ -81,7 +83,8 @@ def newest(folder: Path, usable: Callable[[Checkpoint], None], message: Callable
     Args:
         folder: a run's `checkpoints/`.
         usable: raises ConfigError if a checkpoint cannot be used because of what it depends on.
-        message: told of each that is set aside.
+        message: told of each that is set aside or passed over.
+        set_aside: whether damaged ones are renamed.
 
     Raises:
         ConfigError: if there are some and none can be used.
@@ -92,7 +95,8 @@ def newest(folder: Path, usable: Callable[[Checkpoint], None], message: Callable
             usable(checkpoint)
             return checkpoint
         except DamagedError as error:
-            _set_aside(place)
+            if set_aside:
+                _set_aside(place)
             message(f"the checkpoint after training step {step:,} is set aside: {error}")
         except ConfigError as error:
             message(f"the checkpoint after training step {step:,} is passed over: {error}")

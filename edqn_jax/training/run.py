@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import time
 from collections.abc import Sequence
 from typing import Any
@@ -13,7 +12,7 @@ import numpy as np
 
 from edqn_jax.config import DENSITIES, Config
 from edqn_jax.errors import ConfigError, StoppedError
-from edqn_jax.evaluation.metrics import clearance_text, flight_summary, summarise
+from edqn_jax.evaluation.metrics import clearance_text, flight_summary
 from edqn_jax.evaluation.trajectories import trajectory
 from edqn_jax.learn import saved_state
 from edqn_jax.learn.plan import Plan
@@ -24,12 +23,12 @@ from edqn_jax.report.progress import Progress, clock
 from edqn_jax.report.sights import Sights
 from edqn_jax.runs import world_copy
 from edqn_jax.runs.directory import TO_BE_DRAWN, RunDirectory
-from edqn_jax.runs.provenance import reward_record, state_digest, versions, workload
+from edqn_jax.runs.provenance import state_digest
 from edqn_jax.sim.flights import Flights
 from edqn_jax.sim.reward import Reward
+from edqn_jax.training import summaries
 from edqn_jax.training.keeper import Keeper
 from edqn_jax.training.loop import Chunk, Preparation, Standing, TrainingResult, prepared, run_chunks
-from edqn_jax.training.selection import first_success
 from edqn_jax.training.stopping import Stop
 
 
@@ -72,7 +71,7 @@ def train_run(
         sights = None if run is None else sights_of(preparation)
         flights = preparation.fly(preparation.missions[0].final, result.policy.params)
         digest = state_digest(needed(preparation.trainer, result))  # the last that all processes do together
-        summary = summary_of(preparation, result, flights, digest, reward) | keeper.facts
+        summary = summaries.of_run(preparation, result, flights, digest, reward) | keeper.facts
         if run is not None and sights is not None:
             progress.phase("drawing")
             finish(run, preparation, sights, result, flights, summary, progress)
@@ -158,42 +157,6 @@ def record(run: RunDirectory | None, chunk: Chunk) -> None:
 
 def where_saved(run: RunDirectory | None) -> str:
     return "the first process saves the policy" if run is None else f"the policy is in '{run.checkpoints}'"
-
-
-def summary_of(
-    preparation: Preparation, result: TrainingResult, flights: Flights, digest: str, reward: Reward | None
-) -> dict[str, Any]:
-    """Returns the content of `summary.json`."""
-    config = result.policy.config
-    since = first_success(result.history.validations)
-    summary = {
-        **flight_summary(flights),
-        "shortest_path_m": preparation.shortest.length_m,
-        "world": config.world.name,
-        "flown": config.world.flown or config.world.name,
-        "seed": config.train.seed,
-        "train_decisions": result.decisions,
-        "train_seconds": result.train_seconds,
-        "compile_seconds": result.compile_seconds,
-        "total_seconds": time.perf_counter() - preparation.began,
-        "decisions_per_second": result.decisions / result.train_seconds,
-        "episodes": result.history.episode_count,
-        "first_success_decisions": since[0],
-        "first_success_seconds": since[1],
-        "validation_success": result.kept.success,
-        "validation_spl": result.kept.spl,
-        "parameters_from_decisions": result.kept.decisions,
-        "reward": reward_record(config, reward),
-        "workload": workload(config, preparation.missions[0].training.scene()),
-        "devices": [str(device) for device in preparation.devices],
-        "versions": versions(),
-        "state_digest": digest,
-        "figures": "drawn",  # by the time that anybody reads it
-    }
-    tests = preparation.missions[0].tests
-    if tests:
-        summary["test"] = summarise(jax.tree.map(lambda x: x[-tests:], dataclasses.replace(flights, record=None)))
-    return summary
 
 
 def sights_of(preparation: Preparation) -> Sights:

@@ -6,21 +6,17 @@ import contextlib
 import time
 from typing import Any
 
-import numpy as np
-
 from edqn_jax.config import Config
 from edqn_jax.errors import StoppedError
-from edqn_jax.evaluation.intervals import interquartile_mean, rate_interval
 from edqn_jax.parallel import processes
 from edqn_jax.report.progress import Progress, clock
 from edqn_jax.runs.directory import RunDirectory
 from edqn_jax.runs.provenance import state_digest
-from edqn_jax.sim.flights import Flights
-from edqn_jax.sim.outcomes import Outcome
 from edqn_jax.sim.reward import Reward
+from edqn_jax.training import summaries
 from edqn_jax.training.keeper import Keeper
 from edqn_jax.training.loop import prepared, run_chunks
-from edqn_jax.training.run import described, finish, needed, opened, record, sights_of, summary_of, trained_in, unseen
+from edqn_jax.training.run import described, finish, needed, opened, record, sights_of, trained_in, unseen
 from edqn_jax.training.stopping import Stop
 
 
@@ -68,12 +64,13 @@ def train_seeds_run(
         state = needed(preparation.trainer, results[0])
         digests = [state_digest(preparation.trainer.of_agent(state, k)) for k in agents]
         together = {"trained_together": seeds, **keeper.facts}
-        summaries = [summary_of(preparation, results[k], flights[k], digests[k], reward) | together for k in agents]
-        whole = _summary_of_all(config, preparation.missions[0].tests, flights, summaries)
+        of_each = [summaries.of_run(preparation, results[k], flights[k], digests[k], reward) | together for k in agents]
+        began = {"total_seconds": of_each[0]["total_seconds"]}
+        whole = summaries.of_all_seeds(config, preparation.missions[0].tests, flights, of_each) | began
         if run is not None:
             progress.phase("drawing")
             sights = sights_of(preparation)
-            for folder, result, flown, summary in zip(folders, results, flights, summaries, strict=True):
+            for folder, result, flown, summary in zip(folders, results, flights, of_each, strict=True):
                 assert folder is not None
                 finish(folder, preparation, sights, result, flown, summary, progress)
             whole["total_seconds"] = time.perf_counter() - preparation.began
@@ -81,29 +78,6 @@ def train_seeds_run(
             progress.stop()
             progress.message(_verdict(whole, run))
     return whole
-
-
-def _summary_of_all(
-    config: Config, tests: int, flights: list[Flights], summaries: list[dict[str, Any]]
-) -> dict[str, Any]:
-    """Returns what the seeds say together: in random worlds of all test missions, elsewhere of the one mission."""
-    arrived = np.array([np.asarray(flown.outcome) == Outcome.GOAL for flown in flights])
-    arrived = arrived[:, -tests:] if tests else arrived[:, :1]
-    rates = arrived.mean(axis=1)
-    return {
-        "world": config.world.name,
-        "flown": summaries[0]["flown"],
-        "flown_successes": sum(summary["success"] for summary in summaries),
-        "seeds": [summary["seed"] for summary in summaries],
-        "missions": arrived.shape[1],
-        "success_rates": rates.tolist(),
-        "success_iqm": interquartile_mean(rates),
-        "success_mean": float(rates.mean()),
-        "success_interval": list(rate_interval(arrived)),
-        "train_decisions": summaries[0]["train_decisions"],
-        "train_seconds": summaries[0]["train_seconds"],
-        "total_seconds": summaries[0]["total_seconds"],
-    }
 
 
 def _verdict(summary: dict[str, Any], run: RunDirectory) -> str:

@@ -12,7 +12,9 @@ from collections.abc import Iterator
 import pytest
 
 from edqn_jax.cli.signals import ONE_S
-from tests.processes import PATIENCE_S
+
+SOON_S = 60
+"""Seconds after which a process that should have ended at once hangs."""
 
 WORK = """
 import hashlib, sys, threading
@@ -48,7 +50,7 @@ def working(phase: str) -> Iterator[subprocess.Popen[str]]:
 def test_the_first_signal_ends_what_has_nothing_to_save(number: int, code: int, says: str) -> None:
     with working("alone") as process:
         process.send_signal(number)
-        assert process.communicate(timeout=PATIENCE_S) == ("", f"edqn: {says}\n")
+        assert process.communicate(timeout=SOON_S) == ("", f"edqn: {says}\n")
     assert process.returncode == code
 
 
@@ -61,5 +63,5 @@ def test_a_second_signal_ends_what_obeys_the_first() -> None:
         time.sleep(1.5 * ONE_S)
         assert process.poll() is None
         process.send_signal(signal.SIGINT)
-        assert process.communicate(timeout=PATIENCE_S)[1] == "edqn: interrupted\n"
+        assert process.communicate(timeout=SOON_S)[1] == "edqn: interrupted\n"
     assert process.returncode == 130

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
+import shutil
 from pathlib import Path
 from typing import Literal
 
@@ -18,6 +19,7 @@ from edqn_jax.cli.evaluate import evaluate_command
 from edqn_jax.config import CameraConfig, Config, TrainConfig, WorldConfig
 from edqn_jax.errors import ConfigError, StoppedError
 from edqn_jax.evaluation.missions import run_missions
+from edqn_jax.evaluation.rollouts import fly_on_all_devices
 from edqn_jax.learn import trainer
 from edqn_jax.learn.plan import Plan
 from edqn_jax.learn.policy import PolicyParams
@@ -28,6 +30,7 @@ from edqn_jax.runs.policies import load_run
 from edqn_jax.training.run import train_run
 from edqn_jax.training.selection import Candidate, choose, first_success, is_due
 from edqn_jax.training.stopping import Stop
+from edqn_jax.training.verify import verify
 from tests.learn.test_trainer import CONFIG as SMALL
 from tests.miniature import WORLD as MINIATURE_WORLD
 from tests.miniature import no_losses
@@ -84,6 +87,47 @@ def test_a_run_is_evaluated_and_says_what_was_flown(whole: tuple[RunDirectory, d
     assert (found["run"], found["versions"]) == (str(run.path), summary["versions"])
     sealed = run.checkpoints / "policy" / "manifest.json"
     assert found["policy_sha256"] == hashlib.sha256(sealed.read_bytes()).hexdigest()
+
+
+@pytest.mark.slow
+def test_a_run_is_verified_and_what_was_changed_in_it_is_found(
+    whole: tuple[RunDirectory, dict], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    findings = verify(whole[0].path)
+    assert [finding for finding in findings if not finding.right] == []
+    changed = RunDirectory(tmp_path / "changed")
+    shutil.copytree(whole[0].path, changed.path)
+    # The flights do not change: they need not be flown a third time.
+    flown = fly_on_all_devices(CONFIG, run_missions(CONFIG).final.world, load_run(changed.path)[1], 0, record=True)
+    monkeypatch.setattr("edqn_jax.training.verify.fly_on_all_devices", lambda *_, **__: flown)
+
+    def wrong() -> set[str]:
+        return {finding.what for finding in verify(changed.path) if finding.right is False}
+
+    assert wrong() == set()
+    rewrite(changed.summary_file, '"path_length_m": ', '"path_length_m": 1')
+    assert wrong() == {"summary.json from trajectory.csv"}
+    rewrite(changed.metrics_file, '"validation_spl": ', '"validation_spl": 1')
+    rewrite(changed.episodes_file, "collision", "goal")
+    assert wrong() == {
+        *("summary.json from trajectory.csv", "summary.json from metrics.jsonl", "episodes.csv and metrics.jsonl")
+    }
+    *lines, last = changed.trajectory_file.read_text().splitlines()
+    t, _, *others = last.split(",")
+    changed.trajectory_file.write_text("\n".join([*lines, ",".join([t, "9.5", *others])]) + "\n")
+    rewrite(changed.summary_file, '"state_digest": "', '"state_digest": "0')
+    assert {"the flight, flown again", "last checkpoint"} <= wrong()
+    shutil.rmtree(changed.checkpoints / "step-000000032")
+    assert "last checkpoint" not in wrong()  # there is nothing left to compare
+    rewrite(changed.summary_file, '"figures": "drawn"', '"figures": "to be drawn"')
+    with pytest.raises(ConfigError, match="is not finished; edqn train --run-dir"):
+        verify(changed.path)
+
+
+def rewrite(file: Path, old: str, new: str) -> None:
+    text = file.read_text()
+    assert old in text
+    file.write_text(text.replace(old, new, 1))
 
 
 @pytest.mark.slow

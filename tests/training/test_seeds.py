@@ -21,6 +21,7 @@ from edqn_jax.training.history import mean_metrics
 from edqn_jax.training.loop import train, train_seeds
 from edqn_jax.training.seeds import train_seeds_run
 from edqn_jax.training.stopping import Stop
+from edqn_jax.training.verify import verify
 from tests.miniature import WORLD as MINIATURE_WORLD
 from tests.training.test_loop import SMALL
 from tests.training.test_run import FIGURES
@@ -60,6 +61,13 @@ def test_each_seed_leaves_a_run_and_all_of_them_a_summary(runs: tuple[RunDirecto
         assert {file.stem for file in own.figures.glob("*.png")} == FIGURES  # this sensor shows nothing
     first, second = (run.of_seed(seed).read_episodes()["return"][:8] for seed in (0, 1))
     assert not np.array_equal(first, second)
+
+
+@pytest.mark.slow
+def test_the_runs_of_all_seeds_are_verified(runs: tuple[RunDirectory, dict]) -> None:
+    findings = verify(runs[0].path)
+    assert [finding for finding in findings if not finding.right] == []
+    assert {"seed-1: the test worlds, flown again", "summary.json of all seeds"} < {each.what for each in findings}
 
 
 @pytest.mark.slow

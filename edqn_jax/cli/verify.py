@@ -1,0 +1,46 @@
+"""`edqn verify`: a finished run, derived, flown and judged again."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+
+from rich.console import Console
+from rich.table import Table
+
+from edqn_jax.cli.arguments import VerifyArgs
+from edqn_jax.errors import CheckError
+from edqn_jax.runs.files import check_can_write, write_atomically
+from edqn_jax.training.verify import Finding, verify
+
+
+def verify_command(args: VerifyArgs) -> None:
+    """Runs `edqn verify` with these arguments.
+
+    Raises:
+        CheckError: if something is not as it was recorded.
+        ConfigError: if there is no finished run, or the file to write cannot be written.
+    """
+    if args.json is not None:
+        check_can_write(args.json)
+    console = Console()
+    findings = verify(args.run, lambda text: console.print(text, soft_wrap=True, markup=False, highlight=False))
+    console.print(report(findings))
+    if args.json is not None:
+        found = {"run": str(args.run), "findings": [dataclasses.asdict(finding) for finding in findings]}
+        write_atomically(args.json, json.dumps(found, indent=2) + "\n")
+    wrong = sum(finding.right is False for finding in findings)
+    if wrong:
+        raise CheckError(f"{wrong} of {len(findings)} things in '{args.run}' are not as they were recorded")
+
+
+def report(findings: list[Finding]) -> Table:
+    """Returns the findings as a table for people."""
+    table = Table(title_justify="left")
+    table.add_column("verified")
+    table.add_column("found")
+    table.add_column("")
+    marks = {True: "✓", False: "✗", None: "–"}
+    for finding in findings:
+        table.add_row(finding.what, finding.says, marks[finding.right], style="red" if finding.right is False else None)
+    return table
