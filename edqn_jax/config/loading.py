@@ -28,6 +28,12 @@ Layer = Mapping[str, Mapping[str, Any]]
 Hardware = Literal["cpu", "gpu"]
 """What defaults are chosen for."""
 
+MOST_BYTES = 1_000_000
+"""Of a file of options that is worth reading."""
+
+MOST_SHOWN = 80
+"""Characters of a word that a message repeats."""
+
 WORLD = "medium"
 """World of the `default` preset where nothing names one."""
 
@@ -181,13 +187,17 @@ def load_layer(file: Path) -> Layer:
     """Returns the layer that a YAML file holds; {} for an empty file.
 
     Raises:
-        ConfigError: if it cannot be read, is not YAML, or names a key twice.
+        ConfigError: if it cannot be read, is too large, is not YAML, or names a key twice.
     """
     try:
-        text = file.read_text(encoding="utf-8")
+        with file.open("rb") as opened:
+            held = opened.read(MOST_BYTES + 1)
+        text = held.decode("utf-8")
     except (OSError, UnicodeDecodeError) as error:
         reason = getattr(error, "strerror", None) or "it is not UTF-8 text"
         raise ConfigError(f"cannot read the configuration file '{file}': {reason}") from None
+    if len(held) > MOST_BYTES:
+        raise ConfigError(f"'{file}' has more than {MOST_BYTES:,} bytes, so it is no file of options")
     return parse_layer(text, f"'{file}'")
 
 
@@ -227,7 +237,7 @@ def apply(config: Config, layer: Layer, source: str) -> Config:
         if group not in groups:
             owners = [f"'{name}:'" for name in groups if str(group) in _keys(getattr(config, name))]
             hint = f"; it belongs under {' or '.join(owners)}" if owners else nearest(group, groups)
-            raise ConfigError(f"{source}: there is no group '{group}'{hint}")
+            raise ConfigError(f"{source}: there is no group '{_cut(group)}'{hint}")
         if not isinstance(values, Mapping):
             raise ConfigError(
                 f"{source}: '{group}' must hold keys such as '{_example(config, group)}', not {_describe(values)}"
@@ -236,7 +246,7 @@ def apply(config: Config, layer: Layer, source: str) -> Config:
         hints = typing.get_type_hints(type(section))
         for key in values:
             if key not in hints:
-                raise ConfigError(f"{source}: there is no key '{group}.{key}'{nearest(key, hints)}")
+                raise ConfigError(f"{source}: there is no key '{group}.{_cut(key)}'{nearest(key, hints)}")
         checked = {key: typed(value, hints[key], f"{source}: '{group}.{key}'") for key, value in values.items()}
         changed[group] = dataclasses.replace(section, **checked)
     return dataclasses.replace(config, **changed)
@@ -295,7 +305,7 @@ class _StrictLoader(yaml.SafeLoader):
             key = key_node.value
             if key in seen:
                 raise yaml.constructor.ConstructorError(
-                    problem=f"the key '{key}' is given twice", problem_mark=key_node.start_mark
+                    problem=f"the key '{_cut(key)}' is given twice", problem_mark=key_node.start_mark
                 )
             seen.add(key)
         return super().construct_mapping(node, deep)
@@ -336,4 +346,10 @@ def _describe(value: Any) -> str:
         return "a group of keys"
     if isinstance(value, list | tuple):
         return f"a list of {len(value)}"
-    return f"the text '{value}'" if isinstance(value, str) else shown(value)
+    return f"the text '{_cut(value)}'" if isinstance(value, str) else shown(value)
+
+
+def _cut(word: object) -> str:
+    """Returns a word of a file as text, the beginning alone of one that is very long."""
+    text = str(word)
+    return text if len(text) <= MOST_SHOWN else f"{text[:MOST_SHOWN]}…"

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import shutil
-from collections.abc import Mapping
+import sys
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -69,7 +71,8 @@ def read(folder: Path) -> Any:
         described = handler.metadata(folder).tree  # pyright: ignore[reportArgumentType]
         restored = jax.tree.map(lambda _: ocp.RestoreArgs(restore_type=np.ndarray), described, is_leaf=_is_leaf)
         _check_sizes(folder, described)
-        return reader.restore(folder, args=ocp.args.PyTreeRestore(restore_args=restored))
+        with _without_echo():
+            return reader.restore(folder, args=ocp.args.PyTreeRestore(restore_args=restored))
     except (OSError, ValueError, KeyError, TypeError, AttributeError, RuntimeError) as error:
         raise ConfigError(f"'{folder}' cannot be read: {_short(error)}") from None
 
@@ -89,6 +92,24 @@ def _check_space(folder: Path, needed: int) -> None:
         raise ConfigError(
             f"'{folder}' has {free / 1e6:,.0f} MB of free space, and {(needed + _SPARE) / 1e6:,.0f} MB are needed"
         )
+
+
+@contextlib.contextmanager
+def _without_echo() -> Iterator[None]:
+    """Within the block, and after an error in it, reads that end after the first error say nothing.
+
+    Orbax reads all arrays at a time and closes its loop at the first that fails; each of the others, when its thread
+    ends, then prints a trace of its own.
+    """
+    before = sys.unraisablehook
+
+    def hook(said: Any) -> None:
+        if not (isinstance(said.exc_value, RuntimeError) and str(said.exc_value) == "Event loop is closed"):
+            before(said)
+
+    sys.unraisablehook = hook
+    yield
+    sys.unraisablehook = before
 
 
 def _check_sizes(folder: Path, described: Any) -> None:

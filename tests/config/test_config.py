@@ -148,6 +148,11 @@ def test_a_missing_file_is_named(tmp_path):
         resolve(file=tmp_path / "nowhere.yaml")
 
 
+def test_a_file_without_end_is_not_read_to_its_end():
+    with pytest.raises(ConfigError, match="'/dev/zero' has more than 1,000,000 bytes, so it is no file of options"):
+        resolve("default", Path("/dev/zero"))
+
+
 def test_a_file_that_is_not_text_is_named(tmp_path):
     file = tmp_path / "picture.yaml"
     file.write_bytes(b"\xff\xfe\x00\x80")

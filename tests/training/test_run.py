@@ -120,7 +120,7 @@ def test_a_run_is_verified_and_what_was_changed_in_it_is_found(
     shutil.rmtree(changed.checkpoints / "step-000000032")
     assert "last checkpoint" not in wrong()  # there is nothing left to compare
     rewrite(changed.summary_file, '"figures": "drawn"', '"figures": "to be drawn"')
-    with pytest.raises(ConfigError, match="is not finished; edqn train --run-dir"):
+    with pytest.raises(ConfigError, match="is not finished; continue it with edqn train"):
         verify(changed.path)
 
 
