@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import contextlib
+import logging
+import os
+import re
 import shutil
 import sys
 from collections.abc import Iterator, Mapping
@@ -41,7 +44,8 @@ def write(
     try:
         folder.parent.mkdir(parents=True, exist_ok=True)
         _check_space(folder.parent, sum(leaf.nbytes for leaf in jax.tree.leaves(tree)))
-        _alone()[1].save(folder, args=ocp.args.PyTreeSave(tree))
+        with _without_traces():
+            _alone()[1].save(folder, args=ocp.args.PyTreeSave(tree))
         for name, text in (texts or {}).items():
             write_atomically(folder / name, text)
         manifest.seal(folder, dict(facts or {}))
@@ -71,7 +75,7 @@ def read(folder: Path) -> Any:
         described = handler.metadata(folder).tree  # pyright: ignore[reportArgumentType]
         restored = jax.tree.map(lambda _: ocp.RestoreArgs(restore_type=np.ndarray), described, is_leaf=_is_leaf)
         _check_sizes(folder, described)
-        with _without_echo():
+        with _without_traces():
             return reader.restore(folder, args=ocp.args.PyTreeRestore(restore_args=restored))
     except (OSError, ValueError, KeyError, TypeError, AttributeError, RuntimeError) as error:
         raise ConfigError(f"'{folder}' cannot be read: {_short(error)}") from None
@@ -95,20 +99,25 @@ def _check_space(folder: Path, needed: int) -> None:
 
 
 @contextlib.contextmanager
-def _without_echo() -> Iterator[None]:
-    """Within the block, and after an error in it, reads that end after the first error say nothing.
+def _without_traces() -> Iterator[None]:
+    """Within the block Orbax prints no traces of errors that it raises as well; nor do, after one, its other threads.
 
-    Orbax reads all arrays at a time and closes its loop at the first that fails; each of the others, when its thread
-    ends, then prints a trace of its own.
+    Orbax reads and writes all arrays at a time and closes its loop at the first that fails; each of the others, when
+    its thread ends, then prints a trace of its own.
     """
-    before = sys.unraisablehook
+    before, logger = sys.unraisablehook, logging.getLogger("absl")
+    level = logger.level
 
     def hook(said: Any) -> None:
         if not (isinstance(said.exc_value, RuntimeError) and str(said.exc_value) == "Event loop is closed"):
             before(said)
 
     sys.unraisablehook = hook
-    yield
+    logger.setLevel(logging.CRITICAL)
+    try:
+        yield
+    finally:
+        logger.setLevel(level)
     sys.unraisablehook = before
 
 
@@ -133,4 +142,8 @@ def _is_leaf(node: Any) -> bool:
 
 
 def _short(error: Exception) -> str:
+    """Returns what an error of TensorStore says: of the system's ones, what the system says."""
+    system = re.search(r"os_error_code='(\d+)'", str(error))
+    if system is not None:
+        return os.strerror(int(system[1]))
     return " ".join(str(error).split())[:200] or type(error).__name__
