@@ -98,15 +98,20 @@ def _check_space(folder: Path, needed: int) -> None:
         )
 
 
+def _not_of_orbax(record: logging.LogRecord) -> bool:
+    return "orbax" not in record.getMessage()
+
+
 @contextlib.contextmanager
 def _without_traces() -> Iterator[None]:
     """Within the block Orbax prints no traces of errors that it raises as well; nor do, after one, its other threads.
 
     Orbax reads and writes all arrays at a time and closes its loop at the first that fails; each of the others, when
-    its thread ends, then prints a trace of its own.
+    its thread ends or its task is collected, then prints a trace of its own.
     """
     before, logger = sys.unraisablehook, logging.getLogger("absl")
     level = logger.level
+    logging.getLogger("asyncio").addFilter(_not_of_orbax)  # the same function is added once
 
     def hook(said: Any) -> None:
         if not (isinstance(said.exc_value, RuntimeError) and str(said.exc_value) == "Event loop is closed"):
