@@ -3,6 +3,11 @@
 from __future__ import annotations
 
 
+def sentence(error: Exception) -> str:
+    """Returns what an error says in one line, with escapes in place of what no line can show, as in names of files."""
+    return "".join(c if c.isprintable() else repr(c)[1:-1] for c in str(error))
+
+
 class ConfigError(ValueError):
     """The input is invalid; the message names what is wrong and what would be right."""
 

@@ -13,8 +13,9 @@ import numpy as np
 
 from edqn_jax.config import DENSITIES, Config
 from edqn_jax.parallel.devices import cores, processor
-from edqn_jax.planners.astar import NoPathError, shortest_path
+from edqn_jax.planners.astar import shortest_path
 from edqn_jax.planners.follow import FollowConfig, compiled_follower, reserved, sampled
+from edqn_jax.planners.lattice import NoPathError
 from edqn_jax.planners.planner import Budget, Task, load_planner
 from edqn_jax.runs.provenance import workload
 from edqn_jax.sim import worlds

@@ -22,7 +22,7 @@ from edqn_jax.cli.arguments import (
 from edqn_jax.cli.signals import Stops
 from edqn_jax.cli.train import train_command
 from edqn_jax.config.loading import nearest
-from edqn_jax.errors import CheckError, ConfigError, DivergedError, StoppedError
+from edqn_jax.errors import CheckError, ConfigError, DivergedError, StoppedError, sentence
 
 DONE = 0
 FAILED = 1
@@ -58,7 +58,7 @@ def _dispatched(argv: list[str], stops: Stops) -> int:
     except SystemExit as ending:  # tyro has printed the help, or what is wrong
         return int(ending.code or DONE)
     except (CheckError, ConfigError, DivergedError, StoppedError) as ending:
-        print(f"edqn: {ending}", file=sys.stderr)
+        print(f"edqn: {sentence(ending)}", file=sys.stderr)
         if isinstance(ending, StoppedError):  # by a signal to this process, or to another of the cluster
             return BY_SIGNAL + (stops.number or signal.SIGTERM)
         if isinstance(ending, CheckError):

@@ -9,7 +9,8 @@ import jax
 import numpy as np
 
 from edqn_jax.config import Config
-from edqn_jax.planners.astar import NoPathError, shortest_path
+from edqn_jax.planners.astar import shortest_path
+from edqn_jax.planners.lattice import NoPathError
 from edqn_jax.sim.env import World
 from edqn_jax.sim.flights import Flights
 from edqn_jax.sim.outcomes import Outcome

@@ -14,6 +14,7 @@ import numpy as np
 from edqn_jax.config import DENSITIES, Config
 from edqn_jax.errors import ConfigError
 from edqn_jax.planners.astar import shortest_path
+from edqn_jax.planners.free_space import reachable
 from edqn_jax.random import run_streams
 from edqn_jax.sim import drone, worlds
 from edqn_jax.sim.env import World
@@ -159,20 +160,37 @@ def _file_run_missions(config: Config, training_key: jax.Array, validation_key: 
     airframe, file = drone.load_airframe(config.drone), resolve_world(name)
     pool = _pool_of(name, config)
     spread, jitter = config.world.own_start_fraction, config.world.start_jitter_m
-    training = worlds.spread_missions(pool, config.world.missions, spread, jitter, training_key)
+    cells, note = _with_a_way(pool, config, name)
+    training = worlds.spread_missions(pool, config.world.missions, spread, jitter, training_key, cells)
     # Half of the validation begins near the start, but never at it.
     near = max(jitter, 0.5)
-    validation = worlds.spread_missions(pool, count, 0.5, near, validation_key)
+    validation = worlds.spread_missions(pool, count, 0.5, near, validation_key, cells)
     own = worlds.own_missions(pool)
     final = jax.tree.map(lambda one, many: jnp.concatenate([one, many[1:]]), own, validation)
     final = dataclasses.replace(final, scene=final.scene.astype(jnp.int32))
     return RunMissions(
-        training=MissionSet(name, World(airframe, pool, training), file),
+        training=MissionSet(name, World(airframe, pool, training), file, note),
         validation=MissionSet(name, World(airframe, pool, validation), file),
         final=MissionSet(name, World(airframe, pool, final), file),
         near_start=_near(validation, np.asarray(pool.start[0]), near),
         tests=0,
     )
+
+
+def _with_a_way(pool: Scene, config: Config, name: str) -> tuple[worlds.Cells | None, str | None]:
+    """Returns the cells of the pool's only world that have a way to its goal, and how many have none.
+
+    Returns:
+        (None, None) where there is a way from everywhere.
+
+    Raises:
+        ConfigError: if the world is too large to search it.
+    """
+    found = reachable(take_scene(pool, 0), config.drone.body_radius_m)
+    if found.lost == 0.0:
+        return None, None
+    cells = worlds.cells_of(take_scene(pool, 0), found.is_way, found.corner, found.edge_m)
+    return cells, f"{found.lost:.0%} of the free space of '{name}' has no way to the goal: no mission begins there"
 
 
 def _near(missions: Missions, start: np.ndarray, jitter_m: float) -> np.ndarray:
@@ -261,8 +279,9 @@ def _file_missions(config: Config, name: str, missions: int, seed: int, moved: d
     standing = dataclasses.replace(scene, start=worlds.free_point(scene, probe_key))
     check_scene(standing, radius, names=loaded.names, title=f"'{name}'")
     pool = stack_scenes([scene])
-    many = worlds.spread_missions(pool, missions, 0.0, 0.0, missions_key)
-    return MissionSet(name, World(airframe, pool, many), file, note)
+    cells, said = _with_a_way(pool, config, name)
+    many = worlds.spread_missions(pool, missions, 0.0, 0.0, missions_key, cells)
+    return MissionSet(name, World(airframe, pool, many), file, " ".join(filter(None, (note, said))) or None)
 
 
 def _box(scene: Scene) -> str:

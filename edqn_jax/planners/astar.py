@@ -18,32 +18,23 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import functools
-import itertools
 import math
 import sys
 import time
 from collections.abc import Callable
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
 from edqn_jax.config import DENSITIES, Config
 from edqn_jax.errors import ConfigError
+from edqn_jax.planners.lattice import STEPS, Lattice, NoPathError, leg_touches
 from edqn_jax.planners.planner import path_length, point_text
 from edqn_jax.sim.mjcf import check_scene, load_world, resolve_world
-from edqn_jax.sim.scene import Scene, segment_contact, signed_distance
+from edqn_jax.sim.scene import Scene
 from edqn_jax.sim.worlds import random_scene, world_key
 
-_STEPS = np.array([step for step in itertools.product((-1, 0, 1), repeat=3) if any(step)])  # [26, 3]
 _SLACK = 1.0  # a batch holds entries up to this many cells above the best: fewer batches, a few cells too many
-_STRIDE = 0.02  # metres; undetected penetration of at most 0.01^2 / 2 r = 0.14 mm
-_LANES = (64, 512, 4096, 32768)  # batches are padded to one of these, to compile few programs
-
-
-class NoPathError(ConfigError):
-    """There is no path from start to goal; the message says why."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -67,7 +58,7 @@ def shortest_path(
         NoPathError: if there is no path, or the sphere does not fit at the start or the goal.
     """
     start, goal = np.asarray(start, np.float64), np.asarray(goal, np.float64)
-    lattice = _Lattice(scene, start, radius, cell)
+    lattice = Lattice(scene, start, radius, cell)
     for role, point in (("start", start), ("goal", goal)):
         if not np.all((point >= lattice.lower) & (point <= lattice.upper)):
             raise NoPathError(f"there is no path: the {role} {point_text(point)} lies outside the flight volume")
@@ -81,75 +72,18 @@ def shortest_path(
     last = float(np.linalg.norm(goal - points[-1]))
     if last > 0.0:
         points = np.concatenate([points, goal[None]])
-    tight = shorten(points, functools.partial(_leg_touches, scene, radius=radius))
+    tight = shorten(points, functools.partial(leg_touches, scene, radius=radius))
     return Path(tight, path_length(tight), length + last)
 
 
-class _Lattice:
-    """Cells of the volume by flat index, with the distances computed so far."""
-
-    def __init__(self, scene: Scene, start: np.ndarray, radius: float, cell: float):
-        self.scene, self.radius, self.cell, self.start = scene, radius, cell, start
-        self.lower, self.upper = np.asarray(scene.volume, np.float64)
-        # Rounded up a little: float32 may put a point on the boundary just outside the volume.
-        self.origin = np.floor((start - self.lower) / cell + 1e-5).astype(np.int64)
-        self.shape = self.origin + np.floor((self.upper - start) / cell + 1e-5).astype(np.int64) + 1
-        self.distance = np.full(int(np.prod(np.maximum(self.shape, 1))), np.nan, np.float32)
-
-    def flat(self, index: np.ndarray) -> np.ndarray:
-        return (index[..., 0] * self.shape[1] + index[..., 1]) * self.shape[2] + index[..., 2]
-
-    def index(self, flat: np.ndarray) -> np.ndarray:
-        return np.stack(np.unravel_index(flat, tuple(self.shape)), axis=-1)
-
-    def middle(self, flat: np.ndarray) -> np.ndarray:
-        return self.start + self.cell * (self.index(flat) - self.origin)
-
-    def distances(self, points: np.ndarray) -> np.ndarray:
-        return _batched(_signed_distances, self.scene, points)
-
-    def compute_distances(self, cells: np.ndarray) -> None:
-        """Computes the distances of those cells that are not known yet."""
-        unknown = np.unique(cells[np.isnan(self.distance[cells])])
-        if unknown.size:
-            self.distance[unknown] = self.distances(self.middle(unknown))
-
-    def passable(self, origins: np.ndarray, cells: np.ndarray, lengths: np.ndarray) -> np.ndarray:
-        """Returns whether the sphere fits at `cells` [E] and passes from `origins` [E] to them, [E] bool."""
-        self.compute_distances(cells)
-        passable = self.distance[cells] >= self.radius
-        # The distance changes by at most one metre per metre, which proves most edges free.
-        slack = self.distance[origins] + self.distance[cells] - lengths - 2 * self.radius
-        narrow = np.flatnonzero(passable & (slack < 0))
-        if narrow.size:
-            ends = np.concatenate([self.middle(origins[narrow]), self.middle(cells[narrow])], axis=1)
-            passable[narrow] = ~_batched(_touches, self.scene, ends, self.radius + edge_margin(self.cell, self.radius))
-        return passable
-
-    def cell_near(self, point: np.ndarray) -> int:
-        """Returns the nearest cell from which the sphere passes straight to the point.
-
-        Raises:
-            NoPathError: if there is none.
-        """
-        base = np.floor((point - self.start) / self.cell + 1e-5).astype(np.int64) + self.origin
-        corners = base + np.array(list(itertools.product((0, 1), repeat=3)))
-        corners = corners[np.all((corners >= 0) & (corners < self.shape), axis=1)]
-        middles = self.start + self.cell * (corners - self.origin)
-        for i in np.argsort(np.linalg.norm(middles - point, axis=1), kind="stable"):
-            if not _leg_touches(self.scene, middles[i], point, self.radius):
-                return int(self.flat(corners[i]))
-        raise NoPathError(f"there is no path: the goal {point_text(point)} is enclosed within {self.cell:g} m")
-
-
-def _search(lattice: _Lattice, source: int, target: int) -> tuple[np.ndarray, float]:
+def _search(lattice: Lattice, source: int, target: int) -> tuple[np.ndarray, float]:
     """Returns the flat cells of the shortest path from source to target, and its length in metres.
 
     Raises:
         NoPathError: if there is no path.
     """
-    lengths = lattice.cell * np.linalg.norm(_STEPS, axis=1)
-    offsets = (_STEPS[:, 0] * lattice.shape[1] + _STEPS[:, 1]) * lattice.shape[2] + _STEPS[:, 2]
+    lengths = lattice.cell * np.linalg.norm(STEPS, axis=1)
+    offsets = (STEPS[:, 0] * lattice.shape[1] + STEPS[:, 1]) * lattice.shape[2] + STEPS[:, 2]
     goal = lattice.index(np.array(target))
     tiny = 1e-9 * lattice.cell
     g = np.full(lattice.distance.size, np.inf)
@@ -170,7 +104,7 @@ def _search(lattice: _Lattice, source: int, target: int) -> tuple[np.ndarray, fl
             bound = estimate.min() + _SLACK * lattice.cell
             now, later = waiting[estimate <= bound], [waiting[estimate > bound]]
         is_open[now] = False
-        at = lattice.index(now)[:, None] + _STEPS
+        at = lattice.index(now)[:, None] + STEPS
         inside = np.all((at >= 0) & (at < lattice.shape), axis=-1)
         row, step = np.nonzero(inside)
         origins, cells = now[row], now[row] + offsets[step]
@@ -206,15 +140,6 @@ def _free_length(index: np.ndarray, goal: np.ndarray, cell: float) -> np.ndarray
     apart = np.abs(index - goal)
     low, middle, high = apart.min(axis=-1), np.median(apart, axis=-1), apart.max(axis=-1)
     return cell * (math.sqrt(3) * low + math.sqrt(2) * (middle - low) + (high - middle))
-
-
-def edge_margin(cell: float, radius: float) -> float:
-    """Returns the metres by which a sphere can penetrate between two samples of an edge at most, (h / 2)^2 / 2 r.
-
-    Edges are checked with a radius that is larger by this margin. `segment_contact` takes 8 samples, so h is a seventh
-    of the longest edge, sqrt(3) cells.
-    """
-    return (math.sqrt(3) * cell / 14) ** 2 / (2 * radius)
 
 
 Touches = Callable[[np.ndarray, np.ndarray], bool]
@@ -260,52 +185,6 @@ def _skip_ahead(points: np.ndarray, touches: Touches) -> np.ndarray:
         kept.append(there)
         here = there
     return points[kept]
-
-
-def _leg_touches(scene: Scene, start: np.ndarray, end: np.ndarray, radius: float) -> bool:
-    return bool(_long_touches(scene, np.float32(start), np.float32(end), np.float32(radius)))
-
-
-@jax.jit
-def _long_touches(scene: Scene, start: Array, end: Array, radius: Array) -> Array:
-    """Returns whether the sphere touches anything on a straight leg of any length, in steps of the clearance."""
-    length = jnp.sqrt(jnp.sum((end - start) ** 2))
-    direction = (end - start) / jnp.maximum(length, 1e-9)
-
-    def gap(along: Array) -> Array:
-        return signed_distance(scene, start + along * direction) - radius
-
-    def walk(state: tuple[Array, Array]) -> tuple[Array, Array]:
-        along, free = state
-        along = jnp.minimum(along + jnp.maximum(free, _STRIDE), length)
-        return along, gap(along)
-
-    zero = jnp.zeros(())
-    _, free = jax.lax.while_loop(lambda s: (s[0] < length) & (s[1] >= 0), walk, (zero, gap(zero)))
-    return free < 0
-
-
-@jax.jit
-def _signed_distances(scene: Scene, points: Array) -> Array:
-    return jax.vmap(lambda point: signed_distance(scene, point))(points)
-
-
-@jax.jit
-def _touches(scene: Scene, ends: Array, radius: Array) -> Array:
-    return jax.vmap(lambda pair: segment_contact(scene, pair[:3], pair[3:], radius)[0])(ends)
-
-
-def _batched(function, scene: Scene, rows: np.ndarray, *rest: float) -> np.ndarray:
-    """Returns `function(scene, rows, *rest)`, computed in batches of a few fixed sizes."""
-    parts, done = [], 0
-    while done < len(rows):
-        part = rows[done : done + _LANES[-1]]
-        lanes = next(lanes for lanes in _LANES if lanes >= len(part))
-        padded = np.zeros((lanes, rows.shape[1]), np.float32)
-        padded[: len(part)] = part
-        parts.append(np.asarray(function(scene, padded, *map(np.float32, rest)))[: len(part)])
-        done += len(part)
-    return np.concatenate(parts)
 
 
 def main(arguments: list[str] | None = None) -> int:

@@ -269,7 +269,8 @@ def plan_run_directory(given: Path | None, config: Config, resume: Resume = "aut
         raise unwritable(given, error.strerror) from None
     if taken and not given.is_dir():
         raise ConfigError(f"--run-dir '{given}' is a file; give a folder")
-    occupied = taken and any(path.name != LOCK for path in given.iterdir())
+    # A run that could not write its options, on a full disk, has left empty folders.
+    occupied = taken and any(path.name != LOCK and not path.is_dir() for path in given.rglob("*"))
     if occupied and not _is_ours(run.config_file):
         raise ConfigError(f"--run-dir '{given}' holds files that are not an edqn run; give a new or empty folder")
     if run.finished and (resume == "never" or not _asks_for_more(run, config)):

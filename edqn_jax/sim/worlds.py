@@ -8,6 +8,7 @@ from typing import Literal
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import struct
 from jax import Array
 from jax.typing import ArrayLike
@@ -275,11 +276,54 @@ def _far_apart(
 
 def _scatter(scene: Scene, draw: Array, altitudes: tuple[float, float] | None = None) -> Array:
     """Returns points [K, 3] of the flight volume, a margin inside its faces, from uniform draws [K, 3]."""
-    lower, upper = scene.volume[0] + jnp.array(_FENCE[0]), scene.volume[1] - jnp.array(_FENCE[1])
+    lower, upper = fenced(scene)
     if altitudes is not None:
         lower = lower.at[2].max(altitudes[0])
         upper = upper.at[2].min(altitudes[1])
     return lower[None] + draw * (upper - lower)[None]
+
+
+def fenced(scene: Scene) -> tuple[Array, Array]:
+    """Returns the lower and the upper corner [3] of where random points may be, inside the faces of the volume."""
+    return scene.volume[0] + jnp.array(_FENCE[0]), scene.volume[1] - jnp.array(_FENCE[1])
+
+
+def cells_of(scene: Scene, is_one: np.ndarray, corner: np.ndarray, edge_m: float) -> Cells:
+    """Returns those cubes of a grid that starts are drawn from; those near the volume's faces if there are no others.
+
+    Args:
+        scene: one world.
+        is_one: [X, Y, Z] bool, which cubes they may be.
+        corner: [3] metres, middle of the grid's first cube.
+        edge_m: of the cubes, metres.
+    """
+    every = np.argwhere(is_one)
+    lower, upper = map(np.asarray, fenced(scene))
+    middles = corner + edge_m * every
+    inside = np.all((middles >= lower) & (middles <= upper), axis=1)
+    return Cells(
+        is_one=jnp.asarray(is_one),
+        chosen=jnp.asarray(every[inside] if inside.any() else every, jnp.int32),
+        corner=jnp.asarray(corner, jnp.float32),
+        edge_m=jnp.float32(edge_m),
+    )
+
+
+def _in_cells(cells: Cells, draw: Array) -> Array:
+    """Returns points [K, 3] uniform over the cells, from uniform draws [K, 3]."""
+    count = cells.chosen.shape[0]
+    chosen = jnp.minimum((draw[:, 0] * count).astype(jnp.int32), count - 1)
+    # The last digits of a number are as good as another one.
+    within = jnp.stack([draw[:, 1], (1024.0 * draw[:, 1]) % 1.0, draw[:, 2]], axis=1) - 0.5
+    return cells.corner[None] + cells.edge_m * (cells.chosen[chosen] + within)
+
+
+def _is_in(cells: Cells, point: Array) -> Array:
+    """Returns whether a point [3] lies in one of the cells."""
+    at = jnp.round((point - cells.corner) / cells.edge_m).astype(jnp.int32)
+    inside = jnp.all((at >= 0) & (at < jnp.array(cells.is_one.shape)))
+    x, y, z = jnp.clip(at, 0, jnp.array(cells.is_one.shape) - 1)
+    return inside & cells.is_one[x, y, z]
 
 
 def _first_free(
@@ -323,12 +367,28 @@ def random_missions(pool: Scene, count: int, key: Array) -> Missions:
     return jax.vmap(mission)(index, jax.random.uniform(points_key, (count, 2, _TRIES, 3)))
 
 
+@struct.dataclass
+class Cells:
+    """Cubes of a grid that starts are drawn from."""
+
+    is_one: Array  # [X, Y, Z] bool, which cubes of the grid
+    chosen: Array  # [K, 3] int32, those of them that points all over are drawn from
+    corner: Array  # [3] metres, middle of the grid's first cube
+    edge_m: Array  # [] metres
+
+
 @partial(jax.jit, static_argnums=1)
-def spread_missions(pool: Scene, count: int, own_start_fraction: ArrayLike, jitter: ArrayLike, key: Array) -> Missions:
+def spread_missions(
+    pool: Scene,
+    count: int,
+    own_start_fraction: ArrayLike,
+    jitter: ArrayLike,
+    key: Array,
+    cells: Cells | None = None,
+) -> Missions:
     """Returns missions to the worlds' own goals, from starts spread over the volume.
 
-    The other starts are free points, at least `AWAY` metres from the goal. In worlds with closed spaces there may be
-    no path from some starts; none of the provided worlds has any.
+    The other starts are free points, at least `AWAY` metres from the goal.
 
     Args:
         pool: worlds [P]; missions draw from them at random.
@@ -337,16 +397,21 @@ def spread_missions(pool: Scene, count: int, own_start_fraction: ArrayLike, jitt
         jitter: half width, metres, of the box around the own start that these are drawn from, cut off 0.5 m
             inside the volume; 0 is the start itself.
         key: consumed.
+        cells: of the only world, where starts may be: in closed spaces there may be no way to the goal. None is
+            everywhere.
     """
 
     def mission(own: Array, index: Array, draw: Array) -> Missions:
         scene = take_scene(pool, index)
-        anywhere = _first_free(scene, _scatter(scene, draw[0]), CLEARANCE, scene.goal, AWAY)
+        points = _scatter(scene, draw[0]) if cells is None else _in_cells(cells, draw[0])
+        anywhere = _first_free(scene, points, CLEARANCE, scene.goal, AWAY)
         lower = jnp.minimum(scene.volume[0] + 0.5, scene.start)
         upper = jnp.maximum(scene.volume[1] - 0.5, scene.start)
         # The start itself comes last: it is chosen if no other candidate is free.
         shift = (jnp.asarray(jitter) * (2.0 * draw[1] - 1.0)).at[-1].set(0.0)
         near = jnp.clip(scene.start[None] + shift, lower[None], upper[None])
+        if cells is not None:
+            near = jnp.where(jax.vmap(partial(_is_in, cells))(near)[:, None], near, scene.start)
         start = jnp.where(own, _first_free(scene, near, CLEARANCE), anywhere)
         return Missions(scene=index, start=start, goal=scene.goal)
 

@@ -58,6 +58,8 @@ def train_run(
     """
     with prepared(config, reward, progress) as preparation, contextlib.ExitStack() as held:
         progress.message(f"{trained_in(config)}, {described(preparation.devices)}")
+        if (note := preparation.missions[0].training.note) is not None:
+            progress.message(note)
         keeper = Keeper(preparation, run, [run], reward, progress.message)
         begin = opened(preparation, run, keeper, held, progress)
         preparation.compiled.result()  # until then a signal ends the command: nothing is lost yet

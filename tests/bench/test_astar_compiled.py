@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from edqn_jax.planners import astar, astar_compiled, snn
+from edqn_jax.planners import astar, astar_compiled, lattice, snn
 from edqn_jax.planners.planner import Budget, Plan, Task
 from edqn_jax.planners.solids import solid_table
 from edqn_jax.sim.mjcf import load_scene, resolve_world
@@ -18,7 +18,7 @@ from tests.planners.small_worlds import RADIUS, assert_flyable, box, random_smal
 def lattice_length(task: Task, cell: float = 0.5) -> float:
     """Returns the length of the compiled search's path, including the last leg to the goal; inf if there is no path."""
     lower, upper = np.asarray(task.scene.volume, np.float64)
-    margin = astar.edge_margin(cell, task.body_radius)
+    margin = lattice.edge_margin(cell, task.body_radius)
     table = solid_table(task.scene)
     limits = task.body_radius, margin, 10**9
     _, points, length, _ = astar_compiled.search(table, task.start, task.goal, lower, upper, cell, *limits)

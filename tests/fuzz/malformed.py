@@ -21,7 +21,7 @@ from edqn_jax.cli.commands import BAD_INPUT
 from edqn_jax.config import Config
 from edqn_jax.config.limits import validate
 from edqn_jax.config.loading import resolve
-from edqn_jax.errors import ConfigError
+from edqn_jax.errors import ConfigError, sentence
 from edqn_jax.learn.policy import Policy
 from edqn_jax.runs import manifest, states
 from edqn_jax.runs.policies import load_policy, save_policy
@@ -86,8 +86,8 @@ def refusal(kind: Kind, drawn: Any) -> str | None:
         try:
             kind.read(drawn, Path(name))
         except ConfigError as error:
-            said = str(error)
-            assert 8 < len(said) < 1000 and "\n" not in said.strip(), said
+            said = sentence(error)
+            assert 8 < len(said) < 1000, said
             return said
         return None
 

@@ -9,7 +9,7 @@ import math
 import jax
 import numpy as np
 
-from edqn_jax.planners.astar import edge_margin
+from edqn_jax.planners.lattice import edge_margin
 from edqn_jax.sim.scene import Scene, segment_contact, signed_distance
 
 

@@ -13,7 +13,8 @@ import numpy as np
 import pytest
 
 from edqn_jax.errors import ConfigError
-from edqn_jax.planners.astar import NoPathError, main, shortest_path
+from edqn_jax.planners.astar import main, shortest_path
+from edqn_jax.planners.lattice import NoPathError
 from edqn_jax.sim.scene import (
     Scene,
     Shape,
