@@ -7,6 +7,11 @@ from jax import Array
 from jax.experimental import checkify
 
 
+def check_finite(number: Array, of: str) -> None:
+    """Checks that every number [...] is finite; `of` names what it is for the message."""
+    checkify.debug_check(jnp.all(jnp.isfinite(number)), f"{of} is not finite")
+
+
 def check_index(index: Array, below: int | Array, of: str) -> None:
     """Checks that every index [...] is at least 0 and less than `below`; JAX would take the nearest that is.
 

@@ -21,7 +21,7 @@ class DivergedError(RuntimeError):
 
 
 class CheckError(RuntimeError):
-    """A check of `--debug` failed; the message says which, and where."""
+    """A check of `--debug` or `edqn verify` failed; the message says which."""
 
 
 class StoppedError(RuntimeError):

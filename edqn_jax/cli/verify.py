@@ -29,7 +29,9 @@ def verify_command(args: VerifyArgs) -> None:
     if args.json is not None:
         found = {"run": str(args.run), "findings": [dataclasses.asdict(finding) for finding in findings]}
         write_atomically(args.json, json.dumps(found, indent=2) + "\n")
-    wrong = sum(finding.right is False for finding in findings)
+    wrong, unknown = (sum(finding.right is kind for finding in findings) for kind in (False, None))
+    console.print(f"{len(findings) - wrong - unknown} of {len(findings)} verified", highlight=False, end="")
+    console.print(f"; {unknown} could not be compared" if unknown else "", highlight=False)
     if wrong:
         raise CheckError(f"{wrong} of {len(findings)} things in '{args.run}' are not as they were recorded")
 

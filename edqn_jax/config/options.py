@@ -326,7 +326,7 @@ class TrainConfig:
     """Newest checkpoints that are kept."""
     debug: bool = False
     """Check every index, number, random key and shape of training; the first fault ends the run and is named. One
-    device, and slower by a hundred times and more: for few environments and decisions."""
+    device, and drones one after the other: for few environments."""
 
 
 @dataclass(frozen=True)

@@ -58,7 +58,8 @@ class Learnt(NamedTuple):
         """Returns what updates [U] with these losses and gradients come to."""
         finite = jnp.isfinite(loss)
         count = jnp.sum(finite)
-        loss, other = (jnp.sum(jnp.where(finite, x, 0.0)) / count for x in (loss, other))
+        means = (jnp.sum(jnp.where(finite, x, 0.0)) / jnp.maximum(count, 1) for x in (loss, other))
+        loss, other = (jnp.where(count > 0, mean, jnp.nan) for mean in means)
         return cls((loss, other), (_count(~finite), _count(~gradient_is_finite)))
 
 

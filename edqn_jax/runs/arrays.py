@@ -107,7 +107,8 @@ def _without_traces() -> Iterator[None]:
     """Within the block Orbax prints no traces of errors that it raises as well; nor do, after one, its other threads.
 
     Orbax reads and writes all arrays at a time and closes its loop at the first that fails; each of the others, when
-    its thread ends or its task is collected, then prints a trace of its own.
+    its thread ends or its task is collected, then prints a trace of its own. So what keeps them quiet stays after an
+    error.
     """
     before, logger = sys.unraisablehook, logging.getLogger("absl")
     level = logger.level

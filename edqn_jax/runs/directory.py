@@ -109,10 +109,15 @@ class RunDirectory:
     def locked(self) -> Iterator[None]:
         """Makes the folder if there is none, and locks it until the end of the `with` block.
 
+        A folder that it made is deleted again if nothing has been written to it by then.
+
         Raises:
             ConfigError: if it cannot be made, exists although it `must_be_new`, or another run goes on in it.
         """
+        there = self.path.exists()
         with contextlib.ExitStack() as held:
+            if not there:
+                held.callback(self._remove_if_empty)
             try:
                 self.path.mkdir(parents=True, exist_ok=not self.must_be_new)
                 held.enter_context(Lock(self.path))
@@ -125,6 +130,10 @@ class RunDirectory:
             except OSError as error:
                 raise unwritable(self.path, error.strerror) from None
             yield
+
+    def _remove_if_empty(self) -> None:
+        with contextlib.suppress(OSError):
+            self.path.rmdir()
 
     def begin(self, configs: Sequence[Config], seeds: bool = False) -> None:
         """Deletes the files of an earlier run in the locked folder, and writes those that a new one begins with.

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from flax import struct
 from jax import Array
 
-from edqn_jax.checks import check_index
+from edqn_jax.checks import check_finite, check_index
 from edqn_jax.config import Config, EnvConfig
 from edqn_jax.random import integers
 from edqn_jax.sim import drone, sensor
@@ -284,6 +284,8 @@ def step(
     memory = _choose(is_reset, rested, state.memory)
     move = jnp.where(is_reset, 0.0, jnp.asarray(ACTIONS, jnp.float32)[action])
     observation, memory = observe(config, scene, goal, done.drone, move, poses, memory, noise)
+    for number in jax.tree.leaves(observation.sensed):
+        check_finite(number, "what a sensor shows")
     # Own state and motion are of a finite body; counts of events are whole numbers, and nothing is checked.
     unseen = ~is_finite(observation.sensed)
     if _has_floats(observation.sensed):
@@ -341,6 +343,8 @@ def _fly(config: Config, world: World, scene: Scene, goal: Array, state: EnvStat
     reward = _reward(config, world, scene, goal, before, after, action, outcome)
     numbers = jnp.concatenate([after.position, after.quaternion, after.velocity, after.angular_velocity])
     broken = ~jnp.all(jnp.isfinite(numbers))
+    check_finite(numbers, "the state of a drone")
+    check_finite(jnp.where(broken, 0.0, reward), "the reward of a decision")
     unrewarded = ~broken & ~jnp.isfinite(reward)
     return _Decision(
         drone=_choose(broken, before, after),

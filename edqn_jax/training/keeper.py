@@ -253,7 +253,7 @@ class Keeper:
 
     def _standing(self, host: dict[str, Any], arrays: dict[str, np.ndarray]) -> Standing:
         kept = [
-            jax.tree_util.tree_map_with_path(lambda path, leaf, n=n: arrays.get(_kept_name(n, path), leaf), params)
+            jax.tree_util.tree_map_with_path(lambda path, leaf, n=n: arrays.get(kept_name(n, path), leaf), params)
             for n, params in enumerate(self._fresh())
         ]
         agents = [
@@ -285,13 +285,14 @@ def _scores() -> list[str]:
 
 def _named_kept(agents: Sequence[PolicyParams]) -> dict[str, np.ndarray]:
     return {
-        _kept_name(number, path): np.asarray(leaf)
+        kept_name(number, path): np.asarray(leaf)
         for number, params in enumerate(agents)
         for path, leaf in jax.tree_util.tree_leaves_with_path(params)
     }
 
 
-def _kept_name(agent: int, path: Any) -> str:
+def kept_name(agent: int, path: Any) -> str:
+    """Returns the name in a checkpoint of an array of the parameters that an agent keeps."""
     return f"{_KEPT}[{agent}]{jax.tree_util.keystr(path)}"
 
 

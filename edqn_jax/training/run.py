@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import jax
@@ -56,12 +56,12 @@ def train_run(
         DivergedError: as `train`; the policy of the last checkpoint stays.
         StoppedError: after saving the policy, if it was asked to.
     """
-    with prepared(config, reward, progress) as preparation, contextlib.ExitStack() as held:
+    with locked(run), prepared(config, reward, progress) as preparation:
         progress.message(f"{trained_in(config)}, {described(preparation.devices)}")
         if (note := preparation.missions[0].training.note) is not None:
             progress.message(note)
         keeper = Keeper(preparation, run, [run], reward, progress.message)
-        begin = opened(preparation, run, keeper, held, progress)
+        begin = opened(preparation, run, keeper, progress)
         preparation.compiled.result()  # until then a signal ends the command: nothing is lost yet
         with stop.obeyed():
             (result,) = run_chunks(
@@ -82,21 +82,27 @@ def train_run(
     return summary
 
 
-def opened(
-    preparation: Preparation,
-    run: RunDirectory | None,
-    keeper: Keeper,
-    held: contextlib.ExitStack,
-    progress: Progress,
-    seeds: bool = False,
-) -> Standing | None:
-    """Locks the run's folder, until `held` ends; returns where its run stood if it is continued, else begins it.
+@contextlib.contextmanager
+def locked(run: RunDirectory | None) -> Iterator[None]:
+    """Keeps other runs out of the folder, which is made if there is none; every process must call this.
 
     Raises:
-        ConfigError: if the folder cannot be written, another run goes on in it, or its run cannot be continued.
+        ConfigError: if the folder cannot be made, or another run goes on in it.
+    """
+    with contextlib.ExitStack() as held:
+        processes.together(lambda: None if run is None else held.enter_context(run.locked()))
+        yield
+
+
+def opened(
+    preparation: Preparation, run: RunDirectory | None, keeper: Keeper, progress: Progress, seeds: bool = False
+) -> Standing | None:
+    """Returns where the run in the locked folder stood if it is continued; else begins it.
+
+    Raises:
+        ConfigError: if the folder cannot be written, or its run cannot be continued.
     """
     configs = preparation.configs
-    processes.together(lambda: None if run is None else held.enter_context(run.locked()))
     begin = None
     if processes.on_any(run is not None and run.resume != "never"):
         begin = keeper.restored()

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import time
 from typing import Any
 
@@ -16,7 +15,7 @@ from edqn_jax.sim.reward import Reward
 from edqn_jax.training import summaries
 from edqn_jax.training.keeper import Keeper
 from edqn_jax.training.loop import prepared, run_chunks
-from edqn_jax.training.run import described, finish, needed, opened, record, sights_of, trained_in, unseen
+from edqn_jax.training.run import described, finish, locked, needed, opened, record, sights_of, trained_in, unseen
 from edqn_jax.training.stopping import Stop
 
 
@@ -41,12 +40,12 @@ def train_seeds_run(
     Raises:
         ConfigError, DivergedError, StoppedError: as `train_run`.
     """
-    with prepared(config, reward, progress, agents=seeds) as preparation, contextlib.ExitStack() as held:
+    with locked(run), prepared(config, reward, progress, agents=seeds) as preparation:
         configs, agents = preparation.configs, range(seeds)
         progress.message(f"{trained_in(config)}, {seeds} seeds, {described(preparation.devices)}")
         folders = [None if run is None else run.of_seed(each.train.seed) for each in configs]
         keeper = Keeper(preparation, run, folders, reward, progress.message)
-        begin = opened(preparation, run, keeper, held, progress, seeds=True)
+        begin = opened(preparation, run, keeper, progress, seeds=True)
         preparation.compiled.result()  # as in `train_run`
         with stop.obeyed():
             results = run_chunks(

@@ -29,6 +29,7 @@ from edqn_jax.learn.plan import Plan
 from edqn_jax.learn.policy import PolicyParams
 from edqn_jax.learn.trainer import Episodes
 from edqn_jax.report.progress import Progress
+from edqn_jax.runs.checkpoints import save_params
 from edqn_jax.runs.directory import TRAJECTORY_COLUMNS, RunDirectory, plain
 from edqn_jax.runs.policies import load_run
 from edqn_jax.training.run import train_run
@@ -127,14 +128,21 @@ def test_a_run_is_verified_and_what_was_changed_in_it_is_found(
     assert wrong() == {"summary.json from trajectory.csv"}
     rewrite(changed.metrics_file, '"validation_spl": ', '"validation_spl": 1')
     rewrite(changed.episodes_file, "collision", "goal")
-    assert wrong() == {
-        *("summary.json from trajectory.csv", "summary.json from metrics.jsonl", "episodes.csv and metrics.jsonl")
-    }
+    raw = {"summary.json from metrics.jsonl", "episodes.csv and metrics.jsonl", "metrics.jsonl and episodes.csv"}
+    assert wrong() == {"summary.json from trajectory.csv", *raw}
+    # What is changed everywhere alike is not what the last checkpoint has.
+    first = json.loads(changed.summary_file.read_text())
+    changed.write_summary({**first, "success_rate": 1.0, "reward": {"name": "mine", "source_sha256": None}})
+    assert {"summary.json", "summary.json from the last checkpoint"} <= wrong()
+    changed.write_summary(first)
     *lines, last = changed.trajectory_file.read_text().splitlines()
     t, _, *others = last.split(",")
     changed.trajectory_file.write_text("\n".join([*lines, ",".join([t, "9.5", *others])]) + "\n")
+    params = load_run(changed.path)[1]
+    other = dataclasses.replace(params, q=jax.tree.map(lambda leaf: leaf + 1.0, params.q))
+    save_params(changed.checkpoints, other, changed.config_file)
     rewrite(changed.summary_file, '"state_digest": "', '"state_digest": "0')
-    assert {"the flight, flown again", "last checkpoint"} <= wrong()
+    assert {"the flight, flown again", "last checkpoint", "policy"} <= wrong()
     shutil.rmtree(changed.checkpoints / "step-000000032")
     assert "last checkpoint" not in wrong()  # there is nothing left to compare
     rewrite(changed.summary_file, '"figures": "drawn"', '"figures": "to be drawn"')
