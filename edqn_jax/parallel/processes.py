@@ -47,8 +47,6 @@ def join(arguments: Mapping[str, Any]) -> int:
     """
     # Otherwise JAX installs its own handler of SIGTERM.
     jax.config.update("jax_enable_preemption_service", False)
-    # Otherwise XLA aborts, with a trace, when the first process is gone; the next collective fails all the same.
-    jax.config.update("jax_enable_recoverability", True)
     try:
         jax.distributed.initialize(**arguments, heartbeat_timeout_seconds=HEARTBEAT_S)
     except ValueError as error:

@@ -163,7 +163,6 @@ def test_a_process_joins_as_it_was_told_and_keeps_sigterm_for_itself(joined) -> 
     assert processes.join({"process_id": 0}) == 0
     assert joined == [{"process_id": 0, "heartbeat_timeout_seconds": processes.HEARTBEAT_S}]
     assert not jax.config.values["jax_enable_preemption_service"]
-    assert jax.config.values["jax_enable_recoverability"]
 
 
 def test_processes_with_different_numbers_of_devices_are_refused(joined, monkeypatch: pytest.MonkeyPatch) -> None:
