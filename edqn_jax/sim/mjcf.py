@@ -117,11 +117,14 @@ def load_world(path: str | Path) -> LoadedWorld:
     if not path.is_file():
         raise SceneError(f"there is no scene file '{path.name}' in {path.parent.resolve()}")
     text = checked_text(path)
+    mujoco.set_mju_user_warning(lambda _: None)  # otherwise MuJoCo writes a log into the working folder
     try:
         model = mujoco.MjModel.from_xml_string(text)
     except ValueError as error:
         reason = " ".join(str(error).split())
         raise SceneError(f"{path} is not an MJCF that MuJoCo can read: {reason}") from None
+    finally:
+        mujoco.set_mju_user_warning(None)
     if model.ngeom > MOST_SHAPES:
         raise SceneError(f"{path} has {model.ngeom:,} geoms; a world may have {MOST_SHAPES}")
     data = mujoco.MjData(model)

@@ -6,7 +6,9 @@ some are; anything else is a fault.
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
+import io
 import shutil
 import tempfile
 from collections.abc import Callable
@@ -143,10 +145,13 @@ def read_flags(drawn: list[tuple[str, str]], folder: Path) -> None:
     """Parses the words of a command; what does not parse ends it with the code of bad input, after a message."""
     del folder
     words = [word for flag, value in drawn for word in (flag, value)]
+    said = io.StringIO()
     try:
-        arguments.parse_train([word for word in words if word not in ("-h", "--help")])
+        with contextlib.redirect_stderr(said):
+            arguments.parse_train([word for word in words if word not in ("-h", "--help")])
     except SystemExit as ending:
-        assert ending.code == BAD_INPUT
+        box = said.getvalue()
+        assert ending.code == BAD_INPUT and box.strip() and "Traceback" not in box and len(box) < 20_000, box[:2000]
         raise ConfigError("the words of the command do not parse") from None
 
 

@@ -63,6 +63,16 @@ def test_what_parsers_may_read_differently_is_refused(tmp_path: Path, text: str)
         load_world(file)
 
 
+def test_mujoco_writes_no_log_into_the_working_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SceneError):
+        load_world(world(tmp_path, '<worldbody><geom size="nan"/></worldbody>'))
+    assert [path.name for path in tmp_path.iterdir()] == ["world.xml"]
+    assert capfd.readouterr() == ("", "")
+
+
 def test_copies_and_sizes_have_limits(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     copies = '<replicate count="2000" offset="1 0 0">' * 2 + '<geom size="1"/>' + "</replicate>" * 2
     with pytest.raises(SceneError, match=r"asks for 4,00\d,000 copies by replicate; a world may have 10,000"):

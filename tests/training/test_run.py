@@ -143,8 +143,15 @@ def test_a_run_is_verified_and_what_was_changed_in_it_is_found(
     save_params(changed.checkpoints, other, changed.config_file)
     rewrite(changed.summary_file, '"state_digest": "', '"state_digest": "0')
     assert {"the flight, flown again", "last checkpoint", "policy"} <= wrong()
-    shutil.rmtree(changed.checkpoints / "step-000000032")
+    for checkpoint in changed.checkpoints.glob("step-*"):
+        shutil.rmtree(checkpoint)
     assert "last checkpoint" not in wrong()  # there is nothing left to compare
+    summary = json.loads(changed.summary_file.read_text())
+    for damaged in ({**summary, "devices": 3}, {"figures": "drawn"}):
+        changed.write_summary(damaged)
+        with pytest.raises(ConfigError, match="a file of the run in .* is not as a run writes it"):
+            verify(changed.path)
+    changed.write_summary(summary)
     rewrite(changed.summary_file, '"figures": "drawn"', '"figures": "to be drawn"')
     with pytest.raises(ConfigError, match="is not finished; continue it with edqn train"):
         verify(changed.path)
