@@ -70,12 +70,12 @@ def read(folder: Path) -> Any:
         ConfigError: if they cannot be read.
     """
     try:
-        handler, reader = _alone()
-        folder = folder.absolute()
-        described = handler.metadata(folder).tree  # pyright: ignore[reportArgumentType]
-        restored = jax.tree.map(lambda _: ocp.RestoreArgs(restore_type=np.ndarray), described, is_leaf=_is_leaf)
-        _check_sizes(folder, described)
         with _without_traces():
+            handler, reader = _alone()
+            folder = folder.absolute()
+            described = handler.metadata(folder).tree  # pyright: ignore[reportArgumentType]
+            restored = jax.tree.map(lambda _: ocp.RestoreArgs(restore_type=np.ndarray), described, is_leaf=_is_leaf)
+            _check_sizes(folder, described)
             return reader.restore(folder, args=ocp.args.PyTreeRestore(restore_args=restored))
     except (OSError, ValueError, KeyError, TypeError, AttributeError, RuntimeError) as error:
         raise ConfigError(f"'{folder}' cannot be read: {_short(error)}") from None
