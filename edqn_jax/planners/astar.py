@@ -1,9 +1,10 @@
 """A*: the shortest path of a drone that knows the map, the reference for the paths of learned flights.
 
-A lattice of 0.5 m cells fills the flight volume, with a cell at the start. A cell is free if a sphere of the body's
-radius fits around its middle, and two of the 26 neighbours are joined if the sphere passes straight between them. The
-heuristic, the length of the shortest lattice path without obstacles, is consistent, so the path found is the shortest
-on the lattice. It is then shortened wherever the straight line is free, checked along its whole length.
+A lattice of 0.5 m cells fills the flight volume, with a cell at the start, or finer ones where these find no path. A
+cell is free if a sphere of the body's radius fits around its middle, and two of the 26 neighbours are joined if the
+sphere passes straight between them. The heuristic, the length of the shortest lattice path without obstacles, is
+consistent, so the path found is the shortest on the lattice. It is then shortened wherever the straight line is free,
+checked along its whole length.
 
 The open list is expanded in batches, all entries up to a bound on g + h at once, which NumPy computes quickly. A cell
 may then be improved after it was expanded, so the search ends only when no open entry could still improve the goal:
@@ -28,7 +29,7 @@ from jax import Array
 
 from edqn_jax.config import DENSITIES, Config
 from edqn_jax.errors import ConfigError
-from edqn_jax.planners.lattice import STEPS, Lattice, NoPathError, leg_touches
+from edqn_jax.planners.lattice import CELL_M, FINE_M, STEPS, Lattice, NoPathError, is_small, leg_touches
 from edqn_jax.planners.planner import path_length, point_text
 from edqn_jax.sim.mjcf import check_scene, load_world, resolve_world
 from edqn_jax.sim.scene import Scene
@@ -50,13 +51,24 @@ class Path:
 
 
 def shortest_path(
-    scene: Scene, start: np.ndarray | Array, goal: np.ndarray | Array, radius: float, cell: float = 0.5
+    scene: Scene, start: np.ndarray | Array, goal: np.ndarray | Array, radius: float, cell: float | None = None
 ) -> Path:
     """Returns the shortest path of a sphere from `start` [3] to `goal` [3]; these, `radius` and `cell` in metres.
 
+    Without `cell` the lattice has cells of `CELL_M`; where there is no path on it and the volume is small enough, finer
+    ones, which find narrower doors.
+
     Raises:
+        ConfigError: if the volume has too many cells.
         NoPathError: if there is no path, or the sphere does not fit at the start or the goal.
     """
+    if cell is None:
+        try:
+            return shortest_path(scene, start, goal, radius, CELL_M)
+        except NoPathError:
+            if not is_small(scene, FINE_M):
+                raise
+            return shortest_path(scene, start, goal, radius, FINE_M)
     start, goal = np.asarray(start, np.float64), np.asarray(goal, np.float64)
     lattice = Lattice(scene, start, radius, cell)
     for role, point in (("start", start), ("goal", goal)):

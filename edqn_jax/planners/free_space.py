@@ -5,16 +5,17 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
+from jax import Array
 from scipy import ndimage
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from edqn_jax.planners.lattice import STEPS, Lattice, NoPathError
+from edqn_jax.planners.lattice import CELL_M, FINE_M, STEPS, Lattice, NoPathError, is_small
 from edqn_jax.planners.planner import point_text
 from edqn_jax.sim.scene import Scene
 
-CELL_M, COARSE_M = 0.5, 1.0
-"""Cells of A*'s lattice, and larger ones, on which every closed space is found that has room for a start."""
+COARSE_M = 1.0
+"""Edge of cells that find every closed space that has room for a start."""
 
 _FORWARD = STEPS[13:]  # of each pair of opposite directions one
 
@@ -38,16 +39,20 @@ def reachable(scene: Scene, radius: float, cell: float | None = None) -> Reachab
     Args:
         scene: one world.
         radius: of the sphere, metres.
-        cell: edge of the lattice's cubes, metres; by default as fine as A*'s, unless a coarse one shows that there is a
-            way from everywhere.
+        cell: edge of the lattice's cubes, metres; by default as fine as A* needs them, unless coarse ones show that
+            there is a way from everywhere.
 
     Raises:
         ConfigError: if the volume has too many cells.
         NoPathError: if the sphere does not fit at the goal.
     """
     if cell is None:
-        coarse = reachable(scene, radius, COARSE_M)
-        return coarse if coarse.lost == 0.0 else reachable(scene, radius, CELL_M)
+        found = reachable(scene, radius, COARSE_M)
+        if found.lost > 0.0:
+            found = reachable(scene, radius, CELL_M)
+        if not _holds(found, scene.start) and is_small(scene, FINE_M):
+            found = reachable(scene, radius, FINE_M)
+        return found
     lattice = Lattice(scene, np.asarray(scene.goal, np.float64), radius, cell)
     lattice.compute_all_distances()
     clearance = lattice.distance.reshape(tuple(lattice.shape))
@@ -58,6 +63,12 @@ def reachable(scene: Scene, radius: float, cell: float | None = None) -> Reachab
     way = free & (parts == parts[tuple(lattice.origin)])
     lost = 1.0 - np.count_nonzero(way) / np.count_nonzero(free)
     return Reachable(way, lattice.middle(np.array(0)), cell, lost)
+
+
+def _holds(found: Reachable, point: np.ndarray | Array) -> bool:
+    """Returns whether there is a way from the cell that a point [3] is in."""
+    at = np.round((np.asarray(point) - found.corner) / found.edge_m).astype(int)
+    return bool(np.all((at >= 0) & (at < found.is_way.shape))) and bool(found.is_way[tuple(at)])
 
 
 def _parts(lattice: Lattice, clearance: np.ndarray) -> np.ndarray:

@@ -24,8 +24,19 @@ STEPS = np.array([step for step in itertools.product((-1, 0, 1), repeat=3) if an
 MOST_CELLS = 40_000_000
 """Cells of the largest lattice: ten times those of the paper's world in cells of 0.5 m, and more."""
 
+CELL_M, FINE_M = 0.5, 0.25
+"""Edge of the cells, and of finer ones, which the middle of any door passes that is 0.25 m wider than the drone."""
+
+_MOST_FINE = 4_000_000  # cells that a second search may take
+
 _STRIDE = 0.02  # metres; undetected penetration of at most 0.01^2 / 2 r = 0.14 mm
 _LANES = (64, 512, 4096, 32768)  # batches are padded to one of these, to compile few programs
+
+
+def is_small(scene: Scene, cell: float) -> bool:
+    """Returns whether a volume has so few cells of this edge, metres, that it can be searched once more."""
+    lower, upper = np.asarray(scene.volume, np.float64)
+    return bool(np.prod((upper - lower) / cell + 1.0) <= _MOST_FINE)
 
 
 class NoPathError(ConfigError):

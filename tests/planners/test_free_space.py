@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 
 import jax
@@ -65,7 +66,20 @@ def test_there_is_a_way_from_where_astar_finds_one(shapes: list[Shape], closed: 
 
 def test_what_is_open_is_seen_on_a_coarse_lattice() -> None:
     assert reachable(small_world(goal=tuple(GOAL)).scene, RADIUS).edge_m == 1.0
-    assert reachable(small_world(*wall(0.6), goal=tuple(GOAL)).scene, RADIUS).edge_m == 0.5
+    closed = small_world(*wall(0.6), start=(8.0, 6.0, 3.0), goal=tuple(GOAL)).scene
+    assert reachable(closed, RADIUS).edge_m == 0.5
+
+
+def test_a_door_between_the_cells_is_found_with_finer_ones() -> None:
+    low, high = 5.24, 6.26  # a metre, and no middle of half-metre cells is further than the radius from both sides
+    sides = [box((5.9, 0, 0), (6.1, low, 6)), box((5.9, high, 0), (6.1, 12, 6))]
+    scene = small_world(*sides, start=(2.0, 6.0, 3.0), goal=(10.0, 6.0, 3.0)).scene
+    start, goal = np.asarray(scene.start), np.asarray(scene.goal)
+    for cell in (0.5, None):
+        with pytest.raises(NoPathError) if cell else contextlib.nullcontext():
+            assert shortest_path(scene, start, goal, RADIUS, cell).length_m == pytest.approx(8.0, abs=0.1)
+    found = reachable(scene, RADIUS)
+    assert (found.edge_m, found.lost) == (0.25, 0.0)
 
 
 def test_a_goal_in_a_wall_and_a_volume_without_end_are_refused() -> None:
