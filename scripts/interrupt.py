@@ -36,7 +36,18 @@ from edqn_jax.runs.directory import RunDirectory
 ROOT = Path(__file__).resolve().parents[1]
 
 FLAGS = (
-    *("--world", "paper", "--num-envs", "16", "--total-steps", "16000", "--train.chunk-steps", "16"),
+    *(
+        "--tuned-for",
+        "cpu",
+        "--world",
+        "paper",
+        "--num-envs",
+        "16",
+        "--total-steps",
+        "16000",
+        "--train.chunk-steps",
+        "16",
+    ),
     *("--agent.batch-size", "16", "--agent.replay-size", "4096", "--agent.learning-starts", "64"),
     *("--encoder.warmup-decisions", "1024", "--encoder.batch-size", "16", "--encoder.replay-size", "512"),
     *("--camera.width", "8", "--camera.height", "6", "--drone.physics", "rigid_body", "--train.devices", "1"),

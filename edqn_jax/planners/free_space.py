@@ -14,6 +14,9 @@ from edqn_jax.planners.lattice import CELL_M, FINE_M, STEPS, Lattice, NoPathErro
 from edqn_jax.planners.planner import point_text
 from edqn_jax.sim.scene import Scene
 
+NICHES = 1e-3
+"""Share of the free space that closed places may have in an open world: under a ball, between blocks that overlap."""
+
 COARSE_M = 1.0
 """Edge of cells that find every closed space that has room for a start."""
 
@@ -30,7 +33,7 @@ class Reachable:
     """[3] metres, middle of the first cell."""
     edge_m: float
     lost: float
-    """Share of the free cells that have no way."""
+    """Share of the free cells that have no way; niches between shapes, as small as `NICHES`, are not counted."""
 
 
 def reachable(scene: Scene, radius: float, cell: float | None = None) -> Reachable:
@@ -62,7 +65,7 @@ def reachable(scene: Scene, radius: float, cell: float | None = None) -> Reachab
     parts = _parts(lattice, clearance)
     way = free & (parts == parts[tuple(lattice.origin)])
     lost = 1.0 - np.count_nonzero(way) / np.count_nonzero(free)
-    return Reachable(way, lattice.middle(np.array(0)), cell, lost)
+    return Reachable(way, lattice.middle(np.array(0)), cell, lost if lost > NICHES else 0.0)
 
 
 def _holds(found: Reachable, point: np.ndarray | Array) -> bool:

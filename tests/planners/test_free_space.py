@@ -13,6 +13,7 @@ from edqn_jax.errors import ConfigError
 from edqn_jax.planners.astar import shortest_path
 from edqn_jax.planners.free_space import reachable
 from edqn_jax.planners.lattice import NoPathError
+from edqn_jax.sim.mjcf import load_scene, resolve_world
 from edqn_jax.sim.scene import Shape, stack_scenes
 from edqn_jax.sim.worlds import cells_of, spread_missions
 from tests.planners.small_worlds import RADIUS, SIZE, box, enclosure, small_world
@@ -68,6 +69,11 @@ def test_what_is_open_is_seen_on_a_coarse_lattice() -> None:
     assert reachable(small_world(goal=tuple(GOAL)).scene, RADIUS).edge_m == 1.0
     closed = small_world(*wall(0.6), start=(8.0, 6.0, 3.0), goal=tuple(GOAL)).scene
     assert reachable(closed, RADIUS).edge_m == 0.5
+
+
+def test_the_papers_world_is_open() -> None:
+    found = reachable(load_scene(resolve_world("paper")), RADIUS)
+    assert (found.edge_m, found.lost) == (1.0, 0.0)
 
 
 def test_a_door_between_the_cells_is_found_with_finer_ones() -> None:
