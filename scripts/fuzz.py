@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import argparse
 import collections
-import datetime
 import sys
 import time
 import traceback
@@ -25,12 +24,10 @@ from hypothesis import HealthCheck, Phase, given, seed, settings
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
-from tests.fuzz.malformed import KINDS, Kind, refusal  # noqa: E402
+from tests.fuzz.malformed import HANGS, KINDS, Kind, refusal  # noqa: E402
 
 AT_ONCE = 250
 """Examples of one round of hypothesis: many short rounds are as random as a long one, and need less memory."""
-
-HANGS = datetime.timedelta(seconds=10)
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -8,8 +8,8 @@
 A small agent is trained in the paper's world, with a checkpoint every half second. Each run is interrupted up to four
 times, at moments drawn over its whole length, start-up and drawing included, and then left to end. Its last state,
 metrics and episodes must be those of the uninterrupted run to the last bit. A process that loses the other one must end
-within a minute, with a sentence. Fifty interruptions take twenty minutes on
-two cores. Exit code 1 if one of them lost something.
+within a minute, with a sentence. Fifty interruptions take twenty minutes on two cores. Exit code 1 if one of them lost
+something.
 """
 
 from __future__ import annotations
@@ -36,18 +36,8 @@ from edqn_jax.runs.directory import RunDirectory
 ROOT = Path(__file__).resolve().parents[1]
 
 FLAGS = (
-    *(
-        "--tuned-for",
-        "cpu",
-        "--world",
-        "paper",
-        "--num-envs",
-        "16",
-        "--total-steps",
-        "16000",
-        "--train.chunk-steps",
-        "16",
-    ),
+    *("--tuned-for", "cpu", "--world", "paper"),
+    *("--num-envs", "16", "--total-steps", "16000", "--train.chunk-steps", "16"),
     *("--agent.batch-size", "16", "--agent.replay-size", "4096", "--agent.learning-starts", "64"),
     *("--encoder.warmup-decisions", "1024", "--encoder.batch-size", "16", "--encoder.replay-size", "512"),
     *("--camera.width", "8", "--camera.height", "6", "--drone.physics", "rigid_body", "--train.devices", "1"),

@@ -11,8 +11,9 @@ import numpy as np
 
 from edqn_jax.config import Config
 from edqn_jax.learn.trainer import Health, Losses
-from edqn_jax.sim import drone, mjcf, worlds
+from edqn_jax.sim import drone, mjcf
 from edqn_jax.sim.env import World
+from edqn_jax.sim.missions import spread_missions
 from edqn_jax.sim.scene import stack_scenes
 
 MINIATURE = (
@@ -38,5 +39,5 @@ def no_losses(steps: int) -> Losses:
 def miniature_world(config: Config, own_start_fraction: float = 0.25) -> World:
     """64 missions in that world, so many of them from near its own start."""
     pool = stack_scenes([mjcf.load_scene(WORLD)])
-    missions = worlds.spread_missions(pool, 64, own_start_fraction, 1.0, jax.random.key(1))
+    missions = spread_missions(pool, 64, own_start_fraction, 1.0, jax.random.key(1))
     return World(airframe=drone.load_airframe(config.drone), pool=pool, missions=missions)

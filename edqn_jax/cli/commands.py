@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import os
 import signal
 import sys
@@ -32,6 +33,8 @@ BY_SIGNAL = 128
 """What the number of a signal is added to: 130 for SIGINT, 143 for SIGTERM."""
 
 COMMANDS = {"train": TrainCommand, "evaluate": EvaluateArgs, "record": RecordArgs, "verify": VerifyArgs}
+
+OF_A_RUN = {"evaluate": parse_evaluate, "record": parse_record, "verify": parse_verify}
 
 
 def run(argv: Sequence[str] | None, stops: Stops) -> int:
@@ -70,12 +73,8 @@ def _dispatch(argv: Sequence[str], stops: Stops) -> int:
     command, rest = argv[0] if argv else "--help", argv[1:]
     if command == "train":
         train_command(rest, stops)
-    elif command == "evaluate":
-        _evaluate(rest)
-    elif command == "record":
-        _record(rest)
-    elif command == "verify":
-        _verify(rest)
+    elif command in OF_A_RUN:
+        _of_a_run(command, rest)
     elif command == "--version":
         print(f"edqn-jax {edqn_jax.__version__}")
     elif command in ("-h", "--help"):
@@ -85,31 +84,12 @@ def _dispatch(argv: Sequence[str], stops: Stops) -> int:
     return DONE
 
 
-def _evaluate(argv: Sequence[str]) -> None:
-    args = parse_evaluate(argv)
+def _of_a_run(command: str, argv: Sequence[str]) -> None:
+    """Runs a command that works on a finished run; JAX is imported once the arguments are known to be right."""
+    args = OF_A_RUN[command](argv)
 
-    from edqn_jax.cli.evaluate import evaluate_command
     from edqn_jax.parallel.devices import use_cpu_devices
 
     use_cpu_devices()
-    evaluate_command(args)
-
-
-def _record(argv: Sequence[str]) -> None:
-    args = parse_record(argv)
-
-    from edqn_jax.cli.record import record_command
-    from edqn_jax.parallel.devices import use_cpu_devices
-
-    use_cpu_devices()
-    record_command(args)
-
-
-def _verify(argv: Sequence[str]) -> None:
-    args = parse_verify(argv)
-
-    from edqn_jax.cli.verify import verify_command
-    from edqn_jax.parallel.devices import use_cpu_devices
-
-    use_cpu_devices()
-    verify_command(args)
+    module = importlib.import_module(f"edqn_jax.cli.{command}")
+    getattr(module, f"{command}_command")(args)

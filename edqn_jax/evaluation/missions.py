@@ -18,10 +18,11 @@ from edqn_jax.planners.free_space import reachable
 from edqn_jax.random import run_streams
 from edqn_jax.sim import drone, worlds
 from edqn_jax.sim.env import World
+from edqn_jax.sim.free_points import Cells, cells_of, free_point
+from edqn_jax.sim.missions import Missions, own_missions, random_missions, spread_missions
 from edqn_jax.sim.mjcf import check_scene, load_world, resolve_world, widened, write_scene
 from edqn_jax.sim.reward import Reward
 from edqn_jax.sim.scene import Scene, stack_scenes, take_scene, with_equal_capacities
-from edqn_jax.sim.worlds import Missions
 
 Point = tuple[float, float, float]
 
@@ -114,7 +115,7 @@ def missions_of_runs(configs: Sequence[Config], reward: Reward | None = None) ->
     others = []
     for config in configs[1:]:
         key, world = run_streams(config.train.seed).training_missions, first.training.world
-        missions = worlds.random_missions(world.pool, config.world.missions, key)
+        missions = random_missions(world.pool, config.world.missions, key)
         training = dataclasses.replace(first.training, world=dataclasses.replace(world, missions=missions))
         others.append(dataclasses.replace(first, training=training))
     return [first, *others]
@@ -128,15 +129,15 @@ def _random_run_missions(config: Config, training_key: jax.Array) -> RunMissions
     name, flown, count = config.world.name, config.world.flown, config.train.validation_missions
     airframe = drone.load_airframe(config.drone)
     training_pool = worlds.random_pool(name, worlds.world_keys("training", config.world.pool_size))
-    training = worlds.random_missions(training_pool, config.world.missions, training_key)
+    training = random_missions(training_pool, config.world.missions, training_key)
     validation, test = (worlds.random_pool(name, worlds.world_keys(split, count)) for split in ("validation", "test"))
     if flown:
         validation, test, own = with_equal_capacities([validation, test, _pool_of(flown, config)])
         test = jax.tree.map(lambda one, many: jnp.asarray(np.concatenate([one, many])[:-1]), own, test)
     return RunMissions(
         training=MissionSet(name, World(airframe, training_pool, training)),
-        validation=MissionSet(name, World(airframe, validation, worlds.own_missions(validation))),
-        final=MissionSet(name, World(airframe, test, worlds.own_missions(test))),
+        validation=MissionSet(name, World(airframe, validation, own_missions(validation))),
+        final=MissionSet(name, World(airframe, test, own_missions(test))),
         near_start=np.ones(count, bool),
         tests=count - 1 if flown else count,
     )
@@ -161,11 +162,11 @@ def _file_run_missions(config: Config, training_key: jax.Array, validation_key: 
     pool = _pool_of(name, config)
     spread, jitter = config.world.own_start_fraction, config.world.start_jitter_m
     cells, note = _with_a_way(pool, config, name)
-    training = worlds.spread_missions(pool, config.world.missions, spread, jitter, training_key, cells)
+    training = spread_missions(pool, config.world.missions, spread, jitter, training_key, cells)
     # Half of the validation begins near the start, but never at it.
     near = max(jitter, 0.5)
-    validation = worlds.spread_missions(pool, count, 0.5, near, validation_key, cells)
-    own = worlds.own_missions(pool)
+    validation = spread_missions(pool, count, 0.5, near, validation_key, cells)
+    own = own_missions(pool)
     final = jax.tree.map(lambda one, many: jnp.concatenate([one, many[1:]]), own, validation)
     final = dataclasses.replace(final, scene=final.scene.astype(jnp.int32))
     return RunMissions(
@@ -177,7 +178,7 @@ def _file_run_missions(config: Config, training_key: jax.Array, validation_key: 
     )
 
 
-def _with_a_way(pool: Scene, config: Config, name: str) -> tuple[worlds.Cells | None, str | None]:
+def _with_a_way(pool: Scene, config: Config, name: str) -> tuple[Cells | None, str | None]:
     """Returns the cells of the pool's only world that have a way to its goal, and how many have none.
 
     Returns:
@@ -189,7 +190,7 @@ def _with_a_way(pool: Scene, config: Config, name: str) -> tuple[worlds.Cells | 
     found = reachable(take_scene(pool, 0), config.drone.body_radius_m)
     if found.lost == 0.0:
         return None, None
-    cells = worlds.cells_of(take_scene(pool, 0), found.is_way, found.corner, found.edge_m)
+    cells = cells_of(take_scene(pool, 0), found.is_way, found.corner, found.edge_m)
     return cells, f"{found.lost:.0%} of the free space of '{name}' has no way to the goal: no mission begins there"
 
 
@@ -252,7 +253,7 @@ def _random_missions(config: Config, name: str, missions: int, seed: int, moved:
         for index in range(missions):
             title = f"test world {seed * missions + index} ({name})"
             check_scene(take_scene(pool, index), config.drone.body_radius_m, title=title)
-    return MissionSet(name, World(drone.load_airframe(config.drone), pool, worlds.own_missions(pool)))
+    return MissionSet(name, World(drone.load_airframe(config.drone), pool, own_missions(pool)))
 
 
 def mission_key(seed: int) -> jax.Array:
@@ -273,14 +274,14 @@ def _file_missions(config: Config, name: str, missions: int, seed: int, moved: d
         check_scene(scene, radius, names=loaded.names, title=f"'{name}'", goal_radius=config.env.goal_radius_m)
         shortest_path(scene, scene.start, scene.goal, radius)  # raises where there is no path
         pool = stack_scenes([scene])
-        return MissionSet(name, World(airframe, pool, worlds.own_missions(pool)), file, note)
+        return MissionSet(name, World(airframe, pool, own_missions(pool)), file, note)
     probe_key, missions_key = jax.random.split(mission_key(seed))
     # The world's own start does not matter, any free point will do; the goal does.
-    standing = dataclasses.replace(scene, start=worlds.free_point(scene, probe_key))
+    standing = dataclasses.replace(scene, start=free_point(scene, probe_key))
     check_scene(standing, radius, names=loaded.names, title=f"'{name}'")
     pool = stack_scenes([scene])
     cells, said = _with_a_way(pool, config, name)
-    many = worlds.spread_missions(pool, missions, 0.0, 0.0, missions_key, cells)
+    many = spread_missions(pool, missions, 0.0, 0.0, missions_key, cells)
     return MissionSet(name, World(airframe, pool, many), file, " ".join(filter(None, (note, said))) or None)
 
 

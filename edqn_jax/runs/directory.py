@@ -116,10 +116,10 @@ class RunDirectory:
         """
         there = self.path.exists()
         with contextlib.ExitStack() as held:
-            if not there:
-                held.callback(self._remove_if_empty)
             try:
                 self.path.mkdir(parents=True, exist_ok=not self.must_be_new)
+                if not there:
+                    held.callback(self._remove_if_empty)
                 held.enter_context(Lock(self.path))
                 if (self.finished and self.resume == "never") or (self.was_empty and self.config_file.exists()):
                     raise ConfigError(f"another run was made in '{self.path}' meanwhile; give another folder")

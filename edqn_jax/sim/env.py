@@ -21,12 +21,12 @@ from edqn_jax.random import integers
 from edqn_jax.sim import drone, sensor
 from edqn_jax.sim.drone import Airframe, DroneState, Flight
 from edqn_jax.sim.events import EventMemory
+from edqn_jax.sim.missions import Missions
 from edqn_jax.sim.moves import ACTIONS
 from edqn_jax.sim.outcomes import Outcome, judge
 from edqn_jax.sim.reward import Reward, Transition, configured_reward
 from edqn_jax.sim.scene import Scene, scene_at, signed_distance, take_scene
 from edqn_jax.sim.sensor import Sensed, frame_steps
-from edqn_jax.sim.worlds import Missions
 
 OWN_SIZE = 10
 """Values of the drone's own state in an observation."""

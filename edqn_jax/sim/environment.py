@@ -26,11 +26,12 @@ from edqn_jax.sim import camera, drone, env, events, sensor
 from edqn_jax.sim.drone import Flight
 from edqn_jax.sim.env import EnvState, Observation, Step, World
 from edqn_jax.sim.events import EventField
+from edqn_jax.sim.missions import own_missions
 from edqn_jax.sim.mjcf import check_scene, load_world, resolve_world
 from edqn_jax.sim.moves import move_number
 from edqn_jax.sim.reward import Reward
 from edqn_jax.sim.scene import Scene, stack_scenes, take_scene
-from edqn_jax.sim.worlds import own_missions, random_pool, world_keys
+from edqn_jax.sim.worlds import random_pool, world_keys
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

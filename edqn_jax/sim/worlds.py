@@ -1,4 +1,4 @@
-"""Random worlds and their seeds, and missions: a world, a start and a goal."""
+"""Random worlds and their seeds."""
 
 from __future__ import annotations
 
@@ -8,14 +8,13 @@ from typing import Literal
 
 import jax
 import jax.numpy as jnp
-import numpy as np
-from flax import struct
 from jax import Array
 from jax.typing import ArrayLike
 
 from edqn_jax.config import DENSITIES
 from edqn_jax.errors import ConfigError
 from edqn_jax.random import integers
+from edqn_jax.sim.free_points import TRIES, far_apart
 from edqn_jax.sim.scene import (
     PARKED,
     Capsules,
@@ -27,8 +26,6 @@ from edqn_jax.sim.scene import (
     UprightBoxes,
     UprightCylinders,
     no_shapes,
-    signed_distance,
-    take_scene,
 )
 
 SIZE = (110.0, 110.0, 25.0)
@@ -41,19 +38,10 @@ HALF_WIDTHS = {"sparse": (2.0, 5.5), "medium": (2.0, 5.5), "dense": (1.5, 4.0)}
 """Range of a block's half width and half depth, metres."""
 GAP = 3.0
 """Free metres between the footprints of any two shapes, and between them and the faces of the volume."""
-CLEARANCE = 1.0
-"""Metres between a random start or goal and the nearest surface."""
-FAR = 40.0
-"""Least distance between a random start and a random goal, metres."""
-AWAY = 5.0
-"""Least distance between a random start and a given goal, metres."""
 GROUND_RGB = (0.37, 0.43, 0.35)
 """Albedo of the ground."""
 
-_ALTITUDES = (1.5, 20.0)  # of the start and goal of a random world, metres
-_FENCE = ((1.0, 1.0, 1.0), (1.0, 1.0, 2.0))  # between random points and the volume's lower and upper faces
 _DENSITY = 1_000_003  # folded into the key of a mixed world to draw its density
-_TRIES = 64  # candidates for each free point; the chance that all fail is below 1e-13 in a dense world
 _PLACES = 64  # candidate positions for each shape
 
 # ------------------------------------------------------------------------------------------- seeds
@@ -103,7 +91,7 @@ def random_scene(density: str, key: Array) -> Scene:
     count = blocks + pillars + balls
     wanted, (narrow, wide) = _shapes_wanted(density, key)
     # One draw for all: on CPU each separate draw costs half a second of compilation.
-    draws = jax.random.uniform(key, (count * (4 + 2 * _PLACES + 5) + 2 * _TRIES * 3,))
+    draws = jax.random.uniform(key, (count * (4 + 2 * _PLACES + 5) + 2 * TRIES * 3,))
     sizes, places, colours, ends = jnp.split(
         draws, [count * 4, count * (4 + 2 * _PLACES), count * (4 + 2 * _PLACES + 5)]
     )
@@ -146,7 +134,7 @@ def random_scene(density: str, key: Array) -> Scene:
         start=jnp.zeros(3),
         goal=jnp.zeros(3),
     )
-    start, goal = _far_apart(scene, ends.reshape(2, _TRIES, 3))
+    start, goal = far_apart(scene, ends.reshape(2, TRIES, 3))
     return dataclasses.replace(scene, start=start, goal=goal)
 
 
@@ -214,208 +202,3 @@ def _colours(draw: Array) -> Array:
     grey = 0.15 + 0.7 * draw[:, :1]
     tint = 0.5 * draw[:, 1:4] - 0.25
     return jnp.clip(grey + jnp.where(draw[:, 4:] < 0.5, tint, 0.0), 0.05, 0.95)
-
-
-# ------------------------------------------------------------------------------------- free points
-
-
-def free_point(
-    scene: Scene,
-    key: Array,
-    *,
-    clearance: float = CLEARANCE,
-    altitudes: tuple[float, float] | None = None,
-    away_from: Array | None = None,
-    distance: float = 0.0,
-) -> Array:
-    """Returns a random free point of the flight volume, uniform up to the conditions.
-
-    It is the first of `_TRIES` uniform candidates that meets the conditions; if none does, the one that violates
-    them least.
-
-    Args:
-        scene: one world.
-        key: consumed.
-        clearance: metres to the nearest surface, at least.
-        altitudes: lowest and highest z, metres; None is the full height of the volume.
-        away_from: [3] metres, a point to keep a distance from.
-        distance: least distance to it, metres.
-
-    Returns:
-        [3] metres.
-    """
-    points = _scatter(scene, jax.random.uniform(key, (_TRIES, 3)), altitudes)
-    return _first_free(scene, points, clearance, away_from, distance)
-
-
-def start_goal(
-    scene: Scene,
-    key: Array,
-    *,
-    clearance: float = CLEARANCE,
-    distance: float = FAR,
-    altitudes: tuple[float, float] | None = _ALTITUDES,
-) -> tuple[Array, Array]:
-    """Returns a random free start and goal, each [3], at least `distance` metres apart, as in `free_point`."""
-    draw = jax.random.uniform(key, (2, _TRIES, 3))
-    return _far_apart(scene, draw, clearance=clearance, distance=distance, altitudes=altitudes)
-
-
-def _far_apart(
-    scene: Scene,
-    draw: Array,
-    *,
-    clearance: float = CLEARANCE,
-    distance: float = FAR,
-    altitudes: tuple[float, float] | None = _ALTITUDES,
-) -> tuple[Array, Array]:
-    start = _first_free(scene, _scatter(scene, draw[0], altitudes), clearance)
-    goal = _first_free(scene, _scatter(scene, draw[1], altitudes), clearance, start, distance)
-    return start, goal
-
-
-def _scatter(scene: Scene, draw: Array, altitudes: tuple[float, float] | None = None) -> Array:
-    """Returns points [K, 3] of the flight volume, a margin inside its faces, from uniform draws [K, 3]."""
-    lower, upper = fenced(scene)
-    if altitudes is not None:
-        lower = lower.at[2].max(altitudes[0])
-        upper = upper.at[2].min(altitudes[1])
-    return lower[None] + draw * (upper - lower)[None]
-
-
-def fenced(scene: Scene) -> tuple[Array, Array]:
-    """Returns the lower and the upper corner [3] of where random points may be, inside the faces of the volume."""
-    return scene.volume[0] + jnp.array(_FENCE[0]), scene.volume[1] - jnp.array(_FENCE[1])
-
-
-def cells_of(scene: Scene, is_one: np.ndarray, corner: np.ndarray, edge_m: float) -> Cells:
-    """Returns those cubes of a grid that starts are drawn from; those near the volume's faces if there are no others.
-
-    Args:
-        scene: one world.
-        is_one: [X, Y, Z] bool, which cubes they may be.
-        corner: [3] metres, middle of the grid's first cube.
-        edge_m: of the cubes, metres.
-    """
-    every = np.argwhere(is_one)
-    lower, upper = map(np.asarray, fenced(scene))
-    middles = corner + edge_m * every
-    inside = np.all((middles >= lower) & (middles <= upper), axis=1)
-    return Cells(
-        is_one=jnp.asarray(is_one),
-        chosen=jnp.asarray(every[inside] if inside.any() else every, jnp.int32),
-        corner=jnp.asarray(corner, jnp.float32),
-        edge_m=jnp.float32(edge_m),
-    )
-
-
-def _in_cells(cells: Cells, draw: Array) -> Array:
-    """Returns points [K, 3] uniform over the cells, from uniform draws [K, 3]."""
-    count = cells.chosen.shape[0]
-    chosen = jnp.minimum((draw[:, 0] * count).astype(jnp.int32), count - 1)
-    # The last digits of a number are as good as another one.
-    within = jnp.stack([draw[:, 1], (1024.0 * draw[:, 1]) % 1.0, draw[:, 2]], axis=1) - 0.5
-    return cells.corner[None] + cells.edge_m * (cells.chosen[chosen] + within)
-
-
-def _is_in(cells: Cells, point: Array) -> Array:
-    """Returns whether a point [3] lies in one of the cells."""
-    at = jnp.round((point - cells.corner) / cells.edge_m).astype(jnp.int32)
-    inside = jnp.all((at >= 0) & (at < jnp.array(cells.is_one.shape)))
-    x, y, z = jnp.clip(at, 0, jnp.array(cells.is_one.shape) - 1)
-    return inside & cells.is_one[x, y, z]
-
-
-def _first_free(
-    scene: Scene, points: Array, clearance: float, away_from: Array | None = None, distance: float = 0.0
-) -> Array:
-    """Returns the first of `points` [K, 3] that meets the conditions, or the one that violates them least."""
-    short = jnp.minimum(jax.vmap(partial(signed_distance, scene))(points) - clearance, 0.0)
-    if away_from is not None:
-        apart = jnp.sqrt(jnp.sum((points - away_from[None]) ** 2, axis=1))
-        short += jnp.minimum(apart - distance, 0.0)
-    return points[jnp.argmax(short)]
-
-
-# ---------------------------------------------------------------------------------------- missions
-
-
-@struct.dataclass
-class Missions:
-    """M missions: in which world, from where, to where."""
-
-    scene: Array  # [M] int32, index into the pool of worlds
-    start: Array  # [M, 3] metres
-    goal: Array  # [M, 3] metres
-
-
-def own_missions(pool: Scene) -> Missions:
-    """Returns one mission for each world of the pool [P]: from its own start to its own goal."""
-    return Missions(scene=jnp.arange(pool.start.shape[0]), start=pool.start, goal=pool.goal)
-
-
-@partial(jax.jit, static_argnums=1)
-def random_missions(pool: Scene, count: int, key: Array) -> Missions:
-    """Returns missions in random worlds of the pool between random free points at least `FAR` metres apart."""
-
-    def mission(index: Array, draw: Array) -> Missions:
-        start, goal = _far_apart(take_scene(pool, index), draw)
-        return Missions(scene=index, start=start, goal=goal)
-
-    scene_key, points_key = jax.random.split(key)
-    index = jax.random.randint(scene_key, (count,), 0, pool.start.shape[0])
-    return jax.vmap(mission)(index, jax.random.uniform(points_key, (count, 2, _TRIES, 3)))
-
-
-@struct.dataclass
-class Cells:
-    """Cubes of a grid that starts are drawn from."""
-
-    is_one: Array  # [X, Y, Z] bool, which cubes of the grid
-    chosen: Array  # [K, 3] int32, those of them that points all over are drawn from
-    corner: Array  # [3] metres, middle of the grid's first cube
-    edge_m: Array  # [] metres
-
-
-@partial(jax.jit, static_argnums=1)
-def spread_missions(
-    pool: Scene,
-    count: int,
-    own_start_fraction: ArrayLike,
-    jitter: ArrayLike,
-    key: Array,
-    cells: Cells | None = None,
-) -> Missions:
-    """Returns missions to the worlds' own goals, from starts spread over the volume.
-
-    The other starts are free points, at least `AWAY` metres from the goal.
-
-    Args:
-        pool: worlds [P]; missions draw from them at random.
-        count: M.
-        own_start_fraction: share of missions that begin near the world's own start.
-        jitter: half width, metres, of the box around the own start that these are drawn from, cut off 0.5 m
-            inside the volume; 0 is the start itself.
-        key: consumed.
-        cells: of the only world, where starts may be: in closed spaces there may be no way to the goal. None is
-            everywhere.
-    """
-
-    def mission(own: Array, index: Array, draw: Array) -> Missions:
-        scene = take_scene(pool, index)
-        points = _scatter(scene, draw[0]) if cells is None else _in_cells(cells, draw[0])
-        anywhere = _first_free(scene, points, CLEARANCE, scene.goal, AWAY)
-        lower = jnp.minimum(scene.volume[0] + 0.5, scene.start)
-        upper = jnp.maximum(scene.volume[1] - 0.5, scene.start)
-        # The start itself comes last: it is chosen if no other candidate is free.
-        shift = (jnp.asarray(jitter) * (2.0 * draw[1] - 1.0)).at[-1].set(0.0)
-        near = jnp.clip(scene.start[None] + shift, lower[None], upper[None])
-        if cells is not None:
-            near = jnp.where(jax.vmap(partial(_is_in, cells))(near)[:, None], near, scene.start)
-        start = jnp.where(own, _first_free(scene, near, CLEARANCE), anywhere)
-        return Missions(scene=index, start=start, goal=scene.goal)
-
-    order_key, scene_key, points_key = jax.random.split(key, 3)
-    own = jax.random.permutation(order_key, jnp.arange(count) < jnp.round(own_start_fraction * count))
-    index = jax.random.randint(scene_key, (count,), 0, pool.start.shape[0])
-    return jax.vmap(mission)(own, index, jax.random.uniform(points_key, (count, 2, _TRIES, 3)))

@@ -24,7 +24,8 @@ from edqn_jax.runs.directory import RunDirectory, config_text
 from edqn_jax.runs.provenance import reward_record
 from edqn_jax.runs.states import Checkpoint
 from edqn_jax.sim.reward import Reward
-from edqn_jax.training.loop import AgentStanding, Preparation, Standing
+from edqn_jax.training.loop import AgentStanding, Standing
+from edqn_jax.training.preparation import Preparation
 from edqn_jax.training.selection import Candidate
 
 MOST_OVERHEAD = 0.03

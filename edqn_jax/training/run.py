@@ -28,7 +28,8 @@ from edqn_jax.sim.flights import Flights
 from edqn_jax.sim.reward import Reward
 from edqn_jax.training import summaries
 from edqn_jax.training.keeper import Keeper
-from edqn_jax.training.loop import Chunk, Preparation, Standing, TrainingResult, prepared, run_chunks
+from edqn_jax.training.loop import Chunk, Standing, TrainingResult, run_chunks
+from edqn_jax.training.preparation import Preparation, prepared
 from edqn_jax.training.stopping import Stop
 
 

@@ -14,7 +14,8 @@ from edqn_jax.runs.provenance import state_digest
 from edqn_jax.sim.reward import Reward
 from edqn_jax.training import summaries
 from edqn_jax.training.keeper import Keeper
-from edqn_jax.training.loop import prepared, run_chunks
+from edqn_jax.training.loop import run_chunks
+from edqn_jax.training.preparation import prepared
 from edqn_jax.training.run import described, finish, locked, needed, opened, record, sights_of, trained_in, unseen
 from edqn_jax.training.stopping import Stop
 

@@ -17,7 +17,8 @@ from edqn_jax.runs.provenance import reward_record, versions, workload
 from edqn_jax.sim.flights import Flights
 from edqn_jax.sim.outcomes import Outcome
 from edqn_jax.sim.reward import Reward
-from edqn_jax.training.loop import Preparation, TrainingResult
+from edqn_jax.training.loop import TrainingResult
+from edqn_jax.training.preparation import Preparation
 from edqn_jax.training.selection import first_success
 
 

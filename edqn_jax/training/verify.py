@@ -1,7 +1,8 @@
 """A finished run, verified: its summary derived anew from its raw files, its flights flown again and judged again.
 
-Nothing that the summary says is taken from it: metrics and episodes are added up, the recorded flight is judged by C
-MuJoCo, the policy flies the final missions once more, and the last checkpoint must have the recorded digest.
+What the summary says of training and flying is derived anew: metrics and episodes are added up, the recorded flight is
+judged by C MuJoCo, the policy flies the final missions once more, and the last checkpoint must have the recorded
+digest. Clocks, versions and machine are taken on trust (`NOT_DERIVED`).
 """
 
 from __future__ import annotations
@@ -107,7 +108,7 @@ def _verified(folder: Path, message: Callable[[str], None]) -> list[Finding]:
         flown.append(flights)
     if found.seeds is not None:
         derived = of_all_seeds(configs[0], missions[0].tests, flown, summaries)
-        findings.append(_compared("summary.json of all seeds", _read_summary(run), derived, {}))
+        findings.append(_compared("summary.json of all seeds", _read_summary(run), derived))
     return findings
 
 
@@ -196,12 +197,17 @@ def _of_checkpoint(
 
 def _of_policies(checkpoint: Checkpoint, configs: Sequence[Config], policies: Sequence[PolicyParams]) -> Finding:
     """Returns whether the saved policies are those that the last checkpoint says the run ended with."""
+    compared = 0
     for number, (config, params) in enumerate(zip(configs, policies, strict=True)):
-        validated = config.train.keep == "last" or checkpoint.host["agents"][number]["decisions"] > 0
-        for path, leaf in jax.tree_util.tree_leaves_with_path(params) if validated else []:
+        if config.train.keep == "best" and checkpoint.host["agents"][number]["decisions"] == 0:
+            continue  # ended before its first validation: the checkpoint holds none
+        compared += 1
+        for path, leaf in jax.tree_util.tree_leaves_with_path(params):
             held = checkpoint.arrays.get(kept_name(number, path))
             if np.size(leaf) and (held is None or not np.array_equal(held, leaf)):
                 return Finding("policy", "it is not the one that the last checkpoint says the run ended with", False)
+    if compared == 0:
+        return Finding("policy", "the run ended before its first validation: no checkpoint holds it", None)
     return Finding("policy", "it is the one that the run ended with, by its last checkpoint", True)
 
 
@@ -233,10 +239,10 @@ def _of_agent(
     elsewhere = _recorded_elsewhere(summary, saved)
     return [
         _episodes_and_metrics(run, metrics),
-        _compared("summary.json from metrics.jsonl", summary, of_training, {}),
+        _compared("summary.json from metrics.jsonl", summary, of_training),
         _compared("summary.json from trajectory.csv", summary, of_flight, within),
-        _compared("summary.json from config.yaml and world", summary, described, {}),
-        *([] if saved is None else [_compared("summary.json from the last checkpoint", summary, told, {})]),
+        _compared("summary.json from config.yaml and world", summary, described),
+        *([] if saved is None else [_compared("summary.json from the last checkpoint", summary, told)]),
         *_untold(summary, {*of_training, *of_flight, *described, *told, *worlds}, missions.tests > 0),
         _flown_again(config, summary, recorded, flights, elsewhere),
         *_tests_again(missions, summary, flights, elsewhere),
@@ -327,7 +333,7 @@ def _tests_again(
     if elsewhere is not None:
         says = f"{again['successes']} of {again['missions']} reach the goal, {summary['test']['successes']} {elsewhere}"
         return [Finding(what, says, None)]
-    return [_compared(what, summary.get("test") or {}, again, {})]
+    return [_compared(what, summary.get("test") or {}, again)]
 
 
 def _recorded_elsewhere(summary: Mapping[str, Any], saved: _Saved | None) -> str | None:
@@ -349,12 +355,14 @@ def _model(described: str | None) -> str | None:
     return None if described is None else described.rpartition(",")[0]
 
 
-def _compared(what: str, recorded: Mapping[str, Any], found: Mapping[str, Any], within: Mapping[str, float]) -> Finding:
+def _compared(
+    what: str, recorded: Mapping[str, Any], found: Mapping[str, Any], within: Mapping[str, float] | None = None
+) -> Finding:
     """Returns whether all values that were found are those recorded."""
     differ = [
         f"{name} is {recorded.get(name)} and should be {value}"
         for name, value in found.items()
-        if not same(recorded.get(name), value, within.get(name, 0.0))
+        if not same(recorded.get(name), value, (within or {}).get(name, 0.0))
     ]
     if differ:
         return Finding(what, "; ".join(differ), False)

@@ -12,8 +12,8 @@ from conventional_stack import world
 from conventional_stack.fleet import Course, Fleet, Record
 from edqn_jax.config import Config
 from edqn_jax.sim import drone, env, mjcf
+from edqn_jax.sim.missions import Missions
 from edqn_jax.sim.scene import Scene, stack_scenes
-from edqn_jax.sim.worlds import Missions
 
 
 @functools.cache

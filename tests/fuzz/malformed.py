@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import datetime
 import io
 import shutil
 import tempfile
@@ -30,6 +31,9 @@ from edqn_jax.runs.policies import load_policy, save_policy
 from edqn_jax.runs.states import Checkpoint
 from edqn_jax.sim.mjcf import check_scene, load_world
 from tests.policies import CONFIG, always
+
+HANGS = datetime.timedelta(seconds=10)
+"""No input may take longer to be refused."""
 
 NASTY = (
     *("nan", "inf", "-inf", ".nan", "-.inf", "1e400", "1e-400", "-1", "0", "-0.0", "0x10", "1_0", "1e308", "2**3"),

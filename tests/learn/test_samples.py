@@ -12,9 +12,10 @@ import pytest
 
 from edqn_jax.config import CameraConfig, Config, DroneConfig, EncoderConfig, EventsConfig
 from edqn_jax.learn import samples, vae
-from edqn_jax.sim import drone, env, worlds
+from edqn_jax.sim import drone, env
 from edqn_jax.sim import events as ev
 from edqn_jax.sim.env import MOTION_SIZE, Observation
+from edqn_jax.sim.missions import own_missions
 from edqn_jax.sim.scene import UprightBoxes, build_scene, stack_scenes
 
 ENVS, LENGTH = 3, 4
@@ -156,7 +157,7 @@ def test_a_flight_to_the_right_is_the_mirror_of_one_to_the_left() -> None:
     ]
     scene = build_scene(shapes, volume=[[-9, -15, 0], [40, 15, 20]], start=[0, 0, 4], goal=[30, 0, 4])
     pool = stack_scenes([scene])
-    world = env.World(drone.load_airframe(config.drone), pool, worlds.own_missions(pool))
+    world = env.World(drone.load_airframe(config.drone), pool, own_missions(pool))
     fresh, _ = env.reset(config, world, jax.random.key(0), jnp.asarray(0))
     step = jax.jit(partial(env.step, config, world))
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import fcntl
 import subprocess
 import sys
@@ -10,9 +11,13 @@ from pathlib import Path
 import pytest
 
 from edqn_jax.config import Config
+from edqn_jax.config.options import WorldConfig
 from edqn_jax.errors import ConfigError
 from edqn_jax.runs.directory import RunDirectory, plan_run_directory
 from edqn_jax.runs.lock import LOCK, Lock
+from edqn_jax.report.progress import Progress
+from edqn_jax.training.run import train_run
+from edqn_jax.training.stopping import Stop
 from tests.processes import PATIENCE_S
 
 HOLDER = """
@@ -37,6 +42,14 @@ def test_a_folder_that_a_run_holds_is_refused_whole_and_free_when_it_has_ended(t
     assert not (run.path / LOCK).exists()
     with again.locked():
         pass
+
+
+def test_a_folder_is_locked_before_anything_is_prepared(tmp_path: Path) -> None:
+    # Preparing takes minutes; here it would fail at once, since there is no such world.
+    config = dataclasses.replace(Config(), world=WorldConfig(name=str(tmp_path / "missing.xml")))
+    run = RunDirectory(tmp_path / "run")
+    with run.locked(), pytest.raises(ConfigError, match="is in use"):
+        train_run(config, run, Progress(), Stop())
 
 
 def test_a_process_that_is_killed_leaves_no_lock(tmp_path: Path) -> None:

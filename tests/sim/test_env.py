@@ -16,11 +16,11 @@ import pytest
 from edqn_jax.config import Config, EnvConfig, EventsConfig, preset
 from edqn_jax.sim import camera, drone, env, events, outcomes, sensor
 from edqn_jax.sim.drone import DroneState, Flight
+from edqn_jax.sim.missions import Missions
 from edqn_jax.sim.moves import ACTIONS
 from edqn_jax.sim.outcomes import Outcome
 from edqn_jax.sim.reward import configured_reward
 from edqn_jax.sim.scene import UprightBoxes, build_scene, stack_scenes
-from edqn_jax.sim.worlds import Missions
 from tests.sim.drawn_scenes import GROUND, rotation_of
 
 CONFIG = Config(env=EnvConfig(reward="sparse", step_reward=-0.25, left_volume_reward=-70.0))

@@ -20,10 +20,10 @@ from edqn_jax.runs.provenance import workload
 from edqn_jax.sim import env, mjcf, sensor
 from edqn_jax.sim.drone import Flight, hover, load_airframe
 from edqn_jax.sim.events import EventField
+from edqn_jax.sim.missions import own_missions
 from edqn_jax.sim.moves import ACTIONS, DIRECTIONS
 from edqn_jax.sim.scene import stack_scenes, take_scene
 from edqn_jax.sim.sensor import Form, Sensor
-from edqn_jax.sim.worlds import own_missions
 from tests.learn.test_trainer import CONFIG as MINIATURE
 from tests.miniature import WORLD
 from tests.oracles import camera_plain

@@ -15,6 +15,8 @@ import pytest
 from edqn_jax.config import DENSITIES
 from edqn_jax.errors import ConfigError
 from edqn_jax.planners.astar import shortest_path
+from edqn_jax.sim.free_points import CLEARANCE, FAR, free_point
+from edqn_jax.sim.missions import AWAY, own_missions, random_missions, spread_missions
 from edqn_jax.sim.mjcf import check_scene, load_scene, resolve_world
 from edqn_jax.sim.scene import (
     PARKED,
@@ -29,19 +31,12 @@ from edqn_jax.sim.scene import (
     take_scene,
 )
 from edqn_jax.sim.worlds import (
-    AWAY,
-    CLEARANCE,
-    FAR,
     GAP,
     HALF_WIDTHS,
     SIZE,
     SPLITS,
-    free_point,
-    own_missions,
-    random_missions,
     random_pool,
     random_scene,
-    spread_missions,
     world_key,
     world_keys,
 )

@@ -22,7 +22,7 @@ from edqn_jax.sim import env
 from edqn_jax.sim.moves import ACTIONS
 from edqn_jax.sim.outcomes import Outcome
 from edqn_jax.sim.reward import Reward, Transition
-from edqn_jax.training.loop import config_for_reward
+from edqn_jax.training.preparation import config_for_reward
 
 CONFIG = dataclasses.replace(Config(), env=dataclasses.replace(Config().env, sensor="blind"))
 
