@@ -31,7 +31,7 @@ from typing import Any
 
 from conventional_stack.settings import DRONES, supported
 from edqn_jax.cli.arguments import parse_train
-from edqn_jax.config import DENSITIES, Config
+from edqn_jax.config import FAMILIES, Config
 from edqn_jax.config.loading import nearest, to_yaml
 from edqn_jax.errors import ConfigError
 from edqn_jax.parallel.devices import cores
@@ -275,7 +275,7 @@ def config_of(asked: Asked, world: str, name: str, has_path: bool) -> Config:
 
 def missions_of(asked: Asked, world: str) -> int:
     """Returns the number of missions for planners."""
-    if world not in DENSITIES:
+    if world not in FAMILIES:
         return 1
     most = asked.configs[world].train.validation_missions
     return min(most, QUICK_PLANNED if asked.words.quick else PLANNED)
@@ -369,7 +369,7 @@ def expected(asked: Asked, world: str) -> str:
     learners = [name for name in args.methods if name in LEARNERS]
     improving = [name for name in args.methods if name in IMPROVING]
     each = args.seeds * asked.configs[world].train.total_steps
-    stack = STACK in args.methods and world not in DENSITIES  # it supports only one world
+    stack = STACK in args.methods and world not in FAMILIES  # it supports only one world
     planning = args.seeds * len(improving) * missions_of(asked, world) * args.budget
     seconds = each * len(learners) / GUESS + each * stack / STACK_GUESS + planning + 60 * len(learners)
     return (

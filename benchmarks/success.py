@@ -33,7 +33,7 @@ import numpy as np
 import yaml
 
 from edqn_jax.cli.arguments import parse_train
-from edqn_jax.config import DENSITIES, Config
+from edqn_jax.config import FAMILIES, Config
 from edqn_jax.config.loading import apply, to_yaml
 from edqn_jax.errors import ConfigError
 from edqn_jax.evaluation.intervals import interquartile_mean, rate_interval
@@ -64,7 +64,7 @@ def parse(argv: Sequence[str] | None = None) -> argparse.Namespace:
     )
     worlds = ["sparse", "medium", "dense"]
     parser.add_argument("--out", type=Path, required=True, help="folder of rows and policies")
-    parser.add_argument("--worlds", nargs="+", default=worlds, choices=DENSITIES, help="(default sparse medium dense)")
+    parser.add_argument("--worlds", nargs="+", default=worlds, choices=FAMILIES, help="(default sparse medium dense)")
     parser.add_argument("--sensors", nargs="+", default=["events"], help="env.sensor of each row (default events)")
     parser.add_argument("--seeds", type=int, default=5, help="training seeds, in one program (default 5)")
     parser.add_argument("--runs", nargs="+", type=Path, help="fly the policies of these runs instead of training")

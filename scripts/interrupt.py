@@ -15,6 +15,7 @@ something.
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
 import os
 import random
@@ -97,9 +98,18 @@ def main(argv: Sequence[str] | None = None) -> int:
                 times, saved = interrupted(run, most, seconds, draw, args.signal)
             done += times
             code = 0 if RunDirectory(run).finished else to_the_end(run, processes)
-            same = code == 0 and ending(run) == expected
-            lost += not same
-            says = "ends alike" if same else f"DIFFERS (exit code {code}):\n{(folder / f'{run.name}.log').read_text()}"
+            if code == 0:
+                differs = first_difference(expected, ending(run))
+            else:
+                differs = f"exit code {code}:\n{(folder / f'{run.name}.log').read_text()}"
+            if code == 0 and differs:
+                # Whose end is the odd one? The uninterrupted run once more tells.
+                repeated = folder / f"whole-{runs}"
+                to_the_end(repeated, processes)
+                again = first_difference(expected, ending(repeated))
+                differs += f"; uninterrupted once more: {again or 'ends as the first time'}"
+            lost += bool(differs)
+            says = f"DIFFERS ({differs})" if differs else "ends alike"
             print(f"run {runs}: {times} interruptions, continued from {saved}: {says}", flush=True)
             shutil.rmtree(run)
     by = {"DISK": "full disks", "PEER": "the loss of a process"}.get(args.signal, f"SIG{args.signal}")
@@ -209,6 +219,15 @@ def ending(run: Path) -> dict[str, Any]:
         "episodes": (run / "episodes.csv").read_text(),
         "trajectory": (run / "trajectory.csv").read_text(),
     }
+
+
+def first_difference(expected: dict[str, Any], found: dict[str, Any]) -> str:
+    """Returns where the ends of two runs differ first; nothing where they are alike."""
+    for one, other in itertools.zip_longest(expected["metrics"], found["metrics"], fillvalue={}):
+        for name in one:
+            if one[name] != other.get(name):
+                return f"{name} after {one['decisions']} decisions is {other.get(name)}, not {one[name]}"
+    return ", ".join(name for name in expected if expected[name] != found[name])
 
 
 if __name__ == "__main__":

@@ -37,7 +37,7 @@ LONGEST = (
     "test_run",
     "test_layout",
     "test_flights",
-    "test_cluster",
+    "test_two_processes",
     "test_notebook",
     "test_trainer",
     "test_evaluate",

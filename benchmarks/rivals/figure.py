@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator, PercentFormatter
 
-from edqn_jax.config import DENSITIES
+from edqn_jax.config import FAMILIES
 from edqn_jax.report.style import INK, LINE, MUTED, SECOND_LINE, drawing
 from rivals.rows import Row, figures
 
@@ -52,7 +52,7 @@ def _title(world: str, rows: Sequence[Row]) -> str:
 def _name(world: str) -> str:
     if world.endswith(".xml"):
         return world
-    return f"Unseen {world} worlds" if world in DENSITIES else f"The {world}'s world"
+    return f"Unseen {world} worlds" if world in FAMILIES else f"The {world}'s world"
 
 
 def _caption(rows: Sequence[Row]) -> str:

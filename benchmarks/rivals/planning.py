@@ -11,7 +11,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from edqn_jax.config import DENSITIES, Config
+from edqn_jax.config import FAMILIES, Config
 from edqn_jax.parallel.devices import cores, processor
 from edqn_jax.planners.astar import shortest_path
 from edqn_jax.planners.follow import FollowConfig, compiled_follower, reserved, sampled
@@ -38,7 +38,7 @@ def judged_scenes(config: Config, count: int) -> list[Scene]:
         ConfigError: if there is no such world, or its start or goal is not free.
     """
     name, radius = config.world.name, config.drone.body_radius_m
-    if name in DENSITIES:
+    if name in FAMILIES:
         pool = jax.tree.map(np.asarray, worlds.random_pool(name, worlds.world_keys("test", count)))
         return [take_scene(pool, index) for index in range(count)]
     loaded = load_world(resolve_world(name))

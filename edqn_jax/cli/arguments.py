@@ -12,7 +12,7 @@ from typing import Annotated, Literal
 import tyro
 from tyro.conf import Positional, arg
 
-from edqn_jax.config import DENSITIES, Config
+from edqn_jax.config import FAMILIES, Config
 from edqn_jax.config.limits import validate
 from edqn_jax.config.loading import resolve
 from edqn_jax.errors import ConfigError
@@ -171,7 +171,7 @@ def _found_worlds(config: Config) -> Config:
 
 def _found(world: str) -> str:
     """Returns the name of a world; of a file, its whole path, by which it is found again from any folder."""
-    return str(Path(world).resolve()) if world not in DENSITIES and Path(world).is_file() else world
+    return str(Path(world).resolve()) if world not in FAMILIES and Path(world).is_file() else world
 
 
 def check_flags(argv: Sequence[str], known: Iterable[str], command: str) -> None:

@@ -12,7 +12,7 @@ from rich.console import Console
 
 from edqn_jax.cli.arguments import TrainOptions, parse_train
 from edqn_jax.cli.signals import Stops
-from edqn_jax.config import DENSITIES, Config
+from edqn_jax.config import FAMILIES, Config
 from edqn_jax.config.loading import gpu_layers, to_yaml
 from edqn_jax.errors import ConfigError
 from edqn_jax.parallel.launch import how_to_join
@@ -91,7 +91,7 @@ def _held(world: str) -> str:
     """
     from edqn_jax.sim.mjcf import resolve_world
 
-    if not world or world in DENSITIES:
+    if not world or world in FAMILIES:
         return world
     file = resolve_world(world)
     try:

@@ -1,7 +1,8 @@
 """Every option, its default and its limits, and how a configuration is loaded."""
 
 from edqn_jax.config.options import (
-    DENSITIES,
+    FAMILIES,
+    MIXED,
     AgentConfig,
     CameraConfig,
     Config,
@@ -15,7 +16,8 @@ from edqn_jax.config.options import (
 from edqn_jax.config.presets import PRESETS, preset
 
 __all__ = [
-    "DENSITIES",
+    "FAMILIES",
+    "MIXED",
     "PRESETS",
     "AgentConfig",
     "CameraConfig",

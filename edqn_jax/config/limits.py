@@ -7,7 +7,7 @@ import math
 from collections.abc import Iterable
 
 from edqn_jax.config.options import (
-    DENSITIES,
+    FAMILIES,
     AgentConfig,
     CameraConfig,
     Config,
@@ -40,9 +40,9 @@ def validate(config: Config) -> None:
     judged = not config.world.flown or config.train.validation_missions >= 2
     limit = "at least 2 with world.flown, whose flight takes the place of one test world"
     _require(judged, "train.validation_missions", limit, config.train.validation_missions)
-    if config.agent.turn and config.world.name not in DENSITIES:
+    if config.agent.turn and config.world.name not in FAMILIES:
         raise ConfigError(
-            f"agent.turn needs a random world ({', '.join(DENSITIES)}), not '{config.world.name}': "
+            f"agent.turn needs a random world ({', '.join(FAMILIES)}), not '{config.world.name}': "
             "give --agent.no-turn, or turn: false in a file"
         )
 
@@ -54,12 +54,12 @@ def _world(world: WorldConfig) -> None:
     _not_negative(world, "world", ["start_jitter_m"])
     if not world.name:
         raise ConfigError("world.name must be the name of a world, not empty")
-    if world.flown and world.name not in DENSITIES:
+    if world.flown and world.name not in FAMILIES:
         raise ConfigError(
-            f"world.flown is for random worlds ({', '.join(DENSITIES)}) alone, '{world.name}' is flown itself: "
+            f"world.flown is for random worlds ({', '.join(FAMILIES)}) alone, '{world.name}' is flown itself: "
             "give --world.flown '', or flown: '' in a file"
         )
-    if world.flown in DENSITIES:
+    if world.flown in FAMILIES:
         raise ConfigError(f"world.flown must be `paper` or an MJCF file, not the random world '{world.flown}'")
 
 

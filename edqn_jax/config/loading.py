@@ -19,7 +19,7 @@ from typing import Any, Literal
 import yaml
 
 from edqn_jax.config.limits import shown, validate
-from edqn_jax.config.options import DENSITIES, Config
+from edqn_jax.config.options import FAMILIES, Config
 from edqn_jax.config.presets import preset as named_preset
 from edqn_jax.errors import ConfigError
 
@@ -109,14 +109,14 @@ GPU_FROM_FILE: Layer = {
 
 def world_layers(world: str, tuned_for: Hardware) -> list[Layer]:
     """Returns what a world and the hardware change in the `default` preset; later ones replace earlier ones."""
-    return [*([RANDOM_WORLDS] if world in DENSITIES else []), *gpu_layers(world, tuned_for)]
+    return [*([RANDOM_WORLDS] if world in FAMILIES else []), *gpu_layers(world, tuned_for)]
 
 
 def gpu_layers(world: str, tuned_for: Hardware | Literal["auto"]) -> list[Layer]:
     """Returns what a GPU changes for a world."""
     if tuned_for != "gpu":
         return []
-    return [GPU if world in DENSITIES else GPU_FROM_FILE]
+    return [GPU if world in FAMILIES else GPU_FROM_FILE]
 
 
 def resolve(

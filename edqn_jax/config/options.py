@@ -343,5 +343,6 @@ class Config:
     train: TrainConfig = field(default_factory=TrainConfig)
 
 
-DENSITIES = ("sparse", "medium", "dense", "mixed")
-"""Names of the random worlds; of `mixed` ones each has one of the three densities."""
+MIXED = "mixed"
+FAMILIES = ("sparse", "medium", "dense", "rooms", "forest", "canyon", MIXED)
+"""Families of random worlds; each of the `mixed` ones is of one of the others."""

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from edqn_jax.config import DENSITIES, Config
+from edqn_jax.config import FAMILIES, Config
 from edqn_jax.errors import ConfigError
 from edqn_jax.planners.astar import shortest_path
 from edqn_jax.planners.free_space import reachable
@@ -94,7 +94,7 @@ def run_missions(config: Config, reward: Reward | None = None) -> RunMissions:
         ConfigError: if a drone of this radius does not fit at the world's start or goal.
     """
     keys = run_streams(config.train.seed)
-    if config.world.name in DENSITIES:
+    if config.world.name in FAMILIES:
         missions = _random_run_missions(config, keys.training_missions)
     else:
         missions = _file_run_missions(config, keys.training_missions, keys.validation_missions)
@@ -110,7 +110,7 @@ def missions_of_runs(configs: Sequence[Config], reward: Reward | None = None) ->
         ConfigError: as `run_missions`.
     """
     first = run_missions(configs[0], reward)
-    if configs[0].world.name not in DENSITIES:
+    if configs[0].world.name not in FAMILIES:
         return [first, *(run_missions(config, reward) for config in configs[1:])]
     others = []
     for config in configs[1:]:
@@ -235,7 +235,7 @@ def load_missions(
         if point is not None and not np.all(np.isfinite(point)):
             raise ConfigError(f"--{role} must be three finite numbers, metres, not {' '.join(f'{x:g}' for x in point)}")
     moved = {k: jnp.asarray(v, jnp.float32) for k, v in (("start", start), ("goal", goal)) if v is not None}
-    if name in DENSITIES:
+    if name in FAMILIES:
         return _random_missions(config, name, missions, seed, moved)
     if missions > 1 and start is not None:
         raise ConfigError(

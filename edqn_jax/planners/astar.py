@@ -27,7 +27,7 @@ from collections.abc import Callable
 import numpy as np
 from jax import Array
 
-from edqn_jax.config import DENSITIES, Config
+from edqn_jax.config import FAMILIES, Config
 from edqn_jax.errors import ConfigError
 from edqn_jax.planners.lattice import CELL_M, FINE_M, STEPS, Lattice, NoPathError, is_small, leg_touches
 from edqn_jax.planners.planner import path_length, point_text
@@ -207,7 +207,7 @@ def main(arguments: list[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     radius = Config().drone.body_radius_m
     try:
-        if options.world in DENSITIES:
+        if options.world in FAMILIES:
             scene = random_scene(options.world, world_key("test", options.index))
         else:
             world = load_world(resolve_world(options.world))

@@ -10,7 +10,7 @@ import dataclasses
 import shutil
 from pathlib import Path
 
-from edqn_jax.config import DENSITIES, Config, WorldConfig
+from edqn_jax.config import FAMILIES, Config, WorldConfig
 from edqn_jax.errors import ConfigError
 from edqn_jax.runs import manifest
 from edqn_jax.runs.files import unwritable
@@ -96,4 +96,4 @@ def _changed(folder: Path, config: Config) -> list[tuple[str, str, Path]]:
 
 def _roles(world: WorldConfig) -> list[str]:
     """Returns which of a run's worlds come from files."""
-    return [role for role in _ROLES if getattr(world, role) and getattr(world, role) not in DENSITIES]
+    return [role for role in _ROLES if getattr(world, role) and getattr(world, role) not in FAMILIES]

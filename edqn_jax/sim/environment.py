@@ -19,7 +19,7 @@ import numpy as np
 from jax import Array
 from jax.typing import ArrayLike
 
-from edqn_jax.config import DENSITIES, Config
+from edqn_jax.config import FAMILIES, Config
 from edqn_jax.config.loading import make_config
 from edqn_jax.errors import ConfigError
 from edqn_jax.sim import camera, drone, env, events, sensor
@@ -144,7 +144,7 @@ def make(
     """
     name = str(world) if world is not None else (config or Config()).world.name
     config = make_config(name) if config is None else config
-    pool = _random_pool(name, worlds, seed) if name in DENSITIES else _file_pool(config, name, worlds)
+    pool = _random_pool(name, worlds, seed) if name in FAMILIES else _file_pool(config, name, worlds)
     return Environment(config, World(drone.load_airframe(config.drone), pool, own_missions(pool), reward))
 
 

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 from jax import Array
+from jax.typing import ArrayLike
 
 from edqn_jax.sim.scene import Scene, signed_distance
 
@@ -62,17 +63,14 @@ def free_point(
     return first_free(scene, points, clearance, away_from, distance)
 
 
-def far_apart(
-    scene: Scene,
-    draw: Array,
-    *,
-    clearance: float = CLEARANCE,
-    distance: float = FAR,
-    altitudes: tuple[float, float] | None = _ALTITUDES,
-) -> tuple[Array, Array]:
-    """Returns a free start and a free goal, each [3], `distance` metres apart, from uniform draws [2, K, 3]."""
-    start = first_free(scene, scatter(scene, draw[0], altitudes), clearance)
-    goal = first_free(scene, scatter(scene, draw[1], altitudes), clearance, start, distance)
+def far_apart(scene: Scene, draw: Array) -> tuple[Array, Array]:
+    """Returns a free start and a free goal, each [3], from uniform draws [2, K, 3].
+
+    They are `FAR` metres apart, or half as far as the volume is long.
+    """
+    distance = jnp.minimum(FAR, (scene.volume[1, 0] - scene.volume[0, 0]) / 2)
+    start = first_free(scene, scatter(scene, draw[0], _ALTITUDES), CLEARANCE)
+    goal = first_free(scene, scatter(scene, draw[1], _ALTITUDES), CLEARANCE, start, distance)
     return start, goal
 
 
@@ -129,7 +127,7 @@ def is_in(cells: Cells, point: Array) -> Array:
 
 
 def first_free(
-    scene: Scene, points: Array, clearance: float, away_from: Array | None = None, distance: float = 0.0
+    scene: Scene, points: Array, clearance: float, away_from: Array | None = None, distance: ArrayLike = 0.0
 ) -> Array:
     """Returns the first of `points` [K, 3] that meets the conditions, or the one that violates them least."""
     short = jnp.minimum(jax.vmap(partial(signed_distance, scene))(points) - clearance, 0.0)

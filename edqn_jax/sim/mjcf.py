@@ -27,7 +27,7 @@ import mujoco
 import numpy as np
 from jax.typing import ArrayLike
 
-from edqn_jax.config import DENSITIES
+from edqn_jax.config import FAMILIES
 from edqn_jax.sim.mjcf_files import SceneError, checked_text
 from edqn_jax.sim.scene import (
     KINDS,
@@ -94,9 +94,9 @@ def resolve_world(name: str) -> Path:
     if path.suffix == ".xml" or path.name != name:
         searched = path.parent.resolve()
         raise SceneError(f"there is no scene file '{path.name}' in {searched}; {known}")
-    close = difflib.get_close_matches(name, [*DENSITIES, *scenes], n=1)
+    close = difflib.get_close_matches(name, [*FAMILIES, *scenes], n=1)
     hint = f"; did you mean '{close[0]}'?" if close else ""
-    raise SceneError(f"there is no scene '{name}' in {folder}; {known}; random worlds: {', '.join(DENSITIES)}{hint}")
+    raise SceneError(f"there is no scene '{name}' in {folder}; {known}; random worlds: {', '.join(FAMILIES)}{hint}")
 
 
 def load_scene(path: str | Path) -> Scene:

@@ -10,7 +10,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from edqn_jax.config import DENSITIES, Config
+from edqn_jax.config import FAMILIES, Config
 from edqn_jax.errors import ConfigError, StoppedError
 from edqn_jax.evaluation.metrics import clearance_text, flight_summary
 from edqn_jax.evaluation.trajectories import trajectory
@@ -216,7 +216,7 @@ def needed(trainer: Trainer, result: TrainingResult) -> TrainState:
 def trained_in(config: Config) -> str:
     """Returns what the training worlds are, for the screen."""
     name = config.world.name
-    return f"{config.world.pool_size:,} random {name} worlds" if name in DENSITIES else f"world '{name}'"
+    return f"{config.world.pool_size:,} random {name} worlds" if name in FAMILIES else f"world '{name}'"
 
 
 def described(devices: Sequence[jax.Device]) -> str:  # pyright: ignore[reportInvalidTypeForm]

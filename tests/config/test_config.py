@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from edqn_jax.config import DENSITIES, PRESETS, Config, preset
+from edqn_jax.config import FAMILIES, PRESETS, Config, preset
 from edqn_jax.config.limits import validate
 from edqn_jax.config.loading import RANDOM_WORLDS, apply, load_layer, make_config, resolve, to_yaml
 from edqn_jax.errors import ConfigError
@@ -47,7 +47,7 @@ def test_an_empty_file_changes_nothing(tmp_path):
     assert resolve(file=write(tmp_path, "# nothing\n")) == resolve()
 
 
-@pytest.mark.parametrize("world", DENSITIES)
+@pytest.mark.parametrize("world", FAMILIES)
 def test_a_random_world_brings_its_own_budget(world):
     assert resolve(world=world).train.total_steps == RANDOM_WORLDS["train"]["total_steps"]
 

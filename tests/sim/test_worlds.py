@@ -1,71 +1,39 @@
-"""Random worlds, their seeds, and missions."""
-
-# pyright: reportArgumentType=false
-# Single shapes are written with plain numbers here.
+"""Random worlds of all families, and their seeds."""
 
 from __future__ import annotations
 
-import itertools
+import dataclasses
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from edqn_jax.config import DENSITIES
+from edqn_jax.config import FAMILIES, MIXED
 from edqn_jax.errors import ConfigError
 from edqn_jax.planners.astar import shortest_path
-from edqn_jax.sim.free_points import CLEARANCE, FAR, free_point
-from edqn_jax.sim.missions import AWAY, own_missions, random_missions, spread_missions
-from edqn_jax.sim.mjcf import check_scene, load_scene, resolve_world
-from edqn_jax.sim.scene import (
-    PARKED,
-    Planes,
-    Spheres,
-    UprightBoxes,
-    build_scene,
-    obstacle_count,
-    scene_shapes,
-    signed_distance,
-    stack_scenes,
-    take_scene,
-)
-from edqn_jax.sim.worlds import (
-    GAP,
-    HALF_WIDTHS,
-    SIZE,
-    SPLITS,
-    random_pool,
-    random_scene,
-    world_key,
-    world_keys,
-)
+from edqn_jax.planners.free_space import reachable
+from edqn_jax.sim import canyon, forest, rooms, worlds
+from edqn_jax.sim.free_points import CLEARANCE, FAR
+from edqn_jax.sim.missions import own_missions, random_missions, spread_missions
+from edqn_jax.sim.mjcf import check_scene, load_world, write_scene
+from edqn_jax.sim.scene import Scene, obstacle_count, scene_shapes, signed_distance, take_scene
+from edqn_jax.sim.worlds import SINGLE, SPLITS, random_pool, random_scene, world_key, world_keys
 
 RADIUS = 0.36
 WORLDS = 24
-MISSIONS = 512
+HARD = ("rooms", "forest", "canyon")
 
 
 @pytest.fixture(scope="module")
 def pools():
-    return {density: random_pool(density, world_keys("validation", WORLDS)) for density in DENSITIES}
-
-
-@pytest.fixture(scope="module")
-def paper():
-    return stack_scenes([load_scene(resolve_world("paper"))])
+    return {family: random_pool(family, world_keys("validation", WORLDS)) for family in FAMILIES}
 
 
 @jax.jit
 def clearances(pool, missions, points):
     at = jax.vmap(lambda index, point: signed_distance(take_scene(pool, index), point))
     return at(missions.scene, points)
-
-
-def footprint(shape) -> tuple[float, float, float]:
-    """Middle and radius of the circle around a shape seen from above."""
-    reach = np.hypot(*shape.half[:2]) if isinstance(shape, UprightBoxes) else shape.radius
-    return float(shape.position[0]), float(shape.position[1]), float(reach)
 
 
 def test_the_splits_never_share_a_world():
@@ -80,134 +48,133 @@ def test_a_worlds_key_depends_on_its_split_and_index_alone():
     np.testing.assert_array_equal(batch[2], single)
 
 
-@pytest.mark.parametrize(("density", "least", "most"), [("sparse", 12, 12), ("medium", 28, 30), ("dense", 54, 60)])
+def assert_same_world(ours: Scene, theirs: Scene) -> None:
+    """The same shapes and ends; compiled for one and for many, float32 sums may differ in the last digit."""
+    for one, other in zip(scene_shapes(ours), scene_shapes(theirs), strict=True):
+        jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-4), one, other)
+    for name in ("volume", "start", "goal"):
+        np.testing.assert_allclose(getattr(ours, name), getattr(theirs, name), rtol=1e-5, atol=1e-4)
+
+
+@pytest.mark.parametrize("family", FAMILIES)
 @pytest.mark.slow
-def test_a_density_has_its_number_of_shapes(pools, density, least, most):
-    counts = [obstacle_count(take_scene(pools[density], i)) for i in range(WORLDS)]
-    assert least <= min(counts) and max(counts) <= most
+def test_a_key_makes_one_world_and_another_key_another(pools, family):
+    first, second = take_scene(pools[family], 0), take_scene(pools[family], 1)
+    assert_same_world(random_scene(family, world_key("validation", 0)), first)
+    assert not np.allclose(first.start, second.start)
 
 
 @pytest.mark.slow
-def test_mixed_worlds_are_of_every_density(pools):
-    ranges = {"sparse": range(12, 13), "medium": range(28, 31), "dense": range(54, 61)}
-    seen = dict.fromkeys(ranges, 0)
+def test_a_pool_does_not_depend_on_how_many_are_drawn_at_once(pools, monkeypatch):
+    monkeypatch.setattr(worlds, "_AT_ONCE", 5)
+    again = random_pool("rooms", world_keys("validation", 12))
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b[:12], rtol=1e-5, atol=1e-4), again, pools["rooms"])
+
+
+@pytest.mark.slow
+def test_mixed_worlds_are_of_every_other_family(pools):
+    number = np.asarray(worlds._families_of(world_keys("validation", 600)))
     for i in range(WORLDS):
-        scene = take_scene(pools["mixed"], i)
-        (density,) = [name for name, counts in ranges.items() if obstacle_count(scene) in counts]
-        seen[density] += 1
-        widths = np.asarray(scene.boxes.half)[np.asarray(scene.boxes.position[:, 2]) < PARKED / 2, :2]
-        narrow, wide = HALF_WIDTHS[density]
-        assert widths.min() >= narrow and widths.max() <= wide
-    # Of 24 worlds 8 are expected of each density; 2 or fewer come once in 200 draws of keys, which are fixed.
-    assert min(seen.values()) > 2, seen
+        assert_same_world(take_scene(pools[MIXED], i), take_scene(pools[SINGLE[number[i]]], i))
+    # 100 are expected of each, 9 up or down (standard deviation); the keys are fixed.
+    assert np.abs(np.bincount(number, minlength=len(SINGLE)) - 100).max() < 3 * 9
 
 
-@pytest.mark.parametrize("density", DENSITIES)
-def test_footprints_keep_their_gap_so_that_free_space_is_connected(pools, density):
-    for i in range(WORLDS):
-        shapes = [s for s in scene_shapes(take_scene(pools[density], i)) if not isinstance(s, Planes)]
-        discs = [footprint(shape) for shape in shapes]
-        for (x, y, r), (u, v, s) in itertools.combinations(discs, 2):
-            assert np.hypot(x - u, y - v) - r - s > GAP - 1e-3
-        for x, y, r in discs:
-            assert min(x, y, SIZE[0] - x, SIZE[1] - y) - r > GAP - 1e-3
-
-
-@pytest.mark.parametrize("density", DENSITIES)
-def test_shapes_stand_on_the_ground_and_below_the_ceiling(pools, density):
-    pool = pools[density]
-    for position, half in (
-        (pool.boxes.position[..., 2], pool.boxes.half[..., 2]),
-        (pool.cylinders.position[..., 2], pool.cylinders.half_height),
-    ):
-        present = np.asarray(position) < PARKED / 2
-        np.testing.assert_allclose((position - half)[present], 0.0, atol=1e-5)
-        assert ((position + half)[present] <= SIZE[2]).all()
-    low, high = pool.spheres.position[..., 2] - pool.spheres.radius, pool.spheres.position[..., 2]
-    present = np.asarray(high) < PARKED / 2
-    assert (np.asarray(low)[present] > -1e-4).all()
-
-
-@pytest.mark.parametrize("density", DENSITIES)
+@pytest.mark.parametrize("family", FAMILIES)
 @pytest.mark.slow
-def test_start_and_goal_are_free_and_far_apart(pools, density):
-    pool = pools[density]
+def test_start_and_goal_are_free_and_far_apart(pools, family):
+    pool = pools[family]
     missions = own_missions(pool)
-    assert (np.linalg.norm(missions.start - missions.goal, axis=1) >= FAR).all()
+    far = np.minimum(FAR, np.asarray(pool.volume[:, 1, 0]) / 2)
+    assert (np.linalg.norm(missions.start - missions.goal, axis=1) >= far).all()
     assert (clearances(pool, missions, missions.start) >= CLEARANCE).all()
     assert (clearances(pool, missions, missions.goal) >= CLEARANCE).all()
     for i in range(WORLDS):
         check_scene(take_scene(pool, i), RADIUS)
 
 
-@pytest.mark.parametrize("density", DENSITIES)
+@pytest.mark.parametrize("family", SINGLE)
 @pytest.mark.slow
-def test_there_is_a_path_in_every_random_world(pools, density):
+def test_there_is_a_path_in_every_random_world(pools, family):
     for i in range(2):
-        scene = take_scene(pools[density], i)
-        assert shortest_path(scene, scene.start, scene.goal, RADIUS).length_m >= FAR
+        scene = take_scene(pools[family], i)
+        straight = np.linalg.norm(scene.start - scene.goal)
+        assert shortest_path(scene, scene.start, scene.goal, RADIUS).length_m >= straight - 1e-3
 
 
-def test_a_key_makes_one_world_and_another_key_another(pools):
-    again = random_scene("sparse", world_key("validation", 0))
-    first, second = take_scene(pools["sparse"], 0), take_scene(pools["sparse"], 1)
-    # Compiled for one and for many, float32 sums may differ in the last digit.
-    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-5, atol=1e-4), again, first)
-    assert not np.allclose(first.boxes.position, second.boxes.position)
-
-
-def test_an_unknown_density_names_those_there_are():
-    with pytest.raises(ConfigError, match="'thick'; the densities are sparse, medium, dense, mixed"):
-        random_scene("thick", world_key("test", 0))
+@pytest.mark.parametrize("family", HARD)
+@pytest.mark.slow
+def test_there_is_a_way_from_everywhere_so_that_missions_may_begin_anywhere(pools, family):
+    for i in range(3):
+        found = reachable(take_scene(pools[family], i), RADIUS, 0.5)
+        assert found.lost == 0.0
 
 
 @pytest.mark.slow
-def test_random_missions_fly_far_between_free_points_of_every_world(pools):
-    pool = pools["dense"]
-    missions = random_missions(pool, MISSIONS, jax.random.key(0))
-    assert missions.scene.dtype == jnp.int32 and set(np.asarray(missions.scene)) == set(range(WORLDS))
-    assert (np.linalg.norm(missions.start - missions.goal, axis=1) >= FAR).all()
-    for points in (missions.start, missions.goal):
-        assert (clearances(pool, missions, points) >= CLEARANCE).all()
-        assert (points[:, 2] >= 1.5).all() and (points[:, 2] <= 20.0).all()
+def test_the_families_are_what_they_are_called(pools):
+    for i in range(WORLDS):
+        scene = take_scene(pools["rooms"], i)
+        height = float(scene.volume[1, 2])
+        assert rooms.HEIGHT[0] <= height <= rooms.HEIGHT[1] and scene.planes.position.shape[0] == 2
+        # Outer walls, and up to four pieces of each of the walls between rooms.
+        assert 4 + 12 <= obstacle_count(scene) <= 4 + 4 * 12
+    trees = pools["forest"].cylinders
+    apart = np.linalg.norm(trees.position[:, :, None, :2] - trees.position[:, None, :, :2], axis=-1)
+    surfaces = apart - trees.radius[:, :, None] - trees.radius[:, None, :] + 1e9 * np.eye(forest.TREES)
+    nearest = surfaces.min(axis=2)
+    assert nearest.min() >= forest.GAP - 1e-3 and 2.0 < np.median(nearest) < 3.0
+    low = pools["canyon"].boxes.position[..., 2] - pools["canyon"].boxes.half[..., 2]
+    high = pools["canyon"].boxes.position[..., 2] + pools["canyon"].boxes.half[..., 2]
+    there = np.asarray(low) < 1e3
+    assert (high[there] <= canyon.SIZE[2] + 1e-4).all()
+    full = there & (low < 1e-3) & (high > canyon.SIZE[2] - 1e-3)
+    hanging = there & (low > 1.0)
+    assert (full.sum(axis=1) >= 8).all() and (hanging.sum(axis=1) >= 3).all()
 
 
-def test_spread_missions_begin_near_the_start_or_anywhere_and_end_at_the_goal(paper):
-    missions = spread_missions(paper, MISSIONS, 0.25, 1.0, jax.random.key(0))
-    own = (np.abs(missions.start - paper.start) <= 1.0 + 1e-5).all(axis=1)
-    assert own.sum() == MISSIONS // 4
-    assert len(np.unique(np.asarray(missions.start)[own], axis=0)) > MISSIONS // 8
-    assert (clearances(paper, missions, missions.start) >= CLEARANCE).all()
-    np.testing.assert_array_equal(missions.goal, np.broadcast_to(paper.goal, (MISSIONS, 3)))
-    rest = np.asarray(missions.start)[~own]
-    assert (np.linalg.norm(rest - paper.goal, axis=1) >= AWAY).all()
-    # The whole volume: each octant has its share.
-    octants = (rest > np.asarray([55.0, 55.0, 12.0])) @ np.array([1, 2, 4])
-    assert np.bincount(octants, minlength=8).min() > 0.05 * len(rest)
+@pytest.mark.parametrize("family", HARD)
+@pytest.mark.slow
+def test_hard_worlds_are_the_same_as_mjcf(pools, family, tmp_path):
+    scene = take_scene(pools[family], 3)
+    write_scene(scene, tmp_path / "world.xml", title=family)
+    world = load_world(tmp_path / "world.xml")
+    check_scene(world.scene, RADIUS, names=world.names)
+    points = np.random.default_rng(0).uniform(*np.asarray(scene.volume), (500, 3)).astype(np.float32)
+    ours, theirs = (jax.vmap(lambda point, of=of: signed_distance(of, point))(points) for of in (scene, world.scene))
+    np.testing.assert_allclose(ours, theirs, atol=2e-5)  # written with some digits
 
 
-def test_missions_without_jitter_begin_at_the_start_itself(paper):
-    missions = spread_missions(paper, MISSIONS, 1.0, 0.0, jax.random.key(0))
-    np.testing.assert_array_equal(missions.start, np.broadcast_to(paper.start, (MISSIONS, 3)))
+def test_a_world_without_a_way_is_drawn_again(monkeypatch):
+    def draw(key):
+        """Rooms with a wall all across, for two keys of three."""
+        scene = rooms.draw(key)
+        wall = jax.random.key_data(key)[-1] % 3 > 0
+        half = scene.boxes.half.at[0].set(jnp.where(wall, jnp.array([0.2, 18.0, 4.0]), scene.boxes.half[0]))
+        position = scene.boxes.position.at[0].set(jnp.where(wall, scene.volume[1] / 2, scene.boxes.position[0]))
+        # Nobody starts or ends in it.
+        start, goal = scene.volume[1] * jnp.array([0.1, 0.5, 0.5]), scene.volume[1] * jnp.array([0.9, 0.5, 0.5])
+        boxes = scene.boxes.replace(half=half, position=position)
+        return scene.replace(boxes=boxes, start=start, goal=goal)
+
+    rooms_too = worlds._FAMILIES["rooms"]
+    monkeypatch.setitem(worlds._FAMILIES, "walled", dataclasses.replace(rooms_too, draw=draw))
+    pool = worlds._drawn("walled", world_keys("training", 12))
+    half = np.asarray(pool.boxes.half[:, 0])
+    assert not (half[:, 1] == 18.0).any()
+    # Most first attempts had the wall, so most worlds are another than the first.
+    first = jax.vmap(lambda key: rooms.draw(jax.random.fold_in(key, 0)).boxes.half[0])(world_keys("training", 12))
+    assert 0 < np.isclose(half, first).all(axis=1).sum() < 8
 
 
-def test_missions_are_the_keys_alone(paper):
-    one, same, other = (spread_missions(paper, MISSIONS, 0.25, 1.0, jax.random.key(k)) for k in (3, 3, 4))
-    np.testing.assert_array_equal(one.start, same.start)
-    assert not np.allclose(one.start, other.start)
-
-
-def test_a_free_point_in_a_crowded_world_is_the_least_bad_one():
-    # A ball that leaves free only the corners of the volume, none of them by 3 m.
-    ball = Spheres(position=[5, 5, 5], radius=6, albedo=np.full(3, 0.5))
-    scene = build_scene([ball], volume=[[0, 0, 0], [10, 10, 10]], start=[0, 0, 0], goal=[9, 9, 9])
-    point = free_point(scene, jax.random.key(0), clearance=3.0)
-    assert signed_distance(scene, point) > -0.5
+def test_an_unknown_family_names_those_there_are():
+    with pytest.raises(ConfigError, match="'thick'; there are sparse, medium, dense, rooms, forest, canyon, mixed"):
+        random_scene("thick", world_key("test", 0))
 
 
 @pytest.mark.slow
 def test_worlds_and_missions_reuse_no_key_and_promote_no_rank():
     with jax.debug_key_reuse(True), jax.numpy_rank_promotion("raise"), jax.checking_leaks():
-        pool = random_pool("sparse", world_keys("training", 2))
-        random_missions(pool, 4, jax.random.key(0))
-        spread_missions(pool, 4, 0.5, 1.0, jax.random.key(1))
+        for family in ("sparse", *HARD):
+            pool = random_pool(family, world_keys("training", 2))
+            random_missions(pool, 4, jax.random.key(0))
+            spread_missions(pool, 4, 0.5, 1.0, jax.random.key(1))
