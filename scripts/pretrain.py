@@ -32,7 +32,7 @@ SEEDS = 5
 """Agents that are trained together; the best of them is shipped."""
 
 FLAGS = (
-    *("--tuned-for", "gpu", "--world", "mixed", "--world.flown", ""),
+    *("--tuned-for", "gpu", "--world", "open", "--world.flown", ""),
     *("--train.keep", "last", "--train.validation-every", "20000000"),
 )
 """Options of train.py beside the number of seeds."""
@@ -48,7 +48,7 @@ flies it, `edqn_jax.load_policy("pretrained")` loads it.
 
 | | |
 | --- | --- |
-| trained on | {pool:,} random worlds of mixed density (`--world mixed`, the training split), {missions:,} missions |
+| trained on | {pool:,} open worlds, sparse to dense (`--world open`, the training split), {missions:,} missions |
 | training | {decisions:,} decisions in {envs:,} environments, last averaged parameters; {trained} |
 | seed | {seed}, the best of {seeds} in the validation worlds |
 | sees | events of the last {window:g} s (threshold {threshold:g}), its own state and motion |

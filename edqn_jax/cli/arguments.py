@@ -78,8 +78,9 @@ class EvaluateArgs:
 
     run: Annotated[Positional[Path], arg(metavar="RUN")]
     """Folder of the run, or `pretrained`: the policy that comes with the package."""
-    world: Annotated[str | None, arg(metavar="paper|sparse|medium|dense|mixed|FILE.xml", help_behavior_hint="")] = None
-    """Where to fly (default: where training was; for a random density its test worlds)."""
+    world: Annotated[str | None, arg(metavar="WORLD", help_behavior_hint="")] = None
+    """Where to fly: `paper`, an MJCF file, or test worlds of a family (`sparse`, `medium`, `dense`, `rooms`, `forest`,
+    `canyon`, `open`, `mixed`). Default: where training was."""
     start: Annotated[Point | None, arg(metavar="X Y Z", help_behavior_hint="")] = None
     """Start of every mission, metres (default: the world's; random free ones with --missions)."""
     goal: Annotated[Point | None, arg(metavar="X Y Z", help_behavior_hint="")] = None
@@ -105,14 +106,14 @@ class RecordArgs:
     """Folder of the run, or `pretrained`: the policy that comes with the package."""
     file: Annotated[Positional[Path], arg(metavar="FILE.gif")]
     """GIF to write; it replaces a file of that name."""
-    world: Annotated[str | None, arg(metavar="paper|sparse|medium|dense|mixed|FILE.xml", help_behavior_hint="")] = None
-    """Where to fly (default: the world of the run's last flight)."""
+    world: Annotated[str | None, arg(metavar="WORLD", help_behavior_hint="")] = None
+    """Where to fly: `paper`, an MJCF file, or a family of random worlds (default: that of the run's last flight)."""
     start: Annotated[Point | None, arg(metavar="X Y Z", help_behavior_hint="")] = None
     """Start of the flight, metres (default: the world's)."""
     goal: Annotated[Point | None, arg(metavar="X Y Z", help_behavior_hint="")] = None
     """Goal of the flight, metres (default: the world's)."""
     seed: Annotated[int, arg(metavar="S")] = 0
-    """Number of the test world of a random density; elsewhere it only changes the sensor's noise."""
+    """Number of the test world of a family; elsewhere it only changes the sensor's noise."""
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,7 @@
 
 from edqn_jax.config.options import (
     FAMILIES,
-    MIXED,
+    MIXTURES,
     AgentConfig,
     CameraConfig,
     Config,
@@ -17,7 +17,7 @@ from edqn_jax.config.presets import PRESETS, preset
 
 __all__ = [
     "FAMILIES",
-    "MIXED",
+    "MIXTURES",
     "PRESETS",
     "AgentConfig",
     "CameraConfig",

@@ -163,7 +163,7 @@ def make_config(
         make_config("medium", train={"total_steps": 100_000}, agent={"n_step": 5})
 
     Args:
-        world: `paper`, `sparse`, `medium`, `dense`, `mixed` or an MJCF file; None leaves it to the file, else it is
+        world: `paper`, the name of random worlds (`FAMILIES`) or an MJCF file; None leaves it to the file, else it is
             `medium` (`paper` in the preset of that name).
         preset: one of `config.PRESETS`.
         tuned_for: `cpu` or `gpu`: what environments, batches, networks and decisions are chosen for.

@@ -15,8 +15,8 @@ class WorldConfig:
     """Where to train and to fly."""
 
     name: str = "paper"
-    """Where to train: `paper`, a random density (`sparse`, `medium`, `dense`, or `mixed`: all three), or the path of an
-    MJCF file."""
+    """Where to train: `paper`, the path of an MJCF file, or random worlds: open ones (`sparse`, `medium`, `dense`, or
+    `open`: all three), closed ones (`rooms`, `forest`, `canyon`), or all six (`mixed`)."""
     flown: str = ""
     """World of the flight at the end of a run in random worlds: `paper` or the path of an MJCF file; training never
     uses it. Empty: the first test world. A world from a file is flown itself."""
@@ -343,6 +343,9 @@ class Config:
     train: TrainConfig = field(default_factory=TrainConfig)
 
 
-MIXED = "mixed"
-FAMILIES = ("sparse", "medium", "dense", "rooms", "forest", "canyon", MIXED)
-"""Families of random worlds; each of the `mixed` ones is of one of the others."""
+_OPEN = ("sparse", "medium", "dense")
+_CLOSED = ("rooms", "forest", "canyon")
+MIXTURES: dict[str, tuple[str, ...]] = {"open": _OPEN, "mixed": (*_OPEN, *_CLOSED)}
+"""Random worlds that are of one of several families, with equal chances."""
+FAMILIES = (*_OPEN, *_CLOSED, *MIXTURES)
+"""Names of random worlds."""

@@ -66,8 +66,8 @@ def evaluate(
 
     Args:
         policy: from `train` or `load_policy`.
-        world: `paper`, `sparse`, `medium`, `dense`, `mixed` or an MJCF file; None is where it was
-            trained, of a random density its test worlds.
+        world: `paper`, the name of random worlds (`config.FAMILIES`) or an MJCF file; None is where it was
+            trained, of random worlds the test worlds.
         missions: how many. One in a world from a file goes from its start to its goal, more begin at random free
             points; in random worlds each has a test world of its own, which training never uses.
         seed: which missions.

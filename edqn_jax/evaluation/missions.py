@@ -216,7 +216,7 @@ def load_missions(
 
     Args:
         config: configuration of the policy.
-        name: `sparse`, `medium`, `dense`, `mixed`, the name of a scene or an MJCF file.
+        name: of `config.FAMILIES`, of a scene, or an MJCF file.
         missions: number of missions.
         seed: seed of the missions.
         start: start of every mission, metres.

@@ -202,7 +202,9 @@ def _skip_ahead(points: np.ndarray, touches: Touches) -> np.ndarray:
 def main(arguments: list[str] | None = None) -> int:
     """Print the shortest path of a world."""
     parser = argparse.ArgumentParser(prog="python -m edqn_jax.planners.astar", description=main.__doc__)
-    parser.add_argument("--world", default="paper", help="paper, sparse, medium, dense, mixed or an MJCF file")
+    parser.add_argument(
+        "--world", default="paper", help="paper, the name of random worlds such as medium or rooms, or an MJCF file"
+    )
     parser.add_argument("--index", type=int, default=0, help="which test world, for random worlds")
     options = parser.parse_args(arguments)
     radius = Config().drone.body_radius_m

@@ -54,7 +54,10 @@ def draw(key: Array) -> Scene:
     x, y, placed = discs.place(reach, candidates, GAP)
     low, high, there = jax.vmap(_parts)(reach, plan[:, 1], plan[:, 2], is_large)
 
-    yaw = 2 * jnp.pi * plan[:, 3]
+    # A building that reaches over the edge opens towards the middle: what opens outwards would be closed.
+    to_edge = jnp.minimum(jnp.minimum(x, SIZE[0] - x), jnp.minimum(y, SIZE[1] - y))
+    inwards = jnp.arctan2(y - SIZE[1] / 2, x - SIZE[0] / 2)
+    yaw = jnp.where(to_edge < reach, inwards, 2 * jnp.pi * plan[:, 3])
     cos, sin = jnp.cos(yaw)[:, None], jnp.sin(yaw)[:, None]
     middle = (low + high) / 2
     turned = jnp.stack(

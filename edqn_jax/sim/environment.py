@@ -132,7 +132,7 @@ def make(
     """Makes an environment.
 
     Args:
-        world: `paper`, a random density (`sparse`, `medium`, `dense`, `mixed`), or an MJCF file; None takes that of
+        world: `paper`, the name of random worlds (`config.FAMILIES`), or an MJCF file; None takes that of
             `config`.
         config: of drone, camera, events and task; without it the default for that world.
         worlds: how many random worlds, each with a mission of its own; 1 for a world from a file.

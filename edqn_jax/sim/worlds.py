@@ -14,7 +14,7 @@ import numpy as np
 from jax import Array, lax
 from jax.typing import ArrayLike
 
-from edqn_jax.config import FAMILIES, MIXED
+from edqn_jax.config import FAMILIES, MIXTURES
 from edqn_jax.errors import ConfigError
 from edqn_jax.random import integers
 from edqn_jax.sim import canyon, forest, open_worlds, rooms
@@ -24,10 +24,7 @@ from edqn_jax.sim.ways import has_way
 RADIUS_M = 0.36
 """Of the sphere that has a way in every random world; the drone's."""
 
-SINGLE = tuple(name for name in FAMILIES if name != MIXED)
-"""The families that a mixed world may be of, with equal chances."""
-
-_FAMILY = 1_000_003  # folded into the key of a mixed world to draw its family
+_FAMILY = 1_000_003  # folded into the key of a world of a mixture to draw its family
 _AT_ONCE = 64  # worlds that are drawn by one call
 
 # ------------------------------------------------------------------------------------------- seeds
@@ -75,25 +72,25 @@ def random_scene(family: str, key: Array) -> Scene:
     """Returns a random world with a start, a goal, and a way between them for a sphere of `RADIUS_M`.
 
     Args:
-        family: of `FAMILIES`; a mixed world is of one of the others.
+        family: of `FAMILIES`; a world of a mixture is of one of its families.
         key: consumed.
 
     Raises:
         ConfigError: if there is no such family.
     """
     _check(family)
-    if family == MIXED:
-        family = SINGLE[int(_families_of(key[None])[0])]
+    if family in MIXTURES:
+        family = families_of(family, key[None])[0]
     return take_scene(_drawn(family, key[None]), 0)
 
 
 def random_pool(family: str, keys: Array) -> Scene:
     """Returns a pool of random worlds, one for each of `keys` [P]; see `random_scene`."""
     _check(family)
-    if family != MIXED:
+    if family not in MIXTURES:
         return _in_batches(family, keys)
-    number = np.asarray(_families_of(keys))
-    present = [(SINGLE[each], np.flatnonzero(number == each)) for each in np.unique(number)]
+    names = np.array(families_of(family, keys))
+    present = [(str(name), np.flatnonzero(names == name)) for name in np.unique(names)]
     pools = with_equal_capacities([_in_batches(name, keys[which]) for name, which in present])
     order = np.argsort(np.concatenate([which for _, which in present]))
     return jax.tree.map(lambda *leaves: jnp.asarray(np.concatenate(leaves)[order]), *pools)
@@ -104,10 +101,11 @@ def _check(family: str) -> None:
         raise ConfigError(f"there are no random worlds '{family}'; there are {', '.join(FAMILIES)}")
 
 
-@jax.jit
-def _families_of(keys: Array) -> Array:
-    """Returns the number in `SINGLE` of the family of each mixed world, [P] int32."""
-    return jax.vmap(lambda key: integers(jax.random.fold_in(key, _FAMILY), (), len(SINGLE)))(keys)
+def families_of(mixture: str, keys: Array) -> list[str]:
+    """Returns the family of each world of a mixture, from the worlds' keys [P]."""
+    families = MIXTURES[mixture]
+    numbers = jax.vmap(lambda key: integers(jax.random.fold_in(key, _FAMILY), (), len(families)))(keys)
+    return [families[number] for number in np.asarray(numbers)]
 
 
 def _in_batches(family: str, keys: Array) -> Scene:
@@ -118,7 +116,7 @@ def _in_batches(family: str, keys: Array) -> Scene:
     # As data: the first key is used once more to fill the last batch.
     data = np.asarray(jax.random.key_data(keys))
     data = np.concatenate([data, np.broadcast_to(data[:1], (-count % _AT_ONCE, *data.shape[1:]))])
-    batches = [jax.random.wrap_key_data(data[i : i + _AT_ONCE]) for i in range(0, count, _AT_ONCE)]
+    batches = [jax.random.wrap_key_data(jnp.asarray(data[i : i + _AT_ONCE])) for i in range(0, count, _AT_ONCE)]
     # XLA uses one core for a batch.
     with ThreadPoolExecutor(thread_name_prefix="drawing") as pool:
         drawn = list(pool.map(partial(_drawn, family), batches))
@@ -128,14 +126,14 @@ def _in_batches(family: str, keys: Array) -> Scene:
 @partial(jax.jit, static_argnums=0)
 def _drawn(family: str, keys: Array) -> Scene:
     """Returns worlds of one family, one for each key [P]; one without a way is drawn again with another key."""
-    how = _FAMILIES[family]
-    if how.edge_m is None:
+    how, edge = _FAMILIES[family], _FAMILIES[family].edge_m
+    if edge is None:
         return jax.vmap(how.draw)(keys)
 
     def drawn(key: Array) -> Scene:
         def attempt(number: Array) -> tuple[Array, Scene, Array]:
             scene = how.draw(jax.random.fold_in(key, number))
-            return number, scene, has_way(scene, how.size, RADIUS_M, how.edge_m)
+            return number, scene, has_way(scene, how.size, RADIUS_M, edge)
 
         first = attempt(jnp.zeros((), jnp.int32))
         return lax.while_loop(lambda state: ~state[2], lambda state: attempt(state[0] + 1), first)[1]

@@ -24,7 +24,8 @@ def has_way(scene: Scene, size: tuple[float, float, float], radius: float, edge:
         free & (np.linalg.norm(middles - np.asarray(point), axis=-1) < CLEARANCE - radius)
         for point in (scene.start, scene.goal)
     )
-    parts, _ = ndimage.label(free)
+    parts = np.zeros(counts, np.int32)
+    ndimage.label(free, output=parts)
     return bool(np.intersect1d(parts[start], parts[goal]).size)
 
 

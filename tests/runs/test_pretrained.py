@@ -37,7 +37,7 @@ def test_a_folder_of_that_name_goes_first(tmp_path: Path, monkeypatch: pytest.Mo
 def test_its_card_tells_of_its_training() -> None:
     card, config = (FOLDER / "README.md").read_text(), edqn_jax.load_policy(PRETRAINED).config
     assert f"{config.train.total_steps:,} decisions" in card and f"| seed | {config.train.seed}, " in card
-    assert f"{config.world.pool_size:,} random worlds" in card and config.world.name == "mixed"
+    assert f"{config.world.pool_size:,} open worlds" in card and config.world.name == "open"
     for density in ("sparse", "medium", "dense"):
         assert re.search(rf"^\| {density} \| 1000 \| (9\d|100)\.\d% \| ", card, re.MULTILINE), density
 

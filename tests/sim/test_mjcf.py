@@ -13,6 +13,7 @@ import mujoco
 import numpy as np
 import pytest
 
+from edqn_jax.config import FAMILIES
 from edqn_jax.errors import ConfigError
 from edqn_jax.sim import mjcf
 from edqn_jax.sim.mjcf import (
@@ -228,7 +229,7 @@ def test_a_missing_scene_names_what_there_is_and_what_was_meant(name, hint, tmp_
         resolve_world(name)
     assert message(raised) == (
         f"there is no scene '{name}' in {tmp_path}; scenes known by name: alley, paper; "
-        f"random worlds: sparse, medium, dense, mixed{hint}"
+        f"random worlds: {', '.join(FAMILIES)}{hint}"
     )
 
 

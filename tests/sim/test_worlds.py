@@ -3,22 +3,23 @@
 from __future__ import annotations
 
 import dataclasses
+from functools import partial
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from edqn_jax.config import FAMILIES, MIXED
+from edqn_jax.config import FAMILIES, MIXTURES
 from edqn_jax.errors import ConfigError
 from edqn_jax.planners.astar import shortest_path
 from edqn_jax.planners.free_space import reachable
-from edqn_jax.sim import canyon, forest, rooms, worlds
+from edqn_jax.sim import canyon, discs, forest, rooms, worlds
 from edqn_jax.sim.free_points import CLEARANCE, FAR
 from edqn_jax.sim.missions import own_missions, random_missions, spread_missions
 from edqn_jax.sim.mjcf import check_scene, load_world, write_scene
 from edqn_jax.sim.scene import Scene, obstacle_count, scene_shapes, signed_distance, take_scene
-from edqn_jax.sim.worlds import SINGLE, SPLITS, random_pool, random_scene, world_key, world_keys
+from edqn_jax.sim.worlds import SPLITS, families_of, random_pool, random_scene, world_key, world_keys
 
 RADIUS = 0.36
 WORLDS = 24
@@ -72,12 +73,14 @@ def test_a_pool_does_not_depend_on_how_many_are_drawn_at_once(pools, monkeypatch
 
 
 @pytest.mark.slow
-def test_mixed_worlds_are_of_every_other_family(pools):
-    number = np.asarray(worlds._families_of(world_keys("validation", 600)))
+@pytest.mark.parametrize("mixture", MIXTURES)
+def test_worlds_of_a_mixture_are_of_its_families_with_equal_chances(pools, mixture):
+    names = families_of(mixture, world_keys("validation", 600))
     for i in range(WORLDS):
-        assert_same_world(take_scene(pools[MIXED], i), take_scene(pools[SINGLE[number[i]]], i))
-    # 100 are expected of each, 9 up or down (standard deviation); the keys are fixed.
-    assert np.abs(np.bincount(number, minlength=len(SINGLE)) - 100).max() < 3 * 9
+        assert_same_world(take_scene(pools[mixture], i), take_scene(pools[names[i]], i))
+    counts = [names.count(family) for family in MIXTURES[mixture]]
+    # The standard deviation of each count is below 12; the keys are fixed.
+    assert sum(counts) == 600 and np.abs(np.array(counts) - 600 / len(counts)).max() < 3 * 12
 
 
 @pytest.mark.parametrize("family", FAMILIES)
@@ -93,7 +96,7 @@ def test_start_and_goal_are_free_and_far_apart(pools, family):
         check_scene(take_scene(pool, i), RADIUS)
 
 
-@pytest.mark.parametrize("family", SINGLE)
+@pytest.mark.parametrize("family", MIXTURES["mixed"])
 @pytest.mark.slow
 def test_there_is_a_path_in_every_random_world(pools, family):
     for i in range(2):
@@ -105,9 +108,21 @@ def test_there_is_a_path_in_every_random_world(pools, family):
 @pytest.mark.parametrize("family", HARD)
 @pytest.mark.slow
 def test_there_is_a_way_from_everywhere_so_that_missions_may_begin_anywhere(pools, family):
-    for i in range(3):
-        found = reachable(take_scene(pools[family], i), RADIUS, 0.5)
-        assert found.lost == 0.0
+    scene = take_scene(pools[family], 1)  # the canyon has a courtyard at the edge
+    found = reachable(scene, RADIUS, 0.5)
+    cells = found.corner + found.edge_m * np.argwhere(~found.is_way)
+    clearance = jax.vmap(partial(signed_distance, scene))(jnp.asarray(cells, jnp.float32))
+    assert (clearance < CLEARANCE).all()
+
+
+def test_no_corner_is_cut_off():
+    """A disc with its middle on the floor reaches over one side at most, so that no corner is closed."""
+    reach = jnp.linspace(0.5, 6.5, 40)
+    draw = jax.random.uniform(jax.random.key(0), (40, 64, 2))
+    places = np.asarray(discs.across_the_edge(reach, draw, (40.0, 60.0), 1.0))
+    assert (places >= 0.0).all() and (places <= (40.0, 60.0)).all()
+    near = np.minimum(places, (40.0, 60.0) - places) < np.asarray(reach)[:, None, None] + 1.0 - 1e-4
+    assert not near.all(axis=2).any() and near.any(axis=2).any()
 
 
 @pytest.mark.slow
@@ -139,7 +154,8 @@ def test_hard_worlds_are_the_same_as_mjcf(pools, family, tmp_path):
     write_scene(scene, tmp_path / "world.xml", title=family)
     world = load_world(tmp_path / "world.xml")
     check_scene(world.scene, RADIUS, names=world.names)
-    points = np.random.default_rng(0).uniform(*np.asarray(scene.volume), (500, 3)).astype(np.float32)
+    lower, upper = np.asarray(scene.volume)
+    points = np.random.default_rng(0).uniform(lower, upper, (500, 3)).astype(np.float32)
     ours, theirs = (jax.vmap(lambda point, of=of: signed_distance(of, point))(points) for of in (scene, world.scene))
     np.testing.assert_allclose(ours, theirs, atol=2e-5)  # written with some digits
 
@@ -153,8 +169,8 @@ def test_a_world_without_a_way_is_drawn_again(monkeypatch):
         position = scene.boxes.position.at[0].set(jnp.where(wall, scene.volume[1] / 2, scene.boxes.position[0]))
         # Nobody starts or ends in it.
         start, goal = scene.volume[1] * jnp.array([0.1, 0.5, 0.5]), scene.volume[1] * jnp.array([0.9, 0.5, 0.5])
-        boxes = scene.boxes.replace(half=half, position=position)
-        return scene.replace(boxes=boxes, start=start, goal=goal)
+        boxes = dataclasses.replace(scene.boxes, half=half, position=position)
+        return dataclasses.replace(scene, boxes=boxes, start=start, goal=goal)
 
     rooms_too = worlds._FAMILIES["rooms"]
     monkeypatch.setitem(worlds._FAMILIES, "walled", dataclasses.replace(rooms_too, draw=draw))
@@ -167,7 +183,7 @@ def test_a_world_without_a_way_is_drawn_again(monkeypatch):
 
 
 def test_an_unknown_family_names_those_there_are():
-    with pytest.raises(ConfigError, match="'thick'; there are sparse, medium, dense, rooms, forest, canyon, mixed"):
+    with pytest.raises(ConfigError, match="'thick'; there are sparse, medium, .*, canyon, open, mixed"):
         random_scene("thick", world_key("test", 0))
 
 
