@@ -149,12 +149,13 @@ class EnvConfig:
     """Episode limit in decisions (the `threshold` of Table 1)."""
     heading_hold_m: float = 2.0
     """Within this horizontal distance of the goal the heading setpoint is held."""
-    reward: Literal["sparse", "progress", "potential"] = "progress"
-    """`sparse`: Eq. 8. `progress`: adds metres gained. `potential`: the policy-invariant form."""
+    reward: Literal["sparse", "progress", "potential", "geodesic"] = "progress"
+    """`sparse`: Eq. 8. `progress`: adds metres gained. `potential`: the policy-invariant form. `geodesic`: as
+    `progress`, with metres along the shortest way around what is in the way, which training alone knows."""
     progress_weight: float = 3.0
-    """Reward per metre gained towards the goal (`progress`, `potential`)."""
+    """Reward per metre gained towards the goal (`progress`, `geodesic`, `potential`)."""
     path_weight: float = 1.5
-    """Reward lost per metre flown (`progress`), so that detours cost something."""
+    """Reward lost per metre flown (`progress`, `geodesic`), so that detours cost something."""
     goal_reward: float = 100.0
     """Reward at the goal (Eq. 8)."""
     collision_reward: float = -100.0

@@ -18,7 +18,7 @@ from jax import Array
 from edqn_jax.checks import check_finite, check_index
 from edqn_jax.config import Config, EnvConfig
 from edqn_jax.random import integers
-from edqn_jax.sim import drone, sensor
+from edqn_jax.sim import drone, geodesic, sensor
 from edqn_jax.sim.drone import Airframe, DroneState, Flight
 from edqn_jax.sim.events import EventMemory
 from edqn_jax.sim.missions import Missions
@@ -49,6 +49,7 @@ class World:
     pool: Scene  # every array with a leading [P]
     missions: Missions
     reward: Reward | None = struct.field(pytree_node=False, default=None)  # in place of the configured one
+    ways: geodesic.Field | None = None  # to the goals of the pool's worlds, in training for the reward `geodesic`
 
 
 @struct.dataclass
@@ -340,7 +341,7 @@ def _fly(config: Config, world: World, scene: Scene, goal: Array, state: EnvStat
     command = velocity_command(config.env, action, drone.yaw_of(before.quaternion))
     after, flight = drone.fly(config.drone, world.airframe, before, command, bearing(config.env, before, goal))
     outcome, end_step, contact = judge(config, scene, goal, before.position, flight, state.decision + 1)
-    reward = _reward(config, world, scene, goal, before, after, action, outcome)
+    reward = _reward(config, world, scene, goal, state, after, action, outcome)
     numbers = jnp.concatenate([after.position, after.quaternion, after.velocity, after.angular_velocity])
     broken = ~jnp.all(jnp.isfinite(numbers))
     check_finite(numbers, "the state of a drone")
@@ -363,15 +364,20 @@ def _reward(
     world: World,
     scene: Scene,
     goal: Array,
-    before: DroneState,
+    state: EnvState,
     after: DroneState,
     action: Array,
     outcome: Array,
 ) -> Array:
-    """The configured reward, or that of the world's own function."""
-    distances = [jnp.sqrt(jnp.sum((goal - p) ** 2)) for p in (before.position, after.position)]
+    """The configured reward, or that of the world's own function; without a field of ways `geodesic` is straight."""
+    before, ways = state.drone, world.ways
+    if config.env.reward == "geodesic" and ways is not None:
+        left = lambda point: geodesic.remaining(ways, world.missions.scene[state.mission], goal, point)  # noqa: E731
+    else:
+        left = lambda point: jnp.sqrt(jnp.sum((goal - point) ** 2))  # noqa: E731
     moved = jnp.sqrt(jnp.sum((after.position - before.position) ** 2))
-    configured = configured_reward(config.env, config.agent.discount, outcome, distances[0], distances[1], moved)
+    lefts = left(before.position), left(after.position)
+    configured = configured_reward(config.env, config.agent.discount, outcome, *lefts, moved)
     if world.reward is None:
         return configured
     transition = Transition(

@@ -40,12 +40,12 @@ def configured_reward(
     """Returns the configured reward of one decision.
 
     `sparse` is Eq. 8. `progress` adds the metres gained towards the goal, times a weight, and
-    subtracts a weight for each metre flown. `potential` adds
+    subtracts a weight for each metre flown; `geodesic` is the same with distances around obstacles. `potential` adds
     gamma * Phi(s') - Phi(s) with Phi = -weight * distance, and Phi = 0 at terminal states: the form that leaves the
     optimal policy unchanged (Ng et al. 1999).
 
     Args:
-        before, after: distances to the goal, metres.
+        before, after: distances to the goal, metres; straight, or along the shortest way (`geodesic`).
         flown: metres flown.
     """
     at_end = jnp.select(
@@ -54,7 +54,7 @@ def configured_reward(
         0.0,
     )
     total = at_end + config.step_reward
-    if config.reward == "progress":
+    if config.reward in ("progress", "geodesic"):
         total = total + config.progress_weight * (before - after) - config.path_weight * flown
     elif config.reward == "potential":
         terminal = is_terminal(outcome)
