@@ -10,7 +10,7 @@ not measured again: a command that was stopped goes on where it was. No row is b
 
 With --runs nothing is trained: the policies of these runs, which differ in their seeds alone, fly. Arguments after --
 are options of train.py; defaults are those of the hardware. The interval is a bootstrap over seeds and missions. A* for
-the SPL takes 0.4 s a world and core, once for each density, when there is time after the rows; --no-spl leaves it out.
+the SPL takes 0.4 s a world and core, once for each world, when there is time after the rows; --no-spl leaves it out.
 """
 
 from __future__ import annotations

@@ -39,12 +39,12 @@ FLAGS = (
 
 DENSITIES = ("sparse", "medium", "dense")
 MISSIONS = 1000
-"""Test worlds of each density; training never uses them."""
+"""Test worlds of each family; training never uses them."""
 
 CARD = """# Model card: `pretrained`
 
-A policy for random worlds of every density, flown from simulated events. `edqn evaluate pretrained --world FILE.xml`
-flies it, `edqn_jax.load_policy("pretrained")` loads it.
+A policy for open random worlds, sparse to dense, flown from simulated events.
+`edqn evaluate pretrained --world FILE.xml` flies it, `edqn_jax.load_policy("pretrained")` loads it.
 
 | | |
 | --- | --- |
@@ -87,7 +87,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     )
     parser.add_argument("--run", type=Path, required=True, help="folder of the runs; trained if there are none")
     parser.add_argument("--out", type=Path, required=True, help="folder of policy and card; replaced")
-    parser.add_argument("--missions", type=int, default=MISSIONS, help=f"test worlds of a density (default {MISSIONS})")
+    parser.add_argument("--missions", type=int, default=MISSIONS, help=f"test worlds of a family (default {MISSIONS})")
     parser.add_argument("--trained", help="where and how long the run was trained, if its summary.json does not say")
     parser.add_argument("--commit", help="commit that the run was trained at; needed if it is not trained now")
     args = parser.parse_args(argv)

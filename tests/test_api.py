@@ -115,7 +115,7 @@ def test_options_are_given_by_group_and_the_world_brings_its_own() -> None:
 
 
 @pytest.mark.slow
-def test_an_environment_is_made_from_a_density_or_a_file(tmp_path: Path) -> None:
+def test_an_environment_is_made_from_a_family_or_a_file(tmp_path: Path) -> None:
     two, other = edqn_jax.make("sparse", CONFIG, worlds=2), edqn_jax.make("sparse", CONFIG, worlds=2, seed=1)
     assert two.missions == 2 and not np.array_equal(two.world.pool.start, other.world.pool.start)
     with pytest.raises(edqn_jax.ConfigError, match="worlds must be 1 for 'paper'"):

@@ -92,6 +92,8 @@ def check(config: Config) -> None:
         )
     if config.camera.mount != "level":
         raise ConfigError("the conventional stack supports only a level camera; set camera.mount to 'level'")
+    if config.env.reward == "geodesic":
+        raise ConfigError("the conventional stack has no reward 'geodesic'; set env.reward to 'progress'")
 
 
 class Fleet:

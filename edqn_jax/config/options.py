@@ -21,7 +21,7 @@ class WorldConfig:
     """World of the flight at the end of a run in random worlds: `paper` or the path of an MJCF file; training never
     uses it. Empty: the first test world. A world from a file is flown itself."""
     pool_size: int = 1024
-    """Random training worlds, generated before training (random densities only)."""
+    """Random training worlds, drawn before training (in random worlds only)."""
     missions: int = 8192
     """(world, start, goal) triples, generated before training, that resets draw from."""
     own_start_fraction: float = 0.25
@@ -151,7 +151,8 @@ class EnvConfig:
     """Within this horizontal distance of the goal the heading setpoint is held."""
     reward: Literal["sparse", "progress", "potential", "geodesic"] = "progress"
     """`sparse`: Eq. 8. `progress`: adds metres gained. `potential`: the policy-invariant form. `geodesic`: as
-    `progress`, with metres along the shortest way around what is in the way, which training alone knows."""
+    `progress`, with metres along the shortest way around obstacles, which training alone knows: all its missions in a
+    world then end at that world's own goal, and what is not training counts straight metres."""
     progress_weight: float = 3.0
     """Reward per metre gained towards the goal (`progress`, `geodesic`, `potential`)."""
     path_weight: float = 1.5

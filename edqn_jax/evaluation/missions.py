@@ -16,7 +16,7 @@ from edqn_jax.errors import ConfigError
 from edqn_jax.planners.astar import shortest_path
 from edqn_jax.planners.free_space import reachable
 from edqn_jax.random import run_streams
-from edqn_jax.sim import drone, geodesic, worlds
+from edqn_jax.sim import drone, worlds
 from edqn_jax.sim.env import World
 from edqn_jax.sim.free_points import Cells, cells_of, free_point
 from edqn_jax.sim.missions import Missions, own_missions, random_missions, spread_missions
@@ -135,7 +135,7 @@ def _random_run_missions(config: Config, training_key: jax.Array) -> RunMissions
         validation, test, own = with_equal_capacities([validation, test, _pool_of(flown, config)])
         test = jax.tree.map(lambda one, many: jnp.asarray(np.concatenate([one, many])[:-1]), own, test)
     return RunMissions(
-        training=MissionSet(name, World(airframe, training_pool, training, ways=_ways(training_pool, config))),
+        training=MissionSet(name, World(airframe, training_pool, training)),
         validation=MissionSet(name, World(airframe, validation, own_missions(validation))),
         final=MissionSet(name, World(airframe, test, own_missions(test))),
         near_start=np.ones(count, bool),
@@ -144,17 +144,8 @@ def _random_run_missions(config: Config, training_key: jax.Array) -> RunMissions
 
 
 def _training_missions(pool: Scene, config: Config, key: jax.Array) -> Missions:
-    """Returns missions between random points; to the worlds' own goals alone where the reward needs ways to them."""
-    if config.env.reward == "geodesic":
-        return spread_missions(pool, config.world.missions, 0.0, 0.0, key)
-    return random_missions(pool, config.world.missions, key)
-
-
-def _ways(pool: Scene, config: Config) -> geodesic.Field | None:
-    """Returns the fields of ways to the worlds' goals if the reward needs them."""
-    if config.env.reward != "geodesic":
-        return None
-    return geodesic.fields(pool, config.drone.body_radius_m)
+    """Returns missions between random points; to the worlds' own goals where the reward needs distances to them."""
+    return random_missions(pool, config.world.missions, key, own_goals=config.env.reward == "geodesic")
 
 
 def _pool_of(name: str, config: Config) -> Scene:
@@ -184,7 +175,7 @@ def _file_run_missions(config: Config, training_key: jax.Array, validation_key: 
     final = jax.tree.map(lambda one, many: jnp.concatenate([one, many[1:]]), own, validation)
     final = dataclasses.replace(final, scene=final.scene.astype(jnp.int32))
     return RunMissions(
-        training=MissionSet(name, World(airframe, pool, training, ways=_ways(pool, config)), file, note),
+        training=MissionSet(name, World(airframe, pool, training), file, note),
         validation=MissionSet(name, World(airframe, pool, validation), file),
         final=MissionSet(name, World(airframe, pool, final), file),
         near_start=_near(validation, np.asarray(pool.start[0]), near),

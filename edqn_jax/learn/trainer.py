@@ -396,7 +396,7 @@ class Trainer:
         """Returns `function(world, *arguments)` for all agents; `axes` are those of the other arguments."""
         if self.agents is None:
             return function
-        missions = dataclasses.replace(self.world, airframe=None, pool=None, missions=0)
+        missions = dataclasses.replace(self.world, airframe=None, pool=None, missions=0, distances=None)
         return jax.vmap(function, in_axes=(missions, *axes))
 
     def _spread(self, *before: None) -> PartitionSpec:

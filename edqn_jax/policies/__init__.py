@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 PRETRAINED = "pretrained"
-"""Name of the policy for random worlds of every density."""
+"""Name of the policy for open random worlds."""
 
 
 def policy_folder(run: Path) -> Path:

@@ -69,7 +69,7 @@ def draw(key: Array) -> Scene:
         axis=-1,
     )
     # Of small buildings the last parts, which they never have, are left out.
-    kept = jnp.flatnonzero(is_large[:, None] | (jnp.arange(_PARTS) < _PARTS // 2), size=parts)
+    kept = jnp.flatnonzero(is_large[:, None] | (jnp.arange(_PARTS) < _PARTS // 2)[None], size=parts)
     return building.world(
         SIZE,
         ends.reshape(2, TRIES, 3),
@@ -112,8 +112,8 @@ def _parts(reach: Array, kind: Array, level: Array, is_large: Array) -> tuple[Ar
         ((-0.6 * reach, -0.7 * reach, shelf), (0.0, 0.7 * reach, shelf + SLAB)),
     )
     slabs = (
-        ((-0.3 * reach - w, -0.85 * reach, 0.0), (-0.3 * reach, 0.85 * reach, standing)),
-        ((0.3 * reach, -0.85 * reach, hanging), (0.3 * reach + w, 0.85 * reach, top)),
+        ((-0.3 * reach - w, -0.74 * reach, 0.0), (-0.3 * reach, 0.74 * reach, standing)),
+        ((0.3 * reach, -0.74 * reach, hanging), (0.3 * reach + w, 0.74 * reach, top)),
     )
     tower = (((-0.6 * reach, -0.6 * reach, 0.0), (0.6 * reach, 0.6 * reach, top)),)
     nothing = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))

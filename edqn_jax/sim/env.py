@@ -49,7 +49,7 @@ class World:
     pool: Scene  # every array with a leading [P]
     missions: Missions
     reward: Reward | None = struct.field(pytree_node=False, default=None)  # in place of the configured one
-    ways: geodesic.Field | None = None  # to the goals of the pool's worlds, in training for the reward `geodesic`
+    distances: geodesic.Field | None = None  # to the pool's own goals, in training for the reward `geodesic`
 
 
 @struct.dataclass
@@ -369,15 +369,19 @@ def _reward(
     action: Array,
     outcome: Array,
 ) -> Array:
-    """The configured reward, or that of the world's own function; without a field of ways `geodesic` is straight."""
-    before, ways = state.drone, world.ways
-    if config.env.reward == "geodesic" and ways is not None:
-        left = lambda point: geodesic.remaining(ways, world.missions.scene[state.mission], goal, point)  # noqa: E731
-    else:
-        left = lambda point: jnp.sqrt(jnp.sum((goal - point) ** 2))  # noqa: E731
+    """The configured reward, or that of the world's own function; where there are no distances all are straight."""
+    before = state.drone
     moved = jnp.sqrt(jnp.sum((after.position - before.position) ** 2))
-    lefts = left(before.position), left(after.position)
-    configured = configured_reward(config.env, config.agent.discount, outcome, *lefts, moved)
+    if config.env.reward == "geodesic" and world.distances is not None:
+        number = world.missions.scene[state.mission]
+        left = geodesic.remaining(world.distances, number, goal, before.position)
+        gained = left - geodesic.remaining(world.distances, number, goal, after.position)
+        # Nobody gains more than the way flown: a drone that crashes into a thin wall ends behind it.
+        most = geodesic.LONGER * moved
+        still_left = left - jnp.clip(gained, -most, most)
+    else:
+        left, still_left = (jnp.sqrt(jnp.sum((goal - point) ** 2)) for point in (before.position, after.position))
+    configured = configured_reward(config.env, config.agent.discount, outcome, left, still_left, moved)
     if world.reward is None:
         return configured
     transition = Transition(

@@ -30,9 +30,8 @@ def draw(key: Array) -> Scene:
 
     The free space is connected by construction. A tree is a disc seen from above, and the discs, grown by the drone's
     radius, are still apart. A disc may reach over one side of the floor, but closes no corner: discs and outside have
-    no loop between them, so they do not divide the floor. From beside a branch a drone comes to the rim of the tree's
-    disc by moving level, straight away from the trunk or, where the branch is in the way, around it at its own
-    distance.
+    no loop between them, so they do not divide the floor. Beside a
+    branch the space is open to both sides, above and below.
 
     Args:
         key: consumed.

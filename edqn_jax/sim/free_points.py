@@ -16,9 +16,10 @@ from edqn_jax.sim.scene import Scene, signed_distance
 CLEARANCE = 1.0
 """Metres between a random start or goal and the nearest surface."""
 FAR = 40.0
-"""Least distance between a random start and a random goal, metres."""
+"""Least distance between a random start and a random goal, metres; in a small volume half of its length."""
 TRIES = 64
-"""Candidates for each free point; the chance that all fail is below 1e-13 in a dense world."""
+"""Candidates for each free point; the chance that all fail is below 1e-13 in a dense world, and 3e-5 in rooms, where a
+goal may then be nearer than it should."""
 
 _ALTITUDES = (1.5, 20.0)  # of the start and goal of a random world, metres
 _FENCE = ((1.0, 1.0, 1.0), (1.0, 1.0, 2.0))  # between random points and the volume's lower and upper faces
@@ -68,10 +69,14 @@ def far_apart(scene: Scene, draw: Array) -> tuple[Array, Array]:
 
     They are `FAR` metres apart, or half as far as the volume is long.
     """
-    distance = jnp.minimum(FAR, (scene.volume[1, 0] - scene.volume[0, 0]) / 2)
     start = first_free(scene, scatter(scene, draw[0], _ALTITUDES), CLEARANCE)
-    goal = first_free(scene, scatter(scene, draw[1], _ALTITUDES), CLEARANCE, start, distance)
-    return start, goal
+    return start, far_from(scene, draw[1], start)
+
+
+def far_from(scene: Scene, draw: Array, point: Array) -> Array:
+    """Returns a free point [3] as far from `point` [3] as a start is from its goal, from uniform draws [K, 3]."""
+    distance = jnp.minimum(FAR, (scene.volume[1, 0] - scene.volume[0, 0]) / 2)
+    return first_free(scene, scatter(scene, draw, _ALTITUDES), CLEARANCE, point, distance)
 
 
 def scatter(scene: Scene, draw: Array, altitudes: tuple[float, float] | None = None) -> Array:

@@ -1,8 +1,8 @@
 """How far it is to the goal around what stands in the way: a field per world, for the reward `geodesic`.
 
-A lattice of nodes over the volume. Around each node a ball with the radius of its clearance is free, so wherever two
-balls meet, a point passes straight from node to node. A node holds the length of the shortest such way to the goal.
-Along axes and diagonals lengths are up to an eighth longer than straight ones.
+A lattice of nodes over the volume, each of which has room for the drone. Around a node a ball with the radius of its
+clearance is free, so wherever two balls meet, a point passes straight from node to node: through a gap that is a little
+too narrow for the drone, never through a wall. A node holds the length of the shortest such way to the goal.
 """
 
 from __future__ import annotations
@@ -27,6 +27,9 @@ FINEST_M = 0.5
 POOL_NODES = (40, 40, 9)
 """Nodes of the field of each world of a pool, whatever its volume."""
 
+LONGER = 1.13
+"""Lengths along axes and diagonals over straight ones, at most."""
+
 _AT_ONCE = 128  # worlds of a pool
 
 _SIDES = np.array([*itertools.product((-1, 0, 1), repeat=2)])
@@ -46,21 +49,25 @@ class Field:
 
 
 def nodes(size: tuple[float, float, float], most: int = MOST_NODES) -> tuple[int, int, int]:
-    """Returns so many nodes along each side of a volume, metres, that there are at most about `most` of them."""
+    """Returns so many nodes along each side of a volume, metres, that there are about `most` of them, or fewer."""
     edge = max(FINEST_M, (math.prod(size) / most) ** (1 / 3))
     across, along, levels = (max(2, math.ceil(side / edge)) for side in size)
     return across, along, levels
 
 
 def fields(pool: Scene, radius: float) -> Field:
-    """Returns the fields of a pool of worlds [P] for a sphere of `radius` metres; that of a single world is finer."""
+    """Returns the fields of a pool of worlds [P], whose nodes have `radius` metres of room; of a single world, finer.
+
+    Its arrays are on the host: of many worlds they take gigabytes.
+    """
     worlds = pool.start.shape[0]
-    shape = POOL_NODES if worlds > 1 else nodes(tuple(map(float, pool.volume[0, 1] - pool.volume[0, 0])))
+    across, along, high = map(float, pool.volume[0, 1] - pool.volume[0, 0])
+    shape = POOL_NODES if worlds > 1 else nodes((across, along, high))
     parts = [jax.tree.map(lambda leaf, i=i: leaf[i : i + _AT_ONCE], pool) for i in range(0, worlds, _AT_ONCE)]
     # XLA uses one core for a part.
     with ThreadPoolExecutor(thread_name_prefix="ways") as threads:
-        found = list(threads.map(lambda part: _fields(part, shape, radius), parts))
-    return jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *found)
+        found = list(threads.map(lambda part: jax.tree.map(np.asarray, _fields(part, shape, radius)), parts))
+    return jax.tree.map(lambda *leaves: np.concatenate(leaves), *found)
 
 
 @partial(jax.jit, static_argnums=(1, 2))
@@ -81,9 +88,10 @@ def _field(scene: Scene, shape: tuple[int, int, int], radius: float) -> Field:
 
     clearance = lax.map(clearances, corner[0] + edge * jnp.arange(shape[0]))
     points = _positions(corner, edge, shape)
-    inside = jnp.all((points >= scene.volume[0]) & (points <= scene.volume[1]), axis=-1)
+    lower, upper = scene.volume[0, None, None, None], scene.volume[1, None, None, None]
+    inside = jnp.all((points >= lower) & (points <= upper), axis=-1)
     is_free = inside & (clearance >= radius)
-    apart = jnp.sqrt(jnp.sum((points - scene.goal) ** 2, axis=-1))
+    apart = jnp.sqrt(jnp.sum((points - scene.goal[None, None, None]) ** 2, axis=-1))
     seen = is_free & (apart <= jnp.maximum(clearance, signed_distance(scene, scene.goal)))
     # Where not even the ball around a node reaches the goal, the way begins at the nearest nodes.
     seen = jnp.where(jnp.any(seen), seen, is_free & (apart <= math.sqrt(3) * edge))
@@ -94,7 +102,7 @@ def _field(scene: Scene, shape: tuple[int, int, int], radius: float) -> Field:
 def _positions(corner: Array, edge: Array, shape: tuple[int, int, int]) -> Array:
     """Returns the positions of the nodes [X, Y, Z, 3], metres."""
     grid = jnp.stack(jnp.meshgrid(*(jnp.arange(n, dtype=jnp.float32) for n in shape), indexing="ij"), axis=-1)
-    return corner + edge * grid
+    return corner[None, None, None] + edge * grid
 
 
 def _spread(seeds: Array, is_free: Array, clearance: Array, edge: Array) -> Array:
@@ -122,13 +130,13 @@ def _spread(seeds: Array, is_free: Array, clearance: Array, edge: Array) -> Arra
 def _swept(planes: Array, around: Array, edge: Array, backwards: bool) -> Array:
     """Returns lengths [N, A, B], each plane shortened by ways over the one before it; `around` are the balls."""
     sides = jnp.asarray(_SIDES)
-    weights = edge * jnp.sqrt(1.0 + jnp.sum(sides**2, axis=1))
+    weights = edge * jnp.sqrt(1.0 + jnp.sum(sides**2, axis=1))[:, None, None]
 
     def plane(before: tuple[Array, Array], here: tuple[Array, Array]) -> tuple[tuple[Array, Array], Array]:
         (length, ball), (own, own_ball) = before, here
         lengths, balls = _shifted(length, jnp.inf), _shifted(ball, -jnp.inf)
-        meets = balls + own_ball >= weights[:, None, None]
-        own = jnp.minimum(own, jnp.min(jnp.where(meets, lengths + weights[:, None, None], jnp.inf), axis=0))
+        meets = balls + own_ball[None] >= weights
+        own = jnp.minimum(own, jnp.min(jnp.where(meets, lengths + weights, jnp.inf), axis=0))
         return (own, own_ball), own
 
     nothing = jnp.full_like(planes[0], jnp.inf), jnp.full_like(around[0], -jnp.inf)
@@ -142,7 +150,7 @@ def _shifted(plane: Array, fill: float) -> Array:
     return jnp.stack([padded[1 + i : 1 + i + a, 1 + j : 1 + j + b] for i, j in _SIDES])
 
 
-def remaining(fields: Field, world: Array, goal: Array, point: Array) -> Array:
+def remaining(of: Field, world: Array, goal: Array, point: Array) -> Array:
     """Returns how far it is from a point [3] to the goal [3] of one of the worlds, metres.
 
     It is interpolated between those nodes of the point's cell whose balls hold the point, which count the more the
@@ -150,14 +158,16 @@ def remaining(fields: Field, world: Array, goal: Array, point: Array) -> Array:
     either, it is the straight line.
 
     Args:
-        world: [] int32, which of the fields.
+        of: the worlds' fields.
+        world: [] int32, which world.
     """
-    corner, edge, shape = fields.corner[world], fields.edge[world], jnp.array(fields.remaining.shape[1:])
-    at = (point - corner) / edge
-    cells = jnp.clip(jnp.floor(at).astype(jnp.int32) + jnp.asarray(_CORNERS), 0, shape - 1)
+    of = jax.tree.map(jnp.asarray, of)  # from the host, where a traced number is no index
+    corner, edge, shape = of.corner[world], of.edge[world], jnp.array(of.remaining.shape[1:])
+    at = ((point - corner) / edge)[None]
+    cells = jnp.clip(jnp.floor(at).astype(jnp.int32) + jnp.asarray(_CORNERS), 0, shape[None] - 1)
     x, y, z = cells[:, 0], cells[:, 1], cells[:, 2]
-    left, clearance = fields.remaining[world, x, y, z], fields.clearance[world, x, y, z]
-    apart = jnp.sqrt(jnp.sum((corner + edge * cells - point) ** 2, axis=1))
+    left, clearance = of.remaining[world, x, y, z], of.clearance[world, x, y, z]
+    apart = jnp.sqrt(jnp.sum((corner[None] + edge * cells - point[None]) ** 2, axis=1))
     near = jnp.prod(jnp.clip(1.0 - jnp.abs(at - cells), 0.0, 1.0), axis=1)
     weight = near * jnp.clip((clearance - apart) / edge, 0.0, 1.0) * jnp.isfinite(left)
     total = jnp.sum(weight)

@@ -10,7 +10,7 @@ from flax import struct
 from jax import Array
 from jax.typing import ArrayLike
 
-from edqn_jax.sim.free_points import CLEARANCE, TRIES, Cells, far_apart, first_free, in_cells, is_in, scatter
+from edqn_jax.sim.free_points import CLEARANCE, TRIES, Cells, far_apart, far_from, first_free, in_cells, is_in, scatter
 from edqn_jax.sim.scene import Scene, take_scene
 
 AWAY = 5.0
@@ -31,12 +31,23 @@ def own_missions(pool: Scene) -> Missions:
     return Missions(scene=jnp.arange(pool.start.shape[0]), start=pool.start, goal=pool.goal)
 
 
-@partial(jax.jit, static_argnums=1)
-def random_missions(pool: Scene, count: int, key: Array) -> Missions:
-    """Returns missions in random worlds of the pool between random free points at least `FAR` metres apart."""
+@partial(jax.jit, static_argnames=("count", "own_goals"))
+def random_missions(pool: Scene, count: int, key: Array, own_goals: bool = False) -> Missions:
+    """Returns missions in random worlds of the pool between random free points, as far apart as in `far_apart`.
+
+    Args:
+        pool: worlds [P].
+        count: M.
+        key: consumed.
+        own_goals: whether all missions in a world end at its own goal.
+    """
 
     def mission(index: Array, draw: Array) -> Missions:
-        start, goal = far_apart(take_scene(pool, index), draw)
+        scene = take_scene(pool, index)
+        if own_goals:
+            # The same conditions with the ends exchanged.
+            return Missions(scene=index, start=far_from(scene, draw[0], scene.goal), goal=scene.goal)
+        start, goal = far_apart(scene, draw)
         return Missions(scene=index, start=start, goal=goal)
 
     scene_key, points_key = jax.random.split(key)

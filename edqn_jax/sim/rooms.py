@@ -38,8 +38,8 @@ _OF_A_WALL = 6
 def draw(key: Array) -> Scene:
     """Returns random rooms, a start and a goal.
 
-    The free space is connected by construction: every wall between two rooms has an opening that is at least three
-    times as wide and high as the drone, and a room is a box with nothing in it.
+    The free space is connected by construction: every wall between two rooms has an opening, a window of 2.2 by 2.0 m
+    at least, and a room is a box with nothing in it.
 
     Args:
         key: consumed.
@@ -61,9 +61,9 @@ def draw(key: Array) -> Scene:
     end = jnp.tile(stands[::-1, 1:], (1, ROOMS - 1)).reshape(_WALLS)
     opening = _openings(walls.reshape(_WALLS, _OF_A_WALL), begin, end, height)
     low, high, there = _pieces(opening, begin, end, height)
-    thick = jnp.broadcast_to(across[:, None, None], low[..., :1].shape) + jnp.array([-1.0, 1.0]) * THICKNESS / 2
-    low = jnp.concatenate([thick[..., :1], low], axis=-1).reshape(-1, 3)
-    high = jnp.concatenate([thick[..., 1:], high], axis=-1).reshape(-1, 3)
+    middle = jnp.broadcast_to(across[:, None, None], low[..., :1].shape)
+    low = jnp.concatenate([middle - THICKNESS / 2, low], axis=-1).reshape(-1, 3)
+    high = jnp.concatenate([middle + THICKNESS / 2, high], axis=-1).reshape(-1, 3)
     turned = jnp.arange(_WALLS * _PIECES)[:, None] >= _WALLS * _PIECES // 2
     low, high = (jnp.where(turned, corner[:, jnp.array([1, 0, 2])], corner) for corner in (low, high))
 

@@ -386,13 +386,18 @@ def stack_scenes(scenes: Sequence[Scene]) -> Scene:
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *padded)
 
 
-def with_equal_capacities(pools: Sequence[Scene]) -> list[Scene]:
-    """Returns the pools, every kind of shape padded to its largest capacity in any of them. On the host."""
+def with_equal_capacities(pools: Sequence[Scene], like: Sequence[Any] = ()) -> list[Scene]:
+    """Returns the pools, every kind of shape padded to its largest capacity in any of them. On the host.
+
+    Args:
+        pools: of worlds.
+        like: more pools whose capacities count, or the shapes of their arrays.
+    """
 
     def padded(kind: str, pool: Scene) -> Shape:
         shapes = getattr(pool, kind)
         worlds, capacity = shapes.position.shape[:2]
-        missing = max(getattr(other, kind).position.shape[1] for other in pools) - capacity
+        missing = max(getattr(other, kind).position.shape[1] for other in (*pools, *like)) - capacity
 
         def joined(here: Array, absent: npt.ArrayLike) -> Array:
             more = np.broadcast_to(np.asarray(absent, np.float32), (worlds, missing, *np.shape(absent)))

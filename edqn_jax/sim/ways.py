@@ -36,7 +36,9 @@ def has_way(scene: Scene, size: tuple[float, float, float], radius: float, edge:
     need = radius + edge / 2
     free = _without_planes(scene, z, need, (across, along))
     for footprint, low, high in _prisms(scene, x, y):
-        free = _without(free, footprint, _word((z > low[:, None] - need) & (z < high[:, None] + need)), need)
+        free = _without(
+            free, footprint, _word((z[None] > low[:, None] - need) & (z[None] < high[:, None] + need)), need
+        )
     seeds, ends = (free & _near(point, x, y, z, CLEARANCE - radius) for point in (scene.start, scene.goal))
 
     def spread(state: tuple[Array, Array]) -> tuple[Array, Array]:
@@ -59,13 +61,14 @@ def has_way(scene: Scene, size: tuple[float, float, float], radius: float, edge:
 def _word(bits: Array) -> Array:
     """Returns bits [..., Z] as words [...] uint32."""
     weights = jnp.left_shift(jnp.uint32(1), jnp.arange(bits.shape[-1], dtype=jnp.uint32))
+    weights = jnp.broadcast_to(weights, bits.shape)
     return jnp.sum(jnp.where(bits, weights, jnp.uint32(0)), axis=-1, dtype=jnp.uint32)
 
 
 def _near(point: Array, x: Array, y: Array, z: Array, within: float) -> Array:
     """Returns the nodes [X, Y] words within so many metres of a point [3]."""
     level = (x - point[0]) ** 2 + (y - point[1]) ** 2
-    return _word(level[:, :, None] + (z - point[2]) ** 2 < within**2)
+    return _word(level[:, :, None] + (z - point[2])[None, None] ** 2 < within**2)
 
 
 def _without_planes(scene: Scene, z: Array, need: float, shape: tuple[int, int]) -> Array:

@@ -91,7 +91,9 @@ def random_pool(family: str, keys: Array) -> Scene:
         return _in_batches(family, keys)
     names = np.array(families_of(family, keys))
     present = [(str(name), np.flatnonzero(names == name)) for name in np.unique(names)]
-    pools = with_equal_capacities([_in_batches(name, keys[which]) for name, which in present])
+    # Padded for all families of the mixture, also for one that none of these worlds is of.
+    shapes = [jax.eval_shape(jax.vmap(_FAMILIES[name].draw), keys) for name in MIXTURES[family]]
+    pools = with_equal_capacities([_in_batches(name, keys[which]) for name, which in present], shapes)
     order = np.argsort(np.concatenate([which for _, which in present]))
     return jax.tree.map(lambda *leaves: jnp.asarray(np.concatenate(leaves)[order]), *pools)
 

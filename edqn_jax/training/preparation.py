@@ -25,6 +25,7 @@ from edqn_jax.parallel.devices import choose_devices
 from edqn_jax.planners.astar import Path as ShortestPath
 from edqn_jax.planners.astar import shortest_path
 from edqn_jax.random import run_streams
+from edqn_jax.sim import geodesic
 from edqn_jax.sim.env import World
 from edqn_jax.sim.flights import Flights
 from edqn_jax.sim.reward import Reward
@@ -71,6 +72,9 @@ class Preparation:
         # A world's file may be missing on one host.
         self.missions = processes.together(lambda: missions_of_runs(self.configs, reward))
         worlds = [missions.training.world for missions in self.missions]
+        if config.env.reward == "geodesic":  # agents that train together share their worlds
+            distances = geodesic.fields(worlds[0].pool, config.drone.body_radius_m)
+            worlds = [dataclasses.replace(world, distances=distances) for world in worlds]
         self.trainer = Trainer(config, worlds[0] if agents is None else worlds, self.devices)
         self.mesh = Mesh(np.asarray(self.devices), ("mission",))
         display.phase("compiling")

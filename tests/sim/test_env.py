@@ -14,13 +14,14 @@ import numpy as np
 import pytest
 
 from edqn_jax.config import Config, EnvConfig, EventsConfig, preset
-from edqn_jax.sim import camera, drone, env, events, outcomes, sensor
+from edqn_jax.sim import camera, drone, env, events, geodesic, outcomes, sensor
 from edqn_jax.sim.drone import DroneState, Flight
-from edqn_jax.sim.missions import Missions
+from edqn_jax.sim.missions import Missions, own_missions
 from edqn_jax.sim.moves import ACTIONS
 from edqn_jax.sim.outcomes import Outcome
 from edqn_jax.sim.reward import configured_reward
 from edqn_jax.sim.scene import UprightBoxes, build_scene, stack_scenes
+from tests.planners.small_worlds import box, small_world
 from tests.sim.drawn_scenes import GROUND, rotation_of
 
 CONFIG = Config(env=EnvConfig(reward="sparse", step_reward=-0.25, left_volume_reward=-70.0))
@@ -618,8 +619,32 @@ def test_many_environments_at_once_are_the_same_as_one_by_one(reset, step):
 @pytest.mark.slow
 def test_no_key_is_used_twice_and_no_rank_is_promoted(world, law):
     # Leak checks do not get past MJX. Tracing is enough: both checks are made there.
-    config = dataclasses.replace(FLOWN, events=EventsConfig(law=law, threshold_mismatch=0.1))
+    task = dataclasses.replace(FLOWN.env, reward="geodesic")
+    config = dataclasses.replace(FLOWN, env=task, events=EventsConfig(law=law, threshold_mismatch=0.1))
+    world = dataclasses.replace(world, distances=geodesic.fields(world.pool, 0.36))
     with jax.numpy_rank_promotion("raise"), jax.debug_key_reuse(True):
         state, _ = jax.jit(partial(env.reset, config, world)).trace(jax.random.key(0)).out_info
         after, _ = jax.jit(partial(env.step, config, world)).trace(state, AHEAD).out_info
     assert isinstance(after.drone, DroneState)
+
+
+@pytest.mark.slow
+def test_nobody_is_paid_for_a_way_through_a_wall():
+    """A drone that crashes into a thin wall ends the decision behind it, where the goal is many metres nearer."""
+    scene = small_world(box((5.9, -1.0, -1.0), (6.1, 10.0, 7.0)), start=(4.9, 2.0, 3.0), goal=(10.0, 2.0, 3.0)).scene
+    pool = stack_scenes([scene])
+    fields = geodesic.fields(pool, 0.36)
+    world = env.World(drone.load_airframe(CONFIG.drone), pool, own_missions(pool), distances=fields)
+    task = EnvConfig(sensor="blind", reward="geodesic", progress_weight=1.0, path_weight=0.0, step_reward=0.0)
+    config = dataclasses.replace(CONFIG, env=task)
+    step = jax.jit(partial(env.step, config, world))
+    state, _ = env.reset(config, world, jax.random.key(0))
+    left = [float(geodesic.remaining(fields, jnp.int32(0), scene.goal, state.drone.position))]
+    while not state.ended:
+        before = state.drone.position
+        state, done = step(state, AHEAD)
+        left.append(float(geodesic.remaining(fields, jnp.int32(0), scene.goal, state.drone.position)))
+        moved = float(jnp.linalg.norm(state.drone.position - before))
+        crashed = done.outcome == Outcome.COLLISION
+        assert float(done.reward) - (task.collision_reward if crashed else 0.0) <= 1.13 * moved + 1e-4
+    assert crashed and left[-2] - left[-1] > 5.0

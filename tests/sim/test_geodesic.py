@@ -47,7 +47,7 @@ def test_lengths_are_those_that_dijkstra_finds(monkeypatch):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["corridor", "courtyard", "storeys"])
+@pytest.mark.parametrize("name", ["corridor", "courtyard", "flat", "storeys", "warehouse"])
 def test_the_way_from_the_start_is_about_as_long_as_astars(name):
     scene = load_scene(scenes_folder() / "examples" / f"{name}.xml")
     way = float(left(one(scene), jnp.int32(0), scene.goal, scene.start))

@@ -41,6 +41,17 @@ def test_random_missions_fly_far_between_free_points_of_every_world():
         assert (points[:, 2] >= 1.5).all() and (points[:, 2] <= 20.0).all()
 
 
+@pytest.mark.slow
+def test_missions_to_the_worlds_own_goals_begin_as_far_from_them():
+    pool = random_pool("rooms", world_keys("validation", WORLDS))
+    missions = random_missions(pool, MISSIONS, jax.random.key(0), own_goals=True)
+    np.testing.assert_array_equal(missions.goal, np.asarray(pool.goal)[np.asarray(missions.scene)])
+    assert (clearances(pool, missions, missions.start) >= CLEARANCE).all()
+    far = np.linalg.norm(missions.start - missions.goal, axis=1) >= 18.0
+    # Three in 100,000 find no free point that far.
+    assert far.all()
+
+
 def test_spread_missions_begin_near_the_start_or_anywhere_and_end_at_the_goal(paper):
     missions = spread_missions(paper, MISSIONS, 0.25, 1.0, jax.random.key(0))
     own = (np.abs(missions.start - paper.start) <= 1.0 + 1e-5).all(axis=1)

@@ -18,11 +18,13 @@ from edqn_jax.config.loading import make_config
 from edqn_jax.evaluation.judge import clearance, load_judge
 from edqn_jax.evaluation.missions import load_missions
 from edqn_jax.runs.provenance import reward_record
-from edqn_jax.sim import env
+from edqn_jax.sim import env, geodesic
+from edqn_jax.sim.mjcf import scenes_folder
 from edqn_jax.sim.moves import ACTIONS
 from edqn_jax.sim.outcomes import Outcome
 from edqn_jax.sim.reward import Reward, Transition
-from edqn_jax.training.preparation import config_for_reward
+from edqn_jax.training.preparation import config_for_reward, prepared
+from tests.training.test_loop import SMALL
 
 CONFIG = dataclasses.replace(Config(), env=dataclasses.replace(Config().env, sensor="blind"))
 
@@ -115,3 +117,17 @@ def test_a_reward_of_ones_own_may_prefer_a_direction() -> None:
     straight = config_for_reward(turning, lambda transition: -transition.after[0])
     assert not straight.agent.turn
     assert dataclasses.replace(straight, agent=turning.agent) == turning
+
+
+@pytest.mark.slow
+def test_training_with_the_reward_geodesic_counts_metres_around_obstacles() -> None:
+    world = str(scenes_folder() / "examples" / "corridor.xml")
+    task = dataclasses.replace(SMALL.env, reward="geodesic")
+    config = dataclasses.replace(SMALL, env=task, world=dataclasses.replace(SMALL.world, name=world))
+    with prepared(config, agents=2) as preparation:
+        distances = preparation.trainer.world.distances
+        assert distances is not None and distances.remaining.ndim == 4  # one field for all agents
+        scene = preparation.missions[0].scene
+        way = geodesic.remaining(distances, jnp.int32(0), scene.goal, scene.start)
+        assert float(way) > 1.15 * float(jnp.linalg.norm(scene.goal - scene.start))
+        preparation.compiled.result()
