@@ -36,9 +36,8 @@ def has_way(scene: Scene, size: tuple[float, float, float], radius: float, edge:
     need = radius + edge / 2
     free = _without_planes(scene, z, need, (across, along))
     for footprint, low, high in _prisms(scene, x, y):
-        free = _without(
-            free, footprint, _word((z[None] > low[:, None] - need) & (z[None] < high[:, None] + need)), need
-        )
+        blocked = _word((z[None] > low[:, None] - need) & (z[None] < high[:, None] + need))
+        free = _without(free, footprint, blocked, need)
     seeds, ends = (free & _near(point, x, y, z, CLEARANCE - radius) for point in (scene.start, scene.goal))
 
     def spread(state: tuple[Array, Array]) -> tuple[Array, Array]:
