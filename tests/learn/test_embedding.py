@@ -25,8 +25,8 @@ from edqn_jax.sim import mjcf
 from edqn_jax.sim.env import MOTION_SIZE, Observation, World
 from edqn_jax.sim.sensor import Form
 from tests.learn.moving_boxes import frames
-from tests.learn.test_trainer import CONFIG
 from tests.miniature import miniature_world
+from tests.whole.test_trainer import CONFIG
 
 QUICK = dataclasses.replace(CONFIG, drone=dataclasses.replace(CONFIG.drone, physics="rigid_body"))
 """Sensors do not depend on the physics, and these compile in less time; `test_trainer` trains with the default ones."""

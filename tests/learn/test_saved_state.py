@@ -13,8 +13,8 @@ from edqn_jax.learn import saved_state
 from edqn_jax.learn.plan import Plan
 from edqn_jax.learn.trainer import Trainer
 from edqn_jax.sim.env import World
-from tests.learn.test_trainer import CONFIG
 from tests.miniature import miniature_world
+from tests.whole.test_trainer import CONFIG
 
 
 @pytest.fixture(scope="module")

@@ -24,11 +24,11 @@ from edqn_jax.sim.missions import own_missions
 from edqn_jax.sim.moves import ACTIONS, DIRECTIONS
 from edqn_jax.sim.scene import stack_scenes, take_scene
 from edqn_jax.sim.sensor import Form, Sensor
-from tests.learn.test_trainer import CONFIG as MINIATURE
 from tests.miniature import WORLD
 from tests.oracles import camera_plain
 from tests.oracles.mujoco_depth import RayCaster
 from tests.sim.drawn_scenes import every_kind, free_points, rotation_of, scene_of
+from tests.whole.test_trainer import CONFIG as MINIATURE
 
 CAMERA = CameraConfig(width=16, height=12)
 STAY = 13

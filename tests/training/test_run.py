@@ -24,9 +24,9 @@ from edqn_jax.runs.policies import load_run
 from edqn_jax.training.run import train_run
 from edqn_jax.training.selection import Candidate, choose, first_success, is_due
 from edqn_jax.training.stopping import Stop
-from tests.learn.test_trainer import CONFIG as SMALL
 from tests.miniature import WORLD as MINIATURE_WORLD
 from tests.miniature import no_losses
+from tests.whole.test_trainer import CONFIG as SMALL
 
 CONFIG = dataclasses.replace(
     SMALL,
