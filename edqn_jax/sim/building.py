@@ -102,6 +102,11 @@ def world(
     return dataclasses.replace(scene, start=start, goal=goal)
 
 
+def between(span: tuple[float | Array, float | Array], draw: Array) -> Array:
+    """Returns numbers [...] from the first to the second of `span`, from uniform draws [...]."""
+    return span[0] + (span[1] - span[0]) * draw
+
+
 def albedos(draw: Array) -> Array:
     """Returns albedos [N, 3] from uniform draws [N, 5]: greys of all values, about half of them with a tint."""
     grey = 0.15 + 0.7 * draw[:, :1]

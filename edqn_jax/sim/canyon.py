@@ -49,7 +49,7 @@ def draw(key: Array) -> Scene:
     plan = plans.reshape(buildings, _OF_A_BUILDING)
     is_large = jnp.arange(buildings) < LARGE
     narrow, wide = (jnp.where(is_large, large, small) for large, small in zip(*REACHES, strict=True))
-    reach = narrow + (wide - narrow) * plan[:, 0]
+    reach = building.between((narrow, wide), plan[:, 0])
     candidates = discs.across_the_edge(reach, places.reshape(buildings, discs.PLACES, 2), SIZE[:2], _EDGE)
     x, y, placed = discs.place(reach, candidates, GAP)
     low, high, there = jax.vmap(_parts)(reach, plan[:, 1], plan[:, 2], is_large)
@@ -98,9 +98,7 @@ def _parts(reach: Array, kind: Array, level: Array, is_large: Array) -> tuple[Ar
     """
     top, w = SIZE[2], WALL
     side = 0.7 * reach  # of the largest square, from the middle
-    shelf = SHELF_HEIGHT[0] + (SHELF_HEIGHT[1] - SHELF_HEIGHT[0]) * level
-    standing = STANDING[0] + (STANDING[1] - STANDING[0]) * level
-    hanging = HANGING[0] + (HANGING[1] - HANGING[0]) * level
+    shelf, standing, hanging = (building.between(span, level) for span in (SHELF_HEIGHT, STANDING, HANGING))
     courtyard = (
         ((side - w, -side, 0.0), (side, side, top)),
         ((-side, side - w, 0.0), (side, side, top)),

@@ -30,8 +30,8 @@ def draw(key: Array) -> Scene:
 
     The free space is connected by construction. A tree is a disc seen from above, and the discs, grown by the drone's
     radius, are still apart. A disc may reach over one side of the floor, but closes no corner: discs and outside have
-    no loop between them, so they do not divide the floor. Beside a
-    branch the space is open to both sides, above and below.
+    no loop between them, so they do not divide the floor. Beside a branch the space is open to both sides, above and
+    below.
 
     Args:
         key: consumed.
@@ -41,8 +41,8 @@ def draw(key: Array) -> Scene:
     draws = jax.random.uniform(key, (sum(counts),))
     sizes, places, colours, ends = jnp.split(draws, [sum(counts[:1]), sum(counts[:2]), sum(counts[:3])])
     size = sizes.reshape(TREES, _OF_A_TREE)
-    trunk = _between(TRUNK_RADIUS, size[:, 0])
-    length = _between(BRANCH_LENGTH, size[:WITH_BRANCH, 1])
+    trunk = building.between(TRUNK_RADIUS, size[:, 0])
+    length = building.between(BRANCH_LENGTH, size[:WITH_BRANCH, 1])
     yaw, height = 2 * jnp.pi * size[:WITH_BRANCH, 2], 1.0 + (SIZE[2] - 2.0) * size[:WITH_BRANCH, 3]
     tip = jnp.hypot(length, BRANCH_HALF_WIDTH)
     reach = trunk.at[:WITH_BRANCH].max(tip)
@@ -61,7 +61,3 @@ def draw(key: Array) -> Scene:
         building.boxes(placed[:WITH_BRANCH], branch, half, yaw, albedo[TREES:]),
         building.cylinders(placed, standing, trunk, SIZE[2] / 2, albedo[:TREES]),
     )
-
-
-def _between(span: tuple[float, float], draw: Array) -> Array:
-    return span[0] + (span[1] - span[0]) * draw

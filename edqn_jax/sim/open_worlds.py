@@ -44,8 +44,7 @@ def draw(density: str, key: Array) -> Scene:
     )
     size = sizes.reshape(count, 4)
     first, second = blocks, blocks + pillars
-    narrow, wide = HALF_WIDTHS[density]
-    sides = narrow + (wide - narrow) * size[:first, :2]
+    sides = building.between(HALF_WIDTHS[density], size[:first, :2])
     block_height = 4.0 + 20.0 * size[:first, 2]
     pillar_radius, pillar_height = 0.5 + 1.5 * size[first:second, 0], 8.0 + 17.0 * size[first:second, 1]
     ball_radius = 1.5 + 2.5 * size[second:, 0]

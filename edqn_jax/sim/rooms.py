@@ -49,7 +49,7 @@ def draw(key: Array) -> Scene:
     counts = (1 + lines, _WALLS * _OF_A_WALL, colours, 2 * TRIES * 3)
     draws = jax.random.uniform(key, (sum(counts),))
     plan, walls, shades, ends = jnp.split(draws, [sum(counts[:1]), sum(counts[:2]), sum(counts[:3])])
-    height = _between(HEIGHT, plan[0])
+    height = building.between(HEIGHT, plan[0])
     even = SIDE / ROOMS * jnp.arange(1, ROOMS)[None]
     # Along x and along y: [2, ROOMS + 1] metres, where walls stand, outer ones included.
     stands = even + SHIFT * (2.0 * plan[1:].reshape(2, ROOMS - 1) - 1.0)
@@ -85,11 +85,11 @@ def _openings(draw: Array, begin: Array, end: Array, height: Array) -> Array:
 
     A wall that is left out is all opening.
     """
-    width = _between(OPENING_WIDTH, draw[:, 0])
+    width = building.between(OPENING_WIDTH, draw[:, 0])
     room = end - begin - width - 2 * _PIER
     left = begin + _PIER + room * draw[:, 1]
     is_window, is_missing = draw[:, 2] < WINDOWS, draw[:, 3] < MISSING
-    tall = jnp.where(is_window, _between(WINDOW_HEIGHT, draw[:, 4]), _between(DOOR_HEIGHT, draw[:, 4]))
+    tall = jnp.where(is_window, building.between(WINDOW_HEIGHT, draw[:, 4]), building.between(DOOR_HEIGHT, draw[:, 4]))
     tall = jnp.minimum(tall, height - 2 * SILL_M)
     bottom = jnp.where(is_window, SILL_M + (height - 2 * SILL_M - tall) * draw[:, 5], 0.0)
     drawn = jnp.stack([left, left + width, bottom, bottom + tall], axis=1)
@@ -116,7 +116,3 @@ def _outer_walls(height: Array) -> tuple[Array, Array]:
     low = jnp.array([[0.0, 0.0, 0.0], [inner, 0.0, 0.0], [0.0, 0.0, 0.0], [0.0, inner, 0.0]])
     high = jnp.array([[THICKNESS, SIDE, 0.0], [SIDE, SIDE, 0.0], [SIDE, THICKNESS, 0.0], [SIDE, SIDE, 0.0]])
     return low, high.at[:, 2].set(height)
-
-
-def _between(span: tuple[float, float], draw: Array) -> Array:
-    return span[0] + (span[1] - span[0]) * draw
