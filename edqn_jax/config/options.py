@@ -138,9 +138,10 @@ class EventsConfig:
 class EnvConfig:
     """The task: sensor, actions, outcomes, reward."""
 
-    sensor: Literal["events", "frames", "blind", "depth", "ranges"] = "events"
+    sensor: Literal["events", "frames", "frame-pair", "event-image", "blind", "depth", "ranges"] = "events"
     """What the drone observes besides its own state. `events`: the event camera. For comparison, `frames`: the newest
-    brightness frame; `blind`: nothing; `depth`: true depth; `ranges`: the true free distance along each move."""
+    brightness frame; `frame-pair`: the frames that the events would be made of; `event-image`: an image of the events
+    without a VAE; `blind`: nothing; `depth`: true depth; `ranges`: the true free distance along each move."""
     speed_m_s: float = 4.0
     """Commanded speed per axis; an action is {-1, 0, 1}^3 times this, in the heading frame."""
     goal_radius_m: float = 2.0
@@ -185,8 +186,11 @@ class EncoderConfig:
     """Widths of the ReLU layers that all patches share (`patches`)."""
     joint_layers: tuple[int, ...] = (128, 128)
     """Widths of the ReLU layers between joined patches and code (`patches`)."""
+    pooling: Literal["sum", "max"] = "sum"
+    """How events are pooled (`pooled`): the paper's sum over all of them, or the largest of each feature. Unused by
+    pictures."""
     features: int = 48
-    """Sum-pooled features per temporal channel (`pooled`)."""
+    """Pooled features per temporal channel (`pooled`)."""
     pixel_features: Literal["table", "network"] = "network"
     """f(x, y, p): a learned table over pixels and polarities, or a ReLU network on a positional encoding (`pooled`)."""
     time_frequencies: int = 1

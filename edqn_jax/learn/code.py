@@ -16,11 +16,11 @@ from edqn_jax.sim.sensor import Form
 Params = Any
 """Nested dictionaries of arrays."""
 
-EVENT_CHANNELS, PICTURE_CHANNELS = 2, 1
-"""ON and OFF events; brightness or nearness."""
+EVENT_CHANNELS = 2
+"""ON and OFF events."""
 
-CHANNELS = {Form.EVENTS: EVENT_CHANNELS, Form.PICTURE: PICTURE_CHANNELS}
-"""Channels of the forms that the VAE embeds."""
+EMBEDDED = (Form.EVENTS, Form.PICTURE)
+"""Forms that the VAE embeds."""
 
 MAX_LOG_VARIANCE = 6.0
 """Bound of the log-variance's magnitude: its exponential cannot overflow."""

@@ -7,14 +7,14 @@ from jax import Array
 
 from edqn_jax.config import Config
 from edqn_jax.learn import vae
-from edqn_jax.learn.code import CHANNELS, Params
+from edqn_jax.learn.code import EMBEDDED, Params
 from edqn_jax.sim.env import Observation
-from edqn_jax.sim.sensor import sensor_of
+from edqn_jax.sim.sensor import Form, sensor_of
 
 
 def has_code(config: Config) -> bool:
     """Returns whether a VAE embeds what the sensor shows; it then learns in a warm-up."""
-    return sensor_of(config).form in CHANNELS
+    return sensor_of(config).form in EMBEDDED
 
 
 def needs_nearness(config: Config) -> bool:
@@ -31,13 +31,16 @@ def init(config: Config, key: Array) -> Params:
     """Returns fresh parameters of the VAE; {} where there is none."""
     if not has_code(config):
         return {}
-    windows = len(config.events.frame_times_s) - 1
-    return vae.init_vae(config.encoder, config.camera, key, form=sensor_of(config).form, windows=windows)
+    form, layers = _shape(config)
+    return vae.init_vae(config.encoder, config.camera, key, form=form, layers=layers)
 
 
 def acting(config: Config, params: Params) -> Params:
     """Returns the parameters in the form that `embed` evaluates fastest, no longer trainable; {} of {}."""
-    return vae.frozen(config.encoder, config.camera, params, form=sensor_of(config).form) if params else {}
+    if not params:
+        return {}
+    form, layers = _shape(config)
+    return vae.frozen(config.encoder, config.camera, params, form=form, layers=layers)
 
 
 def embed(config: Config, params: Params, observation: Observation, previous: Array) -> Array | None:
@@ -53,3 +56,9 @@ def embed(config: Config, params: Params, observation: Observation, previous: Ar
     scale = config.agent.code_scale
     code = vae.embed(config.encoder, params, observation.sensed, observation.motion, previous / scale)  # type: ignore[arg-type]
     return scale * code
+
+
+def _shape(config: Config) -> tuple[Form, int]:
+    """Returns the form of what the sensor shows, and its frame pairs or pictures."""
+    sensor = sensor_of(config)
+    return sensor.form, len(config.events.frame_times_s) - 1 if sensor.form is Form.EVENTS else sensor.pictures(config)

@@ -79,7 +79,7 @@ class PatchEncoder(nn.Module):
     def __call__(
         self, sensed: EventField | Array, motion: Array, previous: Array | None = None, begins: Array | None = None
     ) -> tuple[Array, Array]:
-        """Returns mean and log-variance `[..., code_size]` of fields `[..., F, H, W]` or pictures `[..., H, W]`.
+        """Returns mean and log-variance `[..., code_size]` of fields `[..., F, H, W]` or pictures `[..., C, H, W]`.
 
         Args:
             motion: `[..., MOTION_SIZE]` own motion, see `sim.env.own_motion`.
@@ -87,7 +87,7 @@ class PatchEncoder(nn.Module):
                 needs these, or
             begins: `[T, ...]` bool: the observations are T in a row, and nothing is remembered where this is true.
         """
-        images = log_counts(sensed) if isinstance(sensed, EventField) else [sensed]
+        images = log_counts(sensed) if isinstance(sensed, EventField) else list(jnp.moveaxis(sensed, -3, 0))
         first, *later = self.config.patch_layers
         # One product for each channel: joined to one array first, they take twice as long on a CPU.
         products = [

@@ -17,7 +17,7 @@ from jax import Array
 from jax.nn.initializers import zeros
 
 from edqn_jax.config import CameraConfig, EncoderConfig
-from edqn_jax.learn.code import CHANNELS, Params, kl_divergence
+from edqn_jax.learn.code import EVENT_CHANNELS, Params, kl_divergence
 from edqn_jax.learn.layers import Dense
 from edqn_jax.learn.patch_encoder import PatchEncoder, is_recurrent
 from edqn_jax.learn.pooled_encoder import PooledEncoder
@@ -68,9 +68,15 @@ def _drawn(config: EncoderConfig, height: int, width: int) -> tuple[int, int]:
     return tuple(max(1, round(config.decoder_bandwidth * size)) for size in (height, width))  # type: ignore
 
 
-def target_channels(config: EncoderConfig, form: Form) -> int:
-    """Returns the number of channels that the decoder draws, see `target`."""
-    return {"sensed": CHANNELS[form], "nearness": 1, "both": CHANNELS[form] + 1}[config.target]
+def target_channels(config: EncoderConfig, form: Form, layers: int = 1) -> int:
+    """Returns the number of channels that the decoder draws, see `target`.
+
+    Args:
+        form: of what is encoded.
+        layers: C of pictures.
+    """
+    shown = EVENT_CHANNELS if form is Form.EVENTS else layers
+    return {"sensed": shown, "nearness": 1, "both": shown + 1}[config.target]
 
 
 def needs_nearness(config: EncoderConfig) -> bool:
@@ -81,14 +87,14 @@ def needs_nearness(config: EncoderConfig) -> bool:
 def target(config: EncoderConfig, sensed: EventField | Array, nearness: Array | None = None) -> Array:
     """Returns what the decoder must draw, `[..., channels, H, W]`, blurred.
 
-    Of `sensed`, log(1 + count) of ON and of OFF events, or the picture itself; of `nearness`, the label; of `both`, all
+    Of `sensed`, log(1 + count) of ON and of OFF events, or the pictures; of `nearness`, the label; of `both`, all
     of these. Events have two channels because their number shows how near things are, and in a signed image the ON and
     OFF events of a textured wall cancel. The logarithm keeps one bright edge from dominating the loss; the blur (a
     binomial over 2 x `target_blur` + 1 pixels) makes an edge that is off by one pixel one small error, not two large
     ones.
 
     Args:
-        sensed: field `[..., F, H, W]` or picture `[..., H, W]`.
+        sensed: field `[..., F, H, W]` or pictures `[..., C, H, W]`.
         nearness: `[..., H, W]` as the sensor `depth` shows it; needed unless the target is `sensed`.
     """
     channels = []
@@ -107,7 +113,7 @@ def target(config: EncoderConfig, sensed: EventField | Array, nearness: Array | 
 def _shown(sensed: EventField | Array) -> Array:
     """Returns what the sensor shows as channels `[..., C, H, W]`, summed over the window."""
     if not isinstance(sensed, EventField):
-        return sensed[..., None, :, :]
+        return sensed
     on = jnp.sum(jnp.where(sensed.polarity > 0, sensed.count, 0), axis=-3)
     off = jnp.sum(jnp.where(sensed.polarity < 0, sensed.count, 0), axis=-3)
     return jnp.log1p(jnp.stack([on, off], axis=-3).astype(jnp.float32))
@@ -133,21 +139,21 @@ def in_waves(config: EncoderConfig, image: Array) -> Target:
 
 
 def init_vae(
-    config: EncoderConfig, camera: CameraConfig, key: Array, *, form: Form = Form.EVENTS, windows: int = 1
+    config: EncoderConfig, camera: CameraConfig, key: Array, *, form: Form = Form.EVENTS, layers: int = 1
 ) -> Params:
     """Returns fresh parameters, `{"encoder": ..., "decoder": ...}`, for the camera's resolution.
 
     Args:
-        form: of what is encoded; a key of `CHANNELS`.
-        windows: frame pairs F of an event field.
+        form: of what is encoded, one of `code.EMBEDDED`.
+        layers: frame pairs F of an event field, or C of pictures.
     """
     key_encoder, key_decoder = jax.random.split(key)
-    decoder = Decoder(config, camera.height, camera.width, target_channels(config, form))
-    when = jnp.zeros((windows, camera.height, camera.width))
+    decoder = Decoder(config, camera.height, camera.width, target_channels(config, form, layers))
+    when = jnp.zeros((layers, camera.height, camera.width))
     nothing = when.astype(jnp.int32)
     silent = EventField(nothing, nothing.astype(jnp.int8), when, when, window_s=1.0)
-    encoder = _encoder(config, camera.height, camera.width, form)
-    blank = silent if form is Form.EVENTS else when[0]
+    blank = silent if form is Form.EVENTS else when
+    encoder = _encoder(config, blank)
     memory = [jnp.zeros(config.code_size)] if is_recurrent(config) else []
     return {
         "encoder": encoder.init(key_encoder, blank, jnp.zeros(MOTION_SIZE), *memory)["params"],
@@ -155,10 +161,13 @@ def init_vae(
     }
 
 
-def _encoder(config: EncoderConfig, height: int, width: int, form: Form) -> PatchEncoder | PooledEncoder:
+def _encoder(config: EncoderConfig, sensed: EventField | Array) -> PatchEncoder | PooledEncoder:
+    """Returns the encoder of what is shown, or of shapes like it."""
+    fields = isinstance(sensed, EventField)
+    channels, height, width = (sensed.count if fields else sensed).shape[-3:]
     if config.architecture == "patches":
         return PatchEncoder(config, height, width)
-    return PooledEncoder(config, height, width, CHANNELS[form])
+    return PooledEncoder(config, height, width, EVENT_CHANNELS if fields else channels, timed=fields)
 
 
 def encode(
@@ -169,7 +178,7 @@ def encode(
     previous: Array | None = None,
     begins: Array | None = None,
 ) -> tuple[Array, Array]:
-    """Returns mean and log-variance, each `[..., code_size]`, of fields `[..., F, H, W]` or pictures `[..., H, W]`.
+    """Returns mean and log-variance, each `[..., code_size]`, of fields `[..., F, H, W]` or pictures `[..., C, H, W]`.
 
     The code that the agent sees is the mean.
 
@@ -178,9 +187,7 @@ def encode(
         previous, begins: what a recurrent encoder remembers, see `PatchEncoder`, which needs one of them; None if the
             encoder is not recurrent.
     """
-    fields = isinstance(sensed, EventField)
-    height, width = (sensed.count if fields else sensed).shape[-2:]
-    encoder = _encoder(_of_kind(config, params), height, width, Form.EVENTS if fields else Form.PICTURE)
+    encoder = _encoder(_of_kind(config, params), sensed)
     memory = (previous, begins) if is_recurrent(config) else ()
     return encoder.apply({"params": params["encoder"]}, sensed, motion, *memory)  # type: ignore
 
@@ -200,17 +207,22 @@ def encode_events(
     return encoder.apply({"params": params["encoder"]}, x, y, tau, p, method=PooledEncoder.sparse)  # type: ignore
 
 
-def frozen(config: EncoderConfig, camera: CameraConfig, params: Params, *, form: Form = Form.EVENTS) -> Params:
+def frozen(
+    config: EncoderConfig, camera: CameraConfig, params: Params, *, form: Form = Form.EVENTS, layers: int = 1
+) -> Params:
     """Returns the parameters in the form that encodes fastest: the pooled encoder's pixel features as a table.
 
     A frozen encoder need not compute them again for each field or picture.
 
     Args:
         form: of what is encoded.
+        layers: C of pictures.
     """
     if config.architecture == "patches":
         return params
-    encoder = PooledEncoder(_of_kind(config, params), camera.height, camera.width, CHANNELS[form])
+    timed = form is Form.EVENTS
+    channels = EVENT_CHANNELS if timed else layers
+    encoder = PooledEncoder(_of_kind(config, params), camera.height, camera.width, channels, timed)
     table = encoder.apply({"params": params["encoder"]}, method=lambda encoder: encoder.pixels.everywhere())
     return {**params, "encoder": {**params["encoder"], "pixels": {"table": table}}}
 
@@ -255,7 +267,7 @@ def vae_loss(
     The paper states it in section 3.2 without a number.
 
     Args:
-        sensed: field `[..., F, H, W]` or picture `[..., H, W]`.
+        sensed: field `[..., F, H, W]` or pictures `[..., C, H, W]`.
         motion: `[..., MOTION_SIZE]` own motion.
         wanted: what the decoder must draw, see `target` and `in_waves`.
         noise: `[..., code_size]` standard normal, which draws the codes (reparametrised).

@@ -94,6 +94,11 @@ def wave_table(height: int, width: int) -> Callable[..., Array]:
         mix = lecun_normal()
         odd = basis @ mix(key_odd, (basis.shape[1], shape[-1]))
         even = basis @ mix(key_even, (basis.shape[1], shape[-1]))
-        return jnp.stack([even + odd, even - odd][: shape[0]])
+        return jnp.stack([even + polarity * odd for polarity in polarities(shape[0])])
 
     return init
+
+
+def polarities(channels: int) -> np.ndarray:
+    """Returns the polarity of each channel, `[channels]`: 1 and -1 of ON and OFF, evenly between them of more."""
+    return np.linspace(1.0, 1.0 if channels == 1 else -1.0, channels)

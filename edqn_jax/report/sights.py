@@ -33,9 +33,9 @@ class Shown:
     """The sensor's images at D decisions, with the VAE's targets and reconstructions."""
 
     image: np.ndarray
-    """[D, H, W] ON minus OFF events per pixel, or the picture."""
+    """[D, H, W] ON minus OFF events per pixel, or the first picture."""
     target: np.ndarray
-    """[D, H, W] what the decoder must draw, blurred: nearness, or ON plus OFF events per pixel, or the picture."""
+    """[D, H, W] what the decoder must draw, blurred: nearness, ON plus OFF events per pixel, or the first picture."""
     reconstruction: np.ndarray
     """[D, H, W] what it draws from the code, in the same units."""
 
@@ -105,7 +105,7 @@ class Sights:
             if embedding.needs_nearness(config):
                 nearness = sensor.nearness_image(config, scene, position[-1], quaternion[-1])
             code = vae.embed(config.encoder, params.encoder, sensed, motion, code)
-            image = events.event_image(sensed) if isinstance(sensed, EventField) else sensed
+            image = events.event_image(sensed) if isinstance(sensed, EventField) else sensed[0]
             target = vae.target(config.encoder, sensed, nearness)
             made = vae.decode(config.encoder, config.camera, params.encoder, code)
             drawn = (_drawn(config, sensed, channels) for channels in (target, made))
@@ -176,4 +176,4 @@ def _drawn(config: Config, sensed: EventField | Array, channels: Array) -> Array
     """Returns what there is to look at in a target [C, H, W] of `vae.target`: [H, W], in the units of what is shown."""
     if embedding.needs_nearness(config):
         return channels[-1]
-    return jnp.sum(jnp.expm1(channels) if isinstance(sensed, EventField) else channels, axis=-3)
+    return jnp.sum(jnp.expm1(channels), axis=-3) if isinstance(sensed, EventField) else channels[0]

@@ -39,13 +39,17 @@ DEPTH_SCALE = 3.0
 """Value of `depth` at contact: its pictures then vary as much as frames do, and the VAE weighs both alike."""
 
 
+CHANGE_SCALE = 0.1
+"""Change of log brightness that `frame-pair` shows as 1: that of two or three events."""
+
+
 class Form(enum.Enum):
     """Form of what a sensor shows. It decides how the observation is embedded and drawn."""
 
     EVENTS = enum.auto()
     """An event field at the camera's resolution; the VAE embeds it."""
     PICTURE = enum.auto()
-    """An array [H, W] of order 1 at the camera's resolution; the VAE embeds it."""
+    """Pictures of order 1 at the camera's resolution, an array [C, H, W]; the VAE embeds them."""
     VALUES = enum.auto()
     """An array [V] of order 1; the Q-network sees it as it is."""
     NOTHING = enum.auto()
@@ -66,8 +70,16 @@ def _now(config: Config) -> tuple[float, ...]:
     return (0.0,)
 
 
+def _window(config: Config) -> tuple[float, ...]:
+    return config.events.frame_times_s
+
+
 def _no_values(config: Config) -> int:
     return 0
+
+
+def _one(config: Config) -> int:
+    return 1
 
 
 def _no_memory(config: Config, key: Array) -> SensorMemory:
@@ -83,6 +95,8 @@ class Sensor:
     form: Form
     values: Callable[[Config], int] = _no_values
     """V of `Form.VALUES`."""
+    pictures: Callable[[Config], int] = _one
+    """C of `Form.PICTURE`."""
     frame_times_s: Callable[[Config], tuple[float, ...]] = _now
     """Times of the T poses that `show` needs, seconds relative to the end of a decision; each is a physics step."""
     draws_frames: bool = False
@@ -101,7 +115,7 @@ class Sensor:
             case Form.VALUES:
                 return jnp.asarray(rng.random(self.values(config), np.float32))
             case Form.PICTURE:
-                return jnp.asarray(rng.random(shape, np.float32))
+                return jnp.asarray(rng.random((self.pictures(config), *shape), np.float32))
             case Form.EVENTS:
                 return events.random_field(config.events, *shape, rng)
 
@@ -167,6 +181,16 @@ def _show_events(
     return events.events(config.events, memory, frames, config.events.frame_times_s, key)
 
 
+def _show_event_image(
+    config: Config, scene: Scene, poses: Flight, memory: SensorMemory, key: Array
+) -> tuple[Sensed, SensorMemory]:
+    """Returns log(1 + count) of each pixel's ON minus OFF events, with their sign."""
+    field, memory = _show_events(config, scene, poses, memory, key)
+    assert isinstance(field, EventField)
+    image = events.event_image(field).astype(jnp.float32)
+    return (jnp.sign(image) * jnp.log1p(jnp.abs(image))).ravel(), memory
+
+
 def _event_memory(config: Config, key: Array) -> SensorMemory:
     return events.reset_memory(config.events, config.camera.height, config.camera.width, key)
 
@@ -174,7 +198,20 @@ def _event_memory(config: Config, key: Array) -> SensorMemory:
 def _show_frame(
     config: Config, scene: Scene, poses: Flight, memory: SensorMemory, key: Array
 ) -> tuple[Sensed, SensorMemory]:
-    return brightness(config, view(config, scene, poses.position[-1], poses.quaternion[-1])), None
+    return brightness(config, view(config, scene, poses.position[-1], poses.quaternion[-1]))[None], None
+
+
+def _show_frame_pair(
+    config: Config, scene: Scene, poses: Flight, memory: SensorMemory, key: Array
+) -> tuple[Sensed, SensorMemory]:
+    """Returns the newest frame and, of each frame before it, how much darker it was.
+
+    That is all that is in the frames, and what moved is as large a number as what stands: in the frames as they are an
+    encoder would have to take the small difference of two large numbers.
+    """
+    frames = brightness(config, jax.vmap(lambda p, q: view(config, scene, p, q))(poses.position, poses.quaternion))
+    change = (frames[-1:] - frames[:-1]) / CHANGE_SCALE
+    return jnp.concatenate([frames[-1:], change]), None
 
 
 def brightness(config: Config, luma: Array) -> Array:
@@ -189,7 +226,7 @@ def brightness(config: Config, luma: Array) -> Array:
 def _show_depth(
     config: Config, scene: Scene, poses: Flight, memory: SensorMemory, key: Array
 ) -> tuple[Sensed, SensorMemory]:
-    return nearness_image(config, scene, poses.position[-1], poses.quaternion[-1]), None
+    return nearness_image(config, scene, poses.position[-1], poses.quaternion[-1])[None], None
 
 
 def nearness_image(config: Config, scene: Scene, position: Array, quaternion: Array) -> Array:
@@ -248,15 +285,33 @@ SENSORS: dict[str, Sensor] = {
     "events": Sensor(
         show=_show_events,
         form=Form.EVENTS,
-        frame_times_s=lambda config: config.events.frame_times_s,
+        frame_times_s=_window,
         draws_frames=True,
         at_rest=_event_memory,
         image=Image("events", "events per pixel", signed=True),
+    ),
+    # The events as one image, without a VAE.
+    "event-image": Sensor(
+        show=_show_event_image,
+        form=Form.VALUES,
+        values=lambda config: config.camera.width * config.camera.height,
+        frame_times_s=_window,
+        draws_frames=True,
+        at_rest=_event_memory,
     ),
     # The newest brightness frame of the same camera.
     "frames": Sensor(
         show=_show_frame,
         form=Form.PICTURE,
+        draws_frames=True,
+        image=Image("log brightness", "log brightness + 1"),
+    ),
+    # The frames that the events are made of, at the same times.
+    "frame-pair": Sensor(
+        show=_show_frame_pair,
+        form=Form.PICTURE,
+        pictures=lambda config: len(_window(config)),
+        frame_times_s=_window,
         draws_frames=True,
         image=Image("log brightness", "log brightness + 1"),
     ),

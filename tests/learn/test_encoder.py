@@ -79,11 +79,12 @@ def even_field() -> ev.EventField:
     return ev.field_of_counts(EventsConfig(), jnp.asarray(counts))
 
 
-@pytest.mark.parametrize("kind", ["table", "network"])
+@pytest.mark.parametrize(("kind", "pooling"), [("table", "sum"), ("network", "sum"), ("network", "max")])
 @pytest.mark.parametrize("field", [ragged_field(1), even_field()], ids=["ragged", "even"])
 @pytest.mark.slow
-def test_dense_encoder_equals_the_sum_over_single_events(kind, field):
-    config = dataclasses.replace(CONFIG, pixel_features=kind, time_frequencies=2, features=8, hidden=16, code_size=5)
+def test_dense_encoder_pools_single_events(kind, pooling, field):
+    config = dataclasses.replace(CONFIG, pooling=pooling, pixel_features=kind, time_frequencies=2)
+    config = dataclasses.replace(config, features=8, hidden=16, code_size=5)
     params = fresh(config, SMALL, jax.random.key(0))
     x, y, tau, p = event_list(field)
     weights = jax.random.normal(jax.random.key(1), (2, 5))
@@ -116,7 +117,7 @@ def test_pixel_features_written_out_give_the_same_codes(kind, form):
     params = vae.init_vae(config, SMALL, jax.random.key(0), form=form)
     table = vae.frozen(config, SMALL, params, form=form)
     assert "table" in table["encoder"]["pixels"] and table["decoder"] is params["decoder"]
-    field, picture = ragged_field(6), jax.random.normal(jax.random.key(1), (SMALL.height, SMALL.width))
+    field, picture = ragged_field(6), jax.random.normal(jax.random.key(1), (1, SMALL.height, SMALL.width))
     sensed = field if form is Form.EVENTS else picture
     # One and the same product of the same numbers, but for what is fused into it.
     for one, two in zip(encode(config, params, sensed), encode(config, table, sensed), strict=True):

@@ -74,7 +74,7 @@ def test_a_frame_is_the_logarithm_of_the_camera_by_brute_force(scenes) -> None:
     config = config_of("frames")
     for scene, padded in scenes:
         where = poses(scene, np.random.default_rng(1), 3)
-        ours = np.asarray(shown(config, padded, *where), np.float64)
+        ours = np.asarray(shown(config, padded, *where), np.float64)[:, 0]
         plain = np.stack([camera_plain.luma(CAMERA, scene, p, turned(a)) for p, a in zip(*where, strict=True)])
         assert ours.shape == (3, 12, 16)
         # The level camera's own bar against 8 x 8 samples a pixel (tests/sim/test_camera.py).
@@ -87,7 +87,7 @@ def test_depth_is_the_nearness_of_what_mujocos_rays_meet(scenes) -> None:
     config = config_of("depth")
     for scene, padded in scenes:
         where = poses(scene, np.random.default_rng(2), 4)
-        ours = np.asarray(shown(config, padded, *where), np.float64)
+        ours = np.asarray(shown(config, padded, *where), np.float64)[:, 0]
         caster = RayCaster(scene)
         rays = [camera_plain.directions(CAMERA, turned(yaw), 1) for yaw in where[1]]
         metres = np.stack([caster.distance(p, d) for p, d in zip(where[0], rays, strict=True)])
@@ -178,10 +178,48 @@ def test_a_step_shows_what_is_seen_from_where_it_ends(world, name: str) -> None:
     assert np.ptp(np.asarray(step.flight.position), axis=0).max() > 0.3  # elsewhere, another view
     if name == "depth":  # which is the label of every other sensor
         label = jax.jit(lambda s: env.nearness(config_of("frames"), world, s))(state)
-        np.testing.assert_allclose(label, step.observation.sensed, atol=1e-4)
+        np.testing.assert_allclose(label, step.observation.sensed[0], atol=1e-4)  # type: ignore
 
 
-@pytest.mark.parametrize(("name", "frames"), [("events", 2), ("frames", 1), ("depth", 1), ("ranges", 0), ("blind", 0)])
+@pytest.mark.slow
+def test_a_frame_pair_is_the_frames_that_events_are_made_of(world) -> None:
+    """The newest frame, and how the brightness changed, are all that is in two; event images count that change."""
+    scene, times = jax.tree.map(lambda x: x[0], world.pool), (-0.08, -0.04, 0.0)
+    places = jnp.array([[5.0, 5.0, 3.0], [5.1, 5.05, 3.0], [5.3, 5.1, 3.1]])
+    upright = jnp.broadcast_to(jnp.array([1.0, 0.0, 0.0, 0.0]), (3, 4))
+    found, key = {}, jax.random.key(0)
+    for name in ("frame-pair", "frames", "event-image", "events"):
+        config = config_of(name)
+        config = dataclasses.replace(config, events=dataclasses.replace(config.events, frame_times_s=times))
+        memory = sensor.at_rest(config, key)
+        see = jax.jit(lambda at, to, c=config, m=memory: sensor.sense(c, scene, Flight(at, to, at), m, key)[0])
+        found[name] = (
+            [see(places[: k + 1], upright[: k + 1]) for k in range(3)] if name == "frames" else (see(places, upright))
+        )
+    first, middle, last = (np.asarray(frame)[0] for frame in found["frames"])
+    newest, since_first, since_middle = np.asarray(found["frame-pair"])
+    np.testing.assert_allclose(newest, last, atol=1e-4)  # other programs
+    np.testing.assert_allclose(since_first, (last - first) / 0.1, atol=2e-3)
+    np.testing.assert_allclose(since_middle, (last - middle) / 0.1, atol=2e-3)
+    assert np.abs(since_first).max() > 1.0
+    net = np.sum(np.asarray(found["events"].count) * np.asarray(found["events"].polarity), axis=0)
+    assert net.min() < 0 < net.max()
+    np.testing.assert_allclose(found["event-image"], (np.sign(net) * np.log1p(np.abs(net))).ravel(), atol=1e-5)
+
+
+DRAWN = {"events": 2, "frames": 1, "frame-pair": 2, "depth": 1, "event-image": 2, "ranges": 0, "blind": 0}
+"""Pictures of a decision by sensor."""
+
+SHAPES = {
+    "frames": (1, 12, 16),
+    "frame-pair": (2, 12, 16),
+    "depth": (1, 12, 16),
+    "event-image": (192,),
+    "ranges": (26,),
+}
+
+
+@pytest.mark.parametrize(("name", "frames"), DRAWN.items())
 def test_what_a_decision_draws(world, name: str, frames: int) -> None:
     config = config_of(name)
     assert sensor.frames_per_decision(config) == frames
@@ -189,12 +227,12 @@ def test_what_a_decision_draws(world, name: str, frames: int) -> None:
     program = jax.make_jaxpr(lambda s: env.step(config, world, s, 0))(state)
     drawn = [e.outvars[0].aval.shape for e in program.jaxpr.eqns if e.primitive.name == "pictures"]  # type: ignore
     # Two frames of a window are drawn together.
-    assert drawn == ([(frames, 12, 16)] if name in ("events", "frames") else [])
+    assert drawn == ([(frames, 12, 16)] if frames and name != "depth" else [])
     sensed = jax.eval_shape(lambda s: env.step(config, world, s, 0), state)[1].observation.sensed
     if name == "events":
         assert isinstance(sensed, EventField)
     else:
-        assert getattr(sensed, "shape", None) == {"ranges": (26,), "blind": None}.get(name, (12, 16))
+        assert getattr(sensed, "shape", None) == SHAPES.get(name)
 
 
 def test_a_camera_on_the_body_sees_the_ground_rise_and_ranges_do_not_care(world) -> None:
@@ -225,7 +263,7 @@ def _show_row_means(config, scene, poses, memory, key):
 
 def _show_negative(config, scene, poses, memory, key):
     frame = sensor.view(config, scene, poses.position[-1], poses.quaternion[-1])
-    return -sensor.brightness(config, frame), memory
+    return -sensor.brightness(config, frame)[None], memory
 
 
 NEW = {
