@@ -37,6 +37,9 @@ MOST_SHOWN = 80
 WORLD = "medium"
 """World of the `default` preset where nothing names one."""
 
+PAPERS_WORLD = "paper"
+"""The paper's map, in which the options of `Config` were found."""
+
 RANDOM_WORLDS: Layer = {
     "world": {"flown": "paper", "pool_size": 4096, "missions": 32_768},
     "train": {"total_steps": 1_500_000, "validation_every": 1_500_000, "validation_missions": 1024},
@@ -53,6 +56,20 @@ RANDOM_WORLDS: Layer = {
 window of events with lower thresholds, and an encoder that learns from more, and again from flights of the policy,
 since there only events tell where obstacles are. No direction is preferred, so what is replayed is turned. The last
 flight is through the paper's map, which training never uses (docs/ablation.md)."""
+
+DRAWN_WORLDS: Layer = {
+    "env": {
+        "reward": "geodesic",
+        "progress_weight": 6.0,
+        "path_weight": 2.0,
+        "collision_reward": -30.0,
+        "left_volume_reward": -30.0,
+    },
+    "train": {"total_steps": 2_000_000, "validation_every": 131_072},
+}
+"""What a user's own MJCF file changes: the reward counts metres along the way, since behind walls the straight line leads
+into a corner, and collisions cost less, since where ways are narrow a drone that fears them learns to hover
+(docs/results.md)."""
 
 GPU: Layer = {
     "world": {"pool_size": 16_384, "missions": 131_072},
@@ -109,7 +126,9 @@ GPU_FROM_FILE: Layer = {
 
 def world_layers(world: str, tuned_for: Hardware) -> list[Layer]:
     """Returns what a world and the hardware change in the `default` preset; later ones replace earlier ones."""
-    return [*([RANDOM_WORLDS] if world in FAMILIES else []), *gpu_layers(world, tuned_for)]
+    if world == PAPERS_WORLD:
+        return gpu_layers(world, tuned_for)
+    return [RANDOM_WORLDS if world in FAMILIES else DRAWN_WORLDS, *gpu_layers(world, tuned_for)]
 
 
 def gpu_layers(world: str, tuned_for: Hardware | Literal["auto"]) -> list[Layer]:

@@ -1,7 +1,7 @@
 """Every option of the project: one frozen dataclass per module, nested into one `Config`.
 
-The defaults are the `default` preset in a world from a file, the best that we know; `loading` has what random worlds
-and a GPU change. The string under a field is its help text on the command line.
+The defaults are the `default` preset on the paper's map, the best that we know; `loading` has what random worlds, other
+worlds from files and a GPU change. The string under a field is its help text on the command line.
 """
 
 from __future__ import annotations
@@ -322,7 +322,8 @@ class TrainConfig:
     """Decisions between validations, rounded up to whole chunks; 0 validates only at the end."""
     validation_missions: int = 128
     """Missions of each validation, and of the flights at the end, the first of which is in `world.flown`; in worlds
-    from a file half of them begin near the world's start."""
+    from a file half of them begin near the world's start, or as many as in training (`world.own_start_fraction`) if
+    that is more."""
     keep: Literal["best", "last"] = "best"
     """Parameters that the run keeps: those of the best validation (by SPL, the latest of equal ones), or the last."""
     checkpoint_every_s: float = 15.0

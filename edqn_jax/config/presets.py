@@ -56,7 +56,7 @@ def preset(name: str) -> Config:
                 huber_delta=0.0,
                 reward_scale=1.0,
                 batch_size=128,
-                updates_per_step=1,
+                updates_per_step=16,
                 learning_starts=1024,
                 exploration_end=0.01,
                 exploration_episodes=10,

@@ -168,9 +168,10 @@ def _file_run_missions(config: Config, training_key: jax.Array, validation_key: 
     spread, jitter = config.world.own_start_fraction, config.world.start_jitter_m
     cells, note = _with_a_way(pool, config, name)
     training = spread_missions(pool, config.world.missions, spread, jitter, training_key, cells)
-    # Half of the validation begins near the start, but never at it.
+    # Half of the validation begins near the start, more where training does, but never at it: flown greedily, missions
+    # from one point would be one and the same.
     near = max(jitter, 0.5)
-    validation = spread_missions(pool, count, 0.5, near, validation_key, cells)
+    validation = spread_missions(pool, count, max(0.5, spread), near, validation_key, cells)
     own = own_missions(pool)
     final = jax.tree.map(lambda one, many: jnp.concatenate([one, many[1:]]), own, validation)
     final = dataclasses.replace(final, scene=final.scene.astype(jnp.int32))

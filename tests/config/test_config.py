@@ -75,6 +75,17 @@ def test_random_worlds_have_their_own_warm_up_and_the_papers_preset_its_own_agen
     assert (paper.encoder.architecture, paper.encoder.target) == ("pooled", "sensed")
 
 
+def test_a_world_that_somebody_drew_is_learnt_along_its_ways_and_the_papers_map_is_not(tmp_path):
+    drawn, paper = resolve(world="house.xml"), resolve(world="paper")
+    assert paper == dataclasses.replace(Config(), world=dataclasses.replace(Config().world, name="paper"))
+    assert (drawn.env.reward, drawn.env.collision_reward) == ("geodesic", -30.0)
+    assert drawn.train.total_steps > paper.train.total_steps and drawn.agent == paper.agent
+    assert resolve(world="house.xml", tuned_for="gpu").env.reward == "geodesic"
+    file = write(tmp_path, "env: {reward: progress}\n")
+    assert resolve(file=file, world="house.xml").env.reward == "progress"
+    assert resolve("paper", world="house.xml").env.reward == "sparse"
+
+
 def test_a_random_world_in_the_file_brings_its_budget_too(tmp_path):
     assert (
         resolve(file=write(tmp_path, "world: {name: dense}\n")).train.total_steps
