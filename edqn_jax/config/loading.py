@@ -67,8 +67,8 @@ DRAWN_WORLDS: Layer = {
     },
     "train": {"total_steps": 2_000_000, "validation_every": 131_072},
 }
-"""What a user's own MJCF file changes: the reward counts metres along the way, since behind walls the straight line leads
-into a corner, and collisions cost less, since where ways are narrow a drone that fears them learns to hover
+"""What a user's own MJCF file changes: the reward counts metres along the way, since behind walls the straight line
+leads into a corner, and collisions cost less, since where ways are narrow a drone that fears them learns to hover
 (docs/results.md)."""
 
 GPU: Layer = {
