@@ -6,11 +6,14 @@ not measured again: a command that was stopped goes on where it was. No row is b
     python benchmarks/success.py --out runs/success
     python benchmarks/success.py --out runs/success --worlds medium --sensors events depth -- --total-steps 9000000
     python benchmarks/success.py --out runs/success --runs runs/seed-0 runs/seed-1 --worlds medium
+    python benchmarks/success.py --out runs/success --runs runs/seed-0 runs/seed-1 --worlds rooms --shuffle-codes
     python benchmarks/success.py --out runs/success --report
 
-With --runs nothing is trained: the policies of these runs, which differ in their seeds alone, fly. Arguments after --
-are options of train.py; defaults are those of the hardware. The interval is a bootstrap over seeds and missions. A* for
-the SPL takes 0.4 s a world and core, once for each world, when there is time after the rows; --no-spl leaves it out.
+With --runs nothing is trained: the policies of these runs, which differ in their seeds alone, fly; with
+--shuffle-codes each drone gets what the sensor of another one shows: codes as they ought to be, but useless. Arguments
+after -- are options of train.py; defaults are those of the hardware. The interval is a bootstrap over seeds and
+missions. A* for the SPL takes 0.4 s a world and core, once for each world, when there is time after the rows; --no-spl
+leaves it out.
 """
 
 from __future__ import annotations
@@ -68,6 +71,7 @@ def parse(argv: Sequence[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--sensors", nargs="+", default=["events"], help="env.sensor of each row (default events)")
     parser.add_argument("--seeds", type=int, default=5, help="training seeds, in one program (default 5)")
     parser.add_argument("--runs", nargs="+", type=Path, help="fly the policies of these runs instead of training")
+    parser.add_argument("--shuffle-codes", action="store_true", help="give each drone what another one sees (--runs)")
     parser.add_argument("--missions", type=int, default=1000, help="test missions of each seed (default 1000)")
     parser.add_argument("--minutes", type=float, default=9.0, help="begin no row that would end later (default 9)")
     parser.add_argument("--no-spl", action="store_true", help="do not search shortest paths")
@@ -76,6 +80,8 @@ def parse(argv: Sequence[str] | None = None) -> argparse.Namespace:
     args.flags = flags
     if args.runs and (flags or args.sensors != ["events"]):
         parser.error("--runs have their own sensor and options; leave out --sensors and the arguments after --")
+    if args.shuffle_codes and not args.runs:
+        parser.error("--shuffle-codes needs the --runs that fly with them")
     if args.runs and args.report:
         parser.error("--report measures nothing; leave out --runs")
     for name in ("seeds", "missions"):
@@ -171,8 +177,17 @@ def train_row(config: Config, seeds: int, missions: int, folder: Path) -> Row:
     return _row(config, policies, missions, first.decisions, took, began)
 
 
-def fly_row(config: Config, policies: Sequence[Policy], runs: Sequence[Path], missions: int) -> Row:
+def fly_row(
+    config: Config, policies: Sequence[Policy], runs: Sequence[Path], missions: int, shuffle_codes: bool = False
+) -> Row:
     """Flies policies of runs through the test missions, and returns the row; what their training took is added up.
+
+    Args:
+        config: of the row, with the world that is flown.
+        policies: one a run.
+        runs: folders.
+        missions: of each policy.
+        shuffle_codes: give each drone what the sensor of another one shows.
 
     Raises:
         ConfigError: if a run has no summary.
@@ -184,7 +199,7 @@ def fly_row(config: Config, policies: Sequence[Policy], runs: Sequence[Path], mi
         key: sum(summary[key] / summary.get("trained_together", 1) for summary in summaries)
         for key in ("train_seconds", "compile_seconds")
     }
-    row = _row(config, policies, missions, summaries[0]["train_decisions"], took, began)
+    row = _row(config, policies, missions, summaries[0]["train_decisions"], took, began, shuffle_codes)
     return row | {"runs": [str(run) for run in runs], "trained_in": policies[0].config.world.name}
 
 
@@ -196,19 +211,26 @@ def _summary(run: Path) -> dict[str, Any]:
 
 
 def _row(
-    config: Config, policies: Sequence[Policy], missions: int, decisions: int, took: Mapping[str, float], began: float
+    config: Config,
+    policies: Sequence[Policy],
+    missions: int,
+    decisions: int,
+    took: Mapping[str, float],
+    began: float,
+    shuffle_codes: bool = False,
 ) -> Row:
     """Flies the test missions and returns the row."""
     course = load_missions(config, config.world.name, missions)
     turns = []
     for policy in policies:
-        flights = fly_on_all_devices(config, course.world, policy.params)
+        flights = fly_on_all_devices(config, course.world, policy.params, shuffle_codes=shuffle_codes)
         turns.append({"seed": policy.config.train.seed, "flights": flight_columns(flights, missions)})
     return {
         "benchmark": "success",
         "world": config.world.name,
         "sensor": config.env.sensor,
         "missions": missions,
+        "shuffled": shuffle_codes,
         "decisions": decisions,
         **took,
         "row_seconds": time.perf_counter() - began,
@@ -270,6 +292,8 @@ def table(rows: Sequence[Row], shortest: dict[str, np.ndarray | None]) -> str:
         world = row["world"]
         if row.get("trained_in", world) != world:
             world += f", trained in {row['trained_in']}"
+        if row.get("shuffled"):
+            world += ", codes of another drone"
         lines.append(
             f"| {world} | {row['sensor']} | {len(row['turns'])} x {row['missions']} | {found['success']:.2%} "
             f"| {low:.2%} to {high:.2%} | {found['iqm']:.2%} | {each} | {weight} "
@@ -298,9 +322,10 @@ def _wanted(args: argparse.Namespace) -> list[Wanted]:
         by_seed = sorted(runs, key=lambda run: runs[run].config.train.seed)
         policies = [runs[run] for run in by_seed]
         configs = [config_of_runs(world, policies) for world in args.worlds]
-        files = [row_file(args.out, config, args.missions, digest_of(policies)) for config in configs]
+        identity = digest_of(policies) + (" shuffled" if args.shuffle_codes else "")
+        files = [row_file(args.out, config, args.missions, identity) for config in configs]
         return [
-            Wanted(file, functools.partial(fly_row, config, policies, by_seed, args.missions))
+            Wanted(file, functools.partial(fly_row, config, policies, by_seed, args.missions, args.shuffle_codes))
             for file, config in zip(files, configs, strict=True)
         ]
     configs = [config_of(world, sensor, args.flags) for world in args.worlds for sensor in args.sensors]

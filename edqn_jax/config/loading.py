@@ -19,7 +19,7 @@ from typing import Any, Literal
 import yaml
 
 from edqn_jax.config.limits import shown, validate
-from edqn_jax.config.options import FAMILIES, Config
+from edqn_jax.config.options import FAMILIES, WITH_DETOURS, Config
 from edqn_jax.config.presets import preset as named_preset
 from edqn_jax.errors import ConfigError
 
@@ -57,6 +57,13 @@ window of events with lower thresholds, and an encoder that learns from more, an
 since there only events tell where obstacles are. No direction is preferred, so what is replayed is turned. The last
 flight is through the paper's map, which training never uses (docs/ablation.md)."""
 
+CLOSED_WORLDS: Layer = {
+    "env": {"reward": "geodesic", "progress_weight": 6.0, "path_weight": 2.0},
+    "agent": {"discount": 0.98, "n_step": 5},
+}
+"""What rooms, forests and canyons change further: metres count along the way around obstacles, and more than the metres
+flown, since a drone that is paid for the straight line alone hovers where it ends (docs/results.md)."""
+
 DRAWN_WORLDS: Layer = {
     "env": {
         "reward": "geodesic",
@@ -65,7 +72,7 @@ DRAWN_WORLDS: Layer = {
         "collision_reward": -30.0,
         "left_volume_reward": -30.0,
     },
-    "train": {"total_steps": 2_000_000, "validation_every": 131_072},
+    "train": {"total_steps": 3_000_000, "validation_every": 196_608},
 }
 """What a user's own MJCF file changes: the reward counts metres along the way, since behind walls the straight line
 leads into a corner, and collisions cost less, since where ways are narrow a drone that fears them learns to hover
@@ -105,6 +112,9 @@ pool of worlds, since a small one is learnt by heart, and collisions that cost m
 (docs/ablation.md)."""
 
 
+GPU_CLOSED: Layer = {"agent": {"hidden": (512, 512)}}
+"""What a GPU changes further for rooms, forests and canyons."""
+
 GPU_FROM_FILE: Layer = {
     "train": {"num_envs": 2048, "chunk_steps": 32, "total_steps": 6_000_000, "validation_every": 2_000_000},
     "encoder": {
@@ -128,14 +138,18 @@ def world_layers(world: str, tuned_for: Hardware) -> list[Layer]:
     """Returns what a world and the hardware change in the `default` preset; later ones replace earlier ones."""
     if world == PAPERS_WORLD:
         return gpu_layers(world, tuned_for)
-    return [RANDOM_WORLDS if world in FAMILIES else DRAWN_WORLDS, *gpu_layers(world, tuned_for)]
+    if world not in FAMILIES:
+        return [DRAWN_WORLDS, *gpu_layers(world, tuned_for)]
+    return [RANDOM_WORLDS, *([CLOSED_WORLDS] if world in WITH_DETOURS else []), *gpu_layers(world, tuned_for)]
 
 
 def gpu_layers(world: str, tuned_for: Hardware | Literal["auto"]) -> list[Layer]:
     """Returns what a GPU changes for a world."""
     if tuned_for != "gpu":
         return []
-    return [GPU if world in FAMILIES else GPU_FROM_FILE]
+    if world not in FAMILIES:
+        return [GPU_FROM_FILE]
+    return [GPU, GPU_CLOSED] if world in WITH_DETOURS else [GPU]
 
 
 def resolve(

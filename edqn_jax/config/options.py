@@ -356,3 +356,5 @@ MIXTURES: dict[str, tuple[str, ...]] = {"open": _OPEN, "mixed": (*_OPEN, *_CLOSE
 """Random worlds that are of one of several families, with equal chances."""
 FAMILIES = (*_OPEN, *_CLOSED, *MIXTURES)
 """Names of random worlds."""
+WITH_DETOURS = (*_CLOSED, "mixed")
+"""Names of random worlds in which the straight line to the goal is seldom free."""

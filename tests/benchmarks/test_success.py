@@ -109,9 +109,11 @@ def test_existing_runs_make_a_row_of_their_own(tmp_path: Path, monkeypatch, caps
     assert success.main([*words, *map(str, reversed(runs))]) == 0
     monkeypatch.undo()
     monkeypatch.setattr(success, "use_cpu_devices", lambda count: None)
-    # Other policies are another row, and policies of another training are none at all.
+    # Other policies are another row, so are codes of other drones; policies of another training are none at all.
     assert success.main([*words, str(runs[1])]) == 0
-    assert len(list((tmp_path / "rows").glob("medium-*.json"))) == 2
+    assert success.main([*words, str(runs[1]), "--shuffle-codes"]) == 0
+    assert "| medium, trained in sparse, codes of another drone | blind | 1 x 3 |" in capsys.readouterr().out
+    assert len(list((tmp_path / "rows").glob("medium-*.json"))) == 3
     other = dataclasses.replace(trained, agent=dataclasses.replace(trained.agent, n_step=2))
     save_policy(Policy(other, fresh_policy(other, 0)), tmp_path / "other")
     capsys.readouterr()

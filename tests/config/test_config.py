@@ -75,6 +75,15 @@ def test_random_worlds_have_their_own_warm_up_and_the_papers_preset_its_own_agen
     assert (paper.encoder.architecture, paper.encoder.target) == ("pooled", "sensed")
 
 
+@pytest.mark.parametrize("hardware", ["cpu", "gpu"])
+def test_worlds_with_walls_are_learnt_along_their_ways_and_open_ones_are_not(hardware):
+    rooms, mixed, medium = (resolve(world=name, tuned_for=hardware) for name in ("rooms", "mixed", "medium"))
+    assert rooms.env == mixed.env and rooms.agent == mixed.agent
+    assert (rooms.env.reward, medium.env.reward) == ("geodesic", "progress")
+    assert rooms.env.collision_reward == medium.env.collision_reward
+    assert rooms.train == medium.train and rooms.encoder == medium.encoder
+
+
 def test_a_world_that_somebody_drew_is_learnt_along_its_ways_and_the_papers_map_is_not(tmp_path):
     drawn, paper = resolve(world="house.xml"), resolve(world="paper")
     assert paper == dataclasses.replace(Config(), world=dataclasses.replace(Config().world, name="paper"))
