@@ -16,7 +16,7 @@ class WorldConfig:
 
     name: str = "paper"
     """Where to train: `paper`, the path of an MJCF file, or random worlds: open ones (`sparse`, `medium`, `dense`, or
-    `open`: all three), closed ones (`rooms`, `forest`, `canyon`), or all six (`mixed`)."""
+    `open`: all three), closed ones (`rooms`, `forest`, `canyon`), or all six (`mixed`, a quarter of them open)."""
     flown: str = ""
     """World of the flight at the end of a run in random worlds: `paper` or the path of an MJCF file; training never
     uses it. Empty: the first test world. A world from a file is flown itself."""
@@ -352,8 +352,11 @@ class Config:
 
 _OPEN = ("sparse", "medium", "dense")
 _CLOSED = ("rooms", "forest", "canyon")
-MIXTURES: dict[str, tuple[str, ...]] = {"open": _OPEN, "mixed": (*_OPEN, *_CLOSED)}
-"""Random worlds that are of one of several families, with equal chances."""
+MIXTURES: dict[str, dict[str, int]] = {
+    "open": dict.fromkeys(_OPEN, 1),
+    "mixed": {**dict.fromkeys(_OPEN, 1), **dict.fromkeys(_CLOSED, 3)},
+}
+"""Random worlds that are of one of several families, with their shares; a quarter of the mixed ones are open."""
 FAMILIES = (*_OPEN, *_CLOSED, *MIXTURES)
 """Names of random worlds."""
 WITH_DETOURS = (*_CLOSED, "mixed")

@@ -105,7 +105,7 @@ def _check(family: str) -> None:
 
 def families_of(mixture: str, keys: Array) -> list[str]:
     """Returns the family of each world of a mixture, from the worlds' keys [P]."""
-    families = MIXTURES[mixture]
+    families = [family for family, share in MIXTURES[mixture].items() for _ in range(share)]
     numbers = jax.vmap(lambda key: integers(jax.random.fold_in(key, _FAMILY), (), len(families)))(keys)
     return [families[number] for number in np.asarray(numbers)]
 
