@@ -47,6 +47,20 @@ def test_start_and_goal_may_be_given():
     np.testing.assert_allclose(many.goal, np.tile([3, 100, 20], (5, 1)))
 
 
+@pytest.mark.parametrize(("fraction", "near"), [(0.0, 0.5), (0.25, 0.5), (0.75, 0.75), (1.0, 1.0)])
+@pytest.mark.slow
+def test_validation_begins_where_training_does(fraction: float, near: float) -> None:
+    """At least half of it near the start; all of it where training begins nowhere else."""
+    config = make_config(
+        "paper", world={"own_start_fraction": fraction, "missions": 32}, train={"validation_missions": 40}
+    )
+    missions = run_missions(config)
+    assert missions.near_start.mean() == near
+    starts = np.asarray(missions.validation.world.missions.start)
+    apart = np.abs(starts[missions.near_start] - [1.0, 1.0, 3.0]).max(axis=1)
+    assert (apart <= 1.0 + 1e-3).all() and len(np.unique(starts, axis=0)) == 40
+
+
 def test_random_worlds_are_the_test_split_and_each_has_one_mission():
     course = load_missions(CONFIG, "sparse", 4, seed=2)
     pool, missions = course.world.pool, course.world.missions
