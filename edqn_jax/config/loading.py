@@ -69,8 +69,8 @@ DRAWN_WORLDS: Layer = {
         "reward": "geodesic",
         "progress_weight": 6.0,
         "path_weight": 2.0,
-        "collision_reward": -30.0,
-        "left_volume_reward": -30.0,
+        "collision_reward": -60.0,
+        "left_volume_reward": -60.0,
     },
     "train": {"total_steps": 3_000_000, "validation_every": 196_608},
 }

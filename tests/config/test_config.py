@@ -87,7 +87,7 @@ def test_worlds_with_walls_are_learnt_along_their_ways_and_open_ones_are_not(har
 def test_a_world_that_somebody_drew_is_learnt_along_its_ways_and_the_papers_map_is_not(tmp_path):
     drawn, paper = resolve(world="house.xml"), resolve(world="paper")
     assert paper == dataclasses.replace(Config(), world=dataclasses.replace(Config().world, name="paper"))
-    assert (drawn.env.reward, drawn.env.collision_reward) == ("geodesic", -30.0)
+    assert (drawn.env.reward, drawn.env.collision_reward) == ("geodesic", -60.0)
     assert drawn.train.total_steps > paper.train.total_steps and drawn.agent == paper.agent
     assert resolve(world="house.xml", tuned_for="gpu").env.reward == "geodesic"
     file = write(tmp_path, "env: {reward: progress}\n")
