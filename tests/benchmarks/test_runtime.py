@@ -106,7 +106,7 @@ def test_methods_take_turns_seed_by_seed_and_all_of_it_is_told(
     assert runtime.main(words) == 0
     assert faked.asked == [(name, seed) for seed in "01" for name in ("E-DQN", "A*", "RRT*")]
     shown, told = capsys.readouterr()
-    assert "1,000,000 decisions to train, 20 s to plan" in told and "seed 1 is done" in told
+    assert "6,000,000 decisions to train, 20 s to plan" in told and "seed 1 is done" in told
     assert "| E-DQN | no | 40.0 (1,000) | 60.0 | 31.0 | 120 | " in shown
     assert "| RRT*, 5 s | yes | " in shown and "2 of 2: 100% (34% - 100%)" in shown
     assert "- BIT*: ompl is not installed; run pip install 'edqn-jax[bench]'." in shown
