@@ -143,7 +143,16 @@ def main(argv: Sequence[str] | None = None) -> int:
     rows = [row_of(policy, course, sensor, args.calls) for course in courses for sensor in SENSORS]
     print(table(rows))
     if args.json is not None:
-        json_report.write(args.json, {**json_report.machine(jax.devices()), "cores": 1, "rows": rows})
+        json_report.write(
+            args.json,
+            {
+                **json_report.machine(jax.devices()),
+                "cores": 1,
+                "missions": args.missions,
+                "calls": args.calls,
+                "rows": rows,
+            },
+        )
     return 0
 
 

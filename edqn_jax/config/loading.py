@@ -75,7 +75,7 @@ DRAWN_WORLDS: Layer = {
     "train": {"total_steps": 3_000_000, "validation_every": 196_608},
 }
 """What a user's own MJCF file changes: the reward counts metres along the way, since behind walls the straight line
-leads into a corner, and collisions cost less, since where ways are narrow a drone that fears them learns to hover
+leads into a corner, and collisions cost less, since where ways are narrow training otherwise ends in hovering
 (docs/results.md)."""
 
 GPU: Layer = {

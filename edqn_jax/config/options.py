@@ -209,7 +209,7 @@ class EncoderConfig:
     """Adam step size of the VAE."""
     warmup_decisions: int = 16_384
     """Decisions of the warm-up, random manoeuvres from which the VAE learns before the DQN starts; at most a quarter of
-    all decisions. Unused by the sensors `ranges` and `blind`, which have no VAE."""
+    all decisions. Unused by the sensors `event-image`, `ranges` and `blind`, which have no VAE."""
     warmup_updates_per_step: int = 6
     """VAE updates per training step of the warm-up."""
     batch_size: int = 256
