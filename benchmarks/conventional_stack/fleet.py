@@ -92,8 +92,14 @@ def check(config: Config) -> None:
         )
     if config.camera.mount != "level":
         raise ConfigError("the conventional stack supports only a level camera; set camera.mount to 'level'")
+    if not config.env.position:
+        raise ConfigError(
+            "the conventional stack supports only a drone that knows its position; set env.position to true"
+        )
     if config.env.reward == "geodesic":
-        raise ConfigError("the conventional stack has no reward 'geodesic'; set env.reward to 'progress'")
+        raise ConfigError(
+            "the conventional stack supports only rewards of straight metres; set env.reward to 'progress'"
+        )
 
 
 class Fleet:

@@ -98,8 +98,8 @@ def physics(now: Moment) -> Part:
 
     def one(world: World, body: DroneState, move: Array, goal: Array):
         command = env.velocity_command(config.env, move, drone.yaw_of(body.quaternion))
-        bearing = env.bearing(config.env, body, goal)
-        after, flight = drone.fly(config.drone, world.airframe, body, command, bearing)
+        heading = env.heading_setpoint(config.env, body, goal, command)
+        after, flight = drone.fly(config.drone, world.airframe, body, command, heading)
         return after, flight.position
 
     def body(world: World, carry):

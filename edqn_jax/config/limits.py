@@ -105,6 +105,8 @@ def _events(events: EventsConfig, drone: DroneConfig) -> None:
 def _env(env: EnvConfig) -> None:
     _positive(env, "env", ["speed_m_s", "goal_radius_m", "max_decisions"])
     _not_negative(env, "env", ["heading_hold_m", "progress_weight", "path_weight"])
+    known = env.heading == "goal" or not env.position
+    _require(known, "env.position", "false with env.heading flight", env.position)
     _finite(env, "env", ["goal_reward", "collision_reward", "left_volume_reward", "step_reward"])
 
 

@@ -148,8 +148,14 @@ class EnvConfig:
     """Body centre within this distance of the goal, at any physics step, is success."""
     max_decisions: int = 200
     """Episode limit in decisions (the `threshold` of Table 1)."""
+    heading: Literal["goal", "flight"] = "goal"
+    """Where the drone, and with it the camera, turns to. `goal`: towards the goal. `flight`: towards where a move flies;
+    needs `position` to be false."""
     heading_hold_m: float = 2.0
-    """Within this horizontal distance of the goal the heading setpoint is held."""
+    """Within this horizontal distance of the goal the heading setpoint is held (`goal`)."""
+    position: bool = True
+    """Whether the drone knows where it is in the flight volume. If not, it knows the way to the goal ahead and to the
+    left in place of the horizontal distance."""
     reward: Literal["sparse", "progress", "potential", "geodesic"] = "progress"
     """`sparse`: Eq. 8. `progress`: adds metres gained. `potential`: the policy-invariant form. `geodesic`: as
     `progress`, with metres along the shortest way around obstacles, which training alone knows: all its missions in a

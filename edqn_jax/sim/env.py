@@ -112,19 +112,22 @@ def own_state(config: EnvConfig, scene: Scene, goal: Array, state: DroneState) -
     Horizontal distance and height to the goal (asinh(d / 2 m) / 2 and asinh(h / 2 m): metres count near the
     goal, powers of ten far away), cosine and sine of the heading, own position scaled to [-1, 1] in the
     flight volume (3), own velocity in the heading frame (3, in commanded speeds).
+
+    Without `config.position` the first value is of the metres ahead to the goal, the position's horizontal values are 0
+    and its height gives way to the metres to the left, in the heading frame and scaled as the distance.
     """
     yaw = drone.yaw_of(state.quaternion)
-    ahead = goal - state.position
-    distance = jnp.sqrt(ahead[0] ** 2 + ahead[1] ** 2)
-    lower, upper = scene.volume[0], scene.volume[1]
-    position = 2 * (state.position - lower) / (upper - lower) - 1
-    return jnp.concatenate(
-        [
-            jnp.stack([jnp.arcsinh(distance / 2.0) / 2.0, jnp.arcsinh(ahead[2] / 2.0), jnp.cos(yaw), jnp.sin(yaw)]),
-            position,
-            heading_velocity(config, yaw, state.velocity),
-        ]
-    )
+    cos, sin = jnp.cos(yaw), jnp.sin(yaw)
+    way = goal - state.position
+    if config.position:
+        lower, upper = scene.volume[0], scene.volume[1]
+        distance = jnp.sqrt(way[0] ** 2 + way[1] ** 2)
+        place = 2 * (state.position - lower) / (upper - lower) - 1
+    else:
+        distance, left = cos * way[0] + sin * way[1], cos * way[1] - sin * way[0]
+        place = jnp.stack([jnp.zeros(()), jnp.zeros(()), jnp.arcsinh(left / 2.0) / 2.0])
+    towards = jnp.stack([jnp.arcsinh(distance / 2.0) / 2.0, jnp.arcsinh(way[2] / 2.0), cos, sin])
+    return jnp.concatenate([towards, place, heading_velocity(config, yaw, state.velocity)])
 
 
 def turned(own: Array, quarters: Array) -> Array:
@@ -168,6 +171,18 @@ def bearing(config: EnvConfig, state: DroneState, goal: Array) -> Array:
     ahead = goal - state.position
     near = ahead[0] ** 2 + ahead[1] ** 2 < config.heading_hold_m**2
     return jnp.where(near, state.yaw_setpoint, jnp.arctan2(ahead[1], ahead[0]))
+
+
+def heading_setpoint(config: EnvConfig, state: DroneState, goal: Array, command: Array) -> Array:
+    """Heading setpoint [] radians of the next decision: `bearing`, or along the commanded velocity.
+
+    Args:
+        command: [3] m/s in the world; without a horizontal part the setpoint stays.
+    """
+    if config.heading == "goal":
+        return bearing(config, state, goal)
+    level = command[0] ** 2 + command[1] ** 2
+    return jnp.where(level > 0, jnp.arctan2(command[1], command[0]), state.yaw_setpoint)
 
 
 def _start(config: Config, world: World, mission: Array, key: Array) -> tuple[DroneState, EventMemory | None]:
@@ -339,7 +354,8 @@ def _fly(config: Config, world: World, scene: Scene, goal: Array, state: EnvStat
     """
     before = state.drone
     command = velocity_command(config.env, action, drone.yaw_of(before.quaternion))
-    after, flight = drone.fly(config.drone, world.airframe, before, command, bearing(config.env, before, goal))
+    heading = heading_setpoint(config.env, before, goal, command)
+    after, flight = drone.fly(config.drone, world.airframe, before, command, heading)
     outcome, end_step, contact = judge(config, scene, goal, before.position, flight, state.decision + 1)
     reward = _reward(config, world, scene, goal, state, after, action, outcome)
     numbers = jnp.concatenate([after.position, after.quaternion, after.velocity, after.angular_velocity])

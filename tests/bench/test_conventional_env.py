@@ -240,6 +240,8 @@ def test_who_ended_starts_anew_within_the_step():
         {"events": EventsConfig(frame_times_s=(-0.08, -0.04, 0.0))},
         {"camera": CameraConfig(mount="body")},
         {"encoder": EncoderConfig(retrain_at=(0.5,))},
+        {"env": EnvConfig(position=False)},
+        {"env": EnvConfig(reward="geodesic")},
     ],
 )
 def test_what_this_stack_does_not_have_is_said_before_it_flies(change):

@@ -262,19 +262,37 @@ def test_own_state_by_hand():
     np.testing.assert_allclose(own, expected, atol=1e-6)
 
 
+def test_without_the_position_the_goal_is_so_far_ahead_and_to_the_left():
+    config = dataclasses.replace(CONFIG.env, position=False)
+    state = body((20, 10, 5), np.pi / 2, velocity=(-2.0, 0.0, 1.0))
+    own = env.own_state(config, SCENE, jnp.array([50.0, 50.0, 8.0]), state)
+    expected = [
+        1.844752, 1.194763,  # asinh(40 / 2) / 2 and asinh(3 / 2)
+        0.0, 1.0,  # cosine and sine of the heading
+        0.0, 0.0, -1.701153,  # 30 m to the right
+        0.0, 0.5, 0.25,
+    ]  # fmt: skip
+    np.testing.assert_allclose(own, expected, atol=1e-6)
+    facing = body((20, 10, 5), np.arctan2(40, 30))
+    own, placed = (env.own_state(each, SCENE, jnp.array([50.0, 50.0, 8.0]), facing) for each in (config, CONFIG.env))
+    np.testing.assert_allclose(own[jnp.array([0, 6])], [float(placed[0]), 0.0], atol=1e-6)
+
+
+@pytest.mark.parametrize("position", [True, False])
 @pytest.mark.parametrize("quarters", range(4))
-def test_a_turned_own_state_is_that_of_the_turned_world(quarters):
+def test_a_turned_own_state_is_that_of_the_turned_world(quarters, position):
+    config = dataclasses.replace(CONFIG.env, position=position)
     angle = np.pi / 2 * quarters
     turn = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
     middle = np.array([30.0, 30.0, 0.0])  # of a volume of 60 x 60 x 25 m
 
     def own(position, goal, yaw, velocity):
         state = body(position, yaw, velocity=velocity)
-        return env.own_state(CONFIG.env, SCENE, jnp.asarray(goal, jnp.float32), state)
+        return env.own_state(config, SCENE, jnp.asarray(goal, jnp.float32), state)
 
-    position, goal, velocity = np.array([20.0, 10, 5]), np.array([50.0, 45, 8]), np.array([-2.0, 0.5, 1.0])
-    there = turn @ (position - middle) + middle, turn @ (goal - middle) + middle, 0.4 + angle, turn @ velocity
-    found = env.turned(own(position, goal, 0.4, velocity), jnp.int32(quarters))
+    start, goal, velocity = np.array([20.0, 10, 5]), np.array([50.0, 45, 8]), np.array([-2.0, 0.5, 1.0])
+    there = turn @ (start - middle) + middle, turn @ (goal - middle) + middle, 0.4 + angle, turn @ velocity
+    found = env.turned(own(start, goal, 0.4, velocity), jnp.int32(quarters))
     np.testing.assert_allclose(found, own(*there), atol=2e-6)
 
 
@@ -317,6 +335,16 @@ def test_the_heading_setpoint_is_the_bearing_and_is_held_near_the_goal():
     # 1.9 m beside it, however high above: what it was.
     np.testing.assert_allclose(bearing(body((51.9, 50, 20), setpoint=0.3), GOAL), 0.3)
     np.testing.assert_allclose(bearing(body((52.1, 50, 20), setpoint=0.3), GOAL), np.pi, atol=1e-6)
+
+
+def test_a_free_heading_follows_the_commanded_velocity_and_stays_without_one():
+    config = dataclasses.replace(CONFIG.env, heading="flight", position=False)
+    setpoint = partial(env.heading_setpoint, config, body((50, 40, 5), setpoint=0.3), GOAL)
+    np.testing.assert_allclose(setpoint(jnp.array([-4.0, 4.0, 4.0])), 3 * np.pi / 4, atol=1e-6)
+    np.testing.assert_allclose(setpoint(jnp.array([0.0, 0.0, 4.0])), 0.3)
+    np.testing.assert_allclose(setpoint(jnp.zeros(3)), 0.3)
+    towards = env.heading_setpoint(CONFIG.env, body((50, 40, 5), setpoint=0.3), GOAL, jnp.array([-4.0, 4.0, 4.0]))
+    np.testing.assert_allclose(towards, np.pi / 2, atol=1e-6)
 
 
 def quaternion_of(roll, pitch, yaw):
@@ -549,6 +577,22 @@ def test_the_action_is_taken_in_the_heading_at_the_decision_and_the_nose_turns_t
     turned = away - float(after.drone.yaw_setpoint)
     np.testing.assert_allclose(turned, 0.26 * FLOWN.drone.max_yaw_rate_rad_s, rtol=1e-3)
     assert away > float(drone.yaw_of(after.drone.quaternion)) > bearing
+
+
+@pytest.mark.slow
+def test_with_a_free_heading_the_nose_turns_to_where_the_drone_is_told_to_fly(world):
+    task = dataclasses.replace(FLOWN.env, sensor="blind", heading="flight", position=False)
+    config = dataclasses.replace(FLOWN, env=task)
+    state = dataclasses.replace(env.ended(config, world, jax.random.key(0), MISSION["long"]), ended=jnp.array(False))
+    yaw = float(state.drone.yaw_setpoint)
+    take = jax.jit(partial(env.step, config, world))
+    left, step = take(state, action(0, 1, 0))
+    turned = float(left.drone.yaw_setpoint) - yaw
+    np.testing.assert_allclose(turned, 0.26 * FLOWN.drone.max_yaw_rate_rad_s, rtol=1e-3)
+    assert float(drone.yaw_of(left.drone.quaternion)) > yaw
+    assert float(step.observation.own[6]) < 0.0  # the goal is to the right by now
+    still, _ = take(left, STAY)
+    assert float(still.drone.yaw_setpoint) == float(left.drone.yaw_setpoint)
 
 
 @pytest.mark.slow
