@@ -149,7 +149,7 @@ class EnvConfig:
     max_decisions: int = 200
     """Episode limit in decisions (the `threshold` of Table 1)."""
     heading: Literal["goal", "flight"] = "goal"
-    """Where the drone, and with it the camera, turns to. `goal`: towards the goal. `flight`: towards where a move flies;
+    """Where the drone and its camera turn to. `goal`: towards the goal. `flight`: towards where a move flies;
     needs `position` to be false."""
     heading_hold_m: float = 2.0
     """Within this horizontal distance of the goal the heading setpoint is held (`goal`)."""
