@@ -18,6 +18,7 @@ import argparse
 import hashlib
 import json
 import math
+import os
 import statistics
 import subprocess
 import sys
@@ -60,6 +61,9 @@ def parse(argv: Sequence[str] | None = None) -> argparse.Namespace:
         "--out", type=Path, default=Path("runs/mission"), help="folder of the runs (default runs/mission)"
     )
     parser.add_argument("--json", type=Path, help="write the report to this file")
+    parser.add_argument(
+        "--kept-programs", action="store_true", help="let runs use what was compiled before; else each compiles anew"
+    )
     parser.add_argument("--quick", action="store_true", help="two seeds, too short to learn")
     args = parser.parse_args(words)
     args.flags = flags
@@ -75,6 +79,11 @@ def command(args: argparse.Namespace, seed: int, folder: Path) -> list[str]:
     # An interrupted run starts from the beginning, because whole runs are measured.
     options = ["--seed", str(seed), "--world", args.world, "--run-dir", str(folder), "--resume", "never"]
     return [sys.executable, str(TRAIN), *options, *args.flags]
+
+
+def environment(args: argparse.Namespace) -> dict[str, str]:
+    """Returns the variables of a seed's process."""
+    return dict(os.environ) if args.kept_programs else os.environ | {"JAX_ENABLE_COMPILATION_CACHE": "false"}
 
 
 def options_digest(args: argparse.Namespace) -> str:
@@ -111,6 +120,7 @@ def measure(args: argparse.Namespace) -> tuple[list[dict[str, Any]], list[dict[s
         "world": args.world,
         "flags": args.flags,
         "options": options_digest(args),
+        "kept_programs": args.kept_programs,
     }  # raises before the folder exists
     args.out.mkdir(parents=True, exist_ok=True)
     ledger = Ledger(args.out / "ledger.json", asked)
@@ -122,7 +132,9 @@ def measure(args: argparse.Namespace) -> tuple[list[dict[str, Any]], list[dict[s
             print(f"seed {seed} ...", file=sys.stderr, flush=True)
             began = time.perf_counter()
             with (args.out / f"s{seed}.log").open("w", encoding="utf-8") as log:
-                done = subprocess.run(command(args, seed, folder), stdout=log, stderr=subprocess.STDOUT)
+                done = subprocess.run(
+                    command(args, seed, folder), stdout=log, stderr=subprocess.STDOUT, env=environment(args)
+                )
             ledger.note(seed, time.perf_counter() - began, done.returncode)
         known = ledger.seeds.get(str(seed), {"wall_seconds": None, "exit_code": 0})
         if known["exit_code"]:

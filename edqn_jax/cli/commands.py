@@ -89,7 +89,9 @@ def _of_a_run(command: str, argv: Sequence[str]) -> None:
     args = OF_A_RUN[command](argv)
 
     from edqn_jax.parallel.devices import use_cpu_devices
+    from edqn_jax.parallel.programs import keep_programs
 
     use_cpu_devices()
+    keep_programs()
     module = importlib.import_module(f"edqn_jax.cli.{command}")
     getattr(module, f"{command}_command")(args)

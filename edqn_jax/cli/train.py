@@ -34,11 +34,13 @@ def train_command(argv: Sequence[str], stops: Stops) -> None:
 
     from edqn_jax.parallel import processes
     from edqn_jax.parallel.devices import cores, most_that_divide, use_cpu_devices
+    from edqn_jax.parallel.programs import keep_programs
     from edqn_jax.report.progress import Progress
     from edqn_jax.training.stopping import Stop
 
     most = 1 if config.train.debug else most_that_divide(config.train.shards, cores())
     use_cpu_devices(config.train.devices or most)
+    keep_programs()
     process = 0
     if arguments is not None:
         print("edqn: waiting for the other processes, five minutes at most", file=sys.stderr)

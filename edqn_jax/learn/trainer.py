@@ -382,6 +382,7 @@ class Trainer:
         self.mesh = Mesh(np.asarray(devices), (AXIS,))
         self.replicated = NamedSharding(self.mesh, PartitionSpec())
         self.world = processes.replicate(world if isinstance(world, World) else _joined(world), self.mesh)
+        self._traced: jax.stages.Lowered | None = None
         self._chunk = None
 
     def init(self, seed: int | Sequence[int]) -> TrainState:
@@ -420,7 +421,7 @@ class Trainer:
         )
 
     def compile(self) -> None:
-        """Traces and compiles the chunk, once; needs no state, so that it can go on while one is made.
+        """Compiles the chunk, once; needs no state, so that it can go on while one is made.
 
         With `train.debug` the chunk is of one agent on one device.
 
@@ -430,6 +431,15 @@ class Trainer:
         if self.config.train.debug:
             run = partial(run_steps, self.config)
             self._chunk = CheckedChunk(self.config, run, self.world, self.shapes(), self._steps(0))
+            return
+        self.trace()
+        assert self._traced is not None
+        self._chunk = self._traced.compile(compiler_options(self.mesh.devices.flat[0].platform))
+        self._traced = None
+
+    def trace(self) -> None:
+        """Traces the chunk, so that `compile` has little left to do in Python; nothing with `train.debug`."""
+        if self.config.train.debug or self._traced is not None:
             return
         state = self.shapes()
         # One spec for each subtree: only environments and replay are spread, and what they return.
@@ -442,9 +452,7 @@ class Trainer:
             out_specs=(specs, (self._spread(None), same)),
             check_vma=False,
         )
-        jitted = jax.jit(run, donate_argnums=1)
-        options = compiler_options(self.mesh.devices.flat[0].platform)
-        self._chunk = jitted.lower(self.world, state, self._steps(0)).compile(options)
+        self._traced = jax.jit(run, donate_argnums=1).lower(self.world, state, self._steps(0))
 
     def _steps(self, first: int) -> Array:
         numbers = np.arange(first, first + self.config.train.chunk_steps, dtype=np.int32)

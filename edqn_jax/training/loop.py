@@ -155,14 +155,14 @@ def run_chunks(
         DivergedError: if numbers are not finite for so long that nothing is learnt any more.
     """
     trainer = preparation.trainer
+    compile_seconds = preparation.ready(begins=begin is None)
     if begin is None:
-        state = preparation.init()
+        state = preparation.take_first()
         loop = _Loop(preparation, callback, [Candidate(params) for params in _policies(trainer, state)])
     else:
         state = begin.state
         loop = _Loop.continued(preparation, callback, begin)
         del begin  # its state is donated
-    compile_seconds = preparation.compiled.result()
     envs = preparation.config.train.num_envs
     preparation.display.phase("training", total=trainer.plan.total * envs, done=loop.done * envs)
     while not loop.ended:
@@ -287,7 +287,6 @@ class _Loop:
         """Flies the validation missions, keeps the better parameters of each agent, and returns the metrics."""
         preparation = self.preparation
         preparation.display.phase("validating")
-        preparation.rollouts_compiled.result()
         self.checked = self.done * self.config.train.num_envs
         metrics = []
         for number, (agent, params) in enumerate(zip(self.agents, policies, strict=True)):

@@ -57,7 +57,9 @@ class Preparation:
     def __init__(
         self, config: Config, reward: Reward | None, display: Display, pool: Executor, agents: int | None
     ) -> None:
-        """Compiles in the background while the shortest path is searched and the first state is made.
+        """Compiles in the background while the shortest path is searched.
+
+        Programs are traced one after the other: several threads of Python would only wait for one another.
 
         Raises:
             ConfigError: if the configuration is invalid or the world cannot be flown.
@@ -78,17 +80,40 @@ class Preparation:
         self.trainer = Trainer(config, worlds[0] if agents is None else worlds, self.devices)
         self.mesh = Mesh(np.asarray(self.devices), ("mission",))
         display.phase("compiling")
-        self.compiled = _in_background(pool, self.trainer.compile)
-        self.rollouts_compiled = _in_background(pool, self._compile_rollouts)
+        began = time.perf_counter()
+        self.trainer.trace()
+        self._compiled = _in_background(pool, self.trainer.compile, began)
+        self._rollouts_compiled: Future[float] | None = None
+        self._first: TrainState | None = None
         self.shortest = processes.together(self._shortest)
 
-    def init(self) -> TrainState:
-        """Returns the state before the first step."""
-        seeds = [config.train.seed for config in self.configs]
-        return self.trainer.init(seeds[0] if self.trainer.agents is None else seeds)
+    def ready(self, begins: bool) -> float:
+        """Waits until training can go on, and returns the seconds that its program took.
+
+        Until then the first state is made, of a run that begins, and the program of the flights is traced.
+        """
+        if begins and self._first is None:
+            seeds = [config.train.seed for config in self.configs]
+            self._first = self.trainer.init(seeds[0] if self.trainer.agents is None else seeds)
+        self._rollouts()
+        return self._compiled.result()
+
+    def take_first(self) -> TrainState:
+        """Returns the state before the first step, which is not kept: it will be donated."""
+        self.ready(True)
+        state, self._first = self._first, None
+        assert state is not None
+        return state
+
+    def _rollouts(self) -> Future[float]:
+        """Returns the program of the flights, which compiles in the background."""
+        if self._rollouts_compiled is None:
+            self._rollouts_compiled = _in_background(self.pool, self._compile_rollouts, time.perf_counter())
+        return self._rollouts_compiled
 
     def fly(self, missions: MissionSet, params: PolicyParams, agent: int = 0) -> Flights:
         """Returns the missions, flown greedily and recorded; sensor noise is the same each time."""
+        self._rollouts().result()
         placed = self._placed(missions, params, agent)
         return processes.fetch(rollouts.fly_missions(self.config, *placed, record=True, mesh=self.mesh))
 
@@ -147,14 +172,13 @@ def prepared(
         pool.shutdown(wait=False, cancel_futures=True)
 
 
-def _in_background(pool: Executor, work: Callable[[], None]) -> Future[float]:
-    """Runs `work` in a thread; the future holds the elapsed seconds.
+def _in_background(pool: Executor, work: Callable[[], None], began: float) -> Future[float]:
+    """Runs `work` in a thread; the future holds the seconds since the time `began`.
 
     Of several processes none works ahead: all must meet in one order.
     """
 
     def timed() -> float:
-        began = time.perf_counter()
         work()
         return time.perf_counter() - began
 

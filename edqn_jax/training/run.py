@@ -63,7 +63,7 @@ def train_run(
             progress.message(note)
         keeper = Keeper(preparation, run, [run], reward, progress.message)
         begin = opened(preparation, run, keeper, progress)
-        preparation.compiled.result()  # until then a signal ends the command: nothing is lost yet
+        preparation.ready(begins=begin is None)  # until then a signal ends the command: nothing is lost yet
         with stop.obeyed():
             (result,) = run_chunks(
                 preparation, lambda chunk: record(run, chunk) or stop.requested(), keeper.save_if_due, begin

@@ -47,7 +47,7 @@ def train_seeds_run(
         folders = [None if run is None else run.of_seed(each.train.seed) for each in configs]
         keeper = Keeper(preparation, run, folders, reward, progress.message)
         begin = opened(preparation, run, keeper, progress, seeds=True)
-        preparation.compiled.result()  # as in `train_run`
+        preparation.ready(begins=begin is None)  # as in `train_run`
         with stop.obeyed():
             results = run_chunks(
                 preparation,

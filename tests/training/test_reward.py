@@ -130,4 +130,4 @@ def test_training_with_the_reward_geodesic_counts_metres_around_obstacles() -> N
         scene = preparation.missions[0].scene
         way = geodesic.remaining(distances, jnp.int32(0), scene.goal, scene.start)
         assert float(way) > 1.15 * float(jnp.linalg.norm(scene.goal - scene.start))
-        preparation.compiled.result()
+        preparation.ready(begins=False)
