@@ -12,7 +12,7 @@ from matplotlib.collections import LineCollection, PathCollection
 from matplotlib.colors import to_rgba
 from matplotlib.figure import Figure
 
-from edqn_jax.report.curves import draw_learning, draw_returns, running_mean
+from edqn_jax.report.curves import draw_learning, draw_returns, draw_runs, running_mean
 from edqn_jax.report.flights import OBLIQUE, draw_path, draw_world
 from edqn_jax.report.images import LOOKS, draw_reconstruction, draw_sight
 from edqn_jax.report.solids import MAP, View, cut_open, far_to_near, hidden, solids_of
@@ -204,6 +204,18 @@ def test_every_episode_is_a_point_in_its_outcomes_colour(tmp_path):
 def test_a_run_without_episodes_still_has_its_picture(tmp_path):
     draw_returns({"return": np.array([]), "outcome": np.array([], str)}, tmp_path / "returns.png")
     assert is_png(tmp_path / "returns.png")
+
+
+def test_several_runs_are_a_line_each_in_the_panel_of_their_group(tmp_path):
+    groups = {"one": [np.arange(10.0), np.arange(3.0)], "two": [np.ones(8)], "three": [np.zeros(5)]}
+    figure = draw_runs(groups, 4, tmp_path / "runs.png")
+    assert is_png(tmp_path / "runs.png")
+    shown = [axes for axes in figure.axes if axes.get_visible()]
+    assert [axes.get_title(loc="left") for axes in shown] == list(groups)
+    assert [len(axes.get_lines()) for axes in shown] == [2, 1, 1]
+    long, short = (np.asarray(line.get_xydata()) for line in shown[0].get_lines())
+    np.testing.assert_allclose(long[[0, -1]], [[4.0, 1.5], [10.0, 7.5]])
+    np.testing.assert_allclose(short, [[3.0, 1.0]])  # fewer episodes than the window: the mean of all
 
 
 def test_the_running_mean_is_the_mean_of_each_window():

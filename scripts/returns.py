@@ -1,0 +1,58 @@
+"""Draws the returns of training episodes of several runs in one figure, as Fig. 8 of the paper does for one.
+
+    python scripts/returns.py docs/images/fig8.png "sparse reward" runs/sparse-* -- "metres gained" runs/progress-*
+
+Each group is a title and the folders of its runs; `--` begins the next one.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from edqn_jax.errors import ConfigError
+from edqn_jax.report.curves import draw_runs
+from edqn_jax.runs.directory import RunDirectory
+
+WINDOW = 200
+"""Episodes of the running mean."""
+
+
+def grouped(words: Sequence[str]) -> dict[str, list[Path]]:
+    """Returns the folders of each group by its title.
+
+    Raises:
+        ConfigError: if a group has no runs, or two have one title.
+    """
+    groups: dict[str, list[Path]] = {}
+    rest = list(words)
+    while rest:
+        end = rest.index("--") if "--" in rest else len(rest)
+        title, *folders = rest[:end] or [""]
+        if not folders or title in groups:
+            raise ConfigError(f"each group must be a title of its own and the folders of its runs, not '{title}' alone")
+        groups[title], rest = [Path(folder) for folder in folders], rest[end + 1 :]
+    return groups
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Runs the command."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("file", type=Path, help="PNG to write")
+    parser.add_argument("groups", nargs=argparse.REMAINDER, help="title, runs, --, title, runs, ...")
+    args = parser.parse_args(argv)
+    try:
+        returns = {
+            title: [RunDirectory(folder).read_episodes()["return"] for folder in folders]
+            for title, folders in grouped(args.groups).items()
+        }
+    except (ConfigError, OSError) as error:
+        parser.error(str(error))
+    draw_runs(returns, WINDOW, args.file)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
