@@ -19,6 +19,7 @@ LEARNER, PLANNER = LINE, SECOND_LINE
 CURVES = {
     "E-DQN": LINE,
     "DQN frames": "#e69f00",
+    "DQN frame pair": "#56b4e9",
     "DQN blind": "#7a7a7a",
     "DQN depth": "#009e73",
     "DQN ranges": "#cc79a7",

@@ -31,6 +31,7 @@ from measurement import json_report
 LEARNERS = {
     "E-DQN": "events",
     "DQN frames": "frames",
+    "DQN frame pair": "frame-pair",
     "DQN blind": "blind",
     "DQN depth": "depth",
     "DQN ranges": "ranges",

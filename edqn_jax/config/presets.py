@@ -61,7 +61,10 @@ def preset(name: str) -> Config:
                 exploration_end=0.01,
                 exploration_episodes=10,
             ),
-            train=TrainConfig(num_envs=16, total_steps=500_000, max_episodes=40_000, chunk_steps=512, keep="last"),
+            # Its updates are so small that two devices would mostly wait for each other.
+            train=TrainConfig(
+                num_envs=16, total_steps=500_000, max_episodes=40_000, chunk_steps=512, devices=1, keep="last"
+            ),
             world=WorldConfig(own_start_fraction=1.0, start_jitter_m=0.0),
         )
     raise ConfigError(f"there is no preset '{name}'; the presets are {', '.join(PRESETS)}")

@@ -106,6 +106,6 @@ def test_a_learner_compiles_once_and_a_seed_comes_to_the_same_whatever_came_befo
 def test_learners_differ_in_what_they_see_and_in_nothing_else() -> None:
     _, config = parse_train([*MINIATURE, "--env.sensor", "depth"])
     seen = [learners.sensing(config, name) for name in learners.LEARNERS]
-    assert [one.env.sensor for one in seen] == ["events", "frames", "blind", "depth", "ranges"]
+    assert [one.env.sensor for one in seen] == ["events", "frames", "frame-pair", "blind", "depth", "ranges"]
     same = [dataclasses.replace(one, env=dataclasses.replace(one.env, sensor="depth")) for one in seen]
     assert all(one == config for one in same)
