@@ -2,9 +2,10 @@
 
     python scripts/pretrain.py --run runs/pretrained --out edqn_jax/policies/pretrained
 
-Training needs a GPU (eight minutes on an H100, four of them training); where --run holds the seeds already, the best is
-only measured, which takes a quarter of an hour on two cores, most of it A* for the SPL. The best seed is the one with
-the highest success in the validation worlds, SPL among equals; nothing that is measured afterwards has a say in it.
+Training needs a GPU (in open worlds eight minutes on an H100, four of them training); where --run holds the seeds
+already, the best is only measured, which takes a quarter of an hour on two cores for three families, most of it A* for
+the SPL. The best seed is the one with the highest success in the validation worlds, SPL among equals; nothing that is
+measured afterwards has a say in it.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from pathlib import Path
 from typing import Any
 
 import edqn_jax
+from edqn_jax.config.options import MIXTURES
 from edqn_jax.errors import ConfigError
 from edqn_jax.evaluation.evaluate import Evaluation, evaluate
 from edqn_jax.learn.policy import Policy
@@ -31,24 +33,23 @@ ROOT = Path(__file__).resolve().parents[1]
 SEEDS = 5
 """Agents that are trained together; the best of them is shipped."""
 
-FLAGS = (
-    *("--tuned-for", "gpu", "--world", "open", "--world.flown", ""),
-    *("--train.keep", "last", "--train.validation-every", "20000000"),
-)
-"""Options of train.py beside the number of seeds."""
+FLAGS = ("--tuned-for", "gpu", "--world.flown", "", "--train.keep", "last", "--train.validation-every", "20000000")
+"""Options of train.py beside the world and the number of seeds."""
 
-DENSITIES = ("sparse", "medium", "dense")
+DECISIONS = {"open": 60_000_000, "mixed": 100_000_000}
+"""Decisions of each seed, by the worlds that can be trained on."""
+
 MISSIONS = 1000
 """Test worlds of each family; training never uses them."""
 
 CARD = """# Model card: `pretrained`
 
-A policy for open random worlds, sparse to dense, flown from simulated events.
+A policy for random worlds ({families}), flown from simulated events.
 `edqn evaluate pretrained --world FILE.xml` flies it, `edqn_jax.load_policy("pretrained")` loads it.
 
 | | |
 | --- | --- |
-| trained on | {pool:,} open worlds, sparse to dense (`--world open`, the training split), {missions:,} missions |
+| trained on | {pool:,} worlds (`--world {world}`, the training split), {missions:,} missions |
 | training | {decisions:,} decisions in {envs:,} environments, last averaged parameters; {trained} |
 | seed | {seed}, the best of {seeds} in the validation worlds |
 | sees | events of the last {window:g} s (threshold {threshold:g}), its own state and motion |
@@ -69,8 +70,7 @@ The paper's own map, never trained on: {paper}
 
 ## Limits
 
-- The best of {seeds} training seeds: another one flies up to half a point more or less, and {arrived} of these
-  {seeds} reach the goal of the paper's map.
+- The best of {seeds} training seeds, of which {arrived} reach the goal of the paper's map.
 - Simulated events from rendered brightness: no noise, no lens, uniform thresholds, static worlds, no wind. It has not
   been flown on a real drone, and must not be.
 - The map's bounds matter: the own position is given relative to the flight volume, and worlds of other sizes than
@@ -87,6 +87,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     )
     parser.add_argument("--run", type=Path, required=True, help="folder of the runs; trained if there are none")
     parser.add_argument("--out", type=Path, required=True, help="folder of policy and card; replaced")
+    parser.add_argument("--world", choices=sorted(DECISIONS), default="mixed", help="to train on (default mixed)")
     parser.add_argument("--missions", type=int, default=MISSIONS, help=f"test worlds of a family (default {MISSIONS})")
     parser.add_argument("--trained", help="where and how long the run was trained, if its summary.json does not say")
     parser.add_argument("--commit", help="commit that the run was trained at; needed if it is not trained now")
@@ -99,11 +100,11 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         _check_replaceable(args.out)
         if not trained:
-            _train(args.run)
+            _train(args.run, args.world)
         use_cpu_devices()
         run = best_of(args.run)
         policy = load_policy(run)
-        flown = {world: evaluate(policy, world, missions=args.missions) for world in DENSITIES}
+        flown = {world: evaluate(policy, world, missions=args.missions) for world in families_of(policy)}
         paper = {each: evaluate(load_policy(each), "paper") for each in seeds_of(args.run)}
         card = card_of(
             policy,
@@ -138,6 +139,8 @@ def card_of(
             f"| {found['spl']:.3f} | {found['collisions']} | {others} |"
         )
     return CARD.format(
+        families=", ".join(flown),
+        world=config.world.name,
         pool=config.world.pool_size,
         missions=config.world.missions,
         decisions=config.train.total_steps,
@@ -156,6 +159,17 @@ def card_of(
         rows="\n".join(rows),
         paper=_paper(paper.figures, config.drone.body_radius_m),
     )
+
+
+def options_of(world: str) -> list[str]:
+    """Returns the options of train.py for these worlds, without seeds and folder."""
+    return [*FLAGS, "--world", world, "--total-steps", str(DECISIONS[world])]
+
+
+def families_of(policy: Policy) -> list[str]:
+    """Returns the families of the random worlds that a policy was trained on."""
+    name = policy.config.world.name
+    return list(MIXTURES.get(name, [name]))
 
 
 def best_of(folder: Path) -> Path:
@@ -197,10 +211,9 @@ def _paper(figures: dict[str, Any], radius: float) -> str:
     )
 
 
-def _train(run: Path) -> None:
-    code = subprocess.run(
-        [sys.executable, str(ROOT / "train.py"), *FLAGS, "--seeds", str(SEEDS), "--run-dir", str(run)]
-    ).returncode
+def _train(run: Path, world: str) -> None:
+    asked = [*options_of(world), "--seeds", str(SEEDS), "--run-dir", str(run)]
+    code = subprocess.run([sys.executable, str(ROOT / "train.py"), *asked]).returncode
     if code:
         raise ConfigError(f"the training in '{run}' ended with exit code {code}; what it printed says why")
 

@@ -45,8 +45,12 @@ def test_its_card_tells_of_its_training() -> None:
 def test_its_script_trains_with_its_options(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(str(Path(__file__).parents[2] / "scripts"))
     options = edqn_jax.load_policy(PRETRAINED).config
-    _, asked = parse_train(import_module("pretrain").FLAGS)
+    script = import_module("pretrain")
+    _, asked = parse_train(script.options_of(options.world.name))
     assert dataclasses.replace(asked, train=dataclasses.replace(asked.train, seed=options.train.seed)) == options
+    assert script.families_of(edqn_jax.load_policy(PRETRAINED)) == ["sparse", "medium", "dense"]
+    for world in script.DECISIONS:
+        assert parse_train(script.options_of(world))[1].world.name == world
 
 
 def test_the_best_seed_is_that_of_the_validation_worlds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
