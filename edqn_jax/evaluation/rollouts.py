@@ -93,9 +93,11 @@ def fly_on_all_devices(
     return jax.tree.map(np.asarray, flights)
 
 
-def prepare(config: Config, world: World, params: PolicyParams, key: Array, *, record: bool, mesh: Mesh) -> None:
-    """Compiles the program that `fly_missions` runs for such arguments, ahead of its first call."""
-    _program(mesh).lower(config, False, record, mesh, world, params, key).compile()
+def traced(
+    config: Config, world: World, params: PolicyParams, key: Array, *, record: bool, mesh: Mesh
+) -> jax.stages.Lowered:
+    """Returns the program that `fly_missions` runs for such arguments, to be compiled ahead of its first call."""
+    return _program(mesh).lower(config, False, record, mesh, world, params, key)
 
 
 def flight_keys(key: Array, missions: int) -> tuple[Array, Array]:

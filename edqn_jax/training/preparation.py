@@ -83,19 +83,20 @@ class Preparation:
         began = time.perf_counter()
         self.trainer.trace()
         self._compiled = _in_background(pool, self.trainer.compile, began)
-        self._rollouts_compiled: Future[float] | None = None
+        placed = self._placed(self.missions[0].validation, fresh_policy(self.config), 0)
+        flights = rollouts.traced(self.config, *placed, record=True, mesh=self.mesh)
+        self._rollouts_compiled = _in_background(pool, flights.compile, began)
         self._first: TrainState | None = None
         self.shortest = processes.together(self._shortest)
 
     def ready(self, begins: bool) -> float:
         """Waits until training can go on, and returns the seconds that its program took.
 
-        Until then the first state is made, of a run that begins, and the program of the flights is traced.
+        Until then the first state is made, of a run that begins.
         """
         if begins and self._first is None:
             seeds = [config.train.seed for config in self.configs]
             self._first = self.trainer.init(seeds[0] if self.trainer.agents is None else seeds)
-        self._rollouts()
         return self._compiled.result()
 
     def take_first(self) -> TrainState:
@@ -105,25 +106,15 @@ class Preparation:
         assert state is not None
         return state
 
-    def _rollouts(self) -> Future[float]:
-        """Returns the program of the flights, which compiles in the background."""
-        if self._rollouts_compiled is None:
-            self._rollouts_compiled = _in_background(self.pool, self._compile_rollouts, time.perf_counter())
-        return self._rollouts_compiled
-
     def fly(self, missions: MissionSet, params: PolicyParams, agent: int = 0) -> Flights:
         """Returns the missions, flown greedily and recorded; sensor noise is the same each time."""
-        self._rollouts().result()
+        self._rollouts_compiled.result()
         placed = self._placed(missions, params, agent)
         return processes.fetch(rollouts.fly_missions(self.config, *placed, record=True, mesh=self.mesh))
 
     def _shortest(self) -> ShortestPath:
         scene = self.missions[0].scene
         return shortest_path(scene, scene.start, scene.goal, self.config.drone.body_radius_m)
-
-    def _compile_rollouts(self) -> None:
-        placed = self._placed(self.missions[0].validation, fresh_policy(self.config), 0)
-        rollouts.prepare(self.config, *placed, record=True, mesh=self.mesh)
 
     def _placed(self, missions: MissionSet, params: PolicyParams, agent: int) -> tuple[World, PolicyParams, jax.Array]:
         """World, parameters and key as `fly_missions` takes them."""
@@ -172,7 +163,7 @@ def prepared(
         pool.shutdown(wait=False, cancel_futures=True)
 
 
-def _in_background(pool: Executor, work: Callable[[], None], began: float) -> Future[float]:
+def _in_background(pool: Executor, work: Callable[[], object], began: float) -> Future[float]:
     """Runs `work` in a thread; the future holds the seconds since the time `began`.
 
     Of several processes none works ahead: all must meet in one order.

@@ -165,7 +165,7 @@ def test_a_recorded_flight_becomes_columns_and_a_summary_and_compiles_nothing_an
     layout = NamedSharding(mesh, PartitionSpec())
     world, params = jax.device_put((course.world, always((1, 0, 0))), layout)
     key = jax.random.key(0)
-    rollouts.prepare(CONFIG, world, params, key, record=True, mesh=mesh)
+    rollouts.traced(CONFIG, world, params, key, record=True, mesh=mesh).compile()
     another_key = jax.random.key(1)
     compiled: list[str] = []
     jax.monitoring.register_event_duration_secs_listener(lambda event, *_, **__: compiled.append(event))

@@ -15,6 +15,7 @@ import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import jax.numpy as jnp
@@ -90,7 +91,8 @@ if __name__ == "__main__":
     if argv[:1] == ["--no-learning"]:
         del argv[0]
         Trainer.init, Trainer.compile, Trainer.chunk = only_a_policy, lambda self: None, no_learning
-        rollouts.prepare = lambda *_, **__: None
+        Trainer.trace = lambda self: None
+        rollouts.traced = lambda *_, **__: SimpleNamespace(compile=lambda: None)
     code = main(["train", *argv])
     Path(note).write_text(json.dumps(plain(noted)), encoding="utf-8")
     sys.exit(code)
