@@ -1,9 +1,10 @@
 """Does training succeed for every seed? Runs `train.py` for one seed after another.
 
-Each seed runs in a process of its own, and the wall time of the whole command is measured. A seed passes if its greedy
-flight reaches the goal in at most 188 decisions and with at most 1.15 times the length of A*'s path, and the command
-took less than three minutes. No seed is run twice: results of earlier runs in the same folder are read, and a seed
-whose training failed counts as failed. The flight ends within the goal's radius, A*'s path at the goal itself.
+Each seed runs in a process of its own, which compiles everything anew unless --kept-programs is given, and the wall
+time of the whole command is measured. A seed passes if its greedy flight reaches the goal in at most 188 decisions and
+with at most 1.15 times the length of A*'s path, and the command took less than three minutes. No seed is run twice:
+results of earlier runs in the same folder are read, and a seed whose training failed counts as failed. The flight ends
+within the goal's radius, A*'s path at the goal itself.
 
 In random worlds that flight is through `world.flown`; the bars are those of the paper's world.
 
@@ -100,7 +101,7 @@ class Ledger:
         self.seeds: dict[str, dict[str, Any]] = {}
         if file.is_file():
             kept = json.loads(file.read_text(encoding="utf-8"))
-            if kept["asked"] != asked:
+            if {"kept_programs": False} | kept["asked"] != asked:  # older ledgers do not say
                 raise ValueError(f"the runs in '{file.parent}' were made with {kept['asked']}; choose another --out")
             self.seeds = kept["seeds"]
 

@@ -1,10 +1,11 @@
 """How fast is training as tutorials write it?
 
-One Gymnasium environment for each drone, with C MuJoCo, MuJoCo's own renderer, an event simulator in NumPy and
-controllers in plain Python, each in a process of its own; stable-baselines3's DQN reads the event images, without an
-auto-encoder. Nothing is vectorised by hand: `conventional.py` measures what these packages can do when it is. The rows
-take turns with the training step of edqn_jax, which has its auto-encoder learning throughout; each is the median of its
-turns. The reference workload: the same moves, physics steps, frames, pixels and replayed samples a decision.
+One Gymnasium environment for each drone, with C MuJoCo, MuJoCo's own renderer (without shadows), an event simulator in
+NumPy and controllers in plain Python, each in a process of its own; stable-baselines3's DQN reads the event images,
+without an auto-encoder. Nothing is vectorised by hand: `conventional.py` measures what these packages can do when it
+is. The rows take turns with the training step of edqn_jax, which has its auto-encoder learning throughout; each is the
+median of its turns. The reference workload: the same moves, physics steps, frames, pixels and replayed samples a
+decision.
 
     python benchmarks/tutorial.py --json tutorial.json
 
@@ -27,7 +28,7 @@ from typing import Any
 import jax
 
 from conventional_stack.settings import PACKAGES
-from edqn_jax.config import Config
+from edqn_jax.config import FAMILIES, Config
 from edqn_jax.errors import ConfigError
 from edqn_jax.evaluation.missions import run_missions
 from edqn_jax.parallel.devices import choose_devices, use_cpu_devices
@@ -109,6 +110,17 @@ class Tutorial:
         return (self.dqn.num_timesteps - before) / (time.perf_counter() - began)
 
 
+def check(config: Config) -> None:
+    """Raises ConfigError if the environments of the tutorials do not have what the configuration asks for."""
+    require("conventional_stack.fleet").check(config)
+    if config.world.name in FAMILIES:
+        raise ConfigError(f"the tutorials' world must be 'paper' or an MJCF file, not '{config.world.name}'")
+    if config.env.reward != "progress" or config.env.sensor != "events":
+        raise ConfigError(
+            "the tutorials' drone has events and a reward of straight metres; set env.reward to 'progress'"
+        )
+
+
 def measure(config: Config, drones: int, decisions: int, repeats: int) -> dict[str, Any]:
     """Measures and returns the report that `--json` writes.
 
@@ -116,6 +128,7 @@ def measure(config: Config, drones: int, decisions: int, repeats: int) -> dict[s
         ConfigError: if this stack does not support the configuration.
         MissingPackageError: if a package of the extra `bench` is not installed.
     """
+    check(config)
     ours = WholeStep(config, run_missions(config).training.world, choose_devices(0, config.train.shards))
     turns: list[tuple[float, float]] = []
     with Tutorial(config, drones) as tutorial:

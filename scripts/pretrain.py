@@ -104,6 +104,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         use_cpu_devices()
         run = best_of(args.run)
         policy = load_policy(run)
+        if (found := policy.config.world.name) != args.world:
+            raise ConfigError(f"'{args.run}' was trained in '{found}' worlds, not '{args.world}'; give --world {found}")
         flown = {world: evaluate(policy, world, missions=args.missions) for world in families_of(policy)}
         paper = {each: evaluate(load_policy(each), "paper") for each in seeds_of(args.run)}
         card = card_of(

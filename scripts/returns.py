@@ -15,6 +15,7 @@ from pathlib import Path
 from edqn_jax.errors import ConfigError
 from edqn_jax.report.curves import draw_runs
 from edqn_jax.runs.directory import RunDirectory
+from edqn_jax.runs.files import check_can_write
 
 WINDOW = 200
 """Episodes of the running mean."""
@@ -24,8 +25,10 @@ def grouped(words: Sequence[str]) -> dict[str, list[Path]]:
     """Returns the folders of each group by its title.
 
     Raises:
-        ConfigError: if a group has no runs, or two have one title.
+        ConfigError: if there is no group, one has no runs, or two have one title.
     """
+    if not words:
+        raise ConfigError("there must be a title and the folders of runs")
     groups: dict[str, list[Path]] = {}
     rest = list(words)
     while rest:
@@ -44,6 +47,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("groups", nargs=argparse.REMAINDER, help="title, runs, --, title, runs, ...")
     args = parser.parse_args(argv)
     try:
+        check_can_write(args.file)
         returns = {
             title: [RunDirectory(folder).read_episodes()["return"] for folder in folders]
             for title, folders in grouped(args.groups).items()

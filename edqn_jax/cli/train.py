@@ -40,7 +40,8 @@ def train_command(argv: Sequence[str], stops: Stops) -> None:
 
     most = 1 if config.train.debug else most_that_divide(config.train.shards, cores())
     use_cpu_devices(config.train.devices or most)
-    keep_programs()
+    if arguments is None:  # of several processes only the first could keep any
+        keep_programs()
     process = 0
     if arguments is not None:
         print("edqn: waiting for the other processes, five minutes at most", file=sys.stderr)

@@ -154,8 +154,8 @@ class EnvConfig:
     heading_hold_m: float = 2.0
     """Within this horizontal distance of the goal the heading setpoint is held (`goal`)."""
     position: bool = True
-    """Whether the drone knows where it is in the flight volume. If not, it knows the way to the goal ahead and to the
-    left in place of the horizontal distance."""
+    """Whether the drone knows where it is in the flight volume, its height included. If not, it knows the way to the
+    goal ahead and to the left in place of the horizontal distance. It knows its heading in any case."""
     reward: Literal["sparse", "progress", "potential", "geodesic"] = "progress"
     """`sparse`: Eq. 8. `progress`: adds metres gained. `potential`: the policy-invariant form. `geodesic`: as
     `progress`, with metres along the shortest way around obstacles, which training alone knows: all its missions in a

@@ -6,14 +6,17 @@ import contextlib
 import hashlib
 import os
 import platform
+import stat
 import warnings
 from pathlib import Path
 from typing import Any
 
 import jax
 
+from edqn_jax.parallel.devices import cores
+
 MOST_BYTES = 2**30
-"""Of kept programs; beyond this the older half of them goes."""
+"""Of kept programs; beyond this the older ones are deleted."""
 
 
 def keep_programs() -> None:
@@ -21,7 +24,8 @@ def keep_programs() -> None:
 
     The folder is one for this kind of processor under `$XDG_CACHE_HOME/edqn_jax`, by default `~/.cache/edqn_jax`.
     Nothing is kept where that cannot be written, or with JAX_ENABLE_COMPILATION_CACHE=false; and whoever gives
-    JAX_COMPILATION_CACHE_DIR has a folder of their own. A damaged program is compiled again.
+    JAX_COMPILATION_CACHE_DIR has a folder of their own. A damaged program is compiled again, and JAX warns of it
+    in every run until its file is deleted.
     """
     options: Any = jax.config
     if options.jax_compilation_cache_dir or not options.jax_enable_compilation_cache:
@@ -29,6 +33,11 @@ def keep_programs() -> None:
     try:
         folder = _folder()
         folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        status = folder.stat()
+        # What others may write here would be run.
+        foreign = hasattr(os, "getuid") and status.st_uid != os.getuid()
+        if foreign or status.st_mode & (stat.S_IWGRP | stat.S_IWOTH):
+            return
         if not os.access(folder, os.W_OK):
             return
         _make_room(folder, MOST_BYTES)
@@ -36,8 +45,8 @@ def keep_programs() -> None:
         return
     jax.config.update("jax_compilation_cache_dir", str(folder))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
-    for what in ("reading", "writing"):  # it is compiled then, or not kept
-        warnings.filterwarnings("ignore", f"Error {what} persistent compilation cache entry", UserWarning)
+    # Such as on a full disk: the program is not kept, and nothing else is lost.
+    warnings.filterwarnings("ignore", "Error writing persistent compilation cache entry", UserWarning)
 
 
 def _folder() -> Path:
@@ -48,22 +57,25 @@ def _folder() -> Path:
 
 
 def _abilities() -> str:
-    """Returns what tells processors apart that do not run the same programs."""
+    """Returns what tells machines apart that do not run the same programs, or not as fast."""
     cpuinfo = Path("/proc/cpuinfo")
     lines = cpuinfo.read_text(encoding="utf-8").splitlines() if cpuinfo.is_file() else []
     kinds = sorted({line for line in lines if line.startswith(("model name", "flags", "Features", "CPU part"))})
-    return "\n".join([platform.machine(), platform.processor(), *kinds])
+    return "\n".join([platform.machine(), platform.processor(), f"{cores()} cores", *kinds])
 
 
 def _make_room(folder: Path, most: int) -> None:
-    """Removes the older half of a folder's bytes where they are more than `most`."""
-    files = [(file, file.stat()) for file in folder.iterdir() if file.is_file()]
+    """Deletes what was written first, down to half of `most` bytes, where a folder holds more than `most`."""
+    files = []
+    for file in folder.rglob("*"):
+        with contextlib.suppress(FileNotFoundError):  # another command makes room as well
+            if file.is_file():
+                files.append((file, file.stat()))
     left = sum(status.st_size for _, status in files)
     if left <= most:
         return
     for file, status in sorted(files, key=lambda each: each[1].st_mtime):
         if left <= most // 2:
             break
-        with contextlib.suppress(FileNotFoundError):  # another command makes room as well
-            file.unlink()
+        file.unlink(missing_ok=True)
         left -= status.st_size

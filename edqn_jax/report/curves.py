@@ -100,10 +100,13 @@ def draw_runs(groups: Mapping[str, Sequence[np.ndarray]], window: int, file: Pat
         window: episodes of the mean.
         file: PNG to write.
     """
+    columns = min(len(groups), 2)
     with drawing(7.0, 2.0 * -(-len(groups) // 2) + 0.3, file) as figure:
-        panels = figure.subplots(-(-len(groups) // 2), min(len(groups), 2), sharex=True, squeeze=False).ravel()
+        panels = figure.subplots(-(-len(groups) // columns), columns, sharex=True, squeeze=False).ravel()
         for axes, (title, runs) in zip(panels, groups.items(), strict=False):
             for number, returns in enumerate(runs):
+                if not len(returns):
+                    continue
                 window_here = min(window, len(returns))
                 mean = running_mean(np.asarray(returns, np.float64), window_here)
                 axes.plot(np.arange(len(mean)) + window_here, mean, lw=0.9, alpha=0.85, color=f"C{number}")
@@ -111,9 +114,10 @@ def draw_runs(groups: Mapping[str, Sequence[np.ndarray]], window: int, file: Pat
             axes.xaxis.set_major_formatter(EngFormatter(sep=""))
         for axes in panels[len(groups) :]:
             axes.set_visible(False)
-        for axes in panels[-2:]:
+        for axes in panels[max(len(groups) - columns, 0) : len(groups)]:
             axes.set_xlabel("episode")
-        for axes in panels[::2]:
+            axes.tick_params(labelbottom=True)
+        for axes in panels[::columns]:
             axes.set_ylabel(f"return, mean of {window:,}")
     return figure
 

@@ -92,7 +92,7 @@ class Preparation:
     def ready(self, begins: bool) -> float:
         """Waits until training can go on, and returns the seconds that its program took.
 
-        Until then the first state is made, of a run that begins.
+        Meanwhile makes the first state, unless the run is continued.
         """
         if begins and self._first is None:
             seeds = [config.train.seed for config in self.configs]

@@ -15,6 +15,7 @@ import pytest
 
 import tutorial
 from edqn_jax.config import CameraConfig, Config
+from edqn_jax.errors import ConfigError
 from edqn_jax.planners.packages import require
 from edqn_jax.sim import drone, env, events
 from edqn_jax.sim.mjcf import load_scene
@@ -134,6 +135,21 @@ def test_stable_baselines3_trains_on_it(world: Path) -> None:
         assert trained.dqn.num_timesteps == 12 and trained.dqn.replay_buffer.size() == 6
         after = list(trained.dqn.q_net.parameters())
         assert any((new != old).any() for new, old in zip(after, before, strict=True))
+
+
+@pytest.mark.parametrize(
+    ("group", "change"),
+    [
+        ("env", {"reward": "sparse"}),
+        ("env", {"sensor": "blind"}),
+        ("env", {"position": False}),
+        ("world", {"name": "open"}),
+    ],
+)
+def test_what_it_does_not_have_is_said(group: str, change: dict[str, object]) -> None:
+    config = dataclasses.replace(CONFIG, **{group: dataclasses.replace(getattr(CONFIG, group), **change)})
+    with pytest.raises(ConfigError, match=r"must be 'paper'|has events and a reward|supports only"):
+        tutorial.check(config)
 
 
 def test_the_report_says_both_rates_and_their_ratio() -> None:

@@ -19,11 +19,11 @@ print(jax.jit(lambda x: x * 3 + 1)(2.0), jax.config.jax_compilation_cache_dir)
 """
 
 
-def outcome_of(**variables: str) -> tuple[str, str]:
-    """Returns what a process prints that keeps programs: the result, and the folder or None."""
+def outcome_of(warned: str = "", **variables: str) -> tuple[str, str]:
+    """Returns what a process prints that keeps programs: the result, and the folder or None; it warns of `warned`."""
     kept = {name: value for name, value in os.environ.items() if not name.startswith(("JAX_", "XDG_"))}
     done = subprocess.run([sys.executable, "-c", COMMAND], env=kept | variables, capture_output=True, text=True)
-    assert done.returncode == 0 and done.stderr == "", done.stderr
+    assert done.returncode == 0 and bool(done.stderr) == bool(warned) and warned in done.stderr, done.stderr
     result, folder = done.stdout.split()
     return result, folder
 
@@ -37,7 +37,13 @@ def test_what_one_process_compiles_the_next_one_reads_and_what_is_damaged_is_com
     assert sorted(Path(folder).iterdir()) == kept and [file.stat().st_mtime_ns for file in kept] == times
     for file in kept:
         file.write_bytes(file.read_bytes()[:-20])
-    assert outcome_of(XDG_CACHE_HOME=str(tmp_path)) == ("7.0", folder)
+    assert outcome_of("Error reading persistent compilation", XDG_CACHE_HOME=str(tmp_path)) == ("7.0", folder)
+
+
+def test_nothing_is_read_that_others_could_have_written(tmp_path: Path) -> None:
+    _, folder = outcome_of(XDG_CACHE_HOME=str(tmp_path))
+    Path(folder).chmod(0o777)
+    assert outcome_of(XDG_CACHE_HOME=str(tmp_path)) == ("7.0", "None")
 
 
 @pytest.mark.parametrize(

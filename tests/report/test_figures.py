@@ -207,7 +207,7 @@ def test_a_run_without_episodes_still_has_its_picture(tmp_path):
 
 
 def test_several_runs_are_a_line_each_in_the_panel_of_their_group(tmp_path):
-    groups = {"one": [np.arange(10.0), np.arange(3.0)], "two": [np.ones(8)], "three": [np.zeros(5)]}
+    groups = {"one": [np.arange(10.0), np.arange(3.0), np.zeros(0)], "two": [np.ones(8)], "three": [np.zeros(5)]}
     figure = draw_runs(groups, 4, tmp_path / "runs.png")
     assert is_png(tmp_path / "runs.png")
     shown = [axes for axes in figure.axes if axes.get_visible()]
