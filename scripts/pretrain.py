@@ -36,7 +36,7 @@ SEEDS = 5
 FLAGS = ("--tuned-for", "gpu", "--world.flown", "", "--train.keep", "last", "--train.validation-every", "20000000")
 """Options of train.py beside the world and the number of seeds."""
 
-DECISIONS = {"open": 60_000_000, "mixed": 100_000_000}
+DECISIONS = {"open": 60_000_000, "mixed": 200_000_000}
 """Decisions of each seed, by the worlds that can be trained on."""
 
 MISSIONS = 1000
