@@ -10,7 +10,7 @@ import numpy as np
 
 from conventional_stack.flight import wrap_angle
 from edqn_jax.config import Config
-from edqn_jax.planners.packages import require
+from edqn_jax.packages import require
 from edqn_jax.sim.outcomes import Outcome
 
 numba = require("numba")

@@ -27,7 +27,7 @@ from conventional_stack.workers import SpreadFleet
 from edqn_jax.config import AgentConfig, Config
 from edqn_jax.errors import ConfigError
 from edqn_jax.learn.plan import Plan
-from edqn_jax.planners.packages import require
+from edqn_jax.packages import require
 from edqn_jax.sim.flights import Flights
 from edqn_jax.sim.moves import ACTIONS
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edqn_jax.config import CameraConfig, EncoderConfig
-from edqn_jax.planners.packages import require
+from edqn_jax.packages import require
 
 torch = require("torch")
 nn = torch.nn

@@ -17,7 +17,7 @@ from conventional_stack.env import DroneEnv
 from conventional_stack.fleet import Fleet, Record
 from edqn_jax.config import CameraConfig, Config, DroneConfig, EncoderConfig, EnvConfig, EventsConfig
 from edqn_jax.errors import ConfigError
-from edqn_jax.planners.packages import require
+from edqn_jax.packages import require
 from edqn_jax.sim import drone, env, events, outcomes
 from edqn_jax.sim.drone import DroneState
 from edqn_jax.sim.env import EnvState

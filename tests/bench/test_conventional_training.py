@@ -18,7 +18,7 @@ from conventional_stack.vec_env import CodedDrones
 from conventional_stack.workers import SpreadFleet
 from edqn_jax.config import Config
 from edqn_jax.errors import ConfigError
-from edqn_jax.planners.packages import MissingPackageError, require
+from edqn_jax.packages import MissingPackageError, require
 from edqn_jax.runs.directory import plain
 from edqn_jax.sim.env import OWN_SIZE
 from edqn_jax.sim.outcomes import Outcome

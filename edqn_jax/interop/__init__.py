@@ -1,0 +1,1 @@
+"""The task as other libraries want it."""

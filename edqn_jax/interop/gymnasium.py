@@ -1,0 +1,478 @@
+"""The task as Gymnasium environments, one drone or many in one compiled program. Needs the extra `gym`.
+
+    import gymnasium
+    import edqn_jax.interop.gymnasium
+
+    env = gymnasium.make("EDQN/Paper-v0")
+    envs = gymnasium.make_vec("EDQN/Random-v0", num_envs=64, world="rooms")
+
+Both take the same moves, fly the same physics and pay the same rewards as `edqn_jax.make`. Importing this module
+registers the two names; JAX is configured by whoever imports it (`edqn_jax.use_cpu_devices`).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, Literal, get_args
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jax import Array
+from numpy.typing import NDArray
+
+from edqn_jax.config import FAMILIES, Config
+from edqn_jax.config.loading import make_config
+from edqn_jax.errors import ConfigError
+from edqn_jax.learn import embedding
+from edqn_jax.learn.code import Params
+from edqn_jax.learn.policy import Policy
+from edqn_jax.packages import require
+from edqn_jax.sim import env, events
+from edqn_jax.sim.env import MOTION_SIZE, OWN_SIZE, EnvState, Observation, World
+from edqn_jax.sim.environment import Environment, make
+from edqn_jax.sim.events import EventField
+from edqn_jax.sim.moves import ACTIONS
+from edqn_jax.sim.outcomes import Outcome, is_terminal
+from edqn_jax.sim.reward import Reward
+from edqn_jax.sim.sensor import Form, sensor_of
+
+gymnasium = require("gymnasium", extra="gym")
+
+Kind = Literal["image", "code", "kinematics"]
+"""What a drone observes: an image with its own state and motion, one vector with a code, or one without."""
+
+LARGEST = 10.0
+"""Bound of each number of an observation; what is flown stays within, and is cut off there."""
+
+WORLDS = 64
+"""Random worlds of an environment unless it is told how many, each with a mission of its own."""
+
+
+@struct.dataclass
+class Drone:
+    """One drone between two decisions."""
+
+    state: EnvState  # without its key
+    key: Array  # [2] uint32, the data of that key
+    code: Array  # [C] of the newest observation, for an encoder that remembers it; [0] where there is none
+
+
+@struct.dataclass
+class _Decided:
+    """What a decision comes to, as Gymnasium wants it; of many drones with a leading [N]."""
+
+    observed: Any
+    reward: Array
+    outcome: Array
+    terminated: Array
+    truncated: Array
+
+
+@dataclasses.dataclass(frozen=True)
+class _Form:
+    """What a compiled program depends on, beside its arrays."""
+
+    config: Config
+    kind: Kind
+    world: Any  # structure of a `World`
+
+
+# JAX calls a compiled function in a quarter less time where no argument is a typed key or an object whose fields it has
+# to ask for in Python: so keys go in as their data, and worlds as a list.
+Leaves = list[Array]
+
+
+def _held(state: EnvState, code: Array) -> Drone:
+    return Drone(dataclasses.replace(state, key=None), jax.random.key_data(state.key), code)
+
+
+def _numbers(x: Array) -> Array:
+    """Returns any numbers as a Box holds them: float32 within `LARGEST`."""
+    return jnp.clip(x.astype(jnp.float32), -LARGEST, LARGEST)
+
+
+def _observed(config: Config, kind: Kind, encoder: Params, seen: Observation, before: Array) -> tuple[Any, Array]:
+    """Returns the observation as Gymnasium has it, and the code to remember."""
+    own, motion = _numbers(seen.own), _numbers(seen.motion)
+    if kind == "kinematics":
+        return jnp.concatenate([own, motion]), before
+    if kind == "code":
+        code = embedding.embed(config, encoder, seen, before)
+        assert code is not None
+        return jnp.concatenate([_numbers(code), own, motion]), code
+    sensed = seen.sensed
+    if isinstance(sensed, EventField):
+        counts = events.event_image(sensed).astype(jnp.float32)
+        sensed = jnp.sign(counts) * jnp.log1p(jnp.abs(counts))
+    assert sensed is not None
+    return {"image": _numbers(sensed), "own": own, "motion": motion}, before
+
+
+def _reset(form: _Form, leaves: Leaves, encoder: Params, seed: Array, mission: Array | None) -> tuple[Drone, Any]:
+    state, seen = env.reset(form.config, _world(form, leaves), jax.random.key(seed), mission)
+    observed, code = _observed(form.config, form.kind, encoder, seen, _no_code(form))
+    return _held(state, code), observed
+
+
+def _step(form: _Form, leaves: Leaves, encoder: Params, drone: Drone, action: Array) -> tuple[Drone, _Decided]:
+    before = jnp.where(drone.state.ended, 0.0, drone.code)
+    state = dataclasses.replace(drone.state, key=jax.random.wrap_key_data(drone.key))
+    state, step = env.step(form.config, _world(form, leaves), state, action)
+    observed, code = _observed(form.config, form.kind, encoder, step.observation, before)
+    return _held(state, code), _Decided(
+        observed=observed,
+        reward=step.reward,
+        outcome=step.outcome,
+        terminated=is_terminal(step.outcome),
+        truncated=step.outcome == Outcome.TIME_OUT,
+    )
+
+
+def _no_code(form: _Form) -> Array:
+    return jnp.zeros(embedding.size(form.config) if form.kind == "code" else 0)
+
+
+def _world(form: _Form, leaves: Leaves) -> World:
+    return jax.tree.unflatten(form.world, leaves)
+
+
+_reset_one = jax.jit(_reset, static_argnums=0)
+_step_one = jax.jit(_step, static_argnums=0)
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _reset_many(form: _Form, leaves: Leaves, encoder: Params, seeds: Array, missions: Array | None):
+    return jax.vmap(lambda seed, mission: _reset(form, leaves, encoder, seed, mission))(seeds, missions)
+
+
+@functools.partial(jax.jit, static_argnums=0, donate_argnums=3)
+def _step_many(form: _Form, leaves: Leaves, encoder: Params, drones: Drone, actions: Array):
+    return jax.vmap(lambda drone, action: _step(form, leaves, encoder, drone, action))(drones, actions)
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class _Task:
+    """What one environment and many have in common."""
+
+    environment: Environment
+    kind: Kind
+    encoder: Params
+
+    @property
+    def config(self) -> Config:
+        return self.environment.config
+
+    @functools.cached_property
+    def program(self) -> tuple[_Form, Leaves, Params]:
+        """Returns the first arguments of every compiled function."""
+        leaves, structure = jax.tree.flatten(self.environment.world)
+        return _Form(self.config, self.kind, structure), leaves, self.encoder
+
+    @property
+    def observations(self) -> Any:
+        """Returns the space of one drone's observations."""
+        if self.kind == "kinematics":
+            return _box(OWN_SIZE + MOTION_SIZE)
+        if self.kind == "code":
+            return _box(embedding.size(self.config) + OWN_SIZE + MOTION_SIZE)
+        image = jax.eval_shape(lambda: _image_of(self.config)).shape
+        return gymnasium.spaces.Dict({"image": _box(*image), "own": _box(OWN_SIZE), "motion": _box(MOTION_SIZE)})
+
+    def mission(self, options: dict[str, Any] | None, count: int | None) -> Array | None:
+        """Returns which missions [count], or [] of one drone, the options of a reset ask for; None draws them.
+
+        Raises:
+            ConfigError: names the options that there are.
+        """
+        if not options:
+            return None
+        if set(options) != {"mission"}:
+            raise ConfigError(f"options of reset may have 'mission' alone, not {', '.join(map(repr, options))}")
+        asked, most = np.asarray(options["mission"]), self.environment.missions
+        if not np.issubdtype(asked.dtype, np.integer) or np.any(asked < 0) or np.any(asked >= most):
+            raise ConfigError(f"mission must be whole numbers from 0 to {most - 1}, not {options['mission']}")
+        if asked.shape not in ((), () if count is None else (count,)):
+            raise ConfigError(f"mission must be one number{'' if count is None else f' or {count}'}, not {asked.size}")
+        return jnp.asarray(np.broadcast_to(asked, () if count is None else (count,)), jnp.int32)
+
+    def picture(self, state: EnvState) -> NDArray[np.uint8]:
+        """Returns what a person would see from a drone's camera, [192, 256, 3] with the default camera."""
+        return np.round(self.environment.picture(state) * 255.0).astype(np.uint8)
+
+
+def _image_of(config: Config) -> Array:
+    sensed = sensor_of(config).example(config)
+    return events.event_image(sensed) if isinstance(sensed, EventField) else jnp.asarray(sensed)
+
+
+def _box(*shape: int) -> Any:
+    return gymnasium.spaces.Box(-LARGEST, LARGEST, shape, np.float32)
+
+
+def _task(
+    world: str | Path | None,
+    config: Config | None,
+    observation: Kind,
+    policy: Policy | None,
+    worlds: int | None,
+    world_seed: int,
+    reward: Reward | None,
+) -> _Task:
+    """Returns the task of these arguments, which are those of `DroneEnv`.
+
+    Raises:
+        ConfigError: if they do not fit each other, or the world cannot be flown.
+    """
+    if observation not in get_args(Kind):
+        raise ConfigError(f"observation must be one of {', '.join(get_args(Kind))}, not '{observation}'")
+    if (policy is not None) != (observation == "code"):
+        raise ConfigError("observation 'code' needs a policy, whose encoder makes the codes, and the others need none")
+    if policy is not None:
+        if config is not None:
+            raise ConfigError("config must be None with a policy, which has its own")
+        if not embedding.has_code(policy.config):
+            raise ConfigError(f"the policy's sensor '{policy.config.env.sensor}' has no encoder, so there are no codes")
+        config = policy.config
+    elif config is None:
+        config = make_config(str(world) if world is not None else None)
+    if observation == "kinematics":
+        config = dataclasses.replace(config, env=dataclasses.replace(config.env, sensor="blind"))
+    if observation == "image" and sensor_of(config).form is Form.NOTHING:
+        raise ConfigError(f"the sensor '{config.env.sensor}' shows nothing; set observation to 'kinematics'")
+    name = str(world) if world is not None else config.world.name
+    if worlds is None:
+        worlds = WORLDS if name in FAMILIES else 1
+    made = make(name, config, worlds=worlds, seed=world_seed, reward=reward)
+    return _Task(made, observation, {} if policy is None else policy.params.encoder)
+
+
+class DroneEnv(gymnasium.Env):
+    """One drone that flies to a goal. An episode ends by the task's own time-out, without a wrapper.
+
+    Args:
+        world: `paper`, the name of random worlds or an MJCF file; None takes that of `config` or `policy`.
+        config: of drone, camera, sensor and task; without it the default for that world.
+        observation: `image` is a Dict of `image`, `own` [10] and `motion` [7]: the image holds the signed number of
+            events of each pixel as a logarithm, [H, W], or what another sensor of `config` shows. `code` is one
+            vector of the code, own state and own motion. `kinematics` is own state and motion, without a sensor.
+        policy: whose encoder makes the codes.
+        worlds: how many random worlds, of which each reset draws one; None is `WORLDS`, and 1 for a world from a file.
+        world_seed: which random worlds, of those that training draws from.
+        reward: of every decision, in place of the configured one: a function of a `Transition`.
+        render_mode: `rgb_array` or None.
+
+    Raises:
+        ConfigError: if the arguments do not fit each other, or the world cannot be flown.
+    """
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 4}  # noqa: RUF012  as Gymnasium declares it
+
+    def __init__(
+        self,
+        world: str | Path | None = None,
+        config: Config | None = None,
+        *,
+        observation: Kind = "image",
+        policy: Policy | None = None,
+        worlds: int | None = None,
+        world_seed: int = 0,
+        reward: Reward | None = None,
+        render_mode: str | None = None,
+    ) -> None:
+        _check_render_mode(render_mode)
+        self.task = _task(world, config, observation, policy, worlds, world_seed, reward)
+        self.render_mode = render_mode
+        self.observation_space = self.task.observations
+        self.action_space = gymnasium.spaces.Discrete(len(ACTIONS))
+        self.drone: Drone | None = None
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """Begins an episode: at rest at the start of a mission, facing its goal.
+
+        Args:
+            seed: of the drawn mission and the sensor's noise; None goes on from the one before.
+            options: `{"mission": number}` flies that mission.
+
+        Returns:
+            the first observation, and an empty info.
+
+        Raises:
+            ConfigError: if there is no such option or mission.
+        """
+        super().reset(seed=seed)
+        number = np.uint32(self.np_random.integers(2**31) if seed is None else seed)
+        self.drone, observed = _reset_one(*self.task.program, number, self.task.mission(options, None))
+        return jax.tree.map(np.asarray, observed), {}
+
+    def step(self, action: int) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        """Flies one decision of 0.26 s.
+
+        Args:
+            action: number of a move, 0..26.
+
+        Returns:
+            observation; reward; terminated: goal, collision, volume left or diverged; truncated: out of time; info
+            with `outcome`, in words, and `is_success`.
+
+        Raises:
+            gymnasium.error.ResetNeeded: before the first reset, and after an episode has ended.
+            gymnasium.error.InvalidAction: if there is no such move.
+        """
+        if self.drone is None or self.drone.state.ended:
+            raise gymnasium.error.ResetNeeded("there is no episode to step in; call reset first")
+        if not self.action_space.contains(action):
+            raise gymnasium.error.InvalidAction(f"a move must be a whole number from 0 to {len(ACTIONS) - 1}")
+        self.drone, decided = _step_one(*self.task.program, self.drone, np.int32(action))
+        decided = jax.tree.map(np.asarray, decided)
+        outcome = Outcome(int(decided.outcome))
+        info = {"outcome": outcome.name.lower(), "is_success": outcome is Outcome.GOAL}
+        return decided.observed, float(decided.reward), bool(decided.terminated), bool(decided.truncated), info
+
+    def render(self) -> NDArray[np.uint8] | None:
+        """Returns what a person would see from the drone's camera, [192, 256, 3]; None without a render mode.
+
+        Raises:
+            gymnasium.error.ResetNeeded: before the first reset.
+        """
+        if self.render_mode is None:
+            return None
+        if self.drone is None:
+            raise gymnasium.error.ResetNeeded("there is nothing to see yet; call reset first")
+        return self.task.picture(self.drone.state)
+
+
+class DroneVectorEnv(gymnasium.vector.VectorEnv):
+    """Many drones, all of whose decisions are one compiled program.
+
+    A drone whose episode has ended spends its next step on being reset, as Gymnasium's `AutoresetMode.NEXT_STEP` has
+    it: the action is ignored, the reward is 0, and the observation is the first one of a new episode.
+
+    Args:
+        num_envs: how many drones.
+        others: as in `DroneEnv`.
+
+    Raises:
+        ConfigError: as `DroneEnv`.
+    """
+
+    metadata = {**DroneEnv.metadata, "autoreset_mode": gymnasium.vector.AutoresetMode.NEXT_STEP}  # noqa: RUF012
+
+    def __init__(
+        self,
+        num_envs: int = 1,
+        world: str | Path | None = None,
+        config: Config | None = None,
+        *,
+        observation: Kind = "image",
+        policy: Policy | None = None,
+        worlds: int | None = None,
+        world_seed: int = 0,
+        reward: Reward | None = None,
+        render_mode: str | None = None,
+    ) -> None:
+        if num_envs < 1:
+            raise ConfigError(f"num_envs must be at least 1, not {num_envs}")
+        _check_render_mode(render_mode)
+        self.task = _task(world, config, observation, policy, worlds, world_seed, reward)
+        self.num_envs = num_envs
+        self.render_mode = render_mode
+        self.single_observation_space = self.task.observations
+        self.single_action_space = gymnasium.spaces.Discrete(len(ACTIONS))
+        batch = gymnasium.vector.utils.batch_space
+        self.observation_space = batch(self.single_observation_space, num_envs)
+        self.action_space = batch(self.single_action_space, num_envs)
+        self.drones: Drone | None = None
+
+    def reset(
+        self, *, seed: int | Sequence[int] | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[Any, dict[str, Any]]:
+        """Begins an episode of every drone.
+
+        Args:
+            seed: of drone i it is `seed + i`, or `seed[i]`; with the same one a `DroneEnv` begins alike.
+            options: `{"mission": number}`, or one for each drone.
+
+        Returns:
+            the first observations, and an empty info.
+
+        Raises:
+            ConfigError: if there is no such option or mission, or not one seed for each drone.
+        """
+        if seed is not None and not isinstance(seed, int | np.integer) and len(seed) != self.num_envs:
+            raise ConfigError(f"there must be one seed, or {self.num_envs}, not {len(seed)}")
+        if seed is None:
+            seeds = self.np_random.integers(2**31, size=self.num_envs)
+        else:
+            alone = isinstance(seed, int | np.integer)
+            seeds = int(seed) + np.arange(self.num_envs) if alone else np.asarray(seed)
+            super().reset(seed=int(seeds[0]))
+        missions = self.task.mission(options, self.num_envs)
+        self.drones, observed = _reset_many(*self.task.program, seeds.astype(np.uint32), missions)
+        return jax.tree.map(np.asarray, observed), {}
+
+    def step(self, actions: NDArray[np.integer]) -> tuple[Any, NDArray, NDArray, NDArray, dict[str, Any]]:
+        """Flies one decision of every drone, or resets it.
+
+        Args:
+            actions: [num_envs] numbers of moves, 0..26.
+
+        Returns:
+            observations; rewards [num_envs] float32; terminated and truncated [num_envs] bool; info with
+            `outcome` (numbers of `edqn_jax.Outcome`) and `is_success` of the drones whose episodes ended, which
+            `_outcome` and `_is_success` mark.
+
+        Raises:
+            gymnasium.error.ResetNeeded: before the first reset.
+            gymnasium.error.InvalidAction: if an action is no move.
+        """
+        if self.drones is None:
+            raise gymnasium.error.ResetNeeded("there are no episodes to step in; call reset first")
+        moves = np.asarray(actions)
+        whole = np.issubdtype(moves.dtype, np.integer) and moves.shape == (self.num_envs,)
+        if not whole or moves.min() < 0 or moves.max() >= len(ACTIONS):
+            raise gymnasium.error.InvalidAction(
+                f"moves must be {self.num_envs} whole numbers from 0 to {len(ACTIONS) - 1}"
+            )
+        self.drones, decided = _step_many(*self.task.program, self.drones, moves.astype(np.int32))
+        decided = jax.tree.map(np.asarray, decided)
+        ended = decided.terminated | decided.truncated
+        info: dict[str, Any] = {}
+        if ended.any():
+            success = decided.outcome == Outcome.GOAL
+            info = {"outcome": decided.outcome, "_outcome": ended, "is_success": success, "_is_success": ended}
+        return decided.observed, decided.reward, decided.terminated, decided.truncated, info
+
+    def render(self) -> tuple[NDArray[np.uint8], ...] | None:
+        """Returns what a person would see from each drone's camera, [192, 256, 3]; None without a render mode.
+
+        Raises:
+            gymnasium.error.ResetNeeded: before the first reset.
+        """
+        if self.render_mode is None:
+            return None
+        if self.drones is None:
+            raise gymnasium.error.ResetNeeded("there is nothing to see yet; call reset first")
+        states = self.drones.state
+        return tuple(
+            self.task.picture(jax.tree.map(lambda x, i=i: x[i], states))  # type: ignore[misc]
+            for i in range(self.num_envs)
+        )
+
+
+def _check_render_mode(mode: str | None) -> None:
+    if mode not in (None, "rgb_array"):
+        raise ConfigError(f"render_mode must be 'rgb_array' or None, not '{mode}'")
+
+
+for _name, _which in (("Paper", "paper"), ("Random", "medium")):
+    gymnasium.register(
+        f"EDQN/{_name}-v0",
+        entry_point=f"{__name__}:DroneEnv",
+        vector_entry_point=f"{__name__}:DroneVectorEnv",
+        kwargs={"world": _which},
+    )
