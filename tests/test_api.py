@@ -14,6 +14,7 @@ import pytest
 
 import edqn_jax
 from edqn_jax.sim.moves import ACTIONS
+from edqn_jax.sim.scene import signed_distance
 from edqn_jax.training import loop
 from tests.miniature import WORLD
 from tests.policies import CONFIG, always
@@ -126,6 +127,13 @@ def test_an_environment_is_made_from_a_family_or_a_file(tmp_path: Path) -> None:
         '<site name="start" pos="2 2 3"/><site name="goal" pos="20 2 3"/></worldbody></mujoco>'
     )
     np.testing.assert_allclose(edqn_jax.make(file, CONFIG).scene().goal, [20, 2, 3])
+    file.write_text(two.mjcf(1))
+    drawn, written = two.scene(1), edqn_jax.make(file, CONFIG).scene()
+    np.testing.assert_allclose(written.start, drawn.start, atol=1e-5)
+    low, high = np.asarray(drawn.volume)
+    points = np.random.default_rng(0).uniform(low, high, (50, 3)).astype(np.float32)
+    for point in points:
+        assert signed_distance(written, point) == pytest.approx(float(signed_distance(drawn, point)), abs=2e-5)
 
 
 @pytest.mark.slow

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -14,13 +13,14 @@ import numpy as np
 from edqn_jax.config import FAMILIES, Config
 from edqn_jax.errors import ConfigError
 from edqn_jax.planners.astar import shortest_path
-from edqn_jax.planners.free_space import reachable
+from edqn_jax.planners.free_space import holds, reachable
+from edqn_jax.planners.lattice import CELL_M, lattice_shape
 from edqn_jax.random import run_streams
 from edqn_jax.sim import drone, worlds
 from edqn_jax.sim.env import World
 from edqn_jax.sim.free_points import Cells, cells_of, free_point
 from edqn_jax.sim.missions import Missions, own_missions, random_missions, spread_missions
-from edqn_jax.sim.mjcf import check_scene, load_world, resolve_world, widened, write_scene
+from edqn_jax.sim.mjcf import check_scene, load_world, mjcf_of, resolve_world, widened
 from edqn_jax.sim.reward import Reward
 from edqn_jax.sim.scene import Scene, stack_scenes, take_scene, with_equal_capacities
 
@@ -55,13 +55,7 @@ class MissionSet:
         if self.file is not None:
             return [self.file.read_text(encoding="utf-8")]
         pool = jax.tree.map(np.asarray, self.world.pool)
-        with tempfile.TemporaryDirectory() as folder:
-            written = Path(folder) / "world.xml"
-            texts = []
-            for index in range(pool.start.shape[0]):
-                write_scene(take_scene(pool, index), written, title=f"{self.name} {index}")
-                texts.append(written.read_text(encoding="utf-8"))
-        return texts
+        return [mjcf_of(take_scene(pool, i), title=f"{self.name} {i}") for i in range(pool.start.shape[0])]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -166,7 +160,7 @@ def _file_run_missions(config: Config, training_key: jax.Array, validation_key: 
     airframe, file = drone.load_airframe(config.drone), resolve_world(name)
     pool = _pool_of(name, config)
     spread, jitter = config.world.own_start_fraction, config.world.start_jitter_m
-    cells, note = _with_a_way(pool, config, name)
+    cells, note = _with_a_way(pool, config, name, own_start=True)
     training = spread_missions(pool, config.world.missions, spread, jitter, training_key, cells)
     # Half of the validation begins near the start, more where training does, but never at it: flown greedily, missions
     # from one point would be one and the same.
@@ -184,19 +178,30 @@ def _file_run_missions(config: Config, training_key: jax.Array, validation_key: 
     )
 
 
-def _with_a_way(pool: Scene, config: Config, name: str) -> tuple[Cells | None, str | None]:
+def _with_a_way(pool: Scene, config: Config, name: str, own_start: bool = False) -> tuple[Cells | None, str | None]:
     """Returns the cells of the pool's only world that have a way to its goal, and how many have none.
+
+    Args:
+        pool: one world.
+        config: of the run.
+        name: of the world.
+        own_start: whether a mission begins at the world's own start.
 
     Returns:
         (None, None) where there is a way from everywhere.
 
     Raises:
-        ConfigError: if the world is too large to search it.
+        ConfigError: if the world is too large to search it, or there is no way from its own start.
     """
-    found = reachable(take_scene(pool, 0), config.drone.body_radius_m)
+    scene, radius = take_scene(pool, 0), config.drone.body_radius_m
+    if own_start:
+        lattice_shape(scene, np.asarray(scene.start, np.float64), CELL_M)  # A* searches the way from there
+    found = reachable(scene, radius)
     if found.lost == 0.0:
         return None, None
-    cells = cells_of(take_scene(pool, 0), found.is_way, found.corner, found.edge_m)
+    if own_start and not holds(found, scene.start):
+        shortest_path(scene, scene.start, scene.goal, radius)  # raises, before anything is compiled
+    cells = cells_of(scene, found.is_way, found.corner, found.edge_m)
     return cells, f"{found.lost:.0%} of the free space of '{name}' has no way to the goal: no mission begins there"
 
 

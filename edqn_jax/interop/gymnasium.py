@@ -16,7 +16,7 @@ import dataclasses
 import functools
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, Literal, TypedDict, Unpack, get_args
 
 import jax
 import jax.numpy as jnp
@@ -53,6 +53,10 @@ WORLDS = 64
 """Random worlds of an environment unless it is told how many, each with a mission of its own."""
 
 
+SEEDS = 2**32
+"""Seeds that differ; larger ones begin again at 0."""
+
+
 @struct.dataclass
 class Drone:
     """One drone between two decisions."""
@@ -74,7 +78,7 @@ class _Decided:
 
 
 @dataclasses.dataclass(frozen=True)
-class _Form:
+class _Program:
     """What a compiled program depends on, beside its arrays."""
 
     config: Config
@@ -82,9 +86,9 @@ class _Form:
     world: Any  # structure of a `World`
 
 
-# JAX calls a compiled function in a quarter less time where no argument is a typed key or an object whose fields it has
-# to ask for in Python: so keys go in as their data, and worlds as a list.
 Leaves = list[Array]
+"""Arrays of a `World`. JAX calls a compiled function in a quarter less time where no argument is a typed key or an
+object whose fields it has to ask for in Python; so worlds go in as lists, and keys as their data."""
 
 
 def _held(state: EnvState, code: Array) -> Drone:
@@ -113,17 +117,17 @@ def _observed(config: Config, kind: Kind, encoder: Params, seen: Observation, be
     return {"image": _numbers(sensed), "own": own, "motion": motion}, before
 
 
-def _reset(form: _Form, leaves: Leaves, encoder: Params, seed: Array, mission: Array | None) -> tuple[Drone, Any]:
-    state, seen = env.reset(form.config, _world(form, leaves), jax.random.key(seed), mission)
-    observed, code = _observed(form.config, form.kind, encoder, seen, _no_code(form))
+def _reset(program: _Program, leaves: Leaves, encoder: Params, seed: Array, mission: Array | None) -> tuple[Drone, Any]:
+    state, seen = env.reset(program.config, _world(program, leaves), jax.random.key(seed), mission)
+    observed, code = _observed(program.config, program.kind, encoder, seen, _no_code(program))
     return _held(state, code), observed
 
 
-def _step(form: _Form, leaves: Leaves, encoder: Params, drone: Drone, action: Array) -> tuple[Drone, _Decided]:
+def _step(program: _Program, leaves: Leaves, encoder: Params, drone: Drone, action: Array) -> tuple[Drone, _Decided]:
     before = jnp.where(drone.state.ended, 0.0, drone.code)
     state = dataclasses.replace(drone.state, key=jax.random.wrap_key_data(drone.key))
-    state, step = env.step(form.config, _world(form, leaves), state, action)
-    observed, code = _observed(form.config, form.kind, encoder, step.observation, before)
+    state, step = env.step(program.config, _world(program, leaves), state, action)
+    observed, code = _observed(program.config, program.kind, encoder, step.observation, before)
     return _held(state, code), _Decided(
         observed=observed,
         reward=step.reward,
@@ -133,12 +137,12 @@ def _step(form: _Form, leaves: Leaves, encoder: Params, drone: Drone, action: Ar
     )
 
 
-def _no_code(form: _Form) -> Array:
-    return jnp.zeros(embedding.size(form.config) if form.kind == "code" else 0)
+def _no_code(program: _Program) -> Array:
+    return jnp.zeros(embedding.size(program.config) if program.kind == "code" else 0)
 
 
-def _world(form: _Form, leaves: Leaves) -> World:
-    return jax.tree.unflatten(form.world, leaves)
+def _world(program: _Program, leaves: Leaves) -> World:
+    return jax.tree.unflatten(program.world, leaves)
 
 
 _reset_one = jax.jit(_reset, static_argnums=0)
@@ -146,13 +150,13 @@ _step_one = jax.jit(_step, static_argnums=0)
 
 
 @functools.partial(jax.jit, static_argnums=0)
-def _reset_many(form: _Form, leaves: Leaves, encoder: Params, seeds: Array, missions: Array | None):
-    return jax.vmap(lambda seed, mission: _reset(form, leaves, encoder, seed, mission))(seeds, missions)
+def _reset_many(program: _Program, leaves: Leaves, encoder: Params, seeds: Array, missions: Array | None):
+    return jax.vmap(lambda seed, mission: _reset(program, leaves, encoder, seed, mission))(seeds, missions)
 
 
 @functools.partial(jax.jit, static_argnums=0, donate_argnums=3)
-def _step_many(form: _Form, leaves: Leaves, encoder: Params, drones: Drone, actions: Array):
-    return jax.vmap(lambda drone, action: _step(form, leaves, encoder, drone, action))(drones, actions)
+def _step_many(program: _Program, leaves: Leaves, encoder: Params, drones: Drone, actions: Array):
+    return jax.vmap(lambda drone, action: _step(program, leaves, encoder, drone, action))(drones, actions)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -168,10 +172,10 @@ class _Task:
         return self.environment.config
 
     @functools.cached_property
-    def program(self) -> tuple[_Form, Leaves, Params]:
+    def program(self) -> tuple[_Program, Leaves, Params]:
         """Returns the first arguments of every compiled function."""
         leaves, structure = jax.tree.flatten(self.environment.world)
-        return _Form(self.config, self.kind, structure), leaves, self.encoder
+        return _Program(self.config, self.kind, structure), leaves, self.encoder
 
     @property
     def observations(self) -> Any:
@@ -210,18 +214,40 @@ def _image_of(config: Config) -> Array:
     return events.event_image(sensed) if isinstance(sensed, EventField) else jnp.asarray(sensed)
 
 
+def _on_host(tree: Any) -> Any:
+    """Returns the arrays as NumPy's own, which may be written: JAX's may not."""
+    return jax.tree.map(np.array, tree)
+
+
 def _box(*shape: int) -> Any:
     return gymnasium.spaces.Box(-LARGEST, LARGEST, shape, np.float32)
+
+
+class TaskOptions(TypedDict, total=False):
+    """Options of `DroneEnv` and `DroneVectorEnv`, as keywords."""
+
+    observation: Kind
+    """`image` (default) is a Dict of `image`, `own` [10] and `motion` [7]: the image holds the signed number of events
+    of each pixel as a logarithm, [H, W], or what another sensor of the configuration shows. `code` is one vector of
+    code, own state and own motion. `kinematics` is own state and motion, without a sensor."""
+    policy: Policy | None
+    """Whose encoder makes the codes."""
+    worlds: int | None
+    """Random worlds, of which each reset draws one; None is `WORLDS`, and 1 for a world from a file."""
+    world_seed: int
+    """Which random worlds, of those that training draws from."""
+    reward: Reward | None
+    """Of every decision, in place of the configured one: a function of a `Transition`."""
 
 
 def _task(
     world: str | Path | None,
     config: Config | None,
-    observation: Kind,
-    policy: Policy | None,
-    worlds: int | None,
-    world_seed: int,
-    reward: Reward | None,
+    observation: Kind = "image",
+    policy: Policy | None = None,
+    worlds: int | None = None,
+    world_seed: int = 0,
+    reward: Reward | None = None,
 ) -> _Task:
     """Returns the task of these arguments, which are those of `DroneEnv`.
 
@@ -257,35 +283,25 @@ class DroneEnv(gymnasium.Env):
     Args:
         world: `paper`, the name of random worlds or an MJCF file; None takes that of `config` or `policy`.
         config: of drone, camera, sensor and task; without it the default for that world.
-        observation: `image` is a Dict of `image`, `own` [10] and `motion` [7]: the image holds the signed number of
-            events of each pixel as a logarithm, [H, W], or what another sensor of `config` shows. `code` is one
-            vector of the code, own state and own motion. `kinematics` is own state and motion, without a sensor.
-        policy: whose encoder makes the codes.
-        worlds: how many random worlds, of which each reset draws one; None is `WORLDS`, and 1 for a world from a file.
-        world_seed: which random worlds, of those that training draws from.
-        reward: of every decision, in place of the configured one: a function of a `Transition`.
         render_mode: `rgb_array` or None.
+        options: see `TaskOptions`.
 
     Raises:
         ConfigError: if the arguments do not fit each other, or the world cannot be flown.
     """
 
-    metadata = {"render_modes": ["rgb_array"], "render_fps": 4}  # noqa: RUF012  as Gymnasium declares it
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 4}
 
     def __init__(
         self,
         world: str | Path | None = None,
         config: Config | None = None,
         *,
-        observation: Kind = "image",
-        policy: Policy | None = None,
-        worlds: int | None = None,
-        world_seed: int = 0,
-        reward: Reward | None = None,
         render_mode: str | None = None,
+        **options: Unpack[TaskOptions],
     ) -> None:
         _check_render_mode(render_mode)
-        self.task = _task(world, config, observation, policy, worlds, world_seed, reward)
+        self.task = _task(world, config, **options)
         self.render_mode = render_mode
         self.observation_space = self.task.observations
         self.action_space = gymnasium.spaces.Discrete(len(ACTIONS))
@@ -304,10 +320,11 @@ class DroneEnv(gymnasium.Env):
         Raises:
             ConfigError: if there is no such option or mission.
         """
+        mission = self.task.mission(options, None)
         super().reset(seed=seed)
-        number = np.uint32(self.np_random.integers(2**31) if seed is None else seed)
-        self.drone, observed = _reset_one(*self.task.program, number, self.task.mission(options, None))
-        return jax.tree.map(np.asarray, observed), {}
+        number = self.np_random.integers(SEEDS) if seed is None else seed % SEEDS
+        self.drone, observed = _reset_one(*self.task.program, np.uint32(number), mission)
+        return _on_host(observed), {}
 
     def step(self, action: int) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Flies one decision of 0.26 s.
@@ -328,7 +345,7 @@ class DroneEnv(gymnasium.Env):
         if not self.action_space.contains(action):
             raise gymnasium.error.InvalidAction(f"a move must be a whole number from 0 to {len(ACTIONS) - 1}")
         self.drone, decided = _step_one(*self.task.program, self.drone, np.int32(action))
-        decided = jax.tree.map(np.asarray, decided)
+        decided = _on_host(decided)
         outcome = Outcome(int(decided.outcome))
         info = {"outcome": outcome.name.lower(), "is_success": outcome is Outcome.GOAL}
         return decided.observed, float(decided.reward), bool(decided.terminated), bool(decided.truncated), info
@@ -360,7 +377,7 @@ class DroneVectorEnv(gymnasium.vector.VectorEnv):
         ConfigError: as `DroneEnv`.
     """
 
-    metadata = {**DroneEnv.metadata, "autoreset_mode": gymnasium.vector.AutoresetMode.NEXT_STEP}  # noqa: RUF012
+    metadata = {**DroneEnv.metadata, "autoreset_mode": gymnasium.vector.AutoresetMode.NEXT_STEP}
 
     def __init__(
         self,
@@ -368,17 +385,13 @@ class DroneVectorEnv(gymnasium.vector.VectorEnv):
         world: str | Path | None = None,
         config: Config | None = None,
         *,
-        observation: Kind = "image",
-        policy: Policy | None = None,
-        worlds: int | None = None,
-        world_seed: int = 0,
-        reward: Reward | None = None,
         render_mode: str | None = None,
+        **options: Unpack[TaskOptions],
     ) -> None:
         if num_envs < 1:
             raise ConfigError(f"num_envs must be at least 1, not {num_envs}")
         _check_render_mode(render_mode)
-        self.task = _task(world, config, observation, policy, worlds, world_seed, reward)
+        self.task = _task(world, config, **options)
         self.num_envs = num_envs
         self.render_mode = render_mode
         self.single_observation_space = self.task.observations
@@ -403,17 +416,28 @@ class DroneVectorEnv(gymnasium.vector.VectorEnv):
         Raises:
             ConfigError: if there is no such option or mission, or not one seed for each drone.
         """
-        if seed is not None and not isinstance(seed, int | np.integer) and len(seed) != self.num_envs:
-            raise ConfigError(f"there must be one seed, or {self.num_envs}, not {len(seed)}")
+        missions, each = self.task.mission(options, self.num_envs), self._each(seed)
+        if each is not None:
+            super().reset(seed=each[0])
+        numbers = self.np_random.integers(SEEDS, size=self.num_envs) if each is None else [one % SEEDS for one in each]
+        self.drones, observed = _reset_many(*self.task.program, np.asarray(numbers, np.uint32), missions)
+        return _on_host(observed), {}
+
+    def _each(self, seed: int | Sequence[int] | None) -> list[int] | None:
+        """Returns the seed of each drone; None where they go on from the ones before.
+
+        Raises:
+            ConfigError: if there is not one for each drone, or one is negative.
+        """
         if seed is None:
-            seeds = self.np_random.integers(2**31, size=self.num_envs)
-        else:
-            alone = isinstance(seed, int | np.integer)
-            seeds = int(seed) + np.arange(self.num_envs) if alone else np.asarray(seed)
-            super().reset(seed=int(seeds[0]))
-        missions = self.task.mission(options, self.num_envs)
-        self.drones, observed = _reset_many(*self.task.program, seeds.astype(np.uint32), missions)
-        return jax.tree.map(np.asarray, observed), {}
+            return None
+        if isinstance(seed, int | np.integer):
+            seed = [int(seed) + number for number in range(self.num_envs)]
+        if len(seed) != self.num_envs:
+            raise ConfigError(f"there must be one seed, or {self.num_envs}, not {len(seed)}")
+        if not all(isinstance(one, int | np.integer) and one >= 0 for one in seed):
+            raise ConfigError(f"seeds must be whole numbers of at least 0, not {list(seed)}")
+        return [int(one) for one in seed]
 
     def step(self, actions: NDArray[np.integer]) -> tuple[Any, NDArray, NDArray, NDArray, dict[str, Any]]:
         """Flies one decision of every drone, or resets it.
@@ -439,7 +463,7 @@ class DroneVectorEnv(gymnasium.vector.VectorEnv):
                 f"moves must be {self.num_envs} whole numbers from 0 to {len(ACTIONS) - 1}"
             )
         self.drones, decided = _step_many(*self.task.program, self.drones, moves.astype(np.int32))
-        decided = jax.tree.map(np.asarray, decided)
+        decided = _on_host(decided)
         ended = decided.terminated | decided.truncated
         info: dict[str, Any] = {}
         if ended.any():

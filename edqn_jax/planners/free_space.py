@@ -53,7 +53,7 @@ def reachable(scene: Scene, radius: float, cell: float | None = None) -> Reachab
         found = reachable(scene, radius, COARSE_M)
         if found.lost > 0.0:
             found = reachable(scene, radius, CELL_M)
-        if not _holds(found, scene.start) and is_small(scene, FINE_M):
+        if not holds(found, scene.start) and is_small(scene, FINE_M):
             found = reachable(scene, radius, FINE_M)
         return found
     lattice = Lattice(scene, np.asarray(scene.goal, np.float64), radius, cell)
@@ -68,7 +68,7 @@ def reachable(scene: Scene, radius: float, cell: float | None = None) -> Reachab
     return Reachable(way, lattice.middle(np.array(0)), cell, lost if lost > NICHES else 0.0)
 
 
-def _holds(found: Reachable, point: np.ndarray | Array) -> bool:
+def holds(found: Reachable, point: np.ndarray | Array) -> bool:
     """Returns whether there is a way from the cell that a point [3] is in."""
     at = np.round((np.asarray(point) - found.corner) / found.edge_m).astype(int)
     return bool(np.all((at >= 0) & (at < found.is_way.shape))) and bool(found.is_way[tuple(at)])

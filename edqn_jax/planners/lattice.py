@@ -39,6 +39,29 @@ def is_small(scene: Scene, cell: float) -> bool:
     return bool(np.prod((upper - lower) / cell + 1.0) <= _MOST_FINE)
 
 
+def lattice_shape(scene: Scene, start: np.ndarray, cell: float) -> tuple[np.ndarray, np.ndarray]:
+    """Returns the index [3] of the cell around `start` [3], and the number of cells along each axis [3].
+
+    Args:
+        cell: edge of the cells, metres.
+
+    Raises:
+        ConfigError: if the volume has too many cells.
+    """
+    lower, upper = np.asarray(scene.volume, np.float64)
+    # Rounded up a little: float32 may put a point on the boundary just outside the volume.
+    origin = np.floor((start - lower) / cell + 1e-5).astype(np.int64)
+    shape = origin + np.floor((upper - start) / cell + 1e-5).astype(np.int64) + 1
+    size = math.prod(map(int, np.maximum(shape, 1)))
+    if size > MOST_CELLS:
+        sides = " x ".join(f"{side:g}" for side in upper - lower)
+        raise ConfigError(
+            f"the flight volume of {sides} m has {size / 1e6:,.0f} million cells of {cell:g} m, and a way is "
+            f"searched in at most {MOST_CELLS / 1e6:,.0f} million; give a smaller site 'volume'"
+        )
+    return origin, shape
+
+
 class NoPathError(ConfigError):
     """There is no path from start to goal; the message says why."""
 
@@ -54,16 +77,7 @@ class Lattice:
         """
         self.scene, self.radius, self.cell, self.start = scene, radius, cell, start
         self.lower, self.upper = np.asarray(scene.volume, np.float64)
-        # Rounded up a little: float32 may put a point on the boundary just outside the volume.
-        self.origin = np.floor((start - self.lower) / cell + 1e-5).astype(np.int64)
-        self.shape = self.origin + np.floor((self.upper - start) / cell + 1e-5).astype(np.int64) + 1
-        size = math.prod(map(int, np.maximum(self.shape, 1)))
-        if size > MOST_CELLS:
-            sides = " x ".join(f"{side:g}" for side in self.upper - self.lower)
-            raise ConfigError(
-                f"the flight volume of {sides} m has {size / 1e6:,.0f} million cells of {cell:g} m, and a way is "
-                f"searched in at most {MOST_CELLS / 1e6:,.0f} million; give a smaller site 'volume'"
-            )
+        self.origin, self.shape = lattice_shape(scene, start, cell)
         self.distance = np.full(int(np.prod(np.maximum(self.shape, 1))), np.nan, np.float32)
 
     def flat(self, index: np.ndarray) -> np.ndarray:

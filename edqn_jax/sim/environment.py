@@ -27,7 +27,7 @@ from edqn_jax.sim.drone import Flight
 from edqn_jax.sim.env import EnvState, Observation, Step, World
 from edqn_jax.sim.events import EventField
 from edqn_jax.sim.missions import own_missions
-from edqn_jax.sim.mjcf import check_scene, load_world, resolve_world
+from edqn_jax.sim.mjcf import check_scene, load_world, mjcf_of, resolve_world
 from edqn_jax.sim.moves import move_number
 from edqn_jax.sim.reward import Reward
 from edqn_jax.sim.scene import Scene, stack_scenes, take_scene
@@ -52,6 +52,10 @@ class Environment:
     def scene(self, mission: int = 0) -> Scene:
         """Returns the world of a mission: its shapes, flight volume, start and goal."""
         return take_scene(self.world.pool, self.world.missions.scene[mission])
+
+    def mjcf(self, mission: int = 0) -> str:
+        """Returns the world of a mission as the text of an MJCF file, which MuJoCo and `make` open."""
+        return mjcf_of(self.scene(mission), title=f"{self.config.world.name} {mission}")
 
     def reset(self, key: int | Array = 0, mission: int | Array | None = None) -> tuple[EnvState, Observation]:
         """Returns the state at the start of a mission, at rest and facing the goal, and what is observed there.

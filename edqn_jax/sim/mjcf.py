@@ -237,7 +237,12 @@ def check_scene(
 
 
 def write_scene(scene: Scene, path: str | Path, *, title: str = "world") -> None:
-    """Writes one world as MJCF that MuJoCo opens and that loads back to the same scene.
+    """Writes one world as the file of `mjcf_of`."""
+    Path(path).write_text(mjcf_of(scene, title=title), encoding="utf-8")
+
+
+def mjcf_of(scene: Scene, *, title: str = "world") -> str:
+    """Returns one world as MJCF that MuJoCo opens and that loads back to the same scene.
 
     Parked shapes are left out. A tilted shape that is upright loads back as an upright one.
     """
@@ -272,7 +277,7 @@ def write_scene(scene: Scene, path: str | Path, *, title: str = "world") -> None
         number = counts[attributes["type"]] = counts.get(attributes["type"], 0) + 1
         ElementTree.SubElement(world, "geom", {"name": f"{attributes['type']}{number}", **attributes})
     ElementTree.indent(root)
-    Path(path).write_text(ElementTree.tostring(root, encoding="unicode") + "\n", encoding="utf-8")
+    return ElementTree.tostring(root, encoding="unicode") + "\n"
 
 
 def _geom_name(model: mujoco.MjModel, geom: int) -> str:

@@ -15,8 +15,9 @@ from edqn_jax.config.loading import make_config
 from edqn_jax.errors import ConfigError
 from edqn_jax.evaluation.missions import load_missions, missions_of_runs, run_missions
 from edqn_jax.sim import worlds
-from edqn_jax.sim.mjcf import load_scene, resolve_world
+from edqn_jax.sim.mjcf import load_scene, resolve_world, write_scene
 from edqn_jax.sim.scene import signed_distance
+from tests.planners.small_worlds import WITHOUT_A_WAY, small_world
 
 CONFIG = Config()
 
@@ -114,6 +115,17 @@ def test_what_cannot_be_flown_is_a_sentence(arguments, says):
 def test_a_goal_inside_a_wall_names_the_wall(missions):
     with pytest.raises(ConfigError, match=r"the goal .* lies inside '\w+'"):
         load_missions(CONFIG, "paper", missions, goal=inside_a_block())
+
+
+def test_what_cannot_be_trained_in_is_refused_before_anything_is_compiled(tmp_path):
+    shut, vast = tmp_path / "shut.xml", tmp_path / "vast.xml"
+    write_scene(WITHOUT_A_WAY["wall across"].scene, shut)
+    scene = small_world().scene
+    write_scene(dataclasses.replace(scene, volume=scene.volume + np.array([[0], [440.0]])), vast)
+    with pytest.raises(ConfigError, match="every path is blocked"):
+        run_missions(make_config(str(shut)))
+    with pytest.raises(ConfigError, match="million cells of 0.5 m, and a way is searched in at most 40 million"):
+        run_missions(make_config(str(vast)))
 
 
 def test_a_start_inside_a_wall_names_the_wall():

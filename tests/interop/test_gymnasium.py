@@ -37,8 +37,14 @@ def small(world: str = "medium") -> Config:
 
 
 @functools.cache
-def policy() -> Policy:
-    return Policy(small(), fresh_policy(small()))
+def policy(sequence: int = 1) -> Policy:
+    """One that has learnt nothing; its encoder remembers the code before where `sequence` is more than 1."""
+    config = dataclasses.replace(small(), encoder=dataclasses.replace(small().encoder, sequence_decisions=sequence))
+    params = fresh_policy(config)
+    if sequence > 1:  # what is remembered has no weight at first
+        remembered = params.encoder["encoder"]["previous"]
+        remembered["kernel"] = jnp.ones_like(remembered["kernel"]) * 0.1
+    return Policy(config, params)
 
 
 def one(**options: Any) -> Any:
@@ -145,19 +151,61 @@ def test_time_out_truncates_and_the_goal_terminates():
     assert (terminated, truncated, info) == (True, False, {"outcome": "goal", "is_success": True})
 
 
-def test_a_code_is_that_of_the_policy():
-    made = interop.DroneEnv("medium", observation="code", policy=policy(), worlds=3)
-    pure = edqn_jax.make("medium", small(), worlds=3)
+@pytest.mark.parametrize("sequence", [1, 2])
+def test_a_code_is_that_of_the_policy(sequence):
+    flown = policy(sequence)
+    made = interop.DroneEnv("medium", observation="code", policy=flown, worlds=3)
+    pure = edqn_jax.make("medium", flown.config, worlds=3)
     observed, _ = made.reset(seed=1, options={"mission": 2})
     state, seen = pure.reset(1, 2)
-    memory = jnp.zeros((1, small().encoder.code_size + env.OWN_SIZE))
+    empty = jnp.zeros((1, flown.config.encoder.code_size + env.OWN_SIZE))
+    memory = empty
     for move in MOVES[:4, 0]:
-        memory = see(small(), policy().params.encoder, memory, seen)
+        memory = see(flown.config, flown.params.encoder, memory, seen)
         expected = jnp.concatenate([memory[-1], seen.motion])
         np.testing.assert_allclose(observed, np.clip(expected, -10, 10), rtol=1e-5, atol=1e-6)
         observed, *_ = made.step(move)
         state, step = pure.step(state, move)
         seen = step.observation
+
+
+def test_a_reset_drone_remembers_no_code():
+    vector = interop.DroneVectorEnv(1, "medium", observation="code", policy=policy(2), worlds=1)
+    first, _ = vector.reset(seed=0)
+    moves = np.array([DOWN])
+    while not vector.step(moves)[2][0]:
+        pass
+    again, *_ = vector.step(moves)  # the reset: the only mission once more
+    np.testing.assert_allclose(again, first, rtol=1e-5, atol=1e-5)
+
+
+def test_what_is_returned_may_be_written():
+    vector = many(2)
+    observed, _ = vector.reset(seed=0)
+    stepped, rewards, *_ = vector.step(np.zeros(2, int))
+    for array in (*observed.values(), *stepped.values(), rewards):
+        array += 1.0
+
+
+def test_missions_and_worlds_can_be_chosen():
+    vector, pure = many(3, observation="kinematics"), edqn_jax.make("medium", small(), worlds=3)
+    vector.reset(options={"mission": [2, 0, 1]})
+    starts = np.asarray(pure.world.missions.start)
+    np.testing.assert_array_equal(vector.drones.state.drone.position, starts[[2, 0, 1]])
+    vector.reset(options={"mission": 1})
+    np.testing.assert_array_equal(vector.drones.state.drone.position, starts[[1, 1, 1]])
+    others = interop.DroneEnv("medium", small(), worlds=3, world_seed=1, observation="kinematics")
+    expected = edqn_jax.make("medium", small(), worlds=3, seed=1)
+    np.testing.assert_array_equal(others.task.environment.world.pool.start, expected.world.pool.start)
+    assert np.any(expected.world.pool.start != pure.world.pool.start)
+
+
+def test_any_seed_of_gymnasium_is_one():
+    made, vector = one(observation="kinematics"), many(2, observation="kinematics")
+    large, _ = made.reset(seed=2**40 + 3)
+    np.testing.assert_array_equal(large, made.reset(seed=3)[0])
+    together, _ = vector.reset(seed=2**32 - 1)
+    np.testing.assert_allclose(together[1], made.reset(seed=0)[0], rtol=1e-5, atol=1e-5)
 
 
 def test_pictures_show_what_a_person_would_see():
@@ -216,11 +264,18 @@ def test_what_cannot_be_done_is_refused():
             each.reset(options={"mission": 3})
         with pytest.raises(ConfigError, match="may have 'mission' alone, not 'goal'"):
             each.reset(options={"goal": 3})
+    for seeds in (-1, [0, -1], [0, None]):
+        with pytest.raises(ConfigError, match="seeds must be whole numbers of at least 0"):
+            vector.reset(seed=seeds)
     with pytest.raises(ConfigError, match="one seed, or 2, not 3"):
         vector.reset(seed=[1, 2, 3])
     with pytest.raises(ConfigError, match="num_envs must be at least 1"):
         many(0)
     made.reset(seed=0)
+    before = made.np_random.bit_generator.state
+    with pytest.raises(ConfigError):
+        made.reset(seed=5, options={"mission": 3})
+    assert made.np_random.bit_generator.state == before  # a refused reset changes nothing
     vector.reset(seed=[0, 0])
     with pytest.raises(gymnasium.error.InvalidAction, match="from 0 to 26"):
         made.step(27)
