@@ -33,10 +33,10 @@ ROOT = Path(__file__).resolve().parents[1]
 SEEDS = 5
 """Agents that are trained together; the best of them is shipped."""
 
-FLAGS = ("--tuned-for", "gpu", "--world.flown", "", "--train.keep", "last", "--train.validation-every", "20000000")
+FLAGS = ("--tuned-for", "gpu", "--world.flown", "", "--train.keep", "last", "--train.validation-every", "0")
 """Options of train.py beside the world and the number of seeds."""
 
-DECISIONS = {"open": 60_000_000, "mixed": 200_000_000}
+DECISIONS = {"open": 60_000_000, "mixed": 300_000_000}
 """Decisions of each seed, by the worlds that can be trained on."""
 
 MISSIONS = 1000

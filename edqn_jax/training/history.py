@@ -17,6 +17,8 @@ from edqn_jax.sim.outcomes import Outcome
 MOST_ILL_STEPS = 100
 """Training steps without a useful update, or with as many diverged decisions, after which a run is given up."""
 
+_IN_WORDS = {int(outcome): outcome.name.lower() for outcome in Outcome}
+
 
 @dataclasses.dataclass(frozen=True)
 class EndedEpisodes:
@@ -38,7 +40,7 @@ class EndedEpisodes:
 
     def named(self) -> list[str]:
         """Returns the outcomes in words."""
-        return [Outcome(int(kind)).name.lower() for kind in self.outcome]
+        return [_IN_WORDS[kind] for kind in self.outcome.tolist()]
 
 
 @dataclasses.dataclass
