@@ -106,7 +106,7 @@ def _dispatch(argv: Sequence[str], stops: Stops) -> int:
 
 
 def _of_a_run(command: str, argv: Sequence[str]) -> None:
-    """Runs a command that works on a finished run or a file; JAX is imported once the arguments are known to be right."""
+    """Runs a command on a finished run or a file; JAX is imported once the arguments are known to be right."""
     args = OF_A_RUN[command](argv)
 
     from edqn_jax.parallel.devices import use_cpu_devices

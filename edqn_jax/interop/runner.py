@@ -81,7 +81,9 @@ class Runner:
         try:
             self._session = onnxruntime.InferenceSession(path.read_bytes(), options, ["CPUExecutionProvider"])
         except Exception as error:
-            raise ValueError(f"'{path}' is not an ONNX file that onnxruntime {onnxruntime.__version__} reads") from error
+            raise ValueError(
+                f"'{path}' is not an ONNX file that onnxruntime {onnxruntime.__version__} reads"
+            ) from error
         self.about = _about(self._session.get_modelmeta().custom_metadata_map, path)
         """What the policy expects, as `edqn export` wrote it."""
         self._grid = Grid.of(self.about, camera, camera_fov_deg)
@@ -124,8 +126,8 @@ class Runner:
         """Returns the command for the next `period_s` seconds, and remembers the observation.
 
         Args:
-            packet: structured array [N] with the fields `t` (microseconds, any order), `x`, `y` and `p` (-1 or 1); older
-                and newer events than those of the window [until_us - window_us, until_us) are left out.
+            packet: structured array [N] with the fields `t` (microseconds, any order), `x`, `y` and `p` (-1 or 1);
+                events that are not in the window [until_us - window_us, until_us) are left out.
             until_us: time of the decision, on the events' clock.
             position: [3] metres in the world.
             quaternion: [4] w, x, y, z, from the body (x ahead, y left, z up) to the world.
@@ -140,7 +142,11 @@ class Runner:
         """
         place, attitude, speed = (
             _numbers(name, given, (size,))
-            for name, given, size in (("position", position, 3), ("quaternion", quaternion, 4), ("velocity", velocity, 3))
+            for name, given, size in (
+                ("position", position, 3),
+                ("quaternion", quaternion, 4),
+                ("velocity", velocity, 3),
+            )
         )
         aim, bounds = _numbers("goal", goal, (3,)), _numbers("volume", volume, (2, 3))
         if not np.all(bounds[0] < bounds[1]):
@@ -220,7 +226,9 @@ class Grid:
             scale = np.tan(np.radians(camera_fov_deg) / 2) / across
             scale /= np.tan(np.radians(about["horizontal_fov_deg"]) / 2) / width
             columns, rows = _places(across, width, scale), _places(down, height, scale)
-        many = np.bincount(rows[rows >= 0], minlength=height)[:, None] * np.bincount(columns[columns >= 0], minlength=width)
+        many = np.bincount(rows[rows >= 0], minlength=height)[:, None] * np.bincount(
+            columns[columns >= 0], minlength=width
+        )
         inside = _hull(rows)[1], _hull(columns)[1]
         if np.any(many[_hull(rows)[0] : inside[0], _hull(columns)[0] : inside[1]] == 0):
             raise ValueError(

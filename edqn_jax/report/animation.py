@@ -60,7 +60,7 @@ def animate(sights: Sights, params: PolicyParams, flown: Mapping[str, np.ndarray
         stage = _Stage(sights, params, flown, f"{title}, {speed_up:.1f} times as fast as flown")
         frames = [stage.frame(int(number), int(rows[number])) for number in shown]
         frames.append(stage.frame(len(rows) - 1, len(flown["t"]) - 1, outcome))
-    return _gif(frames, [FRAME_S] * len(shown) + [LAST_FRAME_S])
+    return gif(frames, [FRAME_S] * len(shown) + [LAST_FRAME_S])
 
 
 class _Stage:
@@ -195,7 +195,7 @@ def _heading_deg(w: float, z: float) -> float:
     return float(np.degrees(2 * np.arctan2(z, w)))
 
 
-def _gif(frames: list[Image.Image], seconds: list[float]) -> bytes:
+def gif(frames: list[Image.Image], seconds: list[float]) -> bytes:
     """Returns the frames as a GIF with one palette, of which each frame stores what has changed."""
     palette = _palette(frames)
     first, *others = (frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames)
