@@ -27,7 +27,8 @@ def read_npz(file: Path, size: tuple[int, int] | None, time_unit: TimeUnit | Non
         ConfigError: if it is damaged, or has no such arrays.
     """
     try:
-        with np.load(file, allow_pickle=False) as opened:
+        # np.load leaves a file open that it cannot read.
+        with file.open("rb") as content, np.load(content, allow_pickle=False) as opened:
             held = {key: opened[key] for key in opened.files}
     except (OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error) as error:
         raise ConfigError(f"'{file}' is damaged, or no .npz file: {error}") from None

@@ -131,7 +131,7 @@ def _motion(
 
 
 def _encoded(config: Config, params: Any, counts: Array, motion: Array) -> tuple[Array, Array]:
-    """Returns signed event images [D, H, W], and what is drawn of the codes [D, H, W]; a code may see the one before."""
+    """Returns signed event images and what is drawn of the codes, each [D, H, W]; a code may see the one before."""
 
     def one(code: Array, given: tuple[Array, Array]) -> tuple[Array, tuple[Array, Array]]:
         field = field_of(config, given[0])

@@ -27,6 +27,9 @@ MOMENTS = 6
 MOST_FRAMES = 120
 """Frames of the longest GIF; of a longer recording every other window is shown, or fewer."""
 
+COLOURS = 256
+"""Of a GIF: greys are to stay grey beside the tints of events."""
+
 DOTS_PER_INCH = 100
 SLOWEST_S, FASTEST_S = 0.5, 0.05
 """Longest and shortest time for which a frame is shown, seconds."""
@@ -62,7 +65,7 @@ def draw_recording(strips: Sequence[Strip], times_s: Sequence[float], file: Path
             for axes, picture in zip(line, strip.pictures, strict=True):
                 _image(axes, picture, strip, scale)
                 if strip.look.signed:
-                    axes.set_xlabel(f"{int(np.abs(picture).sum()):,} events", fontsize=7, labelpad=2)
+                    axes.set_xlabel(f"{int(np.abs(picture).sum()):,} net events", fontsize=7, labelpad=2)
             line[0].set_ylabel(strip.title, fontsize=7)
         for axes, time in zip(grid[0], times_s, strict=True):
             axes.set_title(f"t = {time:.2f} s", weight="normal", loc="center", fontsize=8)
@@ -92,7 +95,7 @@ def animate_recording(strips: Sequence[Strip], times_s: Sequence[float], period_
             clock.set_text(f"t = {time:.2f} s")
             canvas.draw()
             frames.append(Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3]))
-    return gif(frames, [float(np.clip(period_s, FASTEST_S, SLOWEST_S))] * len(frames))
+    return gif(frames, [float(np.clip(period_s, FASTEST_S, SLOWEST_S))] * len(frames), COLOURS)
 
 
 def _image(axes, picture: NDArray, strip: Strip, scale) -> AxesImage:
