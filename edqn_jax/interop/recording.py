@@ -169,16 +169,14 @@ def found_unit(name: str, t: NDArray) -> TimeUnit:
     for unit, factor in MICROSECONDS.items():
         seconds = length * factor * 1e-6
         rate = len(t) / seconds if seconds > 0.0 else np.inf
-        fine = unit in ("us", "ns") if whole else unit in ("s", "ms")
+        fine = unit != "s" if whole else unit in ("s", "ms")
         plausible = PLAUSIBLE_SECONDS[0] <= seconds <= PLAUSIBLE_SECONDS[1]
         if plausible and fine and PLAUSIBLE_RATE_HZ[0] <= rate <= PLAUSIBLE_RATE_HZ[1]:
             found.append(unit)
     if len(found) == 1:
         return found[0]
-    which = " or ".join(found) if found else "no unit that makes a plausible recording"
-    raise ConfigError(
-        f"'{name}' does not say the unit of its times, which may be {which}; give --time-unit s, ms, us or ns"
-    )
+    which = f"which may be {' or '.join(found)}" if found else "and in none of them it is a plausible recording"
+    raise ConfigError(f"'{name}' does not say the unit of its times, {which}; give --time-unit s, ms, us or ns")
 
 
 def signs(name: str, p: NDArray) -> tuple[NDArray[np.int8], str]:

@@ -231,7 +231,7 @@ def test_pairs_of_frames_are_counted_apart():
     [
         (np.zeros((3, 4)), "structured array"),
         (event(1, 4, 0, 1), "outside of an image of 4 x 2"),
-        (event(1, 0, 0, 0), "must be -1 or 1; with 0 and 1, give 2 * p - 1"),
+        (event(1, 0, 0, 0), r"must be -1 or 1; with 0 and 1, give 2 \* p - 1"),
     ],
 )
 def test_what_is_no_packet_is_refused(packet, says):
