@@ -56,7 +56,7 @@ def read_camera_file(file: Path, size: tuple[int, int] | None) -> Recording:
         raise ConfigError(f"'{file}' does not say how large the image is; give --size W H")
     if size is not None and size != (width, height):
         raise ConfigError(f"'{file}' says that its image is {width} x {height}, not {size[0]} x {size[1]}")
-    events = np.concatenate(packets) if packets else np.zeros(0, faery.EVENTS_DTYPE)
+    events: Any = np.concatenate(packets) if packets else np.zeros(0, faery.EVENTS_DTYPE)
     return recording_of(
         str(file),
         t=events["t"].astype(np.int64),

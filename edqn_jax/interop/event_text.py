@@ -11,6 +11,7 @@ from __future__ import annotations
 import io
 import re
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -65,9 +66,10 @@ def read_text(
         except ValueError as error:
             raise ConfigError(f"'{file}' is damaged: a line must hold {', '.join(order)}: {error}") from None
     says = None if unit is None or time_unit is not None else f"{unit}, as the first line says"
+    events: Any = held
     return recording_of(
         str(file),
-        **{key: held[key] for key in ORDER},
+        **{key: events[key] for key in ORDER},
         size=size or said,
         time_unit=time_unit or unit,
         says_unit=says,

@@ -71,7 +71,7 @@ class Runner:
         Raises:
             ValueError: if the file is no exported policy, or the camera cannot stand for the policy's.
         """
-        import onnxruntime
+        import onnxruntime  # pyright: ignore[reportMissingImports]
 
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = options.inter_op_num_threads = threads
@@ -79,11 +79,12 @@ class Runner:
         if not path.is_file():
             raise ValueError(f"there is no file '{path}'")
         try:
-            self._session = onnxruntime.InferenceSession(path.read_bytes(), options, ["CPUExecutionProvider"])
+            session = onnxruntime.InferenceSession(path.read_bytes(), options, ["CPUExecutionProvider"])
         except Exception as error:
             raise ValueError(
                 f"'{path}' is not an ONNX file that onnxruntime {onnxruntime.__version__} reads"
             ) from error
+        self._session: Any = session
         self.about = _about(self._session.get_modelmeta().custom_metadata_map, path)
         """What the policy expects, as `edqn export` wrote it."""
         self._grid = Grid.of(self.about, camera, camera_fov_deg)
@@ -340,7 +341,7 @@ def own_state(
 
 
 def own_motion(
-    about: Mapping[str, Any], yaw: np.float32, velocity: NDArray[np.float32], yaw_rate: ArrayLike, move: NDArray
+    about: Mapping[str, Any], yaw: np.float32, velocity: NDArray[np.float32], yaw_rate: Any, move: NDArray
 ) -> NDArray[np.float32]:
     """Returns the drone's own motion [7]: velocity in the heading frame (3), yaw rate, last move (3)."""
     most = about["most_yaw_rate"]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -25,7 +26,7 @@ WORDS = {"evt2.raw": event_words.evt2, "evt3.raw": event_words.evt3}
 
 
 def as_faery(events: np.ndarray) -> np.ndarray:
-    held = np.empty(len(events), faery.EVENTS_DTYPE)
+    held: Any = np.empty(len(events), faery.EVENTS_DTYPE)
     for key in "txy":
         held[key] = events[key]
     held["on"] = events["p"] > 0

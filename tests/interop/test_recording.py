@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -16,7 +18,8 @@ COLUMNS = {key: EVENTS[key] for key in "txyp"}
 
 
 def made(**changed) -> Recording:
-    return recording_of("f", **({"time_unit": "us"} | COLUMNS | changed))
+    columns: Any = {"time_unit": "us"} | COLUMNS | changed
+    return recording_of("f", **columns)
 
 
 @pytest.mark.parametrize("unit", MICROSECONDS)

@@ -125,7 +125,7 @@ def test_other_policies_fly_as_in_jax(tmp_path, groups):
 def test_it_flies_a_whole_flight_where_jax_cannot_be_imported(exported, tmp_path):
     decisions = whole_flight(0)
     packets = [each.packet for each in decisions]
-    held = {name: np.stack([each.given[name] for each in decisions]) for name in decisions[0].given}
+    held: Any = {name: np.stack([each.given[name] for each in decisions]) for name in decisions[0].given}
     held["until_us"] = np.array([each.until_us for each in decisions])
     held["first"] = np.cumsum([0, *(len(packet) for packet in packets)])
     np.savez(tmp_path / "flight.npz", packets=np.concatenate(packets), **held)
@@ -209,8 +209,7 @@ def test_an_event_of_a_coarser_contrast_is_several():
 
 
 def test_a_wider_camera_is_cropped_and_a_narrower_one_leaves_a_margin():
-    columns = np.arange(16)
-    packet = np.concatenate([event(1, x, 3, 1) for x in columns] * 4)
+    packet = np.concatenate([event(1, x, 3, 1) for x in range(16)] * 4)
     # tan(126.87 deg / 2) = 2: the middle half of the image is what the policy sees.
     wide = runner.Grid.of(ABOUT, (16, 8), 126.8699)
     assert wide.columns.tolist() == [-1] * 4 + [0, 0, 1, 1, 2, 2, 3, 3] + [-1] * 4
