@@ -29,7 +29,8 @@ def test_it_keeps_to_one_core_and_says_what_it_measured(
     assert "of 64 x 48 pixels to the command" in capsys.readouterr().out
 
 
-def test_bad_input_is_one_sentence(capsys: pytest.CaptureFixture[str]) -> None:
+def test_bad_input_is_one_sentence(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.setattr(os, "sched_setaffinity", lambda pid, cores: None, raising=False)
     assert deployed.main(["nowhere"]) == 2
     assert capsys.readouterr().err.count("\n") == 1
     assert deployed.main(["--camera", "0", "4"]) == 2

@@ -57,7 +57,7 @@ def test_places_and_headings_are_those_of_px4():
 def test_attitudes_are_those_of_px4():
     there = frames()
     swap, flip = np.array([[0.0, 1, 0], [1, 0, 0], [0, 0, -1]]), np.diag([1.0, -1, -1])
-    for turn in Rotation.random(20, random_state=0):
+    for turn in Rotation.from_quat(np.random.default_rng(0).normal(size=(20, 4))):
         q = turn.as_quat(scalar_first=True)
         found = Rotation.from_quat(there["quaternion_from_ned"](q), scalar_first=True).as_matrix()
         np.testing.assert_allclose(found, swap @ turn.as_matrix() @ flip, atol=1e-12)

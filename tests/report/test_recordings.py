@@ -29,7 +29,7 @@ def test_a_still_picture_has_a_row_a_strip_and_a_column_a_moment(tmp_path: Path)
     assert len(figure.axes) == len(STRIPS) * len(TIMES_S)
     assert [axes.get_title() for axes in figure.axes[:4]] == [f"t = {time:.2f} s" for time in TIMES_S]
     assert figure.axes[1].get_xlabel() == f"{np.abs(STRIPS[0].pictures[1]).sum()} net events"
-    drawn = [axes.images[0].get_array() for axes in figure.axes]
+    drawn = [np.asarray(axes.images[0].get_array()) for axes in figure.axes]
     assert np.array_equal(np.stack(drawn[4:]), STRIPS[1].pictures)
 
 
