@@ -100,12 +100,15 @@ class EvaluateArgs:
 
 @dataclass(frozen=True)
 class RecordArgs:
-    """Fly a saved run once and write the flight as an animated GIF: the view, what the drone sees, and its path."""
+    """Fly a saved run once and write the flight as an animated GIF, or the events of a camera that watches it."""
 
     run: Annotated[Positional[Path], arg(metavar="RUN")]
     """Folder of the run, or `pretrained`: the policy that comes with the package."""
-    file: Annotated[Positional[Path], arg(metavar="FILE.gif")]
-    """GIF to write; it replaces a file of that name."""
+    file: Annotated[Positional[Path], arg(metavar="FILE")]
+    """What to write; it replaces a file of that name. FILE.gif: the view, what the drone sees, and its path.
+    FILE.h5, .npz or .txt: the events of a camera with a frame at every physics step."""
+    size: Annotated[tuple[int, int] | None, arg(metavar="W H", help_behavior_hint="")] = None
+    """Pixels across and down of the camera whose events are written (default: those of the policy's)."""
     world: Annotated[str | None, arg(metavar="WORLD", help_behavior_hint="")] = None
     """Where to fly: `paper`, an MJCF file, or a family of random worlds (default: that of the run's last flight)."""
     start: Annotated[Point | None, arg(metavar="X Y Z", help_behavior_hint="")] = None
@@ -126,7 +129,57 @@ class VerifyArgs:
     """Also write what was found as JSON."""
 
 
+@dataclass(frozen=True)
+class ExportArgs:
+    """Write a policy as ONNX, for a computer without JAX, and beside it the runner that flies it; compares both."""
+
+    run: Annotated[Positional[Path], arg(metavar="RUN")]
+    """Folder of the run, or `pretrained`: the policy that comes with the package."""
+    out: Annotated[Path, arg(metavar="FILE.onnx")]
+    """File to write; it replaces one of that name."""
+    checks: Annotated[int, arg(metavar="N")] = 1000
+    """Random inputs on which ONNX and JAX must choose the same moves, with values that are equal to 1e-5."""
+
+
+@dataclass(frozen=True)
+class EventsArgs:
+    """Say what a file of events holds; see it as a policy does; write it in another form."""
+
+    file: Annotated[Positional[Path], arg(metavar="FILE")]
+    """HDF5 in DSEC's layout (.h5, .hdf5), NumPy (.npz), text (.txt, .csv), or a camera's own file: .aedat4, .raw (EVT2,
+    EVT3), .dat, .es."""
+    size: Annotated[tuple[int, int] | None, arg(metavar="W H", help_behavior_hint="")] = None
+    """Pixels across and down, where the file does not say (default: what the file says)."""
+    time_unit: Annotated[Literal["s", "ms", "us", "ns"] | None, arg(help_behavior_hint="")] = None
+    """Unit of the times, where the file does not say (default: the only plausible one)."""
+    columns: Annotated[str | None, arg(metavar="t,x,y,p", help_behavior_hint="")] = None
+    """Order of a text's columns, where its first line does not name them (default: t,x,y,p)."""
+    start: Annotated[float | None, arg(metavar="S", help_behavior_hint="")] = None
+    """Leave out what is before this, seconds from the first event."""
+    stop: Annotated[float | None, arg(metavar="S", help_behavior_hint="")] = None
+    """Leave out what is from this on, seconds from the first event."""
+    policy: Annotated[Path | None, arg(metavar="RUN", help_behavior_hint="")] = None
+    """Run, or `pretrained`, at whose resolution and in whose windows the events are shown, and which encodes them."""
+    contrast: Annotated[float | None, arg(metavar="C", help_behavior_hint="")] = None
+    """Change of log brightness that makes an event in the camera (default: that of the policy)."""
+    fov: Annotated[float | None, arg(metavar="DEG", help_behavior_hint="")] = None
+    """The camera's horizontal field of view, degrees (default: its whole image is taken for the policy's)."""
+    velocity: Annotated[Point, arg(metavar="X Y Z")] = (0.0, 0.0, 0.0)
+    """Velocity ahead, to the left and up, m/s, where the file has no flight: the encoder reads events with it."""
+    yaw_rate: Annotated[float, arg(metavar="R")] = 0.0
+    """Yaw rate, rad/s to the left, likewise."""
+    window: Annotated[float | None, arg(metavar="S", help_behavior_hint="")] = None
+    """Length of a window in pictures, seconds (default: 0.05; a policy's own with --policy)."""
+    picture: Annotated[Path | None, arg(metavar="FILE.png|gif", help_behavior_hint="")] = None
+    """Also draw windows: six moments as a .png, or up to 120 as a .gif."""
+    out: Annotated[Path | None, arg(metavar="FILE.h5|npz|txt", help_behavior_hint="")] = None
+    """Also write the events, from --start to --stop."""
+    json: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
+    """Also write what was found as JSON."""
+
+
 TRAIN, EVALUATE, RECORD, VERIFY = "edqn train", "edqn evaluate", "edqn record", "edqn verify"
+EXPORT, EVENTS = "edqn export", "edqn events"
 
 
 def parse_train(argv: Sequence[str]) -> tuple[TrainOptions, Config]:
@@ -250,8 +303,10 @@ def parse_record(argv: Sequence[str]) -> RecordArgs:
     """
     check_flags(argv, record_flags(), RECORD)
     args = tyro.cli(RecordArgs, args=argv, prog=RECORD)
-    if args.file.suffix.lower() != ".gif":
-        raise ConfigError(f"'{args.file}' must end in .gif; only animated GIFs are written")
+    if args.file.suffix.lower() not in (".gif", ".h5", ".hdf5", ".npz", ".txt"):
+        raise ConfigError(f"'{args.file}' must end in .gif for an animation, or in .h5, .npz or .txt for events")
+    if args.size is not None and (args.file.suffix.lower() == ".gif" or min(args.size) < 1):
+        raise ConfigError("--size must be two whole numbers of at least 1, and is only for files of events")
     _check_run(args.run)
     return args
 
@@ -267,6 +322,44 @@ def parse_verify(argv: Sequence[str]) -> VerifyArgs:
     args = tyro.cli(VerifyArgs, args=argv, prog=VERIFY)
     if not (args.run / "config.yaml").is_file():
         raise ConfigError(f"there is no run in '{args.run}': it holds no config.yaml")
+    return args
+
+
+def parse_export(argv: Sequence[str]) -> ExportArgs:
+    """Returns the checked arguments of `edqn export`.
+
+    Raises:
+        ConfigError: if one is out of its limits, or there is no such run.
+        SystemExit: after printing, for --help and for what does not parse.
+    """
+    check_flags(argv, {_flag(option.name) for option in dataclasses.fields(ExportArgs)}, EXPORT)
+    args = tyro.cli(ExportArgs, args=argv, prog=EXPORT)
+    if args.checks < 1000:
+        raise ConfigError(f"--checks must be at least 1000, not {args.checks}")
+    _check_run(args.run)
+    return args
+
+
+def parse_events(argv: Sequence[str]) -> EventsArgs:
+    """Returns the checked arguments of `edqn events`.
+
+    Raises:
+        ConfigError: if one is out of its limits, or there is no such file or policy.
+        SystemExit: after printing, for --help and for what does not parse.
+    """
+    check_flags(argv, {_flag(option.name) for option in dataclasses.fields(EventsArgs)}, EVENTS)
+    args = tyro.cli(EventsArgs, args=argv, prog=EVENTS)
+    if not args.file.is_file():
+        raise ConfigError(f"there is no file '{args.file}'")
+    for name, number in (("--contrast", args.contrast), ("--window", args.window)):
+        if number is not None and not number > 0.0:
+            raise ConfigError(f"{name} must be above 0, not {number}")
+    if args.window is not None and args.policy is not None:
+        raise ConfigError("--window and --policy cannot both be given: a policy has a window of its own")
+    if args.picture is not None and args.picture.suffix.lower() not in (".png", ".gif"):
+        raise ConfigError(f"'{args.picture}' must end in .png or .gif")
+    if args.policy is not None:
+        _check_run(args.policy)
     return args
 
 

@@ -13,10 +13,14 @@ import tyro
 import edqn_jax
 from edqn_jax.cli.arguments import (
     EvaluateArgs,
+    EventsArgs,
+    ExportArgs,
     RecordArgs,
     TrainCommand,
     VerifyArgs,
     parse_evaluate,
+    parse_events,
+    parse_export,
     parse_record,
     parse_verify,
 )
@@ -24,6 +28,7 @@ from edqn_jax.cli.signals import Stops
 from edqn_jax.cli.train import train_command
 from edqn_jax.config.loading import nearest
 from edqn_jax.errors import CheckError, ConfigError, DivergedError, StoppedError, sentence
+from edqn_jax.packages import MissingPackageError
 
 DONE = 0
 FAILED = 1
@@ -32,9 +37,22 @@ DIVERGED = 3
 BY_SIGNAL = 128
 """What the number of a signal is added to: 130 for SIGINT, 143 for SIGTERM."""
 
-COMMANDS = {"train": TrainCommand, "evaluate": EvaluateArgs, "record": RecordArgs, "verify": VerifyArgs}
+COMMANDS = {
+    "train": TrainCommand,
+    "evaluate": EvaluateArgs,
+    "record": RecordArgs,
+    "verify": VerifyArgs,
+    "export": ExportArgs,
+    "events": EventsArgs,
+}
 
-OF_A_RUN = {"evaluate": parse_evaluate, "record": parse_record, "verify": parse_verify}
+OF_A_RUN = {
+    "evaluate": parse_evaluate,
+    "record": parse_record,
+    "verify": parse_verify,
+    "export": parse_export,
+    "events": parse_events,
+}
 
 
 def run(argv: Sequence[str] | None, stops: Stops) -> int:
@@ -60,6 +78,9 @@ def _dispatched(argv: list[str], stops: Stops) -> int:
         return _dispatch(argv, stops)
     except SystemExit as ending:  # tyro has printed the help, or what is wrong
         return int(ending.code or DONE)
+    except MissingPackageError as missing:
+        print(f"edqn: {sentence(missing)}", file=sys.stderr)
+        return BAD_INPUT
     except (CheckError, ConfigError, DivergedError, StoppedError) as ending:
         print(f"edqn: {sentence(ending)}", file=sys.stderr)
         if isinstance(ending, StoppedError):  # by a signal to this process, or to another of the cluster
@@ -85,7 +106,7 @@ def _dispatch(argv: Sequence[str], stops: Stops) -> int:
 
 
 def _of_a_run(command: str, argv: Sequence[str]) -> None:
-    """Runs a command that works on a finished run; JAX is imported once the arguments are known to be right."""
+    """Runs a command on a finished run or a file; JAX is imported once the arguments are known to be right."""
     args = OF_A_RUN[command](argv)
 
     from edqn_jax.parallel.devices import use_cpu_devices

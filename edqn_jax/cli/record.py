@@ -1,4 +1,4 @@
-"""`edqn record`: flies a saved policy once and writes the flight as an animated GIF."""
+"""`edqn record`: flies a saved policy once and writes the flight as an animated GIF, or the events of its camera."""
 
 from __future__ import annotations
 
@@ -10,14 +10,15 @@ import numpy as np
 from rich.console import Console
 
 from edqn_jax.cli.arguments import RecordArgs
-from edqn_jax.evaluation.missions import load_missions
+from edqn_jax.config import Config
+from edqn_jax.evaluation.missions import MissionSet, load_missions
 from edqn_jax.evaluation.rollouts import fly_on_all_devices
 from edqn_jax.evaluation.trajectories import trajectory
-from edqn_jax.report.animation import animate
-from edqn_jax.report.sights import Sights
+from edqn_jax.learn.policy import PolicyParams
 from edqn_jax.report.style import OUTCOME_LABELS
 from edqn_jax.runs.files import check_can_write, write_atomically
 from edqn_jax.runs.policies import load_run, worlds_replaced
+from edqn_jax.sim.flights import Flights
 from edqn_jax.sim.outcomes import Outcome
 
 
@@ -26,23 +27,51 @@ def record_command(args: RecordArgs) -> None:
 
     Raises:
         ConfigError: if the run, the world or the file to write is not as it should be.
+        MissingPackageError: if the file to write needs the extra `events`.
     """
     check_can_write(args.file)
     config, params = load_run(args.run)
     world = args.world or config.world.flown or config.world.name
     missions = load_missions(config, world, 1, args.seed, args.start, args.goal)
+    write = _write_gif if args.file.suffix.lower() == ".gif" else _write_events
+    outcome, seconds = write(args, config, params, missions)
+    notes = [] if args.world is not None else worlds_replaced(args.run)
+    for note in (*notes, *([missions.note] if missions.note is not None else [])):
+        Console().print(note, soft_wrap=True, markup=False, highlight=False)
+    Console().print(
+        f"{OUTCOME_LABELS[outcome]} after {seconds:.1f} s; '{args.file}' has {args.file.stat().st_size / 1e6:.1f} MB",
+        soft_wrap=True,
+        markup=False,
+        highlight=False,
+    )
+
+
+def _write_gif(args: RecordArgs, config: Config, params: PolicyParams, missions: MissionSet) -> tuple[str, float]:
+    """Writes the flight as an animated GIF; returns how it ended, and after how many seconds."""
+    from edqn_jax.report.animation import animate
+    from edqn_jax.report.sights import Sights
+
     scene = jax.tree.map(np.asarray, missions.scene())
     with ThreadPoolExecutor(2, thread_name_prefix="compiling") as pool:
         sights = Sights(config, scene, pool)
         flights = fly_on_all_devices(config, missions.world, params, args.seed, record=True)
-        outcome = Outcome(int(flights.outcome[0])).name.lower()
+        outcome, seconds = _ending(flights)
         name = missions.name if missions.file is None else Path(missions.name).stem
         gif = animate(sights, params, trajectory(config, flights), outcome, title=f"world '{name}'")
     write_atomically(args.file, gif)
-    notes = [] if args.world is not None else worlds_replaced(args.run)
-    for note in (*notes, *([missions.note] if missions.note is not None else [])):
-        Console().print(note, soft_wrap=True, markup=False, highlight=False)
-    flown = f"{OUTCOME_LABELS[outcome]} after {float(flights.flight_seconds[0]):.1f} s"
-    Console().print(
-        f"{flown}; '{args.file}' has {len(gif) / 1e6:.1f} MB", soft_wrap=True, markup=False, highlight=False
-    )
+    return outcome, seconds
+
+
+def _write_events(args: RecordArgs, config: Config, params: PolicyParams, missions: MissionSet) -> tuple[str, float]:
+    """Writes the events of a camera that watches the flight; returns as `_write_gif`."""
+    from edqn_jax.interop.event_files import check_can_write_events, write_events
+    from edqn_jax.interop.flight_events import flight_recording
+
+    check_can_write_events(args.file)
+    flights = fly_on_all_devices(config, missions.world, params, args.seed, record=True)
+    write_events(args.file, flight_recording(config, missions.world, trajectory(config, flights), args.size))
+    return _ending(flights)
+
+
+def _ending(flights: Flights) -> tuple[str, float]:
+    return Outcome(int(flights.outcome[0])).name.lower(), float(flights.flight_seconds[0])

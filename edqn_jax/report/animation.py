@@ -60,7 +60,7 @@ def animate(sights: Sights, params: PolicyParams, flown: Mapping[str, np.ndarray
         stage = _Stage(sights, params, flown, f"{title}, {speed_up:.1f} times as fast as flown")
         frames = [stage.frame(int(number), int(rows[number])) for number in shown]
         frames.append(stage.frame(len(rows) - 1, len(flown["t"]) - 1, outcome))
-    return _gif(frames, [FRAME_S] * len(shown) + [LAST_FRAME_S])
+    return gif(frames, [FRAME_S] * len(shown) + [LAST_FRAME_S])
 
 
 class _Stage:
@@ -195,9 +195,15 @@ def _heading_deg(w: float, z: float) -> float:
     return float(np.degrees(2 * np.arctan2(z, w)))
 
 
-def _gif(frames: list[Image.Image], seconds: list[float]) -> bytes:
-    """Returns the frames as a GIF with one palette, of which each frame stores what has changed."""
-    palette = _palette(frames)
+def gif(frames: list[Image.Image], seconds: list[float], colours: int = COLOURS) -> bytes:
+    """Returns the frames as a GIF with one palette, of which each frame stores what has changed.
+
+    Args:
+        frames: of one size.
+        seconds: for which each is shown.
+        colours: in the palette, at most 256.
+    """
+    palette = _palette(frames, colours)
     first, *others = (frame.quantize(palette=palette, dither=Image.Dither.NONE) for frame in frames)
     file = io.BytesIO()
     first.save(
@@ -213,7 +219,7 @@ def _gif(frames: list[Image.Image], seconds: list[float]) -> bytes:
     return file.getvalue()
 
 
-def _palette(frames: list[Image.Image], many: int = 8) -> Image.Image:
+def _palette(frames: list[Image.Image], number: int, many: int = 8) -> Image.Image:
     """Returns an image with the palette of all frames.
 
     Vivid colours have a share of their own: they are few pixels, but marks, events and paths are made of them.
@@ -221,7 +227,7 @@ def _palette(frames: list[Image.Image], many: int = 8) -> Image.Image:
     chosen = np.unique(np.linspace(0, len(frames) - 1, many).round().astype(int))
     pixels = np.concatenate([np.asarray(frames[i]).reshape(-1, 3) for i in chosen])
     vivid = np.ptp(pixels.astype(int), axis=1) > VIVID
-    colours = [_main_colours(pixels[vivid], VIVID_COLOURS), _main_colours(pixels[~vivid], COLOURS - VIVID_COLOURS)]
+    colours = [_main_colours(pixels[vivid], VIVID_COLOURS), _main_colours(pixels[~vivid], number - VIVID_COLOURS)]
     palette = Image.new("P", (1, 1))
     palette.putpalette(np.concatenate(colours).astype(np.uint8).tobytes())
     return palette

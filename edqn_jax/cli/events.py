@@ -1,0 +1,171 @@
+"""`edqn events`: what a file of events holds, how a policy sees it, and the same events in another form."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+
+from edqn_jax.cli.arguments import EventsArgs
+from edqn_jax.interop.event_files import check_can_write_events, read_events, write_events
+from edqn_jax.interop.recording import Recording
+from edqn_jax.interop.seen_events import image_at, seen_by, window_ends
+from edqn_jax.report.recordings import (
+    DECODED,
+    EVENTS,
+    MOMENTS,
+    MOST_FRAMES,
+    NEARNESS,
+    Strip,
+    animate_recording,
+    draw_recording,
+    moments,
+)
+from edqn_jax.runs.directory import plain
+from edqn_jax.runs.files import check_can_write, write_atomically
+from edqn_jax.runs.policies import load_policy
+
+WINDOW_S = 0.05
+"""Length of a window in pictures without a policy, seconds."""
+
+
+def events_command(args: EventsArgs) -> None:
+    """Runs `edqn events` with these arguments.
+
+    Raises:
+        ConfigError: if the file, the policy or a file to write is not as it should be.
+        MissingPackageError: if the extra `events` is needed and not installed.
+    """
+    for file in (args.picture, args.json):
+        if file is not None:
+            check_can_write(file)
+    if args.out is not None:
+        check_can_write_events(args.out)
+    console = Console()
+    whole = read_events(args.file, size=args.size, time_unit=args.time_unit, columns=args.columns)
+    recording = whole.between(args.start, args.stop)
+    figures: dict[str, Any] = {"file": str(args.file), **found(recording)}
+    strips, times_s, period_s = _strips(args, recording, figures)
+    console.print(report(figures))
+    if args.policy is not None:
+        for note in _notes(args, recording):
+            console.print(note, soft_wrap=True, markup=False, highlight=False)
+    if args.picture is not None:
+        if args.picture.suffix.lower() == ".gif":
+            write_atomically(args.picture, animate_recording(strips, times_s, period_s))
+        else:
+            draw_recording(strips, times_s, args.picture)
+    if args.out is not None:
+        write_events(args.out, recording)
+    if args.json is not None:
+        write_atomically(args.json, json.dumps(plain(figures), indent=2, allow_nan=False) + "\n")
+
+
+def found(recording: Recording) -> dict[str, Any]:
+    """Returns what a recording holds, as figures."""
+    events = recording.events
+    known = recording.width is not None
+    return {
+        "events": len(events),
+        "seconds": recording.seconds,
+        "first_us": int(events["t"][0]),
+        "events_per_second": len(events) / recording.seconds if recording.seconds else None,
+        "on_share": float(np.mean(events["p"] > 0)),
+        "width": recording.width if known else int(events["x"].max()) + 1,
+        "height": recording.height if known else int(events["y"].max()) + 1,
+        "size_is_known": known,
+        "time_unit": recording.time_unit,
+        "polarity": recording.polarity,
+        "out_of_order": recording.out_of_order,
+        "contrast": recording.contrast,
+        "has_flight": recording.flight is not None,
+    }
+
+
+def report(figures: dict[str, Any]) -> Table:
+    """Returns what a recording holds as a table for people."""
+    table = Table(title=figures["file"], show_header=False, title_justify="left")
+    table.add_column()
+    table.add_column(justify="right")
+    rate = figures["events_per_second"]
+    table.add_row("events", f"{figures['events']:,}")
+    table.add_row("duration", f"{figures['seconds']:.3f} s, from {figures['first_us'] * 1e-6:.6f} s")
+    table.add_row("rate", "–" if rate is None else f"{rate:,.0f} events/s")
+    table.add_row("ON events", f"{figures['on_share']:.1%}")
+    size = f"{figures['width']} × {figures['height']} pixels"
+    table.add_row("image", size if figures["size_is_known"] else f"at least {size}; the file does not say")
+    table.add_row("unit of time in the file", figures["time_unit"])
+    table.add_row("polarities in the file", figures["polarity"])
+    if figures["out_of_order"]:
+        table.add_row("out of order, sorted", f"{figures['out_of_order']:,}")
+    if figures["contrast"] is not None:
+        table.add_row("contrast per event", f"{figures['contrast']:g}")
+    if figures["has_flight"]:
+        table.add_row("poses of the camera", "yes")
+    if "seen" in figures:
+        seen = figures["seen"]
+        table.add_row(f"as '{seen['policy']}' sees it", f"{seen['windows']} windows of {seen['window_s']:g} s")
+    return table
+
+
+def _strips(args: EventsArgs, recording: Recording, figures: dict[str, Any]) -> tuple[list[Strip], list[float], float]:
+    """Returns what there is to draw, when, and how long a frame is to be shown."""
+    if args.policy is None and args.picture is None:
+        return [], [], 0.0
+    most = MOST_FRAMES if args.picture is not None and args.picture.suffix.lower() == ".gif" else MOMENTS
+    begin = int(recording.events["t"][0])
+    seen = None
+    if args.policy is None:
+        window_us = round(1e6 * (args.window or WINDOW_S))
+        ends = window_ends(recording, window_us, window_us)
+        period_s = window_us * 1e-6
+    else:
+        policy = load_policy(args.policy)
+        seen = seen_by(
+            policy,
+            recording,
+            contrast=args.contrast,
+            fov_deg=args.fov,
+            velocity=args.velocity,
+            yaw_rate=args.yaw_rate,
+        )
+        times = policy.config.events.frame_times_s
+        window_us, ends = round(1e6 * (times[-1] - times[0])), seen.until_us
+        period_s = policy.config.drone.physics_steps * policy.config.drone.physics_dt_s
+        figures["seen"] = {
+            "policy": str(args.policy),
+            "windows": len(ends),
+            "window_s": window_us * 1e-6,
+            "width": policy.config.camera.width,
+            "height": policy.config.camera.height,
+            "events_per_window": float(np.abs(seen.image).sum(axis=(1, 2)).mean()),
+        }
+    chosen = moments(len(ends), most)
+    width, height = recording.size()
+    images = np.stack([image_at(recording, int(ends[number]), window_us) for number in chosen])
+    strips = [Strip(f"camera,\n{width} × {height}", images, EVENTS)]
+    if seen is not None:
+        height, width = seen.image.shape[1:]
+        strips.append(Strip(f"policy sees,\n{width} × {height}", seen.image[chosen], EVENTS))
+        name, look = ("decoded nearness", NEARNESS) if seen.has_nearness else ("decoded events", DECODED)
+        strips.append(Strip(name, seen.decoded[chosen], look))
+    return strips, [float(ends[number] - begin) * 1e-6 for number in chosen], period_s
+
+
+def _notes(args: EventsArgs, recording: Recording) -> list[str]:
+    """Returns a sentence for each thing that the policy was told without the file saying so."""
+    notes = []
+    if args.contrast is None and recording.contrast is None:
+        notes.append("contrast: that of the policy was assumed; --contrast gives the camera's")
+    if args.fov is None:
+        notes.append("field of view: the camera's whole image was taken for the policy's; --fov gives its own")
+    if recording.flight is None:
+        speed = " ".join(f"{each:g}" for each in args.velocity)
+        notes.append(
+            f"own motion: the encoder was told {speed} m/s and {args.yaw_rate:g} rad/s throughout; --velocity and "
+            "--yaw-rate give it, and without the right one its nearness is none"
+        )
+    return notes

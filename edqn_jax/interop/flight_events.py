@@ -1,0 +1,72 @@
+"""The events of a camera that watches a simulated flight, as a recording to exchange."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from edqn_jax.config import Config
+from edqn_jax.interop.recording import Recording
+from edqn_jax.sim.drone import Flight
+from edqn_jax.sim.env import World
+from edqn_jax.sim.environment import Environment
+from edqn_jax.sim.moves import ACTIONS
+
+
+def flight_recording(
+    config: Config, world: World, flown: Mapping[str, np.ndarray], size: tuple[int, int] | None = None
+) -> Recording:
+    """Returns the events of a flight, with a frame at every physics step, and where the camera was.
+
+    The camera is an ESIM sensor, which remembers each pixel's level from frame to frame. Where the policy's own law has
+    no memory (`paper`, `airsim`), the contrast of an event is that law's tolerance.
+
+    Args:
+        config: of the policy that flew.
+        world: of the flight, with one mission.
+        flown: the columns of `trajectory.csv`, one row after each physics step.
+        size: width and height of the image; None is the policy's own.
+    """
+    law = config.events
+    contrast = {"paper": law.tolerance, "airsim": law.airsim_tolerance, "esim": law.contrast_on}[law.law]
+    off = law.contrast_off if law.law == "esim" else contrast
+    camera = config.camera if size is None else dataclasses.replace(config.camera, width=size[0], height=size[1])
+    sees = dataclasses.replace(
+        config,
+        camera=camera,
+        events=dataclasses.replace(law, contrast_on=contrast, contrast_off=off),
+    )
+    poses = _from_start(world, flown)
+    stream = Environment(sees, world).stream(poses, law="esim")
+    steps = round(config.drone.physics_dt_s * 1e6)
+    moves = ACTIONS[flown["action"].astype(int)]
+    return Recording(
+        stream,
+        camera.width,
+        camera.height,
+        contrast=contrast if contrast == off else None,
+        flight={
+            "t": steps * np.arange(len(poses.position), dtype=np.int64),
+            "position": np.asarray(poses.position, np.float32),
+            "quaternion": np.asarray(poses.quaternion, np.float32),
+            "velocity": np.asarray(poses.velocity, np.float32),
+            "move": np.concatenate([np.zeros((1, 3)), moves]).astype(np.int8),
+        },
+    )
+
+
+def _from_start(world: World, flown: Mapping[str, np.ndarray]) -> Flight:
+    """Returns the poses of a flight: at rest at the mission's start, facing the goal, then after each physics step."""
+    start, goal = (np.asarray(each[0], np.float64) for each in (world.missions.start, world.missions.goal))
+    half = np.arctan2(goal[1] - start[1], goal[0] - start[0]) / 2
+    first = {"position": start, "quaternion": [np.cos(half), 0.0, 0.0, np.sin(half)], "velocity": np.zeros(3)}
+    names = {"position": "xyz", "quaternion": ("qw", "qx", "qy", "qz"), "velocity": ("vx", "vy", "vz")}
+    columns = {
+        key: jnp.asarray(np.vstack([first[key], np.column_stack([flown[name] for name in names[key]])]), jnp.float32)
+        for key in names
+    }
+    return Flight(**jax.tree.map(jnp.asarray, columns))

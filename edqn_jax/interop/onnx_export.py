@@ -1,0 +1,270 @@
+"""A policy as an ONNX file that a computer without JAX flies, by `interop/runner.py`. Needs the extra `export`."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+import edqn_jax
+from edqn_jax.config import Config
+from edqn_jax.errors import CheckError, ConfigError
+from edqn_jax.interop import runner
+from edqn_jax.learn import policy
+from edqn_jax.learn.policy import Memory, Policy, PolicyParams, observation_size
+from edqn_jax.learn.qnetwork import q_values
+from edqn_jax.packages import require
+from edqn_jax.runs.files import check_can_write, write_atomically
+from edqn_jax.sim import events
+from edqn_jax.sim.env import MOST_YAW_RATE, MOTION_SIZE, OWN_SIZE, Observation
+from edqn_jax.sim.events import EventField
+from edqn_jax.sim.moves import ACTIONS, move_name
+
+RUNNER = "edqn_runner.py"
+"""Name of the copy of the runner that is written beside a policy."""
+
+INPUTS, OUTPUTS = ("counts", "own", "motion", "memory"), ("values", "memory_after")
+
+OPSET, IR_VERSION = 18, 8
+"""The oldest that this network can be written in, so that older versions of onnxruntime read it."""
+
+TOLERANCE = 1e-5
+"""Largest difference between a value of the Q-network in JAX and in ONNX, of the largest value where that exceeds 1."""
+
+CHECKS = 1000
+"""Random inputs that are compared before a policy is written."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Exported:
+    """An exported policy, compared with JAX."""
+
+    file: Path
+    runner: Path
+    checks: int
+    """Random inputs that were compared."""
+    largest_difference: float
+    """Of any value of the Q-network."""
+    ties: int
+    """Inputs whose best moves are equally good within the tolerance, so that either may be chosen."""
+
+
+def export_policy(flown: Policy, file: str | Path, *, checks: int = CHECKS, digest: str | None = None) -> Exported:
+    """Writes a policy as ONNX with all that the runner must know, and a copy of the runner beside it.
+
+    Before anything is written, ONNX and JAX are given the same random inputs.
+
+    Args:
+        flown: a policy that sees events.
+        file: to write; its name ends in .onnx.
+        checks: how many random inputs.
+        digest: SHA-256 of the policy, for the file's metadata.
+
+    Raises:
+        CheckError: if ONNX and JAX do not agree; nothing is written.
+        ConfigError: if the policy does not see events, or sees more of them than their counts, or the file cannot be
+            written.
+    """
+    file = Path(file)
+    if file.suffix.lower() != ".onnx":
+        raise ConfigError(f"'{file}' must end in .onnx")
+    beside = file.with_name(RUNNER)
+    for each in (file, beside):
+        check_can_write(each)
+    jax2onnx = require("jax2onnx", extra="export")
+    require("onnxruntime", extra="export")
+    about = about_policy(flown.config)
+    decide = decision(flown.config, flown.params)
+    model = jax2onnx.to_onnx(
+        decide,
+        inputs=_shapes(flown.config),
+        model_name="edqn_jax_policy",
+        opset=OPSET,
+        input_names=INPUTS,
+        output_names=OUTPUTS,
+    )
+    model.ir_version = IR_VERSION
+    model.producer_name, model.producer_version = "edqn_jax", edqn_jax.__version__
+    difference, ties = _compared(flown.config, jax.jit(decide), model.SerializeToString(), checks)
+    about["checked"] = {"inputs": checks, "largest_difference": difference, "ties": ties}
+    about["policy_sha256"] = digest
+    entry = model.metadata_props.add()
+    entry.key, entry.value = runner.METADATA, json.dumps(about)
+    write_atomically(file, model.SerializeToString())
+    write_atomically(beside, Path(runner.__file__).read_bytes())
+    return Exported(file, beside, checks, difference, ties)
+
+
+def about_policy(config: Config) -> dict[str, Any]:
+    """Returns what the runner must know of a policy, as plain data.
+
+    Raises:
+        ConfigError: if the policy does not see events, or sees more of them than their counts.
+    """
+    sensor, law = config.env.sensor, config.events
+    if sensor not in ("events", "event-image"):
+        raise ConfigError(f"only policies that see events can be exported; the sensor of this one is '{sensor}'")
+    encoder = config.encoder
+    if (
+        sensor == "events"
+        and encoder.architecture == "pooled"
+        and (not _only_counts(config) or encoder.pooling == "max")
+    ):
+        raise ConfigError(
+            "this policy's encoder is 'pooled' and sees when each event was, which the runner does not; encoders of "
+            "patches can be exported, and pooled sums of two frames with the law 'paper' or 'airsim' without noise"
+        )
+    on, off = {
+        "paper": (law.tolerance, law.tolerance),
+        "airsim": (law.airsim_tolerance, law.airsim_tolerance),
+        "esim": (law.contrast_on, law.contrast_off),
+    }[law.law]
+    least = int(law.threshold / law.tolerance + 1e-6) if law.law == "paper" else 1
+    return {
+        "format": runner.FORMAT,
+        "edqn_jax": edqn_jax.__version__,
+        "sensor": sensor,
+        "width": config.camera.width,
+        "height": config.camera.height,
+        "horizontal_fov_deg": config.camera.horizontal_fov_deg,
+        "mount": config.camera.mount,
+        "frame_times_us": [round(t * 1e6) for t in law.frame_times_s],
+        "law": law.law,
+        "contrast_on": on,
+        "contrast_off": off,
+        "least_count": max(1, least),
+        "counts_net": not _has_noise(config),
+        "history": config.agent.history,
+        "observation_size": observation_size(config),
+        "decision_s": config.drone.physics_steps * config.drone.physics_dt_s,
+        "speed_m_s": config.env.speed_m_s,
+        "goal_radius_m": config.env.goal_radius_m,
+        "heading": config.env.heading,
+        "heading_hold_m": config.env.heading_hold_m,
+        "max_yaw_rate_rad_s": config.drone.max_yaw_rate_rad_s,
+        "knows_position": config.env.position,
+        "most_yaw_rate": MOST_YAW_RATE,
+        "actions": ACTIONS.tolist(),
+        "action_names": [move_name(move) for move in range(len(ACTIONS))],
+    }
+
+
+def decision(config: Config, params: PolicyParams) -> Callable[..., tuple[Array, Array]]:
+    """Returns the function that is exported: counts, own state, own motion and memory to values and memory.
+
+    All with a leading [1]: counts [1, F, 2, H, W] int32 of ON and OFF events, own [1, OWN_SIZE], motion
+    [1, MOTION_SIZE], memory [1, history, D]; values [1, 27].
+    """
+    params = jax.tree.map(np.asarray, params)  # constants of the file
+
+    def decide(counts: Array, own: Array, motion: Array, memory: Memory) -> tuple[Array, Array]:
+        observation = Observation(sensed=_sensed(config, counts), own=own, motion=motion)
+        after = policy.see(config, params.encoder, memory, observation)
+        return q_values(config.agent, params.q, len(ACTIONS), after), after
+
+    return decide
+
+
+def field_of(config: Config, counts: Array) -> EventField:
+    """Returns the event field [..., F, H, W] of counts [..., F, 2, H, W] of ON and OFF events.
+
+    Of a policy that was trained with noise it is [..., 2 F, H, W]: ON and OFF apart. Times are those of Eq. 5.
+    """
+    on, off = counts[..., 0, :, :], counts[..., 1, :, :]
+    if _has_noise(config):
+        count = jnp.concatenate([on, off], axis=-3)
+        sign = jnp.concatenate([jnp.ones_like(on), -jnp.ones_like(off)], axis=-3)
+    else:
+        count, sign = on + off, jnp.sign(on - off)
+    edges = np.asarray(config.events.frame_times_s) - config.events.frame_times_s[0]
+    starts, lengths = edges[:-1, None, None], np.diff(edges)[:, None, None]
+    repeats = count.shape[-3] // len(lengths)
+    first, step = events.event_times(
+        count,
+        jnp.asarray(np.tile(starts, (repeats, 1, 1)), jnp.float32),
+        jnp.asarray(np.tile(lengths, (repeats, 1, 1)), jnp.float32),
+    )
+    return EventField(
+        count=count,
+        polarity=sign.astype(jnp.int8),
+        t_first=first,
+        t_step=step,
+        window_s=float(edges[-1]),
+        divides_window=_only_counts(config),
+        with_noise=_has_noise(config),
+    )
+
+
+def _sensed(config: Config, counts: Array) -> EventField | Array:
+    """Returns what the sensor shows where a camera counts these events."""
+    if config.env.sensor == "events":
+        return field_of(config, counts)
+    image = jnp.sum(counts[..., 0, :, :] - counts[..., 1, :, :], axis=-3).astype(jnp.float32)
+    shown = jnp.sign(image) * jnp.log1p(jnp.abs(image))  # as sim.sensor has it
+    return shown.reshape(*shown.shape[:-2], -1)
+
+
+def _has_noise(config: Config) -> bool:
+    return config.events.leak_rate_hz > 0 or config.events.shot_rate_hz > 0 or config.events.hot_pixel_fraction > 0
+
+
+def _only_counts(config: Config) -> bool:
+    """Returns whether the counts of a window say all that there is to its events."""
+    return events.divides_window(config.events, len(config.events.frame_times_s))
+
+
+def _shapes(config: Config) -> list[jax.ShapeDtypeStruct]:
+    pairs = len(config.events.frame_times_s) - 1
+    counts = (1, pairs, 2, config.camera.height, config.camera.width)
+    numbers = [(1, OWN_SIZE), (1, MOTION_SIZE), (1, config.agent.history, observation_size(config))]
+    return [jax.ShapeDtypeStruct(counts, np.int32), *(jax.ShapeDtypeStruct(shape, np.float32) for shape in numbers)]
+
+
+def _random_inputs(config: Config, rng: np.random.Generator) -> list[np.ndarray]:
+    """Returns inputs of every density of events, from none on."""
+    counts, own, motion, memory = (given.shape for given in _shapes(config))
+    number = rng.poisson(3.0 * rng.random(), counts) * (rng.random(counts) < rng.random())
+    if not _has_noise(config):  # of a pixel's events between two frames all have one polarity
+        number[:, :, 0][rng.random(number[:, :, 0].shape) < 0.5] = 0
+        number[:, :, 1][number[:, :, 0] > 0] = 0
+    numbers = (rng.uniform(-1.0, 1.0, own), rng.uniform(-1.0, 1.0, motion), rng.normal(0.0, 0.5, memory))
+    return [number.astype(np.int32), *(each.astype(np.float32) for each in numbers)]
+
+
+def _compared(config: Config, decide: Callable[..., Any], model: bytes, checks: int) -> tuple[float, int]:
+    """Returns the largest difference of any value, and how many best moves are ties.
+
+    Raises:
+        CheckError: if a value or a move differs.
+    """
+    onnxruntime = require("onnxruntime", extra="export")
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = 1
+    session = onnxruntime.InferenceSession(model, options, ["CPUExecutionProvider"])
+    rng, largest, ties = np.random.default_rng(0), 0.0, 0
+    for number in range(checks):
+        given = _random_inputs(config, rng)
+        wanted, remembered = (np.asarray(each) for each in decide(*given))
+        values, memory = session.run(list(OUTPUTS), dict(zip(INPUTS, given, strict=True)))
+        most = TOLERANCE * max(1.0, float(np.abs(wanted).max()))
+        difference = float(np.abs(values - wanted).max())
+        recalled = float(np.abs(memory - remembered).max())
+        if not (difference <= most and recalled <= TOLERANCE * max(1.0, float(np.abs(remembered).max()))):
+            raise CheckError(
+                f"ONNX and JAX differ by {max(difference, recalled):.1e} at random input {number}, more than "
+                f"{most:.1e}; nothing was written"
+            )
+        second, first = np.sort(wanted[0])[-2:]
+        tie = first - second <= 2 * most
+        ties += bool(tie)
+        if not tie and values.argmax() != wanted.argmax():
+            raise CheckError(f"ONNX and JAX choose different moves at random input {number}; nothing was written")
+        largest = max(largest, difference)
+    return largest, ties

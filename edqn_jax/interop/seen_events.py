@@ -1,0 +1,144 @@
+"""A recording as a policy sees it: its windows, at its resolution, encoded and decoded."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from numpy.typing import NDArray
+
+from edqn_jax.config import Config
+from edqn_jax.errors import ConfigError
+from edqn_jax.interop import runner
+from edqn_jax.interop.onnx_export import about_policy, field_of
+from edqn_jax.interop.recording import Recording
+from edqn_jax.learn import embedding, vae
+from edqn_jax.learn.policy import Policy
+from edqn_jax.sim import events
+
+
+@dataclasses.dataclass(frozen=True)
+class Seen:
+    """What a policy sees at D moments of a recording."""
+
+    until_us: NDArray[np.int64]
+    """[D] end of each window, on the recording's clock."""
+    image: NDArray[np.int32]
+    """[D, H, W] ON minus OFF events, as the policy counts them."""
+    decoded: NDArray[np.float32]
+    """[D, H, W] what the decoder draws of the code: nearness, or events per pixel."""
+    has_nearness: bool
+    """Whether it is nearness."""
+
+
+def window_ends(recording: Recording, window_us: int, period_us: int) -> NDArray[np.int64]:
+    """Returns the ends [D] of the windows that are wholly in a recording, one each period, and at least one.
+
+    The first ends a period after the beginning of the flight, where it is known, else a window after the first event.
+    """
+    t = recording.events["t"]
+    if recording.flight is not None:
+        # What `between` leaves of a flight keeps its decisions.
+        begin, last = int(recording.flight["t"][0]), int(recording.flight["t"][-1])
+        ends = np.arange(begin + period_us, last + 1, period_us)
+        inside = ends[(ends - window_us >= t[0]) & (ends <= t[-1] + period_us)]
+        return inside if inside.size else ends[:1]
+    first, last = int(t[0]) + window_us, int(t[-1]) + 1
+    return np.arange(first, max(last, first) + 1, period_us)
+
+
+def image_at(recording: Recording, end_us: int, window_us: int) -> NDArray[np.int32]:
+    """Returns ON minus OFF events of a window [H, W], at the camera's own resolution.
+
+    Raises:
+        ConfigError: if the size of the image is not known.
+    """
+    width, height = recording.size()
+    first, last = np.searchsorted(recording.events["t"], [end_us - window_us, end_us])
+    window = recording.events[first:last]
+    cell = window["y"].astype(np.int64) * width + window["x"]
+    on, off = (np.bincount(cell[window["p"] == sign], minlength=width * height) for sign in (1, -1))
+    return (on - off).reshape(height, width).astype(np.int32)
+
+
+def seen_by(
+    policy: Policy,
+    recording: Recording,
+    *,
+    contrast: float | None = None,
+    fov_deg: float | None = None,
+    velocity: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    yaw_rate: float = 0.0,
+) -> Seen:
+    """Returns what a policy sees of a recording at each of its decisions.
+
+    Args:
+        policy: with an encoder of events.
+        recording: of a camera that looks ahead.
+        contrast: of the camera; None is what the recording says, or the policy's own.
+        fov_deg: horizontal; None takes the camera's whole image for the policy's.
+        velocity: [3] m/s ahead, to the left and up, where the recording has no flight.
+        yaw_rate: rad/s to the left, likewise.
+
+    Raises:
+        ConfigError: if the policy does not encode events, or the camera cannot stand for the policy's.
+    """
+    config = policy.config
+    if config.env.sensor != "events":
+        raise ConfigError(f"only policies with the sensor 'events' encode events, not '{config.env.sensor}'")
+    about = about_policy(config)
+    try:
+        grid = runner.Grid.of(about, recording.size(), fov_deg)
+    except ConfigError:
+        raise
+    except ValueError as error:
+        raise ConfigError(str(error)) from None
+    contrast = recording.contrast if contrast is None else contrast
+    window_us = about["frame_times_us"][-1] - about["frame_times_us"][0]
+    ends = window_ends(recording, window_us, round(about["decision_s"] * 1e6))
+    stream = recording.events
+    first = np.searchsorted(stream["t"], ends - window_us)
+    last = np.searchsorted(stream["t"], ends)
+    counts = np.stack(
+        [
+            runner.counted(about, stream[a:b], int(end) - window_us, grid=grid, contrast=contrast)
+            for a, b, end in zip(first, last, ends, strict=True)
+        ]
+    )
+    motion = np.stack([_motion(about, recording, int(end), velocity, yaw_rate) for end in ends])
+    image, decoded = _encoded(config, policy.params.encoder, jnp.asarray(counts), jnp.asarray(motion))
+    return Seen(ends, np.asarray(image), np.asarray(decoded), embedding.needs_nearness(config))
+
+
+def _motion(
+    about: dict[str, Any], recording: Recording, end_us: int, velocity: tuple[float, float, float], yaw_rate: float
+) -> NDArray[np.float32]:
+    """Returns the own motion [7] at a moment: of the flight, or what was given, with the move nearest to it."""
+    flight = recording.flight
+    if flight is None:
+        given = np.asarray(velocity, np.float32)
+        move = np.clip(np.rint(given / about["speed_m_s"]), -1, 1)
+        return runner.own_motion(about, np.float32(0), given, yaw_rate, move)
+    now = max(int(np.searchsorted(flight["t"], end_us, side="right")) - 1, 1)
+    yaw, before = (runner.heading(flight["quaternion"][row].astype(np.float32)) for row in (now, now - 1))
+    turned = (yaw - before + np.pi) % (2 * np.pi) - np.pi
+    rate = turned / (float(flight["t"][now] - flight["t"][now - 1]) * 1e-6)
+    return runner.own_motion(about, yaw, flight["velocity"][now].astype(np.float32), rate, flight["move"][now])
+
+
+def _encoded(config: Config, params: Any, counts: Array, motion: Array) -> tuple[Array, Array]:
+    """Returns signed event images and what is drawn of the codes, each [D, H, W]; a code may see the one before."""
+
+    def one(code: Array, given: tuple[Array, Array]) -> tuple[Array, tuple[Array, Array]]:
+        field = field_of(config, given[0])
+        code = vae.embed(config.encoder, params, field, given[1], code)
+        channels = vae.decode(config.encoder, config.camera, params, code)
+        nearness = embedding.needs_nearness(config)
+        drawn = channels[-1] if nearness else jnp.sum(jnp.expm1(channels), axis=-3)
+        return code, (events.event_image(field), drawn)
+
+    return jax.jit(lambda c, m: jax.lax.scan(one, jnp.zeros(config.encoder.code_size), (c, m))[1])(counts, motion)

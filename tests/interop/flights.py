@@ -1,0 +1,71 @@
+"""Whole simulated flights of a JAX policy, with all that a runner is given at each decision."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import jax
+import numpy as np
+
+import edqn_jax
+from edqn_jax.config import Config
+from edqn_jax.learn.policy import Policy
+from edqn_jax.sim import drone, env, events
+from edqn_jax.sim.events import EventField
+from edqn_jax.sim.moves import ACTIONS
+
+
+@dataclasses.dataclass(frozen=True)
+class Decided:
+    """One decision of the JAX policy, and what a runner is given for it."""
+
+    packet: np.ndarray
+    until_us: int
+    given: dict[str, Any]
+    move: int
+    command: np.ndarray
+    own: np.ndarray
+    motion: np.ndarray
+    setpoint: float
+
+
+def flown(policy: Policy, world: str = "medium", mission: int = 0, worlds: int = 1, most: int = 1000) -> list[Decided]:
+    """Returns the decisions of a flight, from its start to its end."""
+    environment = edqn_jax.make(world, policy.config, worlds=worlds)
+    scene, config = environment.scene(mission), policy.config
+    goal, volume = np.asarray(scene.goal), np.asarray(scene.volume)
+    window_us = round(1e6 * (config.events.frame_times_s[-1] - config.events.frame_times_s[0]))
+    state, seen = environment.reset(3, mission)
+    memory, last, decisions, until_us = None, np.zeros(3), [], 5_000_000
+    while not state.ended and len(decisions) < most:
+        move, memory = policy.act(seen, memory)
+        body = state.drone
+        yaw = drone.yaw_of(body.quaternion)
+        command = env.velocity_command(config.env, move, yaw)
+        given = {
+            "position": np.asarray(body.position),
+            "quaternion": np.asarray(body.quaternion),
+            "velocity": np.asarray(body.velocity),
+            "yaw_rate": float(drone.yaw_rate_of(body)),
+            "goal": goal,
+            "volume": volume,
+        }
+        packet = events.expand(_field(config, seen.sensed))
+        packet["t"] += until_us - window_us
+        setpoint = float(env.heading_setpoint(config.env, body, jax.numpy.asarray(goal), command))
+        own, motion = np.asarray(seen.own), np.asarray(seen.motion)
+        assert np.array_equal(motion[4:], last)
+        decisions.append(Decided(packet, until_us, given, int(move), np.asarray(command), own, motion, setpoint))
+        last = ACTIONS[int(move)]
+        state, step = environment.step(state, move)
+        seen, until_us = step.observation, until_us + 260_000
+    return decisions
+
+
+def _field(config: Config, sensed: Any) -> EventField:
+    """The events that were seen; of `event-image`, some that would show the same image."""
+    if isinstance(sensed, EventField):
+        return sensed
+    image = np.rint(np.sign(sensed) * np.expm1(np.abs(sensed)))
+    return events.field_of_counts(config.events, jax.numpy.asarray(image.reshape(config.camera.height, -1)))
