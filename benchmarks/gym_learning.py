@@ -33,7 +33,7 @@ from measurement import json_report
 
 NAME = "EDQN/Random-v0"
 OBSERVATIONS = ("code", "kinematics")
-SEEDS, DECISIONS, DRONES, MISSIONS = 2, 250_000, 64, 128
+SEEDS, DECISIONS, DRONES, MISSIONS = 2, 200_000, 64, 128
 WORLDS = 1024
 """Worlds that are trained in."""
 
@@ -51,7 +51,8 @@ SETTINGS: dict[str, Any] = {
     "gradient_steps": 8,
     "target_update_interval": 1,  # as often
     "tau": 0.1,
-    "exploration_fraction": 0.3,
+    "n_steps": 3,
+    "exploration_fraction": 0.15,
     "exploration_final_eps": 0.02,
     "policy_kwargs": {"net_arch": [128, 128]},
 }
