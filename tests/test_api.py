@@ -9,6 +9,7 @@ from importlib import metadata
 from pathlib import Path
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
@@ -194,7 +195,7 @@ def test_a_policy_shows_its_code_and_the_distances_that_its_decoder_draws() -> N
     drawing = vae.decode(QUICK.encoder, QUICK.camera, policy.params.encoder, code)[0] / DEPTH_SCALE
     assert drawn.shape == (QUICK.camera.height, QUICK.camera.width)
     shown = (drawing > 0) & (drawing < 1)
-    np.testing.assert_allclose(nearness(drawn)[shown], drawing[shown], rtol=1e-4)
+    np.testing.assert_allclose(nearness(jnp.asarray(drawn))[shown], drawing[shown], rtol=1e-4)
     assert np.all(np.isinf(drawn[np.asarray(drawing) <= 0])) and np.all(drawn >= 0)
     sensed = dataclasses.replace(QUICK, encoder=dataclasses.replace(QUICK.encoder, target="sensed"))
     with pytest.raises(edqn_jax.ConfigError, match="encoder.target must be 'nearness' or 'both'"):
@@ -209,7 +210,7 @@ def test_the_true_depth_is_what_the_depth_sensor_shows() -> None:
     state, _ = environment.reset()
     depth = environment.depth(state)
     label = nearness_of(QUICK, environment.world, state)
-    np.testing.assert_allclose(DEPTH_SCALE * np.asarray(nearness(depth)), label, atol=1e-5)
+    np.testing.assert_allclose(DEPTH_SCALE * np.asarray(nearness(jnp.asarray(depth))), label, atol=1e-5)
     assert np.isinf(depth[0]).any() and 0 < depth.min() < 20  # the sky, and what stands ahead
 
 
@@ -228,7 +229,7 @@ def test_a_path_is_planned_and_drawn_on_the_map() -> None:
     planned = edqn_jax.plan(scene, "SNN")
     assert planned.path is not None
     np.testing.assert_allclose(planned.path[[0, -1]], [scene.start, scene.goal], atol=1e-5)
-    assert min(float(signed_distance(scene, np.float32(point))) for point in planned.path) > 0.35
+    assert min(float(signed_distance(scene, point)) for point in jnp.asarray(planned.path, jnp.float32)) > 0.35
     with pytest.raises(edqn_jax.ConfigError, match="there is no planner 'SSN'; there are SNN"):
         edqn_jax.plan(scene, "SSN")
     axes = Figure().add_subplot()
