@@ -15,6 +15,8 @@ if TYPE_CHECKING:
     from edqn_jax.evaluation.evaluate import Evaluation, evaluate
     from edqn_jax.learn.policy import Policy
     from edqn_jax.parallel.devices import use_cpu_devices
+    from edqn_jax.planners.planner import Plan, plan
+    from edqn_jax.report.flights import draw_map
     from edqn_jax.runs.policies import load_policy, save_policy
     from edqn_jax.sim.environment import Environment, make
     from edqn_jax.sim.moves import move_name, move_number
@@ -30,16 +32,19 @@ _MODULES = {
     "Environment": "sim.environment",
     "Evaluation": "evaluation.evaluate",
     "Outcome": "sim.outcomes",
+    "Plan": "planners.planner",
     "Policy": "learn.policy",
     "StoppedError": "errors",
     "TrainingResult": "training.loop",
     "Transition": "sim.reward",
+    "draw_map": "report.flights",
     "evaluate": "evaluation.evaluate",
     "load_policy": "runs.policies",
     "make": "sim.environment",
     "make_config": "config.loading",
     "move_name": "sim.moves",
     "move_number": "sim.moves",
+    "plan": "planners.planner",
     "save_policy": "runs.policies",
     "train": "training.loop",
     "train_seeds": "training.loop",
@@ -55,17 +60,20 @@ __all__ = [
     "Environment",
     "Evaluation",
     "Outcome",
+    "Plan",
     "Policy",
     "StoppedError",
     "TrainingResult",
     "Transition",
     "__version__",
+    "draw_map",
     "evaluate",
     "load_policy",
     "make",
     "make_config",
     "move_name",
     "move_number",
+    "plan",
     "save_policy",
     "train",
     "train_seeds",

@@ -39,7 +39,7 @@ LONGEST = (
     "test_flights",
     "test_worlds",
     "test_two_processes",
-    "test_notebook",
+    "test_examples",
     "test_trainer",
     "test_seeds",
     "test_evaluate",

@@ -9,12 +9,18 @@ from importlib import metadata
 from pathlib import Path
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 
 import edqn_jax
+from edqn_jax.evaluation.missions import load_missions
+from edqn_jax.learn import vae
+from edqn_jax.sim.env import nearness as nearness_of
 from edqn_jax.sim.moves import ACTIONS
 from edqn_jax.sim.scene import signed_distance
+from edqn_jax.sim.sensor import DEPTH_SCALE, nearness
 from edqn_jax.training import loop
 from tests.miniature import WORLD
 from tests.policies import CONFIG, always
@@ -176,3 +182,57 @@ def test_a_policy_acts_is_saved_and_is_evaluated(tmp_path: Path) -> None:
     assert flown.success_rate == flown.outcomes.count("goal") / 2
     path = flown.path(1)
     assert path.shape == (int(flown.flights.physics_steps[1]), 3) and np.isfinite(path).all()
+
+
+@pytest.mark.slow
+def test_a_policy_shows_its_code_and_the_distances_that_its_decoder_draws() -> None:
+    policy, environment = edqn_jax.Policy(QUICK, always((1, 0, 0))), edqn_jax.make(WORLD, QUICK)
+    _, observation = environment.reset()
+    code = policy.code(observation)
+    _, memory = policy.act(observation)
+    np.testing.assert_allclose(code * QUICK.agent.code_scale, memory[-1, : QUICK.encoder.code_size], rtol=1e-6)
+    drawn = np.asarray(policy.depth(code))
+    drawing = vae.decode(QUICK.encoder, QUICK.camera, policy.params.encoder, code)[0] / DEPTH_SCALE
+    assert drawn.shape == (QUICK.camera.height, QUICK.camera.width)
+    shown = (drawing > 0) & (drawing < 1)
+    np.testing.assert_allclose(nearness(jnp.asarray(drawn))[shown], drawing[shown], rtol=1e-4)
+    assert np.all(np.isinf(drawn[np.asarray(drawing) <= 0])) and np.all(drawn >= 0)
+    sensed = dataclasses.replace(QUICK, encoder=dataclasses.replace(QUICK.encoder, target="sensed"))
+    with pytest.raises(edqn_jax.ConfigError, match="encoder.target must be 'nearness' or 'both'"):
+        edqn_jax.Policy(sensed, policy.params).depth(code)
+    blind = dataclasses.replace(QUICK, env=dataclasses.replace(QUICK.env, sensor="blind"))
+    with pytest.raises(edqn_jax.ConfigError, match="the policy's sensor 'blind' has no encoder"):
+        edqn_jax.Policy(blind, policy.params).code(observation)
+
+
+def test_the_true_depth_is_what_the_depth_sensor_shows() -> None:
+    environment = edqn_jax.make(WORLD, QUICK)
+    state, _ = environment.reset()
+    depth = environment.depth(state)
+    label = nearness_of(QUICK, environment.world, state)
+    np.testing.assert_allclose(DEPTH_SCALE * np.asarray(nearness(jnp.asarray(depth))), label, atol=1e-5)
+    assert np.isinf(depth[0]).any() and 0 < depth.min() < 20  # the sky, and what stands ahead
+
+
+def test_the_worlds_of_a_split_are_those_of_its_missions() -> None:
+    test, training = (edqn_jax.make("sparse", QUICK, worlds=3, split=split) for split in ("test", "training"))
+    evaluated = load_missions(QUICK, "sparse", 3, 0).world.pool
+    np.testing.assert_array_equal(test.world.pool.start, evaluated.start)
+    np.testing.assert_array_equal(test.world.pool.goal, evaluated.goal)
+    assert np.any(test.world.pool.start != training.world.pool.start)
+    with pytest.raises(edqn_jax.ConfigError, match="split must be one of training, validation, test, not 'tset'"):
+        edqn_jax.make("sparse", QUICK, split="tset")  # type: ignore[arg-type]
+
+
+def test_a_path_is_planned_and_drawn_on_the_map() -> None:
+    scene = edqn_jax.make(WORLD, QUICK).scene()
+    planned = edqn_jax.plan(scene, "SNN")
+    assert planned.path is not None
+    np.testing.assert_allclose(planned.path[[0, -1]], [scene.start, scene.goal], atol=1e-5)
+    assert min(float(signed_distance(scene, point)) for point in jnp.asarray(planned.path, jnp.float32)) > 0.35
+    with pytest.raises(edqn_jax.ConfigError, match="there is no planner 'SSN'; there are SNN"):
+        edqn_jax.plan(scene, "SSN")
+    axes = Figure().add_subplot()
+    edqn_jax.draw_map(axes, scene)
+    (low, *_), (high, *_) = np.asarray(scene.volume)
+    assert axes.get_xlim()[0] <= low < high <= axes.get_xlim()[1] and len(axes.patches) + len(axes.collections) > 3

@@ -56,6 +56,9 @@ WORLDS = 64
 SEEDS = 2**32
 """Seeds that differ; larger ones begin again at 0."""
 
+RESET_TOGETHER = 16
+"""Drones that one call of the program resets in the step in which they ended; more of them take several calls."""
+
 
 @struct.dataclass
 class Drone:
@@ -157,6 +160,14 @@ def _reset_many(program: _Program, leaves: Leaves, encoder: Params, seeds: Array
 @functools.partial(jax.jit, static_argnums=0, donate_argnums=3)
 def _step_many(program: _Program, leaves: Leaves, encoder: Params, drones: Drone, actions: Array):
     return jax.vmap(lambda drone, action: _step(program, leaves, encoder, drone, action))(drones, actions)
+
+
+@functools.partial(jax.jit, static_argnums=0, donate_argnums=3)
+def _reset_some(program: _Program, leaves: Leaves, encoder: Params, drones: Drone, numbers: Array) -> tuple[Drone, Any]:
+    """Resets the ended drones of these numbers [K] and returns their observations; other numbers stand for none."""
+    ended = jax.tree.map(lambda x: x.at[numbers].get(mode="clip"), drones)
+    fresh, decided = jax.vmap(lambda drone: _step(program, leaves, encoder, drone, jnp.zeros((), jnp.int32)))(ended)
+    return jax.tree.map(lambda x, y: x.at[numbers].set(y, mode="drop"), drones, fresh), decided.observed
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -367,10 +378,13 @@ class DroneVectorEnv(gymnasium.vector.VectorEnv):
     """Many drones, all of whose decisions are one compiled program.
 
     A drone whose episode has ended spends its next step on being reset, as Gymnasium's `AutoresetMode.NEXT_STEP` has
-    it: the action is ignored, the reward is 0, and the observation is the first one of a new episode.
+    it: the action is ignored, the reward is 0, and the observation is the first one of a new episode. With `SAME_STEP`
+    it is reset in the same step: the observation is that first one, and `info` holds what the episode ended with. Both
+    fly the same episodes.
 
     Args:
         num_envs: how many drones.
+        autoreset_mode: `NEXT_STEP` or `SAME_STEP`, or their values as words.
         others: as in `DroneEnv`.
 
     Raises:
@@ -386,11 +400,13 @@ class DroneVectorEnv(gymnasium.vector.VectorEnv):
         config: Config | None = None,
         *,
         render_mode: str | None = None,
+        autoreset_mode: Any = gymnasium.vector.AutoresetMode.NEXT_STEP,
         **options: Unpack[TaskOptions],
     ) -> None:
         if num_envs < 1:
             raise ConfigError(f"num_envs must be at least 1, not {num_envs}")
         _check_render_mode(render_mode)
+        self.metadata = {**self.metadata, "autoreset_mode": _autoreset_mode(autoreset_mode)}
         self.task = _task(world, config, **options)
         self.num_envs = num_envs
         self.render_mode = render_mode
@@ -448,7 +464,8 @@ class DroneVectorEnv(gymnasium.vector.VectorEnv):
         Returns:
             observations; rewards [num_envs] float32; terminated and truncated [num_envs] bool; info with
             `outcome` (numbers of `edqn_jax.Outcome`) and `is_success` of the drones whose episodes ended, which
-            `_outcome` and `_is_success` mark.
+            `_outcome` and `_is_success` mark. With `SAME_STEP` these are in `final_info`, and `final_obs` has the last
+            observation of each episode that ended, None of the others, as Gymnasium's own vectors have them.
 
         Raises:
             gymnasium.error.ResetNeeded: before the first reset.
@@ -469,7 +486,29 @@ class DroneVectorEnv(gymnasium.vector.VectorEnv):
         if ended.any():
             success = decided.outcome == Outcome.GOAL
             info = {"outcome": decided.outcome, "_outcome": ended, "is_success": success, "_is_success": ended}
+            if self.metadata["autoreset_mode"] is gymnasium.vector.AutoresetMode.SAME_STEP:
+                info = {"final_info": info, "_final_info": ended.copy(), "_final_obs": ended.copy()}
+                info["final_obs"] = self._reset_ended(np.flatnonzero(ended), decided.observed)
         return decided.observed, decided.reward, decided.terminated, decided.truncated, info
+
+    def _reset_ended(self, ended: NDArray[np.integer], observed: Any) -> NDArray[np.object_]:
+        """Resets the drones of these numbers, in whose rows of `observed` the first observations then stand.
+
+        Returns:
+            the observations that stood there, [num_envs], None of the other drones.
+        """
+        final = np.full(self.num_envs, None, object)
+        for number in ended:
+            final[number] = jax.tree.map(lambda x, i=number: x[i].copy(), observed)  # type: ignore[misc]
+        slots = min(RESET_TOGETHER, self.num_envs)
+        for first in range(0, len(ended), slots):
+            some = ended[first : first + slots]
+            numbers = np.full(slots, self.num_envs, np.int32)  # which is no drone's
+            numbers[: len(some)] = some
+            self.drones, fresh = _reset_some(*self.task.program, self.drones, numbers)
+            for rows, new in zip(jax.tree.leaves(observed), jax.tree.leaves(fresh), strict=True):
+                rows[some] = np.asarray(new)[: len(some)]
+        return final
 
     def render(self) -> tuple[NDArray[np.uint8], ...] | None:
         """Returns what a person would see from each drone's camera, [192, 256, 3]; None without a render mode.
@@ -491,6 +530,15 @@ class DroneVectorEnv(gymnasium.vector.VectorEnv):
 def _check_render_mode(mode: str | None) -> None:
     if mode not in (None, "rgb_array"):
         raise ConfigError(f"render_mode must be 'rgb_array' or None, not '{mode}'")
+
+
+def _autoreset_mode(mode: Any) -> Any:
+    modes = gymnasium.vector.AutoresetMode
+    offered = {kind.value: kind for kind in (modes.NEXT_STEP, modes.SAME_STEP)}
+    found = offered.get(getattr(mode, "value", mode))
+    if found is None:
+        raise ConfigError(f"autoreset_mode must be one of {', '.join(offered)}, not '{getattr(mode, 'value', mode)}'")
+    return found
 
 
 for _name, _which in (("Paper", "paper"), ("Random", "medium")):

@@ -12,13 +12,13 @@ from jax import Array
 
 from edqn_jax.config import Config
 from edqn_jax.errors import ConfigError
-from edqn_jax.learn import embedding
+from edqn_jax.learn import embedding, vae
 from edqn_jax.learn.dqn import epsilon_greedy
 from edqn_jax.learn.qnetwork import Params, init_q, q_values
 from edqn_jax.sim.env import OWN_SIZE, Observation
 from edqn_jax.sim.events import EventField
 from edqn_jax.sim.moves import ACTIONS
-from edqn_jax.sim.sensor import Sensed, sensor_of
+from edqn_jax.sim.sensor import DEPTH_SCALE, Sensed, distance_of, sensor_of
 
 Memory = Array
 """[H, D] the newest observations as the network sees them, newest last; zeros before an episode began."""
@@ -112,6 +112,29 @@ class Policy:
             memory = empty_memory(self.config)
         return _act(self.config, self.params, memory, observation)
 
+    def code(self, observation: Observation, memory: Memory | None = None) -> Array:
+        """Returns the code [C] that the encoder makes of one observation; the arguments are those of `act`.
+
+        Raises:
+            ConfigError: as `act`, or if the policy has no encoder.
+        """
+        if not embedding.has_code(self.config):
+            raise ConfigError(f"the policy's sensor '{self.config.env.sensor}' has no encoder, so there is no code")
+        _, memory = self.act(observation, memory)
+        return memory[-1, : embedding.size(self.config)] / self.config.agent.code_scale
+
+    def depth(self, code: Array) -> Array:
+        """Returns the distances [H, W] metres that the decoder draws from a code [C], inf where it draws nothing.
+
+        Raises:
+            ConfigError: if the policy's encoder was not trained to draw how near things are.
+        """
+        if not embedding.needs_nearness(self.config):
+            raise ConfigError(
+                "the policy's decoder does not draw distances; encoder.target must be 'nearness' or 'both'"
+            )
+        return _depth(self.config, self.params.encoder, code)
+
 
 def _check_fits(config: Config, observation: Observation) -> None:
     """Raises unless an observation is what the sensor of `config` shows.
@@ -147,6 +170,12 @@ def _described(kind: tuple[tuple[int, ...] | None, float | None]) -> str:
         return "nothing"
     size = " x ".join(str(side) for side in shape)
     return f"{size} numbers" if window_s is None else f"events of {size} frame pairs and pixels in {window_s:g} s"
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _depth(config: Config, params: Params, code: Array) -> Array:
+    drawn = vae.decode(config.encoder, config.camera, params, code)[..., -1, :, :]
+    return distance_of(drawn / DEPTH_SCALE)
 
 
 @functools.partial(jax.jit, static_argnums=0)

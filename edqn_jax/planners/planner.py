@@ -13,6 +13,7 @@ import jax
 import numpy as np
 import numpy.typing as npt
 
+from edqn_jax.errors import ConfigError
 from edqn_jax.sim.scene import Scene, signed_distance
 
 MARGIN = 1e-3
@@ -108,6 +109,32 @@ def load_planner(name: str) -> Planner:
     """
     module, function = PLANNERS[name].split(".")
     return getattr(importlib.import_module(f"edqn_jax.planners.{module}"), function)
+
+
+def plan(
+    scene: Scene,
+    planner: str = "SNN",
+    *,
+    body_radius: float = 0.36,
+    budget: Budget = Budget(),
+    seed: int = 0,  # noqa: B008 (it is frozen)
+) -> Plan:
+    """Plans a path from a world's start to its goal with a planner that is given the whole map.
+
+    Args:
+        scene: one world, such as `Environment.scene` returns.
+        planner: a name of `PLANNERS`, such as `SNN`, `A*` or `RRT*`.
+        body_radius: of the sphere that must touch nothing, metres.
+        budget: when the planner stops.
+        seed: of planners that sample.
+
+    Raises:
+        ConfigError: if there is no such planner.
+        MissingPackageError: if a package of the extra `bench` that it needs is not installed.
+    """
+    if planner not in PLANNERS:
+        raise ConfigError(f"there is no planner '{planner}'; there are {', '.join(PLANNERS)}")
+    return load_planner(planner)(Task.of(scene, body_radius=body_radius), budget, seed)
 
 
 def found(path: npt.ArrayLike, seconds: float, steps: int) -> Plan:

@@ -57,6 +57,18 @@ def draw_world(scene: Scene, file: Path) -> Figure:
     return figure
 
 
+def draw_map(axes: Axes, scene: Scene, goal_radius_m: float = 2.0) -> None:
+    """Draws a world from above, metres, with its start and goal, on axes to which paths may be added.
+
+    Args:
+        axes: of matplotlib.
+        scene: one world.
+        goal_radius_m: the circle around the goal.
+    """
+    draw_stage(axes, MAP, scene, goal_radius_m)
+    draw_end_marks(axes, MAP, *_ends(scene))
+
+
 def draw_path(
     scene: Scene,
     trajectory: Mapping[str, np.ndarray],

@@ -31,7 +31,7 @@ from edqn_jax.sim.mjcf import check_scene, load_world, mjcf_of, resolve_world
 from edqn_jax.sim.moves import move_number
 from edqn_jax.sim.reward import Reward
 from edqn_jax.sim.scene import Scene, stack_scenes, take_scene
-from edqn_jax.sim.worlds import random_pool, world_keys
+from edqn_jax.sim.worlds import SPLITS, Split, random_pool, world_keys
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -119,6 +119,11 @@ class Environment:
         body = state.drone
         return np.asarray(_picture(self.config, scale, scene, body.position, body.quaternion))
 
+    def depth(self, state: EnvState) -> np.ndarray:
+        """Returns the true distance along each pixel's ray [H, W] metres, inf where it meets nothing: a label."""
+        scene = take_scene(self.world.pool, self.world.missions.scene[state.mission])
+        return np.asarray(_depth(self.config, scene, state.drone.position, state.drone.quaternion))
+
     def _field(self, observation: Observation) -> EventField:
         if not isinstance(observation.sensed, EventField):
             raise ConfigError(f"the sensor '{self.config.env.sensor}' makes no events; env.sensor must be 'events'")
@@ -131,6 +136,7 @@ def make(
     *,
     worlds: int = 1,
     seed: int = 0,
+    split: Split = "training",
     reward: Reward | None = None,
 ) -> Environment:
     """Makes an environment.
@@ -140,7 +146,9 @@ def make(
             `config`.
         config: of drone, camera, events and task; without it the default for that world.
         worlds: how many random worlds, each with a mission of its own; 1 for a world from a file.
-        seed: which random worlds, of those that training draws from.
+        seed: which random worlds of the split.
+        split: of random worlds: `training`, which training draws from, `validation`, or `test`, whose first worlds are
+            those of `evaluate`.
         reward: of every decision, in place of the configured one: a function of a `Transition`.
 
     Raises:
@@ -148,14 +156,16 @@ def make(
     """
     name = str(world) if world is not None else (config or Config()).world.name
     config = make_config(name) if config is None else config
-    pool = _random_pool(name, worlds, seed) if name in FAMILIES else _file_pool(config, name, worlds)
+    pool = _random_pool(name, worlds, seed, split) if name in FAMILIES else _file_pool(config, name, worlds)
     return Environment(config, World(drone.load_airframe(config.drone), pool, own_missions(pool), reward))
 
 
-def _random_pool(name: str, count: int, seed: int) -> Scene:
+def _random_pool(name: str, count: int, seed: int, split: Split) -> Scene:
+    if split not in SPLITS:
+        raise ConfigError(f"split must be one of {', '.join(SPLITS)}, not '{split}'")
     if count < 1 or seed < 0:
         raise ConfigError(f"worlds must be at least 1 and seed at least 0, not {count} and {seed}")
-    return random_pool(name, world_keys("training", count, first=seed * count))
+    return random_pool(name, world_keys(split, count, first=seed * count))
 
 
 def _file_pool(config: Config, name: str, count: int) -> Scene:
@@ -177,6 +187,11 @@ def _stream(config: Config, scene: Scene, flight: Flight) -> EventField:
     key, noise = jax.random.split(jax.random.key(0))
     memory = events.reset_memory(config.events, config.camera.height, config.camera.width, key)
     return events.events(config.events, memory, frames, times, noise, continuous=True)[0]
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _depth(config: Config, scene: Scene, position: Array, quaternion: Array) -> Array:
+    return camera.depth(config.camera, scene, position, sensor.mount_rotation(config, quaternion))
 
 
 @functools.partial(jax.jit, static_argnums=(0, 1))

@@ -247,6 +247,11 @@ def nearness(distance: Array) -> Array:
     return 1.0 / (1.0 + distance / HALF_NEAR_M)
 
 
+def distance_of(nearness: Array) -> Array:
+    """Returns the metres [...] of which `nearness` is that; 0 above 1, infinity from 0 down."""
+    return HALF_NEAR_M * (1.0 / jnp.clip(nearness, 0.0, 1.0) - 1.0)
+
+
 def ranges(config: CameraConfig, scene: Scene, position: Array, yaw: Array) -> Array:
     """Returns metres [26] from `position` [3] to the nearest shape or face of the flight volume along each move.
 

@@ -26,6 +26,7 @@ interop = require("edqn_jax.interop.gymnasium")
 
 AHEAD = int(move_number("ahead"))
 DOWN = int(move_number("down"))
+HOVER = int(move_number("hover"))
 MOVES = np.random.default_rng(5).integers(0, 27, size=(12, 3))
 
 
@@ -134,6 +135,26 @@ def test_an_ended_drone_spends_its_next_step_on_being_reset():
     assert not observed["motion"][0].any()  # at rest, with no last move
     _, rewards, *_ = vector.step(np.array([DOWN, 0]))
     assert rewards[0] != 0.0
+
+
+@pytest.mark.parametrize("mode", ["SameStep", gymnasium.vector.AutoresetMode.SAME_STEP])
+def test_an_ended_drone_can_be_reset_in_the_same_step(mode):
+    options = {"config": small(), "worlds": 1, "observation": "kinematics"}
+    vector = gymnasium.make_vec("EDQN/Random-v0", num_envs=2, autoreset_mode=mode, **options)
+    assert vector.metadata["autoreset_mode"] is gymnasium.vector.AutoresetMode.SAME_STEP
+    assert many().metadata["autoreset_mode"] is gymnasium.vector.AutoresetMode.NEXT_STEP
+    first, _ = vector.reset(seed=0)
+    while True:
+        observed, rewards, terminated, truncated, info = vector.step(np.array([DOWN, HOVER]))
+        if terminated[0]:
+            break
+        assert not info
+    assert not terminated[1] and not truncated.any()
+    assert rewards[0] != 0.0 and info["_final_obs"].tolist() == info["_final_info"].tolist() == [True, False]
+    np.testing.assert_allclose(observed[0], first[0], rtol=1e-5, atol=1e-5)  # the only mission once more
+    assert info["final_obs"][1] is None and info["final_obs"][0][-1] == -1.0  # the last move was down
+    assert Outcome(int(info["final_info"]["outcome"][0])) is not Outcome.RUNNING
+    assert not info["final_info"]["is_success"][0]
 
 
 def test_time_out_truncates_and_the_goal_terminates():
@@ -271,6 +292,8 @@ def test_what_cannot_be_done_is_refused():
         vector.reset(seed=[1, 2, 3])
     with pytest.raises(ConfigError, match="num_envs must be at least 1"):
         many(0)
+    with pytest.raises(ConfigError, match="autoreset_mode must be one of NextStep, SameStep, not 'Disabled'"):
+        many(2, autoreset_mode=gymnasium.vector.AutoresetMode.DISABLED)
     made.reset(seed=0)
     before = made.np_random.bit_generator.state
     with pytest.raises(ConfigError):
