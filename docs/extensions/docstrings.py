@@ -1,0 +1,44 @@
+"""Docstrings as reStructuredText: results by name, which Napoleon would read as types."""
+
+from __future__ import annotations
+
+import re
+import textwrap
+
+from sphinx.application import Sphinx
+
+NAMED = re.compile(r"(\w+(?:, \w+)*|\(\w+(?:, \w+)*\)): ")
+"""Names of results at the beginning of a line."""
+
+BETWEEN = re.compile(r"(?<=[.;]) (?=(?:\w+|\(\w+(?:, \w+)*\)): \[)")
+"""The space between two results on one line, such as `a: [] action taken. y: [] target`."""
+
+
+def with_results(lines: list[str]) -> list[str]:
+    """Returns a docstring whose section `Returns:` is a field of reStructuredText, a list where it names its results."""
+    out: list[str] = []
+    rest = list(lines)
+    while rest:
+        line = rest.pop(0)
+        if line != "Returns:":
+            out.append(line)
+            continue
+        body: list[str] = []
+        while rest and (not rest[0] or rest[0].startswith("    ")):
+            body.append(rest.pop(0))
+        results = [part for text in textwrap.dedent("\n".join(body)).strip().splitlines() for part in BETWEEN.split(text)]
+        if results and NAMED.match(results[0]):
+            results = [NAMED.sub(r"* **\1**: ", text, count=1) if NAMED.match(text) else f"  {text}" for text in results]
+        out += [":returns:", *(f"    {text}" for text in results), ""]
+    return out
+
+
+def process(app: Sphinx, what: str, name: str, thing: object, options: object, lines: list[str]) -> None:
+    """Changes the lines of a docstring in place, before Napoleon reads them."""
+    lines[:] = with_results(lines)
+
+
+def setup(app: Sphinx) -> dict[str, bool]:
+    """Registers it."""
+    app.connect("autodoc-process-docstring", process, priority=400)
+    return {"parallel_read_safe": True, "parallel_write_safe": True}
