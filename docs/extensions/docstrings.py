@@ -1,4 +1,4 @@
-"""Docstrings as reStructuredText: results by name, which Napoleon would read as types."""
+"""Docstrings as reStructuredText: results by name, which Napoleon would read as types; of our own modules alone."""
 
 from __future__ import annotations
 
@@ -35,10 +35,19 @@ def with_results(lines: list[str]) -> list[str]:
 
 def process(app: Sphinx, what: str, name: str, thing: object, options: object, lines: list[str]) -> None:
     """Changes the lines of a docstring in place, before Napoleon reads them."""
-    lines[:] = with_results(lines)
+    lines[:] = [line.replace("[*", r"[\*") for line in with_results(lines)]
+    if what in ("attribute", "data", "property"):
+        lines.insert(0, "")  # else Napoleon takes what stands before a colon for the type
+
+
+def skip(app: Sphinx, what: str, name: str, thing: object, would: bool, options: object) -> bool | None:
+    """Leaves out functions of other packages: imported ones, and those that `flax.struct` adds to a class."""
+    module = getattr(thing, "__module__", None) or "edqn_jax"
+    return True if callable(thing) and module.split(".")[0] != "edqn_jax" else None
 
 
 def setup(app: Sphinx) -> dict[str, bool]:
-    """Registers it."""
+    """Registers both."""
     app.connect("autodoc-process-docstring", process, priority=400)
+    app.connect("autodoc-skip-member", skip)
     return {"parallel_read_safe": True, "parallel_write_safe": True}
