@@ -31,9 +31,9 @@ extensions = [
 exclude_patterns = ["images/README.md", "extensions", "_templates", "_static"]
 templates_path = ["_templates"]
 
-# Pages are read on GitHub too, so they have nothing that only Sphinx shows: math between dollars, diagrams as fences.
+# Pages are read on GitHub too, which shows math between dollars and in fences, and diagrams in fences, as Sphinx does.
 myst_enable_extensions = ["dollarmath"]
-myst_fence_as_directive = ["mermaid"]
+myst_fence_as_directive = ["math", "mermaid"]
 myst_heading_anchors = 4
 
 # A name in single backticks leads to its documentation where it has some, and is code where not.
