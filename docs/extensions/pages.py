@@ -22,8 +22,8 @@ ELSEWHERE = {
 LINK = re.compile(r"(?<=\]\()(?!\w+:|#)([^)#\s]+)(#[^)\s]*)?(?=\))")
 """Path and fragment of a relative Markdown link."""
 
-DECISIONS = "\n\n```{toctree}\n:hidden:\n:glob:\n\n0*\n```\n"
-"""Table of contents of the decisions, which on GitHub is the list of the page itself."""
+LISTED = {"decisions/README": "0*", "howto/README": "*"}
+"""Pages below a page that lists them itself, as a table of contents that GitHub would show as code."""
 
 
 def linked(text: str, folder: str) -> str:
@@ -63,8 +63,8 @@ def read_page(app: Sphinx, page: str, source: list[str]) -> None:
             file = root / path
             source[0] = file.read_text(encoding="utf-8")
     source[0] = linked(source[0], file.parent.relative_to(root).as_posix())
-    if page == "decisions/README":
-        source[0] += DECISIONS
+    if page in LISTED:
+        source[0] += f"\n\n```{{toctree}}\n:hidden:\n:glob:\n\n{LISTED[page]}\n```\n"
 
 
 def setup(app: Sphinx) -> dict[str, bool]:
