@@ -15,7 +15,7 @@ BETWEEN = re.compile(r"(?<=[.;]) (?=(?:\w+|\(\w+(?:, \w+)*\)): \[)")
 
 
 def with_results(lines: list[str]) -> list[str]:
-    """Returns a docstring whose section `Returns:` is a field of reStructuredText, a list where it names its results."""
+    """Returns a docstring whose section `Returns:` is a field of reStructuredText, and a list if it has names."""
     out: list[str] = []
     rest = list(lines)
     while rest:
@@ -26,9 +26,13 @@ def with_results(lines: list[str]) -> list[str]:
         body: list[str] = []
         while rest and (not rest[0] or rest[0].startswith("    ")):
             body.append(rest.pop(0))
-        results = [part for text in textwrap.dedent("\n".join(body)).strip().splitlines() for part in BETWEEN.split(text)]
+        results = [
+            part for text in textwrap.dedent("\n".join(body)).strip().splitlines() for part in BETWEEN.split(text)
+        ]
         if results and NAMED.match(results[0]):
-            results = [NAMED.sub(r"* **\1**: ", text, count=1) if NAMED.match(text) else f"  {text}" for text in results]
+            results = [
+                NAMED.sub(r"* **\1**: ", text, count=1) if NAMED.match(text) else f"  {text}" for text in results
+            ]
         out += [":returns:", *(f"    {text}" for text in results), ""]
     return out
 

@@ -1,17 +1,21 @@
 """Docstrings: what is public has one, and what takes or returns arrays says in which shape.
 
-The rule, by the source alone. Public is each function, method and class of a public module of the package whose name has
-no leading underscore. One *has arrays* if an annotation of its arguments or its result is `Array`, `ArrayLike` or an array
-of NumPy. It *names a shape* if its docstring has one in brackets: `[]`, `[3]`, `[..., H, W]`. A function whose only array
-is a random key has no shape to name.
+The rule, by the source alone. Public is each function, method and class of a public module of the package whose name
+has no leading underscore. One *has arrays* if an annotation of its arguments or its result is `Array`, `ArrayLike` or an
+array of NumPy; an argument that is a random key does not count. It *names a shape* if its docstring has one in brackets:
+`[]`, `[3]`, `[..., H, W]`. Examples in docstrings are run.
 """
 
 from __future__ import annotations
 
 import ast
+import doctest
+import importlib
 import re
 from collections.abc import Iterator
 from pathlib import Path
+
+import pytest
 
 PACKAGE = Path(__file__).parents[2] / "edqn_jax"
 
@@ -63,3 +67,17 @@ def test_functions_of_arrays_name_their_shapes() -> None:
     without = [name for name, text in of_arrays if not SHAPE.search(text)]
     assert len(of_arrays) > 200
     assert len(without) <= (1 - LEAST) * len(of_arrays), (len(without), len(of_arrays), without)
+
+
+WITH_EXAMPLES = [file for file in sorted(PACKAGE.rglob("*.py")) if ">>> " in file.read_text(encoding="utf-8")]
+
+
+@pytest.mark.parametrize("file", WITH_EXAMPLES, ids=lambda file: file.stem)
+def test_the_examples_of_docstrings_are_true(file: Path) -> None:
+    module = importlib.import_module(".".join(file.relative_to(PACKAGE.parent).with_suffix("").parts))
+    failed, tried = doctest.testmod(module)
+    assert tried > 0 and failed == 0
+
+
+def test_there_are_examples() -> None:
+    assert {"events", "dqn", "moves"} <= {file.stem for file in WITH_EXAMPLES}
