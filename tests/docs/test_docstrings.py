@@ -1,9 +1,9 @@
 """Docstrings: what is public has one, and what takes or returns arrays says in which shape.
 
-The rule, by the source alone. Public is each function, method and class of a public module of the package whose name
-has no leading underscore. One *has arrays* if an annotation of its arguments or its result is `Array`, `ArrayLike` or an
-array of NumPy; an argument that is a random key does not count. It *names a shape* if its docstring has one in brackets:
-`[]`, `[3]`, `[..., H, W]`. Examples in docstrings are run.
+The rule, by the source alone. Public is each function, method and class of a public module of the package whose
+name has no leading underscore. One *has arrays* if an annotation of its arguments or its result is `Array`,
+`ArrayLike` or an array of NumPy; an argument that is a random key does not count. It *names a shape* if its docstring
+has one in brackets: `[]`, `[3]`, `[..., H, W]`. Examples in docstrings are run.
 """
 
 from __future__ import annotations
