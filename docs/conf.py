@@ -38,6 +38,7 @@ myst_heading_anchors = 4
 
 # A name in single backticks leads to its documentation where it has some, and is code where not.
 default_role = "py:obj"
+smartquotes = False  # [...] is a shape
 autosummary_generate = True
 autosummary_ignore_module_all = True
 autosummary_imported_members = False
