@@ -268,7 +268,7 @@ def _random_missions(config: Config, name: str, missions: int, seed: int, moved:
 
 
 def mission_key(seed: int) -> jax.Array:
-    """Returns the key of the evaluation missions `seed` in worlds from files; the same in every version."""
+    """Returns the key [] of the evaluation missions `seed` in worlds from files; the same in every version."""
     return jax.random.fold_in(jax.random.key(_MISSION_SEED), seed)
 
 

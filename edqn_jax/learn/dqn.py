@@ -28,6 +28,12 @@ def target(returns: Array, discount: Array, q_next: Array, q_select: Array) -> A
         q_next: [A] target network at s'.
         q_select: [A] values that choose the action: `q_next` itself, or the online network's (double DQN,
             van Hasselt et al. 2016).
+
+    >>> q_next = jnp.array([3.0, 1.0])
+    >>> print(target(jnp.array(1.0), jnp.array(0.5), q_next, q_next))
+    2.5
+    >>> print(target(jnp.array(1.0), jnp.array(0.5), q_next, jnp.array([0.0, 1.0])))  # double: the other one chooses
+    1.5
     """
     chex.assert_rank([returns, discount, q_next, q_select], [0, 0, 1, 1])
     return returns + discount * q_next[jnp.argmax(q_select)]

@@ -4,7 +4,7 @@
 compiled once and donated. Environments and replay stand in S logical shards, [S, E, ...], whatever the
 number of devices; `shard_map` spreads the shards over a mesh axis, parameters are replicated, sums are
 added over the axis. Numbers that steer `lax.cond` come in through the scan's inputs, so that they stay
-unbatched when training is `vmap`ped over seeds.
+unbatched when `vmap` maps training over seeds.
 """
 
 from __future__ import annotations
@@ -122,7 +122,7 @@ class InitialKeys(NamedTuple):
 
 
 def init(config: Config, world: World, key: Array) -> TrainState:
-    """Returns the state before the first step; a pure function of the key, so it can be `vmap`ped over seeds.
+    """Returns the state before the first step; a pure function of the key, so `vmap` maps it over seeds.
 
     Raises:
         ConfigError: if the environments or the batch do not divide into the shards.

@@ -81,15 +81,19 @@ class Lattice:
         self.distance = np.full(int(np.prod(np.maximum(self.shape, 1))), np.nan, np.float32)
 
     def flat(self, index: np.ndarray) -> np.ndarray:
+        """Returns the flat index [...] of cells [..., 3]."""
         return (index[..., 0] * self.shape[1] + index[..., 1]) * self.shape[2] + index[..., 2]
 
     def index(self, flat: np.ndarray) -> np.ndarray:
+        """Returns the cells [..., 3] of flat indices [...]."""
         return np.stack(np.unravel_index(flat, tuple(self.shape)), axis=-1)
 
     def middle(self, flat: np.ndarray) -> np.ndarray:
+        """Returns the middles [..., 3] metres of the cells of flat indices [...]."""
         return self.start + self.cell * (self.index(flat) - self.origin)
 
     def distances(self, points: np.ndarray) -> np.ndarray:
+        """Returns the signed distances [E] metres of points [E, 3]."""
         return _batched(_signed_distances, self.scene, points)
 
     def compute_all_distances(self) -> None:
@@ -97,7 +101,7 @@ class Lattice:
         self.distance[:] = self.distances(self.middle(np.arange(self.distance.size)))
 
     def compute_distances(self, cells: np.ndarray) -> None:
-        """Computes the distances of those cells that are not known yet."""
+        """Computes the distances of those of the cells [E], by flat index, that are not known yet."""
         unknown = np.unique(cells[np.isnan(self.distance[cells])])
         if unknown.size:
             self.distance[unknown] = self.distances(self.middle(unknown))
@@ -115,7 +119,7 @@ class Lattice:
         return passable
 
     def cell_near(self, point: np.ndarray) -> int:
-        """Returns the nearest cell from which the sphere passes straight to the point.
+        """Returns the nearest cell from which the sphere passes straight to the point [3] metres.
 
         Raises:
             NoPathError: if there is none.
@@ -140,6 +144,7 @@ def edge_margin(cell: float, radius: float) -> float:
 
 
 def leg_touches(scene: Scene, start: np.ndarray, end: np.ndarray, radius: float) -> bool:
+    """Returns whether a sphere touches anything on the straight leg from `start` [3] to `end` [3], metres."""
     return bool(_long_touches(scene, np.float32(start), np.float32(end), np.float32(radius)))
 
 

@@ -138,7 +138,7 @@ def plan(
 
 
 def found(path: npt.ArrayLike, seconds: float, steps: int) -> Plan:
-    """Returns the plan of a planner that finds only one path."""
+    """Returns the plan of a planner that finds only one path [n, 3] metres."""
     path = np.asarray(path, np.float64)
     return Plan(path, "", seconds, steps, seconds, path_length(path))
 

@@ -236,7 +236,7 @@ def spike_wave(
 
 
 def stdp(config: SnnConfig, lag: Array) -> Array:
-    """Returns the change of a synapse whose target fired `lag` seconds after its source, for each pair of spikes.
+    """Returns the change of a synapse whose target fired `lag` seconds [...] after its source, for each pair of spikes.
 
     A+ exp(-lag / tau+) if the source fired first, -A- exp(lag / tau-) if the target did, 0 for the same time.
     """

@@ -33,6 +33,7 @@ class Solid:
 
     @cached_property
     def corners(self) -> np.ndarray:
+        """Returns the corners [N, 3] metres of all faces."""
         return np.concatenate(self.faces)
 
     @cached_property

@@ -202,7 +202,7 @@ def observe(
     memory: EventMemory | None,
     key: Array,
 ) -> tuple[Observation, EventMemory | None]:
-    """What the sensor shows now, the own state and the own motion.
+    """Returns what the sensor shows now, the own state [OWN_SIZE] and the own motion [MOTION_SIZE].
 
     Args:
         move: as in `own_motion`.
@@ -223,7 +223,7 @@ def nearness(config: Config, world: World, state: EnvState) -> Array:
 
 
 def reset(config: Config, world: World, key: Array, mission: Array | None = None) -> tuple[EnvState, Observation]:
-    """A fresh environment on a mission drawn from the pool, or on the given one."""
+    """Returns a fresh environment on a mission drawn from the pool, or on the given one, [] int32."""
     key, noise = jax.random.split(key)
     state = dataclasses.replace(ended(config, world, key, mission), ended=jnp.zeros((), bool))
     scene = _scene_of(config, world, state.mission, state.decision)
@@ -234,7 +234,7 @@ def reset(config: Config, world: World, key: Array, mission: Array | None = None
 
 
 def ended(config: Config, world: World, key: Array, mission: Array | None = None) -> EnvState:
-    """An environment whose next step is a reset; it needs no picture. The mission is as in `reset`."""
+    """Returns an environment whose next step is a reset; it needs no picture. The mission [] is as in `reset`."""
     key, draw, rest = jax.random.split(key, 3)
     mission = _drawn_mission(world, draw) if mission is None else mission
     body, memory = _start(config, world, mission, rest)
@@ -335,7 +335,7 @@ def _has_floats(tree: object) -> bool:
 
 
 def is_finite(tree: object) -> Array:
-    """Returns whether every number of a tree's arrays is finite; whole numbers are."""
+    """Returns whether every number of a tree's arrays is finite, [] bool; whole numbers are."""
     sums = [jnp.sum(leaf) for leaf in jax.tree.leaves(tree) if jnp.issubdtype(leaf.dtype, jnp.floating)]
     return jnp.isfinite(sum(sums, jnp.zeros(())))
 

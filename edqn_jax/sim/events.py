@@ -77,7 +77,7 @@ def log_brightness(config: EventsConfig, intensity: Array) -> Array:
 
 
 def airsim_log_brightness(intensity: Array) -> Array:
-    """Returns Eq. 1 as AirSim computes it: the logarithm of the 8-bit grey value + 0.001, in float32.
+    """Returns Eq. 1 as AirSim computes it: the logarithm of the 8-bit grey value + 0.001, `[...]` float32.
 
     The 256 possible values are tabulated, so that no compiler's logarithm can move an event.
     """
@@ -87,7 +87,11 @@ def airsim_log_brightness(intensity: Array) -> Array:
 
 
 def event_polarity(change: Array, threshold: Array | float) -> Array:
-    """Returns Eq. 2: +1 or -1 where the log brightness changed by more than the threshold, else 0. `[...]` int8."""
+    """Returns Eq. 2: +1 or -1 where the log brightness changed by more than the threshold, else 0. `[...]` int8.
+
+    >>> print(event_polarity(jnp.array([0.12, -0.31, 0.01]), 0.05))
+    [ 1 -1  0]
+    """
     return jnp.where(jnp.abs(change) > threshold, jnp.sign(change), 0.0).astype(jnp.int8)
 
 
@@ -100,12 +104,16 @@ def max_events(config: EventsConfig, interval_s: float) -> int:
 
 
 def event_count(change: Array, tolerance: Array | float, limit: Array | int) -> Array:
-    """Returns Eq. 4: `N_e = min(N_max, floor(|change| / TOL))`, `[...]` int32."""
+    """Returns Eq. 4: `N_e = min(N_max, floor(|change| / TOL))`, `[...]` int32.
+
+    >>> print(event_count(jnp.array([0.12, -0.31, 0.01]), 0.05, 5))
+    [2 5 0]
+    """
     return jnp.minimum(jnp.floor(jnp.abs(change) / tolerance).astype(jnp.int32), limit)
 
 
 def airsim_count(before: Array, after: Array, tolerance: Array | float, limit: Array | int) -> Array:
-    """Returns AirSim's number of events: `floor(|change| / TOL) - 1`, and none up to twice the tolerance.
+    """Returns AirSim's number of events: `floor(|change| / TOL) - 1`, `[...]`, none up to twice the tolerance.
 
     It counts from the first crossing rather than to it; the float32 rounding of that crossing is kept.
     """
@@ -240,7 +248,7 @@ def event_picture(image: NDArray, background: str = "white") -> NDArray[np.uint8
 
 
 def expand(field: EventField, window_start_us: int = 0) -> NDArray:
-    """Returns the stream of a field: structured array of `STREAM_DTYPE`, sorted by time (host side, NumPy).
+    """Returns the stream of a field: [N] of `STREAM_DTYPE`, sorted by time (host side, NumPy).
 
     Times are rounded to the microsecond. Ties keep the order row, column.
     """
@@ -261,7 +269,7 @@ def expand(field: EventField, window_start_us: int = 0) -> NDArray:
 def collect(
     stream: NDArray, frame_times: Sequence[float], height: int, width: int, window_start_us: int = 0
 ) -> EventField:
-    """Returns the field of a stream: the inverse of `expand` for a field without noise (host side, NumPy).
+    """Returns the field of a stream [N]: the inverse of `expand` for a field without noise (host side, NumPy).
 
     Lossless in this sense: `expand(collect(s)) == s` event by event, and `collect(expand(f))` has f's counts
     and polarities exactly and every event within a microsecond. Times come back as float64.

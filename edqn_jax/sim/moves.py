@@ -29,7 +29,11 @@ _AXES = {word: (axis, sign) for sign, words in _WORDS.items() for axis, word in 
 
 
 def move_name(move: ArrayLike) -> str:
-    """Returns the name of a move 0..26, such as `ahead`, `back left up` or `hover`."""
+    """Returns the name of a move [] 0..26, such as `ahead`, `back left up` or `hover`.
+
+    >>> move_name(22), move_name(13)
+    ('ahead', 'hover')
+    """
     vector = ACTIONS[int(np.asarray(move))]
     return " ".join(_WORDS[int(sign)][axis] for axis, sign in enumerate(vector) if sign) or HOVER
 
@@ -43,6 +47,9 @@ def move_number(move: str | ArrayLike) -> Array:
 
     Raises:
         ConfigError: if there is no such move. Numbers that JAX is tracing are taken as they are.
+
+    >>> print(move_number("ahead left"), move_number((1, 1, 0)))
+    25 25
     """
     if isinstance(move, str):
         return jnp.int32(_number_of(_vector_of(move)))

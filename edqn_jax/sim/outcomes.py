@@ -24,7 +24,7 @@ class Outcome(enum.IntEnum):
 
 
 def is_terminal(outcome: Array) -> Array:
-    """Whether the outcome cuts the bootstrap: every end but a time-out."""
+    """Returns whether outcomes [...] cut the bootstrap, [...] bool: every end but a time-out."""
     return (outcome != Outcome.RUNNING) & (outcome != Outcome.TIME_OUT)
 
 

@@ -1,4 +1,4 @@
-"""A JAX primitive that draws pictures in one batch, however many `vmap`s they are mapped by.
+"""A JAX primitive that draws pictures in one batch, however often `vmap` maps them.
 
 It is traced once, where a program is lowered; `jax.custom_batching.custom_vmap` traces again at every `vmap`
 (docs/decisions/0011). M pictures of H x W pixels.

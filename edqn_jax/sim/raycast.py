@@ -159,13 +159,13 @@ def sun_direction(config: CameraConfig) -> tuple[float, float, float]:
 
 
 def shade(config: CameraConfig, nx: Array, ny: Array, nz: Array) -> Array:
-    """Returns the Lambert shade of a unit normal under the sun: ambient + (1 - ambient) max(0, n . sun)."""
+    """Returns the Lambert shade [...] of a unit normal under the sun: ambient + (1 - ambient) max(0, n . sun)."""
     sx, sy, sz = sun_direction(config)
     return config.ambient + (1 - config.ambient) * jnp.maximum(nx * sx + ny * sy + nz * sz, 0.0)
 
 
 def inverse(x: Array) -> Array:
-    """Returns 1 / x, finite at 0."""
+    """Returns 1 / x of [...], finite at 0."""
     return 1.0 / jnp.where(jnp.abs(x) < TINY, TINY, x)
 
 
@@ -182,7 +182,7 @@ def for_shapes(rays: Rays) -> Rays:
 def unit_ball(ox: Array, oy: Array, oz: Array, radius: Array, rays: Rays) -> tuple[Array, Array, Array]:
     """Returns the depth at which rays (`for_shapes`) enter spheres, and depth and distance of closest approach.
 
-    ox, oy, oz: `origin - centre` of each sphere.
+    ox, oy, oz: [N, 1, 1] metres, `origin - centre` of each sphere.
     """
     a = rays.dx**2 + rays.dy**2 + rays.dz**2
     s = -(ox * rays.dx + oy * rays.dy + oz * rays.dz) / a

@@ -37,7 +37,7 @@ def configured_reward(
     after: Array,
     flown: Array | float = 0.0,
 ) -> Array:
-    """Returns the configured reward of one decision.
+    """Returns the configured reward [] of one decision.
 
     `sparse` is Eq. 8. `progress` adds the metres gained towards the goal, times a weight, and
     subtracts a weight for each metre flown; `geodesic` is the same with distances around obstacles. `potential` adds
@@ -45,8 +45,8 @@ def configured_reward(
     optimal policy unchanged (Ng et al. 1999).
 
     Args:
-        before, after: distances to the goal, metres; straight, or along the shortest way (`geodesic`).
-        flown: metres flown.
+        before, after: [] distances to the goal, metres; straight, or along the shortest way (`geodesic`).
+        flown: [] metres flown.
     """
     at_end = jnp.select(
         [outcome == Outcome.GOAL, outcome == Outcome.COLLISION, outcome == Outcome.LEFT_VOLUME],

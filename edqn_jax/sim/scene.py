@@ -125,7 +125,7 @@ _TINY = 1e-20  # under a square root, so that its gradient is finite; 1e-10 m is
 
 
 def scene_at(scene: Scene, time: Array) -> Scene:
-    """Returns the world at `time` (seconds): the identity while every world is static; moving shapes belong here."""
+    """Returns the world at `time` [] seconds: the identity while every world is static; moving shapes belong here."""
     del time
     return scene
 
@@ -409,5 +409,5 @@ def with_equal_capacities(pools: Sequence[Scene], like: Sequence[Any] = ()) -> l
 
 
 def take_scene(pool: Scene, index: ArrayLike) -> Scene:
-    """Returns world `index` of a pool."""
+    """Returns world `index` [] of a pool."""
     return jax.tree.map(lambda leaf: leaf[index], pool)

@@ -37,7 +37,7 @@ _ROOT_SEED = 2024
 
 
 def world_key(split: Split, index: ArrayLike) -> Array:
-    """Returns the key of world `index` (any non-negative integer) of a split."""
+    """Returns the key [] of world `index` (any non-negative integer) of a split."""
     return jax.random.fold_in(jax.random.fold_in(jax.random.key(_ROOT_SEED), SPLITS[split]), index)
 
 

@@ -1,0 +1,83 @@
+"""Docstrings: what is public has one, and what takes or returns arrays says in which shape.
+
+The rule, by the source alone. Public is each function, method and class of a public module of the package whose
+name has no leading underscore. One *has arrays* if an annotation of its arguments or its result is `Array`,
+`ArrayLike` or an array of NumPy; an argument that is a random key does not count. It *names a shape* if its docstring
+has one in brackets: `[]`, `[3]`, `[..., H, W]`. Examples in docstrings are run.
+"""
+
+from __future__ import annotations
+
+import ast
+import doctest
+import importlib
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+PACKAGE = Path(__file__).parents[2] / "edqn_jax"
+
+ARRAY = re.compile(r"\b(Array|ArrayLike|NDArray|ndarray)\b(?!\])")
+
+SHAPE = re.compile(r"\[[^\]\n]*\]")
+
+LEAST = 0.95
+"""Share that the project asks for."""
+
+Public = ast.FunctionDef | ast.ClassDef
+
+
+def public(body: list[ast.stmt], prefix: str) -> Iterator[tuple[str, Public]]:
+    """Yields each public function, class and method with its name."""
+    for node in body:
+        if isinstance(node, Public) and not node.name.startswith("_"):
+            yield f"{prefix}.{node.name}", node
+            if isinstance(node, ast.ClassDef):
+                yield from public(node.body, f"{prefix}.{node.name}")
+
+
+def everything() -> list[tuple[str, Public]]:
+    found = []
+    for file in sorted(PACKAGE.rglob("*.py")):
+        module = ".".join(file.relative_to(PACKAGE.parent).with_suffix("").parts)
+        if not file.stem.startswith("_") or file.stem == "__init__":
+            found += public(ast.parse(file.read_text(encoding="utf-8")).body, module)
+    return found
+
+
+def has_arrays(node: Public) -> bool:
+    if not isinstance(node, ast.FunctionDef):
+        return False
+    arguments = [a for a in (*node.args.args, *node.args.kwonlyargs) if a.annotation and "key" not in a.arg]
+    annotations = [ast.unparse(a.annotation) for a in arguments if a.annotation]
+    annotations += [ast.unparse(node.returns)] if node.returns else []
+    return any(ARRAY.search(text) for text in annotations)
+
+
+def test_public_names_have_docstrings() -> None:
+    names = everything()
+    without = [name for name, node in names if not ast.get_docstring(node)]
+    assert len(without) <= (1 - LEAST) * len(names), without
+
+
+def test_functions_of_arrays_name_their_shapes() -> None:
+    of_arrays = [(name, ast.get_docstring(node) or "") for name, node in everything() if has_arrays(node)]
+    without = [name for name, text in of_arrays if not SHAPE.search(text)]
+    assert len(of_arrays) > 200
+    assert len(without) <= (1 - LEAST) * len(of_arrays), (len(without), len(of_arrays), without)
+
+
+WITH_EXAMPLES = [file for file in sorted(PACKAGE.rglob("*.py")) if ">>> " in file.read_text(encoding="utf-8")]
+
+
+@pytest.mark.parametrize("file", WITH_EXAMPLES, ids=lambda file: file.stem)
+def test_the_examples_of_docstrings_are_true(file: Path) -> None:
+    module = importlib.import_module(".".join(file.relative_to(PACKAGE.parent).with_suffix("").parts))
+    failed, tried = doctest.testmod(module)
+    assert tried > 0 and failed == 0
+
+
+def test_there_are_examples() -> None:
+    assert {"events", "dqn", "moves"} <= {file.stem for file in WITH_EXAMPLES}

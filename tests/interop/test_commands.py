@@ -1,0 +1,67 @@
+"""The shell blocks of all pages are scripts, and each command in them parses by the parser of the real command."""
+
+from __future__ import annotations
+
+import importlib
+import re
+import shlex
+import subprocess
+import tomllib
+from pathlib import Path
+
+import pytest
+
+from edqn_jax.cli import arguments
+from tests.docs.pages import PAGES, ROOT, SHELL, blocks_of, name_of
+
+EXTRAS = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
+
+BLOCKS = [(name_of(page), code) for page in PAGES for code in blocks_of(page, *SHELL)]
+
+RUNS = ("edqn evaluate", "edqn record", "edqn verify")
+
+
+def commands(code: str) -> list[list[str]]:
+    """Returns the words of each command of a script; its variables are numbers."""
+    code = re.sub(r"\$\{?\w+\}?", "0", code).replace("\\\n", " ")
+    found = []
+    for line in code.splitlines():
+        words = shlex.split(line, comments=True)
+        for part in " ".join(map(shlex.quote, words)).replace("'&&'", "&&").replace("'&'", "").split(" && "):
+            found.append(shlex.split(part))
+    return [[word.removeprefix(".venv/bin/") for word in words] for words in found if words]
+
+
+COMMANDS = [(page, words) for page, code in BLOCKS for words in commands(code)]
+
+
+@pytest.mark.parametrize(("page", "code"), BLOCKS, ids=[page for page, _ in BLOCKS])
+def test_a_shell_block_is_a_script(page: str, code: str) -> None:
+    subprocess.run(["bash", "-n"], input=code, text=True, check=True)
+
+
+@pytest.mark.parametrize(("page", "words"), COMMANDS, ids=[f"{page}: {' '.join(words)}" for page, words in COMMANDS])
+def test_a_command_parses(page: str, words: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(arguments, "_check_run", lambda folder: None)  # runs/DIR is a reader's
+    if "train.py" in words or words[:2] == ["edqn", "train"]:
+        arguments.parse_train(words[words.index("train.py" if "train.py" in words else "train") + 1 :])
+    elif words[:2] == ["edqn", "evaluate"]:
+        arguments.parse_evaluate(words[2:])
+    elif words[:2] == ["edqn", "record"]:
+        arguments.parse_record(words[2:])
+    elif words[:2] == ["edqn", "verify"]:
+        arguments.check_flags(words[2:], {"--json"}, arguments.VERIFY)
+    elif words[0] == "python" and words[1].startswith("benchmarks/"):
+        assert (ROOT / words[1]).is_file()
+        module = importlib.import_module(Path(words[1]).stem)
+        if hasattr(module, "parse"):
+            module.parse(words[2:])
+    elif "pip" in words:
+        for asked in re.findall(r"\[([\w,]+)\]", " ".join(words)):
+            assert set(asked.split(",")) <= set(EXTRAS)
+
+
+def test_there_are_commands_of_every_kind() -> None:
+    joined = [" ".join(words) for _, words in COMMANDS]
+    for kind in ("python train.py", *RUNS, "python benchmarks/", "pip install"):
+        assert any(kind in command for command in joined), kind
