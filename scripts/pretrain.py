@@ -33,8 +33,11 @@ ROOT = Path(__file__).resolve().parents[1]
 SEEDS = 5
 """Agents that are trained together; the best of them is shipped."""
 
-FLAGS = ("--tuned-for", "gpu", "--world.flown", "", "--train.keep", "last", "--train.validation-every", "0")
-"""Options of train.py beside the world and the number of seeds."""
+FLAGS = ("--tuned-for", "gpu", "--world.flown", "", "--train.keep", "last")
+"""Options of train.py beside the world, what depends on it, and the number of seeds."""
+
+VALIDATED_EVERY = {"open": 20_000_000, "mixed": 0}
+"""Decisions between validations, by the worlds; 0 validates at the end alone: several seeds take minutes for one."""
 
 DECISIONS = {"open": 60_000_000, "mixed": 300_000_000}
 """Decisions of each seed, by the worlds that can be trained on."""
@@ -165,7 +168,8 @@ def card_of(
 
 def options_of(world: str) -> list[str]:
     """Returns the options of train.py for these worlds, without seeds and folder."""
-    return [*FLAGS, "--world", world, "--total-steps", str(DECISIONS[world])]
+    numbers = {"--total-steps": DECISIONS[world], "--train.validation-every": VALIDATED_EVERY[world]}
+    return [*FLAGS, "--world", world, *(word for name, number in numbers.items() for word in (name, str(number)))]
 
 
 def families_of(policy: Policy) -> list[str]:

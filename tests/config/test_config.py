@@ -78,7 +78,9 @@ def test_random_worlds_have_their_own_warm_up_and_the_papers_preset_its_own_agen
 @pytest.mark.parametrize("hardware", ["cpu", "gpu"])
 def test_worlds_with_walls_are_learnt_along_their_ways_and_open_ones_are_not(hardware):
     rooms, mixed, medium = (resolve(world=name, tuned_for=hardware) for name in ("rooms", "mixed", "medium"))
-    assert rooms.env == mixed.env and rooms.agent == mixed.agent
+    larger = {"hidden", "layer_norm", "replay_size"} if hardware == "gpu" else set()
+    kept = {name: value for name, value in dataclasses.asdict(rooms.agent).items() if name not in larger}
+    assert rooms.env == mixed.env and kept.items() <= dataclasses.asdict(mixed.agent).items()
     assert (rooms.env.reward, medium.env.reward) == ("geodesic", "progress")
     assert rooms.env.collision_reward == medium.env.collision_reward
     assert rooms.train == medium.train and rooms.encoder == medium.encoder
