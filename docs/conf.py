@@ -46,7 +46,7 @@ add_module_names = False
 autodoc_member_order = "bysource"
 # What extras install and the package imports only where it is used; the site is the same with and without.
 sources = "".join(file.read_text(encoding="utf-8") for file in Path(__file__).parents[1].glob("edqn_jax/**/*.py"))
-autodoc_mock_imports = sorted({*re.findall(r'require\("(\w+)', sources)} - {"gymnasium"})
+autodoc_mock_imports = sorted({*re.findall(r'require\("(\w+)', sources)} - {"edqn_jax", "gymnasium"})
 del sources
 autodoc_typehints_format = "short"
 python_use_unqualified_type_names = True

@@ -169,7 +169,7 @@ class EventsArgs:
     yaw_rate: Annotated[float, arg(metavar="R")] = 0.0
     """Yaw rate, rad/s to the left, likewise."""
     window: Annotated[float | None, arg(metavar="S", help_behavior_hint="")] = None
-    """Length of a window in pictures, seconds (default: 0.05; a policy's own with --policy)."""
+    """Length of a window in pictures in seconds (default: 0.05, a policy's own with --policy)."""
     picture: Annotated[Path | None, arg(metavar="FILE.png|gif", help_behavior_hint="")] = None
     """Also draw windows: six moments as a .png, or up to 120 as a .gif."""
     out: Annotated[Path | None, arg(metavar="FILE.h5|npz|txt", help_behavior_hint="")] = None

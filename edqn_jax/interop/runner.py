@@ -2,10 +2,8 @@
 
     runner = Runner("policy.onnx", camera=(346, 260), camera_fov_deg=70.0, contrast=0.2)
     runner.reset()
-    command = runner.decide(
-        packet, until_us,
-        position=position, quaternion=quaternion, velocity=velocity, yaw_rate=yaw_rate, goal=goal, volume=volume,
-    )
+    decide = functools.partial(runner.decide, goal=goal, volume=volume)
+    command = decide(packet, until_us, position=p, quaternion=q, velocity=v, yaw_rate=r)
     command.velocity  # m/s in the world, to be held until the next decision
 
 Needs NumPy and onnxruntime, nothing else: `edqn export` writes a copy of this file beside the policy. Positions and
