@@ -7,19 +7,24 @@ import os
 import signal
 import sys
 from collections.abc import Sequence
+from importlib import metadata
 
 import tyro
 
 import edqn_jax
 from edqn_jax.cli.arguments import (
+    CompletionArgs,
     EvaluateArgs,
     RecordArgs,
     TrainCommand,
     VerifyArgs,
+    parse_completion,
     parse_evaluate,
     parse_record,
     parse_verify,
 )
+from edqn_jax.cli.completion import completion_script
+from edqn_jax.cli.help import ABOUT
 from edqn_jax.cli.signals import Stops
 from edqn_jax.cli.train import train_command
 from edqn_jax.config.loading import nearest
@@ -32,7 +37,16 @@ DIVERGED = 3
 BY_SIGNAL = 128
 """What the number of a signal is added to: 130 for SIGINT, 143 for SIGTERM."""
 
-COMMANDS = {"train": TrainCommand, "evaluate": EvaluateArgs, "record": RecordArgs, "verify": VerifyArgs}
+COMMANDS = {
+    "train": TrainCommand,
+    "evaluate": EvaluateArgs,
+    "record": RecordArgs,
+    "verify": VerifyArgs,
+    "completion": CompletionArgs,
+}
+
+VERSIONS = ("jax", "mujoco", "mujoco-mjx")
+"""Packages whose versions `edqn --version` names below its own."""
 
 OF_A_RUN = {"evaluate": parse_evaluate, "record": parse_record, "verify": parse_verify}
 
@@ -75,10 +89,14 @@ def _dispatch(argv: Sequence[str], stops: Stops) -> int:
         train_command(rest, stops)
     elif command in OF_A_RUN:
         _of_a_run(command, rest)
+    elif command == "completion":
+        print(completion_script(parse_completion(rest).shell))
     elif command == "--version":
         print(f"edqn-jax {edqn_jax.__version__}")
+        for package in VERSIONS:
+            print(f"{package} {metadata.version(package)}")
     elif command in ("-h", "--help"):
-        tyro.extras.subcommand_cli_from_dict(COMMANDS, prog="edqn", args=["--help"])
+        tyro.extras.subcommand_cli_from_dict(COMMANDS, prog="edqn", description=ABOUT["edqn"], args=["--help"])
     else:
         raise ConfigError(f"there is no command '{command}'{nearest(command, [*COMMANDS, '--help', '--version'])}")
     return DONE
