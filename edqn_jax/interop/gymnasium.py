@@ -124,8 +124,12 @@ class _Task:
     params: Params
 
     @property
+    def config(self) -> Config:
+        return self.env.config
+
+    @property
     def environment(self) -> Environment:
-        return Environment(self.env.config, self.params.world)
+        return Environment(self.config, self.params.world)
 
     @functools.cached_property
     def program(self) -> tuple[_Program, Leaves, EncoderParams]:
