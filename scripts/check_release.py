@@ -4,8 +4,9 @@
     python scripts/check_release.py --python python3.13
     python scripts/check_release.py --final --out dist
 
-Checks which files both hold, and that wheels built from checkout and sdist hold the same. Then, for each Python, installs
-the wheel and runs `edqn`, loads the pretrained policy, makes the paper's world and flies once. Needs the package `build`.
+Checks which files both hold, and that wheels built from checkout and sdist hold the same. Then, for each Python,
+installs the wheel and runs `edqn`, loads the pretrained policy, makes the paper's world and flies once. Needs the
+package `build`.
 """
 
 from __future__ import annotations

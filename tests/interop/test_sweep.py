@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +9,7 @@ import pytest
 
 from edqn_jax.config import Config
 from edqn_jax.packages import require
+from tests.interop.tiny import tiny_trial
 from tests.miniature import WORLD
 
 optuna = require("optuna", extra="sweep")
@@ -20,23 +20,10 @@ def tiny(storage: Path, trials: int) -> Any:
     return sweep.Settings(trials=trials, storage=storage, world=str(WORLD), total_steps=2048)
 
 
-def miniature(config: Config) -> Config:
-    """The configuration of a trial, on few pixels and with few environments."""
-    return dataclasses.replace(
-        config,
-        camera=dataclasses.replace(config.camera, width=8, height=6),
-        drone=dataclasses.replace(config.drone, physics="rigid_body"),
-        env=dataclasses.replace(config.env, sensor="blind", reward="progress"),
-        world=dataclasses.replace(config.world, missions=16),
-        agent=dataclasses.replace(config.agent, batch_size=16, replay_size=512, learning_starts=64),
-        train=dataclasses.replace(config.train, num_envs=16, chunk_steps=16, validation_missions=2),
-    )
-
-
 @pytest.fixture
 def quick(monkeypatch: pytest.MonkeyPatch) -> None:
     whole = sweep.configured
-    monkeypatch.setattr(sweep, "configured", lambda settings, trial: miniature(whole(settings, trial)))
+    monkeypatch.setattr(sweep, "configured", lambda settings, trial: tiny_trial(whole(settings, trial)))
 
 
 @pytest.mark.filterwarnings("ignore::Warning:optuna.*", "ignore::Warning:sqlalchemy.*")
