@@ -6,7 +6,7 @@
 
 Checks which files both hold, and that wheels built from checkout and sdist hold the same. Then, for each Python,
 installs the wheel and runs `edqn`, loads the pretrained policy, makes the paper's world and flies once. Needs the
-package `build`.
+extra `release`.
 """
 
 from __future__ import annotations
