@@ -29,8 +29,6 @@ ROOT = Path(__file__).parents[1]
 IN_BOTH = ("sim/skydio_x2.xml", "py.typed", "policies/pretrained/config.yaml", "policies/pretrained/README.md")
 """Files of the package that are not Python, beside worlds and checkpoints."""
 
-NOT_IN_THE_WHEEL = ("tests/", "benchmarks/", "examples/", "notebooks/", "docs/")
-
 FLIES = """
 import sys
 from pathlib import Path
