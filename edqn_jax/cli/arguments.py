@@ -100,12 +100,12 @@ class EvaluateArgs:
 
 @dataclass(frozen=True)
 class RecordArgs:
-    """Fly a saved run once and write the flight as an animated GIF: the view, what the drone sees, and its path."""
+    """Fly a saved run once and write the flight as a GIF or MP4: the view, what the drone sees, and its path."""
 
     run: Annotated[Positional[Path], arg(metavar="RUN")]
     """Folder of the run, or `pretrained`: the policy that comes with the package."""
-    file: Annotated[Positional[Path], arg(metavar="FILE.gif")]
-    """GIF to write; it replaces a file of that name."""
+    file: Annotated[Positional[Path], arg(metavar="FILE.gif|FILE.mp4")]
+    """GIF or MP4 to write, by its ending; it replaces a file of that name. MP4 needs the extra `video`."""
     world: Annotated[str | None, arg(metavar="WORLD", help_behavior_hint="")] = None
     """Where to fly: `paper`, an MJCF file, or a family of random worlds (default: that of the run's last flight)."""
     start: Annotated[Point | None, arg(metavar="X Y Z", help_behavior_hint="")] = None
@@ -126,7 +126,24 @@ class VerifyArgs:
     """Also write what was found as JSON."""
 
 
+@dataclass(frozen=True)
+class ReportArgs:
+    """Write the page of runs: their flights in 3D, what the drone saw, curves, figures and options, in one HTML file."""
+
+    runs: Annotated[Positional[tuple[Path, ...]], arg(metavar="RUN [RUN ...]")]
+    """Folders of runs, or `pretrained`; the folder of several seeds stands for the run of each seed."""
+    out: Annotated[Path | None, arg(metavar="FILE.html", help_behavior_hint="")] = None
+    """HTML file to write; it replaces a file of that name (default: report.html in the first run's folder, of
+    `pretrained` in the current one)."""
+    missions: Annotated[int, arg(metavar="N")] = 128
+    """Evaluation flights of each run at most; of all runs together at most 256."""
+
+
 TRAIN, EVALUATE, RECORD, VERIFY = "edqn train", "edqn evaluate", "edqn record", "edqn verify"
+REPORT = "edqn report"
+
+RECORDED = (".gif", ".mp4")
+"""Endings of the files that `edqn record` writes."""
 
 
 def parse_train(argv: Sequence[str]) -> tuple[TrainOptions, Config]:
@@ -245,13 +262,13 @@ def parse_record(argv: Sequence[str]) -> RecordArgs:
     """Returns the checked arguments of `edqn record`.
 
     Raises:
-        ConfigError: if the file is no GIF, or there is no run.
+        ConfigError: if the file is neither GIF nor MP4, or there is no run.
         SystemExit: after printing, for --help and for what does not parse.
     """
     check_flags(argv, record_flags(), RECORD)
     args = tyro.cli(RecordArgs, args=argv, prog=RECORD)
-    if args.file.suffix.lower() != ".gif":
-        raise ConfigError(f"'{args.file}' must end in .gif; only animated GIFs are written")
+    if args.file.suffix.lower() not in RECORDED:
+        raise ConfigError(f"'{args.file}' must end in {' or '.join(RECORDED)}")
     _check_run(args.run)
     return args
 
@@ -268,6 +285,28 @@ def parse_verify(argv: Sequence[str]) -> VerifyArgs:
     if not (args.run / "config.yaml").is_file():
         raise ConfigError(f"there is no run in '{args.run}': it holds no config.yaml")
     return args
+
+
+def parse_report(argv: Sequence[str]) -> ReportArgs:
+    """Returns the checked arguments of `edqn report`.
+
+    Raises:
+        ConfigError: if a folder holds no run, or another argument is out of its limits.
+        SystemExit: after printing, for --help and for what does not parse.
+    """
+    check_flags(argv, {_flag(option.name) for option in dataclasses.fields(ReportArgs)}, REPORT)
+    args = tyro.cli(ReportArgs, args=argv, prog=REPORT)
+    if not args.runs:
+        raise ConfigError("give the folder of a run, such as edqn report runs/DIR")
+    if args.missions < 1:
+        raise ConfigError(f"--missions must be at least 1, not {args.missions}")
+    for run in args.runs:
+        _check_run(run)
+    first = args.runs[0] / "report.html"
+    out = args.out or (first if args.runs[0].is_dir() else Path("report.html"))
+    if out.suffix.lower() not in (".html", ".htm"):
+        raise ConfigError(f"--out '{out}' must end in .html")
+    return dataclasses.replace(args, out=out)
 
 
 def _check_run(folder: Path) -> None:

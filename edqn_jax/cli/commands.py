@@ -14,10 +14,12 @@ import edqn_jax
 from edqn_jax.cli.arguments import (
     EvaluateArgs,
     RecordArgs,
+    ReportArgs,
     TrainCommand,
     VerifyArgs,
     parse_evaluate,
     parse_record,
+    parse_report,
     parse_verify,
 )
 from edqn_jax.cli.signals import Stops
@@ -32,9 +34,15 @@ DIVERGED = 3
 BY_SIGNAL = 128
 """What the number of a signal is added to: 130 for SIGINT, 143 for SIGTERM."""
 
-COMMANDS = {"train": TrainCommand, "evaluate": EvaluateArgs, "record": RecordArgs, "verify": VerifyArgs}
+COMMANDS = {
+    "train": TrainCommand,
+    "evaluate": EvaluateArgs,
+    "record": RecordArgs,
+    "report": ReportArgs,
+    "verify": VerifyArgs,
+}
 
-OF_A_RUN = {"evaluate": parse_evaluate, "record": parse_record, "verify": parse_verify}
+OF_A_RUN = {"evaluate": parse_evaluate, "record": parse_record, "report": parse_report, "verify": parse_verify}
 
 
 def run(argv: Sequence[str] | None, stops: Stops) -> int:

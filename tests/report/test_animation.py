@@ -35,7 +35,7 @@ class Drawn:
 
     def shown(self, params: object, flown: dict[str, np.ndarray]) -> Shown:
         counts = np.random.default_rng(0).integers(-3, 4, (len(flown["t"]) // 13, 24, 32))
-        return Shown(counts, counts, counts)
+        return Shown(counts, counts, counts, counts)
 
 
 def a_flight(decisions: float) -> dict[str, np.ndarray]:
