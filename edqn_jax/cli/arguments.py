@@ -53,6 +53,12 @@ class TrainOptions:
     """What to do with a run in --run-dir: `auto` continues it from its newest checkpoint, `must` refuses to begin one,
     `never` starts an unfinished one over. A run goes on with its own options; those that are given must be the same,
     but for --total-steps, which may be more."""
+    track: tuple[Literal["tensorboard", "wandb"], ...] = ()
+    """Also write the metrics for TensorBoard, or for Weights & Biases offline, or both, into the folder of the run (extra
+    `track`)."""
+    view: Annotated[Literal["rerun"] | None, arg(help_behavior_hint="")] = None
+    """Also write metrics and validation flights as `training.rrd` into the folder of the run and, where there is a
+    screen, show them live in the Rerun viewer (extra `viz`)."""
     distributed: Distributed = "auto"
     """Whether to train together with other processes, on one host or many: `auto` where --coordinator-address is given
     or Slurm's srun has started several tasks, `must` in any cluster that JAX finds, `never` not at all."""
@@ -128,7 +134,7 @@ class VerifyArgs:
 
 @dataclass(frozen=True)
 class ReportArgs:
-    """Write the page of runs: their flights in 3D, what the drone saw, curves, figures and options, in one HTML file."""
+    """Write one HTML file with runs' flights in 3D, what the drone saw, curves, figures and options."""
 
     runs: Annotated[Positional[tuple[Path, ...]], arg(metavar="RUN [RUN ...]")]
     """Folders of runs, or `pretrained`; the folder of several seeds stands for the run of each seed."""

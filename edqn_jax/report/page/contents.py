@@ -98,7 +98,9 @@ def curves(run: FlownRun) -> dict[str, Any]:
         found["return"] = _curve(step[whole], run.episodes["return"][whole], window)
         found["success"] = _curve(step, (outcome == "goal").astype(np.float64), window)
     validations = [
-        (row["decisions"], row["validation_success"]) for row in run.metrics if row.get("validation_success") is not None
+        (row["decisions"], row["validation_success"])
+        for row in run.metrics
+        if row.get("validation_success") is not None
     ]
     if validations:
         found["validation"] = {"x": [x for x, _ in validations], "y": rounded([y for _, y in validations], 4)}
@@ -141,7 +143,9 @@ def add_pictures(
                     flight["no_pictures"] = "no pictures of this flight: the file would be too large"
                     continue
                 there = shown.in_world(_scene(run, queue[turn]))
-                flight["pictures"] = flight_pictures(there, run.params, trajectory(run.config, run.flights, queue[turn]))
+                flight["pictures"] = flight_pictures(
+                    there, run.params, trajectory(run.config, run.flights, queue[turn])
+                )
                 left -= sum(len(panel["png"]) for panel in flight["pictures"]["panels"])
 
 

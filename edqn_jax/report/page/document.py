@@ -8,7 +8,6 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
-
 from edqn_jax.config.loading import to_yaml
 from edqn_jax.errors import ConfigError
 from edqn_jax.evaluation.metrics import clearance_text, summarise
@@ -54,8 +53,11 @@ def document(runs: Sequence[FlownRun], data: dict[str, Any]) -> str:
     parts = {
         "title": escape(title),
         "made": escape(f"edqn_jax {data['version']}, {data['made']}"),
-        "notes": "".join(f"<p class='note'>{_tag(run, number, runs)}{escape(note)}</p>" for number, run in
-                         enumerate(runs) for note in run.notes),
+        "notes": "".join(
+            f"<p class='note'>{_tag(run, number, runs)} {escape(note)}</p>"
+            for number, run in enumerate(runs)
+            for note in run.notes
+        ),
         "comparison": comparison(runs),
         "options": options(runs),
         "style": _asset("vendored/uPlot.min.css") + _asset("page.css"),
@@ -139,7 +141,8 @@ def _differences(runs: Sequence[FlownRun]) -> str:
         return "<p>All options are the same.</p>"
     head = "".join(f"<th>{_tag(run, number, runs)}</th>" for number, run in enumerate(runs))
     rows = "".join(
-        f"<tr><th>{escape(name)}</th>" + "".join(f"<td>{escape(column.get(name, '–'))}</td>" for column in columns)
+        f"<tr><th>{escape(name)}</th>"
+        + "".join(f"<td>{escape(column.get(name, '–'))}</td>" for column in columns)
         + "</tr>"
         for name in differ
     )
@@ -166,7 +169,7 @@ def _tag(run: FlownRun, number: int, runs: Sequence[FlownRun], *, always: bool =
     if len(runs) == 1 and not always:
         return ""
     colour = RUN_COLOURS[number % len(RUN_COLOURS)]
-    return f"<span class='tag'><i style='background:{colour}'></i>{escape(run.name)}</span> "
+    return f"<span class='tag'><i style='background:{colour}'></i>{escape(run.name)}</span>"
 
 
 def _asset(name: str) -> str:

@@ -143,12 +143,13 @@
     /** Puts the camera where it sees the whole volume. */
     frame() {
       const world = data.worlds[this.world];
+      if (!world) return;
       const middle = world.lower.map((low, axis) => (low + world.upper[axis]) / 2);
-      const wide = this.camera.aspect < 1 ? 1.35 / this.camera.aspect : 1.2;
+      const wide = 0.45 + 1 / Math.min(this.camera.aspect, 1.3);
       const away = reach(world) * wide;
       this.controls.target.set(middle[0], middle[1], world.lower[2] + 0.25 * (world.upper[2] - world.lower[2]));
       this.camera.position.set(middle[0] + 0.28 * away, middle[1] - 0.72 * away, world.lower[2] + 0.62 * away);
-      if (this.mode === "map") this.camera.position.set(middle[0], middle[1] - 0.001 * away, world.upper[2] + 1.0 * away);
+      if (this.mode === "map") this.camera.position.set(middle[0], middle[1] - 0.001 * away, world.upper[2] + 0.95 * away);
       this.controls.update();
     }
 
@@ -157,6 +158,7 @@
       this.controls.enabled = mode === "orbit" || mode === "map";
       this.camera.up.set(0, 0, 1);
       this.camera.fov = 45;
+      this.camera.updateProjectionMatrix();
       if (this.controls.enabled) this.frame();
     }
 
@@ -167,13 +169,15 @@
         [this.width, this.height] = [clientWidth, clientHeight];
         this.renderer.setSize(clientWidth, clientHeight, false);
         this.camera.aspect = clientWidth / Math.max(clientHeight, 1);
+        this.camera.updateProjectionMatrix();
         if (first) this.frame();
       }
       for (const { flight, line, drone, chosen } of this.flights) {
         const [position, turn] = poseAt(flight, (rowsOf(flight), Math.min(time, flight.end)));
         drone.position.copy(position);
         drone.quaternion.copy(turn);
-        const scale = Math.max(1, position.distanceTo(this.camera.position) / (chosen ? 45 : 70));
+        const riding = !this.controls.enabled, far = riding ? 160 : chosen ? 45 : 70;
+        const scale = Math.max(1, position.distanceTo(this.camera.position) / far);
         drone.children.forEach((part) => { if (part.name === "body") part.scale.setScalar(scale); });
         if (chosen) {
           this.sightOf(drone, turn, flight);
@@ -431,7 +435,7 @@
     const x = rows.map((row) => flight.table[row]);
     traces = [["Clearance, m", "clearance", "#d55e00"], ["Speed, m/s", "speed", "#0072b2"]].map(([title, name, colour]) => {
       const y = rows.map((row) => flight.table[row + COLUMN[name]]);
-      return chart(place, title, [{ label: name, colour, x, y }], { height: 110, legend: false });
+      return chart(place, title, [{ label: name, colour, x, y }], { height: 84, legend: false });
     });
     for (const plot of traces) {
       plot.over.addEventListener("click", () => seek(plot.posToVal(plot.cursor.left, "x")));

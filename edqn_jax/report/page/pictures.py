@@ -47,7 +47,12 @@ def flight_pictures(sights: Sights, params: PolicyParams, flown: Mapping[str, np
     panels = [
         ("brightness", on_screen(shown.luma), Normalize(0.0, 1.0), "gray"),
         (look.name, shown.image, scale_of(shown.image, look, share=0.75), look.colours),
-        (f"predicted {drawn.name}" if nearness else f"{drawn.name}, from the code", shown.reconstruction, scale, colours),
+        (
+            f"predicted {drawn.name}" if nearness else f"{drawn.name}, from the code",
+            shown.reconstruction,
+            scale,
+            colours,
+        ),
         (f"true {drawn.name}" if nearness else f"{drawn.name}, blurred", shown.target, scale, colours),
     ]
     count, height, width = shown.image.shape

@@ -30,7 +30,12 @@ def _shapes(scene: Scene) -> Iterator[dict[str, Any]]:
     """Yields every shape that is not parked, in the order of `solids_of`."""
     for at, half, yaw in present(scene.boxes, "position", "half", "yaw"):
         c, s = np.cos(yaw), np.sin(yaw)
-        yield {"kind": "box", "at": rounded(at), "half": rounded(half), "turn": rounded([c, -s, 0, s, c, 0, 0, 0, 1], 5)}
+        yield {
+            "kind": "box",
+            "at": rounded(at),
+            "half": rounded(half),
+            "turn": rounded([c, -s, 0, s, c, 0, 0, 0, 1], 5),
+        }
     for at, half, turn in present(scene.tilted_boxes, "position", "half", "rotation"):
         yield {"kind": "box", "at": rounded(at), "half": rounded(half), "turn": rounded(turn.ravel(), 5)}
     for at, radius, half in present(scene.cylinders, "position", "radius", "half_height"):
