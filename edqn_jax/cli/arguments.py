@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
+import importlib.util
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -54,8 +55,8 @@ class TrainOptions:
     `never` starts an unfinished one over. A run goes on with its own options; those that are given must be the same,
     but for --total-steps, which may be more."""
     track: tuple[Literal["tensorboard", "wandb"], ...] = ()
-    """Also write the metrics for TensorBoard, or for Weights & Biases offline, or both, into the folder of the run (extra
-    `track`)."""
+    """Also write the metrics for TensorBoard, or for Weights & Biases offline, or both, into the folder of the run
+    (extra `track`)."""
     view: Annotated[Literal["rerun"] | None, arg(help_behavior_hint="")] = None
     """Also write metrics and validation flights as `training.rrd` into the folder of the run and, where there is a
     screen, show them live in the Rerun viewer (extra `viz`)."""
@@ -275,6 +276,8 @@ def parse_record(argv: Sequence[str]) -> RecordArgs:
     args = tyro.cli(RecordArgs, args=argv, prog=RECORD)
     if args.file.suffix.lower() not in RECORDED:
         raise ConfigError(f"'{args.file}' must end in {' or '.join(RECORDED)}")
+    if args.file.suffix.lower() == ".mp4" and importlib.util.find_spec("imageio_ffmpeg") is None:
+        raise ConfigError("an .mp4 needs imageio_ffmpeg; run pip install 'edqn-jax[video]', or write a .gif")
     _check_run(args.run)
     return args
 

@@ -1,4 +1,4 @@
-"""`edqn record`: flies a saved policy once and writes the flight as an animated GIF."""
+"""`edqn record`: flies a saved policy once and writes the flight as an animated GIF or an MP4."""
 
 from __future__ import annotations
 
@@ -37,12 +37,13 @@ def record_command(args: RecordArgs) -> None:
         flights = fly_on_all_devices(config, missions.world, params, args.seed, record=True)
         outcome = Outcome(int(flights.outcome[0])).name.lower()
         name = missions.name if missions.file is None else Path(missions.name).stem
-        gif = animate(sights, params, trajectory(config, flights), outcome, title=f"world '{name}'")
-    write_atomically(args.file, gif)
+        flown = trajectory(config, flights)
+        video = animate(sights, params, flown, outcome, title=f"world '{name}'", form=args.file.suffix.lower())
+    write_atomically(args.file, video)
     notes = [] if args.world is not None else worlds_replaced(args.run)
     for note in (*notes, *([missions.note] if missions.note is not None else [])):
         Console().print(note, soft_wrap=True, markup=False, highlight=False)
-    flown = f"{OUTCOME_LABELS[outcome]} after {float(flights.flight_seconds[0]):.1f} s"
+    ended = f"{OUTCOME_LABELS[outcome]} after {float(flights.flight_seconds[0]):.1f} s"
     Console().print(
-        f"{flown}; '{args.file}' has {len(gif) / 1e6:.1f} MB", soft_wrap=True, markup=False, highlight=False
+        f"{ended}; '{args.file}' has {len(video) / 1e6:.1f} MB", soft_wrap=True, markup=False, highlight=False
     )

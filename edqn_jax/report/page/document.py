@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable, Sequence
 from html import escape
 from importlib import resources
 from pathlib import Path
 from typing import Any
 
-from edqn_jax.config.loading import to_yaml
 from edqn_jax.errors import ConfigError
 from edqn_jax.evaluation.metrics import clearance_text, summarise
 from edqn_jax.report.page.contents import RUN_COLOURS, add_pictures, page_data, script_text
@@ -154,14 +154,11 @@ def _differences(runs: Sequence[FlownRun]) -> str:
 
 def _lines(run: FlownRun) -> dict[str, str]:
     """Returns the options of a run as text, by their names with their groups."""
-    found, group = {}, ""
-    for line in to_yaml(run.config).splitlines():
-        name, _, value = line.partition(":")
-        if not line.startswith(" "):
-            group = name
-        elif value:
-            found[f"{group}.{name.strip()}"] = value.strip()
-    return found
+    return {
+        f"{group}.{name}": str(value)
+        for group, options in dataclasses.asdict(run.config).items()
+        for name, value in options.items()
+    }
 
 
 def _tag(run: FlownRun, number: int, runs: Sequence[FlownRun], *, always: bool = False) -> str:

@@ -145,7 +145,7 @@
       const world = data.worlds[this.world];
       if (!world) return;
       const middle = world.lower.map((low, axis) => (low + world.upper[axis]) / 2);
-      const wide = 0.45 + 1 / Math.min(this.camera.aspect, 1.3);
+      const wide = 0.98 + 0.6 / Math.min(this.camera.aspect, 1.3);
       const away = reach(world) * wide;
       this.controls.target.set(middle[0], middle[1], world.lower[2] + 0.25 * (world.upper[2] - world.lower[2]));
       this.camera.position.set(middle[0] + 0.28 * away, middle[1] - 0.72 * away, world.lower[2] + 0.62 * away);
