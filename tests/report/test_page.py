@@ -51,26 +51,26 @@ def a_run(steps: int = 40, name: str = "a run") -> FlownRun:
     x = np.arange(1, steps + 1, dtype=np.float32)
     position = np.stack([x, 0 * x, 0 * x + 2], axis=-1)[None]
     record = Record(
-        position=position,
-        quaternion=np.tile(np.float32([1, 0, 0, 0]), (1, steps, 1)),
-        velocity=np.tile(np.float32([3, 0, 4]), (1, steps, 1)),
-        clearance=x[None],
-        action=np.zeros((1, steps), np.int32),
-        reward=np.zeros((1, steps), np.float32),
-    )  # type: ignore[arg-type]
-    one: Any = np.ones(1, np.float32)
-    closest = Closest(distance=one, time=one, position=np.ones((1, 3)), quaternion=np.ones((1, 4)))  # type: ignore[arg-type]
+        position=jnp.asarray(position),
+        quaternion=jnp.tile(jnp.array([1.0, 0, 0, 0]), (1, steps, 1)),
+        velocity=jnp.tile(jnp.array([3.0, 0, 4]), (1, steps, 1)),
+        clearance=jnp.asarray(x[None]),
+        action=jnp.zeros((1, steps), jnp.int32),
+        reward=jnp.zeros((1, steps)),
+    )
+    one = jnp.ones(1)
+    closest = Closest(distance=one, time=one, position=jnp.ones((1, 3)), quaternion=jnp.ones((1, 4)))
     flights = Flights(
-        outcome=np.array([Outcome.COLLISION]),
-        decisions=np.array([3]),
-        physics_steps=np.array([steps]),
+        outcome=jnp.array([Outcome.COLLISION]),
+        decisions=jnp.array([3]),
+        physics_steps=jnp.array([steps]),
         contact=one,
         episode_return=one,
         path_length_m=one,
         flight_seconds=one,
         closest=closest,
         record=record,
-    )  # type: ignore[arg-type]
+    )
     ends = SimpleNamespace(start=np.zeros((1, 3)), goal=np.ones((1, 3)), scene=np.zeros(1, int))
     missions: Any = SimpleNamespace(name="paper", world=SimpleNamespace(missions=ends))
     params: Any = None

@@ -170,4 +170,4 @@ def _tag(run: FlownRun, number: int, runs: Sequence[FlownRun], *, always: bool =
 
 
 def _asset(name: str) -> str:
-    return resources.files(__package__).joinpath(name).read_text(encoding="utf-8")
+    return resources.files("edqn_jax.report.page").joinpath(name).read_text(encoding="utf-8")

@@ -96,7 +96,7 @@
       }
       this.drop("moving");
       this.moving = new THREE.Group();
-      this.flights = flights.map(({ flight, colour }) => this.addFlight(flight, colour, flight === chosen));
+      this.flights = flights.map(({ flight, colour }) => this.addFlight(flight, colour, flight === chosen, flights.length > 30 ? 0.25 : 0.5));
       this.addEnds(chosen, world);
       this.scene.add(this.moving);
       this.chosen = chosen;
@@ -113,10 +113,10 @@
       this[name] = null;
     }
 
-    addFlight(flight, colour, chosen) {
+    addFlight(flight, colour, chosen, faint) {
       const line = new THREE.Line2(
         new THREE.LineGeometry().setPositions(pathOf(flight)),
-        new THREE.LineMaterial({ color: colour, linewidth: chosen ? 4 : 1.6, transparent: !chosen, opacity: chosen ? 1 : 0.45 }),
+        new THREE.LineMaterial({ color: colour, linewidth: chosen ? 4 : 1.6, transparent: !chosen, opacity: chosen ? 1 : faint }),
       );
       const drone = droneOf(colour, chosen ? flight : null);
       this.moving.add(line, drone);
@@ -176,7 +176,7 @@
         const [position, turn] = poseAt(flight, (rowsOf(flight), Math.min(time, flight.end)));
         drone.position.copy(position);
         drone.quaternion.copy(turn);
-        const riding = !this.controls.enabled, far = riding ? 160 : chosen ? 45 : 70;
+        const riding = !this.controls.enabled, far = riding ? 160 : chosen ? 40 : 90;
         const scale = Math.max(1, position.distanceTo(this.camera.position) / far);
         drone.children.forEach((part) => { if (part.name === "body") part.scale.setScalar(scale); });
         if (chosen) {
@@ -351,8 +351,8 @@
       cursor: { y: false },
       scales: { x: { time: false }, y: range ? { range: () => range } : {} },
       axes: [
-        { ...AXIS, values: (_, ticks) => ticks.map(short) },
-        { ...AXIS, size: 48, values: (_, ticks) => ticks.map(format) },
+        { ...AXIS, size: 30, values: (_, ticks) => ticks.map(short) },
+        { ...AXIS, size: 48, space: 18, values: (_, ticks) => ticks.map(format) },
       ],
       series: [{}, ...lines.map((line) => ({
         label: line.label, stroke: line.colour, width: 1.6, dash: line.dash, spanGaps: true, points: { show: line.x.length < 2 },
