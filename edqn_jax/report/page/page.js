@@ -145,9 +145,9 @@
       const world = data.worlds[this.world];
       if (!world) return;
       const middle = world.lower.map((low, axis) => (low + world.upper[axis]) / 2);
-      const wide = 0.98 + 0.6 / Math.min(this.camera.aspect, 1.3);
+      const wide = 0.9 + 0.72 / Math.min(this.camera.aspect, 1.3);
       const away = reach(world) * wide;
-      this.controls.target.set(middle[0], middle[1], world.lower[2] + 0.25 * (world.upper[2] - world.lower[2]));
+      this.controls.target.set(middle[0], middle[1] - 0.05 * reach(world), world.lower[2] + 0.25 * (world.upper[2] - world.lower[2]));
       this.camera.position.set(middle[0] + 0.28 * away, middle[1] - 0.72 * away, world.lower[2] + 0.62 * away);
       if (this.mode === "map") this.camera.position.set(middle[0], middle[1] - 0.001 * away, world.upper[2] + 0.95 * away);
       this.controls.update();
