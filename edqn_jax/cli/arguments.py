@@ -54,7 +54,7 @@ class TrainOptions:
     """What to do with a run in --run-dir: `auto` continues it from its newest checkpoint, `must` refuses to begin one,
     `never` starts an unfinished one over. A run goes on with its own options; those that are given must be the same,
     but for --total-steps, which may be more."""
-    track: tuple[Literal["tensorboard", "wandb"], ...] = ()
+    track: Annotated[tuple[Literal["tensorboard", "wandb"], ...], arg(help_behavior_hint="")] = ()
     """Also write the metrics for TensorBoard, or for Weights & Biases offline, or both, into the folder of the run
     (extra `track`)."""
     view: Annotated[Literal["rerun"] | None, arg(help_behavior_hint="")] = None
@@ -137,7 +137,7 @@ class VerifyArgs:
 class ReportArgs:
     """Write one HTML file with runs' flights in 3D, what the drone saw, curves, figures and options."""
 
-    runs: Annotated[Positional[tuple[Path, ...]], arg(metavar="RUN [RUN ...]")]
+    runs: Annotated[Positional[tuple[Path, ...]], arg(metavar="RUN [RUN ...]", help_behavior_hint="")]
     """Folders of runs, or `pretrained`; the folder of several seeds stands for the run of each seed."""
     out: Annotated[Path | None, arg(metavar="FILE.html", help_behavior_hint="")] = None
     """HTML file to write; it replaces a file of that name (default: report.html in the first run's folder, of
