@@ -116,8 +116,8 @@ GPU_CLOSED: Layer = {"agent": {"hidden": (512, 512)}}
 """What a GPU changes further for rooms, forests and canyons."""
 
 GPU_MIXED: Layer = {"agent": {"hidden": (1024, 1024, 1024), "layer_norm": True, "replay_size": 2_097_152}}
-"""What a GPU changes further for one policy of all six families: a larger network and replay, since one that is large
-enough for a single family was ahead of nothing else here (docs/decisions/0022-one-policy-for-six-families.md)."""
+"""What a GPU changes further for one policy of all six families: a larger, normalised Q-network and a larger replay
+(docs/decisions/0022-one-policy-for-six-families.md)."""
 
 GPU_FROM_FILE: Layer = {
     "train": {"num_envs": 2048, "chunk_steps": 32, "total_steps": 6_000_000, "validation_every": 2_000_000},

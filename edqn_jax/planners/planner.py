@@ -117,7 +117,7 @@ def plan(
     *,
     body_radius: float = 0.36,
     budget: Budget = Budget(),
-    seed: int = 0,  # noqa: B008 (it is frozen)
+    seed: int = 0,
 ) -> Plan:
     """Plans a path from a world's start to its goal with a planner that is given the whole map.
 
