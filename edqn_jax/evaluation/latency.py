@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import jax
 import jax.numpy as jnp
@@ -27,17 +27,22 @@ def decision_latency_ms(config: Config, params: PolicyParams, calls: int = 300) 
 
 def decision_seconds(config: Config, params: PolicyParams, calls: int) -> np.ndarray:
     """Returns the seconds [calls] that each of `calls` decisions takes, from arrays on the host to an action there."""
+    return in_turn([decision_call(config, params)], calls)[0]
+
+
+def decision_call(config: Config, params: PolicyParams) -> Callable[[], int]:
+    """Returns what makes one decision, from arrays on the host to an action there."""
     seen = env.Observation(
         sensed=sensor_of(config).example(config), own=jnp.zeros(env.OWN_SIZE), motion=jnp.zeros(env.MOTION_SIZE)
     )
     seen, memory = jax.tree.map(np.asarray, (seen, policy.empty_memory(config)))  # on the host
     act = jax.jit(lambda params, memory, seen, key: policy.act(config, params, memory, seen, key)[0])
     params, key = jax.device_put(params), jax.random.key(0)
-    return _timed(lambda: int(act(params, memory, seen, key)), calls)
+    return lambda: int(act(params, memory, seen, key))
 
 
-def look_seconds(config: Config, params: PolicyParams, scene: Scene, calls: int) -> np.ndarray:
-    """Returns the seconds [calls] from poses on the host to an action there: pictures, events, code and Q-network.
+def look_call(config: Config, params: PolicyParams, scene: Scene) -> Callable[[], int]:
+    """Returns what leads from poses on the host to an action there: pictures, events, code and Q-network.
 
     Args:
         scene: what the camera sees, level, from the world's own start, in a flight ahead.
@@ -61,14 +66,21 @@ def look_seconds(config: Config, params: PolicyParams, scene: Scene, calls: int)
         return policy.act(config, params, memory, seen, key)[0]
 
     params, scene, key = jax.device_put(params), jax.device_put(scene), jax.random.key(0)
-    return _timed(lambda: int(act(params, scene, poses, before, memory, key)), calls)
+    return lambda: int(act(params, scene, poses, before, memory, key))
 
 
-def _timed(work: Callable[[], object], calls: int) -> np.ndarray:
-    """Returns the seconds [calls] of each call, without a first one that compiles."""
-    seconds = []
-    for _ in range(calls + 1):
-        began = time.perf_counter()
+def in_turn(works: Sequence[Callable[[], object]], calls: int, block: int = 1) -> np.ndarray:
+    """Returns the seconds [works, calls] of each call, after a first one of each that compiles.
+
+    `block` calls of each follow one another before the next one's turn, so that all of them meet the same machine.
+    """
+    for work in works:
         work()
-        seconds.append(time.perf_counter() - began)
-    return np.array(seconds[1:])
+    seconds = np.empty((len(works), calls))
+    for begun in range(0, calls, block):
+        for number, work in enumerate(works):
+            for call in range(begun, min(begun + block, calls)):
+                began = time.perf_counter()
+                work()
+                seconds[number, call] = time.perf_counter() - began
+    return seconds

@@ -53,13 +53,31 @@ def test_it_says_what_each_sensor_costs(
     monkeypatch.setattr(os, "sched_setaffinity", lambda pid, cores: None, raising=False)
     monkeypatch.setattr(sensing, "load_policy", lambda name: policy)
     monkeypatch.setattr(sensing, "events_per_decision", lambda *_: 250.0)
-    monkeypatch.setattr(sensing, "look_seconds", lambda *_: np.array([0.002, 0.003, 0.004]))
-    monkeypatch.setattr(sensing, "decision_seconds", lambda *_: np.array([0.001]))
+    monkeypatch.setattr(sensing, "look_call", lambda config, *_: ("look", config.env.sensor))
+    monkeypatch.setattr(sensing, "decision_call", lambda config, *_: ("act", config.env.sensor))
+    taken = {"events": [0.002, 0.003, 0.004], "frames": [0.001, 0.002, 0.003], "frame-pair": [0.003, 0.004, 0.005]}
+
+    def in_turn(works: list[tuple[str, str]], *_: int) -> np.ndarray:
+        return np.array([taken[sensor] if kind == "look" else [0.001] * 3 for kind, sensor in works])
+
+    monkeypatch.setattr(sensing, "in_turn", in_turn)
     file = tmp_path / "sensing.json"
     assert sensing.main(["--worlds", "medium", "--missions", "1", "--json", str(file)]) == 0
     rows = json.loads(file.read_text())["rows"]
     assert [row["bytes_per_decision"] for row in rows] == [1000.0, 768, 1536]
-    assert "| medium | events | 250 | 1,000 | 3.00 (3.98) | 1.00 |" in capsys.readouterr().out
+    assert "| medium | events | 250 | 1,000 | 3.00 (3.98) | 1.50 (1.50 to 1.50) | 1.00 |" in capsys.readouterr().out
+
+
+def test_works_are_timed_in_turns() -> None:
+    order: list[str] = []
+    taken = sensing.in_turn([lambda: order.append("a"), lambda: order.append("b")], 5, block=2)
+    assert "".join(order) == "ab" + "aabb" + "aabb" + "ab"  # one of each that compiles, then blocks
+    assert taken.shape == (2, 5) and np.all(taken >= 0.0)
+
+
+def test_ratios_are_those_of_turns() -> None:
+    machine = np.repeat([1.0, 5.0, 1.0], sensing.BLOCK)  # slow for one turn: both are
+    assert sensing.ratio_of(1.5 * machine, machine) == pytest.approx((1.5, 1.5, 1.5))
 
 
 @pytest.mark.slow
@@ -73,8 +91,9 @@ def test_the_time_from_photons_to_move_is_that_of_pictures_and_networks(
     )
     config = dataclasses.replace(policy.config, env=dataclasses.replace(policy.config.env, sensor=sensor))
     course = load_missions(policy.config, "medium", 1)
-    taken = sensing.look_seconds(config, fresh_policy(config), course.scene(), 3)
-    assert taken.shape == (3,) and np.all(taken > 0.0) and drawn == [sensor]
+    look = sensing.look_call(config, fresh_policy(config), course.scene())
+    taken = sensing.in_turn([look], 3)
+    assert taken.shape == (1, 3) and np.all(taken > 0.0) and drawn == [sensor]
 
 
 def test_a_policy_without_events_is_refused(
