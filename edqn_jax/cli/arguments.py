@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
+import importlib.util
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -53,6 +54,12 @@ class TrainOptions:
     """What to do with a run in --run-dir: `auto` continues it from its newest checkpoint, `must` refuses to begin one,
     `never` starts an unfinished one over. A run goes on with its own options; those that are given must be the same,
     but for --total-steps, which may be more."""
+    track: Annotated[tuple[Literal["tensorboard", "wandb"], ...], arg(help_behavior_hint="")] = ()
+    """Also write the metrics for TensorBoard, or for Weights & Biases offline, or both, into the folder of the run
+    (extra `track`)."""
+    view: Annotated[Literal["rerun"] | None, arg(help_behavior_hint="")] = None
+    """Also write metrics and validation flights as `training.rrd` into the folder of the run and, where there is a
+    screen, show them live in the Rerun viewer (extra `viz`)."""
     distributed: Distributed = "auto"
     """Whether to train together with other processes, on one host or many: `auto` where --coordinator-address is given
     or Slurm's srun has started several tasks, `must` in any cluster that JAX finds, `never` not at all."""
@@ -100,13 +107,13 @@ class EvaluateArgs:
 
 @dataclass(frozen=True)
 class RecordArgs:
-    """Fly a saved run once and write the flight as an animated GIF, or the events of a camera that watches it."""
+    """Fly a saved run once and write the flight as a GIF or MP4, or the events of a camera that watches it."""
 
     run: Annotated[Positional[Path], arg(metavar="RUN")]
     """Folder of the run, or `pretrained`: the policy that comes with the package."""
     file: Annotated[Positional[Path], arg(metavar="FILE")]
-    """What to write; it replaces a file of that name. FILE.gif: the view, what the drone sees, and its path.
-    FILE.h5, .npz or .txt: the events of a camera with a frame at every physics step."""
+    """What to write; it replaces a file of that name. FILE.gif or .mp4 (extra `video`): the view, what the drone sees,
+    and its path. FILE.h5, .npz or .txt (extra `events`): the events of a camera with a frame at every physics step."""
     size: Annotated[tuple[int, int] | None, arg(metavar="W H", help_behavior_hint="")] = None
     """Pixels across and down of the camera whose events are written (default: those of the policy's)."""
     world: Annotated[str | None, arg(metavar="WORLD", help_behavior_hint="")] = None
@@ -127,6 +134,19 @@ class VerifyArgs:
     """Folder of the run, or of the runs of several seeds."""
     json: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
     """Also write what was found as JSON."""
+
+
+@dataclass(frozen=True)
+class ReportArgs:
+    """Write one HTML file with runs' flights in 3D, what the drone saw, curves, figures and options."""
+
+    runs: Annotated[Positional[tuple[Path, ...]], arg(metavar="RUN [RUN ...]", help_behavior_hint="")]
+    """Folders of runs, or `pretrained`; the folder of several seeds stands for the run of each seed."""
+    out: Annotated[Path | None, arg(metavar="FILE.html", help_behavior_hint="")] = None
+    """HTML file to write; it replaces a file of that name (default: report.html in the first run's folder, of
+    `pretrained` in the current one)."""
+    missions: Annotated[int, arg(metavar="N")] = 128
+    """Evaluation flights of each run at most; of all runs together at most 256."""
 
 
 @dataclass(frozen=True)
@@ -179,7 +199,10 @@ class EventsArgs:
 
 
 TRAIN, EVALUATE, RECORD, VERIFY = "edqn train", "edqn evaluate", "edqn record", "edqn verify"
-EXPORT, EVENTS = "edqn export", "edqn events"
+REPORT, EXPORT, EVENTS = "edqn report", "edqn export", "edqn events"
+
+VIDEO, EVENT_FILES = (".gif", ".mp4"), (".h5", ".hdf5", ".npz", ".txt")
+"""Endings of the files that `edqn record` writes."""
 
 
 def parse_train(argv: Sequence[str]) -> tuple[TrainOptions, Config]:
@@ -298,15 +321,18 @@ def parse_record(argv: Sequence[str]) -> RecordArgs:
     """Returns the checked arguments of `edqn record`.
 
     Raises:
-        ConfigError: if the file is no GIF, or there is no run.
+        ConfigError: if the file is neither GIF nor MP4, or there is no run.
         SystemExit: after printing, for --help and for what does not parse.
     """
     check_flags(argv, record_flags(), RECORD)
     args = tyro.cli(RecordArgs, args=argv, prog=RECORD)
-    if args.file.suffix.lower() not in (".gif", ".h5", ".hdf5", ".npz", ".txt"):
-        raise ConfigError(f"'{args.file}' must end in .gif for an animation, or in .h5, .npz or .txt for events")
-    if args.size is not None and (args.file.suffix.lower() == ".gif" or min(args.size) < 1):
+    suffix = args.file.suffix.lower()
+    if suffix not in VIDEO + EVENT_FILES:
+        raise ConfigError(f"'{args.file}' must end in .gif or .mp4 for a video, or in .h5, .npz or .txt for events")
+    if args.size is not None and (suffix in VIDEO or min(args.size) < 1):
         raise ConfigError("--size must be two whole numbers of at least 1, and is only for files of events")
+    if suffix == ".mp4" and importlib.util.find_spec("imageio_ffmpeg") is None:
+        raise ConfigError("an .mp4 needs imageio_ffmpeg; run pip install 'edqn-jax[video]', or write a .gif")
     _check_run(args.run)
     return args
 
@@ -323,6 +349,28 @@ def parse_verify(argv: Sequence[str]) -> VerifyArgs:
     if not (args.run / "config.yaml").is_file():
         raise ConfigError(f"there is no run in '{args.run}': it holds no config.yaml")
     return args
+
+
+def parse_report(argv: Sequence[str]) -> ReportArgs:
+    """Returns the checked arguments of `edqn report`.
+
+    Raises:
+        ConfigError: if a folder holds no run, or another argument is out of its limits.
+        SystemExit: after printing, for --help and for what does not parse.
+    """
+    check_flags(argv, {_flag(option.name) for option in dataclasses.fields(ReportArgs)}, REPORT)
+    args = tyro.cli(ReportArgs, args=argv, prog=REPORT)
+    if not args.runs:
+        raise ConfigError("give the folder of a run, such as edqn report runs/DIR")
+    if args.missions < 1:
+        raise ConfigError(f"--missions must be at least 1, not {args.missions}")
+    for run in args.runs:
+        _check_run(run)
+    first = args.runs[0] / "report.html"
+    out = args.out or (first if args.runs[0].is_dir() else Path("report.html"))
+    if out.suffix.lower() not in (".html", ".htm"):
+        raise ConfigError(f"--out '{out}' must end in .html")
+    return dataclasses.replace(args, out=out)
 
 
 def parse_export(argv: Sequence[str]) -> ExportArgs:

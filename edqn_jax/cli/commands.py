@@ -16,12 +16,14 @@ from edqn_jax.cli.arguments import (
     EventsArgs,
     ExportArgs,
     RecordArgs,
+    ReportArgs,
     TrainCommand,
     VerifyArgs,
     parse_evaluate,
     parse_events,
     parse_export,
     parse_record,
+    parse_report,
     parse_verify,
 )
 from edqn_jax.cli.signals import Stops
@@ -41,6 +43,7 @@ COMMANDS = {
     "train": TrainCommand,
     "evaluate": EvaluateArgs,
     "record": RecordArgs,
+    "report": ReportArgs,
     "verify": VerifyArgs,
     "export": ExportArgs,
     "events": EventsArgs,
@@ -49,6 +52,7 @@ COMMANDS = {
 OF_A_RUN = {
     "evaluate": parse_evaluate,
     "record": parse_record,
+    "report": parse_report,
     "verify": parse_verify,
     "export": parse_export,
     "events": parse_events,

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from edqn_jax.cli import arguments, main
+from edqn_jax.cli import arguments, main, train
 from edqn_jax.cli.arguments import parse_train
 from edqn_jax.config import Config, preset
 from edqn_jax.config.loading import RANDOM_WORLDS, make_config
@@ -36,10 +36,11 @@ def trainer(monkeypatch):
     """Stands in for training: a function to set, and the calls that reached it."""
     stand_in = types.ModuleType("edqn_jax.training.run")
     calls: list[tuple] = []
-    behaviour = types.SimpleNamespace(calls=calls, act=lambda *call: None)
+    behaviour = types.SimpleNamespace(calls=calls, act=lambda *call: None, callbacks=[])
 
-    def train_run(*call):
+    def train_run(*call, callback):
         calls.append(call)
+        behaviour.callbacks.append(callback)
         return behaviour.act(*call)
 
     seeds = types.ModuleType("edqn_jax.training.seeds")
@@ -311,3 +312,12 @@ def test_a_reader_that_has_enough_is_no_error() -> None:
     with os.fdopen(writes, "wb") as closed:
         ended = subprocess.run(words, cwd=ROOT, stdout=closed, stderr=subprocess.PIPE, text=True, timeout=PATIENCE_S)
     assert (ended.returncode, ended.stderr) == (0, "")
+
+
+def test_sinks_are_made_only_where_they_are_asked_for(trainer, tmp_path, monkeypatch):
+    monkeypatch.setattr(train.importlib.util, "find_spec", lambda name, *rest: name)
+    run = str(tmp_path / "run")
+    assert main(["train", "--run-dir", run]) == 0
+    assert main(["train", "--run-dir", run, "--track", "tensorboard", "wandb", "--view", "rerun"]) == 0
+    nothing, sinks = trainer.callbacks
+    assert nothing is None and list(sinks._makers) == ["tensorboard", "wandb", "rerun"]
