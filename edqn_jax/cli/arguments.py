@@ -169,7 +169,7 @@ class ReportArgs:
 
 @dataclass(frozen=True)
 class ExportArgs:
-    """Write a policy as ONNX, for a computer without JAX, and beside it the runner that flies it; compares both."""
+    """Write a policy as ONNX, for a computer without JAX, and beside it the runner that flies it; compare both."""
 
     run: Annotated[Positional[Path], arg(metavar="RUN")]
     """Folder of the run, or `pretrained`: the policy that comes with the package."""

@@ -82,6 +82,8 @@ COMMON = {
     "preset": "the best agent that we know, or Table 1 of the paper",
     "tuned_for": "hardware that defaults are chosen for",
     "seeds": "policies to train side by side, of the seeds from --seed on",
+    "track": "also write the metrics for tensorboard, wandb or both (extra `track`)",
+    "view": "also write metrics and flights for rerun, and show them (extra `viz`)",
     "train.seed": "random seed",
     "train.total_steps": "decisions in all, of 0.26 s each",
     "train.num_envs": "parallel environments",
@@ -99,8 +101,8 @@ COMMON = {
 }
 """Options that `edqn train --help` shows, with what it says of them; `--help-all` has their whole texts."""
 
-METAVARS = {int: "N", float: "X", str: "WORLD"}
-"""What stands for a value in the short help."""
+METAVARS = {int: "N", float: "X", str: "WORLD", "track": "WHICH [WHICH]", "view": "WHICH"}
+"""What stands for a value of a type, or of one option, in the short help."""
 
 
 def show_train_help(options: Any, config: Config, short_names: Mapping[str, str], *, everything: bool) -> NoReturn:
@@ -121,7 +123,7 @@ def show_train_help(options: Any, config: Config, short_names: Mapping[str, str]
         owner = getattr(config, group) if group else options
         flag = flag_of(name)
         kind = typing.get_type_hints(type(owner), include_extras=True)[option]
-        metavar = METAVARS.get(kind)
+        metavar = METAVARS.get(name, METAVARS.get(kind))
         if typing.get_origin(kind) is typing.Literal:
             metavar, text = "WHICH", f"{text}: {', '.join(typing.get_args(kind))}"
         said = Annotated[kind, tyro.conf.arg(name=short.get(flag, flag)[2:], metavar=metavar, help=text)]

@@ -133,7 +133,7 @@ def cut_open(scene: Scene, view: View) -> CutOpen:
 
 
 def closed_side(solid: Solid, lower: np.ndarray, upper: np.ndarray) -> tuple[int, int] | None:
-    """Returns which side of the volume from `lower` to `upper` a solid closes: its axis, and -1 or 1.
+    """Returns which side of the volume from `lower` [3] to `upper` [3] a solid closes: its axis, and -1 or 1.
 
     A ceiling closes (2, 1), an outer wall a side of axis 0 or 1; None of other solids.
     """
@@ -206,6 +206,7 @@ def hidden(points: np.ndarray, solids: Sequence[Solid], view: View) -> np.ndarra
 
 
 def present(shapes: object, *names: str) -> Iterator[tuple[np.ndarray, ...]]:
+    """Yields the rows of these fields, [n, ...] each and the first the position, of shapes that stand in the world."""
     columns = [np.asarray(getattr(shapes, name), np.float64) for name in names]
     for row in zip(*columns, strict=True):
         if np.abs(row[0]).max() < PARKED / 10:

@@ -349,7 +349,8 @@ def test_the_versions_are_those_of_the_packages():
 @pytest.mark.parametrize(
     ("words", "offered"),
     [
-        (["ev"], ["evaluate"]),
+        (["ev"], ["evaluate", "events"]),
+        (["rep"], ["report"]),
         (["train", "--num-e"], ["--num-envs"]),
         (["train", "--world", "me"], ["medium"]),
         (["train", "--env.sensor", "fr"], ["frames", "frame-pair"]),
