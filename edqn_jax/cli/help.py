@@ -42,7 +42,7 @@ Examples:
 
 Examples:
   edqn record runs/DIR flight.gif
-  edqn record pretrained flight.mp4 --world rooms --seed 3
+  edqn record pretrained flight.mp4 --world dense --seed 3
   edqn record pretrained events.h5 --size 640 480""",
     REPORT: """Write one HTML file with runs' flights in 3D, what the drone saw, curves, figures and options.
 

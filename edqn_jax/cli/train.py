@@ -61,7 +61,7 @@ def train_command(argv: Sequence[str], stops: Stops) -> None:
     progress = Progress(Console(quiet=not writes))
     if tuned_for_gpu(options, config):
         progress.message(_chosen(config))
-    sinks = None if run is None else sinks_of(options, config, run, progress.message)
+    sinks = None if run is None else _sinks_of(options, config, run, progress.message)
     stop = Stop(stops.requested, lambda: stops.obeyed(progress.message))
     try:
         if options.seeds is None:
@@ -95,7 +95,7 @@ def _check_sinks(options: TrainOptions) -> None:
                 raise ConfigError(f"{flag} {name} needs {package}; run pip install 'edqn-jax[{extra}]'")
 
 
-def sinks_of(
+def _sinks_of(
     options: TrainOptions, config: Config, run: RunDirectory, warn: Callable[[str], None]
 ) -> tracking.Sinks | None:
     """Returns what else gets the metrics of a run, in the folder of each agent; None if nothing was asked for."""

@@ -96,13 +96,15 @@ def figures(run: FlownRun) -> dict[str, str]:
     path = f"{float(run.flights.path_length_m[0]):.1f} m"
     if isinstance(shortest, int | float):
         path += f" (shortest {shortest:.1f} m)"
+    # No-break spaces before the percent signs.
+    share = f"{100 * flown['success_rate']:.1f}\u00a0%; 95\u00a0% Wilson {100 * low:.0f} to {100 * high:.0f}\u00a0%"
     return {
         "trained in": Path(run.config.world.name).name,
         "sensor": run.config.env.sensor,
         "seed": str(run.config.train.seed),
         "flights on this page": f"{flown['missions']} in {Path(run.missions.name).name}"
         + (f", first in {Path(run.config.world.flown).name}" if run.config.world.flown else ""),
-        "reached the goal": f"{flown['successes']} ({flown['success_rate']:.1%}; 95 % Wilson {low:.0%} to {high:.0%})",
+        "reached the goal": f"{flown['successes']} ({share})",
         "collisions": str(flown["collisions"]),
         "time-outs": str(flown["timeouts"]),
         "left the volume": str(flown["left_volume"]),
