@@ -5,6 +5,9 @@ from __future__ import annotations
 import importlib
 from typing import Any
 
+SINKS = {"tensorboard": ("tensorboardX", "track"), "wandb": ("wandb", "track"), "rerun": ("rerun", "viz")}
+"""The package that each sink of metrics needs, and the extra that installs it."""
+
 
 class MissingPackageError(ImportError):
     """A package of an extra is not installed; the message names the command that installs it."""

@@ -4,14 +4,31 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
+import importlib.util
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Literal, TypeVar
 
 import tyro
 from tyro.conf import Positional, arg
 
+from edqn_jax.cli.help import (
+    ABOUT,
+    COMPLETION,
+    EVALUATE,
+    EVENTS,
+    EXPORT,
+    RECORD,
+    REPORT,
+    TRAIN,
+    VERIFY,
+    asks_for_help,
+    described,
+    flag_of,
+    show,
+    show_train_help,
+)
 from edqn_jax.config import FAMILIES, Config
 from edqn_jax.config.limits import validate
 from edqn_jax.config.loading import resolve
@@ -23,6 +40,8 @@ from edqn_jax.runs.continuation import begun, continued
 from edqn_jax.runs.directory import Resume
 
 Point = tuple[float, float, float]
+
+Args = TypeVar("Args")
 
 
 SHORT_NAMES = {
@@ -53,6 +72,12 @@ class TrainOptions:
     """What to do with a run in --run-dir: `auto` continues it from its newest checkpoint, `must` refuses to begin one,
     `never` starts an unfinished one over. A run goes on with its own options; those that are given must be the same,
     but for --total-steps, which may be more."""
+    track: Annotated[tuple[Literal["tensorboard", "wandb"], ...], arg(help_behavior_hint="")] = ()
+    """Also write the metrics for TensorBoard, or for Weights & Biases offline, or both, into the folder of the run
+    (extra `track`)."""
+    view: Annotated[Literal["rerun"] | None, arg(help_behavior_hint="")] = None
+    """Also write metrics and validation flights as `training.rrd` into the folder of the run and, where there is a
+    screen, show them live in the Rerun viewer (extra `viz`)."""
     distributed: Distributed = "auto"
     """Whether to train together with other processes, on one host or many: `auto` where --coordinator-address is given
     or Slurm's srun has started several tasks, `must` in any cluster that JAX finds, `never` not at all."""
@@ -100,13 +125,13 @@ class EvaluateArgs:
 
 @dataclass(frozen=True)
 class RecordArgs:
-    """Fly a saved run once and write the flight as an animated GIF, or the events of a camera that watches it."""
+    """Fly a saved run once and write the flight as a GIF or MP4, or the events of a camera that watches it."""
 
     run: Annotated[Positional[Path], arg(metavar="RUN")]
     """Folder of the run, or `pretrained`: the policy that comes with the package."""
     file: Annotated[Positional[Path], arg(metavar="FILE")]
-    """What to write; it replaces a file of that name. FILE.gif: the view, what the drone sees, and its path.
-    FILE.h5, .npz or .txt: the events of a camera with a frame at every physics step."""
+    """What to write; it replaces a file of that name. FILE.gif or .mp4 (extra `video`): the view, what the drone sees,
+    and its path. FILE.h5, .npz or .txt (extra `events`): the events of a camera with a frame at every physics step."""
     size: Annotated[tuple[int, int] | None, arg(metavar="W H", help_behavior_hint="")] = None
     """Pixels across and down of the camera whose events are written (default: those of the policy's)."""
     world: Annotated[str | None, arg(metavar="WORLD", help_behavior_hint="")] = None
@@ -130,8 +155,21 @@ class VerifyArgs:
 
 
 @dataclass(frozen=True)
+class ReportArgs:
+    """Write one HTML file with runs' flights in 3D, what the drone saw, curves, figures and options."""
+
+    runs: Annotated[Positional[tuple[Path, ...]], arg(metavar="RUN [RUN ...]", help_behavior_hint="")]
+    """Folders of runs, or `pretrained`; the folder of several seeds stands for the run of each seed."""
+    out: Annotated[Path | None, arg(metavar="FILE.html", help_behavior_hint="")] = None
+    """HTML file to write; it replaces a file of that name (default: report.html in the first run's folder, of
+    `pretrained` in the current one)."""
+    missions: Annotated[int, arg(metavar="N")] = 128
+    """Evaluation flights of each run at most; of all runs together at most 256."""
+
+
+@dataclass(frozen=True)
 class ExportArgs:
-    """Write a policy as ONNX, for a computer without JAX, and beside it the runner that flies it; compares both."""
+    """Write a policy as ONNX, for a computer without JAX, and beside it the runner that flies it; compare both."""
 
     run: Annotated[Positional[Path], arg(metavar="RUN")]
     """Folder of the run, or `pretrained`: the policy that comes with the package."""
@@ -178,8 +216,16 @@ class EventsArgs:
     """Also write what was found as JSON."""
 
 
-TRAIN, EVALUATE, RECORD, VERIFY = "edqn train", "edqn evaluate", "edqn record", "edqn verify"
-EXPORT, EVENTS = "edqn export", "edqn events"
+@dataclass(frozen=True)
+class CompletionArgs:
+    """Print a script that completes commands, options and their values in a shell."""
+
+    shell: Annotated[Positional[Literal["bash", "zsh", "fish"]], arg(metavar="SHELL")]
+    """`bash`, `zsh` or `fish`."""
+
+
+VIDEO, EVENT_FILES = (".gif", ".mp4"), (".h5", ".hdf5", ".npz", ".txt")
+"""Endings of the files that `edqn record` writes."""
 
 
 def parse_train(argv: Sequence[str]) -> tuple[TrainOptions, Config]:
@@ -187,24 +233,29 @@ def parse_train(argv: Sequence[str]) -> tuple[TrainOptions, Config]:
 
     Raises:
         ConfigError: if the preset, the file or a value is invalid.
-        SystemExit: after printing, for --help and for arguments that do not parse.
+        SystemExit: after printing, for --help, --help-all and for arguments that do not parse.
     """
     check_flags(argv, train_flags(), TRAIN)
     argv = [_long_name(word) for word in argv]
     # Preset, file and world decide the defaults that the other flags change and that --help shows.
-    early = [word for word in argv if word not in ("-h", "--help")]
-    options, _ = tyro.cli(TrainOptions, args=early, prog=TRAIN, return_unknown_args=True, add_help=False)
+    everything = "--help-all" in argv
+    helped = everything or asks_for_help(argv)
+    argv = [word for word in argv if word not in ("-h", "--help", "--help-all")]
+    options, _ = tyro.cli(TrainOptions, args=argv, prog=TRAIN, return_unknown_args=True, add_help=False)
     if options.seeds is not None and options.seeds < 1:
         raise ConfigError(f"--seeds must be at least 1, not {options.seeds}")
     tuned_for = hardware() if options.tuned_for == "auto" else options.tuned_for
     options = dataclasses.replace(options, tuned_for=tuned_for)
     folder = None if options.resume == "never" else options.run_dir
     run = None if folder is None else begun(folder)
-    if run is not None and not _names_defaults(early):
-        config = _found_worlds(_parse_config(argv, run.config))
+    if run is not None and not _names_defaults(argv):
+        begins = run.config
     else:
-        world = _parse_config(early, resolve(options.preset, options.config)).world.name
-        config = _found_worlds(_parse_config(argv, resolve(options.preset, options.config, world, tuned_for)))
+        world = _parse_config(argv, resolve(options.preset, options.config)).world.name
+        begins = resolve(options.preset, options.config, world, tuned_for)
+    if helped:
+        show_train_help(TrainOptions(), begins, SHORT_NAMES, everything=everything)
+    config = _found_worlds(_parse_config(argv, begins))
     validate(config)
     if run is not None and folder is not None:
         options = dataclasses.replace(options, seeds=run.seeds if options.seeds is None else options.seeds)
@@ -238,14 +289,40 @@ def check_flags(argv: Sequence[str], known: Iterable[str], command: str) -> None
     for word in argv:
         flag = word.partition("=")[0].replace("_", "-")
         if flag.startswith("--") and flag not in known:
-            close = difflib.get_close_matches(flag, known, n=1, cutoff=0.5)
-            hint = f"did you mean '{close[0]}'?" if close else f"'{command} --help' lists what there is"
+            near = _nearest_flag(flag, known)
+            every = "--help-all" if "--help-all" in known else "--help"
+            hint = f"did you mean '{near}'?" if near else f"'{command} {every}' lists what there is"
             raise ConfigError(f"there is no option '{flag}'; {hint}")
+
+
+def _nearest_flag(flag: str, known: Iterable[str]) -> str | None:
+    """Returns the flag that somebody meant who shortened, misspelt or left out the group of one; None if none is near.
+
+    A flag that goes on as the given one does comes first, then one of that name in a group, then one spelt alike.
+    """
+    shortest_first = sorted(known, key=lambda name: (len(name), name))
+    bare = flag.removeprefix("--")
+    for is_meant in (
+        lambda name: len(bare) > 1 and name.startswith(flag),
+        lambda name: name.endswith(f".{bare}"),
+        lambda name: len(bare) > 1 and name.rpartition(".")[2].startswith(bare),
+    ):
+        meant = [name for name in shortest_first if is_meant(name)]
+        if meant:
+            return meant[0]
+    # Names are compared without dashes, which all have, and also without the group, which may have been left out.
+    whole = {name.removeprefix("--"): name for name in shortest_first}
+    last = {name.rpartition(".")[2].removeprefix("--"): name for name in reversed(shortest_first)}
+    for names, cutoff in ((last, 0.75), (whole, 0.6)):
+        close = difflib.get_close_matches(bare, names, n=1, cutoff=cutoff)
+        if close:
+            return names[close[0]]
+    return None
 
 
 def train_flags() -> set[str]:
     """Returns every flag of `edqn train`."""
-    flags = {_flag(option.name) for option in dataclasses.fields(TrainOptions)} | set(SHORT_NAMES)
+    flags = {flag_of(option.name) for option in dataclasses.fields(TrainOptions)} | set(SHORT_NAMES) | {"--help-all"}
     for group in dataclasses.fields(Config):
         for option in dataclasses.fields(getattr(Config(), group.name)):
             names = [option.name, f"no-{option.name}"] if option.type == "bool" else [option.name]
@@ -253,18 +330,13 @@ def train_flags() -> set[str]:
     return flags
 
 
-def evaluate_flags() -> set[str]:
-    """Returns every flag of `edqn evaluate`."""
-    return {_flag(option.name) for option in dataclasses.fields(EvaluateArgs)} | {"--no-shuffle-codes"}
-
-
-def record_flags() -> set[str]:
-    """Returns every flag of `edqn record`."""
-    return {_flag(option.name) for option in dataclasses.fields(RecordArgs)}
-
-
-def _flag(name: str) -> str:
-    return f"--{name.replace('_', '-')}"
+def _flags_of(kind: type) -> set[str]:
+    """Returns every flag of a dataclass of arguments."""
+    return {
+        flag_of(f"{no}{option.name}")
+        for option in dataclasses.fields(kind)
+        for no in (("", "no_") if option.type == "bool" else ("",))
+    }
 
 
 def _long_name(word: str) -> str:
@@ -273,10 +345,20 @@ def _long_name(word: str) -> str:
 
 
 def _parse_config(argv: Sequence[str], base: Config) -> Config:
-    names = ", ".join(f"{short} for {long}" for short, long in SHORT_NAMES.items())
-    description = f"{TrainCommand.__doc__}\n\nEvery option is a flag. Short names: {names}."
-    default = TrainCommand(config=base)
-    return tyro.cli(TrainCommand, args=argv, prog=TRAIN, description=description, default=default).config
+    return tyro.cli(TrainCommand, args=argv, prog=TRAIN, default=TrainCommand(config=base)).config
+
+
+def _parsed(kind: type[Args], argv: Sequence[str], command: str) -> Args:
+    """Returns the arguments of a command.
+
+    Raises:
+        ConfigError: if there is no such flag.
+        SystemExit: after printing, for --help and for arguments that do not parse.
+    """
+    check_flags(argv, _flags_of(kind), command)
+    if asks_for_help(argv):
+        show(described(kind), command, ABOUT[command])
+    return tyro.cli(kind, args=argv, prog=command)
 
 
 def parse_evaluate(argv: Sequence[str]) -> EvaluateArgs:
@@ -286,8 +368,7 @@ def parse_evaluate(argv: Sequence[str]) -> EvaluateArgs:
         ConfigError: if one is out of its limits, or there is no such run.
         SystemExit: after printing, for --help and for arguments that do not parse.
     """
-    check_flags(argv, evaluate_flags(), EVALUATE)
-    args = tyro.cli(EvaluateArgs, args=argv, prog=EVALUATE)
+    args = _parsed(EvaluateArgs, argv, EVALUATE)
     if args.missions < 1:
         raise ConfigError(f"--missions must be at least 1, not {args.missions}")
     _check_run(args.run)
@@ -298,15 +379,17 @@ def parse_record(argv: Sequence[str]) -> RecordArgs:
     """Returns the checked arguments of `edqn record`.
 
     Raises:
-        ConfigError: if the file is no GIF, or there is no run.
+        ConfigError: if the file's ending, its size or a missing package forbids it, or there is no run.
         SystemExit: after printing, for --help and for what does not parse.
     """
-    check_flags(argv, record_flags(), RECORD)
-    args = tyro.cli(RecordArgs, args=argv, prog=RECORD)
-    if args.file.suffix.lower() not in (".gif", ".h5", ".hdf5", ".npz", ".txt"):
-        raise ConfigError(f"'{args.file}' must end in .gif for an animation, or in .h5, .npz or .txt for events")
-    if args.size is not None and (args.file.suffix.lower() == ".gif" or min(args.size) < 1):
+    args = _parsed(RecordArgs, argv, RECORD)
+    suffix = args.file.suffix.lower()
+    if suffix not in VIDEO + EVENT_FILES:
+        raise ConfigError(f"'{args.file}' must end in .gif or .mp4 for a video, or in .h5, .npz or .txt for events")
+    if args.size is not None and (suffix in VIDEO or min(args.size) < 1):
         raise ConfigError("--size must be two whole numbers of at least 1, and is only for files of events")
+    if suffix == ".mp4" and importlib.util.find_spec("imageio_ffmpeg") is None:
+        raise ConfigError("an .mp4 needs imageio_ffmpeg; run pip install 'edqn-jax[video]', or write a .gif")
     _check_run(args.run)
     return args
 
@@ -318,11 +401,31 @@ def parse_verify(argv: Sequence[str]) -> VerifyArgs:
         ConfigError: if there is no run.
         SystemExit: after printing, for --help and for what does not parse.
     """
-    check_flags(argv, {_flag(option.name) for option in dataclasses.fields(VerifyArgs)}, VERIFY)
-    args = tyro.cli(VerifyArgs, args=argv, prog=VERIFY)
+    args = _parsed(VerifyArgs, argv, VERIFY)
     if not (args.run / "config.yaml").is_file():
         raise ConfigError(f"there is no run in '{args.run}': it holds no config.yaml")
     return args
+
+
+def parse_report(argv: Sequence[str]) -> ReportArgs:
+    """Returns the checked arguments of `edqn report`.
+
+    Raises:
+        ConfigError: if a folder holds no run, or another argument is out of its limits.
+        SystemExit: after printing, for --help and for what does not parse.
+    """
+    args = _parsed(ReportArgs, argv, REPORT)
+    if not args.runs:
+        raise ConfigError("give the folder of a run, such as edqn report runs/DIR")
+    if args.missions < 1:
+        raise ConfigError(f"--missions must be at least 1, not {args.missions}")
+    for run in args.runs:
+        _check_run(run)
+    first = args.runs[0] / "report.html"
+    out = args.out or (first if args.runs[0].is_dir() else Path("report.html"))
+    if out.suffix.lower() not in (".html", ".htm"):
+        raise ConfigError(f"--out '{out}' must end in .html")
+    return dataclasses.replace(args, out=out)
 
 
 def parse_export(argv: Sequence[str]) -> ExportArgs:
@@ -332,8 +435,7 @@ def parse_export(argv: Sequence[str]) -> ExportArgs:
         ConfigError: if one is out of its limits, or there is no such run.
         SystemExit: after printing, for --help and for what does not parse.
     """
-    check_flags(argv, {_flag(option.name) for option in dataclasses.fields(ExportArgs)}, EXPORT)
-    args = tyro.cli(ExportArgs, args=argv, prog=EXPORT)
+    args = _parsed(ExportArgs, argv, EXPORT)
     if args.checks < 1000:
         raise ConfigError(f"--checks must be at least 1000, not {args.checks}")
     _check_run(args.run)
@@ -347,8 +449,7 @@ def parse_events(argv: Sequence[str]) -> EventsArgs:
         ConfigError: if one is out of its limits, or there is no such file or policy.
         SystemExit: after printing, for --help and for what does not parse.
     """
-    check_flags(argv, {_flag(option.name) for option in dataclasses.fields(EventsArgs)}, EVENTS)
-    args = tyro.cli(EventsArgs, args=argv, prog=EVENTS)
+    args = _parsed(EventsArgs, argv, EVENTS)
     if not args.file.is_file():
         raise ConfigError(f"there is no file '{args.file}'")
     for name, number in (("--contrast", args.contrast), ("--window", args.window)):
@@ -361,6 +462,16 @@ def parse_events(argv: Sequence[str]) -> EventsArgs:
     if args.policy is not None:
         _check_run(args.policy)
     return args
+
+
+def parse_completion(argv: Sequence[str]) -> CompletionArgs:
+    """Returns the arguments of `edqn completion`.
+
+    Raises:
+        ConfigError: if there is no such flag.
+        SystemExit: after printing, for --help and for what does not parse.
+    """
+    return _parsed(CompletionArgs, argv, COMPLETION)
 
 
 def _check_run(folder: Path) -> None:

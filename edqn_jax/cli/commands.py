@@ -7,23 +7,30 @@ import os
 import signal
 import sys
 from collections.abc import Sequence
+from importlib import metadata
 
 import tyro
 
 import edqn_jax
 from edqn_jax.cli.arguments import (
+    CompletionArgs,
     EvaluateArgs,
     EventsArgs,
     ExportArgs,
     RecordArgs,
+    ReportArgs,
     TrainCommand,
     VerifyArgs,
+    parse_completion,
     parse_evaluate,
     parse_events,
     parse_export,
     parse_record,
+    parse_report,
     parse_verify,
 )
+from edqn_jax.cli.completion import completion_script
+from edqn_jax.cli.help import ABOUT
 from edqn_jax.cli.signals import Stops
 from edqn_jax.cli.train import train_command
 from edqn_jax.config.loading import nearest
@@ -41,14 +48,20 @@ COMMANDS = {
     "train": TrainCommand,
     "evaluate": EvaluateArgs,
     "record": RecordArgs,
+    "report": ReportArgs,
     "verify": VerifyArgs,
     "export": ExportArgs,
     "events": EventsArgs,
+    "completion": CompletionArgs,
 }
+
+VERSIONS = ("jax", "mujoco", "mujoco-mjx")
+"""Packages whose versions `edqn --version` names below its own."""
 
 OF_A_RUN = {
     "evaluate": parse_evaluate,
     "record": parse_record,
+    "report": parse_report,
     "verify": parse_verify,
     "export": parse_export,
     "events": parse_events,
@@ -96,10 +109,14 @@ def _dispatch(argv: Sequence[str], stops: Stops) -> int:
         train_command(rest, stops)
     elif command in OF_A_RUN:
         _of_a_run(command, rest)
+    elif command == "completion":
+        print(completion_script(parse_completion(rest).shell))
     elif command == "--version":
         print(f"edqn-jax {edqn_jax.__version__}")
+        for package in VERSIONS:
+            print(f"{package} {metadata.version(package)}")
     elif command in ("-h", "--help"):
-        tyro.extras.subcommand_cli_from_dict(COMMANDS, prog="edqn", args=["--help"])
+        tyro.extras.subcommand_cli_from_dict(COMMANDS, prog="edqn", description=ABOUT["edqn"], args=["--help"])
     else:
         raise ConfigError(f"there is no command '{command}'{nearest(command, [*COMMANDS, '--help', '--version'])}")
     return DONE

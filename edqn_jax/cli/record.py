@@ -1,4 +1,4 @@
-"""`edqn record`: flies a saved policy once and writes the flight as an animated GIF, or the events of its camera."""
+"""`edqn record`: flies a saved policy once and writes the flight as a GIF or MP4, or the events of its camera."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import jax
 import numpy as np
 from rich.console import Console
 
-from edqn_jax.cli.arguments import RecordArgs
+from edqn_jax.cli.arguments import VIDEO, RecordArgs
 from edqn_jax.config import Config
 from edqn_jax.evaluation.missions import MissionSet, load_missions
 from edqn_jax.evaluation.rollouts import fly_on_all_devices
@@ -27,13 +27,13 @@ def record_command(args: RecordArgs) -> None:
 
     Raises:
         ConfigError: if the run, the world or the file to write is not as it should be.
-        MissingPackageError: if the file to write needs the extra `events`.
+        MissingPackageError: if the file to write needs an extra that is not installed.
     """
     check_can_write(args.file)
     config, params = load_run(args.run)
     world = args.world or config.world.flown or config.world.name
     missions = load_missions(config, world, 1, args.seed, args.start, args.goal)
-    write = _write_gif if args.file.suffix.lower() == ".gif" else _write_events
+    write = _write_video if args.file.suffix.lower() in VIDEO else _write_events
     outcome, seconds = write(args, config, params, missions)
     notes = [] if args.world is not None else worlds_replaced(args.run)
     for note in (*notes, *([missions.note] if missions.note is not None else [])):
@@ -46,8 +46,8 @@ def record_command(args: RecordArgs) -> None:
     )
 
 
-def _write_gif(args: RecordArgs, config: Config, params: PolicyParams, missions: MissionSet) -> tuple[str, float]:
-    """Writes the flight as an animated GIF; returns how it ended, and after how many seconds."""
+def _write_video(args: RecordArgs, config: Config, params: PolicyParams, missions: MissionSet) -> tuple[str, float]:
+    """Writes the flight as a GIF or MP4; returns how it ended, and after how many seconds."""
     from edqn_jax.report.animation import animate
     from edqn_jax.report.sights import Sights
 
@@ -57,13 +57,14 @@ def _write_gif(args: RecordArgs, config: Config, params: PolicyParams, missions:
         flights = fly_on_all_devices(config, missions.world, params, args.seed, record=True)
         outcome, seconds = _ending(flights)
         name = missions.name if missions.file is None else Path(missions.name).stem
-        gif = animate(sights, params, trajectory(config, flights), outcome, title=f"world '{name}'")
-    write_atomically(args.file, gif)
+        flown = trajectory(config, flights)
+        video = animate(sights, params, flown, outcome, title=f"world '{name}'", form=args.file.suffix.lower())
+    write_atomically(args.file, video)
     return outcome, seconds
 
 
 def _write_events(args: RecordArgs, config: Config, params: PolicyParams, missions: MissionSet) -> tuple[str, float]:
-    """Writes the events of a camera that watches the flight; returns as `_write_gif`."""
+    """Writes the events of a camera that watches the flight; returns as `_write_video`."""
     from edqn_jax.interop.event_files import check_can_write_events, write_events
     from edqn_jax.interop.flight_events import flight_recording
 

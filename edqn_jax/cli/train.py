@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 import hashlib
+import importlib.util
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
 
 from rich.console import Console
 
@@ -15,8 +18,12 @@ from edqn_jax.cli.signals import Stops
 from edqn_jax.config import FAMILIES, Config
 from edqn_jax.config.loading import gpu_layers, to_yaml
 from edqn_jax.errors import ConfigError
+from edqn_jax.packages import SINKS
 from edqn_jax.parallel.launch import how_to_join
-from edqn_jax.runs.directory import plan_run_directory
+from edqn_jax.runs.directory import RunDirectory, plan_run_directory
+
+if TYPE_CHECKING:
+    from edqn_jax.interop import tracking
 
 
 def train_command(argv: Sequence[str], stops: Stops) -> None:
@@ -27,6 +34,7 @@ def train_command(argv: Sequence[str], stops: Stops) -> None:
         DivergedError, StoppedError: as `training.train`.
     """
     options, config = parse_train(argv)
+    _check_sinks(options)
     several = options.coordinator_address, options.num_processes, options.process_id
     arguments = how_to_join(options.distributed, *several, os.environ)
 
@@ -53,22 +61,64 @@ def train_command(argv: Sequence[str], stops: Stops) -> None:
     progress = Progress(Console(quiet=not writes))
     if tuned_for_gpu(options, config):
         progress.message(_chosen(config))
+    sinks = None if run is None else _sinks_of(options, config, run, progress.message)
     stop = Stop(stops.requested, lambda: stops.obeyed(progress.message))
     try:
         if options.seeds is None:
             from edqn_jax.training.run import train_run
 
-            train_run(config, run, progress, stop)
+            train_run(config, run, progress, stop, callback=sinks)
         else:
             from edqn_jax.training.seeds import train_seeds_run
 
-            train_seeds_run(config, options.seeds, run, progress, stop)
+            train_seeds_run(config, options.seeds, run, progress, stop, callback=sinks)
     except jax.errors.JaxRuntimeError as error:
         if arguments is None:
             raise
         processes.leave(error)
     finally:
+        if sinks is not None:
+            sinks.close()
         progress.stop()
+
+
+def _check_sinks(options: TrainOptions) -> None:
+    """Raises if a package that `--track` or `--view` needs is not installed.
+
+    Raises:
+        ConfigError: names the command that installs it.
+    """
+    for flag, names in (("--track", options.track), ("--view", (options.view,) if options.view else ())):
+        for name in names:
+            package, extra = SINKS[name]
+            if importlib.util.find_spec(package) is None:
+                raise ConfigError(f"{flag} {name} needs {package}; run pip install 'edqn-jax[{extra}]'")
+
+
+def _sinks_of(
+    options: TrainOptions, config: Config, run: RunDirectory, warn: Callable[[str], None]
+) -> tracking.Sinks | None:
+    """Returns what else gets the metrics of a run, in the folder of each agent; None if nothing was asked for."""
+    if not options.track and options.view is None:
+        return None
+
+    from edqn_jax.interop import tracking
+
+    def folder(agent: int) -> Path:
+        return run.path if options.seeds is None else run.of_seed(config.train.seed + agent).path
+
+    def wandb(agent: int) -> tracking.Wandb:
+        train = dataclasses.replace(config.train, seed=config.train.seed + agent)
+        name = run.path.name if options.seeds is None else f"{run.path.name}/{folder(agent).name}"
+        return tracking.Wandb(folder(agent), dataclasses.replace(config, train=train), name)
+
+    makers: dict[str, tracking.Maker] = {
+        "tensorboard": lambda agent: tracking.TensorBoard(folder(agent) / "tensorboard"),
+        "wandb": wandb,
+        "rerun": lambda agent: tracking.Rerun(folder(agent) / "training.rrd"),
+    }
+    asked = {*options.track, options.view}
+    return tracking.Sinks({name: maker for name, maker in makers.items() if name in asked}, warn)
 
 
 def tuned_for_gpu(options: TrainOptions, config: Config) -> bool:

@@ -127,7 +127,7 @@ def _random_run_missions(config: Config, training_key: jax.Array) -> RunMissions
     validation, test = (worlds.random_pool(name, worlds.world_keys(split, count)) for split in ("validation", "test"))
     if flown:
         validation, test, own = with_equal_capacities([validation, test, _pool_of(flown, config)])
-        test = jax.tree.map(lambda one, many: jnp.asarray(np.concatenate([one, many])[:-1]), own, test)
+        test = _before(own, test)
     return RunMissions(
         training=MissionSet(name, World(airframe, training_pool, training)),
         validation=MissionSet(name, World(airframe, validation, own_missions(validation))),
@@ -135,6 +135,33 @@ def _random_run_missions(config: Config, training_key: jax.Array) -> RunMissions
         near_start=np.ones(count, bool),
         tests=count - 1 if flown else count,
     )
+
+
+def final_missions(config: Config, most: int) -> MissionSet:
+    """Returns the first of the final missions of `run_missions`, without making the training worlds.
+
+    Args:
+        config: of the run.
+        most: how many missions at most; fewer where the run has fewer.
+
+    Raises:
+        ConfigError: as `run_missions`.
+    """
+    name, flown, count = config.world.name, config.world.flown, min(most, config.train.validation_missions)
+    if name not in FAMILIES:
+        final = run_missions(config).final
+        missions = jax.tree.map(lambda leaf: leaf[:count], final.world.missions)
+        return dataclasses.replace(final, world=dataclasses.replace(final.world, missions=missions))
+    pool = worlds.random_pool(name, worlds.world_keys("test", count))
+    if flown:
+        pool, own = with_equal_capacities([pool, _pool_of(flown, config)])
+        pool = _before(own, pool)
+    return MissionSet(name, World(drone.load_airframe(config.drone), pool, own_missions(pool)))
+
+
+def _before(own: Scene, pool: Scene) -> Scene:
+    """Returns a pool with the world `own`, a pool of one, before all others, and without its last."""
+    return jax.tree.map(lambda one, many: jnp.asarray(np.concatenate([one, many])[:-1]), own, pool)
 
 
 def _training_missions(pool: Scene, config: Config, key: jax.Array) -> Missions:

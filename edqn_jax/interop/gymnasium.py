@@ -16,7 +16,7 @@ import dataclasses
 import functools
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Literal, TypedDict, Unpack, get_args
+from typing import Any, TypedDict, Unpack
 
 import jax
 import jax.numpy as jnp
@@ -25,33 +25,20 @@ from flax import struct
 from jax import Array
 from numpy.typing import NDArray
 
-from edqn_jax.config import FAMILIES, Config
-from edqn_jax.config.loading import make_config
+from edqn_jax.config import Config
 from edqn_jax.errors import ConfigError
-from edqn_jax.learn import embedding
-from edqn_jax.learn.code import Params
+from edqn_jax.interop import functional
+from edqn_jax.interop.functional import Box, FunctionalEnv, Kind, Params, State
+from edqn_jax.learn.code import Params as EncoderParams
 from edqn_jax.learn.policy import Policy
 from edqn_jax.packages import require
-from edqn_jax.sim import env, events
-from edqn_jax.sim.env import MOTION_SIZE, OWN_SIZE, EnvState, Observation, World
-from edqn_jax.sim.environment import Environment, make
-from edqn_jax.sim.events import EventField
+from edqn_jax.sim.env import EnvState
+from edqn_jax.sim.environment import Environment
 from edqn_jax.sim.moves import ACTIONS
-from edqn_jax.sim.outcomes import Outcome, is_terminal
+from edqn_jax.sim.outcomes import Outcome
 from edqn_jax.sim.reward import Reward
-from edqn_jax.sim.sensor import Form, sensor_of
 
 gymnasium = require("gymnasium", extra="gym")
-
-Kind = Literal["image", "code", "kinematics"]
-"""What a drone observes: an image with its own state and motion, one vector with a code, or one without."""
-
-LARGEST = 10.0
-"""Bound of each number of an observation; what is flown stays within, and is cut off there."""
-
-WORLDS = 64
-"""Random worlds of an environment unless it is told how many, each with a mission of its own."""
-
 
 SEEDS = 2**32
 """Seeds that differ; larger ones begin again at 0."""
@@ -84,8 +71,7 @@ class _Decided:
 class _Program:
     """What a compiled program depends on, beside its arrays."""
 
-    config: Config
-    kind: Kind
+    env: FunctionalEnv
     world: Any  # structure of a `World`
 
 
@@ -94,58 +80,29 @@ Leaves = list[Array]
 object whose fields it has to ask for in Python; so worlds go in as lists, and keys as their data."""
 
 
-def _held(state: EnvState, code: Array) -> Drone:
-    return Drone(dataclasses.replace(state, key=None), jax.random.key_data(state.key), code)
+def _held(state: State) -> Drone:
+    flight = state.flight
+    return Drone(dataclasses.replace(flight, key=None), jax.random.key_data(flight.key), state.code)
 
 
-def _numbers(x: Array) -> Array:
-    """Returns any numbers as a Box holds them: float32 within `LARGEST`."""
-    return jnp.clip(x.astype(jnp.float32), -LARGEST, LARGEST)
+def _reset(
+    program: _Program, leaves: Leaves, encoder: EncoderParams, seed: Array, mission: Array | None
+) -> tuple[Drone, Any]:
+    observed, state = program.env.reset(jax.random.key(seed), _params(program, leaves, encoder), mission)
+    return _held(state), observed
 
 
-def _observed(config: Config, kind: Kind, encoder: Params, seen: Observation, before: Array) -> tuple[Any, Array]:
-    """Returns the observation as Gymnasium has it, and the code to remember."""
-    own, motion = _numbers(seen.own), _numbers(seen.motion)
-    if kind == "kinematics":
-        return jnp.concatenate([own, motion]), before
-    if kind == "code":
-        code = embedding.embed(config, encoder, seen, before)
-        assert code is not None
-        return jnp.concatenate([_numbers(code), own, motion]), code
-    sensed = seen.sensed
-    if isinstance(sensed, EventField):
-        counts = events.event_image(sensed).astype(jnp.float32)
-        sensed = jnp.sign(counts) * jnp.log1p(jnp.abs(counts))
-    assert sensed is not None
-    return {"image": _numbers(sensed), "own": own, "motion": motion}, before
+def _step(
+    program: _Program, leaves: Leaves, encoder: EncoderParams, drone: Drone, action: Array
+) -> tuple[Drone, _Decided]:
+    key = jax.random.wrap_key_data(drone.key)
+    params, state = _params(program, leaves, encoder), State(dataclasses.replace(drone.state, key=key), drone.code)
+    observed, state, reward, terminated, truncated, info = program.env.step(key, state, action, params)
+    return _held(state), _Decided(observed, reward, info["outcome"], terminated, truncated)
 
 
-def _reset(program: _Program, leaves: Leaves, encoder: Params, seed: Array, mission: Array | None) -> tuple[Drone, Any]:
-    state, seen = env.reset(program.config, _world(program, leaves), jax.random.key(seed), mission)
-    observed, code = _observed(program.config, program.kind, encoder, seen, _no_code(program))
-    return _held(state, code), observed
-
-
-def _step(program: _Program, leaves: Leaves, encoder: Params, drone: Drone, action: Array) -> tuple[Drone, _Decided]:
-    before = jnp.where(drone.state.ended, 0.0, drone.code)
-    state = dataclasses.replace(drone.state, key=jax.random.wrap_key_data(drone.key))
-    state, step = env.step(program.config, _world(program, leaves), state, action)
-    observed, code = _observed(program.config, program.kind, encoder, step.observation, before)
-    return _held(state, code), _Decided(
-        observed=observed,
-        reward=step.reward,
-        outcome=step.outcome,
-        terminated=is_terminal(step.outcome),
-        truncated=step.outcome == Outcome.TIME_OUT,
-    )
-
-
-def _no_code(program: _Program) -> Array:
-    return jnp.zeros(embedding.size(program.config) if program.kind == "code" else 0)
-
-
-def _world(program: _Program, leaves: Leaves) -> World:
-    return jax.tree.unflatten(program.world, leaves)
+def _params(program: _Program, leaves: Leaves, encoder: EncoderParams) -> Params:
+    return Params(jax.tree.unflatten(program.world, leaves), encoder)
 
 
 _reset_one = jax.jit(_reset, static_argnums=0)
@@ -153,17 +110,17 @@ _step_one = jax.jit(_step, static_argnums=0)
 
 
 @functools.partial(jax.jit, static_argnums=0)
-def _reset_many(program: _Program, leaves: Leaves, encoder: Params, seeds: Array, missions: Array | None):
+def _reset_many(program: _Program, leaves: Leaves, encoder: EncoderParams, seeds: Array, missions: Array | None):
     return jax.vmap(lambda seed, mission: _reset(program, leaves, encoder, seed, mission))(seeds, missions)
 
 
 @functools.partial(jax.jit, static_argnums=0, donate_argnums=3)
-def _step_many(program: _Program, leaves: Leaves, encoder: Params, drones: Drone, actions: Array):
+def _step_many(program: _Program, leaves: Leaves, encoder: EncoderParams, drones: Drone, actions: Array):
     return jax.vmap(lambda drone, action: _step(program, leaves, encoder, drone, action))(drones, actions)
 
 
 @functools.partial(jax.jit, static_argnums=0, donate_argnums=3)
-def _reset_some(program: _Program, leaves: Leaves, encoder: Params, drones: Drone, numbers: Array) -> tuple[Drone, Any]:
+def _reset_some(program: _Program, leaves: Leaves, encoder: EncoderParams, drones: Drone, numbers: Array):
     """Resets the ended drones of these numbers [K] and returns their observations; other numbers stand for none."""
     ended = jax.tree.map(lambda x: x.at[numbers].get(mode="clip"), drones)
     fresh, decided = jax.vmap(lambda drone: _step(program, leaves, encoder, drone, jnp.zeros((), jnp.int32)))(ended)
@@ -174,29 +131,30 @@ def _reset_some(program: _Program, leaves: Leaves, encoder: Params, drones: Dron
 class _Task:
     """What one environment and many have in common."""
 
-    environment: Environment
-    kind: Kind
-    encoder: Params
+    env: FunctionalEnv
+    params: Params
 
     @property
     def config(self) -> Config:
-        return self.environment.config
+        return self.env.config
+
+    @property
+    def environment(self) -> Environment:
+        return Environment(self.config, self.params.world)
 
     @functools.cached_property
-    def program(self) -> tuple[_Program, Leaves, Params]:
+    def program(self) -> tuple[_Program, Leaves, EncoderParams]:
         """Returns the first arguments of every compiled function."""
-        leaves, structure = jax.tree.flatten(self.environment.world)
-        return _Program(self.config, self.kind, structure), leaves, self.encoder
+        leaves, structure = jax.tree.flatten(self.params.world)
+        return _Program(self.env, structure), leaves, self.params.encoder
 
     @property
     def observations(self) -> Any:
         """Returns the space of one drone's observations."""
-        if self.kind == "kinematics":
-            return _box(OWN_SIZE + MOTION_SIZE)
-        if self.kind == "code":
-            return _box(embedding.size(self.config) + OWN_SIZE + MOTION_SIZE)
-        image = jax.eval_shape(lambda: _image_of(self.config)).shape
-        return gymnasium.spaces.Dict({"image": _box(*image), "own": _box(OWN_SIZE), "motion": _box(MOTION_SIZE)})
+        space = self.env.observation_space(self.params)
+        if isinstance(space, Box):
+            return _box(space)
+        return gymnasium.spaces.Dict({name: _box(box) for name, box in space.items()})
 
     def mission(self, options: dict[str, Any] | None, count: int | None) -> Array | None:
         """Returns which missions [count], or [] of one drone, the options of a reset ask for; None draws them.
@@ -220,18 +178,13 @@ class _Task:
         return np.round(self.environment.picture(state) * 255.0).astype(np.uint8)
 
 
-def _image_of(config: Config) -> Array:
-    sensed = sensor_of(config).example(config)
-    return events.event_image(sensed) if isinstance(sensed, EventField) else jnp.asarray(sensed)
-
-
 def _on_host(tree: Any) -> Any:
     """Returns the arrays as NumPy's own, which may be written: JAX's may not."""
     return jax.tree.map(np.array, tree)
 
 
-def _box(*shape: int) -> Any:
-    return gymnasium.spaces.Box(-LARGEST, LARGEST, shape, np.float32)
+def _box(space: Box) -> Any:
+    return gymnasium.spaces.Box(space.low, space.high, space.shape, np.float32)
 
 
 class TaskOptions(TypedDict, total=False):
@@ -244,48 +197,20 @@ class TaskOptions(TypedDict, total=False):
     policy: Policy | None
     """Whose encoder makes the codes."""
     worlds: int | None
-    """Random worlds, of which each reset draws one; None is `WORLDS`, and 1 for a world from a file."""
+    """Random worlds, of which each reset draws one; None is `functional.WORLDS`, and 1 for a world from a file."""
     world_seed: int
     """Which random worlds, of those that training draws from."""
     reward: Reward | None
     """Of every decision, in place of the configured one: a function of a `Transition`."""
 
 
-def _task(
-    world: str | Path | None,
-    config: Config | None,
-    observation: Kind = "image",
-    policy: Policy | None = None,
-    worlds: int | None = None,
-    world_seed: int = 0,
-    reward: Reward | None = None,
-) -> _Task:
+def _task(world: str | Path | None, config: Config | None, **options: Unpack[TaskOptions]) -> _Task:
     """Returns the task of these arguments, which are those of `DroneEnv`.
 
     Raises:
         ConfigError: if they do not fit each other, or the world cannot be flown.
     """
-    if observation not in get_args(Kind):
-        raise ConfigError(f"observation must be one of {', '.join(get_args(Kind))}, not '{observation}'")
-    if (policy is not None) != (observation == "code"):
-        raise ConfigError("observation 'code' needs a policy, whose encoder makes the codes, and the others need none")
-    if policy is not None:
-        if config is not None:
-            raise ConfigError("config must be None with a policy, which has its own")
-        if not embedding.has_code(policy.config):
-            raise ConfigError(f"the policy's sensor '{policy.config.env.sensor}' has no encoder, so there are no codes")
-        config = policy.config
-    elif config is None:
-        config = make_config(str(world) if world is not None else None)
-    if observation == "kinematics":
-        config = dataclasses.replace(config, env=dataclasses.replace(config.env, sensor="blind"))
-    if observation == "image" and sensor_of(config).form is Form.NOTHING:
-        raise ConfigError(f"the sensor '{config.env.sensor}' shows nothing; set observation to 'kinematics'")
-    name = str(world) if world is not None else config.world.name
-    if worlds is None:
-        worlds = WORLDS if name in FAMILIES else 1
-    made = make(name, config, worlds=worlds, seed=world_seed, reward=reward)
-    return _Task(made, observation, {} if policy is None else policy.params.encoder)
+    return _Task(*functional.make(world, config, **options))
 
 
 class DroneEnv(gymnasium.Env):

@@ -85,7 +85,7 @@ class DroneVecEnv(vec_env.VecEnv):
         self.envs.close()
 
     def get_images(self) -> Sequence[NDArray[np.uint8] | None]:
-        """Returns what a person would see from each drone's camera, with `render_mode="rgb_array"`."""
+        """Returns what a person would see from each drone's camera, [192, 256, 3], with `render_mode="rgb_array"`."""
         return self.envs.render() or [None] * self.num_envs
 
     def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:

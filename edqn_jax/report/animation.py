@@ -1,9 +1,12 @@
-"""A flight as an animated GIF: what a person would see, what the sensor shows, and the path so far."""
+"""A flight as an animated GIF or an MP4: what a person would see, what the sensor shows, and the path so far."""
 
 from __future__ import annotations
 
 import io
+import tempfile
+import warnings
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import matplotlib
@@ -16,6 +19,7 @@ from matplotlib.patches import Wedge
 from PIL import Image
 
 from edqn_jax.learn.policy import PolicyParams
+from edqn_jax.packages import require
 from edqn_jax.report.flights import OBLIQUE, draw_end_marks, draw_stage
 from edqn_jax.report.images import LOOKS, scale_of
 from edqn_jax.report.sights import Sights, decision_rows, poses
@@ -42,8 +46,10 @@ SIGHT_M = 9.0
 """Length of the field of view on the map, metres, in a volume of 100 m; it is as much shorter in a smaller one."""
 
 
-def animate(sights: Sights, params: PolicyParams, flown: Mapping[str, np.ndarray], outcome: str, title: str) -> bytes:
-    """Returns a flight as an animated GIF of `SIZE`, which repeats for ever.
+def animate(
+    sights: Sights, params: PolicyParams, flown: Mapping[str, np.ndarray], outcome: str, title: str, form: str = ".gif"
+) -> bytes:
+    """Returns a flight as an animated GIF of `SIZE`, which repeats for ever, or as an MP4 (H.264) of that size.
 
     Args:
         sights: of the world in which the flight was flown.
@@ -51,6 +57,10 @@ def animate(sights: Sights, params: PolicyParams, flown: Mapping[str, np.ndarray
         flown: the columns of `trajectory.csv`, each [rows].
         outcome: how the flight ended, a key of `OUTCOME_LABELS`.
         title: stands above the world.
+        form: `.gif` or `.mp4`, which needs the extra `video`.
+
+    Raises:
+        MissingPackageError: if the extra is not installed.
     """
     rows = decision_rows(sights.config, flown)[:, -1]
     every = -(-len(rows) // MOST_FRAMES)
@@ -60,6 +70,8 @@ def animate(sights: Sights, params: PolicyParams, flown: Mapping[str, np.ndarray
         stage = _Stage(sights, params, flown, f"{title}, {speed_up:.1f} times as fast as flown")
         frames = [stage.frame(int(number), int(rows[number])) for number in shown]
         frames.append(stage.frame(len(rows) - 1, len(flown["t"]) - 1, outcome))
+    if form == ".mp4":
+        return _mp4(frames + [frames[-1]] * (round(LAST_FRAME_S / FRAME_S) - 1))
     return gif(frames, [FRAME_S] * len(shown) + [LAST_FRAME_S])
 
 
@@ -217,6 +229,33 @@ def gif(frames: list[Image.Image], seconds: list[float], colours: int = COLOURS)
         optimize=True,
     )
     return file.getvalue()
+
+
+def _mp4(frames: list[Image.Image]) -> bytes:
+    """Returns the frames, each shown for `FRAME_S`, as an MP4 that browsers and slides play."""
+    ffmpeg = require("imageio_ffmpeg", extra="video")
+    with tempfile.TemporaryDirectory() as folder:  # an MP4 is finished by going back in the file
+        file = Path(folder) / "flight.mp4"
+        writer = ffmpeg.write_frames(
+            str(file),
+            frames[0].size,
+            fps=1 / FRAME_S,
+            codec="libx264",
+            pix_fmt_out="yuv420p",
+            macro_block_size=2,
+            quality=None,
+            output_params=["-crf", "20", "-movflags", "+faststart"],
+        )
+        with warnings.catch_warnings():
+            # JAX warns of every fork; here a program takes the child's place at once.
+            warnings.filterwarnings("ignore", "os.fork", RuntimeWarning)
+            writer.send(None)
+        try:
+            for frame in frames:
+                writer.send(np.asarray(frame.convert("RGB")).tobytes())
+        finally:
+            writer.close()
+        return file.read_bytes()
 
 
 def _palette(frames: list[Image.Image], number: int, many: int = 8) -> Image.Image:

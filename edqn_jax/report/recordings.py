@@ -46,7 +46,7 @@ class Strip:
 
 
 def moments(windows: int, most: int) -> NDArray[np.int64]:
-    """Returns the numbers of at most `most` windows, evenly from the first to the last."""
+    """Returns the numbers [M] of at most `most` windows, evenly from the first to the last."""
     return np.unique(np.linspace(0, windows - 1, min(windows, most)).round().astype(np.int64))
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 from collections.abc import Mapping
 from concurrent.futures import Executor
@@ -38,9 +39,11 @@ class Shown:
     """[D, H, W] what the decoder must draw, blurred: nearness, ON plus OFF events per pixel, or the first picture."""
     reconstruction: np.ndarray
     """[D, H, W] what it draws from the code, in the same units."""
+    luma: np.ndarray
+    """[D, H, W] linear brightness in the drone's camera at the end of each decision."""
 
 
-_Images = tuple[Array, Array, Array]
+_Images = tuple[Array, Array, Array, Array]
 """As the fields of `Shown`."""
 
 
@@ -60,6 +63,12 @@ class Sights:
         """Whether the sensor shows an image; without one there is only `rgb`."""
         self._shown = pool.submit(self._compile_shown) if self.has_image else None
         self._rgb = pool.submit(self._compile_rgb)
+
+    def in_world(self, scene: Scene) -> Sights:
+        """Returns the same programs for another world whose arrays have the same shapes."""
+        other = copy.copy(self)
+        other.scene = scene
+        return other
 
     def shown(self, params: PolicyParams, flown: Mapping[str, np.ndarray]) -> Shown:
         """Returns what the sensor shows at each decision of a flight, and what the VAE makes of it.
@@ -109,7 +118,8 @@ class Sights:
             target = vae.target(config.encoder, sensed, nearness)
             made = vae.decode(config.encoder, config.camera, params.encoder, code)
             drawn = (_drawn(config, sensed, channels) for channels in (target, made))
-            return (memory, code), (image, *drawn)  # type: ignore[return-value]
+            luma = sensor.view(config, scene, position[-1], quaternion[-1])
+            return (memory, code), (image, *drawn, luma)  # type: ignore[return-value]
 
         keys = jax.random.split(rest, len(position))
         before = sensor.at_rest(config, start), jnp.zeros(config.encoder.code_size)

@@ -74,21 +74,21 @@ MAP = View(azimuth=-90.0, elevation=90.0)
 def solids_of(scene: Scene) -> list[Solid]:
     """Returns every shape of one world that is not parked; planes are left out, the ground is drawn by itself."""
     found: list[Solid] = []
-    for position, half, yaw, albedo in _present(scene.boxes, "position", "half", "yaw", "albedo"):
+    for position, half, yaw, albedo in present(scene.boxes, "position", "half", "yaw", "albedo"):
         found.append(Solid(_box(position, half, _about_z(float(yaw))), albedo))
-    for position, half, rotation, albedo in _present(scene.tilted_boxes, "position", "half", "rotation", "albedo"):
+    for position, half, rotation, albedo in present(scene.tilted_boxes, "position", "half", "rotation", "albedo"):
         found.append(Solid(_box(position, half, rotation), albedo))
-    for position, radius, half, albedo in _present(scene.cylinders, "position", "radius", "half_height", "albedo"):
+    for position, radius, half, albedo in present(scene.cylinders, "position", "radius", "half_height", "albedo"):
         found.append(Solid(_tube(position, np.array([0.0, 0.0, 1.0]), float(radius), float(half)), albedo))
-    for position, axis, half, radius, albedo in _present(
+    for position, axis, half, radius, albedo in present(
         scene.tilted_cylinders, "position", "axis", "half_length", "radius", "albedo"
     ):
         found.append(Solid(_tube(position, axis, float(radius), float(half)), albedo))
-    for position, axis, half, radius, albedo in _present(
+    for position, axis, half, radius, albedo in present(
         scene.capsules, "position", "axis", "half_length", "radius", "albedo"
     ):
         found.append(Solid(_round(position, axis, float(radius), float(half)), albedo))
-    for position, radius, albedo in _present(scene.spheres, "position", "radius", "albedo"):
+    for position, radius, albedo in present(scene.spheres, "position", "radius", "albedo"):
         found.append(Solid(_round(position, np.array([0.0, 0.0, 1.0]), float(radius), 0.0), albedo))
     return found
 
@@ -122,20 +122,30 @@ def cut_open(scene: Scene, view: View) -> CutOpen:
     has_ceiling = any(normal[2] < -0.9 and middle < position[2] < PARKED / 10 for position, normal in planes)
     shown, near_walls = [], []
     for solid in solids_of(scene):
-        low, high = solid.corners.min(0), solid.corners.max(0)
-        covered = (np.minimum(high, upper) - np.maximum(low, lower)) / (upper - lower) > NEARLY_ALL
-        before_eye = [
-            covered[1 - axis] and _at_rim(axis, np.sign(view.towards[axis]), low, high, lower, upper)
-            for axis in (0, 1)
-            if abs(view.towards[axis]) > 1e-6
-        ]
-        if covered[:2].all() and low[2] >= middle:
+        side = closed_side(solid, lower, upper)
+        if side == (2, 1):
             has_ceiling = True
-        elif any(before_eye) and high[2] > middle:
+        elif side is not None and side[1] * view.towards[side[0]] > 1e-6:
             near_walls.append(solid)
         else:
             shown.append(solid)
     return CutOpen(shown, near_walls, has_ceiling)
+
+
+def closed_side(solid: Solid, lower: np.ndarray, upper: np.ndarray) -> tuple[int, int] | None:
+    """Returns which side of the volume from `lower` [3] to `upper` [3] a solid closes: its axis, and -1 or 1.
+
+    A ceiling closes (2, 1), an outer wall a side of axis 0 or 1; None of other solids.
+    """
+    low, high = solid.corners.min(0), solid.corners.max(0)
+    middle = (lower[2] + upper[2]) / 2
+    covered = (np.minimum(high, upper) - np.maximum(low, lower)) / (upper - lower) > NEARLY_ALL
+    if covered[:2].all() and low[2] >= middle:
+        return 2, 1
+    if high[2] <= middle:
+        return None
+    rims = ((axis, side) for axis in (0, 1) for side in (-1, 1) if covered[1 - axis])
+    return next((rim for rim in rims if _at_rim(*rim, low, high, lower, upper)), None)
 
 
 def _at_rim(axis: int, side: float, low: np.ndarray, high: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> bool:
@@ -195,7 +205,8 @@ def hidden(points: np.ndarray, solids: Sequence[Solid], view: View) -> np.ndarra
     return covered
 
 
-def _present(shapes: object, *names: str) -> Iterator[tuple[np.ndarray, ...]]:
+def present(shapes: object, *names: str) -> Iterator[tuple[np.ndarray, ...]]:
+    """Yields the rows of these fields, [n, ...] each and the first the position, of shapes that stand in the world."""
     columns = [np.asarray(getattr(shapes, name), np.float64) for name in names]
     for row in zip(*columns, strict=True):
         if np.abs(row[0]).max() < PARKED / 10:

@@ -17,10 +17,11 @@ import numpy as np
 
 from edqn_jax.config import Config
 from edqn_jax.config.loading import make_config
-from edqn_jax.evaluation.missions import RunMissions
+from edqn_jax.evaluation.missions import MissionSet, RunMissions
 from edqn_jax.learn.policy import Policy, PolicyParams
 from edqn_jax.learn.trainer import Trainer, TrainState, policy_of
 from edqn_jax.parallel import processes
+from edqn_jax.sim.flights import Flights
 from edqn_jax.sim.reward import Reward
 from edqn_jax.training.history import EndedEpisodes, History, Watch, chunk_metrics, mean_metrics
 from edqn_jax.training.preparation import Preparation, prepared
@@ -41,6 +42,8 @@ class Chunk:
     """Returns the newest policy; to be called during the callback only, the state is donated to the next chunk."""
     agent: int = 0
     """Which of the agents that train in one program."""
+    validation: tuple[MissionSet, Flights] | None = None
+    """Missions of the validation after the chunk and their recorded flights; None if there was none."""
 
 
 Callback = Callable[[Chunk], bool | None]
@@ -250,8 +253,11 @@ class _Loop:
         state, chunks = self._run(state)
         policies = functools.cache(lambda: _policies(self.preparation.trainer, state))
         metrics = [measured for _, measured in chunks]
+        flown: list[tuple[MissionSet, Flights] | None] = [None] * len(self.agents)
         if self.finished or is_due(self.config, self.plan, self.checked, self.done):
-            metrics = [before | found for before, found in zip(metrics, self._validate(policies()), strict=True)]
+            validations = self._validate(policies())
+            metrics = [before | found for before, (found, _) in zip(metrics, validations, strict=True)]
+            flown = [flights for _, flights in validations]
         self.preparation.display.update(mean_metrics(metrics))
         stop = False
         for number, agent in enumerate(self.agents):
@@ -260,7 +266,8 @@ class _Loop:
                 newest = functools.partial(
                     lambda agent, number: Policy(agent.config, policies()[number]), agent, number
                 )
-                stop |= self.callback(Chunk(metrics[number], chunks[number][0], agent.kept, newest, number)) is True
+                chunk = Chunk(metrics[number], chunks[number][0], agent.kept, newest, number, flown[number])
+                stop |= self.callback(chunk) is True
         self.stopped = processes.on_any(stop) and not self.finished
         return state
 
@@ -283,27 +290,26 @@ class _Loop:
             chunks.append((ended, chunk_metrics(self.config, first, ended, lost, seconds, count)))
         return state, chunks
 
-    def _validate(self, policies: Sequence[PolicyParams]) -> list[dict[str, Any]]:
-        """Flies the validation missions, keeps the better parameters of each agent, and returns the metrics."""
+    def _validate(self, policies: Sequence[PolicyParams]) -> list[tuple[dict[str, Any], tuple[MissionSet, Flights]]]:
+        """Flies the validation missions, keeps the better parameters of each agent; returns metrics and flights."""
         preparation = self.preparation
         preparation.display.phase("validating")
         self.checked = self.done * self.config.train.num_envs
-        metrics = []
+        found = []
         for number, (agent, params) in enumerate(zip(self.agents, policies, strict=True)):
             flights = preparation.fly(agent.missions.validation, params, number)
             latest = validated(self.config, agent.missions, flights, params, self.checked)
             agent.kept = choose(self.config.train.keep, agent.kept, latest)
             since = time.perf_counter() - preparation.began
             agent.history.validations.append((self.checked, since, latest.success_near_start))
-            metrics.append(
-                {
-                    "validation_success": latest.success,
-                    "validation_mission": latest.success_near_start,
-                    "validation_spl": latest.spl,
-                }
-            )
+            metrics = {
+                "validation_success": latest.success,
+                "validation_mission": latest.success_near_start,
+                "validation_spl": latest.spl,
+            }
+            found.append((metrics, (agent.missions.validation, flights)))
         preparation.display.phase("training")
-        return metrics
+        return found
 
 
 def _policies(trainer: Trainer, state: TrainState) -> list[PolicyParams]:

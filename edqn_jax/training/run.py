@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import jax
@@ -28,7 +28,7 @@ from edqn_jax.sim.flights import Flights
 from edqn_jax.sim.reward import Reward
 from edqn_jax.training import summaries
 from edqn_jax.training.keeper import Keeper
-from edqn_jax.training.loop import Chunk, Standing, TrainingResult, run_chunks
+from edqn_jax.training.loop import Callback, Chunk, Standing, TrainingResult, run_chunks
 from edqn_jax.training.preparation import Preparation, prepared
 from edqn_jax.training.stopping import Stop
 
@@ -39,6 +39,7 @@ def train_run(
     progress: Progress,
     stop: Stop,
     reward: Reward | None = None,
+    callback: Callback | None = None,
 ) -> dict[str, Any]:
     """Trains, validates, flies and draws; writes everything to the run directory.
 
@@ -47,7 +48,7 @@ def train_run(
         run: None on a process that writes nothing, which is every one but the first of those that train together.
         progress: display of the progress.
         stop: asked after each chunk; where one process is to stop, all do.
-        reward: as in `train`.
+        reward, callback: as in `train`.
 
     Returns:
         the content of `summary.json`.
@@ -66,7 +67,7 @@ def train_run(
         preparation.ready(begins=begin is None)  # until then a signal ends the command: nothing is lost yet
         with stop.obeyed():
             (result,) = run_chunks(
-                preparation, lambda chunk: record(run, chunk) or stop.requested(), keeper.save_if_due, begin
+                preparation, recorded(lambda _: run, callback, stop.requested), keeper.save_if_due, begin
             )
         if processes.on_any(result.stopped or stop.requested()):
             raise StoppedError(f"stopped after {result.decisions:,} decisions; {where_saved(run)}")
@@ -149,6 +150,22 @@ def _continued(plan: Plan, done: int, config: Config) -> str:
             "are at that end, and the encoder is not trained again"
         )
     return text
+
+
+def recorded(
+    run_of: Callable[[Chunk], RunDirectory | None], callback: Callback | None, stop: Callable[[], bool]
+) -> Callback:
+    """Returns the callback of a recorded run: writes the chunk to the run of its agent, then calls `callback`.
+
+    Training ends where that returns True, or where `stop` does.
+    """
+
+    def after(chunk: Chunk) -> bool:
+        record(run_of(chunk), chunk)
+        ended = callback is not None and callback(chunk) is True
+        return ended or stop()
+
+    return after
 
 
 def record(run: RunDirectory | None, chunk: Chunk) -> None:

@@ -14,9 +14,9 @@ from edqn_jax.runs.provenance import state_digest
 from edqn_jax.sim.reward import Reward
 from edqn_jax.training import summaries
 from edqn_jax.training.keeper import Keeper
-from edqn_jax.training.loop import run_chunks
+from edqn_jax.training.loop import Callback, run_chunks
 from edqn_jax.training.preparation import prepared
-from edqn_jax.training.run import described, finish, locked, needed, opened, record, sights_of, trained_in, unseen
+from edqn_jax.training.run import described, finish, locked, needed, opened, recorded, sights_of, trained_in, unseen
 from edqn_jax.training.stopping import Stop
 
 
@@ -27,13 +27,14 @@ def train_seeds_run(
     progress: Progress,
     stop: Stop,
     reward: Reward | None = None,
+    callback: Callback | None = None,
 ) -> dict[str, Any]:
     """Trains an agent of each seed in one program; writes a run of each, and a summary of all.
 
     Args:
         config: of the first seed.
         seeds: how many agents; their seeds count up from `train.seed`.
-        run, progress, stop, reward: as in `train_run`; `run` is the folder that holds those of the seeds.
+        run, progress, stop, reward, callback: as in `train_run`; `run` is the folder that holds those of the seeds.
 
     Returns:
         the content of the `summary.json` of all.
@@ -51,7 +52,7 @@ def train_seeds_run(
         with stop.obeyed():
             results = run_chunks(
                 preparation,
-                lambda chunk: record(folders[chunk.agent], chunk) or stop.requested(),
+                recorded(lambda chunk: folders[chunk.agent], callback, stop.requested),
                 keeper.save_if_due,
                 begin,
             )

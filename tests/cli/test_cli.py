@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -13,8 +14,9 @@ from pathlib import Path
 
 import pytest
 
-from edqn_jax.cli import arguments, main
-from edqn_jax.cli.arguments import parse_train
+from edqn_jax.cli import arguments, main, train
+from edqn_jax.cli.arguments import parse_train, train_flags
+from edqn_jax.cli.help import COMMON, flag_of
 from edqn_jax.config import Config, preset
 from edqn_jax.config.loading import RANDOM_WORLDS, make_config
 from edqn_jax.errors import CheckError, ConfigError, DivergedError, StoppedError
@@ -36,10 +38,11 @@ def trainer(monkeypatch):
     """Stands in for training: a function to set, and the calls that reached it."""
     stand_in = types.ModuleType("edqn_jax.training.run")
     calls: list[tuple] = []
-    behaviour = types.SimpleNamespace(calls=calls, act=lambda *call: None)
+    behaviour = types.SimpleNamespace(calls=calls, act=lambda *call: None, callbacks=[])
 
-    def train_run(*call):
+    def train_run(*call, callback):
         calls.append(call)
+        behaviour.callbacks.append(callback)
         return behaviour.act(*call)
 
     seeds = types.ModuleType("edqn_jax.training.seeds")
@@ -145,7 +148,7 @@ def test_every_kind_of_option_can_be_a_flag():
         (["trian"], "did you mean 'train'?"),
         (["train", "--nun-envs", "64"], "there is no option '--nun-envs'; did you mean '--num-envs'?"),
         (["evaluate", "runs", "--misions=3"], "there is no option '--misions'; did you mean '--missions'?"),
-        (["train", "--zzz"], "there is no option '--zzz'; 'edqn train --help' lists what there is"),
+        (["train", "--zzz"], "there is no option '--zzz'; 'edqn train --help-all' lists what there is"),
     ],
 )
 def test_bad_input_ends_with_2_a_sentence_and_nothing_made(argv, says, capsys, tmp_path, trainer):
@@ -263,26 +266,125 @@ def test_evaluate_hands_on_what_was_asked_for(monkeypatch, tmp_path):
     assert asked == [whole, arguments.EvaluateArgs(tmp_path, shuffle_codes=True, trajectories=Path("a.npz"))]
 
 
-def test_help_lists_every_option_and_does_not_start_jax():
+def shown(*words: str) -> str:
+    """What a command prints that exits with 0 and does not import JAX."""
     script = (
-        "import sys; from edqn_jax.cli import main; code = main(['train', '--world', 'medium', '--help']);"
-        "sys.exit(code or 'jax' in sys.modules)"
+        f"import sys; from edqn_jax.cli import main; code = main({words!r}); sys.exit(code or 'jax' in sys.modules)"
     )
-    shown = subprocess.run(
+    return subprocess.run(
         [sys.executable, "-c", script],
         capture_output=True,
         text=True,
         check=True,
         env={**os.environ, "PYTHONPATH": str(ROOT), "COLUMNS": "100"},
     ).stdout
-    assert "--agent.batch-size INT" in shown and "Replayed samples per update." in shown
-    assert "--events.frame-times-s" in shown and f"(default: {RANDOM_WORLDS['train']['total_steps']})" in shown
-    assert "--num-envs for --train.num-envs" in shown
 
 
-def test_the_version_is_the_packages(capsys):
-    assert main(["--version"]) == 0
-    assert capsys.readouterr().out == f"edqn-jax {metadata.version('edqn-jax')}\n"
+def test_help_all_lists_every_option_and_does_not_start_jax():
+    said = shown("train", "--world", "medium", "--help-all")
+    assert all(flag in said for flag in train_flags() - {"--help-all"})
+    assert "--agent.batch-size INT" in said and "Replayed samples per update." in said
+    assert f"(default: {RANDOM_WORLDS['train']['total_steps']})" in said
+    assert "--num-envs INT, --train.num-envs INT" in said
+
+
+@pytest.mark.parametrize("flag", ["--help", "-h"])
+def test_help_fits_a_screen_and_has_the_defaults_of_the_world(flag):
+    said = shown("train", "--world", "paper", flag)
+    assert len(said.splitlines()) < 50
+    assert "--camera.width N         pixels across (default: 32)" in said
+    assert f"(default: {Config().train.total_steps})" in said and "decisions in all, of 0.26 s each" in said
+    assert "`edqn train --help-all` shows all" in said and "--camera.samples-down" not in said
+
+
+@pytest.mark.parametrize(
+    ("words", "does"),
+    [
+        (["--help"], "Train drones to fly"),
+        (["train", "--help"], "Train a drone"),
+        (["evaluate", "--help"], "Fly a saved policy"),
+        (["record", "--help"], "Fly a saved run"),
+        (["report", "--help"], "Write one HTML file"),
+        (["verify", "--help"], "Verify a finished run"),
+        (["export", "--help"], "Write a policy as ONNX"),
+        (["events", "--help"], "Say what a file of events holds"),
+        (["completion", "--help"], "Print a script"),
+    ],
+)
+def test_a_help_begins_with_what_the_command_does_and_has_an_example(words, does, capsys):
+    assert main(words) == 0
+    usage, text, *_, rest = capsys.readouterr().out.split("\n\n", 2)
+    assert usage.startswith("usage: edqn") and text.startswith(does)
+    examples = re.search(r"Examples?:\n((?:  .*\n)+)", rest)
+    assert examples and " ".join(["edqn", *words[:-1]]) in examples[1]
+
+
+@pytest.mark.parametrize("name", COMMON)
+def test_what_the_short_help_shows_is_an_option(name):
+    assert flag_of(name) in train_flags()
+
+
+@pytest.mark.parametrize(
+    ("flag", "meant"),
+    [
+        ("--num", "--num-envs"),
+        ("--batch-size", "--agent.batch-size"),
+        ("--sensr", "--env.sensor"),
+        ("--camera.widht", "--camera.width"),
+        ("--total_step", "--total-steps"),
+        ("--lr", None),
+    ],
+)
+def test_a_flag_that_is_short_or_wrong_leads_to_the_one_that_was_meant(flag, meant):
+    says = f"did you mean '{meant}'" if meant else "'edqn train --help-all' lists what there is"
+    with pytest.raises(ConfigError, match=re.escape(says)):
+        parse_train([flag, "3"])
+
+
+def test_the_versions_are_those_of_the_packages():
+    versions = [f"{name} {metadata.version(name)}" for name in ("edqn-jax", "jax", "mujoco", "mujoco-mjx")]
+    assert shown("--version").splitlines() == versions
+
+
+@pytest.mark.parametrize(
+    ("words", "offered"),
+    [
+        (["ev"], ["evaluate", "events"]),
+        (["rep"], ["report"]),
+        (["train", "--num-e"], ["--num-envs"]),
+        (["train", "--world", "me"], ["medium"]),
+        (["train", "--env.sensor", "fr"], ["frames", "frame-pair"]),
+        (["train", "--world", "mine"], []),  # bash then offers files
+        (["evaluate", "runs/", "--world", "me"], ["medium"]),
+        (["record", "runs/", "--go"], ["--goal"]),
+    ],
+)
+def test_bash_completes_commands_options_and_values(words, offered, completion):
+    line = " ".join(["edqn", *words])
+    script = f"""
+        source {completion}
+        COMP_WORDS=({line}); COMP_CWORD={len(words)}
+        complete -p edqn | grep --quiet -- '-o default' || exit 1
+        $(complete -p edqn | sed 's/.*-F \\([^ ]*\\).*/\\1/')
+        printf '%s\\n' "${{COMPREPLY[@]}}"
+    """
+    done = subprocess.run(["bash", "-c", script], capture_output=True, text=True, check=True)
+    assert done.stdout.split() == offered and not done.stderr
+
+
+@pytest.fixture(scope="module")
+def completion(tmp_path_factory):
+    """The script for bash, in a file."""
+    file = tmp_path_factory.mktemp("completion") / "edqn.bash"
+    file.write_text(shown("completion", "bash"))
+    return file
+
+
+@pytest.mark.parametrize("shell", ["zsh", "fish"])
+def test_other_shells_have_their_scripts(shell, capsys):
+    assert main(["completion", shell]) == 0
+    script = capsys.readouterr().out
+    assert "--num-envs" in script and {"zsh": "_files; return", "fish": "complete --command"}[shell] in script
 
 
 def test_the_module_is_the_command():
@@ -311,3 +413,12 @@ def test_a_reader_that_has_enough_is_no_error() -> None:
     with os.fdopen(writes, "wb") as closed:
         ended = subprocess.run(words, cwd=ROOT, stdout=closed, stderr=subprocess.PIPE, text=True, timeout=PATIENCE_S)
     assert (ended.returncode, ended.stderr) == (0, "")
+
+
+def test_sinks_are_made_only_where_they_are_asked_for(trainer, tmp_path, monkeypatch):
+    monkeypatch.setattr(train.importlib.util, "find_spec", lambda name, *rest: name)
+    run = str(tmp_path / "run")
+    assert main(["train", "--run-dir", run]) == 0
+    assert main(["train", "--run-dir", run, "--track", "tensorboard", "wandb", "--view", "rerun"]) == 0
+    nothing, sinks = trainer.callbacks
+    assert nothing is None and list(sinks._makers) == ["tensorboard", "wandb", "rerun"]

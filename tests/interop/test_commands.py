@@ -18,12 +18,19 @@ EXTRAS = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["option
 
 BLOCKS = [(name_of(page), code) for page in PAGES for code in blocks_of(page, *SHELL)]
 
-RUNS = ("edqn evaluate", "edqn record", "edqn verify")
+RUNS = ("edqn evaluate", "edqn record", "edqn report", "edqn verify", "edqn export", "edqn events")
+
+PARSERS = {
+    "evaluate": arguments.parse_evaluate,
+    "record": arguments.parse_record,
+    "report": arguments.parse_report,
+    "export": arguments.parse_export,
+}
 
 
 def commands(code: str) -> list[list[str]]:
-    """Returns the words of each command of a script; its variables are numbers."""
-    code = re.sub(r"\$\{?\w+\}?", "0", code).replace("\\\n", " ")
+    """Returns the words of each command of a script; its variables are 1."""
+    code = re.sub(r"\$\{?\w+\}?", "1", code).replace("\\\n", " ")
     found = []
     for line in code.splitlines():
         words = shlex.split(line, comments=True)
@@ -45,10 +52,11 @@ def test_a_command_parses(page: str, words: list[str], monkeypatch: pytest.Monke
     monkeypatch.setattr(arguments, "_check_run", lambda folder: None)  # runs/DIR is a reader's
     if "train.py" in words or words[:2] == ["edqn", "train"]:
         arguments.parse_train(words[words.index("train.py" if "train.py" in words else "train") + 1 :])
-    elif words[:2] == ["edqn", "evaluate"]:
-        arguments.parse_evaluate(words[2:])
-    elif words[:2] == ["edqn", "record"]:
-        arguments.parse_record(words[2:])
+    elif words[0] == "edqn" and words[1] in PARSERS:
+        PARSERS[words[1]](words[2:])
+    elif words[:2] == ["edqn", "events"]:
+        monkeypatch.setattr(Path, "is_file", lambda self: True)  # a reader's, too
+        arguments.parse_events(words[2:])
     elif words[:2] == ["edqn", "verify"]:
         arguments.check_flags(words[2:], {"--json"}, arguments.VERIFY)
     elif words[0] == "python" and words[1].startswith("benchmarks/"):

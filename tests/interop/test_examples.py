@@ -1,7 +1,7 @@
 """The Python blocks of every page run from top to bottom, as a reader would run them.
 
-Training is cut short, and flights are few: what is tested is that the code runs, not how well it flies. The pages on
-Gymnasium and on deployment have tests of their own, and so has the README (tests/whole/test_examples.py).
+Training is cut short, and flights are few: what is tested is that the code runs, not how well it flies. Pages on
+other people's libraries and on deployment have tests of their own, as has the README (tests/whole/test_examples.py).
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import edqn_jax
 from edqn_jax.config import Config
 from tests.docs.pages import PAGES, blocks_of, name_of
 
-ELSEWHERE = ("README.md", "docs/deployment.md", "docs/gymnasium.md")
+ELSEWHERE = ("README.md", *(f"docs/{page}.md" for page in ("deployment", "functional", "gymnasium", "sweeps")))
 
 PYTHON = [page for page in PAGES if name_of(page) not in ELSEWHERE and blocks_of(page, "python")]
 

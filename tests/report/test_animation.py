@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from edqn_jax.cli import main, record
+from edqn_jax.cli import arguments, main, record
 from edqn_jax.config import WorldConfig
 from edqn_jax.config.loading import to_yaml
 from edqn_jax.errors import ConfigError
@@ -35,7 +35,7 @@ class Drawn:
 
     def shown(self, params: object, flown: dict[str, np.ndarray]) -> Shown:
         counts = np.random.default_rng(0).integers(-3, 4, (len(flown["t"]) // 13, 24, 32))
-        return Shown(counts, counts, counts)
+        return Shown(counts, counts, counts, counts)
 
 
 def a_flight(decisions: float) -> dict[str, np.ndarray]:
@@ -130,7 +130,7 @@ def test_a_run_is_recorded_where_its_last_flight_was(flown, asked, world, tmp_pa
 @pytest.mark.parametrize(
     ("file", "says"),
     [
-        ("flight.mp4", "must end in .gif"),
+        ("flight.avi", "must end in .gif or .mp4"),
         ("missing/flight.gif", "cannot be written: there is no folder"),
     ],
 )
@@ -139,6 +139,12 @@ def test_a_file_that_cannot_be_written_is_refused_at_once(file, says, run, tmp_p
     error = capsys.readouterr().err
     assert says in error and error.count("\n") == 1
     assert list(tmp_path.iterdir()) == []
+
+
+def test_an_mp4_without_its_package_is_refused_at_once(run, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(arguments.importlib.util, "find_spec", lambda name: None)
+    assert main(["record", str(run), str(tmp_path / "flight.mp4")]) == 2
+    assert "run pip install 'edqn-jax[video]'" in capsys.readouterr().err
 
 
 def test_a_folder_without_a_run_is_refused(tmp_path, capsys):

@@ -1,0 +1,62 @@
+"""`edqn completion`: what a shell needs to complete commands, options and their values."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+from pathlib import Path
+from typing import Literal
+
+import tyro
+
+from edqn_jax.cli.arguments import (
+    SHORT_NAMES,
+    CompletionArgs,
+    EvaluateArgs,
+    EventsArgs,
+    ExportArgs,
+    RecordArgs,
+    ReportArgs,
+    TrainOptions,
+    VerifyArgs,
+)
+from edqn_jax.cli.help import all_of_train, described
+from edqn_jax.config.loading import make_config
+from edqn_jax.config.options import FAMILIES
+
+WORLDS = Literal[("paper", *FAMILIES)]  # pyright: ignore[reportInvalidTypeForm]
+"""Worlds that have a name; others are files."""
+
+FILES_TOO = {
+    "bash": {
+        "complete -F": "complete -o bashdefault -o default -F",
+        'COMPREPLY=("${matches[@]}")': '[[ -n "$completions" ]] && COMPREPLY=("${matches[@]}")',
+    },
+    "zsh": {"  _describe ": '  [[ -n "$completions" ]] || { _files; return; }\n  _describe '},
+    "fish": {"complete --no-files": "complete"},
+}
+"""What is replaced in tyro's scripts so that a shell offers files, such as runs and worlds, where nothing else fits."""
+
+
+def completion_script(shell: Literal["bash", "zsh", "fish"]) -> str:
+    """Returns the script that completes `edqn` in a shell."""
+    worlds = {"world.name": WORLDS, "world.flown": WORLDS}
+    train = all_of_train(TrainOptions(), make_config(), SHORT_NAMES, worlds)
+    somewhere = Path()
+    commands = {
+        "train": train,
+        "evaluate": described(EvaluateArgs, EvaluateArgs(somewhere, "paper"), kinds={"world": WORLDS}),
+        "record": described(RecordArgs, RecordArgs(somewhere, somewhere, world="paper"), kinds={"world": WORLDS}),
+        "report": described(ReportArgs),
+        "verify": described(VerifyArgs),
+        "export": described(ExportArgs),
+        "events": described(EventsArgs),
+        "completion": described(CompletionArgs),
+    }
+    written = io.StringIO()
+    with contextlib.redirect_stdout(written), contextlib.suppress(SystemExit):
+        tyro.extras.subcommand_cli_from_dict(commands, prog="edqn", args=["--tyro-print-completion", shell])
+    script = written.getvalue()
+    for found, better in FILES_TOO[shell].items():
+        script = script.replace(found, better)
+    return script

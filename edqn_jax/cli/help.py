@@ -1,0 +1,203 @@
+"""Help texts: what a command does, an example of it, and its options from the same dataclasses that parse them."""
+
+from __future__ import annotations
+
+import dataclasses
+import re
+import sys
+import typing
+from collections.abc import Mapping, Sequence
+from typing import Annotated, Any, NoReturn
+
+import docstring_parser
+import tyro
+
+from edqn_jax.config import Config
+
+TRAIN, EVALUATE, RECORD, REPORT = "edqn train", "edqn evaluate", "edqn record", "edqn report"
+VERIFY, EXPORT, EVENTS, COMPLETION = "edqn verify", "edqn export", "edqn events", "edqn completion"
+
+ABOUT = {
+    "edqn": """Train drones to fly through unknown obstacles from the events of a simulated camera, and fly them.
+
+The options of a command: `edqn COMMAND --help`. The versions of packages: `edqn --version`.
+
+Examples:
+  edqn train                                 train in random worlds for some minutes; files under runs/
+  edqn evaluate pretrained --world mine.xml  fly the policy that comes with the package
+  edqn record pretrained flight.gif          see it fly
+  edqn report runs/DIR                       see a whole run in a browser""",
+    TRAIN: """Train a drone to fly from events, evaluate it and draw figures.
+
+Examples:
+  edqn train                                       medium random worlds, then the paper's map, unseen
+  edqn train --world mine.xml --run-dir runs/mine  your own world; the same command continues the run
+  edqn train --preset paper --world paper          Table 1 of the paper""",
+    EVALUATE: """Fly a saved policy greedily on missions in any world and print metrics.
+
+Examples:
+  edqn evaluate pretrained --world dense --missions 100
+  edqn evaluate runs/DIR --world mine.xml --start 2 2 3 --goal 40 30 6 --json figures.json""",
+    RECORD: """Fly a saved run once and write the flight as a GIF or MP4, or the events of a camera that watches it.
+
+Examples:
+  edqn record runs/DIR flight.gif
+  edqn record pretrained flight.mp4 --world dense --seed 3
+  edqn record pretrained events.h5 --size 640 480""",
+    REPORT: """Write one HTML file with runs' flights in 3D, what the drone saw, curves, figures and options.
+
+Examples:
+  edqn report runs/DIR
+  edqn report runs/ONE runs/ANOTHER --out both.html""",
+    VERIFY: """Verify a finished run: derive its summary anew, fly its flights again, have C MuJoCo judge them.
+
+Example:
+  edqn verify runs/DIR --json findings.json""",
+    EXPORT: """Write a policy as ONNX, for a computer without JAX, and beside it the runner that flies it; compare both.
+
+Example:
+  edqn export pretrained --out policy.onnx""",
+    EVENTS: """Say what a file of events holds; see it as a policy does; write it in another form.
+
+Examples:
+  edqn events recording.h5
+  edqn events recording.raw --policy pretrained --picture seen.png
+  edqn events recording.aedat4 --start 2 --stop 4 --out part.npz""",
+    COMPLETION: """Print a script that completes commands, options and their values in a shell.
+
+Examples:
+  eval "$(edqn completion bash)"        in ~/.bashrc
+  edqn completion zsh > ~/.zfunc/_edqn  a folder of $fpath, before compinit
+  edqn completion fish > ~/.config/fish/completions/edqn.fish""",
+}
+"""What each command does, with examples."""
+
+COMMON = {
+    "world.name": "where to train: paper, an MJCF file, or random worlds: sparse, medium, dense, open, rooms, forest, "
+    "canyon, mixed",
+    "world.flown": "world of the last flight of a run in random worlds",
+    "run_dir": "folder of the run (default: a new, dated one under runs/)",
+    "resume": "what to do with a run in --run-dir",
+    "config": "YAML file of options by group; flags override it",
+    "preset": "the best agent that we know, or Table 1 of the paper",
+    "tuned_for": "hardware that defaults are chosen for",
+    "seeds": "policies to train side by side, of the seeds from --seed on",
+    "track": "also write the metrics for tensorboard, wandb or both (extra `track`)",
+    "view": "also write metrics and flights for rerun, and show them (extra `viz`)",
+    "train.seed": "random seed",
+    "train.total_steps": "decisions in all, of 0.26 s each",
+    "train.num_envs": "parallel environments",
+    "train.devices": "devices to use; 0: as many as fit",
+    "env.sensor": "what the drone observes",
+    "env.speed_m_s": "commanded speed per axis, m/s",
+    "env.max_decisions": "limit of an episode, decisions",
+    "drone.physics": "MJX, or its equations in closed form, faster",
+    "camera.width": "pixels across",
+    "camera.height": "pixels down",
+    "events.threshold": "change of log-brightness that makes an event",
+    "agent.learning_rate": "Adam step size at the start",
+    "agent.batch_size": "replayed samples per update",
+    "agent.discount": "gamma, per decision",
+}
+"""Options that `edqn train --help` shows, with what it says of them; `--help-all` has their whole texts."""
+
+METAVARS = {int: "N", float: "X", str: "WORLD", "track": "WHICH [WHICH]", "view": "WHICH"}
+"""What stands for a value of a type, or of one option, in the short help."""
+
+
+def show_train_help(options: Any, config: Config, short_names: Mapping[str, str], *, everything: bool) -> NoReturn:
+    """Prints the help of `edqn train` and exits.
+
+    Args:
+        options: instance of the options that stand in no group.
+        config: whose values are shown as defaults.
+        short_names: short flags, and the long ones that they stand for.
+        everything: all options by group instead of `COMMON`.
+    """
+    if everything:
+        show(all_of_train(options, config, short_names), TRAIN, ABOUT[TRAIN])
+    short = {long: short for short, long in short_names.items()}
+    fields = []
+    for name, text in COMMON.items():
+        group, _, option = name.rpartition(".")
+        owner = getattr(config, group) if group else options
+        flag = flag_of(name)
+        kind = typing.get_type_hints(type(owner), include_extras=True)[option]
+        metavar = METAVARS.get(name, METAVARS.get(kind))
+        if typing.get_origin(kind) is typing.Literal:
+            metavar, text = "WHICH", f"{text}: {', '.join(typing.get_args(kind))}"
+        said = Annotated[kind, tyro.conf.arg(name=short.get(flag, flag)[2:], metavar=metavar, help=text)]
+        fields.append((name.replace(".", "_"), said, dataclasses.field(default=getattr(owner, option))))
+    groups = [options, *(getattr(config, group.name) for group in dataclasses.fields(Config))]
+    count = sum(len(dataclasses.fields(group)) for group in groups)
+    does, _, examples = ABOUT[TRAIN].partition("\n\n")
+    about = (
+        f"{does}\n\nThese options are the ones that people use; `{TRAIN} --help-all` shows all {count}.\n\n{examples}"
+    )
+    show(dataclasses.make_dataclass("Train", fields), TRAIN, about)
+
+
+def all_of_train(
+    options: Any, config: Config, short_names: Mapping[str, str], kinds: Mapping[str, Any] | None = None
+) -> type:
+    """Returns a dataclass of all options of `edqn train`, by group; arguments as in `show_train_help`.
+
+    Args:
+        kinds: types that options have instead of their own, by group and name.
+    """
+    groups = [_nested("options", described(type(options), options), "")]
+    for group in dataclasses.fields(Config):
+        value = getattr(config, group.name)
+        kind = described(type(value), value, f"{group.name}.", short_names, kinds)
+        groups.append(_nested(group.name, kind, group.name))
+    return dataclasses.make_dataclass("Train", groups)
+
+
+def show(kind: type, command: str, about: str) -> NoReturn:
+    """Prints the help of a dataclass of options and exits."""
+    tyro.cli(kind, args=["--help"], prog=command, description=about)
+    sys.exit(0)
+
+
+def described(
+    kind: type,
+    instance: Any = None,
+    group: str = "",
+    short_names: Mapping[str, str] | None = None,
+    kinds: Mapping[str, Any] | None = None,
+) -> type:
+    """Returns a dataclass with the fields of another one, each with its whole help text in flowing lines.
+
+    Args:
+        kind: a dataclass with a string below each field.
+        instance: whose values are the defaults; None takes those of the class.
+        group: of the options, with a dot at its end.
+        short_names: short flags, which become second names of the long ones that they stand for.
+        kinds: types that options have instead of their own, by group and name.
+    """
+    short = {long: short for short, long in (short_names or {}).items()}
+    hints = typing.get_type_hints(kind, include_extras=True)
+    texts = {text.arg_name: text.description or "" for text in docstring_parser.parse_from_object(kind).params}
+    fields = []
+    for option in dataclasses.fields(kind):
+        name = f"{group}{option.name}"
+        alias = short.get(flag_of(name))
+        said = tyro.conf.arg(help=re.sub(r"\s+", " ", texts[option.name]), aliases=[alias] if alias else None)
+        default = option.default if instance is None else getattr(instance, option.name)
+        hint = (kinds or {}).get(name, hints[option.name])
+        fields.append((option.name, Annotated[hint, said], dataclasses.field(default=default)))
+    return dataclasses.make_dataclass(kind.__name__, fields, namespace={"__doc__": kind.__doc__})
+
+
+def _nested(name: str, kind: type, shown: str) -> tuple[str, Any, Any]:
+    return name, Annotated[kind, tyro.conf.arg(name=shown)], dataclasses.field(default_factory=kind)
+
+
+def flag_of(name: str) -> str:
+    """Returns the flag of an option's name."""
+    return f"--{name.replace('_', '-')}"
+
+
+def asks_for_help(argv: Sequence[str]) -> bool:
+    """Returns whether the words of a command ask for its help."""
+    return any(word in ("-h", "--help") for word in argv)

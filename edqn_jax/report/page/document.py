@@ -1,0 +1,175 @@
+"""The page as one HTML file: what is text is written here, what moves is drawn by `page.js` from the data."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from html import escape
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+from edqn_jax.errors import ConfigError
+from edqn_jax.evaluation.metrics import clearance_text, summarise
+from edqn_jax.report.page.contents import RUN_COLOURS, add_pictures, page_data, script_text
+from edqn_jax.report.page.flown import FlownRun, fly_run, folders_of, names_of
+from edqn_jax.report.style import OUTCOME_LABELS
+
+MOST_BYTES = 15_000_000
+"""Size of the page at most."""
+MOST_FLIGHTS = 256
+"""Flights of all runs of a page together at most."""
+
+_LIBRARIES = ("three.min.js", "uPlot.iife.min.js")
+
+
+def report(folders: Sequence[Path], most: int, message: Callable[[str], None] = lambda _: None) -> str:
+    """Returns the page of runs, their evaluation missions flown anew.
+
+    Args:
+        folders: of the runs; those of several seeds stand for each seed's.
+        most: flights of a run at most.
+        message: told of what takes time.
+
+    Raises:
+        ConfigError: if a folder holds no run, or the runs are too many for one page.
+    """
+    single = list(dict.fromkeys(each for folder in folders for each in folders_of(folder)))
+    if len(single) > MOST_FLIGHTS:
+        raise ConfigError(f"{len(single)} runs are too many for one page; give at most {MOST_FLIGHTS}")
+    most = min(most, MOST_FLIGHTS // len(single))
+    runs = [fly_run(folder, name, most, message) for folder, name in zip(single, names_of(single), strict=True)]
+    data = page_data(runs)
+    left = MOST_BYTES - len(document(runs, data).encode()) - 100_000
+    if left < 0:
+        raise ConfigError(f"the page would have more than {MOST_BYTES / 1e6:g} MB; give fewer runs, or --missions")
+    add_pictures(data, runs, left - 200 * sum(len(run["flights"]) for run in data["runs"]), message)
+    return document(runs, data)
+
+
+def document(runs: Sequence[FlownRun], data: dict[str, Any]) -> str:
+    """Returns the HTML; everything that comes from a file is escaped."""
+    title = runs[0].name if len(runs) == 1 else f"{len(runs)} runs"
+    parts = {
+        "title": escape(title),
+        "made": escape(f"edqn_jax {data['version']}, {data['made']}"),
+        "notes": "".join(
+            f"<p class='note'>{_tag(run, number, runs)} {escape(note)}</p>"
+            for number, run in enumerate(runs)
+            for note in run.notes
+        ),
+        "comparison": comparison(runs),
+        "options": options(runs),
+        "style": _asset("vendored/uPlot.min.css") + _asset("page.css"),
+        "libraries": "".join(f"<script>{_asset(f'vendored/{name}')}</script>" for name in _LIBRARIES),
+        "data": script_text(data),
+        "script": _asset("page.js"),
+    }
+    # One pass over the template: what is filled in is not searched for places again.
+    pieces = _asset("page.html").split("{{")
+    return pieces[0] + "".join(parts[name] + rest for name, _, rest in (piece.partition("}}") for piece in pieces[1:]))
+
+
+def comparison(runs: Sequence[FlownRun]) -> str:
+    """Returns the table of the runs' figures: a row a figure, a column a run."""
+    columns = [figures(run) for run in runs]
+    head = "".join(f"<th>{_tag(run, number, runs, always=True)}</th>" for number, run in enumerate(runs))
+    rows = "".join(
+        f"<tr><th>{escape(name)}</th>" + "".join(f"<td>{escape(column[name])}</td>" for column in columns) + "</tr>"
+        for name in columns[0]
+    )
+    return f"<table><thead><tr><th></th>{head}</tr></thead><tbody>{rows}</tbody></table>"
+
+
+def figures(run: FlownRun) -> dict[str, str]:
+    """Returns what a run is compared by, as text; a dash where it is not known."""
+    summary, flown = run.summary, summarise(run.flights)
+    low, high = flown["interval"]
+
+    def of(name: str, form: str) -> str:
+        value = summary.get(name)
+        return form.format(value) if isinstance(value, int | float) else "–"
+
+    outcome = run.outcomes[0]
+    shortest = summary.get("shortest_path_m")
+    first = f"{OUTCOME_LABELS[outcome]}, {float(run.flights.flight_seconds[0]):.1f} s"
+    path = f"{float(run.flights.path_length_m[0]):.1f} m"
+    if isinstance(shortest, int | float):
+        path += f" (shortest {shortest:.1f} m)"
+    # No-break spaces before the percent signs.
+    share = f"{100 * flown['success_rate']:.1f}\u00a0%; 95\u00a0% Wilson {100 * low:.0f} to {100 * high:.0f}\u00a0%"
+    return {
+        "trained in": Path(run.config.world.name).name,
+        "sensor": run.config.env.sensor,
+        "seed": str(run.config.train.seed),
+        "flights on this page": f"{flown['missions']} in {Path(run.missions.name).name}"
+        + (f", first in {Path(run.config.world.flown).name}" if run.config.world.flown else ""),
+        "reached the goal": f"{flown['successes']} ({share})",
+        "collisions": str(flown["collisions"]),
+        "time-outs": str(flown["timeouts"]),
+        "left the volume": str(flown["left_volume"]),
+        "mean return": f"{flown['return']:.1f}",
+        "mean flight time of successes": "–" if flown["flight_seconds"] is None else f"{flown['flight_seconds']:.1f} s",
+        "least clearance of successes": clearance_text(flown["min_clearance_m"]),
+        "first flight": first,
+        "its path": path,
+        "training decisions": of("train_decisions", "{:,}"),
+        "training time": of("train_seconds", "{:.0f} s"),
+        "decisions per second": of("decisions_per_second", "{:,.0f}"),
+        "processor": str(summary.get("processor") or "–"),
+        "state": "finished" if summary else "not finished, or a policy by itself",
+    }
+
+
+def options(runs: Sequence[FlownRun]) -> str:
+    """Returns the runs' options and versions; of several runs, first what differs between them."""
+    parts = [_differences(runs)] if len(runs) > 1 else []
+    for number, run in enumerate(runs):
+        versions = run.summary.get("versions")
+        found = versions if isinstance(versions, dict) else {}
+        said = ", ".join(f"{name} {version}" for name, version in found.items()) or "versions are not recorded"
+        parts.append(
+            f"<details><summary>{_tag(run, number, runs, always=True)}: all options</summary>"
+            f"<p>{escape(said)}</p><pre>{escape(run.config_text)}</pre></details>"
+        )
+    return "".join(parts)
+
+
+def _differences(runs: Sequence[FlownRun]) -> str:
+    """Returns a table of the options in which the runs differ."""
+    columns = [_lines(run) for run in runs]
+    differ = [name for name in columns[0] if len({column.get(name) for column in columns}) > 1]
+    if not differ:
+        return "<p>All options are the same.</p>"
+    head = "".join(f"<th>{_tag(run, number, runs)}</th>" for number, run in enumerate(runs))
+    rows = "".join(
+        f"<tr><th>{escape(name)}</th>"
+        + "".join(f"<td>{escape(column.get(name, '–'))}</td>" for column in columns)
+        + "</tr>"
+        for name in differ
+    )
+    return (
+        "<p>Options that differ:</p><div class='wide'><table>"
+        f"<thead><tr><th></th>{head}</tr></thead><tbody>{rows}</tbody></table></div>"
+    )
+
+
+def _lines(run: FlownRun) -> dict[str, str]:
+    """Returns the options of a run as text, by their names with their groups."""
+    return {
+        f"{group}.{name}": str(value)
+        for group, options in dataclasses.asdict(run.config).items()
+        for name, value in options.items()
+    }
+
+
+def _tag(run: FlownRun, number: int, runs: Sequence[FlownRun], *, always: bool = False) -> str:
+    """Returns a run's name behind a dot of its colour; nothing of a single run unless `always`."""
+    if len(runs) == 1 and not always:
+        return ""
+    colour = RUN_COLOURS[number % len(RUN_COLOURS)]
+    return f"<span class='tag'><i style='background:{colour}'></i>{escape(run.name)}</span>"
+
+
+def _asset(name: str) -> str:
+    return resources.files("edqn_jax.report.page").joinpath(name).read_text(encoding="utf-8")

@@ -1,0 +1,77 @@
+"""What the drone saw at every decision of a flight, as PNGs with a frame below the other."""
+
+from __future__ import annotations
+
+import base64
+import io
+from collections.abc import Mapping
+from typing import Any
+
+import matplotlib
+import numpy as np
+from matplotlib.colors import Colormap, Normalize
+from PIL import Image
+
+from edqn_jax.learn import embedding
+from edqn_jax.learn.policy import PolicyParams
+from edqn_jax.report.images import LOOKS, RECONSTRUCTED_EVENTS, scale_of
+from edqn_jax.report.sights import Sights
+from edqn_jax.sim.camera import on_screen
+
+LEVELS = 64
+"""Colours of a picture; more make the file larger and no better to look at."""
+
+NEARNESS_COLOURS = "inferno"
+"""Bright is near, black far away."""
+
+
+def flight_pictures(sights: Sights, params: PolicyParams, flown: Mapping[str, np.ndarray]) -> dict[str, Any]:
+    """Returns the pictures of a flight as plain JSON data, one frame for each whole decision.
+
+    `width`, `height` of a frame, the number of `frames`, and of each of the `panels` its `name` and `png`, base64:
+    brightness, what the sensor shows, what the decoder draws from the code, and what it should have drawn.
+
+    Args:
+        sights: of the world of the flight; its sensor shows an image.
+        params: of the policy that flew.
+        flown: the columns of `trajectory.csv`.
+    """
+    config = sights.config
+    shown, look = sights.shown(params, flown), LOOKS[config.env.sensor]
+    nearness = embedding.needs_nearness(config)
+    drawn = LOOKS["depth"] if nearness else RECONSTRUCTED_EVENTS if look.signed else look
+    colours = NEARNESS_COLOURS if nearness else drawn.colours
+    # Quiet moments are to be seen, too.
+    scale = Normalize(0.0, max(float(np.quantile(shown.target, 0.999)), 1e-6)) if drawn.signed is False else None
+    scale = scale or scale_of(shown.target, drawn)
+    panels = [
+        ("brightness", on_screen(shown.luma), Normalize(0.0, 1.0), "gray"),
+        (look.name, shown.image, scale_of(shown.image, look, share=0.75), look.colours),
+        (
+            f"predicted {drawn.name}" if nearness else f"{drawn.name}, from the code",
+            shown.reconstruction,
+            scale,
+            colours,
+        ),
+        (f"true {drawn.name}" if nearness else f"{drawn.name}, blurred", shown.target, scale, colours),
+    ]
+    count, height, width = shown.image.shape
+    return {
+        "width": width,
+        "height": height,
+        "frames": count,
+        "panels": [{"name": name, "png": strip(images, norm, colour)} for name, images, norm, colour in panels],
+    }
+
+
+def strip(images: np.ndarray, norm: Normalize, colours: str | Colormap) -> str:
+    """Returns images [D, H, W] as one PNG [D H, W] in colours, base64."""
+    colour_map = matplotlib.colormaps[colours] if isinstance(colours, str) else colours
+    levels = np.asarray(np.clip(norm(np.asarray(images, np.float64)), 0, 1)) * (LEVELS - 1)
+    picture = Image.fromarray(levels.round().astype(np.uint8).reshape(-1, images.shape[-1]), mode="L")
+    picture = Image.frombytes("P", picture.size, picture.tobytes())
+    palette = np.round(255 * colour_map(np.linspace(0, 1, LEVELS))[:, :3]).astype(np.uint8)
+    picture.putpalette(palette.tobytes())
+    file = io.BytesIO()
+    picture.save(file, format="PNG", optimize=True)
+    return base64.b64encode(file.getvalue()).decode("ascii")

@@ -1,0 +1,39 @@
+"""The check of a release sees what is missing and what should not be there."""
+
+from __future__ import annotations
+
+import runpy
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+CHECK = runpy.run_path(str(ROOT / "scripts" / "check_release.py"))
+WANTED = CHECK["expected"](ROOT)
+WHEEL = {*WANTED, "edqn_jax-0.1.0.dist-info/METADATA", "edqn_jax-0.1.0.dist-info/licenses/LICENSE"}
+
+
+@pytest.mark.parametrize(
+    "name",
+    [
+        "edqn_jax/scenes/paper.xml",
+        "edqn_jax/sim/skydio_x2.xml",
+        "edqn_jax/py.typed",
+        "edqn_jax/policies/pretrained/config.yaml",
+        "edqn_jax-0.1.0.dist-info/licenses/LICENSE",
+    ],
+)
+def test_a_wheel_that_lacks_a_file_is_refused(name: str) -> None:
+    CHECK["check_wheel"](WHEEL, WANTED)
+    with pytest.raises(CHECK["ReleaseError"], match=f"the wheel lacks .*{Path(name).name}"):
+        CHECK["check_wheel"](WHEEL - {name}, WANTED)
+
+
+def test_a_wheel_with_tests_is_refused() -> None:
+    with pytest.raises(CHECK["ReleaseError"], match="should not hold tests/test_api.py"):
+        CHECK["check_wheel"](WHEEL | {"tests/test_api.py"}, WANTED)
+
+
+def test_a_version_that_the_changelog_does_not_know_is_no_release() -> None:
+    with pytest.raises(CHECK["ReleaseError"], match=r"no section \[99.0.0\]"):
+        CHECK["check_changelog"](ROOT, "99.0.0")
