@@ -16,7 +16,7 @@ release = version = metadata.version("edqn-jax")
 html_title = f"{project} {release}"
 
 extensions = [
-    "myst_parser",
+    "myst_nb",
     "sphinx.ext.autodoc",
     "sphinx.ext.autosummary",
     "sphinx.ext.mathjax",
@@ -25,6 +25,7 @@ extensions = [
     "sphinx_copybutton",
     "sphinxcontrib.mermaid",
     "extensions.pages",
+    "extensions.notebooks",
     "extensions.docstrings",
     "extensions.fields",
 ]
@@ -35,6 +36,8 @@ templates_path = ["_templates"]
 myst_enable_extensions = ["dollarmath"]
 myst_fence_as_directive = ["math", "mermaid"]
 myst_heading_anchors = 4
+nb_execution_mode = "off"
+nb_merge_streams = True
 
 # A name in single backticks leads to its documentation where it has some, and is code where not.
 default_role = "py:obj"

@@ -12,6 +12,8 @@ from pathlib import Path
 
 from sphinx.application import Sphinx
 
+from extensions.notebooks import SHOWN
+
 ELSEWHERE = {
     "CONTRIBUTING.md": "contributing",
     "CHANGELOG.md": "changelog",
@@ -42,6 +44,8 @@ def linked(text: str, folder: str) -> str:
         if path.startswith("edqn_jax/") and path.endswith(".py"):
             module = path.removesuffix(".py").removesuffix("/__init__").replace("/", ".")
             return "#" + ".".join([module, *fragment.split("#")[1:]])
+        if path.startswith("notebooks/") and path.endswith(".ipynb"):
+            return f"/{path}{fragment}"
         if path.startswith("docs/"):
             # Of a folder GitHub shows its README.
             page = path if posixpath.splitext(path)[1] else f"{path}/README.md"
@@ -54,9 +58,12 @@ def linked(text: str, folder: str) -> str:
 def read_page(app: Sphinx, page: str, source: list[str]) -> None:
     """Changes the text of a page after it was read from its file."""
     file = Path(app.env.doc2path(page))
+    root = Path(app.srcdir).parent
+    if file.suffix == ".ipynb":
+        source[0] = linked(source[0], SHOWN)
+        return
     if file.suffix != ".md":
         return
-    root = Path(app.srcdir).parent
     for path, name in ELSEWHERE.items():
         if page == name:
             app.env.note_dependency(root / path)
