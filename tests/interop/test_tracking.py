@@ -95,6 +95,8 @@ def contents(log: bytes) -> Iterator[bytes]:
             place += block - place % block
             continue
         size, kind = struct.unpack_from("<HB", log, place + 4)
+        if place + 7 + size > len(log):  # still being written
+            return
         parts += log[place + 7 : place + 7 + size]
         place += 7 + size
         if kind in (1, 4):  # whole, or the last part
