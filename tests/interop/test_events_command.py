@@ -153,7 +153,8 @@ def test_a_damaged_file_and_a_missing_one_are_named(tmp_path, capsys):
 
 def test_a_size_is_only_for_events(tmp_path, capsys):
     assert "only for files of events" in refused(capsys, "record", "pretrained", "a.gif", "--size", 8, 6)
-    assert "must end in .gif for an animation" in refused(capsys, "record", "pretrained", tmp_path / "a.mp4")
+    assert "only for files of events" in refused(capsys, "record", "pretrained", "a.mp4", "--size", 8, 6)
+    assert "must end in .gif or .mp4 for a video" in refused(capsys, "record", "pretrained", tmp_path / "a.avi")
 
 
 def test_export_writes_a_policy_and_its_runner(tmp_path, capsys):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib.util
 import json
 import struct
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
@@ -94,11 +95,24 @@ def contents(log: bytes) -> Iterator[bytes]:
             place += block - place % block
             continue
         size, kind = struct.unpack_from("<HB", log, place + 4)
+        if place + 7 + size > len(log):  # still being written
+            return
         parts += log[place + 7 : place + 7 + size]
         place += 7 + size
         if kind in (1, 4):  # whole, or the last part
             yield parts
             parts = b""
+
+
+def whole_log(file: Path) -> list[Any]:
+    """Returns the records of a `.wandb` file once it has the last, which its own process may write after `finish`."""
+    record = require("wandb.proto.wandb_internal_pb2", "track").Record
+    until = time.monotonic() + 60.0
+    while True:
+        rows = [record.FromString(content) for content in contents(file.read_bytes())]
+        if (rows and rows[-1].WhichOneof("record_type") == "exit") or time.monotonic() > until:
+            return rows
+        time.sleep(0.1)
 
 
 def test_wandb_keeps_every_value_in_an_offline_run(tmp_path: Path) -> None:
@@ -108,10 +122,8 @@ def test_wandb_keeps_every_value_in_an_offline_run(tmp_path: Path) -> None:
     sink.close()
     (file,) = sink.folder.glob("*.wandb")
     assert sink.folder.name.startswith("offline-run-") and sink.folder.parent == tmp_path / "wandb"
-    record = require("wandb.proto.wandb_internal_pb2", "track").Record
     found = {}
-    for content in contents(file.read_bytes()):
-        row = record.FromString(content)
+    for row in whole_log(file):
         if row.WhichOneof("record_type") == "history":
             values = {item.key or item.nested_key[0]: json.loads(item.value_json) for item in row.history.item}
             found[values["_step"]] = values["mean_return"]
