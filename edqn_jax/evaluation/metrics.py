@@ -41,7 +41,7 @@ def spl(success: np.ndarray, flown: np.ndarray, shortest: np.ndarray) -> float:
 
 
 def known_lengths(shortest: np.ndarray, flown: np.ndarray) -> np.ndarray:
-    """Returns lengths [M] of shortest paths, where unknown those flown, which have a weight of 1 in the SPL."""
+    """Returns lengths [M] of shortest paths, metres, where unknown those flown, which have a weight of 1 in the SPL."""
     return np.where(np.isfinite(shortest), shortest, flown)
 
 

@@ -150,6 +150,6 @@ def _counts_alone(config: EncoderConfig, field: EventField) -> bool:
 
 
 def target_of(config: EncoderConfig, observation: Observation, nearness: Array | None) -> Target:
-    """Returns what the decoder must draw of observations, see `vae.target`."""
+    """Returns what the decoder must draw of observations, without a unit, see `vae.target`."""
     assert isinstance(observation.sensed, EventField | Array)
     return vae.in_waves(config, vae.target(config, observation.sensed, nearness))

@@ -159,7 +159,7 @@ Touches = Callable[[np.ndarray, np.ndarray], bool]
 
 
 def shorten(points: np.ndarray, touches: Touches) -> np.ndarray:
-    """Shortens a path [K, 3] by line of sight and by cutting corners until a round gains less than 1 cm."""
+    """Shortens a path [K, 3], metres, by line of sight and by cutting corners until a round gains less than 1 cm."""
     points = _skip_ahead(points, touches)
     while True:
         tighter = _skip_ahead(_cut_corners(points, touches), touches)

@@ -69,7 +69,7 @@ def reachable(scene: Scene, radius: float, cell: float | None = None) -> Reachab
 
 
 def holds(found: Reachable, point: np.ndarray | Array) -> bool:
-    """Returns whether there is a way from the cell that a point [3] is in."""
+    """Returns whether there is a way from the cell that a point [3], metres, is in."""
     at = np.round((np.asarray(point) - found.corner) / found.edge_m).astype(int)
     return bool(np.all((at >= 0) & (at < found.is_way.shape))) and bool(found.is_way[tuple(at)])
 

@@ -101,13 +101,13 @@ class Lattice:
         self.distance[:] = self.distances(self.middle(np.arange(self.distance.size)))
 
     def compute_distances(self, cells: np.ndarray) -> None:
-        """Computes the distances of those of the cells [E], by flat index, that are not known yet."""
+        """Computes the distances, metres, of those of the cells [E], by flat index, that are not known yet."""
         unknown = np.unique(cells[np.isnan(self.distance[cells])])
         if unknown.size:
             self.distance[unknown] = self.distances(self.middle(unknown))
 
     def passable(self, origins: np.ndarray, cells: np.ndarray, lengths: np.ndarray) -> np.ndarray:
-        """Returns whether the sphere fits at `cells` [E] and passes from `origins` [E] to them, [E] bool."""
+        """Returns whether the sphere fits at `cells` [E] and passes from `origins` [E], `lengths` [E] metres off, [E] bool."""
         self.compute_distances(cells)
         passable = self.distance[cells] >= self.radius
         # The distance changes by at most one metre per metre, which proves most edges free.

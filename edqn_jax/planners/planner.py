@@ -165,7 +165,7 @@ def path_length(points: np.ndarray) -> float:
 
 
 def point_text(point: np.ndarray) -> str:
-    """Returns a point [3] as text, "(x, y, z)"."""
+    """Returns a point [3], metres, as text: "(x, y, z)"."""
     return "(" + ", ".join(f"{value:g}" for value in point) + ")"
 
 

@@ -179,7 +179,7 @@ def _shift(field: Array, step: np.ndarray) -> Array:
 
 
 def cells_at(scene: Scene, network: Synapses, point: Array, radius: ArrayLike, cell: float = 1.0) -> Array:
-    """Returns [X, Y, Z] bool: the cells around a point [3], at most 8, to which the sphere passes straight from it."""
+    """Returns [X, Y, Z] bool: the cells, at most 8, to which the sphere passes straight from a point [3], metres."""
     base = jnp.floor((point - network.middles[0, 0, 0]) / cell).astype(jnp.int32)
     corners = jnp.clip(base[None] + _CORNERS, 0, np.array([network.free.shape]) - 1)
     x, y, z = corners.T

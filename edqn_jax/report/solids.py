@@ -189,7 +189,7 @@ def draw_shadows(axes: Axes, view: View, solids: Sequence[Solid], floor: np.ndar
 
 
 def hidden(points: np.ndarray, solids: Sequence[Solid], view: View) -> np.ndarray:
-    """Returns which of the points [P, 3] a solid hides from the eye, [P] bool: rays clipped by each convex body."""
+    """Returns which of the points [P, 3], metres, a solid hides from the eye, [P] bool: clips rays by convex bodies."""
     covered = np.zeros(len(points), bool)
     for solid in solids:
         normals = solid.outward

@@ -108,7 +108,7 @@ def luma(config: CameraConfig, scene: Scene, position: Array, rotation: Array) -
 
 
 def rgb(config: CameraConfig, scene: Scene, position: Array, rotation: Array) -> Array:
-    """Returns linear RGB of the scene: [H, W, 3] in [0, 1]; `luma` is its weighted sum in Eq. 1."""
+    """Returns linear RGB seen from `position` [3], metres: [H, W, 3] in [0, 1]; `luma` is its weighted sum in Eq. 1."""
     channels = jax.vmap(lambda weights: _picture(config, scene, position, rotation, weights))(jnp.eye(3))
     return jnp.moveaxis(channels, 0, -1)
 

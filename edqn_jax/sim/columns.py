@@ -81,7 +81,7 @@ Branch = Callable[[CameraConfig, Finish, Array], Array]
 def picture(
     config: CameraConfig, finish: Finish, scene: Scene, origin: Array, rotation: Array, weights: Array
 ) -> Array:
-    """Returns one frame, [H, W], of a scene from origin [3] and rotation [3, 3] under weights [3] of RGB.
+    """Returns one frame, [H, W], of a scene from origin [3], metres, and rotation [3, 3] under weights [3] of RGB.
 
     However it is mapped, all frames end up in one batch: only together can their columns be sorted.
 
@@ -123,9 +123,9 @@ def _pictures(
 def draw_branches(
     config: CameraConfig, scene: Scene, origin: Array, rotation: Array, weights: Array
 ) -> tuple[list[Branch], Array]:
-    """Returns the branches, ordered by capacity, and the index of the first that suffices for each column: [Q].
+    """Returns the branches, ordered by capacity, and [Q] the index of the first that suffices for each column.
 
-    Every array has a leading [M].
+    Every array has a leading [M]; origins are in metres.
     """
     frames, tables = materialised(jax.vmap(partial(_frame, config))(scene, origin, rotation, weights))
     words = jax.vmap(partial(_presence, config))(tables)

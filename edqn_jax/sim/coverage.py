@@ -301,7 +301,7 @@ def _insert_side(config: CameraConfig, layers: Layers, column: Array) -> Layers:
 
 
 def spheres_in_columns(config: CameraConfig, spheres: Spheres, origin: Array, heading: Array) -> Array:
-    """Returns whether any sphere may be visible in each column: [C] bool."""
+    """Returns [C] bool: whether any sphere may be visible in each column, from `origin` [3], metres."""
     # A silhouette fades over half a pixel on either side.
     left, right = _extent_of_discs(spheres.position, spheres.radius, origin, heading)
     u, pitch = columns_of(config)[None], pitch_of(config)

@@ -37,7 +37,7 @@ class _Intervals:
 
 
 def nearest_depth(config: CameraConfig, scene: Scene, origin: Array, rays: Rays) -> Array:
-    """Returns the depth of the nearest surface along each ray: [R, C], inf where there is none."""
+    """Returns the depth of the nearest surface along each ray: [R, C] metres, inf where there is none."""
     shape = jnp.broadcast_shapes(rays.dx.shape, rays.dz.shape)
     nearest = jnp.full(shape, jnp.inf)
     value = raycast.albedo_values(scene, jnp.ones(3))

@@ -202,7 +202,7 @@ def observe(
     memory: EventMemory | None,
     key: Array,
 ) -> tuple[Observation, EventMemory | None]:
-    """Returns what the sensor shows now, the own state [OWN_SIZE] and the own motion [MOTION_SIZE].
+    """Returns what the sensor shows on the way to `goal` [3], metres, own state [OWN_SIZE] and motion [MOTION_SIZE].
 
     Args:
         move: as in `own_motion`.
@@ -214,7 +214,7 @@ def observe(
 
 
 def nearness(config: Config, world: World, state: EnvState) -> Array:
-    """Returns what the sensor `depth` would show of an environment now, [H, W].
+    """Returns what the sensor `depth` would show of an environment now: [H, W], without a unit.
 
     A label for training: no observation holds it.
     """

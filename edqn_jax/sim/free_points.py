@@ -74,7 +74,7 @@ def far_apart(scene: Scene, draw: Array) -> tuple[Array, Array]:
 
 
 def far_from(scene: Scene, draw: Array, point: Array) -> Array:
-    """Returns a free point [3] as far from `point` [3] as a start is from its goal, from uniform draws [K, 3]."""
+    """Returns a free point [3], metres, as far from `point` as a start is from its goal, from uniform draws [K, 3]."""
     distance = jnp.minimum(FAR, (scene.volume[1, 0] - scene.volume[0, 0]) / 2)
     return first_free(scene, scatter(scene, draw, _ALTITUDES), CLEARANCE, point, distance)
 
@@ -124,7 +124,7 @@ def in_cells(cells: Cells, draw: Array) -> Array:
 
 
 def is_in(cells: Cells, point: Array) -> Array:
-    """Returns whether a point [3] lies in one of the cells."""
+    """Returns whether a point [3], metres, lies in one of the cells."""
     at = jnp.round((point - cells.corner) / cells.edge_m).astype(jnp.int32)
     inside = jnp.all((at >= 0) & (at < jnp.array(cells.is_one.shape)))
     x, y, z = jnp.clip(at, 0, jnp.array(cells.is_one.shape) - 1)
@@ -134,7 +134,7 @@ def is_in(cells: Cells, point: Array) -> Array:
 def first_free(
     scene: Scene, points: Array, clearance: float, away_from: Array | None = None, distance: ArrayLike = 0.0
 ) -> Array:
-    """Returns the first of `points` [K, 3] that meets the conditions, or the one that violates them least."""
+    """Returns the first of `points` [K, 3], metres, that meets the conditions, or the one that violates them least."""
     short = jnp.minimum(jax.vmap(partial(signed_distance, scene))(points) - clearance, 0.0)
     if away_from is not None:
         apart = jnp.sqrt(jnp.sum((points - away_from[None]) ** 2, axis=1))

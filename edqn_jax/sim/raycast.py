@@ -280,7 +280,7 @@ def _tube_surfaces(
 
 
 def plane_surfaces(config: CameraConfig, scene: Scene, origin: Array, rays: Rays, value: Values) -> Surfaces:
-    """Returns surfaces of half-spaces, visible from their free side."""
+    """Returns surfaces of half-spaces, visible from their free side, seen from `origin` [3], metres."""
     planes, rays = scene.planes, for_shapes(rays)
     nx, ny, nz = (per_shape(planes.normal[:, i]) for i in range(3))
     height = per_shape(jnp.sum((origin[None] - planes.position) * planes.normal, axis=-1))
@@ -291,7 +291,7 @@ def plane_surfaces(config: CameraConfig, scene: Scene, origin: Array, rays: Rays
 
 
 def upright_surfaces(config: CameraConfig, scene: Scene, origin: Array, rays: Rays, value: Values) -> list[Surfaces]:
-    """Returns surfaces of upright boxes and cylinders, without kinds of capacity 0."""
+    """Returns surfaces of upright boxes and cylinders, seen from `origin` [3], metres, without kinds of capacity 0."""
     found, rays = [], for_shapes(rays)
     if scene.boxes.yaw.shape[0]:
         found.append(_upright_box_surfaces(config, origin, rays, scene, value))
@@ -310,9 +310,9 @@ def upright_surfaces(config: CameraConfig, scene: Scene, origin: Array, rays: Ra
 
 
 def other_surfaces(config: CameraConfig, scene: Scene, origin: Array, rays: Rays, value: Values) -> list[Surfaces]:
-    """Returns surfaces of tilted boxes, tilted cylinders and capsules, without kinds of capacity 0.
+    """Returns surfaces of tilted boxes, tilted cylinders and capsules, seen from `origin` [3], metres.
 
-    A capsule is one surface: the nearest of its side and its two half spheres.
+    Kinds of capacity 0 have none. A capsule is one surface: the nearest of its side and its two half spheres.
     """
     found, rays = [], for_shapes(rays)
     if scene.tilted_boxes.half.shape[0]:
@@ -332,7 +332,7 @@ def other_surfaces(config: CameraConfig, scene: Scene, origin: Array, rays: Rays
 
 
 def sphere_surfaces(config: CameraConfig, scene: Scene, origin: Array, rays: Rays, value: Values) -> list[Surfaces]:
-    """Returns surfaces of spheres; an empty list when the capacity is 0."""
+    """Returns surfaces of spheres, seen from `origin` [3], metres; an empty list when the capacity is 0."""
     spheres = scene.spheres
     if not spheres.radius.shape[0]:
         return []

@@ -137,7 +137,7 @@ def frames_per_decision(config: Config) -> int:
 
 
 def view(config: Config, scene: Scene, position: Array, quaternion: Array) -> Array:
-    """Returns the luma frame [H, W] of the camera on a body at `position` [3] with attitude `quaternion` [4]."""
+    """Returns the camera's luma frame [H, W] on a body at `position` [3], metres, with attitude `quaternion` [4]."""
     return camera.luma(config.camera, scene, position, mount_rotation(config, quaternion))
 
 
@@ -230,7 +230,7 @@ def _show_depth(
 
 
 def nearness_image(config: Config, scene: Scene, position: Array, quaternion: Array) -> Array:
-    """Returns what `depth` shows [H, W] from a body at `position` [3] with attitude `quaternion` [4]."""
+    """Returns what `depth` shows [H, W] from a body at `position` [3], metres, with attitude `quaternion` [4]."""
     metres = camera.depth(config.camera, scene, position, mount_rotation(config, quaternion))
     return DEPTH_SCALE * nearness(metres)
 

@@ -3,7 +3,8 @@
 The rule, by the source alone. Public is each function, method and class of a public module of the package whose
 name has no leading underscore. One *has arrays* if an annotation of its arguments or its result is `Array`,
 `ArrayLike` or an array of NumPy; an argument that is a random key does not count. It *names a shape* if its docstring
-has one in brackets: `[]`, `[3]`, `[..., H, W]`. Examples in docstrings are run.
+has one in brackets: `[]`, `[3]`, `[..., H, W]`. It *has quantities* if an array among its arguments is named after one,
+such as a position or a time, and *names a unit* if its docstring has one. Examples in docstrings are run.
 """
 
 from __future__ import annotations
@@ -22,6 +23,17 @@ PACKAGE = Path(__file__).parents[2] / "edqn_jax"
 ARRAY = re.compile(r"\b(Array|ArrayLike|NDArray|ndarray)\b(?!\])")
 
 SHAPE = re.compile(r"\[[^\]\n]*\]")
+
+QUANTITY = re.compile(
+    r"(position|velocity|speed|distance|clearance|depth|nearness|time|angle|yaw|heading|rate|torque|thrust|start|goal|point"
+    r"|origin|radius|height|length|path|seconds|acceleration|displacement|offset)s?$"
+)
+"""Ends of names of arguments that have a unit, or need the word that they have none."""
+
+UNIT = re.compile(
+    r"\b(metres?|m|m/s|m/s²|s|(milli|micro|nano)?seconds?|ms|rad|radians?|rad/s|degrees?|Hz|newtons?|N m|kg|bytes"
+    r"|pixels?|decisions?|steps|units?)\b"
+)
 
 LEAST = 0.95
 """Share that the project asks for."""
@@ -47,13 +59,13 @@ def everything() -> list[tuple[str, Public]]:
     return found
 
 
-def has_arrays(node: Public) -> bool:
+def arrays_of(node: Public) -> list[str]:
+    """Returns the names of the arguments that are arrays, and `return` if the result is one."""
     if not isinstance(node, ast.FunctionDef):
-        return False
-    arguments = [a for a in (*node.args.args, *node.args.kwonlyargs) if a.annotation and "key" not in a.arg]
-    annotations = [ast.unparse(a.annotation) for a in arguments if a.annotation]
-    annotations += [ast.unparse(node.returns)] if node.returns else []
-    return any(ARRAY.search(text) for text in annotations)
+        return []
+    arguments = [(a.arg, a.annotation) for a in (*node.args.args, *node.args.kwonlyargs) if "key" not in a.arg]
+    named = [*arguments, ("return", node.returns)]
+    return [name for name, annotation in named if annotation is not None and ARRAY.search(ast.unparse(annotation))]
 
 
 def test_public_names_have_docstrings() -> None:
@@ -63,10 +75,21 @@ def test_public_names_have_docstrings() -> None:
 
 
 def test_functions_of_arrays_name_their_shapes() -> None:
-    of_arrays = [(name, ast.get_docstring(node) or "") for name, node in everything() if has_arrays(node)]
+    of_arrays = [(name, ast.get_docstring(node) or "") for name, node in everything() if arrays_of(node)]
     without = [name for name, text in of_arrays if not SHAPE.search(text)]
     assert len(of_arrays) > 200
     assert len(without) <= (1 - LEAST) * len(of_arrays), (len(without), len(of_arrays), without)
+
+
+def test_functions_of_quantities_name_their_units() -> None:
+    of_quantities = [
+        (name, ast.get_docstring(node) or "")
+        for name, node in everything()
+        if any(QUANTITY.search(argument) for argument in arrays_of(node))
+    ]
+    without = [name for name, text in of_quantities if not UNIT.search(text)]
+    assert len(of_quantities) > 60
+    assert len(without) <= (1 - LEAST) * len(of_quantities), (len(without), len(of_quantities), without)
 
 
 WITH_EXAMPLES = [file for file in sorted(PACKAGE.rglob("*.py")) if ">>> " in file.read_text(encoding="utf-8")]
