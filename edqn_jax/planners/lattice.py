@@ -107,7 +107,7 @@ class Lattice:
             self.distance[unknown] = self.distances(self.middle(unknown))
 
     def passable(self, origins: np.ndarray, cells: np.ndarray, lengths: np.ndarray) -> np.ndarray:
-        """Returns whether the sphere fits at `cells` [E] and passes from `origins` [E], `lengths` [E] metres off, [E] bool."""
+        """Returns [E] bool: the sphere fits at `cells` [E] and passes from `origins` [E], `lengths` [E] metres off."""
         self.compute_distances(cells)
         passable = self.distance[cells] >= self.radius
         # The distance changes by at most one metre per metre, which proves most edges free.
