@@ -20,8 +20,8 @@ def export_command(args: ExportArgs) -> None:
     ties = f", {exported.ties} of them ties" if exported.ties else ""
     Console().print(
         f"'{exported.file}' has {exported.file.stat().st_size / 1e6:.1f} MB; on {exported.checks:,} random inputs it "
-        f"chooses JAX's moves{ties}, and no value differs by more than {exported.largest_difference:.1e}; "
-        f"'{exported.runner}' flies it with NumPy and onnxruntime",
+        f"chooses JAX's moves{ties}, and no value differs by more than {exported.largest_difference:.1e} of the "
+        f"largest; '{exported.runner}' flies it with NumPy and onnxruntime",
         soft_wrap=True,
         markup=False,
         highlight=False,

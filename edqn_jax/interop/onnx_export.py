@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import logging
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -35,8 +36,11 @@ INPUTS, OUTPUTS = ("counts", "own", "motion", "memory"), ("values", "memory_afte
 OPSET, IR_VERSION = 18, 8
 """The oldest that this network can be written in, so that older versions of onnxruntime read it."""
 
-TOLERANCE = 1e-5
-"""Largest difference between a value of the Q-network in JAX and in ONNX, of the largest value where that exceeds 1."""
+TOLERANCE = 2e-5
+"""Largest difference between a value of the Q-network in JAX and in ONNX, of the largest value where that exceeds 1.
+
+Both round float32 sums of 1,024 products in orders of their own: 0.9e-5 for the largest networks on one CPU.
+"""
 
 CHECKS = 1000
 """Random inputs that are compared before a policy is written."""
@@ -51,7 +55,7 @@ class Exported:
     checks: int
     """Random inputs that were compared."""
     largest_difference: float
-    """Of any value of the Q-network."""
+    """Of any value of the Q-network, as a share of the input's largest value where that exceeds 1."""
     ties: int
     """Inputs whose best moves are equally good within the tolerance, so that either may be chosen."""
 
@@ -78,6 +82,8 @@ def export_policy(flown: Policy, file: str | Path, *, checks: int = CHECKS, dige
     beside = file.with_name(RUNNER)
     for each in (file, beside):
         check_can_write(each)
+    # Some of its plugins do not load with every JAX, which it says at length; where one is needed, the export fails.
+    logging.getLogger("jax2onnx").setLevel(logging.ERROR)
     jax2onnx = require("jax2onnx", extra="export")
     require("onnxruntime", extra="export")
     about = about_policy(flown.config)
@@ -239,7 +245,7 @@ def _random_inputs(config: Config, rng: np.random.Generator) -> list[np.ndarray]
 
 
 def _compared(config: Config, decide: Callable[..., Any], model: bytes, checks: int) -> tuple[float, int]:
-    """Returns the largest difference of any value, and how many best moves are ties.
+    """Returns the largest difference of any value, as a share of its input's largest, and how many best moves are ties.
 
     Raises:
         CheckError: if a value or a move differs.
@@ -249,12 +255,14 @@ def _compared(config: Config, decide: Callable[..., Any], model: bytes, checks: 
     options.intra_op_num_threads = 1
     session = onnxruntime.InferenceSession(model, options, ["CPUExecutionProvider"])
     rng, largest, ties = np.random.default_rng(0), 0.0, 0
-    for number in range(checks):
-        given = _random_inputs(config, rng)
-        wanted, remembered = (np.asarray(each) for each in decide(*given))
+    inputs = [_random_inputs(config, rng) for _ in range(checks)]
+    # In one batch, as drones are flown: the sums of single decisions are rounded twice as much on a CPU.
+    in_jax = [np.asarray(each) for each in decide(*map(np.concatenate, zip(*inputs, strict=True)))]
+    for number, given in enumerate(inputs):
+        wanted, remembered = (each[number : number + 1] for each in in_jax)
         values, memory = session.run(list(OUTPUTS), dict(zip(INPUTS, given, strict=True)))
-        most = TOLERANCE * max(1.0, float(np.abs(wanted).max()))
-        difference = float(np.abs(values - wanted).max())
+        scale = max(1.0, float(np.abs(wanted).max()))
+        most, difference = TOLERANCE * scale, float(np.abs(values - wanted).max())
         recalled = float(np.abs(memory - remembered).max())
         if not (difference <= most and recalled <= TOLERANCE * max(1.0, float(np.abs(remembered).max()))):
             raise CheckError(
@@ -266,5 +274,5 @@ def _compared(config: Config, decide: Callable[..., Any], model: bytes, checks: 
         ties += bool(tie)
         if not tie and values.argmax() != wanted.argmax():
             raise CheckError(f"ONNX and JAX choose different moves at random input {number}; nothing was written")
-        largest = max(largest, difference)
+        largest = max(largest, difference / scale)
     return largest, ties

@@ -268,7 +268,9 @@ def test_the_file_says_what_the_policy_expects(exported):
     config = pretrained().config
     assert (about["width"], about["height"], about["history"]) == (32, 24, config.agent.history)
     assert about["frame_times_us"] == [-80_000, 0] and about["contrast_on"] == config.events.tolerance
-    assert about["checked"]["inputs"] == 1000 and about["checked"]["largest_difference"] <= 2e-5
+    assert (
+        about["checked"]["inputs"] == 1000 and about["checked"]["largest_difference"] <= 2e-5
+    )  # on any CPU; 0.9e-5 on some
     assert len(about["actions"]) == len(about["action_names"]) == 27 and about["action_names"][13] == "hover"
 
 
