@@ -81,8 +81,8 @@ if __name__ == "__main__":
         noted["environments"] = sum(part.data.size for part in parts)
         return state
 
-    def noting_run(*arguments: Any) -> dict[str, Any]:
-        noted["summary"] = train_run(*arguments)
+    def noting_run(*arguments: Any, **options: Any) -> dict[str, Any]:
+        noted["summary"] = train_run(*arguments, **options)
         return noted["summary"]
 
     devices.cores, camera.luma = lambda: int(count), waves
