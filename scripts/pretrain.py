@@ -2,10 +2,11 @@
 
     python scripts/pretrain.py --run runs/pretrained --out edqn_jax/policies/pretrained
 
-Training needs a GPU (in open worlds eight minutes on an H100, four of them training); where --run holds the seeds
-already, the best is only measured, which takes a quarter of an hour on two cores for three families, most of it A* for
-the SPL. The best seed is the one with the highest success in the validation worlds, SPL among equals; nothing that is
-measured afterwards has a say in it.
+Training needs a GPU: for `mixed` worlds 24 minutes on two H100, 16 of them training (`train.py ... --train.devices 2`,
+with the options that this script has), for `open` ones eight on one. Where --run holds the seeds already, the best is
+only measured, which takes half an hour on one core for six families, most of it A* for the SPL. The best seed is the
+one with the highest success in the validation worlds, SPL among equals; nothing that is measured afterwards has a say
+in it.
 """
 
 from __future__ import annotations
@@ -76,8 +77,8 @@ The paper's own map, never trained on: {paper}
 - The best of {seeds} training seeds, of which {arrived} reach the goal of the paper's map.
 - Simulated events from rendered brightness: no noise, no lens, uniform thresholds, static worlds, no wind. It has not
   been flown on a real drone, and must not be.
-- The map's bounds matter: the own position is given relative to the flight volume, and worlds of other sizes than
-  110 x 110 x 25 m have not been measured.
+- The map's bounds matter: the own position is given relative to the flight volume, and only worlds of these families' sizes have been measured:
+  110 x 110 x 25 m open ones, 36 to 60 m across closed ones.
 - It collides with obstacles in full view and with ones just outside of the camera's view:
   `benchmarks/failures.py pretrained --world medium` lists them.
 """

@@ -35,7 +35,7 @@ from edqn_jax.config.loading import resolve
 from edqn_jax.errors import ConfigError
 from edqn_jax.parallel.hardware import hardware
 from edqn_jax.parallel.launch import Distributed
-from edqn_jax.policies import policy_folder
+from edqn_jax.policies import no_run, policy_folder
 from edqn_jax.runs.continuation import begun, continued
 from edqn_jax.runs.directory import Resume
 
@@ -176,7 +176,7 @@ class ExportArgs:
     out: Annotated[Path, arg(metavar="FILE.onnx")]
     """File to write; it replaces one of that name."""
     checks: Annotated[int, arg(metavar="N")] = 1000
-    """Random inputs on which ONNX and JAX must choose the same moves, with values that are equal to 1e-5."""
+    """Random inputs on which ONNX and JAX must choose the same moves, and values agree to 2e-5 of the largest."""
 
 
 @dataclass(frozen=True)
@@ -403,7 +403,7 @@ def parse_verify(argv: Sequence[str]) -> VerifyArgs:
     """
     args = _parsed(VerifyArgs, argv, VERIFY)
     if not (args.run / "config.yaml").is_file():
-        raise ConfigError(f"there is no run in '{args.run}': it holds no config.yaml")
+        raise no_run(args.run)
     return args
 
 
@@ -450,6 +450,8 @@ def parse_events(argv: Sequence[str]) -> EventsArgs:
         SystemExit: after printing, for --help and for what does not parse.
     """
     args = _parsed(EventsArgs, argv, EVENTS)
+    if args.file.is_dir():
+        raise ConfigError(f"'{args.file}' is a folder; give a file of events")
     if not args.file.is_file():
         raise ConfigError(f"there is no file '{args.file}'")
     for name, number in (("--contrast", args.contrast), ("--window", args.window)):
@@ -476,4 +478,4 @@ def parse_completion(argv: Sequence[str]) -> CompletionArgs:
 
 def _check_run(folder: Path) -> None:
     if not (policy_folder(folder) / "config.yaml").is_file():
-        raise ConfigError(f"there is no run in '{folder}': it holds no config.yaml")
+        raise no_run(folder)

@@ -30,7 +30,9 @@ def read_npz(file: Path, size: tuple[int, int] | None, time_unit: TimeUnit | Non
         # np.load leaves a file open that it cannot read.
         with file.open("rb") as content, np.load(content, allow_pickle=False) as opened:
             held = {key: opened[key] for key in opened.files}
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile, zlib.error) as error:
+    except ValueError:  # NumPy's own words advise to load pickled data, which this never does
+        raise ConfigError(f"'{file}' is damaged, or no .npz file of plain arrays") from None
+    except (OSError, EOFError, zipfile.BadZipFile, zlib.error) as error:
         raise ConfigError(f"'{file}' is damaged, or no .npz file: {error}") from None
     columns = _columns(file, held)
     if size is None and "width" in held and "height" in held:

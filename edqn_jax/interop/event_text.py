@@ -64,7 +64,11 @@ def read_text(
         try:
             held = np.loadtxt(io.StringIO(plain), dtype=[(name, np.float64) for name in order], ndmin=1)
         except ValueError as error:
-            raise ConfigError(f"'{file}' is damaged: a line must hold {', '.join(order)}: {error}") from None
+            where = re.search(r"row (\d+)", str(error))
+            line = "" if where is None else f", which row {where[1]} does not"
+            raise ConfigError(
+                f"'{file}' is damaged: each line must hold {len(order)} numbers, {', '.join(order)}{line}"
+            ) from None
     says = None if unit is None or time_unit is not None else f"{unit}, as the first line says"
     events: Any = held
     return recording_of(

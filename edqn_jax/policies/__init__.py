@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import difflib
 from pathlib import Path
 
+from edqn_jax.errors import ConfigError
+
 PRETRAINED = "pretrained"
-"""Name of the policy for open random worlds."""
+"""Name of the policy for random worlds, open and closed ones."""
 
 
 def policy_folder(run: Path) -> Path:
@@ -14,3 +17,13 @@ def policy_folder(run: Path) -> Path:
     A folder of that name in the current one takes precedence.
     """
     return Path(__file__).parent / PRETRAINED if str(run) == PRETRAINED and not run.is_dir() else run
+
+
+def no_run(folder: Path) -> ConfigError:
+    """Returns the error of a folder that holds no run, or of one that is not there."""
+    if folder.is_dir():
+        return ConfigError(f"there is no run in '{folder}': it holds no config.yaml")
+    near = difflib.get_close_matches(str(folder), [PRETRAINED])
+    return ConfigError(
+        f"there is no run in '{folder}': " + (f"did you mean '{near[0]}'?" if near else "no such folder")
+    )

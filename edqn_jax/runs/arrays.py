@@ -20,6 +20,9 @@ from edqn_jax.errors import ConfigError
 from edqn_jax.runs import manifest
 from edqn_jax.runs.files import unwritable, write_atomically
 
+COMMITTED = "commit_success.txt"
+"""File by which Orbax marks a folder as complete."""
+
 _SPARE = 10_000_000
 """Bytes that stay free on the disk, beside what a folder takes."""
 
@@ -48,6 +51,10 @@ def write(
             _alone()[1].save(folder, args=ocp.args.PyTreeSave(tree))
         for name, text in (texts or {}).items():
             write_atomically(folder / name, text)
+        if (written := folder / COMMITTED).is_file():
+            written.write_text(
+                "complete\n", encoding="utf-8"
+            )  # Orbax names the whole path in it, which is nobody's business
         manifest.seal(folder, dict(facts or {}))
     except ConfigError:
         clear(folder)

@@ -13,7 +13,7 @@ from edqn_jax.config.limits import validate
 from edqn_jax.config.loading import apply, load_layer
 from edqn_jax.errors import ConfigError
 from edqn_jax.learn.policy import Policy, PolicyParams, fresh_policy
-from edqn_jax.policies import policy_folder
+from edqn_jax.policies import no_run, policy_folder
 from edqn_jax.runs import manifest, world_copy
 from edqn_jax.runs.checkpoints import load_params, save_params, saved_at
 from edqn_jax.runs.directory import SEED_FOLDER, config_text, version_of
@@ -58,7 +58,7 @@ def load_run(folder: Path) -> tuple[Config, PolicyParams]:
     folder = policy_folder(folder)
     file = folder / "config.yaml"
     if not file.is_file():
-        raise ConfigError(f"there is no run in '{folder}': it holds no config.yaml")
+        raise no_run(folder)
     seeds = sorted(folder.glob(f"{SEED_FOLDER}*/"))
     if seeds:
         raise ConfigError(f"'{folder}' holds the runs of {len(seeds)} seeds; name one of them, such as '{seeds[0]}'")

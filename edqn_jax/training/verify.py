@@ -28,6 +28,7 @@ from edqn_jax.learn.policy import PolicyParams
 from edqn_jax.learn.trainer import Trainer
 from edqn_jax.parallel.devices import processor
 from edqn_jax.planners.astar import shortest_path
+from edqn_jax.policies import no_run
 from edqn_jax.runs import states
 from edqn_jax.runs.continuation import begun
 from edqn_jax.runs.directory import RunDirectory
@@ -83,7 +84,7 @@ def verify(folder: Path, message: Callable[[str], None] = lambda _: None) -> lis
 def _verified(folder: Path, message: Callable[[str], None]) -> list[Finding]:
     found = begun(folder)
     if found is None:
-        raise ConfigError(f"there is no run in '{folder}': it holds no config.yaml")
+        raise no_run(folder)
     run = RunDirectory(folder)
     runs = [run] if found.seeds is None else [run.of_seed(found.config.train.seed + k) for k in range(found.seeds)]
     policies = [load_run(each.path) for each in runs]

@@ -94,4 +94,4 @@ def test_the_table_counts_what_rows_have_in_common() -> None:
 
 def test_a_run_that_is_none_is_a_sentence(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert failures.main([str(tmp_path)]) == 2
-    assert "holds no config.yaml" in capsys.readouterr().err
+    assert "there is no run in" in capsys.readouterr().err

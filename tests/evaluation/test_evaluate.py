@@ -110,7 +110,7 @@ def test_a_run_is_its_configuration_and_its_policy(run):
 
 
 def test_no_run_an_empty_one_and_one_that_does_not_fit_are_sentences(tmp_path, run):
-    with pytest.raises(ConfigError, match="it holds no config.yaml"):
+    with pytest.raises(ConfigError, match="there is no run in"):
         load_run(tmp_path)
     (tmp_path / "config.yaml").write_text(to_yaml(Config()))
     with pytest.raises(ConfigError, match="there is no policy"):

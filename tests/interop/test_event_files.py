@@ -178,7 +178,7 @@ def test_an_index_that_is_not_that_of_the_times_is_refused(tmp_path):
         ("a.raw", b"% evt 2.1\n% end\n" + bytes(8), "is EVT 2.1; EVT 2.0 and 3.0 are read"),
         ("a.raw", b"% evt 3.0\n% end\n" + bytes(8), "does not say how large the image is; give --size W H"),
         ("a.bag", b"", "is of no kind that is read"),
-        ("a.txt", b"1 2 3\n", "a line must hold t, x, y, p"),
+        ("a.txt", b"1 2 3\n", "each line must hold 4 numbers, t, x, y, p"),
         ("a.txt", b"# t x y p\n", "holds no events"),
     ],
 )
