@@ -77,8 +77,8 @@ The paper's own map, never trained on: {paper}
 - The best of {seeds} training seeds, of which {arrived} reach the goal of the paper's map.
 - Simulated events from rendered brightness: no noise, no lens, uniform thresholds, static worlds, no wind. It has not
   been flown on a real drone, and must not be.
-- The map's bounds matter: the own position is given relative to the flight volume, and only worlds of these families' sizes have been measured:
-  110 x 110 x 25 m open ones, 36 to 60 m across closed ones.
+- The map's bounds matter: the own position is given relative to the flight volume, and only worlds of these
+  families' sizes have been measured: 110 x 110 x 25 m open ones, 36 to 60 m across closed ones.
 - It collides with obstacles in full view and with ones just outside of the camera's view:
   `benchmarks/failures.py pretrained --world medium` lists them.
 """
