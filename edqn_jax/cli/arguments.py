@@ -386,8 +386,10 @@ def parse_record(argv: Sequence[str]) -> RecordArgs:
     suffix = args.file.suffix.lower()
     if suffix not in VIDEO + EVENT_FILES:
         raise ConfigError(f"'{args.file}' must end in .gif or .mp4 for a video, or in .h5, .npz or .txt for events")
-    if args.size is not None and (suffix in VIDEO or min(args.size) < 1):
-        raise ConfigError("--size must be two whole numbers of at least 1, and is only for files of events")
+    if args.size is not None and suffix in VIDEO:
+        raise ConfigError(f"--size is only for files of events, and '{args.file}' is a video")
+    if args.size is not None and min(args.size) < 1:
+        raise ConfigError(f"--size must be two whole numbers of at least 1, not {args.size[0]} {args.size[1]}")
     if suffix == ".mp4" and importlib.util.find_spec("imageio_ffmpeg") is None:
         raise ConfigError("an .mp4 needs imageio_ffmpeg; run pip install 'edqn-jax[video]', or write a .gif")
     _check_run(args.run)

@@ -15,6 +15,7 @@ from jax import Array, lax
 from jax.typing import ArrayLike
 
 from edqn_jax.config import FAMILIES, MIXTURES
+from edqn_jax.config.loading import nearest
 from edqn_jax.errors import ConfigError
 from edqn_jax.random import integers
 from edqn_jax.sim import canyon, forest, open_worlds, rooms
@@ -100,7 +101,7 @@ def random_pool(family: str, keys: Array) -> Scene:
 
 def _check(family: str) -> None:
     if family not in FAMILIES:
-        raise ConfigError(f"there are no random worlds '{family}'; there are {', '.join(FAMILIES)}")
+        raise ConfigError(f"there are no random worlds '{family}'{nearest(family, FAMILIES)}")
 
 
 def families_of(mixture: str, keys: Array) -> list[str]:

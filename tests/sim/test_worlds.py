@@ -194,9 +194,11 @@ def test_a_world_without_a_way_is_drawn_again(monkeypatch):
     assert 0 < np.isclose(half, first).all(axis=1).sum() < 8
 
 
-def test_an_unknown_family_names_those_there_are():
-    with pytest.raises(ConfigError, match="'thick'; there are sparse, medium, .*, canyon, open, mixed"):
-        random_scene("thick", world_key("test", 0))
+def test_an_unknown_family_names_the_nearest_or_those_there_are():
+    with pytest.raises(ConfigError, match="'forrest'; did you mean 'forest'"):
+        random_scene("forrest", world_key("test", 0))
+    with pytest.raises(ConfigError, match="'xyz'; known are sparse, medium, .*, canyon, open, mixed"):
+        random_scene("xyz", world_key("test", 0))
 
 
 @pytest.mark.slow
