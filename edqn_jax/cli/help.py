@@ -90,7 +90,7 @@ COMMON = {
     "train.devices": "devices to use; 0: as many as fit",
     "env.sensor": "what the drone observes",
     "env.speed_m_s": "commanded speed per axis, m/s",
-    "env.max_decisions": "limit of an episode, decisions",
+    "env.reward": "goal and collision alone (Eq. 8), or metres gained, too",
     "drone.physics": "MJX, or its equations in closed form, faster",
     "camera.width": "pixels across",
     "camera.height": "pixels down",
