@@ -22,7 +22,6 @@ from __future__ import annotations
 import argparse
 import contextlib
 import json
-import math
 import statistics
 import subprocess
 import sys
@@ -32,6 +31,7 @@ from pathlib import Path
 from typing import Any
 
 from edqn_jax.errors import ConfigError
+from edqn_jax.evaluation.intervals import median_interval
 from edqn_jax.runs.files import check_can_write
 from measurement import json_report
 from measurement.child import Child, ChildEndedError
@@ -174,20 +174,6 @@ def compared(name: str, first: Sequence[float], second: Sequence[float]) -> dict
         "turns_a": list(first),
         "turns_b": list(second),
     }
-
-
-def median_interval(values: Sequence[float]) -> tuple[float, float]:
-    """Returns a 95 % confidence interval for the median of the distribution that `values` were drawn from.
-
-    The interval is distribution-free: the median is below the k-th smallest of n values with the probability that
-    fewer than k of n tosses of a fair coin are heads. Fewer than six values cannot reach 95 %; the interval is then
-    their range.
-    """
-    ordered, count = sorted(values), len(values)
-    left_out = 0
-    while sum(math.comb(count, heads) for heads in range(left_out + 2)) <= 0.025 * 2**count:
-        left_out += 1
-    return ordered[left_out], ordered[-1 - left_out]
 
 
 def measure(

@@ -110,7 +110,7 @@ def _dispatch(argv: Sequence[str], stops: Stops) -> int:
     elif command in OF_A_RUN:
         _of_a_run(command, rest)
     elif command == "completion":
-        print(completion_script(parse_completion(rest).shell))
+        print(completion_script(parse_completion(rest).shell, COMMANDS))
     elif command == "--version":
         print(f"edqn-jax {edqn_jax.__version__}")
         for package in VERSIONS:

@@ -4,22 +4,13 @@ from __future__ import annotations
 
 import contextlib
 import io
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Literal
 
 import tyro
 
-from edqn_jax.cli.arguments import (
-    SHORT_NAMES,
-    CompletionArgs,
-    EvaluateArgs,
-    EventsArgs,
-    ExportArgs,
-    RecordArgs,
-    ReportArgs,
-    TrainOptions,
-    VerifyArgs,
-)
+from edqn_jax.cli.arguments import SHORT_NAMES, EvaluateArgs, RecordArgs, TrainOptions
 from edqn_jax.cli.help import all_of_train, described
 from edqn_jax.config.loading import make_config
 from edqn_jax.config.options import FAMILIES
@@ -38,21 +29,25 @@ FILES_TOO = {
 """What is replaced in tyro's scripts so that a shell offers files, such as runs and worlds, where nothing else fits."""
 
 
-def completion_script(shell: Literal["bash", "zsh", "fish"]) -> str:
-    """Returns the script that completes `edqn` in a shell."""
+def completion_script(shell: Literal["bash", "zsh", "fish"], kinds: Mapping[str, type]) -> str:
+    """Returns the script that completes `edqn` in a shell.
+
+    Args:
+        shell: for which.
+        kinds: the dataclass of each command's options.
+    """
     worlds = {"world.name": WORLDS, "world.flown": WORLDS}
-    train = all_of_train(TrainOptions(), make_config(), SHORT_NAMES, worlds)
     somewhere = Path()
-    commands = {
-        "train": train,
-        "evaluate": described(EvaluateArgs, EvaluateArgs(somewhere, "paper"), kinds={"world": WORLDS}),
-        "record": described(RecordArgs, RecordArgs(somewhere, somewhere, world="paper"), kinds={"world": WORLDS}),
-        "report": described(ReportArgs),
-        "verify": described(VerifyArgs),
-        "export": described(ExportArgs),
-        "events": described(EventsArgs),
-        "completion": described(CompletionArgs),
+    in_a_world = {
+        "evaluate": EvaluateArgs(somewhere, "paper"),
+        "record": RecordArgs(somewhere, somewhere, world="paper"),
     }
+    commands = {
+        name: described(kind, in_a_world.get(name), kinds={"world": WORLDS} if name in in_a_world else None)
+        for name, kind in kinds.items()
+        if name != "train"
+    }
+    commands = {"train": all_of_train(TrainOptions(), make_config(), SHORT_NAMES, worlds), **commands}
     written = io.StringIO()
     with contextlib.redirect_stdout(written), contextlib.suppress(SystemExit):
         tyro.extras.subcommand_cli_from_dict(commands, prog="edqn", args=["--tyro-print-completion", shell])

@@ -1,4 +1,4 @@
-"""95 % confidence intervals of success rates over seeds and missions.
+"""95 % confidence intervals: of success rates over seeds and missions, and of medians.
 
 The rate of a single seed or a single mission has Wilson's interval. If several seeds fly the same missions, the
 interval must hold for other seeds and other missions: a bootstrap draws seeds with replacement and missions with
@@ -8,6 +8,9 @@ all methods together.
 """
 
 from __future__ import annotations
+
+import math
+from collections.abc import Sequence
 
 import numpy as np
 from scipy.stats import trim_mean
@@ -55,6 +58,20 @@ def difference_interval(first: np.ndarray, second: np.ndarray) -> tuple[float, f
     )
     below, above = np.hypot(a - low_a, high_b - b), np.hypot(high_a - a, b - low_b)
     return float(a - b - below), float(a - b + above)
+
+
+def median_interval(values: Sequence[float]) -> tuple[float, float]:
+    """Returns a 95 % confidence interval for the median of the distribution that `values` were drawn from.
+
+    The interval is distribution-free: the median is below the k-th smallest of n values with the probability that
+    fewer than k of n tosses of a fair coin are heads. Fewer than six values cannot reach 95 %; the interval is then
+    their range.
+    """
+    ordered, count = sorted(values), len(values)
+    left_out = 0
+    while sum(math.comb(count, heads) for heads in range(left_out + 2)) <= 0.025 * 2**count:
+        left_out += 1
+    return ordered[left_out], ordered[-1 - left_out]
 
 
 def drawn_rates(strata: list[np.ndarray], draws: int = DRAWS, seed: int = 0) -> np.ndarray:

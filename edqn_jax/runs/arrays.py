@@ -52,7 +52,7 @@ def write(
         for name, text in (texts or {}).items():
             write_atomically(folder / name, text)
         if (written := folder / COMMITTED).is_file():
-            written.write_text("complete\n", encoding="utf-8")  # Orbax names the whole path in it,
+            written.write_text("complete\n", encoding="utf-8")  # Orbax names the whole path in it
         manifest.seal(folder, dict(facts or {}))
     except ConfigError:
         clear(folder)

@@ -180,6 +180,7 @@ def test_an_index_that_is_not_that_of_the_times_is_refused(tmp_path):
         ("a.bag", b"", "is of no kind that is read"),
         ("a.txt", b"1 2 3\n", "each line must hold 4 numbers, t, x, y, p"),
         ("a.txt", b"# t x y p\n", "holds no events"),
+        ("a.npz", b"no archive", "no .npz file of plain arrays"),
     ],
 )
 def test_what_cannot_be_read_says_what_can(tmp_path, name, content, says):

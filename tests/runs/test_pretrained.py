@@ -42,8 +42,17 @@ def test_its_card_tells_of_its_training() -> None:
         assert re.search(rf"^\| {family} \| 1000 \| (9\d|100)\.\d% \| ", card, re.MULTILINE), family
 
 
-def test_its_files_name_no_folder_of_the_computer_that_wrote_them() -> None:
-    assert not [file for file in FOLDER.rglob("*") if file.is_file() and b"policy.partial" in file.read_bytes()]
+def test_saved_files_name_no_folder_of_the_computer_that_wrote_them(tmp_path: Path) -> None:
+    edqn_jax.save_policy(edqn_jax.load_policy(PRETRAINED), tmp_path / "mine")
+    for folder, path in ((tmp_path, str(tmp_path).encode()), (FOLDER, b"policy.partial")):
+        assert not [file for file in folder.rglob("*") if file.is_file() and path in file.read_bytes()]
+
+
+def test_a_near_miss_of_its_name_is_answered_with_it(tmp_path: Path) -> None:
+    with pytest.raises(edqn_jax.ConfigError, match="no run in 'pretraind': did you mean 'pretrained'"):
+        edqn_jax.load_policy("pretraind")
+    with pytest.raises(edqn_jax.ConfigError, match="it holds no config.yaml"):
+        edqn_jax.load_policy(tmp_path)
 
 
 def test_its_script_trains_with_its_options(monkeypatch: pytest.MonkeyPatch) -> None:
