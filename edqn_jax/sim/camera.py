@@ -17,11 +17,12 @@ import numpy as np
 from jax import Array
 
 from edqn_jax.config import CameraConfig
-from edqn_jax.sim import columns, coverage, raycast
+from edqn_jax.sim import columns, coverage, native, raycast
 from edqn_jax.sim.columns import Frame
 from edqn_jax.sim.coverage import Layers
 from edqn_jax.sim.depth import nearest_depth
 from edqn_jax.sim.events import LUMA_WEIGHTS
+from edqn_jax.sim.picture_primitive import draw_in_one_batch
 from edqn_jax.sim.raycast import Rays, Values
 from edqn_jax.sim.scene import Scene
 from edqn_jax.sim.texture import texture
@@ -132,6 +133,24 @@ def on_screen(linear: Pixels) -> Pixels:
 
 def depth(config: CameraConfig, scene: Scene, position: Array, rotation: Array) -> Array:
     """Returns the distance along each pixel's central ray: [H, W] metres, inf where the ray meets nothing."""
+    nearest = draw_in_one_batch(
+        _depths, (config,), (scene, position, rotation), (config.height, config.width), on_cpu=_depths_on_cpu
+    )
     rays = raycast.camera_rays(config, rotation)
-    nearest = nearest_depth(config, scene, position, rays)
     return nearest * jnp.sqrt(rays.dx**2 + rays.dy**2 + rays.dz**2)
+
+
+def _depths(config: CameraConfig, scene: Scene, position: Array, rotation: Array) -> Array:
+    """Returns the depth [M, H, W] metres along the optical axis; every array has a leading [M]."""
+
+    def one(scene: Scene, position: Array, rotation: Array) -> Array:
+        return nearest_depth(config, scene, position, raycast.camera_rays(config, rotation))
+
+    return jax.vmap(one)(scene, position, rotation)
+
+
+def _depths_on_cpu(config: CameraConfig, scene: Scene, position: Array, rotation: Array) -> Array:
+    """Returns `_depths`, by the library in C where it is at hand."""
+    if native.can_draw(config, scene):
+        return native.depths(config, scene, position, rotation)
+    return _depths(config, scene, position, rotation)

@@ -23,7 +23,7 @@ from jax import Array, lax
 from jax.flatten_util import ravel_pytree
 
 from edqn_jax.config import CameraConfig
-from edqn_jax.sim import coverage, raycast
+from edqn_jax.sim import coverage, native, raycast
 from edqn_jax.sim.coverage import Layers
 from edqn_jax.sim.picture_primitive import draw_in_one_batch
 from edqn_jax.sim.raycast import Rays, Values
@@ -89,8 +89,21 @@ def picture(
         finish: a function of a module, see `draw_in_one_batch`.
     """
     return draw_in_one_batch(
-        _pictures, (config, finish), (scene, origin, rotation, weights), (config.height, config.width)
+        _pictures,
+        (config, finish),
+        (scene, origin, rotation, weights),
+        (config.height, config.width),
+        on_cpu=_pictures_on_cpu,
     )
+
+
+def _pictures_on_cpu(
+    config: CameraConfig, finish: Finish, scene: Scene, origin: Array, rotation: Array, weights: Array
+) -> Array:
+    """Returns `_pictures`, by the library in C where it is at hand."""
+    if native.can_draw(config, scene):
+        return native.pictures(config, scene, origin, rotation, weights)
+    return _pictures(config, finish, scene, origin, rotation, weights)
 
 
 def _pictures(

@@ -21,7 +21,11 @@ Static = tuple[Hashable, ...]
 
 
 def draw_in_one_batch(
-    draw: Callable[..., Array], static: Static, arguments: tuple[Any, ...], shape: tuple[int, int]
+    draw: Callable[..., Array],
+    static: Static,
+    arguments: tuple[Any, ...],
+    shape: tuple[int, int],
+    on_cpu: Callable[..., Array],
 ) -> Array:
     """Returns one picture, [H, W] float32; all pictures that it is mapped to are drawn by one call of `draw`.
 
@@ -31,17 +35,23 @@ def draw_in_one_batch(
         static: arguments that are known when tracing.
         arguments: pytrees of arrays, of one picture.
         shape: H, W.
+        on_cpu: what draws in place of `draw` where the program is compiled for CPUs.
     """
     leaves, tree = jax.tree.flatten(arguments)
-    return _pictures_p.bind(*(leaf[None] for leaf in leaves), draw=draw, static=static, tree=tree, shape=shape)[0]
+    parameters = {"draw": draw, "static": static, "tree": tree, "shape": shape, "on_cpu": on_cpu}
+    return _pictures_p.bind(*(leaf[None] for leaf in leaves), **parameters)[0]
 
 
 _pictures_p = Primitive("pictures")
 """Its operands are the leaves of the arguments, each with a leading [M]; its result is [M, H, W]."""
 
 
-def _draw(*leaves: Array, draw: Callable[..., Array], static: Static, tree: Any, shape: tuple[int, int]) -> Array:
+def _draw(*leaves: Array, draw: Callable[..., Array], static: Static, tree: Any, **_: Any) -> Array:
     return draw(*static, *jax.tree.unflatten(tree, leaves))
+
+
+def _draw_on_cpu(*leaves: Array, on_cpu: Callable[..., Array], **parameters: Any) -> Array:
+    return _draw(*leaves, **(parameters | {"draw": on_cpu}))
 
 
 def _abstract(*leaves: Any, shape: tuple[int, int], **_: Any) -> ShapedArray:
@@ -61,6 +71,7 @@ def _batch(leaves: Sequence[Array], axes: Sequence[int | None], **parameters: An
 
 
 _pictures_p.def_abstract_eval(_abstract)
-_pictures_p.def_impl(jax.jit(_draw, static_argnames=("draw", "static", "tree", "shape")))
+_pictures_p.def_impl(jax.jit(_pictures_p.bind, static_argnames=("draw", "static", "tree", "shape", "on_cpu")))
 batching.primitive_batchers[_pictures_p] = _batch
 mlir.register_lowering(_pictures_p, mlir.lower_fun(_draw, multiple_results=False))
+mlir.register_lowering(_pictures_p, mlir.lower_fun(_draw_on_cpu, multiple_results=False), platform="cpu")
