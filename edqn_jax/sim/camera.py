@@ -149,8 +149,6 @@ def _depths(config: CameraConfig, scene: Scene, position: Array, rotation: Array
     return jax.vmap(one)(scene, position, rotation)
 
 
-def _depths_on_cpu(config: CameraConfig, scene: Scene, position: Array, rotation: Array) -> Array:
-    """Returns `_depths`, by the library in C where it is at hand."""
-    if native.can_draw(config, scene):
-        return native.depths(config, scene, position, rotation)
-    return _depths(config, scene, position, rotation)
+def _depths_on_cpu(config: CameraConfig, scene: Scene, position: Array, rotation: Array) -> Array | None:
+    """Returns `_depths`, by the library in C where that is at hand and draws such scenes."""
+    return native.depths(config, scene, position, rotation) if native.can_draw(config, scene) else None

@@ -99,11 +99,11 @@ def picture(
 
 def _pictures_on_cpu(
     config: CameraConfig, finish: Finish, scene: Scene, origin: Array, rotation: Array, weights: Array
-) -> Array:
-    """Returns `_pictures`, by the library in C where it is at hand."""
+) -> Array | None:
+    """Returns `_pictures`, by the library in C where that is at hand and draws such scenes."""
     if native.can_draw(config, scene):
         return native.pictures(config, scene, origin, rotation, weights)
-    return _pictures(config, finish, scene, origin, rotation, weights)
+    return None
 
 
 def _pictures(

@@ -26,6 +26,7 @@ from jax import Array
 from edqn_jax.config import CameraConfig
 from edqn_jax.parallel.programs import private_folder
 from edqn_jax.sim import coverage, raycast
+from edqn_jax.sim.picture_primitive import most_rows
 from edqn_jax.sim.scene import Scene
 from edqn_jax.sim.texture import WAVES
 
@@ -55,14 +56,14 @@ def can_draw(config: CameraConfig, scene: Scene) -> bool:
 
 
 def pictures(config: CameraConfig, scene: Scene, origin: Array, rotation: Array, weights: Array) -> Array:
-    """Returns brightness [M, H, W] as `columns.picture` does; every array has a leading [M]."""
+    """Returns brightness [M, H, W] as `columns.picture` does; arrays have a leading [L], see `picture_primitive`."""
     return _call("edqn_pictures", config, scene, origin, rotation, weights)
 
 
 def depths(config: CameraConfig, scene: Scene, origin: Array, rotation: Array) -> Array:
     """Returns the depth [M, H, W] metres along the middle ray of each pixel, inf where there is nothing.
 
-    As `depth.nearest_depth` does; every array has a leading [M].
+    As `depth.nearest_depth` does; arrays have a leading [L], see `picture_primitive`.
     """
     found = _call("edqn_depths", config, scene, origin, rotation)
     return jnp.where(found > NOWHERE, jnp.inf, found)
@@ -70,12 +71,15 @@ def depths(config: CameraConfig, scene: Scene, origin: Array, rotation: Array) -
 
 def _call(target: str, config: CameraConfig, scene: Scene, *frames: Array) -> Array:
     u, v = raycast.image_plane(config, 1, 1)
-    waves = np.array([[*np.divide(w.direction, config.texture_period_m * w.octave), w.weight] for w in WAVES], np.float32)
+    waves = np.array(
+        [[*np.divide(w.direction, config.texture_period_m * w.octave), w.weight] for w in WAVES], np.float32
+    )
     first = [raycast.pitch_of(config), config.texture_contrast, config.ambient]
     constants = np.array([*first, *raycast.sun_direction(config), *config.sky_rgb], np.float32)
     shapes = [getattr(getattr(scene, kind), f.name) for kind in KINDS for f in dataclasses.fields(getattr(scene, kind))]
     origin, rotation, *weights = frames
-    shape = jax.ShapeDtypeStruct((origin.shape[0], config.height, config.width), jnp.float32)
+    count = most_rows([*shapes, *frames])
+    shape = jax.ShapeDtypeStruct((count, config.height, config.width), jnp.float32)
     return jax.ffi.ffi_call(target, shape)(constants, u, v, waves, origin, rotation, *shapes, *weights)
 
 
@@ -119,4 +123,7 @@ def _definitions() -> Sequence[str]:
         "FAR_U": coverage.FAR_U,
         "LEVEL_FACE": coverage.LEVEL_FACE,
     }
-    return [*(f"-D{name}={value:e}f" for name, value in numbers.items()), f"-DDEPTH_OF_LAYERS={coverage.DEPTH_OF_LAYERS}"]
+    return [
+        *(f"-D{name}={value:e}f" for name, value in numbers.items()),
+        f"-DDEPTH_OF_LAYERS={coverage.DEPTH_OF_LAYERS}",
+    ]

@@ -25,7 +25,7 @@ def draw_in_one_batch(
     static: Static,
     arguments: tuple[Any, ...],
     shape: tuple[int, int],
-    on_cpu: Callable[..., Array],
+    on_cpu: Callable[..., Array | None],
 ) -> Array:
     """Returns one picture, [H, W] float32; all pictures that it is mapped to are drawn by one call of `draw`.
 
@@ -35,7 +35,8 @@ def draw_in_one_batch(
         static: arguments that are known when tracing.
         arguments: pytrees of arrays, of one picture.
         shape: H, W.
-        on_cpu: what draws in place of `draw` where the program is compiled for CPUs.
+        on_cpu: what draws where the program is compiled for CPUs, of arguments with leading [L] (see `_pictures_p`); or
+            returns None if it cannot, and `draw` does.
     """
     leaves, tree = jax.tree.flatten(arguments)
     parameters = {"draw": draw, "static": static, "tree": tree, "shape": shape, "on_cpu": on_cpu}
@@ -43,19 +44,34 @@ def draw_in_one_batch(
 
 
 _pictures_p = Primitive("pictures")
-"""Its operands are the leaves of the arguments, each with a leading [M]; its result is [M, H, W]."""
+"""Its operands are the leaves of the arguments, each with a leading [L]; its result is [M, H, W].
+
+M is the largest L, and a multiple of every other: where frames share a world, one row of it serves M / L pictures in a
+row.
+"""
 
 
 def _draw(*leaves: Array, draw: Callable[..., Array], static: Static, tree: Any, **_: Any) -> Array:
-    return draw(*static, *jax.tree.unflatten(tree, leaves))
+    count = most_rows(leaves)
+    return draw(
+        *static, *jax.tree.unflatten(tree, [jnp.repeat(leaf, count // leaf.shape[0], axis=0) for leaf in leaves])
+    )
 
 
-def _draw_on_cpu(*leaves: Array, on_cpu: Callable[..., Array], **parameters: Any) -> Array:
-    return _draw(*leaves, **(parameters | {"draw": on_cpu}))
+def _draw_on_cpu(
+    *leaves: Array, draw: Callable[..., Array], on_cpu: Callable[..., Array | None], static: Static, tree: Any, **_: Any
+) -> Array:
+    found = on_cpu(*static, *jax.tree.unflatten(tree, leaves))
+    return _draw(*leaves, draw=draw, static=static, tree=tree) if found is None else found
+
+
+def most_rows(leaves: Sequence[Any]) -> int:
+    """Returns M of arrays with a leading [L]."""
+    return max(leaf.shape[0] for leaf in leaves)
 
 
 def _abstract(*leaves: Any, shape: tuple[int, int], **_: Any) -> ShapedArray:
-    return ShapedArray((leaves[0].shape[0], *shape), np.dtype(np.float32))
+    return ShapedArray((most_rows(leaves), *shape), np.dtype(np.float32))
 
 
 def _batch(leaves: Sequence[Array], axes: Sequence[int | None], **parameters: Any) -> tuple[Array, int]:
@@ -63,6 +79,8 @@ def _batch(leaves: Sequence[Array], axes: Sequence[int | None], **parameters: An
     size = next(leaf.shape[axis] for leaf, axis in zip(leaves, axes, strict=True) if axis is not None)
 
     def merged(leaf: Array, axis: int | None) -> Array:
+        if axis is None and leaf.shape[0] == 1:
+            return leaf
         mapped = jnp.broadcast_to(leaf, (size, *leaf.shape)) if axis is None else jnp.moveaxis(leaf, axis, 0)
         return mapped.reshape(mapped.shape[0] * mapped.shape[1], *mapped.shape[2:])
 

@@ -10,6 +10,9 @@
 #include <stdint.h>
 #include <stdlib.h>
 #include <string.h>
+#ifdef __AVX__
+#include <immintrin.h>
+#endif
 
 #include "xla/ffi/api/c_api.h"
 
@@ -25,8 +28,13 @@ static inline Lanes all(float x) { return x - (Lanes){0}; }
 static inline Lanes load(const float *from) { return *(const Loose *)from; }
 static inline void store(float *to, Lanes x) { *(Loose *)to = x; }
 static inline Lanes pick(Mask where, Lanes a, Lanes b) { return (Lanes)((where & (Mask)a) | (~where & (Mask)b)); }
+#ifdef __AVX__ /* one instruction, which compilers do not find by themselves */
+static inline Lanes lesser(Lanes a, Lanes b) { return (Lanes)_mm256_min_ps((__m256)a, (__m256)b); }
+static inline Lanes greater(Lanes a, Lanes b) { return (Lanes)_mm256_max_ps((__m256)a, (__m256)b); }
+#else
 static inline Lanes lesser(Lanes a, Lanes b) { return pick(a < b, a, b); }
 static inline Lanes greater(Lanes a, Lanes b) { return pick(a > b, a, b); }
+#endif
 static inline Lanes between(Lanes x, float low, float high) { return lesser(greater(x, all(low)), all(high)); }
 static inline Lanes absolute(Lanes x) { return (Lanes)((Mask)x & 0x7fffffff); }
 static inline Lanes inverses(Lanes x) { return 1.0f / pick(absolute(x) < TINY, all(TINY), x); }
@@ -72,24 +80,6 @@ typedef struct {
   const float *origin, *weights; /* [3] each */
   float cos, sin;
 } Eye;
-
-/* Shapes of frame `m` of arrays with a leading [M]. */
-static Shapes shapes_of(const Shapes *all, int64_t m) {
-  Shapes s = *all;
-  s.box_position += m * 3 * s.boxes, s.box_half += m * 3 * s.boxes;
-  s.box_yaw += m * s.boxes, s.box_albedo += m * 3 * s.boxes;
-  s.cylinder_position += m * 3 * s.cylinders, s.cylinder_radius += m * s.cylinders;
-  s.cylinder_half += m * s.cylinders, s.cylinder_albedo += m * 3 * s.cylinders;
-  s.sphere_position += m * 3 * s.spheres, s.sphere_radius += m * s.spheres, s.sphere_albedo += m * 3 * s.spheres;
-  s.plane_position += m * 3 * s.planes, s.plane_normal += m * 3 * s.planes, s.plane_albedo += m * 3 * s.planes;
-  return s;
-}
-
-static Eye eye_of(const float *origin, const float *rotation, const float *weights, int64_t m) {
-  const float *r = rotation + 9 * m;
-  const float scale = 1.0f / sqrtf(most(r[0] * r[0] + r[3] * r[3], TINY));
-  return (Eye){origin + 3 * m, weights ? weights + 3 * m : 0, r[0] * scale, r[3] * scale};
-}
 
 static inline float dot3(const float *a, const float *b) { return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]; }
 
@@ -527,38 +517,49 @@ static inline Lanes nearer_upright(float from, float to, float middle, float hal
   return pick((enter < leave) & (enter > 0) & (enter < nearest), enter, nearest);
 }
 
+/* Depths between which the middle rays of LANES columns are beside the axis of box or cylinder `n`, whose centre is at
+ * (x, y) from the eye. */
+static inline void beside(const Shapes *s, int n, float x, float y, float cos, float sin, Lanes dx, Lanes dy, Lanes *from, Lanes *to) {
+  if (n < s->boxes) {
+    const float *half = s->box_half + 3 * n;
+    const Lanes per_x = inverses(cos * dx + sin * dy), per_y = inverses(cos * dy - sin * dx);
+    const Lanes middle_x = (cos * x + sin * y) * per_x, middle_y = (cos * y - sin * x) * per_y;
+    const Lanes reach_x = half[0] * absolute(per_x), reach_y = half[1] * absolute(per_y);
+    *from = greater(middle_x - reach_x, middle_y - reach_y), *to = lesser(middle_x + reach_x, middle_y + reach_y);
+    return;
+  }
+  const float radius = s->cylinder_radius[n - s->boxes];
+  const Lanes flat = greater(dx * dx + dy * dy, all(TINY)), middle = (x * dx + y * dy) / flat;
+  const Lanes px = middle * dx - x, py = middle * dy - y, inside = radius * radius - (px * px + py * py);
+  const Lanes reach = roots(greater(inside, all(0)) / flat);
+  *from = pick(inside > 0, middle - reach, all(NOWHERE)), *to = pick(inside > 0, middle + reach, all(-NOWHERE));
+}
+
 /* Depth along the middle ray of every pixel of one frame, [H, C]; NOWHERE where there is nothing. */
 static void measure(const Camera *c, const Shapes *s, const Eye *e, Work *w, float *picture) {
-  const int rows = rounded_up(c->height);
-  int visible = 0;
+  memset(w->found, 0, sizeof(int) * (size_t)c->width);
   for (int n = 0; n < s->boxes + s->cylinders; ++n) {
     const int is_box = n < s->boxes, i = is_box ? n : n - s->boxes;
-    const float *at = is_box ? s->box_position + 3 * i : s->cylinder_position + 3 * i;
+    const float *at = is_box ? s->box_position + 3 * i : s->cylinder_position + 3 * i, *half = s->box_half + 3 * i;
     const float x = at[0] - e->origin[0], y = at[1] - e->origin[1];
-    const float radius = is_box ? sqrtf(s->box_half[3 * i] * s->box_half[3 * i] + s->box_half[3 * i + 1] * s->box_half[3 * i + 1])
-                                : s->cylinder_radius[i];
+    const float radius = is_box ? sqrtf(half[0] * half[0] + half[1] * half[1]) : s->cylinder_radius[i];
     if (out_of_sight(c, e, x, y, radius)) continue;
-    float *from = w->numbers + (size_t)visible * NUMBERS * w->stride, *to = from + w->stride;
-    w->sides[visible++] = (Sides){n, 0, from};
+    float *from = w->numbers + (size_t)n * NUMBERS * w->stride, *to = from + w->stride;
     const float cos = is_box ? cosf(s->box_yaw[i]) : 1, sin = is_box ? sinf(s->box_yaw[i]) : 0;
-    for (int k = 0; k < w->stride; ++k) {
-      const float dx = e->cos + w->u[k] * e->sin, dy = e->sin - w->u[k] * e->cos;
-      if (is_box) {
-        const float per_x = inverse(cos * dx + sin * dy), per_y = inverse(cos * dy - sin * dx);
-        const float mx = (cos * x + sin * y) * per_x, my = (cos * y - sin * x) * per_y;
-        const float rx = s->box_half[3 * i] * fabsf(per_x), ry = s->box_half[3 * i + 1] * fabsf(per_y);
-        from[k] = most(mx - rx, my - ry), to[k] = least(mx + rx, my + ry);
-      } else {
-        const float flat = most(dx * dx + dy * dy, TINY), middle = (x * dx + y * dy) / flat;
-        const float px = middle * dx - x, py = middle * dy - y, inside = radius * radius - (px * px + py * py);
-        const float reach = sqrtf(most(inside, 0.0f) / flat);
-        from[k] = inside > 0 ? middle - reach : NOWHERE, to[k] = inside > 0 ? middle + reach : -NOWHERE;
-      }
+    for (int first = 0; first < c->width; first += LANES) {
+      const Lanes u = load(w->u + first), dx = e->cos + u * e->sin, dy = e->sin - u * e->cos;
+      Lanes begin, end;
+      beside(s, n, x, y, cos, sin, dx, dy, &begin, &end);
+      store(from + first, begin), store(to + first, end);
+    }
+    for (int column = 0; column < c->width; ++column) {
+      w->covering[column * w->most + w->found[column]] = n;
+      w->found[column] += (from[column] < to[column]) & (to[column] > 0);
     }
   }
   for (int column = 0; column < c->width; ++column) {
     const float dx = e->cos + c->u[column] * e->sin, dy = e->sin - c->u[column] * e->cos;
-    for (int first = 0; first < rows; first += LANES) {
+    for (int first = 0; first < c->height; first += LANES) {
       const Lanes dz = load(w->v + first), per_z = inverses(dz);
       Lanes nearest = all(NOWHERE);
       for (int n = 0; n < s->planes; ++n) {
@@ -577,13 +578,12 @@ static void measure(const Camera *c, const Shapes *s, const Eye *e, Work *w, flo
         const Lanes t = middle - roots(greater(radius * radius - miss2, all(0)) / a);
         nearest = pick((roots(miss2) < radius) & (t > 0) & (t < nearest), t, nearest);
       }
-      for (int k = 0; k < visible; ++k) {
-        const int n = w->sides[k].first, is_box = n < s->boxes, i = is_box ? n : n - s->boxes;
-        const float from = w->sides[k].numbers[column], to = w->sides[k].numbers[w->stride + column];
-        if (from >= to || to <= 0) continue;
+      for (int k = 0; k < w->found[column]; ++k) {
+        const int n = w->covering[column * w->most + k], is_box = n < s->boxes, i = is_box ? n : n - s->boxes;
+        const float *from = w->numbers + (size_t)n * NUMBERS * w->stride + column;
         const float z = is_box ? s->box_position[3 * i + 2] : s->cylinder_position[3 * i + 2];
         const float half = is_box ? s->box_half[3 * i + 2] : s->cylinder_half[i];
-        nearest = nearer_upright(from, to, z - e->origin[2], half, per_z, nearest);
+        nearest = nearer_upright(from[0], from[w->stride], z - e->origin[2], half, per_z, nearest);
       }
       for (int l = 0; l < LANES && first + l < c->height; ++l) picture[(first + l) * c->width + column] = nearest[l];
     }
@@ -610,37 +610,49 @@ static XLA_FFI_Error *failed(XLA_FFI_CallFrame *call, XLA_FFI_Error_Code code, c
   return call->api->XLA_FFI_Error_Create(&args);
 }
 
+/* The part of an operand that frame `m` reads. Of [L, ...] each row serves frames / L frames in a row. */
+static const float *of_frame(const XLA_FFI_Buffer *operand, int64_t m, int64_t frames) {
+  int64_t size = 1;
+  for (int i = 1; i < operand->rank; ++i) size *= operand->dims[i];
+  return (const float *)operand->data + m / (frames / operand->dims[0]) * size;
+}
+
 typedef void Render(const Camera *, const Shapes *, const Eye *, Work *, float *);
 
-/* Renders all frames. Operands as numbered above, arrays of frames with a leading [M]; weights [M, 3] come last, if
- * at all. */
+/* Renders all frames. Operands are numbered above; from ORIGIN on they have a leading [L], see `of_frame`, and last
+ * come the weights [L, 3], if any. */
 static XLA_FFI_Error *each_frame(XLA_FFI_CallFrame *call, Render *render, int weighted) {
   if (asked_for_version(call)) return 0;
   if (call->args.size != OPERANDS + weighted || call->rets.size != 1)
     return failed(call, XLA_FFI_Error_Code_INVALID_ARGUMENT, "pictures.c: another number of operands");
   XLA_FFI_Buffer **arg = (XLA_FFI_Buffer **)call->args.args;
-#define NUMBERS_OF(i) ((const float *)arg[i]->data)
-#define CAPACITY(i) ((int)arg[i]->dims[1])
-  const float *k = NUMBERS_OF(CONSTANTS);
-  Camera camera = {(int)arg[V]->dims[0], (int)arg[U]->dims[0], (int)arg[WAVES]->dims[0], k[0], k[1], k[2], k + 3,
-                   k + 6, NUMBERS_OF(U), NUMBERS_OF(V), NUMBERS_OF(WAVES)};
-  Shapes all = {CAPACITY(BOXES), CAPACITY(CYLINDERS), CAPACITY(SPHERES), CAPACITY(PLANES),
-                NUMBERS_OF(BOXES), NUMBERS_OF(BOXES + 1), NUMBERS_OF(BOXES + 2), NUMBERS_OF(BOXES + 3),
-                NUMBERS_OF(CYLINDERS), NUMBERS_OF(CYLINDERS + 1), NUMBERS_OF(CYLINDERS + 2), NUMBERS_OF(CYLINDERS + 3),
-                NUMBERS_OF(SPHERES), NUMBERS_OF(SPHERES + 1), NUMBERS_OF(SPHERES + 2),
-                NUMBERS_OF(PLANES), NUMBERS_OF(PLANES + 1), NUMBERS_OF(PLANES + 2)};
+  const XLA_FFI_Buffer *pictures = call->rets.rets[0];
+  const int64_t frames = pictures->dims[0];
+  const float *k = arg[CONSTANTS]->data;
+  const Camera camera = {(int)pictures->dims[1], (int)pictures->dims[2], (int)arg[WAVES]->dims[0], k[0], k[1], k[2],
+                         k + 3, k + 6, arg[U]->data, arg[V]->data, arg[WAVES]->data};
+  Shapes shapes = {.boxes = (int)arg[BOXES]->dims[1], .cylinders = (int)arg[CYLINDERS]->dims[1],
+                   .spheres = (int)arg[SPHERES]->dims[1], .planes = (int)arg[PLANES]->dims[1]};
   if (camera.waves > MOST_WAVES)
     return failed(call, XLA_FFI_Error_Code_INVALID_ARGUMENT, "pictures.c: more waves than MOST_WAVES");
   Work work = {0};
-  if (!prepare(&camera, &all, &work)) {
+  if (!prepare(&camera, &shapes, &work)) {
     release(&work);
     return failed(call, XLA_FFI_Error_Code_RESOURCE_EXHAUSTED, "pictures.c: no memory for the columns of a frame");
   }
-  float *pictures = ((XLA_FFI_Buffer *)call->rets.rets[0])->data;
-  for (int64_t m = 0; m < arg[ORIGIN]->dims[0]; ++m) {
-    const Shapes shapes = shapes_of(&all, m);
-    const Eye eye = eye_of(NUMBERS_OF(ORIGIN), NUMBERS_OF(ROTATION), weighted ? NUMBERS_OF(OPERANDS) : 0, m);
-    render(&camera, &shapes, &eye, &work, pictures + m * camera.height * camera.width);
+  for (int64_t m = 0; m < frames; ++m) {
+    const float *of[OPERANDS + 1] = {0};
+    for (int i = ORIGIN; i < OPERANDS + weighted; ++i) of[i] = of_frame(arg[i], m, frames);
+    shapes.box_position = of[BOXES], shapes.box_half = of[BOXES + 1];
+    shapes.box_yaw = of[BOXES + 2], shapes.box_albedo = of[BOXES + 3];
+    shapes.cylinder_position = of[CYLINDERS], shapes.cylinder_radius = of[CYLINDERS + 1];
+    shapes.cylinder_half = of[CYLINDERS + 2], shapes.cylinder_albedo = of[CYLINDERS + 3];
+    shapes.sphere_position = of[SPHERES], shapes.sphere_radius = of[SPHERES + 1];
+    shapes.sphere_albedo = of[SPHERES + 2];
+    shapes.plane_position = of[PLANES], shapes.plane_normal = of[PLANES + 1], shapes.plane_albedo = of[PLANES + 2];
+    const float *r = of[ROTATION], scale = 1.0f / sqrtf(most(r[0] * r[0] + r[3] * r[3], TINY));
+    const Eye eye = {of[ORIGIN], of[OPERANDS], r[0] * scale, r[3] * scale};
+    render(&camera, &shapes, &eye, &work, (float *)pictures->data + m * camera.height * camera.width);
   }
   release(&work);
   return 0;
