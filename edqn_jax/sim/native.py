@@ -1,21 +1,12 @@
-"""The level camera in C, for CPUs: compiles `pictures.c` once for this machine and registers it with XLA.
+"""The level camera in C, for CPUs: calls `pictures.c`.
 
-Where there is a C compiler, pictures and depth images are drawn by the compiled library; everywhere else, and on
-GPUs, by the same functions in JAX (`columns.py`, `depth.py`). Both agree to rounding (`tests/sim/test_native.py`).
-The library is kept beside compiled programs, in a folder for this kind of processor.
+Where there is a C compiler, pictures and depth images are drawn by it; everywhere else, and on GPUs, by the same
+functions in JAX (`columns.py`, `depth.py`). Both agree to rounding (`tests/sim/test_native.py`).
 """
 
 from __future__ import annotations
 
-import ctypes
 import dataclasses
-import functools
-import hashlib
-import os
-import shutil
-import subprocess
-import tempfile
-from collections.abc import Sequence
 from pathlib import Path
 
 import jax
@@ -24,22 +15,13 @@ import numpy as np
 from jax import Array
 
 from edqn_jax.config import CameraConfig
-from edqn_jax.parallel.programs import private_folder
+from edqn_jax.parallel.c_library import registered
 from edqn_jax.sim import coverage, raycast
 from edqn_jax.sim.picture_primitive import most_rows
 from edqn_jax.sim.scene import Scene
 from edqn_jax.sim.texture import WAVES
 
 SOURCE = Path(__file__).with_name("pictures.c")
-
-SWITCH = "EDQN_JAX_NATIVE"
-"""Environment variable; 0 draws with JAX alone."""
-
-FLAGS = (
-    *("-std=gnu11", "-O3", "-march=native", "-fPIC", "-shared"),
-    # What vector instructions need. Comparisons of NaN are never relied on.
-    *("-fno-math-errno", "-fno-trapping-math", "-ffinite-math-only", "-fno-signed-zeros"),
-)
 
 KINDS = ("boxes", "cylinders", "spheres", "planes")
 """Kinds of shape that the library draws. A scene with room for any other is drawn by JAX."""
@@ -83,39 +65,8 @@ def _call(target: str, config: CameraConfig, scene: Scene, *frames: Array) -> Ar
     return jax.ffi.ffi_call(target, shape)(constants, u, v, waves, origin, rotation, *shapes, *weights)
 
 
-@functools.cache
 def is_at_hand() -> bool:
     """Returns whether the library is compiled, loaded and registered, which the first call does."""
-    if os.environ.get(SWITCH, "1") == "0":
-        return False
-    compiler = shutil.which(os.environ.get("CC", "cc"))
-    if compiler is None:
-        return False
-    try:
-        library = ctypes.CDLL(str(_compiled(compiler)))
-    except (OSError, subprocess.SubprocessError):
-        return False
-    for target in ("edqn_pictures", "edqn_depths"):
-        jax.ffi.register_ffi_target(target, jax.ffi.pycapsule(getattr(library, target)), platform="cpu")
-    return True
-
-
-def _compiled(compiler: str) -> Path:
-    """Returns the library's file, compiled unless one of the same source, flags and XLA is kept."""
-    command = [compiler, *FLAGS, *_definitions(), f"-I{jax.ffi.include_dir()}", str(SOURCE), "-lm"]
-    named = hashlib.sha256(SOURCE.read_bytes() + repr((command, jax.__version__)).encode()).hexdigest()[:16]
-    folder = private_folder() or Path(tempfile.mkdtemp())
-    library = folder / f"pictures-{named}.so"
-    if not library.is_file():
-        with tempfile.TemporaryDirectory(dir=folder) as scratch:
-            made = Path(scratch) / library.name
-            subprocess.run([*command, "-o", str(made)], check=True, capture_output=True, timeout=60)
-            made.replace(library)
-    return library
-
-
-def _definitions() -> Sequence[str]:
-    """Returns the constants that the source shares with the modules it speaks of."""
     numbers = {
         "TINY": raycast.TINY,
         "HORIZON_M": raycast.HORIZON_M,
@@ -123,7 +74,5 @@ def _definitions() -> Sequence[str]:
         "FAR_U": coverage.FAR_U,
         "LEVEL_FACE": coverage.LEVEL_FACE,
     }
-    return [
-        *(f"-D{name}={value:e}f" for name, value in numbers.items()),
-        f"-DDEPTH_OF_LAYERS={coverage.DEPTH_OF_LAYERS}",
-    ]
+    shared = (*(f"{name}={value:e}f" for name, value in numbers.items()), f"DEPTH_OF_LAYERS={coverage.DEPTH_OF_LAYERS}")
+    return registered(SOURCE, ("edqn_pictures", "edqn_depths"), shared)
