@@ -2,7 +2,7 @@
  * (`all_sum.py` registers it).
  *
  * XLA's own sum lets a device sleep several times until another has arrived, and waking up takes longer than the sum.
- * Here devices spin, since each has a thread and all arrive at about the same time. The devices of one execution meet
+ * Here devices spin at first, since each has a thread and all arrive at about the same time. The devices of one execution meet
  * in a place that nobody else uses meanwhile; each adds up its share of the elements, in the order of the devices, and
  * writes it to the results of all.
  */
@@ -16,8 +16,8 @@
 
 #define MOST_DEVICES 256
 #define PLACES 64
-#define SPINS 20000        /* some tens of microseconds, before the core is offered to others */
-#define LONGEST_WAIT_S 600 /* a device that is this late has failed */
+#define SPIN_US 300            /* after which a device leaves its core to others, which may be what it waits for */
+#define LONGEST_WAIT_US 600000000 /* a device that is this late has failed */
 
 typedef struct {
   int64_t run;     /* of the execution that meets here, 0 for none */
@@ -62,21 +62,28 @@ static void leave(Place *here) {
   unlock();
 }
 
+static int64_t microseconds(void) {
+  struct timespec now;
+  clock_gettime(CLOCK_MONOTONIC, &now);
+  return (int64_t)now.tv_sec * 1000000 + now.tv_nsec / 1000;
+}
+
 /* Waits until `count` is `wanted`; returns 0 if that takes too long. */
 static int wait_for(atomic_int *count, int wanted) {
-  struct timespec began, now;
-  clock_gettime(CLOCK_MONOTONIC, &began);
-  for (;;) {
-    for (int i = 0; i < SPINS; ++i) {
+  const struct timespec nap = {0, 20000};
+  const int64_t began = microseconds();
+  int64_t waited = 0;
+  while (waited < LONGEST_WAIT_US) {
+    for (int i = 0; i < 64; ++i) {
       if (atomic_load_explicit(count, memory_order_acquire) >= wanted) return 1;
 #if defined(__x86_64__)
       __builtin_ia32_pause();
 #endif
     }
-    sched_yield();
-    clock_gettime(CLOCK_MONOTONIC, &now);
-    if (now.tv_sec - began.tv_sec > LONGEST_WAIT_S) return 0;
+    waited = microseconds() - began;
+    if (waited > SPIN_US) nanosleep(&nap, 0);
   }
+  return 0;
 }
 
 static int64_t elements(const XLA_FFI_Buffer *buffer) {

@@ -42,10 +42,10 @@ def registered(source: Path, targets: tuple[str, ...], definitions: tuple[str, .
         return False
     try:
         library = ctypes.CDLL(str(_compiled(compiler, source, definitions)))
-    except (OSError, subprocess.SubprocessError):
+        for target in targets:
+            jax.ffi.register_ffi_target(target, jax.ffi.pycapsule(getattr(library, target)), platform="cpu")
+    except (OSError, subprocess.SubprocessError, jax.errors.JaxRuntimeError):
         return False
-    for target in targets:
-        jax.ffi.register_ffi_target(target, jax.ffi.pycapsule(getattr(library, target)), platform="cpu")
     return True
 
 
