@@ -324,7 +324,7 @@ class TrainConfig:
     """Devices to use; 0 uses the largest number that divides the shards."""
     seed: int = 0
     """Random seed of the run."""
-    validation_every: int = 65_536
+    validation_every: int = 98_304
     """Decisions between validations, rounded up to whole chunks; 0 validates only at the end."""
     validation_missions: int = 128
     """Missions of each validation, and of the flights at the end, the first of which is in `world.flown`; in worlds
