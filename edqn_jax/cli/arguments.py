@@ -30,7 +30,7 @@ from edqn_jax.cli.help import (
     show_train_help,
     with_conditions,
 )
-from edqn_jax.config import FAMILIES, AirConfig, BodyConfig, Config, MotorsConfig, NoiseConfig
+from edqn_jax.config import CONDITIONS, FAMILIES, Config
 from edqn_jax.config.limits import validate
 from edqn_jax.config.loading import Layer, resolve
 from edqn_jax.errors import ConfigError
@@ -53,16 +53,6 @@ SHORT_NAMES = {
     "--debug": "--train.debug",
 }
 """Short names of common options."""
-
-
-CONDITIONS = {
-    "env": ("action_delay",),
-    **{
-        group: tuple(option.name for option in dataclasses.fields(kind))
-        for group, kind in (("air", AirConfig), ("body", BodyConfig), ("motors", MotorsConfig), ("noise", NoiseConfig))
-    },
-}
-"""Options by group that a policy may be evaluated with other values of than it was trained with."""
 
 
 @dataclass(frozen=True)
@@ -133,7 +123,7 @@ class EvaluateArgs:
     trajectories: Annotated[Path | None, arg(metavar="FILE.npz", help_behavior_hint="")] = None
     """Also write every flight, one pose per physics step."""
     conditions: Annotated[Layer, tyro.conf.Fixed] = field(default_factory=dict)
-    """Options of `CONDITIONS` in place of the policy's own."""
+    """Options of `config.CONDITIONS` in place of the policy's own."""
 
 
 @dataclass(frozen=True)

@@ -10,10 +10,10 @@ from typing import Literal
 
 import tyro
 
-from edqn_jax.cli.arguments import CONDITIONS, SHORT_NAMES, EvaluateArgs, RecordArgs, TrainOptions
+from edqn_jax.cli.arguments import SHORT_NAMES, EvaluateArgs, RecordArgs, TrainOptions
 from edqn_jax.cli.help import all_of_train, described, with_conditions
 from edqn_jax.config.loading import make_config
-from edqn_jax.config.options import FAMILIES
+from edqn_jax.config.options import CONDITIONS, FAMILIES
 
 WORLDS = Literal[("paper", *FAMILIES)]  # pyright: ignore[reportInvalidTypeForm]
 """Worlds that have a name; others are files."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
 from collections.abc import Iterator
 from typing import Any
@@ -11,8 +10,7 @@ from rich.console import Console
 from rich.table import Table
 
 from edqn_jax.cli.arguments import EvaluateArgs
-from edqn_jax.config.limits import validate
-from edqn_jax.config.loading import Layer, apply
+from edqn_jax.config.loading import Layer
 from edqn_jax.errors import ConfigError
 from edqn_jax.evaluation.evaluate import evaluate
 from edqn_jax.evaluation.latency import decision_latency_ms
@@ -36,9 +34,6 @@ def evaluate_command(args: EvaluateArgs) -> None:
     if args.json is not None and args.trajectories is not None and args.json.resolve() == args.trajectories.resolve():
         raise ConfigError(f"--json and --trajectories are both '{args.json}'; give two files")
     policy, digest = load_policy(args.run), policy_digest(args.run)
-    config = apply(policy.config, args.conditions, "edqn evaluate")
-    validate(config)
-    policy = dataclasses.replace(policy, config=config)
     evaluation = evaluate(
         policy,
         args.world,
@@ -48,6 +43,7 @@ def evaluate_command(args: EvaluateArgs) -> None:
         goal=args.goal,
         record=args.trajectories is not None,
         shuffle_codes=args.shuffle_codes,
+        conditions=args.conditions,
     )
     figures = {
         "run": str(args.run),

@@ -1,6 +1,7 @@
 """Every option, its default and its limits, and how a configuration is loaded."""
 
 from edqn_jax.config.options import (
+    CONDITIONS,
     FAMILIES,
     MIXTURES,
     AgentConfig,
@@ -20,6 +21,7 @@ from edqn_jax.config.options import (
 from edqn_jax.config.presets import PRESETS, preset
 
 __all__ = [
+    "CONDITIONS",
     "FAMILIES",
     "MIXTURES",
     "PRESETS",

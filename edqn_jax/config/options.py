@@ -6,7 +6,7 @@ worlds from files and a GPU change. The string under a field is its help text on
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from typing import Literal
 
 
@@ -416,6 +416,15 @@ class Config:
     agent: AgentConfig = field(default_factory=AgentConfig)
     train: TrainConfig = field(default_factory=TrainConfig)
 
+
+CONDITIONS: dict[str, tuple[str, ...]] = {
+    "env": ("action_delay",),
+    **{
+        group: tuple(option.name for option in fields(kind))
+        for group, kind in (("air", AirConfig), ("body", BodyConfig), ("motors", MotorsConfig), ("noise", NoiseConfig))
+    },
+}
+"""Options by group that a policy may be flown with other values of than it was trained with."""
 
 _OPEN = ("sparse", "medium", "dense")
 _CLOSED = ("rooms", "forest", "canyon")
