@@ -306,6 +306,8 @@ class AgentConfig:
     """Widths of the hidden layers."""
     history: int = 2
     """Observations in the Q-network's input, the newest included."""
+    last_move: bool = False
+    """Whether the Q-network also sees the last move that was chosen; with `env.action_delay` it is yet to be flown."""
     code_scale: float = 0.5
     """Factor on the code before the Q-network, so that it does not outweigh the own state."""
     layer_norm: bool = False
