@@ -229,7 +229,7 @@ def air_velocity(air: AirConfig, disturbance: Disturbance) -> Array:
 def drag(air: AirConfig, velocity: Array, through: Array) -> Array:
     """Returns the drag [3] newtons on a body at `velocity` [3] m/s in air that moves at `through` [3] m/s, world.
 
-    F = (c + rho / 2 C_d A |v|) v with v the velocity of the air relative to the body: linear for the rotors (Faessler,
+    (c + rho / 2 C_d A abs(v)) v with v the velocity of the air relative to the body: linear for the rotors (Faessler,
     Franchi and Scaramuzza 2018, here alike in all directions), quadratic for the body.
     """
     x, y, z = through - velocity
