@@ -18,7 +18,8 @@ from jax import Array
 from edqn_jax.checks import check_finite, check_index
 from edqn_jax.config import Config, EnvConfig
 from edqn_jax.random import integers
-from edqn_jax.sim import drone, geodesic, sensor
+from edqn_jax.sim import disturbances, drone, geodesic, sensor
+from edqn_jax.sim.disturbances import Disturbance
 from edqn_jax.sim.drone import Airframe, DroneState, Flight
 from edqn_jax.sim.events import EventMemory
 from edqn_jax.sim.missions import Missions
@@ -72,6 +73,7 @@ class EnvState:
     memory: EventMemory | None  # the sensor's
     episode_return: Array  # [] sum of rewards so far
     key: Array  # [] typed key
+    disturbance: Disturbance | None = None  # what the episode flies against; None where nothing disturbs
 
 
 @struct.dataclass
@@ -151,7 +153,8 @@ def own_motion(config: EnvConfig, state: DroneState, move: Array) -> Array:
     Velocity in the heading frame (3, in commanded speeds), yaw rate (rad/s, at most `MOST_YAW_RATE`), last move (3).
 
     Args:
-        move: [3] of the last decision, of -1, 0 and 1 in the heading frame; zeros at a start.
+        move: [3] chosen at the last decision, of -1, 0 and 1 in the heading frame; zeros at a start. With
+            `env.action_delay` it is yet to be flown.
     """
     velocity = heading_velocity(config, drone.yaw_of(state.quaternion), state.velocity)
     # Of a drone on its back the heading turns at any rate.
@@ -185,11 +188,17 @@ def heading_setpoint(config: EnvConfig, state: DroneState, goal: Array, command:
     return jnp.where(level > 0, jnp.arctan2(command[1], command[0]), state.yaw_setpoint)
 
 
-def _start(config: Config, world: World, mission: Array, key: Array) -> tuple[DroneState, EventMemory | None]:
-    """At rest at the mission's start, facing its goal, the sensor at rest."""
+def _start(
+    config: Config, world: World, mission: Array, key: Array
+) -> tuple[DroneState, EventMemory | None, Disturbance | None]:
+    """At rest at the mission's start, facing its goal, the sensor at rest, and what the episode will fly against."""
     start, goal = world.missions.start[mission], world.missions.goal[mission]
     yaw = jnp.arctan2(goal[1] - start[1], goal[0] - start[0])
-    return drone.hover(start, yaw), sensor.at_rest(config, key)
+    drawn = None
+    if disturbances.any_on(config):
+        key, drawing = jax.random.split(key)
+        drawn = disturbances.draw(config, world.airframe.mass * world.airframe.gravity / 4, drawing)
+    return drone.hover(start, yaw), sensor.at_rest(config, key), drawn
 
 
 def observe(
@@ -201,13 +210,19 @@ def observe(
     poses: Flight,
     memory: EventMemory | None,
     key: Array,
+    disturbance: Disturbance | None = None,
 ) -> tuple[Observation, EventMemory | None]:
     """Returns what the sensor shows on the way to `goal` [3], metres, own state [OWN_SIZE] and motion [MOTION_SIZE].
 
     Args:
         move: as in `own_motion`.
         poses, memory, key: as in `sensor.sense`.
+        disturbance: whose errors own state and motion have; None where there are none.
     """
+    if disturbance is not None and disturbances.has_noise(config.noise):
+        key, errs = jax.random.split(key)
+        position, velocity = disturbances.believed(config.noise, disturbance, state.position, state.velocity, errs)
+        state = dataclasses.replace(state, position=position, velocity=velocity)
     sensed, memory = sensor.sense(config, scene, poses, memory, key)
     own, motion = own_state(config.env, scene, goal, state), own_motion(config.env, state, move)
     return Observation(sensed=sensed, own=own, motion=motion), memory
@@ -229,7 +244,9 @@ def reset(config: Config, world: World, key: Array, mission: Array | None = None
     scene = _scene_of(config, world, state.mission, state.decision)
     still = _hold(state.drone, len(frame_steps(config)))
     goal = world.missions.goal[state.mission]
-    observation, memory = observe(config, scene, goal, state.drone, jnp.zeros(3), still, state.memory, noise)
+    observation, memory = observe(
+        *(config, scene, goal, state.drone, jnp.zeros(3), still, state.memory, noise, state.disturbance)
+    )
     return dataclasses.replace(state, memory=memory), observation
 
 
@@ -237,7 +254,7 @@ def ended(config: Config, world: World, key: Array, mission: Array | None = None
     """Returns an environment whose next step is a reset; it needs no picture. The mission [] is as in `reset`."""
     key, draw, rest = jax.random.split(key, 3)
     mission = _drawn_mission(world, draw) if mission is None else mission
-    body, memory = _start(config, world, mission, rest)
+    body, memory, disturbance = _start(config, world, mission, rest)
     return EnvState(
         drone=body,
         mission=mission.astype(jnp.int32),
@@ -246,6 +263,7 @@ def ended(config: Config, world: World, key: Array, mission: Array | None = None
         memory=memory,
         episode_return=jnp.zeros(()),
         key=key,
+        disturbance=disturbance,
     )
 
 
@@ -271,6 +289,7 @@ class _Decision:
     reward: Array
     broken: Array  # [] bool, the body was not finite
     unrewarded: Array  # [] bool, the reward was not, although the body was
+    disturbance: Disturbance | None = None
 
 
 def step(
@@ -283,6 +302,9 @@ def step(
         mission: [] int, which one a reset takes; None draws one.
     """
     key, draw, rest, noise = jax.random.split(state.key, 4)
+    gusts = None
+    if disturbances.changes_flight(config):
+        key, gusts = jax.random.split(key)
     is_reset = state.ended
     fresh = _drawn_mission(world, draw) if mission is None else mission
     mission = jnp.where(is_reset, fresh, state.mission).astype(jnp.int32)
@@ -292,14 +314,14 @@ def step(
     scene = _scene_of(config, world, mission, state.decision)
 
     # For an ended environment the decision is computed and dropped.
-    start, rested = _start(config, world, mission, rest)
-    flown = _fly(config, world, scene, goal, state, action)
-    done = _choose(is_reset, _reset_in_place_of(flown, start), flown)
+    start, rested, drawn = _start(config, world, mission, rest)
+    flown = _fly(config, world, scene, goal, state, action, gusts)
+    done = _choose(is_reset, _reset_in_place_of(flown, start, drawn), flown)
 
     poses = _poses_seen(config, _choose(is_reset, start, state.drone), done.flight)
     memory = _choose(is_reset, rested, state.memory)
     move = jnp.where(is_reset, 0.0, jnp.asarray(ACTIONS, jnp.float32)[action])
-    observation, memory = observe(config, scene, goal, done.drone, move, poses, memory, noise)
+    observation, memory = observe(*(config, scene, goal, done.drone, move, poses, memory, noise, done.disturbance))
     for number in jax.tree.leaves(observation.sensed):
         check_finite(number, "what a sensor shows")
     # Own state and motion are of a finite body; counts of events are whole numbers, and nothing is checked.
@@ -315,6 +337,7 @@ def step(
         memory=memory,
         episode_return=jnp.where(is_reset, 0.0, state.episode_return + done.reward),
         key=key,
+        disturbance=done.disturbance,
     )
     return after, Step(
         observation=observation,
@@ -346,16 +369,28 @@ def _scene_of(config: Config, world: World, mission: Array, decision: Array) -> 
     return scene_at(take_scene(world.pool, world.missions.scene[mission]), time)
 
 
-def _fly(config: Config, world: World, scene: Scene, goal: Array, state: EnvState, action: Array) -> _Decision:
+def _fly(
+    config: Config, world: World, scene: Scene, goal: Array, state: EnvState, action: Array, gusts: Array | None
+) -> _Decision:
     """The decision as flown and judged.
 
     A diverged body stays where it was, so that no NaN reaches an observation; a decision without a finite reward has
-    diverged, too.
+    diverged, too. The key `gusts` is consumed; None where nothing changes how a drone flies.
     """
-    before = state.drone
-    command = velocity_command(config.env, action, drone.yaw_of(before.quaternion))
+    before, disturbance = state.drone, state.disturbance
+    move = action
+    if config.env.action_delay:
+        assert disturbance is not None and disturbance.move is not None
+        move, disturbance = disturbance.move, dataclasses.replace(disturbance, move=jnp.asarray(action, jnp.int32))
+    command = velocity_command(config.env, move, drone.yaw_of(before.quaternion))
     heading = heading_setpoint(config.env, before, goal, command)
-    after, flight = drone.fly(config.drone, world.airframe, before, command, heading)
+    if gusts is None:
+        after, flight = drone.fly(config.drone, world.airframe, before, command, heading)
+    else:
+        assert disturbance is not None
+        after, disturbance, flight = drone.fly_disturbed(
+            config, world.airframe, before, disturbance, command, heading, gusts
+        )
     outcome, end_step, contact = judge(config, scene, goal, before.position, flight, state.decision + 1)
     reward = _reward(config, world, scene, goal, state, after, action, outcome)
     numbers = jnp.concatenate([after.position, after.quaternion, after.velocity, after.angular_velocity])
@@ -372,6 +407,7 @@ def _fly(config: Config, world: World, scene: Scene, goal: Array, state: EnvStat
         reward=jnp.where(broken | unrewarded, 0.0, reward),
         broken=broken,
         unrewarded=unrewarded,
+        disturbance=_choose(broken, state.disturbance, disturbance),
     )
 
 
@@ -412,7 +448,7 @@ def _reward(
     return jnp.asarray(world.reward(transition), jnp.float32)
 
 
-def _reset_in_place_of(flown: _Decision, start: DroneState) -> _Decision:
+def _reset_in_place_of(flown: _Decision, start: DroneState, drawn: Disturbance | None = None) -> _Decision:
     """A reset with the arrays of a decision: at `start` throughout, with no reward."""
     return dataclasses.replace(
         flown,
@@ -422,6 +458,7 @@ def _reset_in_place_of(flown: _Decision, start: DroneState) -> _Decision:
         reward=jnp.zeros(()),
         broken=jnp.zeros((), bool),
         unrewarded=jnp.zeros((), bool),
+        disturbance=drawn,
     )
 
 
