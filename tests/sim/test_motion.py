@@ -220,9 +220,11 @@ def _fastest(scene, times):
     return jax.vmap(lambda t: fastest(scene, t))(times)
 
 
-def test_the_bound_of_a_circle_is_its_speed():
+def test_the_bound_of_an_ellipse_is_its_top_speed():
     scene = scene_of(UprightCylinders(position=[1, 1, 1], radius=1, half_height=1, albedo=GREY, motion=CIRCLING))
     np.testing.assert_allclose(fastest(scene, jnp.float32(0)), 3.0, rtol=1e-6)
+    swaying = scene_of(ball([5, 5, 5], motion=SWAYING))
+    np.testing.assert_allclose(fastest(swaying, jnp.float32(0)), 1.9 * np.hypot(1.5, 0.5), rtol=1e-6)
 
 
 # ---------------------------------------------------------------------------------------- pools
@@ -235,6 +237,12 @@ def test_a_pool_gives_moving_and_still_worlds_back():
     for index, scene in enumerate((first, second)):
         for ours, theirs in zip(scene_shapes(take_scene(pool, index)), scene_shapes(scene), strict=True):
             jax.tree.map(np.testing.assert_array_equal, ours, theirs)
+    times = jnp.float32([0.0, 2.0, 5.1])
+    for kind, expected in places(first, times).items():
+        present = expected[2, :, 0] < PARKED  # the pool's are packed
+        np.testing.assert_array_equal(
+            places(take_scene(pool, 0), times)[kind][:, : present.sum()], expected[:, present]
+        )
     one = jax.jit(lambda t: scene_at(take_scene(pool, 1), t))(jnp.float32(7.0))
     np.testing.assert_array_equal(one.spheres.position[0], [5, 5, 5])
 
