@@ -17,7 +17,7 @@ from edqn_jax.planners.free_space import holds, reachable
 from edqn_jax.planners.lattice import CELL_M, lattice_shape
 from edqn_jax.random import run_streams
 from edqn_jax.sim import drone, worlds
-from edqn_jax.sim.env import World
+from edqn_jax.sim.env import World, scene_of
 from edqn_jax.sim.free_points import Cells, cells_of, free_point
 from edqn_jax.sim.missions import Missions, own_missions, random_missions, spread_missions
 from edqn_jax.sim.mjcf import check_scene, load_world, mjcf_of, resolve_world, widened
@@ -44,7 +44,7 @@ class MissionSet:
 
     def scene(self, mission: int = 0) -> Scene:
         """Returns the world of one mission."""
-        return take_scene(self.world.pool, self.world.missions.scene[mission])
+        return scene_of(self.world, jnp.asarray(mission))
 
     def rewarded_by(self, reward: Reward | None) -> MissionSet:
         """Returns the same missions with this reward; None is the configured one."""
