@@ -138,10 +138,13 @@ class EventsConfig:
 class EnvConfig:
     """The task: sensor, actions, outcomes, reward."""
 
-    sensor: Literal["events", "frames", "frame-pair", "event-image", "blind", "depth", "ranges"] = "events"
+    sensor: Literal["events", "frames", "frame-pair", "event-image", "blind", "depth", "depth-motion", "ranges"] = (
+        "events"
+    )
     """What the drone observes besides its own state. `events`: the event camera. For comparison, `frames`: the newest
     brightness frame; `frame-pair`: the frames that the events would be made of; `event-image`: an image of the events
-    without a VAE; `blind`: nothing; `depth`: true depth; `ranges`: the true free distance along each move."""
+    without a VAE; `blind`: nothing; `depth`: true depth; `depth-motion`: that and how it changes by the obstacles' own
+    motion; `ranges`: the true free distance along each move."""
     speed_m_s: float = 4.0
     """Commanded speed per axis; an action is {-1, 0, 1}^3 times this, in the heading frame."""
     goal_radius_m: float = 2.0

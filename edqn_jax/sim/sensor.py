@@ -42,6 +42,10 @@ DEPTH_SCALE = 3.0
 CHANGE_SCALE = 0.1
 """Change of log brightness that `frame-pair` shows as 1: that of two or three events."""
 
+CLOSING_SCALE = 0.5
+"""Rate at which `depth-motion` shows obstacles come nearer, 1/s, per unit before it saturates: of `depth`'s own
+values, 3 m/s at a distance of 4 m."""
+
 
 class Form(enum.Enum):
     """Form of what a sensor shows. It decides how the observation is embedded and drawn."""
@@ -243,6 +247,22 @@ def _show_depth(
     return nearness_image(config, *_last(scene, poses))[None], None
 
 
+def _show_depth_motion(
+    config: Config, scene: Scene, poses: Flight, memory: SensorMemory, key: Array
+) -> tuple[Sensed, SensorMemory]:
+    """Returns what `depth` shows, and the rate at which it changed by the obstacles' own motion alone.
+
+    Both depths are seen from the last pose, so that the drone's own motion does not show.
+    """
+    now, position, quaternion = _last(scene, poses)
+    near = nearness_image(config, now, position, quaternion)
+    if poses.time is None:
+        return jnp.stack([near, jnp.zeros_like(near)]), None
+    before = nearness_image(config, scene_at(scene, poses.time[0]), position, quaternion)
+    rate = (near - before) / (poses.time[-1] - poses.time[0])
+    return jnp.stack([near, jnp.tanh(rate / CLOSING_SCALE)]), None
+
+
 def nearness_image(config: Config, scene: Scene, position: Array, quaternion: Array) -> Array:
     """Returns what `depth` shows [H, W] from a body at `position` [3], metres, with attitude `quaternion` [4]."""
     metres = camera.depth(config.camera, scene, position, mount_rotation(config, quaternion))
@@ -338,6 +358,15 @@ SENSORS: dict[str, Sensor] = {
     "depth": Sensor(
         show=_show_depth,
         form=Form.PICTURE,
+        draws_frames=True,
+        image=Image("nearness", "nearness (3 is contact)"),
+    ),
+    # True depth, and how the obstacles' own motion changes it.
+    "depth-motion": Sensor(
+        show=_show_depth_motion,
+        form=Form.PICTURE,
+        pictures=lambda config: 2,
+        frame_times_s=_window,
         draws_frames=True,
         image=Image("nearness", "nearness (3 is contact)"),
     ),

@@ -128,6 +128,38 @@ def test_every_frame_sees_the_world_at_its_own_time(name):
         np.testing.assert_allclose(observed.sensed, expected, atol=2e-3, err_msg=f"{decision}")
 
 
+def test_true_depth_with_the_obstacles_motion_shows_who_comes_and_not_that_the_drone_flies():
+    config, ahead = configured("depth-motion"), move_number("ahead")
+    coming = UprightBoxes([30.0, 20, 6], [1, 2, 6], 0.0, GREY, motion=sliding((-3.0, 0.0, 0.0)))
+    world, still = world_of(coming), world_of(dataclasses.replace(coming, motion=None))
+    step = fly(world, [ahead] * 8, config)[2][-1]
+    near, rate = np.asarray(step.observation.sensed)
+    assert near[10:14, 14:18].min() > 0.5 and rate[:, 14:18].max() > 0.3
+    assert np.abs(rate[:, :6]).max() == 0  # nothing moves there but the drone itself
+    # By hand, for a pixel of its near face: how nearness changed within 0.04 s, at 3 m/s.
+    away = float(np.asarray(sensor.distance_of(near[12, 16] / sensor.DEPTH_SCALE)))
+    slant = away / (29 - 3 * 8 * N * DT - float(step.flight.position[-1, 0]))  # of the pixel's ray
+    before = sensor.DEPTH_SCALE * sensor.nearness(away + 0.12 * slant)
+    expected = np.tanh((near[12, 16] - before) / 0.04 / sensor.CLOSING_SCALE)
+    assert abs(rate[12, 16] - expected) < 0.01
+    there = np.asarray(fly(still, [ahead] * 3, config)[2][-1].observation.sensed)
+    depth = np.asarray(fly(still, [ahead] * 3, configured("depth"))[2][-1].observation.sensed)
+    np.testing.assert_allclose(there, np.stack([depth[0], np.zeros_like(depth[0])]), atol=1e-5)
+
+
+def test_a_window_as_long_as_a_decision_begins_at_its_beginning():
+    config = configured("frame-pair")
+    window = (-N * DT, 0.0)
+    config = dataclasses.replace(config, events=dataclasses.replace(config.events, frame_times_s=window))
+    world = world_of(pillar(sliding()))
+    _, _, steps = fly(world, [HOVER] * 2, config)
+    seen = [np.asarray(step.observation.sensed) for step in steps]
+    # The frame at the end of one decision is that at the beginning of the next.
+    first = seen[1][0] - sensor.CHANGE_SCALE * seen[1][1]
+    np.testing.assert_allclose(first, seen[0][0], atol=1e-3)
+    assert np.abs(seen[1][1]).max() > 1
+
+
 def test_the_labels_of_the_encoder_are_of_the_moment(hovered):
     states, _, _ = hovered[True]
     world = world_of(pillar(sliding()))

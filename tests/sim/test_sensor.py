@@ -208,12 +208,14 @@ def test_a_frame_pair_is_the_frames_that_events_are_made_of(world) -> None:
 
 
 DRAWN = {"events": 2, "frames": 1, "frame-pair": 2, "depth": 1, "event-image": 2, "ranges": 0, "blind": 0}
+DRAWN |= {"depth-motion": 2}
 """Pictures of a decision by sensor."""
 
 SHAPES = {
     "frames": (1, 12, 16),
     "frame-pair": (2, 12, 16),
     "depth": (1, 12, 16),
+    "depth-motion": (2, 12, 16),
     "event-image": (192,),
     "ranges": (26,),
 }
@@ -227,7 +229,7 @@ def test_what_a_decision_draws(world, name: str, frames: int) -> None:
     program = jax.make_jaxpr(lambda s: env.step(config, world, s, 0))(state)
     drawn = [e.outvars[0].aval.shape for e in program.jaxpr.eqns if e.primitive.name == "pictures"]  # type: ignore
     # Two frames of a window are drawn together.
-    assert drawn == ([(frames, 12, 16)] if frames and name != "depth" else [])
+    assert drawn == ([(frames, 12, 16)] if frames and name not in ("depth", "depth-motion") else [])
     sensed = jax.eval_shape(lambda s: env.step(config, world, s, 0), state)[1].observation.sensed
     if name == "events":
         assert isinstance(sensed, EventField)
