@@ -29,6 +29,7 @@ from edqn_jax.sim.events import EventField
 from edqn_jax.sim.missions import own_missions
 from edqn_jax.sim.mjcf import check_scene, load_world, mjcf_of, resolve_world
 from edqn_jax.sim.moves import move_number
+from edqn_jax.sim.moving_worlds import Moving
 from edqn_jax.sim.reward import Reward
 from edqn_jax.sim.scene import Scene, scene_at, stack_scenes
 from edqn_jax.sim.worlds import SPLITS, Split, random_pool, world_keys
@@ -157,16 +158,16 @@ def make(
     """
     name = str(world) if world is not None else (config or Config()).world.name
     config = make_config(name) if config is None else config
-    pool = _random_pool(name, worlds, seed, split) if name in FAMILIES else _file_pool(config, name, worlds)
+    pool = _random_pool(config, name, worlds, seed, split) if name in FAMILIES else _file_pool(config, name, worlds)
     return Environment(config, World(drone.load_airframe(config.drone), pool, own_missions(pool), reward))
 
 
-def _random_pool(name: str, count: int, seed: int, split: Split) -> Scene:
+def _random_pool(config: Config, name: str, count: int, seed: int, split: Split) -> Scene:
     if split not in SPLITS:
         raise ConfigError(f"split must be one of {', '.join(SPLITS)}, not '{split}'")
     if count < 1 or seed < 0:
         raise ConfigError(f"worlds must be at least 1 and seed at least 0, not {count} and {seed}")
-    return random_pool(name, world_keys(split, count, first=seed * count))
+    return random_pool(name, world_keys(split, count, first=seed * count), Moving.of(config))
 
 
 def _file_pool(config: Config, name: str, count: int) -> Scene:

@@ -106,7 +106,7 @@ def in_flight(throw: Throw, start: Array, goal: Array, time: Array, outside: Arr
         start, goal: [3] metres, of the drone that is thrown at.
         outside: [N] bool, whether it is beyond the flight volume.
     """
-    launched = time >= hit_time(throw, start, goal) - throw.early
+    launched = time > hit_time(throw, start, goal) - throw.early
     return (throw.early > 0) & launched & ~outside
 
 
