@@ -14,6 +14,7 @@ from edqn_jax.evaluation.judge import clearance, fastest, load_judge, replay_con
 from edqn_jax.evaluation.missions import MissionSet, load_missions
 from edqn_jax.evaluation.rollouts import fly_missions
 from edqn_jax.evaluation.verdicts import check_verdicts
+from edqn_jax.sim.missions import random_missions
 from edqn_jax.sim.mjcf import load_world
 from edqn_jax.sim.outcomes import Outcome
 from edqn_jax.sim.scene import path_contact, scene_at, signed_distance
@@ -140,7 +141,10 @@ def test_a_still_world_is_judged_as_before():
 @pytest.fixture(scope="module")
 def course() -> MissionSet:
     moving = {"moving_share": 0.8, "moving_speed_m_s": 4.0, "balls": 4}
-    return load_missions(make_config("medium", world=moving), "medium", 60)
+    course = load_missions(make_config("medium", world=moving), "medium", 60)
+    # Balls are thrown at the missions' drones, which begin elsewhere than the worlds' own.
+    missions = random_missions(course.world.pool, 60, jax.random.key(5))
+    return dataclasses.replace(course, world=dataclasses.replace(course.world, missions=missions))
 
 
 @pytest.mark.slow
