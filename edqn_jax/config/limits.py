@@ -60,6 +60,19 @@ def _world(world: WorldConfig) -> None:
     _at_most(world, "world", ["pool_size", "missions"], 1_000_000)
     _share(world, "world", ["own_start_fraction"])
     _not_negative(world, "world", ["start_jitter_m"])
+    _share(world, "world", ["moving_share"])
+    _positive(world, "world", ["moving_speed_m_s", "ball_speed_m_s"])
+    _not_negative(world, "world", ["balls", "ball_gravity_m_s2"])
+    # A random start is free of what moves as fast as this for the first two seconds (`sim/free_points.py`).
+    _at_most(world, "world", ["moving_speed_m_s"], 5)
+    _at_most(world, "world", ["ball_speed_m_s"], 100)
+    _at_most(world, "world", ["balls"], 64)
+    if (world.moving_share or world.balls) and world.name not in FAMILIES:
+        option = "moving_share" if world.moving_share else "balls"
+        raise ConfigError(
+            f"world.{option} is for random worlds ({', '.join(FAMILIES)}) alone; in '{world.name}' the file says what "
+            f"moves: give --world.{option.replace('_', '-')} 0"
+        )
     if not world.name:
         raise ConfigError("world.name must be the name of a world, not empty")
     if world.flown and world.name not in FAMILIES:

@@ -16,7 +16,8 @@ class WorldConfig:
 
     name: str = "paper"
     """Where to train: `paper`, the path of an MJCF file, or random worlds: open ones (`sparse`, `medium`, `dense`, or
-    `open`: all three), closed ones (`rooms`, `forest`, `canyon`), or all six (`mixed`, a quarter of them open)."""
+    `open`: all three), closed ones (`rooms`, `forest`, `canyon`), all six (`mixed`, a quarter of them open), or medium
+    ones in which obstacles move (`moving`)."""
     flown: str = ""
     """World of the flight at the end of a run in random worlds: `paper` or the path of an MJCF file; training never
     uses it. Empty: the first test world. A world from a file is flown itself."""
@@ -28,6 +29,16 @@ class WorldConfig:
     """Share of training missions that begin within `start_jitter_m` of the world's own start."""
     start_jitter_m: float = 1.0
     """Half width of the box around the world's own start that such starts are drawn from, metres."""
+    moving_share: float = 0.0
+    """Share of the obstacles of random worlds that move; 0 is none, and one half in the worlds `moving`."""
+    moving_speed_m_s: float = 3.0
+    """Speed of the fastest of them, m/s; each has its own, of at least 0.3 times this."""
+    balls: int = 0
+    """Balls in each random world that are thrown at where a drone would be that flies straight to its goal."""
+    ball_speed_m_s: float = 6.0
+    """Speed of these balls, m/s."""
+    ball_gravity_m_s2: float = 0.0
+    """Gravity that bends their way, m/s^2; at 0 they fly straight."""
 
 
 @dataclass(frozen=True)
@@ -138,10 +149,13 @@ class EventsConfig:
 class EnvConfig:
     """The task: sensor, actions, outcomes, reward."""
 
-    sensor: Literal["events", "frames", "frame-pair", "event-image", "blind", "depth", "ranges"] = "events"
+    sensor: Literal["events", "frames", "frame-pair", "event-image", "blind", "depth", "depth-motion", "ranges"] = (
+        "events"
+    )
     """What the drone observes besides its own state. `events`: the event camera. For comparison, `frames`: the newest
     brightness frame; `frame-pair`: the frames that the events would be made of; `event-image`: an image of the events
-    without a VAE; `blind`: nothing; `depth`: true depth; `ranges`: the true free distance along each move."""
+    without a VAE; `blind`: nothing; `depth`: true depth; `depth-motion`: that and how it changes by the obstacles' own
+    motion; `ranges`: the true free distance along each move."""
     speed_m_s: float = 4.0
     """Commanded speed per axis; an action is {-1, 0, 1}^3 times this, in the heading frame."""
     goal_radius_m: float = 2.0
@@ -435,7 +449,7 @@ MIXTURES: dict[str, dict[str, int]] = {
     "mixed": {**dict.fromkeys(_OPEN, 1), **dict.fromkeys(_CLOSED, 3)},
 }
 """Random worlds that are of one of several families, with their shares; a quarter of the mixed ones are open."""
-FAMILIES = (*_OPEN, *_CLOSED, *MIXTURES)
+FAMILIES = (*_OPEN, *_CLOSED, *MIXTURES, "moving")
 """Names of random worlds."""
 WITH_DETOURS = (*_CLOSED, "mixed")
 """Names of random worlds in which the straight line to the goal is seldom free."""

@@ -22,7 +22,7 @@ from edqn_jax.learn.policy import PolicyParams
 from edqn_jax.packages import require
 from edqn_jax.report.flights import OBLIQUE, draw_end_marks, draw_stage
 from edqn_jax.report.images import LOOKS, scale_of
-from edqn_jax.report.sights import Sights, decision_rows, poses
+from edqn_jax.report.sights import Sights, decision_rows, poses, times_of
 from edqn_jax.report.solids import MAP, View, hidden
 from edqn_jax.report.style import INK, LINE, MUTED, OUTCOME_COLOURS, OUTCOME_LABELS, STYLE
 from edqn_jax.sim.camera import on_screen
@@ -97,7 +97,7 @@ class _Stage:
     def frame(self, decision: int, row: int, outcome: str = "") -> Image.Image:
         """Returns the picture of a decision, with the path up to a row of the trajectory."""
         seen_at = decision_rows(self._sights.config, self._flown)[decision, -1]
-        self._rgb.set_data(on_screen(self._sights.rgb(*poses(self._flown, seen_at))))
+        self._rgb.set_data(on_screen(self._sights.rgb(*poses(self._flown, seen_at), times_of(self._flown, seen_at))))
         if self._shown is not None:
             self._sensed.set_data(self._shown[decision])
         for view in (self._oblique, self._map):

@@ -73,6 +73,7 @@ class Flight:
     position: Array  # [n, 3] metres, world
     quaternion: Array  # [n, 4]
     velocity: Array  # [n, 3] m/s, world
+    time: Array | None = None  # [n] seconds of the episode, in a world that moves
 
 
 def c_model(config: DroneConfig) -> mujoco.MjModel:

@@ -12,6 +12,7 @@ from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import struct
 from jax import Array
 
@@ -26,7 +27,7 @@ from edqn_jax.sim.missions import Missions
 from edqn_jax.sim.moves import ACTIONS
 from edqn_jax.sim.outcomes import Outcome, judge
 from edqn_jax.sim.reward import Reward, Transition, configured_reward
-from edqn_jax.sim.scene import Scene, scene_at, signed_distance, take_scene
+from edqn_jax.sim.scene import Scene, moves, scene_at, signed_distance, take_scene
 from edqn_jax.sim.sensor import Sensed, frame_steps
 
 OWN_SIZE = 10
@@ -233,7 +234,7 @@ def nearness(config: Config, world: World, state: EnvState) -> Array:
 
     A label for training: no observation holds it.
     """
-    scene = _scene_of(config, world, state.mission, jnp.maximum(state.decision - 1, 0))
+    scene = scene_now(config, world, state)
     return sensor.nearness_image(config, scene, state.drone.position, state.drone.quaternion)
 
 
@@ -241,8 +242,9 @@ def reset(config: Config, world: World, key: Array, mission: Array | None = None
     """Returns a fresh environment on a mission drawn from the pool, or on the given one, [] int32."""
     key, noise = jax.random.split(key)
     state = dataclasses.replace(ended(config, world, key, mission), ended=jnp.zeros((), bool))
-    scene = _scene_of(config, world, state.mission, state.decision)
-    still = _hold(state.drone, len(frame_steps(config)))
+    scene = scene_of(world, state.mission)
+    before = np.array(frame_steps(config)) - config.drone.physics_steps
+    still = _timed(config, scene, _hold(state.drone, len(before)), jnp.asarray(before) if moves(scene) else None)
     goal = world.missions.goal[state.mission]
     observation, memory = observe(
         *(config, scene, goal, state.drone, jnp.zeros(3), still, state.memory, noise, state.disturbance)
@@ -311,12 +313,16 @@ def step(
     check_index(action, len(ACTIONS), "the moves")
     check_index(mission, world.missions.scene.shape[0], "the missions")
     goal = world.missions.goal[mission]
-    scene = _scene_of(config, world, mission, state.decision)
+    scene = scene_of(world, mission)
 
     # For an ended environment the decision is computed and dropped.
     start, rested, drawn = _start(config, world, mission, rest)
     flown = _fly(config, world, scene, goal, state, action, gusts)
     done = _choose(is_reset, _reset_in_place_of(flown, start, drawn), flown)
+    n = config.drone.physics_steps
+    # The time before a start is negative: what moves has moved before.
+    steps = jnp.where(is_reset, -n, state.decision * n) + jnp.arange(1, n + 1) if moves(scene) else None
+    done = dataclasses.replace(done, flight=_timed(config, scene, done.flight, steps))
 
     poses = _poses_seen(config, _choose(is_reset, start, state.drone), done.flight)
     memory = _choose(is_reset, rested, state.memory)
@@ -363,10 +369,33 @@ def is_finite(tree: object) -> Array:
     return jnp.isfinite(sum(sums, jnp.zeros(())))
 
 
-def _scene_of(config: Config, world: World, mission: Array, decision: Array) -> Scene:
-    """The mission's world as it stands at this decision of the episode."""
-    time = decision * (config.drone.physics_steps * config.drone.physics_dt_s)
-    return scene_at(take_scene(world.pool, world.missions.scene[mission]), time)
+def scene_of(world: World, mission: Array) -> Scene:
+    """Returns the world of a mission [] int32, with its motion; balls are thrown at the mission's own drone."""
+    scene = take_scene(world.pool, world.missions.scene[mission])
+    if not moves(scene):
+        return scene
+    return dataclasses.replace(scene, start=world.missions.start[mission], goal=world.missions.goal[mission])
+
+
+def scene_now(config: Config, world: World, state: EnvState) -> Scene:
+    """Returns the world of an environment as it stands now, after its last decision."""
+    scene = scene_of(world, state.mission)
+    return scene_at(scene, _time(config, state.decision) if moves(scene) else None)
+
+
+def _time(config: Config, decisions: Array) -> Array:
+    """Returns the seconds [] of an episode after so many decisions []."""
+    return decisions * (config.drone.physics_steps * config.drone.physics_dt_s)
+
+
+def _timed(config: Config, scene: Scene, flight: Flight, steps: Array | None) -> Flight:
+    """Returns a flight with the times of its poses, taken after physics steps `steps` [n] of the episode.
+
+    In a still world nobody asks for times, and there are none.
+    """
+    if not moves(scene):
+        return flight
+    return dataclasses.replace(flight, time=steps * config.drone.physics_dt_s)
 
 
 def _fly(
@@ -436,11 +465,12 @@ def _reward(
     configured = configured_reward(config.env, config.agent.discount, outcome, left, still_left, moved)
     if world.reward is None:
         return configured
+    afterwards = scene_at(scene, _time(config, state.decision + 1) if moves(scene) else None)
     transition = Transition(
         before=before.position,
         after=after.position,
         goal=goal,
-        clearance=signed_distance(scene, after.position) - config.drone.body_radius_m,
+        clearance=signed_distance(afterwards, after.position) - config.drone.body_radius_m,
         move=jnp.asarray(action, jnp.int32),
         outcome=outcome,
         configured=configured,
@@ -464,9 +494,10 @@ def _reset_in_place_of(flown: _Decision, start: DroneState, drawn: Disturbance |
 
 def _poses_seen(config: Config, first: DroneState, flight: Flight) -> Flight:
     """Poses [T] at which the sensor looks, of those before the first and after each physics step."""
+    began = None if flight.time is None else flight.time[0] - config.drone.physics_dt_s
     path = jax.tree.map(
         lambda a, b: jnp.concatenate([a[None], b]),
-        Flight(position=first.position, quaternion=first.quaternion, velocity=first.velocity),
+        Flight(position=first.position, quaternion=first.quaternion, velocity=first.velocity, time=began),
         flight,
     )
     return jax.tree.map(lambda x: jnp.stack([x[i] for i in frame_steps(config)]), path)
