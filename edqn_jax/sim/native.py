@@ -6,7 +6,6 @@ functions in JAX (`columns.py`, `depth.py`). Both agree to rounding (`tests/sim/
 
 from __future__ import annotations
 
-import dataclasses
 from pathlib import Path
 
 import jax
@@ -23,8 +22,13 @@ from edqn_jax.sim.texture import WAVES
 
 SOURCE = Path(__file__).with_name("pictures.c")
 
-KINDS = ("boxes", "cylinders", "spheres", "planes")
-"""Kinds of shape that the library draws. A scene with room for any other is drawn by JAX."""
+OPERANDS = {
+    "boxes": ("position", "half", "yaw", "albedo"),
+    "cylinders": ("position", "radius", "half_height", "albedo"),
+    "spheres": ("position", "radius", "albedo"),
+    "planes": ("position", "normal", "albedo"),
+}
+"""Kinds of shape that the library draws, and what it reads of each. A scene with room for any other is drawn by JAX."""
 
 NOWHERE = 1e29
 """Depths beyond this, in metres, are those of rays that meet nothing."""
@@ -58,7 +62,7 @@ def _call(target: str, config: CameraConfig, scene: Scene, *frames: Array) -> Ar
     )
     first = [raycast.pitch_of(config), config.texture_contrast, config.ambient]
     constants = np.array([*first, *raycast.sun_direction(config), *config.sky_rgb], np.float32)
-    shapes = [getattr(getattr(scene, kind), f.name) for kind in KINDS for f in dataclasses.fields(getattr(scene, kind))]
+    shapes = [getattr(getattr(scene, kind), name) for kind, names in OPERANDS.items() for name in names]
     origin, rotation, *weights = frames
     count = most_rows([*shapes, *frames])
     shape = jax.ShapeDtypeStruct((count, config.height, config.width), jnp.float32)
