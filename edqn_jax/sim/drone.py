@@ -330,10 +330,8 @@ def physics_step(
             *(state.position, state.quaternion, state.velocity, state.angular_velocity),
             push,
         )
-    elif load is None:
-        moved = _mjx_step(airframe, state, {"ctrl": thrust})
     else:
-        moved = _mjx_step(airframe, state, {"qfrc_applied": _applied(airframe, state, thrust, load)})
+        moved = _mjx_step(airframe, state, _applied(airframe, state, thrust, load or Load()))
     position, quaternion, velocity, angular_velocity = moved
     return dataclasses.replace(
         state, position=position, quaternion=quaternion, velocity=velocity, angular_velocity=angular_velocity
@@ -362,28 +360,25 @@ def _applied(airframe: Airframe, state: DroneState, thrust: Array, load: Load) -
     return jnp.stack([*force, *torque])
 
 
-def _mjx_step(airframe: Airframe, state: DroneState, driven: dict[str, Array]) -> tuple[Array, Array, Array, Array]:
+def _mjx_step(airframe: Airframe, state: DroneState, applied: Array) -> tuple[Array, Array, Array, Array]:
     """Returns position, quaternion, velocity and angular velocity after one MJX step.
 
     These are the stages of `mjx.step` for this model: with the body frame at the centre of mass and no joint
-    below it, the mass matrix is constant, the template's, and there are no collisions, constraints or damping.
+    below it, the mass matrix is constant, the template's, and there are no collisions, constraints or damping. What the
+    rotors do comes as an applied force: MJX's own stages of actuation take a quarter of the step.
 
     Args:
-        driven: `ctrl`, the rotors' thrusts [4], or all that acts in their place, `qfrc_applied` [6].
+        applied: [6] force (N, world) and torque (N m, body).
     """
     model = airframe.model
     data = airframe.data.replace(
         qpos=jnp.concatenate([state.position, state.quaternion]),
         qvel=jnp.concatenate([state.velocity, state.angular_velocity]),
-        **driven,
+        qfrc_applied=applied,
     )
     with jax.numpy_rank_promotion("allow"):  # MJX's own arithmetic relies on it
         data = mjx.com_pos(model, mjx.kinematics(model, data))
-        if "ctrl" in driven:
-            data = mjx.transmission(model, data)
         data = mjx.rne(model, mjx.com_vel(model, data))
-        if "ctrl" in driven:
-            data = mjx.fwd_actuation(model, data)
         data = mjx.fwd_acceleration(model, data)
         data = mjx.euler(model, data.replace(qacc=data.qacc_smooth))
     return data.qpos[:3], data.qpos[3:], data.qvel[:3], data.qvel[3:]
