@@ -14,7 +14,7 @@ from conventional_stack import camera, events, flight, task, world
 from conventional_stack.stopwatch import Stopwatch
 from edqn_jax.config import Config
 from edqn_jax.errors import ConfigError
-from edqn_jax.sim import env
+from edqn_jax.sim import disturbances, env
 from edqn_jax.sim.env import OWN_SIZE
 from edqn_jax.sim.moves import ACTIONS
 from edqn_jax.sim.scene import take_scene
@@ -99,6 +99,11 @@ def check(config: Config) -> None:
     if config.env.reward == "geodesic":
         raise ConfigError(
             "the conventional stack supports only rewards of straight metres; set env.reward to 'progress'"
+        )
+    if disturbances.any_on(config):
+        raise ConfigError(
+            "the conventional stack supports only undisturbed flights; leave air, body, motors, noise and "
+            "env.action_delay as they are"
         )
 
 

@@ -107,10 +107,11 @@ def fly(trained: Trained, course: Course) -> Flights:
 
 def check(config: AgentConfig) -> None:
     """Raises ConfigError if stable-baselines3's DQN does not support the configuration."""
-    if config.history != 1 or config.layer_norm or config.huber_delta != 1.0 or config.exploration_episodes > 0:
+    unknown = config.layer_norm or config.last_move or config.exploration_episodes > 0
+    if config.history != 1 or config.huber_delta != 1.0 or unknown:
         raise ConfigError(
-            "the conventional stack's DQN supports only agent.history 1, agent.layer_norm False, agent.huber_delta 1 "
-            "and agent.exploration_episodes 0"
+            "the conventional stack's DQN supports only agent.history 1, agent.layer_norm False, agent.last_move "
+            "False, agent.huber_delta 1 and agent.exploration_episodes 0"
         )
 
 

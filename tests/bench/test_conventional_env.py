@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from conventional_stack import task
 from conventional_stack.env import DroneEnv
 from conventional_stack.fleet import Fleet, Record
-from edqn_jax.config import CameraConfig, Config, DroneConfig, EncoderConfig, EnvConfig, EventsConfig
+from edqn_jax.config import AirConfig, CameraConfig, Config, DroneConfig, EncoderConfig, EnvConfig, EventsConfig
 from edqn_jax.errors import ConfigError
 from edqn_jax.packages import require
 from edqn_jax.sim import drone, env, events, outcomes
@@ -242,6 +242,8 @@ def test_who_ended_starts_anew_within_the_step():
         {"encoder": EncoderConfig(retrain_at=(0.5,))},
         {"env": EnvConfig(position=False)},
         {"env": EnvConfig(reward="geodesic")},
+        {"air": AirConfig(gusts_m_s=1.0)},
+        {"env": EnvConfig(action_delay=1)},
     ],
 )
 def test_what_this_stack_does_not_have_is_said_before_it_flies(change):

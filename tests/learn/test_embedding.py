@@ -31,8 +31,8 @@ from tests.whole.test_trainer import CONFIG
 QUICK = dataclasses.replace(CONFIG, drone=dataclasses.replace(CONFIG.drone, physics="rigid_body"))
 """Sensors do not depend on the physics, and these compile in less time; `test_trainer` trains with the default ones."""
 
-SENSORS = ("events", "frames", "frame-pair", "depth", "event-image", "ranges", "blind")
-CODED = SENSORS[:4]
+SENSORS = ("events", "frames", "frame-pair", "depth", "depth-motion", "event-image", "ranges", "blind")
+CODED = SENSORS[:5]
 STEPS = 12
 
 

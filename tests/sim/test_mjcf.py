@@ -281,6 +281,9 @@ def assert_same_scene(ours, theirs):
         assert type(a) is type(b)
         for field in dataclasses.fields(a):
             x, y = getattr(a, field.name), getattr(b, field.name)
+            if x is None or y is None:  # of what moves
+                assert x is y, field.name
+                continue
             if field.name == "yaw":  # a box turned by half a turn is the same box
                 x, y = np.sin(2 * x), np.sin(2 * y)
             np.testing.assert_allclose(x, y, rtol=1e-6, atol=2e-6, err_msg=field.name)

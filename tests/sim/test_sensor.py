@@ -208,12 +208,14 @@ def test_a_frame_pair_is_the_frames_that_events_are_made_of(world) -> None:
 
 
 DRAWN = {"events": 2, "frames": 1, "frame-pair": 2, "depth": 1, "event-image": 2, "ranges": 0, "blind": 0}
+DRAWN |= {"depth-motion": 2}
 """Pictures of a decision by sensor."""
 
 SHAPES = {
     "frames": (1, 12, 16),
     "frame-pair": (2, 12, 16),
     "depth": (1, 12, 16),
+    "depth-motion": (2, 12, 16),
     "event-image": (192,),
     "ranges": (26,),
 }
