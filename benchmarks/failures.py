@@ -92,6 +92,7 @@ def seen_of_it(config: Config, scene: Scene, only: Scene, poses: Flight) -> tupl
 
     def one(poses: Flight) -> tuple[jax.Array, jax.Array]:
         position, rotation = poses.position[-1], sensor.mount_rotation(config, poses.quaternion[-1])
+        assert poses.time is not None
         now = poses.time[-1]
         whole, own = (camera.depth(config.camera, scene_at(each, now), position, rotation) for each in (scene, only))
         shows = jnp.isfinite(own) & (own < whole + SAME_M)

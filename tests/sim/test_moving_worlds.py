@@ -95,6 +95,7 @@ def test_what_runs_stays_between_the_faces_of_the_volume(pools):
     times, found = jnp.linspace(0, 52, 200), 0
     for i in range(WORLDS):
         scene = take_scene(pools["everything"], i)
+        assert scene.cylinders.motion is not None
         runs = np.abs(np.asarray(scene.cylinders.motion.velocity)).max(-1) > 0
         at = np.asarray(places(scene, times)["cylinders"])[:, runs]
         beyond = np.asarray(scene.cylinders.radius)[runs][None, :, None]
