@@ -77,7 +77,7 @@ Examples:
 
 COMMON = {
     "world.name": "where to train: paper, an MJCF file, or random worlds: sparse, medium, dense, open, rooms, forest, "
-    "canyon, mixed",
+    "canyon, mixed, moving",
     "world.flown": "world of the last flight of a run in random worlds",
     "run_dir": "folder of the run (default: a new, dated one under runs/)",
     "resume": "what to do with a run in --run-dir",

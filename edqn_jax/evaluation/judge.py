@@ -181,8 +181,8 @@ def load_judge(world: str | Path | mujoco.MjSpec, radius: float, volume: ArrayLi
     plane = model.geom_type[solids] == mujoco.mjtGeom.mjGEOM_PLANE
     reach = np.where(plane, np.inf, model.geom_rbound[solids])
     moving = tuple(_moving(model, data, solids, volume))
-    ends = tuple(np.array(data.site(n).xpos) if n in _sites(model) else np.zeros(3) for n in ("start", "goal"))
-    return Judge(model=model, data=data, probe=probe, solids=solids, reach=reach, moving=moving, ends=ends)
+    start, goal = (np.array(data.site(n).xpos) if n in _sites(model) else np.zeros(3) for n in ("start", "goal"))
+    return Judge(model=model, data=data, probe=probe, solids=solids, reach=reach, moving=moving, ends=(start, goal))
 
 
 def _sites(model: mujoco.MjModel) -> list[str]:

@@ -7,6 +7,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
+import jax.numpy as jnp
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import PolyCollection
@@ -101,7 +102,7 @@ def standing(scene: Scene) -> Scene:
 
 def moving_solids(scene: Scene, time: float) -> list[Solid]:
     """Returns the shapes of one world that move, where they are at `time` seconds; a ball only while it flies."""
-    return solids_of(_only(scene, scene_at(scene, np.float32(time)), moving=True))
+    return solids_of(_only(scene, scene_at(scene, jnp.float32(time)), moving=True))
 
 
 def _only(scene: Scene, now: Scene, moving: bool) -> Scene:

@@ -395,6 +395,7 @@ def _timed(config: Config, scene: Scene, flight: Flight, steps: Array | None) ->
     """
     if not moves(scene):
         return flight
+    assert steps is not None
     return dataclasses.replace(flight, time=steps * config.drone.physics_dt_s)
 
 

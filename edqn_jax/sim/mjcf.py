@@ -32,7 +32,7 @@ from jax.typing import ArrayLike
 from edqn_jax.config import FAMILIES
 from edqn_jax.sim.mjcf_files import SceneError, checked_text
 from edqn_jax.sim.mjcf_motion import PREFIX, motions_of, set_in_motion, text_of
-from edqn_jax.sim.motion import hit_time, thrown_to
+from edqn_jax.sim.motion import Throw, hit_time, thrown_to
 from edqn_jax.sim.scene import (
     KINDS,
     Capsules,
@@ -298,7 +298,8 @@ def mjcf_of(scene: Scene, *, title: str = "world") -> str:
         number = counts[attributes["type"]] = counts.get(attributes["type"], 0) + 1
         name, parent, said = f"{attributes['type']}{number}", world, text_of(shape)
         if said is not None:
-            place = _launch(scene, shape) if getattr(shape, "throw", None) is not None else shape.position
+            throw = shape.throw if isinstance(shape, Spheres) else None
+            place = shape.position if throw is None else _launch(scene, throw)
             attributes.pop("pos")
             parent = ElementTree.SubElement(world, "body", name=f"moving {name}", mocap="true", pos=_numbers(place))
             ElementTree.SubElement(custom, "text", name=f"{PREFIX}moving {name}", data=said)
@@ -309,9 +310,9 @@ def mjcf_of(scene: Scene, *, title: str = "world") -> str:
     return ElementTree.tostring(root, encoding="unicode") + "\n"
 
 
-def _launch(scene: Scene, ball: Shape) -> np.ndarray:
+def _launch(scene: Scene, one: Throw) -> np.ndarray:
     """Returns where a ball is launched at a drone between the world's own start and goal, [3] metres."""
-    throw, ends = jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], ball.throw), (scene.start, scene.goal)
+    throw, ends = jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], one), (scene.start, scene.goal)
     return np.asarray(thrown_to(throw, *ends, (hit_time(throw, *ends) - throw.early)[0]))[0]
 
 

@@ -24,11 +24,12 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
+import jax
 import mujoco
 import numpy as np
 
 from edqn_jax.sim.mjcf_files import SceneError
-from edqn_jax.sim.motion import Motion, Throw, at_rest
+from edqn_jax.sim.motion import Throw, at_rest
 from edqn_jax.sim.scene import PARKED, Planes, Shape, Spheres
 
 PREFIX = "motion:"
@@ -81,9 +82,9 @@ def _one(words: Sequence[str], title: str) -> Said:
         raise SceneError(f"{title} must begin with {', '.join(_COUNTS)}, not '{' '.join(words)[:80]}'")
     word, counts = words[0], _COUNTS[words[0]]
     try:
-        numbers = tuple(float(number) for number in words[1:])
+        numbers = [float(number) for number in words[1:]]
     except ValueError:
-        numbers = (math.nan,)
+        numbers = [math.nan]
     if len(numbers) not in counts or not np.all(np.isfinite(numbers)):
         many = " or ".join(map(str, counts))
         raise SceneError(f"{title} must have {many} numbers after '{word}', not '{' '.join(words[1:])[:80]}'")
@@ -91,7 +92,7 @@ def _one(words: Sequence[str], title: str) -> Said:
         raise SceneError(f"{title} must have a period that is not 0")
     if word == "throw" and (numbers[0] < 0 or min(numbers[1], numbers[2], numbers[6]) <= 0):
         raise SceneError(f"{title} must have a share of 0 or more, and EARLY, SPEED and PACE above 0")
-    return word, numbers
+    return word, tuple(numbers)
 
 
 def as_ellipse(said: Said) -> tuple[np.ndarray, np.ndarray, float, float]:
@@ -132,30 +133,27 @@ def set_in_motion(
         if len(shapes) != 1 or not isinstance(shapes[0], Spheres):
             raise SceneError(f"{title} is thrown and must be one sphere, nothing else")
         return [_thrown(shapes[0], said[0][1], title)]
-    rest = at_rest()
-    how: dict[str, Any] = {name.name: np.asarray(getattr(rest, name.name)) for name in dataclasses.fields(rest)}
+    how: Any = jax.tree.map(np.asarray, at_rest())
     low = high = np.zeros(3)
     for word, numbers in said:
         if word == "bounce":
-            how["velocity"] = np.array(numbers[:3])
+            how = dataclasses.replace(how, velocity=np.array(numbers[:3]))
             low, high = _walls(numbers, shapes, reaches, at, volume, title)
         else:
             a, b, rate, phase = as_ellipse((word, numbers))
-            how |= {"swing": np.stack([a, b]), "rate": rate, "phase": phase}
-    top = float(np.linalg.norm(how["velocity"])) + abs(how["rate"]) * float(np.linalg.norm(how["swing"]))
+            how = dataclasses.replace(how, swing=np.stack([a, b]), rate=rate, phase=phase)
+    top = float(np.linalg.norm(how.velocity) + abs(how.rate) * np.linalg.norm(how.swing))
     if not top <= FASTEST:
         raise SceneError(f"{title} moves at {top:.0f} m/s; an obstacle may move at {FASTEST:g}")
-    runs = how["velocity"] != 0
-    return [
-        dataclasses.replace(
-            shape,
-            motion=Motion(
-                **how
-                | {"low": np.where(runs, shape.position + low, 0), "high": np.where(runs, shape.position + high, 0)}
-            ),
-        )  # type: ignore[call-arg]
-        for shape in shapes
-    ]
+    runs = how.velocity != 0
+
+    def moving(shape: Any) -> Shape:
+        walls = (np.where(runs, shape.position + way, 0) for way in (low, high))
+        return dataclasses.replace(
+            shape, motion=dataclasses.replace(how, **dict(zip(("low", "high"), walls, strict=True)))
+        )
+
+    return [moving(shape) for shape in shapes]
 
 
 def _walls(

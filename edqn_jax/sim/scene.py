@@ -401,6 +401,12 @@ def parked_shape(kind: type[S]) -> S:
     return kind(**{name: values[name] for name in names})
 
 
+def parked_like(shapes: S) -> S:
+    """Returns one absent shape of the kind of `shapes`, which stands still where they have arrays of motion."""
+    rest = {name: still() for name, still in _MOVING.items() if getattr(shapes, name, None) is not None}
+    return dataclasses.replace(parked_shape(type(shapes)), **rest)
+
+
 def no_shapes(kind: type[S]) -> S:
     """Returns the kind's dataclass with capacity 0."""
     return jax.tree.map(lambda leaf: jnp.zeros((0, *np.shape(leaf)), jnp.float32), parked_shape(kind))
@@ -538,9 +544,7 @@ def with_equal_capacities(pools: Sequence[Scene], like: Sequence[Any] = ()) -> l
             more = np.broadcast_to(np.asarray(absent, np.float32), (worlds, missing, *np.shape(absent)))
             return jnp.asarray(np.concatenate([np.asarray(here), more], axis=1))
 
-        absent = parked_shape(KINDS[kind])
-        rest = {name: still() for name, still in _MOVING.items() if getattr(shapes, name, None) is not None}
-        return jax.tree.map(joined, shapes, dataclasses.replace(absent, **rest))
+        return jax.tree.map(joined, shapes, parked_like(shapes))
 
     able = [_able_to_move(pool, [*pools, *like]) for pool in pools]
     return [dataclasses.replace(pool, **{kind: padded(kind, pool) for kind in KINDS}) for pool in able]

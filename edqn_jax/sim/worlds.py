@@ -92,7 +92,7 @@ def random_scene(family: str, key: Array, moving: Moving = STILL) -> Scene:
     family, moving = _checked(family, moving)
     if family in MIXTURES:
         family = families_of(family, key[None])[0]
-    return take_scene(_drawn(family, moving, key[None]), 0)
+    return take_scene(_drawn(family, key[None], moving), 0)
 
 
 def random_pool(family: str, keys: Array, moving: Moving = STILL) -> Scene:
@@ -129,19 +129,19 @@ def _in_batches(family: str, moving: Moving, keys: Array) -> Scene:
     """Returns a pool of one family, drawn in batches of one size, so that one program draws pools of every size."""
     count = keys.shape[0]
     if count <= 1:
-        return _drawn(family, moving, keys)
+        return _drawn(family, keys, moving)
     # As data: the first key is used once more to fill the last batch.
     data = np.asarray(jax.random.key_data(keys))
     data = np.concatenate([data, np.broadcast_to(data[:1], (-count % _AT_ONCE, *data.shape[1:]))])
     batches = [jax.random.wrap_key_data(jnp.asarray(data[i : i + _AT_ONCE])) for i in range(0, count, _AT_ONCE)]
     # XLA uses one core for a batch.
     with ThreadPoolExecutor(thread_name_prefix="drawing") as pool:
-        drawn = list(pool.map(partial(_drawn, family, moving), batches))
+        drawn = list(pool.map(partial(_drawn, family, moving=moving), batches))
     return jax.tree.map(lambda *leaves: jnp.concatenate(leaves)[:count], *drawn)
 
 
-@partial(jax.jit, static_argnums=(0, 1))
-def _drawn(family: str, moving: Moving, keys: Array) -> Scene:
+@partial(jax.jit, static_argnums=(0, 2), static_argnames="moving")
+def _drawn(family: str, keys: Array, moving: Moving = STILL) -> Scene:
     """Returns worlds of one family, one for each key [P]."""
     return _set_in_motion(family, moving, _standing(family, keys), keys)
 

@@ -120,8 +120,8 @@ def test_a_shape_bounces_between_its_walls_as_one_that_is_stepped():
     found = np.asarray(places(scene, times)["boxes"])[:, 0]
     for time, place in zip(times, found, strict=True):
         for axis in range(3):
-            one = (float(np.asarray(getattr(BOUNCING, n))[axis]) for n in ("velocity", "low", "high"))
-            expected = motion_plain.bounced(float(scene.boxes.position[0, axis]), *one, float(time))
+            velocity, low, high = (float(np.asarray(x)[axis]) for x in (BOUNCING.velocity, BOUNCING.low, BOUNCING.high))
+            expected = motion_plain.bounced(float(scene.boxes.position[0, axis]), velocity, low, high, float(time))
             # 150 m of way in float32; the stepped one turns back exactly, whatever its step.
             assert abs(place[axis] - expected) < 1e-4, (time, axis)
 
@@ -131,7 +131,7 @@ def test_a_shape_swings_on_its_ellipse(kind, number, how):
     scene = moving_world()
     times = np.linspace(-0.08, 50, 40, dtype=np.float32)
     found = np.asarray(places(scene, times)[kind])[:, number]
-    away = np.array([motion_plain.swung(*np.asarray(how.swing), how.rate, how.phase, float(t)) for t in times])
+    away = np.array([motion_plain.swung(how.swing[0], how.swing[1], how.rate, how.phase, float(t)) for t in times])
     np.testing.assert_allclose(found, np.asarray(getattr(scene, kind).position[number]) + away, atol=3e-5)
 
 
@@ -161,6 +161,7 @@ def test_a_ball_is_absent_before_its_launch_meets_the_drone_and_is_absent_when_i
     np.testing.assert_allclose(np.asarray(places(scene, jnp.float32([hit]))["spheres"])[0, number], aim, atol=1e-4)
     for time in (hit - 1.9, hit - 0.5, hit + 0.2):
         expected = motion_plain.thrown(how, START, GOAL, time)
+        assert expected is not None
         at = np.asarray(places(scene, jnp.float32([time]))["spheres"])[0, number]
         np.testing.assert_allclose(at, expected, atol=2e-4)
 
@@ -262,6 +263,7 @@ def test_pools_of_equal_capacities_move_as_before():
 def test_shapes_that_never_move_have_no_motion():
     scene = scene_of(ball([5, 5, 5], motion=at_rest()), ball([8, 5, 5], motion=SWAYING))
     first, second = scene_shapes(scene)
+    assert isinstance(first, Spheres) and isinstance(second, Spheres)
     assert first.motion is None and second.motion is not None
 
 

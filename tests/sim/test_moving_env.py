@@ -237,6 +237,7 @@ def test_the_clearance_of_a_flight_is_to_shapes_as_they_move():
     world = world_of(pillar(sliding(), x=14.0))
     flights = fly_missions(CONFIG, world, fresh_policy(CONFIG), jax.random.key(0), record=True)
     record, scene = flights.record, env.scene_of(world, jnp.int32(0))
+    assert record is not None
     steps = int(flights.physics_steps[0]) - 1  # the last may be cut off at a contact
     times = DT * np.arange(1, steps + 1, dtype=np.float32)
     expected = jax.vmap(lambda p, t: signed_distance(scene_at(scene, t), p))(record.position[0, :steps], times) - 0.36

@@ -12,7 +12,7 @@ import pytest
 from edqn_jax.config.loading import make_config
 from edqn_jax.errors import ConfigError
 from edqn_jax.evaluation.missions import load_missions
-from edqn_jax.sim import canyon, forest
+from edqn_jax.sim import canyon, forest, worlds
 from edqn_jax.sim.environment import make
 from edqn_jax.sim.free_points import CLEARANCE, EARLY_S
 from edqn_jax.sim.missions import own_missions, random_missions
@@ -95,6 +95,7 @@ def test_what_runs_stays_between_the_faces_of_the_volume(pools):
     times, found = jnp.linspace(0, 52, 200), 0
     for i in range(WORLDS):
         scene = take_scene(pools["everything"], i)
+        assert scene.cylinders.motion is not None
         runs = np.abs(np.asarray(scene.cylinders.motion.velocity)).max(-1) > 0
         at = np.asarray(places(scene, times)["cylinders"])[:, runs]
         beyond = np.asarray(scene.cylinders.radius)[runs][None, :, None]
@@ -203,6 +204,16 @@ def test_no_ball_comes_near_the_start_in_the_first_seconds(pools):
         scene = take_scene(pool, i)
         at = np.asarray(places(scene, jnp.arange(0, EARLY_S, 0.05))["spheres"])[:, -4:]
         assert np.linalg.norm(at - np.asarray(scene.start), axis=-1).min() > 3.0
+
+
+@pytest.mark.slow
+def test_moving_worlds_reuse_no_key_and_promote_no_rank():
+    with jax.debug_key_reuse(True), jax.numpy_rank_promotion("raise"), jax.checking_leaks():
+        for family in ("sparse", "forest"):
+            # Not by `random_pool`, which draws in threads, where none of this holds.
+            pool = worlds._drawn(family, world_keys("training", 2), EVERYTHING)
+            random_missions(pool, 4, jax.random.key(0))
+            jax.jit(lambda pool: scene_at(take_scene(pool, 0), jnp.float32(1.0)))(pool)
 
 
 def test_environments_and_evaluations_fly_in_what_the_configuration_says():
