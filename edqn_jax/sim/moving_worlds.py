@@ -33,8 +33,8 @@ EARLY = (1.5, 3.0)
 """How long a ball flies before that, seconds."""
 BALL_RADIUS = (0.3, 0.5)
 BEARING = math.radians(60.0)
-"""Balls come from at most so far to the left or right of ahead: at 6 m/s, what they come from is in the image of a
-drone that flies straight at 4 m/s."""
+"""Balls come from at most so far to either side of ahead, so that at 6 m/s they are in the image of a drone that flies
+straight at 4 m/s."""
 ELEVATION = math.radians(20.0)
 """Balls come from at most so far above the horizon."""
 

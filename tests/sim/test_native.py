@@ -64,11 +64,12 @@ def agree(config: CameraConfig, scene: Scene, origin: jax.Array, rotation: jax.A
 
 def crowd(rng: np.random.Generator) -> Scene:
     places = rng.uniform([0, 0, 0], [60, 60, 12], (30, 3))
+    sizes = rng.uniform(0.3, 4, (30, 3))
     return scene_of(
         GROUND,
-        *(box(x, y, z, *rng.uniform(0.3, 4, 3), yaw) for yaw, (x, y, z) in enumerate(places[:14])),
-        *(pillar(x, y, z, *rng.uniform(0.3, 3, 2)) for x, y, z in places[14:24]),
-        *(ball(x, y, z, rng.uniform(0.1, 4)) for x, y, z in places[24:]),
+        *(box(x, y, z, a, b, c, x) for (x, y, z), (a, b, c) in zip(places[:14], sizes, strict=False)),
+        *(pillar(x, y, z, a, b) for (x, y, z), (a, b, _) in zip(places[14:24], sizes[14:], strict=False)),
+        *(ball(x, y, z, a) for (x, y, z), (a, _, _) in zip(places[24:], sizes[24:], strict=True)),
     )
 
 
