@@ -2,9 +2,9 @@
  * (`all_sum.py` registers it).
  *
  * XLA's own sum lets a device sleep several times until another has arrived, and waking up takes longer than the sum.
- * Here devices spin at first, since each has a thread and all arrive at about the same time. The devices of one execution meet
- * in a place that nobody else uses meanwhile; each adds up its share of the elements, in the order of the devices, and
- * writes it to the results of all.
+ * Here devices spin at first, since each has a thread and all arrive at about the same time. The devices of one
+ * execution meet in a place that nobody else uses meanwhile; each adds up its share of the elements, in the order of
+ * the devices, and writes it to the results of all.
  */
 
 #include <sched.h>
@@ -12,18 +12,18 @@
 #include <stdint.h>
 #include <time.h>
 
-#include "xla/ffi/api/c_api.h"
+#include "handler.h"
 
 #define MOST_DEVICES 256
 #define PLACES 64
-#define SPIN_US 300            /* after which a device leaves its core to others, which may be what it waits for */
+#define SPIN_US 300               /* after which a device leaves its core to others, which may be what it waits for */
 #define LONGEST_WAIT_US 600000000 /* a device that is this late has failed */
 
 typedef struct {
-  int64_t run;     /* of the execution that meets here, 0 for none */
-  int expected;    /* devices */
+  int64_t run;  /* of the execution that meets here, 0 for none */
+  int expected; /* devices */
   atomic_int arrived, done, left;
-  XLA_FFI_CallFrame *calls[MOST_DEVICES];
+  XLA_FFI_CallFrame* calls[MOST_DEVICES];
 } Place;
 
 static Place places[PLACES];
@@ -36,8 +36,8 @@ static void lock(void) {
 static void unlock(void) { atomic_flag_clear_explicit(&busy, memory_order_release); }
 
 /* Returns where the execution `run` meets now, with this device registered; NULL if all places are taken. */
-static Place *arrive(int64_t run, int expected, int rank, XLA_FFI_CallFrame *call) {
-  Place *here = 0;
+static Place* arrive(int64_t run, int expected, int rank, XLA_FFI_CallFrame* call) {
+  Place* here = 0;
   lock();
   for (int i = 0; i < PLACES && !here; ++i)
     if (places[i].run == run && atomic_load(&places[i].arrived) < expected) here = &places[i];
@@ -54,7 +54,7 @@ static Place *arrive(int64_t run, int expected, int rank, XLA_FFI_CallFrame *cal
   return here;
 }
 
-static void leave(Place *here) {
+static void leave(Place* here) {
   if (atomic_fetch_add(&here->left, 1) + 1 < here->expected) return;
   lock();
   atomic_store(&here->arrived, 0), atomic_store(&here->done, 0), atomic_store(&here->left, 0);
@@ -69,7 +69,7 @@ static int64_t microseconds(void) {
 }
 
 /* Waits until `count` is `wanted`; returns 0 if that takes too long. */
-static int wait_for(atomic_int *count, int wanted) {
+static int wait_for(atomic_int* count, int wanted) {
   const struct timespec nap = {0, 20000};
   const int64_t began = microseconds();
   int64_t waited = 0;
@@ -86,74 +86,68 @@ static int wait_for(atomic_int *count, int wanted) {
   return 0;
 }
 
-static int64_t elements(const XLA_FFI_Buffer *buffer) {
+static int64_t elements(const XLA_FFI_Buffer* buffer) {
   int64_t count = 1;
   for (int i = 0; i < buffer->rank; ++i) count *= buffer->dims[i];
   return count;
 }
 
-static void *operand(const XLA_FFI_CallFrame *call, int i) { return ((XLA_FFI_Buffer *)call->args.args[i])->data; }
-static void *result(const XLA_FFI_CallFrame *call, int i) { return ((XLA_FFI_Buffer *)call->rets.rets[i])->data; }
+static void* operand(const XLA_FFI_CallFrame* call, int i) { return ((XLA_FFI_Buffer*)call->args.args[i])->data; }
+static void* result(const XLA_FFI_CallFrame* call, int i) { return ((XLA_FFI_Buffer*)call->rets.rets[i])->data; }
 
 /* Operands before those that are summed: the device's number, how many there are, and what must come first. */
 #define OPERANDS_BEFORE 3
 
 #define CHUNK 1024 /* elements added at a time, so that they stay in the cache */
 
-static void add_share(Place *here, int rank, const XLA_FFI_CallFrame *call) {
+static void add_share(Place* here, int rank, const XLA_FFI_CallFrame* call) {
   for (int i = 0; i < call->rets.size; ++i) {
-    const XLA_FFI_Buffer *buffer = (XLA_FFI_Buffer *)call->rets.rets[i];
+    const XLA_FFI_Buffer* buffer = (XLA_FFI_Buffer*)call->rets.rets[i];
     const int64_t count = elements(buffer), begin = count * rank / here->expected;
     const int64_t end = count * (rank + 1) / here->expected;
     if (buffer->dtype == XLA_FFI_DataType_S32) {
       for (int64_t k = begin; k < end; ++k) {
         int32_t total = 0;
-        for (int d = 0; d < here->expected; ++d) total += ((const int32_t *)operand(here->calls[d], i + OPERANDS_BEFORE))[k];
-        for (int d = 0; d < here->expected; ++d) ((int32_t *)result(here->calls[d], i))[k] = total;
+        for (int d = 0; d < here->expected; ++d)
+          total += ((const int32_t*)operand(here->calls[d], i + OPERANDS_BEFORE))[k];
+        for (int d = 0; d < here->expected; ++d) ((int32_t*)result(here->calls[d], i))[k] = total;
       }
       continue;
     }
     for (int64_t first = begin; first < end; first += CHUNK) {
       const int64_t size = end - first < CHUNK ? end - first : CHUNK;
       float total[CHUNK];
-      const float *own = (const float *)operand(here->calls[0], i + OPERANDS_BEFORE) + first;
+      const float* own = (const float*)operand(here->calls[0], i + OPERANDS_BEFORE) + first;
       for (int64_t k = 0; k < size; ++k) total[k] = own[k];
       for (int d = 1; d < here->expected; ++d) {
-        const float *more = (const float *)operand(here->calls[d], i + OPERANDS_BEFORE) + first;
+        const float* more = (const float*)operand(here->calls[d], i + OPERANDS_BEFORE) + first;
         for (int64_t k = 0; k < size; ++k) total[k] += more[k];
       }
       for (int d = 0; d < here->expected; ++d) {
-        float *to = (float *)result(here->calls[d], i) + first;
+        float* to = (float*)result(here->calls[d], i) + first;
         for (int64_t k = 0; k < size; ++k) to[k] = total[k];
       }
     }
   }
 }
 
-static XLA_FFI_Error *failed(XLA_FFI_CallFrame *call, const char *message) {
-  XLA_FFI_Error_Create_Args args = {XLA_FFI_Error_Create_Args_STRUCT_SIZE, 0, message, XLA_FFI_Error_Code_INTERNAL};
-  return call->api->XLA_FFI_Error_Create(&args);
-}
-
-XLA_FFI_Error *edqn_all_sum(XLA_FFI_CallFrame *call) {
-  XLA_FFI_Extension_Base *extension = call->extension_start;
-  if (extension && extension->type == XLA_FFI_Extension_Metadata) { /* XLA asks, and does not call */
-    XLA_FFI_Metadata *metadata = ((XLA_FFI_Metadata_Extension *)extension)->metadata;
-    metadata->api_version.major_version = XLA_FFI_API_MAJOR;
-    metadata->api_version.minor_version = XLA_FFI_API_MINOR;
-    return 0;
-  }
-  const int rank = *(const int32_t *)operand(call, 0), expected = *(const int32_t *)operand(call, 1);
-  if (rank < 0 || rank >= expected || expected > MOST_DEVICES) return failed(call, "all_sum.c: more than 256 devices");
+XLA_FFI_Error* edqn_all_sum(XLA_FFI_CallFrame* call) {
+  if (asked_for_version(call)) return 0;
+  const int rank = *(const int32_t*)operand(call, 0), expected = *(const int32_t*)operand(call, 1);
+  if (rank < 0 || rank >= expected || expected > MOST_DEVICES)
+    return failed(call, XLA_FFI_Error_Code_INVALID_ARGUMENT, "all_sum.c adds over at most 256 devices");
   XLA_FFI_RunId_Get_Args run = {XLA_FFI_RunId_Get_Args_STRUCT_SIZE, 0, call->ctx, 0};
-  XLA_FFI_Error *error = call->api->XLA_FFI_RunId_Get(&run);
+  XLA_FFI_Error* error = call->api->XLA_FFI_RunId_Get(&run);
   if (error) return error;
-  Place *here = arrive(run.run_id, expected, rank, call);
-  if (!here) return failed(call, "all_sum.c: more than 64 programs on several devices at once");
-  if (!wait_for(&here->arrived, expected)) return failed(call, "all_sum.c: a device did not arrive within ten minutes");
+  Place* here = arrive(run.run_id, expected, rank, call);
+  if (!here) return failed(call, XLA_FFI_Error_Code_RESOURCE_EXHAUSTED, "all_sum.c serves at most 64 programs at once");
+  if (!wait_for(&here->arrived, expected))
+    return failed(call, XLA_FFI_Error_Code_DEADLINE_EXCEEDED,
+                  "all_sum.c waited ten minutes for another device to arrive");
   add_share(here, rank, call);
   atomic_fetch_add_explicit(&here->done, 1, memory_order_release);
-  if (!wait_for(&here->done, expected)) return failed(call, "all_sum.c: a device did not finish within ten minutes");
+  if (!wait_for(&here->done, expected))
+    return failed(call, XLA_FFI_Error_Code_DEADLINE_EXCEEDED, "all_sum.c waited ten minutes for another device to add");
   leave(here);
   return 0;
 }

@@ -17,11 +17,10 @@ SOURCE = Path(__file__).with_suffix(".c")
 
 
 def all_sum(tree: Tree, axis: str | None, after: Any) -> Tree:
-    """Returns the sum of float32 and int32 arrays over the devices that share the work, if there are any.
+    """Returns the sums of float32 and int32 arrays over the devices of a mesh axis.
 
-    Devices meet in the same order everywhere: that of the sums, if each is given something of the one before. On CPUs
-    of one process it is ours (`all_sum.c`), where it is at hand; else XLA's, which keeps to an order by itself. Both
-    add in the order of the devices.
+    On CPUs of one process with a C compiler, `all_sum.c` adds, elsewhere XLA. All devices must take the sums of a
+    program in the same order. XLA keeps to one by itself; `all_sum.c` waits for what each sum is given as `after`.
 
     Args:
         axis: name of the mesh axis, None for one device.

@@ -5,6 +5,7 @@ Whoever uses one has the same function in JAX for where there is no compiler, an
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import functools
 import hashlib
@@ -20,6 +21,8 @@ from edqn_jax.parallel.programs import private_folder
 
 SWITCH = "EDQN_JAX_NATIVE"
 """Environment variable; with 0 nothing in C is used."""
+
+HEADER = Path(__file__).with_name("handler.h")
 
 FLAGS = (
     *("-std=gnu11", "-O3", "-march=native", "-fPIC", "-shared"),
@@ -41,7 +44,10 @@ def registered(source: Path, targets: tuple[str, ...], definitions: tuple[str, .
     if compiler is None or os.environ.get(SWITCH, "1") == "0":
         return False
     try:
-        library = ctypes.CDLL(str(_compiled(compiler, source, definitions)))
+        with contextlib.ExitStack() as scratch:
+            # Where nothing can be kept, the file is not needed once it is loaded.
+            folder = private_folder() or Path(scratch.enter_context(tempfile.TemporaryDirectory()))
+            library = _loaded(compiler, source, definitions, folder)
         for target in targets:
             jax.ffi.register_ffi_target(target, jax.ffi.pycapsule(getattr(library, target)), platform="cpu")
     except (OSError, subprocess.SubprocessError, jax.errors.JaxRuntimeError):
@@ -49,16 +55,16 @@ def registered(source: Path, targets: tuple[str, ...], definitions: tuple[str, .
     return True
 
 
-def _compiled(compiler: str, source: Path, definitions: tuple[str, ...]) -> Path:
-    """Returns the library's file, compiled unless one of the same source, flags and XLA is kept."""
+def _loaded(compiler: str, source: Path, definitions: tuple[str, ...], folder: Path) -> ctypes.CDLL:
+    """Returns the library, compiled in `folder` unless one of the same source, flags and XLA is kept there."""
     defined = [f"-D{definition}" for definition in definitions]
-    command = [compiler, *FLAGS, *defined, f"-I{jax.ffi.include_dir()}", str(source), "-lm"]
-    told_apart = (command, source.read_bytes(), jax.__version__)
-    folder = private_folder() or Path(tempfile.mkdtemp())
+    headers = [f"-I{folder}" for folder in (jax.ffi.include_dir(), HEADER.parent)]
+    command = [compiler, *FLAGS, *defined, *headers, str(source), "-lm"]
+    told_apart = (command, source.read_bytes(), HEADER.read_bytes(), jax.__version__)
     library = folder / f"{source.stem}-{hashlib.sha256(repr(told_apart).encode()).hexdigest()[:16]}.so"
     if not library.is_file():
         with tempfile.TemporaryDirectory(dir=folder) as scratch:
             made = Path(scratch) / library.name
             subprocess.run([*command, "-o", str(made)], check=True, capture_output=True, timeout=60)
             made.replace(library)
-    return library
+    return ctypes.CDLL(str(library))

@@ -42,7 +42,7 @@ def can_draw(config: CameraConfig, scene: Scene) -> bool:
 
 
 def pictures(config: CameraConfig, scene: Scene, origin: Array, rotation: Array, weights: Array) -> Array:
-    """Returns brightness [M, H, W] as `columns.picture` does; arrays have a leading [L], see `picture_primitive`."""
+    """Returns brightness [M, H, W] as `columns.pictures` does; arrays have a leading [L], see `picture_primitive`."""
     return _call("edqn_pictures", config, scene, origin, rotation, weights)
 
 

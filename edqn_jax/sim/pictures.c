@@ -1,9 +1,10 @@
-/* Pictures and depth images of a level camera, for CPUs: the functions `columns.picture` and `depth.nearest_depth` in
+/* Pictures and depth images of a level camera, for CPUs: the functions `columns.pictures` and `depth.nearest_depth` in
  * C, as handlers of XLA's foreign function interface (`native.py` compiles and registers them).
  *
  * A column is drawn at a time, since few shapes cover one, and of its rows LANES at a time, in vectors as GCC and Clang
- * have them for any processor. The mathematics, its order and its words are those of `coverage.py`, `camera.py`, `texture.py`
- * and `depth.py`; constants in capitals that are not defined here come from there. M frames, H rows, C columns.
+ * have them for any processor. The mathematics, its order and its words are those of `coverage.py`, `camera.py`,
+ * `texture.py` and `depth.py`; constants in capitals that are not defined here come from there. M frames, H rows, C
+ * columns.
  */
 
 #include <math.h>
@@ -14,7 +15,7 @@
 #include <immintrin.h>
 #endif
 
-#include "xla/ffi/api/c_api.h"
+#include "handler.h"
 
 #define LANES 8
 #define NOWHERE 1e30f
@@ -25,8 +26,8 @@ typedef int32_t Mask __attribute__((vector_size(4 * LANES)));            /* of c
 typedef int64_t Pairs __attribute__((vector_size(4 * LANES)));
 
 static inline Lanes all(float x) { return x - (Lanes){0}; }
-static inline Lanes load(const float *from) { return *(const Loose *)from; }
-static inline void store(float *to, Lanes x) { *(Loose *)to = x; }
+static inline Lanes load(const float* from) { return *(const Loose*)from; }
+static inline void store(float* to, Lanes x) { *(Loose*)to = x; }
 static inline Lanes pick(Mask where, Lanes a, Lanes b) { return (Lanes)((where & (Mask)a) | (~where & (Mask)b)); }
 #ifdef __AVX__ /* one instruction, which compilers do not find by themselves */
 static inline Lanes lesser(Lanes a, Lanes b) { return (Lanes)_mm256_min_ps((__m256)a, (__m256)b); }
@@ -65,7 +66,7 @@ typedef struct {
   float pitch, contrast, ambient;
   const float *sun, *sky; /* [3] each */
   const float *u, *v;     /* [C], [H] middles of pixels in the image plane */
-  const float *wave;      /* [waves, 4] direction in periods a metre, and weight */
+  const float* wave;      /* [waves, 4] direction in periods a metre, and weight */
 } Camera;
 
 typedef struct {
@@ -81,18 +82,18 @@ typedef struct {
   float cos, sin;
 } Eye;
 
-static inline float dot3(const float *a, const float *b) { return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]; }
+static inline float dot3(const float* a, const float* b) { return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]; }
 
-static inline float shade(const Camera *c, float nx, float ny, float nz) {
+static inline float shade(const Camera* c, float nx, float ny, float nz) {
   return c->ambient + (1 - c->ambient) * most(nx * c->sun[0] + ny * c->sun[1] + nz * c->sun[2], 0.0f);
 }
 
-static inline Lanes shades(const Camera *c, Lanes nx, Lanes ny, Lanes nz) {
+static inline Lanes shades(const Camera* c, Lanes nx, Lanes ny, Lanes nz) {
   return c->ambient + (1 - c->ambient) * greater(nx * c->sun[0] + ny * c->sun[1] + nz * c->sun[2], all(0));
 }
 
 /* Whether no part of an upright shape within `radius` of (x, y), relative to the eye, can be in the image. */
-static int out_of_sight(const Camera *c, const Eye *e, float x, float y, float radius) {
+static int out_of_sight(const Camera* c, const Eye* e, float x, float y, float radius) {
   const float ahead = x * e->cos + y * e->sin, right = x * e->sin - y * e->cos;
   const float edge = 0.5f * c->pitch * c->width;
   const float reach = radius * 1.0001f + 1e-3f, aslant = reach * sqrtf(1 + edge * edge);
@@ -100,7 +101,7 @@ static int out_of_sight(const Camera *c, const Eye *e, float x, float y, float r
 }
 
 /* The columns [first, last) that an interval of the image plane may touch. */
-static void columns_between(const Camera *c, float left, float right, int *first, int *last) {
+static void columns_between(const Camera* c, float left, float right, int* first, int* last) {
   const float begin = (left - c->u[0]) / c->pitch - 1.0f, end = (right - c->u[0]) / c->pitch + 2.0f;
   *first = (int)least(most(begin, 0.0f), (float)c->width);
   *last = (int)least(most(end, 0.0f), (float)c->width);
@@ -116,14 +117,14 @@ enum { SHARE, BOTTOM, TOP, CAP_LOW, CAP_HIGH, SIDE, SHOWN, FAR, NEAR, PER_ROW, L
 /* What the pixels of a column need of a shape (`coverage.sides`), for all columns: NUMBERS arrays of `stride`. */
 typedef struct {
   int first, last; /* columns that it may cover */
-  float *numbers;
+  float* numbers;
 } Sides;
 
 typedef struct {
   float left, right, bottom, top, cap, shown;
 } Extent;
 
-static void extent_of_box(const Eye *e, float x, float y, float hx, float hy, float cos, float sin, Extent *extent) {
+static void extent_of_box(const Eye* e, float x, float y, float hx, float hy, float cos, float sin, Extent* extent) {
   static const float sign_x[4] = {1, -1, -1, 1}, sign_y[4] = {1, 1, -1, -1};
   float ahead[4], right[4];
   for (int i = 0; i < 4; ++i) {
@@ -147,13 +148,14 @@ static void extent_of_box(const Eye *e, float x, float y, float hx, float hy, fl
   extent->left = low, extent->right = high;
 }
 
-static float edge_of_disc(float ahead, float right, float distance, float radius, float sine, float cosine, float sign) {
+static float edge_of_disc(float ahead, float right, float distance, float radius, float sine, float cosine,
+                          float sign) {
   const float f = ahead * cosine - sign * right * sine, r = right * cosine + sign * ahead * sine;
   const int in_front = f > NEAR_M * 1e-3f && distance > radius;
   return in_front ? r / most(f, NEAR_M * 1e-3f) : sign * FAR_U;
 }
 
-static void extent_of_disc(const Eye *e, float x, float y, float radius, Extent *extent) {
+static void extent_of_disc(const Eye* e, float x, float y, float radius, Extent* extent) {
   const float ahead = x * e->cos + y * e->sin, right = x * e->sin - y * e->cos;
   const float distance = sqrtf(ahead * ahead + right * right);
   const float sine = least(radius / most(distance, TINY), 1.0f), cosine = sqrtf(1 - sine * sine);
@@ -162,15 +164,15 @@ static void extent_of_disc(const Eye *e, float x, float y, float radius, Extent 
   extent->right = behind ? -NOWHERE : edge_of_disc(ahead, right, distance, radius, sine, cosine, 1.0f);
 }
 
-static void heights_of(const Camera *c, float middle, float half, float value, Extent *extent) {
+static void heights_of(const Camera* c, float middle, float half, float value, Extent* extent) {
   extent->bottom = (middle - half) / c->pitch, extent->top = (middle + half) / c->pitch;
   extent->cap = extent->top < 0 ? extent->top : most(extent->bottom, 0.0f);
   extent->shown = value * (extent->top < 0 ? shade(c, 0, 0, 1) : shade(c, 0, 0, -1));
 }
 
 /* Writes the numbers of LANES columns from the shape's depths, brightness and lean there. */
-static inline void write_sides(const Camera *c, const Extent *e, Lanes share, Lanes enter, Lanes leave, Lanes side,
-                               Lanes lean, float *numbers, int stride) {
+static inline void write_sides(const Camera* c, const Extent* e, Lanes share, Lanes enter, Lanes leave, Lanes side,
+                               Lanes lean, float* numbers, int stride) {
   const Lanes near = 1.0f / greater(enter, all(NEAR_M)), far = 1.0f / greater(leave, all(NEAR_M));
   const Lanes cap_near = e->cap * near, cap_far = e->cap * far;
   store(numbers + SHARE * stride, share);
@@ -187,7 +189,7 @@ static inline void write_sides(const Camera *c, const Extent *e, Lanes share, La
 }
 
 /* The part of the columns `u` that an extent covers: its ends; returns its share of the column's width. */
-static inline Lanes part_covered(const Camera *c, const Extent *e, Lanes u, Lanes *low, Lanes *high) {
+static inline Lanes part_covered(const Camera* c, const Extent* e, Lanes u, Lanes* low, Lanes* high) {
   const Lanes from = greater(u - c->pitch / 2, all(e->left)), to = lesser(u + c->pitch / 2, all(e->right));
   const Lanes share = greater(to - from, all(0)) / c->pitch;
   *low = pick(share > 0, from, u), *high = pick(share > 0, to, u);
@@ -200,20 +202,21 @@ typedef struct {
 } Box;
 
 /* The depths at which the rays at `u` enter and leave both pairs of side faces. */
-static inline void slabs(const Box *b, Lanes u, Lanes *ix, Lanes *iy, Lanes *in_x, Lanes *in_y, Lanes *out_x, Lanes *out_y) {
+static inline void slabs(const Box* b, Lanes u, Lanes* ix, Lanes* iy, Lanes* in_x, Lanes* in_y, Lanes* out_x,
+                         Lanes* out_y) {
   *ix = inverses(b->fx + u * b->fy), *iy = inverses(b->fy - u * b->fx);
   const Lanes mx = -b->x * *ix, my = -b->y * *iy, reach_x = b->hx * absolute(*ix), reach_y = b->hy * absolute(*iy);
   *in_x = mx - reach_x, *in_y = my - reach_y, *out_x = mx + reach_x, *out_y = my + reach_y;
 }
 
-static inline Mask meets_x_face(const Box *b, Lanes u) {
+static inline Mask meets_x_face(const Box* b, Lanes u) {
   Lanes ix, iy, in_x, in_y, out_x, out_y;
   slabs(b, u, &ix, &iy, &in_x, &in_y, &out_x, &out_y);
   return in_x > in_y;
 }
 
 /* Writes what columns need of box `n`; returns 0 if it covers none. */
-static int box_sides(const Camera *c, const Shapes *s, const Eye *e, int n, const float *u, int stride, Sides *out) {
+static int box_sides(const Camera* c, const Shapes* s, const Eye* e, int n, const float* u, int stride, Sides* out) {
   const float *position = s->box_position + 3 * n, *half = s->box_half + 3 * n;
   const float ox = e->origin[0] - position[0], oy = e->origin[1] - position[1], hx = half[0], hy = half[1];
   if (out_of_sight(c, e, -ox, -oy, sqrtf(hx * hx + hy * hy))) return 0;
@@ -248,7 +251,8 @@ static int box_sides(const Camera *c, const Shapes *s, const Eye *e, int n, cons
 }
 
 /* The same of cylinder `n`. */
-static int cylinder_sides(const Camera *c, const Shapes *s, const Eye *e, int n, const float *u, int stride, Sides *out) {
+static int cylinder_sides(const Camera* c, const Shapes* s, const Eye* e, int n, const float* u, int stride,
+                          Sides* out) {
   const float *position = s->cylinder_position + 3 * n, radius = s->cylinder_radius[n];
   const float ox = e->origin[0] - position[0], oy = e->origin[1] - position[1];
   if (out_of_sight(c, e, -ox, -oy, radius)) return 0;
@@ -286,7 +290,7 @@ typedef struct {
   int inserted;
 } Layers;
 
-static inline void insert(Layers *layers, Layer new) {
+static inline void insert(Layers* layers, Layer new) {
   if (!layers->inserted++) {
     layers->layer[0] = new;
     for (int k = 1; k < DEPTH_OF_LAYERS; ++k) layers->layer[k] = (Layer){{0}, {0}, {0}, {0}};
@@ -309,7 +313,7 @@ static inline Lanes counted(void) {
 }
 
 /* Adds one shape, whose numbers of this column are `stride` apart, to the layers of all blocks of rows. */
-static void insert_side(const Camera *c, const float *n, int stride, Layers *layers) {
+static void insert_side(const Camera* c, const float* n, int stride, Layers* layers) {
   const float bottom = n[BOTTOM * stride], top = n[TOP * stride];
   const float cap_low = n[CAP_LOW * stride], cap_high = n[CAP_HIGH * stride];
   const float highest = c->height / 2.0f - 0.5f;
@@ -329,7 +333,8 @@ static void insert_side(const Camera *c, const float *n, int stride, Layers *lay
 }
 
 /* Adds sphere `n` to the layers of the column at `u`. */
-static void insert_sphere(const Camera *c, const Shapes *s, const Eye *e, int n, float u, const float *v, Layers *layers) {
+static void insert_sphere(const Camera* c, const Shapes* s, const Eye* e, int n, float u, const float* v,
+                          Layers* layers) {
   const float *position = s->sphere_position + 3 * n, radius = s->sphere_radius[n];
   const float ox = e->origin[0] - position[0], oy = e->origin[1] - position[1], oz = e->origin[2] - position[2];
   const float value = dot3(s->sphere_albedo + 3 * n, e->weights);
@@ -362,10 +367,11 @@ typedef struct {
   float kx, ky, kz, weight, at_origin, right, up;
 } Wave;
 
-static void waves_of(const Camera *c, const Eye *e, Wave *waves) {
+static void waves_of(const Camera* c, const Eye* e, Wave* waves) {
   for (int i = 0; i < c->waves; ++i) {
-    const float *k = c->wave + 4 * i;
-    waves[i] = (Wave){k[0], k[1], k[2], k[3], dot3(k, e->origin), (k[0] * e->sin - k[1] * e->cos) * c->pitch, k[2] * c->pitch};
+    const float* k = c->wave + 4 * i;
+    waves[i] =
+        (Wave){k[0], k[1], k[2], k[3], dot3(k, e->origin), (k[0] * e->sin - k[1] * e->cos) * c->pitch, k[2] * c->pitch};
   }
 }
 
@@ -375,13 +381,14 @@ static inline Lanes box_filter(Lanes cycles) {
 }
 
 /* The texture's factor on LANES rows of a column. */
-static inline Lanes texture(const Camera *c, const Wave *waves, float dx, float dy, Lanes dz, Lanes depth,
+static inline Lanes texture(const Camera* c, const Wave* waves, float dx, float dy, Lanes dz, Lanes depth,
                             Lanes slope_right, Lanes slope_up) {
   Lanes total = {0};
   for (int i = 0; i < c->waves; ++i) {
-    const Wave *w = &waves[i];
+    const Wave* w = &waves[i];
     const Lanes along = (w->kx * dx + w->ky * dy) + w->kz * dz, phase = w->at_origin + depth * along;
-    const Lanes left = box_filter(depth * w->right + slope_right * along) * box_filter(depth * w->up + slope_up * along);
+    const Lanes left =
+        box_filter(depth * w->right + slope_right * along) * box_filter(depth * w->up + slope_up * along);
     const Lanes f = phase - nearest_whole(phase);
     total += w->weight * left * (f * (8.0f - 16.0f * absolute(f)));
   }
@@ -389,13 +396,14 @@ static inline Lanes texture(const Camera *c, const Wave *waves, float dx, float 
 }
 
 /* Brightness of textured ground and other planes before the sky, LANES rows of the column along (dx, dy). */
-static inline Lanes backdrop(const Camera *c, const Shapes *s, const Eye *e, const Wave *waves, float dx, float dy, Lanes dz) {
+static inline Lanes backdrop(const Camera* c, const Shapes* s, const Eye* e, const Wave* waves, float dx, float dy,
+                             Lanes dz) {
   const Lanes sky = all(dot3(c->sky, e->weights));
   Lanes depth = all(NOWHERE), shown = {0}, share = {0}, slope_right = {0}, slope_up = {0};
   for (int n = 0; n < s->planes; ++n) {
     const float *normal = s->plane_normal + 3 * n, *at = s->plane_position + 3 * n;
-    const float height = (e->origin[0] - at[0]) * normal[0] + (e->origin[1] - at[1]) * normal[1] +
-                         (e->origin[2] - at[2]) * normal[2];
+    const float height =
+        (e->origin[0] - at[0]) * normal[0] + (e->origin[1] - at[1]) * normal[1] + (e->origin[2] - at[2]) * normal[2];
     const float across = (normal[0] * e->sin - normal[1] * e->cos) * c->pitch, along = normal[2] * c->pitch;
     const float spread = fabsf(across) + fabsf(along);
     const float value = shade(c, normal[0], normal[1], normal[2]) * dot3(s->plane_albedo + 3 * n, e->weights);
@@ -416,15 +424,15 @@ static inline Lanes backdrop(const Camera *c, const Shapes *s, const Eye *e, con
 #define WHOLE (1 - 1e-6f)
 
 /* Blends the layers of LANES rows over ground and sky. */
-static inline Lanes blend(const Camera *c, const Shapes *s, const Eye *e, const Wave *waves, float dx, float dy, Lanes dz,
-                          const Layers *layers) {
+static inline Lanes blend(const Camera* c, const Shapes* s, const Eye* e, const Wave* waves, float dx, float dy,
+                          Lanes dz, const Layers* layers) {
   const int used = layers->inserted < DEPTH_OF_LAYERS ? layers->inserted : DEPTH_OF_LAYERS;
   int visible = 0; /* layers before, and with, the first that covers all that lies behind it */
   while (visible < used && any(layers->layer[visible++].coverage < WHOLE)) continue;
   const int hidden = visible > 0 && !any(layers->layer[visible - 1].coverage < WHOLE);
   Lanes behind = hidden ? all(0) : backdrop(c, s, e, waves, dx, dy, dz);
   for (int k = visible - 1; k >= 0; --k) {
-    const Layer *layer = &layers->layer[k];
+    const Layer* layer = &layers->layer[k];
     const Mask met = layer->closeness > 0, level = layer->slope == LEVEL_FACE;
     const Lanes near = pick(met, inverses(layer->closeness), all(0));
     const Lanes right = pick(level, all(0), -near * near * layer->slope);
@@ -440,16 +448,16 @@ static inline Lanes blend(const Camera *c, const Shapes *s, const Eye *e, const 
 /* Memory for the frames of one call. */
 typedef struct {
   float *numbers, *u, *v;
-  Sides *sides;
-  Extent *spheres;
-  Layers *layers;
+  Sides* sides;
+  Extent* spheres;
+  Layers* layers;
   int *covering, *found; /* shapes that cover each column, in order, and how many */
   int stride, most;
 } Work;
 
 static int rounded_up(int n) { return (n + LANES - 1) / LANES * LANES; }
 
-static int prepare(const Camera *c, const Shapes *s, Work *w) {
+static int prepare(const Camera* c, const Shapes* s, Work* w) {
   const int uprights = s->boxes + s->cylinders, rows = rounded_up(c->height);
   w->stride = rounded_up(c->width);
   w->numbers = malloc(sizeof(float) * ((size_t)uprights * NUMBERS * w->stride + 1));
@@ -468,21 +476,23 @@ static int prepare(const Camera *c, const Shapes *s, Work *w) {
   return 1;
 }
 
-static void release(Work *w) { free(w->numbers), free(w->sides), free(w->layers), free(w->u), free(w->found), free(w->spheres); }
+static void release(Work* w) {
+  free(w->numbers), free(w->sides), free(w->layers), free(w->u), free(w->found), free(w->spheres);
+}
 
 /* Draws one frame, [H, C]. */
-static void draw(const Camera *c, const Shapes *s, const Eye *e, Work *w, float *picture) {
+static void draw(const Camera* c, const Shapes* s, const Eye* e, Work* w, float* picture) {
   Wave waves[MOST_WAVES];
   waves_of(c, e, waves);
   int visible = 0;
   for (int n = 0; n < s->boxes + s->cylinders; ++n) {
-    Sides *next = &w->sides[visible];
+    Sides* next = &w->sides[visible];
     next->numbers = w->numbers + (size_t)visible * NUMBERS * w->stride;
     visible += n < s->boxes ? box_sides(c, s, e, n, w->u, w->stride, next)
                             : cylinder_sides(c, s, e, n - s->boxes, w->u, w->stride, next);
   }
   for (int n = 0; n < s->spheres; ++n) {
-    const float *at = s->sphere_position + 3 * n;
+    const float* at = s->sphere_position + 3 * n;
     extent_of_disc(e, at[0] - e->origin[0], at[1] - e->origin[1], s->sphere_radius[n], &w->spheres[n]);
   }
   memset(w->found, 0, sizeof(int) * (size_t)c->width);
@@ -495,8 +505,7 @@ static void draw(const Camera *c, const Shapes *s, const Eye *e, Work *w, float 
   for (int column = 0; column < c->width; ++column) {
     const float u = c->u[column], dx = e->cos + u * e->sin, dy = e->sin - u * e->cos;
     for (int b = 0; b < blocks; ++b) w->layers[b].inserted = 0;
-    for (int n = 0; n < s->spheres; ++n)
-      /* A silhouette fades over half a pixel on either side. */
+    for (int n = 0; n < s->spheres; ++n) /* A silhouette fades over half a pixel on either side. */
       if (u + 1.5f * c->pitch > w->spheres[n].left && u - 1.5f * c->pitch < w->spheres[n].right)
         insert_sphere(c, s, e, n, u, w->v, w->layers);
     for (int n = 0; n < w->found[column]; ++n)
@@ -519,9 +528,10 @@ static inline Lanes nearer_upright(float from, float to, float middle, float hal
 
 /* Depths between which the middle rays of LANES columns are beside the axis of box or cylinder `n`, whose centre is at
  * (x, y) from the eye. */
-static inline void beside(const Shapes *s, int n, float x, float y, float cos, float sin, Lanes dx, Lanes dy, Lanes *from, Lanes *to) {
+static inline void beside(const Shapes* s, int n, float x, float y, float cos, float sin, Lanes dx, Lanes dy,
+                          Lanes* from, Lanes* to) {
   if (n < s->boxes) {
-    const float *half = s->box_half + 3 * n;
+    const float* half = s->box_half + 3 * n;
     const Lanes per_x = inverses(cos * dx + sin * dy), per_y = inverses(cos * dy - sin * dx);
     const Lanes middle_x = (cos * x + sin * y) * per_x, middle_y = (cos * y - sin * x) * per_y;
     const Lanes reach_x = half[0] * absolute(per_x), reach_y = half[1] * absolute(per_y);
@@ -536,7 +546,7 @@ static inline void beside(const Shapes *s, int n, float x, float y, float cos, f
 }
 
 /* Depth along the middle ray of every pixel of one frame, [H, C]; NOWHERE where there is nothing. */
-static void measure(const Camera *c, const Shapes *s, const Eye *e, Work *w, float *picture) {
+static void measure(const Camera* c, const Shapes* s, const Eye* e, Work* w, float* picture) {
   memset(w->found, 0, sizeof(int) * (size_t)c->width);
   for (int n = 0; n < s->boxes + s->cylinders; ++n) {
     const int is_box = n < s->boxes, i = is_box ? n : n - s->boxes;
@@ -580,7 +590,7 @@ static void measure(const Camera *c, const Shapes *s, const Eye *e, Work *w, flo
       }
       for (int k = 0; k < w->found[column]; ++k) {
         const int n = w->covering[column * w->most + k], is_box = n < s->boxes, i = is_box ? n : n - s->boxes;
-        const float *from = w->numbers + (size_t)n * NUMBERS * w->stride + column;
+        const float* from = w->numbers + (size_t)n * NUMBERS * w->stride + column;
         const float z = is_box ? s->box_position[3 * i + 2] : s->cylinder_position[3 * i + 2];
         const float half = is_box ? s->box_half[3 * i + 2] : s->cylinder_half[i];
         nearest = nearer_upright(from[0], from[w->stride], z - e->origin[2], half, per_z, nearest);
@@ -592,56 +602,59 @@ static void measure(const Camera *c, const Shapes *s, const Eye *e, Work *w, flo
 
 /* ------------------------------------------------------------------------------------------------------- handlers */
 
-enum { CONSTANTS, U, V, WAVES, ORIGIN, ROTATION, BOXES, CYLINDERS = BOXES + 4, SPHERES = CYLINDERS + 4,
-       PLANES = SPHERES + 3, OPERANDS = PLANES + 3 };
-
-/* Returns whether XLA asked what the handler is, rather than called it, and answers. */
-static int asked_for_version(XLA_FFI_CallFrame *call) {
-  XLA_FFI_Extension_Base *extension = call->extension_start;
-  if (!extension || extension->type != XLA_FFI_Extension_Metadata) return 0;
-  XLA_FFI_Metadata *metadata = ((XLA_FFI_Metadata_Extension *)extension)->metadata;
-  metadata->api_version.major_version = XLA_FFI_API_MAJOR;
-  metadata->api_version.minor_version = XLA_FFI_API_MINOR;
-  return 1;
-}
-
-static XLA_FFI_Error *failed(XLA_FFI_CallFrame *call, XLA_FFI_Error_Code code, const char *message) {
-  XLA_FFI_Error_Create_Args args = {XLA_FFI_Error_Create_Args_STRUCT_SIZE, 0, message, code};
-  return call->api->XLA_FFI_Error_Create(&args);
-}
+enum {
+  CONSTANTS,
+  U,
+  V,
+  WAVES,
+  ORIGIN,
+  ROTATION,
+  BOXES,
+  CYLINDERS = BOXES + 4,
+  SPHERES = CYLINDERS + 4,
+  PLANES = SPHERES + 3,
+  OPERANDS = PLANES + 3
+};
 
 /* The part of an operand that frame `m` reads. Of [L, ...] each row serves frames / L frames in a row. */
-static const float *of_frame(const XLA_FFI_Buffer *operand, int64_t m, int64_t frames) {
+static const float* of_frame(const XLA_FFI_Buffer* operand, int64_t m, int64_t frames) {
   int64_t size = 1;
   for (int i = 1; i < operand->rank; ++i) size *= operand->dims[i];
-  return (const float *)operand->data + m / (frames / operand->dims[0]) * size;
+  return (const float*)operand->data + m / (frames / operand->dims[0]) * size;
 }
 
-typedef void Render(const Camera *, const Shapes *, const Eye *, Work *, float *);
+typedef void Render(const Camera*, const Shapes*, const Eye*, Work*, float*);
 
 /* Renders all frames. Operands are numbered above; from ORIGIN on they have a leading [L], see `of_frame`, and last
  * come the weights [L, 3], if any. */
-static XLA_FFI_Error *each_frame(XLA_FFI_CallFrame *call, Render *render, int weighted) {
+static XLA_FFI_Error* each_frame(XLA_FFI_CallFrame* call, Render* render, int weighted) {
   if (asked_for_version(call)) return 0;
   if (call->args.size != OPERANDS + weighted || call->rets.size != 1)
-    return failed(call, XLA_FFI_Error_Code_INVALID_ARGUMENT, "pictures.c: another number of operands");
-  XLA_FFI_Buffer **arg = (XLA_FFI_Buffer **)call->args.args;
-  const XLA_FFI_Buffer *pictures = call->rets.rets[0];
+    return failed(
+        call, XLA_FFI_Error_Code_INVALID_ARGUMENT,
+        "pictures.c was called with a number of operands that it does not know; native.py must give those of its enum");
+  XLA_FFI_Buffer** arg = (XLA_FFI_Buffer**)call->args.args;
+  const XLA_FFI_Buffer* pictures = call->rets.rets[0];
   const int64_t frames = pictures->dims[0];
-  const float *k = arg[CONSTANTS]->data;
-  const Camera camera = {(int)pictures->dims[1], (int)pictures->dims[2], (int)arg[WAVES]->dims[0], k[0], k[1], k[2],
-                         k + 3, k + 6, arg[U]->data, arg[V]->data, arg[WAVES]->data};
-  Shapes shapes = {.boxes = (int)arg[BOXES]->dims[1], .cylinders = (int)arg[CYLINDERS]->dims[1],
-                   .spheres = (int)arg[SPHERES]->dims[1], .planes = (int)arg[PLANES]->dims[1]};
+  const float* k = arg[CONSTANTS]->data;
+  const Camera camera = {
+      (int)pictures->dims[1], (int)pictures->dims[2], (int)arg[WAVES]->dims[0], k[0], k[1], k[2], k + 3, k + 6,
+      arg[U]->data,           arg[V]->data,           arg[WAVES]->data};
+  Shapes shapes = {.boxes = (int)arg[BOXES]->dims[1],
+                   .cylinders = (int)arg[CYLINDERS]->dims[1],
+                   .spheres = (int)arg[SPHERES]->dims[1],
+                   .planes = (int)arg[PLANES]->dims[1]};
   if (camera.waves > MOST_WAVES)
-    return failed(call, XLA_FFI_Error_Code_INVALID_ARGUMENT, "pictures.c: more waves than MOST_WAVES");
+    return failed(call, XLA_FFI_Error_Code_INVALID_ARGUMENT,
+                  "pictures.c draws a texture of at most 8 waves; texture.WAVES must not have more");
   Work work = {0};
   if (!prepare(&camera, &shapes, &work)) {
     release(&work);
-    return failed(call, XLA_FFI_Error_Code_RESOURCE_EXHAUSTED, "pictures.c: no memory for the columns of a frame");
+    return failed(call, XLA_FFI_Error_Code_RESOURCE_EXHAUSTED,
+                  "pictures.c found no memory for the columns of a frame; the image must be smaller");
   }
   for (int64_t m = 0; m < frames; ++m) {
-    const float *of[OPERANDS + 1] = {0};
+    const float* of[OPERANDS + 1] = {0};
     for (int i = ORIGIN; i < OPERANDS + weighted; ++i) of[i] = of_frame(arg[i], m, frames);
     shapes.box_position = of[BOXES], shapes.box_half = of[BOXES + 1];
     shapes.box_yaw = of[BOXES + 2], shapes.box_albedo = of[BOXES + 3];
@@ -652,12 +665,12 @@ static XLA_FFI_Error *each_frame(XLA_FFI_CallFrame *call, Render *render, int we
     shapes.plane_position = of[PLANES], shapes.plane_normal = of[PLANES + 1], shapes.plane_albedo = of[PLANES + 2];
     const float *r = of[ROTATION], scale = 1.0f / sqrtf(most(r[0] * r[0] + r[3] * r[3], TINY));
     const Eye eye = {of[ORIGIN], of[OPERANDS], r[0] * scale, r[3] * scale};
-    render(&camera, &shapes, &eye, &work, (float *)pictures->data + m * camera.height * camera.width);
+    render(&camera, &shapes, &eye, &work, (float*)pictures->data + m * camera.height * camera.width);
   }
   release(&work);
   return 0;
 }
 
-XLA_FFI_Error *edqn_pictures(XLA_FFI_CallFrame *call) { return each_frame(call, draw, 1); }
+XLA_FFI_Error* edqn_pictures(XLA_FFI_CallFrame* call) { return each_frame(call, draw, 1); }
 
-XLA_FFI_Error *edqn_depths(XLA_FFI_CallFrame *call) { return each_frame(call, measure, 0); }
+XLA_FFI_Error* edqn_depths(XLA_FFI_CallFrame* call) { return each_frame(call, measure, 0); }

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import shutil
+import tempfile
 from pathlib import Path
 
 import pytest
@@ -10,12 +12,8 @@ from edqn_jax.parallel import c_library
 from edqn_jax.parallel.c_library import registered
 
 SOURCE = """
-#include "xla/ffi/api/c_api.h"
-XLA_FFI_Error *NAME(XLA_FFI_CallFrame *call) {
-  XLA_FFI_Metadata *asked = ((XLA_FFI_Metadata_Extension *)call->extension_start)->metadata;
-  asked->api_version.major_version = XLA_FFI_API_MAJOR, asked->api_version.minor_version = XLA_FFI_API_MINOR;
-  return 0;
-}
+#include "handler.h"
+XLA_FFI_Error *NAME(XLA_FFI_CallFrame *call) { return asked_for_version(call) ? 0 : failed(call, 2, "nothing"); }
 """
 
 
@@ -67,3 +65,14 @@ def test_what_is_compiled_once_is_kept(source: Path, tmp_path: Path) -> None:
         registered.cache_clear()
         assert registered(source, names, ("NAME=edqn_test_e",))
         assert kept(tmp_path) == [first] and first.stat().st_mtime_ns == made
+
+
+def test_where_nothing_can_be_kept_it_is_compiled_and_leaves_nothing(
+    source: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(c_library, "private_folder", lambda: None)
+    scratch = tmp_path / "scratch"
+    scratch.mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(scratch))
+    assert registered(source, ("edqn_test_f",), ("NAME=edqn_test_f",)) is (shutil.which("cc") is not None)
+    assert not list(scratch.rglob("*")) and not kept(tmp_path)

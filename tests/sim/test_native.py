@@ -46,7 +46,7 @@ def drawn(config: CameraConfig, scene: Scene, origin: jax.Array, rotation: jax.A
             native.depths(config, scene, origin, rotation),
         ),
         lambda: (
-            columns._pictures(config, camera.blend, scene, origin, rotation, weights),
+            columns.pictures(config, camera.blend, scene, origin, rotation, weights),
             camera._depths(config, scene, origin, rotation),
         ),
     ]
