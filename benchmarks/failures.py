@@ -28,11 +28,12 @@ from edqn_jax.parallel.devices import use_cpu_devices
 from edqn_jax.runs.files import check_can_write
 from edqn_jax.runs.policies import load_run
 from edqn_jax.sim import camera, sensor
+from edqn_jax.sim.distance import shape_distances, signed_distance
 from edqn_jax.sim.drone import Flight, yaw_of
 from edqn_jax.sim.events import EventField
 from edqn_jax.sim.flights import Flights
 from edqn_jax.sim.outcomes import Outcome
-from edqn_jax.sim.scene import KINDS, Scene, parked_like, scene_at, shape_distances, signed_distance
+from edqn_jax.sim.scene import KINDS, Scene, parked_like, scene_at
 from measurement import json_report
 
 NAMES = {

@@ -28,7 +28,7 @@ _PLANE, _SPHERE, _CAPSULE, _CYLINDER = (
 )
 
 _SAMPLES = 8
-"""Points at which a segment is checked, as in `scene.segment_contact`."""
+"""Points at which a segment is checked, as in `distance.segment_contact`."""
 
 _REWARDS = ("sparse", "progress", "potential")
 

@@ -9,7 +9,7 @@ box-filtered over the pixel (`texture.py`).
 from __future__ import annotations
 
 import dataclasses
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -77,7 +77,9 @@ def blend(config: CameraConfig, frame: Frame, rays: Rays, layers: Layers) -> Arr
 def _picture(config: CameraConfig, scene: Scene, origin: Array, rotation: Array, weights: Array) -> Array:
     """Returns brightness [H, W] under `weights` [3] of RGB."""
     if config.mount == "level":
-        return columns.picture(config, blend, scene, origin, rotation, weights)
+        image = (scene, origin, rotation, weights)
+        size = (config.height, config.width)
+        return draw_in_one_batch(columns.pictures, (config, blend), image, size, on_cpu=_pictures_on_cpu)
     value = raycast.albedo_values(scene, weights)
     rays = raycast.camera_rays(config, rotation)
     many = raycast.camera_rays(config, rotation, config.samples_across, config.samples_down)
@@ -140,6 +142,11 @@ def depth(config: CameraConfig, scene: Scene, position: Array, rotation: Array) 
     return nearest * jnp.sqrt(rays.dx**2 + rays.dy**2 + rays.dz**2)
 
 
+def _pictures_on_cpu(config: CameraConfig, _: columns.Finish, *image: Any) -> Array | None:
+    """Returns brightness [M, H, W] by the library in C, which blends as `blend` does; None where it cannot draw it."""
+    return native.pictures(config, *image) if native.can_draw(config, image[0]) else None
+
+
 def _depths(config: CameraConfig, scene: Scene, position: Array, rotation: Array) -> Array:
     """Returns the depth [M, H, W] metres along the optical axis; every array has a leading [M]."""
 
@@ -150,5 +157,5 @@ def _depths(config: CameraConfig, scene: Scene, position: Array, rotation: Array
 
 
 def _depths_on_cpu(config: CameraConfig, scene: Scene, position: Array, rotation: Array) -> Array | None:
-    """Returns `_depths`, by the library in C where that is at hand and draws such scenes."""
+    """Returns `_depths` by the library in C; None where it cannot draw them."""
     return native.depths(config, scene, position, rotation) if native.can_draw(config, scene) else None

@@ -20,6 +20,7 @@ from edqn_jax.checks import check_finite, check_index
 from edqn_jax.config import Config, EnvConfig
 from edqn_jax.random import integers
 from edqn_jax.sim import disturbances, drone, geodesic, sensor
+from edqn_jax.sim.distance import signed_distance
 from edqn_jax.sim.disturbances import Disturbance
 from edqn_jax.sim.drone import Airframe, DroneState, Flight
 from edqn_jax.sim.events import EventMemory
@@ -27,7 +28,7 @@ from edqn_jax.sim.missions import Missions
 from edqn_jax.sim.moves import ACTIONS
 from edqn_jax.sim.outcomes import Outcome, judge
 from edqn_jax.sim.reward import Reward, Transition, configured_reward
-from edqn_jax.sim.scene import Scene, moves, scene_at, signed_distance, take_scene
+from edqn_jax.sim.scene import Scene, moves, scene_at, take_scene
 from edqn_jax.sim.sensor import Sensed, frame_steps
 
 OWN_SIZE = 10

@@ -8,8 +8,9 @@ from flax import struct
 from jax import Array
 
 from edqn_jax.config import Config
+from edqn_jax.sim.distance import signed_distance
 from edqn_jax.sim.drone import DroneState, Flight
-from edqn_jax.sim.scene import Scene, scene_at, signed_distance
+from edqn_jax.sim.scene import Scene, scene_at
 
 
 @struct.dataclass

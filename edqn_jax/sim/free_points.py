@@ -12,7 +12,8 @@ from flax import struct
 from jax import Array, lax
 from jax.typing import ArrayLike
 
-from edqn_jax.sim.scene import Scene, moves, scene_at, signed_distance
+from edqn_jax.sim.distance import signed_distance
+from edqn_jax.sim.scene import Scene, moves, scene_at
 
 CLEARANCE = 1.0
 """Metres between a random start or goal and the nearest surface."""

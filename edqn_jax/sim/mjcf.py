@@ -30,6 +30,7 @@ import numpy as np
 from jax.typing import ArrayLike
 
 from edqn_jax.config import FAMILIES
+from edqn_jax.sim.distance import shape_distances
 from edqn_jax.sim.mjcf_files import SceneError, checked_text
 from edqn_jax.sim.mjcf_motion import PREFIX, motions_of, set_in_motion, text_of
 from edqn_jax.sim.motion import Throw, hit_time, thrown_to
@@ -46,7 +47,6 @@ from edqn_jax.sim.scene import (
     UprightCylinders,
     build_scene,
     scene_shapes,
-    shape_distances,
 )
 
 VOLUME_MARGIN = 5.0

@@ -14,9 +14,10 @@ from jax import Array, lax
 
 from edqn_jax.config import Config
 from edqn_jax.sim import building
+from edqn_jax.sim.distance import shape_distances
 from edqn_jax.sim.free_points import CLEARANCE, early_times
 from edqn_jax.sim.motion import Motion, Throw, at_rest
-from edqn_jax.sim.scene import PARKED, Scene, Spheres, UprightBoxes, scene_at, shape_distances
+from edqn_jax.sim.scene import PARKED, Scene, Spheres, UprightBoxes, scene_at
 
 Bodies = Mapping[str, tuple[int, ...]]
 """By kind of shape, the number of the body that each shape is part of; what is in no body stands."""

@@ -8,8 +8,9 @@ import jax.numpy as jnp
 from jax import Array
 
 from edqn_jax.config import Config
+from edqn_jax.sim.distance import path_contact
 from edqn_jax.sim.drone import Flight
-from edqn_jax.sim.scene import Scene, moves, path_contact
+from edqn_jax.sim.scene import Scene, moves
 
 
 class Outcome(enum.IntEnum):

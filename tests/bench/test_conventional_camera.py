@@ -15,7 +15,7 @@ from edqn_jax.config import CameraConfig, Config, EventsConfig
 from edqn_jax.sim import camera as our_camera
 from edqn_jax.sim import env as our_env
 from edqn_jax.sim import events as our_events
-from edqn_jax.sim.scene import signed_distance
+from edqn_jax.sim.distance import signed_distance
 from tests.bench.conventional_course import paper
 from tests.oracles import camera_plain, events_plain
 from tests.sim.drawn_scenes import every_kind, free_points

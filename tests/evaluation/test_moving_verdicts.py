@@ -14,10 +14,11 @@ from edqn_jax.evaluation.judge import clearance, fastest, load_judge, replay_con
 from edqn_jax.evaluation.missions import MissionSet, load_missions
 from edqn_jax.evaluation.rollouts import fly_missions
 from edqn_jax.evaluation.verdicts import check_verdicts
+from edqn_jax.sim.distance import path_contact, signed_distance
 from edqn_jax.sim.missions import random_missions
 from edqn_jax.sim.mjcf import load_world
 from edqn_jax.sim.outcomes import Outcome
-from edqn_jax.sim.scene import path_contact, scene_at, signed_distance
+from edqn_jax.sim.scene import scene_at
 from tests.policies import CONFIG, always
 
 RADIUS = 0.36

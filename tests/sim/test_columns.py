@@ -21,7 +21,7 @@ ROUNDING = 2e-6
 @pytest.fixture(autouse=True)
 def in_jax(monkeypatch):
     """Columns as GPUs draw them, and CPUs without a compiler; `test_native.py` holds the others against them."""
-    monkeypatch.setattr(columns, "_pictures_on_cpu", lambda *_: None)
+    monkeypatch.setattr(camera, "_pictures_on_cpu", lambda *_: None)
 
 
 def stairs(count):

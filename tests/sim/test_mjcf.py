@@ -16,6 +16,7 @@ import pytest
 from edqn_jax.config import FAMILIES
 from edqn_jax.errors import ConfigError
 from edqn_jax.sim import mjcf
+from edqn_jax.sim.distance import shape_distances, signed_distance
 from edqn_jax.sim.mjcf import (
     VOLUME_MARGIN,
     SceneError,
@@ -37,8 +38,6 @@ from edqn_jax.sim.scene import (
     build_scene,
     obstacle_count,
     scene_shapes,
-    shape_distances,
-    signed_distance,
 )
 from edqn_jax.sim.worlds import random_scene, world_key
 

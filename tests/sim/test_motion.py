@@ -14,6 +14,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from edqn_jax.sim.distance import path_contact, segment_contact, signed_distance
 from edqn_jax.sim.motion import Motion, Throw, at_rest
 from edqn_jax.sim.scene import (
     PARKED,
@@ -25,11 +26,8 @@ from edqn_jax.sim.scene import (
     build_scene,
     fastest,
     moves,
-    path_contact,
     scene_at,
     scene_shapes,
-    segment_contact,
-    signed_distance,
     stack_scenes,
     take_scene,
     with_equal_capacities,

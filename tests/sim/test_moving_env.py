@@ -17,6 +17,7 @@ from edqn_jax.config.loading import make_config
 from edqn_jax.evaluation.rollouts import fly_missions
 from edqn_jax.learn.policy import fresh_policy
 from edqn_jax.sim import drone, env, sensor
+from edqn_jax.sim.distance import signed_distance
 from edqn_jax.sim.env import World
 from edqn_jax.sim.environment import Environment
 from edqn_jax.sim.events import event_image
@@ -24,7 +25,7 @@ from edqn_jax.sim.missions import own_missions
 from edqn_jax.sim.motion import Motion, Throw
 from edqn_jax.sim.moves import move_number
 from edqn_jax.sim.outcomes import Outcome
-from edqn_jax.sim.scene import PARKED, Spheres, UprightBoxes, build_scene, scene_at, signed_distance, stack_scenes
+from edqn_jax.sim.scene import PARKED, Spheres, UprightBoxes, build_scene, scene_at, stack_scenes
 from tests.sim.drawn_scenes import GROUND
 
 CONFIG = make_config(

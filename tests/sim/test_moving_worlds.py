@@ -13,12 +13,13 @@ from edqn_jax.config.loading import make_config
 from edqn_jax.errors import ConfigError
 from edqn_jax.evaluation.missions import load_missions
 from edqn_jax.sim import canyon, forest, worlds
+from edqn_jax.sim.distance import signed_distance
 from edqn_jax.sim.environment import make
 from edqn_jax.sim.free_points import CLEARANCE, EARLY_S
 from edqn_jax.sim.missions import own_missions, random_missions
 from edqn_jax.sim.motion import hit_time
 from edqn_jax.sim.moving_worlds import MOVING_SHARE, Moving
-from edqn_jax.sim.scene import PARKED, Scene, moves, scene_at, signed_distance, take_scene
+from edqn_jax.sim.scene import PARKED, Scene, moves, scene_at, take_scene
 from edqn_jax.sim.worlds import random_pool, world_keys
 
 WORLDS = 12

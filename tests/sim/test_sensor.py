@@ -207,8 +207,16 @@ def test_a_frame_pair_is_the_frames_that_events_are_made_of(world) -> None:
     np.testing.assert_allclose(found["event-image"], (np.sign(net) * np.log1p(np.abs(net))).ravel(), atol=1e-5)
 
 
-DRAWN = {"events": 2, "frames": 1, "frame-pair": 2, "depth": 1, "event-image": 2, "ranges": 0, "blind": 0}
-DRAWN |= {"depth-motion": 2}
+DRAWN = {
+    "events": 2,
+    "frames": 1,
+    "frame-pair": 2,
+    "depth": 1,
+    "depth-motion": 2,
+    "event-image": 2,
+    "ranges": 0,
+    "blind": 0,
+}
 """Pictures of a decision by sensor."""
 
 SHAPES = {
