@@ -141,7 +141,8 @@ def set_in_motion(
             low, high = _walls(numbers, shapes, reaches, at, volume, title)
         else:
             a, b, rate, phase = as_ellipse((word, numbers))
-            how = dataclasses.replace(how, swing=np.stack([a, b]), rate=rate, phase=phase)
+            cos, sin = math.cos(phase), math.sin(phase)
+            how = dataclasses.replace(how, swing=np.stack([cos * a + sin * b, cos * b - sin * a]), rate=rate)
     top = float(np.linalg.norm(how.velocity) + abs(how.rate) * np.linalg.norm(how.swing))
     if not top <= FASTEST:
         raise SceneError(f"{title} moves at {top:.0f} m/s; an obstacle may move at {FASTEST:g}")
@@ -203,7 +204,7 @@ def text_of(shape: Shape) -> str | None:
     if np.any(motion.velocity):
         said.append(_text("bounce", *motion.velocity, *motion.low, *motion.high))
     if np.any(motion.swing) and motion.rate:
-        said.append(_text("ellipse", *np.ravel(motion.swing), motion.rate, motion.phase))
+        said.append(_text("ellipse", *np.ravel(motion.swing), motion.rate, 0.0))
     return "; ".join(said)
 
 

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from flax import struct
 from jax import Array
 
-from edqn_jax.sim.sine import sin_pi
+from edqn_jax.sim.sine import turned_by
 
 
 @struct.dataclass
@@ -19,9 +19,8 @@ class Motion:
     velocity: Array  # [N, 3] m/s at time 0; each component changes its sign at the walls
     low: Array  # [N, 3] metres, between which and `high` the centre moves along the axes of its velocity
     high: Array  # [N, 3] metres
-    swing: Array  # [N, 2, 3] metres, half axes of the ellipse: along the cosine and along the sine of the phase
+    swing: Array  # [N, 2, 3] metres, conjugate half axes of the ellipse: towards where it is at time 0, and ahead
     rate: Array  # [N] rad/s
-    phase: Array  # [N] rad at time 0
 
 
 @struct.dataclass
@@ -49,25 +48,27 @@ def displacement(motion: Motion, position: Array, time: Array) -> Array:
     """Returns how far the shapes have moved at `time` [] seconds: [N, 3] metres, exactly zero at time 0.
 
     A velocity is reflected at the walls: the position is a triangle wave of the time. The ellipse is
-    a (cos(p + w t) - cos p) + b (sin(p + w t) - sin p).
+    a (cos(w t) - 1) + b sin(w t).
 
     Args:
         position: [N, 3] metres at time 0, between the walls where there is a velocity.
     """
-    runs = motion.velocity != 0
-    both_ways = 2 * jnp.where(runs, motion.high - motion.low, 1.0)
-    ahead = position - motion.low + motion.velocity * time
+    # One array per coordinate, so that CPUs take all shapes of a kind in vectors.
+    back, ahead = turned_by(motion.rate * time)
+    around = [motion.swing[:, 0, axis] * back + motion.swing[:, 1, axis] * ahead for axis in range(3)]
+    along = [_along(motion, position, axis, time) for axis in range(3)]
+    return jnp.stack([line + turn for line, turn in zip(along, around, strict=True)], axis=1)
+
+
+def _along(motion: Motion, position: Array, axis: int, time: Array) -> Array:
+    """Returns how far the shapes have run between their walls along one axis: [N] metres."""
+    place, velocity, low, high = (of[:, axis] for of in (position, motion.velocity, motion.low, motion.high))
+    runs = velocity != 0
+    both_ways = 2 * jnp.where(runs, high - low, 1.0)
+    ahead = place - low + velocity * time
     # XLA's remainder of a division is a call of a library for each number on a CPU, and takes ten times as long.
     ahead = ahead - both_ways * jnp.floor(ahead / both_ways)
-    line = jnp.where(runs & (time != 0), motion.low + both_ways / 2 - jnp.abs(ahead - both_ways / 2) - position, 0.0)
-    cos, sin = (after - before for after, before in zip(_waves(motion, time), _waves(motion, 0.0), strict=True))
-    return line + motion.swing[:, 0] * cos[:, None] + motion.swing[:, 1] * sin[:, None]
-
-
-def _waves(motion: Motion, time: Array | float) -> tuple[Array, Array]:
-    """Returns cosine and sine [N] of the phases at a time."""
-    half_turns = (motion.phase + motion.rate * time) / jnp.pi
-    return sin_pi(half_turns + 0.5), sin_pi(half_turns)
+    return jnp.where(runs & (time != 0), low + both_ways / 2 - jnp.abs(ahead - both_ways / 2) - place, 0.0)
 
 
 def top_speed(motion: Motion) -> Array:
@@ -133,7 +134,6 @@ def at_rest(*lead: int) -> Motion:
         high=jnp.zeros((*lead, 3)),
         swing=jnp.zeros((*lead, 2, 3)),
         rate=jnp.zeros(lead),
-        phase=jnp.zeros(lead),
     )
 
 

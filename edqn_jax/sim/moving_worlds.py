@@ -139,15 +139,17 @@ def _motions(moving: Moving, draw: Array, runs: bool) -> Motion:
     along = jnp.stack([jnp.cos(heading), jnp.sin(heading), none], axis=1)
     across = jnp.stack([-jnp.sin(heading), jnp.cos(heading), none], axis=1)
     turns = jnp.where(draw[:, 2] * 1024.0 % 1.0 < 0.5, -1.0, 1.0)  # of either hand
+    # It is somewhere on its line or circle at time 0, as far as `phase` says.
     circle = jnp.where((go & (sort == 2))[:, None], reach[:, None] * across, 0.0)
-    swing = jnp.stack([circle, jnp.where((go & (sort > 0))[:, None], reach[:, None] * along, 0.0)], axis=1)
+    line = jnp.where((go & (sort > 0))[:, None], reach[:, None] * along, 0.0)
+    cos, sin = jnp.cos(phase)[:, None], jnp.sin(phase)[:, None]
+    swing = jnp.stack([cos * circle + sin * line, cos * line - sin * circle], axis=1)
     return Motion(
         velocity=jnp.where((go & (sort == 0))[:, None], speed[:, None] * along, 0.0),
         low=jnp.zeros_like(along),
         high=jnp.zeros_like(along),
         swing=swing,
         rate=jnp.where(go, turns * speed / reach, 0.0),
-        phase=phase,
     )
 
 

@@ -25,7 +25,7 @@ from tests.report.test_animation import Drawn, a_flight, recorded
 from tests.report.test_sights import SMALL
 
 RED, GREY = np.array([0.9, 0.05, 0.05]), np.full(3, 0.5)
-SLIDING = Motion((0, 4, 0), (0, -9, 0), (0, 9, 0), np.zeros((2, 3)), 0.0, 0.0)
+SLIDING = Motion((0, 4, 0), (0, -9, 0), (0, 9, 0), np.zeros((2, 3)), 0.0)
 
 
 def moving_world() -> Scene:

@@ -45,8 +45,9 @@ def scene_of(*shapes, **capacities) -> Scene:
 
 
 def motion(velocity=(0, 0, 0), low=(0, 0, 0), high=(0, 0, 0), a=(0, 0, 0), b=(0, 0, 0), rate=0.0, phase=0.0) -> Motion:
-    swing = np.array([a, b], float)
-    return Motion(velocity=velocity, low=low, high=high, swing=swing, rate=rate, phase=phase)
+    a, b, cos, sin = np.array(a, float), np.array(b, float), np.cos(phase), np.sin(phase)
+    swing = np.array([cos * a + sin * b, cos * b - sin * a])  # a cos(phase + x) + b sin(phase + x)
+    return Motion(velocity=velocity, low=low, high=high, swing=swing, rate=rate)
 
 
 def ball(position, radius=0.4, **fields) -> Spheres:
@@ -62,8 +63,10 @@ def thrown(**fields) -> Spheres:
 
 
 BOUNCING = motion(velocity=(3, -2, 0.5), low=(5, 4, 2), high=(20, 9, 4))
-CIRCLING = motion(a=(3, 0, 0), b=(0, -3, 0), rate=1.0, phase=0.7)
-SWAYING = motion(b=(0, 1.5, 0.5), rate=1.9, phase=-2.0)
+CIRCLE = ((3, 0, 0), (0, -3, 0), 1.0, 0.7)
+SWAY = ((0, 0, 0), (0, 1.5, 0.5), 1.9, -2.0)
+"""Half axes, rate and phase."""
+CIRCLING, SWAYING = (motion(a=a, b=b, rate=rate, phase=phase) for a, b, rate, phase in (CIRCLE, SWAY))
 
 
 def moving_world() -> Scene:
@@ -124,12 +127,13 @@ def test_a_shape_bounces_between_its_walls_as_one_that_is_stepped():
             assert abs(place[axis] - expected) < 1e-4, (time, axis)
 
 
-@pytest.mark.parametrize(("kind", "number", "how"), [("cylinders", 0, CIRCLING), ("spheres", 0, SWAYING)])
+@pytest.mark.parametrize(("kind", "number", "how"), [("cylinders", 0, CIRCLE), ("spheres", 0, SWAY)])
 def test_a_shape_swings_on_its_ellipse(kind, number, how):
     scene = moving_world()
     times = np.linspace(-0.08, 50, 40, dtype=np.float32)
     found = np.asarray(places(scene, times)[kind])[:, number]
-    away = np.array([motion_plain.swung(how.swing[0], how.swing[1], how.rate, how.phase, float(t)) for t in times])
+    a, b, rate, phase = how
+    away = np.array([motion_plain.swung(np.array(a), np.array(b), rate, phase, float(t)) for t in times])
     np.testing.assert_allclose(found, np.asarray(getattr(scene, kind).position[number]) + away, atol=3e-5)
 
 

@@ -44,7 +44,7 @@ HOVER = move_number("hover")
 
 def sliding(velocity=(0.0, 2.0, 0.0)) -> Motion:
     """Back and forth through the whole volume."""
-    return Motion(velocity, VOLUME[0], VOLUME[1], np.zeros((2, 3)), 0.0, 0.0)
+    return Motion(velocity, VOLUME[0], VOLUME[1], np.zeros((2, 3)), 0.0)
 
 
 def pillar(motion: Motion | None, x=18.0, y=16.0) -> UprightBoxes:

@@ -82,12 +82,16 @@ def test_obstacles_are_as_fast_as_the_option_says_and_all_three_motions_occur(po
             fastest = speed.max(0)[speed.max(0) > 0.05]
             assert (fastest > 0.3 * top * 0.97).all()
             motion = getattr(scene, kind).motion
-            runs, sways = (np.abs(np.asarray(x)).max(-1) > 0 for x in (motion.velocity, motion.swing[:, 1]))
-            circles = np.abs(np.asarray(motion.swing[:, 0])).max(-1) > 0
+            runs, swings = (
+                np.abs(np.asarray(x)).reshape(len(x), -1).max(1) > 0 for x in (motion.velocity, motion.swing)
+            )
+            a, b = np.asarray(motion.swing)[:, 0], np.asarray(motion.swing)[:, 1]
+            circles = np.abs(np.cross(a, b)).max(-1) > 0.1  # at least 1 m^2; of one that sways they are parallel
+            sways = swings & ~circles
             sorts["runs"] += runs.sum()
-            sorts["sways"] += (sways & ~circles).sum()
+            sorts["sways"] += sways.sum()
             sorts["circles"] += circles.sum()
-            assert not (runs & sways).any()
+            assert not (runs & swings).any()
     counts = np.array(list(sorts.values()))
     assert (np.abs(counts / counts.sum() - 1 / 3) < 0.12).all(), sorts
 
