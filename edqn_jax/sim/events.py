@@ -4,8 +4,10 @@ Inside the compiled step events are never a list. Between two frames a pixel's e
 and even spacing, so `EventField` holds them exactly; `expand` turns it into the `(t, x, y, p)` stream that
 people exchange, and `collect` turns such a stream back.
 
-Shapes: T frames, F = T - 1 frame pairs (2 F rows in an `EventField` when noise events are on, the second F
-being noise), H rows, W columns.
+With noise a pixel may have events of both polarities between two frames: the rows of a field are then the ON events
+of every frame pair and after them the OFF events, and in a row noise and signal of a pixel are one (`merged`).
+
+Shapes: T frames, F = T - 1 frame pairs (2 F rows in an `EventField` when noise events are on), H rows, W columns.
 """
 
 from __future__ import annotations
@@ -49,7 +51,7 @@ class EventField:
     divides_window: bool = struct.field(pytree_node=False, default=False)
     """Whether `t_first` is 0 and `t_step` the window over `count` everywhere: Eq. 5 between one pair of frames."""
     with_noise: bool = struct.field(pytree_node=False, default=False)
-    """Whether the second half of the rows are noise events of the frame pairs of the first half."""
+    """Whether the rows are the ON events of every frame pair and then the OFF events, 2 F in all."""
 
 
 @struct.dataclass
@@ -191,16 +193,16 @@ def events(
         field, memory = _esim(config, memory, level, times, continuous)
     else:
         field = _frame_pairs(config, memory.gain, frames, times)
-    if _has_noise(config):
-        field = _join(field, _noise(config, memory.hot, field, times, key))
+    noisy = has_noise(config)
+    if noisy:
+        field = merged(config, by_polarity(field), noise_events(config, memory.hot, field.count, times, key), times)
     even = divides_window(config, len(times))
-    noisy = _has_noise(config)
     return dataclasses.replace(field, window_s=window_s, divides_window=even, with_noise=noisy), memory
 
 
 def divides_window(config: EventsConfig, frames: int) -> bool:
     """Returns whether each pixel's events divide a window of so many frames evenly, see `EventField`."""
-    return frames == 2 and config.law != "esim" and not _has_noise(config)
+    return frames == 2 and config.law != "esim" and not has_noise(config)
 
 
 def signed_count(field: EventField) -> Array:
@@ -414,31 +416,73 @@ def _esim_pair(
     return (residual, last_event), EventField(count, polarity, first, step, 0.0)
 
 
-def _has_noise(config: EventsConfig) -> bool:
+def has_noise(config: EventsConfig) -> bool:
+    """Returns whether pixels fire without a change of brightness."""
     return config.leak_rate_hz > 0.0 or config.shot_rate_hz > 0.0 or config.hot_pixel_fraction > 0.0
 
 
-def _noise(config: EventsConfig, hot: Array | None, field: EventField, times: NDArray, key: Array) -> EventField:
-    """Returns the noise events of every frame pair: Poisson counts, evenly spaced from a random phase.
+def noise_events(config: EventsConfig, hot: Array | None, signal: Array, times: NDArray, key: Array) -> EventField:
+    """Returns the noise events of every frame pair, ON and then OFF [2 F, H, W]: Poisson counts, evenly spaced.
 
-    A pixel's noise events between two frames share one polarity, drawn by the rates: exact as long as
-    there is at most one. They neither change esim's reference nor obey the refractory period.
+    Leak and hot pixels make ON events, shot noise either. A pixel's refractory period leaves it `max_events` between
+    two frames, of which the signal's come first. Noise does not change esim's reference.
+
+    Args:
+        hot: [H, W] bool, hot pixels; None where there are none.
+        signal: [F, H, W] int32, events that the pixels have without noise.
+        times: [T] seconds of the frames.
+        key: consumed.
     """
-    key_count, key_polarity, key_phase = jax.random.split(key, 3)
-    shape = field.count.shape
+    key_count, key_phase = jax.random.split(key)
+    pairs, *size = signal.shape
     firing = 0.0 if hot is None else config.hot_pixel_rate_hz * hot
-    rate_off = 0.5 * config.shot_rate_hz
-    rate = jnp.broadcast_to(config.leak_rate_hz + config.shot_rate_hz + firing, shape[1:])
-    intervals = jnp.asarray(np.diff(times), jnp.float32)[:, None, None]
-    limit = jnp.array([max_events(config, dt) for dt in np.diff(times)], jnp.int32)[:, None, None]
-    count = jnp.minimum(jax.random.poisson(key_count, rate[None] * intervals, shape, dtype=jnp.int32), limit)
-    off = jax.random.uniform(key_polarity, shape) * rate[None] < rate_off
+    shot = 0.5 * config.shot_rate_hz
+    rates = jnp.stack([jnp.broadcast_to(rate, size) for rate in (config.leak_rate_hz + shot + firing, shot)])
+    lengths = np.diff(times)
+    intervals = jnp.asarray(lengths, jnp.float32)[:, None, None]
+    drawn = jax.random.poisson(key_count, rates[:, None] * intervals, (2, *signal.shape), dtype=jnp.int32)
+    limit = jnp.array([max_events(config, dt) for dt in lengths], jnp.int32)[:, None, None]
+    room = jnp.maximum(limit - signal, 0)
+    on = jnp.minimum(drawn[0], room)
+    count = jnp.concatenate([on, jnp.minimum(drawn[1], room - on)])
+    intervals, starts = jnp.tile(intervals, (2, 1, 1)), jnp.tile(jnp.asarray(times[:-1], jnp.float32), 2)[:, None, None]
     step = intervals / jnp.maximum(count, 1)
-    first = jnp.asarray(times[:-1, None, None], jnp.float32) + jax.random.uniform(key_phase, shape) * step
-    polarity = jnp.where(count > 0, jnp.where(off, -1, 1), 0).astype(jnp.int8)
-    return EventField(count, polarity, first, step, 0.0)
+    # A window is half open; float32 may round a phase of nearly 1 up to its end.
+    phase = jnp.minimum(jax.random.uniform(key_phase, count.shape) * step, intervals - (count - 1) * step - MICROSECOND)
+    sign = jnp.repeat(jnp.array([1, -1], jnp.int8), pairs)[:, None, None]
+    return EventField(count, jnp.where(count > 0, sign, 0).astype(jnp.int8), starts + phase, step, 0.0)
 
 
-def _join(signal: EventField, noise: EventField) -> EventField:
-    """Returns the signal rows, then the noise rows."""
-    return jax.tree.map(lambda a, b: jnp.concatenate([a, b]), signal, noise)
+def by_polarity(field: EventField) -> EventField:
+    """Returns a field [F, H, W] as the ON events of its rows and then the OFF events, [2 F, H, W]."""
+    signs = (field.polarity > 0, field.polarity < 0)
+    twice = jax.tree.map(lambda leaf: jnp.concatenate([leaf, leaf]), field)
+    of_sign = jnp.concatenate(signs)
+    return dataclasses.replace(
+        twice, count=jnp.where(of_sign, twice.count, 0), polarity=jnp.where(of_sign, twice.polarity, 0).astype(jnp.int8)
+    )
+
+
+def merged(config: EventsConfig, one: EventField, other: EventField, times: NDArray) -> EventField:
+    """Returns the events of two fields [2 F, H, W] of `by_polarity` in one: nothing tells which field an event is of.
+
+    Counts are added. Where both have events in a row, they are spaced evenly from the first to the last of all, at
+    least a refractory period apart.
+    """
+    count = one.count + other.count
+    fields = (one, other)
+    firsts = [jnp.where(field.count > 0, field.t_first, jnp.inf) for field in fields]
+    lasts = [jnp.where(field.count > 0, field.t_first + (field.count - 1) * field.t_step, 0.0) for field in fields]
+    first, last = jnp.minimum(*firsts), jnp.maximum(*lasts)
+    gaps = jnp.maximum(count - 1, 1)
+    step = jnp.maximum((last - first) / gaps, config.refractory_ns * 1e-9)
+    starts, ends = (jnp.tile(jnp.asarray(t, jnp.float32), 2)[:, None, None] for t in (times[:-1], times[1:]))
+    first = jnp.clip(first, starts, jnp.maximum(ends - MICROSECOND - gaps * step, starts))
+    alone, still = other.count == 0, one.count == 0
+    return dataclasses.replace(
+        one,
+        count=count,
+        polarity=jnp.where(alone, one.polarity, other.polarity),
+        t_first=jnp.where(alone, one.t_first, jnp.where(still, other.t_first, first)),
+        t_step=jnp.where(alone, one.t_step, jnp.where(still, other.t_step, step)),
+    )
