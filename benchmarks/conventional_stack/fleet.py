@@ -90,7 +90,7 @@ def check(config: Config) -> None:
     """Raises ConfigError if this stack does not support the configuration."""
     sensor = config.events
     noisy = (sensor.threshold_mismatch, sensor.leak_rate_hz, sensor.shot_rate_hz, sensor.hot_pixel_fraction)
-    if sensor.law != "paper" or len(sensor.frame_times_s) != 2 or any(noisy):
+    if sensor.law != "paper" or len(sensor.frame_times_s) != 2 or any(noisy) or sensor.bandwidth_hz:
         raise ConfigError("the conventional stack supports only the noiseless 'paper' event law between two frames")
     if config.encoder.retrain_at:
         raise ConfigError(

@@ -109,6 +109,7 @@ def _events(events: EventsConfig, drone: DroneConfig) -> None:
     thresholds = ["threshold", "tolerance", "contrast_on", "contrast_off", "airsim_tolerance", "log_epsilon"]
     _positive(events, "events", [*thresholds, "refractory_ns"])
     _not_negative(events, "events", ["threshold_mismatch", "leak_rate_hz", "shot_rate_hz", "hot_pixel_rate_hz"])
+    _not_negative(events, "events", ["bandwidth_hz"])
     _share(events, "events", ["hot_pixel_fraction"])
     times = events.frame_times_s
     name, dt = "events.frame_times_s", drone.physics_dt_s

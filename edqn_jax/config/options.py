@@ -133,6 +133,9 @@ class EventsConfig:
     """Refractory period, nanoseconds; caps a pixel's events in a window (Eq. 3)."""
     log_epsilon: float = 1e-3
     """Added to brightness in [0, 1] before the logarithm of Eq. 1."""
+    bandwidth_hz: float = 0.0
+    """Cutoff frequency of a white pixel's photoreceptor, which lags behind the light; a darker pixel's is lower in
+    proportion. 0 is infinite."""
     threshold_mismatch: float = 0.0
     """Standard deviation of the per-pixel threshold relative to the threshold; 0 is a perfect sensor."""
     leak_rate_hz: float = 0.0

@@ -23,6 +23,7 @@ from jax import Array
 from numpy.typing import NDArray
 
 from edqn_jax.config import EventsConfig
+from edqn_jax.sim import photoreceptor
 
 STREAM_DTYPE = np.dtype([("t", "<i8"), ("x", "<u2"), ("y", "<u2"), ("p", "i1")])
 """One event of a stream: time in microseconds, column, row, polarity in {-1, +1}."""
@@ -62,6 +63,7 @@ class EventMemory:
     last_event: Array | None  # [H, W] esim: time of the last event, seconds from the end of the last window
     gain: Array | None  # [2, H, W] threshold mismatch of ON and OFF, relative to the nominal threshold
     hot: Array | None  # [H, W] bool, pixels that fire on their own
+    lag: Array | None = None  # [H, W] esim with finite bandwidth: what the photoreceptor shows minus log brightness
 
 
 def luma(rgb: Array) -> Array:
@@ -154,6 +156,7 @@ def reset_memory(config: EventsConfig, height: int, width: int, key: Array) -> E
         last_event=jnp.full((height, width), -jnp.inf),
         gain=gain,
         hot=hot,
+        lag=jnp.zeros((height, width)) if config.bandwidth_hz > 0.0 else None,
     )
 
 
@@ -174,8 +177,9 @@ def events(
         frame_times: T times in seconds, rising; only their differences matter. Known when tracing.
         key: consumed only by noise events.
         continuous: the first frame is the previous window's last one (`stream` mode), so that esim's
-            refractory clock runs on. Otherwise there is a gap between the windows: esim's reference is set at the
-            first frame, keeping each pixel's sub-threshold residual.
+            refractory clock and the lag of its photoreceptors run on. Otherwise there is a gap between the windows:
+            esim's reference is set at the first frame, keeping each pixel's sub-threshold residual, and
+            photoreceptors have settled there, as they always have under the laws without memory.
 
     Raises:
         ValueError: if there are fewer than two frames, or not one rising time for each.
@@ -188,11 +192,16 @@ def events(
         )
     times = times - times[0]
     window_s = float(times[-1])
+    level = airsim_log_brightness(frames) if config.law == "airsim" else log_brightness(config, frames)
+    if config.bandwidth_hz > 0.0:
+        current = photoreceptor.between_frames(photoreceptor.photocurrent(frames))
+        lag = memory.lag if continuous and memory.lag is not None else jnp.zeros(frames.shape[1:])
+        level, lag = photoreceptor.follow(config.bandwidth_hz, level, times, current, lag)
+        memory = dataclasses.replace(memory, lag=lag if config.law == "esim" else None)
     if config.law == "esim":
-        level = log_brightness(config, frames)
         field, memory = _esim(config, memory, level, times, continuous)
     else:
-        field = _frame_pairs(config, memory.gain, frames, times)
+        field = _frame_pairs(config, memory.gain, level, times)
     noisy = has_noise(config)
     if noisy:
         field = merged(config, by_polarity(field), noise_events(config, memory.hot, field.count, times, key), times)
@@ -337,11 +346,10 @@ def _both(gain: Array | None, on: float, off: float) -> tuple[Array, Array]:
     return gain[0] * on, gain[1] * off
 
 
-def _frame_pairs(config: EventsConfig, gain: Array | None, frames: Array, times: NDArray) -> EventField:
+def _frame_pairs(config: EventsConfig, gain: Array | None, level: Array, times: NDArray) -> EventField:
     """Returns the events of the memoryless laws, `paper` and `airsim`."""
     intervals = np.diff(times)
     limit = jnp.array([max_events(config, dt) for dt in intervals], jnp.int32)[:, None, None]
-    level = log_brightness(config, frames) if config.law == "paper" else airsim_log_brightness(frames)
     before, after = level[:-1], level[1:]
     change = after - before
     scale: Array | float = 1.0 if gain is None else jnp.where(change > 0.0, gain[0], gain[1])

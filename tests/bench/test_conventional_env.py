@@ -247,6 +247,7 @@ def test_who_ended_starts_anew_within_the_step():
     [
         {"events": EventsConfig(law="esim")},
         {"events": EventsConfig(shot_rate_hz=1.0)},
+        {"events": EventsConfig(bandwidth_hz=30.0)},
         {"events": EventsConfig(frame_times_s=(-0.08, -0.04, 0.0))},
         {"camera": CameraConfig(mount="body")},
         {"encoder": EncoderConfig(retrain_at=(0.5,))},
