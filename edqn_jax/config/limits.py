@@ -17,6 +17,7 @@ from edqn_jax.config.options import (
     EncoderConfig,
     EnvConfig,
     EventsConfig,
+    LightConfig,
     MotorsConfig,
     NoiseConfig,
     TrainConfig,
@@ -40,6 +41,7 @@ def validate(config: Config) -> None:
     _body(config.body)
     _motors(config.motors)
     _noise(config.noise)
+    _light(config.light)
     _encoder(config.encoder)
     _agent(config.agent)
     _train(config.train)
@@ -107,7 +109,7 @@ def _camera(camera: CameraConfig) -> None:
 
 def _events(events: EventsConfig, drone: DroneConfig) -> None:
     thresholds = ["threshold", "tolerance", "contrast_on", "contrast_off", "airsim_tolerance", "log_epsilon"]
-    _positive(events, "events", [*thresholds, "refractory_ns"])
+    _positive(events, "events", [*thresholds, "refractory_ns", "reference_lux"])
     _not_negative(events, "events", ["threshold_mismatch", "leak_rate_hz", "shot_rate_hz", "hot_pixel_rate_hz"])
     _not_negative(events, "events", ["bandwidth_hz"])
     _share(events, "events", ["hot_pixel_fraction"])
@@ -152,6 +154,14 @@ def _motors(motors: MotorsConfig) -> None:
 
 def _noise(noise: NoiseConfig) -> None:
     _not_negative(noise, "noise", ["position_m", "velocity_m_s", "position_bias_m", "velocity_bias_m_s"])
+
+
+def _light(light: LightConfig) -> None:
+    _not_negative(light, "light", ["least_lux", "most_lux"])
+    least, most = light.least_lux, light.most_lux
+    if (least, most) != (0.0, 0.0):
+        _within(light, "light", ["least_lux", "most_lux"], 0.1, 10_000.0)
+        _require(least <= most, "light.least_lux", f"at most light.most_lux ({most:g})", least)
 
 
 def _encoder(encoder: EncoderConfig) -> None:

@@ -146,6 +146,8 @@ class EventsConfig:
     """Share of pixels that are hot: they fire at `hot_pixel_rate_hz` without any change of brightness."""
     hot_pixel_rate_hz: float = 50.0
     """Events per second of a hot pixel."""
+    reference_lux: float = 10.0
+    """Illuminance in which `bandwidth_hz` and `shot_rate_hz` are a white and a black pixel's, where `light` is on."""
 
 
 @dataclass(frozen=True)
@@ -246,6 +248,17 @@ class NoiseConfig:
     """Standard deviation of an error of each coordinate of the own position, metres, that stays for an episode."""
     velocity_bias_m_s: float = 0.0
     """Standard deviation of an error of each coordinate of the own velocity, m/s, that stays for an episode."""
+
+
+@dataclass(frozen=True)
+class LightConfig:
+    """How much light there is, drawn for each episode. With 0 and 0 there is always enough for every sensor."""
+
+    least_lux: float = 0.0
+    """Least illuminance of a surface that faces the sun, lux; an episode's is log-uniform from this to `most_lux`. From
+    0.1 on; 0 is off."""
+    most_lux: float = 0.0
+    """Most illuminance, lux; up to 10000, and 0 is off."""
 
 
 @dataclass(frozen=True)
@@ -431,6 +444,7 @@ class Config:
     body: BodyConfig = field(default_factory=BodyConfig)
     motors: MotorsConfig = field(default_factory=MotorsConfig)
     noise: NoiseConfig = field(default_factory=NoiseConfig)
+    light: LightConfig = field(default_factory=LightConfig)
     encoder: EncoderConfig = field(default_factory=EncoderConfig)
     agent: AgentConfig = field(default_factory=AgentConfig)
     train: TrainConfig = field(default_factory=TrainConfig)
@@ -440,7 +454,13 @@ CONDITIONS: dict[str, tuple[str, ...]] = {
     "env": ("action_delay",),
     **{
         group: tuple(option.name for option in fields(kind))
-        for group, kind in (("air", AirConfig), ("body", BodyConfig), ("motors", MotorsConfig), ("noise", NoiseConfig))
+        for group, kind in (
+            ("air", AirConfig),
+            ("body", BodyConfig),
+            ("motors", MotorsConfig),
+            ("noise", NoiseConfig),
+            ("light", LightConfig),
+        )
     },
 }
 """Options by group that a policy may be flown with other values of than it was trained with."""

@@ -63,6 +63,7 @@ class EventMemory:
     last_event: Array | None  # [H, W] esim: time of the last event, seconds from the end of the last window
     gain: Array | None  # [2, H, W] threshold mismatch of ON and OFF, relative to the nominal threshold
     hot: Array | None  # [H, W] bool, pixels that fire on their own
+    lux: Array | None = None  # [] illuminance of the episode; None where there is always enough light
     lag: Array | None = None  # [H, W] esim with finite bandwidth: what the photoreceptor shows minus log brightness
 
 
@@ -133,11 +134,14 @@ def event_times(count: Array, starts: Array, intervals: Array) -> tuple[Array, A
     return jnp.broadcast_to(starts, count.shape), intervals / jnp.maximum(count, 1).astype(jnp.float32)
 
 
-def reset_memory(config: EventsConfig, height: int, width: int, key: Array) -> EventMemory:
+def reset_memory(config: EventsConfig, height: int, width: int, key: Array, lux: Array | None = None) -> EventMemory:
     """Returns the memory of a sensor at rest.
 
     esim's residuals are uniform in (-C-, C+); threshold mismatch and hot pixels are drawn. The same key gives the same
     sensor.
+
+    Args:
+        lux: [] illuminance of the scene; None where light does not matter.
     """
     key_residual, key_gain, key_hot = jax.random.split(key, 3)
     gain = None
@@ -148,7 +152,7 @@ def reset_memory(config: EventsConfig, height: int, width: int, key: Array) -> E
     if config.hot_pixel_fraction > 0.0:
         hot = jax.random.bernoulli(key_hot, config.hot_pixel_fraction, (height, width))
     if config.law != "esim":
-        return EventMemory(residual=None, last_event=None, gain=gain, hot=hot)
+        return EventMemory(residual=None, last_event=None, gain=gain, hot=hot, lux=lux)
     contrast_on, contrast_off = _both(gain, config.contrast_on, config.contrast_off)
     share = jax.random.uniform(key_residual, (height, width))
     return EventMemory(
@@ -156,6 +160,7 @@ def reset_memory(config: EventsConfig, height: int, width: int, key: Array) -> E
         last_event=jnp.full((height, width), -jnp.inf),
         gain=gain,
         hot=hot,
+        lux=lux,
         lag=jnp.zeros((height, width)) if config.bandwidth_hz > 0.0 else None,
     )
 
@@ -193,8 +198,12 @@ def events(
     times = times - times[0]
     window_s = float(times[-1])
     level = airsim_log_brightness(frames) if config.law == "airsim" else log_brightness(config, frames)
+    light = 1.0 if memory.lux is None else memory.lux / config.reference_lux
+    current = None
+    if config.bandwidth_hz > 0.0 or (memory.lux is not None and config.shot_rate_hz > 0.0):
+        current = photoreceptor.between_frames(photoreceptor.photocurrent(frames, light))
     if config.bandwidth_hz > 0.0:
-        current = photoreceptor.between_frames(photoreceptor.photocurrent(frames))
+        assert current is not None
         lag = memory.lag if continuous and memory.lag is not None else jnp.zeros(frames.shape[1:])
         level, lag = photoreceptor.follow(config.bandwidth_hz, level, times, current, lag)
         memory = dataclasses.replace(memory, lag=lag if config.law == "esim" else None)
@@ -204,7 +213,9 @@ def events(
         field = _frame_pairs(config, memory.gain, level, times)
     noisy = has_noise(config)
     if noisy:
-        field = merged(config, by_polarity(field), noise_events(config, memory.hot, field.count, times, key), times)
+        shot = 1.0 if memory.lux is None or current is None else photoreceptor.shot_noise(current)
+        noise = noise_events(config, memory.hot, field.count, times, key, shot)
+        field = merged(config, by_polarity(field), noise, times)
     even = divides_window(config, len(times))
     return dataclasses.replace(field, window_s=window_s, divides_window=even, with_noise=noisy), memory
 
@@ -429,7 +440,9 @@ def has_noise(config: EventsConfig) -> bool:
     return config.leak_rate_hz > 0.0 or config.shot_rate_hz > 0.0 or config.hot_pixel_fraction > 0.0
 
 
-def noise_events(config: EventsConfig, hot: Array | None, signal: Array, times: NDArray, key: Array) -> EventField:
+def noise_events(
+    config: EventsConfig, hot: Array | None, signal: Array, times: NDArray, key: Array, shot: Array | float = 1.0
+) -> EventField:
     """Returns the noise events of every frame pair, ON and then OFF [2 F, H, W]: Poisson counts, evenly spaced.
 
     Leak and hot pixels make ON events, shot noise either. A pixel's refractory period leaves it `max_events` between
@@ -440,15 +453,16 @@ def noise_events(config: EventsConfig, hot: Array | None, signal: Array, times: 
         signal: [F, H, W] int32, events that the pixels have without noise.
         times: [T] seconds of the frames.
         key: consumed.
+        shot: [F, H, W] or scalar factor on the rate of shot noise.
     """
     key_count, key_phase = jax.random.split(key)
-    pairs, *size = signal.shape
+    pairs = signal.shape[0]
     firing = 0.0 if hot is None else config.hot_pixel_rate_hz * hot
-    shot = 0.5 * config.shot_rate_hz
-    rates = jnp.stack([jnp.broadcast_to(rate, size) for rate in (config.leak_rate_hz + shot + firing, shot)])
+    off = 0.5 * config.shot_rate_hz * shot
+    rates = jnp.stack([jnp.broadcast_to(rate, signal.shape) for rate in (config.leak_rate_hz + off + firing, off)])
     lengths = np.diff(times)
     intervals = jnp.asarray(lengths, jnp.float32)[:, None, None]
-    drawn = jax.random.poisson(key_count, rates[:, None] * intervals, (2, *signal.shape), dtype=jnp.int32)
+    drawn = jax.random.poisson(key_count, rates * intervals, rates.shape, dtype=jnp.int32)
     limit = jnp.array([max_events(config, dt) for dt in lengths], jnp.int32)[:, None, None]
     room = jnp.maximum(limit - signal, 0)
     on = jnp.minimum(drawn[0], room)

@@ -18,13 +18,31 @@ DARKEST = 20.0
 """8-bit value that v2e adds to brightness, so that a black pixel still has a photocurrent."""
 
 
-def photocurrent(luma: Array) -> Array:
+SHOT_NOISE_OF_WHITE = 0.25
+"""Shot noise of a white pixel per that of a black one, in v2e."""
+
+
+def photocurrent(luma: Array, light: Array | float = 1.0) -> Array:
     """Returns the photocurrent of pixels as a share of a white one's: luma [...] in [0, 1] to [...], v2e's formula.
 
     >>> print(photocurrent(jnp.array([0.0, 1.0])))
     [0.07272727 1.        ]
+
+    Args:
+        light: [] illuminance as a share of the one in which the white pixel is.
     """
-    return (255.0 * luma + DARKEST) / (255.0 + DARKEST)
+    return light * (255.0 * luma + DARKEST) / (255.0 + DARKEST)
+
+
+def shot_noise(current: Array) -> Array:
+    """Returns the rate of shot noise as a share of that in darkness, of photocurrents [...].
+
+    v2e's line from 1 in darkness to a quarter in a white pixel. Beyond, in more light, the rate is inversely
+    proportional to it: so is the density of the noise at the photoreceptor (Graca and Delbruck 2021, "Unraveling the
+    paradox of intensity-dependent DVS pixel noise"), while the rate of a real pixel falls faster.
+    """
+    line = 1.0 - (1.0 - SHOT_NOISE_OF_WHITE) * current
+    return jnp.where(current < 1.0, line, SHOT_NOISE_OF_WHITE / jnp.maximum(current, 1.0))
 
 
 def between_frames(photocurrents: Array) -> Array:

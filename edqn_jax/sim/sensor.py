@@ -15,7 +15,7 @@ import numpy as np
 from jax import Array
 
 from edqn_jax.config import CameraConfig, Config
-from edqn_jax.sim import camera, drone, events, raycast
+from edqn_jax.sim import camera, drone, events, light, raycast
 from edqn_jax.sim.depth import nearest_depth
 from edqn_jax.sim.drone import Flight
 from edqn_jax.sim.events import EventField, EventMemory
@@ -209,7 +209,11 @@ def _show_event_image(
 
 
 def _event_memory(config: Config, key: Array) -> SensorMemory:
-    return events.reset_memory(config.events, config.camera.height, config.camera.width, key)
+    lux = None
+    if light.is_on(config.light):
+        key, drawing = jax.random.split(key)
+        lux = light.draw(config.light, drawing)
+    return events.reset_memory(config.events, config.camera.height, config.camera.width, key, lux)
 
 
 def _show_frame(

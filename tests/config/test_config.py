@@ -267,6 +267,9 @@ def test_every_numeric_option_has_limits(group, option, nonsense):
         ),
         ("events", {"frame_times_s": (-0.28, 0.0)}, "within the decision's 0.26 s"),
         ("camera", {"sky_rgb": (0.5, 0.5, 1.5)}, "camera.sky_rgb must be three shares"),
+        ("light", {"most_lux": 100.0}, "light.least_lux must be between 0.1 and 10000, not 0.0"),
+        ("light", {"least_lux": 1.0, "most_lux": 20_000.0}, "light.most_lux must be between 0.1 and 10000, not 20000"),
+        ("light", {"least_lux": 9.0, "most_lux": 1.0}, r"light.least_lux must be at most light.most_lux \(1\), not 9"),
     ],
 )
 def test_what_cannot_be_run_is_named_with_its_limits(group, options, says):

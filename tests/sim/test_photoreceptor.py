@@ -100,6 +100,8 @@ def test_the_lag_of_a_stream_is_carried_from_window_to_window():
     # With a gap before it a window begins settled: another one than in the stream.
     gap, _ = run(config, memory, jnp.asarray(frames[36:]), times[:5], False)
     assert np.any(np.asarray(gap.count * gap.polarity) != streamed[-1])
+    settled, _ = run(config, memory.replace(lag=jnp.zeros((4, 5))), jnp.asarray(frames[36:]), times[:5], False)
+    np.testing.assert_array_equal(gap.count, settled.count)
 
 
 def test_what_esim_shows_is_the_photoreceptor_within_one_threshold():

@@ -1,0 +1,112 @@
+"""Light: one illuminance an episode, and what it does to events."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from edqn_jax.config import CameraConfig, Config, DroneConfig, EventsConfig, LightConfig
+from edqn_jax.config.loading import flown_under
+from edqn_jax.errors import ConfigError
+from edqn_jax.sim import env, light, photoreceptor
+from edqn_jax.sim import events as ev
+from edqn_jax.sim.drone import load_airframe
+from edqn_jax.sim.missions import own_missions
+from edqn_jax.sim.mjcf import load_scene
+from edqn_jax.sim.scene import stack_scenes
+from tests.miniature import WORLD
+from tests.sim.test_events import PAPER, host, memory_of, random_frames, run
+
+LIT = Config(
+    camera=CameraConfig(width=16, height=12),
+    drone=DroneConfig(physics="rigid_body"),
+    events=EventsConfig(bandwidth_hz=30.0, shot_rate_hz=5.0),
+    light=LightConfig(0.1, 10_000.0),
+)
+DARK = dataclasses.replace(LIT, light=LightConfig())
+
+
+@pytest.fixture(scope="module")
+def world():
+    pool = stack_scenes([load_scene(WORLD)])
+    return env.World(load_airframe(Config().drone), pool, own_missions(pool))
+
+
+def test_an_illuminance_is_log_uniform():
+    lux = np.asarray(jax.vmap(lambda key: light.draw(LIT.light, key))(jax.random.split(jax.random.key(0), 4000)))
+    assert lux.min() >= 0.1 and lux.max() <= 10_000
+    # 4000 draws: a share has a standard error of 0.8 %, and each decade has a fifth.
+    shares = np.histogram(np.log10(lux), bins=[-1, 0, 1, 2, 3, 4])[0] / 4000
+    np.testing.assert_allclose(shares, 0.2, atol=0.03)
+    assert float(light.draw(LightConfig(7.0, 7.0), jax.random.key(1))) == pytest.approx(7.0, rel=1e-6)
+
+
+def test_an_episode_keeps_its_light_and_the_next_one_has_another(world):
+    state, _ = jax.jit(lambda key: env.reset(LIT, world, key))(jax.random.key(0))
+    step = jax.jit(lambda s: env.step(LIT, world, s, 13)[0])
+    after = step(state)
+    assert state.memory.lux == after.memory.lux
+    fresh = step(dataclasses.replace(after, ended=jnp.ones((), bool)))
+    assert fresh.memory.lux != state.memory.lux and 0.1 <= fresh.memory.lux <= 10_000
+    again, _ = jax.jit(lambda key: env.reset(LIT, world, key))(jax.random.key(0))
+    assert again.memory.lux == state.memory.lux
+
+
+def test_without_light_no_sensor_knows_of_it(world):
+    state = jax.eval_shape(lambda key: env.ended(DARK, world, key), jax.random.key(0))
+    assert state.memory.lux is None
+    state = jax.eval_shape(lambda key: env.ended(Config(), world, key), jax.random.key(0))
+    assert len(jax.tree.leaves(state.memory)) == 0
+
+
+def lit(config: EventsConfig, lux: float | None, frames, key: int = 3) -> ev.EventField:
+    memory = memory_of(config, 0, *frames.shape[1:])
+    if lux is not None:
+        memory = dataclasses.replace(memory, lux=jnp.float32(lux))
+    return host(run(config, memory, frames)[0])
+
+
+@pytest.mark.parametrize("lux", [2.0, 10.0, 300.0])
+def test_the_bandwidth_is_proportional_to_light(lux):
+    frames = jnp.asarray(random_frames(1))
+    config = dataclasses.replace(PAPER, bandwidth_hz=20.0)
+    unlit = dataclasses.replace(PAPER, bandwidth_hz=20.0 * lux / 10.0)
+    ours, theirs = lit(config, lux, frames), lit(unlit, None, frames)
+    np.testing.assert_array_equal(ours.count * ours.polarity, theirs.count * theirs.polarity)
+
+
+def test_less_light_leaves_fewer_events_of_what_moves():
+    config = dataclasses.replace(PAPER, bandwidth_hz=30.0)
+    frames = jnp.asarray(random_frames(1))
+    counts = [lit(config, lux, frames).count.sum() for lux in (0.1, 1.0, 10.0, 100.0, 10_000.0)]
+    assert counts == sorted(counts) and counts[0] == 0
+    assert counts[-1] == lit(dataclasses.replace(config, bandwidth_hz=0.0), None, frames).count.sum() > 40
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("luma", [0.0, 1.0])
+def test_shot_noise_rises_as_light_falls(luma):
+    config, size = EventsConfig(shot_rate_hz=200.0, log_epsilon=1.0), 100
+    frames = jnp.full((3, size, size), luma)
+    current = (255.0 * luma + 20.0) / 275.0
+    rates = []
+    for lux in (1e-6, 1.0, 10.0, 100.0, 10_000.0):
+        share = current * lux / 10.0
+        wanted = 200.0 * (1 - 0.75 * share if share < 1 else 0.25 / share)
+        mean = lit(config, lux, frames).count.sum() / (size * size * 0.04)
+        # Poisson: the standard error of n events is their root.
+        assert abs(mean - wanted) < 4 * np.sqrt(wanted / (size * size * 0.04)) + 1e-3
+        rates.append(mean)
+    assert rates[0] > rates[-1] * 3
+    np.testing.assert_allclose(photoreceptor.shot_noise(jnp.array([0.0, 1.0, 2.0])), [1.0, 0.25, 0.125])
+
+
+def test_a_policy_is_flown_in_other_light_than_it_was_trained_in():
+    darker = flown_under(Config(), {"light": {"least_lux": 0.5, "most_lux": 0.5}}, "conditions")
+    assert darker.light == LightConfig(0.5, 0.5)
+    with pytest.raises(ConfigError, match=r"light.least_lux must be at most light.most_lux \(0.5\)"):
+        flown_under(darker, {"light": {"least_lux": 2.0}}, "conditions")
