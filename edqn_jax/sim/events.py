@@ -213,7 +213,7 @@ def events(
         field = _frame_pairs(config, memory.gain, level, times)
     noisy = has_noise(config)
     if noisy:
-        shot = 1.0 if memory.lux is None or current is None else photoreceptor.shot_noise(current)
+        shot = 1.0 if current is None else photoreceptor.shot_noise(current)
         noise = noise_events(config, memory.hot, field.count, times, key, shot)
         field = merged(config, by_polarity(field), noise, times)
     even = divides_window(config, len(times))

@@ -105,6 +105,17 @@ def test_shot_noise_rises_as_light_falls(luma):
     np.testing.assert_allclose(photoreceptor.shot_noise(jnp.array([0.0, 1.0, 2.0])), [1.0, 0.25, 0.125])
 
 
+def test_shot_noise_follows_brightness_where_a_pixel_has_a_bandwidth():
+    config, size = EventsConfig(shot_rate_hz=200.0, bandwidth_hz=30.0), 60
+    frames = jnp.zeros((3, size, 2 * size)).at[:, :, size:].set(1.0)
+    count = lit(config, None, frames).count.sum(0) / 0.04
+    black = 200.0 * (1 - 0.75 * 20 / 275)
+    assert abs(count[:, :size].mean() / black - 1) < 0.05  # 3600 pixels x 7.6 events: 0.6 %
+    assert abs(count[:, size:].mean() / 50.0 - 1) < 0.05
+    uniform = lit(dataclasses.replace(config, bandwidth_hz=0.0), None, frames).count.sum(0) / 0.04
+    assert abs(uniform[:, :size].mean() / uniform[:, size:].mean() - 1) < 0.05
+
+
 def test_a_policy_is_flown_in_other_light_than_it_was_trained_in():
     darker = flown_under(Config(), {"light": {"least_lux": 0.5, "most_lux": 0.5}}, "conditions")
     assert darker.light == LightConfig(0.5, 0.5)
