@@ -17,6 +17,7 @@ from edqn_jax.config.options import (
     EncoderConfig,
     EnvConfig,
     EventsConfig,
+    ExposureConfig,
     LightConfig,
     MotorsConfig,
     NoiseConfig,
@@ -42,6 +43,7 @@ def validate(config: Config) -> None:
     _motors(config.motors)
     _noise(config.noise)
     _light(config.light)
+    _exposure(config)
     _encoder(config.encoder)
     _agent(config.agent)
     _train(config.train)
@@ -162,6 +164,25 @@ def _light(light: LightConfig) -> None:
     if (least, most) != (0.0, 0.0):
         _within(light, "light", ["least_lux", "most_lux"], 0.1, 10_000.0)
         _require(least <= most, "light.least_lux", f"at most light.most_lux ({most:g})", least)
+
+
+def _exposure(config: Config) -> None:
+    exposure: ExposureConfig = config.exposure
+    _positive(exposure, "exposure", ["shortest_s", "longest_s", "sub_frames", "sensitivity_e_lux_s", "full_well_e"])
+    _not_negative(exposure, "exposure", ["read_noise_e"])
+    _at_most(exposure, "exposure", ["sub_frames"], 64)
+    _require(0 < exposure.target < 1, "exposure.target", "more than 0 and less than 1", exposure.target)
+    _within(exposure, "exposure", ["most_gain"], 1.0, 1000.0)
+    longest = f"at most exposure.longest_s ({exposure.longest_s:g})"
+    _require(exposure.shortest_s <= exposure.longest_s, "exposure.shortest_s", longest, exposure.shortest_s)
+    if not exposure.real:
+        return
+    _require(config.light.most_lux > 0, "exposure.real", "false without light.least_lux and light.most_lux", True)
+    # Poses are known from the beginning of a decision on, and an exposure reaches into whole physics steps.
+    dt = config.drone.physics_dt_s
+    before = round(config.drone.physics_steps + config.events.frame_times_s[0] / dt) * dt
+    limit = f"at most {before:g}, the seconds of a decision before events.frame_times_s"
+    _require(exposure.longest_s <= before + 1e-3 * dt, "exposure.longest_s", limit, exposure.longest_s)
 
 
 def _encoder(encoder: EncoderConfig) -> None:

@@ -265,6 +265,30 @@ class LightConfig:
 
 
 @dataclass(frozen=True)
+class ExposureConfig:
+    """How a camera takes the frames of the sensors `frames` and `frame-pair`."""
+
+    real: bool = False
+    """Whether frames have an exposure time, motion blur, noise and 8 bits; needs `light`. If not, they are perfect."""
+    shortest_s: float = 1e-4
+    """Shortest exposure, seconds; the camera chooses it by the light."""
+    longest_s: float = 0.02
+    """Longest exposure, seconds."""
+    target: float = 0.4
+    """Mean level of a picture that exposure and gain are set for, as a share of white."""
+    most_gain: float = 4.0
+    """Largest gain, where the longest exposure is not enough; it amplifies noise, too."""
+    sub_frames: int = 5
+    """Pictures whose mean is one exposure: motion blur has so many steps, and rendering so many times the cost."""
+    sensitivity_e_lux_s: float = 6000.0
+    """Electrons of a white pixel per lux and second of light on the scene."""
+    full_well_e: float = 10_000.0
+    """Electrons that a pixel holds; at a gain of 1 they are white."""
+    read_noise_e: float = 18.0
+    """Standard deviation of the read noise, electrons."""
+
+
+@dataclass(frozen=True)
 class EncoderConfig:
     """The event VAE (section 3.2), or the VAE of another sensor's pictures, and when it learns."""
 
@@ -448,6 +472,7 @@ class Config:
     motors: MotorsConfig = field(default_factory=MotorsConfig)
     noise: NoiseConfig = field(default_factory=NoiseConfig)
     light: LightConfig = field(default_factory=LightConfig)
+    exposure: ExposureConfig = field(default_factory=ExposureConfig)
     encoder: EncoderConfig = field(default_factory=EncoderConfig)
     agent: AgentConfig = field(default_factory=AgentConfig)
     train: TrainConfig = field(default_factory=TrainConfig)
@@ -463,6 +488,7 @@ CONDITIONS: dict[str, tuple[str, ...]] = {
             ("motors", MotorsConfig),
             ("noise", NoiseConfig),
             ("light", LightConfig),
+            ("exposure", ExposureConfig),
         )
     },
 }
