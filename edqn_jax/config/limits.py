@@ -126,6 +126,8 @@ def _events(events: EventsConfig, drone: DroneConfig) -> None:
     whole = all(abs(time / dt - round(time / dt)) < 1e-3 for time in times)
     _require(whole, name, f"multiples of drone.physics_dt_s ({dt:g} s)", times)
     _require(times[0] >= -window - 1e-3 * dt, name, f"within the decision's {window:g} s", times)
+    gapless = not events.stream or times[0] <= -window + 1e-3 * dt
+    _require(gapless, name, f"times that begin at -{window:g}, with the decision, where events.stream is on", times)
 
 
 def _env(env: EnvConfig) -> None:

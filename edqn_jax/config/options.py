@@ -122,6 +122,9 @@ class EventsConfig:
     given beside it change one. `ideal`: no faults. `dvs`: the noisy sensor of v2e. `dark`: a sensor in low light."""
     frame_times_s: tuple[float, ...] = (-0.04, 0.0)
     """When frames are rendered relative to the decision, seconds; each must be a physics step."""
+    stream: bool = False
+    """Whether a window begins where the one before ended, so that `esim` and slow photoreceptors remember all that was
+    seen. `frame_times_s` must then begin with the decision, at -0.26; with every physics step, nothing is missed."""
     threshold: float = 0.05
     """Th of Eq. 2 (`paper`): log-brightness change that makes events."""
     tolerance: float = 0.05

@@ -203,7 +203,8 @@ def _show_events(
 ) -> tuple[Sensed, SensorMemory]:
     frames = _views(config, scene, poses)
     assert isinstance(memory, EventMemory)
-    return events.events(config.events, memory, frames, config.events.frame_times_s, key)
+    options = config.events
+    return events.events(options, memory, frames, options.frame_times_s, key, continuous=options.stream)
 
 
 def _show_event_image(

@@ -74,6 +74,12 @@ def test_a_flag_names_a_profile_and_other_flags_change_it(words):
     assert parse_train(["--world", "medium", "--events.profile", "ideal"])[1] == make_config("medium")
 
 
+def test_a_stream_of_all_physics_steps_is_what_seq_prints():
+    times = [f"{-0.26 + 0.02 * step:.2f}" for step in range(14)]
+    _, config = parse_train(["--events.law", "esim", "--events.stream", "--events.frame-times-s", *times])
+    assert config.events.stream and len(config.events.frame_times_s) == 14
+
+
 def test_flags_win_over_the_file_and_the_file_over_the_preset(tmp_path):
     file = tmp_path / "options.yaml"
     file.write_text("agent: {batch_size: 256, n_step: 3}\n")

@@ -294,6 +294,11 @@ def test_every_numeric_option_has_limits(group, option, nonsense):
             r"multiples of drone.physics_dt_s \(0.02 s\), not -0.03, 0",
         ),
         ("events", {"frame_times_s": (-0.28, 0.0)}, "within the decision's 0.26 s"),
+        (
+            "events",
+            {"stream": True},
+            "must be times that begin at -0.26, with the decision, where events.stream",
+        ),
         ("camera", {"sky_rgb": (0.5, 0.5, 1.5)}, "camera.sky_rgb must be three shares"),
         ("light", {"most_lux": 100.0}, "light.least_lux must be between 0.1 and 10000, not 0.0"),
         ("light", {"least_lux": 1.0, "most_lux": 20_000.0}, "light.most_lux must be between 0.1 and 10000, not 20000"),

@@ -11,9 +11,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from edqn_jax.config import EventsConfig
+from edqn_jax.config import CameraConfig, Config, DroneConfig, EventsConfig
+from edqn_jax.config.limits import validate
+from edqn_jax.sim import env, photoreceptor, sensor
 from edqn_jax.sim import events as ev
-from edqn_jax.sim import photoreceptor
+from edqn_jax.sim.drone import load_airframe
+from edqn_jax.sim.missions import own_missions
+from edqn_jax.sim.mjcf import load_scene
+from edqn_jax.sim.scene import stack_scenes
+from tests.miniature import WORLD
 from tests.oracles import photoreceptor_plain
 from tests.sim.test_events import AIRSIM, ESIM, PAPER, TIMES, host, levels, long_flight, memory_of, random_frames, run
 
@@ -123,3 +129,34 @@ def test_infinite_bandwidth_traces_nothing():
     trace = jax.make_jaxpr(lambda k, f: ev.events(PAPER, ev.EventMemory(None, None, None, None), f, TIMES, k))
     plain = str(trace(jax.random.key(0), jnp.ones((3, 2, 2))))
     assert "exp" not in plain and EventsConfig().bandwidth_hz == 0
+
+
+@pytest.mark.slow
+def test_decisions_of_a_stream_are_one_recording_of_the_flight():
+    """Windows go on where they ended: no change is lost between two decisions, and none counted twice."""
+    times = tuple(round(-0.26 + 0.02 * step, 2) for step in range(14))
+    options = EventsConfig(law="esim", stream=True, frame_times_s=times, **SLOW)
+    camera, drone = CameraConfig(width=16, height=12), DroneConfig(physics="rigid_body")
+    config = Config(camera=camera, drone=drone, events=options)
+    validate(config)
+    pool = stack_scenes([load_scene(WORLD)])
+    world = env.World(load_airframe(drone), pool, own_missions(pool))
+    begun, _ = jax.jit(lambda key: env.reset(config, world, key))(jax.random.key(0))
+    step, state, steps = jax.jit(lambda s, move: env.step(config, world, s, move)), begun, []
+    for move in (26, 22, 4):
+        state, seen = step(state, move)
+        steps.append(seen)
+    fields = [host(each.observation.sensed) for each in steps]
+    assert all(field.count.shape == (13, 12, 16) for field in fields)
+
+    body, scene = begun.drone, jax.tree.map(lambda x: x[0], pool)
+    position = jnp.concatenate([body.position[None], *(each.flight.position for each in steps)])
+    quaternion = jnp.concatenate([body.quaternion[None], *(each.flight.quaternion for each in steps)])
+    frames = jax.jit(jax.vmap(lambda p, q: sensor.view(config, scene, p, q)))(position, quaternion)
+    whole, end = run(options, begun.memory, frames, tuple(0.02 * k for k in range(40)), True)
+    streamed = np.concatenate([field.count * field.polarity for field in fields])
+    recorded = np.asarray(whole.count * whole.polarity)
+    # Two programs draw the frames: a level that is met almost exactly may be counted a frame later.
+    assert np.mean(streamed != recorded) < 0.002 and np.abs(recorded).sum() > 500
+    assert np.abs(streamed.sum(0) - recorded.sum(0)).max() <= 1
+    np.testing.assert_allclose(state.memory.lag, end.lag, atol=1e-3)
