@@ -483,6 +483,11 @@ class Config:
 
 CONDITIONS: dict[str, tuple[str, ...]] = {
     "env": ("action_delay",),
+    "events": (
+        *("profile", "threshold", "tolerance", "contrast_on", "contrast_off", "refractory_ns", "bandwidth_hz"),
+        *("threshold_mismatch", "leak_rate_hz", "shot_rate_hz", "hot_pixel_fraction", "hot_pixel_rate_hz"),
+        "reference_lux",
+    ),
     **{
         group: tuple(option.name for option in fields(kind))
         for group, kind in (

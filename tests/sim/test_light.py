@@ -12,6 +12,7 @@ import pytest
 from edqn_jax.config import CameraConfig, Config, DroneConfig, EventsConfig, LightConfig
 from edqn_jax.config.loading import flown_under
 from edqn_jax.errors import ConfigError
+from edqn_jax.learn import policy
 from edqn_jax.sim import env, light, photoreceptor
 from edqn_jax.sim import events as ev
 from edqn_jax.sim.drone import load_airframe
@@ -121,3 +122,26 @@ def test_a_policy_is_flown_in_other_light_than_it_was_trained_in():
     assert darker.light == LightConfig(0.5, 0.5)
     with pytest.raises(ConfigError, match=r"light.least_lux must be at most light.most_lux \(0.5\)"):
         flown_under(darker, {"light": {"least_lux": 2.0}}, "conditions")
+
+
+def test_a_policy_is_flown_with_another_sensor_than_it_was_trained_with():
+    noisy = flown_under(Config(), {"events": {"profile": "dvs", "shot_rate_hz": 1.0}}, "conditions")
+    assert (noisy.events.bandwidth_hz, noisy.events.threshold, noisy.events.shot_rate_hz) == (30.0, 0.2, 1.0)
+    with pytest.raises(ConfigError, match="'events.law' is a policy's own; .* of events the pixels' thresholds"):
+        flown_under(Config(), {"events": {"law": "esim"}}, "conditions")
+
+
+def test_a_policy_acts_on_events_with_and_without_noise():
+    """Rows of ON and of OFF events are the same channels to an encoder that was trained without noise."""
+    noisy = dataclasses.replace(DARK, events=dataclasses.replace(DARK.events, shot_rate_hz=1e-6))
+    quiet = dataclasses.replace(DARK, events=dataclasses.replace(DARK.events, shot_rate_hz=0.0))
+    flies = policy.Policy(quiet, policy.fresh_policy(quiet))
+    frames = jnp.exp(jnp.asarray(np.random.default_rng(0).normal(-1.0, 0.3, (2, 12, 16)))).clip(0.0, 1.0)
+    seen = []
+    for config in (quiet, noisy):
+        memory = ev.reset_memory(config.events, 12, 16, jax.random.key(0))
+        field, _ = ev.events(config.events, memory, frames, config.events.frame_times_s, jax.random.key(1))
+        seen.append(env.Observation(field, jnp.ones(env.OWN_SIZE), jnp.ones(env.MOTION_SIZE)))
+    assert seen[0].sensed.count.shape[0] * 2 == seen[1].sensed.count.shape[0] == 2
+    codes = [flies.code(each) for each in seen]
+    np.testing.assert_array_equal(codes[0], codes[1])
