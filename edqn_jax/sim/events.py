@@ -490,6 +490,9 @@ def merged(config: EventsConfig, one: EventField, other: EventField, times: NDAr
 
     Counts are added. Where both have events in a row, they are spaced evenly from the first to the last of all, at
     least a refractory period apart.
+
+    Args:
+        times: [T] seconds of the frames.
     """
     count = one.count + other.count
     fields = (one, other)

@@ -106,6 +106,12 @@ def develop(exposure: ExposureConfig, luma: Array, lux: Array, time: Array, gain
 
     The Poisson distribution of electrons is taken for a normal one of its variance, which is far off only where there
     are fewer than `read_noise_e` squared anyway.
+
+    Args:
+        luma: share of a surface that faces the sun.
+        lux: [] illuminance.
+        time: [] seconds of exposure.
+        gain: [] without a unit.
     """
     electrons = exposure.sensitivity_e_lux_s * lux * time * luma
     spread = jnp.sqrt(electrons + exposure.read_noise_e**2)
@@ -115,5 +121,10 @@ def develop(exposure: ExposureConfig, luma: Array, lux: Array, time: Array, gain
 
 
 def metered(exposure: ExposureConfig, picture: Array, lux: Array, time: Array, gain: Array) -> Array:
-    """Returns the mean brightness [] that a picture [...] says of its scene; where it clips, the scene has more."""
+    """Returns the mean brightness [] that a picture [...] says of its scene; where it clips, the scene has more.
+
+    Args:
+        picture: shares of white.
+        lux, time, gain: illuminance in lux, seconds of exposure, and gain, as in `develop`.
+    """
     return jnp.mean(picture) * exposure.full_well_e / (exposure.sensitivity_e_lux_s * lux * time * gain)

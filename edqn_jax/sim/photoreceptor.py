@@ -38,8 +38,8 @@ def shot_noise(current: Array) -> Array:
     """Returns the rate of shot noise as a share of that in darkness, of photocurrents [...].
 
     v2e's line from 1 in darkness to a quarter in a white pixel. Beyond, in more light, the rate is inversely
-    proportional to it: so is the density of the noise at the photoreceptor (Graca and Delbruck 2021, "Unraveling the
-    paradox of intensity-dependent DVS pixel noise"), while the rate of a real pixel falls faster.
+    proportional to it: a continuation of ours. The relative density of a current's shot noise falls so, and with it
+    what passes a limited bandwidth (Graca and Delbruck 2021, arXiv:2109.08640); a real pixel's rate falls faster.
     """
     line = 1.0 - (1.0 - SHOT_NOISE_OF_WHITE) * current
     return jnp.where(current < 1.0, line, SHOT_NOISE_OF_WHITE / jnp.maximum(current, 1.0))

@@ -390,9 +390,9 @@ def parts(config, memory, frames):
 def test_signal_and_noise_are_merged_as_by_the_plain_loop(seed, law):
     config = dataclasses.replace(FIRING[law], **BUSY)
     signal, noise, shown = map(host, parts(config, memory_of(config, seed), jnp.asarray(random_frames(seed))))
-    lists = [[(t * 1e-6, x, y, p) for t, x, y, p in ev.expand(field).tolist()] for field in (signal, noise)]
-    plain = events_plain.merged(*lists, np.array(TIMES), config.refractory_ns)
-    assert min(map(len, lists)) > 5
+    one, other = ([(t * 1e-6, x, y, p) for t, x, y, p in ev.expand(each).tolist()] for each in (signal, noise))
+    plain = events_plain.merged(one, other, np.array(TIMES), config.refractory_ns)
+    assert min(len(one), len(other)) > 5
     stream = ev.expand(shown)
     for name, field in (("count", shown.count), ("stream", stream)):
         assert (field.sum() if name == "count" else len(field)) == len(plain)

@@ -59,7 +59,7 @@ def test_sub_frames_are_taken_where_the_drone_was(seed, steps, share):
         where, attitude = exposure_plain.pose(position, quaternion, dt, before)
         np.testing.assert_allclose(found.position[k], where, atol=2e-5)
         assert abs(np.asarray(found.quaternion[k]) @ attitude) > 1 - 1e-5  # q and -q are the same
-        assert abs(float(found.time[k]) - (times[-1] - before)) < 1e-6
+        assert found.time is not None and abs(float(found.time[k]) - (times[-1] - before)) < 1e-6
 
 
 @few

@@ -1,5 +1,7 @@
 """Light: one illuminance an episode, and what it does to events."""
 
+# pyright: reportArgumentType=false
+
 from __future__ import annotations
 
 import dataclasses

@@ -1,5 +1,7 @@
 """Photoreceptors of finite bandwidth: against the differential equation, and what they do to events."""
 
+# pyright: reportArgumentType=false
+
 from __future__ import annotations
 
 import dataclasses
@@ -75,7 +77,7 @@ def test_the_same_contrast_makes_fewer_events_in_a_dark_pixel_than_in_a_bright_o
     frames = jnp.stack([before, before * 2.0])
     memory = ev.reset_memory(config, 1, 3, jax.random.key(0))
     if memory.residual is not None:
-        memory = memory.replace(residual=jnp.zeros((1, 3)))
+        memory = dataclasses.replace(memory, residual=jnp.zeros((1, 3)))
     field, _ = ev.events(config, memory, frames, (0.0, 0.04), jax.random.key(0))
     dark, middle, bright = np.asarray(field.count[0, 0])
     assert 0 <= dark < middle < bright <= np.log(2) / 0.09

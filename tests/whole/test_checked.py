@@ -87,7 +87,9 @@ def test_a_sound_run_with_a_faulty_sensor_in_any_light_has_no_fault(sensor: str)
     trainer = trainer_of((*CHECKED, *light, *faults))
     state, (_, losses) = trainer.chunk(trainer.init(0), 0)
     assert jnp.isfinite(losses.reconstruction[-1])
-    lux = state.actors.env.memory.lux  # type: ignore
+    memory = state.actors.env.memory
+    assert memory is not None and memory.lux is not None
+    lux = memory.lux
     assert jnp.all((lux >= 0.1) & (lux <= 10_000)) and jnp.std(jnp.log(lux)) > 1
 
 
