@@ -109,6 +109,8 @@ class Environment:
             mission: in whose world it was flown.
             law: of the events; `esim` remembers each pixel's level from frame to frame.
 
+        The camera's faults, and its light where there is any, are drawn, and are the same at every call.
+
         Returns:
             a structured array as `events` returns it; `t` counts from the first pose.
         """

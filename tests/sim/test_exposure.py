@@ -14,14 +14,15 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from edqn_jax.config import CameraConfig, Config, DroneConfig, EnvConfig, ExposureConfig, LightConfig
+import edqn_jax
+from edqn_jax.config import CameraConfig, Config, DroneConfig, EnvConfig, ExposureConfig, LightConfig, WorldConfig
 from edqn_jax.config.limits import validate
 from edqn_jax.errors import ConfigError
 from edqn_jax.sim import env, exposure, mjcf, sensor
 from edqn_jax.sim.drone import Flight, load_airframe
 from edqn_jax.sim.exposure import FrameMemory
 from edqn_jax.sim.missions import own_missions
-from edqn_jax.sim.scene import stack_scenes
+from edqn_jax.sim.scene import scene_at, stack_scenes
 from tests.miniature import WORLD
 from tests.oracles import exposure_plain
 
@@ -186,6 +187,28 @@ def test_a_turning_camera_smears_what_it_sees_over_its_exposure(scene):
     inside = wanted < 0.95
     assert np.abs(mean - wanted)[inside].max() < 0.005
     assert np.abs(wanted - views[0]).max() > 0.03 and inside.mean() > 0.5
+
+
+@pytest.mark.slow
+def test_what_moves_is_smeared_where_the_drone_stands_still():
+    """Each part of an exposure sees the world at its own time."""
+    slow = dataclasses.replace(REAL, shortest_s=0.02, read_noise_e=0.0)
+    config = dataclasses.replace(config_of("frames", slow), world=WorldConfig(name="moving", moving_speed_m_s=5.0))
+    scene, rng = edqn_jax.make("moving", config, seed=1).scene(0), np.random.default_rng(0)
+    at = jax.jit(lambda t, p: sensor.view(config, scene_at(scene, t), p, jnp.asarray(UPRIGHT)))
+    # Somewhere where something moves in the picture.
+    places = [np.array([x, y, 3.0], np.float32) for x, y in rng.uniform(10.0, 90.0, (60, 2))]
+    place = max(places, key=lambda p: np.abs(at(4.0, p) - at(4.02, p)).max())
+    still = np.tile(place, (2, 1)), np.tile(UPRIGHT, (2, 1)), np.tile(place, (2, 1)), [4.0, 4.02]
+    poses = Flight(*(jnp.asarray(x, jnp.float32) for x in still))
+    lux, many = jnp.float32(10_000 / (6000 * 0.02)), jax.random.split(jax.random.key(1), 300)
+    sensed = jax.vmap(lambda key: shown(config, scene, poses, lux, jnp.float32(0.4), key)[0])(many)
+    mean = np.mean([luma_of(config, each) for each in sensed], axis=0)
+    wanted = np.mean([at(4.02 - 0.02 * (k + 0.5) / 5, place) for k in range(5)], axis=0)
+    sharp = np.asarray(at(4.02, place))
+    inside = wanted < 0.95
+    # 300 pictures with a noise of at most 0.01 each.
+    assert np.abs(mean - wanted)[inside].max() < 0.003 < 0.006 < np.abs(wanted - sharp)[inside].max()
 
 
 @pytest.mark.slow
