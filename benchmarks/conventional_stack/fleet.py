@@ -15,7 +15,7 @@ from conventional_stack.stopwatch import Stopwatch
 from edqn_jax.config import Config
 from edqn_jax.errors import ConfigError
 from edqn_jax.learn.vae import needs_nearness
-from edqn_jax.sim import disturbances, env
+from edqn_jax.sim import disturbances, env, light
 from edqn_jax.sim.env import MOTION_SIZE, OWN_SIZE
 from edqn_jax.sim.moves import ACTIONS
 from edqn_jax.sim.scene import take_scene
@@ -90,8 +90,10 @@ def check(config: Config) -> None:
     """Raises ConfigError if this stack does not support the configuration."""
     sensor = config.events
     noisy = (sensor.threshold_mismatch, sensor.leak_rate_hz, sensor.shot_rate_hz, sensor.hot_pixel_fraction)
-    if sensor.law != "paper" or len(sensor.frame_times_s) != 2 or any(noisy):
+    if sensor.law != "paper" or len(sensor.frame_times_s) != 2 or any(noisy) or sensor.bandwidth_hz:
         raise ConfigError("the conventional stack supports only the noiseless 'paper' event law between two frames")
+    if light.is_on(config.light):
+        raise ConfigError("the conventional stack supports only events without light; set light.most_lux to 0")
     if config.encoder.retrain_at:
         raise ConfigError(
             "the conventional stack supports only a VAE that is trained once; leave encoder.retrain_at empty"

@@ -32,7 +32,7 @@ from edqn_jax.cli.help import (
 )
 from edqn_jax.config import CONDITIONS, FAMILIES, Config
 from edqn_jax.config.limits import validate
-from edqn_jax.config.loading import Layer, resolve
+from edqn_jax.config.loading import Layer, apply, resolve
 from edqn_jax.errors import ConfigError
 from edqn_jax.parallel.hardware import hardware
 from edqn_jax.parallel.launch import Distributed
@@ -227,6 +227,8 @@ class CompletionArgs:
     """`bash`, `zsh` or `fish`."""
 
 
+PROFILE = "--events.profile"
+
 VIDEO, EVENT_FILES = (".gif", ".mp4"), (".h5", ".hdf5", ".npz", ".txt")
 """Endings of the files that `edqn record` writes."""
 
@@ -256,6 +258,10 @@ def parse_train(argv: Sequence[str]) -> tuple[TrainOptions, Config]:
     else:
         world = _parse_config(argv, resolve(options.preset, options.config)).world.name
         begins = resolve(options.preset, options.config, world, tuned_for)
+    if any(word.partition("=")[0] == PROFILE for word in argv):
+        # What else is given changes one of the profile's figures.
+        profile = _parse_config(argv, begins).events.profile
+        begins = apply(begins, {"events": {"profile": profile}}, "the command line")
     if helped:
         show_train_help(TrainOptions(), begins, SHORT_NAMES, everything=everything)
     config = _found_worlds(_parse_config(argv, begins))

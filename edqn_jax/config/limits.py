@@ -17,6 +17,8 @@ from edqn_jax.config.options import (
     EncoderConfig,
     EnvConfig,
     EventsConfig,
+    ExposureConfig,
+    LightConfig,
     MotorsConfig,
     NoiseConfig,
     TrainConfig,
@@ -40,6 +42,8 @@ def validate(config: Config) -> None:
     _body(config.body)
     _motors(config.motors)
     _noise(config.noise)
+    _light(config.light)
+    _exposure(config)
     _encoder(config.encoder)
     _agent(config.agent)
     _train(config.train)
@@ -107,8 +111,9 @@ def _camera(camera: CameraConfig) -> None:
 
 def _events(events: EventsConfig, drone: DroneConfig) -> None:
     thresholds = ["threshold", "tolerance", "contrast_on", "contrast_off", "airsim_tolerance", "log_epsilon"]
-    _positive(events, "events", [*thresholds, "refractory_ns"])
+    _positive(events, "events", [*thresholds, "refractory_ns", "reference_lux"])
     _not_negative(events, "events", ["threshold_mismatch", "leak_rate_hz", "shot_rate_hz", "hot_pixel_rate_hz"])
+    _not_negative(events, "events", ["bandwidth_hz"])
     _share(events, "events", ["hot_pixel_fraction"])
     times = events.frame_times_s
     name, dt = "events.frame_times_s", drone.physics_dt_s
@@ -121,6 +126,8 @@ def _events(events: EventsConfig, drone: DroneConfig) -> None:
     whole = all(abs(time / dt - round(time / dt)) < 1e-3 for time in times)
     _require(whole, name, f"multiples of drone.physics_dt_s ({dt:g} s)", times)
     _require(times[0] >= -window - 1e-3 * dt, name, f"within the decision's {window:g} s", times)
+    gapless = not events.stream or times[0] <= -window + 1e-3 * dt
+    _require(gapless, name, f"times that begin at -{window:g}, with the decision, where events.stream is on", times)
 
 
 def _env(env: EnvConfig) -> None:
@@ -151,6 +158,33 @@ def _motors(motors: MotorsConfig) -> None:
 
 def _noise(noise: NoiseConfig) -> None:
     _not_negative(noise, "noise", ["position_m", "velocity_m_s", "position_bias_m", "velocity_bias_m_s"])
+
+
+def _light(light: LightConfig) -> None:
+    _not_negative(light, "light", ["least_lux", "most_lux"])
+    least, most = light.least_lux, light.most_lux
+    if (least, most) != (0.0, 0.0):
+        _within(light, "light", ["least_lux", "most_lux"], 0.1, 10_000.0)
+        _require(least <= most, "light.least_lux", f"at most light.most_lux ({most:g})", least)
+
+
+def _exposure(config: Config) -> None:
+    exposure: ExposureConfig = config.exposure
+    _positive(exposure, "exposure", ["shortest_s", "longest_s", "sub_frames", "sensitivity_e_lux_s", "full_well_e"])
+    _not_negative(exposure, "exposure", ["read_noise_e"])
+    _at_most(exposure, "exposure", ["sub_frames"], 64)
+    _require(0 < exposure.target < 1, "exposure.target", "more than 0 and less than 1", exposure.target)
+    _within(exposure, "exposure", ["most_gain"], 1.0, 1000.0)
+    longest = f"at most exposure.longest_s ({exposure.longest_s:g})"
+    _require(exposure.shortest_s <= exposure.longest_s, "exposure.shortest_s", longest, exposure.shortest_s)
+    if not exposure.real:
+        return
+    _require(config.light.most_lux > 0, "exposure.real", "false without light.least_lux and light.most_lux", True)
+    # Poses are known from the beginning of a decision on, and an exposure reaches into whole physics steps.
+    dt = config.drone.physics_dt_s
+    before = round(config.drone.physics_steps + config.events.frame_times_s[0] / dt) * dt
+    limit = f"at most {before:g}, the seconds of a decision before events.frame_times_s"
+    _require(exposure.longest_s <= before + 1e-3 * dt, "exposure.longest_s", limit, exposure.longest_s)
 
 
 def _encoder(encoder: EncoderConfig) -> None:

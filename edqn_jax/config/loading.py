@@ -21,6 +21,7 @@ import yaml
 from edqn_jax.config.limits import shown, validate
 from edqn_jax.config.options import CONDITIONS, FAMILIES, WITH_DETOURS, Config
 from edqn_jax.config.presets import preset as named_preset
+from edqn_jax.config.profiles import PROFILES
 from edqn_jax.errors import ConfigError
 
 Layer = Mapping[str, Mapping[str, Any]]
@@ -239,7 +240,7 @@ def flown_under(config: Config, conditions: Layer, source: str) -> Config:
             if option not in CONDITIONS.get(group, ()):
                 raise ConfigError(
                     f"{source}: '{group}.{option}' is a policy's own; conditions are {', '.join(CONDITIONS)} "
-                    "(of env action_delay alone)"
+                    "(of env action_delay alone, of events the pixels' thresholds and faults)"
                 )
     validate(changed)
     return changed
@@ -288,7 +289,9 @@ def parse_layer(text: str, source: str) -> Layer:
 
 
 def apply(config: Config, layer: Layer, source: str) -> Config:
-    """Returns `config` with every key of the layer replaced.
+    """Returns `config` with every key of the layer replaced; `events.profile` also replaces what it stands for.
+
+    Options that the layer names beside a profile are not the profile's.
 
     Raises:
         ConfigError: if a group or key is unknown (names the nearest known one) or a type is wrong.
@@ -310,7 +313,8 @@ def apply(config: Config, layer: Layer, source: str) -> Config:
             if key not in hints:
                 raise ConfigError(f"{source}: there is no key '{group}.{_cut(key)}'{nearest(key, hints)}")
         checked = {key: typed(value, hints[key], f"{source}: '{group}.{key}'") for key, value in values.items()}
-        changed[group] = dataclasses.replace(section, **checked)
+        profile = PROFILES[checked["profile"]] if group == "events" and "profile" in checked else {}
+        changed[group] = dataclasses.replace(section, **{**profile, **checked})
     return dataclasses.replace(config, **changed)
 
 

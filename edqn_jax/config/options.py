@@ -117,8 +117,14 @@ class EventsConfig:
 
     law: Literal["paper", "airsim", "esim"] = "paper"
     """Event law: the paper's, AirSim's (equal to its simulator event by event), or ESIM's, a sensor with memory."""
+    profile: Literal["ideal", "dvs", "dark"] = "ideal"
+    """Named sensor whose figures take the place of thresholds, refractory period, bandwidth and noise; options that are
+    given beside it change one. `ideal`: no faults. `dvs`: the noisy sensor of v2e. `dark`: a sensor in low light."""
     frame_times_s: tuple[float, ...] = (-0.04, 0.0)
     """When frames are rendered relative to the decision, seconds; each must be a physics step."""
+    stream: bool = False
+    """Whether a window begins where the one before ended, so that `esim` and slow photoreceptors remember all that was
+    seen. `frame_times_s` must then begin with the decision, at -0.26; with every physics step, nothing is missed."""
     threshold: float = 0.05
     """Th of Eq. 2 (`paper`): log-brightness change that makes events."""
     tolerance: float = 0.05
@@ -133,6 +139,9 @@ class EventsConfig:
     """Refractory period, nanoseconds; caps a pixel's events in a window (Eq. 3)."""
     log_epsilon: float = 1e-3
     """Added to brightness in [0, 1] before the logarithm of Eq. 1."""
+    bandwidth_hz: float = 0.0
+    """Cutoff frequency of a white pixel's photoreceptor, which lags behind the light; a darker pixel's is lower in
+    proportion. 0 is infinite."""
     threshold_mismatch: float = 0.0
     """Standard deviation of the per-pixel threshold relative to the threshold; 0 is a perfect sensor."""
     leak_rate_hz: float = 0.0
@@ -143,6 +152,8 @@ class EventsConfig:
     """Share of pixels that are hot: they fire at `hot_pixel_rate_hz` without any change of brightness."""
     hot_pixel_rate_hz: float = 50.0
     """Events per second of a hot pixel."""
+    reference_lux: float = 10.0
+    """Illuminance in which `bandwidth_hz` and `shot_rate_hz` are a white and a black pixel's, where `light` is on."""
 
 
 @dataclass(frozen=True)
@@ -243,6 +254,41 @@ class NoiseConfig:
     """Standard deviation of an error of each coordinate of the own position, metres, that stays for an episode."""
     velocity_bias_m_s: float = 0.0
     """Standard deviation of an error of each coordinate of the own velocity, m/s, that stays for an episode."""
+
+
+@dataclass(frozen=True)
+class LightConfig:
+    """How much light there is, drawn for each episode. With 0 and 0 there is always enough for every sensor."""
+
+    least_lux: float = 0.0
+    """Least illuminance of a surface that faces the sun, lux; an episode's is log-uniform from this to `most_lux`. From
+    0.1 on; 0 is off."""
+    most_lux: float = 0.0
+    """Most illuminance, lux; up to 10000, and 0 is off."""
+
+
+@dataclass(frozen=True)
+class ExposureConfig:
+    """How a camera takes the frames of the sensors `frames` and `frame-pair`."""
+
+    real: bool = False
+    """Whether frames have an exposure time, motion blur, noise and 8 bits; needs `light`. If not, they are perfect."""
+    shortest_s: float = 1e-4
+    """Shortest exposure, seconds; the camera chooses it by the light."""
+    longest_s: float = 0.02
+    """Longest exposure, seconds."""
+    target: float = 0.4
+    """Mean level of a picture that exposure and gain are set for, as a share of white."""
+    most_gain: float = 4.0
+    """Largest gain, where the longest exposure is not enough; it amplifies noise, too."""
+    sub_frames: int = 5
+    """Pictures whose mean is one exposure: motion blur has so many steps, and rendering so many times the cost."""
+    sensitivity_e_lux_s: float = 6000.0
+    """Electrons of a white pixel per lux and second of light on the scene."""
+    full_well_e: float = 10_000.0
+    """Electrons that a pixel holds; at a gain of 1 they are white."""
+    read_noise_e: float = 18.0
+    """Standard deviation of the read noise, electrons."""
 
 
 @dataclass(frozen=True)
@@ -428,6 +474,8 @@ class Config:
     body: BodyConfig = field(default_factory=BodyConfig)
     motors: MotorsConfig = field(default_factory=MotorsConfig)
     noise: NoiseConfig = field(default_factory=NoiseConfig)
+    light: LightConfig = field(default_factory=LightConfig)
+    exposure: ExposureConfig = field(default_factory=ExposureConfig)
     encoder: EncoderConfig = field(default_factory=EncoderConfig)
     agent: AgentConfig = field(default_factory=AgentConfig)
     train: TrainConfig = field(default_factory=TrainConfig)
@@ -435,9 +483,21 @@ class Config:
 
 CONDITIONS: dict[str, tuple[str, ...]] = {
     "env": ("action_delay",),
+    "events": (
+        *("profile", "threshold", "tolerance", "contrast_on", "contrast_off", "refractory_ns", "bandwidth_hz"),
+        *("threshold_mismatch", "leak_rate_hz", "shot_rate_hz", "hot_pixel_fraction", "hot_pixel_rate_hz"),
+        "reference_lux",
+    ),
     **{
         group: tuple(option.name for option in fields(kind))
-        for group, kind in (("air", AirConfig), ("body", BodyConfig), ("motors", MotorsConfig), ("noise", NoiseConfig))
+        for group, kind in (
+            ("air", AirConfig),
+            ("body", BodyConfig),
+            ("motors", MotorsConfig),
+            ("noise", NoiseConfig),
+            ("light", LightConfig),
+            ("exposure", ExposureConfig),
+        )
     },
 }
 """Options by group that a policy may be flown with other values of than it was trained with."""

@@ -155,7 +155,7 @@ def about_policy(config: Config) -> dict[str, Any]:
         "contrast_on": on,
         "contrast_off": off,
         "least_count": max(1, least),
-        "counts_net": not _has_noise(config),
+        "counts_net": not events.has_noise(config.events),
         "history": config.agent.history,
         "observation_size": observation_size(config),
         "decision_s": config.drone.physics_steps * config.drone.physics_dt_s,
@@ -193,7 +193,7 @@ def field_of(config: Config, counts: Array) -> EventField:
     Of a policy that was trained with noise it is [..., 2 F, H, W]: ON and OFF apart. Times are those of Eq. 5.
     """
     on, off = counts[..., 0, :, :], counts[..., 1, :, :]
-    if _has_noise(config):
+    if events.has_noise(config.events):
         count = jnp.concatenate([on, off], axis=-3)
         sign = jnp.concatenate([jnp.ones_like(on), -jnp.ones_like(off)], axis=-3)
     else:
@@ -213,7 +213,7 @@ def field_of(config: Config, counts: Array) -> EventField:
         t_step=step,
         window_s=float(edges[-1]),
         divides_window=_only_counts(config),
-        with_noise=_has_noise(config),
+        with_noise=events.has_noise(config.events),
     )
 
 
@@ -224,10 +224,6 @@ def _sensed(config: Config, counts: Array) -> EventField | Array:
     image = jnp.sum(counts[..., 0, :, :] - counts[..., 1, :, :], axis=-3).astype(jnp.float32)
     shown = jnp.sign(image) * jnp.log1p(jnp.abs(image))  # as sim.sensor has it
     return shown.reshape(*shown.shape[:-2], -1)
-
-
-def _has_noise(config: Config) -> bool:
-    return config.events.leak_rate_hz > 0 or config.events.shot_rate_hz > 0 or config.events.hot_pixel_fraction > 0
 
 
 def _only_counts(config: Config) -> bool:
@@ -246,7 +242,7 @@ def _random_inputs(config: Config, rng: np.random.Generator) -> list[np.ndarray]
     """Returns inputs of every density of events, from none on."""
     counts, own, motion, memory = (given.shape for given in _shapes(config))
     number = rng.poisson(3.0 * rng.random(), counts) * (rng.random(counts) < rng.random())
-    if not _has_noise(config):  # of a pixel's events between two frames all have one polarity
+    if not events.has_noise(config.events):  # of a pixel's events between two frames all have one polarity
         number[:, :, 0][rng.random(number[:, :, 0].shape) < 0.5] = 0
         number[:, :, 1][number[:, :, 0] > 0] = 0
     numbers = (rng.uniform(-1.0, 1.0, own), rng.uniform(-1.0, 1.0, motion), rng.normal(0.0, 0.5, memory))

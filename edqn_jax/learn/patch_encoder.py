@@ -26,18 +26,14 @@ from edqn_jax.sim.events import EventField
 def log_counts(field: EventField) -> list[Array]:
     """Returns log(1 + count) of ON and of OFF events of each pixel, of each pair of frames: 2 F arrays [..., H, W].
 
-    Noise events of a pixel are added to those of the same frame pair and polarity, which no sensor could tell apart.
+    With noise, a pixel's ON and OFF events between two frames stand in rows of their own.
     """
-    signs = (field.polarity > 0, field.polarity < 0)
-    if not field.with_noise:
-        # A pixel's events between two frames have one polarity, so one logarithm serves both channels.
-        level = jnp.log(1.0 + field.count.astype(jnp.float32))
-        pairs = [jnp.where(sign, level, 0.0) for sign in signs]
+    level = jnp.log(1.0 + field.count.astype(jnp.float32))
+    if field.with_noise:
+        pairs = jnp.split(level, 2, axis=-3)
     else:
-        *batch, rows, height, width = field.count.shape
-        split = (*batch, 2, rows // 2, height, width)
-        counts = [jnp.sum(jnp.where(sign, field.count, 0).reshape(split), axis=-4) for sign in signs]
-        pairs = [jnp.log(1.0 + count.astype(jnp.float32)) for count in counts]
+        # A pixel's events between two frames have one polarity, so one logarithm serves both channels.
+        pairs = [jnp.where(sign, level, 0.0) for sign in (field.polarity > 0, field.polarity < 0)]
     return [pair[..., row, :, :] for row in range(pairs[0].shape[-3]) for pair in pairs]
 
 

@@ -167,7 +167,7 @@ def _example(config: Config) -> Sensed:
 def _kind(sensed: Sensed) -> tuple[tuple[int, ...] | None, float | None]:
     """Returns the shape of what a sensor shows, and of events the length of the window in seconds."""
     if isinstance(sensed, EventField):
-        # Noise events stand in rows of their own.
+        # With noise, ON and OFF events of a frame pair stand in rows of their own.
         rows, *size = sensed.count.shape
         return (rows // 2 if sensed.with_noise else rows, *size), round(sensed.window_s, 6)
     return (None if sensed is None else sensed.shape), None

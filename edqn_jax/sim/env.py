@@ -23,13 +23,12 @@ from edqn_jax.sim import disturbances, drone, geodesic, sensor
 from edqn_jax.sim.distance import signed_distance
 from edqn_jax.sim.disturbances import Disturbance
 from edqn_jax.sim.drone import Airframe, DroneState, Flight
-from edqn_jax.sim.events import EventMemory
 from edqn_jax.sim.missions import Missions
 from edqn_jax.sim.moves import ACTIONS
 from edqn_jax.sim.outcomes import Outcome, judge
 from edqn_jax.sim.reward import Reward, Transition, configured_reward
 from edqn_jax.sim.scene import Scene, moves, scene_at, take_scene
-from edqn_jax.sim.sensor import Sensed, frame_steps
+from edqn_jax.sim.sensor import Sensed, SensorMemory, frame_steps
 
 OWN_SIZE = 10
 """Values of the drone's own state in an observation."""
@@ -72,7 +71,7 @@ class EnvState:
     mission: Array  # [] int32 index into the missions
     decision: Array  # [] int32 decisions taken in this episode
     ended: Array  # [] bool, the next step is a reset
-    memory: EventMemory | None  # the sensor's
+    memory: SensorMemory  # the sensor's
     episode_return: Array  # [] sum of rewards so far
     key: Array  # [] typed key
     disturbance: Disturbance | None = None  # what the episode flies against; None where nothing disturbs
@@ -192,7 +191,7 @@ def heading_setpoint(config: EnvConfig, state: DroneState, goal: Array, command:
 
 def _start(
     config: Config, world: World, mission: Array, key: Array
-) -> tuple[DroneState, EventMemory | None, Disturbance | None]:
+) -> tuple[DroneState, SensorMemory, Disturbance | None]:
     """At rest at the mission's start, facing its goal, the sensor at rest, and what the episode will fly against."""
     start, goal = world.missions.start[mission], world.missions.goal[mission]
     yaw = jnp.arctan2(goal[1] - start[1], goal[0] - start[0])
@@ -210,10 +209,10 @@ def observe(
     state: DroneState,
     move: Array,
     poses: Flight,
-    memory: EventMemory | None,
+    memory: SensorMemory,
     key: Array,
     disturbance: Disturbance | None = None,
-) -> tuple[Observation, EventMemory | None]:
+) -> tuple[Observation, SensorMemory]:
     """Returns what the sensor shows on the way to `goal` [3], metres, own state [OWN_SIZE] and motion [MOTION_SIZE].
 
     Args:

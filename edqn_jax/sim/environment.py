@@ -25,7 +25,7 @@ from edqn_jax.errors import ConfigError
 from edqn_jax.sim import camera, drone, env, events, sensor
 from edqn_jax.sim.drone import Flight
 from edqn_jax.sim.env import EnvState, Observation, Step, World
-from edqn_jax.sim.events import EventField
+from edqn_jax.sim.events import EventField, EventMemory
 from edqn_jax.sim.missions import own_missions
 from edqn_jax.sim.mjcf import check_scene, load_world, mjcf_of, resolve_world
 from edqn_jax.sim.moves import move_number
@@ -109,6 +109,8 @@ class Environment:
             mission: in whose world it was flown.
             law: of the events; `esim` remembers each pixel's level from frame to frame.
 
+        The camera's faults, and its light where there is any, are drawn, and are the same at every call.
+
         Returns:
             a structured array as `events` returns it; `t` counts from the first pose.
         """
@@ -190,7 +192,8 @@ def _stream(config: Config, scene: Scene, flight: Flight) -> EventField:
     frames = jax.lax.map(see, flight)
     times = tuple(config.drone.physics_dt_s * np.arange(frames.shape[0]))
     key, noise = jax.random.split(jax.random.key(0))
-    memory = events.reset_memory(config.events, config.camera.height, config.camera.width, key)
+    memory = sensor.SENSORS["events"].at_rest(config, key)
+    assert isinstance(memory, EventMemory)
     return events.events(config.events, memory, frames, times, noise, continuous=True)[0]
 
 

@@ -4,8 +4,10 @@ Inside the compiled step events are never a list. Between two frames a pixel's e
 and even spacing, so `EventField` holds them exactly; `expand` turns it into the `(t, x, y, p)` stream that
 people exchange, and `collect` turns such a stream back.
 
-Shapes: T frames, F = T - 1 frame pairs (2 F rows in an `EventField` when noise events are on, the second F
-being noise), H rows, W columns.
+With noise a pixel may have events of both polarities between two frames: the rows of a field are then the ON events
+of every frame pair and after them the OFF events, and in a row noise and signal of a pixel are one (`merged`).
+
+Shapes: T frames, F = T - 1 frame pairs (2 F rows in an `EventField` when noise events are on), H rows, W columns.
 """
 
 from __future__ import annotations
@@ -21,6 +23,7 @@ from jax import Array
 from numpy.typing import NDArray
 
 from edqn_jax.config import EventsConfig
+from edqn_jax.sim import photoreceptor
 
 STREAM_DTYPE = np.dtype([("t", "<i8"), ("x", "<u2"), ("y", "<u2"), ("p", "i1")])
 """One event of a stream: time in microseconds, column, row, polarity in {-1, +1}."""
@@ -49,7 +52,7 @@ class EventField:
     divides_window: bool = struct.field(pytree_node=False, default=False)
     """Whether `t_first` is 0 and `t_step` the window over `count` everywhere: Eq. 5 between one pair of frames."""
     with_noise: bool = struct.field(pytree_node=False, default=False)
-    """Whether the second half of the rows are noise events of the frame pairs of the first half."""
+    """Whether the rows are the ON events of every frame pair and then the OFF events, 2 F in all."""
 
 
 @struct.dataclass
@@ -60,6 +63,8 @@ class EventMemory:
     last_event: Array | None  # [H, W] esim: time of the last event, seconds from the end of the last window
     gain: Array | None  # [2, H, W] threshold mismatch of ON and OFF, relative to the nominal threshold
     hot: Array | None  # [H, W] bool, pixels that fire on their own
+    lux: Array | None = None  # [] illuminance of the episode; None where there is always enough light
+    lag: Array | None = None  # [H, W] esim with finite bandwidth: what the photoreceptor shows minus log brightness
 
 
 def luma(rgb: Array) -> Array:
@@ -129,11 +134,14 @@ def event_times(count: Array, starts: Array, intervals: Array) -> tuple[Array, A
     return jnp.broadcast_to(starts, count.shape), intervals / jnp.maximum(count, 1).astype(jnp.float32)
 
 
-def reset_memory(config: EventsConfig, height: int, width: int, key: Array) -> EventMemory:
+def reset_memory(config: EventsConfig, height: int, width: int, key: Array, lux: Array | None = None) -> EventMemory:
     """Returns the memory of a sensor at rest.
 
     esim's residuals are uniform in (-C-, C+); threshold mismatch and hot pixels are drawn. The same key gives the same
     sensor.
+
+    Args:
+        lux: [] illuminance of the scene; None where light does not matter.
     """
     key_residual, key_gain, key_hot = jax.random.split(key, 3)
     gain = None
@@ -144,7 +152,7 @@ def reset_memory(config: EventsConfig, height: int, width: int, key: Array) -> E
     if config.hot_pixel_fraction > 0.0:
         hot = jax.random.bernoulli(key_hot, config.hot_pixel_fraction, (height, width))
     if config.law != "esim":
-        return EventMemory(residual=None, last_event=None, gain=gain, hot=hot)
+        return EventMemory(residual=None, last_event=None, gain=gain, hot=hot, lux=lux)
     contrast_on, contrast_off = _both(gain, config.contrast_on, config.contrast_off)
     share = jax.random.uniform(key_residual, (height, width))
     return EventMemory(
@@ -152,6 +160,8 @@ def reset_memory(config: EventsConfig, height: int, width: int, key: Array) -> E
         last_event=jnp.full((height, width), -jnp.inf),
         gain=gain,
         hot=hot,
+        lux=lux,
+        lag=jnp.zeros((height, width)) if config.bandwidth_hz > 0.0 else None,
     )
 
 
@@ -172,8 +182,9 @@ def events(
         frame_times: T times in seconds, rising; only their differences matter. Known when tracing.
         key: consumed only by noise events.
         continuous: the first frame is the previous window's last one (`stream` mode), so that esim's
-            refractory clock runs on. Otherwise there is a gap between the windows: esim's reference is set at the
-            first frame, keeping each pixel's sub-threshold residual.
+            refractory clock and the lag of its photoreceptors run on. Otherwise there is a gap between the windows:
+            esim's reference is set at the first frame, keeping each pixel's sub-threshold residual, and
+            photoreceptors have settled there, as they always have under the laws without memory.
 
     Raises:
         ValueError: if there are fewer than two frames, or not one rising time for each.
@@ -186,21 +197,32 @@ def events(
         )
     times = times - times[0]
     window_s = float(times[-1])
+    level = airsim_log_brightness(frames) if config.law == "airsim" else log_brightness(config, frames)
+    light = 1.0 if memory.lux is None else memory.lux / config.reference_lux
+    current = None
+    if config.bandwidth_hz > 0.0 or (memory.lux is not None and config.shot_rate_hz > 0.0):
+        current = photoreceptor.between_frames(photoreceptor.photocurrent(frames, light))
+    if config.bandwidth_hz > 0.0:
+        assert current is not None
+        lag = memory.lag if continuous and memory.lag is not None else jnp.zeros(frames.shape[1:])
+        level, lag = photoreceptor.follow(config.bandwidth_hz, level, times, current, lag)
+        memory = dataclasses.replace(memory, lag=lag if config.law == "esim" else None)
     if config.law == "esim":
-        level = log_brightness(config, frames)
         field, memory = _esim(config, memory, level, times, continuous)
     else:
-        field = _frame_pairs(config, memory.gain, frames, times)
-    if _has_noise(config):
-        field = _join(field, _noise(config, memory.hot, field, times, key))
+        field = _frame_pairs(config, memory.gain, level, times)
+    noisy = has_noise(config)
+    if noisy:
+        shot = 1.0 if current is None else photoreceptor.shot_noise(current)
+        noise = noise_events(config, memory.hot, field.count, times, key, shot)
+        field = merged(config, by_polarity(field), noise, times)
     even = divides_window(config, len(times))
-    noisy = _has_noise(config)
     return dataclasses.replace(field, window_s=window_s, divides_window=even, with_noise=noisy), memory
 
 
 def divides_window(config: EventsConfig, frames: int) -> bool:
     """Returns whether each pixel's events divide a window of so many frames evenly, see `EventField`."""
-    return frames == 2 and config.law != "esim" and not _has_noise(config)
+    return frames == 2 and config.law != "esim" and not has_noise(config)
 
 
 def signed_count(field: EventField) -> Array:
@@ -335,11 +357,10 @@ def _both(gain: Array | None, on: float, off: float) -> tuple[Array, Array]:
     return gain[0] * on, gain[1] * off
 
 
-def _frame_pairs(config: EventsConfig, gain: Array | None, frames: Array, times: NDArray) -> EventField:
+def _frame_pairs(config: EventsConfig, gain: Array | None, level: Array, times: NDArray) -> EventField:
     """Returns the events of the memoryless laws, `paper` and `airsim`."""
     intervals = np.diff(times)
     limit = jnp.array([max_events(config, dt) for dt in intervals], jnp.int32)[:, None, None]
-    level = log_brightness(config, frames) if config.law == "paper" else airsim_log_brightness(frames)
     before, after = level[:-1], level[1:]
     change = after - before
     scale: Array | float = 1.0 if gain is None else jnp.where(change > 0.0, gain[0], gain[1])
@@ -414,31 +435,79 @@ def _esim_pair(
     return (residual, last_event), EventField(count, polarity, first, step, 0.0)
 
 
-def _has_noise(config: EventsConfig) -> bool:
+def has_noise(config: EventsConfig) -> bool:
+    """Returns whether pixels fire without a change of brightness."""
     return config.leak_rate_hz > 0.0 or config.shot_rate_hz > 0.0 or config.hot_pixel_fraction > 0.0
 
 
-def _noise(config: EventsConfig, hot: Array | None, field: EventField, times: NDArray, key: Array) -> EventField:
-    """Returns the noise events of every frame pair: Poisson counts, evenly spaced from a random phase.
+def noise_events(
+    config: EventsConfig, hot: Array | None, signal: Array, times: NDArray, key: Array, shot: Array | float = 1.0
+) -> EventField:
+    """Returns the noise events of every frame pair, ON and then OFF [2 F, H, W]: Poisson counts, evenly spaced.
 
-    A pixel's noise events between two frames share one polarity, drawn by the rates: exact as long as
-    there is at most one. They neither change esim's reference nor obey the refractory period.
+    Leak and hot pixels make ON events, shot noise either. A pixel's refractory period leaves it `max_events` between
+    two frames, of which the signal's come first. Noise does not change esim's reference.
+
+    Args:
+        hot: [H, W] bool, hot pixels; None where there are none.
+        signal: [F, H, W] int32, events that the pixels have without noise.
+        times: [T] seconds of the frames.
+        key: consumed.
+        shot: [F, H, W] or scalar factor on the rate of shot noise.
     """
-    key_count, key_polarity, key_phase = jax.random.split(key, 3)
-    shape = field.count.shape
+    key_count, key_phase = jax.random.split(key)
+    pairs = signal.shape[0]
     firing = 0.0 if hot is None else config.hot_pixel_rate_hz * hot
-    rate_off = 0.5 * config.shot_rate_hz
-    rate = jnp.broadcast_to(config.leak_rate_hz + config.shot_rate_hz + firing, shape[1:])
-    intervals = jnp.asarray(np.diff(times), jnp.float32)[:, None, None]
-    limit = jnp.array([max_events(config, dt) for dt in np.diff(times)], jnp.int32)[:, None, None]
-    count = jnp.minimum(jax.random.poisson(key_count, rate[None] * intervals, shape, dtype=jnp.int32), limit)
-    off = jax.random.uniform(key_polarity, shape) * rate[None] < rate_off
+    off = 0.5 * config.shot_rate_hz * shot
+    rates = jnp.stack([jnp.broadcast_to(rate, signal.shape) for rate in (config.leak_rate_hz + off + firing, off)])
+    lengths = np.diff(times)
+    intervals = jnp.asarray(lengths, jnp.float32)[:, None, None]
+    drawn = jax.random.poisson(key_count, rates * intervals, rates.shape, dtype=jnp.int32)
+    limit = jnp.array([max_events(config, dt) for dt in lengths], jnp.int32)[:, None, None]
+    room = jnp.maximum(limit - signal, 0)
+    on = jnp.minimum(drawn[0], room)
+    count = jnp.concatenate([on, jnp.minimum(drawn[1], room - on)])
+    intervals, starts = jnp.tile(intervals, (2, 1, 1)), jnp.tile(jnp.asarray(times[:-1], jnp.float32), 2)[:, None, None]
     step = intervals / jnp.maximum(count, 1)
-    first = jnp.asarray(times[:-1, None, None], jnp.float32) + jax.random.uniform(key_phase, shape) * step
-    polarity = jnp.where(count > 0, jnp.where(off, -1, 1), 0).astype(jnp.int8)
-    return EventField(count, polarity, first, step, 0.0)
+    # A window is half open; float32 may round a phase of nearly 1 up to its end.
+    phase = jnp.minimum(jax.random.uniform(key_phase, count.shape) * step, intervals - (count - 1) * step - MICROSECOND)
+    sign = jnp.repeat(jnp.array([1, -1], jnp.int8), pairs)[:, None, None]
+    return EventField(count, jnp.where(count > 0, sign, 0).astype(jnp.int8), starts + phase, step, 0.0)
 
 
-def _join(signal: EventField, noise: EventField) -> EventField:
-    """Returns the signal rows, then the noise rows."""
-    return jax.tree.map(lambda a, b: jnp.concatenate([a, b]), signal, noise)
+def by_polarity(field: EventField) -> EventField:
+    """Returns a field [F, H, W] as the ON events of its rows and then the OFF events, [2 F, H, W]."""
+    signs = (field.polarity > 0, field.polarity < 0)
+    twice = jax.tree.map(lambda leaf: jnp.concatenate([leaf, leaf]), field)
+    of_sign = jnp.concatenate(signs)
+    return dataclasses.replace(
+        twice, count=jnp.where(of_sign, twice.count, 0), polarity=jnp.where(of_sign, twice.polarity, 0).astype(jnp.int8)
+    )
+
+
+def merged(config: EventsConfig, one: EventField, other: EventField, times: NDArray) -> EventField:
+    """Returns the events of two fields [2 F, H, W] of `by_polarity` in one: nothing tells which field an event is of.
+
+    Counts are added. Where both have events in a row, they are spaced evenly from the first to the last of all, at
+    least a refractory period apart.
+
+    Args:
+        times: [T] seconds of the frames.
+    """
+    count = one.count + other.count
+    fields = (one, other)
+    firsts = [jnp.where(field.count > 0, field.t_first, jnp.inf) for field in fields]
+    lasts = [jnp.where(field.count > 0, field.t_first + (field.count - 1) * field.t_step, 0.0) for field in fields]
+    first, last = jnp.minimum(*firsts), jnp.maximum(*lasts)
+    gaps = jnp.maximum(count - 1, 1)
+    step = jnp.maximum((last - first) / gaps, config.refractory_ns * 1e-9)
+    starts, ends = (jnp.tile(jnp.asarray(t, jnp.float32), 2)[:, None, None] for t in (times[:-1], times[1:]))
+    first = jnp.clip(first, starts, jnp.maximum(ends - MICROSECOND - gaps * step, starts))
+    alone, still = other.count == 0, one.count == 0
+    return dataclasses.replace(
+        one,
+        count=count,
+        polarity=jnp.where(alone, one.polarity, other.polarity),
+        t_first=jnp.where(alone, one.t_first, jnp.where(still, other.t_first, first)),
+        t_step=jnp.where(alone, one.t_step, jnp.where(still, other.t_step, step)),
+    )

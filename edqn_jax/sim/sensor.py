@@ -15,10 +15,11 @@ import numpy as np
 from jax import Array
 
 from edqn_jax.config import CameraConfig, Config
-from edqn_jax.sim import camera, drone, events, raycast
+from edqn_jax.sim import camera, drone, events, exposure, light, raycast
 from edqn_jax.sim.depth import nearest_depth
 from edqn_jax.sim.drone import Flight
 from edqn_jax.sim.events import EventField, EventMemory
+from edqn_jax.sim.exposure import FrameMemory
 from edqn_jax.sim.moves import DIRECTIONS
 from edqn_jax.sim.raycast import Rays
 from edqn_jax.sim.scene import Scene, scene_at
@@ -26,7 +27,7 @@ from edqn_jax.sim.scene import Scene, scene_at
 Sensed = EventField | Array | None
 """What a sensor shows, see `Form`."""
 
-SensorMemory = EventMemory | None
+SensorMemory = EventMemory | FrameMemory | None
 """What a sensor carries from one decision to the next."""
 
 MID_GREY = -1.0
@@ -105,6 +106,8 @@ class Sensor:
     """Times of the T poses that `show` needs, seconds relative to the end of a decision; each is a physics step."""
     draws_frames: bool = False
     """Whether `show` draws a picture at each of these times."""
+    exposes: bool = False
+    """Whether its pictures are taken as `exposure` has it, over the poses up to a frame's time."""
     at_rest: Callable[[Config, Array], SensorMemory] = _no_memory
     """Memory before the first decision, from a key; None where nothing is carried from one decision to the next."""
     image: Image | None = None
@@ -137,7 +140,12 @@ def frame_steps(config: Config) -> tuple[int, ...]:
 
 def frames_per_decision(config: Config) -> int:
     """Returns the number of pictures that are drawn for one decision."""
-    return len(frame_steps(config)) if sensor_of(config).draws_frames else 0
+    if not sensor_of(config).draws_frames:
+        return 0
+    if not (sensor_of(config).exposes and config.exposure.real):
+        return len(frame_steps(config))
+    poses = exposure.steps_touched(config.exposure, config.drone.physics_dt_s) + 1
+    return len(frame_steps(config)) // poses * config.exposure.sub_frames
 
 
 def view(config: Config, scene: Scene, position: Array, quaternion: Array) -> Array:
@@ -173,7 +181,7 @@ def sense(config: Config, scene: Scene, poses: Flight, memory: SensorMemory, key
         scene: one world; each pose sees it as it stands at the pose's time.
         poses: [T, ...] after the physics steps of `frame_steps`, in order.
         memory: from `at_rest` or the decision before.
-        key: consumed only by noise events.
+        key: consumed only by noise.
     """
     return sensor_of(config).show(config, scene, poses, memory, key)
 
@@ -194,8 +202,9 @@ def _show_events(
     config: Config, scene: Scene, poses: Flight, memory: SensorMemory, key: Array
 ) -> tuple[Sensed, SensorMemory]:
     frames = _views(config, scene, poses)
-    assert memory is not None
-    return events.events(config.events, memory, frames, config.events.frame_times_s, key)
+    assert isinstance(memory, EventMemory)
+    options = config.events
+    return events.events(options, memory, frames, options.frame_times_s, key, continuous=options.stream)
 
 
 def _show_event_image(
@@ -209,14 +218,42 @@ def _show_event_image(
 
 
 def _event_memory(config: Config, key: Array) -> SensorMemory:
-    return events.reset_memory(config.events, config.camera.height, config.camera.width, key)
+    lux = None
+    if light.is_on(config.light):
+        key, drawing = jax.random.split(key)
+        lux = light.draw(config.light, drawing)
+    return events.reset_memory(config.events, config.camera.height, config.camera.width, key, lux)
 
 
 def _show_frame(
     config: Config, scene: Scene, poses: Flight, memory: SensorMemory, key: Array
 ) -> tuple[Sensed, SensorMemory]:
+    if config.exposure.real:
+        frames, memory = _exposed(config, scene, poses, memory, key)
+        return brightness(config, frames), memory
     scene, position, quaternion = _last(scene, poses)
     return brightness(config, view(config, scene, position, quaternion))[None], None
+
+
+def _exposed(
+    config: Config, scene: Scene, poses: Flight, memory: SensorMemory, key: Array
+) -> tuple[Array, SensorMemory]:
+    """Returns pictures [T, H, W] that a camera takes, as shares of white, and its memory; see `exposure`.
+
+    Args:
+        poses: [T (K + 1)] up to the times of the frames.
+    """
+    assert isinstance(memory, FrameMemory)
+    options, dt, lux = config.exposure, config.drone.physics_dt_s, memory.lux
+    time, gain = exposure.settings(options, lux, memory.metered)
+    of_frame = exposure.steps_touched(options, dt) + 1
+    windows = jax.tree.map(lambda x: x.reshape(-1, of_frame, *x.shape[1:]), poses)
+    within = jax.vmap(lambda window: exposure.poses_within(window, dt, time, options.sub_frames))(windows)
+    views = _views(config, scene, jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), within))
+    luma = jnp.mean(views.reshape(-1, options.sub_frames, *views.shape[1:]), axis=1)
+    frames = exposure.develop(options, luma, lux, time, gain, key)
+    metered = exposure.metered(options, frames[-1], lux, time, gain)
+    return frames, FrameMemory(lux=lux, metered=metered)
 
 
 def _show_frame_pair(
@@ -227,9 +264,13 @@ def _show_frame_pair(
     That is all that is in the frames, and what moved is as large a number as what stands: in the frames as they are an
     encoder would have to take the small difference of two large numbers.
     """
-    frames = brightness(config, _views(config, scene, poses))
+    if config.exposure.real:
+        frames, memory = _exposed(config, scene, poses, memory, key)
+    else:
+        frames = _views(config, scene, poses)
+    frames = brightness(config, frames)
     change = (frames[-1:] - frames[:-1]) / CHANGE_SCALE
-    return jnp.concatenate([frames[-1:], change]), None
+    return jnp.concatenate([frames[-1:], change]), memory
 
 
 def brightness(config: Config, luma: Array) -> Array:
@@ -338,11 +379,14 @@ SENSORS: dict[str, Sensor] = {
         draws_frames=True,
         at_rest=_event_memory,
     ),
-    # The newest brightness frame of the same camera.
+    # The newest brightness frame of the same camera, perfect or as `exposure` has it.
     "frames": Sensor(
         show=_show_frame,
         form=Form.PICTURE,
+        frame_times_s=lambda config: exposure.pose_times(config, (0.0,)),
         draws_frames=True,
+        exposes=True,
+        at_rest=exposure.at_rest,
         image=Image("log brightness", "log brightness + 1"),
     ),
     # The frames that the events are made of, at the same times.
@@ -350,8 +394,10 @@ SENSORS: dict[str, Sensor] = {
         show=_show_frame_pair,
         form=Form.PICTURE,
         pictures=lambda config: len(_window(config)),
-        frame_times_s=_window,
+        frame_times_s=lambda config: exposure.pose_times(config, _window(config)),
         draws_frames=True,
+        exposes=True,
+        at_rest=exposure.at_rest,
         image=Image("log brightness", "log brightness + 1"),
     ),
     # True depth.

@@ -15,7 +15,16 @@ from hypothesis import strategies as st
 from conventional_stack import task
 from conventional_stack.env import DroneEnv
 from conventional_stack.fleet import Fleet, Record
-from edqn_jax.config import AirConfig, CameraConfig, Config, DroneConfig, EncoderConfig, EnvConfig, EventsConfig
+from edqn_jax.config import (
+    AirConfig,
+    CameraConfig,
+    Config,
+    DroneConfig,
+    EncoderConfig,
+    EnvConfig,
+    EventsConfig,
+    LightConfig,
+)
 from edqn_jax.errors import ConfigError
 from edqn_jax.packages import require
 from edqn_jax.sim import drone, env, events, outcomes
@@ -247,6 +256,8 @@ def test_who_ended_starts_anew_within_the_step():
     [
         {"events": EventsConfig(law="esim")},
         {"events": EventsConfig(shot_rate_hz=1.0)},
+        {"events": EventsConfig(bandwidth_hz=30.0)},
+        {"light": LightConfig(1.0, 100.0)},
         {"events": EventsConfig(frame_times_s=(-0.08, -0.04, 0.0))},
         {"camera": CameraConfig(mount="body")},
         {"encoder": EncoderConfig(retrain_at=(0.5,))},

@@ -66,6 +66,20 @@ def test_the_world_of_a_file_stands_without_a_flag(tmp_path, trainer):
     assert parse_train(["--config", str(file)])[1] == parse_train(["--world", "paper"])[1] == Config()
 
 
+@pytest.mark.parametrize("words", [["--events.profile", "dvs"], ["--events.profile=dvs"]])
+def test_a_flag_names_a_profile_and_other_flags_change_it(words):
+    _, config = parse_train(["--events.shot-rate-hz", "1", "--world", "medium", *words])
+    assert config == make_config("medium", events={"profile": "dvs", "shot_rate_hz": 1.0})
+    assert config.events.bandwidth_hz == 30.0
+    assert parse_train(["--world", "medium", "--events.profile", "ideal"])[1] == make_config("medium")
+
+
+def test_a_stream_of_all_physics_steps_is_what_seq_prints():
+    times = [f"{-0.26 + 0.02 * step:.2f}" for step in range(14)]
+    _, config = parse_train(["--events.law", "esim", "--events.stream", "--events.frame-times-s", *times])
+    assert config.events.stream and len(config.events.frame_times_s) == 14
+
+
 def test_flags_win_over_the_file_and_the_file_over_the_preset(tmp_path):
     file = tmp_path / "options.yaml"
     file.write_text("agent: {batch_size: 256, n_step: 3}\n")

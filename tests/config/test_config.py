@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args, get_type_hints
 
 import pytest
 
-from edqn_jax.config import FAMILIES, PRESETS, Config, preset
+from edqn_jax.config import FAMILIES, PRESETS, Config, EventsConfig, preset
 from edqn_jax.config.limits import validate
 from edqn_jax.config.loading import RANDOM_WORLDS, apply, load_layer, make_config, resolve, to_yaml
+from edqn_jax.config.profiles import PROFILES
 from edqn_jax.errors import ConfigError
 
 
@@ -95,6 +96,33 @@ def test_a_world_that_somebody_drew_is_learnt_along_its_ways_and_the_papers_map_
     file = write(tmp_path, "env: {reward: progress}\n")
     assert resolve(file=file, world="house.xml").env.reward == "progress"
     assert resolve("paper", world="house.xml").env.reward == "sparse"
+
+
+def test_a_profile_is_its_figures_and_what_is_given_beside_it_wins(tmp_path):
+    base = make_config("medium").events
+    noisy = make_config("medium", events={"profile": "dvs"}).events
+    # The figures of v2e's noisy setting: 0.2 +- 0.05, 30 Hz, 0.1 Hz, 5 Hz, 10 ms.
+    assert (noisy.threshold, noisy.tolerance, noisy.contrast_on, noisy.contrast_off) == (0.2,) * 4
+    assert noisy.threshold_mismatch * noisy.threshold == pytest.approx(0.05)
+    assert (noisy.bandwidth_hz, noisy.leak_rate_hz, noisy.shot_rate_hz, noisy.refractory_ns) == (30, 0.1, 5.0, 1e7)
+    assert (noisy.law, noisy.frame_times_s) == (base.law, base.frame_times_s)
+    sensitive = make_config("medium", events={"threshold": 0.05, "profile": "dvs", "shot_rate_hz": 0.0}).events
+    assert (sensitive.threshold, sensitive.tolerance, sensitive.shot_rate_hz) == (0.05, 0.2, 0.0)
+    file = write(tmp_path, "events: {profile: dark, leak_rate_hz: 1.0}\n")
+    dark = resolve(file=file, world="medium").events
+    assert (dark.threshold, dark.bandwidth_hz, dark.leak_rate_hz) == (0.2, 3.0, 1.0)
+    config = make_config("medium", file=file)
+    assert apply(Config(), load_layer(write(tmp_path, to_yaml(config))), "file") == config
+    ideal = make_config("medium", file=file, events={"profile": "ideal"}).events
+    assert (ideal.bandwidth_hz, ideal.leak_rate_hz, ideal.threshold) == (0.0, 0.0, 0.2)
+    assert make_config("medium", events={"profile": "ideal"}).events == base
+
+
+@pytest.mark.parametrize("name", PROFILES)
+def test_every_profile_names_the_same_faults_and_is_valid(name):
+    validate(make_config("medium", events={"profile": name}))
+    assert set(PROFILES["ideal"]) <= set(PROFILES[name])
+    assert get_args(get_type_hints(EventsConfig)["profile"]) == tuple(PROFILES)
 
 
 def test_a_random_world_in_the_file_brings_its_budget_too(tmp_path):
@@ -266,7 +294,15 @@ def test_every_numeric_option_has_limits(group, option, nonsense):
             r"multiples of drone.physics_dt_s \(0.02 s\), not -0.03, 0",
         ),
         ("events", {"frame_times_s": (-0.28, 0.0)}, "within the decision's 0.26 s"),
+        (
+            "events",
+            {"stream": True},
+            "must be times that begin at -0.26, with the decision, where events.stream",
+        ),
         ("camera", {"sky_rgb": (0.5, 0.5, 1.5)}, "camera.sky_rgb must be three shares"),
+        ("light", {"most_lux": 100.0}, "light.least_lux must be between 0.1 and 10000, not 0.0"),
+        ("light", {"least_lux": 1.0, "most_lux": 20_000.0}, "light.most_lux must be between 0.1 and 10000, not 20000"),
+        ("light", {"least_lux": 9.0, "most_lux": 1.0}, r"light.least_lux must be at most light.most_lux \(1\), not 9"),
     ],
 )
 def test_what_cannot_be_run_is_named_with_its_limits(group, options, says):

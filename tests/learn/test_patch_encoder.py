@@ -37,18 +37,19 @@ def shaken(params, key: int = 5):
 
 
 def random_field(seed: int, pairs: int, *, noise: bool = False) -> ev.EventField:
-    """Counts of 0 to 6, either polarity; with noise, as many rows again."""
+    """Counts of 0 to 6, either polarity; with noise, rows of ON events and as many of OFF events."""
     rng = np.random.default_rng(seed)
     shape = (pairs * (2 if noise else 1), SMALL.height, SMALL.width)
     count = rng.poisson(0.7, shape).astype(np.int32)
-    polarity = np.where(count > 0, rng.choice([-1, 1], shape), 0).astype(np.int8)
+    sign = np.repeat([1, -1], pairs)[:, None, None] if noise else rng.choice([-1, 1], shape)
+    polarity = np.where(count > 0, sign, 0).astype(np.int8)
     times = np.zeros(shape, np.float32)
     field = ev.EventField(*map(jnp.asarray, (count, polarity, times, times)), window_s=0.04, with_noise=noise)  # pyright: ignore
     return field
 
 
 def single_events(field: ev.EventField, pairs: int) -> list[patch_encoder_plain.Event]:
-    """All events one by one, in an arbitrary order; rows of noise belong to the frame pairs before them."""
+    """All events one by one, in an arbitrary order; rows of OFF events follow those of ON events."""
     found = []
     for row, y, x in np.argwhere(np.asarray(field.count) > 0):
         event = (int(row) % pairs, int(x), int(y), int(field.polarity[row, y, x]))
@@ -70,9 +71,9 @@ def test_dense_codes_are_those_of_single_events(pairs: int, noise: bool) -> None
         np.testing.assert_allclose(got, expected, rtol=1e-4, atol=1e-4)  # float32 sums of order 1
 
 
-def test_noise_of_the_other_polarity_is_counted_apart() -> None:
+def test_both_polarities_of_a_pixel_are_counted_apart() -> None:
     blank = np.zeros((2, 1, 1), np.int32)
-    blank[:, 0, 0] = 3, 2  # three ON events of the signal, two OFF events of noise
+    blank[:, 0, 0] = 3, 2  # three ON events, two OFF events in the same frame pair
     polarity = np.array([1, -1], np.int8).reshape(2, 1, 1)
     times = jnp.zeros((2, 1, 1))
     field = ev.EventField(jnp.asarray(blank), jnp.asarray(polarity), times, times, 0.04, with_noise=True)

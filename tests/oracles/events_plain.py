@@ -73,3 +73,25 @@ def esim(
                         found.append((moment, x, y, sign))
                         last = moment
     return sorted(found)
+
+
+def merged(one: list[Event], other: list[Event], times: NDArray, refractory_ns: float) -> list[Event]:
+    """Two lists of events as one camera's: a pixel's of a polarity between two frames, evenly from first to last.
+
+    Pixels that have events of one list alone keep them as they are.
+    """
+    groups: dict[tuple[int, int, int, int], tuple[list[float], list[float]]] = {}
+    for which, events in enumerate((one, other)):
+        for moment, x, y, sign in events:
+            pair = int(np.searchsorted(times - times[0], moment, side="right")) - 1
+            groups.setdefault((pair, x, y, sign), ([], []))[which].append(moment)
+    found: list[Event] = []
+    for (pair, x, y, sign), (of_one, of_other) in groups.items():
+        moments = sorted(of_one + of_other)
+        if of_one and of_other:
+            step = max((moments[-1] - moments[0]) / (len(moments) - 1), refractory_ns * 1e-9)
+            start, end = times[pair] - times[0], times[pair + 1] - times[0]
+            first = max(min(moments[0], end - 1e-6 - (len(moments) - 1) * step), start)
+            moments = [first + k * step for k in range(len(moments))]
+        found += [(moment, x, y, sign) for moment in moments]
+    return sorted(found)

@@ -352,7 +352,8 @@ def test_noise_rates_are_the_configured_ones():
     memory = ev.reset_memory(NOISY, size, size, jax.random.key(1))
     still = jnp.full((3, size, size), 0.5)
     field = host(run(NOISY, memory, still)[0])
-    assert field.count.shape == (4, size, size) and not field.count[:2].any()
+    assert field.count.shape == (4, size, size)
+    assert np.all(field.polarity[:2] >= 0) and np.all(field.polarity[2:] <= 0)
     hot = np.asarray(memory.hot)
     assert abs(hot.mean() - 0.1) < 0.01  # 40 000 draws: standard error 0.0015
     count = field.count.sum(0)
@@ -362,9 +363,79 @@ def test_noise_rates_are_the_configured_ones():
     off = (field.count * (field.polarity < 0)).sum(0)[~hot].mean() / (20.0 * 0.04)
     assert abs(off - 1.0) < 0.03
     t = ev.expand(field)["t"]
-    assert t[0] >= 0 and t[-1] <= 40_000
+    assert t[0] >= 0 and t[-1] < 40_000
     # Uniform in time: the mean of n uniform stamps has standard error 0.04 / sqrt(12 n) = 3e-5 s.
     assert abs(t.mean() * 1e-6 - 0.02) < 2e-4
+
+
+BUSY = {"leak_rate_hz": 40.0, "shot_rate_hz": 60.0, "hot_pixel_fraction": 0.3, "hot_pixel_rate_hz": 100.0}
+"""Some events of noise in nearly every pixel, and in most rows that have signal."""
+FIRING = {**LAWS, "airsim": dataclasses.replace(AIRSIM, airsim_tolerance=0.1)}
+"""Laws under which random frames make events."""
+
+
+@partial(jax.jit, static_argnames="config")
+def parts(config, memory, frames):
+    """Signal and noise apart, and what the camera shows; one key."""
+    quiet = dataclasses.replace(config, **dict.fromkeys(BUSY, 0.0))
+    key, times = jax.random.key(KEY), np.array(TIMES)
+    signal, _ = ev.events(quiet, memory, frames, TIMES, key)
+    noise = ev.noise_events(config, memory.hot, signal.count, times - times[0], key)
+    shown, _ = ev.events(config, memory, frames, TIMES, key)
+    return signal, noise, shown
+
+
+@few
+@given(seed=seeds, law=st.sampled_from(list(FIRING)))
+def test_signal_and_noise_are_merged_as_by_the_plain_loop(seed, law):
+    config = dataclasses.replace(FIRING[law], **BUSY)
+    signal, noise, shown = map(host, parts(config, memory_of(config, seed), jnp.asarray(random_frames(seed))))
+    one, other = ([(t * 1e-6, x, y, p) for t, x, y, p in ev.expand(each).tolist()] for each in (signal, noise))
+    plain = events_plain.merged(one, other, np.array(TIMES), config.refractory_ns)
+    assert min(len(one), len(other)) > 5
+    stream = ev.expand(shown)
+    for name, field in (("count", shown.count), ("stream", stream)):
+        assert (field.sum() if name == "count" else len(field)) == len(plain)
+    ours = np.sort(stream, order=["y", "x", "p", "t"])
+    theirs = np.array(sorted((y, x, p, t * 1e6) for t, x, y, p in plain))
+    for column, name in enumerate(("y", "x", "p")):
+        np.testing.assert_array_equal(ours[name], theirs[:, column])
+    # Signal and noise are rounded to a microsecond before they are merged, and what is merged once more.
+    assert np.all(np.abs(ours["t"] - theirs[:, 3]) <= 3)
+
+
+@pytest.mark.parametrize("law", FIRING)
+def test_no_row_tells_noise_from_signal(law):
+    """Which of two fields is the noise cannot be told from both in one, and rows hold polarities, not origins."""
+    config = dataclasses.replace(FIRING[law], **BUSY)
+    signal, noise, shown = parts(config, memory_of(config, 3), jnp.asarray(random_frames(3)))
+    times = np.array(TIMES) - TIMES[0]
+    split = ev.by_polarity(signal)
+    assert np.all(np.asarray(shown.polarity[:2]) >= 0) and np.all(np.asarray(shown.polarity[2:]) <= 0)
+    for half in (slice(0, 2), slice(2, 4)):
+        assert np.any(split.count[half]) and np.any(noise.count[half])
+    exchanged = ev.merged(config, noise, split, times)
+    has = np.asarray(shown.count) > 0
+    for name in ("count", "polarity", "t_first", "t_step"):
+        one, other = (np.asarray(getattr(field, name)) for field in (shown, exchanged))
+        np.testing.assert_allclose(one[has], other[has], rtol=1e-5, atol=1e-9)  # two programs
+    np.testing.assert_array_equal(ev.event_image(shown), ev.event_image(signal) + ev.event_image(noise))
+
+
+@pytest.mark.parametrize("law", ["paper", "airsim", "binding esim"])
+def test_noise_obeys_the_refractory_period_of_its_pixel(law):
+    """A pixel and polarity fires no two events within it, however much noise there is; signal is not replaced."""
+    config = dataclasses.replace(FIRING[law], leak_rate_hz=1000.0, shot_rate_hz=2000.0)
+    rng = np.random.default_rng(1)
+    frames = jnp.asarray(np.exp(rng.uniform(-3.0, 0.0, (3, HEIGHT, WIDTH))).astype(np.float32))
+    signal, _, shown = map(host, parts(config, memory_of(config, 5), frames))
+    limit = ev.max_events(config, 0.02)
+    together = shown.count[:2] + shown.count[2:]
+    assert np.all((together == limit) | (signal.count >= limit)) and np.all(shown.count.sum(0) >= signal.count.sum(0))
+    steps = shown.t_step[shown.count > 1]
+    assert steps.min() >= config.refractory_ns * 1e-9 * (1 - 1e-6)
+    lasts = (shown.t_first + (shown.count - 1) * shown.t_step)[shown.count > 0]
+    assert lasts.max() < 0.04
 
 
 def test_threshold_mismatch_spreads_where_pixels_begin_to_fire():

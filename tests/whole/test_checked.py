@@ -80,6 +80,19 @@ def test_a_sound_run_against_every_disturbance_has_no_fault() -> None:
     assert jnp.isfinite(losses.q_loss[-1]) and state.actors.env.disturbance is not None
 
 
+@pytest.mark.parametrize("sensor", ["events", "frame-pair"])
+def test_a_sound_run_with_a_faulty_sensor_in_any_light_has_no_fault(sensor: str) -> None:
+    light = ("--light.least-lux", "0.1", "--light.most-lux", "10000", "--events.hot-pixel-fraction", "0.1")
+    faults = ("--events.profile", "dvs", "--exposure.real", "--env.sensor", sensor, "--events.law", "esim")
+    trainer = trainer_of((*CHECKED, *light, *faults))
+    state, (_, losses) = trainer.chunk(trainer.init(0), 0)
+    assert jnp.isfinite(losses.reconstruction[-1])
+    memory = state.actors.env.memory
+    assert memory is not None and memory.lux is not None
+    lux = memory.lux
+    assert jnp.all((lux >= 0.1) & (lux <= 10_000)) and jnp.std(jnp.log(lux)) > 1
+
+
 def test_a_number_that_is_none_is_named_with_its_steps(checked: Trainer, learning: TrainState) -> None:
     drone = learning.actors.env.drone
     drone = dataclasses.replace(drone, position=drone.position.at[0, 0, 0].set(jnp.nan))
