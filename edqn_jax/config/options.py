@@ -162,6 +162,9 @@ class EnvConfig:
     """Body centre within this distance of the goal, at any physics step, is success."""
     max_decisions: int = 200
     """Episode limit in decisions (the `threshold` of Table 1)."""
+    drones: int = 1
+    """Drones that fly together in one world, with missions that cross, at most 8; each sees and hits the others. As
+    many environments in a row, and as many missions, are one group (docs/several_drones.md)."""
     action_delay: int = 0
     """Decisions between choosing a move and flying it: 0, or 1, with which the first decision of an episode hovers."""
     heading: Literal["goal", "flight"] = "goal"
@@ -434,7 +437,7 @@ class Config:
 
 
 CONDITIONS: dict[str, tuple[str, ...]] = {
-    "env": ("action_delay",),
+    "env": ("action_delay", "drones"),
     **{
         group: tuple(option.name for option in fields(kind))
         for group, kind in (("air", AirConfig), ("body", BodyConfig), ("motors", MotorsConfig), ("noise", NoiseConfig))

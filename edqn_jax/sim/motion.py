@@ -40,6 +40,25 @@ class Throw:
     pace: Array  # [N] m/s, of the drone that it is thrown at
 
 
+@struct.dataclass
+class Flown:
+    """Where K other drones have flown during one decision of n physics steps, as a table."""
+
+    path: Array  # [K, n + 1, 3] metres, before the first physics step and after each
+    radius: Array  # [K] metres, 0 of a drone that is absent
+    began: Array  # [] seconds of the episode
+    step_s: Array  # [] seconds between two places of the path
+
+
+def flown_to(flown: Flown, time: Array) -> Array:
+    """Returns where these drones are at `time` [] seconds of the decision, straight between two physics steps: [K, 3]."""
+    last = flown.path.shape[1] - 1
+    at = jnp.clip((time - flown.began) / flown.step_s, 0.0, last)
+    before = jnp.minimum(at.astype(jnp.int32), last - 1)
+    begin, end = flown.path[:, before], flown.path[:, before + 1]
+    return begin + (at - before) * (end - begin)
+
+
 OUTSIDE_M = 1.0
 """Metres beyond the flight volume's faces at which a ball appears and is absent again, plus its radius: no drone is
 so near."""

@@ -89,6 +89,11 @@ def _verified(folder: Path, message: Callable[[str], None]) -> list[Finding]:
     runs = [run] if found.seeds is None else [run.of_seed(found.config.train.seed + k) for k in range(found.seeds)]
     policies = [load_run(each.path) for each in runs]
     configs, summaries = [config for config, _ in policies], [_read_summary(each) for each in runs]
+    if group.several(configs[0]):
+        raise ConfigError(
+            f"`edqn verify` is for runs of one drone, and env.drones is {configs[0].env.drones}: C MuJoCo, which judges "
+            "collisions, knows of no other drones"
+        )
     missions = missions_of_runs(configs)
     checkpoint, findings = _last_checkpoint(run)
     if checkpoint is not None:
