@@ -104,7 +104,7 @@ def summarise(flights: Flights, shortest: np.ndarray | None = None, drones: int 
     }
     if flights.hit_drone is not None:
         whole = success.reshape(-1, drones).all(axis=1)
-        hits = int(np.sum(np.asarray(flights.hit_drone) & (outcome == Outcome.COLLISION)))
+        hits = int(np.sum(flights.hit_drone))
         figures |= {"collisions_with_drones": hits, "groups": len(whole), "groups_arrived": int(whole.sum())}
     if shortest is not None:
         known = success & np.isfinite(shortest)

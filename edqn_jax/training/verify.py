@@ -36,6 +36,7 @@ from edqn_jax.runs.policies import load_run
 from edqn_jax.runs.provenance import digest_of, versions, workload
 from edqn_jax.runs.states import Checkpoint
 from edqn_jax.runs.world_copy import WORLD
+from edqn_jax.sim import group
 from edqn_jax.sim.flights import Flights
 from edqn_jax.training.derived import DIGITS, from_metrics, from_trajectory, same
 from edqn_jax.training.keeper import kept_name
