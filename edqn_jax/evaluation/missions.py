@@ -193,7 +193,10 @@ def _before(own: Scene, pool: Scene) -> Scene:
 
 
 def _training_missions(pool: Scene, config: Config, key: jax.Array) -> Missions:
-    """Returns missions between random points, of several drones blocks that cross; to the worlds' own goals where the reward needs distances to them."""
+    """Returns missions between random points, to the worlds' own goals where the reward needs distances to them.
+
+    Of several drones they are blocks that cross.
+    """
     if group.several(config):
         return crossing_missions(pool, config.env.drones, config.world.missions // config.env.drones, key)
     return random_missions(pool, config.world.missions, key, own_goals=config.env.reward == "geodesic")

@@ -47,7 +47,7 @@ def crossing_missions(pool: Scene, drones: int, blocks: int, key: Array) -> Miss
 
 @partial(jax.jit, static_argnames="drones")
 def own_crossings(pool: Scene, drones: int, keys: Array) -> Missions:
-    """Returns one block of N = `drones` missions for each world of the pool [P], from `keys` [P], which are consumed."""
+    """Returns one block of N = `drones` missions for each world of the pool [P], from `keys` [P], consumed."""
     return _in_worlds(pool, drones, jnp.arange(pool.start.shape[0]), keys)
 
 

@@ -15,7 +15,7 @@ from edqn_jax.sim.scene import Scene, scene_at
 
 @struct.dataclass
 class Closest:
-    """Where a flight came closest to a shape of the world, other drones aside, its start and end included. M missions."""
+    """Where a flight came closest to a shape, other drones aside, its start and end included. M missions."""
 
     distance: Array  # [M] metres between the body's sphere and the shape
     time: Array  # [M] seconds since the start

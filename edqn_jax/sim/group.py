@@ -42,8 +42,8 @@ def check_alone(config: Config, caller: str) -> None:
     """
     if several(config):
         raise ConfigError(
-            f"{caller} flies one drone: env.drones must be 1, not {config.env.drones}; `edqn train` and `edqn evaluate` "
-            "fly several"
+            f"{caller} flies one drone: env.drones must be 1, not {config.env.drones}; "
+            "`edqn train` and `edqn evaluate` fly several"
         )
 
 
@@ -82,7 +82,7 @@ def others(config: Config, tree: Any) -> Any:
 
 
 def mission_of_block(config: Config, block: Array) -> Array:
-    """Returns the drone's own mission [] int32 of the block that the group's first drone has drawn, `block` [] int32."""
+    """Returns the drone's own mission [] int32 of the block [] int32 that the group's first drone has drawn."""
     return together(block)[0] * config.env.drones + own_number()
 
 

@@ -92,8 +92,8 @@ def _verified(folder: Path, message: Callable[[str], None]) -> list[Finding]:
     configs, summaries = [config for config, _ in policies], [_read_summary(each) for each in runs]
     if group.several(configs[0]):
         raise ConfigError(
-            f"`edqn verify` is for runs of one drone, and env.drones is {configs[0].env.drones}: C MuJoCo, which judges "
-            "collisions, knows of no other drones"
+            f"`edqn verify` is for runs of one drone, and env.drones is {configs[0].env.drones}: "
+            "C MuJoCo, which judges collisions, knows of no other drones"
         )
     missions = missions_of_runs(configs)
     checkpoint, findings = _last_checkpoint(run)
