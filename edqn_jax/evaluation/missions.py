@@ -140,8 +140,8 @@ def _random_run_missions(config: Config, training_key: jax.Array) -> RunMissions
         test = _before(own, test)
     return RunMissions(
         training=MissionSet(name, World(airframe, training_pool, training)),
-        validation=MissionSet(name, World(airframe, validation, _missions_of(validation, config, "validation"))),
-        final=MissionSet(name, World(airframe, test, _missions_of(test, config, "test"))),
+        validation=MissionSet(name, _flown_in(validation, config, "validation")),
+        final=MissionSet(name, _flown_in(test, config, "test")),
         near_start=np.ones(count, bool),
         tests=count - drones if flown else count,
     )
@@ -152,7 +152,7 @@ def final_missions(config: Config, most: int) -> MissionSet:
 
     Args:
         config: of the run.
-        most: how many missions at most; fewer where the run has fewer.
+        most: how many missions at most; fewer where the run has fewer, and in whole groups, at least one.
 
     Raises:
         ConfigError: as `run_missions`.
@@ -162,17 +162,18 @@ def final_missions(config: Config, most: int) -> MissionSet:
         final = run_missions(config).final
         missions = jax.tree.map(lambda leaf: leaf[:count], final.world.missions)
         return dataclasses.replace(final, world=dataclasses.replace(final.world, missions=missions))
-    if count % config.env.drones:
-        raise ConfigError(f"{count} missions are no whole groups of env.drones ({config.env.drones})")
+    count = max(count // config.env.drones, 1) * config.env.drones
     pool = worlds.random_pool(name, worlds.world_keys("test", count // config.env.drones), Moving.of(config))
     if flown:
         pool, own = with_equal_capacities([pool, _pool_of(flown, config)])
         pool = _before(own, pool)
-    return MissionSet(name, World(drone.load_airframe(config.drone), pool, _missions_of(pool, config, "test")))
+    return MissionSet(name, _flown_in(pool, config, "test"))
 
 
-def _missions_of(pool: Scene, config: Config, split: worlds.Split, first: int = 0) -> Missions:
-    """Returns one mission for each world of the pool, its own, or one block of missions that cross.
+def _flown_in(pool: Scene, config: Config, split: worlds.Split, first: int = 0) -> World:
+    """Returns one mission in each world of the pool, its own, or one block of missions that cross.
+
+    The own mission of a world is then that of its block's first drone.
 
     Args:
         pool: worlds `first`, `first + 1`, ... of the split.
@@ -180,11 +181,13 @@ def _missions_of(pool: Scene, config: Config, split: worlds.Split, first: int = 
         split: of the worlds.
         first: number of the first world.
     """
+    airframe, drones = drone.load_airframe(config.drone), config.env.drones
     if not group.several(config):
-        return own_missions(pool)
+        return World(airframe, pool, own_missions(pool))
     keys = worlds.world_keys(split, pool.start.shape[0], first)
-    keys = jax.vmap(lambda key: jax.random.fold_in(key, _CROSSING))(keys)
-    return own_crossings(pool, config.env.drones, keys)
+    missions = own_crossings(pool, drones, jax.vmap(lambda key: jax.random.fold_in(key, _CROSSING))(keys))
+    pool = dataclasses.replace(pool, start=missions.start[::drones], goal=missions.goal[::drones])
+    return World(airframe, pool, missions)
 
 
 def _before(own: Scene, pool: Scene) -> Scene:
@@ -327,8 +330,7 @@ def _random_missions(config: Config, name: str, missions: int, seed: int, moved:
         for index in range(missions):
             title = f"test world {seed * missions + index} ({name})"
             check_scene(take_scene(pool, index), config.drone.body_radius_m, title=title)
-    flown = _missions_of(pool, config, "test", seed * count)
-    return MissionSet(name, World(drone.load_airframe(config.drone), pool, flown))
+    return MissionSet(name, _flown_in(pool, config, "test", seed * count))
 
 
 def _check_group(config: Config, name: str, missions: int, moved: dict[str, jax.Array]) -> None:
