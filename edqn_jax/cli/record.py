@@ -71,7 +71,7 @@ def _write_events(args: RecordArgs, config: Config, params: PolicyParams, missio
     from edqn_jax.interop.event_files import check_can_write_events, write_events
     from edqn_jax.interop.flight_events import flight_recording
 
-    group.check_alone(config, "the events of a flight: `edqn record FILE`, unless it is a GIF or an MP4,")
+    group.check_alone(config, "`edqn record` of events")
     check_can_write_events(args.file)
     flights = fly_on_all_devices(config, missions.world, params, args.seed, record=True)
     write_events(args.file, flight_recording(config, missions.world, trajectory(config, flights), args.size))

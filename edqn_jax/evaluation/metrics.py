@@ -133,4 +133,5 @@ def flight_summary(flights: Flights, mission: int = 0) -> dict[str, Any]:
         "return": float(flights.episode_return[mission]),
         "min_clearance_m": float(flights.closest.distance[mission]),
         "flight_seconds": float(flights.flight_seconds[mission]),
+        **({} if flights.hit_drone is None else {"hit_drone": bool(flights.hit_drone[mission])}),
     }

@@ -287,7 +287,7 @@ def unseen(summary: dict[str, Any]) -> str:
 def _nearest(summary: dict[str, Any]) -> str:
     """Returns the closest approach as a sentence."""
     if summary["outcome"] == "collision":
-        return "It touched an obstacle or the ground."
+        return f"It touched {'another drone' if summary.get('hit_drone') else 'an obstacle or the ground'}."
     return f"The least clearance was {clearance_text(summary['min_clearance_m'])}."
 
 
