@@ -1,4 +1,4 @@
-"""Evaluation of several drones: which missions they fly, and that their collisions are those of the recorded flights."""
+"""Evaluation of several drones: which missions they fly; their collisions are those of the recorded flights."""
 
 from __future__ import annotations
 
