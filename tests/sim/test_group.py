@@ -117,14 +117,16 @@ def test_drones_that_pass_a_centimetre_apart_do_not_collide_and_a_centimetre_nea
 
 
 def test_a_drone_that_has_ended_is_neither_hit_nor_seen_and_its_group_is_reset_when_all_have_ended():
-    # The second leaves the volume above its start, in the way of the first, long before the first is there.
-    config = configured(2, sensor="depth")
-    world = world_of(((10, 20, 17), (24, 20, 17)), ((18, 20, 17), (40, 20, 17)))
-    states, steps = fly(world, [[HOVER, HOVER], [HOVER, UP], [HOVER, UP], [HOVER, UP]] + [[AHEAD, UP]] * 20, config)
+    # The second arrives in the way of the first, 4 m before it; then the first flies through the place.
+    config = configured(2, sensor="depth", goal_radius_m=0.5)
+    world = world_of(((10, 20, 17), (24, 20, 17)), ((14, 25, 17), (14, 20, 17)))
+    states, steps = fly(world, [[HOVER, AHEAD]] * 7 + [[AHEAD, AHEAD]] * 20, config)
     gone, arrived = first_end(steps, 1), first_end(steps, 0)
-    assert int(steps[gone].outcome[1]) == Outcome.LEFT_VOLUME and int(steps[arrived].outcome[0]) == Outcome.GOAL
+    assert int(steps[gone].outcome[1]) == Outcome.GOAL and int(steps[arrived].outcome[0]) == Outcome.GOAL
+    path = np.concatenate([np.asarray(step.flight.position[0]) for step in steps[gone + 1 : arrived + 1]])
+    assert np.linalg.norm(path - np.asarray(states[gone].drone.position[1]), axis=1).min() < RADIUS
     near = [np.asarray(step.observation.sensed)[0, 0].max() for step in steps[: arrived + 1]]
-    assert max(near[gone:]) < 0.5 < near[1]  # the ground alone, 17 m below; and the other drone at 8 m
+    assert max(near[gone:]) < 0.5 < 1.2 < max(near[:gone])  # the ground alone, 17 m below; and the other drone
     for i in range(gone + 1, arrived + 1):
         assert list(steps[i].waits) == [False, True] and bool(steps[i].is_reset[1]) and bool(states[i].ended[1])
         assert float(steps[i].reward[1]) == 0.0 and int(steps[i].outcome[1]) == Outcome.RUNNING
