@@ -32,8 +32,8 @@ def record_command(args: RecordArgs) -> None:
     check_can_write(args.file)
     config, params = load_run(args.run)
     # Of several drones the whole group is flown, and the first one's flight is shown.
-    own = "" if group.several(config) else config.world.flown
-    world = args.world or own or config.world.name
+    own = config.world.name if group.several(config) else config.world.flown or config.world.name
+    world = args.world or own
     missions = load_missions(config, world, config.env.drones, args.seed, args.start, args.goal)
     write = _write_video if args.file.suffix.lower() in VIDEO else _write_events
     outcome, seconds = write(args, config, params, missions)
