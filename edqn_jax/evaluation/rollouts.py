@@ -198,7 +198,7 @@ def _fly(
 def _at_start(config: Config, world: World, state: EnvState) -> Flights:
     """Returns the tallies of one flight before its first step."""
     flights = at_start(config, env.scene_of(world, state.mission), state.drone)
-    return flights.replace(hit_drone=jnp.zeros((), bool)) if group.several(config) else flights
+    return dataclasses.replace(flights, hit_drone=jnp.zeros((), bool)) if group.several(config) else flights
 
 
 def _tally(config: Config, world: World, flights: Flights, before: EnvState, step: Step) -> tuple[Flights, Array]:

@@ -348,7 +348,7 @@ def _keep(config: Config, world: World, actors: Actors, flown: EnvState, seen: e
     rows = samples.samples_of(config.encoder, seen.observation, wanted, begins)
     if seen.waits is not None:
         mate = group.mates(config, seen.waits)
-        rows = jax.tree.map(lambda x: x[mate], rows).replace(begins=begins)
+        rows = dataclasses.replace(jax.tree.map(lambda x: x[mate], rows), begins=begins)
     write = jax.vmap(samples.write, in_axes=(0, 0, None, None))
     return write(actors.samples, _shaped(actors.reward.shape, rows), plan.samples_kept(config, step), keep)
 

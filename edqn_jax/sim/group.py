@@ -140,7 +140,8 @@ def collide(
     """
     ends = (outcome != Outcome.RUNNING) & (outcome != Outcome.TIME_OUT)
     until = jnp.where(ends, end_step - 1 + contact, jnp.inf)
-    hit = encounters(*together((path, flies, until)), 2 * config.drone.body_radius_m)[own_number()]
+    paths, fly, untils = together((path, flies, until))
+    hit = encounters(paths, fly, untils, 2 * config.drone.body_radius_m)[own_number()]
     hits = jnp.isfinite(hit)
     step = jnp.clip(jnp.ceil(jnp.where(hits, hit, 1.0)), 1, path.shape[0] - 1).astype(jnp.int32)
     return (

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -80,12 +81,13 @@ def test_the_others_are_in_a_flights_pictures_where_they_were_and_only_while_the
     mission, steps, dt = DRONES + 1, evaluation.flights.physics_steps, config.drone.physics_dt_s
     before = scene_of_flight(config, evaluation.missions)
     scene = scene_of_flight(config, evaluation.missions, evaluation.flights, mission)
+    assert before.drones is not None and scene.drones is not None
     assert [np.shape(x) for x in before.drones.path] == [np.shape(x) for x in scene.drones.path]
     assert (before.drones.path == PARKED).all()
     assert np.array_equal(scene.goal, evaluation.missions.world.missions.goal[mission])
     others = [DRONES, DRONES + 2, DRONES + 3]
     for step in (0, 1, int(min(steps[others])), int(max(steps[others])) + 3):
-        seen = np.asarray(scene_at(scene, np.float32(step * dt)).spheres.position)[-3:]
+        seen = np.asarray(scene_at(scene, jnp.float32(step * dt)).spheres.position)[-3:]
         for place, other in zip(seen, others, strict=True):
             assert (
                 np.allclose(place, paths[other, step], atol=1e-5) if step <= steps[other] else (place == PARKED).all()

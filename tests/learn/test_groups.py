@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -48,7 +49,8 @@ def configured(**groups) -> Config:
         },
         "train": {"num_envs": 16, "shards": 2, "chunk_steps": 4, "total_steps": 16 * STEPS, "validation_missions": 8},
     }
-    return make_config("dense", **{name: {**small.get(name, {}), **groups.get(name, {})} for name in {*small, *groups}})
+    both: Any = {name: {**small.get(name, {}), **groups.get(name, {})} for name in {*small, *groups}}
+    return make_config("dense", **both)
 
 
 @pytest.fixture(scope="module")

@@ -25,7 +25,8 @@ def blocks_of(family: str, drones: int) -> tuple[Scene, np.ndarray, np.ndarray]:
     pool = random_pool(family, world_keys("validation", WORLDS), Moving())
     missions = own_crossings(pool, drones, jax.random.split(jax.random.key(5), WORLDS))
     assert np.array_equal(missions.scene, np.repeat(np.arange(WORLDS), drones))
-    return pool, *(np.asarray(ends).reshape(WORLDS, drones, 3) for ends in (missions.start, missions.goal))
+    start, goal = (np.asarray(ends).reshape(WORLDS, drones, 3) for ends in (missions.start, missions.goal))
+    return pool, start, goal
 
 
 def clearance(pool: Scene, points: np.ndarray) -> np.ndarray:
