@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from edqn_jax.config import Config
@@ -43,11 +44,10 @@ def scene_of_flight(config: Config, missions: MissionSet, flights: Flights | Non
         flown = np.asarray(flights.record.position)[others]
         path[:, 1:] = np.where(np.isnan(flown), PARKED, flown)
     table = Flown(
-        path=path,
-        radius=np.full(count - 1, config.drone.body_radius_m, np.float32),
-        began=np.float32(0.0),
-        step_s=np.float32(config.drone.physics_dt_s),
+        path=jnp.asarray(path),
+        radius=jnp.full(count - 1, config.drone.body_radius_m),
+        began=jnp.zeros(()),
+        step_s=jnp.float32(config.drone.physics_dt_s),
     )
-    return dataclasses.replace(
-        scene, start=np.asarray(ends.start[mission]), goal=np.asarray(ends.goal[mission]), drones=table
-    )
+    own = {name: np.asarray(getattr(ends, name)[mission]) for name in ("start", "goal")}
+    return dataclasses.replace(scene, **own, drones=jax.tree.map(np.asarray, table))

@@ -346,7 +346,8 @@ def _keep(config: Config, world: World, actors: Actors, flown: EnvState, seen: e
     wanted = lax.cond(keep, target, lambda: nothing)
     begins = seen.is_reset | plan.begins_to_keep(config, step)
     rows = samples.samples_of(config.encoder, seen.observation, wanted, begins)
-    if seen.waits is not None:
+    if group.several(config):
+        assert seen.waits is not None
         mate = group.mates(config, seen.waits)
         rows = dataclasses.replace(jax.tree.map(lambda x: x[mate], rows), begins=begins)
     write = jax.vmap(samples.write, in_axes=(0, 0, None, None))
