@@ -66,7 +66,7 @@ def summarise(flights: Flights, shortest: np.ndarray | None = None, drones: int 
         flights: M flights.
         shortest: [M] lengths of the shortest paths, metres, NaN where unknown; without them `spl` and
             `path_over_shortest` are None.
-        drones: in a group; flights of a group are in a row.
+        drones: in a group; flights of a group are in a row. 1 leaves out the figures of groups.
 
     Returns:
         The content of `edqn evaluate --json` without world, seed and latency. `spl` and the mean `return` are
@@ -103,9 +103,10 @@ def summarise(flights: Flights, shortest: np.ndarray | None = None, drones: int 
         "min_clearance_m": float(np.min(flights.closest.distance[success])) if success.any() else None,
     }
     if flights.hit_drone is not None:
+        figures["collisions_with_drones"] = int(np.sum(flights.hit_drone))
+    if drones > 1:
         whole = success.reshape(-1, drones).all(axis=1)
-        hits = int(np.sum(flights.hit_drone))
-        figures |= {"collisions_with_drones": hits, "groups": len(whole), "groups_arrived": int(whole.sum())}
+        figures |= {"groups": len(whole), "groups_arrived": int(whole.sum())}
     if shortest is not None:
         known = success & np.isfinite(shortest)
         figures["spl"] = spl(success, flown, known_lengths(shortest, flown))
