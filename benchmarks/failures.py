@@ -27,7 +27,7 @@ from edqn_jax.evaluation.rollouts import fly_on_all_devices
 from edqn_jax.parallel.devices import use_cpu_devices
 from edqn_jax.runs.files import check_can_write
 from edqn_jax.runs.policies import load_run
-from edqn_jax.sim import camera, sensor
+from edqn_jax.sim import camera, group, sensor
 from edqn_jax.sim.distance import shape_distances, signed_distance
 from edqn_jax.sim.drone import Flight, yaw_of
 from edqn_jax.sim.events import EventField
@@ -210,6 +210,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             check_can_write(args.json)
         use_cpu_devices()
         config, params = load_run(args.run)
+        group.check_alone(config, "this benchmark")
         missions = load_missions(config, args.world or config.world.name, args.missions, args.seed)
     except ConfigError as error:
         print(error, file=sys.stderr)

@@ -34,7 +34,7 @@ from edqn_jax.learn import policy as acting
 from edqn_jax.learn.policy import Policy, fresh_policy
 from edqn_jax.runs.files import check_can_write
 from edqn_jax.runs.policies import load_policy
-from edqn_jax.sim import env
+from edqn_jax.sim import env, group
 from edqn_jax.sim.events import EventField
 from edqn_jax.sim.outcomes import Outcome
 from edqn_jax.sim.sensor import frames_per_decision
@@ -162,6 +162,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         policy = load_policy(args.policy)
         if policy.config.env.sensor != "events":
             raise ConfigError(f"'{args.policy}' sees {policy.config.env.sensor}; --policy must be one that sees events")
+        group.check_alone(policy.config, "this benchmark")
         courses = [load_missions(policy.config, world, args.missions) for world in args.worlds]
     except ConfigError as error:
         print(error, file=sys.stderr)

@@ -98,7 +98,7 @@ def config_of(world: str, sensor: str, flags: Sequence[str]) -> Config:
     """
     config = judged_in_tests(parse_train(["--world", world, "--env.sensor", sensor, *flags])[1])
     # What is flown at the end is what was learnt at the end: no choice by validation, no time for it.
-    train = dataclasses.replace(config.train, validation_every=0, validation_missions=1, keep="last")
+    train = dataclasses.replace(config.train, validation_every=0, validation_missions=config.env.drones, keep="last")
     return dataclasses.replace(config, train=train)
 
 

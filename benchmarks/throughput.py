@@ -72,6 +72,8 @@ def parse(argv: Sequence[str] | None = None) -> tuple[argparse.Namespace, Config
     config = configured(flags)
     if config.env.sensor != "events" and not args.whole_only:
         raise ConfigError(f"parts can be timed only for env.sensor events; {config.env.sensor} needs --whole-only")
+    if config.env.drones > 1 and not args.whole_only:
+        raise ConfigError("parts can be timed only for drones that fly alone; env.drones above 1 needs --whole-only")
     return args, steady(config, 8 if args.quick else config.train.chunk_steps)
 
 

@@ -27,6 +27,7 @@ from edqn_jax.evaluation.verdicts import CONTACT_TOLERANCE_M, Agreement, check_v
 from edqn_jax.parallel.devices import use_cpu_devices
 from edqn_jax.runs.files import check_can_write, write_atomically
 from edqn_jax.runs.policies import load_run
+from edqn_jax.sim import group
 from edqn_jax.sim.outcomes import Outcome
 
 
@@ -81,6 +82,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             check_can_write(args.json)
         use_cpu_devices()
         config, params = load_run(args.run)
+        group.check_alone(config, "this benchmark")
         course = load_missions(config, args.world or config.world.name, args.missions, args.seed)
     except ConfigError as error:
         print(error, file=sys.stderr)

@@ -108,6 +108,8 @@ def check(config: Config) -> None:
         raise ConfigError(
             "the conventional stack supports only rewards of straight metres; set env.reward to 'progress'"
         )
+    if config.env.drones > 1:
+        raise ConfigError("the conventional stack supports only drones that fly alone; set env.drones to 1")
     if disturbances.any_on(config):
         raise ConfigError(
             "the conventional stack supports only undisturbed flights; leave air, body, motors, noise and "

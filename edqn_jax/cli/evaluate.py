@@ -92,6 +92,11 @@ def report(figures: dict[str, Any]) -> Table:
     table.add_row("95 % Wilson interval", f"{low:.1%} – {high:.1%}")
     for name in ("collisions", "left_volume", "timeouts", "diverged"):
         table.add_row(name.replace("_", " "), str(figures[name]))
+        if name == "collisions" and "groups" in figures:
+            table.add_row("– with another drone", str(figures["collisions_with_drones"]))
+            table.add_row("– with the world", str(figures["collisions"] - figures["collisions_with_drones"]))
+    if "groups" in figures:
+        table.add_row("groups of which all arrived", f"{figures['groups_arrived']} of {figures['groups']}")
     table.add_row("SPL", number(figures["spl"], "{:.3f}"))
     table.add_section()
     table.add_row("flights that reached the goal", "", style="bold")

@@ -5,12 +5,11 @@ from __future__ import annotations
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
-import jax
-import numpy as np
 from rich.console import Console
 
 from edqn_jax.cli.arguments import VIDEO, RecordArgs
 from edqn_jax.config import Config
+from edqn_jax.evaluation.companions import scene_of_flight
 from edqn_jax.evaluation.missions import MissionSet, load_missions
 from edqn_jax.evaluation.rollouts import fly_on_all_devices
 from edqn_jax.evaluation.trajectories import trajectory
@@ -18,6 +17,7 @@ from edqn_jax.learn.policy import PolicyParams
 from edqn_jax.report.style import OUTCOME_LABELS
 from edqn_jax.runs.files import check_can_write, write_atomically
 from edqn_jax.runs.policies import load_run, worlds_replaced
+from edqn_jax.sim import group
 from edqn_jax.sim.flights import Flights
 from edqn_jax.sim.outcomes import Outcome
 
@@ -31,8 +31,10 @@ def record_command(args: RecordArgs) -> None:
     """
     check_can_write(args.file)
     config, params = load_run(args.run)
-    world = args.world or config.world.flown or config.world.name
-    missions = load_missions(config, world, 1, args.seed, args.start, args.goal)
+    # Of several drones the whole group is flown, and the first one's flight is shown.
+    own = config.world.name if group.several(config) else config.world.flown or config.world.name
+    world = args.world or own
+    missions = load_missions(config, world, config.env.drones, args.seed, args.start, args.goal)
     write = _write_video if args.file.suffix.lower() in VIDEO else _write_events
     outcome, seconds = write(args, config, params, missions)
     notes = [] if args.world is not None else worlds_replaced(args.run)
@@ -51,10 +53,11 @@ def _write_video(args: RecordArgs, config: Config, params: PolicyParams, mission
     from edqn_jax.report.animation import animate
     from edqn_jax.report.sights import Sights
 
-    scene = jax.tree.map(np.asarray, missions.scene())
+    scene = scene_of_flight(config, missions)
     with ThreadPoolExecutor(2, thread_name_prefix="compiling") as pool:
         sights = Sights(config, scene, pool)
         flights = fly_on_all_devices(config, missions.world, params, args.seed, record=True)
+        sights = sights.in_world(scene_of_flight(config, missions, flights))
         outcome, seconds = _ending(flights)
         name = missions.name if missions.file is None else Path(missions.name).stem
         flown = trajectory(config, flights)
@@ -68,6 +71,7 @@ def _write_events(args: RecordArgs, config: Config, params: PolicyParams, missio
     from edqn_jax.interop.event_files import check_can_write_events, write_events
     from edqn_jax.interop.flight_events import flight_recording
 
+    group.check_alone(config, "`edqn record` of events")
     check_can_write_events(args.file)
     flights = fly_on_all_devices(config, missions.world, params, args.seed, record=True)
     write_events(args.file, flight_recording(config, missions.world, trajectory(config, flights), args.size))

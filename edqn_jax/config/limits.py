@@ -27,8 +27,12 @@ from edqn_jax.config.options import (
 from edqn_jax.errors import ConfigError
 
 
-def validate(config: Config) -> None:
+def validate(config: Config, *, trains: bool = True) -> None:
     """Raises ConfigError if the configuration is invalid.
+
+    Args:
+        config: all options.
+        trains: whether it must be one that a policy can be trained with, not only flown.
 
     Raises:
         ConfigError: names the first option that is out of its limits, and the limits.
@@ -47,6 +51,8 @@ def validate(config: Config) -> None:
     _encoder(config.encoder)
     _agent(config.agent)
     _train(config.train)
+    if config.env.drones > 1:
+        _several_drones(config, trains)
     _replay(config.agent, config.train)
     _samples(config.encoder, config.train)
     judged = not config.world.flown or config.train.validation_missions >= 2
@@ -137,6 +143,28 @@ def _env(env: EnvConfig) -> None:
     _require(known, "env.position", "false with env.heading flight", env.position)
     _finite(env, "env", ["goal_reward", "collision_reward", "left_volume_reward", "step_reward"])
     _require(env.action_delay in (0, 1), "env.action_delay", "0 or 1", env.action_delay)
+    _require(1 <= env.drones <= 8, "env.drones", "from 1 to 8", env.drones)
+
+
+def _several_drones(config: Config, trains: bool) -> None:
+    env, train, drones = config.env, config.train, f"with env.drones {config.env.drones}"
+    _require(not config.world.balls, "world.balls", f"0 {drones}: balls are thrown at one drone", config.world.balls)
+    if not trains:
+        return
+    name = config.world.name
+    _require(name in FAMILIES, "world.name", f"a random world ({', '.join(FAMILIES)}) {drones}", f"'{name}'")
+    _require(env.reward != "geodesic", "env.reward", f"sparse, progress or potential {drones}", env.reward)
+    _require(not train.debug, "train.debug", f"false {drones}", train.debug)
+    # A group never spans two shards, so no device has a part of one.
+    for option, value, unit in (
+        ("train.num_envs", train.num_envs, env.drones * train.shards),
+        ("train.validation_missions", train.validation_missions, env.drones),
+        ("world.missions", config.world.missions, env.drones),
+    ):
+        _require(value % unit == 0, option, f"a multiple of {unit} {drones}", value)
+    if config.world.flown:
+        least, count = 2 * env.drones, train.validation_missions
+        _require(count >= least, "train.validation_missions", f"at least {least} {drones} and world.flown", count)
 
 
 def _air(air: AirConfig) -> None:

@@ -173,6 +173,9 @@ class EnvConfig:
     """Body centre within this distance of the goal, at any physics step, is success."""
     max_decisions: int = 200
     """Episode limit in decisions (the `threshold` of Table 1)."""
+    drones: int = 1
+    """Drones that fly together in one world, with missions that cross, at most 8; each sees and hits the others. As
+    many environments in a row, and as many missions, are one group (docs/several_drones.md)."""
     action_delay: int = 0
     """Decisions between choosing a move and flying it: 0, or 1, with which the first decision of an episode hovers."""
     heading: Literal["goal", "flight"] = "goal"
@@ -482,7 +485,7 @@ class Config:
 
 
 CONDITIONS: dict[str, tuple[str, ...]] = {
-    "env": ("action_delay",),
+    "env": ("action_delay", "drones"),
     "events": (
         *("profile", "threshold", "tolerance", "contrast_on", "contrast_off", "refractory_ns", "bandwidth_hz"),
         *("threshold_mismatch", "leak_rate_hz", "shot_rate_hz", "hot_pixel_fraction", "hot_pixel_rate_hz"),

@@ -71,12 +71,13 @@ def evaluate(
         world: `paper`, the name of random worlds (`config.FAMILIES`) or an MJCF file; None is where it was
             trained, of random worlds the test worlds.
         missions: how many. One in a world from a file goes from its start to its goal, more begin at random free
-            points; in random worlds each has a test world of its own, which training never uses.
+            points; in random worlds each has a test world of its own, which training never uses; of several drones
+            (`env.drones`) each group has one.
         seed: which missions.
         start, goal: of every mission, metres, in place of the world's.
         record: keep every pose.
         shuffle_codes: give each drone the observation of another one's sensor at each decision.
-        conditions: wind and other disturbances in place of the policy's own, by group, such as
+        conditions: wind and other disturbances, and drones, in place of the policy's own, by group, such as
             `{"air": {"gusts_m_s": 5.0}}`; see `config.CONDITIONS`.
 
     Raises:
@@ -89,7 +90,7 @@ def evaluate(
     flown = load_missions(config, str(world or config.world.name), missions, seed, start, goal)
     flights = fly_on_all_devices(config, flown.world, policy.params, seed, record=record, shuffle_codes=shuffle_codes)
     shortest = shortest_paths(config, flown.world, np.asarray(flights.outcome) == Outcome.GOAL)
-    return Evaluation(flown, flights, summarise(flights, shortest))
+    return Evaluation(flown, flights, summarise(flights, shortest, config.env.drones))
 
 
 def _check_can_shuffle(policy: Policy, missions: int) -> None:

@@ -59,18 +59,21 @@ def shortest_paths(config: Config, world: World, wanted: np.ndarray) -> np.ndarr
     return lengths
 
 
-def summarise(flights: Flights, shortest: np.ndarray | None = None) -> dict[str, Any]:
+def summarise(flights: Flights, shortest: np.ndarray | None = None, drones: int = 1) -> dict[str, Any]:
     """Returns the metrics of a set of flights.
 
     Args:
         flights: M flights.
         shortest: [M] lengths of the shortest paths, metres, NaN where unknown; without them `spl` and
             `path_over_shortest` are None.
+        drones: in a group; flights of a group are in a row. 1 leaves out the figures of groups.
 
     Returns:
         The content of `edqn evaluate --json` without world, seed and latency. `spl` and the mean `return` are
         over all flights; the means of path, decisions and seconds, and the least clearance, over successes
-        only (None if there is none). A flight ends at the goal's radius, the shortest path at the goal.
+        only (None if there is none). A flight ends at the goal's radius, the shortest path at the goal. Of several
+        drones also the collisions with a drone, of which each counts for both, the groups, and those of which all
+        arrived; the interval then takes drones for independent, which those of a group are not.
     """
     outcome = np.asarray(flights.outcome)
     counts = {kind: int(np.sum(outcome == kind)) for kind in Outcome}
@@ -99,6 +102,11 @@ def summarise(flights: Flights, shortest: np.ndarray | None = None) -> dict[str,
         "return": mean(flights.episode_return, np.ones_like(success)),
         "min_clearance_m": float(np.min(flights.closest.distance[success])) if success.any() else None,
     }
+    if flights.hit_drone is not None:
+        figures["collisions_with_drones"] = int(np.sum(flights.hit_drone))
+    if drones > 1:
+        whole = success.reshape(-1, drones).all(axis=1)
+        figures |= {"groups": len(whole), "groups_arrived": int(whole.sum())}
     if shortest is not None:
         known = success & np.isfinite(shortest)
         figures["spl"] = spl(success, flown, known_lengths(shortest, flown))
@@ -126,4 +134,5 @@ def flight_summary(flights: Flights, mission: int = 0) -> dict[str, Any]:
         "return": float(flights.episode_return[mission]),
         "min_clearance_m": float(flights.closest.distance[mission]),
         "flight_seconds": float(flights.flight_seconds[mission]),
+        **({} if flights.hit_drone is None else {"hit_drone": bool(flights.hit_drone[mission])}),
     }

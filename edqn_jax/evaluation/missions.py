@@ -16,7 +16,8 @@ from edqn_jax.planners.astar import shortest_path
 from edqn_jax.planners.free_space import holds, reachable
 from edqn_jax.planners.lattice import CELL_M, lattice_shape
 from edqn_jax.random import run_streams
-from edqn_jax.sim import drone, worlds
+from edqn_jax.sim import drone, group, worlds
+from edqn_jax.sim.crossing import crossing_missions, own_crossings
 from edqn_jax.sim.env import World, scene_of
 from edqn_jax.sim.free_points import Cells, cells_of, free_point
 from edqn_jax.sim.missions import Missions, own_missions, random_missions, spread_missions
@@ -29,6 +30,10 @@ Point = tuple[float, float, float]
 
 _MISSION_SEED = 7_919
 """Root of the keys of evaluation missions in worlds from files; training derives its keys from other roots."""
+
+
+_CROSSING = 9_000_011
+"""Folded into the key of a world to draw the missions of several drones in it."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -117,27 +122,28 @@ def missions_of_runs(configs: Sequence[Config], reward: Reward | None = None) ->
 
 
 def _random_run_missions(config: Config, training_key: jax.Array) -> RunMissions:
-    """Returns missions of random worlds; every validation and final mission has a world of its own.
+    """Returns missions of random worlds; every validation and final mission, or block of them, has a world of its own.
 
-    Where `world.flown` names a world, the first final mission is that world's own.
+    Where `world.flown` names a world, the first final mission, or block of them, is in that world.
     """
     name, flown, count = config.world.name, config.world.flown, config.train.validation_missions
+    drones = config.env.drones
     airframe = drone.load_airframe(config.drone)
     moving = Moving.of(config)
     training_pool = worlds.random_pool(name, worlds.world_keys("training", config.world.pool_size), moving)
     training = _training_missions(training_pool, config, training_key)
     validation, test = (
-        worlds.random_pool(name, worlds.world_keys(split, count), moving) for split in ("validation", "test")
+        worlds.random_pool(name, worlds.world_keys(split, count // drones), moving) for split in ("validation", "test")
     )
     if flown:
         validation, test, own = with_equal_capacities([validation, test, _pool_of(flown, config)])
         test = _before(own, test)
     return RunMissions(
         training=MissionSet(name, World(airframe, training_pool, training)),
-        validation=MissionSet(name, World(airframe, validation, own_missions(validation))),
-        final=MissionSet(name, World(airframe, test, own_missions(test))),
+        validation=MissionSet(name, _flown_in(validation, config, "validation")),
+        final=MissionSet(name, _flown_in(test, config, "test")),
         near_start=np.ones(count, bool),
-        tests=count - 1 if flown else count,
+        tests=count - drones if flown else count,
     )
 
 
@@ -146,7 +152,7 @@ def final_missions(config: Config, most: int) -> MissionSet:
 
     Args:
         config: of the run.
-        most: how many missions at most; fewer where the run has fewer.
+        most: how many missions at most; fewer where the run has fewer, and in whole groups, at least one.
 
     Raises:
         ConfigError: as `run_missions`.
@@ -156,11 +162,32 @@ def final_missions(config: Config, most: int) -> MissionSet:
         final = run_missions(config).final
         missions = jax.tree.map(lambda leaf: leaf[:count], final.world.missions)
         return dataclasses.replace(final, world=dataclasses.replace(final.world, missions=missions))
-    pool = worlds.random_pool(name, worlds.world_keys("test", count), Moving.of(config))
+    count = max(count // config.env.drones, 1) * config.env.drones
+    pool = worlds.random_pool(name, worlds.world_keys("test", count // config.env.drones), Moving.of(config))
     if flown:
         pool, own = with_equal_capacities([pool, _pool_of(flown, config)])
         pool = _before(own, pool)
-    return MissionSet(name, World(drone.load_airframe(config.drone), pool, own_missions(pool)))
+    return MissionSet(name, _flown_in(pool, config, "test"))
+
+
+def _flown_in(pool: Scene, config: Config, split: worlds.Split, first: int = 0) -> World:
+    """Returns one mission in each world of the pool, its own, or one block of missions that cross.
+
+    The own mission of a world is then that of its block's first drone.
+
+    Args:
+        pool: worlds `first`, `first + 1`, ... of the split.
+        config: says how many drones fly together.
+        split: of the worlds.
+        first: number of the first world.
+    """
+    airframe, drones = drone.load_airframe(config.drone), config.env.drones
+    if not group.several(config):
+        return World(airframe, pool, own_missions(pool))
+    keys = worlds.world_keys(split, pool.start.shape[0], first)
+    missions = own_crossings(pool, drones, jax.vmap(lambda key: jax.random.fold_in(key, _CROSSING))(keys))
+    pool = dataclasses.replace(pool, start=missions.start[::drones], goal=missions.goal[::drones])
+    return World(airframe, pool, missions)
 
 
 def _before(own: Scene, pool: Scene) -> Scene:
@@ -169,7 +196,12 @@ def _before(own: Scene, pool: Scene) -> Scene:
 
 
 def _training_missions(pool: Scene, config: Config, key: jax.Array) -> Missions:
-    """Returns missions between random points; to the worlds' own goals where the reward needs distances to them."""
+    """Returns missions between random points, to the worlds' own goals where the reward needs distances to them.
+
+    Of several drones they are blocks that cross.
+    """
+    if group.several(config):
+        return crossing_missions(pool, config.env.drones, config.world.missions // config.env.drones, key)
     return random_missions(pool, config.world.missions, key, own_goals=config.env.reward == "geodesic")
 
 
@@ -277,6 +309,8 @@ def load_missions(
         if point is not None and not np.all(np.isfinite(point)):
             raise ConfigError(f"--{role} must be three finite numbers, metres, not {' '.join(f'{x:g}' for x in point)}")
     moved = {k: jnp.asarray(v, jnp.float32) for k, v in (("start", start), ("goal", goal)) if v is not None}
+    if group.several(config):
+        _check_group(config, name, missions, moved)
     if name in FAMILIES:
         return _random_missions(config, name, missions, seed, moved)
     if missions > 1 and start is not None:
@@ -287,15 +321,31 @@ def load_missions(
 
 
 def _random_missions(config: Config, name: str, missions: int, seed: int, moved: dict[str, jax.Array]) -> MissionSet:
-    """Returns one mission in each of `missions` test worlds."""
-    pool = worlds.random_pool(name, worlds.world_keys("test", missions, first=seed * missions), Moving.of(config))
+    """Returns one mission in each of `missions` test worlds, of N drones one block in each of `missions` / N."""
+    count = missions // config.env.drones
+    pool = worlds.random_pool(name, worlds.world_keys("test", count, first=seed * count), Moving.of(config))
     if moved:
         many = {key: jnp.broadcast_to(value, (missions, 3)) for key, value in moved.items()}
         pool = dataclasses.replace(pool, **many)
         for index in range(missions):
             title = f"test world {seed * missions + index} ({name})"
             check_scene(take_scene(pool, index), config.drone.body_radius_m, title=title)
-    return MissionSet(name, World(drone.load_airframe(config.drone), pool, own_missions(pool)))
+    return MissionSet(name, _flown_in(pool, config, "test", seed * count))
+
+
+def _check_group(config: Config, name: str, missions: int, moved: dict[str, jax.Array]) -> None:
+    """Refuses what several drones cannot fly.
+
+    Raises:
+        ConfigError: says what they can.
+    """
+    drones = config.env.drones
+    if name not in FAMILIES:
+        raise ConfigError(f"env.drones {drones} needs a random world ({', '.join(FAMILIES)}), not '{name}'")
+    if missions % drones:
+        raise ConfigError(f"--missions must be a multiple of env.drones ({drones}), not {missions}")
+    if moved:
+        raise ConfigError(f"--{' and --'.join(moved)} cannot be given with env.drones {drones}: their missions cross")
 
 
 def mission_key(seed: int) -> jax.Array:

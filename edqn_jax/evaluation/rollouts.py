@@ -18,7 +18,7 @@ from edqn_jax.learn import policy
 from edqn_jax.learn.policy import Memory, PolicyParams
 from edqn_jax.parallel.devices import compiler_options
 from edqn_jax.random import run_streams
-from edqn_jax.sim import env
+from edqn_jax.sim import env, group
 from edqn_jax.sim.env import EnvState, Observation, Step, World
 from edqn_jax.sim.flights import Flights, Record, at_start, tally
 from edqn_jax.sim.outcomes import Outcome
@@ -50,7 +50,7 @@ def fly_missions(
     """Flies each of the world's M missions once, greedily.
 
     Environment i flies mission i; the program ends with the last flight. Environments whose flight has ended
-    fly it again, which is not counted.
+    fly it again, which is not counted, those of a group when all have ended. M is a multiple of `env.drones`.
 
     Compiles once for each configuration, choice of flags, mesh, and shapes and layout of the arrays.
 
@@ -127,8 +127,9 @@ def _fly_all(
     missions = world.missions.scene.shape[0]
     devices = 1 if mesh is None else mesh.size
     reset_keys, loop_key = flight_keys(key, missions)
-    # Every device flies equally many missions; the first ones are repeated to fill up.
-    number = jnp.arange(-(-missions // devices) * devices) % missions
+    # Every device flies equally many missions, whole groups; the first ones are repeated to fill up.
+    unit = devices * config.env.drones
+    number = jnp.arange(-(-missions // unit) * unit) % missions
     if shuffle_codes and number.shape[0] // devices < 2:
         raise ValueError("shuffling codes needs at least two missions on each device")
     keys = reset_keys[number]
@@ -164,7 +165,7 @@ def _fly(
             seen = dataclasses.replace(seen, sensed=sensed)
         act = partial(policy.act, config, params, key=act_key)  # greedy: the key has no effect
         action, memory = jax.vmap(act)(flying.memory, seen)
-        state, step = jax.vmap(partial(env.step, config, world))(flying.state, action, number)
+        state, step = group.each(config, partial(env.step, config, world))(flying.state, action, number)
         flights, clearance = jax.vmap(partial(_tally, config, world))(flying.flights, flying.state, step)
         return _Flying(
             state=state,
@@ -178,7 +179,7 @@ def _fly(
 
     # The first iteration resets every environment: the observation and the action before it are not used.
     state = jax.vmap(partial(env.ended, config, world))(keys, number)
-    seen = jax.eval_shape(jax.vmap(partial(env.step, config, world)), state, number)[1].observation
+    seen = jax.eval_shape(group.each(config, partial(env.step, config, world)), state, number)[1].observation
     memory = policy.empty_memory(config)
     flying = _Flying(
         state=state,
@@ -196,7 +197,8 @@ def _fly(
 
 def _at_start(config: Config, world: World, state: EnvState) -> Flights:
     """Returns the tallies of one flight before its first step."""
-    return at_start(config, env.scene_of(world, state.mission), state.drone)
+    flights = at_start(config, env.scene_of(world, state.mission), state.drone)
+    return dataclasses.replace(flights, hit_drone=jnp.zeros((), bool)) if group.several(config) else flights
 
 
 def _tally(config: Config, world: World, flights: Flights, before: EnvState, step: Step) -> tuple[Flights, Array]:
@@ -205,7 +207,7 @@ def _tally(config: Config, world: World, flights: Flights, before: EnvState, ste
     scene = env.scene_of(world, before.mission)
     verdict = step.outcome, step.end_step, step.contact
     after, clearance = tally(config, scene, flights, before.drone.position, step.flight, *verdict)
-    after = dataclasses.replace(after, episode_return=step.episode_return)
+    after = dataclasses.replace(after, episode_return=step.episode_return, hit_drone=step.hit_drone)
     return jax.tree.map(lambda new, old: jnp.where(running, new, old), after, flights), clearance
 
 

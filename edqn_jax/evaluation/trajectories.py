@@ -46,7 +46,8 @@ def write_trajectories(config: Config, missions: MissionSet, flights: Flights, f
 
     Row 0 of each flight is its start, row k its pose after physics step k; rows after the end are NaN.
     `lengths` is the number of rows of each flight. The contact of a collision is in the last segment, at the
-    fraction `contact` of it. `mjcf[scene[i]]` is the world of mission i.
+    fraction `contact` of it. `mjcf[scene[i]]` is the world of mission i. Of several drones `hit_drone` says which
+    collisions were with another; those of a group are in a row, and all begin at the same time.
 
     Raises:
         ConfigError: if the file cannot be written.
@@ -78,6 +79,7 @@ def write_trajectories(config: Config, missions: MissionSet, flights: Flights, f
         "start": flown.start,
         "goal": flown.goal,
         "mjcf": np.array(missions.mjcf()),
+        **({} if flights.hit_drone is None else {"hit_drone": flights.hit_drone}),
         "body_radius_m": np.float64(config.drone.body_radius_m),
         "physics_dt_s": np.float64(config.drone.physics_dt_s),
     }

@@ -33,7 +33,7 @@ from edqn_jax.parallel import processes
 from edqn_jax.parallel.all_sum import all_sum
 from edqn_jax.parallel.devices import compiler_options
 from edqn_jax.random import run_streams
-from edqn_jax.sim import env
+from edqn_jax.sim import env, group
 from edqn_jax.sim.env import EnvState, World
 from edqn_jax.sim.moves import ACTIONS
 from edqn_jax.sim.outcomes import Outcome
@@ -136,7 +136,7 @@ def init(config: Config, world: World, key: Array) -> TrainState:
         )
     keys = InitialKeys.split(key, envs, shards)
     # Nothing has been seen yet: the first step is every environment's reset.
-    state = jax.vmap(lambda k: env.ended(config, world, k))(keys.environments)
+    state = group.each(config, lambda k: env.ended(config, world, k))(keys.environments)
     learner = init_learner(config, keys.learner)
     size = observation_size(config)
     ring = replay.empty(config.agent, envs // shards, envs, size)
@@ -144,7 +144,7 @@ def init(config: Config, world: World, key: Array) -> TrainState:
         env=state,
         memory=jnp.broadcast_to(empty_memory(config), (envs, *empty_memory(config).shape)),
         reward=jnp.zeros(envs),
-        outcome=jnp.full(envs, int(Outcome.TIME_OUT)),  # as before every reset: no transition starts here
+        outcome=jnp.full(envs, _NO_START),
         is_reset=jnp.ones(envs, bool),
         manoeuvre=jnp.zeros(envs, jnp.int32),
         episodes=jnp.zeros(envs, jnp.int32),
@@ -171,7 +171,11 @@ def _empty_samples(config: Config, world: World, state: EnvState) -> Samples | N
         wanted = samples.target_of(config.encoder, observation, env.nearness(config, world, state))
         return samples.samples_of(config.encoder, observation, wanted, jnp.zeros((), bool))
 
-    shapes = jax.eval_shape(one, jax.tree.map(lambda x: x[0], state))
+    if group.several(config):
+        whole = jax.eval_shape(group.each(config, one), state)
+        shapes = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), whole)
+    else:
+        shapes = jax.eval_shape(one, jax.tree.map(lambda x: x[0], state))
     ring = samples.empty(config.encoder, shapes, envs // shards, envs)
     return jax.tree.map(lambda x: jnp.broadcast_to(x, (shards, *x.shape)), ring)
 
@@ -222,7 +226,7 @@ def train_step(
         env=shaped(flown),
         memory=shaped(memory),
         reward=reward,
-        outcome=outcome,
+        outcome=outcome if seen.waits is None else jnp.where(shaped(seen.waits), _NO_START, outcome),
         is_reset=shaped(seen.is_reset),
         manoeuvre=manoeuvre,
         episodes=actors.episodes + ((outcome != Outcome.RUNNING) & ~warming),
@@ -257,6 +261,9 @@ def train_step(
 
 _OF_A_DECISION = ("physics_state", "observation", "reward")
 
+_NO_START = int(Outcome.TIME_OUT)
+"""Outcome in the replay of a row at which no transition starts, as where an episode has ended."""
+
 
 def _act(
     config: Config, learner: Learner, actors: Actors, keys: ShardKeys, time: Array, warming: Array
@@ -287,7 +294,7 @@ def _store(actors: Actors, action: Array, time: Array) -> replay.Rows:
 
 def _fly(config: Config, world: World, actors: Actors, action: Array) -> tuple[EnvState, env.Step]:
     """Steps all environments, [S * E, ...]."""
-    each = one_by_one if config.train.debug else jax.vmap
+    each = one_by_one if config.train.debug else partial(group.each, config)
     return each(lambda s, a: env.step(config, world, s, a))(jax.tree.map(flat, actors.env), flat(action))
 
 
@@ -332,13 +339,17 @@ def _keep(config: Config, world: World, actors: Actors, flown: EnvState, seen: e
     def target() -> vae.Target:
         near = None
         if embedding.needs_nearness(config):
-            near = jax.vmap(partial(env.nearness, config, world))(flown)
+            near = group.each(config, partial(env.nearness, config, world))(flown)
         return samples.target_of(config.encoder, seen.observation, near)
 
     nothing = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(target))
     wanted = lax.cond(keep, target, lambda: nothing)
     begins = seen.is_reset | plan.begins_to_keep(config, step)
     rows = samples.samples_of(config.encoder, seen.observation, wanted, begins)
+    if group.several(config):
+        assert seen.waits is not None
+        mate = group.mates(config, seen.waits)
+        rows = dataclasses.replace(jax.tree.map(lambda x: x[mate], rows), begins=begins)
     write = jax.vmap(samples.write, in_axes=(0, 0, None, None))
     return write(actors.samples, _shaped(actors.reward.shape, rows), plan.samples_kept(config, step), keep)
 

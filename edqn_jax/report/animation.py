@@ -21,7 +21,7 @@ from PIL import Image
 
 from edqn_jax.learn.policy import PolicyParams
 from edqn_jax.packages import require
-from edqn_jax.report.flights import OBLIQUE, draw_end_marks, draw_stage
+from edqn_jax.report.flights import OBLIQUE, OTHER_COLOUR, draw_end_marks, draw_stage, others_paths
 from edqn_jax.report.images import LOOKS, scale_of
 from edqn_jax.report.sights import Sights, decision_rows, poses, times_of
 from edqn_jax.report.solids import MAP, View, faces_seen, hidden, moving_solids
@@ -197,7 +197,11 @@ class _PathView:
         (self._drone,) = axes.plot([], [], "o", ms=8, mfc=LINE, mec="white", mew=1.5, animated=True, zorder=9.5)
         self._obstacles = PolyCollection([], animated=True, linewidths=0.3, zorder=5)
         axes.add_collection(self._obstacles, autolim=False)
-        self.moving: list[Artist] = [self._obstacles, *self._lines, self._drone]
+        self._others = [view.project(path) for path in others_paths(sights.scene)]
+        style = {"color": OTHER_COLOUR, "lw": 0.9, "alpha": 0.7, "zorder": 6.8}
+        self._trails = [axes.plot([], [], animated=True, **style)[0] for _ in self._others]
+        (self._swarm,) = axes.plot([], [], "o", ms=5, mfc=OTHER_COLOUR, mec="white", mew=0.8, animated=True, zorder=9)
+        self.moving: list[Artist] = [self._obstacles, *self._trails, *self._lines, self._swarm, self._drone]
 
     def advance(self, row: int, time: float) -> None:
         """Draws the path up to a row of the trajectory, and the obstacles that move where they are at its time."""
@@ -207,6 +211,11 @@ class _PathView:
         for line, points in zip(self._lines, (self._flat, self._visible, self._visible), strict=True):
             line.set_data(*points[: row + 1].T)
         self._drone.set_data(*self._flat[row : row + 1].T)
+        # Row k of the trajectory stands after physics step k + 1, with which entry k + 1 of the others' paths begins.
+        for trail, path in zip(self._trails, self._others, strict=True):
+            trail.set_data(*path[: row + 2].T)
+        there = [path[row + 1] for path in self._others if row + 1 < len(path)]
+        self._swarm.set_data(*np.array(there).reshape(-1, 2).T)
 
 
 def _heading_deg(w: float, z: float) -> float:

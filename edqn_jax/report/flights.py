@@ -28,7 +28,7 @@ from edqn_jax.report.solids import (
     standing,
 )
 from edqn_jax.report.style import INK, MUTED, OUTCOME_COLOURS, OUTCOME_LABELS, drawing
-from edqn_jax.sim.scene import Scene
+from edqn_jax.sim.scene import PARKED, Scene
 
 OBLIQUE = View(azimuth=-62.0, elevation=34.0)
 SPEED_COLOURS = "viridis"
@@ -36,6 +36,8 @@ START_COLOUR = "#0072b2"
 GOAL_COLOUR = OUTCOME_COLOURS["goal"]
 SHORTEST_COLOUR = "#c2185b"
 HALO = 3.4
+OTHER_COLOUR = "#5a5a66"
+"""Of the other drones of a group, and of their paths."""
 TICK: dict[str, Any] = {"fontsize": 7, "color": INK, "ha": "center", "va": "center"}
 PATH_POINTS = 1500
 """A flight is thinned to about this many points; more cannot be seen."""
@@ -90,7 +92,7 @@ def draw_path(
 ) -> Figure:
     """Draws the flown path in 3-D and from above, coloured by speed, written to `file` as PNG.
 
-    What a solid hides is faint; the shortest path is dashed.
+    What a solid hides is faint; the shortest path is dashed; those of other drones in the world are grey.
 
     Args:
         scene: one world.
@@ -115,6 +117,10 @@ def draw_path(
                 axes.plot(*floor.T, color=MUTED, lw=0.7, alpha=0.7, zorder=1.5)
             if shortest is not None:
                 _draw_shortest(axes, view, np.asarray(shortest, np.float64), solids)
+            for other in others_paths(scene):
+                axes.plot(
+                    *view.project(other[:: len(other) // PATH_POINTS + 1]).T, color=OTHER_COLOUR, lw=1.0, zorder=5.5
+                )
             _draw_flown(axes, view, points, speed, scale, solids)
             draw_end_marks(axes, view, start, goal)
             if outcome != "goal":
@@ -131,6 +137,14 @@ def draw_path(
         bar.outline.set_visible(False)  # pyright: ignore[reportCallIssue]
         figure.legend(handles=_path_legend(shortest is not None, outcome), loc="outside lower center", ncols=5)
     return figure
+
+
+def others_paths(scene: Scene) -> list[np.ndarray]:
+    """Returns the paths [T, 3], metres, of the other drones in a flight's world, each up to its end."""
+    if scene.drones is None:
+        return []
+    paths = np.asarray(scene.drones.path, np.float64)
+    return [path[path[:, 0] < PARKED / 2] for path in paths]
 
 
 def draw_stage(axes: Axes, view: View, scene: Scene, goal_radius_m: float, outlines: bool = True) -> list[Solid]:

@@ -96,12 +96,17 @@ def solids_of(scene: Scene) -> list[Solid]:
 
 
 def standing(scene: Scene) -> Scene:
-    """Returns one world without the shapes that move."""
+    """Returns one world without the shapes that move, and without drones."""
+    scene = dataclasses.replace(scene, drones=None)
     return _only(scene, scene_at(scene, None), moving=False)
 
 
 def moving_solids(scene: Scene, time: float) -> list[Solid]:
-    """Returns the shapes of one world that move, where they are at `time` seconds; a ball only while it flies."""
+    """Returns the shapes of one world that move, where they are at `time` seconds; a ball only while it flies.
+
+    Drones are not among them: they are too small to be drawn to scale.
+    """
+    scene = dataclasses.replace(scene, drones=None)
     return solids_of(_only(scene, scene_at(scene, jnp.float32(time)), moving=True))
 
 

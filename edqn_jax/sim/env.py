@@ -19,7 +19,7 @@ from jax import Array
 from edqn_jax.checks import check_finite, check_index
 from edqn_jax.config import Config, EnvConfig
 from edqn_jax.random import integers
-from edqn_jax.sim import disturbances, drone, geodesic, sensor
+from edqn_jax.sim import disturbances, drone, geodesic, group, sensor
 from edqn_jax.sim.distance import signed_distance
 from edqn_jax.sim.disturbances import Disturbance
 from edqn_jax.sim.drone import Airframe, DroneState, Flight
@@ -27,7 +27,7 @@ from edqn_jax.sim.missions import Missions
 from edqn_jax.sim.moves import ACTIONS
 from edqn_jax.sim.outcomes import Outcome, judge
 from edqn_jax.sim.reward import Reward, Transition, configured_reward
-from edqn_jax.sim.scene import Scene, moves, scene_at, take_scene
+from edqn_jax.sim.scene import PARKED, Scene, moves, scene_at, take_scene, with_drones
 from edqn_jax.sim.sensor import Sensed, SensorMemory, frame_steps
 
 OWN_SIZE = 10
@@ -93,13 +93,15 @@ class Step:
     observation: Observation
     reward: Array  # [] float32, unscaled
     outcome: Array  # [] int32, an `Outcome`
-    is_reset: Array  # [] bool, the step was spent on a reset: reward 0, action ignored
+    is_reset: Array  # [] bool, the step was spent on a reset, or on waiting for one: reward 0, action ignored
     episode_return: Array  # [] of the episode so far, this step included
     episode_length: Array  # [] int32, likewise
     flight: Flight  # [n, ...] after each physics step; for a reset, the new start throughout
     end_step: Array  # [] int32, physics step (1..n) at which the outcome fell; n while running
     contact: Array  # [] share of that step flown before a collision touched, 1 otherwise
     broken: Broken
+    waits: Array | None = None  # [] bool, the episode has ended and that of others in the group has not
+    hit_drone: Array | None = None  # [] bool, the collision was with a drone; both None for a drone alone
 
 
 def velocity_command(config: EnvConfig, action: Array, yaw: Array) -> Array:
@@ -232,9 +234,13 @@ def observe(
 def nearness(config: Config, world: World, state: EnvState) -> Array:
     """Returns what the sensor `depth` would show of an environment now: [H, W], without a unit.
 
-    A label for training: no observation holds it.
+    A label for training: no observation holds it. With several drones as `step`.
     """
     scene = scene_now(config, world, state)
+    if group.several(config):
+        there, is_there = group.others(config, (state.drone.position, ~state.ended))
+        there = jnp.where(is_there[:, None], there, PARKED)
+        scene = with_drones(scene, there, jnp.where(is_there, config.drone.body_radius_m, 0.0))
     return sensor.nearness_image(config, scene, state.drone.position, state.drone.quaternion)
 
 
@@ -244,7 +250,7 @@ def reset(config: Config, world: World, key: Array, mission: Array | None = None
     state = dataclasses.replace(ended(config, world, key, mission), ended=jnp.zeros((), bool))
     scene = scene_of(world, state.mission)
     before = np.array(frame_steps(config)) - config.drone.physics_steps
-    still = _timed(config, scene, _hold(state.drone, len(before)), jnp.asarray(before) if moves(scene) else None)
+    still = _timed(config, _hold(state.drone, len(before)), jnp.asarray(before) if moves(scene) else None)
     goal = world.missions.goal[state.mission]
     observation, memory = observe(
         *(config, scene, goal, state.drone, jnp.zeros(3), still, state.memory, noise, state.disturbance)
@@ -255,7 +261,7 @@ def reset(config: Config, world: World, key: Array, mission: Array | None = None
 def ended(config: Config, world: World, key: Array, mission: Array | None = None) -> EnvState:
     """Returns an environment whose next step is a reset; it needs no picture. The mission [] is as in `reset`."""
     key, draw, rest = jax.random.split(key, 3)
-    mission = _drawn_mission(world, draw) if mission is None else mission
+    mission = _drawn_mission(config, world, draw) if mission is None else mission
     body, memory, disturbance = _start(config, world, mission, rest)
     return EnvState(
         drone=body,
@@ -269,8 +275,11 @@ def ended(config: Config, world: World, key: Array, mission: Array | None = None
     )
 
 
-def _drawn_mission(world: World, key: Array) -> Array:
-    return integers(key, (), world.missions.scene.shape[0])
+def _drawn_mission(config: Config, world: World, key: Array) -> Array:
+    count = world.missions.scene.shape[0]
+    if group.several(config):
+        return group.mission_of_block(config, integers(key, (), count // config.env.drones))
+    return integers(key, (), count)
 
 
 def _hold(body: DroneState, n: int) -> Flight:
@@ -292,6 +301,7 @@ class _Decision:
     broken: Array  # [] bool, the body was not finite
     unrewarded: Array  # [] bool, the reward was not, although the body was
     disturbance: Disturbance | None = None
+    hit_drone: Array | None = None
 
 
 def step(
@@ -299,16 +309,21 @@ def step(
 ) -> tuple[EnvState, Step]:
     """Takes one decision of one drone, or its reset if its episode has ended.
 
+    With several drones it must be mapped by `group.each`; a drone whose episode has ended waits until all of its
+    group have ended, and is absent meanwhile.
+
     Args:
         action: [] int, 0..26.
-        mission: [] int, which one a reset takes; None draws one.
+        mission: [] int, which one a reset takes; None draws one. Those of a group are a block of N in a row.
     """
     key, draw, rest, noise = jax.random.split(state.key, 4)
     gusts = None
     if disturbances.changes_flight(config):
         key, gusts = jax.random.split(key)
-    is_reset = state.ended
-    fresh = _drawn_mission(world, draw) if mission is None else mission
+    is_reset, waits = state.ended, None
+    if group.several(config):
+        is_reset, waits = group.resets_and_waits(state.ended)
+    fresh = _drawn_mission(config, world, draw) if mission is None else mission
     mission = jnp.where(is_reset, fresh, state.mission).astype(jnp.int32)
     check_index(action, len(ACTIONS), "the moves")
     check_index(mission, world.missions.scene.shape[0], "the missions")
@@ -319,12 +334,19 @@ def step(
     start, rested, drawn = _start(config, world, mission, rest)
     flown = _fly(config, world, scene, goal, state, action, gusts)
     done = _choose(is_reset, _reset_in_place_of(flown, start, drawn), flown)
+    if waits is not None:
+        done = _choose(waits, _reset_in_place_of(flown, state.drone, state.disturbance), done)
     n = config.drone.physics_steps
     # The time before a start is negative: what moves has moved before.
-    steps = jnp.where(is_reset, -n, state.decision * n) + jnp.arange(1, n + 1) if moves(scene) else None
-    done = dataclasses.replace(done, flight=_timed(config, scene, done.flight, steps))
+    timed = moves(scene) or group.several(config)
+    steps = jnp.where(is_reset, -n, state.decision * n) + jnp.arange(1, n + 1) if timed else None
+    done = dataclasses.replace(done, flight=_timed(config, done.flight, steps))
 
-    poses = _poses_seen(config, _choose(is_reset, start, state.drone), done.flight)
+    first = _choose(is_reset, start, state.drone)
+    if waits is not None:
+        goes_on = (done.outcome == Outcome.RUNNING) & ~waits
+        scene = group.present(config, scene, first.position, done.flight, goes_on)
+    poses = _poses_seen(config, first, done.flight)
     memory = _choose(is_reset, rested, state.memory)
     move = jnp.where(is_reset, 0.0, jnp.asarray(ACTIONS, jnp.float32)[action])
     observation, memory = observe(*(config, scene, goal, done.drone, move, poses, memory, noise, done.disturbance))
@@ -332,14 +354,20 @@ def step(
         check_finite(number, "what a sensor shows")
     # Own state and motion are of a finite body; counts of events are whole numbers, and nothing is checked.
     unseen = ~is_finite(observation.sensed)
+    if waits is not None:
+        unseen &= ~waits
     if _has_floats(observation.sensed):
         observation = _choose(unseen, jax.tree.map(jnp.zeros_like, observation), observation)
     done = dataclasses.replace(done, outcome=jnp.where(unseen, int(Outcome.DIVERGED), done.outcome))
+    decision = jnp.where(is_reset, 0, state.decision + 1)
+    over = done.outcome != Outcome.RUNNING
+    if waits is not None:
+        decision, over = jnp.where(waits, state.decision, decision), over | waits
     after = EnvState(
         drone=done.drone,
         mission=mission,
-        decision=jnp.where(is_reset, 0, state.decision + 1),
-        ended=done.outcome != Outcome.RUNNING,
+        decision=decision,
+        ended=over,
         memory=memory,
         episode_return=jnp.where(is_reset, 0.0, state.episode_return + done.reward),
         key=key,
@@ -349,13 +377,15 @@ def step(
         observation=observation,
         reward=done.reward,
         outcome=done.outcome,
-        is_reset=is_reset,
+        is_reset=is_reset if waits is None else is_reset | waits,
         episode_return=after.episode_return,
         episode_length=after.decision,
         flight=done.flight,
         end_step=done.end_step,
         contact=done.contact,
         broken=Broken(physics_state=done.broken, observation=unseen, reward=done.unrewarded),
+        waits=waits,
+        hit_drone=done.hit_drone,
     )
 
 
@@ -388,14 +418,13 @@ def _time(config: Config, decisions: Array) -> Array:
     return decisions * (config.drone.physics_steps * config.drone.physics_dt_s)
 
 
-def _timed(config: Config, scene: Scene, flight: Flight, steps: Array | None) -> Flight:
+def _timed(config: Config, flight: Flight, steps: Array | None) -> Flight:
     """Returns a flight with the times of its poses, taken after physics steps `steps` [n] of the episode.
 
-    In a still world nobody asks for times, and there are none.
+    Where nothing moves but the drone nobody asks for times, and there are none.
     """
-    if not moves(scene):
+    if steps is None:
         return flight
-    assert steps is not None
     return dataclasses.replace(flight, time=steps * config.drone.physics_dt_s)
 
 
@@ -422,6 +451,10 @@ def _fly(
             config, world.airframe, before, disturbance, command, heading, gusts
         )
     outcome, end_step, contact = judge(config, scene, goal, before.position, flight, state.decision + 1)
+    hit_drone = None
+    if group.several(config):
+        path = jnp.concatenate([before.position[None], flight.position])
+        outcome, end_step, contact, hit_drone = group.collide(config, path, ~state.ended, outcome, end_step, contact)
     reward = _reward(config, world, scene, goal, state, after, action, outcome)
     numbers = jnp.concatenate([after.position, after.quaternion, after.velocity, after.angular_velocity])
     broken = ~jnp.all(jnp.isfinite(numbers))
@@ -438,6 +471,7 @@ def _fly(
         broken=broken,
         unrewarded=unrewarded,
         disturbance=_choose(broken, state.disturbance, disturbance),
+        hit_drone=None if hit_drone is None else hit_drone & ~(broken | unrewarded),
     )
 
 
@@ -490,6 +524,7 @@ def _reset_in_place_of(flown: _Decision, start: DroneState, drawn: Disturbance |
         broken=jnp.zeros((), bool),
         unrewarded=jnp.zeros((), bool),
         disturbance=drawn,
+        hit_drone=None if flown.hit_drone is None else jnp.zeros((), bool),
     )
 
 

@@ -22,7 +22,7 @@ from jax.typing import ArrayLike
 from edqn_jax.config import FAMILIES, Config
 from edqn_jax.config.loading import make_config
 from edqn_jax.errors import ConfigError
-from edqn_jax.sim import camera, drone, env, events, sensor
+from edqn_jax.sim import camera, drone, env, events, group, sensor
 from edqn_jax.sim.drone import Flight
 from edqn_jax.sim.env import EnvState, Observation, Step, World
 from edqn_jax.sim.events import EventField, EventMemory
@@ -156,10 +156,12 @@ def make(
         reward: of every decision, in place of the configured one: a function of a `Transition`.
 
     Raises:
-        ConfigError: if there is no such world, or the drone does not fit at its start or goal.
+        ConfigError: if there is no such world, the drone does not fit at its start or goal, or several drones are
+            configured.
     """
     name = str(world) if world is not None else (config or Config()).world.name
     config = make_config(name) if config is None else config
+    group.check_alone(config, "edqn_jax.make")
     pool = _random_pool(config, name, worlds, seed, split) if name in FAMILIES else _file_pool(config, name, worlds)
     return Environment(config, World(drone.load_airframe(config.drone), pool, own_missions(pool), reward))
 

@@ -15,7 +15,7 @@ from edqn_jax.sim.scene import Scene, scene_at
 
 @struct.dataclass
 class Closest:
-    """Where a flight came closest to a shape, its start and end included. M missions."""
+    """Where a flight came closest to a shape, other drones aside, its start and end included. M missions."""
 
     distance: Array  # [M] metres between the body's sphere and the shape
     time: Array  # [M] seconds since the start
@@ -52,6 +52,7 @@ class Flights:
     flight_seconds: Array  # [M]
     closest: Closest
     record: Record | None
+    hit_drone: Array | None = None  # [M] bool, the collision was with another drone; None where one flies alone
 
 
 def at_start(config: Config, scene: Scene, body: DroneState) -> Flights:

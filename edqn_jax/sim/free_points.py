@@ -27,7 +27,8 @@ EARLY_S = 2.0
 """Seconds from the start of an episode during which a random point is free of shapes that move."""
 _EARLY_STEP_S = 0.25  # what moves at 5 m/s comes no nearer between two samples than 0.625 m less than the clearance
 
-_ALTITUDES = (1.5, 20.0)  # of the start and goal of a random world, metres
+ALTITUDES = (1.5, 20.0)
+"""Of the start and goal of a random world, metres."""
 _FENCE = ((1.0, 1.0, 1.0), (1.0, 1.0, 2.0))  # between random points and the volume's lower and upper faces
 
 
@@ -75,14 +76,14 @@ def far_apart(scene: Scene, draw: Array) -> tuple[Array, Array]:
 
     They are `FAR` metres apart, or half as far as the volume is long.
     """
-    start = first_free(scene, scatter(scene, draw[0], _ALTITUDES), CLEARANCE)
+    start = first_free(scene, scatter(scene, draw[0], ALTITUDES), CLEARANCE)
     return start, far_from(scene, draw[1], start)
 
 
 def far_from(scene: Scene, draw: Array, point: Array) -> Array:
     """Returns a free point [3], metres, as far from `point` as a start is from its goal, from uniform draws [K, 3]."""
     distance = jnp.minimum(FAR, (scene.volume[1, 0] - scene.volume[0, 0]) / 2)
-    return first_free(scene, scatter(scene, draw, _ALTITUDES), CLEARANCE, point, distance)
+    return first_free(scene, scatter(scene, draw, ALTITUDES), CLEARANCE, point, distance)
 
 
 def scatter(scene: Scene, draw: Array, altitudes: tuple[float, float] | None = None) -> Array:
@@ -144,7 +145,7 @@ def first_free(
 
     Where shapes move, a point is free if it is so at each of `early_times`; balls are not asked for.
     """
-    short = jnp.minimum(_least_distances(scene, points) - clearance, 0.0)
+    short = jnp.minimum(least_distances(scene, points) - clearance, 0.0)
     if away_from is not None:
         apart = jnp.sqrt(jnp.sum((points - away_from[None]) ** 2, axis=1))
         short += jnp.minimum(apart - distance, 0.0)
@@ -156,7 +157,7 @@ def early_times() -> Array:
     return jnp.linspace(0.0, EARLY_S, 1 + round(EARLY_S / _EARLY_STEP_S))
 
 
-def _least_distances(scene: Scene, points: Array) -> Array:
+def least_distances(scene: Scene, points: Array) -> Array:
     """Returns the least distance [K] of points [K, 3] to the nearest surface at any of `early_times`, metres."""
     if not moves(scene):
         return jax.vmap(partial(signed_distance, scene))(points)

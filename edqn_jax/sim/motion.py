@@ -39,6 +39,25 @@ class Throw:
     pace: Array  # [N] m/s, of the drone that it is thrown at
 
 
+@struct.dataclass
+class Flown:
+    """Where K other drones have flown during n physics steps, as a table."""
+
+    path: Array  # [K, n + 1, 3] metres, before the first physics step and after each
+    radius: Array  # [K] metres, 0 of a drone that is absent
+    began: Array  # [] seconds of the episode
+    step_s: Array  # [] seconds between two places of the path
+
+
+def flown_to(flown: Flown, time: Array) -> Array:
+    """Returns where these drones are after the physics step at `time` [] seconds: [K, 3] metres.
+
+    Every frame is of a physics step, so nobody asks between two.
+    """
+    step = jnp.round((time - flown.began) / flown.step_s).astype(jnp.int32)
+    return flown.path[:, jnp.clip(step, 0, flown.path.shape[1] - 1)]
+
+
 OUTSIDE_M = 1.0
 """Metres beyond the flight volume's faces at which a ball appears and is absent again, plus its radius: no drone is
 so near."""

@@ -25,10 +25,12 @@ from jax.typing import ArrayLike
 
 from edqn_jax.sim.motion import (
     OUTSIDE_M,
+    Flown,
     Motion,
     Throw,
     at_rest,
     displacement,
+    flown_to,
     in_flight,
     not_thrown,
     thrown_to,
@@ -38,6 +40,9 @@ from edqn_jax.sim.motion import (
 
 PARKED = 1e6
 """Coordinate of absent shapes, metres along each axis."""
+
+DRONE_RGB = (0.08, 0.08, 0.1)
+"""Reflectance of other drones: dark, as airframes of carbon fibre are."""
 
 
 @struct.dataclass
@@ -127,6 +132,7 @@ class Scene:
     volume: Array  # [2, 3] lower and upper corner of the flight volume, metres
     start: Array  # [3] metres
     goal: Array  # [3] metres
+    drones: Flown | None = None  # the others of a group, within one decision; in no pool of worlds
 
 
 Shape = UprightBoxes | UprightCylinders | Spheres | TiltedBoxes | Capsules | TiltedCylinders | Planes
@@ -151,7 +157,7 @@ _MOVING = {"motion": at_rest, "throw": not_thrown}
 
 def moves(scene: Scene) -> bool:
     """Returns whether any kind of shape has motion. Static: known when a program is traced."""
-    return any(_moves(getattr(scene, kind)) for kind in KINDS)
+    return scene.drones is not None or any(_moves(getattr(scene, kind)) for kind in KINDS)
 
 
 def _moves(shapes: Shape) -> bool:
@@ -168,7 +174,17 @@ def scene_at(scene: Scene, time: Array | None) -> Scene:
         time: None is time 0, before anything is thrown.
     """
     moving = [kind for kind in KINDS if _moves(getattr(scene, kind))]
-    return dataclasses.replace(scene, **{kind: _standing(scene, getattr(scene, kind), time) for kind in moving})
+    now = dataclasses.replace(scene, **{kind: _standing(scene, getattr(scene, kind), time) for kind in moving})
+    if scene.drones is None:
+        return now
+    return with_drones(now, flown_to(scene.drones, scene.drones.began if time is None else time), scene.drones.radius)
+
+
+def with_drones(scene: Scene, position: Array, radius: Array) -> Scene:
+    """Returns a world that stands, with K drones in it: spheres at `position` [K, 3] of `radius` [K], metres."""
+    drones = Spheres(position, radius, jnp.broadcast_to(jnp.asarray(DRONE_RGB), position.shape))
+    spheres = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), scene.spheres, drones)
+    return dataclasses.replace(scene, spheres=spheres, drones=None)
 
 
 def _standing(scene: Scene, shapes: Any, time: Array | None) -> Any:

@@ -12,6 +12,7 @@ import numpy as np
 
 from edqn_jax.config import FAMILIES, Config
 from edqn_jax.errors import ConfigError, StoppedError
+from edqn_jax.evaluation.companions import scene_of_flight
 from edqn_jax.evaluation.metrics import clearance_text, flight_summary
 from edqn_jax.evaluation.trajectories import trajectory
 from edqn_jax.learn import saved_state
@@ -189,7 +190,7 @@ def where_saved(run: RunDirectory | None) -> str:
 
 def sights_of(preparation: Preparation) -> Sights:
     """Starts to compile the programs that draw the final flight's images, while it is flown."""
-    scene = jax.tree.map(np.asarray, preparation.missions[0].scene)
+    scene = scene_of_flight(preparation.config, preparation.missions[0].final)
     return Sights(preparation.config, scene, preparation.pool)
 
 
@@ -215,7 +216,7 @@ def finish(
     try:
         draw_gallery(
             run,
-            sights,
+            sights.in_world(scene_of_flight(preparation.config, preparation.missions[0].final, flights)),
             result.policy.params,
             np.asarray(preparation.shortest.points),
             flight_summary(flights)["outcome"],
@@ -286,7 +287,7 @@ def unseen(summary: dict[str, Any]) -> str:
 def _nearest(summary: dict[str, Any]) -> str:
     """Returns the closest approach as a sentence."""
     if summary["outcome"] == "collision":
-        return "It touched an obstacle or the ground."
+        return f"It touched {'another drone' if summary.get('hit_drone') else 'an obstacle or the ground'}."
     return f"The least clearance was {clearance_text(summary['min_clearance_m'])}."
 
 

@@ -36,6 +36,7 @@ from edqn_jax.runs.policies import load_run
 from edqn_jax.runs.provenance import digest_of, versions, workload
 from edqn_jax.runs.states import Checkpoint
 from edqn_jax.runs.world_copy import WORLD
+from edqn_jax.sim import group
 from edqn_jax.sim.flights import Flights
 from edqn_jax.training.derived import DIGITS, from_metrics, from_trajectory, same
 from edqn_jax.training.keeper import kept_name
@@ -89,6 +90,11 @@ def _verified(folder: Path, message: Callable[[str], None]) -> list[Finding]:
     runs = [run] if found.seeds is None else [run.of_seed(found.config.train.seed + k) for k in range(found.seeds)]
     policies = [load_run(each.path) for each in runs]
     configs, summaries = [config for config, _ in policies], [_read_summary(each) for each in runs]
+    if group.several(configs[0]):
+        raise ConfigError(
+            f"`edqn verify` is for runs of one drone, and env.drones is {configs[0].env.drones}: "
+            "C MuJoCo, which judges collisions, knows of no other drones"
+        )
     missions = missions_of_runs(configs)
     checkpoint, findings = _last_checkpoint(run)
     if checkpoint is not None:

@@ -265,6 +265,7 @@ def test_who_ended_starts_anew_within_the_step():
         {"env": EnvConfig(reward="geodesic")},
         {"air": AirConfig(gusts_m_s=1.0)},
         {"env": EnvConfig(action_delay=1)},
+        {"env": EnvConfig(drones=2)},
     ],
 )
 def test_what_this_stack_does_not_have_is_said_before_it_flies(change):

@@ -14,7 +14,7 @@ import pytest
 from edqn_jax.config import CameraConfig
 from edqn_jax.sim import camera, columns, native, worlds
 from edqn_jax.sim.events import LUMA_WEIGHTS
-from edqn_jax.sim.scene import Scene, stack_scenes, take_scene
+from edqn_jax.sim.scene import PARKED, Scene, stack_scenes, take_scene, with_drones
 from tests.sim.drawn_scenes import GROUND, ball, box, every_kind, pillar, rotation_of, scene_of
 
 CONFIG = CameraConfig()
@@ -75,6 +75,17 @@ def crowd(rng: np.random.Generator) -> Scene:
 
 def test_the_library_is_at_hand_wherever_there_is_a_compiler() -> None:
     assert native.is_at_hand() is (shutil.which("cc") is not None)
+
+
+def test_both_draw_the_other_drones_and_neither_those_that_are_absent() -> None:
+    scene, origin, rotation = frames([crowd(np.random.default_rng(3))], 64, seed=4)
+    ahead = np.asarray(rotation)[:, :, 0] * 3.0 + np.random.default_rng(5).normal(0, 0.5, (64, 3))
+    place = np.stack([np.asarray(origin) + ahead, np.full((64, 3), PARKED)], axis=1).astype(np.float32)
+    radius = jnp.broadcast_to(jnp.array([0.36, 0.0]), (64, 2))
+    among = jax.vmap(with_drones)(scene, jnp.asarray(place), radius)
+    agree(CONFIG, among, origin, rotation)
+    apart = np.abs(drawn(CONFIG, among, origin, rotation)[0] - drawn(CONFIG, scene, origin, rotation)[0])
+    assert (apart.max(axis=(1, 2)) > 0.05).mean() > 0.4  # the others' drones are behind something
 
 
 @pytest.mark.parametrize("size", [(32, 24), (13, 7)], ids=["usual", "no multiple of a vector"])

@@ -10,10 +10,10 @@ from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
-import jax
 import numpy as np
 
 import edqn_jax
+from edqn_jax.evaluation.companions import scene_of_flight
 from edqn_jax.evaluation.trajectories import trajectory
 from edqn_jax.report.curves import running_mean
 from edqn_jax.report.page.flown import FlownRun
@@ -155,7 +155,7 @@ def _by_interest(outcomes: Sequence[str]) -> list[int]:
 
 
 def _scene(run: FlownRun, mission: int) -> Any:
-    return jax.tree.map(np.asarray, run.missions.scene(mission))
+    return scene_of_flight(run.config, run.missions, run.flights, mission)
 
 
 def script_text(data: Mapping[str, Any]) -> str:
