@@ -80,6 +80,17 @@ class PilotConfig:
                 raise ConfigError(f"{name} of a pilot must be 0 or more, not {getattr(self, name):g}")
 
 
+TUNED = {
+    "true": PilotConfig(depth="true"),
+    "decoded": PilotConfig(
+        depth="decoded",
+        map=MapConfig(cell_m=0.35, range_m=6.0, free_share=0.8, least=-0.8),
+        route=RouteConfig(touch_m=0.7, near_m=1.05),
+    ),
+}
+"""By `PilotConfig.depth`, what flew best in validation worlds (docs/growing_map.md)."""
+
+
 @struct.dataclass
 class Piloted:
     """One drone in flight."""
@@ -252,6 +263,7 @@ def _begin(
 
 @functools.cache
 def _programs(platform: str):
+    """Returns the programs that begin B flights and that fly a decision of each."""
     options = compiler_options(platform)
 
     @functools.partial(jax.jit, static_argnums=(0, 1, 2), compiler_options=options)
@@ -265,7 +277,9 @@ def _programs(platform: str):
     return begin, fly
 
 
-def order(pilot: PilotConfig, router: Router, log_odds: np.ndarray, position: np.ndarray, goal: np.ndarray):
+def order(
+    pilot: PilotConfig, router: Router, log_odds: np.ndarray, position: np.ndarray, goal: np.ndarray
+) -> tuple[np.ndarray, float, int]:
     """Returns the plan of one drone: points [POINTS, 3] metres, the speed limit in metres per second, cells expanded.
 
     Args:

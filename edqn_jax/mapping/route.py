@@ -22,8 +22,11 @@ from edqn_jax.planners.astar import shorten
 
 numba = require("numba")
 
-TOUCHED_WEIGHT = 60.0
-"""Weight of a cell in which the body might touch an occupied one: rather a detour of 60 m than a metre through it."""
+OCCUPIED_WEIGHT = 1000.0
+"""Weight of an occupied cell: rather a detour of 1 km than a metre through it."""
+
+TOUCHED_WEIGHT = 30.0
+"""Weight of a cell in which the body might touch an occupied one: rather a detour of 30 m than a metre through it."""
 
 _STEPS = (0.0, 1.0, math.sqrt(2.0), math.sqrt(3.0))  # cells between neighbours, by the number of axes moved along
 _TIE = 1e-6  # of entries of equal estimate the one nearest to the goal comes first
@@ -42,8 +45,10 @@ class RouteConfig:
     """Distance from an occupied cell within which a way costs more, metres."""
     near_weight: float = 2.0
     """Cost of a metre there."""
-    unknown_weight: float = 1.0
-    """Cost of a metre through what nobody has seen; 1 is as through what is free."""
+    body_m: float = 0.5
+    """Distance from an unknown cell within which the body might touch what is in it, metres."""
+    unknown_weight: float = 1.5
+    """Cost of a metre there; 1 is as through what is free."""
     fence_m: float = 0.66
     """Distance that a way keeps from the ends of the volume, metres; less at a start or goal that has less."""
     ahead_m: float = 10.0
@@ -56,6 +61,7 @@ class _Map(NamedTuple):
     log_odds: np.ndarray  # [X, Y, Z]
     touch: np.ndarray  # [T, 3] int, cells around one in which the body might touch it
     near: np.ndarray  # [N, 3] int, cells around those
+    body: np.ndarray  # [B, 3] int, cells that the body might touch
     low: tuple[int, int, int]  # first cell that a way may use
     high: tuple[int, int, int]  # last one
     occupied_above: float
@@ -77,34 +83,50 @@ class Router:
     """Plans ways in one volume."""
 
     def __init__(self, config: RouteConfig, cell_m: float, volume: np.ndarray):
-        """Prepares the search; edge of the cells in metres, `volume` [2, 3] metres."""
+        """Prepares the search; edge of the cells in metres, `volume` [2, 3] metres, as float64."""
         self.config, self.cell, self.volume = config, cell_m, np.asarray(volume, np.float64)
         self._touch, self._near = _around(cell_m, 0.0, config.touch_m), _around(cell_m, config.touch_m, config.near_m)
+        self._body = _around(cell_m, 0.0, config.body_m)
 
-    def plan(self, log_odds: np.ndarray, position: np.ndarray, goal: np.ndarray) -> Route:
-        """Returns the next part of the cheapest way.
+    def cheapest(self, log_odds: np.ndarray, position: np.ndarray, goal: np.ndarray) -> tuple[np.ndarray, float, int]:
+        """Returns the cells [n, 3] of the next part of the cheapest way, the cost of all of it and cells expanded.
 
         Args:
             log_odds: [X, Y, Z] of the grid, of which cell (0, 0, 0) is in the volume's lower corner.
             position: [3] of the drone, metres.
             goal: [3] metres.
+
+        Returns:
+            cells, the drone's first; cost in cells that weigh 1; number of expanded cells.
         """
-        config, cell, (lower, upper) = self.config, self.cell, self.volume
-        known = self._map(log_odds, goal)
+        known, lower = self._map(log_odds, goal), self.volume[0]
         source, target = (
-            tuple(int(i) for i in np.clip((point - lower) // cell, known.low, known.high)) for point in (position, goal)
+            tuple(int(i) for i in np.clip((point - lower) // self.cell, known.low, known.high))
+            for point in (position, goal)
         )
-        cells, expanded = _search(known, source, target, math.ceil(config.ahead_m / cell))
+        return _search(known, source, target, math.ceil(self.config.ahead_m / self.cell))
+
+    def plan(self, log_odds: np.ndarray, position: np.ndarray, goal: np.ndarray) -> Route:
+        """Returns the next part of the cheapest way, shortened where the straight line is as good; as `cheapest`.
+
+        Args:
+            log_odds: [X, Y, Z] of the grid.
+            position: [3] of the drone, metres.
+            goal: [3] metres.
+        """
+        cell, (lower, upper) = self.cell, self.volume
+        cells, _, expanded = self.cheapest(log_odds, position, goal)
         points = np.clip(lower + cell * (cells + 0.5), lower, upper)
         points[0] = position
-        if tuple(cells[-1]) == target:
-            points = np.concatenate([points, [goal]])
-        most = max(1.0, config.unknown_weight) + 1e-9
-        tight = shorten(points, lambda a, b: _heaviest(known, (a - lower) / cell, (b - lower) / cell) > most)
+        if np.all(np.abs(points[-1] - goal) <= cell):  # the last cell is the goal's, or the nearest that a way may use
+            points = np.concatenate([points, goal[None]])
+        known = self._map(log_odds, goal)
+        # Only through cells of weight 1, where the straight line is the cheapest way.
+        tight = shorten(points, lambda a, b: _heaviest(known, (a - lower) / cell, (b - lower) / cell) > 1.0)
         return Route(tight, expanded)
 
     def seen_m(self, log_odds: np.ndarray, points: np.ndarray) -> float:
-        """Returns the length, metres, of the part of a way [N, 3], metres, that is known to be free."""
+        """Returns the length, metres, of the part of a way [N, 3], metres, in which the body is known to be free."""
         lower = self.volume[0]
         known = self._map(log_odds, points[-1])
         return self.cell * float(_seen(known, (points - lower) / self.cell))
@@ -121,6 +143,7 @@ class Router:
             log_odds,
             self._touch,
             self._near,
+            self._body,
             (int(low[0]), int(low[1]), int(low[2])),
             (int(high[0]), int(high[1]), int(high[2])),
             config.occupied_above,
@@ -154,11 +177,27 @@ def _is_occupied_around(known, around, i, j, k):
 
 
 @numba.njit
+def _is_unknown_around(known, around, i, j, k):
+    """Returns whether one of the cells at the offsets `around` [N, 3] from (i, j, k) is unknown."""
+    shape = known.log_odds.shape
+    for n in range(around.shape[0]):
+        a, b, c = i + around[n, 0], j + around[n, 1], k + around[n, 2]
+        if 0 <= a < shape[0] and 0 <= b < shape[1] and 0 <= c < shape[2]:
+            if known.log_odds[a, b, c] == 0.0:
+                return True
+    return False
+
+
+@numba.njit
 def _weight(known, i, j, k):
     """Returns the cost of a metre through the cell (i, j, k)."""
+    if known.log_odds[i, j, k] > known.occupied_above:
+        return OCCUPIED_WEIGHT
     if _is_occupied_around(known, known.touch, i, j, k):
         return TOUCHED_WEIGHT
-    weight = known.unknown_weight if known.log_odds[i, j, k] == 0.0 else 1.0
+    weight = 1.0
+    if known.unknown_weight > 1.0 and _is_unknown_around(known, known.body, i, j, k):
+        weight = known.unknown_weight
     if _is_occupied_around(known, known.near, i, j, k):
         return max(weight, known.near_weight)
     return weight
@@ -174,7 +213,7 @@ def _free_length(a, b, c):
 
 @numba.njit
 def _search(known, source, target, most):
-    """Returns the first `most` + 1 cells [n, 3] of the cheapest way, and how many cells were expanded."""
+    """Returns the first `most` + 1 cells [n, 3] of the cheapest way, its cost, and how many cells were expanded."""
     shape, low, high = known.log_odds.shape, known.low, known.high
     count = shape[0] * shape[1] * shape[2]
     weights = np.zeros(count, np.float32)  # 0: not computed yet
@@ -225,7 +264,7 @@ def _search(known, source, target, most):
             j, k = divmod(rest, shape[2])
             cells[n, 0], cells[n, 1], cells[n, 2] = i, j, k
         at = parent[at]
-    return cells, expanded
+    return cells, costs[finish], expanded
 
 
 @numba.njit
@@ -253,7 +292,7 @@ def _heaviest(known, a, b):
 
 @numba.njit
 def _seen(known, points):
-    """Returns the length of the part of a way [N, 3] that is known to be free; both in cells."""
+    """Returns the length of the part of a way [N, 3] in which the body is known to be free; both in cells."""
     total = 0.0
     for leg in range(points.shape[0] - 1):
         a, b = points[leg], points[leg + 1]
@@ -264,7 +303,7 @@ def _seen(known, points):
             i, j, k = _cell_of(
                 known, a[0] + share * (b[0] - a[0]), a[1] + share * (b[1] - a[1]), a[2] + share * (b[2] - a[2])
             )
-            unseen = known.log_odds[i, j, k] == 0.0
+            unseen = _is_unknown_around(known, known.body, i, j, k)
             if unseen or _is_occupied_around(known, known.touch, i, j, k):
                 return total + length * n / steps
         total += length
