@@ -34,10 +34,9 @@ from edqn_jax.evaluation.metrics import summarise
 from edqn_jax.evaluation.rollouts import fly_on_all_devices
 from edqn_jax.learn import policy as acting
 from edqn_jax.learn.policy import Policy
-from edqn_jax.mapping import grid, pilot
+from edqn_jax.mapping import grid
 from edqn_jax.mapping.grid import MapConfig
-from edqn_jax.mapping.pilot import TUNED, Orders, Piloted, PilotConfig
-from edqn_jax.mapping.route import RouteConfig
+from edqn_jax.packages import MissingPackageError
 from edqn_jax.parallel.devices import use_cpu_devices
 from edqn_jax.planners.follow import FollowConfig
 from edqn_jax.report.growing_map import Moment, animate_growth, draw_growth
@@ -51,6 +50,14 @@ from edqn_jax.sim.outcomes import Outcome
 from edqn_jax.sim.scene import Scene, signed_distance, take_scene
 from edqn_jax.sim.sensor import mount_rotation, sensor_of
 from measurement import json_report
+
+try:
+    from edqn_jax.mapping import pilot
+    from edqn_jax.mapping.pilot import TUNED, Orders, PilotConfig, Piloted
+    from edqn_jax.mapping.route import RouteConfig
+except MissingPackageError as missing:
+    print(missing, file=sys.stderr)
+    sys.exit(2)
 
 Row = dict[str, Any]
 

@@ -99,9 +99,7 @@ def empty_grid(shape: tuple[int, int, int], volume: Array) -> Grid:
     return Grid(log_odds=jnp.zeros(shape), corner=jnp.asarray(volume)[0])
 
 
-def update(
-    config: MapConfig, camera: CameraConfig, grid: Grid, depth: Array, position: Array, rotation: Array
-) -> Grid:
+def update(config: MapConfig, camera: CameraConfig, grid: Grid, depth: Array, position: Array, rotation: Array) -> Grid:
     """Returns the grid with one more depth image.
 
     Args:

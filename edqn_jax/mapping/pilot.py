@@ -1,10 +1,10 @@
-"""The pilot that a drone engineer would build: sense, update the map, plan on it, follow the plan; every decision anew.
+"""The pilot that a drone engineer would build: sense, update the map, plan on it, follow the plan; each decision anew.
 
-It is given what a learned policy is given, one sensor, its own state, the goal and the fence, and no map. Distances come
-from the true depth of the policy's camera (an upper bound, as the sensor `depth` is one) or from what the decoder of the
-policy's event VAE draws of the events, so that pilot and policy see with the same encoder. Physics, episode limit and
-outcomes are those of every flight; commands are those of the follower of `planners.follow`, which plans on a true map
-are flown with.
+It is given what a learned policy is given, one sensor, its own state, the goal and the fence, and no map. Distances
+come from the true depth of the policy's camera (an upper bound, as the sensor `depth` is one) or from what the decoder
+of the policy's event VAE draws of the events, so that pilot and policy see with the same encoder. Physics, episode
+limit and outcomes are those of every flight, and commands those of the follower of `planners.follow`, which also flies
+plans on a true map.
 
 Drones fly side by side: what JAX computes is mapped over them, plans are computed on the host, one drone after another.
 """
@@ -335,9 +335,7 @@ def fly(
     check_can_decode(config, pilot)
     shape = grid_shape(pilot.map, world.pool.volume)
     begin, step = _programs(jax.devices()[0].platform)
-    scenes, goals, volumes = (
-        np.asarray(x) for x in (world.missions.scene, world.missions.goal, world.pool.volume)
-    )
+    scenes, goals, volumes = (np.asarray(x) for x in (world.missions.scene, world.missions.goal, world.pool.volume))
     count = len(scenes)
     keys = jax.vmap(functools.partial(jax.random.fold_in, key))(jnp.arange(count))
     flown, seconds = [], []

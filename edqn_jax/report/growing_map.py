@@ -1,4 +1,4 @@
-"""The map that grows, at several moments of a flight: free, occupied and unknown around the drone's height, its plan."""
+"""The map that grows, at several moments of a flight: what is known at the drone's height, and its plan."""
 
 from __future__ import annotations
 

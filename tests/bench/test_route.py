@@ -1,7 +1,8 @@
-"""A* on an occupancy grid: the cheapest way, held against Dijkstra's on the same weights, and what it does where none is."""
+"""A* on an occupancy grid: the cheapest way, held against Dijkstra's, and what it does where none is free."""
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 
 import numpy as np
@@ -16,7 +17,7 @@ from edqn_jax.mapping.route import OCCUPIED_WEIGHT, TOUCHED_WEIGHT, RouteConfig,
 CELL = 0.5
 VOLUME = np.array([[2.0, -1.0, 0.0], [8.0, 4.0, 3.0]])
 SHAPE = (12, 10, 6)
-OPEN = RouteConfig(fence_m=0.25, ahead_m=100.0)
+OPEN = RouteConfig(unknown_weight=1.0, fence_m=0.25, ahead_m=100.0)
 START, GOAL = np.array([2.75, 1.25, 1.25]), np.array([7.25, 1.25, 1.25])
 
 
@@ -28,8 +29,10 @@ def weights_of(config: RouteConfig, log_odds: np.ndarray) -> np.ndarray:
     """The weight of each cell, from its distance to each occupied one."""
     cells = np.stack(np.meshgrid(*map(np.arange, SHAPE), indexing="ij"), -1).reshape(-1, 3)
     occupied = cells[(log_odds > config.occupied_above).ravel()]
-    weight = np.where(log_odds.ravel() == 0.0, config.unknown_weight, 1.0)
+    unknown, weight = cells[(log_odds == 0.0).ravel()], np.ones(len(cells))
     for n, cell in enumerate(cells):
+        if CELL * np.linalg.norm(unknown - cell, axis=1).min(initial=np.inf) <= config.body_m:
+            weight[n] = config.unknown_weight
         apart = CELL * np.linalg.norm(occupied - cell, axis=1).min(initial=np.inf)
         if apart <= config.near_m:
             weight[n] = max(weight[n], config.near_weight)
@@ -98,7 +101,7 @@ def test_unknown_cells_are_free_unless_they_cost_something() -> None:
     log_odds[5:7, 2:8, 1:5] = 0.0
     straight = Router(OPEN, CELL, VOLUME).plan(log_odds, START, GOAL)
     np.testing.assert_allclose(straight.points, [START, GOAL])
-    dear = RouteConfig(fence_m=0.25, ahead_m=100.0, unknown_weight=20.0)
+    dear = dataclasses.replace(OPEN, unknown_weight=20.0)
     around = Router(dear, CELL, VOLUME).plan(log_odds, START, GOAL)
     assert cost_of(OPEN, log_odds, around.points) > cost_of(OPEN, log_odds, straight.points)
     assert cost_of(dear, log_odds, around.points) < cost_of(dear, log_odds, straight.points)
@@ -121,24 +124,27 @@ def test_a_drone_beside_an_obstacle_leaves_it_first() -> None:
 
 
 def test_only_the_next_part_is_returned() -> None:
-    route = Router(RouteConfig(ahead_m=2.0, fence_m=0.25), CELL, VOLUME).plan(free(), START, GOAL)
+    route = Router(dataclasses.replace(OPEN, ahead_m=2.0), CELL, VOLUME).plan(free(), START, GOAL)
     assert np.linalg.norm(route.points[-1] - START) == pytest.approx(2.0, abs=CELL)
 
 
-def test_what_is_seen_of_a_way_ends_at_the_first_cell_that_is_unknown_or_might_touch() -> None:
+def test_what_is_seen_of_a_way_ends_where_the_body_might_touch_what_is_unknown_or_occupied() -> None:
     router = Router(OPEN, CELL, VOLUME)
     way = np.array([START, GOAL])
     assert router.seen_m(free(), way) == pytest.approx(np.linalg.norm(GOAL - START))
     unknown = free()
-    unknown[6:] = 0.0  # from x = 5 on
-    assert router.seen_m(unknown, way) == pytest.approx(5.0 - START[0], abs=CELL / 2)
+    unknown[6:] = 0.0  # from x = 5 on, so from 4.5 on the body might touch it
+    assert router.seen_m(unknown, way) == pytest.approx(4.5 - START[0], abs=CELL / 2)
+    beside = free()
+    beside[6, 5] = 0.0  # one cell beside the way
+    assert router.seen_m(beside, way) == pytest.approx(5.0 - START[0], abs=CELL / 2)
     wall = free()
     wall[9, 4, 2] = 1.0  # its middle at x = 6.75, so cells from 6.75 - 0.75 on touch
     assert router.seen_m(wall, way) == pytest.approx(7.0 - OPEN.touch_m - START[0], abs=CELL)
 
 
 def test_a_way_keeps_its_distance_from_the_fence_except_at_the_goal() -> None:
-    router = Router(RouteConfig(fence_m=1.0, ahead_m=100.0), CELL, VOLUME)
+    router = Router(dataclasses.replace(OPEN, fence_m=1.0), CELL, VOLUME)
     log_odds = free()
     log_odds[6, 2:8, :4] = 1.0
     route = router.plan(log_odds, START, np.array([7.25, 1.25, 0.3]))
