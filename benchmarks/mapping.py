@@ -201,7 +201,7 @@ def decision_ms(policy: Policy, flown: PilotConfig, world: World, planning: np.n
     seen, memory = jax.tree.map(np.asarray, (seen, acting.empty_memory(config)))
     picture = np.full((config.camera.height, config.camera.width), 5.0, np.float32)
     position = np.asarray(world.missions.start)[0]
-    rotation = np.asarray(mount_rotation(config, jnp.array([1.0, 0.0, 0.0, 0.0])))
+    rotation = mount_rotation(config, jnp.array([1.0, 0.0, 0.0, 0.0]))
 
     @jax.jit
     def integrate(params: acting.PolicyParams, seen: env.Observation, memory: Any, picture: Any, known: grid.Grid):
@@ -227,7 +227,7 @@ def pilot_row(policy: Policy, flown: PilotConfig, world: World, batch: int, call
     radius, maps = policy.config.drone.body_radius_m, hindsight.finished()
     for mission in np.flatnonzero(flights.outcome == Outcome.COLLISION):
         scene = take_scene(world.pool, world.missions.scene[mission])
-        touched = flights.closest.position[mission]
+        touched = np.asarray(flights.closest.position[mission])
         had.append(what_the_map_had(maps[mission], flown.map.cell_m, scene, touched, radius))
     return {
         **figures(flights, decision_ms(policy, flown, world, planning, calls)),

@@ -222,7 +222,7 @@ def _search(known, source, target, most):
     start = (source[0] * shape[1] + source[1]) * shape[2] + source[2]
     finish = (target[0] * shape[1] + target[1]) * shape[2] + target[2]
     weights[start], costs[start], parent[start] = _weight(known, *source), 0.0, start
-    entries = [(0.0, 0.0, start)]  # estimate of the whole way, minus the cost so far, cell
+    entries: list = [(0.0, 0.0, start)]  # estimate of the whole way, minus the cost so far, cell
     expanded = 0
     while True:
         _, minus, at = heapq.heappop(entries)

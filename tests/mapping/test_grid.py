@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.spatial.transform import Rotation
 
 from edqn_jax.config import CameraConfig
 from edqn_jax.errors import ConfigError
@@ -30,6 +29,12 @@ def empty(config: MapConfig = CONFIG) -> Grid:
     return empty_grid(grid_shape(config, VOLUME), jnp.asarray(VOLUME, jnp.float32))
 
 
+def any_rotation(random: np.random.Generator) -> np.ndarray:
+    """A rotation [3, 3] in single precision."""
+    rotation, _ = np.linalg.qr(random.normal(size=(3, 3)))
+    return (rotation * np.sign(np.linalg.det(rotation))).astype(np.float32)
+
+
 def cell_at(point: tuple[float, float, float]) -> tuple[int, ...]:
     return tuple(np.floor((np.array(point) - VOLUME[0]) / CONFIG.cell_m).astype(int))
 
@@ -40,7 +45,7 @@ def test_the_cells_are_those_of_rays_walked_in_small_steps(seed: int, share: flo
     random = np.random.default_rng(seed)
     config = dataclasses.replace(CONFIG, free_share=share)
     # Single precision throughout, so that both begin with the same numbers.
-    rotation = Rotation.random(random_state=random).as_matrix().astype(np.float32)
+    rotation = any_rotation(random)
     position = random.uniform(VOLUME[0] + 0.1, VOLUME[1] - 0.1).astype(np.float32)
     depth = random.uniform(0.2, 6.0, (CAMERA.height, CAMERA.width)).astype(np.float32)
     depth[random.random(depth.shape) < 0.2] = np.inf
@@ -113,7 +118,7 @@ def test_drones_side_by_side_have_maps_of_their_own() -> None:
     random = np.random.default_rng(3)
     depth = random.uniform(0.5, 6.0, (3, CAMERA.height, CAMERA.width)).astype(np.float32)
     position = random.uniform(VOLUME[0], VOLUME[1], (3, 3)).astype(np.float32)
-    rotation = Rotation.random(3, random_state=random).as_matrix().astype(np.float32)
+    rotation = np.stack([any_rotation(random) for _ in range(3)])
     one = functools.partial(update, CONFIG, CAMERA, empty())
     many = jax.jit(jax.vmap(one))(depth, position, rotation).log_odds
     for n in range(3):
