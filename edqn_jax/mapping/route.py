@@ -1,10 +1,14 @@
-"""A* on an occupancy grid, compiled with numba: the cheapest way over what is known, and how far of it has been seen.
+"""A* on an occupancy grid, compiled with numba: a cheap way over what is known, and how far of it has been seen.
 
 The cells are those of the grid and each has a weight, the cost of a metre through it: 1 where it is free, more where it
 is unknown or near an occupied one, and very much where the body might touch one. So there is always a way, also for a
 drone that a new obstacle has caught beside itself; a way through an obstacle is taken only where nothing else is left.
-Weights are computed for cells that the search reaches, and for no others. Search: Hart, Nilsson and Raphael 1968, with
-the lattice of `planners.astar_compiled`; the way is then shortened as all paths of A* are.
+Weights are computed for cells that the search reaches, and for no others. Search: Hart, Nilsson and Raphael 1968, on
+26 neighbours as the lattices of `planners`; the way is then shortened as all paths of A* are.
+
+Far away nearly all is unknown, so the rest of a way is estimated as if all of it were (Pohl's weighted A*, *Artificial
+Intelligence* 1, 1970): the way costs at most `unknown_weight`, or `MOST_GREED` if that is less, times what the cheapest
+one costs, and is the cheapest if the unknown costs nothing more. Estimated by free cells, a search would expand most of the volume.
 """
 
 from __future__ import annotations
@@ -27,6 +31,9 @@ OCCUPIED_WEIGHT = 1000.0
 
 TOUCHED_WEIGHT = 30.0
 """Weight of a cell in which the body might touch an occupied one: rather a detour of 30 m than a metre through it."""
+
+MOST_GREED = 1.5
+"""How many times what the cheapest way costs a way may cost at most."""
 
 _STEPS = (0.0, 1.0, math.sqrt(2.0), math.sqrt(3.0))  # cells between neighbours, by the number of axes moved along
 _TIE = 1e-6  # of entries of equal estimate the one nearest to the goal comes first
@@ -88,8 +95,8 @@ class Router:
         self._touch, self._near = _around(cell_m, 0.0, config.touch_m), _around(cell_m, config.touch_m, config.near_m)
         self._body = _around(cell_m, 0.0, config.body_m)
 
-    def cheapest(self, log_odds: np.ndarray, position: np.ndarray, goal: np.ndarray) -> tuple[np.ndarray, float, int]:
-        """Returns the cells [n, 3] of the next part of the cheapest way, the cost of all of it and cells expanded.
+    def cells(self, log_odds: np.ndarray, position: np.ndarray, goal: np.ndarray) -> tuple[np.ndarray, float, int]:
+        """Returns the cells [n, 3] of the next part of a way, the cost of all of it and cells expanded.
 
         Args:
             log_odds: [X, Y, Z] of the grid, of which cell (0, 0, 0) is in the volume's lower corner.
@@ -107,7 +114,7 @@ class Router:
         return _search(known, source, target, math.ceil(self.config.ahead_m / self.cell))
 
     def plan(self, log_odds: np.ndarray, position: np.ndarray, goal: np.ndarray) -> Route:
-        """Returns the next part of the cheapest way, shortened where the straight line is as good; as `cheapest`.
+        """Returns the next part of a way, shortened where the straight line is free; as `cells`.
 
         Args:
             log_odds: [X, Y, Z] of the grid.
@@ -115,7 +122,7 @@ class Router:
             goal: [3] metres.
         """
         cell, (lower, upper) = self.cell, self.volume
-        cells, _, expanded = self.cheapest(log_odds, position, goal)
+        cells, _, expanded = self.cells(log_odds, position, goal)
         points = np.clip(lower + cell * (cells + 0.5), lower, upper)
         points[0] = position
         if np.all(np.abs(points[-1] - goal) <= cell):  # the last cell is the goal's, or the nearest that a way may use
@@ -213,8 +220,9 @@ def _free_length(a, b, c):
 
 @numba.njit
 def _search(known, source, target, most):
-    """Returns the first `most` + 1 cells [n, 3] of the cheapest way, its cost, and how many cells were expanded."""
+    """Returns the first `most` + 1 cells [n, 3] of a way, its cost, and how many cells were expanded."""
     shape, low, high = known.log_odds.shape, known.low, known.high
+    greed = min(max(1.0, known.unknown_weight), MOST_GREED)
     count = shape[0] * shape[1] * shape[2]
     weights = np.zeros(count, np.float32)  # 0: not computed yet
     costs = np.empty(count)  # where there is a weight
@@ -249,7 +257,7 @@ def _search(known, source, target, most):
                     if cost >= costs[to] - 1e-9:
                         continue
                     costs[to], parent[to] = cost, at
-                    left = _free_length(abs(a - target[0]), abs(b - target[1]), abs(c - target[2]))
+                    left = greed * _free_length(abs(a - target[0]), abs(b - target[1]), abs(c - target[2]))
                     heapq.heappush(entries, (cost + left - _TIE * cost, -cost, to))
     length, at = 1, finish
     while at != start:
