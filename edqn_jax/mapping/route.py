@@ -8,7 +8,8 @@ Weights are computed for cells that the search reaches, and for no others. Searc
 
 Far away nearly all is unknown, so the rest of a way is estimated as if all of it were (Pohl's weighted A*, *Artificial
 Intelligence* 1, 1970): the way costs at most `unknown_weight`, or `MOST_GREED` if that is less, times what the cheapest
-one costs, and is the cheapest if the unknown costs nothing more. Estimated by free cells, a search would expand most of the volume.
+one costs, and is the cheapest if the unknown costs nothing more. Estimated by free cells, a search would expand most of
+the volume.
 """
 
 from __future__ import annotations
