@@ -84,8 +84,9 @@ TUNED = {
     "true": PilotConfig(depth="true"),
     "decoded": PilotConfig(
         depth="decoded",
-        map=MapConfig(cell_m=0.35, range_m=6.0, free_share=0.8, least=-0.8),
-        route=RouteConfig(touch_m=0.7, near_m=1.05),
+        map=MapConfig(cell_m=0.35, range_m=6.0, hit=0.5, least=-0.8, free_share=0.8),
+        route=RouteConfig(touch_m=0.7, near_m=1.4, near_weight=4.0, unknown_weight=1.2),
+        speed_m_s=2.5,
     ),
 }
 """By `PilotConfig.depth`, what flew best in validation worlds (docs/growing_map.md)."""

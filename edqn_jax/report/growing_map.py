@@ -101,7 +101,7 @@ def animate_growth(scene: Scene, cell_m: float, moments: Sequence[Moment], title
             figure.legend(handles=_legend(), loc="outside lower center", ncols=7, frameon=False, fontsize=7)
             canvas.draw()
             frames.append(Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3]))
-    return gif(frames, [FRAME_S] * (len(frames) - 1) + [LAST_FRAME_S], 64)
+    return gif(frames, [FRAME_S] * (len(frames) - 1) + [LAST_FRAME_S])
 
 
 def _draw_known(axes: Axes, scene: Scene, cell_m: float, moment: Moment) -> None:

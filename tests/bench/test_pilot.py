@@ -137,13 +137,18 @@ def test_the_follower_gets_points_at_its_spacing() -> None:
     np.testing.assert_allclose(points[71:], np.broadcast_to([3.0, 4.0, 1.0], (POINTS - 71, 3)))
 
 
-def test_the_command_never_exceeds_the_limit(course: World) -> None:
+def test_the_command_never_exceeds_the_limit_and_a_flight_that_is_over_stays_so(course: World) -> None:
     shape = pilot.grid_shape(TRUE.map, course.pool.volume)
     flying = pilot.at_rest(CONFIG, TRUE, shape, course, jnp.zeros((), jnp.int32), jax.random.key(0))
     points = pilot.sampled(np.array([[3.0, 10.0, 4.0], [9.0, 10.0, 4.0]]))
     step = jax.jit(functools.partial(pilot.decide, CONFIG, TRUE, course, params()))
     for _ in range(4):
         flying = step(jnp.zeros((), jnp.int32), flying, points, jnp.float32(1.5))
+    over = dataclasses.replace(flying.flights, outcome=jnp.int32(Outcome.GOAL))
+    ended = dataclasses.replace(flying, flights=over)
+    after = step(jnp.zeros((), jnp.int32), ended, points, jnp.float32(1.5))
+    np.testing.assert_array_equal(after.drone.position, flying.drone.position)  # a flight that is over stays so
+    assert int(after.flights.outcome) == Outcome.GOAL and int(after.flights.decisions) == int(over.decisions)
     # What a velocity loop overshoots is a few per cent.
     assert float(np.linalg.norm(flying.drone.velocity)) == pytest.approx(1.5, abs=0.1)
 
