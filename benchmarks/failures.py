@@ -28,11 +28,12 @@ from edqn_jax.parallel.devices import use_cpu_devices
 from edqn_jax.runs.files import check_can_write
 from edqn_jax.runs.policies import load_run
 from edqn_jax.sim import camera, sensor
+from edqn_jax.sim.distance import shape_distances, signed_distance
 from edqn_jax.sim.drone import Flight, yaw_of
 from edqn_jax.sim.events import EventField
 from edqn_jax.sim.flights import Flights
 from edqn_jax.sim.outcomes import Outcome
-from edqn_jax.sim.scene import KINDS, Scene, parked_shape, shape_distances, signed_distance
+from edqn_jax.sim.scene import KINDS, Scene, parked_like, scene_at
 from measurement import json_report
 
 NAMES = {
@@ -70,9 +71,9 @@ def what_was_hit(scene: Scene, point: np.ndarray, yaw: float) -> tuple[str, int,
 def alone(scene: Scene, kind: str, index: int) -> Scene:
     """Returns the scene with one shape; all others are parked."""
     shapes: dict[str, Any] = {}
-    for name, dataclass in KINDS.items():
+    for name in KINDS:
         kept = np.arange(getattr(scene, name).position.shape[0]) == (index if name == kind else -1)
-        away = parked_shape(dataclass)
+        away = parked_like(getattr(scene, name))
         shapes[name] = jax.tree.map(
             lambda own, none, kept=kept: jnp.where(kept.reshape(-1, *[1] * (own.ndim - 1)), own, none),
             getattr(scene, name),
@@ -92,7 +93,9 @@ def seen_of_it(config: Config, scene: Scene, only: Scene, poses: Flight) -> tupl
 
     def one(poses: Flight) -> tuple[jax.Array, jax.Array]:
         position, rotation = poses.position[-1], sensor.mount_rotation(config, poses.quaternion[-1])
-        whole, own = (camera.depth(config.camera, each, position, rotation) for each in (scene, only))
+        assert poses.time is not None
+        now = poses.time[-1]
+        whole, own = (camera.depth(config.camera, scene_at(each, now), position, rotation) for each in (scene, only))
         shows = jnp.isfinite(own) & (own < whole + SAME_M)
         key = jax.random.key(0)
         field, _ = sensor.sense(config, scene, poses, sensor.at_rest(config, key), key)
@@ -116,7 +119,8 @@ def poses_of(config: Config, position: np.ndarray, quaternion: np.ndarray, decis
     ends = np.maximum(np.arange(decisions - LOOK_BACK, decisions), 1) * n
     rows = np.maximum(ends[:, None] - n + np.asarray(sensor.frame_steps(config))[None] - 1, 0)
     at, turned = jnp.asarray(position[rows]), jnp.asarray(quaternion[rows])
-    return Flight(position=at, quaternion=turned, velocity=jnp.zeros_like(at))
+    time = jnp.asarray(config.drone.physics_dt_s * (rows + 1), jnp.float32)
+    return Flight(position=at, quaternion=turned, velocity=jnp.zeros_like(at), time=time)
 
 
 def look_back(config: Config, missions: MissionSet, flights: Flights, mission: int) -> dict[str, Any]:
@@ -128,7 +132,9 @@ def look_back(config: Config, missions: MissionSet, flights: Flights, mission: i
     before = position[-2] if steps > 1 else position[-1]
     point = before + float(flights.contact[mission]) * (position[-1] - before)
     scene = missions.scene(mission)
-    kind, index, side = what_was_hit(scene, point, float(yaw_of(jnp.asarray(quaternion[-1]))))
+    then = config.drone.physics_dt_s * (steps - 1 + float(flights.contact[mission]))
+    heading = float(yaw_of(jnp.asarray(quaternion[-1])))
+    kind, index, side = what_was_hit(scene_at(scene, jnp.float32(then)), point, heading)
     pixels, events = (
         np.asarray(values)
         for values in seen_of_it(

@@ -43,11 +43,12 @@ from edqn_jax.report.growing_map import Moment, animate_growth, draw_growth
 from edqn_jax.runs.files import check_can_write, write_atomically
 from edqn_jax.runs.policies import load_policy
 from edqn_jax.sim import drone, env, worlds
+from edqn_jax.sim.distance import signed_distance
 from edqn_jax.sim.env import World
 from edqn_jax.sim.flights import Flights
 from edqn_jax.sim.missions import own_missions
 from edqn_jax.sim.outcomes import Outcome
-from edqn_jax.sim.scene import Scene, signed_distance, take_scene
+from edqn_jax.sim.scene import Scene, take_scene
 from edqn_jax.sim.sensor import mount_rotation, sensor_of
 from measurement import json_report
 

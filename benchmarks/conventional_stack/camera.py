@@ -17,6 +17,7 @@ from edqn_jax.config import CameraConfig
 from edqn_jax.packages import require
 from edqn_jax.sim.events import LUMA_WEIGHTS
 from edqn_jax.sim.raycast import HORIZON_M, image_plane, pitch_of, sun_direction
+from edqn_jax.sim.sensor import DEPTH_SCALE, HALF_NEAR_M
 from edqn_jax.sim.texture import WAVES
 
 numba = require("numba")
@@ -146,3 +147,16 @@ def shade(geoms, optics, pose, hits, luma):
                 phase = kx * ox + ky * oy + kz * oz + t * along
                 total += optics.weights[k] * _box_filter(right) * _box_filter(up) * _wave(phase)
             luma[m, p] = bright * total
+
+
+@numba.njit(cache=True, error_model="numpy", fastmath=True)
+def nearness(hits, label):
+    """Computes what `edqn_jax.sim.sensor.nearness_image` shows, of M frames from their ray hits, into `label` [M, P].
+
+    Of the metres along each ray, not along the optical axis; the sky is 0.
+    """
+    for m in range(len(label)):
+        for p in range(label.shape[1]):
+            dx, dy, dz = hits.ray[m, p, 0], hits.ray[m, p, 1], hits.ray[m, p, 2]
+            metres = hits.depth[m, p] * math.sqrt(dx * dx + dy * dy + dz * dz)
+            label[m, p] = DEPTH_SCALE / (1.0 + metres / HALF_NEAR_M) if hits.geom[m, p] >= 0 else 0.0

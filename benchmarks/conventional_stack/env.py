@@ -9,23 +9,24 @@ import numpy as np
 from conventional_stack.fleet import Course, Fleet, Record
 from edqn_jax.config import Config
 from edqn_jax.packages import require
-from edqn_jax.sim.env import OWN_SIZE
+from edqn_jax.sim.env import MOTION_SIZE, OWN_SIZE
 from edqn_jax.sim.moves import ACTIONS
 from edqn_jax.sim.outcomes import Outcome
 
 gymnasium = require("gymnasium")
 spaces = gymnasium.spaces
 
-_OWN_LIMIT = 1e3
-"""Bound of the own state, whose values are of order 1."""
+_LIMIT = 1e3
+"""Bound of own state and own motion, whose values are of order 1."""
 
 
 def observation_space(config: Config) -> Any:
-    """Returns the space of signed event counts [H, W] of the window before a decision and the own state [10]."""
+    """Returns the space of event counts [H, W] of the window before a decision, own state [10] and own motion [7]."""
     return spaces.Dict(
         {
             "events": spaces.Box(-127, 127, (config.camera.height, config.camera.width), np.int8),
-            "own": spaces.Box(-_OWN_LIMIT, _OWN_LIMIT, (OWN_SIZE,), np.float32),
+            "own": spaces.Box(-_LIMIT, _LIMIT, (OWN_SIZE,), np.float32),
+            "motion": spaces.Box(-_LIMIT, _LIMIT, (MOTION_SIZE,), np.float32),
         }
     )
 
@@ -65,4 +66,5 @@ class DroneEnv(gymnasium.Env):
         return self._observation(self.record.final_own), reward, terminated, truncated, {"outcome": outcome.name}
 
     def _observation(self, own: np.ndarray) -> dict[str, np.ndarray]:
-        return {"events": self.record.events[0].copy(), "own": own[0].copy()}
+        record = self.record
+        return {"events": record.events[0].copy(), "own": own[0].copy(), "motion": record.motion[0].copy()}

@@ -1,4 +1,4 @@
-"""N drones in one process: physics, outcome, rays, shading and events of all of them in compiled loops."""
+"""N drones in one process: physics, outcome, rays, shading, events and label of all of them in compiled loops."""
 
 from __future__ import annotations
 
@@ -14,8 +14,9 @@ from conventional_stack import camera, events, flight, task, world
 from conventional_stack.stopwatch import Stopwatch
 from edqn_jax.config import Config
 from edqn_jax.errors import ConfigError
-from edqn_jax.sim import env
-from edqn_jax.sim.env import OWN_SIZE
+from edqn_jax.learn.vae import needs_nearness
+from edqn_jax.sim import disturbances, env
+from edqn_jax.sim.env import MOTION_SIZE, OWN_SIZE
 from edqn_jax.sim.moves import ACTIONS
 from edqn_jax.sim.scene import take_scene
 from edqn_jax.sim.sensor import frame_steps
@@ -53,6 +54,8 @@ class Record:
 
     action: np.ndarray  # [N] int64 of the next step
     events: np.ndarray  # [N, H, W] int8 signed counts of the window before the next decision
+    motion: np.ndarray  # [N, 7] float32 at the end of that window, see `edqn_jax.sim.env.own_motion`
+    nearness: np.ndarray  # [N, H, W] float32 at the end of that window, if the VAE must draw it; otherwise [N, 0, 0]
     own: np.ndarray  # [N, 10] float32 see `edqn_jax.sim.env.own_state`
     final_own: np.ndarray  # [N, 10] float32 the same before drones whose episode ended were reset
     reward: np.ndarray  # [N] float32
@@ -61,9 +64,12 @@ class Record:
     @classmethod
     def shapes(cls, config: Config, drones: int) -> dict[str, tuple[tuple[int, ...], str]]:
         """Returns shape and type of every array."""
+        image = config.camera.height, config.camera.width
         return {
             "action": ((drones,), "i8"),
-            "events": ((drones, config.camera.height, config.camera.width), "i1"),
+            "events": ((drones, *image), "i1"),
+            "motion": ((drones, MOTION_SIZE), "f4"),
+            "nearness": ((drones, *(image if needs_nearness(config.encoder) else (0, 0))), "f4"),
             "own": ((drones, OWN_SIZE), "f4"),
             "final_own": ((drones, OWN_SIZE), "f4"),
             "reward": ((drones,), "f4"),
@@ -99,6 +105,11 @@ def check(config: Config) -> None:
     if config.env.reward == "geodesic":
         raise ConfigError(
             "the conventional stack supports only rewards of straight metres; set env.reward to 'progress'"
+        )
+    if disturbances.any_on(config):
+        raise ConfigError(
+            "the conventional stack supports only undisturbed flights; leave air, body, motors, noise and "
+            "env.action_delay as they are"
         )
 
 
@@ -140,6 +151,7 @@ class Fleet:
         self.hits = [camera.Hits.empty(block, pixels) for _ in self.frames]
         self.luma = np.zeros((2, block, pixels))
         self.counts = record.events.reshape(drones, pixels)
+        self.label = record.nearness.reshape(drones, pixels) if needs_nearness(config.encoder) else None
 
     def begin(self, drone: int, mission: int | None = None) -> None:
         """Puts a drone at rest at the start of a mission, facing its goal; draws the mission if None."""
@@ -158,7 +170,7 @@ class Fleet:
         """Starts the given or drawn mission for every drone, without events, because the drones are at rest."""
         for drone in range(len(self.goal)):
             self.begin(drone, None if missions is None else missions[drone])
-        self.record.events[:] = 0
+        self.record.events[:], self.record.motion[:] = 0, 0.0
         self.write_own_states()
 
     def step(self, restart: bool = True) -> None:
@@ -179,9 +191,10 @@ class Fleet:
                 self.end_step, self.contact,
             )  # fmt: skip
             self._write_own_states(record.final_own)
+            task.own_motion(ACTIONS, record.action, record.final_own, self.state, record.motion)
         for first in range(0, len(self.goal), _BLOCK):
             drones = slice(first, min(first + _BLOCK, len(self.goal)))
-            self._render_events(drones)
+            self._render(drones)
         with self.stopwatch.time("outcome"):
             if restart:
                 for drone in np.flatnonzero(record.outcome):
@@ -195,8 +208,8 @@ class Fleet:
     def _write_own_states(self, own: NDArray[np.float32]) -> None:
         task.own_state(self.world.geoms, self.rules, self.goal, self.state, own)
 
-    def _render_events(self, drones: slice) -> None:
-        """Computes the events of some drones."""
+    def _render(self, drones: slice) -> None:
+        """Computes the events of some drones, and the label of the newest frame."""
         world, count = self.world, drones.stop - drones.start
         poses, luma = self.poses[:, :count], self.luma[:, :count]
         hits = [frame.first(count) for frame in self.hits]
@@ -207,5 +220,7 @@ class Fleet:
         with self.stopwatch.time("shading"):
             for at in range(2):
                 camera.shade(world.geoms, self.optics, poses[at], hits[at], luma[at])
+            if self.label is not None:
+                camera.nearness(hits[1], self.label[drones])
         with self.stopwatch.time("events"):
             events.signed_counts(self.law, luma[0], luma[1], self.counts[drones])

@@ -17,8 +17,8 @@ from edqn_jax.sim.flights import Closest, Flights
 
 numba = require("numba")
 
-Act = Callable[[NDArray[np.int8], NDArray[np.float32]], NDArray[np.int64]]
-"""Returns the actions [M] for event counts [M, H, W] and own states [M, 10]."""
+Act = Callable[[NDArray[np.int8], NDArray[np.float32], NDArray[np.float32]], NDArray[np.int64]]
+"""Returns the actions [M] for event counts [M, H, W], own states [M, 10] and own motions [M, 7]."""
 
 
 def fly_missions(config: Config, course: Course, act: Act) -> Flights:
@@ -41,7 +41,7 @@ def fly_missions(config: Config, course: Course, act: Act) -> Flights:
     episode_return, length, seconds = np.zeros((3, missions))
     contact = np.ones(missions)
     while np.any(running := outcome == RUNNING):
-        record.action[:] = act(record.events, record.own)
+        record.action[:] = act(record.events, record.own, record.motion)
         fleet.step()
         _tally(geoms, radius, dt, running, fleet.path, fleet.end_step, fleet.contact, length, seconds, nearest)
         decisions += running

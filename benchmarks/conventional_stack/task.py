@@ -1,4 +1,4 @@
-"""Outcome, reward and own state of a decision, as `edqn_jax/sim/env.py` defines them, in numba."""
+"""Outcome, reward, own state and own motion of a decision, as `edqn_jax/sim/env.py` defines them, in numba."""
 
 from __future__ import annotations
 
@@ -8,9 +8,10 @@ from typing import NamedTuple
 import mujoco
 import numpy as np
 
-from conventional_stack.flight import wrap_angle
+from conventional_stack.flight import clip, wrap_angle
 from edqn_jax.config import Config
 from edqn_jax.packages import require
+from edqn_jax.sim.env import MOST_YAW_RATE
 from edqn_jax.sim.outcomes import Outcome
 
 numba = require("numba")
@@ -28,7 +29,7 @@ _PLANE, _SPHERE, _CAPSULE, _CYLINDER = (
 )
 
 _SAMPLES = 8
-"""Points at which a segment is checked, as in `scene.segment_contact`."""
+"""Points at which a segment is checked, as in `distance.segment_contact`."""
 
 _REWARDS = ("sparse", "progress", "potential")
 
@@ -211,3 +212,22 @@ def own_state(geoms, rules, goal, state, own):
             own[i, 4 + axis] = 2 * (state[i, axis] - lower) / (upper - lower) - 1
         vx, vy, vz = state[i, 7] / rules.speed, state[i, 8] / rules.speed, state[i, 9] / rules.speed
         own[i, 7], own[i, 8], own[i, 9] = cos * vx + sin * vy, cos * vy - sin * vx, vz
+
+
+@numba.njit(cache=True, error_model="numpy")
+def own_motion(moves, action, own, state, motion):
+    """Computes the drones' own motions as `edqn_jax.sim.env.own_motion`, into `motion` [N, 7].
+
+    Args:
+        moves: [27, 3] the vectors of the moves.
+        action: [N] the moves that were flown.
+        own: [N, 10] own states, which hold the velocity.
+        state: [N, 13].
+    """
+    for i in range(len(state)):
+        w, x, y, z = state[i, 3], state[i, 4], state[i, 5], state[i, 6]
+        p, q, r = state[i, 10], state[i, 11], state[i, 12]
+        turn = w * (w * r + x * q - y * p) + z * (x * p + y * q + z * r)
+        motion[i, :3] = own[i, 7:]
+        motion[i, 3] = clip(turn / max(w * w + z * z, 1e-9), -MOST_YAW_RATE, MOST_YAW_RATE)
+        motion[i, 4:] = moves[action[i]]

@@ -21,11 +21,12 @@ from numpy.typing import NDArray
 from conventional_stack.fleet import Course
 from conventional_stack.flights import fly_missions
 from conventional_stack.stopwatch import Stopwatch
-from conventional_stack.vae import EventVAE, Learner, images
+from conventional_stack.vae import EventVAE, Learner
 from conventional_stack.vec_env import CodedDrones, observed
 from conventional_stack.workers import SpreadFleet
-from edqn_jax.config import AgentConfig, Config
+from edqn_jax.config import Config
 from edqn_jax.errors import ConfigError
+from edqn_jax.learn.patch_encoder import is_recurrent
 from edqn_jax.learn.plan import Plan
 from edqn_jax.packages import require
 from edqn_jax.sim.flights import Flights
@@ -62,9 +63,10 @@ class Trained:
     seconds: float
     """Time of these decisions, without the start of processes."""
 
-    def act(self, events: NDArray[np.int8], own: NDArray[np.float32]) -> NDArray[np.int64]:
-        """Returns the best actions [M] for event counts [M, H, W] and own states [M, 10]."""
-        observation = torch.from_numpy(observed(self.config, self.vae.code(images(events)), own))
+    def act(self, events: NDArray[np.int8], own: NDArray[np.float32], motion: NDArray[np.float32]) -> NDArray[np.int64]:
+        """Returns the best actions [M] for event counts [M, H, W], own states [M, 10] and own motions [M, 7]."""
+        code = self.vae.code(self.vae.patches(events), motion)
+        observation = torch.from_numpy(observed(self.config, code, own))
         with torch.inference_mode():
             return self.q(observation).argmax(dim=1).numpy()
 
@@ -105,12 +107,18 @@ def fly(trained: Trained, course: Course) -> Flights:
     return fly_missions(trained.config, course, trained.act)
 
 
-def check(config: AgentConfig) -> None:
-    """Raises ConfigError if stable-baselines3's DQN does not support the configuration."""
-    if config.history != 1 or config.layer_norm or config.huber_delta != 1.0 or config.exploration_episodes > 0:
+def check(config: Config) -> None:
+    """Raises ConfigError if stable-baselines3's DQN or the VAE does not support the configuration."""
+    agent = config.agent
+    unknown = agent.layer_norm or agent.last_move or agent.exploration_episodes > 0
+    if agent.history != 1 or agent.huber_delta != 1.0 or unknown:
         raise ConfigError(
-            "the conventional stack's DQN supports only agent.history 1, agent.layer_norm False, agent.huber_delta 1 "
-            "and agent.exploration_episodes 0"
+            "the conventional stack's DQN supports only agent.history 1, agent.layer_norm False, agent.last_move "
+            "False, agent.huber_delta 1 and agent.exploration_episodes 0"
+        )
+    if config.encoder.architecture != "patches" or is_recurrent(config.encoder):
+        raise ConfigError(
+            "the conventional stack's VAE supports only encoder.architecture 'patches' and encoder.sequence_decisions 1"
         )
 
 
@@ -145,7 +153,7 @@ class Training:
             ValueError: if the number of drones is not a multiple of the number of processes.
         """
         agent, drones = config.agent, config.train.num_envs
-        check(agent)
+        check(config)
         self.config, self.threads, self.plan = config, threads, Plan.of(config)
         self.warm, self.seconds = 0, 0.0
         fleet = SpreadFleet(config, course, drones, processes, config.train.seed)

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from conventional_stack.vae import Learner, images
+from conventional_stack.vae import Learner
 from conventional_stack.workers import SpreadFleet
 from edqn_jax.config import Config
 from edqn_jax.packages import require
@@ -49,8 +49,8 @@ class CodedDrones(vec_env.VecEnv):
     def reset(self) -> np.ndarray:
         """Starts new missions and returns the observations [N, code_size + 10]."""
         self.fleet.reset()
-        record = self.fleet.record
-        return observed(self.config, self.learner.code(images(record.events)), record.own)
+        record, vae = self.fleet.record, self.learner.acting
+        return observed(self.config, vae.code(vae.patches(record.events), record.motion), record.own)
 
     def step_async(self, actions: np.ndarray) -> None:
         """Sets the actions [N] of the next step."""
@@ -59,20 +59,22 @@ class CodedDrones(vec_env.VecEnv):
     def step_wait(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[dict[str, Any]]]:
         """Returns observations [N, code_size + 10], rewards [N] as scaled for learning, ends [N], infos."""
         self.fleet.step()
-        record = self.fleet.record
+        record, vae = self.fleet.record, self.learner.acting
         with self.stopwatch.time("encoder"):
-            image = images(record.events)
-            codes = self.learner.code(image)
-        with self.stopwatch.time("vae_update"):
-            for _ in range(self.updates):
-                self.learner.update(image)
+            patches = vae.patches(record.events)
+            codes = vae.code(patches, record.motion)
+        if self.updates:
+            with self.stopwatch.time("vae_update"):
+                wanted = vae.target(record.events, record.nearness)
+                for _ in range(self.updates):
+                    self.learner.update(patches, record.motion, wanted)
         observations = observed(self.config, codes, record.own)
         infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
         ended = np.flatnonzero(record.outcome)
         if len(ended):
             final = observed(self.config, codes[ended], record.final_own[ended])
-            # There are no events at the start of a mission.
-            nothing = self.learner.code(images(np.zeros_like(record.events[:1])))
+            # There are no events and no motion at the start of a mission.
+            nothing = vae.code(vae.patches(np.zeros_like(record.events[:1])), np.zeros_like(record.motion[:1]))
             observations[ended] = observed(self.config, nothing.repeat(len(ended), axis=0), record.own[ended])
             for i, last in zip(ended, final, strict=True):
                 timed_out = bool(record.outcome[i] == Outcome.TIME_OUT)

@@ -19,7 +19,7 @@ from edqn_jax.learn.plan import Plan
 from edqn_jax.learn.samples import Samples
 from edqn_jax.learn.trainer import AXIS, Actors, TrainState
 from edqn_jax.learn.updates import Learner
-from edqn_jax.sim import camera, columns, drone, env, events, sensor
+from edqn_jax.sim import camera, columns, drone, env, events, native, sensor
 from edqn_jax.sim.drone import DroneState
 from edqn_jax.sim.env import EnvState, World
 from edqn_jax.sim.scene import take_scene
@@ -154,7 +154,8 @@ def rendering(now: Moment) -> Part:
         jnp.stack([path[:, t - 1] for t in steps], 1)
         for path in (now.next_step.flight.position, now.next_step.flight.quaternion)
     ]
-    return Part("rendering", body, now.world, (*poses, now.scenes), by_hand=_drawing(now, *poses))
+    by_hand = _drawing(now, *poses)
+    return Part("rendering", body, now.world, (*poses, now.scenes), by_hand=by_hand, countable=by_hand is not None)
 
 
 def _drawing(now: Moment, position: Array, quaternion: Array) -> float | None:
@@ -162,10 +163,10 @@ def _drawing(now: Moment, position: Array, quaternion: Array) -> float | None:
 
     XLA counts the body of a loop once, and blocks of columns differ in the branch that draws them. So the operations of
     every branch are counted for one column, and the columns by the branch that they need. They cannot be counted on a
-    GPU and for cameras that do not draw by columns.
+    GPU, for cameras that do not draw by columns, and where the columns are drawn in C.
     """
     config = now.config.camera
-    if config.mount != "level":
+    if config.mount != "level" or native.can_draw(config, now.world.pool):
         return None
     times = position.shape[1]
     scene = jax.tree.map(

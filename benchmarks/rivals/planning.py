@@ -21,6 +21,7 @@ from edqn_jax.runs.provenance import workload
 from edqn_jax.sim import worlds
 from edqn_jax.sim.drone import load_airframe
 from edqn_jax.sim.mjcf import check_scene, load_world, resolve_world
+from edqn_jax.sim.moving_worlds import Moving
 from edqn_jax.sim.outcomes import Outcome
 from edqn_jax.sim.scene import Scene, take_scene
 from measurement import json_report
@@ -39,7 +40,7 @@ def judged_scenes(config: Config, count: int) -> list[Scene]:
     """
     name, radius = config.world.name, config.drone.body_radius_m
     if name in FAMILIES:
-        pool = jax.tree.map(np.asarray, worlds.random_pool(name, worlds.world_keys("test", count)))
+        pool = jax.tree.map(np.asarray, worlds.random_pool(name, worlds.world_keys("test", count), Moving.of(config)))
         return [take_scene(pool, index) for index in range(count)]
     loaded = load_world(resolve_world(name))
     check_scene(loaded.scene, radius, names=loaded.names, title=f"'{name}'")

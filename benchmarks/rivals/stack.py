@@ -18,7 +18,7 @@ from edqn_jax.config import Config
 from edqn_jax.evaluation.missions import run_missions
 from edqn_jax.parallel.devices import choose_devices, processor
 from edqn_jax.runs.provenance import workload
-from edqn_jax.sim.env import OWN_SIZE, World
+from edqn_jax.sim.env import MOTION_SIZE, OWN_SIZE, World
 from edqn_jax.sim.flights import Flights
 from measurement import json_report
 from measurement.peak_memory import peak_of_workers
@@ -84,7 +84,8 @@ class Stack:
     def _decision_seconds(self, trained: Any, calls: int) -> np.ndarray:
         """Returns the seconds [calls] of each decision of one drone, from arrays on the host to the action."""
         random, shape = np.random.default_rng(0), (1, self.config.camera.height, self.config.camera.width)
-        observation = random.integers(-2, 3, shape, dtype=np.int8), np.zeros((1, OWN_SIZE), np.float32)
+        own, motion = (np.zeros((1, size), np.float32) for size in (OWN_SIZE, MOTION_SIZE))
+        observation = random.integers(-2, 3, shape, dtype=np.int8), own, motion
         seconds = []
         for _ in range(calls + 1):
             began = time.perf_counter()

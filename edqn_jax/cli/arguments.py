@@ -8,7 +8,7 @@ import importlib.util
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Literal, TypeVar
+from typing import Annotated, Any, Literal, TypeVar
 
 import tyro
 from tyro.conf import Positional, arg
@@ -28,10 +28,11 @@ from edqn_jax.cli.help import (
     flag_of,
     show,
     show_train_help,
+    with_conditions,
 )
-from edqn_jax.config import FAMILIES, Config
+from edqn_jax.config import CONDITIONS, FAMILIES, Config
 from edqn_jax.config.limits import validate
-from edqn_jax.config.loading import resolve
+from edqn_jax.config.loading import Layer, resolve
 from edqn_jax.errors import ConfigError
 from edqn_jax.parallel.hardware import hardware
 from edqn_jax.parallel.launch import Distributed
@@ -105,7 +106,7 @@ class EvaluateArgs:
     """Folder of the run, or `pretrained`: the policy that comes with the package."""
     world: Annotated[str | None, arg(metavar="WORLD", help_behavior_hint="")] = None
     """Where to fly: `paper`, an MJCF file, or test worlds of a family (`sparse`, `medium`, `dense`, `rooms`, `forest`,
-    `canyon`, `open`, `mixed`). Default: where training was."""
+    `canyon`, `open`, `mixed`, `moving`). Default: where training was."""
     start: Annotated[Point | None, arg(metavar="X Y Z", help_behavior_hint="")] = None
     """Start of every mission, metres (default: the world's; random free ones with --missions)."""
     goal: Annotated[Point | None, arg(metavar="X Y Z", help_behavior_hint="")] = None
@@ -121,6 +122,8 @@ class EvaluateArgs:
     """Also write the metrics as JSON."""
     trajectories: Annotated[Path | None, arg(metavar="FILE.npz", help_behavior_hint="")] = None
     """Also write every flight, one pose per physics step."""
+    conditions: Annotated[Layer, tyro.conf.Fixed] = field(default_factory=dict)
+    """Options of `config.CONDITIONS` in place of the policy's own."""
 
 
 @dataclass(frozen=True)
@@ -324,10 +327,19 @@ def train_flags() -> set[str]:
     """Returns every flag of `edqn train`."""
     flags = {flag_of(option.name) for option in dataclasses.fields(TrainOptions)} | set(SHORT_NAMES) | {"--help-all"}
     for group in dataclasses.fields(Config):
-        for option in dataclasses.fields(getattr(Config(), group.name)):
-            names = [option.name, f"no-{option.name}"] if option.type == "bool" else [option.name]
-            flags |= {f"--{group.name}.{name.replace('_', '-')}" for name in names}
+        names = [option.name for option in dataclasses.fields(getattr(Config(), group.name))]
+        flags |= {flag for flag, _ in _named_by(group.name, names)}
     return flags
+
+
+def _named_by(group: str, names: Iterable[str]) -> list[tuple[str, str]]:
+    """Returns every flag of a group's options of these names, and which of the options it gives."""
+    kinds = {option.name: option.type for option in dataclasses.fields(getattr(Config(), group))}
+    return [
+        (f"--{group}.{no}{name.replace('_', '-')}", name)
+        for name in names
+        for no in (("", "no-") if kinds[name] == "bool" else ("",))
+    ]
 
 
 def _flags_of(kind: type) -> set[str]:
@@ -335,6 +347,7 @@ def _flags_of(kind: type) -> set[str]:
     return {
         flag_of(f"{no}{option.name}")
         for option in dataclasses.fields(kind)
+        if "tyro.conf.Fixed" not in str(option.type)
         for no in (("", "no_") if option.type == "bool" else ("",))
     }
 
@@ -368,7 +381,19 @@ def parse_evaluate(argv: Sequence[str]) -> EvaluateArgs:
         ConfigError: if one is out of its limits, or there is no such run.
         SystemExit: after printing, for --help and for arguments that do not parse.
     """
-    args = _parsed(EvaluateArgs, argv, EVALUATE)
+    kind = with_conditions(described(EvaluateArgs), CONDITIONS)
+    flags = {flag: (group, option) for group, names in CONDITIONS.items() for flag, option in _named_by(group, names)}
+    check_flags(argv, _flags_of(EvaluateArgs) | set(flags), EVALUATE)
+    if asks_for_help(argv):
+        show(kind, EVALUATE, ABOUT[EVALUATE])
+    parsed: Any = tyro.cli(kind, args=argv, prog=EVALUATE)
+    conditions: dict[str, dict[str, Any]] = {}
+    for word in argv:
+        group, option = flags.get(word.partition("=")[0].replace("_", "-"), ("", ""))
+        if group:
+            conditions.setdefault(group, {})[option] = getattr(getattr(parsed, group), option)
+    own = {name: value for name, value in vars(parsed).items() if name not in CONDITIONS}
+    args = EvaluateArgs(**own, conditions=conditions)
     if args.missions < 1:
         raise ConfigError(f"--missions must be at least 1, not {args.missions}")
     _check_run(args.run)

@@ -11,9 +11,9 @@ from typing import Literal
 import tyro
 
 from edqn_jax.cli.arguments import SHORT_NAMES, EvaluateArgs, RecordArgs, TrainOptions
-from edqn_jax.cli.help import all_of_train, described
+from edqn_jax.cli.help import all_of_train, described, with_conditions
 from edqn_jax.config.loading import make_config
-from edqn_jax.config.options import FAMILIES
+from edqn_jax.config.options import CONDITIONS, FAMILIES
 
 WORLDS = Literal[("paper", *FAMILIES)]  # pyright: ignore[reportInvalidTypeForm]
 """Worlds that have a name; others are files."""
@@ -47,6 +47,7 @@ def completion_script(shell: Literal["bash", "zsh", "fish"], kinds: Mapping[str,
         for name, kind in kinds.items()
         if name != "train"
     }
+    commands["evaluate"] = with_conditions(commands["evaluate"], CONDITIONS)
     commands = {"train": all_of_train(TrainOptions(), make_config(), SHORT_NAMES, worlds), **commands}
     written = io.StringIO()
     with contextlib.redirect_stdout(written), contextlib.suppress(SystemExit):

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
 from typing import Any
 
 from rich.console import Console
 from rich.table import Table
 
 from edqn_jax.cli.arguments import EvaluateArgs
+from edqn_jax.config.loading import Layer
 from edqn_jax.errors import ConfigError
 from edqn_jax.evaluation.evaluate import evaluate
 from edqn_jax.evaluation.latency import decision_latency_ms
@@ -41,6 +43,7 @@ def evaluate_command(args: EvaluateArgs) -> None:
         goal=args.goal,
         record=args.trajectories is not None,
         shuffle_codes=args.shuffle_codes,
+        conditions=args.conditions,
     )
     figures = {
         "run": str(args.run),
@@ -49,6 +52,7 @@ def evaluate_command(args: EvaluateArgs) -> None:
         "world": evaluation.missions.name,
         "seed": args.seed,
         "shuffled_codes": args.shuffle_codes,
+        "conditions": dict(_named(args.conditions)),
         **evaluation.figures,
         "decision_latency_ms": decision_latency_ms(policy.config, policy.params),
     }
@@ -60,6 +64,12 @@ def evaluate_command(args: EvaluateArgs) -> None:
         write_atomically(args.json, json.dumps(plain(figures), indent=2, allow_nan=False) + "\n")
     if args.trajectories is not None:
         write_trajectories(policy.config, evaluation.missions, evaluation.flights, args.trajectories)
+
+
+def _named(conditions: Layer) -> Iterator[tuple[str, Any]]:
+    for group, options in conditions.items():
+        for option, value in options.items():
+            yield f"{group}.{option}", value
 
 
 def report(figures: dict[str, Any]) -> Table:
@@ -74,6 +84,8 @@ def report(figures: dict[str, Any]) -> Table:
     table = Table(title=title, show_header=False, title_justify="left")
     table.add_column()
     table.add_column(justify="right")
+    for name, value in figures["conditions"].items():
+        table.add_row(name, str(value), end_section=name == list(figures["conditions"])[-1])
     table.add_row("all flights", "", style="bold")
     rate = f"{figures['successes']} of {figures['missions']} ({figures['success_rate']:.1%})"
     table.add_row("reached the goal", rate)

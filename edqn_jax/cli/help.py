@@ -6,7 +6,7 @@ import dataclasses
 import re
 import sys
 import typing
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import Annotated, Any, NoReturn
 
 import docstring_parser
@@ -35,8 +35,11 @@ Examples:
   edqn train --preset paper --world paper          Table 1 of the paper""",
     EVALUATE: """Fly a saved policy greedily on missions in any world and print metrics.
 
+Options with a group, such as --air.gusts-m-s, disturb the flights; without them they are as in training.
+
 Examples:
   edqn evaluate pretrained --world dense --missions 100
+  edqn evaluate pretrained --world medium --missions 300 --air.gusts-m-s 5
   edqn evaluate runs/DIR --world mine.xml --start 2 2 3 --goal 40 30 6 --json figures.json""",
     RECORD: """Fly a saved run once and write the flight as a GIF or MP4, or the events of a camera that watches it.
 
@@ -74,7 +77,7 @@ Examples:
 
 COMMON = {
     "world.name": "where to train: paper, an MJCF file, or random worlds: sparse, medium, dense, open, rooms, forest, "
-    "canyon, mixed",
+    "canyon, mixed, moving",
     "world.flown": "world of the last flight of a run in random worlds",
     "run_dir": "folder of the run (default: a new, dated one under runs/)",
     "resume": "what to do with a run in --run-dir",
@@ -153,6 +156,22 @@ def all_of_train(
     return dataclasses.make_dataclass("Train", groups)
 
 
+def with_conditions(kind: type, conditions: Mapping[str, Collection[str]]) -> type:
+    """Returns a dataclass of arguments and, by group, of options that may be given in place of a policy's own.
+
+    Args:
+        kind: the arguments, as `described` returns them.
+        conditions: names of these options by group.
+    """
+    config = Config()
+    groups = [
+        _nested(name, described(type(group), group, f"{name}.", only=options), name)
+        for name, options in conditions.items()
+        for group in (getattr(config, name),)
+    ]
+    return dataclasses.make_dataclass(kind.__name__, groups, bases=(kind,), namespace={"__doc__": kind.__doc__})
+
+
 def show(kind: type, command: str, about: str) -> NoReturn:
     """Prints the help of a dataclass of options and exits."""
     tyro.cli(kind, args=["--help"], prog=command, description=about)
@@ -165,8 +184,11 @@ def described(
     group: str = "",
     short_names: Mapping[str, str] | None = None,
     kinds: Mapping[str, Any] | None = None,
+    only: Collection[str] | None = None,
 ) -> type:
     """Returns a dataclass with the fields of another one, each with its whole help text in flowing lines.
+
+    Fields that no flag gives are left out.
 
     Args:
         kind: a dataclass with a string below each field.
@@ -174,15 +196,22 @@ def described(
         group: of the options, with a dot at its end.
         short_names: short flags, which become second names of the long ones that they stand for.
         kinds: types that options have instead of their own, by group and name.
+        only: names of the fields to take, whose defaults are left unsaid; None takes all.
     """
     short = {long: short for short, long in (short_names or {}).items()}
     hints = typing.get_type_hints(kind, include_extras=True)
     texts = {text.arg_name: text.description or "" for text in docstring_parser.parse_from_object(kind).params}
     fields = []
     for option in dataclasses.fields(kind):
+        if tyro.conf.Fixed in typing.get_args(hints[option.name]) or (only is not None and option.name not in only):
+            continue
         name = f"{group}{option.name}"
         alias = short.get(flag_of(name))
-        said = tyro.conf.arg(help=re.sub(r"\s+", " ", texts[option.name]), aliases=[alias] if alias else None)
+        said = tyro.conf.arg(
+            help=re.sub(r"\s+", " ", texts[option.name]),
+            aliases=[alias] if alias else None,
+            help_behavior_hint=None if only is None else "",
+        )
         default = option.default if instance is None else getattr(instance, option.name)
         hint = (kinds or {}).get(name, hints[option.name])
         fields.append((option.name, Annotated[hint, said], dataclasses.field(default=default)))

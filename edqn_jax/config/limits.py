@@ -9,12 +9,16 @@ from collections.abc import Iterable
 from edqn_jax.config.options import (
     FAMILIES,
     AgentConfig,
+    AirConfig,
+    BodyConfig,
     CameraConfig,
     Config,
     DroneConfig,
     EncoderConfig,
     EnvConfig,
     EventsConfig,
+    MotorsConfig,
+    NoiseConfig,
     TrainConfig,
     WorldConfig,
 )
@@ -32,6 +36,10 @@ def validate(config: Config) -> None:
     _camera(config.camera)
     _events(config.events, config.drone)
     _env(config.env)
+    _air(config.air)
+    _body(config.body)
+    _motors(config.motors)
+    _noise(config.noise)
     _encoder(config.encoder)
     _agent(config.agent)
     _train(config.train)
@@ -52,6 +60,19 @@ def _world(world: WorldConfig) -> None:
     _at_most(world, "world", ["pool_size", "missions"], 1_000_000)
     _share(world, "world", ["own_start_fraction"])
     _not_negative(world, "world", ["start_jitter_m"])
+    _share(world, "world", ["moving_share"])
+    _positive(world, "world", ["moving_speed_m_s", "ball_speed_m_s"])
+    _not_negative(world, "world", ["balls", "ball_gravity_m_s2"])
+    # A random start is free of what moves as fast as this for the first two seconds (`sim/free_points.py`).
+    _at_most(world, "world", ["moving_speed_m_s"], 5)
+    _at_most(world, "world", ["ball_speed_m_s"], 100)
+    _at_most(world, "world", ["balls"], 64)
+    if (world.moving_share or world.balls) and world.name not in FAMILIES:
+        option = "moving_share" if world.moving_share else "balls"
+        raise ConfigError(
+            f"world.{option} is for random worlds ({', '.join(FAMILIES)}) alone; in '{world.name}' the file says what "
+            f"moves: give --world.{option.replace('_', '-')} 0"
+        )
     if not world.name:
         raise ConfigError("world.name must be the name of a world, not empty")
     if world.flown and world.name not in FAMILIES:
@@ -108,6 +129,28 @@ def _env(env: EnvConfig) -> None:
     known = env.heading == "goal" or not env.position
     _require(known, "env.position", "false with env.heading flight", env.position)
     _finite(env, "env", ["goal_reward", "collision_reward", "left_volume_reward", "step_reward"])
+    _require(env.action_delay in (0, 1), "env.action_delay", "0 or 1", env.action_delay)
+
+
+def _air(air: AirConfig) -> None:
+    _not_negative(air, "air", ["linear_drag_kg_s", "drag_area_m2"])
+    _within(air, "air", ["wind_m_s", "gusts_m_s"], 0.0, 100.0)
+    # What MIL-F-8785C has formulas for: 10 to 1000 feet.
+    _within(air, "air", ["gust_height_m"], 3.048, 304.8)
+    _within(air, "air", ["gust_airspeed_m_s"], 0.1, 100.0)
+
+
+def _body(body: BodyConfig) -> None:
+    _deviation(body, "body", ["mass_share", "inertia_share"])
+
+
+def _motors(motors: MotorsConfig) -> None:
+    _deviation(motors, "motors", ["gain_share"])
+    _not_negative(motors, "motors", ["lag_s"])
+
+
+def _noise(noise: NoiseConfig) -> None:
+    _not_negative(noise, "noise", ["position_m", "velocity_m_s", "position_bias_m", "velocity_bias_m_s"])
 
 
 def _encoder(encoder: EncoderConfig) -> None:
@@ -241,6 +284,13 @@ def _within(section: object, group: str, keys: Iterable[str], low: float, high: 
 
 def _share(section: object, group: str, keys: Iterable[str]) -> None:
     _within(section, group, keys, 0.0, 1.0)
+
+
+def _deviation(section: object, group: str, keys: Iterable[str]) -> None:
+    """Refuses deviations that could leave nothing of a positive number."""
+    for key in keys:
+        value = getattr(section, key)
+        _require(0 <= value < 1, f"{group}.{key}", "at least 0 and less than 1", value)
 
 
 def _finite(section: object, group: str, keys: Iterable[str]) -> None:

@@ -19,7 +19,7 @@ from typing import Any, Literal
 import yaml
 
 from edqn_jax.config.limits import shown, validate
-from edqn_jax.config.options import FAMILIES, WITH_DETOURS, Config
+from edqn_jax.config.options import CONDITIONS, FAMILIES, WITH_DETOURS, Config
 from edqn_jax.config.presets import preset as named_preset
 from edqn_jax.errors import ConfigError
 
@@ -220,6 +220,29 @@ def make_config(
     config = apply(resolve(preset, None if file is None else Path(file), world, tuned_for), groups, "make_config")
     validate(config)
     return config
+
+
+def flown_under(config: Config, conditions: Layer, source: str) -> Config:
+    """Returns the checked configuration of a policy that is flown under other conditions than it was trained under.
+
+    Args:
+        config: of the policy.
+        conditions: options of `CONDITIONS` by group.
+        source: of them, for messages.
+
+    Raises:
+        ConfigError: if there is no such option, it is none of `CONDITIONS`, or it is out of its limits.
+    """
+    changed = apply(config, conditions, source)
+    for group, options in conditions.items():
+        for option in options:
+            if option not in CONDITIONS.get(group, ()):
+                raise ConfigError(
+                    f"{source}: '{group}.{option}' is a policy's own; conditions are {', '.join(CONDITIONS)} "
+                    "(of env action_delay alone)"
+                )
+    validate(changed)
+    return changed
 
 
 def load_layer(file: Path) -> Layer:

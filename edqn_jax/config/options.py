@@ -6,7 +6,7 @@ worlds from files and a GPU change. The string under a field is its help text on
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from typing import Literal
 
 
@@ -16,7 +16,8 @@ class WorldConfig:
 
     name: str = "paper"
     """Where to train: `paper`, the path of an MJCF file, or random worlds: open ones (`sparse`, `medium`, `dense`, or
-    `open`: all three), closed ones (`rooms`, `forest`, `canyon`), or all six (`mixed`, a quarter of them open)."""
+    `open`: all three), closed ones (`rooms`, `forest`, `canyon`), all six (`mixed`, a quarter of them open), or medium
+    ones in which obstacles move (`moving`)."""
     flown: str = ""
     """World of the flight at the end of a run in random worlds: `paper` or the path of an MJCF file; training never
     uses it. Empty: the first test world. A world from a file is flown itself."""
@@ -28,6 +29,16 @@ class WorldConfig:
     """Share of training missions that begin within `start_jitter_m` of the world's own start."""
     start_jitter_m: float = 1.0
     """Half width of the box around the world's own start that such starts are drawn from, metres."""
+    moving_share: float = 0.0
+    """Share of the obstacles of random worlds that move; 0 is none, and one half in the worlds `moving`."""
+    moving_speed_m_s: float = 3.0
+    """Speed of the fastest of them, m/s; each has its own, of at least 0.3 times this."""
+    balls: int = 0
+    """Balls in each random world that are thrown at where a drone would be that flies straight to its goal."""
+    ball_speed_m_s: float = 6.0
+    """Speed of these balls, m/s."""
+    ball_gravity_m_s2: float = 0.0
+    """Gravity that bends their way, m/s^2; at 0 they fly straight."""
 
 
 @dataclass(frozen=True)
@@ -138,16 +149,21 @@ class EventsConfig:
 class EnvConfig:
     """The task: sensor, actions, outcomes, reward."""
 
-    sensor: Literal["events", "frames", "frame-pair", "event-image", "blind", "depth", "ranges"] = "events"
+    sensor: Literal["events", "frames", "frame-pair", "event-image", "blind", "depth", "depth-motion", "ranges"] = (
+        "events"
+    )
     """What the drone observes besides its own state. `events`: the event camera. For comparison, `frames`: the newest
     brightness frame; `frame-pair`: the frames that the events would be made of; `event-image`: an image of the events
-    without a VAE; `blind`: nothing; `depth`: true depth; `ranges`: the true free distance along each move."""
+    without a VAE; `blind`: nothing; `depth`: true depth; `depth-motion`: that and how it changes by the obstacles' own
+    motion; `ranges`: the true free distance along each move."""
     speed_m_s: float = 4.0
     """Commanded speed per axis; an action is {-1, 0, 1}^3 times this, in the heading frame."""
     goal_radius_m: float = 2.0
     """Body centre within this distance of the goal, at any physics step, is success."""
     max_decisions: int = 200
     """Episode limit in decisions (the `threshold` of Table 1)."""
+    action_delay: int = 0
+    """Decisions between choosing a move and flying it: 0, or 1, with which the first decision of an episode hovers."""
     heading: Literal["goal", "flight"] = "goal"
     """Where the drone and its camera turn to. `goal`: towards the goal. `flight`: towards where a move flies;
     needs `position` to be false."""
@@ -172,6 +188,61 @@ class EnvConfig:
     """Reward for leaving the flight volume; Eq. 8 says 0, and the `paper` preset does too."""
     step_reward: float = -0.2
     """Reward of every decision; Eq. 8 says 0."""
+
+
+@dataclass(frozen=True)
+class AirConfig:
+    """Wind, gusts and drag. With wind, gusts and `drag` off there is no air."""
+
+    wind_m_s: float = 0.0
+    """Largest steady wind, m/s; an episode's is level, of a speed from 0 to this in any direction. 0 is off."""
+    gusts_m_s: float = 0.0
+    """Standard deviation of either horizontal component of the gusts, m/s (Dryden's model in MIL-F-8785C). 0 is off."""
+    gust_height_m: float = 10.0
+    """Height above ground whose gusts are flown in, metres; it sets their lengths and how strong vertical ones are."""
+    gust_airspeed_m_s: float = 5.0
+    """Speed at which gusts pass by, m/s; with their lengths it sets how quickly they change."""
+    drag: bool = False
+    """Drag in still air, too; wind and gusts bring it in any case."""
+    linear_drag_kg_s: float = 0.4
+    """Drag of the rotors per airspeed, newtons per m/s."""
+    drag_area_m2: float = 0.05
+    """Drag coefficient times area of the body, m^2, from any side; its drag grows with the square of the airspeed."""
+
+
+@dataclass(frozen=True)
+class BodyConfig:
+    """How the flown body differs from the airframe that the controller believes in, drawn for each episode."""
+
+    mass_share: float = 0.0
+    """Largest deviation of the mass, as a share of it; 0.2 is +-20 %. 0 is off."""
+    inertia_share: float = 0.0
+    """Largest deviation of the inertia, the same for all axes, as a share of it. 0 is off."""
+
+
+@dataclass(frozen=True)
+class MotorsConfig:
+    """How motors differ from ideal ones, drawn for each episode; the controller does not know of it."""
+
+    gain_share: float = 0.0
+    """Largest deviation of each rotor's thrust, as a share of it; 0.2 is +-20 %. 0 is off."""
+    lag_s: float = 0.0
+    """Largest time constant with which thrusts follow their commands, seconds; an episode's is from 0 to this, the same
+    for all rotors. 0 is off."""
+
+
+@dataclass(frozen=True)
+class NoiseConfig:
+    """Errors of what the drone knows of its own position and velocity; what it does is not changed by them."""
+
+    position_m: float = 0.0
+    """Standard deviation of the noise on each coordinate of the own position, metres, anew at each decision."""
+    velocity_m_s: float = 0.0
+    """Standard deviation of the noise on each coordinate of the own velocity, m/s, anew at each decision."""
+    position_bias_m: float = 0.0
+    """Standard deviation of an error of each coordinate of the own position, metres, that stays for an episode."""
+    velocity_bias_m_s: float = 0.0
+    """Standard deviation of an error of each coordinate of the own velocity, m/s, that stays for an episode."""
 
 
 @dataclass(frozen=True)
@@ -249,6 +320,8 @@ class AgentConfig:
     """Widths of the hidden layers."""
     history: int = 2
     """Observations in the Q-network's input, the newest included."""
+    last_move: bool = False
+    """Whether the Q-network also sees the last move that was chosen; with `env.action_delay` it is yet to be flown."""
     code_scale: float = 0.5
     """Factor on the code before the Q-network, so that it does not outweigh the own state."""
     layer_norm: bool = False
@@ -324,7 +397,7 @@ class TrainConfig:
     """Devices to use; 0 uses the largest number that divides the shards."""
     seed: int = 0
     """Random seed of the run."""
-    validation_every: int = 65_536
+    validation_every: int = 98_304
     """Decisions between validations, rounded up to whole chunks; 0 validates only at the end."""
     validation_missions: int = 128
     """Missions of each validation, and of the flights at the end, the first of which is in `world.flown`; in worlds
@@ -351,10 +424,23 @@ class Config:
     camera: CameraConfig = field(default_factory=CameraConfig)
     events: EventsConfig = field(default_factory=EventsConfig)
     env: EnvConfig = field(default_factory=EnvConfig)
+    air: AirConfig = field(default_factory=AirConfig)
+    body: BodyConfig = field(default_factory=BodyConfig)
+    motors: MotorsConfig = field(default_factory=MotorsConfig)
+    noise: NoiseConfig = field(default_factory=NoiseConfig)
     encoder: EncoderConfig = field(default_factory=EncoderConfig)
     agent: AgentConfig = field(default_factory=AgentConfig)
     train: TrainConfig = field(default_factory=TrainConfig)
 
+
+CONDITIONS: dict[str, tuple[str, ...]] = {
+    "env": ("action_delay",),
+    **{
+        group: tuple(option.name for option in fields(kind))
+        for group, kind in (("air", AirConfig), ("body", BodyConfig), ("motors", MotorsConfig), ("noise", NoiseConfig))
+    },
+}
+"""Options by group that a policy may be flown with other values of than it was trained with."""
 
 _OPEN = ("sparse", "medium", "dense")
 _CLOSED = ("rooms", "forest", "canyon")
@@ -363,7 +449,7 @@ MIXTURES: dict[str, dict[str, int]] = {
     "mixed": {**dict.fromkeys(_OPEN, 1), **dict.fromkeys(_CLOSED, 3)},
 }
 """Random worlds that are of one of several families, with their shares; a quarter of the mixed ones are open."""
-FAMILIES = (*_OPEN, *_CLOSED, *MIXTURES)
+FAMILIES = (*_OPEN, *_CLOSED, *MIXTURES, "moving")
 """Names of random worlds."""
 WITH_DETOURS = (*_CLOSED, "mixed")
 """Names of random worlds in which the straight line to the goal is seldom free."""

@@ -9,6 +9,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from edqn_jax.config.loading import Layer, flown_under
 from edqn_jax.errors import ConfigError
 from edqn_jax.evaluation.metrics import shortest_paths, summarise
 from edqn_jax.evaluation.missions import MissionSet, Point, load_missions
@@ -61,6 +62,7 @@ def evaluate(
     goal: Point | None = None,
     record: bool = False,
     shuffle_codes: bool = False,
+    conditions: Layer | None = None,
 ) -> Evaluation:
     """Flies a policy greedily, every mission once, and measures.
 
@@ -74,11 +76,14 @@ def evaluate(
         start, goal: of every mission, metres, in place of the world's.
         record: keep every pose.
         shuffle_codes: give each drone the observation of another one's sensor at each decision.
+        conditions: wind and other disturbances in place of the policy's own, by group, such as
+            `{"air": {"gusts_m_s": 5.0}}`; see `config.CONDITIONS`.
 
     Raises:
-        ConfigError: if there is no such world, the missions cannot be flown, or there is nothing to shuffle.
+        ConfigError: if there is no such world or condition, the missions cannot be flown, or there is nothing to
+            shuffle.
     """
-    config = policy.config
+    config = flown_under(policy.config, conditions or {}, "evaluate")
     if shuffle_codes:
         _check_can_shuffle(policy, missions)
     flown = load_missions(config, str(world or config.world.name), missions, seed, start, goal)

@@ -3,16 +3,24 @@
 Shares no code with the signed distance that training uses. A probe sphere of the body's radius is added to the
 world. Along the straight segments between physics steps it advances by the clearance that `mj_geomDistance`
 reports; no solid is nearer than that, so the search misses neither a thin wall between two steps nor a graze.
+
+Mocap bodies of which the file says how they move stand, at every point of the search, where they are at its time. The
+sphere then advances by the clearance less what the fastest of them may move meanwhile. Where they are is computed here
+from the words of the file, too, by other formulas than the simulator's.
 """
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import mujoco
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+
+from edqn_jax.sim.mjcf_motion import Said, as_ellipse, motions_of
 
 PROBE_NAME = "edqn_body_sphere"
 """Name of the sphere that is added to the world."""
@@ -23,6 +31,8 @@ HIDDEN_GROUP = 3
 _SHORTEST_ADVANCE_M = 1e-4  # a graze shorter than this is at most 4 nanometres deep for a 0.36 m sphere
 _DEPTH_SPACING_M = 5e-3
 _FARTHEST_M = 1e3
+_AWAY_M = 1e6
+_OUT_M = 1.0  # beyond the flight volume, and its radius, a ball is no more
 
 
 @dataclass(frozen=True)
@@ -41,6 +51,92 @@ class Contact:
     """Deepest overlap with any geom from then to the segment's end, metres."""
 
 
+Ends = tuple[ArrayLike, ArrayLike]
+"""Start and goal of a flight, [3] metres each: whom balls are thrown at."""
+
+
+@dataclass(frozen=True)
+class Moving:
+    """A mocap body that moves."""
+
+    mocap: int
+    """Its number among the mocap bodies."""
+    position: NDArray[np.float64]
+    """[3] at time 0, metres."""
+    said: Sequence[Said]
+    volume: NDArray[np.float64]
+    """[2, 3] between which it bounces where the file names no limits, and beyond which a ball is no more, metres."""
+    low: NDArray[np.float64]
+    """[3] metres from its position to the lowest point of its shapes, 0 or less."""
+    high: NDArray[np.float64]
+    """[3] metres to the highest point."""
+
+    def at(self, time: float, ends: Ends) -> NDArray[np.float64]:
+        """Returns where it is [3], metres; `_AWAY_M` away before a ball is launched and after it has flown out."""
+        place = self.position.copy()
+        for word, numbers in self.said:
+            if word == "throw":
+                return self._thrown(numbers, time, ends)
+            if word == "bounce":
+                low, high = self.volume[0] - self.low, self.volume[1] - self.high
+                if len(numbers) == 9:
+                    low, high = np.array(numbers[3:6]), np.array(numbers[6:9])
+                for axis in range(3):
+                    if numbers[axis]:
+                        one = self.position[axis], numbers[axis] * time, low[axis], high[axis]
+                        place[axis] += _bounced(*one) - self.position[axis]
+            else:
+                a, b, rate, phase = as_ellipse((word, numbers))
+                place += a * (math.cos(phase + rate * time) - math.cos(phase))
+                place += b * (math.sin(phase + rate * time) - math.sin(phase))
+        return place
+
+    def speed(self) -> float:
+        """Returns a bound of its speed, m/s."""
+        total = 0.0
+        for word, numbers in self.said:
+            if word == "bounce":
+                total += float(np.linalg.norm(numbers[:3]))
+            elif word != "throw":
+                a, b, rate, _ = as_ellipse((word, numbers))
+                total += abs(rate) * float(np.linalg.norm(np.stack([a, b]), ord=2))
+        return total
+
+    def _thrown(self, numbers: Sequence[float], time: float, ends: Ends) -> NDArray[np.float64]:
+        share, early, speed, bearing, elevation, gravity, pace = numbers
+        away = np.full(3, _AWAY_M)
+        start, goal = (np.asarray(end, np.float64) for end in ends)
+        length = float(np.linalg.norm(goal - start))
+        hit = max(share * length / pace, early)
+        if time <= hit - early:
+            return away
+        heading = math.atan2(goal[1] - start[1], goal[0] - start[0]) + math.radians(bearing)
+        up = math.radians(elevation)
+        from_there = np.array([math.cos(heading) * math.cos(up), math.sin(heading) * math.cos(up), math.sin(up)])
+        flown, aim = time - (hit - early), start + (goal - start) * min(1.0, pace * hit / length)
+        # From the point of launch, with what is thrown upwards for gravity to take back by the hit.
+        place = aim + speed * (early - flown) * from_there
+        place[2] += gravity * early / 2 * flown - gravity * flown**2 / 2
+        out = self.high[0] + _OUT_M
+        inside = np.all((place >= self.volume[0] - out) & (place <= self.volume[1] + out))
+        return place if inside else away
+
+    def throw_speed(self, seconds: float) -> float:
+        """Returns a bound of its speed as a ball within so many seconds of a flight, m/s; 0 if it is none."""
+        word, numbers = self.said[0]
+        return numbers[2] + abs(numbers[5]) * (numbers[1] / 2 + seconds) if word == "throw" else 0.0
+
+
+def _bounced(position: float, way: float, low: float, high: float) -> float:
+    """Returns where a point ends that runs `way` metres from `position` and turns back at `low` and `high`."""
+    while way:
+        wall = high if way > 0 else low
+        if abs(way) <= abs(wall - position):
+            return position + way
+        way, position = -(way - (wall - position)), wall
+    return position
+
+
 @dataclass(frozen=True)
 class Judge:
     """A compiled world with the probe sphere. Build it with `load_judge`, once per world."""
@@ -53,10 +149,18 @@ class Judge:
     """[N] geom numbers of the solids."""
     reach: NDArray[np.float64]
     """[N] radius of each solid's bounding sphere, metres; inf for planes."""
+    moving: tuple[Moving, ...] = ()
+    ends: Ends = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+    """Sites `start` and `goal` of the world."""
 
 
-def load_judge(world: str | Path | mujoco.MjSpec, radius: float) -> Judge:
+def load_judge(world: str | Path | mujoco.MjSpec, radius: float, volume: ArrayLike | None = None) -> Judge:
     """Returns the world of an MJCF file (or a spec) with a probe sphere of `radius` metres.
+
+    Args:
+        world: the world.
+        radius: of the body, metres.
+        volume: [2, 3] flight volume in which bodies bounce, metres; None is the world's site `volume`.
 
     Raises:
         ValueError: if the file is not MJCF, or the radius is not positive.
@@ -76,15 +180,65 @@ def load_judge(world: str | Path | mujoco.MjSpec, radius: float) -> Judge:
     solids = np.flatnonzero(solid)
     plane = model.geom_type[solids] == mujoco.mjtGeom.mjGEOM_PLANE
     reach = np.where(plane, np.inf, model.geom_rbound[solids])
-    return Judge(model=model, data=data, probe=probe, solids=solids, reach=reach)
+    moving = tuple(_moving(model, data, solids, volume))
+    start, goal = (np.array(data.site(n).xpos) if n in _sites(model) else np.zeros(3) for n in ("start", "goal"))
+    return Judge(model=model, data=data, probe=probe, solids=solids, reach=reach, moving=moving, ends=(start, goal))
 
 
-def clearance(judge: Judge, position: ArrayLike) -> tuple[float, str]:
+def _sites(model: mujoco.MjModel) -> list[str]:
+    return [model.site(i).name for i in range(model.nsite)]
+
+
+def _moving(
+    model: mujoco.MjModel, data: mujoco.MjData, solids: NDArray[np.int64], volume: ArrayLike | None
+) -> list[Moving]:
+    """Returns the bodies that move."""
+    said = motions_of(model, "the world")
+    if not said:
+        return []
+    if volume is None:
+        if "volume" not in _sites(model):
+            raise ValueError("a world that moves needs a site 'volume', or the volume that is given")
+        site = model.site("volume").id
+        volume = data.site_xpos[site] + np.array([[-1.0], [1.0]]) * model.site_size[site]
+    found = []
+    for body, words in said.items():
+        geoms = [int(geom) for geom in solids if model.body_rootid[model.geom_bodyid[geom]] == body]
+        place = np.array(data.xpos[body])
+        extents = np.stack([_extent(model, data, geom) for geom in geoms]) - place
+        low, high = extents[:, 0].min(0), extents[:, 1].max(0)
+        found.append(Moving(int(model.body_mocapid[body]), place, words, np.asarray(volume, np.float64), low, high))
+    return found
+
+
+def _extent(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> NDArray[np.float64]:
+    """Returns the corners [2, 3] of the axis-aligned box around a geom, by MuJoCo's support of it along each axis."""
+    turn, size = data.geom_xmat[geom].reshape(3, 3), model.geom_size[geom]
+    kind, up = mujoco.mjtGeom(model.geom_type[geom]), np.abs(turn[:, 2])
+    aside = np.sqrt(np.maximum(1.0 - up**2, 0.0))
+    match kind:
+        case mujoco.mjtGeom.mjGEOM_SPHERE:
+            reach = np.full(3, size[0])
+        case mujoco.mjtGeom.mjGEOM_CAPSULE:
+            reach = size[0] + up * size[1]
+        case mujoco.mjtGeom.mjGEOM_CYLINDER:
+            reach = up * size[1] + aside * size[0]
+        case _:
+            reach = np.abs(turn) @ size
+    return data.geom_xpos[geom] + np.array([[-1.0], [1.0]]) * reach
+
+
+def clearance(judge: Judge, position: ArrayLike, time: float = 0.0, ends: Ends | None = None) -> tuple[float, str]:
     """Returns the distance from the body sphere at `position` [3] to the nearest solid, and that solid's name.
 
-    Metres, negative where they overlap; inf and "" in an empty world.
+    Metres, negative where they overlap; inf and "" in an empty world. What moves is where it is at `time` seconds;
+    balls are thrown at a drone on its way between `ends`, by default the world's own.
     """
     data, radius = judge.data, judge.model.geom_size[judge.probe, 0]
+    for body in judge.moving:
+        data.mocap_pos[body.mocap] = body.at(time, judge.ends if ends is None else ends)
+    if judge.moving:
+        mujoco.mj_kinematics(judge.model, data)
     data.geom_xpos[judge.probe] = position
     centres = data.geom_xpos[judge.solids]
     at_least = np.linalg.norm(centres - data.geom_xpos[judge.probe], axis=1) - judge.reach - radius
@@ -101,18 +255,34 @@ def clearance(judge: Judge, position: ArrayLike) -> tuple[float, str]:
     return float(nearest), judge.model.geom(name).name or f"geom {name}"
 
 
-def replay_contact(judge: Judge, positions: ArrayLike) -> Contact | None:
+def fastest(judge: Judge, seconds: float) -> float:
+    """Returns a bound of the speed of everything that moves within so many seconds of a flight, m/s."""
+    return max((max(body.speed(), body.throw_speed(seconds)) for body in judge.moving), default=0.0)
+
+
+def replay_contact(
+    judge: Judge, positions: ArrayLike, step_s: float | None = None, ends: Ends | None = None
+) -> Contact | None:
     """Returns the first contact of the body sphere along the segments between `positions` [n, 3], n >= 2, or None.
 
-    Row 0 is the start of the flight, row k the position after physics step k, metres.
+    Args:
+        judge: of the world.
+        positions: row 0 is the start of the flight, row k the position after physics step k, metres.
+        step_s: seconds of a physics step; needed where something moves.
+        ends: as in `clearance`.
 
     Raises:
-        ValueError: if `positions` is not an array of at least two finite points.
+        ValueError: if `positions` is not an array of at least two finite points, or `step_s` is missing.
     """
+    if judge.moving and step_s is None:
+        raise ValueError("the world moves: the contact depends on the seconds of a physics step, step_s")
+    step_s = step_s or 0.0
     points = np.asarray(positions, dtype=np.float64)
     if points.ndim != 2 or points.shape[1] != 3 or len(points) < 2 or not np.isfinite(points).all():
         raise ValueError(f"positions must be finite metres of shape [n, 3] with n >= 2, not of shape {points.shape}")
-    steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
+    # The way of the body and of whatever comes to meet it.
+    steps = np.linalg.norm(np.diff(points, axis=0), axis=1) + fastest(judge, step_s * len(points)) * step_s
+    jumps = any(body.said[0][0] == "throw" for body in judge.moving)  # a ball may appear between two steps
     travelled = np.concatenate([[0.0], np.cumsum(steps)])
 
     def place(distance: float) -> tuple[int, float]:
@@ -125,17 +295,23 @@ def replay_contact(judge: Judge, positions: ArrayLike) -> Contact | None:
         segment, fraction = place(distance)
         return points[segment] + fraction * (points[segment + 1] - points[segment])
 
+    def gap_at(distance: float) -> tuple[float, str]:
+        segment, fraction = place(distance)
+        return clearance(judge, at(distance), step_s * (segment + fraction), ends)
+
     free, here, end = 0.0, 0.0, float(travelled[-1])
     while True:
-        gap, _ = clearance(judge, at(here))
+        gap, _ = gap_at(here)
         if gap <= 0.0:
             break
         if here >= end:
             return None
-        free, here = here, min(end, here + max(gap, _SHORTEST_ADVANCE_M))
+        ahead = travelled[min(place(here)[0] + 1, len(steps))] if jumps else end
+        ahead = max(ahead, here + _SHORTEST_ADVANCE_M)
+        free, here = here, min(end, ahead, here + max(gap, _SHORTEST_ADVANCE_M))
     while here - free > 1e-9:  # bisection; `free` never touches, `here` always does
         middle = 0.5 * (free + here)
-        if clearance(judge, at(middle))[0] > 0.0:
+        if gap_at(middle)[0] > 0.0:
             free = middle
         else:
             here = middle
@@ -148,6 +324,6 @@ def replay_contact(judge: Judge, positions: ArrayLike) -> Contact | None:
         segment=segment,
         fraction=float(fraction),
         position=(float(x), float(y), float(z)),
-        geom=clearance(judge, at(here))[1],
-        depth=max(0.0, -min(clearance(judge, at(sample))[0] for sample in samples)),
+        geom=gap_at(here)[1],
+        depth=max(0.0, -min(gap_at(sample)[0] for sample in samples)),
     )

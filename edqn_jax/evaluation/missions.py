@@ -17,10 +17,11 @@ from edqn_jax.planners.free_space import holds, reachable
 from edqn_jax.planners.lattice import CELL_M, lattice_shape
 from edqn_jax.random import run_streams
 from edqn_jax.sim import drone, worlds
-from edqn_jax.sim.env import World
+from edqn_jax.sim.env import World, scene_of
 from edqn_jax.sim.free_points import Cells, cells_of, free_point
 from edqn_jax.sim.missions import Missions, own_missions, random_missions, spread_missions
 from edqn_jax.sim.mjcf import check_scene, load_world, mjcf_of, resolve_world, widened
+from edqn_jax.sim.moving_worlds import Moving
 from edqn_jax.sim.reward import Reward
 from edqn_jax.sim.scene import Scene, stack_scenes, take_scene, with_equal_capacities
 
@@ -44,7 +45,7 @@ class MissionSet:
 
     def scene(self, mission: int = 0) -> Scene:
         """Returns the world of one mission."""
-        return take_scene(self.world.pool, self.world.missions.scene[mission])
+        return scene_of(self.world, jnp.asarray(mission))
 
     def rewarded_by(self, reward: Reward | None) -> MissionSet:
         """Returns the same missions with this reward; None is the configured one."""
@@ -122,9 +123,12 @@ def _random_run_missions(config: Config, training_key: jax.Array) -> RunMissions
     """
     name, flown, count = config.world.name, config.world.flown, config.train.validation_missions
     airframe = drone.load_airframe(config.drone)
-    training_pool = worlds.random_pool(name, worlds.world_keys("training", config.world.pool_size))
+    moving = Moving.of(config)
+    training_pool = worlds.random_pool(name, worlds.world_keys("training", config.world.pool_size), moving)
     training = _training_missions(training_pool, config, training_key)
-    validation, test = (worlds.random_pool(name, worlds.world_keys(split, count)) for split in ("validation", "test"))
+    validation, test = (
+        worlds.random_pool(name, worlds.world_keys(split, count), moving) for split in ("validation", "test")
+    )
     if flown:
         validation, test, own = with_equal_capacities([validation, test, _pool_of(flown, config)])
         test = _before(own, test)
@@ -152,7 +156,7 @@ def final_missions(config: Config, most: int) -> MissionSet:
         final = run_missions(config).final
         missions = jax.tree.map(lambda leaf: leaf[:count], final.world.missions)
         return dataclasses.replace(final, world=dataclasses.replace(final.world, missions=missions))
-    pool = worlds.random_pool(name, worlds.world_keys("test", count))
+    pool = worlds.random_pool(name, worlds.world_keys("test", count), Moving.of(config))
     if flown:
         pool, own = with_equal_capacities([pool, _pool_of(flown, config)])
         pool = _before(own, pool)
@@ -284,7 +288,7 @@ def load_missions(
 
 def _random_missions(config: Config, name: str, missions: int, seed: int, moved: dict[str, jax.Array]) -> MissionSet:
     """Returns one mission in each of `missions` test worlds."""
-    pool = worlds.random_pool(name, worlds.world_keys("test", missions, first=seed * missions))
+    pool = worlds.random_pool(name, worlds.world_keys("test", missions, first=seed * missions), Moving.of(config))
     if moved:
         many = {key: jnp.broadcast_to(value, (missions, 3)) for key, value in moved.items()}
         pool = dataclasses.replace(pool, **many)

@@ -22,7 +22,6 @@ from edqn_jax.sim import env
 from edqn_jax.sim.env import EnvState, Observation, Step, World
 from edqn_jax.sim.flights import Flights, Record, at_start, tally
 from edqn_jax.sim.outcomes import Outcome
-from edqn_jax.sim.scene import scene_at, take_scene
 
 
 @struct.dataclass
@@ -197,15 +196,13 @@ def _fly(
 
 def _at_start(config: Config, world: World, state: EnvState) -> Flights:
     """Returns the tallies of one flight before its first step."""
-    scene = scene_at(take_scene(world.pool, world.missions.scene[state.mission]), jnp.zeros(()))
-    return at_start(config, scene, state.drone)
+    return at_start(config, env.scene_of(world, state.mission), state.drone)
 
 
 def _tally(config: Config, world: World, flights: Flights, before: EnvState, step: Step) -> tuple[Flights, Array]:
     """Returns the tallies of one flight after a step, and the clearance [n] after each of its physics steps."""
     running = (flights.outcome == Outcome.RUNNING) & ~step.is_reset
-    time = before.decision * (config.drone.physics_steps * config.drone.physics_dt_s)
-    scene = scene_at(take_scene(world.pool, world.missions.scene[before.mission]), time)
+    scene = env.scene_of(world, before.mission)
     verdict = step.outcome, step.end_step, step.contact
     after, clearance = tally(config, scene, flights, before.drone.position, step.flight, *verdict)
     after = dataclasses.replace(after, episode_return=step.episode_return)

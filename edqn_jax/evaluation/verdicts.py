@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 
 from edqn_jax.config import Config
-from edqn_jax.evaluation.judge import Judge, load_judge, replay_contact
+from edqn_jax.evaluation.judge import Judge, fastest, load_judge, replay_contact
 from edqn_jax.evaluation.missions import MissionSet
 from edqn_jax.sim.flights import Flights
 from edqn_jax.sim.outcomes import Outcome
@@ -16,7 +16,7 @@ from edqn_jax.sim.outcomes import Outcome
 CONTACT_TOLERANCE_M = 0.01
 """Largest distance along the path between the two moments of one contact. `segment_contact` samples the distance
 seven times a segment and interpolates: it may miss a graze 0.1 mm deep, which at a grazing angle is
-sqrt(2 x 0.36 m x 0.1 mm) = 8.5 mm of path."""
+sqrt(2 x 0.36 m x 0.1 mm) = 8.5 mm of path. Where obstacles move, the path is that of body and obstacle together."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -31,7 +31,7 @@ class Agreement:
     found: float | None
     """Moment of the first contact that C MuJoCo finds; None if it finds none."""
     apart_m: float | None
-    """Metres of path between the two moments; None unless both exist."""
+    """Metres of path between the two moments, where obstacles move at most so many; None unless both exist."""
     touched: str
     """Name of the geom that C MuJoCo finds touched; empty without a contact."""
 
@@ -58,18 +58,20 @@ def check_verdicts(config: Config, missions: MissionSet, flights: Flights) -> li
         raise ValueError("the flights were not recorded; fly them with record=True")
     judges = judges_of(config, missions)
     flown = missions.world.missions
-    scenes, starts = np.asarray(flown.scene), np.asarray(flown.start)
+    scenes, starts, goals = np.asarray(flown.scene), np.asarray(flown.start), np.asarray(flown.goal)
+    step_s = config.drone.physics_dt_s
     positions = np.asarray(flights.record.position)
     outcomes, steps = np.asarray(flights.outcome), np.asarray(flights.physics_steps)
     results = []
     for i, (scene, outcome, count) in enumerate(zip(scenes, outcomes, steps, strict=True)):
         path = np.concatenate([starts[i][None], positions[i, :count]]).astype(np.float64)
-        contact = replay_contact(judges[scene], path)
+        contact = replay_contact(judges[scene], path, step_s, (starts[i], goals[i]))
         stated = count - 1 + float(flights.contact[i]) if outcome == Outcome.COLLISION else None
         found = None if contact is None else contact.segment + contact.fraction
         apart = None
         if stated is not None and found is not None:
-            travelled = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))])
+            steps_m = np.linalg.norm(np.diff(path, axis=0), axis=1) + fastest(judges[scene], step_s * count) * step_s
+            travelled = np.concatenate([[0.0], np.cumsum(steps_m)])
             apart = abs(float(np.diff(np.interp([stated, found], np.arange(count + 1), travelled))[0]))
         touched = "" if contact is None else contact.geom
         results.append(Agreement(i, Outcome(int(outcome)), stated, found, apart, touched))
@@ -78,4 +80,6 @@ def check_verdicts(config: Config, missions: MissionSet, flights: Flights) -> li
 
 def judges_of(config: Config, missions: MissionSet) -> list[Judge]:
     """Returns the worlds of missions in C MuJoCo, each with a probe of the drone's radius."""
-    return [load_judge(mujoco.MjSpec.from_string(text), config.drone.body_radius_m) for text in missions.mjcf()]
+    radius, volumes = config.drone.body_radius_m, np.asarray(missions.world.pool.volume)
+    specs = (mujoco.MjSpec.from_string(text) for text in missions.mjcf())
+    return [load_judge(spec, radius, volume) for spec, volume in zip(specs, volumes, strict=True)]

@@ -5,7 +5,6 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -60,7 +59,10 @@ def flight_recording(
 
 
 def _from_start(world: World, flown: Mapping[str, np.ndarray]) -> Flight:
-    """Returns the poses of a flight: at rest at the mission's start, facing the goal, then after each physics step."""
+    """Returns the poses of a flight: at rest at the mission's start, facing the goal, then after each physics step.
+
+    Each has its time.
+    """
     start, goal = (np.asarray(each[0], np.float64) for each in (world.missions.start, world.missions.goal))
     half = np.arctan2(goal[1] - start[1], goal[0] - start[0]) / 2
     first = {"position": start, "quaternion": [np.cos(half), 0.0, 0.0, np.sin(half)], "velocity": np.zeros(3)}
@@ -69,4 +71,5 @@ def _from_start(world: World, flown: Mapping[str, np.ndarray]) -> Flight:
         key: jnp.asarray(np.vstack([first[key], np.column_stack([flown[name] for name in names[key]])]), jnp.float32)
         for key in names
     }
-    return Flight(**jax.tree.map(jnp.asarray, columns))
+    time = jnp.asarray(np.concatenate([[0.0], flown["t"]]), jnp.float32)
+    return Flight(**columns, time=time)

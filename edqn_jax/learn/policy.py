@@ -20,6 +20,9 @@ from edqn_jax.sim.events import EventField
 from edqn_jax.sim.moves import ACTIONS
 from edqn_jax.sim.sensor import DEPTH_SCALE, Sensed, distance_of, sensor_of
 
+MOVE_SIZE = 3
+"""Values of the last move, which end the own motion (`sim.env.own_motion`)."""
+
 Memory = Array
 """[H, D] the newest observations as the network sees them, newest last; zeros before an episode began."""
 
@@ -33,8 +36,8 @@ class PolicyParams:
 
 
 def observation_size(config: Config) -> int:
-    """Returns D, the length of what is seen and the own state."""
-    return embedding.size(config) + OWN_SIZE
+    """Returns D, the length of what is seen, the last move where the Q-network sees it, and the own state."""
+    return embedding.size(config) + (MOVE_SIZE if config.agent.last_move else 0) + OWN_SIZE
 
 
 def fresh_policy(config: Config, seed: int = 0) -> PolicyParams:
@@ -58,9 +61,15 @@ def remember(memory: Memory, flat: Array) -> Memory:
 
 
 def flatten(config: Config, params: Params, memory: Memory, observation: Observation) -> Array:
-    """Returns [..., D]: what is seen, by default as a code, and own state of observations [...] after a memory."""
+    """Returns [..., D]: what is seen, by default as a code, and own state of observations [...] after a memory.
+
+    With `agent.last_move` the move, which stays as it is where own states are turned, stands between both.
+    """
     seen = embedding.embed(config, params, observation, memory[..., -1, : embedding.size(config)])
-    return observation.own if seen is None else jnp.concatenate([seen, observation.own], axis=-1)
+    parts = [] if seen is None else [seen]
+    if config.agent.last_move:
+        parts.append(observation.motion[..., -MOVE_SIZE:])
+    return jnp.concatenate([*parts, observation.own], axis=-1) if parts else observation.own
 
 
 def see(config: Config, params: Params, memory: Memory, observation: Observation) -> Memory:

@@ -30,6 +30,7 @@ from edqn_jax.config import EncoderConfig
 from edqn_jax.learn.code import EVENT_CHANNELS, CodeHead
 from edqn_jax.learn.waves import mirrored, polarities, wave_table
 from edqn_jax.sim.events import EventField
+from edqn_jax.sim.sine import sin_pi
 
 POSITION_OCTAVES = 4
 """Sine-cosine pairs per image axis in the positional encoding; the finest period is a quarter image."""
@@ -71,9 +72,9 @@ def temporal_sums(frequencies: int, field: EventField) -> list[Array | None]:
         half_turns = jnp.round(k * step)
         rest = k * step - half_turns
         small = jnp.abs(rest) < 1e-6
-        kernel = jnp.where(small, n, _sin_pi(n * rest) / _sin_pi(jnp.where(small, 0.5, rest)))
+        kernel = jnp.where(small, n, sin_pi(n * rest) / sin_pi(jnp.where(small, 0.5, rest)))
         middle = 2.0 * k * first + (n - 1.0) * (k * step + half_turns)
-        sums += [kernel * _sin_pi(middle + 0.5), kernel * _sin_pi(middle)]
+        sums += [kernel * sin_pi(middle + 0.5), kernel * sin_pi(middle)]
     return sums
 
 
@@ -96,15 +97,6 @@ def temporal_maxima(frequencies: int, field: EventField) -> list[Array]:
                 highest = jnp.maximum(highest, jnp.cos(2.0 * jnp.pi * (k * tau - peak)))
             maxima.append(highest)
     return maxima
-
-
-def _sin_pi(z: Array) -> Array:
-    """Returns `sin(pi z)` to 1e-7, exact at integers: a polynomial, three times as fast as XLA's sine on a CPU."""
-    turns = jnp.round(z)
-    x = jnp.pi * (z - turns)
-    y = x * x
-    series = 1.0 + y * (-1 / 6 + y * (1 / 120 + y * (-1 / 5040 + y * (1 / 362880 - y / 39916800))))
-    return x * series * (1.0 - 2.0 * (turns - 2.0 * jnp.floor(0.5 * turns)))
 
 
 def positional_encoding(x: Array, y: Array, width: int, height: int) -> Array:

@@ -28,8 +28,9 @@ from edqn_jax.learn.checked import CheckedChunk, one_by_one
 from edqn_jax.learn.plan import Plan
 from edqn_jax.learn.policy import PolicyParams, empty_memory, observation_size
 from edqn_jax.learn.samples import Samples
-from edqn_jax.learn.updates import Learner, all_sum, flat, init_learner, learn_to_act, learn_to_see
+from edqn_jax.learn.updates import Learner, flat, init_learner, learn_to_act, learn_to_see
 from edqn_jax.parallel import processes
+from edqn_jax.parallel.all_sum import all_sum
 from edqn_jax.parallel.devices import compiler_options
 from edqn_jax.random import run_streams
 from edqn_jax.sim import env
@@ -211,7 +212,7 @@ def train_step(
     rings = _keep(config, world, actors, flown, seen, step)
     spoilt = ~env.is_finite((learner.vae, learner.encoder, learner.q))
     vae_losses, learner = learn_to_see(config, axis, learner, rings, keys.vae, step)
-    q_losses, learner = learn_to_act(config, axis, learner, ring, time, keys.dqn, step)
+    q_losses, learner = learn_to_act(config, axis, learner, ring, time, keys.dqn, step, after=vae_losses.means[0])
     learner = _publish(config, learner, step)
     memory = _remember(config, learner, actors, seen, step)
 
@@ -230,15 +231,22 @@ def train_step(
         key=keys.next,
     )
     episodes = Episodes(outcome=outcome, length=shaped(seen.episode_length), episode_return=shaped(seen.episode_return))
-    shards = epsilon.shape[0]
+    mean, broken = all_sum(
+        (
+            jnp.mean(epsilon) * (epsilon.shape[0] / config.train.shards),
+            {name: jnp.sum(getattr(seen.broken, name), dtype=jnp.int32) for name in _OF_A_DECISION},
+        ),
+        axis,
+        after=q_losses.means[0],
+    )
     losses = Losses(
         q_loss=q_losses.means[0],
         mean_q=q_losses.means[1],
         reconstruction=vae_losses.means[0],
         kl=vae_losses.means[1],
-        epsilon=jnp.where(warming, 1.0, all_sum(jnp.mean(epsilon) * shards, axis) / config.train.shards),
+        epsilon=jnp.where(warming, 1.0, mean),
         health=Health(
-            **{name: all_sum(jnp.sum(getattr(seen.broken, name), dtype=jnp.int32), axis) for name in _OF_A_DECISION},
+            **broken,
             parameters=spoilt.astype(jnp.int32),
             loss=q_losses.broken[0] + vae_losses.broken[0],
             gradient=q_losses.broken[1] + vae_losses.broken[1],

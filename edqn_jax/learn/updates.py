@@ -22,6 +22,7 @@ from edqn_jax.learn.plan import Plan
 from edqn_jax.learn.policy import observation_size
 from edqn_jax.learn.qnetwork import Params
 from edqn_jax.learn.samples import Samples
+from edqn_jax.parallel.all_sum import all_sum
 from edqn_jax.random import split_each
 from edqn_jax.sim.env import is_finite
 from edqn_jax.sim.moves import ACTIONS
@@ -130,7 +131,8 @@ def learn_to_see(
         noise = jax.vmap(lambda key: jax.random.normal(key, shape))(noise_keys)
         batch, noise = jax.tree.map(_side_by_side, (batch, noise))
         gradient, parts = jax.grad(loss, has_aux=True)(learner.vae, batch, noise)
-        gradient, parts = all_sum((gradient, jax.tree.map(lambda x: jnp.mean(x) * part, parts)), axis)
+        found = gradient, jax.tree.map(lambda x: jnp.mean(x) * part, parts)
+        gradient, parts = all_sum(found, axis, after=0.0)
         change, optimiser = _vae_optimiser(config).update(gradient, learner.vae_optimiser, learner.vae)
         learner = dataclasses.replace(learner, vae=optax.apply_updates(learner.vae, change), vae_optimiser=optimiser)
         return learner, (parts.reconstruction, parts.kl, is_finite(gradient))
@@ -148,12 +150,20 @@ def learn_to_see(
 
 
 def learn_to_act(
-    config: Config, axis: str | None, learner: Learner, ring: replay.Rows, time: Array, keys: Array, step: Array
+    config: Config,
+    axis: str | None,
+    learner: Learner,
+    ring: replay.Rows,
+    time: Array,
+    keys: Array,
+    step: Array,
+    after: Array | float = 0.0,
 ) -> tuple[Learnt, Learner]:
     """Updates the DQN from the replay [S, L, E, ...] (steps 7-9); returns loss and mean Q, and the learner.
 
     Args:
         time: [] int32, of the newest row of the replay.
+        after: [] a result of the sum over the devices before these, see `all_sum`.
         axis, keys, step: as in `learn_to_see`.
     """
     plan, agent = Plan.of(config), config.agent
@@ -172,7 +182,7 @@ def learn_to_act(
         batch = jax.vmap(lambda r, k: replay.sample(agent, r, time, share, k))(ring, keys)
         batch = jax.tree.map(flat, batch)
         (total, (count, sum_q)), gradient = jax.value_and_grad(loss, has_aux=True)(learner.q, learner.target, batch)
-        gradient, total, count, sum_q = all_sum((gradient, total, count, sum_q), axis)
+        gradient, total, count, sum_q = all_sum((gradient, total, count, sum_q), axis, after)
         gradient = gradient / jnp.maximum(count, 1.0)
         change, optimiser = _q_optimiser(config).update(gradient, learner.q_optimiser, learner.q)
         q, finite = optax.apply_updates(learner.q, change), is_finite(gradient)
@@ -217,8 +227,3 @@ def flat(x: Array) -> Array:
 def _side_by_side(x: Array) -> Array:
     """Returns [T, S * B, ...] of [S, T, B, ...]."""
     return jnp.moveaxis(x, 0, 1).reshape(x.shape[1], -1, *x.shape[3:])
-
-
-def all_sum(x, axis: str | None):
-    """Returns the sum over the devices that share the work, if there are any."""
-    return lax.psum(x, axis) if axis is not None else x

@@ -30,23 +30,33 @@ def keep_programs() -> None:
     options: Any = jax.config
     if options.jax_compilation_cache_dir or not options.jax_enable_compilation_cache:
         return
-    try:
-        folder = _folder()
-        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-        status = folder.stat()
-        # What others may write here would be run.
-        foreign = hasattr(os, "getuid") and status.st_uid != os.getuid()
-        if foreign or status.st_mode & (stat.S_IWGRP | stat.S_IWOTH):
-            return
-        if not os.access(folder, os.W_OK):
-            return
-        _make_room(folder, MOST_BYTES)
-    except (OSError, RuntimeError):  # there is no home
+    folder = private_folder()
+    if folder is None:
         return
     jax.config.update("jax_compilation_cache_dir", str(folder))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
     # Such as on a full disk: the program is not kept, and nothing else is lost.
     warnings.filterwarnings("ignore", "Error writing persistent compilation cache entry", UserWarning)
+
+
+def private_folder() -> Path | None:
+    """Returns the folder of what is compiled for this kind of processor, made and not too full.
+
+    None where it cannot be written, or where others may write: what is in it is run.
+    """
+    try:
+        folder = _folder()
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        status = folder.stat()
+        foreign = hasattr(os, "getuid") and status.st_uid != os.getuid()
+        if foreign or status.st_mode & (stat.S_IWGRP | stat.S_IWOTH):
+            return None
+        if not os.access(folder, os.W_OK):
+            return None
+        _make_room(folder, MOST_BYTES)
+    except (OSError, RuntimeError):  # there is no home
+        return None
+    return folder
 
 
 def _folder() -> Path:

@@ -28,7 +28,7 @@ CELL_M, COARSE_CELL_M = 0.5, 1.0
 
 _FOUND, _BLOCKED, _ENCLOSED, _SPENT = range(4)
 _KNOWN, _REACHED = 1, 2
-_SAMPLES = 8  # of an edge, as in `sim.scene.segment_contact`
+_SAMPLES = 8  # of an edge, as in `sim.distance.segment_contact`
 _STEPS = (0.0, 1.0, math.sqrt(2.0), math.sqrt(3.0))  # cells between neighbours, by the number of axes moved along
 _TIE = 1e-9  # of entries of equal estimate the one nearest to the goal comes first; costs at most 1e-9 of the length
 

@@ -94,7 +94,7 @@ def shape_distance(row, x, y, z):
 
 @numba.njit
 def distance(table, x, y, z):
-    """Returns metres from a point to the nearest surface, negative inside a shape: `sim.scene.signed_distance`."""
+    """Returns metres from a point to the nearest surface, negative inside a shape: `sim.distance.signed_distance`."""
     nearest = PARKED
     for i in range(table.shape[0]):
         row = table[i]

@@ -14,6 +14,7 @@ import numpy as np
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.collections import PolyCollection
 from matplotlib.figure import Figure
 from matplotlib.patches import Wedge
 from PIL import Image
@@ -22,10 +23,11 @@ from edqn_jax.learn.policy import PolicyParams
 from edqn_jax.packages import require
 from edqn_jax.report.flights import OBLIQUE, draw_end_marks, draw_stage
 from edqn_jax.report.images import LOOKS, scale_of
-from edqn_jax.report.sights import Sights, decision_rows, poses
-from edqn_jax.report.solids import MAP, View, hidden
+from edqn_jax.report.sights import Sights, decision_rows, poses, times_of
+from edqn_jax.report.solids import MAP, View, faces_seen, hidden, moving_solids
 from edqn_jax.report.style import INK, LINE, MUTED, OUTCOME_COLOURS, OUTCOME_LABELS, STYLE
 from edqn_jax.sim.camera import on_screen
+from edqn_jax.sim.scene import moves
 
 SIZE = (800, 540)
 """Width and height of the GIF, pixels."""
@@ -97,11 +99,11 @@ class _Stage:
     def frame(self, decision: int, row: int, outcome: str = "") -> Image.Image:
         """Returns the picture of a decision, with the path up to a row of the trajectory."""
         seen_at = decision_rows(self._sights.config, self._flown)[decision, -1]
-        self._rgb.set_data(on_screen(self._sights.rgb(*poses(self._flown, seen_at))))
+        self._rgb.set_data(on_screen(self._sights.rgb(*poses(self._flown, seen_at), times_of(self._flown, seen_at))))
         if self._shown is not None:
             self._sensed.set_data(self._shown[decision])
         for view in (self._oblique, self._map):
-            view.advance(row)
+            view.advance(row, float(self._flown["t"][row]))
         self._sight.set_center(tuple(self._points[row, :2]))
         heading = _heading_deg(*(self._flown[name][row] for name in ("qw", "qz")))
         half = self._sights.config.camera.horizontal_fov_deg / 2
@@ -180,8 +182,8 @@ class _PathView:
     """The world from one side, and the path so far in it: faint where a solid hides it."""
 
     def __init__(self, axes: Axes, view: View, sights: Sights, points: np.ndarray) -> None:
-        self.axes = axes
-        solids = draw_stage(axes, view, sights.scene, sights.config.env.goal_radius_m)
+        self.axes, self._view, self._scene = axes, view, sights.scene
+        solids = draw_stage(axes, view, sights.scene, sights.config.env.goal_radius_m, outlines=False)
         draw_end_marks(axes, view, points[0], np.asarray(sights.scene.goal, np.float64))
         axes.set_aspect("equal", anchor="C")
         self._flat = view.project(points)
@@ -193,10 +195,15 @@ class _PathView:
             for order, style in enumerate(styles)
         ]
         (self._drone,) = axes.plot([], [], "o", ms=8, mfc=LINE, mec="white", mew=1.5, animated=True, zorder=9.5)
-        self.moving: list[Artist] = [*self._lines, self._drone]
+        self._obstacles = PolyCollection([], animated=True, linewidths=0.3, zorder=5)
+        axes.add_collection(self._obstacles, autolim=False)
+        self.moving: list[Artist] = [self._obstacles, *self._lines, self._drone]
 
-    def advance(self, row: int) -> None:
-        """Draws the path up to a row of the trajectory."""
+    def advance(self, row: int, time: float) -> None:
+        """Draws the path up to a row of the trajectory, and the obstacles that move where they are at its time."""
+        if moves(self._scene):
+            rings, colours = faces_seen(self._view, moving_solids(self._scene, time))
+            self._obstacles.set(verts=rings, facecolors=colours, edgecolors=colours)
         for line, points in zip(self._lines, (self._flat, self._visible, self._visible), strict=True):
             line.set_data(*points[: row + 1].T)
         self._drone.set_data(*self._flat[row : row + 1].T)

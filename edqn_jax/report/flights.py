@@ -15,7 +15,18 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Circle
 
-from edqn_jax.report.solids import GROUND, MAP, Solid, View, cut_open, draw_outlines, draw_shadows, draw_solids, hidden
+from edqn_jax.report.solids import (
+    GROUND,
+    MAP,
+    Solid,
+    View,
+    cut_open,
+    draw_outlines,
+    draw_shadows,
+    draw_solids,
+    hidden,
+    standing,
+)
 from edqn_jax.report.style import INK, MUTED, OUTCOME_COLOURS, OUTCOME_LABELS, drawing
 from edqn_jax.sim.scene import Scene
 
@@ -122,7 +133,7 @@ def draw_path(
     return figure
 
 
-def draw_stage(axes: Axes, view: View, scene: Scene, goal_radius_m: float) -> list[Solid]:
+def draw_stage(axes: Axes, view: View, scene: Scene, goal_radius_m: float, outlines: bool = True) -> list[Solid]:
     """Draws the world in which a flight is shown, its goal marked; returns the solids that hide what is behind them.
 
     Args:
@@ -130,10 +141,11 @@ def draw_stage(axes: Axes, view: View, scene: Scene, goal_radius_m: float) -> li
         view: `OBLIQUE` or `solids.MAP`.
         scene: one world.
         goal_radius_m: the circle around the goal on the map.
+        outlines: whether what moves is outlined where it is at time 0.
     """
     goal = _ends(scene)[1]
     _draw_ground(axes, view, np.asarray(scene.volume, np.float64))
-    solids = _draw_obstacles(axes, view, scene)
+    solids = _draw_obstacles(axes, view, scene if outlines else standing(scene))
     if view is MAP:
         circle = Circle((goal[0], goal[1]), goal_radius_m, fill=False, ec=GOAL_COLOUR, lw=0.8)
         axes.add_patch(circle).set_zorder(6)
@@ -148,7 +160,7 @@ def _draw_obstacles(axes: Axes, view: View, scene: Scene) -> list[Solid]:
     if view is not MAP:
         draw_shadows(axes, view, world.shown, _corners(np.asarray(scene.volume, np.float64)))
     draw_solids(axes, view, world.shown)
-    draw_outlines(axes, view, world.near_walls)
+    draw_outlines(axes, view, [*world.near_walls, *world.moving])
     if world.note:
         axes.set_title(world.note, fontsize=7, weight="normal", color=MUTED)
     return world.shown

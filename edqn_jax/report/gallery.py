@@ -9,7 +9,7 @@ from edqn_jax.learn.policy import PolicyParams
 from edqn_jax.report.curves import draw_learning, draw_returns
 from edqn_jax.report.flights import draw_path, draw_world
 from edqn_jax.report.images import LOOKS, RECONSTRUCTED_EVENTS, draw_reconstruction, draw_sight
-from edqn_jax.report.sights import Sights, coarse, decision_rows, poses
+from edqn_jax.report.sights import Sights, coarse, decision_rows, poses, times_of
 from edqn_jax.runs.directory import TRAJECTORY_COLUMNS, RunDirectory
 from edqn_jax.sim.camera import on_screen
 
@@ -46,7 +46,8 @@ def _draw_what_it_sees(run: RunDirectory, sights: Sights, params: PolicyParams, 
     shown = sights.shown(params, flown)
     moments = _busiest(np.abs(shown.image).sum((1, 2)) if look.signed else shown.image.std((1, 2)), MOMENTS)
     rows = decision_rows(config, flown)[moments, -1]
-    fine = np.stack([sights.rgb(*pose) for pose in zip(*poses(flown, rows), strict=True)])
+    seen = zip(*poses(flown, rows), times_of(flown, rows), strict=True)
+    fine = np.stack([sights.rgb(*pose) for pose in seen])
     draw_sight(
         on_screen(fine),
         on_screen(coarse(fine)),

@@ -20,7 +20,8 @@ from PIL import Image
 
 from edqn_jax.report.animation import gif
 from edqn_jax.report.style import LINE, MUTED, SECOND_LINE, STYLE, drawing
-from edqn_jax.sim.scene import Scene, signed_distance
+from edqn_jax.sim.distance import signed_distance
+from edqn_jax.sim.scene import Scene
 from edqn_jax.sim.sensor import nearness
 
 UNKNOWN, FREE, OCCUPIED = range(3)

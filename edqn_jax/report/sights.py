@@ -11,6 +11,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+import numpy.typing as npt
 from jax import Array
 from jax.stages import Compiled
 
@@ -23,7 +24,7 @@ from edqn_jax.sim.drone import Flight
 from edqn_jax.sim.env import MOTION_SIZE
 from edqn_jax.sim.events import EventField
 from edqn_jax.sim.moves import ACTIONS
-from edqn_jax.sim.scene import Scene
+from edqn_jax.sim.scene import Scene, scene_at
 
 FINE = 8
 """How much finer than the drone's camera the RGB pictures for people are, per axis."""
@@ -80,12 +81,13 @@ class Sights:
         assert self._shown is not None, "this sensor shows no image"
         rows = decision_rows(self.config, flown)
         padded = np.pad(rows, ((0, self.config.env.max_decisions - len(rows)), (0, 0)), mode="edge")
-        found = self._shown.result()(self.scene, params, *poses(flown, padded), own_motions(self.config, flown, padded))
+        motions = own_motions(self.config, flown, padded)
+        found = self._shown.result()(self.scene, params, *poses(flown, padded), times_of(flown, padded), motions)
         return Shown(*(np.asarray(leaf)[: len(rows)] for leaf in found))
 
-    def rgb(self, position: np.ndarray, quaternion: np.ndarray) -> np.ndarray:
-        """Returns the linear RGB [FINE H, FINE W, 3] of the drone's camera at a pose, a ray per pixel."""
-        return np.asarray(self._rgb.result()(self.scene, position, quaternion))
+    def rgb(self, position: np.ndarray, quaternion: np.ndarray, time: npt.ArrayLike = 0.0) -> np.ndarray:
+        """Returns the linear RGB [FINE H, FINE W, 3] of the drone's camera at a pose and a time, a ray per pixel."""
+        return np.asarray(self._rgb.result()(self.scene, position, quaternion, np.asarray(time, np.float32)))
 
     def _compile_shown(self) -> Compiled:
         config, decisions = self.config, self.config.env.max_decisions
@@ -95,9 +97,9 @@ class Sights:
         return _compiled(self._all_shown, self.scene, params, *_blank_poses(decisions, looks), motion)
 
     def _all_shown(
-        self, scene: Scene, params: PolicyParams, position: Array, quaternion: Array, motion: Array
+        self, scene: Scene, params: PolicyParams, position: Array, quaternion: Array, time: Array, motion: Array
     ) -> _Images:
-        """The images of `shown` at [D, T, ...] poses with own motions [D, MOTION_SIZE].
+        """The images of `shown` at [D, T, ...] poses and times with own motions [D, MOTION_SIZE].
 
         The sensor carries its memory from each decision to the next, and so does a recurrent encoder.
         """
@@ -106,29 +108,30 @@ class Sights:
 
         def one(before: tuple[Any, Array], given: tuple[Array, ...]) -> tuple[tuple[Any, Array], _Images]:
             memory, code = before
-            position, quaternion, motion, key = given
-            here = Flight(position, quaternion, jnp.zeros_like(position))
+            position, quaternion, time, motion, key = given
+            here = Flight(position, quaternion, jnp.zeros_like(position), time)
+            now = scene_at(scene, time[-1])
             sensed, memory = sensor.sense(config, scene, here, memory, key)
             assert isinstance(sensed, EventField | Array)
             nearness = None
             if embedding.needs_nearness(config):
-                nearness = sensor.nearness_image(config, scene, position[-1], quaternion[-1])
+                nearness = sensor.nearness_image(config, now, position[-1], quaternion[-1])
             code = vae.embed(config.encoder, params.encoder, sensed, motion, code)
             image = events.event_image(sensed) if isinstance(sensed, EventField) else sensed[0]
             target = vae.target(config.encoder, sensed, nearness)
             made = vae.decode(config.encoder, config.camera, params.encoder, code)
             drawn = (_drawn(config, sensed, channels) for channels in (target, made))
-            luma = sensor.view(config, scene, position[-1], quaternion[-1])
+            luma = sensor.view(config, now, position[-1], quaternion[-1])
             return (memory, code), (image, *drawn, luma)  # type: ignore[return-value]
 
         keys = jax.random.split(rest, len(position))
         before = sensor.at_rest(config, start), jnp.zeros(config.encoder.code_size)
-        return jax.lax.scan(one, before, (position, quaternion, motion, keys))[1]
+        return jax.lax.scan(one, before, (position, quaternion, time, motion, keys))[1]
 
     def _compile_rgb(self) -> Compiled:
-        def picture(scene: Scene, position: Array, quaternion: Array) -> Array:
+        def picture(scene: Scene, position: Array, quaternion: Array, time: Array) -> Array:
             rotation = sensor.mount_rotation(self.config, quaternion)
-            return camera.fine_rgb(self.config.camera, FINE, scene, position, rotation)
+            return camera.fine_rgb(self.config.camera, FINE, scene_at(scene, time), position, rotation)
 
         return _compiled(picture, self.scene, *_blank_poses())
 
@@ -149,6 +152,11 @@ def poses(flown: Mapping[str, np.ndarray], rows: np.ndarray) -> tuple[np.ndarray
     position = np.stack([flown[name] for name in ("x", "y", "z")], axis=-1)
     quaternion = np.stack([flown[name] for name in ("qw", "qx", "qy", "qz")], axis=-1)
     return position[rows].astype(np.float32), quaternion[rows].astype(np.float32)
+
+
+def times_of(flown: Mapping[str, np.ndarray], rows: np.ndarray) -> np.ndarray:
+    """Returns the times [...] of a trajectory at rows [...], seconds."""
+    return np.asarray(flown["t"])[rows].astype(np.float32)
 
 
 def coarse(picture: np.ndarray) -> np.ndarray:
@@ -177,9 +185,9 @@ def _compiled(program: Any, *arguments: Any) -> Compiled:
     return jax.jit(program).lower(*arguments).compile(quick_compiler_options(jax.default_backend()))
 
 
-def _blank_poses(*shape: int) -> tuple[jax.ShapeDtypeStruct, jax.ShapeDtypeStruct]:
-    position, quaternion = (jax.ShapeDtypeStruct((*shape, size), np.float32) for size in (3, 4))
-    return position, quaternion
+def _blank_poses(*shape: int) -> tuple[jax.ShapeDtypeStruct, ...]:
+    """Returns positions, quaternions and times of poses [...], without values."""
+    return tuple(jax.ShapeDtypeStruct((*shape, *size), np.float32) for size in ((3,), (4,), ()))
 
 
 def _drawn(config: Config, sensed: EventField | Array, channels: Array) -> Array:

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
+import jax.numpy as jnp
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import PolyCollection
 from matplotlib.patches import Polygon
 
-from edqn_jax.sim.scene import PARKED, Scene
+from edqn_jax.sim.scene import KINDS, PARKED, Scene, scene_at
 
 AROUND = 36
 """Corners of a circle."""
@@ -93,6 +95,32 @@ def solids_of(scene: Scene) -> list[Solid]:
     return found
 
 
+def standing(scene: Scene) -> Scene:
+    """Returns one world without the shapes that move."""
+    return _only(scene, scene_at(scene, None), moving=False)
+
+
+def moving_solids(scene: Scene, time: float) -> list[Solid]:
+    """Returns the shapes of one world that move, where they are at `time` seconds; a ball only while it flies."""
+    return solids_of(_only(scene, scene_at(scene, jnp.float32(time)), moving=True))
+
+
+def _only(scene: Scene, now: Scene, moving: bool) -> Scene:
+    """Returns the world `now` with those shapes alone that move in `scene`, or that stand; the others are parked."""
+    kept = {}
+    for kind in KINDS:
+        shapes, here = getattr(scene, kind), getattr(now, kind)
+        goes = np.zeros(here.position.shape[0], bool)
+        if getattr(shapes, "motion", None) is not None:
+            velocity, swing = np.asarray(shapes.motion.velocity), np.asarray(shapes.motion.swing)
+            goes |= np.any(velocity, axis=1) | (np.any(swing, axis=(1, 2)) & (np.asarray(shapes.motion.rate) != 0))
+        if getattr(shapes, "throw", None) is not None:
+            goes |= np.asarray(shapes.throw.early) > 0
+        place = np.where((goes == moving)[:, None], np.asarray(here.position), PARKED)
+        kept[kind] = dataclasses.replace(here, position=place)
+    return dataclasses.replace(now, **kept)
+
+
 @dataclass(frozen=True)
 class CutOpen:
     """A world's solids for one view, sorted into what is drawn and what would hide all the rest."""
@@ -102,16 +130,19 @@ class CutOpen:
     """Walls along the rim of the volume, on the side of the eye: drawn as outlines."""
     has_ceiling: bool
     """Whether a ceiling was left out."""
+    moving: list[Solid]
+    """What moves, where it is at time 0: drawn as outlines."""
 
     @property
     def note(self) -> str:
         """Note on what was cut away, for the figure; empty if nothing was."""
         parts = [name for name, cut in (("ceiling", self.has_ceiling), ("near walls", self.near_walls)) if cut]
-        return f"{' and '.join(parts)} cut away" if parts else ""
+        notes = [f"{' and '.join(parts)} cut away"] if parts else []
+        return "; ".join(notes + (["outlined: what moves, as at the start"] if self.moving else []))
 
 
 def cut_open(scene: Scene, view: View) -> CutOpen:
-    """Returns a world as it is drawn: without its ceiling, and without the outer walls before the eye.
+    """Returns a world as it is drawn: without its ceiling, without outer walls before the eye, and what moves apart.
 
     A ceiling is a box or another shape in the upper half of the volume that covers nearly all of it, or a plane
     that looks down there; an outer wall runs along nearly a whole side of the volume.
@@ -121,7 +152,7 @@ def cut_open(scene: Scene, view: View) -> CutOpen:
     planes = zip(np.asarray(scene.planes.position), np.asarray(scene.planes.normal), strict=True)
     has_ceiling = any(normal[2] < -0.9 and middle < position[2] < PARKED / 10 for position, normal in planes)
     shown, near_walls = [], []
-    for solid in solids_of(scene):
+    for solid in solids_of(standing(scene)):
         side = closed_side(solid, lower, upper)
         if side == (2, 1):
             has_ceiling = True
@@ -129,7 +160,7 @@ def cut_open(scene: Scene, view: View) -> CutOpen:
             near_walls.append(solid)
         else:
             shown.append(solid)
-    return CutOpen(shown, near_walls, has_ceiling)
+    return CutOpen(shown, near_walls, has_ceiling, moving_solids(scene, 0.0))
 
 
 def closed_side(solid: Solid, lower: np.ndarray, upper: np.ndarray) -> tuple[int, int] | None:
@@ -168,16 +199,21 @@ def draw_outlines(axes: Axes, view: View, solids: Sequence[Solid]) -> None:
 
 def draw_solids(axes: Axes, view: View, solids: Sequence[Solid]) -> None:
     """Draws the solids, the far ones first, each as its faces that look at the eye."""
-    rings, colours = [], []
-    for solid in far_to_near(solids, view):
-        normals = solid.outward
-        for face, normal in zip(solid.faces, normals, strict=True):
-            if normal @ view.towards > 0:
-                rings.append(view.project(face))
-                colours.append(_shaded(solid.colour, normal))
+    rings, colours = faces_seen(view, solids)
     # Edges in the face's own colour close the hairline between neighbouring faces.
     bodies = PolyCollection(rings, facecolors=colours, edgecolors=colours, linewidths=0.3, zorder=2)
     axes.add_collection(bodies)
+
+
+def faces_seen(view: View, solids: Sequence[Solid]) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    """Returns the faces of solids that look at the eye, [k, 2] each, and their colours, in the order of painting."""
+    rings, colours = [], []
+    for solid in far_to_near(solids, view):
+        for face, normal in zip(solid.faces, solid.outward, strict=True):
+            if normal @ view.towards > 0:
+                rings.append(view.project(face))
+                colours.append(_shaded(solid.colour, normal))
+    return rings, colours
 
 
 def draw_shadows(axes: Axes, view: View, solids: Sequence[Solid], floor: np.ndarray) -> None:

@@ -9,7 +9,7 @@ box-filtered over the pixel (`texture.py`).
 from __future__ import annotations
 
 import dataclasses
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -17,11 +17,12 @@ import numpy as np
 from jax import Array
 
 from edqn_jax.config import CameraConfig
-from edqn_jax.sim import columns, coverage, raycast
+from edqn_jax.sim import columns, coverage, native, raycast
 from edqn_jax.sim.columns import Frame
 from edqn_jax.sim.coverage import Layers
 from edqn_jax.sim.depth import nearest_depth
 from edqn_jax.sim.events import LUMA_WEIGHTS
+from edqn_jax.sim.picture_primitive import draw_in_one_batch
 from edqn_jax.sim.raycast import Rays, Values
 from edqn_jax.sim.scene import Scene
 from edqn_jax.sim.texture import texture
@@ -76,7 +77,9 @@ def blend(config: CameraConfig, frame: Frame, rays: Rays, layers: Layers) -> Arr
 def _picture(config: CameraConfig, scene: Scene, origin: Array, rotation: Array, weights: Array) -> Array:
     """Returns brightness [H, W] under `weights` [3] of RGB."""
     if config.mount == "level":
-        return columns.picture(config, blend, scene, origin, rotation, weights)
+        image = (scene, origin, rotation, weights)
+        size = (config.height, config.width)
+        return draw_in_one_batch(columns.pictures, (config, blend), image, size, on_cpu=_pictures_on_cpu)
     value = raycast.albedo_values(scene, weights)
     rays = raycast.camera_rays(config, rotation)
     many = raycast.camera_rays(config, rotation, config.samples_across, config.samples_down)
@@ -132,6 +135,27 @@ def on_screen(linear: Pixels) -> Pixels:
 
 def depth(config: CameraConfig, scene: Scene, position: Array, rotation: Array) -> Array:
     """Returns the distance along each pixel's central ray: [H, W] metres, inf where the ray meets nothing."""
+    nearest = draw_in_one_batch(
+        _depths, (config,), (scene, position, rotation), (config.height, config.width), on_cpu=_depths_on_cpu
+    )
     rays = raycast.camera_rays(config, rotation)
-    nearest = nearest_depth(config, scene, position, rays)
     return nearest * jnp.sqrt(rays.dx**2 + rays.dy**2 + rays.dz**2)
+
+
+def _pictures_on_cpu(config: CameraConfig, _: columns.Finish, *image: Any) -> Array | None:
+    """Returns brightness [M, H, W] by the library in C, which blends as `blend` does; None where it cannot draw it."""
+    return native.pictures(config, *image) if native.can_draw(config, image[0]) else None
+
+
+def _depths(config: CameraConfig, scene: Scene, position: Array, rotation: Array) -> Array:
+    """Returns the depth [M, H, W] metres along the optical axis; every array has a leading [M]."""
+
+    def one(scene: Scene, position: Array, rotation: Array) -> Array:
+        return nearest_depth(config, scene, position, raycast.camera_rays(config, rotation))
+
+    return jax.vmap(one)(scene, position, rotation)
+
+
+def _depths_on_cpu(config: CameraConfig, scene: Scene, position: Array, rotation: Array) -> Array | None:
+    """Returns `_depths` by the library in C; None where it cannot draw them."""
+    return native.depths(config, scene, position, rotation) if native.can_draw(config, scene) else None

@@ -31,6 +31,11 @@ _EDGE = 2.0  # metres around a corner of the floor that no building closes
 _PARTS = 4  # of a large building at most; a small one is no courtyard and has half as many
 _OF_A_BUILDING = 4
 
+BODIES = {
+    "boxes": tuple(b for b in range(LARGE + SMALL) for _ in range(_PARTS if b < LARGE else _PARTS // 2)),
+}
+"""Bodies, as `moving_worlds` moves them: all parts of a building are one."""
+
 
 def draw(key: Array) -> Scene:
     """Returns a random canyon, a start and a goal.

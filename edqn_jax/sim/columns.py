@@ -25,7 +25,6 @@ from jax.flatten_util import ravel_pytree
 from edqn_jax.config import CameraConfig
 from edqn_jax.sim import coverage, raycast
 from edqn_jax.sim.coverage import Layers
-from edqn_jax.sim.picture_primitive import draw_in_one_batch
 from edqn_jax.sim.raycast import Rays, Values
 from edqn_jax.sim.scene import Scene, UprightBoxes, UprightCylinders, no_shapes
 from edqn_jax.sim.xla import materialised
@@ -78,25 +77,13 @@ Branch = Callable[[CameraConfig, Finish, Array], Array]
 """Draws the columns numbered [B] of a batch: brightness [B, H]."""
 
 
-def picture(
+def pictures(
     config: CameraConfig, finish: Finish, scene: Scene, origin: Array, rotation: Array, weights: Array
 ) -> Array:
-    """Returns one frame, [H, W], of a scene from origin [3], metres, and rotation [3, 3] under weights [3] of RGB.
+    """Returns brightness [M, H, W] of scenes from origin [3], metres, and rotation [3, 3] under weights [3] of RGB.
 
-    However it is mapped, all frames end up in one batch: only together can their columns be sorted.
-
-    Args:
-        finish: a function of a module, see `draw_in_one_batch`.
+    Every array has a leading [M]. All frames must come in one batch: only together can their columns be sorted.
     """
-    return draw_in_one_batch(
-        _pictures, (config, finish), (scene, origin, rotation, weights), (config.height, config.width)
-    )
-
-
-def _pictures(
-    config: CameraConfig, finish: Finish, scene: Scene, origin: Array, rotation: Array, weights: Array
-) -> Array:
-    """Returns brightness [M, H, W]; every array has a leading [M]."""
     branches, branch = draw_branches(config, scene, origin, rotation, weights)
 
     # Sorted by the branch that they need, in blocks; each block takes the branch of its last column, the fullest.

@@ -161,7 +161,9 @@ def _boxes_in_table(config: CameraConfig, boxes: UprightBoxes, origin: Array, he
     ex, ey = sx * hx - bx, sy * hy - by
     corner = (ex * fy - ey * fx) * inverse(ex * fx + ey * fy)
     heights = _heights(config, boxes.position[:, 2] - origin[2], boxes.half[:, 2], value)
-    return jnp.stack([left, right, *heights, bx, by, fx, fy, hx, hy, x_face, y_face, corner], axis=1)
+    # Computed once: a GPU would otherwise compute each number for itself, with all that it depends on.
+    found = materialised([left, right, *heights, bx, by, fx, fy, hx, hy, x_face, y_face, corner])
+    return jnp.stack(found, axis=1)
 
 
 def _cylinders_in_table(

@@ -24,8 +24,10 @@ import numpy as np
 from flax import struct
 from jax import Array
 
-from edqn_jax.config import DroneConfig
+from edqn_jax.config import Config, DroneConfig
 from edqn_jax.errors import ConfigError
+from edqn_jax.sim import disturbances
+from edqn_jax.sim.disturbances import Disturbance, Load
 from edqn_jax.sim.rigid_body import rigid_body_step
 from edqn_jax.sim.xla import materialised
 
@@ -71,6 +73,7 @@ class Flight:
     position: Array  # [n, 3] metres, world
     quaternion: Array  # [n, 4]
     velocity: Array  # [n, 3] m/s, world
+    time: Array | None = None  # [n] seconds of the episode, in a world that moves
 
 
 def c_model(config: DroneConfig) -> mujoco.MjModel:
@@ -303,41 +306,80 @@ def _least(values: list[Array]) -> Array:
     return least
 
 
-def physics_step(config: DroneConfig, airframe: Airframe, state: DroneState, thrust: Array) -> DroneState:
+def physics_step(
+    config: DroneConfig, airframe: Airframe, state: DroneState, thrust: Array, load: Load | None = None
+) -> DroneState:
     """Returns the state after one step of `config.physics` under rotor thrusts [4] newtons.
 
     Only position and velocity are carried from step to step.
+
+    Args:
+        config: engine and length of the step.
+        airframe: nominal.
+        state: before the step.
+        thrust: [4] newtons; with a load also beyond what a nominal rotor gives.
+        load: what else acts, and mass and inertia that are flown; None flies the nominal airframe in a vacuum.
     """
     if config.physics == "rigid_body":
+        mass, inertia, push = airframe.mass, airframe.inertia, None
+        if load is not None:
+            mass, inertia, push = _scaled(mass, load.mass), _scaled(inertia, load.inertia), load.force
         moved = rigid_body_step(
-            *(config.physics_dt_s, airframe.mass, airframe.inertia, airframe.gravity),
+            *(config.physics_dt_s, mass, inertia, airframe.gravity),
             jnp.stack([_dot(row, thrust) for row in airframe.wrench]),
             *(state.position, state.quaternion, state.velocity, state.angular_velocity),
+            push,
         )
     else:
-        moved = _mjx_step(airframe, state, thrust)
+        moved = _mjx_step(airframe, state, _applied(airframe, state, thrust, load or Load()))
     position, quaternion, velocity, angular_velocity = moved
     return dataclasses.replace(
         state, position=position, quaternion=quaternion, velocity=velocity, angular_velocity=angular_velocity
     )
 
 
-def _mjx_step(airframe: Airframe, state: DroneState, thrust: Array) -> tuple[Array, Array, Array, Array]:
+def _scaled(value: Array, share: Array | None) -> Array:
+    return value if share is None else share * value
+
+
+def _applied(airframe: Airframe, state: DroneState, thrust: Array, load: Load) -> Array:
+    """Returns the force (N, world) and torque (N m, body) [6] that accelerate the nominal body as the flown one.
+
+    m' a = F - m' g and s I w' = t - w x (s I w), so that the nominal mass m and inertia I need F m / m' and t / s:
+    gravity and gyroscopic torque accelerate alike. The mass matrix stays the template's.
+    """
+    collective, *torque = (_dot(row, thrust) for row in airframe.wrench)
+    ahead, left, up = _body_axes(*state.quaternion)
+    force = [axis[2] * collective for axis in (ahead, left, up)]
+    if load.force is not None:
+        force = [part + push for part, push in zip(force, load.force, strict=True)]
+    if load.mass is not None:
+        force = [part / load.mass for part in force]
+    if load.inertia is not None:
+        torque = [part / load.inertia for part in torque]
+    return jnp.stack([*force, *torque])
+
+
+def _mjx_step(airframe: Airframe, state: DroneState, applied: Array) -> tuple[Array, Array, Array, Array]:
     """Returns position, quaternion, velocity and angular velocity after one MJX step.
 
     These are the stages of `mjx.step` for this model: with the body frame at the centre of mass and no joint
-    below it, the mass matrix is constant, the template's, and there are no collisions, constraints or damping.
+    below it, the mass matrix is constant, the template's, and there are no collisions, constraints or damping. What the
+    rotors do comes as an applied force: MJX's own stages of actuation take a quarter of the step.
+
+    Args:
+        applied: [6] force (N, world) and torque (N m, body).
     """
     model = airframe.model
     data = airframe.data.replace(
         qpos=jnp.concatenate([state.position, state.quaternion]),
         qvel=jnp.concatenate([state.velocity, state.angular_velocity]),
-        ctrl=thrust,
+        qfrc_applied=applied,
     )
     with jax.numpy_rank_promotion("allow"):  # MJX's own arithmetic relies on it
-        data = mjx.transmission(model, mjx.com_pos(model, mjx.kinematics(model, data)))
+        data = mjx.com_pos(model, mjx.kinematics(model, data))
         data = mjx.rne(model, mjx.com_vel(model, data))
-        data = mjx.fwd_acceleration(model, mjx.fwd_actuation(model, data))
+        data = mjx.fwd_acceleration(model, data)
         data = mjx.euler(model, data.replace(qacc=data.qacc_smooth))
     return data.qpos[:3], data.qpos[3:], data.qvel[:3], data.qvel[3:]
 
@@ -349,9 +391,7 @@ def fly(
 
     The yaw setpoint moves towards `target_yaw` [] radians in the shorter direction, at most `max_yaw_rate_rad_s` fast.
     """
-    steps = jnp.arange(1, config.physics_steps + 1, dtype=jnp.float32)
-    most = config.max_yaw_rate_rad_s * config.physics_dt_s * steps
-    yaws = state.yaw_setpoint + jnp.clip(wrap_angle(target_yaw - state.yaw_setpoint), -most, most)
+    yaws = _setpoints(config, state, target_yaw)
 
     def body(state: DroneState, half_yaw: tuple[Array, Array]) -> tuple[DroneState, Flight]:
         thrust = _thrusts(config, airframe, state, velocity_command, *half_yaw)
@@ -360,3 +400,50 @@ def fly(
 
     state, flight = jax.lax.scan(body, state, (jnp.cos(yaws / 2), jnp.sin(yaws / 2)))
     return dataclasses.replace(state, yaw_setpoint=wrap_angle(yaws[-1])), flight
+
+
+def fly_disturbed(
+    config: Config,
+    airframe: Airframe,
+    state: DroneState,
+    disturbance: Disturbance,
+    velocity_command: Array,
+    target_yaw: Array,
+    key: Array,
+) -> tuple[DroneState, Disturbance, Flight]:
+    """Flies one decision as `fly`, against a disturbance that the controller does not know of.
+
+    Args:
+        config: of drone, air and motors.
+        airframe: that the controller believes in.
+        state, velocity_command, target_yaw: as in `fly`.
+        disturbance: of the episode, as of the decision before.
+        key: consumed by gusts.
+    """
+    yaws = _setpoints(config.drone, state, target_yaw)
+    dt_s = config.drone.physics_dt_s
+
+    def body(
+        flying: tuple[DroneState, Disturbance], given: tuple[Array, Array, Array | None]
+    ) -> tuple[tuple[DroneState, Disturbance], Flight]:
+        (state, now), (cos, sin, white) = flying, given
+        command = _thrusts(config.drone, airframe, state, velocity_command, cos, sin)
+        now, thrust = disturbances.motor_step(config.motors, dt_s, now, command)
+        load = disturbances.load_of(config.air, now, state.velocity)
+        state = physics_step(config.drone, airframe, state, thrust, load)
+        if white is not None:
+            now = disturbances.gust_step(config.air, dt_s, now, white)
+        return (state, now), Flight(state.position, state.quaternion, state.velocity)
+
+    white = disturbances.white_noise(config, key)
+    (state, disturbance), flight = jax.lax.scan(
+        body, (state, disturbance), (jnp.cos(yaws / 2), jnp.sin(yaws / 2), white)
+    )
+    return dataclasses.replace(state, yaw_setpoint=wrap_angle(yaws[-1])), disturbance, flight
+
+
+def _setpoints(config: DroneConfig, state: DroneState, target_yaw: Array) -> Array:
+    """Returns the yaw setpoints [physics_steps] radians of one decision, not wrapped."""
+    steps = jnp.arange(1, config.physics_steps + 1, dtype=jnp.float32)
+    most = config.max_yaw_rate_rad_s * config.physics_dt_s * steps
+    return state.yaw_setpoint + jnp.clip(wrap_angle(target_yaw - state.yaw_setpoint), -most, most)

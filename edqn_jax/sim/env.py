@@ -12,20 +12,23 @@ from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import struct
 from jax import Array
 
 from edqn_jax.checks import check_finite, check_index
 from edqn_jax.config import Config, EnvConfig
 from edqn_jax.random import integers
-from edqn_jax.sim import drone, geodesic, sensor
+from edqn_jax.sim import disturbances, drone, geodesic, sensor
+from edqn_jax.sim.distance import signed_distance
+from edqn_jax.sim.disturbances import Disturbance
 from edqn_jax.sim.drone import Airframe, DroneState, Flight
 from edqn_jax.sim.events import EventMemory
 from edqn_jax.sim.missions import Missions
 from edqn_jax.sim.moves import ACTIONS
 from edqn_jax.sim.outcomes import Outcome, judge
 from edqn_jax.sim.reward import Reward, Transition, configured_reward
-from edqn_jax.sim.scene import Scene, scene_at, signed_distance, take_scene
+from edqn_jax.sim.scene import Scene, moves, scene_at, take_scene
 from edqn_jax.sim.sensor import Sensed, frame_steps
 
 OWN_SIZE = 10
@@ -72,6 +75,7 @@ class EnvState:
     memory: EventMemory | None  # the sensor's
     episode_return: Array  # [] sum of rewards so far
     key: Array  # [] typed key
+    disturbance: Disturbance | None = None  # what the episode flies against; None where nothing disturbs
 
 
 @struct.dataclass
@@ -151,7 +155,8 @@ def own_motion(config: EnvConfig, state: DroneState, move: Array) -> Array:
     Velocity in the heading frame (3, in commanded speeds), yaw rate (rad/s, at most `MOST_YAW_RATE`), last move (3).
 
     Args:
-        move: [3] of the last decision, of -1, 0 and 1 in the heading frame; zeros at a start.
+        move: [3] chosen at the last decision, of -1, 0 and 1 in the heading frame; zeros at a start. With
+            `env.action_delay` it is yet to be flown.
     """
     velocity = heading_velocity(config, drone.yaw_of(state.quaternion), state.velocity)
     # Of a drone on its back the heading turns at any rate.
@@ -185,11 +190,17 @@ def heading_setpoint(config: EnvConfig, state: DroneState, goal: Array, command:
     return jnp.where(level > 0, jnp.arctan2(command[1], command[0]), state.yaw_setpoint)
 
 
-def _start(config: Config, world: World, mission: Array, key: Array) -> tuple[DroneState, EventMemory | None]:
-    """At rest at the mission's start, facing its goal, the sensor at rest."""
+def _start(
+    config: Config, world: World, mission: Array, key: Array
+) -> tuple[DroneState, EventMemory | None, Disturbance | None]:
+    """At rest at the mission's start, facing its goal, the sensor at rest, and what the episode will fly against."""
     start, goal = world.missions.start[mission], world.missions.goal[mission]
     yaw = jnp.arctan2(goal[1] - start[1], goal[0] - start[0])
-    return drone.hover(start, yaw), sensor.at_rest(config, key)
+    drawn = None
+    if disturbances.any_on(config):
+        key, drawing = jax.random.split(key)
+        drawn = disturbances.draw(config, world.airframe.mass * world.airframe.gravity / 4, drawing)
+    return drone.hover(start, yaw), sensor.at_rest(config, key), drawn
 
 
 def observe(
@@ -201,13 +212,19 @@ def observe(
     poses: Flight,
     memory: EventMemory | None,
     key: Array,
+    disturbance: Disturbance | None = None,
 ) -> tuple[Observation, EventMemory | None]:
     """Returns what the sensor shows on the way to `goal` [3], metres, own state [OWN_SIZE] and motion [MOTION_SIZE].
 
     Args:
         move: as in `own_motion`.
         poses, memory, key: as in `sensor.sense`.
+        disturbance: whose errors own state and motion have; None where there are none.
     """
+    if disturbance is not None and disturbances.has_noise(config.noise):
+        key, errs = jax.random.split(key)
+        position, velocity = disturbances.believed(config.noise, disturbance, state.position, state.velocity, errs)
+        state = dataclasses.replace(state, position=position, velocity=velocity)
     sensed, memory = sensor.sense(config, scene, poses, memory, key)
     own, motion = own_state(config.env, scene, goal, state), own_motion(config.env, state, move)
     return Observation(sensed=sensed, own=own, motion=motion), memory
@@ -218,7 +235,7 @@ def nearness(config: Config, world: World, state: EnvState) -> Array:
 
     A label for training: no observation holds it.
     """
-    scene = _scene_of(config, world, state.mission, jnp.maximum(state.decision - 1, 0))
+    scene = scene_now(config, world, state)
     return sensor.nearness_image(config, scene, state.drone.position, state.drone.quaternion)
 
 
@@ -226,10 +243,13 @@ def reset(config: Config, world: World, key: Array, mission: Array | None = None
     """Returns a fresh environment on a mission drawn from the pool, or on the given one, [] int32."""
     key, noise = jax.random.split(key)
     state = dataclasses.replace(ended(config, world, key, mission), ended=jnp.zeros((), bool))
-    scene = _scene_of(config, world, state.mission, state.decision)
-    still = _hold(state.drone, len(frame_steps(config)))
+    scene = scene_of(world, state.mission)
+    before = np.array(frame_steps(config)) - config.drone.physics_steps
+    still = _timed(config, scene, _hold(state.drone, len(before)), jnp.asarray(before) if moves(scene) else None)
     goal = world.missions.goal[state.mission]
-    observation, memory = observe(config, scene, goal, state.drone, jnp.zeros(3), still, state.memory, noise)
+    observation, memory = observe(
+        *(config, scene, goal, state.drone, jnp.zeros(3), still, state.memory, noise, state.disturbance)
+    )
     return dataclasses.replace(state, memory=memory), observation
 
 
@@ -237,7 +257,7 @@ def ended(config: Config, world: World, key: Array, mission: Array | None = None
     """Returns an environment whose next step is a reset; it needs no picture. The mission [] is as in `reset`."""
     key, draw, rest = jax.random.split(key, 3)
     mission = _drawn_mission(world, draw) if mission is None else mission
-    body, memory = _start(config, world, mission, rest)
+    body, memory, disturbance = _start(config, world, mission, rest)
     return EnvState(
         drone=body,
         mission=mission.astype(jnp.int32),
@@ -246,6 +266,7 @@ def ended(config: Config, world: World, key: Array, mission: Array | None = None
         memory=memory,
         episode_return=jnp.zeros(()),
         key=key,
+        disturbance=disturbance,
     )
 
 
@@ -271,6 +292,7 @@ class _Decision:
     reward: Array
     broken: Array  # [] bool, the body was not finite
     unrewarded: Array  # [] bool, the reward was not, although the body was
+    disturbance: Disturbance | None = None
 
 
 def step(
@@ -283,23 +305,30 @@ def step(
         mission: [] int, which one a reset takes; None draws one.
     """
     key, draw, rest, noise = jax.random.split(state.key, 4)
+    gusts = None
+    if disturbances.changes_flight(config):
+        key, gusts = jax.random.split(key)
     is_reset = state.ended
     fresh = _drawn_mission(world, draw) if mission is None else mission
     mission = jnp.where(is_reset, fresh, state.mission).astype(jnp.int32)
     check_index(action, len(ACTIONS), "the moves")
     check_index(mission, world.missions.scene.shape[0], "the missions")
     goal = world.missions.goal[mission]
-    scene = _scene_of(config, world, mission, state.decision)
+    scene = scene_of(world, mission)
 
     # For an ended environment the decision is computed and dropped.
-    start, rested = _start(config, world, mission, rest)
-    flown = _fly(config, world, scene, goal, state, action)
-    done = _choose(is_reset, _reset_in_place_of(flown, start), flown)
+    start, rested, drawn = _start(config, world, mission, rest)
+    flown = _fly(config, world, scene, goal, state, action, gusts)
+    done = _choose(is_reset, _reset_in_place_of(flown, start, drawn), flown)
+    n = config.drone.physics_steps
+    # The time before a start is negative: what moves has moved before.
+    steps = jnp.where(is_reset, -n, state.decision * n) + jnp.arange(1, n + 1) if moves(scene) else None
+    done = dataclasses.replace(done, flight=_timed(config, scene, done.flight, steps))
 
     poses = _poses_seen(config, _choose(is_reset, start, state.drone), done.flight)
     memory = _choose(is_reset, rested, state.memory)
     move = jnp.where(is_reset, 0.0, jnp.asarray(ACTIONS, jnp.float32)[action])
-    observation, memory = observe(config, scene, goal, done.drone, move, poses, memory, noise)
+    observation, memory = observe(*(config, scene, goal, done.drone, move, poses, memory, noise, done.disturbance))
     for number in jax.tree.leaves(observation.sensed):
         check_finite(number, "what a sensor shows")
     # Own state and motion are of a finite body; counts of events are whole numbers, and nothing is checked.
@@ -315,6 +344,7 @@ def step(
         memory=memory,
         episode_return=jnp.where(is_reset, 0.0, state.episode_return + done.reward),
         key=key,
+        disturbance=done.disturbance,
     )
     return after, Step(
         observation=observation,
@@ -340,22 +370,58 @@ def is_finite(tree: object) -> Array:
     return jnp.isfinite(sum(sums, jnp.zeros(())))
 
 
-def _scene_of(config: Config, world: World, mission: Array, decision: Array) -> Scene:
-    """The mission's world as it stands at this decision of the episode."""
-    time = decision * (config.drone.physics_steps * config.drone.physics_dt_s)
-    return scene_at(take_scene(world.pool, world.missions.scene[mission]), time)
+def scene_of(world: World, mission: Array) -> Scene:
+    """Returns the world of a mission [] int32, with its motion; balls are thrown at the mission's own drone."""
+    scene = take_scene(world.pool, world.missions.scene[mission])
+    if not moves(scene):
+        return scene
+    return dataclasses.replace(scene, start=world.missions.start[mission], goal=world.missions.goal[mission])
 
 
-def _fly(config: Config, world: World, scene: Scene, goal: Array, state: EnvState, action: Array) -> _Decision:
+def scene_now(config: Config, world: World, state: EnvState) -> Scene:
+    """Returns the world of an environment as it stands now, after its last decision."""
+    scene = scene_of(world, state.mission)
+    return scene_at(scene, _time(config, state.decision) if moves(scene) else None)
+
+
+def _time(config: Config, decisions: Array) -> Array:
+    """Returns the seconds [] of an episode after so many decisions []."""
+    return decisions * (config.drone.physics_steps * config.drone.physics_dt_s)
+
+
+def _timed(config: Config, scene: Scene, flight: Flight, steps: Array | None) -> Flight:
+    """Returns a flight with the times of its poses, taken after physics steps `steps` [n] of the episode.
+
+    In a still world nobody asks for times, and there are none.
+    """
+    if not moves(scene):
+        return flight
+    assert steps is not None
+    return dataclasses.replace(flight, time=steps * config.drone.physics_dt_s)
+
+
+def _fly(
+    config: Config, world: World, scene: Scene, goal: Array, state: EnvState, action: Array, gusts: Array | None
+) -> _Decision:
     """The decision as flown and judged.
 
     A diverged body stays where it was, so that no NaN reaches an observation; a decision without a finite reward has
-    diverged, too.
+    diverged, too. The key `gusts` is consumed; None where nothing changes how a drone flies.
     """
-    before = state.drone
-    command = velocity_command(config.env, action, drone.yaw_of(before.quaternion))
+    before, disturbance = state.drone, state.disturbance
+    move = action
+    if config.env.action_delay:
+        assert disturbance is not None and disturbance.move is not None
+        move, disturbance = disturbance.move, dataclasses.replace(disturbance, move=jnp.asarray(action, jnp.int32))
+    command = velocity_command(config.env, move, drone.yaw_of(before.quaternion))
     heading = heading_setpoint(config.env, before, goal, command)
-    after, flight = drone.fly(config.drone, world.airframe, before, command, heading)
+    if gusts is None:
+        after, flight = drone.fly(config.drone, world.airframe, before, command, heading)
+    else:
+        assert disturbance is not None
+        after, disturbance, flight = drone.fly_disturbed(
+            config, world.airframe, before, disturbance, command, heading, gusts
+        )
     outcome, end_step, contact = judge(config, scene, goal, before.position, flight, state.decision + 1)
     reward = _reward(config, world, scene, goal, state, after, action, outcome)
     numbers = jnp.concatenate([after.position, after.quaternion, after.velocity, after.angular_velocity])
@@ -372,6 +438,7 @@ def _fly(config: Config, world: World, scene: Scene, goal: Array, state: EnvStat
         reward=jnp.where(broken | unrewarded, 0.0, reward),
         broken=broken,
         unrewarded=unrewarded,
+        disturbance=_choose(broken, state.disturbance, disturbance),
     )
 
 
@@ -400,11 +467,12 @@ def _reward(
     configured = configured_reward(config.env, config.agent.discount, outcome, left, still_left, moved)
     if world.reward is None:
         return configured
+    afterwards = scene_at(scene, _time(config, state.decision + 1) if moves(scene) else None)
     transition = Transition(
         before=before.position,
         after=after.position,
         goal=goal,
-        clearance=signed_distance(scene, after.position) - config.drone.body_radius_m,
+        clearance=signed_distance(afterwards, after.position) - config.drone.body_radius_m,
         move=jnp.asarray(action, jnp.int32),
         outcome=outcome,
         configured=configured,
@@ -412,7 +480,7 @@ def _reward(
     return jnp.asarray(world.reward(transition), jnp.float32)
 
 
-def _reset_in_place_of(flown: _Decision, start: DroneState) -> _Decision:
+def _reset_in_place_of(flown: _Decision, start: DroneState, drawn: Disturbance | None = None) -> _Decision:
     """A reset with the arrays of a decision: at `start` throughout, with no reward."""
     return dataclasses.replace(
         flown,
@@ -422,14 +490,16 @@ def _reset_in_place_of(flown: _Decision, start: DroneState) -> _Decision:
         reward=jnp.zeros(()),
         broken=jnp.zeros((), bool),
         unrewarded=jnp.zeros((), bool),
+        disturbance=drawn,
     )
 
 
 def _poses_seen(config: Config, first: DroneState, flight: Flight) -> Flight:
     """Poses [T] at which the sensor looks, of those before the first and after each physics step."""
+    began = None if flight.time is None else flight.time[0] - config.drone.physics_dt_s
     path = jax.tree.map(
         lambda a, b: jnp.concatenate([a[None], b]),
-        Flight(position=first.position, quaternion=first.quaternion, velocity=first.velocity),
+        Flight(position=first.position, quaternion=first.quaternion, velocity=first.velocity, time=began),
         flight,
     )
     return jax.tree.map(lambda x: jnp.stack([x[i] for i in frame_steps(config)]), path)

@@ -29,8 +29,9 @@ from edqn_jax.sim.events import EventField
 from edqn_jax.sim.missions import own_missions
 from edqn_jax.sim.mjcf import check_scene, load_world, mjcf_of, resolve_world
 from edqn_jax.sim.moves import move_number
+from edqn_jax.sim.moving_worlds import Moving
 from edqn_jax.sim.reward import Reward
-from edqn_jax.sim.scene import Scene, stack_scenes, take_scene
+from edqn_jax.sim.scene import Scene, scene_at, stack_scenes
 from edqn_jax.sim.worlds import SPLITS, Split, random_pool, world_keys
 
 
@@ -51,7 +52,7 @@ class Environment:
 
     def scene(self, mission: int = 0) -> Scene:
         """Returns the world of a mission: its shapes, flight volume, start and goal."""
-        return take_scene(self.world.pool, self.world.missions.scene[mission])
+        return env.scene_of(self.world, jnp.asarray(mission))
 
     def mjcf(self, mission: int = 0) -> str:
         """Returns the world of a mission as the text of an MJCF file, which MuJoCo and `make` open."""
@@ -103,7 +104,8 @@ class Environment:
         """Returns the events of a camera that watches a whole flight, with a frame at every physics step.
 
         Args:
-            flight: poses [T] of consecutive physics steps, such as the `flight` of steps, concatenated.
+            flight: poses [T] of consecutive physics steps, such as the `flight` of steps, concatenated. Where shapes
+                move, each sees them at its own `time`.
             mission: in whose world it was flown.
             law: of the events; `esim` remembers each pixel's level from frame to frame.
 
@@ -115,13 +117,13 @@ class Environment:
 
     def picture(self, state: EnvState, scale: int = 8) -> np.ndarray:
         """Returns what a person would see from the drone's camera: [H * scale, W * scale, 3] sRGB in [0, 1]."""
-        scene = take_scene(self.world.pool, self.world.missions.scene[state.mission])
+        scene = env.scene_now(self.config, self.world, state)
         body = state.drone
         return np.asarray(_picture(self.config, scale, scene, body.position, body.quaternion))
 
     def depth(self, state: EnvState) -> np.ndarray:
         """Returns the true distance along each pixel's ray [H, W] metres, inf where it meets nothing: a label."""
-        scene = take_scene(self.world.pool, self.world.missions.scene[state.mission])
+        scene = env.scene_now(self.config, self.world, state)
         return np.asarray(_depth(self.config, scene, state.drone.position, state.drone.quaternion))
 
     def _field(self, observation: Observation) -> EventField:
@@ -156,16 +158,16 @@ def make(
     """
     name = str(world) if world is not None else (config or Config()).world.name
     config = make_config(name) if config is None else config
-    pool = _random_pool(name, worlds, seed, split) if name in FAMILIES else _file_pool(config, name, worlds)
+    pool = _random_pool(config, name, worlds, seed, split) if name in FAMILIES else _file_pool(config, name, worlds)
     return Environment(config, World(drone.load_airframe(config.drone), pool, own_missions(pool), reward))
 
 
-def _random_pool(name: str, count: int, seed: int, split: Split) -> Scene:
+def _random_pool(config: Config, name: str, count: int, seed: int, split: Split) -> Scene:
     if split not in SPLITS:
         raise ConfigError(f"split must be one of {', '.join(SPLITS)}, not '{split}'")
     if count < 1 or seed < 0:
         raise ConfigError(f"worlds must be at least 1 and seed at least 0, not {count} and {seed}")
-    return random_pool(name, world_keys(split, count, first=seed * count))
+    return random_pool(name, world_keys(split, count, first=seed * count), Moving.of(config))
 
 
 def _file_pool(config: Config, name: str, count: int) -> Scene:
@@ -182,7 +184,10 @@ _step = jax.jit(env.step, static_argnums=0)
 
 @functools.partial(jax.jit, static_argnums=0)
 def _stream(config: Config, scene: Scene, flight: Flight) -> EventField:
-    frames = jax.lax.map(lambda pose: sensor.view(config, scene, pose.position, pose.quaternion), flight)
+    def see(pose: Flight) -> Array:
+        return sensor.view(config, scene_at(scene, pose.time), pose.position, pose.quaternion)
+
+    frames = jax.lax.map(see, flight)
     times = tuple(config.drone.physics_dt_s * np.arange(frames.shape[0]))
     key, noise = jax.random.split(jax.random.key(0))
     memory = events.reset_memory(config.events, config.camera.height, config.camera.width, key)

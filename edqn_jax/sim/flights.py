@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from functools import partial
-
 import jax
 import jax.numpy as jnp
 from flax import struct
 from jax import Array
 
 from edqn_jax.config import Config
+from edqn_jax.sim.distance import signed_distance
 from edqn_jax.sim.drone import DroneState, Flight
-from edqn_jax.sim.scene import Scene, signed_distance
+from edqn_jax.sim.scene import Scene, scene_at
 
 
 @struct.dataclass
@@ -90,7 +89,7 @@ def tally(
 
     Args:
         config: body and physics.
-        scene: as it stands during the decision.
+        scene: its shapes are where they are at each moment of the decision.
         flights: of one flight that is not over.
         before: [3] metres, position before the first physics step.
         flight: n physics steps.
@@ -109,7 +108,8 @@ def tally(
     end = begin + segment
     times = flights.flight_seconds + (steps + share) * config.drone.physics_dt_s
 
-    clearance = jax.vmap(partial(signed_distance, scene))(end) - config.drone.body_radius_m
+    distance = jax.vmap(lambda point, time: signed_distance(scene_at(scene, time), point))(end, times)
+    clearance = distance - config.drone.body_radius_m
     least = jnp.argmin(jnp.where(flown, clearance, jnp.inf))
     closest = Closest(
         distance=clearance[least],

@@ -24,6 +24,9 @@ BRANCH_HALF_WIDTH = 0.09
 _EDGE = 1.0  # metres around a corner of the floor that no tree closes
 _OF_A_TREE = 5
 
+BODIES = {"cylinders": tuple(range(TREES)), "boxes": tuple(range(WITH_BRANCH))}
+"""Bodies, as `moving_worlds` moves them: trunk and branch are one."""
+
 
 def draw(key: Array) -> Scene:
     """Returns a random forest, a start and a goal.

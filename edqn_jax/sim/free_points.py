@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+import dataclasses
 from functools import partial
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
-from jax import Array
+from jax import Array, lax
 from jax.typing import ArrayLike
 
-from edqn_jax.sim.scene import Scene, signed_distance
+from edqn_jax.sim.distance import signed_distance
+from edqn_jax.sim.scene import Scene, moves, scene_at
 
 CLEARANCE = 1.0
 """Metres between a random start or goal and the nearest surface."""
@@ -20,6 +22,10 @@ FAR = 40.0
 TRIES = 64
 """Candidates for each free point; the chance that all fail is below 1e-13 in a dense world, and 3e-5 in rooms, where a
 goal may then be nearer than it should."""
+
+EARLY_S = 2.0
+"""Seconds from the start of an episode during which a random point is free of shapes that move."""
+_EARLY_STEP_S = 0.25  # what moves at 5 m/s comes no nearer between two samples than 0.625 m less than the clearance
 
 _ALTITUDES = (1.5, 20.0)  # of the start and goal of a random world, metres
 _FENCE = ((1.0, 1.0, 1.0), (1.0, 1.0, 2.0))  # between random points and the volume's lower and upper faces
@@ -134,9 +140,29 @@ def is_in(cells: Cells, point: Array) -> Array:
 def first_free(
     scene: Scene, points: Array, clearance: float, away_from: Array | None = None, distance: ArrayLike = 0.0
 ) -> Array:
-    """Returns the first of `points` [K, 3], metres, that meets the conditions, or the one that violates them least."""
-    short = jnp.minimum(jax.vmap(partial(signed_distance, scene))(points) - clearance, 0.0)
+    """Returns the first of `points` [K, 3], metres, that meets the conditions, or the one that violates them least.
+
+    Where shapes move, a point is free if it is so at each of `early_times`; balls are not asked for.
+    """
+    short = jnp.minimum(_least_distances(scene, points) - clearance, 0.0)
     if away_from is not None:
         apart = jnp.sqrt(jnp.sum((points - away_from[None]) ** 2, axis=1))
         short += jnp.minimum(apart - distance, 0.0)
     return points[jnp.argmax(short)]
+
+
+def early_times() -> Array:
+    """Returns times [T] from 0 to `EARLY_S` at which random points are free, seconds."""
+    return jnp.linspace(0.0, EARLY_S, 1 + round(EARLY_S / _EARLY_STEP_S))
+
+
+def _least_distances(scene: Scene, points: Array) -> Array:
+    """Returns the least distance [K] of points [K, 3] to the nearest surface at any of `early_times`, metres."""
+    if not moves(scene):
+        return jax.vmap(partial(signed_distance, scene))(points)
+    unthrown = dataclasses.replace(scene, spheres=dataclasses.replace(scene.spheres, throw=None))
+
+    def at(time: Array) -> Array:
+        return jax.vmap(partial(signed_distance, scene_at(unthrown, time)))(points)
+
+    return jnp.min(lax.map(at, early_times()), axis=0)

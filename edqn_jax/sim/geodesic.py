@@ -18,7 +18,8 @@ import numpy as np
 from flax import struct
 from jax import Array, lax
 
-from edqn_jax.sim.scene import Scene, signed_distance
+from edqn_jax.sim.distance import signed_distance
+from edqn_jax.sim.scene import Scene
 
 MOST_NODES = 500_000
 """Nodes of the field of a single world."""

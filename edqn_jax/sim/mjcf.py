@@ -7,6 +7,7 @@ An MJCF file that names no other file can be read. A world for the drone consist
   MuJoCo's viewer (groups 0 to 2) or if MuJoCo would collide with it (contype or conaffinity set): every
   visible geom is solid, and every solid geom is visible. Colour is the material's or the geom's own `rgba`; alpha
   and textures are ignored.
+* its moving geoms, on mocap bodies whose motion a text says (`mjcf_motion.py`).
 * two sites `start` and `goal`, of which only the positions are read.
 * a box site `volume`, not rotated: the space that the drone may fly in. Without one, the box around all
   shapes and sites, `VOLUME_MARGIN` wider on every side, but not below a level plane; an evaluation whose start or goal
@@ -22,13 +23,17 @@ import xml.etree.ElementTree as ElementTree
 from collections.abc import Mapping
 from pathlib import Path
 
+import jax
 import jax.numpy as jnp
 import mujoco
 import numpy as np
 from jax.typing import ArrayLike
 
 from edqn_jax.config import FAMILIES
+from edqn_jax.sim.distance import shape_distances
 from edqn_jax.sim.mjcf_files import SceneError, checked_text
+from edqn_jax.sim.mjcf_motion import PREFIX, motions_of, set_in_motion, text_of
+from edqn_jax.sim.motion import Throw, hit_time, thrown_to
 from edqn_jax.sim.scene import (
     KINDS,
     Capsules,
@@ -42,7 +47,6 @@ from edqn_jax.sim.scene import (
     UprightCylinders,
     build_scene,
     scene_shapes,
-    shape_distances,
 )
 
 VOLUME_MARGIN = 5.0
@@ -129,13 +133,17 @@ def load_world(path: str | Path) -> LoadedWorld:
         raise SceneError(f"{path} has {model.ngeom:,} geoms; a world may have {MOST_SHAPES}")
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
+    said = motions_of(model, str(path))
     shapes: list[Shape] = []
+    bodies: list[int] = []
     names: dict[str, list[str]] = {kind: [] for kind in KINDS}
     for geom in range(model.ngeom):
         if model.geom_group[geom] >= 3 and not (model.geom_contype[geom] or model.geom_conaffinity[geom]):
             continue
-        shape = _shape(model, data, geom, path)
+        body = int(model.body_rootid[model.geom_bodyid[geom]])
+        shape = _shape(model, data, geom, path, moves=body in said)
         shapes.append(shape)
+        bodies.append(body if body in said else 0)
         kind = next(kind for kind, dataclass in KINDS.items() if isinstance(shape, dataclass))
         names[kind].append(_geom_name(model, geom))
     sites = {model.site(i).name: data.site_xpos[i] for i in range(model.nsite)}
@@ -143,9 +151,21 @@ def load_world(path: str | Path) -> LoadedWorld:
         if not np.all(np.isfinite(where)):
             raise SceneError(f"{path}: the site '{name}' stands at no finite point; give its pos three numbers")
     unknown = np.full(3, np.nan)
+    volume = _volume(model, data, shapes, path)
+    for body, motion in said.items():
+        of = [i for i, each in enumerate(bodies) if each == body]
+        if not of:
+            raise SceneError(f"{path}: the body '{model.body(body).name}' moves and has no solid geom; give it one")
+        title = f"{path}: the body '{model.body(body).name}'"
+        parts = [shapes[i] for i in of]
+        reaches = [np.zeros(3) if isinstance(part, Planes) else _reach(part) for part in parts]
+        faces = volume if "volume" in sites else None
+        moving = set_in_motion(parts, reaches, motion, data.xpos[body], faces, title)
+        for i, shape in zip(of, moving, strict=True):
+            shapes[i] = shape
     scene = build_scene(
         shapes,
-        volume=_volume(model, data, shapes, path),
+        volume=volume,
         start=sites.get("start", unknown),
         goal=sites.get("goal", unknown),
     )
@@ -272,12 +292,28 @@ def mjcf_of(scene: Scene, *, title: str = "world") -> str:
         rgba="0.2 0.4 1 0.1",
     )  # fmt: skip
     counts: dict[str, int] = {}
+    custom = ElementTree.Element("custom")
     for shape in scene_shapes(scene):
         attributes = _attributes(shape)
         number = counts[attributes["type"]] = counts.get(attributes["type"], 0) + 1
-        ElementTree.SubElement(world, "geom", {"name": f"{attributes['type']}{number}", **attributes})
+        name, parent, said = f"{attributes['type']}{number}", world, text_of(shape)
+        if said is not None:
+            throw = shape.throw if isinstance(shape, Spheres) else None
+            place = shape.position if throw is None else _launch(scene, throw)
+            attributes.pop("pos")
+            parent = ElementTree.SubElement(world, "body", name=f"moving {name}", mocap="true", pos=_numbers(place))
+            ElementTree.SubElement(custom, "text", name=f"{PREFIX}moving {name}", data=said)
+        ElementTree.SubElement(parent, "geom", {"name": name, **attributes})
+    if len(custom):
+        root.append(custom)
     ElementTree.indent(root)
     return ElementTree.tostring(root, encoding="unicode") + "\n"
+
+
+def _launch(scene: Scene, one: Throw) -> np.ndarray:
+    """Returns where a ball is launched at a drone between the world's own start and goal, [3] metres."""
+    throw, ends = jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], one), (scene.start, scene.goal)
+    return np.asarray(thrown_to(throw, *ends, (hit_time(throw, *ends) - throw.early)[0]))[0]
 
 
 def _geom_name(model: mujoco.MjModel, geom: int) -> str:
@@ -289,15 +325,22 @@ def _kind_name(kind: mujoco.mjtGeom) -> str:
     return kind.name.removeprefix("mjGEOM_").lower()
 
 
-def _shape(model: mujoco.MjModel, data: mujoco.MjData, geom: int, path: Path) -> Shape:
-    """Returns geom `geom` as a single shape, in the world's frame."""
+def _shape(model: mujoco.MjModel, data: mujoco.MjData, geom: int, path: Path, moves: bool) -> Shape:
+    """Returns geom `geom` as a single shape, in the world's frame; `moves` if its mocap body may."""
     kind = mujoco.mjtGeom(model.geom_type[geom])
     name = _geom_name(model, geom)
     body = model.geom_bodyid[geom]
-    if model.body_weldid[body] != 0 or model.body_mocapid[body] >= 0:
+    root = model.body_rootid[body]
+    if model.body_weldid[body] != model.body_weldid[root] or model.body_dofnum[root]:
         raise SceneError(
-            f"{path}: geom '{name}' is on a body that can move; remove the joints (or mocap) of body "
-            f"'{model.body(body).name}', every world is static"
+            f"{path}: geom '{name}' is on a body that can move; remove the joints of body '{model.body(body).name}', "
+            "nothing is simulated but the drone"
+        )
+    if model.body_mocapid[root] >= 0 and not moves:
+        said = f"{PREFIX}{model.body(root).name}"
+        raise SceneError(
+            f"{path}: geom '{name}' is on a body that can move; remove the mocap of body '{model.body(root).name}', or "
+            f'say how it moves: <custom><text name="{said}" data="oscillate 0 2 0 4 0"/></custom>'
         )
     material = model.geom_matid[geom]
     albedo = (model.geom_rgba[geom] if material < 0 else model.mat_rgba[material])[:3]

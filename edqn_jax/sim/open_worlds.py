@@ -20,6 +20,14 @@ GAP = 3.0
 """Free metres between the footprints of any two shapes, and between them and the faces of the volume."""
 
 
+def bodies(density: str) -> dict[str, tuple[int, ...]]:
+    """Returns the bodies of the worlds of a density, as `moving_worlds` moves them: every shape is one."""
+    blocks, pillars, balls = SHAPES[density]
+    ends = {"boxes": blocks, "cylinders": blocks + pillars, "spheres": blocks + pillars + balls}
+    counts = {"boxes": blocks, "cylinders": pillars, "spheres": balls}
+    return {kind: tuple(range(ends[kind] - counts[kind], ends[kind])) for kind in ends}
+
+
 def draw(density: str, key: Array) -> Scene:
     """Returns a random world: blocks, pillars and balls over level ground, a start and a goal.
 

@@ -8,8 +8,9 @@ import jax.numpy as jnp
 from jax import Array
 
 from edqn_jax.config import Config
+from edqn_jax.sim.distance import path_contact
 from edqn_jax.sim.drone import Flight
-from edqn_jax.sim.scene import Scene, path_contact
+from edqn_jax.sim.scene import Scene, moves
 
 
 class Outcome(enum.IntEnum):
@@ -34,6 +35,7 @@ def judge(
     """Returns the outcome of one decision: the earliest physics step wins, and at the same step a collision wins.
 
     Args:
+        scene: shapes that move are where they are at each moment of the decision.
         before: [3] position before the first physics step.
         decision: decisions taken, this one included.
 
@@ -44,7 +46,8 @@ def judge(
     """
     n = flight.position.shape[0]
     path = jnp.concatenate([before[None], flight.position])
-    touch, contact = path_contact(scene, path, config.drone.body_radius_m)
+    times = ((decision - 1) * n + jnp.arange(n + 1)) * config.drone.physics_dt_s if moves(scene) else None
+    touch, contact = path_contact(scene, path, config.drone.body_radius_m, times)
     at = flight.position
     apart = at - goal[None]
     arrived = jnp.sum(apart * apart, axis=1) < config.env.goal_radius_m**2

@@ -21,7 +21,11 @@ Static = tuple[Hashable, ...]
 
 
 def draw_in_one_batch(
-    draw: Callable[..., Array], static: Static, arguments: tuple[Any, ...], shape: tuple[int, int]
+    draw: Callable[..., Array],
+    static: Static,
+    arguments: tuple[Any, ...],
+    shape: tuple[int, int],
+    on_cpu: Callable[..., Array | None],
 ) -> Array:
     """Returns one picture, [H, W] float32; all pictures that it is mapped to are drawn by one call of `draw`.
 
@@ -31,21 +35,43 @@ def draw_in_one_batch(
         static: arguments that are known when tracing.
         arguments: pytrees of arrays, of one picture.
         shape: H, W.
+        on_cpu: what draws where the program is compiled for CPUs, of arguments with leading [L] (see `_pictures_p`); or
+            returns None if it cannot, and `draw` does.
     """
     leaves, tree = jax.tree.flatten(arguments)
-    return _pictures_p.bind(*(leaf[None] for leaf in leaves), draw=draw, static=static, tree=tree, shape=shape)[0]
+    parameters = {"draw": draw, "static": static, "tree": tree, "shape": shape, "on_cpu": on_cpu}
+    return _pictures_p.bind(*(leaf[None] for leaf in leaves), **parameters)[0]
 
 
 _pictures_p = Primitive("pictures")
-"""Its operands are the leaves of the arguments, each with a leading [M]; its result is [M, H, W]."""
+"""Its operands are the leaves of the arguments, each with a leading [L]; its result is [M, H, W].
+
+M is the largest L, and a multiple of every other: where frames share a world, one row of it serves M / L pictures in a
+row.
+"""
 
 
-def _draw(*leaves: Array, draw: Callable[..., Array], static: Static, tree: Any, shape: tuple[int, int]) -> Array:
-    return draw(*static, *jax.tree.unflatten(tree, leaves))
+def _draw(*leaves: Array, draw: Callable[..., Array], static: Static, tree: Any, **_: Any) -> Array:
+    count = most_rows(leaves)
+    return draw(
+        *static, *jax.tree.unflatten(tree, [jnp.repeat(leaf, count // leaf.shape[0], axis=0) for leaf in leaves])
+    )
+
+
+def _draw_on_cpu(
+    *leaves: Array, draw: Callable[..., Array], on_cpu: Callable[..., Array | None], static: Static, tree: Any, **_: Any
+) -> Array:
+    found = on_cpu(*static, *jax.tree.unflatten(tree, leaves))
+    return _draw(*leaves, draw=draw, static=static, tree=tree) if found is None else found
+
+
+def most_rows(leaves: Sequence[Any]) -> int:
+    """Returns M of arrays with a leading [L]."""
+    return max(leaf.shape[0] for leaf in leaves)
 
 
 def _abstract(*leaves: Any, shape: tuple[int, int], **_: Any) -> ShapedArray:
-    return ShapedArray((leaves[0].shape[0], *shape), np.dtype(np.float32))
+    return ShapedArray((most_rows(leaves), *shape), np.dtype(np.float32))
 
 
 def _batch(leaves: Sequence[Array], axes: Sequence[int | None], **parameters: Any) -> tuple[Array, int]:
@@ -53,6 +79,8 @@ def _batch(leaves: Sequence[Array], axes: Sequence[int | None], **parameters: An
     size = next(leaf.shape[axis] for leaf, axis in zip(leaves, axes, strict=True) if axis is not None)
 
     def merged(leaf: Array, axis: int | None) -> Array:
+        if axis is None and leaf.shape[0] == 1:
+            return leaf
         mapped = jnp.broadcast_to(leaf, (size, *leaf.shape)) if axis is None else jnp.moveaxis(leaf, axis, 0)
         return mapped.reshape(mapped.shape[0] * mapped.shape[1], *mapped.shape[2:])
 
@@ -61,6 +89,7 @@ def _batch(leaves: Sequence[Array], axes: Sequence[int | None], **parameters: An
 
 
 _pictures_p.def_abstract_eval(_abstract)
-_pictures_p.def_impl(jax.jit(_draw, static_argnames=("draw", "static", "tree", "shape")))
+_pictures_p.def_impl(jax.jit(_pictures_p.bind, static_argnames=("draw", "static", "tree", "shape", "on_cpu")))
 batching.primitive_batchers[_pictures_p] = _batch
 mlir.register_lowering(_pictures_p, mlir.lower_fun(_draw, multiple_results=False))
+mlir.register_lowering(_pictures_p, mlir.lower_fun(_draw_on_cpu, multiple_results=False), platform="cpu")

@@ -20,7 +20,7 @@ class Transition:
     after: Array  # [3] metres, position 0.26 s later
     goal: Array  # [3] metres
     clearance: Array  # [] metres between the body's sphere and the nearest shape afterwards; negative inside one
-    move: Array  # [] int32, 0..26, see `sim.moves`
+    move: Array  # [] int32, 0..26, see `sim.moves`; as chosen, also where `env.action_delay` flies it later
     outcome: Array  # [] int32, an `Outcome`
     configured: Array  # [] the reward that the configuration asks for
 

@@ -22,6 +22,7 @@ def rigid_body_step(
     quaternion: Array,
     velocity: Array,
     angular_velocity: Array,
+    push: Array | None = None,
 ) -> tuple[Array, Array, Array, Array]:
     """Returns the body's state after `dt_s` seconds.
 
@@ -35,6 +36,7 @@ def rigid_body_step(
         quaternion: [4] w, x, y, z; body to world.
         velocity: [3] m/s, world.
         angular_velocity: [3] rad/s, body.
+        push: [3] further force at the centre of mass, newtons, world; None is none.
 
     Returns:
         position, quaternion, velocity, angular_velocity after the step; the quaternion has length 1.
@@ -48,6 +50,8 @@ def rigid_body_step(
     gained = jnp.stack(
         [2 * (x * z + w * y) * lift, 2 * (y * z - w * x) * lift, (1 - 2 * (x * x + y * y)) * lift - gravity]
     )
+    if push is not None:
+        gained = gained + push / mass
     velocity = velocity + dt_s * gained
 
     p, q, r = (

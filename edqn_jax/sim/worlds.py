@@ -19,6 +19,7 @@ from edqn_jax.config.loading import nearest
 from edqn_jax.errors import ConfigError
 from edqn_jax.random import integers
 from edqn_jax.sim import canyon, forest, open_worlds, rooms
+from edqn_jax.sim.moving_worlds import MOVING_SHARE, STILL, Bodies, Moving, in_motion
 from edqn_jax.sim.scene import Scene, take_scene, with_equal_capacities
 from edqn_jax.sim.ways import has_way
 
@@ -26,6 +27,7 @@ RADIUS_M = 0.36
 """Of the sphere that has a way in every random world; the drone's."""
 
 _FAMILY = 1_000_003  # folded into the key of a world of a mixture to draw its family
+_MOTION = 7_000_003  # folded into the key of a world to draw what moves in it
 _AT_ONCE = 64  # worlds that are drawn by one call
 
 # ------------------------------------------------------------------------------------------- seeds
@@ -59,49 +61,61 @@ class _Family:
     """Of the volume at most, metres."""
     edge_m: float | None
     """Of the lattice on which each world is checked for a way; None where no check could ever fail."""
+    bodies: Bodies
+    """What can move."""
 
 
 _FAMILIES = {
-    **{density: _Family(partial(open_worlds.draw, density), open_worlds.SIZE, None) for density in open_worlds.SHAPES},
-    "rooms": _Family(rooms.draw, (rooms.SIDE, rooms.SIDE, rooms.HEIGHT[1]), 0.5),
-    "forest": _Family(forest.draw, forest.SIZE, 0.5),
-    "canyon": _Family(canyon.draw, canyon.SIZE, 0.7),
+    **{
+        density: _Family(partial(open_worlds.draw, density), open_worlds.SIZE, None, open_worlds.bodies(density))
+        for density in open_worlds.SHAPES
+    },
+    "rooms": _Family(rooms.draw, (rooms.SIDE, rooms.SIDE, rooms.HEIGHT[1]), 0.5, {}),  # walls stand
+    "forest": _Family(forest.draw, forest.SIZE, 0.5, forest.BODIES),
+    "canyon": _Family(canyon.draw, canyon.SIZE, 0.7, canyon.BODIES),
 }
 
 
-def random_scene(family: str, key: Array) -> Scene:
+def random_scene(family: str, key: Array, moving: Moving = STILL) -> Scene:
     """Returns a random world with a start, a goal, and a way between them for a sphere of `RADIUS_M`.
+
+    What moves does so on top of the world that the key gives without it, and the way is one at time 0.
 
     Args:
         family: of `FAMILIES`; a world of a mixture is of one of its families.
         key: consumed.
+        moving: what moves.
 
     Raises:
         ConfigError: if there is no such family.
     """
-    _check(family)
+    family, moving = _checked(family, moving)
     if family in MIXTURES:
         family = families_of(family, key[None])[0]
-    return take_scene(_drawn(family, key[None]), 0)
+    return take_scene(_drawn(family, key[None], moving), 0)
 
 
-def random_pool(family: str, keys: Array) -> Scene:
+def random_pool(family: str, keys: Array, moving: Moving = STILL) -> Scene:
     """Returns a pool of random worlds, one for each of `keys` [P]; see `random_scene`."""
-    _check(family)
+    family, moving = _checked(family, moving)
     if family not in MIXTURES:
-        return _in_batches(family, keys)
+        return _in_batches(family, moving, keys)
     names = np.array(families_of(family, keys))
     present = [(str(name), np.flatnonzero(names == name)) for name in np.unique(names)]
     # Padded for all families of the mixture, also for one that none of these worlds is of.
-    shapes = [jax.eval_shape(jax.vmap(_FAMILIES[name].draw), keys) for name in MIXTURES[family]]
-    pools = with_equal_capacities([_in_batches(name, keys[which]) for name, which in present], shapes)
+    shapes = [jax.eval_shape(partial(_unchecked, name, moving), keys) for name in MIXTURES[family]]
+    pools = with_equal_capacities([_in_batches(name, moving, keys[which]) for name, which in present], shapes)
     order = np.argsort(np.concatenate([which for _, which in present]))
     return jax.tree.map(lambda *leaves: jnp.asarray(np.concatenate(leaves)[order]), *pools)
 
 
-def _check(family: str) -> None:
+def _checked(family: str, moving: Moving) -> tuple[str, Moving]:
+    """Returns a family that is drawn, and what moves in it: the worlds `moving` are medium ones."""
     if family not in FAMILIES:
         raise ConfigError(f"there are no random worlds '{family}'{nearest(family, FAMILIES)}")
+    if family == "moving":
+        return "medium", dataclasses.replace(moving, share=moving.share or MOVING_SHARE)
+    return family, moving
 
 
 def families_of(mixture: str, keys: Array) -> list[str]:
@@ -111,24 +125,41 @@ def families_of(mixture: str, keys: Array) -> list[str]:
     return [families[number] for number in np.asarray(numbers)]
 
 
-def _in_batches(family: str, keys: Array) -> Scene:
+def _in_batches(family: str, moving: Moving, keys: Array) -> Scene:
     """Returns a pool of one family, drawn in batches of one size, so that one program draws pools of every size."""
     count = keys.shape[0]
     if count <= 1:
-        return _drawn(family, keys)
+        return _drawn(family, keys, moving)
     # As data: the first key is used once more to fill the last batch.
     data = np.asarray(jax.random.key_data(keys))
     data = np.concatenate([data, np.broadcast_to(data[:1], (-count % _AT_ONCE, *data.shape[1:]))])
     batches = [jax.random.wrap_key_data(jnp.asarray(data[i : i + _AT_ONCE])) for i in range(0, count, _AT_ONCE)]
     # XLA uses one core for a batch.
     with ThreadPoolExecutor(thread_name_prefix="drawing") as pool:
-        drawn = list(pool.map(partial(_drawn, family), batches))
+        drawn = list(pool.map(partial(_drawn, family, moving=moving), batches))
     return jax.tree.map(lambda *leaves: jnp.concatenate(leaves)[:count], *drawn)
 
 
-@partial(jax.jit, static_argnums=0)
-def _drawn(family: str, keys: Array) -> Scene:
-    """Returns worlds of one family, one for each key [P]; one without a way is drawn again with another key."""
+@partial(jax.jit, static_argnums=(0, 2), static_argnames="moving")
+def _drawn(family: str, keys: Array, moving: Moving = STILL) -> Scene:
+    """Returns worlds of one family, one for each key [P]."""
+    return _set_in_motion(family, moving, _standing(family, keys), keys)
+
+
+def _unchecked(family: str, moving: Moving, keys: Array) -> Scene:
+    """Returns what `_drawn` returns, but for worlds without a way, which are kept."""
+    return _set_in_motion(family, moving, jax.vmap(_FAMILIES[family].draw)(keys), keys)
+
+
+def _set_in_motion(family: str, moving: Moving, scenes: Scene, keys: Array) -> Scene:
+    bodies = _FAMILIES[family].bodies
+    if not moving.balls and not (moving.share and bodies):
+        return scenes
+    return jax.vmap(lambda scene, key: in_motion(scene, moving, bodies, jax.random.fold_in(key, _MOTION)))(scenes, keys)
+
+
+def _standing(family: str, keys: Array) -> Scene:
+    """Returns worlds in which nothing moves; one without a way is drawn again with another key."""
     how, edge = _FAMILIES[family], _FAMILIES[family].edge_m
     if edge is None:
         return jax.vmap(how.draw)(keys)

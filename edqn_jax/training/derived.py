@@ -57,8 +57,9 @@ def from_trajectory(
     path = np.concatenate([start[None], positions])
     lengths = np.linalg.norm(np.diff(path, axis=0), axis=1)
     steps, seconds, decision = len(positions), float(recorded["t"][-1]), config.drone.physics_steps
-    contact = replay_contact(judge, path)
-    ends = [clearance(judge, point)[0] for point in path]
+    step_s = config.drone.physics_dt_s
+    contact = replay_contact(judge, path, step_s, (start, goal))
+    ends = [clearance(judge, point, step_s * row, (start, goal))[0] for row, point in enumerate(path)]
     if contact is not None:
         cut = 1.0 - contact.fraction if contact.segment == steps - 1 else math.inf  # sooner: not as recorded
         lengths[-1] *= 1.0 - cut

@@ -1,4 +1,4 @@
-"""Rays, shade and texture of the conventional camera against brute force and against ours; its events too."""
+"""Rays, shade, texture and label of the conventional camera against brute force and ours; its events too."""
 
 from __future__ import annotations
 
@@ -11,11 +11,12 @@ import numpy as np
 import pytest
 
 from conventional_stack import camera, events, task, world
-from edqn_jax.config import CameraConfig, Config, EventsConfig
+from edqn_jax.config import CameraConfig, Config, EncoderConfig, EventsConfig
 from edqn_jax.sim import camera as our_camera
 from edqn_jax.sim import env as our_env
 from edqn_jax.sim import events as our_events
-from edqn_jax.sim.scene import signed_distance
+from edqn_jax.sim import sensor as our_sensor
+from edqn_jax.sim.distance import signed_distance
 from tests.bench.conventional_course import paper
 from tests.oracles import camera_plain, events_plain
 from tests.sim.drawn_scenes import every_kind, free_points
@@ -83,6 +84,25 @@ def test_off_the_silhouettes_a_picture_is_ours():
     assert face.sum() > 3000
     # Float32 against float64; the few others lie beside a face that a middle ray does not meet.
     assert np.quantile(error[face], 0.99) < 1e-5
+
+
+def our_labels(config, scene, pose):
+    place = jnp.asarray(pose, jnp.float32)
+    label = partial(our_sensor.nearness_image, config, scene)
+    return np.asarray(jax.jit(jax.vmap(label))(place[:, :3], place[:, 3:]))
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_the_label_is_our_nearness_image(seed):
+    config, scene = Config(), every_kind(np.random.default_rng(seed))
+    pose, _ = poses(scene, 6, seed)
+    _, hits = pictures(config.camera, scene, pose)
+    label = np.empty(hits.depth.shape, np.float32)
+    camera.nearness(hits, label)
+    error = np.abs(label.reshape(-1, config.camera.height, config.camera.width) - our_labels(config, scene, pose))
+    # A ray may pass a silhouette on the other side, as above.
+    assert np.mean(error > 1e-5) < 0.003
+    assert np.ptp(label) > 1.0 and np.any(label == 0.0)
 
 
 def test_texture_is_averaged_over_the_pixel():
@@ -162,3 +182,14 @@ def test_the_fleet_sees_what_the_two_frames_show():
     events.signed_counts(events.law_of(config.events), *(f.reshape(2, -1) for f in frames), expected)
     np.testing.assert_array_equal(fleet.record.events.reshape(2, -1), expected)
     assert np.count_nonzero(expected) > 50
+    label = our_labels(config, paper(), fleet.path[:, last])
+    assert np.mean(np.abs(fleet.record.nearness - label) > 1e-5) < 0.003
+
+
+def test_a_label_that_is_not_drawn_is_not_rendered():
+    from tests.bench.conventional_course import fleet_of
+
+    config = dataclasses.replace(Config(), encoder=EncoderConfig(target="sensed"))
+    fleet = fleet_of(config, np.array([[40.0, 22.0, 6.0]]), np.array([[90.0, 90.0, 10.0]]))
+    fleet.step(restart=False)
+    assert fleet.record.nearness.shape == (1, 0, 0)

@@ -1,4 +1,4 @@
-"""The conventional environment is ours: the same flights, outcomes, rewards and own states on the same actions."""
+"""The conventional environment is ours: flights, outcomes, rewards, own states and motions on the same actions."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from conventional_stack import task
 from conventional_stack.env import DroneEnv
 from conventional_stack.fleet import Fleet, Record
-from edqn_jax.config import CameraConfig, Config, DroneConfig, EncoderConfig, EnvConfig, EventsConfig
+from edqn_jax.config import AirConfig, CameraConfig, Config, DroneConfig, EncoderConfig, EnvConfig, EventsConfig
 from edqn_jax.errors import ConfigError
 from edqn_jax.packages import require
 from edqn_jax.sim import drone, env, events, outcomes
@@ -46,7 +46,7 @@ def stepped(config, world, state, action):
     """Our environment's step without the pictures: what is not returned is not computed."""
     state, step = jax.vmap(lambda s, a: env.step(config, world, s, a))(state, action)
     ended = step.end_step - 1 + step.contact
-    return state, (step.flight, step.outcome, step.reward, step.observation.own, ended)
+    return state, (step.flight, step.outcome, step.reward, step.observation, ended)
 
 
 def begun(bodies: DroneState, decision) -> EnvState:
@@ -116,7 +116,7 @@ def test_one_decision_from_any_state_ends_where_ours_does_and_is_judged_alike():
         yaw_setpoint=jnp.asarray(setpoint),
     )
     world = world_of(CONFIG, state[:, :3], goal)
-    after, (flight, outcome, reward, own, ended) = stepped(CONFIG, world, begun(body, decision), jnp.asarray(action))
+    after, (flight, outcome, reward, seen, ended) = stepped(CONFIG, world, begun(body, decision), jnp.asarray(action))
 
     fleet = fleet_of(CONFIG, state[:, :3], goal)
     fleet.state[:], fleet.yaw_setpoint[:], fleet.decision[:] = state, setpoint, decision
@@ -139,7 +139,15 @@ def test_one_decision_from_any_state_ends_where_ours_does_and_is_judged_alike():
     # Three metres' worth of reward a metre, from two rounded distances.
     np.testing.assert_allclose(fleet.record.reward[sure], np.asarray(reward)[sure], atol=10 * POSITION_M)
     # Velocities in units of 4 m/s; near the goal a metre is half of a unit.
-    np.testing.assert_allclose(fleet.record.final_own, own, atol=VELOCITY)
+    np.testing.assert_allclose(fleet.record.final_own, seen.own, atol=VELOCITY)
+    motion, ours = fleet.record.motion, np.asarray(seen.motion)
+    np.testing.assert_allclose(motion[:, :3], ours[:, :3], atol=VELOCITY)
+    # The heading of a body on its back turns at any rate.
+    upright = fleet.state[:, 3] ** 2 + fleet.state[:, 6] ** 2 > 0.5
+    assert upright.mean() > 0.9
+    np.testing.assert_allclose(motion[upright, 3], ours[upright, 3], atol=10 * VELOCITY)
+    assert np.abs(motion[:, 3]).max() <= env.MOST_YAW_RATE
+    np.testing.assert_array_equal(motion[:, 4:], ours[:, 4:])
 
 
 @pytest.mark.parametrize("name", ["sparse", "progress", "potential"])
@@ -188,11 +196,13 @@ def test_whole_flights_are_ours_until_they_end_and_end_alike(mission, legs):
 def test_a_reset_is_ours():
     start, goal = STARTS[1], GOALS[1]
     body = drone.hover(jnp.asarray(start), jnp.arctan2(goal[1] - start[1], goal[0] - start[0]))
+    DRONE.reset(options={"mission": 1})
+    assert DRONE.step(22)[0]["motion"].any()
     got, info = DRONE.reset(seed=1, options={"mission": 1})
     np.testing.assert_allclose(got["own"], env.own_state(CONFIG.env, paper(), jnp.asarray(goal), body), atol=1e-6)
     np.testing.assert_allclose(DRONE.fleet.state[0, 3:7], body.quaternion, atol=1e-6)
     np.testing.assert_allclose(DRONE.fleet.yaw_setpoint[0], body.yaw_setpoint, atol=1e-6)
-    assert not got["events"].any() and info["outcome"] == "RUNNING"
+    assert not got["events"].any() and not got["motion"].any() and info["outcome"] == "RUNNING"
 
 
 def test_gymnasium_and_stable_baselines3_accept_the_environment():
@@ -216,7 +226,7 @@ def test_a_body_that_diverges_is_put_back_and_seen_as_such(monkeypatch, tmp_path
     fleet.step(restart=False)
     assert fleet.record.outcome[0] == Outcome.DIVERGED and fleet.record.reward[0] == 0.0
     np.testing.assert_array_equal(fleet.state[0, :3], [20.0, 40.0, 12.0])
-    assert np.isfinite(fleet.record.final_own).all()
+    assert np.isfinite(fleet.record.final_own).all() and np.isfinite(fleet.record.motion).all()
 
 
 def test_who_ended_starts_anew_within_the_step():
@@ -242,6 +252,8 @@ def test_who_ended_starts_anew_within_the_step():
         {"encoder": EncoderConfig(retrain_at=(0.5,))},
         {"env": EnvConfig(position=False)},
         {"env": EnvConfig(reward="geodesic")},
+        {"air": AirConfig(gusts_m_s=1.0)},
+        {"env": EnvConfig(action_delay=1)},
     ],
 )
 def test_what_this_stack_does_not_have_is_said_before_it_flies(change):

@@ -16,6 +16,7 @@ from edqn_jax.errors import ConfigError
 from edqn_jax.evaluation import rollouts as our_flights
 from edqn_jax.evaluation.metrics import summarise
 from edqn_jax.learn.policy import PolicyParams
+from edqn_jax.sim.moves import ACTIONS
 from edqn_jax.sim.outcomes import Outcome
 from edqn_jax.sim.scene import stack_scenes
 from tests.bench.conventional_course import course_of, paper, world_of
@@ -40,6 +41,10 @@ def towards_the_goal(xp, own):
     return xp.where(own[..., 1] > 0.3, UP, xp.where(own[..., 1] < -0.3, DOWN, AHEAD))
 
 
+def by_own_state(events, own, motion):
+    return towards_the_goal(np, own)
+
+
 def test_outcome_path_clearance_and_time_are_ours(monkeypatch):
     def act(config, params, memory, observation, key):
         return towards_the_goal(jnp, observation.own).astype(jnp.int32), memory
@@ -49,7 +54,7 @@ def test_outcome_path_clearance_and_time_are_ours(monkeypatch):
     blind = dataclasses.replace(CONFIG, env=dataclasses.replace(CONFIG.env, sensor="blind"))
     world = world_of(CONFIG, STARTS, GOALS)
     ours = our_flights.fly_missions(blind, world, PolicyParams(encoder=None, q=None), jax.random.key(0))
-    got = fly_missions(CONFIG, course_of(STARTS, GOALS), lambda events, own: towards_the_goal(np, own))
+    got = fly_missions(CONFIG, course_of(STARTS, GOALS), by_own_state)
     assert {Outcome.GOAL, Outcome.COLLISION, Outcome.TIME_OUT, Outcome.LEFT_VOLUME} == set(map(Outcome, got.outcome))
     for name in ("outcome", "decisions", "physics_steps"):
         np.testing.assert_array_equal(getattr(got, name), getattr(ours, name), err_msg=name)
@@ -65,13 +70,24 @@ def test_outcome_path_clearance_and_time_are_ours(monkeypatch):
 
 
 def test_a_mission_flies_alike_alone_and_beside_others():
-    together = fly_missions(CONFIG, course_of(STARTS, GOALS), lambda events, own: towards_the_goal(np, own))
+    together = fly_missions(CONFIG, course_of(STARTS, GOALS), by_own_state)
     for i in (0, 3):
-        alone = fly_missions(
-            CONFIG, course_of(STARTS[i : i + 1], GOALS[i : i + 1]), lambda events, own: towards_the_goal(np, own)
-        )
+        alone = fly_missions(CONFIG, course_of(STARTS[i : i + 1], GOALS[i : i + 1]), by_own_state)
         for mine, theirs in zip(jax.tree.leaves(alone), jax.tree.leaves(together), strict=True):
             np.testing.assert_array_equal(mine[0], theirs[i])
+
+
+def test_a_flight_is_shown_its_own_motion():
+    moves = [13]  # nothing is flown before the first decision
+
+    def act(events, own, motion):
+        np.testing.assert_array_equal(motion[:, :3], own[:, 7:])
+        np.testing.assert_array_equal(motion[0, 4:], ACTIONS[moves[-1]])
+        moves.append(int(towards_the_goal(np, own)[0]))
+        return np.array(moves[-1:])
+
+    fly_missions(CONFIG, course_of(STARTS[:1], GOALS[:1]), act)
+    assert {AHEAD, UP} <= set(moves)
 
 
 def test_a_course_is_our_missions():

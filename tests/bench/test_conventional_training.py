@@ -6,6 +6,8 @@ import dataclasses
 import importlib
 import json
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -13,14 +15,17 @@ import conventional
 from conventional_stack.fleet import Record
 from conventional_stack.settings import supported
 from conventional_stack.train import Steady, Trained, Training, fly, train
-from conventional_stack.vae import EventVAE, Learner, images
+from conventional_stack.vae import EventVAE, Learner
 from conventional_stack.vec_env import CodedDrones
 from conventional_stack.workers import SpreadFleet
-from edqn_jax.config import Config
+from edqn_jax.config import CameraConfig, Config, EncoderConfig
 from edqn_jax.errors import ConfigError
+from edqn_jax.learn import vae
+from edqn_jax.learn.waves import cosines
 from edqn_jax.packages import MissingPackageError, require
 from edqn_jax.runs.directory import plain
-from edqn_jax.sim.env import OWN_SIZE
+from edqn_jax.sim.env import MOTION_SIZE, OWN_SIZE
+from edqn_jax.sim.events import EventField
 from edqn_jax.sim.outcomes import Outcome
 from measurement.flags import configured
 from rivals import stack
@@ -47,41 +52,123 @@ def blobs(count: int, seed: int) -> np.ndarray:
     return fields
 
 
-def test_images_are_logarithms_of_on_and_off_counts():
-    counts = np.array([[[2, 0], [-1, -127]]], np.int8)
-    expected = np.log1p([[2, 0, 0, 0, 0, 0, 1, 127]])
-    np.testing.assert_allclose(images(counts).numpy(), expected, rtol=1e-6)
+def motions(count: int, seed: int) -> np.ndarray:
+    return np.random.default_rng(seed).normal(size=(count, MOTION_SIZE)).astype(np.float32)
 
 
-def test_the_loss_is_squared_error_and_kl_of_an_image():
-    torch.manual_seed(0)
-    vae = EventVAE(CONFIG.encoder, CONFIG.camera)
-    image = images(blobs(5, 0))
-    mean, log_variance = vae.encode(image)
+def labels(fields: np.ndarray) -> np.ndarray:
+    """Near where there are ON events, far elsewhere."""
+    return np.where(fields > 0, 2.0, 0.5).astype(np.float32)
+
+
+def field_of(counts: np.ndarray) -> EventField:
+    """The same event counts [B, H, W] as ours."""
+    signed = jnp.asarray(counts, jnp.int32)[:, None]
+    when = jnp.zeros(signed.shape)
+    return EventField(jnp.abs(signed), jnp.sign(signed).astype(jnp.int8), when, when, window_s=1.0)
+
+
+def twins(camera: CameraConfig, config: EncoderConfig):
+    """Our parameters, none of which is zero, and the VAE in PyTorch that has them."""
+    leaves, tree = jax.tree.flatten(vae.init_vae(config, camera, jax.random.key(0)))
+    rng = np.random.default_rng(1)
+    params = jax.tree.unflatten(tree, [leaf + 0.05 * rng.normal(size=leaf.shape).astype(np.float32) for leaf in leaves])
+    return params, EventVAE(config, camera, params)
+
+
+def sensed(camera: CameraConfig, count: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(2)
+    shape = (count, camera.height, camera.width)
+    counts = (rng.integers(-9, 10, shape) * (rng.random(shape) < 0.3)).astype(np.int8)
+    counts[0, 0, :2] = 127, -127
+    return counts, motions(count, 3), rng.uniform(0.0, 3.0, shape).astype(np.float32)
+
+
+SMALL = dataclasses.replace(
+    CONFIG.encoder, patch_layers=(8,), joint_layers=(12,), decoder_hidden=(10,), target_blur=0, decoder_bandwidth=1.0
+)
+NETWORKS = [
+    (CONFIG.camera, CONFIG.encoder),
+    (CONFIG.camera, dataclasses.replace(CONFIG.encoder, target="sensed")),
+    (CONFIG.camera, dataclasses.replace(CONFIG.encoder, target="both", target_blur=5)),
+    (CameraConfig(width=10, height=6), SMALL),  # patches beyond the image
+]
+TOLERANCE = 1e-5
+"""Sums of at most some hundred float32 products of order 1, in another order."""
+
+
+@pytest.mark.parametrize(("camera", "config"), NETWORKS)
+def test_codes_and_drawings_of_our_parameters_are_ours(camera, config):
+    params, theirs = twins(camera, config)
+    counts, motion, _ = sensed(camera, 8)
+    ours = vae.encode(config, params, field_of(counts), jnp.asarray(motion))
+    with torch.inference_mode():
+        got = theirs.encoder(theirs.patches(counts), torch.from_numpy(motion))
+        drawn = theirs.decoder(got[0]).numpy()
+    for mine, expected in zip(got, ours, strict=True):
+        assert np.ptp(expected) > 0.5
+        np.testing.assert_allclose(mine.numpy(), expected, atol=TOLERANCE, rtol=TOLERANCE)
+    np.testing.assert_array_equal(theirs.code(theirs.patches(counts), motion), got[0].numpy())
+    rows, columns = drawn.shape[-2:]
+    image = cosines(camera.height, rows).T @ drawn @ cosines(camera.width, columns)
+    expected = vae.decode(config, camera, params, ours[0])
+    assert np.ptp(expected) > 0.5
+    np.testing.assert_allclose(image, expected, atol=TOLERANCE, rtol=TOLERANCE)
+
+
+@pytest.mark.parametrize(("camera", "config"), NETWORKS)
+def test_what_is_drawn_and_its_loss_are_ours(camera, config):
+    params, theirs = twins(camera, config)
+    counts, motion, near = sensed(camera, 8)
+    wanted = vae.in_waves(config, vae.target(config, field_of(counts), jnp.asarray(near)))
+    got = theirs.target(counts, near)
+    assert np.ptp(wanted.amplitudes) > 1.0
+    np.testing.assert_allclose(got.numpy(), wanted.amplitudes, atol=TOLERANCE, rtol=TOLERANCE)
     torch.manual_seed(1)
-    loss = vae.loss(image)
+    loss = theirs.loss(theirs.patches(counts), motion, got)
+    loss.backward()
     torch.manual_seed(1)
-    code = mean + torch.exp(log_variance / 2) * torch.randn(5, 32)
-    error = ((vae.decoder(code) - image) ** 2).sum(1)
-    normal = torch.distributions.Normal
-    kl = torch.distributions.kl_divergence(normal(mean, torch.exp(log_variance / 2)), normal(0.0, 1.0)).sum(1)
-    np.testing.assert_allclose(loss.item(), (error + CONFIG.encoder.kl_weight * kl).mean().item(), rtol=1e-5)
+    noise = jnp.asarray(torch.randn(8, config.code_size).numpy())
+    drawable = dataclasses.replace(wanted, beyond=jnp.zeros(8))
+
+    def our_loss(params):
+        return vae.vae_loss(config, params, field_of(counts), jnp.asarray(motion), drawable, noise)[0]
+
+    expected, gradient = jax.value_and_grad(our_loss)(params)
+    np.testing.assert_allclose(loss.item(), expected, rtol=TOLERANCE)
+    # The whole chain of layers: the gradient of the first one.
+    first = np.concatenate([gradient["encoder"][name]["kernel"] for name in ("channel_0", "channel_1")])
+    size = np.abs(first).max()
+    np.testing.assert_allclose(theirs.encoder.patch.weight.grad.numpy().T / size, first / size, atol=TOLERANCE)
 
 
-def test_the_vae_learns_where_events_are_and_the_agents_code_waits_to_be_published():
+def test_the_vae_starts_as_ours():
+    learner = Learner(CONFIG.encoder, CONFIG.camera, seed=3)
+    params = vae.init_vae(CONFIG.encoder, CONFIG.camera, jax.random.key(3))
+    counts, motion = blobs(5, 0), motions(5, 0)
+    expected = vae.embed(CONFIG.encoder, params, field_of(counts), jnp.asarray(motion))
+    got = learner.acting.code(learner.acting.patches(counts), motion)
+    np.testing.assert_allclose(got, expected, atol=TOLERANCE, rtol=TOLERANCE)
+
+
+def test_the_vae_learns_what_is_near_and_the_agents_code_waits_to_be_published():
     learner = Learner(CONFIG.encoder, CONFIG.camera, seed=0)
-    held_out = images(blobs(64, 1))
-    blank = held_out.square().sum(1).mean().item()
-    code = learner.code(held_out)
+    known = learner.acting
+    fields, motion = blobs(64, 1), motions(64, 1)
+    patches, wanted = known.patches(fields), known.target(fields, labels(fields))
+    mean = known.target(fields, labels(fields)).mean(dim=0)
+    blank = (wanted - mean).square().sum((1, 2, 3)).mean().item()
+    code = known.code(patches, motion)
     for step in range(300):
-        learner.update(images(blobs(64, 100 + step)))
-    np.testing.assert_array_equal(learner.code(held_out), code)
+        seen = blobs(64, 100 + step)
+        learner.update(known.patches(seen), motions(64, 100 + step), known.target(seen, labels(seen)))
+    np.testing.assert_array_equal(learner.acting.code(patches, motion), code)
     learner.publish()
-    assert not np.allclose(learner.code(held_out), code)
+    assert not np.allclose(learner.acting.code(patches, motion), code)
     assert learner.samples == 300 * 64
     with torch.no_grad():
-        drawn = learner.learning.decoder(torch.from_numpy(learner.code(held_out)))
-    assert (drawn - held_out).square().sum(1).mean().item() < 0.6 * blank
+        drawn = learner.learning.decoder(torch.from_numpy(learner.acting.code(patches, motion)))
+    assert (drawn - wanted).square().sum((1, 2, 3)).mean().item() < 0.6 * blank
 
 
 @pytest.mark.parametrize("processes", [1, 2])
@@ -100,9 +187,10 @@ def test_drones_fly_alike_in_one_process_and_in_two(processes):
             for step in range(6):
                 alone.record.action[0] = (5 * step + 7 * drone) % 27
                 alone.step()
-            for name in ("events", "own", "reward", "outcome"):
+            for name in ("events", "motion", "nearness", "own", "reward", "outcome"):
                 np.testing.assert_array_equal(getattr(fleet.record, name)[drone], getattr(alone.record, name)[0])
-        assert fleet.record.events.any()
+        for name in ("events", "motion", "nearness"):
+            assert getattr(fleet.record, name).any()
     finally:
         fleet.close()
 
@@ -144,7 +232,8 @@ def test_ended_drones_keep_their_last_observation_and_only_time_outs_are_truncat
     drones = CodedDrones(CONFIG, still, learner)  # type: ignore[arg-type]
     drones.reset()
     record = still.record
-    record.events[:] = blobs(4, 0)
+    record.events[:], record.motion[:] = blobs(4, 0), motions(4, 0)
+    record.nearness[:] = labels(record.events)
     record.own[:], record.final_own[:] = 1.0, 2.0
     record.outcome[:] = [Outcome.RUNNING, Outcome.GOAL, Outcome.TIME_OUT, Outcome.COLLISION]
     record.reward[:] = [1.0, 100.0, 0.0, -100.0]
@@ -152,8 +241,10 @@ def test_ended_drones_keep_their_last_observation_and_only_time_outs_are_truncat
     np.testing.assert_allclose(rewards, CONFIG.agent.reward_scale * record.reward)
     assert ends.tolist() == [False, True, True, True]
     assert [info.get("TimeLimit.truncated") for info in infos] == [None, False, True, False]
-    codes = CONFIG.agent.code_scale * learner.code(images(record.events))
-    quiet = CONFIG.agent.code_scale * learner.code(images(np.zeros((1, 24, 32), np.int8)))[0]
+    acting, scale = learner.acting, CONFIG.agent.code_scale
+    codes = scale * acting.code(acting.patches(record.events), record.motion)
+    still_one = np.zeros((1, MOTION_SIZE), np.float32)
+    quiet = scale * acting.code(acting.patches(np.zeros((1, 24, 32), np.int8)), still_one)[0]
     # The frozen encoder's own code, whatever the VAE learned in this step.
     np.testing.assert_allclose(seen[0, :-OWN_SIZE], codes[0], atol=1e-6)
     for drone in (1, 2, 3):
@@ -162,6 +253,11 @@ def test_ended_drones_keep_their_last_observation_and_only_time_outs_are_truncat
         assert (infos[drone]["terminal_observation"][-OWN_SIZE:] == 2.0).all()
     assert (seen[:, -OWN_SIZE:] == 1.0).all()
     assert learner.samples == 4
+    # What it learned is all of what was seen and of what was near.
+    twin = Learner(CONFIG.encoder, CONFIG.camera, seed=0)
+    twin.update(acting.patches(record.events), record.motion, acting.target(record.events, record.nearness))
+    for got, expected in zip(learner.learning.parameters(), twin.learning.parameters(), strict=True):
+        assert torch.equal(got, expected)
 
 
 def test_drones_answer_for_all_at_once_and_have_no_methods_of_their_own():
@@ -205,6 +301,14 @@ def test_a_training_takes_its_decisions_in_pieces_as_in_one_and_its_seed_says_ho
     assert not np.allclose(weights(other), weights(whole))
 
 
+def test_a_vae_that_reconstructs_events_is_trained_without_a_label():
+    config = dataclasses.replace(SHORT, encoder=dataclasses.replace(SHORT.encoder, target="sensed"))
+    with Training(config, course_of(START, GOAL)) as training:
+        training.warm_up()
+        assert training.env.fleet.record.nearness.size == 0
+        assert training.learner.samples == config.encoder.warmup_updates_per_step * 256
+
+
 def test_the_schedules_run_over_the_whole_training():
     with Training(SHORT, course_of(START, GOAL)) as training:
         training.warm_up()
@@ -225,11 +329,13 @@ def test_what_was_learnt_flies_by_the_best_value_of_what_it_sees():
     course = course_of(START, GOAL)
     trained = train(SHORT, course)
     rng = np.random.default_rng(0)
-    events = rng.integers(-3, 4, (5, 6, 8)).astype(np.int8)
-    own = rng.normal(size=(5, OWN_SIZE)).astype(np.float32)
-    code = trained.vae.code(images(events)) * SHORT.agent.code_scale
+    events = rng.integers(-3, 4, (200, 6, 8)).astype(np.int8)
+    own = rng.normal(size=(200, OWN_SIZE)).astype(np.float32)
+    motion = motions(200, 0)
+    code = trained.vae.code(trained.vae.patches(events), motion) * SHORT.agent.code_scale
     values = trained.q(torch.from_numpy(np.concatenate([code, own], axis=1)))
-    np.testing.assert_array_equal(trained.act(events, own), values.numpy().argmax(1))
+    np.testing.assert_array_equal(trained.act(events, own, motion), values.numpy().argmax(1))
+    assert not np.array_equal(trained.act(events, own, np.zeros_like(motion)), values.numpy().argmax(1))
     flights = fly(trained, course)
     np.testing.assert_array_equal(flights.outcome != Outcome.RUNNING, [True])
     again = fly(trained, course)
@@ -242,6 +348,13 @@ def test_what_was_learnt_flies_by_the_best_value_of_what_it_sees():
 def test_a_dqn_that_stable_baselines3_does_not_have_is_declined(change):
     config = dataclasses.replace(CONFIG, agent=dataclasses.replace(CONFIG.agent, **change))
     with pytest.raises(ConfigError, match="the conventional stack's DQN supports only agent.history 1"):
+        train(config, course_of(START, GOAL))
+
+
+@pytest.mark.parametrize("change", [{"architecture": "pooled"}, {"sequence_decisions": 4}])
+def test_a_vae_that_this_stack_does_not_have_is_declined(change):
+    config = dataclasses.replace(CONFIG, encoder=dataclasses.replace(CONFIG.encoder, **change))
+    with pytest.raises(ConfigError, match="the conventional stack's VAE supports only encoder.architecture 'patches'"):
         train(config, course_of(START, GOAL))
 
 
@@ -271,14 +384,18 @@ def test_the_warm_up_publishes_the_code_and_rests():
     config = miniature()
     config = dataclasses.replace(config, encoder=dataclasses.replace(config.encoder, keep_learning=False))
     with Training(config, course_of(START, GOAL)) as training:
-        field = images(blobs(3, 0)[:, :6, :8].copy())
-        before = training.learner.code(field)
+        fields, motion = blobs(3, 0)[:, 6:12, 8:16].copy(), motions(3, 0)
+
+        def code():
+            return training.learner.acting.code(training.learner.acting.patches(fields), motion)
+
+        before = code()
         training.warm_up()
         assert training.learner.samples == config.encoder.warmup_updates_per_step * config.encoder.warmup_decisions
-        after = training.learner.code(field)
+        after = code()
         assert not np.array_equal(after, before)
         training.learn(64)
-        np.testing.assert_array_equal(training.learner.code(field), after)
+        np.testing.assert_array_equal(code(), after)
         assert training.learner.samples == config.encoder.warmup_updates_per_step * config.encoder.warmup_decisions
 
 

@@ -148,6 +148,9 @@ def test_every_kind_of_option_can_be_a_flag():
         (["trian"], "did you mean 'train'?"),
         (["train", "--nun-envs", "64"], "there is no option '--nun-envs'; did you mean '--num-envs'?"),
         (["evaluate", "runs", "--misions=3"], "there is no option '--misions'; did you mean '--missions'?"),
+        (["evaluate", "runs", "--gusts-m-s", "5"], "there is no option '--gusts-m-s'; did you mean '--air.gusts-m-s'?"),
+        (["evaluate", "runs", "--conditions", "5"], "there is no option '--conditions'; 'edqn evaluate --help' lists"),
+        (["evaluate", "runs", "--env.speed-m-s", "5"], "there is no option '--env.speed-m-s'"),
         (["train", "--zzz"], "there is no option '--zzz'; 'edqn train --help-all' lists what there is"),
     ],
 )
@@ -268,6 +271,15 @@ def test_evaluate_hands_on_what_was_asked_for(monkeypatch, tmp_path):
     )
     assert main(["evaluate", str(tmp_path), "--shuffle-codes", "--trajectories", "a.npz"]) == 0
     assert asked == [whole, arguments.EvaluateArgs(tmp_path, shuffle_codes=True, trajectories=Path("a.npz"))]
+    assert all(not each.conditions for each in asked)
+
+
+def test_evaluate_hands_on_the_disturbances_that_were_given_and_no_others(tmp_path):
+    (tmp_path / "config.yaml").touch()
+    words = ["--air.gusts-m-s", "5", "--air.no-drag", "--env.action_delay=1", "--body.mass-share", "0"]
+    given = arguments.parse_evaluate([str(tmp_path), *words]).conditions
+    assert given == {"air": {"gusts_m_s": 5.0, "drag": False}, "env": {"action_delay": 1}, "body": {"mass_share": 0.0}}
+    assert shown("evaluate", "--help").count("--air.gusts-m-s FLOAT") == 1
 
 
 def shown(*words: str) -> str:
@@ -360,6 +372,7 @@ def test_the_versions_are_those_of_the_packages():
         (["train", "--env.sensor", "fr"], ["frames", "frame-pair"]),
         (["train", "--world", "mine"], []),  # bash then offers files
         (["evaluate", "runs/", "--world", "me"], ["medium"]),
+        (["evaluate", "runs/", "--air.gusts"], ["--air.gusts-m-s"]),
         (["record", "runs/", "--go"], ["--goal"]),
     ],
 )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import re
 from importlib.metadata import version
 from pathlib import Path
 
@@ -15,7 +16,7 @@ from edqn_jax.cli import evaluate
 from edqn_jax.cli.arguments import EvaluateArgs
 from edqn_jax.cli.evaluate import evaluate_command
 from edqn_jax.config import Config
-from edqn_jax.config.loading import to_yaml
+from edqn_jax.config.loading import apply, to_yaml
 from edqn_jax.errors import ConfigError
 from edqn_jax.evaluation import evaluate as evaluation
 from edqn_jax.evaluation.judge import load_judge, replay_contact
@@ -174,6 +175,31 @@ def test_the_command_shuffles_codes_only_when_asked_and_says_so(shuffle_codes, r
     assert asked == [{"record": False, "shuffle_codes": shuffle_codes}]
     assert json.loads((tmp_path / "figures.json").read_text())["shuffled_codes"] is shuffle_codes
     assert ("shuffled codes" in capsys.readouterr().out) is shuffle_codes
+
+
+def test_the_command_flies_under_the_conditions_that_it_is_given_and_says_so(run, tmp_path, monkeypatch, capsys):
+    flown = []
+
+    def fly(config: Config, *_: object, **__: object) -> Flights:
+        flown.append(config)
+        return four_flights()
+
+    # Stand-ins for what would compile.
+    monkeypatch.setattr(evaluation, "load_missions", lambda *_: MissionSet("paper", None, None))  # type: ignore[arg-type]
+    monkeypatch.setattr(evaluation, "fly_on_all_devices", fly)
+    monkeypatch.setattr(evaluation, "shortest_paths", lambda *_: np.full(4, 10.0))
+    monkeypatch.setattr(evaluate, "decision_latency_ms", lambda *_: {"median": 1.0, "p99": 2.0})
+    conditions = {"air": {"gusts_m_s": 5.0}, "env": {"action_delay": 1}}
+    evaluate_command(EvaluateArgs(run, missions=4, conditions=conditions, json=tmp_path / "figures.json"))
+    assert flown == [apply(CONFIG, conditions, "test")] != [CONFIG]
+    figures = json.loads((tmp_path / "figures.json").read_text())
+    assert figures["conditions"] == {"air.gusts_m_s": 5.0, "env.action_delay": 1}
+    said = capsys.readouterr().out
+    assert re.search(r"air.gusts_m_s +│ +5.0 ", said) and re.search(r"env.action_delay +│ +1 ", said)
+    with pytest.raises(ConfigError, match="body.mass_share must be at least 0 and less than 1, not 2.0"):
+        evaluate_command(EvaluateArgs(run, conditions={"body": {"mass_share": 2.0}}))
+    with pytest.raises(ConfigError, match="evaluate: 'agent.history' is a policy's own; conditions are env, air, body"):
+        evaluate_command(EvaluateArgs(run, conditions={"agent": {"history": 3}}))
 
 
 @pytest.mark.slow

@@ -15,8 +15,8 @@ from edqn_jax.config.loading import make_config
 from edqn_jax.errors import ConfigError
 from edqn_jax.evaluation.missions import load_missions, missions_of_runs, run_missions
 from edqn_jax.sim import worlds
+from edqn_jax.sim.distance import signed_distance
 from edqn_jax.sim.mjcf import load_scene, resolve_world, write_scene
-from edqn_jax.sim.scene import signed_distance
 from tests.planners.small_worlds import WITHOUT_A_WAY, small_world
 
 CONFIG = Config()

@@ -13,7 +13,7 @@ import pytest
 from jax import Array
 
 import edqn_jax
-from edqn_jax.config import Config
+from edqn_jax.config import AirConfig, BodyConfig, Config, NoiseConfig
 from edqn_jax.config.loading import make_config
 from edqn_jax.errors import ConfigError
 from edqn_jax.interop import functional
@@ -76,6 +76,29 @@ def test_a_flight_is_that_of_the_pure_functions() -> None:
         assert bool(terminated | truncated) == bool(expected.ended)
         resets += int(taken.is_reset)
     assert resets >= 1
+
+
+def test_a_disturbed_flight_is_that_of_the_pure_functions_and_every_episode_draws_anew() -> None:
+    config = dataclasses.replace(
+        small(),
+        env=dataclasses.replace(small().env, action_delay=1),
+        air=AirConfig(gusts_m_s=5.0),
+        body=BodyConfig(mass_share=0.2),
+        noise=NoiseConfig(position_m=0.5),
+    )
+    env, params = made("kinematics", config=config)
+    pure = edqn_jax.make("medium", config, worlds=3)
+    reset, step = jitted(env)
+    (observed, state), (expected, seen) = reset(jax.random.key(3), params, jnp.int32(1)), pure.reset(3, 1)
+    masses = set()
+    for move in MOVES[:, 0]:
+        # two programs that XLA fuses in its own ways
+        np.testing.assert_allclose(observed, jnp.concatenate([seen.own, seen.motion]), rtol=1e-4, atol=1e-4)
+        masses.add(float(state.flight.disturbance.mass))
+        observed, state, *_ = step(state.flight.key, state, jnp.int32(move), params)
+        expected, taken = pure.step(expected, int(move))
+        seen = taken.observation
+    assert len(masses) > 1 and all(0.8 <= mass <= 1.2 for mass in masses)
 
 
 @pytest.mark.parametrize("kind", ["image", "code", "kinematics"])

@@ -21,7 +21,7 @@ def examples(page: str) -> list[str]:
 
 EXAMPLES = {
     f"{page}-{number}": example
-    for page in ("gymnasium.md", "functional.md")
+    for page in ("disturbances.md", "functional.md", "gymnasium.md")
     for number, example in enumerate(examples(page))
 }
 
@@ -34,7 +34,7 @@ def test_it_runs(example: str, capsys: pytest.CaptureFixture[str]) -> None:
 
 
 def test_there_are_examples() -> None:
-    assert len(EXAMPLES) == 6
+    assert len(EXAMPLES) == 7
 
 
 @pytest.mark.filterwarnings("ignore::Warning:optuna.*", "ignore::Warning:sqlalchemy.*")

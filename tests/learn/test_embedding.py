@@ -31,8 +31,8 @@ from tests.whole.test_trainer import CONFIG
 QUICK = dataclasses.replace(CONFIG, drone=dataclasses.replace(CONFIG.drone, physics="rigid_body"))
 """Sensors do not depend on the physics, and these compile in less time; `test_trainer` trains with the default ones."""
 
-SENSORS = ("events", "frames", "frame-pair", "depth", "event-image", "ranges", "blind")
-CODED = SENSORS[:4]
+SENSORS = ("events", "frames", "frame-pair", "depth", "depth-motion", "event-image", "ranges", "blind")
+CODED = SENSORS[:5]
 STEPS = 12
 
 
@@ -84,7 +84,7 @@ def test_only_a_sensor_with_an_image_has_one_in_its_program_and_a_vae(world: Wor
     config = dataclasses.replace(with_sensor(name, QUICK), camera=CameraConfig(width=11, height=7))
     state = jax.eval_shape(lambda key: trainer.init(config, world, key), jax.random.key(0))
     program = str(jax.make_jaxpr(lambda s, n: trainer.run_steps(config, world, s, n))(state, jnp.arange(2)))
-    assert ("pictures[" in program) is (name in (*CODED[:3], "event-image"))
+    assert ("pictures[" in program) is (name in (*CODED, "event-image"))
     assert ("7,11]" in program) is (name in (*CODED, "event-image"))  # an array as large as an image
     assert bool(jax.tree.leaves((state.learner.vae, state.learner.vae_optimiser))) is (name in CODED)
     assert (state.actors.env.memory is None) is (name not in ("events", "event-image"))
@@ -104,8 +104,8 @@ def test_training_can_be_mapped_over_seeds(world: World, name: str) -> None:
 def test_decisions_that_others_warm_up_in_are_learnt_in() -> None:
     plans = {name: Plan.of(with_sensor(name)) for name in SENSORS}
     assert len({plan.total for plan in plans.values()}) == 1
-    assert [plans[name].warmup for name in SENSORS] == [4, 4, 4, 4, 0, 0, 0]
-    assert [plans[name].learn_from for name in SENSORS] == [9, 9, 9, 9, 5, 5, 5]
+    assert [plans[name].warmup for name in SENSORS] == [4, 4, 4, 4, 4, 0, 0, 0]
+    assert [plans[name].learn_from for name in SENSORS] == [9, 9, 9, 9, 9, 5, 5, 5]
 
 
 def test_the_workload_says_what_is_drawn_and_learnt_from() -> None:
@@ -113,8 +113,8 @@ def test_the_workload_says_what_is_drawn_and_learnt_from() -> None:
     always = dataclasses.replace(CONFIG, encoder=dataclasses.replace(CONFIG.encoder, keep_learning=True, batch_size=32))
     found = {name: workload(with_sensor(name, always), scene) for name in SENSORS}
     assert [found[name]["sensor"] for name in SENSORS] == list(SENSORS)
-    assert [found[name]["frames_per_decision"] for name in SENSORS] == [2, 1, 2, 1, 2, 0, 0]
-    assert [found[name]["vae_samples_per_decision"] for name in SENSORS] == [2, 2, 2, 2, 0, 0, 0]
+    assert [found[name]["frames_per_decision"] for name in SENSORS] == [2, 1, 2, 1, 2, 2, 0, 0]
+    assert [found[name]["vae_samples_per_decision"] for name in SENSORS] == [2, 2, 2, 2, 2, 0, 0, 0]
 
 
 # ------------------------------------------------------------------------------------- what is seen
@@ -122,7 +122,7 @@ def test_the_workload_says_what_is_drawn_and_learnt_from() -> None:
 
 def test_the_q_network_sees_a_code_or_the_ranges_or_only_the_own_state() -> None:
     sizes = [policy.observation_size(with_sensor(name, Config())) for name in SENSORS]
-    assert sizes == [42, 42, 42, 42, 778, 36, 10]
+    assert sizes == [42, 42, 42, 42, 42, 778, 36, 10]
     own, sensed, motion = jnp.arange(10.0), jnp.linspace(0.0, 1.0, 26), jnp.ones(MOTION_SIZE)
     ranges = policy.flatten(with_sensor("ranges"), {}, jnp.zeros((1, 36)), Observation(sensed, own, motion))
     np.testing.assert_array_equal(ranges, jnp.concatenate([sensed, own]))
@@ -150,10 +150,11 @@ def shapes(params) -> dict[str, tuple[int, ...]]:
 @pytest.mark.parametrize("kind", ["network", "table"])
 def test_the_code_of_a_picture_has_the_sizes_of_the_code_of_events(kind) -> None:
     config = dataclasses.replace(Config(), encoder=EncoderConfig("pooled", "sensed", pixel_features=kind))
-    events, frames, pair, depth = (
+    events, frames, pair, depth, motion = (
         shapes(jax.eval_shape(partial(embedding.init, with_sensor(name, config)), jax.random.key(0))) for name in CODED
     )
     assert pair["decoder/kernel"] == events["decoder/kernel"] and pair.keys() == frames.keys()
+    assert motion == pair
     assert frames == depth and events.keys() == frames.keys()
     apart = {name: (events[name], frames[name]) for name in events if events[name] != frames[name]}
     last = {"network": ("layers_2/kernel", (64, 48), (64, 144)), "table": ("table", (2, 768, 48), (1, 768, 144))}[kind]

@@ -103,6 +103,18 @@ def test_an_observation_is_the_scaled_code_and_the_own_state(params):
     np.testing.assert_array_equal(flat[5:], one.own)
 
 
+@pytest.mark.slow
+def test_a_network_that_sees_the_last_move_has_it_between_the_code_and_the_own_state(params):
+    config = dataclasses.replace(CONFIG, agent=dataclasses.replace(CONFIG.agent, last_move=True))
+    one = observations(1)[0]
+    memory = policy.empty_memory(config)
+    flat = policy.flatten(config, params.encoder, memory, one)
+    plain = flatten(params.encoder, policy.empty_memory(CONFIG), one)
+    assert flat.shape == memory.shape[1:] == (policy.observation_size(config),)
+    np.testing.assert_array_equal(flat[5:8], one.motion[4:])
+    np.testing.assert_allclose(np.delete(flat, [5, 6, 7]), plain, rtol=1e-6)
+
+
 def test_the_greedy_move_is_the_best_of_the_network(params, act):
     memory = policy.empty_memory(CONFIG)
     for number, each in enumerate(observations(4, seed=1)):
@@ -123,6 +135,7 @@ def test_memories_of_many_drones_are_remembered_side_by_side():
 
 def test_the_table_of_the_paper_has_a_state_of_42():
     assert policy.observation_size(Config()) == 42
+    assert policy.observation_size(dataclasses.replace(Config(), agent=AgentConfig(last_move=True))) == 45
 
 
 @pytest.mark.usefixtures("strict_jax")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import mujoco
 import numpy as np
 
@@ -32,3 +34,46 @@ def acceleration(qpos: np.ndarray, qvel: np.ndarray, thrust: np.ndarray) -> np.n
     data.qpos[:], data.qvel[:], data.ctrl[:] = qpos, qvel, thrust
     mujoco.mj_forward(model, data)
     return data.qacc.copy()
+
+
+def fly_loaded(
+    qpos: np.ndarray,
+    qvel: np.ndarray,
+    thrusts: np.ndarray,
+    *,
+    mass: float = 1.0,
+    inertia: float = 1.0,
+    gain: np.ndarray | None = None,
+    lag_s: float | None = None,
+    first: float = 0.0,
+    push: Callable[[np.ndarray], np.ndarray] = lambda velocity: np.zeros(3),
+) -> tuple[np.ndarray, np.ndarray]:
+    """qpos [n, 7] and qvel [n, 6] as `fly_thrusts`, of another machine: everything is changed in the model itself.
+
+    Args:
+        mass, inertia: per those of the file.
+        gain: [4] thrust of each rotor per its command.
+        lag_s: time constant of the rotors, which begin at `first` newtons.
+        push: force [3] newtons at the centre of mass at a velocity [3] m/s, world.
+    """
+    spec = mujoco.MjSpec.from_file(str(AIRFRAME_FILE))
+    body = spec.bodies[1]
+    body.mass *= mass
+    body.inertia = inertia * np.asarray(body.inertia)
+    for rotor, actuator in enumerate(spec.actuators):
+        actuator.gainprm[0] = 1.0 if gain is None else gain[rotor]
+        if lag_s is not None:
+            actuator.dyntype = mujoco.mjtDyn.mjDYN_FILTEREXACT
+            actuator.dynprm[0] = lag_s
+            actuator.actearly = True
+    model = spec.compile()
+    data = mujoco.MjData(model)
+    data.qpos[:], data.qvel[:], data.act[:] = qpos, qvel, first
+    places, speeds = [], []
+    for thrust in thrusts:
+        data.ctrl[:] = thrust
+        data.xfrc_applied[1, :3] = push(data.qvel[:3])
+        mujoco.mj_step(model, data)
+        places.append(data.qpos.copy())
+        speeds.append(data.qvel.copy())
+    return np.array(places), np.array(speeds)

@@ -30,7 +30,7 @@ class Drawn:
 
     config, scene, has_image = SMALL, world_with_a_box(), True
 
-    def rgb(self, position: np.ndarray, quaternion: np.ndarray) -> np.ndarray:
+    def rgb(self, position: np.ndarray, quaternion: np.ndarray, time: np.ndarray) -> np.ndarray:
         return np.full((SMALL.camera.height * FINE, SMALL.camera.width * FINE, 3), 0.2 + 0.02 * position[0])
 
     def shown(self, params: object, flown: dict[str, np.ndarray]) -> Shown:

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
+from edqn_jax.sim.distance import signed_distance
 from edqn_jax.sim.scene import (
     Capsules,
     Planes,
@@ -20,7 +21,6 @@ from edqn_jax.sim.scene import (
     UprightBoxes,
     UprightCylinders,
     build_scene,
-    signed_distance,
 )
 
 VOLUME = np.array([[0.0, 0.0, 0.0], [60.0, 60.0, 25.0]])

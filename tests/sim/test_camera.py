@@ -15,14 +15,8 @@ import pytest
 from edqn_jax.config import CameraConfig, EventsConfig
 from edqn_jax.sim import camera, mjcf, worlds
 from edqn_jax.sim import events as event_laws
-from edqn_jax.sim.scene import (
-    Spheres,
-    UprightBoxes,
-    UprightCylinders,
-    signed_distance,
-    stack_scenes,
-    take_scene,
-)
+from edqn_jax.sim.distance import signed_distance
+from edqn_jax.sim.scene import Spheres, UprightBoxes, UprightCylinders, stack_scenes, take_scene
 from edqn_jax.sim.texture import _box_filter
 from tests.oracles import camera_plain
 from tests.sim.drawn_scenes import GROUND, ball, box, every_kind, free_points, pillar, rotation_of, scene_of

@@ -18,6 +18,12 @@ ROUNDING = 2e-6
 """Ten times float32's own: compilers contract multiplications and additions differently in different programs."""
 
 
+@pytest.fixture(autouse=True)
+def in_jax(monkeypatch):
+    """Columns as GPUs draw them, and CPUs without a compiler; `test_native.py` holds the others against them."""
+    monkeypatch.setattr(camera, "_pictures_on_cpu", lambda *_: None)
+
+
 def stairs(count):
     """Steps one behind the other, each a little higher: all of them in the same columns."""
     return [box(8 + 1.5 * n, 20, 0.5 + 0.2 * n, 0.3, 6, 0.5 + 0.2 * n) for n in range(count)]

@@ -12,8 +12,9 @@ import pytest
 
 from edqn_jax.planners.astar import shortest_path
 from edqn_jax.sim import geodesic
+from edqn_jax.sim.distance import signed_distance
 from edqn_jax.sim.mjcf import load_scene, scenes_folder
-from edqn_jax.sim.scene import Scene, signed_distance, stack_scenes, take_scene
+from edqn_jax.sim.scene import Scene, stack_scenes, take_scene
 from edqn_jax.sim.worlds import random_pool, world_keys
 from tests.oracles import geodesic_plain
 from tests.planners.small_worlds import RADIUS, WITHOUT_A_WAY, box, random_small_world, small_world

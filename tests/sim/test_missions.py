@@ -10,10 +10,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from edqn_jax.sim.distance import signed_distance
 from edqn_jax.sim.free_points import CLEARANCE, FAR, free_point
 from edqn_jax.sim.missions import AWAY, random_missions, spread_missions
 from edqn_jax.sim.mjcf import load_scene, resolve_world
-from edqn_jax.sim.scene import Spheres, build_scene, signed_distance, stack_scenes, take_scene
+from edqn_jax.sim.scene import Spheres, build_scene, stack_scenes, take_scene
 from edqn_jax.sim.worlds import random_pool, world_keys
 
 WORLDS, MISSIONS = 24, 512

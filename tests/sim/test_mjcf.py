@@ -16,6 +16,7 @@ import pytest
 from edqn_jax.config import FAMILIES
 from edqn_jax.errors import ConfigError
 from edqn_jax.sim import mjcf
+from edqn_jax.sim.distance import shape_distances, signed_distance
 from edqn_jax.sim.mjcf import (
     VOLUME_MARGIN,
     SceneError,
@@ -37,8 +38,6 @@ from edqn_jax.sim.scene import (
     build_scene,
     obstacle_count,
     scene_shapes,
-    shape_distances,
-    signed_distance,
 )
 from edqn_jax.sim.worlds import random_scene, world_key
 
@@ -281,6 +280,9 @@ def assert_same_scene(ours, theirs):
         assert type(a) is type(b)
         for field in dataclasses.fields(a):
             x, y = getattr(a, field.name), getattr(b, field.name)
+            if x is None or y is None:  # of what moves
+                assert x is y, field.name
+                continue
             if field.name == "yaw":  # a box turned by half a turn is the same box
                 x, y = np.sin(2 * x), np.sin(2 * y)
             np.testing.assert_allclose(x, y, rtol=1e-6, atol=2e-6, err_msg=field.name)

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from edqn_jax.sim.distance import path_contact, segment_contact, shape_distances, signed_distance
 from edqn_jax.sim.mjcf import load_world
 from edqn_jax.sim.scene import (
     KINDS,
@@ -25,11 +26,7 @@ from edqn_jax.sim.scene import (
     build_scene,
     obstacle_count,
     parked_shape,
-    path_contact,
     scene_shapes,
-    segment_contact,
-    shape_distances,
-    signed_distance,
     stack_scenes,
     take_scene,
     with_equal_capacities,

@@ -15,10 +15,11 @@ from edqn_jax.errors import ConfigError
 from edqn_jax.planners.astar import shortest_path
 from edqn_jax.planners.free_space import reachable
 from edqn_jax.sim import canyon, discs, forest, rooms, worlds
+from edqn_jax.sim.distance import signed_distance
 from edqn_jax.sim.free_points import CLEARANCE, FAR
 from edqn_jax.sim.missions import own_missions, random_missions, spread_missions
 from edqn_jax.sim.mjcf import check_scene, load_world, write_scene
-from edqn_jax.sim.scene import Scene, obstacle_count, scene_shapes, signed_distance, take_scene
+from edqn_jax.sim.scene import Scene, obstacle_count, scene_shapes, take_scene
 from edqn_jax.sim.worlds import SPLITS, families_of, random_pool, random_scene, world_key, world_keys
 
 RADIUS = 0.36

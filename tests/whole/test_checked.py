@@ -72,6 +72,14 @@ def test_a_sound_run_learns_as_without_checks(learning: TrainState) -> None:
     assert jnp.allclose(state.actors.env.drone.position, learning.actors.env.drone.position, atol=1e-3)
 
 
+def test_a_sound_run_against_every_disturbance_has_no_fault() -> None:
+    disturbed = ("--air.wind-m-s", "5", "--air.gusts-m-s", "5", "--body.mass-share", "0.2", "--motors.lag-s", "0.1")
+    noisy = ("--noise.position-m", "0.5", "--noise.velocity-bias-m-s", "0.3", "--env.action-delay", "1")
+    trainer = trainer_of((*CHECKED, *disturbed, *noisy))
+    state, (_, losses) = trainer.chunk(trainer.init(0), 0)
+    assert jnp.isfinite(losses.q_loss[-1]) and state.actors.env.disturbance is not None
+
+
 def test_a_number_that_is_none_is_named_with_its_steps(checked: Trainer, learning: TrainState) -> None:
     drone = learning.actors.env.drone
     drone = dataclasses.replace(drone, position=drone.position.at[0, 0, 0].set(jnp.nan))

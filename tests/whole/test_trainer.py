@@ -12,13 +12,25 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from edqn_jax.config import AgentConfig, CameraConfig, Config, DroneConfig, EncoderConfig, TrainConfig
+from edqn_jax.config import (
+    AgentConfig,
+    AirConfig,
+    BodyConfig,
+    CameraConfig,
+    Config,
+    DroneConfig,
+    EncoderConfig,
+    MotorsConfig,
+    NoiseConfig,
+    TrainConfig,
+)
 from edqn_jax.config.loading import make_config
 from edqn_jax.errors import ConfigError
-from edqn_jax.learn import replay, trainer
+from edqn_jax.learn import replay, saved_state, trainer
 from edqn_jax.learn.plan import Plan
 from edqn_jax.learn.trainer import Trainer, TrainState
 from edqn_jax.sim import env
+from edqn_jax.sim.disturbances import Disturbance
 from edqn_jax.sim.env import MOTION_SIZE, OWN_SIZE, Observation, World
 from edqn_jax.sim.outcomes import Outcome
 from tests.miniature import miniature_world
@@ -124,6 +136,32 @@ def test_parameters_agree_on_one_device_and_two_after_the_first_updates(on_one, 
     # Sums over shards are added in another order: a few units in the last place per update.
     for one, two in zip(jax.tree.leaves(on_one[0][1].learner), jax.tree.leaves(on_two[0][1].learner), strict=True):
         np.testing.assert_allclose(one, two, atol=1e-5)
+
+
+@pytest.mark.slow
+def test_training_against_every_disturbance_stores_what_was_chosen_and_goes_on_from_what_was_saved(
+    world: World,
+) -> None:
+    config = dataclasses.replace(
+        CONFIG,
+        env=dataclasses.replace(CONFIG.env, sensor="blind", action_delay=1, max_decisions=6),
+        air=AirConfig(wind_m_s=5.0, gusts_m_s=3.0),
+        body=BodyConfig(mass_share=0.2, inertia_share=0.2),
+        motors=MotorsConfig(gain_share=0.2, lag_s=0.05),
+        noise=NoiseConfig(0.3, 0.2, 0.3, 0.2),
+    )
+    made = Trainer(config, world, jax.devices()[:1])
+    state, _ = made.chunk(made.init(0), 0)
+    saved = saved_state.to_host(made, state, 4)
+    assert {name.rpartition(".")[2] for name in saved if ".disturbance." in name} == set(vars(Disturbance()))
+    chosen = saved[".actors.env.disturbance.move"]  # in the newest row, which is to be flown next
+    running, newest = ~saved[".actors.is_reset"], saved[".actors.replay.action"][:, 3]
+    assert running.any()
+    np.testing.assert_array_equal(chosen[running], newest[running])
+    again = saved_state.from_host(made, saved)
+    (one, (_, losses)), (other, _) = (made.chunk(each, 4) for each in (state, again))
+    assert np.isfinite(losses.q_loss[-1]) and not any(np.any(count) for count in vars(losses.health).values())
+    jax.tree.map(np.testing.assert_array_equal, _host(one), _host(other))
 
 
 def flown_on(made: Trainer, chunks: int, poison: Any = None) -> tuple[TrainState, Any]:

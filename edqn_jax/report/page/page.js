@@ -86,11 +86,13 @@
         this.drop("solids");
         this.solids = new THREE.Group();
         this.closing = [];
+        this.movers = [];
         this.solids.add(ground(world));
         for (const shape of world.shapes) {
           const solid = solidOf(shape);
           this.solids.add(solid);
           if (shape.closes) this.closing.push([solid, shape]);
+          if (shape.moves) this.movers.push([solid, shape]);
         }
         this.scene.add(this.solids);
       }
@@ -163,7 +165,7 @@
     }
 
     draw(time) {
-      const { clientWidth, clientHeight } = this.renderer.domElement;
+      const { clientWidth, clientHeight } = this.renderer.domElement, world = data.worlds[this.world];
       if (clientWidth !== this.width || clientHeight !== this.height) {
         const first = this.width === undefined;
         [this.width, this.height] = [clientWidth, clientHeight];
@@ -185,6 +187,11 @@
           line.visible = this.mode !== "eye";
           this.ride(position, turn, flight);
         }
+      }
+      for (const [solid, shape] of this.movers) {
+        const at = placeOf(shape, world, Math.min(time, this.chosen.end));
+        solid.visible = at !== null;
+        if (at) solid.position.set(...at);
       }
       for (const [solid, shape] of this.closing) {
         const [axis, sign] = shape.closes, eye = this.camera.position.getComponent(axis);
@@ -243,6 +250,30 @@
     edges.position.set(...world.lower.map((low, axis) => (low + world.upper[axis]) / 2));
     group.add(edges);
     return group;
+  }
+
+  /** Returns where a shape that moves is at a time, or null where it is not there: `sim/motion.py` in other words. */
+  function placeOf(shape, world, time) {
+    const how = shape.moves;
+    if (how.velocity) {
+      const turn = (of) => [Math.cos(of) - Math.cos(how.phase), Math.sin(of) - Math.sin(how.phase)];
+      const [cos, sin] = turn(how.phase + how.rate * time);
+      return shape.at.map((at, axis) => {
+        let place = at + how.swing[0][axis] * cos + how.swing[1][axis] * sin;
+        if (how.velocity[axis]) {
+          const low = how.low[axis], span = how.high[axis] - low;
+          const ahead = at - low + how.velocity[axis] * time;
+          place += low + span - Math.abs(ahead - 2 * span * Math.floor(ahead / (2 * span)) - span) - at;
+        }
+        return place;
+      });
+    }
+    const after = time - how.hit;
+    if (after <= -how.early) return null;
+    const place = how.aim.map((aim, axis) => aim - how.speed * after * how.from[axis]);
+    place[2] -= how.gravity * after * (after + how.early) / 2;
+    const out = shape.radius + how.outside;
+    return place.every((x, axis) => x >= world.lower[axis] - out && x <= world.upper[axis] + out) ? place : null;
   }
 
   function solidOf(shape) {

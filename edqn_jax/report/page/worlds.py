@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Iterator
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 
-from edqn_jax.report.solids import Solid, closed_side, present, solids_of
-from edqn_jax.sim.scene import Scene
+from edqn_jax.report.solids import closed_side, present, solids_of
+from edqn_jax.sim.motion import OUTSIDE_M, hit_time, thrown_to
+from edqn_jax.sim.scene import PARKED, Scene
 
 
 def world_data(scene: Scene) -> dict[str, Any]:
@@ -16,14 +19,58 @@ def world_data(scene: Scene) -> dict[str, Any]:
 
     A shape has its `kind` (box, cylinder, capsule, sphere), centre `at`, `colour`, and of its kind `half` and `turn`
     (body-to-world, row by row), `radius`, `axis` and `half`. `closes` is the axis and the sign of the side of the
-    volume that a ceiling or an outer wall closes: the view leaves it out when it looks from there.
+    volume that a ceiling or an outer wall closes: the view leaves it out when it looks from there. `moves` says where a
+    shape is at another time; a thrown ball's are of the world's own start and goal.
     """
     lower, upper = np.asarray(scene.volume, np.float64)
     shapes = []
-    for shape, solid in zip(_shapes(scene), solids_of(scene), strict=True):
-        closes = closed_side(solid, lower, upper)
-        shapes.append(shape | {"colour": _hex(solid)} | ({} if closes is None else {"closes": list(closes)}))
-    return {"lower": rounded(lower), "upper": rounded(upper), "shapes": shapes}
+    for shape, solid, moves in zip(_shapes(scene), solids_of(scene), _motions(scene), strict=True):
+        closes = None if moves else closed_side(solid, lower, upper)
+        shape |= {"colour": _hex(solid.colour)} | moves
+        shapes.append(shape | ({} if closes is None else {"closes": list(closes)}))
+    return {"lower": rounded(lower), "upper": rounded(upper), "shapes": [*shapes, *_balls(scene)]}
+
+
+def _motions(scene: Scene) -> Iterator[dict[str, Any]]:
+    """Yields `moves` of every shape that is not parked, in the order of `solids_of`; nothing of those that stand."""
+    for kind in ("boxes", "tilted_boxes", "cylinders", "tilted_cylinders", "capsules", "spheres"):
+        shapes = getattr(scene, kind)
+        if shapes.motion is None:
+            yield from ({} for _ in present(shapes, "position"))
+            continue
+        names = [field.name for field in dataclasses.fields(shapes.motion)]
+        columns = [np.asarray(getattr(shapes.motion, name), np.float64) for name in names]
+        for place, *values in zip(np.asarray(shapes.position), *columns, strict=True):
+            if np.abs(place).max() < PARKED / 10:
+                moves = {name: rounded(value, 6) for name, value in zip(names, values, strict=True)}
+                yield {"moves": moves} if np.any(moves["velocity"]) or np.any(moves["swing"]) else {}
+
+
+def _balls(scene: Scene) -> Iterator[dict[str, Any]]:
+    """Yields the balls that are thrown."""
+    throw = scene.spheres.throw
+    if throw is None:
+        return
+    hits = hit_time(throw, scene.start, scene.goal)
+    aims = np.stack([thrown_to(throw, scene.start, scene.goal, hit)[i] for i, hit in enumerate(hits)])
+    # A second before the hit, without gravity, it is so far away from there.
+    straight = dataclasses.replace(throw, gravity=jnp.zeros_like(throw.gravity))
+    before = np.stack([thrown_to(straight, scene.start, scene.goal, hit - 1.0)[i] for i, hit in enumerate(hits)])
+    for i in np.flatnonzero(np.asarray(throw.early) > 0):
+        speed, colour = float(throw.speed[i]), np.asarray(scene.spheres.albedo[i])
+        moves = {"hit": float(hits[i]), "early": float(throw.early[i]), "speed": speed, "outside": OUTSIDE_M}
+        moves |= {
+            "gravity": float(throw.gravity[i]),
+            "aim": rounded(aims[i]),
+            "from": rounded((before[i] - aims[i]) / speed, 6),
+        }
+        yield {
+            "kind": "sphere",
+            "at": rounded(aims[i]),
+            "radius": rounded(scene.spheres.radius[i]),
+            "colour": _hex(colour),
+            "moves": moves,
+        }
 
 
 def _shapes(scene: Scene) -> Iterator[dict[str, Any]]:
@@ -57,5 +104,5 @@ def rounded(values: Any, digits: int = 3) -> Any:
     return (np.round(np.asarray(values, np.float64), digits) + 0.0).tolist()
 
 
-def _hex(solid: Solid) -> str:
-    return "#" + "".join(f"{round(255 * float(channel)):02x}" for channel in np.clip(solid.colour, 0, 1))
+def _hex(colour: np.ndarray) -> str:
+    return "#" + "".join(f"{round(255 * float(channel)):02x}" for channel in np.clip(colour, 0, 1))

@@ -1,0 +1,118 @@
+"""How far does a drone come that does not look? Flies the test missions of random worlds without a policy.
+
+`hover` stays where it starts; `straight` takes at every decision the move whose direction is nearest to that of the
+goal. With the policies of the sensors `blind`, `depth` and `depth-motion` (benchmarks/success.py) they say what a world
+asks for: a policy that sees must be well ahead of these two and of the blind one.
+
+    python benchmarks/gates.py --world moving
+    python benchmarks/gates.py --world medium --missions 1000 -- --world.balls 8
+
+Arguments after -- are options of train.py. The interval is a bootstrap over missions, 95 %.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections import Counter
+from collections.abc import Callable, Sequence
+from functools import partial
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from edqn_jax.cli.arguments import parse_train
+from edqn_jax.config import FAMILIES, Config
+from edqn_jax.errors import ConfigError
+from edqn_jax.evaluation.intervals import rate_interval
+from edqn_jax.evaluation.missions import load_missions
+from edqn_jax.evaluation.rollouts import flight_keys
+from edqn_jax.parallel.devices import use_cpu_devices
+from edqn_jax.random import run_streams
+from edqn_jax.runs.files import check_can_write
+from edqn_jax.sim import env
+from edqn_jax.sim.drone import DroneState, yaw_of
+from edqn_jax.sim.env import World
+from edqn_jax.sim.moves import DIRECTIONS, move_number
+from edqn_jax.sim.outcomes import Outcome
+from measurement import json_report
+from measurement.flags import judged_in_tests, split
+
+
+def hover(body: DroneState, goal: Array) -> Array:
+    """Returns the move [] that goes nowhere."""
+    return move_number("hover")
+
+
+def straight(body: DroneState, goal: Array) -> Array:
+    """Returns the move [] whose direction is nearest to that of the goal [3], metres."""
+    way = goal - body.position
+    yaw = yaw_of(body.quaternion)
+    cos, sin = jnp.cos(yaw), jnp.sin(yaw)
+    ahead = jnp.stack([cos * way[0] + sin * way[1], cos * way[1] - sin * way[0], way[2]])
+    nearest = jnp.argmax(DIRECTIONS @ ahead)
+    return nearest + (nearest >= move_number("hover"))  # DIRECTIONS has no hovering among them
+
+
+GATES: dict[str, Callable[[DroneState, Array], Array]] = {"hover": hover, "straight": straight}
+"""By name: the move [] of a drone that is on its way to a goal."""
+
+
+@partial(jax.jit, static_argnums=(0, 2))
+def outcomes(config: Config, world: World, gate: str, key: Array) -> Array:
+    """Returns the outcome [M] int32 of each of the world's M missions."""
+    number = jnp.arange(world.missions.scene.shape[0])
+    keys, _ = flight_keys(key, len(number))
+
+    def decide(flying: tuple[env.EnvState, Array, Array]) -> tuple[env.EnvState, Array, Array]:
+        state, outcome, _ = flying
+        action = jax.vmap(GATES[gate])(state.drone, world.missions.goal[state.mission])
+        state, step = jax.vmap(partial(env.step, config, world))(state, action, number)
+        return state, jnp.where(outcome == Outcome.RUNNING, step.outcome, outcome), step.episode_length
+
+    start = jax.vmap(partial(env.ended, config, world))(keys, number), jnp.zeros_like(number), number
+    return jax.lax.while_loop(lambda flying: jnp.any(flying[1] == Outcome.RUNNING), decide, start)[1]
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Returns exit code 0; 2 for invalid input."""
+    words, flags = split(sys.argv[1:] if argv is None else argv)
+    parser = argparse.ArgumentParser(
+        prog="python benchmarks/gates.py", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--world", default="moving", choices=FAMILIES, help="(default moving)")
+    parser.add_argument("--missions", type=int, default=1000, help="test missions (default 1000)")
+    parser.add_argument("--json", type=Path, help="write the rows to this file")
+    args = parser.parse_args(words)
+    if args.missions < 1:
+        parser.error(f"--missions must be at least 1, not {args.missions}")
+    try:
+        if args.json is not None:
+            check_can_write(args.json)
+        config = judged_in_tests(parse_train(["--world", args.world, "--env.sensor", "blind", *flags])[1])
+        use_cpu_devices()
+        missions = load_missions(config, args.world, args.missions)
+    except ConfigError as error:
+        print(error, file=sys.stderr)
+        return 2
+    names = [outcome.name.lower().replace("_", " ") for outcome in Outcome if outcome != Outcome.RUNNING]
+    print(f"| gate | success | 95 % interval | {' | '.join(names)} |\n| --- | ---: | --- |{' ---: |' * len(names)}")
+    rows = []
+    for gate in GATES:
+        flown = np.asarray(outcomes(config, missions.world, gate, run_streams(0).flights))
+        counts = Counter(Outcome(int(kind)).name.lower().replace("_", " ") for kind in flown)
+        low, high = rate_interval((flown == Outcome.GOAL)[None])
+        rows.append({"gate": gate, "missions": args.missions, "interval": [low, high], **counts})
+        cells = " | ".join(str(counts[name]) for name in names)
+        print(f"| {gate} | {counts['goal'] / args.missions:.1%} | {low:.1%} to {high:.1%} | {cells} |", flush=True)
+    if args.json is not None:
+        report = {"benchmark": "gates", "world": args.world, "options": flags, "rows": rows}
+        json_report.write(args.json, report | json_report.machine(jax.devices()))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,82 @@
+"""The level camera in C, for CPUs: calls `pictures.c`.
+
+Where there is a C compiler, pictures and depth images are drawn by it; everywhere else, and on GPUs, by the same
+functions in JAX (`columns.py`, `depth.py`). Both agree to rounding (`tests/sim/test_native.py`).
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from edqn_jax.config import CameraConfig
+from edqn_jax.parallel.c_library import registered
+from edqn_jax.sim import coverage, raycast
+from edqn_jax.sim.picture_primitive import most_rows
+from edqn_jax.sim.scene import Scene
+from edqn_jax.sim.texture import WAVES
+
+SOURCE = Path(__file__).with_name("pictures.c")
+
+OPERANDS = {
+    "boxes": ("position", "half", "yaw", "albedo"),
+    "cylinders": ("position", "radius", "half_height", "albedo"),
+    "spheres": ("position", "radius", "albedo"),
+    "planes": ("position", "normal", "albedo"),
+}
+"""Kinds of shape that the library draws, and what it reads of each. A scene with room for any other is drawn by JAX."""
+
+NOWHERE = 1e29
+"""Depths beyond this, in metres, are those of rays that meet nothing."""
+
+
+def can_draw(config: CameraConfig, scene: Scene) -> bool:
+    """Returns whether the library is at hand and draws such pictures; known when tracing."""
+    others = (scene.tilted_boxes, scene.capsules, scene.tilted_cylinders)
+    plain = config.mount == "level" and not any(kind.position.shape[-2] for kind in others)
+    return plain and is_at_hand()
+
+
+def pictures(config: CameraConfig, scene: Scene, origin: Array, rotation: Array, weights: Array) -> Array:
+    """Returns brightness [M, H, W] as `columns.pictures` does; arrays have a leading [L], see `picture_primitive`."""
+    return _call("edqn_pictures", config, scene, origin, rotation, weights)
+
+
+def depths(config: CameraConfig, scene: Scene, origin: Array, rotation: Array) -> Array:
+    """Returns the depth [M, H, W] metres along the middle ray of each pixel, inf where there is nothing.
+
+    As `depth.nearest_depth` does; arrays have a leading [L], see `picture_primitive`.
+    """
+    found = _call("edqn_depths", config, scene, origin, rotation)
+    return jnp.where(found > NOWHERE, jnp.inf, found)
+
+
+def _call(target: str, config: CameraConfig, scene: Scene, *frames: Array) -> Array:
+    u, v = raycast.image_plane(config, 1, 1)
+    waves = np.array(
+        [[*np.divide(w.direction, config.texture_period_m * w.octave), w.weight] for w in WAVES], np.float32
+    )
+    first = [raycast.pitch_of(config), config.texture_contrast, config.ambient]
+    constants = np.array([*first, *raycast.sun_direction(config), *config.sky_rgb], np.float32)
+    shapes = [getattr(getattr(scene, kind), name) for kind, names in OPERANDS.items() for name in names]
+    origin, rotation, *weights = frames
+    count = most_rows([*shapes, *frames])
+    shape = jax.ShapeDtypeStruct((count, config.height, config.width), jnp.float32)
+    return jax.ffi.ffi_call(target, shape)(constants, u, v, waves, origin, rotation, *shapes, *weights)
+
+
+def is_at_hand() -> bool:
+    """Returns whether the library is compiled, loaded and registered, which the first call does."""
+    numbers = {
+        "TINY": raycast.TINY,
+        "HORIZON_M": raycast.HORIZON_M,
+        "NEAR_M": coverage.NEAR_M,
+        "FAR_U": coverage.FAR_U,
+        "LEVEL_FACE": coverage.LEVEL_FACE,
+    }
+    shared = (*(f"{name}={value:e}f" for name, value in numbers.items()), f"DEPTH_OF_LAYERS={coverage.DEPTH_OF_LAYERS}")
+    return registered(SOURCE, ("edqn_pictures", "edqn_depths"), shared)

@@ -1,0 +1,78 @@
+"""Compiling C on the user's machine, and doing without."""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+from pathlib import Path
+
+import pytest
+
+from edqn_jax.parallel import c_library
+from edqn_jax.parallel.c_library import registered
+
+SOURCE = """
+#include "handler.h"
+XLA_FFI_Error *NAME(XLA_FFI_CallFrame *call) { return asked_for_version(call) ? 0 : failed(call, 2, "nothing"); }
+"""
+
+
+@pytest.fixture
+def source(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.delenv(c_library.SWITCH, raising=False)
+    file = tmp_path / "nothing.c"
+    file.write_text(SOURCE, encoding="utf-8")
+    return file
+
+
+def kept(tmp_path: Path) -> list[Path]:
+    return sorted((tmp_path / "cache").rglob("*.so"))
+
+
+def test_without_a_compiler_nothing_is_registered(
+    source: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("CC", "no-such-compiler")
+    assert not registered(source, ("edqn_test_a",), ("NAME=edqn_test_a",)) and not kept(tmp_path)
+
+
+def test_it_can_be_switched_off(source: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(c_library.SWITCH, "0")
+    assert not registered(source, ("edqn_test_b",), ("NAME=edqn_test_b",)) and not kept(tmp_path)
+
+
+def test_a_source_that_does_not_compile_leaves_nothing(source: Path, tmp_path: Path) -> None:
+    source.write_text("no C at all", encoding="utf-8")
+    assert not registered(source, ("edqn_test_c",), ("NAME=edqn_test_c",)) and not kept(tmp_path)
+
+
+def test_a_compiler_that_writes_no_library_is_as_none(
+    source: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    broken = tmp_path / "cc"
+    broken.write_text('#!/bin/sh\nfor last; do :; done\necho nothing > "$last"\n', encoding="utf-8")
+    broken.chmod(0o755)
+    monkeypatch.setenv("CC", str(broken))
+    assert not registered(source, ("edqn_test_d",), ("NAME=edqn_test_d",))
+
+
+def test_what_is_compiled_once_is_kept(source: Path, tmp_path: Path) -> None:
+    names = ("edqn_test_e",)
+    if registered(source, names, ("NAME=edqn_test_e",)):
+        (first,) = kept(tmp_path)
+        made = first.stat().st_mtime_ns
+        registered.cache_clear()
+        assert registered(source, names, ("NAME=edqn_test_e",))
+        assert kept(tmp_path) == [first] and first.stat().st_mtime_ns == made
+
+
+def test_where_nothing_can_be_kept_it_is_compiled_and_leaves_nothing(
+    source: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(c_library, "private_folder", lambda: None)
+    scratch = tmp_path / "scratch"
+    scratch.mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(scratch))
+    assert registered(source, ("edqn_test_f",), ("NAME=edqn_test_f",)) is (shutil.which("cc") is not None)
+    assert not list(scratch.rglob("*")) and not kept(tmp_path)
