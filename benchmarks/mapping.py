@@ -48,7 +48,7 @@ from edqn_jax.sim.env import World
 from edqn_jax.sim.flights import Flights
 from edqn_jax.sim.missions import own_missions
 from edqn_jax.sim.outcomes import Outcome
-from edqn_jax.sim.scene import Scene, take_scene
+from edqn_jax.sim.scene import Scene, scene_at, take_scene
 from edqn_jax.sim.sensor import mount_rotation, sensor_of
 from measurement import json_report
 
@@ -139,30 +139,6 @@ def course_of(policy: Policy, family: str, split: worlds.Split, missions: int, f
     return World(drone.load_airframe(policy.config.drone), pool, own_missions(pool))
 
 
-class Hindsight:
-    """Keeps the maps that the last commands were chosen on."""
-
-    def __init__(self) -> None:
-        """Begins before the first flight."""
-        self.log_odds: list[np.ndarray] = []  # [X, Y, Z] of each finished mission, in order
-        self._batch: np.ndarray | None = None
-
-    def __call__(self, flying: Piloted, orders: Orders) -> None:
-        """Is given to `pilot.fly` as `watch`."""
-        if int(np.max(flying.flights.decisions)) == 0:  # another batch begins
-            self.log_odds += [] if self._batch is None else list(self._batch)
-            self._batch = None
-        running = np.asarray(flying.flights.outcome) == Outcome.RUNNING
-        now = np.asarray(flying.grid.log_odds)
-        if self._batch is None:
-            self._batch = now.copy()
-        self._batch[running] = now[running]
-
-    def finished(self) -> list[np.ndarray]:
-        """Returns the log-odds [X, Y, Z] of all missions, in order; those that filled the last batch come last."""
-        return self.log_odds + ([] if self._batch is None else list(self._batch))
-
-
 def what_the_map_had(log_odds: np.ndarray, cell_m: float, scene: Scene, position: np.ndarray, radius: float) -> str:
     """Returns what a map had of the place that a body touches: `KNOWN`, `TAKEN_FOR_FREE` or `UNSEEN`.
 
@@ -220,16 +196,19 @@ def decision_ms(policy: Policy, flown: PilotConfig, world: World, planning: np.n
 
 def pilot_row(policy: Policy, flown: PilotConfig, world: World, batch: int, calls: int) -> Row:
     """Returns the row of a pilot."""
-    hindsight = Hindsight()
-    flights, planning = pilot.fly(
-        policy.config, flown, world, policy.params, jax.random.key(0), batch=batch, watch=hindsight
-    )
     had: list[str] = []
-    radius, maps = policy.config.drone.body_radius_m, hindsight.finished()
-    for mission in np.flatnonzero(flights.outcome == Outcome.COLLISION):
-        scene = take_scene(world.pool, world.missions.scene[mission])
-        touched = np.asarray(flights.closest.position[mission])
-        had.append(what_the_map_had(maps[mission], flown.map.cell_m, scene, touched, radius))
+
+    def landed(missions: np.ndarray, flying: Piloted) -> None:
+        outcome, position = np.asarray(flying.flights.outcome), np.asarray(flying.flights.closest.position)
+        time_s, radius = flying.flights.closest.time, policy.config.drone.body_radius_m
+        for lane in np.flatnonzero(outcome[: len(missions)] == Outcome.COLLISION):
+            scene = scene_at(env.scene_of(world, jnp.asarray(missions[lane])), time_s[lane])
+            log_odds = np.asarray(flying.grid.log_odds[lane])
+            had.append(what_the_map_had(log_odds, flown.map.cell_m, scene, position[lane], radius))
+
+    flights, planning = pilot.fly(
+        policy.config, flown, world, policy.params, jax.random.key(0), batch=batch, landed=landed
+    )
     return {
         **figures(flights, decision_ms(policy, flown, world, planning, calls)),
         "plan_ms": float(1e3 * np.median(planning)),
@@ -329,7 +308,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         policy = load_policy(args.policy)
         pilots = {name: with_options(TUNED[name], args.set) for name in args.methods if name != "learned"}
         for flown in pilots.values():
-            pilot.check_can_decode(policy.config, flown)
+            pilot.check_can_fly(policy.config, flown)
         if args.figure is not None:
             draw(policy, args)
             return 0

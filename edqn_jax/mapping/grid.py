@@ -21,6 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import struct
 from jax import Array
+from jax.typing import ArrayLike
 
 from edqn_jax.config import CameraConfig
 from edqn_jax.errors import ConfigError
@@ -99,7 +100,15 @@ def empty_grid(shape: tuple[int, int, int], volume: Array) -> Grid:
     return Grid(log_odds=jnp.zeros(shape), corner=jnp.asarray(volume)[0])
 
 
-def update(config: MapConfig, camera: CameraConfig, grid: Grid, depth: Array, position: Array, rotation: Array) -> Grid:
+def update(
+    config: MapConfig,
+    camera: CameraConfig,
+    grid: Grid,
+    depth: Array,
+    position: Array,
+    rotation: Array,
+    counts: ArrayLike = True,
+) -> Grid:
     """Returns the grid with one more depth image.
 
     Args:
@@ -108,6 +117,7 @@ def update(config: MapConfig, camera: CameraConfig, grid: Grid, depth: Array, po
         depth: [H, W] metres along each pixel's middle ray, inf where it meets nothing.
         position: [3] of the camera, metres.
         rotation: [3, 3] of the camera, body-to-world, see `sensor.mount_rotation`.
+        counts: [] bool, whether the image tells anything; the grid stays as it is if not.
     """
     size = tuple(min(n, 2 * math.ceil(config.range_m / config.cell_m) + 2) for n in grid.log_odds.shape)
     start = (position - grid.corner) / config.cell_m
@@ -116,7 +126,7 @@ def update(config: MapConfig, camera: CameraConfig, grid: Grid, depth: Array, po
     part = jax.lax.dynamic_slice(grid.log_odds, first, size)
     rays = raycast.camera_rays(camera, rotation)
     passed, ended = _seen(config, size, start - first, _directions(rays, depth.shape), depth.ravel())
-    change = jnp.where(ended, config.hit, jnp.where(passed, config.miss, 0.0))
+    change = jnp.where(ended, config.hit, jnp.where(passed, config.miss, 0.0)) * counts
     part = jnp.clip(part + change, config.least, config.most)
     return dataclasses.replace(grid, log_odds=jax.lax.dynamic_update_slice(grid.log_odds, part, first))
 

@@ -6,15 +6,17 @@ of the policy's event VAE draws of the events, so that pilot and policy see with
 limit and outcomes are those of every flight, and commands those of the follower of `planners.follow`, which also flies
 plans on a true map.
 
-Drones fly side by side: what JAX computes is mapped over them, plans are computed on the host, one drone after another.
+Drones fly side by side: what JAX computes is mapped over them, plans are computed on the host, one a core.
 """
 
 from __future__ import annotations
 
 import dataclasses
 import functools
+import os
 import time
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from typing import Literal
 
 import jax
@@ -31,13 +33,13 @@ from edqn_jax.mapping.grid import Grid, MapConfig, empty_grid, grid_shape, updat
 from edqn_jax.mapping.route import RouteConfig, Router
 from edqn_jax.parallel.devices import compiler_options
 from edqn_jax.planners.follow import SPACING_M, FollowConfig, steer
-from edqn_jax.sim import camera, drone, env, sensor
+from edqn_jax.sim import camera, disturbances, drone, env, sensor
 from edqn_jax.sim.drone import DroneState, Flight
 from edqn_jax.sim.env import World
 from edqn_jax.sim.flights import Flights, at_start, tally
 from edqn_jax.sim.outcomes import Outcome, judge
-from edqn_jax.sim.scene import Scene, scene_at, take_scene
-from edqn_jax.sim.sensor import DEPTH_SCALE, SensorMemory, distance_of, frame_steps, mount_rotation
+from edqn_jax.sim.scene import Scene, scene_at
+from edqn_jax.sim.sensor import DEPTH_SCALE, SensorMemory, distance_of, mount_rotation
 
 POINTS = 128
 """Points, `SPACING_M` apart, of the part of a plan that the follower is given."""
@@ -116,19 +118,33 @@ class Orders:
     expanded: np.ndarray
     """[B] cells that the search expanded."""
     seconds: np.ndarray
-    """[B] of planning; NaN of drones that have arrived or failed."""
+    """[B] of one core's time for planning; NaN of drones that have arrived or failed."""
 
 
 Watch = Callable[[Piloted, Orders], None]
 """Is called after every decision's planning with B drones, before they fly."""
 
 
-def check_can_decode(config: Config, pilot: PilotConfig) -> None:
-    """Raises ConfigError if the policy's decoder draws no distances and the pilot needs them.
+Landed = Callable[[np.ndarray, Piloted], None]
+"""Is called after every batch with the numbers [B] of its missions and its drones as their flights ended."""
+
+
+def check_can_fly(config: Config, pilot: PilotConfig) -> None:
+    """Raises ConfigError if the pilot cannot fly what a policy's configuration describes.
 
     Raises:
         ConfigError: says what is needed.
     """
+    if disturbances.any_on(config):
+        raise ConfigError(
+            "the pilot flies without disturbances; all options of air, body, motors and noise, and env.action_delay, "
+            "must be off"
+        )
+    if config.drone.body_radius_m > pilot.route.body_m:
+        raise ConfigError(
+            f"the pilot's routes are for bodies of at most {pilot.route.body_m:g} m, not of "
+            f"{config.drone.body_radius_m:g} m; body_m, touch_m and near_m of a route must grow with the body"
+        )
     if pilot.depth == "decoded" and not embedding.needs_nearness(config):
         raise ConfigError("the policy's decoder draws no distances; encoder.target must be 'nearness' or 'both'")
 
@@ -154,25 +170,28 @@ def look(
 
     Args:
         params: of the policy whose encoder and decoder see.
-        scene: the world as it stands, for the sensor alone.
+        scene: the world with its motion, for the sensor alone.
         goal: [3] metres.
         flying: so far.
         move: [3] the last command in the heading frame, in commanded speeds.
         poses: [T] at the sensor's frame times.
+
+    A drone whose flight is over keeps the map on which its last command was chosen.
     """
     key, noise = jax.random.split(flying.key)
     body = flying.drone
     rotation = mount_rotation(config, body.quaternion)
-    seen, sensed, memory = jnp.ones((), bool), flying.sensed, flying.memory
+    counts = flying.flights.outcome == Outcome.RUNNING
+    sensed, memory = flying.sensed, flying.memory
     if pilot.depth == "true":
-        depth = camera.depth(config.camera, scene, body.position, rotation)
+        now = scene_at(scene, None if poses.time is None else poses.time[-1])
+        depth = camera.depth(config.camera, now, body.position, rotation)
     else:
         observation, sensed = env.observe(config, scene, goal, body, move, poses, sensed, noise)
         memory = policy.see(config, params.encoder, memory, observation)
         depth = decoded_depth(config, params, memory)
-        seen = jnp.sum(body.velocity**2) >= pilot.seeing_m_s**2
-    grown = update(pilot.map, config.camera, flying.grid, depth, body.position, rotation)
-    grid = jax.tree.map(lambda new, old: jnp.where(seen, new, old), grown, flying.grid)
+        counts &= jnp.sum(body.velocity**2) >= pilot.seeing_m_s**2
+    grid = update(pilot.map, config.camera, flying.grid, depth, body.position, rotation, counts)
     return dataclasses.replace(flying, memory=memory, sensed=sensed, grid=grid, depth=depth, key=key)
 
 
@@ -195,8 +214,7 @@ def decide(
         points: [POINTS, 3] metres, the plan.
         speed: [] metres per second, the limit.
     """
-    time_s = flying.flights.decisions * (config.drone.physics_steps * config.drone.physics_dt_s)
-    scene = scene_at(take_scene(world.pool, world.missions.scene[mission]), time_s)
+    scene = env.scene_of(world, mission)
     goal, before = world.missions.goal[mission], flying.drone
     limit = dataclasses.replace(config.env, speed_m_s=pilot.speed_m_s)
     command, _ = steer(limit, pilot.follow, points, jnp.zeros((), jnp.int32), before)
@@ -208,24 +226,22 @@ def decide(
     outcome, end, contact = judge(config, scene, goal, before.position, flight, flying.flights.decisions + 1)
     flights, _ = tally(config, scene, flying.flights, before.position, flight, outcome, end, contact)
     move = env.heading_velocity(config.env, drone.yaw_of(before.quaternion), command)
-    # Frame times of a sensor are physics steps of the decision; 0 is the pose before it.
-    path = jax.tree.map(
-        lambda first, rest: jnp.concatenate([first[None], rest]),
-        Flight(position=before.position, quaternion=before.quaternion, velocity=before.velocity),
-        flight,
-    )
-    poses = jax.tree.map(lambda leaf: leaf[jnp.asarray(frame_steps(config))], path)
-    flown = dataclasses.replace(flying, drone=after, flights=flights)
-    flown = look(config, pilot, params, scene, goal, flown, move, poses)
+    steps = flying.flights.decisions * config.drone.physics_steps + jnp.arange(1, config.drone.physics_steps + 1)
+    poses = env.poses_seen(config, before, env.timed(config, scene, flight, steps))
     running = flying.flights.outcome == Outcome.RUNNING
-    return jax.tree.map(lambda new, old: jnp.where(running, new, old), flown, flying)
+    keep = functools.partial(jax.tree.map, lambda new, old: jnp.where(running, new, old))
+    # Before looking, so that the map, by far the largest part, need not be chosen as a whole.
+    flown = dataclasses.replace(flying, drone=keep(after, before), flights=keep(flights, flying.flights))
+    seen = look(config, pilot, params, scene, goal, flown, move, poses)
+    others = {name: keep(getattr(seen, name), getattr(flying, name)) for name in ("memory", "sensed", "depth", "key")}
+    return dataclasses.replace(seen, **others)
 
 
 def at_rest(
     config: Config, pilot: PilotConfig, shape: tuple[int, int, int], world: World, mission: Array, key: Array
 ) -> Piloted:
     """Returns a drone at a mission's start [] int32, facing the goal, with an empty map of `shape` cells."""
-    scene = scene_at(take_scene(world.pool, world.missions.scene[mission]), jnp.zeros(()))
+    scene = env.scene_of(world, mission)
     start, goal = world.missions.start[mission], world.missions.goal[mission]
     key, rest = jax.random.split(key)
     body = drone.hover(start, jnp.arctan2(goal[1] - start[1], goal[0] - start[0]))
@@ -251,14 +267,8 @@ def _begin(
 ) -> Piloted:
     """Returns a drone at its start that has looked ahead once."""
     flying = at_rest(config, pilot, shape, world, mission, key)
-    scene = scene_at(take_scene(world.pool, world.missions.scene[mission]), jnp.zeros(()))
-    count = len(frame_steps(config))
-    body = flying.drone
-    still = Flight(
-        position=jnp.tile(body.position, (count, 1)),
-        quaternion=jnp.tile(body.quaternion, (count, 1)),
-        velocity=jnp.tile(body.velocity, (count, 1)),
-    )
+    scene = env.scene_of(world, mission)
+    still = env.poses_at_start(config, scene, flying.drone)
     return look(config, pilot, params, scene, world.missions.goal[mission], flying, jnp.zeros(3), still)
 
 
@@ -315,6 +325,7 @@ def fly(
     *,
     batch: int = 16,
     watch: Watch | None = None,
+    landed: Landed | None = None,
 ) -> tuple[Flights, np.ndarray]:
     """Flies each of the world's M missions once.
 
@@ -326,14 +337,15 @@ def fly(
         key: consumed by the sensor's noise.
         batch: drones that fly side by side, which decides the memory that maps need and no result.
         watch: sees drones and plans before every decision.
+        landed: sees drones and their maps after their flights.
 
     Returns:
-        the flights [M] without record, on the host; seconds [N] of planning of each decision.
+        the flights [M] without record, on the host; seconds [N] of one core's time for planning, a decision each.
 
     Raises:
-        ConfigError: if the decoder draws no distances, or the map has too many cells.
+        ConfigError: if the pilot cannot fly what `config` describes, or the map has too many cells.
     """
-    check_can_decode(config, pilot)
+    check_can_fly(config, pilot)
     shape = grid_shape(pilot.map, world.pool.volume)
     begin, step = _programs(jax.devices()[0].platform)
     scenes, goals, volumes = (np.asarray(x) for x in (world.missions.scene, world.missions.goal, world.pool.volume))
@@ -356,6 +368,8 @@ def fly(
             if watch is not None:
                 watch(flying, orders)
             flying = step(config, pilot, world, params, number, flying, orders.points, orders.speed)
+        if landed is not None:
+            landed(chosen[chosen < count], flying)
         flown.append(jax.tree.map(np.asarray, flying.flights))
     flights = jax.tree.map(lambda *parts: np.concatenate(parts)[:count], *flown)
     return flights, np.concatenate(seconds)
@@ -369,10 +383,14 @@ def _orders(
     batch = len(routers)
     points = np.zeros((batch, POINTS, 3), np.float32)
     speed, expanded, seconds = np.zeros(batch, np.float32), np.zeros(batch, int), np.full(batch, np.nan)
-    for b in np.flatnonzero(running):
-        began = time.perf_counter()
+
+    def plan(b: int) -> None:
+        began = time.thread_time()
         points[b], speed[b], expanded[b] = order(
             pilot, routers[b], log_odds[b], position[b], goals[b].astype(np.float64)
         )
-        seconds[b] = time.perf_counter() - began
+        seconds[b] = time.thread_time() - began
+
+    with ThreadPoolExecutor(os.cpu_count()) as threads:
+        list(threads.map(plan, np.flatnonzero(running)))
     return Orders(points, speed, expanded, seconds)

@@ -172,7 +172,7 @@ def _around(cell: float, beyond: float, within: float) -> np.ndarray:
     return np.ascontiguousarray(cells[chosen][np.argsort(apart[chosen], kind="stable")])
 
 
-@numba.njit
+@numba.njit(nogil=True)
 def _is_occupied_around(known, around, i, j, k):
     """Returns whether one of the cells at the offsets `around` [N, 3] from (i, j, k) is occupied."""
     shape = known.log_odds.shape
@@ -184,7 +184,7 @@ def _is_occupied_around(known, around, i, j, k):
     return False
 
 
-@numba.njit
+@numba.njit(nogil=True)
 def _is_unknown_around(known, around, i, j, k):
     """Returns whether one of the cells at the offsets `around` [N, 3] from (i, j, k) is unknown."""
     shape = known.log_odds.shape
@@ -196,7 +196,7 @@ def _is_unknown_around(known, around, i, j, k):
     return False
 
 
-@numba.njit
+@numba.njit(nogil=True)
 def _weight(known, i, j, k):
     """Returns the cost of a metre through the cell (i, j, k)."""
     if known.log_odds[i, j, k] > known.occupied_above:
@@ -211,7 +211,7 @@ def _weight(known, i, j, k):
     return weight
 
 
-@numba.njit
+@numba.njit(nogil=True)
 def _free_length(a, b, c):
     """Returns the cells of the shortest lattice path over `a`, `b` and `c` cells along the axes."""
     low, high = min(a, b, c), max(a, b, c)
@@ -219,7 +219,7 @@ def _free_length(a, b, c):
     return math.sqrt(3.0) * low + math.sqrt(2.0) * (middle - low) + (high - middle)
 
 
-@numba.njit
+@numba.njit(nogil=True)
 def _search(known, source, target, most):
     """Returns the first `most` + 1 cells [n, 3] of a way, its cost, and how many cells were expanded."""
     shape, low, high = known.log_odds.shape, known.low, known.high
@@ -276,7 +276,7 @@ def _search(known, source, target, most):
     return cells, costs[finish], expanded
 
 
-@numba.njit
+@numba.njit(nogil=True)
 def _cell_of(known, x, y, z):
     """Returns the cell (i, j, k) of a point in cells, the nearest one of the grid."""
     shape = known.log_odds.shape
@@ -284,7 +284,7 @@ def _cell_of(known, x, y, z):
     return min(max(i, 0), shape[0] - 1), min(max(j, 0), shape[1] - 1), min(max(k, 0), shape[2] - 1)
 
 
-@numba.njit
+@numba.njit(nogil=True)
 def _heaviest(known, a, b):
     """Returns the largest weight on the straight leg from `a` [3] to `b` [3], in cells."""
     length = math.sqrt((b[0] - a[0]) ** 2 + (b[1] - a[1]) ** 2 + (b[2] - a[2]) ** 2)
@@ -299,7 +299,7 @@ def _heaviest(known, a, b):
     return heaviest
 
 
-@numba.njit
+@numba.njit(nogil=True)
 def _seen(known, points):
     """Returns the length of the part of a way [N, 3] in which the body is known to be free; both in cells."""
     total = 0.0

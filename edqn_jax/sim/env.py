@@ -244,8 +244,7 @@ def reset(config: Config, world: World, key: Array, mission: Array | None = None
     key, noise = jax.random.split(key)
     state = dataclasses.replace(ended(config, world, key, mission), ended=jnp.zeros((), bool))
     scene = scene_of(world, state.mission)
-    before = np.array(frame_steps(config)) - config.drone.physics_steps
-    still = _timed(config, scene, _hold(state.drone, len(before)), jnp.asarray(before) if moves(scene) else None)
+    still = poses_at_start(config, scene, state.drone)
     goal = world.missions.goal[state.mission]
     observation, memory = observe(
         *(config, scene, goal, state.drone, jnp.zeros(3), still, state.memory, noise, state.disturbance)
@@ -272,6 +271,12 @@ def ended(config: Config, world: World, key: Array, mission: Array | None = None
 
 def _drawn_mission(world: World, key: Array) -> Array:
     return integers(key, (), world.missions.scene.shape[0])
+
+
+def poses_at_start(config: Config, scene: Scene, body: DroneState) -> Flight:
+    """Returns the poses [T] at which the sensor looks before an episode, in which the body is at rest."""
+    before = np.array(frame_steps(config)) - config.drone.physics_steps
+    return timed(config, scene, _hold(body, len(before)), jnp.asarray(before) if moves(scene) else None)
 
 
 def _hold(body: DroneState, n: int) -> Flight:
@@ -323,9 +328,9 @@ def step(
     n = config.drone.physics_steps
     # The time before a start is negative: what moves has moved before.
     steps = jnp.where(is_reset, -n, state.decision * n) + jnp.arange(1, n + 1) if moves(scene) else None
-    done = dataclasses.replace(done, flight=_timed(config, scene, done.flight, steps))
+    done = dataclasses.replace(done, flight=timed(config, scene, done.flight, steps))
 
-    poses = _poses_seen(config, _choose(is_reset, start, state.drone), done.flight)
+    poses = poses_seen(config, _choose(is_reset, start, state.drone), done.flight)
     memory = _choose(is_reset, rested, state.memory)
     move = jnp.where(is_reset, 0.0, jnp.asarray(ACTIONS, jnp.float32)[action])
     observation, memory = observe(*(config, scene, goal, done.drone, move, poses, memory, noise, done.disturbance))
@@ -389,7 +394,7 @@ def _time(config: Config, decisions: Array) -> Array:
     return decisions * (config.drone.physics_steps * config.drone.physics_dt_s)
 
 
-def _timed(config: Config, scene: Scene, flight: Flight, steps: Array | None) -> Flight:
+def timed(config: Config, scene: Scene, flight: Flight, steps: Array | None) -> Flight:
     """Returns a flight with the times of its poses, taken after physics steps `steps` [n] of the episode.
 
     In a still world nobody asks for times, and there are none.
@@ -494,8 +499,8 @@ def _reset_in_place_of(flown: _Decision, start: DroneState, drawn: Disturbance |
     )
 
 
-def _poses_seen(config: Config, first: DroneState, flight: Flight) -> Flight:
-    """Poses [T] at which the sensor looks, of those before the first and after each physics step."""
+def poses_seen(config: Config, first: DroneState, flight: Flight) -> Flight:
+    """Returns the poses [T] at which the sensor looks, of those before the first and after each physics step."""
     began = None if flight.time is None else flight.time[0] - config.drone.physics_dt_s
     path = jax.tree.map(
         lambda a, b: jnp.concatenate([a[None], b]),

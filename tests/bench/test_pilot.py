@@ -156,7 +156,7 @@ def test_the_command_never_exceeds_the_limit_and_a_flight_that_is_over_stays_so(
 def test_what_cannot_be_flown_is_a_sentence() -> None:
     blind = dataclasses.replace(CONFIG, env=dataclasses.replace(CONFIG.env, sensor="blind"))
     with pytest.raises(ConfigError, match="draws no distances"):
-        pilot.check_can_decode(blind, PilotConfig(depth="decoded"))
-    pilot.check_can_decode(blind, TRUE)
+        pilot.check_can_fly(blind, PilotConfig(depth="decoded"))
+    pilot.check_can_fly(blind, TRUE)
     with pytest.raises(ConfigError, match="speed_m_s of a pilot must be more than 0"):
         PilotConfig(speed_m_s=0.0)
