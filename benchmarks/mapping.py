@@ -47,8 +47,9 @@ from edqn_jax.sim.distance import signed_distance
 from edqn_jax.sim.env import World
 from edqn_jax.sim.flights import Flights
 from edqn_jax.sim.missions import own_missions
+from edqn_jax.sim.moving_worlds import Moving
 from edqn_jax.sim.outcomes import Outcome
-from edqn_jax.sim.scene import Scene, scene_at, take_scene
+from edqn_jax.sim.scene import Scene, scene_at
 from edqn_jax.sim.sensor import mount_rotation, sensor_of
 from measurement import json_report
 
@@ -135,7 +136,7 @@ def with_options(base: PilotConfig, words: Sequence[str]) -> PilotConfig:
 
 def course_of(policy: Policy, family: str, split: worlds.Split, missions: int, first: int = 0) -> World:
     """Returns one mission in each of `missions` worlds of a split, from world `first` on."""
-    pool = worlds.random_pool(family, worlds.world_keys(split, missions, first=first))
+    pool = worlds.random_pool(family, worlds.world_keys(split, missions, first=first), Moving.of(policy.config))
     return World(drone.load_airframe(policy.config.drone), pool, own_missions(pool))
 
 
@@ -287,7 +288,7 @@ def draw(policy: Policy, args: argparse.Namespace) -> None:
     flown = with_options(TUNED[method], args.set)
     world = course_of(policy, args.worlds[0], args.split, 1, first=args.mission)
     moments, outcome = watched(policy, flown, world)
-    scene = take_scene(world.pool, 0)
+    scene = env.scene_of(world, jnp.asarray(0))
     if args.figure.suffix == ".png":
         chosen = np.unique(np.linspace(0, len(moments) - 1, PICTURES).round().astype(int))
         draw_growth(scene, flown.map.cell_m, [moments[i] for i in chosen], args.figure)

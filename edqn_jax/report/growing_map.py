@@ -21,7 +21,7 @@ from PIL import Image
 from edqn_jax.report.animation import gif
 from edqn_jax.report.style import LINE, MUTED, SECOND_LINE, STYLE, drawing
 from edqn_jax.sim.distance import signed_distance
-from edqn_jax.sim.scene import Scene
+from edqn_jax.sim.scene import Scene, scene_at
 from edqn_jax.sim.sensor import nearness
 
 UNKNOWN, FREE, OCCUPIED = range(3)
@@ -120,7 +120,7 @@ def _draw_known(axes: Axes, scene: Scene, cell_m: float, moment: Moment) -> None
         extent=(lower[0], far[0], lower[1], far[1]),
         interpolation="nearest",
     )
-    x, y, clearance = _clearance_at(scene, float(here[2]))
+    x, y, clearance = _clearance_at(scene_at(scene, jnp.float32(moment.time_s)), float(here[2]))
     axes.contour(x, y, clearance.T, levels=[0.0], colors=SECOND_LINE, linewidths=0.7)
     axes.plot(*moment.plan[:, :2].T, color="#009e73", linewidth=1.4)
     axes.plot(*moment.flown[:, :2].T, color=LINE, linewidth=1.4)

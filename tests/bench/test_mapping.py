@@ -82,30 +82,6 @@ def test_all_methods_fly_the_same_missions(tmp_path: Path, capsys, monkeypatch) 
     assert figure.read_bytes().startswith(b"\x89PNG") and "after 4 decisions" in capsys.readouterr().out
 
 
-def test_maps_are_kept_in_the_order_of_the_missions() -> None:
-    class Grid:
-        def __init__(self, values):
-            self.log_odds = np.array(values, float)[:, None, None, None]
-
-    class Flights:
-        def __init__(self, decisions, outcome):
-            self.decisions, self.outcome = np.array(decisions), np.array(outcome)
-
-    class Flying:
-        def __init__(self, values, decisions, outcome):
-            self.grid, self.flights = Grid(values), Flights(decisions, outcome)
-
-    seen = mapping.Hindsight()
-    for flying in (
-        Flying([1, 2], [0, 0], [0, 0]),
-        Flying([3, 4], [1, 1], [2, 0]),  # the first has ended: what it saw after its end does not count
-        Flying([5, 6], [0, 0], [0, 0]),  # the second batch, after one decision more
-        Flying([7, 8], [1, 1], [0, 0]),
-    ):
-        seen(flying, None)  # type: ignore[arg-type]
-    assert [float(each.squeeze()) for each in seen.finished()] == [1, 4, 7, 8]
-
-
 def test_what_cannot_be_measured_is_a_sentence(tmp_path: Path, capsys) -> None:
     assert mapping.main(["--policy", str(tmp_path)]) == 2
     assert "there is no run in" in capsys.readouterr().err

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -13,7 +14,7 @@ import pytest
 from edqn_jax.errors import ConfigError
 from edqn_jax.mapping import pilot
 from edqn_jax.mapping.pilot import POINTS, Orders, PilotConfig, Piloted
-from edqn_jax.mapping.route import Router
+from edqn_jax.mapping.route import RouteConfig, Router
 from edqn_jax.planners.follow import SPACING_M
 from edqn_jax.sim import drone
 from edqn_jax.sim.env import World
@@ -153,7 +154,93 @@ def test_the_command_never_exceeds_the_limit_and_a_flight_that_is_over_stays_so(
     assert float(np.linalg.norm(flying.drone.velocity)) == pytest.approx(1.5, abs=0.1)
 
 
+MOVING = """<mujoco>
+  <custom><text name="motion:it" data="bounce {velocity}"/></custom>
+  <worldbody>
+    <site name="start" pos="3 10 4"/><site name="goal" pos="21 10 4"/>
+    <site name="volume" type="box" pos="12 10 4" size="12 10 4"/>
+    <body name="it" mocap="true" pos="{place}"><geom type="box" size="{size}"/></body>
+  </worldbody>
+</mujoco>"""
+
+
+def hovering(tmp_path: Path, decisions: int, **words: str) -> list[Piloted]:
+    """A drone that stays at its start while a box moves in front of it; it after 0, 1, ... decisions."""
+    file = tmp_path / "moving.xml"
+    file.write_text(MOVING.format(**words))
+    pool = stack_scenes([load_world(file).scene])
+    world = World(drone.load_airframe(CONFIG.drone), pool, own_missions(pool))
+    number, shape = jnp.zeros((), jnp.int32), pilot.grid_shape(TRUE.map, pool.volume)
+    flying = jax.jit(functools.partial(pilot._begin, CONFIG, TRUE, shape, world, params()))(number, jax.random.key(0))
+    step = jax.jit(functools.partial(pilot.decide, CONFIG, TRUE, world, params()))
+    points = pilot.sampled(np.array([[3.0, 10.0, 4.0], [3.5, 10.0, 4.0]]))
+    seen = [flying]
+    for _ in range(decisions):
+        seen.append(step(number, seen[-1], points, jnp.float32(1e-4)))
+    return seen
+
+
+def test_what_an_obstacle_has_left_becomes_free_again(tmp_path: Path) -> None:
+    # Its face is 4 m ahead at x = 7, and its middle moves from y = 8 to y = 14 in 3 s; without images of the world at
+    # their own times it would stay where it is drawn.
+    seen = hovering(tmp_path, 26, place="8 8 4", size="1 1 4", velocity="0 2 0  8 8 4  8 14 4")
+    cell = lambda y: (14, int(2 * y), 8)  # noqa: E731
+    first, hit = np.asarray(seen[0].grid.log_odds), TRUE.map.hit
+    assert first[cell(8.25)] == pytest.approx(hit) and first[cell(12.25)] < 0
+    # 3.12 s later it has passed the middle and turns back at the end of its way; what it had hit twice takes 5 images.
+    after = np.asarray(seen[12].grid.log_odds)
+    assert after[cell(8.25)] < 0 < after[cell(13.25)]
+    # And back at y = 8 again after 6 s, where it is seen at once.
+    back = np.asarray(seen[24].grid.log_odds)
+    assert back[cell(13.25)] < 0 < back[cell(8.25)]
+
+
+def test_an_obstacle_that_flies_into_a_hovering_drone_is_a_collision_at_its_own_time(tmp_path: Path) -> None:
+    # Its face is 3 m from the drone's middle and comes at 2 m/s: it touches the body 1.32 s after the start.
+    seen = hovering(tmp_path, 7, place="7 10 4", size="1 1 1", velocity="-2 0 0  2 10 4  7 10 4")
+    end = seen[-1].flights
+    assert int(end.outcome) == Outcome.COLLISION and int(end.decisions) == 6
+    assert float(end.flight_seconds) == pytest.approx((3 - CONFIG.drone.body_radius_m) / 2, abs=0.01)
+
+
+def test_a_flight_that_is_over_keeps_the_map_of_its_last_command(tmp_path: Path) -> None:
+    seen = hovering(tmp_path, 7, place="7 10 4", size="1 1 1", velocity="-2 0 0  2 10 4  7 10 4")
+    last, before, over = (np.asarray(seen[n].grid.log_odds) for n in (5, 4, 7))
+    assert np.any(last != before)
+    np.testing.assert_array_equal(over, last)
+
+
+@pytest.mark.slow
+def test_what_has_landed_comes_with_its_number(course: World) -> None:
+    short = dataclasses.replace(CONFIG, env=dataclasses.replace(CONFIG.env, max_decisions=2))
+    found: list[tuple[int, int]] = []
+
+    def landed(missions: np.ndarray, flying: Piloted) -> None:
+        # The walls reach from y = 0 to 16 and from 4 to 20; the floor is below them.
+        beyond = np.asarray(flying.grid.log_odds)[:, :, 33:, 4:].max(axis=(1, 2, 3)) > 0
+        found.extend((int(m), int(beyond[lane])) for lane, m in enumerate(missions))
+
+    pilot.fly(short, TRUE, course, params(), jax.random.key(0), batch=1, landed=landed)
+    assert found == [(0, 0), (1, 1)]
+    found.clear()
+    pilot.fly(short, TRUE, course, params(), jax.random.key(0), batch=3, landed=landed)
+    assert found == [(0, 0), (1, 1)]  # and without the one that fills the batch
+
+
 def test_what_cannot_be_flown_is_a_sentence() -> None:
+    for group, option, value in (
+        ("air", "wind_m_s", 1.0),
+        ("noise", "position_m", 0.1),
+        ("motors", "lag_s", 0.05),
+        ("env", "action_delay", 1),
+    ):
+        part = dataclasses.replace(getattr(CONFIG, group), **{option: value})
+        with pytest.raises(ConfigError, match="the pilot flies without disturbances"):
+            pilot.check_can_fly(dataclasses.replace(CONFIG, **{group: part}), TRUE)
+    large = dataclasses.replace(CONFIG, drone=dataclasses.replace(CONFIG.drone, body_radius_m=0.6))
+    with pytest.raises(ConfigError, match="for bodies of at most 0.5 m, not of 0.6 m"):
+        pilot.check_can_fly(large, TRUE)
+    pilot.check_can_fly(large, dataclasses.replace(TRUE, route=RouteConfig(body_m=0.6)))
     blind = dataclasses.replace(CONFIG, env=dataclasses.replace(CONFIG.env, sensor="blind"))
     with pytest.raises(ConfigError, match="draws no distances"):
         pilot.check_can_fly(blind, PilotConfig(depth="decoded"))
