@@ -32,7 +32,7 @@ from edqn_jax.learn.policy import Memory, PolicyParams
 from edqn_jax.mapping.grid import Grid, MapConfig, empty_grid, grid_shape, update
 from edqn_jax.mapping.route import RouteConfig, Router
 from edqn_jax.parallel.devices import compiler_options
-from edqn_jax.planners.follow import SPACING_M, FollowConfig, steer
+from edqn_jax.planners.follow import FollowConfig, sampled, steer
 from edqn_jax.sim import camera, disturbances, drone, env, sensor
 from edqn_jax.sim.drone import DroneState, Flight
 from edqn_jax.sim.env import World
@@ -42,7 +42,7 @@ from edqn_jax.sim.scene import Scene, scene_at
 from edqn_jax.sim.sensor import DEPTH_SCALE, SensorMemory, distance_of, mount_rotation
 
 POINTS = 128
-"""Points, `SPACING_M` apart, of the part of a plan that the follower is given."""
+"""Points, `planners.follow.SPACING_M` apart, of the part of a plan that the follower is given."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -306,14 +306,7 @@ def order(
         # v with v t + v^2 / 2 a = free: the way until it brakes, and that of braking.
         lag = pilot.braking_m_s2 * pilot.reaction_s
         speed = min(speed, max(pilot.least_m_s, -lag + float(np.sqrt(lag**2 + 2 * pilot.braking_m_s2 * free))))
-    return sampled(route.points), speed, route.expanded
-
-
-def sampled(points: np.ndarray) -> np.ndarray:
-    """Returns points [POINTS, 3] every `SPACING_M` along a way [N, 3], metres; the last is repeated."""
-    along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
-    at = np.minimum(SPACING_M * np.arange(POINTS), along[-1])
-    return np.stack([np.interp(at, along, axis) for axis in points.T], axis=1).astype(np.float32)
+    return sampled(route.points)[:POINTS], speed, route.expanded
 
 
 def fly(

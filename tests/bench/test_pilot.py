@@ -15,7 +15,7 @@ from edqn_jax.errors import ConfigError
 from edqn_jax.mapping import pilot
 from edqn_jax.mapping.pilot import POINTS, Orders, PilotConfig, Piloted
 from edqn_jax.mapping.route import RouteConfig, Router
-from edqn_jax.planners.follow import SPACING_M
+from edqn_jax.planners.follow import SPACING_M, sampled
 from edqn_jax.sim import drone
 from edqn_jax.sim.env import World
 from edqn_jax.sim.missions import own_missions
@@ -131,17 +131,20 @@ def test_it_flies_as_fast_as_it_can_stop_within_what_it_has_seen() -> None:
 
 
 def test_the_follower_gets_points_at_its_spacing() -> None:
-    points = pilot.sampled(np.array([[0.0, 0.0, 1.0], [3.0, 0.0, 1.0], [3.0, 4.0, 1.0]]))
+    volume = np.array([[0.0, 0.0, 0.0], [24.0, 20.0, 8.0]])
+    router = Router(TRUE.route, TRUE.map.cell_m, volume)
+    known = np.full((48, 40, 16), -1.0, np.float32)
+    points, _, _ = pilot.order(TRUE, router, known, np.array([3.25, 10.25, 4.25]), np.array([21.25, 10.25, 4.25]))
     assert points.shape == (POINTS, 3)
-    np.testing.assert_allclose(points[45], [3.0, 1.5, 1.0], atol=1e-6)
-    np.testing.assert_allclose(np.linalg.norm(np.diff(points[:30], axis=0), axis=1), SPACING_M, atol=1e-6)
-    np.testing.assert_allclose(points[71:], np.broadcast_to([3.0, 4.0, 1.0], (POINTS - 71, 3)))
+    np.testing.assert_allclose(points[:95, 0], 3.25 + SPACING_M * np.arange(95), atol=1e-5)
+    # A way of 10 m, in whole cells; its end is repeated.
+    np.testing.assert_allclose(points[105:], np.broadcast_to([13.25, 10.25, 4.25], (POINTS - 105, 3)), atol=1e-5)
 
 
 def test_the_command_never_exceeds_the_limit_and_a_flight_that_is_over_stays_so(course: World) -> None:
     shape = pilot.grid_shape(TRUE.map, course.pool.volume)
     flying = pilot.at_rest(CONFIG, TRUE, shape, course, jnp.zeros((), jnp.int32), jax.random.key(0))
-    points = pilot.sampled(np.array([[3.0, 10.0, 4.0], [9.0, 10.0, 4.0]]))
+    points = sampled(np.array([[3.0, 10.0, 4.0], [9.0, 10.0, 4.0]]))
     step = jax.jit(functools.partial(pilot.decide, CONFIG, TRUE, course, params()))
     for _ in range(4):
         flying = step(jnp.zeros((), jnp.int32), flying, points, jnp.float32(1.5))
@@ -173,7 +176,7 @@ def hovering(tmp_path: Path, decisions: int, **words: str) -> list[Piloted]:
     number, shape = jnp.zeros((), jnp.int32), pilot.grid_shape(TRUE.map, pool.volume)
     flying = jax.jit(functools.partial(pilot._begin, CONFIG, TRUE, shape, world, params()))(number, jax.random.key(0))
     step = jax.jit(functools.partial(pilot.decide, CONFIG, TRUE, world, params()))
-    points = pilot.sampled(np.array([[3.0, 10.0, 4.0], [3.5, 10.0, 4.0]]))
+    points = sampled(np.array([[3.0, 10.0, 4.0], [3.5, 10.0, 4.0]]))
     seen = [flying]
     for _ in range(decisions):
         seen.append(step(number, seen[-1], points, jnp.float32(1e-4)))
