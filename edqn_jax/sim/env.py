@@ -249,8 +249,7 @@ def reset(config: Config, world: World, key: Array, mission: Array | None = None
     key, noise = jax.random.split(key)
     state = dataclasses.replace(ended(config, world, key, mission), ended=jnp.zeros((), bool))
     scene = scene_of(world, state.mission)
-    before = np.array(frame_steps(config)) - config.drone.physics_steps
-    still = _timed(config, _hold(state.drone, len(before)), jnp.asarray(before) if moves(scene) else None)
+    still = poses_at_start(config, scene, state.drone)
     goal = world.missions.goal[state.mission]
     observation, memory = observe(
         *(config, scene, goal, state.drone, jnp.zeros(3), still, state.memory, noise, state.disturbance)
@@ -280,6 +279,12 @@ def _drawn_mission(config: Config, world: World, key: Array) -> Array:
     if group.several(config):
         return group.mission_of_block(config, integers(key, (), count // config.env.drones))
     return integers(key, (), count)
+
+
+def poses_at_start(config: Config, scene: Scene, body: DroneState) -> Flight:
+    """Returns the poses [T] at which the sensor looks before an episode, in which the body is at rest."""
+    before = np.array(frame_steps(config)) - config.drone.physics_steps
+    return timed(config, _hold(body, len(before)), jnp.asarray(before) if moves(scene) else None)
 
 
 def _hold(body: DroneState, n: int) -> Flight:
@@ -338,15 +343,15 @@ def step(
         done = _choose(waits, _reset_in_place_of(flown, state.drone, state.disturbance), done)
     n = config.drone.physics_steps
     # The time before a start is negative: what moves has moved before.
-    timed = moves(scene) or group.several(config)
-    steps = jnp.where(is_reset, -n, state.decision * n) + jnp.arange(1, n + 1) if timed else None
-    done = dataclasses.replace(done, flight=_timed(config, done.flight, steps))
+    moving = moves(scene) or group.several(config)
+    steps = jnp.where(is_reset, -n, state.decision * n) + jnp.arange(1, n + 1) if moving else None
+    done = dataclasses.replace(done, flight=timed(config, done.flight, steps))
 
     first = _choose(is_reset, start, state.drone)
     if waits is not None:
         goes_on = (done.outcome == Outcome.RUNNING) & ~waits
         scene = group.present(config, scene, first.position, done.flight, goes_on)
-    poses = _poses_seen(config, first, done.flight)
+    poses = poses_seen(config, first, done.flight)
     memory = _choose(is_reset, rested, state.memory)
     move = jnp.where(is_reset, 0.0, jnp.asarray(ACTIONS, jnp.float32)[action])
     observation, memory = observe(*(config, scene, goal, done.drone, move, poses, memory, noise, done.disturbance))
@@ -418,7 +423,7 @@ def _time(config: Config, decisions: Array) -> Array:
     return decisions * (config.drone.physics_steps * config.drone.physics_dt_s)
 
 
-def _timed(config: Config, flight: Flight, steps: Array | None) -> Flight:
+def timed(config: Config, flight: Flight, steps: Array | None) -> Flight:
     """Returns a flight with the times of its poses, taken after physics steps `steps` [n] of the episode.
 
     Where nothing moves but the drone nobody asks for times, and there are none.
@@ -528,8 +533,8 @@ def _reset_in_place_of(flown: _Decision, start: DroneState, drawn: Disturbance |
     )
 
 
-def _poses_seen(config: Config, first: DroneState, flight: Flight) -> Flight:
-    """Poses [T] at which the sensor looks, of those before the first and after each physics step."""
+def poses_seen(config: Config, first: DroneState, flight: Flight) -> Flight:
+    """Returns the poses [T] at which the sensor looks, of those before the first and after each physics step."""
     began = None if flight.time is None else flight.time[0] - config.drone.physics_dt_s
     path = jax.tree.map(
         lambda a, b: jnp.concatenate([a[None], b]),
