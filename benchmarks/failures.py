@@ -22,6 +22,7 @@ import numpy as np
 
 from edqn_jax.config import Config
 from edqn_jax.errors import ConfigError
+from edqn_jax.evaluation.companions import scene_of_flight
 from edqn_jax.evaluation.missions import MissionSet, load_missions
 from edqn_jax.evaluation.rollouts import fly_on_all_devices
 from edqn_jax.parallel.devices import use_cpu_devices
@@ -131,7 +132,7 @@ def look_back(config: Config, missions: MissionSet, flights: Flights, mission: i
     quaternion = np.asarray(flights.record.quaternion[mission])[:steps]
     before = position[-2] if steps > 1 else position[-1]
     point = before + float(flights.contact[mission]) * (position[-1] - before)
-    scene = missions.scene(mission)
+    scene = scene_of_flight(config, missions, flights, mission)
     then = config.drone.physics_dt_s * (steps - 1 + float(flights.contact[mission]))
     heading = float(yaw_of(jnp.asarray(quaternion[-1])))
     kind, index, side = what_was_hit(scene_at(scene, jnp.float32(then)), point, heading)

@@ -7,7 +7,7 @@ asks for: a policy that sees must be well ahead of these two and of the blind on
     python benchmarks/gates.py --world moving
     python benchmarks/gates.py --world medium --missions 1000 -- --world.balls 8
 
-Arguments after -- are options of train.py. The interval is a bootstrap over missions, 95 %.
+Arguments after -- are options of train.py. The interval is Wilson's, 95 %.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from edqn_jax.evaluation.rollouts import flight_keys
 from edqn_jax.parallel.devices import use_cpu_devices
 from edqn_jax.random import run_streams
 from edqn_jax.runs.files import check_can_write
-from edqn_jax.sim import env
+from edqn_jax.sim import env, group
 from edqn_jax.sim.drone import DroneState, yaw_of
 from edqn_jax.sim.env import World
 from edqn_jax.sim.moves import DIRECTIONS, move_number
@@ -70,7 +70,7 @@ def outcomes(config: Config, world: World, gate: str, key: Array) -> Array:
     def decide(flying: tuple[env.EnvState, Array, Array]) -> tuple[env.EnvState, Array, Array]:
         state, outcome, _ = flying
         action = jax.vmap(GATES[gate])(state.drone, world.missions.goal[state.mission])
-        state, step = jax.vmap(partial(env.step, config, world))(state, action, number)
+        state, step = group.each(config, partial(env.step, config, world))(state, action, number)
         return state, jnp.where(outcome == Outcome.RUNNING, step.outcome, outcome), step.episode_length
 
     start = jax.vmap(partial(env.ended, config, world))(keys, number), jnp.zeros_like(number), number

@@ -47,6 +47,7 @@ from edqn_jax.sim.distance import signed_distance
 from edqn_jax.sim.env import World
 from edqn_jax.sim.flights import Flights
 from edqn_jax.sim.missions import own_missions
+from edqn_jax.sim.motion import Aim
 from edqn_jax.sim.moving_worlds import Moving
 from edqn_jax.sim.outcomes import Outcome
 from edqn_jax.sim.scene import Scene, scene_at
@@ -203,7 +204,8 @@ def pilot_row(policy: Policy, flown: PilotConfig, world: World, batch: int, call
         outcome, position = np.asarray(flying.flights.outcome), np.asarray(flying.flights.closest.position)
         time_s, radius = flying.flights.closest.time, policy.config.drone.body_radius_m
         for lane in np.flatnonzero(outcome[: len(missions)] == Outcome.COLLISION):
-            scene = scene_at(env.scene_of(world, jnp.asarray(missions[lane])), time_s[lane])
+            aim = jax.tree.map(lambda leaf, lane=lane: leaf[lane], flying.aim)
+            scene = scene_at(env.scene_of(world, jnp.asarray(missions[lane]), aim), time_s[lane])
             log_odds = np.asarray(flying.grid.log_odds[lane])
             had.append(what_the_map_had(log_odds, flown.map.cell_m, scene, position[lane], radius))
 
@@ -260,14 +262,16 @@ def table(rows: Sequence[Row]) -> str:
     return "\n".join(lines)
 
 
-def watched(policy: Policy, flown: PilotConfig, world: World) -> tuple[list[Moment], Outcome]:
-    """Returns what the pilot knew at each decision of the first mission, and how it ended."""
+def watched(policy: Policy, flown: PilotConfig, world: World) -> tuple[list[Moment], Outcome, Aim | None]:
+    """Returns what the pilot knew at each decision of the first mission, how it ended, and where balls were thrown."""
     moments: list[Moment] = []
     seconds = policy.config.drone.physics_steps * policy.config.drone.physics_dt_s
     places: list[np.ndarray] = []
+    aims: list[Aim | None] = []
 
     def watch(flying: Piloted, orders: Orders) -> None:
         places.append(np.array(flying.drone.position[0]))
+        aims.append(jax.tree.map(lambda leaf: np.array(leaf[0]), flying.aim))
         moments.append(
             Moment(
                 time_s=float(flying.flights.decisions[0]) * seconds,
@@ -279,7 +283,7 @@ def watched(policy: Policy, flown: PilotConfig, world: World) -> tuple[list[Mome
         )
 
     flights, _ = pilot.fly(policy.config, flown, world, policy.params, jax.random.key(0), batch=1, watch=watch)
-    return moments, Outcome(int(flights.outcome[0]))
+    return moments, Outcome(int(flights.outcome[0])), aims[-1]
 
 
 def draw(policy: Policy, args: argparse.Namespace) -> None:
@@ -287,8 +291,8 @@ def draw(policy: Policy, args: argparse.Namespace) -> None:
     method = args.methods[0]
     flown = with_options(TUNED[method], args.set)
     world = course_of(policy, args.worlds[0], args.split, 1, first=args.mission)
-    moments, outcome = watched(policy, flown, world)
-    scene = env.scene_of(world, jnp.asarray(0))
+    moments, outcome, aim = watched(policy, flown, world)
+    scene = env.scene_of(world, jnp.asarray(0), aim)
     if args.figure.suffix == ".png":
         chosen = np.unique(np.linspace(0, len(moments) - 1, PICTURES).round().astype(int))
         draw_growth(scene, flown.map.cell_m, [moments[i] for i in chosen], args.figure)

@@ -47,6 +47,7 @@ from edqn_jax.learn.policy import Policy
 from edqn_jax.parallel.devices import cores, most_that_divide, use_cpu_devices
 from edqn_jax.runs.files import check_can_make
 from edqn_jax.runs.policies import load_policy, save_policy
+from edqn_jax.sim.env import World
 from edqn_jax.training.loop import train_seeds
 from measurement import json_report
 from measurement.flags import judged_in_tests, split
@@ -221,10 +222,7 @@ def _row(
 ) -> Row:
     """Flies the test missions and returns the row."""
     course = load_missions(config, config.world.name, missions)
-    turns = []
-    for policy in policies:
-        flights = fly_on_all_devices(config, course.world, policy.params, shuffle_codes=shuffle_codes)
-        turns.append({"seed": policy.config.train.seed, "flights": flight_columns(flights, missions)})
+    turns = turns_of(config, policies, course.world, missions, shuffle_codes)
     return {
         "benchmark": "success",
         "world": config.world.name,
@@ -239,6 +237,17 @@ def _row(
         "turns": turns,
         **json_report.machine(jax.devices()),
     }
+
+
+def turns_of(
+    config: Config, policies: Sequence[Policy], world: World, missions: int, shuffle_codes: bool = False
+) -> list[dict[str, Any]]:
+    """Returns the flights of each policy through the same missions."""
+    turns = []
+    for policy in policies:
+        flights = fly_on_all_devices(config, world, policy.params, shuffle_codes=shuffle_codes)
+        turns.append({"seed": policy.config.train.seed, "flights": flight_columns(flights, missions)})
+    return turns
 
 
 def shortest_paths(out: Path, config: Config, missions: int, search: bool) -> np.ndarray | None:
@@ -310,6 +319,32 @@ class Wanted:
     measure: Callable[[], Row]
 
 
+def measure(wanted: Sequence[Wanted], rows: list[Row], until: float) -> int:
+    """Measures, writes and appends the rows that are not written yet, while there is time; returns how many are left.
+
+    Args:
+        wanted: rows.
+        rows: that are written already.
+        until: when the last row must have ended, in seconds of `time.perf_counter`.
+
+    Raises:
+        ConfigError: if a row cannot be measured.
+    """
+    left = [one for one in wanted if not one.file.is_file()]
+    longest = FIRST_ROW_S
+    while left and time.perf_counter() + longest < until:
+        row = left[0].measure()
+        left[0].file.parent.mkdir(parents=True, exist_ok=True)
+        json_report.write(left[0].file, row)
+        rows.append(row)
+        longest = max(row["row_seconds"] for row in rows[-len(wanted) :])
+        print(f"{left[0].file.name}: {figures(row, None)['success']:.2%}, {row['row_seconds']:.0f} s", file=sys.stderr)
+        left.pop(0)
+    if left:
+        print(f"{len(left)} rows are left; the same command goes on with them", file=sys.stderr)
+    return len(left)
+
+
 def _wanted(args: argparse.Namespace) -> list[Wanted]:
     """Returns the rows that the arguments ask for, and makes JAX present as many devices as they use.
 
@@ -358,28 +393,17 @@ def main(argv: Sequence[str] | None = None) -> int:
     except ConfigError as error:
         print(error, file=sys.stderr)
         return 2
-    left = [one for one in wanted if not one.file.is_file()]
-    longest = FIRST_ROW_S
-    while left and (time.perf_counter() - began + longest < 60 * args.minutes):
-        try:
-            row = left[0].measure()
-            args.out.mkdir(parents=True, exist_ok=True)
-            json_report.write(left[0].file, row)
-        except ConfigError as error:
-            print(error, file=sys.stderr)
-            return 2
-        rows.append(row)
-        longest = max(row["row_seconds"] for row in rows[-len(wanted) :])
-        print(f"{left[0].file.name}: {figures(row, None)['success']:.2%}, {row['row_seconds']:.0f} s", file=sys.stderr)
-        left.pop(0)
+    try:
+        left = measure(wanted, rows, began + 60 * args.minutes)
+    except ConfigError as error:
+        print(error, file=sys.stderr)
+        return 2
     shortest: dict[str, np.ndarray | None] = {}
     for row in [] if args.no_spl else rows:
         # Two cores search 1 000 worlds in 200 s.
         in_time = time.perf_counter() - began + 0.4 * row["missions"] / cores() < 60 * args.minutes
         shortest[_course(row)] = shortest_paths(args.out, _config_in(row), row["missions"], in_time)
     print(table(rows, shortest))
-    if left:
-        print(f"{len(left)} rows are left; the same command goes on with them", file=sys.stderr)
     return 3 if left else 0
 
 

@@ -71,11 +71,13 @@ def _world(world: WorldConfig) -> None:
     _share(world, "world", ["own_start_fraction"])
     _not_negative(world, "world", ["start_jitter_m"])
     _share(world, "world", ["moving_share"])
-    _positive(world, "world", ["moving_speed_m_s", "ball_speed_m_s"])
+    _positive(world, "world", ["moving_speed_m_s"])
     _not_negative(world, "world", ["balls", "ball_gravity_m_s2"])
     # A random start is free of what moves as fast as this for the first two seconds (`sim/free_points.py`).
     _at_most(world, "world", ["moving_speed_m_s"], 5)
     _at_most(world, "world", ["ball_speed_m_s"], 100)
+    # Of 1.5 s at least: balls are launched 3 m away or further.
+    _require(world.ball_speed_m_s >= 2, "world.ball_speed_m_s", "at least 2", world.ball_speed_m_s)
     _at_most(world, "world", ["balls"], 64)
     if (world.moving_share or world.balls) and world.name not in FAMILIES:
         option = "moving_share" if world.moving_share else "balls"

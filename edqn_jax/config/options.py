@@ -34,7 +34,7 @@ class WorldConfig:
     moving_speed_m_s: float = 3.0
     """Speed of the fastest of them, m/s; each has its own, of at least 0.3 times this."""
     balls: int = 0
-    """Balls in each random world that are thrown at where a drone would be that flies straight to its goal."""
+    """Balls in each random world, thrown at where the drone will be if it goes on as it flies then."""
     ball_speed_m_s: float = 6.0
     """Speed of these balls, m/s."""
     ball_gravity_m_s2: float = 0.0

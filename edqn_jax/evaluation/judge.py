@@ -33,6 +33,8 @@ _DEPTH_SPACING_M = 5e-3
 _FARTHEST_M = 1e3
 _AWAY_M = 1e6
 _OUT_M = 1.0  # beyond the flight volume, and its radius, a ball is no more
+_AT_ONCE_S = 1e-3  # times that differ by less are the same
+_LEAST_LAUNCH_M = 3.0  # nearer to the drone no ball is launched; it is then thrown at where the drone is
 
 
 @dataclass(frozen=True)
@@ -51,8 +53,18 @@ class Contact:
     """Deepest overlap with any geom from then to the segment's end, metres."""
 
 
-Ends = tuple[ArrayLike, ArrayLike]
-"""Start and goal of a flight, [3] metres each: whom balls are thrown at."""
+@dataclass(frozen=True)
+class Target:
+    """A flight: whom balls are thrown at."""
+
+    start: ArrayLike
+    """[3] metres."""
+    goal: ArrayLike
+    """[3] metres."""
+    places: ArrayLike | None = None
+    """[K, 3] metres, where the drone was at its start and after each decision; None flies straight at a steady pace."""
+    decision_s: float = 0.0
+    """Length of a decision, seconds, where there are places."""
 
 
 @dataclass(frozen=True)
@@ -71,12 +83,12 @@ class Moving:
     high: NDArray[np.float64]
     """[3] metres to the highest point."""
 
-    def at(self, time: float, ends: Ends) -> NDArray[np.float64]:
+    def at(self, time: float, target: Target) -> NDArray[np.float64]:
         """Returns where it is [3], metres; `_AWAY_M` away before a ball is launched and after it has flown out."""
         place = self.position.copy()
         for word, numbers in self.said:
             if word == "throw":
-                return self._thrown(numbers, time, ends)
+                return self._thrown(numbers, time, target)
             if word == "bounce":
                 low, high = self.volume[0] - self.low, self.volume[1] - self.high
                 if len(numbers) == 9:
@@ -102,24 +114,35 @@ class Moving:
                 total += abs(rate) * float(np.linalg.norm(np.stack([a, b]), ord=2))
         return total
 
-    def _thrown(self, numbers: Sequence[float], time: float, ends: Ends) -> NDArray[np.float64]:
+    def _thrown(self, numbers: Sequence[float], time: float, target: Target) -> NDArray[np.float64]:
         share, early, speed, bearing, elevation, gravity, pace = numbers
         away = np.full(3, _AWAY_M)
-        start, goal = (np.asarray(end, np.float64) for end in ends)
+        start, goal = (np.asarray(end, np.float64) for end in (target.start, target.goal))
         length = float(np.linalg.norm(goal - start))
-        hit = max(share * length / pace, early)
-        if time <= hit - early:
+        launch = max(share * length / pace - early, 0.0)
+        if target.places is None:
+            here, aim = start, start + (goal - start) * min(1.0, pace * (launch + early) / length)
+        else:
+            places, number = np.asarray(target.places, np.float64), int((launch + _AT_ONCE_S) // target.decision_s)
+            if number >= len(places):
+                return away
+            here, last = places[number], places[max(number - 1, 0)]
+            launch = number * target.decision_s
+            aim = np.clip(here + (here - last) / target.decision_s * early, self.volume[0], self.volume[1])
+        if time <= launch + _AT_ONCE_S:
             return away
-        heading = math.atan2(goal[1] - start[1], goal[0] - start[0]) + math.radians(bearing)
+        heading = math.atan2(goal[1] - here[1], goal[0] - here[0]) + math.radians(bearing)
         up = math.radians(elevation)
         from_there = np.array([math.cos(heading) * math.cos(up), math.sin(heading) * math.cos(up), math.sin(up)])
-        flown, aim = time - (hit - early), start + (goal - start) * min(1.0, pace * hit / length)
+        if target.places is not None and np.linalg.norm(aim + speed * early * from_there - here) < _LEAST_LAUNCH_M:
+            aim = here
+        flown = time - launch
         # From the point of launch, with what is thrown upwards for gravity to take back by the hit.
         place = aim + speed * (early - flown) * from_there
         place[2] += gravity * early / 2 * flown - gravity * flown**2 / 2
-        out = self.high[0] + _OUT_M
+        out = (self.high[0] - self.low[0]) / 2 + _OUT_M
         inside = np.all((place >= self.volume[0] - out) & (place <= self.volume[1] + out))
-        return place if inside else away
+        return place - (self.low + self.high) / 2 if inside else away
 
     def throw_speed(self, seconds: float) -> float:
         """Returns a bound of its speed as a ball within so many seconds of a flight, m/s; 0 if it is none."""
@@ -150,8 +173,8 @@ class Judge:
     reach: NDArray[np.float64]
     """[N] radius of each solid's bounding sphere, metres; inf for planes."""
     moving: tuple[Moving, ...] = ()
-    ends: Ends = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
-    """Sites `start` and `goal` of the world."""
+    target: Target = Target((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+    """From site `start` to site `goal` of the world, at a steady pace."""
 
 
 def load_judge(world: str | Path | mujoco.MjSpec, radius: float, volume: ArrayLike | None = None) -> Judge:
@@ -182,7 +205,7 @@ def load_judge(world: str | Path | mujoco.MjSpec, radius: float, volume: ArrayLi
     reach = np.where(plane, np.inf, model.geom_rbound[solids])
     moving = tuple(_moving(model, data, solids, volume))
     start, goal = (np.array(data.site(n).xpos) if n in _sites(model) else np.zeros(3) for n in ("start", "goal"))
-    return Judge(model=model, data=data, probe=probe, solids=solids, reach=reach, moving=moving, ends=(start, goal))
+    return Judge(model, data, probe, solids, reach, moving, Target(start, goal))
 
 
 def _sites(model: mujoco.MjModel) -> list[str]:
@@ -228,15 +251,15 @@ def _extent(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> NDArray[np
     return data.geom_xpos[geom] + np.array([[-1.0], [1.0]]) * reach
 
 
-def clearance(judge: Judge, position: ArrayLike, time: float = 0.0, ends: Ends | None = None) -> tuple[float, str]:
+def clearance(judge: Judge, position: ArrayLike, time: float = 0.0, target: Target | None = None) -> tuple[float, str]:
     """Returns the distance from the body sphere at `position` [3] to the nearest solid, and that solid's name.
 
     Metres, negative where they overlap; inf and "" in an empty world. What moves is where it is at `time` seconds;
-    balls are thrown at a drone on its way between `ends`, by default the world's own.
+    balls are thrown at the target, by default the world's own.
     """
     data, radius = judge.data, judge.model.geom_size[judge.probe, 0]
     for body in judge.moving:
-        data.mocap_pos[body.mocap] = body.at(time, judge.ends if ends is None else ends)
+        data.mocap_pos[body.mocap] = body.at(time, judge.target if target is None else target)
     if judge.moving:
         mujoco.mj_kinematics(judge.model, data)
     data.geom_xpos[judge.probe] = position
@@ -261,7 +284,7 @@ def fastest(judge: Judge, seconds: float) -> float:
 
 
 def replay_contact(
-    judge: Judge, positions: ArrayLike, step_s: float | None = None, ends: Ends | None = None
+    judge: Judge, positions: ArrayLike, step_s: float | None = None, target: Target | None = None
 ) -> Contact | None:
     """Returns the first contact of the body sphere along the segments between `positions` [n, 3], n >= 2, or None.
 
@@ -269,7 +292,7 @@ def replay_contact(
         judge: of the world.
         positions: row 0 is the start of the flight, row k the position after physics step k, metres.
         step_s: seconds of a physics step; needed where something moves.
-        ends: as in `clearance`.
+        target: as in `clearance`.
 
     Raises:
         ValueError: if `positions` is not an array of at least two finite points, or `step_s` is missing.
@@ -297,7 +320,7 @@ def replay_contact(
 
     def gap_at(distance: float) -> tuple[float, str]:
         segment, fraction = place(distance)
-        return clearance(judge, at(distance), step_s * (segment + fraction), ends)
+        return clearance(judge, at(distance), step_s * (segment + fraction), target)
 
     free, here, end = 0.0, 0.0, float(travelled[-1])
     while True:

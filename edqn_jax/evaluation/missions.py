@@ -184,6 +184,8 @@ def _flown_in(pool: Scene, config: Config, split: worlds.Split, first: int = 0) 
     airframe, drones = drone.load_airframe(config.drone), config.env.drones
     if not group.several(config):
         return World(airframe, pool, own_missions(pool))
+    if pool.spheres.throw is not None:
+        raise ConfigError(f"with env.drones {drones} the world must throw no balls, which are for one drone alone")
     keys = worlds.world_keys(split, pool.start.shape[0], first)
     missions = own_crossings(pool, drones, jax.vmap(lambda key: jax.random.fold_in(key, _CROSSING))(keys))
     pool = dataclasses.replace(pool, start=missions.start[::drones], goal=missions.goal[::drones])

@@ -204,7 +204,7 @@ def _at_start(config: Config, world: World, state: EnvState) -> Flights:
 def _tally(config: Config, world: World, flights: Flights, before: EnvState, step: Step) -> tuple[Flights, Array]:
     """Returns the tallies of one flight after a step, and the clearance [n] after each of its physics steps."""
     running = (flights.outcome == Outcome.RUNNING) & ~step.is_reset
-    scene = env.scene_of(world, before.mission)
+    scene = env.scene_of(world, before.mission, before.aim)
     verdict = step.outcome, step.end_step, step.contact
     after, clearance = tally(config, scene, flights, before.drone.position, step.flight, *verdict)
     after = dataclasses.replace(after, episode_return=step.episode_return, hit_drone=step.hit_drone)

@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 
 from edqn_jax.config import Config
-from edqn_jax.evaluation.judge import Judge, fastest, load_judge, replay_contact
+from edqn_jax.evaluation.judge import Judge, Target, fastest, load_judge, replay_contact
 from edqn_jax.evaluation.missions import MissionSet
 from edqn_jax.sim.flights import Flights
 from edqn_jax.sim.outcomes import Outcome
@@ -59,13 +59,14 @@ def check_verdicts(config: Config, missions: MissionSet, flights: Flights) -> li
     judges = judges_of(config, missions)
     flown = missions.world.missions
     scenes, starts, goals = np.asarray(flown.scene), np.asarray(flown.start), np.asarray(flown.goal)
-    step_s = config.drone.physics_dt_s
+    step_s, of_decision = config.drone.physics_dt_s, config.drone.physics_steps
     positions = np.asarray(flights.record.position)
     outcomes, steps = np.asarray(flights.outcome), np.asarray(flights.physics_steps)
     results = []
     for i, (scene, outcome, count) in enumerate(zip(scenes, outcomes, steps, strict=True)):
         path = np.concatenate([starts[i][None], positions[i, :count]]).astype(np.float64)
-        contact = replay_contact(judges[scene], path, step_s, (starts[i], goals[i]))
+        target = Target(starts[i], goals[i], path[::of_decision], step_s * of_decision)
+        contact = replay_contact(judges[scene], path, step_s, target)
         stated = count - 1 + float(flights.contact[i]) if outcome == Outcome.COLLISION else None
         found = None if contact is None else contact.segment + contact.fraction
         apart = None

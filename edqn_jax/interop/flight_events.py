@@ -11,7 +11,7 @@ import numpy as np
 from edqn_jax.config import Config
 from edqn_jax.interop.recording import Recording
 from edqn_jax.sim.drone import Flight
-from edqn_jax.sim.env import World
+from edqn_jax.sim.env import World, aim_along, scene_of
 from edqn_jax.sim.environment import Environment
 from edqn_jax.sim.moves import ACTIONS
 
@@ -40,7 +40,11 @@ def flight_recording(
         events=dataclasses.replace(law, contrast_on=contrast, contrast_off=off),
     )
     poses = _from_start(world, flown)
-    stream = Environment(sees, world).stream(poses, law="esim")
+    aim = None
+    if world.pool.spheres.throw is not None:
+        places = poses.position[:: config.drone.physics_steps]
+        aim = aim_along(config, scene_of(world, jnp.asarray(0)), places)
+    stream = Environment(sees, world).stream(poses, law="esim", aim=aim)
     steps = round(config.drone.physics_dt_s * 1e6)
     moves = ACTIONS[flown["action"].astype(int)]
     return Recording(

@@ -37,6 +37,7 @@ from edqn_jax.sim import camera, disturbances, drone, env, sensor
 from edqn_jax.sim.drone import DroneState, Flight
 from edqn_jax.sim.env import World
 from edqn_jax.sim.flights import Flights, at_start, tally
+from edqn_jax.sim.motion import Aim
 from edqn_jax.sim.outcomes import Outcome, judge
 from edqn_jax.sim.scene import Scene, moves, scene_at
 from edqn_jax.sim.sensor import DEPTH_SCALE, SensorMemory, distance_of, mount_rotation
@@ -105,6 +106,7 @@ class Piloted:
     depth: Array  # [H, W] metres, the newest image
     flights: Flights
     key: Array
+    aim: Aim | None = None  # of the balls thrown until now
 
 
 @dataclasses.dataclass(frozen=True)
@@ -216,7 +218,7 @@ def decide(
         points: [POINTS, 3] metres, the plan.
         speed: [] metres per second, the limit.
     """
-    scene = env.scene_of(world, mission)
+    scene = env.scene_of(world, mission, flying.aim)
     goal, before = world.missions.goal[mission], flying.drone
     limit = dataclasses.replace(config.env, speed_m_s=pilot.speed_m_s)
     command, _ = steer(limit, pilot.follow, points, jnp.zeros((), jnp.int32), before)
@@ -232,8 +234,11 @@ def decide(
     poses = env.poses_seen(config, before, env.timed(config, flight, steps if moves(scene) else None))
     running = flying.flights.outcome == Outcome.RUNNING
     keep = functools.partial(jax.tree.map, lambda new, old: jnp.where(running, new, old))
+    thrown = env.thrown(config, scene, flying.aim, flights.decisions, after.position, after.position - before.position)
     # Before looking, so that the map, by far the largest part, need not be chosen as a whole.
-    flown = dataclasses.replace(flying, drone=keep(after, before), flights=keep(flights, flying.flights))
+    flown = dataclasses.replace(
+        flying, drone=keep(after, before), flights=keep(flights, flying.flights), aim=keep(thrown, flying.aim)
+    )
     seen = look(config, pilot, params, scene, goal, flown, move, poses)
     others = {name: keep(getattr(seen, name), getattr(flying, name)) for name in ("memory", "sensed", "depth", "key")}
     return dataclasses.replace(seen, **others)
@@ -255,6 +260,7 @@ def at_rest(
         depth=jnp.full((config.camera.height, config.camera.width), jnp.inf),
         flights=at_start(config, scene, body),
         key=key,
+        aim=env.thrown(config, scene, env.nobody_aimed_at(world), jnp.int32(0), start, jnp.zeros(3)),
     )
 
 

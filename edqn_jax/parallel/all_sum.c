@@ -16,13 +16,15 @@
 
 #define MOST_DEVICES 256
 #define PLACES 64
-#define SPIN_US 300               /* after which a device leaves its core to others, which may be what it waits for */
-#define LONGEST_WAIT_US 600000000 /* a device that is this late has failed */
+#define SPIN_US 300        /* after which a device leaves its core to others, which may be what it waits for */
+#define NAP_US 20          /* at a time */
+#define MOST_NAPS 10000000 /* ten minutes or so; naps are counted, so that a process may be stopped for longer */
 
 typedef struct {
-  int64_t run;  /* of the execution that meets here, 0 for none */
+  int taken;
+  int64_t run;  /* of the execution that meets here */
   int expected; /* devices */
-  atomic_int arrived, done, left;
+  atomic_int arrived, done, left, failed;
   XLA_FFI_CallFrame* calls[MOST_DEVICES];
 } Place;
 
@@ -40,11 +42,13 @@ static Place* arrive(int64_t run, int expected, int rank, XLA_FFI_CallFrame* cal
   Place* here = 0;
   lock();
   for (int i = 0; i < PLACES && !here; ++i)
-    if (places[i].run == run && atomic_load(&places[i].arrived) < expected) here = &places[i];
-  for (int i = 0; i < PLACES && !here; ++i)
-    if (places[i].run == 0) {
+    if (places[i].taken && places[i].run == run && places[i].expected == expected &&
+        atomic_load(&places[i].arrived) < expected)
       here = &places[i];
-      here->run = run, here->expected = expected;
+  for (int i = 0; i < PLACES && !here; ++i)
+    if (!places[i].taken) {
+      here = &places[i];
+      here->taken = 1, here->run = run, here->expected = expected;
     }
   if (here) {
     here->calls[rank] = call;
@@ -57,8 +61,9 @@ static Place* arrive(int64_t run, int expected, int rank, XLA_FFI_CallFrame* cal
 static void leave(Place* here) {
   if (atomic_fetch_add(&here->left, 1) + 1 < here->expected) return;
   lock();
-  atomic_store(&here->arrived, 0), atomic_store(&here->done, 0), atomic_store(&here->left, 0);
-  here->run = 0;
+  atomic_store(&here->arrived, 0), atomic_store(&here->done, 0);
+  atomic_store(&here->left, 0), atomic_store(&here->failed, 0);
+  here->taken = 0;
   unlock();
 }
 
@@ -68,22 +73,30 @@ static int64_t microseconds(void) {
   return (int64_t)now.tv_sec * 1000000 + now.tv_nsec / 1000;
 }
 
-/* Waits until `count` is `wanted`; returns 0 if that takes too long. */
-static int wait_for(atomic_int* count, int wanted) {
-  const struct timespec nap = {0, 20000};
+/* Waits until `count` is `wanted`; returns 0 if that takes more than `most` naps. */
+static int wait_for(atomic_int* count, int wanted, int64_t most) {
+  const struct timespec nap = {0, 1000 * NAP_US};
   const int64_t began = microseconds();
-  int64_t waited = 0;
-  while (waited < LONGEST_WAIT_US) {
+  for (int64_t naps = 0; naps < most;) {
     for (int i = 0; i < 64; ++i) {
       if (atomic_load_explicit(count, memory_order_acquire) >= wanted) return 1;
 #if defined(__x86_64__)
       __builtin_ia32_pause();
 #endif
     }
-    waited = microseconds() - began;
-    if (waited > SPIN_US) nanosleep(&nap, 0);
+    if (naps || microseconds() - began > SPIN_US) nanosleep(&nap, 0), ++naps;
   }
   return 0;
+}
+
+/* Waits for all devices; returns 0 if one has not come in time, for every device alike, so that none reads what another
+ * has given up. */
+static int all_arrived(Place* here) {
+  const int in_time = wait_for(&here->arrived, here->expected, MOST_NAPS);
+  lock();
+  if (!in_time && atomic_load(&here->arrived) < here->expected) atomic_store(&here->failed, 1);
+  unlock();
+  return !atomic_load(&here->failed);
 }
 
 static int64_t elements(const XLA_FFI_Buffer* buffer) {
@@ -136,18 +149,24 @@ XLA_FFI_Error* edqn_all_sum(XLA_FFI_CallFrame* call) {
   const int rank = *(const int32_t*)operand(call, 0), expected = *(const int32_t*)operand(call, 1);
   if (rank < 0 || rank >= expected || expected > MOST_DEVICES)
     return failed(call, XLA_FFI_Error_Code_INVALID_ARGUMENT, "all_sum.c adds over at most 256 devices");
+  for (int i = 0; i < call->rets.size; ++i) {
+    const XLA_FFI_DataType type = ((XLA_FFI_Buffer*)call->rets.rets[i])->dtype;
+    if (type != XLA_FFI_DataType_F32 && type != XLA_FFI_DataType_S32)
+      return failed(call, XLA_FFI_Error_Code_INVALID_ARGUMENT, "all_sum.c adds float32 and int32 alone");
+  }
   XLA_FFI_RunId_Get_Args run = {XLA_FFI_RunId_Get_Args_STRUCT_SIZE, 0, call->ctx, 0};
   XLA_FFI_Error* error = call->api->XLA_FFI_RunId_Get(&run);
   if (error) return error;
   Place* here = arrive(run.run_id, expected, rank, call);
   if (!here) return failed(call, XLA_FFI_Error_Code_RESOURCE_EXHAUSTED, "all_sum.c serves at most 64 programs at once");
-  if (!wait_for(&here->arrived, expected))
+  if (!all_arrived(here)) {
+    leave(here);
     return failed(call, XLA_FFI_Error_Code_DEADLINE_EXCEEDED,
                   "all_sum.c waited ten minutes for another device to arrive");
+  }
   add_share(here, rank, call);
   atomic_fetch_add_explicit(&here->done, 1, memory_order_release);
-  if (!wait_for(&here->done, expected))
-    return failed(call, XLA_FFI_Error_Code_DEADLINE_EXCEEDED, "all_sum.c waited ten minutes for another device to add");
+  wait_for(&here->done, expected, INT64_MAX); /* all are adding, so this ends */
   leave(here);
   return 0;
 }

@@ -17,10 +17,11 @@ SOURCE = Path(__file__).with_suffix(".c")
 
 
 def all_sum(tree: Tree, axis: str | None, after: Any) -> Tree:
-    """Returns the sums of float32 and int32 arrays over the devices of a mesh axis.
+    """Returns the sums of arrays over the devices of a mesh axis.
 
-    On CPUs of one process with a C compiler, `all_sum.c` adds, elsewhere XLA. All devices must take the sums of a
-    program in the same order. XLA keeps to one by itself; `all_sum.c` waits for what each sum is given as `after`.
+    On CPUs of one process with a C compiler, `all_sum.c` adds arrays of float32 and int32, elsewhere and otherwise XLA.
+    All devices must take the sums of a program in the same order. XLA keeps one for its own sums, and for those in C
+    because each is given a result of the one before, `after`.
 
     Args:
         axis: name of the mesh axis, None for one device.
@@ -30,7 +31,8 @@ def all_sum(tree: Tree, axis: str | None, after: Any) -> Tree:
         return tree
     leaves, form = jax.tree.flatten(tree)
     count = lax.axis_size(axis)
-    if count == 1 or jax.default_backend() != "cpu" or jax.process_count() > 1 or not _is_at_hand():
+    plain = all(leaf.dtype in (jnp.float32, jnp.int32) for leaf in leaves)
+    if count == 1 or not plain or jax.default_backend() != "cpu" or jax.process_count() > 1 or not _is_at_hand():
         return lax.psum(tree, axis)
     shapes = [jax.ShapeDtypeStruct(jnp.shape(leaf), leaf.dtype) for leaf in leaves]
     call = jax.ffi.ffi_call("edqn_all_sum", shapes, vmap_method="broadcast_all")

@@ -19,6 +19,7 @@ import numpy as np
 from jax import Array
 
 from edqn_jax.config import Config, EnvConfig
+from edqn_jax.errors import ConfigError
 from edqn_jax.parallel.devices import compiler_options
 from edqn_jax.planners.planner import Task
 from edqn_jax.sim import drone
@@ -115,9 +116,14 @@ def fly_path(
 
     Pure; `config` and `follow` are static. The scene's own start and goal are not used.
 
+    Raises:
+        ConfigError: if balls are thrown in the scene.
+
     Returns:
         the figures of the flight, without return and record.
     """
+    if scene.spheres.throw is not None:
+        raise ConfigError("planned paths are flown where no balls are thrown; world.balls must be 0")
     away = goal - points[0]
     body = drone.hover(points[0], jnp.arctan2(away[1], away[0]))
 

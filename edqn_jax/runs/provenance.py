@@ -20,7 +20,7 @@ import numpy as np
 from edqn_jax.config import Config
 from edqn_jax.learn.embedding import has_code
 from edqn_jax.learn.trainer import TrainState
-from edqn_jax.parallel import processes
+from edqn_jax.parallel import c_library, processes
 from edqn_jax.sim.reward import Reward
 from edqn_jax.sim.scene import Scene, obstacle_count
 from edqn_jax.sim.sensor import frames_per_decision
@@ -47,9 +47,10 @@ def workload(config: Config, scene: Scene) -> dict[str, Any]:
 
 
 def versions() -> dict[str, str]:
-    """Returns the versions of Python and of the packages that figures depend on."""
+    """Returns the versions of Python, of packages, and of the C compiler if one is used, that figures depend on."""
     packages = ("jax", "mujoco", "mujoco-mjx", "flax", "optax", "numpy")
-    return {"python": platform.python_version(), **{name: metadata.version(name) for name in packages}}
+    found = {name: metadata.version(name) for name in packages}
+    return {"python": platform.python_version(), **found, "C compiler": c_library.compiler() or "none"}
 
 
 def state_digest(state: TrainState) -> str:

@@ -20,9 +20,9 @@ from edqn_jax.sim.scene import (
     TiltedCylinders,
     UprightBoxes,
     UprightCylinders,
-    fastest,
     moves,
     scene_at,
+    speeds,
 )
 
 _TINY = 1e-20  # under a square root, so that its gradient is finite; 1e-10 m is nothing
@@ -62,7 +62,11 @@ def signed_distance(scene: Scene, point: Array) -> Array:
     Exact outside. Where shapes overlap, the depth inside is that of the shape whose own surface is
     furthest away, a lower bound of the depth in the union. A scene without shapes is `PARKED` away.
     """
-    nearest = [jnp.min(distance) for distance in shape_distances(scene, point).values()]
+    return _least(shape_distances(scene, point))
+
+
+def _least(distances: dict[str, Array]) -> Array:
+    nearest = [jnp.min(distance) for distance in distances.values()]
     if not nearest:
         return jnp.full((), PARKED, jnp.float32)
     return jnp.min(jnp.stack(nearest))
@@ -117,7 +121,8 @@ def path_contact(scene: Scene, path: Array, radius: ArrayLike, times: Array | No
     """Returns `segment_contact` of each segment of a path up to the first that touches.
 
     One distance at each point proves most segments free (d0 + d1 > L + 2 r, with L the length of the relative motion
-    at most); the others are searched one by one, so that the usual path costs an eighth.
+    at most); the others are searched one by one, so that the usual path costs an eighth. Each shape's distance is less
+    what it may move itself by the middle of the segment, so that a fast one far away makes no segment near.
 
     Args:
         path: [n + 1, 3] metres.
@@ -129,11 +134,12 @@ def path_contact(scene: Scene, path: Array, radius: ArrayLike, times: Array | No
     """
     if not moves(scene):
         times = None
-    gap = jax.vmap(lambda point, time: signed_distance(scene_at(scene, time), point))(path, times) - radius
+    if times is None:
+        gap = jax.vmap(lambda point: signed_distance(scene, point))(path) - radius
+    else:
+        half = 0.5 * jnp.max(times[1:] - times[:-1])
+        gap = jax.vmap(lambda point, time: _room(scene, point, time, half))(path, times) - radius
     length = jnp.sqrt(jnp.sum((path[1:] - path[:-1]) ** 2, axis=1))
-    if times is not None:
-        speed = jax.vmap(lambda time: fastest(scene, time))(times)
-        length = length + jnp.maximum(speed[1:], speed[:-1]) * (times[1:] - times[:-1])
     near = ~(gap[:-1] + gap[1:] > length)  # a path that is not finite is near everything
     number = jnp.arange(length.shape[0])
 
@@ -147,6 +153,14 @@ def path_contact(scene: Scene, path: Array, radius: ArrayLike, times: Array | No
 
     nothing = (near, jnp.zeros_like(near), jnp.ones_like(length))
     return lax.while_loop(lambda carry: jnp.any(carry[0]), search, nothing)[1:]
+
+
+def _room(scene: Scene, point: Array, time: Array, seconds: Array) -> Array:
+    """Returns `signed_distance` at `time` [] less what each shape may move within `seconds` []."""
+    distances = shape_distances(scene_at(scene, time), point)
+    for kind, speed in speeds(scene, time).items():
+        distances[kind] = distances[kind] - speed * seconds
+    return _least(distances)
 
 
 def _norm(*components: Array) -> Array:

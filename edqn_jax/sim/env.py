@@ -9,12 +9,14 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
+from functools import partial
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
-from jax import Array
+from jax import Array, lax
+from jax.typing import ArrayLike
 
 from edqn_jax.checks import check_finite, check_index
 from edqn_jax.config import Config, EnvConfig
@@ -24,6 +26,7 @@ from edqn_jax.sim.distance import signed_distance
 from edqn_jax.sim.disturbances import Disturbance
 from edqn_jax.sim.drone import Airframe, DroneState, Flight
 from edqn_jax.sim.missions import Missions
+from edqn_jax.sim.motion import AT_ONCE_S, Aim, aim_at, due, no_aim
 from edqn_jax.sim.moves import ACTIONS
 from edqn_jax.sim.outcomes import Outcome, judge
 from edqn_jax.sim.reward import Reward, Transition, configured_reward
@@ -75,6 +78,7 @@ class EnvState:
     episode_return: Array  # [] sum of rewards so far
     key: Array  # [] typed key
     disturbance: Disturbance | None = None  # what the episode flies against; None where nothing disturbs
+    aim: Aim | None = None  # of the balls thrown until now; None where no world has any
 
 
 @struct.dataclass
@@ -254,7 +258,8 @@ def reset(config: Config, world: World, key: Array, mission: Array | None = None
     observation, memory = observe(
         *(config, scene, goal, state.drone, jnp.zeros(3), still, state.memory, noise, state.disturbance)
     )
-    return dataclasses.replace(state, memory=memory), observation
+    aim = thrown(config, scene, state.aim, state.decision, state.drone.position, jnp.zeros(3))
+    return dataclasses.replace(state, memory=memory, aim=aim), observation
 
 
 def ended(config: Config, world: World, key: Array, mission: Array | None = None) -> EnvState:
@@ -271,7 +276,53 @@ def ended(config: Config, world: World, key: Array, mission: Array | None = None
         episode_return=jnp.zeros(()),
         key=key,
         disturbance=disturbance,
+        aim=nobody_aimed_at(world),
     )
+
+
+def nobody_aimed_at(world: World) -> Aim | None:
+    """Returns the aim of one flight's balls before any is thrown; None where no world has any."""
+    throw = world.pool.spheres.throw
+    return None if throw is None else no_aim(jax.tree.map(lambda leaf: leaf[0], throw))
+
+
+def thrown(config: Config, scene: Scene, aim: Aim | None, decision: Array, here: Array, moved: Array) -> Aim | None:
+    """Returns the aim with that of the balls which are thrown as decision [] int32 begins.
+
+    A ball is thrown at the beginning of the decision in which it is due.
+
+    Args:
+        here: [3] metres, where the drone is.
+        moved: [3] metres, how far it has come within the decision before.
+    """
+    throw = scene.spheres.throw
+    if throw is None or aim is None:
+        return None
+    step_s = config.drone.physics_steps * config.drone.physics_dt_s
+    begins = jnp.floor((due(throw, scene.start, scene.goal) + AT_ONCE_S) / step_s).astype(jnp.int32)
+    now = begins == decision
+    new = aim_at(throw, scene.goal, scene.volume, _time(config, decision), here, moved, step_s)
+    return jax.tree.map(lambda a, b: jnp.where(now if a.ndim == 1 else now[:, None], a, b), new, aim)
+
+
+@partial(jax.jit, static_argnums=0)
+def aim_along(config: Config, scene: Scene, places: ArrayLike) -> Aim:
+    """Returns the aim of the balls of one world in a whole flight.
+
+    Args:
+        scene: with balls; its start and goal are those of the flight.
+        places: [D + 1, 3] metres, where the drone was at its start and after each decision; NaN after its end.
+    """
+    throw, here = scene.spheres.throw, jnp.asarray(places)
+    assert throw is not None
+    moved = jnp.diff(here, axis=0, prepend=here[:1])
+
+    def decide(aim: Aim, flown: tuple[Array, Array, Array]) -> tuple[Aim, None]:
+        decision, place, way = flown
+        new = thrown(config, scene, aim, decision, place, way)
+        return _choose(jnp.all(jnp.isfinite(place)), new, aim), None
+
+    return lax.scan(decide, no_aim(throw), (jnp.arange(len(here)), here, moved))[0]
 
 
 def _drawn_mission(config: Config, world: World, key: Array) -> Array:
@@ -333,7 +384,8 @@ def step(
     check_index(action, len(ACTIONS), "the moves")
     check_index(mission, world.missions.scene.shape[0], "the missions")
     goal = world.missions.goal[mission]
-    scene = scene_of(world, mission)
+    nobody = nobody_aimed_at(world)
+    scene = scene_of(world, mission, _choose(is_reset, nobody, state.aim))
 
     # For an ended environment the decision is computed and dropped.
     start, rested, drawn = _start(config, world, mission, rest)
@@ -368,6 +420,7 @@ def step(
     over = done.outcome != Outcome.RUNNING
     if waits is not None:
         decision, over = jnp.where(waits, state.decision, decision), over | waits
+    moved = jnp.where(is_reset, 0.0, done.drone.position - first.position)
     after = EnvState(
         drone=done.drone,
         mission=mission,
@@ -377,6 +430,7 @@ def step(
         episode_return=jnp.where(is_reset, 0.0, state.episode_return + done.reward),
         key=key,
         disturbance=done.disturbance,
+        aim=thrown(config, scene, scene.aim, decision, done.drone.position, moved),
     )
     return after, Step(
         observation=observation,
@@ -404,23 +458,27 @@ def is_finite(tree: object) -> Array:
     return jnp.isfinite(sum(sums, jnp.zeros(())))
 
 
-def scene_of(world: World, mission: Array) -> Scene:
-    """Returns the world of a mission [] int32, with its motion; balls are thrown at the mission's own drone."""
+def scene_of(world: World, mission: Array, aim: Aim | None = None) -> Scene:
+    """Returns the world of a mission [] int32, with its motion; balls are thrown at the mission's own drone.
+
+    Args:
+        aim: of the flight; None is that of a drone of steady pace.
+    """
     scene = take_scene(world.pool, world.missions.scene[mission])
     if not moves(scene):
         return scene
-    return dataclasses.replace(scene, start=world.missions.start[mission], goal=world.missions.goal[mission])
+    return dataclasses.replace(scene, start=world.missions.start[mission], goal=world.missions.goal[mission], aim=aim)
 
 
 def scene_now(config: Config, world: World, state: EnvState) -> Scene:
     """Returns the world of an environment as it stands now, after its last decision."""
-    scene = scene_of(world, state.mission)
+    scene = scene_of(world, state.mission, state.aim)
     return scene_at(scene, _time(config, state.decision) if moves(scene) else None)
 
 
 def _time(config: Config, decisions: Array) -> Array:
     """Returns the seconds [] of an episode after so many decisions []."""
-    return decisions * (config.drone.physics_steps * config.drone.physics_dt_s)
+    return (decisions * config.drone.physics_steps) * config.drone.physics_dt_s
 
 
 def timed(config: Config, flight: Flight, steps: Array | None) -> Flight:

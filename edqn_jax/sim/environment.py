@@ -28,6 +28,7 @@ from edqn_jax.sim.env import EnvState, Observation, Step, World
 from edqn_jax.sim.events import EventField, EventMemory
 from edqn_jax.sim.missions import own_missions
 from edqn_jax.sim.mjcf import check_scene, load_world, mjcf_of, resolve_world
+from edqn_jax.sim.motion import Aim
 from edqn_jax.sim.moves import move_number
 from edqn_jax.sim.moving_worlds import Moving
 from edqn_jax.sim.reward import Reward
@@ -100,7 +101,13 @@ class Environment:
         """
         return np.asarray(events.event_image(self._field(observation)))
 
-    def stream(self, flight: Flight, mission: int = 0, law: Literal["paper", "airsim", "esim"] = "esim") -> np.ndarray:
+    def stream(
+        self,
+        flight: Flight,
+        mission: int = 0,
+        law: Literal["paper", "airsim", "esim"] = "esim",
+        aim: Aim | None = None,
+    ) -> np.ndarray:
         """Returns the events of a camera that watches a whole flight, with a frame at every physics step.
 
         Args:
@@ -108,6 +115,8 @@ class Environment:
                 move, each sees them at its own `time`.
             mission: in whose world it was flown.
             law: of the events; `esim` remembers each pixel's level from frame to frame.
+            aim: `EnvState.aim` at the end of the flight: where the balls of a world with some were thrown. None throws
+                them at a drone of steady pace.
 
         The camera's faults, and its light where there is any, are drawn, and are the same at every call.
 
@@ -115,7 +124,8 @@ class Environment:
             a structured array as `events` returns it; `t` counts from the first pose.
         """
         sees = dataclasses.replace(self.config, events=dataclasses.replace(self.config.events, law=law))
-        return events.expand(_stream(sees, self.scene(mission), flight))
+        scene = env.scene_of(self.world, jnp.asarray(mission), aim)
+        return events.expand(_stream(sees, scene, flight))
 
     def picture(self, state: EnvState, scale: int = 8) -> np.ndarray:
         """Returns what a person would see from the drone's camera: [H * scale, W * scale, 3] sRGB in [0, 1]."""

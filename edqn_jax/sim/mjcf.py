@@ -33,7 +33,7 @@ from edqn_jax.config import FAMILIES
 from edqn_jax.sim.distance import shape_distances
 from edqn_jax.sim.mjcf_files import SceneError, checked_text
 from edqn_jax.sim.mjcf_motion import PREFIX, motions_of, set_in_motion, text_of
-from edqn_jax.sim.motion import Throw, hit_time, thrown_to
+from edqn_jax.sim.motion import Throw, steady_aim, thrown_to
 from edqn_jax.sim.scene import (
     KINDS,
     Capsules,
@@ -151,7 +151,9 @@ def load_world(path: str | Path) -> LoadedWorld:
         if not np.all(np.isfinite(where)):
             raise SceneError(f"{path}: the site '{name}' stands at no finite point; give its pos three numbers")
     unknown = np.full(3, np.nan)
-    volume = _volume(model, data, shapes, path)
+    thrown = {body for body, motion in said.items() if motion[0][0] == "throw"}
+    stays = [shape for shape, body in zip(shapes, bodies, strict=True) if body not in thrown]
+    volume = _volume(model, data, stays, path)
     for body, motion in said.items():
         of = [i for i, each in enumerate(bodies) if each == body]
         if not of:
@@ -312,8 +314,9 @@ def mjcf_of(scene: Scene, *, title: str = "world") -> str:
 
 def _launch(scene: Scene, one: Throw) -> np.ndarray:
     """Returns where a ball is launched at a drone between the world's own start and goal, [3] metres."""
-    throw, ends = jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], one), (scene.start, scene.goal)
-    return np.asarray(thrown_to(throw, *ends, (hit_time(throw, *ends) - throw.early)[0]))[0]
+    throw = jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], one)
+    aim = steady_aim(throw, scene.start, scene.goal)
+    return np.asarray(thrown_to(throw, aim, aim.launch[0]))[0]
 
 
 def _geom_name(model: mujoco.MjModel, geom: int) -> str:

@@ -11,8 +11,9 @@ A moving obstacle is a mocap body, and a text `motion:` with the body's name hol
   is negative.
 * `ellipse AX AY AZ BX BY BZ RATE PHASE`: A cos + B sin of an angle that grows by RATE rad/s from PHASE rad.
 * `throw SHARE EARLY SPEED BEARING ELEVATION GRAVITY PACE`: a ball (a body of one sphere) that is launched EARLY seconds
-  before it meets a drone that flies straight from start to goal at PACE m/s, after that SHARE of the way; SPEED m/s,
-  BEARING degrees to the left of ahead and ELEVATION degrees above the horizon from which it comes, GRAVITY m/s^2.
+  before it meets a drone that goes on as it flies at the launch. It is due when it would meet one that flies straight
+  from start to goal at PACE m/s after that SHARE of the way. SPEED m/s; it comes from BEARING degrees to the left of
+  the way to the goal and ELEVATION degrees above the horizon; GRAVITY m/s^2.
 
 Where a body is drawn is where it is at time 0. A `;` joins a `bounce` and one of the others but `throw`.
 """
@@ -29,7 +30,7 @@ import mujoco
 import numpy as np
 
 from edqn_jax.sim.mjcf_files import SceneError
-from edqn_jax.sim.motion import Throw, at_rest
+from edqn_jax.sim.motion import LEAST_LAUNCH_M, Throw, at_rest
 from edqn_jax.sim.scene import PARKED, Planes, Shape, Spheres
 
 PREFIX = "motion:"
@@ -92,6 +93,8 @@ def _one(words: Sequence[str], title: str) -> Said:
         raise SceneError(f"{title} must have a period that is not 0")
     if word == "throw" and (numbers[0] < 0 or min(numbers[1], numbers[2], numbers[6]) <= 0):
         raise SceneError(f"{title} must have a share of 0 or more, and EARLY, SPEED and PACE above 0")
+    if word == "throw" and numbers[1] * numbers[2] < LEAST_LAUNCH_M:
+        raise SceneError(f"{title} must begin {LEAST_LAUNCH_M:g} m away or further: EARLY times SPEED")
     return word, tuple(numbers)
 
 

@@ -33,9 +33,9 @@ SHARES = (0.2, 0.95)
 EARLY = (1.5, 3.0)
 """How long a ball flies before that, seconds."""
 BALL_RADIUS = (0.3, 0.5)
-BEARING = math.radians(60.0)
-"""Balls come from at most so far to either side of ahead, so that at 6 m/s they are in the image of a drone that flies
-straight at 4 m/s."""
+BEARING = math.radians(40.0)
+"""Balls come from at most so far to either side of the way to the goal, so that a drone that hovers or flies straight
+has them in its image."""
 ELEVATION = math.radians(20.0)
 """Balls come from at most so far above the horizon."""
 

@@ -38,7 +38,8 @@ def can_draw(config: CameraConfig, scene: Scene) -> bool:
     """Returns whether the library is at hand and draws such pictures; known when tracing."""
     others = (scene.tilted_boxes, scene.capsules, scene.tilted_cylinders)
     plain = config.mount == "level" and not any(kind.position.shape[-2] for kind in others)
-    return plain and is_at_hand()
+    shapes = [getattr(getattr(scene, kind), name) for kind, names in OPERANDS.items() for name in names]
+    return plain and all(leaf.dtype == jnp.float32 for leaf in shapes) and is_at_hand()
 
 
 def pictures(config: CameraConfig, scene: Scene, origin: Array, rotation: Array, weights: Array) -> Array:

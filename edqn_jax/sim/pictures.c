@@ -56,6 +56,12 @@ static inline float least(float a, float b) { return a < b ? a : b; }
 static inline float most(float a, float b) { return a > b ? a : b; }
 static inline float inverse(float x) { return 1.0f / (fabsf(x) < TINY ? TINY : x); }
 
+static inline int is_finite(float x) {
+  uint32_t bits;
+  memcpy(&bits, &x, sizeof bits);
+  return (bits & 0x7f800000u) != 0x7f800000u;
+}
+
 /* Rounds to the nearest whole number, halves to even, for |x| < 2^22. */
 static inline Lanes nearest_whole(Lanes x) { return (x + 12582912.0f) - 12582912.0f; }
 
@@ -103,11 +109,11 @@ static int out_of_sight(const Camera* c, const Eye* e, float x, float y, float r
 /* The columns [first, last) that an interval of the image plane may touch. */
 static void columns_between(const Camera* c, float left, float right, int* first, int* last) {
   const float begin = (left - c->u[0]) / c->pitch - 1.0f, end = (right - c->u[0]) / c->pitch + 2.0f;
+  /* Numbers that are not finite, which `-ffinite-math-only` lets no comparison find, are told by their bits. */
+  *first = *last = 0;
+  if (!is_finite(begin) || !is_finite(end)) return;
   *first = (int)least(most(begin, 0.0f), (float)c->width);
   *last = (int)least(most(end, 0.0f), (float)c->width);
-  /* Of a number that is not finite the result may be any. */
-  *first = *first < 0 ? 0 : *first;
-  *last = *last > c->width ? c->width : *last;
 }
 
 /* --------------------------------------------------------------------- upright shapes and the columns they cover */
@@ -550,7 +556,8 @@ static void measure(const Camera* c, const Shapes* s, const Eye* e, Work* w, flo
   memset(w->found, 0, sizeof(int) * (size_t)c->width);
   for (int n = 0; n < s->boxes + s->cylinders; ++n) {
     const int is_box = n < s->boxes, i = is_box ? n : n - s->boxes;
-    const float *at = is_box ? s->box_position + 3 * i : s->cylinder_position + 3 * i, *half = s->box_half + 3 * i;
+    const float* at = is_box ? s->box_position + 3 * i : s->cylinder_position + 3 * i;
+    const float* half = is_box ? s->box_half + 3 * i : 0;
     const float x = at[0] - e->origin[0], y = at[1] - e->origin[1];
     const float radius = is_box ? sqrtf(half[0] * half[0] + half[1] * half[1]) : s->cylinder_radius[i];
     if (out_of_sight(c, e, x, y, radius)) continue;

@@ -25,6 +25,7 @@ from jax.typing import ArrayLike
 
 from edqn_jax.sim.motion import (
     OUTSIDE_M,
+    Aim,
     Flown,
     Motion,
     Throw,
@@ -33,9 +34,10 @@ from edqn_jax.sim.motion import (
     flown_to,
     in_flight,
     not_thrown,
+    steady_aim,
+    throw_speeds,
     thrown_to,
-    top_speed,
-    top_throw_speed,
+    top_speeds,
 )
 
 PARKED = 1e6
@@ -133,6 +135,7 @@ class Scene:
     start: Array  # [3] metres
     goal: Array  # [3] metres
     drones: Flown | None = None  # the others of a group, within one decision; in no pool of worlds
+    aim: Aim | None = None  # of balls at the drone that flies; in no pool of worlds
 
 
 Shape = UprightBoxes | UprightCylinders | Spheres | TiltedBoxes | Capsules | TiltedCylinders | Planes
@@ -170,11 +173,12 @@ def scene_at(scene: Scene, time: Array | None) -> Scene:
     The one place where shapes move: the camera and the collisions both see what it returns.
 
     Args:
-        scene: one world; balls are thrown at a drone on its way from the scene's start to its goal.
+        scene: one world; balls fly as its `aim` says, without one as `steady_aim`.
         time: None is time 0, before anything is thrown.
     """
     moving = [kind for kind in KINDS if _moves(getattr(scene, kind))]
-    now = dataclasses.replace(scene, **{kind: _standing(scene, getattr(scene, kind), time) for kind in moving})
+    there = {kind: _standing(scene, getattr(scene, kind), time) for kind in moving}
+    now = dataclasses.replace(scene, **there, aim=None)
     if scene.drones is None:
         return now
     return with_drones(now, flown_to(scene.drones, scene.drones.began if time is None else time), scene.drones.radius)
@@ -195,21 +199,31 @@ def _standing(scene: Scene, shapes: Any, time: Array | None) -> Any:
     if not isinstance(shapes, Spheres):
         return dataclasses.replace(shapes, position=place, motion=None)
     if shapes.throw is not None and time is not None:
-        ends = scene.start, scene.goal
-        ball = thrown_to(shapes.throw, *ends, time)
+        aim = aim_of(scene, shapes.throw)
+        ball = thrown_to(shapes.throw, aim, time)
         beyond = (shapes.radius + OUTSIDE_M)[:, None]
         outside = jnp.any((ball < scene.volume[0][None] - beyond) | (ball > scene.volume[1][None] + beyond), axis=1)
-        place = jnp.where(in_flight(shapes.throw, *ends, time, outside)[:, None], ball, place)
+        place = jnp.where(in_flight(shapes.throw, aim, time, outside)[:, None], ball, place)
     return dataclasses.replace(shapes, position=place, motion=None, throw=None)
 
 
-def fastest(scene: Scene, time: Array | None) -> Array:
-    """Returns a bound [] m/s of the speed of every shape of one world at `time` [] seconds."""
-    kinds = [getattr(scene, kind) for kind in KINDS]
-    speeds = [top_speed(shapes.motion) for shapes in kinds if getattr(shapes, "motion", None) is not None]
-    if scene.spheres.throw is not None and time is not None:
-        speeds.append(top_throw_speed(scene.spheres.throw, scene.start, scene.goal, time))
-    return jnp.max(jnp.stack([jnp.zeros(()), *speeds]))
+def aim_of(scene: Scene, throw: Throw) -> Aim:
+    """Returns at what the balls of one world are thrown."""
+    return steady_aim(throw, scene.start, scene.goal) if scene.aim is None else scene.aim
+
+
+def speeds(scene: Scene, time: Array) -> dict[str, Array]:
+    """Returns a bound [N] m/s of the speed of every shape at `time` [] seconds, of the kinds that move.
+
+    Between two times no shape moves further than at the mean of its bounds there, but for a ball that is launched in
+    between, which is then `LEAST_LAUNCH_M` away. Other drones are not among them.
+    """
+    shapes = {kind: getattr(scene, kind) for kind in KINDS}
+    bounds = {kind: top_speeds(each.motion) for kind, each in shapes.items() if getattr(each, "motion", None)}
+    throw = scene.spheres.throw
+    if throw is not None:
+        bounds["spheres"] = bounds.get("spheres", 0.0) + throw_speeds(throw, aim_of(scene, throw), time)
+    return bounds
 
 
 # ----------------------------------------------------------------------- building, pools of worlds

@@ -9,7 +9,7 @@ from typing import Any, TypeGuard
 import numpy as np
 
 from edqn_jax.config import Config
-from edqn_jax.evaluation.judge import Judge, clearance, replay_contact
+from edqn_jax.evaluation.judge import Judge, Target, clearance, replay_contact
 from edqn_jax.evaluation.metrics import EMPTY_M
 from edqn_jax.evaluation.missions import RunMissions
 from edqn_jax.evaluation.verdicts import CONTACT_TOLERANCE_M
@@ -58,8 +58,9 @@ def from_trajectory(
     lengths = np.linalg.norm(np.diff(path, axis=0), axis=1)
     steps, seconds, decision = len(positions), float(recorded["t"][-1]), config.drone.physics_steps
     step_s = config.drone.physics_dt_s
-    contact = replay_contact(judge, path, step_s, (start, goal))
-    ends = [clearance(judge, point, step_s * row, (start, goal))[0] for row, point in enumerate(path)]
+    target = Target(start, goal, path[::decision], step_s * decision)
+    contact = replay_contact(judge, path, step_s, target)
+    ends = [clearance(judge, point, step_s * row, target)[0] for row, point in enumerate(path)]
     if contact is not None:
         cut = 1.0 - contact.fraction if contact.segment == steps - 1 else math.inf  # sooner: not as recorded
         lengths[-1] *= 1.0 - cut

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import edqn_jax.report.page
-from edqn_jax.report.page.worlds import world_data
+from edqn_jax.report.page.worlds import ball_data, world_data
 from edqn_jax.sim.moving_worlds import Moving
 from edqn_jax.sim.scene import PARKED, scene_at, take_scene
 from edqn_jax.sim.worlds import random_pool, world_keys
@@ -24,6 +24,7 @@ def test_obstacles_of_the_page_are_where_the_simulators_are(browser: Any) -> Non
     moving = Moving(share=0.9, balls=6, ball_gravity_m_s2=4.0)
     scene = take_scene(random_pool("medium", world_keys("test", 1), moving), 0)
     world = json.loads(json.dumps(world_data(scene)))
+    world["shapes"] += json.loads(json.dumps(ball_data(scene)))
     script = (Path(edqn_jax.report.page.__file__).parent / "page.js").read_text(encoding="utf-8")
     begin = script.index("  function placeOf(")
     program = script[begin : script.index("\n  }\n", begin) + 5]

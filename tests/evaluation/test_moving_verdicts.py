@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from edqn_jax.config.loading import make_config
-from edqn_jax.evaluation.judge import clearance, fastest, load_judge, replay_contact
+from edqn_jax.evaluation.companions import scene_of_flight
+from edqn_jax.evaluation.judge import Target, clearance, fastest, load_judge, replay_contact
 from edqn_jax.evaluation.missions import MissionSet, load_missions
 from edqn_jax.evaluation.rollouts import fly_missions
 from edqn_jax.evaluation.verdicts import check_verdicts
@@ -90,7 +91,7 @@ def test_each_ball_is_absent_before_its_launch_in_both(world, judge):
     assert len(names) == 2
     ball = [body for body in judge.moving if body.said[0][0] == "throw"]
     for each in ball:
-        present = [np.abs(each.at(t, judge.ends)).max() < 1e5 for t in np.arange(0, 30, 0.1)]
+        present = [np.abs(each.at(t, judge.target)).max() < 1e5 for t in np.arange(0, 30, 0.1)]
         assert not present[0] and any(present) and not present[-1]
 
 
@@ -134,7 +135,7 @@ def test_a_world_that_moves_needs_the_time_of_a_step(judge):
 def test_a_still_world_is_judged_as_before():
     still = load_judge(mujoco.MjSpec.from_string("<mujoco><worldbody><geom size='1'/></worldbody></mujoco>"), RADIUS)
     contact = replay_contact(still, [[-3, 0, 0], [3, 0, 0]])
-    assert contact == replay_contact(still, [[-3, 0, 0], [3, 0, 0]], 0.02, ((0, 0, 0), (1, 0, 0)))
+    assert contact == replay_contact(still, [[-3, 0, 0], [3, 0, 0]], 0.02, Target((0, 0, 0), (1, 0, 0)))
     assert contact is not None and abs(contact.fraction - (3 - 1.36) / 6) < 1e-6
     assert still.moving == ()
 
@@ -163,3 +164,31 @@ def test_every_verdict_on_a_flight_among_moving_obstacles_is_mujocos(course, mov
     # Judged as if nothing moved, or a decision later, verdicts differ.
     late = dataclasses.replace(config, drone=dataclasses.replace(config.drone, physics_dt_s=0.03))
     assert not all(result.agrees for result in check_verdicts(late, course, flights))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("physics_steps", [13, 6])
+def test_a_drone_is_hit_by_balls_where_the_world_of_its_flight_has_them(physics_steps):
+    config = make_config(
+        "sparse",
+        drone={"physics": "rigid_body", "physics_steps": physics_steps},
+        env={"sensor": "blind", "max_decisions": 90},
+        world={"balls": 3},
+    )
+    course = load_missions(config, "sparse", 16)
+    flights = fly_missions(config, course.world, always((0, 0, 0)), jax.random.key(0), record=True)
+    flights = jax.tree.map(np.asarray, flights)
+    assert (flights.outcome == Outcome.COLLISION).sum() > 12  # they hover
+    assert all(result.agrees for result in check_verdicts(config, course, flights))
+    steady = 0
+    for i in np.flatnonzero(flights.outcome == Outcome.COLLISION):
+        steps, part = int(flights.physics_steps[i]), float(flights.contact[i])
+        before, after = flights.record.position[i, steps - 2 : steps]
+        point, when = before + part * (after - before), np.float32(0.02 * (steps - 1 + part))
+        gaps = [
+            float(signed_distance(scene_at(scene, when), point)) - RADIUS
+            for scene in (scene_of_flight(config, course, flights, int(i)), course.scene(int(i)))
+        ]
+        assert abs(gaps[0]) < 0.02, (i, gaps)  # found within a step of 0.12 m
+        steady += gaps[1] < 0.02
+    assert steady < 4  # thrown at a drone of steady pace they would have missed nearly all

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from functools import partial
 
 import jax
@@ -33,6 +34,13 @@ def test_it_is_the_sum_that_xla_makes_to_the_bit() -> None:
     ours = spread(lambda x: all_sum(x, "d", 0.0))(arrays(0))
     theirs = spread(lambda x: lax.psum(x, "d"))(arrays(0))
     jax.tree.map(np.testing.assert_array_equal, ours, theirs)
+
+
+def test_where_there_is_a_compiler_c_adds_what_it_can() -> None:
+    text = spread(lambda x: all_sum(x, "d", 0.0)).lower(arrays(0)).as_text()
+    assert ("edqn_all_sum" in text) is (shutil.which("cc") is not None)
+    halves = {name: x.astype(jnp.bfloat16) for name, x in arrays(0).items()}
+    assert "edqn_all_sum" not in spread(lambda x: all_sum(x, "d", 0.0)).lower(halves).as_text()
 
 
 def test_a_mapped_sum_is_the_sum_of_each() -> None:

@@ -62,7 +62,7 @@ def test_what_is_compiled_once_is_kept(source: Path, tmp_path: Path) -> None:
     if registered(source, names, ("NAME=edqn_test_e",)):
         (first,) = kept(tmp_path)
         made = first.stat().st_mtime_ns
-        registered.cache_clear()
+        c_library._registered.cache_clear()
         assert registered(source, names, ("NAME=edqn_test_e",))
         assert kept(tmp_path) == [first] and first.stat().st_mtime_ns == made
 
@@ -76,3 +76,32 @@ def test_where_nothing_can_be_kept_it_is_compiled_and_leaves_nothing(
     monkeypatch.setattr(tempfile, "tempdir", str(scratch))
     assert registered(source, ("edqn_test_f",), ("NAME=edqn_test_f",)) is (shutil.which("cc") is not None)
     assert not list(scratch.rglob("*")) and not kept(tmp_path)
+
+
+def test_a_damaged_library_is_made_anew(source: Path, tmp_path: Path) -> None:
+    names, definitions = ("edqn_test_g",), ("NAME=edqn_test_g",)
+    if registered(source, names, definitions):
+        (file,) = kept(tmp_path)
+        file.unlink()  # what is loaded stays as it is
+        file.write_bytes(b"no library")
+        c_library._registered.cache_clear()
+        assert registered(source, names, definitions)
+        assert kept(tmp_path) == [file] and file.stat().st_size > 1000
+
+
+def test_the_compiler_may_have_options_and_a_failure_is_told(
+    source: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setenv("CC", "cc -DBEFORE=1")
+    c_library.compiler.cache_clear()
+    if shutil.which("cc") is None:
+        assert c_library.compiler() is None
+        return
+    source.write_text(SOURCE.replace("#include", "#if BEFORE != 1\n#error no option\n#endif\n#include"))
+    assert registered(source, ("edqn_test_h",), ("NAME=edqn_test_h",)) and not caplog.records
+    assert not registered(source, ("edqn_test_j",), ("NAME=other_name",))
+    assert "nothing.c could not be compiled or loaded, JAX does its work more slowly" in caplog.text
+    monkeypatch.setenv(c_library.SWITCH, "0")
+    c_library.compiler.cache_clear()
+    assert c_library.compiler() is None
+    c_library.compiler.cache_clear()

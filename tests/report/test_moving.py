@@ -13,7 +13,7 @@ import pytest
 
 from edqn_jax.learn.policy import fresh_policy
 from edqn_jax.report.flights import draw_path, draw_world
-from edqn_jax.report.page.worlds import world_data
+from edqn_jax.report.page.worlds import ball_data, world_data
 from edqn_jax.report.sights import Sights, decision_rows, poses, times_of
 from edqn_jax.report.solids import MAP, cut_open, moving_solids, solids_of, standing
 from edqn_jax.sim import drone, env, events
@@ -109,7 +109,8 @@ def test_the_pictures_of_a_flight_are_those_that_the_drone_saw():
 
 def test_the_page_knows_how_shapes_move():
     world = world_data(moving_world())
-    box, still, ball = world["shapes"]
+    box, still = world["shapes"]
+    (ball,) = ball_data(moving_world())
     assert box["moves"]["velocity"] == [0, 4, 0] and box["moves"]["high"] == [0, 9, 0] and "closes" not in box
     assert "moves" not in still
     moves = ball["moves"]

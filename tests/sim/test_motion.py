@@ -24,10 +24,10 @@ from edqn_jax.sim.scene import (
     UprightBoxes,
     UprightCylinders,
     build_scene,
-    fastest,
     moves,
     scene_at,
     scene_shapes,
+    speeds,
     stack_scenes,
     take_scene,
     with_equal_capacities,
@@ -220,14 +220,14 @@ def _positions(scene, times):
 
 @jax.jit
 def _fastest(scene, times):
-    return jax.vmap(lambda t: fastest(scene, t))(times)
+    return jax.vmap(lambda t: jnp.max(speeds(scene, t)["spheres"]))(times)
 
 
 def test_the_bound_of_an_ellipse_is_its_top_speed():
     scene = scene_of(UprightCylinders(position=[1, 1, 1], radius=1, half_height=1, albedo=GREY, motion=CIRCLING))
-    np.testing.assert_allclose(fastest(scene, jnp.float32(0)), 3.0, rtol=1e-6)
+    np.testing.assert_allclose(speeds(scene, jnp.float32(0))["cylinders"], [3.0], rtol=1e-6)
     swaying = scene_of(ball([5, 5, 5], motion=SWAYING))
-    np.testing.assert_allclose(fastest(swaying, jnp.float32(0)), 1.9 * np.hypot(1.5, 0.5), rtol=1e-6)
+    np.testing.assert_allclose(speeds(swaying, jnp.float32(0))["spheres"], [1.9 * np.hypot(1.5, 0.5)], rtol=1e-6)
 
 
 # ---------------------------------------------------------------------------------------- pools

@@ -22,7 +22,7 @@ from edqn_jax.sim.env import World
 from edqn_jax.sim.environment import Environment
 from edqn_jax.sim.events import event_image
 from edqn_jax.sim.missions import own_missions
-from edqn_jax.sim.motion import Motion, Throw
+from edqn_jax.sim.motion import Motion, Throw, aim_at, throw_speeds, thrown_to
 from edqn_jax.sim.moves import move_number
 from edqn_jax.sim.outcomes import Outcome
 from edqn_jax.sim.scene import PARKED, Spheres, UprightBoxes, build_scene, scene_at, stack_scenes
@@ -215,19 +215,84 @@ def test_a_hovering_drone_is_hit_and_the_moment_is_right():
     assert ends[:hit] == [Outcome.RUNNING] * hit
 
 
-def test_a_ball_hits_who_flies_straight_ahead_and_misses_who_hovers():
-    ball = Spheres(np.full(3, PARKED), 0.4, GREY, throw=Throw(0.5, 2.0, 6.0, 0.3, 0.1, 0.0, 4.0))
-    ahead, world = move_number("ahead"), world_of(ball)
-    outcomes = [int(step.outcome) for step in fly(world, [ahead] * 22)[2]]
+BALL = Spheres(np.full(3, PARKED), 0.4, GREY, throw=Throw(0.5, 2.0, 6.0, 0.3, 0.1, 0.0, 4.0))
+"""Due at 3 s: half of 40 m at 4 m/s, less 2 s. It is thrown as decision 11 begins, at 2.86 s."""
+
+
+@pytest.mark.parametrize("move", ["ahead", "hover"])
+def test_a_ball_hits_who_goes_on_as_before(move):
+    outcomes = [int(step.outcome) for step in fly(world_of(BALL), [move_number(move)] * 22)[2]]
     assert Outcome.COLLISION in outcomes
-    # At 5 s: half of 40 m at 4 m/s; the drone lags by its acceleration.
-    assert 4.0 < outcomes.index(Outcome.COLLISION) * N * DT < 5.4
-    assert Outcome.COLLISION not in [int(step.outcome) for step in fly(world, [HOVER] * 30)[2]]
+    # At 4.86 s, earlier by what the spheres of 0.36 and 0.4 m need to come together at 6 m/s, and later by lag.
+    assert 4.5 < (outcomes.index(Outcome.COLLISION) + 1) * N * DT < 5.4
+
+
+@pytest.mark.parametrize("then", ["left", "back", "up"])
+def test_a_ball_misses_who_turns_away_after_its_launch(then):
+    moves = [move_number("ahead")] * 12 + [move_number(then)] * 10
+    outcomes = [int(step.outcome) for step in fly(world_of(BALL), moves)[2]]
+    assert Outcome.COLLISION not in outcomes
+
+
+def test_a_ball_is_where_the_drones_last_decision_has_sent_it():
+    world = world_of(BALL)
+    states, _, steps = fly(world, [move_number("ahead left")] * 14)
+    launches = [float(state.aim.launch[0]) for state in states]
+    thrown = next(i for i, launch in enumerate(launches) if launch < 100)
+    here, last = (np.asarray(states[i].drone.position, np.float64) for i in (thrown, thrown - 1))
+    assert int(states[thrown].decision) == 11 and abs(launches[thrown] - 11 * N * DT) < 1e-6
+    aim = here + (here - last) * 2.0 / (N * DT)
+    assert len({np.asarray(state.aim.point[0]).tobytes() for state in states[thrown:]}) == 1
+    np.testing.assert_allclose(states[-1].aim.point[0], aim, atol=1e-4)
+    goal = np.asarray(world.missions.goal[0]) - here
+    bearing, elevation = np.arctan2(goal[1], goal[0]) + 0.3, 0.1
+    comes = np.array([np.cos(elevation) * np.cos(bearing), np.cos(elevation) * np.sin(bearing), np.sin(elevation)])
+    scene = env.scene_of(world, jnp.int32(0), states[-1].aim)
+    place = lambda t: np.asarray(scene_at(scene, jnp.float32(t)).spheres.position[0])  # noqa: E731
+    for after in (0.1, 0.9, 2.0):
+        np.testing.assert_allclose(place(launches[thrown] + after), aim + 6.0 * (2.0 - after) * comes, atol=1e-3)
+    assert np.abs(place(launches[thrown])).max() == PARKED  # it appears just after
+    # The same from the recorded places alone.
+    start = np.asarray(world.missions.start[0])
+    places = np.stack([start, *(np.asarray(step.flight.position[-1]) for step in steps)])
+    whole = env.aim_along(CONFIG, scene, np.concatenate([places, np.full((3, 3), np.nan)]))
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-5), whole, states[-1].aim)
+
+
+def test_a_recording_shows_the_balls_of_its_flight():
+    world = world_of(BALL)
+    states, _, steps = fly(world, [HOVER] * 18)
+    first = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), *[step.flight for step in steps])
+    environment, aim = Environment(CONFIG, world), states[-1].aim
+    shown, steady = environment.stream(first, aim=aim), environment.stream(first)
+    assert len(shown) > len(steady) + 100  # the ball comes close to the drone that hovers
+
+
+def test_no_ball_begins_close_to_the_drone_and_none_is_slower_than_it_may_be():
+    many = 400
+    rng = np.random.default_rng(0)
+    spread = lambda low, high: jnp.asarray(rng.uniform(low, high, many), jnp.float32)  # noqa: E731
+    throw = Throw(
+        share=spread(0, 1), early=spread(0.6, 3), speed=spread(5, 7), bearing=spread(-3, 3), elevation=spread(-1, 1),
+        gravity=spread(-9, 9), pace=spread(2, 6),
+    )  # fmt: skip
+    here = jnp.asarray(rng.uniform([3, 3, 3], [57, 37, 17], (many, 3)), jnp.float32)
+    moved = jnp.asarray(rng.uniform(-1.7, 1.7, (many, 3)), jnp.float32)
+    with jax.numpy_rank_promotion("raise"):
+        aim = aim_at(throw, jnp.float32([50, 20, 6]), jnp.asarray(VOLUME, jnp.float32), 1.3, here, moved, 0.26)
+        thrown_to(throw, aim, jnp.float32(2.0))
+    begin = np.asarray(thrown_to(throw, aim, jnp.float32(1.3)), np.float64)
+    assert np.linalg.norm(begin - np.asarray(here), axis=1).min() >= 3.0 - 1e-3
+    at_drone = np.abs(np.asarray(aim.point - here)).max(1) == 0
+    assert 0 < at_drone.mean() < 0.3
+    for time in np.linspace(1.32, 5, 12):
+        one, two = (np.asarray(thrown_to(throw, aim, jnp.float32(t)), np.float64) for t in (time, time + 0.02))
+        bound = np.maximum(*(np.asarray(throw_speeds(throw, aim, jnp.float32(t))) for t in (time, time + 0.02)))
+        assert (np.linalg.norm(two - one, axis=1) / 0.02 <= bound * 1.001 + 2e-3).all()
 
 
 def test_a_mission_has_its_balls_thrown_at_its_own_drone():
-    ball = Spheres(np.full(3, PARKED), 0.4, GREY, throw=Throw(0.5, 2.0, 6.0, 0.3, 0.1, 0.0, 4.0))
-    world = world_of(ball)
+    world = world_of(BALL)
     start, goal = jnp.float32([[10, 5, 4]]), jnp.float32([[50, 5, 4]])
     moved = dataclasses.replace(world, missions=dataclasses.replace(world.missions, start=start, goal=goal))
     outcomes = [int(step.outcome) for step in fly(moved, [move_number("ahead")] * 22)[2]]

@@ -86,7 +86,7 @@ if __name__ == "__main__":
         return noted["summary"]
 
     devices.cores, camera.luma = lambda: int(count), waves
-    run.Sights, run.draw_gallery = lambda *_: object(), lambda *_: None
+    run.Sights, run.draw_gallery = lambda *_: SimpleNamespace(in_world=lambda scene: None), lambda *_: None
     Trainer.init, run.train_run = noting_init, noting_run
     if argv[:1] == ["--no-learning"]:
         del argv[0]

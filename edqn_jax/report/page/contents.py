@@ -18,7 +18,7 @@ from edqn_jax.evaluation.trajectories import trajectory
 from edqn_jax.report.curves import running_mean
 from edqn_jax.report.page.flown import FlownRun
 from edqn_jax.report.page.pictures import flight_pictures
-from edqn_jax.report.page.worlds import rounded, world_data
+from edqn_jax.report.page.worlds import ball_data, rounded, world_data
 from edqn_jax.report.sights import Sights
 from edqn_jax.report.style import OUTCOME_COLOURS, OUTCOME_LABELS
 from edqn_jax.runs.directory import plain
@@ -42,12 +42,14 @@ def page_data(runs: Sequence[FlownRun]) -> dict[str, Any]:
         colour = RUN_COLOURS[number % len(RUN_COLOURS)]
         flights = []
         for mission in range(len(run.flights.outcome)):
-            world = world_data(_scene(run, mission))
+            scene = _scene(run, mission)
+            world = world_data(scene)
             key = hashlib.sha256(json.dumps(world).encode()).hexdigest()
             if key not in worlds:
                 worlds[key] = len(drawn)
                 drawn.append(world)
-            flights.append({"world": worlds[key], **flight_data(run, mission)})
+            balls = ball_data(scene)
+            flights.append({"world": worlds[key], **flight_data(run, mission), **({"balls": balls} if balls else {})})
         data.append({"name": run.name, "colour": colour, "curves": curves(run), "flights": flights})
     return {
         "version": edqn_jax.__version__,

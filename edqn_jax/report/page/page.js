@@ -77,6 +77,7 @@
       this.mode = "orbit";
       this.world = -1;
       this.flights = [];
+      this.balls = [];
     }
 
     /** Shows a world, the flights in it, one of them chosen. */
@@ -99,6 +100,8 @@
       this.drop("moving");
       this.moving = new THREE.Group();
       this.flights = flights.map(({ flight, colour }) => this.addFlight(flight, colour, flight === chosen, flights.length > 30 ? 0.25 : 0.5));
+      this.balls = (chosen.balls ?? []).map((shape) => [solidOf(shape), shape]);
+      this.balls.forEach(([solid]) => this.moving.add(solid));
       this.addEnds(chosen, world);
       this.scene.add(this.moving);
       this.chosen = chosen;
@@ -188,7 +191,7 @@
           this.ride(position, turn, flight);
         }
       }
-      for (const [solid, shape] of this.movers) {
+      for (const [solid, shape] of [...this.movers, ...this.balls]) {
         const at = placeOf(shape, world, Math.min(time, this.chosen.end));
         solid.visible = at !== null;
         if (at) solid.position.set(...at);
@@ -256,8 +259,7 @@
   function placeOf(shape, world, time) {
     const how = shape.moves;
     if (how.velocity) {
-      const turn = (of) => [Math.cos(of) - Math.cos(how.phase), Math.sin(of) - Math.sin(how.phase)];
-      const [cos, sin] = turn(how.phase + how.rate * time);
+      const cos = Math.cos(how.rate * time) - 1, sin = Math.sin(how.rate * time);
       return shape.at.map((at, axis) => {
         let place = at + how.swing[0][axis] * cos + how.swing[1][axis] * sin;
         if (how.velocity[axis]) {

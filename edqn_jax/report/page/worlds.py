@@ -10,8 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from edqn_jax.report.solids import closed_side, present, solids_of
-from edqn_jax.sim.motion import OUTSIDE_M, hit_time, thrown_to
-from edqn_jax.sim.scene import PARKED, Scene
+from edqn_jax.sim.motion import NEVER, OUTSIDE_M, thrown_to
+from edqn_jax.sim.scene import PARKED, Scene, aim_of
 
 
 def world_data(scene: Scene) -> dict[str, Any]:
@@ -20,7 +20,7 @@ def world_data(scene: Scene) -> dict[str, Any]:
     A shape has its `kind` (box, cylinder, capsule, sphere), centre `at`, `colour`, and of its kind `half` and `turn`
     (body-to-world, row by row), `radius`, `axis` and `half`. `closes` is the axis and the sign of the side of the
     volume that a ceiling or an outer wall closes: the view leaves it out when it looks from there. `moves` says where a
-    shape is at another time; a thrown ball's are of the world's own start and goal.
+    shape is at another time.
     """
     lower, upper = np.asarray(scene.volume, np.float64)
     shapes = []
@@ -28,7 +28,12 @@ def world_data(scene: Scene) -> dict[str, Any]:
         closes = None if moves else closed_side(solid, lower, upper)
         shape |= {"colour": _hex(solid.colour)} | moves
         shapes.append(shape | ({} if closes is None else {"closes": list(closes)}))
-    return {"lower": rounded(lower), "upper": rounded(upper), "shapes": [*shapes, *_balls(scene)]}
+    return {"lower": rounded(lower), "upper": rounded(upper), "shapes": shapes}
+
+
+def ball_data(scene: Scene) -> list[dict[str, Any]]:
+    """Returns the balls that are thrown within a flight, as shapes of `world_data`, which holds none of them."""
+    return list(_balls(scene))
 
 
 def _motions(scene: Scene) -> Iterator[dict[str, Any]]:
@@ -47,16 +52,16 @@ def _motions(scene: Scene) -> Iterator[dict[str, Any]]:
 
 
 def _balls(scene: Scene) -> Iterator[dict[str, Any]]:
-    """Yields the balls that are thrown."""
+    """Yields the balls that are thrown within the flight."""
     throw = scene.spheres.throw
     if throw is None:
         return
-    hits = hit_time(throw, scene.start, scene.goal)
-    aims = np.stack([thrown_to(throw, scene.start, scene.goal, hit)[i] for i, hit in enumerate(hits)])
+    aim = aim_of(scene, throw)
+    hits, aims = np.asarray(aim.launch + throw.early), np.asarray(aim.point)
     # A second before the hit, without gravity, it is so far away from there.
     straight = dataclasses.replace(throw, gravity=jnp.zeros_like(throw.gravity))
-    before = np.stack([thrown_to(straight, scene.start, scene.goal, hit - 1.0)[i] for i, hit in enumerate(hits)])
-    for i in np.flatnonzero(np.asarray(throw.early) > 0):
+    before = np.stack([thrown_to(straight, aim, hit - 1.0)[i] for i, hit in enumerate(hits)])
+    for i in np.flatnonzero((np.asarray(throw.early) > 0) & (np.asarray(aim.launch) < NEVER)):
         speed, colour = float(throw.speed[i]), np.asarray(scene.spheres.albedo[i])
         moves = {"hit": float(hits[i]), "early": float(throw.early[i]), "speed": speed, "outside": OUTSIDE_M}
         moves |= {
