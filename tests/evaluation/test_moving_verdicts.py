@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 
 import jax
+import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
@@ -169,11 +170,11 @@ def test_every_verdict_on_a_flight_among_moving_obstacles_is_mujocos(course, mov
 @pytest.mark.slow
 @pytest.mark.parametrize("physics_steps", [13, 6])
 def test_a_drone_is_hit_by_balls_where_the_world_of_its_flight_has_them(physics_steps):
-    config = make_config(
-        "sparse",
-        drone={"physics": "rigid_body", "physics_steps": physics_steps},
-        env={"sensor": "blind", "max_decisions": 90},
-        world={"balls": 3},
+    config = dataclasses.replace(
+        CONFIG,
+        drone=dataclasses.replace(CONFIG.drone, physics_steps=physics_steps),
+        env=dataclasses.replace(CONFIG.env, max_decisions=90),
+        world=make_config("sparse", world={"balls": 3}).world,
     )
     course = load_missions(config, "sparse", 16)
     flights = fly_missions(config, course.world, always((0, 0, 0)), jax.random.key(0), record=True)
@@ -186,7 +187,7 @@ def test_a_drone_is_hit_by_balls_where_the_world_of_its_flight_has_them(physics_
         before, after = flights.record.position[i, steps - 2 : steps]
         point, when = before + part * (after - before), np.float32(0.02 * (steps - 1 + part))
         gaps = [
-            float(signed_distance(scene_at(scene, when), point)) - RADIUS
+            float(signed_distance(scene_at(scene, jnp.float32(when)), point)) - RADIUS
             for scene in (scene_of_flight(config, course, flights, int(i)), course.scene(int(i)))
         ]
         assert abs(gaps[0]) < 0.02, (i, gaps)  # found within a step of 0.12 m

@@ -79,14 +79,18 @@ def test_where_nothing_can_be_kept_it_is_compiled_and_leaves_nothing(
 
 
 def test_a_damaged_library_is_made_anew(source: Path, tmp_path: Path) -> None:
-    names, definitions = ("edqn_test_g",), ("NAME=edqn_test_g",)
-    if registered(source, names, definitions):
-        (file,) = kept(tmp_path)
-        file.unlink()  # what is loaded stays as it is
-        file.write_bytes(b"no library")
-        c_library._registered.cache_clear()
-        assert registered(source, names, definitions)
-        assert kept(tmp_path) == [file] and file.stat().st_size > 1000
+    command = c_library._command()
+    if command is not None:
+        folders = tmp_path / "whole", tmp_path / "damaged"
+        for folder in folders:
+            folder.mkdir()
+        c_library._loaded(command, source, ("NAME=edqn_test_g",), folders[0])
+        (whole,) = folders[0].iterdir()
+        # In another folder: a library that is loaded already is not read again.
+        damaged = folders[1] / whole.name
+        damaged.write_bytes(whole.read_bytes()[:100])
+        assert c_library._loaded(command, source, ("NAME=edqn_test_g",), folders[1]).edqn_test_g
+        assert list(folders[1].iterdir()) == [damaged] and damaged.stat().st_size == whole.stat().st_size
 
 
 def test_the_compiler_may_have_options_and_a_failure_is_told(

@@ -13,29 +13,11 @@ import pytest
 from tests.processes import ROOT
 
 SMALL = (
-    *(
-        "--world",
-        "paper",
-        "--num-envs",
-        "16",
-        "--train.chunk-steps",
-        "4",
-        "--total-steps",
-        "256",
-        "--env.max-decisions",
-    ),
-    *(
-        "--env.max-decisions",
-        "12",
-        "--encoder.warmup-decisions",
-        "64",
-        "--encoder.replay-size",
-        "256",
-        "--encoder.batch-size",
-        "16",
-    ),
-    *("--agent.batch-size", "16", "--agent.replay-size", "512", "--agent.learning-starts", "64", "--drone.physics"),
-    *("rigid_body", "--camera.width", "8", "--camera.height", "6", "--train.validation-missions", "2"),
+    *("--world", "paper", "--num-envs", "16", "--train.chunk-steps", "4", "--total-steps", "256"),
+    *("--env.max-decisions", "12", "--encoder.warmup-decisions", "64", "--encoder.replay-size", "256"),
+    *("--encoder.batch-size", "16", "--agent.batch-size", "16", "--agent.replay-size", "512"),
+    *("--agent.learning-starts", "64", "--drone.physics", "rigid_body", "--camera.width", "8", "--camera.height", "6"),
+    *("--train.validation-missions", "2"),
 )
 
 
