@@ -42,7 +42,9 @@ from measurement.whole import WholeStep, steady
 
 REPEATS, QUICK_REPEATS = 7, 3
 DECISIONS, QUICK_DECISIONS = 4096, 2048
-"""Approximate number of decisions in a chunk."""
+"""Approximate number of decisions in a chunk, of at least `STEPS` steps."""
+STEPS = 16
+"""With one, as 4,096 environments would have, a quarter of the time is that of beginning and ending chunks."""
 TURN_SECONDS = 0.5
 """Minimum duration of a turn of one size."""
 MILLION = 1_000_000
@@ -74,7 +76,7 @@ class Runner:
 
 def chunked(config: Config, decisions: int) -> Config:
     """Returns the steady workload in chunks of about `decisions`, with a short warm-up, which is not timed."""
-    config = steady(config, max(1, decisions // config.train.num_envs))
+    config = steady(config, max(STEPS, decisions // config.train.num_envs))
     return dataclasses.replace(config, encoder=dataclasses.replace(config.encoder, warmup_updates_per_step=1))
 
 
@@ -260,7 +262,7 @@ def memory_lines(memory: dict[str, Any]) -> list[str]:
         f"| state of one environment | {memory['bytes_per_environment']:,} |",
         f"| one slot of the replay | {memory['bytes_per_replay_slot']:,} |",
         f"| a replay of 1 000 000 transitions | {memory['bytes_of_a_million_transitions']:,} |",
-        f"| parameters, optimisers, keys | {memory['bytes_of_the_rest']:,} |",
+        f"| parameters, optimisers, keys, samples of the VAE | {memory['bytes_of_the_rest']:,} |",
     ]
     if temporary is not None:
         lines.append(f"| temporary in the compiled chunk, per environment | {temporary:,.0f} |")
