@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import functools
 import io
 from pathlib import Path
 
@@ -29,6 +30,7 @@ from edqn_jax.errors import ConfigError
 from edqn_jax.sim import disturbances
 from edqn_jax.sim.disturbances import Disturbance, Load
 from edqn_jax.sim.rigid_body import rigid_body_step
+from edqn_jax.sim.scalars import number_by_number
 from edqn_jax.sim.xla import materialised
 
 with contextlib.redirect_stdout(io.StringIO()):  # it prints that Warp, which is not used here, is missing
@@ -45,8 +47,6 @@ LEAST_LEVELNESS = 0.4
 class Airframe:
     """Constants of the airframe. R = 4 rotors."""
 
-    model: mjx.Model
-    data: mjx.Data  # a template that holds the factored mass matrix
     mass: Array  # [] kg
     inertia: Array  # [3] kg m^2 about the body's axes
     gravity: Array  # [] m/s^2
@@ -100,19 +100,14 @@ def mixer_of(model: mujoco.MjModel) -> np.ndarray:
 
 
 def load_airframe(config: DroneConfig) -> Airframe:
-    """Returns the Skydio X2 as MJX arrays, and the mixer that follows from its rotor layout.
+    """Returns what a controller knows of the Skydio X2, and the mixer that follows from its rotor layout.
 
     Raises:
         ConfigError: if the airframe's file has something that a physics step would ignore.
     """
     model = c_model(config)
     _check(model)
-    rest = mujoco.MjData(model)
-    mujoco.mj_forward(model, rest)
-    here = jax.local_devices()[0]  # MJX's own choice may be another process's
     return Airframe(
-        model=mjx.put_model(model, device=here, impl="jax"),
-        data=mjx.put_data(model, rest, device=here, impl="jax"),
         mass=jnp.float32(model.body_mass[1]),
         inertia=jnp.asarray(model.body_inertia[1], jnp.float32),
         gravity=jnp.float32(-model.opt.gravity[2]),
@@ -120,6 +115,17 @@ def load_airframe(config: DroneConfig) -> Airframe:
         wrench=jnp.asarray(wrench_of_thrust(model), jnp.float32),
         mixer=jnp.asarray(mixer_of(model), jnp.float32),
     )
+
+
+@functools.cache
+def _mjx_template(config: DroneConfig) -> tuple[mjx.Model, mjx.Data]:
+    """Returns the Skydio X2 as MJX has it, and data that hold its factored mass matrix; known when tracing."""
+    model = c_model(config)
+    rest = mujoco.MjData(model)
+    mujoco.mj_forward(model, rest)
+    here = jax.local_devices()[0]  # MJX's own choice may be another process's
+    with jax.ensure_compile_time_eval():
+        return mjx.put_model(model, device=here, impl="jax"), mjx.put_data(model, rest, device=here, impl="jax")
 
 
 def _check(model: mujoco.MjModel) -> None:
@@ -331,7 +337,7 @@ def physics_step(
             push,
         )
     else:
-        moved = _mjx_step(airframe, state, _applied(airframe, state, thrust, load or Load()))
+        moved = _mjx_step(config, state, _applied(airframe, state, thrust, load or Load()))
     position, quaternion, velocity, angular_velocity = moved
     return dataclasses.replace(
         state, position=position, quaternion=quaternion, velocity=velocity, angular_velocity=angular_velocity
@@ -360,7 +366,8 @@ def _applied(airframe: Airframe, state: DroneState, thrust: Array, load: Load) -
     return jnp.stack([*force, *torque])
 
 
-def _mjx_step(airframe: Airframe, state: DroneState, applied: Array) -> tuple[Array, Array, Array, Array]:
+@functools.partial(jax.jit, static_argnums=0, inline=True)  # traced once, not wherever a drone flies
+def _mjx_step(config: DroneConfig, state: DroneState, applied: Array) -> tuple[Array, Array, Array, Array]:
     """Returns position, quaternion, velocity and angular velocity after one MJX step.
 
     These are the stages of `mjx.step` for this model: with the body frame at the centre of mass and no joint
@@ -368,20 +375,31 @@ def _mjx_step(airframe: Airframe, state: DroneState, applied: Array) -> tuple[Ar
     rotors do comes as an applied force: MJX's own stages of actuation take a quarter of the step.
 
     Args:
+        config: of the drone.
+        state: before the step.
         applied: [6] force (N, world) and torque (N m, body).
     """
-    model = airframe.model
-    data = airframe.data.replace(
-        qpos=jnp.concatenate([state.position, state.quaternion]),
-        qvel=jnp.concatenate([state.velocity, state.angular_velocity]),
-        qfrc_applied=applied,
-    )
-    with jax.numpy_rank_promotion("allow"):  # MJX's own arithmetic relies on it
-        data = mjx.com_pos(model, mjx.kinematics(model, data))
+    model, template = _mjx_template(config)
+
+    def at(state: DroneState) -> mjx.Data:
+        return template.replace(
+            qpos=jnp.concatenate([state.position, state.quaternion]),
+            qvel=jnp.concatenate([state.velocity, state.angular_velocity]),
+        )
+
+    def acceleration(state: DroneState, applied: Array) -> Array:
+        data = mjx.com_pos(model, mjx.kinematics(model, at(state).replace(qfrc_applied=applied)))
         data = mjx.rne(model, mjx.com_vel(model, data))
-        data = mjx.fwd_acceleration(model, data)
-        data = mjx.euler(model, data.replace(qacc=data.qacc_smooth))
-    return data.qpos[:3], data.qpos[3:], data.qvel[:3], data.qvel[3:]
+        return mjx.fwd_acceleration(model, data).qacc_smooth
+
+    def integrated(state: DroneState, acceleration: Array) -> tuple[Array, Array, Array, Array]:
+        data = mjx.euler(model, at(state).replace(qacc=acceleration))
+        return data.qpos[:3], data.qpos[3:], data.qvel[:3], data.qvel[3:]
+
+    with jax.numpy_rank_promotion("allow"):  # MJX's own arithmetic relies on it
+        # Computed once, and not again for each number that is read.
+        force = materialised(applied)
+        return number_by_number(integrated)(state, materialised(number_by_number(acceleration)(state, force)))
 
 
 def fly(
