@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from functools import partial
 
 import jax
@@ -383,6 +384,18 @@ def parts(config, memory, frames):
     noise = ev.noise_events(config, memory.hot, signal.count, times - times[0], key)
     shown, _ = ev.events(config, memory, frames, TIMES, key)
     return signal, noise, shown
+
+
+@pytest.mark.parametrize("most", [4, 16, 100])
+@pytest.mark.parametrize("mean", [0.0, 0.05, 0.4, 3.0, 120.0])
+def test_counts_of_noise_are_poisson_cut_off_at_the_most(mean, most):
+    many = 200_000
+    counts = np.asarray(jax.jit(ev.poisson, static_argnums=2)(jax.random.key(KEY), jnp.full(many, mean), most))
+    terms = [math.exp(k * math.log(mean) - mean - math.lgamma(k + 1)) if mean else float(k == 0) for k in range(most)]
+    expected = np.array([*terms, max(1 - sum(terms), 0.0)])
+    found = np.bincount(np.minimum(counts, most), minlength=most + 1) / many
+    # Five standard errors of a share of `many`, and what float32 leaves of a distribution function.
+    assert np.all(np.abs(found - expected) < 5 * np.sqrt(expected / many) + 1e-6)
 
 
 @few
