@@ -79,7 +79,7 @@ def _draw_memory(axes: Axes, report: dict[str, Any]) -> None:
     memory = report["memory"]
     named = {
         "a replay of 1 000 000 transitions": memory["bytes_of_a_million_transitions"],
-        "parameters, optimisers, keys, samples of the VAE": memory["bytes_of_the_rest"],
+        "parameters, optimisers, keys, samples": memory["bytes_of_the_rest"],
         "one environment, in the compiled step": memory["temporary_bytes_per_environment"],
         "one environment, between steps": memory["bytes_per_environment"],
         "one slot of the replay": memory["bytes_per_replay_slot"],
