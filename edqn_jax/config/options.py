@@ -46,7 +46,7 @@ class DroneConfig:
     """The airframe and its inner loops: velocity, attitude and body rate, all at the physics rate."""
 
     physics: Literal["mjx", "rigid_body"] = "mjx"
-    """Physics engine. `rigid_body`: the closed form of MJX's equations for this airframe, several times as fast."""
+    """Physics engine. `rigid_body`: the closed form of MJX's equations for this airframe, which compiles sooner."""
     physics_dt_s: float = 0.02
     """Physics step, seconds."""
     physics_steps: int = 13
