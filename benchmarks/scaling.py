@@ -42,9 +42,9 @@ from measurement.whole import WholeStep, steady
 
 REPEATS, QUICK_REPEATS = 7, 3
 DECISIONS, QUICK_DECISIONS = 4096, 2048
-"""Approximate number of decisions in a chunk, of at least `STEPS` steps."""
+"""Approximate number of decisions in a chunk, unless these are less than `STEPS` steps."""
 STEPS = 16
-"""With one, as 4,096 environments would have, a quarter of the time is that of beginning and ending chunks."""
+"""Minimum number of steps in a chunk; with one, beginning and ending chunks takes a quarter of the time."""
 TURN_SECONDS = 0.5
 """Minimum duration of a turn of one size."""
 MILLION = 1_000_000
@@ -262,7 +262,7 @@ def memory_lines(memory: dict[str, Any]) -> list[str]:
         f"| state of one environment | {memory['bytes_per_environment']:,} |",
         f"| one slot of the replay | {memory['bytes_per_replay_slot']:,} |",
         f"| a replay of 1 000 000 transitions | {memory['bytes_of_a_million_transitions']:,} |",
-        f"| parameters, optimisers, keys, samples of the VAE | {memory['bytes_of_the_rest']:,} |",
+        f"| parameters, optimisers, keys, samples of the encoder | {memory['bytes_of_the_rest']:,} |",
     ]
     if temporary is not None:
         lines.append(f"| temporary in the compiled chunk, per environment | {temporary:,.0f} |")

@@ -14,7 +14,9 @@ MUTANTS = load_mutants()
 
 @pytest.mark.parametrize("mutant", MUTANTS, ids=[mutant.name for mutant in MUTANTS])
 def test_a_mutant_changes_one_place_and_names_tests_that_there_are(mutant: Mutant) -> None:
-    compile(mutated(mutant, ROOT), mutant.file, "exec")
+    text = mutated(mutant, ROOT)
+    if mutant.file.endswith(".py"):
+        compile(text, mutant.file, "exec")
     assert mutant.replace != mutant.find
     for test in mutant.tests:
         file, function = test.split("::")

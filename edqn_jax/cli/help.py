@@ -94,7 +94,7 @@ COMMON = {
     "env.sensor": "what the drone observes",
     "env.speed_m_s": "commanded speed per axis, m/s",
     "env.reward": "goal and collision alone (Eq. 8), or metres gained, too",
-    "drone.physics": "MJX, or its equations in closed form, faster",
+    "drone.physics": "MJX, or its equations in closed form",
     "camera.width": "pixels across",
     "camera.height": "pixels down",
     "events.threshold": "change of log-brightness that makes an event",

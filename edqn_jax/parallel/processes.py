@@ -132,7 +132,7 @@ def on_any(flag: bool) -> bool:
 
 def replicate(tree: Any, mesh: Mesh) -> Any:
     """Copies arrays that are equal on every process to every device of a mesh, which may span processes."""
-    # Through the host: MJX commits its arrays to one device, and JAX cannot move them to another process from there.
+    # Through the host: JAX cannot move an array that is committed to one device to another process.
     return jax.device_put(jax.tree.map(np.asarray, tree), NamedSharding(mesh, PartitionSpec()))
 
 

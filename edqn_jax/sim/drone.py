@@ -6,8 +6,8 @@ quaternion (w, x, y, z) turns body vectors into world vectors.
 Heading is the quaternion's turn about the world's z, 2 atan2(z, w): what remains when the tilt is undone by
 the shortest rotation, as a gimbal does. Unlike the Euler angle it does not change when a drone only tilts.
 
-Inside the scan everything but MJX is computed in scalars, one per coordinate: mapped over environments they
-are contiguous rows that XLA fuses into a few loops.
+Inside the scan everything is computed in scalars, one per coordinate (MJX by `scalars.py`): mapped over environments
+they are contiguous rows that XLA fuses into a few loops.
 """
 
 from __future__ import annotations
@@ -45,7 +45,10 @@ LEAST_LEVELNESS = 0.4
 
 @struct.dataclass
 class Airframe:
-    """Constants of the airframe. R = 4 rotors."""
+    """Constants of the airframe, of controller, rotors and `rigid_body`. R = 4 rotors.
+
+    MJX flies mass, inertia and gravity of the MJCF file (`_mjx_template`), whatever these say.
+    """
 
     mass: Array  # [] kg
     inertia: Array  # [3] kg m^2 about the body's axes
@@ -100,7 +103,7 @@ def mixer_of(model: mujoco.MjModel) -> np.ndarray:
 
 
 def load_airframe(config: DroneConfig) -> Airframe:
-    """Returns what a controller knows of the Skydio X2, and the mixer that follows from its rotor layout.
+    """Returns the constants of the Skydio X2, with the mixer that follows from its rotor layout.
 
     Raises:
         ConfigError: if the airframe's file has something that a physics step would ignore.
@@ -133,11 +136,14 @@ def _check(model: mujoco.MjModel) -> None:
     in_vacuum = not model.opt.density and not model.opt.viscosity and not model.opt.wind.any()
     centred = np.allclose(model.body_ipos[1], 0.0) and np.allclose(np.abs(model.body_iquat[1]), [1, 0, 0, 0])
     rotors = model.actuator_trnid[:, 0]
+    # Otherwise `mjx.euler` computes accelerations of its own.
+    undamped = model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_EULERDAMP
     upright = not model.actuator_gear[:, [0, 1, 3, 4]].any() and np.allclose(model.site_quat[rotors], [1, 0, 0, 0])
-    if not (free and in_vacuum and centred and upright):
+    if not (free and in_vacuum and centred and upright and undamped):
         raise ConfigError(
             f"'{AIRFRAME_FILE.name}' must be one free body in a vacuum, its frame at the centre of mass and along the "
-            "principal axes of inertia, under rotors that push along its z; no other model is supported"
+            "principal axes of inertia, under rotors that push along its z, with eulerdamp disabled; no other model is "
+            "supported"
         )
 
 
@@ -372,7 +378,7 @@ def _mjx_step(config: DroneConfig, state: DroneState, applied: Array) -> tuple[A
 
     These are the stages of `mjx.step` for this model: with the body frame at the centre of mass and no joint
     below it, the mass matrix is constant, the template's, and there are no collisions, constraints or damping. What the
-    rotors do comes as an applied force: MJX's own stages of actuation take a quarter of the step.
+    rotors do comes as an applied force.
 
     Args:
         config: of the drone.

@@ -476,19 +476,25 @@ def noise_events(
     return EventField(count, jnp.where(count > 0, sign, 0).astype(jnp.int8), starts + phase, step, 0.0)
 
 
-def poisson(key: Array, mean: Array, most: int) -> Array:
-    """Returns Poisson counts of a mean [...], int32; those beyond `most` as `most`, or as they are.
+MOST_BY_INVERSION = 16
 
-    Up to a `most` of 16, as refractory pixels have, a count is that of how many values of the distribution function one
-    uniform number exceeds, which costs a hundredth of `jax.random.poisson`.
+
+def poisson(key: Array, mean: Array, most: int) -> Array:
+    """Returns Poisson counts of a mean [...], int32, to probabilities of 2^-23.
+
+    For `most` <= MOST_BY_INVERSION counts are capped at `most`, otherwise they are not capped. Capped ones, as
+    refractory pixels have, come from one uniform number by inversion, at a small part of the cost of
+    `jax.random.poisson`.
     """
-    if most > 16:
+    if most > MOST_BY_INVERSION:
         return jax.random.poisson(key, mean, mean.shape, dtype=jnp.int32)
     drawn = jax.random.uniform(key, mean.shape)
     probability = below = jnp.exp(-mean)
     count = jnp.zeros(mean.shape, jnp.int32)
     for number in range(most):
-        count = count + (drawn >= below)
+        # Above the median, what is less probable than a step of `drawn` is left out: float32's sum may end below 1.
+        possible = (below < 0.5) | (probability > 2.0**-24)
+        count = count + ((drawn >= below) & possible)
         probability = probability * mean / (number + 1)
         below = below + probability
     return count

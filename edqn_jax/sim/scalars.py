@@ -1,8 +1,8 @@
 """Evaluates functions of small arrays number by number, so that XLA fuses them into a few loops.
 
-A function as MJX has them cuts, joins, turns and multiplies arrays of a few numbers. XLA:CPU gives most of these steps
-a loop of their own, and mapped over environments each costs a microsecond, however little it does. Here the function is
-traced once and evaluated again with every number of its arrays an array of its own. To cut and to join then costs
+MJX's functions slice, concatenate, transpose and multiply small arrays. XLA:CPU gives most of these steps a loop of
+their own, and mapped over environments each costs a microsecond, however little it does. Here a function is traced once
+and its jaxpr evaluated again with every number of its arrays a traced array []. Slicing and concatenating then cost
 nothing, what is left is arithmetic of whole rows of environments, which is fused, and what constants make known
 beforehand (products with zeros and ones, above all) is not computed.
 """
@@ -25,32 +25,31 @@ from jax.extend.core import ClosedJaxpr, Literal
 Numbers = np.ndarray
 """Constants in their own dtype; or objects, each a constant or a traced array []."""
 
-_CALLS = frozenset({"jit", "pjit", "closed_call", "custom_jvp_call", "custom_vjp_call"})
-
 
 def number_by_number(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Returns `function` evaluated number by number: the same results to rounding.
+    """Returns `function` evaluated number by number: the same finite results to rounding.
 
-    NaN and infinity times a constant 0 are 0.
+    Signs of zeros may differ, NaN and infinity times a constant 0 are 0, and derivatives are those of the operations,
+    without custom rules.
 
     Args:
-        function: of arrays of fixed shapes, to a pytree of arrays, without loops, branches and random numbers.
-            Where it reads or writes at an index, that is known when tracing, and within bounds where it reads.
+        function: of arrays of fixed shapes, to a pytree of arrays. Of JAX's operations it has those that are named in
+            this file; no loops, branches and random numbers. Indices are constants when tracing, reads in bounds.
 
     Raises:
-        NotImplementedError: when called, if the function does something else.
+        NotImplementedError: when called, if the function has another operation.
     """
 
     def evaluated(*arguments: Any) -> Any:
         jaxpr, shape = jax.make_jaxpr(function, return_shape=True)(*arguments)
-        results = _evaluated(jaxpr, [_apart(leaf) for leaf in jax.tree.leaves(arguments)])
+        results = _evaluated(jaxpr, [_to_numbers(leaf) for leaf in jax.tree.leaves(arguments)])
         leaves, tree = jax.tree.flatten(shape)
-        return jax.tree.unflatten(tree, [_joined(*each) for each in zip(results, leaves, strict=True)])
+        return jax.tree.unflatten(tree, [_to_array(*each) for each in zip(results, leaves, strict=True)])
 
     return evaluated
 
 
-def _apart(array: Any) -> Numbers:
+def _to_numbers(array: Any) -> Numbers:
     if not isinstance(array, Tracer):
         return np.asarray(array)
     parts = np.empty(array.shape, object)
@@ -59,7 +58,7 @@ def _apart(array: Any) -> Numbers:
     return parts
 
 
-def _joined(numbers: Numbers, like: jax.ShapeDtypeStruct) -> Array:
+def _to_array(numbers: Numbers, like: jax.ShapeDtypeStruct) -> Array:
     if not _traced(numbers):
         return jnp.asarray(numbers, like.dtype)
     return jnp.stack([jnp.asarray(number, like.dtype) for number in numbers.flat]).reshape(like.shape)
@@ -74,8 +73,9 @@ def _constant(number: Any) -> bool:
 
 
 def _evaluated(closed: ClosedJaxpr, arguments: Sequence[Numbers]) -> list[Numbers]:
+    """Returns the results of a jaxpr for its arguments, equation by equation."""
     jaxpr = closed.jaxpr
-    known: dict[Any, Numbers] = dict(zip(jaxpr.constvars, map(_apart, closed.consts), strict=True))
+    known: dict[Any, Numbers] = dict(zip(jaxpr.constvars, map(_to_numbers, closed.consts), strict=True))
     known.update(zip(jaxpr.invars, arguments, strict=True))
 
     def value(atom: Any) -> Numbers:
@@ -83,39 +83,43 @@ def _evaluated(closed: ClosedJaxpr, arguments: Sequence[Numbers]) -> list[Number
 
     for equation in jaxpr.eqns:
         results = _results(equation, [value(atom) for atom in equation.invars])
-        known.update(zip(equation.outvars, map(_settled, results, equation.outvars), strict=True))
+        known.update(zip(equation.outvars, map(_as_constants, results, equation.outvars), strict=True))
     return [value(atom) for atom in jaxpr.outvars]
 
 
-def _settled(numbers: Numbers, variable: Any) -> Numbers:
-    """Returns constants in their dtype, if all are constants."""
+def _as_constants(numbers: Numbers, variable: Any) -> Numbers:
+    """Returns the numbers in their variable's dtype if all are constants, as they are otherwise."""
     if _traced(numbers) and not all(map(_constant, numbers.flat)):
         return numbers
     return numbers.astype(variable.aval.dtype)
 
 
 def _results(equation: Any, operands: list[Numbers]) -> list[Numbers]:
+    """Returns the results of one equation of a jaxpr for its operands."""
     name, params = equation.primitive.name, equation.params
-    if name in _CALLS:
-        inner = params["jaxpr"] if "jaxpr" in params else params["call_jaxpr"]
-        return _evaluated(inner if isinstance(inner, ClosedJaxpr) else ClosedJaxpr(inner, ()), operands)
-    if name in _CUT_AND_JOINED:
-        return [_CUT_AND_JOINED[name](params, *operands)]
+    if name in ("jit", "closed_call"):
+        return _evaluated(params["jaxpr"], operands)
+    if name == "custom_jvp_call":
+        return _evaluated(params["call_jaxpr"], operands)
+    if name in _LAYOUT:
+        return [_LAYOUT[name](params, *operands)]
     if not any(map(_traced, operands)):
         return _of_constants(equation, operands)
     if name in _REDUCTIONS:
         return [_reduced(_REDUCTIONS[name], operands[0], params["axes"])]
     if name == "dot_general":
+        if params["preferred_element_type"] not in (None, equation.invars[0].aval.dtype):
+            raise NotImplementedError("a product cannot be summed in another dtype number by number; convert before it")
         return [_product(params["dimension_numbers"], *operands)]
     if name in _ELEMENTWISE:
         return [_elementwise(equation, operands)]
     raise NotImplementedError(f"'{name}' cannot be evaluated number by number")
 
 
-# ------------------------------------------------------------------------------------------ cutting and joining
+# -------------------------------------------------------------------------------- slices, concatenation and indices
 
 
-def _alike(parts: Sequence[Numbers]) -> list[Numbers]:
+def _same_kind(parts: Sequence[Numbers]) -> list[Numbers]:
     return [part.astype(object) for part in parts] if any(map(_traced, parts)) else list(parts)
 
 
@@ -134,7 +138,9 @@ def _sliced(params: dict[str, Any], x: Numbers) -> Numbers:
 def _places(
     shape: Sequence[int], indices: Numbers, sizes: Sequence[int], window: Sequence[int], dropped: Any, mapped: Any
 ) -> Numbers:
-    """Returns the place, in an array of `shape` that is made flat, of all that is read or written; -1 out of bounds.
+    """Returns the place [...] of all that is read or written, in an array of `shape` that is made flat.
+
+    All places of a window that is not in bounds are -1.
 
     Args:
         shape: of what is read from or written to.
@@ -145,48 +151,60 @@ def _places(
         mapped: K axes.
     """
     if _traced(indices):
-        raise NotImplementedError("an index must be known when tracing")
-    numbered = np.full(np.add(shape, sizes), -1)
-    numbered[tuple(map(slice, shape))] = np.arange(int(np.prod(shape))).reshape(shape)
+        raise NotImplementedError("an index must be a constant when tracing")
+    numbered = np.arange(int(np.prod(shape))).reshape(shape)
     found = []
     for first in indices.reshape(-1, indices.shape[-1]):
         corner = np.zeros(len(shape), int)
         corner[list(mapped)] = first
-        corner = np.where((corner < 0) | (corner > shape), shape, corner)
-        cut = tuple(slice(low, low + size) for low, size in zip(corner, sizes, strict=True))
-        found.append(np.squeeze(numbered[cut], tuple(dropped)))
+        inside = bool(((corner >= 0) & (corner + sizes <= shape)).all())
+        cut = [slice(low, low + size) for low, size in zip(corner if inside else 0 * corner, sizes, strict=True)]
+        places = np.squeeze(numbered[tuple(cut)], tuple(dropped))
+        found.append(places if inside else np.full_like(places, -1))
     places = np.reshape(found, [*indices.shape[:-1], *found[0].shape])
     others = [axis for axis in range(places.ndim) if axis not in window]
     return np.moveaxis(places, range(places.ndim), [*others, *window])
 
 
+def _dimension_numbers(params: dict[str, Any]) -> Any:
+    numbers = params["dimension_numbers"]
+    if numbers.operand_batching_dims:
+        raise NotImplementedError(
+            "an index must not be mapped by vmap inside of the function; map the function instead"
+        )
+    return numbers
+
+
 def _gathered(params: dict[str, Any], x: Numbers, indices: Numbers) -> Numbers:
-    how, sizes = params["dimension_numbers"], params["slice_sizes"]
-    if how.operand_batching_dims:
-        raise NotImplementedError("a gather with axes in common cannot be evaluated number by number")
-    places = _places(x.shape, indices, sizes, how.offset_dims, how.collapsed_slice_dims, how.start_index_map)
+    numbers = _dimension_numbers(params)
+    axes = numbers.offset_dims, numbers.collapsed_slice_dims, numbers.start_index_map
+    places = _places(x.shape, indices, params["slice_sizes"], *axes)
     if (places < 0).any():
-        raise NotImplementedError("what is out of bounds cannot be read number by number")
+        raise NotImplementedError("an index to read at must be in bounds")
     return x.reshape(-1)[places]
 
 
 def _scattered(params: dict[str, Any], x: Numbers, indices: Numbers, new: Numbers, *, add: bool) -> Numbers:
-    how = params["dimension_numbers"]
-    if how.operand_batching_dims:
-        raise NotImplementedError("a scatter with axes in common cannot be evaluated number by number")
-    kept = [axis for axis in range(x.ndim) if axis not in how.inserted_window_dims]
+    """Returns `x` with numbers written at indices, or added; windows out of bounds are left out."""
+    numbers = _dimension_numbers(params)
+    if not add and params["update_jaxpr"] is not None:
+        raise NotImplementedError("a function cannot be applied at indices number by number; set what it returns")
+    windows = [axis for axis in range(x.ndim) if axis not in numbers.inserted_window_dims]
     sizes = [1] * x.ndim
-    for axis, of in zip(kept, how.update_window_dims, strict=True):
-        sizes[axis] = new.shape[of]
-    axes = how.update_window_dims, how.inserted_window_dims, how.scatter_dims_to_operand_dims
+    for axis, of_new in zip(windows, numbers.update_window_dims, strict=True):
+        sizes[axis] = new.shape[of_new]
+    axes = numbers.update_window_dims, numbers.inserted_window_dims, numbers.scatter_dims_to_operand_dims
+    places = _places(x.shape, indices, sizes, *axes)
+    if (places < 0).any() and params["mode"] == jax.lax.GatherScatterMode.CLIP:
+        raise NotImplementedError("an index to write at must be in bounds where it is clipped")
     result = x.astype(object).reshape(-1)
-    for place, number in zip(_places(x.shape, indices, sizes, *axes).flat, new.astype(object).flat, strict=True):
+    for place, number in zip(places.flat, new.astype(object).flat, strict=True):
         if place >= 0:
             result[place] = _plus(result[place], number) if add else number
     return result.reshape(x.shape)
 
 
-_CUT_AND_JOINED: dict[str, Callable[..., Numbers]] = {
+_LAYOUT: dict[str, Callable[..., Numbers]] = {
     "slice": _sliced,
     "squeeze": lambda params, x: np.squeeze(x, tuple(params["dimensions"])),
     "reshape": lambda params, x: x.reshape(params["new_sizes"]),
@@ -194,8 +212,8 @@ _CUT_AND_JOINED: dict[str, Callable[..., Numbers]] = {
     "rev": lambda params, x: np.flip(x, params["dimensions"]),
     "broadcast_in_dim": _broadcast,
     "tile": lambda params, x: np.tile(x, params["reps"]),
-    "concatenate": lambda params, *parts: np.concatenate(_alike(parts), params["dimension"]),
-    "stack": lambda params, *parts: np.stack(_alike(parts), params["axis"]),
+    "concatenate": lambda params, *parts: np.concatenate(_same_kind(parts), params["dimension"]),
+    "stack": lambda params, *parts: np.stack(_same_kind(parts), params["axis"]),
     "gather": _gathered,
     "scatter": functools.partial(_scattered, add=False),
     "scatter-add": functools.partial(_scattered, add=True),
@@ -203,28 +221,26 @@ _CUT_AND_JOINED: dict[str, Callable[..., Numbers]] = {
 
 # ---------------------------------------------------------------------------------------------------- arithmetic
 
-_QUICK: dict[str, Callable[..., Numbers]] = {
+_NUMPY: dict[str, Callable[..., Numbers]] = {
     **{"add": np.add, "sub": np.subtract, "mul": np.multiply, "max": np.maximum, "min": np.minimum, "neg": np.negative},
     **{"lt": np.less, "le": np.less_equal, "gt": np.greater, "ge": np.greater_equal, "eq": np.equal},
     **{"ne": np.not_equal, "and": np.bitwise_and, "or": np.bitwise_or, "rem": np.fmod},
 }
-"""Of constants, in NumPy: most are arithmetic of indices, and XLA compiles a program for each shape."""
+"""NumPy functions for constant operands, mostly indices; XLA would compile a program for each shape."""
 
 _ELEMENTWISE = frozenset(
-    "abs acos add add_any and asin atan atan2 ceil clamp convert_element_type cos div eq exp expm1 floor ge gt "
-    "integer_pow is_finite le log log1p logistic lt max min mul ne neg not or pow reduce_precision rem round rsqrt "
-    "select_n sign sin sqrt square sub tan tanh xor".split()
+    "abs add add_any and atan2 clamp convert_element_type cos div eq exp floor ge gt integer_pow is_finite le log lt "
+    "max min mul ne neg not or pow reduce_precision rem rsqrt select_n sign sin sqrt square sub tan tanh".split()
 )
 
 
 def _of_constants(equation: Any, operands: Sequence[Any]) -> list[Numbers]:
+    """Returns the results of an equation whose operands are all constants, as constants."""
     name = equation.primitive.name
-    if name in _QUICK:
-        return [_QUICK[name](*operands)]
+    if name in _NUMPY:
+        return [_NUMPY[name](*operands)]
     if name == "select_n":
         return [np.choose(np.asarray(operands[0], int), operands[1:])]
-    if name == "convert_element_type":
-        return [operands[0].astype(equation.params["new_dtype"])]
     with jax.ensure_compile_time_eval():
         found = equation.primitive.bind(*map(jnp.asarray, operands), **equation.params)
     return [np.asarray(each) for each in (found if equation.primitive.multiple_results else [found])]
@@ -242,7 +258,7 @@ def _simpler(name: str, a: Any, b: Any) -> Any:
         return b
     if name == "sub" and _is(a, 0):
         return -b
-    if name in ("mul", "div") and (_is(a, 0) or _is(b, 1)):
+    if (name == "mul" and _is(a, 0)) or (name in ("mul", "div") and _is(b, 1)):
         return a
     if name == "mul" and (_is(b, 0) or _is(a, 1)):
         return b
@@ -272,6 +288,7 @@ _REDUCTIONS: dict[str, Callable[[Any, Any], Any]] = {
 
 
 def _reduced(combine: Callable[[Any, Any], Any], x: Numbers, axes: Sequence[int]) -> Numbers:
+    """Returns `x` with the numbers along `axes` combined, first to last."""
     kept = [axis for axis in range(x.ndim) if axis not in axes]
     rows = x.transpose([*kept, *axes]).reshape([*(x.shape[axis] for axis in kept), -1])
     result = np.empty(rows.shape[:-1], object)
@@ -281,6 +298,7 @@ def _reduced(combine: Callable[[Any, Any], Any], x: Numbers, axes: Sequence[int]
 
 
 def _product(dimensions: Any, a: Numbers, b: Numbers) -> Numbers:
+    """Returns the sums of products of `dot_general`: axes in common, then those of `a`, then those of `b`."""
     (over_a, over_b), (shared_a, shared_b) = dimensions
 
     def rows(x: Numbers, over: Sequence[int], shared: Sequence[int]) -> tuple[Numbers, list[int]]:
@@ -296,6 +314,7 @@ def _product(dimensions: Any, a: Numbers, b: Numbers) -> Numbers:
 
 
 def _elementwise(equation: Any, operands: list[Numbers]) -> Numbers:
+    """Returns an equation's result, computed for each number unless a constant spares it."""
     name, dtypes = equation.primitive.name, [atom.aval.dtype for atom in equation.invars]
     shape = np.broadcast_shapes(*(x.shape for x in operands))
     result = np.empty(shape, object)

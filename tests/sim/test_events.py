@@ -13,7 +13,7 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
-from edqn_jax.config import EventsConfig
+from edqn_jax.config import Config, EventsConfig
 from edqn_jax.sim import events as ev
 from tests.oracles import events_plain
 
@@ -396,6 +396,25 @@ def test_counts_of_noise_are_poisson_cut_off_at_the_most(mean, most):
     found = np.bincount(np.minimum(counts, most), minlength=most + 1) / many
     # Five standard errors of a share of `many`, and what float32 leaves of a distribution function.
     assert np.all(np.abs(found - expected) < 5 * np.sqrt(expected / many) + 1e-6)
+
+
+def test_no_mean_makes_bursts_of_noise(monkeypatch):
+    monkeypatch.setattr(jax.random, "uniform", lambda key, shape: jnp.full(shape, 1 - 2.0**-23))
+    means = jnp.asarray(np.geomspace(1e-6, 4, 5000), jnp.float32)
+    counts = np.asarray(ev.poisson(jax.random.key(0), means, 16))
+    # Less than one window in 2^27 has more events than these.
+    mean = np.asarray(means, float)
+    assert np.all(counts <= 4 + 2 * mean + 6 * np.sqrt(mean))
+
+
+def test_each_frame_pair_has_the_noise_of_its_own_length():
+    config = dataclasses.replace(Config().events, shot_rate_hz=200.0, refractory_ns=5e6)
+    times = np.array([0.0, 0.005, 0.04])
+    field = ev.noise_events(config, None, jnp.zeros((2, 100, 100), jnp.int32), times, jax.random.key(KEY))
+    count = np.asarray(field.count).reshape(2, 2, 100, 100).sum(0).mean((1, 2))
+    # 200 Hz in 5 ms, at most one event a pixel: 1 - exp(-1), and in 35 ms, at most seven, with a mean of 7.
+    sevens = sum(min(k, 7) * math.exp(-7 + k * math.log(7) - math.lgamma(k + 1)) for k in range(60))
+    np.testing.assert_allclose(count, [1 - math.exp(-1), sevens], rtol=0.02)
 
 
 @few

@@ -126,7 +126,11 @@ def with_a_load(spec: mujoco.MjSpec) -> None:
     spec.bodies[1].ipos = [0.0, 0.0, -0.1]
 
 
-@pytest.mark.parametrize("change", [with_air, with_a_joint, with_a_tilted_rotor, with_a_load])
+def with_damping(spec: mujoco.MjSpec) -> None:
+    spec.option.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_EULERDAMP)
+
+
+@pytest.mark.parametrize("change", [with_air, with_a_joint, with_a_tilted_rotor, with_a_load, with_damping])
 def test_an_airframe_that_a_step_would_fly_wrongly_is_refused(change, monkeypatch: pytest.MonkeyPatch) -> None:
     spec = mujoco.MjSpec.from_file(str(AIRFRAME_FILE))
     for shape in list(spec.geoms):

@@ -1,4 +1,4 @@
-"""Runs: what is kept when one is stopped, what it ends with, when it validates; whole ones are in `tests/whole`."""
+"""Runs: what is kept when one is stopped, what it ends with, when it validates."""
 
 from __future__ import annotations
 
