@@ -14,7 +14,7 @@ from edqn_jax.learn.policy import Policy, PolicyParams
 from edqn_jax.sim.outcomes import Outcome
 from edqn_jax.sim.reward import Transition
 from edqn_jax.training.loop import Chunk, TrainingResult, train
-from tests.training.test_run import CONFIG
+from tests.whole.test_run import CONFIG
 
 SMALL = dataclasses.replace(
     CONFIG,

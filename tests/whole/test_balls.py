@@ -17,7 +17,7 @@ from edqn_jax.runs.directory import RunDirectory
 from edqn_jax.training.run import train_run
 from edqn_jax.training.stopping import Stop
 from edqn_jax.training.verify import verify
-from tests.training.test_run import CONFIG
+from tests.whole.test_run import CONFIG
 
 WORLD = WorldConfig(name="sparse", flown="", pool_size=2, missions=8, balls=3)
 BALLS = dataclasses.replace(CONFIG, world=WORLD, train=dataclasses.replace(CONFIG.train, devices=2))

@@ -24,7 +24,7 @@ from edqn_jax.training.stopping import Stop
 from edqn_jax.training.verify import verify
 from tests.miniature import WORLD as MINIATURE_WORLD
 from tests.training.test_loop import SMALL
-from tests.training.test_run import FIGURES
+from tests.whole.test_run import FIGURES
 
 RANDOM = dataclasses.replace(
     SMALL, world=WorldConfig(name="sparse", flown=str(MINIATURE_WORLD), pool_size=2, missions=8)

@@ -17,7 +17,7 @@ from edqn_jax.config.loading import to_yaml
 from edqn_jax.runs.checkpoints import load_params
 from edqn_jax.runs.directory import RunDirectory
 from tests.processes import PATIENCE_S, WORLD, by_srun, one_process, to_the_end, two_processes
-from tests.training.test_run import CONFIG
+from tests.whole.test_run import CONFIG
 
 
 def arguments_for(config: Config, folder: Path) -> list[str]:

@@ -29,13 +29,13 @@ from edqn_jax.training.run import train_run
 from edqn_jax.training.stopping import Stop
 from edqn_jax.training.verify import verify
 from tests.processes import ROOT
-from tests.training.test_run import CONFIG, FIGURES
+from tests.whole.test_run import CONFIG, FIGURES
 
 KILLED = """
 import sys, time
 from pathlib import Path
 from tests import conftest
-from tests.training.test_run import CONFIG, Progress, RunDirectory, Stop, train_run
+from tests.whole.test_run import CONFIG, Progress, RunDirectory, Stop, train_run
 from edqn_jax.training import keeper
 import dataclasses
 keeper.MOST_OVERHEAD = 1e9
