@@ -181,7 +181,7 @@ def encounters(path: Array, flies: Array, until: Array, reach: float) -> Array:
 def meeting(one: Array, other: Array, reach: float) -> Array:
     """Returns when two spheres that move straight within each physics step first touch: [] physics steps, inf if never.
 
-    Seen from the other, one moves along a segment d0 + f d, f in [0, 1]; they touch where |d0 + f d| = reach. The
+    Seen from the other, one moves along a segment `d0 + f d`, f in [0, 1]; they touch where its length is `reach`. The
     result is the same to the bit with the two exchanged.
 
     Args:
