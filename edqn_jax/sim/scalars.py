@@ -113,7 +113,7 @@ def _results(equation: Any, operands: list[Numbers]) -> list[Numbers]:
         return [_product(params["dimension_numbers"], *operands)]
     if name in _ELEMENTWISE:
         return [_elementwise(equation, operands)]
-    raise NotImplementedError(f"'{name}' cannot be evaluated number by number")
+    raise NotImplementedError(f"'{name}' cannot be evaluated number by number; call a function that has it as it is")
 
 
 # -------------------------------------------------------------------------------- slices, concatenation and indices

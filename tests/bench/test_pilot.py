@@ -167,15 +167,25 @@ MOVING = """<mujoco>
 </mujoco>"""
 
 
-def hovering(tmp_path: Path, decisions: int, **words: str) -> list[Piloted]:
-    """A drone that stays at its start while a box moves in front of it; it after 0, 1, ... decisions."""
+BALL = """<mujoco>
+  <custom><text name="motion:it" data="throw 0.6 2 6 10 0 0 4"/></custom>
+  <worldbody>
+    <site name="start" pos="3 10 4"/><site name="goal" pos="21 10 4"/>
+    <site name="volume" type="box" pos="12 10 4" size="12 10 4"/>
+    <body name="it" mocap="true" pos="12 2 2"><geom type="sphere" size="0.4"/></body>
+  </worldbody>
+</mujoco>"""
+
+
+def hovering(tmp_path: Path, decisions: int, world: str = MOVING, **words: str) -> list[Piloted]:
+    """A drone that stays at its start while something moves in front of it; it after 0, 1, ... decisions."""
     file = tmp_path / "moving.xml"
-    file.write_text(MOVING.format(**words))
+    file.write_text(world.format(**words))
     pool = stack_scenes([load_world(file).scene])
-    world = World(drone.load_airframe(CONFIG.drone), pool, own_missions(pool))
+    flown = World(drone.load_airframe(CONFIG.drone), pool, own_missions(pool))
     number, shape = jnp.zeros((), jnp.int32), pilot.grid_shape(TRUE.map, pool.volume)
-    flying = jax.jit(functools.partial(pilot._begin, CONFIG, TRUE, shape, world, params()))(number, jax.random.key(0))
-    step = jax.jit(functools.partial(pilot.decide, CONFIG, TRUE, world, params()))
+    flying = jax.jit(functools.partial(pilot._begin, CONFIG, TRUE, shape, flown, params()))(number, jax.random.key(0))
+    step = jax.jit(functools.partial(pilot.decide, CONFIG, TRUE, flown, params()))
     points = sampled(np.array([[3.0, 10.0, 4.0], [3.5, 10.0, 4.0]]))
     seen = [flying]
     for _ in range(decisions):
@@ -204,6 +214,14 @@ def test_an_obstacle_that_flies_into_a_hovering_drone_is_a_collision_at_its_own_
     end = seen[-1].flights
     assert int(end.outcome) == Outcome.COLLISION and int(end.decisions) == 6
     assert float(end.flight_seconds) == pytest.approx((3 - CONFIG.drone.body_radius_m) / 2, abs=0.01)
+
+
+def test_a_ball_is_thrown_at_where_the_pilot_hovers(tmp_path: Path) -> None:
+    # Due 0.7 s after the start, so thrown as the third decision begins, 2 s before it would meet the drone's middle.
+    end = hovering(tmp_path, 12, BALL)[-1].flights
+    assert int(end.outcome) == Outcome.COLLISION
+    expected = 2 * 0.26 + 2 - (0.4 + CONFIG.drone.body_radius_m) / 6
+    assert float(end.flight_seconds) == pytest.approx(expected, abs=0.02)
 
 
 def test_a_flight_that_is_over_keeps_the_map_of_its_last_command(tmp_path: Path) -> None:

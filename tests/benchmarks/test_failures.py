@@ -58,6 +58,17 @@ def test_the_ground_is_below(course) -> None:
 
 
 @pytest.mark.slow
+def test_a_ball_that_was_thrown_at_a_hovering_drone_is_what_was_hit(tmp_path: Path) -> None:
+    file = tmp_path / "ball.xml"
+    ball = '<body name="ball" mocap="true" pos="20 0 8"><geom type="sphere" size="0.4"/></body>'
+    words = '<custom><text name="motion:ball" data="throw 0.4 2 6 0 0 0 4"/></custom>'
+    file.write_text(WORLD.replace("<worldbody>", f"{words}<worldbody>{ball}"))
+    row = flown(load_missions(CONFIG, str(file)), (0, 0, 0))
+    # Thrown at a drone of steady pace it would be 16 m away, and the ground be nearest.
+    assert (row["hit"], row["side"]) == ("ball", "ahead")
+
+
+@pytest.mark.slow
 def test_a_shape_alone_is_all_that_is_left(course) -> None:
     scene = course.scene()
     only = failures.alone(scene, "spheres", 0)

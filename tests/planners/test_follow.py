@@ -13,11 +13,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from edqn_jax.config import Config
+from edqn_jax.errors import ConfigError
 from edqn_jax.planners import snn
 from edqn_jax.planners.follow import SPACING_M, FollowConfig, compiled_follower, reserved, sampled, steer
 from edqn_jax.planners.planner import Task, path_length
 from edqn_jax.sim import drone
 from edqn_jax.sim.flights import Flights
+from edqn_jax.sim.motion import not_thrown
 from edqn_jax.sim.outcomes import Outcome
 from tests.planners.small_worlds import RADIUS, SIZE, assert_flyable, box, enclosure, random_small_world, small_world
 
@@ -39,6 +41,14 @@ def test_in_the_open_it_flies_straight_to_the_goal_about_as_fast_as_a_learner_ma
     assert 6.0 <= flight.path_length_m < 6.3
     assert 6.0 / CONFIG.env.speed_m_s < flight.flight_seconds < 6.0 / CONFIG.env.speed_m_s + 0.8
     assert (flight.decisions - 1) * 0.26 < flight.flight_seconds <= flight.decisions * 0.26 + 1e-5
+
+
+def test_planned_paths_are_not_flown_where_balls_are_thrown():
+    task = small_world()
+    balls = dataclasses.replace(task.scene.spheres, throw=not_thrown(len(task.scene.spheres.radius)))
+    thrown = dataclasses.replace(task.scene, spheres=balls)
+    with pytest.raises(ConfigError, match=r"^planned paths are flown where no balls are thrown; world.balls must be 0"):
+        flown(dataclasses.replace(task, scene=thrown), [task.start, task.goal])
 
 
 # Two walls across the world that are open at opposite sides, 2 m wide: enough for a body of 0.36 m and its reserve.
