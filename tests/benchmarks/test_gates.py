@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 
 import jax.numpy as jnp
@@ -54,6 +55,14 @@ def test_who_flies_straight_reaches_a_free_goal_and_hits_a_wall_before_it(tmp_pa
 
 def test_who_hovers_stays_until_time_is_out(tmp_path: Path) -> None:
     assert outcome(tmp_path, "", "hover") == Outcome.TIME_OUT
+
+
+def test_several_drones_that_fly_straight_hit_each_other() -> None:
+    together = dataclasses.replace(CONFIG, env=dataclasses.replace(CONFIG.env, drones=4, max_decisions=200))
+    world = load_missions(together, "sparse", 8).world
+    found = gates.outcomes(together, world, "straight", run_streams(0).flights)
+    alone = gates.outcomes(CONFIG, world, "straight", run_streams(0).flights)
+    assert np.sum(found == Outcome.COLLISION) > np.sum(alone == Outcome.COLLISION)
 
 
 def test_a_world_of_a_file_is_refused(capsys: pytest.CaptureFixture[str]) -> None:

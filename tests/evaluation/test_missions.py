@@ -188,3 +188,10 @@ def test_runs_of_several_seeds_have_the_missions_of_each_alone(name):
             jax.tree.map(np.testing.assert_array_equal, getattr(own, kind).world, getattr(alone, kind).world)
     first, second = (each.training.world.missions.start for each in together)
     assert not np.array_equal(first, second)
+
+
+def test_several_drones_are_not_flown_where_balls_are_thrown():
+    trained = make_config("sparse", world={"balls": 1})
+    together = dataclasses.replace(trained, env=dataclasses.replace(trained.env, drones=2))
+    with pytest.raises(ConfigError, match=r"^with env.drones 2 the world must throw no balls"):
+        load_missions(together, "sparse", 4)
