@@ -11,7 +11,7 @@ import numpy as np
 from edqn_jax.config import Config
 from edqn_jax.evaluation.missions import MissionSet
 from edqn_jax.sim import group
-from edqn_jax.sim.env import aim_along
+from edqn_jax.sim.balls import aim_along
 from edqn_jax.sim.flights import Flights
 from edqn_jax.sim.motion import Flown
 from edqn_jax.sim.scene import PARKED, Scene

@@ -10,8 +10,9 @@ import numpy as np
 
 from edqn_jax.config import Config
 from edqn_jax.interop.recording import Recording
+from edqn_jax.sim.balls import aim_along
 from edqn_jax.sim.drone import Flight
-from edqn_jax.sim.env import World, aim_along, scene_of
+from edqn_jax.sim.env import World, scene_of
 from edqn_jax.sim.environment import Environment
 from edqn_jax.sim.moves import ACTIONS
 

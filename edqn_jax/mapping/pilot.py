@@ -33,7 +33,7 @@ from edqn_jax.mapping.grid import Grid, MapConfig, empty_grid, grid_shape, updat
 from edqn_jax.mapping.route import RouteConfig, Router
 from edqn_jax.parallel.devices import compiler_options
 from edqn_jax.planners.follow import FollowConfig, sampled, steer
-from edqn_jax.sim import camera, disturbances, drone, env, sensor
+from edqn_jax.sim import balls, camera, disturbances, drone, env, sensor
 from edqn_jax.sim.drone import DroneState, Flight
 from edqn_jax.sim.env import World
 from edqn_jax.sim.flights import Flights, at_start, tally
@@ -234,7 +234,9 @@ def decide(
     poses = env.poses_seen(config, before, env.timed(config, flight, steps if moves(scene) else None))
     running = flying.flights.outcome == Outcome.RUNNING
     keep = functools.partial(jax.tree.map, lambda new, old: jnp.where(running, new, old))
-    thrown = env.thrown(config, scene, flying.aim, flights.decisions, after.position, after.position - before.position)
+    thrown = balls.thrown(
+        config, scene, flying.aim, flights.decisions, after.position, after.position - before.position
+    )
     # Before looking, so that the map, by far the largest part, need not be chosen as a whole.
     flown = dataclasses.replace(
         flying, drone=keep(after, before), flights=keep(flights, flying.flights), aim=keep(thrown, flying.aim)
@@ -260,7 +262,7 @@ def at_rest(
         depth=jnp.full((config.camera.height, config.camera.width), jnp.inf),
         flights=at_start(config, scene, body),
         key=key,
-        aim=env.thrown(config, scene, env.nobody_aimed_at(world), jnp.int32(0), start, jnp.zeros(3)),
+        aim=balls.thrown(config, scene, balls.nobody_aimed_at(world.pool), jnp.int32(0), start, jnp.zeros(3)),
     )
 
 

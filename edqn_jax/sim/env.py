@@ -9,24 +9,23 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
-from functools import partial
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from flax import struct
-from jax import Array, lax
-from jax.typing import ArrayLike
+from jax import Array
 
 from edqn_jax.checks import check_finite, check_index
 from edqn_jax.config import Config, EnvConfig
 from edqn_jax.random import integers
 from edqn_jax.sim import disturbances, drone, geodesic, group, sensor
+from edqn_jax.sim.balls import nobody_aimed_at, thrown
 from edqn_jax.sim.distance import signed_distance
 from edqn_jax.sim.disturbances import Disturbance
 from edqn_jax.sim.drone import Airframe, DroneState, Flight
 from edqn_jax.sim.missions import Missions
-from edqn_jax.sim.motion import AT_ONCE_S, Aim, aim_at, due, no_aim
+from edqn_jax.sim.motion import Aim
 from edqn_jax.sim.moves import ACTIONS
 from edqn_jax.sim.outcomes import Outcome, judge
 from edqn_jax.sim.reward import Reward, Transition, configured_reward
@@ -276,53 +275,8 @@ def ended(config: Config, world: World, key: Array, mission: Array | None = None
         episode_return=jnp.zeros(()),
         key=key,
         disturbance=disturbance,
-        aim=nobody_aimed_at(world),
+        aim=nobody_aimed_at(world.pool),
     )
-
-
-def nobody_aimed_at(world: World) -> Aim | None:
-    """Returns the aim of one flight's balls before any is thrown; None where no world has any."""
-    throw = world.pool.spheres.throw
-    return None if throw is None else no_aim(jax.tree.map(lambda leaf: leaf[0], throw))
-
-
-def thrown(config: Config, scene: Scene, aim: Aim | None, decision: Array, here: Array, moved: Array) -> Aim | None:
-    """Returns the aim with that of the balls which are thrown as decision [] int32 begins.
-
-    A ball is thrown at the beginning of the decision in which it is due.
-
-    Args:
-        here: [3] metres, where the drone is.
-        moved: [3] metres, how far it has come within the decision before.
-    """
-    throw = scene.spheres.throw
-    if throw is None or aim is None:
-        return None
-    step_s = config.drone.physics_steps * config.drone.physics_dt_s
-    begins = jnp.floor((due(throw, scene.start, scene.goal) + AT_ONCE_S) / step_s).astype(jnp.int32)
-    now = begins == decision
-    new = aim_at(throw, scene.goal, scene.volume, _time(config, decision), here, moved, step_s)
-    return jax.tree.map(lambda a, b: jnp.where(now if a.ndim == 1 else now[:, None], a, b), new, aim)
-
-
-@partial(jax.jit, static_argnums=0)
-def aim_along(config: Config, scene: Scene, places: ArrayLike) -> Aim:
-    """Returns the aim of the balls of one world in a whole flight.
-
-    Args:
-        scene: with balls; its start and goal are those of the flight.
-        places: [D + 1, 3] metres, where the drone was at its start and after each decision; NaN after its end.
-    """
-    throw, here = scene.spheres.throw, jnp.asarray(places)
-    assert throw is not None
-    moved = jnp.diff(here, axis=0, prepend=here[:1])
-
-    def decide(aim: Aim, flown: tuple[Array, Array, Array]) -> tuple[Aim, None]:
-        decision, place, way = flown
-        new = thrown(config, scene, aim, decision, place, way)
-        return _choose(jnp.all(jnp.isfinite(place)), new, aim), None
-
-    return lax.scan(decide, no_aim(throw), (jnp.arange(len(here)), here, moved))[0]
 
 
 def _drawn_mission(config: Config, world: World, key: Array) -> Array:
@@ -384,7 +338,7 @@ def step(
     check_index(action, len(ACTIONS), "the moves")
     check_index(mission, world.missions.scene.shape[0], "the missions")
     goal = world.missions.goal[mission]
-    nobody = nobody_aimed_at(world)
+    nobody = nobody_aimed_at(world.pool)
     scene = scene_of(world, mission, _choose(is_reset, nobody, state.aim))
 
     # For an ended environment the decision is computed and dropped.

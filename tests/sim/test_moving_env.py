@@ -17,6 +17,7 @@ from edqn_jax.config.loading import make_config
 from edqn_jax.evaluation.rollouts import fly_missions
 from edqn_jax.learn.policy import fresh_policy
 from edqn_jax.sim import drone, env, sensor
+from edqn_jax.sim.balls import aim_along
 from edqn_jax.sim.distance import signed_distance
 from edqn_jax.sim.env import World
 from edqn_jax.sim.environment import Environment
@@ -255,7 +256,7 @@ def test_a_ball_is_where_the_drones_last_decision_has_sent_it():
     # The same from the recorded places alone.
     start = np.asarray(world.missions.start[0])
     places = np.stack([start, *(np.asarray(step.flight.position[-1]) for step in steps)])
-    whole = env.aim_along(CONFIG, scene, np.concatenate([places, np.full((3, 3), np.nan)]))
+    whole = aim_along(CONFIG, scene, np.concatenate([places, np.full((3, 3), np.nan)]))
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-5), whole, states[-1].aim)
 
 
