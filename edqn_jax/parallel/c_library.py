@@ -1,4 +1,4 @@
-"""Functions in C that XLA calls on CPUs: compiled once for this machine, kept beside compiled programs.
+"""Functions in C that XLA calls, on CPUs or GPUs: compiled once for this machine, kept beside compiled programs.
 
 Whoever uses one has the same function in JAX for where there is no compiler, and a test that both agree.
 """
@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import contextlib
 import ctypes
+import dataclasses
 import functools
 import hashlib
 import logging
@@ -16,6 +17,7 @@ import shutil
 import subprocess
 import tempfile
 import threading
+from collections.abc import Sequence
 from pathlib import Path
 
 import jax
@@ -29,61 +31,105 @@ _ONE_AT_A_TIME = threading.Lock()
 
 HEADER = Path(__file__).with_name("handler.h")
 
-FLAGS = (
-    *("-std=gnu11", "-O3", "-march=native", "-fPIC", "-shared"),
-    # What vector instructions need. Comparisons of NaN are never relied on.
-    *("-fno-math-errno", "-fno-trapping-math", "-ffinite-math-only", "-fno-signed-zeros"),
+
+@dataclasses.dataclass(frozen=True)
+class Compiler:
+    """What compiles a source, and for which of XLA's platforms."""
+
+    variable: str  # environment variable that names another one, with its own options
+    usual: str
+    flags: tuple[str, ...]
+    platform: str
+
+
+C = Compiler(
+    "CC",
+    "cc",
+    (
+        *("-std=gnu11", "-O3", "-march=native", "-fPIC", "-shared"),
+        # What vector instructions need. Comparisons of NaN are never relied on.
+        *("-fno-math-errno", "-fno-trapping-math", "-ffinite-math-only", "-fno-signed-zeros"),
+    ),
+    "cpu",
 )
+
+
+@functools.cache
+def cuda() -> Compiler | None:
+    """Returns the compiler for NVIDIA GPUs like the first of this machine; None where there is none."""
+    try:
+        major, minor = str(jax.devices("cuda")[0].compute_capability).split(".")
+    except RuntimeError:
+        return None
+    # Quotients and roots to 2 units in the last place, as fused products are in any case.
+    fast = ("-prec-div=false", "-prec-sqrt=false")
+    return Compiler("NVCC", "nvcc", ("-O3", f"-arch=sm_{major}{minor}", *fast, "-Xcompiler=-fPIC", "-shared"), "CUDA")
 
 
 @functools.cache
 def compiler() -> str | None:
     """Returns the C compiler that is used and its version, as its own first line; None where nothing in C is used."""
-    command = _command()
-    if command is None:
-        return None
+    command = _command(C)
+    return None if command is None else next(iter(_version(command).splitlines()), shlex.join(command))
+
+
+def _version(command: Sequence[str]) -> str:
+    """Returns what a compiler says of its version; nothing where it does not answer."""
     with contextlib.suppress(OSError, subprocess.SubprocessError):
         said = subprocess.run([*command, "--version"], capture_output=True, text=True, timeout=20)
-        if said.returncode == 0 and said.stdout.strip():
-            return said.stdout.strip().splitlines()[0]
-    return shlex.join(command)
+        if said.returncode == 0:
+            return said.stdout.strip()
+    return ""
 
 
-def _command() -> list[str] | None:
-    """Returns the compiler that CC names, `cc` otherwise, with its own options; None where none is to be used."""
+def _command(of: Compiler) -> list[str] | None:
+    """Returns the compiler that the variable names, else the usual one, with its options; None if none is to be used."""
     if os.environ.get(SWITCH, "1") == "0":
         return None
-    words = shlex.split(os.environ.get("CC", "")) or ["cc"]
+    words = shlex.split(os.environ.get(of.variable, "")) or [of.usual]
     found = shutil.which(words[0])
     return None if found is None else [found, *words[1:]]
 
 
-def registered(source: Path, targets: tuple[str, ...], definitions: tuple[str, ...] = ()) -> bool:
+def registered(
+    source: Path,
+    targets: tuple[str, ...],
+    definitions: tuple[str, ...] = (),
+    compiler: Compiler = C,
+    headers: tuple[Path, ...] = (),
+) -> bool:
     """Compiles and loads a source, and registers its handlers with XLA; returns whether that was possible.
 
-    Where there is a compiler and it was not, a warning says why.
+    Where there is a compiler and it was not, a warning says why. It may export `edqn_unusable`, which returns why it
+    cannot be used on this machine, or a null pointer.
 
     Args:
         source: C, with XLA's header for foreign functions.
         targets: names of its handlers.
         definitions: of the preprocessor, NAME=VALUE.
+        compiler: and for what.
+        headers: that the source includes from beside it.
     """
     with _ONE_AT_A_TIME:
-        return _registered(source, targets, definitions)
+        return _registered(source, targets, definitions, compiler, headers)
 
 
 @functools.cache
-def _registered(source: Path, targets: tuple[str, ...], definitions: tuple[str, ...]) -> bool:
-    command = _command()
+def _registered(
+    source: Path, targets: tuple[str, ...], definitions: tuple[str, ...], compiler: Compiler, headers: tuple[Path, ...]
+) -> bool:
+    command = _command(compiler)
     if command is None:
         return False
     try:
         with contextlib.ExitStack() as scratch:
             # Where nothing can be kept, the file is not needed once it is loaded.
             folder = private_folder() or Path(scratch.enter_context(tempfile.TemporaryDirectory()))
-            library = _loaded(command, source, definitions, folder)
+            library = _loaded([*command, *compiler.flags], source, definitions, folder, headers)
+        _check_usable(library)
         for target in targets:
-            jax.ffi.register_ffi_target(target, jax.ffi.pycapsule(getattr(library, target)), platform="cpu")
+            handler = jax.ffi.pycapsule(getattr(library, target))
+            jax.ffi.register_ffi_target(target, handler, platform=compiler.platform)
     except (OSError, AttributeError, subprocess.SubprocessError, jax.errors.JaxRuntimeError) as error:
         said = error.stderr.decode(errors="replace") if isinstance(error, subprocess.CalledProcessError) else str(error)
         first = next(iter(said.strip().splitlines()), type(error).__name__)
@@ -94,12 +140,33 @@ def _registered(source: Path, targets: tuple[str, ...], definitions: tuple[str, 
     return True
 
 
-def _loaded(command: list[str], source: Path, definitions: tuple[str, ...], folder: Path) -> ctypes.CDLL:
-    """Returns the library, compiled in `folder` unless one of the same source, compiler and XLA is kept there."""
+def _check_usable(library: ctypes.CDLL) -> None:
+    """Asks a library whether it can be used here.
+
+    Raises:
+        OSError: with its answer, if it cannot.
+    """
+    ask = getattr(library, "edqn_unusable", None)
+    if ask is not None:
+        ask.restype = ctypes.c_char_p
+        reason = ask()
+        if reason is not None:
+            raise OSError(reason.decode(errors="replace"))
+
+
+def _loaded(
+    command: list[str], source: Path, definitions: tuple[str, ...], folder: Path, headers: tuple[Path, ...] = ()
+) -> ctypes.CDLL:
+    """Returns the library, compiled in `folder` unless one of the same source, compiler and XLA is kept there.
+
+    Args:
+        command: the compiler with its options.
+    """
     defined = [f"-D{definition}" for definition in definitions]
-    headers = [f"-I{folder}" for folder in (jax.ffi.include_dir(), HEADER.parent)]
-    command = [*command, *FLAGS, *defined, *headers, str(source), "-lm"]
-    told_apart = (command, compiler(), source.read_bytes(), HEADER.read_bytes(), jax.__version__)
+    searched = [f"-I{folder}" for folder in (jax.ffi.include_dir(), HEADER.parent)]
+    command = [*command, *defined, *searched, str(source), "-lm"]
+    texts = [file.read_bytes() for file in (source, HEADER, *headers)]
+    told_apart = (command, _version(command[:1]), texts, jax.__version__)
     library = folder / f"{source.stem}-{hashlib.sha256(repr(told_apart).encode()).hexdigest()[:16]}.so"
     if library.is_file():
         with contextlib.suppress(OSError):  # a damaged file is made anew

@@ -79,7 +79,7 @@ def _picture(config: CameraConfig, scene: Scene, origin: Array, rotation: Array,
     if config.mount == "level":
         image = (scene, origin, rotation, weights)
         size = (config.height, config.width)
-        return draw_in_one_batch(columns.pictures, (config, blend), image, size, on_cpu=_pictures_on_cpu)
+        return draw_in_one_batch(columns.pictures, (config, blend), image, size, natively=_pictures_natively)
     value = raycast.albedo_values(scene, weights)
     rays = raycast.camera_rays(config, rotation)
     many = raycast.camera_rays(config, rotation, config.samples_across, config.samples_down)
@@ -136,15 +136,15 @@ def on_screen(linear: Pixels) -> Pixels:
 def depth(config: CameraConfig, scene: Scene, position: Array, rotation: Array) -> Array:
     """Returns the distance along each pixel's central ray: [H, W] metres, inf where the ray meets nothing."""
     nearest = draw_in_one_batch(
-        _depths, (config,), (scene, position, rotation), (config.height, config.width), on_cpu=_depths_on_cpu
+        _depths, (config,), (scene, position, rotation), (config.height, config.width), natively=_depths_natively
     )
     rays = raycast.camera_rays(config, rotation)
     return nearest * jnp.sqrt(rays.dx**2 + rays.dy**2 + rays.dz**2)
 
 
-def _pictures_on_cpu(config: CameraConfig, _: columns.Finish, *image: Any) -> Array | None:
+def _pictures_natively(platform: str, config: CameraConfig, _: columns.Finish, *image: Any) -> Array | None:
     """Returns brightness [M, H, W] by the library in C, which blends as `blend` does; None where it cannot draw it."""
-    return native.pictures(config, *image) if native.can_draw(config, image[0]) else None
+    return native.pictures(config, *image) if native.can_draw(config, image[0], platform) else None
 
 
 def _depths(config: CameraConfig, scene: Scene, position: Array, rotation: Array) -> Array:
@@ -156,6 +156,8 @@ def _depths(config: CameraConfig, scene: Scene, position: Array, rotation: Array
     return jax.vmap(one)(scene, position, rotation)
 
 
-def _depths_on_cpu(config: CameraConfig, scene: Scene, position: Array, rotation: Array) -> Array | None:
+def _depths_natively(
+    platform: str, config: CameraConfig, scene: Scene, position: Array, rotation: Array
+) -> Array | None:
     """Returns `_depths` by the library in C; None where it cannot draw them."""
-    return native.depths(config, scene, position, rotation) if native.can_draw(config, scene) else None
+    return native.depths(config, scene, position, rotation) if native.can_draw(config, scene, platform) else None

@@ -128,7 +128,9 @@ def _mjx_template(config: DroneConfig) -> tuple[mjx.Model, mjx.Data]:
     mujoco.mj_forward(model, rest)
     here = jax.local_devices()[0]  # MJX's own choice may be another process's
     with jax.ensure_compile_time_eval():
-        return mjx.put_model(model, device=here, impl="jax"), mjx.put_data(model, rest, device=here, impl="jax")
+        placed = mjx.put_model(model, device=here, impl="jax"), mjx.put_data(model, rest, device=here, impl="jax")
+    # Arrays of JAX belong to the mesh under which they are made, and are kept here for programs of other meshes.
+    return jax.tree.map(np.asarray, placed)
 
 
 def _check(model: mujoco.MjModel) -> None:

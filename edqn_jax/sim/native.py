@@ -1,7 +1,7 @@
-"""The level camera in C, for CPUs: calls `pictures.c`.
+"""The level camera in C, for CPUs and NVIDIA GPUs: calls `pictures.c` and `pictures.cu`.
 
-Where there is a C compiler, pictures and depth images are drawn by it; everywhere else, and on GPUs, by the same
-functions in JAX (`columns.py`, `depth.py`). Both agree to rounding (`tests/sim/test_native.py`).
+Where there is a C compiler, or on GPUs CUDA's, pictures and depth images are drawn by it; everywhere else by the same
+functions in JAX (`columns.py`, `depth.py`). All agree to rounding (`tests/sim/test_native.py`).
 """
 
 from __future__ import annotations
@@ -14,13 +14,13 @@ import numpy as np
 from jax import Array
 
 from edqn_jax.config import CameraConfig
-from edqn_jax.parallel.c_library import registered
+from edqn_jax.parallel import c_library
 from edqn_jax.sim import coverage, raycast
 from edqn_jax.sim.picture_primitive import most_rows
 from edqn_jax.sim.scene import Scene
 from edqn_jax.sim.texture import WAVES
 
-SOURCE = Path(__file__).with_name("pictures.c")
+SOURCES = {name: Path(__file__).with_name(f"pictures.{name}") for name in ("h", "c", "cu")}
 
 OPERANDS = {
     "boxes": ("position", "half", "yaw", "albedo"),
@@ -30,16 +30,18 @@ OPERANDS = {
 }
 """Kinds of shape that the library draws, and what it reads of each. A scene with room for any other is drawn by JAX."""
 
+TARGETS = ("edqn_pictures", "edqn_depths")
+
 NOWHERE = 1e29
 """Depths beyond this, in metres, are those of rays that meet nothing."""
 
 
-def can_draw(config: CameraConfig, scene: Scene) -> bool:
-    """Returns whether the library is at hand and draws such pictures; known when tracing."""
+def can_draw(config: CameraConfig, scene: Scene, platform: str) -> bool:
+    """Returns whether the library of "cpu" or "cuda" is at hand and draws such pictures; known when tracing."""
     others = (scene.tilted_boxes, scene.capsules, scene.tilted_cylinders)
     plain = config.mount == "level" and not any(kind.position.shape[-2] for kind in others)
     shapes = [getattr(getattr(scene, kind), name) for kind, names in OPERANDS.items() for name in names]
-    return plain and all(leaf.dtype == jnp.float32 for leaf in shapes) and is_at_hand()
+    return plain and all(leaf.dtype == jnp.float32 for leaf in shapes) and is_at_hand(platform)
 
 
 def pictures(config: CameraConfig, scene: Scene, origin: Array, rotation: Array, weights: Array) -> Array:
@@ -70,8 +72,14 @@ def _call(target: str, config: CameraConfig, scene: Scene, *frames: Array) -> Ar
     return jax.ffi.ffi_call(target, shape)(constants, u, v, waves, origin, rotation, *shapes, *weights)
 
 
-def is_at_hand() -> bool:
-    """Returns whether the library is compiled, loaded and registered, which the first call does."""
+def is_at_hand(platform: str) -> bool:
+    """Returns whether the library of "cpu" or "cuda" is compiled, loaded and registered, which the first call does."""
+    compiler, source = (c_library.C, SOURCES["c"]) if platform == "cpu" else (c_library.cuda(), SOURCES["cu"])
+    return compiler is not None and c_library.registered(source, TARGETS, definitions(), compiler, (SOURCES["h"],))
+
+
+def definitions() -> tuple[str, ...]:
+    """Returns the constants that the sources do not define, NAME=VALUE."""
     numbers = {
         "TINY": raycast.TINY,
         "HORIZON_M": raycast.HORIZON_M,
@@ -79,5 +87,4 @@ def is_at_hand() -> bool:
         "FAR_U": coverage.FAR_U,
         "LEVEL_FACE": coverage.LEVEL_FACE,
     }
-    shared = (*(f"{name}={value:e}f" for name, value in numbers.items()), f"DEPTH_OF_LAYERS={coverage.DEPTH_OF_LAYERS}")
-    return registered(SOURCE, ("edqn_pictures", "edqn_depths"), shared)
+    return (*(f"{name}={value:e}f" for name, value in numbers.items()), f"DEPTH_OF_LAYERS={coverage.DEPTH_OF_LAYERS}")

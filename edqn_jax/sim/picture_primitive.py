@@ -7,6 +7,7 @@ It is traced once, where a program is lowered; `jax.custom_batching.custom_vmap`
 from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Sequence
+from functools import partial
 from typing import Any
 
 import jax
@@ -25,7 +26,7 @@ def draw_in_one_batch(
     static: Static,
     arguments: tuple[Any, ...],
     shape: tuple[int, int],
-    on_cpu: Callable[..., Array | None],
+    natively: Callable[..., Array | None],
 ) -> Array:
     """Returns one picture, [H, W] float32; all pictures that it is mapped to are drawn by one call of `draw`.
 
@@ -35,11 +36,11 @@ def draw_in_one_batch(
         static: arguments that are known when tracing.
         arguments: pytrees of arrays, of one picture.
         shape: H, W.
-        on_cpu: what draws where the program is compiled for CPUs, of arguments with leading [L] (see `_pictures_p`); or
-            returns None if it cannot, and `draw` does.
+        natively: `natively(platform, *static, *arguments)` draws where the program is compiled for "cpu" or "cuda", of
+            arguments with leading [L] (see `_pictures_p`); or returns None if it cannot, and `draw` does.
     """
     leaves, tree = jax.tree.flatten(arguments)
-    parameters = {"draw": draw, "static": static, "tree": tree, "shape": shape, "on_cpu": on_cpu}
+    parameters = {"draw": draw, "static": static, "tree": tree, "shape": shape, "natively": natively}
     return _pictures_p.bind(*(leaf[None] for leaf in leaves), **parameters)[0]
 
 
@@ -58,10 +59,16 @@ def _draw(*leaves: Array, draw: Callable[..., Array], static: Static, tree: Any,
     )
 
 
-def _draw_on_cpu(
-    *leaves: Array, draw: Callable[..., Array], on_cpu: Callable[..., Array | None], static: Static, tree: Any, **_: Any
+def _draw_natively(
+    platform: str,
+    *leaves: Array,
+    draw: Callable[..., Array],
+    natively: Callable[..., Array | None],
+    static: Static,
+    tree: Any,
+    **_: Any,
 ) -> Array:
-    found = on_cpu(*static, *jax.tree.unflatten(tree, leaves))
+    found = natively(platform, *static, *jax.tree.unflatten(tree, leaves))
     return _draw(*leaves, draw=draw, static=static, tree=tree) if found is None else found
 
 
@@ -89,7 +96,9 @@ def _batch(leaves: Sequence[Array], axes: Sequence[int | None], **parameters: An
 
 
 _pictures_p.def_abstract_eval(_abstract)
-_pictures_p.def_impl(jax.jit(_pictures_p.bind, static_argnames=("draw", "static", "tree", "shape", "on_cpu")))
+_pictures_p.def_impl(jax.jit(_pictures_p.bind, static_argnames=("draw", "static", "tree", "shape", "natively")))
 batching.primitive_batchers[_pictures_p] = _batch
 mlir.register_lowering(_pictures_p, mlir.lower_fun(_draw, multiple_results=False))
-mlir.register_lowering(_pictures_p, mlir.lower_fun(_draw_on_cpu, multiple_results=False), platform="cpu")
+for _platform in ("cpu", "cuda"):
+    _lowering = mlir.lower_fun(partial(_draw_natively, _platform), multiple_results=False)
+    mlir.register_lowering(_pictures_p, _lowering, platform=_platform)

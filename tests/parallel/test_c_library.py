@@ -79,8 +79,9 @@ def test_where_nothing_can_be_kept_it_is_compiled_and_leaves_nothing(
 
 
 def test_a_damaged_library_is_made_anew(source: Path, tmp_path: Path) -> None:
-    command = c_library._command()
+    command = c_library._command(c_library.C)
     if command is not None:
+        command += c_library.C.flags
         folders = tmp_path / "whole", tmp_path / "damaged"
         for folder in folders:
             folder.mkdir()

@@ -12,6 +12,7 @@ import pytest
 from mujoco import mjx
 
 from edqn_jax.config import Config
+from edqn_jax.sim import drone
 from edqn_jax.sim.drone import (
     Airframe,
     DroneState,
@@ -322,6 +323,19 @@ def test_fly_traces_to_one_scan_without_callbacks(airframe):
     program = str(jax.make_jaxpr(lambda s, c, y: fly(CONFIG, airframe, s, c, y))(state, jnp.zeros(3), jnp.float32(0.0)))
     assert "callback" not in program
     assert program.count("length=13") == 1
+
+
+@pytest.mark.parametrize("axis", ["env", "mission"])  # one after the other, in one process
+def test_it_flies_in_programs_of_different_meshes(airframe, axis):
+    mesh = jax.sharding.Mesh(np.array(jax.devices()[:1]), (axis,))
+    spec = jax.sharding.PartitionSpec(axis)
+    drone._mjx_step.clear_cache()  # so that each is traced in its own mesh
+
+    def fall(place: jax.Array) -> jax.Array:
+        return physics_step(CONFIG, airframe, hover(place, jnp.float32(0.0)), jnp.zeros(4)).velocity
+
+    falling = jax.shard_map(jax.vmap(fall), mesh=mesh, in_specs=spec, out_specs=spec, check_vma=False)
+    np.testing.assert_allclose(jax.jit(falling)(jnp.zeros((2, 3)))[:, 2], -9.81 * CONFIG.physics_dt_s, rtol=1e-5)
 
 
 def test_the_airframe_file_holds_nothing_that_collides_and_no_air():

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 import shutil
+from collections.abc import Callable
 from functools import partial
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -12,6 +14,7 @@ import numpy as np
 import pytest
 
 from edqn_jax.config import CameraConfig
+from edqn_jax.parallel import c_library
 from edqn_jax.sim import camera, columns, native, worlds
 from edqn_jax.sim.events import LUMA_WEIGHTS
 from edqn_jax.sim.scene import PARKED, Scene, stack_scenes, take_scene, with_drones
@@ -74,7 +77,7 @@ def crowd(rng: np.random.Generator) -> Scene:
 
 
 def test_the_library_is_at_hand_wherever_there_is_a_compiler() -> None:
-    assert native.is_at_hand() is (shutil.which("cc") is not None)
+    assert native.is_at_hand("cpu") is (shutil.which("cc") is not None)
 
 
 def test_both_draw_the_other_drones_and_neither_those_that_are_absent() -> None:
@@ -92,7 +95,7 @@ def test_both_draw_the_other_drones_and_neither_those_that_are_absent() -> None:
 def test_c_draws_what_jax_draws(size: tuple[int, int]) -> None:
     config = dataclasses.replace(CONFIG, width=size[0], height=size[1])
     rng = np.random.default_rng(3)
-    if native.is_at_hand():
+    if native.is_at_hand("cpu"):
         agree(config, *frames([crowd(rng) for _ in range(8)], 192, seed=4))
     else:  # then there is one camera, and the pictures of the package are its
         scene, origin, rotation = frames([crowd(rng)], 2, seed=4)
@@ -102,17 +105,52 @@ def test_c_draws_what_jax_draws(size: tuple[int, int]) -> None:
 @pytest.mark.parametrize("family", ["rooms", "forest", "canyon", "dense"])
 @pytest.mark.slow
 def test_c_draws_the_worlds_of_a_family_as_jax_does(family: str) -> None:
-    if native.is_at_hand():
+    if native.is_at_hand("cpu"):
         pool = worlds.random_pool(family, worlds.world_keys("training", 4))
         scenes = [take_scene(pool, number) for number in range(4)]
         agree(CONFIG, *frames(scenes, 128, seed=8), ties=TIES)
 
 
+@pytest.fixture(scope="module")
+def kernels() -> bool:
+    """Whether the kernels of GPUs are registered for the CPU, where there is a compiler."""
+    on_cpu = Path(__file__).parents[1] / "oracles" / "cuda_on_cpu.h"
+    names = [f"-D{target}=emulated_{target}" for target in native.TARGETS]
+    compiler = dataclasses.replace(c_library.C, flags=(*c_library.C.flags, "-xc", "-include", str(on_cpu), *names))
+    targets = tuple(f"emulated_{target}" for target in native.TARGETS)
+    headers = (native.SOURCES["h"], on_cpu)
+    return c_library.registered(native.SOURCES["cu"], targets, native.definitions(), compiler, headers)
+
+
+def crowded_forest(rng: np.random.Generator) -> Scene:
+    """More shapes in a frame than a block of threads gathers in a pass, and than it keeps at once."""
+    places = rng.uniform([0, 0, 0], [60, 60, 6], (300, 3))
+    return scene_of(GROUND, *(pillar(x, y, z, 0.3, 3) for x, y, z in places), box(30, 30, 2, 2, 3, 4, 1), ball(9, 9, 3, 2))
+
+
+@pytest.mark.parametrize(
+    "size, world",
+    [((32, 24), crowd), ((13, 7), crowd), ((70, 20), crowd), ((32, 24), crowded_forest)],
+    ids=["usual", "no multiple of a block", "several blocks", "several passes"],
+)
+def test_the_kernels_of_gpus_draw_what_jax_draws(
+    kernels: bool, monkeypatch: pytest.MonkeyPatch, size: tuple[int, int], world: Callable[..., Scene]
+) -> None:
+    """On the CPU, thread by thread."""
+    call = native._call
+    monkeypatch.setattr(native, "_call", lambda target, *given: call(f"emulated_{target}", *given))
+    config = dataclasses.replace(CONFIG, width=size[0], height=size[1])
+    if kernels:
+        agree(config, *frames([world(np.random.default_rng(3))], 32, seed=4))
+    else:
+        assert shutil.which("cc") is None
+
+
 def test_a_world_with_other_shapes_and_a_camera_on_the_body_are_drawn_by_jax() -> None:
     rng = np.random.default_rng(0)
-    assert not native.can_draw(CONFIG, every_kind(rng))
-    assert not native.can_draw(dataclasses.replace(CONFIG, mount="body"), crowd(rng))
-    assert native.can_draw(CONFIG, crowd(rng)) is native.is_at_hand()
+    assert not native.can_draw(CONFIG, every_kind(rng), "cpu")
+    assert not native.can_draw(dataclasses.replace(CONFIG, mount="body"), crowd(rng), "cpu")
+    assert native.can_draw(CONFIG, crowd(rng), "cpu") is native.is_at_hand("cpu")
 
 
 def test_a_frame_is_the_same_to_the_bit_however_it_is_mapped() -> None:

@@ -1,0 +1,202 @@
+/* Pictures and depth images of a level camera, for NVIDIA GPUs, as handlers of XLA's foreign function interface
+ * (`native.py` compiles and registers them). What they are made of is in `pictures.h`.
+ *
+ * A block of threads draws a strip of COLUMNS columns of a frame, ROWS rows of it at a time, a thread a pixel. First it
+ * gathers the upright shapes that the strip may show; then, AT_ONCE of them at a time, what the strip's columns need of
+ * them goes into shared memory, from which the pixels read it. Written in C as CPUs have it too, so that a test can run
+ * the kernels on one (`tests/oracles/cuda_on_cpu.h`).
+ */
+
+#include <stdint.h>
+
+#ifndef LAUNCH
+#include <cuda_runtime.h>
+#define LAUNCH(kernel, blocks, stream, batch) kernel<<<(unsigned)(blocks), THREADS, 0, (cudaStream_t)(stream)>>>(batch)
+#define KERNEL_ON_CPU(kernel)
+#define EXPORTED extern "C"
+#define STREAM(call, args) (call)->api->XLA_FFI_Stream_Get(args)
+#define LAUNCH_ERROR() (cudaPeekAtLastError() == cudaSuccess ? 0 : cudaGetErrorString(cudaGetLastError()))
+#endif
+
+#define LANES 1
+#define FN static __device__ __forceinline__
+#define UNROLLED _Pragma("unroll")
+#define COLUMNS 32
+#define ROWS 8
+#define THREADS (COLUMNS * ROWS)
+#define AT_ONCE 16
+#define MEASURED_AT_ONCE 64
+
+typedef float Lanes;
+typedef int Mask;
+
+FN Lanes lanes(float x) { return x; }
+FN void store(float* to, Lanes x) { *to = x; }
+FN Lanes pick(Mask where, Lanes a, Lanes b) { return where ? a : b; }
+FN Lanes lesser(Lanes a, Lanes b) { return a < b ? a : b; }
+FN Lanes greater(Lanes a, Lanes b) { return a > b ? a : b; }
+FN Lanes absolute(Lanes x) { return fabsf(x); }
+FN Lanes roots(Lanes x) { return sqrtf(x); }
+FN int any_of(Mask where) { return where; }
+FN Lanes counted(void) { return 0; }
+
+#include "pictures.h"
+
+/* The upright shapes of a pass that a strip may show, in their order. */
+typedef struct {
+  unsigned char shown[THREADS]; /* by thread, a shape each */
+  int list[THREADS];
+} Gathered;
+
+/* Adds shape `n` to the list if it is shown; returns how many are. Every thread of the block calls it. */
+FN int gather(Gathered* g, int n, int shown) {
+  const int t = threadIdx.x;
+  g->shown[t] = (unsigned char)shown;
+  const int found = __syncthreads_count(shown);
+  if (shown) {
+    int before = 0;
+    for (int i = 0; i < t; ++i) before += g->shown[i];
+    g->list[before] = n;
+  }
+  __syncthreads();
+  return found;
+}
+
+/* Where a thread's pixels are: neighbours of a warp are 8 columns wide and 4 rows high. */
+FN int column_of(int t) { return t % 8 + t / 32 % (COLUMNS / 8) * 8; }
+FN int row_of(int t) { return t / 8 % 4 + t / 128 * 4; }
+
+static __global__ void __launch_bounds__(THREADS) draw(const Batch batch) {
+  __shared__ Wave waves[MOST_WAVES];
+  __shared__ Gathered gathered;
+  __shared__ Upright shapes[AT_ONCE];
+  __shared__ float numbers[AT_ONCE * NUMBERS * COLUMNS];
+  const int t = threadIdx.x, strips = (batch.width + COLUMNS - 1) / COLUMNS;
+  const int64_t m = blockIdx.x / strips;
+  const int left = (int)(blockIdx.x % strips) * COLUMNS, right = left + COLUMNS;
+  Camera c;
+  Shapes s;
+  Eye e;
+  frame_of(&batch, m, &c, &s, &e);
+  if (t == 0) waves_of(&c, &e, waves);
+  __syncthreads();
+
+  const int uprights = s.boxes + s.cylinders, column = left + column_of(t), in_image = column < c.width;
+  const float u = c.u[in_image ? column : c.width - 1], dx = e.cos + u * e.sin, dy = e.sin - u * e.cos;
+  int found = 0, kept = 0; /* kept: all that is shown stays in shared memory */
+  for (int first = 0; first < c.height; first += ROWS) {
+    const int row = first + row_of(t), drawn = in_image && row < c.height;
+    const float dz = c.v[row < c.height ? row : c.height - 1];
+    Layers layers;
+    layers.inserted = 0;
+    if (drawn)
+      for (int n = 0; n < s.spheres; ++n) insert_sphere(&c, &s, &e, n, u, dz, &layers);
+    for (int base = 0; base < uprights; base += THREADS) {
+      if (!kept) {
+        Upright shape;
+        const int n = base + t;
+        const int shown = n < uprights && upright(&c, &s, &e, n, &shape) && shape.first < right && shape.last > left;
+        __syncthreads();
+        found = gather(&gathered, n, shown);
+      }
+      for (int k = 0; k < found; k += AT_ONCE) {
+        const int many = found - k < AT_ONCE ? found - k : AT_ONCE;
+        if (!kept) {
+          __syncthreads();
+          if (t < many) upright(&c, &s, &e, gathered.list[k + t], &shapes[t]);
+          __syncthreads();
+          for (int task = t; task < many * COLUMNS; task += THREADS) {
+            const int which = task / COLUMNS, across = task % COLUMNS, at = left + across;
+            if (at >= shapes[which].first && at < shapes[which].last)
+              sides(&c, &e, &shapes[which], c.u[at], numbers + which * NUMBERS * COLUMNS + across, COLUMNS);
+          }
+          __syncthreads();
+        }
+        if (drawn)
+          for (int i = 0; i < many; ++i) {
+            const float* of = numbers + i * NUMBERS * COLUMNS + (column - left);
+            if (column >= shapes[i].first && column < shapes[i].last && of[SHARE * COLUMNS] > 0)
+              insert_side(&c, of, COLUMNS, row, &layers);
+          }
+      }
+    }
+    kept = uprights <= THREADS && found <= AT_ONCE;
+    if (drawn)
+      batch.pictures[(m * c.height + row) * c.width + column] = blend(&c, &s, &e, waves, dx, dy, dz, &layers);
+  }
+}
+
+static __global__ void __launch_bounds__(THREADS) measure(const Batch batch) {
+  __shared__ Gathered gathered;
+  __shared__ float from[MEASURED_AT_ONCE * COLUMNS], to[MEASURED_AT_ONCE * COLUMNS];
+  const int t = threadIdx.x, strips = (batch.width + COLUMNS - 1) / COLUMNS;
+  const int64_t m = blockIdx.x / strips;
+  const int left = (int)(blockIdx.x % strips) * COLUMNS;
+  Camera c;
+  Shapes s;
+  Eye e;
+  frame_of(&batch, m, &c, &s, &e);
+  const int uprights = s.boxes + s.cylinders, column = left + column_of(t), in_image = column < c.width;
+  const float u = c.u[in_image ? column : c.width - 1], dx = e.cos + u * e.sin, dy = e.sin - u * e.cos;
+  int found = 0, kept = 0;
+  for (int first = 0; first < c.height; first += ROWS) {
+    const int row = first + row_of(t), drawn = in_image && row < c.height;
+    const float dz = c.v[row < c.height ? row : c.height - 1], per_z = inverses(dz);
+    float nearest = nearest_of_others(&s, &e, dx, dy, dz);
+    for (int base = 0; base < uprights; base += THREADS) {
+      if (!kept) {
+        const int n = base + t;
+        const int shown = n < uprights && !upright_out_of_sight(&c, &s, &e, n);
+        __syncthreads();
+        found = gather(&gathered, n, shown);
+      }
+      for (int k = 0; k < found; k += MEASURED_AT_ONCE) {
+        const int many = found - k < MEASURED_AT_ONCE ? found - k : MEASURED_AT_ONCE;
+        if (!kept) {
+          __syncthreads();
+          for (int task = t; task < many * COLUMNS; task += THREADS) {
+            const int n = gathered.list[k + task / COLUMNS], at = left + task % COLUMNS;
+            const float v = c.u[at < c.width ? at : c.width - 1];
+            beside(&s, &e, n, turn_of(&s, n), e.cos + v * e.sin, e.sin - v * e.cos, &from[task], &to[task]);
+          }
+          __syncthreads();
+        }
+        for (int i = 0; i < many; ++i) {
+          const int at = i * COLUMNS + (column - left);
+          nearest = nearer_upright(&s, &e, gathered.list[k + i], from[at], to[at], per_z, nearest);
+        }
+      }
+    }
+    kept = uprights <= THREADS && found <= MEASURED_AT_ONCE;
+    if (drawn) batch.pictures[(m * c.height + row) * c.width + column] = nearest;
+  }
+}
+
+KERNEL_ON_CPU(draw)
+KERNEL_ON_CPU(measure)
+
+/* Launches a kernel on all frames of a call. */
+#define DRAW(kernel, weighted)                                                                        \
+  if (asked_for_version(call)) return 0;                                                              \
+  Batch batch;                                                                                        \
+  XLA_FFI_Error* error = batch_of(call, weighted, &batch);                                            \
+  if (error || !batch.frames) return error;                                                           \
+  XLA_FFI_Stream_Get_Args stream = {XLA_FFI_Stream_Get_Args_STRUCT_SIZE, 0, call->ctx, 0};             \
+  error = STREAM(call, &stream);                                                                      \
+  if (error) return error;                                                                            \
+  LAUNCH(kernel, batch.frames * ((batch.width + COLUMNS - 1) / COLUMNS), stream.stream, batch);        \
+  const char* said = LAUNCH_ERROR();                                                                  \
+  return said ? failed(call, XLA_FFI_Error_Code_INTERNAL, said) : 0;
+
+EXPORTED XLA_FFI_Error* edqn_pictures(XLA_FFI_CallFrame* call) { DRAW(draw, 1) }
+
+EXPORTED XLA_FFI_Error* edqn_depths(XLA_FFI_CallFrame* call) { DRAW(measure, 0) }
+
+#ifdef __CUDACC__
+/* Returns why the kernels cannot be run on this machine, as with a driver that is older than the compiler; or 0. */
+EXPORTED const char* edqn_unusable(void) {
+  cudaFuncAttributes found;
+  const cudaError_t error = cudaFuncGetAttributes(&found, draw);
+  return error == cudaSuccess ? 0 : cudaGetErrorString(error);
+}
+#endif

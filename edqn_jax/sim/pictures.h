@@ -1,0 +1,581 @@
+/* What pictures and depth images of a level camera are made of, for `pictures.c` (CPUs) and `pictures.cu` (GPUs): the
+ * functions `columns.pictures` and `depth.nearest_depth` in C.
+ *
+ * The mathematics, its order and its words are those of `coverage.py`, `camera.py`, `texture.py` and `depth.py`;
+ * constants in capitals that are not defined here come from there. M frames, H rows, C columns.
+ *
+ * Whoever includes this has defined: LANES, how many pixels are drawn at a time; Lanes and Mask, their numbers and
+ * whether something holds of them; FN, how functions are declared; UNROLLED, before a loop; and lanes, load, store, pick,
+ * lesser, greater, absolute, roots, any_of, counted of Lanes.
+ */
+
+#ifndef EDQN_PICTURES_H
+#define EDQN_PICTURES_H
+
+#include <math.h>
+#include <stdint.h>
+#include <string.h>
+
+#include "handler.h"
+
+#define NOWHERE 1e30f
+
+FN Lanes between(Lanes x, float low, float high) { return lesser(greater(x, lanes(low)), lanes(high)); }
+FN Lanes inverses(Lanes x) { return 1.0f / pick(absolute(x) < TINY, lanes(TINY), x); }
+
+FN float least(float a, float b) { return a < b ? a : b; }
+FN float most(float a, float b) { return a > b ? a : b; }
+FN float inverse(float x) { return 1.0f / (fabsf(x) < TINY ? TINY : x); }
+
+FN int is_finite(float x) {
+  uint32_t bits;
+  memcpy(&bits, &x, sizeof bits);
+  return (bits & 0x7f800000u) != 0x7f800000u;
+}
+
+/* Rounds to the nearest whole number, halves to even, for |x| < 2^22. */
+FN Lanes nearest_whole(Lanes x) { return (x + 12582912.0f) - 12582912.0f; }
+
+/* ------------------------------------------------------------------------------------------- what is drawn */
+
+typedef struct {
+  int height, width, waves;
+  float pitch, contrast, ambient;
+  const float *sun, *sky; /* [3] each */
+  const float *u, *v;     /* [C], [H] middles of pixels in the image plane */
+  const float* wave;      /* [waves, 4] direction in periods a metre, and weight */
+} Camera;
+
+typedef struct {
+  int boxes, cylinders, spheres, planes;
+  const float *box_position, *box_half, *box_yaw, *box_albedo;
+  const float *cylinder_position, *cylinder_radius, *cylinder_half, *cylinder_albedo;
+  const float *sphere_position, *sphere_radius, *sphere_albedo;
+  const float *plane_position, *plane_normal, *plane_albedo;
+} Shapes;
+
+typedef struct {
+  const float *origin, *weights; /* [3] each */
+  float cos, sin;
+} Eye;
+
+FN float dot3(const float* a, const float* b) { return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]; }
+
+FN float shade(const Camera* c, float nx, float ny, float nz) {
+  return c->ambient + (1 - c->ambient) * most(nx * c->sun[0] + ny * c->sun[1] + nz * c->sun[2], 0.0f);
+}
+
+FN Lanes shades(const Camera* c, Lanes nx, Lanes ny, Lanes nz) {
+  return c->ambient + (1 - c->ambient) * greater(nx * c->sun[0] + ny * c->sun[1] + nz * c->sun[2], lanes(0));
+}
+
+/* Whether no part of an upright shape within `radius` of (x, y), relative to the eye, can be in the image. */
+FN int out_of_sight(const Camera* c, const Eye* e, float x, float y, float radius) {
+  const float ahead = x * e->cos + y * e->sin, right = x * e->sin - y * e->cos;
+  const float edge = 0.5f * c->pitch * c->width;
+  const float reach = radius * 1.0001f + 1e-3f, aslant = reach * sqrtf(1 + edge * edge);
+  return ahead + reach < NEAR_M || right - edge * ahead > aslant || -right - edge * ahead > aslant;
+}
+
+/* The columns [first, last) that an interval of the image plane may touch. */
+FN void columns_between(const Camera* c, float left, float right, int* first, int* last) {
+  const float begin = (left - c->u[0]) / c->pitch - 1.0f, end = (right - c->u[0]) / c->pitch + 2.0f;
+  /* Numbers that are not finite, which `-ffinite-math-only` lets no comparison find, are told by their bits. */
+  *first = *last = 0;
+  if (!is_finite(begin) || !is_finite(end)) return;
+  *first = (int)least(most(begin, 0.0f), (float)c->width);
+  *last = (int)least(most(end, 0.0f), (float)c->width);
+}
+
+/* --------------------------------------------------------------------- upright shapes and the columns they cover */
+
+enum { SHARE, BOTTOM, TOP, CAP_LOW, CAP_HIGH, SIDE, SHOWN, FAR, NEAR, PER_ROW, LEAN, NUMBERS };
+
+typedef struct {
+  float left, right, bottom, top, cap, shown;
+} Extent;
+
+FN void extent_of_box(const Eye* e, float x, float y, float hx, float hy, float cos, float sin, Extent* extent) {
+  const float sign_x[4] = {1, -1, -1, 1}, sign_y[4] = {1, 1, -1, -1};
+  float ahead[4], right[4];
+  for (int i = 0; i < 4; ++i) {
+    const float cx = x + cos * (sign_x[i] * hx) - sin * (sign_y[i] * hy);
+    const float cy = y + sin * (sign_x[i] * hx) + cos * (sign_y[i] * hy);
+    ahead[i] = cx * e->cos + cy * e->sin, right[i] = cx * e->sin - cy * e->cos;
+  }
+  float low = NOWHERE, high = -NOWHERE;
+  for (int i = 0; i < 4; ++i) {
+    const int j = (i + 1) & 3;
+    if (ahead[i] >= NEAR_M) {
+      const float u = right[i] / ahead[i];
+      low = least(low, u), high = most(high, u);
+    }
+    if ((ahead[i] < NEAR_M) != (ahead[j] < NEAR_M)) {
+      const float share = (NEAR_M - ahead[i]) * inverse(ahead[j] - ahead[i]);
+      const float u = (right[i] + share * (right[j] - right[i])) / NEAR_M;
+      low = least(low, u), high = most(high, u);
+    }
+  }
+  extent->left = low, extent->right = high;
+}
+
+FN float edge_of_disc(float ahead, float right, float distance, float radius, float sine, float cosine,
+                          float sign) {
+  const float f = ahead * cosine - sign * right * sine, r = right * cosine + sign * ahead * sine;
+  const int in_front = f > NEAR_M * 1e-3f && distance > radius;
+  return in_front ? r / most(f, NEAR_M * 1e-3f) : sign * FAR_U;
+}
+
+FN void extent_of_disc(const Eye* e, float x, float y, float radius, Extent* extent) {
+  const float ahead = x * e->cos + y * e->sin, right = x * e->sin - y * e->cos;
+  const float distance = sqrtf(ahead * ahead + right * right);
+  const float sine = least(radius / most(distance, TINY), 1.0f), cosine = sqrtf(1 - sine * sine);
+  const int behind = ahead + radius <= 0;
+  extent->left = behind ? NOWHERE : edge_of_disc(ahead, right, distance, radius, sine, cosine, -1.0f);
+  extent->right = behind ? -NOWHERE : edge_of_disc(ahead, right, distance, radius, sine, cosine, 1.0f);
+}
+
+FN void heights_of(const Camera* c, float middle, float half, float value, Extent* extent) {
+  extent->bottom = (middle - half) / c->pitch, extent->top = (middle + half) / c->pitch;
+  extent->cap = extent->top < 0 ? extent->top : most(extent->bottom, 0.0f);
+  extent->shown = value * (extent->top < 0 ? shade(c, 0, 0, 1) : shade(c, 0, 0, -1));
+}
+
+/* Writes the numbers of LANES columns from the shape's depths, brightness and lean there. */
+FN void write_sides(const Camera* c, const Extent* e, Lanes share, Lanes enter, Lanes leave, Lanes side,
+                               Lanes lean, float* numbers, int stride) {
+  const Lanes near = 1.0f / greater(enter, lanes(NEAR_M)), far = 1.0f / greater(leave, lanes(NEAR_M));
+  const Lanes cap_near = e->cap * near, cap_far = e->cap * far;
+  store(numbers + SHARE * stride, share);
+  store(numbers + BOTTOM * stride, e->bottom * near);
+  store(numbers + TOP * stride, e->top * near);
+  store(numbers + CAP_LOW * stride, lesser(cap_near, cap_far));
+  store(numbers + CAP_HIGH * stride, greater(cap_near, cap_far));
+  store(numbers + SIDE * stride, side * share);
+  store(numbers + SHOWN * stride, e->shown * share);
+  store(numbers + FAR * stride, e->cap == 0 ? near : far);
+  store(numbers + NEAR * stride, near);
+  store(numbers + PER_ROW * stride, lanes(inverse(e->cap)));
+  store(numbers + LEAN * stride, lean * near * c->pitch);
+}
+
+/* The part of the columns `u` that an extent covers: its ends; returns its share of the column's width. */
+FN Lanes part_covered(const Camera* c, const Extent* e, Lanes u, Lanes* low, Lanes* high) {
+  const Lanes from = greater(u - c->pitch / 2, lanes(e->left)), to = lesser(u + c->pitch / 2, lanes(e->right));
+  const Lanes share = greater(to - from, lanes(0)) / c->pitch;
+  *low = pick(share > 0, from, u), *high = pick(share > 0, to, u);
+  return share;
+}
+
+/* What columns share of an upright shape. */
+typedef struct {
+  int is_box, first, last; /* columns that it may cover */
+  Extent extent;
+  float x, y;                   /* the eye from its axis, of a box in its own frame */
+  float value, x_face, y_face;  /* brightness: unlit; of the faces of a box that the eye may see */
+  float fx, fy, hx, hy, corner; /* of a box, in its frame: the image's axis; halves; where its two faces meet */
+  float radius;
+} Upright;
+
+/* The depths at which the rays at `u` enter and leave both pairs of side faces of a box. */
+FN void slabs(const Upright* b, Lanes u, Lanes* ix, Lanes* iy, Lanes* in_x, Lanes* in_y, Lanes* out_x, Lanes* out_y) {
+  *ix = inverses(b->fx + u * b->fy), *iy = inverses(b->fy - u * b->fx);
+  const Lanes mx = -b->x * *ix, my = -b->y * *iy, reach_x = b->hx * absolute(*ix), reach_y = b->hy * absolute(*iy);
+  *in_x = mx - reach_x, *in_y = my - reach_y, *out_x = mx + reach_x, *out_y = my + reach_y;
+}
+
+FN Mask meets_x_face(const Upright* b, Lanes u) {
+  Lanes ix, iy, in_x, in_y, out_x, out_y;
+  slabs(b, u, &ix, &iy, &in_x, &in_y, &out_x, &out_y);
+  return in_x > in_y;
+}
+
+/* Returns whether box `n` may cover a column, and what columns share of it. */
+FN int upright_box(const Camera* c, const Shapes* s, const Eye* e, int n, Upright* b) {
+  const float *position = s->box_position + 3 * n, *half = s->box_half + 3 * n;
+  const float ox = e->origin[0] - position[0], oy = e->origin[1] - position[1];
+  b->is_box = 1, b->hx = half[0], b->hy = half[1];
+  if (out_of_sight(c, e, -ox, -oy, sqrtf(b->hx * b->hx + b->hy * b->hy))) return 0;
+  const float cos = cosf(s->box_yaw[n]), sin = sinf(s->box_yaw[n]);
+  extent_of_box(e, -ox, -oy, b->hx, b->hy, cos, sin, &b->extent);
+  columns_between(c, b->extent.left, b->extent.right, &b->first, &b->last);
+  if (b->first >= b->last) return 0;
+
+  b->value = dot3(s->box_albedo + 3 * n, e->weights);
+  heights_of(c, position[2] - e->origin[2], half[2], b->value, &b->extent);
+  b->x = cos * ox + sin * oy, b->y = cos * oy - sin * ox;
+  b->fx = cos * e->cos + sin * e->sin, b->fy = cos * e->sin - sin * e->cos;
+  const float sx = (b->x > 0) - (b->x < 0), sy = (b->y > 0) - (b->y < 0);
+  b->x_face = b->value * shade(c, sx * cos, sx * sin, 0), b->y_face = b->value * shade(c, -sy * sin, sy * cos, 0);
+  const float ex = sx * b->hx - b->x, ey = sy * b->hy - b->y;
+  b->corner = (ex * b->fy - ey * b->fx) * inverse(ex * b->fx + ey * b->fy);
+  return 1;
+}
+
+/* Writes what the columns at `u` need of a box. */
+FN void box_sides(const Camera* c, const Upright* b, Lanes u, float* numbers, int stride) {
+  Lanes low, high, ix, iy, in_x, in_y, out_x, out_y;
+  const Lanes share = part_covered(c, &b->extent, u, &low, &high);
+  slabs(b, (low + high) / 2, &ix, &iy, &in_x, &in_y, &out_x, &out_y);
+  const Lanes lean = pick(in_x > in_y, b->fy * ix, -b->fx * iy);
+  const Lanes part = between((b->corner - low) * inverses(high - low), 0, 1);
+  const Lanes at_low = pick(meets_x_face(b, low), lanes(b->x_face), lanes(b->y_face));
+  const Lanes at_high = pick(meets_x_face(b, high), lanes(b->x_face), lanes(b->y_face));
+  const Lanes side = pick(at_low == at_high, at_low, part * at_low + (1 - part) * at_high);
+  write_sides(c, &b->extent, share, greater(in_x, in_y), lesser(out_x, out_y), side, lean, numbers, stride);
+}
+
+/* Returns whether cylinder `n` may cover a column, and what columns share of it. */
+FN int upright_cylinder(const Camera* c, const Shapes* s, const Eye* e, int n, Upright* p) {
+  const float* position = s->cylinder_position + 3 * n;
+  p->is_box = 0, p->radius = s->cylinder_radius[n];
+  p->x = e->origin[0] - position[0], p->y = e->origin[1] - position[1];
+  if (out_of_sight(c, e, -p->x, -p->y, p->radius)) return 0;
+  extent_of_disc(e, -p->x, -p->y, p->radius, &p->extent);
+  columns_between(c, p->extent.left, p->extent.right, &p->first, &p->last);
+  if (p->first >= p->last) return 0;
+  p->value = dot3(s->cylinder_albedo + 3 * n, e->weights);
+  heights_of(c, position[2] - e->origin[2], s->cylinder_half[n], p->value, &p->extent);
+  return 1;
+}
+
+/* Writes what the columns at `u` need of a cylinder. */
+FN void cylinder_sides(const Camera* c, const Eye* e, const Upright* p, Lanes u, float* numbers, int stride) {
+  const float per_radius = 1.0f / most(p->radius, TINY);
+  Lanes low, high;
+  const Lanes share = part_covered(c, &p->extent, u, &low, &high);
+  const Lanes at = (low + high) / 2, dx = e->cos + at * e->sin, dy = e->sin - at * e->cos;
+  const Lanes a = dx * dx + dy * dy, middle = -(p->x * dx + p->y * dy) / a;
+  const Lanes px = p->x + middle * dx, py = p->y + middle * dy, inside = p->radius * p->radius - (px * px + py * py);
+  const Lanes reach = roots(greater(inside, lanes(0)) / a), enter = middle - reach;
+  const Lanes nx = (p->x + enter * dx) * per_radius, ny = (p->y + enter * dy) * per_radius;
+  const Lanes lean = (nx * e->sin - ny * e->cos) * inverses(nx * dx + ny * dy);
+  const Lanes side = p->value * shades(c, nx, ny, lanes(0));
+  write_sides(c, &p->extent, share, enter, middle + reach, side, lean, numbers, stride);
+}
+
+/* Returns whether upright shape `n`, boxes first, may cover a column, and what columns share of it. */
+FN int upright(const Camera* c, const Shapes* s, const Eye* e, int n, Upright* found) {
+  return n < s->boxes ? upright_box(c, s, e, n, found) : upright_cylinder(c, s, e, n - s->boxes, found);
+}
+
+/* Writes what the columns at `u` need of an upright shape (`coverage.sides`): NUMBERS numbers, `stride` apart. */
+FN void sides(const Camera* c, const Eye* e, const Upright* from, Lanes u, float* numbers, int stride) {
+  if (from->is_box)
+    box_sides(c, from, u, numbers, stride);
+  else
+    cylinder_sides(c, e, from, u, numbers, stride);
+}
+
+/* -------------------------------------------------------------------------------------------- layers of a column */
+
+typedef struct {
+  Lanes closeness, coverage, value, slope;
+} Layer;
+
+/* The nearest layers of LANES rows of a column, nearest first, and how many shapes were inserted. */
+typedef struct {
+  Layer layer[DEPTH_OF_LAYERS];
+  int inserted;
+} Layers;
+
+FN void insert(Layers* layers, Layer added) {
+  const Layer none = {lanes(0), lanes(0), lanes(0), lanes(0)};
+  if (!layers->inserted++) {
+    layers->layer[0] = added;
+    for (int k = 1; k < DEPTH_OF_LAYERS; ++k) layers->layer[k] = none;
+    return;
+  }
+  UNROLLED for (int k = 0; k < DEPTH_OF_LAYERS; ++k) {
+    const Layer old = layers->layer[k];
+    const Mask nearer = added.closeness > old.closeness;
+    const Layer front = {pick(nearer, added.closeness, old.closeness), pick(nearer, added.coverage, old.coverage),
+                         pick(nearer, added.value, old.value), pick(nearer, added.slope, old.slope)};
+    const Layer back = {pick(nearer, old.closeness, added.closeness), pick(nearer, old.coverage, added.coverage),
+                        pick(nearer, old.value, added.value), pick(nearer, old.slope, added.slope)};
+    layers->layer[k] = front, added = back;
+  }
+}
+
+/* Adds one shape, whose numbers of this column are `stride` apart, to the layers of the LANES rows from `first` on. */
+FN void insert_side(const Camera* c, const float* n, int stride, int first, Layers* layers) {
+  const float bottom = n[BOTTOM * stride], top = n[TOP * stride];
+  const float cap_low = n[CAP_LOW * stride], cap_high = n[CAP_HIGH * stride];
+  const float highest = c->height / 2.0f - 0.5f, above = highest - first + 0.5f, below = above - LANES;
+  if (most(top, cap_high) <= below || least(bottom, cap_low) >= above) return;
+  const Lanes row = (highest - first) - counted(), upper = row + 0.5f, lower = row - 0.5f;
+  const Lanes of_side = greater(lesser(lanes(top), upper) - greater(lanes(bottom), lower), lanes(0));
+  const Lanes of_cap = greater(lesser(lanes(cap_high), upper) - greater(lanes(cap_low), lower), lanes(0));
+  const Lanes coverage = (of_side + of_cap) * n[SHARE * stride];
+  const Lanes closeness = between(row * n[PER_ROW * stride], n[FAR * stride], n[NEAR * stride]);
+  const Layer added = {pick(coverage > 0, closeness, lanes(0)), coverage,
+                       of_side * n[SIDE * stride] + of_cap * n[SHOWN * stride],
+                       pick(of_cap > of_side, lanes(LEVEL_FACE), lanes(n[LEAN * stride]))};
+  insert(layers, added);
+}
+
+/* Adds sphere `n` to the layers of the LANES rows along `dz` of the column at `u`. */
+FN void insert_sphere(const Camera* c, const Shapes* s, const Eye* e, int n, float u, Lanes dz, Layers* layers) {
+  const float *position = s->sphere_position + 3 * n, radius = s->sphere_radius[n];
+  const float ox = e->origin[0] - position[0], oy = e->origin[1] - position[1], oz = e->origin[2] - position[2];
+  const float dx = e->cos + u * e->sin, dy = e->sin - u * e->cos;
+  const Lanes a = dx * dx + dy * dy + dz * dz;
+  const Lanes nearest = -(ox * dx + oy * dy + oz * dz) / a;
+  const Lanes px = ox + nearest * dx, py = oy + nearest * dy, pz = oz + nearest * dz;
+  const Lanes miss2 = px * px + py * py + pz * pz, miss = roots(miss2);
+  const Lanes pixel = greater(nearest, lanes(NEAR_M)) * c->pitch, size = radius / pixel;
+  const Lanes whole = lesser(3.14159265f * size * size, lanes(1));
+  const Lanes part = lesser(greater(0.5f + (radius - miss) / pixel, lanes(0)), whole);
+  const Lanes coverage = pick(nearest > 0, part, lanes(0));
+  if (!any_of(coverage > 0)) return;
+  const float value = dot3(s->sphere_albedo + 3 * n, e->weights);
+  const Lanes depth = nearest - roots(greater(radius * radius - miss2, lanes(0)) / a);
+  const Lanes per_miss = 1.0f / greater(greater(miss, lanes(radius)), lanes(TINY));
+  const Lanes bright =
+      value * shades(c, (ox + depth * dx) * per_miss, (oy + depth * dy) * per_miss, (oz + depth * dz) * per_miss);
+  const Layer added = {pick(coverage > 0, 1.0f / greater(depth, lanes(NEAR_M)), lanes(0)), coverage, coverage * bright,
+                       lanes(0)};
+  insert(layers, added);
+}
+
+/* ------------------------------------------------------------------------------------------------------- texture */
+
+#define MOST_WAVES 8
+
+/* What all pixels of a frame share of each wave of the texture. */
+typedef struct {
+  float kx, ky, kz, weight, at_origin, right, up;
+} Wave;
+
+FN void waves_of(const Camera* c, const Eye* e, Wave* waves) {
+  for (int i = 0; i < c->waves; ++i) {
+    const float* k = c->wave + 4 * i;
+    const Wave wave = {
+        k[0], k[1], k[2], k[3], dot3(k, e->origin), (k[0] * e->sin - k[1] * e->cos) * c->pitch, k[2] * c->pitch};
+    waves[i] = wave;
+  }
+}
+
+FN Lanes box_filter(Lanes cycles) {
+  const Lanes x = lesser(cycles * cycles, lanes(1));
+  return (1.0f - x) * (1.0f - 0.55f * x);
+}
+
+/* The texture's factor on LANES rows of a column. */
+FN Lanes texture(const Camera* c, const Wave* waves, float dx, float dy, Lanes dz, Lanes depth,
+                            Lanes slope_right, Lanes slope_up) {
+  Lanes total = lanes(0);
+  for (int i = 0; i < c->waves; ++i) {
+    const Wave* w = &waves[i];
+    const Lanes along = (w->kx * dx + w->ky * dy) + w->kz * dz, phase = w->at_origin + depth * along;
+    const Lanes left =
+        box_filter(depth * w->right + slope_right * along) * box_filter(depth * w->up + slope_up * along);
+    const Lanes f = phase - nearest_whole(phase);
+    total += w->weight * left * (f * (8.0f - 16.0f * absolute(f)));
+  }
+  return 1.0f + c->contrast * total;
+}
+
+/* Brightness of textured ground and other planes before the sky, LANES rows of the column along (dx, dy). */
+FN Lanes backdrop(const Camera* c, const Shapes* s, const Eye* e, const Wave* waves, float dx, float dy,
+                             Lanes dz) {
+  const Lanes sky = lanes(dot3(c->sky, e->weights));
+  Lanes depth = lanes(NOWHERE), shown = lanes(0), share = lanes(0), slope_right = lanes(0), slope_up = lanes(0);
+  for (int n = 0; n < s->planes; ++n) {
+    const float *normal = s->plane_normal + 3 * n, *at = s->plane_position + 3 * n;
+    const float height =
+        (e->origin[0] - at[0]) * normal[0] + (e->origin[1] - at[1]) * normal[1] + (e->origin[2] - at[2]) * normal[2];
+    const float across = (normal[0] * e->sin - normal[1] * e->cos) * c->pitch, along = normal[2] * c->pitch;
+    const float spread = fabsf(across) + fabsf(along);
+    const float value = shade(c, normal[0], normal[1], normal[2]) * dot3(s->plane_albedo + 3 * n, e->weights);
+    const Lanes approach = normal[0] * dx + normal[1] * dy + normal[2] * dz;
+    const Lanes part = between(0.5f - approach * inverse(spread), 0, 1);
+    const Lanes middle = (approach - spread / 2 + lesser(approach + spread / 2, lanes(0))) / 2;
+    const Lanes per_middle = inverses(middle), t = -height * per_middle, relative = -t * per_middle;
+    const Mask seen = (middle < 0) & (t > 0) & (t < HORIZON_M) & (t < depth);
+    depth = pick(seen, t, depth), share = pick(seen, part, share), shown = pick(seen, lanes(value), shown);
+    slope_right = pick(seen, relative * across, slope_right), slope_up = pick(seen, relative * along, slope_up);
+  }
+  if (!any_of(share > 0)) return sky;
+  depth = pick(share > 0, depth, lanes(0));
+  return sky + share * (shown * texture(c, waves, dx, dy, dz, depth, slope_right, slope_up) - sky);
+}
+
+/* Coverage from which on what lies behind is not seen: 1 but for rounding. */
+#define WHOLE (1 - 1e-6f)
+
+/* Blends the layers of LANES rows over ground and sky. */
+FN Lanes blend(const Camera* c, const Shapes* s, const Eye* e, const Wave* waves, float dx, float dy,
+                          Lanes dz, const Layers* layers) {
+  const int used = layers->inserted < DEPTH_OF_LAYERS ? layers->inserted : DEPTH_OF_LAYERS;
+  int visible = 0, hidden = 0; /* layers before, and with, the first that covers all that lies behind it */
+  UNROLLED for (int k = 0; k < DEPTH_OF_LAYERS; ++k)
+    if (k < used && !hidden) visible = k + 1, hidden = !any_of(layers->layer[k].coverage < WHOLE);
+  Lanes behind = hidden ? lanes(0) : backdrop(c, s, e, waves, dx, dy, dz);
+  UNROLLED for (int k = DEPTH_OF_LAYERS - 1; k >= 0; --k) {
+    if (k >= visible) continue;
+    const Layer* layer = &layers->layer[k];
+    const Mask met = layer->closeness > 0, level = layer->slope == LEVEL_FACE;
+    const Lanes near = pick(met, inverses(layer->closeness), lanes(0));
+    const Lanes right = pick(level, lanes(0), -near * near * layer->slope);
+    const Lanes up = pick(level, -near * inverses(dz) * c->pitch, lanes(0));
+    const Lanes factor = texture(c, waves, dx, dy, dz, near, right, up);
+    behind += pick(met, layer->value * factor - layer->coverage * behind, lanes(0));
+  }
+  return behind;
+}
+
+/* ------------------------------------------------------------------------------------------------------- depths */
+
+/* Lowers `nearest` of LANES rows to the depth at which rays are both beside an upright shape's axis, from `from` to
+ * `to`, and between its bottom and its top. */
+FN Lanes nearer_upright(const Shapes* s, const Eye* e, int n, float from, float to, Lanes per_z, Lanes nearest) {
+  const int is_box = n < s->boxes, i = is_box ? n : n - s->boxes;
+  const float z = is_box ? s->box_position[3 * i + 2] : s->cylinder_position[3 * i + 2];
+  const float half = is_box ? s->box_half[3 * i + 2] : s->cylinder_half[i];
+  const Lanes at = (z - e->origin[2]) * per_z, reach = half * absolute(per_z);
+  const Lanes enter = greater(lanes(from), at - reach), leave = lesser(lanes(to), at + reach);
+  return pick((enter < leave) & (enter > 0) & (enter < nearest), enter, nearest);
+}
+
+/* How an upright shape is turned about its axis. */
+typedef struct {
+  float cos, sin;
+} Turn;
+
+FN Turn turn_of(const Shapes* s, int n) {
+  const Turn none = {1, 0};
+  if (n >= s->boxes) return none;
+  const Turn turn = {cosf(s->box_yaw[n]), sinf(s->box_yaw[n])};
+  return turn;
+}
+
+/* Depths between which the rays of LANES columns are beside the axis of upright shape `n`; boxes come first. */
+FN void beside(const Shapes* s, const Eye* e, int n, Turn turn, Lanes dx, Lanes dy, Lanes* from, Lanes* to) {
+  const int is_box = n < s->boxes, i = is_box ? n : n - s->boxes;
+  const float* position = is_box ? s->box_position + 3 * i : s->cylinder_position + 3 * i;
+  const float x = position[0] - e->origin[0], y = position[1] - e->origin[1], cos = turn.cos, sin = turn.sin;
+  if (is_box) {
+    const float* half = s->box_half + 3 * n;
+    const Lanes per_x = inverses(cos * dx + sin * dy), per_y = inverses(cos * dy - sin * dx);
+    const Lanes middle_x = (cos * x + sin * y) * per_x, middle_y = (cos * y - sin * x) * per_y;
+    const Lanes reach_x = half[0] * absolute(per_x), reach_y = half[1] * absolute(per_y);
+    *from = greater(middle_x - reach_x, middle_y - reach_y), *to = lesser(middle_x + reach_x, middle_y + reach_y);
+    return;
+  }
+  const float radius = s->cylinder_radius[i];
+  const Lanes flat = greater(dx * dx + dy * dy, lanes(TINY)), middle = (x * dx + y * dy) / flat;
+  const Lanes px = middle * dx - x, py = middle * dy - y, inside = radius * radius - (px * px + py * py);
+  const Lanes reach = roots(greater(inside, lanes(0)) / flat);
+  *from = pick(inside > 0, middle - reach, lanes(NOWHERE)), *to = pick(inside > 0, middle + reach, lanes(-NOWHERE));
+}
+
+/* Whether no part of upright shape `n` can be in the image; boxes come first. */
+FN int upright_out_of_sight(const Camera* c, const Shapes* s, const Eye* e, int n) {
+  const int is_box = n < s->boxes, i = is_box ? n : n - s->boxes;
+  const float *at = is_box ? s->box_position + 3 * i : s->cylinder_position + 3 * i, *half = s->box_half + 3 * i;
+  const float radius = is_box ? sqrtf(half[0] * half[0] + half[1] * half[1]) : s->cylinder_radius[i];
+  return out_of_sight(c, e, at[0] - e->origin[0], at[1] - e->origin[1], radius);
+}
+
+/* Depths at which LANES rays, along `dz` in the column along (dx, dy), meet a plane or a sphere; else NOWHERE. */
+FN Lanes nearest_of_others(const Shapes* s, const Eye* e, float dx, float dy, Lanes dz) {
+  Lanes nearest = lanes(NOWHERE);
+  for (int n = 0; n < s->planes; ++n) {
+    const float *normal = s->plane_normal + 3 * n, *at = s->plane_position + 3 * n;
+    const float height =
+        (e->origin[0] - at[0]) * normal[0] + (e->origin[1] - at[1]) * normal[1] + (e->origin[2] - at[2]) * normal[2];
+    const Lanes approach = normal[0] * dx + normal[1] * dy + normal[2] * dz, t = -height * inverses(approach);
+    nearest = pick((approach < 0) & (t > 0) & (t < HORIZON_M) & (t < nearest), t, nearest);
+  }
+  for (int n = 0; n < s->spheres; ++n) {
+    const float *at = s->sphere_position + 3 * n, radius = s->sphere_radius[n];
+    const float ox = e->origin[0] - at[0], oy = e->origin[1] - at[1], oz = e->origin[2] - at[2];
+    const Lanes a = dx * dx + dy * dy + dz * dz, middle = -(ox * dx + oy * dy + oz * dz) / a;
+    const Lanes px = ox + middle * dx, py = oy + middle * dy, pz = oz + middle * dz;
+    const Lanes miss2 = px * px + py * py + pz * pz;
+    const Lanes t = middle - roots(greater(radius * radius - miss2, lanes(0)) / a);
+    nearest = pick((roots(miss2) < radius) & (t > 0) & (t < nearest), t, nearest);
+  }
+  return nearest;
+}
+
+/* -------------------------------------------------------------------------------------------------------- frames */
+
+enum {
+  CONSTANTS,
+  U,
+  V,
+  WAVES,
+  ORIGIN,
+  ROTATION,
+  BOXES,
+  CYLINDERS = BOXES + 4,
+  SPHERES = CYLINDERS + 4,
+  PLANES = SPHERES + 3,
+  WEIGHTS = PLANES + 3, /* of pictures */
+  OPERANDS
+};
+
+/* The frames of one call. From ORIGIN on operands have a leading [L], of which each row serves M / L frames in a row. */
+typedef struct {
+  const float* data[OPERANDS];
+  int64_t size[OPERANDS], serves[OPERANDS]; /* of a row: its numbers, the frames that it serves */
+  int64_t frames;
+  int height, width, waves, boxes, cylinders, spheres, planes;
+  float* pictures;
+} Batch;
+
+FN const float* of_frame(const Batch* b, int operand, int64_t m) {
+  return b->data[operand] + m / b->serves[operand] * b->size[operand];
+}
+
+/* Frame `m` of a batch. */
+FN void frame_of(const Batch* b, int64_t m, Camera* c, Shapes* s, Eye* e) {
+  const float* k = b->data[CONSTANTS];
+  c->height = b->height, c->width = b->width, c->waves = b->waves;
+  c->pitch = k[0], c->contrast = k[1], c->ambient = k[2], c->sun = k + 3, c->sky = k + 6;
+  c->u = b->data[U], c->v = b->data[V], c->wave = b->data[WAVES];
+  s->boxes = b->boxes, s->cylinders = b->cylinders, s->spheres = b->spheres, s->planes = b->planes;
+  s->box_position = of_frame(b, BOXES, m), s->box_half = of_frame(b, BOXES + 1, m);
+  s->box_yaw = of_frame(b, BOXES + 2, m), s->box_albedo = of_frame(b, BOXES + 3, m);
+  s->cylinder_position = of_frame(b, CYLINDERS, m), s->cylinder_radius = of_frame(b, CYLINDERS + 1, m);
+  s->cylinder_half = of_frame(b, CYLINDERS + 2, m), s->cylinder_albedo = of_frame(b, CYLINDERS + 3, m);
+  s->sphere_position = of_frame(b, SPHERES, m), s->sphere_radius = of_frame(b, SPHERES + 1, m);
+  s->sphere_albedo = of_frame(b, SPHERES + 2, m);
+  s->plane_position = of_frame(b, PLANES, m), s->plane_normal = of_frame(b, PLANES + 1, m);
+  s->plane_albedo = of_frame(b, PLANES + 2, m);
+  const float *r = of_frame(b, ROTATION, m), scale = 1.0f / sqrtf(most(r[0] * r[0] + r[3] * r[3], TINY));
+  e->origin = of_frame(b, ORIGIN, m), e->weights = of_frame(b, WEIGHTS, m);
+  e->cos = r[0] * scale, e->sin = r[3] * scale;
+}
+
+/* Reads a call of XLA's into a batch; returns an error for XLA to raise, or 0. Depth images have no WEIGHTS. */
+static inline XLA_FFI_Error* batch_of(XLA_FFI_CallFrame* call, int weighted, Batch* b) {
+  const int operands = weighted ? OPERANDS : WEIGHTS;
+  if (call->args.size != operands || call->rets.size != 1)
+    return failed(call, XLA_FFI_Error_Code_INVALID_ARGUMENT,
+                  "pictures were asked for with a number of operands that the library does not know; native.py must "
+                  "give those of the enum in pictures.h");
+  XLA_FFI_Buffer** arg = (XLA_FFI_Buffer**)call->args.args;
+  const XLA_FFI_Buffer* pictures = (const XLA_FFI_Buffer*)call->rets.rets[0];
+  memset(b, 0, sizeof *b);
+  b->frames = pictures->dims[0], b->height = (int)pictures->dims[1], b->width = (int)pictures->dims[2];
+  b->pictures = (float*)pictures->data;
+  for (int i = 0; i < OPERANDS; ++i) b->serves[i] = 1;
+  for (int i = 0; i < operands; ++i) {
+    b->data[i] = (const float*)arg[i]->data;
+    if (i < ORIGIN) continue;
+    b->size[i] = 1, b->serves[i] = b->frames / arg[i]->dims[0];
+    for (int d = 1; d < arg[i]->rank; ++d) b->size[i] *= arg[i]->dims[d];
+  }
+  b->waves = (int)arg[WAVES]->dims[0];
+  b->boxes = (int)arg[BOXES]->dims[1], b->cylinders = (int)arg[CYLINDERS]->dims[1];
+  b->spheres = (int)arg[SPHERES]->dims[1], b->planes = (int)arg[PLANES]->dims[1];
+  if (b->waves > MOST_WAVES)
+    return failed(call, XLA_FFI_Error_Code_INVALID_ARGUMENT,
+                  "pictures have a texture of at most 8 waves; texture.WAVES must not have more");
+  return 0;
+}
+
+#endif
