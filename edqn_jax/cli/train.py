@@ -129,17 +129,15 @@ def tuned_for_gpu(options: TrainOptions, config: Config) -> bool:
 def options_to_compare(config: Config) -> str:
     """Returns what processes must have alike: all options, and in place of a world file's path what it holds.
 
-    On CPUs also whether there is a C compiler, since all must run the same program.
+    Also whether there is a compiler of C for their devices, since all must run the same program.
 
     Raises:
         ConfigError: if there is no such file, or it cannot be read.
     """
-    import jax
-
-    from edqn_jax.parallel.c_library import compiler
+    from edqn_jax.parallel.c_library import compiler, of_backend
 
     world = dataclasses.replace(config.world, name=_held(config.world.name), flown=_held(config.world.flown))
-    in_c = jax.default_backend() == "cpu" and compiler() is not None
+    in_c = compiler(of_backend()) is not None
     return f"{to_yaml(dataclasses.replace(config, world=world))}in_c: {in_c}\n"
 
 

@@ -40,6 +40,7 @@ class Compiler:
     usual: str
     flags: tuple[str, ...]
     platform: str
+    told: int  # line of what it says of its version that names it
 
 
 C = Compiler(
@@ -51,6 +52,7 @@ C = Compiler(
         *("-fno-math-errno", "-fno-trapping-math", "-ffinite-math-only", "-fno-signed-zeros"),
     ),
     "cpu",
+    0,
 )
 
 
@@ -63,14 +65,23 @@ def cuda() -> Compiler | None:
         return None
     # Quotients and roots to 2 units in the last place, as fused products are in any case.
     fast = ("-prec-div=false", "-prec-sqrt=false")
-    return Compiler("NVCC", "nvcc", ("-O3", f"-arch=sm_{major}{minor}", *fast, "-Xcompiler=-fPIC", "-shared"), "CUDA")
+    flags = ("-O3", f"-arch=sm_{major}{minor}", *fast, "-Xcompiler=-fPIC", "-shared")
+    return Compiler("NVCC", "nvcc", flags, "CUDA", -1)
+
+
+def of_backend() -> Compiler | None:
+    """Returns the compiler for the devices that JAX prefers; None where these are neither CPUs nor NVIDIA GPUs."""
+    return C if jax.default_backend() == "cpu" else cuda()
 
 
 @functools.cache
-def compiler() -> str | None:
-    """Returns the C compiler that is used and its version, as its own first line; None where nothing in C is used."""
-    command = _command(C)
-    return None if command is None else next(iter(_version(command).splitlines()), shlex.join(command))
+def compiler(of: Compiler | None = C) -> str | None:
+    """Returns the name and version of a compiler in its own words; None where it is not used."""
+    command = None if of is None else _command(of)
+    if of is None or command is None:
+        return None
+    lines = _version(command).splitlines()
+    return lines[of.told] if lines else shlex.join(command)
 
 
 def _version(command: Sequence[str]) -> str:
@@ -95,7 +106,7 @@ def registered(
     source: Path,
     targets: tuple[str, ...],
     definitions: tuple[str, ...] = (),
-    compiler: Compiler = C,
+    by: Compiler = C,
     headers: tuple[Path, ...] = (),
 ) -> bool:
     """Compiles and loads a source, and registers its handlers with XLA; returns whether that was possible.
@@ -107,29 +118,29 @@ def registered(
         source: C, with XLA's header for foreign functions.
         targets: names of its handlers.
         definitions: of the preprocessor, NAME=VALUE.
-        compiler: and for what.
+        by: compiler.
         headers: that the source includes from beside it.
     """
     with _ONE_AT_A_TIME:
-        return _registered(source, targets, definitions, compiler, headers)
+        return _registered(source, targets, definitions, by, headers)
 
 
 @functools.cache
 def _registered(
-    source: Path, targets: tuple[str, ...], definitions: tuple[str, ...], compiler: Compiler, headers: tuple[Path, ...]
+    source: Path, targets: tuple[str, ...], definitions: tuple[str, ...], by: Compiler, headers: tuple[Path, ...]
 ) -> bool:
-    command = _command(compiler)
+    command = _command(by)
     if command is None:
         return False
     try:
         with contextlib.ExitStack() as scratch:
             # Where nothing can be kept, the file is not needed once it is loaded.
             folder = private_folder() or Path(scratch.enter_context(tempfile.TemporaryDirectory()))
-            library = _loaded([*command, *compiler.flags], source, definitions, folder, headers)
+            library = _loaded([*command, *by.flags], source, definitions, folder, headers)
         _check_usable(library)
         for target in targets:
             handler = jax.ffi.pycapsule(getattr(library, target))
-            jax.ffi.register_ffi_target(target, handler, platform=compiler.platform)
+            jax.ffi.register_ffi_target(target, handler, platform=by.platform)
     except (OSError, AttributeError, subprocess.SubprocessError, jax.errors.JaxRuntimeError) as error:
         said = error.stderr.decode(errors="replace") if isinstance(error, subprocess.CalledProcessError) else str(error)
         first = next(iter(said.strip().splitlines()), type(error).__name__)

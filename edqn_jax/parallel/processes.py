@@ -111,7 +111,7 @@ def check_alike(text: str) -> None:
     if len({row.tobytes() for row in multihost_utils.process_allgather(digest)}) > 1:
         raise ConfigError(
             "the processes have different options or world files; give all of them the same ones, --tuned-for "
-            "cpu or gpu included; on CPUs all need a C compiler, or EDQN_JAX_NATIVE=0"
+            "cpu or gpu included; all need a C compiler (with GPUs, CUDA's), or EDQN_JAX_NATIVE=0"
         )
 
 

@@ -47,10 +47,13 @@ def workload(config: Config, scene: Scene) -> dict[str, Any]:
 
 
 def versions() -> dict[str, str]:
-    """Returns the versions of Python, of packages, and of the C compiler if one is used, that figures depend on."""
-    packages = ("jax", "mujoco", "mujoco-mjx", "flax", "optax", "numpy")
-    found = {name: metadata.version(name) for name in packages}
-    return {"python": platform.python_version(), **found, "C compiler": c_library.compiler() or "none"}
+    """Returns the versions of Python, of packages, and of the compilers of C, that figures depend on."""
+    names = ("jax", "mujoco", "mujoco-mjx", "flax", "optax", "numpy")
+    packages = {name: metadata.version(name) for name in names}
+    cuda = c_library.cuda()
+    compilers = {"C compiler": c_library.C} | ({} if cuda is None else {"CUDA compiler": cuda})
+    in_c = {name: c_library.compiler(each) or "none" for name, each in compilers.items()}
+    return {"python": platform.python_version(), **packages, **in_c}
 
 
 def state_digest(state: TrainState) -> str:
