@@ -94,6 +94,27 @@ def test_a_damaged_library_is_made_anew(source: Path, tmp_path: Path) -> None:
         assert list(folders[1].iterdir()) == [damaged] and damaged.stat().st_size == whole.stat().st_size
 
 
+def test_a_library_that_says_that_it_cannot_be_used_here_is_not(
+    source: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    usable = 'const char *edqn_unusable(void) { return 0; }\n'
+    source.write_text(SOURCE + usable, encoding="utf-8")
+    compiler = shutil.which("cc") is not None
+    assert registered(source, ("edqn_test_k",), ("NAME=edqn_test_k",)) is compiler and not caplog.records
+    source.write_text(SOURCE + usable.replace("return 0", 'return "the driver is too old"'), encoding="utf-8")
+    assert not registered(source, ("edqn_test_l",), ("NAME=edqn_test_l",))
+    assert ("JAX does its work more slowly: the driver is too old" in caplog.text) is compiler
+
+
+def test_what_an_included_header_says_is_compiled_anew_when_it_changes(source: Path, tmp_path: Path) -> None:
+    header = source.with_name("name.h")
+    for count, name in enumerate(("edqn_test_m", "edqn_test_n")):
+        header.write_text(f"#define NAME {name}\n", encoding="utf-8")
+        source.write_text('#include "name.h"\n' + SOURCE, encoding="utf-8")
+        if registered(source, (name,), (), c_library.C, (header,)):
+            assert len(kept(tmp_path)) == count + 1
+
+
 def test_the_compiler_may_have_options_and_a_failure_is_told(
     source: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
