@@ -10,7 +10,7 @@ have noise, and frames the blur and the exposure of their light.
     python benchmarks/light.py --out runs/light --report
 
 A row is written when it is done, with the policies, and is not measured again; no row is begun that would not end in
-time. Arguments after -- are options of train.py; defaults are those of the hardware. Intervals are a bootstrap over
+time. --train-only is as in success.py. Arguments after -- are options of train.py; defaults are those of the hardware. Intervals are a bootstrap over
 seeds and missions, 95 %.
 """
 
@@ -31,7 +31,6 @@ from edqn_jax.errors import ConfigError
 from edqn_jax.evaluation.missions import load_missions
 from edqn_jax.parallel.devices import cores, most_that_divide, use_cpu_devices
 from edqn_jax.runs.files import check_can_make
-from edqn_jax.runs.policies import load_policy
 from measurement.flags import split
 
 REAL = ("--exposure.real",)
@@ -58,6 +57,7 @@ def parse(argv: Sequence[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--seeds", type=int, default=5, help="training seeds, in one program (default 5)")
     parser.add_argument("--missions", type=int, default=1000, help="test missions in each light (default 1000)")
     parser.add_argument("--minutes", type=float, default=9.0, help="begin no row that would end later (default 9)")
+    parser.add_argument("--train-only", action="store_true", help="leave the flights to a later call, on any machine")
     parser.add_argument("--report", action="store_true", help="measure no row, print those in --out")
     args = parser.parse_args(words)
     args.flags = flags
@@ -83,7 +83,7 @@ def measure_row(config: Config, args: argparse.Namespace, folder: Path) -> succe
     """Trains the seeds of a row, saves their policies in `folder`, flies each light, and returns the row."""
     began = time.perf_counter()
     row = success.train_row(config, args.seeds, args.missions, folder)
-    policies = [load_policy(folder / f"seed-{seed}") for seed in range(args.seeds)]
+    policies, _ = success.trained(config, args.seeds, folder)
     lights = []
     for lux in args.lux:
         lit = flown_under(config, {"light": {"least_lux": lux, "most_lux": lux}}, "--lux")
@@ -131,8 +131,13 @@ def main(argv: Sequence[str] | None = None) -> int:
                 config = config_of(args, sensor, speed)
                 use_cpu_devices(most_that_divide(config.train.shards, cores()))
                 file = success.row_file(args.out, config, args.missions, f"light {args.lux} {args.seeds}")
-                folder = args.out / "policies" / file.stem
-                wanted.append(success.Wanted(file, functools.partial(measure_row, config, args, folder)))
+                folder = success.policies_of(file)
+                measure = functools.partial(measure_row, config, args, folder)
+                train = functools.partial(success.trained, config, args.seeds, folder)
+                wanted.append(success.Wanted(file, measure, train))
+        if args.train_only:
+            success.train_all(wanted, began + 60 * args.minutes)
+            return 3
         left = success.measure(wanted, rows, began + 60 * args.minutes)
         if rows:
             print(table(rows))

@@ -1,7 +1,9 @@
 """How many unseen worlds does a policy fly? Trains several seeds in one program and flies test worlds, row by row.
 
 A row is a world with a sensor. It is written when it is done, with the policies, and a row that is written already is
-not measured again: a command that was stopped goes on where it was. No row is begun that would not end in time.
+not measured again: a command that was stopped goes on where it was. No row is begun that would not end in time. With
+--train-only a machine with a GPU trains; the same command without it flies, on any machine, at the same commit and with
+the same options (-- --tuned-for gpu).
 
     python benchmarks/success.py --out runs/success
     python benchmarks/success.py --out runs/success --worlds medium --sensors events depth -- --total-steps 9000000
@@ -56,6 +58,9 @@ from rivals.planning import judged_scenes, shortest_lengths
 
 Row = dict[str, Any]
 
+TRAINED = "trained.json"
+"""In a folder of policies: says that all seeds of a row have been trained, and what that took."""
+
 FIRST_ROW_S = 240.0
 """Assumed duration of a row before one has been measured."""
 
@@ -75,6 +80,7 @@ def parse(argv: Sequence[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--shuffle-codes", action="store_true", help="give each drone what another one sees (--runs)")
     parser.add_argument("--missions", type=int, default=1000, help="test missions of each seed (default 1000)")
     parser.add_argument("--minutes", type=float, default=9.0, help="begin no row that would end later (default 9)")
+    parser.add_argument("--train-only", action="store_true", help="leave the flights to a later call, on any machine")
     parser.add_argument("--no-spl", action="store_true", help="do not search shortest paths")
     parser.add_argument("--report", action="store_true", help="measure no row, print those in --out, with SPL")
     args = parser.parse_args(words)
@@ -83,8 +89,8 @@ def parse(argv: Sequence[str] | None = None) -> argparse.Namespace:
         parser.error("--runs have their own sensor and options; leave out --sensors and the arguments after --")
     if args.shuffle_codes and not args.runs:
         parser.error("--shuffle-codes needs the --runs that fly with them")
-    if args.runs and args.report:
-        parser.error("--report measures nothing; leave out --runs")
+    if args.runs and (args.report or args.train_only):
+        parser.error("--report and --train-only fly nothing; leave out --runs")
     for name in ("seeds", "missions"):
         if getattr(args, name) < 1:
             parser.error(f"--{name} must be at least 1, not {getattr(args, name)}")
@@ -131,6 +137,11 @@ def row_file(out: Path, config: Config, missions: int, identity: str) -> Path:
     return out / f"{config.world.name}-{config.env.sensor}-{digest}.json"
 
 
+def policies_of(file: Path) -> Path:
+    """Returns the folder of the policies of a row's file."""
+    return file.parent / "policies" / file.stem
+
+
 def digest_of(policies: Sequence[Policy]) -> str:
     """Returns a digest of the parameters of policies."""
     digest = hashlib.sha256()
@@ -166,16 +177,39 @@ def read_rows(out: Path) -> list[Row]:
 
 
 def train_row(config: Config, seeds: int, missions: int, folder: Path) -> Row:
-    """Trains the seeds of a row, saves their policies in `folder`, flies the test missions, and returns the row."""
+    """Trains the seeds of a row as `trained` does, flies the test missions, and returns the row."""
     began = time.perf_counter()
-    shutil.rmtree(folder, ignore_errors=True)  # of a row that was cut short
+    policies, training = trained(config, seeds, folder)
+    took = {name: training[name] for name in ("train_seconds", "compile_seconds")}
+    return _row(config, policies, missions, training["decisions"], took, began) | {"training": training}
+
+
+def trained(config: Config, seeds: int, folder: Path) -> tuple[list[Policy], dict[str, Any]]:
+    """Trains the seeds of a row and saves their policies in `folder`, or loads them if that has been done.
+
+    Returns:
+        The policies, and what their training took, where and with which commit.
+    """
+    file = folder / TRAINED
+    if file.is_file():
+        training = json.loads(file.read_text(encoding="utf-8"))
+        return [load_policy(folder / name) for name in training["policies"]], training
+    shutil.rmtree(folder, ignore_errors=True)  # of a training that was cut short
     results = train_seeds(seeds, config)
     policies = [Policy(result.policy.config, result.policy.params) for result in results]
-    for policy in policies:
-        save_policy(policy, folder / f"seed-{policy.config.train.seed}")
-    first = results[0]
-    took = {"train_seconds": first.train_seconds, "compile_seconds": first.compile_seconds}
-    return _row(config, policies, missions, first.decisions, took, began)
+    names = [f"seed-{policy.config.train.seed}" for policy in policies]
+    for policy, name in zip(policies, names, strict=True):
+        save_policy(policy, folder / name)
+    training = {
+        "policies": names,
+        "decisions": results[0].decisions,
+        "train_seconds": results[0].train_seconds,
+        "compile_seconds": results[0].compile_seconds,
+        "commit": _commit(),
+        **json_report.machine(jax.devices()),
+    }
+    json_report.write(file, training)
+    return policies, training
 
 
 def fly_row(
@@ -317,6 +351,7 @@ class Wanted:
 
     file: Path
     measure: Callable[[], Row]
+    train: Callable[[], object] | None = None  # what `measure` does first; None where nothing is to be trained
 
 
 def measure(wanted: Sequence[Wanted], rows: list[Row], until: float) -> int:
@@ -345,6 +380,18 @@ def measure(wanted: Sequence[Wanted], rows: list[Row], until: float) -> int:
     return len(left)
 
 
+def train_all(wanted: Sequence[Wanted], until: float) -> None:
+    """Trains the rows that are not written yet, one after the other, while there is time for one more."""
+    longest = FIRST_ROW_S
+    for one in wanted:
+        began = time.perf_counter()
+        if one.train is None or one.file.is_file() or began + longest > until:
+            continue
+        one.train()
+        longest = time.perf_counter() - began
+        print(f"{policies_of(one.file)}: trained, {longest:.0f} s", file=sys.stderr)
+
+
 def _wanted(args: argparse.Namespace) -> list[Wanted]:
     """Returns the rows that the arguments ask for, and makes JAX present as many devices as they use.
 
@@ -367,7 +414,11 @@ def _wanted(args: argparse.Namespace) -> list[Wanted]:
     use_cpu_devices(most_that_divide(configs[0].train.shards, cores()))
     files = [row_file(args.out, config, args.missions, str(args.seeds)) for config in configs]
     return [
-        Wanted(file, functools.partial(train_row, config, args.seeds, args.missions, args.out / "policies" / file.stem))
+        Wanted(
+            file,
+            functools.partial(train_row, config, args.seeds, args.missions, policies_of(file)),
+            functools.partial(trained, config, args.seeds, policies_of(file)),
+        )
         for file, config in zip(files, configs, strict=True)
     ]
 
@@ -393,6 +444,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     except ConfigError as error:
         print(error, file=sys.stderr)
         return 2
+    if args.train_only:
+        train_all(wanted, began + 60 * args.minutes)
+        return 3
     try:
         left = measure(wanted, rows, began + 60 * args.minutes)
     except ConfigError as error:

@@ -40,6 +40,25 @@ def untrained(seeds: int, config: Config) -> list[TrainingResult]:
     return results
 
 
+def test_what_one_call_trains_another_flies(tmp_path: Path, monkeypatch, capsys) -> None:
+    monkeypatch.setattr(success, "use_cpu_devices", lambda count: None)
+    monkeypatch.setattr(success, "train_seeds", untrained)
+    assert call(tmp_path, "--train-only") == 3
+    (folder,) = (tmp_path / "policies").iterdir()
+    assert "trained" in capsys.readouterr().err and not list(tmp_path.glob("*.json"))
+    monkeypatch.setattr(success, "train_seeds", lambda *_: pytest.fail("trained again"))
+    assert call(tmp_path, "--train-only") == 3
+    assert call(tmp_path, "--no-spl") == 0
+    (file,) = tmp_path.glob("sparse-blind-*.json")
+    row = json.loads(file.read_text())
+    assert file.stem == folder.name and row["training"]["policies"] == ["seed-0", "seed-1"]
+    assert row["decisions"] == 256 and [turn["seed"] for turn in row["turns"]] == [0, 1]
+    (folder / success.TRAINED).unlink()  # as if the training had been cut short
+    file.unlink()
+    with pytest.raises(pytest.fail.Exception, match="trained again"):
+        call(tmp_path, "--no-spl")
+
+
 @pytest.mark.slow
 def test_a_row_is_measured_once_and_then_read(tmp_path: Path, monkeypatch, capsys) -> None:
     monkeypatch.setattr(success, "use_cpu_devices", lambda count: None)
