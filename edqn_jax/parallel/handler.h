@@ -8,9 +8,10 @@
 /* Returns whether XLA asks for a handler's version rather than calls it, and answers. What kernels are launched on a
  * stream can be recorded there and launched again. */
 static inline int asked_for_version(XLA_FFI_CallFrame* call) {
-  XLA_FFI_Extension_Base* extension = call->extension_start;
-  if (!extension || extension->type != XLA_FFI_Extension_Metadata) return 0;
-  XLA_FFI_Metadata* metadata = ((XLA_FFI_Metadata_Extension*)extension)->metadata;
+  /* The base of extensions has another name in each version of XLA. */
+  const XLA_FFI_Metadata_Extension* extension = (const XLA_FFI_Metadata_Extension*)call->extension_start;
+  if (!extension || extension->extension_base.type != XLA_FFI_Extension_Metadata) return 0;
+  XLA_FFI_Metadata* metadata = extension->metadata;
   metadata->api_version.major_version = XLA_FFI_API_MAJOR;
   metadata->api_version.minor_version = XLA_FFI_API_MINOR;
 #ifdef __CUDACC__
