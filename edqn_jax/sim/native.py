@@ -30,6 +30,9 @@ OPERANDS = {
 }
 """Kinds of shape that the library draws, and what it reads of each. A scene with room for any other is drawn by JAX."""
 
+MOST_PLANES = 8
+"""As in `pictures.h`."""
+
 TARGETS = ("edqn_pictures", "edqn_depths")
 
 NOWHERE = 1e29
@@ -41,6 +44,7 @@ def can_draw(config: CameraConfig, scene: Scene, platform: str) -> bool:
     others = (scene.tilted_boxes, scene.capsules, scene.tilted_cylinders)
     plain = config.mount == "level" and not any(kind.position.shape[-2] for kind in others)
     shapes = [getattr(getattr(scene, kind), name) for kind, names in OPERANDS.items() for name in names]
+    plain = plain and scene.planes.position.shape[-2] <= MOST_PLANES
     return plain and all(leaf.dtype == jnp.float32 for leaf in shapes) and is_at_hand(platform)
 
 

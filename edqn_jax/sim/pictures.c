@@ -102,6 +102,9 @@ static void release(Work* w) {
 static void draw(const Camera* c, const Shapes* s, const Eye* e, Work* w, float* picture) {
   Wave waves[MOST_WAVES];
   waves_of(c, e, waves);
+  Plane planes[MOST_PLANES];
+  planes_of(c, s, e, planes);
+  light_planes(c, s, e, planes);
   int visible = 0;
   for (int n = 0; n < s->boxes + s->cylinders; ++n) {
     Upright shape;
@@ -134,7 +137,7 @@ static void draw(const Camera* c, const Shapes* s, const Eye* e, Work* w, float*
       for (int b = 0; b < blocks; ++b) insert_side(c, numbers, w->stride, b * LANES, &w->layers[b]);
     }
     for (int b = 0; b < blocks; ++b) {
-      const Lanes behind = blend(c, s, e, waves, dx, dy, load(w->v + b * LANES), &w->layers[b]);
+      const Lanes behind = blend(c, planes, s->planes, e, waves, dx, dy, load(w->v + b * LANES), &w->layers[b]);
       for (int l = 0; l < LANES && b * LANES + l < c->height; ++l)
         picture[(b * LANES + l) * c->width + column] = behind[l];
     }
@@ -143,6 +146,8 @@ static void draw(const Camera* c, const Shapes* s, const Eye* e, Work* w, float*
 
 /* Depth along the middle ray of every pixel of one frame, [H, C]; NOWHERE where there is nothing. */
 static void measure(const Camera* c, const Shapes* s, const Eye* e, Work* w, float* picture) {
+  Plane planes[MOST_PLANES];
+  planes_of(c, s, e, planes);
   memset(w->found, 0, sizeof(int) * (size_t)c->width);
   for (int n = 0; n < s->boxes + s->cylinders; ++n) {
     if (upright_out_of_sight(c, s, e, n)) continue;
@@ -163,11 +168,11 @@ static void measure(const Camera* c, const Shapes* s, const Eye* e, Work* w, flo
     const float dx = e->cos + c->u[column] * e->sin, dy = e->sin - c->u[column] * e->cos;
     for (int first = 0; first < c->height; first += LANES) {
       const Lanes dz = load(w->v + first), per_z = inverses(dz);
-      Lanes nearest = nearest_of_others(s, e, dx, dy, dz);
+      Lanes nearest = nearest_of_others(s, planes, e, dx, dy, dz);
       for (int k = 0; k < w->found[column]; ++k) {
         const int n = w->covering[column * w->most + k];
         const float* from = w->numbers + (size_t)n * NUMBERS * w->stride + column;
-        nearest = nearer_upright(s, e, n, from[0], from[w->stride], per_z, nearest);
+        nearest = nearer_upright(level_of(s, e, n), from[0], from[w->stride], per_z, nearest);
       }
       for (int l = 0; l < LANES && first + l < c->height; ++l) picture[(first + l) * c->width + column] = nearest[l];
     }
@@ -186,16 +191,19 @@ static XLA_FFI_Error* each_frame(XLA_FFI_CallFrame* call, Render* render, int we
   Camera camera;
   Shapes shapes;
   Eye eye;
-  frame_of(&batch, 0, &camera, &shapes, &eye);
+  const float* of[OPERANDS];
+  memcpy(of, batch.data, sizeof of);
+  frame_of(&batch, of, &camera, &shapes, &eye);
   Work work = {0};
   if (!prepare(&camera, &shapes, &work)) {
     release(&work);
     return failed(call, XLA_FFI_Error_Code_RESOURCE_EXHAUSTED,
                   "pictures.c found no memory for the columns of a frame; the image must be smaller");
   }
-  for (int64_t m = 0; m < batch.frames; ++m) {
-    frame_of(&batch, m, &camera, &shapes, &eye);
-    render(&camera, &shapes, &eye, &work, batch.pictures + m * batch.height * batch.width);
+  for (uint32_t m = 0; m < batch.frames; ++m) {
+    for (int i = ORIGIN; i < OPERANDS; ++i) of[i] = of_frame(&batch, i, m);
+    frame_of(&batch, of, &camera, &shapes, &eye);
+    render(&camera, &shapes, &eye, &work, batch.pictures + (int64_t)m * batch.height * batch.width);
   }
   release(&work);
   return 0;

@@ -22,10 +22,15 @@
 #define FN static __device__ __forceinline__
 #define UNROLLED _Pragma("unroll")
 #define COLUMNS 32
+#ifndef ROWS
 #define ROWS 8
+#define RESIDENT 4 
+#endif
 #define THREADS (COLUMNS * ROWS)
+#ifndef AT_ONCE
 #define AT_ONCE 16
-#define MEASURED_AT_ONCE 64
+#endif
+#define MEASURED_AT_ONCE 32
 
 typedef float Lanes;
 typedef int Mask;
@@ -42,20 +47,43 @@ FN Lanes counted(void) { return 0; }
 
 #include "pictures.h"
 
+/* What the threads of a block share of their frame. */
+typedef struct {
+  const float* of[OPERANDS];
+  Camera camera;
+  Shapes shapes;
+  Eye eye;
+  Plane planes[MOST_PLANES];
+} Frame;
+
+/* Reads frame `m`. Every thread of the block calls it. */
+FN void share_frame(const Batch* b, uint32_t m, Frame* f) {
+  const int t = threadIdx.x;
+  if (t < OPERANDS) f->of[t] = of_frame(b, t, m);
+  __syncthreads();
+  if (t == 0) {
+    frame_of(b, f->of, &f->camera, &f->shapes, &f->eye);
+    planes_of(&f->camera, &f->shapes, &f->eye, f->planes);
+  }
+  __syncthreads();
+}
+
 /* The upright shapes of a pass that a strip may show, in their order. */
 typedef struct {
-  unsigned char shown[THREADS]; /* by thread, a shape each */
+  unsigned bits[THREADS / 32]; /* by thread, a shape each */
   int list[THREADS];
 } Gathered;
 
 /* Adds shape `n` to the list if it is shown; returns how many are. Every thread of the block calls it. */
 FN int gather(Gathered* g, int n, int shown) {
   const int t = threadIdx.x;
-  g->shown[t] = (unsigned char)shown;
+  if (t < THREADS / 32) g->bits[t] = 0;
+  __syncthreads();
+  if (shown) atomicOr(&g->bits[t / 32], 1u << t % 32);
   const int found = __syncthreads_count(shown);
   if (shown) {
-    int before = 0;
-    for (int i = 0; i < t; ++i) before += g->shown[i];
+    int before = __popc(g->bits[t / 32] & ((1u << t % 32) - 1));
+    for (int word = 0; word < t / 32; ++word) before += __popc(g->bits[word]);
     g->list[before] = n;
   }
   __syncthreads();
@@ -66,36 +94,39 @@ FN int gather(Gathered* g, int n, int shown) {
 FN int column_of(int t) { return t % 8 + t / 32 % (COLUMNS / 8) * 8; }
 FN int row_of(int t) { return t / 8 % 4 + t / 128 * 4; }
 
-static __global__ void __launch_bounds__(THREADS) draw(const Batch batch) {
+static __global__ void __launch_bounds__(THREADS, RESIDENT) draw(const Batch batch) {
+  __shared__ Frame frame;
   __shared__ Wave waves[MOST_WAVES];
   __shared__ Gathered gathered;
   __shared__ Upright shapes[AT_ONCE];
+  __shared__ unsigned covering[COLUMNS]; /* which of the shapes, a bit each */
   __shared__ float numbers[AT_ONCE * NUMBERS * COLUMNS];
   const int t = threadIdx.x, strips = (batch.width + COLUMNS - 1) / COLUMNS;
-  const int64_t m = blockIdx.x / strips;
+  const uint32_t m = blockIdx.x / strips;
   const int left = (int)(blockIdx.x % strips) * COLUMNS, right = left + COLUMNS;
-  Camera c;
-  Shapes s;
-  Eye e;
-  frame_of(&batch, m, &c, &s, &e);
-  if (t == 0) waves_of(&c, &e, waves);
-  __syncthreads();
+  share_frame(&batch, m, &frame);
+  const Camera* c = &frame.camera;
+  const Shapes* s = &frame.shapes;
+  const Eye* e = &frame.eye;
+  if (t == THREADS - 1) waves_of(c, e, waves); /* in other warps than those that gather */
+  if (t == THREADS - 33) light_planes(c, s, e, frame.planes);
 
-  const int uprights = s.boxes + s.cylinders, column = left + column_of(t), in_image = column < c.width;
-  const float u = c.u[in_image ? column : c.width - 1], dx = e.cos + u * e.sin, dy = e.sin - u * e.cos;
+  const int uprights = s->boxes + s->cylinders, across = column_of(t), column = left + across;
+  const int in_image = column < c->width;
+  const float u = c->u[in_image ? column : c->width - 1], dx = e->cos + u * e->sin, dy = e->sin - u * e->cos;
   int found = 0, kept = 0; /* kept: all that is shown stays in shared memory */
-  for (int first = 0; first < c.height; first += ROWS) {
-    const int row = first + row_of(t), drawn = in_image && row < c.height;
-    const float dz = c.v[row < c.height ? row : c.height - 1];
+  for (int first = 0; first < c->height; first += ROWS) {
+    const int row = first + row_of(t), drawn = in_image && row < c->height;
+    const float dz = c->v[row < c->height ? row : c->height - 1];
     Layers layers;
     layers.inserted = 0;
     if (drawn)
-      for (int n = 0; n < s.spheres; ++n) insert_sphere(&c, &s, &e, n, u, dz, &layers);
+      for (int n = 0; n < s->spheres; ++n) insert_sphere(c, s, e, n, u, dz, &layers);
     for (int base = 0; base < uprights; base += THREADS) {
       if (!kept) {
         Upright shape;
         const int n = base + t;
-        const int shown = n < uprights && upright(&c, &s, &e, n, &shape) && shape.first < right && shape.last > left;
+        const int shown = n < uprights && upright(c, s, e, n, &shape) && shape.first < right && shape.last > left;
         __syncthreads();
         found = gather(&gathered, n, shown);
       }
@@ -103,50 +134,55 @@ static __global__ void __launch_bounds__(THREADS) draw(const Batch batch) {
         const int many = found - k < AT_ONCE ? found - k : AT_ONCE;
         if (!kept) {
           __syncthreads();
-          if (t < many) upright(&c, &s, &e, gathered.list[k + t], &shapes[t]);
+          if (t < COLUMNS) covering[t] = 0;
+          if (t < many) upright(c, s, e, gathered.list[k + t], &shapes[t]);
           __syncthreads();
           for (int task = t; task < many * COLUMNS; task += THREADS) {
-            const int which = task / COLUMNS, across = task % COLUMNS, at = left + across;
-            if (at >= shapes[which].first && at < shapes[which].last)
-              sides(&c, &e, &shapes[which], c.u[at], numbers + which * NUMBERS * COLUMNS + across, COLUMNS);
+            const int which = task / COLUMNS, x = task % COLUMNS, at = left + x;
+            if (at < shapes[which].first || at >= shapes[which].last) continue;
+            float* of = numbers + which * NUMBERS * COLUMNS + x;
+            sides(c, e, &shapes[which], c->u[at], of, COLUMNS);
+            if (of[SHARE * COLUMNS] > 0) atomicOr(&covering[x], 1u << which);
           }
           __syncthreads();
         }
         if (drawn)
-          for (int i = 0; i < many; ++i) {
-            const float* of = numbers + i * NUMBERS * COLUMNS + (column - left);
-            if (column >= shapes[i].first && column < shapes[i].last && of[SHARE * COLUMNS] > 0)
-              insert_side(&c, of, COLUMNS, row, &layers);
-          }
+          for (unsigned left_over = covering[across]; left_over; left_over &= left_over - 1)
+            insert_side(c, numbers + (__ffs((int)left_over) - 1) * NUMBERS * COLUMNS + across, COLUMNS, row, &layers);
       }
     }
+    if (uprights == 0) __syncthreads(); /* waves and planes are there */
     kept = uprights <= THREADS && found <= AT_ONCE;
     if (drawn)
-      batch.pictures[(m * c.height + row) * c.width + column] = blend(&c, &s, &e, waves, dx, dy, dz, &layers);
+      batch.pictures[((int64_t)m * c->height + row) * c->width + column] =
+          blend(c, frame.planes, s->planes, e, waves, dx, dy, dz, &layers);
   }
 }
 
-static __global__ void __launch_bounds__(THREADS) measure(const Batch batch) {
+static __global__ void __launch_bounds__(THREADS, RESIDENT) measure(const Batch batch) {
+  __shared__ Frame frame;
   __shared__ Gathered gathered;
+  __shared__ Level levels[MEASURED_AT_ONCE];
+  __shared__ unsigned covering[COLUMNS];
   __shared__ float from[MEASURED_AT_ONCE * COLUMNS], to[MEASURED_AT_ONCE * COLUMNS];
   const int t = threadIdx.x, strips = (batch.width + COLUMNS - 1) / COLUMNS;
-  const int64_t m = blockIdx.x / strips;
+  const uint32_t m = blockIdx.x / strips;
   const int left = (int)(blockIdx.x % strips) * COLUMNS;
-  Camera c;
-  Shapes s;
-  Eye e;
-  frame_of(&batch, m, &c, &s, &e);
-  const int uprights = s.boxes + s.cylinders, column = left + column_of(t), in_image = column < c.width;
-  const float u = c.u[in_image ? column : c.width - 1], dx = e.cos + u * e.sin, dy = e.sin - u * e.cos;
+  share_frame(&batch, m, &frame);
+  const Camera* c = &frame.camera;
+  const Shapes* s = &frame.shapes;
+  const Eye* e = &frame.eye;
+  const int uprights = s->boxes + s->cylinders, across = column_of(t), column = left + across;
+  const int in_image = column < c->width;
+  const float u = c->u[in_image ? column : c->width - 1], dx = e->cos + u * e->sin, dy = e->sin - u * e->cos;
   int found = 0, kept = 0;
-  for (int first = 0; first < c.height; first += ROWS) {
-    const int row = first + row_of(t), drawn = in_image && row < c.height;
-    const float dz = c.v[row < c.height ? row : c.height - 1], per_z = inverses(dz);
-    float nearest = nearest_of_others(&s, &e, dx, dy, dz);
+  for (int first = 0; first < c->height; first += ROWS) {
+    const int row = first + row_of(t), drawn = in_image && row < c->height;
+    const float dz = c->v[row < c->height ? row : c->height - 1], per_z = inverses(dz);
+    float nearest = nearest_of_others(s, frame.planes, e, dx, dy, dz);
     for (int base = 0; base < uprights; base += THREADS) {
       if (!kept) {
-        const int n = base + t;
-        const int shown = n < uprights && !upright_out_of_sight(&c, &s, &e, n);
+        const int n = base + t, shown = n < uprights && !upright_out_of_sight(c, s, e, n);
         __syncthreads();
         found = gather(&gathered, n, shown);
       }
@@ -154,21 +190,26 @@ static __global__ void __launch_bounds__(THREADS) measure(const Batch batch) {
         const int many = found - k < MEASURED_AT_ONCE ? found - k : MEASURED_AT_ONCE;
         if (!kept) {
           __syncthreads();
+          if (t < COLUMNS) covering[t] = 0;
+          if (t < many) levels[t] = level_of(s, e, gathered.list[k + t]);
+          __syncthreads();
           for (int task = t; task < many * COLUMNS; task += THREADS) {
-            const int n = gathered.list[k + task / COLUMNS], at = left + task % COLUMNS;
-            const float v = c.u[at < c.width ? at : c.width - 1];
-            beside(&s, &e, n, turn_of(&s, n), e.cos + v * e.sin, e.sin - v * e.cos, &from[task], &to[task]);
+            const int which = task / COLUMNS, n = gathered.list[k + which], x = task % COLUMNS, at = left + x;
+            if (at >= c->width) continue;
+            beside(s, e, n, turn_of(s, n), e->cos + c->u[at] * e->sin, e->sin - c->u[at] * e->cos, &from[task],
+                   &to[task]);
+            if (from[task] < to[task] && to[task] > 0) atomicOr(&covering[x], 1u << which);
           }
           __syncthreads();
         }
-        for (int i = 0; i < many; ++i) {
-          const int at = i * COLUMNS + (column - left);
-          nearest = nearer_upright(&s, &e, gathered.list[k + i], from[at], to[at], per_z, nearest);
+        for (unsigned left_over = covering[across]; left_over; left_over &= left_over - 1) {
+          const int which = __ffs((int)left_over) - 1, at = which * COLUMNS + across;
+          nearest = nearer_upright(levels[which], from[at], to[at], per_z, nearest);
         }
       }
     }
     kept = uprights <= THREADS && found <= MEASURED_AT_ONCE;
-    if (drawn) batch.pictures[(m * c.height + row) * c.width + column] = nearest;
+    if (drawn) batch.pictures[((int64_t)m * c->height + row) * c->width + column] = nearest;
   }
 }
 
@@ -184,7 +225,7 @@ KERNEL_ON_CPU(measure)
   XLA_FFI_Stream_Get_Args stream = {XLA_FFI_Stream_Get_Args_STRUCT_SIZE, 0, call->ctx, 0};             \
   error = STREAM(call, &stream);                                                                      \
   if (error) return error;                                                                            \
-  LAUNCH(kernel, batch.frames * ((batch.width + COLUMNS - 1) / COLUMNS), stream.stream, batch);        \
+  LAUNCH(kernel, (int64_t)batch.frames * ((batch.width + COLUMNS - 1) / COLUMNS), stream.stream, batch);        \
   const char* said = LAUNCH_ERROR();                                                                  \
   return said ? failed(call, XLA_FFI_Error_Code_INTERNAL, said) : 0;
 

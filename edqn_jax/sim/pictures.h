@@ -56,7 +56,7 @@ typedef struct {
 
 typedef struct {
   const float *origin, *weights; /* [3] each */
-  float cos, sin;
+  float cos, sin, sky;
 } Eye;
 
 FN float dot3(const float* a, const float* b) { return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]; }
@@ -98,13 +98,13 @@ typedef struct {
 FN void extent_of_box(const Eye* e, float x, float y, float hx, float hy, float cos, float sin, Extent* extent) {
   const float sign_x[4] = {1, -1, -1, 1}, sign_y[4] = {1, 1, -1, -1};
   float ahead[4], right[4];
-  for (int i = 0; i < 4; ++i) {
+  UNROLLED for (int i = 0; i < 4; ++i) {
     const float cx = x + cos * (sign_x[i] * hx) - sin * (sign_y[i] * hy);
     const float cy = y + sin * (sign_x[i] * hx) + cos * (sign_y[i] * hy);
     ahead[i] = cx * e->cos + cy * e->sin, right[i] = cx * e->sin - cy * e->cos;
   }
   float low = NOWHERE, high = -NOWHERE;
-  for (int i = 0; i < 4; ++i) {
+  UNROLLED for (int i = 0; i < 4; ++i) {
     const int j = (i + 1) & 3;
     if (ahead[i] >= NEAR_M) {
       const float u = right[i] / ahead[i];
@@ -376,25 +376,47 @@ FN Lanes texture(const Camera* c, const Wave* waves, float dx, float dy, Lanes d
   return 1.0f + c->contrast * total;
 }
 
-/* Brightness of textured ground and other planes before the sky, LANES rows of the column along (dx, dy). */
-FN Lanes backdrop(const Camera* c, const Shapes* s, const Eye* e, const Wave* waves, float dx, float dy,
-                             Lanes dz) {
-  const Lanes sky = lanes(dot3(c->sky, e->weights));
-  Lanes depth = lanes(NOWHERE), shown = lanes(0), share = lanes(0), slope_right = lanes(0), slope_up = lanes(0);
+/* ------------------------------------------------------------------------------------------------- ground and sky */
+
+#define MOST_PLANES 8
+
+/* What all pixels of a frame share of a plane. */
+typedef struct {
+  float nx, ny, nz, height; /* normal; of the eye above it */
+  float across, along, spread, value;
+} Plane;
+
+FN void planes_of(const Camera* c, const Shapes* s, const Eye* e, Plane* planes) {
   for (int n = 0; n < s->planes; ++n) {
     const float *normal = s->plane_normal + 3 * n, *at = s->plane_position + 3 * n;
-    const float height =
-        (e->origin[0] - at[0]) * normal[0] + (e->origin[1] - at[1]) * normal[1] + (e->origin[2] - at[2]) * normal[2];
-    const float across = (normal[0] * e->sin - normal[1] * e->cos) * c->pitch, along = normal[2] * c->pitch;
-    const float spread = fabsf(across) + fabsf(along);
-    const float value = shade(c, normal[0], normal[1], normal[2]) * dot3(s->plane_albedo + 3 * n, e->weights);
-    const Lanes approach = normal[0] * dx + normal[1] * dy + normal[2] * dz;
-    const Lanes part = between(0.5f - approach * inverse(spread), 0, 1);
-    const Lanes middle = (approach - spread / 2 + lesser(approach + spread / 2, lanes(0))) / 2;
-    const Lanes per_middle = inverses(middle), t = -height * per_middle, relative = -t * per_middle;
+    Plane* p = &planes[n];
+    p->nx = normal[0], p->ny = normal[1], p->nz = normal[2];
+    p->height = (e->origin[0] - at[0]) * p->nx + (e->origin[1] - at[1]) * p->ny + (e->origin[2] - at[2]) * p->nz;
+    p->across = (p->nx * e->sin - p->ny * e->cos) * c->pitch, p->along = p->nz * c->pitch;
+    p->spread = fabsf(p->across) + fabsf(p->along);
+  }
+}
+
+/* Their brightness, which depth images do without. */
+FN void light_planes(const Camera* c, const Shapes* s, const Eye* e, Plane* planes) {
+  for (int n = 0; n < s->planes; ++n)
+    planes[n].value = shade(c, planes[n].nx, planes[n].ny, planes[n].nz) * dot3(s->plane_albedo + 3 * n, e->weights);
+}
+
+/* Brightness of textured ground and other planes before the sky, LANES rows of the column along (dx, dy). */
+FN Lanes backdrop(const Camera* c, const Plane* planes, int count, const Eye* e, const Wave* waves, float dx, float dy,
+                  Lanes dz) {
+  const Lanes sky = lanes(e->sky);
+  Lanes depth = lanes(NOWHERE), shown = lanes(0), share = lanes(0), slope_right = lanes(0), slope_up = lanes(0);
+  for (int n = 0; n < count; ++n) {
+    const Plane* p = &planes[n];
+    const Lanes approach = p->nx * dx + p->ny * dy + p->nz * dz;
+    const Lanes part = between(0.5f - approach * inverse(p->spread), 0, 1);
+    const Lanes middle = (approach - p->spread / 2 + lesser(approach + p->spread / 2, lanes(0))) / 2;
+    const Lanes per_middle = inverses(middle), t = -p->height * per_middle, relative = -t * per_middle;
     const Mask seen = (middle < 0) & (t > 0) & (t < HORIZON_M) & (t < depth);
-    depth = pick(seen, t, depth), share = pick(seen, part, share), shown = pick(seen, lanes(value), shown);
-    slope_right = pick(seen, relative * across, slope_right), slope_up = pick(seen, relative * along, slope_up);
+    depth = pick(seen, t, depth), share = pick(seen, part, share), shown = pick(seen, lanes(p->value), shown);
+    slope_right = pick(seen, relative * p->across, slope_right), slope_up = pick(seen, relative * p->along, slope_up);
   }
   if (!any_of(share > 0)) return sky;
   depth = pick(share > 0, depth, lanes(0));
@@ -404,14 +426,14 @@ FN Lanes backdrop(const Camera* c, const Shapes* s, const Eye* e, const Wave* wa
 /* Coverage from which on what lies behind is not seen: 1 but for rounding. */
 #define WHOLE (1 - 1e-6f)
 
-/* Blends the layers of LANES rows over ground and sky. */
-FN Lanes blend(const Camera* c, const Shapes* s, const Eye* e, const Wave* waves, float dx, float dy,
-                          Lanes dz, const Layers* layers) {
+/* Blends the layers of LANES rows over `count` planes and the sky. */
+FN Lanes blend(const Camera* c, const Plane* planes, int count, const Eye* e, const Wave* waves, float dx, float dy,
+               Lanes dz, const Layers* layers) {
   const int used = layers->inserted < DEPTH_OF_LAYERS ? layers->inserted : DEPTH_OF_LAYERS;
   int visible = 0, hidden = 0; /* layers before, and with, the first that covers all that lies behind it */
   UNROLLED for (int k = 0; k < DEPTH_OF_LAYERS; ++k)
     if (k < used && !hidden) visible = k + 1, hidden = !any_of(layers->layer[k].coverage < WHOLE);
-  Lanes behind = hidden ? lanes(0) : backdrop(c, s, e, waves, dx, dy, dz);
+  Lanes behind = hidden ? lanes(0) : backdrop(c, planes, count, e, waves, dx, dy, dz);
   UNROLLED for (int k = DEPTH_OF_LAYERS - 1; k >= 0; --k) {
     if (k >= visible) continue;
     const Layer* layer = &layers->layer[k];
@@ -427,13 +449,22 @@ FN Lanes blend(const Camera* c, const Shapes* s, const Eye* e, const Wave* waves
 
 /* ------------------------------------------------------------------------------------------------------- depths */
 
+/* Where an upright shape's middle is above the eye, and half its height; boxes come first. */
+typedef struct {
+  float middle, half;
+} Level;
+
+FN Level level_of(const Shapes* s, const Eye* e, int n) {
+  const int is_box = n < s->boxes, i = is_box ? n : n - s->boxes;
+  const Level level = {(is_box ? s->box_position[3 * i + 2] : s->cylinder_position[3 * i + 2]) - e->origin[2],
+                       is_box ? s->box_half[3 * i + 2] : s->cylinder_half[i]};
+  return level;
+}
+
 /* Lowers `nearest` of LANES rows to the depth at which rays are both beside an upright shape's axis, from `from` to
  * `to`, and between its bottom and its top. */
-FN Lanes nearer_upright(const Shapes* s, const Eye* e, int n, float from, float to, Lanes per_z, Lanes nearest) {
-  const int is_box = n < s->boxes, i = is_box ? n : n - s->boxes;
-  const float z = is_box ? s->box_position[3 * i + 2] : s->cylinder_position[3 * i + 2];
-  const float half = is_box ? s->box_half[3 * i + 2] : s->cylinder_half[i];
-  const Lanes at = (z - e->origin[2]) * per_z, reach = half * absolute(per_z);
+FN Lanes nearer_upright(Level level, float from, float to, Lanes per_z, Lanes nearest) {
+  const Lanes at = level.middle * per_z, reach = level.half * absolute(per_z);
   const Lanes enter = greater(lanes(from), at - reach), leave = lesser(lanes(to), at + reach);
   return pick((enter < leave) & (enter > 0) & (enter < nearest), enter, nearest);
 }
@@ -479,13 +510,11 @@ FN int upright_out_of_sight(const Camera* c, const Shapes* s, const Eye* e, int 
 }
 
 /* Depths at which LANES rays, along `dz` in the column along (dx, dy), meet a plane or a sphere; else NOWHERE. */
-FN Lanes nearest_of_others(const Shapes* s, const Eye* e, float dx, float dy, Lanes dz) {
+FN Lanes nearest_of_others(const Shapes* s, const Plane* planes, const Eye* e, float dx, float dy, Lanes dz) {
   Lanes nearest = lanes(NOWHERE);
   for (int n = 0; n < s->planes; ++n) {
-    const float *normal = s->plane_normal + 3 * n, *at = s->plane_position + 3 * n;
-    const float height =
-        (e->origin[0] - at[0]) * normal[0] + (e->origin[1] - at[1]) * normal[1] + (e->origin[2] - at[2]) * normal[2];
-    const Lanes approach = normal[0] * dx + normal[1] * dy + normal[2] * dz, t = -height * inverses(approach);
+    const Plane* p = &planes[n];
+    const Lanes approach = p->nx * dx + p->ny * dy + p->nz * dz, t = -p->height * inverses(approach);
     nearest = pick((approach < 0) & (t > 0) & (t < HORIZON_M) & (t < nearest), t, nearest);
   }
   for (int n = 0; n < s->spheres; ++n) {
@@ -520,34 +549,31 @@ enum {
 /* The frames of one call. From ORIGIN on operands have a leading [L], of which each row serves M / L frames in a row. */
 typedef struct {
   const float* data[OPERANDS];
-  int64_t size[OPERANDS], serves[OPERANDS]; /* of a row: its numbers, the frames that it serves */
-  int64_t frames;
+  int64_t size[OPERANDS]; /* of a row */
+  uint32_t serves[OPERANDS], frames;
   int height, width, waves, boxes, cylinders, spheres, planes;
   float* pictures;
 } Batch;
 
-FN const float* of_frame(const Batch* b, int operand, int64_t m) {
+/* What frame `m` reads of an operand. */
+FN const float* of_frame(const Batch* b, int operand, uint32_t m) {
   return b->data[operand] + m / b->serves[operand] * b->size[operand];
 }
 
-/* Frame `m` of a batch. */
-FN void frame_of(const Batch* b, int64_t m, Camera* c, Shapes* s, Eye* e) {
-  const float* k = b->data[CONSTANTS];
+/* A frame that reads `of`, a pointer an operand. */
+FN void frame_of(const Batch* b, const float* const* of, Camera* c, Shapes* s, Eye* e) {
+  const float *k = of[CONSTANTS], *r = of[ROTATION], scale = 1.0f / sqrtf(most(r[0] * r[0] + r[3] * r[3], TINY));
   c->height = b->height, c->width = b->width, c->waves = b->waves;
   c->pitch = k[0], c->contrast = k[1], c->ambient = k[2], c->sun = k + 3, c->sky = k + 6;
-  c->u = b->data[U], c->v = b->data[V], c->wave = b->data[WAVES];
+  c->u = of[U], c->v = of[V], c->wave = of[WAVES];
   s->boxes = b->boxes, s->cylinders = b->cylinders, s->spheres = b->spheres, s->planes = b->planes;
-  s->box_position = of_frame(b, BOXES, m), s->box_half = of_frame(b, BOXES + 1, m);
-  s->box_yaw = of_frame(b, BOXES + 2, m), s->box_albedo = of_frame(b, BOXES + 3, m);
-  s->cylinder_position = of_frame(b, CYLINDERS, m), s->cylinder_radius = of_frame(b, CYLINDERS + 1, m);
-  s->cylinder_half = of_frame(b, CYLINDERS + 2, m), s->cylinder_albedo = of_frame(b, CYLINDERS + 3, m);
-  s->sphere_position = of_frame(b, SPHERES, m), s->sphere_radius = of_frame(b, SPHERES + 1, m);
-  s->sphere_albedo = of_frame(b, SPHERES + 2, m);
-  s->plane_position = of_frame(b, PLANES, m), s->plane_normal = of_frame(b, PLANES + 1, m);
-  s->plane_albedo = of_frame(b, PLANES + 2, m);
-  const float *r = of_frame(b, ROTATION, m), scale = 1.0f / sqrtf(most(r[0] * r[0] + r[3] * r[3], TINY));
-  e->origin = of_frame(b, ORIGIN, m), e->weights = of_frame(b, WEIGHTS, m);
-  e->cos = r[0] * scale, e->sin = r[3] * scale;
+  s->box_position = of[BOXES], s->box_half = of[BOXES + 1], s->box_yaw = of[BOXES + 2], s->box_albedo = of[BOXES + 3];
+  s->cylinder_position = of[CYLINDERS], s->cylinder_radius = of[CYLINDERS + 1];
+  s->cylinder_half = of[CYLINDERS + 2], s->cylinder_albedo = of[CYLINDERS + 3];
+  s->sphere_position = of[SPHERES], s->sphere_radius = of[SPHERES + 1], s->sphere_albedo = of[SPHERES + 2];
+  s->plane_position = of[PLANES], s->plane_normal = of[PLANES + 1], s->plane_albedo = of[PLANES + 2];
+  e->origin = of[ORIGIN], e->weights = of[WEIGHTS], e->cos = r[0] * scale, e->sin = r[3] * scale;
+  e->sky = of[WEIGHTS] ? dot3(c->sky, e->weights) : 0;
 }
 
 /* Reads a call of XLA's into a batch; returns an error for XLA to raise, or 0. Depth images have no WEIGHTS. */
@@ -560,13 +586,13 @@ static inline XLA_FFI_Error* batch_of(XLA_FFI_CallFrame* call, int weighted, Bat
   XLA_FFI_Buffer** arg = (XLA_FFI_Buffer**)call->args.args;
   const XLA_FFI_Buffer* pictures = (const XLA_FFI_Buffer*)call->rets.rets[0];
   memset(b, 0, sizeof *b);
-  b->frames = pictures->dims[0], b->height = (int)pictures->dims[1], b->width = (int)pictures->dims[2];
+  b->frames = (uint32_t)pictures->dims[0], b->height = (int)pictures->dims[1], b->width = (int)pictures->dims[2];
   b->pictures = (float*)pictures->data;
   for (int i = 0; i < OPERANDS; ++i) b->serves[i] = 1;
   for (int i = 0; i < operands; ++i) {
     b->data[i] = (const float*)arg[i]->data;
     if (i < ORIGIN) continue;
-    b->size[i] = 1, b->serves[i] = b->frames / arg[i]->dims[0];
+    b->size[i] = 1, b->serves[i] = b->frames / (uint32_t)arg[i]->dims[0];
     for (int d = 1; d < arg[i]->rank; ++d) b->size[i] *= arg[i]->dims[d];
   }
   b->waves = (int)arg[WAVES]->dims[0];
@@ -575,6 +601,9 @@ static inline XLA_FFI_Error* batch_of(XLA_FFI_CallFrame* call, int weighted, Bat
   if (b->waves > MOST_WAVES)
     return failed(call, XLA_FFI_Error_Code_INVALID_ARGUMENT,
                   "pictures have a texture of at most 8 waves; texture.WAVES must not have more");
+  if (b->planes > MOST_PLANES)
+    return failed(call, XLA_FFI_Error_Code_INVALID_ARGUMENT,
+                  "pictures have at most 8 planes; native.can_draw must refuse more");
   return 0;
 }
 

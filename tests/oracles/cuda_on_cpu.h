@@ -15,7 +15,7 @@
 #define __global__
 #define __forceinline__ inline
 #define __shared__ static
-#define __launch_bounds__(threads)
+#define __launch_bounds__(threads, resident)
 #define EXPORTED
 #define STREAM(call, stream) 0
 #define LAUNCH_ERROR() 0
@@ -52,6 +52,10 @@ static int __syncthreads_count(int holds) {
   __syncthreads();
   return counts[which];
 }
+
+static int __popc(unsigned x) { return __builtin_popcount(x); }
+static int __ffs(int x) { return __builtin_ffs(x); }
+static unsigned atomicOr(unsigned* at, unsigned x) { return *at |= x; }
 
 static void (*body)(void);
 static const void* launched;
