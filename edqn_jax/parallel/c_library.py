@@ -63,8 +63,8 @@ def cuda() -> Compiler | None:
         major, minor = str(jax.devices("cuda")[0].compute_capability).split(".")
     except RuntimeError:
         return None
-    # Quotients and roots to 2 units in the last place, as fused products are in any case.
-    fast = ("-prec-div=false", "-prec-sqrt=false")
+    # Quotients and roots to 2 units in the last place, and no numbers below 1e-38.
+    fast = ("-prec-div=false", "-prec-sqrt=false", "-ftz=true")
     flags = ("-O3", f"-arch=sm_{major}{minor}", *fast, "-Xcompiler=-fPIC", "-shared")
     return Compiler("NVCC", "nvcc", flags, "CUDA", -1)
 

@@ -16,6 +16,7 @@
 #define LANES 8
 #define FN static inline
 #define UNROLLED
+#define ALIGNED
 
 typedef float Lanes __attribute__((vector_size(4 * LANES)));
 typedef float Loose __attribute__((vector_size(4 * LANES), aligned(4))); /* the same anywhere in memory */

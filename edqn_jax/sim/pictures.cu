@@ -21,6 +21,7 @@
 #define LANES 1
 #define FN static __device__ __forceinline__
 #define UNROLLED _Pragma("unroll")
+#define ALIGNED __align__(16)
 #define COLUMNS 32
 #ifndef ROWS
 #define ROWS 8

@@ -5,8 +5,8 @@
  * constants in capitals that are not defined here come from there. M frames, H rows, C columns.
  *
  * Whoever includes this has defined: LANES, how many pixels are drawn at a time; Lanes and Mask, their numbers and
- * whether something holds of them; FN, how functions are declared; UNROLLED, before a loop; and lanes, load, store, pick,
- * lesser, greater, absolute, roots, any_of, counted of Lanes.
+ * whether something holds of them; FN, how functions are declared; UNROLLED, before a loop; ALIGNED, of what is read at
+ * once; and lanes, load, store, pick, lesser, greater, absolute, roots, any_of, counted of Lanes.
  */
 
 #ifndef EDQN_PICTURES_H
@@ -343,7 +343,7 @@ FN void insert_sphere(const Camera* c, const Shapes* s, const Eye* e, int n, flo
 #define MOST_WAVES 8
 
 /* What all pixels of a frame share of each wave of the texture. */
-typedef struct {
+typedef struct ALIGNED {
   float kx, ky, kz, weight, at_origin, right, up;
 } Wave;
 
@@ -361,19 +361,29 @@ FN Lanes box_filter(Lanes cycles) {
   return (1.0f - x) * (1.0f - 0.55f * x);
 }
 
-/* The texture's factor on LANES rows of a column. */
-FN Lanes texture(const Camera* c, const Wave* waves, float dx, float dy, Lanes dz, Lanes depth,
-                            Lanes slope_right, Lanes slope_up) {
-  Lanes total = lanes(0);
+/* The depth at which LANES rays meet a surface, and by how much it grows a pixel further right and up. */
+typedef struct {
+  Lanes depth, right, up;
+} Meeting;
+
+#define MEETINGS (DEPTH_OF_LAYERS + 1) /* with layers, and with what is behind them */
+
+/* Writes the texture's factor on LANES rows of a column at those meetings whose bit of `wanted` is set. */
+FN void textures(const Camera* c, const Wave* waves, float dx, float dy, Lanes dz, const Meeting* at, unsigned wanted,
+                 Lanes* factor) {
+  UNROLLED for (int k = 0; k < MEETINGS; ++k) factor[k] = lanes(0);
   for (int i = 0; i < c->waves; ++i) {
-    const Wave* w = &waves[i];
-    const Lanes along = (w->kx * dx + w->ky * dy) + w->kz * dz, phase = w->at_origin + depth * along;
-    const Lanes left =
-        box_filter(depth * w->right + slope_right * along) * box_filter(depth * w->up + slope_up * along);
-    const Lanes f = phase - nearest_whole(phase);
-    total += w->weight * left * (f * (8.0f - 16.0f * absolute(f)));
+    const Wave w = waves[i];
+    const Lanes along = (w.kx * dx + w.ky * dy) + w.kz * dz;
+    UNROLLED for (int k = 0; k < MEETINGS; ++k) {
+      if (!(wanted >> k & 1)) continue;
+      const Lanes phase = w.at_origin + at[k].depth * along, f = phase - nearest_whole(phase);
+      const Lanes left = box_filter(at[k].depth * w.right + at[k].right * along) *
+                         box_filter(at[k].depth * w.up + at[k].up * along);
+      factor[k] += w.weight * left * (f * (8.0f - 16.0f * absolute(f)));
+    }
   }
-  return 1.0f + c->contrast * total;
+  UNROLLED for (int k = 0; k < MEETINGS; ++k) factor[k] = 1.0f + c->contrast * factor[k];
 }
 
 /* ------------------------------------------------------------------------------------------------- ground and sky */
@@ -403,24 +413,24 @@ FN void light_planes(const Camera* c, const Shapes* s, const Eye* e, Plane* plan
     planes[n].value = shade(c, planes[n].nx, planes[n].ny, planes[n].nz) * dot3(s->plane_albedo + 3 * n, e->weights);
 }
 
-/* Brightness of textured ground and other planes before the sky, LANES rows of the column along (dx, dy). */
-FN Lanes backdrop(const Camera* c, const Plane* planes, int count, const Eye* e, const Wave* waves, float dx, float dy,
-                  Lanes dz) {
-  const Lanes sky = lanes(e->sky);
-  Lanes depth = lanes(NOWHERE), shown = lanes(0), share = lanes(0), slope_right = lanes(0), slope_up = lanes(0);
+/* Where LANES rays, along `dz` in the column along (dx, dy), meet ground or another plane; its brightness without
+ * texture, and which share of the pixels it covers. */
+FN void meet_planes(const Plane* planes, int count, float dx, float dy, Lanes dz, Meeting* at, Lanes* shown,
+                    Lanes* share) {
+  const Meeting none = {lanes(NOWHERE), lanes(0), lanes(0)};
+  *at = none, *shown = lanes(0), *share = lanes(0);
   for (int n = 0; n < count; ++n) {
     const Plane* p = &planes[n];
     const Lanes approach = p->nx * dx + p->ny * dy + p->nz * dz;
     const Lanes part = between(0.5f - approach * inverse(p->spread), 0, 1);
     const Lanes middle = (approach - p->spread / 2 + lesser(approach + p->spread / 2, lanes(0))) / 2;
     const Lanes per_middle = inverses(middle), t = -p->height * per_middle, relative = -t * per_middle;
-    const Mask seen = (middle < 0) & (t > 0) & (t < HORIZON_M) & (t < depth);
-    depth = pick(seen, t, depth), share = pick(seen, part, share), shown = pick(seen, lanes(p->value), shown);
-    slope_right = pick(seen, relative * p->across, slope_right), slope_up = pick(seen, relative * p->along, slope_up);
+    const Mask seen = (middle < 0) & (t > 0) & (t < HORIZON_M) & (t < at->depth);
+    *share = pick(seen, part, *share), *shown = pick(seen, lanes(p->value), *shown);
+    at->depth = pick(seen, t, at->depth);
+    at->right = pick(seen, relative * p->across, at->right), at->up = pick(seen, relative * p->along, at->up);
   }
-  if (!any_of(share > 0)) return sky;
-  depth = pick(share > 0, depth, lanes(0));
-  return sky + share * (shown * texture(c, waves, dx, dy, dz, depth, slope_right, slope_up) - sky);
+  at->depth = pick(*share > 0, at->depth, lanes(0));
 }
 
 /* Coverage from which on what lies behind is not seen: 1 but for rounding. */
@@ -433,16 +443,30 @@ FN Lanes blend(const Camera* c, const Plane* planes, int count, const Eye* e, co
   int visible = 0, hidden = 0; /* layers before, and with, the first that covers all that lies behind it */
   UNROLLED for (int k = 0; k < DEPTH_OF_LAYERS; ++k)
     if (k < used && !hidden) visible = k + 1, hidden = !any_of(layers->layer[k].coverage < WHOLE);
-  Lanes behind = hidden ? lanes(0) : backdrop(c, planes, count, e, waves, dx, dy, dz);
+
+  Meeting at[MEETINGS] = {{lanes(0), lanes(0), lanes(0)}};
+  Lanes factor[MEETINGS], shown = lanes(0), share = lanes(0);
+  unsigned wanted = (1u << visible) - 1;
+  UNROLLED for (int k = 0; k < DEPTH_OF_LAYERS; ++k) {
+    if (k >= visible) continue;
+    const Layer* layer = &layers->layer[k];
+    const Mask level = layer->slope == LEVEL_FACE;
+    const Lanes near = pick(layer->closeness > 0, inverses(layer->closeness), lanes(0));
+    at[k].depth = near, at[k].right = pick(level, lanes(0), -near * near * layer->slope);
+    at[k].up = pick(level, -near * inverses(dz) * c->pitch, lanes(0));
+  }
+  if (!hidden) {
+    meet_planes(planes, count, dx, dy, dz, &at[DEPTH_OF_LAYERS], &shown, &share);
+    wanted |= (unsigned)(any_of(share > 0) != 0) << DEPTH_OF_LAYERS;
+  }
+  textures(c, waves, dx, dy, dz, at, wanted, factor);
+
+  Lanes behind = lanes(hidden ? 0 : e->sky);
+  if (wanted >> DEPTH_OF_LAYERS & 1) behind += share * (shown * factor[DEPTH_OF_LAYERS] - behind);
   UNROLLED for (int k = DEPTH_OF_LAYERS - 1; k >= 0; --k) {
     if (k >= visible) continue;
     const Layer* layer = &layers->layer[k];
-    const Mask met = layer->closeness > 0, level = layer->slope == LEVEL_FACE;
-    const Lanes near = pick(met, inverses(layer->closeness), lanes(0));
-    const Lanes right = pick(level, lanes(0), -near * near * layer->slope);
-    const Lanes up = pick(level, -near * inverses(dz) * c->pitch, lanes(0));
-    const Lanes factor = texture(c, waves, dx, dy, dz, near, right, up);
-    behind += pick(met, layer->value * factor - layer->coverage * behind, lanes(0));
+    behind += pick(layer->closeness > 0, layer->value * factor[k] - layer->coverage * behind, lanes(0));
   }
   return behind;
 }

@@ -15,6 +15,7 @@
 #define __global__
 #define __forceinline__ inline
 #define __shared__ static
+#define __align__(bytes)
 #define __launch_bounds__(threads, resident)
 #define EXPORTED
 #define STREAM(call, stream) 0
