@@ -31,7 +31,7 @@ OPERANDS = {
 """Kinds of shape that the library draws, and what it reads of each. A scene with room for any other is drawn by JAX."""
 
 MOST_PLANES = 8
-"""As in `pictures.h`."""
+"""A scene with more is drawn by JAX."""
 
 TARGETS = ("edqn_pictures", "edqn_depths")
 
@@ -91,4 +91,8 @@ def definitions() -> tuple[str, ...]:
         "FAR_U": coverage.FAR_U,
         "LEVEL_FACE": coverage.LEVEL_FACE,
     }
-    return (*(f"{name}={value:e}f" for name, value in numbers.items()), f"DEPTH_OF_LAYERS={coverage.DEPTH_OF_LAYERS}")
+    counts = {"DEPTH_OF_LAYERS": coverage.DEPTH_OF_LAYERS, "MOST_PLANES": MOST_PLANES}
+    return (
+        *(f"{name}={value:e}f" for name, value in numbers.items()),
+        *(f"{name}={value}" for name, value in counts.items()),
+    )

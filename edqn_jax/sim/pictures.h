@@ -388,8 +388,6 @@ FN void textures(const Camera* c, const Wave* waves, float dx, float dy, Lanes d
 
 /* ------------------------------------------------------------------------------------------------- ground and sky */
 
-#define MOST_PLANES 8
-
 /* What all pixels of a frame share of a plane. */
 typedef struct {
   float nx, ny, nz, height; /* normal; of the eye above it */

@@ -150,6 +150,9 @@ def test_a_world_with_other_shapes_and_a_camera_on_the_body_are_drawn_by_jax() -
     rng = np.random.default_rng(0)
     assert not native.can_draw(CONFIG, every_kind(rng), "cpu")
     assert not native.can_draw(dataclasses.replace(CONFIG, mount="body"), crowd(rng), "cpu")
+    walls = [GROUND] * native.MOST_PLANES
+    assert native.can_draw(CONFIG, scene_of(*walls), "cpu") is native.is_at_hand("cpu")
+    assert not native.can_draw(CONFIG, scene_of(*walls, GROUND), "cpu")
     assert native.can_draw(CONFIG, crowd(rng), "cpu") is native.is_at_hand("cpu")
 
 
