@@ -141,18 +141,42 @@ def path_contact(scene: Scene, path: Array, radius: ArrayLike, times: Array | No
         gap = jax.vmap(lambda point, time: _room(scene, point, time, half))(path, times) - radius
     length = jnp.sqrt(jnp.sum((path[1:] - path[:-1]) ** 2, axis=1))
     near = ~(gap[:-1] + gap[1:] > length)  # a path that is not finite is near everything
-    number = jnp.arange(length.shape[0])
+    given = (scene, path, radius, times, near)
+    return lax.platform_dependent(*given, cpu=_searched_in_turn, default=_searched_at_once)
+
+
+def _contact_in(scene: Scene, path: Array, radius: ArrayLike, times: Array | None, number: Array) -> tuple[Array, Array]:
+    """Returns `segment_contact` of one segment of a path."""
+    when = None if times is None else (times[number], times[number + 1])
+    return segment_contact(scene, path[number], path[number + 1], radius, times=when)
+
+
+def _searched_in_turn(
+    scene: Scene, path: Array, radius: ArrayLike, times: Array | None, near: Array
+) -> tuple[Array, Array]:
+    """Searches the segments that are near, one after the other, up to the first that touches."""
+    numbers = jnp.arange(near.shape[0])
 
     def search(carry: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
         near, touch, fraction = carry
         first = jnp.argmax(near)
-        when = None if times is None else (times[first], times[first + 1])
-        touches, at = segment_contact(scene, path[first], path[first + 1], radius, times=when)
-        here = number == first
+        touches, at = _contact_in(scene, path, radius, times, first)
+        here = numbers == first
         return near & ~here & ~touches, touch | (here & touches), jnp.where(here, at, fraction)
 
-    nothing = (near, jnp.zeros_like(near), jnp.ones_like(length))
+    nothing = (near, jnp.zeros_like(near), jnp.ones(near.shape))
     return lax.while_loop(lambda carry: jnp.any(carry[0]), search, nothing)[1:]
+
+
+def _searched_at_once(
+    scene: Scene, path: Array, radius: ArrayLike, times: Array | None, near: Array
+) -> tuple[Array, Array]:
+    """Searches all segments: a GPU takes longer to ask whether one of them is left than to search them."""
+    numbers = jnp.arange(near.shape[0])
+    touches, at = jax.vmap(lambda number: _contact_in(scene, path, radius, times, number))(numbers)
+    touches &= near
+    touch = touches & (numbers == jnp.argmax(touches))
+    return touch, jnp.where(touch, at, 1.0)
 
 
 def _room(scene: Scene, point: Array, time: Array, seconds: Array) -> Array:

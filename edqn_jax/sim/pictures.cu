@@ -23,14 +23,10 @@
 #define UNROLLED _Pragma("unroll")
 #define ALIGNED __align__(16)
 #define COLUMNS 32
-#ifndef ROWS
-#define ROWS 8
-#define RESIDENT 4 
-#endif
+#define ROWS 4
+#define RESIDENT 8 /* blocks that a multiprocessor holds at once: as many as its registers allow */
 #define THREADS (COLUMNS * ROWS)
-#ifndef AT_ONCE
 #define AT_ONCE 16
-#endif
 #define MEASURED_AT_ONCE 32
 
 typedef float Lanes;

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from edqn_jax.sim import distance
 from edqn_jax.sim.distance import path_contact, segment_contact, shape_distances, signed_distance
 from edqn_jax.sim.mjcf import load_world
 from edqn_jax.sim.scene import (
@@ -218,7 +219,10 @@ def test_a_segment_that_begins_in_contact_touches_at_once():
 
 
 @pytest.mark.slow
-def test_a_path_is_searched_no_less_than_its_segments(world):
+@pytest.mark.parametrize("way", ["cpu", "default"])
+def test_a_path_is_searched_no_less_than_its_segments(world, way, monkeypatch):
+    """On CPUs one segment after the other, elsewhere all of them at once."""
+    monkeypatch.setattr(distance.lax, "platform_dependent", lambda *given, **ways: ways[way](*given))
     rng = np.random.default_rng(6)
     begin = rng.uniform(-10, 10, (3000, 1, 3))
     steps = rng.normal(size=(3000, 1, 3)) * 0.06 + rng.normal(size=(3000, 13, 3)) * 0.03
