@@ -10,8 +10,8 @@ have noise, and frames the blur and the exposure of their light.
     python benchmarks/light.py --out runs/light --report
 
 A row is written when it is done, with the policies, and is not measured again; no row is begun that would not end in
-time. --train-only is as in success.py. Arguments after -- are options of train.py; defaults are those of the hardware. Intervals are a bootstrap over
-seeds and missions, 95 %.
+time. --train-only is as in success.py. Arguments after -- are options of train.py; defaults are those of the hardware.
+Intervals are a bootstrap over seeds and missions, 95 %.
 """
 
 from __future__ import annotations

@@ -94,7 +94,7 @@ def _version(command: Sequence[str]) -> str:
 
 
 def _command(of: Compiler) -> list[str] | None:
-    """Returns the compiler that the variable names, else the usual one, with its options; None if none is to be used."""
+    """Returns the compiler that is named, else the usual one, with its options; None if none is to be used."""
     if os.environ.get(SWITCH, "1") == "0":
         return None
     words = shlex.split(os.environ.get(of.variable, "")) or [of.usual]

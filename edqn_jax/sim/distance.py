@@ -145,7 +145,9 @@ def path_contact(scene: Scene, path: Array, radius: ArrayLike, times: Array | No
     return lax.platform_dependent(*given, cpu=_searched_in_turn, default=_searched_at_once)
 
 
-def _contact_in(scene: Scene, path: Array, radius: ArrayLike, times: Array | None, number: Array) -> tuple[Array, Array]:
+def _contact_in(
+    scene: Scene, path: Array, radius: ArrayLike, times: Array | None, number: Array
+) -> tuple[Array, Array]:
     """Returns `segment_contact` of one segment of a path."""
     when = None if times is None else (times[number], times[number + 1])
     return segment_contact(scene, path[number], path[number + 1], radius, times=when)

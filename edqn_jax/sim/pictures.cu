@@ -214,21 +214,21 @@ KERNEL_ON_CPU(draw)
 KERNEL_ON_CPU(measure)
 
 /* Launches a kernel on all frames of a call. */
-#define DRAW(kernel, weighted)                                                                        \
-  if (asked_for_version(call)) return 0;                                                              \
-  Batch batch;                                                                                        \
-  XLA_FFI_Error* error = batch_of(call, weighted, &batch);                                            \
-  if (error || !batch.frames) return error;                                                           \
+#define DRAW(kernel, weighted)                                                                         \
+  if (asked_for_version(call)) return 0;                                                               \
+  Batch batch;                                                                                         \
+  XLA_FFI_Error* error = batch_of(call, weighted, &batch);                                             \
+  if (error || !batch.frames) return error;                                                            \
   XLA_FFI_Stream_Get_Args stream = {XLA_FFI_Stream_Get_Args_STRUCT_SIZE, 0, call->ctx, 0};             \
-  error = STREAM(call, &stream);                                                                      \
-  if (error) return error;                                                                            \
-  LAUNCH(kernel, (int64_t)batch.frames * ((batch.width + COLUMNS - 1) / COLUMNS), stream.stream, batch);        \
-  const char* said = LAUNCH_ERROR();                                                                  \
+  error = STREAM(call, &stream);                                                                       \
+  if (error) return error;                                                                             \
+  LAUNCH(kernel, (int64_t)batch.frames*((batch.width + COLUMNS - 1) / COLUMNS), stream.stream, batch); \
+  const char* said = LAUNCH_ERROR();                                                                   \
   return said ? failed(call, XLA_FFI_Error_Code_INTERNAL, said) : 0;
 
-EXPORTED XLA_FFI_Error* edqn_pictures(XLA_FFI_CallFrame* call) { DRAW(draw, 1) }
+EXPORTED XLA_FFI_Error* edqn_pictures(XLA_FFI_CallFrame* call){DRAW(draw, 1)}
 
-EXPORTED XLA_FFI_Error* edqn_depths(XLA_FFI_CallFrame* call) { DRAW(measure, 0) }
+EXPORTED XLA_FFI_Error* edqn_depths(XLA_FFI_CallFrame* call){DRAW(measure, 0)}
 
 #ifdef __CUDACC__
 /* Returns why the kernels cannot be run on this machine, as with a driver that is older than the compiler; or 0. */

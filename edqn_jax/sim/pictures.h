@@ -119,8 +119,7 @@ FN void extent_of_box(const Eye* e, float x, float y, float hx, float hy, float 
   extent->left = low, extent->right = high;
 }
 
-FN float edge_of_disc(float ahead, float right, float distance, float radius, float sine, float cosine,
-                          float sign) {
+FN float edge_of_disc(float ahead, float right, float distance, float radius, float sine, float cosine, float sign) {
   const float f = ahead * cosine - sign * right * sine, r = right * cosine + sign * ahead * sine;
   const int in_front = f > NEAR_M * 1e-3f && distance > radius;
   return in_front ? r / most(f, NEAR_M * 1e-3f) : sign * FAR_U;
@@ -142,8 +141,8 @@ FN void heights_of(const Camera* c, float middle, float half, float value, Exten
 }
 
 /* Writes the numbers of LANES columns from the shape's depths, brightness and lean there. */
-FN void write_sides(const Camera* c, const Extent* e, Lanes share, Lanes enter, Lanes leave, Lanes side,
-                               Lanes lean, float* numbers, int stride) {
+FN void write_sides(const Camera* c, const Extent* e, Lanes share, Lanes enter, Lanes leave, Lanes side, Lanes lean,
+                    float* numbers, int stride) {
   const Lanes near = 1.0f / greater(enter, lanes(NEAR_M)), far = 1.0f / greater(leave, lanes(NEAR_M));
   const Lanes cap_near = e->cap * near, cap_far = e->cap * far;
   store(numbers + SHARE * stride, share);
@@ -350,8 +349,8 @@ typedef struct ALIGNED {
 FN void waves_of(const Camera* c, const Eye* e, Wave* waves) {
   for (int i = 0; i < c->waves; ++i) {
     const float* k = c->wave + 4 * i;
-    const Wave wave = {
-        k[0], k[1], k[2], k[3], dot3(k, e->origin), (k[0] * e->sin - k[1] * e->cos) * c->pitch, k[2] * c->pitch};
+    const Wave wave = {k[0],           k[1], k[2], k[3], dot3(k, e->origin), (k[0] * e->sin - k[1] * e->cos) * c->pitch,
+                       k[2] * c->pitch};
     waves[i] = wave;
   }
 }
@@ -378,8 +377,8 @@ FN void textures(const Camera* c, const Wave* waves, float dx, float dy, Lanes d
     UNROLLED for (int k = 0; k < MEETINGS; ++k) {
       if (!(wanted >> k & 1)) continue;
       const Lanes phase = w.at_origin + at[k].depth * along, f = phase - nearest_whole(phase);
-      const Lanes left = box_filter(at[k].depth * w.right + at[k].right * along) *
-                         box_filter(at[k].depth * w.up + at[k].up * along);
+      const Lanes left =
+          box_filter(at[k].depth * w.right + at[k].right * along) * box_filter(at[k].depth * w.up + at[k].up * along);
       factor[k] += w.weight * left * (f * (8.0f - 16.0f * absolute(f)));
     }
   }
@@ -439,8 +438,9 @@ FN Lanes blend(const Camera* c, const Plane* planes, int count, const Eye* e, co
                Lanes dz, const Layers* layers) {
   const int used = layers->inserted < DEPTH_OF_LAYERS ? layers->inserted : DEPTH_OF_LAYERS;
   int visible = 0, hidden = 0; /* layers before, and with, the first that covers all that lies behind it */
-  UNROLLED for (int k = 0; k < DEPTH_OF_LAYERS; ++k)
-    if (k < used && !hidden) visible = k + 1, hidden = !any_of(layers->layer[k].coverage < WHOLE);
+  UNROLLED for (int k = 0; k < DEPTH_OF_LAYERS; ++k) if (k < used && !hidden)
+      visible = k + 1,
+      hidden = !any_of(layers->layer[k].coverage < WHOLE);
 
   Meeting at[MEETINGS] = {{lanes(0), lanes(0), lanes(0)}};
   Lanes factor[MEETINGS], shown = lanes(0), share = lanes(0);
@@ -568,7 +568,8 @@ enum {
   OPERANDS
 };
 
-/* The frames of one call. From ORIGIN on operands have a leading [L], of which each row serves M / L frames in a row. */
+/* The frames of one call. From ORIGIN on operands have a leading [L], of which each row serves M / L frames in a row.
+ */
 typedef struct {
   const float* data[OPERANDS];
   int64_t size[OPERANDS]; /* of a row */

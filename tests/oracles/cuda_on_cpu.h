@@ -20,13 +20,13 @@
 #define EXPORTED
 #define STREAM(call, stream) 0
 #define LAUNCH_ERROR() 0
-#define LAUNCH(kernel, blocks, stream, batch)            \
-  do {                                                   \
-    launched = &(batch);                                 \
-    for (int64_t b = 0; b < (blocks); ++b) {             \
-      blockIdx.x = (int)b;                               \
-      run_block(call_##kernel, THREADS);                 \
-    }                                                    \
+#define LAUNCH(kernel, blocks, stream, batch) \
+  do {                                        \
+    launched = &(batch);                      \
+    for (int64_t b = 0; b < (blocks); ++b) {  \
+      blockIdx.x = (int)b;                    \
+      run_block(call_##kernel, THREADS);      \
+    }                                         \
   } while (0)
 #define KERNEL_ON_CPU(kernel) \
   static void call_##kernel(void) { kernel(*(const Batch*)launched); }

@@ -51,7 +51,8 @@ def test_a_compiler_that_writes_no_library_is_as_none(
     source: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     broken = tmp_path / "cc"
-    broken.write_text('#!/bin/sh\nfor last; do :; done\necho nothing > "$last"\n', encoding="utf-8")
+    words = '#!/bin/sh\nfor last; do :; done\n[ "$last" = --version ] || echo nothing > "$last"\n'
+    broken.write_text(words, encoding="utf-8")
     broken.chmod(0o755)
     monkeypatch.setenv("CC", str(broken))
     assert not registered(source, ("edqn_test_d",), ("NAME=edqn_test_d",))
@@ -94,10 +95,8 @@ def test_a_damaged_library_is_made_anew(source: Path, tmp_path: Path) -> None:
         assert list(folders[1].iterdir()) == [damaged] and damaged.stat().st_size == whole.stat().st_size
 
 
-def test_a_library_that_says_that_it_cannot_be_used_here_is_not(
-    source: Path, caplog: pytest.LogCaptureFixture
-) -> None:
-    usable = 'const char *edqn_unusable(void) { return 0; }\n'
+def test_a_library_that_says_that_it_cannot_be_used_here_is_not(source: Path, caplog: pytest.LogCaptureFixture) -> None:
+    usable = "const char *edqn_unusable(void) { return 0; }\n"
     source.write_text(SOURCE + usable, encoding="utf-8")
     compiler = shutil.which("cc") is not None
     assert registered(source, ("edqn_test_k",), ("NAME=edqn_test_k",)) is compiler and not caplog.records

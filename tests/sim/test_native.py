@@ -125,7 +125,9 @@ def kernels() -> bool:
 def crowded_forest(rng: np.random.Generator) -> Scene:
     """More shapes in a frame than a block of threads gathers in a pass, and than it keeps at once."""
     places = rng.uniform([0, 0, 0], [60, 60, 6], (300, 3))
-    return scene_of(GROUND, *(pillar(x, y, z, 0.3, 3) for x, y, z in places), box(30, 30, 2, 2, 3, 4, 1), ball(9, 9, 3, 2))
+    return scene_of(
+        GROUND, *(pillar(x, y, z, 0.3, 3) for x, y, z in places), box(30, 30, 2, 2, 3, 4, 1), ball(9, 9, 3, 2)
+    )
 
 
 @pytest.mark.parametrize(
