@@ -61,6 +61,8 @@ def parse(argv: Sequence[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--report", action="store_true", help="measure no row, print those in --out")
     args = parser.parse_args(words)
     args.flags = flags
+    if args.report and args.train_only:
+        parser.error("--report measures nothing; leave out --train-only")
     for name in ("seeds", "missions"):
         if getattr(args, name) < 1:
             parser.error(f"--{name} must be at least 1, not {getattr(args, name)}")

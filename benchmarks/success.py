@@ -91,6 +91,8 @@ def parse(argv: Sequence[str] | None = None) -> argparse.Namespace:
         parser.error("--shuffle-codes needs the --runs that fly with them")
     if args.runs and (args.report or args.train_only):
         parser.error("--report and --train-only fly nothing; leave out --runs")
+    if args.report and args.train_only:
+        parser.error("--report measures nothing; leave out --train-only")
     for name in ("seeds", "missions"):
         if getattr(args, name) < 1:
             parser.error(f"--{name} must be at least 1, not {getattr(args, name)}")
@@ -179,7 +181,9 @@ def read_rows(out: Path) -> list[Row]:
 def train_row(config: Config, seeds: int, missions: int, folder: Path) -> Row:
     """Trains the seeds of a row as `trained` does, flies the test missions, and returns the row."""
     began = time.perf_counter()
+    known = (folder / TRAINED).is_file()
     policies, training = trained(config, seeds, folder)
+    began -= training["seconds"] if known else 0.0
     took = {name: training[name] for name in ("train_seconds", "compile_seconds")}
     return _row(config, policies, missions, training["decisions"], took, began) | {"training": training}
 
@@ -194,6 +198,7 @@ def trained(config: Config, seeds: int, folder: Path) -> tuple[list[Policy], dic
     if file.is_file():
         training = json.loads(file.read_text(encoding="utf-8"))
         return [load_policy(folder / name) for name in training["policies"]], training
+    began = time.perf_counter()
     shutil.rmtree(folder, ignore_errors=True)  # of a training that was cut short
     results = train_seeds(seeds, config)
     policies = [Policy(result.policy.config, result.policy.params) for result in results]
@@ -205,6 +210,7 @@ def trained(config: Config, seeds: int, folder: Path) -> tuple[list[Policy], dic
         "decisions": results[0].decisions,
         "train_seconds": results[0].train_seconds,
         "compile_seconds": results[0].compile_seconds,
+        "seconds": time.perf_counter() - began,
         "commit": _commit(),
         **json_report.machine(jax.devices()),
     }
@@ -382,14 +388,18 @@ def measure(wanted: Sequence[Wanted], rows: list[Row], until: float) -> int:
 
 def train_all(wanted: Sequence[Wanted], until: float) -> None:
     """Trains the rows that are not written yet, one after the other, while there is time for one more."""
-    longest = FIRST_ROW_S
-    for one in wanted:
+    trainings = [one for one in wanted if one.train is not None and not one.file.is_file()]
+    trainings = [one for one in trainings if not (policies_of(one.file) / TRAINED).is_file()]
+    took: list[float] = []
+    for one in trainings:
         began = time.perf_counter()
-        if one.train is None or one.file.is_file() or began + longest > until:
-            continue
+        if began + max(took, default=FIRST_ROW_S) > until:
+            print("trainings are left; the same command goes on with them", file=sys.stderr)
+            return
+        assert one.train is not None
         one.train()
-        longest = time.perf_counter() - began
-        print(f"{policies_of(one.file)}: trained, {longest:.0f} s", file=sys.stderr)
+        took.append(time.perf_counter() - began)
+        print(f"{policies_of(one.file)}: trained, {took[-1]:.0f} s", file=sys.stderr)
 
 
 def _wanted(args: argparse.Namespace) -> list[Wanted]:
@@ -444,10 +454,10 @@ def main(argv: Sequence[str] | None = None) -> int:
     except ConfigError as error:
         print(error, file=sys.stderr)
         return 2
-    if args.train_only:
-        train_all(wanted, began + 60 * args.minutes)
-        return 3
     try:
+        if args.train_only:
+            train_all(wanted, began + 60 * args.minutes)
+            return 3
         left = measure(wanted, rows, began + 60 * args.minutes)
     except ConfigError as error:
         print(error, file=sys.stderr)

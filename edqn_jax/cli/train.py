@@ -129,15 +129,17 @@ def tuned_for_gpu(options: TrainOptions, config: Config) -> bool:
 def options_to_compare(config: Config) -> str:
     """Returns what processes must have alike: all options, and in place of a world file's path what it holds.
 
-    Also whether there is a compiler of C for their devices, since all must run the same program.
+    Also whether their devices draw in C, since all must run the same program.
 
     Raises:
         ConfigError: if there is no such file, or it cannot be read.
     """
-    from edqn_jax.parallel.c_library import compiler, of_backend
+    import jax
+
+    from edqn_jax.sim import native
 
     world = dataclasses.replace(config.world, name=_held(config.world.name), flown=_held(config.world.flown))
-    in_c = compiler(of_backend()) is not None
+    in_c = native.is_at_hand("cpu" if jax.default_backend() == "cpu" else "cuda")
     return f"{to_yaml(dataclasses.replace(config, world=world))}in_c: {in_c}\n"
 
 

@@ -58,20 +58,15 @@ C = Compiler(
 
 @functools.cache
 def cuda() -> Compiler | None:
-    """Returns the compiler for NVIDIA GPUs like the first of this machine; None where there is none."""
+    """Returns the compiler for NVIDIA GPUs like the first of this process; None where there is none."""
     try:
-        major, minor = str(jax.devices("cuda")[0].compute_capability).split(".")
+        major, minor = str(jax.local_devices(backend="cuda")[0].compute_capability).split(".")
     except RuntimeError:
         return None
     # Quotients and roots to 2 units in the last place, and no numbers below 1e-38.
     fast = ("-prec-div=false", "-prec-sqrt=false", "-ftz=true")
     flags = ("-O3", f"-arch=sm_{major}{minor}", *fast, "-Xcompiler=-fPIC", "-shared")
     return Compiler("NVCC", "nvcc", flags, "CUDA", -1)
-
-
-def of_backend() -> Compiler | None:
-    """Returns the compiler for the devices that JAX prefers; None where these are neither CPUs nor NVIDIA GPUs."""
-    return C if jax.default_backend() == "cpu" else cuda()
 
 
 @functools.cache
@@ -136,7 +131,7 @@ def _registered(
         with contextlib.ExitStack() as scratch:
             # Where nothing can be kept, the file is not needed once it is loaded.
             folder = private_folder() or Path(scratch.enter_context(tempfile.TemporaryDirectory()))
-            library = _loaded([*command, *by.flags], source, definitions, folder, headers)
+            library = _loaded(command, by.flags, source, definitions, folder, headers)
         _check_usable(library)
         for target in targets:
             handler = jax.ffi.pycapsule(getattr(library, target))
@@ -166,18 +161,19 @@ def _check_usable(library: ctypes.CDLL) -> None:
 
 
 def _loaded(
-    command: list[str], source: Path, definitions: tuple[str, ...], folder: Path, headers: tuple[Path, ...] = ()
+    compiler: list[str],
+    flags: tuple[str, ...],
+    source: Path,
+    definitions: tuple[str, ...],
+    folder: Path,
+    headers: tuple[Path, ...] = (),
 ) -> ctypes.CDLL:
-    """Returns the library, compiled in `folder` unless one of the same source, compiler and XLA is kept there.
-
-    Args:
-        command: the compiler with its options.
-    """
+    """Returns the library, compiled in `folder` unless one of the same source, compiler and XLA is kept there."""
     defined = [f"-D{definition}" for definition in definitions]
     searched = [f"-I{folder}" for folder in (jax.ffi.include_dir(), HEADER.parent)]
-    command = [*command, *defined, *searched, str(source), "-lm"]
+    command = [*compiler, *flags, *defined, *searched, str(source), "-lm"]
     texts = [file.read_bytes() for file in (source, HEADER, *headers)]
-    told_apart = (command, _version(command[:1]), texts, jax.__version__)
+    told_apart = (command, _version(compiler), texts, jax.__version__)
     library = folder / f"{source.stem}-{hashlib.sha256(repr(told_apart).encode()).hexdigest()[:16]}.so"
     if library.is_file():
         with contextlib.suppress(OSError):  # a damaged file is made anew

@@ -121,7 +121,7 @@ def path_contact(scene: Scene, path: Array, radius: ArrayLike, times: Array | No
     """Returns `segment_contact` of each segment of a path up to the first that touches.
 
     One distance at each point proves most segments free (d0 + d1 > L + 2 r, with L the length of the relative motion
-    at most); the others are searched one by one, so that the usual path costs an eighth. Each shape's distance is less
+    at most); only the others are searched, so that the usual path costs a CPU an eighth. Each shape's distance is less
     what it may move itself by the middle of the segment, so that a fast one far away makes no segment near.
 
     Args:

@@ -83,7 +83,7 @@ FN int gather(Gathered* g, int n, int shown) {
     for (int word = 0; word < t / 32; ++word) before += __popc(g->bits[word]);
     g->list[before] = n;
   }
-  __syncthreads();
+  __syncthreads(); /* the list is there, and the bits have been read, before the next pass clears them */
   return found;
 }
 
@@ -105,7 +105,7 @@ static __global__ void __launch_bounds__(THREADS, RESIDENT) draw(const Batch bat
   const Camera* c = &frame.camera;
   const Shapes* s = &frame.shapes;
   const Eye* e = &frame.eye;
-  if (t == THREADS - 1) waves_of(c, e, waves); /* in other warps than those that gather */
+  if (t == THREADS - 1) waves_of(c, e, waves); /* in warps that have no shape of a usual scene to look at */
   if (t == THREADS - 33) light_planes(c, s, e, frame.planes);
 
   const int uprights = s->boxes + s->cylinders, across = column_of(t), column = left + across;
@@ -124,7 +124,7 @@ static __global__ void __launch_bounds__(THREADS, RESIDENT) draw(const Batch bat
         Upright shape;
         const int n = base + t;
         const int shown = n < uprights && upright(c, s, e, n, &shape) && shape.first < right && shape.last > left;
-        __syncthreads();
+        __syncthreads(); /* nobody is at the list of the pass before */
         found = gather(&gathered, n, shown);
       }
       for (int k = 0; k < found; k += AT_ONCE) {
@@ -180,7 +180,7 @@ static __global__ void __launch_bounds__(THREADS, RESIDENT) measure(const Batch 
     for (int base = 0; base < uprights; base += THREADS) {
       if (!kept) {
         const int n = base + t, shown = n < uprights && !upright_out_of_sight(c, s, e, n);
-        __syncthreads();
+        __syncthreads(); /* nobody is at the list of the pass before */
         found = gather(&gathered, n, shown);
       }
       for (int k = 0; k < found; k += MEASURED_AT_ONCE) {
@@ -224,17 +224,18 @@ KERNEL_ON_CPU(measure)
   if (error) return error;                                                                             \
   LAUNCH(kernel, (int64_t)batch.frames*((batch.width + COLUMNS - 1) / COLUMNS), stream.stream, batch); \
   const char* said = LAUNCH_ERROR();                                                                   \
-  return said ? failed(call, XLA_FFI_Error_Code_INTERNAL, said) : 0;
+  return said ? failed(call, XLA_FFI_Error_Code_INTERNAL, said) : 0
 
-EXPORTED XLA_FFI_Error* edqn_pictures(XLA_FFI_CallFrame* call){DRAW(draw, 1)}
+EXPORTED XLA_FFI_Error* edqn_pictures(XLA_FFI_CallFrame* call) { DRAW(draw, 1); }
 
-EXPORTED XLA_FFI_Error* edqn_depths(XLA_FFI_CallFrame* call){DRAW(measure, 0)}
+EXPORTED XLA_FFI_Error* edqn_depths(XLA_FFI_CallFrame* call) { DRAW(measure, 0); }
 
 #ifdef __CUDACC__
-/* Returns why the kernels cannot be run on this machine, as with a driver that is older than the compiler; or 0. */
+/* Returns why the kernels cannot be run on this machine, or 0. Asks nothing that would take memory on a card. */
 EXPORTED const char* edqn_unusable(void) {
-  cudaFuncAttributes found;
-  const cudaError_t error = cudaFuncGetAttributes(&found, draw);
-  return error == cudaSuccess ? 0 : cudaGetErrorString(error);
+  int driver = 0, compiler = 0;
+  const cudaError_t error = cudaDriverGetVersion(&driver), other = cudaRuntimeGetVersion(&compiler);
+  if (error != cudaSuccess || other != cudaSuccess) return cudaGetErrorString(error != cudaSuccess ? error : other);
+  return driver / 1000 < compiler / 1000 ? "the driver is of an older major version of CUDA than nvcc" : 0;
 }
 #endif

@@ -6,7 +6,7 @@
  *
  * Whoever includes this has defined: LANES, how many pixels are drawn at a time; Lanes and Mask, their numbers and
  * whether something holds of them; FN, how functions are declared; UNROLLED, before a loop; ALIGNED, of what is read at
- * once; and lanes, load, store, pick, lesser, greater, absolute, roots, any_of, counted of Lanes.
+ * once; and lanes, store, pick, lesser, greater, absolute, roots, any_of, counted of Lanes.
  */
 
 #ifndef EDQN_PICTURES_H
@@ -609,6 +609,7 @@ static inline XLA_FFI_Error* batch_of(XLA_FFI_CallFrame* call, int weighted, Bat
   XLA_FFI_Buffer** arg = (XLA_FFI_Buffer**)call->args.args;
   const XLA_FFI_Buffer* pictures = (const XLA_FFI_Buffer*)call->rets.rets[0];
   memset(b, 0, sizeof *b);
+  if (!pictures->dims[0]) return 0;
   b->frames = (uint32_t)pictures->dims[0], b->height = (int)pictures->dims[1], b->width = (int)pictures->dims[2];
   b->pictures = (float*)pictures->data;
   for (int i = 0; i < OPERANDS; ++i) b->serves[i] = 1;

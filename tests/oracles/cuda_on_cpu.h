@@ -1,7 +1,8 @@
 /* Runs kernels of CUDA on a CPU, one thread of a block after another: `cc -include` this before `pictures.cu`.
  *
  * Every thread of a block runs until it waits for the others; when all do, they go on. All threads have to wait equally
- * often, which a GPU asks for as well and does not check. There is no warp, and shared memory is that of the process.
+ * often, which a GPU asks for as well and does not check. In every other block the last thread runs first, so that what
+ * one reads before another has written it shows. There is no warp, and shared memory is that of the process.
  */
 
 #include <math.h>
@@ -80,7 +81,8 @@ static void run_block(void (*kernel)(void), int size) {
   for (int left = size; left; ++waits) {
     counts[waits & 1] = 0; /* of two waits ago; those of the last are read in this round */
     left = 0;
-    for (int t = 0; t < size; ++t) {
+    for (int i = 0; i < size; ++i) {
+      const int t = blockIdx.x & 1 ? size - 1 - i : i; /* in either order: none may count on the other's */
       threadIdx.x = t;
       swapcontext(&scheduler, &threads[t]);
       left += !ended[t];

@@ -82,16 +82,15 @@ def test_where_nothing_can_be_kept_it_is_compiled_and_leaves_nothing(
 def test_a_damaged_library_is_made_anew(source: Path, tmp_path: Path) -> None:
     command = c_library._command(c_library.C)
     if command is not None:
-        command += c_library.C.flags
         folders = tmp_path / "whole", tmp_path / "damaged"
         for folder in folders:
             folder.mkdir()
-        c_library._loaded(command, source, ("NAME=edqn_test_g",), folders[0])
+        c_library._loaded(command, c_library.C.flags, source, ("NAME=edqn_test_g",), folders[0])
         (whole,) = folders[0].iterdir()
         # In another folder: a library that is loaded already is not read again.
         damaged = folders[1] / whole.name
         damaged.write_bytes(whole.read_bytes()[:100])
-        assert c_library._loaded(command, source, ("NAME=edqn_test_g",), folders[1]).edqn_test_g
+        assert c_library._loaded(command, c_library.C.flags, source, ("NAME=edqn_test_g",), folders[1]).edqn_test_g
         assert list(folders[1].iterdir()) == [damaged] and damaged.stat().st_size == whole.stat().st_size
 
 

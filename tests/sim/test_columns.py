@@ -20,8 +20,8 @@ ROUNDING = 2e-6
 
 @pytest.fixture(autouse=True)
 def in_jax(monkeypatch):
-    """Columns as GPUs draw them, and CPUs without a compiler; `test_native.py` holds the others against them."""
-    monkeypatch.setattr(camera, "_pictures_on_cpu", lambda *_: None)
+    """Columns as they are drawn without a compiler; `test_native.py` holds the others against them."""
+    monkeypatch.setattr(camera, "_pictures_natively", lambda *_: None)
 
 
 def stairs(count):

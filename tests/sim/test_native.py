@@ -130,10 +130,15 @@ def crowded_forest(rng: np.random.Generator) -> Scene:
     )
 
 
+def empty_field(rng: np.random.Generator) -> Scene:
+    """Ground and a ball: no upright shape."""
+    return scene_of(GROUND, ball(30, 30, 3, rng.uniform(8, 12)))
+
+
 @pytest.mark.parametrize(
     "size, world",
-    [((32, 24), crowd), ((13, 7), crowd), ((70, 20), crowd), ((32, 24), crowded_forest)],
-    ids=["usual", "no multiple of a block", "several blocks", "several passes"],
+    [((32, 24), crowd), ((13, 7), crowd), ((70, 20), crowd), ((32, 24), crowded_forest), ((32, 24), empty_field)],
+    ids=["usual", "no multiple of a block", "several blocks", "several passes", "no upright shapes"],
 )
 def test_the_kernels_of_gpus_draw_what_jax_draws(
     kernels: bool, monkeypatch: pytest.MonkeyPatch, size: tuple[int, int], world: Callable[..., Scene]
