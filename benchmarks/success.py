@@ -388,15 +388,14 @@ def measure(wanted: Sequence[Wanted], rows: list[Row], until: float) -> int:
 
 def train_all(wanted: Sequence[Wanted], until: float) -> None:
     """Trains the rows that are not written yet, one after the other, while there is time for one more."""
-    trainings = [one for one in wanted if one.train is not None and not one.file.is_file()]
-    trainings = [one for one in trainings if not (policies_of(one.file) / TRAINED).is_file()]
     took: list[float] = []
-    for one in trainings:
+    for one in wanted:
+        if one.train is None or one.file.is_file() or (policies_of(one.file) / TRAINED).is_file():
+            continue
         began = time.perf_counter()
         if began + max(took, default=FIRST_ROW_S) > until:
             print("trainings are left; the same command goes on with them", file=sys.stderr)
             return
-        assert one.train is not None
         one.train()
         took.append(time.perf_counter() - began)
         print(f"{policies_of(one.file)}: trained, {took[-1]:.0f} s", file=sys.stderr)

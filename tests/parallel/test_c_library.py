@@ -109,8 +109,9 @@ def test_what_an_included_header_says_is_compiled_anew_when_it_changes(source: P
     for count, name in enumerate(("edqn_test_m", "edqn_test_n")):
         header.write_text(f"#define NAME {name}\n", encoding="utf-8")
         source.write_text('#include "name.h"\n' + SOURCE, encoding="utf-8")
-        if registered(source, (name,), (), c_library.C, (header,)):
-            assert len(kept(tmp_path)) == count + 1
+        compiler = shutil.which("cc") is not None
+        assert registered(source, (name,), (), c_library.C, (header,)) is compiler
+        assert len(kept(tmp_path)) == (count + 1 if compiler else 0)
 
 
 def test_the_compiler_may_have_options_and_a_failure_is_told(
