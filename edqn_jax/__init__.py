@@ -1,12 +1,15 @@
 """Train drones to fly through unknown obstacles from simulated events, in one compiled JAX program.
 
 The names below are public; they are loaded when first used, so that importing this package imports neither JAX nor
-MuJoCo and configures nothing. Everything else may change between versions.
+MuJoCo. It configures one thing: XLA's flags, so that sums on CPUs are right (docs/decisions/0028). Everything else may
+change between versions.
 """
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
+
+from edqn_jax.xla_flags import disable_ynn_fusions
 
 if TYPE_CHECKING:
     from edqn_jax.config import Config
@@ -102,3 +105,6 @@ def __getattr__(name: str) -> Any:
 
 def __dir__() -> list[str]:
     return sorted(__all__)
+
+
+disable_ynn_fusions()

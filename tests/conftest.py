@@ -12,8 +12,6 @@ from pathlib import Path
 import jax
 import pytest
 
-from edqn_jax.parallel.devices import use_cpu_devices
-
 CACHE = {
     "jax_compilation_cache_dir": "",
     "jax_persistent_cache_min_compile_time_secs": 0.0,
@@ -57,9 +55,12 @@ LONGEST = (
 `test_evaluate` flies what `test_flights` flies, so it stands some places after it and finds the program compiled.
 """
 
-# For the processes that tests start as well. Whoever gives flags gets these alone: `XLA_FLAGS= pytest` compiles
-# everything as users do.
+# For the processes that tests start as well, and before the package is imported, which adds its own. Whoever gives
+# flags gets these alone: `XLA_FLAGS= pytest` compiles everything as users do.
 os.environ.setdefault("XLA_FLAGS", QUICK_TO_COMPILE)
+
+from edqn_jax.parallel.devices import use_cpu_devices  # noqa: E402
+
 use_cpu_devices(2)
 
 

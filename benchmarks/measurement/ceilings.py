@@ -16,7 +16,7 @@ from mujoco import rollout
 
 from edqn_jax.config import Config
 from edqn_jax.learn.trainer import AXIS
-from edqn_jax.parallel.devices import cores
+from edqn_jax.parallel.hardware import cores
 from edqn_jax.sim import drone
 
 ROLLOUT_STEPS = 130

@@ -12,7 +12,7 @@ import jax
 import numpy as np
 
 from edqn_jax.config import FAMILIES, Config
-from edqn_jax.parallel.devices import cores, processor
+from edqn_jax.parallel.hardware import cores, processor
 from edqn_jax.planners.astar import shortest_path
 from edqn_jax.planners.follow import FollowConfig, compiled_follower, reserved, sampled
 from edqn_jax.planners.lattice import NoPathError

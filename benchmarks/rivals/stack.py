@@ -16,7 +16,8 @@ import numpy as np
 from conventional_stack.settings import PACKAGES, SETTINGS
 from edqn_jax.config import Config
 from edqn_jax.evaluation.missions import run_missions
-from edqn_jax.parallel.devices import choose_devices, processor
+from edqn_jax.parallel.devices import choose_devices
+from edqn_jax.parallel.hardware import processor
 from edqn_jax.runs.provenance import workload
 from edqn_jax.sim.env import MOTION_SIZE, OWN_SIZE, World
 from edqn_jax.sim.flights import Flights

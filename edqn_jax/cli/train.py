@@ -41,7 +41,8 @@ def train_command(argv: Sequence[str], stops: Stops) -> None:
     import jax
 
     from edqn_jax.parallel import processes
-    from edqn_jax.parallel.devices import cores, most_that_divide, use_cpu_devices
+    from edqn_jax.parallel.devices import most_that_divide, use_cpu_devices
+    from edqn_jax.parallel.hardware import cores
     from edqn_jax.parallel.programs import keep_programs
     from edqn_jax.report.progress import Progress
     from edqn_jax.training.stopping import Stop

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import functools
 import os
-import platform
-from pathlib import Path
 
 import jax
 
 from edqn_jax.errors import ConfigError
+from edqn_jax.parallel.hardware import cores
+from edqn_jax.parallel.sums import check_sums
+from edqn_jax.xla_flags import YNN_OPTION
 
 ALIKE = "--xla_backend_extra_options=xla_cpu_disable_loop_unrolling"
 """XLA flag that makes CPU programs round equally for every batch size (docs/decisions/0006)."""
@@ -38,17 +39,19 @@ def use_cpu_devices(count: int | None = None) -> None:
 def compiler_options(platform: str) -> dict[str, str | bool]:
     """Returns the compiler options for a platform beyond XLA's defaults, for `jax.jit` and `compile`.
 
-    By default XLA on CPUs calls a library for sums of products that is made for large ones: one sum of 6 x 6 numbers
-    in a physics step then takes longer than the rest of the step. Matrix products still use the library. LLVM's
-    first optimisation level gives programs as fast as its third and compiles an eighth faster.
+    XLA's path for sums and products through YNNPACK is off, since it computes some sums wrongly, as the flag does that
+    is set at import (docs/decisions/0028). LLVM's first optimisation level gives programs as fast as its third and
+    compiles an eighth faster.
+
+    Raises:
+        ConfigError: if programs with these options get wrong sums on this machine.
     """
     if platform != "cpu":
         return {}
-    wanted = {
-        "xla_cpu_experimental_ynn_fusion_type": "LIBRARY_FUSION_TYPE_DOT",
-        "xla_backend_optimization_level": "1",
-    }
-    return {name: value for name, value in wanted.items() if _has_option(name, value)}
+    wanted = {YNN_OPTION: "", "xla_backend_optimization_level": "1"}
+    options: dict[str, str | bool] = {name: value for name, value in wanted.items() if _has_option(name, value)}
+    check_sums(options)
+    return options
 
 
 @functools.cache
@@ -70,21 +73,6 @@ def _has_option(name: str, value: str | bool) -> bool:
     except (jax.errors.JaxRuntimeError, ValueError):
         return False
     return True
-
-
-def cores() -> int:
-    """Returns the number of cores that this process may run on."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
-
-
-def processor() -> str:
-    """Returns the CPU's model name and the number of cores that this process may use."""
-    cpuinfo = Path("/proc/cpuinfo")
-    lines = cpuinfo.read_text(encoding="utf-8").splitlines() if cpuinfo.is_file() else []
-    named = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
-    return f"{named[0] if named else platform.machine()}, {cores()} cores"
 
 
 def choose_devices(requested: int, shards: int) -> list[jax.Device]:  # pyright: ignore[reportInvalidTypeForm]

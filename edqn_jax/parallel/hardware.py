@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import pkgutil
+import platform
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Literal
@@ -37,3 +38,18 @@ def hardware(environ: Mapping[str, str] = os.environ, devices: Path = Path("/dev
 def _has_plugin(plugin: str) -> bool:
     names = [module.name for module in pkgutil.iter_modules()]
     return any(name.startswith(plugin) and name.endswith("_plugin") for name in names)
+
+
+def cores() -> int:
+    """Returns the number of cores that this process may run on."""
+    if hasattr(os, "sched_getaffinity"):
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
+def processor() -> str:
+    """Returns the CPU's model name and the number of cores that this process may use."""
+    cpuinfo = Path("/proc/cpuinfo")
+    lines = cpuinfo.read_text(encoding="utf-8").splitlines() if cpuinfo.is_file() else []
+    named = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    return f"{named[0] if named else platform.machine()}, {cores()} cores"

@@ -13,7 +13,7 @@ from typing import Any
 
 import jax
 
-from edqn_jax.parallel.devices import cores
+from edqn_jax.parallel.hardware import cores
 
 MOST_BYTES = 2**30
 """Of kept programs; beyond this the older ones are deleted."""

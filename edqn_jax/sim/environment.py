@@ -22,6 +22,7 @@ from jax.typing import ArrayLike
 from edqn_jax.config import FAMILIES, Config
 from edqn_jax.config.loading import make_config
 from edqn_jax.errors import ConfigError
+from edqn_jax.parallel.sums import check_default_sums
 from edqn_jax.sim import camera, drone, env, events, group, sensor
 from edqn_jax.sim.drone import Flight
 from edqn_jax.sim.env import EnvState, Observation, Step, World
@@ -168,7 +169,11 @@ def make(
     Raises:
         ConfigError: if there is no such world, the drone does not fit at its start or goal, or several drones are
             configured.
+
+    Warns:
+        RuntimeWarning: if XLA computes wrong sums on this CPU in programs that are compiled with its defaults.
     """
+    check_default_sums()
     name = str(world) if world is not None else (config or Config()).world.name
     config = make_config(name) if config is None else config
     group.check_alone(config, "edqn_jax.make")

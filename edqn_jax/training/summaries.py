@@ -12,7 +12,7 @@ import numpy as np
 from edqn_jax.config import Config
 from edqn_jax.evaluation.intervals import interquartile_mean, rate_interval
 from edqn_jax.evaluation.metrics import flight_summary, summarise
-from edqn_jax.parallel.devices import processor
+from edqn_jax.parallel.hardware import processor
 from edqn_jax.runs.provenance import reward_record, versions, workload
 from edqn_jax.sim.flights import Flights
 from edqn_jax.sim.outcomes import Outcome

@@ -12,7 +12,8 @@ import pytest
 
 from edqn_jax.errors import ConfigError
 from edqn_jax.parallel import devices
-from edqn_jax.parallel.devices import choose_devices, cores, most_that_divide, use_cpu_devices
+from edqn_jax.parallel.devices import choose_devices, most_that_divide, use_cpu_devices
+from edqn_jax.parallel.hardware import cores
 
 
 @pytest.mark.parametrize(("shards", "available", "used"), [(8, 2, 2), (8, 3, 2), (8, 7, 4), (8, 64, 8), (6, 4, 3)])
