@@ -168,7 +168,8 @@ def recording_of(
         events,
         width,
         height,
-        time_unit=known.pop("says_unit", None) or f"{unit}, {'as given' if time_unit else 'assumed from length, rate and resolution'}",
+        time_unit=known.pop("says_unit", None)
+        or f"{unit}, {'as given' if time_unit else 'assumed from length, rate and resolution'}",
         polarity=polarity,
         out_of_order=out_of_order,
         **known,
