@@ -31,6 +31,8 @@ class Header(NamedTuple):
     """In bytes."""
     size: tuple[int, int] | None
     """Width and height of the image; None where it does not say them."""
+    begin_us: int
+    """Added to the times of the words, as faery writes it (`t0`)."""
 
 
 def read_prophesee(file: Path, size: tuple[int, int] | None) -> Recording:
@@ -71,6 +73,7 @@ def read_prophesee(file: Path, size: tuple[int, int] | None) -> Recording:
         size=header.size or size,
         time_unit="us",
         says_unit=f"us, as {says} has it",
+        offset_us=header.begin_us,
         left_out=left_out,
     )
 
@@ -93,7 +96,8 @@ def header_of(beginning: bytes) -> Header:
         size = int(geometry[1]), int(geometry[2])
     else:
         size = (int(sides[0][1]), int(sides[1][1])) if sides[0] and sides[1] else None
-    return Header(text, length, size)
+    begin = re.search(r"^% t0:? (\d+)$", text, re.MULTILINE | re.IGNORECASE)
+    return Header(text, length, size, int(begin[1]) if begin else 0)
 
 
 def _evt(file: Path, header: Header) -> tuple[Words, int, str]:
