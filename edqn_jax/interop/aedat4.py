@@ -34,15 +34,16 @@ class Stream(NamedTuple):
 
     number: int
     name: str
-    width: int
-    height: int
+    size: tuple[int, int] | None
+    """Width and height of its image; None where the file does not say them."""
 
 
-def read_aedat4(file: Path, number: int | None = None) -> Recording:
+def read_aedat4(file: Path, size: tuple[int, int] | None = None, number: int | None = None) -> Recording:
     """Returns the recording of an AEDAT4.
 
     Args:
         file: to read.
+        size: width and height where the file does not say them.
         number: of the stream; None where there is one of events.
 
     Raises:
@@ -68,7 +69,7 @@ def read_aedat4(file: Path, number: int | None = None) -> Recording:
         x=events["x"],
         y=events["y"],
         p=events["p"],
-        size=(stream.width, stream.height),
+        size=stream.size or size,
         time_unit="us",
         says_unit="us, as AEDAT4 has it",
     )
@@ -93,8 +94,9 @@ def _streams(described: ElementTree.Element) -> list[Stream]:
     for node in described.iterfind("node[@name='outInfo']/node"):
         said = {attribute.get("key"): attribute.text or "" for attribute in node.iter("attr")}
         if said.get("typeIdentifier") == "EVTS":
-            name = said.get("originalOutputName", "")
-            found.append(Stream(int(node.attrib["name"]), name, int(said["sizeX"]), int(said["sizeY"])))
+            name, sides = said.get("originalOutputName", ""), (said.get("sizeX"), said.get("sizeY"))
+            size = (int(sides[0]), int(sides[1])) if sides[0] and sides[1] else None
+            found.append(Stream(int(node.attrib["name"]), name, size))
     return found
 
 

@@ -35,7 +35,7 @@ def read_camera_file(file: Path, size: tuple[int, int] | None, stream: int | Non
     """
     kind = KINDS[file.suffix.lower()]
     if kind == "AEDAT4":
-        recording = read_aedat4(file, stream)
+        recording = read_aedat4(file, size, stream)
     elif kind == "Event Stream":
         recording = _read_event_stream(file)
     else:

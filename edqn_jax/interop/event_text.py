@@ -103,13 +103,13 @@ def _beginning(file: Path, lines: list[str], is_order_given: bool) -> _Said:
     said = _Said()
     for line in lines:
         words = [word for word in re.split(r"[,;\s]+", _bare(line)) if word]
-        is_size = len(words) == 2 and all(word.isdecimal() for word in words)
-        is_event = words and not is_size and all(_is_number(word) or word.lower() in _WORDS for word in words)
-        if is_event or (words and said.order is not None and said.lines and not is_size):
+        sides = None if said.size else re.fullmatch(r"(\d+)(?:\s*[x,;]\s*|\s+)(\d+)", _bare(line))
+        is_event = words and not sides and all(_is_number(word) or word.lower() in _WORDS for word in words)
+        if is_event or (words and said.order is not None and said.lines and not sides):
             break
         said.lines += 1
-        if is_size:
-            said.size = int(words[0]), int(words[1])
+        if sides:
+            said.size = int(sides[1]), int(sides[2])
             continue
         _read_header(line, said)
         if words and said.order is None and not is_order_given:

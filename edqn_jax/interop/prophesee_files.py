@@ -49,7 +49,7 @@ def read_prophesee(file: Path, size: tuple[int, int] | None) -> Recording:
         beginning = opened.read(HEADER_BYTES)
     header = header_of(beginning)
     if not header.length:
-        raise ConfigError(f"'{file}' has no header of Prophesee's, lines that begin with '% ': it is of another kind")
+        raise ConfigError(f"'{file}' has no header of Prophesee's, lines that begin with '% ', which say what it holds")
     if file.suffix.lower() == ".dat":
         words, begin, says = _dat(file, header, beginning)
     else:

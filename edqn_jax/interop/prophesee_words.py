@@ -78,7 +78,7 @@ def decode_evt3(words: NDArray) -> Columns:
 
     A column is written by itself (0x2), or as bits of the 12 or 8 columns (0x4, 0x5) from a base (0x3) on, which each
     such word moves on. Row (0x0), upper (0x8) and lower (0x6) 12 bits of the time hold until the next word of their
-    kind; the lower are 0 after the upper changed.
+    kind; the lower are 0 after the upper changed, as in Prophesee's own decoder.
     """
     kinds, values = words >> 12, words & 0xFFF
     row_at, base_at, low_at, high_at = (np.flatnonzero(kinds == kind) for kind in (0x0, 0x3, 0x6, 0x8))

@@ -145,6 +145,8 @@ def recording_of(
     Raises:
         ConfigError: if the columns are no events, or can be read in several ways.
     """
+    if size is not None and min(size) < 1:
+        raise ConfigError(f"the image of '{name}' must have at least 1 x 1 pixels, not {size[0]} x {size[1]}")
     columns = {"t": np.asarray(t), "x": np.asarray(x), "y": np.asarray(y), "p": np.asarray(p)}
     lengths = {len(column) if column.ndim == 1 else -1 for column in columns.values()}
     if len(lengths) != 1 or -1 in lengths:
@@ -224,7 +226,9 @@ def one_number(name: str, key: str, value: ArrayLike) -> float | int:
     """
     held = np.asarray(value)
     if held.size != 1 or held.dtype.kind not in "iuf" or not np.isfinite(held).all():
-        said = f"an array {list(held.shape)}" if held.size != 1 else f"'{held.reshape(-1)[0]}'"
+        word = held.reshape(-1)[0] if held.size == 1 else None
+        text = word.decode("latin-1") if isinstance(word, bytes) else str(word)
+        said = f"an array {list(held.shape)}" if held.size != 1 else f"'{text}'"
         raise ConfigError(f"the {key} of '{name}' must be one number, not {said}")
     return held.reshape(-1)[0].item()
 
