@@ -7,7 +7,7 @@ Every program is compiled with four sets of options and run on the same inputs: 
 `products` the same with matrix products in YNNPACK, `defaults` XLA's own options, and `plain` without LLVM's optimiser,
 as a measure of what rounding alone does. A difference from `off` is that of the worst array: of floating-point numbers
 the largest, as a share of the array's largest magnitude, of whole numbers the share of elements that differ, since a
-rounded difference can tip an event. Flights whose moves differ, as of two that are equally good, are left out and counted.
+rounded difference can tip an event. Flights whose moves differ, as of two equally good ones, are left out and counted.
 Where there is an oracle in double precision, all four are compared with it.
 
 Exit code 1 if `off` is wrong beside an oracle, if a difference from `off` is more than `BEYOND` times that of `plain`

@@ -194,7 +194,9 @@ class EventsArgs:
     time_unit: Annotated[Literal["s", "ms", "us", "ns"] | None, arg(help_behavior_hint="")] = None
     """Unit of the times, where the file does not say (default: the only plausible one)."""
     columns: Annotated[str | None, arg(metavar="t,x,y,p", help_behavior_hint="")] = None
-    """Order of a text's columns, where its first line does not name them (default: t,x,y,p)."""
+    """Order of a text's columns, where no line names them (default: t,x,y,p, refused where another order fits)."""
+    stream: Annotated[int | None, arg(metavar="N", help_behavior_hint="")] = None
+    """Which stream of events of an .aedat4 that has several, such as those of two cameras."""
     start: Annotated[float | None, arg(metavar="S", help_behavior_hint="")] = None
     """Leave out what is before this, seconds from the first event."""
     stop: Annotated[float | None, arg(metavar="S", help_behavior_hint="")] = None

@@ -31,6 +31,9 @@ from edqn_jax.runs.policies import load_policy
 WINDOW_S = 0.05
 """Length of a window in pictures without a policy, seconds."""
 
+LONG_PAUSE_S = 1.0
+"""Longest time between two events that is not told, seconds."""
+
 
 def events_command(args: EventsArgs) -> None:
     """Runs `edqn events` with these arguments.
@@ -45,7 +48,7 @@ def events_command(args: EventsArgs) -> None:
     if args.out is not None:
         check_can_write_events(args.out)
     console = Console()
-    whole = read_events(args.file, size=args.size, time_unit=args.time_unit, columns=args.columns)
+    whole = read_events(args.file, size=args.size, time_unit=args.time_unit, columns=args.columns, stream=args.stream)
     recording = whole.between(args.start, args.stop)
     figures: dict[str, Any] = {"file": str(args.file), **found(recording)}
     strips, times_s, period_s = _strips(args, recording, figures)
@@ -79,7 +82,10 @@ def found(recording: Recording) -> dict[str, Any]:
         "size_is_known": known,
         "time_unit": recording.time_unit,
         "polarity": recording.polarity,
+        "columns": recording.columns or None,
         "out_of_order": recording.out_of_order,
+        "left_out": recording.left_out,
+        "longest_pause_s": recording.longest_pause_s,
         "contrast": recording.contrast,
         "has_flight": recording.flight is not None,
     }
@@ -99,8 +105,14 @@ def report(figures: dict[str, Any]) -> Table:
     table.add_row("image", size if figures["size_is_known"] else f"at least {size}; the file does not say")
     table.add_row("unit of time in the file", figures["time_unit"])
     table.add_row("polarities in the file", figures["polarity"])
+    if figures["columns"] is not None:
+        table.add_row("columns in the file", figures["columns"])
     if figures["out_of_order"]:
         table.add_row("out of order, sorted", f"{figures['out_of_order']:,}")
+    if figures["left_out"]:
+        table.add_row("before the file's first time, left out", f"{figures['left_out']:,}")
+    if figures["longest_pause_s"] > LONG_PAUSE_S:
+        table.add_row("longest pause", f"{figures['longest_pause_s']:.3f} s without an event")
     if figures["contrast"] is not None:
         table.add_row("contrast per event", f"{figures['contrast']:g}")
     if figures["has_flight"]:

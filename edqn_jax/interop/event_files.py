@@ -24,6 +24,7 @@ def read_events(
     size: tuple[int, int] | None = None,
     time_unit: TimeUnit | None = None,
     columns: str | None = None,
+    stream: int | None = None,
 ) -> Recording:
     """Returns the recording that a file holds.
 
@@ -32,6 +33,7 @@ def read_events(
         size: width and height of the image, where the file does not say them.
         time_unit: of the times, where the file does not say it.
         columns: order of a text's columns, such as `x,y,t,p`.
+        stream: which stream of events of an .aedat4 that has several.
 
     Raises:
         ConfigError: if the file is damaged, of another kind, or can be read in several ways.
@@ -43,6 +45,8 @@ def read_events(
         raise ConfigError(f"there is no file '{file}'")
     if columns is not None and kind not in TEXT:
         raise ConfigError(f"--columns is for texts, and '{file}' is none")
+    if stream is not None and kind != ".aedat4":
+        raise ConfigError(f"--stream is for .aedat4, and '{file}' is none")
     if kind in HDF5:
         return read_hdf5(file, size, time_unit)
     if kind == ".npz":
@@ -52,7 +56,7 @@ def read_events(
     if kind in KINDS:
         if time_unit not in (None, "us"):
             raise ConfigError(f"'{file}' is {KINDS[kind]}, whose times are in us, not {time_unit}")
-        return read_camera_file(file, size)
+        return read_camera_file(file, size, stream)
     ends = ", ".join((*HDF5, ".npz", *TEXT, *KINDS))
     raise ConfigError(f"'{file}' is of no kind that is read, which end in {ends}")
 

@@ -7,7 +7,8 @@
     ms_to_idx            uint64 [M]: t[ms_to_idx[k]] is the first event of millisecond k or later
 
 DSEC's own files do not say how large the image is; ours do, as attributes `width` and `height` of `events`, together
-with `contrast`. A group `flight` says where the camera was, see `Recording.flight`.
+with `contrast`. Other usual names of the columns are read, too (`COLUMN_NAMES`). A group `flight` says where the camera
+was, see `Recording.flight`.
 """
 
 from __future__ import annotations
@@ -20,7 +21,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edqn_jax.errors import ConfigError
-from edqn_jax.interop.recording import Recording, TimeUnit, recording_of
+from edqn_jax.interop.recording import (
+    Recording,
+    TimeUnit,
+    named_columns,
+    one_number,
+    recording_of,
+    whole_number,
+)
 from edqn_jax.packages import require
 
 
@@ -39,6 +47,8 @@ def read_hdf5(file: Path, size: tuple[int, int] | None, time_unit: TimeUnit | No
         with h5py.File(file, "r") as opened:
             columns, others = _columns(file, opened)
     except (OSError, RuntimeError, KeyError) as error:
+        if "filter" in str(error):
+            raise ConfigError(f"'{file}' is compressed with a filter that is not installed: {error}") from None
         raise ConfigError(f"'{file}' is damaged, or no HDF5 file: {error}") from None
     index, offset_us = others.pop("ms_to_idx"), others.pop("t_offset")
     if index is not None:
@@ -51,26 +61,56 @@ def read_hdf5(file: Path, size: tuple[int, int] | None, time_unit: TimeUnit | No
 
 def _columns(file: Path, opened: Any) -> tuple[dict[str, NDArray], dict[str, Any]]:
     group = opened.get("events")
-    if group is None or not all(key in group for key in "xypt"):
-        raise ConfigError(f"'{file}' has no group 'events' with x, y, p and t: it is not in DSEC's layout")
-    columns = {key: np.asarray(group[key]) for key in "xypt"}
+    names = named_columns(group) if _is_group(group) else None
+    if names is None or any(_is_group(group[key]) for key in names.values()):
+        raise ConfigError(
+            f"'{file}' is not in DSEC's layout, a group 'events' with columns x, y, p and t; "
+            f"it holds {_contents(opened)}"
+        )
+    columns = {key: _held(group[name]) for key, name in names.items()}
 
     def found(name: str) -> NDArray | None:
         for place in (opened, group):
             if name in place:
-                return np.asarray(place[name])
+                return _held(place[name])
         return None
 
-    offset = found("t_offset")
-    said = group.attrs
+    offset, index, said = found("t_offset"), found("ms_to_idx"), group.attrs
     flight = opened.get("flight")
     return columns, {
-        "ms_to_idx": found("ms_to_idx"),
-        "t_offset": 0 if offset is None else int(offset),
-        "size": (int(said["width"]), int(said["height"])) if "width" in said and "height" in said else None,
-        "contrast": float(said["contrast"]) if "contrast" in said else None,
-        "flight": None if flight is None else {key: np.asarray(flight[key]) for key in flight},
+        "ms_to_idx": None if index is None or not index.size else index,
+        "t_offset": 0 if offset is None else whole_number(str(file), "t_offset", offset),
+        "size": (
+            (whole_number(str(file), "width", said["width"]), whole_number(str(file), "height", said["height"]))
+            if "width" in said and "height" in said
+            else None
+        ),
+        "contrast": one_number(str(file), "contrast", said["contrast"]) if "contrast" in said else None,
+        "flight": {key: _held(flight[key]) for key in flight} if _is_group(flight) else None,
     }
+
+
+def _held(place: Any) -> NDArray:
+    """Returns what a data set holds; HDF5 has some that hold nothing, without a shape."""
+    return np.zeros(0) if getattr(place, "shape", ()) is None else np.asarray(place)
+
+
+def _is_group(place: Any) -> bool:
+    return hasattr(place, "keys")
+
+
+def _contents(opened: Any) -> str:
+    """Returns the names of the first data sets in a file, with their shapes and fields."""
+    found: list[str] = []
+
+    def add(name: str, place: Any) -> bool | None:
+        if not _is_group(place):
+            fields = f" of {', '.join(place.dtype.names)}" if place.dtype.names else ""
+            found.append(f"{name} {list(place.shape or ())}{fields}")
+        return True if len(found) == 6 else None
+
+    opened.visititems(add)
+    return "; ".join(found) or "nothing"
 
 
 def _check_index(file: Path, t: NDArray, index: NDArray) -> None:
@@ -81,7 +121,8 @@ def _check_index(file: Path, t: NDArray, index: NDArray) -> None:
     """
     if index.ndim != 1 or index.dtype.kind not in "iu":
         raise ConfigError(f"'{file}' is damaged: its ms_to_idx is no column of whole numbers")
-    wanted = np.searchsorted(t, 1000 * np.arange(index.size))
+    # Where times run back a little, the first event of a millisecond or later is that of the latest time so far.
+    wanted = np.searchsorted(np.maximum.accumulate(t), 1000 * np.arange(index.size))
     wrong = np.flatnonzero(index.astype(np.int64) != wanted)
     wrong = wrong[wrong > 0]  # DSEC begins with 0 whatever comes before
     if wrong.size:

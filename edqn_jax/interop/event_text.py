@@ -1,28 +1,53 @@
 """Recordings as text, one event a line.
 
 What we write begins with `# t_us x y p width=W height=H`. Read are columns that spaces, tabs, commas or semicolons
-separate; comments begin with #. A first line with the names of the columns decides their order, and a unit in the name
-of the time (`t_us`, `t[s]`) that unit. Without one the order is t x y p, as in the event camera dataset of Zurich
-(Mueggler et al. 2017).
+separate; comments begin with # or %. A comment at the beginning, or a first line, with the names of the columns
+decides their order, and a unit in the name of the time (`t_us`, `t[s]`) that unit. Without names the order is t x y p,
+as in the event camera dataset of Zurich (Mueggler et al. 2017), where no other is possible.
 """
 
 from __future__ import annotations
 
+import dataclasses
 import io
 import re
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from edqn_jax.errors import ConfigError
-from edqn_jax.interop.recording import Recording, TimeUnit, recording_of
+from edqn_jax.interop.column_order import ORDER, check_usual_order
+from edqn_jax.interop.recording import COLUMN_NAMES, Recording, TimeUnit, named_columns, recording_of
 
-ORDER = ("t", "x", "y", "p")
+UNITS: dict[str, TimeUnit] = {
+    "s": "s",
+    "sec": "s",
+    "ms": "ms",
+    "us": "us",
+    "\u00b5s": "us",
+    "\u03bcs": "us",
+    "ns": "ns",
+}
+"""As texts write them."""
 
-_NAMES = {"t": "t", "ts": "t", "time": "t", "timestamp": "t", "x": "x", "y": "y", "p": "p", "polarity": "p", "on": "p"}
-_TIME = re.compile(r"(t|ts|time|timestamp)(?:[_\[(](s|ms|us|ns)[\])]?)?")
+_UNIT = "|".join(UNITS)
+_TIME = re.compile(rf"(.*[a-z])(?:_|[\[(])({_UNIT})[\])]?")
 _SIZED = re.compile(r"([xy])@(\d+)")  # as faery writes it
+_SIZE = re.compile(r"(?:geometry|resolution|size)\W*(\d+)\s*[x,;\s]\s*(\d+)")
+_WORDS = {"true": "1", "on": "1", "false": "0", "off": "0"}
+
+
+@dataclasses.dataclass
+class _Said:
+    """What the lines before the events say."""
+
+    lines: int = 0
+    """Number of them."""
+    order: tuple[str, ...] | None = None
+    unit: TimeUnit | None = None
+    size: tuple[int, int] | None = None
 
 
 def read_text(
@@ -34,70 +59,132 @@ def read_text(
         file: to read.
         size: width and height of the image.
         time_unit: of the times.
-        columns: their order, such as `x,y,t,p`; None is what the first line says, or `t,x,y,p`.
+        columns: their order, such as `x,y,t,p`; None is what a line names, or `t,x,y,p`.
 
     Raises:
-        ConfigError: if it is no text of four numbers a line.
+        ConfigError: if it is no text of four numbers a line, or its columns can be read in several orders.
     """
     try:
-        text = file.read_text(encoding="utf-8")
+        text = file.read_text(encoding="utf-8-sig")
     except UnicodeDecodeError:
         raise ConfigError(f"'{file}' is no text: it holds bytes that are not UTF-8") from None
-    lines = text.lstrip("\ufeff").split("\n", 1)
-    names, unit, said = _header(lines[0])
-    body = (
-        text.lstrip("\ufeff") if names is None and not lines[0].startswith("#") else lines[1] if len(lines) > 1 else ""
-    )
-    order = names or ORDER
-    if columns is not None:
-        order = tuple(word.strip() for word in columns.split(","))
-        if sorted(order) != sorted(ORDER):
-            raise ConfigError(f"--columns must be t, x, y and p in some order, not '{columns}'")
-    if not body.strip():
+    given = None if columns is None else tuple(word.strip().lower() for word in columns.split(","))
+    if given is not None and sorted(given) != sorted(ORDER):
+        raise ConfigError(f"--columns must be t, x, y and p in some order, not '{columns}'")
+    lines = text.split("\n")
+    said = _beginning(file, lines, given is not None)
+    body = lines[said.lines :]
+    if not any(_bare(line) for line in body):
         raise ConfigError(f"'{file}' holds no events")
-    # Whole numbers stay whole: the float64 of a time in nanoseconds since 1970 does not hold it.
-    plain = re.sub(r"[,;\t]", " ", body)
-    try:
-        kinds = [(name, np.int64) for name in order]
-        held = np.loadtxt(io.StringIO(plain), dtype=kinds, ndmin=1)
-    except ValueError:
-        try:
-            held = np.loadtxt(io.StringIO(plain), dtype=[(name, np.float64) for name in order], ndmin=1)
-        except ValueError as error:
-            where = re.search(r"row (\d+)", str(error))
-            line = "" if where is None else f", which row {where[1]} does not"
-            raise ConfigError(
-                f"'{file}' is damaged: each line must hold {len(order)} numbers, {', '.join(order)}{line}"
-            ) from None
-    says = None if unit is None or time_unit is not None else f"{unit}, as the first line says"
-    events: Any = held
+    order = given or said.order or ORDER
+    held = _numbers(file, body, order, said.lines)
+    known = "as given" if given else "as a line says" if said.order else "as no line names them"
+    if given is None and said.order is None:
+        check_usual_order(str(file), [held[key] for key in order])
     return recording_of(
         str(file),
-        **{key: events[key] for key in ORDER},
-        size=size or said,
-        time_unit=time_unit or unit,
-        says_unit=says,
+        t=held["t"],
+        x=held["x"],
+        y=held["y"],
+        p=held["p"],
+        size=size or said.size,
+        time_unit=time_unit or said.unit,
+        says_unit=None if said.unit is None or time_unit is not None else f"{said.unit}, as a line says",
+        columns=f"{' '.join(order)}, {known}",
     )
 
 
-def _header(line: str) -> tuple[tuple[str, ...] | None, TimeUnit | None, tuple[int, int] | None]:
-    """Returns the names of the columns, the unit of the times and the size of the image that a first line says."""
-    words = re.split(r"[,;\s]+", line.lstrip("#").strip().lower())
+def _beginning(file: Path, lines: list[str], is_order_given: bool) -> _Said:
+    """Returns what comments, a size and a line of names say before the first event.
+
+    Raises:
+        ConfigError: if the line of names does not name all columns, and their order is not given.
+    """
+    said = _Said()
+    for line in lines:
+        words = [word for word in re.split(r"[,;\s]+", _bare(line)) if word]
+        sides = None if said.size else re.fullmatch(r"(\d+)(?:\s*[x,;]\s*|\s+)(\d+)", _bare(line))
+        is_event = words and not sides and all(_is_number(word) or word.lower() in _WORDS for word in words)
+        if is_event or (words and said.order is not None and said.lines and not sides):
+            break
+        said.lines += 1
+        if sides:
+            said.size = int(sides[1]), int(sides[2])
+            continue
+        _read_header(line, said)
+        if words and said.order is None and not is_order_given:
+            raise ConfigError(
+                f"line {said.lines} of '{file}', '{line.strip()[:60]}', is neither an event nor names t, x, y and p; "
+                "give --columns if the lines after it are events"
+            )
+        if words:
+            break
+    return said
+
+
+def _read_header(line: str, said: _Said) -> None:
+    """Adds to `said` the names of the columns, the unit of the times and the size of the image that a line says."""
+    line = re.sub(rf"\s+([\[(](?:{_UNIT})[\])])", r"\1", line.lower().lstrip("#% !").replace('"', ""))
     names: list[str] = []
     unit, size = None, {}
-    for word in words:
+    for word in re.split(r"[,;\s]+", line.strip()):
         if sized := re.fullmatch(r"(width|height)=(\d+)", word):
             size[sized[1]] = int(sized[2])
         elif sized := _SIZED.fullmatch(word):
             names.append(sized[1])
             size["width" if sized[1] == "x" else "height"] = int(sized[2])
-        elif timed := _TIME.fullmatch(word):
+        elif (timed := _TIME.fullmatch(word)) and COLUMN_NAMES.get(timed[1]) == "t":
             names.append("t")
-            unit = timed[2]
-        elif word in _NAMES:
-            names.append(_NAMES[word])
-    said = (size["width"], size["height"]) if len(size) == 2 else None
-    return (tuple(names) if sorted(names) == sorted(ORDER) else None), unit, said  # type: ignore[return-value]
+            unit = UNITS[timed[2]]
+        elif word in COLUMN_NAMES:
+            names.append(word)
+    if named_columns(names) is not None:
+        said.order, said.unit = tuple(COLUMN_NAMES[word] for word in names), unit
+    if len(size) == 2:
+        said.size = size["width"], size["height"]
+    elif found := _SIZE.search(line):
+        said.size = int(found[1]), int(found[2])
+
+
+def _numbers(file: Path, lines: list[str], order: tuple[str, ...], before: int) -> dict[str, NDArray]:
+    """Returns the columns of the lines.
+
+    Raises:
+        ConfigError: names the first line that does not hold four numbers.
+    """
+    plain = re.sub(r"[,;\t\"]", " ", "\n".join(lines))
+    if re.search(r"[a-df-z]", plain, re.IGNORECASE):  # not the e of 1e6
+        plain = re.sub(r"[a-z]+", lambda word: _WORDS.get(word[0].lower(), word[0]), plain, flags=re.IGNORECASE)
+    # Whole numbers stay whole: the float64 of a time in nanoseconds since 1970 does not hold it.
+    for kind in (np.int64, np.float64):
+        try:
+            held: Any = np.loadtxt(
+                io.StringIO(plain), dtype=[(name, kind) for name in order], ndmin=1, comments=["#", "%"]
+            )
+        except (ValueError, OverflowError):
+            continue
+        return {key: held[key] for key in order}
+    for number, line in enumerate(plain.split("\n")):
+        words = _bare(line).split()
+        if words and (len(words) != len(order) or not all(map(_is_number, words))):
+            raise ConfigError(
+                f"each line of '{file}' must hold {len(order)} numbers, {', '.join(order)}; "
+                f"line {before + number + 1}, '{lines[number].strip()[:60]}', does not"
+            )
+    raise ConfigError(f"each line of '{file}' must hold {len(order)} numbers, {', '.join(order)}")
+
+
+def _bare(line: str) -> str:
+    """Returns a line without quotes and what is a comment."""
+    return re.split("[#%]", line, maxsplit=1)[0].replace('"', "").strip()
+
+
+def _is_number(word: str) -> bool:
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True
 
 
 def text_bytes(recording: Recording) -> bytes:

@@ -8,7 +8,7 @@ plausible; otherwise it is refused with a sentence that names the option to give
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any, Literal
 
 import numpy as np
@@ -31,6 +31,18 @@ PLAUSIBLE_RATE_HZ = (100.0, 3e7)
 EPOCH_SECONDS = (1.0e9, 2.2e9)
 """Seconds since 1970 that a clock shows between 2001 and 2039."""
 
+EPOCH_RATE_HZ = 1.0
+"""Fewest events per second of a recording whose clock counts from 1970: a clock that began with the camera shows the
+same numbers in a finer unit."""
+
+COLUMN_NAMES = {
+    **dict.fromkeys(("t", "ts", "time", "times", "timestamp", "timestamps"), "t"),
+    **dict.fromkeys(("x", "xs"), "x"),
+    **dict.fromkeys(("y", "ys"), "y"),
+    **dict.fromkeys(("p", "ps", "pol", "polarity", "polarities", "on"), "p"),
+}
+"""What files call the columns, in lower case."""
+
 MOST_BACK_US = 1_000_000
 """Furthest that time may go back from one event to the next; events that are less out of order are sorted."""
 
@@ -51,13 +63,22 @@ class Recording:
     """Unit of the times in the file, and how it is known."""
     polarity: str = "-1 and 1"
     """How the file writes OFF and ON."""
+    columns: str = ""
+    """Order of a text's columns, and how it is known; empty where they have names."""
     out_of_order: int = 0
-    """Events that came before an earlier one in the file."""
+    """Events that stand in the file behind a later one."""
+    left_out: int = 0
+    """Events of a camera's file that stand before its first words of time and row, and have none."""
     contrast: float | None = None
     """Change of log brightness that made an event; None where it is not known."""
     flight: Mapping[str, NDArray] | None = None
     """Where the camera was: `t` [T] microseconds, `position` [T, 3], `quaternion` [T, 4], `velocity` [T, 3], `move`
     [T, 3] of the decision that was being flown; None where it is not known."""
+
+    @property
+    def longest_pause_s(self) -> float:
+        """Returns the longest time between an event and the next."""
+        return float(np.diff(self.events["t"]).max()) * 1e-6 if len(self.events) > 1 else 0.0
 
     @property
     def seconds(self) -> float:
@@ -124,16 +145,18 @@ def recording_of(
     Raises:
         ConfigError: if the columns are no events, or can be read in several ways.
     """
+    if size is not None and min(size) < 1:
+        raise ConfigError(f"the image of '{name}' must have at least 1 x 1 pixels, not {size[0]} x {size[1]}")
     columns = {"t": np.asarray(t), "x": np.asarray(x), "y": np.asarray(y), "p": np.asarray(p)}
     lengths = {len(column) if column.ndim == 1 else -1 for column in columns.values()}
     if len(lengths) != 1 or -1 in lengths:
         shapes = ", ".join(f"{key} {list(column.shape)}" for key, column in columns.items())
-        raise ConfigError(f"'{name}' is damaged: t, x, y and p must be columns of one length, not {shapes}")
+        raise ConfigError(f"t, x, y and p of '{name}' must be columns of one length, not {shapes}")
     if not len(columns["t"]):
         raise ConfigError(f"'{name}' holds no events")
     for key, column in columns.items():
         if column.dtype.kind not in "biuf" or not np.all(np.isfinite(column)):
-            raise ConfigError(f"'{name}' is damaged: its column {key} is not all finite numbers")
+            raise ConfigError(f"the column {key} of '{name}' is not all finite numbers")
     for key, limit in (("x", size and size[0]), ("y", size and size[1])):
         _check_pixels(name, key, columns[key], limit)
     unit = time_unit or found_unit(name, columns["t"])
@@ -147,7 +170,8 @@ def recording_of(
         events,
         width,
         height,
-        time_unit=known.pop("says_unit", None) or f"{unit}, {'as given' if time_unit else 'the only plausible unit'}",
+        time_unit=known.pop("says_unit", None)
+        or f"{unit}, {'as given' if time_unit else 'assumed from length, rate and resolution'}",
         polarity=polarity,
         out_of_order=out_of_order,
         **known,
@@ -160,23 +184,65 @@ def found_unit(name: str, t: NDArray) -> TimeUnit:
     Raises:
         ConfigError: if there is none, or more than one.
     """
-    first, length = float(t[0]), float(t.max() - t.min())
+    first, length = float(t[0]), float(t.max()) - float(t.min())
     whole = bool(np.all(t == np.floor(t)))
-    for unit, factor in MICROSECONDS.items():
-        if EPOCH_SECONDS[0] <= first * factor * 1e-6 <= EPOCH_SECONDS[1] and (unit == "s" or first > 1e11):
-            return unit
+    since_1970: list[TimeUnit] = []
     found: list[TimeUnit] = []
     for unit, factor in MICROSECONDS.items():
+        if unit == ("s" if whole else "ns"):  # such times would all lie on whole seconds, or within a nanosecond
+            continue
         seconds = length * factor * 1e-6
         rate = len(t) / seconds if seconds > 0.0 else np.inf
-        fine = unit != "s" if whole else unit in ("s", "ms")
-        plausible = PLAUSIBLE_SECONDS[0] <= seconds <= PLAUSIBLE_SECONDS[1]
-        if plausible and fine and PLAUSIBLE_RATE_HZ[0] <= rate <= PLAUSIBLE_RATE_HZ[1]:
-            found.append(unit)
+        if EPOCH_SECONDS[0] <= first * factor * 1e-6 <= EPOCH_SECONDS[1]:
+            if seconds <= PLAUSIBLE_SECONDS[1] and rate >= EPOCH_RATE_HZ:
+                since_1970.append(unit)
+        if PLAUSIBLE_SECONDS[0] <= seconds <= PLAUSIBLE_SECONDS[1]:
+            if PLAUSIBLE_RATE_HZ[0] <= rate <= PLAUSIBLE_RATE_HZ[1]:
+                found.append(unit)
+    found = since_1970 or found
     if len(found) == 1:
         return found[0]
     which = f"which may be {' or '.join(found)}" if found else "and in none of them it is a plausible recording"
     raise ConfigError(f"'{name}' does not say the unit of its times, {which}; give --time-unit s, ms, us or ns")
+
+
+def named_columns(names: Iterable[str]) -> dict[str, str] | None:
+    """Returns which of the names is that of t, x, y and p; None unless there is one of each."""
+    found: dict[str, str] = {}
+    for name in names:
+        key = COLUMN_NAMES.get(name.lower())
+        if key in found:
+            return None
+        if key is not None:
+            found[key] = name
+    return found if len(found) == len("txyp") else None
+
+
+def one_number(name: str, key: str, value: ArrayLike) -> float | int:
+    """Returns the number that a file has under a key, be it by itself or as an array of one.
+
+    Raises:
+        ConfigError: if it is none.
+    """
+    held = np.asarray(value)
+    if held.size != 1 or held.dtype.kind not in "iuf" or not np.isfinite(held).all():
+        word = held.reshape(-1)[0] if held.size == 1 else None
+        text = word.decode("latin-1") if isinstance(word, bytes) else str(word)
+        said = f"an array {list(held.shape)}" if held.size != 1 else f"'{text}'"
+        raise ConfigError(f"the {key} of '{name}' must be one number, not {said}")
+    return held.reshape(-1)[0].item()
+
+
+def whole_number(name: str, key: str, value: ArrayLike) -> int:
+    """Returns the whole number that a file has under a key.
+
+    Raises:
+        ConfigError: if it is none.
+    """
+    number = one_number(name, key, value)
+    if number != int(number):
+        raise ConfigError(f"the {key} of '{name}' must be a whole number, not {number:g}")
+    return int(number)
 
 
 def signs(name: str, p: NDArray) -> tuple[NDArray[np.int8], str]:
@@ -218,18 +284,18 @@ def _microseconds(name: str, t: NDArray, unit: TimeUnit) -> NDArray[np.int64]:
 
 
 def _in_order(name: str, events: NDArray) -> tuple[NDArray, int]:
-    """Returns the events sorted by time, and how many were not.
+    """Returns the events sorted by time, and how many stood behind a later one.
 
     Raises:
         ConfigError: if time goes back so far that they are not one recording.
     """
-    back = -np.diff(events["t"])
-    if not back.size or back.max() <= 0:
-        return events, 0
-    if back.max() > MOST_BACK_US:
-        where = int(back.argmax()) + 1
+    back = np.maximum.accumulate(events["t"]) - events["t"]
+    furthest = int(back.argmax())
+    if back[furthest] > MOST_BACK_US:
         raise ConfigError(
-            f"time goes back by {back.max() * 1e-6:g} s at event {where:,} of '{name}': it is damaged, or several "
-            "recordings in one file"
+            f"time goes back by {back[furthest] * 1e-6:g} s at event {furthest:,} of '{name}': it is damaged, or "
+            "several recordings in one file"
         )
-    return events[np.argsort(events["t"], kind="stable")], int(np.count_nonzero(back > 0))
+    if not back[furthest]:
+        return events, 0
+    return events[np.argsort(events["t"], kind="stable")], int(np.count_nonzero(back))

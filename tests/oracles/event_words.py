@@ -1,4 +1,4 @@
-"""Prophesee's EVT2 and EVT3 written word by word, after their published descriptions; slow and obvious."""
+"""Prophesee's EVT2, EVT3 and DAT written word by word, after their published descriptions; slow and obvious."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def evt3(events: np.ndarray, width: int, height: int) -> bytes:
     words, high, low, row = [], -1, -1, -1
     for t, x, y, p in events.tolist():
         if t >> 12 != high:
-            high = t >> 12
+            high, low = t >> 12, -1  # Prophesee's decoder begins with lower bits of 0 here
             words.append(EVT3_TIME_HIGH << 12 | high)
         if t & 4095 != low:
             low = t & 4095
@@ -40,3 +40,9 @@ def evt3(events: np.ndarray, width: int, height: int) -> bytes:
         words.append(EVT3_X << 12 | (p > 0) << 11 | x)
     header = f"% evt 3.0\n% format EVT3;height={height};width={width}\n% geometry {width}x{height}\n% end\n"
     return header.encode() + struct.pack(f"<{len(words)}H", *words)
+
+
+def dat(events: np.ndarray, header: bytes, kind: int = 12) -> bytes:
+    """Returns a `.dat`: two bytes of kind and length, then 32 bits of time and 32 of pixel and polarity an event."""
+    rows = b"".join(struct.pack("<II", t, x | y << 14 | (p > 0) << 28) for t, x, y, p in events.tolist())
+    return header + bytes([kind, 8]) + rows
