@@ -22,6 +22,7 @@ from jax.typing import ArrayLike
 from edqn_jax.config import FAMILIES, Config
 from edqn_jax.config.loading import make_config
 from edqn_jax.errors import ConfigError
+from edqn_jax.parallel.forks import check_not_forked
 from edqn_jax.sim import camera, drone, env, events, group, sensor
 from edqn_jax.sim.drone import Flight
 from edqn_jax.sim.env import EnvState, Observation, Step, World
@@ -66,6 +67,7 @@ class Environment:
             key: a typed JAX key, consumed, or a seed.
             mission: [] int, which one; None draws one.
         """
+        check_not_forked()
         key = jax.random.key(key) if isinstance(key, int) else key
         return _reset(self.config, self.world, key, None if mission is None else jnp.asarray(mission, jnp.int32))
 
@@ -80,6 +82,7 @@ class Environment:
         Raises:
             ConfigError: if there is no such move.
         """
+        check_not_forked()
         return _step(self.config, self.world, state, move_number(move))
 
     def events(self, observation: Observation) -> np.ndarray:
@@ -166,9 +169,10 @@ def make(
         reward: of every decision, in place of the configured one: a function of a `Transition`.
 
     Raises:
-        ConfigError: if there is no such world, the drone does not fit at its start or goal, or several drones are
-            configured.
+        ConfigError: if there is no such world, the drone does not fit at its start or goal, several drones are
+            configured, or the process was forked after JAX had been used.
     """
+    check_not_forked()
     name = str(world) if world is not None else (config or Config()).world.name
     config = make_config(name) if config is None else config
     group.check_alone(config, "edqn_jax.make")
