@@ -15,6 +15,7 @@ from edqn_jax.evaluation.metrics import shortest_paths, summarise
 from edqn_jax.evaluation.missions import MissionSet, Point, load_missions
 from edqn_jax.evaluation.rollouts import fly_on_all_devices
 from edqn_jax.learn.policy import Policy
+from edqn_jax.parallel.forks import check_not_forked
 from edqn_jax.sim.flights import Flights
 from edqn_jax.sim.outcomes import Outcome
 from edqn_jax.sim.sensor import Form, sensor_of
@@ -84,6 +85,7 @@ def evaluate(
         ConfigError: if there is no such world or condition, the missions cannot be flown, or there is nothing to
             shuffle.
     """
+    check_not_forked()
     config = flown_under(policy.config, conditions or {}, "evaluate")
     if shuffle_codes:
         _check_can_shuffle(policy, missions)

@@ -16,22 +16,32 @@ import dataclasses
 import functools
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, TypedDict, Unpack
+from typing import Any, ClassVar, TypedDict, Unpack
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from flax import struct
 from jax import Array
 from numpy.typing import NDArray
 
 from edqn_jax.config import Config
 from edqn_jax.errors import ConfigError
 from edqn_jax.interop import functional
-from edqn_jax.interop.functional import Box, FunctionalEnv, Kind, Params, State
+from edqn_jax.interop.drone_programs import (
+    Drone,
+    Leaves,
+    Program,
+    reset_many,
+    reset_one,
+    reset_some,
+    step_many,
+    step_one,
+)
+from edqn_jax.interop.functional import Box, FunctionalEnv, Kind, Params
 from edqn_jax.learn.code import Params as EncoderParams
 from edqn_jax.learn.policy import Policy
 from edqn_jax.packages import require
+from edqn_jax.parallel.forks import check_not_forked, lacks_threads
 from edqn_jax.sim.env import EnvState
 from edqn_jax.sim.environment import Environment
 from edqn_jax.sim.moves import ACTIONS
@@ -47,92 +57,13 @@ RESET_TOGETHER = 16
 """Drones that one call of the program resets in the step in which they ended; more of them take several calls."""
 
 
-@struct.dataclass
-class Drone:
-    """One drone between two decisions."""
-
-    state: EnvState  # without its key
-    key: Array  # [2] uint32, the data of that key
-    code: Array  # [C] of the newest observation, for an encoder that remembers it; [0] where there is none
-
-
-@struct.dataclass
-class _Decided:
-    """What a decision comes to, as Gymnasium wants it; of many drones with a leading [N]."""
-
-    observed: Any
-    reward: Array
-    outcome: Array
-    terminated: Array
-    truncated: Array
-
-
-@dataclasses.dataclass(frozen=True)
-class _Program:
-    """What a compiled program depends on, beside its arrays."""
-
-    env: FunctionalEnv
-    world: Any  # structure of a `World`
-
-
-Leaves = list[Array]
-"""Arrays of a `World`. JAX calls a compiled function in a quarter less time where no argument is a typed key or an
-object whose fields it has to ask for in Python; so worlds go in as lists, and keys as their data."""
-
-
-def _held(state: State) -> Drone:
-    flight = state.flight
-    return Drone(dataclasses.replace(flight, key=None), jax.random.key_data(flight.key), state.code)
-
-
-def _reset(
-    program: _Program, leaves: Leaves, encoder: EncoderParams, seed: Array, mission: Array | None
-) -> tuple[Drone, Any]:
-    observed, state = program.env.reset(jax.random.key(seed), _params(program, leaves, encoder), mission)
-    return _held(state), observed
-
-
-def _step(
-    program: _Program, leaves: Leaves, encoder: EncoderParams, drone: Drone, action: Array
-) -> tuple[Drone, _Decided]:
-    key = jax.random.wrap_key_data(drone.key)
-    params, state = _params(program, leaves, encoder), State(dataclasses.replace(drone.state, key=key), drone.code)
-    observed, state, reward, terminated, truncated, info = program.env.step(key, state, action, params)
-    return _held(state), _Decided(observed, reward, info["outcome"], terminated, truncated)
-
-
-def _params(program: _Program, leaves: Leaves, encoder: EncoderParams) -> Params:
-    return Params(jax.tree.unflatten(program.world, leaves), encoder)
-
-
-_reset_one = jax.jit(_reset, static_argnums=0)
-_step_one = jax.jit(_step, static_argnums=0)
-
-
-@functools.partial(jax.jit, static_argnums=0)
-def _reset_many(program: _Program, leaves: Leaves, encoder: EncoderParams, seeds: Array, missions: Array | None):
-    return jax.vmap(lambda seed, mission: _reset(program, leaves, encoder, seed, mission))(seeds, missions)
-
-
-@functools.partial(jax.jit, static_argnums=0, donate_argnums=3)
-def _step_many(program: _Program, leaves: Leaves, encoder: EncoderParams, drones: Drone, actions: Array):
-    return jax.vmap(lambda drone, action: _step(program, leaves, encoder, drone, action))(drones, actions)
-
-
-@functools.partial(jax.jit, static_argnums=0, donate_argnums=3)
-def _reset_some(program: _Program, leaves: Leaves, encoder: EncoderParams, drones: Drone, numbers: Array):
-    """Resets the ended drones of these numbers [K] and returns their observations; other numbers stand for none."""
-    ended = jax.tree.map(lambda x: x.at[numbers].get(mode="clip"), drones)
-    fresh, decided = jax.vmap(lambda drone: _step(program, leaves, encoder, drone, jnp.zeros((), jnp.int32)))(ended)
-    return jax.tree.map(lambda x, y: x.at[numbers].set(y, mode="drop"), drones, fresh), decided.observed
-
-
 @dataclasses.dataclass(frozen=True, eq=False)
 class _Task:
     """What one environment and many have in common."""
 
     env: FunctionalEnv
     params: Params
+    limit: int | None = None
 
     @property
     def config(self) -> Config:
@@ -143,10 +74,10 @@ class _Task:
         return Environment(self.config, self.params.world)
 
     @functools.cached_property
-    def program(self) -> tuple[_Program, Leaves, EncoderParams]:
+    def program(self) -> tuple[Program, Leaves, EncoderParams]:
         """Returns the first arguments of every compiled function."""
         leaves, structure = jax.tree.flatten(self.params.world)
-        return _Program(self.env, structure), leaves, self.params.encoder
+        return Program(self.env, structure, self.limit), leaves, self.params.encoder
 
     @property
     def observations(self) -> Any:
@@ -204,13 +135,15 @@ class TaskOptions(TypedDict, total=False):
     """Of every decision, in place of the configured one: a function of a `Transition`."""
 
 
-def _task(world: str | Path | None, config: Config | None, **options: Unpack[TaskOptions]) -> _Task:
+def _task(
+    world: str | Path | None, config: Config | None, limit: int | None = None, **options: Unpack[TaskOptions]
+) -> _Task:
     """Returns the task of these arguments, which are those of `DroneEnv`.
 
     Raises:
         ConfigError: if they do not fit each other, or the world cannot be flown.
     """
-    return _Task(*functional.make(world, config, **options))
+    return _Task(*functional.make(world, config, **options), limit)
 
 
 class DroneEnv(gymnasium.Env):
@@ -227,6 +160,8 @@ class DroneEnv(gymnasium.Env):
     """
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 4}
+    spaces_before: ClassVar[tuple[Any, Any] | None] = None
+    """Spaces of observations and moves of the environment that was made last."""
 
     def __init__(
         self,
@@ -237,11 +172,16 @@ class DroneEnv(gymnasium.Env):
         **options: Unpack[TaskOptions],
     ) -> None:
         _check_render_mode(render_mode)
-        self.task = _task(world, config, **options)
         self.render_mode = render_mode
+        self.drone: Drone | None = None
+        if lacks_threads() and DroneEnv.spaces_before is not None:
+            # AsyncVectorEnv hands on what reset raises in a process, and not what making raises there.
+            self.observation_space, self.action_space = DroneEnv.spaces_before
+            return
+        self.task = _task(world, config, **options)
         self.observation_space = self.task.observations
         self.action_space = gymnasium.spaces.Discrete(len(ACTIONS))
-        self.drone: Drone | None = None
+        DroneEnv.spaces_before = self.observation_space, self.action_space
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Begins an episode: at rest at the start of a mission, facing its goal.
@@ -254,12 +194,13 @@ class DroneEnv(gymnasium.Env):
             the first observation, and an empty info.
 
         Raises:
-            ConfigError: if there is no such option or mission.
+            ConfigError: if there is no such option or mission, or the process was forked after JAX had been used.
         """
+        check_not_forked()
         mission = self.task.mission(options, None)
         super().reset(seed=seed)
         number = self.np_random.integers(SEEDS) if seed is None else seed % SEEDS
-        self.drone, observed = _reset_one(*self.task.program, np.uint32(number), mission)
+        self.drone, observed = reset_one(*self.task.program, np.uint32(number), mission)
         return _on_host(observed), {}
 
     def step(self, action: int) -> tuple[Any, float, bool, bool, dict[str, Any]]:
@@ -276,11 +217,12 @@ class DroneEnv(gymnasium.Env):
             gymnasium.error.ResetNeeded: before the first reset, and after an episode has ended.
             gymnasium.error.InvalidAction: if there is no such move.
         """
+        check_not_forked()
         if self.drone is None or self.drone.state.ended:
             raise gymnasium.error.ResetNeeded("there is no episode to step in; call reset first")
         if not self.action_space.contains(action):
             raise gymnasium.error.InvalidAction(f"a move must be a whole number from 0 to {len(ACTIONS) - 1}")
-        self.drone, decided = _step_one(*self.task.program, self.drone, np.int32(action))
+        self.drone, decided = step_one(*self.task.program, self.drone, np.int32(action))
         decided = _on_host(decided)
         outcome = Outcome(int(decided.outcome))
         info = {"outcome": outcome.name.lower(), "is_success": outcome is Outcome.GOAL}
@@ -310,6 +252,9 @@ class DroneVectorEnv(gymnasium.vector.VectorEnv):
     Args:
         num_envs: how many drones.
         autoreset_mode: `NEXT_STEP` or `SAME_STEP`, or their values as words.
+        max_episode_steps: decisions after which an episode is truncated, as `gymnasium.make` has it: its outcome stays
+            `RUNNING`, and the task's own time-out stays; None or -1 is no such limit.
+        disable_env_checker: for `gymnasium.make`, which has it; a vector is not checked at every step in any case.
         others: as in `DroneEnv`.
 
     Raises:
@@ -326,13 +271,16 @@ class DroneVectorEnv(gymnasium.vector.VectorEnv):
         *,
         render_mode: str | None = None,
         autoreset_mode: Any = gymnasium.vector.AutoresetMode.NEXT_STEP,
+        max_episode_steps: int | None = None,
+        disable_env_checker: bool | None = None,
         **options: Unpack[TaskOptions],
     ) -> None:
         if num_envs < 1:
             raise ConfigError(f"num_envs must be at least 1, not {num_envs}")
         _check_render_mode(render_mode)
+        limit = _limit(max_episode_steps)
         self.metadata = {**self.metadata, "autoreset_mode": _autoreset_mode(autoreset_mode)}
-        self.task = _task(world, config, **options)
+        self.task = _task(world, config, limit, **options)
         self.num_envs = num_envs
         self.render_mode = render_mode
         self.single_observation_space = self.task.observations
@@ -355,13 +303,15 @@ class DroneVectorEnv(gymnasium.vector.VectorEnv):
             the first observations, and an empty info.
 
         Raises:
-            ConfigError: if there is no such option or mission, or not one seed for each drone.
+            ConfigError: if there is no such option or mission, or not one seed for each drone, or the process was
+                forked after JAX had been used.
         """
+        check_not_forked()
         missions, each = self.task.mission(options, self.num_envs), self._each(seed)
         if each is not None:
             super().reset(seed=each[0])
         numbers = self.np_random.integers(SEEDS, size=self.num_envs) if each is None else [one % SEEDS for one in each]
-        self.drones, observed = _reset_many(*self.task.program, np.asarray(numbers, np.uint32), missions)
+        self.drones, observed = reset_many(*self.task.program, np.asarray(numbers, np.uint32), missions)
         return _on_host(observed), {}
 
     def _each(self, seed: int | Sequence[int] | None) -> list[int] | None:
@@ -396,6 +346,7 @@ class DroneVectorEnv(gymnasium.vector.VectorEnv):
             gymnasium.error.ResetNeeded: before the first reset.
             gymnasium.error.InvalidAction: if an action is no move.
         """
+        check_not_forked()
         if self.drones is None:
             raise gymnasium.error.ResetNeeded("there are no episodes to step in; call reset first")
         moves = np.asarray(actions)
@@ -404,7 +355,7 @@ class DroneVectorEnv(gymnasium.vector.VectorEnv):
             raise gymnasium.error.InvalidAction(
                 f"moves must be {self.num_envs} whole numbers from 0 to {len(ACTIONS) - 1}"
             )
-        self.drones, decided = _step_many(*self.task.program, self.drones, moves.astype(np.int32))
+        self.drones, decided = step_many(*self.task.program, self.drones, moves.astype(np.int32))
         decided = _on_host(decided)
         ended = decided.terminated | decided.truncated
         info: dict[str, Any] = {}
@@ -430,7 +381,7 @@ class DroneVectorEnv(gymnasium.vector.VectorEnv):
             some = ended[first : first + slots]
             numbers = np.full(slots, self.num_envs, np.int32)  # which is no drone's
             numbers[: len(some)] = some
-            self.drones, fresh = _reset_some(*self.task.program, self.drones, numbers)
+            self.drones, fresh = reset_some(*self.task.program, self.drones, numbers)
             for rows, new in zip(jax.tree.leaves(observed), jax.tree.leaves(fresh), strict=True):
                 rows[some] = np.asarray(new)[: len(some)]
         return final
@@ -455,6 +406,15 @@ class DroneVectorEnv(gymnasium.vector.VectorEnv):
 def _check_render_mode(mode: str | None) -> None:
     if mode not in (None, "rgb_array"):
         raise ConfigError(f"render_mode must be 'rgb_array' or None, not '{mode}'")
+
+
+def _limit(steps: int | None) -> int | None:
+    """Returns a limit of decisions as `gymnasium.make` takes it, where -1 is none."""
+    if steps is None or steps == -1:
+        return None
+    if isinstance(steps, bool) or not isinstance(steps, int | np.integer) or steps < 1:
+        raise ConfigError(f"max_episode_steps must be a whole number of at least 1, or -1 for no limit, not {steps!r}")
+    return int(steps)
 
 
 def _autoreset_mode(mode: Any) -> Any:

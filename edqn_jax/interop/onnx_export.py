@@ -35,7 +35,7 @@ RUNNER = "edqn_runner.py"
 INPUTS, OUTPUTS = ("counts", "own", "motion", "memory"), ("values", "memory_after")
 
 OPSET, IR_VERSION = 18, 8
-"""The oldest that this network can be written in, so that older versions of onnxruntime read it."""
+"""The oldest that this network can be written in, so that onnxruntime reads it from `runner.OLDEST_ONNXRUNTIME` on."""
 
 TOLERANCE = 1e-5
 """Largest difference between a value of the Q-network in JAX and in ONNX, of the largest value where that exceeds 1."""
@@ -191,6 +191,7 @@ def field_of(config: Config, counts: Array) -> EventField:
     """Returns the event field [..., F, H, W] of counts [..., F, 2, H, W] of ON and OFF events.
 
     Of a policy that was trained with noise it is [..., 2 F, H, W]: ON and OFF apart. Times are those of Eq. 5.
+    Polarities are int32.
     """
     on, off = counts[..., 0, :, :], counts[..., 1, :, :]
     if events.has_noise(config.events):
@@ -208,7 +209,7 @@ def field_of(config: Config, counts: Array) -> EventField:
     )
     return EventField(
         count=count,
-        polarity=sign.astype(jnp.int8),
+        polarity=sign,  # int32: onnxruntime compares int8 from 1.21 on only
         t_first=first,
         t_step=step,
         window_s=float(edges[-1]),

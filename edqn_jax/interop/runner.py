@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -26,6 +27,9 @@ METADATA = "edqn_jax"
 
 FORMAT = 1
 """Number of the form of an exported policy that this file reads."""
+
+OLDEST_ONNXRUNTIME = (1, 14)
+"""The oldest version of onnxruntime that runs the operators of exported policies."""
 
 FIELDS = ("t", "x", "y", "p")
 """Fields of a packet of events: microseconds, column, row, polarity in {-1, 1}."""
@@ -79,9 +83,7 @@ class Runner:
         try:
             session = onnxruntime.InferenceSession(path.read_bytes(), options, ["CPUExecutionProvider"])
         except Exception as error:
-            raise ValueError(
-                f"'{path}' is not an ONNX file that onnxruntime {onnxruntime.__version__} reads"
-            ) from error
+            raise ValueError(_why_not(path, error, onnxruntime.__version__)) from error
         self._session: Any = session
         self.about = _about(self._session.get_modelmeta().custom_metadata_map, path)
         """What the policy expects, as `edqn export` wrote it."""
@@ -352,6 +354,17 @@ def _ahead(about: Mapping[str, Any], yaw: np.float32, velocity: NDArray[np.float
     vx, vy, vz = velocity / np.float32(about["speed_m_s"])
     cos, sin = np.cos(yaw), np.sin(yaw)
     return np.stack([cos * vx + sin * vy, cos * vy - sin * vx, vz])
+
+
+def _why_not(file: Path, error: Exception, version: str) -> str:
+    """Returns why onnxruntime of a version did not load a file, in a sentence."""
+    reason = " ".join(str(error).split())
+    if type(error).__name__ == "InvalidProtobuf" or "No graph was found" in reason:
+        return f"'{file}' is not an ONNX file"
+    oldest = ".".join(map(str, OLDEST_ONNXRUNTIME))
+    if tuple(int(part) for part in re.findall(r"\d+", version)[:2]) < OLDEST_ONNXRUNTIME:
+        return f"onnxruntime {version} is too old for exported policies; install {oldest} or newer to fly '{file}'"
+    return f"onnxruntime {version} cannot run '{file}'; export it again, or install a newer version: {reason}"
 
 
 def _about(metadata: Mapping[str, str], file: Path) -> dict[str, Any]:

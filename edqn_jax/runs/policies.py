@@ -13,6 +13,7 @@ from edqn_jax.config.limits import validate
 from edqn_jax.config.loading import apply, load_layer
 from edqn_jax.errors import ConfigError
 from edqn_jax.learn.policy import Policy, PolicyParams, fresh_policy
+from edqn_jax.parallel.forks import check_not_forked
 from edqn_jax.policies import no_run, policy_folder
 from edqn_jax.runs import manifest, world_copy
 from edqn_jax.runs.checkpoints import load_params, save_params, saved_at
@@ -53,8 +54,10 @@ def load_run(folder: Path) -> tuple[Config, PolicyParams]:
         folder: of the run, or the name of a policy that comes with the package.
 
     Raises:
-        ConfigError: if there is none, or its parts are incomplete, do not match, or do not fit this version.
+        ConfigError: if there is none, or its parts are incomplete, do not match, or do not fit this version, or
+            the process was forked after JAX had been used.
     """
+    check_not_forked()
     folder = policy_folder(folder)
     file = folder / "config.yaml"
     if not file.is_file():

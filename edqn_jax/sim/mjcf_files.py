@@ -1,17 +1,18 @@
 """The text of an MJCF world, checked before MuJoCo reads it.
 
 A world may come from a stranger, so it is one file that names no other, and it declares nothing that takes much memory.
-MuJoCo is given the text that was checked, never a path.
+MuJoCo is given what was checked, written anew, never a path: so nothing is read in two ways.
 """
 
 from __future__ import annotations
 
+import codecs
 import math
-import re
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 
 from edqn_jax.errors import ConfigError
+from edqn_jax.sim import mjcf_xml
 
 MOST_BYTES = 20_000_000
 """Of a world's file."""
@@ -31,7 +32,7 @@ class SceneError(ConfigError):
 
 
 def checked_text(path: Path) -> str:
-    """Returns the text of a world's file.
+    """Returns the text of a world's file as XML of its elements alone.
 
     Raises:
         SceneError: if there is no such file, it is too large or no XML, or it asks for what a world may not have.
@@ -40,21 +41,23 @@ def checked_text(path: Path) -> str:
         size = path.stat().st_size
         if size > MOST_BYTES:
             raise SceneError(f"'{path}' has {size:,} bytes; a world may have {MOST_BYTES:,}")
-        text = path.read_bytes().decode()
-    except UnicodeDecodeError:
-        raise SceneError(f"{path} is not an MJCF that MuJoCo can read: it is not UTF-8 text") from None
+        content = path.read_bytes()
     except (OSError, RuntimeError) as error:
         raise SceneError(f"cannot read the world '{path}': {getattr(error, 'strerror', None) or error}") from None
-    if re.search(r"<!(?!--)", text):  # parsers differ in what a declaration is
-        raise SceneError(f"{path} has a <!DOCTYPE> or another declaration; a world needs none")
+    if content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)) or b"\0" in content[:4]:
+        raise SceneError(f"{path} is not an MJCF that MuJoCo can read: it is UTF-16 or UTF-32 text; save it as UTF-8")
     try:
-        tree = ElementTree.fromstring(text)
-    except (ElementTree.ParseError, ValueError) as error:
+        text = content.decode()
+    except UnicodeDecodeError:
+        text = content.decode("latin-1")  # MuJoCo asks no name for its encoding
+    try:
+        tree, text = mjcf_xml.parse(text)
+    except mjcf_xml.SubsetError:
+        raise SceneError(f"{path} has a <!DOCTYPE> that declares something; a world needs none") from None
+    except mjcf_xml.MarkupError as error:
         raise SceneError(f"{path} is not an MJCF that MuJoCo can read: {error}") from None
-    except RecursionError:
-        raise SceneError(f"{path} is nested too deeply for a world") from None
     if tree.tag != "mujoco":
-        raise SceneError(f"{path} is not an MJCF that MuJoCo can read: it begins with <{tree.tag}>, not <mujoco>")
+        raise SceneError(f"{path} is not an MJCF: it begins with <{tree.tag}>, not <mujoco>")
     _check_elements(tree, path)
     _check_copies(tree, path)
     return text

@@ -22,6 +22,7 @@ from edqn_jax.learn.policy import PolicyParams, fresh_policy
 from edqn_jax.learn.trainer import Trainer, TrainState
 from edqn_jax.parallel import processes
 from edqn_jax.parallel.devices import choose_devices
+from edqn_jax.parallel.forks import check_not_forked
 from edqn_jax.planners.astar import Path as ShortestPath
 from edqn_jax.planners.astar import shortest_path
 from edqn_jax.random import run_streams
@@ -154,8 +155,10 @@ def prepared(
         agents: how many are trained in one program; None is one, compiled as such.
 
     Raises:
-        ConfigError: if the configuration is invalid or the world cannot be flown.
+        ConfigError: if the configuration is invalid or the world cannot be flown, or the process was forked after JAX
+            had been used.
     """
+    check_not_forked()
     pool = ThreadPoolExecutor(max_workers=2, thread_name_prefix="compiling")
     try:
         yield Preparation(config, reward, display or Silent(), pool, agents)
