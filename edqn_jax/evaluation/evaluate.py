@@ -15,6 +15,7 @@ from edqn_jax.evaluation.metrics import shortest_paths, summarise
 from edqn_jax.evaluation.missions import MissionSet, Point, load_missions
 from edqn_jax.evaluation.rollouts import fly_on_all_devices
 from edqn_jax.learn.policy import Policy
+from edqn_jax.parallel.jax_settings import as_tested
 from edqn_jax.sim.flights import Flights
 from edqn_jax.sim.outcomes import Outcome
 from edqn_jax.sim.sensor import Form, sensor_of
@@ -52,6 +53,7 @@ class Evaluation:
         return np.asarray(self.flights.record.position[mission])[: int(self.flights.physics_steps[mission])]
 
 
+@as_tested
 def evaluate(
     policy: Policy,
     world: str | Path | None = None,

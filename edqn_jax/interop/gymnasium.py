@@ -32,6 +32,7 @@ from edqn_jax.interop.functional import Box, FunctionalEnv, Kind, Params, State
 from edqn_jax.learn.code import Params as EncoderParams
 from edqn_jax.learn.policy import Policy
 from edqn_jax.packages import require
+from edqn_jax.parallel.jax_settings import as_tested
 from edqn_jax.sim.env import EnvState
 from edqn_jax.sim.environment import Environment
 from edqn_jax.sim.moves import ACTIONS
@@ -228,6 +229,7 @@ class DroneEnv(gymnasium.Env):
 
     metadata = {"render_modes": ["rgb_array"], "render_fps": 4}
 
+    @as_tested
     def __init__(
         self,
         world: str | Path | None = None,
@@ -243,6 +245,7 @@ class DroneEnv(gymnasium.Env):
         self.action_space = gymnasium.spaces.Discrete(len(ACTIONS))
         self.drone: Drone | None = None
 
+    @as_tested
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Begins an episode: at rest at the start of a mission, facing its goal.
 
@@ -262,6 +265,7 @@ class DroneEnv(gymnasium.Env):
         self.drone, observed = _reset_one(*self.task.program, np.uint32(number), mission)
         return _on_host(observed), {}
 
+    @as_tested
     def step(self, action: int) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Flies one decision of 0.26 s.
 
@@ -286,6 +290,7 @@ class DroneEnv(gymnasium.Env):
         info = {"outcome": outcome.name.lower(), "is_success": outcome is Outcome.GOAL}
         return decided.observed, float(decided.reward), bool(decided.terminated), bool(decided.truncated), info
 
+    @as_tested
     def render(self) -> NDArray[np.uint8] | None:
         """Returns what a person would see from the drone's camera, [192, 256, 3]; None without a render mode.
 
@@ -318,6 +323,7 @@ class DroneVectorEnv(gymnasium.vector.VectorEnv):
 
     metadata = {**DroneEnv.metadata, "autoreset_mode": gymnasium.vector.AutoresetMode.NEXT_STEP}
 
+    @as_tested
     def __init__(
         self,
         num_envs: int = 1,
@@ -342,6 +348,7 @@ class DroneVectorEnv(gymnasium.vector.VectorEnv):
         self.action_space = batch(self.single_action_space, num_envs)
         self.drones: Drone | None = None
 
+    @as_tested
     def reset(
         self, *, seed: int | Sequence[int] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
@@ -380,6 +387,7 @@ class DroneVectorEnv(gymnasium.vector.VectorEnv):
             raise ConfigError(f"seeds must be whole numbers of at least 0, not {list(seed)}")
         return [int(one) for one in seed]
 
+    @as_tested
     def step(self, actions: NDArray[np.integer]) -> tuple[Any, NDArray, NDArray, NDArray, dict[str, Any]]:
         """Flies one decision of every drone, or resets it.
 
@@ -435,6 +443,7 @@ class DroneVectorEnv(gymnasium.vector.VectorEnv):
                 rows[some] = np.asarray(new)[: len(some)]
         return final
 
+    @as_tested
     def render(self) -> tuple[NDArray[np.uint8], ...] | None:
         """Returns what a person would see from each drone's camera, [192, 256, 3]; None without a render mode.
 

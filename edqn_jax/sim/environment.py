@@ -22,6 +22,7 @@ from jax.typing import ArrayLike
 from edqn_jax.config import FAMILIES, Config
 from edqn_jax.config.loading import make_config
 from edqn_jax.errors import ConfigError
+from edqn_jax.parallel.jax_settings import as_tested
 from edqn_jax.sim import camera, drone, env, events, group, sensor
 from edqn_jax.sim.drone import Flight
 from edqn_jax.sim.env import EnvState, Observation, Step, World
@@ -51,14 +52,17 @@ class Environment:
         """Returns the number of missions."""
         return self.world.missions.scene.shape[0]
 
+    @as_tested
     def scene(self, mission: int = 0) -> Scene:
         """Returns the world of a mission: its shapes, flight volume, start and goal."""
         return env.scene_of(self.world, jnp.asarray(mission))
 
+    @as_tested
     def mjcf(self, mission: int = 0) -> str:
         """Returns the world of a mission as the text of an MJCF file, which MuJoCo and `make` open."""
         return mjcf_of(self.scene(mission), title=f"{self.config.world.name} {mission}")
 
+    @as_tested
     def reset(self, key: int | Array = 0, mission: int | Array | None = None) -> tuple[EnvState, Observation]:
         """Returns the state at the start of a mission, at rest and facing the goal, and what is observed there.
 
@@ -69,6 +73,7 @@ class Environment:
         key = jax.random.key(key) if isinstance(key, int) else key
         return _reset(self.config, self.world, key, None if mission is None else jnp.asarray(mission, jnp.int32))
 
+    @as_tested
     def step(self, state: EnvState, move: str | ArrayLike) -> tuple[EnvState, Step]:
         """Flies one decision (0.26 s), or resets to a drawn mission where the episode has ended.
 
@@ -82,6 +87,7 @@ class Environment:
         """
         return _step(self.config, self.world, state, move_number(move))
 
+    @as_tested
     def events(self, observation: Observation) -> np.ndarray:
         """Returns the events of one drone's observation, sorted by time.
 
@@ -93,6 +99,7 @@ class Environment:
         """
         return events.expand(self._field(observation))
 
+    @as_tested
     def event_image(self, observation: Observation) -> np.ndarray:
         """Returns the signed number of events of each pixel, [H, W] int32.
 
@@ -101,6 +108,7 @@ class Environment:
         """
         return np.asarray(events.event_image(self._field(observation)))
 
+    @as_tested
     def stream(
         self,
         flight: Flight,
@@ -127,12 +135,14 @@ class Environment:
         scene = env.scene_of(self.world, jnp.asarray(mission), aim)
         return events.expand(_stream(sees, scene, flight))
 
+    @as_tested
     def picture(self, state: EnvState, scale: int = 8) -> np.ndarray:
         """Returns what a person would see from the drone's camera: [H * scale, W * scale, 3] sRGB in [0, 1]."""
         scene = env.scene_now(self.config, self.world, state)
         body = state.drone
         return np.asarray(_picture(self.config, scale, scene, body.position, body.quaternion))
 
+    @as_tested
     def depth(self, state: EnvState) -> np.ndarray:
         """Returns the true distance along each pixel's ray [H, W] metres, inf where it meets nothing: a label."""
         scene = env.scene_now(self.config, self.world, state)
@@ -144,6 +154,7 @@ class Environment:
         return observation.sensed
 
 
+@as_tested
 def make(
     world: str | Path | None = None,
     config: Config | None = None,

@@ -22,6 +22,7 @@ from edqn_jax.learn.policy import PolicyParams, fresh_policy
 from edqn_jax.learn.trainer import Trainer, TrainState
 from edqn_jax.parallel import processes
 from edqn_jax.parallel.devices import choose_devices
+from edqn_jax.parallel.jax_settings import keep_tested_settings
 from edqn_jax.planners.astar import Path as ShortestPath
 from edqn_jax.planners.astar import shortest_path
 from edqn_jax.random import run_streams
@@ -156,7 +157,7 @@ def prepared(
     Raises:
         ConfigError: if the configuration is invalid or the world cannot be flown.
     """
-    pool = ThreadPoolExecutor(max_workers=2, thread_name_prefix="compiling")
+    pool = ThreadPoolExecutor(max_workers=2, thread_name_prefix="compiling", initializer=keep_tested_settings)
     try:
         yield Preparation(config, reward, display or Silent(), pool, agents)
     finally:
