@@ -25,7 +25,9 @@ def use_cpu_devices(count: int | None = None) -> None:
         RuntimeError: if JAX has already been used.
     """
     jax.config.update("jax_num_cpu_devices", cores() if count is None else count)
-    flags = os.environ.get("XLA_FLAGS", "")
+    flags = os.environ.get("XLA_FLAGS", "").strip()
+    if flags and not flags.startswith("--") and os.path.isfile(flags):  # XLA reads flags from a file, or from here
+        flags = Path(flags).read_text(encoding="utf-8").strip()
     if "xla_backend_extra_options" not in flags:
         os.environ["XLA_FLAGS"] = f"{flags} {ALIKE}".strip()
     if jax.__version_info__[:2] == (0, 11):

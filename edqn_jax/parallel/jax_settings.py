@@ -41,7 +41,7 @@ TESTED = {
     "jax_disable_jit": Setting(False, jax.disable_jit, "runs nothing that is compiled ahead of its first call"),
     "jax_debug_nans": Setting(False, jax.debug_nans, "refuses NaN, which marks what there is none of"),
     "jax_debug_infs": Setting(False, jax.debug_infs, "refuses infinity, the distance where a ray meets nothing"),
-    "jax_check_tracer_leaks": Setting(False, jax.checking_leaks, "refuses MJX"),
+    "jax_check_tracer_leaks": Setting(False, jax.check_tracer_leaks, "refuses MJX"),
     "jax_debug_key_reuse": Setting(False, jax.debug_key_reuse, "refuses keys that are folded and split"),
     "jax_default_prng_impl": Setting("threefry2x32", jax.default_prng_impl, "draws other worlds and flights"),
     "jax_threefry_partitionable": Setting(True, jax.threefry_partitionable, "draws other worlds and flights"),
