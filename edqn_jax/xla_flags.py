@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import MutableMapping
+from collections.abc import Mapping, MutableMapping
 from importlib import metadata
+from pathlib import Path
 
 YNN_OPTION = "xla_cpu_experimental_ynn_fusion_type"
 """XLA's option for the kinds of operation that run in YNNPACK on CPUs; empty for none (docs/decisions/0028)."""
@@ -17,6 +18,18 @@ jax_was_imported = "jax" in sys.modules
 """Whether JAX was imported before this package. XLA reads its flags once, when JAX is first used."""
 
 
+given_flags = os.environ.get("XLA_FLAGS", "").strip()
+"""`XLA_FLAGS` before this package added any."""
+
+
+def read_flags(environ: Mapping[str, str] = os.environ) -> str:
+    """Returns the flags of `XLA_FLAGS`, which may also name a file that holds them."""
+    flags = environ.get("XLA_FLAGS", "").strip()
+    if flags and not flags.startswith("--") and os.path.isfile(flags):
+        return Path(flags).read_text(encoding="utf-8").strip()
+    return flags
+
+
 def disable_ynn_fusions(environ: MutableMapping[str, str] = os.environ) -> None:
     """Adds the flag to `XLA_FLAGS` that keeps XLA from computing sums in YNNPACK.
 
@@ -25,7 +38,7 @@ def disable_ynn_fusions(environ: MutableMapping[str, str] = os.environ) -> None:
     Args:
         environ: environment variables.
     """
-    flags = environ.get("XLA_FLAGS", "")
+    flags = read_flags(environ)
     if YNN_OPTION not in flags and _knows_option():
         environ["XLA_FLAGS"] = f"{flags} --{YNN_OPTION}=".strip()
 

@@ -7,12 +7,18 @@ from collections.abc import Sequence
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Runs one command and returns its exit code, see `cli.commands.run`."""
-    from edqn_jax.cli.signals import heard
+    from edqn_jax.cli.streams import lasting_streams, lost
 
-    with heard() as stops:
-        from edqn_jax.cli.commands import run  # takes a while: a signal may come meanwhile
+    with lasting_streams() as outputs:
+        from edqn_jax.cli.signals import heard
+        from edqn_jax.cli.variables import prepare_process
 
-        return run(argv, stops)
+        prepare_process()
+        with heard() as stops:
+            from edqn_jax.cli.commands import run  # takes a while: a signal may come meanwhile
+
+            code = run(argv, stops)
+        return lost(outputs, code)
 
 
 __all__ = ["main"]

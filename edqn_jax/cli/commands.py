@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib
-import os
 import signal
 import sys
 from collections.abc import Sequence
@@ -33,6 +32,7 @@ from edqn_jax.cli.completion import completion_script
 from edqn_jax.cli.help import ABOUT
 from edqn_jax.cli.signals import Stops
 from edqn_jax.cli.train import train_command
+from edqn_jax.cli.variables import check_devices, start_jax
 from edqn_jax.config.loading import nearest
 from edqn_jax.errors import CheckError, ConfigError, DivergedError, StoppedError, sentence
 from edqn_jax.packages import MissingPackageError
@@ -73,16 +73,7 @@ def run(argv: Sequence[str] | None, stops: Stops) -> int:
 
     0 is done, 1 a check failed, 2 bad input, 3 diverged, 130 stopped by SIGINT, and 143 by SIGTERM.
     """
-    argv = list(sys.argv[1:] if argv is None else argv)
-    # XLA's errors are for people, its warnings for those who write XLA; read when JAX is first imported.
-    os.environ.setdefault("TF_CPP_MIN_LOG_LEVEL", "2")
-    try:
-        code = _dispatched(argv, stops)
-        sys.stdout.flush()
-        return code
-    except BrokenPipeError:  # whoever reads, such as `head`, has enough; Python would try once more at its end
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return DONE
+    return _dispatched(list(sys.argv[1:] if argv is None else argv), stops)
 
 
 def _dispatched(argv: list[str], stops: Stops) -> int:
@@ -101,6 +92,13 @@ def _dispatched(argv: list[str], stops: Stops) -> int:
         if isinstance(ending, CheckError):
             return FAILED
         return BAD_INPUT if isinstance(ending, ConfigError) else DIVERGED
+    except (MemoryError, RuntimeError) as error:
+        from edqn_jax.parallel.memory import memory_error
+
+        if (full := memory_error(error, argv[0])) is None:
+            raise
+        print(f"edqn: {sentence(full)}", file=sys.stderr)
+        return BAD_INPUT
 
 
 def _dispatch(argv: Sequence[str], stops: Stops) -> int:
@@ -125,11 +123,13 @@ def _dispatch(argv: Sequence[str], stops: Stops) -> int:
 def _of_a_run(command: str, argv: Sequence[str]) -> None:
     """Runs a command on a finished run or a file; JAX is imported once the arguments are known to be right."""
     args = OF_A_RUN[command](argv)
+    start_jax()
 
     from edqn_jax.parallel.devices import use_cpu_devices
     from edqn_jax.parallel.programs import keep_programs
 
     use_cpu_devices()
+    check_devices()
     keep_programs()
     module = importlib.import_module(f"edqn_jax.cli.{command}")
     getattr(module, f"{command}_command")(args)

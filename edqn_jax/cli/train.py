@@ -15,6 +15,7 @@ from rich.console import Console
 
 from edqn_jax.cli.arguments import TrainOptions, parse_train
 from edqn_jax.cli.signals import Stops
+from edqn_jax.cli.variables import check_devices, platforms_named, start_jax
 from edqn_jax.config import FAMILIES, Config
 from edqn_jax.config.loading import gpu_layers, to_yaml
 from edqn_jax.errors import ConfigError
@@ -38,9 +39,11 @@ def train_command(argv: Sequence[str], stops: Stops) -> None:
     several = options.coordinator_address, options.num_processes, options.process_id
     arguments = how_to_join(options.distributed, *several, os.environ)
 
+    start_jax()
+
     import jax
 
-    from edqn_jax.parallel import processes
+    from edqn_jax.parallel import memory, processes
     from edqn_jax.parallel.devices import most_that_divide, use_cpu_devices
     from edqn_jax.parallel.hardware import cores
     from edqn_jax.parallel.programs import keep_programs
@@ -54,7 +57,9 @@ def train_command(argv: Sequence[str], stops: Stops) -> None:
     process = 0
     if arguments is not None:
         print("edqn: waiting for the other processes, five minutes at most", file=sys.stderr)
-        process = processes.join(arguments)
+        with platforms_named():
+            process = processes.join(arguments)
+    check_devices()
     processes.together(lambda: _check_gpu() if tuned_for_gpu(options, config) else None)
     processes.check_alike(processes.together(lambda: options_to_compare(config)))
     writes = process == 0
@@ -76,7 +81,7 @@ def train_command(argv: Sequence[str], stops: Stops) -> None:
     except jax.errors.JaxRuntimeError as error:
         if arguments is None:
             raise
-        processes.leave(error)
+        processes.leave(error, memory.memory_error(error, "train"))
     finally:
         if sinks is not None:
             sinks.close()
@@ -170,8 +175,10 @@ def _check_gpu() -> None:
     import jax
 
     if jax.default_backend() == "cpu":
+        hidden = os.environ.get("CUDA_VISIBLE_DEVICES")
+        hides = "" if hidden is None else f" with CUDA_VISIBLE_DEVICES='{hidden}'"
         raise ConfigError(
-            "the options are tuned for a GPU, but JAX can use none here; install its plugin with "
+            f"the options are tuned for a GPU, but JAX can use none here{hides}; install its plugin with "
             "pip install 'jax[cuda13]', or give --tuned-for cpu"
         )
 

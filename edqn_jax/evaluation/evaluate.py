@@ -16,6 +16,7 @@ from edqn_jax.evaluation.missions import MissionSet, Point, load_missions
 from edqn_jax.evaluation.rollouts import fly_on_all_devices
 from edqn_jax.learn.policy import Policy
 from edqn_jax.parallel.forks import check_not_forked
+from edqn_jax.parallel.jax_settings import as_tested
 from edqn_jax.sim.flights import Flights
 from edqn_jax.sim.outcomes import Outcome
 from edqn_jax.sim.sensor import Form, sensor_of
@@ -53,6 +54,7 @@ class Evaluation:
         return np.asarray(self.flights.record.position[mission])[: int(self.flights.physics_steps[mission])]
 
 
+@as_tested
 def evaluate(
     policy: Policy,
     world: str | Path | None = None,

@@ -26,6 +26,7 @@ from edqn_jax.errors import ConfigError
 from edqn_jax.learn import embedding
 from edqn_jax.learn.code import Params as EncoderParams
 from edqn_jax.learn.policy import Policy
+from edqn_jax.parallel.jax_settings import as_tested
 from edqn_jax.sim import env, events
 from edqn_jax.sim.env import MOTION_SIZE, OWN_SIZE, EnvState, World
 from edqn_jax.sim.environment import make as make_environment
@@ -96,6 +97,7 @@ class FunctionalEnv:
         """Returns the space of moves."""
         return Discrete(len(ACTIONS))
 
+    @as_tested
     def observation_space(self, params: Params | None = None) -> Box | dict[str, Box]:
         """Returns the space of observations, of `image` one for each name."""
         if self.observation == "kinematics":
@@ -105,6 +107,7 @@ class FunctionalEnv:
         image = jax.eval_shape(lambda: _image_of(self.config)).shape
         return {"image": _box(*image), "own": _box(OWN_SIZE), "motion": _box(MOTION_SIZE)}
 
+    @as_tested
     def reset(self, key: Array, params: Params, mission: Array | None = None) -> tuple[Observed, State]:
         """Begins an episode: at rest at the start of a mission, facing its goal.
 
@@ -118,6 +121,7 @@ class FunctionalEnv:
         observed, code = self._observed(params, seen, code)
         return observed, State(flight, code)
 
+    @as_tested
     def step(
         self, key: Array, state: State, action: Array, params: Params
     ) -> tuple[Observed, State, Array, Array, Array, dict[str, Array]]:
@@ -149,6 +153,7 @@ class FunctionalEnv:
         truncated = step.outcome == Outcome.TIME_OUT
         return observed, State(flight, code), step.reward, is_terminal(step.outcome), truncated, info
 
+    @as_tested
     def step_autoreset(
         self, key: Array, state: State, action: Array, params: Params
     ) -> tuple[Observed, State, Array, Array, Array, dict[str, Any]]:
@@ -184,6 +189,7 @@ class FunctionalEnv:
         return {"image": _numbers(sensed), "own": own, "motion": motion}, before
 
 
+@as_tested
 def make(
     world: str | Path | None = None,
     config: Config | None = None,

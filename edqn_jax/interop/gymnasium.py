@@ -42,6 +42,7 @@ from edqn_jax.learn.code import Params as EncoderParams
 from edqn_jax.learn.policy import Policy
 from edqn_jax.packages import require
 from edqn_jax.parallel.forks import check_not_forked, lacks_threads
+from edqn_jax.parallel.jax_settings import as_tested
 from edqn_jax.sim.env import EnvState
 from edqn_jax.sim.environment import Environment
 from edqn_jax.sim.moves import ACTIONS
@@ -163,6 +164,7 @@ class DroneEnv(gymnasium.Env):
     spaces_before: ClassVar[tuple[Any, Any] | None] = None
     """Spaces of observations and moves of the environment that was made last."""
 
+    @as_tested
     def __init__(
         self,
         world: str | Path | None = None,
@@ -183,6 +185,7 @@ class DroneEnv(gymnasium.Env):
         self.action_space = gymnasium.spaces.Discrete(len(ACTIONS))
         DroneEnv.spaces_before = self.observation_space, self.action_space
 
+    @as_tested
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """Begins an episode: at rest at the start of a mission, facing its goal.
 
@@ -203,6 +206,7 @@ class DroneEnv(gymnasium.Env):
         self.drone, observed = reset_one(*self.task.program, np.uint32(number), mission)
         return _on_host(observed), {}
 
+    @as_tested
     def step(self, action: int) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Flies one decision of 0.26 s.
 
@@ -228,6 +232,7 @@ class DroneEnv(gymnasium.Env):
         info = {"outcome": outcome.name.lower(), "is_success": outcome is Outcome.GOAL}
         return decided.observed, float(decided.reward), bool(decided.terminated), bool(decided.truncated), info
 
+    @as_tested
     def render(self) -> NDArray[np.uint8] | None:
         """Returns what a person would see from the drone's camera, [192, 256, 3]; None without a render mode.
 
@@ -263,6 +268,7 @@ class DroneVectorEnv(gymnasium.vector.VectorEnv):
 
     metadata = {**DroneEnv.metadata, "autoreset_mode": gymnasium.vector.AutoresetMode.NEXT_STEP}
 
+    @as_tested
     def __init__(
         self,
         num_envs: int = 1,
@@ -290,6 +296,7 @@ class DroneVectorEnv(gymnasium.vector.VectorEnv):
         self.action_space = batch(self.single_action_space, num_envs)
         self.drones: Drone | None = None
 
+    @as_tested
     def reset(
         self, *, seed: int | Sequence[int] | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
@@ -330,6 +337,7 @@ class DroneVectorEnv(gymnasium.vector.VectorEnv):
             raise ConfigError(f"seeds must be whole numbers of at least 0, not {list(seed)}")
         return [int(one) for one in seed]
 
+    @as_tested
     def step(self, actions: NDArray[np.integer]) -> tuple[Any, NDArray, NDArray, NDArray, dict[str, Any]]:
         """Flies one decision of every drone, or resets it.
 
@@ -386,6 +394,7 @@ class DroneVectorEnv(gymnasium.vector.VectorEnv):
                 rows[some] = np.asarray(new)[: len(some)]
         return final
 
+    @as_tested
     def render(self) -> tuple[NDArray[np.uint8], ...] | None:
         """Returns what a person would see from each drone's camera, [192, 256, 3]; None without a render mode.
 

@@ -15,6 +15,7 @@ from edqn_jax.errors import ConfigError
 from edqn_jax.learn import embedding, vae
 from edqn_jax.learn.dqn import epsilon_greedy
 from edqn_jax.learn.qnetwork import Params, init_q, q_values
+from edqn_jax.parallel.jax_settings import as_tested
 from edqn_jax.sim.env import OWN_SIZE, Observation
 from edqn_jax.sim.events import EventField
 from edqn_jax.sim.moves import ACTIONS
@@ -106,6 +107,7 @@ class Policy:
     config: Config
     params: PolicyParams
 
+    @as_tested
     def act(self, observation: Observation, memory: Memory | None = None) -> tuple[Array, Memory]:
         """Returns the greedy move [] int32 (0..26) for one observation, and the memory for the next call.
 
@@ -121,6 +123,7 @@ class Policy:
             memory = empty_memory(self.config)
         return _act(self.config, self.params, memory, observation)
 
+    @as_tested
     def code(self, observation: Observation, memory: Memory | None = None) -> Array:
         """Returns the code [C] that the encoder makes of one observation; the arguments are those of `act`.
 
@@ -132,6 +135,7 @@ class Policy:
         _, memory = self.act(observation, memory)
         return memory[-1, : embedding.size(self.config)] / self.config.agent.code_scale
 
+    @as_tested
     def depth(self, code: Array) -> Array:
         """Returns the distances [H, W] metres that the decoder draws from a code [C], inf where it draws nothing.
 

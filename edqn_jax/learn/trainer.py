@@ -402,6 +402,7 @@ class Trainer:
         self.replicated = NamedSharding(self.mesh, PartitionSpec())
         self.world = processes.replicate(world if isinstance(world, World) else _joined(world), self.mesh)
         self._traced: jax.stages.Lowered | None = None
+        self._shapes: TrainState | None = None
         self._chunk = None
 
     def init(self, seed: int | Sequence[int]) -> TrainState:
@@ -428,7 +429,12 @@ class Trainer:
         return TrainState(actors=spread, learner=same, step=same)  # pyright: ignore[reportArgumentType]
 
     def shapes(self) -> TrainState:
-        """Returns shape, type and layout of every array of a state."""
+        """Returns shape, type and layout of every array of a state, which takes half a second once."""
+        if self._shapes is None:
+            self._shapes = self._shaped()
+        return self._shapes
+
+    def _shaped(self) -> TrainState:
         key = jax.random.key(0)
         keys = key if self.agents is None else jax.random.split(key, self.agents)
         shapes = jax.eval_shape(self._each(partial(init, self.config), 0), self.world, keys)

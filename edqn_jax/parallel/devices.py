@@ -10,7 +10,7 @@ import jax
 from edqn_jax.errors import ConfigError
 from edqn_jax.parallel.hardware import cores
 from edqn_jax.parallel.sums import check_sums
-from edqn_jax.xla_flags import YNN_OPTION
+from edqn_jax.xla_flags import YNN_OPTION, read_flags
 
 ALIKE = "--xla_backend_extra_options=xla_cpu_disable_loop_unrolling"
 """XLA flag that makes CPU programs round equally for every batch size (docs/decisions/0006)."""
@@ -26,7 +26,7 @@ def use_cpu_devices(count: int | None = None) -> None:
         RuntimeError: if JAX has already been used.
     """
     jax.config.update("jax_num_cpu_devices", cores() if count is None else count)
-    flags = os.environ.get("XLA_FLAGS", "")
+    flags = read_flags()
     if "xla_backend_extra_options" not in flags:
         os.environ["XLA_FLAGS"] = f"{flags} {ALIKE}".strip()
     if jax.__version_info__[:2] == (0, 11):

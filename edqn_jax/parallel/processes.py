@@ -63,18 +63,19 @@ def join(arguments: Mapping[str, Any]) -> int:
     return jax.process_index()
 
 
-def leave(error: Exception) -> NoReturn:
-    """Ends this process, with a sentence and exit code 1, after an error that others of the cluster may have caused.
+def leave(error: Exception, own: ConfigError | None = None) -> NoReturn:
+    """Ends this process, with a sentence, after an error that others of the cluster may have caused.
 
     At once: JAX would wait at the exit for those that are gone.
+
+    Args:
+        error: of JAX.
+        own: what to say if this process alone caused it; the exit code is then 2, else 1.
     """
     reason = " ".join(str(error).split())[:200]
-    print(
-        f"edqn: another process of the cluster has ended or cannot be reached; the run can be continued ({reason})",
-        file=sys.stderr,
-        flush=True,
-    )
-    os._exit(1)
+    lost = f"another process of the cluster has ended or cannot be reached; the run can be continued ({reason})"
+    print(f"edqn: {lost if own is None else own}", file=sys.stderr, flush=True)
+    os._exit(1 if own is None else 2)
 
 
 def together(work: Callable[[], T]) -> T:

@@ -14,6 +14,7 @@ import numpy as np
 import numpy.typing as npt
 
 from edqn_jax.errors import ConfigError
+from edqn_jax.parallel.jax_settings import as_tested
 from edqn_jax.sim.distance import signed_distance
 from edqn_jax.sim.scene import Scene
 
@@ -112,6 +113,7 @@ def load_planner(name: str) -> Planner:
     return getattr(importlib.import_module(f"edqn_jax.planners.{module}"), function)
 
 
+@as_tested
 def plan(
     scene: Scene,
     planner: str = "SNN",

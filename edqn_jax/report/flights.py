@@ -15,6 +15,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Circle
 
+from edqn_jax.parallel.jax_settings import as_tested
 from edqn_jax.report.solids import (
     GROUND,
     MAP,
@@ -43,6 +44,7 @@ PATH_POINTS = 1500
 """A flight is thinned to about this many points; more cannot be seen."""
 
 
+@as_tested
 def draw_world(scene: Scene, file: Path) -> Figure:
     """Draws the world's solids with start and goal, in proportion, written to `file` as PNG."""
     start, goal = _ends(scene)
@@ -70,6 +72,7 @@ def draw_world(scene: Scene, file: Path) -> Figure:
     return figure
 
 
+@as_tested
 def draw_map(axes: Axes, scene: Scene, goal_radius_m: float = 2.0) -> None:
     """Draws a world from above, metres, with its start and goal, on axes to which paths may be added.
 

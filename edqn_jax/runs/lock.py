@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import contextlib
-import fcntl
 import os
 import socket
 from pathlib import Path
+
+import filelock
 
 from edqn_jax.errors import ConfigError
 
@@ -31,7 +32,8 @@ class Lock(contextlib.AbstractContextManager["Lock"]):
 
     def __exit__(self, *_: object) -> None:
         if self._held is not None:
-            self.file.unlink(missing_ok=True)
+            with contextlib.suppress(PermissionError):  # Windows deletes no open file; what stays locks nobody out
+                self.file.unlink(missing_ok=True)
             self._unlock()
 
     def __del__(self) -> None:
@@ -52,18 +54,25 @@ def _taken(file: Path) -> int | None:
     """
     opened, kept = os.open(file, os.O_RDWR | os.O_CREAT, 0o644), False
     try:
-        fcntl.flock(opened, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        if not filelock.lock_descriptor(opened, blocking=False):
+            holder = _holder(opened)
+            raise ConfigError(
+                f"'{file.parent}' is in use: {holder} writes a run there; give another folder, or stop it first"
+            )
         kept = file.exists() and os.path.samestat(os.fstat(opened), file.stat())
         if not kept:
             return None
         os.truncate(opened, 0)
         os.write(opened, f"process {os.getpid()} on {socket.gethostname()}\n".encode())
         return opened
-    except BlockingIOError:
-        holder = os.read(opened, 200).decode(errors="replace").strip() or "another process"
-        raise ConfigError(
-            f"'{file.parent}' is in use: {holder} writes a run there; give another folder, or stop it first"
-        ) from None
     finally:
         if not kept:
             os.close(opened)
+
+
+def _holder(opened: int) -> str:
+    """Returns what the holder of a lock has written into its file."""
+    with contextlib.suppress(PermissionError):  # on Windows nobody else reads a locked file
+        if said := os.read(opened, 200).decode(errors="replace").strip():
+            return said
+    return "another process"

@@ -83,7 +83,9 @@ def digest(file: Path) -> str:
 
 
 def sync(path: Path) -> None:
-    """Writes what the system still holds of a file or folder to the disk."""
+    """Writes what the system still holds of a file or folder to the disk; of a file alone where folders cannot be."""
+    if os.name == "nt" and path.is_dir():
+        return
     opened = os.open(path, os.O_RDONLY)
     try:
         os.fsync(opened)

@@ -14,6 +14,7 @@ from edqn_jax.config.loading import apply, load_layer
 from edqn_jax.errors import ConfigError
 from edqn_jax.learn.policy import Policy, PolicyParams, fresh_policy
 from edqn_jax.parallel.forks import check_not_forked
+from edqn_jax.parallel.jax_settings import as_tested
 from edqn_jax.policies import no_run, policy_folder
 from edqn_jax.runs import manifest, world_copy
 from edqn_jax.runs.checkpoints import load_params, save_params, saved_at
@@ -21,6 +22,7 @@ from edqn_jax.runs.directory import SEED_FOLDER, config_text, version_of
 from edqn_jax.runs.files import check_can_make, write_atomically
 
 
+@as_tested
 def load_policy(run: str | Path) -> Policy:
     """Returns the policy of a run directory, of a folder that `save_policy` wrote, or `pretrained`.
 
@@ -30,6 +32,7 @@ def load_policy(run: str | Path) -> Policy:
     return Policy(*load_run(Path(run)))
 
 
+@as_tested
 def save_policy(policy: Policy, folder: str | Path) -> None:
     """Writes a policy into `folder`, for `load_policy` and `edqn evaluate`; the folder must be new or empty.
 

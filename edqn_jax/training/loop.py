@@ -21,6 +21,7 @@ from edqn_jax.evaluation.missions import MissionSet, RunMissions
 from edqn_jax.learn.policy import Policy, PolicyParams
 from edqn_jax.learn.trainer import Trainer, TrainState, policy_of
 from edqn_jax.parallel import processes
+from edqn_jax.parallel.jax_settings import as_tested
 from edqn_jax.sim.flights import Flights
 from edqn_jax.sim.reward import Reward
 from edqn_jax.training.history import EndedEpisodes, History, Watch, chunk_metrics, mean_metrics
@@ -108,6 +109,7 @@ class TrainingResult:
     compile_seconds: float
 
 
+@as_tested
 def train(
     config: Config | None = None, *, reward: Reward | None = None, callback: Callback | None = None
 ) -> TrainingResult:
@@ -127,6 +129,7 @@ def train(
         return run_chunks(preparation, callback)[0]
 
 
+@as_tested
 def train_seeds(
     seeds: int, config: Config | None = None, *, reward: Reward | None = None, callback: Callback | None = None
 ) -> list[TrainingResult]:

@@ -23,6 +23,8 @@ from edqn_jax.learn.trainer import Trainer, TrainState
 from edqn_jax.parallel import processes
 from edqn_jax.parallel.devices import choose_devices
 from edqn_jax.parallel.forks import check_not_forked
+from edqn_jax.parallel.jax_settings import keep_tested_settings
+from edqn_jax.parallel.memory import check_fits
 from edqn_jax.planners.astar import Path as ShortestPath
 from edqn_jax.planners.astar import shortest_path
 from edqn_jax.random import run_streams
@@ -63,7 +65,7 @@ class Preparation:
         Programs are traced one after the other: several threads of Python would only wait for one another.
 
         Raises:
-            ConfigError: if the configuration is invalid or the world cannot be flown.
+            ConfigError: if the configuration is invalid, the world cannot be flown, or memory is too small.
         """
         config = config_for_reward(config, reward)
         self.configs = _of_agents(config, agents)
@@ -79,6 +81,7 @@ class Preparation:
             distances = geodesic.fields(worlds[0].pool, config.drone.body_radius_m)
             worlds = [dataclasses.replace(world, distances=distances) for world in worlds]
         self.trainer = Trainer(config, worlds[0] if agents is None else worlds, self.devices)
+        check_fits(self.trainer.shapes(), [each for each in self.devices if each in jax.local_devices()])
         self.mesh = Mesh(np.asarray(self.devices), ("mission",))
         display.phase("compiling")
         began = time.perf_counter()
@@ -159,7 +162,7 @@ def prepared(
             had been used.
     """
     check_not_forked()
-    pool = ThreadPoolExecutor(max_workers=2, thread_name_prefix="compiling")
+    pool = ThreadPoolExecutor(max_workers=2, thread_name_prefix="compiling", initializer=keep_tested_settings)
     try:
         yield Preparation(config, reward, display or Silent(), pool, agents)
     finally:

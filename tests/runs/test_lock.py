@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
-import fcntl
 import subprocess
 import sys
 from pathlib import Path
 
+import filelock
 import pytest
 
 from edqn_jax.config import Config
@@ -71,14 +71,14 @@ def test_a_lock_is_on_the_file_that_is_in_the_folder(tmp_path: Path, monkeypatch
     """The holder before may remove its file between the moments at which another opens and locks it."""
     locked: list[int] = []
 
-    def removed_meanwhile(opened: int, operation: int) -> None:
+    def removed_meanwhile(opened: int, *, blocking: bool) -> bool:
         locked.append(opened)
         if len(locked) == 1:
             (tmp_path / LOCK).unlink()
-        flock(opened, operation)
+        return lock(opened, blocking=blocking)
 
-    flock = fcntl.flock
-    monkeypatch.setattr(fcntl, "flock", removed_meanwhile)
+    lock = filelock.lock_descriptor
+    monkeypatch.setattr(filelock, "lock_descriptor", removed_meanwhile)
     with Lock(tmp_path):
         assert len(locked) == 2 and (tmp_path / LOCK).exists()
         with pytest.raises(ConfigError, match="is in use"):
