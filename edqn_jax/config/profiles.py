@@ -14,7 +14,7 @@ PROFILES: dict[str, Mapping[str, Any]] = {
         "shot_rate_hz": 0.0,
         "hot_pixel_fraction": 0.0,
     },
-    # v2e's `--dvs_params noisy` of June 2021 to May 2022; since then its refractory period is 0 (docs/sensors_in_light.md).
+    # v2e's `--dvs_params noisy` of June 2021 to May 2022; its refractory period is 0 since (docs/sensors_in_light.md).
     # The standard deviation of its thresholds, 0.05, is relative to them here.
     "dvs": {
         "threshold": 0.2,
