@@ -119,8 +119,7 @@ class EventsConfig:
     """Event law: the paper's, AirSim's (equal to its simulator event by event), or ESIM's, a sensor with memory."""
     profile: Literal["ideal", "dvs", "dark"] = "ideal"
     """Named sensor whose figures take the place of thresholds, refractory period, bandwidth and noise; options that are
-    given beside it change one. `ideal`: no faults. `dvs`: the noisy sensor of v2e in 2021. `dark`: a sensor in low
-    light."""
+    given beside it change one. `ideal`: no faults. `dvs`: the noisy sensor of v2e in 2021. `dark`: in low light."""
     frame_times_s: tuple[float, ...] = (-0.04, 0.0)
     """When frames are rendered relative to the decision, seconds; each must be a physics step."""
     stream: bool = False
