@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import struct
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -229,7 +230,7 @@ def test_other_hdf5_is_refused_as_what_it_is(tmp_path, changes, says):
 def test_columns_of_other_names_and_byte_orders_are_read(tmp_path, names, order):
     events = some_events()
     columns = [events[key].astype(events[key].dtype.newbyteorder(order)) for key in "txyp"]
-    held = dict(zip(names, columns, strict=True))
+    held: Any = dict(zip(names, columns, strict=True))
     with h5py.File(tmp_path / "a.h5", "w") as opened:
         for name, column in held.items():
             opened[f"events/{name}"] = column
@@ -237,7 +238,7 @@ def test_columns_of_other_names_and_byte_orders_are_read(tmp_path, names, order)
         opened["events"].attrs["width"], opened["events"].attrs["height"] = [64], [48]
     np.savez(tmp_path / "a.npz", **held, width=[64], height=[48], time_unit=["us"])
     (tmp_path / "a.npz").rename(tmp_path / "A.NPZ")
-    structured = np.rec.fromarrays(list(held.values()), names=list(held))
+    structured = np.rec.fromarrays(columns, dtype=[(name, column.dtype) for name, column in held.items()])
     np.savez(tmp_path / "b.npz", arr_0=structured, time_unit=np.bytes_(b"us"))
     for file, offset in (("a.h5", 7), ("A.NPZ", 0), ("b.npz", 0)):
         found = read_events(tmp_path / file, time_unit="us", size=SIZE if file == "b.npz" else None)
