@@ -71,6 +71,10 @@ def refusal(file: Path, **options) -> str:
         ("early2.raw", raw2(event2(1), event2(2), high2(640), event2(641)), [641], 0, 2),
         ("early3.raw", raw3(0x6007, 3, 0x2005, 0x82DC, 0x6064, 20, 0x200A), [2998372], 0, 1),
         ("percent.raw", raw2(0x80000025, event2(2373), header=EVT2_HEADER[:-6]), [37 * 64 + 5], 0, 0),
+        ("text.raw", raw2(0x80002025, 0x10000000 | 5 << 11 | 10, header=EVT2_HEADER[:-6]), [0x2025 * 64], 0, 0),
+        ("sign.raw", raw2(0x80414125, 0x10000000 | 5 << 11 | 10, header=EVT2_HEADER[:-6]), [0x414125 * 64], 0, 0),
+        # An older value of before the clock began again.
+        ("over3.raw", raw3(0x8FFF, 1, 0x2001, 0x8000, 0x8FFF, 0x6FFF, 0x2002), [2**24 - 4096, 2**24 - 1], 0, 0),
         ("CAPITALS.RAW", raw2(high2(640), event2(641)), [641], 0, 0),
         ("order.dat", event_words.dat(at_times(0, 2000, 1000, 3000), DAT_HEADER), [0, 1000, 2000, 3000], 1, 0),
         ("2d.dat", event_words.dat(at_times(0, 1000), DAT_HEADER, kind=0), [0, 1000], 0, 0),
