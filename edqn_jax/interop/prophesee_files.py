@@ -85,7 +85,7 @@ def header_of(beginning: bytes) -> Header:
     are none.
     """
     lines, length = [], 0
-    while found := re.compile(rb"%(| [^\x00-\x08\x0e-\x1f\x7f\n]*)\r?\n").match(beginning, length):
+    while found := re.compile(rb"% [^\x00-\x08\x0e-\x1f\x7f\n]*\n").match(beginning, length):
         lines.append(found[0].decode("latin-1").strip())
         length = found.end()
         if lines[-1] == "% end":

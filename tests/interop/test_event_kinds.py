@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import struct
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -70,6 +71,10 @@ def refusal(file: Path, **options) -> str:
         ("early2.raw", raw2(event2(1), event2(2), high2(640), event2(641)), [641], 0, 2),
         ("early3.raw", raw3(0x6007, 3, 0x2005, 0x82DC, 0x6064, 20, 0x200A), [2998372], 0, 1),
         ("percent.raw", raw2(0x80000025, event2(2373), header=EVT2_HEADER[:-6]), [37 * 64 + 5], 0, 0),
+        ("text.raw", raw2(0x80002025, 0x10000000 | 5 << 11 | 10, header=EVT2_HEADER[:-6]), [0x2025 * 64], 0, 0),
+        ("sign.raw", raw2(0x80414125, 0x10000000 | 5 << 11 | 10, header=EVT2_HEADER[:-6]), [0x414125 * 64], 0, 0),
+        # An older value of before the clock began again.
+        ("over3.raw", raw3(0x8FFF, 1, 0x2001, 0x8000, 0x8FFF, 0x6FFF, 0x2002), [2**24 - 4096, 2**24 - 1], 0, 0),
         ("CAPITALS.RAW", raw2(high2(640), event2(641)), [641], 0, 0),
         ("order.dat", event_words.dat(at_times(0, 2000, 1000, 3000), DAT_HEADER), [0, 1000, 2000, 3000], 1, 0),
         ("2d.dat", event_words.dat(at_times(0, 1000), DAT_HEADER, kind=0), [0, 1000], 0, 0),
@@ -229,7 +234,7 @@ def test_other_hdf5_is_refused_as_what_it_is(tmp_path, changes, says):
 def test_columns_of_other_names_and_byte_orders_are_read(tmp_path, names, order):
     events = some_events()
     columns = [events[key].astype(events[key].dtype.newbyteorder(order)) for key in "txyp"]
-    held = dict(zip(names, columns, strict=True))
+    held: Any = dict(zip(names, columns, strict=True))
     with h5py.File(tmp_path / "a.h5", "w") as opened:
         for name, column in held.items():
             opened[f"events/{name}"] = column
@@ -237,7 +242,7 @@ def test_columns_of_other_names_and_byte_orders_are_read(tmp_path, names, order)
         opened["events"].attrs["width"], opened["events"].attrs["height"] = [64], [48]
     np.savez(tmp_path / "a.npz", **held, width=[64], height=[48], time_unit=["us"])
     (tmp_path / "a.npz").rename(tmp_path / "A.NPZ")
-    structured = np.rec.fromarrays(list(held.values()), names=list(held))
+    structured = np.rec.fromarrays(columns, dtype=[(name, column.dtype) for name, column in held.items()])
     np.savez(tmp_path / "b.npz", arr_0=structured, time_unit=np.bytes_(b"us"))
     for file, offset in (("a.h5", 7), ("A.NPZ", 0), ("b.npz", 0)):
         found = read_events(tmp_path / file, time_unit="us", size=SIZE if file == "b.npz" else None)

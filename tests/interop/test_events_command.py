@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import functools
 import json
+import struct
 from pathlib import Path
 from typing import Any
 
@@ -70,6 +71,20 @@ def test_it_says_what_a_file_holds(tmp_path, capsys):
     assert "4,000" in said and "64 × 48 pixels" in said
 
 
+def test_it_says_what_was_assumed_sorted_and_left_out(tmp_path, capsys):
+    rows = "".join(f"{t / 1e6:.6f} {x} {y} {int(p > 0)}\n" for t, x, y, p in some_recording().events.tolist())
+    (tmp_path / "a.txt").write_text(rows)
+    done("events", tmp_path / "a.txt", "--time-unit", "s")
+    assert "t x y p, as no line names them" in capsys.readouterr().out
+    early = struct.pack("<5I", 1 << 28, 8 << 28 | 99, 1 << 28, 8 << 28 | 40000, 1 << 28)
+    (tmp_path / "a.raw").write_bytes(b"% evt 2.0\n% geometry 64x48\n% end\n" + early)
+    done("events", tmp_path / "a.raw", "--json", tmp_path / "found.json")
+    found = json.loads((tmp_path / "found.json").read_text())
+    assert (found["events"], found["left_out"], found["columns"]) == (2, 1, None)
+    said = capsys.readouterr().out
+    assert "left out" in said and "2.554 s without an event" in said
+
+
 def test_a_part_is_written_in_another_form(tmp_path):
     recording = some_recording()
     write_events(tmp_path / "a.npz", recording)
@@ -126,6 +141,7 @@ def test_windows_lie_within_the_recording():
         (["--policy", "nowhere"], "there is no run in 'nowhere'"),
         (["--picture", "a.jpg"], "must end in .png or .gif"),
         (["--out", "a.raw"], "must end in .h5"),
+        (["--stream", "1"], "--stream is for .aedat4"),
         (["--contrast", "0"], "--contrast must be above 0"),
         (["--contrst", "1"], "did you mean '--contrast'?"),
     ],

@@ -34,6 +34,7 @@ def test_given_units_become_microseconds(unit):
         (0.9, 2_000, 1.0, False, "s"),  # as milliseconds, less than one
         (600.0, 100_000, 1e9, True, "ns"),  # as microseconds, a week
         (20.0, 1_000_000, 1e6, True, "us"),  # as nanoseconds, 50 million a second; as milliseconds, 50
+        (2.0, 4_000, 1e6, False, "us"),  # with decimals: as milliseconds, 2 a second
     ],
 )
 def test_the_only_plausible_unit_is_found(seconds, events, scale, whole, unit):
@@ -46,6 +47,14 @@ def test_times_since_1970_say_their_unit(unit):
     since = 1_750_000_000 + np.linspace(0.0, 10.0, 1000)
     times = since if unit == "s" else np.rint(since * 1e6 / MICROSECONDS[unit]).astype(np.int64)
     assert found_unit("f", times) == unit
+
+
+def test_a_clock_that_runs_for_minutes_does_not_show_seconds_since_1970():
+    """1.5e9 us after the camera began; and 1.5e12 ns, which as milliseconds would last 14 hours."""
+    since = np.linspace(0.0, 20e6, 1_000_000)
+    assert found_unit("f", (1.5e9 + since).astype(np.int64)) == "us"
+    with pytest.raises(ConfigError, match="us or ns"):
+        found_unit("f", (1.5e12 + np.linspace(0.0, 50e6, 10_000)).astype(np.int64))
 
 
 @pytest.mark.parametrize(
