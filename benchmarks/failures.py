@@ -25,8 +25,8 @@ from edqn_jax.errors import ConfigError
 from edqn_jax.evaluation.companions import scene_of_flight
 from edqn_jax.evaluation.missions import MissionSet, load_missions
 from edqn_jax.evaluation.rollouts import fly_on_all_devices
+from edqn_jax.files import check_can_write
 from edqn_jax.parallel.devices import use_cpu_devices
-from edqn_jax.runs.files import check_can_write
 from edqn_jax.runs.policies import load_run
 from edqn_jax.sim import camera, group, sensor
 from edqn_jax.sim.distance import shape_distances, signed_distance

@@ -30,9 +30,9 @@ from edqn_jax.errors import ConfigError
 from edqn_jax.evaluation.intervals import rate_interval
 from edqn_jax.evaluation.missions import load_missions
 from edqn_jax.evaluation.rollouts import flight_keys
+from edqn_jax.files import check_can_write
+from edqn_jax.keys import run_streams
 from edqn_jax.parallel.devices import use_cpu_devices
-from edqn_jax.random import run_streams
-from edqn_jax.runs.files import check_can_write
 from edqn_jax.sim import env, group
 from edqn_jax.sim.drone import DroneState, yaw_of
 from edqn_jax.sim.env import World

@@ -32,15 +32,15 @@ from edqn_jax.evaluation.intervals import difference_interval
 from edqn_jax.evaluation.latency import decision_seconds, in_turn
 from edqn_jax.evaluation.metrics import summarise
 from edqn_jax.evaluation.rollouts import fly_on_all_devices
+from edqn_jax.extras import MissingPackageError
+from edqn_jax.files import check_can_write, write_atomically
 from edqn_jax.learn import policy as acting
 from edqn_jax.learn.policy import Policy
 from edqn_jax.mapping import grid
 from edqn_jax.mapping.grid import MapConfig
-from edqn_jax.packages import MissingPackageError
 from edqn_jax.parallel.devices import use_cpu_devices
 from edqn_jax.planners.follow import FollowConfig
 from edqn_jax.report.growing_map import Moment, animate_growth, draw_growth
-from edqn_jax.runs.files import check_can_write, write_atomically
 from edqn_jax.runs.policies import load_policy
 from edqn_jax.sim import drone, env, worlds
 from edqn_jax.sim.distance import signed_distance

@@ -30,9 +30,9 @@ from edqn_jax.errors import ConfigError
 from edqn_jax.evaluation.intervals import median_interval
 from edqn_jax.evaluation.latency import decision_call, in_turn, look_call
 from edqn_jax.evaluation.missions import MissionSet, load_missions
+from edqn_jax.files import check_can_write
 from edqn_jax.learn import policy as acting
 from edqn_jax.learn.policy import Policy, fresh_policy
-from edqn_jax.runs.files import check_can_write
 from edqn_jax.runs.policies import load_policy
 from edqn_jax.sim import env, group
 from edqn_jax.sim.events import EventField

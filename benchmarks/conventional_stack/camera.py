@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from conventional_stack.c_mujoco import mj_multi_ray
 from edqn_jax.config import CameraConfig
-from edqn_jax.packages import require
+from edqn_jax.extras import require
 from edqn_jax.sim.events import LUMA_WEIGHTS
 from edqn_jax.sim.raycast import HORIZON_M, image_plane, pitch_of, sun_direction
 from edqn_jax.sim.sensor import DEPTH_SCALE, HALF_NEAR_M

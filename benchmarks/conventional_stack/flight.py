@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from conventional_stack.c_mujoco import mj_step
 from edqn_jax.config import Config, DroneConfig
-from edqn_jax.packages import require
+from edqn_jax.extras import require
 from edqn_jax.sim.drone import LEAST_LEVELNESS, c_model, mixer_of
 
 numba = require("numba")

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from conventional_stack.fleet import Course, Fleet, Record
 from conventional_stack.task import RUNNING, signed_distance
 from edqn_jax.config import Config
-from edqn_jax.packages import require
+from edqn_jax.extras import require
 from edqn_jax.sim.flights import Closest, Flights
 
 numba = require("numba")

@@ -10,7 +10,7 @@ import numpy as np
 
 from conventional_stack.flight import clip, wrap_angle
 from edqn_jax.config import Config
-from edqn_jax.packages import require
+from edqn_jax.extras import require
 from edqn_jax.sim.env import MOST_YAW_RATE
 from edqn_jax.sim.outcomes import Outcome
 

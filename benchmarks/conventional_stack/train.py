@@ -26,9 +26,9 @@ from conventional_stack.vec_env import CodedDrones, observed
 from conventional_stack.workers import SpreadFleet
 from edqn_jax.config import Config
 from edqn_jax.errors import ConfigError
+from edqn_jax.extras import require
 from edqn_jax.learn.patch_encoder import is_recurrent
 from edqn_jax.learn.plan import Plan
-from edqn_jax.packages import require
 from edqn_jax.sim.flights import Flights
 from edqn_jax.sim.moves import ACTIONS
 

@@ -14,11 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edqn_jax.config import CameraConfig, EncoderConfig
+from edqn_jax.extras import require
 from edqn_jax.learn.code import MAX_LOG_VARIANCE, MAX_MEAN
 from edqn_jax.learn.patch_encoder import patch_places
 from edqn_jax.learn.vae import init_vae
 from edqn_jax.learn.waves import OUTPUT_SCALE, cosines
-from edqn_jax.packages import require
 
 torch = require("torch")
 nn = torch.nn

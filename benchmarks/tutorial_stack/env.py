@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edqn_jax.config import CameraConfig, Config, EventsConfig
-from edqn_jax.packages import require
+from edqn_jax.extras import require
 from edqn_jax.sim.drone import AIRFRAME_FILE, mixer_of
 from edqn_jax.sim.events import LUMA_WEIGHTS, max_events
 from edqn_jax.sim.moves import ACTIONS

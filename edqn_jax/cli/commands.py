@@ -35,7 +35,7 @@ from edqn_jax.cli.signals import Stops
 from edqn_jax.cli.train import train_command
 from edqn_jax.config.loading import nearest
 from edqn_jax.errors import CheckError, ConfigError, DivergedError, StoppedError, sentence
-from edqn_jax.packages import MissingPackageError
+from edqn_jax.extras import MissingPackageError
 
 DONE = 0
 FAILED = 1

@@ -18,7 +18,7 @@ from edqn_jax.cli.signals import Stops
 from edqn_jax.config import FAMILIES, Config
 from edqn_jax.config.loading import gpu_layers, to_yaml
 from edqn_jax.errors import ConfigError
-from edqn_jax.packages import SINKS
+from edqn_jax.extras import SINKS
 from edqn_jax.parallel.launch import how_to_join
 from edqn_jax.runs.directory import RunDirectory, plan_run_directory
 

@@ -12,10 +12,10 @@ import numpy as np
 
 from edqn_jax.config import FAMILIES, Config
 from edqn_jax.errors import ConfigError
+from edqn_jax.keys import run_streams
 from edqn_jax.planners.astar import shortest_path
 from edqn_jax.planners.free_space import holds, reachable
 from edqn_jax.planners.lattice import CELL_M, lattice_shape
-from edqn_jax.random import run_streams
 from edqn_jax.sim import drone, group, worlds
 from edqn_jax.sim.crossing import crossing_missions, own_crossings
 from edqn_jax.sim.env import World, scene_of

@@ -10,8 +10,8 @@ import numpy as np
 
 from edqn_jax.config import Config
 from edqn_jax.evaluation.missions import MissionSet
+from edqn_jax.files import write_atomically
 from edqn_jax.runs.directory import TRAJECTORY_COLUMNS
-from edqn_jax.runs.files import write_atomically
 from edqn_jax.sim.flights import Flights
 from edqn_jax.sim.outcomes import Outcome
 

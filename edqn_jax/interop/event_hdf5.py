@@ -20,8 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edqn_jax.errors import ConfigError
+from edqn_jax.extras import require
 from edqn_jax.interop.recording import Recording, TimeUnit, recording_of
-from edqn_jax.packages import require
 
 
 def read_hdf5(file: Path, size: tuple[int, int] | None, time_unit: TimeUnit | None) -> Recording:

@@ -27,11 +27,11 @@ from numpy.typing import NDArray
 
 from edqn_jax.config import Config
 from edqn_jax.errors import ConfigError
+from edqn_jax.extras import require
 from edqn_jax.interop import functional
 from edqn_jax.interop.functional import Box, FunctionalEnv, Kind, Params, State
 from edqn_jax.learn.code import Params as EncoderParams
 from edqn_jax.learn.policy import Policy
-from edqn_jax.packages import require
 from edqn_jax.sim.env import EnvState
 from edqn_jax.sim.environment import Environment
 from edqn_jax.sim.moves import ACTIONS

@@ -18,12 +18,12 @@ from jax import Array
 import edqn_jax
 from edqn_jax.config import Config
 from edqn_jax.errors import CheckError, ConfigError
+from edqn_jax.extras import require
+from edqn_jax.files import check_can_write, write_atomically
 from edqn_jax.interop import runner
 from edqn_jax.learn import policy
 from edqn_jax.learn.policy import Memory, Policy, PolicyParams, observation_size
 from edqn_jax.learn.qnetwork import q_values
-from edqn_jax.packages import require
-from edqn_jax.runs.files import check_can_write, write_atomically
 from edqn_jax.sim import events
 from edqn_jax.sim.env import MOST_YAW_RATE, MOTION_SIZE, OWN_SIZE, Observation
 from edqn_jax.sim.events import EventField

@@ -22,7 +22,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from edqn_jax.config import Config
-from edqn_jax.packages import SINKS, require
+from edqn_jax.extras import SINKS, require
 from edqn_jax.report.solids import solids_of
 from edqn_jax.report.style import OUTCOME_COLOURS
 from edqn_jax.sim.outcomes import Outcome

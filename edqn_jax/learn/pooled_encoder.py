@@ -30,7 +30,7 @@ from edqn_jax.config import EncoderConfig
 from edqn_jax.learn.code import EVENT_CHANNELS, CodeHead
 from edqn_jax.learn.waves import mirrored, polarities, wave_table
 from edqn_jax.sim.events import EventField
-from edqn_jax.sim.sine import sin_pi
+from edqn_jax.sine import sin_pi
 
 POSITION_OCTAVES = 4
 """Sine-cosine pairs per image axis in the positional encoding; the finest period is a quarter image."""

@@ -20,9 +20,9 @@ from jax import Array
 
 from edqn_jax.checks import check_index
 from edqn_jax.config import EncoderConfig
+from edqn_jax.keys import integers
 from edqn_jax.learn import vae
 from edqn_jax.learn.vae import Target
-from edqn_jax.random import integers
 from edqn_jax.sim.env import MIRRORED_MOTION, Observation
 from edqn_jax.sim.events import EventField
 

@@ -23,6 +23,7 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from edqn_jax.config import Config
 from edqn_jax.errors import ConfigError
+from edqn_jax.keys import run_streams
 from edqn_jax.learn import dqn, embedding, policy, replay, samples, vae
 from edqn_jax.learn.checked import CheckedChunk, one_by_one
 from edqn_jax.learn.plan import Plan
@@ -32,7 +33,6 @@ from edqn_jax.learn.updates import Learner, flat, init_learner, learn_to_act, le
 from edqn_jax.parallel import processes
 from edqn_jax.parallel.all_sum import all_sum
 from edqn_jax.parallel.devices import compiler_options
-from edqn_jax.random import run_streams
 from edqn_jax.sim import env, group
 from edqn_jax.sim.env import EnvState, World
 from edqn_jax.sim.moves import ACTIONS

@@ -22,7 +22,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from edqn_jax.packages import require
+from edqn_jax.extras import require
 from edqn_jax.planners.astar import shorten
 
 numba = require("numba")

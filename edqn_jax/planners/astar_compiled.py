@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from edqn_jax.packages import require
+from edqn_jax.extras import require
 from edqn_jax.planners.astar import shorten
 from edqn_jax.planners.lattice import edge_margin
 from edqn_jax.planners.planner import Budget, Plan, Task, found, not_found, refusal

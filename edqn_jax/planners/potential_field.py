@@ -20,7 +20,7 @@ import time
 
 import numpy as np
 
-from edqn_jax.packages import require
+from edqn_jax.extras import require
 from edqn_jax.planners.planner import MARGIN, Budget, Plan, Task, found, not_found, point_text, refusal
 from edqn_jax.planners.solids import leg_free, shape_distance, solid_table
 

@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from edqn_jax.packages import require
+from edqn_jax.extras import require
 from edqn_jax.planners.planner import MARGIN, Budget, Plan, Task, not_found, path_length, refusal
 from edqn_jax.planners.solids import leg_free, solid_table
 

@@ -11,7 +11,7 @@ import math
 
 import numpy as np
 
-from edqn_jax.packages import require
+from edqn_jax.extras import require
 from edqn_jax.sim.scene import (
     PARKED,
     Capsules,

@@ -19,8 +19,8 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Wedge
 from PIL import Image
 
+from edqn_jax.extras import require
 from edqn_jax.learn.policy import PolicyParams
-from edqn_jax.packages import require
 from edqn_jax.report.flights import OBLIQUE, OTHER_COLOUR, draw_end_marks, draw_stage, others_paths
 from edqn_jax.report.images import LOOKS, scale_of
 from edqn_jax.report.sights import Sights, decision_rows, poses, times_of

@@ -17,8 +17,8 @@ import numpy as np
 import orbax.checkpoint as ocp
 
 from edqn_jax.errors import ConfigError
+from edqn_jax.files import unwritable, write_atomically
 from edqn_jax.runs import manifest
-from edqn_jax.runs.files import unwritable, write_atomically
 
 COMMITTED = "commit_success.txt"
 """File by which Orbax marks a folder as complete."""

@@ -10,9 +10,9 @@ import shutil
 from pathlib import Path
 
 from edqn_jax.errors import ConfigError
+from edqn_jax.files import unwritable
 from edqn_jax.learn.policy import PolicyParams
 from edqn_jax.runs import arrays, manifest
-from edqn_jax.runs.files import unwritable
 
 POLICY = "policy"
 """The policy's folder within `checkpoints/`."""

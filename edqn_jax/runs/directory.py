@@ -19,7 +19,7 @@ import edqn_jax
 from edqn_jax.config import Config
 from edqn_jax.config.loading import apply, load_layer, to_yaml
 from edqn_jax.errors import ConfigError
-from edqn_jax.runs.files import check_can_make, unwritable, write_atomically
+from edqn_jax.files import check_can_make, unwritable, write_atomically
 from edqn_jax.runs.lock import LOCK, Lock
 
 Resume = Literal["auto", "never", "must"]

@@ -20,8 +20,8 @@ import numpy as np
 
 import edqn_jax
 from edqn_jax.errors import ConfigError, DamagedError
+from edqn_jax.files import unwritable
 from edqn_jax.runs import arrays, manifest
-from edqn_jax.runs.files import unwritable
 
 _NAME = re.compile(r"step-(\d{9,})")
 _HOST, _CONFIG = "host.json", "config.yaml"

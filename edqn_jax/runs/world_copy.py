@@ -12,8 +12,8 @@ from pathlib import Path
 
 from edqn_jax.config import FAMILIES, Config, WorldConfig
 from edqn_jax.errors import ConfigError
+from edqn_jax.files import unwritable
 from edqn_jax.runs import manifest
-from edqn_jax.runs.files import unwritable
 from edqn_jax.sim.mjcf import SceneError, resolve_world
 
 WORLD = "world"

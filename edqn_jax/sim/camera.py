@@ -26,7 +26,7 @@ from edqn_jax.sim.picture_primitive import draw_in_one_batch
 from edqn_jax.sim.raycast import Rays, Values
 from edqn_jax.sim.scene import Scene
 from edqn_jax.sim.texture import texture
-from edqn_jax.sim.xla import materialised
+from edqn_jax.xla import materialised
 
 Pixels = TypeVar("Pixels", Array, np.ndarray)
 

@@ -27,7 +27,7 @@ from edqn_jax.sim import coverage, raycast
 from edqn_jax.sim.coverage import Layers
 from edqn_jax.sim.raycast import Rays, Values
 from edqn_jax.sim.scene import Scene, UprightBoxes, UprightCylinders, no_shapes
-from edqn_jax.sim.xla import materialised
+from edqn_jax.xla import materialised
 
 SLOTS = (0, 2, 4, 8)
 """Capacities of the branches, upright shapes per column; columns with more are drawn in a loop over their shapes."""

@@ -29,7 +29,7 @@ from edqn_jax.sim.raycast import (
     unit_ball,
 )
 from edqn_jax.sim.scene import Scene, Spheres, UprightBoxes, UprightCylinders
-from edqn_jax.sim.xla import materialised
+from edqn_jax.xla import materialised
 
 NEAR_M = 0.05
 """Shapes are clipped at this depth before they are projected; the body sphere is wider."""

@@ -31,7 +31,7 @@ from edqn_jax.sim import disturbances
 from edqn_jax.sim.disturbances import Disturbance, Load
 from edqn_jax.sim.rigid_body import rigid_body_step
 from edqn_jax.sim.scalars import number_by_number
-from edqn_jax.sim.xla import materialised
+from edqn_jax.xla import materialised
 
 with contextlib.redirect_stdout(io.StringIO()):  # it prints that Warp, which is not used here, is missing
     from mujoco import mjx

@@ -18,7 +18,7 @@ from jax import Array
 
 from edqn_jax.checks import check_finite, check_index
 from edqn_jax.config import Config, EnvConfig
-from edqn_jax.random import integers
+from edqn_jax.keys import integers
 from edqn_jax.sim import disturbances, drone, geodesic, group, sensor
 from edqn_jax.sim.balls import nobody_aimed_at, thrown
 from edqn_jax.sim.distance import signed_distance

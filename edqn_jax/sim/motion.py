@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from flax import struct
 from jax import Array
 
-from edqn_jax.sim.sine import turned_by
+from edqn_jax.sine import turned_by
 
 
 @struct.dataclass

@@ -17,7 +17,7 @@ from jax.typing import ArrayLike
 from edqn_jax.config import FAMILIES, MIXTURES
 from edqn_jax.config.loading import nearest
 from edqn_jax.errors import ConfigError
-from edqn_jax.random import integers
+from edqn_jax.keys import integers
 from edqn_jax.sim import canyon, forest, open_worlds, rooms
 from edqn_jax.sim.moving_worlds import MOVING_SHARE, STILL, Bodies, Moving, in_motion
 from edqn_jax.sim.scene import Scene, take_scene, with_equal_capacities

@@ -18,13 +18,13 @@ from edqn_jax.config.limits import validate
 from edqn_jax.errors import ConfigError
 from edqn_jax.evaluation import rollouts
 from edqn_jax.evaluation.missions import MissionSet, missions_of_runs
+from edqn_jax.keys import run_streams
 from edqn_jax.learn.policy import PolicyParams, fresh_policy
 from edqn_jax.learn.trainer import Trainer, TrainState
 from edqn_jax.parallel import processes
 from edqn_jax.parallel.devices import choose_devices
 from edqn_jax.planners.astar import Path as ShortestPath
 from edqn_jax.planners.astar import shortest_path
-from edqn_jax.random import run_streams
 from edqn_jax.sim import geodesic
 from edqn_jax.sim.env import World
 from edqn_jax.sim.flights import Flights

@@ -26,7 +26,7 @@ from edqn_jax.config import (
     LightConfig,
 )
 from edqn_jax.errors import ConfigError
-from edqn_jax.packages import require
+from edqn_jax.extras import require
 from edqn_jax.sim import drone, env, events, outcomes
 from edqn_jax.sim.drone import DroneState
 from edqn_jax.sim.env import EnvState

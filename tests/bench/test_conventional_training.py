@@ -20,9 +20,9 @@ from conventional_stack.vec_env import CodedDrones
 from conventional_stack.workers import SpreadFleet
 from edqn_jax.config import CameraConfig, Config, EncoderConfig
 from edqn_jax.errors import ConfigError
+from edqn_jax.extras import MissingPackageError, require
 from edqn_jax.learn import vae
 from edqn_jax.learn.waves import cosines
-from edqn_jax.packages import MissingPackageError, require
 from edqn_jax.runs.directory import plain
 from edqn_jax.sim.env import MOTION_SIZE, OWN_SIZE
 from edqn_jax.sim.events import EventField

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from edqn_jax.packages import MissingPackageError
+from edqn_jax.extras import MissingPackageError
 from edqn_jax.planners.planner import Budget, load_planner
 from tests.planners.small_worlds import WITHOUT_A_WAY, assert_flyable, box, small_world
 from tests.planners.uninstalled import hide

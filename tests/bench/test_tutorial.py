@@ -16,7 +16,7 @@ import pytest
 import tutorial
 from edqn_jax.config import CameraConfig, Config
 from edqn_jax.errors import ConfigError
-from edqn_jax.packages import require
+from edqn_jax.extras import require
 from edqn_jax.sim import drone, env, events
 from edqn_jax.sim.mjcf import load_scene
 from edqn_jax.sim.moves import ACTIONS

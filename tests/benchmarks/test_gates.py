@@ -11,7 +11,7 @@ import pytest
 
 import gates
 from edqn_jax.evaluation.missions import load_missions
-from edqn_jax.random import run_streams
+from edqn_jax.keys import run_streams
 from edqn_jax.sim.drone import hover
 from edqn_jax.sim.moves import move_name
 from edqn_jax.sim.outcomes import Outcome

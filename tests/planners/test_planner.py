@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from edqn_jax.packages import MissingPackageError, require
+from edqn_jax.extras import MissingPackageError, require
 from edqn_jax.planners import snn
 from edqn_jax.planners.planner import PLANNERS, load_planner, refusal
 from tests.planners.small_worlds import box, small_world

@@ -153,7 +153,7 @@ def test_a_place_without_the_right_to_write_is_named(given, tmp_path, monkeypatc
         raise PermissionError(13, "Permission denied")
 
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("edqn_jax.runs.files.tempfile.mkdtemp", refuse)
+    monkeypatch.setattr("edqn_jax.files.tempfile.mkdtemp", refuse)
     with pytest.raises(ConfigError, match=f"'{given or 'runs'}' cannot be written: .*Permission denied"):
         plan_run_directory(given, Config())
 

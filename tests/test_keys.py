@@ -10,8 +10,8 @@ import pytest
 from edqn_jax.cli.arguments import parse_train
 from edqn_jax.evaluation.missions import mission_key, run_missions
 from edqn_jax.evaluation.rollouts import flight_keys
+from edqn_jax.keys import integers, run_streams
 from edqn_jax.learn.trainer import InitialKeys, ShardKeys, init
-from edqn_jax.random import integers, run_streams
 from edqn_jax.sim import env, worlds
 from tests.miniature import MINIATURE
 

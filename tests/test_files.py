@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from edqn_jax.errors import ConfigError
-from edqn_jax.runs.files import check_can_make, check_can_write, write_atomically
+from edqn_jax.files import check_can_make, check_can_write, write_atomically
 
 
 @pytest.mark.parametrize("content", ["95 % \N{EN DASH} 97 %\n", b"\x00\xff"])
