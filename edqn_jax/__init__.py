@@ -85,13 +85,10 @@ __version__: str
 
 def __getattr__(name: str) -> Any:
     """Loads a public name when it is first used (PEP 562)."""
-    from importlib import import_module, metadata
+    from importlib import import_module
 
     if name == "__version__":
-        try:
-            value: Any = metadata.version("edqn-jax")
-        except metadata.PackageNotFoundError:  # run from a checkout that is not installed
-            value = "0+unknown"
+        value: Any = import_module(f"{__name__}.version").package_version()
     elif name in _MODULES:
         value = getattr(import_module(f"{__name__}.{_MODULES[name]}"), name)
     else:

@@ -8,9 +8,24 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-_RUN = 0xED09_0000
+RUN = 0xED09_0000
 """Folded into the key of every run's seed. Roots that are folded with counters, such as those of the test worlds, never
 reach it: these stay below 2^31. (`split(key, n)[i]` equals `fold_in(key, i)`.)"""
+
+RANDOM_WORLDS = 2_024
+"""Seed of the root of every random world's key."""
+
+FAMILY_OF_WORLD = 1_000_003
+"""Folded into the key of a world of a mixture to draw its family."""
+
+MOTION_OF_WORLD = 7_000_003
+"""Folded into the key of a world to draw what moves in it."""
+
+CROSSING_OF_WORLD = 9_000_011
+"""Folded into the key of a world to draw the missions of several drones in it."""
+
+FILE_MISSIONS = 7_919
+"""Seed of the root of the keys of evaluation missions in worlds from files."""
 
 
 class RunStreams(NamedTuple):
@@ -26,7 +41,7 @@ class RunStreams(NamedTuple):
 
 def run_streams(seed: int) -> RunStreams:
     """Returns the keys of a run with this seed; no other code derives keys from a run's seed."""
-    root = jax.random.fold_in(jax.random.key(seed), _RUN)
+    root = jax.random.fold_in(jax.random.key(seed), RUN)
     return RunStreams(*jax.random.split(root, len(RunStreams._fields)))
 
 

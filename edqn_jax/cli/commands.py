@@ -11,7 +11,6 @@ from importlib import metadata
 
 import tyro
 
-import edqn_jax
 from edqn_jax.cli.arguments import (
     CompletionArgs,
     EvaluateArgs,
@@ -36,6 +35,7 @@ from edqn_jax.cli.train import train_command
 from edqn_jax.config.loading import nearest
 from edqn_jax.errors import CheckError, ConfigError, DivergedError, StoppedError, sentence
 from edqn_jax.extras import MissingPackageError
+from edqn_jax.version import package_version
 
 DONE = 0
 FAILED = 1
@@ -112,7 +112,7 @@ def _dispatch(argv: Sequence[str], stops: Stops) -> int:
     elif command == "completion":
         print(completion_script(parse_completion(rest).shell, COMMANDS))
     elif command == "--version":
-        print(f"edqn-jax {edqn_jax.__version__}")
+        print(f"edqn-jax {package_version()}")
         for package in VERSIONS:
             print(f"{package} {metadata.version(package)}")
     elif command in ("-h", "--help"):

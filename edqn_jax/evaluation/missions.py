@@ -12,7 +12,7 @@ import numpy as np
 
 from edqn_jax.config import FAMILIES, Config
 from edqn_jax.errors import ConfigError
-from edqn_jax.keys import run_streams
+from edqn_jax.keys import CROSSING_OF_WORLD, FILE_MISSIONS, run_streams
 from edqn_jax.planners.astar import shortest_path
 from edqn_jax.planners.free_space import holds, reachable
 from edqn_jax.planners.lattice import CELL_M, lattice_shape
@@ -27,13 +27,6 @@ from edqn_jax.sim.reward import Reward
 from edqn_jax.sim.scene import Scene, stack_scenes, take_scene, with_equal_capacities
 
 Point = tuple[float, float, float]
-
-_MISSION_SEED = 7_919
-"""Root of the keys of evaluation missions in worlds from files; training derives its keys from other roots."""
-
-
-_CROSSING = 9_000_011
-"""Folded into the key of a world to draw the missions of several drones in it."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -187,7 +180,7 @@ def _flown_in(pool: Scene, config: Config, split: worlds.Split, first: int = 0) 
     if pool.spheres.throw is not None:
         raise ConfigError(f"with env.drones {drones} the world must throw no balls, which are for one drone alone")
     keys = worlds.world_keys(split, pool.start.shape[0], first)
-    missions = own_crossings(pool, drones, jax.vmap(lambda key: jax.random.fold_in(key, _CROSSING))(keys))
+    missions = own_crossings(pool, drones, jax.vmap(lambda key: jax.random.fold_in(key, CROSSING_OF_WORLD))(keys))
     pool = dataclasses.replace(pool, start=missions.start[::drones], goal=missions.goal[::drones])
     return World(airframe, pool, missions)
 
@@ -352,7 +345,7 @@ def _check_group(config: Config, name: str, missions: int, moved: dict[str, jax.
 
 def mission_key(seed: int) -> jax.Array:
     """Returns the key [] of the evaluation missions `seed` in worlds from files; the same in every version."""
-    return jax.random.fold_in(jax.random.key(_MISSION_SEED), seed)
+    return jax.random.fold_in(jax.random.key(FILE_MISSIONS), seed)
 
 
 def _file_missions(config: Config, name: str, missions: int, seed: int, moved: dict[str, jax.Array]) -> MissionSet:

@@ -15,12 +15,12 @@ from typing import Any, Literal
 
 import numpy as np
 
-import edqn_jax
 from edqn_jax.config import Config
 from edqn_jax.config.loading import apply, load_layer, to_yaml
 from edqn_jax.errors import ConfigError
 from edqn_jax.files import check_can_make, unwritable, write_atomically
 from edqn_jax.runs.lock import LOCK, Lock
+from edqn_jax.version import package_version
 
 Resume = Literal["auto", "never", "must"]
 
@@ -299,7 +299,7 @@ def _asks_for_more(run: RunDirectory, config: Config) -> bool:
 
 def config_text(config: Config) -> str:
     """Returns the content of a run's `config.yaml`: the version of this package, and every option."""
-    return f"{_VERSION}{edqn_jax.__version__}\n{to_yaml(config)}"
+    return f"{_VERSION}{package_version()}\n{to_yaml(config)}"
 
 
 def version_of(config_file: Path) -> str | None:

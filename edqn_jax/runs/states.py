@@ -18,10 +18,10 @@ from typing import Any
 import jax
 import numpy as np
 
-import edqn_jax
 from edqn_jax.errors import ConfigError, DamagedError
 from edqn_jax.files import unwritable
 from edqn_jax.runs import arrays, manifest
+from edqn_jax.version import package_version
 
 _NAME = re.compile(r"step-(\d{9,})")
 _HOST, _CONFIG = "host.json", "config.yaml"
@@ -107,7 +107,7 @@ def newest(
 
 def versions() -> dict[str, str]:
     """Returns the versions that a checkpoint belongs to."""
-    return {"edqn_jax": edqn_jax.__version__, "jax": jax.__version__}
+    return {"edqn_jax": package_version(), "jax": jax.__version__}
 
 
 def grown(files: Mapping[str, Path]) -> dict[str, list[Any]]:

@@ -17,7 +17,7 @@ from jax.typing import ArrayLike
 from edqn_jax.config import FAMILIES, MIXTURES
 from edqn_jax.config.loading import nearest
 from edqn_jax.errors import ConfigError
-from edqn_jax.keys import integers
+from edqn_jax.keys import FAMILY_OF_WORLD, MOTION_OF_WORLD, RANDOM_WORLDS, integers
 from edqn_jax.sim import canyon, forest, open_worlds, rooms
 from edqn_jax.sim.moving_worlds import MOVING_SHARE, STILL, Bodies, Moving, in_motion
 from edqn_jax.sim.scene import Scene, take_scene, with_equal_capacities
@@ -26,8 +26,6 @@ from edqn_jax.sim.ways import has_way
 RADIUS_M = 0.36
 """Of the sphere that has a way in every random world; the drone's."""
 
-_FAMILY = 1_000_003  # folded into the key of a world of a mixture to draw its family
-_MOTION = 7_000_003  # folded into the key of a world to draw what moves in it
 _AT_ONCE = 64  # worlds that are drawn by one call
 
 # ------------------------------------------------------------------------------------------- seeds
@@ -36,12 +34,11 @@ Split = Literal["training", "validation", "test"]
 SPLITS: dict[Split, int] = {"training": 0, "validation": 1, "test": 2}
 """The three ranges of random worlds. They are disjoint by construction: a world's key is the fixed root
 folded with its split's number, then with its index in the split."""
-_ROOT_SEED = 2024
 
 
 def world_key(split: Split, index: ArrayLike) -> Array:
     """Returns the key [] of world `index` (any non-negative integer) of a split."""
-    return jax.random.fold_in(jax.random.fold_in(jax.random.key(_ROOT_SEED), SPLITS[split]), index)
+    return jax.random.fold_in(jax.random.fold_in(jax.random.key(RANDOM_WORLDS), SPLITS[split]), index)
 
 
 def world_keys(split: Split, count: int, first: int = 0) -> Array:
@@ -121,7 +118,7 @@ def _checked(family: str, moving: Moving) -> tuple[str, Moving]:
 def families_of(mixture: str, keys: Array) -> list[str]:
     """Returns the family of each world of a mixture, from the worlds' keys [P]."""
     families = [family for family, share in MIXTURES[mixture].items() for _ in range(share)]
-    numbers = jax.vmap(lambda key: integers(jax.random.fold_in(key, _FAMILY), (), len(families)))(keys)
+    numbers = jax.vmap(lambda key: integers(jax.random.fold_in(key, FAMILY_OF_WORLD), (), len(families)))(keys)
     return [families[number] for number in np.asarray(numbers)]
 
 
@@ -155,7 +152,9 @@ def _set_in_motion(family: str, moving: Moving, scenes: Scene, keys: Array) -> S
     bodies = _FAMILIES[family].bodies
     if not moving.balls and not (moving.share and bodies):
         return scenes
-    return jax.vmap(lambda scene, key: in_motion(scene, moving, bodies, jax.random.fold_in(key, _MOTION)))(scenes, keys)
+    return jax.vmap(lambda scene, key: in_motion(scene, moving, bodies, jax.random.fold_in(key, MOTION_OF_WORLD)))(
+        scenes, keys
+    )
 
 
 def _standing(family: str, keys: Array) -> Scene:
