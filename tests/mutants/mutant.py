@@ -73,7 +73,7 @@ def put_into(mutant: Mutant, root: Path) -> Bug:
 
 
 def find_test(test: str, root: Path) -> str:
-    """Returns pytest's node id, under `root`, of a test that is named by file and function, as `test_env::test_it_flies`.
+    """Returns pytest's node id, under `root`, of a test named by file and function, as `test_env::test_flies`.
 
     Raises:
         MutantError: if there is not exactly one such test.
