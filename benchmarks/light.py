@@ -27,10 +27,10 @@ from typing import Any
 import success
 from edqn_jax.config import FAMILIES, Config
 from edqn_jax.config.loading import flown_under
+from edqn_jax.devices.devices import cores, most_that_divide, use_cpu_devices
 from edqn_jax.errors import ConfigError
 from edqn_jax.evaluation.missions import load_missions
 from edqn_jax.files import check_can_make
-from edqn_jax.parallel.devices import cores, most_that_divide, use_cpu_devices
 from measurement.flags import split
 
 REAL = ("--exposure.real",)

@@ -33,9 +33,9 @@ from conventional_stack.settings import DRONES, supported
 from edqn_jax.cli.arguments import parse_train
 from edqn_jax.config import FAMILIES, Config
 from edqn_jax.config.loading import nearest, to_yaml
+from edqn_jax.devices.devices import cores
 from edqn_jax.errors import ConfigError
 from edqn_jax.files import check_can_write
-from edqn_jax.parallel.devices import cores
 from edqn_jax.planners.planner import IMPROVING, PLANNERS
 from measurement import json_report
 from measurement.child import Child, ChildEndedError

@@ -12,7 +12,7 @@ from pathlib import Path
 import jax
 import pytest
 
-from edqn_jax.parallel.devices import use_cpu_devices
+from edqn_jax.devices.devices import use_cpu_devices
 
 CACHE = {
     "jax_compilation_cache_dir": "",

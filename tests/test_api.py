@@ -17,10 +17,10 @@ from matplotlib.figure import Figure
 import edqn_jax
 from edqn_jax.evaluation.missions import load_missions
 from edqn_jax.learn import vae
-from edqn_jax.sim.distance import signed_distance
-from edqn_jax.sim.env import nearness as nearness_of
-from edqn_jax.sim.moves import ACTIONS
-from edqn_jax.sim.sensor import DEPTH_SCALE, nearness
+from edqn_jax.sim.actions import ACTIONS
+from edqn_jax.sim.scene.distance import signed_distance
+from edqn_jax.sim.sensors.sensor import DEPTH_SCALE, nearness
+from edqn_jax.sim.task.env import nearness as nearness_of
 from edqn_jax.training import loop
 from tests.miniature import WORLD
 from tests.policies import CONFIG, always

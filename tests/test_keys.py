@@ -12,7 +12,8 @@ from edqn_jax.evaluation.missions import mission_key, run_missions
 from edqn_jax.evaluation.rollouts import flight_keys
 from edqn_jax.keys import integers, run_streams
 from edqn_jax.learn.trainer import InitialKeys, ShardKeys, init
-from edqn_jax.sim import env, worlds
+from edqn_jax.sim.task import env
+from edqn_jax.sim.worlds import families
 from tests.miniature import MINIATURE
 
 
@@ -50,7 +51,7 @@ def keys_of_a_run(seed: int) -> dict[str, jax.Array]:
         "flights' loop": jax.random.split(loop, 3),
         "roots": jnp.stack([*streams, initial.learner, loop]),
         "first keys of environments and shards": jnp.concatenate([initial.environments, initial.shards, environments]),
-        **{f"{split} worlds": worlds.world_keys(split, 64) for split in worlds.SPLITS},
+        **{f"{split} worlds": families.world_keys(split, 64) for split in families.SPLITS},
         "evaluation missions": jnp.stack([mission_key(number) for number in range(64)]),
     }
 
@@ -67,7 +68,7 @@ def test_no_two_streams_of_a_run_are_equal(seed: int) -> None:
 
 
 def test_runs_of_two_seeds_share_no_stream_but_worlds_and_evaluation_missions() -> None:
-    shared = {*(f"{split} worlds" for split in worlds.SPLITS), "evaluation missions"}
+    shared = {*(f"{split} worlds" for split in families.SPLITS), "evaluation missions"}
     first, second = keys_of_a_run(0), keys_of_a_run(1)
     for stream in first.keys() - shared:
         data = [{key.tobytes() for key in np.asarray(jax.random.key_data(run[stream]))} for run in (first, second)]

@@ -11,7 +11,8 @@ import pytest
 ROOT = Path(__file__).parents[1]
 
 ORDER = (
-    *("version", "errors", "keys", "files", "checks", "extras", "xla", "sine", "config", "parallel", "sim"),
+    *("version", "errors", "keys", "files", "checks", "extras", "xla", "sine", "config", "devices", "native"),
+    *("sim.actions", "sim.scene", "sim.worlds", "sim.physics", "sim.camera", "sim.sensors", "sim.task", "sim"),
     *("planners", "learn", "mapping", "policies", "runs", "evaluation", "report", "training", "interop", "cli"),
 )
 """Places of the package: a module imports from its own place and from those before it."""

@@ -29,8 +29,8 @@ from edqn_jax.errors import ConfigError
 from edqn_jax.extras import require
 from edqn_jax.learn.patch_encoder import is_recurrent
 from edqn_jax.learn.plan import Plan
-from edqn_jax.sim.flights import Flights
-from edqn_jax.sim.moves import ACTIONS
+from edqn_jax.sim.actions import ACTIONS
+from edqn_jax.sim.task.flights import Flights
 
 torch = require("torch")
 stable_baselines3 = require("stable_baselines3")

@@ -16,9 +16,9 @@ import jax
 
 from edqn_jax.config import Config
 from edqn_jax.config.loading import apply, load_layer
+from edqn_jax.devices.devices import use_cpu_devices
 from edqn_jax.errors import ConfigError
 from edqn_jax.extras import MissingPackageError
-from edqn_jax.parallel.devices import use_cpu_devices
 from edqn_jax.planners.planner import PLANNERS
 from edqn_jax.runs.directory import plain
 from measurement.child import answers

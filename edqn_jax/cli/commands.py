@@ -126,8 +126,8 @@ def _of_a_run(command: str, argv: Sequence[str]) -> None:
     """Runs a command on a finished run or a file; JAX is imported once the arguments are known to be right."""
     args = OF_A_RUN[command](argv)
 
-    from edqn_jax.parallel.devices import use_cpu_devices
-    from edqn_jax.parallel.programs import keep_programs
+    from edqn_jax.devices.cache import keep_programs
+    from edqn_jax.devices.devices import use_cpu_devices
 
     use_cpu_devices()
     keep_programs()

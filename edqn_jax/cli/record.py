@@ -17,9 +17,9 @@ from edqn_jax.files import check_can_write, write_atomically
 from edqn_jax.learn.policy import PolicyParams
 from edqn_jax.report.style import OUTCOME_LABELS
 from edqn_jax.runs.policies import load_run, worlds_replaced
-from edqn_jax.sim import group
-from edqn_jax.sim.flights import Flights
-from edqn_jax.sim.outcomes import Outcome
+from edqn_jax.sim.task import group
+from edqn_jax.sim.task.flights import Flights
+from edqn_jax.sim.task.outcomes import Outcome
 
 
 def record_command(args: RecordArgs) -> None:

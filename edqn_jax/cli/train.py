@@ -17,9 +17,9 @@ from edqn_jax.cli.arguments import TrainOptions, parse_train
 from edqn_jax.cli.signals import Stops
 from edqn_jax.config import FAMILIES, Config
 from edqn_jax.config.loading import gpu_layers, to_yaml
+from edqn_jax.devices.launch import how_to_join
 from edqn_jax.errors import ConfigError
 from edqn_jax.extras import SINKS
-from edqn_jax.parallel.launch import how_to_join
 from edqn_jax.runs.directory import RunDirectory, plan_run_directory
 
 if TYPE_CHECKING:
@@ -40,9 +40,9 @@ def train_command(argv: Sequence[str], stops: Stops) -> None:
 
     import jax
 
-    from edqn_jax.parallel import processes
-    from edqn_jax.parallel.devices import cores, most_that_divide, use_cpu_devices
-    from edqn_jax.parallel.programs import keep_programs
+    from edqn_jax.devices import processes
+    from edqn_jax.devices.cache import keep_programs
+    from edqn_jax.devices.devices import cores, most_that_divide, use_cpu_devices
     from edqn_jax.report.progress import Progress
     from edqn_jax.training.stopping import Stop
 
@@ -136,7 +136,7 @@ def options_to_compare(config: Config) -> str:
     """
     import jax
 
-    from edqn_jax.sim import native
+    from edqn_jax.sim.camera import native
 
     world = dataclasses.replace(config.world, name=_held(config.world.name), flown=_held(config.world.flown))
     in_c = native.is_at_hand("cpu" if jax.default_backend() == "cpu" else "cuda")
@@ -149,7 +149,7 @@ def _held(world: str) -> str:
     Raises:
         ConfigError: as `options_to_compare`.
     """
-    from edqn_jax.sim.mjcf import resolve_world
+    from edqn_jax.sim.scene.mjcf import resolve_world
 
     if not world or world in FAMILIES:
         return world

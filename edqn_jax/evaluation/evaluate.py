@@ -15,9 +15,9 @@ from edqn_jax.evaluation.metrics import shortest_paths, summarise
 from edqn_jax.evaluation.missions import MissionSet, Point, load_missions
 from edqn_jax.evaluation.rollouts import fly_on_all_devices
 from edqn_jax.learn.policy import Policy
-from edqn_jax.sim.flights import Flights
-from edqn_jax.sim.outcomes import Outcome
-from edqn_jax.sim.sensor import Form, sensor_of
+from edqn_jax.sim.sensors.sensor import Form, sensor_of
+from edqn_jax.sim.task.flights import Flights
+from edqn_jax.sim.task.outcomes import Outcome
 
 
 @dataclasses.dataclass(frozen=True)

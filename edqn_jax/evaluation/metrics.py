@@ -11,10 +11,10 @@ import numpy as np
 from edqn_jax.config import Config
 from edqn_jax.planners.astar import shortest_path
 from edqn_jax.planners.lattice import NoPathError
-from edqn_jax.sim.env import World
-from edqn_jax.sim.flights import Flights
-from edqn_jax.sim.outcomes import Outcome
-from edqn_jax.sim.scene import take_scene
+from edqn_jax.sim.scene.scene import take_scene
+from edqn_jax.sim.task.env import World
+from edqn_jax.sim.task.flights import Flights
+from edqn_jax.sim.task.outcomes import Outcome
 
 EMPTY_M = 1e5
 """A clearance beyond this is that of a world without shapes, metres: absent shapes are parked further away."""

@@ -12,8 +12,8 @@ from edqn_jax.config import Config
 from edqn_jax.evaluation.missions import MissionSet
 from edqn_jax.files import write_atomically
 from edqn_jax.runs.directory import TRAJECTORY_COLUMNS
-from edqn_jax.sim.flights import Flights
-from edqn_jax.sim.outcomes import Outcome
+from edqn_jax.sim.task.flights import Flights
+from edqn_jax.sim.task.outcomes import Outcome
 
 
 def trajectory(config: Config, flights: Flights, mission: int = 0) -> dict[str, np.ndarray]:

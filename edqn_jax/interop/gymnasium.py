@@ -32,11 +32,11 @@ from edqn_jax.interop import functional
 from edqn_jax.interop.functional import Box, FunctionalEnv, Kind, Params, State
 from edqn_jax.learn.code import Params as EncoderParams
 from edqn_jax.learn.policy import Policy
-from edqn_jax.sim.env import EnvState
-from edqn_jax.sim.environment import Environment
-from edqn_jax.sim.moves import ACTIONS
-from edqn_jax.sim.outcomes import Outcome
-from edqn_jax.sim.reward import Reward
+from edqn_jax.sim.actions import ACTIONS
+from edqn_jax.sim.task.env import EnvState
+from edqn_jax.sim.task.environment import Environment
+from edqn_jax.sim.task.outcomes import Outcome
+from edqn_jax.sim.task.reward import Reward
 
 gymnasium = require("gymnasium", extra="gym")
 

@@ -11,7 +11,7 @@ from jax import Array
 from jax.nn.initializers import constant, lecun_normal, zeros
 
 from edqn_jax.learn.layers import Dense
-from edqn_jax.sim.sensor import Form
+from edqn_jax.sim.sensors.sensor import Form
 
 Params = Any
 """Nested dictionaries of arrays."""

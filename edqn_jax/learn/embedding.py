@@ -8,8 +8,8 @@ from jax import Array
 from edqn_jax.config import Config
 from edqn_jax.learn import vae
 from edqn_jax.learn.code import EMBEDDED, Params
-from edqn_jax.sim.env import Observation
-from edqn_jax.sim.sensor import Form, sensor_of
+from edqn_jax.sim.sensors.sensor import Form, sensor_of
+from edqn_jax.sim.task.env import Observation
 
 
 def has_code(config: Config) -> bool:

@@ -20,7 +20,7 @@ from jax.nn.initializers import zeros
 from edqn_jax.config import EncoderConfig
 from edqn_jax.learn.code import CodeHead
 from edqn_jax.learn.layers import Dense, added
-from edqn_jax.sim.events import EventField
+from edqn_jax.sim.sensors.events import EventField
 
 
 def log_counts(field: EventField) -> list[Array]:

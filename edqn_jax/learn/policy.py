@@ -15,10 +15,10 @@ from edqn_jax.errors import ConfigError
 from edqn_jax.learn import embedding, vae
 from edqn_jax.learn.dqn import epsilon_greedy
 from edqn_jax.learn.qnetwork import Params, init_q, q_values
-from edqn_jax.sim.env import OWN_SIZE, Observation
-from edqn_jax.sim.events import EventField
-from edqn_jax.sim.moves import ACTIONS
-from edqn_jax.sim.sensor import DEPTH_SCALE, Sensed, distance_of, sensor_of
+from edqn_jax.sim.actions import ACTIONS
+from edqn_jax.sim.sensors.events import EventField
+from edqn_jax.sim.sensors.sensor import DEPTH_SCALE, Sensed, distance_of, sensor_of
+from edqn_jax.sim.task.env import OWN_SIZE, Observation
 
 MOVE_SIZE = 3
 """Values of the last move, which end the own motion (`sim.env.own_motion`)."""

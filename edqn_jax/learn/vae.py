@@ -22,9 +22,9 @@ from edqn_jax.learn.layers import Dense
 from edqn_jax.learn.patch_encoder import PatchEncoder, is_recurrent
 from edqn_jax.learn.pooled_encoder import PooledEncoder
 from edqn_jax.learn.waves import OUTPUT_SCALE, cosines, mirrored, wave_images
-from edqn_jax.sim.env import MOTION_SIZE
-from edqn_jax.sim.events import EventField
-from edqn_jax.sim.sensor import Form
+from edqn_jax.sim.sensors.events import EventField
+from edqn_jax.sim.sensors.sensor import Form
+from edqn_jax.sim.task.env import MOTION_SIZE
 
 
 @struct.dataclass

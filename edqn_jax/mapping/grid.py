@@ -25,7 +25,7 @@ from jax.typing import ArrayLike
 
 from edqn_jax.config import CameraConfig
 from edqn_jax.errors import ConfigError
-from edqn_jax.sim import raycast
+from edqn_jax.sim.camera import raycast
 
 MOST_CELLS = 40_000_000
 """Cells of the largest grid, as of the planners' largest lattice."""

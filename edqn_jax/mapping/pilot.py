@@ -26,21 +26,25 @@ from flax import struct
 from jax import Array
 
 from edqn_jax.config import Config
+from edqn_jax.devices.devices import compiler_options
 from edqn_jax.errors import ConfigError
 from edqn_jax.learn import embedding, policy, vae
 from edqn_jax.learn.policy import Memory, PolicyParams
 from edqn_jax.mapping.grid import Grid, MapConfig, empty_grid, grid_shape, update
 from edqn_jax.mapping.route import RouteConfig, Router
-from edqn_jax.parallel.devices import compiler_options
 from edqn_jax.planners.follow import FollowConfig, sampled, steer
-from edqn_jax.sim import balls, camera, disturbances, drone, env, sensor
-from edqn_jax.sim.drone import DroneState, Flight
-from edqn_jax.sim.env import World
-from edqn_jax.sim.flights import Flights, at_start, tally
-from edqn_jax.sim.motion import Aim
-from edqn_jax.sim.outcomes import Outcome, judge
-from edqn_jax.sim.scene import Scene, moves, scene_at
-from edqn_jax.sim.sensor import DEPTH_SCALE, SensorMemory, distance_of, mount_rotation
+from edqn_jax.sim.camera import camera
+from edqn_jax.sim.physics import disturbances, drone
+from edqn_jax.sim.physics.drone import DroneState, Flight
+from edqn_jax.sim.scene import launches
+from edqn_jax.sim.scene.motion import Aim
+from edqn_jax.sim.scene.scene import Scene, moves, scene_at
+from edqn_jax.sim.sensors import sensor
+from edqn_jax.sim.sensors.sensor import DEPTH_SCALE, SensorMemory, distance_of, mount_rotation
+from edqn_jax.sim.task import env
+from edqn_jax.sim.task.env import World
+from edqn_jax.sim.task.flights import Flights, at_start, tally
+from edqn_jax.sim.task.outcomes import Outcome, judge
 
 POINTS = 128
 """Points, `planners.follow.SPACING_M` apart, of the part of a plan that the follower is given."""
@@ -234,7 +238,7 @@ def decide(
     poses = env.poses_seen(config, before, env.timed(config, flight, steps if moves(scene) else None))
     running = flying.flights.outcome == Outcome.RUNNING
     keep = functools.partial(jax.tree.map, lambda new, old: jnp.where(running, new, old))
-    thrown = balls.thrown(
+    thrown = launches.thrown(
         config, scene, flying.aim, flights.decisions, after.position, after.position - before.position
     )
     # Before looking, so that the map, by far the largest part, need not be chosen as a whole.
@@ -262,7 +266,7 @@ def at_rest(
         depth=jnp.full((config.camera.height, config.camera.width), jnp.inf),
         flights=at_start(config, scene, body),
         key=key,
-        aim=balls.thrown(config, scene, balls.nobody_aimed_at(world.pool), jnp.int32(0), start, jnp.zeros(3)),
+        aim=launches.thrown(config, scene, launches.nobody_aimed_at(world.pool), jnp.int32(0), start, jnp.zeros(3)),
     )
 
 

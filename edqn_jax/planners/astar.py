@@ -31,9 +31,9 @@ from edqn_jax.config import FAMILIES, Config
 from edqn_jax.errors import ConfigError
 from edqn_jax.planners.lattice import CELL_M, FINE_M, STEPS, Lattice, NoPathError, is_small, leg_touches
 from edqn_jax.planners.planner import path_length, point_text
-from edqn_jax.sim.mjcf import check_scene, load_world, resolve_world
-from edqn_jax.sim.scene import Scene
-from edqn_jax.sim.worlds import random_scene, world_key
+from edqn_jax.sim.scene.mjcf import check_scene, load_world, resolve_world
+from edqn_jax.sim.scene.scene import Scene
+from edqn_jax.sim.worlds.families import random_scene, world_key
 
 _SLACK = 1.0  # a batch holds entries up to this many cells above the best: fewer batches, a few cells too many
 

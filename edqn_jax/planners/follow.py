@@ -19,15 +19,15 @@ import numpy as np
 from jax import Array
 
 from edqn_jax.config import Config, EnvConfig
+from edqn_jax.devices.devices import compiler_options
 from edqn_jax.errors import ConfigError
-from edqn_jax.parallel.devices import compiler_options
 from edqn_jax.planners.planner import Task
-from edqn_jax.sim import drone
-from edqn_jax.sim.drone import Airframe, DroneState
-from edqn_jax.sim.env import bearing
-from edqn_jax.sim.flights import Flights, at_start, tally
-from edqn_jax.sim.outcomes import Outcome, judge
-from edqn_jax.sim.scene import Scene
+from edqn_jax.sim.physics import drone
+from edqn_jax.sim.physics.drone import Airframe, DroneState
+from edqn_jax.sim.scene.scene import Scene
+from edqn_jax.sim.task.env import bearing
+from edqn_jax.sim.task.flights import Flights, at_start, tally
+from edqn_jax.sim.task.outcomes import Outcome, judge
 
 SPACING_M = 0.1
 """Metres between the points of a sampled path."""

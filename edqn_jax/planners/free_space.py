@@ -12,7 +12,7 @@ from scipy.sparse.csgraph import connected_components
 
 from edqn_jax.planners.lattice import CELL_M, FINE_M, STEPS, Lattice, NoPathError, is_small
 from edqn_jax.planners.planner import point_text
-from edqn_jax.sim.scene import Scene
+from edqn_jax.sim.scene.scene import Scene
 
 NICHES = 1e-3
 """Share of the free space that closed places may have in an open world: under a ball, between blocks that overlap."""

@@ -16,8 +16,8 @@ from jax import Array
 
 from edqn_jax.errors import ConfigError
 from edqn_jax.planners.planner import point_text
-from edqn_jax.sim.distance import segment_contact, signed_distance
-from edqn_jax.sim.scene import Scene
+from edqn_jax.sim.scene.distance import segment_contact, signed_distance
+from edqn_jax.sim.scene.scene import Scene
 
 STEPS = np.array([step for step in itertools.product((-1, 0, 1), repeat=3) if any(step)])
 """From a cell to its neighbours, [26, 3] cells."""

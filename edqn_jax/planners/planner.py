@@ -14,8 +14,8 @@ import numpy as np
 import numpy.typing as npt
 
 from edqn_jax.errors import ConfigError
-from edqn_jax.sim.distance import signed_distance
-from edqn_jax.sim.scene import Scene
+from edqn_jax.sim.scene.distance import signed_distance
+from edqn_jax.sim.scene.scene import Scene
 
 MARGIN = 1e-3
 """Metres of clearance beyond the body, so that neither sampling nor float32 of a check finds a contact."""

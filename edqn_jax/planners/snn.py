@@ -35,8 +35,8 @@ from jax import Array, lax
 from jax.typing import ArrayLike
 
 from edqn_jax.planners.planner import MARGIN, Budget, Plan, Task, found, not_found, refusal
-from edqn_jax.sim.distance import segment_contact, shape_distances, signed_distance
-from edqn_jax.sim.scene import Scene
+from edqn_jax.sim.scene.distance import segment_contact, shape_distances, signed_distance
+from edqn_jax.sim.scene.scene import Scene
 
 DIRECTIONS = np.array([step for step in itertools.product((-1, 0, 1), repeat=3) if any(step)])
 """[26, 3] from a cell to its neighbours; the opposite of direction k is 25 - k."""

@@ -12,7 +12,7 @@ import math
 import numpy as np
 
 from edqn_jax.extras import require
-from edqn_jax.sim.scene import (
+from edqn_jax.sim.scene.scene import (
     PARKED,
     Capsules,
     Planes,

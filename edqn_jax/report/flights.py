@@ -28,7 +28,7 @@ from edqn_jax.report.solids import (
     standing,
 )
 from edqn_jax.report.style import INK, MUTED, OUTCOME_COLOURS, OUTCOME_LABELS, drawing
-from edqn_jax.sim.scene import PARKED, Scene
+from edqn_jax.sim.scene.scene import PARKED, Scene
 
 OBLIQUE = View(azimuth=-62.0, elevation=34.0)
 SPEED_COLOURS = "viridis"

@@ -11,7 +11,7 @@ from edqn_jax.report.flights import draw_path, draw_world
 from edqn_jax.report.images import LOOKS, RECONSTRUCTED_EVENTS, draw_reconstruction, draw_sight
 from edqn_jax.report.sights import Sights, coarse, decision_rows, poses, times_of
 from edqn_jax.runs.directory import TRAJECTORY_COLUMNS, RunDirectory
-from edqn_jax.sim.camera import on_screen
+from edqn_jax.sim.camera.camera import on_screen
 
 MOMENTS = 5
 """Moments of the flight that are shown."""

@@ -20,9 +20,9 @@ from PIL import Image
 
 from edqn_jax.report.animation import gif
 from edqn_jax.report.style import LINE, MUTED, SECOND_LINE, STYLE, drawing
-from edqn_jax.sim.distance import signed_distance
-from edqn_jax.sim.scene import Scene, scene_at
-from edqn_jax.sim.sensor import nearness
+from edqn_jax.sim.scene.distance import signed_distance
+from edqn_jax.sim.scene.scene import Scene, scene_at
+from edqn_jax.sim.sensors.sensor import nearness
 
 UNKNOWN, FREE, OCCUPIED = range(3)
 """What is known of a cell, in the order of `COLOURS`."""

@@ -13,7 +13,7 @@ from edqn_jax.evaluation.judge import Judge, Target, clearance, replay_contact
 from edqn_jax.evaluation.metrics import EMPTY_M
 from edqn_jax.evaluation.missions import RunMissions
 from edqn_jax.evaluation.verdicts import CONTACT_TOLERANCE_M
-from edqn_jax.sim.outcomes import Outcome
+from edqn_jax.sim.task.outcomes import Outcome
 from edqn_jax.training.selection import FLIES
 
 DIGITS = 1e-5

@@ -13,17 +13,17 @@ import numpy as np
 
 from edqn_jax.config import Config
 from edqn_jax.config.loading import apply, parse_layer
+from edqn_jax.devices import processes
 from edqn_jax.errors import ConfigError
 from edqn_jax.learn import saved_state
 from edqn_jax.learn.policy import PolicyParams
-from edqn_jax.parallel import processes
 from edqn_jax.runs import states, world_copy
 from edqn_jax.runs.checkpoints import save_params
 from edqn_jax.runs.continuation import MAY_CHANGE, differences
 from edqn_jax.runs.directory import RunDirectory, config_text
 from edqn_jax.runs.provenance import reward_record
 from edqn_jax.runs.states import Checkpoint
-from edqn_jax.sim.reward import Reward
+from edqn_jax.sim.task.reward import Reward
 from edqn_jax.training.loop import AgentStanding, Standing
 from edqn_jax.training.preparation import Preparation
 from edqn_jax.training.selection import Candidate

@@ -15,20 +15,20 @@ from jax.sharding import Mesh
 
 from edqn_jax.config import Config
 from edqn_jax.config.limits import validate
+from edqn_jax.devices import processes
+from edqn_jax.devices.devices import choose_devices
 from edqn_jax.errors import ConfigError
 from edqn_jax.evaluation import rollouts
 from edqn_jax.evaluation.missions import MissionSet, missions_of_runs
 from edqn_jax.keys import run_streams
 from edqn_jax.learn.policy import PolicyParams, fresh_policy
 from edqn_jax.learn.trainer import Trainer, TrainState
-from edqn_jax.parallel import processes
-from edqn_jax.parallel.devices import choose_devices
 from edqn_jax.planners.astar import Path as ShortestPath
 from edqn_jax.planners.astar import shortest_path
-from edqn_jax.sim import geodesic
-from edqn_jax.sim.env import World
-from edqn_jax.sim.flights import Flights
-from edqn_jax.sim.reward import Reward
+from edqn_jax.sim.task.env import World
+from edqn_jax.sim.task.flights import Flights
+from edqn_jax.sim.task.reward import Reward
+from edqn_jax.sim.worlds import geodesic
 
 
 class Display(Protocol):

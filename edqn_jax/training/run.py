@@ -11,6 +11,7 @@ import jax
 import numpy as np
 
 from edqn_jax.config import FAMILIES, Config
+from edqn_jax.devices import processes
 from edqn_jax.errors import ConfigError, StoppedError
 from edqn_jax.evaluation.companions import scene_of_flight
 from edqn_jax.evaluation.metrics import clearance_text, flight_summary
@@ -18,15 +19,14 @@ from edqn_jax.evaluation.trajectories import trajectory
 from edqn_jax.learn import saved_state
 from edqn_jax.learn.plan import Plan
 from edqn_jax.learn.trainer import Trainer, TrainState
-from edqn_jax.parallel import processes
 from edqn_jax.report.gallery import draw_gallery
 from edqn_jax.report.progress import Progress, clock
 from edqn_jax.report.sights import Sights
 from edqn_jax.runs import world_copy
 from edqn_jax.runs.directory import TO_BE_DRAWN, RunDirectory
 from edqn_jax.runs.provenance import state_digest
-from edqn_jax.sim.flights import Flights
-from edqn_jax.sim.reward import Reward
+from edqn_jax.sim.task.flights import Flights
+from edqn_jax.sim.task.reward import Reward
 from edqn_jax.training import summaries
 from edqn_jax.training.keeper import Keeper
 from edqn_jax.training.loop import Callback, Chunk, Standing, TrainingResult, run_chunks

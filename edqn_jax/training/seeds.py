@@ -6,12 +6,12 @@ import time
 from typing import Any
 
 from edqn_jax.config import Config
+from edqn_jax.devices import processes
 from edqn_jax.errors import StoppedError
-from edqn_jax.parallel import processes
 from edqn_jax.report.progress import Progress, clock
 from edqn_jax.runs.directory import RunDirectory
 from edqn_jax.runs.provenance import state_digest
-from edqn_jax.sim.reward import Reward
+from edqn_jax.sim.task.reward import Reward
 from edqn_jax.training import summaries
 from edqn_jax.training.keeper import Keeper
 from edqn_jax.training.loop import Callback, run_chunks

@@ -10,13 +10,13 @@ import jax
 import numpy as np
 
 from edqn_jax.config import Config
+from edqn_jax.devices.devices import processor
 from edqn_jax.evaluation.intervals import interquartile_mean, rate_interval
 from edqn_jax.evaluation.metrics import flight_summary, summarise
-from edqn_jax.parallel.devices import processor
 from edqn_jax.runs.provenance import reward_record, versions, workload
-from edqn_jax.sim.flights import Flights
-from edqn_jax.sim.outcomes import Outcome
-from edqn_jax.sim.reward import Reward
+from edqn_jax.sim.task.flights import Flights
+from edqn_jax.sim.task.outcomes import Outcome
+from edqn_jax.sim.task.reward import Reward
 from edqn_jax.training.loop import TrainingResult
 from edqn_jax.training.preparation import Preparation
 from edqn_jax.training.selection import first_success

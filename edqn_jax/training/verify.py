@@ -17,6 +17,7 @@ import jax
 import numpy as np
 
 from edqn_jax.config import Config
+from edqn_jax.devices.devices import processor
 from edqn_jax.errors import ConfigError
 from edqn_jax.evaluation.metrics import flight_summary
 from edqn_jax.evaluation.missions import RunMissions, missions_of_runs
@@ -26,7 +27,6 @@ from edqn_jax.evaluation.verdicts import check_verdicts, judges_of
 from edqn_jax.learn import saved_state
 from edqn_jax.learn.policy import PolicyParams
 from edqn_jax.learn.trainer import Trainer
-from edqn_jax.parallel.devices import processor
 from edqn_jax.planners.astar import shortest_path
 from edqn_jax.policies import no_run
 from edqn_jax.runs import states
@@ -36,8 +36,8 @@ from edqn_jax.runs.policies import load_run
 from edqn_jax.runs.provenance import digest_of, versions, workload
 from edqn_jax.runs.states import Checkpoint
 from edqn_jax.runs.world_copy import WORLD
-from edqn_jax.sim import group
-from edqn_jax.sim.flights import Flights
+from edqn_jax.sim.task import group
+from edqn_jax.sim.task.flights import Flights
 from edqn_jax.training.derived import DIGITS, from_metrics, from_trajectory, same
 from edqn_jax.training.keeper import kept_name
 from edqn_jax.training.selection import first_success

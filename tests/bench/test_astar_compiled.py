@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 from edqn_jax.planners import astar, astar_compiled, lattice, snn
 from edqn_jax.planners.planner import Budget, Plan, Task
 from edqn_jax.planners.solids import solid_table
-from edqn_jax.sim.mjcf import load_scene, resolve_world
-from edqn_jax.sim.worlds import random_scene, world_key
+from edqn_jax.sim.scene.mjcf import load_scene, resolve_world
+from edqn_jax.sim.worlds.families import random_scene, world_key
 from tests.planners.small_worlds import RADIUS, assert_flyable, box, random_small_world, small_world
 
 

@@ -24,9 +24,9 @@ from edqn_jax.extras import MissingPackageError, require
 from edqn_jax.learn import vae
 from edqn_jax.learn.waves import cosines
 from edqn_jax.runs.directory import plain
-from edqn_jax.sim.env import MOTION_SIZE, OWN_SIZE
-from edqn_jax.sim.events import EventField
-from edqn_jax.sim.outcomes import Outcome
+from edqn_jax.sim.sensors.events import EventField
+from edqn_jax.sim.task.env import MOTION_SIZE, OWN_SIZE
+from edqn_jax.sim.task.outcomes import Outcome
 from measurement.flags import configured
 from rivals import stack
 from tests.bench.conventional_course import course_of

@@ -14,7 +14,7 @@ from edqn_jax.errors import ConfigError
 from edqn_jax.learn.policy import Policy
 from edqn_jax.mapping.pilot import TUNED
 from edqn_jax.runs.policies import save_policy
-from edqn_jax.sim.mjcf import load_world
+from edqn_jax.sim.scene.mjcf import load_world
 from tests.policies import CONFIG, fresh
 
 WORLD = """<mujoco><worldbody>

@@ -10,7 +10,7 @@ import pytest
 from edqn_jax.planners import potential_field
 from edqn_jax.planners.planner import Budget
 from edqn_jax.planners.solids import solid_table
-from edqn_jax.sim.distance import shape_distances
+from edqn_jax.sim.scene.distance import shape_distances
 from tests.planners.small_worlds import RADIUS, assert_flyable, box, small_world
 
 CONFIG = potential_field.ApfConfig()

@@ -9,7 +9,7 @@ import pytest
 from edqn_jax.cli.arguments import parse_train
 from edqn_jax.config import Config
 from edqn_jax.planners.planner import PLANNERS
-from edqn_jax.sim.mjcf import write_scene
+from edqn_jax.sim.scene.mjcf import write_scene
 from rivals.planning import Planning
 from tests.planners.small_worlds import WITHOUT_A_WAY, box, small_world
 

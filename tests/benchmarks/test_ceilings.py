@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from edqn_jax.parallel.devices import cores
+from edqn_jax.devices.devices import cores
 from measurement import ceilings
 from measurement.flags import configured
 

@@ -15,7 +15,7 @@ import pytest
 from edqn_jax.cli.arguments import parse_train
 from edqn_jax.config import Config
 from edqn_jax.config.loading import to_yaml
-from edqn_jax.sim.mjcf import write_scene
+from edqn_jax.sim.scene.mjcf import write_scene
 from rivals import learners, planning, rival, table
 from tests.benchmarks.turns import row
 from tests.miniature import MINIATURE

@@ -16,7 +16,7 @@ from conventional_stack.settings import supported
 from edqn_jax.config import Config
 from edqn_jax.errors import ConfigError
 from edqn_jax.planners.planner import PLANNERS
-from edqn_jax.sim.mjcf import write_scene
+from edqn_jax.sim.scene.mjcf import write_scene
 from measurement.child import ChildEndedError
 from rivals import stack, table
 from tests.benchmarks.turns import flights, row, turn

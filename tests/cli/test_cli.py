@@ -19,9 +19,9 @@ from edqn_jax.cli.arguments import parse_train, train_flags
 from edqn_jax.cli.help import COMMON, flag_of
 from edqn_jax.config import Config, preset
 from edqn_jax.config.loading import RANDOM_WORLDS, make_config
+from edqn_jax.devices import devices
 from edqn_jax.errors import CheckError, ConfigError, DivergedError, StoppedError
-from edqn_jax.parallel import devices
-from edqn_jax.sim.mjcf import SceneError
+from edqn_jax.sim.scene.mjcf import SceneError
 from tests.processes import PATIENCE_S
 
 ROOT = Path(__file__).parents[2]

@@ -21,9 +21,9 @@ from edqn_jax.learn.policy import fresh_policy
 from edqn_jax.runs.checkpoints import save_params
 from edqn_jax.runs.policies import load_run
 from edqn_jax.runs.provenance import workload
-from edqn_jax.sim import mjcf
-from edqn_jax.sim.env import MOTION_SIZE, Observation, World
-from edqn_jax.sim.sensor import Form
+from edqn_jax.sim.scene import mjcf
+from edqn_jax.sim.sensors.sensor import Form
+from edqn_jax.sim.task.env import MOTION_SIZE, Observation, World
 from tests.learn.moving_boxes import frames
 from tests.miniature import miniature_world
 from tests.whole.test_trainer import CONFIG

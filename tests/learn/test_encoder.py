@@ -14,9 +14,9 @@ import pytest
 from edqn_jax.config import CameraConfig, EncoderConfig, EventsConfig
 from edqn_jax.learn import pooled_encoder, vae
 from edqn_jax.learn.code import kl_divergence
-from edqn_jax.sim import events as ev
-from edqn_jax.sim.env import MOTION_SIZE
-from edqn_jax.sim.sensor import Form
+from edqn_jax.sim.sensors import events as ev
+from edqn_jax.sim.sensors.sensor import Form
+from edqn_jax.sim.task.env import MOTION_SIZE
 from tests.learn.moving_boxes import fields
 
 CAMERA = CameraConfig()

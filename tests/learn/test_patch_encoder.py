@@ -14,9 +14,9 @@ import pytest
 from edqn_jax.config import CameraConfig, EncoderConfig, EventsConfig
 from edqn_jax.learn import vae
 from edqn_jax.learn.patch_encoder import log_counts, patch_places, patches
-from edqn_jax.sim import events as ev
-from edqn_jax.sim.env import MOTION_SIZE
-from edqn_jax.sim.sensor import Form
+from edqn_jax.sim.sensors import events as ev
+from edqn_jax.sim.sensors.sensor import Form
+from edqn_jax.sim.task.env import MOTION_SIZE
 from tests.oracles import patch_encoder_plain
 
 SMALL = CameraConfig(width=10, height=6)  # no multiple of a patch's side

@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edqn_jax.planners.planner import Task
-from edqn_jax.sim.distance import signed_distance
-from edqn_jax.sim.scene import Planes, Scene, Shape, UprightBoxes, build_scene
+from edqn_jax.sim.scene.distance import signed_distance
+from edqn_jax.sim.scene.scene import Planes, Scene, Shape, UprightBoxes, build_scene
 
 RADIUS = 0.36
 GREY = np.full(3, 0.5)

@@ -14,8 +14,8 @@ import pytest
 
 from edqn_jax.planners import snn
 from edqn_jax.planners.planner import MARGIN, Budget, Task
-from edqn_jax.sim.mjcf import load_scene, resolve_world
-from edqn_jax.sim.worlds import random_scene, world_key
+from edqn_jax.sim.scene.mjcf import load_scene, resolve_world
+from edqn_jax.sim.worlds.families import random_scene, world_key
 from tests.oracles.breadth_first import hop_counts
 from tests.planners.small_worlds import (
     RADIUS,

@@ -23,14 +23,14 @@ from jax import Array
 
 from edqn_jax.cli import main
 from edqn_jax.config import CameraConfig
+from edqn_jax.devices import devices, processes
 from edqn_jax.evaluation import rollouts
 from edqn_jax.learn.policy import fresh_policy
 from edqn_jax.learn.trainer import Episodes, Losses, Trainer, TrainState
 from edqn_jax.learn.updates import Learner
-from edqn_jax.parallel import devices, processes
 from edqn_jax.runs.directory import plain
-from edqn_jax.sim import camera
-from edqn_jax.sim.scene import Scene
+from edqn_jax.sim.camera import camera
+from edqn_jax.sim.scene.scene import Scene
 from edqn_jax.training import run
 from tests.miniature import no_losses
 
