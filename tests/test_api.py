@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 
 import edqn_jax
 from edqn_jax.evaluation.missions import load_missions
-from edqn_jax.learn import vae
+from edqn_jax.learn.perception import vae
 from edqn_jax.sim.actions import ACTIONS
 from edqn_jax.sim.scene.distance import signed_distance
 from edqn_jax.sim.sensors.sensor import DEPTH_SCALE, nearness

@@ -14,7 +14,7 @@ from conventional_stack import camera, events, flight, task, world
 from conventional_stack.stopwatch import Stopwatch
 from edqn_jax.config import Config
 from edqn_jax.errors import ConfigError
-from edqn_jax.learn.vae import needs_nearness
+from edqn_jax.learn.perception.vae import needs_nearness
 from edqn_jax.sim.actions import ACTIONS
 from edqn_jax.sim.physics import disturbances
 from edqn_jax.sim.scene.scene import take_scene

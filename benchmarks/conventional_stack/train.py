@@ -27,7 +27,7 @@ from conventional_stack.workers import SpreadFleet
 from edqn_jax.config import Config
 from edqn_jax.errors import ConfigError
 from edqn_jax.extras import require
-from edqn_jax.learn.patch_encoder import is_recurrent
+from edqn_jax.learn.perception.patch_encoder import is_recurrent
 from edqn_jax.learn.plan import Plan
 from edqn_jax.sim.actions import ACTIONS
 from edqn_jax.sim.task.flights import Flights

@@ -14,7 +14,8 @@ from jax import Array
 from jax.sharding import PartitionSpec
 
 from edqn_jax.config import Config
-from edqn_jax.learn import dqn, qnetwork, replay, updates, vae
+from edqn_jax.learn import dqn, qnetwork, replay, updates
+from edqn_jax.learn.perception import vae
 from edqn_jax.learn.plan import Plan
 from edqn_jax.learn.samples import Samples
 from edqn_jax.learn.trainer import AXIS, Actors, TrainState

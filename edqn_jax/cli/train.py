@@ -44,7 +44,7 @@ def train_command(argv: Sequence[str], stops: Stops) -> None:
     from edqn_jax.devices.cache import keep_programs
     from edqn_jax.devices.devices import cores, most_that_divide, use_cpu_devices
     from edqn_jax.report.progress import Progress
-    from edqn_jax.training.stopping import Stop
+    from edqn_jax.runs.stopping import Stop
 
     most = 1 if config.train.debug else most_that_divide(config.train.shards, cores())
     use_cpu_devices(config.train.devices or most)
@@ -65,11 +65,11 @@ def train_command(argv: Sequence[str], stops: Stops) -> None:
     stop = Stop(stops.requested, lambda: stops.obeyed(progress.message))
     try:
         if options.seeds is None:
-            from edqn_jax.training.run import train_run
+            from edqn_jax.runs.record import train_run
 
             train_run(config, run, progress, stop, callback=sinks)
         else:
-            from edqn_jax.training.seeds import train_seeds_run
+            from edqn_jax.runs.seeds import train_seeds_run
 
             train_seeds_run(config, options.seeds, run, progress, stop, callback=sinks)
     except jax.errors.JaxRuntimeError as error:

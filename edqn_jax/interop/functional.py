@@ -23,8 +23,8 @@ from jax import Array
 from edqn_jax.config import FAMILIES, Config
 from edqn_jax.config.loading import make_config
 from edqn_jax.errors import ConfigError
-from edqn_jax.learn import embedding
-from edqn_jax.learn.code import Params as EncoderParams
+from edqn_jax.learn.perception import embedding
+from edqn_jax.learn.perception.code import Params as EncoderParams
 from edqn_jax.learn.policy import Policy
 from edqn_jax.sim.actions import ACTIONS
 from edqn_jax.sim.sensors import events

@@ -30,7 +30,7 @@ from edqn_jax.errors import ConfigError
 from edqn_jax.extras import require
 from edqn_jax.interop import functional
 from edqn_jax.interop.functional import Box, FunctionalEnv, Kind, Params, State
-from edqn_jax.learn.code import Params as EncoderParams
+from edqn_jax.learn.perception.code import Params as EncoderParams
 from edqn_jax.learn.policy import Policy
 from edqn_jax.sim.actions import ACTIONS
 from edqn_jax.sim.task.env import EnvState

@@ -12,8 +12,8 @@ from jax import Array
 
 from edqn_jax.config import Config
 from edqn_jax.errors import ConfigError
-from edqn_jax.learn import embedding, vae
 from edqn_jax.learn.dqn import epsilon_greedy
+from edqn_jax.learn.perception import embedding, vae
 from edqn_jax.learn.qnetwork import Params, init_q, q_values
 from edqn_jax.sim.actions import ACTIONS
 from edqn_jax.sim.sensors.events import EventField

@@ -21,8 +21,8 @@ from jax import Array
 from edqn_jax.checks import check_index
 from edqn_jax.config import EncoderConfig
 from edqn_jax.keys import integers
-from edqn_jax.learn import vae
-from edqn_jax.learn.vae import Target
+from edqn_jax.learn.perception import vae
+from edqn_jax.learn.perception.vae import Target
 from edqn_jax.sim.sensors.events import EventField
 from edqn_jax.sim.task.env import MIRRORED_MOTION, Observation
 

@@ -26,8 +26,9 @@ from edqn_jax.devices import processes
 from edqn_jax.devices.devices import compiler_options
 from edqn_jax.errors import ConfigError
 from edqn_jax.keys import run_streams
-from edqn_jax.learn import dqn, embedding, policy, replay, samples, vae
+from edqn_jax.learn import dqn, policy, replay, samples
 from edqn_jax.learn.checked import CheckedChunk, one_by_one
+from edqn_jax.learn.perception import embedding, vae
 from edqn_jax.learn.plan import Plan
 from edqn_jax.learn.policy import PolicyParams, empty_memory, observation_size
 from edqn_jax.learn.samples import Samples

@@ -18,7 +18,8 @@ from jax.flatten_util import ravel_pytree
 
 from edqn_jax.config import Config
 from edqn_jax.keys import split_each
-from edqn_jax.learn import dqn, embedding, qnetwork, replay, samples, vae
+from edqn_jax.learn import dqn, qnetwork, replay, samples
+from edqn_jax.learn.perception import embedding, vae
 from edqn_jax.learn.plan import Plan
 from edqn_jax.learn.policy import observation_size
 from edqn_jax.learn.qnetwork import Params

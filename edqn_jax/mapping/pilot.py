@@ -28,7 +28,8 @@ from jax import Array
 from edqn_jax.config import Config
 from edqn_jax.devices.devices import compiler_options
 from edqn_jax.errors import ConfigError
-from edqn_jax.learn import embedding, policy, vae
+from edqn_jax.learn import policy
+from edqn_jax.learn.perception import embedding, vae
 from edqn_jax.learn.policy import Memory, PolicyParams
 from edqn_jax.mapping.grid import Grid, MapConfig, empty_grid, grid_shape, update
 from edqn_jax.mapping.route import RouteConfig, Router

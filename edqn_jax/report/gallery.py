@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from edqn_jax.learn import embedding
+from edqn_jax.learn.perception import embedding
 from edqn_jax.learn.policy import PolicyParams
 from edqn_jax.report.curves import draw_learning, draw_returns
 from edqn_jax.report.flights import draw_path, draw_world

@@ -17,7 +17,7 @@ from jax.stages import Compiled
 
 from edqn_jax.config import Config
 from edqn_jax.devices.devices import quick_compiler_options
-from edqn_jax.learn import embedding, vae
+from edqn_jax.learn.perception import embedding, vae
 from edqn_jax.learn.policy import PolicyParams, fresh_policy
 from edqn_jax.sim.actions import ACTIONS
 from edqn_jax.sim.camera import camera

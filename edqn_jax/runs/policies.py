@@ -14,8 +14,9 @@ from edqn_jax.errors import ConfigError
 from edqn_jax.files import check_can_make, write_atomically
 from edqn_jax.learn.policy import Policy, PolicyParams, fresh_policy
 from edqn_jax.policies import no_run, policy_folder
-from edqn_jax.runs import manifest, world_copy
-from edqn_jax.runs.checkpoints import load_params, save_params, saved_at
+from edqn_jax.runs import world_copy
+from edqn_jax.runs.checkpoints import manifest
+from edqn_jax.runs.checkpoints.params import load_params, save_params, saved_at
 from edqn_jax.runs.directory import SEED_FOLDER, config_text, version_of
 from edqn_jax.version import package_version
 

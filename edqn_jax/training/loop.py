@@ -24,8 +24,8 @@ from edqn_jax.learn.trainer import Trainer, TrainState, policy_of
 from edqn_jax.sim.task.flights import Flights
 from edqn_jax.sim.task.reward import Reward
 from edqn_jax.training.history import EndedEpisodes, History, Watch, chunk_metrics, mean_metrics
-from edqn_jax.training.preparation import Preparation, prepared
 from edqn_jax.training.selection import Candidate, choose, is_due, validated
+from edqn_jax.training.setup import Preparation, prepared
 
 
 @dataclasses.dataclass(frozen=True)

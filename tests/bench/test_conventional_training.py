@@ -21,8 +21,8 @@ from conventional_stack.workers import SpreadFleet
 from edqn_jax.config import CameraConfig, Config, EncoderConfig
 from edqn_jax.errors import ConfigError
 from edqn_jax.extras import MissingPackageError, require
-from edqn_jax.learn import vae
-from edqn_jax.learn.waves import cosines
+from edqn_jax.learn.perception import vae
+from edqn_jax.learn.perception.waves import cosines
 from edqn_jax.runs.directory import plain
 from edqn_jax.sim.sensors.events import EventField
 from edqn_jax.sim.task.env import MOTION_SIZE, OWN_SIZE

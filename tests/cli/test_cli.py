@@ -36,7 +36,7 @@ def elsewhere(tmp_path, monkeypatch):
 @pytest.fixture
 def trainer(monkeypatch):
     """Stands in for training: a function to set, and the calls that reached it."""
-    stand_in = types.ModuleType("edqn_jax.training.run")
+    stand_in = types.ModuleType("edqn_jax.runs.record")
     calls: list[tuple] = []
     behaviour = types.SimpleNamespace(calls=calls, act=lambda *call: None, callbacks=[])
 
@@ -45,10 +45,10 @@ def trainer(monkeypatch):
         behaviour.callbacks.append(callback)
         return behaviour.act(*call)
 
-    seeds = types.ModuleType("edqn_jax.training.seeds")
+    seeds = types.ModuleType("edqn_jax.runs.seeds")
     stand_in.__dict__["train_run"] = seeds.__dict__["train_seeds_run"] = train_run
-    monkeypatch.setitem(sys.modules, "edqn_jax.training.run", stand_in)
-    monkeypatch.setitem(sys.modules, "edqn_jax.training.seeds", seeds)
+    monkeypatch.setitem(sys.modules, "edqn_jax.runs.record", stand_in)
+    monkeypatch.setitem(sys.modules, "edqn_jax.runs.seeds", seeds)
     monkeypatch.setattr(arguments, "hardware", lambda: "cpu")
     monkeypatch.setattr(devices, "use_cpu_devices", lambda count=None: None)
     return behaviour

@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 
 from edqn_jax.config import CameraConfig, Config, DroneConfig, EncoderConfig, EventsConfig
-from edqn_jax.learn import samples, vae
+from edqn_jax.learn import samples
+from edqn_jax.learn.perception import vae
 from edqn_jax.sim.physics import drone
 from edqn_jax.sim.scene.scene import UprightBoxes, build_scene, stack_scenes
 from edqn_jax.sim.sensors import events as ev

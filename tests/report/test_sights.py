@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from edqn_jax.config import CameraConfig, Config
-from edqn_jax.learn import vae
+from edqn_jax.learn.perception import vae
 from edqn_jax.learn.policy import fresh_policy
 from edqn_jax.report.sights import FINE, Sights, coarse, decision_rows, own_motions, poses
 from edqn_jax.sim.actions import ACTIONS

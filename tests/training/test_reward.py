@@ -24,7 +24,7 @@ from edqn_jax.sim.task import env
 from edqn_jax.sim.task.outcomes import Outcome
 from edqn_jax.sim.task.reward import Reward, Transition
 from edqn_jax.sim.worlds import geodesic
-from edqn_jax.training.preparation import config_for_reward, prepared
+from edqn_jax.training.setup import config_for_reward, prepared
 from tests.training.test_loop import SMALL
 
 CONFIG = dataclasses.replace(Config(), env=dataclasses.replace(Config().env, sensor="blind"))

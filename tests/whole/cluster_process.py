@@ -28,10 +28,10 @@ from edqn_jax.evaluation import rollouts
 from edqn_jax.learn.policy import fresh_policy
 from edqn_jax.learn.trainer import Episodes, Losses, Trainer, TrainState
 from edqn_jax.learn.updates import Learner
+from edqn_jax.runs import record
 from edqn_jax.runs.directory import plain
 from edqn_jax.sim.camera import camera
 from edqn_jax.sim.scene.scene import Scene
-from edqn_jax.training import run
 from tests.miniature import no_losses
 
 
@@ -72,7 +72,7 @@ def no_learning(self: Trainer, state: TrainState, first: int) -> tuple[TrainStat
 if __name__ == "__main__":
     note, count, *argv = sys.argv[1:]
     noted: dict[str, Any] = {}
-    init, train_run = Trainer.init, run.train_run
+    init, train_run = Trainer.init, record.train_run
 
     def noting_init(self: Trainer, seed: int | Sequence[int]) -> TrainState:
         state = init(self, seed)
@@ -86,8 +86,8 @@ if __name__ == "__main__":
         return noted["summary"]
 
     devices.cores, camera.luma = lambda: int(count), waves
-    run.Sights, run.draw_gallery = lambda *_: SimpleNamespace(in_world=lambda scene: None), lambda *_: None
-    Trainer.init, run.train_run = noting_init, noting_run
+    record.Sights, record.draw_gallery = lambda *_: SimpleNamespace(in_world=lambda scene: None), lambda *_: None
+    Trainer.init, record.train_run = noting_init, noting_run
     if argv[:1] == ["--no-learning"]:
         del argv[0]
         Trainer.init, Trainer.compile, Trainer.chunk = only_a_policy, lambda self: None, no_learning

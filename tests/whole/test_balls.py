@@ -14,9 +14,9 @@ from edqn_jax.evaluation.missions import run_missions
 from edqn_jax.interop.flight_events import flight_recording
 from edqn_jax.report.progress import Progress
 from edqn_jax.runs.directory import RunDirectory
-from edqn_jax.training.run import train_run
-from edqn_jax.training.stopping import Stop
-from edqn_jax.training.verify import verify
+from edqn_jax.runs.record import train_run
+from edqn_jax.runs.stopping import Stop
+from edqn_jax.runs.verify import verify
 from tests.whole.test_run import CONFIG
 
 WORLD = WorldConfig(name="sparse", flown="", pool_size=2, missions=8, balls=3)

@@ -21,9 +21,9 @@ from edqn_jax.learn.trainer import Episodes
 from edqn_jax.report.progress import Progress
 from edqn_jax.runs.directory import RunDirectory
 from edqn_jax.runs.policies import load_run
-from edqn_jax.training.run import train_run
+from edqn_jax.runs.record import train_run
+from edqn_jax.runs.stopping import Stop
 from edqn_jax.training.selection import Candidate, choose, first_success, is_due
-from edqn_jax.training.stopping import Stop
 from tests.miniature import WORLD as MINIATURE_WORLD
 from tests.miniature import no_losses
 from tests.whole.test_trainer import CONFIG as SMALL

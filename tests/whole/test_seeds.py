@@ -16,12 +16,12 @@ from edqn_jax.learn import trainer
 from edqn_jax.report.progress import Progress
 from edqn_jax.runs.directory import RunDirectory, plain
 from edqn_jax.runs.policies import load_policy
+from edqn_jax.runs.seeds import train_seeds_run
+from edqn_jax.runs.stopping import Stop
+from edqn_jax.runs.verify import verify
 from edqn_jax.training import history
 from edqn_jax.training.history import mean_metrics
 from edqn_jax.training.loop import train, train_seeds
-from edqn_jax.training.seeds import train_seeds_run
-from edqn_jax.training.stopping import Stop
-from edqn_jax.training.verify import verify
 from tests.miniature import WORLD as MINIATURE_WORLD
 from tests.training.test_loop import SMALL
 from tests.whole.test_run import FIGURES

@@ -22,12 +22,12 @@ from edqn_jax.errors import ConfigError
 from edqn_jax.evaluation.missions import run_missions
 from edqn_jax.evaluation.rollouts import fly_on_all_devices
 from edqn_jax.report.progress import Progress
-from edqn_jax.runs.checkpoints import save_params
+from edqn_jax.runs.checkpoints.params import save_params
 from edqn_jax.runs.directory import TRAJECTORY_COLUMNS, RunDirectory, plain
 from edqn_jax.runs.policies import load_run
-from edqn_jax.training.run import train_run
-from edqn_jax.training.stopping import Stop
-from edqn_jax.training.verify import verify
+from edqn_jax.runs.record import train_run
+from edqn_jax.runs.stopping import Stop
+from edqn_jax.runs.verify import verify
 from tests.processes import ROOT
 from tests.whole.test_run import CONFIG, FIGURES
 
@@ -96,7 +96,7 @@ def test_a_run_is_verified_and_what_was_changed_in_it_is_found(
     shutil.copytree(whole[0].path, changed.path)
     # The flights do not change: they need not be flown a third time.
     flown = fly_on_all_devices(CONFIG, run_missions(CONFIG).final.world, load_run(changed.path)[1], 0, record=True)
-    monkeypatch.setattr("edqn_jax.training.verify.fly_on_all_devices", lambda *_, **__: flown)
+    monkeypatch.setattr("edqn_jax.runs.verify.fly_on_all_devices", lambda *_, **__: flown)
 
     def wrong() -> set[str]:
         return {finding.what for finding in verify(changed.path) if finding.right is False}

@@ -12,7 +12,7 @@ import numpy as np
 from matplotlib.colors import Colormap, Normalize
 from PIL import Image
 
-from edqn_jax.learn import embedding
+from edqn_jax.learn.perception import embedding
 from edqn_jax.learn.policy import PolicyParams
 from edqn_jax.report.images import LOOKS, RECONSTRUCTED_EVENTS, scale_of
 from edqn_jax.report.sights import Sights

@@ -14,7 +14,8 @@ import pytest
 
 from edqn_jax.config import CameraConfig, Config, DroneConfig, EnvConfig
 from edqn_jax.evaluation.latency import decision_latency_ms
-from edqn_jax.learn import embedding, policy, trainer
+from edqn_jax.learn import policy, trainer
+from edqn_jax.learn.perception import embedding
 from edqn_jax.learn.plan import Plan
 from edqn_jax.runs.provenance import workload
 from edqn_jax.sim.actions import ACTIONS, DIRECTIONS

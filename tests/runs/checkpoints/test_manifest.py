@@ -11,8 +11,8 @@ import pytest
 
 from edqn_jax.errors import ConfigError
 from edqn_jax.learn.policy import Policy
-from edqn_jax.runs import manifest
-from edqn_jax.runs.manifest import MANIFEST, check, seal
+from edqn_jax.runs.checkpoints import manifest
+from edqn_jax.runs.checkpoints.manifest import MANIFEST, check, seal
 from edqn_jax.runs.policies import load_policy, save_policy
 from tests.policies import CONFIG, always
 

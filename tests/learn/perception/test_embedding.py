@@ -15,10 +15,11 @@ import pytest
 from edqn_jax.config import CameraConfig, Config, EncoderConfig
 from edqn_jax.config.loading import to_yaml
 from edqn_jax.evaluation.latency import decision_latency_ms
-from edqn_jax.learn import embedding, policy, pooled_encoder, trainer, vae
+from edqn_jax.learn import policy, trainer
+from edqn_jax.learn.perception import embedding, pooled_encoder, vae
 from edqn_jax.learn.plan import Plan
 from edqn_jax.learn.policy import fresh_policy
-from edqn_jax.runs.checkpoints import save_params
+from edqn_jax.runs.checkpoints.params import save_params
 from edqn_jax.runs.policies import load_run
 from edqn_jax.runs.provenance import workload
 from edqn_jax.sim.scene import mjcf

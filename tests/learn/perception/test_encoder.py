@@ -12,8 +12,8 @@ import optax
 import pytest
 
 from edqn_jax.config import CameraConfig, EncoderConfig, EventsConfig
-from edqn_jax.learn import pooled_encoder, vae
-from edqn_jax.learn.code import kl_divergence
+from edqn_jax.learn.perception import pooled_encoder, vae
+from edqn_jax.learn.perception.code import kl_divergence
 from edqn_jax.sim.sensors import events as ev
 from edqn_jax.sim.sensors.sensor import Form
 from edqn_jax.sim.task.env import MOTION_SIZE

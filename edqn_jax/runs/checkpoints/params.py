@@ -12,7 +12,7 @@ from pathlib import Path
 from edqn_jax.errors import ConfigError
 from edqn_jax.files import unwritable
 from edqn_jax.learn.policy import PolicyParams
-from edqn_jax.runs import arrays, manifest
+from edqn_jax.runs.checkpoints import arrays, manifest
 
 POLICY = "policy"
 """The policy's folder within `checkpoints/`."""

@@ -27,8 +27,8 @@ import jax.numpy as jnp
 from jax import Array
 
 from edqn_jax.config import EncoderConfig
-from edqn_jax.learn.code import EVENT_CHANNELS, CodeHead
-from edqn_jax.learn.waves import mirrored, polarities, wave_table
+from edqn_jax.learn.perception.code import EVENT_CHANNELS, CodeHead
+from edqn_jax.learn.perception.waves import mirrored, polarities, wave_table
 from edqn_jax.sim.sensors.events import EventField
 from edqn_jax.sine import sin_pi
 

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from edqn_jax.errors import ConfigError
-from edqn_jax.runs import manifest, states
-from edqn_jax.runs.states import Checkpoint
+from edqn_jax.runs.checkpoints import manifest, states
+from edqn_jax.runs.checkpoints.states import Checkpoint
 from tests.processes import PATIENCE_S
 
 ARRAYS = {
@@ -118,7 +118,7 @@ def test_a_disk_with_too_little_space_is_noticed_before_anything_is_written(
 ) -> None:
     saved(tmp_path, 1)
     usage = collections.namedtuple("usage", "free")
-    monkeypatch.setattr("edqn_jax.runs.arrays.shutil.disk_usage", lambda folder: usage(5_000_000))
+    monkeypatch.setattr("edqn_jax.runs.checkpoints.arrays.shutil.disk_usage", lambda folder: usage(5_000_000))
     with pytest.raises(ConfigError, match="has 5 MB of free space, and 10 MB are needed"):
         saved(tmp_path, 2)
     assert [place.name for place in tmp_path.iterdir()] == ["step-000000001"]
@@ -128,7 +128,7 @@ FULL = """
 import resource, sys
 from pathlib import Path
 from edqn_jax.errors import ConfigError
-from tests.runs.test_states import newest, saved
+from tests.runs.checkpoints.test_states import newest, saved
 folder, failed = Path(sys.argv[1]), 0
 saved(folder, 1)
 most = max(file.stat().st_size for file in folder.rglob("*") if file.is_file())

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from edqn_jax.learn import layers
+from edqn_jax.learn.perception import layers
 
 
 @pytest.mark.parametrize("rows", [(), (3,), (4, 5), (2 * layers.ROWS_OF_A_PART + 6,)])

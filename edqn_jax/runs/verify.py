@@ -29,19 +29,19 @@ from edqn_jax.learn.policy import PolicyParams
 from edqn_jax.learn.trainer import Trainer
 from edqn_jax.planners.astar import shortest_path
 from edqn_jax.policies import no_run
-from edqn_jax.runs import states
+from edqn_jax.runs.checkpoints import states
+from edqn_jax.runs.checkpoints.states import Checkpoint
 from edqn_jax.runs.continuation import begun
+from edqn_jax.runs.derived import DIGITS, from_metrics, from_trajectory, same
 from edqn_jax.runs.directory import RunDirectory
+from edqn_jax.runs.keeper import kept_name
 from edqn_jax.runs.policies import load_run
 from edqn_jax.runs.provenance import digest_of, versions, workload
-from edqn_jax.runs.states import Checkpoint
+from edqn_jax.runs.summaries import of_all_seeds, of_tests
 from edqn_jax.runs.world_copy import WORLD
 from edqn_jax.sim.task import group
 from edqn_jax.sim.task.flights import Flights
-from edqn_jax.training.derived import DIGITS, from_metrics, from_trajectory, same
-from edqn_jax.training.keeper import kept_name
 from edqn_jax.training.selection import first_success
-from edqn_jax.training.summaries import of_all_seeds, of_tests
 
 _OF_A_CHECKPOINT = ("resumed_at_decisions", "reward", "first_success_seconds")
 """What only a checkpoint tells."""

@@ -15,10 +15,10 @@ import pytest
 from edqn_jax.config import Config, TrainConfig
 from edqn_jax.errors import ConfigError
 from edqn_jax.learn.policy import PolicyParams
+from edqn_jax.runs import keeper
 from edqn_jax.runs.directory import RunDirectory
+from edqn_jax.runs.keeper import MOST_OVERHEAD, Keeper
 from edqn_jax.sim.task.reward import Reward
-from edqn_jax.training import keeper
-from edqn_jax.training.keeper import MOST_OVERHEAD, Keeper
 from edqn_jax.training.loop import AgentStanding, Standing
 from edqn_jax.training.selection import Candidate
 

@@ -18,8 +18,8 @@ from jax import Array
 from jax.nn.initializers import zeros
 
 from edqn_jax.config import EncoderConfig
-from edqn_jax.learn.code import CodeHead
-from edqn_jax.learn.layers import Dense, added
+from edqn_jax.learn.perception.code import CodeHead
+from edqn_jax.learn.perception.layers import Dense, added
 from edqn_jax.sim.sensors.events import EventField
 
 

@@ -9,15 +9,15 @@ from edqn_jax.config import Config
 from edqn_jax.devices import processes
 from edqn_jax.errors import StoppedError
 from edqn_jax.report.progress import Progress, clock
+from edqn_jax.runs import summaries
 from edqn_jax.runs.directory import RunDirectory
+from edqn_jax.runs.keeper import Keeper
 from edqn_jax.runs.provenance import state_digest
+from edqn_jax.runs.record import described, finish, locked, needed, opened, recorded, sights_of, trained_in, unseen
+from edqn_jax.runs.stopping import Stop
 from edqn_jax.sim.task.reward import Reward
-from edqn_jax.training import summaries
-from edqn_jax.training.keeper import Keeper
 from edqn_jax.training.loop import Callback, run_chunks
-from edqn_jax.training.preparation import prepared
-from edqn_jax.training.run import described, finish, locked, needed, opened, recorded, sights_of, trained_in, unseen
-from edqn_jax.training.stopping import Stop
+from edqn_jax.training.setup import prepared
 
 
 def train_seeds_run(

@@ -17,11 +17,11 @@ from jax import Array
 from jax.nn.initializers import zeros
 
 from edqn_jax.config import CameraConfig, EncoderConfig
-from edqn_jax.learn.code import EVENT_CHANNELS, Params, kl_divergence
-from edqn_jax.learn.layers import Dense
-from edqn_jax.learn.patch_encoder import PatchEncoder, is_recurrent
-from edqn_jax.learn.pooled_encoder import PooledEncoder
-from edqn_jax.learn.waves import OUTPUT_SCALE, cosines, mirrored, wave_images
+from edqn_jax.learn.perception.code import EVENT_CHANNELS, Params, kl_divergence
+from edqn_jax.learn.perception.layers import Dense
+from edqn_jax.learn.perception.patch_encoder import PatchEncoder, is_recurrent
+from edqn_jax.learn.perception.pooled_encoder import PooledEncoder
+from edqn_jax.learn.perception.waves import OUTPUT_SCALE, cosines, mirrored, wave_images
 from edqn_jax.sim.sensors.events import EventField
 from edqn_jax.sim.sensors.sensor import Form
 from edqn_jax.sim.task.env import MOTION_SIZE

@@ -11,8 +11,9 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from edqn_jax.config import Config
 from edqn_jax.errors import ConfigError
 from edqn_jax.learn.policy import Policy, PolicyParams
-from edqn_jax.runs import checkpoints, manifest
-from edqn_jax.runs.checkpoints import POLICY, load_params, save_params
+from edqn_jax.runs.checkpoints import manifest
+from edqn_jax.runs.checkpoints import params as checkpoints
+from edqn_jax.runs.checkpoints.params import POLICY, load_params, save_params
 from edqn_jax.runs.policies import save_policy
 
 

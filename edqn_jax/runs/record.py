@@ -22,16 +22,15 @@ from edqn_jax.learn.trainer import Trainer, TrainState
 from edqn_jax.report.gallery import draw_gallery
 from edqn_jax.report.progress import Progress, clock
 from edqn_jax.report.sights import Sights
-from edqn_jax.runs import world_copy
+from edqn_jax.runs import summaries, world_copy
 from edqn_jax.runs.directory import TO_BE_DRAWN, RunDirectory
+from edqn_jax.runs.keeper import Keeper
 from edqn_jax.runs.provenance import state_digest
+from edqn_jax.runs.stopping import Stop
 from edqn_jax.sim.task.flights import Flights
 from edqn_jax.sim.task.reward import Reward
-from edqn_jax.training import summaries
-from edqn_jax.training.keeper import Keeper
 from edqn_jax.training.loop import Callback, Chunk, Standing, TrainingResult, run_chunks
-from edqn_jax.training.preparation import Preparation, prepared
-from edqn_jax.training.stopping import Stop
+from edqn_jax.training.setup import Preparation, prepared
 
 
 def train_run(

@@ -18,8 +18,8 @@ from edqn_jax.sim.task.flights import Flights
 from edqn_jax.sim.task.outcomes import Outcome
 from edqn_jax.sim.task.reward import Reward
 from edqn_jax.training.loop import TrainingResult
-from edqn_jax.training.preparation import Preparation
 from edqn_jax.training.selection import first_success
+from edqn_jax.training.setup import Preparation
 
 
 def of_run(

@@ -20,7 +20,7 @@ import numpy as np
 
 from edqn_jax.errors import ConfigError, DamagedError
 from edqn_jax.files import unwritable
-from edqn_jax.runs import arrays, manifest
+from edqn_jax.runs.checkpoints import arrays, manifest
 from edqn_jax.version import package_version
 
 _NAME = re.compile(r"step-(\d{9,})")

@@ -17,16 +17,17 @@ from edqn_jax.devices import processes
 from edqn_jax.errors import ConfigError
 from edqn_jax.learn import saved_state
 from edqn_jax.learn.policy import PolicyParams
-from edqn_jax.runs import states, world_copy
-from edqn_jax.runs.checkpoints import save_params
+from edqn_jax.runs import world_copy
+from edqn_jax.runs.checkpoints import states
+from edqn_jax.runs.checkpoints.params import save_params
+from edqn_jax.runs.checkpoints.states import Checkpoint
 from edqn_jax.runs.continuation import MAY_CHANGE, differences
 from edqn_jax.runs.directory import RunDirectory, config_text
 from edqn_jax.runs.provenance import reward_record
-from edqn_jax.runs.states import Checkpoint
 from edqn_jax.sim.task.reward import Reward
 from edqn_jax.training.loop import AgentStanding, Standing
-from edqn_jax.training.preparation import Preparation
 from edqn_jax.training.selection import Candidate
+from edqn_jax.training.setup import Preparation
 
 MOST_OVERHEAD = 0.03
 """Share of the time that saving may take: where it takes longer, checkpoints are further apart."""

@@ -6,8 +6,8 @@ import jax.numpy as jnp
 from jax import Array
 
 from edqn_jax.config import Config
-from edqn_jax.learn import vae
-from edqn_jax.learn.code import EMBEDDED, Params
+from edqn_jax.learn.perception import vae
+from edqn_jax.learn.perception.code import EMBEDDED, Params
 from edqn_jax.sim.sensors.sensor import Form, sensor_of
 from edqn_jax.sim.task.env import Observation
 

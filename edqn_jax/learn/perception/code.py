@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jax import Array
 from jax.nn.initializers import constant, lecun_normal, zeros
 
-from edqn_jax.learn.layers import Dense
+from edqn_jax.learn.perception.layers import Dense
 from edqn_jax.sim.sensors.sensor import Form
 
 Params = Any

@@ -18,7 +18,7 @@ import orbax.checkpoint as ocp
 
 from edqn_jax.errors import ConfigError
 from edqn_jax.files import unwritable, write_atomically
-from edqn_jax.runs import manifest
+from edqn_jax.runs.checkpoints import manifest
 
 COMMITTED = "commit_success.txt"
 """File by which Orbax marks a folder as complete."""
