@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+from collections import Counter
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
@@ -13,7 +14,8 @@ ROOT = Path(__file__).parents[1]
 ORDER = (
     *("version", "errors", "keys", "files", "checks", "extras", "xla", "sine", "config", "devices", "native"),
     *("sim.actions", "sim.scene", "sim.worlds", "sim.physics", "sim.camera", "sim.sensors", "sim.task", "sim"),
-    *("planners", "learn", "mapping", "policies", "runs", "evaluation", "report", "training", "interop", "cli"),
+    *("planners", "learn.perception", "learn", "mapping", "policies", "evaluation", "training"),
+    *("runs.checkpoints", "runs", "report", "interop", "cli"),
 )
 """Places of the package: a module imports from its own place and from those before it."""
 
@@ -73,3 +75,13 @@ def test_the_package_imports_no_benchmark() -> None:
     names = modules_below(ROOT / "benchmarks") | {path.stem: path for path in (ROOT / "benchmarks").iterdir()}
     arrows = {name: imported_by(file.read_text(encoding="utf-8"), names) for name, file in PACKAGE.items()}
     assert {name: found for name, found in arrows.items() if found} == {}
+
+
+def test_no_folder_of_the_package_holds_more_than_15_modules() -> None:
+    held = Counter(file.parent.relative_to(ROOT) for file in PACKAGE.values())
+    assert {str(folder): count for folder, count in held.items() if count > 15} == {}
+
+
+def test_training_stores_and_draws_nothing() -> None:
+    sources = [file.read_text(encoding="utf-8") for file in (ROOT / "edqn_jax" / "training").glob("*.py")]
+    assert not any(word in source for source in sources for word in ("matplotlib", "write_atomically", "edqn_jax.runs"))

@@ -78,7 +78,7 @@ class EventVAE(nn.Module):
     """Encoder and decoder with given parameters."""
 
     def __init__(self, config: EncoderConfig, camera: CameraConfig, params: Params) -> None:
-        """Copies the parameters, which are those of `edqn_jax.learn.perception.vae.init_vae` for the same configuration."""
+        """Copies the parameters, those of `edqn_jax.learn.perception.vae.init_vae` for the same configuration."""
         super().__init__()
         params = jax.tree.map(np.asarray, params)
         self.config = config

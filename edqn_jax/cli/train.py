@@ -43,6 +43,7 @@ def train_command(argv: Sequence[str], stops: Stops) -> None:
     from edqn_jax.devices import processes
     from edqn_jax.devices.cache import keep_programs
     from edqn_jax.devices.devices import cores, most_that_divide, use_cpu_devices
+    from edqn_jax.report.gallery import prepare_gallery
     from edqn_jax.report.progress import Progress
     from edqn_jax.runs.stopping import Stop
 
@@ -67,11 +68,11 @@ def train_command(argv: Sequence[str], stops: Stops) -> None:
         if options.seeds is None:
             from edqn_jax.runs.record import train_run
 
-            train_run(config, run, progress, stop, callback=sinks)
+            train_run(config, run, progress, stop, callback=sinks, drawing=prepare_gallery)
         else:
             from edqn_jax.runs.seeds import train_seeds_run
 
-            train_seeds_run(config, options.seeds, run, progress, stop, callback=sinks)
+            train_seeds_run(config, options.seeds, run, progress, stop, callback=sinks, drawing=prepare_gallery)
     except jax.errors.JaxRuntimeError as error:
         if arguments is None:
             raise

@@ -136,3 +136,10 @@ def flight_summary(flights: Flights, mission: int = 0) -> dict[str, Any]:
         "flight_seconds": float(flights.flight_seconds[mission]),
         **({} if flights.hit_drone is None else {"hit_drone": bool(flights.hit_drone[mission])}),
     }
+
+
+def clock(seconds: float) -> str:
+    """Returns `m:ss`, or `h:mm:ss` from an hour on."""
+    minutes, rest = divmod(int(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours}:{minutes:02}:{rest:02}" if hours else f"{minutes}:{rest:02}"

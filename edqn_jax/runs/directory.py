@@ -24,12 +24,6 @@ from edqn_jax.version import package_version
 
 Resume = Literal["auto", "never", "must"]
 
-TRAJECTORY_COLUMNS = (
-    "t", "x", "y", "z", "qw", "qx", "qy", "qz", "vx", "vy", "vz", "action", "reward", "clearance",
-)  # fmt: skip
-"""Columns of `trajectory.csv`, one row a physics step: seconds, metres, a unit quaternion, m/s, the action's
-number, the reward of the decision and the distance of the body's sphere from the nearest shape."""
-
 EPISODE_COLUMNS = ("step", "return", "length", "outcome")
 """Columns of `episodes.csv`: decisions of all environments when the episode ended, undiscounted return,
 decisions of the episode, and how it ended."""
@@ -217,11 +211,13 @@ class RunDirectory:
         write_atomically(self.summary_file, json.dumps(plain(summary), indent=2, allow_nan=False) + "\n")
 
     def write_trajectory(self, columns: Mapping[str, np.ndarray]) -> None:
-        """Writes `trajectory.csv` from one [T] array for each of `TRAJECTORY_COLUMNS`.
+        """Writes `trajectory.csv` from one [T] array for each of `evaluation.trajectories.TRAJECTORY_COLUMNS`.
 
         Raises:
             ConfigError: if it cannot be written.
         """
+        from edqn_jax.evaluation.trajectories import TRAJECTORY_COLUMNS  # here: it imports JAX
+
         table = np.stack([np.asarray(columns[name], np.float64) for name in TRAJECTORY_COLUMNS], axis=1)
         lines = [",".join(TRAJECTORY_COLUMNS), *(",".join(f"{value:.7g}" for value in row) for row in table)]
         write_atomically(self.trajectory_file, "\n".join(lines) + "\n")
@@ -236,6 +232,8 @@ class RunDirectory:
         Raises:
             ValueError: if it has other columns, or something that is no number.
         """
+        from edqn_jax.evaluation.trajectories import TRAJECTORY_COLUMNS  # here: it imports JAX
+
         with self.trajectory_file.open(encoding="utf-8", newline="") as file:
             header, *rows = csv.reader(file)
         if tuple(header) != TRAJECTORY_COLUMNS or not rows:

@@ -5,7 +5,8 @@ from __future__ import annotations
 import contextlib
 import time
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any
+from concurrent.futures import Executor
+from typing import Any, Protocol
 
 import jax
 import numpy as np
@@ -14,32 +15,50 @@ from edqn_jax.config import FAMILIES, Config
 from edqn_jax.devices import processes
 from edqn_jax.errors import ConfigError, StoppedError
 from edqn_jax.evaluation.companions import scene_of_flight
-from edqn_jax.evaluation.metrics import clearance_text, flight_summary
+from edqn_jax.evaluation.metrics import clearance_text, clock, flight_summary
 from edqn_jax.evaluation.trajectories import trajectory
 from edqn_jax.learn import saved_state
 from edqn_jax.learn.plan import Plan
+from edqn_jax.learn.policy import PolicyParams
 from edqn_jax.learn.trainer import Trainer, TrainState
-from edqn_jax.report.gallery import draw_gallery
-from edqn_jax.report.progress import Progress, clock
-from edqn_jax.report.sights import Sights
 from edqn_jax.runs import summaries, world_copy
 from edqn_jax.runs.directory import TO_BE_DRAWN, RunDirectory
 from edqn_jax.runs.keeper import Keeper
 from edqn_jax.runs.provenance import state_digest
 from edqn_jax.runs.stopping import Stop
+from edqn_jax.sim.scene.scene import Scene
 from edqn_jax.sim.task.flights import Flights
 from edqn_jax.sim.task.reward import Reward
 from edqn_jax.training.loop import Callback, Chunk, Standing, TrainingResult, run_chunks
-from edqn_jax.training.setup import Preparation, prepared
+from edqn_jax.training.setup import Display, Preparation, prepared
+
+
+class Screen(Display, Protocol):
+    """Interface of a progress display that also prints lines."""
+
+    def message(self, text: str) -> None:
+        """Prints a line that stays."""
+
+    def stop(self) -> None:
+        """Ends the display; what it shows stays."""
+
+
+Draw = Callable[[RunDirectory, Scene, PolicyParams, np.ndarray, str], None]
+"""Draws a run's pictures from its directory: the world of the flight, the policy that flew, points [P, 3] of the
+shortest path in metres, and the flight's outcome."""
+
+PrepareDrawing = Callable[[Config, Scene, Executor], Draw]
+"""Starts to compile what draws flights in a world of this shape, as `report.gallery.prepare_gallery`."""
 
 
 def train_run(
     config: Config,
     run: RunDirectory | None,
-    progress: Progress,
+    progress: Screen,
     stop: Stop,
     reward: Reward | None = None,
     callback: Callback | None = None,
+    drawing: PrepareDrawing | None = None,
 ) -> dict[str, Any]:
     """Trains, validates, flies and draws; writes everything to the run directory.
 
@@ -49,6 +68,7 @@ def train_run(
         progress: display of the progress.
         stop: asked after each chunk; where one process is to stop, all do.
         reward, callback: as in `train`.
+        drawing: of the run's pictures; None draws none.
 
     Returns:
         the content of `summary.json`.
@@ -72,13 +92,13 @@ def train_run(
         if processes.on_any(result.stopped or stop.requested()):
             raise StoppedError(f"stopped after {result.decisions:,} decisions; {where_saved(run)}")
         progress.phase("flying the mission")
-        sights = None if run is None else sights_of(preparation)
+        draw = None if run is None else prepare_to_draw(preparation, drawing)
         flights = preparation.fly(preparation.missions[0].final, result.policy.params)
         digest = state_digest(needed(preparation.trainer, result))  # the last that all processes do together
         summary = summaries.of_run(preparation, result, flights, digest, reward) | keeper.facts
-        if run is not None and sights is not None:
+        if run is not None:
             progress.phase("drawing")
-            finish(run, preparation, sights, result, flights, summary, progress)
+            finish(run, preparation, draw, result, flights, summary, progress)
             progress.stop()
             progress.message(_verdict(summary, run))
     return summary
@@ -97,7 +117,7 @@ def locked(run: RunDirectory | None) -> Iterator[None]:
 
 
 def opened(
-    preparation: Preparation, run: RunDirectory | None, keeper: Keeper, progress: Progress, seeds: bool = False
+    preparation: Preparation, run: RunDirectory | None, keeper: Keeper, progress: Screen, seeds: bool = False
 ) -> Standing | None:
     """Returns where the run in the locked folder stood if it is continued; else begins it.
 
@@ -187,20 +207,22 @@ def where_saved(run: RunDirectory | None) -> str:
     return "the first process saves the policy" if run is None else f"the policy is in '{run.checkpoints}'"
 
 
-def sights_of(preparation: Preparation) -> Sights:
-    """Starts to compile the programs that draw the final flight's images, while it is flown."""
+def prepare_to_draw(preparation: Preparation, drawing: PrepareDrawing | None) -> Draw | None:
+    """Starts to compile the programs that draw the final flight, while it is flown."""
+    if drawing is None:
+        return None
     scene = scene_of_flight(preparation.config, preparation.missions[0].final)
-    return Sights(preparation.config, scene, preparation.pool)
+    return drawing(preparation.config, scene, preparation.pool)
 
 
 def finish(
     run: RunDirectory,
     preparation: Preparation,
-    sights: Sights,
+    draw: Draw | None,
     result: TrainingResult,
     flights: Flights,
     summary: dict[str, Any],
-    progress: Progress,
+    progress: Screen,
 ) -> None:
     """Writes the flight of the mission that the run is judged by, the summary and all pictures.
 
@@ -213,13 +235,16 @@ def finish(
     summary["total_seconds"] = time.perf_counter() - preparation.began
     run.write_summary({**summary, "figures": TO_BE_DRAWN})
     try:
-        draw_gallery(
-            run,
-            sights.in_world(scene_of_flight(preparation.config, preparation.missions[0].final, flights)),
-            result.policy.params,
-            np.asarray(preparation.shortest.points),
-            flight_summary(flights)["outcome"],
-        )
+        if draw is None:
+            summary["figures"] = "not asked for"
+        else:
+            draw(
+                run,
+                scene_of_flight(preparation.config, preparation.missions[0].final, flights),
+                result.policy.params,
+                np.asarray(preparation.shortest.points),
+                flight_summary(flights)["outcome"],
+            )
     except (OSError, ConfigError) as error:
         summary["figures"] = f"incomplete: {error}"
         progress.message(f"the figures are incomplete: {error}; everything else is in '{run.path}'")

@@ -8,12 +8,24 @@ from typing import Any
 from edqn_jax.config import Config
 from edqn_jax.devices import processes
 from edqn_jax.errors import StoppedError
-from edqn_jax.report.progress import Progress, clock
+from edqn_jax.evaluation.metrics import clock
 from edqn_jax.runs import summaries
 from edqn_jax.runs.directory import RunDirectory
 from edqn_jax.runs.keeper import Keeper
 from edqn_jax.runs.provenance import state_digest
-from edqn_jax.runs.record import described, finish, locked, needed, opened, recorded, sights_of, trained_in, unseen
+from edqn_jax.runs.record import (
+    PrepareDrawing,
+    Screen,
+    described,
+    finish,
+    locked,
+    needed,
+    opened,
+    prepare_to_draw,
+    recorded,
+    trained_in,
+    unseen,
+)
 from edqn_jax.runs.stopping import Stop
 from edqn_jax.sim.task.reward import Reward
 from edqn_jax.training.loop import Callback, run_chunks
@@ -24,17 +36,19 @@ def train_seeds_run(
     config: Config,
     seeds: int,
     run: RunDirectory | None,
-    progress: Progress,
+    progress: Screen,
     stop: Stop,
     reward: Reward | None = None,
     callback: Callback | None = None,
+    drawing: PrepareDrawing | None = None,
 ) -> dict[str, Any]:
     """Trains an agent of each seed in one program; writes a run of each, and a summary of all.
 
     Args:
         config: of the first seed.
         seeds: how many agents; their seeds count up from `train.seed`.
-        run, progress, stop, reward, callback: as in `train_run`; `run` is the folder that holds those of the seeds.
+        run: the folder that holds those of the seeds, or None, as in `train_run`.
+        progress, stop, reward, callback, drawing: as in `train_run`.
 
     Returns:
         the content of the `summary.json` of all.
@@ -70,10 +84,10 @@ def train_seeds_run(
         whole = summaries.of_all_seeds(config, preparation.missions[0].tests, flights, of_each) | began
         if run is not None:
             progress.phase("drawing")
-            sights = sights_of(preparation)
+            draw = prepare_to_draw(preparation, drawing)
             for folder, result, flown, summary in zip(folders, results, flights, of_each, strict=True):
                 assert folder is not None
-                finish(folder, preparation, sights, result, flown, summary, progress)
+                finish(folder, preparation, draw, result, flown, summary, progress)
             whole["total_seconds"] = time.perf_counter() - preparation.began
             run.write_summary(whole)
             progress.stop()

@@ -40,7 +40,7 @@ def trainer(monkeypatch):
     calls: list[tuple] = []
     behaviour = types.SimpleNamespace(calls=calls, act=lambda *call: None, callbacks=[])
 
-    def train_run(*call, callback):
+    def train_run(*call, callback, drawing):
         calls.append(call)
         behaviour.callbacks.append(callback)
         return behaviour.act(*call)

@@ -28,6 +28,7 @@ from edqn_jax.evaluation import rollouts
 from edqn_jax.learn.policy import fresh_policy
 from edqn_jax.learn.trainer import Episodes, Losses, Trainer, TrainState
 from edqn_jax.learn.updates import Learner
+from edqn_jax.report import gallery
 from edqn_jax.runs import record
 from edqn_jax.runs.directory import plain
 from edqn_jax.sim.camera import camera
@@ -86,7 +87,7 @@ if __name__ == "__main__":
         return noted["summary"]
 
     devices.cores, camera.luma = lambda: int(count), waves
-    record.Sights, record.draw_gallery = lambda *_: SimpleNamespace(in_world=lambda scene: None), lambda *_: None
+    gallery.prepare_gallery = lambda *_: lambda *_: None
     Trainer.init, record.train_run = noting_init, noting_run
     if argv[:1] == ["--no-learning"]:
         del argv[0]
