@@ -14,7 +14,8 @@ import pytest
 from edqn_jax.config import Config, TrainConfig
 from edqn_jax.config.loading import resolve
 from edqn_jax.errors import ConfigError
-from edqn_jax.runs.directory import TO_BE_DRAWN, TRAJECTORY_COLUMNS, RunDirectory, plan_run_directory, version_of
+from edqn_jax.evaluation.trajectories import TRAJECTORY_COLUMNS
+from edqn_jax.runs.directory import TO_BE_DRAWN, RunDirectory, plan_run_directory, version_of
 
 
 def begin(run: RunDirectory, seeds: list[Config] | None = None) -> None:
