@@ -37,10 +37,6 @@ from edqn_jax.extras import MissingPackageError
 from edqn_jax.files import check_can_write, write_atomically
 from edqn_jax.learn import policy as acting
 from edqn_jax.learn.policy import Policy
-from edqn_jax.mapping import grid
-from edqn_jax.mapping.grid import MapConfig
-from edqn_jax.planners.follow import FollowConfig
-from edqn_jax.report.growing_map import Moment, animate_growth, draw_growth
 from edqn_jax.runs.policies import load_policy
 from edqn_jax.sim.physics import drone
 from edqn_jax.sim.scene.distance import signed_distance
@@ -55,11 +51,15 @@ from edqn_jax.sim.task.outcomes import Outcome
 from edqn_jax.sim.worlds import families
 from edqn_jax.sim.worlds.moving import Moving
 from measurement import json_report
+from rivals.mapping import grid
+from rivals.mapping.grid import MapConfig
+from rivals.mapping.growing_map import Moment, animate_growth, draw_growth
+from rivals.planners.follow import FollowConfig
 
 try:
-    from edqn_jax.mapping import pilot
-    from edqn_jax.mapping.pilot import TUNED, Orders, PilotConfig, Piloted
-    from edqn_jax.mapping.route import RouteConfig
+    from rivals.mapping import pilot
+    from rivals.mapping.pilot import TUNED, Orders, PilotConfig, Piloted
+    from rivals.mapping.route import RouteConfig
 except MissingPackageError as missing:
     print(missing, file=sys.stderr)
     sys.exit(2)

@@ -15,7 +15,8 @@ if TYPE_CHECKING:
     from edqn_jax.errors import ConfigError, DivergedError, StoppedError
     from edqn_jax.evaluation.evaluate import Evaluation, evaluate
     from edqn_jax.learn.policy import Policy
-    from edqn_jax.planners.planner import Plan, plan
+    from edqn_jax.planning.astar import plan
+    from edqn_jax.planning.path import PlannedPath
     from edqn_jax.report.flights import draw_map
     from edqn_jax.runs.policies import load_policy, save_policy
     from edqn_jax.sim.actions import move_name, move_number
@@ -32,7 +33,7 @@ _MODULES = {
     "Environment": "sim.task.environment",
     "Evaluation": "evaluation.evaluate",
     "Outcome": "sim.task.outcomes",
-    "Plan": "planners.planner",
+    "PlannedPath": "planning.path",
     "Policy": "learn.policy",
     "StoppedError": "errors",
     "TrainingResult": "training.loop",
@@ -44,7 +45,7 @@ _MODULES = {
     "make_config": "config.loading",
     "move_name": "sim.actions",
     "move_number": "sim.actions",
-    "plan": "planners.planner",
+    "plan": "planning.astar",
     "save_policy": "runs.policies",
     "train": "training.loop",
     "train_seeds": "training.loop",
@@ -60,7 +61,7 @@ __all__ = [
     "Environment",
     "Evaluation",
     "Outcome",
-    "Plan",
+    "PlannedPath",
     "Policy",
     "StoppedError",
     "TrainingResult",

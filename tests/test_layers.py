@@ -14,7 +14,7 @@ ROOT = Path(__file__).parents[1]
 ORDER = (
     *("version", "errors", "keys", "files", "checks", "extras", "xla", "sine", "config", "devices", "native"),
     *("sim.actions", "sim.scene", "sim.worlds", "sim.physics", "sim.camera", "sim.sensors", "sim.task", "sim"),
-    *("planners", "learn.perception", "learn", "mapping", "policies", "evaluation", "training"),
+    *("planning", "learn.perception", "learn", "policies", "evaluation", "training"),
     *("runs.checkpoints", "runs", "report", "interop", "cli"),
 )
 """Places of the package: a module imports from its own place and from those before it."""

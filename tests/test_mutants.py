@@ -25,7 +25,7 @@ def test_a_mutant_changes_one_place_and_names_tests_that_there_are(mutant: Mutan
 
 def test_each_package_has_at_least_two_mutants() -> None:
     count = Counter(put_into(mutant, ROOT).file.split("/")[1] for mutant in MUTANTS)
-    for package in ("config", "sim", "planners", "learn", "runs", "evaluation", "training"):
+    for package in ("config", "sim", "planning", "learn", "runs", "evaluation", "training"):
         assert count[package] >= 2, package
 
 

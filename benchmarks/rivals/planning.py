@@ -13,10 +13,9 @@ import numpy as np
 
 from edqn_jax.config import FAMILIES, Config
 from edqn_jax.devices.devices import cores, processor
-from edqn_jax.planners.astar import shortest_path
-from edqn_jax.planners.follow import FollowConfig, compiled_follower, reserved, sampled
-from edqn_jax.planners.lattice import NoPathError
-from edqn_jax.planners.planner import Budget, Task, load_planner
+from edqn_jax.planning.astar import shortest_path
+from edqn_jax.planning.lattice import NoPathError
+from edqn_jax.planning.path import Task
 from edqn_jax.runs.provenance import workload
 from edqn_jax.sim.physics.drone import load_airframe
 from edqn_jax.sim.scene.mjcf import check_scene, load_world, resolve_world
@@ -25,6 +24,8 @@ from edqn_jax.sim.task.outcomes import Outcome
 from edqn_jax.sim.worlds import families
 from edqn_jax.sim.worlds.moving import Moving
 from measurement import json_report
+from rivals.planners.follow import FollowConfig, compiled_follower, reserved, sampled
+from rivals.planners.planner import Budget, load_planner
 
 MANY = 64
 """Number of worlds from which on shortest paths are computed in several processes."""

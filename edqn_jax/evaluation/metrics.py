@@ -9,8 +9,8 @@ import jax
 import numpy as np
 
 from edqn_jax.config import Config
-from edqn_jax.planners.astar import shortest_path
-from edqn_jax.planners.lattice import NoPathError
+from edqn_jax.planning.astar import shortest_path
+from edqn_jax.planning.lattice import NoPathError
 from edqn_jax.sim.scene.scene import take_scene
 from edqn_jax.sim.task.env import World
 from edqn_jax.sim.task.flights import Flights

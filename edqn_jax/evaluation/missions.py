@@ -13,9 +13,9 @@ import numpy as np
 from edqn_jax.config import FAMILIES, Config
 from edqn_jax.errors import ConfigError
 from edqn_jax.keys import CROSSING_OF_WORLD, FILE_MISSIONS, run_streams
-from edqn_jax.planners.astar import shortest_path
-from edqn_jax.planners.free_space import holds, reachable
-from edqn_jax.planners.lattice import CELL_M, lattice_shape
+from edqn_jax.planning.astar import shortest_path
+from edqn_jax.planning.free_space import holds, reachable
+from edqn_jax.planning.lattice import CELL_M, lattice_shape
 from edqn_jax.sim.physics import drone
 from edqn_jax.sim.scene.mjcf import check_scene, load_world, mjcf_of, resolve_world, widened
 from edqn_jax.sim.scene.scene import Scene, stack_scenes, take_scene, with_equal_capacities

@@ -27,7 +27,7 @@ from edqn_jax.evaluation.verdicts import check_verdicts, judges_of
 from edqn_jax.learn import saved_state
 from edqn_jax.learn.policy import PolicyParams
 from edqn_jax.learn.trainer import Trainer
-from edqn_jax.planners.astar import shortest_path
+from edqn_jax.planning.astar import shortest_path
 from edqn_jax.policies import no_run
 from edqn_jax.runs.checkpoints import states
 from edqn_jax.runs.checkpoints.states import Checkpoint

@@ -30,8 +30,8 @@ from edqn_jax.sim.task.outcomes import Outcome
 from measurement.flags import configured
 from rivals import stack
 from tests.bench.conventional_course import course_of
+from tests.benchmarks.rivals.uninstalled import hide
 from tests.miniature import MINIATURE
-from tests.planners.uninstalled import hide
 
 torch = require("torch")
 torch.set_num_threads(1)  # beside other tests a second one costs more than it does

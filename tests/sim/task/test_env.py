@@ -25,7 +25,7 @@ from edqn_jax.sim.task.missions import Missions, own_missions
 from edqn_jax.sim.task.outcomes import Outcome
 from edqn_jax.sim.task.reward import configured_reward
 from edqn_jax.sim.worlds import geodesic
-from tests.planners.small_worlds import box, small_world
+from tests.planning.small_worlds import box, small_world
 from tests.sim.drawn_scenes import GROUND, rotation_of
 
 CONFIG = Config(env=EnvConfig(reward="sparse", step_reward=-0.25, left_volume_reward=-70.0))

@@ -12,8 +12,8 @@ import pytest
 
 from edqn_jax.config import FAMILIES, MIXTURES
 from edqn_jax.errors import ConfigError
-from edqn_jax.planners.astar import shortest_path
-from edqn_jax.planners.free_space import reachable
+from edqn_jax.planning.astar import shortest_path
+from edqn_jax.planning.free_space import reachable
 from edqn_jax.sim.scene.distance import signed_distance
 from edqn_jax.sim.scene.mjcf import check_scene, load_world, write_scene
 from edqn_jax.sim.scene.scene import Scene, obstacle_count, scene_shapes, take_scene

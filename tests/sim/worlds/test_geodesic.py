@@ -10,14 +10,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from edqn_jax.planners.astar import shortest_path
+from edqn_jax.planning.astar import shortest_path
 from edqn_jax.sim.scene.distance import signed_distance
 from edqn_jax.sim.scene.mjcf import load_scene, scenes_folder
 from edqn_jax.sim.scene.scene import Scene, stack_scenes, take_scene
 from edqn_jax.sim.worlds import geodesic
 from edqn_jax.sim.worlds.families import random_pool, world_keys
 from tests.oracles import geodesic_plain
-from tests.planners.small_worlds import RADIUS, WITHOUT_A_WAY, box, random_small_world, small_world
+from tests.planning.small_worlds import RADIUS, WITHOUT_A_WAY, box, random_small_world, small_world
 
 left = jax.jit(geodesic.remaining)
 

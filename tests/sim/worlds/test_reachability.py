@@ -9,8 +9,8 @@ import jax
 import numpy as np
 import pytest
 
-from edqn_jax.planners.astar import shortest_path
-from edqn_jax.planners.lattice import NoPathError
+from edqn_jax.planning.astar import shortest_path
+from edqn_jax.planning.lattice import NoPathError
 from edqn_jax.sim.scene.scene import Planes, Scene, Spheres, UprightBoxes, UprightCylinders, build_scene
 from edqn_jax.sim.worlds import reachability
 from tests.oracles import ways_plain

@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 
 from edqn_jax.errors import ConfigError
-from edqn_jax.planners.astar import shortest_path
-from edqn_jax.planners.free_space import reachable
-from edqn_jax.planners.lattice import NoPathError
+from edqn_jax.planning.astar import shortest_path
+from edqn_jax.planning.free_space import reachable
+from edqn_jax.planning.lattice import NoPathError
 from edqn_jax.sim.scene.mjcf import load_scene, resolve_world
 from edqn_jax.sim.scene.scene import Shape, stack_scenes
 from edqn_jax.sim.task.missions import spread_missions
 from edqn_jax.sim.worlds.free_points import cells_of
-from tests.planners.small_worlds import RADIUS, SIZE, box, enclosure, small_world
+from tests.planning.small_worlds import RADIUS, SIZE, box, enclosure, small_world
 
 GOAL = np.array([10.0, 6.0, 3.0])
 

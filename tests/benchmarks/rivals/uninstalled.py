@@ -11,7 +11,7 @@ def hide(monkeypatch: pytest.MonkeyPatch, *packages: str) -> None:
     """Hides these packages, and our modules that import them, until the test ends."""
     for module in list(sys.modules):
         name = module.split(".")
-        ours = name[0] == "conventional_stack" or name[:2] == ["edqn_jax", "planners"] and name[-1] in _NEED_BENCH
+        ours = name[0] == "conventional_stack" or name[:2] == ["rivals", "planners"] and name[-1] in _NEED_BENCH
         if name[0] in packages or ours:
             monkeypatch.delitem(sys.modules, module)
     for package in packages:

@@ -11,7 +11,7 @@ import jax
 import numpy as np
 from numpy.typing import NDArray
 
-from edqn_jax.planners.planner import Task
+from edqn_jax.planning.path import Task
 from edqn_jax.sim.scene.distance import signed_distance
 from edqn_jax.sim.scene.scene import Planes, Scene, Shape, UprightBoxes, build_scene
 

@@ -14,14 +14,14 @@ from hypothesis import strategies as st
 
 from edqn_jax.config import Config
 from edqn_jax.errors import ConfigError
-from edqn_jax.planners import snn
-from edqn_jax.planners.follow import SPACING_M, FollowConfig, compiled_follower, reserved, sampled, steer
-from edqn_jax.planners.planner import Task, path_length
+from edqn_jax.planning.path import Task, path_length
 from edqn_jax.sim.physics import drone
 from edqn_jax.sim.scene.motion import not_thrown
 from edqn_jax.sim.task.flights import Flights
 from edqn_jax.sim.task.outcomes import Outcome
-from tests.planners.small_worlds import RADIUS, SIZE, assert_flyable, box, enclosure, random_small_world, small_world
+from rivals.planners import snn
+from rivals.planners.follow import SPACING_M, FollowConfig, compiled_follower, reserved, sampled, steer
+from tests.planning.small_worlds import RADIUS, SIZE, assert_flyable, box, enclosure, random_small_world, small_world
 
 CONFIG, FOLLOW = Config(), FollowConfig()
 AIRFRAME = drone.load_airframe(CONFIG.drone)

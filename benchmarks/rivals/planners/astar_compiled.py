@@ -16,10 +16,11 @@ from typing import NamedTuple
 import numpy as np
 
 from edqn_jax.extras import require
-from edqn_jax.planners.astar import shorten
-from edqn_jax.planners.lattice import edge_margin
-from edqn_jax.planners.planner import Budget, Plan, Task, found, not_found, refusal
-from edqn_jax.planners.solids import distance, leg_free, solid_table
+from edqn_jax.planning.astar import shorten
+from edqn_jax.planning.lattice import edge_margin
+from edqn_jax.planning.path import PlannedPath, Task, found, not_found, refusal
+from rivals.planners.planner import Budget
+from rivals.planners.solids import distance, leg_free, solid_table
 
 numba = require("numba")
 
@@ -259,7 +260,7 @@ def plan(
     budget: Budget = Budget(),  # noqa: B008 (it is frozen)
     seed: int = 0,
     cell: float = CELL_M,
-) -> Plan:
+) -> PlannedPath:
     """Returns the shortest path on a lattice of `cell` metres, shortened. Deterministic: `seed` is unused."""
     del seed
     refused = refusal(task)
@@ -288,7 +289,7 @@ def plan(
     return not_found(why[how], seconds, expanded)
 
 
-def plan_coarse(task: Task, budget: Budget = Budget(), seed: int = 0) -> Plan:  # noqa: B008
+def plan_coarse(task: Task, budget: Budget = Budget(), seed: int = 0) -> PlannedPath:  # noqa: B008
     """Returns the shortest path on a lattice of `COARSE_CELL_M`, which has an eighth of the cells, shortened."""
     return plan(task, budget, seed, COARSE_CELL_M)
 

@@ -11,7 +11,7 @@ may then be improved after it was expanded, so the search ends only when no open
 the result is as exact as that of expanding one entry at a time. Distances are computed only for cells that the search
 reaches.
 
-    python -m edqn_jax.planners.astar [--world NAME]
+    python -m edqn_jax.planning.astar [--world NAME]
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ from jax import Array
 
 from edqn_jax.config import FAMILIES, Config
 from edqn_jax.errors import ConfigError
-from edqn_jax.planners.lattice import CELL_M, FINE_M, STEPS, Lattice, NoPathError, is_small, leg_touches
-from edqn_jax.planners.planner import path_length, point_text
+from edqn_jax.planning.lattice import CELL_M, FINE_M, STEPS, Lattice, NoPathError, is_small, leg_touches
+from edqn_jax.planning.path import PlannedPath, found, not_found, path_length, point_text
 from edqn_jax.sim.scene.mjcf import check_scene, load_world, resolve_world
 from edqn_jax.sim.scene.scene import Scene
 from edqn_jax.sim.worlds.families import random_scene, world_key
@@ -86,6 +86,25 @@ def shortest_path(
         points = np.concatenate([points, goal[None]])
     tight = shorten(points, functools.partial(leg_touches, scene, radius=radius))
     return Path(tight, path_length(tight), length + last)
+
+
+def plan(scene: Scene, *, body_radius: float = 0.36) -> PlannedPath:
+    """Plans a path from a world's start to its goal with A*, which is given the whole map.
+
+    Args:
+        scene: one world, such as `Environment.scene` returns.
+        body_radius: of the sphere that must touch nothing, metres.
+
+    Raises:
+        ConfigError: if the volume has too many cells.
+    """
+    began = time.perf_counter()
+    try:
+        path = shortest_path(scene, scene.start, scene.goal, body_radius)
+    except NoPathError as error:
+        reason = str(error).removeprefix("there is no path: ")
+        return not_found(reason, time.perf_counter() - began)
+    return found(path.points, time.perf_counter() - began, steps=0)
 
 
 def _search(lattice: Lattice, source: int, target: int) -> tuple[np.ndarray, float]:
@@ -201,7 +220,7 @@ def _skip_ahead(points: np.ndarray, touches: Touches) -> np.ndarray:
 
 def main(arguments: list[str] | None = None) -> int:
     """Print the shortest path of a world."""
-    parser = argparse.ArgumentParser(prog="python -m edqn_jax.planners.astar", description=main.__doc__)
+    parser = argparse.ArgumentParser(prog="python -m edqn_jax.planning.astar", description=main.__doc__)
     parser.add_argument(
         "--world", default="paper", help="paper, the name of random worlds such as medium or rooms, or an MJCF file"
     )

@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 from edqn_jax.errors import ConfigError
-from edqn_jax.planners.astar import main, shortest_path
-from edqn_jax.planners.lattice import NoPathError
+from edqn_jax.planning.astar import main, shortest_path
+from edqn_jax.planning.lattice import NoPathError
 from edqn_jax.sim.scene.distance import signed_distance
 from edqn_jax.sim.scene.scene import Scene, Shape, Spheres, UprightBoxes, UprightCylinders, build_scene
 from tests.oracles import dijkstra

@@ -10,8 +10,8 @@ from scipy import ndimage
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from edqn_jax.planners.lattice import CELL_M, FINE_M, STEPS, Lattice, NoPathError, is_small
-from edqn_jax.planners.planner import point_text
+from edqn_jax.planning.lattice import CELL_M, FINE_M, STEPS, Lattice, NoPathError, is_small
+from edqn_jax.planning.path import point_text
 from edqn_jax.sim.scene.scene import Scene
 
 NICHES = 1e-3

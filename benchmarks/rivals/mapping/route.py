@@ -23,7 +23,7 @@ from typing import NamedTuple
 import numpy as np
 
 from edqn_jax.extras import require
-from edqn_jax.planners.astar import shorten
+from edqn_jax.planning.astar import shorten
 
 numba = require("numba")
 

@@ -12,12 +12,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from edqn_jax.planners import snn
-from edqn_jax.planners.planner import MARGIN, Budget, Task
+from edqn_jax.planning.path import MARGIN, Task
 from edqn_jax.sim.scene.mjcf import load_scene, resolve_world
 from edqn_jax.sim.worlds.families import random_scene, world_key
+from rivals.planners import snn
+from rivals.planners.planner import Budget
 from tests.oracles.breadth_first import hop_counts
-from tests.planners.small_worlds import (
+from tests.planning.small_worlds import (
     RADIUS,
     WITHOUT_A_WAY,
     assert_flyable,

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from edqn_jax.config import CameraConfig
 from edqn_jax.errors import ConfigError
-from edqn_jax.mapping.grid import Grid, MapConfig, empty_grid, grid_shape, update
+from rivals.mapping.grid import Grid, MapConfig, empty_grid, grid_shape, update
 from tests.oracles import grid_plain
 
 CAMERA = CameraConfig(width=5, height=4, mount="body")

@@ -31,9 +31,6 @@ from edqn_jax.errors import ConfigError
 from edqn_jax.learn import policy
 from edqn_jax.learn.perception import embedding, vae
 from edqn_jax.learn.policy import Memory, PolicyParams
-from edqn_jax.mapping.grid import Grid, MapConfig, empty_grid, grid_shape, update
-from edqn_jax.mapping.route import RouteConfig, Router
-from edqn_jax.planners.follow import FollowConfig, sampled, steer
 from edqn_jax.sim.camera import camera
 from edqn_jax.sim.physics import disturbances, drone
 from edqn_jax.sim.physics.drone import DroneState, Flight
@@ -46,6 +43,9 @@ from edqn_jax.sim.task import env
 from edqn_jax.sim.task.env import World
 from edqn_jax.sim.task.flights import Flights, at_start, tally
 from edqn_jax.sim.task.outcomes import Outcome, judge
+from rivals.mapping.grid import Grid, MapConfig, empty_grid, grid_shape, update
+from rivals.mapping.route import RouteConfig, Router
+from rivals.planners.follow import FollowConfig, sampled, steer
 
 POINTS = 128
 """Points, `planners.follow.SPACING_M` apart, of the part of a plan that the follower is given."""

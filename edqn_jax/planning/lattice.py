@@ -15,7 +15,7 @@ import numpy as np
 from jax import Array
 
 from edqn_jax.errors import ConfigError
-from edqn_jax.planners.planner import point_text
+from edqn_jax.planning.path import point_text
 from edqn_jax.sim.scene.distance import segment_contact, signed_distance
 from edqn_jax.sim.scene.scene import Scene
 

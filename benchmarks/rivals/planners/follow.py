@@ -21,7 +21,7 @@ from jax import Array
 from edqn_jax.config import Config, EnvConfig
 from edqn_jax.devices.devices import compiler_options
 from edqn_jax.errors import ConfigError
-from edqn_jax.planners.planner import Task
+from edqn_jax.planning.path import Task
 from edqn_jax.sim.physics import drone
 from edqn_jax.sim.physics.drone import Airframe, DroneState
 from edqn_jax.sim.scene.scene import Scene

@@ -21,8 +21,9 @@ import time
 import numpy as np
 
 from edqn_jax.extras import require
-from edqn_jax.planners.planner import MARGIN, Budget, Plan, Task, found, not_found, point_text, refusal
-from edqn_jax.planners.solids import leg_free, shape_distance, solid_table
+from edqn_jax.planning.path import MARGIN, PlannedPath, Task, found, not_found, point_text, refusal
+from rivals.planners.planner import Budget
+from rivals.planners.solids import leg_free, shape_distance, solid_table
 
 numba = require("numba")
 
@@ -123,7 +124,7 @@ def plan(
     budget: Budget = Budget(),  # noqa: B008 (it is frozen)
     seed: int = 0,
     config: ApfConfig = ApfConfig(),  # noqa: B008
-) -> Plan:
+) -> PlannedPath:
     """Returns the path along the force, or where it got stuck. The descent is deterministic: `seed` is unused."""
     del seed
     refused = refusal(task)

@@ -1,19 +1,13 @@
-"""The interface of planners that know the map, and the planners by name.
-
-plan = load_planner("A*")(Task.of(scene, body_radius=0.36), Budget(), seed=0)
-"""
+"""Paths through known worlds, and the task of finding one."""
 
 from __future__ import annotations
 
 import dataclasses
-import importlib
-from typing import Protocol
 
 import jax
 import numpy as np
 import numpy.typing as npt
 
-from edqn_jax.errors import ConfigError
 from edqn_jax.sim.scene.distance import signed_distance
 from edqn_jax.sim.scene.scene import Scene
 
@@ -41,16 +35,7 @@ class Task:
 
 
 @dataclasses.dataclass(frozen=True)
-class Budget:
-    """When a planner stops. Each module defines its step; only sampling planners use `seconds`."""
-
-    seconds: float = 5.0
-    steps: int | None = None
-    """None for the planner's own limit."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Plan:
+class PlannedPath:
     """The result of a planner. Seconds are of wall time, with reading the map and without compilation."""
 
     path: np.ndarray | None
@@ -59,7 +44,7 @@ class Plan:
     """Why there is no path, a sentence that begins with "no path"; empty if there is a path."""
     seconds: float
     steps: int
-    """Steps used."""
+    """Steps used; 0 where a planner counts none."""
     first_seconds: float
     """Time to the first path; equals `seconds` for planners that find only one. NaN without a path."""
     first_length_m: float
@@ -76,77 +61,15 @@ class Plan:
         return float("nan") if self.path is None else path_length(self.path)
 
 
-class Planner(Protocol):
-    """Returns a plan for a task. Only planners that sample use the seed."""
-
-    def __call__(self, task: Task, budget: Budget = ..., seed: int = ...) -> Plan: ...
-
-
-PLANNERS = {
-    "SNN": "snn.plan",
-    "A*": "astar_compiled.plan",
-    "A* 1 m": "astar_compiled.plan_coarse",
-    "RRT*": "sampling.rrt_star",
-    "RRT* first path": "sampling.rrt_star_first",
-    "BIT*": "sampling.bit_star",
-    "BIT* first path": "sampling.bit_star_first",
-    "APF": "potential_field.plan",
-}
-"""Module and function within `edqn_jax.planners` by name."""
-
-IMPROVING = "RRT*", "BIT*"
-"""Planners that go on after their first path until the budget is used up."""
-
-SAMPLING = (*IMPROVING, "RRT* first path", "BIT* first path")
-"""Planners that sample at random, so that the path depends on the seed."""
-
-
-def load_planner(name: str) -> Planner:
-    """Returns the planner of that name.
-
-    Raises:
-        KeyError: if there is no such planner.
-        MissingPackageError: if a package of the extra `bench` that it needs is not installed.
-    """
-    module, function = PLANNERS[name].split(".")
-    return getattr(importlib.import_module(f"edqn_jax.planners.{module}"), function)
-
-
-def plan(
-    scene: Scene,
-    planner: str = "SNN",
-    *,
-    body_radius: float = 0.36,
-    budget: Budget = Budget(),
-    seed: int = 0,
-) -> Plan:
-    """Plans a path from a world's start to its goal with a planner that is given the whole map.
-
-    Args:
-        scene: one world, such as `Environment.scene` returns.
-        planner: a name of `PLANNERS`, such as `SNN`, `A*` or `RRT*`.
-        body_radius: of the sphere that must touch nothing, metres.
-        budget: when the planner stops.
-        seed: of planners that sample.
-
-    Raises:
-        ConfigError: if there is no such planner.
-        MissingPackageError: if a package of the extra `bench` that it needs is not installed.
-    """
-    if planner not in PLANNERS:
-        raise ConfigError(f"there is no planner '{planner}'; there are {', '.join(PLANNERS)}")
-    return load_planner(planner)(Task.of(scene, body_radius=body_radius), budget, seed)
-
-
-def found(path: npt.ArrayLike, seconds: float, steps: int) -> Plan:
+def found(path: npt.ArrayLike, seconds: float, steps: int) -> PlannedPath:
     """Returns the plan of a planner that finds only one path [n, 3] metres."""
     path = np.asarray(path, np.float64)
-    return Plan(path, "", seconds, steps, seconds, path_length(path))
+    return PlannedPath(path, "", seconds, steps, seconds, path_length(path))
 
 
-def not_found(why: str, seconds: float = 0.0, steps: int = 0) -> Plan:
+def not_found(why: str, seconds: float = 0.0, steps: int = 0) -> PlannedPath:
     """Returns a plan without a path; `why` follows "no path: "."""
-    return Plan(None, f"no path: {why}", seconds, steps, float("nan"), float("nan"))
+    return PlannedPath(None, f"no path: {why}", seconds, steps, float("nan"), float("nan"))
 
 
 def refusal(task: Task) -> str | None:

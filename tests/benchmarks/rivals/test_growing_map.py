@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.colors import ListedColormap
 from PIL import Image
 
-from edqn_jax.report.growing_map import FREE, OCCUPIED, UNKNOWN, Moment, animate_growth, draw_growth, known_at
+from rivals.mapping.growing_map import FREE, OCCUPIED, UNKNOWN, Moment, animate_growth, draw_growth, known_at
 from tests.report.test_figures import a_scene
 
 SHAPE = (22, 22, 5)

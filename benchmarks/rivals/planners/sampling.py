@@ -19,8 +19,9 @@ from typing import Any
 import numpy as np
 
 from edqn_jax.extras import require
-from edqn_jax.planners.planner import MARGIN, Budget, Plan, Task, not_found, path_length, refusal
-from edqn_jax.planners.solids import leg_free, solid_table
+from edqn_jax.planning.path import MARGIN, PlannedPath, Task, not_found, path_length, refusal
+from rivals.planners.planner import Budget
+from rivals.planners.solids import leg_free, solid_table
 
 base = require("ompl.base")
 geometric = require("ompl.geometric")
@@ -38,27 +39,27 @@ class _Legs(base.MotionValidator):
         return leg_free(self.table, tuple(start[0:3]), tuple(end[0:3]), self.radius)
 
 
-def rrt_star(task: Task, budget: Budget = Budget(), seed: int = 0) -> Plan:  # noqa: B008 (it is frozen)
+def rrt_star(task: Task, budget: Budget = Budget(), seed: int = 0) -> PlannedPath:  # noqa: B008 (it is frozen)
     """Returns the shortest path that RRT* finds within the budget."""
     return _plan(geometric.RRTstar, task, budget, seed)
 
 
-def rrt_star_first(task: Task, budget: Budget = Budget(), seed: int = 0) -> Plan:  # noqa: B008
+def rrt_star_first(task: Task, budget: Budget = Budget(), seed: int = 0) -> PlannedPath:  # noqa: B008
     """Returns the first path that RRT* finds within the budget."""
     return _plan(geometric.RRTstar, task, budget, seed, ends_with_first=True)
 
 
-def bit_star(task: Task, budget: Budget = Budget(), seed: int = 0) -> Plan:  # noqa: B008
+def bit_star(task: Task, budget: Budget = Budget(), seed: int = 0) -> PlannedPath:  # noqa: B008
     """Returns the shortest path that BIT* finds within the budget."""
     return _plan(geometric.BITstar, task, budget, seed)
 
 
-def bit_star_first(task: Task, budget: Budget = Budget(), seed: int = 0) -> Plan:  # noqa: B008
+def bit_star_first(task: Task, budget: Budget = Budget(), seed: int = 0) -> PlannedPath:  # noqa: B008
     """Returns the first path that BIT* finds within the budget."""
     return _plan(geometric.BITstar, task, budget, seed, ends_with_first=True)
 
 
-def _plan(algorithm: Any, task: Task, budget: Budget, seed: int, ends_with_first: bool = False) -> Plan:
+def _plan(algorithm: Any, task: Task, budget: Budget, seed: int, ends_with_first: bool = False) -> PlannedPath:
     refused = refusal(task)
     if refused:
         return not_found(refused)
@@ -104,7 +105,7 @@ def _plan(algorithm: Any, task: Task, budget: Budget, seed: int, ends_with_first
     path = np.array([state[0:3] for state in problem.getSolutionPath().getStates()])
     if not first:  # found by the last iteration
         first = [seconds, path_length(path)]
-    return Plan(path, "", seconds, taken, first[0], first[1])
+    return PlannedPath(path, "", seconds, taken, first[0], first[1])
 
 
 @functools.lru_cache(maxsize=1)
