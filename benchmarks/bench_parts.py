@@ -19,10 +19,10 @@ import pytest
 from jax.sharding import Mesh
 from pytest_benchmark.fixture import BenchmarkFixture
 
+from edqn_jax.devices.devices import choose_devices, use_cpu_devices
 from edqn_jax.evaluation.missions import run_missions
 from edqn_jax.learn.plan import Plan
 from edqn_jax.learn.trainer import AXIS, Trainer
-from edqn_jax.parallel.devices import choose_devices, use_cpu_devices
 from measurement.flags import configured
 from measurement.parts import PARTS, Moment
 from measurement.timing import Timed

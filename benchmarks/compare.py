@@ -32,7 +32,7 @@ from typing import Any
 
 from edqn_jax.errors import ConfigError
 from edqn_jax.evaluation.intervals import median_interval
-from edqn_jax.runs.files import check_can_write
+from edqn_jax.files import check_can_write
 from measurement import json_report
 from measurement.child import Child, ChildEndedError
 from measurement.flags import configured, split

@@ -25,13 +25,13 @@ import jax
 
 from conventional_stack.settings import DRONES, PACKAGES, SETTINGS, supported
 from edqn_jax.config import Config
+from edqn_jax.devices.devices import use_cpu_devices
 from edqn_jax.errors import ConfigError
 from edqn_jax.evaluation.missions import run_missions
-from edqn_jax.packages import MissingPackageError
-from edqn_jax.parallel.devices import use_cpu_devices
-from edqn_jax.runs.files import check_can_write
+from edqn_jax.extras import MissingPackageError
+from edqn_jax.files import check_can_write
 from edqn_jax.runs.provenance import workload
-from edqn_jax.sim.mjcf import load_scene, resolve_world
+from edqn_jax.sim.scene.mjcf import load_scene, resolve_world
 from measurement import json_report
 from measurement.flags import configured, split
 from measurement.whole import steady

@@ -25,8 +25,8 @@ from edqn_jax.config import Config
 from edqn_jax.errors import ConfigError
 from edqn_jax.evaluation.latency import decision_latency_ms
 from edqn_jax.evaluation.missions import run_missions
+from edqn_jax.files import check_can_write
 from edqn_jax.learn.policy import fresh_policy
-from edqn_jax.runs.files import check_can_write
 from edqn_jax.runs.provenance import workload
 from measurement import json_report
 from measurement.flags import configured, split

@@ -21,20 +21,22 @@ import jax.numpy as jnp
 import numpy as np
 
 from edqn_jax.config import Config
+from edqn_jax.devices.devices import use_cpu_devices
 from edqn_jax.errors import ConfigError
 from edqn_jax.evaluation.companions import scene_of_flight
 from edqn_jax.evaluation.missions import MissionSet, load_missions
 from edqn_jax.evaluation.rollouts import fly_on_all_devices
-from edqn_jax.parallel.devices import use_cpu_devices
-from edqn_jax.runs.files import check_can_write
+from edqn_jax.files import check_can_write
 from edqn_jax.runs.policies import load_run
-from edqn_jax.sim import camera, group, sensor
-from edqn_jax.sim.distance import shape_distances, signed_distance
-from edqn_jax.sim.drone import Flight, yaw_of
-from edqn_jax.sim.events import EventField
-from edqn_jax.sim.flights import Flights
-from edqn_jax.sim.outcomes import Outcome
-from edqn_jax.sim.scene import KINDS, Scene, parked_like, scene_at
+from edqn_jax.sim.camera import camera
+from edqn_jax.sim.physics.drone import Flight, yaw_of
+from edqn_jax.sim.scene.distance import shape_distances, signed_distance
+from edqn_jax.sim.scene.scene import KINDS, Scene, parked_like, scene_at
+from edqn_jax.sim.sensors import sensor
+from edqn_jax.sim.sensors.events import EventField
+from edqn_jax.sim.task import group
+from edqn_jax.sim.task.flights import Flights
+from edqn_jax.sim.task.outcomes import Outcome
 from measurement import json_report
 
 NAMES = {

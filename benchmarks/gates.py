@@ -26,18 +26,18 @@ from jax import Array
 
 from edqn_jax.cli.arguments import parse_train
 from edqn_jax.config import FAMILIES, Config
+from edqn_jax.devices.devices import use_cpu_devices
 from edqn_jax.errors import ConfigError
 from edqn_jax.evaluation.intervals import rate_interval
 from edqn_jax.evaluation.missions import load_missions
 from edqn_jax.evaluation.rollouts import flight_keys
-from edqn_jax.parallel.devices import use_cpu_devices
-from edqn_jax.random import run_streams
-from edqn_jax.runs.files import check_can_write
-from edqn_jax.sim import env, group
-from edqn_jax.sim.drone import DroneState, yaw_of
-from edqn_jax.sim.env import World
-from edqn_jax.sim.moves import DIRECTIONS, move_number
-from edqn_jax.sim.outcomes import Outcome
+from edqn_jax.files import check_can_write
+from edqn_jax.keys import run_streams
+from edqn_jax.sim.actions import DIRECTIONS, move_number
+from edqn_jax.sim.physics.drone import DroneState, yaw_of
+from edqn_jax.sim.task import env, group
+from edqn_jax.sim.task.env import World
+from edqn_jax.sim.task.outcomes import Outcome
 from measurement import json_report
 from measurement.flags import judged_in_tests, split
 

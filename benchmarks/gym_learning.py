@@ -25,8 +25,8 @@ import numpy as np
 from edqn_jax.config import FAMILIES
 from edqn_jax.errors import ConfigError
 from edqn_jax.evaluation.intervals import drawn_rates, rate_interval
-from edqn_jax.packages import MissingPackageError, require
-from edqn_jax.runs.files import check_can_write
+from edqn_jax.extras import MissingPackageError, require
+from edqn_jax.files import check_can_write
 from edqn_jax.runs.policies import load_policy
 from edqn_jax.runs.provenance import workload
 from measurement import json_report

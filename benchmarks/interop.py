@@ -25,12 +25,12 @@ import numpy as np
 
 from edqn_jax.config import Config
 from edqn_jax.errors import ConfigError
-from edqn_jax.packages import MissingPackageError, require
-from edqn_jax.runs.files import check_can_write
+from edqn_jax.extras import MissingPackageError, require
+from edqn_jax.files import check_can_write
 from edqn_jax.runs.provenance import workload
-from edqn_jax.sim import env
-from edqn_jax.sim.environment import Environment
-from edqn_jax.sim.moves import ACTIONS
+from edqn_jax.sim.actions import ACTIONS
+from edqn_jax.sim.task import env
+from edqn_jax.sim.task.environment import Environment
 from measurement import json_report
 from measurement.flags import configured, split
 

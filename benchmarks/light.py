@@ -27,11 +27,11 @@ from typing import Any
 import success
 from edqn_jax.config import FAMILIES, Config
 from edqn_jax.config.loading import flown_under
+from edqn_jax.devices.devices import most_that_divide, use_cpu_devices
+from edqn_jax.devices.hardware import cores
 from edqn_jax.errors import ConfigError
 from edqn_jax.evaluation.missions import load_missions
-from edqn_jax.parallel.devices import most_that_divide, use_cpu_devices
-from edqn_jax.parallel.hardware import cores
-from edqn_jax.runs.files import check_can_make
+from edqn_jax.files import check_can_make
 from measurement.flags import split
 
 REAL = ("--exposure.real",)

@@ -27,37 +27,39 @@ import jax.numpy as jnp
 import numpy as np
 
 from edqn_jax.config import FAMILIES
+from edqn_jax.devices.devices import use_cpu_devices
 from edqn_jax.errors import ConfigError
 from edqn_jax.evaluation.intervals import difference_interval
 from edqn_jax.evaluation.latency import decision_seconds, in_turn
 from edqn_jax.evaluation.metrics import summarise
 from edqn_jax.evaluation.rollouts import fly_on_all_devices
+from edqn_jax.extras import MissingPackageError
+from edqn_jax.files import check_can_write, write_atomically
 from edqn_jax.learn import policy as acting
 from edqn_jax.learn.policy import Policy
-from edqn_jax.mapping import grid
-from edqn_jax.mapping.grid import MapConfig
-from edqn_jax.packages import MissingPackageError
-from edqn_jax.parallel.devices import use_cpu_devices
-from edqn_jax.planners.follow import FollowConfig
-from edqn_jax.report.growing_map import Moment, animate_growth, draw_growth
-from edqn_jax.runs.files import check_can_write, write_atomically
 from edqn_jax.runs.policies import load_policy
-from edqn_jax.sim import drone, env, worlds
-from edqn_jax.sim.distance import signed_distance
-from edqn_jax.sim.env import World
-from edqn_jax.sim.flights import Flights
-from edqn_jax.sim.missions import own_missions
-from edqn_jax.sim.motion import Aim
-from edqn_jax.sim.moving_worlds import Moving
-from edqn_jax.sim.outcomes import Outcome
-from edqn_jax.sim.scene import Scene, scene_at
-from edqn_jax.sim.sensor import mount_rotation, sensor_of
+from edqn_jax.sim.physics import drone
+from edqn_jax.sim.scene.distance import signed_distance
+from edqn_jax.sim.scene.motion import Aim
+from edqn_jax.sim.scene.scene import Scene, scene_at
+from edqn_jax.sim.sensors.sensor import mount_rotation, sensor_of
+from edqn_jax.sim.task import env
+from edqn_jax.sim.task.env import World
+from edqn_jax.sim.task.flights import Flights
+from edqn_jax.sim.task.missions import own_missions
+from edqn_jax.sim.task.outcomes import Outcome
+from edqn_jax.sim.worlds import families
+from edqn_jax.sim.worlds.moving import Moving
 from measurement import json_report
+from rivals.mapping import grid
+from rivals.mapping.grid import MapConfig
+from rivals.mapping.growing_map import Moment, animate_growth, draw_growth
+from rivals.planners.follow import FollowConfig
 
 try:
-    from edqn_jax.mapping import pilot
-    from edqn_jax.mapping.pilot import TUNED, Orders, PilotConfig, Piloted
-    from edqn_jax.mapping.route import RouteConfig
+    from rivals.mapping import pilot
+    from rivals.mapping.pilot import TUNED, Orders, PilotConfig, Piloted
+    from rivals.mapping.route import RouteConfig
 except MissingPackageError as missing:
     print(missing, file=sys.stderr)
     sys.exit(2)
@@ -135,9 +137,9 @@ def with_options(base: PilotConfig, words: Sequence[str]) -> PilotConfig:
     return changed
 
 
-def course_of(policy: Policy, family: str, split: worlds.Split, missions: int, first: int = 0) -> World:
+def course_of(policy: Policy, family: str, split: families.Split, missions: int, first: int = 0) -> World:
     """Returns one mission in each of `missions` worlds of a split, from world `first` on."""
-    pool = worlds.random_pool(family, worlds.world_keys(split, missions, first=first), Moving.of(policy.config))
+    pool = families.random_pool(family, families.world_keys(split, missions, first=first), Moving.of(policy.config))
     return World(drone.load_airframe(policy.config.drone), pool, own_missions(pool))
 
 

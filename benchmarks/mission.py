@@ -30,9 +30,9 @@ from typing import Any
 
 from edqn_jax.cli.arguments import parse_train
 from edqn_jax.config.loading import to_yaml
+from edqn_jax.devices.hardware import processor
 from edqn_jax.evaluation.metrics import wilson_interval
-from edqn_jax.parallel.hardware import processor
-from edqn_jax.runs.files import check_can_write, write_atomically
+from edqn_jax.files import check_can_write, write_atomically
 from measurement import json_report
 from measurement.flags import split
 

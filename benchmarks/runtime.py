@@ -33,10 +33,9 @@ from conventional_stack.settings import DRONES, supported
 from edqn_jax.cli.arguments import parse_train
 from edqn_jax.config import FAMILIES, Config
 from edqn_jax.config.loading import nearest, to_yaml
+from edqn_jax.devices.hardware import cores
 from edqn_jax.errors import ConfigError
-from edqn_jax.parallel.hardware import cores
-from edqn_jax.planners.planner import IMPROVING, PLANNERS
-from edqn_jax.runs.files import check_can_write
+from edqn_jax.files import check_can_write
 from measurement import json_report
 from measurement.child import Child, ChildEndedError
 from measurement.flags import configured as for_timing
@@ -45,6 +44,7 @@ from measurement.whole import steady
 from rivals import table
 from rivals.figure import draw_runtime
 from rivals.learners import LEARNERS, sensing
+from rivals.planners.planner import IMPROVING, PLANNERS
 from rivals.planning import judged_scenes, keep_to_cpu, shortest_lengths
 from rivals.rows import Row, figures, joined, worth
 from rivals.stack import STACK, STEADY

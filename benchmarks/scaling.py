@@ -30,10 +30,10 @@ from curves.figure import draw_scaling
 from curves.sizes import CURVES, Curve, changed
 from curves.state_bytes import StateBytes, state_bytes
 from edqn_jax.config import Config
+from edqn_jax.devices.devices import choose_devices, use_cpu_devices
 from edqn_jax.errors import ConfigError
 from edqn_jax.evaluation.missions import RunMissions, run_missions
-from edqn_jax.parallel.devices import choose_devices, use_cpu_devices
-from edqn_jax.runs.files import check_can_write
+from edqn_jax.files import check_can_write
 from edqn_jax.runs.provenance import workload
 from measurement import json_report
 from measurement.ceilings import Rollout

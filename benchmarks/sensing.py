@@ -30,14 +30,14 @@ from edqn_jax.errors import ConfigError
 from edqn_jax.evaluation.intervals import median_interval
 from edqn_jax.evaluation.latency import decision_call, in_turn, look_call
 from edqn_jax.evaluation.missions import MissionSet, load_missions
+from edqn_jax.files import check_can_write
 from edqn_jax.learn import policy as acting
 from edqn_jax.learn.policy import Policy, fresh_policy
-from edqn_jax.runs.files import check_can_write
 from edqn_jax.runs.policies import load_policy
-from edqn_jax.sim import env, group
-from edqn_jax.sim.events import EventField
-from edqn_jax.sim.outcomes import Outcome
-from edqn_jax.sim.sensor import frames_per_decision
+from edqn_jax.sim.sensors.events import EventField
+from edqn_jax.sim.sensors.sensor import frames_per_decision
+from edqn_jax.sim.task import env, group
+from edqn_jax.sim.task.outcomes import Outcome
 from measurement import json_report
 
 SENSORS = ("events", "frames", "frame-pair")

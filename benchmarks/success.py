@@ -40,17 +40,17 @@ import yaml
 from edqn_jax.cli.arguments import parse_train
 from edqn_jax.config import FAMILIES, Config
 from edqn_jax.config.loading import apply, to_yaml
+from edqn_jax.devices.devices import most_that_divide, use_cpu_devices
+from edqn_jax.devices.hardware import cores
 from edqn_jax.errors import ConfigError
 from edqn_jax.evaluation.intervals import interquartile_mean, rate_interval
 from edqn_jax.evaluation.metrics import known_lengths, spl
 from edqn_jax.evaluation.missions import load_missions
 from edqn_jax.evaluation.rollouts import fly_on_all_devices
+from edqn_jax.files import check_can_make
 from edqn_jax.learn.policy import Policy
-from edqn_jax.parallel.devices import most_that_divide, use_cpu_devices
-from edqn_jax.parallel.hardware import cores
-from edqn_jax.runs.files import check_can_make
 from edqn_jax.runs.policies import load_policy, save_policy
-from edqn_jax.sim.env import World
+from edqn_jax.sim.task.env import World
 from edqn_jax.training.loop import train_seeds
 from measurement import json_report
 from measurement.flags import judged_in_tests, split

@@ -25,12 +25,12 @@ import numpy as np
 from jax.sharding import Mesh
 
 from edqn_jax.config import Config
+from edqn_jax.devices.devices import choose_devices, use_cpu_devices
+from edqn_jax.devices.hardware import cores
 from edqn_jax.errors import ConfigError
 from edqn_jax.evaluation.missions import run_missions
+from edqn_jax.files import check_can_write
 from edqn_jax.learn.trainer import AXIS
-from edqn_jax.parallel.devices import choose_devices, use_cpu_devices
-from edqn_jax.parallel.hardware import cores
-from edqn_jax.runs.files import check_can_write
 from edqn_jax.runs.provenance import workload
 from measurement import json_report
 from measurement.ceilings import Rollout, ceilings

@@ -24,8 +24,8 @@ import numpy as np
 
 from edqn_jax.config import Config, DroneConfig
 from edqn_jax.errors import ConfigError
-from edqn_jax.runs.files import check_can_write, write_atomically
-from edqn_jax.sim.drone import DroneState, Flight, fly, hover, load_airframe, yaw_of
+from edqn_jax.files import check_can_write, write_atomically
+from edqn_jax.sim.physics.drone import DroneState, Flight, fly, hover, load_airframe, yaw_of
 
 Decide = Callable[[DroneState, jax.Array, jax.Array], tuple[DroneState, Flight]]
 

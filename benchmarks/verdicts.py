@@ -20,15 +20,15 @@ from typing import Any
 import jax
 import numpy as np
 
+from edqn_jax.devices.devices import use_cpu_devices
 from edqn_jax.errors import ConfigError
 from edqn_jax.evaluation.missions import load_missions
 from edqn_jax.evaluation.rollouts import fly_on_all_devices
 from edqn_jax.evaluation.verdicts import CONTACT_TOLERANCE_M, Agreement, check_verdicts
-from edqn_jax.parallel.devices import use_cpu_devices
-from edqn_jax.runs.files import check_can_write, write_atomically
+from edqn_jax.files import check_can_write, write_atomically
 from edqn_jax.runs.policies import load_run
-from edqn_jax.sim import group
-from edqn_jax.sim.outcomes import Outcome
+from edqn_jax.sim.task import group
+from edqn_jax.sim.task.outcomes import Outcome
 
 
 def rows_of(results: list[Agreement]) -> list[dict[str, Any]]:

@@ -14,17 +14,18 @@ from edqn_jax.xla_flags import disable_ynn_fusions
 if TYPE_CHECKING:
     from edqn_jax.config import Config
     from edqn_jax.config.loading import make_config
+    from edqn_jax.devices.devices import use_cpu_devices
     from edqn_jax.errors import ConfigError, DivergedError, StoppedError
     from edqn_jax.evaluation.evaluate import Evaluation, evaluate
     from edqn_jax.learn.policy import Policy
-    from edqn_jax.parallel.devices import use_cpu_devices
-    from edqn_jax.planners.planner import Plan, plan
+    from edqn_jax.planning.astar import plan
+    from edqn_jax.planning.path import PlannedPath
     from edqn_jax.report.flights import draw_map
     from edqn_jax.runs.policies import load_policy, save_policy
-    from edqn_jax.sim.environment import Environment, make
-    from edqn_jax.sim.moves import move_name, move_number
-    from edqn_jax.sim.outcomes import Outcome
-    from edqn_jax.sim.reward import Transition
+    from edqn_jax.sim.actions import move_name, move_number
+    from edqn_jax.sim.task.environment import Environment, make
+    from edqn_jax.sim.task.outcomes import Outcome
+    from edqn_jax.sim.task.reward import Transition
     from edqn_jax.training.loop import Chunk, TrainingResult, train, train_seeds
 
 _MODULES = {
@@ -32,26 +33,26 @@ _MODULES = {
     "Config": "config",
     "ConfigError": "errors",
     "DivergedError": "errors",
-    "Environment": "sim.environment",
+    "Environment": "sim.task.environment",
     "Evaluation": "evaluation.evaluate",
-    "Outcome": "sim.outcomes",
-    "Plan": "planners.planner",
+    "Outcome": "sim.task.outcomes",
+    "PlannedPath": "planning.path",
     "Policy": "learn.policy",
     "StoppedError": "errors",
     "TrainingResult": "training.loop",
-    "Transition": "sim.reward",
+    "Transition": "sim.task.reward",
     "draw_map": "report.flights",
     "evaluate": "evaluation.evaluate",
     "load_policy": "runs.policies",
-    "make": "sim.environment",
+    "make": "sim.task.environment",
     "make_config": "config.loading",
-    "move_name": "sim.moves",
-    "move_number": "sim.moves",
-    "plan": "planners.planner",
+    "move_name": "sim.actions",
+    "move_number": "sim.actions",
+    "plan": "planning.astar",
     "save_policy": "runs.policies",
     "train": "training.loop",
     "train_seeds": "training.loop",
-    "use_cpu_devices": "parallel.devices",
+    "use_cpu_devices": "devices.devices",
 }
 """The module of each public name."""
 
@@ -63,7 +64,7 @@ __all__ = [
     "Environment",
     "Evaluation",
     "Outcome",
-    "Plan",
+    "PlannedPath",
     "Policy",
     "StoppedError",
     "TrainingResult",
@@ -88,13 +89,10 @@ __version__: str
 
 def __getattr__(name: str) -> Any:
     """Loads a public name when it is first used (PEP 562)."""
-    from importlib import import_module, metadata
+    from importlib import import_module
 
     if name == "__version__":
-        try:
-            value: Any = metadata.version("edqn-jax")
-        except metadata.PackageNotFoundError:  # run from a checkout that is not installed
-            value = "0+unknown"
+        value: Any = import_module(f"{__name__}.version").package_version()
     elif name in _MODULES:
         value = getattr(import_module(f"{__name__}.{_MODULES[name]}"), name)
     else:

@@ -42,14 +42,14 @@ from jaxlib.version import __version__ as JAXLIB
 
 from edqn_jax.config import Config
 from edqn_jax.config.loading import make_config
+from edqn_jax.devices.devices import compiler_options
+from edqn_jax.devices.sums import squared_norms
 from edqn_jax.evaluation import rollouts
 from edqn_jax.evaluation.missions import load_missions, run_missions
+from edqn_jax.files import check_can_write, write_atomically
 from edqn_jax.interop import functional, onnx_export
+from edqn_jax.keys import run_streams
 from edqn_jax.learn.trainer import Trainer
-from edqn_jax.parallel.devices import compiler_options
-from edqn_jax.parallel.sums import squared_norms
-from edqn_jax.random import run_streams
-from edqn_jax.runs.files import check_can_write, write_atomically
 from edqn_jax.runs.policies import load_policy
 from edqn_jax.xla_flags import YNN_OPTION
 

@@ -26,7 +26,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
 
-IN_BOTH = ("sim/skydio_x2.xml", "py.typed", "policies/pretrained/config.yaml", "policies/pretrained/README.md")
+IN_BOTH = ("sim/physics/skydio_x2.xml", "py.typed", "policies/pretrained/config.yaml", "policies/pretrained/README.md")
 """Files of the package that are not Python, beside worlds and checkpoints."""
 
 FLIES = """

@@ -22,11 +22,11 @@ from typing import Any
 
 import edqn_jax
 from edqn_jax.config.options import MIXTURES
+from edqn_jax.devices.devices import use_cpu_devices
 from edqn_jax.errors import ConfigError
 from edqn_jax.evaluation.evaluate import Evaluation, evaluate
+from edqn_jax.files import write_atomically
 from edqn_jax.learn.policy import Policy
-from edqn_jax.parallel.devices import use_cpu_devices
-from edqn_jax.runs.files import write_atomically
 from edqn_jax.runs.policies import load_policy, save_policy
 
 ROOT = Path(__file__).resolve().parents[1]

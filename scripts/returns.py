@@ -13,9 +13,9 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from edqn_jax.errors import ConfigError
+from edqn_jax.files import check_can_write
 from edqn_jax.report.curves import draw_runs
 from edqn_jax.runs.directory import RunDirectory
-from edqn_jax.runs.files import check_can_write
 
 WINDOW = 200
 """Episodes of the running mean."""

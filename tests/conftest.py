@@ -12,6 +12,8 @@ from pathlib import Path
 import jax
 import pytest
 
+from edqn_jax.devices.devices import use_cpu_devices
+
 CACHE = {
     "jax_compilation_cache_dir": "",
     "jax_persistent_cache_min_compile_time_secs": 0.0,
@@ -59,7 +61,6 @@ LONGEST = (
 # flags gets these alone: `XLA_FLAGS= pytest` compiles everything as users do.
 os.environ.setdefault("XLA_FLAGS", QUICK_TO_COMPILE)
 
-from edqn_jax.parallel.devices import use_cpu_devices  # noqa: E402
 
 use_cpu_devices(2)
 

@@ -11,10 +11,11 @@ import numpy as np
 
 from edqn_jax.config import Config
 from edqn_jax.learn.trainer import Health, Losses
-from edqn_jax.sim import drone, mjcf
-from edqn_jax.sim.env import World
-from edqn_jax.sim.missions import spread_missions
-from edqn_jax.sim.scene import stack_scenes
+from edqn_jax.sim.physics import drone
+from edqn_jax.sim.scene import mjcf
+from edqn_jax.sim.scene.scene import stack_scenes
+from edqn_jax.sim.task.env import World
+from edqn_jax.sim.task.missions import spread_missions
 
 MINIATURE = (
     *("--world", "paper"),

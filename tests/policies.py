@@ -11,7 +11,7 @@ import numpy as np
 
 from edqn_jax.config import AgentConfig, CameraConfig, Config, DroneConfig, EncoderConfig
 from edqn_jax.learn.policy import PolicyParams, fresh_policy, observation_size
-from edqn_jax.sim.moves import ACTIONS
+from edqn_jax.sim.actions import ACTIONS
 
 CONFIG = dataclasses.replace(
     Config(),

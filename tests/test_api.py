@@ -16,11 +16,11 @@ from matplotlib.figure import Figure
 
 import edqn_jax
 from edqn_jax.evaluation.missions import load_missions
-from edqn_jax.learn import vae
-from edqn_jax.sim.distance import signed_distance
-from edqn_jax.sim.env import nearness as nearness_of
-from edqn_jax.sim.moves import ACTIONS
-from edqn_jax.sim.sensor import DEPTH_SCALE, nearness
+from edqn_jax.learn.perception import vae
+from edqn_jax.sim.actions import ACTIONS
+from edqn_jax.sim.scene.distance import signed_distance
+from edqn_jax.sim.sensors.sensor import DEPTH_SCALE, nearness
+from edqn_jax.sim.task.env import nearness as nearness_of
 from edqn_jax.training import loop
 from tests.miniature import WORLD
 from tests.policies import CONFIG, always
@@ -226,12 +226,13 @@ def test_the_worlds_of_a_split_are_those_of_its_missions() -> None:
 
 def test_a_path_is_planned_and_drawn_on_the_map() -> None:
     scene = edqn_jax.make(WORLD, QUICK).scene()
-    planned = edqn_jax.plan(scene, "SNN")
+    planned = edqn_jax.plan(scene)
     assert planned.path is not None
     np.testing.assert_allclose(planned.path[[0, -1]], [scene.start, scene.goal], atol=1e-5)
     assert min(float(signed_distance(scene, point)) for point in jnp.asarray(planned.path, jnp.float32)) > 0.35
-    with pytest.raises(edqn_jax.ConfigError, match="there is no planner 'SSN'; there are SNN"):
-        edqn_jax.plan(scene, "SSN")
+    assert planned.found and planned.length_m >= float(jnp.linalg.norm(scene.goal - scene.start)) - 1e-5
+    unfit = edqn_jax.plan(scene, body_radius=50.0)
+    assert not unfit.found and unfit.reason.startswith("no path: a sphere of 50 m does not fit at the start")
     axes = Figure().add_subplot()
     edqn_jax.draw_map(axes, scene)
     (low, *_), (high, *_) = np.asarray(scene.volume)

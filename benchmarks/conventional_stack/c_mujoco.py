@@ -9,7 +9,7 @@ from pathlib import Path
 
 import mujoco
 
-from edqn_jax.packages import require
+from edqn_jax.extras import require
 
 types = require("numba").types
 llvm = require("llvmlite.binding")  # comes with numba

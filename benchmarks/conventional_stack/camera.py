@@ -14,11 +14,11 @@ from numpy.typing import NDArray
 
 from conventional_stack.c_mujoco import mj_multi_ray
 from edqn_jax.config import CameraConfig
-from edqn_jax.packages import require
-from edqn_jax.sim.events import LUMA_WEIGHTS
-from edqn_jax.sim.raycast import HORIZON_M, image_plane, pitch_of, sun_direction
-from edqn_jax.sim.sensor import DEPTH_SCALE, HALF_NEAR_M
-from edqn_jax.sim.texture import WAVES
+from edqn_jax.extras import require
+from edqn_jax.sim.camera.camera import LUMA_WEIGHTS
+from edqn_jax.sim.camera.raycast import HORIZON_M, image_plane, pitch_of, sun_direction
+from edqn_jax.sim.camera.texture import WAVES
+from edqn_jax.sim.sensors.sensor import DEPTH_SCALE, HALF_NEAR_M
 
 numba = require("numba")
 
@@ -107,7 +107,7 @@ def cast(model, data, optics, pose, hits):
 
 @numba.njit(cache=True, inline="always")
 def _box_filter(cycles):
-    """Returns the factor of a wave's amplitude after a box average over `cycles` periods, as `sim/texture.py`."""
+    """Returns the factor of a wave's amplitude averaged over `cycles` periods, as `sim/camera/texture.py`."""
     x = min(cycles * cycles, 1.0)
     return (1.0 - x) * (1.0 - 0.55 * x)
 
@@ -151,7 +151,7 @@ def shade(geoms, optics, pose, hits, luma):
 
 @numba.njit(cache=True, error_model="numpy", fastmath=True)
 def nearness(hits, label):
-    """Computes what `edqn_jax.sim.sensor.nearness_image` shows, of M frames from their ray hits, into `label` [M, P].
+    """Computes `edqn_jax.sim.sensors.sensor.nearness_image` of M frames from their ray hits, into `label` [M, P].
 
     Of the metres along each ray, not along the optical axis; the sky is 0.
     """

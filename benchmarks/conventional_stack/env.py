@@ -8,10 +8,10 @@ import numpy as np
 
 from conventional_stack.fleet import Course, Fleet, Record
 from edqn_jax.config import Config
-from edqn_jax.packages import require
-from edqn_jax.sim.env import MOTION_SIZE, OWN_SIZE
-from edqn_jax.sim.moves import ACTIONS
-from edqn_jax.sim.outcomes import Outcome
+from edqn_jax.extras import require
+from edqn_jax.sim.actions import ACTIONS
+from edqn_jax.sim.task.env import MOTION_SIZE, OWN_SIZE
+from edqn_jax.sim.task.outcomes import Outcome
 
 gymnasium = require("gymnasium")
 spaces = gymnasium.spaces

@@ -9,8 +9,8 @@ import math
 from typing import NamedTuple
 
 from edqn_jax.config import EventsConfig
-from edqn_jax.packages import require
-from edqn_jax.sim.events import max_events
+from edqn_jax.extras import require
+from edqn_jax.sim.sensors.events import max_events
 
 numba = require("numba")
 

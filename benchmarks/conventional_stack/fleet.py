@@ -14,12 +14,14 @@ from conventional_stack import camera, events, flight, task, world
 from conventional_stack.stopwatch import Stopwatch
 from edqn_jax.config import Config
 from edqn_jax.errors import ConfigError
-from edqn_jax.learn.vae import needs_nearness
-from edqn_jax.sim import disturbances, env, light
-from edqn_jax.sim.env import MOTION_SIZE, OWN_SIZE
-from edqn_jax.sim.moves import ACTIONS
-from edqn_jax.sim.scene import take_scene
-from edqn_jax.sim.sensor import frame_steps
+from edqn_jax.learn.perception.vae import needs_nearness
+from edqn_jax.sim.actions import ACTIONS
+from edqn_jax.sim.physics import disturbances
+from edqn_jax.sim.scene.scene import take_scene
+from edqn_jax.sim.sensors import light
+from edqn_jax.sim.sensors.sensor import frame_steps
+from edqn_jax.sim.task import env
+from edqn_jax.sim.task.env import MOTION_SIZE, OWN_SIZE
 
 _BLOCK = 8
 """Drones whose frames are rendered together, so that their rays stay in the cache."""
@@ -54,9 +56,9 @@ class Record:
 
     action: np.ndarray  # [N] int64 of the next step
     events: np.ndarray  # [N, H, W] int8 signed counts of the window before the next decision
-    motion: np.ndarray  # [N, 7] float32 at the end of that window, see `edqn_jax.sim.env.own_motion`
+    motion: np.ndarray  # [N, 7] float32 at the end of that window, see `edqn_jax.sim.task.env.own_motion`
     nearness: np.ndarray  # [N, H, W] float32 at the end of that window, if the VAE must draw it; otherwise [N, 0, 0]
-    own: np.ndarray  # [N, 10] float32 see `edqn_jax.sim.env.own_state`
+    own: np.ndarray  # [N, 10] float32 see `edqn_jax.sim.task.env.own_state`
     final_own: np.ndarray  # [N, 10] float32 the same before drones whose episode ended were reset
     reward: np.ndarray  # [N] float32
     outcome: np.ndarray  # [N] int64 an `Outcome`; other than RUNNING, the drone has been reset
@@ -120,7 +122,7 @@ def check(config: Config) -> None:
 class Fleet:
     """N drones. `step` reads `record.action` and fills the rest of `record`.
 
-    Until the next step `path` holds the poses, and `end_step` and `contact` are as in `edqn_jax.sim.env.Step`.
+    Until the next step `path` holds the poses, and `end_step` and `contact` are as in `edqn_jax.sim.task.env.Step`.
     """
 
     def __init__(self, config: Config, course: Course, record: Record, seed: int) -> None:

@@ -1,4 +1,4 @@
-"""The drone in C MuJoCo with the cascaded controller of `edqn_jax/sim/drone.py`, in numba."""
+"""The drone in C MuJoCo with the cascaded controller of `edqn_jax/sim/physics/drone.py`, in numba."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from conventional_stack.c_mujoco import mj_step
 from edqn_jax.config import Config, DroneConfig
-from edqn_jax.packages import require
-from edqn_jax.sim.drone import LEAST_LEVELNESS, c_model, mixer_of
+from edqn_jax.extras import require
+from edqn_jax.sim.physics.drone import LEAST_LEVELNESS, c_model, mixer_of
 
 numba = require("numba")
 
@@ -41,7 +41,7 @@ class Airframe(NamedTuple):
     gravity: float
     max_thrust: float
     inertia: NDArray[np.float64]  # [3]
-    mixer: NDArray[np.float64]  # [4, 4], see `edqn_jax.sim.drone.Airframe`
+    mixer: NDArray[np.float64]  # [4, 4], see `edqn_jax.sim.physics.drone.Airframe`
 
 
 class Command(NamedTuple):
@@ -109,7 +109,7 @@ def wrap_angle(angle):
 
 @numba.njit(cache=True, error_model="numpy")
 def control(airframe, state, vx, vy, vz, cos_half_yaw, sin_half_yaw, thrust):
-    """Computes rotor thrusts as `edqn_jax.sim.drone.thrusts` does, line by line.
+    """Computes rotor thrusts as `edqn_jax.sim.physics.drone.thrusts` does, line by line.
 
     Args:
         state: [13].

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from conventional_stack.fleet import Course, Fleet, Record
 from conventional_stack.task import RUNNING, signed_distance
 from edqn_jax.config import Config
-from edqn_jax.packages import require
-from edqn_jax.sim.flights import Closest, Flights
+from edqn_jax.extras import require
+from edqn_jax.sim.task.flights import Closest, Flights
 
 numba = require("numba")
 
@@ -60,7 +60,7 @@ def _tally(geoms, radius, dt, running, path, end_step, contact, length, seconds,
     Args:
         running: [M] bool; the others are not changed.
         path: [M, n + 1, 7].
-        end_step, contact: [M], as in `edqn_jax.sim.env.Step`.
+        end_step, contact: [M], as in `edqn_jax.sim.task.env.Step`.
         length, seconds: [M], updated.
         nearest: distance [M], time [M], position [M, 3] and quaternion [M, 4], updated.
     """

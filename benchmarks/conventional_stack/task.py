@@ -1,4 +1,4 @@
-"""Outcome, reward, own state and own motion of a decision, as `edqn_jax/sim/env.py` defines them, in numba."""
+"""Outcome, reward, own state and own motion of a decision, as `edqn_jax/sim/task/env.py` defines them, in numba."""
 
 from __future__ import annotations
 
@@ -10,9 +10,9 @@ import numpy as np
 
 from conventional_stack.flight import clip, wrap_angle
 from edqn_jax.config import Config
-from edqn_jax.packages import require
-from edqn_jax.sim.env import MOST_YAW_RATE
-from edqn_jax.sim.outcomes import Outcome
+from edqn_jax.extras import require
+from edqn_jax.sim.task.env import MOST_YAW_RATE
+from edqn_jax.sim.task.outcomes import Outcome
 
 numba = require("numba")
 
@@ -123,7 +123,7 @@ def _first_verdict(geoms, rules, goal, path):
     """Returns the outcome of the first physics step that ends the episode, else RUNNING.
 
     Within a step the order is: not finite, contact, outside the volume, goal. Also returns that step, 1..n, and the
-    fraction of it before a contact, as `edqn_jax.sim.outcomes.judge`.
+    fraction of it before a contact, as `edqn_jax.sim.task.outcomes.judge`.
     """
     gap = signed_distance(geoms, path[0, 0], path[0, 1], path[0, 2]) - rules.radius
     for step in range(1, len(path)):
@@ -176,7 +176,7 @@ def judge(geoms, rules, goal, path, state, decision, outcome, reward, end_step, 
         state: [N, 13]; if a drone diverged, set to its first pose at rest.
         decision: [N] number of decisions, increased by 1.
         outcome, reward: [N], output.
-        end_step, contact: [N], output, as in `edqn_jax.sim.env.Step`.
+        end_step, contact: [N], output, as in `edqn_jax.sim.task.env.Step`.
     """
     for i in range(len(decision)):
         decision[i] += 1
@@ -199,7 +199,7 @@ def judge(geoms, rules, goal, path, state, decision, outcome, reward, end_step, 
 
 @numba.njit(cache=True, error_model="numpy")
 def own_state(geoms, rules, goal, state, own):
-    """Computes the drones' own states as `edqn_jax.sim.env.own_state`, into `own` [N, 10]."""
+    """Computes the drones' own states as `edqn_jax.sim.task.env.own_state`, into `own` [N, 10]."""
     for i in range(len(state)):
         yaw = wrap_angle(2 * math.atan2(state[i, 6], state[i, 3]))
         cos, sin = math.cos(yaw), math.sin(yaw)
@@ -216,7 +216,7 @@ def own_state(geoms, rules, goal, state, own):
 
 @numba.njit(cache=True, error_model="numpy")
 def own_motion(moves, action, own, state, motion):
-    """Computes the drones' own motions as `edqn_jax.sim.env.own_motion`, into `motion` [N, 7].
+    """Computes the drones' own motions as `edqn_jax.sim.task.env.own_motion`, into `motion` [N, 7].
 
     Args:
         moves: [27, 3] the vectors of the moves.

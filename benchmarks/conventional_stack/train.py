@@ -26,11 +26,11 @@ from conventional_stack.vec_env import CodedDrones, observed
 from conventional_stack.workers import SpreadFleet
 from edqn_jax.config import Config
 from edqn_jax.errors import ConfigError
-from edqn_jax.learn.patch_encoder import is_recurrent
+from edqn_jax.extras import require
+from edqn_jax.learn.perception.patch_encoder import is_recurrent
 from edqn_jax.learn.plan import Plan
-from edqn_jax.packages import require
-from edqn_jax.sim.flights import Flights
-from edqn_jax.sim.moves import ACTIONS
+from edqn_jax.sim.actions import ACTIONS
+from edqn_jax.sim.task.flights import Flights
 
 torch = require("torch")
 stable_baselines3 = require("stable_baselines3")

@@ -1,4 +1,4 @@
-"""The event VAE in PyTorch, the same networks as `edqn_jax/learn/vae.py` with the patch encoder.
+"""The event VAE in PyTorch, the same networks as `edqn_jax/learn/perception/vae.py` with the patch encoder.
 
 It encodes the event counts of a window and the drone's own motion, and draws `encoder.target` in standing waves. It
 starts from parameters that `edqn_jax` draws. B is the batch, N the number of patches, K the number of pixels in one.
@@ -14,11 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edqn_jax.config import CameraConfig, EncoderConfig
-from edqn_jax.learn.code import MAX_LOG_VARIANCE, MAX_MEAN
-from edqn_jax.learn.patch_encoder import patch_places
-from edqn_jax.learn.vae import init_vae
-from edqn_jax.learn.waves import OUTPUT_SCALE, cosines
-from edqn_jax.packages import require
+from edqn_jax.extras import require
+from edqn_jax.learn.perception.code import MAX_LOG_VARIANCE, MAX_MEAN
+from edqn_jax.learn.perception.patch_encoder import patch_places
+from edqn_jax.learn.perception.vae import init_vae
+from edqn_jax.learn.perception.waves import OUTPUT_SCALE, cosines
 
 torch = require("torch")
 nn = torch.nn
@@ -27,7 +27,7 @@ Tensor = Any
 """A `torch.Tensor`; a type checker need not have PyTorch."""
 
 Params = Any
-"""Nested dictionaries of arrays, as `edqn_jax.learn.vae.init_vae` returns them."""
+"""Nested dictionaries of arrays, as `edqn_jax.learn.perception.vae.init_vae` returns them."""
 
 
 class Encoder(nn.Module):
@@ -78,7 +78,7 @@ class EventVAE(nn.Module):
     """Encoder and decoder with given parameters."""
 
     def __init__(self, config: EncoderConfig, camera: CameraConfig, params: Params) -> None:
-        """Copies the parameters, which are those of `edqn_jax.learn.vae.init_vae` for the same configuration."""
+        """Copies the parameters, those of `edqn_jax.learn.perception.vae.init_vae` for the same configuration."""
         super().__init__()
         params = jax.tree.map(np.asarray, params)
         self.config = config
@@ -100,7 +100,7 @@ class EventVAE(nn.Module):
         return torch.cat([level.clamp(min=0), level.neg_().clamp_(min=0)], dim=2)
 
     def target(self, counts: NDArray[np.int8], nearness: NDArray[np.float32]) -> Tensor:
-        """Returns what the decoder must draw: amplitudes [B, channels, P, Q] of `edqn_jax.learn.vae.target`.
+        """Returns what the decoder must draw: amplitudes [B, channels, P, Q] of `edqn_jax.learn.perception.vae.target`.
 
         Args:
             counts: [B, H, W] signed event counts.

@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 from conventional_stack.vae import Learner
 from conventional_stack.workers import SpreadFleet
 from edqn_jax.config import Config
-from edqn_jax.packages import require
-from edqn_jax.sim.env import OWN_SIZE
-from edqn_jax.sim.moves import ACTIONS
-from edqn_jax.sim.outcomes import Outcome
+from edqn_jax.extras import require
+from edqn_jax.sim.actions import ACTIONS
+from edqn_jax.sim.task.env import OWN_SIZE
+from edqn_jax.sim.task.outcomes import Outcome
 
 spaces = require("gymnasium").spaces
 vec_env = require("stable_baselines3.common.vec_env")

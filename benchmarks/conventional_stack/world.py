@@ -10,9 +10,9 @@ import mujoco
 import numpy as np
 from numpy.typing import NDArray
 
-from edqn_jax.sim.events import LUMA_WEIGHTS
-from edqn_jax.sim.mjcf import write_scene
-from edqn_jax.sim.scene import Scene
+from edqn_jax.sim.camera.camera import LUMA_WEIGHTS
+from edqn_jax.sim.scene.mjcf import write_scene
+from edqn_jax.sim.scene.scene import Scene
 
 
 class Geoms(NamedTuple):

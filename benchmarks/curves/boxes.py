@@ -6,9 +6,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from edqn_jax.sim.building import GROUND_RGB
-from edqn_jax.sim.open_worlds import SIZE
-from edqn_jax.sim.scene import Planes, Scene, UprightBoxes, build_scene
+from edqn_jax.sim.scene.scene import Planes, Scene, UprightBoxes, build_scene
+from edqn_jax.sim.worlds.building import GROUND_RGB
+from edqn_jax.sim.worlds.open_worlds import SIZE
 
 CELL = 10.0
 """Size of a square cell of the ground, metres; a cell contains at most one box."""

@@ -11,7 +11,7 @@ from curves.boxes import world_of_boxes
 from edqn_jax.config import Config
 from edqn_jax.config.limits import validate
 from edqn_jax.config.loading import Layer, apply
-from edqn_jax.sim.mjcf import write_scene
+from edqn_jax.sim.scene.mjcf import write_scene
 
 BOXES = (8, 16, 30, 60, 120)
 """Numbers of obstacles; random worlds have 12, 30 and 60."""

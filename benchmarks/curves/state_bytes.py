@@ -8,7 +8,7 @@ import jax
 
 from edqn_jax.config import Config
 from edqn_jax.learn import trainer
-from edqn_jax.sim.env import World
+from edqn_jax.sim.task.env import World
 from measurement.timing import size_of
 
 

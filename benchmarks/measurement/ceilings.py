@@ -15,9 +15,9 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from mujoco import rollout
 
 from edqn_jax.config import Config
+from edqn_jax.devices.hardware import cores
 from edqn_jax.learn.trainer import AXIS
-from edqn_jax.parallel.hardware import cores
-from edqn_jax.sim import drone
+from edqn_jax.sim.physics import drone
 
 ROLLOUT_STEPS = 130
 """Physics steps of C MuJoCo in one call for each drone: ten decisions."""

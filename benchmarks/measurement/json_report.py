@@ -7,9 +7,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from edqn_jax.parallel.hardware import processor
+from edqn_jax.devices.hardware import processor
+from edqn_jax.files import write_atomically
 from edqn_jax.runs.directory import plain
-from edqn_jax.runs.files import write_atomically
 from edqn_jax.runs.provenance import versions
 
 

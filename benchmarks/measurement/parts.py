@@ -14,15 +14,19 @@ from jax import Array
 from jax.sharding import PartitionSpec
 
 from edqn_jax.config import Config
-from edqn_jax.learn import dqn, qnetwork, replay, updates, vae
+from edqn_jax.learn import dqn, qnetwork, replay, updates
+from edqn_jax.learn.perception import vae
 from edqn_jax.learn.plan import Plan
 from edqn_jax.learn.samples import Samples
 from edqn_jax.learn.trainer import AXIS, Actors, TrainState
 from edqn_jax.learn.updates import Learner
-from edqn_jax.sim import camera, columns, drone, env, events, native, sensor
-from edqn_jax.sim.drone import DroneState
-from edqn_jax.sim.env import EnvState, World
-from edqn_jax.sim.scene import take_scene
+from edqn_jax.sim.camera import camera, columns, native
+from edqn_jax.sim.physics import drone
+from edqn_jax.sim.physics.drone import DroneState
+from edqn_jax.sim.scene.scene import take_scene
+from edqn_jax.sim.sensors import events, sensor
+from edqn_jax.sim.task import env
+from edqn_jax.sim.task.env import EnvState, World
 from measurement.timing import Part, depending_on, operations_of, size_of, unchanged
 
 _ROWS, _SAME = PartitionSpec(AXIS), PartitionSpec()
@@ -174,7 +178,7 @@ def _drawing(now: Moment, position: Array, quaternion: Array) -> float | None:
     )
     place = position.reshape(-1, 3)
     turn = jax.vmap(partial(sensor.mount_rotation, now.config))(quaternion.reshape(-1, 4))
-    weights = jnp.broadcast_to(jnp.asarray(events.LUMA_WEIGHTS), (len(place), 3))
+    weights = jnp.broadcast_to(jnp.asarray(camera.LUMA_WEIGHTS), (len(place), 3))
     given = (scene, place, turn, weights)
     branches, branch = columns.draw_branches(config, *given)
     laid = operations_of(lambda *given: columns.draw_branches(config, *given)[1], *given)

@@ -14,8 +14,8 @@ import numpy as np
 from jax import Array
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
+from edqn_jax.devices.devices import compiler_options
 from edqn_jax.learn.trainer import AXIS
-from edqn_jax.parallel.devices import compiler_options
 
 TURN_SECONDS = 0.4
 """Approximate duration of a turn of a part."""

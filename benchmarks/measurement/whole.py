@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 
 from edqn_jax.config import Config
-from edqn_jax.learn import embedding
+from edqn_jax.learn.perception import embedding
 from edqn_jax.learn.trainer import Trainer
-from edqn_jax.sim import env
+from edqn_jax.sim.task import env
 
 WHOLE = "whole_training_step"
 """Name of the row of the whole step."""

@@ -22,9 +22,9 @@ from jax.sharding import Mesh
 
 import edqn_jax
 import throughput
+from edqn_jax.devices.devices import choose_devices, use_cpu_devices
 from edqn_jax.evaluation.missions import run_missions
 from edqn_jax.learn.trainer import AXIS
-from edqn_jax.parallel.devices import choose_devices, use_cpu_devices
 from edqn_jax.runs.provenance import workload
 from measurement import json_report
 from measurement.child import answers

@@ -13,17 +13,17 @@ import numpy as np
 from edqn_jax.config import Config
 from edqn_jax.config.limits import validate
 from edqn_jax.config.loading import apply
+from edqn_jax.devices.devices import choose_devices
 from edqn_jax.errors import DivergedError
 from edqn_jax.evaluation.latency import decision_seconds
 from edqn_jax.evaluation.missions import RunMissions, run_missions
 from edqn_jax.evaluation.rollouts import fly_on_all_devices
 from edqn_jax.learn.policy import PolicyParams
 from edqn_jax.learn.trainer import Trainer, policy_of
-from edqn_jax.parallel.devices import choose_devices
 from edqn_jax.runs.provenance import workload
-from edqn_jax.sim.env import World
-from edqn_jax.sim.flights import Flights
-from edqn_jax.sim.outcomes import Outcome
+from edqn_jax.sim.task.env import World
+from edqn_jax.sim.task.flights import Flights
+from edqn_jax.sim.task.outcomes import Outcome
 from edqn_jax.training.history import Watch
 from edqn_jax.training.selection import Candidate, choose, first_success, is_due, validated
 from measurement import json_report

@@ -12,19 +12,20 @@ import jax
 import numpy as np
 
 from edqn_jax.config import FAMILIES, Config
-from edqn_jax.parallel.hardware import cores, processor
-from edqn_jax.planners.astar import shortest_path
-from edqn_jax.planners.follow import FollowConfig, compiled_follower, reserved, sampled
-from edqn_jax.planners.lattice import NoPathError
-from edqn_jax.planners.planner import Budget, Task, load_planner
+from edqn_jax.devices.hardware import cores, processor
+from edqn_jax.planning.astar import shortest_path
+from edqn_jax.planning.lattice import NoPathError
+from edqn_jax.planning.path import Task
 from edqn_jax.runs.provenance import workload
-from edqn_jax.sim import worlds
-from edqn_jax.sim.drone import load_airframe
-from edqn_jax.sim.mjcf import check_scene, load_world, resolve_world
-from edqn_jax.sim.moving_worlds import Moving
-from edqn_jax.sim.outcomes import Outcome
-from edqn_jax.sim.scene import Scene, take_scene
+from edqn_jax.sim.physics.drone import load_airframe
+from edqn_jax.sim.scene.mjcf import check_scene, load_world, resolve_world
+from edqn_jax.sim.scene.scene import Scene, take_scene
+from edqn_jax.sim.task.outcomes import Outcome
+from edqn_jax.sim.worlds import families
+from edqn_jax.sim.worlds.moving import Moving
 from measurement import json_report
+from rivals.planners.follow import FollowConfig, compiled_follower, reserved, sampled
+from rivals.planners.planner import Budget, load_planner
 
 MANY = 64
 """Number of worlds from which on shortest paths are computed in several processes."""
@@ -40,7 +41,9 @@ def judged_scenes(config: Config, count: int) -> list[Scene]:
     """
     name, radius = config.world.name, config.drone.body_radius_m
     if name in FAMILIES:
-        pool = jax.tree.map(np.asarray, worlds.random_pool(name, worlds.world_keys("test", count), Moving.of(config)))
+        pool = jax.tree.map(
+            np.asarray, families.random_pool(name, families.world_keys("test", count), Moving.of(config))
+        )
         return [take_scene(pool, index) for index in range(count)]
     loaded = load_world(resolve_world(name))
     check_scene(loaded.scene, radius, names=loaded.names, title=f"'{name}'")

@@ -16,14 +16,14 @@ import jax
 
 from edqn_jax.config import Config
 from edqn_jax.config.loading import apply, load_layer
+from edqn_jax.devices.devices import use_cpu_devices
 from edqn_jax.errors import ConfigError
-from edqn_jax.packages import MissingPackageError
-from edqn_jax.parallel.devices import use_cpu_devices
-from edqn_jax.planners.planner import PLANNERS
+from edqn_jax.extras import MissingPackageError
 from edqn_jax.runs.directory import plain
 from measurement.child import answers
 from measurement.peak_memory import peak_of
 from rivals.learners import Learner
+from rivals.planners.planner import PLANNERS
 from rivals.planning import Planning
 from rivals.stack import STACK, STEADY, Stack
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from edqn_jax.errors import ConfigError
 from edqn_jax.evaluation.intervals import difference_interval, rate_interval
-from edqn_jax.planners.planner import SAMPLING
+from rivals.planners.planner import SAMPLING
 
 Row = dict[str, Any]
 

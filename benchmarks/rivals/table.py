@@ -6,7 +6,7 @@ import statistics
 from collections.abc import Sequence
 from typing import Any
 
-from edqn_jax.planners.planner import IMPROVING
+from rivals.planners.planner import IMPROVING
 from rivals.rows import Row, Worth, figures, worth
 from rivals.stack import STACK
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edqn_jax.config import DroneConfig
-from edqn_jax.sim.drone import LEAST_LEVELNESS
+from edqn_jax.sim.physics.drone import LEAST_LEVELNESS
 
 Vector = NDArray[np.float64]
 
@@ -25,7 +25,7 @@ def thrusts(
     velocity: Vector,
     yaw: float,
 ) -> Vector:
-    """Returns rotor thrusts [4] newtons as `edqn_jax.sim.drone.thrusts`: velocity, tilt, body rates, torque.
+    """Returns rotor thrusts [4] newtons as `edqn_jax.sim.physics.drone.thrusts`: velocity, tilt, body rates, torque.
 
     Args:
         config: gains and limits.

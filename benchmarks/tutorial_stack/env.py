@@ -12,10 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edqn_jax.config import CameraConfig, Config, EventsConfig
-from edqn_jax.packages import require
-from edqn_jax.sim.drone import AIRFRAME_FILE, mixer_of
-from edqn_jax.sim.events import LUMA_WEIGHTS, max_events
-from edqn_jax.sim.moves import ACTIONS
+from edqn_jax.extras import require
+from edqn_jax.sim.actions import ACTIONS
+from edqn_jax.sim.camera.camera import LUMA_WEIGHTS
+from edqn_jax.sim.physics.drone import AIRFRAME_FILE, mixer_of
+from edqn_jax.sim.sensors.events import max_events
 from tutorial_stack.control import thrusts
 
 gymnasium = require("gymnasium")
@@ -168,7 +169,7 @@ class TutorialDrone(gymnasium.Env):
         return ""
 
     def _observed(self, events: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Returns the event image and the ten own values of `edqn_jax.sim.env.own_state` as one vector."""
+        """Returns the event image and the ten own values of `edqn_jax.sim.task.env.own_state` as one vector."""
         position, velocity = self.data.qpos[:3], self.data.qvel[:3] / self.config.env.speed_m_s
         w, x, y, z = self.data.qpos[3:]
         heading = 2 * math.atan2(z, w)

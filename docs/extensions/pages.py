@@ -1,7 +1,7 @@
 """Pages that the site takes from elsewhere, and links that lead out of `docs/`.
 
-Markdown is written for GitHub, where a link to `../edqn_jax/sim/events.py#event_count` opens the file. On the site the
-same link leads to the function's documentation.
+Markdown is written for GitHub, where a link to `../edqn_jax/sim/sensors/events.py#event_count` opens the file. On the
+site the same link leads to the function's documentation.
 """
 
 from __future__ import annotations

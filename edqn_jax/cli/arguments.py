@@ -33,9 +33,9 @@ from edqn_jax.cli.help import (
 from edqn_jax.config import CONDITIONS, FAMILIES, Config
 from edqn_jax.config.limits import validate
 from edqn_jax.config.loading import Layer, apply, resolve
+from edqn_jax.devices.hardware import hardware
+from edqn_jax.devices.launch import Distributed
 from edqn_jax.errors import ConfigError
-from edqn_jax.parallel.hardware import hardware
-from edqn_jax.parallel.launch import Distributed
 from edqn_jax.policies import no_run, policy_folder
 from edqn_jax.runs.continuation import begun, continued
 from edqn_jax.runs.directory import Resume

@@ -10,7 +10,6 @@ from importlib import metadata
 
 import tyro
 
-import edqn_jax
 from edqn_jax.cli.arguments import (
     CompletionArgs,
     EvaluateArgs,
@@ -35,7 +34,8 @@ from edqn_jax.cli.train import train_command
 from edqn_jax.cli.variables import check_devices, start_jax
 from edqn_jax.config.loading import nearest
 from edqn_jax.errors import CheckError, ConfigError, DivergedError, StoppedError, sentence
-from edqn_jax.packages import MissingPackageError
+from edqn_jax.extras import MissingPackageError
+from edqn_jax.version import package_version
 
 DONE = 0
 FAILED = 1
@@ -93,7 +93,7 @@ def _dispatched(argv: list[str], stops: Stops) -> int:
             return FAILED
         return BAD_INPUT if isinstance(ending, ConfigError) else DIVERGED
     except (MemoryError, RuntimeError) as error:
-        from edqn_jax.parallel.memory import memory_error
+        from edqn_jax.devices.memory import memory_error
 
         if (full := memory_error(error, argv[0])) is None:
             raise
@@ -110,7 +110,7 @@ def _dispatch(argv: Sequence[str], stops: Stops) -> int:
     elif command == "completion":
         print(completion_script(parse_completion(rest).shell, COMMANDS))
     elif command == "--version":
-        print(f"edqn-jax {edqn_jax.__version__}")
+        print(f"edqn-jax {package_version()}")
         for package in VERSIONS:
             print(f"{package} {metadata.version(package)}")
     elif command in ("-h", "--help"):
@@ -125,8 +125,8 @@ def _of_a_run(command: str, argv: Sequence[str]) -> None:
     args = OF_A_RUN[command](argv)
     start_jax()
 
-    from edqn_jax.parallel.devices import use_cpu_devices
-    from edqn_jax.parallel.programs import keep_programs
+    from edqn_jax.devices.cache import keep_programs
+    from edqn_jax.devices.devices import use_cpu_devices
 
     use_cpu_devices()
     check_devices()

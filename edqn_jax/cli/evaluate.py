@@ -16,8 +16,8 @@ from edqn_jax.evaluation.evaluate import evaluate
 from edqn_jax.evaluation.latency import decision_latency_ms
 from edqn_jax.evaluation.metrics import clearance_text
 from edqn_jax.evaluation.trajectories import write_trajectories
+from edqn_jax.files import check_can_write, write_atomically
 from edqn_jax.runs.directory import plain
-from edqn_jax.runs.files import check_can_write, write_atomically
 from edqn_jax.runs.policies import load_policy, policy_digest, worlds_replaced
 from edqn_jax.runs.provenance import versions
 

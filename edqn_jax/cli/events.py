@@ -10,6 +10,7 @@ from rich.console import Console
 from rich.table import Table
 
 from edqn_jax.cli.arguments import EventsArgs
+from edqn_jax.files import check_can_write, write_atomically
 from edqn_jax.interop.event_files import check_can_write_events, read_events, write_events
 from edqn_jax.interop.recording import Recording
 from edqn_jax.interop.seen_events import image_at, seen_by, window_ends
@@ -25,7 +26,6 @@ from edqn_jax.report.recordings import (
     moments,
 )
 from edqn_jax.runs.directory import plain
-from edqn_jax.runs.files import check_can_write, write_atomically
 from edqn_jax.runs.policies import load_policy
 
 WINDOW_S = 0.05

@@ -13,13 +13,13 @@ from edqn_jax.evaluation.companions import scene_of_flight
 from edqn_jax.evaluation.missions import MissionSet, load_missions
 from edqn_jax.evaluation.rollouts import fly_on_all_devices
 from edqn_jax.evaluation.trajectories import trajectory
+from edqn_jax.files import check_can_write, write_atomically
 from edqn_jax.learn.policy import PolicyParams
 from edqn_jax.report.style import OUTCOME_LABELS
-from edqn_jax.runs.files import check_can_write, write_atomically
 from edqn_jax.runs.policies import load_run, worlds_replaced
-from edqn_jax.sim import group
-from edqn_jax.sim.flights import Flights
-from edqn_jax.sim.outcomes import Outcome
+from edqn_jax.sim.task import group
+from edqn_jax.sim.task.flights import Flights
+from edqn_jax.sim.task.outcomes import Outcome
 
 
 def record_command(args: RecordArgs) -> None:

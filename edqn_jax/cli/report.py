@@ -5,8 +5,8 @@ from __future__ import annotations
 from rich.console import Console
 
 from edqn_jax.cli.arguments import ReportArgs
+from edqn_jax.files import check_can_write, write_atomically
 from edqn_jax.report.page.document import report
-from edqn_jax.runs.files import check_can_write, write_atomically
 
 
 def report_command(args: ReportArgs) -> None:

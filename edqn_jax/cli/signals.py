@@ -16,7 +16,7 @@ import time
 from collections.abc import Callable, Iterator
 from typing import NoReturn
 
-from edqn_jax.runs.files import whole_files
+from edqn_jax.files import whole_files
 
 HEARD = (signal.SIGINT, signal.SIGTERM)
 

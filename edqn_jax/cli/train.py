@@ -18,9 +18,9 @@ from edqn_jax.cli.signals import Stops
 from edqn_jax.cli.variables import check_devices, platforms_named, start_jax
 from edqn_jax.config import FAMILIES, Config
 from edqn_jax.config.loading import gpu_layers, to_yaml
+from edqn_jax.devices.launch import how_to_join
 from edqn_jax.errors import ConfigError
-from edqn_jax.packages import SINKS
-from edqn_jax.parallel.launch import how_to_join
+from edqn_jax.extras import SINKS
 from edqn_jax.runs.directory import RunDirectory, plan_run_directory
 
 if TYPE_CHECKING:
@@ -43,12 +43,13 @@ def train_command(argv: Sequence[str], stops: Stops) -> None:
 
     import jax
 
-    from edqn_jax.parallel import memory, processes
-    from edqn_jax.parallel.devices import most_that_divide, use_cpu_devices
-    from edqn_jax.parallel.hardware import cores
-    from edqn_jax.parallel.programs import keep_programs
+    from edqn_jax.devices import memory, processes
+    from edqn_jax.devices.cache import keep_programs
+    from edqn_jax.devices.devices import most_that_divide, use_cpu_devices
+    from edqn_jax.devices.hardware import cores
+    from edqn_jax.report.gallery import prepare_gallery
     from edqn_jax.report.progress import Progress
-    from edqn_jax.training.stopping import Stop
+    from edqn_jax.runs.stopping import Stop
 
     most = 1 if config.train.debug else most_that_divide(config.train.shards, cores())
     use_cpu_devices(config.train.devices or most)
@@ -71,13 +72,13 @@ def train_command(argv: Sequence[str], stops: Stops) -> None:
     stop = Stop(stops.requested, lambda: stops.obeyed(progress.message))
     try:
         if options.seeds is None:
-            from edqn_jax.training.run import train_run
+            from edqn_jax.runs.record import train_run
 
-            train_run(config, run, progress, stop, callback=sinks)
+            train_run(config, run, progress, stop, callback=sinks, drawing=prepare_gallery)
         else:
-            from edqn_jax.training.seeds import train_seeds_run
+            from edqn_jax.runs.seeds import train_seeds_run
 
-            train_seeds_run(config, options.seeds, run, progress, stop, callback=sinks)
+            train_seeds_run(config, options.seeds, run, progress, stop, callback=sinks, drawing=prepare_gallery)
     except jax.errors.JaxRuntimeError as error:
         if arguments is None:
             raise
@@ -142,7 +143,7 @@ def options_to_compare(config: Config) -> str:
     """
     import jax
 
-    from edqn_jax.sim import native
+    from edqn_jax.sim.camera.camera import native
 
     world = dataclasses.replace(config.world, name=_held(config.world.name), flown=_held(config.world.flown))
     in_c = native.is_at_hand("cpu" if jax.default_backend() == "cpu" else "cuda")
@@ -155,7 +156,7 @@ def _held(world: str) -> str:
     Raises:
         ConfigError: as `options_to_compare`.
     """
-    from edqn_jax.sim.mjcf import resolve_world
+    from edqn_jax.sim.scene.mjcf import resolve_world
 
     if not world or world in FAMILIES:
         return world

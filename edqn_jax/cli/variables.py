@@ -53,7 +53,7 @@ def start_jax() -> None:
             f"{variable} is '{os.environ[variable]}', which JAX refuses; give another value or none"
         ) from None
 
-    from edqn_jax.parallel.jax_settings import set_as_tested
+    from edqn_jax.devices.jax_settings import set_as_tested
 
     if told := set_as_tested():
         names, are = ", ".join(told), "is" if len(told) == 1 else "are"

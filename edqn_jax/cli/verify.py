@@ -10,8 +10,8 @@ from rich.table import Table
 
 from edqn_jax.cli.arguments import VerifyArgs
 from edqn_jax.errors import CheckError
-from edqn_jax.runs.files import check_can_write, write_atomically
-from edqn_jax.training.verify import Finding, verify
+from edqn_jax.files import check_can_write, write_atomically
+from edqn_jax.runs.verify import Finding, verify
 
 
 def verify_command(args: VerifyArgs) -> None:

@@ -73,7 +73,7 @@ def _world(world: WorldConfig) -> None:
     _share(world, "world", ["moving_share"])
     _positive(world, "world", ["moving_speed_m_s"])
     _not_negative(world, "world", ["balls", "ball_gravity_m_s2"])
-    # A random start is free of what moves as fast as this for the first two seconds (`sim/free_points.py`).
+    # A random start is free of what moves as fast as this for the first two seconds (`sim/worlds/free_points.py`).
     _at_most(world, "world", ["moving_speed_m_s"], 5)
     _at_most(world, "world", ["ball_speed_m_s"], 100)
     # Of 1.5 s at least: balls are launched 3 m away or further.

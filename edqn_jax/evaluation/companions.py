@@ -10,11 +10,11 @@ import numpy as np
 
 from edqn_jax.config import Config
 from edqn_jax.evaluation.missions import MissionSet
-from edqn_jax.sim import group
-from edqn_jax.sim.balls import aim_along
-from edqn_jax.sim.flights import Flights
-from edqn_jax.sim.motion import Flown
-from edqn_jax.sim.scene import PARKED, Scene
+from edqn_jax.sim.scene.launches import aim_along
+from edqn_jax.sim.scene.motion import Flown
+from edqn_jax.sim.scene.scene import PARKED, Scene
+from edqn_jax.sim.task import group
+from edqn_jax.sim.task.flights import Flights
 
 
 def scene_of_flight(config: Config, missions: MissionSet, flights: Flights | None = None, mission: int = 0) -> Scene:

@@ -10,16 +10,16 @@ import jax
 import numpy as np
 
 from edqn_jax.config.loading import Layer, flown_under
+from edqn_jax.devices.forks import check_not_forked
+from edqn_jax.devices.jax_settings import as_tested
 from edqn_jax.errors import ConfigError
 from edqn_jax.evaluation.metrics import shortest_paths, summarise
 from edqn_jax.evaluation.missions import MissionSet, Point, load_missions
 from edqn_jax.evaluation.rollouts import fly_on_all_devices
 from edqn_jax.learn.policy import Policy
-from edqn_jax.parallel.forks import check_not_forked
-from edqn_jax.parallel.jax_settings import as_tested
-from edqn_jax.sim.flights import Flights
-from edqn_jax.sim.outcomes import Outcome
-from edqn_jax.sim.sensor import Form, sensor_of
+from edqn_jax.sim.sensors.sensor import Form, sensor_of
+from edqn_jax.sim.task.flights import Flights
+from edqn_jax.sim.task.outcomes import Outcome
 
 
 @dataclasses.dataclass(frozen=True)

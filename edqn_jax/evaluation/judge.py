@@ -20,7 +20,7 @@ import mujoco
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from edqn_jax.sim.mjcf_motion import Said, as_ellipse, motions_of
+from edqn_jax.sim.scene.mjcf_motion import Said, as_ellipse, motions_of
 
 PROBE_NAME = "edqn_body_sphere"
 """Name of the sphere that is added to the world."""

@@ -13,10 +13,10 @@ from jax import Array
 from edqn_jax.config import Config
 from edqn_jax.learn import policy
 from edqn_jax.learn.policy import PolicyParams
-from edqn_jax.sim import env
-from edqn_jax.sim.drone import Flight
-from edqn_jax.sim.scene import Scene
-from edqn_jax.sim.sensor import SensorMemory, at_rest, frame_steps, sense, sensor_of
+from edqn_jax.sim.physics.drone import Flight
+from edqn_jax.sim.scene.scene import Scene
+from edqn_jax.sim.sensors.sensor import SensorMemory, at_rest, frame_steps, sense, sensor_of
+from edqn_jax.sim.task import env
 
 
 def decision_latency_ms(config: Config, params: PolicyParams, calls: int = 300) -> dict[str, float]:

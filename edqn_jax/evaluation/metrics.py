@@ -9,12 +9,12 @@ import jax
 import numpy as np
 
 from edqn_jax.config import Config
-from edqn_jax.planners.astar import shortest_path
-from edqn_jax.planners.lattice import NoPathError
-from edqn_jax.sim.env import World
-from edqn_jax.sim.flights import Flights
-from edqn_jax.sim.outcomes import Outcome
-from edqn_jax.sim.scene import take_scene
+from edqn_jax.planning.astar import shortest_path
+from edqn_jax.planning.lattice import NoPathError
+from edqn_jax.sim.scene.scene import take_scene
+from edqn_jax.sim.task.env import World
+from edqn_jax.sim.task.flights import Flights
+from edqn_jax.sim.task.outcomes import Outcome
 
 EMPTY_M = 1e5
 """A clearance beyond this is that of a world without shapes, metres: absent shapes are parked further away."""
@@ -136,3 +136,10 @@ def flight_summary(flights: Flights, mission: int = 0) -> dict[str, Any]:
         "flight_seconds": float(flights.flight_seconds[mission]),
         **({} if flights.hit_drone is None else {"hit_drone": bool(flights.hit_drone[mission])}),
     }
+
+
+def clock(seconds: float) -> str:
+    """Returns `m:ss`, or `h:mm:ss` from an hour on."""
+    minutes, rest = divmod(int(seconds), 60)
+    hours, minutes = divmod(minutes, 60)
+    return f"{hours}:{minutes:02}:{rest:02}" if hours else f"{minutes}:{rest:02}"

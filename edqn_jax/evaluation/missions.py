@@ -12,28 +12,23 @@ import numpy as np
 
 from edqn_jax.config import FAMILIES, Config
 from edqn_jax.errors import ConfigError
-from edqn_jax.planners.astar import shortest_path
-from edqn_jax.planners.free_space import holds, reachable
-from edqn_jax.planners.lattice import CELL_M, lattice_shape
-from edqn_jax.random import run_streams
-from edqn_jax.sim import drone, group, worlds
-from edqn_jax.sim.crossing import crossing_missions, own_crossings
-from edqn_jax.sim.env import World, scene_of
-from edqn_jax.sim.free_points import Cells, cells_of, free_point
-from edqn_jax.sim.missions import Missions, own_missions, random_missions, spread_missions
-from edqn_jax.sim.mjcf import check_scene, load_world, mjcf_of, resolve_world, widened
-from edqn_jax.sim.moving_worlds import Moving
-from edqn_jax.sim.reward import Reward
-from edqn_jax.sim.scene import Scene, stack_scenes, take_scene, with_equal_capacities
+from edqn_jax.keys import CROSSING_OF_WORLD, FILE_MISSIONS, run_streams
+from edqn_jax.planning.astar import shortest_path
+from edqn_jax.planning.free_space import holds, reachable
+from edqn_jax.planning.lattice import CELL_M, lattice_shape
+from edqn_jax.sim.physics import drone
+from edqn_jax.sim.scene.mjcf import check_scene, load_world, mjcf_of, resolve_world, widened
+from edqn_jax.sim.scene.scene import Scene, stack_scenes, take_scene, with_equal_capacities
+from edqn_jax.sim.task import group
+from edqn_jax.sim.task.crossing import crossing_missions, own_crossings
+from edqn_jax.sim.task.env import World, scene_of
+from edqn_jax.sim.task.missions import Missions, own_missions, random_missions, spread_missions
+from edqn_jax.sim.task.reward import Reward
+from edqn_jax.sim.worlds import families
+from edqn_jax.sim.worlds.free_points import Cells, cells_of, free_point
+from edqn_jax.sim.worlds.moving import Moving
 
 Point = tuple[float, float, float]
-
-_MISSION_SEED = 7_919
-"""Root of the keys of evaluation missions in worlds from files; training derives its keys from other roots."""
-
-
-_CROSSING = 9_000_011
-"""Folded into the key of a world to draw the missions of several drones in it."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -130,10 +125,11 @@ def _random_run_missions(config: Config, training_key: jax.Array) -> RunMissions
     drones = config.env.drones
     airframe = drone.load_airframe(config.drone)
     moving = Moving.of(config)
-    training_pool = worlds.random_pool(name, worlds.world_keys("training", config.world.pool_size), moving)
+    training_pool = families.random_pool(name, families.world_keys("training", config.world.pool_size), moving)
     training = _training_missions(training_pool, config, training_key)
     validation, test = (
-        worlds.random_pool(name, worlds.world_keys(split, count // drones), moving) for split in ("validation", "test")
+        families.random_pool(name, families.world_keys(split, count // drones), moving)
+        for split in ("validation", "test")
     )
     if flown:
         validation, test, own = with_equal_capacities([validation, test, _pool_of(flown, config)])
@@ -163,14 +159,14 @@ def final_missions(config: Config, most: int) -> MissionSet:
         missions = jax.tree.map(lambda leaf: leaf[:count], final.world.missions)
         return dataclasses.replace(final, world=dataclasses.replace(final.world, missions=missions))
     count = max(count // config.env.drones, 1) * config.env.drones
-    pool = worlds.random_pool(name, worlds.world_keys("test", count // config.env.drones), Moving.of(config))
+    pool = families.random_pool(name, families.world_keys("test", count // config.env.drones), Moving.of(config))
     if flown:
         pool, own = with_equal_capacities([pool, _pool_of(flown, config)])
         pool = _before(own, pool)
     return MissionSet(name, _flown_in(pool, config, "test"))
 
 
-def _flown_in(pool: Scene, config: Config, split: worlds.Split, first: int = 0) -> World:
+def _flown_in(pool: Scene, config: Config, split: families.Split, first: int = 0) -> World:
     """Returns one mission in each world of the pool, its own, or one block of missions that cross.
 
     The own mission of a world is then that of its block's first drone.
@@ -186,8 +182,8 @@ def _flown_in(pool: Scene, config: Config, split: worlds.Split, first: int = 0) 
         return World(airframe, pool, own_missions(pool))
     if pool.spheres.throw is not None:
         raise ConfigError(f"with env.drones {drones} the world must throw no balls, which are for one drone alone")
-    keys = worlds.world_keys(split, pool.start.shape[0], first)
-    missions = own_crossings(pool, drones, jax.vmap(lambda key: jax.random.fold_in(key, _CROSSING))(keys))
+    keys = families.world_keys(split, pool.start.shape[0], first)
+    missions = own_crossings(pool, drones, jax.vmap(lambda key: jax.random.fold_in(key, CROSSING_OF_WORLD))(keys))
     pool = dataclasses.replace(pool, start=missions.start[::drones], goal=missions.goal[::drones])
     return World(airframe, pool, missions)
 
@@ -325,7 +321,7 @@ def load_missions(
 def _random_missions(config: Config, name: str, missions: int, seed: int, moved: dict[str, jax.Array]) -> MissionSet:
     """Returns one mission in each of `missions` test worlds, of N drones one block in each of `missions` / N."""
     count = missions // config.env.drones
-    pool = worlds.random_pool(name, worlds.world_keys("test", count, first=seed * count), Moving.of(config))
+    pool = families.random_pool(name, families.world_keys("test", count, first=seed * count), Moving.of(config))
     if moved:
         many = {key: jnp.broadcast_to(value, (missions, 3)) for key, value in moved.items()}
         pool = dataclasses.replace(pool, **many)
@@ -352,7 +348,7 @@ def _check_group(config: Config, name: str, missions: int, moved: dict[str, jax.
 
 def mission_key(seed: int) -> jax.Array:
     """Returns the key [] of the evaluation missions `seed` in worlds from files; the same in every version."""
-    return jax.random.fold_in(jax.random.key(_MISSION_SEED), seed)
+    return jax.random.fold_in(jax.random.key(FILE_MISSIONS), seed)
 
 
 def _file_missions(config: Config, name: str, missions: int, seed: int, moved: dict[str, jax.Array]) -> MissionSet:

@@ -14,14 +14,14 @@ from jax import Array
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from edqn_jax.config import Config
+from edqn_jax.devices.devices import compiler_options
+from edqn_jax.keys import run_streams
 from edqn_jax.learn import policy
 from edqn_jax.learn.policy import Memory, PolicyParams
-from edqn_jax.parallel.devices import compiler_options
-from edqn_jax.random import run_streams
-from edqn_jax.sim import env, group
-from edqn_jax.sim.env import EnvState, Observation, Step, World
-from edqn_jax.sim.flights import Flights, Record, at_start, tally
-from edqn_jax.sim.outcomes import Outcome
+from edqn_jax.sim.task import env, group
+from edqn_jax.sim.task.env import EnvState, Observation, Step, World
+from edqn_jax.sim.task.flights import Flights, Record, at_start, tally
+from edqn_jax.sim.task.outcomes import Outcome
 
 
 @struct.dataclass

@@ -10,10 +10,15 @@ import numpy as np
 
 from edqn_jax.config import Config
 from edqn_jax.evaluation.missions import MissionSet
-from edqn_jax.runs.directory import TRAJECTORY_COLUMNS
-from edqn_jax.runs.files import write_atomically
-from edqn_jax.sim.flights import Flights
-from edqn_jax.sim.outcomes import Outcome
+from edqn_jax.files import write_atomically
+from edqn_jax.sim.task.flights import Flights
+from edqn_jax.sim.task.outcomes import Outcome
+
+TRAJECTORY_COLUMNS = (
+    "t", "x", "y", "z", "qw", "qx", "qy", "qz", "vx", "vy", "vz", "action", "reward", "clearance",
+)  # fmt: skip
+"""Columns of `trajectory.csv`, one row a physics step: seconds, metres, a unit quaternion, m/s, the action's
+number, the reward of the decision and the distance of the body's sphere from the nearest shape."""
 
 
 def trajectory(config: Config, flights: Flights, mission: int = 0) -> dict[str, np.ndarray]:

@@ -10,8 +10,8 @@ import numpy as np
 from edqn_jax.config import Config
 from edqn_jax.evaluation.judge import Judge, Target, fastest, load_judge, replay_contact
 from edqn_jax.evaluation.missions import MissionSet
-from edqn_jax.sim.flights import Flights
-from edqn_jax.sim.outcomes import Outcome
+from edqn_jax.sim.task.flights import Flights
+from edqn_jax.sim.task.outcomes import Outcome
 
 CONTACT_TOLERANCE_M = 0.01
 """Largest distance along the path between the two moments of one contact. `segment_contact` samples the distance

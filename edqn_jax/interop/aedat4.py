@@ -19,8 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edqn_jax.errors import ConfigError
+from edqn_jax.extras import require
 from edqn_jax.interop.recording import Recording, recording_of
-from edqn_jax.packages import require
 
 MAGIC = b"#!AER-DAT4.0\r\n"
 

@@ -12,8 +12,8 @@ from flax import struct
 from jax import Array
 
 from edqn_jax.interop.functional import FunctionalEnv, Params, State
-from edqn_jax.learn.code import Params as EncoderParams
-from edqn_jax.sim.env import EnvState
+from edqn_jax.learn.perception.code import Params as EncoderParams
+from edqn_jax.sim.task.env import EnvState
 
 
 @struct.dataclass

@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edqn_jax.errors import ConfigError
+from edqn_jax.extras import require
 from edqn_jax.interop.recording import (
     Recording,
     TimeUnit,
@@ -29,7 +30,6 @@ from edqn_jax.interop.recording import (
     recording_of,
     whole_number,
 )
-from edqn_jax.packages import require
 
 
 def read_hdf5(file: Path, size: tuple[int, int] | None, time_unit: TimeUnit | None) -> Recording:

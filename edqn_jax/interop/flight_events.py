@@ -10,11 +10,11 @@ import numpy as np
 
 from edqn_jax.config import Config
 from edqn_jax.interop.recording import Recording
-from edqn_jax.sim.balls import aim_along
-from edqn_jax.sim.drone import Flight
-from edqn_jax.sim.env import World, scene_of
-from edqn_jax.sim.environment import Environment
-from edqn_jax.sim.moves import ACTIONS
+from edqn_jax.sim.actions import ACTIONS
+from edqn_jax.sim.physics.drone import Flight
+from edqn_jax.sim.scene.launches import aim_along
+from edqn_jax.sim.task.env import World, scene_of
+from edqn_jax.sim.task.environment import Environment
 
 
 def flight_recording(

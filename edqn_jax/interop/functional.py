@@ -22,19 +22,20 @@ from jax import Array
 
 from edqn_jax.config import FAMILIES, Config
 from edqn_jax.config.loading import make_config
+from edqn_jax.devices.jax_settings import as_tested
 from edqn_jax.errors import ConfigError
-from edqn_jax.learn import embedding
-from edqn_jax.learn.code import Params as EncoderParams
+from edqn_jax.learn.perception import embedding
+from edqn_jax.learn.perception.code import Params as EncoderParams
 from edqn_jax.learn.policy import Policy
-from edqn_jax.parallel.jax_settings import as_tested
-from edqn_jax.sim import env, events
-from edqn_jax.sim.env import MOTION_SIZE, OWN_SIZE, EnvState, World
-from edqn_jax.sim.environment import make as make_environment
-from edqn_jax.sim.events import EventField
-from edqn_jax.sim.moves import ACTIONS
-from edqn_jax.sim.outcomes import Outcome, is_terminal
-from edqn_jax.sim.reward import Reward
-from edqn_jax.sim.sensor import Form, sensor_of
+from edqn_jax.sim.actions import ACTIONS
+from edqn_jax.sim.sensors import events
+from edqn_jax.sim.sensors.events import EventField
+from edqn_jax.sim.sensors.sensor import Form, sensor_of
+from edqn_jax.sim.task import env
+from edqn_jax.sim.task.env import MOTION_SIZE, OWN_SIZE, EnvState, World
+from edqn_jax.sim.task.environment import make as make_environment
+from edqn_jax.sim.task.outcomes import Outcome, is_terminal
+from edqn_jax.sim.task.reward import Reward
 
 Kind = Literal["image", "code", "kinematics"]
 """What a drone observes: an image with its own state and motion, one vector with a code, or one without."""

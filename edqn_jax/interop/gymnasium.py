@@ -25,7 +25,10 @@ from jax import Array
 from numpy.typing import NDArray
 
 from edqn_jax.config import Config
+from edqn_jax.devices.forks import check_not_forked, lacks_threads
+from edqn_jax.devices.jax_settings import as_tested
 from edqn_jax.errors import ConfigError
+from edqn_jax.extras import require
 from edqn_jax.interop import functional
 from edqn_jax.interop.drone_programs import (
     Drone,
@@ -38,16 +41,13 @@ from edqn_jax.interop.drone_programs import (
     step_one,
 )
 from edqn_jax.interop.functional import Box, FunctionalEnv, Kind, Params
-from edqn_jax.learn.code import Params as EncoderParams
+from edqn_jax.learn.perception.code import Params as EncoderParams
 from edqn_jax.learn.policy import Policy
-from edqn_jax.packages import require
-from edqn_jax.parallel.forks import check_not_forked, lacks_threads
-from edqn_jax.parallel.jax_settings import as_tested
-from edqn_jax.sim.env import EnvState
-from edqn_jax.sim.environment import Environment
-from edqn_jax.sim.moves import ACTIONS
-from edqn_jax.sim.outcomes import Outcome
-from edqn_jax.sim.reward import Reward
+from edqn_jax.sim.actions import ACTIONS
+from edqn_jax.sim.task.env import EnvState
+from edqn_jax.sim.task.environment import Environment
+from edqn_jax.sim.task.outcomes import Outcome
+from edqn_jax.sim.task.reward import Reward
 
 gymnasium = require("gymnasium", extra="gym")
 

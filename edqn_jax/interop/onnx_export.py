@@ -15,19 +15,19 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-import edqn_jax
 from edqn_jax.config import Config
 from edqn_jax.errors import CheckError, ConfigError
+from edqn_jax.extras import require
+from edqn_jax.files import check_can_write, write_atomically
 from edqn_jax.interop import runner
 from edqn_jax.learn import policy
 from edqn_jax.learn.policy import Memory, Policy, PolicyParams, observation_size
 from edqn_jax.learn.qnetwork import q_values
-from edqn_jax.packages import require
-from edqn_jax.runs.files import check_can_write, write_atomically
-from edqn_jax.sim import events
-from edqn_jax.sim.env import MOST_YAW_RATE, MOTION_SIZE, OWN_SIZE, Observation
-from edqn_jax.sim.events import EventField
-from edqn_jax.sim.moves import ACTIONS, move_name
+from edqn_jax.sim.actions import ACTIONS, move_name
+from edqn_jax.sim.sensors import events
+from edqn_jax.sim.sensors.events import EventField
+from edqn_jax.sim.task.env import MOST_YAW_RATE, MOTION_SIZE, OWN_SIZE, Observation
+from edqn_jax.version import package_version
 
 RUNNER = "edqn_runner.py"
 """Name of the copy of the runner that is written beside a policy."""
@@ -94,7 +94,7 @@ def export_policy(flown: Policy, file: str | Path, *, checks: int = CHECKS, dige
             output_names=OUTPUTS,
         )
     model.ir_version = IR_VERSION
-    model.producer_name, model.producer_version = "edqn_jax", edqn_jax.__version__
+    model.producer_name, model.producer_version = "edqn_jax", package_version()
     difference, ties = _compared(flown, model.SerializeToString(), checks)
     about["checked"] = {"inputs": checks, "largest_difference": difference, "ties": ties}
     about["policy_sha256"] = digest
@@ -144,7 +144,7 @@ def about_policy(config: Config) -> dict[str, Any]:
     least = int(law.threshold / law.tolerance + 1e-6) if law.law == "paper" else 1
     return {
         "format": runner.FORMAT,
-        "edqn_jax": edqn_jax.__version__,
+        "edqn_jax": package_version(),
         "sensor": sensor,
         "width": config.camera.width,
         "height": config.camera.height,

@@ -17,8 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edqn_jax.errors import ConfigError
-from edqn_jax.packages import require
-from edqn_jax.sim.outcomes import Outcome
+from edqn_jax.extras import require
+from edqn_jax.sim.task.outcomes import Outcome
 
 gymnasium = require("gymnasium", extra="gym")
 require("edqn_jax.interop.gymnasium", extra="gym")  # registers the names

@@ -22,10 +22,10 @@ from typing import Any, Protocol
 import numpy as np
 
 from edqn_jax.config import Config
-from edqn_jax.packages import SINKS, require
+from edqn_jax.extras import SINKS, require
 from edqn_jax.report.solids import solids_of
 from edqn_jax.report.style import OUTCOME_COLOURS
-from edqn_jax.sim.outcomes import Outcome
+from edqn_jax.sim.task.outcomes import Outcome
 from edqn_jax.training.loop import Chunk
 
 

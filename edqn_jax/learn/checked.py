@@ -20,9 +20,9 @@ from jax.experimental import checkify
 from edqn_jax.config import Config
 from edqn_jax.errors import CheckError
 from edqn_jax.learn.updates import flat
-from edqn_jax.sim import env
-from edqn_jax.sim.env import EnvState, World
-from edqn_jax.sim.moves import ACTIONS
+from edqn_jax.sim.actions import ACTIONS
+from edqn_jax.sim.task import env
+from edqn_jax.sim.task.env import EnvState, World
 
 Run = Callable[[World, Any, Array], tuple[Any, Any]]
 """A chunk: from world, train state and the numbers of its steps to the state and what it returns."""

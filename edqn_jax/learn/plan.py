@@ -14,7 +14,7 @@ import numpy as np
 from jax import Array
 
 from edqn_jax.config import Config, TrainConfig
-from edqn_jax.learn import embedding
+from edqn_jax.learn.perception import embedding
 
 
 @dataclasses.dataclass(frozen=True)

@@ -11,15 +11,15 @@ from flax import struct
 from jax import Array
 
 from edqn_jax.config import Config
+from edqn_jax.devices.jax_settings import as_tested
 from edqn_jax.errors import ConfigError
-from edqn_jax.learn import embedding, vae
 from edqn_jax.learn.dqn import epsilon_greedy
+from edqn_jax.learn.perception import embedding, vae
 from edqn_jax.learn.qnetwork import Params, init_q, q_values
-from edqn_jax.parallel.jax_settings import as_tested
-from edqn_jax.sim.env import OWN_SIZE, Observation
-from edqn_jax.sim.events import EventField
-from edqn_jax.sim.moves import ACTIONS
-from edqn_jax.sim.sensor import DEPTH_SCALE, Sensed, distance_of, sensor_of
+from edqn_jax.sim.actions import ACTIONS
+from edqn_jax.sim.sensors.events import EventField
+from edqn_jax.sim.sensors.sensor import DEPTH_SCALE, Sensed, distance_of, sensor_of
+from edqn_jax.sim.task.env import OWN_SIZE, Observation
 
 MOVE_SIZE = 3
 """Values of the last move, which end the own motion (`sim.env.own_motion`)."""

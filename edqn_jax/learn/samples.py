@@ -20,11 +20,11 @@ from jax import Array
 
 from edqn_jax.checks import check_index
 from edqn_jax.config import EncoderConfig
-from edqn_jax.learn import vae
-from edqn_jax.learn.vae import Target
-from edqn_jax.random import integers
-from edqn_jax.sim.env import MIRRORED_MOTION, Observation
-from edqn_jax.sim.events import EventField
+from edqn_jax.keys import integers
+from edqn_jax.learn.perception import vae
+from edqn_jax.learn.perception.vae import Target
+from edqn_jax.sim.sensors.events import EventField
+from edqn_jax.sim.task.env import MIRRORED_MOTION, Observation
 
 MOST_EVENTS = 2**15 - 1
 """More events of a pixel than this are stored as this many."""

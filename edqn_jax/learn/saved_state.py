@@ -14,9 +14,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from edqn_jax.devices import processes
 from edqn_jax.errors import ConfigError
 from edqn_jax.learn.trainer import Trainer, TrainState
-from edqn_jax.parallel import processes
 
 Shape = tuple[tuple[int, ...], str]
 """Shape and type of an array on the host."""

@@ -22,21 +22,22 @@ from jax import Array, lax
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from edqn_jax.config import Config
+from edqn_jax.devices import processes
+from edqn_jax.devices.devices import compiler_options
 from edqn_jax.errors import ConfigError
-from edqn_jax.learn import dqn, embedding, policy, replay, samples, vae
+from edqn_jax.keys import run_streams
+from edqn_jax.learn import dqn, policy, replay, samples
 from edqn_jax.learn.checked import CheckedChunk, one_by_one
+from edqn_jax.learn.perception import embedding, vae
 from edqn_jax.learn.plan import Plan
 from edqn_jax.learn.policy import PolicyParams, empty_memory, observation_size
 from edqn_jax.learn.samples import Samples
 from edqn_jax.learn.updates import Learner, flat, init_learner, learn_to_act, learn_to_see
-from edqn_jax.parallel import processes
-from edqn_jax.parallel.all_sum import all_sum
-from edqn_jax.parallel.devices import compiler_options
-from edqn_jax.random import run_streams
-from edqn_jax.sim import env, group
-from edqn_jax.sim.env import EnvState, World
-from edqn_jax.sim.moves import ACTIONS
-from edqn_jax.sim.outcomes import Outcome
+from edqn_jax.native.all_sum import all_sum
+from edqn_jax.sim.actions import ACTIONS
+from edqn_jax.sim.task import env, group
+from edqn_jax.sim.task.env import EnvState, World
+from edqn_jax.sim.task.outcomes import Outcome
 
 AXIS = "env"
 """Name of the mesh axis that shards are spread over."""

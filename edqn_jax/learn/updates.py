@@ -17,15 +17,16 @@ from jax import Array, lax
 from jax.flatten_util import ravel_pytree
 
 from edqn_jax.config import Config
-from edqn_jax.learn import dqn, embedding, qnetwork, replay, samples, vae
+from edqn_jax.keys import split_each
+from edqn_jax.learn import dqn, qnetwork, replay, samples
+from edqn_jax.learn.perception import embedding, vae
 from edqn_jax.learn.plan import Plan
 from edqn_jax.learn.policy import observation_size
 from edqn_jax.learn.qnetwork import Params
 from edqn_jax.learn.samples import Samples
-from edqn_jax.parallel.all_sum import all_sum
-from edqn_jax.random import split_each
-from edqn_jax.sim.env import is_finite
-from edqn_jax.sim.moves import ACTIONS
+from edqn_jax.native.all_sum import all_sum
+from edqn_jax.sim.actions import ACTIONS
+from edqn_jax.sim.task.env import is_finite
 
 
 @struct.dataclass

@@ -19,15 +19,15 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Wedge
 from PIL import Image
 
+from edqn_jax.extras import require
 from edqn_jax.learn.policy import PolicyParams
-from edqn_jax.packages import require
 from edqn_jax.report.flights import OBLIQUE, OTHER_COLOUR, draw_end_marks, draw_stage, others_paths
 from edqn_jax.report.images import LOOKS, scale_of
 from edqn_jax.report.sights import Sights, decision_rows, poses, times_of
 from edqn_jax.report.solids import MAP, View, faces_seen, hidden, moving_solids
 from edqn_jax.report.style import INK, LINE, MUTED, OUTCOME_COLOURS, OUTCOME_LABELS, STYLE
-from edqn_jax.sim.camera import on_screen
-from edqn_jax.sim.scene import moves
+from edqn_jax.sim.camera.camera import on_screen
+from edqn_jax.sim.scene.scene import moves
 
 SIZE = (800, 540)
 """Width and height of the GIF, pixels."""

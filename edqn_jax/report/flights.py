@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Circle
 
-from edqn_jax.parallel.jax_settings import as_tested
+from edqn_jax.devices.jax_settings import as_tested
 from edqn_jax.report.solids import (
     GROUND,
     MAP,
@@ -29,7 +29,7 @@ from edqn_jax.report.solids import (
     standing,
 )
 from edqn_jax.report.style import INK, MUTED, OUTCOME_COLOURS, OUTCOME_LABELS, drawing
-from edqn_jax.sim.scene import PARKED, Scene
+from edqn_jax.sim.scene.scene import PARKED, Scene
 
 OBLIQUE = View(azimuth=-62.0, elevation=34.0)
 SPEED_COLOURS = "viridis"

@@ -2,19 +2,42 @@
 
 from __future__ import annotations
 
+from concurrent.futures import Executor
+
 import numpy as np
 
-from edqn_jax.learn import embedding
+from edqn_jax.config import Config
+from edqn_jax.evaluation.trajectories import TRAJECTORY_COLUMNS
+from edqn_jax.learn.perception import embedding
 from edqn_jax.learn.policy import PolicyParams
 from edqn_jax.report.curves import draw_learning, draw_returns
 from edqn_jax.report.flights import draw_path, draw_world
 from edqn_jax.report.images import LOOKS, RECONSTRUCTED_EVENTS, draw_reconstruction, draw_sight
 from edqn_jax.report.sights import Sights, coarse, decision_rows, poses, times_of
-from edqn_jax.runs.directory import TRAJECTORY_COLUMNS, RunDirectory
-from edqn_jax.sim.camera import on_screen
+from edqn_jax.runs.directory import RunDirectory
+from edqn_jax.runs.record import Draw
+from edqn_jax.sim.camera.camera import on_screen
+from edqn_jax.sim.scene.scene import Scene
 
 MOMENTS = 5
 """Moments of the flight that are shown."""
+
+
+def prepare_gallery(config: Config, scene: Scene, pool: Executor) -> Draw:
+    """Starts to compile what draws flights in worlds whose arrays have the shapes of `scene`.
+
+    Args:
+        pool: as in `Sights`.
+
+    Returns:
+        the function that draws all pictures of a run.
+    """
+    sights = Sights(config, scene, pool)
+
+    def draw(run: RunDirectory, scene: Scene, params: PolicyParams, shortest: np.ndarray, outcome: str) -> None:
+        draw_gallery(run, sights.in_world(scene), params, shortest, outcome)
+
+    return draw
 
 
 def draw_gallery(run: RunDirectory, sights: Sights, params: PolicyParams, shortest: np.ndarray, outcome: str) -> None:

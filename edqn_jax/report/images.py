@@ -13,7 +13,7 @@ from matplotlib.colors import Colormap, Normalize
 from matplotlib.figure import Figure
 
 from edqn_jax.report.style import COUNTS, INK, MUTED, POLARITY, drawing
-from edqn_jax.sim.sensor import SENSORS
+from edqn_jax.sim.sensors.sensor import SENSORS
 
 
 @dataclasses.dataclass(frozen=True)

@@ -13,6 +13,8 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
+from edqn_jax.evaluation.metrics import clock
+
 SHOWN = {
     "decisions_per_second": ("decisions/s", "{:,.0f}"),
     "episodes": ("episodes", "{:,.0f}"),
@@ -145,10 +147,3 @@ class Progress:
             values.add_row(*(Text(label, style="dim") for label, _ in shown))
             values.add_row(*(value for _, value in shown))
         return Panel(Group(head, values) if shown else head, title="edqn", title_align="left")
-
-
-def clock(seconds: float) -> str:
-    """Returns `m:ss`, or `h:mm:ss` from an hour on."""
-    minutes, rest = divmod(int(seconds), 60)
-    hours, minutes = divmod(minutes, 60)
-    return f"{hours}:{minutes:02}:{rest:02}" if hours else f"{minutes}:{rest:02}"

@@ -16,15 +16,18 @@ from jax import Array
 from jax.stages import Compiled
 
 from edqn_jax.config import Config
-from edqn_jax.learn import embedding, vae
+from edqn_jax.devices.devices import quick_compiler_options
+from edqn_jax.learn.perception import embedding, vae
 from edqn_jax.learn.policy import PolicyParams, fresh_policy
-from edqn_jax.parallel.devices import quick_compiler_options
-from edqn_jax.sim import camera, drone, env, events, sensor
-from edqn_jax.sim.drone import Flight
-from edqn_jax.sim.env import MOTION_SIZE
-from edqn_jax.sim.events import EventField
-from edqn_jax.sim.moves import ACTIONS
-from edqn_jax.sim.scene import Scene, scene_at
+from edqn_jax.sim.actions import ACTIONS
+from edqn_jax.sim.camera import camera
+from edqn_jax.sim.physics import drone
+from edqn_jax.sim.physics.drone import Flight
+from edqn_jax.sim.scene.scene import Scene, scene_at
+from edqn_jax.sim.sensors import events, sensor
+from edqn_jax.sim.sensors.events import EventField
+from edqn_jax.sim.task import env
+from edqn_jax.sim.task.env import MOTION_SIZE
 
 FINE = 8
 """How much finer than the drone's camera the RGB pictures for people are, per axis."""

@@ -13,7 +13,7 @@ from matplotlib.axes import Axes
 from matplotlib.collections import PolyCollection
 from matplotlib.patches import Polygon
 
-from edqn_jax.sim.scene import KINDS, PARKED, Scene, scene_at
+from edqn_jax.sim.scene.scene import KINDS, PARKED, Scene, scene_at
 
 AROUND = 36
 """Corners of a circle."""

@@ -15,20 +15,14 @@ from typing import Any, Literal
 
 import numpy as np
 
-import edqn_jax
 from edqn_jax.config import Config
 from edqn_jax.config.loading import apply, load_layer, to_yaml
 from edqn_jax.errors import ConfigError
-from edqn_jax.runs.files import check_can_make, unwritable, write_atomically
+from edqn_jax.files import check_can_make, unwritable, write_atomically
 from edqn_jax.runs.lock import LOCK, Lock
+from edqn_jax.version import package_version
 
 Resume = Literal["auto", "never", "must"]
-
-TRAJECTORY_COLUMNS = (
-    "t", "x", "y", "z", "qw", "qx", "qy", "qz", "vx", "vy", "vz", "action", "reward", "clearance",
-)  # fmt: skip
-"""Columns of `trajectory.csv`, one row a physics step: seconds, metres, a unit quaternion, m/s, the action's
-number, the reward of the decision and the distance of the body's sphere from the nearest shape."""
 
 EPISODE_COLUMNS = ("step", "return", "length", "outcome")
 """Columns of `episodes.csv`: decisions of all environments when the episode ended, undiscounted return,
@@ -217,11 +211,13 @@ class RunDirectory:
         write_atomically(self.summary_file, json.dumps(plain(summary), indent=2, allow_nan=False) + "\n")
 
     def write_trajectory(self, columns: Mapping[str, np.ndarray]) -> None:
-        """Writes `trajectory.csv` from one [T] array for each of `TRAJECTORY_COLUMNS`.
+        """Writes `trajectory.csv` from one [T] array for each of `evaluation.trajectories.TRAJECTORY_COLUMNS`.
 
         Raises:
             ConfigError: if it cannot be written.
         """
+        from edqn_jax.evaluation.trajectories import TRAJECTORY_COLUMNS  # here: it imports JAX
+
         table = np.stack([np.asarray(columns[name], np.float64) for name in TRAJECTORY_COLUMNS], axis=1)
         lines = [",".join(TRAJECTORY_COLUMNS), *(",".join(f"{value:.7g}" for value in row) for row in table)]
         write_atomically(self.trajectory_file, "\n".join(lines) + "\n")
@@ -236,6 +232,8 @@ class RunDirectory:
         Raises:
             ValueError: if it has other columns, or something that is no number.
         """
+        from edqn_jax.evaluation.trajectories import TRAJECTORY_COLUMNS  # here: it imports JAX
+
         with self.trajectory_file.open(encoding="utf-8", newline="") as file:
             header, *rows = csv.reader(file)
         if tuple(header) != TRAJECTORY_COLUMNS or not rows:
@@ -299,7 +297,7 @@ def _asks_for_more(run: RunDirectory, config: Config) -> bool:
 
 def config_text(config: Config) -> str:
     """Returns the content of a run's `config.yaml`: the version of this package, and every option."""
-    return f"{_VERSION}{edqn_jax.__version__}\n{to_yaml(config)}"
+    return f"{_VERSION}{package_version()}\n{to_yaml(config)}"
 
 
 def version_of(config_file: Path) -> str | None:

@@ -7,19 +7,20 @@ from pathlib import Path
 import jax
 import numpy as np
 
-import edqn_jax
 from edqn_jax.config import Config
 from edqn_jax.config.limits import validate
 from edqn_jax.config.loading import apply, load_layer
+from edqn_jax.devices.forks import check_not_forked
+from edqn_jax.devices.jax_settings import as_tested
 from edqn_jax.errors import ConfigError
+from edqn_jax.files import check_can_make, write_atomically
 from edqn_jax.learn.policy import Policy, PolicyParams, fresh_policy
-from edqn_jax.parallel.forks import check_not_forked
-from edqn_jax.parallel.jax_settings import as_tested
 from edqn_jax.policies import no_run, policy_folder
-from edqn_jax.runs import manifest, world_copy
-from edqn_jax.runs.checkpoints import load_params, save_params, saved_at
+from edqn_jax.runs import world_copy
+from edqn_jax.runs.checkpoints import manifest
+from edqn_jax.runs.checkpoints.params import load_params, save_params, saved_at
 from edqn_jax.runs.directory import SEED_FOLDER, config_text, version_of
-from edqn_jax.runs.files import check_can_make, write_atomically
+from edqn_jax.version import package_version
 
 
 @as_tested
@@ -71,7 +72,7 @@ def load_run(folder: Path) -> tuple[Config, PolicyParams]:
     try:
         return _loaded(folder, file)
     except ConfigError as error:
-        writer, here = version_of(file), edqn_jax.__version__
+        writer, here = version_of(file), package_version()
         if writer in (None, here):
             raise
         raise ConfigError(
@@ -90,7 +91,7 @@ def _loaded(folder: Path, file: Path) -> tuple[Config, PolicyParams]:
     if _shapes(params) != _shapes(fresh):
         raise ConfigError(
             f"the policy in '{folder}' does not have the shapes that its config.yaml asks for in edqn_jax "
-            f"{edqn_jax.__version__}; fly it with the version that trained it, or train it anew"
+            f"{package_version()}; fly it with the version that trained it, or train it anew"
         )
     return world_copy.flown_in(folder, config)[0], params
 

@@ -18,12 +18,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from edqn_jax.config import Config
-from edqn_jax.learn.embedding import has_code
+from edqn_jax.devices import processes
+from edqn_jax.learn.perception.embedding import has_code
 from edqn_jax.learn.trainer import TrainState
-from edqn_jax.parallel import c_library, processes
-from edqn_jax.sim.reward import Reward
-from edqn_jax.sim.scene import Scene, obstacle_count
-from edqn_jax.sim.sensor import frames_per_decision
+from edqn_jax.native import build
+from edqn_jax.sim.scene.scene import Scene, obstacle_count
+from edqn_jax.sim.sensors.sensor import frames_per_decision
+from edqn_jax.sim.task.reward import Reward
 
 
 def workload(config: Config, scene: Scene) -> dict[str, Any]:
@@ -50,9 +51,9 @@ def versions() -> dict[str, str]:
     """Returns the versions of Python, of packages, and of the compilers of C, that figures depend on."""
     names = ("jax", "mujoco", "mujoco-mjx", "flax", "optax", "numpy")
     packages = {name: metadata.version(name) for name in names}
-    cuda = c_library.cuda()
-    compilers = {"C compiler": c_library.C} | ({} if cuda is None else {"CUDA compiler": cuda})
-    in_c = {name: c_library.compiler(each) or "none" for name, each in compilers.items()}
+    cuda = build.cuda()
+    compilers = {"C compiler": build.C} | ({} if cuda is None else {"CUDA compiler": cuda})
+    in_c = {name: build.compiler(each) or "none" for name, each in compilers.items()}
     return {"python": platform.python_version(), **packages, **in_c}
 
 

@@ -12,9 +12,9 @@ from pathlib import Path
 
 from edqn_jax.config import FAMILIES, Config, WorldConfig
 from edqn_jax.errors import ConfigError
-from edqn_jax.runs import manifest
-from edqn_jax.runs.files import unwritable
-from edqn_jax.sim.mjcf import SceneError, resolve_world
+from edqn_jax.files import unwritable
+from edqn_jax.runs.checkpoints import manifest
+from edqn_jax.sim.scene.mjcf import SceneError, resolve_world
 
 WORLD = "world"
 """The folder of the copies within that of a run."""

@@ -12,7 +12,7 @@ from edqn_jax.config import Config
 from edqn_jax.errors import DivergedError
 from edqn_jax.learn.plan import Plan
 from edqn_jax.learn.trainer import Episodes, Health, Losses
-from edqn_jax.sim.outcomes import Outcome
+from edqn_jax.sim.task.outcomes import Outcome
 
 MOST_ILL_STEPS = 100
 """Training steps without a useful update, or with as many diverged decisions, after which a run is given up."""

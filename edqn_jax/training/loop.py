@@ -17,16 +17,16 @@ import numpy as np
 
 from edqn_jax.config import Config
 from edqn_jax.config.loading import make_config
+from edqn_jax.devices import processes
+from edqn_jax.devices.jax_settings import as_tested
 from edqn_jax.evaluation.missions import MissionSet, RunMissions
 from edqn_jax.learn.policy import Policy, PolicyParams
 from edqn_jax.learn.trainer import Trainer, TrainState, policy_of
-from edqn_jax.parallel import processes
-from edqn_jax.parallel.jax_settings import as_tested
-from edqn_jax.sim.flights import Flights
-from edqn_jax.sim.reward import Reward
+from edqn_jax.sim.task.flights import Flights
+from edqn_jax.sim.task.reward import Reward
 from edqn_jax.training.history import EndedEpisodes, History, Watch, chunk_metrics, mean_metrics
-from edqn_jax.training.preparation import Preparation, prepared
 from edqn_jax.training.selection import Candidate, choose, is_due, validated
+from edqn_jax.training.setup import Preparation, prepared
 
 
 @dataclasses.dataclass(frozen=True)

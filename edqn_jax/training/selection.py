@@ -13,9 +13,9 @@ from edqn_jax.evaluation.metrics import spl
 from edqn_jax.evaluation.missions import RunMissions
 from edqn_jax.learn.plan import Plan
 from edqn_jax.learn.policy import PolicyParams
-from edqn_jax.sim.flights import Flights
-from edqn_jax.sim.missions import Missions
-from edqn_jax.sim.outcomes import Outcome
+from edqn_jax.sim.task.flights import Flights
+from edqn_jax.sim.task.missions import Missions
+from edqn_jax.sim.task.outcomes import Outcome
 
 FLIES = 0.9
 """Success rate, in the validation missions that begin at or near a world's own start, from which a policy is said to

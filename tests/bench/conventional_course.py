@@ -11,9 +11,11 @@ from numpy.typing import NDArray
 from conventional_stack import world
 from conventional_stack.fleet import Course, Fleet, Record
 from edqn_jax.config import Config
-from edqn_jax.sim import drone, env, mjcf
-from edqn_jax.sim.missions import Missions
-from edqn_jax.sim.scene import Scene, stack_scenes
+from edqn_jax.sim.physics import drone
+from edqn_jax.sim.scene import mjcf
+from edqn_jax.sim.scene.scene import Scene, stack_scenes
+from edqn_jax.sim.task import env
+from edqn_jax.sim.task.missions import Missions
 
 
 @functools.cache

@@ -7,12 +7,14 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from edqn_jax.planners import astar, astar_compiled, lattice, snn
-from edqn_jax.planners.planner import Budget, Plan, Task
-from edqn_jax.planners.solids import solid_table
-from edqn_jax.sim.mjcf import load_scene, resolve_world
-from edqn_jax.sim.worlds import random_scene, world_key
-from tests.planners.small_worlds import RADIUS, assert_flyable, box, random_small_world, small_world
+from edqn_jax.planning import astar, lattice
+from edqn_jax.planning.path import PlannedPath, Task
+from edqn_jax.sim.scene.mjcf import load_scene, resolve_world
+from edqn_jax.sim.worlds.families import random_scene, world_key
+from rivals.planners import astar_compiled, snn
+from rivals.planners.planner import Budget
+from rivals.planners.solids import solid_table
+from tests.planning.small_worlds import RADIUS, assert_flyable, box, random_small_world, small_world
 
 
 def lattice_length(task: Task, cell: float = 0.5) -> float:
@@ -25,7 +27,7 @@ def lattice_length(task: Task, cell: float = 0.5) -> float:
     return length + np.linalg.norm(task.goal - points[-1]) if len(points) else np.inf
 
 
-def assert_like_the_plain_one(task: Task, plan: Plan, cell: float = 0.5) -> None:
+def assert_like_the_plain_one(task: Task, plan: PlannedPath, cell: float = 0.5) -> None:
     try:
         plain = astar.shortest_path(task.scene, task.start, task.goal, task.body_radius, cell)
     except astar.NoPathError:

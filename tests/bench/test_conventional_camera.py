@@ -12,11 +12,11 @@ import pytest
 
 from conventional_stack import camera, events, task, world
 from edqn_jax.config import CameraConfig, Config, EncoderConfig, EventsConfig
-from edqn_jax.sim import camera as our_camera
-from edqn_jax.sim import env as our_env
-from edqn_jax.sim import events as our_events
-from edqn_jax.sim import sensor as our_sensor
-from edqn_jax.sim.distance import signed_distance
+from edqn_jax.sim.camera import camera as our_camera
+from edqn_jax.sim.scene.distance import signed_distance
+from edqn_jax.sim.sensors import events as our_events
+from edqn_jax.sim.sensors import sensor as our_sensor
+from edqn_jax.sim.task import env as our_env
 from tests.bench.conventional_course import paper
 from tests.oracles import camera_plain, events_plain
 from tests.sim.drawn_scenes import every_kind, free_points

@@ -26,12 +26,14 @@ from edqn_jax.config import (
     LightConfig,
 )
 from edqn_jax.errors import ConfigError
-from edqn_jax.packages import require
-from edqn_jax.sim import drone, env, events, outcomes
-from edqn_jax.sim.drone import DroneState
-from edqn_jax.sim.env import EnvState
-from edqn_jax.sim.outcomes import Outcome
-from edqn_jax.sim.reward import configured_reward
+from edqn_jax.extras import require
+from edqn_jax.sim.physics import drone
+from edqn_jax.sim.physics.drone import DroneState
+from edqn_jax.sim.sensors import events
+from edqn_jax.sim.task import env, outcomes
+from edqn_jax.sim.task.env import EnvState
+from edqn_jax.sim.task.outcomes import Outcome
+from edqn_jax.sim.task.reward import configured_reward
 from tests.bench.conventional_course import course_of, fleet_of, paper, world_of
 
 gymnasium_check = require("gymnasium.utils.env_checker")

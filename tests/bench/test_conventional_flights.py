@@ -16,9 +16,9 @@ from edqn_jax.errors import ConfigError
 from edqn_jax.evaluation import rollouts as our_flights
 from edqn_jax.evaluation.metrics import summarise
 from edqn_jax.learn.policy import PolicyParams
-from edqn_jax.sim.moves import ACTIONS
-from edqn_jax.sim.outcomes import Outcome
-from edqn_jax.sim.scene import stack_scenes
+from edqn_jax.sim.actions import ACTIONS
+from edqn_jax.sim.scene.scene import stack_scenes
+from edqn_jax.sim.task.outcomes import Outcome
 from tests.bench.conventional_course import course_of, paper, world_of
 
 CONFIG = dataclasses.replace(Config(), camera=CameraConfig(width=8, height=6), env=EnvConfig(max_decisions=40))

@@ -20,18 +20,18 @@ from conventional_stack.vec_env import CodedDrones
 from conventional_stack.workers import SpreadFleet
 from edqn_jax.config import CameraConfig, Config, EncoderConfig
 from edqn_jax.errors import ConfigError
-from edqn_jax.learn import vae
-from edqn_jax.learn.waves import cosines
-from edqn_jax.packages import MissingPackageError, require
+from edqn_jax.extras import MissingPackageError, require
+from edqn_jax.learn.perception import vae
+from edqn_jax.learn.perception.waves import cosines
 from edqn_jax.runs.directory import plain
-from edqn_jax.sim.env import MOTION_SIZE, OWN_SIZE
-from edqn_jax.sim.events import EventField
-from edqn_jax.sim.outcomes import Outcome
+from edqn_jax.sim.sensors.events import EventField
+from edqn_jax.sim.task.env import MOTION_SIZE, OWN_SIZE
+from edqn_jax.sim.task.outcomes import Outcome
 from measurement.flags import configured
 from rivals import stack
 from tests.bench.conventional_course import course_of
+from tests.benchmarks.rivals.uninstalled import hide
 from tests.miniature import MINIATURE
-from tests.planners.uninstalled import hide
 
 torch = require("torch")
 torch.set_num_threads(1)  # beside other tests a second one costs more than it does

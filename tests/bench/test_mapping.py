@@ -12,9 +12,9 @@ import pytest
 import mapping
 from edqn_jax.errors import ConfigError
 from edqn_jax.learn.policy import Policy
-from edqn_jax.mapping.pilot import TUNED
 from edqn_jax.runs.policies import save_policy
-from edqn_jax.sim.mjcf import load_world
+from edqn_jax.sim.scene.mjcf import load_world
+from rivals.mapping.pilot import TUNED
 from tests.policies import CONFIG, fresh
 
 WORLD = """<mujoco><worldbody>

@@ -12,16 +12,16 @@ import numpy as np
 import pytest
 
 from edqn_jax.errors import ConfigError
-from edqn_jax.mapping import pilot
-from edqn_jax.mapping.pilot import POINTS, Orders, PilotConfig, Piloted
-from edqn_jax.mapping.route import RouteConfig, Router
-from edqn_jax.planners.follow import SPACING_M, sampled
-from edqn_jax.sim import drone
-from edqn_jax.sim.env import World
-from edqn_jax.sim.missions import own_missions
-from edqn_jax.sim.mjcf import load_world
-from edqn_jax.sim.outcomes import Outcome
-from edqn_jax.sim.scene import stack_scenes
+from edqn_jax.sim.physics import drone
+from edqn_jax.sim.scene.mjcf import load_world
+from edqn_jax.sim.scene.scene import stack_scenes
+from edqn_jax.sim.task.env import World
+from edqn_jax.sim.task.missions import own_missions
+from edqn_jax.sim.task.outcomes import Outcome
+from rivals.mapping import pilot
+from rivals.mapping.pilot import POINTS, Orders, PilotConfig, Piloted
+from rivals.mapping.route import RouteConfig, Router
+from rivals.planners.follow import SPACING_M, sampled
 from tests.policies import CONFIG, fresh
 
 CONFIG = dataclasses.replace(CONFIG, camera=dataclasses.replace(CONFIG.camera, width=32, height=24))

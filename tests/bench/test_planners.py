@@ -5,10 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from edqn_jax.planners.planner import PLANNERS, Budget, Task, load_planner
-from edqn_jax.sim.mjcf import load_scene, resolve_world
-from edqn_jax.sim.worlds import random_scene, world_key
-from tests.planners.small_worlds import RADIUS, WITHOUT_A_WAY, assert_flyable, random_small_world, small_world
+from edqn_jax.planning.path import Task
+from edqn_jax.sim.scene.mjcf import load_scene, resolve_world
+from edqn_jax.sim.worlds.families import random_scene, world_key
+from rivals.planners.planner import PLANNERS, Budget, load_planner
+from tests.planning.small_worlds import RADIUS, WITHOUT_A_WAY, assert_flyable, random_small_world, small_world
 
 # A* hugs what it passes: its legs are checked every 2 cm, which misses 0.14 mm, and the judge is float32.
 TOLERANCE = {"A*": 2e-4, "A* 1 m": 2e-4}

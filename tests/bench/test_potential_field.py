@@ -7,11 +7,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from edqn_jax.planners import potential_field
-from edqn_jax.planners.planner import Budget
-from edqn_jax.planners.solids import solid_table
-from edqn_jax.sim.distance import shape_distances
-from tests.planners.small_worlds import RADIUS, assert_flyable, box, small_world
+from edqn_jax.sim.scene.distance import shape_distances
+from rivals.planners import potential_field
+from rivals.planners.planner import Budget
+from rivals.planners.solids import solid_table
+from tests.planning.small_worlds import RADIUS, assert_flyable, box, small_world
 
 CONFIG = potential_field.ApfConfig()
 

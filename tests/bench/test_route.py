@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import dijkstra
 
-from edqn_jax.mapping.route import OCCUPIED_WEIGHT, TOUCHED_WEIGHT, RouteConfig, Router
+from rivals.mapping.route import OCCUPIED_WEIGHT, TOUCHED_WEIGHT, RouteConfig, Router
 
 CELL = 0.5
 VOLUME = np.array([[2.0, -1.0, 0.0], [8.0, 4.0, 3.0]])

@@ -8,10 +8,10 @@ import pytest
 
 from edqn_jax.cli.arguments import parse_train
 from edqn_jax.config import Config
-from edqn_jax.planners.planner import PLANNERS
-from edqn_jax.sim.mjcf import write_scene
+from edqn_jax.sim.scene.mjcf import write_scene
+from rivals.planners.planner import PLANNERS
 from rivals.planning import Planning
-from tests.planners.small_worlds import WITHOUT_A_WAY, box, small_world
+from tests.planning.small_worlds import WITHOUT_A_WAY, box, small_world
 
 BUDGET_SECONDS = 0.5
 MISSIONS = {"open": small_world(box((4, -1, 0), (6, 5, 7))), **WITHOUT_A_WAY}

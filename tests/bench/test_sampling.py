@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from edqn_jax.packages import MissingPackageError
-from edqn_jax.planners.planner import Budget, load_planner
-from tests.planners.small_worlds import WITHOUT_A_WAY, assert_flyable, box, small_world
-from tests.planners.uninstalled import hide
+from edqn_jax.extras import MissingPackageError
+from rivals.planners.planner import Budget, load_planner
+from tests.benchmarks.rivals.uninstalled import hide
+from tests.planning.small_worlds import WITHOUT_A_WAY, assert_flyable, box, small_world
 
 LONG = 600.0  # seconds; the steps end it
 

@@ -10,10 +10,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from edqn_jax.planners.solids import distance, leg_free, shape_distance, solid_table
-from edqn_jax.sim.distance import shape_distances
-from edqn_jax.sim.scene import PARKED, scene_shapes
-from tests.planners.small_worlds import box, small_world, true_distances
+from edqn_jax.sim.scene.distance import shape_distances
+from edqn_jax.sim.scene.scene import PARKED, scene_shapes
+from rivals.planners.solids import distance, leg_free, shape_distance, solid_table
+from tests.planning.small_worlds import box, small_world, true_distances
 from tests.sim.drawn_scenes import ball, every_kind, scene_of
 
 

@@ -16,10 +16,13 @@ import pytest
 import tutorial
 from edqn_jax.config import CameraConfig, Config
 from edqn_jax.errors import ConfigError
-from edqn_jax.packages import require
-from edqn_jax.sim import drone, env, events
-from edqn_jax.sim.mjcf import load_scene
-from edqn_jax.sim.moves import ACTIONS
+from edqn_jax.extras import require
+from edqn_jax.sim.actions import ACTIONS
+from edqn_jax.sim.camera import camera
+from edqn_jax.sim.physics import drone
+from edqn_jax.sim.scene.mjcf import load_scene
+from edqn_jax.sim.sensors import events
+from edqn_jax.sim.task import env
 from tutorial_stack.control import thrusts
 from tutorial_stack.env import Look, TutorialDrone, event_image
 
@@ -78,7 +81,7 @@ def test_the_rotors_get_what_those_of_edqn_jax_get() -> None:
 def test_the_events_are_those_of_the_papers_law() -> None:
     before, after = np.random.default_rng(1).integers(0, 256, (2, 24, 32, 3), dtype=np.uint8)
     law = dataclasses.replace(CONFIG.events, threshold=0.15, tolerance=0.1)
-    luma = jnp.asarray(np.stack([before, after]) @ np.array(events.LUMA_WEIGHTS) / 255.0)
+    luma = jnp.asarray(np.stack([before, after]) @ np.array(camera.LUMA_WEIGHTS) / 255.0)
     memory = events.reset_memory(law, 24, 32, jax.random.key(0))
     field, _ = events.events(law, memory, luma, law.frame_times_s, jax.random.key(1))
     expected = np.asarray(field.polarity * np.log1p(field.count))

@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from edqn_jax.parallel.hardware import cores
+from edqn_jax.devices.hardware import cores
 from measurement import ceilings
 from measurement.flags import configured
 

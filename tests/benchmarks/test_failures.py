@@ -12,8 +12,8 @@ import pytest
 import failures
 from edqn_jax.evaluation.missions import load_missions
 from edqn_jax.evaluation.rollouts import fly_on_all_devices
-from edqn_jax.sim import camera
-from edqn_jax.sim.outcomes import Outcome
+from edqn_jax.sim.camera import camera
+from edqn_jax.sim.task.outcomes import Outcome
 from tests.policies import CONFIG, always
 
 WORLD = """<mujoco><worldbody>

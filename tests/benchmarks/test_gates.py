@@ -11,10 +11,10 @@ import pytest
 
 import gates
 from edqn_jax.evaluation.missions import load_missions
-from edqn_jax.random import run_streams
-from edqn_jax.sim.drone import hover
-from edqn_jax.sim.moves import move_name
-from edqn_jax.sim.outcomes import Outcome
+from edqn_jax.keys import run_streams
+from edqn_jax.sim.actions import move_name
+from edqn_jax.sim.physics.drone import hover
+from edqn_jax.sim.task.outcomes import Outcome
 from tests.policies import CONFIG
 
 WORLD = """<mujoco><worldbody>

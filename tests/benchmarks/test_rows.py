@@ -8,8 +8,8 @@ from typing import Any
 import pytest
 
 from edqn_jax.errors import ConfigError
-from edqn_jax.planners.planner import PLANNERS
 from rivals import rows, table
+from rivals.planners.planner import PLANNERS
 from tests.benchmarks.turns import flights, row, turn
 
 

@@ -15,12 +15,12 @@ import runtime
 from conventional_stack.settings import supported
 from edqn_jax.config import Config
 from edqn_jax.errors import ConfigError
-from edqn_jax.planners.planner import PLANNERS
-from edqn_jax.sim.mjcf import write_scene
+from edqn_jax.sim.scene.mjcf import write_scene
 from measurement.child import ChildEndedError
 from rivals import stack, table
+from rivals.planners.planner import PLANNERS
 from tests.benchmarks.turns import flights, row, turn
-from tests.planners.small_worlds import WITHOUT_A_WAY, small_world
+from tests.planning.small_worlds import WITHOUT_A_WAY, small_world
 
 
 @pytest.fixture

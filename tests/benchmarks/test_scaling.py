@@ -20,8 +20,8 @@ from edqn_jax.errors import ConfigError
 from edqn_jax.evaluation.missions import run_missions
 from edqn_jax.learn import trainer
 from edqn_jax.runs.directory import plain
-from edqn_jax.sim.mjcf import check_scene, load_scene
-from edqn_jax.sim.scene import obstacle_count
+from edqn_jax.sim.scene.mjcf import check_scene, load_scene
+from edqn_jax.sim.scene.scene import obstacle_count
 from measurement.flags import configured
 from measurement.timing import size_of
 from tests.miniature import MINIATURE

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from edqn_jax.planners.planner import PLANNERS
+from rivals.planners.planner import PLANNERS
 
 
 def flights(*outcomes: str, **changes: Any) -> dict[str, list[Any]]:

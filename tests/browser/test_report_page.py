@@ -21,10 +21,10 @@ from PIL import Image
 from edqn_jax.cli import main
 from edqn_jax.config import WorldConfig
 from edqn_jax.config.loading import to_yaml
+from edqn_jax.extras import require
 from edqn_jax.learn.policy import fresh_policy
-from edqn_jax.packages import require
-from edqn_jax.runs.checkpoints import save_params
-from edqn_jax.sim.mjcf import write_scene
+from edqn_jax.runs.checkpoints.params import save_params
+from edqn_jax.sim.scene.mjcf import write_scene
 from tests.policies import always
 from tests.report.test_sights import SMALL, world_with_a_box
 

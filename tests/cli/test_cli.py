@@ -19,9 +19,9 @@ from edqn_jax.cli.arguments import parse_train, train_flags
 from edqn_jax.cli.help import COMMON, flag_of
 from edqn_jax.config import Config, preset
 from edqn_jax.config.loading import RANDOM_WORLDS, make_config
+from edqn_jax.devices import devices
 from edqn_jax.errors import CheckError, ConfigError, DivergedError, StoppedError
-from edqn_jax.parallel import devices
-from edqn_jax.sim.mjcf import SceneError
+from edqn_jax.sim.scene.mjcf import SceneError
 from tests.processes import PATIENCE_S
 
 ROOT = Path(__file__).parents[2]
@@ -36,19 +36,19 @@ def elsewhere(tmp_path, monkeypatch):
 @pytest.fixture
 def trainer(monkeypatch):
     """Stands in for training: a function to set, and the calls that reached it."""
-    stand_in = types.ModuleType("edqn_jax.training.run")
+    stand_in = types.ModuleType("edqn_jax.runs.record")
     calls: list[tuple] = []
     behaviour = types.SimpleNamespace(calls=calls, act=lambda *call: None, callbacks=[])
 
-    def train_run(*call, callback):
+    def train_run(*call, callback, drawing):
         calls.append(call)
         behaviour.callbacks.append(callback)
         return behaviour.act(*call)
 
-    seeds = types.ModuleType("edqn_jax.training.seeds")
+    seeds = types.ModuleType("edqn_jax.runs.seeds")
     stand_in.__dict__["train_run"] = seeds.__dict__["train_seeds_run"] = train_run
-    monkeypatch.setitem(sys.modules, "edqn_jax.training.run", stand_in)
-    monkeypatch.setitem(sys.modules, "edqn_jax.training.seeds", seeds)
+    monkeypatch.setitem(sys.modules, "edqn_jax.runs.record", stand_in)
+    monkeypatch.setitem(sys.modules, "edqn_jax.runs.seeds", seeds)
     monkeypatch.setattr(arguments, "hardware", lambda: "cpu")
     monkeypatch.setattr(devices, "use_cpu_devices", lambda count=None: None)
     return behaviour

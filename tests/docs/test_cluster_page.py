@@ -11,7 +11,7 @@ import pytest
 import yaml
 
 from edqn_jax.cli.arguments import parse_train
-from edqn_jax.parallel.launch import how_to_join
+from edqn_jax.devices.launch import how_to_join
 
 PAGE = (Path(__file__).parents[2] / "docs" / "cluster.md").read_text(encoding="utf-8")
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from edqn_jax.config import Config
-from edqn_jax.sim.mjcf import check_scene, load_world
+from edqn_jax.sim.scene.mjcf import check_scene, load_world
 
 ROOT = Path(__file__).parents[2]
 README = (ROOT / "README.md").read_text(encoding="utf-8")

@@ -24,10 +24,10 @@ from edqn_jax.evaluation.latency import decision_latency_ms
 from edqn_jax.evaluation.metrics import spl, summarise, wilson_interval
 from edqn_jax.evaluation.missions import MissionSet
 from edqn_jax.learn.policy import fresh_policy
-from edqn_jax.runs.checkpoints import save_params
+from edqn_jax.runs.checkpoints.params import save_params
 from edqn_jax.runs.policies import load_run
-from edqn_jax.sim.flights import Closest, Flights
-from edqn_jax.sim.outcomes import Outcome
+from edqn_jax.sim.task.flights import Closest, Flights
+from edqn_jax.sim.task.outcomes import Outcome
 from tests.policies import CONFIG, always
 
 

@@ -14,13 +14,12 @@ from edqn_jax.evaluation import rollouts
 from edqn_jax.evaluation.metrics import flight_summary
 from edqn_jax.evaluation.missions import MissionSet, load_missions
 from edqn_jax.evaluation.rollouts import fly_missions, fly_on_all_devices
-from edqn_jax.evaluation.trajectories import trajectory
+from edqn_jax.evaluation.trajectories import TRAJECTORY_COLUMNS, trajectory
 from edqn_jax.evaluation.verdicts import check_verdicts
-from edqn_jax.runs.directory import TRAJECTORY_COLUMNS
-from edqn_jax.sim.distance import signed_distance
-from edqn_jax.sim.flights import Flights
-from edqn_jax.sim.outcomes import Outcome
-from edqn_jax.sim.scene import take_scene
+from edqn_jax.sim.scene.distance import signed_distance
+from edqn_jax.sim.scene.scene import take_scene
+from edqn_jax.sim.task.flights import Flights
+from edqn_jax.sim.task.outcomes import Outcome
 from tests.policies import CONFIG, always, that_sees
 
 pytestmark = pytest.mark.slow

@@ -14,10 +14,10 @@ from edqn_jax.config import Config
 from edqn_jax.config.loading import make_config
 from edqn_jax.errors import ConfigError
 from edqn_jax.evaluation.missions import load_missions, missions_of_runs, run_missions
-from edqn_jax.sim import worlds
-from edqn_jax.sim.distance import signed_distance
-from edqn_jax.sim.mjcf import load_scene, resolve_world, write_scene
-from tests.planners.small_worlds import WITHOUT_A_WAY, small_world
+from edqn_jax.sim.scene.distance import signed_distance
+from edqn_jax.sim.scene.mjcf import load_scene, resolve_world, write_scene
+from edqn_jax.sim.worlds import families
+from tests.planning.small_worlds import WITHOUT_A_WAY, small_world
 
 CONFIG = Config()
 
@@ -67,7 +67,7 @@ def test_random_worlds_are_the_test_split_and_each_has_one_mission():
     pool, missions = course.world.pool, course.world.missions
     assert missions.scene.tolist() == [0, 1, 2, 3]
     np.testing.assert_array_equal(missions.start, pool.start)
-    expected = worlds.random_pool("sparse", worlds.world_keys("test", 4, first=8))
+    expected = families.random_pool("sparse", families.world_keys("test", 4, first=8))
     np.testing.assert_array_equal(pool.boxes.position, expected.boxes.position)
 
 

@@ -15,8 +15,8 @@ from edqn_jax.evaluation.evaluate import evaluate
 from edqn_jax.evaluation.metrics import summarise
 from edqn_jax.evaluation.missions import final_missions, load_missions, run_missions
 from edqn_jax.runs.policies import load_policy
-from edqn_jax.sim.outcomes import Outcome
-from edqn_jax.sim.scene import PARKED, scene_at
+from edqn_jax.sim.scene.scene import PARKED, scene_at
+from edqn_jax.sim.task.outcomes import Outcome
 
 DRONES = 4
 GROUPS = 3

@@ -8,7 +8,7 @@ import pytest
 
 from edqn_jax.evaluation.judge import Judge, clearance, load_judge, replay_contact
 from edqn_jax.evaluation.verdicts import CONTACT_TOLERANCE_M, Agreement
-from edqn_jax.sim.outcomes import Outcome
+from edqn_jax.sim.task.outcomes import Outcome
 
 RADIUS = 0.36
 MILLIMETRE = 1e-3

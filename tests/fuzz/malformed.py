@@ -26,10 +26,10 @@ from edqn_jax.config.limits import validate
 from edqn_jax.config.loading import resolve
 from edqn_jax.errors import ConfigError, sentence
 from edqn_jax.learn.policy import Policy
-from edqn_jax.runs import manifest, states
+from edqn_jax.runs.checkpoints import manifest, states
+from edqn_jax.runs.checkpoints.states import Checkpoint
 from edqn_jax.runs.policies import load_policy, save_policy
-from edqn_jax.runs.states import Checkpoint
-from edqn_jax.sim.mjcf import check_scene, load_world
+from edqn_jax.sim.scene.mjcf import check_scene, load_world
 from tests.policies import CONFIG, always
 
 HANGS = datetime.timedelta(seconds=10)

@@ -11,9 +11,11 @@ import numpy as np
 import edqn_jax
 from edqn_jax.config import Config
 from edqn_jax.learn.policy import Policy
-from edqn_jax.sim import drone, env, events
-from edqn_jax.sim.events import EventField
-from edqn_jax.sim.moves import ACTIONS
+from edqn_jax.sim.actions import ACTIONS
+from edqn_jax.sim.physics import drone
+from edqn_jax.sim.sensors import events
+from edqn_jax.sim.sensors.events import EventField
+from edqn_jax.sim.task import env
 
 
 @dataclasses.dataclass(frozen=True)

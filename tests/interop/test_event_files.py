@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 from edqn_jax.errors import ConfigError
+from edqn_jax.extras import MissingPackageError, require
 from edqn_jax.interop.event_files import read_events, write_events
 from edqn_jax.interop.recording import Recording
-from edqn_jax.packages import MissingPackageError, require
 from tests.interop.recordings import HEIGHT, WIDTH, some_events, some_recording
 from tests.oracles import event_words
 

@@ -21,10 +21,10 @@ from edqn_jax.interop import runner
 from edqn_jax.interop.event_files import read_events, write_events
 from edqn_jax.interop.recording import Recording
 from edqn_jax.interop.seen_events import seen_by, window_ends
-from edqn_jax.learn import vae
+from edqn_jax.learn.perception import vae
 from edqn_jax.learn.policy import Policy
-from edqn_jax.sim.env import Observation
-from edqn_jax.sim.environment import Environment
+from edqn_jax.sim.task.env import Observation
+from edqn_jax.sim.task.environment import Environment
 from tests.interop.recordings import some_recording
 
 pytestmark = pytest.mark.filterwarnings("ignore")  # jax2onnx and what it imports

@@ -16,11 +16,11 @@ import edqn_jax
 from edqn_jax.config import AirConfig, BodyConfig, Config, NoiseConfig
 from edqn_jax.config.loading import make_config
 from edqn_jax.errors import ConfigError
+from edqn_jax.extras import require
 from edqn_jax.interop import functional
 from edqn_jax.learn.policy import Policy, fresh_policy
-from edqn_jax.packages import require
-from edqn_jax.sim.moves import move_number
-from edqn_jax.sim.outcomes import Outcome
+from edqn_jax.sim.actions import move_number
+from edqn_jax.sim.task.outcomes import Outcome
 
 interop = require("edqn_jax.interop.gymnasium")
 

@@ -15,11 +15,11 @@ import edqn_jax
 from edqn_jax.config import Config
 from edqn_jax.config.loading import make_config
 from edqn_jax.errors import ConfigError
+from edqn_jax.extras import require
 from edqn_jax.learn.policy import Policy, fresh_policy, see
-from edqn_jax.packages import require
-from edqn_jax.sim import env
-from edqn_jax.sim.moves import move_number
-from edqn_jax.sim.outcomes import Outcome
+from edqn_jax.sim.actions import move_number
+from edqn_jax.sim.task import env
+from edqn_jax.sim.task.outcomes import Outcome
 
 gymnasium = require("gymnasium", extra="gym")
 interop = require("edqn_jax.interop.gymnasium")

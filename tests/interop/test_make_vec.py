@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 import edqn_jax
+from edqn_jax.devices import forks
 from edqn_jax.errors import ConfigError
-from edqn_jax.packages import require
-from edqn_jax.parallel import forks
-from edqn_jax.sim.moves import move_number
-from edqn_jax.sim.outcomes import Outcome
+from edqn_jax.extras import require
+from edqn_jax.sim.actions import move_number
+from edqn_jax.sim.task.outcomes import Outcome
 from tests.interop.test_gymnasium import small
 
 gymnasium = require("gymnasium", extra="gym")

@@ -17,7 +17,7 @@ WHEEL = {*WANTED, "edqn_jax-0.1.0.dist-info/METADATA", "edqn_jax-0.1.0.dist-info
     "name",
     [
         "edqn_jax/scenes/paper.xml",
-        "edqn_jax/sim/skydio_x2.xml",
+        "edqn_jax/sim/physics/skydio_x2.xml",
         "edqn_jax/py.typed",
         "edqn_jax/policies/pretrained/config.yaml",
         "edqn_jax-0.1.0.dist-info/licenses/LICENSE",

@@ -11,8 +11,8 @@ import pytest
 
 import edqn_jax
 from edqn_jax.errors import ConfigError
-from edqn_jax.packages import require
-from edqn_jax.sim.outcomes import Outcome
+from edqn_jax.extras import require
+from edqn_jax.sim.task.outcomes import Outcome
 from tests.interop.test_gymnasium import DOWN, HOVER, MOVES, many, policy, small
 
 library = require("stable_baselines3")

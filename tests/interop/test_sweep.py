@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from edqn_jax.config import Config
-from edqn_jax.packages import require
+from edqn_jax.extras import require
 from tests.interop.tiny import tiny_trial
 from tests.miniature import WORLD
 

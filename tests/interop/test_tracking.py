@@ -16,9 +16,9 @@ import pytest
 
 from edqn_jax.cli import main
 from edqn_jax.config import Config
+from edqn_jax.extras import require
 from edqn_jax.interop.tracking import Rerun, Sinks, TensorBoard, Wandb
-from edqn_jax.packages import require
-from edqn_jax.sim.outcomes import Outcome
+from edqn_jax.sim.task.outcomes import Outcome
 from edqn_jax.training.history import EndedEpisodes
 from edqn_jax.training.loop import Chunk
 from edqn_jax.training.selection import Candidate

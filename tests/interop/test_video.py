@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from edqn_jax.packages import require
+from edqn_jax.extras import require
 from edqn_jax.report.animation import FRAME_S, SIZE, _mp4
 
 

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from edqn_jax.config import CameraConfig, EventsConfig
-from edqn_jax.sim.events import EventField, events, reset_memory
+from edqn_jax.sim.sensors.events import EventField, events, reset_memory
 
 BOXES = 5
 

@@ -17,7 +17,7 @@ from jax import Array
 
 from edqn_jax.config import AgentConfig
 from edqn_jax.learn import dqn, qnetwork, replay
-from edqn_jax.sim.outcomes import Outcome
+from edqn_jax.sim.task.outcomes import Outcome
 
 ACTIONS, ENVS, STATES = 2, 16, 2
 LIMIT = 5

@@ -16,7 +16,7 @@ from edqn_jax.config.loading import make_config
 from edqn_jax.errors import ConfigError
 from edqn_jax.evaluation.missions import run_missions
 from edqn_jax.learn import replay, trainer
-from edqn_jax.sim.outcomes import Outcome
+from edqn_jax.sim.task.outcomes import Outcome
 
 STEPS = 40
 

@@ -13,10 +13,11 @@ import pytest
 import edqn_jax
 from edqn_jax.config import AgentConfig, CameraConfig, Config, EncoderConfig, EventsConfig
 from edqn_jax.errors import ConfigError
-from edqn_jax.learn import policy, qnetwork, replay, vae
-from edqn_jax.sim.env import MOTION_SIZE, OWN_SIZE, Observation
-from edqn_jax.sim.events import field_of_counts
-from edqn_jax.sim.moves import ACTIONS
+from edqn_jax.learn import policy, qnetwork, replay
+from edqn_jax.learn.perception import vae
+from edqn_jax.sim.actions import ACTIONS
+from edqn_jax.sim.sensors.events import field_of_counts
+from edqn_jax.sim.task.env import MOTION_SIZE, OWN_SIZE, Observation
 
 CONFIG = Config(
     camera=CameraConfig(width=8, height=6),

@@ -15,8 +15,8 @@ from hypothesis import strategies as st
 
 from edqn_jax.config import AgentConfig
 from edqn_jax.learn import replay
-from edqn_jax.sim.env import OWN_SIZE, turned
-from edqn_jax.sim.outcomes import Outcome
+from edqn_jax.sim.task.env import OWN_SIZE, turned
+from edqn_jax.sim.task.outcomes import Outcome
 from tests.oracles import replay_plain
 
 ENVS, LENGTH, BATCH, LONGEST = 3, 17, 96, 80

@@ -11,12 +11,14 @@ import numpy as np
 import pytest
 
 from edqn_jax.config import CameraConfig, Config, DroneConfig, EncoderConfig, EventsConfig
-from edqn_jax.learn import samples, vae
-from edqn_jax.sim import drone, env
-from edqn_jax.sim import events as ev
-from edqn_jax.sim.env import MOTION_SIZE, Observation
-from edqn_jax.sim.missions import own_missions
-from edqn_jax.sim.scene import UprightBoxes, build_scene, stack_scenes
+from edqn_jax.learn import samples
+from edqn_jax.learn.perception import vae
+from edqn_jax.sim.physics import drone
+from edqn_jax.sim.scene.scene import UprightBoxes, build_scene, stack_scenes
+from edqn_jax.sim.sensors import events as ev
+from edqn_jax.sim.task import env
+from edqn_jax.sim.task.env import MOTION_SIZE, Observation
+from edqn_jax.sim.task.missions import own_missions
 
 ENVS, LENGTH = 3, 4
 CONFIG = EncoderConfig(replay_size=2 * ENVS * LENGTH, target="sensed", mirror=False)  # of two shards

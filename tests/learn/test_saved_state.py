@@ -12,7 +12,7 @@ from edqn_jax.errors import ConfigError
 from edqn_jax.learn import saved_state
 from edqn_jax.learn.plan import Plan
 from edqn_jax.learn.trainer import Trainer
-from edqn_jax.sim.env import World
+from edqn_jax.sim.task.env import World
 from tests.miniature import miniature_world
 from tests.whole.test_trainer import CONFIG
 

@@ -9,80 +9,22 @@ errors outside of a test do not count. Exits with 1 if a mutant survives. Run by
 from __future__ import annotations
 
 import argparse
-import dataclasses
 import os
 import shutil
 import subprocess
 import sys
 import tempfile
 import time
-import tomllib
 from collections.abc import Sequence
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
+sys.path.insert(0, str(ROOT))
 
-LIST = Path(__file__).with_name("mutants.toml")
+from tests.mutants.mutant import Mutant, MutantError, find_test, load_mutants, put_into  # noqa: E402
 
 LIMIT_S = 600
 """Seconds after which a test run is ended."""
-
-
-class MutantError(Exception):
-    """The list or the tests cannot be used; the message says why."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Mutant:
-    """One deliberate bug."""
-
-    name: str
-    says: str
-    """What is broken."""
-    file: str
-    """Path in the repository."""
-    find: str
-    """Occurs exactly once in the file."""
-    replace: str
-    tests: tuple[str, ...]
-    """Node ids of test functions, of which at least one must fail."""
-
-    @property
-    def package(self) -> str:
-        """Returns the package of `edqn_jax` that the mutant is in."""
-        return self.file.split("/")[1]
-
-
-def load_mutants() -> list[Mutant]:
-    """Returns the mutants of the list, in its order.
-
-    Raises:
-        MutantError: if a mutant names a key that `[tests]` does not have.
-    """
-    content = tomllib.loads(LIST.read_text(encoding="utf-8"))
-    files = content["tests"]
-    mutants = []
-    for name, fields in content["mutants"].items():
-        named = [test.split("::", 1) for test in fields.pop("test")]
-        if unknown := [key for key, _ in named if key not in files]:
-            raise MutantError(f"the mutant '{name}' names '{unknown[0]}', which [tests] of {LIST.name} does not have")
-        mutants.append(Mutant(name, **fields, tests=tuple(f"{files[key]}::{function}" for key, function in named)))
-    return mutants
-
-
-def mutated(mutant: Mutant, root: Path) -> str:
-    """Returns the text of the mutant's file under `root` with the bug in it.
-
-    Raises:
-        MutantError: if the file does not exist, or `find` does not occur exactly once.
-    """
-    file = root / mutant.file
-    if not file.is_file():
-        raise MutantError(f"the mutant '{mutant.name}' is for '{mutant.file}', which does not exist")
-    text = file.read_text(encoding="utf-8")
-    if (count := text.count(mutant.find)) != 1:
-        raise MutantError(f"what '{mutant.name}' looks for occurs {count} times in '{mutant.file}'; it must be once")
-    return text.replace(mutant.find, mutant.replace)
 
 
 def copy_checkout(to: Path) -> None:
@@ -126,7 +68,7 @@ def check_unmutated(copy: Path, mutants: Sequence[Mutant]) -> None:
         MutantError: names the test.
     """
     began = time.perf_counter()
-    tests = list(dict.fromkeys(test for mutant in mutants for test in mutant.tests))
+    tests = list(dict.fromkeys(find_test(test, copy) for mutant in mutants for test in mutant.tests))
     code, output = run_tests(copy, tests)
     if code:
         last = (output.strip().splitlines() or ["no output"])[-1]
@@ -137,11 +79,12 @@ def check_unmutated(copy: Path, mutants: Sequence[Mutant]) -> None:
 def try_mutant(copy: Path, mutant: Mutant, verbose: bool) -> bool:
     """Applies a mutant, runs its tests, prints the verdict, restores the file, and returns whether it was killed."""
     began = time.perf_counter()
-    file = copy / mutant.file
+    bug = put_into(mutant, copy)
+    file = copy / bug.file
     original = file.read_text(encoding="utf-8")
-    file.write_text(mutated(mutant, copy), encoding="utf-8")
+    file.write_text(bug.text, encoding="utf-8")
     try:
-        code, output = run_tests(copy, mutant.tests)
+        code, output = run_tests(copy, [find_test(test, copy) for test in mutant.tests])
     finally:
         file.write_text(original, encoding="utf-8")
     killer = failure(code, output)
@@ -178,11 +121,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     options = parser.parse_args(arguments)
     try:
         mutants = chosen(load_mutants(), options.only)
-        for mutant in mutants:
-            mutated(mutant, ROOT)
+        files = {mutant.name: put_into(mutant, ROOT).file for mutant in mutants}
         if options.list:
             for mutant in mutants:
-                print(f"{mutant.name:32}{mutant.file:36}{mutant.says}")
+                print(f"{mutant.name:32}{files[mutant.name]:40}{mutant.says}")
             return 0
         with tempfile.TemporaryDirectory(prefix="mutants-") as folder:
             copy = Path(folder)

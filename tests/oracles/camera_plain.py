@@ -10,7 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edqn_jax.config import CameraConfig
-from edqn_jax.sim.scene import (
+from edqn_jax.sim.camera.texture import WAVES
+from edqn_jax.sim.scene.scene import (
     Capsules,
     Planes,
     Scene,
@@ -22,7 +23,6 @@ from edqn_jax.sim.scene import (
     UprightCylinders,
     scene_shapes,
 )
-from edqn_jax.sim.texture import WAVES
 
 
 def luma(config: CameraConfig, scene: Scene, position: NDArray, rotation: NDArray, samples: int = 8) -> NDArray:

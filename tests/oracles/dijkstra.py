@@ -9,9 +9,9 @@ import math
 import jax
 import numpy as np
 
-from edqn_jax.planners.lattice import edge_margin
-from edqn_jax.sim.distance import segment_contact, signed_distance
-from edqn_jax.sim.scene import Scene
+from edqn_jax.planning.lattice import edge_margin
+from edqn_jax.sim.scene.distance import segment_contact, signed_distance
+from edqn_jax.sim.scene.scene import Scene
 
 
 def shortest_length(

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import mujoco
 import numpy as np
 
-from edqn_jax.sim.drone import AIRFRAME_FILE
+from edqn_jax.sim.physics.drone import AIRFRAME_FILE
 
 
 def load() -> tuple[mujoco.MjModel, mujoco.MjData]:

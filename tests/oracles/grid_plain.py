@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from edqn_jax.config import CameraConfig
-from edqn_jax.mapping.grid import MapConfig
+from rivals.mapping.grid import MapConfig
 
 STEP = 0.01
 """Cells between two steps. A cell of which a ray only clips a corner can lie between them."""

@@ -8,8 +8,8 @@ from pathlib import Path
 import mujoco
 import numpy as np
 
-from edqn_jax.sim.mjcf import write_scene
-from edqn_jax.sim.scene import Scene
+from edqn_jax.sim.scene.mjcf import write_scene
+from edqn_jax.sim.scene.scene import Scene
 
 
 class RayCaster:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from edqn_jax.sim.outcomes import Outcome
+from edqn_jax.sim.task.outcomes import Outcome
 
 
 @dataclass

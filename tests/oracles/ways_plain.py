@@ -7,8 +7,8 @@ import itertools
 import numpy as np
 from scipy import ndimage
 
-from edqn_jax.sim.free_points import CLEARANCE
-from edqn_jax.sim.scene import Planes, Scene, UprightBoxes, UprightCylinders, scene_shapes
+from edqn_jax.sim.scene.scene import Planes, Scene, UprightBoxes, UprightCylinders, scene_shapes
+from edqn_jax.sim.worlds.free_points import CLEARANCE
 
 
 def has_way(scene: Scene, size: tuple[float, float, float], radius: float, edge: float) -> bool:

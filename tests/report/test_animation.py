@@ -19,8 +19,8 @@ from edqn_jax.learn.policy import PolicyParams, fresh_policy
 from edqn_jax.report.animation import LAST_FRAME_S, MOST_FRAMES, SIZE, animate
 from edqn_jax.report.sights import FINE, Shown
 from edqn_jax.report.style import OUTCOME_COLOURS
-from edqn_jax.runs.checkpoints import save_params
-from edqn_jax.sim.mjcf import write_scene
+from edqn_jax.runs.checkpoints.params import save_params
+from edqn_jax.sim.scene.mjcf import write_scene
 from tests.policies import always
 from tests.report.test_sights import SMALL, world_with_a_box
 

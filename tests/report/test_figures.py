@@ -17,7 +17,7 @@ from edqn_jax.report.flights import OBLIQUE, draw_path, draw_world
 from edqn_jax.report.images import LOOKS, draw_reconstruction, draw_sight
 from edqn_jax.report.solids import MAP, View, cut_open, far_to_near, hidden, solids_of
 from edqn_jax.report.style import OUTCOME_COLOURS
-from edqn_jax.sim.scene import (
+from edqn_jax.sim.scene.scene import (
     PARKED,
     Capsules,
     Planes,

@@ -16,11 +16,13 @@ from edqn_jax.report.flights import draw_path, draw_world
 from edqn_jax.report.page.worlds import ball_data, world_data
 from edqn_jax.report.sights import Sights, decision_rows, poses, times_of
 from edqn_jax.report.solids import MAP, cut_open, moving_solids, solids_of, standing
-from edqn_jax.sim import drone, env, events
-from edqn_jax.sim.missions import own_missions
-from edqn_jax.sim.motion import Motion, Throw
-from edqn_jax.sim.moves import move_number
-from edqn_jax.sim.scene import PARKED, Planes, Scene, Spheres, UprightBoxes, build_scene, stack_scenes
+from edqn_jax.sim.actions import move_number
+from edqn_jax.sim.physics import drone
+from edqn_jax.sim.scene.motion import Motion, Throw
+from edqn_jax.sim.scene.scene import PARKED, Planes, Scene, Spheres, UprightBoxes, build_scene, stack_scenes
+from edqn_jax.sim.sensors import events
+from edqn_jax.sim.task import env
+from edqn_jax.sim.task.missions import own_missions
 from tests.report.test_animation import Drawn, a_flight, recorded
 from tests.report.test_sights import SMALL
 

@@ -23,9 +23,9 @@ from edqn_jax.report.page.contents import COLUMNS, _by_interest, curves, flight_
 from edqn_jax.report.page.flown import FlownRun, folders_of, names_of
 from edqn_jax.report.page.pictures import LEVELS, strip
 from edqn_jax.report.page.worlds import world_data
-from edqn_jax.sim.flights import Closest, Flights, Record
-from edqn_jax.sim.mjcf import load_scene
-from edqn_jax.sim.outcomes import Outcome
+from edqn_jax.sim.scene.mjcf import load_scene
+from edqn_jax.sim.task.flights import Closest, Flights, Record
+from edqn_jax.sim.task.outcomes import Outcome
 
 HOSTILE = "</script><img src=x onerror=alert(1)>&"
 

@@ -12,13 +12,16 @@ import numpy as np
 import pytest
 
 from edqn_jax.config import CameraConfig, Config
-from edqn_jax.learn import vae
+from edqn_jax.learn.perception import vae
 from edqn_jax.learn.policy import fresh_policy
 from edqn_jax.report.sights import FINE, Sights, coarse, decision_rows, own_motions, poses
-from edqn_jax.sim import camera, drone, env, events, sensor
-from edqn_jax.sim.missions import own_missions
-from edqn_jax.sim.moves import ACTIONS
-from edqn_jax.sim.scene import Planes, Scene, UprightBoxes, build_scene, stack_scenes
+from edqn_jax.sim.actions import ACTIONS
+from edqn_jax.sim.camera import camera
+from edqn_jax.sim.physics import drone
+from edqn_jax.sim.scene.scene import Planes, Scene, UprightBoxes, build_scene, stack_scenes
+from edqn_jax.sim.sensors import events, sensor
+from edqn_jax.sim.task import env
+from edqn_jax.sim.task.missions import own_missions
 from tests.policies import CONFIG
 
 SMALL = dataclasses.replace(

@@ -14,7 +14,8 @@ import pytest
 from edqn_jax.config import Config, TrainConfig
 from edqn_jax.config.loading import resolve
 from edqn_jax.errors import ConfigError
-from edqn_jax.runs.directory import TO_BE_DRAWN, TRAJECTORY_COLUMNS, RunDirectory, plan_run_directory, version_of
+from edqn_jax.evaluation.trajectories import TRAJECTORY_COLUMNS
+from edqn_jax.runs.directory import TO_BE_DRAWN, RunDirectory, plan_run_directory, version_of
 
 
 def begin(run: RunDirectory, seeds: list[Config] | None = None) -> None:
@@ -153,7 +154,7 @@ def test_a_place_without_the_right_to_write_is_named(given, tmp_path, monkeypatc
         raise PermissionError(13, "Permission denied")
 
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("edqn_jax.runs.files.tempfile.mkdtemp", refuse)
+    monkeypatch.setattr("edqn_jax.files.tempfile.mkdtemp", refuse)
     with pytest.raises(ConfigError, match=f"'{given or 'runs'}' cannot be written: .*Permission denied"):
         plan_run_directory(given, Config())
 

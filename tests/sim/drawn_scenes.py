@@ -9,8 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
-from edqn_jax.sim.distance import signed_distance
-from edqn_jax.sim.scene import (
+from edqn_jax.sim.scene.distance import signed_distance
+from edqn_jax.sim.scene.scene import (
     Capsules,
     Planes,
     Scene,

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from edqn_jax.learn.policy import Policy, PolicyParams
-from edqn_jax.sim.outcomes import Outcome
-from edqn_jax.sim.reward import Transition
+from edqn_jax.sim.task.outcomes import Outcome
+from edqn_jax.sim.task.reward import Transition
 from edqn_jax.training.loop import Chunk, TrainingResult, train
 from tests.whole.test_run import CONFIG
 

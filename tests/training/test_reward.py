@@ -18,12 +18,13 @@ from edqn_jax.config.loading import make_config
 from edqn_jax.evaluation.judge import clearance, load_judge
 from edqn_jax.evaluation.missions import load_missions
 from edqn_jax.runs.provenance import reward_record
-from edqn_jax.sim import env, geodesic
-from edqn_jax.sim.mjcf import scenes_folder
-from edqn_jax.sim.moves import ACTIONS
-from edqn_jax.sim.outcomes import Outcome
-from edqn_jax.sim.reward import Reward, Transition
-from edqn_jax.training.preparation import config_for_reward, prepared
+from edqn_jax.sim.actions import ACTIONS
+from edqn_jax.sim.scene.mjcf import scenes_folder
+from edqn_jax.sim.task import env
+from edqn_jax.sim.task.outcomes import Outcome
+from edqn_jax.sim.task.reward import Reward, Transition
+from edqn_jax.sim.worlds import geodesic
+from edqn_jax.training.setup import config_for_reward, prepared
 from tests.training.test_loop import SMALL
 
 CONFIG = dataclasses.replace(Config(), env=dataclasses.replace(Config().env, sensor="blind"))

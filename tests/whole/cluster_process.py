@@ -23,15 +23,16 @@ from jax import Array
 
 from edqn_jax.cli import main
 from edqn_jax.config import CameraConfig
+from edqn_jax.devices import devices, processes
 from edqn_jax.evaluation import rollouts
 from edqn_jax.learn.policy import fresh_policy
 from edqn_jax.learn.trainer import Episodes, Losses, Trainer, TrainState
 from edqn_jax.learn.updates import Learner
-from edqn_jax.parallel import devices, processes
+from edqn_jax.report import gallery
+from edqn_jax.runs import record
 from edqn_jax.runs.directory import plain
-from edqn_jax.sim import camera
-from edqn_jax.sim.scene import Scene
-from edqn_jax.training import run
+from edqn_jax.sim.camera import camera
+from edqn_jax.sim.scene.scene import Scene
 from tests.miniature import no_losses
 
 
@@ -72,7 +73,7 @@ def no_learning(self: Trainer, state: TrainState, first: int) -> tuple[TrainStat
 if __name__ == "__main__":
     note, count, *argv = sys.argv[1:]
     noted: dict[str, Any] = {}
-    init, train_run = Trainer.init, run.train_run
+    init, train_run = Trainer.init, record.train_run
 
     def noting_init(self: Trainer, seed: int | Sequence[int]) -> TrainState:
         state = init(self, seed)
@@ -86,8 +87,8 @@ if __name__ == "__main__":
         return noted["summary"]
 
     devices.cores, camera.luma = lambda: int(count), waves
-    run.Sights, run.draw_gallery = lambda *_: SimpleNamespace(in_world=lambda scene: None), lambda *_: None
-    Trainer.init, run.train_run = noting_init, noting_run
+    gallery.prepare_gallery = lambda *_: lambda *_: None
+    Trainer.init, record.train_run = noting_init, noting_run
     if argv[:1] == ["--no-learning"]:
         del argv[0]
         Trainer.init, Trainer.compile, Trainer.chunk = only_a_policy, lambda self: None, no_learning

@@ -18,10 +18,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from edqn_jax.config import AgentConfig, CameraConfig, Config, EncoderConfig, EnvConfig, TrainConfig
+from edqn_jax.devices.devices import use_cpu_devices
 from edqn_jax.learn.plan import Plan
 from edqn_jax.learn.trainer import Trainer
-from edqn_jax.parallel.devices import use_cpu_devices
-from edqn_jax.sim.env import World
+from edqn_jax.sim.task.env import World
 from tests.miniature import miniature_world
 
 DEVICES = (1, 8)

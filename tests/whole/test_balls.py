@@ -12,11 +12,12 @@ import pytest
 from edqn_jax.config import WorldConfig
 from edqn_jax.evaluation.missions import run_missions
 from edqn_jax.interop.flight_events import flight_recording
+from edqn_jax.report.gallery import prepare_gallery
 from edqn_jax.report.progress import Progress
 from edqn_jax.runs.directory import RunDirectory
-from edqn_jax.training.run import train_run
-from edqn_jax.training.stopping import Stop
-from edqn_jax.training.verify import verify
+from edqn_jax.runs.record import train_run
+from edqn_jax.runs.stopping import Stop
+from edqn_jax.runs.verify import verify
 from tests.whole.test_run import CONFIG
 
 WORLD = WorldConfig(name="sparse", flown="", pool_size=2, missions=8, balls=3)
@@ -26,7 +27,7 @@ BALLS = dataclasses.replace(CONFIG, world=WORLD, train=dataclasses.replace(CONFI
 @pytest.mark.slow
 def test_a_run_among_balls_is_drawn_and_verified(tmp_path: Path) -> None:
     run = RunDirectory(tmp_path / "run")
-    train_run(BALLS, run, Progress(), Stop())
+    train_run(BALLS, run, Progress(), Stop(), drawing=prepare_gallery)
     summary = json.loads(run.summary_file.read_text())
     assert [finding for finding in verify(run.path) if not finding.right] == []
     assert summary["devices"][1] and (run.figures / "path.png").is_file()

@@ -9,7 +9,7 @@ import sys
 import numpy as np
 import pytest
 
-from edqn_jax.sim.outcomes import Outcome
+from edqn_jax.sim.task.outcomes import Outcome
 from tests.processes import PATIENCE_S, ROOT
 from tests.whole.layout_process import CONFIG, DECISIONS, DEVICES
 

@@ -16,11 +16,11 @@ from edqn_jax.evaluation.judge import Target, clearance, fastest, load_judge, re
 from edqn_jax.evaluation.missions import MissionSet, load_missions
 from edqn_jax.evaluation.rollouts import fly_missions
 from edqn_jax.evaluation.verdicts import check_verdicts
-from edqn_jax.sim.distance import path_contact, signed_distance
-from edqn_jax.sim.missions import random_missions
-from edqn_jax.sim.mjcf import load_world
-from edqn_jax.sim.outcomes import Outcome
-from edqn_jax.sim.scene import scene_at
+from edqn_jax.sim.scene.distance import path_contact, signed_distance
+from edqn_jax.sim.scene.mjcf import load_world
+from edqn_jax.sim.scene.scene import scene_at
+from edqn_jax.sim.task.missions import random_missions
+from edqn_jax.sim.task.outcomes import Outcome
 from tests.policies import CONFIG, always
 
 RADIUS = 0.36

@@ -18,12 +18,13 @@ from edqn_jax.learn import trainer
 from edqn_jax.learn.plan import Plan
 from edqn_jax.learn.policy import PolicyParams
 from edqn_jax.learn.trainer import Episodes
+from edqn_jax.report.gallery import prepare_gallery
 from edqn_jax.report.progress import Progress
 from edqn_jax.runs.directory import RunDirectory
 from edqn_jax.runs.policies import load_run
-from edqn_jax.training.run import train_run
+from edqn_jax.runs.record import train_run
+from edqn_jax.runs.stopping import Stop
 from edqn_jax.training.selection import Candidate, choose, first_success, is_due
-from edqn_jax.training.stopping import Stop
 from tests.miniature import WORLD as MINIATURE_WORLD
 from tests.miniature import no_losses
 from tests.whole.test_trainer import CONFIG as SMALL
@@ -55,7 +56,7 @@ def test_a_run_stopped_before_any_validation_keeps_what_it_has_learnt(
     config = dataclasses.replace(CONFIG, train=dataclasses.replace(CONFIG.train, validation_every=0))
     run = RunDirectory(tmp_path / "stopped")
     with pytest.raises(StoppedError, match="stopped after 256 decisions"):
-        train_run(config, run, Progress(), Stop(lambda: len(run.read_metrics()) == 4))
+        train_run(config, run, Progress(), Stop(lambda: len(run.read_metrics()) == 4), drawing=prepare_gallery)
     _, params = load_run(run.path)
     np.testing.assert_array_equal(params.q["Dense_0"]["bias"], 4.0)  # it began at zero and grew in four chunks
     assert not run.summary_file.exists()
@@ -70,7 +71,7 @@ def test_a_world_that_cannot_be_flown_leaves_nothing_behind(tmp_path: Path) -> N
     run = RunDirectory(tmp_path / "run")
     config = Config(world=WorldConfig(name=str(file)))
     with pytest.raises(ConfigError, match="the start .* lies inside 'wall'"):
-        train_run(config, run, Progress(), Stop())
+        train_run(config, run, Progress(), Stop(), drawing=prepare_gallery)
     assert not run.path.exists()
 
 

@@ -29,10 +29,10 @@ from edqn_jax.errors import ConfigError
 from edqn_jax.learn import replay, saved_state, trainer
 from edqn_jax.learn.plan import Plan
 from edqn_jax.learn.trainer import Trainer, TrainState
-from edqn_jax.sim import env
-from edqn_jax.sim.disturbances import Disturbance
-from edqn_jax.sim.env import MOTION_SIZE, OWN_SIZE, Observation, World
-from edqn_jax.sim.outcomes import Outcome
+from edqn_jax.sim.physics.disturbances import Disturbance
+from edqn_jax.sim.task import env
+from edqn_jax.sim.task.env import MOTION_SIZE, OWN_SIZE, Observation, World
+from edqn_jax.sim.task.outcomes import Outcome
 from tests.miniature import miniature_world
 
 CONFIG = Config(

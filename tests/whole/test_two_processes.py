@@ -14,7 +14,7 @@ import pytest
 
 from edqn_jax.config import Config
 from edqn_jax.config.loading import to_yaml
-from edqn_jax.runs.checkpoints import load_params
+from edqn_jax.runs.checkpoints.params import load_params
 from edqn_jax.runs.directory import RunDirectory
 from tests.processes import PATIENCE_S, WORLD, by_srun, one_process, to_the_end, two_processes
 from tests.whole.test_run import CONFIG

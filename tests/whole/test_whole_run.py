@@ -21,13 +21,15 @@ from edqn_jax.cli.evaluate import evaluate_command
 from edqn_jax.errors import ConfigError
 from edqn_jax.evaluation.missions import run_missions
 from edqn_jax.evaluation.rollouts import fly_on_all_devices
+from edqn_jax.evaluation.trajectories import TRAJECTORY_COLUMNS
+from edqn_jax.report.gallery import prepare_gallery
 from edqn_jax.report.progress import Progress
-from edqn_jax.runs.checkpoints import save_params
-from edqn_jax.runs.directory import TRAJECTORY_COLUMNS, RunDirectory, plain
+from edqn_jax.runs.checkpoints.params import save_params
+from edqn_jax.runs.directory import RunDirectory, plain
 from edqn_jax.runs.policies import load_run
-from edqn_jax.training.run import train_run
-from edqn_jax.training.stopping import Stop
-from edqn_jax.training.verify import verify
+from edqn_jax.runs.record import train_run
+from edqn_jax.runs.stopping import Stop
+from edqn_jax.runs.verify import verify
 from tests.processes import ROOT
 from tests.whole.test_run import CONFIG, FIGURES
 
@@ -35,12 +37,12 @@ KILLED = """
 import sys, time
 from pathlib import Path
 from tests import conftest
-from tests.whole.test_run import CONFIG, Progress, RunDirectory, Stop, train_run
-from edqn_jax.training import keeper
+from tests.whole.test_run import CONFIG, Progress, RunDirectory, Stop, prepare_gallery, train_run
+from edqn_jax.runs import keeper
 import dataclasses
 keeper.MOST_OVERHEAD = 1e9
 often = dataclasses.replace(CONFIG, train=dataclasses.replace(CONFIG.train, checkpoint_every_s=1e-3))
-train_run(often, RunDirectory(Path(sys.argv[1])), Progress(), Stop(lambda: time.sleep(0.2)))
+train_run(often, RunDirectory(Path(sys.argv[1])), Progress(), Stop(lambda: time.sleep(0.2)), drawing=prepare_gallery)
 """
 """A run with a checkpoint after every chunk, which takes long enough to be killed."""
 
@@ -48,7 +50,7 @@ train_run(often, RunDirectory(Path(sys.argv[1])), Progress(), Stop(lambda: time.
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory: pytest.TempPathFactory) -> tuple[RunDirectory, dict]:
     run = RunDirectory(tmp_path_factory.mktemp("runs") / "whole")
-    return run, train_run(CONFIG, run, Progress(), Stop())
+    return run, train_run(CONFIG, run, Progress(), Stop(), drawing=prepare_gallery)
 
 
 @pytest.mark.slow
@@ -96,7 +98,7 @@ def test_a_run_is_verified_and_what_was_changed_in_it_is_found(
     shutil.copytree(whole[0].path, changed.path)
     # The flights do not change: they need not be flown a third time.
     flown = fly_on_all_devices(CONFIG, run_missions(CONFIG).final.world, load_run(changed.path)[1], 0, record=True)
-    monkeypatch.setattr("edqn_jax.training.verify.fly_on_all_devices", lambda *_, **__: flown)
+    monkeypatch.setattr("edqn_jax.runs.verify.fly_on_all_devices", lambda *_, **__: flown)
 
     def wrong() -> set[str]:
         return {finding.what for finding in verify(changed.path) if finding.right is False}
@@ -157,7 +159,7 @@ def test_an_interrupted_run_that_is_continued_is_the_run_that_was_not(
     # As if it had been killed while it wrote.
     with run.metrics_file.open("a") as file:
         file.write('{"decisions": 25')
-    summary = train_run(CONFIG, dataclasses.replace(run, resume="must"), Progress(), Stop())
+    summary = train_run(CONFIG, dataclasses.replace(run, resume="must"), Progress(), Stop(), drawing=prepare_gallery)
     assert 0 < summary["resumed_at_decisions"][0] < 512
     clocks = [name for name in summary if "seconds" in name or name == "resumed_at_decisions"]
     for name in [*clocks, "decisions_per_second"]:

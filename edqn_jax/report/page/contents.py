@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 
-import edqn_jax
 from edqn_jax.evaluation.companions import scene_of_flight
 from edqn_jax.evaluation.trajectories import trajectory
 from edqn_jax.report.curves import running_mean
@@ -22,6 +21,7 @@ from edqn_jax.report.page.worlds import ball_data, rounded, world_data
 from edqn_jax.report.sights import Sights
 from edqn_jax.report.style import OUTCOME_COLOURS, OUTCOME_LABELS
 from edqn_jax.runs.directory import plain
+from edqn_jax.version import package_version
 
 RUN_COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#8c6bb1", "#7a7a7a")
 """Of the runs, of Okabe and Ito's palette; more runs begin again."""
@@ -52,7 +52,7 @@ def page_data(runs: Sequence[FlownRun]) -> dict[str, Any]:
             flights.append({"world": worlds[key], **flight_data(run, mission), **({"balls": balls} if balls else {})})
         data.append({"name": run.name, "colour": colour, "curves": curves(run), "flights": flights})
     return {
-        "version": edqn_jax.__version__,
+        "version": package_version(),
         "made": datetime.datetime.now().isoformat(sep=" ", timespec="minutes"),
         "columns": list(COLUMNS),
         "outcomes": {kind: {"label": OUTCOME_LABELS[kind], "colour": OUTCOME_COLOURS[kind]} for kind in OUTCOME_LABELS},

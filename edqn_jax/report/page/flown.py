@@ -18,8 +18,8 @@ from edqn_jax.learn.policy import PolicyParams
 from edqn_jax.policies import policy_folder
 from edqn_jax.runs.directory import SEED_FOLDER, RunDirectory
 from edqn_jax.runs.policies import load_run, worlds_replaced
-from edqn_jax.sim.flights import Flights
-from edqn_jax.sim.outcomes import Outcome
+from edqn_jax.sim.task.flights import Flights
+from edqn_jax.sim.task.outcomes import Outcome
 
 
 @dataclasses.dataclass(frozen=True)

@@ -255,7 +255,7 @@
     return group;
   }
 
-  /** Returns where a shape that moves is at a time, or null where it is not there: `sim/motion.py` in other words. */
+  /** Returns where a shape that moves is at a time, or null where it is not there: `sim/scene/motion.py` in other words. */
   function placeOf(shape, world, time) {
     const how = shape.moves;
     if (how.velocity) {

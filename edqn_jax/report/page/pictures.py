@@ -12,11 +12,11 @@ import numpy as np
 from matplotlib.colors import Colormap, Normalize
 from PIL import Image
 
-from edqn_jax.learn import embedding
+from edqn_jax.learn.perception import embedding
 from edqn_jax.learn.policy import PolicyParams
 from edqn_jax.report.images import LOOKS, RECONSTRUCTED_EVENTS, scale_of
 from edqn_jax.report.sights import Sights
-from edqn_jax.sim.camera import on_screen
+from edqn_jax.sim.camera.camera import on_screen
 
 LEVELS = 64
 """Colours of a picture; more make the file larger and no better to look at."""

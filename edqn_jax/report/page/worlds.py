@@ -10,8 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from edqn_jax.report.solids import closed_side, present, solids_of
-from edqn_jax.sim.motion import NEVER, OUTSIDE_M, thrown_to
-from edqn_jax.sim.scene import PARKED, Scene, aim_of
+from edqn_jax.sim.scene.motion import NEVER, OUTSIDE_M, thrown_to
+from edqn_jax.sim.scene.scene import PARKED, Scene, aim_of
 
 
 def world_data(scene: Scene) -> dict[str, Any]:

@@ -1,0 +1,1 @@
+"""What JAX runs on: devices, kept programs, several processes."""

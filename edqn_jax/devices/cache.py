@@ -1,0 +1,91 @@
+"""Compiled programs that are kept from one command to the next, in JAX's persistent cache."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import os
+import platform
+import stat
+import warnings
+from pathlib import Path
+from typing import Any
+
+import jax
+
+from edqn_jax.devices.hardware import cores
+
+MOST_BYTES = 2**30
+"""Of kept programs; beyond this the older ones are deleted."""
+
+
+def keep_programs() -> None:
+    """Makes JAX keep what it compiles for the next command; must be called before anything is compiled.
+
+    The folder is one for this kind of processor under `$XDG_CACHE_HOME/edqn_jax`, by default `~/.cache/edqn_jax`.
+    Nothing is kept where that cannot be written, or with JAX_ENABLE_COMPILATION_CACHE=false; and whoever gives
+    JAX_COMPILATION_CACHE_DIR has a folder of their own. A damaged program is compiled again, and JAX warns of it
+    in every run until its file is deleted.
+    """
+    options: Any = jax.config
+    if options.jax_compilation_cache_dir or not options.jax_enable_compilation_cache:
+        return
+    folder = private_folder()
+    if folder is None:
+        return
+    jax.config.update("jax_compilation_cache_dir", str(folder))
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+    # Such as on a full disk: the program is not kept, and nothing else is lost.
+    warnings.filterwarnings("ignore", "Error writing persistent compilation cache entry", UserWarning)
+
+
+def private_folder() -> Path | None:
+    """Returns the folder of what is compiled for this kind of processor, made and not too full.
+
+    None where it cannot be written, or where others may write: what is in it is run.
+    """
+    try:
+        folder = _folder()
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        status = folder.stat()
+        foreign = hasattr(os, "getuid") and status.st_uid != os.getuid()
+        if foreign or status.st_mode & (stat.S_IWGRP | stat.S_IWOTH):
+            return None
+        if not os.access(folder, os.W_OK):
+            return None
+        _make_room(folder, MOST_BYTES)
+    except (OSError, RuntimeError):  # there is no home
+        return None
+    return folder
+
+
+def _folder() -> Path:
+    """Returns where programs are kept: those of one processor may not run on another."""
+    given = os.environ.get("XDG_CACHE_HOME", "")
+    root = Path(given) if os.path.isabs(given) else Path.home() / ".cache"
+    return root / "edqn_jax" / f"programs-{hashlib.sha256(_abilities().encode()).hexdigest()[:12]}"
+
+
+def _abilities() -> str:
+    """Returns what tells machines apart that do not run the same programs, or not as fast."""
+    cpuinfo = Path("/proc/cpuinfo")
+    lines = cpuinfo.read_text(encoding="utf-8").splitlines() if cpuinfo.is_file() else []
+    kinds = sorted({line for line in lines if line.startswith(("model name", "flags", "Features", "CPU part"))})
+    return "\n".join([platform.machine(), platform.processor(), f"{cores()} cores", *kinds])
+
+
+def _make_room(folder: Path, most: int) -> None:
+    """Deletes what was written first, down to half of `most` bytes, where a folder holds more than `most`."""
+    files = []
+    for file in folder.rglob("*"):
+        with contextlib.suppress(FileNotFoundError):  # another command makes room as well
+            if file.is_file():
+                files.append((file, file.stat()))
+    left = sum(status.st_size for _, status in files)
+    if left <= most:
+        return
+    for file, status in sorted(files, key=lambda each: each[1].st_mtime):
+        if left <= most // 2:
+            break
+        file.unlink(missing_ok=True)
+        left -= status.st_size

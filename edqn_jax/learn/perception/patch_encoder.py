@@ -1,0 +1,124 @@
+"""The patch encoder: events are summed per pixel, pixels are read together in patches, patches are joined to a code.
+
+A recurrent one joins the code of the decision before as well, so that a code holds what has left the view, and what
+makes no events at the moment.
+
+An event tells distance only together with the motion that made it, and only beside its neighbours. So the layers
+before the join are shared by all patches, and each sees the patch's place in the image and the drone's own motion.
+
+N is the number of patches, K the number of pixels in one.
+"""
+
+from __future__ import annotations
+
+import flax.linen as nn
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jax.nn.initializers import zeros
+
+from edqn_jax.config import EncoderConfig
+from edqn_jax.learn.perception.code import CodeHead
+from edqn_jax.learn.perception.layers import Dense, added
+from edqn_jax.sim.sensors.events import EventField
+
+
+def log_counts(field: EventField) -> list[Array]:
+    """Returns log(1 + count) of ON and of OFF events of each pixel, of each pair of frames: 2 F arrays [..., H, W].
+
+    With noise, a pixel's ON and OFF events between two frames stand in rows of their own.
+    """
+    level = jnp.log(1.0 + field.count.astype(jnp.float32))
+    if field.with_noise:
+        pairs = jnp.split(level, 2, axis=-3)
+    else:
+        # A pixel's events between two frames have one polarity, so one logarithm serves both channels.
+        pairs = [jnp.where(sign, level, 0.0) for sign in (field.polarity > 0, field.polarity < 0)]
+    return [pair[..., row, :, :] for row in range(pairs[0].shape[-3]) for pair in pairs]
+
+
+def patches(image: Array, pixels: int) -> Array:
+    """Cuts images `[..., H, W]` into square patches of `pixels` x `pixels`: `[..., N, K]`, row by row.
+
+    Images whose sides are no multiples of `pixels` are padded with zeros at the right and at the bottom.
+    """
+    *batch, height, width = image.shape
+    rows, columns = -(-height // pixels), -(-width // pixels)
+    missing = rows * pixels - height, columns * pixels - width
+    if any(missing):
+        image = jnp.pad(image, [(0, 0)] * len(batch) + [(0, size) for size in missing])
+    cut = image.reshape(*batch, rows, pixels, columns, pixels).swapaxes(-3, -2)
+    return cut.reshape(*batch, rows * columns, pixels * pixels)
+
+
+def patch_places(height: int, width: int, pixels: int) -> np.ndarray:
+    """Returns the centres of the patches, `[N, 2]`: across and down, each from -1 to 1 over the image."""
+    rows, columns = -(-height // pixels), -(-width // pixels)
+    down, across = np.divmod(np.arange(rows * columns), columns)
+    middle = np.stack([(across + 0.5) * pixels / width, (down + 0.5) * pixels / height], axis=-1)
+    return (2.0 * middle - 1.0).astype(np.float32)
+
+
+def is_recurrent(config: EncoderConfig) -> bool:
+    """Returns whether a code depends on the one of the decision before."""
+    return config.sequence_decisions > 1
+
+
+class PatchEncoder(nn.Module):
+    """Layers shared by all patches, layers over all patches joined, and the code."""
+
+    config: EncoderConfig
+    height: int
+    width: int
+
+    @nn.compact
+    def __call__(
+        self, sensed: EventField | Array, motion: Array, previous: Array | None = None, begins: Array | None = None
+    ) -> tuple[Array, Array]:
+        """Returns mean and log-variance `[..., code_size]` of fields `[..., F, H, W]` or pictures `[..., C, H, W]`.
+
+        Args:
+            motion: `[..., MOTION_SIZE]` own motion, see `sim.env.own_motion`.
+            previous: `[..., code_size]` codes of the decision before, 0 at the start of an episode; a recurrent encoder
+                needs these, or
+            begins: `[T, ...]` bool: the observations are T in a row, and nothing is remembered where this is true.
+        """
+        images = log_counts(sensed) if isinstance(sensed, EventField) else list(jnp.moveaxis(sensed, -3, 0))
+        first, *later = self.config.patch_layers
+        # One product for each channel: joined to one array first, they take twice as long on a CPU.
+        products = [
+            Dense(first, use_bias=number == 0, name=f"channel_{number}")(patches(image, self.config.patch_pixels))
+            for number, image in enumerate(images)
+        ]
+        z = sum(products[1:], products[0])
+        # A layer over patch, place and motion together; what all patches or all fields share is computed once.
+        place = patch_places(self.height, self.width, self.config.patch_pixels)
+        z = added(z, Dense(first, use_bias=False, name="place")(jnp.asarray(place)))
+        z += Dense(first, use_bias=False, name="motion")(motion)[..., None, :]
+        z = nn.relu(z)
+        for number, size in enumerate(later, start=1):
+            z = nn.relu(Dense(size, name=f"patch_{number}")(z))
+        z = jnp.concatenate([z.reshape(*z.shape[:-2], -1), motion], axis=-1)
+        widths = self.config.joint_layers
+        joint = [Dense(size, name=f"joint_{number}") for number, size in enumerate(widths)]
+        head = CodeHead(self.config.code_size, name="code")
+
+        def code_of(z: Array) -> tuple[Array, Array]:
+            for layer in joint[1:]:
+                z = layer(nn.relu(z))
+            return head(nn.relu(z))
+
+        z = joint[0](z)
+        if not is_recurrent(self.config):
+            return code_of(z)
+        # Nothing is remembered at first, so that codes are not random functions of random codes.
+        remembered = Dense(widths[0], use_bias=False, kernel_init=zeros, name="previous")
+        if begins is None:
+            assert previous is not None, "a recurrent encoder needs the code before"
+            return code_of(z + remembered(previous))
+        codes = [code_of(z[0])]
+        for now in range(1, len(z)):
+            known = jnp.where(begins[now, ..., None], 0.0, codes[-1][0])
+            codes.append(code_of(z[now] + remembered(known)))
+        mean, log_variance = zip(*codes, strict=True)
+        return jnp.stack(mean), jnp.stack(log_variance)

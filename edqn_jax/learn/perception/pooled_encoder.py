@@ -1,0 +1,226 @@
+"""The pooled set encoder (section 3.2): a sum over events of features of position and polarity, then a code.
+
+An event is (x, y, t, p). The encoder's first layer is a sum over events, independent of their order,
+
+    pooled = sum over events of f(x, y, p) outer phi(t),
+
+with a learned feature f of position and polarity, and a sinusoidal phi of time. All events of a pixel between
+two frames share x, y and p, so the sum over them reaches only phi, where it is a geometric series with a
+closed form: the dense path costs the same for one event as for a thousand, and it is exact.
+
+`encoder.pooling: max` takes, instead, the largest f(x, y, p) + phi(t) of any event, as the public code of an event VAE
+for drones does (microsoft/event-vae-rl, after PointNet). Of a pixel's events between two frames the one nearest to a
+peak of phi has the largest, so that it, too, is exact at the cost of one event.
+
+Field arrays are `[..., F, H, W]`: any leading dimensions are the batch, carried into a few large matmuls.
+C is the number of temporal channels, 1 + 2 x `time_frequencies`.
+
+Pictures `[..., P, H, W]` have P channels where a field has two, ON and OFF, and no time: they are pooled as the
+sum over channels and pixels of f(x, y) x value, divided by the root of their number. They have C times the features, so
+that the pooled vector, and all later layers, have the same size as for events.
+"""
+
+from __future__ import annotations
+
+import flax.linen as nn
+import jax.numpy as jnp
+from jax import Array
+
+from edqn_jax.config import EncoderConfig
+from edqn_jax.learn.perception.code import EVENT_CHANNELS, CodeHead
+from edqn_jax.learn.perception.waves import mirrored, polarities, wave_table
+from edqn_jax.sim.sensors.events import EventField
+from edqn_jax.sine import sin_pi
+
+POSITION_OCTAVES = 4
+"""Sine-cosine pairs per image axis in the positional encoding; the finest period is a quarter image."""
+
+POOL_SCALE = 1.0 / 8.0
+"""Constant factor on the pooled sum: the root of some 64 events, so that the next layer sees unit scale."""
+
+
+def temporal_encoding(frequencies: int, tau: Array) -> Array:
+    """Returns `phi(t) = [1, cos(2 pi k tau), sin(2 pi k tau), ...]` for k = 1 .. frequencies: `[...]` to `[..., C]`.
+
+    `tau` is the time normalised to the window: 0 at its start, 1 at its end.
+    """
+    channels = [jnp.ones_like(tau)]
+    for k in range(1, frequencies + 1):
+        channels += [jnp.cos(2.0 * jnp.pi * k * tau), jnp.sin(2.0 * jnp.pi * k * tau)]
+    return jnp.stack(channels, axis=-1)
+
+
+def temporal_sums(frequencies: int, field: EventField) -> list[Array | None]:
+    """Returns the sums of `temporal_encoding` over each pixel's events in closed form: C arrays `[..., F, H, W]`.
+
+    None stands for a sum that is always zero: n events that divide the window evenly add up to
+    the n-th roots of unity, which leave n where n divides the frequency, and nothing else.
+
+    The geometric series of n phasors a step apart is Dirichlet's kernel, `sin(n x) / sin(x)`, times the
+    middle phasor. Half turns are subtracted from x first: the kernel is then stable where sin(x) vanishes.
+    """
+    n = field.count.astype(jnp.float32)
+    if field.divides_window:
+        sums: list[Array | None] = [n]
+        for k in range(1, frequencies + 1):
+            divides = sum((n == d) for d in range(1, k + 1) if k % d == 0)
+            sums += [n * divides, None]
+        return sums
+    first, step = field.t_first / field.window_s, field.t_step / field.window_s
+    sums = [n]
+    for k in range(1, frequencies + 1):
+        half_turns = jnp.round(k * step)
+        rest = k * step - half_turns
+        small = jnp.abs(rest) < 1e-6
+        kernel = jnp.where(small, n, sin_pi(n * rest) / sin_pi(jnp.where(small, 0.5, rest)))
+        middle = 2.0 * k * first + (n - 1.0) * (k * step + half_turns)
+        sums += [kernel * sin_pi(middle + 0.5), kernel * sin_pi(middle)]
+    return sums
+
+
+def temporal_maxima(frequencies: int, field: EventField) -> list[Array]:
+    """Returns the largest of each channel of `temporal_encoding` over each pixel's events: C arrays `[..., F, H, W]`.
+
+    A channel falls evenly to both sides of its peaks, so of events that follow one another evenly the one nearest to
+    a peak, or the first or last, is the highest around it. Pixels without events have some finite value.
+    """
+    n = field.count.astype(jnp.float32)
+    first, step = field.t_first / field.window_s, field.t_step / field.window_s
+    maxima = [jnp.ones_like(n)]
+    for k in range(1, frequencies + 1):
+        for peak in (0.0, 0.25):  # of the cosine and of the sine, in turns
+            highest = jnp.full_like(n, -1.0)
+            for turn in range(k + 1):
+                place = (turn + peak) / k
+                nearest = jnp.clip(jnp.round((place - first) / jnp.maximum(step, 1e-9)), 0.0, jnp.maximum(n - 1.0, 0.0))
+                tau = first + nearest * step
+                highest = jnp.maximum(highest, jnp.cos(2.0 * jnp.pi * (k * tau - peak)))
+            maxima.append(highest)
+    return maxima
+
+
+def positional_encoding(x: Array, y: Array, width: int, height: int) -> Array:
+    """Returns sines and cosines of a pixel's position, `[...]` to `[..., 4 * POSITION_OCTAVES + 2]`."""
+    u, v = (x + 0.5) / width * 2.0 - 1.0, (y + 0.5) / height * 2.0 - 1.0
+    channels = [u, v]
+    for octave in range(POSITION_OCTAVES):
+        for place in (u, v):
+            angle = jnp.pi * 2.0**octave * 0.5 * place
+            channels += [jnp.cos(angle), jnp.sin(angle)]
+    return jnp.stack(channels, axis=-1)
+
+
+class PixelTable(nn.Module):
+    """f(x, y, p) as a free table over pixels and polarities."""
+
+    features: int
+    height: int
+    width: int
+    channels: int = EVENT_CHANNELS
+
+    def setup(self) -> None:
+        shape = (self.channels, self.height * self.width, self.features)
+        self.table = self.param("table", wave_table(self.height, self.width), shape)
+
+    def everywhere(self) -> Array:
+        """Returns f of every pixel, `[channels, H * W, features]`, ON first."""
+        return self.table
+
+    def at(self, x: Array, y: Array, p: Array) -> Array:
+        """Returns f, `[..., features]`, at columns x, rows y, polarities p."""
+        return self.table[(p < 0).astype(jnp.int32), y * self.width + x]
+
+
+class PixelNetwork(nn.Module):
+    """f(x, y, p) as a ReLU network on the positional encoding and the polarity."""
+
+    features: int
+    height: int
+    width: int
+    channels: int = EVENT_CHANNELS
+
+    def setup(self) -> None:
+        self.layers = [nn.Dense(64), nn.Dense(64), nn.Dense(self.features)]
+
+    def everywhere(self) -> Array:
+        y, x = jnp.divmod(jnp.arange(self.height * self.width), self.width)
+        return jnp.stack([self.at(x, y, jnp.full(x.shape, p)) for p in polarities(self.channels)])
+
+    def at(self, x: Array, y: Array, p: Array) -> Array:
+        place = positional_encoding(x.astype(jnp.float32), y.astype(jnp.float32), self.width, self.height)
+        z = jnp.concatenate([place, p.astype(jnp.float32)[..., None]], axis=-1)
+        for layer in self.layers[:-1]:
+            z = nn.relu(layer(z))
+        return self.layers[-1](z)
+
+
+class PooledEncoder(nn.Module):
+    """Set encoder. `dense` and `sparse` share their parameters and agree; `picture` has its own."""
+
+    config: EncoderConfig
+    height: int
+    width: int
+    channels: int = EVENT_CHANNELS
+    timed: bool = True
+
+    def setup(self) -> None:
+        kind = {"table": PixelTable, "network": PixelNetwork}[self.config.pixel_features]
+        temporal = 1 if self.timed else 1 + 2 * self.config.time_frequencies
+        self.pixels = kind(temporal * self.config.features, self.height, self.width, self.channels)
+        self.hidden = nn.Dense(self.config.hidden, kernel_init=mirrored(inputs=False, outputs=True))
+        self.code = CodeHead(self.config.code_size, mean_init=mirrored(inputs=True, outputs=False))
+
+    def __call__(self, sensed: EventField | Array, motion: Array) -> tuple[Array, Array]:
+        """Returns mean and log-variance `[..., code_size]` of fields or pictures; the own motion is not used."""
+        return self.dense(sensed) if isinstance(sensed, EventField) else self.picture(sensed)
+
+    def dense(self, field: EventField) -> tuple[Array, Array]:
+        """Returns mean and log-variance `[..., code_size]` of fields `[..., F, H, W]`."""
+        on, off = self.pixels.everywhere()
+        batch = field.count.shape[:-3]
+        if self.config.pooling == "max":
+            return self._head(self._largest(field, on, off), 1.0)
+        pooled = []
+        for phi in temporal_sums(self.config.time_frequencies, field):
+            if phi is None:
+                pooled.append(jnp.zeros((*batch, on.shape[-1])))
+                continue
+            phi_on = jnp.sum(jnp.where(field.polarity > 0, phi, 0.0), axis=-3).reshape(*batch, -1)
+            phi_off = jnp.sum(jnp.where(field.polarity < 0, phi, 0.0), axis=-3).reshape(*batch, -1)
+            pooled.append(phi_on @ on + phi_off @ off)
+        return self._head(jnp.concatenate(pooled, axis=-1), POOL_SCALE)
+
+    def sparse(self, x: Array, y: Array, tau: Array, p: Array) -> tuple[Array, Array]:
+        """Returns mean and log-variance of event lists, each `[..., N]`; entries with p = 0 are no events."""
+        place = self.pixels.at(x, y, p) * (p != 0)[..., None]
+        phi = temporal_encoding(self.config.time_frequencies, tau)
+        if self.config.pooling == "max":
+            every = phi[..., :, None] + place[..., None, :]
+            highest = _highest(every, (p != 0)[..., None, None], -3)
+            return self._head(highest.reshape(*highest.shape[:-2], -1), 1.0)
+        pooled = jnp.einsum("...nf,...nc->...cf", place, phi)
+        return self._head(pooled.reshape(*pooled.shape[:-2], -1), POOL_SCALE)
+
+    def picture(self, image: Array) -> tuple[Array, Array]:
+        """Returns mean and log-variance `[..., code_size]` of pictures `[..., P, H, W]`."""
+        everywhere = self.pixels.everywhere()
+        flat = image.reshape(*image.shape[:-3], -1)
+        return self._head(flat @ everywhere.reshape(flat.shape[-1], -1), flat.shape[-1] ** -0.5)
+
+    def _largest(self, field: EventField, on: Array, off: Array) -> Array:
+        """Returns the largest f + phi of all events, `[..., C x features]`; 0 where there are none."""
+        flat = (*field.count.shape[:-2], -1, 1)
+        place = jnp.where(field.polarity.reshape(flat) > 0, on, off)
+        has = (field.count > 0).reshape(flat)
+        maxima = temporal_maxima(self.config.time_frequencies, field)
+        return jnp.concatenate([_highest(place + phi.reshape(flat), has, (-3, -2)) for phi in maxima], axis=-1)
+
+    def _head(self, pooled: Array, scale: float) -> tuple[Array, Array]:
+        return self.code(nn.relu(self.hidden(pooled * scale)))
+
+
+def _highest(values: Array, counted: Array, axes: int | tuple[int, ...]) -> Array:
+    """Returns the largest, over `axes`, of the values that count; 0 where none does."""
+    lowest = jnp.finfo(values.dtype).min
+    highest = jnp.max(values, axis=axes, where=counted, initial=lowest)
+    return jnp.where(highest > lowest, highest, 0.0)

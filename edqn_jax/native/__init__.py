@@ -1,0 +1,1 @@
+"""Functions in C that XLA calls on CPUs or GPUs."""

@@ -1,0 +1,185 @@
+"""Functions in C that XLA calls, on CPUs or GPUs: compiled once for this machine, kept beside compiled programs.
+
+Whoever uses one has the same function in JAX for where there is no compiler, and a test that both agree.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import dataclasses
+import functools
+import hashlib
+import logging
+import os
+import shlex
+import shutil
+import subprocess
+import tempfile
+import threading
+from collections.abc import Sequence
+from pathlib import Path
+
+import jax
+
+from edqn_jax.devices.cache import private_folder
+
+SWITCH = "EDQN_JAX_NATIVE"
+"""Environment variable; with 0 nothing in C is used."""
+
+_ONE_AT_A_TIME = threading.Lock()
+
+HEADER = Path(__file__).with_name("handler.h")
+
+
+@dataclasses.dataclass(frozen=True)
+class Compiler:
+    """What compiles a source, and for which of XLA's platforms."""
+
+    variable: str  # environment variable that names another one, with its own options
+    usual: str
+    flags: tuple[str, ...]
+    platform: str
+    told: int  # line of what it says of its version that names it
+
+
+C = Compiler(
+    "CC",
+    "cc",
+    (
+        *("-std=gnu11", "-O3", "-march=native", "-fPIC", "-shared"),
+        # What vector instructions need. Comparisons of NaN are never relied on.
+        *("-fno-math-errno", "-fno-trapping-math", "-ffinite-math-only", "-fno-signed-zeros"),
+    ),
+    "cpu",
+    0,
+)
+
+
+@functools.cache
+def cuda() -> Compiler | None:
+    """Returns the compiler for NVIDIA GPUs like the first of this process; None where there is none."""
+    try:
+        major, minor = str(jax.local_devices(backend="cuda")[0].compute_capability).split(".")
+    except RuntimeError:
+        return None
+    # Quotients and roots to 2 units in the last place, and no numbers below 1e-38.
+    fast = ("-prec-div=false", "-prec-sqrt=false", "-ftz=true")
+    flags = ("-O3", f"-arch=sm_{major}{minor}", *fast, "-Xcompiler=-fPIC", "-shared")
+    return Compiler("NVCC", "nvcc", flags, "CUDA", -1)
+
+
+@functools.cache
+def compiler(of: Compiler | None = C) -> str | None:
+    """Returns the name and version of a compiler in its own words; None where it is not used."""
+    command = None if of is None else _command(of)
+    if of is None or command is None:
+        return None
+    lines = _version(command).splitlines()
+    return lines[of.told] if lines else shlex.join(command)
+
+
+def _version(command: Sequence[str]) -> str:
+    """Returns what a compiler says of its version; nothing where it does not answer."""
+    with contextlib.suppress(OSError, subprocess.SubprocessError):
+        said = subprocess.run([*command, "--version"], capture_output=True, text=True, timeout=20)
+        if said.returncode == 0:
+            return said.stdout.strip()
+    return ""
+
+
+def _command(of: Compiler) -> list[str] | None:
+    """Returns the compiler that is named, else the usual one, with its options; None if none is to be used."""
+    if os.environ.get(SWITCH, "1") == "0":
+        return None
+    words = shlex.split(os.environ.get(of.variable, "")) or [of.usual]
+    found = shutil.which(words[0])
+    return None if found is None else [found, *words[1:]]
+
+
+def registered(
+    source: Path,
+    targets: tuple[str, ...],
+    definitions: tuple[str, ...] = (),
+    by: Compiler = C,
+    headers: tuple[Path, ...] = (),
+) -> bool:
+    """Compiles and loads a source, and registers its handlers with XLA; returns whether that was possible.
+
+    Where there is a compiler and it was not, a warning says why. It may export `edqn_unusable`, which returns why it
+    cannot be used on this machine, or a null pointer.
+
+    Args:
+        source: C, with XLA's header for foreign functions.
+        targets: names of its handlers.
+        definitions: of the preprocessor, NAME=VALUE.
+        by: compiler.
+        headers: that the source includes from beside it.
+    """
+    with _ONE_AT_A_TIME:
+        return _registered(source, targets, definitions, by, headers)
+
+
+@functools.cache
+def _registered(
+    source: Path, targets: tuple[str, ...], definitions: tuple[str, ...], by: Compiler, headers: tuple[Path, ...]
+) -> bool:
+    command = _command(by)
+    if command is None:
+        return False
+    try:
+        with contextlib.ExitStack() as scratch:
+            # Where nothing can be kept, the file is not needed once it is loaded.
+            folder = private_folder() or Path(scratch.enter_context(tempfile.TemporaryDirectory()))
+            library = _loaded(command, by.flags, source, definitions, folder, headers)
+        _check_usable(library)
+        for target in targets:
+            handler = jax.ffi.pycapsule(getattr(library, target))
+            jax.ffi.register_ffi_target(target, handler, platform=by.platform)
+    except (OSError, AttributeError, subprocess.SubprocessError, jax.errors.JaxRuntimeError) as error:
+        said = error.stderr.decode(errors="replace") if isinstance(error, subprocess.CalledProcessError) else str(error)
+        first = next(iter(said.strip().splitlines()), type(error).__name__)
+        logging.getLogger(__name__).warning(
+            "%s could not be compiled or loaded, JAX does its work more slowly: %s", source.name, first
+        )
+        return False
+    return True
+
+
+def _check_usable(library: ctypes.CDLL) -> None:
+    """Asks a library whether it can be used here.
+
+    Raises:
+        OSError: with its answer, if it cannot.
+    """
+    ask = getattr(library, "edqn_unusable", None)
+    if ask is not None:
+        ask.restype = ctypes.c_char_p
+        reason = ask()
+        if reason is not None:
+            raise OSError(reason.decode(errors="replace"))
+
+
+def _loaded(
+    compiler: list[str],
+    flags: tuple[str, ...],
+    source: Path,
+    definitions: tuple[str, ...],
+    folder: Path,
+    headers: tuple[Path, ...] = (),
+) -> ctypes.CDLL:
+    """Returns the library, compiled in `folder` unless one of the same source, compiler and XLA is kept there."""
+    defined = [f"-D{definition}" for definition in definitions]
+    searched = [f"-I{folder}" for folder in (jax.ffi.include_dir(), HEADER.parent)]
+    command = [*compiler, *flags, *defined, *searched, str(source), "-lm"]
+    texts = [file.read_bytes() for file in (source, HEADER, *headers)]
+    told_apart = (command, _version(compiler), texts, jax.__version__)
+    library = folder / f"{source.stem}-{hashlib.sha256(repr(told_apart).encode()).hexdigest()[:16]}.so"
+    if library.is_file():
+        with contextlib.suppress(OSError):  # a damaged file is made anew
+            return ctypes.CDLL(str(library))
+    with tempfile.TemporaryDirectory(dir=folder) as scratch:
+        made = Path(scratch) / library.name
+        subprocess.run([*command, "-o", str(made)], check=True, capture_output=True, timeout=60)
+        made.replace(library)
+    return ctypes.CDLL(str(library))

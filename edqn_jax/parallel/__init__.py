@@ -1,1 +1,0 @@
-"""Devices, the launch of one of several processes, and collectives."""

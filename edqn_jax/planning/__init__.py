@@ -1,0 +1,1 @@
+"""Shortest paths through known worlds: what missions, the reward and SPL need."""

@@ -1,0 +1,165 @@
+"""A pinhole camera by analytic ray casting: depth, luma and RGB of a scene from any pose.
+
+Brightness of a pixel is its area average: Lambert shade under a sun x albedo x texture. Between two frames
+0.04 s apart silhouettes move by a fraction of a pixel, so the fraction has to be right: shapes become layers
+of exact coverage (`coverage.py`), the nearest few are blended over ground and sky, and the texture is
+box-filtered over the pixel (`texture.py`).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any, TypeVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from edqn_jax.config import CameraConfig
+from edqn_jax.sim.camera import columns, coverage, native, raycast
+from edqn_jax.sim.camera.columns import Frame
+from edqn_jax.sim.camera.coverage import Layers
+from edqn_jax.sim.camera.depth import nearest_depth
+from edqn_jax.sim.camera.primitive import draw_in_one_batch
+from edqn_jax.sim.camera.raycast import Rays, Values
+from edqn_jax.sim.camera.texture import texture
+from edqn_jax.sim.scene.scene import Scene
+from edqn_jax.xla import materialised
+
+LUMA_WEIGHTS = (0.299, 0.587, 0.114)
+"""Weights of R, G and B in Eq. 1."""
+
+Pixels = TypeVar("Pixels", Array, np.ndarray)
+
+
+def _backdrop(config: CameraConfig, scene: Scene, origin: Array, rays: Rays, value: Values, sky: Array) -> Array:
+    """Returns brightness [H, W] of textured ground and other planes before the sky."""
+    shape = jnp.broadcast_shapes(rays.dx.shape, rays.dz.shape)
+    behind = jnp.broadcast_to(sky, shape)
+    if scene.planes.normal.shape[0] == 0:
+        return behind
+    depth, shown, share = jnp.full(shape, jnp.inf), jnp.zeros(shape), jnp.zeros(shape)
+    slopes = jnp.zeros(shape), jnp.zeros(shape)
+    for n in range(scene.planes.normal.shape[0]):
+        normal = scene.planes.normal[n]
+        height = jnp.dot(origin - scene.planes.position[n], normal)
+        across, along = jnp.dot(normal, rays.right) * rays.pitch, jnp.dot(normal, rays.up) * rays.pitch
+        # The plane's horizon is the line n . d = 0; the part of the pixel below it is covered by the plane.
+        approach = normal[0] * rays.dx + normal[1] * rays.dy + normal[2] * rays.dz
+        spread = jnp.abs(across) + jnp.abs(along)
+        covered = jnp.clip(0.5 - approach * raycast.inverse(spread), 0.0, 1.0)
+        middle = (approach - spread / 2 + jnp.minimum(approach + spread / 2, 0.0)) / 2
+        t = -height * raycast.inverse(middle)
+        # On a plane t = h / (n . d), so dt = -t (n . d') / (n . d), exactly.
+        relative = -t * raycast.inverse(middle)
+        seen = (middle < 0) & (t > 0) & (t < raycast.HORIZON_M) & (t < depth)
+        depth = jnp.where(seen, t, depth)
+        share = jnp.where(seen, covered, share)
+        shown = jnp.where(seen, raycast.shade(config, *normal) * value.planes[n], shown)
+        slopes = jnp.where(seen, relative * across, slopes[0]), jnp.where(seen, relative * along, slopes[1])
+    factor = texture(config, origin, rays, jnp.where(share > 0, depth, 0.0), *slopes)
+    return behind + share * (shown * factor - behind)
+
+
+def blend(config: CameraConfig, frame: Frame, rays: Rays, layers: Layers) -> Array:
+    """Returns brightness [H, W] of the layers over ground and sky."""
+    behind = _backdrop(config, frame.scene, frame.origin, rays, frame.value, frame.sky)
+    for layer in reversed(layers):
+        met = layer.closeness > 0
+        near = jnp.where(met, raycast.inverse(layer.closeness), 0.0)
+        level = layer.slope == coverage.LEVEL_FACE
+        right = jnp.where(level, 0.0, -near * near * layer.slope)
+        up = jnp.where(level, -near * raycast.inverse(rays.dz) * rays.pitch, 0.0)
+        factor = texture(config, frame.origin, rays, near, right, up)
+        behind = behind + jnp.where(met, layer.value * factor - layer.coverage * behind, 0.0)
+    return behind
+
+
+def _picture(config: CameraConfig, scene: Scene, origin: Array, rotation: Array, weights: Array) -> Array:
+    """Returns brightness [H, W] under `weights` [3] of RGB."""
+    if config.mount == "level":
+        image = (scene, origin, rotation, weights)
+        size = (config.height, config.width)
+        return draw_in_one_batch(columns.pictures, (config, blend), image, size, natively=_pictures_natively)
+    value = raycast.albedo_values(scene, weights)
+    rays = raycast.camera_rays(config, rotation)
+    many = raycast.camera_rays(config, rotation, config.samples_across, config.samples_down)
+    layers = coverage.no_layers((config.height, config.width))
+    counted = raycast.other_surfaces(config, scene, origin, many, value)
+    counted += raycast.upright_surfaces(config, scene, origin, many, value)
+    for surfaces in counted:
+        layers = coverage.counted_layers(surfaces, many, layers)
+    layers = coverage.sphere_layers(config, scene, origin, rays, value, layers)
+    sky = jnp.sum(jnp.asarray(config.sky_rgb) * weights)
+    frame = Frame(origin=origin, heading=rotation[:2, 0], scene=scene, value=value, sky=sky)
+    return materialised(blend(config, frame, rays, layers))
+
+
+def luma(config: CameraConfig, scene: Scene, position: Array, rotation: Array) -> Array:
+    """Returns linear luma of the scene, each pixel the average over its area.
+
+    Shade and texture multiply R, G and B alike, so the luma of Eq. 1 needs one channel, not three.
+
+    Args:
+        position: [3] metres.
+        rotation: [3, 3] body-to-world; the camera looks along body x with body z up. A level mount keeps
+            only the heading.
+
+    Returns:
+        [H, W] in [0, 1], row 0 at the top.
+    """
+    return _picture(config, scene, position, rotation, jnp.asarray(LUMA_WEIGHTS))
+
+
+def rgb(config: CameraConfig, scene: Scene, position: Array, rotation: Array) -> Array:
+    """Returns linear RGB seen from `position` [3], metres: [H, W, 3] in [0, 1]; `luma` is its weighted sum in Eq. 1."""
+    channels = jax.vmap(lambda weights: _picture(config, scene, position, rotation, weights))(jnp.eye(3))
+    return jnp.moveaxis(channels, 0, -1)
+
+
+def fine_rgb(config: CameraConfig, scale: int, scene: Scene, position: Array, rotation: Array) -> Array:
+    """Returns linear RGB [scale H, scale W, 3] for people: the same view in pixels `scale` times finer per axis.
+
+    Args:
+        rotation: [3, 3] of the camera itself, body-to-world; the mount is not applied.
+    """
+    # Fine pixels need only one ray each, and the body-mounted camera's program is the quickest to compile.
+    size = {"width": config.width * scale, "height": config.height * scale}
+    lens = dataclasses.replace(config, **size, mount="body", samples_across=1, samples_down=1)
+    return rgb(lens, scene, position, rotation)
+
+
+def on_screen(linear: Pixels) -> Pixels:
+    """Returns linear brightness as screens show it (gamma 2.2), in [0, 1]."""
+    return linear.clip(0.0, 1.0) ** (1 / 2.2)
+
+
+def depth(config: CameraConfig, scene: Scene, position: Array, rotation: Array) -> Array:
+    """Returns the distance along each pixel's central ray: [H, W] metres, inf where the ray meets nothing."""
+    nearest = draw_in_one_batch(
+        _depths, (config,), (scene, position, rotation), (config.height, config.width), natively=_depths_natively
+    )
+    rays = raycast.camera_rays(config, rotation)
+    return nearest * jnp.sqrt(rays.dx**2 + rays.dy**2 + rays.dz**2)
+
+
+def _pictures_natively(platform: str, config: CameraConfig, _: columns.Finish, *image: Any) -> Array | None:
+    """Returns brightness [M, H, W] by the library in C, which blends as `blend` does; None where it cannot draw it."""
+    return native.pictures(config, *image) if native.can_draw(config, image[0], platform) else None
+
+
+def _depths(config: CameraConfig, scene: Scene, position: Array, rotation: Array) -> Array:
+    """Returns the depth [M, H, W] metres along the optical axis; every array has a leading [M]."""
+
+    def one(scene: Scene, position: Array, rotation: Array) -> Array:
+        return nearest_depth(config, scene, position, raycast.camera_rays(config, rotation))
+
+    return jax.vmap(one)(scene, position, rotation)
+
+
+def _depths_natively(
+    platform: str, config: CameraConfig, scene: Scene, position: Array, rotation: Array
+) -> Array | None:
+    """Returns `_depths` by the library in C; None where it cannot draw them."""
+    return native.depths(config, scene, position, rotation) if native.can_draw(config, scene, platform) else None

@@ -1,0 +1,98 @@
+"""The level camera in C, for CPUs and NVIDIA GPUs: calls `pictures.c` and `pictures.cu`.
+
+Where there is a C compiler, or on GPUs CUDA's, pictures and depth images are drawn by it; everywhere else by the same
+functions in JAX (`columns.py`, `depth.py`). All agree to rounding (`tests/sim/camera/test_native.py`).
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from edqn_jax.config import CameraConfig
+from edqn_jax.native import build
+from edqn_jax.sim.camera import coverage, raycast
+from edqn_jax.sim.camera.primitive import most_rows
+from edqn_jax.sim.camera.texture import WAVES
+from edqn_jax.sim.scene.scene import Scene
+
+SOURCES = {name: Path(__file__).with_name(f"pictures.{name}") for name in ("h", "c", "cu")}
+
+OPERANDS = {
+    "boxes": ("position", "half", "yaw", "albedo"),
+    "cylinders": ("position", "radius", "half_height", "albedo"),
+    "spheres": ("position", "radius", "albedo"),
+    "planes": ("position", "normal", "albedo"),
+}
+"""Kinds of shape that the library draws, and what it reads of each. A scene with room for any other is drawn by JAX."""
+
+MOST_PLANES = 8
+"""A scene with more is drawn by JAX."""
+
+TARGETS = ("edqn_pictures", "edqn_depths")
+
+NOWHERE = 1e29
+"""Depths beyond this, in metres, are those of rays that meet nothing."""
+
+
+def can_draw(config: CameraConfig, scene: Scene, platform: str) -> bool:
+    """Returns whether the library of "cpu" or "cuda" is at hand and draws such pictures; known when tracing."""
+    others = (scene.tilted_boxes, scene.capsules, scene.tilted_cylinders)
+    plain = config.mount == "level" and not any(kind.position.shape[-2] for kind in others)
+    shapes = [getattr(getattr(scene, kind), name) for kind, names in OPERANDS.items() for name in names]
+    plain = plain and scene.planes.position.shape[-2] <= MOST_PLANES
+    return plain and all(leaf.dtype == jnp.float32 for leaf in shapes) and is_at_hand(platform)
+
+
+def pictures(config: CameraConfig, scene: Scene, origin: Array, rotation: Array, weights: Array) -> Array:
+    """Returns brightness [M, H, W] as `columns.pictures` does; arrays have a leading [L], see `primitive`."""
+    return _call("edqn_pictures", config, scene, origin, rotation, weights)
+
+
+def depths(config: CameraConfig, scene: Scene, origin: Array, rotation: Array) -> Array:
+    """Returns the depth [M, H, W] metres along the middle ray of each pixel, inf where there is nothing.
+
+    As `depth.nearest_depth` does; arrays have a leading [L], see `primitive`.
+    """
+    found = _call("edqn_depths", config, scene, origin, rotation)
+    return jnp.where(found > NOWHERE, jnp.inf, found)
+
+
+def _call(target: str, config: CameraConfig, scene: Scene, *frames: Array) -> Array:
+    u, v = raycast.image_plane(config, 1, 1)
+    waves = np.array(
+        [[*np.divide(w.direction, config.texture_period_m * w.octave), w.weight] for w in WAVES], np.float32
+    )
+    first = [raycast.pitch_of(config), config.texture_contrast, config.ambient]
+    constants = np.array([*first, *raycast.sun_direction(config), *config.sky_rgb], np.float32)
+    shapes = [getattr(getattr(scene, kind), name) for kind, names in OPERANDS.items() for name in names]
+    origin, rotation, *weights = frames
+    count = most_rows([*shapes, *frames])
+    shape = jax.ShapeDtypeStruct((count, config.height, config.width), jnp.float32)
+    return jax.ffi.ffi_call(target, shape)(constants, u, v, waves, origin, rotation, *shapes, *weights)
+
+
+def is_at_hand(platform: str) -> bool:
+    """Returns whether the library of "cpu" or "cuda" is compiled, loaded and registered, which the first call does."""
+    compiler, source = (build.C, SOURCES["c"]) if platform == "cpu" else (build.cuda(), SOURCES["cu"])
+    return compiler is not None and build.registered(source, TARGETS, definitions(), compiler, (SOURCES["h"],))
+
+
+def definitions() -> tuple[str, ...]:
+    """Returns the constants that the sources do not define, NAME=VALUE."""
+    numbers = {
+        "TINY": raycast.TINY,
+        "HORIZON_M": raycast.HORIZON_M,
+        "NEAR_M": coverage.NEAR_M,
+        "FAR_U": coverage.FAR_U,
+        "LEVEL_FACE": coverage.LEVEL_FACE,
+    }
+    counts = {"DEPTH_OF_LAYERS": coverage.DEPTH_OF_LAYERS, "MOST_PLANES": MOST_PLANES}
+    return (
+        *(f"{name}={value:e}f" for name, value in numbers.items()),
+        *(f"{name}={value}" for name, value in counts.items()),
+    )

@@ -1,0 +1,1 @@
+"""The drone: airframe, controller, one physics step, disturbances."""

@@ -1,0 +1,1 @@
+"""Worlds as arrays: shapes, how they move, distances to them, and MJCF."""

@@ -1,0 +1,461 @@
+"""Reads and writes worlds as MJCF, MuJoCo's file format.
+
+An MJCF file that names no other file can be read. A world for the drone consists of
+
+* its static geoms (on the world body or on bodies welded to it): boxes, spheres, capsules, cylinders at
+  any rotation, and planes, which are solid below and infinite. A geom is read if it is visible in
+  MuJoCo's viewer (groups 0 to 2) or if MuJoCo would collide with it (contype or conaffinity set): every
+  visible geom is solid, and every solid geom is visible. Colour is the material's or the geom's own `rgba`; alpha
+  and textures are ignored.
+* its moving geoms, on mocap bodies whose motion a text says (`mjcf_motion.py`).
+* two sites `start` and `goal`, of which only the positions are read.
+* a box site `volume`, not rotated: the space that the drone may fly in. Without one, the box around all
+  shapes and sites, `VOLUME_MARGIN` wider on every side, but not below a level plane; an evaluation whose start or goal
+  lies outside that box widens it (`widened`).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import math
+import xml.etree.ElementTree as ElementTree
+from collections.abc import Mapping
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+from jax.typing import ArrayLike
+
+from edqn_jax.config import FAMILIES
+from edqn_jax.sim.scene.distance import shape_distances
+from edqn_jax.sim.scene.mjcf_files import SceneError, checked_text
+from edqn_jax.sim.scene.mjcf_motion import PREFIX, motions_of, set_in_motion, text_of
+from edqn_jax.sim.scene.motion import Throw, steady_aim, thrown_to
+from edqn_jax.sim.scene.scene import (
+    KINDS,
+    Capsules,
+    Planes,
+    Scene,
+    Shape,
+    Spheres,
+    TiltedBoxes,
+    TiltedCylinders,
+    UprightBoxes,
+    UprightCylinders,
+    build_scene,
+    scene_shapes,
+)
+
+VOLUME_MARGIN = 5.0
+"""Metres around shapes and sites where a world names no `volume`."""
+
+LONGEST_VOLUME = 500.0
+"""Most metres along an axis of a flight volume; A*'s lattice must hold it."""
+
+MOST_SHAPES = 500
+"""Geoms of a world: 2 000 of them take 8 GB to train in."""
+
+_LEVEL = 1e-6  # an axis this near to vertical (sine of the angle) is vertical: 0.1 mm over 100 m
+
+
+@dataclasses.dataclass(frozen=True)
+class LoadedWorld:
+    """A scene and the names of its shapes."""
+
+    scene: Scene
+    names: Mapping[str, tuple[str, ...]]
+    """For every kind (field of `Scene`), the name of each of its shapes, in order."""
+    path: Path
+    has_volume: bool
+    """Whether the file says where the drone may fly."""
+
+
+def scenes_folder() -> Path:
+    """Returns the folder of the project's own worlds: beside the package in a checkout, inside it in a wheel."""
+    package = Path(__file__).resolve().parents[2]
+    packed = package / "scenes"
+    return packed if packed.is_dir() else package.parent / "scenes"
+
+
+def resolve_world(name: str) -> Path:
+    """Returns the MJCF file of a world, given by its path or by its name in `scenes/`.
+
+    Raises:
+        SceneError: if the file does not exist.
+    """
+    path = Path(name).expanduser()
+    if path.is_file():
+        return path
+    folder = scenes_folder()
+    named = folder / f"{name}.xml"
+    if path.name == name and named.is_file():
+        return named
+    scenes = sorted(file.stem for file in folder.glob("*.xml"))
+    known = f"scenes known by name: {', '.join(scenes) or 'none'}"
+    if path.suffix == ".xml" or path.name != name:
+        searched = path.parent.resolve()
+        raise SceneError(f"there is no scene file '{path.name}' in {searched}; {known}")
+    close = difflib.get_close_matches(name, [*FAMILIES, *scenes], n=1)
+    hint = f"; did you mean '{close[0]}'?" if close else ""
+    raise SceneError(f"there is no scene '{name}' in {folder}; {known}; random worlds: {', '.join(FAMILIES)}{hint}")
+
+
+def load_scene(path: str | Path) -> Scene:
+    """Returns `load_world(path).scene`."""
+    return load_world(path).scene
+
+
+def load_world(path: str | Path) -> LoadedWorld:
+    """Reads a world from an MJCF file.
+
+    Where the file has no site `start` or `goal`, that point is NaN in the scene; `check_scene` raises an error
+    unless the caller has replaced it.
+
+    Raises:
+        SceneError: if the file is missing or does not parse, or has an unsupported geom.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise SceneError(f"there is no scene file '{path.name}' in {path.parent.resolve()}")
+    text = checked_text(path)
+    mujoco.set_mju_user_warning(lambda _: None)  # otherwise MuJoCo writes a log into the working folder
+    try:
+        model = mujoco.MjModel.from_xml_string(text)
+    except ValueError as error:
+        reason = " ".join(str(error).split())
+        raise SceneError(f"{path} is not an MJCF that MuJoCo can read: {reason}") from None
+    finally:
+        mujoco.set_mju_user_warning(None)
+    if model.ngeom > MOST_SHAPES:
+        raise SceneError(f"{path} has {model.ngeom:,} geoms; a world may have {MOST_SHAPES}")
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    said = motions_of(model, str(path))
+    shapes: list[Shape] = []
+    bodies: list[int] = []
+    names: dict[str, list[str]] = {kind: [] for kind in KINDS}
+    for geom in range(model.ngeom):
+        if model.geom_group[geom] >= 3 and not (model.geom_contype[geom] or model.geom_conaffinity[geom]):
+            continue
+        body = int(model.body_rootid[model.geom_bodyid[geom]])
+        shape = _shape(model, data, geom, path, moves=body in said)
+        shapes.append(shape)
+        bodies.append(body if body in said else 0)
+        kind = next(kind for kind, dataclass in KINDS.items() if isinstance(shape, dataclass))
+        names[kind].append(_geom_name(model, geom))
+    sites = {model.site(i).name: data.site_xpos[i] for i in range(model.nsite)}
+    for name, where in sites.items():
+        if not np.all(np.isfinite(where)):
+            raise SceneError(f"{path}: the site '{name}' stands at no finite point; give its pos three numbers")
+    unknown = np.full(3, np.nan)
+    thrown = {body for body, motion in said.items() if motion[0][0] == "throw"}
+    stays = [shape for shape, body in zip(shapes, bodies, strict=True) if body not in thrown]
+    volume = _volume(model, data, stays, path)
+    for body, motion in said.items():
+        of = [i for i, each in enumerate(bodies) if each == body]
+        if not of:
+            raise SceneError(f"{path}: the body '{model.body(body).name}' moves and has no solid geom; give it one")
+        title = f"{path}: the body '{model.body(body).name}'"
+        parts = [shapes[i] for i in of]
+        reaches = [np.zeros(3) if isinstance(part, Planes) else _reach(part) for part in parts]
+        faces = volume if "volume" in sites else None
+        moving = set_in_motion(parts, reaches, motion, data.xpos[body], faces, title)
+        for i, shape in zip(of, moving, strict=True):
+            shapes[i] = shape
+    scene = build_scene(
+        shapes,
+        volume=volume,
+        start=sites.get("start", unknown),
+        goal=sites.get("goal", unknown),
+    )
+    return LoadedWorld(scene, {kind: tuple(members) for kind, members in names.items()}, path, "volume" in sites)
+
+
+def widened(scene: Scene, points: Mapping[str, ArrayLike], title: str) -> Scene:
+    """Returns a scene whose flight volume also holds `points`, each [3], with `VOLUME_MARGIN` around those outside.
+
+    Args:
+        scene: one world.
+        points: by what they are, for the message.
+        title: name of the world in the message.
+
+    Raises:
+        SceneError: if the volume would be longer than `LONGEST_VOLUME` along an axis.
+    """
+    lower, upper = np.asarray(scene.volume)
+    for role, point in points.items():
+        place = np.asarray(point)
+        lower = np.where(place < lower, place - VOLUME_MARGIN, lower)
+        upper = np.where(place > upper, place + VOLUME_MARGIN, upper)
+        if not np.all(upper - lower <= LONGEST_VOLUME):
+            raise SceneError(
+                f"the {role} {_point(place)} is too far from the shapes of {title}; its flight volume would be longer "
+                f"than {LONGEST_VOLUME:g} m"
+            )
+    return dataclasses.replace(scene, volume=jnp.asarray(np.stack([lower, upper]), jnp.float32))
+
+
+def check_scene(
+    scene: Scene,
+    body_radius: float,
+    *,
+    names: Mapping[str, tuple[str, ...]] | None = None,
+    title: str = "the world",
+    goal_radius: float | None = None,
+) -> None:
+    """Checks that a drone of this radius fits at the start and at the goal.
+
+    Args:
+        scene: one world.
+        body_radius: metres.
+        names: as in `LoadedWorld`, for the message.
+        title: name of the world in the message.
+        goal_radius: metres within which a drone has arrived; None if it does not matter where the start is.
+
+    Raises:
+        SceneError: if either is missing, outside the flight volume or too close to a shape, if the start is at the goal
+            already, or if the volume is empty or longer than `LONGEST_VOLUME` along an axis.
+    """
+    lower, upper = np.asarray(scene.volume)
+    if not np.all(upper > lower):
+        raise SceneError(f"the flight volume of {title}, {_point(lower)} to {_point(upper)}, is empty")
+    if not np.all(upper - lower <= LONGEST_VOLUME):
+        raise SceneError(
+            f"the flight volume of {title}, {_point(lower)} to {_point(upper)}, is longer than {LONGEST_VOLUME:g} m"
+        )
+    for role, where in (("start", scene.start), ("goal", scene.goal)):
+        point = np.asarray(where)
+        if not np.all(np.isfinite(point)):
+            raise SceneError(f'{title} does not say where its {role} is; add a site, <site name="{role}" pos="x y z"/>')
+        for axis, value, low, high in zip("xyz", point, lower, upper, strict=True):
+            if not low <= value <= high:
+                raise SceneError(
+                    f"the {role} {_point(point)} lies outside the flight volume of {title}: "
+                    f"{axis} = {value:g} is not within {low:g} to {high:g}"
+                )
+        for kind, distances in shape_distances(scene, jnp.asarray(point)).items():
+            nearest = int(np.argmin(distances))
+            distance = float(distances[nearest])
+            if distance > body_radius:
+                continue
+            known = (names or {}).get(kind, ())
+            name = f"'{known[nearest]}'" if nearest < len(known) else f"{kind}[{nearest}]"
+            if distance < 0:
+                raise SceneError(f"the {role} {_point(point)} of {title} lies inside {name}; move either")
+            raise SceneError(
+                f"the {role} {_point(point)} of {title} is {distance:.2f} m from {name}, "
+                f"closer than the drone's radius of {body_radius:g} m"
+            )
+
+    apart = float(np.linalg.norm(np.asarray(scene.goal) - np.asarray(scene.start)))
+    if goal_radius is not None and apart <= goal_radius:
+        raise SceneError(
+            f"the start {_point(np.asarray(scene.start))} of {title} is {apart:.2f} m from the goal, where a drone has "
+            f"arrived within {goal_radius:g} m; move either"
+        )
+
+
+def write_scene(scene: Scene, path: str | Path, *, title: str = "world") -> None:
+    """Writes one world as the file of `mjcf_of`."""
+    Path(path).write_text(mjcf_of(scene, title=title), encoding="utf-8")
+
+
+def mjcf_of(scene: Scene, *, title: str = "world") -> str:
+    """Returns one world as MJCF that MuJoCo opens and that loads back to the same scene.
+
+    Parked shapes are left out. A tilted shape that is upright loads back as an upright one.
+    """
+    root = ElementTree.Element("mujoco", model=title)
+    ElementTree.SubElement(root, "compiler", angle="radian")
+    visual = ElementTree.SubElement(root, "visual")
+    ElementTree.SubElement(visual, "headlight", ambient="0.35 0.35 0.35", diffuse="0.4 0.4 0.4")
+    ElementTree.SubElement(visual, "map", zfar="50")
+    lower, upper = np.asarray(scene.volume)
+    middle, half = (lower + upper) / 2, (upper - lower) / 2
+    ElementTree.SubElement(root, "statistic", center=_numbers(middle), extent=_numbers([np.max(half)]))
+    asset = ElementTree.SubElement(root, "asset")
+    ElementTree.SubElement(
+        asset, "texture", type="skybox", builtin="gradient", width="256", height="256",
+        rgb1="0.45 0.62 0.85", rgb2="0.85 0.9 0.95",
+    )  # fmt: skip
+    world = ElementTree.SubElement(root, "worldbody")
+    sun = _numbers([middle[0], middle[1], upper[2] + 50.0])
+    ElementTree.SubElement(world, "light", directional="true", pos=sun, dir="0.5 0.3 -0.8")
+    for role, where in (("start", scene.start), ("goal", scene.goal)):
+        if np.all(np.isfinite(where)):
+            colour = "0.1 0.6 1 1" if role == "start" else "0.1 0.8 0.2 1"
+            ElementTree.SubElement(world, "site", name=role, pos=_numbers(where), size="0.5", rgba=colour)
+    # Group 3 is hidden in the viewer by default.
+    ElementTree.SubElement(
+        world, "site", name="volume", type="box", group="3", pos=_numbers(middle), size=_numbers(half),
+        rgba="0.2 0.4 1 0.1",
+    )  # fmt: skip
+    counts: dict[str, int] = {}
+    custom = ElementTree.Element("custom")
+    for shape in scene_shapes(scene):
+        attributes = _attributes(shape)
+        number = counts[attributes["type"]] = counts.get(attributes["type"], 0) + 1
+        name, parent, said = f"{attributes['type']}{number}", world, text_of(shape)
+        if said is not None:
+            throw = shape.throw if isinstance(shape, Spheres) else None
+            place = shape.position if throw is None else _launch(scene, throw)
+            attributes.pop("pos")
+            parent = ElementTree.SubElement(world, "body", name=f"moving {name}", mocap="true", pos=_numbers(place))
+            ElementTree.SubElement(custom, "text", name=f"{PREFIX}moving {name}", data=said)
+        ElementTree.SubElement(parent, "geom", {"name": name, **attributes})
+    if len(custom):
+        root.append(custom)
+    ElementTree.indent(root)
+    return ElementTree.tostring(root, encoding="unicode") + "\n"
+
+
+def _launch(scene: Scene, one: Throw) -> np.ndarray:
+    """Returns where a ball is launched at a drone between the world's own start and goal, [3] metres."""
+    throw = jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], one)
+    aim = steady_aim(throw, scene.start, scene.goal)
+    return np.asarray(thrown_to(throw, aim, aim.launch[0]))[0]
+
+
+def _geom_name(model: mujoco.MjModel, geom: int) -> str:
+    kind = _kind_name(mujoco.mjtGeom(model.geom_type[geom]))
+    return model.geom(geom).name or f"geom number {geom} ({kind})"
+
+
+def _kind_name(kind: mujoco.mjtGeom) -> str:
+    return kind.name.removeprefix("mjGEOM_").lower()
+
+
+def _shape(model: mujoco.MjModel, data: mujoco.MjData, geom: int, path: Path, moves: bool) -> Shape:
+    """Returns geom `geom` as a single shape, in the world's frame; `moves` if its mocap body may."""
+    kind = mujoco.mjtGeom(model.geom_type[geom])
+    name = _geom_name(model, geom)
+    body = model.geom_bodyid[geom]
+    root = model.body_rootid[body]
+    if model.body_weldid[body] != model.body_weldid[root] or model.body_dofnum[root]:
+        raise SceneError(
+            f"{path}: geom '{name}' is on a body that can move; remove the joints of body '{model.body(body).name}', "
+            "nothing is simulated but the drone"
+        )
+    if model.body_mocapid[root] >= 0 and not moves:
+        said = f"{PREFIX}{model.body(root).name}"
+        raise SceneError(
+            f"{path}: geom '{name}' is on a body that can move; remove the mocap of body '{model.body(root).name}', or "
+            f'say how it moves: <custom><text name="{said}" data="oscillate 0 2 0 4 0"/></custom>'
+        )
+    material = model.geom_matid[geom]
+    albedo = (model.geom_rgba[geom] if material < 0 else model.mat_rgba[material])[:3]
+    position, rotation, size = data.geom_xpos[geom], data.geom_xmat[geom].reshape(3, 3), model.geom_size[geom]
+    if not all(np.all(np.isfinite(values)) for values in (position, rotation, size)):
+        raise SceneError(f"{path}: geom '{name}' has a place or a size that is not finite; give it numbers")
+    axis = rotation[:, 2]
+    upright = math.hypot(axis[0], axis[1]) < _LEVEL
+    match kind:
+        case mujoco.mjtGeom.mjGEOM_BOX:
+            return _box(position, rotation, size, albedo)
+        case mujoco.mjtGeom.mjGEOM_SPHERE:
+            return Spheres(position=position, radius=size[0], albedo=albedo)
+        case mujoco.mjtGeom.mjGEOM_CAPSULE:
+            return Capsules(position=position, axis=axis, half_length=size[1], radius=size[0], albedo=albedo)
+        case mujoco.mjtGeom.mjGEOM_CYLINDER if upright:
+            return UprightCylinders(position=position, radius=size[0], half_height=size[1], albedo=albedo)
+        case mujoco.mjtGeom.mjGEOM_CYLINDER:
+            return TiltedCylinders(position=position, axis=axis, half_length=size[1], radius=size[0], albedo=albedo)
+        case mujoco.mjtGeom.mjGEOM_PLANE:
+            return Planes(position=position, normal=axis, albedo=albedo)
+    raise SceneError(
+        f"{path}: geom '{name}' is of the unsupported kind {_kind_name(kind)}; use boxes, "
+        "spheres, capsules, cylinders or planes, or hide it in group 3 with contype and conaffinity 0"
+    )
+
+
+def _box(position: np.ndarray, rotation: np.ndarray, size: np.ndarray, albedo: np.ndarray) -> Shape:
+    """Returns an upright box if any of its axes is vertical, else a tilted one."""
+    for vertical in (2, 0, 1):
+        if math.hypot(rotation[0, vertical], rotation[1, vertical]) < _LEVEL:
+            across, deep = ((0, 1), (1, 2), (0, 2))[(2, 0, 1).index(vertical)]
+            yaw = math.atan2(rotation[1, across], rotation[0, across])
+            half = size[[across, deep, vertical]]
+            return UprightBoxes(position=position, half=half, yaw=yaw, albedo=albedo)  # type: ignore[arg-type]
+    return TiltedBoxes(position=position, half=size, rotation=rotation, albedo=albedo)  # type: ignore[arg-type]
+
+
+def _volume(model: mujoco.MjModel, data: mujoco.MjData, shapes: list[Shape], path: Path) -> np.ndarray:
+    for i in range(model.nsite):
+        if model.site(i).name == "volume":
+            turned = np.abs(data.site_xmat[i].reshape(3, 3) - np.eye(3)).max() > _LEVEL
+            if model.site_type[i] != mujoco.mjtGeom.mjGEOM_BOX or turned:
+                raise SceneError(f"{path}: the site 'volume' must be a box that is not rotated")
+            return data.site_xpos[i] + np.array([[-1.0], [1.0]]) * model.site_size[i]
+    corners = [data.site_xpos[i] for i in range(model.nsite)]
+    floors = []
+    for shape in shapes:
+        if isinstance(shape, Planes):
+            if shape.normal[2] > 1 - _LEVEL:
+                floors.append(shape.position[2])
+            continue
+        reach = _reach(shape)
+        corners += [shape.position - reach, shape.position + reach]
+    if not corners:
+        raise SceneError(f"{path}: the size of the world is unknown; add a box site named 'volume'")
+    lower, upper = np.min(corners, axis=0) - VOLUME_MARGIN, np.max(corners, axis=0) + VOLUME_MARGIN
+    if floors:
+        lower[2] = max(lower[2], max(floors))
+    return np.stack([lower, upper])
+
+
+def _reach(shape: Shape) -> np.ndarray:
+    """Returns the half extents [3] of the axis-aligned box around a shape."""
+    match shape:
+        case UprightBoxes():
+            c, s = abs(math.cos(shape.yaw)), abs(math.sin(shape.yaw))
+            x, y, z = shape.half
+            return np.array([c * x + s * y, s * x + c * y, z])
+        case TiltedBoxes():
+            return np.asarray(np.abs(shape.rotation) @ shape.half)
+        case UprightCylinders():
+            return np.array([shape.radius, shape.radius, shape.half_height])
+        case Spheres():
+            return np.full(3, shape.radius)
+        case Capsules():
+            return np.asarray(np.abs(shape.axis) * shape.half_length + shape.radius)
+        case TiltedCylinders():
+            across = np.sqrt(np.maximum(1.0 - np.asarray(shape.axis) ** 2, 0.0))
+            return np.asarray(np.abs(shape.axis) * shape.half_length + across * shape.radius)
+    raise TypeError(f"a {type(shape).__name__} has no finite extent")
+
+
+def _attributes(shape: Shape) -> dict[str, str]:
+    """Returns the MJCF attributes of a geom."""
+    common = {"pos": _numbers(shape.position), "rgba": _numbers([*np.asarray(shape.albedo), 1.0])}
+    match shape:
+        case UprightBoxes():
+            own = {"type": "box", "size": _numbers(shape.half), "euler": _numbers([0.0, 0.0, shape.yaw])}
+        case TiltedBoxes():
+            quaternion = np.empty(4)
+            mujoco.mju_mat2Quat(quaternion, np.asarray(shape.rotation, np.float64).ravel())
+            own = {"type": "box", "size": _numbers(shape.half), "quat": _numbers(quaternion)}
+        case UprightCylinders():
+            own = {"type": "cylinder", "size": _numbers([shape.radius, shape.half_height])}
+        case TiltedCylinders():
+            size = _numbers([shape.radius, shape.half_length])
+            own = {"type": "cylinder", "size": size, "zaxis": _numbers(shape.axis)}
+        case Capsules():
+            size = _numbers([shape.radius, shape.half_length])
+            own = {"type": "capsule", "size": size, "zaxis": _numbers(shape.axis)}
+        case Spheres():
+            own = {"type": "sphere", "size": _numbers([shape.radius])}
+        case Planes():
+            own = {"type": "plane", "size": "0 0 1", "zaxis": _numbers(shape.normal)}
+    return {**own, **common}
+
+
+def _numbers(values: object) -> str:
+    """Formats numbers with enough digits to restore a float32."""
+    return " ".join(f"{float(value):.9g}" for value in np.asarray(values).ravel())
+
+
+def _point(point: np.ndarray) -> str:
+    return "(" + ", ".join(f"{value:g}" for value in point) + ")"

@@ -1,0 +1,397 @@
+"""A world as padded arrays, one per kind of shape, and its signed distance.
+
+The same arrays are what the drone collides with and what the camera sees. Every kind has a static
+capacity; unused entries are parked `PARKED` metres away with zero size, so that no ray
+meets them, they affect no distance, and no code needs a mask.
+
+Shapes may move (`motion.py`): their `position` is that at time 0, and `scene_at` is the world at another time, in
+which nothing moves any more. What does not ask for a time sees the world at time 0. A kind without motion has None in
+place of the arrays.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from typing import Any, TypeVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import numpy.typing as npt
+from flax import struct
+from jax import Array
+from jax.typing import ArrayLike
+
+from edqn_jax.sim.scene.motion import (
+    OUTSIDE_M,
+    Aim,
+    Flown,
+    Motion,
+    Throw,
+    at_rest,
+    displacement,
+    flown_to,
+    in_flight,
+    not_thrown,
+    steady_aim,
+    throw_speeds,
+    thrown_to,
+    top_speeds,
+)
+
+PARKED = 1e6
+"""Coordinate of absent shapes, metres along each axis."""
+
+DRONE_RGB = (0.08, 0.08, 0.1)
+"""Reflectance of other drones: dark, as airframes of carbon fibre are."""
+
+
+@struct.dataclass
+class UprightBoxes:
+    """Boxes rotated about the vertical only. N is the capacity."""
+
+    position: Array  # [N, 3] centre, metres
+    half: Array  # [N, 3] half extents, metres
+    yaw: Array  # [N] rotation about world z, radians
+    albedo: Array  # [N, 3] RGB reflectance in [0, 1]
+    motion: Motion | None = None
+
+
+@struct.dataclass
+class UprightCylinders:
+    """Cylinders whose axis is world z."""
+
+    position: Array  # [N, 3] centre, metres
+    radius: Array  # [N] metres
+    half_height: Array  # [N] metres
+    albedo: Array  # [N, 3]
+    motion: Motion | None = None
+
+
+@struct.dataclass
+class Spheres:
+    position: Array  # [N, 3] centre, metres
+    radius: Array  # [N] metres
+    albedo: Array  # [N, 3]
+    motion: Motion | None = None
+    throw: Throw | None = None
+
+
+@struct.dataclass
+class TiltedBoxes:
+    """Boxes at any rotation."""
+
+    position: Array  # [N, 3] centre, metres
+    half: Array  # [N, 3] half extents, metres
+    rotation: Array  # [N, 3, 3] body-to-world; columns are the box's axes
+    albedo: Array  # [N, 3]
+    motion: Motion | None = None
+
+
+@struct.dataclass
+class Capsules:
+    position: Array  # [N, 3] centre, metres
+    axis: Array  # [N, 3] unit direction
+    half_length: Array  # [N] metres, of the straight part
+    radius: Array  # [N] metres
+    albedo: Array  # [N, 3]
+    motion: Motion | None = None
+
+
+@struct.dataclass
+class TiltedCylinders:
+    """Cylinders with any axis."""
+
+    position: Array  # [N, 3] centre, metres
+    axis: Array  # [N, 3] unit direction
+    half_length: Array  # [N] metres
+    radius: Array  # [N] metres
+    albedo: Array  # [N, 3]
+    motion: Motion | None = None
+
+
+@struct.dataclass
+class Planes:
+    """Half-spaces: solid below the plane, free on the side that the normal points to."""
+
+    position: Array  # [N, 3] any point of the plane, metres
+    normal: Array  # [N, 3] unit
+    albedo: Array  # [N, 3]
+
+
+@struct.dataclass
+class Scene:
+    """One world. A pool of worlds is the same dataclass with a leading axis on every array."""
+
+    boxes: UprightBoxes
+    cylinders: UprightCylinders
+    spheres: Spheres
+    tilted_boxes: TiltedBoxes
+    capsules: Capsules
+    tilted_cylinders: TiltedCylinders
+    planes: Planes
+    volume: Array  # [2, 3] lower and upper corner of the flight volume, metres
+    start: Array  # [3] metres
+    goal: Array  # [3] metres
+    drones: Flown | None = None  # the others of a group, within one decision; in no pool of worlds
+    aim: Aim | None = None  # of balls at the drone that flies; in no pool of worlds
+
+
+Shape = UprightBoxes | UprightCylinders | Spheres | TiltedBoxes | Capsules | TiltedCylinders | Planes
+"""One shape: a kind's dataclass whose fields lack the leading axis."""
+
+KINDS: dict[str, type[Shape]] = {
+    "boxes": UprightBoxes,
+    "cylinders": UprightCylinders,
+    "spheres": Spheres,
+    "tilted_boxes": TiltedBoxes,
+    "capsules": Capsules,
+    "tilted_cylinders": TiltedCylinders,
+    "planes": Planes,
+}
+"""The kinds of shape by the name of their field in `Scene`."""
+
+S = TypeVar("S", bound=Shape)
+
+_MOVING = {"motion": at_rest, "throw": not_thrown}
+"""The fields of a kind that are None where nothing moves, and what stands for a shape that does not."""
+
+
+def moves(scene: Scene) -> bool:
+    """Returns whether any kind of shape has motion. Static: known when a program is traced."""
+    return scene.drones is not None or any(_moves(getattr(scene, kind)) for kind in KINDS)
+
+
+def _moves(shapes: Shape) -> bool:
+    return getattr(shapes, "motion", None) is not None or getattr(shapes, "throw", None) is not None
+
+
+def scene_at(scene: Scene, time: Array | None) -> Scene:
+    """Returns the world as it stands at `time` [] seconds of the episode, without motion; a still world is returned.
+
+    The one place where shapes move: the camera and the collisions both see what it returns.
+
+    Args:
+        scene: one world; balls fly as its `aim` says, without one as `steady_aim`.
+        time: None is time 0, before anything is thrown.
+    """
+    moving = [kind for kind in KINDS if _moves(getattr(scene, kind))]
+    there = {kind: _standing(scene, getattr(scene, kind), time) for kind in moving}
+    now = dataclasses.replace(scene, **there, aim=None)
+    if scene.drones is None:
+        return now
+    return with_drones(now, flown_to(scene.drones, scene.drones.began if time is None else time), scene.drones.radius)
+
+
+def with_drones(scene: Scene, position: Array, radius: Array) -> Scene:
+    """Returns a world that stands, with K drones in it: spheres at `position` [K, 3] of `radius` [K], metres."""
+    drones = Spheres(position, radius, jnp.broadcast_to(jnp.asarray(DRONE_RGB), position.shape))
+    spheres = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), scene.spheres, drones)
+    return dataclasses.replace(scene, spheres=spheres, drones=None)
+
+
+def _standing(scene: Scene, shapes: Any, time: Array | None) -> Any:
+    """Returns the shapes of one kind where they stand at a time."""
+    place = shapes.position
+    if shapes.motion is not None and time is not None:
+        place = place + displacement(shapes.motion, place, time)
+    if not isinstance(shapes, Spheres):
+        return dataclasses.replace(shapes, position=place, motion=None)
+    if shapes.throw is not None and time is not None:
+        aim = aim_of(scene, shapes.throw)
+        ball = thrown_to(shapes.throw, aim, time)
+        beyond = (shapes.radius + OUTSIDE_M)[:, None]
+        outside = jnp.any((ball < scene.volume[0][None] - beyond) | (ball > scene.volume[1][None] + beyond), axis=1)
+        place = jnp.where(in_flight(shapes.throw, aim, time, outside)[:, None], ball, place)
+    return dataclasses.replace(shapes, position=place, motion=None, throw=None)
+
+
+def aim_of(scene: Scene, throw: Throw) -> Aim:
+    """Returns at what the balls of one world are thrown."""
+    return steady_aim(throw, scene.start, scene.goal) if scene.aim is None else scene.aim
+
+
+def speeds(scene: Scene, time: Array) -> dict[str, Array]:
+    """Returns a bound [N] m/s of the speed of every shape at `time` [] seconds, of the kinds that move.
+
+    Between two times no shape moves further than at the mean of its bounds there, but for a ball that is launched in
+    between, which is then `LEAST_LAUNCH_M` away. Other drones are not among them.
+    """
+    shapes = {kind: getattr(scene, kind) for kind in KINDS}
+    bounds = {kind: top_speeds(each.motion) for kind, each in shapes.items() if getattr(each, "motion", None)}
+    throw = scene.spheres.throw
+    if throw is not None:
+        bounds["spheres"] = bounds.get("spheres", 0.0) + throw_speeds(throw, aim_of(scene, throw), time)
+    return bounds
+
+
+# ----------------------------------------------------------------------- building, pools of worlds
+
+
+def parked_shape(kind: type[S]) -> S:
+    """Returns one absent shape of the kind (its dataclass): parked far away, with zero size."""
+    names = [field.name for field in dataclasses.fields(kind) if field.name not in _MOVING]
+    values: dict[str, Any] = {name: np.float32(0.0) for name in names} | {
+        "position": np.array([0.0, 0.0, -PARKED]) if "normal" in names else np.full(3, PARKED),
+        "half": np.zeros(3),
+        "rotation": np.eye(3),
+        "axis": np.array([0.0, 0.0, 1.0]),
+        "normal": np.array([0.0, 0.0, 1.0]),
+        "albedo": np.full(3, 0.5),
+    }
+    return kind(**{name: values[name] for name in names})
+
+
+def parked_like(shapes: S) -> S:
+    """Returns one absent shape of the kind of `shapes`, which stands still where they have arrays of motion."""
+    rest = {name: still() for name, still in _MOVING.items() if getattr(shapes, name, None) is not None}
+    return dataclasses.replace(parked_shape(type(shapes)), **rest)
+
+
+def no_shapes(kind: type[S]) -> S:
+    """Returns the kind's dataclass with capacity 0."""
+    return jax.tree.map(lambda leaf: jnp.zeros((0, *np.shape(leaf)), jnp.float32), parked_shape(kind))
+
+
+def build_scene(
+    shapes: Sequence[Shape],
+    *,
+    volume: npt.ArrayLike,
+    start: npt.ArrayLike,
+    goal: npt.ArrayLike,
+    capacities: Mapping[str, int] | None = None,
+) -> Scene:
+    """Returns a scene from a list of single shapes, on the host.
+
+    Args:
+        shapes: of any kinds in any order; within a kind the order is kept.
+        volume: [2, 3] lower and upper corner, metres.
+        start: [3] metres.
+        goal: [3] metres.
+        capacities: by the name of the kind's field in `Scene`; the default is the number of its shapes.
+
+    Raises:
+        ValueError: if a kind has more shapes than its capacity.
+    """
+    fields = {}
+    for kind, dataclass in KINDS.items():
+        members = [shape for shape in shapes if isinstance(shape, dataclass)]
+        capacity = (capacities or {}).get(kind, len(members))
+        if len(members) > capacity:
+            raise ValueError(
+                f"{len(members)} {kind} exceed the capacity of {capacity}; it must be at least their number"
+            )
+        members += [parked_shape(dataclass)] * (capacity - len(members))
+        if not members:
+            fields[kind] = no_shapes(dataclass)
+            continue
+        fields[kind] = dataclass(
+            **{field.name: _stacked(members, field.name) for field in dataclasses.fields(dataclass)}
+        )
+    return Scene(
+        **fields,
+        volume=jnp.asarray(volume, jnp.float32),
+        start=jnp.asarray(start, jnp.float32),
+        goal=jnp.asarray(goal, jnp.float32),
+    )
+
+
+def _stacked(members: Sequence[Any], name: str) -> Any:
+    """Returns one field of single shapes as arrays [N, ...]; None where none of them moves in this manner."""
+    values = [getattr(member, name) for member in members]
+    if name not in _MOVING:
+        # jax.tree would treat a position given as a list as a subtree, so fields are stacked by name.
+        return jnp.asarray(np.stack(values), jnp.float32)
+    if all(value is None for value in values):
+        return None
+    rest = _MOVING[name]()
+    whole = [rest if value is None else value for value in values]
+    return type(rest)(**{field.name: _stacked(whole, field.name) for field in dataclasses.fields(rest)})
+
+
+def scene_shapes(scene: Scene) -> list[Shape]:
+    """Returns the shapes of one world that are not parked, kind by kind, as single shapes on the host.
+
+    Balls yet to be thrown are among them, parked; shapes that stand still have no motion.
+    """
+    shapes: list[Shape] = []
+    for kind in KINDS:
+        arrays = jax.tree.map(np.asarray, getattr(scene, kind))
+        present = np.all(np.abs(arrays.position) < PARKED / 2, axis=-1)
+        if getattr(arrays, "throw", None) is not None:
+            present |= arrays.throw.early > 0
+        for i in np.flatnonzero(present):
+            shapes.append(_without_rest(jax.tree.map(lambda leaf, i=i: leaf[i], arrays)))
+    return shapes
+
+
+def _without_rest(shape: Shape) -> Shape:
+    """Returns a single shape with None in place of a motion or a throw that moves nothing."""
+    motion, throw = getattr(shape, "motion", None), getattr(shape, "throw", None)
+    if motion is not None and not np.any(motion.velocity) and not (np.any(motion.swing) and motion.rate):
+        shape = dataclasses.replace(shape, motion=None)
+    if throw is not None and not throw.early:
+        shape = dataclasses.replace(shape, throw=None)
+    return shape
+
+
+def obstacle_count(scene: Scene) -> int:
+    """Returns the number of shapes in one world without ground and other planes. On the host."""
+    return sum(not isinstance(shape, Planes) for shape in scene_shapes(scene))
+
+
+def stack_scenes(scenes: Sequence[Scene]) -> Scene:
+    """Returns a pool of worlds: the scenes with a leading axis, each kind padded to its largest capacity.
+
+    Where a kind moves in any of the worlds, it has arrays of motion in all.
+    """
+    capacities = {kind: max(getattr(s, kind).position.shape[0] for s in scenes) for kind in KINDS}
+    padded = [
+        build_scene(scene_shapes(s), volume=s.volume, start=s.start, goal=s.goal, capacities=capacities) for s in scenes
+    ]
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *[_able_to_move(s, padded) for s in padded])
+
+
+def _able_to_move(scene: Any, others: Sequence[Any]) -> Any:
+    """Returns a world, or a pool, with arrays of motion wherever any of the others has some."""
+
+    def filled(shapes: Any, kind: str) -> Any:
+        absent = [
+            name
+            for name in _MOVING
+            if getattr(shapes, name, 0) is None and any(getattr(getattr(o, kind), name) is not None for o in others)
+        ]
+        return dataclasses.replace(shapes, **{name: _MOVING[name](*shapes.position.shape[:-1]) for name in absent})
+
+    return dataclasses.replace(scene, **{kind: filled(getattr(scene, kind), kind) for kind in KINDS})
+
+
+def with_equal_capacities(pools: Sequence[Scene], like: Sequence[Any] = ()) -> list[Scene]:
+    """Returns the pools, every kind of shape padded to its largest capacity in any of them. On the host.
+
+    Where a kind moves in any of them, it has arrays of motion in all.
+
+    Args:
+        pools: of worlds.
+        like: more pools whose capacities count, or the shapes of their arrays.
+    """
+
+    def padded(kind: str, pool: Scene) -> Shape:
+        shapes = getattr(pool, kind)
+        worlds, capacity = shapes.position.shape[:2]
+        missing = max(getattr(other, kind).position.shape[1] for other in (*pools, *like)) - capacity
+
+        def joined(here: Array, absent: npt.ArrayLike) -> Array:
+            more = np.broadcast_to(np.asarray(absent, np.float32), (worlds, missing, *np.shape(absent)))
+            return jnp.asarray(np.concatenate([np.asarray(here), more], axis=1))
+
+        return jax.tree.map(joined, shapes, parked_like(shapes))
+
+    able = [_able_to_move(pool, [*pools, *like]) for pool in pools]
+    return [dataclasses.replace(pool, **{kind: padded(kind, pool) for kind in KINDS}) for pool in able]
+
+
+def take_scene(pool: Scene, index: ArrayLike) -> Scene:
+    """Returns world `index` [] of a pool."""
+    return jax.tree.map(lambda leaf: leaf[index], pool)

@@ -1,0 +1,1 @@
+"""Events and other observations from pictures."""

@@ -1,0 +1,1 @@
+"""Missions, outcome, reward and observation: the environment as pure functions."""

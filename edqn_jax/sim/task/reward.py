@@ -1,0 +1,62 @@
+"""Reward of a decision: Eq. 8 of the paper, its shaped forms, and reward functions of users."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import jax.numpy as jnp
+from flax import struct
+from jax import Array
+
+from edqn_jax.config import EnvConfig
+from edqn_jax.sim.task.outcomes import Outcome, is_terminal
+
+
+@struct.dataclass
+class Transition:
+    """One decision of one drone: the argument of a user's reward function."""
+
+    before: Array  # [3] metres, position when it was taken
+    after: Array  # [3] metres, position 0.26 s later
+    goal: Array  # [3] metres
+    clearance: Array  # [] metres between the body's sphere and the nearest shape afterwards; negative inside one
+    move: Array  # [] int32, 0..26, see `sim.actions`; as chosen, also where `env.action_delay` flies it later
+    outcome: Array  # [] int32, an `Outcome`
+    configured: Array  # [] the reward that the configuration asks for
+
+
+Reward = Callable[[Transition], Array]
+"""A user's reward: one decision of one drone to a float32 []; it is traced by JAX and mapped over environments."""
+
+
+def configured_reward(
+    config: EnvConfig,
+    discount: float,
+    outcome: Array,
+    before: Array,
+    after: Array,
+    flown: Array | float = 0.0,
+) -> Array:
+    """Returns the configured reward [] of one decision.
+
+    `sparse` is Eq. 8. `progress` adds the metres gained towards the goal, times a weight, and
+    subtracts a weight for each metre flown; `geodesic` is the same with distances around obstacles. `potential` adds
+    gamma * Phi(s') - Phi(s) with Phi = -weight * distance, and Phi = 0 at terminal states: the form that leaves the
+    optimal policy unchanged (Ng et al. 1999).
+
+    Args:
+        before, after: [] distances to the goal, metres; straight, or along the shortest way (`geodesic`).
+        flown: [] metres flown.
+    """
+    at_end = jnp.select(
+        [outcome == Outcome.GOAL, outcome == Outcome.COLLISION, outcome == Outcome.LEFT_VOLUME],
+        [config.goal_reward, config.collision_reward, config.left_volume_reward],
+        0.0,
+    )
+    total = at_end + config.step_reward
+    if config.reward in ("progress", "geodesic"):
+        total = total + config.progress_weight * (before - after) - config.path_weight * flown
+    elif config.reward == "potential":
+        terminal = is_terminal(outcome)
+        total = total + config.progress_weight * (before - jnp.where(terminal, 0.0, discount * after))
+    return jnp.where(outcome == Outcome.DIVERGED, 0.0, total)

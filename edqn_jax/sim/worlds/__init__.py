@@ -1,0 +1,1 @@
+"""Random worlds of every family, free points in them and ways through them."""

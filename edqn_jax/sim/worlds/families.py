@@ -1,0 +1,174 @@
+"""Random worlds of every family, and their seeds."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+from typing import Literal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array, lax
+from jax.typing import ArrayLike
+
+from edqn_jax.config import FAMILIES, MIXTURES
+from edqn_jax.config.loading import nearest
+from edqn_jax.errors import ConfigError
+from edqn_jax.keys import FAMILY_OF_WORLD, MOTION_OF_WORLD, RANDOM_WORLDS, integers
+from edqn_jax.sim.scene.scene import Scene, take_scene, with_equal_capacities
+from edqn_jax.sim.worlds import canyon, forest, open_worlds, rooms
+from edqn_jax.sim.worlds.moving import MOVING_SHARE, STILL, Bodies, Moving, in_motion
+from edqn_jax.sim.worlds.reachability import has_way
+
+RADIUS_M = 0.36
+"""Of the sphere that has a way in every random world; the drone's."""
+
+_AT_ONCE = 64  # worlds that are drawn by one call
+
+# ------------------------------------------------------------------------------------------- seeds
+
+Split = Literal["training", "validation", "test"]
+SPLITS: dict[Split, int] = {"training": 0, "validation": 1, "test": 2}
+"""The three ranges of random worlds. They are disjoint by construction: a world's key is the fixed root
+folded with its split's number, then with its index in the split."""
+
+
+def world_key(split: Split, index: ArrayLike) -> Array:
+    """Returns the key [] of world `index` (any non-negative integer) of a split."""
+    return jax.random.fold_in(jax.random.fold_in(jax.random.key(RANDOM_WORLDS), SPLITS[split]), index)
+
+
+def world_keys(split: Split, count: int, first: int = 0) -> Array:
+    """Returns the keys [count] of worlds `first`, `first + 1`, ... of a split."""
+    return jax.vmap(partial(world_key, split))(first + jnp.arange(count))
+
+
+# ------------------------------------------------------------------------------------------- worlds
+
+
+@dataclasses.dataclass(frozen=True)
+class _Family:
+    """How a family's worlds are drawn."""
+
+    draw: Callable[[Array], Scene]
+    size: tuple[float, float, float]
+    """Of the volume at most, metres."""
+    edge_m: float | None
+    """Of the lattice on which each world is checked for a way; None where no check could ever fail."""
+    bodies: Bodies
+    """What can move."""
+
+
+_FAMILIES = {
+    **{
+        density: _Family(partial(open_worlds.draw, density), open_worlds.SIZE, None, open_worlds.bodies(density))
+        for density in open_worlds.SHAPES
+    },
+    "rooms": _Family(rooms.draw, (rooms.SIDE, rooms.SIDE, rooms.HEIGHT[1]), 0.5, {}),  # walls stand
+    "forest": _Family(forest.draw, forest.SIZE, 0.5, forest.BODIES),
+    "canyon": _Family(canyon.draw, canyon.SIZE, 0.7, canyon.BODIES),
+}
+
+
+def random_scene(family: str, key: Array, moving: Moving = STILL) -> Scene:
+    """Returns a random world with a start, a goal, and a way between them for a sphere of `RADIUS_M`.
+
+    What moves does so on top of the world that the key gives without it, and the way is one at time 0.
+
+    Args:
+        family: of `FAMILIES`; a world of a mixture is of one of its families.
+        key: consumed.
+        moving: what moves.
+
+    Raises:
+        ConfigError: if there is no such family.
+    """
+    family, moving = _checked(family, moving)
+    if family in MIXTURES:
+        family = families_of(family, key[None])[0]
+    return take_scene(_drawn(family, key[None], moving), 0)
+
+
+def random_pool(family: str, keys: Array, moving: Moving = STILL) -> Scene:
+    """Returns a pool of random worlds, one for each of `keys` [P]; see `random_scene`."""
+    family, moving = _checked(family, moving)
+    if family not in MIXTURES:
+        return _in_batches(family, moving, keys)
+    names = np.array(families_of(family, keys))
+    present = [(str(name), np.flatnonzero(names == name)) for name in np.unique(names)]
+    # Padded for all families of the mixture, also for one that none of these worlds is of.
+    shapes = [jax.eval_shape(partial(_unchecked, name, moving), keys) for name in MIXTURES[family]]
+    pools = with_equal_capacities([_in_batches(name, moving, keys[which]) for name, which in present], shapes)
+    order = np.argsort(np.concatenate([which for _, which in present]))
+    return jax.tree.map(lambda *leaves: jnp.asarray(np.concatenate(leaves)[order]), *pools)
+
+
+def _checked(family: str, moving: Moving) -> tuple[str, Moving]:
+    """Returns a family that is drawn, and what moves in it: the worlds `moving` are medium ones."""
+    if family not in FAMILIES:
+        raise ConfigError(f"there are no random worlds '{family}'{nearest(family, FAMILIES)}")
+    if family == "moving":
+        return "medium", dataclasses.replace(moving, share=moving.share or MOVING_SHARE)
+    return family, moving
+
+
+def families_of(mixture: str, keys: Array) -> list[str]:
+    """Returns the family of each world of a mixture, from the worlds' keys [P]."""
+    families = [family for family, share in MIXTURES[mixture].items() for _ in range(share)]
+    numbers = jax.vmap(lambda key: integers(jax.random.fold_in(key, FAMILY_OF_WORLD), (), len(families)))(keys)
+    return [families[number] for number in np.asarray(numbers)]
+
+
+def _in_batches(family: str, moving: Moving, keys: Array) -> Scene:
+    """Returns a pool of one family, drawn in batches of one size, so that one program draws pools of every size."""
+    count = keys.shape[0]
+    if count <= 1:
+        return _drawn(family, keys, moving)
+    # As data: the first key is used once more to fill the last batch.
+    data = np.asarray(jax.random.key_data(keys))
+    data = np.concatenate([data, np.broadcast_to(data[:1], (-count % _AT_ONCE, *data.shape[1:]))])
+    batches = [jax.random.wrap_key_data(jnp.asarray(data[i : i + _AT_ONCE])) for i in range(0, count, _AT_ONCE)]
+    # XLA uses one core for a batch.
+    with ThreadPoolExecutor(thread_name_prefix="drawing") as pool:
+        drawn = list(pool.map(partial(_drawn, family, moving=moving), batches))
+    return jax.tree.map(lambda *leaves: jnp.concatenate(leaves)[:count], *drawn)
+
+
+@partial(jax.jit, static_argnums=(0, 2), static_argnames="moving")
+def _drawn(family: str, keys: Array, moving: Moving = STILL) -> Scene:
+    """Returns worlds of one family, one for each key [P]."""
+    return _set_in_motion(family, moving, _standing(family, keys), keys)
+
+
+def _unchecked(family: str, moving: Moving, keys: Array) -> Scene:
+    """Returns what `_drawn` returns, but for worlds without a way, which are kept."""
+    return _set_in_motion(family, moving, jax.vmap(_FAMILIES[family].draw)(keys), keys)
+
+
+def _set_in_motion(family: str, moving: Moving, scenes: Scene, keys: Array) -> Scene:
+    bodies = _FAMILIES[family].bodies
+    if not moving.balls and not (moving.share and bodies):
+        return scenes
+    return jax.vmap(lambda scene, key: in_motion(scene, moving, bodies, jax.random.fold_in(key, MOTION_OF_WORLD)))(
+        scenes, keys
+    )
+
+
+def _standing(family: str, keys: Array) -> Scene:
+    """Returns worlds in which nothing moves; one without a way is drawn again with another key."""
+    how, edge = _FAMILIES[family], _FAMILIES[family].edge_m
+    if edge is None:
+        return jax.vmap(how.draw)(keys)
+
+    def drawn(key: Array) -> Scene:
+        def attempt(number: Array) -> tuple[Array, Scene, Array]:
+            scene = how.draw(jax.random.fold_in(key, number))
+            return number, scene, has_way(scene, how.size, RADIUS_M, edge)
+
+        first = attempt(jnp.zeros((), jnp.int32))
+        return lax.while_loop(lambda state: ~state[2], lambda state: attempt(state[0] + 1), first)[1]
+
+    return jax.vmap(drawn)(keys)

@@ -1,0 +1,185 @@
+"""Preparing a run: devices, missions, programs, the first state."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import Executor, Future, ThreadPoolExecutor
+from typing import Any, Protocol
+
+import jax
+import numpy as np
+from jax.sharding import Mesh
+
+from edqn_jax.config import Config
+from edqn_jax.config.limits import validate
+from edqn_jax.devices import processes
+from edqn_jax.devices.devices import choose_devices
+from edqn_jax.devices.forks import check_not_forked
+from edqn_jax.devices.jax_settings import keep_tested_settings
+from edqn_jax.devices.memory import check_fits
+from edqn_jax.errors import ConfigError
+from edqn_jax.evaluation import rollouts
+from edqn_jax.evaluation.missions import MissionSet, missions_of_runs
+from edqn_jax.keys import run_streams
+from edqn_jax.learn.policy import PolicyParams, fresh_policy
+from edqn_jax.learn.trainer import Trainer, TrainState
+from edqn_jax.planning.astar import Path as ShortestPath
+from edqn_jax.planning.astar import shortest_path
+from edqn_jax.sim.task.env import World
+from edqn_jax.sim.task.flights import Flights
+from edqn_jax.sim.task.reward import Reward
+from edqn_jax.sim.worlds import geodesic
+
+
+class Display(Protocol):
+    """Interface of a progress display."""
+
+    def phase(self, name: str, *, total: int = 0, done: int = 0) -> None:
+        """Shows that the phase `name` begins; if it is training, with the decisions in all and those taken before."""
+
+    def update(self, metrics: dict[str, Any]) -> None:
+        """Shows the metrics of a chunk."""
+
+
+class Silent:
+    """Shows nothing."""
+
+    def phase(self, name: str, *, total: int = 0, done: int = 0) -> None:
+        pass
+
+    def update(self, metrics: dict[str, Any]) -> None:
+        pass
+
+
+class Preparation:
+    """Devices, missions, programs and the first state of a run; made by `prepared`."""
+
+    def __init__(
+        self, config: Config, reward: Reward | None, display: Display, pool: Executor, agents: int | None
+    ) -> None:
+        """Compiles in the background while the shortest path is searched.
+
+        Programs are traced one after the other: several threads of Python would only wait for one another.
+
+        Raises:
+            ConfigError: if the configuration is invalid, the world cannot be flown, or memory is too small.
+        """
+        config = config_for_reward(config, reward)
+        self.configs = _of_agents(config, agents)
+        for each in self.configs:
+            validate(each)
+        self.config, self.display, self.pool, self.began = config, display, pool, time.perf_counter()
+        display.phase("preparing worlds")
+        self.devices = choose_devices(1 if config.train.debug else config.train.devices, config.train.shards)
+        # A world's file may be missing on one host.
+        self.missions = processes.together(lambda: missions_of_runs(self.configs, reward))
+        worlds = [missions.training.world for missions in self.missions]
+        if config.env.reward == "geodesic":  # agents that train together share their worlds
+            distances = geodesic.fields(worlds[0].pool, config.drone.body_radius_m)
+            worlds = [dataclasses.replace(world, distances=distances) for world in worlds]
+        self.trainer = Trainer(config, worlds[0] if agents is None else worlds, self.devices)
+        check_fits(self.trainer.shapes(), [each for each in self.devices if each in jax.local_devices()])
+        self.mesh = Mesh(np.asarray(self.devices), ("mission",))
+        display.phase("compiling")
+        began = time.perf_counter()
+        self.trainer.trace()
+        self._compiled = _in_background(pool, self.trainer.compile, began)
+        placed = self._placed(self.missions[0].validation, fresh_policy(self.config), 0)
+        flights = rollouts.traced(self.config, *placed, record=True, mesh=self.mesh)
+        self._rollouts_compiled = _in_background(pool, flights.compile, began)
+        self._first: TrainState | None = None
+        self.shortest = processes.together(self._shortest)
+
+    def ready(self, begins: bool) -> float:
+        """Waits until training can go on, and returns the seconds that its program took.
+
+        Meanwhile makes the first state, unless the run is continued.
+        """
+        if begins and self._first is None:
+            seeds = [config.train.seed for config in self.configs]
+            self._first = self.trainer.init(seeds[0] if self.trainer.agents is None else seeds)
+        return self._compiled.result()
+
+    def take_first(self) -> TrainState:
+        """Returns the state before the first step, which is not kept: it will be donated."""
+        self.ready(True)
+        state, self._first = self._first, None
+        assert state is not None
+        return state
+
+    def fly(self, missions: MissionSet, params: PolicyParams, agent: int = 0) -> Flights:
+        """Returns the missions, flown greedily and recorded; sensor noise is the same each time."""
+        self._rollouts_compiled.result()
+        placed = self._placed(missions, params, agent)
+        return processes.fetch(rollouts.fly_missions(self.config, *placed, record=True, mesh=self.mesh))
+
+    def _shortest(self) -> ShortestPath:
+        scene = self.missions[0].scene
+        return shortest_path(scene, scene.start, scene.goal, self.config.drone.body_radius_m)
+
+    def _placed(self, missions: MissionSet, params: PolicyParams, agent: int) -> tuple[World, PolicyParams, jax.Array]:
+        """World, parameters and key as `fly_missions` takes them."""
+        key = run_streams(self.configs[agent].train.seed).flights
+        return *processes.replicate((missions.world, params), self.mesh), key
+
+
+def config_for_reward(config: Config, reward: Reward | None) -> Config:
+    """Returns the configuration that a run with a reward of one's own has: the reward may prefer a direction."""
+    if reward is None or not config.agent.turn:
+        return config
+    return dataclasses.replace(config, agent=dataclasses.replace(config.agent, turn=False))
+
+
+def _of_agents(config: Config, agents: int | None) -> list[Config]:
+    """Returns the configuration of each agent: the seeds of several are those from the configured one on."""
+    if agents is None:
+        return [config]
+    if agents < 1:
+        raise ConfigError(f"the number of agents must be at least 1, not {agents}")
+    if config.train.debug:
+        raise ConfigError("--debug trains one agent; leave --seeds out")
+    seeds = range(config.train.seed, config.train.seed + agents)
+    return [dataclasses.replace(config, train=dataclasses.replace(config.train, seed=seed)) for seed in seeds]
+
+
+@contextlib.contextmanager
+def prepared(
+    config: Config, reward: Reward | None = None, display: Display | None = None, agents: int | None = None
+) -> Iterator[Preparation]:
+    """Prepares a run; where the block ends with an error, nobody waits for what is still being compiled.
+
+    Args:
+        config: of the run; its seed is that of the first agent.
+        reward: as in `train`.
+        display: of the progress.
+        agents: how many are trained in one program; None is one, compiled as such.
+
+    Raises:
+        ConfigError: if the configuration is invalid or the world cannot be flown, or the process was forked after JAX
+            had been used.
+    """
+    check_not_forked()
+    pool = ThreadPoolExecutor(max_workers=2, thread_name_prefix="compiling", initializer=keep_tested_settings)
+    try:
+        yield Preparation(config, reward, display or Silent(), pool, agents)
+    finally:
+        pool.shutdown(wait=False, cancel_futures=True)
+
+
+def _in_background(pool: Executor, work: Callable[[], object], began: float) -> Future[float]:
+    """Runs `work` in a thread; the future holds the seconds since the time `began`.
+
+    Of several processes none works ahead: all must meet in one order.
+    """
+
+    def timed() -> float:
+        work()
+        return time.perf_counter() - began
+
+    future = pool.submit(timed)
+    if jax.process_count() > 1:
+        future.result()
+    return future

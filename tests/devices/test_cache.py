@@ -1,0 +1,74 @@
+"""Compiled programs are kept between commands, where they may be, and a damaged one is no harm."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from edqn_jax.devices import cache
+
+COMMAND = """
+import jax
+from edqn_jax.devices.cache import keep_programs
+keep_programs()
+print(jax.jit(lambda x: x * 3 + 1)(2.0), jax.config.jax_compilation_cache_dir)
+"""
+
+
+def outcome_of(warned: str = "", **variables: str) -> tuple[str, str]:
+    """Returns what a process prints that keeps programs: the result, and the folder or None; it warns of `warned`."""
+    kept = {name: value for name, value in os.environ.items() if not name.startswith(("JAX_", "XDG_"))}
+    done = subprocess.run([sys.executable, "-c", COMMAND], env=kept | variables, capture_output=True, text=True)
+    assert done.returncode == 0 and bool(done.stderr) == bool(warned) and warned in done.stderr, done.stderr
+    result, folder = done.stdout.split()
+    return result, folder
+
+
+def test_what_one_process_compiles_the_next_one_reads_and_what_is_damaged_is_compiled_again(tmp_path: Path) -> None:
+    _, folder = outcome_of(XDG_CACHE_HOME=str(tmp_path))
+    kept = sorted(Path(folder).iterdir())
+    assert kept and Path(folder).is_relative_to(tmp_path / "edqn_jax")
+    times = [file.stat().st_mtime_ns for file in kept]
+    assert outcome_of(XDG_CACHE_HOME=str(tmp_path)) == ("7.0", folder)
+    assert sorted(Path(folder).iterdir()) == kept and [file.stat().st_mtime_ns for file in kept] == times
+    for file in kept:
+        file.write_bytes(file.read_bytes()[:-20])
+    assert outcome_of("Error reading persistent compilation", XDG_CACHE_HOME=str(tmp_path)) == ("7.0", folder)
+
+
+def test_nothing_is_read_that_others_could_have_written(tmp_path: Path) -> None:
+    _, folder = outcome_of(XDG_CACHE_HOME=str(tmp_path))
+    Path(folder).chmod(0o777)
+    assert outcome_of(XDG_CACHE_HOME=str(tmp_path)) == ("7.0", "None")
+
+
+@pytest.mark.parametrize(
+    ("variables", "folder"),
+    [
+        ({"JAX_COMPILATION_CACHE_DIR": "own"}, "own"),
+        ({"JAX_ENABLE_COMPILATION_CACHE": "false"}, "None"),
+        ({"XDG_CACHE_HOME": "/dev/null"}, "None"),
+    ],
+)
+def test_nothing_is_kept_where_it_may_not_be(variables: dict[str, str], folder: str, tmp_path: Path) -> None:
+    placed = {name: value.replace("own", str(tmp_path)) for name, value in variables.items()}
+    assert outcome_of(**{"XDG_CACHE_HOME": str(tmp_path / "cache")} | placed) == (
+        "7.0",
+        folder.replace("own", str(tmp_path)),
+    )
+    assert not (tmp_path / "cache").exists()
+
+
+def test_the_oldest_programs_go_once_there_are_too_many_bytes(tmp_path: Path) -> None:
+    for age in range(6):
+        file = tmp_path / f"{age}"
+        file.write_bytes(bytes(100))
+        os.utime(file, (1_000_000 - age, 1_000_000 - age))
+    cache._make_room(tmp_path, 600)
+    assert len(list(tmp_path.iterdir())) == 6
+    cache._make_room(tmp_path, 599)
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["0", "1"]

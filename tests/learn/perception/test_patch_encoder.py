@@ -1,0 +1,240 @@
+"""The patch encoder: held against its event-by-event twin; what it reads, and what it must not."""
+
+from __future__ import annotations
+
+import dataclasses
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+import pytest
+
+from edqn_jax.config import CameraConfig, EncoderConfig, EventsConfig
+from edqn_jax.learn.perception import vae
+from edqn_jax.learn.perception.patch_encoder import log_counts, patch_places, patches
+from edqn_jax.sim.sensors import events as ev
+from edqn_jax.sim.sensors.sensor import Form
+from edqn_jax.sim.task.env import MOTION_SIZE
+from tests.oracles import patch_encoder_plain
+
+SMALL = CameraConfig(width=10, height=6)  # no multiple of a patch's side
+CONFIG = EncoderConfig(code_size=5, patch_layers=(6, 3), joint_layers=(8, 7))
+MOTION = np.random.default_rng(9).normal(size=MOTION_SIZE).astype(np.float32)
+
+fresh = jax.jit(vae.init_vae, static_argnums=(0, 1), static_argnames=("form", "layers"))
+encode = jax.jit(vae.encode, static_argnums=0)
+
+
+def shaken(params, key: int = 5):
+    """Parameters with biases and log-variances that are not zero."""
+    leaves, tree = jax.tree.flatten(params)
+    keys = jax.random.split(jax.random.key(key), len(leaves))
+    return jax.tree.unflatten(
+        tree, [x + 0.3 * jax.random.normal(k, x.shape) for x, k in zip(leaves, keys, strict=True)]
+    )
+
+
+def random_field(seed: int, pairs: int, *, noise: bool = False) -> ev.EventField:
+    """Counts of 0 to 6, either polarity; with noise, rows of ON events and as many of OFF events."""
+    rng = np.random.default_rng(seed)
+    shape = (pairs * (2 if noise else 1), SMALL.height, SMALL.width)
+    count = rng.poisson(0.7, shape).astype(np.int32)
+    sign = np.repeat([1, -1], pairs)[:, None, None] if noise else rng.choice([-1, 1], shape)
+    polarity = np.where(count > 0, sign, 0).astype(np.int8)
+    times = np.zeros(shape, np.float32)
+    field = ev.EventField(*map(jnp.asarray, (count, polarity, times, times)), window_s=0.04, with_noise=noise)  # pyright: ignore
+    return field
+
+
+def single_events(field: ev.EventField, pairs: int) -> list[patch_encoder_plain.Event]:
+    """All events one by one, in an arbitrary order; rows of OFF events follow those of ON events."""
+    found = []
+    for row, y, x in np.argwhere(np.asarray(field.count) > 0):
+        event = (int(row) % pairs, int(x), int(y), int(field.polarity[row, y, x]))
+        found += [event] * int(field.count[row, y, x])
+    return [found[at] for at in np.random.default_rng(1).permutation(len(found))]
+
+
+@pytest.mark.parametrize(("pairs", "noise"), [(1, False), (2, False), (1, True), (2, True)])
+@pytest.mark.slow
+def test_dense_codes_are_those_of_single_events(pairs: int, noise: bool) -> None:
+    params = shaken(fresh(CONFIG, SMALL, jax.random.key(0), layers=pairs))
+    field = random_field(pairs, pairs, noise=noise)
+    dense = encode(CONFIG, params, field, MOTION)
+    one_by_one = jax.tree.map(lambda x: np.asarray(x, np.float64), params["encoder"])
+    plain = patch_encoder_plain.code(
+        one_by_one, single_events(field, pairs), MOTION, pairs, SMALL.height, SMALL.width, CONFIG.patch_pixels
+    )
+    for got, expected in zip(dense, plain, strict=True):
+        np.testing.assert_allclose(got, expected, rtol=1e-4, atol=1e-4)  # float32 sums of order 1
+
+
+def test_both_polarities_of_a_pixel_are_counted_apart() -> None:
+    blank = np.zeros((2, 1, 1), np.int32)
+    blank[:, 0, 0] = 3, 2  # three ON events, two OFF events in the same frame pair
+    polarity = np.array([1, -1], np.int8).reshape(2, 1, 1)
+    times = jnp.zeros((2, 1, 1))
+    field = ev.EventField(jnp.asarray(blank), jnp.asarray(polarity), times, times, 0.04, with_noise=True)
+    np.testing.assert_allclose([float(x[0, 0]) for x in log_counts(field)], np.log([4.0, 3.0]), rtol=1e-6)
+
+
+def test_patches_are_cut_row_by_row_and_padded_with_zeros() -> None:
+    image = jnp.arange(1.0, 61.0).reshape(6, 10)
+    cut = np.asarray(patches(image, 4))
+    assert cut.shape == (6, 16)
+    np.testing.assert_array_equal(cut[1].reshape(4, 4), image[:4, 4:8])
+    np.testing.assert_array_equal(cut[5].reshape(4, 4)[:2, :2], image[4:, 8:])
+    assert cut[5].reshape(4, 4)[2:].sum() == cut[5].reshape(4, 4)[:, 2:].sum() == 0.0
+    np.testing.assert_allclose(patch_places(6, 10, 4)[:3], [[-0.6, -1 / 3], [0.2, -1 / 3], [1.0, -1 / 3]], atol=1e-6)
+
+
+def test_the_same_events_mean_something_else_under_another_motion() -> None:
+    params = fresh(CONFIG, SMALL, jax.random.key(0))
+    field = random_field(1, 1)
+    codes = [encode(CONFIG, params, field, jnp.asarray(motion))[0] for motion in (MOTION, -MOTION)]
+    assert np.abs(codes[0] - codes[1]).max() > 0.1
+
+
+def test_a_batch_is_encoded_as_its_fields_are_one_by_one() -> None:
+    params = shaken(fresh(CONFIG, SMALL, jax.random.key(0)))
+    fields = [random_field(seed, 1) for seed in range(4)]
+    motion = jnp.asarray(np.random.default_rng(2).normal(size=(4, MOTION_SIZE)), jnp.float32)
+    whole = encode(CONFIG, params, jax.tree.map(lambda *x: jnp.stack(x), *fields), motion)
+    single = [encode(CONFIG, params, field, each) for field, each in zip(fields, motion, strict=True)]
+    for got, expected in zip(whole, zip(*single, strict=True), strict=True):
+        np.testing.assert_allclose(got, np.stack(expected), rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.slow
+def test_a_picture_is_read_as_one_channel_of_events_is() -> None:
+    params = shaken(fresh(CONFIG, SMALL, jax.random.key(0), form=Form.PICTURE))
+    field = random_field(1, 1)
+    field = dataclasses.replace(field, polarity=jnp.abs(field.polarity))  # ON alone
+    both = fresh(CONFIG, SMALL, jax.random.key(1))
+    shared = {"encoder": {**both["encoder"], **params["encoder"]}}
+    picture = jnp.log(1.0 + field.count)
+    for got, expected in zip(
+        encode(CONFIG, params, picture, MOTION), encode(CONFIG, shared, field, MOTION), strict=True
+    ):
+        np.testing.assert_allclose(got, expected, rtol=1e-5, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("target", "form", "channels"),
+    [
+        ("sensed", Form.EVENTS, 2),
+        ("nearness", Form.EVENTS, 1),
+        ("both", Form.EVENTS, 3),
+        ("nearness", Form.PICTURE, 1),
+        ("both", Form.PICTURE, 2),
+    ],
+)
+@pytest.mark.slow
+def test_the_decoder_draws_what_the_target_holds(target, form, channels) -> None:
+    config = dataclasses.replace(CONFIG, target=target, target_blur=0)
+    params = fresh(config, SMALL, jax.random.key(0), form=form)
+    sensed = random_field(3, 1) if form is Form.EVENTS else jnp.ones((1, SMALL.height, SMALL.width))
+    near = jnp.asarray(np.random.default_rng(4).random((SMALL.height, SMALL.width)), jnp.float32)
+    image = vae.target(config, sensed, near)
+    assert image.shape == vae.decode(config, SMALL, params, jnp.zeros(5)).shape == (channels, SMALL.height, SMALL.width)
+    if target != "sensed":
+        np.testing.assert_array_equal(image[-1], near)
+    if target != "nearness":
+        np.testing.assert_array_equal(
+            image[: channels - (target == "both")], vae.target(dataclasses.replace(config, target="sensed"), sensed)
+        )
+
+
+@pytest.mark.slow
+def test_nearness_is_learnt_from_events_and_motion_and_not_from_events_alone() -> None:
+    """A patch of k events at speed v stands for a nearness of k / (8 v): only both together tell it."""
+    camera, config = CameraConfig(width=8, height=8), EncoderConfig(code_size=4, kl_weight=0.0, target_blur=0)
+    rng = np.random.default_rng(0)
+    speed = rng.uniform(0.5, 1.0, 512).astype(np.float32)
+    near = rng.uniform(0.2, 1.0, 512).astype(np.float32)
+    counts = np.rint(16 * near * speed).astype(np.int8)
+    fields = jax.vmap(partial(ev.field_of_counts, EventsConfig()))(
+        jnp.asarray(np.broadcast_to(counts[:, None, None], (512, 8, 8)))
+    )
+    motion = np.zeros((512, MOTION_SIZE), np.float32)
+    motion[:, 0] = speed
+    wanted = vae.in_waves(
+        config, vae.target(config, fields, jnp.asarray(np.broadcast_to(near[:, None, None], (512, 8, 8))))
+    )
+
+    def error_after(motion) -> float:
+        params = fresh(config, camera, jax.random.key(0))
+        optimiser = optax.adam(2e-3)
+
+        def update(carry, key):
+            params, state = carry
+            noise = jax.random.normal(key, (*wanted.beyond.shape, config.code_size))
+            gradient = jax.grad(lambda p: vae.vae_loss(config, p, fields, motion, wanted, noise)[0])(params)
+            change, state = optimiser.update(gradient, state)
+            return (optax.apply_updates(params, change), state), None
+
+        keys = jax.random.split(jax.random.key(1), 150)
+        (params, _), _ = jax.jit(lambda c: jax.lax.scan(update, c, keys))((params, optimiser.init(params)))
+        made = vae.decode(config, camera, params, vae.embed(config, params, fields, motion))
+        return float(np.sqrt(np.mean((np.asarray(made)[:, 0].mean((1, 2)) - near) ** 2)))
+
+    with_motion, without = error_after(jnp.asarray(motion)), error_after(jnp.zeros_like(motion))
+    assert with_motion < 0.5 * without, (with_motion, without)
+
+
+def a_row_of_fields(seed: int, number: int) -> ev.EventField:
+    """Fields of consecutive decisions, [number, F, H, W]."""
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *[random_field(seed + at, 1) for at in range(number)])
+
+
+def test_codes_of_decisions_in_a_row_are_those_of_one_decision_after_the_other() -> None:
+    config = dataclasses.replace(CONFIG, sequence_decisions=4)
+    params = shaken(fresh(config, SMALL, jax.random.key(0)))
+    fields = a_row_of_fields(3, 6)
+    motion = jnp.asarray(np.random.default_rng(4).normal(size=(6, MOTION_SIZE)), jnp.float32)
+    begins = jnp.array([False, False, True, False, False, False])  # the first remembers nothing in any case
+    together = encode(config, params, fields, motion, None, begins)
+    remembered = jnp.zeros(config.code_size)
+    for now in range(6):
+        if begins[now]:
+            remembered = jnp.zeros(config.code_size)
+        field = jax.tree.map(lambda leaf, now=now: leaf[now], fields)
+        one = encode(config, params, field, motion[now], remembered)
+        for found, wanted in zip(one, together, strict=True):
+            np.testing.assert_allclose(found, wanted[now], atol=1e-5)
+        remembered = one[0]
+    forgetful = encode(config, params, fields, motion, None, jnp.ones(6, bool))[0]
+    same = np.isclose(forgetful, together[0], atol=1e-3).all(axis=1)
+    assert same.tolist() == [True, False, True, False, False, False]
+
+
+def test_what_was_seen_is_remembered_where_nothing_is_seen() -> None:
+    """Each flight shows how near its world is once; the decoder draws it three decisions later."""
+    camera = CameraConfig(width=8, height=8)
+    config = EncoderConfig(code_size=4, kl_weight=0.0, target_blur=0, sequence_decisions=4)
+    rng = np.random.default_rng(0)
+    near = rng.uniform(0.2, 1.0, 128).astype(np.float32)
+    counts = np.zeros((4, 128, 8, 8), np.int8)
+    counts[0] = np.rint(16 * near)[:, None, None]
+    fields = jax.vmap(jax.vmap(partial(ev.field_of_counts, EventsConfig())))(jnp.asarray(counts))
+    image = jnp.asarray(np.broadcast_to(near[None, :, None, None], counts.shape))
+    wanted = vae.in_waves(config, vae.target(config, fields, image))
+    motion, begins = jnp.zeros((4, 128, MOTION_SIZE)), jnp.zeros((4, 128), bool)
+    optimiser = optax.adam(3e-3)
+
+    def update(carry, key):
+        params, state = carry
+        noise = jax.random.normal(key, (4, 128, config.code_size))
+        gradient = jax.grad(lambda p: vae.vae_loss(config, p, fields, motion, wanted, noise, begins)[0])(params)
+        change, state = optimiser.update(gradient, state)
+        return (optax.apply_updates(params, change), state), None
+
+    params = fresh(config, camera, jax.random.key(0))
+    keys = jax.random.split(jax.random.key(1), 150)
+    (params, _), _ = jax.jit(lambda c: jax.lax.scan(update, c, keys))((params, optimiser.init(params)))
+    made = vae.decode(config, camera, params, encode(config, params, fields, motion, None, begins)[0])
+    error = np.sqrt(np.mean((np.asarray(made)[:, :, 0].mean((2, 3)) - near) ** 2, axis=1))
+    # A guess that does not remember is off by the standard deviation of what there is to know, 0.23.
+    assert error[0] < 0.1 and error[3] < 0.1, error

@@ -1,0 +1,188 @@
+"""The camera in C beside the camera in JAX, from which it is translated."""
+
+from __future__ import annotations
+
+import dataclasses
+import shutil
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from edqn_jax.config import CameraConfig
+from edqn_jax.native import build
+from edqn_jax.sim.camera import camera, columns, native
+from edqn_jax.sim.camera.camera import LUMA_WEIGHTS
+from edqn_jax.sim.scene.scene import PARKED, Scene, stack_scenes, take_scene, with_drones
+from edqn_jax.sim.worlds import families
+from tests.sim.drawn_scenes import GROUND, ball, box, every_kind, pillar, rotation_of, scene_of
+
+CONFIG = CameraConfig()
+ROUNDING = 1e-4
+"""Brightness, three times the most that was seen away from ties: compilers contract and order operations otherwise."""
+
+TIES = 1e-3
+"""Share of pixels in which faces of two shapes that coincide, as walls of a canyon do, are told apart by rounding; 3e-4
+were seen."""
+
+
+def frames(scenes: list[Scene], count: int, seed: int) -> tuple[Scene, jax.Array, jax.Array]:
+    """Frames anywhere in the worlds' volumes, inside of shapes as well: scenes, origins and rotations [count, ...]."""
+    rng = np.random.default_rng(seed)
+    pool = stack_scenes(scenes)
+    scene = jax.tree.map(lambda leaf: leaf[rng.integers(0, len(scenes), count)], pool)
+    low, high = np.asarray(scene.volume[:, 0]), np.asarray(scene.volume[:, 1])
+    origin = low + (high - low) * rng.random((count, 3))
+    rotation = np.stack([rotation_of(0, 0, yaw) for yaw in rng.uniform(-np.pi, np.pi, count)])
+    return scene, jnp.asarray(origin, jnp.float32), jnp.asarray(rotation, jnp.float32)
+
+
+def drawn(config: CameraConfig, scene: Scene, origin: jax.Array, rotation: jax.Array) -> list[np.ndarray]:
+    """Brightness and depth [M, H, W], first in C and then in JAX."""
+    weights = jnp.broadcast_to(jnp.asarray(LUMA_WEIGHTS), origin.shape)
+    programs = [
+        lambda: (
+            native.pictures(config, scene, origin, rotation, weights),
+            native.depths(config, scene, origin, rotation),
+        ),
+        lambda: (
+            columns.pictures(config, camera.blend, scene, origin, rotation, weights),
+            camera._depths(config, scene, origin, rotation),
+        ),
+    ]
+    return [np.asarray(image) for program in programs for image in jax.jit(program)()]
+
+
+def agree(config: CameraConfig, scene: Scene, origin: jax.Array, rotation: jax.Array, ties: float = 0.0) -> None:
+    picture, depth, plain_picture, plain_depth = drawn(config, scene, origin, rotation)
+    differ = np.abs(picture - plain_picture) > ROUNDING
+    assert np.isfinite(picture).all() and np.mean(differ) <= ties, np.abs(picture - plain_picture).max()
+    np.testing.assert_array_equal(np.isfinite(depth), np.isfinite(plain_depth))
+    np.testing.assert_allclose(depth, plain_depth, rtol=1e-4)
+    assert picture.std() > 0.05 and np.isfinite(depth).mean() > 0.3  # there is something to see
+
+
+def crowd(rng: np.random.Generator) -> Scene:
+    places = rng.uniform([0, 0, 0], [60, 60, 12], (30, 3))
+    sizes = rng.uniform(0.3, 4, (30, 3))
+    return scene_of(
+        GROUND,
+        *(box(x, y, z, a, b, c, x) for (x, y, z), (a, b, c) in zip(places[:14], sizes, strict=False)),
+        *(pillar(x, y, z, a, b) for (x, y, z), (a, b, _) in zip(places[14:24], sizes[14:], strict=False)),
+        *(ball(x, y, z, a) for (x, y, z), (a, _, _) in zip(places[24:], sizes[24:], strict=True)),
+    )
+
+
+def test_the_library_is_at_hand_wherever_there_is_a_compiler() -> None:
+    assert native.is_at_hand("cpu") is (shutil.which("cc") is not None)
+
+
+def test_both_draw_the_other_drones_and_neither_those_that_are_absent() -> None:
+    scene, origin, rotation = frames([crowd(np.random.default_rng(3))], 64, seed=4)
+    ahead = np.asarray(rotation)[:, :, 0] * 3.0 + np.random.default_rng(5).normal(0, 0.5, (64, 3))
+    place = np.stack([np.asarray(origin) + ahead, np.full((64, 3), PARKED)], axis=1).astype(np.float32)
+    radius = jnp.broadcast_to(jnp.array([0.36, 0.0]), (64, 2))
+    among = jax.vmap(with_drones)(scene, jnp.asarray(place), radius)
+    agree(CONFIG, among, origin, rotation)
+    apart = np.abs(drawn(CONFIG, among, origin, rotation)[0] - drawn(CONFIG, scene, origin, rotation)[0])
+    assert (apart.max(axis=(1, 2)) > 0.05).mean() > 0.4  # the others' drones are behind something
+
+
+@pytest.mark.parametrize("size", [(32, 24), (13, 7)], ids=["usual", "no multiple of a vector"])
+def test_c_draws_what_jax_draws(size: tuple[int, int]) -> None:
+    config = dataclasses.replace(CONFIG, width=size[0], height=size[1])
+    rng = np.random.default_rng(3)
+    if native.is_at_hand("cpu"):
+        agree(config, *frames([crowd(rng) for _ in range(8)], 192, seed=4))
+    else:  # then there is one camera, and the pictures of the package are its
+        scene, origin, rotation = frames([crowd(rng)], 2, seed=4)
+        assert np.isfinite(jax.vmap(partial(camera.luma, config))(scene, origin, rotation)).all()
+
+
+@pytest.mark.parametrize("family", ["rooms", "forest", "canyon", "dense"])
+@pytest.mark.slow
+def test_c_draws_the_worlds_of_a_family_as_jax_does(family: str) -> None:
+    if native.is_at_hand("cpu"):
+        pool = families.random_pool(family, families.world_keys("training", 4))
+        scenes = [take_scene(pool, number) for number in range(4)]
+        agree(CONFIG, *frames(scenes, 128, seed=8), ties=TIES)
+
+
+@pytest.fixture(scope="module")
+def kernels() -> bool:
+    """Whether the kernels of GPUs are registered for the CPU, where there is a compiler."""
+    on_cpu = Path(__file__).parents[2] / "oracles" / "cuda_on_cpu.h"
+    names = [f"-D{target}=emulated_{target}" for target in native.TARGETS]
+    compiler = dataclasses.replace(build.C, flags=(*build.C.flags, "-xc", "-include", str(on_cpu), *names))
+    targets = tuple(f"emulated_{target}" for target in native.TARGETS)
+    headers = (native.SOURCES["h"], on_cpu)
+    return build.registered(native.SOURCES["cu"], targets, native.definitions(), compiler, headers)
+
+
+def crowded_forest(rng: np.random.Generator) -> Scene:
+    """More shapes in a frame than a block of threads gathers in a pass, and than it keeps at once."""
+    places = rng.uniform([0, 0, 0], [60, 60, 6], (300, 3))
+    return scene_of(
+        GROUND, *(pillar(x, y, z, 0.3, 3) for x, y, z in places), box(30, 30, 2, 2, 3, 4, 1), ball(9, 9, 3, 2)
+    )
+
+
+def empty_field(rng: np.random.Generator) -> Scene:
+    """Ground and a ball: no upright shape."""
+    return scene_of(GROUND, ball(30, 30, 3, rng.uniform(8, 12)))
+
+
+@pytest.mark.parametrize(
+    "size, world",
+    [((32, 24), crowd), ((13, 7), crowd), ((70, 20), crowd), ((32, 24), crowded_forest), ((32, 24), empty_field)],
+    ids=["usual", "no multiple of a block", "several blocks", "several passes", "no upright shapes"],
+)
+def test_the_kernels_of_gpus_draw_what_jax_draws(
+    kernels: bool, monkeypatch: pytest.MonkeyPatch, size: tuple[int, int], world: Callable[..., Scene]
+) -> None:
+    """On the CPU, thread by thread."""
+    call = native._call
+    monkeypatch.setattr(native, "_call", lambda target, *given: call(f"emulated_{target}", *given))
+    config = dataclasses.replace(CONFIG, width=size[0], height=size[1])
+    if kernels:
+        agree(config, *frames([world(np.random.default_rng(3))], 32, seed=4))
+    else:
+        assert shutil.which("cc") is None
+
+
+def test_a_world_with_other_shapes_and_a_camera_on_the_body_are_drawn_by_jax() -> None:
+    rng = np.random.default_rng(0)
+    assert not native.can_draw(CONFIG, every_kind(rng), "cpu")
+    assert not native.can_draw(dataclasses.replace(CONFIG, mount="body"), crowd(rng), "cpu")
+    walls = [GROUND] * native.MOST_PLANES
+    assert native.can_draw(CONFIG, scene_of(*walls), "cpu") is native.is_at_hand("cpu")
+    assert not native.can_draw(CONFIG, scene_of(*walls, GROUND), "cpu")
+    assert native.can_draw(CONFIG, crowd(rng), "cpu") is native.is_at_hand("cpu")
+
+
+def test_a_frame_is_the_same_to_the_bit_however_it_is_mapped() -> None:
+    """Worlds of their own, a world for every four frames, and one world for all."""
+    scene, origin, rotation = frames([crowd(np.random.default_rng(1))], 12, seed=2)
+    world = jax.tree.map(lambda leaf: leaf[0], scene)
+    one = partial(camera.luma, CONFIG)
+    own = jax.vmap(one)(scene, origin, rotation)
+    folded = jax.tree.map(lambda leaf: leaf.reshape(3, 4, *leaf.shape[1:]), (origin, rotation))
+    three = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (3, *leaf.shape)), world)
+    shared = jax.vmap(jax.vmap(one, in_axes=(None, 0, 0)))(three, *folded)
+    single = jax.vmap(one, in_axes=(None, 0, 0))(world, origin, rotation)
+    inverted = jax.vmap(jax.vmap(one, in_axes=(0, None, None)), in_axes=(None, 0, 0))(three, origin, rotation)
+    alone = jnp.stack([one(world, o, r) for o, r in zip(origin, rotation, strict=True)])
+    for other in (shared.reshape(own.shape), single, inverted[:, 2], alone):
+        np.testing.assert_array_equal(own, other)
+
+
+def test_poses_that_are_not_finite_spoil_their_own_frame_alone() -> None:
+    scene, origin, rotation = frames([crowd(np.random.default_rng(1))], 6, seed=2)
+    draw = jax.vmap(partial(camera.luma, CONFIG))
+    good = np.asarray(draw(scene, origin, rotation))
+    bad = np.asarray(draw(scene, origin.at[1].set(jnp.nan).at[4].set(jnp.inf), rotation.at[2].set(jnp.nan)))
+    np.testing.assert_array_equal(bad[[0, 3, 5]], good[[0, 3, 5]])
