@@ -8,7 +8,7 @@ from pathlib import Path
 import mujoco
 import pytest
 
-from edqn_jax.sim import mjcf_xml
+from edqn_jax.sim.scene import mjcf_xml
 from edqn_jax.sim.scene.mjcf import SceneError, load_world
 
 GEOM = '<geom name="block" type="box" pos="11 7 3" size="1 2 3"/>'
