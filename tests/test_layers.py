@@ -12,7 +12,20 @@ import pytest
 ROOT = Path(__file__).parents[1]
 
 ORDER = (
-    *("version", "errors", "keys", "files", "checks", "extras", "xla", "sine", "config", "devices", "native"),
+    *(
+        "version",
+        "errors",
+        "keys",
+        "files",
+        "checks",
+        "extras",
+        "xla_flags",
+        "xla",
+        "sine",
+        "config",
+        "devices",
+        "native",
+    ),
     *("sim.actions", "sim.scene", "sim.worlds", "sim.physics", "sim.camera", "sim.sensors", "sim.task", "sim"),
     *("planning", "learn.perception", "learn", "policies", "evaluation", "training"),
     *("runs.checkpoints", "runs", "report", "interop", "cli"),

@@ -11,9 +11,9 @@ from rich.table import Table
 
 from edqn_jax.cli.arguments import EventsArgs
 from edqn_jax.files import check_can_write, write_atomically
-from edqn_jax.interop.event_files import check_can_write_events, read_events, write_events
-from edqn_jax.interop.recording import Recording
-from edqn_jax.interop.seen_events import image_at, seen_by, window_ends
+from edqn_jax.interop.recordings.event_files import check_can_write_events, read_events, write_events
+from edqn_jax.interop.recordings.recording import Recording
+from edqn_jax.interop.recordings.seen_events import image_at, seen_by, window_ends
 from edqn_jax.report.recordings import (
     DECODED,
     EVENTS,

@@ -68,8 +68,8 @@ def _write_video(args: RecordArgs, config: Config, params: PolicyParams, mission
 
 def _write_events(args: RecordArgs, config: Config, params: PolicyParams, missions: MissionSet) -> tuple[str, float]:
     """Writes the events of a camera that watches the flight; returns as `_write_video`."""
-    from edqn_jax.interop.event_files import check_can_write_events, write_events
-    from edqn_jax.interop.flight_events import flight_recording
+    from edqn_jax.interop.recordings.event_files import check_can_write_events, write_events
+    from edqn_jax.interop.recordings.flight_events import flight_recording
 
     group.check_alone(config, "`edqn record` of events")
     check_can_write_events(args.file)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from edqn_jax.interop.recording import Recording
+from edqn_jax.interop.recordings.recording import Recording
 from edqn_jax.sim.sensors.events import STREAM_DTYPE
 
 WIDTH, HEIGHT = 64, 48

@@ -11,8 +11,8 @@ import pytest
 
 from edqn_jax.errors import ConfigError
 from edqn_jax.extras import require
-from edqn_jax.interop.event_files import read_events
-from edqn_jax.interop.prophesee_words import EVT3
+from edqn_jax.interop.recordings.event_files import read_events
+from edqn_jax.interop.recordings.prophesee_words import EVT3
 from edqn_jax.sim.sensors.events import STREAM_DTYPE
 from tests.interop.recordings import HEIGHT, WIDTH, some_events
 from tests.oracles import event_words

@@ -18,9 +18,9 @@ from edqn_jax.cli import main
 from edqn_jax.config import Config
 from edqn_jax.evaluation.missions import load_missions
 from edqn_jax.interop import runner
-from edqn_jax.interop.event_files import read_events, write_events
-from edqn_jax.interop.recording import Recording
-from edqn_jax.interop.seen_events import seen_by, window_ends
+from edqn_jax.interop.recordings.event_files import read_events, write_events
+from edqn_jax.interop.recordings.recording import Recording
+from edqn_jax.interop.recordings.seen_events import seen_by, window_ends
 from edqn_jax.learn.perception import vae
 from edqn_jax.learn.policy import Policy
 from edqn_jax.sim.task.env import Observation

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from edqn_jax.errors import ConfigError
-from edqn_jax.interop.recording import MICROSECONDS, Recording, found_unit, recording_of
+from edqn_jax.interop.recordings.recording import MICROSECONDS, Recording, found_unit, recording_of
 from tests.interop.recordings import some_events
 
 EVENTS = some_events()

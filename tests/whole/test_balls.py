@@ -11,7 +11,7 @@ import pytest
 
 from edqn_jax.config import WorldConfig
 from edqn_jax.evaluation.missions import run_missions
-from edqn_jax.interop.flight_events import flight_recording
+from edqn_jax.interop.recordings.flight_events import flight_recording
 from edqn_jax.report.gallery import prepare_gallery
 from edqn_jax.report.progress import Progress
 from edqn_jax.runs.directory import RunDirectory

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edqn_jax.errors import ConfigError
-from edqn_jax.interop.recording import MOST_PIXELS
+from edqn_jax.interop.recordings.recording import MOST_PIXELS
 
 ORDER = ("t", "x", "y", "p")
 """The usual one: the event camera dataset of Zurich, ESIM, v2e."""

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from edqn_jax.interop.recording import MOST_BACK_US
+from edqn_jax.interop.recordings.recording import MOST_BACK_US
 
 MOST_AHEAD_US = 10_000_000
 """Longest pause in which a clock may begin again at zero, as in Prophesee's own decoder."""

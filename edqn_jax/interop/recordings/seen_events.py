@@ -15,7 +15,7 @@ from edqn_jax.config import Config
 from edqn_jax.errors import ConfigError
 from edqn_jax.interop import runner
 from edqn_jax.interop.onnx_export import about_policy, field_of
-from edqn_jax.interop.recording import Recording
+from edqn_jax.interop.recordings.recording import Recording
 from edqn_jax.learn.perception import embedding, vae
 from edqn_jax.learn.policy import Policy
 from edqn_jax.sim.sensors import events

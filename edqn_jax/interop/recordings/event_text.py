@@ -18,8 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edqn_jax.errors import ConfigError
-from edqn_jax.interop.column_order import ORDER, check_usual_order
-from edqn_jax.interop.recording import COLUMN_NAMES, Recording, TimeUnit, named_columns, recording_of
+from edqn_jax.interop.recordings.column_order import ORDER, check_usual_order
+from edqn_jax.interop.recordings.recording import COLUMN_NAMES, Recording, TimeUnit, named_columns, recording_of
 
 UNITS: dict[str, TimeUnit] = {
     "s": "s",

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from edqn_jax.errors import ConfigError
 from edqn_jax.extras import require
-from edqn_jax.interop.recording import Recording, recording_of
+from edqn_jax.interop.recordings.recording import Recording, recording_of
 
 MAGIC = b"#!AER-DAT4.0\r\n"
 

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edqn_jax.errors import ConfigError
-from edqn_jax.interop.recording import (
+from edqn_jax.interop.recordings.recording import (
     MICROSECONDS,
     Recording,
     TimeUnit,

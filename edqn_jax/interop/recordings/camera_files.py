@@ -12,9 +12,9 @@ import numpy as np
 
 from edqn_jax.errors import ConfigError
 from edqn_jax.extras import require
-from edqn_jax.interop.aedat4 import read_aedat4
-from edqn_jax.interop.prophesee_files import read_prophesee
-from edqn_jax.interop.recording import Recording, recording_of
+from edqn_jax.interop.recordings.aedat4 import read_aedat4
+from edqn_jax.interop.recordings.prophesee_files import read_prophesee
+from edqn_jax.interop.recordings.recording import Recording, recording_of
 
 KINDS = {".aedat4": "AEDAT4", ".raw": "EVT", ".dat": "DAT", ".es": "Event Stream"}
 """What is read, by the end of a file's name."""

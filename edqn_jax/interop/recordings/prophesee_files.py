@@ -9,8 +9,8 @@ from typing import NamedTuple
 import numpy as np
 
 from edqn_jax.errors import ConfigError
-from edqn_jax.interop.prophesee_words import DAT, EVT2, EVT3, Words
-from edqn_jax.interop.recording import Recording, recording_of
+from edqn_jax.interop.recordings.prophesee_words import DAT, EVT2, EVT3, Words
+from edqn_jax.interop.recordings.recording import Recording, recording_of
 
 EVT = {"2": EVT2, "3": EVT3}
 """By version."""

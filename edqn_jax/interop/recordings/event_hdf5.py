@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from edqn_jax.errors import ConfigError
 from edqn_jax.extras import require
-from edqn_jax.interop.recording import (
+from edqn_jax.interop.recordings.recording import (
     Recording,
     TimeUnit,
     named_columns,

@@ -6,11 +6,11 @@ from pathlib import Path
 
 from edqn_jax.errors import ConfigError
 from edqn_jax.files import check_can_write, write_atomically
-from edqn_jax.interop.camera_files import KINDS, read_camera_file
-from edqn_jax.interop.event_hdf5 import hdf5_bytes, read_hdf5
-from edqn_jax.interop.event_npz import npz_bytes, read_npz
-from edqn_jax.interop.event_text import read_text, text_bytes
-from edqn_jax.interop.recording import Recording, TimeUnit
+from edqn_jax.interop.recordings.camera_files import KINDS, read_camera_file
+from edqn_jax.interop.recordings.event_hdf5 import hdf5_bytes, read_hdf5
+from edqn_jax.interop.recordings.event_npz import npz_bytes, read_npz
+from edqn_jax.interop.recordings.event_text import read_text, text_bytes
+from edqn_jax.interop.recordings.recording import Recording, TimeUnit
 
 HDF5, TEXT = (".h5", ".hdf5"), (".txt", ".csv")
 

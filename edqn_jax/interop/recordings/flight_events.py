@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from edqn_jax.config import Config
-from edqn_jax.interop.recording import Recording
+from edqn_jax.interop.recordings.recording import Recording
 from edqn_jax.sim.actions import ACTIONS
 from edqn_jax.sim.physics.drone import Flight
 from edqn_jax.sim.scene.launches import aim_along

@@ -1,0 +1,1 @@
+"""Recorded events, the files that hold them, and how a policy sees them."""
