@@ -16,6 +16,7 @@ from edqn_jax.config.loading import apply, parse_layer
 from edqn_jax.errors import ConfigError
 from edqn_jax.learn import saved_state
 from edqn_jax.learn.policy import PolicyParams
+from edqn_jax.learn.trainer import policy_of
 from edqn_jax.parallel import processes
 from edqn_jax.runs import states, world_copy
 from edqn_jax.runs.checkpoints import save_params
@@ -238,8 +239,7 @@ class Keeper:
     def _fresh(self) -> list[PolicyParams]:
         """Returns parameters of the right shapes for each agent, on the host."""
         trainer = self.preparation.trainer
-        learner = trainer.shapes().learner
-        whole = PolicyParams(encoder=learner.encoder, q=learner.average)
+        whole = policy_of(trainer.config, trainer.shapes())
         zeros = jax.tree.map(lambda leaf: np.zeros(leaf.shape, leaf.dtype), whole)
         return trainer.each(zeros)
 
