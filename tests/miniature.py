@@ -33,8 +33,8 @@ def no_losses(steps: int) -> Losses:
     """Stands for what training steps return in which nothing was learnt."""
     zeros: Any = np.zeros(steps)
     health = Health(*[zeros] * len(dataclasses.fields(Health)))
-    numbers = {field.name: zeros for field in dataclasses.fields(Losses)}
-    return Losses(**{**numbers, "health": health})
+    names = ("q_loss", "mean_q", "reconstruction_loss", "kl", "epsilon")
+    return Losses(metrics=dict.fromkeys(names, zeros), health=health)
 
 
 def miniature_world(config: Config, own_start_fraction: float = 0.25) -> World:

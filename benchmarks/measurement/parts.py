@@ -14,12 +14,14 @@ from jax import Array
 from jax.sharding import PartitionSpec
 
 from edqn_jax.config import Config
-from edqn_jax.learn import dqn, qnetwork, replay, updates
+from edqn_jax.learn import qnetwork, replay, updates
+from edqn_jax.learn.exploration import epsilon_greedy
+from edqn_jax.learn.learner import Rings, learner_of
 from edqn_jax.learn.perception import vae
 from edqn_jax.learn.plan import Plan
 from edqn_jax.learn.samples import Samples
 from edqn_jax.learn.trainer import AXIS, Actors, TrainState
-from edqn_jax.learn.updates import Learner
+from edqn_jax.learn.updates import Networks
 from edqn_jax.sim.camera import camera, columns, native
 from edqn_jax.sim.physics import drone
 from edqn_jax.sim.physics.drone import DroneState
@@ -46,7 +48,7 @@ class Moment:
         return self.state.actors
 
     @property
-    def learner(self) -> Learner:
+    def learner(self) -> Networks:
         return self.state.learner
 
     @cached_property
@@ -252,11 +254,11 @@ def acting(now: Moment) -> Part:
         memory, keys = carry
         q = qnetwork.q_values(now.config.agent, params, len(env.ACTIONS), memory)
         keys = _next(keys)
-        action = jax.vmap(lambda q, k: dqn.epsilon_greedy(q, jnp.float32(0.02), k))(q, keys)
+        action = jax.vmap(lambda q, k: epsilon_greedy(q, jnp.float32(0.02), k))(q, keys)
         return depending_on(memory, action), keys
 
     carry = (now.actors.memory, now.shard_keys)
-    return Part("acting", body, now.learner.q, carry, products=True)
+    return Part("acting", body, now.learner.agent.q, carry, products=True)
 
 
 def _draw(now: Moment, ring: replay.Rows, keys: Array) -> tuple[Array, Any]:
@@ -306,7 +308,7 @@ def vae_updating(now: Moment) -> Part:
     def body(rings: Samples, carry):
         learner, keys = carry
         keys = _next(keys)
-        _, learner = updates.learn_to_see(now.config, AXIS, learner, rings, keys, now.state.step)
+        _, learner = updates.update_vae(now.config, AXIS, learner, rings, keys, now.state.step)
         return learner, keys
 
     rings, carry = now.actors.samples, (now.learner, now.shard_keys)
@@ -319,16 +321,16 @@ def learning(now: Moment) -> Part:
     """Returns the part of a training step's DQN updates with their sampling."""
 
     def body(ring: replay.Rows, carry):
-        learner, keys = carry
+        agent, keys = carry
         keys = _next(keys)
-        _, learner = updates.learn_to_act(now.config, AXIS, learner, ring, now.newest, keys, now.state.step)
-        return learner, keys
+        _, agent = learner_of(now.config).update(now.config, AXIS, agent, Rings(ring, now.newest, keys), 0.0)
+        return agent, keys
 
     return Part(
         "dqn_update_and_sampling",
         body,
         now.actors.replay,
-        (now.learner, now.shard_keys),
+        (now.learner.agent, now.shard_keys),
         _LEARNER_AND_KEYS,
         scans=now.config.agent.updates_per_step,
         products=True,

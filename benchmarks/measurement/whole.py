@@ -64,11 +64,13 @@ class WholeStep:
         """
         began = time.perf_counter()
         self.state, (_, losses) = self.trainer.chunk(self.state, self.done)
-        q_loss = np.asarray(losses.q_loss)
+        q_loss = np.asarray(losses.metrics["q_loss"])
         seconds = time.perf_counter() - began
         learns = self.done >= self.trainer.plan.learn_from
         self.done += len(q_loss)
-        learnt = [q_loss, np.asarray(losses.reconstruction)] if embedding.has_code(self.trainer.config) else [q_loss]
+        learnt = [q_loss]
+        if embedding.has_code(self.trainer.config):
+            learnt.append(np.asarray(losses.metrics["reconstruction_loss"]))
         if learns and not np.isfinite(np.concatenate(learnt)).all():
             raise RuntimeError("a timed chunk did not learn throughout")
         return self.decisions / seconds

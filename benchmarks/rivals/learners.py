@@ -19,7 +19,7 @@ from edqn_jax.evaluation.latency import decision_seconds
 from edqn_jax.evaluation.missions import RunMissions, run_missions
 from edqn_jax.evaluation.rollouts import fly_on_all_devices
 from edqn_jax.learn.policy import PolicyParams
-from edqn_jax.learn.trainer import Trainer, policy_of
+from edqn_jax.learn.trainer import Trainer, TrainState, policy_of
 from edqn_jax.runs.provenance import workload
 from edqn_jax.sim.task.env import World
 from edqn_jax.sim.task.flights import Flights
@@ -131,7 +131,7 @@ class Learner:
         self.trainer = Trainer(config, self.missions.training.world, devices)
         began = time.perf_counter()
         self.trainer.compile()
-        self._fly(self.missions.final.world, jax.tree.map(np.asarray, policy_of(self.trainer.init(0))))
+        self._fly(self.missions.final.world, self._policy(self.trainer.init(0)))
         self.about = {
             **json_report.machine(devices),
             "workload": workload(config, self.missions.scene),
@@ -140,6 +140,9 @@ class Learner:
 
     def _fly(self, world: World, params: PolicyParams) -> Flights:
         return fly_on_all_devices(self.config, world, params, self.config.train.seed)
+
+    def _policy(self, state: TrainState) -> PolicyParams:
+        return jax.tree.map(np.asarray, policy_of(self.config, state))
 
     def turn(self, seed: int) -> dict[str, Any]:
         """Trains and flies one seed and returns `Validation.result`. Seconds are of the chunks alone."""
@@ -159,7 +162,7 @@ class Learner:
             except DivergedError as error:
                 return diverged(seed, str(error), done * envs, seconds, validation)
             if done >= plan.total or is_due(config, plan, validation.checked, done):
-                validation.validate(jax.tree.map(np.asarray, policy_of(state)), done * envs, seconds)
+                validation.validate(self._policy(state), done * envs, seconds)
         return validation.result(seed, done * envs, seconds, lambda params, n: decision_seconds(config, params, n))
 
 

@@ -21,9 +21,11 @@ from edqn_jax.config.options import (
     LightConfig,
     MotorsConfig,
     NoiseConfig,
+    PqnConfig,
     TrainConfig,
     WorldConfig,
 )
+from edqn_jax.config.registry import LEARNERS
 from edqn_jax.errors import ConfigError
 
 
@@ -53,7 +55,9 @@ def validate(config: Config, *, trains: bool = True) -> None:
     _train(config.train)
     if config.env.drones > 1:
         _several_drones(config, trains)
+    LEARNERS.check(config.agent.learner)
     _replay(config.agent, config.train)
+    _pqn(config.pqn, config.train)
     _samples(config.encoder, config.train)
     judged = not config.world.flown or config.train.validation_missions >= 2
     limit = "at least 2 with world.flown, whose flight takes the place of one test world"
@@ -273,6 +277,12 @@ def _train(train: TrainConfig) -> None:
         divides = f"0 or a divisor of train.shards ({shards})"
         _require(shards % train.devices == 0, "train.devices", divides, train.devices)
     _require(not train.debug or train.devices <= 1, "train.devices", "0 or 1 with train.debug", train.devices)
+
+
+def _pqn(pqn: PqnConfig, train: TrainConfig) -> None:
+    _positive(pqn, "pqn", ["rollout", "epochs", "minibatches"])
+    _share(pqn, "pqn", ["trace"])
+    _require(0 < pqn.average_rate <= 1, "pqn.average_rate", "more than 0 and at most 1", pqn.average_rate)
 
 
 def _replay(agent: AgentConfig, train: TrainConfig) -> None:

@@ -363,8 +363,10 @@ class EncoderConfig:
 
 @dataclass(frozen=True)
 class AgentConfig:
-    """The deep Q-network (section 3.3, Eq. 7-10)."""
+    """What chooses moves: the deep Q-network (section 3.3, Eq. 7-10), or another learner."""
 
+    learner: str = "dqn"
+    """How it learns: `dqn`, from a replay, or `pqn`, from fresh rollouts (options `pqn.*`)."""
     hidden: tuple[int, ...] = (128, 128)
     """Widths of the hidden layers."""
     history: int = 2
@@ -426,6 +428,24 @@ class AgentConfig:
 
 
 @dataclass(frozen=True)
+class PqnConfig:
+    """PQN, `agent.learner pqn` (Gallici et al. 2024). It also reads network, discount, step sizes and exploration of
+    `agent`.
+    """
+
+    rollout: int = 32
+    """Decisions of each environment between learning."""
+    epochs: int = 4
+    """Passes over a rollout."""
+    minibatches: int = 32
+    """Updates of one pass; must divide `rollout` times the environments of a shard."""
+    trace: float = 0.65
+    """lambda of the returns; 0 looks one decision ahead."""
+    average_rate: float = 0.01
+    """Polyak rate, per update, of the averaged parameters that evaluation uses; 1 uses the newest parameters."""
+
+
+@dataclass(frozen=True)
 class TrainConfig:
     """The training run."""
 
@@ -481,6 +501,7 @@ class Config:
     exposure: ExposureConfig = field(default_factory=ExposureConfig)
     encoder: EncoderConfig = field(default_factory=EncoderConfig)
     agent: AgentConfig = field(default_factory=AgentConfig)
+    pqn: PqnConfig = field(default_factory=PqnConfig)
     train: TrainConfig = field(default_factory=TrainConfig)
 
 

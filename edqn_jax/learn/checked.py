@@ -19,6 +19,7 @@ from jax.experimental import checkify
 
 from edqn_jax.config import Config
 from edqn_jax.errors import CheckError
+from edqn_jax.learn.learner import learner_of
 from edqn_jax.learn.updates import flat
 from edqn_jax.sim.actions import ACTIONS
 from edqn_jax.sim.task import env
@@ -97,7 +98,8 @@ def _check_shapes(config: Config, state: Any) -> None:
         chex.assert_tree_shape_prefix((rings, actors.key), (shards,))
         for ring in rings:
             chex.assert_equal_shape_prefix(jax.tree.leaves(ring), 3)
-        chex.assert_trees_all_equal_shapes_and_dtypes(learner.q, learner.target, learner.average)
+        policy = learner_of(config).policy(learner.agent)
+        chex.assert_trees_all_equal_shapes_and_dtypes(learner.agent.q, policy)
         chex.assert_shape(state.step, ())
     except AssertionError as wrong:
         raise CheckError(f"--debug: the train state has a wrong shape: {_line(wrong)}") from wrong

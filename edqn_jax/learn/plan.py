@@ -1,7 +1,7 @@
 """When what is trained: the numbers of training steps that follow from a configuration.
 
-The warm-up comes first, then the DQN learns; each retraining of the VAE gives the agent a new encoder, and the replay
-begins anew.
+The warm-up comes first, then the learner learns; each retraining of the VAE gives the agent a new encoder, and the
+rings begin anew.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ import numpy as np
 from jax import Array
 
 from edqn_jax.config import Config, TrainConfig
+from edqn_jax.config.registry import LEARNERS
 from edqn_jax.learn.perception import embedding
 
 
@@ -26,7 +27,7 @@ class Plan:
     """Steps that exploration, step size and retraining are planned for; fewer than `total` in an extended run."""
     warmup: int
     starts: int
-    """Steps of a replay before the first update of the DQN."""
+    """Steps of a ring before the first update of the learner."""
     vae_training: tuple[tuple[int, int], ...]
     """Of the warm-up and of each retraining of the VAE, the first step and the step after the last."""
 
@@ -42,14 +43,13 @@ class Plan:
         scheduled = _whole_chunks(config.train, config.train.schedule_steps or config.train.total_steps)
         most = scheduled // 4 if embedding.has_code(config) else 0
         warmup = min(math.ceil(config.encoder.warmup_decisions / envs), most)
-        least = config.agent.n_step + config.agent.history
-        starts = max(math.ceil(config.agent.learning_starts / envs), least)
+        starts = LEARNERS.get(config.agent.learner).starts(config)
         vae_training = _vae_training(config, scheduled, warmup, starts) if warmup else ()
         return cls(total=total, scheduled=scheduled, warmup=warmup, starts=starts, vae_training=vae_training)
 
     @property
     def learn_from(self) -> int:
-        """Step of the DQN's first update."""
+        """Step of the learner's first update."""
         return self.warmup + self.starts
 
     def trains_vae(self, step: Array | np.ndarray) -> Array:
@@ -94,10 +94,6 @@ class Plan:
         for _, end in self.vae_training:
             began = jnp.where(step >= end, end, began)
         return jnp.maximum(step - began, 0)
-
-    def trains_q(self, step: Array | np.ndarray) -> Array:
-        """Returns whether the DQN learns in steps `[...]`, bool."""
-        return jnp.asarray(step >= self.warmup) & (self.replay_time(step) >= self.starts)
 
 
 def _whole_chunks(train: TrainConfig, decisions: int) -> int:

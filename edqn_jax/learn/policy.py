@@ -13,10 +13,9 @@ from jax import Array
 from edqn_jax.config import Config
 from edqn_jax.devices.jax_settings import as_tested
 from edqn_jax.errors import ConfigError
-from edqn_jax.learn.dqn import epsilon_greedy
+from edqn_jax.learn.learner import learner_of
 from edqn_jax.learn.perception import embedding, vae
-from edqn_jax.learn.qnetwork import Params, init_q, q_values
-from edqn_jax.sim.actions import ACTIONS
+from edqn_jax.learn.qnetwork import Params
 from edqn_jax.sim.sensors.events import EventField
 from edqn_jax.sim.sensors.sensor import DEPTH_SCALE, Sensed, distance_of, sensor_of
 from edqn_jax.sim.task.env import OWN_SIZE, Observation
@@ -43,11 +42,11 @@ def observation_size(config: Config) -> int:
 
 def fresh_policy(config: Config, seed: int = 0) -> PolicyParams:
     """Returns a policy that has learnt nothing."""
-    encoder_key, q_key = jax.random.split(jax.random.key(seed))
-    size = observation_size(config)
+    encoder_key, agent_key = jax.random.split(jax.random.key(seed))
+    learner = learner_of(config)
     return PolicyParams(
         encoder=embedding.acting(config, embedding.init(config, encoder_key)),
-        q=init_q(config.agent, size, len(ACTIONS), q_key),
+        q=learner.policy(learner.init(config, agent_key)),
     )
 
 
@@ -78,26 +77,12 @@ def see(config: Config, params: Params, memory: Memory, observation: Observation
     return remember(memory, flatten(config, params, memory, observation))
 
 
-def choose(config: Config, params: Params, memory: Memory, key: Array, epsilon: Array | None = None) -> Array:
-    """Returns the move [...] int32 that the Q-network prefers for memories [..., H, D].
-
-    Args:
-        params: of the Q-network.
-        key: consumed where epsilon is given.
-        epsilon: [...] probability of a random move; None is greedy.
-    """
-    q = q_values(config.agent, params, len(ACTIONS), memory)
-    if epsilon is None:
-        return jnp.argmax(q, axis=-1).astype(jnp.int32)
-    return epsilon_greedy(q, epsilon, key)
-
-
 def act(
     config: Config, params: PolicyParams, memory: Memory, observation: Observation, key: Array
 ) -> tuple[Array, Memory]:
     """Returns the greedy move [] int32 for one observation, and the memory with that observation in it."""
     memory = see(config, params.encoder, memory, observation)
-    return choose(config, params.q, memory, key), memory
+    return learner_of(config).decide(config, params.q, memory), memory
 
 
 @dataclasses.dataclass(frozen=True)

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from edqn_jax.config import AgentConfig
+from edqn_jax.sim.actions import ACTIONS
 
 Params = Any
 """A plain pytree of parameters."""
@@ -46,3 +47,13 @@ def q_values(config: AgentConfig, params: Params, actions: int, history: Array) 
     """Returns values [..., actions] of observation histories [..., history, observation], newest last."""
     flat = history.reshape(*history.shape[:-2], -1)
     return QNetwork(config, actions).apply({"params": params}, flat)  # type: ignore[return-value]
+
+
+def network_values(config: AgentConfig, params: Params, memory: Array) -> Array:
+    """Returns the values [..., 27] of the drone's moves for memories [..., H, D]."""
+    return q_values(config, params, len(ACTIONS), memory)
+
+
+def greedy_moves(config: AgentConfig, params: Params, memory: Array) -> Array:
+    """Returns the best moves [...] int32 for memories [..., H, D]."""
+    return jnp.argmax(network_values(config, params, memory), axis=-1).astype(jnp.int32)

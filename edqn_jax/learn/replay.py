@@ -48,9 +48,8 @@ class Batch:
     weight: Array  # [B] 1 for a sample, 0 for a row that starts nothing (an episode's last) or led to a divergence
 
 
-def empty(config: AgentConfig, envs: int, total_envs: int, observation_size: int) -> Rows:
-    """Returns a ring for one shard's `envs` environments of `total_envs`."""
-    length = ring_length(config, total_envs)
+def empty(length: int, envs: int, observation_size: int) -> Rows:
+    """Returns a ring of `length` decisions of the `envs` environments of one shard."""
     return Rows(
         observation=jnp.zeros((length, envs, observation_size)),
         reward=jnp.zeros((length, envs)),

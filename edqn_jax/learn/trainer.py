@@ -26,13 +26,19 @@ from edqn_jax.devices import processes
 from edqn_jax.devices.devices import compiler_options
 from edqn_jax.errors import ConfigError
 from edqn_jax.keys import run_streams
-from edqn_jax.learn import dqn, policy, replay, samples
+from edqn_jax.learn import policy, replay, samples
 from edqn_jax.learn.checked import CheckedChunk, one_by_one
+from edqn_jax.learn.learner import Exploration, Metrics, Rings, learner_of
 from edqn_jax.learn.perception import embedding, vae
 from edqn_jax.learn.plan import Plan
 from edqn_jax.learn.policy import PolicyParams, empty_memory, observation_size
 from edqn_jax.learn.samples import Samples
-from edqn_jax.learn.updates import Learner, flat, init_learner, learn_to_act, learn_to_see
+from edqn_jax.learn.updates import (
+    Networks,
+    flat,
+    init_networks,
+    update_vae,
+)
 from edqn_jax.native.all_sum import all_sum
 from edqn_jax.sim.actions import ACTIONS
 from edqn_jax.sim.task import env, group
@@ -64,7 +70,7 @@ class TrainState:
     """Everything that the future of a run depends on."""
 
     actors: Actors
-    learner: Learner
+    learner: Networks
     step: Array  # [] int32 training steps done
 
 
@@ -95,13 +101,11 @@ class Health:
 
 @struct.dataclass
 class Losses:
-    """One training step's means over its updates that had a finite loss; NaN for what did not learn in it."""
+    """One training step: metrics of perception and learner by name, and health."""
 
-    q_loss: Array
-    mean_q: Array
-    reconstruction: Array
-    kl: Array
-    epsilon: Array
+    metrics: Metrics
+    """Means over the step's updates that had a finite loss, and what the learner tells of acting; NaN for what did not
+    learn in it."""
     health: Health
 
 
@@ -138,9 +142,8 @@ def init(config: Config, world: World, key: Array) -> TrainState:
     keys = InitialKeys.split(key, envs, shards)
     # Nothing has been seen yet: the first step is every environment's reset.
     state = group.each(config, lambda k: env.ended(config, world, k))(keys.environments)
-    learner = init_learner(config, keys.learner)
-    size = observation_size(config)
-    ring = replay.empty(config.agent, envs // shards, envs, size)
+    networks = init_networks(config, keys.learner)
+    ring = replay.empty(learner_of(config).ring_length(config), envs // shards, observation_size(config))
     flat = Actors(
         env=state,
         memory=jnp.broadcast_to(empty_memory(config), (envs, *empty_memory(config).shape)),
@@ -158,7 +161,7 @@ def init(config: Config, world: World, key: Array) -> TrainState:
         samples=_empty_samples(config, world, state),
         key=keys.shards,
     )
-    return TrainState(actors=actors, learner=learner, step=jnp.zeros((), jnp.int32))
+    return TrainState(actors=actors, learner=networks, step=jnp.zeros((), jnp.int32))
 
 
 def _empty_samples(config: Config, world: World, state: EnvState) -> Samples | None:
@@ -206,20 +209,21 @@ def train_step(
         axis: name of the mesh axis over which the shards of `state.actors` are spread; None on one device.
         step: [] int32, the number of this step from 0; steers the phases.
     """
-    plan, actors, learner = Plan.of(config), state.actors, state.learner
+    plan, actors, networks = Plan.of(config), state.actors, state.learner
     keys = ShardKeys.split(actors.key)
     warming = step < plan.warmup
     time = plan.replay_time(step)
 
-    action, manoeuvre, epsilon = _act(config, learner, actors, keys, jnp.maximum(step - plan.warmup, 0), warming)
+    action, manoeuvre, acted = _act(config, networks, actors, keys, jnp.maximum(step - plan.warmup, 0), warming)
     ring = _store(actors, action, time)
     flown, seen = _fly(config, world, actors, action)
     rings = _keep(config, world, actors, flown, seen, step)
-    spoilt = ~env.is_finite((learner.vae, learner.encoder, learner.q))
-    vae_losses, learner = learn_to_see(config, axis, learner, rings, keys.vae, step)
-    q_losses, learner = learn_to_act(config, axis, learner, ring, time, keys.dqn, step, after=vae_losses.means[0])
-    learner = _publish(config, learner, step)
-    memory = _remember(config, learner, actors, seen, step)
+    spoilt = ~env.is_finite((networks.vae, networks.encoder, networks.agent.q))
+    of_vae, networks = update_vae(config, axis, networks, rings, keys.vae, step)
+    last = of_vae.metrics["reconstruction_loss"]
+    of_agent, agent = learner_of(config).update(config, axis, networks.agent, Rings(ring, time, keys.dqn), last)
+    networks = _publish(config, dataclasses.replace(networks, agent=agent), step)
+    memory = _remember(config, networks, actors, seen, step)
 
     shaped = partial(_shaped, actors.reward.shape)
     outcome, reward = shaped(seen.outcome), shaped(seen.reward)
@@ -236,28 +240,25 @@ def train_step(
         key=keys.next,
     )
     episodes = Episodes(outcome=outcome, length=shaped(seen.episode_length), episode_return=shaped(seen.episode_return))
-    mean, broken = all_sum(
+    part = outcome.shape[0] / config.train.shards  # of all shards, on this device
+    means, broken = all_sum(
         (
-            jnp.mean(epsilon) * (epsilon.shape[0] / config.train.shards),
+            {name: jnp.where(warming, jnp.nan, value * part) for name, value in acted.items()},
             {name: jnp.sum(getattr(seen.broken, name), dtype=jnp.int32) for name in _OF_A_DECISION},
         ),
         axis,
-        after=q_losses.means[0],
+        after=next(iter(of_agent.metrics.values()), last),
     )
     losses = Losses(
-        q_loss=q_losses.means[0],
-        mean_q=q_losses.means[1],
-        reconstruction=vae_losses.means[0],
-        kl=vae_losses.means[1],
-        epsilon=jnp.where(warming, 1.0, mean),
+        metrics={**of_agent.metrics, **of_vae.metrics, **means},
         health=Health(
             **broken,
             parameters=spoilt.astype(jnp.int32),
-            loss=q_losses.broken[0] + vae_losses.broken[0],
-            gradient=q_losses.broken[1] + vae_losses.broken[1],
+            loss=of_agent.ill_losses + of_vae.ill_losses,
+            gradient=of_agent.ill_gradients + of_vae.ill_gradients,
         ),
     )
-    return TrainState(actors=actors, learner=learner, step=step + 1), (episodes, losses)
+    return TrainState(actors=actors, learner=networks, step=step + 1), (episodes, losses)
 
 
 _OF_A_DECISION = ("physics_state", "observation", "reward")
@@ -267,18 +268,18 @@ _NO_START = int(Outcome.TIME_OUT)
 
 
 def _act(
-    config: Config, learner: Learner, actors: Actors, keys: ShardKeys, time: Array, warming: Array
-) -> tuple[Array, Array, Array]:
-    """Chooses moves [S, E]: held random manoeuvres in the warm-up, then epsilon-greedy (Algorithm 1, step 5).
+    config: Config, networks: Networks, actors: Actors, keys: ShardKeys, time: Array, warming: Array
+) -> tuple[Array, Array, Metrics]:
+    """Chooses moves [S, E]: held random manoeuvres in the warm-up, then the learner's (Algorithm 1, step 5).
 
     Returns:
-        action, the held manoeuvres, epsilon; each [S, E].
+        action, the held manoeuvres, each [S, E], and the learner's metrics.
     """
     plan, envs = Plan.of(config), config.train.num_envs
-    epsilon = dqn.exploration(config.agent, time * envs, (plan.scheduled - plan.warmup) * envs, actors.episodes)
-    chosen = jax.vmap(partial(policy.choose, config, learner.q))(actors.memory, keys.act, epsilon)
+    progress = Exploration(time * envs, (plan.scheduled - plan.warmup) * envs, actors.episodes)
+    chosen, metrics = learner_of(config).act(config, networks.agent, actors.memory, keys.act, progress)
     manoeuvre = jax.vmap(partial(_manoeuvre, config.encoder.hold_decisions))(actors.manoeuvre, keys.manoeuvre)
-    return jnp.where(warming, manoeuvre, chosen), manoeuvre, epsilon
+    return jnp.where(warming, manoeuvre, chosen), manoeuvre, metrics
 
 
 def _store(actors: Actors, action: Array, time: Array) -> replay.Rows:
@@ -299,11 +300,11 @@ def _fly(config: Config, world: World, actors: Actors, action: Array) -> tuple[E
     return each(lambda s, a: env.step(config, world, s, a))(jax.tree.map(flat, actors.env), flat(action))
 
 
-def _remember(config: Config, learner: Learner, actors: Actors, seen: env.Step, step: Array) -> Array:
+def _remember(config: Config, networks: Networks, actors: Actors, seen: env.Step, step: Array) -> Array:
     """Returns memories [S * E, H, D] with the new observations, encoded once; new episodes or encoders begin empty."""
     forget = seen.is_reset | Plan.of(config).replaces_encoder(step)
     memory = jnp.where(forget[:, None, None], 0.0, flat(actors.memory))
-    return policy.see(config, learner.encoder, memory, seen.observation)
+    return policy.see(config, networks.encoder, memory, seen.observation)
 
 
 def _shaped(shape: tuple[int, ...], tree: Any) -> Any:
@@ -317,14 +318,14 @@ def _manoeuvre(hold: int, held: Array, key: Array) -> Array:
     return jnp.where(coin < 1.0 / hold, (draw * len(ACTIONS)).astype(held.dtype), held)
 
 
-def _publish(config: Config, learner: Learner, step: Array) -> Learner:
+def _publish(config: Config, networks: Networks, step: Array) -> Networks:
     """Copies the VAE to the encoder that acts, in the step after which the replay begins anew."""
     encoder = lax.cond(
         Plan.of(config).replaces_encoder(step),
-        lambda: embedding.acting(config, learner.vae),
-        lambda: learner.encoder,
+        lambda: embedding.acting(config, networks.vae),
+        lambda: networks.encoder,
     )
-    return dataclasses.replace(learner, encoder=encoder)
+    return dataclasses.replace(networks, encoder=encoder)
 
 
 def _keep(config: Config, world: World, actors: Actors, flown: EnvState, seen: env.Step, step: Array) -> Samples | None:
@@ -366,9 +367,9 @@ def run_steps(
     return lax.scan(partial(train_step, config, world, axis), state, steps)
 
 
-def policy_of(state: TrainState) -> PolicyParams:
+def policy_of(config: Config, state: TrainState) -> PolicyParams:
     """Returns what evaluation flies: the acting encoder and the averaged Q-network."""
-    return PolicyParams(encoder=state.learner.encoder, q=state.learner.average)
+    return PolicyParams(encoder=state.learner.encoder, q=learner_of(config).policy(state.learner.agent))
 
 
 def _laid(shapes: Any, sharding: NamedSharding) -> Any:

@@ -17,6 +17,7 @@ from edqn_jax.devices import processes
 from edqn_jax.errors import ConfigError
 from edqn_jax.learn import saved_state
 from edqn_jax.learn.policy import PolicyParams
+from edqn_jax.learn.trainer import policy_of
 from edqn_jax.runs import world_copy
 from edqn_jax.runs.checkpoints import states
 from edqn_jax.runs.checkpoints.params import save_params
@@ -239,8 +240,7 @@ class Keeper:
     def _fresh(self) -> list[PolicyParams]:
         """Returns parameters of the right shapes for each agent, on the host."""
         trainer = self.preparation.trainer
-        learner = trainer.shapes().learner
-        whole = PolicyParams(encoder=learner.encoder, q=learner.average)
+        whole = policy_of(trainer.config, trainer.shapes())
         zeros = jax.tree.map(lambda leaf: np.zeros(leaf.shape, leaf.dtype), whole)
         return trainer.each(zeros)
 

@@ -10,8 +10,10 @@ import numpy as np
 
 from edqn_jax.config import Config
 from edqn_jax.errors import DivergedError
+from edqn_jax.learn.learner import learner_of
 from edqn_jax.learn.plan import Plan
 from edqn_jax.learn.trainer import Episodes, Health, Losses
+from edqn_jax.learn.updates import VAE_METRICS
 from edqn_jax.sim.task.outcomes import Outcome
 
 MOST_ILL_STEPS = 100
@@ -76,11 +78,11 @@ def chunk_metrics(
     Args:
         first: number of the chunk's first training step.
         ended: what ended in the chunk.
-        losses: [K] each.
+        losses: [K] each; what perception and learner tell of themselves has the names that they give it.
         seconds: that the chunk took.
         episodes: ended in all, this chunk included.
     """
-    envs, steps = config.train.num_envs, len(losses.q_loss)
+    envs, steps = config.train.num_envs, _steps(losses)
     whole = ended.episode_return[ended.outcome != Outcome.DIVERGED]
     return {
         "phase": _phase(Plan.of(config), first + steps - 1),
@@ -91,11 +93,7 @@ def chunk_metrics(
         "mean_return": float(np.mean(whole)) if len(whole) else None,
         "diverged": int(np.sum(ended.outcome == Outcome.DIVERGED)),
         "skipped_updates": int(np.sum(losses.health.gradient)),
-        "epsilon": float(losses.epsilon[-1]),
-        "q_loss": _mean(losses.q_loss),
-        "mean_q": _mean(losses.mean_q),
-        "reconstruction_loss": _mean(losses.reconstruction),
-        "kl": _mean(losses.kl),
+        **{name: _mean(values) for name, values in losses.metrics.items()},
         "warm_up": _warm_up(config, first, losses),
     }
 
@@ -126,14 +124,13 @@ def _warm_up(config: Config, first: int, losses: Losses) -> dict[str, Any] | Non
     The warm-up is a chunk or two, whose means alone show nothing. The run's first step is left out: all environments
     begin in it, and nothing moves.
     """
-    steps = np.arange(first, first + len(losses.kl))
+    steps = np.arange(first, first + _steps(losses))
     wanted = (steps > 0) & (steps < Plan.of(config).warmup)
     if not wanted.any():
         return None
     return {
         "decisions": ((steps[wanted] + 1) * config.train.num_envs).tolist(),
-        "reconstruction_loss": np.asarray(losses.reconstruction)[wanted].astype(float).tolist(),
-        "kl": np.asarray(losses.kl)[wanted].astype(float).tolist(),
+        **{name: np.asarray(losses.metrics[name])[wanted].astype(float).tolist() for name in VAE_METRICS},
     }
 
 
@@ -159,9 +156,10 @@ class Watch:
             DivergedError: after `MOST_ILL_STEPS` training steps of ill chunks in a row; names the quantity that was the
                 first not to be finite, the step and the run's seed.
         """
-        steps, health = len(losses.q_loss), losses.health
+        steps, health = _steps(losses), losses.health
         numbers = np.arange(done - steps, done)
-        updates = np.asarray(plan.trains_q(numbers)) * config.agent.updates_per_step
+        learns = np.asarray(learner_of(config).updates(config, plan.replay_time(numbers)))
+        updates = np.where(numbers >= plan.warmup, learns, 0)
         trained = np.asarray(plan.trains_vae(numbers))
         rest = int(config.encoder.keep_learning and bool(plan.vae_training))
         updates = updates + np.where(trained, config.encoder.warmup_updates_per_step, rest)
@@ -187,6 +185,11 @@ def _first_broken(health: Health, steps: np.ndarray) -> str:
     begins = {name: int(np.argmax(count > 0)) for name, count in counts.items() if np.any(count > 0)}
     name = min(begins, key=lambda name: begins[name])  # of equals the first
     return f"NaN or Inf in the {name.replace('_', ' ')} at training step {steps[begins[name]]}"
+
+
+def _steps(losses: Losses) -> int:
+    """Returns the training steps of a chunk."""
+    return len(losses.health.gradient)
 
 
 def _mean(values: Any) -> float | None:

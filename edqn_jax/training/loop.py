@@ -317,4 +317,4 @@ class _Loop:
 
 def _policies(trainer: Trainer, state: TrainState) -> list[PolicyParams]:
     """Returns the newest policy of each agent, on the host."""
-    return trainer.each(jax.tree.map(np.asarray, policy_of(state)))
+    return trainer.each(jax.tree.map(np.asarray, policy_of(trainer.config, state)))

@@ -21,9 +21,9 @@ def test_what_is_timed_is_training_past_its_beginning(monkeypatch: pytest.Monkey
     whole = WholeStep(config, run_missions(config).training.world, jax.devices()[:2])
     # Three chunks, to warm up and to fill the replay: what is timed from here on is all alike.
     assert whole.done == 12 >= whole.trainer.plan.learn_from
-    before = jax.tree.map(np.asarray, (whole.state.learner.q, whole.state.learner.vae))
+    before = jax.tree.map(np.asarray, (whole.state.learner.agent.q, whole.state.learner.vae))
     assert whole.turn() > 0
-    after = jax.tree.map(np.asarray, (whole.state.learner.q, whole.state.learner.vae))
+    after = jax.tree.map(np.asarray, (whole.state.learner.agent.q, whole.state.learner.vae))
     assert all(jax.tree.leaves(jax.tree.map(lambda a, b: np.any(a != b), before, after)))
     assert int(whole.state.step) == whole.done == 16
     assert whole.temporary_bytes > 0

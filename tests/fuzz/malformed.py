@@ -230,7 +230,7 @@ def read_world(text: str, folder: Path) -> None:
 # --------------------------------------------------------------------- policies and checkpoints
 
 _SAVED = Path(tempfile.mkdtemp(prefix="edqn-fuzz-saved-"))
-_ARRAYS = {".step": np.arange(3, dtype=np.int32), ".learner.q['a']": np.ones((4, 5), np.float32)}
+_ARRAYS = {".step": np.arange(3, dtype=np.int32), ".learner.agent.q['a']": np.ones((4, 5), np.float32)}
 
 
 def saved(kind: str) -> Path:

@@ -16,7 +16,8 @@ import optax
 from jax import Array
 
 from edqn_jax.config import AgentConfig
-from edqn_jax.learn import dqn, qnetwork, replay
+from edqn_jax.learn import optimiser, qnetwork, replay
+from edqn_jax.learn.dqn import losses
 from edqn_jax.sim.task.outcomes import Outcome
 
 ACTIONS, ENVS, STATES = 2, 16, 2
@@ -93,7 +94,7 @@ def learn(config: AgentConfig, steps: int, task: Array, key: Array) -> Array:
     """Q [states, actions] after `steps` decisions of random exploration, one update each."""
     q_key, first_key, key = jax.random.split(key, 3)
     online = qnetwork.init_q(config, STATES, ACTIONS, q_key)
-    optimiser = dqn.optimiser(config, steps)
+    adam = optimiser.optimiser(config, steps)
     draw = partial(jax.random.randint, shape=(ENVS,), minval=0, maxval=ACTIONS)
     lives = Life(
         state=jax.vmap(partial(first_state, task))(jax.random.split(first_key, ENVS)),
@@ -110,17 +111,17 @@ def learn(config: AgentConfig, steps: int, task: Array, key: Array) -> Array:
         batch = replay.sample(config, ring, time, config.batch_size, sample_key)
 
         def loss(params):
-            total, (count, _) = dqn.batch_loss(config, params, target, ACTIONS, batch)
+            total, (count, _) = losses.batch_loss(config, params, target, ACTIONS, batch)
             return total / jnp.maximum(count, 1.0)
 
-        change, after = optimiser.update(jax.grad(loss)(online), state, online)
+        change, after = adam.update(jax.grad(loss)(online), state, online)
         learned: qnetwork.Params = optax.apply_updates(online, change)
         warm = time > 4 * (config.n_step + config.history)
         learned, after = jax.tree.map(lambda a, b: jnp.where(warm, a, b), (learned, after), (online, state))
-        target = dqn.polyak(learned, target, config.target_rate)
+        target = optimiser.polyak(learned, target, config.target_rate)
         return (learned, target, after, lives, ring, action, key), None
 
-    ring = replay.empty(config, ENVS, ENVS, STATES)
-    carry = (online, online, optimiser.init(online), lives, ring, jnp.zeros(ENVS, jnp.int32), key)
+    ring = replay.empty(replay.ring_length(config, ENVS), ENVS, STATES)
+    carry = (online, online, adam.init(online), lives, ring, jnp.zeros(ENVS, jnp.int32), key)
     online = jax.lax.scan(step, carry, jnp.arange(steps))[0][0]
     return qnetwork.q_values(config, online, ACTIONS, first_seen(task, config.history))

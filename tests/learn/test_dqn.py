@@ -12,7 +12,8 @@ import numpy as np
 import pytest
 
 from edqn_jax.config import AgentConfig, preset
-from edqn_jax.learn import dqn, qnetwork, replay
+from edqn_jax.learn import exploration, optimiser, qnetwork, replay
+from edqn_jax.learn.dqn import losses
 from tests.learn import probes
 
 # --------------------------------------------------------------------------------- equations by hand
@@ -22,27 +23,27 @@ Q_NEXT = jnp.array([2.0, 5.0, 3.0])
 
 
 def test_the_target_is_eq_10():
-    assert dqn.target(RETURNS, DISCOUNT, Q_NEXT, Q_NEXT) == pytest.approx(1.0 + 0.9 * 5.0)
-    assert dqn.target(RETURNS, jnp.float32(0.0), Q_NEXT, Q_NEXT) == 1.0
+    assert losses.target(RETURNS, DISCOUNT, Q_NEXT, Q_NEXT) == pytest.approx(1.0 + 0.9 * 5.0)
+    assert losses.target(RETURNS, jnp.float32(0.0), Q_NEXT, Q_NEXT) == 1.0
 
 
 def test_double_learning_lets_one_network_choose_and_the_other_judge():
     online = jnp.array([9.0, 1.0, 2.0])
-    assert dqn.target(RETURNS, DISCOUNT, Q_NEXT, online) == pytest.approx(1.0 + 0.9 * 2.0)
+    assert losses.target(RETURNS, DISCOUNT, Q_NEXT, online) == pytest.approx(1.0 + 0.9 * 2.0)
 
 
 def test_the_loss_is_eq_9():
     q = jnp.array([1.0, 4.0])
-    assert dqn.td_loss(q, jnp.int32(1), jnp.float32(7.0), 0.0) == pytest.approx(4.5)
+    assert losses.td_loss(q, jnp.int32(1), jnp.float32(7.0), 0.0) == pytest.approx(4.5)
     # Half the square up to delta = 1, then delta (|e| - delta / 2).
-    assert dqn.td_loss(q, jnp.int32(1), jnp.float32(4.5), 1.0) == pytest.approx(0.125)
-    assert dqn.td_loss(q, jnp.int32(1), jnp.float32(7.0), 1.0) == pytest.approx(2.5)
-    assert dqn.td_loss(q, jnp.int32(0), jnp.float32(-2.0), 2.0) == pytest.approx(2.0 * (3.0 - 1.0))
+    assert losses.td_loss(q, jnp.int32(1), jnp.float32(4.5), 1.0) == pytest.approx(0.125)
+    assert losses.td_loss(q, jnp.int32(1), jnp.float32(7.0), 1.0) == pytest.approx(2.5)
+    assert losses.td_loss(q, jnp.int32(0), jnp.float32(-2.0), 2.0) == pytest.approx(2.0 * (3.0 - 1.0))
 
 
 def test_only_the_value_of_the_action_taken_learns_and_the_target_is_held():
     q = jnp.array([1.0, 4.0])
-    by_q, by_y = jax.grad(dqn.td_loss, argnums=(0, 2))(q, jnp.int32(1), jnp.float32(7.0), 0.0)
+    by_q, by_y = jax.grad(losses.td_loss, argnums=(0, 2))(q, jnp.int32(1), jnp.float32(7.0), 0.0)
     np.testing.assert_allclose(by_q, [0.0, -3.0])
     assert by_y == 0.0
 
@@ -73,11 +74,11 @@ def two_samples(weight=(1.0, 1.0)) -> replay.Batch:
 def test_a_batch_by_hand():
     online, target = linear([[1.0, 2.0], [3.0, 4.0]]), linear([[10.0, 20.0], [30.0, 40.0]])
     # Rewards are halved. First: 1 + 0.9 * 40 - 1 = 36; second, a terminal one: -2 - 4 = -6.
-    loss, (count, mean_q) = dqn.batch_loss(LINEAR, online, target, 2, two_samples())
+    loss, (count, mean_q) = losses.batch_loss(LINEAR, online, target, 2, two_samples())
     assert loss == pytest.approx(0.5 * 36.0**2 + 0.5 * 36.0)
     assert count == 2.0 and mean_q == pytest.approx(1.0 + 4.0)
     # Of a weight of 0 nothing is left.
-    loss, (count, mean_q) = dqn.batch_loss(LINEAR, online, target, 2, two_samples((0.0, 1.0)))
+    loss, (count, mean_q) = losses.batch_loss(LINEAR, online, target, 2, two_samples((0.0, 1.0)))
     assert loss == pytest.approx(18.0) and count == 1.0 and mean_q == pytest.approx(4.0)
 
 
@@ -85,14 +86,14 @@ def test_a_double_batch_by_hand():
     double = dataclasses.replace(LINEAR, double=True)
     online, target = linear([[1.0, 2.0], [5.0, 4.0]]), linear([[10.0, 20.0], [30.0, 40.0]])
     # In the second state the online network prefers the first action, which the target network gives 30.
-    loss, _ = dqn.batch_loss(double, online, target, 2, two_samples((1.0, 0.0)))
+    loss, _ = losses.batch_loss(double, online, target, 2, two_samples((1.0, 0.0)))
     assert loss == pytest.approx(0.5 * (1 + 0.9 * 30 - 1) ** 2)
 
 
 def test_a_munchausen_batch_by_hand():
     soft = dataclasses.replace(LINEAR, munchausen=0.5, munchausen_temperature=2.0)
     online, target = linear([[1.0, 2.0], [5.0, 4.0]]), linear([[1.0, 3.0], [3.0, 4.0]])
-    loss, _ = dqn.batch_loss(soft, online, target, 2, two_samples((1.0, 0.0)))
+    loss, _ = losses.batch_loss(soft, online, target, 2, two_samples((1.0, 0.0)))
     # Vieillard et al. 2020, Eq. 1: the policy is the softmax of the target network's values over the temperature.
     before, after = (
         np.exp(np.array(row) / 2.0) / np.exp(np.array(row) / 2.0).sum() for row in ([1.0, 3.0], [3.0, 4.0])
@@ -102,7 +103,7 @@ def test_a_munchausen_batch_by_hand():
     assert bonus == -0.5  # at its bound
     assert loss == pytest.approx(0.5 * (1.0 + bonus + 0.9 * value - 1.0) ** 2, rel=1e-5)
     likely = dataclasses.replace(two_samples((1.0, 0.0)), action=jnp.array([1, 0]))
-    loss, _ = dqn.batch_loss(soft, online, target, 2, likely)
+    loss, _ = losses.batch_loss(soft, online, target, 2, likely)
     bonus = 0.5 * 2.0 * np.log(before[1])
     assert bonus > -0.5
     assert loss == pytest.approx(0.5 * (1.0 + bonus + 0.9 * value - 2.0) ** 2, rel=1e-5)
@@ -110,7 +111,7 @@ def test_a_munchausen_batch_by_hand():
 
 def test_polyak_moves_by_its_rate():
     old, new = {"a": jnp.array([0.0, 8.0])}, {"a": jnp.array([4.0, 0.0])}
-    np.testing.assert_allclose(dqn.polyak(new, old, 0.25)["a"], [1.0, 6.0])
+    np.testing.assert_allclose(optimiser.polyak(new, old, 0.25)["a"], [1.0, 6.0])
 
 
 @pytest.mark.slow
@@ -143,7 +144,7 @@ def test_epsilon_greedy_mixes_as_told():
     keys = jax.random.split(jax.random.key(0), 4000)
     share = {}
     for epsilon in (0.0, 0.4, 1.0):
-        chosen = jax.vmap(lambda k, e=epsilon: dqn.epsilon_greedy(q, jnp.float32(e), k))(keys)
+        chosen = jax.vmap(lambda k, e=epsilon: exploration.epsilon_greedy(q, jnp.float32(e), k))(keys)
         share[epsilon] = np.bincount(chosen, minlength=4) / 4000
     np.testing.assert_array_equal(share[0.0], [0, 1, 0, 0])
     # A standard deviation is 0.008 at most.
@@ -152,7 +153,7 @@ def test_epsilon_greedy_mixes_as_told():
 
 
 def epsilon(config, decisions, episodes=(0, 0), total=10_000):
-    values = dqn.exploration(config, jnp.int32(decisions), total, jnp.array(episodes))
+    values = exploration.exploration(config, jnp.int32(decisions), total, jnp.array(episodes))
     assert values.shape == (2,)
     return np.asarray(values)
 
@@ -175,11 +176,11 @@ def test_epsilon_falls_over_ten_episodes_of_each_environment_in_the_papers_form(
 
 def test_the_step_size_falls_linearly_and_the_gradient_is_clipped():
     config = AgentConfig(learning_rate=0.1, final_learning_rate=0.02, max_gradient_norm=1.0)
-    optimiser = dqn.optimiser(config, 4)
+    adam = optimiser.optimiser(config, 4)
     params = {"w": jnp.zeros(2)}
-    state, sizes = optimiser.init(params), []
+    state, sizes = adam.init(params), []
     for _ in range(6):
-        update, state = optimiser.update({"w": jnp.array([30.0, 40.0])}, state, params)
+        update, state = adam.update({"w": jnp.array([30.0, 40.0])}, state, params)
         sizes.append(-float(jax.tree.leaves(update)[0][0]))
     # Adam's step under a constant gradient is the step size.
     np.testing.assert_allclose(sizes, [0.1, 0.08, 0.06, 0.04, 0.02, 0.02], rtol=1e-4)

@@ -73,7 +73,7 @@ def test_training_with_several_drones_learns_and_drones_wait_for_the_others(trai
     _, state, (waited, episodes, losses) = trained
     share = waited.mean()
     assert 0.02 < share < 0.6  # random manoeuvres in dense worlds end early, at different times
-    assert np.isfinite(losses.q_loss[-1]) and np.isfinite(losses.reconstruction[-1])
+    assert np.isfinite(losses.metrics["q_loss"][-1]) and np.isfinite(losses.metrics["reconstruction_loss"][-1])
     assert int(losses.health.gradient.sum()) == 0 and int(state.step) == STEPS
 
 

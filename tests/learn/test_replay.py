@@ -60,7 +60,7 @@ def written(config: AgentConfig, rows: replay.Rows, decisions) -> replay.Rows:
         kept = replay.write(ring, row, time)
         return jax.tree.map(lambda a, b: jnp.where(time < decisions, a, b), kept, ring), None
 
-    return jax.lax.scan(store, replay.empty(config, ENVS, ENVS, 2), jnp.arange(LONGEST))[0]
+    return jax.lax.scan(store, replay.empty(replay.ring_length(config, ENVS), ENVS, 2), jnp.arange(LONGEST))[0]
 
 
 def ring_of(config: AgentConfig, life: list[list[replay_plain.Row]]) -> replay.Rows:
@@ -186,7 +186,7 @@ def test_the_ring_is_as_long_as_its_share_and_never_too_short_for_a_transition()
     config = AgentConfig(replay_size=1000, n_step=5, history=3)
     assert replay.ring_length(config, 10) == 100
     assert replay.ring_length(config, 500) == 9
-    ring = replay.empty(config, 4, 10, 7)
+    ring = replay.empty(replay.ring_length(config, 10), 4, 7)
     assert ring.observation.shape == (100, 4, 7) and ring.reward.shape == (100, 4)
 
 
@@ -194,7 +194,7 @@ def test_the_ring_is_as_long_as_its_share_and_never_too_short_for_a_transition()
 @pytest.mark.slow
 def test_the_replay_is_strict():
     config = agent(3, 2)
-    ring = replay.empty(config, ENVS, ENVS, 5)
+    ring = replay.empty(replay.ring_length(config, ENVS), ENVS, 5)
     rows = jax.tree.map(lambda x: x[0], ring)
     ring = jax.jit(replay.write)(ring, rows, jnp.int32(20))
     batch = sampled(config, ring, jnp.int32(20), 8, jax.random.key(0))
@@ -203,7 +203,7 @@ def test_the_replay_is_strict():
 
 def test_what_is_drawn_is_turned_in_whole_quarters_and_only_the_own_state_is() -> None:
     rng, config, write = np.random.default_rng(5), dataclasses.replace(agent(3, 2), turn=True), jax.jit(replay.write)
-    ring = replay.empty(config, ENVS, ENVS, 3 + OWN_SIZE)
+    ring = replay.empty(replay.ring_length(config, ENVS), ENVS, 3 + OWN_SIZE)
     for time in range(LENGTH):
         rows = replay.Rows(
             observation=jnp.asarray(rng.normal(size=(ENVS, 3 + OWN_SIZE)), jnp.float32),

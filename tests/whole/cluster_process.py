@@ -25,9 +25,10 @@ from edqn_jax.cli import main
 from edqn_jax.config import CameraConfig
 from edqn_jax.devices import devices, processes
 from edqn_jax.evaluation import rollouts
+from edqn_jax.learn.dqn.learner import DqnState
 from edqn_jax.learn.policy import fresh_policy
 from edqn_jax.learn.trainer import Episodes, Losses, Trainer, TrainState
-from edqn_jax.learn.updates import Learner
+from edqn_jax.learn.updates import Networks
 from edqn_jax.report import gallery
 from edqn_jax.runs import record
 from edqn_jax.runs.directory import plain
@@ -47,15 +48,8 @@ def only_a_policy(self: Trainer, seed: int | Sequence[int]) -> TrainState:
     """Stands for the state before the first step: of all of it, parameters."""
     assert isinstance(seed, int)
     params = fresh_policy(self.config, seed)
-    learner = Learner(
-        vae={},
-        vae_optimiser=None,
-        encoder=params.encoder,
-        q=params.q,
-        target=params.q,
-        average=params.q,
-        q_optimiser=None,
-    )
+    agent = DqnState(q=params.q, target=params.q, average=params.q, q_optimiser=None)
+    learner = Networks(vae={}, vae_optimiser=None, encoder=params.encoder, agent=agent)
     state = TrainState(actors=None, learner=learner, step=jnp.int32(0))  # type: ignore[arg-type]
     return processes.replicate(state, self.mesh)
 

@@ -46,7 +46,7 @@ def learning(checked: Trainer) -> TrainState:
     state = checked.init(0)
     for first in (0, 16):
         state, (_, losses) = checked.chunk(state, first)
-    assert jnp.isfinite(losses.q_loss).all()
+    assert jnp.isfinite(losses.metrics["q_loss"]).all()
     return state
 
 
@@ -77,7 +77,7 @@ def test_a_sound_run_against_every_disturbance_has_no_fault() -> None:
     noisy = ("--noise.position-m", "0.5", "--noise.velocity-bias-m-s", "0.3", "--env.action-delay", "1")
     trainer = trainer_of((*CHECKED, *disturbed, *noisy))
     state, (_, losses) = trainer.chunk(trainer.init(0), 0)
-    assert jnp.isfinite(losses.q_loss[-1]) and state.actors.env.disturbance is not None
+    assert jnp.isfinite(losses.metrics["q_loss"][-1]) and state.actors.env.disturbance is not None
 
 
 @pytest.mark.parametrize("sensor", ["events", "frame-pair"])
@@ -86,7 +86,7 @@ def test_a_sound_run_with_a_faulty_sensor_in_any_light_has_no_fault(sensor: str)
     faults = ("--events.profile", "dvs", "--exposure.real", "--env.sensor", sensor, "--events.law", "esim")
     trainer = trainer_of((*CHECKED, *light, *faults))
     state, (_, losses) = trainer.chunk(trainer.init(0), 0)
-    assert jnp.isfinite(losses.reconstruction[-1])
+    assert jnp.isfinite(losses.metrics["reconstruction_loss"][-1])
     memory = state.actors.env.memory
     assert memory is not None and memory.lux is not None
     lux = memory.lux

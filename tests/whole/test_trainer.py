@@ -27,6 +27,7 @@ from edqn_jax.config import (
 from edqn_jax.config.loading import make_config
 from edqn_jax.errors import ConfigError
 from edqn_jax.learn import replay, saved_state, trainer
+from edqn_jax.learn.learner import learner_of
 from edqn_jax.learn.plan import Plan
 from edqn_jax.learn.trainer import Trainer, TrainState
 from edqn_jax.sim.physics.disturbances import Disturbance
@@ -160,7 +161,9 @@ def test_training_against_every_disturbance_stores_what_was_chosen_and_goes_on_f
     np.testing.assert_array_equal(chosen[running], newest[running])
     again = saved_state.from_host(made, saved)
     (one, (_, losses)), (other, _) = (made.chunk(each, 4) for each in (state, again))
-    assert np.isfinite(losses.q_loss[-1]) and not any(np.any(count) for count in vars(losses.health).values())
+    assert np.isfinite(losses.metrics["q_loss"][-1]) and not any(
+        np.any(count) for count in vars(losses.health).values()
+    )
     jax.tree.map(np.testing.assert_array_equal, _host(one), _host(other))
 
 
@@ -194,15 +197,17 @@ def test_a_poisoned_parameter_stops_all_updates_and_spoils_no_saved_policy(on_on
     made, steps, updates = on_one[3], CONFIG.train.chunk_steps, CONFIG.agent.updates_per_step
     clean, _ = flown_on(made, 3)
     state, losses = flown_on(
-        made, 4, lambda state: changed(state, "learner.q", lambda x: x.at[(0,) * x.ndim].set(np.nan))
+        made, 4, lambda state: changed(state, "learner.agent.q", lambda x: x.at[(0,) * x.ndim].set(np.nan))
     )
     health = losses.health
     np.testing.assert_array_equal(health.parameters, np.ones(steps))
     np.testing.assert_array_equal(health.gradient, np.full(steps, updates))
-    assert np.isnan(losses.q_loss).all() and not health.physics_state.any()
+    assert np.isnan(losses.metrics["q_loss"]).all() and not health.physics_state.any()
     # What is flown and saved is the average, which stays; so does the optimiser.
-    assert _same(state.learner.average, clean.learner.average) and _same(state.learner.target, clean.learner.target)
-    assert finite(state.learner.q_optimiser) and finite(state.actors.replay)
+    assert _same(state.learner.agent.average, clean.learner.agent.average) and _same(
+        state.learner.agent.target, clean.learner.agent.target
+    )
+    assert finite(state.learner.agent.q_optimiser) and finite(state.actors.replay)
 
 
 @pytest.mark.slow
@@ -258,13 +263,13 @@ def test_the_acting_encoder_changes_once_at_the_end_of_the_warm_up(on_one) -> No
 def test_the_q_network_rests_until_there_is_enough_to_learn_from(on_one) -> None:
     states, returned, *_ = on_one
     plan = Plan.of(CONFIG)
-    losses = np.concatenate([losses.q_loss for _, losses in returned])
+    losses = np.concatenate([losses.metrics["q_loss"] for _, losses in returned])
     assert np.isnan(losses[: plan.learn_from]).all()
     assert np.isfinite(losses[plan.learn_from :]).all()
-    assert _same(states[0].learner.q, states[1].learner.q)
-    assert not _same(states[0].learner.q, states[-1].learner.q)
+    assert _same(states[0].learner.agent.q, states[1].learner.agent.q)
+    assert not _same(states[0].learner.agent.q, states[-1].learner.agent.q)
     # The average lags behind what learns, and the target too.
-    assert not _same(states[-1].learner.q, states[-1].learner.target)
+    assert not _same(states[-1].learner.agent.q, states[-1].learner.agent.target)
 
 
 @pytest.mark.slow
@@ -338,7 +343,7 @@ def test_a_retrained_encoder_begins_a_replay_of_its_own() -> None:
     assert np.flatnonzero(plan.trains_vae(steps)).tolist() == [0, 1, 2, 3, 16, 17]
     assert np.flatnonzero(plan.replaces_encoder(steps)).tolist() == [3, 17]
     assert plan.replay_time(steps).tolist() == [*[0] * 4, *range(14), *range(6)]
-    assert np.flatnonzero(plan.trains_q(steps)).tolist() == [*range(9, 18), 23]
+    assert np.flatnonzero(learner_of(config).updates(config, plan.replay_time(steps))).tolist() == [*range(9, 18), 23]
     # Every step in which the VAE learns adds a row to its ring, and no other does.
     assert plan.samples_kept(config, steps).tolist() == [0, 1, 2, 3, *[4] * 13, 5, *[6] * 6]
     always = dataclasses.replace(config, encoder=dataclasses.replace(config.encoder, keep_learning=True))
@@ -384,7 +389,7 @@ def test_the_encoder_that_acts_changes_when_the_vae_has_been_trained_and_never_e
         before = state
         state, (_, losses) = step(state, jnp.int32(number))
         changed += [number] * (not _same(before.learner.encoder, state.learner.encoder))
-        learnt += [number] * bool(np.isfinite(losses.reconstruction))
+        learnt += [number] * bool(np.isfinite(losses.metrics["reconstruction_loss"]))
         if number in (3, 12):  # nothing that was encoded with the old one is left in a memory
             memory = np.asarray(state.actors.memory)
             assert not memory[:, :, :-1].any() and memory[:, :, -1].any()
@@ -424,11 +429,13 @@ def test_agents_that_train_together_train_as_each_alone(on_two, world: World) ->
         np.testing.assert_array_equal(second_episodes.outcome, episodes.outcome)
         for name in ("reconstruction", "q_loss"):
             np.testing.assert_allclose(getattr(second_losses, name), getattr(losses, name), rtol=1e-4)
-        learnt |= bool(np.isfinite(losses.q_loss).any())
+        learnt |= bool(np.isfinite(losses.metrics["q_loss"]).any())
     assert learnt
-    first, second = together.each(jax.tree.map(np.asarray, trainer.policy_of(two)))
+    first, second = together.each(jax.tree.map(np.asarray, trainer.policy_of(together.config, two)))
     assert not _same(first, second)
-    jax.tree.map(partial(np.testing.assert_allclose, rtol=1e-3, atol=1e-5), second, trainer.policy_of(state))
+    jax.tree.map(
+        partial(np.testing.assert_allclose, rtol=1e-3, atol=1e-5), second, trainer.policy_of(together.config, state)
+    )
 
 
 def test_a_sample_says_whether_it_goes_on_from_the_one_before(world: World) -> None:
@@ -464,7 +471,7 @@ def test_totals_round_up_to_whole_chunks() -> None:
 def _told(trained: tuple) -> tuple:
     """What the agent of a chunk knew, saw and did, and how its episodes ended; all but the VAE that learns."""
     state, (episodes, _) = trained
-    return state.learner.encoder, state.learner.q, state.actors.memory, state.actors.replay, episodes
+    return state.learner.encoder, state.learner.agent.q, state.actors.memory, state.actors.replay, episodes
 
 
 def _same(one, two) -> bool:

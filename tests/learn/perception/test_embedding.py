@@ -62,10 +62,10 @@ def test_the_training_step_learns_from_every_sensor(world: World, name: str) -> 
     for part in ("q", "target", "average"):
         assert moved(getattr(before.learner, part), getattr(after.learner, part)), part
     learns = np.arange(STEPS) >= plan.learn_from
-    np.testing.assert_array_equal(np.isfinite(losses.q_loss), learns)
+    np.testing.assert_array_equal(np.isfinite(losses.metrics["q_loss"]), learns)
     assert learns.any() and not learns.all()
     sees = np.arange(STEPS) < plan.warmup
-    np.testing.assert_array_equal(np.isfinite(losses.reconstruction), sees)
+    np.testing.assert_array_equal(np.isfinite(losses.metrics["reconstruction_loss"]), sees)
     if name in CODED:
         assert plan.warmup == 4 and moved(before.learner.vae, after.learner.vae)
         learnt = embedding.acting(config, after.learner.vae)  # what was learnt acts
@@ -98,7 +98,7 @@ def test_training_can_be_mapped_over_seeds(world: World, name: str) -> None:
     states = jax.eval_shape(jax.vmap(lambda key: trainer.init(config, world, key)), jax.random.split(jax.random.key(0)))
     train = jax.vmap(lambda state: trainer.run_steps(config, world, state, jnp.arange(4)))
     after, (episodes, losses) = jax.eval_shape(train, states)
-    assert losses.q_loss.shape == (2, 4) and episodes.outcome.shape[:2] == (2, 4)
+    assert losses.metrics["q_loss"].shape == (2, 4) and episodes.outcome.shape[:2] == (2, 4)
     assert jax.tree.map(lambda x: x.shape, after) == jax.tree.map(lambda x: x.shape, states)
 
 

@@ -327,8 +327,8 @@ def test_a_new_sensor_needs_only_its_entry_to_train(with_new_sensor, world) -> N
     steps = Plan.of(config).learn_from + 2
     before = jax.jit(lambda key: trainer.init(config, world, key))(jax.random.key(0))
     after, (_, losses) = jax.jit(lambda s: trainer.run_steps(config, world, s, jnp.arange(steps)))(before)
-    assert np.isfinite(np.asarray(losses.q_loss)[-1])
-    assert np.isfinite(np.asarray(losses.reconstruction)).sum() == Plan.of(config).warmup
+    assert np.isfinite(np.asarray(losses.metrics["q_loss"])[-1])
+    assert np.isfinite(np.asarray(losses.metrics["reconstruction_loss"])).sum() == Plan.of(config).warmup
     if sensor.sensor_of(config).form is Form.VALUES:
         np.testing.assert_array_equal(after.actors.env.memory >= 1, True)  # what it carries is carried
     assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(after.learner))

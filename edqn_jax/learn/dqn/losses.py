@@ -98,39 +98,3 @@ def batch_loss(config: AgentConfig, params: Params, target_params: Params, actio
     losses = jax.vmap(lambda q, a, y: td_loss(q, a, y, config.huber_delta))(q, batch.action, y)
     taken = jax.vmap(value_of)(q, batch.action)
     return jnp.sum(batch.weight * losses), (jnp.sum(batch.weight), jnp.sum(batch.weight * taken))
-
-
-def polyak(new: Params, old: Params, rate: float) -> Params:
-    """Returns old + rate (new - old), leaf by leaf: the target network's soft update, tau of Table 1."""
-    return optax.incremental_update(new, old, rate)
-
-
-def epsilon_greedy(q: Array, epsilon: Array, key: Array) -> Array:
-    """Chooses the best action of `q` [..., A], or with probability `epsilon` [...] a random one: [...] int32."""
-    coin, draw = jax.random.uniform(key, (2, *q.shape[:-1]))
-    random = jnp.floor(draw * q.shape[-1])
-    return jnp.where(coin < epsilon, random, jnp.argmax(q, axis=-1)).astype(jnp.int32)
-
-
-def exploration(config: AgentConfig, decisions: Array, total: int, episodes: Array) -> Array:
-    """Returns epsilon [...]: random at first, then falling linearly.
-
-    Args:
-        decisions: [] decisions of the DQN phase so far, in all environments.
-        total: decisions that the phase will have.
-        episodes: [...] episodes that each environment has finished in the phase.
-    """
-    if config.exploration_episodes > 0:
-        progress = episodes / config.exploration_episodes
-    else:
-        span = max(config.exploration_fraction * total, 1.0)
-        progress = jnp.full(episodes.shape, (decisions - config.random_decisions) / span)
-    progress = jnp.clip(progress, 0.0, 1.0)
-    epsilon = config.exploration_start + progress * (config.exploration_end - config.exploration_start)
-    return jnp.where(decisions < config.random_decisions, 1.0, epsilon)
-
-
-def optimiser(config: AgentConfig, updates: int) -> optax.GradientTransformation:
-    """Returns Adam with a clipped global norm and a step size that falls linearly over `updates`."""
-    rate = optax.linear_schedule(config.learning_rate, config.final_learning_rate, max(updates, 1))
-    return optax.flatten(optax.chain(optax.clip_by_global_norm(config.max_gradient_norm), optax.adam(rate)))

@@ -1,0 +1,136 @@
+"""DQN as a learner: updates from the replay, a target network that follows, an average that flies."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import optax
+from flax import struct
+from jax import Array, lax
+from jax.flatten_util import ravel_pytree
+
+from edqn_jax.config import Config
+from edqn_jax.keys import split_each
+from edqn_jax.learn import qnetwork, replay
+from edqn_jax.learn.dqn.losses import batch_loss
+from edqn_jax.learn.exploration import explore
+from edqn_jax.learn.learner import Exploration, Learner, Metrics, Rings, UpdateStats
+from edqn_jax.learn.optimiser import optimiser, polyak, skip_nonfinite
+from edqn_jax.learn.plan import Plan
+from edqn_jax.learn.policy import observation_size
+from edqn_jax.learn.qnetwork import Params
+from edqn_jax.native.all_sum import all_sum
+from edqn_jax.sim.actions import ACTIONS
+from edqn_jax.sim.task.env import is_finite
+
+METRICS = ("q_loss", "mean_q")
+
+
+@struct.dataclass
+class DqnState:
+    """Q-networks and their optimiser; the same on every device."""
+
+    q: Params
+    target: Params
+    average: Params  # Polyak average that evaluation flies
+    q_optimiser: Any
+
+
+def init_state(config: Config, key: Array) -> DqnState:
+    """Returns networks that have learnt nothing; `key` is consumed."""
+    q = qnetwork.init_q(config.agent, observation_size(config), len(ACTIONS), key)
+    return DqnState(q=q, target=q, average=q, q_optimiser=_optimiser(config).init(q))
+
+
+def _optimiser(config: Config) -> optax.GradientTransformation:
+    plan = Plan.of(config)
+    return skip_nonfinite(optimiser(config.agent, (plan.scheduled - plan.learn_from) * config.agent.updates_per_step))
+
+
+def count_rows_before_updates(config: Config) -> int:
+    """Returns the rows of a replay before the first update."""
+    least = config.agent.n_step + config.agent.history
+    return max(math.ceil(config.agent.learning_starts / config.train.num_envs), least)
+
+
+def count_updates(config: Config, time: Array) -> Array:
+    """Returns the updates [...] int32 after the rows `time` [...]."""
+    return jnp.where(time >= count_rows_before_updates(config), config.agent.updates_per_step, 0)
+
+
+def update_q(
+    config: Config, axis: str | None, state: DqnState, rings: Rings, after: Array | float
+) -> tuple[UpdateStats, DqnState]:
+    """Updates the Q-network from the replay (Algorithm 1, steps 7-9); see `Learner.update`."""
+    agent = config.agent
+    share = agent.batch_size // config.train.shards
+
+    # All of a network as one vector: what is done to each number of it is one operation, and not one for each layer.
+    _, tree = ravel_pytree(state.q)
+
+    def vector(params: Params) -> Array:
+        return ravel_pytree(params)[0]
+
+    def loss(q: Array, target: Array, batch: replay.Batch):
+        return batch_loss(agent, tree(q), tree(target), len(ACTIONS), batch)
+
+    def update(state: DqnState, keys: Array):
+        batch = jax.vmap(lambda r, k: replay.sample(agent, r, rings.time, share, k))(rings.rows, keys)
+        batch = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), batch)
+        (total, (count, sum_q)), gradient = jax.value_and_grad(loss, has_aux=True)(state.q, state.target, batch)
+        gradient, total, count, sum_q = all_sum((gradient, total, count, sum_q), axis, after)
+        gradient = gradient / jnp.maximum(count, 1.0)
+        change, optimiser = _optimiser(config).update(gradient, state.q_optimiser, state.q)
+        q, finite = optax.apply_updates(state.q, change), is_finite(gradient)
+
+        def followed(old: Array, rate: float) -> Array:
+            """Follows `q`, unless it may be `q` that is not finite."""
+            return jnp.where(finite, polyak(q, old, rate), old)
+
+        state = DqnState(
+            q=q,
+            q_optimiser=optimiser,
+            target=followed(state.target, agent.target_rate),
+            average=followed(state.average, agent.average_rate),
+        )
+        count = jnp.maximum(count, 1.0)
+        return state, (total / count, sum_q / count, finite)
+
+    def learn(state: DqnState):
+        many = split_each(rings.keys, agent.updates_per_step)
+        state, (loss, mean_q, finite) = lax.scan(update, _each_network(vector, state), many)
+        stats = UpdateStats.of(loss, dict(zip(METRICS, (loss, mean_q), strict=True)), finite)
+        return stats, _each_network(tree, state)
+
+    def rest(state: DqnState):
+        return UpdateStats.none(*METRICS), state
+
+    return lax.cond(count_updates(config, rings.time) > 0, learn, rest, state)
+
+
+def _each_network(change: Callable[[Any], Any], state: DqnState) -> DqnState:
+    """Returns `state` with its three Q-networks changed."""
+    return dataclasses.replace(state, q=change(state.q), target=change(state.target), average=change(state.average))
+
+
+def _explore(
+    config: Config, state: DqnState, memory: Array, keys: Array, progress: Exploration
+) -> tuple[Array, Metrics]:
+    return explore(config, state.q, memory, keys, progress)
+
+
+DQN = Learner(
+    init=init_state,
+    act=_explore,
+    decide=lambda config, params, memory: qnetwork.greedy_moves(config.agent, params, memory),
+    ring_length=lambda config: replay.ring_length(config.agent, config.train.num_envs),
+    starts=count_rows_before_updates,
+    updates=count_updates,
+    update=update_q,
+    policy=lambda state: state.average,
+)

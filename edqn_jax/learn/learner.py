@@ -1,0 +1,111 @@
+"""The contract of a learner: what the training step asks of whatever learns to choose moves.
+
+A learner is a bag of pure functions, named in `agent.learner` and found in `config.registry.LEARNERS`:
+
+    from edqn_jax.config.registry import LEARNERS
+
+    LEARNERS.register("mine", Learner(init=..., act=..., decide=..., ...))
+
+The training step flies, encodes and stores one row a decision (`learn.replay.Rows`) in a ring of the length that the
+learner asks for, one ring for each of S logical shards with E environments each, and calls `update` after every step.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+from flax import struct
+from jax import Array
+
+from edqn_jax.config import Config
+from edqn_jax.config.registry import LEARNERS
+from edqn_jax.learn import replay
+
+State = Any
+"""Parameters and optimisers of a learner, a pytree; the same on every device."""
+
+Params = Any
+"""Parameters that fly, a pytree."""
+
+Metrics = dict[str, Array]
+"""[] float32 by name, NaN where nothing was learnt; `metrics.jsonl` and the live display show them."""
+
+
+class Exploration(NamedTuple):
+    """Where a run stands, for what depends on its progress."""
+
+    decisions: Array  # [] int32, of all environments since the learner began
+    total: int  # decisions that it will have
+    episodes: Array  # [S, E] that each environment has finished since then
+
+
+class Rings(NamedTuple):
+    """What an update reads."""
+
+    rows: replay.Rows  # [S, L, E, ...] the shards of this device
+    time: Array  # [] int32, of the newest row, counted since the rings began
+    keys: Array  # [S] of the shards, consumed
+
+
+@struct.dataclass
+class UpdateStats:
+    """What the updates of one network in one training step come to."""
+
+    metrics: Metrics
+    ill_losses: Array
+    """[] int32 updates whose loss was not finite."""
+    ill_gradients: Array
+    """[] int32 updates whose gradient was not finite, which were skipped."""
+
+    @classmethod
+    def none(cls, *names: str) -> UpdateStats:
+        """Returns the statistics of a step without updates, with these metrics."""
+        return cls({name: jnp.float32(jnp.nan) for name in names}, jnp.int32(0), jnp.int32(0))
+
+    @classmethod
+    def of(cls, loss: Array, metrics: Metrics, gradient_is_finite: Array) -> UpdateStats:
+        """Returns the statistics of updates [U]; metrics [U] are averaged over those with a finite loss."""
+        finite = jnp.isfinite(loss)
+        count = jnp.sum(finite)
+        means = {name: jnp.sum(jnp.where(finite, x, 0.0)) / jnp.maximum(count, 1) for name, x in metrics.items()}
+        return cls(
+            {name: jnp.where(count > 0, mean, jnp.nan) for name, mean in means.items()},
+            jnp.sum(~finite, dtype=jnp.int32),
+            jnp.sum(~gradient_is_finite, dtype=jnp.int32),
+        )
+
+
+@dataclasses.dataclass(frozen=True)
+class Learner:
+    """Pure functions of one learner; the configuration is their first argument."""
+
+    init: Callable[[Config, Array], State]
+    """(config, key) → state that has learnt nothing; the key is consumed."""
+    act: Callable[[Config, State, Array, Array, Exploration], tuple[Array, Metrics]]
+    """(config, state, memory [S, E, H, D], keys [S] consumed, exploration) → moves [S, E] for training, and
+    metrics that are averaged over the shards."""
+    decide: Callable[[Config, Params, Array], Array]
+    """(config, params, memory [..., H, D]) → moves [...] int32, greedily."""
+    ring_length: Callable[[Config], int]
+    """Rows that each ring must hold."""
+    starts: Callable[[Config], int]
+    """Rows of a ring before the first update."""
+    updates: Callable[[Config, Array], Array]
+    """(config, time [...] of the newest row) → updates [...] int32 that `update` makes then."""
+    update: Callable[[Config, str | None, State, Rings, Array | float], tuple[UpdateStats, State]]
+    """(config, mesh axis that the shards are spread over or None, state, rings, a result of the sum over the devices
+    before, see `all_sum`) → statistics, state. Called at every step; `updates` tells at which it learns."""
+    policy: Callable[[State], Params]
+    """Returns the parameters that fly."""
+
+
+def learner_of(config: Config) -> Learner:
+    """Returns the learner that a configuration names.
+
+    Raises:
+        ConfigError: if there is none of that name.
+    """
+    return LEARNERS.get(config.agent.learner)
