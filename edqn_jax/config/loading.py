@@ -77,7 +77,7 @@ DRAWN_WORLDS: Layer = {
 }
 """What a user's own MJCF file changes: the reward counts metres along the way, since behind walls the straight line
 leads into a corner, and collisions cost less, since where ways are narrow training otherwise ends in hovering
-(docs/results.md)."""
+(docs/decisions/0019-metres-along-the-way.md)."""
 
 GPU: Layer = {
     "world": {"pool_size": 16_384, "missions": 131_072},
@@ -136,7 +136,8 @@ GPU_FROM_FILE: Layer = {
         "random_decisions": 16_384,
     },
 }
-"""What a GPU changes for a world from a file: more environments and larger batches (docs/results.md)."""
+"""What a GPU changes for a world from a file: more environments and larger batches
+(docs/decisions/0014-gpu-defaults-and-seeds.md)."""
 
 
 def world_layers(world: str, tuned_for: Hardware) -> list[Layer]:
