@@ -16,7 +16,8 @@ from edqn_jax.errors import ConfigError
 
 
 @pytest.mark.parametrize(
-    ("given", "kept"), [("0", "60"), ("10", "60"), ("-3", "60"), ("many", "60"), ("", "60"), ("60", "60"), ("120", "120")]
+    ("given", "kept"),
+    [("0", "60"), ("10", "60"), ("-3", "60"), ("many", "60"), ("", "60"), ("60", "60"), ("120", "120")],
 )
 def test_tables_have_room_for_their_numbers(given: str, kept: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("COLUMNS", given)
@@ -34,9 +35,7 @@ def test_the_backend_of_a_notebook_is_not_a_commands(monkeypatch: pytest.MonkeyP
 
 
 @pytest.mark.parametrize(("options", "raised"), [(["error"], False), (["error::UserWarning"], False), ([], True)])
-def test_warnings_of_packages_end_no_command(
-    options: list[str], raised: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_warnings_of_packages_end_no_command(options: list[str], raised: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys, "warnoptions", options)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
