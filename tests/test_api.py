@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import dataclasses
 import subprocess
 import sys
@@ -237,3 +238,19 @@ def test_a_path_is_planned_and_drawn_on_the_map() -> None:
     edqn_jax.draw_map(axes, scene)
     (low, *_), (high, *_) = np.asarray(scene.volume)
     assert axes.get_xlim()[0] <= low < high <= axes.get_xlim()[1] and len(axes.patches) + len(axes.collections) > 3
+
+
+UNIX = {"fcntl", "grp", "posix", "pty", "pwd", "resource", "termios", "tty"}
+"""Modules that no other system has."""
+
+
+def test_no_module_imports_what_only_unix_has() -> None:
+    files = sorted((ROOT / "edqn_jax").rglob("*.py"))
+    imported = {
+        (file.name, name.split(".")[0])
+        for file in files
+        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8")))
+        if isinstance(node, ast.Import | ast.ImportFrom)
+        for name in ([node.module or ""] if isinstance(node, ast.ImportFrom) else [each.name for each in node.names])
+    }
+    assert len(files) > 100 and not {(file, name) for file, name in imported if name in UNIX}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from rich.console import Console
@@ -14,19 +14,11 @@ from edqn_jax.files import check_can_write, write_atomically
 from edqn_jax.interop.recordings.event_files import check_can_write_events, read_events, write_events
 from edqn_jax.interop.recordings.recording import Recording
 from edqn_jax.interop.recordings.seen_events import image_at, seen_by, window_ends
-from edqn_jax.report.recordings import (
-    DECODED,
-    EVENTS,
-    MOMENTS,
-    MOST_FRAMES,
-    NEARNESS,
-    Strip,
-    animate_recording,
-    draw_recording,
-    moments,
-)
 from edqn_jax.runs.directory import plain
 from edqn_jax.runs.policies import load_policy
+
+if TYPE_CHECKING:
+    from edqn_jax.report.recordings import Strip
 
 WINDOW_S = 0.05
 """Length of a window in pictures without a policy, seconds."""
@@ -57,6 +49,8 @@ def events_command(args: EventsArgs) -> None:
         for note in _notes(args, recording):
             console.print(note, soft_wrap=True, markup=False, highlight=False)
     if args.picture is not None:
+        from edqn_jax.report.recordings import animate_recording, draw_recording
+
         if args.picture.suffix.lower() == ".gif":
             write_atomically(args.picture, animate_recording(strips, times_s, period_s))
         else:
@@ -127,7 +121,6 @@ def _strips(args: EventsArgs, recording: Recording, figures: dict[str, Any]) -> 
     """Returns what there is to draw, when, and how long a frame is to be shown."""
     if args.policy is None and args.picture is None:
         return [], [], 0.0
-    most = MOST_FRAMES if args.picture is not None and args.picture.suffix.lower() == ".gif" else MOMENTS
     begin = int(recording.events["t"][0])
     seen = None
     if args.policy is None:
@@ -155,6 +148,12 @@ def _strips(args: EventsArgs, recording: Recording, figures: dict[str, Any]) -> 
             "height": policy.config.camera.height,
             "events_per_window": float(np.abs(seen.image).sum(axis=(1, 2)).mean()),
         }
+    if args.picture is None:
+        return [], [], period_s
+
+    from edqn_jax.report.recordings import DECODED, EVENTS, MOMENTS, MOST_FRAMES, NEARNESS, Strip, moments
+
+    most = MOST_FRAMES if args.picture.suffix.lower() == ".gif" else MOMENTS
     chosen = moments(len(ends), most)
     width, height = recording.size()
     images = np.stack([image_at(recording, int(ends[number]), window_us) for number in chosen])

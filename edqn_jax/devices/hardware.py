@@ -27,7 +27,7 @@ def hardware(environ: Mapping[str, str] = os.environ, devices: Path = Path("/dev
     first = environ.get("JAX_PLATFORMS", "").lower().split(",")[0].strip()
     if first and first not in ("cuda", "gpu", "rocm"):
         return "cpu"
-    if environ.get("CUDA_VISIBLE_DEVICES", "all").lower() in HIDDEN:
+    if environ.get("CUDA_VISIBLE_DEVICES", "all").strip().lower() in HIDDEN:
         return "cpu"
     for plugin, patterns in CARDS.items():
         if any(next(devices.glob(pattern), None) for pattern in patterns) and _has_plugin(plugin):
