@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import struct
 
-import lz4.frame
 import numpy as np
-import zstandard
 
-PACKERS = {0: bytes, 1: lz4.frame.compress, 3: zstandard.ZstdCompressor().compress}
+from edqn_jax.packages import require
+
+lz4 = require("lz4.frame", extra="events")
+zstandard = require("zstandard", extra="events")
+
+PACKERS = {0: bytes, 1: lz4.compress, 3: zstandard.ZstdCompressor().compress}
 """By the number of the compression: none, LZ4, Zstandard."""
 
 
