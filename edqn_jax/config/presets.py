@@ -1,4 +1,4 @@
-"""Named configurations: `default`, the best that we know, and `paper`, Table 1 of the paper (read by docs/method.md)."""
+"""Named configurations: `default`, the best that we know, and `paper`, Table 1 of the paper (docs/method.md)."""
 
 from __future__ import annotations
 
