@@ -85,6 +85,18 @@ def test_a_live_panel_goes_on_whoever_reads(streams: str, tmp_path: Path) -> Non
     assert b"Traceback" not in ended.stderr and done.read_text() == "0\n"
 
 
+def test_no_file_gets_the_number_of_a_closed_stream(tmp_path: Path) -> None:
+    opens = (
+        "import sys\nfrom edqn_jax.cli.streams import lasting_streams\n"
+        "with lasting_streams(), open(sys.argv[1], 'w') as file:\n    file.write(str(file.fileno()))\n"
+    )
+    script = '"$PYTHON" -c "$1" "$2" <&- >&- 2>&-'
+    environ = {**os.environ, "PYTHON": sys.executable, "PYTHONPATH": str(ROOT)}
+    words = ["/bin/bash", "-c", script, "bash", opens, str(tmp_path / "file")]
+    assert subprocess.run(words, env=environ, timeout=PATIENCE_S).returncode == 0
+    assert int((tmp_path / "file").read_text()) > 2  # else a library that writes to standard output writes into it
+
+
 def test_what_cannot_be_written_for_another_reason_is_told() -> None:
     words = [sys.executable, "-m", "edqn_jax", "--version"]
     with open("/dev/full", "w") as stdout:
