@@ -5,7 +5,6 @@ from __future__ import annotations
 import struct
 
 import numpy as np
-
 from edqn_jax.packages import require
 
 lz4 = require("lz4.frame", extra="events")
