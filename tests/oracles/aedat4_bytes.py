@@ -5,7 +5,8 @@ from __future__ import annotations
 import struct
 
 import numpy as np
-from edqn_jax.packages import require
+
+from edqn_jax.extras import require
 
 lz4 = require("lz4.frame", extra="events")
 zstandard = require("zstandard", extra="events")
