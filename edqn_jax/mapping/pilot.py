@@ -32,7 +32,6 @@ from edqn_jax.learn.policy import Memory, PolicyParams
 from edqn_jax.mapping.grid import Grid, MapConfig, empty_grid, grid_shape, update
 from edqn_jax.mapping.route import RouteConfig, Router
 from edqn_jax.parallel.devices import compiler_options
-from edqn_jax.parallel.jax_settings import as_tested
 from edqn_jax.planners.follow import FollowConfig, sampled, steer
 from edqn_jax.sim import balls, camera, disturbances, drone, env, sensor
 from edqn_jax.sim.drone import DroneState, Flight
@@ -320,7 +319,6 @@ def order(
     return sampled(route.points)[:POINTS], speed, route.expanded
 
 
-@as_tested
 def fly(
     config: Config,
     pilot: PilotConfig,
