@@ -117,6 +117,7 @@ class FunctionalEnv:
             params: as `make` returned them.
             mission: [] int, which one; None draws one.
         """
+        mission = None if mission is None else jnp.asarray(mission, jnp.int32)
         flight, seen = env.reset(self.config, params.world, key, mission)
         code = jnp.zeros(embedding.size(self.config) if self.observation == "code" else 0)
         observed, code = self._observed(params, seen, code)
@@ -142,6 +143,7 @@ class FunctionalEnv:
             bool, `episode_return` [] and `episode_length` [] int32 of the episode so far.
         """
         before = jnp.where(state.flight.ended, 0.0, state.code)
+        action = jnp.asarray(action, jnp.int32)  # which a user's own precision may have made int64
         flight, step = env.step(self.config, params.world, dataclasses.replace(state.flight, key=key), action)
         observed, code = self._observed(params, step.observation, before)
         info = {

@@ -82,9 +82,9 @@ def compiler(of: Compiler | None = C) -> str | None:
 def _version(command: Sequence[str]) -> str:
     """Returns what a compiler says of its version; nothing where it does not answer."""
     with contextlib.suppress(OSError, subprocess.SubprocessError):
-        said = subprocess.run([*command, "--version"], capture_output=True, text=True, timeout=20)
+        said = subprocess.run([*command, "--version"], capture_output=True, timeout=20)
         if said.returncode == 0:
-            return said.stdout.strip()
+            return said.stdout.decode(errors="replace").strip()
     return ""
 
 
@@ -92,7 +92,11 @@ def _command(of: Compiler) -> list[str] | None:
     """Returns the compiler that is named, else the usual one, with its options; None if none is to be used."""
     if os.environ.get(SWITCH, "1") == "0":
         return None
-    words = shlex.split(os.environ.get(of.variable, "")) or [of.usual]
+    named = os.environ.get(of.variable, "")
+    try:
+        words = shlex.split(named) or [of.usual]
+    except ValueError:  # a quotation without its end, which names no compiler
+        words = [named]
     found = shutil.which(words[0])
     return None if found is None else [found, *words[1:]]
 

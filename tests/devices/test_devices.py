@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import types
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -120,3 +121,12 @@ def test_an_option_that_xla_does_not_know_is_left_out(asked_anew, monkeypatch):
     misspelt = {"xla_cpu_of_another_century": "1"}
     monkeypatch.setattr(jax, "jit", lambda f, compiler_options: jit(f, compiler_options=compiler_options and misspelt))
     assert devices.compiler_options("cpu") == {}
+
+
+def test_flags_of_xla_in_a_file_are_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    file = tmp_path / "flags"
+    file.write_text("--xla_cpu_enable_fast_math=false\n", encoding="utf-8")
+    monkeypatch.setattr(jax.config, "update", lambda *_: None)
+    monkeypatch.setenv("XLA_FLAGS", str(file))
+    use_cpu_devices(1)
+    assert os.environ["XLA_FLAGS"] == f"--xla_cpu_enable_fast_math=false {devices.ALIKE}"

@@ -14,6 +14,7 @@ import pytest
 
 import edqn_jax
 from edqn_jax.devices.jax_settings import TESTED, as_tested, keep_tested_settings, others, set_as_tested
+from edqn_jax.interop import functional
 from tests.miniature import WORLD
 
 OTHER: dict[str, Any] = {
@@ -105,3 +106,13 @@ def test_what_is_flown_is_the_same_in_double_precision_and_strictness() -> None:
         same = jax.tree.map(lambda x, y: x.dtype == y.dtype, (flown, step), one)
         assert all(jax.tree.leaves(same))
         np.testing.assert_allclose(step.flight.position, one[1].flight.position, rtol=1e-5)
+
+
+@pytest.mark.slow
+def test_functions_of_the_task_keep_their_types_in_a_program_of_double_precision() -> None:
+    env, params = functional.make(WORLD, observation="kinematics")
+    with set_for_process(jax_enable_x64=True, jax_numpy_dtype_promotion="strict"):
+        _, state = env.reset(jax.random.key(0), params, jnp.asarray(0))
+        step = jax.jit(env.step_autoreset)
+        stepped = step(jax.random.key(1), state, jnp.asarray(3), params)  # int64
+        assert not wide((state, stepped))

@@ -118,7 +118,7 @@ SETTINGS = [
     *_one("MPLCONFIGDIR", "/proc"),
     *_one("OMP_NUM_THREADS", "0", "x"),
     *_one("TZ", "Nowhere/At_All"),
-    *_one("CC", "/nonexistent/cc", "'"),
+    *_one("CC", "/nonexistent/cc", "'", "true"),
     *_one("EDQN_JAX_NATIVE", "0", "x"),
 ]
 """Every setting that is tried; the first is none."""

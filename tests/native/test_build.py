@@ -30,10 +30,11 @@ def kept(tmp_path: Path) -> list[Path]:
     return sorted((tmp_path / "cache").rglob("*.so"))
 
 
+@pytest.mark.parametrize("named", ["no-such-compiler", "'", 'cc "-O'])
 def test_without_a_compiler_nothing_is_registered(
-    source: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    named: str, source: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setenv("CC", "no-such-compiler")
+    monkeypatch.setenv("CC", named)
     assert not registered(source, ("edqn_test_a",), ("NAME=edqn_test_a",)) and not kept(tmp_path)
 
 

@@ -27,7 +27,6 @@ from jax import Array
 
 from edqn_jax.config import Config
 from edqn_jax.devices.devices import compiler_options
-from edqn_jax.devices.jax_settings import as_tested
 from edqn_jax.errors import ConfigError
 from edqn_jax.learn import policy
 from edqn_jax.learn.perception import embedding, vae
@@ -325,7 +324,6 @@ def order(
     return sampled(route.points)[:POINTS], speed, route.expanded
 
 
-@as_tested
 def fly(
     config: Config,
     pilot: PilotConfig,
