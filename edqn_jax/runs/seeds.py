@@ -47,8 +47,7 @@ def train_seeds_run(
     Args:
         config: of the first seed.
         seeds: how many agents; their seeds count up from `train.seed`.
-        run: the folder that holds those of the seeds, or None, as in `train_run`.
-        progress, stop, reward, callback, drawing: as in `train_run`.
+        run: the folder that holds those of the seeds, or None; all others as in `train_run`.
 
     Returns:
         the content of the `summary.json` of all.
