@@ -60,7 +60,7 @@ def test_the_training_step_learns_from_every_sensor(world: World, name: str) -> 
     for leaf in jax.tree.leaves((after.learner, after.actors.memory, after.actors.replay)):
         assert np.isfinite(np.asarray(leaf)).all()
     for part in ("q", "target", "average"):
-        assert moved(getattr(before.learner, part), getattr(after.learner, part)), part
+        assert moved(getattr(before.learner.agent, part), getattr(after.learner.agent, part)), part
     learns = np.arange(STEPS) >= plan.learn_from
     np.testing.assert_array_equal(np.isfinite(losses.metrics["q_loss"]), learns)
     assert learns.any() and not learns.all()
