@@ -18,8 +18,8 @@ jax_was_imported = "jax" in sys.modules
 """Whether JAX was imported before this package. XLA reads its flags once, when JAX is first used."""
 
 
-given_flags = os.environ.get("XLA_FLAGS", "").strip()
-"""`XLA_FLAGS` before this package added any."""
+OURS = f"--{YNN_OPTION}="
+"""The flag that is added to `XLA_FLAGS`."""
 
 
 def read_flags(environ: Mapping[str, str] = os.environ) -> str:
@@ -40,7 +40,7 @@ def disable_ynn_fusions(environ: MutableMapping[str, str] = os.environ) -> None:
     """
     flags = read_flags(environ)
     if YNN_OPTION not in flags and _knows_option():
-        environ["XLA_FLAGS"] = f"{flags} --{YNN_OPTION}=".strip()
+        environ["XLA_FLAGS"] = f"{flags} {OURS}".strip()
 
 
 def _knows_option() -> bool:
