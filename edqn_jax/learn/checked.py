@@ -98,8 +98,8 @@ def _check_shapes(config: Config, state: Any) -> None:
         chex.assert_tree_shape_prefix((rings, actors.key), (shards,))
         for ring in rings:
             chex.assert_equal_shape_prefix(jax.tree.leaves(ring), 3)
-        policy = learner_of(config).policy(learner.agent)
-        chex.assert_trees_all_equal_shapes_and_dtypes(learner.agent.q, policy)
+        of_agent = learner_of(config)
+        chex.assert_trees_all_equal_shapes_and_dtypes(of_agent.network(learner.agent), of_agent.policy(learner.agent))
         chex.assert_shape(state.step, ())
     except AssertionError as wrong:
         raise CheckError(f"--debug: the train state has a wrong shape: {_line(wrong)}") from wrong

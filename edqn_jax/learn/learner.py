@@ -94,10 +94,12 @@ class Learner:
     starts: Callable[[Config], int]
     """Rows of a ring before the first update."""
     updates: Callable[[Config, Array], Array]
-    """(config, time [...] of the newest row) → updates [...] int32 that `update` makes then."""
+    """(config, number [...] of the newest row) → updates [...] int32 that `update` makes then."""
     update: Callable[[Config, str | None, State, Rings, Array | float], tuple[UpdateStats, State]]
     """(config, mesh axis that the shards are spread over or None, state, rings, a result of the sum over the devices
     before, see `all_sum`) → statistics, state. Called at every step; `updates` tells at which it learns."""
+    network: Callable[[State], Params]
+    """Returns the parameters that learn, which are watched for numbers that are not finite."""
     policy: Callable[[State], Params]
     """Returns the parameters that fly."""
 

@@ -218,7 +218,7 @@ def train_step(
     ring = _store(actors, action, time)
     flown, seen = _fly(config, world, actors, action)
     rings = _keep(config, world, actors, flown, seen, step)
-    spoilt = ~env.is_finite((networks.vae, networks.encoder, networks.agent.q))
+    spoilt = ~env.is_finite((networks.vae, networks.encoder, learner_of(config).network(networks.agent)))
     of_vae, networks = update_vae(config, axis, networks, rings, keys.vae, step)
     last = of_vae.metrics["reconstruction_loss"]
     of_agent, agent = learner_of(config).update(config, axis, networks.agent, Rings(ring, time, keys.dqn), last)

@@ -103,4 +103,4 @@ def test_the_examples_of_docstrings_are_true(file: Path) -> None:
 
 
 def test_there_are_examples() -> None:
-    assert {"events", "dqn", "actions"} <= {file.stem for file in WITH_EXAMPLES}
+    assert {"events", "losses", "actions"} <= {file.stem for file in WITH_EXAMPLES}

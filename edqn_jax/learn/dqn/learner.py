@@ -58,9 +58,9 @@ def count_rows_before_updates(config: Config) -> int:
     return max(math.ceil(config.agent.learning_starts / config.train.num_envs), least)
 
 
-def count_updates(config: Config, time: Array) -> Array:
-    """Returns the updates [...] int32 after the rows `time` [...]."""
-    return jnp.where(time >= count_rows_before_updates(config), config.agent.updates_per_step, 0)
+def count_updates(config: Config, newest: Array) -> Array:
+    """Returns the updates [...] int32 that follow when rows `newest` [...] are the newest."""
+    return jnp.where(newest >= count_rows_before_updates(config), config.agent.updates_per_step, 0)
 
 
 def update_q(
@@ -132,5 +132,6 @@ DQN = Learner(
     starts=count_rows_before_updates,
     updates=count_updates,
     update=update_q,
+    network=lambda state: state.q,
     policy=lambda state: state.average,
 )

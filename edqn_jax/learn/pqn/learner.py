@@ -74,9 +74,9 @@ def count_ring_rows(config: Config) -> int:
     return config.pqn.rollout + config.agent.history
 
 
-def count_updates(config: Config, time: Array) -> Array:
-    """Returns the updates [...] int32 after the rows `time` [...]."""
-    since = time - count_rows_before_updates(config)
+def count_updates(config: Config, newest: Array) -> Array:
+    """Returns the updates [...] int32 that follow when rows `newest` [...] are the newest."""
+    since = newest - count_rows_before_updates(config)
     ends = (since >= 0) & (since % config.pqn.rollout == 0)
     return jnp.where(ends, config.pqn.epochs * config.pqn.minibatches, 0)
 
@@ -156,5 +156,6 @@ PQN = Learner(
     starts=count_rows_before_updates,
     updates=count_updates,
     update=update_q,
+    network=lambda state: state.q,
     policy=lambda state: state.average,
 )
