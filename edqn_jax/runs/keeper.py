@@ -240,7 +240,7 @@ class Keeper:
     def _fresh(self) -> list[PolicyParams]:
         """Returns parameters of the right shapes for each agent, on the host."""
         trainer = self.preparation.trainer
-        whole = policy_of(trainer.config, trainer.shapes())
+        whole = policy_of(self.preparation.config, trainer.shapes())
         zeros = jax.tree.map(lambda leaf: np.zeros(leaf.shape, leaf.dtype), whole)
         return trainer.each(zeros)
 

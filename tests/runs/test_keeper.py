@@ -54,7 +54,7 @@ def kept(tmp_path: Path, config: Config = CONFIG, reward: Reward | None = None) 
         with run.locked():
             run.begin([config])
     newest = jax.tree.map(lambda leaf: leaf + 7.0, PARAMS)
-    learner = SimpleNamespace(encoder=newest.encoder, average=newest.q)
+    learner = SimpleNamespace(encoder=newest.encoder, agent=SimpleNamespace(average=newest.q))
     trainer = SimpleNamespace(shapes=lambda: SimpleNamespace(learner=learner), each=lambda tree: [tree])
     preparation = SimpleNamespace(config=config, configs=[config], trainer=trainer)
     return Keeper(preparation, run, [run], reward, said.append), said  # type: ignore[arg-type]
