@@ -20,7 +20,7 @@ PLAN = Plan(total=100, scheduled=100, warmup=4, starts=6, vae_training=((0, 4),)
 
 CONFIG = Config(
     encoder=EncoderConfig(warmup_updates_per_step=2),
-    agent=AgentConfig(updates_per_step=4),
+    agent=AgentConfig(updates_per_step=4, learning_starts=48),
     train=TrainConfig(num_envs=8, chunk_steps=40, seed=3),
 )
 
