@@ -25,7 +25,6 @@ from edqn_jax.sim.scene.scene import Scene, scene_at
 from edqn_jax.sim.sensors import events, exposure, light
 from edqn_jax.sim.sensors.events import EventField, EventMemory
 from edqn_jax.sim.sensors.exposure import FrameMemory
-from edqn_jax.xla import materialised
 
 Sensed = EventField | Array | None
 """What a sensor shows, see `Form`."""
@@ -302,9 +301,9 @@ def _show_depth_motion(
     near = nearness_image(config, now, position, quaternion)
     if poses.time is None:
         return jnp.stack([near, jnp.zeros_like(near)]), None
-    before = nearness_image(config, scene_at(scene, poses.time[0]), position, quaternion)
-    # Each computed once and alike: fused into their difference, what stands still would have a rate by rounding.
-    near, before = materialised((near, before))
+    # One program for both: compiled apart they round apart, and what stands still would have a rate.
+    times = jnp.stack([poses.time[-1], poses.time[0]])
+    near, before = jax.lax.map(lambda time: nearness_image(config, scene_at(scene, time), position, quaternion), times)
     rate = (near - before) / (poses.time[-1] - poses.time[0])
     return jnp.stack([near, jnp.tanh(rate / CLOSING_SCALE)]), None
 
