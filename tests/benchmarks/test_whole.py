@@ -28,7 +28,7 @@ def test_what_is_timed_is_training_past_its_beginning(monkeypatch: pytest.Monkey
     assert int(whole.state.step) == whole.done == 16
     assert whole.temporary_bytes > 0
     # A chunk in which nothing learnt must not pass for a fast one.
-    idle = SimpleNamespace(q_loss=np.array([np.nan]), reconstruction=np.array([1.0]))
+    idle = SimpleNamespace(metrics={"q_loss": np.array([np.nan]), "reconstruction_loss": np.array([1.0])})
     monkeypatch.setattr(whole.trainer, "chunk", lambda state, first: (state, (None, idle)))
     with pytest.raises(RuntimeError, match="did not learn throughout"):
         whole.turn()

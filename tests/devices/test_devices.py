@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import subprocess
+import sys
 import types
 from collections.abc import Iterator
 from pathlib import Path
@@ -130,3 +132,10 @@ def test_flags_of_xla_in_a_file_are_kept(tmp_path: Path, monkeypatch: pytest.Mon
     monkeypatch.setenv("XLA_FLAGS", str(file))
     use_cpu_devices(1)
     assert os.environ["XLA_FLAGS"] == f"--xla_cpu_enable_fast_math=false {devices.ALIKE}"
+
+
+def test_what_tests_compile_is_quick_to_compile_though_the_package_adds_a_flag_of_its_own() -> None:
+    environ = {name: value for name, value in os.environ.items() if name != "XLA_FLAGS"}
+    code = "import os, tests.conftest; print(os.environ['XLA_FLAGS'])"
+    said = subprocess.run([sys.executable, "-c", code], env=environ, text=True, capture_output=True, check=True)
+    assert "xla_backend_optimization_level=0" in said.stdout and "ynn_fusion_type=" in said.stdout

@@ -23,7 +23,7 @@ from jax import Array
 
 from edqn_jax.cli import main
 from edqn_jax.config import CameraConfig
-from edqn_jax.devices import devices, processes
+from edqn_jax.devices import devices, hardware, processes
 from edqn_jax.evaluation import rollouts
 from edqn_jax.learn.dqn.learner import DqnState
 from edqn_jax.learn.policy import fresh_policy
@@ -80,7 +80,8 @@ if __name__ == "__main__":
         noted["summary"] = train_run(*arguments, **options)
         return noted["summary"]
 
-    devices.cores, camera.luma = lambda: int(count), waves
+    hardware.cores = devices.cores = lambda: int(count)
+    camera.luma = waves
     gallery.prepare_gallery = lambda *_: lambda *_: None
     Trainer.init, record.train_run = noting_init, noting_run
     if argv[:1] == ["--no-learning"]:

@@ -12,7 +12,7 @@ import pytest
 from edqn_jax.cli.arguments import parse_train
 from edqn_jax.config import Config
 from edqn_jax.errors import CheckError
-from edqn_jax.learn import updates
+from edqn_jax.learn.dqn import learner as dqn
 from edqn_jax.learn.trainer import Trainer, TrainState
 from tests.miniature import MINIATURE, miniature_world
 
@@ -129,6 +129,6 @@ def test_an_array_with_other_axes_is_named(checked: Trainer, learning: TrainStat
 
 
 def test_a_key_that_is_used_twice_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(updates, "split_each", lambda keys, count: jnp.stack([keys] * count))
+    monkeypatch.setattr(dqn, "split_each", lambda keys, count: jnp.stack([keys] * count))
     with pytest.raises(CheckError, match="a random key is used twice"):
         trainer_of(CHECKED).compile()

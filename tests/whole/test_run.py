@@ -47,7 +47,9 @@ def test_a_run_stopped_before_any_validation_keeps_what_it_has_learnt(
 ) -> None:
     def chunk(self, state, first: int):
         """Stands for the compiled chunk: the policy's parameters grow by one, nothing else happens."""
-        learner = dataclasses.replace(state.learner, average=jax.tree.map(lambda x: x + 1, state.learner.agent.average))
+        agent = state.learner.agent
+        agent = dataclasses.replace(agent, average=jax.tree.map(lambda x: x + 1, agent.average))
+        learner = dataclasses.replace(state.learner, agent=agent)
         steps, none = CONFIG.train.chunk_steps, jnp.zeros((CONFIG.train.chunk_steps, 8, 2))
         return dataclasses.replace(state, learner=learner), (Episodes(none, none, none), no_losses(steps))
 

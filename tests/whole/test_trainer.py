@@ -427,8 +427,8 @@ def test_agents_that_train_together_train_as_each_alone(on_two, world: World) ->
         second_episodes, second_losses = together.each(jax.tree.map(np.asarray, returned))[1]
         # Flights are exact; batched products round otherwise, which after many updates would change a move.
         np.testing.assert_array_equal(second_episodes.outcome, episodes.outcome)
-        for name in ("reconstruction", "q_loss"):
-            np.testing.assert_allclose(getattr(second_losses, name), getattr(losses, name), rtol=1e-4)
+        for name in ("reconstruction_loss", "q_loss"):
+            np.testing.assert_allclose(second_losses.metrics[name], losses.metrics[name], rtol=1e-4)
         learnt |= bool(np.isfinite(losses.metrics["q_loss"]).any())
     assert learnt
     first, second = together.each(jax.tree.map(np.asarray, trainer.policy_of(together.config, two)))
