@@ -79,11 +79,11 @@ def even_field() -> ev.EventField:
     return ev.field_of_counts(EventsConfig(), jnp.asarray(counts))
 
 
-@pytest.mark.parametrize(("kind", "pooling"), [("table", "sum"), ("network", "sum"), ("network", "max")])
+@pytest.mark.parametrize("kind", ["table", "network"])
 @pytest.mark.parametrize("field", [ragged_field(1), even_field()], ids=["ragged", "even"])
 @pytest.mark.slow
-def test_dense_encoder_pools_single_events(kind, pooling, field):
-    config = dataclasses.replace(CONFIG, pooling=pooling, pixel_features=kind, time_frequencies=2)
+def test_dense_encoder_pools_single_events(kind, field):
+    config = dataclasses.replace(CONFIG, pixel_features=kind, time_frequencies=2)
     config = dataclasses.replace(config, features=8, hidden=16, code_size=5)
     params = fresh(config, SMALL, jax.random.key(0))
     x, y, tau, p = event_list(field)
