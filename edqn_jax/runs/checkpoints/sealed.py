@@ -24,7 +24,7 @@ from edqn_jax.files import unwritable
 SUFFIX = ".safetensors"
 
 _KINDS = {
-    **{"bool": "BOOL", "float16": "F16", "float32": "F32", "float64": "F64"},
+    **{"bool": "BOOL", "bfloat16": "BF16", "float16": "F16", "float32": "F32", "float64": "F64"},
     **{f"{sign}int{bits}": f"{sign or 'i'}{bits}".upper() for sign in ("", "u") for bits in (8, 16, 32, 64)},
 }
 _OPEN = "0" * 64  # the digits of a seal that is yet to be made
