@@ -57,7 +57,7 @@ def validate(config: Config, *, trains: bool = True) -> None:
         _several_drones(config, trains)
     LEARNERS.check(config.agent.learner)
     _replay(config.agent, config.train)
-    _pqn(config.pqn, config.train)
+    _pqn(config.pqn)
     _samples(config.encoder, config.train)
     judged = not config.world.flown or config.train.validation_missions >= 2
     limit = "at least 2 with world.flown, whose flight takes the place of one test world"
@@ -276,7 +276,7 @@ def _train(train: TrainConfig) -> None:
     _require(not train.debug or train.devices <= 1, "train.devices", "0 or 1 with train.debug", train.devices)
 
 
-def _pqn(pqn: PqnConfig, train: TrainConfig) -> None:
+def _pqn(pqn: PqnConfig) -> None:
     _positive(pqn, "pqn", ["rollout", "epochs", "minibatches"])
     _share(pqn, "pqn", ["trace"])
     _require(0 < pqn.average_rate <= 1, "pqn.average_rate", "more than 0 and at most 1", pqn.average_rate)

@@ -16,8 +16,8 @@ from edqn_jax.errors import ConfigError
 from edqn_jax.learn import policy, qnetwork, replay
 from edqn_jax.learn.perception import vae
 from edqn_jax.sim.actions import ACTIONS
-from edqn_jax.sim.sensors.events import field_of_counts
 from edqn_jax.sim.task.env import MOTION_SIZE, OWN_SIZE, Observation
+from tests.oracles import event_fields
 
 CONFIG = Config(
     camera=CameraConfig(width=8, height=6),
@@ -46,7 +46,11 @@ def observations(count, seed=0):
     own = rng.normal(size=(count, OWN_SIZE)).astype(np.float32)
     motion = rng.normal(size=(count, MOTION_SIZE)).astype(np.float32)
     return [
-        Observation(sensed=field_of_counts(CONFIG.events, jnp.asarray(c)), own=jnp.asarray(o), motion=jnp.asarray(m))
+        Observation(
+            sensed=event_fields.field_of_counts(CONFIG.events, jnp.asarray(c)),
+            own=jnp.asarray(o),
+            motion=jnp.asarray(m),
+        )
         for c, o, m in zip(counts, own, motion, strict=True)
     ]
 
@@ -138,9 +142,12 @@ def test_the_policy_is_strict(params):
     [
         (jnp.zeros((6, 8)), r"events of 1 x 6 x 8 .* in 0.04 s; this observation is 6 x 8 numbers"),
         (None, "this observation is nothing"),
-        (field_of_counts(CONFIG.events, jnp.zeros((12, 8), jnp.int8)), "this observation is events of 1 x 12 x 8"),
         (
-            field_of_counts(EventsConfig(frame_times_s=(-0.08, 0.0)), jnp.zeros((6, 8), jnp.int8)),
+            event_fields.field_of_counts(CONFIG.events, jnp.zeros((12, 8), jnp.int8)),
+            "this observation is events of 1 x 12 x 8",
+        ),
+        (
+            event_fields.field_of_counts(EventsConfig(frame_times_s=(-0.08, 0.0)), jnp.zeros((6, 8), jnp.int8)),
             "this observation is events of 1 x 6 x 8 frame pairs and pixels in 0.08 s",
         ),
     ],

@@ -15,10 +15,10 @@ from edqn_jax.learn import samples
 from edqn_jax.learn.perception import vae
 from edqn_jax.sim.physics import drone
 from edqn_jax.sim.scene.scene import UprightBoxes, build_scene, stack_scenes
-from edqn_jax.sim.sensors import events as ev
 from edqn_jax.sim.task import env
 from edqn_jax.sim.task.env import MOTION_SIZE, Observation
 from edqn_jax.sim.task.missions import own_missions
+from tests.oracles import event_fields
 
 ENVS, LENGTH = 3, 4
 CONFIG = EncoderConfig(replay_size=2 * ENVS * LENGTH, target="sensed", mirror=False)  # of two shards
@@ -32,7 +32,7 @@ def decision(number: int, config: EncoderConfig = CONFIG, *, even: bool = True) 
     """Samples of all environments in one decision; everything in them says which."""
     rng = np.random.default_rng(number)
     counts = rng.integers(-5, 6, (ENVS, SMALL.height, SMALL.width)).astype(np.int8)
-    field = jax.vmap(lambda c: ev.field_of_counts(EventsConfig(), c))(jnp.asarray(counts))
+    field = jax.vmap(lambda c: event_fields.field_of_counts(EventsConfig(), c))(jnp.asarray(counts))
     field = dataclasses.replace(field, divides_window=even)
     motion = jnp.full((ENVS, MOTION_SIZE), float(number)) + jnp.arange(ENVS)[:, None] / 10.0
     observation = Observation(field, jnp.zeros((ENVS, 10)), motion)
@@ -83,7 +83,7 @@ def test_what_is_drawn_belongs_together() -> None:
 @pytest.mark.slow
 def test_what_is_stored_is_encoded_as_what_was_seen(architecture, even, alone) -> None:
     config = EncoderConfig(architecture=architecture, code_size=4, replay_size=64, target="sensed", features=4)
-    field = jax.vmap(lambda c: ev.field_of_counts(EventsConfig(), c))(
+    field = jax.vmap(lambda c: event_fields.field_of_counts(EventsConfig(), c))(
         jnp.asarray(np.random.default_rng(3).integers(-200, 200, (ENVS, SMALL.height, SMALL.width)))
     )
     field = dataclasses.replace(field, divides_window=even)
@@ -115,7 +115,7 @@ def test_a_mirrored_sample_is_that_of_the_mirrored_image() -> None:
     motion = jnp.arange(1.0, 1.0 + MOTION_SIZE)
 
     def sample(counts: np.ndarray, near: jax.Array, motion: jax.Array) -> samples.Samples:
-        field = ev.field_of_counts(EventsConfig(), jnp.asarray(counts))
+        field = event_fields.field_of_counts(EventsConfig(), jnp.asarray(counts))
         observation = Observation(field, motion, motion)
         return samples.samples_of(config, observation, samples.target_of(config, observation, near))
 

@@ -35,19 +35,11 @@ POOL_SCALE = 1.0 / 8.0
 """Constant factor on the pooled sum: the root of some 64 events, so that the next layer sees unit scale."""
 
 
-def temporal_encoding(frequencies: int, tau: Array) -> Array:
-    """Returns `phi(t) = [1, cos(2 pi k tau), sin(2 pi k tau), ...]` for k = 1 .. frequencies: `[...]` to `[..., C]`.
-
-    `tau` is the time normalised to the window: 0 at its start, 1 at its end.
-    """
-    channels = [jnp.ones_like(tau)]
-    for k in range(1, frequencies + 1):
-        channels += [jnp.cos(2.0 * jnp.pi * k * tau), jnp.sin(2.0 * jnp.pi * k * tau)]
-    return jnp.stack(channels, axis=-1)
-
-
 def temporal_sums(frequencies: int, field: EventField) -> list[Array | None]:
-    """Returns the sums of `temporal_encoding` over each pixel's events in closed form: C arrays `[..., F, H, W]`.
+    """Returns the sums of phi(t) over each pixel's events in closed form: C arrays `[..., F, H, W]`.
+
+    `phi(t) = [1, cos(2 pi k tau), sin(2 pi k tau), ...]` for k = 1 .. frequencies; tau is 0 at the window's start and 1
+    at its end.
 
     None stands for a sum that is always zero: n events that divide the window evenly add up to
     the n-th roots of unity, which leave n where n divides the frequency, and nothing else.
@@ -101,10 +93,6 @@ class PixelTable(nn.Module):
         """Returns f of every pixel, `[channels, H * W, features]`, ON first."""
         return self.table
 
-    def at(self, x: Array, y: Array, p: Array) -> Array:
-        """Returns f, `[..., features]`, at columns x, rows y, polarities p."""
-        return self.table[(p < 0).astype(jnp.int32), y * self.width + x]
-
 
 class PixelNetwork(nn.Module):
     """f(x, y, p) as a ReLU network on the positional encoding and the polarity."""
@@ -130,7 +118,7 @@ class PixelNetwork(nn.Module):
 
 
 class PooledEncoder(nn.Module):
-    """Set encoder. `dense` and `sparse` share their parameters and agree; `picture` has its own."""
+    """Set encoder. `dense` and `picture` have parameters of their own."""
 
     config: EncoderConfig
     height: int
@@ -162,13 +150,6 @@ class PooledEncoder(nn.Module):
             phi_off = jnp.sum(jnp.where(field.polarity < 0, phi, 0.0), axis=-3).reshape(*batch, -1)
             pooled.append(phi_on @ on + phi_off @ off)
         return self._head(jnp.concatenate(pooled, axis=-1), POOL_SCALE)
-
-    def sparse(self, x: Array, y: Array, tau: Array, p: Array) -> tuple[Array, Array]:
-        """Returns mean and log-variance of event lists, each `[..., N]`; entries with p = 0 are no events."""
-        place = self.pixels.at(x, y, p) * (p != 0)[..., None]
-        phi = temporal_encoding(self.config.time_frequencies, tau)
-        pooled = jnp.einsum("...nf,...nc->...cf", place, phi)
-        return self._head(pooled.reshape(*pooled.shape[:-2], -1), POOL_SCALE)
 
     def picture(self, image: Array) -> tuple[Array, Array]:
         """Returns mean and log-variance `[..., code_size]` of pictures `[..., P, H, W]`."""

@@ -181,21 +181,6 @@ def encode(config: EncoderConfig, params: Params, sensed: EventField | Array, mo
     return encoder.apply({"params": params["encoder"]}, sensed, motion)  # type: ignore
 
 
-def encode_events(
-    config: EncoderConfig, params: Params, camera: CameraConfig, x: Array, y: Array, tau: Array, p: Array
-) -> tuple[Array, Array]:
-    """Returns the same as `encode` with the pooled encoder, from a list of events: `[..., N]` each.
-
-    Args:
-        x: column.
-        y: row.
-        tau: time in the window, 0 at its start and 1 at its end.
-        p: polarity; 0 marks an empty entry.
-    """
-    encoder = PooledEncoder(_of_kind(config, params), camera.height, camera.width)
-    return encoder.apply({"params": params["encoder"]}, x, y, tau, p, method=PooledEncoder.sparse)  # type: ignore
-
-
 def frozen(
     config: EncoderConfig, camera: CameraConfig, params: Params, *, form: Form = Form.EVENTS, layers: int = 1
 ) -> Params:

@@ -17,7 +17,7 @@ from edqn_jax.learn.perception.patch_encoder import log_counts, patch_places, pa
 from edqn_jax.sim.sensors import events as ev
 from edqn_jax.sim.sensors.sensor import Form
 from edqn_jax.sim.task.env import MOTION_SIZE
-from tests.oracles import patch_encoder_plain
+from tests.oracles import event_fields, patch_encoder_plain
 
 SMALL = CameraConfig(width=10, height=6)  # no multiple of a patch's side
 CONFIG = EncoderConfig(code_size=5, patch_layers=(6, 3), joint_layers=(8, 7))
@@ -155,7 +155,7 @@ def test_nearness_is_learnt_from_events_and_motion_and_not_from_events_alone() -
     speed = rng.uniform(0.5, 1.0, 512).astype(np.float32)
     near = rng.uniform(0.2, 1.0, 512).astype(np.float32)
     counts = np.rint(16 * near * speed).astype(np.int8)
-    fields = jax.vmap(partial(ev.field_of_counts, EventsConfig()))(
+    fields = jax.vmap(partial(event_fields.field_of_counts, EventsConfig()))(
         jnp.asarray(np.broadcast_to(counts[:, None, None], (512, 8, 8)))
     )
     motion = np.zeros((512, MOTION_SIZE), np.float32)
