@@ -48,7 +48,7 @@ def write(file: Path, arrays: Mapping[str, Any], texts: Mapping[str, str]) -> No
     # In this order all of them are aligned.
     held = dict(sorted(whole.items(), key=lambda item: -item[1].itemsize))
     header = _header(held, texts)
-    data = [np.ascontiguousarray(array).reshape(-1).view(np.uint8) for array in held.values()]
+    data = [np.ascontiguousarray(array).reshape(-1).view(np.uint8).data for array in held.values()]
     summed = hashlib.sha256(header)
     for piece in data:
         summed.update(piece)
