@@ -31,11 +31,11 @@ from pathlib import Path
 from typing import Any
 
 from edqn_jax.errors import ConfigError
-from edqn_jax.evaluation.intervals import median_interval
-from edqn_jax.files import check_can_write
 from measurement import json_report
 from measurement.child import Child, ChildEndedError
+from measurement.command import Parser, at_least_one, in_a_sentence
 from measurement.flags import configured, split
+from measurement.intervals import median_interval
 from measurement.parts import PARTS
 from measurement.whole import WHOLE
 
@@ -248,43 +248,31 @@ def parse(argv: Sequence[str] | None = None) -> tuple[argparse.Namespace, list[s
         ConfigError: if a row is unknown, the options after -- are invalid, or the file cannot be written.
     """
     words, flags = split(sys.argv[1:] if argv is None else argv)
-    parser = argparse.ArgumentParser(
-        prog="python benchmarks/compare.py",
-        description=__doc__,
-        epilog="All rows take about five minutes on two cores.",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    parser = Parser("compare", __doc__, epilog="All rows take about five minutes on two cores.")
     parser.add_argument("a", metavar="COMMIT_A", help="the commit to compare with")
     parser.add_argument("b", metavar="COMMIT_B", help="the commit to compare")
     parser.add_argument("--rows", nargs="+", default=[], metavar="ROW", help="rows to time (default: all common rows)")
-    parser.add_argument("--repeats", type=int, help=f"turns of each row (default {REPEATS}, quick {QUICK_REPEATS})")
+    parser.add_argument(
+        "--repeats", type=at_least_one, help=f"turns of each row (default {REPEATS}, quick {QUICK_REPEATS})"
+    )
     parser.add_argument("--quick", action="store_true", help="fewer and shorter turns")
-    parser.add_argument("--json", type=Path, help="write the report to this file")
-    args = parser.parse_args(words)
+    args = parser.parse(words)
     if args.repeats is None:
         args.repeats = QUICK_REPEATS if args.quick else REPEATS
-    if args.repeats < 1:
-        parser.error(f"--repeats must be at least 1, not {args.repeats}")
     for row in args.rows:
         if row not in (WHOLE, *PARTS):
             raise ConfigError(f"there is no row '{row}'; there are {', '.join((WHOLE, *PARTS))}")
-    if args.json is not None:
-        check_can_write(args.json)
     configured(flags)  # raises before anything is checked out
     return args, [*(["--quick"] if args.quick else []), "--", *flags]
 
 
+@in_a_sentence
 def main(argv: Sequence[str] | None = None, root: Path = ROOT) -> int:
     """Returns exit code 0 after both commits were timed, 2 for invalid input."""
-    try:
-        args, words = parse(argv)
-        report = measure(root, [args.a, args.b], args.rows, args.repeats, words)
-    except ConfigError as error:
-        print(error, file=sys.stderr)
-        return 2
+    args, words = parse(argv)
+    report = measure(root, [args.a, args.b], args.rows, args.repeats, words)
     print(table(report))
-    if args.json is not None:
-        json_report.write(args.json, report)
+    json_report.write(args.json, report)
     return 0
 
 

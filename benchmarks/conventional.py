@@ -18,7 +18,6 @@ import sys
 from collections.abc import Sequence
 from contextlib import ExitStack
 from importlib import metadata
-from pathlib import Path
 from typing import Any
 
 import jax
@@ -26,13 +25,11 @@ import jax
 from conventional_stack.settings import DRONES, PACKAGES, SETTINGS, supported
 from edqn_jax.config import Config
 from edqn_jax.devices.devices import use_cpu_devices
-from edqn_jax.errors import ConfigError
 from edqn_jax.evaluation.missions import run_missions
-from edqn_jax.extras import MissingPackageError
-from edqn_jax.files import check_can_write
 from edqn_jax.runs.provenance import workload
 from edqn_jax.sim.scene.mjcf import load_scene, resolve_world
 from measurement import json_report
+from measurement.command import Parser, at_least_one, in_a_sentence
 from measurement.flags import configured, split
 from measurement.whole import steady
 
@@ -47,22 +44,12 @@ def parse(argv: Sequence[str] | None = None) -> tuple[argparse.Namespace, Config
         ConfigError: if the options after -- are invalid, or the file cannot be written.
     """
     words, flags = split(sys.argv[1:] if argv is None else argv)
-    parser = argparse.ArgumentParser(
-        prog="python benchmarks/conventional.py",
-        description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    parser = Parser("conventional", __doc__)
     parser.add_argument(
-        "--decisions", type=int, default=DECISIONS, help=f"decisions of each turn (default {DECISIONS})"
+        "--decisions", type=at_least_one, default=DECISIONS, help=f"decisions of each turn (default {DECISIONS})"
     )
-    parser.add_argument("--repeats", type=int, default=REPEATS, help=f"turns of each row (default {REPEATS})")
-    parser.add_argument("--json", type=Path, help="write the report to this file")
-    args = parser.parse_args(words)
-    for name in ("decisions", "repeats"):
-        if getattr(args, name) < 1:
-            parser.error(f"--{name} must be at least 1, not {getattr(args, name)}")
-    if args.json is not None:
-        check_can_write(args.json)
+    parser.add_argument("--repeats", type=at_least_one, default=REPEATS, help=f"turns of each row (default {REPEATS})")
+    args = parser.parse(words)
     return args, steady(supported(configured(["--num-envs", str(DRONES), *flags])), 4)
 
 
@@ -128,18 +115,14 @@ def table(report: dict[str, Any]) -> str:
     return "\n".join(lines)
 
 
+@in_a_sentence
 def main(argv: Sequence[str] | None = None) -> int:
     """Returns exit code 0 after the measurement, 2 for invalid input."""
     use_cpu_devices()
-    try:
-        args, config = parse(argv)
-        report = measure(config, args.decisions, args.repeats)
-    except (ConfigError, MissingPackageError) as error:
-        print(error, file=sys.stderr)
-        return 2
+    args, config = parse(argv)
+    report = measure(config, args.decisions, args.repeats)
     print(table(report))
-    if args.json is not None:
-        json_report.write(args.json, report)
+    json_report.write(args.json, report)
     return 0
 
 

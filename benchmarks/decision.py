@@ -16,19 +16,17 @@ import os
 import statistics
 import sys
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 import jax
 
 from edqn_jax.config import Config
-from edqn_jax.errors import ConfigError
 from edqn_jax.evaluation.latency import decision_latency_ms
 from edqn_jax.evaluation.missions import run_missions
-from edqn_jax.files import check_can_write
 from edqn_jax.learn.policy import fresh_policy
 from edqn_jax.runs.provenance import workload
 from measurement import json_report
+from measurement.command import Parser, in_a_sentence
 from measurement.flags import configured, split
 
 REPEATS, CALLS = 5, 2000
@@ -41,16 +39,9 @@ def parse(argv: Sequence[str] | None = None) -> tuple[argparse.Namespace, Config
         ConfigError: if the options after -- are invalid, or the file cannot be written.
     """
     words, flags = split(sys.argv[1:] if argv is None else argv)
-    parser = argparse.ArgumentParser(
-        prog="python benchmarks/decision.py",
-        description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    parser = Parser("decision", __doc__)
     parser.add_argument("--quick", action="store_true", help=f"{CALLS // 10} decisions instead of {REPEATS} x {CALLS}")
-    parser.add_argument("--json", type=Path, help="write the report to this file")
-    args = parser.parse_args(words)
-    if args.json is not None:
-        check_can_write(args.json)
+    args = parser.parse(words)
     return args, configured(flags)
 
 
@@ -72,13 +63,10 @@ def measure(config: Config, repeats: int, calls: int) -> dict[str, Any]:
     }
 
 
+@in_a_sentence
 def main(argv: Sequence[str] | None = None) -> int:
     """Returns exit code 0 after the measurement, 2 for invalid input."""
-    try:
-        args, config = parse(argv)
-    except ConfigError as error:
-        print(error, file=sys.stderr)
-        return 2
+    args, config = parse(argv)
     if hasattr(os, "sched_setaffinity"):
         os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})  # before JAX starts its threads
     report = measure(config, *((1, CALLS // 10) if args.quick else (REPEATS, CALLS)))
@@ -87,8 +75,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         f"One decision on one core: median {row['median_ms']:.2f} ms, 99th percentile {row['p99_ms']:.2f} ms "
         f"({report['decisions']:,} decisions, {report['device']})"
     )
-    if args.json is not None:
-        json_report.write(args.json, report)
+    json_report.write(args.json, report)
     return 0
 
 

@@ -26,8 +26,7 @@ from edqn_jax.errors import ConfigError
 from edqn_jax.evaluation.missions import load_missions
 from edqn_jax.evaluation.rollouts import fly_on_all_devices
 from edqn_jax.evaluation.trajectories import trajectory
-from edqn_jax.extras import MissingPackageError, require
-from edqn_jax.files import check_can_write
+from edqn_jax.extras import require
 from edqn_jax.interop.onnx_export import export_policy
 from edqn_jax.interop.recordings.flight_events import flight_recording
 from edqn_jax.interop.runner import Runner
@@ -35,6 +34,7 @@ from edqn_jax.learn.policy import Policy
 from edqn_jax.runs.policies import load_policy
 from edqn_jax.runs.provenance import workload
 from measurement import json_report
+from measurement.command import Parser, in_a_sentence
 
 REPEATS, CALLS = 5, 2000
 
@@ -48,18 +48,11 @@ def parse(argv: Sequence[str] | None = None) -> argparse.Namespace:
     Raises:
         ConfigError: if the file cannot be written, or the camera has no pixels.
     """
-    parser = argparse.ArgumentParser(
-        prog="python benchmarks/deployed.py",
-        description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    parser = Parser("deployed", __doc__)
     parser.add_argument("run", nargs="?", type=Path, default=Path("pretrained"), help="folder of a run, or pretrained")
     parser.add_argument("--camera", nargs=2, type=int, metavar=("W", "H"), help="pixels (default: the policy's)")
     parser.add_argument("--quick", action="store_true", help=f"{CALLS // 10} decisions instead of {REPEATS} x {CALLS}")
-    parser.add_argument("--json", type=Path, help="write the report to this file")
-    args = parser.parse_args(argv)
-    if args.json is not None:
-        check_can_write(args.json)
+    args = parser.parse(argv)
     if args.camera is not None and min(args.camera) < 1:
         raise ConfigError(f"--camera must be two numbers of at least 1, not {args.camera[0]} {args.camera[1]}")
     return args
@@ -123,17 +116,14 @@ def _seconds(runner: Runner, given: list[tuple[np.ndarray, int, dict[str, Any]]]
     return np.array(seconds[warm:])
 
 
+@in_a_sentence
 def main(argv: Sequence[str] | None = None) -> int:
     """Returns exit code 0 after the measurement, 2 for invalid input."""
-    try:
-        args = parse(argv)
-        if hasattr(os, "sched_setaffinity"):
-            os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})  # before JAX and onnxruntime start their threads
-        camera = None if args.camera is None else (args.camera[0], args.camera[1])
-        report = measure(load_policy(args.run), camera, *((1, CALLS // 10) if args.quick else (REPEATS, CALLS)))
-    except (ConfigError, MissingPackageError) as error:
-        print(error, file=sys.stderr)
-        return 2
+    args = parse(argv)
+    if hasattr(os, "sched_setaffinity"):
+        os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})  # before JAX and onnxruntime start their threads
+    camera = None if args.camera is None else (args.camera[0], args.camera[1])
+    report = measure(load_policy(args.run), camera, *((1, CALLS // 10) if args.quick else (REPEATS, CALLS)))
     row = report["rows"][0]
     width, height = report["camera"]
     print(
@@ -141,8 +131,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         f"median {row['median_ms']:.2f} ms, 99th percentile {row['p99_ms']:.2f} ms ({report['decisions']:,} decisions, "
         f"{report['device']})"
     )
-    if args.json is not None:
-        json_report.write(args.json, report)
+    json_report.write(args.json, report)
     return 0
 
 

@@ -8,7 +8,6 @@ of the last four decisions, for a sensor that begins anew in each (as that of th
 
 from __future__ import annotations
 
-import argparse
 import sys
 from collections import Counter
 from collections.abc import Sequence
@@ -22,11 +21,9 @@ import numpy as np
 
 from edqn_jax.config import Config
 from edqn_jax.devices.devices import use_cpu_devices
-from edqn_jax.errors import ConfigError
 from edqn_jax.evaluation.companions import scene_of_flight
 from edqn_jax.evaluation.missions import MissionSet, load_missions
 from edqn_jax.evaluation.rollouts import fly_on_all_devices
-from edqn_jax.files import check_can_write
 from edqn_jax.runs.policies import load_run
 from edqn_jax.sim.camera import camera
 from edqn_jax.sim.physics.drone import Flight, yaw_of
@@ -38,6 +35,7 @@ from edqn_jax.sim.task import group
 from edqn_jax.sim.task.flights import Flights
 from edqn_jax.sim.task.outcomes import Outcome
 from measurement import json_report
+from measurement.command import Parser, at_least_one, in_a_sentence
 
 NAMES = {
     "boxes": "block",
@@ -194,30 +192,20 @@ def table(rows: Sequence[dict[str, Any]]) -> str:
     return "\n".join(lines)
 
 
+@in_a_sentence
 def main(argv: Sequence[str] | None = None) -> int:
     """Returns exit code 0; 2 for invalid input."""
-    parser = argparse.ArgumentParser(
-        prog="python benchmarks/failures.py", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = Parser("failures", __doc__, json="write a row for each collision to this file")
     parser.add_argument("run", type=Path, help="folder of a run, or pretrained")
     parser.add_argument("--world", help="--world of train.py (default: that of the run)")
     parser.add_argument("--missions", type=int, default=1000, help="number of missions (default 1000)")
     parser.add_argument("--seed", type=int, default=0, help="seed of the missions (default 0)")
-    parser.add_argument("--flights", type=int, default=50, help="most collisions to look at (default 50)")
-    parser.add_argument("--json", type=Path, help="write a row for each collision to this file")
-    args = parser.parse_args(argv)
-    if args.flights < 1:
-        parser.error(f"--flights must be at least 1, not {args.flights}")
-    try:
-        if args.json is not None:
-            check_can_write(args.json)
-        use_cpu_devices()
-        config, params = load_run(args.run)
-        group.check_alone(config, "this benchmark")
-        missions = load_missions(config, args.world or config.world.name, args.missions, args.seed)
-    except ConfigError as error:
-        print(error, file=sys.stderr)
-        return 2
+    parser.add_argument("--flights", type=at_least_one, default=50, help="most collisions to look at (default 50)")
+    args = parser.parse(argv)
+    use_cpu_devices()
+    config, params = load_run(args.run)
+    group.check_alone(config, "this benchmark")
+    missions = load_missions(config, args.world or config.world.name, args.missions, args.seed)
     flights = jax.tree.map(np.asarray, fly_on_all_devices(config, missions.world, params, args.seed, record=True))
     (collided,) = np.nonzero(flights.outcome == Outcome.COLLISION)
     rows = [look_back(config, missions, flights, int(mission)) for mission in collided[: args.flights]]

@@ -12,12 +12,10 @@ Arguments after -- are options of train.py. The interval is Wilson's, 95 %.
 
 from __future__ import annotations
 
-import argparse
 import sys
 from collections import Counter
 from collections.abc import Callable, Sequence
 from functools import partial
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -27,11 +25,9 @@ from jax import Array
 from edqn_jax.cli.arguments import parse_train
 from edqn_jax.config import FAMILIES, Config
 from edqn_jax.devices.devices import use_cpu_devices
-from edqn_jax.errors import ConfigError
 from edqn_jax.evaluation.intervals import rate_interval
 from edqn_jax.evaluation.missions import load_missions
 from edqn_jax.evaluation.rollouts import flight_keys
-from edqn_jax.files import check_can_write
 from edqn_jax.keys import run_streams
 from edqn_jax.sim.actions import DIRECTIONS, move_number
 from edqn_jax.sim.physics.drone import DroneState, yaw_of
@@ -39,6 +35,7 @@ from edqn_jax.sim.task import env, group
 from edqn_jax.sim.task.env import World
 from edqn_jax.sim.task.outcomes import Outcome
 from measurement import json_report
+from measurement.command import Parser, at_least_one, in_a_sentence
 from measurement.flags import judged_in_tests, split
 
 
@@ -77,27 +74,17 @@ def outcomes(config: Config, world: World, gate: str, key: Array) -> Array:
     return jax.lax.while_loop(lambda flying: jnp.any(flying[1] == Outcome.RUNNING), decide, start)[1]
 
 
+@in_a_sentence
 def main(argv: Sequence[str] | None = None) -> int:
     """Returns exit code 0; 2 for invalid input."""
     words, flags = split(sys.argv[1:] if argv is None else argv)
-    parser = argparse.ArgumentParser(
-        prog="python benchmarks/gates.py", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = Parser("gates", __doc__, json="write the rows to this file")
     parser.add_argument("--world", default="moving", choices=FAMILIES, help="(default moving)")
-    parser.add_argument("--missions", type=int, default=1000, help="test missions (default 1000)")
-    parser.add_argument("--json", type=Path, help="write the rows to this file")
-    args = parser.parse_args(words)
-    if args.missions < 1:
-        parser.error(f"--missions must be at least 1, not {args.missions}")
-    try:
-        if args.json is not None:
-            check_can_write(args.json)
-        config = judged_in_tests(parse_train(["--world", args.world, "--env.sensor", "blind", *flags])[1])
-        use_cpu_devices()
-        missions = load_missions(config, args.world, args.missions)
-    except ConfigError as error:
-        print(error, file=sys.stderr)
-        return 2
+    parser.add_argument("--missions", type=at_least_one, default=1000, help="test missions (default 1000)")
+    args = parser.parse(words)
+    config = judged_in_tests(parse_train(["--world", args.world, "--env.sensor", "blind", *flags])[1])
+    use_cpu_devices()
+    missions = load_missions(config, args.world, args.missions)
     names = [outcome.name.lower().replace("_", " ") for outcome in Outcome if outcome != Outcome.RUNNING]
     print(f"| gate | success | 95 % interval | {' | '.join(names)} |\n| --- | ---: | --- |{' ---: |' * len(names)}")
     rows = []

@@ -13,10 +13,8 @@ blind. Intervals are a bootstrap over seeds and missions, Wilson's for one seed.
 from __future__ import annotations
 
 import argparse
-import sys
 import time
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 import jax
@@ -25,11 +23,11 @@ import numpy as np
 from edqn_jax.config import FAMILIES
 from edqn_jax.errors import ConfigError
 from edqn_jax.evaluation.intervals import drawn_rates, rate_interval
-from edqn_jax.extras import MissingPackageError, require
-from edqn_jax.files import check_can_write
+from edqn_jax.extras import require
 from edqn_jax.runs.policies import load_policy
 from edqn_jax.runs.provenance import workload
 from measurement import json_report
+from measurement.command import Parser, at_least_one, in_a_sentence
 
 NAME = "EDQN/Random-v0"
 OBSERVATIONS = ("code", "kinematics")
@@ -65,11 +63,7 @@ def parse(argv: Sequence[str] | None = None) -> argparse.Namespace:
     Raises:
         ConfigError: if there are no random worlds of that name, or the file cannot be written.
     """
-    parser = argparse.ArgumentParser(
-        prog="python benchmarks/gym_learning.py",
-        description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    parser = Parser("gym_learning", __doc__)
     parser.add_argument("--world", default="medium", help="name of random worlds (default medium)")
     parser.add_argument("--observation", choices=OBSERVATIONS, default=OBSERVATIONS[0], help="default code")
     for name, default, help in (
@@ -78,16 +72,10 @@ def parse(argv: Sequence[str] | None = None) -> argparse.Namespace:
         ("--num-envs", DRONES, "drones that train"),
         ("--missions", MISSIONS, "test missions"),
     ):
-        parser.add_argument(name, type=int, default=default, help=f"{help} (default {default:,})")
-    parser.add_argument("--json", type=Path, help="write the report to this file")
-    args = parser.parse_args(argv)
-    for name in ("seeds", "decisions", "num_envs", "missions"):
-        if getattr(args, name) < 1:
-            parser.error(f"--{name.replace('_', '-')} must be at least 1, not {getattr(args, name)}")
+        parser.add_argument(name, type=at_least_one, default=default, help=f"{help} (default {default:,})")
+    args = parser.parse(argv)
     if args.world not in FAMILIES:
         raise ConfigError(f"--world must be one of {', '.join(FAMILIES)}, not '{args.world}'")
-    if args.json is not None:
-        check_can_write(args.json)
     return args
 
 
@@ -178,14 +166,11 @@ def measure(args: argparse.Namespace) -> dict[str, Any]:
     }
 
 
+@in_a_sentence
 def main(argv: Sequence[str] | None = None) -> int:
     """Returns exit code 0 after the measurement, 2 for invalid input or a missing package."""
-    try:
-        args = parse(argv)
-        report = measure(args)
-    except (ConfigError, MissingPackageError) as error:
-        print(error, file=sys.stderr)
-        return 2
+    args = parse(argv)
+    report = measure(args)
     for each in report["rows"]:
         (low, high), (least, most) = each["return_interval"], each["success_interval"]
         print(
@@ -194,8 +179,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         )
     low, high = report["return_gained_interval"]
     print(f"Training gains {low:.1f} to {high:.1f} of return; all took {report['total_seconds']:.0f} s.")
-    if args.json is not None:
-        json_report.write(args.json, report)
+    json_report.write(args.json, report)
     return 0
 
 

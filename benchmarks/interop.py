@@ -16,7 +16,6 @@ import sys
 import time
 from collections.abc import Callable, Sequence
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import jax
@@ -24,14 +23,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from edqn_jax.config import Config
-from edqn_jax.errors import ConfigError
-from edqn_jax.extras import MissingPackageError, require
-from edqn_jax.files import check_can_write
+from edqn_jax.extras import require
 from edqn_jax.runs.provenance import workload
 from edqn_jax.sim.actions import ACTIONS
 from edqn_jax.sim.task import env
 from edqn_jax.sim.task.environment import Environment
 from measurement import json_report
+from measurement.command import Parser, at_least_one, in_a_sentence
 from measurement.flags import configured, split
 
 DRONES = 256
@@ -46,19 +44,11 @@ def parse(argv: Sequence[str] | None = None) -> tuple[argparse.Namespace, Config
         ConfigError: if the options after -- are invalid, or the file cannot be written.
     """
     words, flags = split(sys.argv[1:] if argv is None else argv)
-    parser = argparse.ArgumentParser(
-        prog="python benchmarks/interop.py", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--num-envs", type=int, default=DRONES, help=f"drones of a vector (default {DRONES})")
-    parser.add_argument("--steps", type=int, default=STEPS, help=f"steps of a turn (default {STEPS})")
-    parser.add_argument("--repeats", type=int, default=REPEATS, help=f"turns of each row (default {REPEATS})")
-    parser.add_argument("--json", type=Path, help="write the report to this file")
-    args = parser.parse_args(words)
-    for name in ("num_envs", "steps", "repeats"):
-        if getattr(args, name) < 1:
-            parser.error(f"--{name.replace('_', '-')} must be at least 1, not {getattr(args, name)}")
-    if args.json is not None:
-        check_can_write(args.json)
+    parser = Parser("interop", __doc__)
+    parser.add_argument("--num-envs", type=at_least_one, default=DRONES, help=f"drones of a vector (default {DRONES})")
+    parser.add_argument("--steps", type=at_least_one, default=STEPS, help=f"steps of a turn (default {STEPS})")
+    parser.add_argument("--repeats", type=at_least_one, default=REPEATS, help=f"turns of each row (default {REPEATS})")
+    args = parser.parse(words)
     return args, configured(flags)
 
 
@@ -126,19 +116,15 @@ def measure(config: Config, drones: int, steps: int, repeats: int) -> dict[str, 
     }
 
 
+@in_a_sentence
 def main(argv: Sequence[str] | None = None) -> int:
     """Returns exit code 0 after the measurement, 2 for invalid input or a missing package."""
-    try:
-        args, config = parse(argv)
-        report = measure(config, args.num_envs, args.steps, args.repeats)
-    except (ConfigError, MissingPackageError) as error:
-        print(error, file=sys.stderr)
-        return 2
+    args, config = parse(argv)
+    report = measure(config, args.num_envs, args.steps, args.repeats)
     for row in report["rows"]:
         print(f"{row['name']:<16}{row['decisions_per_second']:>12,.0f} decisions/s")
     print(f"The vector makes {report['share_of_pure_functions']:.0%} of the pure functions' decisions.")
-    if args.json is not None:
-        json_report.write(args.json, report)
+    json_report.write(args.json, report)
     return 0
 
 

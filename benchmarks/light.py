@@ -32,6 +32,7 @@ from edqn_jax.devices.hardware import cores
 from edqn_jax.errors import ConfigError
 from edqn_jax.evaluation.missions import load_missions
 from edqn_jax.files import check_can_make
+from measurement.command import Parser, at_least_one, in_a_sentence
 from measurement.flags import split
 
 REAL = ("--exposure.real",)
@@ -46,27 +47,24 @@ SENSORS: dict[str, tuple[str, ...]] = {
 def parse(argv: Sequence[str] | None = None) -> argparse.Namespace:
     """Returns the parsed arguments; `flags` are those after --."""
     words, flags = split(sys.argv[1:] if argv is None else argv)
-    parser = argparse.ArgumentParser(
-        prog="python benchmarks/light.py", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = Parser("light", __doc__, json=None)
     lights = [0.1, 1.0, 10.0, 100.0, 1000.0, 10_000.0]
     parser.add_argument("--out", type=Path, required=True, help="folder of rows and policies")
     parser.add_argument("--world", default="medium", choices=FAMILIES, help="(default medium)")
     parser.add_argument("--sensors", nargs="+", default=list(SENSORS), choices=SENSORS, help="(default all)")
     parser.add_argument("--speeds", nargs="+", type=float, default=[4.0, 8.0], help="env.speed_m_s (default 4 8)")
     parser.add_argument("--lux", nargs="+", type=float, default=lights, help="(default 0.1 1 10 100 1000 10000)")
-    parser.add_argument("--seeds", type=int, default=5, help="training seeds, in one program (default 5)")
-    parser.add_argument("--missions", type=int, default=1000, help="test missions in each light (default 1000)")
+    parser.add_argument("--seeds", type=at_least_one, default=5, help="training seeds, in one program (default 5)")
+    parser.add_argument(
+        "--missions", type=at_least_one, default=1000, help="test missions in each light (default 1000)"
+    )
     parser.add_argument("--minutes", type=float, default=9.0, help="begin no row that would end later (default 9)")
     parser.add_argument("--train-only", action="store_true", help="leave the flights to a later call, on any machine")
     parser.add_argument("--report", action="store_true", help="measure no row, print those in --out")
-    args = parser.parse_args(words)
+    args = parser.parse(words)
     args.flags = flags
     if args.report and args.train_only:
         parser.error("--report measures nothing; leave out --train-only")
-    for name in ("seeds", "missions"):
-        if getattr(args, name) < 1:
-            parser.error(f"--{name} must be at least 1, not {getattr(args, name)}")
     if sorted(args.lux) != args.lux:
         parser.error("--lux must go from dark to bright")
     return args
@@ -121,32 +119,29 @@ def _cell(flown: dict[str, Any]) -> str:
     return f"{found['success']:.1%} ({100 * low:.1f} to {100 * high:.1f})"
 
 
+@in_a_sentence
 def main(argv: Sequence[str] | None = None) -> int:
     """Returns exit code 0 when every row is there, 3 when rows are left for another call, 2 for invalid input."""
     began = time.perf_counter()
     args = parse(argv)
-    try:
-        check_can_make(args.out)
-        rows = success.read_rows(args.out)
-        wanted = []
-        for speed in [] if args.report else args.speeds:
-            for sensor in args.sensors:
-                config = config_of(args, sensor, speed)
-                use_cpu_devices(most_that_divide(config.train.shards, cores()))
-                file = success.row_file(args.out, config, args.missions, f"light {args.lux} {args.seeds}")
-                folder = success.policies_of(file)
-                measure = functools.partial(measure_row, config, args, folder)
-                train = functools.partial(success.trained, config, args.seeds, folder)
-                wanted.append(success.Wanted(file, measure, train))
-        if args.train_only:
-            success.train_all(wanted, began + 60 * args.minutes)
-            return 3
-        left = success.measure(wanted, rows, began + 60 * args.minutes)
-        if rows:
-            print(table(rows))
-    except ConfigError as error:
-        print(error, file=sys.stderr)
-        return 2
+    check_can_make(args.out)
+    rows = success.read_rows(args.out)
+    wanted = []
+    for speed in [] if args.report else args.speeds:
+        for sensor in args.sensors:
+            config = config_of(args, sensor, speed)
+            use_cpu_devices(most_that_divide(config.train.shards, cores()))
+            file = success.row_file(args.out, config, args.missions, f"light {args.lux} {args.seeds}")
+            folder = success.policies_of(file)
+            measure = functools.partial(measure_row, config, args, folder)
+            train = functools.partial(success.trained, config, args.seeds, folder)
+            wanted.append(success.Wanted(file, measure, train))
+    if args.train_only:
+        success.train_all(wanted, began + 60 * args.minutes)
+        return 3
+    left = success.measure(wanted, rows, began + 60 * args.minutes)
+    if rows:
+        print(table(rows))
     return 3 if left else 0
 
 

@@ -29,12 +29,11 @@ import numpy as np
 from edqn_jax.config import FAMILIES
 from edqn_jax.devices.devices import use_cpu_devices
 from edqn_jax.errors import ConfigError
-from edqn_jax.evaluation.intervals import difference_interval
 from edqn_jax.evaluation.latency import decision_seconds, in_turn
 from edqn_jax.evaluation.metrics import summarise
 from edqn_jax.evaluation.rollouts import fly_on_all_devices
 from edqn_jax.extras import MissingPackageError
-from edqn_jax.files import check_can_write, write_atomically
+from edqn_jax.files import write_atomically
 from edqn_jax.learn import policy as acting
 from edqn_jax.learn.policy import Policy
 from edqn_jax.runs.policies import load_policy
@@ -51,6 +50,8 @@ from edqn_jax.sim.task.outcomes import Outcome
 from edqn_jax.sim.worlds import families
 from edqn_jax.sim.worlds.moving import Moving
 from measurement import json_report
+from measurement.command import Parser, in_a_sentence
+from measurement.intervals import difference_interval
 from rivals.mapping import grid
 from rivals.mapping.grid import MapConfig
 from rivals.mapping.growing_map import Moment, animate_growth, draw_growth
@@ -82,9 +83,7 @@ PICTURES = 6
 
 def parse(argv: Sequence[str] | None = None) -> argparse.Namespace:
     """Returns the parsed arguments."""
-    parser = argparse.ArgumentParser(
-        prog="python benchmarks/mapping.py", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = Parser("mapping", __doc__)
     parser.add_argument("--policy", type=Path, default=Path("pretrained"), help="run or policy (default pretrained)")
     parser.add_argument("--worlds", nargs="+", default=["rooms"], choices=FAMILIES, help="families (default rooms)")
     parser.add_argument("--methods", nargs="+", default=list(METHODS), choices=METHODS, help="(default all)")
@@ -95,8 +94,7 @@ def parse(argv: Sequence[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--calls", type=int, default=200, help="decisions that are timed (default 200)")
     parser.add_argument("--mission", type=int, default=0, help="world of --figure (default 0)")
     parser.add_argument("--figure", type=Path, help="draw one mission of the first method, a .png or .gif")
-    parser.add_argument("--json", type=Path, help="write the report to this file")
-    args = parser.parse_args(argv)
+    args = parser.parse(argv)
     for name, least in (("missions", 1), ("batch", 1), ("calls", 1), ("mission", 0)):
         if getattr(args, name) < least:
             parser.error(f"--{name} must be at least {least}, not {getattr(args, name)}")
@@ -304,24 +302,18 @@ def draw(policy: Policy, args: argparse.Namespace) -> None:
     print(f"{args.worlds[0]} {args.mission}: {outcome.name.lower()} after {len(moments)} decisions, in {args.figure}")
 
 
+@in_a_sentence
 def main(argv: Sequence[str] | None = None) -> int:
     """Returns exit code 0; 2 for invalid input."""
     args = parse(argv)
-    try:
-        for file in (args.json, args.figure):
-            if file is not None:
-                check_can_write(file)
-        use_cpu_devices()
-        policy = load_policy(args.policy)
-        pilots = {name: with_options(TUNED[name], args.set) for name in args.methods if name != "learned"}
-        for flown in pilots.values():
-            pilot.check_can_fly(policy.config, flown)
-        if args.figure is not None:
-            draw(policy, args)
-            return 0
-    except ConfigError as error:
-        print(error, file=sys.stderr)
-        return 2
+    use_cpu_devices()
+    policy = load_policy(args.policy)
+    pilots = {name: with_options(TUNED[name], args.set) for name in args.methods if name != "learned"}
+    for flown in pilots.values():
+        pilot.check_can_fly(policy.config, flown)
+    if args.figure is not None:
+        draw(policy, args)
+        return 0
     rows: list[Row] = []
     for family in args.worlds:
         world = course_of(policy, family, args.split, args.missions)

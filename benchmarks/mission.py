@@ -32,8 +32,9 @@ from edqn_jax.cli.arguments import parse_train
 from edqn_jax.config.loading import to_yaml
 from edqn_jax.devices.hardware import processor
 from edqn_jax.evaluation.metrics import wilson_interval
-from edqn_jax.files import check_can_write, write_atomically
+from edqn_jax.files import write_atomically
 from measurement import json_report
+from measurement.command import Parser, at_least_one, in_a_sentence
 from measurement.flags import split
 
 TRAIN = Path(__file__).resolve().parents[1] / "train.py"
@@ -52,26 +53,21 @@ QUICK = ("--total-steps", "49152", "--encoder.warmup-decisions", "16384")
 def parse(argv: Sequence[str] | None = None) -> argparse.Namespace:
     """Returns the parsed arguments; `flags` are those after --, for train.py."""
     words, flags = split(sys.argv[1:] if argv is None else argv)
-    parser = argparse.ArgumentParser(
-        prog="python benchmarks/mission.py", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--seeds", type=int, default=20, help="number of seeds (default 20)")
+    parser = Parser("mission", __doc__)
+    parser.add_argument("--seeds", type=at_least_one, default=20, help="number of seeds (default 20)")
     parser.add_argument("--first-seed", type=int, default=0, help="the first seed (default 0)")
     parser.add_argument("--world", default="paper", help="--world of train.py (default paper)")
     parser.add_argument(
         "--out", type=Path, default=Path("runs/mission"), help="folder of the runs (default runs/mission)"
     )
-    parser.add_argument("--json", type=Path, help="write the report to this file")
     parser.add_argument(
         "--kept-programs", action="store_true", help="let runs use what was compiled before; else each compiles anew"
     )
     parser.add_argument("--quick", action="store_true", help="two seeds, too short to learn")
-    args = parser.parse_args(words)
+    args = parser.parse(words)
     args.flags = flags
     if args.quick:
         args.seeds, args.flags = min(args.seeds, 2), [*QUICK, *args.flags]
-    if args.seeds < 1:
-        parser.error(f"--seeds must be at least 1, not {args.seeds}")
     return args
 
 
@@ -314,20 +310,18 @@ def report_of(
     }
 
 
+@in_a_sentence
 def main(argv: Sequence[str] | None = None) -> int:
     """Returns exit code 0 after the measurement, whatever the results; 2 for invalid input."""
     args = parse(argv)
     try:
-        if args.json is not None:
-            check_can_write(args.json)
         rows, summaries = measure(args)
     except (OSError, ValueError) as error:
         print(error, file=sys.stderr)
         return 2
     report = report_of(args, rows, summaries)
     print(f"{table(rows)}\n\n{sentences(report['totals'])}\n{report['device']}")
-    if args.json is not None:
-        json_report.write(args.json, report)
+    json_report.write(args.json, report)
     return 0
 
 

@@ -35,9 +35,9 @@ from edqn_jax.config import FAMILIES, Config
 from edqn_jax.config.loading import nearest, to_yaml
 from edqn_jax.devices.hardware import cores
 from edqn_jax.errors import ConfigError
-from edqn_jax.files import check_can_write
 from measurement import json_report
 from measurement.child import Child, ChildEndedError
+from measurement.command import Parser, in_a_sentence
 from measurement.flags import configured as for_timing
 from measurement.flags import judged_in_tests, split
 from measurement.whole import steady
@@ -91,11 +91,7 @@ def parse(argv: Sequence[str] | None = None) -> Asked:
         ConfigError: if a method or world is unknown, options are invalid, or a file cannot be read or written.
     """
     words, flags = split(sys.argv[1:] if argv is None else argv)
-    parser = argparse.ArgumentParser(
-        prog="python benchmarks/runtime.py",
-        description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    parser = Parser("runtime", __doc__)
     parser.add_argument(
         "--quick", action="store_true", help="60 000 decisions, two seeds, the paper's world: learners do not converge"
     )
@@ -120,9 +116,8 @@ def parse(argv: Sequence[str] | None = None) -> Asked:
     parser.add_argument(
         "--add", nargs="+", type=Path, default=[], metavar="FILE.json", help="add the rows of earlier reports"
     )
-    parser.add_argument("--json", type=Path, help="write the report to this file")
     parser.add_argument("--figure", type=Path, metavar="FILE.png", help="write a picture of the rows to this file")
-    args = parser.parse_args(words)
+    args = parser.parse(words)
     if args.worlds is None:
         args.worlds = list(QUICK_WORLDS if args.quick else WORLDS)
     if args.seeds is None:
@@ -140,9 +135,6 @@ def parse(argv: Sequence[str] | None = None) -> Asked:
     check_worlds(args.worlds)
     if args.figure is not None and args.figure.suffix != ".png":
         raise ConfigError(f"--figure must end in .png, not '{args.figure}'")
-    for file in (args.json, args.figure):
-        if file is not None:
-            check_can_write(file)
     added = [read(file) for file in args.add]
     joined(row for report in added for row in report["rows"])  # raises before anything is measured
     configs = {world: configured(world, flags, args.quick) for world in (args.worlds if args.seeds else [])}
@@ -399,16 +391,13 @@ def report_of(rows: Sequence[Row], rates: Sequence[dict[str, Any]]) -> dict[str,
     }
 
 
+@in_a_sentence
 def main(argv: Sequence[str] | None = None) -> int:
     """Returns exit code 0 after the measurement, whatever the results; 2 for invalid input."""
     keep_to_cpu()
-    try:
-        asked = parse(argv)
-        rows = measure(asked)
-        measured = measure_rates(asked)
-    except ConfigError as error:
-        print(error, file=sys.stderr)
-        return 2
+    asked = parse(argv)
+    rows = measure(asked)
+    measured = measure_rates(asked)
     rates = [*([measured] if measured else []), *(rate for report in asked.added for rate in report["rates"])]
     complaints = []
     try:

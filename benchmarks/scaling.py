@@ -33,10 +33,10 @@ from edqn_jax.config import Config
 from edqn_jax.devices.devices import choose_devices, use_cpu_devices
 from edqn_jax.errors import ConfigError
 from edqn_jax.evaluation.missions import RunMissions, run_missions
-from edqn_jax.files import check_can_write
 from edqn_jax.runs.provenance import workload
 from measurement import json_report
 from measurement.ceilings import Rollout
+from measurement.command import Parser, at_least_one, in_a_sentence
 from measurement.flags import configured, split
 from measurement.whole import WholeStep, steady
 
@@ -276,41 +276,29 @@ def parse(argv: Sequence[str] | None = None) -> tuple[argparse.Namespace, Config
         ConfigError: if the options after -- are invalid, or a file cannot be written.
     """
     words, flags = split(sys.argv[1:] if argv is None else argv)
-    parser = argparse.ArgumentParser(
-        prog="python benchmarks/scaling.py",
-        description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    parser = Parser("scaling", __doc__)
     parser.add_argument("--quick", action="store_true", help="fewer sizes and shorter turns")
     parser.add_argument(
         "--curves", nargs="+", choices=CURVES, default=list(CURVES), help="curves to measure (default: all)"
     )
-    parser.add_argument("--repeats", type=int, help=f"turns of each size (default {REPEATS}, quick {QUICK_REPEATS})")
-    parser.add_argument("--json", type=Path, help="write the report to this file")
+    parser.add_argument(
+        "--repeats", type=at_least_one, help=f"turns of each size (default {REPEATS}, quick {QUICK_REPEATS})"
+    )
     parser.add_argument("--figure", type=Path, help="write a picture of the curves to this PNG file")
-    args = parser.parse_args(words)
+    args = parser.parse(words)
     if args.repeats is None:
         args.repeats = QUICK_REPEATS if args.quick else REPEATS
-    if args.repeats < 1:
-        parser.error(f"--repeats must be at least 1, not {args.repeats}")
-    for file in (args.json, args.figure):
-        if file is not None:
-            check_can_write(file)
     return args, configured(flags)
 
 
+@in_a_sentence
 def main(argv: Sequence[str] | None = None) -> int:
     """Returns exit code 0 after the measurement, 2 for invalid input."""
     use_cpu_devices()
-    try:
-        args, config = parse(argv)
-        report = measure(config, args.curves, args.quick, args.repeats)
-    except ConfigError as error:
-        print(error, file=sys.stderr)
-        return 2
+    args, config = parse(argv)
+    report = measure(config, args.curves, args.quick, args.repeats)
     print(table(report))
-    if args.json is not None:
-        json_report.write(args.json, report)
+    json_report.write(args.json, report)
     if args.figure is not None:
         draw_scaling(report, args.figure)
     return 0

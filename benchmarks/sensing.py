@@ -18,7 +18,6 @@ import os
 import sys
 from collections.abc import Sequence
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import jax
@@ -27,10 +26,8 @@ import numpy as np
 
 from edqn_jax.config import FAMILIES, Config
 from edqn_jax.errors import ConfigError
-from edqn_jax.evaluation.intervals import median_interval
 from edqn_jax.evaluation.latency import decision_call, in_turn, look_call
 from edqn_jax.evaluation.missions import MissionSet, load_missions
-from edqn_jax.files import check_can_write
 from edqn_jax.learn import policy as acting
 from edqn_jax.learn.policy import Policy, fresh_policy
 from edqn_jax.runs.policies import load_policy
@@ -39,6 +36,8 @@ from edqn_jax.sim.sensors.sensor import frames_per_decision
 from edqn_jax.sim.task import env, group
 from edqn_jax.sim.task.outcomes import Outcome
 from measurement import json_report
+from measurement.command import Parser, at_least_one, in_a_sentence
+from measurement.intervals import median_interval
 
 SENSORS = ("events", "frames", "frame-pair")
 BYTES_OF_AN_EVENT, BYTES_OF_A_PIXEL = 4, 1
@@ -49,18 +48,12 @@ CALLS, BLOCK = 2000, 50
 
 def parse(argv: Sequence[str] | None = None) -> argparse.Namespace:
     """Returns the parsed arguments."""
-    parser = argparse.ArgumentParser(
-        prog="python benchmarks/sensing.py", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = Parser("sensing", __doc__)
     parser.add_argument("--policy", default="pretrained", help="run or policy that flies (default pretrained)")
     parser.add_argument("--worlds", nargs="+", default=["medium", "rooms"], choices=FAMILIES, help="of the flights")
-    parser.add_argument("--missions", type=int, default=64, help="test worlds of each (default 64)")
-    parser.add_argument("--calls", type=int, default=CALLS, help=f"decisions that are timed (default {CALLS})")
-    parser.add_argument("--json", type=Path, help="write the report to this file")
-    args = parser.parse_args(argv)
-    for name in ("missions", "calls"):
-        if getattr(args, name) < 1:
-            parser.error(f"--{name} must be at least 1, not {getattr(args, name)}")
+    parser.add_argument("--missions", type=at_least_one, default=64, help="test worlds of each (default 64)")
+    parser.add_argument("--calls", type=at_least_one, default=CALLS, help=f"decisions that are timed (default {CALLS})")
+    args = parser.parse(argv)
     return args
 
 
@@ -151,22 +144,17 @@ def table(rows: Sequence[dict[str, Any]]) -> str:
     return "\n".join(lines)
 
 
+@in_a_sentence
 def main(argv: Sequence[str] | None = None) -> int:
     """Returns exit code 0 after the measurement, 2 for invalid input."""
     args = parse(argv)
     if hasattr(os, "sched_setaffinity"):
         os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})  # before JAX starts its threads
-    try:
-        if args.json is not None:
-            check_can_write(args.json)
-        policy = load_policy(args.policy)
-        if policy.config.env.sensor != "events":
-            raise ConfigError(f"'{args.policy}' sees {policy.config.env.sensor}; --policy must be one that sees events")
-        group.check_alone(policy.config, "this benchmark")
-        courses = [load_missions(policy.config, world, args.missions) for world in args.worlds]
-    except ConfigError as error:
-        print(error, file=sys.stderr)
-        return 2
+    policy = load_policy(args.policy)
+    if policy.config.env.sensor != "events":
+        raise ConfigError(f"'{args.policy}' sees {policy.config.env.sensor}; --policy must be one that sees events")
+    group.check_alone(policy.config, "this benchmark")
+    courses = [load_missions(policy.config, world, args.missions) for world in args.worlds]
     rows = [row for course in courses for row in rows_of(policy, course, args.calls)]
     print(table(rows))
     if args.json is not None:

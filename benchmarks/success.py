@@ -53,6 +53,7 @@ from edqn_jax.runs.policies import load_policy, save_policy
 from edqn_jax.sim.task.env import World
 from edqn_jax.training.loop import train_seeds
 from measurement import json_report
+from measurement.command import Parser, at_least_one, in_a_sentence
 from measurement.flags import judged_in_tests, split
 from rivals.learners import flight_columns
 from rivals.planning import judged_scenes, shortest_lengths
@@ -69,22 +70,20 @@ FIRST_ROW_S = 240.0
 def parse(argv: Sequence[str] | None = None) -> argparse.Namespace:
     """Returns the parsed arguments; `flags` are those after --."""
     words, flags = split(sys.argv[1:] if argv is None else argv)
-    parser = argparse.ArgumentParser(
-        prog="python benchmarks/success.py", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = Parser("success", __doc__, json=None)
     worlds = ["sparse", "medium", "dense"]
     parser.add_argument("--out", type=Path, required=True, help="folder of rows and policies")
     parser.add_argument("--worlds", nargs="+", default=worlds, choices=FAMILIES, help="(default sparse medium dense)")
     parser.add_argument("--sensors", nargs="+", default=["events"], help="env.sensor of each row (default events)")
-    parser.add_argument("--seeds", type=int, default=5, help="training seeds, in one program (default 5)")
+    parser.add_argument("--seeds", type=at_least_one, default=5, help="training seeds, in one program (default 5)")
     parser.add_argument("--runs", nargs="+", type=Path, help="fly the policies of these runs instead of training")
     parser.add_argument("--shuffle-codes", action="store_true", help="give each drone what another one sees (--runs)")
-    parser.add_argument("--missions", type=int, default=1000, help="test missions of each seed (default 1000)")
+    parser.add_argument("--missions", type=at_least_one, default=1000, help="test missions of each seed (default 1000)")
     parser.add_argument("--minutes", type=float, default=9.0, help="begin no row that would end later (default 9)")
     parser.add_argument("--train-only", action="store_true", help="leave the flights to a later call, on any machine")
     parser.add_argument("--no-spl", action="store_true", help="do not search shortest paths")
     parser.add_argument("--report", action="store_true", help="measure no row, print those in --out, with SPL")
-    args = parser.parse_args(words)
+    args = parser.parse(words)
     args.flags = flags
     if args.runs and (flags or args.sensors != ["events"]):
         parser.error("--runs have their own sensor and options; leave out --sensors and the arguments after --")
@@ -94,9 +93,6 @@ def parse(argv: Sequence[str] | None = None) -> argparse.Namespace:
         parser.error("--report and --train-only fly nothing; leave out --runs")
     if args.report and args.train_only:
         parser.error("--report measures nothing; leave out --train-only")
-    for name in ("seeds", "missions"):
-        if getattr(args, name) < 1:
-            parser.error(f"--{name} must be at least 1, not {getattr(args, name)}")
     return args
 
 
@@ -443,25 +439,18 @@ def _course(row: Row) -> str:
     return f"{row['world']} {row['missions']} {_config_in(row).drone.body_radius_m:g}"
 
 
+@in_a_sentence
 def main(argv: Sequence[str] | None = None) -> int:
     """Returns exit code 0 when every row is there, 3 when rows are left for another call, 2 for invalid input."""
     began = time.perf_counter()
     args = parse(argv)
-    try:
-        check_can_make(args.out)
-        rows = read_rows(args.out)
-        wanted = [] if args.report else _wanted(args)
-    except ConfigError as error:
-        print(error, file=sys.stderr)
-        return 2
-    try:
-        if args.train_only:
-            train_all(wanted, began + 60 * args.minutes)
-            return 3
-        left = measure(wanted, rows, began + 60 * args.minutes)
-    except ConfigError as error:
-        print(error, file=sys.stderr)
-        return 2
+    check_can_make(args.out)
+    rows = read_rows(args.out)
+    wanted = [] if args.report else _wanted(args)
+    if args.train_only:
+        train_all(wanted, began + 60 * args.minutes)
+        return 3
+    left = measure(wanted, rows, began + 60 * args.minutes)
     shortest: dict[str, np.ndarray | None] = {}
     for row in [] if args.no_spl else rows:
         # Two cores search 1 000 worlds in 200 s.

@@ -17,7 +17,6 @@ import argparse
 import statistics
 import sys
 from collections.abc import Sequence
-from pathlib import Path
 from typing import Any
 
 import jax
@@ -29,11 +28,11 @@ from edqn_jax.devices.devices import choose_devices, use_cpu_devices
 from edqn_jax.devices.hardware import cores
 from edqn_jax.errors import ConfigError
 from edqn_jax.evaluation.missions import run_missions
-from edqn_jax.files import check_can_write
 from edqn_jax.learn.trainer import AXIS
 from edqn_jax.runs.provenance import workload
 from measurement import json_report
 from measurement.ceilings import Rollout, ceilings
+from measurement.command import Parser, at_least_one, in_a_sentence
 from measurement.flags import configured, split
 from measurement.parts import parts_of
 from measurement.timing import Timed
@@ -56,20 +55,11 @@ def parse(argv: Sequence[str] | None = None) -> tuple[argparse.Namespace, Config
         ConfigError: if the options after -- are invalid, or the file cannot be written.
     """
     words, flags = split(sys.argv[1:] if argv is None else argv)
-    parser = argparse.ArgumentParser(
-        prog="python benchmarks/throughput.py",
-        description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    parser.add_argument("--repeats", type=int, default=REPEATS, help=f"turns of each row (default {REPEATS})")
+    parser = Parser("throughput", __doc__)
+    parser.add_argument("--repeats", type=at_least_one, default=REPEATS, help=f"turns of each row (default {REPEATS})")
     parser.add_argument("--quick", action="store_true", help="one short turn of each row")
     parser.add_argument("--whole-only", action="store_true", help="do not time the parts")
-    parser.add_argument("--json", type=Path, help="write the report to this file")
-    args = parser.parse_args(words)
-    if args.repeats < 1:
-        parser.error(f"--repeats must be at least 1, not {args.repeats}")
-    if args.json is not None:
-        check_can_write(args.json)
+    args = parser.parse(words)
     config = configured(flags)
     if config.env.sensor != "events" and not args.whole_only:
         raise ConfigError(f"parts can be timed only for env.sensor events; {config.env.sensor} needs --whole-only")
@@ -192,18 +182,14 @@ def table(report: dict[str, Any]) -> str:
     return "\n".join(lines)
 
 
+@in_a_sentence
 def main(argv: Sequence[str] | None = None) -> int:
     """Returns exit code 0 after the measurement, 2 for invalid input."""
     use_cpu_devices()
-    try:
-        args, config = parse(argv)
-        report = measure(config, 1 if args.quick else args.repeats, not args.whole_only)
-    except ConfigError as error:
-        print(error, file=sys.stderr)
-        return 2
+    args, config = parse(argv)
+    report = measure(config, 1 if args.quick else args.repeats, not args.whole_only)
     print(table(report))
-    if args.json is not None:
-        json_report.write(args.json, report)
+    json_report.write(args.json, report)
     return 0
 
 

@@ -8,14 +8,12 @@ uses. Prints a Markdown table.
 
 from __future__ import annotations
 
-import argparse
 import itertools
 import json
 import platform
 import sys
 from collections.abc import Callable, Sequence
 from importlib.metadata import version
-from pathlib import Path
 from typing import Any
 
 import jax
@@ -23,9 +21,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from edqn_jax.config import Config, DroneConfig
-from edqn_jax.errors import ConfigError
-from edqn_jax.files import check_can_write, write_atomically
+from edqn_jax.files import write_atomically
 from edqn_jax.sim.physics.drone import DroneState, Flight, fly, hover, load_airframe, yaw_of
+from measurement.command import Parser, in_a_sentence
 
 Decide = Callable[[DroneState, jax.Array, jax.Array], tuple[DroneState, Flight]]
 
@@ -132,19 +130,11 @@ def table(rows: list[dict[str, Any]]) -> str:
     return "\n".join(lines)
 
 
+@in_a_sentence
 def main(argv: Sequence[str] | None = None) -> int:
     """Returns exit code 0 after the measurement, 2 for invalid input."""
-    parser = argparse.ArgumentParser(
-        prog="python benchmarks/tracking.py", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
-    parser.add_argument("--json", type=Path, help="write the report to this file")
-    args = parser.parse_args(argv)
-    try:
-        if args.json is not None:
-            check_can_write(args.json)
-    except ConfigError as error:
-        print(error, file=sys.stderr)
-        return 2
+    parser = Parser("tracking", __doc__)
+    args = parser.parse(argv)
     config = Config()
     rows = measure(config.drone, config.env.speed_m_s, batched_fly(config.drone))
     print(table(rows))

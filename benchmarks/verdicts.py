@@ -8,7 +8,6 @@ for any other outcome. The exit code is 1 if one outcome differs.
 
 from __future__ import annotations
 
-import argparse
 import json
 import platform
 import sys
@@ -21,14 +20,14 @@ import jax
 import numpy as np
 
 from edqn_jax.devices.devices import use_cpu_devices
-from edqn_jax.errors import ConfigError
 from edqn_jax.evaluation.missions import load_missions
 from edqn_jax.evaluation.rollouts import fly_on_all_devices
 from edqn_jax.evaluation.verdicts import CONTACT_TOLERANCE_M, Agreement, check_verdicts
-from edqn_jax.files import check_can_write, write_atomically
+from edqn_jax.files import write_atomically
 from edqn_jax.runs.policies import load_run
 from edqn_jax.sim.task import group
 from edqn_jax.sim.task.outcomes import Outcome
+from measurement.command import Parser, in_a_sentence
 
 
 def rows_of(results: list[Agreement]) -> list[dict[str, Any]]:
@@ -66,27 +65,19 @@ def table(rows: list[dict[str, Any]]) -> str:
     return "\n".join(lines)
 
 
+@in_a_sentence
 def main(argv: Sequence[str] | None = None) -> int:
     """Returns exit code 0 if all outcomes agree, 1 if one differs, 2 for invalid input."""
-    parser = argparse.ArgumentParser(
-        prog="python benchmarks/verdicts.py", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
-    )
+    parser = Parser("verdicts", __doc__)
     parser.add_argument("run", type=Path, help="folder of a run")
     parser.add_argument("--world", help="--world of train.py (default: that of the run)")
     parser.add_argument("--missions", type=int, default=200, help="number of missions (default 200)")
     parser.add_argument("--seed", type=int, default=0, help="seed of the missions (default 0)")
-    parser.add_argument("--json", type=Path, help="write the report to this file")
-    args = parser.parse_args(argv)
-    try:
-        if args.json is not None:
-            check_can_write(args.json)
-        use_cpu_devices()
-        config, params = load_run(args.run)
-        group.check_alone(config, "this benchmark")
-        course = load_missions(config, args.world or config.world.name, args.missions, args.seed)
-    except ConfigError as error:
-        print(error, file=sys.stderr)
-        return 2
+    args = parser.parse(argv)
+    use_cpu_devices()
+    config, params = load_run(args.run)
+    group.check_alone(config, "this benchmark")
+    course = load_missions(config, args.world or config.world.name, args.missions, args.seed)
     flights = fly_on_all_devices(config, course.world, params, args.seed, record=True)
     results = check_verdicts(config, course, flights)
     rows = rows_of(results)

@@ -205,7 +205,7 @@ def bereft(run: Path, most: int, seconds: float, draw: random.Random) -> tuple[i
 
 def newest(run: Path) -> str:
     """Returns the name of a run's newest checkpoint."""
-    names = sorted(place.name for place in run.glob("checkpoints/step-*") if place.name[-1].isdigit())
+    names = sorted(place.name for place in run.glob("checkpoints/step-*.safetensors"))
     return names[-1] if names else "the beginning"
 
 

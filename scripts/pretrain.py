@@ -58,7 +58,7 @@ A policy for random worlds ({families}), flown from simulated events.
 | seed | {seed}, the best of {seeds} in the validation worlds |
 | sees | events of the last {window:g} s (threshold {threshold:g}), its own state and motion |
 | camera | level, {width} x {height} pixels, {fov:g} degrees across |
-| format | configuration in `config.yaml`, parameters as an Orbax checkpoint (arrays, no pickle) |
+| format | configuration in `config.yaml`, parameters in `checkpoints/policy.safetensors` (arrays, no pickle) |
 | trained at | commit `{commit}`, with the options in `config.yaml` |
 | made by | `scripts/pretrain.py`, which trains with these options, edqn_jax {version} |
 

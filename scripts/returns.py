@@ -9,12 +9,17 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+
+import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.ticker import EngFormatter
 
 from edqn_jax.errors import ConfigError
 from edqn_jax.files import check_can_write
-from edqn_jax.report.curves import draw_runs
+from edqn_jax.report.curves import running_mean
+from edqn_jax.report.style import drawing
 from edqn_jax.runs.directory import RunDirectory
 
 WINDOW = 200
@@ -38,6 +43,36 @@ def grouped(words: Sequence[str]) -> dict[str, list[Path]]:
             raise ConfigError(f"each group must be a title of its own and the folders of its runs, not '{title}' alone")
         groups[title], rest = [Path(folder) for folder in folders], rest[end + 1 :]
     return groups
+
+
+def draw_runs(groups: Mapping[str, Sequence[np.ndarray]], window: int, file: Path) -> Figure:
+    """Draws the running mean of the returns of several runs, a line for each run and a panel for each group.
+
+    Args:
+        groups: by their titles the returns [episodes] of each run, in the order in which the episodes ended.
+        window: episodes of the mean.
+        file: PNG to write.
+    """
+    columns = min(len(groups), 2)
+    with drawing(7.0, 2.0 * -(-len(groups) // 2) + 0.3, file) as figure:
+        panels = figure.subplots(-(-len(groups) // columns), columns, sharex=True, squeeze=False).ravel()
+        for axes, (title, runs) in zip(panels, groups.items(), strict=False):
+            for number, returns in enumerate(runs):
+                if not len(returns):
+                    continue
+                window_here = min(window, len(returns))
+                mean = running_mean(np.asarray(returns, np.float64), window_here)
+                axes.plot(np.arange(len(mean)) + window_here, mean, lw=0.9, alpha=0.85, color=f"C{number}")
+            axes.set_title(title)
+            axes.xaxis.set_major_formatter(EngFormatter(sep=""))
+        for axes in panels[len(groups) :]:
+            axes.set_visible(False)
+        for axes in panels[max(len(groups) - columns, 0) : len(groups)]:
+            axes.set_xlabel("episode")
+            axes.tick_params(labelbottom=True)
+        for axes in panels[::columns]:
+            axes.set_ylabel(f"return, mean of {window:,}")
+    return figure
 
 
 def main(argv: Sequence[str] | None = None) -> int:

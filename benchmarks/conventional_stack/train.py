@@ -27,7 +27,6 @@ from conventional_stack.workers import SpreadFleet
 from edqn_jax.config import Config
 from edqn_jax.errors import ConfigError
 from edqn_jax.extras import require
-from edqn_jax.learn.perception.patch_encoder import is_recurrent
 from edqn_jax.learn.plan import Plan
 from edqn_jax.sim.actions import ACTIONS
 from edqn_jax.sim.task.flights import Flights
@@ -116,10 +115,8 @@ def check(config: Config) -> None:
             "the conventional stack's DQN supports only agent.history 1, agent.layer_norm False, agent.last_move "
             "False, agent.huber_delta 1 and agent.exploration_episodes 0"
         )
-    if config.encoder.architecture != "patches" or is_recurrent(config.encoder):
-        raise ConfigError(
-            "the conventional stack's VAE supports only encoder.architecture 'patches' and encoder.sequence_decisions 1"
-        )
+    if config.encoder.architecture != "patches":
+        raise ConfigError("the conventional stack's VAE supports only encoder.architecture 'patches'")
 
 
 class TimedDQN(stable_baselines3.DQN):

@@ -22,10 +22,11 @@ def machine(devices: Sequence[Any]) -> dict[str, Any]:
     }
 
 
-def write(file: Path, report: dict[str, Any]) -> None:
-    """Writes the report atomically.
+def write(file: Path | None, report: dict[str, Any]) -> None:
+    """Writes the report atomically, where a file is named.
 
     Raises:
         ConfigError: if the file cannot be written.
     """
-    write_atomically(file, json.dumps(plain(report), indent=1, allow_nan=False) + "\n")
+    if file is not None:
+        write_atomically(file, json.dumps(plain(report), indent=1, allow_nan=False) + "\n")

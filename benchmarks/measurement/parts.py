@@ -238,13 +238,12 @@ def encoding(now: Moment) -> Part:
     """Returns the part that encodes events."""
 
     def body(params: Any, carry):
-        field, motion, code = carry
-        code = vae.embed(now.config.encoder, params, field, motion, code)
-        return dataclasses.replace(field, count=depending_on(field.count, code)), motion, code
+        field, motion = carry
+        code = vae.embed(now.config.encoder, params, field, motion)
+        return dataclasses.replace(field, count=depending_on(field.count, code)), motion
 
     seen = now.next_step.observation
-    code = jnp.zeros((len(seen.motion), now.config.encoder.code_size))
-    return Part("encoder", body, now.learner.encoder, (seen.sensed, seen.motion, code), products=True)
+    return Part("encoder", body, now.learner.encoder, (seen.sensed, seen.motion), products=True)
 
 
 def acting(now: Moment) -> Part:

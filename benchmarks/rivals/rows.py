@@ -13,7 +13,8 @@ from typing import Any
 import numpy as np
 
 from edqn_jax.errors import ConfigError
-from edqn_jax.evaluation.intervals import difference_interval, rate_interval
+from edqn_jax.evaluation.intervals import rate_interval
+from measurement.intervals import difference_interval
 from rivals.planners.planner import SAMPLING
 
 Row = dict[str, Any]

@@ -57,7 +57,7 @@ def validate(config: Config, *, trains: bool = True) -> None:
         _several_drones(config, trains)
     LEARNERS.check(config.agent.learner)
     _replay(config.agent, config.train)
-    _pqn(config.pqn, config.train)
+    _pqn(config.pqn)
     _samples(config.encoder, config.train)
     judged = not config.world.flown or config.train.validation_missions >= 2
     limit = "at least 2 with world.flown, whose flight takes the place of one test world"
@@ -225,10 +225,7 @@ def _encoder(encoder: EncoderConfig) -> None:
     _positive(encoder, "encoder", ["code_size", "features", "hidden", "learning_rate", "hold_decisions"])
     _not_negative(encoder, "encoder", ["time_frequencies", "target_blur", "kl_weight", "warmup_decisions"])
     _positive(encoder, "encoder", ["warmup_updates_per_step", "patch_pixels", "batch_size", "replay_size"])
-    _positive(encoder, "encoder", ["retrain_decisions", "sequence_decisions"])
-    remembers = encoder.sequence_decisions == 1 or encoder.architecture == "patches"
-    needed = "1 unless encoder.architecture is patches"
-    _require(remembers, "encoder.sequence_decisions", needed, encoder.sequence_decisions)
+    _positive(encoder, "encoder", ["retrain_decisions"])
     times = encoder.retrain_at
     rising = all(earlier < later for earlier, later in zip(times, times[1:], strict=False))
     inside = rising and all(0 < time < 1 for time in times)
@@ -245,10 +242,10 @@ def _encoder(encoder: EncoderConfig) -> None:
 
 def _agent(agent: AgentConfig) -> None:
     _positive(agent, "agent", ["history", "n_step", "batch_size", "updates_per_step", "replay_size"])
-    _positive(agent, "agent", ["learning_rate", "reward_scale", "code_scale", "munchausen_temperature"])
+    _positive(agent, "agent", ["learning_rate", "reward_scale", "code_scale"])
     _not_negative(agent, "agent", ["final_learning_rate", "huber_delta"])
     _not_negative(agent, "agent", ["learning_starts", "random_decisions", "exploration_episodes"])
-    _share(agent, "agent", ["discount", "munchausen", "exploration_start", "exploration_end", "exploration_fraction"])
+    _share(agent, "agent", ["discount", "exploration_start", "exploration_end", "exploration_fraction"])
     for key in ("target_rate", "average_rate"):
         rate = getattr(agent, key)
         _require(0 < rate <= 1, f"agent.{key}", "more than 0 and at most 1", rate)
@@ -279,7 +276,7 @@ def _train(train: TrainConfig) -> None:
     _require(not train.debug or train.devices <= 1, "train.devices", "0 or 1 with train.debug", train.devices)
 
 
-def _pqn(pqn: PqnConfig, train: TrainConfig) -> None:
+def _pqn(pqn: PqnConfig) -> None:
     _positive(pqn, "pqn", ["rollout", "epochs", "minibatches"])
     _share(pqn, "pqn", ["trace"])
     _require(0 < pqn.average_rate <= 1, "pqn.average_rate", "more than 0 and at most 1", pqn.average_rate)
@@ -301,17 +298,9 @@ def _replay(agent: AgentConfig, train: TrainConfig) -> None:
 
 
 def _samples(encoder: EncoderConfig, train: TrainConfig) -> None:
-    batch, unit, named = encoder.batch_size, train.shards, f"train.shards ({train.shards})"
-    if encoder.sequence_decisions > 1:
-        length = encoder.sequence_decisions
-        _require(length <= 64, "encoder.sequence_decisions", "at most 64", length)
-        needed = length * train.num_envs
-        limit = f"at least {needed}: {length} observations for each of the {train.num_envs} environments"
-        _require(encoder.replay_size >= needed, "encoder.replay_size", limit, encoder.replay_size)
-        unit *= length
-        named += f" x encoder.sequence_decisions ({length})"
-    multiple = f"a multiple of {named}, such as {-(-batch // unit) * unit}"
-    _require(batch % unit == 0, "encoder.batch_size", multiple, batch)
+    batch, shards = encoder.batch_size, train.shards
+    multiple = f"a multiple of train.shards ({shards}), such as {-(-batch // shards) * shards}"
+    _require(batch % shards == 0, "encoder.batch_size", multiple, batch)
 
 
 def _require(holds: bool, name: str, limits: str, value: object) -> None:

@@ -22,6 +22,7 @@ from edqn_jax.config.limits import shown, validate
 from edqn_jax.config.options import CONDITIONS, FAMILIES, WITH_DETOURS, Config
 from edqn_jax.config.presets import preset as named_preset
 from edqn_jax.config.profiles import PROFILES
+from edqn_jax.config.retired import LAST_COMMIT, RETIRED, is_off
 from edqn_jax.errors import ConfigError
 
 Layer = Mapping[str, Mapping[str, Any]]
@@ -310,6 +311,7 @@ def apply(config: Config, layer: Layer, source: str) -> Config:
             )
         section = getattr(config, group)
         hints = typing.get_type_hints(type(section))
+        values = {key: value for key, value in values.items() if not _has_gone(f"{group}.{key}", value, source)}
         for key in values:
             if key not in hints:
                 raise ConfigError(f"{source}: there is no key '{group}.{_cut(key)}'{nearest(key, hints)}")
@@ -317,6 +319,20 @@ def apply(config: Config, layer: Layer, source: str) -> Config:
         profile = PROFILES[checked["profile"]] if group == "events" and "profile" in checked else {}
         changed[group] = dataclasses.replace(section, **{**profile, **checked})
     return dataclasses.replace(config, **changed)
+
+
+def _has_gone(name: str, value: Any, source: str) -> bool:
+    """Returns whether an option is a retired one that is off.
+
+    Raises:
+        ConfigError: if it is a retired one that is on.
+    """
+    if name in RETIRED and not is_off(name, value):
+        raise ConfigError(
+            f"{source}: '{name}' is no longer an option, and {_describe(value)} is not what happens without it; "
+            f"commit {LAST_COMMIT} is the last that has it"
+        )
+    return name in RETIRED
 
 
 def typed(value: Any, hint: Any, name: str) -> Any:

@@ -312,9 +312,6 @@ class EncoderConfig:
     """Widths of the ReLU layers that all patches share (`patches`)."""
     joint_layers: tuple[int, ...] = (128, 128)
     """Widths of the ReLU layers between joined patches and code (`patches`)."""
-    pooling: Literal["sum", "max"] = "sum"
-    """How events are pooled (`pooled`): the paper's sum over all of them, or the largest of each feature. Unused by
-    pictures."""
     features: int = 48
     """Pooled features per temporal channel (`pooled`)."""
     pixel_features: Literal["table", "network"] = "network"
@@ -339,15 +336,11 @@ class EncoderConfig:
     warmup_updates_per_step: int = 6
     """VAE updates per training step of the warm-up."""
     batch_size: int = 256
-    """Observations in a VAE update, drawn from the newest `replay_size`; a multiple of `train.shards` x
-    `sequence_decisions`."""
+    """Observations in a VAE update, drawn from the newest `replay_size`; a multiple of `train.shards`."""
     replay_size: int = 16_384
     """Observations that the VAE learns from, with what its decoder must draw of each."""
     mirror: bool = True
     """Mirror half of the observations of a VAE update left to right."""
-    sequence_decisions: int = 1
-    """Decisions in a row that a VAE update takes from a flight (`patches`), at most 64. With more than 1 the encoder is
-    recurrent: a code also depends on the one before, and is trained through as many."""
     hold_decisions: int = 4
     """Mean length of a random manoeuvre of the warm-up, decisions."""
     retrain_at: tuple[float, ...] = ()
@@ -381,10 +374,6 @@ class AgentConfig:
     """Dueling heads (Wang et al. 2016)."""
     double: bool = True
     """Double DQN targets (van Hasselt et al. 2016)."""
-    munchausen: float = 0.0
-    """Weight of the log-policy in the reward (Munchausen DQN, Vieillard et al. 2020); above 0 it replaces `double`."""
-    munchausen_temperature: float = 0.03
-    """Temperature of that policy, in units of scaled reward."""
     n_step: int = 3
     """Steps of the return before the bootstrap."""
     discount: float = 0.97

@@ -22,7 +22,6 @@ class Drone:
 
     state: EnvState  # without its key
     key: Array  # [2] uint32, the data of that key
-    code: Array  # [C] of the newest observation, for an encoder that remembers it; [0] where there is none
 
 
 @struct.dataclass
@@ -52,7 +51,7 @@ object whose fields it has to ask for in Python; so worlds go in as lists, and k
 
 def _held(state: State) -> Drone:
     flight = state.flight
-    return Drone(dataclasses.replace(flight, key=None), jax.random.key_data(flight.key), state.code)
+    return Drone(dataclasses.replace(flight, key=None), jax.random.key_data(flight.key))
 
 
 def _reset(
@@ -66,12 +65,12 @@ def _step(
     program: Program, leaves: Leaves, encoder: EncoderParams, drone: Drone, action: Array
 ) -> tuple[Drone, Decided]:
     key = jax.random.wrap_key_data(drone.key)
-    params, state = _params(program, leaves, encoder), State(dataclasses.replace(drone.state, key=key), drone.code)
+    params, state = _params(program, leaves, encoder), State(dataclasses.replace(drone.state, key=key))
     observed, state, reward, terminated, truncated, info = program.env.step(key, state, action, params)
     if program.limit is not None:
         cut = ~info["is_reset"] & (info["episode_length"] >= program.limit)
         truncated, ended = truncated | cut, state.flight.ended | cut
-        state = State(dataclasses.replace(state.flight, ended=ended), state.code)
+        state = State(dataclasses.replace(state.flight, ended=ended))
     return _held(state), Decided(observed, reward, info["outcome"], terminated, truncated)
 
 

@@ -79,7 +79,6 @@ class State:
     """One drone between two decisions."""
 
     flight: EnvState
-    code: Array  # [C] of the newest observation, for an encoder that remembers it; [0] where there is none
 
 
 @dataclasses.dataclass(frozen=True)
@@ -119,9 +118,7 @@ class FunctionalEnv:
         """
         mission = None if mission is None else jnp.asarray(mission, jnp.int32)
         flight, seen = env.reset(self.config, params.world, key, mission)
-        code = jnp.zeros(embedding.size(self.config) if self.observation == "code" else 0)
-        observed, code = self._observed(params, seen, code)
-        return observed, State(flight, code)
+        return self._observed(params, seen), State(flight)
 
     @as_tested
     def step(
@@ -142,10 +139,8 @@ class FunctionalEnv:
             bool: out of time, and info: `outcome` [] int32 of `edqn_jax.Outcome`, `is_success` [] bool, `is_reset` []
             bool, `episode_return` [] and `episode_length` [] int32 of the episode so far.
         """
-        before = jnp.where(state.flight.ended, 0.0, state.code)
         action = jnp.asarray(action, jnp.int32)  # which a user's own precision may have made int64
         flight, step = env.step(self.config, params.world, dataclasses.replace(state.flight, key=key), action)
-        observed, code = self._observed(params, step.observation, before)
         info = {
             "outcome": step.outcome,
             "is_success": step.outcome == Outcome.GOAL,
@@ -153,8 +148,9 @@ class FunctionalEnv:
             "episode_return": step.episode_return,
             "episode_length": step.episode_length,
         }
+        observed = self._observed(params, step.observation)
         truncated = step.outcome == Outcome.TIME_OUT
-        return observed, State(flight, code), step.reward, is_terminal(step.outcome), truncated, info
+        return observed, State(flight), step.reward, is_terminal(step.outcome), truncated, info
 
     @as_tested
     def step_autoreset(
@@ -175,21 +171,20 @@ class FunctionalEnv:
         info["final_observation"] = observed
         return choose(first, observed), choose(fresh, after), reward, terminated, truncated, info
 
-    def _observed(self, params: Params, seen: env.Observation, before: Array) -> tuple[Observed, Array]:
-        """Returns the observation, and the code to remember."""
+    def _observed(self, params: Params, seen: env.Observation) -> Observed:
         own, motion = _numbers(seen.own), _numbers(seen.motion)
         if self.observation == "kinematics":
-            return jnp.concatenate([own, motion]), before
+            return jnp.concatenate([own, motion])
         if self.observation == "code":
-            code = embedding.embed(self.config, params.encoder, seen, before)
+            code = embedding.embed(self.config, params.encoder, seen)
             assert code is not None
-            return jnp.concatenate([_numbers(code), own, motion]), code
+            return jnp.concatenate([_numbers(code), own, motion])
         sensed = seen.sensed
         if isinstance(sensed, EventField):
             counts = events.event_image(sensed).astype(jnp.float32)
             sensed = jnp.sign(counts) * jnp.log1p(jnp.abs(counts))
         assert sensed is not None
-        return {"image": _numbers(sensed), "own": own, "motion": motion}, before
+        return {"image": _numbers(sensed), "own": own, "motion": motion}
 
 
 @as_tested

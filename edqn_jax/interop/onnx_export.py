@@ -127,11 +127,7 @@ def about_policy(config: Config) -> dict[str, Any]:
     if sensor not in ("events", "event-image"):
         raise ConfigError(f"only policies that see events can be exported; the sensor of this one is '{sensor}'")
     encoder = config.encoder
-    if (
-        sensor == "events"
-        and encoder.architecture == "pooled"
-        and (not _only_counts(config) or encoder.pooling == "max")
-    ):
+    if sensor == "events" and encoder.architecture == "pooled" and not _only_counts(config):
         raise ConfigError(
             "this policy's encoder is 'pooled' and sees when each event was, which the runner does not; encoders of "
             "patches can be exported, and pooled sums of two frames with the law 'paper' or 'airsim' without noise"

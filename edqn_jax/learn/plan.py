@@ -59,15 +59,6 @@ class Plan:
             trained |= (first <= step) & (step < end)
         return trained
 
-    def begins_to_keep(self, config: Config, step: Array) -> Array:
-        """Returns whether steps `[...]` follow ones that gave the VAE nothing to learn from, bool."""
-        if config.encoder.keep_learning:
-            return step == 0
-        begins = jnp.zeros(jnp.shape(step), bool)
-        for first, _ in self.vae_training:
-            begins |= step == first
-        return begins
-
     def samples_kept(self, config: Config, step: Array) -> Array:
         """Returns how many steps before steps `[...]` gave the VAE something to learn from, int32."""
         if config.encoder.keep_learning:

@@ -60,12 +60,12 @@ def remember(memory: Memory, flat: Array) -> Memory:
     return jnp.concatenate([memory[..., 1:, :], flat[..., None, :]], axis=-2)
 
 
-def flatten(config: Config, params: Params, memory: Memory, observation: Observation) -> Array:
-    """Returns [..., D]: what is seen, by default as a code, and own state of observations [...] after a memory.
+def flatten(config: Config, params: Params, observation: Observation) -> Array:
+    """Returns [..., D]: what is seen, by default as a code, and own state of observations [...].
 
     With `agent.last_move` the move, which stays as it is where own states are turned, stands between both.
     """
-    seen = embedding.embed(config, params, observation, memory[..., -1, : embedding.size(config)])
+    seen = embedding.embed(config, params, observation)
     parts = [] if seen is None else [seen]
     if config.agent.last_move:
         parts.append(observation.motion[..., -MOVE_SIZE:])
@@ -74,7 +74,7 @@ def flatten(config: Config, params: Params, memory: Memory, observation: Observa
 
 def see(config: Config, params: Params, memory: Memory, observation: Observation) -> Memory:
     """Returns the memory [..., H, D] with the encoded observation [...] at its end."""
-    return remember(memory, flatten(config, params, memory, observation))
+    return remember(memory, flatten(config, params, observation))
 
 
 def act(
@@ -109,15 +109,15 @@ class Policy:
         return _act(self.config, self.params, memory, observation)
 
     @as_tested
-    def code(self, observation: Observation, memory: Memory | None = None) -> Array:
-        """Returns the code [C] that the encoder makes of one observation; the arguments are those of `act`.
+    def code(self, observation: Observation) -> Array:
+        """Returns the code [C] that the encoder makes of one observation, as `act` is given it.
 
         Raises:
             ConfigError: as `act`, or if the policy has no encoder.
         """
         if not embedding.has_code(self.config):
             raise ConfigError(f"the policy's sensor '{self.config.env.sensor}' has no encoder, so there is no code")
-        _, memory = self.act(observation, memory)
+        _, memory = self.act(observation)
         return memory[-1, : embedding.size(self.config)] / self.config.agent.code_scale
 
     @as_tested

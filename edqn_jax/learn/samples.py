@@ -10,8 +10,6 @@ nothing else of them is read.
 
 from __future__ import annotations
 
-from functools import partial
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -47,14 +45,13 @@ class Samples:
     sensed: Counts | EventField | Array  # a picture is an array
     motion: Array  # [..., MOTION_SIZE]
     wanted: Target
-    begins: Array  # [...] bool, whether the row before is not the decision before
 
 
-def samples_of(config: EncoderConfig, observation: Observation, wanted: Target, begins: Array) -> Samples:
+def samples_of(config: EncoderConfig, observation: Observation, wanted: Target) -> Samples:
     """Returns observations and their targets in the form in which they are stored."""
     sensed = observation.sensed
     assert isinstance(sensed, EventField | Array)
-    return Samples(_stored(config, sensed), observation.motion, wanted, begins)
+    return Samples(_stored(config, sensed), observation.motion, wanted)
 
 
 def empty(config: EncoderConfig, one: Samples, envs: int, total_envs: int) -> Samples:
@@ -84,34 +81,29 @@ def write(ring: Samples, rows: Samples, time: Array, keep: Array) -> Samples:
 
 
 def draw(config: EncoderConfig, ring: Samples, time: Array, count: int, key: Array) -> Samples:
-    """Returns `count` samples of one shard, [T, count / T, ...]: T in a row, of which the first is uniform.
+    """Returns `count` samples of one shard, each of which is uniform.
 
     Args:
-        time: [] int32, how many decisions have been kept, at least 1. Before there are T, the last is repeated.
+        time: [] int32, how many decisions have been kept, at least 1.
         key: consumed.
     """
     rows, envs = ring.motion.shape[:2]
-    length, flights = config.sequence_decisions, count // config.sequence_decisions
-    row_key, env_key, *coin_key = jax.random.split(key, 2 + flights % 2)
+    row_key, env_key, *coin_key = jax.random.split(key, 2 + count % 2)
     oldest = jnp.maximum(time - (rows - 1), 0)
-    first = oldest + integers(row_key, (flights,), jnp.maximum(time - oldest - length, 0) + 1)
-    row = jnp.minimum(first + jnp.arange(length)[:, None], time - 1) % (rows - 1)
-    env = integers(env_key, (flights,), envs)
+    row = (oldest + integers(row_key, (count,), time - oldest)) % (rows - 1)
+    env = integers(env_key, (count,), envs)
     check_index(env, envs, "the samples' environments")
     check_index(row, jnp.minimum(time, rows - 1), "the samples that have been kept")
     drawn = jax.tree.map(lambda leaf: leaf[row, env], ring)
     if not config.mirror:
         return drawn
     # Half of them; of an odd number the one in the middle is mirrored or not.
-    half = flights // 2
-    turned = jax.tree.map(lambda leaf: leaf[:, : half + 1 if coin_key else half], mirrored(drawn))
+    half = count // 2
+    turned = jax.tree.map(lambda leaf: leaf[: half + 1 if coin_key else half], mirrored(drawn))
     if coin_key:
         middle = jax.random.bernoulli(*coin_key)
-        turned = jax.tree.map(
-            lambda new, old: new.at[:, half].set(jnp.where(middle, new[:, half], old[:, half])), turned, drawn
-        )
-    join = partial(jnp.concatenate, axis=1)
-    return jax.tree.map(lambda new, old: join([new, old[:, new.shape[1] :]]), turned, drawn)
+        turned = jax.tree.map(lambda new, old: new.at[half].set(jnp.where(middle, new[half], old[half])), turned, drawn)
+    return jax.tree.map(lambda new, old: jnp.concatenate([new, old[len(new) :]]), turned, drawn)
 
 
 def mirrored(samples: Samples) -> Samples:
@@ -123,7 +115,6 @@ def mirrored(samples: Samples) -> Samples:
         sensed=jax.tree.map(lambda image: jnp.flip(image, axis=-1), samples.sensed),
         motion=samples.motion * jnp.asarray(MIRRORED_MOTION),
         wanted=Target(amplitudes * signs, samples.wanted.beyond),
-        begins=samples.begins,
     )
 
 

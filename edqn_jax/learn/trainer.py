@@ -173,7 +173,7 @@ def _empty_samples(config: Config, world: World, state: EnvState) -> Samples | N
     def one(state: EnvState) -> Samples:
         observation = env.step(config, world, state, jnp.zeros((), jnp.int32))[1].observation
         wanted = samples.target_of(config.encoder, observation, env.nearness(config, world, state))
-        return samples.samples_of(config.encoder, observation, wanted, jnp.zeros((), bool))
+        return samples.samples_of(config.encoder, observation, wanted)
 
     if group.several(config):
         whole = jax.eval_shape(group.each(config, one), state)
@@ -346,12 +346,11 @@ def _keep(config: Config, world: World, actors: Actors, flown: EnvState, seen: e
 
     nothing = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(target))
     wanted = lax.cond(keep, target, lambda: nothing)
-    begins = seen.is_reset | plan.begins_to_keep(config, step)
-    rows = samples.samples_of(config.encoder, seen.observation, wanted, begins)
+    rows = samples.samples_of(config.encoder, seen.observation, wanted)
     if group.several(config):
         assert seen.waits is not None
         mate = group.mates(config, seen.waits)
-        rows = dataclasses.replace(jax.tree.map(lambda x: x[mate], rows), begins=begins)
+        rows = jax.tree.map(lambda x: x[mate], rows)
     write = jax.vmap(samples.write, in_axes=(0, 0, None, None))
     return write(actors.samples, _shaped(actors.reward.shape, rows), plan.samples_kept(config, step), keep)
 

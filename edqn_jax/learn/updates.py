@@ -75,16 +75,15 @@ def update_vae(
 
     def loss(params: Params, batch: Samples, noise: Array):
         sensed = samples.read(batch)
-        total, parts = vae.vae_loss(config.encoder, params, sensed, batch.motion, batch.wanted, noise, batch.begins)
+        total, parts = vae.vae_loss(config.encoder, params, sensed, batch.motion, batch.wanted, noise)
         return total * part, parts
 
     def update(networks: Networks, keys: Array):
         draw_keys, noise_keys = split_each(keys, 2)
         batch = jax.vmap(lambda ring, key: samples.draw(config.encoder, ring, kept, share, key))(rings, draw_keys)
         # Each shard draws its own noise, so that the layout on devices does not change it.
-        shape = *batch.motion.shape[1:-1], config.encoder.code_size
-        noise = jax.vmap(lambda key: jax.random.normal(key, shape))(noise_keys)
-        batch, noise = jax.tree.map(_side_by_side, (batch, noise))
+        noise = jax.vmap(lambda key: jax.random.normal(key, (share, config.encoder.code_size)))(noise_keys)
+        batch, noise = jax.tree.map(flat, (batch, noise))
         gradient, parts = jax.grad(loss, has_aux=True)(networks.vae, batch, noise)
         found = gradient, jax.tree.map(lambda x: jnp.mean(x) * part, parts)
         gradient, parts = all_sum(found, axis, after=0.0)
@@ -109,8 +108,3 @@ def update_vae(
 def flat(x: Array) -> Array:
     """Returns [S * E, ...] of [S, E, ...]."""
     return x.reshape(-1, *x.shape[2:])
-
-
-def _side_by_side(x: Array) -> Array:
-    """Returns [T, S * B, ...] of [S, T, B, ...]."""
-    return jnp.moveaxis(x, 0, 1).reshape(x.shape[1], -1, *x.shape[3:])

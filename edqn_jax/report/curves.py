@@ -92,36 +92,6 @@ def draw_learning(metrics: Sequence[Mapping[str, Any]], file: Path) -> Figure:
     return figure
 
 
-def draw_runs(groups: Mapping[str, Sequence[np.ndarray]], window: int, file: Path) -> Figure:
-    """Draws the running mean of the returns of several runs, a line for each run and a panel for each group.
-
-    Args:
-        groups: by their titles the returns [episodes] of each run, in the order in which the episodes ended.
-        window: episodes of the mean.
-        file: PNG to write.
-    """
-    columns = min(len(groups), 2)
-    with drawing(7.0, 2.0 * -(-len(groups) // 2) + 0.3, file) as figure:
-        panels = figure.subplots(-(-len(groups) // columns), columns, sharex=True, squeeze=False).ravel()
-        for axes, (title, runs) in zip(panels, groups.items(), strict=False):
-            for number, returns in enumerate(runs):
-                if not len(returns):
-                    continue
-                window_here = min(window, len(returns))
-                mean = running_mean(np.asarray(returns, np.float64), window_here)
-                axes.plot(np.arange(len(mean)) + window_here, mean, lw=0.9, alpha=0.85, color=f"C{number}")
-            axes.set_title(title)
-            axes.xaxis.set_major_formatter(EngFormatter(sep=""))
-        for axes in panels[len(groups) :]:
-            axes.set_visible(False)
-        for axes in panels[max(len(groups) - columns, 0) : len(groups)]:
-            axes.set_xlabel("episode")
-            axes.tick_params(labelbottom=True)
-        for axes in panels[::columns]:
-            axes.set_ylabel(f"return, mean of {window:,}")
-    return figure
-
-
 def running_mean(values: np.ndarray, window: int) -> np.ndarray:
     """Returns the means of every `window` neighbours, [len(values) - window + 1]."""
     sums = np.cumsum(np.concatenate([[0.0], values]))

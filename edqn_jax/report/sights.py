@@ -104,13 +104,12 @@ class Sights:
     ) -> _Images:
         """The images of `shown` at [D, T, ...] poses and times with own motions [D, MOTION_SIZE].
 
-        The sensor carries its memory from each decision to the next, and so does a recurrent encoder.
+        The sensor carries its memory from each decision to the next.
         """
         config = self.config
         start, rest = jax.random.split(jax.random.key(0))
 
-        def one(before: tuple[Any, Array], given: tuple[Array, ...]) -> tuple[tuple[Any, Array], _Images]:
-            memory, code = before
+        def one(memory: Any, given: tuple[Array, ...]) -> tuple[Any, _Images]:
             position, quaternion, time, motion, key = given
             here = Flight(position, quaternion, jnp.zeros_like(position), time)
             now = scene_at(scene, time[-1])
@@ -119,16 +118,16 @@ class Sights:
             nearness = None
             if embedding.needs_nearness(config):
                 nearness = sensor.nearness_image(config, now, position[-1], quaternion[-1])
-            code = vae.embed(config.encoder, params.encoder, sensed, motion, code)
+            code = vae.embed(config.encoder, params.encoder, sensed, motion)
             image = events.event_image(sensed) if isinstance(sensed, EventField) else sensed[0]
             target = vae.target(config.encoder, sensed, nearness)
             made = vae.decode(config.encoder, config.camera, params.encoder, code)
             drawn = (_drawn(config, sensed, channels) for channels in (target, made))
             luma = sensor.view(config, now, position[-1], quaternion[-1])
-            return (memory, code), (image, *drawn, luma)  # type: ignore[return-value]
+            return memory, (image, *drawn, luma)  # type: ignore[return-value]
 
         keys = jax.random.split(rest, len(position))
-        before = sensor.at_rest(config, start), jnp.zeros(config.encoder.code_size)
+        before = sensor.at_rest(config, start)
         return jax.lax.scan(one, before, (position, quaternion, time, motion, keys))[1]
 
     def _compile_rgb(self) -> Compiled:

@@ -205,7 +205,7 @@ class Keeper:
         if checkpoint is None:
             return None
         world_copy.check_unchanged(run.path, self.config)
-        where = f"the checkpoint in '{checkpoint.folder}'"
+        where = f"the checkpoint in '{checkpoint.file}'"
         wrote, here = checkpoint.facts.get("edqn_jax"), states.versions()
         if wrote != here["edqn_jax"]:
             raise ConfigError(

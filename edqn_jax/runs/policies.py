@@ -17,8 +17,8 @@ from edqn_jax.files import check_can_make, write_atomically
 from edqn_jax.learn.policy import Policy, PolicyParams, fresh_policy
 from edqn_jax.policies import no_run, policy_folder
 from edqn_jax.runs import world_copy
-from edqn_jax.runs.checkpoints import manifest
 from edqn_jax.runs.checkpoints.params import load_params, save_params, saved_at
+from edqn_jax.runs.checkpoints.sealed import digest
 from edqn_jax.runs.directory import SEED_FOLDER, config_text, version_of
 from edqn_jax.version import package_version
 
@@ -108,12 +108,12 @@ def worlds_replaced(run: Path) -> list[str]:
 
 
 def policy_digest(run: Path) -> str:
-    """Returns the SHA-256 of a policy's manifest, which has those of all its files.
+    """Returns the SHA-256 of a policy's file.
 
     Raises:
         ConfigError: if there is no policy.
     """
-    return manifest.digest(saved_at(policy_folder(run) / "checkpoints") / manifest.MANIFEST)
+    return digest(saved_at(policy_folder(run) / "checkpoints"))
 
 
 def _shapes(params: PolicyParams) -> PolicyParams:

@@ -1,7 +1,7 @@
 """A run's own copy of the world files that it trains and flies in, so that what it was measured in stays.
 
 `world/name.xml` and `world/flown.xml` are the files of `world.name` and `world.flown`, where these are no random
-worlds; a manifest beside them has their digests.
+worlds; `SHA256SUMS` beside them has their digests, as `sha256sum --check` reads them.
 """
 
 from __future__ import annotations
@@ -11,13 +11,16 @@ import shutil
 from pathlib import Path
 
 from edqn_jax.config import FAMILIES, Config, WorldConfig
-from edqn_jax.errors import ConfigError
+from edqn_jax.errors import ConfigError, DamagedError
 from edqn_jax.files import unwritable
-from edqn_jax.runs.checkpoints import manifest
+from edqn_jax.runs.checkpoints.sealed import digest, sync
 from edqn_jax.sim.scene.mjcf import SceneError, resolve_world
 
 WORLD = "world"
 """The folder of the copies within that of a run."""
+
+SUMS = "SHA256SUMS"
+"""File with the digests, which is written last."""
 
 _ROLES = ("name", "flown")
 
@@ -38,7 +41,9 @@ def keep(folder: Path, config: Config) -> None:
             partial.mkdir()
             for role in roles:
                 shutil.copyfile(resolve_world(getattr(config.world, role)), partial / f"{role}.xml")
-            manifest.seal(partial)
+            (partial / SUMS).write_text(_sums(partial), encoding="utf-8")
+            for path in (*partial.iterdir(), partial):
+                sync(path)
             partial.rename(copies)
     except OSError as error:
         raise unwritable(copies, error.strerror) from None
@@ -80,7 +85,7 @@ def _changed(folder: Path, config: Config) -> list[tuple[str, str, Path]]:
     """Returns of each world that differs from its copy its role, how it differs, and the copy."""
     if not (folder / WORLD).is_dir():
         return []
-    manifest.check(folder / WORLD)
+    _check(folder / WORLD)
     found = []
     for role in _roles(config.world):
         name, copy = getattr(config.world, role), folder / WORLD / f"{role}.xml"
@@ -92,6 +97,33 @@ def _changed(folder: Path, config: Config) -> list[tuple[str, str, Path]]:
         except (SceneError, OSError):
             found.append((role, "is missing", copy))
     return found
+
+
+def _check(copies: Path) -> None:
+    """Raises unless copies are as they were made.
+
+    Raises:
+        DamagedError: names the first one that is not.
+        ConfigError: if one cannot be read.
+    """
+    try:
+        if not (copies / SUMS).is_file():
+            raise DamagedError(f"'{copies}' is incomplete: it has no {SUMS}")
+        made, found = (copies / SUMS).read_bytes()[:1_000_000].decode(errors="replace"), _sums(copies)
+    except OSError as error:
+        raise ConfigError(f"'{copies}' cannot be read: {error.strerror or 'unknown reason'}") from None
+    changed = sorted(set(made.splitlines()) ^ set(found.splitlines()))
+    if changed:
+        raise DamagedError(f"'{copies}' is damaged: '{changed[0][66:]}' is missing, new or not as it was copied")
+
+
+def _sums(copies: Path) -> str:
+    """Returns name and digest of each of the copies, a line each."""
+    for path in copies.iterdir():
+        if path.is_symlink() or not path.is_file():
+            raise DamagedError(f"'{copies}' is damaged: '{path.name}' is no file")
+    names = sorted(path.name for path in copies.iterdir() if path.name != SUMS)
+    return "".join(f"{digest(copies / name)}  {name}\n" for name in names)
 
 
 def _roles(world: WorldConfig) -> list[str]:

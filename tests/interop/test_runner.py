@@ -54,13 +54,9 @@ def pretrained() -> Policy:
 
 
 def fresh(**groups: Any) -> Policy:
-    """A policy that has learnt nothing; recurrent weights are not 0."""
+    """A policy that has learnt nothing."""
     config = make_config("medium", drone={"physics": "rigid_body"}, camera={"width": 16, "height": 12}, **groups)
-    params = fresh_policy(config)
-    if config.encoder.sequence_decisions > 1:
-        remembered = params.encoder["encoder"]["previous"]
-        remembered["kernel"] = 0.1 * np.ones_like(remembered["kernel"])
-    return Policy(config, params)
+    return Policy(config, fresh_policy(config))
 
 
 def event(t: int, x: int, y: int, p: int) -> np.ndarray:
@@ -109,10 +105,9 @@ def _way(each: Decided) -> np.ndarray:
         {"events": {"threshold": 0.08, "tolerance": 0.02}, "agent": {"history": 4, "dueling": False}},
         {"env": {"sensor": "event-image"}},
         {"env": {"position": False, "heading": "flight"}},
-        {"encoder": {"sequence_decisions": 4}},
         {"encoder": {"architecture": "pooled"}, "agent": {"history": 1, "layer_norm": True}},
     ],
-    ids=["esim", "noise", "threshold", "event-image", "no-position", "recurrent", "pooled"],
+    ids=["esim", "noise", "threshold", "event-image", "no-position", "pooled"],
 )
 def test_other_policies_fly_as_in_jax(tmp_path, groups):
     policy = fresh(**groups)
@@ -303,7 +298,6 @@ def test_nothing_is_written_where_onnx_and_jax_differ(tmp_path, monkeypatch):
     [
         ({"env": {"sensor": "depth"}}, "the sensor of this one is 'depth'"),
         ({"encoder": {"architecture": "pooled"}, "events": {"law": "esim"}}, "sees when each event was"),
-        ({"encoder": {"architecture": "pooled", "pooling": "max"}}, "sees when each event was"),
     ],
 )
 def test_policies_that_see_more_than_counts_are_refused(tmp_path, groups, says):

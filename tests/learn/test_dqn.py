@@ -90,25 +90,6 @@ def test_a_double_batch_by_hand():
     assert loss == pytest.approx(0.5 * (1 + 0.9 * 30 - 1) ** 2)
 
 
-def test_a_munchausen_batch_by_hand():
-    soft = dataclasses.replace(LINEAR, munchausen=0.5, munchausen_temperature=2.0)
-    online, target = linear([[1.0, 2.0], [5.0, 4.0]]), linear([[1.0, 3.0], [3.0, 4.0]])
-    loss, _ = losses.batch_loss(soft, online, target, 2, two_samples((1.0, 0.0)))
-    # Vieillard et al. 2020, Eq. 1: the policy is the softmax of the target network's values over the temperature.
-    before, after = (
-        np.exp(np.array(row) / 2.0) / np.exp(np.array(row) / 2.0).sum() for row in ([1.0, 3.0], [3.0, 4.0])
-    )
-    bonus = 0.5 * max(2.0 * np.log(before[0]), -1.0)
-    value = np.sum(after * (np.array([3.0, 4.0]) - 2.0 * np.log(after)))
-    assert bonus == -0.5  # at its bound
-    assert loss == pytest.approx(0.5 * (1.0 + bonus + 0.9 * value - 1.0) ** 2, rel=1e-5)
-    likely = dataclasses.replace(two_samples((1.0, 0.0)), action=jnp.array([1, 0]))
-    loss, _ = losses.batch_loss(soft, online, target, 2, likely)
-    bonus = 0.5 * 2.0 * np.log(before[1])
-    assert bonus > -0.5
-    assert loss == pytest.approx(0.5 * (1.0 + bonus + 0.9 * value - 2.0) ** 2, rel=1e-5)
-
-
 def test_polyak_moves_by_its_rate():
     old, new = {"a": jnp.array([0.0, 8.0])}, {"a": jnp.array([4.0, 0.0])}
     np.testing.assert_allclose(optimiser.polyak(new, old, 0.25)["a"], [1.0, 6.0])

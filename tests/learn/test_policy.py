@@ -16,8 +16,8 @@ from edqn_jax.errors import ConfigError
 from edqn_jax.learn import policy, qnetwork, replay
 from edqn_jax.learn.perception import vae
 from edqn_jax.sim.actions import ACTIONS
-from edqn_jax.sim.sensors.events import field_of_counts
 from edqn_jax.sim.task.env import MOTION_SIZE, OWN_SIZE, Observation
+from tests.oracles import event_fields
 
 CONFIG = Config(
     camera=CameraConfig(width=8, height=6),
@@ -46,7 +46,11 @@ def observations(count, seed=0):
     own = rng.normal(size=(count, OWN_SIZE)).astype(np.float32)
     motion = rng.normal(size=(count, MOTION_SIZE)).astype(np.float32)
     return [
-        Observation(sensed=field_of_counts(CONFIG.events, jnp.asarray(c)), own=jnp.asarray(o), motion=jnp.asarray(m))
+        Observation(
+            sensed=event_fields.field_of_counts(CONFIG.events, jnp.asarray(c)),
+            own=jnp.asarray(o),
+            motion=jnp.asarray(m),
+        )
         for c, o, m in zip(counts, own, motion, strict=True)
     ]
 
@@ -63,7 +67,7 @@ flatten = jax.jit(partial(policy.flatten, CONFIG))
 def test_memory_stacks_an_episode_as_the_replay_does(params, act):
     seen = observations(5)
     memory = policy.empty_memory(CONFIG)
-    flat = np.stack([flatten(params.encoder, memory, each) for each in seen])
+    flat = np.stack([flatten(params.encoder, each) for each in seen])
     history = CONFIG.agent.history
     # The replay's rows: an older episode's observations before this one's first, which is a reset.
     rows = np.concatenate([np.full((history, SIZE), 9.0, np.float32), flat])
@@ -77,27 +81,10 @@ def test_memory_stacks_an_episode_as_the_replay_does(params, act):
         np.testing.assert_allclose(memory, trained_on, atol=1e-5)
 
 
-def test_a_recurrent_policy_remembers_what_its_encoder_was_trained_to() -> None:
-    config = dataclasses.replace(CONFIG, encoder=dataclasses.replace(CONFIG.encoder, sequence_decisions=4))
-    encoder = vae.init_vae(config.encoder, config.camera, jax.random.key(2))
-    previous = encoder["encoder"]["previous"]
-    previous["kernel"] = jax.random.normal(jax.random.key(3), previous["kernel"].shape)  # at first it remembers nothing
-    seen = observations(5)
-    together = jax.tree.map(lambda *leaves: jnp.stack(leaves), *seen)
-    codes, _ = vae.encode(config.encoder, encoder, together.sensed, together.motion, begins=jnp.zeros(5, bool))  # pyright: ignore[reportArgumentType]
-    memory = policy.empty_memory(config)
-    see = jax.jit(partial(policy.see, config))
-    for number, each in enumerate(seen):
-        memory = see(encoder, memory, each)
-        np.testing.assert_allclose(memory[-1, :5], config.agent.code_scale * codes[number], atol=1e-5)
-    alone = vae.encode(config.encoder, encoder, seen[-1].sensed, seen[-1].motion, jnp.zeros(5))[0]  # pyright: ignore[reportArgumentType]
-    assert np.abs(alone - codes[-1]).max() > 0.01
-
-
 @pytest.mark.slow
 def test_an_observation_is_the_scaled_code_and_the_own_state(params):
     one = observations(1)[0]
-    flat = flatten(params.encoder, policy.empty_memory(CONFIG), one)
+    flat = flatten(params.encoder, one)
     assert flat.shape == (SIZE,) == (5 + OWN_SIZE,)
     code = vae.embed(CONFIG.encoder, params.encoder, one.sensed, one.motion)  # pyright: ignore[reportArgumentType]
     np.testing.assert_allclose(flat[:5], CONFIG.agent.code_scale * code, rtol=1e-6)
@@ -109,8 +96,8 @@ def test_a_network_that_sees_the_last_move_has_it_between_the_code_and_the_own_s
     config = dataclasses.replace(CONFIG, agent=dataclasses.replace(CONFIG.agent, last_move=True))
     one = observations(1)[0]
     memory = policy.empty_memory(config)
-    flat = policy.flatten(config, params.encoder, memory, one)
-    plain = flatten(params.encoder, policy.empty_memory(CONFIG), one)
+    flat = policy.flatten(config, params.encoder, one)
+    plain = flatten(params.encoder, one)
     assert flat.shape == memory.shape[1:] == (policy.observation_size(config),)
     np.testing.assert_array_equal(flat[5:8], one.motion[4:])
     np.testing.assert_allclose(np.delete(flat, [5, 6, 7]), plain, rtol=1e-6)
@@ -155,9 +142,12 @@ def test_the_policy_is_strict(params):
     [
         (jnp.zeros((6, 8)), r"events of 1 x 6 x 8 .* in 0.04 s; this observation is 6 x 8 numbers"),
         (None, "this observation is nothing"),
-        (field_of_counts(CONFIG.events, jnp.zeros((12, 8), jnp.int8)), "this observation is events of 1 x 12 x 8"),
         (
-            field_of_counts(EventsConfig(frame_times_s=(-0.08, 0.0)), jnp.zeros((6, 8), jnp.int8)),
+            event_fields.field_of_counts(CONFIG.events, jnp.zeros((12, 8), jnp.int8)),
+            "this observation is events of 1 x 12 x 8",
+        ),
+        (
+            event_fields.field_of_counts(EventsConfig(frame_times_s=(-0.08, 0.0)), jnp.zeros((6, 8), jnp.int8)),
             "this observation is events of 1 x 6 x 8 frame pairs and pixels in 0.08 s",
         ),
     ],

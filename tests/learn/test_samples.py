@@ -15,10 +15,10 @@ from edqn_jax.learn import samples
 from edqn_jax.learn.perception import vae
 from edqn_jax.sim.physics import drone
 from edqn_jax.sim.scene.scene import UprightBoxes, build_scene, stack_scenes
-from edqn_jax.sim.sensors import events as ev
 from edqn_jax.sim.task import env
 from edqn_jax.sim.task.env import MOTION_SIZE, Observation
 from edqn_jax.sim.task.missions import own_missions
+from tests.oracles import event_fields
 
 ENVS, LENGTH = 3, 4
 CONFIG = EncoderConfig(replay_size=2 * ENVS * LENGTH, target="sensed", mirror=False)  # of two shards
@@ -32,12 +32,11 @@ def decision(number: int, config: EncoderConfig = CONFIG, *, even: bool = True) 
     """Samples of all environments in one decision; everything in them says which."""
     rng = np.random.default_rng(number)
     counts = rng.integers(-5, 6, (ENVS, SMALL.height, SMALL.width)).astype(np.int8)
-    field = jax.vmap(lambda c: ev.field_of_counts(EventsConfig(), c))(jnp.asarray(counts))
+    field = jax.vmap(lambda c: event_fields.field_of_counts(EventsConfig(), c))(jnp.asarray(counts))
     field = dataclasses.replace(field, divides_window=even)
     motion = jnp.full((ENVS, MOTION_SIZE), float(number)) + jnp.arange(ENVS)[:, None] / 10.0
     observation = Observation(field, jnp.zeros((ENVS, 10)), motion)
-    begins = jnp.full(ENVS, number % 2 == 0)
-    return samples.samples_of(config, observation, samples.target_of(config, observation, None), begins)
+    return samples.samples_of(config, observation, samples.target_of(config, observation, None))
 
 
 def ring_after(kept: list[bool]) -> tuple[samples.Samples, int]:
@@ -62,7 +61,7 @@ def ring_after(kept: list[bool]) -> tuple[samples.Samples, int]:
 def test_what_was_kept_last_is_drawn_and_nothing_else(kept, expected) -> None:
     ring, time = ring_after(kept)
     drawn = draw(ring, jnp.int32(time), 256, jax.random.key(0))
-    numbers, envs = np.divmod(np.rint(10 * np.asarray(drawn.motion[0, :, 0])).astype(int), 10)
+    numbers, envs = np.divmod(np.rint(10 * np.asarray(drawn.motion[:, 0])).astype(int), 10)
     assert set(numbers) == expected and set(envs) == set(range(ENVS))
     # Uniform: 256 draws of at most 12 samples; five standard deviations below the mean of 21 is 0.
     assert np.bincount(numbers)[sorted(expected)].min() > 256 / len(expected) / 2
@@ -72,9 +71,9 @@ def test_what_is_drawn_belongs_together() -> None:
     ring, time = ring_after([True] * 3)
     drawn = draw(ring, jnp.int32(time), 64, jax.random.key(1))
     for index in range(0, 64, 7):
-        number, env = divmod(round(10 * float(drawn.motion[0, index, 0])), 10)
+        number, env = divmod(round(10 * float(drawn.motion[index, 0])), 10)
         source = jax.tree.map(lambda x, env=env: x[env], decision(number))
-        jax.tree.map(lambda x, y, at=index: np.testing.assert_array_equal(x[0, at], y), drawn, source)
+        jax.tree.map(lambda x, y, at=index: np.testing.assert_array_equal(x[at], y), drawn, source)
 
 
 @pytest.mark.parametrize(
@@ -84,14 +83,14 @@ def test_what_is_drawn_belongs_together() -> None:
 @pytest.mark.slow
 def test_what_is_stored_is_encoded_as_what_was_seen(architecture, even, alone) -> None:
     config = EncoderConfig(architecture=architecture, code_size=4, replay_size=64, target="sensed", features=4)
-    field = jax.vmap(lambda c: ev.field_of_counts(EventsConfig(), c))(
+    field = jax.vmap(lambda c: event_fields.field_of_counts(EventsConfig(), c))(
         jnp.asarray(np.random.default_rng(3).integers(-200, 200, (ENVS, SMALL.height, SMALL.width)))
     )
     field = dataclasses.replace(field, divides_window=even)
     motion = jnp.asarray(np.random.default_rng(4).normal(size=(ENVS, MOTION_SIZE)), jnp.float32)
     observation = Observation(field, motion, motion)
     wanted = samples.target_of(config, observation, None)
-    stored = samples.samples_of(config, observation, wanted, jnp.zeros(ENVS, bool))
+    stored = samples.samples_of(config, observation, wanted)
     assert isinstance(stored.sensed, samples.Counts) == alone
     params = vae.init_vae(config, SMALL, jax.random.key(0))
     read, shown = (vae.encode(config, params, sensed, motion) for sensed in (samples.read(stored), field))
@@ -102,29 +101,10 @@ def test_what_is_stored_is_encoded_as_what_was_seen(architecture, even, alone) -
 def test_half_of_what_is_drawn_is_mirrored() -> None:
     ring, time = ring_after([True] * 3)
     mirror = jax.jit(partial(samples.draw, dataclasses.replace(CONFIG, mirror=True)), static_argnums=2)
-    turned = np.asarray(mirror(ring, jnp.int32(time), 256, jax.random.key(2)).motion[0, :, 1])
+    turned = np.asarray(mirror(ring, jnp.int32(time), 256, jax.random.key(2)).motion[:, 1])
     # The motion of one sample in nine is 0, the same either way.
     assert (turned[:128] <= 0.0).all() and (turned[128:] >= 0.0).all()
     assert (turned[:128] < 0.0).sum() > 90 and (turned[128:] > 0.0).sum() > 90
-
-
-@pytest.mark.parametrize(("kept", "firsts"), [(3, {0}), (9, {5, 6}), (10, {6, 7})])
-def test_decisions_in_a_row_are_of_one_flight(kept: int, firsts: set[int]) -> None:
-    config = dataclasses.replace(CONFIG, sequence_decisions=3)
-    ring, time = ring_after([True] * kept)
-    drawn = samples.draw(config, ring, jnp.int32(time), 3 * 64, jax.random.key(1))
-    assert drawn.motion.shape == (3, 64, MOTION_SIZE)
-    numbers, envs = np.divmod(np.rint(10 * np.asarray(drawn.motion[..., 0])).astype(int), 10)
-    assert set(numbers[0]) == firsts and (envs == envs[0]).all()
-    np.testing.assert_array_equal(numbers, numbers[0] + np.arange(3)[:, None])
-    np.testing.assert_array_equal(drawn.begins, numbers % 2 == 0)
-
-
-def test_before_there_are_enough_the_last_decision_is_repeated() -> None:
-    config = dataclasses.replace(CONFIG, sequence_decisions=3)
-    ring, time = ring_after([True] * 2)
-    drawn = samples.draw(config, ring, jnp.int32(time), 3 * 64, jax.random.key(1))
-    assert (np.rint(np.asarray(drawn.motion[..., 0])) == np.array([[0], [1], [1]])).all()
 
 
 def test_a_mirrored_sample_is_that_of_the_mirrored_image() -> None:
@@ -135,9 +115,9 @@ def test_a_mirrored_sample_is_that_of_the_mirrored_image() -> None:
     motion = jnp.arange(1.0, 1.0 + MOTION_SIZE)
 
     def sample(counts: np.ndarray, near: jax.Array, motion: jax.Array) -> samples.Samples:
-        field = ev.field_of_counts(EventsConfig(), jnp.asarray(counts))
+        field = event_fields.field_of_counts(EventsConfig(), jnp.asarray(counts))
         observation = Observation(field, motion, motion)
-        return samples.samples_of(config, observation, samples.target_of(config, observation, near), jnp.asarray(True))
+        return samples.samples_of(config, observation, samples.target_of(config, observation, near))
 
     got = samples.mirrored(sample(counts, near, motion))
     # To the left, turning left and the move to the left become those to the right.
@@ -169,7 +149,7 @@ def test_a_flight_to_the_right_is_the_mirror_of_one_to_the_left() -> None:
             number = np.flatnonzero((env.ACTIONS == move).all(axis=1))[0]
             state, seen = step(state, jnp.asarray(number))
         wanted = samples.target_of(EncoderConfig(), seen.observation, env.nearness(config, world, state))
-        return samples.samples_of(EncoderConfig(), seen.observation, wanted, seen.is_reset)
+        return samples.samples_of(EncoderConfig(), seen.observation, wanted)
 
     left, right = flown(1), samples.mirrored(flown(-1))
     assert np.abs(left.sensed.signed).sum() > 20  # type: ignore[union-attr]

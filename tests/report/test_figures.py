@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from importlib import import_module
 from pathlib import Path
 
 import jax
@@ -12,7 +13,7 @@ from matplotlib.collections import LineCollection, PathCollection
 from matplotlib.colors import to_rgba
 from matplotlib.figure import Figure
 
-from edqn_jax.report.curves import draw_learning, draw_returns, draw_runs, running_mean
+from edqn_jax.report.curves import draw_learning, draw_returns, running_mean
 from edqn_jax.report.flights import OBLIQUE, draw_path, draw_world
 from edqn_jax.report.images import LOOKS, draw_reconstruction, draw_sight
 from edqn_jax.report.solids import MAP, View, cut_open, far_to_near, hidden, solids_of
@@ -206,9 +207,10 @@ def test_a_run_without_episodes_still_has_its_picture(tmp_path):
     assert is_png(tmp_path / "returns.png")
 
 
-def test_several_runs_are_a_line_each_in_the_panel_of_their_group(tmp_path):
+def test_several_runs_are_a_line_each_in_the_panel_of_their_group(tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(str(Path(__file__).parents[2] / "scripts"))
     groups = {"one": [np.arange(10.0), np.arange(3.0), np.zeros(0)], "two": [np.ones(8)], "three": [np.zeros(5)]}
-    figure = draw_runs(groups, 4, tmp_path / "runs.png")
+    figure = import_module("returns").draw_runs(groups, 4, tmp_path / "runs.png")
     assert is_png(tmp_path / "runs.png")
     shown = [axes for axes in figure.axes if axes.get_visible()]
     assert [axes.get_title(loc="left") for axes in shown] == list(groups)

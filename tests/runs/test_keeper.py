@@ -66,7 +66,7 @@ def standing(done: int) -> Standing:
 
 
 def steps(tmp_path: Path) -> list[int]:
-    return [int(place.name[5:]) for place in sorted((tmp_path / "run" / "checkpoints").glob("step-*"))]
+    return [int(place.stem[5:]) for place in sorted((tmp_path / "run" / "checkpoints").glob("step-*"))]
 
 
 def test_checkpoints_are_so_far_apart_that_saving_takes_little_time(

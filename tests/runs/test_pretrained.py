@@ -44,7 +44,7 @@ def test_its_card_tells_of_its_training() -> None:
 
 def test_saved_files_name_no_folder_of_the_computer_that_wrote_them(tmp_path: Path) -> None:
     edqn_jax.save_policy(edqn_jax.load_policy(PRETRAINED), tmp_path / "mine")
-    for folder, path in ((tmp_path, str(tmp_path).encode()), (FOLDER, b"policy.partial")):
+    for folder, path in ((tmp_path, str(tmp_path).encode()), (FOLDER, b".partial")):
         assert not [file for file in folder.rglob("*") if file.is_file() and path in file.read_bytes()]
 
 

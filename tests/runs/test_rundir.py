@@ -118,7 +118,7 @@ def test_what_another_run_made_meanwhile_is_not_deleted(tmp_path):
 
 def test_a_run_holds_results_once_there_is_anything_of_it(run):
     assert not run.holds_results
-    (run.checkpoints / "step-000000001.damaged").mkdir()
+    (run.checkpoints / "step-000000001.safetensors.damaged").touch()
     assert run.holds_results
 
 

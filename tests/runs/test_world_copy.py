@@ -48,8 +48,17 @@ def test_what_is_missing_or_another_one_is_flown_from_the_copy(tmp_path: Path, w
 def test_a_damaged_copy_is_refused(tmp_path: Path, world: Path) -> None:
     config = make_config(str(world))
     world_copy.keep(tmp_path, config)
-    (tmp_path / "world" / "name.xml").unlink()
-    with pytest.raises(ConfigError, match=r"is damaged: 'name\.xml' is missing"):
+    copy = tmp_path / "world" / "name.xml"
+    copy.write_text(copy.read_text() + "\n")
+    with pytest.raises(ConfigError, match=r"is damaged: 'name\.xml' is missing, new or not as it was copied"):
+        world_copy.flown_in(tmp_path, config)
+    copy.unlink()
+    copy.symlink_to("/dev/zero")
+    with pytest.raises(ConfigError, match=r"is damaged: 'name\.xml' is no file"):
+        world_copy.flown_in(tmp_path, config)
+    copy.unlink()
+    (tmp_path / "world" / world_copy.SUMS).unlink()
+    with pytest.raises(ConfigError, match="is incomplete: it has no SHA256SUMS"):
         world_copy.flown_in(tmp_path, config)
 
 

@@ -348,9 +348,6 @@ def test_a_retrained_encoder_begins_a_replay_of_its_own() -> None:
     assert plan.samples_kept(config, steps).tolist() == [0, 1, 2, 3, *[4] * 13, 5, *[6] * 6]
     always = dataclasses.replace(config, encoder=dataclasses.replace(config.encoder, keep_learning=True))
     assert plan.samples_kept(always, steps).tolist() == list(range(24))
-    # The first row of a training does not go on from the last one of the training before.
-    assert np.flatnonzero(plan.begins_to_keep(config, steps)).tolist() == [0, 16]
-    assert np.flatnonzero(plan.begins_to_keep(always, steps)).tolist() == [0]
 
 
 @pytest.mark.parametrize(
@@ -436,25 +433,6 @@ def test_agents_that_train_together_train_as_each_alone(on_two, world: World) ->
     jax.tree.map(
         partial(np.testing.assert_allclose, rtol=1e-3, atol=1e-5), second, trainer.policy_of(together.config, state)
     )
-
-
-def test_a_sample_says_whether_it_goes_on_from_the_one_before(world: World) -> None:
-    encoder = dataclasses.replace(CONFIG.encoder, target="sensed")  # no label is rendered
-    config = dataclasses.replace(CONFIG, encoder=encoder)
-    shapes = jax.eval_shape(partial(trainer.init, config, world), jax.random.key(0)).actors
-
-    def blank(tree: Any) -> Any:
-        return jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), tree)
-
-    flown, seen = jax.eval_shape(partial(trainer._fly, config, world), shapes, jnp.zeros((8, 2), jnp.int32))
-    actors = SimpleNamespace(samples=blank(shapes.samples), reward=blank(shapes.reward))
-    resets = jnp.arange(16) % 3 == 0
-    shown = SimpleNamespace(observation=blank(seen.observation), is_reset=resets)
-    keep = jax.jit(lambda step: trainer._keep(config, world, actors, flown, shown, step))  # pyright: ignore[reportArgumentType]
-    for step, begins in ((0, jnp.ones(16, bool)), (2, resets)):
-        rings = keep(jnp.int32(step))
-        assert rings is not None and rings.begins.shape == (8, 4, 2)
-        np.testing.assert_array_equal(rings.begins[:, step], begins.reshape(8, 2))
 
 
 def test_environments_that_do_not_divide_into_shards_are_refused_with_a_sentence(world: World) -> None:

@@ -24,7 +24,7 @@ from edqn_jax.evaluation.rollouts import fly_on_all_devices
 from edqn_jax.evaluation.trajectories import TRAJECTORY_COLUMNS
 from edqn_jax.report.gallery import prepare_gallery
 from edqn_jax.report.progress import Progress
-from edqn_jax.runs.checkpoints.params import save_params
+from edqn_jax.runs.checkpoints.params import POLICY, save_params
 from edqn_jax.runs.directory import RunDirectory, plain
 from edqn_jax.runs.policies import load_run
 from edqn_jax.runs.record import train_run
@@ -84,7 +84,7 @@ def test_a_run_is_evaluated_and_says_what_was_flown(whole: tuple[RunDirectory, d
     found = json.loads(figures.read_text())
     assert found["missions"] == missions and len(np.load(flights)["outcome"]) == missions
     assert (found["run"], found["versions"]) == (str(run.path), summary["versions"])
-    sealed = run.checkpoints / "policy" / "manifest.json"
+    sealed = run.checkpoints / POLICY
     assert found["policy_sha256"] == hashlib.sha256(sealed.read_bytes()).hexdigest()
 
 
@@ -124,7 +124,7 @@ def test_a_run_is_verified_and_what_was_changed_in_it_is_found(
     rewrite(changed.summary_file, '"state_digest": "', '"state_digest": "0')
     assert {"the flight, flown again", "last checkpoint", "policy"} <= wrong()
     for checkpoint in changed.checkpoints.glob("step-*"):
-        shutil.rmtree(checkpoint)
+        checkpoint.unlink()
     assert "last checkpoint" not in wrong()  # there is nothing left to compare
     summary = json.loads(changed.summary_file.read_text())
     for damaged in ({**summary, "devices": 3}, {"figures": "drawn"}):
@@ -151,7 +151,7 @@ def test_an_interrupted_run_that_is_continued_is_the_run_that_was_not(
     run = RunDirectory(tmp_path / "cut")
     words = [sys.executable, "-c", KILLED, str(run.path)]
     with subprocess.Popen(words, cwd=ROOT, stderr=subprocess.PIPE, text=True) as process:
-        while process.poll() is None and len(list(run.checkpoints.glob("step-*[0-9]"))) < 2:
+        while process.poll() is None and len(list(run.checkpoints.glob("step-*.safetensors"))) < 2:
             time.sleep(0.01)
         time.sleep(random.Random(0).uniform(0.0, 0.3))  # in a chunk, while it saves, or between
         assert process.poll() is None, process.communicate()[1]
@@ -170,7 +170,7 @@ def test_an_interrupted_run_that_is_continued_is_the_run_that_was_not(
     ended = [load_run(folder.path)[1] for folder in (run, uninterrupted)]
     jax.tree.map(np.testing.assert_array_equal, *ended)
     *_, policy, before, last = sorted(place.name for place in run.checkpoints.iterdir())
-    assert (policy, last) == ("policy", "step-000000032") and before.startswith("step-")
+    assert (policy, last) == (POLICY, "step-000000032.safetensors") and before.startswith("step-")
 
 
 def _without_clocks(run: RunDirectory) -> list[dict]:

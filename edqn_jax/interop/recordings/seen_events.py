@@ -131,14 +131,14 @@ def _motion(
 
 
 def _encoded(config: Config, params: Any, counts: Array, motion: Array) -> tuple[Array, Array]:
-    """Returns signed event images and what is drawn of the codes, each [D, H, W]; a code may see the one before."""
+    """Returns signed event images and what is drawn of the codes, each [D, H, W]."""
 
-    def one(code: Array, given: tuple[Array, Array]) -> tuple[Array, tuple[Array, Array]]:
+    def one(given: tuple[Array, Array]) -> tuple[Array, Array]:
         field = field_of(config, given[0])
-        code = vae.embed(config.encoder, params, field, given[1], code)
+        code = vae.embed(config.encoder, params, field, given[1])
         channels = vae.decode(config.encoder, config.camera, params, code)
         nearness = embedding.needs_nearness(config)
         drawn = channels[-1] if nearness else jnp.sum(jnp.expm1(channels), axis=-3)
-        return code, (events.event_image(field), drawn)
+        return events.event_image(field), drawn
 
-    return jax.jit(lambda c, m: jax.lax.scan(one, jnp.zeros(config.encoder.code_size), (c, m))[1])(counts, motion)
+    return jax.jit(lambda c, m: jax.lax.map(one, (c, m)))(counts, motion)

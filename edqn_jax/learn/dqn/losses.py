@@ -5,8 +5,6 @@ Functions are for one transition, named as the literature does: `q` values, `a` 
 
 from __future__ import annotations
 
-from functools import partial
-
 import chex
 import jax
 import jax.numpy as jnp
@@ -47,22 +45,6 @@ def target(returns: Array, discount: Array, q_next: Array, q_select: Array) -> A
     return returns + discount * value_of(q_next, jnp.argmax(q_select))
 
 
-def soft_value(q: Array, temperature: float) -> Array:
-    """Returns the value [] of `q` [A] under its softmax policy, entropy included: t log sum exp(q / t)."""
-    chex.assert_rank(q, 1)
-    return temperature * jax.nn.logsumexp(q / temperature)
-
-
-def munchausen_bonus(config: AgentConfig, q: Array, a: Array) -> Array:
-    """Returns `munchausen` x max(t log pi(a|s), -1) [], with pi = softmax(q / t) (Vieillard et al. 2020, Eq. 1).
-
-    Args:
-        q: [A] target network at s, in units of scaled reward. a: [] action taken.
-    """
-    log_policy = value_of(jax.nn.log_softmax(q / config.munchausen_temperature), a)
-    return config.munchausen * jnp.clip(config.munchausen_temperature * log_policy, -1.0, 0.0)
-
-
 def td_loss(q: Array, a: Array, y: Array, huber_delta: float) -> Array:
     """Returns Eq. 9, half the squared TD error; beyond `huber_delta` > 0 it grows linearly.
 
@@ -87,14 +69,7 @@ def batch_loss(config: AgentConfig, params: Params, target_params: Params, actio
     q_next = q_values(config, target_params, actions, batch.next_history)
     q_select = q_values(config, params, actions, batch.next_history) if config.double else q_next
     returns = config.reward_scale * batch.returns
-    if config.munchausen > 0:
-        # Of an n-step return, the first step alone has the bonus.
-        q_before = q_values(config, target_params, actions, batch.history)
-        returns += jax.vmap(partial(munchausen_bonus, config))(q_before, batch.action)
-        values = jax.vmap(partial(soft_value, temperature=config.munchausen_temperature))(q_next)
-        y = returns + batch.discount * values
-    else:
-        y = jax.vmap(target)(returns, batch.discount, q_next, q_select)
+    y = jax.vmap(target)(returns, batch.discount, q_next, q_select)
     losses = jax.vmap(lambda q, a, y: td_loss(q, a, y, config.huber_delta))(q, batch.action, y)
     taken = jax.vmap(value_of)(q, batch.action)
     return jnp.sum(batch.weight * losses), (jnp.sum(batch.weight), jnp.sum(batch.weight * taken))

@@ -43,19 +43,14 @@ def acting(config: Config, params: Params) -> Params:
     return vae.frozen(config.encoder, config.camera, params, form=form, layers=layers)
 
 
-def embed(config: Config, params: Params, observation: Observation, previous: Array) -> Array | None:
-    """Returns [..., size] of order 1: the scaled code, or values as they are; None where the sensor shows nothing.
-
-    Args:
-        previous: `[..., size]` what this returned for the decision before; 0 at the start of an episode.
-    """
+def embed(config: Config, params: Params, observation: Observation) -> Array | None:
+    """Returns [..., size] of order 1: the scaled code, or values as they are; None where the sensor shows nothing."""
     if observation.sensed is None:
         return None
     if not has_code(config):
         return jnp.asarray(observation.sensed)
-    scale = config.agent.code_scale
-    code = vae.embed(config.encoder, params, observation.sensed, observation.motion, previous / scale)  # type: ignore[arg-type]
-    return scale * code
+    code = vae.embed(config.encoder, params, observation.sensed, observation.motion)  # type: ignore[arg-type]
+    return config.agent.code_scale * code
 
 
 def _shape(config: Config) -> tuple[Form, int]:

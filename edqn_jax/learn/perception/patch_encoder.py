@@ -1,8 +1,5 @@
 """The patch encoder: events are summed per pixel, pixels are read together in patches, patches are joined to a code.
 
-A recurrent one joins the code of the decision before as well, so that a code holds what has left the view, and what
-makes no events at the moment.
-
 An event tells distance only together with the motion that made it, and only beside its neighbours. So the layers
 before the join are shared by all patches, and each sees the patch's place in the image and the drone's own motion.
 
@@ -15,7 +12,6 @@ import flax.linen as nn
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from jax.nn.initializers import zeros
 
 from edqn_jax.config import EncoderConfig
 from edqn_jax.learn.perception.code import CodeHead
@@ -59,11 +55,6 @@ def patch_places(height: int, width: int, pixels: int) -> np.ndarray:
     return (2.0 * middle - 1.0).astype(np.float32)
 
 
-def is_recurrent(config: EncoderConfig) -> bool:
-    """Returns whether a code depends on the one of the decision before."""
-    return config.sequence_decisions > 1
-
-
 class PatchEncoder(nn.Module):
     """Layers shared by all patches, layers over all patches joined, and the code."""
 
@@ -72,16 +63,11 @@ class PatchEncoder(nn.Module):
     width: int
 
     @nn.compact
-    def __call__(
-        self, sensed: EventField | Array, motion: Array, previous: Array | None = None, begins: Array | None = None
-    ) -> tuple[Array, Array]:
+    def __call__(self, sensed: EventField | Array, motion: Array) -> tuple[Array, Array]:
         """Returns mean and log-variance `[..., code_size]` of fields `[..., F, H, W]` or pictures `[..., C, H, W]`.
 
         Args:
             motion: `[..., MOTION_SIZE]` own motion, see `sim.env.own_motion`.
-            previous: `[..., code_size]` codes of the decision before, 0 at the start of an episode; a recurrent encoder
-                needs these, or
-            begins: `[T, ...]` bool: the observations are T in a row, and nothing is remembered where this is true.
         """
         images = log_counts(sensed) if isinstance(sensed, EventField) else list(jnp.moveaxis(sensed, -3, 0))
         first, *later = self.config.patch_layers
@@ -99,26 +85,6 @@ class PatchEncoder(nn.Module):
         for number, size in enumerate(later, start=1):
             z = nn.relu(Dense(size, name=f"patch_{number}")(z))
         z = jnp.concatenate([z.reshape(*z.shape[:-2], -1), motion], axis=-1)
-        widths = self.config.joint_layers
-        joint = [Dense(size, name=f"joint_{number}") for number, size in enumerate(widths)]
-        head = CodeHead(self.config.code_size, name="code")
-
-        def code_of(z: Array) -> tuple[Array, Array]:
-            for layer in joint[1:]:
-                z = layer(nn.relu(z))
-            return head(nn.relu(z))
-
-        z = joint[0](z)
-        if not is_recurrent(self.config):
-            return code_of(z)
-        # Nothing is remembered at first, so that codes are not random functions of random codes.
-        remembered = Dense(widths[0], use_bias=False, kernel_init=zeros, name="previous")
-        if begins is None:
-            assert previous is not None, "a recurrent encoder needs the code before"
-            return code_of(z + remembered(previous))
-        codes = [code_of(z[0])]
-        for now in range(1, len(z)):
-            known = jnp.where(begins[now, ..., None], 0.0, codes[-1][0])
-            codes.append(code_of(z[now] + remembered(known)))
-        mean, log_variance = zip(*codes, strict=True)
-        return jnp.stack(mean), jnp.stack(log_variance)
+        for number, size in enumerate(self.config.joint_layers):
+            z = nn.relu(Dense(size, name=f"joint_{number}")(z))
+        return CodeHead(self.config.code_size, name="code")(z)

@@ -8,10 +8,6 @@ with a learned feature f of position and polarity, and a sinusoidal phi of time.
 two frames share x, y and p, so the sum over them reaches only phi, where it is a geometric series with a
 closed form: the dense path costs the same for one event as for a thousand, and it is exact.
 
-`encoder.pooling: max` takes, instead, the largest f(x, y, p) + phi(t) of any event, as the public code of an event VAE
-for drones does (microsoft/event-vae-rl, after PointNet). Of a pixel's events between two frames the one nearest to a
-peak of phi has the largest, so that it, too, is exact at the cost of one event.
-
 Field arrays are `[..., F, H, W]`: any leading dimensions are the batch, carried into a few large matmuls.
 C is the number of temporal channels, 1 + 2 x `time_frequencies`.
 
@@ -39,19 +35,11 @@ POOL_SCALE = 1.0 / 8.0
 """Constant factor on the pooled sum: the root of some 64 events, so that the next layer sees unit scale."""
 
 
-def temporal_encoding(frequencies: int, tau: Array) -> Array:
-    """Returns `phi(t) = [1, cos(2 pi k tau), sin(2 pi k tau), ...]` for k = 1 .. frequencies: `[...]` to `[..., C]`.
-
-    `tau` is the time normalised to the window: 0 at its start, 1 at its end.
-    """
-    channels = [jnp.ones_like(tau)]
-    for k in range(1, frequencies + 1):
-        channels += [jnp.cos(2.0 * jnp.pi * k * tau), jnp.sin(2.0 * jnp.pi * k * tau)]
-    return jnp.stack(channels, axis=-1)
-
-
 def temporal_sums(frequencies: int, field: EventField) -> list[Array | None]:
-    """Returns the sums of `temporal_encoding` over each pixel's events in closed form: C arrays `[..., F, H, W]`.
+    """Returns the sums of phi(t) over each pixel's events in closed form: C arrays `[..., F, H, W]`.
+
+    `phi(t) = [1, cos(2 pi k tau), sin(2 pi k tau), ...]` for k = 1 .. frequencies; tau is 0 at the window's start and 1
+    at its end.
 
     None stands for a sum that is always zero: n events that divide the window evenly add up to
     the n-th roots of unity, which leave n where n divides the frequency, and nothing else.
@@ -76,27 +64,6 @@ def temporal_sums(frequencies: int, field: EventField) -> list[Array | None]:
         middle = 2.0 * k * first + (n - 1.0) * (k * step + half_turns)
         sums += [kernel * sin_pi(middle + 0.5), kernel * sin_pi(middle)]
     return sums
-
-
-def temporal_maxima(frequencies: int, field: EventField) -> list[Array]:
-    """Returns the largest of each channel of `temporal_encoding` over each pixel's events: C arrays `[..., F, H, W]`.
-
-    A channel falls evenly to both sides of its peaks, so of events that follow one another evenly the one nearest to
-    a peak, or the first or last, is the highest around it. Pixels without events have some finite value.
-    """
-    n = field.count.astype(jnp.float32)
-    first, step = field.t_first / field.window_s, field.t_step / field.window_s
-    maxima = [jnp.ones_like(n)]
-    for k in range(1, frequencies + 1):
-        for peak in (0.0, 0.25):  # of the cosine and of the sine, in turns
-            highest = jnp.full_like(n, -1.0)
-            for turn in range(k + 1):
-                place = (turn + peak) / k
-                nearest = jnp.clip(jnp.round((place - first) / jnp.maximum(step, 1e-9)), 0.0, jnp.maximum(n - 1.0, 0.0))
-                tau = first + nearest * step
-                highest = jnp.maximum(highest, jnp.cos(2.0 * jnp.pi * (k * tau - peak)))
-            maxima.append(highest)
-    return maxima
 
 
 def positional_encoding(x: Array, y: Array, width: int, height: int) -> Array:
@@ -126,10 +93,6 @@ class PixelTable(nn.Module):
         """Returns f of every pixel, `[channels, H * W, features]`, ON first."""
         return self.table
 
-    def at(self, x: Array, y: Array, p: Array) -> Array:
-        """Returns f, `[..., features]`, at columns x, rows y, polarities p."""
-        return self.table[(p < 0).astype(jnp.int32), y * self.width + x]
-
 
 class PixelNetwork(nn.Module):
     """f(x, y, p) as a ReLU network on the positional encoding and the polarity."""
@@ -155,7 +118,7 @@ class PixelNetwork(nn.Module):
 
 
 class PooledEncoder(nn.Module):
-    """Set encoder. `dense` and `sparse` share their parameters and agree; `picture` has its own."""
+    """Set encoder. `dense` and `picture` have parameters of their own."""
 
     config: EncoderConfig
     height: int
@@ -178,8 +141,6 @@ class PooledEncoder(nn.Module):
         """Returns mean and log-variance `[..., code_size]` of fields `[..., F, H, W]`."""
         on, off = self.pixels.everywhere()
         batch = field.count.shape[:-3]
-        if self.config.pooling == "max":
-            return self._head(self._largest(field, on, off), 1.0)
         pooled = []
         for phi in temporal_sums(self.config.time_frequencies, field):
             if phi is None:
@@ -190,37 +151,11 @@ class PooledEncoder(nn.Module):
             pooled.append(phi_on @ on + phi_off @ off)
         return self._head(jnp.concatenate(pooled, axis=-1), POOL_SCALE)
 
-    def sparse(self, x: Array, y: Array, tau: Array, p: Array) -> tuple[Array, Array]:
-        """Returns mean and log-variance of event lists, each `[..., N]`; entries with p = 0 are no events."""
-        place = self.pixels.at(x, y, p) * (p != 0)[..., None]
-        phi = temporal_encoding(self.config.time_frequencies, tau)
-        if self.config.pooling == "max":
-            every = phi[..., :, None] + place[..., None, :]
-            highest = _highest(every, (p != 0)[..., None, None], -3)
-            return self._head(highest.reshape(*highest.shape[:-2], -1), 1.0)
-        pooled = jnp.einsum("...nf,...nc->...cf", place, phi)
-        return self._head(pooled.reshape(*pooled.shape[:-2], -1), POOL_SCALE)
-
     def picture(self, image: Array) -> tuple[Array, Array]:
         """Returns mean and log-variance `[..., code_size]` of pictures `[..., P, H, W]`."""
         everywhere = self.pixels.everywhere()
         flat = image.reshape(*image.shape[:-3], -1)
         return self._head(flat @ everywhere.reshape(flat.shape[-1], -1), flat.shape[-1] ** -0.5)
 
-    def _largest(self, field: EventField, on: Array, off: Array) -> Array:
-        """Returns the largest f + phi of all events, `[..., C x features]`; 0 where there are none."""
-        flat = (*field.count.shape[:-2], -1, 1)
-        place = jnp.where(field.polarity.reshape(flat) > 0, on, off)
-        has = (field.count > 0).reshape(flat)
-        maxima = temporal_maxima(self.config.time_frequencies, field)
-        return jnp.concatenate([_highest(place + phi.reshape(flat), has, (-3, -2)) for phi in maxima], axis=-1)
-
     def _head(self, pooled: Array, scale: float) -> tuple[Array, Array]:
         return self.code(nn.relu(self.hidden(pooled * scale)))
-
-
-def _highest(values: Array, counted: Array, axes: int | tuple[int, ...]) -> Array:
-    """Returns the largest, over `axes`, of the values that count; 0 where none does."""
-    lowest = jnp.finfo(values.dtype).min
-    highest = jnp.max(values, axis=axes, where=counted, initial=lowest)
-    return jnp.where(highest > lowest, highest, 0.0)

@@ -19,7 +19,7 @@ from jax.nn.initializers import zeros
 from edqn_jax.config import CameraConfig, EncoderConfig
 from edqn_jax.learn.perception.code import EVENT_CHANNELS, Params, kl_divergence
 from edqn_jax.learn.perception.layers import Dense
-from edqn_jax.learn.perception.patch_encoder import PatchEncoder, is_recurrent
+from edqn_jax.learn.perception.patch_encoder import PatchEncoder
 from edqn_jax.learn.perception.pooled_encoder import PooledEncoder
 from edqn_jax.learn.perception.waves import OUTPUT_SCALE, cosines, mirrored, wave_images
 from edqn_jax.sim.sensors.events import EventField
@@ -154,9 +154,8 @@ def init_vae(
     silent = EventField(nothing, nothing.astype(jnp.int8), when, when, window_s=1.0)
     blank = silent if form is Form.EVENTS else when
     encoder = _encoder(config, blank)
-    memory = [jnp.zeros(config.code_size)] if is_recurrent(config) else []
     return {
-        "encoder": encoder.init(key_encoder, blank, jnp.zeros(MOTION_SIZE), *memory)["params"],
+        "encoder": encoder.init(key_encoder, blank, jnp.zeros(MOTION_SIZE))["params"],
         "decoder": decoder.init(key_decoder, jnp.zeros(config.code_size))["params"],
     }
 
@@ -170,41 +169,16 @@ def _encoder(config: EncoderConfig, sensed: EventField | Array) -> PatchEncoder 
     return PooledEncoder(config, height, width, EVENT_CHANNELS if fields else channels, timed=fields)
 
 
-def encode(
-    config: EncoderConfig,
-    params: Params,
-    sensed: EventField | Array,
-    motion: Array,
-    previous: Array | None = None,
-    begins: Array | None = None,
-) -> tuple[Array, Array]:
+def encode(config: EncoderConfig, params: Params, sensed: EventField | Array, motion: Array) -> tuple[Array, Array]:
     """Returns mean and log-variance, each `[..., code_size]`, of fields `[..., F, H, W]` or pictures `[..., C, H, W]`.
 
     The code that the agent sees is the mean.
 
     Args:
         motion: `[..., MOTION_SIZE]` own motion, see `sim.env.own_motion`.
-        previous, begins: what a recurrent encoder remembers, see `PatchEncoder`, which needs one of them; None if the
-            encoder is not recurrent.
     """
     encoder = _encoder(_of_kind(config, params), sensed)
-    memory = (previous, begins) if is_recurrent(config) else ()
-    return encoder.apply({"params": params["encoder"]}, sensed, motion, *memory)  # type: ignore
-
-
-def encode_events(
-    config: EncoderConfig, params: Params, camera: CameraConfig, x: Array, y: Array, tau: Array, p: Array
-) -> tuple[Array, Array]:
-    """Returns the same as `encode` with the pooled encoder, from a list of events: `[..., N]` each.
-
-    Args:
-        x: column.
-        y: row.
-        tau: time in the window, 0 at its start and 1 at its end.
-        p: polarity; 0 marks an empty entry.
-    """
-    encoder = PooledEncoder(_of_kind(config, params), camera.height, camera.width)
-    return encoder.apply({"params": params["encoder"]}, x, y, tau, p, method=PooledEncoder.sparse)  # type: ignore
+    return encoder.apply({"params": params["encoder"]}, sensed, motion)  # type: ignore
 
 
 def frozen(
@@ -233,11 +207,9 @@ def _of_kind(config: EncoderConfig, params: Params) -> EncoderConfig:
     return dataclasses.replace(config, pixel_features="table") if tables else config
 
 
-def embed(
-    config: EncoderConfig, params: Params, sensed: EventField | Array, motion: Array, previous: Array | None = None
-) -> Array:
+def embed(config: EncoderConfig, params: Params, sensed: EventField | Array, motion: Array) -> Array:
     """Returns the agent's code, the mean `[..., code_size]`; arguments as `encode`."""
-    return encode(config, params, sensed, motion, previous)[0]
+    return encode(config, params, sensed, motion)[0]
 
 
 def decode(config: EncoderConfig, camera: CameraConfig, params: Params, code: Array) -> Array:
@@ -260,7 +232,6 @@ def vae_loss(
     motion: Array,
     wanted: Target,
     noise: Array,
-    begins: Array | None = None,
 ) -> tuple[Array, Losses]:
     """Returns the VAE loss, squared reconstruction error + `kl_weight` x KL, averaged over the batch, and its terms.
 
@@ -271,9 +242,8 @@ def vae_loss(
         motion: `[..., MOTION_SIZE]` own motion.
         wanted: what the decoder must draw, see `target` and `in_waves`.
         noise: `[..., code_size]` standard normal, which draws the codes (reparametrised).
-        begins: see `PatchEncoder`; None if the encoder is not recurrent.
     """
-    mean, log_variance = encode(config, params, sensed, motion, begins=begins)
+    mean, log_variance = encode(config, params, sensed, motion)
     code = mean + jnp.exp(0.5 * log_variance) * noise
     height, width = (sensed.count if isinstance(sensed, EventField) else sensed).shape[-2:]
     drawn = _waves_of(config, height, width, params, code)

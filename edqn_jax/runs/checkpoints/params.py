@@ -1,24 +1,25 @@
-"""Policies on disk, with checksums.
+"""Policies on disk, each one sealed file.
 
 When `save_params` returns, the policy is complete and on the disk, and has taken the place of the one before, which is
-whole until then. A policy without its manifest, or with a changed bit, is refused.
+whole until then. A policy with a changed bit is refused.
 """
 
 from __future__ import annotations
 
-import shutil
 from pathlib import Path
 
-from edqn_jax.errors import ConfigError
-from edqn_jax.files import unwritable
-from edqn_jax.learn.policy import PolicyParams
-from edqn_jax.runs.checkpoints import arrays, manifest
+from flax.traverse_util import flatten_dict, unflatten_dict
 
-POLICY = "policy"
-"""The policy's folder within `checkpoints/`."""
+from edqn_jax.errors import ConfigError
+from edqn_jax.learn.policy import PolicyParams
+from edqn_jax.runs.checkpoints import sealed
+from edqn_jax.runs.checkpoints.sealed import digest
+
+POLICY = f"policy{sealed.SUFFIX}"
+"""The policy's file within `checkpoints/`."""
 
 CONFIG = "config_sha256"
-"""The fact of a policy's manifest that says which `config.yaml` it was saved with."""
+"""The text in a policy's file that says which `config.yaml` it was saved with."""
 
 
 def save_params(folder: Path, params: PolicyParams, config_file: Path | None = None) -> None:
@@ -34,20 +35,8 @@ def save_params(folder: Path, params: PolicyParams, config_file: Path | None = N
     Raises:
         ConfigError: if it cannot be written; a policy that was there is there still.
     """
-    saved, partial, replaced = _places(folder.absolute())
-    arrays.clear(partial)
-    facts = {} if config_file is None else {CONFIG: manifest.digest(config_file)}
-    arrays.write(partial, {"encoder": params.encoder, "q": params.q}, facts)
-    try:
-        if saved.exists():  # if not, what is in the other place may be the only policy
-            shutil.rmtree(replaced, ignore_errors=True)
-            saved.rename(replaced)
-        partial.rename(saved)
-        manifest.sync(saved.parent)
-        shutil.rmtree(replaced, ignore_errors=True)
-    except OSError as error:
-        shutil.rmtree(partial, ignore_errors=True)
-        raise unwritable(saved, error.strerror) from None
+    facts = {} if config_file is None else {CONFIG: digest(config_file)}
+    sealed.write(folder / POLICY, flatten_dict({"encoder": params.encoder, "q": params.q}, sep="/"), facts)
 
 
 def load_params(folder: Path, config_file: Path | None = None) -> PolicyParams:
@@ -58,32 +47,29 @@ def load_params(folder: Path, config_file: Path | None = None) -> PolicyParams:
         config_file: `config.yaml` beside it; refused if it is not the one that the policy was saved with.
 
     Raises:
-        ConfigError: if there is none, or it is incomplete, damaged or unreadable.
+        ConfigError: if there is none, or it is damaged or unreadable.
     """
     saved = saved_at(folder)
-    facts = manifest.check(saved)
-    if config_file is not None and CONFIG in facts and facts[CONFIG] != manifest.digest(config_file):
+    arrays, facts = sealed.read(saved)
+    if config_file is not None and CONFIG in facts and facts[CONFIG] != digest(config_file):
         raise ConfigError(f"'{config_file}' has changed since the policy beside it was saved; put the old one back")
-    tree = arrays.read(saved)
-    if not isinstance(tree, dict) or set(tree) != {"encoder", "q"}:
-        raise ConfigError(f"'{saved}' holds no policy: it has no encoder or no Q-network")
+    tree = {"encoder": {}, **unflatten_dict(arrays, sep="/")}
+    if set(tree) != {"encoder", "q"}:
+        raise ConfigError(f"'{saved}' holds no policy: it has no Q-network, or more than a policy has")
     return PolicyParams(encoder=tree["encoder"], q=tree["q"])
 
 
 def saved_at(folder: Path) -> Path:
-    """Returns the folder of the policy in a run's `checkpoints/`.
+    """Returns the file of the policy in a run's `checkpoints/`.
 
     Raises:
         ConfigError: if there is none.
     """
-    saved, _, replaced = _places(folder.absolute())
-    if not saved.is_dir() and replaced.is_dir():  # the process ended between two renames
-        saved = replaced
-    if not saved.is_dir():
-        raise ConfigError(f"there is no policy in '{folder}'; a run saves one with its checkpoints and at its end")
-    return saved
-
-
-def _places(folder: Path) -> tuple[Path, Path, Path]:
-    """Returns where a policy is, where it is while it is written, and where the one before is while it is replaced."""
-    return folder / POLICY, folder / f"{POLICY}.partial", folder / f"{POLICY}.replaced"
+    if (folder / POLICY).is_file():
+        return folder / POLICY
+    if (folder / "policy").is_dir():
+        raise ConfigError(
+            f"the policy in '{folder}' is a folder, as older versions saved them; this one reads '{POLICY}' alone: fly "
+            "it with the version that saved it"
+        )
+    raise ConfigError(f"there is no policy in '{folder}'; a run saves one with its checkpoints and at its end")

@@ -1,4 +1,4 @@
-"""Checkpoints of a whole run, from which it is continued: `checkpoints/step-N` after N training steps.
+"""Checkpoints of a whole run, from which it is continued: the file `step-N` in `checkpoints/` after N training steps.
 
 A checkpoint has this name when it is complete and on the disk, never before. The newest are kept; one that is damaged
 is set aside, and the one before it is used.
@@ -6,11 +6,11 @@ is set aside, and the one before it is used.
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import hashlib
 import json
 import re
-import shutil
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -20,11 +20,11 @@ import numpy as np
 
 from edqn_jax.errors import ConfigError, DamagedError
 from edqn_jax.files import unwritable
-from edqn_jax.runs.checkpoints import arrays, manifest
+from edqn_jax.runs.checkpoints import sealed
 from edqn_jax.version import package_version
 
-_NAME = re.compile(r"step-(\d{9,})")
-_HOST, _CONFIG = "host.json", "config.yaml"
+_NAME = re.compile(rf"step-(\d{{9,}}){re.escape(sealed.SUFFIX)}")
+_HOST, _CONFIG = "host", "config"
 _PIECE = 1 << 20  # bytes
 
 
@@ -39,8 +39,8 @@ class Checkpoint:
     config: str
     """Content of the run's `config.yaml`."""
     facts: dict[str, str]
-    """Of the manifest: versions and reward. Its checksums have the digest of the configuration."""
-    folder: Path = Path()
+    """Versions and reward."""
+    file: Path = Path()
     """Where it was read from."""
 
 
@@ -50,27 +50,14 @@ def save(folder: Path, step: int, checkpoint: Checkpoint, keep: int) -> Path:
     Raises:
         ConfigError: if it cannot be written; those that were there are there still.
     """
-    folder = folder.absolute()
-    place = folder / f"step-{step:09}"
-    partial = place.with_name(place.name + ".partial")
+    file = folder / f"step-{step:09}{sealed.SUFFIX}"
     remove_partials(folder)
-    shapes = {name: [list(array.shape), str(array.dtype)] for name, array in checkpoint.arrays.items()}
-    host = {**checkpoint.host, "arrays": shapes}
-    texts = {_HOST: json.dumps(host, allow_nan=False) + "\n", _CONFIG: checkpoint.config}
-    # Names of arrays are no names of files; numbers are.
-    numbered = {str(number): array for number, array in enumerate(checkpoint.arrays.values())}
-    arrays.write(partial, numbered, checkpoint.facts, texts)
-    try:
-        if place.exists():  # of a run that was begun anew from the step before
-            shutil.rmtree(place)
-        partial.rename(place)
-        manifest.sync(folder)
-        for _, older in list(_newest_first(folder))[keep:]:
-            shutil.rmtree(older, ignore_errors=True)
-    except OSError as error:
-        shutil.rmtree(partial, ignore_errors=True)
-        raise unwritable(place, error.strerror) from None
-    return place
+    host = json.dumps(checkpoint.host, allow_nan=False)
+    sealed.write(file, checkpoint.arrays, {**checkpoint.facts, _HOST: host, _CONFIG: checkpoint.config})
+    for _, older in list(_newest_first(folder))[keep:]:
+        with contextlib.suppress(OSError):
+            older.unlink()
+    return file
 
 
 def newest(
@@ -89,17 +76,22 @@ def newest(
     Raises:
         ConfigError: if there are some and none can be used.
     """
-    for step, place in list(_newest_first(folder)):
+    for step, file in list(_newest_first(folder)):
         try:
-            checkpoint = _read(place)
+            checkpoint = _read(file)
             usable(checkpoint)
             return checkpoint
         except DamagedError as error:
             if set_aside:
-                _set_aside(place)
+                _set_aside(file)
             message(f"the checkpoint after training step {step:,} is set aside: {error}")
         except ConfigError as error:
             message(f"the checkpoint after training step {step:,} is passed over: {error}")
+    if any(place.is_dir() and not place.suffix for place in folder.glob("step-*")):
+        raise ConfigError(
+            f"the checkpoints in '{folder}' are folders, as older versions saved them; this one reads files alone: "
+            "continue the run with the version that saved them, or give --resume never"
+        )
     if any(folder.glob("step-*")):
         raise ConfigError(f"no checkpoint in '{folder}' can be used; --resume never begins the run anew")
     return None
@@ -119,8 +111,8 @@ def grown(files: Mapping[str, Path]) -> dict[str, list[Any]]:
     found = {}
     for name, file in files.items():
         if file.is_file():
-            manifest.sync(file)
-            found[name] = [file.stat().st_size, manifest.digest(file)]
+            sealed.sync(file)
+            found[name] = [file.stat().st_size, sealed.digest(file)]
     return found
 
 
@@ -154,48 +146,38 @@ def cut_back(files: Mapping[str, Path], said: Mapping[str, list[Any]]) -> None:
 
 def remove_partials(folder: Path) -> None:
     """Deletes what an interrupted process has left of checkpoints."""
-    for leftover in folder.glob("step-*.partial*"):
-        shutil.rmtree(leftover, ignore_errors=True)
+    for leftover in folder.glob("step-*.partial"):
+        with contextlib.suppress(OSError):
+            leftover.unlink()
 
 
-def _read(place: Path) -> Checkpoint:
-    """Returns the checkpoint in a folder.
+def _read(file: Path) -> Checkpoint:
+    """Returns the checkpoint in a file.
 
     Raises:
         ConfigError: if it is damaged or unreadable.
     """
-    facts = manifest.check(place)
+    arrays, texts = sealed.read(file)
     try:
-        host = json.loads((place / _HOST).read_text(encoding="utf-8"))
-        config = (place / _CONFIG).read_text(encoding="utf-8")
-        shapes = {str(name): (tuple(shape), str(kind)) for name, (shape, kind) in host.pop("arrays").items()}
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError):
-        raise ConfigError(f"'{place}' is no checkpoint of a run") from None
-    held = arrays.read(place)
-    named = {}
-    for number, (name, shape) in enumerate(shapes.items()):
-        array = held.get(str(number)) if isinstance(held, dict) else None
-        if not isinstance(array, np.ndarray) or (array.shape, str(array.dtype)) != shape:
-            raise ConfigError(f"'{place}' does not hold the array '{name}' that it names")
-        named[name] = array
-    return Checkpoint(named, host, config, facts, place)
+        host, config = json.loads(texts.pop(_HOST)), texts.pop(_CONFIG)
+    except (ValueError, KeyError, TypeError, RecursionError):
+        raise ConfigError(f"'{file}' is no checkpoint of a run") from None
+    return Checkpoint(arrays, host, config, texts, file)
 
 
 def _newest_first(folder: Path) -> Iterator[tuple[int, Path]]:
-    """Yields step and folder of each complete checkpoint."""
+    """Yields step and file of each complete checkpoint."""
     found: Iterable[Path] = folder.iterdir() if folder.is_dir() else ()
-    numbered = [(int(match[1]), place) for place in found if (match := _NAME.fullmatch(place.name))]
+    numbered = [(int(match[1]), file) for file in found if (match := _NAME.fullmatch(file.name))]
     yield from sorted(numbered, reverse=True)
 
 
-def _set_aside(place: Path) -> None:
+def _set_aside(file: Path) -> None:
     """Renames a checkpoint that cannot be used."""
-    aside = place.with_name(place.name + ".damaged")
-    shutil.rmtree(aside, ignore_errors=True)
     try:
-        place.rename(aside)
+        file.replace(file.with_name(file.name + ".damaged"))
     except OSError as error:
-        raise unwritable(place, error.strerror) from None
+        raise unwritable(file, error.strerror) from None
 
 
 def _digest_of_first(file: Path, length: int) -> str | None:

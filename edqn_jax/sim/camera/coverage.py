@@ -126,8 +126,8 @@ def _extent_of_discs(position: Array, radius: Array, origin: Array, forward: Arr
     return jnp.where(behind, jnp.inf, edge(-1.0)), jnp.where(behind, -jnp.inf, edge(1.0))
 
 
-BOX_VALUES, CYLINDER_VALUES = 9, 4
-"""Numbers that the sides of a box and of a cylinder need, besides their extent and heights."""
+CYLINDER_VALUES = 4
+"""Numbers that the sides of a cylinder need, besides their extent and heights."""
 
 
 def upright_table(config: CameraConfig, scene: Scene, origin: Array, heading: Array, value: Values) -> Array:

@@ -125,9 +125,9 @@ def test_the_q_network_sees_a_code_or_the_ranges_or_only_the_own_state() -> None
     sizes = [policy.observation_size(with_sensor(name, Config())) for name in SENSORS]
     assert sizes == [42, 42, 42, 42, 42, 778, 36, 10]
     own, sensed, motion = jnp.arange(10.0), jnp.linspace(0.0, 1.0, 26), jnp.ones(MOTION_SIZE)
-    ranges = policy.flatten(with_sensor("ranges"), {}, jnp.zeros((1, 36)), Observation(sensed, own, motion))
+    ranges = policy.flatten(with_sensor("ranges"), {}, Observation(sensed, own, motion))
     np.testing.assert_array_equal(ranges, jnp.concatenate([sensed, own]))
-    blind = policy.flatten(with_sensor("blind"), {}, jnp.zeros((1, 10)), Observation(None, own, motion))
+    blind = policy.flatten(with_sensor("blind"), {}, Observation(None, own, motion))
     np.testing.assert_array_equal(blind, own)
 
 

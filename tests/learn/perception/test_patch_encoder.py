@@ -17,7 +17,7 @@ from edqn_jax.learn.perception.patch_encoder import log_counts, patch_places, pa
 from edqn_jax.sim.sensors import events as ev
 from edqn_jax.sim.sensors.sensor import Form
 from edqn_jax.sim.task.env import MOTION_SIZE
-from tests.oracles import patch_encoder_plain
+from tests.oracles import event_fields, patch_encoder_plain
 
 SMALL = CameraConfig(width=10, height=6)  # no multiple of a patch's side
 CONFIG = EncoderConfig(code_size=5, patch_layers=(6, 3), joint_layers=(8, 7))
@@ -155,7 +155,7 @@ def test_nearness_is_learnt_from_events_and_motion_and_not_from_events_alone() -
     speed = rng.uniform(0.5, 1.0, 512).astype(np.float32)
     near = rng.uniform(0.2, 1.0, 512).astype(np.float32)
     counts = np.rint(16 * near * speed).astype(np.int8)
-    fields = jax.vmap(partial(ev.field_of_counts, EventsConfig()))(
+    fields = jax.vmap(partial(event_fields.field_of_counts, EventsConfig()))(
         jnp.asarray(np.broadcast_to(counts[:, None, None], (512, 8, 8)))
     )
     motion = np.zeros((512, MOTION_SIZE), np.float32)
@@ -182,59 +182,3 @@ def test_nearness_is_learnt_from_events_and_motion_and_not_from_events_alone() -
 
     with_motion, without = error_after(jnp.asarray(motion)), error_after(jnp.zeros_like(motion))
     assert with_motion < 0.5 * without, (with_motion, without)
-
-
-def a_row_of_fields(seed: int, number: int) -> ev.EventField:
-    """Fields of consecutive decisions, [number, F, H, W]."""
-    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *[random_field(seed + at, 1) for at in range(number)])
-
-
-def test_codes_of_decisions_in_a_row_are_those_of_one_decision_after_the_other() -> None:
-    config = dataclasses.replace(CONFIG, sequence_decisions=4)
-    params = shaken(fresh(config, SMALL, jax.random.key(0)))
-    fields = a_row_of_fields(3, 6)
-    motion = jnp.asarray(np.random.default_rng(4).normal(size=(6, MOTION_SIZE)), jnp.float32)
-    begins = jnp.array([False, False, True, False, False, False])  # the first remembers nothing in any case
-    together = encode(config, params, fields, motion, None, begins)
-    remembered = jnp.zeros(config.code_size)
-    for now in range(6):
-        if begins[now]:
-            remembered = jnp.zeros(config.code_size)
-        field = jax.tree.map(lambda leaf, now=now: leaf[now], fields)
-        one = encode(config, params, field, motion[now], remembered)
-        for found, wanted in zip(one, together, strict=True):
-            np.testing.assert_allclose(found, wanted[now], atol=1e-5)
-        remembered = one[0]
-    forgetful = encode(config, params, fields, motion, None, jnp.ones(6, bool))[0]
-    same = np.isclose(forgetful, together[0], atol=1e-3).all(axis=1)
-    assert same.tolist() == [True, False, True, False, False, False]
-
-
-def test_what_was_seen_is_remembered_where_nothing_is_seen() -> None:
-    """Each flight shows how near its world is once; the decoder draws it three decisions later."""
-    camera = CameraConfig(width=8, height=8)
-    config = EncoderConfig(code_size=4, kl_weight=0.0, target_blur=0, sequence_decisions=4)
-    rng = np.random.default_rng(0)
-    near = rng.uniform(0.2, 1.0, 128).astype(np.float32)
-    counts = np.zeros((4, 128, 8, 8), np.int8)
-    counts[0] = np.rint(16 * near)[:, None, None]
-    fields = jax.vmap(jax.vmap(partial(ev.field_of_counts, EventsConfig())))(jnp.asarray(counts))
-    image = jnp.asarray(np.broadcast_to(near[None, :, None, None], counts.shape))
-    wanted = vae.in_waves(config, vae.target(config, fields, image))
-    motion, begins = jnp.zeros((4, 128, MOTION_SIZE)), jnp.zeros((4, 128), bool)
-    optimiser = optax.adam(3e-3)
-
-    def update(carry, key):
-        params, state = carry
-        noise = jax.random.normal(key, (4, 128, config.code_size))
-        gradient = jax.grad(lambda p: vae.vae_loss(config, p, fields, motion, wanted, noise, begins)[0])(params)
-        change, state = optimiser.update(gradient, state)
-        return (optax.apply_updates(params, change), state), None
-
-    params = fresh(config, camera, jax.random.key(0))
-    keys = jax.random.split(jax.random.key(1), 150)
-    (params, _), _ = jax.jit(lambda c: jax.lax.scan(update, c, keys))((params, optimiser.init(params)))
-    made = vae.decode(config, camera, params, encode(config, params, fields, motion, None, begins)[0])
-    error = np.sqrt(np.mean((np.asarray(made)[:, :, 0].mean((2, 3)) - near) ** 2, axis=1))
-    # A guess that does not remember is off by the standard deviation of what there is to know, 0.23.
-    assert error[0] < 0.1 and error[3] < 0.1, error

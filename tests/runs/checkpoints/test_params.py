@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import dataclasses
+from pathlib import Path
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -11,10 +14,12 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from edqn_jax.config import Config
 from edqn_jax.errors import ConfigError
 from edqn_jax.learn.policy import Policy, PolicyParams
-from edqn_jax.runs.checkpoints import manifest
-from edqn_jax.runs.checkpoints import params as checkpoints
+from edqn_jax.runs.checkpoints import sealed
 from edqn_jax.runs.checkpoints.params import POLICY, load_params, save_params
-from edqn_jax.runs.policies import save_policy
+from edqn_jax.runs.policies import load_policy, save_policy
+from tests.policies import CONFIG, always
+
+FLIPS = 200
 
 
 def some_policy(value: float = 1.0) -> PolicyParams:
@@ -54,38 +59,31 @@ def test_no_policy_is_a_sentence(tmp_path):
         load_params(tmp_path)
 
 
-def test_a_policy_whose_saving_was_interrupted_does_not_exist(tmp_path):
-    save_params(tmp_path, some_policy())
-    (tmp_path / POLICY / manifest.MANIFEST).unlink()
-    with pytest.raises(ConfigError, match="incomplete: it has no manifest.json, so saving it was interrupted"):
-        load_params(tmp_path)
-
-
-@pytest.mark.parametrize("fails", ["rename", "seal"])
-@pytest.mark.parametrize("interrupted", [False, True])
-def test_a_policy_is_there_until_the_next_one_is_whole(tmp_path, monkeypatch, fails, interrupted):
+@pytest.mark.parametrize("fails", ["replace", "fsync"])
+def test_a_policy_is_there_until_the_next_one_is_whole(tmp_path, monkeypatch, fails):
     save_params(tmp_path, some_policy(1.0))
-    if interrupted:
-        (tmp_path / POLICY).rename(tmp_path / f"{POLICY}.replaced")
 
     def full(*arguments):
         raise OSError(28, "No space left on device")
 
     with monkeypatch.context() as broken:
-        broken.setattr(*((type(tmp_path), "rename") if fails == "rename" else (checkpoints.manifest, "seal")), full)
+        broken.setattr(type(tmp_path) if fails == "replace" else sealed.os, fails, full)
         with pytest.raises(ConfigError, match="cannot be written: No space left on device"):
             save_params(tmp_path, some_policy(2.0))
     assert same(load_params(tmp_path), some_policy(1.0))
-    assert len(list(tmp_path.iterdir())) == 1
-
-
-def test_a_policy_that_was_just_being_replaced_is_found(tmp_path):
-    save_params(tmp_path, some_policy(1.0))
-    (tmp_path / POLICY).rename(tmp_path / f"{POLICY}.replaced")  # and then the process was killed
-    assert same(load_params(tmp_path), some_policy(1.0))
-    save_params(tmp_path, some_policy(2.0))
-    assert same(load_params(tmp_path), some_policy(2.0))
     assert [path.name for path in tmp_path.iterdir()] == [POLICY]
+
+
+def test_a_policy_without_an_encoder_comes_back(tmp_path):
+    blind = dataclasses.replace(some_policy(), encoder={})
+    save_params(tmp_path, blind)
+    assert same(load_params(tmp_path), blind)
+
+
+def test_a_folder_of_an_older_version_is_a_sentence(tmp_path):
+    (tmp_path / "policy").mkdir()
+    with pytest.raises(ConfigError, match="is a folder, as older versions saved them; .* the version that saved it"):
+        load_params(tmp_path)
 
 
 def test_a_configuration_that_was_changed_afterwards_is_refused(tmp_path):
@@ -107,9 +105,26 @@ def test_a_policy_is_saved_into_no_folder_that_holds_files(tmp_path):
     assert same(load_params(tmp_path / "new" / "checkpoints"), some_policy())
 
 
-def test_a_damaged_policy_is_one_sentence(tmp_path):
-    save_params(tmp_path, some_policy())
-    (tmp_path / POLICY / "_METADATA").unlink()
-    with pytest.raises(ConfigError, match="'_METADATA' is missing") as refusal:
-        load_params(tmp_path)
-    assert "\n" not in str(refusal.value)
+def test_no_flipped_bit_and_no_cut_file_of_a_policy_is_loaded(tmp_path: Path) -> None:
+    whole = tmp_path / "whole"
+    save_policy(Policy(CONFIG, always((1, 0, 0))), whole)
+    load_policy(whole)
+    files = sorted(path.relative_to(whole) for path in whole.rglob("*") if path.is_file())
+    rng = np.random.default_rng(0)
+    sizes = np.array([(whole / file).stat().st_size for file in files], float)
+    chosen = [*range(len(files)), *rng.choice(len(files), FLIPS - len(files), p=sizes / sizes.sum())]
+    for number, index in enumerate(chosen):
+        damaged = whole / files[index]
+        held = damaged.read_bytes()
+        if number % 4 == 3:
+            damaged.write_bytes(held[: rng.integers(len(held))])
+        else:
+            bit = int(rng.integers(8 * len(held)))
+            changed = bytearray(held)
+            changed[bit // 8] ^= 1 << bit % 8
+            damaged.write_bytes(changed)
+        with pytest.raises(ConfigError) as refusal:
+            load_policy(whole)
+        assert "\n" not in str(refusal.value)
+        damaged.write_bytes(held)
+    load_policy(whole)

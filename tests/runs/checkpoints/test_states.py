@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import collections
+import json
 import shutil
 import subprocess
 import sys
@@ -12,7 +13,7 @@ import numpy as np
 import pytest
 
 from edqn_jax.errors import ConfigError
-from edqn_jax.runs.checkpoints import manifest, states
+from edqn_jax.runs.checkpoints import states
 from edqn_jax.runs.checkpoints.states import Checkpoint
 from tests.processes import PATIENCE_S
 
@@ -26,6 +27,10 @@ ARRAYS = {
 def saved(folder: Path, step: int, keep: int = 2) -> Path:
     arrays = {**ARRAYS, ".step": np.asarray(step, np.int32)}
     return states.save(folder, step, Checkpoint(arrays, {"done": step}, "train: {}\n", {"reward": "r"}), keep)
+
+
+def name(step: int) -> str:
+    return f"step-{step:09}.safetensors"
 
 
 def newest(folder: Path) -> tuple[Checkpoint | None, list[str]]:
@@ -53,10 +58,10 @@ def test_a_checkpoint_comes_back_bit_for_bit(tmp_path: Path, monkeypatch: pytest
 
 
 def test_the_newest_are_kept_and_what_an_interrupted_one_left_is_removed(tmp_path: Path) -> None:
-    (tmp_path / "step-000000003.partial").mkdir()
+    (tmp_path / "step-000000003.safetensors.partial").touch()
     for step in (1, 2, 10):
         saved(tmp_path, step)
-    assert sorted(place.name for place in tmp_path.iterdir()) == ["step-000000002", "step-000000010"]
+    assert sorted(place.name for place in tmp_path.iterdir()) == [name(2), name(10)]
     found, _ = newest(tmp_path)
     assert found is not None and found.arrays[".step"] == 10
 
@@ -68,33 +73,46 @@ def test_without_checkpoints_there_is_none(tmp_path: Path) -> None:
 def test_no_flipped_bit_and_no_cut_file_is_loaded_and_the_one_before_is_used(tmp_path: Path) -> None:
     saved(tmp_path / "good", 1)
     saved(tmp_path / "good", 2)
-    whole = tmp_path / "good" / "step-000000002"
-    files = sorted(file.relative_to(whole) for file in whole.rglob("*") if file.is_file())
-    draw, damages = np.random.default_rng(0), 0
-    for name in files:
-        size = (whole / name).stat().st_size
-        bits = sorted({0, *draw.integers(0, 8 * size, 12).tolist()}) if size else []
-        for bit in [*bits, None, "gone"]:
-            folder = tmp_path / "hurt"
-            shutil.copytree(tmp_path / "good", folder)
-            hurt = folder / whole.name / name
-            if bit == "gone":
-                hurt.unlink()
-            elif bit is None:
-                hurt.write_bytes(hurt.read_bytes()[: size // 2] + (b"" if size else b"x"))
-            else:
-                flip(hurt, bit)
-            found, said = newest(folder)
-            assert found is not None and found.arrays[".step"] == 1, (name, bit)
-            assert len(said) == 1 and "after training step 2 is set aside" in said[0]
-            assert (folder / "step-000000002.damaged").is_dir()
-            shutil.rmtree(folder)
-            damages += 1
-    assert damages >= 100
+    whole = tmp_path / "good" / name(2)
+    size = whole.stat().st_size
+    bits = np.random.default_rng(0).integers(0, 8 * size, 100).tolist()
+    for damage in [*range(0, 64, 7), *bits, "cut", "longer", "empty"]:
+        folder = tmp_path / "hurt"
+        shutil.copytree(tmp_path / "good", folder)
+        hurt = folder / whole.name
+        if isinstance(damage, int):
+            flip(hurt, damage)
+        else:
+            held = hurt.read_bytes()
+            hurt.write_bytes({"cut": held[:-1], "longer": held + b"x", "empty": b""}[damage])
+        found, said = newest(folder)
+        assert found is not None and found.arrays[".step"] == 1, damage
+        assert len(said) == 1 and "after training step 2 is set aside" in said[0]
+        assert (folder / f"{whole.name}.damaged").is_file()
+        shutil.rmtree(folder)
+
+
+def test_other_programs_read_it_as_safetensors(tmp_path: Path) -> None:
+    held = saved(tmp_path, 7).read_bytes()
+    begins = 8 + int.from_bytes(held[:8], "little")
+    header = json.loads(held[8:begins])
+    assert begins % 8 == 0 and set(header) == {"__metadata__", *ARRAYS}
+    assert all(isinstance(text, str) for text in header["__metadata__"].values())
+    said = header[".actors.env"]
+    first, end = said["data_offsets"]
+    assert (said["dtype"], said["shape"]) == ("F32", [3, 4])
+    np.testing.assert_array_equal(np.frombuffer(held[begins:][first:end], "<f4").reshape(3, 4), ARRAYS[".actors.env"])
+    assert len(held) - begins == max(each["data_offsets"][1] for name, each in header.items() if name in ARRAYS)
+
+
+def test_folders_of_an_older_version_are_a_sentence(tmp_path: Path) -> None:
+    (tmp_path / "step-000000002").mkdir()
+    with pytest.raises(ConfigError, match="are folders, as older versions saved them; .* or give --resume never"):
+        newest(tmp_path)
 
 
 def test_where_all_are_damaged_the_run_is_not_quietly_begun_anew(tmp_path: Path) -> None:
-    (saved(tmp_path, 1) / manifest.MANIFEST).unlink()
+    flip(saved(tmp_path, 1), 9)
     for _ in range(2):  # nor at the next start
         with pytest.raises(ConfigError, match="no checkpoint in .* can be used; --resume never begins the run anew"):
             newest(tmp_path)
@@ -118,17 +136,17 @@ def test_a_disk_with_too_little_space_is_noticed_before_anything_is_written(
 ) -> None:
     saved(tmp_path, 1)
     usage = collections.namedtuple("usage", "free")
-    monkeypatch.setattr("edqn_jax.runs.checkpoints.arrays.shutil.disk_usage", lambda folder: usage(5_000_000))
+    monkeypatch.setattr("edqn_jax.runs.checkpoints.sealed.shutil.disk_usage", lambda folder: usage(5_000_000))
     with pytest.raises(ConfigError, match="has 5 MB of free space, and 10 MB are needed"):
         saved(tmp_path, 2)
-    assert [place.name for place in tmp_path.iterdir()] == ["step-000000001"]
+    assert [place.name for place in tmp_path.iterdir()] == [name(1)]
 
 
 FULL = """
 import resource, sys
 from pathlib import Path
 from edqn_jax.errors import ConfigError
-from tests.runs.checkpoints.test_states import newest, saved
+from tests.runs.checkpoints.test_states import name, newest, saved
 folder, failed = Path(sys.argv[1]), 0
 saved(folder, 1)
 most = max(file.stat().st_size for file in folder.rglob("*") if file.is_file())
@@ -143,8 +161,8 @@ for limit in range(0, most + 1, max(most // 12, 1)):
     found, said = newest(folder)
     assert found is not None and not said
     names = {place.name for place in folder.iterdir()}
-    assert names <= {"step-000000001", "step-000000002"}, names
-    assert "step-000000001" in names
+    assert names <= {name(1), name(2)}, names
+    assert name(1) in names
 print(failed)
 """
 

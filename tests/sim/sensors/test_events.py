@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from edqn_jax.config import Config, EventsConfig
 from edqn_jax.sim.sensors import events as ev
-from tests.oracles import events_plain
+from tests.oracles import event_fields, events_plain
 
 HEIGHT, WIDTH = 4, 5
 TIMES = (-0.04, -0.02, 0.0)
@@ -243,7 +243,7 @@ def test_esim_windows_are_half_open():
     stream = ev.expand(field)
     assert np.all(field.count == [[[3]], [[0]]])
     assert stream["t"].max() == 19_999
-    np.testing.assert_array_equal(ev.collect(stream, TIMES, HEIGHT, WIDTH).count, field.count)
+    np.testing.assert_array_equal(event_fields.collect(stream, TIMES, HEIGHT, WIDTH).count, field.count)
 
 
 @few
@@ -256,7 +256,7 @@ def test_expansion_is_sorted_inside_the_window_and_lossless_both_ways(seed, law)
     assert np.all(np.diff(stream["t"]) >= 0)
     if len(stream):
         assert start_us <= stream["t"][0] and stream["t"][-1] < start_us + 40_000
-    back = ev.collect(stream, TIMES, HEIGHT, WIDTH, start_us)
+    back = event_fields.collect(stream, TIMES, HEIGHT, WIDTH, start_us)
     np.testing.assert_array_equal(back.count, field.count)
     np.testing.assert_array_equal(back.polarity, field.polarity)
     for k in range(int(field.count.max())):
@@ -276,7 +276,7 @@ def test_a_stream_of_evenly_spaced_events_survives_collection(data):
     stream = np.zeros(count, ev.STREAM_DTYPE)
     stream["t"] = np.rint(start + step * np.arange(count)).astype(np.int64)
     stream["x"], stream["y"], stream["p"] = 2, 1, -1
-    field = ev.collect(stream, (0.0, 0.02), HEIGHT, WIDTH)
+    field = event_fields.collect(stream, (0.0, 0.02), HEIGHT, WIDTH)
     assert field.count.sum() == field.count[0, 1, 2] == count
     np.testing.assert_array_equal(ev.expand(field), stream)
 
@@ -285,23 +285,23 @@ def test_collect_refuses_a_stream_that_no_field_can_hold():
     stream = np.zeros(3, ev.STREAM_DTYPE)
     stream["p"], stream["t"] = 1, [0, 10, 100]
     with pytest.raises(ValueError, match="unevenly"):
-        ev.collect(stream, (0.0, 0.02), HEIGHT, WIDTH)
+        event_fields.collect(stream, (0.0, 0.02), HEIGHT, WIDTH)
     stream["t"], stream["p"] = [0, 10, 20], [1, -1, 1]
     with pytest.raises(ValueError, match="both polarities"):
-        ev.collect(stream, (0.0, 0.02), HEIGHT, WIDTH)
+        event_fields.collect(stream, (0.0, 0.02), HEIGHT, WIDTH)
 
 
 def test_an_empty_window_has_an_empty_stream():
     still = jnp.full((3, HEIGHT, WIDTH), 0.5)
     stream = ev.expand(host(run(PAPER, memory_of(PAPER, 0), still)[0]))
     assert len(stream) == 0
-    assert not np.any(ev.collect(stream, TIMES, HEIGHT, WIDTH).count)
+    assert not np.any(event_fields.collect(stream, TIMES, HEIGHT, WIDTH).count)
 
 
 def test_a_stored_signed_count_holds_the_whole_field_of_two_frames():
     config = EventsConfig()
     field, _ = run(config, memory_of(config, 0), jnp.asarray(random_frames(9, 2)), config.frame_times_s)
-    again = ev.field_of_counts(config, ev.signed_count(field))
+    again = event_fields.field_of_counts(config, event_fields.signed_count(field))
     for name in ("count", "polarity"):
         np.testing.assert_array_equal(getattr(field, name), getattr(again, name))
     np.testing.assert_allclose(field.t_step, again.t_step, rtol=1e-6)

@@ -313,7 +313,7 @@ def test_a_new_sensor_needs_only_its_entry_to_act(with_new_sensor, world) -> Non
     assert workload(config, jax.tree.map(lambda x: x[0], world.pool))["frames_per_decision"] == 1
     params = policy.fresh_policy(config)
     observation = env.Observation(shown, jnp.zeros(env.OWN_SIZE), jnp.zeros(env.MOTION_SIZE))
-    code = embedding.embed(config, params.encoder, observation, jnp.zeros(embedding.size(config)))
+    code = embedding.embed(config, params.encoder, observation)
     assert code is not None and code.shape == (embedding.size(config),)
     if sensor.sensor_of(config).form is Form.VALUES:
         np.testing.assert_array_equal(code, shown)

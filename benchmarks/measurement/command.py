@@ -1,0 +1,70 @@
+"""What the commands of all benchmarks share: help, `--json`, and a sentence with exit code 2 for invalid input."""
+
+from __future__ import annotations
+
+import argparse
+import functools
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+from edqn_jax.errors import ConfigError
+from edqn_jax.extras import MissingPackageError
+from edqn_jax.files import check_can_write
+
+
+class Parser(argparse.ArgumentParser):
+    """Parses the options of a benchmark."""
+
+    def __init__(
+        self, name: str, about: str | None, *, json: str | None = "write the report to this file", epilog: str = ""
+    ) -> None:
+        """Holds no option but `--json`.
+
+        Args:
+            name: of the file in `benchmarks/`.
+            about: its docstring.
+            json: help of `--json`; None for a benchmark that has no such option.
+            epilog: last line of the help.
+        """
+        super().__init__(
+            prog=f"python benchmarks/{name}.py",
+            description=about,
+            epilog=epilog,
+            formatter_class=argparse.RawDescriptionHelpFormatter,
+        )
+        if json is not None:
+            self.add_argument("--json", type=Path, help=json)
+
+    def parse(self, words: Sequence[str] | None) -> argparse.Namespace:
+        """Returns the options.
+
+        Raises:
+            ConfigError: if the file of `--json` or `--figure` cannot be written.
+        """
+        args = self.parse_args(words)
+        for name in ("json", "figure"):
+            if getattr(args, name, None) is not None:
+                check_can_write(getattr(args, name))
+        return args
+
+
+def at_least_one(text: str) -> int:
+    """Returns an option's whole number of at least 1."""
+    if not text.isdecimal() or int(text) < 1:
+        raise argparse.ArgumentTypeError(f"must be a whole number of at least 1, not {text}")
+    return int(text)
+
+
+def in_a_sentence(main: Callable[..., int]) -> Callable[..., int]:
+    """Returns a `main` that prints what is wrong with its input, or which package is missing, and returns 2."""
+
+    @functools.wraps(main)
+    def command(*arguments: object) -> int:
+        try:
+            return main(*arguments)
+        except (ConfigError, MissingPackageError) as error:
+            print(error, file=sys.stderr)
+            return 2
+
+    return command
