@@ -7,7 +7,6 @@ import math
 from collections.abc import Iterable
 
 from edqn_jax.config.options import (
-    FAMILIES,
     AgentConfig,
     AirConfig,
     BodyConfig,
@@ -25,7 +24,7 @@ from edqn_jax.config.options import (
     TrainConfig,
     WorldConfig,
 )
-from edqn_jax.config.registry import LEARNERS
+from edqn_jax.config.registry import FAMILIES, LEARNERS, NETWORKS, SENSORS
 from edqn_jax.errors import ConfigError
 
 
@@ -55,7 +54,9 @@ def validate(config: Config, *, trains: bool = True) -> None:
     _train(config.train)
     if config.env.drones > 1:
         _several_drones(config, trains)
+    SENSORS.check(config.env.sensor)
     LEARNERS.check(config.agent.learner)
+    NETWORKS.check(config.agent.network)
     _replay(config.agent, config.train)
     _pqn(config.pqn, config.train)
     _samples(config.encoder, config.train)

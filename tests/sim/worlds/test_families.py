@@ -185,8 +185,7 @@ def test_a_world_without_a_way_is_drawn_again(monkeypatch):
         boxes = dataclasses.replace(scene.boxes, half=half, position=position)
         return dataclasses.replace(scene, boxes=boxes, start=start, goal=goal)
 
-    rooms_too = families._FAMILIES["rooms"]
-    monkeypatch.setitem(families._FAMILIES, "walled", dataclasses.replace(rooms_too, draw=draw))
+    monkeypatch.setitem(FAMILIES._entries, "walled", dataclasses.replace(families.ROOMS, draw=draw))
     pool = families._drawn("walled", world_keys("training", 12))
     half = np.asarray(pool.boxes.half[:, 0])
     assert not (half[:, 1] == 18.0).any()
