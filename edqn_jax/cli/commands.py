@@ -154,7 +154,7 @@ def import_module_or_file(name: str) -> None:
     """
     start_jax()
 
-    import jax
+    from edqn_jax.devices.forks import has_found_devices
 
     module = Path(name).stem if name.endswith(".py") else name
     folder = str(Path(name).resolve().parent if name.endswith(".py") else Path.cwd())
@@ -167,13 +167,11 @@ def import_module_or_file(name: str) -> None:
         if error.name != module:
             raise
         raise ConfigError(f"there is no module '{name}' to import; give a file that ends in .py, or a module") from None
-    try:
-        jax.config.update("jax_num_cpu_devices", jax.config.jax_num_cpu_devices)  # pyright: ignore[reportAttributeAccessIssue]
-    except RuntimeError:
+    if has_found_devices():
         raise ConfigError(
             f"'{name}' computes with JAX while it is imported, before the devices are known; make its arrays within "
             "functions, or with NumPy"
-        ) from None
+        )
 
 
 def _of_a_run(command: str, argv: Sequence[str]) -> None:

@@ -84,8 +84,9 @@ class Registry:
         """
         if name not in self._entries:
             near = difflib.get_close_matches(name, self._entries, n=1)
-            hint = f"did you mean '{near[0]}'?" if near else f"it must be one of {', '.join(self._entries)}, or {FIRST}"
-            raise ConfigError(f"{self.option}: there is no {self.kind} '{name}'; {hint}")
+            known = f"did you mean '{near[0]}'" if near else f"it must be one of {', '.join(self)}"
+            end = "?" if near else ""
+            raise ConfigError(f"{self.option}: there is no {self.kind} '{name}'; {known}, or {FIRST}{end}")
 
     def get(self, name: str) -> Any:
         """Returns the entry of that name.

@@ -21,6 +21,7 @@ from edqn_jax.sim.sensors.sensor import (
     Sensor,
     SensorMemory,
     brightness,
+    last_view,
     nearness,
     nearness_image,
     ranges,
@@ -40,12 +41,6 @@ def _views(config: Config, scene: Scene, poses: Flight) -> Array:
     """Returns the luma frames [T, H, W] at poses [T], each of the world as it stands at its own time."""
     see = lambda p, q, t: view(config, scene_at(scene, t), p, q)  # noqa: E731
     return jax.vmap(see)(poses.position, poses.quaternion, poses.time)
-
-
-def _last(scene: Scene, poses: Flight) -> tuple[Scene, Array, Array]:
-    """Returns the world at the last of the poses, its position [3] and its quaternion [4]."""
-    time = None if poses.time is None else poses.time[-1]
-    return scene_at(scene, time), poses.position[-1], poses.quaternion[-1]
 
 
 def _show_events(
@@ -80,7 +75,7 @@ def _show_frame(
     if config.exposure.real:
         frames, memory = _exposed(config, scene, poses, memory, key)
         return brightness(config, frames), memory
-    scene, position, quaternion = _last(scene, poses)
+    scene, position, quaternion = last_view(scene, poses)
     return brightness(config, view(config, scene, position, quaternion))[None], None
 
 
@@ -125,7 +120,7 @@ def _show_frame_pair(
 def _show_depth(
     config: Config, scene: Scene, poses: Flight, memory: SensorMemory, key: Array
 ) -> tuple[Sensed, SensorMemory]:
-    return nearness_image(config, *_last(scene, poses))[None], None
+    return nearness_image(config, *last_view(scene, poses))[None], None
 
 
 def _show_depth_motion(
@@ -135,7 +130,7 @@ def _show_depth_motion(
 
     Both depths are seen from the last pose, so that the drone's own motion does not show.
     """
-    now, position, quaternion = _last(scene, poses)
+    now, position, quaternion = last_view(scene, poses)
     near = nearness_image(config, now, position, quaternion)
     if poses.time is None:
         return jnp.stack([near, jnp.zeros_like(near)]), None
@@ -149,7 +144,7 @@ def _show_depth_motion(
 def _show_ranges(
     config: Config, scene: Scene, poses: Flight, memory: SensorMemory, key: Array
 ) -> tuple[Sensed, SensorMemory]:
-    scene, position, quaternion = _last(scene, poses)
+    scene, position, quaternion = last_view(scene, poses)
     return nearness(ranges(config.camera, scene, position, drone.yaw_of(quaternion))), None
 
 

@@ -28,7 +28,7 @@ from edqn_jax.sim.camera import camera, raycast
 from edqn_jax.sim.camera.depth import nearest_depth
 from edqn_jax.sim.camera.raycast import Rays
 from edqn_jax.sim.physics.drone import Flight
-from edqn_jax.sim.scene.scene import Scene
+from edqn_jax.sim.scene.scene import Scene, scene_at
 from edqn_jax.sim.sensors import events, exposure
 from edqn_jax.sim.sensors.events import EventField, EventMemory
 from edqn_jax.sim.sensors.exposure import FrameMemory
@@ -283,6 +283,12 @@ def sense(config: Config, scene: Scene, poses: Flight, memory: SensorMemory, key
     sensed, memory = sensor.show(config, scene, poses, memory, key)
     sensor.check(config, sensed)
     return sensed, memory
+
+
+def last_view(scene: Scene, poses: Flight) -> tuple[Scene, Array, Array]:
+    """Returns the world as it stands at the last of the poses, its position [3] metres and its quaternion [4]."""
+    time = None if poses.time is None else poses.time[-1]
+    return scene_at(scene, time), poses.position[-1], poses.quaternion[-1]
 
 
 def brightness(config: Config, luma: Array) -> Array:

@@ -280,6 +280,12 @@ def _show_negative(config, scene, poses, memory, key):
     return -sensor.brightness(config, frame)[None], memory
 
 
+def _show_tree(config, scene, poses, memory, key):
+    """Two pictures and three values."""
+    picture = _show_negative(config, scene, poses, memory, key)[0]
+    return {"pictures": jnp.concatenate([picture, 2.0 * picture]), "rows": picture[0, :3, 0]}, memory
+
+
 NEW = {
     "row_means": Sensor(
         show=_show_row_means,
@@ -289,6 +295,11 @@ NEW = {
     ),
     "negative": Sensor(
         show=_show_negative, shape=lambda config: (1, config.camera.height, config.camera.width), draws_frames=True
+    ),
+    "tree": Sensor(
+        show=_show_tree,
+        shape=lambda config: {"pictures": (2, config.camera.height, config.camera.width), "rows": (3,)},
+        draws_frames=True,
     ),
 }
 
@@ -310,7 +321,7 @@ def test_a_new_sensor_needs_only_its_entry_to_act(with_new_sensor, world) -> Non
     state = jax.eval_shape(lambda key: env.ended(config, world, key), jax.random.key(0))
     state, step = jax.eval_shape(lambda s: env.step(config, world, s, 0), state)
     shown = sensor.sensor_of(config).example(config)
-    assert step.observation.sensed.shape == shown.shape  # type: ignore
+    assert jax.tree.map(jnp.shape, step.observation.sensed) == jax.tree.map(jnp.shape, shown)
     assert workload(config, jax.tree.map(lambda x: x[0], world.pool))["frames_per_decision"] == 1
     params = policy.fresh_policy(config)
     observation = env.Observation(shown, jnp.zeros(env.OWN_SIZE), jnp.zeros(env.MOTION_SIZE))
@@ -319,6 +330,10 @@ def test_a_new_sensor_needs_only_its_entry_to_act(with_new_sensor, world) -> Non
     if config.env.sensor == "row_means":
         np.testing.assert_array_equal(code, shown)
         assert state.memory.shape == () and not params.encoder
+    if config.env.sensor == "tree":
+        assert embedding.code_size(config) == embedding.size(config) - 3 == config.encoder.code_size
+        np.testing.assert_array_equal(code[-3:], shown["rows"])
+        assert policy.Policy(config, params).code(observation).shape == (config.encoder.code_size,)
     assert decision_latency_ms(config, params, calls=1)["median"] > 0.0
 
 
