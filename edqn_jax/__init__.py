@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from edqn_jax.xla_flags import disable_ynn_fusions
 
 if TYPE_CHECKING:
-    from edqn_jax.config import Config
+    from edqn_jax.config import FAMILIES, LEARNERS, NETWORKS, SENSORS, Config
     from edqn_jax.config.loading import make_config
     from edqn_jax.devices.devices import use_cpu_devices
     from edqn_jax.errors import ConfigError, DivergedError, StoppedError
@@ -23,21 +23,29 @@ if TYPE_CHECKING:
     from edqn_jax.report.flights import draw_map
     from edqn_jax.runs.policies import load_policy, save_policy
     from edqn_jax.sim.actions import move_name, move_number
+    from edqn_jax.sim.sensors.sensor import Sensor
     from edqn_jax.sim.task.environment import Environment, make
     from edqn_jax.sim.task.outcomes import Outcome
     from edqn_jax.sim.task.reward import Transition
+    from edqn_jax.sim.worlds.families import Family
     from edqn_jax.training.loop import Chunk, TrainingResult, train, train_seeds
 
 _MODULES = {
+    "FAMILIES": "config",
+    "LEARNERS": "config",
+    "NETWORKS": "config",
+    "SENSORS": "config",
     "Chunk": "training.loop",
     "Config": "config",
     "ConfigError": "errors",
     "DivergedError": "errors",
     "Environment": "sim.task.environment",
     "Evaluation": "evaluation.evaluate",
+    "Family": "sim.worlds.families",
     "Outcome": "sim.task.outcomes",
     "PlannedPath": "planning.path",
     "Policy": "learn.policy",
+    "Sensor": "sim.sensors.sensor",
     "StoppedError": "errors",
     "TrainingResult": "training.loop",
     "Transition": "sim.task.reward",
@@ -57,15 +65,21 @@ _MODULES = {
 """The module of each public name."""
 
 __all__ = [
+    "FAMILIES",
+    "LEARNERS",
+    "NETWORKS",
+    "SENSORS",
     "Chunk",
     "Config",
     "ConfigError",
     "DivergedError",
     "Environment",
     "Evaluation",
+    "Family",
     "Outcome",
     "PlannedPath",
     "Policy",
+    "Sensor",
     "StoppedError",
     "TrainingResult",
     "Transition",

@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any
 
 import edqn_jax
-from edqn_jax.config.options import MIXTURES
+from edqn_jax.config import MIXTURES
 from edqn_jax.devices.devices import use_cpu_devices
 from edqn_jax.errors import ConfigError
 from edqn_jax.evaluation.evaluate import Evaluation, evaluate

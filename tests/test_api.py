@@ -6,6 +6,7 @@ import ast
 import dataclasses
 import subprocess
 import sys
+from functools import partial
 from importlib import metadata
 from pathlib import Path
 
@@ -213,6 +214,17 @@ def test_the_true_depth_is_what_the_depth_sensor_shows() -> None:
     label = nearness_of(QUICK, environment.world, state)
     np.testing.assert_allclose(DEPTH_SCALE * np.asarray(nearness(jnp.asarray(depth))), label, atol=1e-5)
     assert np.isinf(depth[0]).any() and 0 < depth.min() < 20  # the sky, and what stands ahead
+
+
+def test_pictures_and_depth_are_drawn_within_programs_of_ones_own() -> None:
+    environment = edqn_jax.make(WORLD, QUICK)
+    states, _ = jax.vmap(environment.reset)(jax.random.split(jax.random.key(0), 2))
+    first = jax.tree.map(lambda x: x[0], states)
+    for see in (environment.depth, partial(environment.picture, scale=1)):
+        alone, many = jax.jit(see)(first), jax.jit(jax.vmap(see))(states)
+        np.testing.assert_allclose(alone, see(first), rtol=1e-5)
+        np.testing.assert_allclose(many[0], alone, rtol=1e-5)
+        assert many.shape == (2, *alone.shape)
 
 
 def test_the_worlds_of_a_split_are_those_of_its_missions() -> None:

@@ -105,8 +105,7 @@ class EvaluateArgs:
     run: Annotated[Positional[Path], arg(metavar="RUN")]
     """Folder of the run, or `pretrained`: the policy that comes with the package."""
     world: Annotated[str | None, arg(metavar="WORLD", help_behavior_hint="")] = None
-    """Where to fly: `paper`, an MJCF file, or test worlds of a family (`sparse`, `medium`, `dense`, `rooms`, `forest`,
-    `canyon`, `open`, `mixed`, `moving`). Default: where training was."""
+    """Where to fly: `paper`, an MJCF file, or test worlds of a family (default: where training was)."""
     start: Annotated[Point | None, arg(metavar="X Y Z", help_behavior_hint="")] = None
     """Start of every mission, metres (default: the world's; random free ones with --missions)."""
     goal: Annotated[Point | None, arg(metavar="X Y Z", help_behavior_hint="")] = None

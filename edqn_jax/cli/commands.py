@@ -7,6 +7,7 @@ import signal
 import sys
 from collections.abc import Sequence
 from importlib import metadata
+from pathlib import Path
 
 import tyro
 
@@ -55,6 +56,9 @@ COMMANDS = {
     "completion": CompletionArgs,
 }
 
+IMPORT = "--import"
+"""Option of every command: what to import first."""
+
 VERSIONS = ("jax", "mujoco", "mujoco-mjx")
 """Packages whose versions `edqn --version` names below its own."""
 
@@ -102,6 +106,9 @@ def _dispatched(argv: list[str], stops: Stops) -> int:
 
 
 def _dispatch(argv: Sequence[str], stops: Stops) -> int:
+    argv, modules = take_imports(argv)
+    for module in modules:
+        import_module_or_file(module)
     command, rest = argv[0] if argv else "--help", argv[1:]
     if command == "train":
         train_command(rest, stops)
@@ -118,6 +125,53 @@ def _dispatch(argv: Sequence[str], stops: Stops) -> int:
     else:
         raise ConfigError(f"there is no command '{command}'{nearest(command, [*COMMANDS, '--help', '--version'])}")
     return DONE
+
+
+def take_imports(argv: Sequence[str]) -> tuple[list[str], list[str]]:
+    """Returns the words of a command without `--import`, and the modules and files that it names.
+
+    Raises:
+        ConfigError: if it names none.
+    """
+    words, modules = iter(argv), []
+    rest: list[str] = []
+    for word in words:
+        flag, equals, value = word.partition("=")
+        if flag != IMPORT:
+            rest.append(word)
+            continue
+        modules.append(value if equals else next(words, ""))
+        if not modules[-1]:
+            raise ConfigError(f"{IMPORT} must be followed by a Python file or the name of a module")
+    return rest, modules
+
+
+def import_module_or_file(name: str) -> None:
+    """Imports what registers a user's own entries: a file that ends in .py, or a module, also of the current folder.
+
+    Raises:
+        ConfigError: if there is none, or it makes arrays while it is imported, which fixes JAX's devices too soon.
+    """
+    start_jax()
+
+    from edqn_jax.devices.forks import has_found_devices
+
+    module = Path(name).stem if name.endswith(".py") else name
+    folder = str(Path(name).resolve().parent if name.endswith(".py") else Path.cwd())
+    if name.endswith(".py") and not Path(name).is_file():
+        raise ConfigError(f"there is no file '{name}' to import")
+    sys.path.insert(0, folder)
+    try:
+        importlib.import_module(module)
+    except ModuleNotFoundError as error:
+        if error.name != module:
+            raise
+        raise ConfigError(f"there is no module '{name}' to import; give a file that ends in .py, or a module") from None
+    if has_found_devices():
+        raise ConfigError(
+            f"'{name}' computes with JAX while it is imported, before the devices are known; make its arrays within "
+            "functions, or with NumPy"
+        )
 
 
 def _of_a_run(command: str, argv: Sequence[str]) -> None:

@@ -6,17 +6,14 @@ import contextlib
 import io
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import tyro
 
 from edqn_jax.cli.arguments import SHORT_NAMES, EvaluateArgs, RecordArgs, TrainOptions
-from edqn_jax.cli.help import all_of_train, described, with_conditions
+from edqn_jax.cli.help import REGISTERED, all_of_train, described, with_conditions
 from edqn_jax.config.loading import make_config
-from edqn_jax.config.options import CONDITIONS, FAMILIES
-
-WORLDS = Literal[("paper", *FAMILIES)]  # pyright: ignore[reportInvalidTypeForm]
-"""Worlds that have a name; others are files."""
+from edqn_jax.config.options import CONDITIONS
 
 FILES_TOO = {
     "bash": {
@@ -36,19 +33,21 @@ def completion_script(shell: Literal["bash", "zsh", "fish"], kinds: Mapping[str,
         shell: for which.
         kinds: the dataclass of each command's options.
     """
-    worlds = {"world.name": WORLDS, "world.flown": WORLDS}
+    names: dict[str, Any] = {name: Literal[tuple(registry)] for name, registry in REGISTERED.items()}
+    worlds: Any = Literal[("paper", *REGISTERED["world"])]  # those that have a name; others are files
+    names |= dict.fromkeys(("world", "world.name", "world.flown"), worlds)
     somewhere = Path()
     in_a_world = {
         "evaluate": EvaluateArgs(somewhere, "paper"),
         "record": RecordArgs(somewhere, somewhere, world="paper"),
     }
     commands = {
-        name: described(kind, in_a_world.get(name), kinds={"world": WORLDS} if name in in_a_world else None)
+        name: described(kind, in_a_world.get(name), kinds=names if name in in_a_world else None)
         for name, kind in kinds.items()
         if name != "train"
     }
     commands["evaluate"] = with_conditions(commands["evaluate"], CONDITIONS)
-    commands = {"train": all_of_train(TrainOptions(), make_config(), SHORT_NAMES, worlds), **commands}
+    commands = {"train": all_of_train(TrainOptions(), make_config(), SHORT_NAMES, names), **commands}
     written = io.StringIO()
     with contextlib.redirect_stdout(written), contextlib.suppress(SystemExit):
         tyro.extras.subcommand_cli_from_dict(commands, prog="edqn", args=["--tyro-print-completion", shell])

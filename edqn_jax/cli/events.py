@@ -151,7 +151,8 @@ def _strips(args: EventsArgs, recording: Recording, figures: dict[str, Any]) -> 
     if args.picture is None:
         return [], [], period_s
 
-    from edqn_jax.report.recordings import DECODED, EVENTS, MOMENTS, MOST_FRAMES, NEARNESS, Strip, moments
+    from edqn_jax.report.images import EVENTS, NEARNESS, RECONSTRUCTED_EVENTS
+    from edqn_jax.report.recordings import MOMENTS, MOST_FRAMES, Strip, moments
 
     most = MOST_FRAMES if args.picture.suffix.lower() == ".gif" else MOMENTS
     chosen = moments(len(ends), most)
@@ -161,7 +162,7 @@ def _strips(args: EventsArgs, recording: Recording, figures: dict[str, Any]) -> 
     if seen is not None:
         height, width = seen.image.shape[1:]
         strips.append(Strip(f"policy sees,\n{width} × {height}", seen.image[chosen], EVENTS))
-        name, look = ("decoded nearness", NEARNESS) if seen.has_nearness else ("decoded events", DECODED)
+        name, look = ("decoded nearness", NEARNESS) if seen.has_nearness else ("decoded events", RECONSTRUCTED_EVENTS)
         strips.append(Strip(name, seen.decoded[chosen], look))
     return strips, [float(ends[number] - begin) * 1e-6 for number in chosen], period_s
 

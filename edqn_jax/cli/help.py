@@ -13,6 +13,7 @@ import docstring_parser
 import tyro
 
 from edqn_jax.config import Config
+from edqn_jax.config.registry import FAMILIES, LEARNERS, NETWORKS, SENSORS, Registry
 
 TRAIN, EVALUATE, RECORD, REPORT = "edqn train", "edqn evaluate", "edqn record", "edqn report"
 VERIFY, EXPORT, EVENTS, COMPLETION = "edqn verify", "edqn export", "edqn events", "edqn completion"
@@ -20,7 +21,9 @@ VERIFY, EXPORT, EVENTS, COMPLETION = "edqn verify", "edqn export", "edqn events"
 ABOUT = {
     "edqn": """Train drones to fly through unknown obstacles from the events of a simulated camera, and fly them.
 
-The options of a command: `edqn COMMAND --help`. The versions of packages: `edqn --version`.
+The options of a command: `edqn COMMAND --help`. The versions of packages: `edqn --version`. With `--import FILE.py` (or
+the name of a module), before or after a command, it knows the sensors, worlds, learners and networks that this file
+registers (docs/howto/own_sensor.md).
 
 Examples:
   edqn train                                 train in random worlds for some minutes; files under runs/
@@ -76,8 +79,7 @@ Examples:
 """What each command does, with examples."""
 
 COMMON = {
-    "world.name": "where to train: paper, an MJCF file, or random worlds: sparse, medium, dense, open, rooms, forest, "
-    "canyon, mixed, moving",
+    "world.name": "where to train: paper, an MJCF file, or random worlds",
     "world.flown": "world of the last flight of a run in random worlds",
     "run_dir": "folder of the run (default: a new, dated one under runs/)",
     "resume": "what to do with a run in --run-dir",
@@ -104,6 +106,12 @@ COMMON = {
 }
 """Options that `edqn train --help` shows, with what it says of them; `--help-all` has their whole texts."""
 
+REGISTERED: dict[str, Registry] = {
+    **{registry.option: registry for registry in (SENSORS, LEARNERS, NETWORKS, FAMILIES)},
+    "world": FAMILIES,
+}
+"""What an option names, by the option; of `world` and `world.name` also files."""
+
 METAVARS = {int: "N", float: "X", str: "WORLD", "track": "WHICH [WHICH]", "view": "WHICH"}
 """What stands for a value of a type, or of one option, in the short help."""
 
@@ -129,6 +137,8 @@ def show_train_help(options: Any, config: Config, short_names: Mapping[str, str]
         metavar = METAVARS.get(name, METAVARS.get(kind))
         if typing.get_origin(kind) is typing.Literal:
             metavar, text = "WHICH", f"{text}: {', '.join(typing.get_args(kind))}"
+        elif name in REGISTERED:
+            metavar, text = "WORLD" if group == "world" else "WHICH", f"{text}: {', '.join(REGISTERED[name])}"
         said = Annotated[kind, tyro.conf.arg(name=short.get(flag, flag)[2:], metavar=metavar, help=text)]
         fields.append((name.replace(".", "_"), said, dataclasses.field(default=getattr(owner, option))))
     groups = [options, *(getattr(config, group.name) for group in dataclasses.fields(Config))]
@@ -207,8 +217,11 @@ def described(
             continue
         name = f"{group}{option.name}"
         alias = short.get(flag_of(name))
+        text = re.sub(r"\s+", " ", texts[option.name])
+        if name in REGISTERED:
+            text = f"{text} {REGISTERED[name].describe()}."
         said = tyro.conf.arg(
-            help=re.sub(r"\s+", " ", texts[option.name]),
+            help=text,
             aliases=[alias] if alias else None,
             help_behavior_hint=None if only is None else "",
         )

@@ -2,8 +2,6 @@
 
 from edqn_jax.config.options import (
     CONDITIONS,
-    FAMILIES,
-    MIXTURES,
     AgentConfig,
     AirConfig,
     BodyConfig,
@@ -21,12 +19,16 @@ from edqn_jax.config.options import (
     WorldConfig,
 )
 from edqn_jax.config.presets import PRESETS, preset
+from edqn_jax.config.registry import FAMILIES, LEARNERS, MIXTURES, NETWORKS, SENSORS
 
 __all__ = [
     "CONDITIONS",
     "FAMILIES",
+    "LEARNERS",
     "MIXTURES",
+    "NETWORKS",
     "PRESETS",
+    "SENSORS",
     "AgentConfig",
     "AirConfig",
     "BodyConfig",

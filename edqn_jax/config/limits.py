@@ -7,7 +7,6 @@ import math
 from collections.abc import Iterable
 
 from edqn_jax.config.options import (
-    FAMILIES,
     AgentConfig,
     AirConfig,
     BodyConfig,
@@ -25,7 +24,7 @@ from edqn_jax.config.options import (
     TrainConfig,
     WorldConfig,
 )
-from edqn_jax.config.registry import LEARNERS
+from edqn_jax.config.registry import FAMILIES, FIRST, LEARNERS, NETWORKS, SENSORS
 from edqn_jax.errors import ConfigError
 
 
@@ -55,7 +54,9 @@ def validate(config: Config, *, trains: bool = True) -> None:
     _train(config.train)
     if config.env.drones > 1:
         _several_drones(config, trains)
+    SENSORS.check(config.env.sensor)
     LEARNERS.check(config.agent.learner)
+    NETWORKS.check(config.agent.network)
     _replay(config.agent, config.train)
     _pqn(config.pqn)
     _samples(config.encoder, config.train)
@@ -64,7 +65,7 @@ def validate(config: Config, *, trains: bool = True) -> None:
     _require(judged, "train.validation_missions", limit, config.train.validation_missions)
     if config.agent.turn and config.world.name not in FAMILIES:
         raise ConfigError(
-            f"agent.turn needs a random world ({', '.join(FAMILIES)}), not '{config.world.name}': "
+            f"agent.turn needs a random world ({', '.join(FAMILIES)}, or {FIRST}), not '{config.world.name}': "
             "give --agent.no-turn, or turn: false in a file"
         )
 
@@ -93,8 +94,8 @@ def _world(world: WorldConfig) -> None:
         raise ConfigError("world.name must be the name of a world, not empty")
     if world.flown and world.name not in FAMILIES:
         raise ConfigError(
-            f"world.flown is for random worlds ({', '.join(FAMILIES)}) alone, '{world.name}' is flown itself: "
-            "give --world.flown '', or flown: '' in a file"
+            f"world.flown is for random worlds ({', '.join(FAMILIES)}, or {FIRST}) alone, '{world.name}' is flown "
+            "itself: give --world.flown '', or flown: '' in a file"
         )
     if world.flown in FAMILIES:
         raise ConfigError(f"world.flown must be `paper` or an MJCF file, not the random world '{world.flown}'")

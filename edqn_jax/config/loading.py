@@ -19,9 +19,10 @@ from typing import Any, Literal
 import yaml
 
 from edqn_jax.config.limits import shown, validate
-from edqn_jax.config.options import CONDITIONS, FAMILIES, WITH_DETOURS, Config
+from edqn_jax.config.options import CONDITIONS, Config
 from edqn_jax.config.presets import preset as named_preset
 from edqn_jax.config.profiles import PROFILES
+from edqn_jax.config.registry import FAMILIES, has_detours
 from edqn_jax.config.retired import LAST_COMMIT, RETIRED, is_off
 from edqn_jax.errors import ConfigError
 
@@ -147,7 +148,7 @@ def world_layers(world: str, tuned_for: Hardware) -> list[Layer]:
         return gpu_layers(world, tuned_for)
     if world not in FAMILIES:
         return [DRAWN_WORLDS, *gpu_layers(world, tuned_for)]
-    return [RANDOM_WORLDS, *([CLOSED_WORLDS] if world in WITH_DETOURS else []), *gpu_layers(world, tuned_for)]
+    return [RANDOM_WORLDS, *([CLOSED_WORLDS] if has_detours(world) else []), *gpu_layers(world, tuned_for)]
 
 
 def gpu_layers(world: str, tuned_for: Hardware | Literal["auto"]) -> list[Layer]:
@@ -158,7 +159,7 @@ def gpu_layers(world: str, tuned_for: Hardware | Literal["auto"]) -> list[Layer]
         return [GPU_FROM_FILE]
     if world == "mixed":
         return [GPU, GPU_MIXED]
-    return [GPU, GPU_CLOSED] if world in WITH_DETOURS else [GPU]
+    return [GPU, GPU_CLOSED] if has_detours(world) else [GPU]
 
 
 def resolve(

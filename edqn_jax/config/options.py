@@ -15,9 +15,7 @@ class WorldConfig:
     """Where to train and to fly."""
 
     name: str = "paper"
-    """Where to train: `paper`, the path of an MJCF file, or random worlds: open ones (`sparse`, `medium`, `dense`, or
-    `open`: all three), closed ones (`rooms`, `forest`, `canyon`), all six (`mixed`, a quarter of them open), or medium
-    ones in which obstacles move (`moving`)."""
+    """Where to train: `paper`, the path of an MJCF file, or random worlds."""
     flown: str = ""
     """World of the flight at the end of a run in random worlds: `paper` or the path of an MJCF file; training never
     uses it. Empty: the first test world. A world from a file is flown itself."""
@@ -160,13 +158,8 @@ class EventsConfig:
 class EnvConfig:
     """The task: sensor, actions, outcomes, reward."""
 
-    sensor: Literal["events", "frames", "frame-pair", "event-image", "blind", "depth", "depth-motion", "ranges"] = (
-        "events"
-    )
-    """What the drone observes besides its own state. `events`: the event camera. For comparison, `frames`: the newest
-    brightness frame; `frame-pair`: the frames that the events would be made of; `event-image`: an image of the events
-    without a VAE; `blind`: nothing; `depth`: true depth; `depth-motion`: that and how it changes by the obstacles' own
-    motion; `ranges`: the true free distance along each move."""
+    sensor: str = "events"
+    """What the drone observes besides its own state."""
     speed_m_s: float = 4.0
     """Commanded speed per axis; an action is {-1, 0, 1}^3 times this, in the heading frame."""
     goal_radius_m: float = 2.0
@@ -359,7 +352,9 @@ class AgentConfig:
     """What chooses moves: the deep Q-network (section 3.3, Eq. 7-10), or another learner."""
 
     learner: str = "dqn"
-    """How it learns: `dqn`, from a replay, or `pqn`, from fresh rollouts (options `pqn.*`)."""
+    """How it learns."""
+    network: str = "mlp"
+    """The Q-network."""
     hidden: tuple[int, ...] = (128, 128)
     """Widths of the hidden layers."""
     history: int = 2
@@ -514,15 +509,3 @@ CONDITIONS: dict[str, tuple[str, ...]] = {
     },
 }
 """Options by group that a policy may be flown with other values of than it was trained with."""
-
-_OPEN = ("sparse", "medium", "dense")
-_CLOSED = ("rooms", "forest", "canyon")
-MIXTURES: dict[str, dict[str, int]] = {
-    "open": dict.fromkeys(_OPEN, 1),
-    "mixed": {**dict.fromkeys(_OPEN, 1), **dict.fromkeys(_CLOSED, 3)},
-}
-"""Random worlds that are of one of several families, with their shares; a quarter of the mixed ones are open."""
-FAMILIES = (*_OPEN, *_CLOSED, *MIXTURES, "moving")
-"""Names of random worlds."""
-WITH_DETOURS = (*_CLOSED, "mixed")
-"""Names of random worlds in which the straight line to the goal is seldom free."""

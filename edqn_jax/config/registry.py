@@ -8,34 +8,63 @@ from __future__ import annotations
 
 import difflib
 import importlib
-from collections.abc import Mapping
+import itertools
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 from edqn_jax.errors import ConfigError
+
+FIRST = "your own, registered first (on the command line by --import)"
+"""What else a name may be."""
 
 
 class Registry:
     """Entries of one kind by name."""
 
-    def __init__(self, kind: str, option: str, entries: Mapping[str, str]) -> None:
+    def __init__(
+        self, kind: str, option: str, entries: Mapping[str, str], about: Mapping[str, str] | None = None
+    ) -> None:
         """Holds built-in entries.
 
         Args:
             kind: what an entry is, for messages.
             option: that names one, such as `agent.learner`.
             entries: `module:name` by name.
+            about: what help texts say of entries, by name.
         """
         self.kind = kind
         self.option = option
+        self._built_in = tuple(entries)
         self._entries: dict[str, Any] = dict(entries)
+        self._about = dict(about or {})
 
     @property
     def names(self) -> tuple[str, ...]:
         """Returns the names, built-in ones first."""
         return tuple(self._entries)
 
-    def register(self, name: str, entry: Any) -> None:
-        """Adds an entry of one's own.
+    @property
+    def own(self) -> tuple[str, ...]:
+        """Returns the names that are not built in."""
+        return self.names[len(self._built_in) :]
+
+    def __contains__(self, name: object) -> bool:
+        return name in self._entries
+
+    def __len__(self) -> int:
+        return len(self._entries)
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.names)
+
+    def describe(self) -> str:
+        """Returns the names with what is said of them; neighbours of which the same is said stand together."""
+        groups = itertools.groupby(self.names, lambda name: self._about.get(name, ""))
+        listed = [(", ".join(f"`{name}`" for name in names), about) for about, names in groups]
+        return "; ".join(f"{names}: {about}" if about else names for names, about in listed)
+
+    def register(self, name: str, entry: Any, about: str = "") -> None:
+        """Adds an entry of one's own, with what help texts say of it.
 
         Raises:
             ConfigError: if the name is taken or is no identifier with hyphens.
@@ -45,6 +74,7 @@ class Registry:
         if name in self._entries:
             raise ConfigError(f"there is a {self.kind} '{name}' already; give yours another name")
         self._entries[name] = entry
+        self._about[name] = about
 
     def check(self, name: str) -> None:
         """Raises unless there is an entry of that name.
@@ -54,8 +84,9 @@ class Registry:
         """
         if name not in self._entries:
             near = difflib.get_close_matches(name, self._entries, n=1)
-            hint = f"did you mean '{near[0]}'?" if near else f"it must be one of {', '.join(self._entries)}"
-            raise ConfigError(f"{self.option}: there is no {self.kind} '{name}'; {hint}")
+            known = f"did you mean '{near[0]}'" if near else f"it must be one of {', '.join(self)}"
+            end = "?" if near else ""
+            raise ConfigError(f"{self.option}: there is no {self.kind} '{name}'; {known}, or {FIRST}{end}")
 
     def get(self, name: str) -> Any:
         """Returns the entry of that name.
@@ -75,5 +106,74 @@ LEARNERS = Registry(
     "learner",
     "agent.learner",
     {"dqn": "edqn_jax.learn.dqn.learner:DQN", "pqn": "edqn_jax.learn.pqn.learner:PQN"},
+    {"dqn": "from a replay", "pqn": "from fresh rollouts (options `pqn.*`)"},
 )
 """How the network that chooses moves learns: `edqn_jax.learn.learner.Learner`."""
+
+NETWORKS = Registry(
+    "network",
+    "agent.network",
+    {"mlp": "edqn_jax.learn.qnetwork:QNetwork"},
+    {"mlp": "ReLU layers of `agent.hidden`"},
+)
+"""Q-networks: a flax module, made of `AgentConfig` and the number of moves, that maps stacked observations
+[..., history x observation] to a value of each move [..., moves]."""
+
+_SENSORS = "edqn_jax.sim.sensors.built_in"
+
+SENSORS = Registry(
+    "sensor",
+    "env.sensor",
+    {
+        "events": f"{_SENSORS}:EVENTS",
+        "frames": f"{_SENSORS}:FRAMES",
+        "frame-pair": f"{_SENSORS}:FRAME_PAIR",
+        "event-image": f"{_SENSORS}:EVENT_IMAGE",
+        "blind": f"{_SENSORS}:BLIND",
+        "depth": f"{_SENSORS}:DEPTH",
+        "depth-motion": f"{_SENSORS}:DEPTH_MOTION",
+        "ranges": f"{_SENSORS}:RANGES",
+    },
+    {
+        "events": "the event camera",
+        "frames": "the newest brightness frame",
+        "frame-pair": "the frames that the events would be made of",
+        "event-image": "an image of the events without a VAE",
+        "blind": "nothing",
+        "depth": "true depth",
+        "depth-motion": "that and how it changes by the obstacles' own motion",
+        "ranges": "the true free distance along each move",
+    },
+)
+"""What a drone sees of the world: `edqn_jax.sim.sensors.sensor.Sensor`. `events` is the method's; the others are
+compared with it at the same budget."""
+
+OPEN = ("sparse", "medium", "dense")
+CLOSED = ("rooms", "forest", "canyon")
+"""Families of worlds in which the straight line to the goal is often, or seldom, free."""
+
+MIXTURES: dict[str, dict[str, int]] = {
+    "open": dict.fromkeys(OPEN, 1),
+    "mixed": {**dict.fromkeys(OPEN, 1), **dict.fromkeys(CLOSED, 3)},
+}
+"""Random worlds that are of one of several families, with their shares; a quarter of the mixed ones are open."""
+
+FAMILIES = Registry(
+    "family of random worlds",
+    "world.name",
+    {name: f"edqn_jax.sim.worlds.families:{name.upper()}" for name in (*OPEN, *CLOSED, *MIXTURES, "moving")},
+    {
+        **dict.fromkeys(OPEN, "open ones"),
+        **dict.fromkeys(CLOSED, "closed ones"),
+        "open": "open ones of all three kinds",
+        "mixed": "all six, a quarter of them open",
+        "moving": "medium ones in which obstacles move",
+    },
+)
+"""Random worlds: `edqn_jax.sim.worlds.families.Family`, or a `Mixture` of some."""
+
+
+def has_detours(world: str) -> bool:
+    """Returns whether a world is a random one in which the straight line to the goal is seldom free."""
+    # Of built-in families without their modules, which import JAX.
+    return world in (*CLOSED, "mixed") or (world in FAMILIES.own and FAMILIES.get(world).detours)

@@ -13,11 +13,16 @@ from edqn_jax.errors import ConfigError
 _without_threads = False
 
 
+def has_found_devices() -> bool:
+    """Returns whether JAX has found its devices in this process, after which their number is fixed."""
+    bridge = sys.modules.get("jax._src.xla_bridge")  # JAX has no public name for this
+    return bridge is not None and bridge.backends_are_initialized()
+
+
 def _after_fork() -> None:
     """Notes in a forked process whether JAX had already found its devices in the process before."""
     global _without_threads
-    bridge = sys.modules.get("jax._src.xla_bridge")  # JAX has no public name for this
-    _without_threads = _without_threads or (bridge is not None and bridge.backends_are_initialized())
+    _without_threads = _without_threads or has_found_devices()
 
 
 if hasattr(os, "register_at_fork"):

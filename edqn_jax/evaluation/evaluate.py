@@ -17,7 +17,7 @@ from edqn_jax.evaluation.metrics import shortest_paths, summarise
 from edqn_jax.evaluation.missions import MissionSet, Point, load_missions
 from edqn_jax.evaluation.rollouts import fly_on_all_devices
 from edqn_jax.learn.policy import Policy
-from edqn_jax.sim.sensors.sensor import Form, sensor_of
+from edqn_jax.sim.sensors.sensor import sensor_of
 from edqn_jax.sim.task.flights import Flights
 from edqn_jax.sim.task.outcomes import Outcome
 
@@ -101,7 +101,7 @@ def _check_can_shuffle(policy: Policy, missions: int) -> None:
     least = 2 * len(jax.devices())
     if missions < least:
         raise ConfigError(f"--shuffle-codes needs --missions of at least {least}, not {missions}")
-    if sensor_of(policy.config).form is Form.NOTHING:
+    if not sensor_of(policy.config).shapes(policy.config):
         raise ConfigError(
             f"--shuffle-codes has nothing to shuffle: the sensor '{policy.config.env.sensor}' shows nothing"
         )

@@ -28,9 +28,7 @@ from edqn_jax.learn.perception import embedding
 from edqn_jax.learn.perception.code import Params as EncoderParams
 from edqn_jax.learn.policy import Policy
 from edqn_jax.sim.actions import ACTIONS
-from edqn_jax.sim.sensors import events
-from edqn_jax.sim.sensors.events import EventField
-from edqn_jax.sim.sensors.sensor import Form, sensor_of
+from edqn_jax.sim.sensors.sensor import sensor_of
 from edqn_jax.sim.task import env
 from edqn_jax.sim.task.env import MOTION_SIZE, OWN_SIZE, EnvState, World
 from edqn_jax.sim.task.environment import make as make_environment
@@ -179,12 +177,8 @@ class FunctionalEnv:
             code = embedding.embed(self.config, params.encoder, seen)
             assert code is not None
             return jnp.concatenate([_numbers(code), own, motion])
-        sensed = seen.sensed
-        if isinstance(sensed, EventField):
-            counts = events.event_image(sensed).astype(jnp.float32)
-            sensed = jnp.sign(counts) * jnp.log1p(jnp.abs(counts))
-        assert sensed is not None
-        return {"image": _numbers(sensed), "own": own, "motion": motion}
+        image = sensor_of(self.config).numbers(self.config, seen.sensed)
+        return {"image": _numbers(image), "own": own, "motion": motion}
 
 
 @as_tested
@@ -228,7 +222,7 @@ def make(
         config = make_config(str(world) if world is not None else None)
     if observation == "kinematics":
         config = dataclasses.replace(config, env=dataclasses.replace(config.env, sensor="blind"))
-    if observation == "image" and sensor_of(config).form is Form.NOTHING:
+    if observation == "image" and not sensor_of(config).shapes(config):
         raise ConfigError(f"the sensor '{config.env.sensor}' shows nothing; set observation to 'kinematics'")
     name = str(world) if world is not None else config.world.name
     if worlds is None:
@@ -244,8 +238,8 @@ def _numbers(x: Array) -> Array:
 
 
 def _image_of(config: Config) -> Array:
-    sensed = sensor_of(config).example(config)
-    return events.event_image(sensed) if isinstance(sensed, EventField) else jnp.asarray(sensed)
+    sensor = sensor_of(config)
+    return sensor.numbers(config, sensor.example(config))
 
 
 def _box(*shape: int) -> Box:

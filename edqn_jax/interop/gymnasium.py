@@ -107,7 +107,7 @@ class _Task:
 
     def picture(self, state: EnvState) -> NDArray[np.uint8]:
         """Returns what a person would see from a drone's camera, [192, 256, 3] with the default camera."""
-        return np.round(self.environment.picture(state) * 255.0).astype(np.uint8)
+        return np.round(np.asarray(self.environment.picture(state)) * 255.0).astype(np.uint8)
 
 
 def _on_host(tree: Any) -> Any:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -118,7 +119,7 @@ class Policy:
         if not embedding.has_code(self.config):
             raise ConfigError(f"the policy's sensor '{self.config.env.sensor}' has no encoder, so there is no code")
         _, memory = self.act(observation)
-        return memory[-1, : embedding.size(self.config)] / self.config.agent.code_scale
+        return memory[-1, : embedding.code_size(self.config)] / self.config.agent.code_scale
 
     @as_tested
     def depth(self, code: Array) -> Array:
@@ -153,19 +154,21 @@ def _example(config: Config) -> Sensed:
     return sensor_of(config).example(config)
 
 
-def _kind(sensed: Sensed) -> tuple[tuple[int, ...] | None, float | None]:
-    """Returns the shape of what a sensor shows, and of events the length of the window in seconds."""
+def _kind(sensed: Sensed) -> tuple[Any, float | None]:
+    """Returns the shape, or shapes, of what a sensor shows, and of events the length of the window in seconds."""
     if isinstance(sensed, EventField):
         # With noise, ON and OFF events of a frame pair stand in rows of their own.
         rows, *size = sensed.count.shape
         return (rows // 2 if sensed.with_noise else rows, *size), round(sensed.window_s, 6)
-    return (None if sensed is None else sensed.shape), None
+    return (None if sensed is None else jax.tree.map(jnp.shape, sensed)), None
 
 
-def _described(kind: tuple[tuple[int, ...] | None, float | None]) -> str:
+def _described(kind: tuple[Any, float | None]) -> str:
     shape, window_s = kind
     if shape is None:
         return "nothing"
+    if not isinstance(shape, tuple):
+        return f"numbers of the shapes {shape}"
     size = " x ".join(str(side) for side in shape)
     return f"{size} numbers" if window_s is None else f"events of {size} frame pairs and pixels in {window_s:g} s"
 

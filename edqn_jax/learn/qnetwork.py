@@ -1,14 +1,16 @@
-"""The Q-network: stacked observations in, one value per move out."""
+"""The Q-network: stacked observations in, one value per move out; `agent.network` may name one of your own."""
 
 from __future__ import annotations
 
 from typing import Any
 
 import flax.linen as nn
+import jax
 import jax.numpy as jnp
 from jax import Array
 
-from edqn_jax.config import AgentConfig
+from edqn_jax.config import NETWORKS, AgentConfig
+from edqn_jax.errors import ConfigError
 from edqn_jax.sim.actions import ACTIONS
 
 Params = Any
@@ -37,16 +39,38 @@ class QNetwork(nn.Module):
         return heads[..., :1] + advantage - jnp.mean(advantage, axis=-1, keepdims=True)
 
 
+def network_of(config: AgentConfig, actions: int) -> nn.Module:
+    """Returns the network that `agent.network` names.
+
+    Raises:
+        ConfigError: if there is none of that name.
+    """
+    return NETWORKS.get(config.network)(config, actions)
+
+
 def init_q(config: AgentConfig, observation_size: int, actions: int, key: Array) -> Params:
-    """Returns fresh parameters."""
-    inputs = jnp.zeros(config.history * observation_size)
-    return QNetwork(config, actions).init(key, inputs)["params"]
+    """Returns fresh parameters.
+
+    Raises:
+        ConfigError: if the network does not map `[history * observation_size]` to `[actions]`, or has other variables.
+    """
+    inputs, network = jnp.zeros(config.history * observation_size), network_of(config, actions)
+    variables = network.init(key, inputs)
+    if set(variables) != {"params"}:
+        raise ConfigError(f"the network '{config.network}' must have parameters alone, not {', '.join(variables)}")
+    values = jax.eval_shape(network.apply, variables, inputs)
+    if jnp.shape(values) != (actions,):
+        raise ConfigError(
+            f"the network '{config.network}' must return [{actions}] values for [{inputs.size}] inputs, not "
+            f"{list(jnp.shape(values))}"
+        )
+    return variables["params"]
 
 
 def q_values(config: AgentConfig, params: Params, actions: int, history: Array) -> Array:
     """Returns values [..., actions] of observation histories [..., history, observation], newest last."""
     flat = history.reshape(*history.shape[:-2], -1)
-    return QNetwork(config, actions).apply({"params": params}, flat)  # type: ignore[return-value]
+    return network_of(config, actions).apply({"params": params}, flat)  # type: ignore[return-value]
 
 
 def network_values(config: AgentConfig, params: Params, memory: Array) -> Array:

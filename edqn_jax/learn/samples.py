@@ -10,6 +10,8 @@ nothing else of them is read.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -22,6 +24,7 @@ from edqn_jax.keys import integers
 from edqn_jax.learn.perception import vae
 from edqn_jax.learn.perception.vae import Target
 from edqn_jax.sim.sensors.events import EventField
+from edqn_jax.sim.sensors.sensor import flip_left_right
 from edqn_jax.sim.task.env import MIRRORED_MOTION, Observation
 
 MOST_EVENTS = 2**15 - 1
@@ -48,7 +51,7 @@ class Samples:
 
 
 def samples_of(config: EncoderConfig, observation: Observation, wanted: Target) -> Samples:
-    """Returns observations and their targets in the form in which they are stored."""
+    """Returns observations, as `embedding.as_encoder_input` has them, and their targets in the form that is stored."""
     sensed = observation.sensed
     assert isinstance(sensed, EventField | Array)
     return Samples(_stored(config, sensed), observation.motion, wanted)
@@ -80,12 +83,20 @@ def write(ring: Samples, rows: Samples, time: Array, keep: Array) -> Samples:
     return jax.tree.map(lambda old, new: old.at[at].set(new), ring, rows)
 
 
-def draw(config: EncoderConfig, ring: Samples, time: Array, count: int, key: Array) -> Samples:
+def draw(
+    config: EncoderConfig,
+    ring: Samples,
+    time: Array,
+    count: int,
+    key: Array,
+    mirror: Callable[[Array], Array] = flip_left_right,
+) -> Samples:
     """Returns `count` samples of one shard, each of which is uniform.
 
     Args:
         time: [] int32, how many decisions have been kept, at least 1.
         key: consumed.
+        mirror: of the sensor, see `Sensor.mirror`.
     """
     rows, envs = ring.motion.shape[:2]
     row_key, env_key, *coin_key = jax.random.split(key, 2 + count % 2)
@@ -99,20 +110,20 @@ def draw(config: EncoderConfig, ring: Samples, time: Array, count: int, key: Arr
         return drawn
     # Half of them; of an odd number the one in the middle is mirrored or not.
     half = count // 2
-    turned = jax.tree.map(lambda leaf: leaf[: half + 1 if coin_key else half], mirrored(drawn))
+    turned = jax.tree.map(lambda leaf: leaf[: half + 1 if coin_key else half], mirrored(drawn, mirror))
     if coin_key:
         middle = jax.random.bernoulli(*coin_key)
         turned = jax.tree.map(lambda new, old: new.at[half].set(jnp.where(middle, new[half], old[half])), turned, drawn)
     return jax.tree.map(lambda new, old: jnp.concatenate([new, old[len(new) :]]), turned, drawn)
 
 
-def mirrored(samples: Samples) -> Samples:
-    """Returns samples [...] as they would be with left and right exchanged."""
+def mirrored(samples: Samples, mirror: Callable[[Array], Array] = flip_left_right) -> Samples:
+    """Returns samples [...] as they would be with left and right exchanged; `mirror` is the sensor's."""
     # The standing waves across the image that change their sign are the odd ones.
     amplitudes = samples.wanted.amplitudes
     signs = jnp.asarray(1.0 - 2.0 * (np.arange(amplitudes.shape[-1]) % 2), jnp.float32)
     return Samples(
-        sensed=jax.tree.map(lambda image: jnp.flip(image, axis=-1), samples.sensed),
+        sensed=jax.tree.map(mirror, samples.sensed),
         motion=samples.motion * jnp.asarray(MIRRORED_MOTION),
         wanted=Target(amplitudes * signs, samples.wanted.beyond),
     )

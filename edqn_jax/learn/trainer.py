@@ -171,7 +171,8 @@ def _empty_samples(config: Config, world: World, state: EnvState) -> Samples | N
     shards, envs = config.train.shards, config.train.num_envs
 
     def one(state: EnvState) -> Samples:
-        observation = env.step(config, world, state, jnp.zeros((), jnp.int32))[1].observation
+        step = env.step(config, world, state, jnp.zeros((), jnp.int32))[1]
+        observation = embedding.as_encoder_input(config, step.observation)
         wanted = samples.target_of(config.encoder, observation, env.nearness(config, world, state))
         return samples.samples_of(config.encoder, observation, wanted)
 
@@ -337,16 +338,17 @@ def _keep(config: Config, world: World, actors: Actors, flown: EnvState, seen: e
         return None
     plan = Plan.of(config)
     keep = plan.trains_vae(step) | config.encoder.keep_learning
+    observation = embedding.as_encoder_input(config, seen.observation)
 
     def target() -> vae.Target:
         near = None
         if embedding.needs_nearness(config):
             near = group.each(config, partial(env.nearness, config, world))(flown)
-        return samples.target_of(config.encoder, seen.observation, near)
+        return samples.target_of(config.encoder, observation, near)
 
     nothing = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(target))
     wanted = lax.cond(keep, target, lambda: nothing)
-    rows = samples.samples_of(config.encoder, seen.observation, wanted)
+    rows = samples.samples_of(config.encoder, observation, wanted)
     if group.several(config):
         assert seen.waits is not None
         mate = group.mates(config, seen.waits)

@@ -24,6 +24,7 @@ from edqn_jax.learn.plan import Plan
 from edqn_jax.learn.qnetwork import Params
 from edqn_jax.learn.samples import Samples
 from edqn_jax.native.all_sum import all_sum
+from edqn_jax.sim.sensors.sensor import sensor_of
 from edqn_jax.sim.task.env import is_finite
 
 VAE_METRICS = ("reconstruction_loss", "kl")
@@ -72,6 +73,7 @@ def update_vae(
     share = config.encoder.batch_size // config.train.shards
     kept = plan.samples_kept(config, step) + 1
     part = keys.shape[0] / config.train.shards  # of all shards, on this device
+    mirror = sensor_of(config).mirror
 
     def loss(params: Params, batch: Samples, noise: Array):
         sensed = samples.read(batch)
@@ -80,7 +82,8 @@ def update_vae(
 
     def update(networks: Networks, keys: Array):
         draw_keys, noise_keys = split_each(keys, 2)
-        batch = jax.vmap(lambda ring, key: samples.draw(config.encoder, ring, kept, share, key))(rings, draw_keys)
+        draw = lambda ring, key: samples.draw(config.encoder, ring, kept, share, key, mirror)  # noqa: E731
+        batch = jax.vmap(draw)(rings, draw_keys)
         # Each shard draws its own noise, so that the layout on devices does not change it.
         noise = jax.vmap(lambda key: jax.random.normal(key, (share, config.encoder.code_size)))(noise_keys)
         batch, noise = jax.tree.map(flat, (batch, noise))

@@ -22,7 +22,7 @@ from PIL import Image
 from edqn_jax.extras import require
 from edqn_jax.learn.policy import PolicyParams
 from edqn_jax.report.flights import OBLIQUE, OTHER_COLOUR, draw_end_marks, draw_stage, others_paths
-from edqn_jax.report.images import LOOKS, scale_of
+from edqn_jax.report.images import look_of, scale_of
 from edqn_jax.report.sights import Sights, decision_rows, poses, times_of
 from edqn_jax.report.solids import MAP, View, faces_seen, hidden, moving_solids
 from edqn_jax.report.style import INK, LINE, MUTED, OUTCOME_COLOURS, OUTCOME_LABELS, STYLE
@@ -152,7 +152,7 @@ class _Stage:
                 0.5, 0.5, f"no image: its sensor is '{name}'", ha="center", fontsize=10, transform=below.transAxes
             )
             return
-        look = LOOKS[name]
+        look = look_of(name)
         below.set_title(f"What the drone sees: {look.name}, {camera.width} × {camera.height}", fontsize=10)
         self._shown = sights.shown(params, self._flown).image
         if look.signed:

@@ -12,7 +12,7 @@ from edqn_jax.learn.perception import embedding
 from edqn_jax.learn.policy import PolicyParams
 from edqn_jax.report.curves import draw_learning, draw_returns
 from edqn_jax.report.flights import draw_path, draw_world
-from edqn_jax.report.images import LOOKS, RECONSTRUCTED_EVENTS, draw_reconstruction, draw_sight
+from edqn_jax.report.images import NEARNESS, RECONSTRUCTED_EVENTS, draw_reconstruction, draw_sight, look_of
 from edqn_jax.report.sights import Sights, coarse, decision_rows, poses, times_of
 from edqn_jax.runs.directory import RunDirectory
 from edqn_jax.runs.record import Draw
@@ -65,7 +65,7 @@ def draw_gallery(run: RunDirectory, sights: Sights, params: PolicyParams, shorte
 def _draw_what_it_sees(run: RunDirectory, sights: Sights, params: PolicyParams, flown: dict[str, np.ndarray]) -> None:
     """Draws RGB above what the sensor shows at moments of the flight, and what the VAE makes of that."""
     config = sights.config
-    look = LOOKS[config.env.sensor]
+    look = look_of(config.env.sensor)
     shown = sights.shown(params, flown)
     moments = _busiest(np.abs(shown.image).sum((1, 2)) if look.signed else shown.image.std((1, 2)), MOMENTS)
     rows = decision_rows(config, flown)[moments, -1]
@@ -81,7 +81,7 @@ def _draw_what_it_sees(run: RunDirectory, sights: Sights, params: PolicyParams, 
     )
     file = run.figures / "reconstruction.png"
     draws_nearness = embedding.needs_nearness(config)
-    drawn = LOOKS["depth"] if draws_nearness else RECONSTRUCTED_EVENTS if look.signed else look
+    drawn = NEARNESS if draws_nearness else RECONSTRUCTED_EVENTS if look.signed else look
     # A target made of what is shown says nothing more than that.
     seen = (shown.image[moments], look) if draws_nearness else None
     draw_reconstruction(shown.target[moments], shown.reconstruction[moments], file, drawn, seen)

@@ -12,8 +12,8 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.colors import Colormap, Normalize
 from matplotlib.figure import Figure
 
+from edqn_jax.config.registry import SENSORS
 from edqn_jax.report.style import COUNTS, INK, MUTED, POLARITY, drawing
-from edqn_jax.sim.sensors.sensor import SENSORS
 
 
 @dataclasses.dataclass(frozen=True)
@@ -27,12 +27,14 @@ class Look:
     """Whether values are negative where the image became darker."""
 
 
-LOOKS = {
-    name: Look(sensor.image.label, sensor.image.unit, POLARITY if sensor.image.signed else "gray", sensor.image.signed)
-    for name, sensor in SENSORS.items()
-    if sensor.image is not None
-}
-"""By the name of the sensor, those that show an image."""
+def look_of(sensor: str) -> Look:
+    """Returns the look of the image that a sensor of this name shows; it must show one."""
+    image = SENSORS.get(sensor).image
+    assert image is not None, f"the sensor '{sensor}' shows no image"
+    return Look(image.label, image.unit, POLARITY if image.signed else "gray", image.signed)
+
+
+EVENTS, NEARNESS = look_of("events"), look_of("depth")
 
 RECONSTRUCTED_EVENTS = Look("events", "events per pixel\n(ON + OFF)", COUNTS)
 """The VAE's reconstruction of events: their number per pixel, whatever the sign."""
@@ -44,7 +46,7 @@ def draw_sight(
     shown: np.ndarray,
     file: Path,
     times_s: Sequence[float] | None = None,
-    look: Look = LOOKS["events"],
+    look: Look = EVENTS,
 ) -> Figure:
     """Draws RGB, fine and as the drone's camera has it, above what the sensor shows, one column a moment.
 

@@ -15,11 +15,8 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from edqn_jax.report.animation import gif
-from edqn_jax.report.images import LOOKS, RECONSTRUCTED_EVENTS, Look, scale_of
+from edqn_jax.report.images import Look, scale_of
 from edqn_jax.report.style import MUTED, STYLE, drawing
-
-EVENTS, NEARNESS, DECODED = LOOKS["events"], LOOKS["depth"], RECONSTRUCTED_EVENTS
-"""How each kind of picture is coloured."""
 
 MOMENTS = 6
 """Moments of a still picture."""

@@ -24,8 +24,7 @@ from edqn_jax.sim.camera import camera
 from edqn_jax.sim.physics import drone
 from edqn_jax.sim.physics.drone import Flight
 from edqn_jax.sim.scene.scene import Scene, scene_at
-from edqn_jax.sim.sensors import events, sensor
-from edqn_jax.sim.sensors.events import EventField
+from edqn_jax.sim.sensors import sensor
 from edqn_jax.sim.task import env
 from edqn_jax.sim.task.env import MOTION_SIZE
 
@@ -63,8 +62,8 @@ class Sights:
             pool: with two threads, both programs are compiled at once.
         """
         self.config, self.scene = config, scene
-        self.has_image = sensor.sensor_of(config).image is not None
-        """Whether the sensor shows an image; without one there is only `rgb`."""
+        self.has_image = sensor.sensor_of(config).image is not None and embedding.has_code(config)
+        """Whether the sensor shows an image that is encoded; without one there is only `rgb`."""
         self._shown = pool.submit(self._compile_shown) if self.has_image else None
         self._rgb = pool.submit(self._compile_rgb)
 
@@ -106,7 +105,7 @@ class Sights:
 
         The sensor carries its memory from each decision to the next.
         """
-        config = self.config
+        config, shows = self.config, sensor.sensor_of(self.config)
         start, rest = jax.random.split(jax.random.key(0))
 
         def one(memory: Any, given: tuple[Array, ...]) -> tuple[Any, _Images]:
@@ -114,17 +113,17 @@ class Sights:
             here = Flight(position, quaternion, jnp.zeros_like(position), time)
             now = scene_at(scene, time[-1])
             sensed, memory = sensor.sense(config, scene, here, memory, key)
-            assert isinstance(sensed, EventField | Array)
+            read = shows.encoder_input(config, sensed)
+            assert read is not None
             nearness = None
             if embedding.needs_nearness(config):
                 nearness = sensor.nearness_image(config, now, position[-1], quaternion[-1])
-            code = vae.embed(config.encoder, params.encoder, sensed, motion)
-            image = events.event_image(sensed) if isinstance(sensed, EventField) else sensed[0]
-            target = vae.target(config.encoder, sensed, nearness)
+            code = vae.embed(config.encoder, params.encoder, read, motion)
+            target = vae.target(config.encoder, read, nearness)
             made = vae.decode(config.encoder, config.camera, params.encoder, code)
-            drawn = (_drawn(config, sensed, channels) for channels in (target, made))
+            drawn = (_drawn(config, channels) for channels in (target, made))
             luma = sensor.view(config, now, position[-1], quaternion[-1])
-            return memory, (image, *drawn, luma)  # type: ignore[return-value]
+            return memory, (shows.picture(config, sensed), *drawn, luma)  # type: ignore[return-value]
 
         keys = jax.random.split(rest, len(position))
         before = sensor.at_rest(config, start)
@@ -192,8 +191,8 @@ def _blank_poses(*shape: int) -> tuple[jax.ShapeDtypeStruct, ...]:
     return tuple(jax.ShapeDtypeStruct((*shape, *size), np.float32) for size in ((3,), (4,), ()))
 
 
-def _drawn(config: Config, sensed: EventField | Array, channels: Array) -> Array:
+def _drawn(config: Config, channels: Array) -> Array:
     """Returns what there is to look at in a target [C, H, W] of `vae.target`: [H, W], in the units of what is shown."""
     if embedding.needs_nearness(config):
         return channels[-1]
-    return jnp.sum(jnp.expm1(channels), axis=-3) if isinstance(sensed, EventField) else channels[0]
+    return sensor.sensor_of(config).picture_of_target(config, channels)

@@ -275,7 +275,11 @@ def test_every_numeric_option_has_limits(group, option, nonsense):
         ("encoder", {"batch_size": 12}, r"encoder.batch_size must be a multiple of train.shards \(8\), such as 16"),
         ("env", {"heading": "flight"}, "env.position must be false with env.heading flight, not True"),
         ("agent", {"turn": True}, r"agent.turn needs a random world \(sparse, .*\), not 'paper': give --agent.no-turn"),
-        ("world", {"flown": "my.xml"}, r"world.flown is for random worlds \(.*\) alone, 'paper' is flown itself: give"),
+        (
+            "world",
+            {"flown": "my.xml"},
+            r"world.flown is for random worlds \(.*registered first.*\) alone, 'paper' is flown itself: give",
+        ),
         (
             "world",
             {"name": "sparse", "flown": "dense"},

@@ -3,7 +3,12 @@
 from __future__ import annotations
 
 import re
+import sys
+import types
 from pathlib import Path
+from typing import Any
+
+import pytest
 
 ROOT = Path(__file__).parents[2]
 
@@ -18,6 +23,13 @@ SHELL = ("", "sh", "bash")
 def blocks_of(page: Path, *languages: str) -> list[str]:
     """Returns the code blocks of a page in these languages."""
     return [code for language, code in FENCE.findall(page.read_text(encoding="utf-8")) if language in languages]
+
+
+def empty_module(name: str, monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
+    """Returns the names of an imported module for code to run in; flax looks there for types of fields."""
+    module = types.ModuleType(name)
+    monkeypatch.setitem(sys.modules, name, module)
+    return vars(module)
 
 
 def name_of(page: Path) -> str:

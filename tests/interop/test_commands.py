@@ -12,7 +12,9 @@ from pathlib import Path
 import pytest
 
 from edqn_jax.cli import arguments
-from tests.docs.pages import PAGES, ROOT, SHELL, blocks_of, name_of
+from edqn_jax.cli.commands import take_imports
+from tests.docs.pages import PAGES, ROOT, SHELL, blocks_of, empty_module, name_of
+from tests.registries import keep_as_they_are
 
 EXTRAS = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
 
@@ -50,6 +52,11 @@ def test_a_shell_block_is_a_script(page: str, code: str) -> None:
 @pytest.mark.parametrize(("page", "words"), COMMANDS, ids=[f"{page}: {' '.join(words)}" for page, words in COMMANDS])
 def test_a_command_parses(page: str, words: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(arguments, "_check_run", lambda folder: None)  # runs/DIR is a reader's
+    words, imported = take_imports(words)
+    if imported:  # the page says what the file has in the first block that registers something
+        keep_as_they_are(monkeypatch)
+        code = next(code for code in blocks_of(ROOT / page, "python") if ".register(" in code)
+        exec(code, empty_module("imported_by_a_command", monkeypatch))
     if "train.py" in words or words[:2] == ["edqn", "train"]:
         arguments.parse_train(words[words.index("train.py" if "train.py" in words else "train") + 1 :])
     elif words[0] == "edqn" and words[1] in PARSERS:

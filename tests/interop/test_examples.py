@@ -14,7 +14,8 @@ import pytest
 
 import edqn_jax
 from edqn_jax.config import Config
-from tests.docs.pages import PAGES, blocks_of, name_of
+from tests.docs.pages import PAGES, blocks_of, empty_module, name_of
+from tests.registries import keep_as_they_are
 
 ELSEWHERE = ("README.md", *(f"docs/{page}.md" for page in ("deployment", "functional", "gymnasium", "sweeps")))
 
@@ -48,9 +49,10 @@ def test_the_examples_of_a_page_run(page: Path, tmp_path: Path, monkeypatch: pyt
     monkeypatch.setattr(edqn_jax, "train", trained)
     monkeypatch.setattr(edqn_jax, "evaluate", evaluated)
     monkeypatch.chdir(tmp_path)
+    keep_as_they_are(monkeypatch)
     for world in blocks_of(page, "xml"):
         Path("mine.xml").write_text(world, encoding="utf-8")
-    names: dict[str, Any] = {"__name__": page.stem}
+    names = empty_module(f"page_{page.stem}", monkeypatch)
     for number, code in enumerate(blocks_of(page, "python")):
         program = compile(code, f"{name_of(page)}, block {number}", "exec")
         if not code.startswith(CONVENTIONAL):

@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 
 from edqn_jax.report.curves import draw_learning, draw_returns, running_mean
 from edqn_jax.report.flights import OBLIQUE, draw_path, draw_world
-from edqn_jax.report.images import LOOKS, draw_reconstruction, draw_sight
+from edqn_jax.report.images import EVENTS, NEARNESS, draw_reconstruction, draw_sight
 from edqn_jax.report.solids import MAP, View, cut_open, far_to_near, hidden, solids_of
 from edqn_jax.report.style import OUTCOME_COLOURS
 from edqn_jax.sim.scene.scene import (
@@ -295,8 +295,8 @@ def test_reconstructions_share_the_colours_of_the_events(tmp_path):
 def test_nearness_is_drawn_below_the_events_that_it_was_told_from(tmp_path):
     counts, near = np.zeros((2, 24, 32)), np.full((2, 24, 32), 0.5)
     counts[:, 3:9, 10], near[:, 3:9, 8:14] = -4, 2.0
-    seen = (counts, LOOKS["events"])
-    figure = draw_reconstruction(near, near * 0.75, tmp_path / "reconstruction.png", LOOKS["depth"], seen)
+    seen = (counts, EVENTS)
+    figure = draw_reconstruction(near, near * 0.75, tmp_path / "reconstruction.png", NEARNESS, seen)
     assert is_png(tmp_path / "reconstruction.png")
     pictures = [np.asarray(axes.images[0].get_array()) for axes in figure.axes[:6]]
     for row, expected in enumerate((counts, near, near * 0.75)):

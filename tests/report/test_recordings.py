@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from edqn_jax.report.recordings import EVENTS, NEARNESS, Strip, animate_recording, draw_recording, moments
+from edqn_jax.report.images import EVENTS, NEARNESS
+from edqn_jax.report.recordings import Strip, animate_recording, draw_recording, moments
 
 RNG = np.random.default_rng(0)
 STRIPS = [

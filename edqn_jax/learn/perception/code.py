@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import enum
 from collections.abc import Callable
 from typing import Any
 
@@ -11,7 +12,6 @@ from jax import Array
 from jax.nn.initializers import constant, lecun_normal, zeros
 
 from edqn_jax.learn.perception.layers import Dense
-from edqn_jax.sim.sensors.sensor import Form
 
 Params = Any
 """Nested dictionaries of arrays."""
@@ -19,8 +19,15 @@ Params = Any
 EVENT_CHANNELS = 2
 """ON and OFF events."""
 
-EMBEDDED = (Form.EVENTS, Form.PICTURE)
-"""Forms that the VAE embeds."""
+
+class Form(enum.Enum):
+    """Form of what the VAE reads."""
+
+    EVENTS = enum.auto()
+    """An event field."""
+    PICTURE = enum.auto()
+    """Pictures, an array [..., C, H, W] of order 1."""
+
 
 MAX_LOG_VARIANCE = 6.0
 """Bound of the log-variance's magnitude: its exponential cannot overflow."""

@@ -1,20 +1,23 @@
-"""Embeds what the sensor shows for the Q-network: a learned code, the values themselves, or nothing."""
+"""Embeds what the sensor shows for the Q-network: a learned code, values as they are, both, or nothing."""
 
 from __future__ import annotations
+
+import dataclasses
 
 import jax.numpy as jnp
 from jax import Array
 
 from edqn_jax.config import Config
 from edqn_jax.learn.perception import vae
-from edqn_jax.learn.perception.code import EMBEDDED, Params
-from edqn_jax.sim.sensors.sensor import Form, sensor_of
+from edqn_jax.learn.perception.code import Form, Params
+from edqn_jax.sim.sensors.sensor import sensor_of
 from edqn_jax.sim.task.env import Observation
 
 
 def has_code(config: Config) -> bool:
     """Returns whether a VAE embeds what the sensor shows; it then learns in a warm-up."""
-    return sensor_of(config).form in EMBEDDED
+    sensor = sensor_of(config)
+    return sensor.shows_events(config) or sensor.count_pictures(config) > 0
 
 
 def needs_nearness(config: Config) -> bool:
@@ -24,7 +27,17 @@ def needs_nearness(config: Config) -> bool:
 
 def size(config: Config) -> int:
     """Returns the number of values that the Q-network sees of what the sensor shows."""
-    return config.encoder.code_size if has_code(config) else sensor_of(config).values(config)
+    return code_size(config) + sensor_of(config).count_values(config)
+
+
+def code_size(config: Config) -> int:
+    """Returns the number of these that are a code, which come first; 0 where there is no VAE."""
+    return config.encoder.code_size if has_code(config) else 0
+
+
+def as_encoder_input(config: Config, observation: Observation) -> Observation:
+    """Returns observations [...] with that of what the sensor shows which the VAE reads, a field or pictures."""
+    return dataclasses.replace(observation, sensed=sensor_of(config).encoder_input(config, observation.sensed))
 
 
 def init(config: Config, key: Array) -> Params:
@@ -44,16 +57,20 @@ def acting(config: Config, params: Params) -> Params:
 
 
 def embed(config: Config, params: Params, observation: Observation) -> Array | None:
-    """Returns [..., size] of order 1: the scaled code, or values as they are; None where the sensor shows nothing."""
+    """Returns [..., size] of order 1: the scaled code, then values as they are; None where the sensor shows nothing."""
     if observation.sensed is None:
         return None
+    values = sensor_of(config).values(config, observation.sensed)
     if not has_code(config):
-        return jnp.asarray(observation.sensed)
-    code = vae.embed(config.encoder, params, observation.sensed, observation.motion)  # type: ignore[arg-type]
-    return config.agent.code_scale * code
+        return values
+    read = as_encoder_input(config, observation)
+    code = config.agent.code_scale * vae.embed(config.encoder, params, read.sensed, read.motion)
+    return code if values is None else jnp.concatenate([code, values], axis=-1)
 
 
 def _shape(config: Config) -> tuple[Form, int]:
-    """Returns the form of what the sensor shows, and its frame pairs or pictures."""
+    """Returns the form of what the VAE reads, and its frame pairs or pictures."""
     sensor = sensor_of(config)
-    return sensor.form, len(config.events.frame_times_s) - 1 if sensor.form is Form.EVENTS else sensor.pictures(config)
+    if sensor.shows_events(config):
+        return Form.EVENTS, len(config.events.frame_times_s) - 1
+    return Form.PICTURE, sensor.count_pictures(config)

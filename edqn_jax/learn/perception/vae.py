@@ -17,13 +17,12 @@ from jax import Array
 from jax.nn.initializers import zeros
 
 from edqn_jax.config import CameraConfig, EncoderConfig
-from edqn_jax.learn.perception.code import EVENT_CHANNELS, Params, kl_divergence
+from edqn_jax.learn.perception.code import EVENT_CHANNELS, Form, Params, kl_divergence
 from edqn_jax.learn.perception.layers import Dense
 from edqn_jax.learn.perception.patch_encoder import PatchEncoder
 from edqn_jax.learn.perception.pooled_encoder import PooledEncoder
 from edqn_jax.learn.perception.waves import OUTPUT_SCALE, cosines, mirrored, wave_images
 from edqn_jax.sim.sensors.events import EventField
-from edqn_jax.sim.sensors.sensor import Form
 from edqn_jax.sim.task.env import MOTION_SIZE
 
 
@@ -144,7 +143,7 @@ def init_vae(
     """Returns fresh parameters, `{"encoder": ..., "decoder": ...}`, for the camera's resolution.
 
     Args:
-        form: of what is encoded, one of `code.EMBEDDED`.
+        form: of what is encoded.
         layers: frame pairs F of an event field, or C of pictures.
     """
     key_encoder, key_decoder = jax.random.split(key)

@@ -14,7 +14,7 @@ from PIL import Image
 
 from edqn_jax.learn.perception import embedding
 from edqn_jax.learn.policy import PolicyParams
-from edqn_jax.report.images import LOOKS, RECONSTRUCTED_EVENTS, scale_of
+from edqn_jax.report.images import NEARNESS, RECONSTRUCTED_EVENTS, look_of, scale_of
 from edqn_jax.report.sights import Sights
 from edqn_jax.sim.camera.camera import on_screen
 
@@ -37,9 +37,9 @@ def flight_pictures(sights: Sights, params: PolicyParams, flown: Mapping[str, np
         flown: the columns of `trajectory.csv`.
     """
     config = sights.config
-    shown, look = sights.shown(params, flown), LOOKS[config.env.sensor]
+    shown, look = sights.shown(params, flown), look_of(config.env.sensor)
     nearness = embedding.needs_nearness(config)
-    drawn = LOOKS["depth"] if nearness else RECONSTRUCTED_EVENTS if look.signed else look
+    drawn = NEARNESS if nearness else RECONSTRUCTED_EVENTS if look.signed else look
     colours = NEARNESS_COLOURS if nearness else drawn.colours
     # Quiet moments are to be seen, too.
     scale = Normalize(0.0, max(float(np.quantile(shown.target, 0.999)), 1e-6)) if drawn.signed is False else None

@@ -1,13 +1,19 @@
-"""Sensors: what a drone sees of the world around it. `SENSORS` has one entry for each choice of `env.sensor`.
+"""What a sensor is: what a drone sees of the world around it, and all that other code asks about that.
 
-A new sensor is an entry here and a choice in `config/options.py`; all other code asks the entry.
+A new sensor is a `Sensor`, registered under a name for `env.sensor`; nothing else has to know it:
+
+    from edqn_jax.config.registry import SENSORS
+
+    SENSORS.register("mine", Sensor(show=..., shape=lambda config: (3,)))
+
+The package's own are in `built_in.py`.
 """
 
 from __future__ import annotations
 
 import dataclasses
-import enum
 from collections.abc import Callable
+from typing import Any, Final
 
 import jax
 import jax.numpy as jnp
@@ -15,22 +21,26 @@ import numpy as np
 from jax import Array
 
 from edqn_jax.config import CameraConfig, Config
+from edqn_jax.config.registry import SENSORS
+from edqn_jax.errors import ConfigError
 from edqn_jax.sim.actions import DIRECTIONS
 from edqn_jax.sim.camera import camera, raycast
 from edqn_jax.sim.camera.depth import nearest_depth
 from edqn_jax.sim.camera.raycast import Rays
-from edqn_jax.sim.physics import drone
 from edqn_jax.sim.physics.drone import Flight
 from edqn_jax.sim.scene.scene import Scene, scene_at
-from edqn_jax.sim.sensors import events, exposure, light
+from edqn_jax.sim.sensors import events, exposure
 from edqn_jax.sim.sensors.events import EventField, EventMemory
 from edqn_jax.sim.sensors.exposure import FrameMemory
 
-Sensed = EventField | Array | None
-"""What a sensor shows, see `Form`."""
+Sensed = Any
+"""What a sensor shows, an `EventField`, an array, a tree of these, or None; see `Sensor.shape`."""
 
-SensorMemory = EventMemory | FrameMemory | None
-"""What a sensor carries from one decision to the next."""
+SensorMemory = EventMemory | FrameMemory | Any
+"""What a sensor carries from one decision to the next, a tree of arrays; None for nothing."""
+
+EVENT_FIELD: Final = "events"
+"""What `Sensor.shape` has in the place of an event field."""
 
 MID_GREY = -1.0
 """Log brightness that `frames` shows as 0: about the middle of the range in a scene."""
@@ -42,96 +52,177 @@ DEPTH_SCALE = 3.0
 """Value of `depth` at contact: its pictures then vary as much as frames do, and the VAE weighs both alike."""
 
 
-CHANGE_SCALE = 0.1
-"""Change of log brightness that `frame-pair` shows as 1: that of two or three events."""
-
-CLOSING_SCALE = 0.5
-"""Rate at which `depth-motion` shows obstacles come nearer, 1/s, per unit before it saturates: of `depth`'s own
-values, 3 m/s at a distance of 4 m."""
-
-
-class Form(enum.Enum):
-    """Form of what a sensor shows. It decides how the observation is embedded and drawn."""
-
-    EVENTS = enum.auto()
-    """An event field at the camera's resolution; the VAE embeds it."""
-    PICTURE = enum.auto()
-    """Pictures of order 1 at the camera's resolution, an array [C, H, W]; the VAE embeds them."""
-    VALUES = enum.auto()
-    """An array [V] of order 1; the Q-network sees it as it is."""
-    NOTHING = enum.auto()
-    """None; the Q-network sees only the drone's own state."""
-
-
 @dataclasses.dataclass(frozen=True)
 class Image:
-    """How a sensor's image is labelled and coloured in figures."""
+    """How a sensor's image is taken from what it shows, and how it is labelled and coloured in figures."""
 
     label: str
     unit: str
     signed: bool = False
     """Whether it holds signed event counts: the colours are symmetric about 0. Otherwise they span the values."""
+    picture: int = 0
+    """Number of the picture that is drawn, of those that the sensor shows; of events it is their number."""
 
 
-def _now(config: Config) -> tuple[float, ...]:
-    return (0.0,)
-
-
-def _window(config: Config) -> tuple[float, ...]:
-    return config.events.frame_times_s
-
-
-def _no_values(config: Config) -> int:
-    return 0
-
-
-def _one(config: Config) -> int:
-    return 1
-
-
-def _no_memory(config: Config, key: Array) -> SensorMemory:
-    return None
+def flip_left_right(image: Array) -> Array:
+    """Returns images [..., H, W] with left and right exchanged."""
+    return jnp.flip(image, axis=-1)
 
 
 @dataclasses.dataclass(frozen=True)
 class Sensor:
     """Everything that the rest of the code asks about one sensor. T frame times."""
 
-    show: Callable[[Config, Scene, Flight, SensorMemory, Array], tuple[Sensed, SensorMemory]]
+    show: Callable[[Config, Scene, Flight, Any, Array], tuple[Sensed, Any]]
     """As `sense`."""
-    form: Form
-    values: Callable[[Config], int] = _no_values
-    """V of `Form.VALUES`."""
-    pictures: Callable[[Config], int] = _one
-    """C of `Form.PICTURE`."""
-    frame_times_s: Callable[[Config], tuple[float, ...]] = _now
+    shape: Callable[[Config], Any] = lambda config: None
+    """Shape of what is shown of order 1: (V,) values, which the Q-network sees as they are; (C, H, W) pictures at the
+    camera's resolution, or `EVENT_FIELD`, which the VAE embeds; or a tree, such as a dict, of values and one of these.
+    None: nothing is shown, and the Q-network sees only the drone's own state."""
+    frame_times_s: Callable[[Config], tuple[float, ...]] = lambda config: (0.0,)
     """Times of the T poses that `show` needs, seconds relative to the end of a decision; each is a physics step."""
     draws_frames: bool = False
     """Whether `show` draws a picture at each of these times."""
     exposes: bool = False
     """Whether its pictures are taken as `exposure` has it, over the poses up to a frame's time."""
-    at_rest: Callable[[Config, Array], SensorMemory] = _no_memory
+    at_rest: Callable[[Config, Array], Any] = lambda config, key: None
     """Memory before the first decision, from a key; None where nothing is carried from one decision to the next."""
     image: Image | None = None
-    """How what is shown is drawn; None where it is no image."""
+    """How what is shown is drawn; None where it is not."""
+    mirror: Callable[[Array], Array] = flip_left_right
+    """Returns pictures [..., C, H, W], or images of events, as they would be with left and right exchanged."""
+
+    def encoder_input(self, config: Config, sensed: Sensed) -> EventField | Array | None:
+        """Returns what the VAE reads: a field [..., F, H, W], pictures [..., C, H, W] joined, or None."""
+        seen = self._parts(config, sensed, lambda shape: not _is_of_values(shape))
+        return seen[0] if len(seen) == 1 else jnp.concatenate(seen, axis=-3) if seen else None
+
+    def values(self, config: Config, sensed: Sensed) -> Array | None:
+        """Returns what the Q-network sees as it is, [..., V] joined, or None."""
+        seen = self._parts(config, sensed, _is_of_values)
+        return seen[0] if len(seen) == 1 else jnp.concatenate(seen, axis=-1) if seen else None
+
+    def count_values(self, config: Config) -> int:
+        """Returns V, the number of values that the Q-network sees as they are."""
+        return sum(shape[0] for shape in self.shapes(config) if _is_of_values(shape))
+
+    def shows_events(self, config: Config) -> bool:
+        """Returns whether it shows an event field."""
+        return EVENT_FIELD in self.shapes(config)
+
+    def count_pictures(self, config: Config) -> int:
+        """Returns C, the number of pictures; 0 where it shows none."""
+        return sum(shape[0] for shape in self.shapes(config) if _is_of_pictures(shape))
+
+    def picture(self, config: Config, sensed: Sensed) -> Array:
+        """Returns the picture [..., H, W] for figures: signed event counts, or that of `image.picture`."""
+        seen = self.encoder_input(config, sensed)
+        assert seen is not None and self.image is not None
+        if isinstance(seen, EventField):
+            return events.event_image(seen)
+        return seen[..., self.image.picture, :, :]
+
+    def picture_of_target(self, config: Config, channels: Array) -> Array:
+        """Returns the picture [..., H, W] of what a decoder draws of this sensor, [..., C, H, W] of `vae.target`.
+
+        Of events it is their number, ON plus OFF.
+        """
+        assert self.image is not None
+        if self.shows_events(config):
+            return jnp.sum(jnp.expm1(channels), axis=-3)
+        return channels[..., self.image.picture, :, :]
+
+    def numbers(self, config: Config, sensed: Sensed) -> Array:
+        """Returns what is shown as one array of order 1, for learners of other libraries.
+
+        Of events it is the logarithm of each pixel's signed count, [..., H, W]; an array is itself; the parts of a tree
+        are joined to one vector [..., N].
+        """
+        shapes = self.shapes(config)
+        parts = self._parts(config, sensed, lambda shape: True)
+        arrays = [signed_log(events.event_image(x)) if isinstance(x, EventField) else x for x in parts]
+        if len(arrays) == 1:
+            return arrays[0]
+        axes = [2 if shape == EVENT_FIELD else len(shape) for shape in shapes]
+        flat = [x.reshape(*x.shape[: x.ndim - n], -1) for x, n in zip(arrays, axes, strict=True)]
+        return jnp.concatenate(flat, axis=-1)
+
+    def shapes(self, config: Config) -> list[Any]:
+        """Returns the shapes of what is shown, of a tree in its order.
+
+        Raises:
+            ConfigError: if one is none that `shape` may have.
+        """
+        found = jax.tree.leaves(self.shape(config), is_leaf=_is_shape)
+        name, size = config.env.sensor, (config.camera.height, config.camera.width)
+        for shape in found:
+            if not (shape == EVENT_FIELD or _is_of_values(shape) or (_is_of_pictures(shape) and shape[1:] == size)):
+                raise ConfigError(
+                    f"the sensor '{name}' must show values (V,), pictures (C, {size[0]}, {size[1]}) of the camera's "
+                    f"pixels, or EVENT_FIELD, not {shape}"
+                )
+        if EVENT_FIELD in found and (found.count(EVENT_FIELD) > 1 or any(map(_is_of_pictures, found))):
+            raise ConfigError(f"the sensor '{name}' must show pictures or one EVENT_FIELD, not both or several")
+        return found
+
+    def check(self, config: Config, sensed: Sensed) -> None:
+        """Raises unless `sensed` has the shape that `shape` says.
+
+        Raises:
+            ConfigError: names both.
+        """
+        wanted = self.shape(config)
+        shown = jax.tree.map(jnp.shape, sensed)
+        if EVENT_FIELD not in self.shapes(config) and wanted != shown:
+            raise ConfigError(
+                f"the sensor '{config.env.sensor}' shows {shown}, but its shape is {wanted}; both must be the same"
+            )
 
     def example(self, config: Config) -> Sensed:
         """Returns random data of the form that the sensor shows, the same at every call."""
-        rng, shape = np.random.default_rng(0), (config.camera.height, config.camera.width)
-        match self.form:
-            case Form.NOTHING:
-                return None
-            case Form.VALUES:
-                return jnp.asarray(rng.random(self.values(config), np.float32))
-            case Form.PICTURE:
-                return jnp.asarray(rng.random((self.pictures(config), *shape), np.float32))
-            case Form.EVENTS:
-                return events.random_field(config.events, *shape, rng)
+        rng, size = np.random.default_rng(0), (config.camera.height, config.camera.width)
+
+        def random(shape: Any) -> EventField | Array:
+            if shape == EVENT_FIELD:
+                return events.random_field(config.events, *size, rng)
+            return jnp.asarray(rng.random(shape, np.float32))
+
+        self.shapes(config)
+        return jax.tree.map(random, self.shape(config), is_leaf=_is_shape)
+
+    def _parts(self, config: Config, sensed: Sensed, chosen: Callable[[Any], bool]) -> list[Any]:
+        """Returns those parts of what is shown whose shapes are chosen."""
+        tree = jax.tree.structure(self.shape(config), is_leaf=_is_shape)
+        pairs = zip(self.shapes(config), tree.flatten_up_to(sensed), strict=True)
+        return [part for shape, part in pairs if chosen(shape)]
+
+
+def signed_log(image: Array) -> Array:
+    """Returns log(1 + count) of signed counts [...], with their sign."""
+    counts = image.astype(jnp.float32)
+    return jnp.sign(counts) * jnp.log1p(jnp.abs(counts))
+
+
+def _is_shape(tree: Any) -> bool:
+    """Returns whether this is the shape of one array, or `EVENT_FIELD`."""
+    return tree == EVENT_FIELD or (isinstance(tree, tuple) and all(isinstance(size, int) for size in tree))
+
+
+def _is_of_values(shape: Any) -> bool:
+    return _is_shape(shape) and shape != EVENT_FIELD and len(shape) == 1
+
+
+def _is_of_pictures(shape: Any) -> bool:
+    return _is_shape(shape) and shape != EVENT_FIELD and len(shape) == 3
 
 
 def sensor_of(config: Config) -> Sensor:
-    """Returns the entry of `SENSORS` that `config` names."""
-    return SENSORS[config.env.sensor]
+    """Returns the sensor that `config` names.
+
+    Raises:
+        ConfigError: if there is none of that name.
+    """
+    return SENSORS.get(config.env.sensor)
 
 
 def frame_steps(config: Config) -> tuple[int, ...]:
@@ -184,95 +275,20 @@ def sense(config: Config, scene: Scene, poses: Flight, memory: SensorMemory, key
         poses: [T, ...] after the physics steps of `frame_steps`, in order.
         memory: from `at_rest` or the decision before.
         key: consumed only by noise.
+
+    Raises:
+        ConfigError: if the sensor does not show what its `shape` says.
     """
-    return sensor_of(config).show(config, scene, poses, memory, key)
+    sensor = sensor_of(config)
+    sensed, memory = sensor.show(config, scene, poses, memory, key)
+    sensor.check(config, sensed)
+    return sensed, memory
 
 
-def _views(config: Config, scene: Scene, poses: Flight) -> Array:
-    """Returns the luma frames [T, H, W] at poses [T], each of the world as it stands at its own time."""
-    see = lambda p, q, t: view(config, scene_at(scene, t), p, q)  # noqa: E731
-    return jax.vmap(see)(poses.position, poses.quaternion, poses.time)
-
-
-def _last(scene: Scene, poses: Flight) -> tuple[Scene, Array, Array]:
-    """Returns the world at the last of the poses, its position [3] and its quaternion [4]."""
+def last_view(scene: Scene, poses: Flight) -> tuple[Scene, Array, Array]:
+    """Returns the world as it stands at the last of the poses, its position [3] metres and its quaternion [4]."""
     time = None if poses.time is None else poses.time[-1]
     return scene_at(scene, time), poses.position[-1], poses.quaternion[-1]
-
-
-def _show_events(
-    config: Config, scene: Scene, poses: Flight, memory: SensorMemory, key: Array
-) -> tuple[Sensed, SensorMemory]:
-    frames = _views(config, scene, poses)
-    assert isinstance(memory, EventMemory)
-    options = config.events
-    return events.events(options, memory, frames, options.frame_times_s, key, continuous=options.stream)
-
-
-def _show_event_image(
-    config: Config, scene: Scene, poses: Flight, memory: SensorMemory, key: Array
-) -> tuple[Sensed, SensorMemory]:
-    """Returns log(1 + count) of each pixel's ON minus OFF events, with their sign."""
-    field, memory = _show_events(config, scene, poses, memory, key)
-    assert isinstance(field, EventField)
-    image = events.event_image(field).astype(jnp.float32)
-    return (jnp.sign(image) * jnp.log1p(jnp.abs(image))).ravel(), memory
-
-
-def _event_memory(config: Config, key: Array) -> SensorMemory:
-    lux = None
-    if light.is_on(config.light):
-        key, drawing = jax.random.split(key)
-        lux = light.draw(config.light, drawing)
-    return events.reset_memory(config.events, config.camera.height, config.camera.width, key, lux)
-
-
-def _show_frame(
-    config: Config, scene: Scene, poses: Flight, memory: SensorMemory, key: Array
-) -> tuple[Sensed, SensorMemory]:
-    if config.exposure.real:
-        frames, memory = _exposed(config, scene, poses, memory, key)
-        return brightness(config, frames), memory
-    scene, position, quaternion = _last(scene, poses)
-    return brightness(config, view(config, scene, position, quaternion))[None], None
-
-
-def _exposed(
-    config: Config, scene: Scene, poses: Flight, memory: SensorMemory, key: Array
-) -> tuple[Array, SensorMemory]:
-    """Returns pictures [T, H, W] that a camera takes, as shares of white, and its memory; see `exposure`.
-
-    Args:
-        poses: [T (K + 1)] up to the times of the frames.
-    """
-    assert isinstance(memory, FrameMemory)
-    options, dt, lux = config.exposure, config.drone.physics_dt_s, memory.lux
-    time, gain = exposure.settings(options, lux, memory.metered)
-    of_frame = exposure.steps_touched(options, dt) + 1
-    windows = jax.tree.map(lambda x: x.reshape(-1, of_frame, *x.shape[1:]), poses)
-    within = jax.vmap(lambda window: exposure.poses_within(window, dt, time, options.sub_frames))(windows)
-    views = _views(config, scene, jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), within))
-    luma = jnp.mean(views.reshape(-1, options.sub_frames, *views.shape[1:]), axis=1)
-    frames = exposure.develop(options, luma, lux, time, gain, key)
-    metered = exposure.metered(options, frames[-1], lux, time, gain)
-    return frames, FrameMemory(lux=lux, metered=metered)
-
-
-def _show_frame_pair(
-    config: Config, scene: Scene, poses: Flight, memory: SensorMemory, key: Array
-) -> tuple[Sensed, SensorMemory]:
-    """Returns the newest frame and, of each frame before it, how much darker it was.
-
-    That is all that is in the frames, and what moved is as large a number as what stands: in the frames as they are an
-    encoder would have to take the small difference of two large numbers.
-    """
-    if config.exposure.real:
-        frames, memory = _exposed(config, scene, poses, memory, key)
-    else:
-        frames = _views(config, scene, poses)
-    frames = brightness(config, frames)
-    change = (frames[-1:] - frames[:-1]) / CHANGE_SCALE
-    return jnp.concatenate([frames[-1:], change]), memory
 
 
 def brightness(config: Config, luma: Array) -> Array:
@@ -284,41 +300,10 @@ def brightness(config: Config, luma: Array) -> Array:
     return events.log_brightness(config.events, luma) - MID_GREY
 
 
-def _show_depth(
-    config: Config, scene: Scene, poses: Flight, memory: SensorMemory, key: Array
-) -> tuple[Sensed, SensorMemory]:
-    return nearness_image(config, *_last(scene, poses))[None], None
-
-
-def _show_depth_motion(
-    config: Config, scene: Scene, poses: Flight, memory: SensorMemory, key: Array
-) -> tuple[Sensed, SensorMemory]:
-    """Returns what `depth` shows, and the rate at which it changed by the obstacles' own motion alone.
-
-    Both depths are seen from the last pose, so that the drone's own motion does not show.
-    """
-    now, position, quaternion = _last(scene, poses)
-    near = nearness_image(config, now, position, quaternion)
-    if poses.time is None:
-        return jnp.stack([near, jnp.zeros_like(near)]), None
-    # One program for both: compiled apart they round apart, and what stands still would have a rate.
-    times = jnp.stack([poses.time[-1], poses.time[0]])
-    near, before = jax.lax.map(lambda time: nearness_image(config, scene_at(scene, time), position, quaternion), times)
-    rate = (near - before) / (poses.time[-1] - poses.time[0])
-    return jnp.stack([near, jnp.tanh(rate / CLOSING_SCALE)]), None
-
-
 def nearness_image(config: Config, scene: Scene, position: Array, quaternion: Array) -> Array:
     """Returns what `depth` shows [H, W] from a body at `position` [3], metres, with attitude `quaternion` [4]."""
     metres = camera.depth(config.camera, scene, position, mount_rotation(config, quaternion))
     return DEPTH_SCALE * nearness(metres)
-
-
-def _show_ranges(
-    config: Config, scene: Scene, poses: Flight, memory: SensorMemory, key: Array
-) -> tuple[Sensed, SensorMemory]:
-    scene, position, quaternion = _last(scene, poses)
-    return nearness(ranges(config.camera, scene, position, drone.yaw_of(quaternion))), None
 
 
 def nearness(distance: Array) -> Array:
@@ -356,73 +341,3 @@ def ranges(config: CameraConfig, scene: Scene, position: Array, yaw: Array) -> A
     along = jnp.where(direction > 0, upper, lower) / jnp.maximum(jnp.abs(direction), raycast.TINY)
     to_face = jnp.min(jnp.where(jnp.abs(direction) > raycast.TINY, along, jnp.inf), axis=0)
     return jnp.minimum(to_shape, to_face)
-
-
-def _show_nothing(
-    config: Config, scene: Scene, poses: Flight, memory: SensorMemory, key: Array
-) -> tuple[Sensed, SensorMemory]:
-    return None, None
-
-
-SENSORS: dict[str, Sensor] = {
-    # The method's sensor.
-    "events": Sensor(
-        show=_show_events,
-        form=Form.EVENTS,
-        frame_times_s=_window,
-        draws_frames=True,
-        at_rest=_event_memory,
-        image=Image("events", "events per pixel", signed=True),
-    ),
-    # The events as one image, without a VAE.
-    "event-image": Sensor(
-        show=_show_event_image,
-        form=Form.VALUES,
-        values=lambda config: config.camera.width * config.camera.height,
-        frame_times_s=_window,
-        draws_frames=True,
-        at_rest=_event_memory,
-    ),
-    # The newest brightness frame of the same camera, perfect or as `exposure` has it.
-    "frames": Sensor(
-        show=_show_frame,
-        form=Form.PICTURE,
-        frame_times_s=lambda config: exposure.pose_times(config, (0.0,)),
-        draws_frames=True,
-        exposes=True,
-        at_rest=exposure.at_rest,
-        image=Image("log brightness", "log brightness + 1"),
-    ),
-    # The frames that the events are made of, at the same times.
-    "frame-pair": Sensor(
-        show=_show_frame_pair,
-        form=Form.PICTURE,
-        pictures=lambda config: len(_window(config)),
-        frame_times_s=lambda config: exposure.pose_times(config, _window(config)),
-        draws_frames=True,
-        exposes=True,
-        at_rest=exposure.at_rest,
-        image=Image("log brightness", "log brightness + 1"),
-    ),
-    # True depth.
-    "depth": Sensor(
-        show=_show_depth,
-        form=Form.PICTURE,
-        draws_frames=True,
-        image=Image("nearness", "nearness (3 is contact)"),
-    ),
-    # True depth, and how the obstacles' own motion changes it.
-    "depth-motion": Sensor(
-        show=_show_depth_motion,
-        form=Form.PICTURE,
-        pictures=lambda config: 2,
-        frame_times_s=_window,
-        draws_frames=True,
-        image=Image("nearness", "nearness (3 is contact)"),
-    ),
-    # True free distance along each move, as nearness.
-    "ranges": Sensor(show=_show_ranges, form=Form.VALUES, values=lambda config: len(DIRECTIONS)),
-    # Nothing but the drone's own state.
-    "blind": Sensor(show=_show_nothing, form=Form.NOTHING),
-}
-"""By `env.sensor`. `events` is the method's; the others are compared with it at the same budget."""

@@ -19,7 +19,7 @@ import numpy as np
 from jax import Array
 from jax.typing import ArrayLike
 
-from edqn_jax.config import FAMILIES, Config
+from edqn_jax.config import FAMILIES, SENSORS, Config
 from edqn_jax.config.loading import make_config
 from edqn_jax.devices.forks import check_not_forked
 from edqn_jax.devices.jax_settings import as_tested
@@ -46,7 +46,8 @@ from edqn_jax.sim.worlds.moving import Moving
 class Environment:
     """One or more worlds, a mission in each, and the functions of one drone in them.
 
-    `reset` and `step` are compiled when first called, and may be called within `jax.jit` and `jax.vmap`.
+    `reset`, `step`, `picture` and `depth` are compiled when first called, and may be called within `jax.jit` and
+    `jax.vmap`.
     """
 
     config: Config
@@ -143,17 +144,17 @@ class Environment:
         return events.expand(_stream(sees, scene, flight))
 
     @as_tested
-    def picture(self, state: EnvState, scale: int = 8) -> np.ndarray:
+    def picture(self, state: EnvState, scale: int = 8) -> Array:
         """Returns what a person would see from the drone's camera: [H * scale, W * scale, 3] sRGB in [0, 1]."""
         scene = env.scene_now(self.config, self.world, state)
         body = state.drone
-        return np.asarray(_picture(self.config, scale, scene, body.position, body.quaternion))
+        return _picture(self.config, scale, scene, body.position, body.quaternion)
 
     @as_tested
-    def depth(self, state: EnvState) -> np.ndarray:
+    def depth(self, state: EnvState) -> Array:
         """Returns the true distance along each pixel's ray [H, W] metres, inf where it meets nothing: a label."""
         scene = env.scene_now(self.config, self.world, state)
-        return np.asarray(_depth(self.config, scene, state.drone.position, state.drone.quaternion))
+        return _depth(self.config, scene, state.drone.position, state.drone.quaternion)
 
     def _field(self, observation: Observation) -> EventField:
         if not isinstance(observation.sensed, EventField):
@@ -227,7 +228,7 @@ def _stream(config: Config, scene: Scene, flight: Flight) -> EventField:
     frames = jax.lax.map(see, flight)
     times = tuple(config.drone.physics_dt_s * np.arange(frames.shape[0]))
     key, noise = jax.random.split(jax.random.key(0))
-    memory = sensor.SENSORS["events"].at_rest(config, key)
+    memory = SENSORS.get("events").at_rest(config, key)
     assert isinstance(memory, EventMemory)
     return events.events(config.events, memory, frames, times, noise, continuous=True)[0]
 

@@ -1,9 +1,9 @@
-"""Random worlds of every family, and their seeds."""
+"""Random worlds of every family, and their seeds; `config.registry.FAMILIES` has the families by name."""
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from typing import Literal
@@ -50,27 +50,43 @@ def world_keys(split: Split, count: int, first: int = 0) -> Array:
 
 
 @dataclasses.dataclass(frozen=True)
-class _Family:
-    """How a family's worlds are drawn."""
+class Family:
+    """How the worlds of a family are drawn."""
 
     draw: Callable[[Array], Scene]
+    """Returns a world of a key, which is consumed; all worlds of a family have arrays of the same shapes."""
     size: tuple[float, float, float]
     """Of the volume at most, metres."""
-    edge_m: float | None
+    edge_m: float | None = 0.5
     """Of the lattice on which each world is checked for a way; None where no check could ever fail."""
-    bodies: Bodies
+    bodies: Bodies = dataclasses.field(default_factory=dict)
     """What can move."""
+    moving_share: float = 0.0
+    """Share of the bodies that move unless `world.moving_share` says otherwise."""
+    detours: bool = False
+    """Whether the straight line to the goal is seldom free; options then begin as in rooms (`CLOSED_WORLDS`)."""
 
 
-_FAMILIES = {
-    **{
-        density: _Family(partial(open_worlds.draw, density), open_worlds.SIZE, None, open_worlds.bodies(density))
-        for density in open_worlds.SHAPES
-    },
-    "rooms": _Family(rooms.draw, (rooms.SIDE, rooms.SIDE, rooms.HEIGHT[1]), 0.5, {}),  # walls stand
-    "forest": _Family(forest.draw, forest.SIZE, 0.5, forest.BODIES),
-    "canyon": _Family(canyon.draw, canyon.SIZE, 0.7, canyon.BODIES),
-}
+@dataclasses.dataclass(frozen=True)
+class Mixture:
+    """Worlds that are of one of several families."""
+
+    shares: Mapping[str, int]
+    """By the name of the family."""
+    detours: bool = False
+    """As of `Family`."""
+
+
+def _open(density: str) -> Family:
+    return Family(partial(open_worlds.draw, density), open_worlds.SIZE, None, open_worlds.bodies(density))
+
+
+SPARSE, MEDIUM, DENSE = (_open(density) for density in open_worlds.SHAPES)
+MOVING = dataclasses.replace(MEDIUM, moving_share=MOVING_SHARE)
+ROOMS = Family(rooms.draw, (rooms.SIDE, rooms.SIDE, rooms.HEIGHT[1]), detours=True)  # walls stand
+FOREST = Family(forest.draw, forest.SIZE, bodies=forest.BODIES, detours=True)
+CANYON = Family(canyon.draw, canyon.SIZE, edge_m=0.7, bodies=canyon.BODIES, detours=True)
+OPEN, MIXED = Mixture(MIXTURES["open"]), Mixture(MIXTURES["mixed"], detours=True)
 
 
 def random_scene(family: str, key: Array, moving: Moving = STILL) -> Scene:
@@ -86,38 +102,59 @@ def random_scene(family: str, key: Array, moving: Moving = STILL) -> Scene:
     Raises:
         ConfigError: if there is no such family.
     """
-    family, moving = _checked(family, moving)
-    if family in MIXTURES:
+    if isinstance(_entry(family), Mixture):
         family = families_of(family, key[None])[0]
-    return take_scene(_drawn(family, key[None], moving), 0)
+    return take_scene(_drawn(family, key[None], _moving_in(family, moving)), 0)
 
 
 def random_pool(family: str, keys: Array, moving: Moving = STILL) -> Scene:
     """Returns a pool of random worlds, one for each of `keys` [P]; see `random_scene`."""
-    family, moving = _checked(family, moving)
-    if family not in MIXTURES:
-        return _in_batches(family, moving, keys)
+    mixture = _entry(family)
+    if not isinstance(mixture, Mixture):
+        return _in_batches(family, _moving_in(family, moving), keys)
     names = np.array(families_of(family, keys))
     present = [(str(name), np.flatnonzero(names == name)) for name in np.unique(names)]
     # Padded for all families of the mixture, also for one that none of these worlds is of.
-    shapes = [jax.eval_shape(partial(_unchecked, name, moving), keys) for name in MIXTURES[family]]
-    pools = with_equal_capacities([_in_batches(name, moving, keys[which]) for name, which in present], shapes)
+    shapes = [jax.eval_shape(partial(_unchecked, name, _moving_in(name, moving)), keys) for name in mixture.shares]
+    drawn = [_in_batches(name, _moving_in(name, moving), keys[which]) for name, which in present]
+    pools = with_equal_capacities(drawn, shapes)
     order = np.argsort(np.concatenate([which for _, which in present]))
     return jax.tree.map(lambda *leaves: jnp.asarray(np.concatenate(leaves)[order]), *pools)
 
 
-def _checked(family: str, moving: Moving) -> tuple[str, Moving]:
-    """Returns a family that is drawn, and what moves in it: the worlds `moving` are medium ones."""
-    if family not in FAMILIES:
-        raise ConfigError(f"there are no random worlds '{family}'{nearest(family, FAMILIES)}")
-    if family == "moving":
-        return "medium", dataclasses.replace(moving, share=moving.share or MOVING_SHARE)
-    return family, moving
+def _entry(name: str) -> Family | Mixture:
+    """Returns a family or a mixture.
+
+    Raises:
+        ConfigError: if there is none of that name.
+    """
+    if name not in FAMILIES:
+        raise ConfigError(f"there are no random worlds '{name}'{nearest(name, FAMILIES)}")
+    return FAMILIES.get(name)
+
+
+def _family(name: str) -> Family:
+    """Returns a family.
+
+    Raises:
+        ConfigError: if there is none of that name, or it is a mixture, of which no mixture can be made.
+    """
+    family = _entry(name)
+    if isinstance(family, Mixture):
+        raise ConfigError(f"the random worlds '{name}' are a mixture; a mixture must be of families")
+    return family
+
+
+def _moving_in(family: str, moving: Moving) -> Moving:
+    """Returns what moves in a family."""
+    return dataclasses.replace(moving, share=moving.share or _family(family).moving_share)
 
 
 def families_of(mixture: str, keys: Array) -> list[str]:
     """Returns the family of each world of a mixture, from the worlds' keys [P]."""
-    families = [family for family, share in MIXTURES[mixture].items() for _ in range(share)]
+    entry = _entry(mixture)
+    assert isinstance(entry, Mixture), f"{mixture} is one family"
+    families = [family for family, share in entry.shares.items() for _ in range(share)]
     numbers = jax.vmap(lambda key: integers(jax.random.fold_in(key, FAMILY_OF_WORLD), (), len(families)))(keys)
     return [families[number] for number in np.asarray(numbers)]
 
@@ -145,11 +182,11 @@ def _drawn(family: str, keys: Array, moving: Moving = STILL) -> Scene:
 
 def _unchecked(family: str, moving: Moving, keys: Array) -> Scene:
     """Returns what `_drawn` returns, but for worlds without a way, which are kept."""
-    return _set_in_motion(family, moving, jax.vmap(_FAMILIES[family].draw)(keys), keys)
+    return _set_in_motion(family, moving, jax.vmap(_family(family).draw)(keys), keys)
 
 
 def _set_in_motion(family: str, moving: Moving, scenes: Scene, keys: Array) -> Scene:
-    bodies = _FAMILIES[family].bodies
+    bodies = _family(family).bodies
     if not moving.balls and not (moving.share and bodies):
         return scenes
     return jax.vmap(lambda scene, key: in_motion(scene, moving, bodies, jax.random.fold_in(key, MOTION_OF_WORLD)))(
@@ -159,7 +196,7 @@ def _set_in_motion(family: str, moving: Moving, scenes: Scene, keys: Array) -> S
 
 def _standing(family: str, keys: Array) -> Scene:
     """Returns worlds in which nothing moves; one without a way is drawn again with another key."""
-    how, edge = _FAMILIES[family], _FAMILIES[family].edge_m
+    how, edge = _family(family), _family(family).edge_m
     if edge is None:
         return jax.vmap(how.draw)(keys)
 

@@ -17,13 +17,13 @@ from edqn_jax.config.loading import to_yaml
 from edqn_jax.evaluation.latency import decision_latency_ms
 from edqn_jax.learn import policy, trainer
 from edqn_jax.learn.perception import embedding, pooled_encoder, vae
+from edqn_jax.learn.perception.code import Form
 from edqn_jax.learn.plan import Plan
 from edqn_jax.learn.policy import fresh_policy
 from edqn_jax.runs.checkpoints.params import save_params
 from edqn_jax.runs.policies import load_run
 from edqn_jax.runs.provenance import workload
 from edqn_jax.sim.scene import mjcf
-from edqn_jax.sim.sensors.sensor import Form
 from edqn_jax.sim.task.env import MOTION_SIZE, Observation, World
 from tests.learn.moving_boxes import frames
 from tests.miniature import miniature_world

@@ -21,7 +21,7 @@ from edqn_jax.errors import ConfigError
 from edqn_jax.sim.physics.drone import Flight, load_airframe
 from edqn_jax.sim.scene import mjcf
 from edqn_jax.sim.scene.scene import scene_at, stack_scenes
-from edqn_jax.sim.sensors import exposure, sensor
+from edqn_jax.sim.sensors import built_in, exposure, sensor
 from edqn_jax.sim.sensors.exposure import FrameMemory
 from edqn_jax.sim.task import env
 from edqn_jax.sim.task.missions import own_missions
@@ -223,7 +223,7 @@ def test_a_pair_of_real_frames_has_one_exposure_and_its_change(scene):
     assert np.abs(luma_of(config, sensed) - after).max() <= 0.5 / 255 + 1e-5
     change = np.log(after + 1e-3) - np.log(before + 1e-3)
     bright = np.minimum(after, before) > 0.2  # half a level of 51 is 1 %
-    np.testing.assert_allclose((np.asarray(sensed)[1] * sensor.CHANGE_SCALE)[bright], change[bright], atol=0.021)
+    np.testing.assert_allclose((np.asarray(sensed)[1] * built_in.CHANGE_SCALE)[bright], change[bright], atol=0.021)
     assert np.abs(change[bright]).max() > 0.1
 
 

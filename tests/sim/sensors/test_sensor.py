@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from edqn_jax.config import CameraConfig, Config, DroneConfig, EnvConfig
+from edqn_jax.config import SENSORS, CameraConfig, Config, DroneConfig, EnvConfig
 from edqn_jax.evaluation.latency import decision_latency_ms
 from edqn_jax.learn import policy, trainer
 from edqn_jax.learn.perception import embedding
@@ -24,7 +24,7 @@ from edqn_jax.sim.scene import mjcf
 from edqn_jax.sim.scene.scene import stack_scenes, take_scene
 from edqn_jax.sim.sensors import sensor
 from edqn_jax.sim.sensors.events import EventField
-from edqn_jax.sim.sensors.sensor import Form, Sensor
+from edqn_jax.sim.sensors.sensor import Sensor
 from edqn_jax.sim.task import env
 from edqn_jax.sim.task.missions import own_missions
 from tests.miniature import WORLD
@@ -280,22 +280,34 @@ def _show_negative(config, scene, poses, memory, key):
     return -sensor.brightness(config, frame)[None], memory
 
 
+def _show_tree(config, scene, poses, memory, key):
+    """Two pictures and three values."""
+    picture = _show_negative(config, scene, poses, memory, key)[0]
+    return {"pictures": jnp.concatenate([picture, 2.0 * picture]), "rows": picture[0, :3, 0]}, memory
+
+
 NEW = {
     "row_means": Sensor(
         show=_show_row_means,
-        form=Form.VALUES,
-        values=lambda config: config.camera.height,
+        shape=lambda config: (config.camera.height,),
         draws_frames=True,
         at_rest=lambda config, key: jnp.zeros(()),
     ),
-    "negative": Sensor(show=_show_negative, form=Form.PICTURE, draws_frames=True),
+    "negative": Sensor(
+        show=_show_negative, shape=lambda config: (1, config.camera.height, config.camera.width), draws_frames=True
+    ),
+    "tree": Sensor(
+        show=_show_tree,
+        shape=lambda config: {"pictures": (2, config.camera.height, config.camera.width), "rows": (3,)},
+        draws_frames=True,
+    ),
 }
 
 
 @pytest.fixture(params=NEW)
 def with_new_sensor(request, monkeypatch) -> Config:
     """A miniature that trains with a sensor that only the table knows."""
-    monkeypatch.setitem(sensor.SENSORS, request.param, NEW[request.param])
+    monkeypatch.setitem(SENSORS._entries, request.param, NEW[request.param])
     return dataclasses.replace(
         MINIATURE,
         env=dataclasses.replace(MINIATURE.env, sensor=request.param),
@@ -309,15 +321,19 @@ def test_a_new_sensor_needs_only_its_entry_to_act(with_new_sensor, world) -> Non
     state = jax.eval_shape(lambda key: env.ended(config, world, key), jax.random.key(0))
     state, step = jax.eval_shape(lambda s: env.step(config, world, s, 0), state)
     shown = sensor.sensor_of(config).example(config)
-    assert step.observation.sensed.shape == shown.shape  # type: ignore
+    assert jax.tree.map(jnp.shape, step.observation.sensed) == jax.tree.map(jnp.shape, shown)
     assert workload(config, jax.tree.map(lambda x: x[0], world.pool))["frames_per_decision"] == 1
     params = policy.fresh_policy(config)
     observation = env.Observation(shown, jnp.zeros(env.OWN_SIZE), jnp.zeros(env.MOTION_SIZE))
     code = embedding.embed(config, params.encoder, observation)
     assert code is not None and code.shape == (embedding.size(config),)
-    if sensor.sensor_of(config).form is Form.VALUES:
+    if config.env.sensor == "row_means":
         np.testing.assert_array_equal(code, shown)
         assert state.memory.shape == () and not params.encoder
+    if config.env.sensor == "tree":
+        assert embedding.code_size(config) == embedding.size(config) - 3 == config.encoder.code_size
+        np.testing.assert_array_equal(code[-3:], shown["rows"])
+        assert policy.Policy(config, params).code(observation).shape == (config.encoder.code_size,)
     assert decision_latency_ms(config, params, calls=1)["median"] > 0.0
 
 
@@ -329,6 +345,6 @@ def test_a_new_sensor_needs_only_its_entry_to_train(with_new_sensor, world) -> N
     after, (_, losses) = jax.jit(lambda s: trainer.run_steps(config, world, s, jnp.arange(steps)))(before)
     assert np.isfinite(np.asarray(losses.metrics["q_loss"])[-1])
     assert np.isfinite(np.asarray(losses.metrics["reconstruction_loss"])).sum() == Plan.of(config).warmup
-    if sensor.sensor_of(config).form is Form.VALUES:
+    if config.env.sensor == "row_means":
         np.testing.assert_array_equal(after.actors.env.memory >= 1, True)  # what it carries is carried
     assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(after.learner))

@@ -22,7 +22,7 @@ from edqn_jax.sim.scene.distance import signed_distance
 from edqn_jax.sim.scene.launches import aim_along
 from edqn_jax.sim.scene.motion import Motion, Throw, aim_at, throw_speeds, thrown_to
 from edqn_jax.sim.scene.scene import PARKED, Spheres, UprightBoxes, build_scene, scene_at, stack_scenes
-from edqn_jax.sim.sensors import sensor
+from edqn_jax.sim.sensors import built_in, sensor
 from edqn_jax.sim.sensors.events import event_image
 from edqn_jax.sim.task import env
 from edqn_jax.sim.task.env import World
@@ -125,7 +125,7 @@ def test_every_frame_sees_the_world_at_its_own_time(name):
             poses = drone.Flight(*(jnp.stack([x[row]] * len(times)) for x in (at, to, at)))
             alone.append(np.asarray(sensor.sense(config, still, poses, None, key)[0]))
         if name == "frame-pair":
-            expected = np.stack([alone[1][0], (alone[1][0] - alone[0][0]) / sensor.CHANGE_SCALE])
+            expected = np.stack([alone[1][0], (alone[1][0] - alone[0][0]) / built_in.CHANGE_SCALE])
         else:
             expected = alone[-1]
         # Brightness is linear; its logarithm's change is divided by 0.1.
@@ -144,7 +144,7 @@ def test_true_depth_with_the_obstacles_motion_shows_who_comes_and_not_that_the_d
     away = float(np.asarray(sensor.distance_of(near[12, 16] / sensor.DEPTH_SCALE)))
     slant = away / (29 - 3 * 8 * N * DT - float(step.flight.position[-1, 0]))  # of the pixel's ray
     before = sensor.DEPTH_SCALE * sensor.nearness(away + 0.12 * slant)
-    expected = np.tanh((near[12, 16] - before) / 0.04 / sensor.CLOSING_SCALE)
+    expected = np.tanh((near[12, 16] - before) / 0.04 / built_in.CLOSING_SCALE)
     assert abs(rate[12, 16] - expected) < 0.01
     there = np.asarray(fly(still, [ahead] * 3, config)[2][-1].observation.sensed)
     depth = np.asarray(fly(still, [ahead] * 3, configured("depth"))[2][-1].observation.sensed)
@@ -159,7 +159,7 @@ def test_a_window_as_long_as_a_decision_begins_at_its_beginning():
     _, _, steps = fly(world, [HOVER] * 2, config)
     seen = [np.asarray(step.observation.sensed) for step in steps]
     # The frame at the end of one decision is that at the beginning of the next.
-    first = seen[1][0] - sensor.CHANGE_SCALE * seen[1][1]
+    first = seen[1][0] - built_in.CHANGE_SCALE * seen[1][1]
     np.testing.assert_allclose(first, seen[0][0], atol=1e-3)
     assert np.abs(seen[1][1]).max() > 1
 

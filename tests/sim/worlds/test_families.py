@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from edqn_jax.config import FAMILIES, MIXTURES
+from edqn_jax.config.loading import make_config
 from edqn_jax.errors import ConfigError
 from edqn_jax.planning.astar import shortest_path
 from edqn_jax.planning.free_space import reachable
@@ -21,6 +22,7 @@ from edqn_jax.sim.task.missions import own_missions, random_missions, spread_mis
 from edqn_jax.sim.worlds import canyon, discs, families, forest, rooms
 from edqn_jax.sim.worlds.families import SPLITS, families_of, random_pool, random_scene, world_key, world_keys
 from edqn_jax.sim.worlds.free_points import CLEARANCE, FAR
+from tests.registries import keep_as_they_are
 
 RADIUS = 0.36
 WORLDS = 24
@@ -185,14 +187,28 @@ def test_a_world_without_a_way_is_drawn_again(monkeypatch):
         boxes = dataclasses.replace(scene.boxes, half=half, position=position)
         return dataclasses.replace(scene, boxes=boxes, start=start, goal=goal)
 
-    rooms_too = families._FAMILIES["rooms"]
-    monkeypatch.setitem(families._FAMILIES, "walled", dataclasses.replace(rooms_too, draw=draw))
+    monkeypatch.setitem(FAMILIES._entries, "walled", dataclasses.replace(families.ROOMS, draw=draw))
     pool = families._drawn("walled", world_keys("training", 12))
     half = np.asarray(pool.boxes.half[:, 0])
     assert not (half[:, 1] == 18.0).any()
     # Most first attempts had the wall, so most worlds are another than the first.
     first = jax.vmap(lambda key: rooms.draw(jax.random.fold_in(key, 0)).boxes.half[0])(world_keys("training", 12))
     assert 0 < np.isclose(half, first).all(axis=1).sum() < 8
+
+
+def test_a_family_of_ones_own_and_a_mixture_with_it_are_worlds_by_their_names(monkeypatch):
+    keep_as_they_are(monkeypatch)
+    FAMILIES.register("columns", dataclasses.replace(families.SPARSE, size=(1.0, 1.0, 1.0), detours=True))
+    FAMILIES.register("some", families.Mixture({"columns": 1, "sparse": 1}))
+    keys = world_keys("test", 3)
+    own, sparse = (random_pool(name, keys) for name in ("columns", "sparse"))
+    jax.tree.map(np.testing.assert_array_equal, own, sparse)
+    jax.tree.map(np.testing.assert_array_equal, random_pool("some", keys), sparse)
+    assert set(families_of("some", world_keys("test", 20))) == {"columns", "sparse"}
+    assert make_config("columns").env.reward == "geodesic" and make_config("some").env.reward == "progress"
+    FAMILIES.register("nested", families.Mixture({"some": 1}))
+    with pytest.raises(ConfigError, match="'some' are a mixture; a mixture must be of families"):
+        random_pool("nested", keys)
 
 
 def test_an_unknown_family_names_the_nearest_or_those_there_are():

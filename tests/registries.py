@@ -1,0 +1,16 @@
+"""Registries that a test may add to: what it registers is gone after it."""
+
+from __future__ import annotations
+
+import pytest
+
+from edqn_jax.config.registry import FAMILIES, LEARNERS, NETWORKS, SENSORS, Registry
+
+EVERY: tuple[Registry, ...] = (SENSORS, FAMILIES, LEARNERS, NETWORKS)
+
+
+def keep_as_they_are(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Makes every registry forget, at the end of the test, what is registered from now on."""
+    for registry in EVERY:
+        for table in ("_entries", "_about"):
+            monkeypatch.setattr(registry, table, dict(getattr(registry, table)))

@@ -1,0 +1,122 @@
+"""A sensor of one's own: what its shape says, what is made of what it shows, and what is refused."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from edqn_jax.config import SENSORS, Config
+from edqn_jax.config.limits import validate
+from edqn_jax.config.loading import make_config
+from edqn_jax.errors import ConfigError
+from edqn_jax.interop import functional
+from edqn_jax.learn.perception import embedding, vae
+from edqn_jax.learn.samples import Samples, mirrored
+from edqn_jax.sim.sensors import sensor
+from edqn_jax.sim.sensors.events import EventField, event_image, random_field
+from edqn_jax.sim.sensors.sensor import EVENT_FIELD, Image, Sensor
+from tests.registries import keep_as_they_are
+
+H, W = 6, 8
+
+
+def of_shape(shape: Any, **more: Any) -> Sensor:
+    return Sensor(show=lambda *_: (None, None), shape=lambda config: shape, **more)
+
+
+@pytest.fixture
+def config(monkeypatch: pytest.MonkeyPatch) -> Config:
+    """Of a small camera and a sensor of one's own, `mine`."""
+    keep_as_they_are(monkeypatch)
+    SENSORS.register("mine", of_shape((3,)), "three numbers")
+    return make_config("paper", camera={"width": W, "height": H}, env={"sensor": "mine"})
+
+
+def test_a_registered_sensor_is_a_choice_and_another_is_answered_with_the_nearest(config: Config) -> None:
+    assert sensor.sensor_of(config).count_values(config) == 3 and embedding.size(config) == 3
+    assert "`mine`: three numbers" in SENSORS.describe() and SENSORS.own == ("mine",)
+    wrong = dataclasses.replace(config, env=dataclasses.replace(config.env, sensor="mien"))
+    with pytest.raises(ConfigError, match="env.sensor: there is no sensor 'mien'; did you mean 'mine'?"):
+        validate(wrong)
+    unknown = dataclasses.replace(config, env=dataclasses.replace(config.env, sensor="xyz"))
+    with pytest.raises(ConfigError, match="events, frames, .*, mine, or your own, registered first .*--import"):
+        validate(unknown)
+
+
+def test_pictures_are_read_by_the_encoder_and_values_by_the_q_network(config: Config) -> None:
+    tree = of_shape({"b": (2, H, W), "a": (3,), "c": [(1, H, W), (4,)]})
+    shown = tree.example(config)
+    pictures, values = tree.encoder_input(config, shown), tree.values(config, shown)
+    np.testing.assert_array_equal(pictures, jnp.concatenate([shown["b"], shown["c"][0]]))
+    np.testing.assert_array_equal(values, jnp.concatenate([shown["a"], shown["c"][1]]))
+    assert (tree.count_pictures(config), tree.count_values(config)) == (3, 7)
+    many = {"b": jnp.ones((5, 2, H, W)), "a": jnp.ones((5, 3)), "c": [jnp.ones((5, 1, H, W)), jnp.ones((5, 4))]}
+    assert jnp.shape(tree.encoder_input(config, many)) == (5, 3, H, W)  # type: ignore[arg-type]
+    assert jnp.shape(tree.values(config, many)) == (5, 7)  # type: ignore[arg-type]
+    assert tree.numbers(config, shown).shape == (3 * H * W + 7,)
+    assert tree.numbers(config, many).shape == (5, 3 * H * W + 7)
+
+
+def test_events_may_have_values_beside_them(config: Config) -> None:
+    tree = of_shape({"field": EVENT_FIELD, "near": (2,)}, image=Image("events", "events", signed=True))
+    shown = tree.example(config)
+    assert isinstance(tree.encoder_input(config, shown), EventField) and tree.shows_events(config)
+    np.testing.assert_array_equal(tree.values(config, shown), shown["near"])
+    np.testing.assert_array_equal(tree.picture(config, shown), event_image(shown["field"]))
+
+
+def test_the_picture_of_figures_is_the_one_that_the_entry_names(config: Config) -> None:
+    two = of_shape((2, H, W), image=Image("second", "units", picture=1))
+    shown = two.example(config)
+    np.testing.assert_array_equal(two.picture(config, shown), shown[1])
+    np.testing.assert_array_equal(two.picture_of_target(config, 2.0 * shown), 2.0 * shown[1])
+
+
+def test_samples_are_mirrored_as_the_sensor_says() -> None:
+    pictures = jnp.asarray(np.random.default_rng(0).normal(size=(4, 2, H, W)), jnp.float32)
+    wanted = vae.Target(jnp.ones((4, 1, 3, 4)), jnp.zeros(4))
+    samples = Samples(pictures, jnp.ones((4, 7)), wanted)
+    signs = jnp.array([1.0, -1.0])[:, None, None]
+    found = mirrored(samples, lambda image: signs * jnp.flip(image, axis=-1)).sensed
+    assert isinstance(found, jax.Array)
+    np.testing.assert_array_equal(found[:, 0], pictures[:, 0, :, ::-1])
+    np.testing.assert_array_equal(found[:, 1], -pictures[:, 1, :, ::-1])
+    np.testing.assert_array_equal(mirrored(samples).sensed, pictures[..., ::-1])
+
+
+@pytest.mark.parametrize(
+    ("shape", "says"),
+    [
+        ((2, H + 1, W), r"'mine' must show values \(V,\), pictures \(C, 6, 8\).*, not \(2, 7, 8\)"),
+        ((H, W), r"or EVENT_FIELD, not \(6, 8\)"),
+        ({"a": EVENT_FIELD, "b": (1, H, W)}, "must show pictures or one EVENT_FIELD, not both"),
+        ("picture", "or EVENT_FIELD, not picture"),
+    ],
+)
+def test_a_shape_that_nothing_can_read_is_refused(config: Config, shape: Any, says: str) -> None:
+    with pytest.raises(ConfigError, match=says):
+        of_shape(shape).shapes(config)
+
+
+def test_what_is_shown_must_have_the_shape_that_is_told(config: Config) -> None:
+    of_shape({"a": (3,)}).check(config, {"a": jnp.zeros(3)})
+    of_shape(None).check(config, None)
+    of_shape(EVENT_FIELD).check(config, random_field(config.events, H, W, np.random.default_rng(0)))
+    with pytest.raises(ConfigError, match=r"'mine' shows \(4,\), but its shape is \(3,\); both must be the same"):
+        of_shape((3,)).check(config, jnp.zeros(4))
+    with pytest.raises(ConfigError, match="shows None, but its shape is"):
+        of_shape((3,)).check(config, None)
+
+
+def test_the_functional_face_joins_a_tree_and_refuses_nothing(config: Config) -> None:
+    space = functional.FunctionalEnv(config, "image").observation_space()
+    assert isinstance(space, dict) and space["image"].shape == (3,)
+    SENSORS.register("nothing", of_shape(None))
+    nothing = dataclasses.replace(config, env=dataclasses.replace(config.env, sensor="nothing"))
+    with pytest.raises(ConfigError, match="the sensor 'nothing' shows nothing"):
+        functional.make("paper", nothing)
