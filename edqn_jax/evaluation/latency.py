@@ -11,8 +11,7 @@ import numpy as np
 from jax import Array
 
 from edqn_jax.config import Config
-from edqn_jax.learn import policy
-from edqn_jax.learn.policy import PolicyParams
+from edqn_jax.learn.actor import AgentActor, PolicyParams
 from edqn_jax.sim.physics.drone import Flight
 from edqn_jax.sim.scene.scene import Scene
 from edqn_jax.sim.sensors.sensor import SensorMemory, at_rest, frame_steps, sense, sensor_of
@@ -35,8 +34,9 @@ def decision_call(config: Config, params: PolicyParams) -> Callable[[], int]:
     seen = env.Observation(
         sensed=sensor_of(config).example(config), own=jnp.zeros(env.OWN_SIZE), motion=jnp.zeros(env.MOTION_SIZE)
     )
-    seen, memory = jax.tree.map(np.asarray, (seen, policy.empty_memory(config)))  # on the host
-    act = jax.jit(lambda params, memory, seen, key: policy.act(config, params, memory, seen, key)[0])
+    actor = AgentActor(config)
+    seen, memory = jax.tree.map(np.asarray, (seen, actor.init()))  # on the host
+    act = jax.jit(lambda params, memory, seen, key: actor.act(params, memory, seen, key)[0])
     params, key = jax.device_put(params), jax.random.key(0)
     return lambda: int(act(params, memory, seen, key))
 
@@ -54,8 +54,8 @@ def look_call(config: Config, params: PolicyParams, scene: Scene) -> Callable[[]
         quaternion=jnp.tile(jnp.array([1.0, 0.0, 0.0, 0.0]), (steps, 1)),
         velocity=jnp.tile(jnp.array([4.0, 0.0, 0.0]), (steps, 1)),
     )
-    before = at_rest(config, jax.random.key(0))
-    poses, before, memory = jax.tree.map(np.asarray, (poses, before, policy.empty_memory(config)))  # on the host
+    before, actor = at_rest(config, jax.random.key(0)), AgentActor(config)
+    poses, before, memory = jax.tree.map(np.asarray, (poses, before, actor.init()))  # on the host
 
     @jax.jit
     def act(
@@ -63,7 +63,7 @@ def look_call(config: Config, params: PolicyParams, scene: Scene) -> Callable[[]
     ) -> Array:
         sensed, _ = sense(config, scene, poses, before, key)
         seen = env.Observation(sensed=sensed, own=jnp.zeros(env.OWN_SIZE), motion=jnp.zeros(env.MOTION_SIZE))
-        return policy.act(config, params, memory, seen, key)[0]
+        return actor.act(params, memory, seen, key)[0]
 
     params, scene, key = jax.device_put(params), jax.device_put(scene), jax.random.key(0)
     return lambda: int(act(params, scene, poses, before, memory, key))

@@ -16,8 +16,7 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from edqn_jax.config import Config
 from edqn_jax.devices.devices import compiler_options
 from edqn_jax.keys import run_streams
-from edqn_jax.learn import policy
-from edqn_jax.learn.policy import Memory, PolicyParams
+from edqn_jax.learn.actor import AgentActor, Memory, PolicyParams
 from edqn_jax.sim.task import env, group
 from edqn_jax.sim.task.env import EnvState, Observation, Step, World
 from edqn_jax.sim.task.flights import Flights, Record, at_start, tally
@@ -153,7 +152,7 @@ def _fly(
     key: Array,
 ) -> Flights:
     """Runs `fly_missions` on one device: missions `number` [M] with the environments' keys [M]."""
-    missions = number.shape[0]
+    missions, actor = number.shape[0], AgentActor(config)
 
     def decide(flying: _Flying) -> _Flying:
         key, act_key, shift_key = jax.random.split(flying.key, 3)
@@ -163,7 +162,7 @@ def _fly(
             # What a code tells of obstacles is in the sensor's output alone; the own motion stays.
             sensed = jax.tree.map(lambda x: jnp.roll(x, shift, axis=0), seen.sensed)
             seen = dataclasses.replace(seen, sensed=sensed)
-        act = partial(policy.act, config, params, key=act_key)  # greedy: the key has no effect
+        act = partial(actor.act, params, key=act_key)  # greedy: the key has no effect
         action, memory = jax.vmap(act)(flying.memory, seen)
         state, step = group.each(config, partial(env.step, config, world))(flying.state, action, number)
         flights, clearance = jax.vmap(partial(_tally, config, world))(flying.flights, flying.state, step)
@@ -180,7 +179,7 @@ def _fly(
     # The first iteration resets every environment: the observation and the action before it are not used.
     state = jax.vmap(partial(env.ended, config, world))(keys, number)
     seen = jax.eval_shape(group.each(config, partial(env.step, config, world)), state, number)[1].observation
-    memory = policy.empty_memory(config)
+    memory = actor.init()
     flying = _Flying(
         state=state,
         observation=jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), seen),

@@ -24,6 +24,7 @@ from edqn_jax.config import FAMILIES, Config
 from edqn_jax.config.loading import make_config
 from edqn_jax.devices.jax_settings import as_tested
 from edqn_jax.errors import ConfigError
+from edqn_jax.learn.actor import AgentActor, PolicyParams
 from edqn_jax.learn.perception import embedding
 from edqn_jax.learn.perception.code import Params as EncoderParams
 from edqn_jax.learn.policy import Policy
@@ -181,7 +182,7 @@ class FunctionalEnv:
         if self.observation == "kinematics":
             return jnp.concatenate([own, motion]), before
         if self.observation == "code":
-            code = embedding.embed(self.config, params.encoder, seen, before)
+            code = AgentActor(self.config).embed(PolicyParams(params.encoder, q={}), seen, before)
             assert code is not None
             return jnp.concatenate([_numbers(code), own, motion]), code
         sensed = seen.sensed

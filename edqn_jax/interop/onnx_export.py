@@ -20,8 +20,8 @@ from edqn_jax.errors import CheckError, ConfigError
 from edqn_jax.extras import require
 from edqn_jax.files import check_can_write, write_atomically
 from edqn_jax.interop import runner
-from edqn_jax.learn import policy
-from edqn_jax.learn.policy import Memory, Policy, PolicyParams, observation_size
+from edqn_jax.learn.actor import AgentActor, Memory, PolicyParams, observation_size
+from edqn_jax.learn.policy import Policy
 from edqn_jax.learn.qnetwork import q_values
 from edqn_jax.sim.actions import ACTIONS, move_name
 from edqn_jax.sim.sensors import events
@@ -181,7 +181,7 @@ def decision(config: Config, params: PolicyParams) -> Callable[..., tuple[Array,
 
     def decide(counts: Array, own: Array, motion: Array, memory: Memory) -> tuple[Array, Array]:
         observation = Observation(sensed=_sensed(config, counts), own=own, motion=motion)
-        after = policy.see(config, params.encoder, memory, observation)
+        after = AgentActor(config).encode(params, memory, observation)
         return q_values(config.agent, params.q, len(ACTIONS), after), after
 
     return decide

@@ -17,8 +17,9 @@ from jax.stages import Compiled
 
 from edqn_jax.config import Config
 from edqn_jax.devices.devices import quick_compiler_options
+from edqn_jax.learn.actor import AgentActor, PolicyParams
 from edqn_jax.learn.perception import embedding, vae
-from edqn_jax.learn.policy import PolicyParams, fresh_policy
+from edqn_jax.learn.policy import fresh_policy
 from edqn_jax.sim.actions import ACTIONS
 from edqn_jax.sim.camera import camera
 from edqn_jax.sim.physics import drone
@@ -104,13 +105,13 @@ class Sights:
     ) -> _Images:
         """The images of `shown` at [D, T, ...] poses and times with own motions [D, MOTION_SIZE].
 
-        The sensor carries its memory from each decision to the next, and so does a recurrent encoder.
+        The sensor carries its memory from each decision to the next, and so does the actor.
         """
-        config = self.config
+        config, actor = self.config, AgentActor(self.config)
         start, rest = jax.random.split(jax.random.key(0))
 
         def one(before: tuple[Any, Array], given: tuple[Array, ...]) -> tuple[tuple[Any, Array], _Images]:
-            memory, code = before
+            memory, looked = before
             position, quaternion, time, motion, key = given
             here = Flight(position, quaternion, jnp.zeros_like(position), time)
             now = scene_at(scene, time[-1])
@@ -119,16 +120,18 @@ class Sights:
             nearness = None
             if embedding.needs_nearness(config):
                 nearness = sensor.nearness_image(config, now, position[-1], quaternion[-1])
-            code = vae.embed(config.encoder, params.encoder, sensed, motion, code)
+            # What it knows of the goal is no part of a code.
+            observation = env.Observation(sensed=sensed, own=jnp.zeros(env.OWN_SIZE), motion=motion)
+            looked = actor.encode(params, looked, observation)
             image = events.event_image(sensed) if isinstance(sensed, EventField) else sensed[0]
             target = vae.target(config.encoder, sensed, nearness)
-            made = vae.decode(config.encoder, config.camera, params.encoder, code)
+            made = vae.decode(config.encoder, config.camera, params.encoder, actor.code(looked))
             drawn = (_drawn(config, sensed, channels) for channels in (target, made))
             luma = sensor.view(config, now, position[-1], quaternion[-1])
-            return (memory, code), (image, *drawn, luma)  # type: ignore[return-value]
+            return (memory, looked), (image, *drawn, luma)  # type: ignore[return-value]
 
         keys = jax.random.split(rest, len(position))
-        before = sensor.at_rest(config, start), jnp.zeros(config.encoder.code_size)
+        before = sensor.at_rest(config, start), actor.init()
         return jax.lax.scan(one, before, (position, quaternion, time, motion, keys))[1]
 
     def _compile_rgb(self) -> Compiled:

@@ -16,9 +16,11 @@ from edqn_jax.errors import ConfigError
 from edqn_jax.interop import runner
 from edqn_jax.interop.onnx_export import about_policy, field_of
 from edqn_jax.interop.recordings.recording import Recording
+from edqn_jax.learn.actor import AgentActor, Memory, PolicyParams
 from edqn_jax.learn.perception import embedding, vae
 from edqn_jax.learn.policy import Policy
 from edqn_jax.sim.sensors import events
+from edqn_jax.sim.task.env import OWN_SIZE, Observation
 
 
 @dataclasses.dataclass(frozen=True)
@@ -110,7 +112,7 @@ def seen_by(
         ]
     )
     motion = np.stack([_motion(about, recording, int(end), velocity, yaw_rate) for end in ends])
-    image, decoded = _encoded(config, policy.params.encoder, jnp.asarray(counts), jnp.asarray(motion))
+    image, decoded = _encoded(config, policy.params, jnp.asarray(counts), jnp.asarray(motion))
     return Seen(ends, np.asarray(image), np.asarray(decoded), embedding.needs_nearness(config))
 
 
@@ -130,15 +132,17 @@ def _motion(
     return runner.own_motion(about, yaw, flight["velocity"][now].astype(np.float32), rate, flight["move"][now])
 
 
-def _encoded(config: Config, params: Any, counts: Array, motion: Array) -> tuple[Array, Array]:
-    """Returns signed event images and what is drawn of the codes, each [D, H, W]; a code may see the one before."""
+def _encoded(config: Config, params: PolicyParams, counts: Array, motion: Array) -> tuple[Array, Array]:
+    """Returns signed event images and what is drawn of the codes, each [D, H, W], in their order."""
+    actor = AgentActor(config)
 
-    def one(code: Array, given: tuple[Array, Array]) -> tuple[Array, tuple[Array, Array]]:
+    def one(memory: Memory, given: tuple[Array, Array]) -> tuple[Memory, tuple[Array, Array]]:
         field = field_of(config, given[0])
-        code = vae.embed(config.encoder, params, field, given[1], code)
-        channels = vae.decode(config.encoder, config.camera, params, code)
+        # What a policy knows of its goal is no part of a code.
+        memory = actor.encode(params, memory, Observation(sensed=field, own=jnp.zeros(OWN_SIZE), motion=given[1]))
+        channels = vae.decode(config.encoder, config.camera, params.encoder, actor.code(memory))
         nearness = embedding.needs_nearness(config)
         drawn = channels[-1] if nearness else jnp.sum(jnp.expm1(channels), axis=-3)
-        return code, (events.event_image(field), drawn)
+        return memory, (events.event_image(field), drawn)
 
-    return jax.jit(lambda c, m: jax.lax.scan(one, jnp.zeros(config.encoder.code_size), (c, m))[1])(counts, motion)
+    return jax.jit(lambda c, m: jax.lax.scan(one, actor.init(), (c, m))[1])(counts, motion)
