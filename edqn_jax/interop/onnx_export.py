@@ -23,6 +23,7 @@ from edqn_jax.interop import runner
 from edqn_jax.learn.actor import AgentActor, Memory, PolicyParams, observation_size
 from edqn_jax.learn.policy import Policy
 from edqn_jax.learn.qnetwork import q_values
+from edqn_jax.policies.functions import check_has_params
 from edqn_jax.sim.actions import ACTIONS, move_name
 from edqn_jax.sim.sensors import events
 from edqn_jax.sim.sensors.events import EventField
@@ -71,9 +72,10 @@ def export_policy(flown: Policy, file: str | Path, *, checks: int = CHECKS, dige
 
     Raises:
         CheckError: if ONNX and JAX do not agree; nothing is written.
-        ConfigError: if the policy does not see events, or sees more of them than their counts, or the file cannot be
-            written.
+        ConfigError: if the policy is a function, does not see events, or sees more of them than their counts, or the
+            file cannot be written.
     """
+    check_has_params(flown, "an ONNX file")
     file = Path(file)
     if file.suffix.lower() != ".onnx":
         raise ConfigError(f"'{file}' must end in .onnx")

@@ -19,7 +19,8 @@ from edqn_jax.config import Config
 from edqn_jax.learn.learner import learner_of
 from edqn_jax.learn.perception import embedding
 from edqn_jax.learn.qnetwork import Params
-from edqn_jax.sim.task.env import OWN_SIZE, Observation
+from edqn_jax.sim.sensors.sensor import sensor_of
+from edqn_jax.sim.task.env import MOTION_SIZE, OWN_SIZE, Observation
 
 MOVE_SIZE = 3
 """Values of the last move, which end the own motion (`sim.env.own_motion`)."""
@@ -57,6 +58,11 @@ class PolicyParams:
 
     encoder: Params  # {} where nothing is encoded
     q: Params
+
+
+def blank_observation(config: Config) -> Observation:
+    """Returns an observation of one drone in which nothing is seen, with the shapes and types of any other."""
+    return Observation(sensor_of(config).example(config), own=jnp.zeros(OWN_SIZE), motion=jnp.zeros(MOTION_SIZE))
 
 
 def observation_size(config: Config) -> int:

@@ -40,30 +40,32 @@ class Shown:
 
     image: np.ndarray
     """[D, H, W] ON minus OFF events per pixel, or the first picture."""
-    target: np.ndarray
-    """[D, H, W] what the decoder must draw, blurred: nearness, ON plus OFF events per pixel, or the first picture."""
-    reconstruction: np.ndarray
-    """[D, H, W] what it draws from the code, in the same units."""
     luma: np.ndarray
     """[D, H, W] linear brightness in the drone's camera at the end of each decision."""
+    target: np.ndarray | None = None
+    """[D, H, W] what the decoder must draw, blurred: nearness, ON plus OFF events per pixel, or the first picture; None
+    where there is no decoder."""
+    reconstruction: np.ndarray | None = None
+    """[D, H, W] what it draws from the code, in the same units."""
 
 
-_Images = tuple[Array, Array, Array, Array]
-"""As the fields of `Shown`."""
+_Images = tuple[Array, ...]
+"""As the fields of `Shown`, without the last two where there is no decoder."""
 
 
 class Sights:
     """Programs that draw images in one world; compiled in the background, since that takes seconds."""
 
-    def __init__(self, config: Config, scene: Scene, pool: Executor) -> None:
+    def __init__(self, config: Config, scene: Scene, pool: Executor, *, decodes: bool = True) -> None:
         """Compiles in `pool`; `shown` and `rgb` wait for it.
 
         Args:
             config: of the policy that flies.
             scene: one world.
             pool: with two threads, both programs are compiled at once.
+            decodes: whether the policy has a decoder, which a function has not.
         """
-        self.config, self.scene = config, scene
+        self.config, self.scene, self._decodes = config, scene, decodes
         self.has_image = sensor.sensor_of(config).image is not None
         """Whether the sensor shows an image; without one there is only `rgb`."""
         self._shown = pool.submit(self._compile_shown) if self.has_image else None
@@ -75,11 +77,11 @@ class Sights:
         other.scene = scene
         return other
 
-    def shown(self, params: PolicyParams, flown: Mapping[str, np.ndarray]) -> Shown:
+    def shown(self, params: PolicyParams | None, flown: Mapping[str, np.ndarray]) -> Shown:
         """Returns what the sensor shows at each decision of a flight, and what the VAE makes of it.
 
         Args:
-            params: whose VAE.
+            params: whose VAE; None without a decoder.
             flown: the columns of `trajectory.csv`, as `decision_rows`.
         """
         assert self._shown is not None, "this sensor shows no image"
@@ -96,12 +98,12 @@ class Sights:
     def _compile_shown(self) -> Compiled:
         config, decisions = self.config, self.config.env.max_decisions
         looks = len(sensor.frame_steps(config))
-        params = jax.eval_shape(lambda: fresh_policy(config))
+        params = jax.eval_shape(lambda: fresh_policy(config)) if self._decodes else None
         motion = jax.ShapeDtypeStruct((decisions, MOTION_SIZE), np.float32)
         return _compiled(self._all_shown, self.scene, params, *_blank_poses(decisions, looks), motion)
 
     def _all_shown(
-        self, scene: Scene, params: PolicyParams, position: Array, quaternion: Array, time: Array, motion: Array
+        self, scene: Scene, params: PolicyParams | None, position: Array, quaternion: Array, time: Array, motion: Array
     ) -> _Images:
         """The images of `shown` at [D, T, ...] poses and times with own motions [D, MOTION_SIZE].
 
@@ -117,18 +119,20 @@ class Sights:
             now = scene_at(scene, time[-1])
             sensed, memory = sensor.sense(config, scene, here, memory, key)
             assert isinstance(sensed, EventField | Array)
+            image = events.event_image(sensed) if isinstance(sensed, EventField) else sensed[0]
+            luma = sensor.view(config, now, position[-1], quaternion[-1])
+            if params is None:
+                return (memory, looked), (image, luma)
             nearness = None
             if embedding.needs_nearness(config):
                 nearness = sensor.nearness_image(config, now, position[-1], quaternion[-1])
             # What it knows of the goal is no part of a code.
             observation = env.Observation(sensed=sensed, own=jnp.zeros(env.OWN_SIZE), motion=motion)
             looked = actor.encode(params, looked, observation)
-            image = events.event_image(sensed) if isinstance(sensed, EventField) else sensed[0]
             target = vae.target(config.encoder, sensed, nearness)
             made = vae.decode(config.encoder, config.camera, params.encoder, actor.code(looked))
             drawn = (_drawn(config, sensed, channels) for channels in (target, made))
-            luma = sensor.view(config, now, position[-1], quaternion[-1])
-            return (memory, looked), (image, *drawn, luma)  # type: ignore[return-value]
+            return (memory, looked), (image, luma, *drawn)
 
         keys = jax.random.split(rest, len(position))
         before = sensor.at_rest(config, start), actor.init()
