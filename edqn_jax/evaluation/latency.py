@@ -33,7 +33,7 @@ def decision_seconds(config: Config, params: Any, calls: int, *, actor: Actor | 
 
 
 def decision_call(config: Config, params: Any, actor: Actor | None = None) -> Callable[[], np.ndarray]:
-    """Returns what makes one decision, from arrays on the host to an action there.
+    """Returns what makes one decision, from arrays on the host to an action [] or [...] there.
 
     Args:
         config: of the policy.

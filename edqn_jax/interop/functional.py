@@ -28,6 +28,7 @@ from edqn_jax.learn.actor import AgentActor, PolicyParams
 from edqn_jax.learn.perception import embedding
 from edqn_jax.learn.perception.code import Params as EncoderParams
 from edqn_jax.learn.policy import Policy
+from edqn_jax.policies.functions import check_has_params
 from edqn_jax.sim.actions import ACTIONS
 from edqn_jax.sim.sensors import events
 from edqn_jax.sim.sensors.events import EventField
@@ -225,6 +226,7 @@ def make(
     if (policy is not None) != (observation == "code"):
         raise ConfigError("observation 'code' needs a policy, whose encoder makes the codes, and the others need none")
     if policy is not None:
+        check_has_params(policy, "observation 'code'")
         if config is not None:
             raise ConfigError("config must be None with a policy, which has its own")
         if not embedding.has_code(policy.config):

@@ -45,10 +45,10 @@ class Actor(abc.ABC):
 
     @abc.abstractmethod
     def decide(self, params: Any, seen: Any, key: Array) -> tuple[Array, Any]:
-        """Returns the action for what `encode` returned, and the memory for the next observation."""
+        """Returns the action [] or [...] for what `encode` returned, and the memory for the next observation."""
 
     def act(self, params: Any, memory: Any, observation: Observation, key: Array) -> tuple[Array, Any]:
-        """Returns the action for a new observation, and the memory for the next one; the key is consumed."""
+        """Returns the action [] or [...] for a new observation, and the next memory; the key is consumed."""
         return self.decide(params, self.encode(params, memory, observation), key)
 
 

@@ -99,10 +99,16 @@ class FunctionPolicy:
         """Checks what can be checked before it flies.
 
         Raises:
-            ConfigError: if the function or `memory` cannot be called.
+            ConfigError: if the function or `memory` cannot be called, or the function has no hash.
         """
         if not callable(self.function) or isinstance(self.function, type):
             raise ConfigError(f"a policy is {TAKES}, not {self.function!r}")
+        try:
+            hash(self.function)
+        except TypeError:
+            raise ConfigError(
+                f"a policy's function must be hashable, as functions and frozen dataclasses are, not {self.function!r}"
+            ) from None
         if self.memory is not None and not callable(self.memory):
             raise ConfigError(f"memory must be a function that returns the first memory, not {self.memory!r}")
 
@@ -179,7 +185,7 @@ def load_function(name: str) -> Policy | FunctionPolicy | Function:
     policy = getattr(module, attribute)
     if not isinstance(policy, Policy | FunctionPolicy) and (not callable(policy) or isinstance(policy, type)):
         raise ConfigError(f"'{name}' is of the type {type(policy).__name__}; a policy is {TAKES}, or a FunctionPolicy")
-    return policy
+    return getattr(module, attribute)
 
 
 def _module_of_file(file: Path) -> Any:

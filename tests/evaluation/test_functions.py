@@ -17,6 +17,7 @@ from edqn_jax.cli import main
 from edqn_jax.config import Config
 from edqn_jax.errors import ConfigError
 from edqn_jax.evaluation.verdicts import check_verdicts
+from edqn_jax.interop import functional
 from edqn_jax.interop.onnx_export import export_policy
 from edqn_jax.learn.actor import AgentActor
 from edqn_jax.learn.policy import Policy
@@ -146,10 +147,18 @@ def test_what_a_function_does_wrong_is_said(function: Any, memory: Any, says: st
         flown(function, memory)
 
 
+@dataclasses.dataclass
+class Unhashable:
+    def __call__(self, observation: Observation, memory: Any, key: jax.Array) -> tuple[str, Any]:
+        return "up", memory
+
+
 @pytest.mark.parametrize("thing", [3, Config, "ahead"])
 def test_what_is_no_policy_is_refused(thing: Any) -> None:
     with pytest.raises(ConfigError, match="a policy is a function"):
         edqn_jax.evaluate(thing)
+    with pytest.raises(ConfigError, match="must be hashable"):
+        FunctionPolicy(Unhashable())
     with pytest.raises(ConfigError, match="memory must be a function"):
         FunctionPolicy(lambda o, m, k: (0, m), memory=jnp.zeros(3))  # type: ignore[arg-type]
 
@@ -160,6 +169,8 @@ def test_what_needs_parameters_says_so(tmp_path: Path) -> None:
         edqn_jax.save_policy(function, tmp_path / "saved")
     with pytest.raises(ConfigError, match="an ONNX file needs a policy"):
         export_policy(function, tmp_path / "policy.onnx")
+    with pytest.raises(ConfigError, match="observation 'code' needs a policy"):
+        functional.make("sparse", observation="code", policy=function)
     assert not list(tmp_path.iterdir())
 
 

@@ -189,8 +189,9 @@ def test_a_trained_model_is_evaluated_as_a_policy():
     model.learn(16)
     policy = sb3_policy(model, config, observation="kinematics")
     evaluation = edqn_jax.evaluate(policy, "medium", missions=2, record=True)
-    environment = edqn_jax.make("medium", config, worlds=2, split="test")
-    for mission, moves in enumerate(np.asarray(evaluation.flights.record.action)):
+    environment, record = edqn_jax.make("medium", config, worlds=2, split="test"), evaluation.flights.record
+    assert record is not None
+    for mission, moves in enumerate(np.asarray(record.action)):
         state, seen = environment.reset(0, mission)
         for move in moves[moves >= 0]:
             vector = np.clip(np.concatenate([seen.own, seen.motion]), -10, 10)

@@ -19,6 +19,7 @@ from edqn_jax.interop.recordings.recording import Recording
 from edqn_jax.learn.actor import AgentActor, Memory, PolicyParams
 from edqn_jax.learn.perception import embedding, vae
 from edqn_jax.learn.policy import Policy
+from edqn_jax.policies.functions import check_has_params
 from edqn_jax.sim.sensors import events
 from edqn_jax.sim.task.env import OWN_SIZE, Observation
 
@@ -89,6 +90,7 @@ def seen_by(
     Raises:
         ConfigError: if the policy does not encode events, or the camera cannot stand for the policy's.
     """
+    check_has_params(policy, "seen_by")
     config = policy.config
     if config.env.sensor != "events":
         raise ConfigError(f"only policies with the sensor 'events' encode events, not '{config.env.sensor}'")
