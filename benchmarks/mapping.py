@@ -34,7 +34,7 @@ from edqn_jax.evaluation.metrics import summarise
 from edqn_jax.evaluation.rollouts import fly_on_all_devices
 from edqn_jax.extras import MissingPackageError
 from edqn_jax.files import write_atomically
-from edqn_jax.learn import policy as acting
+from edqn_jax.learn.actor import AgentActor, PolicyParams
 from edqn_jax.learn.policy import Policy
 from edqn_jax.runs.policies import load_policy
 from edqn_jax.sim.physics import drone
@@ -177,16 +177,16 @@ def decision_ms(policy: Policy, flown: PilotConfig, world: World, planning: np.n
     seen = env.Observation(
         sensed=sensor_of(config).example(config), own=jnp.zeros(env.OWN_SIZE), motion=jnp.zeros(env.MOTION_SIZE)
     )
-    seen, memory = jax.tree.map(np.asarray, (seen, acting.empty_memory(config)))
+    seen, memory = jax.tree.map(np.asarray, (seen, AgentActor(config).init()))
     picture = np.full((config.camera.height, config.camera.width), 5.0, np.float32)
     position = np.asarray(world.missions.start)[0]
     rotation = mount_rotation(config, jnp.array([1.0, 0.0, 0.0, 0.0]))
 
     @jax.jit
-    def integrate(params: acting.PolicyParams, seen: env.Observation, memory: Any, picture: Any, known: grid.Grid):
+    def integrate(params: PolicyParams, seen: env.Observation, memory: Any, picture: Any, known: grid.Grid):
         depth = picture
         if flown.depth == "decoded":
-            memory = acting.see(config, params.encoder, memory, seen)
+            memory = AgentActor(config).encode(params, memory, seen)
             depth = pilot.decoded_depth(config, params, memory)
         return memory, grid.update(flown.map, config.camera, known, depth, position, rotation)
 

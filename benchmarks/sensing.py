@@ -28,7 +28,7 @@ from edqn_jax.config import FAMILIES, Config
 from edqn_jax.errors import ConfigError
 from edqn_jax.evaluation.latency import decision_call, in_turn, look_call
 from edqn_jax.evaluation.missions import MissionSet, load_missions
-from edqn_jax.learn import policy as acting
+from edqn_jax.learn.actor import AgentActor, PolicyParams
 from edqn_jax.learn.policy import Policy, fresh_policy
 from edqn_jax.runs.policies import load_policy
 from edqn_jax.sim.sensors.events import EventField
@@ -64,14 +64,15 @@ def events_per_decision(policy: Policy, course: MissionSet) -> float:
 
 
 @partial(jax.jit, static_argnums=0)
-def _flown(config: Config, world: env.World, params: acting.PolicyParams) -> tuple[jax.Array, jax.Array]:
+def _flown(config: Config, world: env.World, params: PolicyParams) -> tuple[jax.Array, jax.Array]:
     """Returns the events of all flights, and their decisions."""
     missions = world.missions.scene.shape[0]
     number, keys = jnp.arange(missions), jax.random.split(jax.random.key(0), missions)
-    act = jax.vmap(partial(acting.act, config, params, key=jax.random.key(1)))  # greedy: the key has no effect
+    actor = AgentActor(config)
+    act = jax.vmap(partial(actor.act, params, key=jax.random.key(1)))  # greedy: the key has no effect
     state = jax.vmap(partial(env.ended, config, world))(keys, number)
     state, first = jax.vmap(partial(env.step, config, world))(state, jnp.zeros(missions, jnp.int32), number)
-    memory = jnp.broadcast_to(acting.empty_memory(config), (missions, *acting.empty_memory(config).shape))
+    memory = jnp.broadcast_to(actor.init(), (missions, *actor.init().shape))
 
     def decide(carry: Any, _: None) -> tuple[Any, tuple[jax.Array, jax.Array]]:
         state, seen, memory, flying = carry

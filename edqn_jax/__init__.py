@@ -17,10 +17,13 @@ if TYPE_CHECKING:
     from edqn_jax.devices.devices import use_cpu_devices
     from edqn_jax.errors import ConfigError, DivergedError, StoppedError
     from edqn_jax.evaluation.evaluate import Evaluation, evaluate
+    from edqn_jax.interop.flight_files import record
     from edqn_jax.learn.policy import Policy
     from edqn_jax.planning.astar import plan
     from edqn_jax.planning.path import PlannedPath
+    from edqn_jax.policies.functions import FunctionPolicy
     from edqn_jax.report.flights import draw_map
+    from edqn_jax.report.page.document import write_report
     from edqn_jax.runs.policies import load_policy, save_policy
     from edqn_jax.sim.actions import move_name, move_number
     from edqn_jax.sim.sensors.sensor import Sensor
@@ -42,6 +45,7 @@ _MODULES = {
     "Environment": "sim.task.environment",
     "Evaluation": "evaluation.evaluate",
     "Family": "sim.worlds.families",
+    "FunctionPolicy": "policies.functions",
     "Outcome": "sim.task.outcomes",
     "PlannedPath": "planning.path",
     "Policy": "learn.policy",
@@ -57,10 +61,12 @@ _MODULES = {
     "move_name": "sim.actions",
     "move_number": "sim.actions",
     "plan": "planning.astar",
+    "record": "interop.flight_files",
     "save_policy": "runs.policies",
     "train": "training.loop",
     "train_seeds": "training.loop",
     "use_cpu_devices": "devices.devices",
+    "write_report": "report.page.document",
 }
 """The module of each public name."""
 
@@ -76,6 +82,7 @@ __all__ = [
     "Environment",
     "Evaluation",
     "Family",
+    "FunctionPolicy",
     "Outcome",
     "PlannedPath",
     "Policy",
@@ -92,10 +99,12 @@ __all__ = [
     "move_name",
     "move_number",
     "plan",
+    "record",
     "save_policy",
     "train",
     "train_seeds",
     "use_cpu_devices",
+    "write_report",
 ]
 
 __version__: str

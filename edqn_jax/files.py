@@ -10,6 +10,9 @@ from pathlib import Path
 
 from edqn_jax.errors import ConfigError
 
+VIDEO, EVENT_FILES = (".gif", ".mp4"), (".h5", ".hdf5", ".npz", ".txt")
+"""Endings of the files of one flight that `edqn record` writes."""
+
 whole_files = threading.Lock()
 """Held while a file is written: whoever holds it finds none half-written by this process."""
 

@@ -10,7 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from edqn_jax.config import AgentConfig, CameraConfig, Config, DroneConfig, EncoderConfig
-from edqn_jax.learn.policy import PolicyParams, fresh_policy, observation_size
+from edqn_jax.learn.actor import PolicyParams, observation_size
+from edqn_jax.learn.policy import fresh_policy
 from edqn_jax.sim.actions import ACTIONS
 
 CONFIG = dataclasses.replace(

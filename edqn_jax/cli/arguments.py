@@ -36,7 +36,8 @@ from edqn_jax.config.loading import Layer, apply, resolve
 from edqn_jax.devices.hardware import hardware
 from edqn_jax.devices.launch import Distributed
 from edqn_jax.errors import ConfigError
-from edqn_jax.policies import no_run, policy_folder
+from edqn_jax.files import EVENT_FILES, VIDEO
+from edqn_jax.policies import function_named, no_run, policy_folder
 from edqn_jax.runs.continuation import begun, continued
 from edqn_jax.runs.directory import Resume
 
@@ -100,10 +101,11 @@ class TrainCommand:
 
 @dataclass(frozen=True)
 class EvaluateArgs:
-    """Fly a saved policy greedily on missions in any world and print metrics."""
+    """Fly a policy on missions in any world and print metrics."""
 
-    run: Annotated[Positional[Path], arg(metavar="RUN")]
-    """Folder of the run, or `pretrained`: the policy that comes with the package."""
+    run: Annotated[Positional[Path], arg(metavar="POLICY")]
+    """Folder of a run, or `pretrained`: the policy that comes with the package; or any function of your own, as
+    `module:name` or `path/to/file.py:name`."""
     world: Annotated[str | None, arg(metavar="WORLD", help_behavior_hint="")] = None
     """Where to fly: `paper`, an MJCF file, or test worlds of a family (default: where training was)."""
     start: Annotated[Point | None, arg(metavar="X Y Z", help_behavior_hint="")] = None
@@ -127,10 +129,11 @@ class EvaluateArgs:
 
 @dataclass(frozen=True)
 class RecordArgs:
-    """Fly a saved run once and write the flight as a GIF or MP4, or the events of a camera that watches it."""
+    """Fly a policy once and write the flight as a GIF or MP4, or the events of a camera that watches it."""
 
-    run: Annotated[Positional[Path], arg(metavar="RUN")]
-    """Folder of the run, or `pretrained`: the policy that comes with the package."""
+    run: Annotated[Positional[Path], arg(metavar="POLICY")]
+    """Folder of a run, or `pretrained`: the policy that comes with the package; or any function of your own, as
+    `module:name` or `path/to/file.py:name`."""
     file: Annotated[Positional[Path], arg(metavar="FILE")]
     """What to write; it replaces a file of that name. FILE.gif or .mp4 (extra `video`): the view, what the drone sees,
     and its path. FILE.h5, .npz or .txt (extra `events`): the events of a camera with a frame at every physics step."""
@@ -161,7 +164,8 @@ class ReportArgs:
     """Write one HTML file with runs' flights in 3D, what the drone saw, curves, figures and options."""
 
     runs: Annotated[Positional[tuple[Path, ...]], arg(metavar="RUN [RUN ...]", help_behavior_hint="")]
-    """Folders of runs, or `pretrained`; the folder of several seeds stands for the run of each seed."""
+    """Folders of runs, or `pretrained`; the folder of several seeds stands for the run of each seed. Or functions of
+    your own, as `module:name` or `path/to/file.py:name`."""
     out: Annotated[Path | None, arg(metavar="FILE.html", help_behavior_hint="")] = None
     """HTML file to write; it replaces a file of that name (default: report.html in the first run's folder, of
     `pretrained` in the current one)."""
@@ -229,9 +233,6 @@ class CompletionArgs:
 
 
 PROFILE = "--events.profile"
-
-VIDEO, EVENT_FILES = (".gif", ".mp4"), (".h5", ".hdf5", ".npz", ".txt")
-"""Endings of the files that `edqn record` writes."""
 
 
 def parse_train(argv: Sequence[str]) -> tuple[TrainOptions, Config]:
@@ -436,6 +437,7 @@ def parse_verify(argv: Sequence[str]) -> VerifyArgs:
         SystemExit: after printing, for --help and for what does not parse.
     """
     args = _parsed(VerifyArgs, argv, VERIFY)
+    _check_is_saved(args.run, VERIFY)
     if not (args.run / "config.yaml").is_file():
         raise no_run(args.run)
     return args
@@ -472,6 +474,7 @@ def parse_export(argv: Sequence[str]) -> ExportArgs:
     args = _parsed(ExportArgs, argv, EXPORT)
     if args.checks < 1000:
         raise ConfigError(f"--checks must be at least 1000, not {args.checks}")
+    _check_is_saved(args.run, EXPORT)
     _check_run(args.run)
     return args
 
@@ -496,6 +499,7 @@ def parse_events(argv: Sequence[str]) -> EventsArgs:
     if args.picture is not None and args.picture.suffix.lower() not in (".png", ".gif"):
         raise ConfigError(f"'{args.picture}' must end in .png or .gif")
     if args.policy is not None:
+        _check_is_saved(args.policy, "--policy")
         _check_run(args.policy)
     return args
 
@@ -510,6 +514,17 @@ def parse_completion(argv: Sequence[str]) -> CompletionArgs:
     return _parsed(CompletionArgs, argv, COMPLETION)
 
 
+def _check_is_saved(run: Path, what: str) -> None:
+    """Raises ConfigError if `run` names a function."""
+    if function_named(run) is not None:
+        raise ConfigError(f"'{what}' needs a saved policy, with its parameters, and '{run}' is a function")
+
+
 def _check_run(folder: Path) -> None:
+    named = function_named(folder)
+    if named is not None:
+        if named[0].endswith(".py") and not Path(named[0]).is_file():
+            raise ConfigError(f"there is no file '{named[0]}'")
+        return
     if not (policy_folder(folder) / "config.yaml").is_file():
         raise no_run(folder)

@@ -1,9 +1,10 @@
-"""`edqn evaluate`: flies a saved policy, prints the figures, writes what was asked for."""
+"""`edqn evaluate`: flies a policy, prints the figures, writes what was asked for."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 from rich.console import Console
@@ -17,9 +18,12 @@ from edqn_jax.evaluation.latency import decision_latency_ms
 from edqn_jax.evaluation.metrics import clearance_text
 from edqn_jax.evaluation.trajectories import write_trajectories
 from edqn_jax.files import check_can_write, write_atomically
+from edqn_jax.learn.policy import Policy
+from edqn_jax.policies import function_named
+from edqn_jax.policies.functions import FunctionPolicy, actor_of, config_of
 from edqn_jax.runs.directory import plain
-from edqn_jax.runs.policies import load_policy, policy_digest, worlds_replaced
-from edqn_jax.runs.provenance import versions
+from edqn_jax.runs.policies import find_policy, policy_digest, worlds_replaced
+from edqn_jax.runs.provenance import source_record, versions
 
 
 def evaluate_command(args: EvaluateArgs) -> None:
@@ -33,7 +37,7 @@ def evaluate_command(args: EvaluateArgs) -> None:
             check_can_write(file)
     if args.json is not None and args.trajectories is not None and args.json.resolve() == args.trajectories.resolve():
         raise ConfigError(f"--json and --trajectories are both '{args.json}'; give two files")
-    policy, digest = load_policy(args.run), policy_digest(args.run)
+    policy = find_policy(args.run, args.world)
     evaluation = evaluate(
         policy,
         args.world,
@@ -45,16 +49,17 @@ def evaluate_command(args: EvaluateArgs) -> None:
         shuffle_codes=args.shuffle_codes,
         conditions=args.conditions,
     )
+    config = config_of(policy)
     figures = {
         "run": str(args.run),
-        "policy_sha256": digest,
+        **_told_of(policy, args.run),
         "versions": versions(),
         "world": evaluation.missions.name,
         "seed": args.seed,
         "shuffled_codes": args.shuffle_codes,
         "conditions": dict(_named(args.conditions)),
         **evaluation.figures,
-        "decision_latency_ms": decision_latency_ms(policy.config, policy.params),
+        "decision_latency_ms": decision_latency_ms(config, policy.params, actor=actor_of(policy, config)),
     }
     notes = [] if args.world is not None else worlds_replaced(args.run)
     for note in (*notes, *([evaluation.missions.note] if evaluation.missions.note is not None else [])):
@@ -63,7 +68,14 @@ def evaluate_command(args: EvaluateArgs) -> None:
     if args.json is not None:
         write_atomically(args.json, json.dumps(plain(figures), indent=2, allow_nan=False) + "\n")
     if args.trajectories is not None:
-        write_trajectories(policy.config, evaluation.missions, evaluation.flights, args.trajectories)
+        write_trajectories(config, evaluation.missions, evaluation.flights, args.trajectories)
+
+
+def _told_of(policy: Policy | FunctionPolicy, run: Path) -> dict[str, Any]:
+    """Returns the SHA-256 of a saved policy, or the name of a function with that of its source."""
+    if isinstance(policy, FunctionPolicy):
+        return {"policy_function": source_record(policy.function)}
+    return {} if function_named(run) else {"policy_sha256": policy_digest(run)}
 
 
 def _named(conditions: Layer) -> Iterator[tuple[str, Any]]:

@@ -36,15 +36,16 @@ Examples:
   edqn train                                       medium random worlds, then the paper's map, unseen
   edqn train --world mine.xml --run-dir runs/mine  your own world; the same command continues the run
   edqn train --preset paper --world paper          Table 1 of the paper""",
-    EVALUATE: """Fly a saved policy greedily on missions in any world and print metrics.
+    EVALUATE: """Fly a policy on missions in any world and print metrics.
 
 Options with a group, such as --air.gusts-m-s, disturb the flights; without them they are as in training.
 
 Examples:
   edqn evaluate pretrained --world dense --missions 100
   edqn evaluate pretrained --world medium --missions 300 --air.gusts-m-s 5
-  edqn evaluate runs/DIR --world mine.xml --start 2 2 3 --goal 40 30 6 --json figures.json""",
-    RECORD: """Fly a saved run once and write the flight as a GIF or MP4, or the events of a camera that watches it.
+  edqn evaluate runs/DIR --world mine.xml --start 2 2 3 --goal 40 30 6 --json figures.json
+  edqn evaluate mine.py:policy --world medium --missions 100""",
+    RECORD: """Fly a policy once and write the flight as a GIF or MP4, or the events of a camera that watches it.
 
 Examples:
   edqn record runs/DIR flight.gif

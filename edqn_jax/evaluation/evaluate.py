@@ -9,6 +9,7 @@ from typing import Any
 import jax
 import numpy as np
 
+from edqn_jax.config import Config
 from edqn_jax.config.loading import Layer, flown_under
 from edqn_jax.devices.forks import check_not_forked
 from edqn_jax.devices.jax_settings import as_tested
@@ -17,6 +18,7 @@ from edqn_jax.evaluation.metrics import shortest_paths, summarise
 from edqn_jax.evaluation.missions import MissionSet, Point, load_missions
 from edqn_jax.evaluation.rollouts import fly_on_all_devices
 from edqn_jax.learn.policy import Policy
+from edqn_jax.policies.functions import Function, FunctionPolicy, actor_of, as_policy, config_of
 from edqn_jax.sim.sensors.sensor import sensor_of
 from edqn_jax.sim.task.flights import Flights
 from edqn_jax.sim.task.outcomes import Outcome
@@ -56,7 +58,7 @@ class Evaluation:
 
 @as_tested
 def evaluate(
-    policy: Policy,
+    policy: Policy | FunctionPolicy | Function,
     world: str | Path | None = None,
     *,
     missions: int = 1,
@@ -70,7 +72,8 @@ def evaluate(
     """Flies a policy greedily, every mission once, and measures.
 
     Args:
-        policy: from `train` or `load_policy`.
+        policy: from `train` or `load_policy`; or any function of an observation, a memory and a key that returns a move
+            and the memory, see `FunctionPolicy`.
         world: `paper`, the name of random worlds (`config.FAMILIES`) or an MJCF file; None is where it was
             trained, of random worlds the test worlds.
         missions: how many. One in a world from a file goes from its start to its goal, more begin at random free
@@ -84,24 +87,26 @@ def evaluate(
             `{"air": {"gusts_m_s": 5.0}}`; see `config.CONDITIONS`.
 
     Raises:
-        ConfigError: if there is no such world or condition, the missions cannot be flown, or there is nothing to
-            shuffle.
+        ConfigError: if there is no such world or condition, the missions cannot be flown, the policy cannot fly, or
+            there is nothing to shuffle.
     """
     check_not_forked()
-    config = flown_under(policy.config, conditions or {}, "evaluate")
+    policy = as_policy(policy, world)
+    config = flown_under(config_of(policy), conditions or {}, "evaluate")
     if shuffle_codes:
-        _check_can_shuffle(policy, missions)
+        _check_can_shuffle(config, missions)
     flown = load_missions(config, str(world or config.world.name), missions, seed, start, goal)
-    flights = fly_on_all_devices(config, flown.world, policy.params, seed, record=record, shuffle_codes=shuffle_codes)
+    actor = actor_of(policy, config)
+    flights = fly_on_all_devices(
+        config, flown.world, policy.params, seed, actor=actor, record=record, shuffle_codes=shuffle_codes
+    )
     shortest = shortest_paths(config, flown.world, np.asarray(flights.outcome) == Outcome.GOAL)
     return Evaluation(flown, flights, summarise(flights, shortest, config.env.drones))
 
 
-def _check_can_shuffle(policy: Policy, missions: int) -> None:
+def _check_can_shuffle(config: Config, missions: int) -> None:
     least = 2 * len(jax.devices())
     if missions < least:
         raise ConfigError(f"--shuffle-codes needs --missions of at least {least}, not {missions}")
-    if not sensor_of(policy.config).shapes(policy.config):
-        raise ConfigError(
-            f"--shuffle-codes has nothing to shuffle: the sensor '{policy.config.env.sensor}' shows nothing"
-        )
+    if not sensor_of(config).shapes(config):
+        raise ConfigError(f"--shuffle-codes has nothing to shuffle: the sensor '{config.env.sensor}' shows nothing")

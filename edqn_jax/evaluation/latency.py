@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -11,34 +12,39 @@ import numpy as np
 from jax import Array
 
 from edqn_jax.config import Config
-from edqn_jax.learn import policy
-from edqn_jax.learn.policy import PolicyParams
+from edqn_jax.learn.actor import Actor, AgentActor, PolicyParams, blank_observation
 from edqn_jax.sim.physics.drone import Flight
 from edqn_jax.sim.scene.scene import Scene
-from edqn_jax.sim.sensors.sensor import SensorMemory, at_rest, frame_steps, sense, sensor_of
+from edqn_jax.sim.sensors.sensor import SensorMemory, at_rest, frame_steps, sense
 from edqn_jax.sim.task import env
 
 
-def decision_latency_ms(config: Config, params: PolicyParams, calls: int = 300) -> dict[str, float]:
+def decision_latency_ms(
+    config: Config, params: Any, calls: int = 300, *, actor: Actor | None = None
+) -> dict[str, float]:
     """Returns the median and 99th percentile of `decision_seconds`, in milliseconds: `median`, `p99`."""
-    median, p99 = np.percentile(1e3 * decision_seconds(config, params, calls), [50, 99])
+    median, p99 = np.percentile(1e3 * decision_seconds(config, params, calls, actor=actor), [50, 99])
     return {"median": float(median), "p99": float(p99)}
 
 
-def decision_seconds(config: Config, params: PolicyParams, calls: int) -> np.ndarray:
+def decision_seconds(config: Config, params: Any, calls: int, *, actor: Actor | None = None) -> np.ndarray:
     """Returns the seconds [calls] that each of `calls` decisions takes, from arrays on the host to an action there."""
-    return in_turn([decision_call(config, params)], calls)[0]
+    return in_turn([decision_call(config, params, actor)], calls)[0]
 
 
-def decision_call(config: Config, params: PolicyParams) -> Callable[[], int]:
-    """Returns what makes one decision, from arrays on the host to an action there."""
-    seen = env.Observation(
-        sensed=sensor_of(config).example(config), own=jnp.zeros(env.OWN_SIZE), motion=jnp.zeros(env.MOTION_SIZE)
-    )
-    seen, memory = jax.tree.map(np.asarray, (seen, policy.empty_memory(config)))  # on the host
-    act = jax.jit(lambda params, memory, seen, key: policy.act(config, params, memory, seen, key)[0])
+def decision_call(config: Config, params: Any, actor: Actor | None = None) -> Callable[[], np.ndarray]:
+    """Returns what makes one decision, from arrays on the host to an action [] or [...] there.
+
+    Args:
+        config: of the policy.
+        params: of the actor.
+        actor: what decides; None is the agent of `config`.
+    """
+    actor = actor or AgentActor(config)
+    seen, memory = jax.tree.map(np.asarray, (blank_observation(config), actor.init()))  # on the host
+    act = jax.jit(lambda params, memory, seen, key: actor.act(params, memory, seen, key)[0])
     params, key = jax.device_put(params), jax.random.key(0)
-    return lambda: int(act(params, memory, seen, key))
+    return lambda: np.asarray(act(params, memory, seen, key))
 
 
 def look_call(config: Config, params: PolicyParams, scene: Scene) -> Callable[[], int]:
@@ -54,8 +60,8 @@ def look_call(config: Config, params: PolicyParams, scene: Scene) -> Callable[[]
         quaternion=jnp.tile(jnp.array([1.0, 0.0, 0.0, 0.0]), (steps, 1)),
         velocity=jnp.tile(jnp.array([4.0, 0.0, 0.0]), (steps, 1)),
     )
-    before = at_rest(config, jax.random.key(0))
-    poses, before, memory = jax.tree.map(np.asarray, (poses, before, policy.empty_memory(config)))  # on the host
+    before, actor = at_rest(config, jax.random.key(0)), AgentActor(config)
+    poses, before, memory = jax.tree.map(np.asarray, (poses, before, actor.init()))  # on the host
 
     @jax.jit
     def act(
@@ -63,7 +69,7 @@ def look_call(config: Config, params: PolicyParams, scene: Scene) -> Callable[[]
     ) -> Array:
         sensed, _ = sense(config, scene, poses, before, key)
         seen = env.Observation(sensed=sensed, own=jnp.zeros(env.OWN_SIZE), motion=jnp.zeros(env.MOTION_SIZE))
-        return policy.act(config, params, memory, seen, key)[0]
+        return actor.act(params, memory, seen, key)[0]
 
     params, scene, key = jax.device_put(params), jax.device_put(scene), jax.random.key(0)
     return lambda: int(act(params, scene, poses, before, memory, key))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -15,13 +16,23 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 from edqn_jax.config import Config
 from edqn_jax.devices.devices import compiler_options
+from edqn_jax.errors import ConfigError
 from edqn_jax.keys import run_streams
-from edqn_jax.learn import policy
-from edqn_jax.learn.policy import Memory, PolicyParams
+from edqn_jax.learn.actor import Actor, AgentActor, blank_observation
 from edqn_jax.sim.task import env, group
 from edqn_jax.sim.task.env import EnvState, Observation, Step, World
 from edqn_jax.sim.task.flights import Flights, Record, at_start, tally
 from edqn_jax.sim.task.outcomes import Outcome
+
+
+@dataclasses.dataclass(frozen=True)
+class _Program:
+    """What a compiled program depends on, beside its arrays and devices."""
+
+    config: Config
+    actor: Actor
+    shuffle_codes: bool
+    record: bool
 
 
 @struct.dataclass
@@ -30,7 +41,7 @@ class _Flying:
 
     state: EnvState
     observation: Observation
-    memory: Memory
+    memory: Any  # [M, ...] of the actor
     flights: Flights  # record not in it
     record: Record | None  # decision first: [D, M, ...]
     decision: Array  # [] int32, -1 is the reset
@@ -40,9 +51,10 @@ class _Flying:
 def fly_missions(
     config: Config,
     world: World,
-    params: PolicyParams,
+    params: Any,
     key: Array,
     *,
+    actor: Actor | None = None,
     shuffle_codes: bool = False,
     record: bool = False,
     mesh: Mesh | None = None,
@@ -58,7 +70,8 @@ def fly_missions(
         config: configuration of the policy and its world.
         world: the missions.
         params: parameters of the policy.
-        key: consumed; sensor noise and the shuffling depend on it.
+        key: consumed; sensor noise, the shuffling and an actor that is not greedy depend on it.
+        actor: what flies; None is the agent of `config`.
         shuffle_codes: give each environment the sensor's output of another one, permuted anew at each decision,
             but its own state: measures how much the policy depends on its sensor.
         record: keep every pose of the flights.
@@ -69,34 +82,37 @@ def fly_missions(
         Flights of the M missions, on the devices.
 
     Raises:
+        ConfigError: if the actor's actions are no moves.
         ValueError: if codes are to be shuffled and a device has only one mission.
     """
-    return _program(mesh)(config, shuffle_codes, record, mesh, world, params, key)
+    program = _Program(config, actor or AgentActor(config), shuffle_codes, record)
+    return _compiled_for(mesh)(program, mesh, world, params, key)
 
 
 def fly_on_all_devices(
     config: Config,
     world: World,
-    params: PolicyParams,
+    params: Any,
     seed: int = 0,
     *,
+    actor: Actor | None = None,
     record: bool = False,
     shuffle_codes: bool = False,
 ) -> Flights:
     """Runs `fly_missions` on all devices and returns the flights on the host."""
     mesh = Mesh(np.asarray(jax.devices()), ("mission",))
     world, params = jax.device_put((world, params), NamedSharding(mesh, PartitionSpec()))
+    key = run_streams(seed).flights
     flights = fly_missions(
-        config, world, params, run_streams(seed).flights, record=record, shuffle_codes=shuffle_codes, mesh=mesh
+        config, world, params, key, actor=actor, record=record, shuffle_codes=shuffle_codes, mesh=mesh
     )
     return jax.tree.map(np.asarray, flights)
 
 
-def traced(
-    config: Config, world: World, params: PolicyParams, key: Array, *, record: bool, mesh: Mesh
-) -> jax.stages.Lowered:
-    """Returns the program that `fly_missions` runs for such arguments, to be compiled ahead of its first call."""
-    return _program(mesh).lower(config, False, record, mesh, world, params, key)
+def traced(config: Config, world: World, params: Any, key: Array, *, record: bool, mesh: Mesh) -> jax.stages.Lowered:
+    """Returns the program that `fly_missions` runs for the agent, to be compiled ahead of its first call."""
+    program = _Program(config, AgentActor(config), False, record)
+    return _compiled_for(mesh).lower(program, mesh, world, params, key)
 
 
 def flight_keys(key: Array, missions: int) -> tuple[Array, Array]:
@@ -105,35 +121,27 @@ def flight_keys(key: Array, missions: int) -> tuple[Array, Array]:
     return jax.vmap(partial(jax.random.fold_in, reset_key))(jnp.arange(missions)), loop_key
 
 
-def _program(mesh: Mesh | None):
+def _compiled_for(mesh: Mesh | None):
     return _compiled((jax.devices()[0] if mesh is None else mesh.devices.flat[0]).platform)
 
 
 @functools.cache
 def _compiled(platform: str):
     # Static by position: a flag passed by name would compile another program.
-    return jax.jit(_fly_all, static_argnums=(0, 1, 2, 3), compiler_options=compiler_options(platform))
+    return jax.jit(_fly_all, static_argnums=(0, 1), compiler_options=compiler_options(platform))
 
 
-def _fly_all(
-    config: Config,
-    shuffle_codes: bool,
-    record: bool,
-    mesh: Mesh | None,
-    world: World,
-    params: PolicyParams,
-    key: Array,
-) -> Flights:
+def _fly_all(program: _Program, mesh: Mesh | None, world: World, params: Any, key: Array) -> Flights:
     missions = world.missions.scene.shape[0]
     devices = 1 if mesh is None else mesh.size
     reset_keys, loop_key = flight_keys(key, missions)
     # Every device flies equally many missions, whole groups; the first ones are repeated to fill up.
-    unit = devices * config.env.drones
+    unit = devices * program.config.env.drones
     number = jnp.arange(-(-missions // unit) * unit) % missions
-    if shuffle_codes and number.shape[0] // devices < 2:
+    if program.shuffle_codes and number.shape[0] // devices < 2:
         raise ValueError("shuffling codes needs at least two missions on each device")
     keys = reset_keys[number]
-    fly = partial(_fly, config, shuffle_codes, record)
+    fly = partial(_fly, program)
     if mesh is not None:
         (axis,) = mesh.axis_names
         specs = PartitionSpec(), PartitionSpec(), PartitionSpec(axis), PartitionSpec(axis), PartitionSpec()
@@ -142,35 +150,28 @@ def _fly_all(
     return jax.tree.map(lambda leaf: leaf[:missions], flights)
 
 
-def _fly(
-    config: Config,
-    shuffle_codes: bool,
-    record: bool,
-    world: World,
-    params: PolicyParams,
-    number: Array,
-    keys: Array,
-    key: Array,
-) -> Flights:
+def _fly(program: _Program, world: World, params: Any, number: Array, keys: Array, key: Array) -> Flights:
     """Runs `fly_missions` on one device: missions `number` [M] with the environments' keys [M]."""
-    missions = number.shape[0]
+    config, actor, missions = program.config, program.actor, number.shape[0]
+    first = actor.init()
+    action = _action_of(config, actor, params)
 
     def decide(flying: _Flying) -> _Flying:
         key, act_key, shift_key = jax.random.split(flying.key, 3)
         seen = flying.observation
-        if shuffle_codes:
+        if program.shuffle_codes:
             shift = jax.random.randint(shift_key, (), 1, missions)
             # What a code tells of obstacles is in the sensor's output alone; the own motion stays.
             sensed = jax.tree.map(lambda x: jnp.roll(x, shift, axis=0), seen.sensed)
             seen = dataclasses.replace(seen, sensed=sensed)
-        act = partial(policy.act, config, params, key=act_key)  # greedy: the key has no effect
-        action, memory = jax.vmap(act)(flying.memory, seen)
+        own_keys = jax.vmap(partial(jax.random.fold_in, act_key))(number)
+        action, memory = jax.vmap(partial(actor.act, params))(flying.memory, seen, own_keys)
         state, step = group.each(config, partial(env.step, config, world))(flying.state, action, number)
         flights, clearance = jax.vmap(partial(_tally, config, world))(flying.flights, flying.state, step)
         return _Flying(
             state=state,
             observation=step.observation,
-            memory=jnp.where(step.is_reset[:, None, None], 0.0, memory),
+            memory=jax.tree.map(lambda new, begun: _where(step.is_reset, begun, new), memory, first),
             flights=flights,
             record=_write(flying, action, step, clearance),
             decision=flying.decision + 1,
@@ -179,14 +180,14 @@ def _fly(
 
     # The first iteration resets every environment: the observation and the action before it are not used.
     state = jax.vmap(partial(env.ended, config, world))(keys, number)
-    seen = jax.eval_shape(group.each(config, partial(env.step, config, world)), state, number)[1].observation
-    memory = policy.empty_memory(config)
+    actions = jnp.zeros((missions, *action.shape), action.dtype)
+    seen = jax.eval_shape(group.each(config, partial(env.step, config, world)), state, actions)[1].observation
     flying = _Flying(
         state=state,
         observation=jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), seen),
-        memory=jnp.broadcast_to(memory, (missions, *memory.shape)),
+        memory=jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (missions, *leaf.shape)), first),
         flights=jax.vmap(partial(_at_start, config, world))(state),
-        record=_blank(config, missions) if record else None,
+        record=_blank(config, missions, action) if program.record else None,
         decision=jnp.full((), -1),
         key=key,
     )
@@ -211,7 +212,23 @@ def _tally(config: Config, world: World, flights: Flights, before: EnvState, ste
     return jax.tree.map(lambda new, old: jnp.where(running, new, old), after, flights), clearance
 
 
-def _blank(config: Config, missions: int) -> Record:
+def _action_of(config: Config, actor: Actor, params: Any) -> jax.ShapeDtypeStruct:
+    """Returns shape and type of an actor's actions.
+
+    Raises:
+        ConfigError: if they are no moves.
+    """
+    act = partial(actor.act, key=jax.random.key(0))
+    action = jax.eval_shape(act, params, actor.init(), blank_observation(config))[0]
+    if action.shape or not jnp.issubdtype(action.dtype, jnp.integer):
+        raise ConfigError(
+            f"this policy's actions are {action.dtype}{list(action.shape)}; a move is a number from 0 to 26, [] int, a "
+            "vector of three from -1, 0 and 1, or a name"
+        )
+    return action
+
+
+def _blank(config: Config, missions: int, action: jax.ShapeDtypeStruct) -> Record:
     decisions, steps = config.env.max_decisions, config.drone.physics_steps
 
     def unwritten(*size: int) -> Array:
@@ -222,9 +239,19 @@ def _blank(config: Config, missions: int) -> Record:
         quaternion=unwritten(steps, 4),
         velocity=unwritten(steps, 3),
         clearance=unwritten(steps),
-        action=jnp.full((decisions, missions), -1, jnp.int32),
+        action=jnp.full((decisions, missions, *action.shape), _no_action(action.dtype), action.dtype),
         reward=unwritten(),
     )
+
+
+def _no_action(kind: Any) -> float | int:
+    """Returns what stands in a record in place of an action after a flight's end."""
+    return -1 if jnp.issubdtype(kind, jnp.integer) else jnp.nan
+
+
+def _where(chosen: Array, new: Array, old: Array) -> Array:
+    """Returns new rows [...] or [M, ...] where `chosen` [M], and old ones [M, ...] elsewhere."""
+    return jnp.where(chosen.reshape(-1, *(1 for _ in old.shape[1:])), new, old)
 
 
 def _write(flying: _Flying, action: Array, step: Step, clearance: Array) -> Record | None:
@@ -239,7 +266,7 @@ def _write(flying: _Flying, action: Array, step: Step, clearance: Array) -> Reco
         quaternion=jnp.where(flown[..., None], step.flight.quaternion, jnp.nan),
         velocity=jnp.where(flown[..., None], step.flight.velocity, jnp.nan),
         clearance=jnp.where(flown, clearance, jnp.nan),
-        action=jnp.where(running, action, -1),
+        action=_where(running, action, jnp.full_like(action, _no_action(action.dtype))),
         reward=jnp.where(running, step.reward, jnp.nan),
     )
     return jax.tree.map(lambda whole, new: whole.at[flying.decision].set(new), flying.record, row)
@@ -257,6 +284,6 @@ def _by_mission(record: Record) -> Record:
         quaternion=joined(record.quaternion),
         velocity=joined(record.velocity),
         clearance=joined(record.clearance),
-        action=record.action.T,
+        action=jnp.swapaxes(record.action, 0, 1),
         reward=record.reward.T,
     )

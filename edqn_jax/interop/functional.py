@@ -24,9 +24,11 @@ from edqn_jax.config import FAMILIES, Config
 from edqn_jax.config.loading import make_config
 from edqn_jax.devices.jax_settings import as_tested
 from edqn_jax.errors import ConfigError
+from edqn_jax.learn.actor import AgentActor, PolicyParams
 from edqn_jax.learn.perception import embedding
 from edqn_jax.learn.perception.code import Params as EncoderParams
 from edqn_jax.learn.policy import Policy
+from edqn_jax.policies.functions import check_has_params
 from edqn_jax.sim.actions import ACTIONS
 from edqn_jax.sim.sensors.sensor import sensor_of
 from edqn_jax.sim.task import env
@@ -174,7 +176,7 @@ class FunctionalEnv:
         if self.observation == "kinematics":
             return jnp.concatenate([own, motion])
         if self.observation == "code":
-            code = embedding.embed(self.config, params.encoder, seen)
+            code = AgentActor(self.config).embed(PolicyParams(params.encoder, q={}), seen)
             assert code is not None
             return jnp.concatenate([_numbers(code), own, motion])
         image = sensor_of(self.config).numbers(self.config, seen.sensed)
@@ -213,6 +215,7 @@ def make(
     if (policy is not None) != (observation == "code"):
         raise ConfigError("observation 'code' needs a policy, whose encoder makes the codes, and the others need none")
     if policy is not None:
+        check_has_params(policy, "observation 'code'")
         if config is not None:
             raise ConfigError("config must be None with a policy, which has its own")
         if not embedding.has_code(policy.config):

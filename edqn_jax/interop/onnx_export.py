@@ -20,9 +20,10 @@ from edqn_jax.errors import CheckError, ConfigError
 from edqn_jax.extras import require
 from edqn_jax.files import check_can_write, write_atomically
 from edqn_jax.interop import runner
-from edqn_jax.learn import policy
-from edqn_jax.learn.policy import Memory, Policy, PolicyParams, observation_size
+from edqn_jax.learn.actor import AgentActor, Memory, PolicyParams, observation_size
+from edqn_jax.learn.policy import Policy
 from edqn_jax.learn.qnetwork import q_values
+from edqn_jax.policies.functions import check_has_params
 from edqn_jax.sim.actions import ACTIONS, move_name
 from edqn_jax.sim.sensors import events
 from edqn_jax.sim.sensors.events import EventField
@@ -71,9 +72,10 @@ def export_policy(flown: Policy, file: str | Path, *, checks: int = CHECKS, dige
 
     Raises:
         CheckError: if ONNX and JAX do not agree; nothing is written.
-        ConfigError: if the policy does not see events, or sees more of them than their counts, or the file cannot be
-            written.
+        ConfigError: if the policy is a function, does not see events, or sees more of them than their counts, or the
+            file cannot be written.
     """
+    check_has_params(flown, "an ONNX file")
     file = Path(file)
     if file.suffix.lower() != ".onnx":
         raise ConfigError(f"'{file}' must end in .onnx")
@@ -177,7 +179,7 @@ def decision(config: Config, params: PolicyParams) -> Callable[..., tuple[Array,
 
     def decide(counts: Array, own: Array, motion: Array, memory: Memory) -> tuple[Array, Array]:
         observation = Observation(sensed=_sensed(config, counts), own=own, motion=motion)
-        after = policy.see(config, params.encoder, memory, observation)
+        after = AgentActor(config).encode(params, memory, observation)
         return q_values(config.agent, params.q, len(ACTIONS), after), after
 
     return decide

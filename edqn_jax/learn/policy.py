@@ -1,4 +1,4 @@
-"""The policy that flies: an encoder, a Q-network and the memory that stacks observations."""
+"""The policy that flies, for people: a configuration and parameters, given one observation after another."""
 
 from __future__ import annotations
 
@@ -8,37 +8,18 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
-from flax import struct
 from jax import Array
 
 from edqn_jax.config import Config
 from edqn_jax.devices.jax_settings import as_tested
 from edqn_jax.errors import ConfigError
+from edqn_jax.learn.actor import AgentActor, Memory, PolicyParams
 from edqn_jax.learn.learner import learner_of
 from edqn_jax.learn.perception import embedding, vae
 from edqn_jax.learn.qnetwork import Params
 from edqn_jax.sim.sensors.events import EventField
 from edqn_jax.sim.sensors.sensor import DEPTH_SCALE, Sensed, distance_of, sensor_of
-from edqn_jax.sim.task.env import OWN_SIZE, Observation
-
-MOVE_SIZE = 3
-"""Values of the last move, which end the own motion (`sim.env.own_motion`)."""
-
-Memory = Array
-"""[H, D] the newest observations as the network sees them, newest last; zeros before an episode began."""
-
-
-@struct.dataclass
-class PolicyParams:
-    """All that a policy knows."""
-
-    encoder: Params  # {} where nothing is encoded
-    q: Params
-
-
-def observation_size(config: Config) -> int:
-    """Returns D, the length of what is seen, the last move where the Q-network sees it, and the own state."""
-    return embedding.size(config) + (MOVE_SIZE if config.agent.last_move else 0) + OWN_SIZE
+from edqn_jax.sim.task.env import Observation
 
 
 def fresh_policy(config: Config, seed: int = 0) -> PolicyParams:
@@ -49,41 +30,6 @@ def fresh_policy(config: Config, seed: int = 0) -> PolicyParams:
         encoder=embedding.acting(config, embedding.init(config, encoder_key)),
         q=learner.policy(learner.init(config, agent_key)),
     )
-
-
-def empty_memory(config: Config) -> Memory:
-    """Returns the memory at the beginning of an episode."""
-    return jnp.zeros((config.agent.history, observation_size(config)))
-
-
-def remember(memory: Memory, flat: Array) -> Memory:
-    """Returns the memory [..., H, D] with a new observation [..., D] at its end."""
-    return jnp.concatenate([memory[..., 1:, :], flat[..., None, :]], axis=-2)
-
-
-def flatten(config: Config, params: Params, observation: Observation) -> Array:
-    """Returns [..., D]: what is seen, by default as a code, and own state of observations [...].
-
-    With `agent.last_move` the move, which stays as it is where own states are turned, stands between both.
-    """
-    seen = embedding.embed(config, params, observation)
-    parts = [] if seen is None else [seen]
-    if config.agent.last_move:
-        parts.append(observation.motion[..., -MOVE_SIZE:])
-    return jnp.concatenate([*parts, observation.own], axis=-1) if parts else observation.own
-
-
-def see(config: Config, params: Params, memory: Memory, observation: Observation) -> Memory:
-    """Returns the memory [..., H, D] with the encoded observation [...] at its end."""
-    return remember(memory, flatten(config, params, observation))
-
-
-def act(
-    config: Config, params: PolicyParams, memory: Memory, observation: Observation, key: Array
-) -> tuple[Array, Memory]:
-    """Returns the greedy move [] int32 for one observation, and the memory with that observation in it."""
-    memory = see(config, params.encoder, memory, observation)
-    return learner_of(config).decide(config, params.q, memory), memory
 
 
 @dataclasses.dataclass(frozen=True)
@@ -106,7 +52,7 @@ class Policy:
         """
         _check_fits(self.config, observation)
         if memory is None:
-            memory = empty_memory(self.config)
+            memory = AgentActor(self.config).init()
         return _act(self.config, self.params, memory, observation)
 
     @as_tested
@@ -119,7 +65,7 @@ class Policy:
         if not embedding.has_code(self.config):
             raise ConfigError(f"the policy's sensor '{self.config.env.sensor}' has no encoder, so there is no code")
         _, memory = self.act(observation)
-        return memory[-1, : embedding.code_size(self.config)] / self.config.agent.code_scale
+        return AgentActor(self.config).code(memory)
 
     @as_tested
     def depth(self, code: Array) -> Array:
@@ -181,4 +127,4 @@ def _depth(config: Config, params: Params, code: Array) -> Array:
 
 @functools.partial(jax.jit, static_argnums=0)
 def _act(config: Config, params: PolicyParams, memory: Memory, observation: Observation) -> tuple[Array, Memory]:
-    return act(config, params, memory, observation, jax.random.key(0))  # greedy, so the key does not matter
+    return AgentActor(config).act(params, memory, observation, jax.random.key(0))  # greedy: the key has no effect

@@ -26,12 +26,12 @@ from edqn_jax.devices import processes
 from edqn_jax.devices.devices import compiler_options
 from edqn_jax.errors import ConfigError
 from edqn_jax.keys import run_streams
-from edqn_jax.learn import policy, replay, samples
+from edqn_jax.learn import replay, samples
+from edqn_jax.learn.actor import AgentActor, PolicyParams, observation_size
 from edqn_jax.learn.checked import CheckedChunk, one_by_one
 from edqn_jax.learn.learner import Exploration, Metrics, Rings, learner_of
 from edqn_jax.learn.perception import embedding, vae
 from edqn_jax.learn.plan import Plan
-from edqn_jax.learn.policy import PolicyParams, empty_memory, observation_size
 from edqn_jax.learn.samples import Samples
 from edqn_jax.learn.updates import (
     Networks,
@@ -142,11 +142,11 @@ def init(config: Config, world: World, key: Array) -> TrainState:
     keys = InitialKeys.split(key, envs, shards)
     # Nothing has been seen yet: the first step is every environment's reset.
     state = group.each(config, lambda k: env.ended(config, world, k))(keys.environments)
-    networks = init_networks(config, keys.learner)
+    networks, memory = init_networks(config, keys.learner), AgentActor(config).init()
     ring = replay.empty(learner_of(config).ring_length(config), envs // shards, observation_size(config))
     flat = Actors(
         env=state,
-        memory=jnp.broadcast_to(empty_memory(config), (envs, *empty_memory(config).shape)),
+        memory=jnp.broadcast_to(memory, (envs, *memory.shape)),
         reward=jnp.zeros(envs),
         outcome=jnp.full(envs, _NO_START),
         is_reset=jnp.ones(envs, bool),
@@ -305,7 +305,7 @@ def _remember(config: Config, networks: Networks, actors: Actors, seen: env.Step
     """Returns memories [S * E, H, D] with the new observations, encoded once; new episodes or encoders begin empty."""
     forget = seen.is_reset | Plan.of(config).replaces_encoder(step)
     memory = jnp.where(forget[:, None, None], 0.0, flat(actors.memory))
-    return policy.see(config, networks.encoder, memory, seen.observation)
+    return AgentActor(config).encode(_acting(config, networks), memory, seen.observation)
 
 
 def _shaped(shape: tuple[int, ...], tree: Any) -> Any:
@@ -370,7 +370,11 @@ def run_steps(
 
 def policy_of(config: Config, state: TrainState) -> PolicyParams:
     """Returns what evaluation flies: the acting encoder and the averaged Q-network."""
-    return PolicyParams(encoder=state.learner.encoder, q=learner_of(config).policy(state.learner.agent))
+    return _acting(config, state.learner)
+
+
+def _acting(config: Config, networks: Networks) -> PolicyParams:
+    return PolicyParams(encoder=networks.encoder, q=learner_of(config).policy(networks.agent))
 
 
 def _laid(shapes: Any, sharding: NamedSharding) -> Any:

@@ -1,14 +1,24 @@
-"""Policies that come with the package, each a folder as `save_policy` writes it, with a model card."""
+"""Policies that come with the package, each a folder as `save_policy` writes it, with a model card, and functions."""
 
 from __future__ import annotations
 
 import difflib
+import re
 from pathlib import Path
 
 from edqn_jax.errors import ConfigError
 
 PRETRAINED = "pretrained"
 """Name of the policy for random worlds, open and closed ones."""
+
+
+def function_named(name: str | Path) -> tuple[str, str] | None:
+    """Returns module or file, and what is in it, of `module:name` or `path/to/file.py:name`; None of anything else.
+
+    A folder of that name takes precedence.
+    """
+    found = re.fullmatch(r"(.+\.py|[A-Za-z_][\w.]*):([A-Za-z_]\w*)", str(name))
+    return None if found is None or Path(name).is_dir() else (found[1], found[2])
 
 
 def policy_folder(run: Path) -> Path:

@@ -49,13 +49,18 @@ SIGHT_M = 9.0
 
 
 def animate(
-    sights: Sights, params: PolicyParams, flown: Mapping[str, np.ndarray], outcome: str, title: str, form: str = ".gif"
+    sights: Sights,
+    params: PolicyParams | None,
+    flown: Mapping[str, np.ndarray],
+    outcome: str,
+    title: str,
+    form: str = ".gif",
 ) -> bytes:
     """Returns a flight as an animated GIF of `SIZE`, which repeats for ever, or as an MP4 (H.264) of that size.
 
     Args:
         sights: of the world in which the flight was flown.
-        params: of the policy that flew.
+        params: of the policy that flew; None of a function.
         flown: the columns of `trajectory.csv`, each [rows].
         outcome: how the flight ended, a key of `OUTCOME_LABELS`.
         title: stands above the world.
@@ -80,7 +85,9 @@ def animate(
 class _Stage:
     """The figure of which all frames are pictures; what moves is drawn over a background that is drawn once."""
 
-    def __init__(self, sights: Sights, params: PolicyParams, flown: Mapping[str, np.ndarray], title: str) -> None:
+    def __init__(
+        self, sights: Sights, params: PolicyParams | None, flown: Mapping[str, np.ndarray], title: str
+    ) -> None:
         self._sights, self._flown = sights, flown
         self._points = np.stack([flown[name] for name in ("x", "y", "z")], axis=-1).astype(np.float64)
         self._figure = Figure(figsize=(SIZE[0] / DOTS_PER_INCH, SIZE[1] / DOTS_PER_INCH), dpi=DOTS_PER_INCH)
@@ -131,7 +138,7 @@ class _Stage:
         self._moving.append(text)
         return text
 
-    def _add_pictures(self, params: PolicyParams) -> None:
+    def _add_pictures(self, params: PolicyParams | None) -> None:
         """Adds the view for people above what the sensor shows."""
         sights, camera = self._sights, self._sights.config.camera
         above, below = (self._figure.add_axes((0.015, y, 0.375, 0.415)) for y in (0.533, 0.06))

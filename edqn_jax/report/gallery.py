@@ -81,6 +81,7 @@ def _draw_what_it_sees(run: RunDirectory, sights: Sights, params: PolicyParams, 
     )
     file = run.figures / "reconstruction.png"
     draws_nearness = embedding.needs_nearness(config)
+    assert shown.target is not None and shown.reconstruction is not None
     drawn = NEARNESS if draws_nearness else RECONSTRUCTED_EVENTS if look.signed else look
     # A target made of what is shown says nothing more than that.
     seen = (shown.image[moments], look) if draws_nearness else None

@@ -17,8 +17,9 @@ from jax.stages import Compiled
 
 from edqn_jax.config import Config
 from edqn_jax.devices.devices import quick_compiler_options
+from edqn_jax.learn.actor import AgentActor, PolicyParams
 from edqn_jax.learn.perception import embedding, vae
-from edqn_jax.learn.policy import PolicyParams, fresh_policy
+from edqn_jax.learn.policy import fresh_policy
 from edqn_jax.sim.actions import ACTIONS
 from edqn_jax.sim.camera import camera
 from edqn_jax.sim.physics import drone
@@ -38,32 +39,35 @@ class Shown:
 
     image: np.ndarray
     """[D, H, W] ON minus OFF events per pixel, or the first picture."""
-    target: np.ndarray
-    """[D, H, W] what the decoder must draw, blurred: nearness, ON plus OFF events per pixel, or the first picture."""
-    reconstruction: np.ndarray
-    """[D, H, W] what it draws from the code, in the same units."""
     luma: np.ndarray
     """[D, H, W] linear brightness in the drone's camera at the end of each decision."""
+    target: np.ndarray | None = None
+    """[D, H, W] what the decoder must draw, blurred: nearness, ON plus OFF events per pixel, or the first picture; None
+    where there is no decoder."""
+    reconstruction: np.ndarray | None = None
+    """[D, H, W] what it draws from the code, in the same units."""
 
 
-_Images = tuple[Array, Array, Array, Array]
-"""As the fields of `Shown`."""
+_Images = tuple[Array, ...]
+"""As the fields of `Shown`, without the last two where there is no decoder."""
 
 
 class Sights:
     """Programs that draw images in one world; compiled in the background, since that takes seconds."""
 
-    def __init__(self, config: Config, scene: Scene, pool: Executor) -> None:
+    def __init__(self, config: Config, scene: Scene, pool: Executor, *, decodes: bool = True) -> None:
         """Compiles in `pool`; `shown` and `rgb` wait for it.
 
         Args:
             config: of the policy that flies.
             scene: one world.
             pool: with two threads, both programs are compiled at once.
+            decodes: whether the policy has a decoder, which a function has not.
         """
-        self.config, self.scene = config, scene
-        self.has_image = sensor.sensor_of(config).image is not None and embedding.has_code(config)
-        """Whether the sensor shows an image that is encoded; without one there is only `rgb`."""
+        self.config, self.scene, self._decodes = config, scene, decodes
+        drawable = sensor.sensor_of(config).image is not None
+        self.has_image = drawable and (embedding.has_code(config) or not decodes)
+        """Whether the sensor shows an image, of a policy one that is encoded; without one there is only `rgb`."""
         self._shown = pool.submit(self._compile_shown) if self.has_image else None
         self._rgb = pool.submit(self._compile_rgb)
 
@@ -73,11 +77,11 @@ class Sights:
         other.scene = scene
         return other
 
-    def shown(self, params: PolicyParams, flown: Mapping[str, np.ndarray]) -> Shown:
+    def shown(self, params: PolicyParams | None, flown: Mapping[str, np.ndarray]) -> Shown:
         """Returns what the sensor shows at each decision of a flight, and what the VAE makes of it.
 
         Args:
-            params: whose VAE.
+            params: whose VAE; None without a decoder.
             flown: the columns of `trajectory.csv`, as `decision_rows`.
         """
         assert self._shown is not None, "this sensor shows no image"
@@ -94,18 +98,18 @@ class Sights:
     def _compile_shown(self) -> Compiled:
         config, decisions = self.config, self.config.env.max_decisions
         looks = len(sensor.frame_steps(config))
-        params = jax.eval_shape(lambda: fresh_policy(config))
+        params = jax.eval_shape(lambda: fresh_policy(config)) if self._decodes else None
         motion = jax.ShapeDtypeStruct((decisions, MOTION_SIZE), np.float32)
         return _compiled(self._all_shown, self.scene, params, *_blank_poses(decisions, looks), motion)
 
     def _all_shown(
-        self, scene: Scene, params: PolicyParams, position: Array, quaternion: Array, time: Array, motion: Array
+        self, scene: Scene, params: PolicyParams | None, position: Array, quaternion: Array, time: Array, motion: Array
     ) -> _Images:
         """The images of `shown` at [D, T, ...] poses and times with own motions [D, MOTION_SIZE].
 
         The sensor carries its memory from each decision to the next.
         """
-        config, shows = self.config, sensor.sensor_of(self.config)
+        config, actor, shows = self.config, AgentActor(self.config), sensor.sensor_of(self.config)
         start, rest = jax.random.split(jax.random.key(0))
 
         def one(memory: Any, given: tuple[Array, ...]) -> tuple[Any, _Images]:
@@ -113,17 +117,21 @@ class Sights:
             here = Flight(position, quaternion, jnp.zeros_like(position), time)
             now = scene_at(scene, time[-1])
             sensed, memory = sensor.sense(config, scene, here, memory, key)
-            read = shows.encoder_input(config, sensed)
-            assert read is not None
+            image, luma = shows.picture(config, sensed), sensor.view(config, now, position[-1], quaternion[-1])
+            if params is None:
+                return memory, (image, luma)
             nearness = None
             if embedding.needs_nearness(config):
                 nearness = sensor.nearness_image(config, now, position[-1], quaternion[-1])
-            code = vae.embed(config.encoder, params.encoder, read, motion)
+            # What it knows of the goal is no part of a code.
+            observation = env.Observation(sensed=sensed, own=jnp.zeros(env.OWN_SIZE), motion=motion)
+            code = actor.code(actor.encode(params, actor.init(), observation))
+            read = shows.encoder_input(config, sensed)
+            assert read is not None
             target = vae.target(config.encoder, read, nearness)
             made = vae.decode(config.encoder, config.camera, params.encoder, code)
             drawn = (_drawn(config, channels) for channels in (target, made))
-            luma = sensor.view(config, now, position[-1], quaternion[-1])
-            return memory, (shows.picture(config, sensed), *drawn, luma)  # type: ignore[return-value]
+            return memory, (image, luma, *drawn)
 
         keys = jax.random.split(rest, len(position))
         before = sensor.at_rest(config, start)

@@ -15,7 +15,8 @@ from edqn_jax.devices.jax_settings import as_tested
 from edqn_jax.errors import ConfigError
 from edqn_jax.files import check_can_make, write_atomically
 from edqn_jax.learn.policy import Policy, PolicyParams, fresh_policy
-from edqn_jax.policies import no_run, policy_folder
+from edqn_jax.policies import function_named, no_run, policy_folder
+from edqn_jax.policies.functions import FunctionPolicy, as_policy, check_has_params, load_function
 from edqn_jax.runs import world_copy
 from edqn_jax.runs.checkpoints.params import load_params, save_params, saved_at
 from edqn_jax.runs.checkpoints.sealed import digest
@@ -33,13 +34,29 @@ def load_policy(run: str | Path) -> Policy:
     return Policy(*load_run(Path(run)))
 
 
+def find_policy(name: str | Path, world: str | Path | None = None) -> Policy | FunctionPolicy:
+    """Returns what a command is given to fly: what `load_policy` returns, or a function.
+
+    Args:
+        name: as `load_policy`, or `module:name` or `path/to/file.py:name` of a function.
+        world: where it will fly, whose default configuration a function has that brings none.
+
+    Raises:
+        ConfigError: as `load_policy`, or if the function does not load.
+    """
+    if function_named(name) is None:
+        return load_policy(name)
+    return as_policy(load_function(str(name)), world)
+
+
 @as_tested
 def save_policy(policy: Policy, folder: str | Path) -> None:
     """Writes a policy into `folder`, for `load_policy` and `edqn evaluate`; the folder must be new or empty.
 
     Raises:
-        ConfigError: if the folder holds files already, or cannot be written.
+        ConfigError: if the folder holds files already, or cannot be written, or the policy is a function.
     """
+    check_has_params(policy, "save_policy")
     folder = Path(folder)
     check_can_make(folder)
     if folder.is_dir() and any(folder.iterdir()):
@@ -97,11 +114,13 @@ def _loaded(folder: Path, file: Path) -> tuple[Config, PolicyParams]:
 
 
 def worlds_replaced(run: Path) -> list[str]:
-    """Returns a sentence for each world that a run's own copy is flown in place of.
+    """Returns a sentence for each world that a run's own copy is flown in place of; none of a function.
 
     Raises:
         ConfigError: if the run's configuration or its copies are damaged.
     """
+    if function_named(run) is not None:
+        return []
     folder = policy_folder(run)
     config = apply(Config(), load_layer(folder / "config.yaml"), str(folder / "config.yaml"))
     return world_copy.flown_in(folder, config)[1]

@@ -76,19 +76,26 @@ def digest_of(arrays: Iterable[np.ndarray]) -> str:
 
 
 def reward_record(config: Config, reward: Reward | None) -> dict[str, str | None]:
-    """Returns a reward's name, and for a reward function the SHA-256 of its source and of the values bound to it.
+    """Returns a reward's name, and for a reward function also what `source_record` does.
 
-    Bound are the arguments of a `functools.partial`, defaults, variables of an enclosing function, and the attributes
-    of an object that is called or whose method is. The digest is None for the configured rewards, and where Python
-    cannot find the source.
+    The digest is None for the configured rewards.
     """
     if reward is None:
         return {"name": config.env.reward, "source_sha256": None}
-    name, digest = type(reward).__qualname__, None
+    return source_record(reward)
+
+
+def source_record(function: Any) -> dict[str, str | None]:
+    """Returns a function's name, and the SHA-256 of its source and of the values bound to it.
+
+    Bound are the arguments of a `functools.partial`, defaults, variables of an enclosing function, and the attributes
+    of an object that is called or whose method is. The digest is None where Python cannot find the source.
+    """
+    name, digest = type(function).__qualname__, None
     # Attributes and `repr` of foreign objects may raise anything; a run must not end without its summary for that.
     with contextlib.suppress(Exception):
-        name = _name(reward)
-        digest = hashlib.sha256("".join(_parts(reward)).encode()).hexdigest()
+        name = _name(function)
+        digest = hashlib.sha256("".join(_parts(function)).encode()).hexdigest()
     return {"name": name, "source_sha256": digest}
 
 

@@ -15,7 +15,7 @@ from edqn_jax.config import CameraConfig, Config, EnvConfig
 from edqn_jax.errors import ConfigError
 from edqn_jax.evaluation import rollouts as our_flights
 from edqn_jax.evaluation.metrics import summarise
-from edqn_jax.learn.policy import PolicyParams
+from edqn_jax.policies.functions import FunctionActor
 from edqn_jax.sim.actions import ACTIONS
 from edqn_jax.sim.scene.scene import stack_scenes
 from edqn_jax.sim.task.outcomes import Outcome
@@ -45,15 +45,14 @@ def by_own_state(events, own, motion):
     return towards_the_goal(np, own)
 
 
-def test_outcome_path_clearance_and_time_are_ours(monkeypatch):
-    def act(config, params, memory, observation, key):
-        return towards_the_goal(jnp, observation.own).astype(jnp.int32), memory
+def test_outcome_path_clearance_and_time_are_ours():
+    def act(observation, memory, key):
+        return towards_the_goal(jnp, observation.own), memory
 
-    monkeypatch.setattr(our_flights.policy, "act", act)
     # This policy does not look, so its pictures need not be compiled.
     blind = dataclasses.replace(CONFIG, env=dataclasses.replace(CONFIG.env, sensor="blind"))
     world = world_of(CONFIG, STARTS, GOALS)
-    ours = our_flights.fly_missions(blind, world, PolicyParams(encoder=None, q=None), jax.random.key(0))
+    ours = our_flights.fly_missions(blind, world, None, jax.random.key(0), actor=FunctionActor(act))
     got = fly_missions(CONFIG, course_of(STARTS, GOALS), by_own_state)
     assert {Outcome.GOAL, Outcome.COLLISION, Outcome.TIME_OUT, Outcome.LEFT_VOLUME} == set(map(Outcome, got.outcome))
     for name in ("outcome", "decisions", "physics_steps"):

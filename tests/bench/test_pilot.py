@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from edqn_jax.errors import ConfigError
+from edqn_jax.learn.policy import Policy
 from edqn_jax.sim.physics import drone
 from edqn_jax.sim.scene.mjcf import load_world
 from edqn_jax.sim.scene.scene import stack_scenes
@@ -110,7 +111,7 @@ def test_decoded_depth_is_what_the_policy_says_it_is() -> None:
     memory = jax.random.normal(jax.random.key(1), (CONFIG.agent.history, 100))
     code = memory[-1, : CONFIG.encoder.code_size] / CONFIG.agent.code_scale
     drawn = pilot.decoded_depth(CONFIG, params(), memory)
-    np.testing.assert_allclose(drawn, pilot.policy.Policy(CONFIG, params()).depth(code), rtol=1e-5)
+    np.testing.assert_allclose(drawn, Policy(CONFIG, params()).depth(code), rtol=1e-5)
     assert drawn.shape == (CONFIG.camera.height, CONFIG.camera.width)
 
 

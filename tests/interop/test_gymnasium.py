@@ -16,7 +16,8 @@ from edqn_jax.config import Config
 from edqn_jax.config.loading import make_config
 from edqn_jax.errors import ConfigError
 from edqn_jax.extras import require
-from edqn_jax.learn.policy import Policy, fresh_policy, see
+from edqn_jax.learn.actor import AgentActor
+from edqn_jax.learn.policy import Policy, fresh_policy
 from edqn_jax.sim.actions import move_number
 from edqn_jax.sim.task import env
 from edqn_jax.sim.task.outcomes import Outcome
@@ -176,7 +177,7 @@ def test_a_code_is_that_of_the_policy():
     empty = jnp.zeros((1, flown.config.encoder.code_size + env.OWN_SIZE))
     memory = empty
     for move in MOVES[:4, 0]:
-        memory = see(flown.config, flown.params.encoder, memory, seen)
+        memory = AgentActor(flown.config).encode(flown.params, memory, seen)
         expected = jnp.concatenate([memory[-1], seen.motion])
         np.testing.assert_allclose(observed, np.clip(expected, -10, 10), rtol=1e-5, atol=1e-6)
         observed, *_ = made.step(move)

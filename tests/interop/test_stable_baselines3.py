@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import warnings
 from typing import Any
 
@@ -10,8 +11,10 @@ import numpy as np
 import pytest
 
 import edqn_jax
+from edqn_jax.config import DroneConfig
 from edqn_jax.errors import ConfigError
 from edqn_jax.extras import require
+from edqn_jax.interop.sb3_policy import sb3_policy
 from edqn_jax.sim.task.outcomes import Outcome
 from tests.interop.test_gymnasium import DOWN, HOVER, MOVES, many, policy, small
 
@@ -177,3 +180,21 @@ def test_what_one_drone_cannot_do_is_refused():
     vector.set_options({"goal": 1})
     with pytest.raises(ConfigError, match="may have 'mission' alone, not 'goal'"):
         vector.reset()
+
+
+def test_a_trained_model_is_evaluated_as_a_policy():
+    config = dataclasses.replace(short(8), drone=DroneConfig(physics="rigid_body"))
+    vector = drones(2, config=config, observation="kinematics")
+    model = library.PPO("MlpPolicy", vector, n_steps=8, batch_size=8, seed=0, device="cpu")
+    model.learn(16)
+    policy = sb3_policy(model, config, observation="kinematics")
+    evaluation = edqn_jax.evaluate(policy, "medium", missions=2, record=True)
+    environment, record = edqn_jax.make("medium", config, worlds=2, split="test"), evaluation.flights.record
+    assert record is not None
+    for mission, moves in enumerate(np.asarray(record.action)):
+        state, seen = environment.reset(0, mission)
+        for move in moves[moves >= 0]:
+            vector = np.clip(np.concatenate([seen.own, seen.motion]), -10, 10)
+            assert move == model.predict(vector, deterministic=True)[0]
+            state, step = environment.step(state, int(move))
+            seen = step.observation

@@ -18,8 +18,9 @@ from edqn_jax.config import NETWORKS, Config
 from edqn_jax.config.loading import make_config
 from edqn_jax.errors import ConfigError
 from edqn_jax.learn import qnetwork
+from edqn_jax.learn.actor import observation_size
 from edqn_jax.learn.dqn.learner import DQN
-from edqn_jax.learn.policy import Policy, fresh_policy, observation_size
+from edqn_jax.learn.policy import Policy, fresh_policy
 from tests.registries import keep_as_they_are
 
 

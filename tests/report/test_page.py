@@ -115,6 +115,10 @@ def test_curves_are_running_means_at_the_last_of_their_episodes() -> None:
     assert found["validation"] == {"x": [9], "y": [0.5]}
 
 
+def test_a_function_was_trained_nowhere() -> None:
+    assert document.figures(a_run())["trained in"] == "–"
+
+
 def test_a_run_without_episodes_has_no_curves() -> None:
     assert curves(a_run()) == {}
 

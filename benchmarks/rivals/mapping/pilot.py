@@ -28,9 +28,8 @@ from jax import Array
 from edqn_jax.config import Config
 from edqn_jax.devices.devices import compiler_options
 from edqn_jax.errors import ConfigError
-from edqn_jax.learn import policy
+from edqn_jax.learn.actor import AgentActor, Memory, PolicyParams
 from edqn_jax.learn.perception import embedding, vae
-from edqn_jax.learn.policy import Memory, PolicyParams
 from edqn_jax.sim.camera import camera
 from edqn_jax.sim.physics import disturbances, drone
 from edqn_jax.sim.physics.drone import DroneState, Flight
@@ -160,8 +159,7 @@ def check_can_fly(config: Config, pilot: PilotConfig) -> None:
 
 def decoded_depth(config: Config, params: PolicyParams, memory: Memory) -> Array:
     """Returns the distances [H, W], metres, that the decoder draws of the newest code in a memory [H, D]."""
-    code = memory[-1, : embedding.size(config)] / config.agent.code_scale
-    drawn = vae.decode(config.encoder, config.camera, params.encoder, code)[-1]
+    drawn = vae.decode(config.encoder, config.camera, params.encoder, AgentActor(config).code(memory))[-1]
     return distance_of(drawn / DEPTH_SCALE)
 
 
@@ -197,7 +195,7 @@ def look(
         depth = camera.depth(config.camera, now, body.position, rotation)
     else:
         observation, sensed = env.observe(config, scene, goal, body, move, poses, sensed, noise)
-        memory = policy.see(config, params.encoder, memory, observation)
+        memory = AgentActor(config).encode(params, memory, observation)
         depth = decoded_depth(config, params, memory)
         counts &= jnp.sum(body.velocity**2) >= pilot.seeing_m_s**2
     grid = update(pilot.map, config.camera, flying.grid, depth, body.position, rotation, counts)
@@ -261,7 +259,7 @@ def at_rest(
     body = drone.hover(start, jnp.arctan2(goal[1] - start[1], goal[0] - start[0]))
     return Piloted(
         drone=body,
-        memory=policy.empty_memory(config),
+        memory=AgentActor(config).init(),
         sensed=sensor.at_rest(config, rest),
         grid=empty_grid(shape, scene.volume),
         depth=jnp.full((config.camera.height, config.camera.width), jnp.inf),

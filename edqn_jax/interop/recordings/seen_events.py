@@ -16,9 +16,12 @@ from edqn_jax.errors import ConfigError
 from edqn_jax.interop import runner
 from edqn_jax.interop.onnx_export import about_policy, field_of
 from edqn_jax.interop.recordings.recording import Recording
+from edqn_jax.learn.actor import AgentActor, PolicyParams
 from edqn_jax.learn.perception import embedding, vae
 from edqn_jax.learn.policy import Policy
+from edqn_jax.policies.functions import check_has_params
 from edqn_jax.sim.sensors import events
+from edqn_jax.sim.task.env import OWN_SIZE, Observation
 
 
 @dataclasses.dataclass(frozen=True)
@@ -87,6 +90,7 @@ def seen_by(
     Raises:
         ConfigError: if the policy does not encode events, or the camera cannot stand for the policy's.
     """
+    check_has_params(policy, "seen_by")
     config = policy.config
     if config.env.sensor != "events":
         raise ConfigError(f"only policies with the sensor 'events' encode events, not '{config.env.sensor}'")
@@ -110,7 +114,7 @@ def seen_by(
         ]
     )
     motion = np.stack([_motion(about, recording, int(end), velocity, yaw_rate) for end in ends])
-    image, decoded = _encoded(config, policy.params.encoder, jnp.asarray(counts), jnp.asarray(motion))
+    image, decoded = _encoded(config, policy.params, jnp.asarray(counts), jnp.asarray(motion))
     return Seen(ends, np.asarray(image), np.asarray(decoded), embedding.needs_nearness(config))
 
 
@@ -130,13 +134,16 @@ def _motion(
     return runner.own_motion(about, yaw, flight["velocity"][now].astype(np.float32), rate, flight["move"][now])
 
 
-def _encoded(config: Config, params: Any, counts: Array, motion: Array) -> tuple[Array, Array]:
+def _encoded(config: Config, params: PolicyParams, counts: Array, motion: Array) -> tuple[Array, Array]:
     """Returns signed event images and what is drawn of the codes, each [D, H, W]."""
+    actor = AgentActor(config)
 
     def one(given: tuple[Array, Array]) -> tuple[Array, Array]:
         field = field_of(config, given[0])
-        code = vae.embed(config.encoder, params, field, given[1])
-        channels = vae.decode(config.encoder, config.camera, params, code)
+        # What a policy knows of its goal is no part of a code.
+        seen = Observation(sensed=field, own=jnp.zeros(OWN_SIZE), motion=given[1])
+        code = actor.code(actor.encode(params, actor.init(), seen))
+        channels = vae.decode(config.encoder, config.camera, params.encoder, code)
         nearness = embedding.needs_nearness(config)
         drawn = channels[-1] if nearness else jnp.sum(jnp.expm1(channels), axis=-3)
         return events.event_image(field), drawn

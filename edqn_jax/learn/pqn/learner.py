@@ -18,12 +18,12 @@ from jax import Array, lax
 from edqn_jax.config import Config
 from edqn_jax.keys import split_each
 from edqn_jax.learn import qnetwork
+from edqn_jax.learn.actor import observation_size
 from edqn_jax.learn.dqn.losses import td_loss, value_of
 from edqn_jax.learn.exploration import explore
 from edqn_jax.learn.learner import Exploration, Learner, Metrics, Rings, UpdateStats
 from edqn_jax.learn.optimiser import optimiser, polyak, skip_nonfinite
 from edqn_jax.learn.plan import Plan
-from edqn_jax.learn.policy import observation_size
 from edqn_jax.learn.pqn.returns import Rollout, lambda_returns, rollout_of
 from edqn_jax.learn.qnetwork import Params, network_values
 from edqn_jax.native.all_sum import all_sum

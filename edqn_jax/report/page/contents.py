@@ -129,7 +129,7 @@ def add_pictures(
     """
     left = most_bytes
     with ThreadPoolExecutor(2, thread_name_prefix="compiling") as pool:
-        sights = [Sights(run.config, _scene(run, 0), pool) for run in runs]
+        sights = [Sights(run.config, _scene(run, 0), pool, decodes=run.params is not None) for run in runs]
         queues = [_by_interest(run.outcomes) for run in runs]
         if any(each.has_image for each in sights):
             message("drawing what the drone saw")

@@ -9,10 +9,15 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
+from edqn_jax.devices.jax_settings import as_tested
 from edqn_jax.errors import ConfigError
 from edqn_jax.evaluation.metrics import clearance_text, summarise
+from edqn_jax.files import check_can_write, write_atomically
+from edqn_jax.learn.policy import Policy
+from edqn_jax.policies import function_named
+from edqn_jax.policies.functions import Function, FunctionPolicy, as_policy, load_function
 from edqn_jax.report.page.contents import RUN_COLOURS, add_pictures, page_data, script_text
-from edqn_jax.report.page.flown import FlownRun, fly_run, folders_of, names_of
+from edqn_jax.report.page.flown import FlownRun, fly_policy, fly_run, folders_of, names_of
 from edqn_jax.report.style import OUTCOME_LABELS
 
 MOST_BYTES = 15_000_000
@@ -23,28 +28,66 @@ MOST_FLIGHTS = 256
 _LIBRARIES = ("three.min.js", "uPlot.iife.min.js")
 
 
-def report(folders: Sequence[Path], most: int, message: Callable[[str], None] = lambda _: None) -> str:
-    """Returns the page of runs, their evaluation missions flown anew.
+Shown = str | Path | Policy | FunctionPolicy | Function
+"""What a page is made of: a folder, the name of a policy or of a function, or a policy itself."""
+
+
+@as_tested
+def write_report(policies: Sequence[Shown], file: str | Path, *, missions: int = 128) -> None:
+    """Writes the page of runs and policies as one HTML file, which replaces a file of that name.
 
     Args:
-        folders: of the runs; those of several seeds stand for each seed's.
+        policies: folders of runs, `pretrained`, policies, and functions, see `FunctionPolicy`.
+        file: to write.
+        missions: flights of each at most; of all together at most `MOST_FLIGHTS`.
+
+    Raises:
+        ConfigError: if there is nothing to show, a folder holds no run, a policy cannot fly, they are too many for one
+            page, or the file cannot be written.
+    """
+    check_can_write(Path(file))
+    if not policies or missions < 1:
+        raise ConfigError(f"a report needs a policy and at least 1 of its missions, not {len(policies)} and {missions}")
+    write_atomically(Path(file), report(policies, missions).encode())
+
+
+def report(shown: Sequence[Shown], most: int, message: Callable[[str], None] = lambda _: None) -> str:
+    """Returns the page of runs and policies, their evaluation missions flown anew, those of folders first.
+
+    Args:
+        shown: folders of several seeds stand for each seed's.
         most: flights of a run at most.
         message: told of what takes time.
 
     Raises:
         ConfigError: if a folder holds no run, or the runs are too many for one page.
     """
-    single = list(dict.fromkeys(each for folder in folders for each in folders_of(folder)))
-    if len(single) > MOST_FLIGHTS:
-        raise ConfigError(f"{len(single)} runs are too many for one page; give at most {MOST_FLIGHTS}")
-    most = min(most, MOST_FLIGHTS // len(single))
+    named = {str(each): load_function(str(each)) for each in shown if _is_name(each) and function_named(str(each))}
+    paths = [Path(each) for each in shown if _is_name(each) and str(each) not in named]  # pyright: ignore[reportArgumentType]
+    single = list(dict.fromkeys(each for folder in paths for each in folders_of(folder)))
+    policies = [*named.items(), *((_own_name(each), each) for each in shown if not _is_name(each))]
+    count = len(single) + len(policies)
+    if count > MOST_FLIGHTS:
+        raise ConfigError(f"{count} runs are too many for one page; give at most {MOST_FLIGHTS}")
+    most = min(most, MOST_FLIGHTS // count)
     runs = [fly_run(folder, name, most, message) for folder, name in zip(single, names_of(single), strict=True)]
+    runs += [fly_policy(as_policy(policy), name, most, message) for name, policy in policies]
     data = page_data(runs)
     left = MOST_BYTES - len(document(runs, data).encode()) - 100_000
     if left < 0:
         raise ConfigError(f"the page would have more than {MOST_BYTES / 1e6:g} MB; give fewer runs, or --missions")
     add_pictures(data, runs, left - 200 * sum(len(run["flights"]) for run in data["runs"]), message)
     return document(runs, data)
+
+
+def _is_name(shown: Shown) -> bool:
+    return isinstance(shown, str | Path)
+
+
+def _own_name(policy: Any) -> str:
+    """Returns the name of a function, and of what has none that of its type."""
+    function = getattr(policy, "function", policy)
+    return getattr(function, "__name__", type(function).__name__)
 
 
 def document(runs: Sequence[FlownRun], data: dict[str, Any]) -> str:
@@ -99,7 +142,7 @@ def figures(run: FlownRun) -> dict[str, str]:
     # No-break spaces before the percent signs.
     share = f"{100 * flown['success_rate']:.1f}\u00a0%; 95\u00a0% Wilson {100 * low:.0f} to {100 * high:.0f}\u00a0%"
     return {
-        "trained in": Path(run.config.world.name).name,
+        "trained in": "–" if run.params is None else Path(run.config.world.name).name,
         "sensor": run.config.env.sensor,
         "seed": str(run.config.train.seed),
         "flights on this page": f"{flown['missions']} in {Path(run.missions.name).name}"

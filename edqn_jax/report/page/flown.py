@@ -1,4 +1,4 @@
-"""A run as the page shows it: what its folder says, and its evaluation flights, flown anew by the stored policy."""
+"""A run or a policy as the page shows it: what its folder says, and its evaluation flights, flown anew."""
 
 from __future__ import annotations
 
@@ -14,9 +14,11 @@ from edqn_jax.config import Config
 from edqn_jax.errors import ConfigError
 from edqn_jax.evaluation.missions import MissionSet, final_missions
 from edqn_jax.evaluation.rollouts import fly_on_all_devices
-from edqn_jax.learn.policy import PolicyParams
+from edqn_jax.learn.actor import Actor, AgentActor, PolicyParams
+from edqn_jax.learn.policy import Policy
 from edqn_jax.policies import policy_folder
-from edqn_jax.runs.directory import SEED_FOLDER, RunDirectory
+from edqn_jax.policies.functions import FunctionPolicy, actor_of, config_of
+from edqn_jax.runs.directory import SEED_FOLDER, RunDirectory, config_text
 from edqn_jax.runs.policies import load_run, worlds_replaced
 from edqn_jax.sim.task.flights import Flights
 from edqn_jax.sim.task.outcomes import Outcome
@@ -31,7 +33,8 @@ class FlownRun:
     config: Config
     config_text: str
     """`config.yaml` as it stands in the folder."""
-    params: PolicyParams
+    params: PolicyParams | None
+    """None of a function."""
     missions: MissionSet
     flights: Flights
     """On the host, recorded."""
@@ -78,11 +81,8 @@ def fly_run(folder: Path, name: str, most: int, message: Callable[[str], None] =
             raise ValueError("something other than an object in a file of JSON")
     except (AttributeError, LookupError, OSError, RecursionError, TypeError, ValueError) as error:
         raise ConfigError(f"a file of the run in '{folder}' is not as a run writes it: {error}"[:300]) from None
-    missions = final_missions(config, most)
-    count = missions.world.missions.scene.shape[0]
-    message(f"flying {count} mission{'' if count == 1 else 's'} of '{folder}'")
-    flights = fly_on_all_devices(config, missions.world, params, config.train.seed, record=True)
-    notes = worlds_replaced(folder)
+    missions, flights = _flown(config, params, AgentActor(config), most, f"'{folder}'", message)
+    count, notes = len(flights.outcome), worlds_replaced(folder)
     if count < config.train.validation_missions:
         notes.append(f"{count} of the run's {config.train.validation_missions} evaluation flights are on this page.")
     ended = Outcome(int(flights.outcome[0])).name.lower()
@@ -94,11 +94,40 @@ def fly_run(folder: Path, name: str, most: int, message: Callable[[str], None] =
     return FlownRun(name, config, text, params, missions, flights, summary, metrics, episodes, notes)
 
 
+def fly_policy(
+    policy: Policy | FunctionPolicy, name: str, most: int, message: Callable[[str], None] = lambda _: None
+) -> FlownRun:
+    """Flies a policy that no folder holds on the missions that a run of its configuration ends with.
+
+    Args:
+        policy: as `as_policy` returns it.
+        name: what the page calls it.
+        most: missions at most.
+        message: told of what takes time.
+
+    Raises:
+        ConfigError: if it cannot fly there.
+    """
+    config = config_of(policy)
+    missions, flights = _flown(config, policy.params, actor_of(policy, config), most, f"'{name}'", message)
+    return FlownRun(name, config, config_text(config), policy.params, missions, flights, {}, [], {}, [])
+
+
+def _flown(
+    config: Config, params: PolicyParams | None, actor: Actor, most: int, name: str, message: Callable[[str], None]
+) -> tuple[MissionSet, Flights]:
+    missions = final_missions(config, most)
+    count = missions.world.missions.scene.shape[0]
+    message(f"flying {count} mission{'' if count == 1 else 's'} of {name}")
+    seed = config.train.seed
+    return missions, fly_on_all_devices(config, missions.world, params, seed, actor=actor, record=True)
+
+
 def names_of(folders: Sequence[Path]) -> list[str]:
     """Returns a name for each folder: as few of the last parts of its path as tell it from the others."""
     parts = [folder.absolute().parts for folder in folders]
     names: list[str] = []
-    for length in range(1, max(map(len, parts)) + 1):
+    for length in range(1, max(map(len, parts), default=0) + 1):
         names = ["/".join(each[-length - each[-1].startswith(SEED_FOLDER) :]) for each in parts]
         if len(set(names)) == len(set(parts)):
             break

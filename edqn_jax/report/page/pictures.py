@@ -12,10 +12,11 @@ import numpy as np
 from matplotlib.colors import Colormap, Normalize
 from PIL import Image
 
+from edqn_jax.config import Config
 from edqn_jax.learn.perception import embedding
 from edqn_jax.learn.policy import PolicyParams
-from edqn_jax.report.images import NEARNESS, RECONSTRUCTED_EVENTS, look_of, scale_of
-from edqn_jax.report.sights import Sights
+from edqn_jax.report.images import RECONSTRUCTED_EVENTS, Look, look_of, scale_of
+from edqn_jax.report.sights import Shown, Sights
 from edqn_jax.sim.camera.camera import on_screen
 
 LEVELS = 64
@@ -25,7 +26,7 @@ NEARNESS_COLOURS = "inferno"
 """Bright is near, black far away."""
 
 
-def flight_pictures(sights: Sights, params: PolicyParams, flown: Mapping[str, np.ndarray]) -> dict[str, Any]:
+def flight_pictures(sights: Sights, params: PolicyParams | None, flown: Mapping[str, np.ndarray]) -> dict[str, Any]:
     """Returns the pictures of a flight as plain JSON data, one frame for each whole decision.
 
     `width`, `height` of a frame, the number of `frames`, and of each of the `panels` its `name` and `png`, base64:
@@ -33,27 +34,15 @@ def flight_pictures(sights: Sights, params: PolicyParams, flown: Mapping[str, np
 
     Args:
         sights: of the world of the flight; its sensor shows an image.
-        params: of the policy that flew.
+        params: of the policy that flew; None of a function, which draws nothing.
         flown: the columns of `trajectory.csv`.
     """
     config = sights.config
     shown, look = sights.shown(params, flown), look_of(config.env.sensor)
-    nearness = embedding.needs_nearness(config)
-    drawn = NEARNESS if nearness else RECONSTRUCTED_EVENTS if look.signed else look
-    colours = NEARNESS_COLOURS if nearness else drawn.colours
-    # Quiet moments are to be seen, too.
-    scale = Normalize(0.0, max(float(np.quantile(shown.target, 0.999)), 1e-6)) if drawn.signed is False else None
-    scale = scale or scale_of(shown.target, drawn)
     panels = [
         ("brightness", on_screen(shown.luma), Normalize(0.0, 1.0), "gray"),
         (look.name, shown.image, scale_of(shown.image, look, share=0.75), look.colours),
-        (
-            f"predicted {drawn.name}" if nearness else f"{drawn.name}, from the code",
-            shown.reconstruction,
-            scale,
-            colours,
-        ),
-        (f"true {drawn.name}" if nearness else f"{drawn.name}, blurred", shown.target, scale, colours),
+        *_decoded(config, shown, look),
     ]
     count, height, width = shown.image.shape
     return {
@@ -62,6 +51,27 @@ def flight_pictures(sights: Sights, params: PolicyParams, flown: Mapping[str, np
         "frames": count,
         "panels": [{"name": name, "png": strip(images, norm, colour)} for name, images, norm, colour in panels],
     }
+
+
+def _decoded(config: Config, shown: Shown, look: Look) -> list[tuple[str, np.ndarray, Normalize, str | Colormap]]:
+    """Returns name, images, scale and colours of what a decoder draws and of what it should draw, if there is one."""
+    if shown.reconstruction is None or shown.target is None:
+        return []
+    nearness = embedding.needs_nearness(config)
+    drawn = NEARNESS if nearness else RECONSTRUCTED_EVENTS if look.signed else look
+    colours = NEARNESS_COLOURS if nearness else drawn.colours
+    # Quiet moments are to be seen, too.
+    scale = Normalize(0.0, max(float(np.quantile(shown.target, 0.999)), 1e-6)) if drawn.signed is False else None
+    scale = scale or scale_of(shown.target, drawn)
+    return [
+        (
+            f"predicted {drawn.name}" if nearness else f"{drawn.name}, from the code",
+            shown.reconstruction,
+            scale,
+            colours,
+        ),
+        (f"true {drawn.name}" if nearness else f"{drawn.name}, blurred", shown.target, scale, colours),
+    ]
 
 
 def strip(images: np.ndarray, norm: Normalize, colours: str | Colormap) -> str:

@@ -15,7 +15,8 @@ import pytest
 from edqn_jax.config import CameraConfig, Config, EncoderConfig
 from edqn_jax.config.loading import to_yaml
 from edqn_jax.evaluation.latency import decision_latency_ms
-from edqn_jax.learn import policy, trainer
+from edqn_jax.learn import trainer
+from edqn_jax.learn.actor import AgentActor, PolicyParams, observation_size
 from edqn_jax.learn.perception import embedding, pooled_encoder, vae
 from edqn_jax.learn.perception.code import Form
 from edqn_jax.learn.plan import Plan
@@ -122,12 +123,14 @@ def test_the_workload_says_what_is_drawn_and_learnt_from() -> None:
 
 
 def test_the_q_network_sees_a_code_or_the_ranges_or_only_the_own_state() -> None:
-    sizes = [policy.observation_size(with_sensor(name, Config())) for name in SENSORS]
+    sizes = [observation_size(with_sensor(name, Config())) for name in SENSORS]
     assert sizes == [42, 42, 42, 42, 42, 778, 36, 10]
     own, sensed, motion = jnp.arange(10.0), jnp.linspace(0.0, 1.0, 26), jnp.ones(MOTION_SIZE)
-    ranges = policy.flatten(with_sensor("ranges"), {}, Observation(sensed, own, motion))
+    nothing = PolicyParams(encoder={}, q={})
+    actor = AgentActor(with_sensor("ranges"))
+    (ranges,) = actor.encode(nothing, jnp.zeros((1, 36)), Observation(sensed, own, motion))
     np.testing.assert_array_equal(ranges, jnp.concatenate([sensed, own]))
-    blind = policy.flatten(with_sensor("blind"), {}, Observation(None, own, motion))
+    (blind,) = AgentActor(with_sensor("blind")).encode(nothing, jnp.zeros((1, 10)), Observation(None, own, motion))
     np.testing.assert_array_equal(blind, own)
 
 

@@ -1,0 +1,200 @@
+"""Policies of other people: a function of an observation, a memory and a key, that flies wherever ours do."""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib
+import importlib.util
+import sys
+import traceback
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from edqn_jax.config import Config
+from edqn_jax.config.loading import make_config, nearest
+from edqn_jax.errors import ConfigError
+from edqn_jax.learn.actor import Actor, AgentActor
+from edqn_jax.learn.policy import Policy
+from edqn_jax.policies import function_named
+from edqn_jax.sim.actions import move_number
+from edqn_jax.sim.task.env import Observation
+
+Function = Callable[[Observation, Any, Array], tuple[Any, Any]]
+"""(observation of one drone, memory, key consumed) → action, memory for the next observation; traced by JAX."""
+
+TAKES = "a function (observation, memory, key) -> (action, memory)"
+"""What a policy of one's own is, in messages."""
+
+
+@dataclasses.dataclass(frozen=True)
+class FunctionActor(Actor):
+    """Acts by a function; what it decides on is its memory and the observation as it is."""
+
+    function: Function
+    memory: Callable[[], Any] | None = None
+
+    def init(self) -> Any:
+        """Returns the memory of one drone at the beginning of an episode, as arrays; None where there is none."""
+        begins = None if self.memory is None else self.memory()
+        # An explicit type: a memory of Python's numbers would take that of what the function makes of them.
+        return jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.asarray(leaf).dtype), begins)
+
+    def encode(self, params: None, memory: Any, observation: Observation) -> tuple[Any, Observation]:
+        """Returns memory and observation."""
+        return memory, observation
+
+    def decide(self, params: None, seen: tuple[Any, Observation], key: Array) -> tuple[Array, Any]:
+        """Returns the action, a move as its number [] int32, and the memory.
+
+        Raises:
+            ConfigError: if the function does not return an action and a memory like the one that it was given.
+        """
+        memory, observation = seen
+        result = self.function(observation, memory, key)
+        if not (isinstance(result, tuple) and len(result) == 2):
+            raise ConfigError(f"a policy is {TAKES}; this one returned {type(result).__name__}")
+        action, after = result
+        before, now = _form(memory), _form(after)
+        if before != now:
+            raise ConfigError(
+                f"a policy's function must return a memory like the one that it is given, {before}, not {now}; "
+                "`memory` of FunctionPolicy returns the first one"
+            )
+        if isinstance(action, str) or not jnp.issubdtype(jnp.asarray(action).dtype, jnp.floating):
+            action = move_number(action)
+        return jnp.asarray(action), after
+
+
+def _form(memory: Any) -> str:
+    """Returns what a memory is made of, in words: types and shapes of its arrays, and how they are held together."""
+    leaves, tree = jax.tree.flatten(memory)
+    arrays = [jnp.asarray(leaf) for leaf in leaves]
+    text = str(tree).removeprefix("PyTreeDef(").removesuffix(")")
+    for each in arrays:
+        text = text.replace("*", f"{each.dtype}{list(each.shape)}", 1)
+    return text
+
+
+@dataclasses.dataclass(frozen=True)
+class FunctionPolicy:
+    """A policy that is a function, for `evaluate`, `record` and `write_report`.
+
+    The function sees one drone and is traced by JAX, so it is written with `jnp.where` instead of `if`; what else it
+    uses must not change after the first flight.
+    """
+
+    function: Function
+    """(observation, memory, key) → action, memory. The action is a move: its number, vector or name."""
+    config: Config | None = None
+    """Drone, camera, sensor and task; None is the default for the world that is flown."""
+    memory: Callable[[], Any] | None = None
+    """Returns the memory at the beginning of an episode, any arrays; without it the memory is None."""
+
+    def __post_init__(self) -> None:
+        """Checks what can be checked before it flies.
+
+        Raises:
+            ConfigError: if the function or `memory` cannot be called, or the function has no hash.
+        """
+        if not callable(self.function) or isinstance(self.function, type):
+            raise ConfigError(f"a policy is {TAKES}, not {self.function!r}")
+        try:
+            hash(self.function)
+        except TypeError:
+            raise ConfigError(
+                f"a policy's function must be hashable, as functions and frozen dataclasses are, not {self.function!r}"
+            ) from None
+        if self.memory is not None and not callable(self.memory):
+            raise ConfigError(f"memory must be a function that returns the first memory, not {self.memory!r}")
+
+    @property
+    def params(self) -> None:
+        """Returns None: what a function knows is in it."""
+        return None
+
+    @property
+    def actor(self) -> FunctionActor:
+        """Returns what flies."""
+        return FunctionActor(self.function, self.memory)
+
+
+def as_policy(policy: Policy | FunctionPolicy | Function, world: str | Path | None = None) -> Policy | FunctionPolicy:
+    """Returns a policy as it is, and a function as one; the configuration that is not given is that of the world.
+
+    Raises:
+        ConfigError: if it is neither.
+    """
+    if isinstance(policy, Policy):
+        return policy
+    own = policy if isinstance(policy, FunctionPolicy) else FunctionPolicy(policy)
+    if own.config is not None:
+        return own
+    return dataclasses.replace(own, config=make_config(None if world is None else str(world)))
+
+
+def config_of(policy: Policy | FunctionPolicy) -> Config:
+    """Returns the configuration of what `as_policy` returned."""
+    assert policy.config is not None
+    return policy.config
+
+
+def actor_of(policy: Policy | FunctionPolicy, config: Config) -> Actor:
+    """Returns what flies a policy under a configuration, which may have other conditions than the policy's own."""
+    return policy.actor if isinstance(policy, FunctionPolicy) else AgentActor(config)
+
+
+def check_has_params(policy: Policy | FunctionPolicy, what: str) -> None:
+    """Raises unless a policy was trained here.
+
+    Raises:
+        ConfigError: says what needs it.
+    """
+    if not isinstance(policy, Policy):
+        raise ConfigError(f"{what} needs a policy of `train` or `load_policy`, with parameters, not a function")
+
+
+def load_function(name: str) -> Policy | FunctionPolicy | Function:
+    """Returns what `module:name` or `path/to/file.py:name` names.
+
+    Modules are searched for in the current folder, too, and what a file imports in the file's folder.
+
+    Raises:
+        ConfigError: if it does not load, or is not what can fly.
+    """
+    found = function_named(name)
+    assert found is not None
+    where, attribute = found
+    is_file = where.endswith(".py")
+    folder = str(Path(where).parent.resolve() if is_file else Path.cwd())
+    if folder not in sys.path:
+        sys.path.insert(0, folder)
+    try:
+        module = _module_of_file(Path(where)) if is_file else importlib.import_module(where)
+    except (Exception, SystemExit) as error:
+        line = next((each.lineno for each in reversed(traceback.extract_tb(error.__traceback__)) if is_file), None)
+        at = "" if line is None else f", line {line}"
+        raise ConfigError(f"'{where}' does not load: {type(error).__name__}: {error}{at}"[:300]) from error
+    if not hasattr(module, attribute):
+        names = [each for each in vars(module) if not each.startswith("_")]
+        raise ConfigError(f"'{where}' has no '{attribute}'{nearest(attribute, names)}")
+    policy = getattr(module, attribute)
+    if not isinstance(policy, Policy | FunctionPolicy) and (not callable(policy) or isinstance(policy, type)):
+        raise ConfigError(f"'{name}' is of the type {type(policy).__name__}; a policy is {TAKES}, or a FunctionPolicy")
+    return getattr(module, attribute)
+
+
+def _module_of_file(file: Path) -> Any:
+    if not file.is_file():
+        raise ConfigError(f"there is no file '{file}'")
+    name = f"edqn_policy_{file.stem}"
+    spec = importlib.util.spec_from_file_location(name, file)
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[name] = module  # dataclasses look their module up
+    spec.loader.exec_module(module)
+    return module
