@@ -167,8 +167,11 @@ class EnvConfig:
     brightness frame; `frame-pair`: the frames that the events would be made of; `event-image`: an image of the events
     without a VAE; `blind`: nothing; `depth`: true depth; `depth-motion`: that and how it changes by the obstacles' own
     motion; `ranges`: the true free distance along each move."""
+    actions: str = "moves"
+    """What an action commands. `moves`: {-1, 0, 1}^3 times `speed_m_s`, in the heading frame; `velocity`: [-1, 1]^3
+    times it; `body-rates`: thrust and rates about the body's axes. `edqn train` learns moves alone."""
     speed_m_s: float = 4.0
-    """Commanded speed per axis; an action is {-1, 0, 1}^3 times this, in the heading frame."""
+    """Commanded speed per axis of a move, in the heading frame."""
     goal_radius_m: float = 2.0
     """Body centre within this distance of the goal, at any physics step, is success."""
     max_decisions: int = 200
@@ -194,6 +197,8 @@ class EnvConfig:
     """Reward per metre gained towards the goal (`progress`, `geodesic`, `potential`)."""
     path_weight: float = 1.5
     """Reward lost per metre flown (`progress`, `geodesic`), so that detours cost something."""
+    potential_discount: float = 0.97
+    """gamma of the potential (`potential`), the same as `agent.discount`: with another, another policy is the best."""
     goal_reward: float = 100.0
     """Reward at the goal (Eq. 8)."""
     collision_reward: float = -100.0

@@ -77,3 +77,14 @@ LEARNERS = Registry(
     {"dqn": "edqn_jax.learn.dqn.learner:DQN", "pqn": "edqn_jax.learn.pqn.learner:PQN"},
 )
 """How the network that chooses moves learns: `edqn_jax.learn.learner.Learner`."""
+
+ACTION_SETS = Registry(
+    "set of actions",
+    "env.actions",
+    {
+        "moves": "edqn_jax.sim.task.action_sets:MOVES",
+        "velocity": "edqn_jax.sim.task.action_sets:VELOCITY",
+        "body-rates": "edqn_jax.sim.task.action_sets:BODY_RATES",
+    },
+)
+"""What actions are and what they command: `edqn_jax.sim.task.action_sets.ActionSet`."""

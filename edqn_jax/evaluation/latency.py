@@ -16,7 +16,7 @@ from edqn_jax.learn.policy import PolicyParams
 from edqn_jax.sim.physics.drone import Flight
 from edqn_jax.sim.scene.scene import Scene
 from edqn_jax.sim.sensors.sensor import SensorMemory, at_rest, frame_steps, sense, sensor_of
-from edqn_jax.sim.task import env
+from edqn_jax.sim.task.observation import MOTION_SIZE, OWN_SIZE, Observation
 
 
 def decision_latency_ms(config: Config, params: PolicyParams, calls: int = 300) -> dict[str, float]:
@@ -32,9 +32,7 @@ def decision_seconds(config: Config, params: PolicyParams, calls: int) -> np.nda
 
 def decision_call(config: Config, params: PolicyParams) -> Callable[[], int]:
     """Returns what makes one decision, from arrays on the host to an action there."""
-    seen = env.Observation(
-        sensed=sensor_of(config).example(config), own=jnp.zeros(env.OWN_SIZE), motion=jnp.zeros(env.MOTION_SIZE)
-    )
+    seen = Observation(sensed=sensor_of(config).example(config), own=jnp.zeros(OWN_SIZE), motion=jnp.zeros(MOTION_SIZE))
     seen, memory = jax.tree.map(np.asarray, (seen, policy.empty_memory(config)))  # on the host
     act = jax.jit(lambda params, memory, seen, key: policy.act(config, params, memory, seen, key)[0])
     params, key = jax.device_put(params), jax.random.key(0)
@@ -62,7 +60,7 @@ def look_call(config: Config, params: PolicyParams, scene: Scene) -> Callable[[]
         params: PolicyParams, scene: Scene, poses: Flight, before: SensorMemory, memory: Array, key: Array
     ) -> Array:
         sensed, _ = sense(config, scene, poses, before, key)
-        seen = env.Observation(sensed=sensed, own=jnp.zeros(env.OWN_SIZE), motion=jnp.zeros(env.MOTION_SIZE))
+        seen = Observation(sensed=sensed, own=jnp.zeros(OWN_SIZE), motion=jnp.zeros(MOTION_SIZE))
         return policy.act(config, params, memory, seen, key)[0]
 
     params, scene, key = jax.device_put(params), jax.device_put(scene), jax.random.key(0)

@@ -32,8 +32,9 @@ from edqn_jax.sim.sensors import events
 from edqn_jax.sim.sensors.events import EventField
 from edqn_jax.sim.sensors.sensor import Form, sensor_of
 from edqn_jax.sim.task import env
-from edqn_jax.sim.task.env import MOTION_SIZE, OWN_SIZE, EnvState, World
+from edqn_jax.sim.task.env import EnvState, World
 from edqn_jax.sim.task.environment import make as make_environment
+from edqn_jax.sim.task.observation import MOTION_SIZE, OWN_SIZE, Observation
 from edqn_jax.sim.task.outcomes import Outcome, is_terminal
 from edqn_jax.sim.task.reward import Reward
 
@@ -175,7 +176,7 @@ class FunctionalEnv:
         info["final_observation"] = observed
         return choose(first, observed), choose(fresh, after), reward, terminated, truncated, info
 
-    def _observed(self, params: Params, seen: env.Observation, before: Array) -> tuple[Observed, Array]:
+    def _observed(self, params: Params, seen: Observation, before: Array) -> tuple[Observed, Array]:
         """Returns the observation, and the code to remember."""
         own, motion = _numbers(seen.own), _numbers(seen.motion)
         if self.observation == "kinematics":

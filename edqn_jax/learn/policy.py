@@ -18,10 +18,10 @@ from edqn_jax.learn.perception import embedding, vae
 from edqn_jax.learn.qnetwork import Params
 from edqn_jax.sim.sensors.events import EventField
 from edqn_jax.sim.sensors.sensor import DEPTH_SCALE, Sensed, distance_of, sensor_of
-from edqn_jax.sim.task.env import OWN_SIZE, Observation
+from edqn_jax.sim.task.observation import OWN_SIZE, Observation
 
 MOVE_SIZE = 3
-"""Values of the last move, which end the own motion (`sim.env.own_motion`)."""
+"""Values of the last move, which end the own motion (`sim.task.observation.own_motion`)."""
 
 Memory = Array
 """[H, D] the newest observations as the network sees them, newest last; zeros before an episode began."""

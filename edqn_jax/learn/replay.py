@@ -21,7 +21,7 @@ from jax import Array
 from edqn_jax.checks import check_index
 from edqn_jax.config import AgentConfig
 from edqn_jax.keys import integers
-from edqn_jax.sim.task.env import OWN_SIZE, turned
+from edqn_jax.sim.task.observation import OWN_SIZE, turned
 from edqn_jax.sim.task.outcomes import Outcome
 
 

@@ -24,7 +24,7 @@ from edqn_jax.keys import integers
 from edqn_jax.learn.perception import vae
 from edqn_jax.learn.perception.vae import Target
 from edqn_jax.sim.sensors.events import EventField
-from edqn_jax.sim.task.env import MIRRORED_MOTION, Observation
+from edqn_jax.sim.task.observation import MIRRORED_MOTION, Observation
 
 MOST_EVENTS = 2**15 - 1
 """More events of a pixel than this are stored as this many."""

@@ -21,6 +21,7 @@ from flax import struct
 from jax import Array, lax
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
+from edqn_jax.checks import is_finite
 from edqn_jax.config import Config
 from edqn_jax.devices import processes
 from edqn_jax.devices.devices import compiler_options
@@ -218,7 +219,7 @@ def train_step(
     ring = _store(actors, action, time)
     flown, seen = _fly(config, world, actors, action)
     rings = _keep(config, world, actors, flown, seen, step)
-    spoilt = ~env.is_finite((networks.vae, networks.encoder, learner_of(config).network(networks.agent)))
+    spoilt = ~is_finite((networks.vae, networks.encoder, learner_of(config).network(networks.agent)))
     of_vae, networks = update_vae(config, axis, networks, rings, keys.vae, step)
     last = of_vae.metrics["reconstruction_loss"]
     of_agent, agent = learner_of(config).update(config, axis, networks.agent, Rings(ring, time, keys.dqn), last)

@@ -14,6 +14,7 @@ import optax
 from flax import struct
 from jax import Array, lax
 
+from edqn_jax.checks import is_finite
 from edqn_jax.config import Config
 from edqn_jax.keys import split_each
 from edqn_jax.learn import samples
@@ -24,7 +25,6 @@ from edqn_jax.learn.plan import Plan
 from edqn_jax.learn.qnetwork import Params
 from edqn_jax.learn.samples import Samples
 from edqn_jax.native.all_sum import all_sum
-from edqn_jax.sim.task.env import is_finite
 
 VAE_METRICS = ("reconstruction_loss", "kl")
 

@@ -26,8 +26,7 @@ from edqn_jax.sim.physics.drone import Flight
 from edqn_jax.sim.scene.scene import Scene, scene_at
 from edqn_jax.sim.sensors import events, sensor
 from edqn_jax.sim.sensors.events import EventField
-from edqn_jax.sim.task import env
-from edqn_jax.sim.task.env import MOTION_SIZE
+from edqn_jax.sim.task.observation import MOTION_SIZE, heading_velocity
 
 FINE = 8
 """How much finer than the drone's camera the RGB pictures for people are, per axis."""
@@ -170,7 +169,7 @@ def coarse(picture: np.ndarray) -> np.ndarray:
 
 
 def own_motions(config: Config, flown: Mapping[str, np.ndarray], rows: np.ndarray) -> np.ndarray:
-    """Returns the own motions [D, MOTION_SIZE] at the last of each decision's rows [D, T], as `env.own_motion`.
+    """Returns the own motions [D, MOTION_SIZE] at the last of each decision's rows [D, T], as `own_motion`.
 
     The yaw rate is that of the heading between the last two rows, which a trajectory holds.
     """
@@ -179,7 +178,7 @@ def own_motions(config: Config, flown: Mapping[str, np.ndarray], rows: np.ndarra
     yaw = drone.yaw_of(jnp.asarray(now))
     rate = drone.wrap_angle(yaw - drone.yaw_of(jnp.asarray(before))) / config.drone.physics_dt_s
     velocity = np.stack([flown[name] for name in ("vx", "vy", "vz")], axis=-1)[last]
-    ahead = env.heading_velocity(config.env, yaw, jnp.asarray(velocity))
+    ahead = heading_velocity(config.env, yaw, jnp.asarray(velocity))
     moves = ACTIONS[flown["action"][last].astype(int)]
     return np.concatenate([ahead, np.asarray(rate)[:, None], moves], axis=-1).astype(np.float32)
 

@@ -18,7 +18,7 @@ from edqn_jax.errors import ConfigError
 from edqn_jax.extras import require
 from edqn_jax.learn.policy import Policy, fresh_policy, see
 from edqn_jax.sim.actions import move_number
-from edqn_jax.sim.task import env
+from edqn_jax.sim.task.observation import OWN_SIZE
 from edqn_jax.sim.task.outcomes import Outcome
 
 gymnasium = require("gymnasium", extra="gym")
@@ -179,7 +179,7 @@ def test_a_code_is_that_of_the_policy(sequence):
     pure = edqn_jax.make("medium", flown.config, worlds=3)
     observed, _ = made.reset(seed=1, options={"mission": 2})
     state, seen = pure.reset(1, 2)
-    empty = jnp.zeros((1, flown.config.encoder.code_size + env.OWN_SIZE))
+    empty = jnp.zeros((1, flown.config.encoder.code_size + OWN_SIZE))
     memory = empty
     for move in MOVES[:4, 0]:
         memory = see(flown.config, flown.params.encoder, memory, seen)

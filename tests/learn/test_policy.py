@@ -17,7 +17,7 @@ from edqn_jax.learn import policy, qnetwork, replay
 from edqn_jax.learn.perception import vae
 from edqn_jax.sim.actions import ACTIONS
 from edqn_jax.sim.sensors.events import field_of_counts
-from edqn_jax.sim.task.env import MOTION_SIZE, OWN_SIZE, Observation
+from edqn_jax.sim.task.observation import MOTION_SIZE, OWN_SIZE, Observation
 
 CONFIG = Config(
     camera=CameraConfig(width=8, height=6),

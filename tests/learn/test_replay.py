@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from edqn_jax.config import AgentConfig
 from edqn_jax.learn import replay
-from edqn_jax.sim.task.env import OWN_SIZE, turned
+from edqn_jax.sim.task.observation import OWN_SIZE, turned
 from edqn_jax.sim.task.outcomes import Outcome
 from tests.oracles import replay_plain
 

@@ -13,12 +13,13 @@ import pytest
 from edqn_jax.config import CameraConfig, Config, DroneConfig, EncoderConfig, EventsConfig
 from edqn_jax.learn import samples
 from edqn_jax.learn.perception import vae
+from edqn_jax.sim.actions import ACTIONS
 from edqn_jax.sim.physics import drone
 from edqn_jax.sim.scene.scene import UprightBoxes, build_scene, stack_scenes
 from edqn_jax.sim.sensors import events as ev
 from edqn_jax.sim.task import env
-from edqn_jax.sim.task.env import MOTION_SIZE, Observation
 from edqn_jax.sim.task.missions import own_missions
+from edqn_jax.sim.task.observation import MOTION_SIZE, Observation
 
 ENVS, LENGTH = 3, 4
 CONFIG = EncoderConfig(replay_size=2 * ENVS * LENGTH, target="sensed", mirror=False)  # of two shards
@@ -166,7 +167,7 @@ def test_a_flight_to_the_right_is_the_mirror_of_one_to_the_left() -> None:
     def flown(side: int) -> samples.Samples:
         state = fresh
         for move in ((1, side, 0), (1, side, 1)):
-            number = np.flatnonzero((env.ACTIONS == move).all(axis=1))[0]
+            number = np.flatnonzero((ACTIONS == move).all(axis=1))[0]
             state, seen = step(state, jnp.asarray(number))
         wanted = samples.target_of(EncoderConfig(), seen.observation, env.nearness(config, world, state))
         return samples.samples_of(EncoderConfig(), seen.observation, wanted, seen.is_reset)

@@ -14,6 +14,7 @@ from flax import struct
 from jax import Array, lax
 from jax.flatten_util import ravel_pytree
 
+from edqn_jax.checks import is_finite
 from edqn_jax.config import Config
 from edqn_jax.keys import split_each
 from edqn_jax.learn import qnetwork, replay
@@ -26,7 +27,6 @@ from edqn_jax.learn.policy import observation_size
 from edqn_jax.learn.qnetwork import Params
 from edqn_jax.native.all_sum import all_sum
 from edqn_jax.sim.actions import ACTIONS
-from edqn_jax.sim.task.env import is_finite
 
 METRICS = ("q_loss", "mean_q")
 

@@ -9,7 +9,7 @@ from edqn_jax.config import Config
 from edqn_jax.learn.perception import vae
 from edqn_jax.learn.perception.code import EMBEDDED, Params
 from edqn_jax.sim.sensors.sensor import Form, sensor_of
-from edqn_jax.sim.task.env import Observation
+from edqn_jax.sim.task.observation import Observation
 
 
 def has_code(config: Config) -> bool:

@@ -78,7 +78,7 @@ class PatchEncoder(nn.Module):
         """Returns mean and log-variance `[..., code_size]` of fields `[..., F, H, W]` or pictures `[..., C, H, W]`.
 
         Args:
-            motion: `[..., MOTION_SIZE]` own motion, see `sim.env.own_motion`.
+            motion: `[..., MOTION_SIZE]` own motion, see `sim.task.observation.own_motion`.
             previous: `[..., code_size]` codes of the decision before, 0 at the start of an episode; a recurrent encoder
                 needs these, or
             begins: `[T, ...]` bool: the observations are T in a row, and nothing is remembered where this is true.

@@ -24,7 +24,7 @@ from edqn_jax.learn.perception.pooled_encoder import PooledEncoder
 from edqn_jax.learn.perception.waves import OUTPUT_SCALE, cosines, mirrored, wave_images
 from edqn_jax.sim.sensors.events import EventField
 from edqn_jax.sim.sensors.sensor import Form
-from edqn_jax.sim.task.env import MOTION_SIZE
+from edqn_jax.sim.task.observation import MOTION_SIZE
 
 
 @struct.dataclass
@@ -183,7 +183,7 @@ def encode(
     The code that the agent sees is the mean.
 
     Args:
-        motion: `[..., MOTION_SIZE]` own motion, see `sim.env.own_motion`.
+        motion: `[..., MOTION_SIZE]` own motion, see `sim.task.observation.own_motion`.
         previous, begins: what a recurrent encoder remembers, see `PatchEncoder`, which needs one of them; None if the
             encoder is not recurrent.
     """

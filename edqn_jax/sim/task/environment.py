@@ -35,8 +35,9 @@ from edqn_jax.sim.scene.scene import Scene, scene_at, stack_scenes
 from edqn_jax.sim.sensors import events, sensor
 from edqn_jax.sim.sensors.events import EventField, EventMemory
 from edqn_jax.sim.task import env, group
-from edqn_jax.sim.task.env import EnvState, Observation, Step, World
+from edqn_jax.sim.task.env import EnvState, Step, World
 from edqn_jax.sim.task.missions import own_missions
+from edqn_jax.sim.task.observation import Observation
 from edqn_jax.sim.task.reward import Reward
 from edqn_jax.sim.worlds.families import SPLITS, Split, random_pool, world_keys
 from edqn_jax.sim.worlds.moving import Moving

@@ -16,7 +16,7 @@ from edqn_jax.learn.perception import pooled_encoder, vae
 from edqn_jax.learn.perception.code import kl_divergence
 from edqn_jax.sim.sensors import events as ev
 from edqn_jax.sim.sensors.sensor import Form
-from edqn_jax.sim.task.env import MOTION_SIZE
+from edqn_jax.sim.task.observation import MOTION_SIZE
 from tests.learn.moving_boxes import fields
 
 CAMERA = CameraConfig()
