@@ -32,6 +32,7 @@ from edqn_jax.sim.task import env
 from edqn_jax.sim.task.action_sets import heading_setpoint, velocity_command
 from edqn_jax.sim.task.env import EnvState, World
 from edqn_jax.sim.task.outcomes import judge
+from edqn_jax.sim.task.task import task_of
 from measurement.timing import Part, depending_on, operations_of, size_of, unchanged
 
 _ROWS, _SAME = PartitionSpec(AXIS), PartitionSpec()
@@ -266,12 +267,12 @@ def acting(now: Moment) -> Part:
 
 def _draw(now: Moment, ring: replay.Rows, keys: Array) -> tuple[Array, Any]:
     """Draws a training step's batches from the replay; returns the next keys, and sums over all that was drawn."""
-    agent, newest = now.config.agent, now.newest
+    agent, task, newest = now.config.agent, task_of(now.config), now.newest
     share = agent.batch_size // now.config.train.shards
 
     def batch(keys: Array, _: None):
         keys = _next(keys)
-        drawn = jax.vmap(lambda r, k: replay.sample(agent, r, newest, share, k))(ring, keys)
+        drawn = jax.vmap(lambda r, k: replay.sample(agent, r, newest, share, k, task))(ring, keys)
         return keys, jax.tree.map(jnp.sum, drawn)
 
     return jax.lax.scan(batch, keys, length=agent.updates_per_step)

@@ -10,6 +10,7 @@ nothing else of them is read.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import partial
 
 import jax
@@ -24,7 +25,8 @@ from edqn_jax.keys import integers
 from edqn_jax.learn.perception import vae
 from edqn_jax.learn.perception.vae import Target
 from edqn_jax.sim.sensors.events import EventField
-from edqn_jax.sim.task.observation import MIRRORED_MOTION, Observation
+from edqn_jax.sim.task.observation import Observation
+from edqn_jax.sim.task.task import Task
 
 MOST_EVENTS = 2**15 - 1
 """More events of a pixel than this are stored as this many."""
@@ -83,12 +85,15 @@ def write(ring: Samples, rows: Samples, time: Array, keep: Array) -> Samples:
     return jax.tree.map(lambda old, new: old.at[at].set(new), ring, rows)
 
 
-def draw(config: EncoderConfig, ring: Samples, time: Array, count: int, key: Array) -> Samples:
+def draw(
+    config: EncoderConfig, ring: Samples, time: Array, count: int, key: Array, task: Task | None = None
+) -> Samples:
     """Returns `count` samples of one shard, [T, count / T, ...]: T in a row, of which the first is uniform.
 
     Args:
         time: [] int32, how many decisions have been kept, at least 1. Before there are T, the last is repeated.
         key: consumed.
+        task: that was flown; None will do where `config.mirror` is off.
     """
     rows, envs = ring.motion.shape[:2]
     length, flights = config.sequence_decisions, count // config.sequence_decisions
@@ -102,9 +107,10 @@ def draw(config: EncoderConfig, ring: Samples, time: Array, count: int, key: Arr
     drawn = jax.tree.map(lambda leaf: leaf[row, env], ring)
     if not config.mirror:
         return drawn
+    assert task is not None and task.mirror is not None
     # Half of them; of an odd number the one in the middle is mirrored or not.
     half = flights // 2
-    turned = jax.tree.map(lambda leaf: leaf[:, : half + 1 if coin_key else half], mirrored(drawn))
+    turned = jax.tree.map(lambda leaf: leaf[:, : half + 1 if coin_key else half], mirrored(drawn, task.mirror))
     if coin_key:
         middle = jax.random.bernoulli(*coin_key)
         turned = jax.tree.map(
@@ -114,14 +120,14 @@ def draw(config: EncoderConfig, ring: Samples, time: Array, count: int, key: Arr
     return jax.tree.map(lambda new, old: join([new, old[:, new.shape[1] :]]), turned, drawn)
 
 
-def mirrored(samples: Samples) -> Samples:
-    """Returns samples [...] as they would be with left and right exchanged."""
+def mirrored(samples: Samples, factors: Sequence[float]) -> Samples:
+    """Returns samples [...] as they would be with left and right exchanged, with the own motion times `factors`."""
     # The standing waves across the image that change their sign are the odd ones.
     amplitudes = samples.wanted.amplitudes
     signs = jnp.asarray(1.0 - 2.0 * (np.arange(amplitudes.shape[-1]) % 2), jnp.float32)
     return Samples(
         sensed=jax.tree.map(lambda image: jnp.flip(image, axis=-1), samples.sensed),
-        motion=samples.motion * jnp.asarray(MIRRORED_MOTION),
+        motion=samples.motion * jnp.asarray(factors),
         wanted=Target(amplitudes * signs, samples.wanted.beyond),
         begins=samples.begins,
     )

@@ -25,6 +25,7 @@ from edqn_jax.learn.plan import Plan
 from edqn_jax.learn.qnetwork import Params
 from edqn_jax.learn.samples import Samples
 from edqn_jax.native.all_sum import all_sum
+from edqn_jax.sim.task.task import task_of
 
 VAE_METRICS = ("reconstruction_loss", "kl")
 
@@ -66,7 +67,7 @@ def update_vae(
         keys: [S] of the shards on this device, consumed.
         step: [] int32, of training.
     """
-    plan = Plan.of(config)
+    plan, task = Plan.of(config), task_of(config)
     if rings is None:
         return UpdateStats.none(*VAE_METRICS), networks
     share = config.encoder.batch_size // config.train.shards
@@ -80,7 +81,7 @@ def update_vae(
 
     def update(networks: Networks, keys: Array):
         draw_keys, noise_keys = split_each(keys, 2)
-        batch = jax.vmap(lambda ring, key: samples.draw(config.encoder, ring, kept, share, key))(rings, draw_keys)
+        batch = jax.vmap(lambda ring, key: samples.draw(config.encoder, ring, kept, share, key, task))(rings, draw_keys)
         # Each shard draws its own noise, so that the layout on devices does not change it.
         shape = *batch.motion.shape[1:-1], config.encoder.code_size
         noise = jax.vmap(lambda key: jax.random.normal(key, shape))(noise_keys)

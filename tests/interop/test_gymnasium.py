@@ -303,7 +303,7 @@ def test_what_cannot_be_done_is_refused():
     with pytest.raises(gymnasium.error.InvalidAction, match="from 0 to 26"):
         made.step(27)
     for moves in (np.array([0, 27]), np.array([0]), np.array([0.0, 1.0])):
-        with pytest.raises(gymnasium.error.InvalidAction, match="2 whole numbers from 0 to 26"):
+        with pytest.raises(gymnasium.error.InvalidAction, match="2 actions, each a whole number from 0 to 26"):
             vector.step(moves)
     while not any(made.step(DOWN)[2:4]):
         pass

@@ -19,7 +19,8 @@ from edqn_jax.sim.scene.scene import UprightBoxes, build_scene, stack_scenes
 from edqn_jax.sim.sensors import events as ev
 from edqn_jax.sim.task import env
 from edqn_jax.sim.task.missions import own_missions
-from edqn_jax.sim.task.observation import MOTION_SIZE, Observation
+from edqn_jax.sim.task.observation import MIRRORED_MOTION, MOTION_SIZE, Observation
+from edqn_jax.sim.task.task import task_of
 
 ENVS, LENGTH = 3, 4
 CONFIG = EncoderConfig(replay_size=2 * ENVS * LENGTH, target="sensed", mirror=False)  # of two shards
@@ -102,7 +103,8 @@ def test_what_is_stored_is_encoded_as_what_was_seen(architecture, even, alone) -
 
 def test_half_of_what_is_drawn_is_mirrored() -> None:
     ring, time = ring_after([True] * 3)
-    mirror = jax.jit(partial(samples.draw, dataclasses.replace(CONFIG, mirror=True)), static_argnums=2)
+    mirroring = dataclasses.replace(CONFIG, mirror=True)
+    mirror = jax.jit(partial(samples.draw, mirroring, task=task_of(Config())), static_argnums=2)
     turned = np.asarray(mirror(ring, jnp.int32(time), 256, jax.random.key(2)).motion[0, :, 1])
     # The motion of one sample in nine is 0, the same either way.
     assert (turned[:128] <= 0.0).all() and (turned[128:] >= 0.0).all()
@@ -113,7 +115,7 @@ def test_half_of_what_is_drawn_is_mirrored() -> None:
 def test_decisions_in_a_row_are_of_one_flight(kept: int, firsts: set[int]) -> None:
     config = dataclasses.replace(CONFIG, sequence_decisions=3)
     ring, time = ring_after([True] * kept)
-    drawn = samples.draw(config, ring, jnp.int32(time), 3 * 64, jax.random.key(1))
+    drawn = samples.draw(config, ring, jnp.int32(time), 3 * 64, jax.random.key(1), task_of(Config()))
     assert drawn.motion.shape == (3, 64, MOTION_SIZE)
     numbers, envs = np.divmod(np.rint(10 * np.asarray(drawn.motion[..., 0])).astype(int), 10)
     assert set(numbers[0]) == firsts and (envs == envs[0]).all()
@@ -124,7 +126,7 @@ def test_decisions_in_a_row_are_of_one_flight(kept: int, firsts: set[int]) -> No
 def test_before_there_are_enough_the_last_decision_is_repeated() -> None:
     config = dataclasses.replace(CONFIG, sequence_decisions=3)
     ring, time = ring_after([True] * 2)
-    drawn = samples.draw(config, ring, jnp.int32(time), 3 * 64, jax.random.key(1))
+    drawn = samples.draw(config, ring, jnp.int32(time), 3 * 64, jax.random.key(1), task_of(Config()))
     assert (np.rint(np.asarray(drawn.motion[..., 0])) == np.array([[0], [1], [1]])).all()
 
 
@@ -140,7 +142,7 @@ def test_a_mirrored_sample_is_that_of_the_mirrored_image() -> None:
         observation = Observation(field, motion, motion)
         return samples.samples_of(config, observation, samples.target_of(config, observation, near), jnp.asarray(True))
 
-    got = samples.mirrored(sample(counts, near, motion))
+    got = samples.mirrored(sample(counts, near, motion), MIRRORED_MOTION)
     # To the left, turning left and the move to the left become those to the right.
     expected = sample(counts[:, ::-1], near[:, ::-1], jnp.array([1.0, -2, 3, -4, 5, -6, 7]))
     jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, atol=1e-5), got, expected)
@@ -172,7 +174,7 @@ def test_a_flight_to_the_right_is_the_mirror_of_one_to_the_left() -> None:
         wanted = samples.target_of(EncoderConfig(), seen.observation, env.nearness(config, world, state))
         return samples.samples_of(EncoderConfig(), seen.observation, wanted, seen.is_reset)
 
-    left, right = flown(1), samples.mirrored(flown(-1))
+    left, right = flown(1), samples.mirrored(flown(-1), MIRRORED_MOTION)
     assert np.abs(left.sensed.signed).sum() > 20  # type: ignore[union-attr]
     # A pixel on an edge may round the other way and then have an event more or less.
     assert np.mean(np.asarray(left.sensed.signed) != np.asarray(right.sensed.signed)) < 0.01  # type: ignore[union-attr]

@@ -18,11 +18,14 @@ from collections.abc import Callable
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from jax.core import Tracer
+from jax.typing import ArrayLike
 
 from edqn_jax.checks import check_finite, check_index
 from edqn_jax.config import Config, EnvConfig
 from edqn_jax.config.registry import ACTION_SETS
-from edqn_jax.sim.actions import ACTIONS, HOVER, Box, Discrete, named_move
+from edqn_jax.errors import ConfigError
+from edqn_jax.sim.actions import ACTIONS, HOVER, Box, Discrete, move_number, named_move
 from edqn_jax.sim.physics import drone
 from edqn_jax.sim.physics.drone import Airframe, Command, DroneState, RateCommand, VelocityCommand
 
@@ -54,13 +57,46 @@ def admitted(space: Discrete | Box, action: Array) -> Array:
     """Returns an action as it is flown: of a box clipped to its bounds, and NaN where it is not finite.
 
     NaN lets the decision diverge, as any other number that is not finite.
+
+    Raises:
+        ConfigError: if it has another shape.
     """
     action = jnp.asarray(action, space.dtype)
+    if action.shape != space.shape:
+        raise ConfigError(f"an action is {described(space)}, not an array of shape {action.shape}")
     if isinstance(space, Discrete):
         check_index(action, space.n, "the moves")
         return action
     check_finite(action, "an action")
     return jnp.where(jnp.isfinite(action), jnp.clip(action, space.low, space.high), jnp.nan)
+
+
+def action_of(config: Config, given: str | ArrayLike) -> Array:
+    """Returns an action that a person gave: of moves also by vector or name, see `actions.move_number`.
+
+    Raises:
+        ConfigError: if there is no such action. Numbers that JAX is tracing are taken as they are.
+    """
+    if config.env.actions == "moves":
+        return move_number(given)
+    space = action_set(config).space
+    if isinstance(given, Tracer):
+        return given
+    try:
+        number = np.asarray(given, space.dtype)
+    except (TypeError, ValueError):
+        number = np.zeros(0)
+    inside = not isinstance(space, Discrete) or np.all((number >= 0) & (number < space.n))
+    if number.shape != space.shape or not np.isfinite(number).all() or not inside:
+        raise ConfigError(f"an action of '{config.env.actions}' is {described(space)}, not {given!r}")
+    return jnp.asarray(number)
+
+
+def described(space: Discrete | Box) -> str:
+    """Returns what an action is, in words."""
+    if isinstance(space, Discrete):
+        return f"a whole number from 0 to {space.n - 1}"
+    return f"{space.shape[0]} finite numbers from {space.low:g} to {space.high:g}"
 
 
 def velocity_command(config: EnvConfig, action: Array, yaw: Array) -> Array:
