@@ -81,7 +81,7 @@ def check_learns(config: Config) -> None:
     if config.env.actions != "moves":
         raise ConfigError(
             f"agent.learner '{config.agent.learner}' chooses among moves: env.actions must be moves for training, not "
-            f"{config.env.actions}, which learners of your own or of other libraries fly (docs/howto/continuous.md)"
+            f"{config.env.actions}; docs/howto/continuous_actions.md says what learns with those"
         )
 
 

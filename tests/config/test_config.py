@@ -276,6 +276,11 @@ def test_every_numeric_option_has_limits(group, option, nonsense):
             {"sequence_decisions": 2, "replay_size": 511},
             "encoder.replay_size must be at least 512: 2 observations for each of the 256 environments, not 511",
         ),
+        (
+            "env",
+            {"reward": "potential", "potential_discount": 0.9},
+            "must be 0.97, agent.discount, with env.reward potential",
+        ),
         ("env", {"heading": "flight"}, "env.position must be false with env.heading flight, not True"),
         ("agent", {"turn": True}, r"agent.turn needs a random world \(sparse, .*\), not 'paper': give --agent.no-turn"),
         ("world", {"flown": "my.xml"}, r"world.flown is for random worlds \(.*\) alone, 'paper' is flown itself: give"),

@@ -54,7 +54,7 @@ def action_set(config: Config) -> ActionSet:
 
 
 def admitted(space: Discrete | Box, action: Array) -> Array:
-    """Returns an action as it is flown: of a box clipped to its bounds, and NaN where it is not finite.
+    """Returns an action [] or [A] as it is flown: of a box clipped to its bounds, and NaN where it is not finite.
 
     NaN lets the decision diverge, as any other number that is not finite.
 
@@ -72,7 +72,7 @@ def admitted(space: Discrete | Box, action: Array) -> Array:
 
 
 def action_of(config: Config, given: str | ArrayLike) -> Array:
-    """Returns an action that a person gave: of moves also by vector or name, see `actions.move_number`.
+    """Returns an action [] or [A] that a person gave: of moves also by vector or name, see `actions.move_number`.
 
     Raises:
         ConfigError: if there is no such action. Numbers that JAX is tracing are taken as they are.

@@ -63,7 +63,7 @@ class Decision:
 
 
 def choose(condition: Array, yes, no):
-    """Returns `yes` where the scalar condition holds, else `no`, leaf by leaf."""
+    """Returns `yes` where the condition [] holds, else `no`, leaf by leaf."""
     return jax.tree.map(lambda a, b: jnp.where(condition, a, b), yes, no)
 
 
@@ -78,7 +78,15 @@ def decide(
     """Returns the decision as flown, judged and rewarded.
 
     A diverged body stays where it was, so that no NaN reaches an observation; a decision without a finite reward has
-    diverged, too. The key `gusts` is consumed; None where nothing changes how a drone flies.
+    diverged, too.
+
+    Args:
+        config: of task and drone.
+        airframe: that the controller believes in.
+        payment: see there.
+        before: see there.
+        action: [] or [A], as chosen.
+        gusts: key, consumed; None where nothing changes how a drone flies.
     """
     flown, late = _delayed(config, before.disturbance, action)
     command = action_set(config).command(config, airframe, before.drone, before.goal, flown)
