@@ -9,6 +9,19 @@ import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
+QUICK_TO_COMPILE = (
+    "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_count=1"
+)
+"""XLA's flags with which a program compiles in less than half the time: what runs once need not be fast.
+
+Nor is it cut up for several threads, since each core has another process. What the package compiles with options of
+its own (`compiler_options`) keeps their level of optimisation.
+"""
+
+# For the processes that tests start as well, and before the package is imported, which adds its own. Whoever gives
+# flags gets these alone: `XLA_FLAGS= pytest` compiles everything as users do.
+os.environ.setdefault("XLA_FLAGS", QUICK_TO_COMPILE)
+
 import jax
 import pytest
 
@@ -23,15 +36,6 @@ CACHE = {
 
 MOST_CACHED_BYTES = 2**30
 """The cache of compiled programs is emptied at the start of a session when it has grown beyond this."""
-
-QUICK_TO_COMPILE = (
-    "--xla_backend_optimization_level=0 --xla_cpu_use_fusion_emitters=false --xla_cpu_parallel_codegen_split_count=1"
-)
-"""XLA's flags with which a program compiles in less than half the time: what runs once need not be fast.
-
-Nor is it cut up for several threads, since each core has another process. What the package compiles with options of
-its own (`compiler_options`) keeps their level of optimisation.
-"""
 
 LONGEST = (
     "test_run",
@@ -56,11 +60,6 @@ LONGEST = (
 
 `test_evaluate` flies what `test_flights` flies, so it stands some places after it and finds the program compiled.
 """
-
-# For the processes that tests start as well, and before the package is imported, which adds its own. Whoever gives
-# flags gets these alone: `XLA_FLAGS= pytest` compiles everything as users do.
-os.environ.setdefault("XLA_FLAGS", QUICK_TO_COMPILE)
-
 
 use_cpu_devices(2)
 
