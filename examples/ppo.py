@@ -85,7 +85,7 @@ class ActorCritic(nn.Module):
         value = tower(1, 1.0)[..., 0]
         if isinstance(self.space, functional.Discrete):
             return tower(self.space.n, 0.01), value
-        mean = tower(*self.space.shape, 0.01)
+        mean = tower(self.space.shape[0], 0.01)
         spread = self.param("log_deviation", nn.initializers.constant(-0.5), self.space.shape)
         return jnp.concatenate([mean, jnp.broadcast_to(spread, mean.shape)], axis=-1), value
 
@@ -174,7 +174,7 @@ def make_train(settings: Settings, env: functional.FunctionalEnv, task: function
             key, move_key, step_key = jax.random.split(key, 3)
             said, value = decided(space, params, observed)
             action = drawn(space, said, move_key)
-            log_prob, _ = likelihood(space, said, action)
+            log_prob = likelihood(space, said, action)[0]
             keys = jax.random.split(step_key, settings.num_envs)
             after, states, reward, terminated, truncated, info = step(keys, states, action, task)
             reward, ended = settings.reward_scale * reward, terminated | truncated
@@ -229,8 +229,8 @@ def main(settings: Settings) -> None:
         flown = dataclasses.replace(policy.config.env, actions=settings.actions)
         options["policy"] = dataclasses.replace(policy, config=dataclasses.replace(policy.config, env=flown))
     else:
-        flies = {"drone": {"physics": "rigid_body"}, "env": {"actions": settings.actions}}
-        options["config"] = edqn_jax.make_config(settings.world, **flies)
+        physics, flown = {"physics": "rigid_body"}, {"actions": settings.actions}
+        options["config"] = edqn_jax.make_config(settings.world, drone=physics, env=flown)
     env, task = functional.make(settings.world, worlds=settings.worlds, **options)
     if settings.worlds > 1:
         _, unseen = functional.make(settings.world, worlds=settings.test_worlds, world_seed=1000, **options)

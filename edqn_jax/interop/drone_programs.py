@@ -7,6 +7,7 @@ import functools
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 from flax import struct
 from jax import Array
 
@@ -96,5 +97,6 @@ def step_many(program: Program, leaves: Leaves, encoder: EncoderParams, drones: 
 def reset_some(program: Program, leaves: Leaves, encoder: EncoderParams, drones: Drone, numbers: Array):
     """Resets the ended drones of these numbers [K] and returns their observations; other numbers stand for none."""
     ended = jax.tree.map(lambda x: x.at[numbers].get(mode="clip"), drones)
-    fresh, decided = jax.vmap(lambda drone: _step(program, leaves, encoder, drone, program.env.task.still))(ended)
+    still = jnp.asarray(program.env.task.still)
+    fresh, decided = jax.vmap(lambda drone: _step(program, leaves, encoder, drone, still))(ended)
     return jax.tree.map(lambda x, y: x.at[numbers].set(y, mode="drop"), drones, fresh), decided.observed

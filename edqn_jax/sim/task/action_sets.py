@@ -30,12 +30,12 @@ from edqn_jax.sim.physics import drone
 from edqn_jax.sim.physics.drone import Airframe, Command, DroneState, RateCommand, VelocityCommand
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, eq=False)
 class ActionSet:
     """What actions are, and what they command. All functions are pure and of one drone."""
 
     space: Discrete | Box
-    still: np.ndarray
+    still: ArrayLike
     """An action that holds the drone where it is; with `env.action_delay` the first decision flies it."""
     command: Callable[[Config, Airframe, DroneState, Array, Array], Command]
     """(config, airframe, state, goal [3], action) → what the controller holds for one decision."""

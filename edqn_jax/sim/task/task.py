@@ -15,8 +15,8 @@ import functools
 from collections.abc import Callable
 from typing import Any
 
-import numpy as np
 from jax import Array
+from jax.typing import ArrayLike
 
 from edqn_jax.config import Config
 from edqn_jax.sim.actions import Box, Discrete
@@ -26,13 +26,13 @@ from edqn_jax.sim.task.env import EnvState, Step, World
 from edqn_jax.sim.task.observation import MIRRORED_MOTION, MOTION_SIZE, OWN_SIZE, Observation, turned
 
 
-@dataclasses.dataclass(frozen=True)
+@dataclasses.dataclass(frozen=True, eq=False)
 class Task:
     """Pure functions of one drone on its missions."""
 
     actions: Discrete | Box
     """What an action is."""
-    still: np.ndarray
+    still: ArrayLike
     """An action that holds the drone where it is."""
     own_size: int
     """Values of the own state in an observation."""

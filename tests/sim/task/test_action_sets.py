@@ -37,6 +37,7 @@ def configured(actions: str, **options: object) -> Config:
 CONFIG = configured("body-rates")
 LATE = configured("velocity", action_delay=1)
 AIRFRAME = load_airframe(CONFIG.drone)
+BODY = hover(jnp.zeros(3), jnp.float32(0.0))
 WEIGHT = float(AIRFRAME.mass * AIRFRAME.gravity)
 
 
@@ -135,7 +136,7 @@ def test_body_rates_fly_as_c_mujoco_under_a_plain_control_law():
 
 
 def test_a_body_rate_of_1_is_the_largest_of_the_drones_options():
-    command = BODY_RATES.command(CONFIG, AIRFRAME, hover(jnp.zeros(3), 0.0), jnp.ones(3), jnp.array([-1.0, 1, -1, 1]))
+    command = BODY_RATES.command(CONFIG, AIRFRAME, BODY, jnp.ones(3), jnp.array([-1.0, 1, -1, 1]))
     assert isinstance(command, RateCommand) and float(command.thrust) == 0.0
     np.testing.assert_allclose(command.rates, [6.0, -6.0, 2.0])
 
@@ -144,7 +145,7 @@ def test_the_direction_of_body_rates_is_that_of_the_rotors_in_the_heading_frame(
     quaternions = np.random.default_rng(0).normal(size=(50, 4))
     quaternions /= np.linalg.norm(quaternions, axis=1, keepdims=True)
     for quaternion in quaternions:
-        body = dataclasses.replace(hover(jnp.zeros(3), 0.0), quaternion=jnp.asarray(quaternion, jnp.float32))
+        body = dataclasses.replace(BODY, quaternion=jnp.asarray(quaternion, jnp.float32))
         matrix, yaw = np.zeros(9), 2 * np.arctan2(quaternion[3], quaternion[0])
         mujoco.mju_quat2Mat(matrix, quaternion)
         x, y, z = matrix.reshape(3, 3)[:, 2]
