@@ -46,6 +46,7 @@ from edqn_jax.sim.task import env
 from edqn_jax.sim.task.env import World
 from edqn_jax.sim.task.flights import Flights
 from edqn_jax.sim.task.missions import own_missions
+from edqn_jax.sim.task.observation import MOTION_SIZE, OWN_SIZE, Observation
 from edqn_jax.sim.task.outcomes import Outcome
 from edqn_jax.sim.worlds import families
 from edqn_jax.sim.worlds.moving import Moving
@@ -174,16 +175,14 @@ def decision_ms(policy: Policy, flown: PilotConfig, world: World, planning: np.n
     """
     config, volume = policy.config, np.asarray(world.pool.volume)
     shape = grid.grid_shape(flown.map, volume)
-    seen = env.Observation(
-        sensed=sensor_of(config).example(config), own=jnp.zeros(env.OWN_SIZE), motion=jnp.zeros(env.MOTION_SIZE)
-    )
+    seen = Observation(sensed=sensor_of(config).example(config), own=jnp.zeros(OWN_SIZE), motion=jnp.zeros(MOTION_SIZE))
     seen, memory = jax.tree.map(np.asarray, (seen, AgentActor(config).init()))
     picture = np.full((config.camera.height, config.camera.width), 5.0, np.float32)
     position = np.asarray(world.missions.start)[0]
     rotation = mount_rotation(config, jnp.array([1.0, 0.0, 0.0, 0.0]))
 
     @jax.jit
-    def integrate(params: PolicyParams, seen: env.Observation, memory: Any, picture: Any, known: grid.Grid):
+    def integrate(params: PolicyParams, seen: Observation, memory: Any, picture: Any, known: grid.Grid):
         depth = picture
         if flown.depth == "decoded":
             memory = AgentActor(config).encode(params, memory, seen)

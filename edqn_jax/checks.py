@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import jax
 import jax.numpy as jnp
 from jax import Array
 from jax.experimental import checkify
@@ -23,3 +24,9 @@ def check_index(index: Array, below: int | Array, of: str) -> None:
     wrong = (index < 0) | (index >= below)
     first = jnp.ravel(index)[jnp.argmax(wrong)]
     checkify.debug_check(~jnp.any(wrong), f"index {{index}} of {of} is out of bounds", index=first)
+
+
+def is_finite(tree: object) -> Array:
+    """Returns whether every number of a tree's arrays is finite, [] bool; whole numbers are."""
+    sums = [jnp.sum(leaf) for leaf in jax.tree.leaves(tree) if jnp.issubdtype(leaf.dtype, jnp.floating)]
+    return jnp.isfinite(sum(sums, jnp.zeros(())))

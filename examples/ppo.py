@@ -2,6 +2,7 @@
 
     python examples/ppo.py                                        # about two minutes on two CPU cores
     python examples/ppo.py --observation code --world medium      # with the events, through the pretrained encoder
+    python examples/ppo.py --actions velocity                     # any velocity in place of 27 moves
 
 Prints mean return and success of the greedy policy before and after training, in worlds that training does not use.
 """
@@ -22,6 +23,8 @@ from jax import Array
 import edqn_jax
 from edqn_jax.interop import functional
 
+Space = functional.Discrete | functional.Box
+
 
 @dataclasses.dataclass(frozen=True)
 class Settings:
@@ -33,6 +36,8 @@ class Settings:
     """Random worlds to train in; 1 for a world from a file."""
     observation: Literal["kinematics", "code"] = "kinematics"
     """Own state and motion alone, or also the codes of the pretrained policy's encoder."""
+    actions: Literal["moves", "velocity"] = "moves"
+    """27 moves, or velocities [3] of a Gaussian policy."""
     decisions: int = 4_000_000
     """Decisions in all."""
     seed: int = 0
@@ -65,7 +70,9 @@ class Row(NamedTuple):
 
 
 class ActorCritic(nn.Module):
-    """Returns the logits of the moves and the value."""
+    """Returns the logits [n] of the moves, or mean and log standard deviation [2 A] of an action, and the value."""
+
+    space: Space
 
     @nn.compact
     def __call__(self, observed: Array) -> tuple[Array, Array]:
@@ -75,13 +82,43 @@ class ActorCritic(nn.Module):
                 x = nn.tanh(nn.Dense(width, kernel_init=nn.initializers.orthogonal(2**0.5))(x))
             return nn.Dense(outputs, kernel_init=nn.initializers.orthogonal(scale))(x)
 
-        return tower(27, 0.01), tower(1, 1.0)[..., 0]
+        value = tower(1, 1.0)[..., 0]
+        if isinstance(self.space, functional.Discrete):
+            return tower(self.space.n, 0.01), value
+        mean = tower(self.space.shape[0], 0.01)
+        spread = self.param("log_deviation", nn.initializers.constant(-0.5), self.space.shape)
+        return jnp.concatenate([mean, jnp.broadcast_to(spread, mean.shape)], axis=-1), value
 
 
-def decided(params: Any, observed: Array) -> tuple[Array, Array]:
-    """Returns logits [..., 27] and values [...] of observations [..., D]."""
-    made: Any = ActorCritic().apply(params, observed)
+def decided(space: Space, params: Any, observed: Array) -> tuple[Array, Array]:
+    """Returns what the policy says [..., n or 2 A] and values [...] of observations [..., D]."""
+    made: Any = ActorCritic(space).apply(params, observed)
     return made
+
+
+def drawn(space: Space, said: Array, key: Array) -> Array:
+    """Returns random actions [N] or [N, A] of what the policy says."""
+    if isinstance(space, functional.Discrete):
+        return jax.random.categorical(key, said)
+    mean, log_deviation = jnp.split(said, 2, axis=-1)
+    return mean + jnp.exp(log_deviation) * jax.random.normal(key, mean.shape)
+
+
+def best(space: Space, said: Array) -> Array:
+    """Returns the likeliest action [] or [A] of what the policy says."""
+    return jnp.argmax(said) if isinstance(space, functional.Discrete) else jnp.split(said, 2)[0]
+
+
+def likelihood(space: Space, said: Array, action: Array) -> tuple[Array, Array]:
+    """Returns the log-probability [N] of actions [N, ...], and the policy's entropy [N]."""
+    if isinstance(space, functional.Discrete):
+        log_probs = jax.nn.log_softmax(said)
+        log_prob = jnp.take_along_axis(log_probs, action[:, None], axis=1)[:, 0]
+        return log_prob, -jnp.sum(jnp.exp(log_probs) * log_probs, axis=1)
+    mean, log_deviation = jnp.split(said, 2, axis=-1)
+    constant = 0.5 * jnp.log(2 * jnp.pi)
+    log_prob = -0.5 * ((action - mean) / jnp.exp(log_deviation)) ** 2 - log_deviation - constant
+    return jnp.sum(log_prob, axis=-1), jnp.sum(log_deviation + constant + 0.5, axis=-1)
 
 
 def advantages(rows: Row, last_value: Array, discount: float, decay: float) -> Array:
@@ -101,24 +138,22 @@ def advantages(rows: Row, last_value: Array, discount: float, decay: float) -> A
     return jax.lax.scan(back, start, rows, reverse=True)[1]
 
 
-def loss(settings: Settings, params: Any, rows: Row, advantage: Array) -> Array:
+def loss(settings: Settings, space: Space, params: Any, rows: Row, advantage: Array) -> Array:
     """Returns PPO's clipped loss, the mean over valid rows [B]."""
-    logits, value = decided(params, rows.observed)
-    log_probs = jax.nn.log_softmax(logits)
-    log_prob = jnp.take_along_axis(log_probs, rows.action[:, None], axis=1)[:, 0]
+    said, value = decided(space, params, rows.observed)
+    log_prob, entropy = likelihood(space, said, rows.action)
     weight = rows.valid / jnp.maximum(rows.valid.sum(), 1)
     mean = jnp.sum(weight * advantage)
     normed = (advantage - mean) / (jnp.sqrt(jnp.sum(weight * (advantage - mean) ** 2)) + 1e-8)
     ratio = jnp.exp(log_prob - rows.log_prob)
     gain = jnp.minimum(ratio * normed, jnp.clip(ratio, 1 - settings.clip, 1 + settings.clip) * normed)
     error = (value - (rows.value + advantage)) ** 2
-    entropy = -jnp.sum(jnp.exp(log_probs) * log_probs, axis=1)
     return jnp.sum(weight * (-gain + 0.5 * error - settings.entropy * entropy))
 
 
 def make_train(settings: Settings, env: functional.FunctionalEnv, task: functional.Params) -> tuple[Any, Any]:
     """Returns the functions `init(key)` → carry and `update(carry)` → carry, figures."""
-    step = jax.vmap(env.step, in_axes=(0, 0, 0, None))
+    step, space = jax.vmap(env.step, in_axes=(0, 0, 0, None)), env.action_space(task)
     batch = settings.num_envs * settings.num_steps
     updates = -(-settings.decisions // batch)
     schedule = optax.linear_schedule(settings.learning_rate, 0.0, updates * settings.epochs * settings.minibatches)
@@ -127,7 +162,7 @@ def make_train(settings: Settings, env: functional.FunctionalEnv, task: function
     def init(key: Array) -> tuple:
         network_key, reset_key, key = jax.random.split(key, 3)
         observed, states = jax.vmap(env.reset, in_axes=(0, None))(jax.random.split(reset_key, settings.num_envs), task)
-        params = ActorCritic().init(network_key, observed)
+        params = ActorCritic(space).init(network_key, observed)
         return params, optimiser.init(params), observed, states, key
 
     def update(carry: tuple) -> tuple[tuple, dict[str, Array]]:
@@ -137,9 +172,9 @@ def make_train(settings: Settings, env: functional.FunctionalEnv, task: function
         def act(carry: tuple, _: None) -> tuple[tuple, tuple[Row, dict]]:
             observed, states, key = carry
             key, move_key, step_key = jax.random.split(key, 3)
-            logits, value = decided(params, observed)
-            action = jax.random.categorical(move_key, logits)
-            log_prob = jnp.take_along_axis(jax.nn.log_softmax(logits), action[:, None], axis=1)[:, 0]
+            said, value = decided(space, params, observed)
+            action = drawn(space, said, move_key)
+            log_prob = likelihood(space, said, action)[0]
             keys = jax.random.split(step_key, settings.num_envs)
             after, states, reward, terminated, truncated, info = step(keys, states, action, task)
             reward, ended = settings.reward_scale * reward, terminated | truncated
@@ -148,14 +183,14 @@ def make_train(settings: Settings, env: functional.FunctionalEnv, task: function
 
         carry, (rows, info) = jax.lax.scan(act, (observed, states, key), None, settings.num_steps)
         observed, states, key = carry
-        last_value = decided(params, observed)[1]
+        last_value = decided(space, params, observed)[1]
         advantage = advantages(rows, last_value, settings.discount, settings.gae_lambda)
         flat = jax.tree.map(lambda x: x.reshape(batch, *x.shape[2:]), (rows, advantage))
 
         def descend(carry: tuple, chosen: Array) -> tuple[tuple, None]:
             params, optimised = carry
             part = jax.tree.map(lambda x: x[chosen], flat)
-            changes, optimised = optimiser.update(jax.grad(loss, argnums=1)(settings, params, *part), optimised)
+            changes, optimised = optimiser.update(jax.grad(loss, argnums=2)(settings, space, params, *part), optimised)
             return (optax.apply_updates(params, changes), optimised), None
 
         orders = jax.vmap(lambda key: jax.random.permutation(key, batch))(jax.random.split(order_key, settings.epochs))
@@ -173,12 +208,12 @@ def make_train(settings: Settings, env: functional.FunctionalEnv, task: function
 
 def fly(env: functional.FunctionalEnv, task: functional.Params, params: Any, mission: Array) -> tuple[Array, Array]:
     """Returns return [] and success [] of one greedy flight of a mission [], with the seed of its number."""
+    space = env.action_space(task)
 
     def decide(carry: tuple, nothing: None) -> tuple[tuple, tuple[Array, Array]]:
         observed, state, alive = carry
-        logits, _ = decided(params, observed)
-        key = state.flight.key
-        observed, state, reward, terminated, truncated, info = env.step(key, state, jnp.argmax(logits), task)
+        action = best(space, decided(space, params, observed)[0])
+        observed, state, reward, terminated, truncated, info = env.step(state.flight.key, state, action, task)
         return (observed, state, alive & ~(terminated | truncated)), (alive * reward, alive & info["is_success"])
 
     observed, state = env.reset(jax.random.key(mission), task, mission)
@@ -190,9 +225,12 @@ def main(settings: Settings) -> None:
     """Trains and prints."""
     options: dict[str, Any] = {"observation": settings.observation}
     if settings.observation == "code":
-        options["policy"] = edqn_jax.load_policy("pretrained")
+        policy = edqn_jax.load_policy("pretrained")
+        flown = dataclasses.replace(policy.config.env, actions=settings.actions)
+        options["policy"] = dataclasses.replace(policy, config=dataclasses.replace(policy.config, env=flown))
     else:
-        options["config"] = edqn_jax.make_config(settings.world, drone={"physics": "rigid_body"})
+        physics, flown = {"physics": "rigid_body"}, {"actions": settings.actions}
+        options["config"] = edqn_jax.make_config(settings.world, drone=physics, env=flown)
     env, task = functional.make(settings.world, worlds=settings.worlds, **options)
     if settings.worlds > 1:
         _, unseen = functional.make(settings.world, worlds=settings.test_worlds, world_seed=1000, **options)

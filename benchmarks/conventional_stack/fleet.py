@@ -21,7 +21,7 @@ from edqn_jax.sim.scene.scene import take_scene
 from edqn_jax.sim.sensors import light
 from edqn_jax.sim.sensors.sensor import frame_steps
 from edqn_jax.sim.task import env
-from edqn_jax.sim.task.env import MOTION_SIZE, OWN_SIZE
+from edqn_jax.sim.task.observation import MOTION_SIZE, OWN_SIZE
 
 _BLOCK = 8
 """Drones whose frames are rendered together, so that their rays stay in the cache."""
@@ -56,9 +56,9 @@ class Record:
 
     action: np.ndarray  # [N] int64 of the next step
     events: np.ndarray  # [N, H, W] int8 signed counts of the window before the next decision
-    motion: np.ndarray  # [N, 7] float32 at the end of that window, see `edqn_jax.sim.task.env.own_motion`
+    motion: np.ndarray  # [N, 7] float32 at the end of that window, see `edqn_jax.sim.task.observation.own_motion`
     nearness: np.ndarray  # [N, H, W] float32 at the end of that window, if the VAE must draw it; otherwise [N, 0, 0]
-    own: np.ndarray  # [N, 10] float32 see `edqn_jax.sim.task.env.own_state`
+    own: np.ndarray  # [N, 10] float32 see `edqn_jax.sim.task.observation.own_state`
     final_own: np.ndarray  # [N, 10] float32 the same before drones whose episode ended were reset
     reward: np.ndarray  # [N] float32
     outcome: np.ndarray  # [N] int64 an `Outcome`; other than RUNNING, the drone has been reset

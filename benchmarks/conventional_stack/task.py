@@ -11,7 +11,7 @@ import numpy as np
 from conventional_stack.flight import clip, wrap_angle
 from edqn_jax.config import Config
 from edqn_jax.extras import require
-from edqn_jax.sim.task.env import MOST_YAW_RATE
+from edqn_jax.sim.task.observation import MOST_YAW_RATE
 from edqn_jax.sim.task.outcomes import Outcome
 
 numba = require("numba")
@@ -64,7 +64,7 @@ def rules_of(config: Config) -> Rules:
         collision_reward=config.env.collision_reward,
         left_volume_reward=config.env.left_volume_reward,
         step_reward=config.env.step_reward,
-        discount=config.agent.discount,
+        discount=config.env.potential_discount,
         speed=config.env.speed_m_s,
     )
 
@@ -199,7 +199,7 @@ def judge(geoms, rules, goal, path, state, decision, outcome, reward, end_step, 
 
 @numba.njit(cache=True, error_model="numpy")
 def own_state(geoms, rules, goal, state, own):
-    """Computes the drones' own states as `edqn_jax.sim.task.env.own_state`, into `own` [N, 10]."""
+    """Computes the drones' own states as `edqn_jax.sim.task.observation.own_state`, into `own` [N, 10]."""
     for i in range(len(state)):
         yaw = wrap_angle(2 * math.atan2(state[i, 6], state[i, 3]))
         cos, sin = math.cos(yaw), math.sin(yaw)
@@ -216,7 +216,7 @@ def own_state(geoms, rules, goal, state, own):
 
 @numba.njit(cache=True, error_model="numpy")
 def own_motion(moves, action, own, state, motion):
-    """Computes the drones' own motions as `edqn_jax.sim.task.env.own_motion`, into `motion` [N, 7].
+    """Computes the drones' own motions as `edqn_jax.sim.task.observation.own_motion`, into `motion` [N, 7].
 
     Args:
         moves: [27, 3] the vectors of the moves.

@@ -13,7 +13,7 @@ from conventional_stack.workers import SpreadFleet
 from edqn_jax.config import Config
 from edqn_jax.extras import require
 from edqn_jax.sim.actions import ACTIONS
-from edqn_jax.sim.task.env import OWN_SIZE
+from edqn_jax.sim.task.observation import OWN_SIZE
 from edqn_jax.sim.task.outcomes import Outcome
 
 spaces = require("gymnasium").spaces

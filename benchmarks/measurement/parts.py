@@ -22,13 +22,17 @@ from edqn_jax.learn.plan import Plan
 from edqn_jax.learn.samples import Samples
 from edqn_jax.learn.trainer import AXIS, Actors, TrainState
 from edqn_jax.learn.updates import Networks
+from edqn_jax.sim.actions import ACTIONS
 from edqn_jax.sim.camera import camera, columns, native
 from edqn_jax.sim.physics import drone
 from edqn_jax.sim.physics.drone import DroneState
 from edqn_jax.sim.scene.scene import take_scene
 from edqn_jax.sim.sensors import events, sensor
 from edqn_jax.sim.task import env
+from edqn_jax.sim.task.action_sets import heading_setpoint, velocity_command
 from edqn_jax.sim.task.env import EnvState, World
+from edqn_jax.sim.task.outcomes import judge
+from edqn_jax.sim.task.task import task_of
 from measurement.timing import Part, depending_on, operations_of, size_of, unchanged
 
 _ROWS, _SAME = PartitionSpec(AXIS), PartitionSpec()
@@ -57,7 +61,7 @@ class Moment:
 
     @property
     def moves(self) -> Array:
-        return jnp.arange(self.config.train.num_envs) % len(env.ACTIONS)
+        return jnp.arange(self.config.train.num_envs) % len(ACTIONS)
 
     @property
     def scenes(self) -> Array:
@@ -103,8 +107,8 @@ def physics(now: Moment) -> Part:
     config = now.config
 
     def one(world: World, body: DroneState, move: Array, goal: Array):
-        command = env.velocity_command(config.env, move, drone.yaw_of(body.quaternion))
-        heading = env.heading_setpoint(config.env, body, goal, command)
+        command = velocity_command(config.env, move, drone.yaw_of(body.quaternion))
+        heading = heading_setpoint(config.env, body, goal, command)
         after, flight = drone.fly(config.drone, world.airframe, body, command, heading)
         return after, flight.position
 
@@ -132,7 +136,7 @@ def outcome(now: Moment) -> Part:
 
     def body(world: World, carry):
         before, flight, scene, goal = carry
-        judged = jax.vmap(lambda b, f, s, g: env.judge(now.config, take_scene(world.pool, s), g, b, f, jnp.int32(1)))(
+        judged = jax.vmap(lambda b, f, s, g: judge(now.config, take_scene(world.pool, s), g, b, f, jnp.int32(1)))(
             before, flight, scene, goal
         )
         return depending_on(before, judged), flight, scene, goal
@@ -251,7 +255,7 @@ def acting(now: Moment) -> Part:
 
     def body(params: Any, carry):
         memory, keys = carry
-        q = qnetwork.q_values(now.config.agent, params, len(env.ACTIONS), memory)
+        q = qnetwork.q_values(now.config.agent, params, len(ACTIONS), memory)
         keys = _next(keys)
         action = jax.vmap(lambda q, k: epsilon_greedy(q, jnp.float32(0.02), k))(q, keys)
         return depending_on(memory, action), keys
@@ -262,12 +266,12 @@ def acting(now: Moment) -> Part:
 
 def _draw(now: Moment, ring: replay.Rows, keys: Array) -> tuple[Array, Any]:
     """Draws a training step's batches from the replay; returns the next keys, and sums over all that was drawn."""
-    agent, newest = now.config.agent, now.newest
+    agent, task, newest = now.config.agent, task_of(now.config), now.newest
     share = agent.batch_size // now.config.train.shards
 
     def batch(keys: Array, _: None):
         keys = _next(keys)
-        drawn = jax.vmap(lambda r, k: replay.sample(agent, r, newest, share, k))(ring, keys)
+        drawn = jax.vmap(lambda r, k: replay.sample(agent, r, newest, share, k, task))(ring, keys)
         return keys, jax.tree.map(jnp.sum, drawn)
 
     return jax.lax.scan(batch, keys, length=agent.updates_per_step)

@@ -19,8 +19,9 @@ from edqn_jax.devices.devices import choose_devices
 from edqn_jax.devices.hardware import processor
 from edqn_jax.evaluation.missions import run_missions
 from edqn_jax.runs.provenance import workload
-from edqn_jax.sim.task.env import MOTION_SIZE, OWN_SIZE, World
+from edqn_jax.sim.task.env import World
 from edqn_jax.sim.task.flights import Flights
+from edqn_jax.sim.task.observation import MOTION_SIZE, OWN_SIZE
 from measurement import json_report
 from measurement.peak_memory import peak_of_workers
 from measurement.whole import WholeStep, steady

@@ -169,7 +169,7 @@ class TutorialDrone(gymnasium.Env):
         return ""
 
     def _observed(self, events: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Returns the event image and the ten own values of `edqn_jax.sim.task.env.own_state` as one vector."""
+        """Returns the event image and the ten own values of `edqn_jax.sim.task.observation.own_state` as one vector."""
         position, velocity = self.data.qpos[:3], self.data.qvel[:3] / self.config.env.speed_m_s
         w, x, y, z = self.data.qpos[3:]
         heading = 2 * math.atan2(z, w)

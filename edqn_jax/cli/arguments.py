@@ -31,7 +31,7 @@ from edqn_jax.cli.help import (
     with_conditions,
 )
 from edqn_jax.config import CONDITIONS, FAMILIES, Config
-from edqn_jax.config.limits import validate
+from edqn_jax.config.limits import check_learns, validate
 from edqn_jax.config.loading import Layer, apply, resolve
 from edqn_jax.devices.hardware import hardware
 from edqn_jax.devices.launch import Distributed
@@ -268,6 +268,7 @@ def parse_train(argv: Sequence[str]) -> tuple[TrainOptions, Config]:
         show_train_help(TrainOptions(), begins, SHORT_NAMES, everything=everything)
     config = _found_worlds(_parse_config(argv, begins))
     validate(config)
+    check_learns(config)
     if run is not None and folder is not None:
         options = dataclasses.replace(options, seeds=run.seeds if options.seeds is None else options.seeds)
         config = continued(folder, run, config, options.seeds)

@@ -24,7 +24,7 @@ from edqn_jax.config.options import (
     TrainConfig,
     WorldConfig,
 )
-from edqn_jax.config.registry import FAMILIES, FIRST, LEARNERS, NETWORKS, SENSORS
+from edqn_jax.config.registry import ACTION_SETS, FAMILIES, FIRST, LEARNERS, NETWORKS, SENSORS
 from edqn_jax.errors import ConfigError
 
 
@@ -54,9 +54,12 @@ def validate(config: Config, *, trains: bool = True) -> None:
     _train(config.train)
     if config.env.drones > 1:
         _several_drones(config, trains)
+    if trains:
+        _potential(config)
     SENSORS.check(config.env.sensor)
     LEARNERS.check(config.agent.learner)
     NETWORKS.check(config.agent.network)
+    ACTION_SETS.check(config.env.actions)
     _replay(config.agent, config.train)
     _pqn(config.pqn)
     _samples(config.encoder, config.train)
@@ -67,6 +70,19 @@ def validate(config: Config, *, trains: bool = True) -> None:
         raise ConfigError(
             f"agent.turn needs a random world ({', '.join(FAMILIES)}, or {FIRST}), not '{config.world.name}': "
             "give --agent.no-turn, or turn: false in a file"
+        )
+
+
+def check_learns(config: Config) -> None:
+    """Raises unless the learners of the package can learn what the configuration flies.
+
+    Raises:
+        ConfigError: if actions are not moves.
+    """
+    if config.env.actions != "moves":
+        raise ConfigError(
+            f"agent.learner '{config.agent.learner}' chooses among moves: env.actions must be moves for training, not "
+            f"{config.env.actions}; docs/howto/continuous_actions.md says what learns with those"
         )
 
 
@@ -148,9 +164,17 @@ def _env(env: EnvConfig) -> None:
     _not_negative(env, "env", ["heading_hold_m", "progress_weight", "path_weight"])
     known = env.heading == "goal" or not env.position
     _require(known, "env.position", "false with env.heading flight", env.position)
+    _share(env, "env", ["potential_discount"])
     _finite(env, "env", ["goal_reward", "collision_reward", "left_volume_reward", "step_reward"])
     _require(env.action_delay in (0, 1), "env.action_delay", "0 or 1", env.action_delay)
     _require(1 <= env.drones <= 8, "env.drones", "from 1 to 8", env.drones)
+
+
+def _potential(config: Config) -> None:
+    gamma = config.agent.discount
+    same = config.env.reward != "potential" or config.env.potential_discount == gamma
+    limit = f"{gamma:g}, agent.discount, with env.reward potential"
+    _require(same, "env.potential_discount", limit, config.env.potential_discount)
 
 
 def _several_drones(config: Config, trains: bool) -> None:

@@ -61,7 +61,7 @@ since there only events tell where obstacles are. No direction is preferred, so 
 flight is through the paper's map, which training never uses (docs/ablation.md)."""
 
 CLOSED_WORLDS: Layer = {
-    "env": {"reward": "geodesic", "progress_weight": 6.0, "path_weight": 2.0},
+    "env": {"reward": "geodesic", "progress_weight": 6.0, "path_weight": 2.0, "potential_discount": 0.98},
     "agent": {"discount": 0.98, "n_step": 5},
 }
 """What rooms, forests and canyons change further: metres count along the way around obstacles, and more than the metres

@@ -160,8 +160,10 @@ class EnvConfig:
 
     sensor: str = "events"
     """What the drone observes besides its own state."""
+    actions: str = "moves"
+    """What an action commands. `edqn train` learns moves alone."""
     speed_m_s: float = 4.0
-    """Commanded speed per axis; an action is {-1, 0, 1}^3 times this, in the heading frame."""
+    """Commanded speed per axis of a move, in the heading frame."""
     goal_radius_m: float = 2.0
     """Body centre within this distance of the goal, at any physics step, is success."""
     max_decisions: int = 200
@@ -187,6 +189,8 @@ class EnvConfig:
     """Reward per metre gained towards the goal (`progress`, `geodesic`, `potential`)."""
     path_weight: float = 1.5
     """Reward lost per metre flown (`progress`, `geodesic`), so that detours cost something."""
+    potential_discount: float = 0.97
+    """gamma of the potential (`potential`), the same as `agent.discount`: with another, another policy is the best."""
     goal_reward: float = 100.0
     """Reward at the goal (Eq. 8)."""
     collision_reward: float = -100.0

@@ -39,7 +39,12 @@ def preset(name: str) -> Config:
                 mirror=False,
             ),
             env=EnvConfig(
-                reward="sparse", progress_weight=1.0, path_weight=0.0, left_volume_reward=0.0, step_reward=0.0
+                reward="sparse",
+                progress_weight=1.0,
+                path_weight=0.0,
+                potential_discount=0.99,
+                left_volume_reward=0.0,
+                step_reward=0.0,
             ),
             agent=AgentConfig(
                 hidden=(16, 16),

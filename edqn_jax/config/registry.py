@@ -173,6 +173,23 @@ FAMILIES = Registry(
 """Random worlds: `edqn_jax.sim.worlds.families.Family`, or a `Mixture` of some."""
 
 
+ACTION_SETS = Registry(
+    "set of actions",
+    "env.actions",
+    {
+        "moves": "edqn_jax.sim.task.action_sets:MOVES",
+        "velocity": "edqn_jax.sim.task.action_sets:VELOCITY",
+        "body-rates": "edqn_jax.sim.task.action_sets:BODY_RATES",
+    },
+    {
+        "moves": "{-1, 0, 1}^3 times `speed_m_s`, in the heading frame",
+        "velocity": "[-1, 1]^3 times it",
+        "body-rates": "thrust and rates about the body's axes",
+    },
+)
+"""What actions are and what they command: `edqn_jax.sim.task.action_sets.ActionSet`."""
+
+
 def has_detours(world: str) -> bool:
     """Returns whether a world is a random one in which the straight line to the goal is seldom free."""
     # Of built-in families without their modules, which import JAX.

@@ -16,7 +16,7 @@ from edqn_jax.learn.actor import Actor, AgentActor, PolicyParams, blank_observat
 from edqn_jax.sim.physics.drone import Flight
 from edqn_jax.sim.scene.scene import Scene
 from edqn_jax.sim.sensors.sensor import SensorMemory, at_rest, frame_steps, sense
-from edqn_jax.sim.task import env
+from edqn_jax.sim.task.observation import MOTION_SIZE, OWN_SIZE, Observation
 
 
 def decision_latency_ms(
@@ -68,7 +68,7 @@ def look_call(config: Config, params: PolicyParams, scene: Scene) -> Callable[[]
         params: PolicyParams, scene: Scene, poses: Flight, before: SensorMemory, memory: Array, key: Array
     ) -> Array:
         sensed, _ = sense(config, scene, poses, before, key)
-        seen = env.Observation(sensed=sensed, own=jnp.zeros(env.OWN_SIZE), motion=jnp.zeros(env.MOTION_SIZE))
+        seen = Observation(sensed=sensed, own=jnp.zeros(OWN_SIZE), motion=jnp.zeros(MOTION_SIZE))
         return actor.act(params, memory, seen, key)[0]
 
     params, scene, key = jax.device_put(params), jax.device_put(scene), jax.random.key(0)

@@ -20,8 +20,9 @@ from edqn_jax.errors import ConfigError
 from edqn_jax.keys import run_streams
 from edqn_jax.learn.actor import Actor, AgentActor, blank_observation
 from edqn_jax.sim.task import env, group
-from edqn_jax.sim.task.env import EnvState, Observation, Step, World
+from edqn_jax.sim.task.env import EnvState, Step, World
 from edqn_jax.sim.task.flights import Flights, Record, at_start, tally
+from edqn_jax.sim.task.observation import Observation
 from edqn_jax.sim.task.outcomes import Outcome
 
 

@@ -96,5 +96,6 @@ def step_many(program: Program, leaves: Leaves, encoder: EncoderParams, drones: 
 def reset_some(program: Program, leaves: Leaves, encoder: EncoderParams, drones: Drone, numbers: Array):
     """Resets the ended drones of these numbers [K] and returns their observations; other numbers stand for none."""
     ended = jax.tree.map(lambda x: x.at[numbers].get(mode="clip"), drones)
-    fresh, decided = jax.vmap(lambda drone: _step(program, leaves, encoder, drone, jnp.zeros((), jnp.int32)))(ended)
+    still = jnp.asarray(program.env.task.still)
+    fresh, decided = jax.vmap(lambda drone: _step(program, leaves, encoder, drone, still))(ended)
     return jax.tree.map(lambda x, y: x.at[numbers].set(y, mode="drop"), drones, fresh), decided.observed

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
-from typing import Any, Literal, NamedTuple, get_args
+from typing import Any, Literal, get_args
 
 import jax
 import jax.numpy as jnp
@@ -29,13 +29,14 @@ from edqn_jax.learn.perception import embedding
 from edqn_jax.learn.perception.code import Params as EncoderParams
 from edqn_jax.learn.policy import Policy
 from edqn_jax.policies.functions import check_has_params
-from edqn_jax.sim.actions import ACTIONS
+from edqn_jax.sim.actions import Box, Discrete
 from edqn_jax.sim.sensors.sensor import sensor_of
-from edqn_jax.sim.task import env
-from edqn_jax.sim.task.env import MOTION_SIZE, OWN_SIZE, EnvState, World
+from edqn_jax.sim.task.env import EnvState, World
 from edqn_jax.sim.task.environment import make as make_environment
+from edqn_jax.sim.task.observation import Observation
 from edqn_jax.sim.task.outcomes import Outcome, is_terminal
 from edqn_jax.sim.task.reward import Reward
+from edqn_jax.sim.task.task import Task, task_of
 
 Kind = Literal["image", "code", "kinematics"]
 """What a drone observes: an image with its own state and motion, one vector with a code, or one without."""
@@ -48,22 +49,6 @@ WORLDS = 64
 
 Observed = Any
 """An observation: a dict of `image` [H, W, ...], `own` [10] and `motion` [7], or a vector [N]; float32."""
-
-
-class Box(NamedTuple):
-    """Arrays of float32 between two bounds."""
-
-    low: float
-    high: float
-    shape: tuple[int, ...]
-    dtype: Any = jnp.float32
-
-
-class Discrete(NamedTuple):
-    """Whole numbers 0..n-1."""
-
-    n: int
-    dtype: Any = jnp.int32
 
 
 @struct.dataclass
@@ -89,23 +74,36 @@ class FunctionalEnv:
     observation: Kind
 
     @property
-    def num_actions(self) -> int:
-        """Returns the number of moves."""
-        return len(ACTIONS)
+    def task(self) -> Task:
+        """Returns the task that is flown, without what is observed of it."""
+        return task_of(self.config)
 
-    def action_space(self, params: Params | None = None) -> Discrete:
-        """Returns the space of moves."""
-        return Discrete(len(ACTIONS))
+    @property
+    def num_actions(self) -> int:
+        """Returns the number of moves.
+
+        Raises:
+            ConfigError: if actions are not numbered.
+        """
+        space = self.task.actions
+        if not isinstance(space, Discrete):
+            raise ConfigError(f"actions of '{self.config.env.actions}' have no numbers; ask `action_space`")
+        return space.n
+
+    def action_space(self, params: Params | None = None) -> Discrete | Box:
+        """Returns the space of actions: of moves numbers, of other `env.actions` a box."""
+        return self.task.actions
 
     @as_tested
     def observation_space(self, params: Params | None = None) -> Box | dict[str, Box]:
         """Returns the space of observations, of `image` one for each name."""
+        own, motion = self.task.own_size, self.task.motion_size
         if self.observation == "kinematics":
-            return _box(OWN_SIZE + MOTION_SIZE)
+            return _box(own + motion)
         if self.observation == "code":
-            return _box(embedding.size(self.config) + OWN_SIZE + MOTION_SIZE)
+            return _box(embedding.size(self.config) + own + motion)
         image = jax.eval_shape(lambda: _image_of(self.config)).shape
-        return {"image": _box(*image), "own": _box(OWN_SIZE), "motion": _box(MOTION_SIZE)}
+        return {"image": _box(*image), "own": _box(own), "motion": _box(motion)}
 
     @as_tested
     def reset(self, key: Array, params: Params, mission: Array | None = None) -> tuple[Observed, State]:
@@ -117,7 +115,7 @@ class FunctionalEnv:
             mission: [] int, which one; None draws one.
         """
         mission = None if mission is None else jnp.asarray(mission, jnp.int32)
-        flight, seen = env.reset(self.config, params.world, key, mission)
+        flight, seen = self.task.reset(params.world, key, mission)
         return self._observed(params, seen), State(flight)
 
     @as_tested
@@ -132,15 +130,15 @@ class FunctionalEnv:
 
         Args:
             key: consumed, in place of the state's own; with `state.flight.key` flights are those of `edqn_jax.make`.
-            action: [] int, 0..26.
+            action: [] int, 0..26; with another `env.actions` numbers [A] in [-1, 1], beyond which they are clipped. One
+                that is not finite ends the episode as diverged.
 
         Returns:
             observation, state, reward [], terminated [] bool: goal, collision, volume left or diverged, truncated []
             bool: out of time, and info: `outcome` [] int32 of `edqn_jax.Outcome`, `is_success` [] bool, `is_reset` []
             bool, `episode_return` [] and `episode_length` [] int32 of the episode so far.
         """
-        action = jnp.asarray(action, jnp.int32)  # which a user's own precision may have made int64
-        flight, step = env.step(self.config, params.world, dataclasses.replace(state.flight, key=key), action)
+        flight, step = self.task.step(params.world, dataclasses.replace(state.flight, key=key), action)
         info = {
             "outcome": step.outcome,
             "is_success": step.outcome == Outcome.GOAL,
@@ -171,7 +169,7 @@ class FunctionalEnv:
         info["final_observation"] = observed
         return choose(first, observed), choose(fresh, after), reward, terminated, truncated, info
 
-    def _observed(self, params: Params, seen: env.Observation) -> Observed:
+    def _observed(self, params: Params, seen: Observation) -> Observed:
         own, motion = _numbers(seen.own), _numbers(seen.motion)
         if self.observation == "kinematics":
             return jnp.concatenate([own, motion])

@@ -40,10 +40,11 @@ from edqn_jax.interop.drone_programs import (
     step_many,
     step_one,
 )
-from edqn_jax.interop.functional import Box, FunctionalEnv, Kind, Params
+from edqn_jax.interop.functional import FunctionalEnv, Kind, Params
 from edqn_jax.learn.perception.code import Params as EncoderParams
 from edqn_jax.learn.policy import Policy
-from edqn_jax.sim.actions import ACTIONS
+from edqn_jax.sim.actions import Box, Discrete
+from edqn_jax.sim.task.action_sets import described
 from edqn_jax.sim.task.env import EnvState
 from edqn_jax.sim.task.environment import Environment
 from edqn_jax.sim.task.outcomes import Outcome
@@ -87,6 +88,29 @@ class _Task:
         if isinstance(space, Box):
             return _box(space)
         return gymnasium.spaces.Dict({name: _box(box) for name, box in space.items()})
+
+    @property
+    def actions(self) -> Any:
+        """Returns the space of one drone's actions."""
+        space = self.env.action_space(self.params)
+        return gymnasium.spaces.Discrete(space.n) if isinstance(space, Discrete) else _box(space)
+
+    def action(self, given: Any, count: int | None) -> NDArray:
+        """Returns actions [count, ...], or one, as the programs take them.
+
+        Raises:
+            gymnasium.error.InvalidAction: if they are none.
+        """
+        space, numbers = self.env.action_space(self.params), np.asarray(given)
+        good = numbers.shape == (*(() if count is None else (count,)), *space.shape)
+        if isinstance(space, Discrete):
+            good = good and np.issubdtype(numbers.dtype, np.integer) and 0 <= numbers.min() <= numbers.max() < space.n
+        else:
+            good = good and np.issubdtype(numbers.dtype, np.number) and bool(np.isfinite(numbers).all())
+        if not good:
+            wanted = "an action must be" if count is None else f"there must be {count} actions, each"
+            raise gymnasium.error.InvalidAction(f"{wanted} {described(space)}")
+        return numbers.astype(space.dtype)
 
     def mission(self, options: dict[str, Any] | None, count: int | None) -> Array | None:
         """Returns which missions [count], or [] of one drone, the options of a reset ask for; None draws them.
@@ -182,7 +206,7 @@ class DroneEnv(gymnasium.Env):
             return
         self.task = _task(world, config, **options)
         self.observation_space = self.task.observations
-        self.action_space = gymnasium.spaces.Discrete(len(ACTIONS))
+        self.action_space = self.task.actions
         DroneEnv.spaces_before = self.observation_space, self.action_space
 
     @as_tested
@@ -207,11 +231,11 @@ class DroneEnv(gymnasium.Env):
         return _on_host(observed), {}
 
     @as_tested
-    def step(self, action: int) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+    def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Flies one decision of 0.26 s.
 
         Args:
-            action: number of a move, 0..26.
+            action: number of a move, 0..26; with another `env.actions` numbers [A], clipped to [-1, 1].
 
         Returns:
             observation; reward; terminated: goal, collision, volume left or diverged; truncated: out of time; info
@@ -219,14 +243,12 @@ class DroneEnv(gymnasium.Env):
 
         Raises:
             gymnasium.error.ResetNeeded: before the first reset, and after an episode has ended.
-            gymnasium.error.InvalidAction: if there is no such move.
+            gymnasium.error.InvalidAction: if there is no such action.
         """
         check_not_forked()
         if self.drone is None or self.drone.state.ended:
             raise gymnasium.error.ResetNeeded("there is no episode to step in; call reset first")
-        if not self.action_space.contains(action):
-            raise gymnasium.error.InvalidAction(f"a move must be a whole number from 0 to {len(ACTIONS) - 1}")
-        self.drone, decided = step_one(*self.task.program, self.drone, np.int32(action))
+        self.drone, decided = step_one(*self.task.program, self.drone, self.task.action(action, None))
         decided = _on_host(decided)
         outcome = Outcome(int(decided.outcome))
         info = {"outcome": outcome.name.lower(), "is_success": outcome is Outcome.GOAL}
@@ -290,7 +312,7 @@ class DroneVectorEnv(gymnasium.vector.VectorEnv):
         self.num_envs = num_envs
         self.render_mode = render_mode
         self.single_observation_space = self.task.observations
-        self.single_action_space = gymnasium.spaces.Discrete(len(ACTIONS))
+        self.single_action_space = self.task.actions
         batch = gymnasium.vector.utils.batch_space
         self.observation_space = batch(self.single_observation_space, num_envs)
         self.action_space = batch(self.single_action_space, num_envs)
@@ -338,11 +360,11 @@ class DroneVectorEnv(gymnasium.vector.VectorEnv):
         return [int(one) for one in seed]
 
     @as_tested
-    def step(self, actions: NDArray[np.integer]) -> tuple[Any, NDArray, NDArray, NDArray, dict[str, Any]]:
+    def step(self, actions: NDArray) -> tuple[Any, NDArray, NDArray, NDArray, dict[str, Any]]:
         """Flies one decision of every drone, or resets it.
 
         Args:
-            actions: [num_envs] numbers of moves, 0..26.
+            actions: [num_envs] numbers of moves, 0..26; with another `env.actions` [num_envs, A], clipped to [-1, 1].
 
         Returns:
             observations; rewards [num_envs] float32; terminated and truncated [num_envs] bool; info with
@@ -352,18 +374,13 @@ class DroneVectorEnv(gymnasium.vector.VectorEnv):
 
         Raises:
             gymnasium.error.ResetNeeded: before the first reset.
-            gymnasium.error.InvalidAction: if an action is no move.
+            gymnasium.error.InvalidAction: if there is no such action.
         """
         check_not_forked()
         if self.drones is None:
             raise gymnasium.error.ResetNeeded("there are no episodes to step in; call reset first")
-        moves = np.asarray(actions)
-        whole = np.issubdtype(moves.dtype, np.integer) and moves.shape == (self.num_envs,)
-        if not whole or moves.min() < 0 or moves.max() >= len(ACTIONS):
-            raise gymnasium.error.InvalidAction(
-                f"moves must be {self.num_envs} whole numbers from 0 to {len(ACTIONS) - 1}"
-            )
-        self.drones, decided = step_many(*self.task.program, self.drones, moves.astype(np.int32))
+        chosen = self.task.action(actions, self.num_envs)
+        self.drones, decided = step_many(*self.task.program, self.drones, chosen)
         decided = _on_host(decided)
         ended = decided.terminated | decided.truncated
         info: dict[str, Any] = {}

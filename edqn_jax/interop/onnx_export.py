@@ -27,7 +27,7 @@ from edqn_jax.policies.functions import check_has_params
 from edqn_jax.sim.actions import ACTIONS, move_name
 from edqn_jax.sim.sensors import events
 from edqn_jax.sim.sensors.events import EventField
-from edqn_jax.sim.task.env import MOST_YAW_RATE, MOTION_SIZE, OWN_SIZE, Observation
+from edqn_jax.sim.task.observation import MOST_YAW_RATE, MOTION_SIZE, OWN_SIZE, Observation
 from edqn_jax.version import package_version
 
 RUNNER = "edqn_runner.py"

@@ -44,7 +44,7 @@ class DroneVecEnv(vec_env.VecEnv):
         same = gymnasium.vector.AutoresetMode.SAME_STEP
         self.envs = gymnasium.make_vec(name, num_envs=num_envs, autoreset_mode=same, **options)
         super().__init__(num_envs, self.envs.single_observation_space, self.envs.single_action_space)
-        self._actions: NDArray[np.integer] | None = None
+        self._actions: NDArray | None = None
 
     def reset(self) -> Any:
         """Begins an episode of every drone; returns the first observations. Seeds and options are used once."""
@@ -56,8 +56,8 @@ class DroneVecEnv(vec_env.VecEnv):
         self._reset_options()
         return observed
 
-    def step_async(self, actions: NDArray[np.integer]) -> None:
-        """Keeps the moves [num_envs], numbers 0..26, for `step_wait`."""
+    def step_async(self, actions: NDArray) -> None:
+        """Keeps the actions [num_envs, ...] for `step_wait`."""
         self._actions = actions
 
     def step_wait(self) -> tuple[Any, NDArray, NDArray, list[dict[str, Any]]]:

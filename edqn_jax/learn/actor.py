@@ -20,10 +20,10 @@ from edqn_jax.learn.learner import learner_of
 from edqn_jax.learn.perception import embedding
 from edqn_jax.learn.qnetwork import Params
 from edqn_jax.sim.sensors.sensor import sensor_of
-from edqn_jax.sim.task.env import MOTION_SIZE, OWN_SIZE, Observation
+from edqn_jax.sim.task.observation import MOTION_SIZE, OWN_SIZE, Observation
 
 MOVE_SIZE = 3
-"""Values of the last move, which end the own motion (`sim.env.own_motion`)."""
+"""Values of the last move, which end the own motion (`sim.task.observation.own_motion`)."""
 
 Memory = Array
 """[H, D] the newest observations as the network sees them, newest last; zeros before an episode began."""

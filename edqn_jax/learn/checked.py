@@ -22,8 +22,8 @@ from edqn_jax.errors import CheckError
 from edqn_jax.learn.learner import learner_of
 from edqn_jax.learn.updates import flat
 from edqn_jax.sim.actions import ACTIONS
-from edqn_jax.sim.task import env
-from edqn_jax.sim.task.env import EnvState, World
+from edqn_jax.sim.task.env import EnvState, Step, World
+from edqn_jax.sim.task.task import task_of
 
 Run = Callable[[World, Any, Array], tuple[Any, Any]]
 """A chunk: from world, train state and the numbers of its steps to the state and what it returns."""
@@ -75,12 +75,12 @@ class CheckedChunk:
         return after, found
 
 
-def _decide(config: Config, world: World, state: EnvState) -> env.Step:
+def _decide(config: Config, world: World, state: EnvState) -> Step:
     """Takes a decision of every environment [S, E], each with another move."""
     state = jax.tree.map(flat, state)
     count = state.decision.shape[0]
     moves = jnp.arange(count, dtype=jnp.int32) % len(ACTIONS)
-    return one_by_one(lambda state, move: env.step(config, world, state, move)[1])(state, moves)
+    return one_by_one(lambda state, move: task_of(config).step(world, state, move)[1])(state, moves)
 
 
 def _check_shapes(config: Config, state: Any) -> None:

@@ -19,7 +19,7 @@ from edqn_jax.learn.perception import embedding, vae
 from edqn_jax.learn.qnetwork import Params
 from edqn_jax.sim.sensors.events import EventField
 from edqn_jax.sim.sensors.sensor import DEPTH_SCALE, Sensed, distance_of, sensor_of
-from edqn_jax.sim.task.env import Observation
+from edqn_jax.sim.task.observation import Observation
 
 
 def fresh_policy(config: Config, seed: int = 0) -> PolicyParams:

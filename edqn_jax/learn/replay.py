@@ -21,8 +21,8 @@ from jax import Array
 from edqn_jax.checks import check_index
 from edqn_jax.config import AgentConfig
 from edqn_jax.keys import integers
-from edqn_jax.sim.task.env import OWN_SIZE, turned
 from edqn_jax.sim.task.outcomes import Outcome
+from edqn_jax.sim.task.task import Task
 
 
 @struct.dataclass
@@ -78,13 +78,14 @@ def stacked(rows: Array, is_reset: Array) -> Array:
     return jnp.where((after == 0)[:, None], rows, 0.0)
 
 
-def sample(config: AgentConfig, ring: Rows, time: Array, batch: int, key: Array) -> Batch:
+def sample(config: AgentConfig, ring: Rows, time: Array, batch: int, key: Array, task: Task | None = None) -> Batch:
     """Draws B = `batch` transitions of one shard, uniform over the rows that can start one.
 
     Args:
         ring: [L, E, ...].
         time: the newest row's, as in `write`.
         key: consumed.
+        task: that was flown; None will do where `config.turn` is off.
     """
     length, envs = ring.reward.shape
     n, h = config.n_step, config.history
@@ -98,15 +99,16 @@ def sample(config: AgentConfig, ring: Rows, time: Array, batch: int, key: Array)
     if not config.turn:
         return drawn
     quarters = jnp.broadcast_to(integers(more[0], (batch, 1), 4), (batch, h))
-    return dataclasses.replace(
-        drawn, history=_turned(drawn.history, quarters), next_history=_turned(drawn.next_history, quarters)
-    )
+    assert task is not None
+    history, next_history = (_turned(task, each, quarters) for each in (drawn.history, drawn.next_history))
+    return dataclasses.replace(drawn, history=history, next_history=next_history)
 
 
-def _turned(history: Array, quarters: Array) -> Array:
+def _turned(task: Task, history: Array, quarters: Array) -> Array:
     """Returns observations [B, H, D] with own states turned by quarters [B, H]; those before an episode stay zero."""
-    seen, own = jnp.split(history, [history.shape[-1] - OWN_SIZE], axis=-1)
-    return jnp.concatenate([seen, turned(own, quarters)], axis=-1)
+    assert task.turn is not None
+    seen, own = jnp.split(history, [history.shape[-1] - task.own_size], axis=-1)
+    return jnp.concatenate([seen, task.turn(own, quarters)], axis=-1)
 
 
 def _transition(config: AgentConfig, ring: Rows, start: Array, env: Array) -> Batch:

@@ -10,7 +10,7 @@ nothing else of them is read.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import jax
 import jax.numpy as jnp
@@ -25,7 +25,8 @@ from edqn_jax.learn.perception import vae
 from edqn_jax.learn.perception.vae import Target
 from edqn_jax.sim.sensors.events import EventField
 from edqn_jax.sim.sensors.sensor import flip_left_right
-from edqn_jax.sim.task.env import MIRRORED_MOTION, Observation
+from edqn_jax.sim.task.observation import Observation
+from edqn_jax.sim.task.task import Task
 
 MOST_EVENTS = 2**15 - 1
 """More events of a pixel than this are stored as this many."""
@@ -89,6 +90,7 @@ def draw(
     time: Array,
     count: int,
     key: Array,
+    task: Task | None = None,
     mirror: Callable[[Array], Array] = flip_left_right,
 ) -> Samples:
     """Returns `count` samples of one shard, each of which is uniform.
@@ -96,6 +98,7 @@ def draw(
     Args:
         time: [] int32, how many decisions have been kept, at least 1.
         key: consumed.
+        task: that was flown; None will do where `config.mirror` is off.
         mirror: of the sensor, see `Sensor.mirror`.
     """
     rows, envs = ring.motion.shape[:2]
@@ -108,23 +111,30 @@ def draw(
     drawn = jax.tree.map(lambda leaf: leaf[row, env], ring)
     if not config.mirror:
         return drawn
+    assert task is not None and task.mirror is not None
     # Half of them; of an odd number the one in the middle is mirrored or not.
     half = count // 2
-    turned = jax.tree.map(lambda leaf: leaf[: half + 1 if coin_key else half], mirrored(drawn, mirror))
+    reflected = mirrored(drawn, task.mirror, mirror)
+    turned = jax.tree.map(lambda leaf: leaf[: half + 1 if coin_key else half], reflected)
     if coin_key:
         middle = jax.random.bernoulli(*coin_key)
         turned = jax.tree.map(lambda new, old: new.at[half].set(jnp.where(middle, new[half], old[half])), turned, drawn)
     return jax.tree.map(lambda new, old: jnp.concatenate([new, old[len(new) :]]), turned, drawn)
 
 
-def mirrored(samples: Samples, mirror: Callable[[Array], Array] = flip_left_right) -> Samples:
-    """Returns samples [...] as they would be with left and right exchanged; `mirror` is the sensor's."""
+def mirrored(samples: Samples, factors: Sequence[float], mirror: Callable[[Array], Array] = flip_left_right) -> Samples:
+    """Returns samples [...] as they would be with left and right exchanged.
+
+    Args:
+        factors: [MOTION_SIZE] of the own motion.
+        mirror: of the sensor, see `Sensor.mirror`.
+    """
     # The standing waves across the image that change their sign are the odd ones.
     amplitudes = samples.wanted.amplitudes
     signs = jnp.asarray(1.0 - 2.0 * (np.arange(amplitudes.shape[-1]) % 2), jnp.float32)
     return Samples(
         sensed=jax.tree.map(mirror, samples.sensed),
-        motion=samples.motion * jnp.asarray(MIRRORED_MOTION),
+        motion=samples.motion * jnp.asarray(factors),
         wanted=Target(amplitudes * signs, samples.wanted.beyond),
     )
 

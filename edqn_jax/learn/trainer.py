@@ -21,6 +21,7 @@ from flax import struct
 from jax import Array, lax
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
+from edqn_jax.checks import is_finite
 from edqn_jax.config import Config
 from edqn_jax.devices import processes
 from edqn_jax.devices.devices import compiler_options
@@ -40,10 +41,11 @@ from edqn_jax.learn.updates import (
     update_vae,
 )
 from edqn_jax.native.all_sum import all_sum
-from edqn_jax.sim.actions import ACTIONS
-from edqn_jax.sim.task import env, group
-from edqn_jax.sim.task.env import EnvState, World
+from edqn_jax.sim.actions import Discrete
+from edqn_jax.sim.task import group
+from edqn_jax.sim.task.env import EnvState, Step, World
 from edqn_jax.sim.task.outcomes import Outcome
+from edqn_jax.sim.task.task import task_of
 
 AXIS = "env"
 """Name of the mesh axis that shards are spread over."""
@@ -141,7 +143,8 @@ def init(config: Config, world: World, key: Array) -> TrainState:
         )
     keys = InitialKeys.split(key, envs, shards)
     # Nothing has been seen yet: the first step is every environment's reset.
-    state = group.each(config, lambda k: env.ended(config, world, k))(keys.environments)
+    task = task_of(config)
+    state = task.map(lambda k: task.begin(world, k, None))(keys.environments)
     networks, memory = init_networks(config, keys.learner), AgentActor(config).init()
     ring = replay.empty(learner_of(config).ring_length(config), envs // shards, observation_size(config))
     flat = Actors(
@@ -168,16 +171,17 @@ def _empty_samples(config: Config, world: World, state: EnvState) -> Samples | N
     """Returns the rings [S, L, E, ...] of what the VAE learns from; None where there is no VAE."""
     if not embedding.has_code(config):
         return None
-    shards, envs = config.train.shards, config.train.num_envs
+    task, shards, envs = task_of(config), config.train.shards, config.train.num_envs
 
     def one(state: EnvState) -> Samples:
-        step = env.step(config, world, state, jnp.zeros((), jnp.int32))[1]
+        step = task.step(world, state, task.still)[1]
         observation = embedding.as_encoder_input(config, step.observation)
-        wanted = samples.target_of(config.encoder, observation, env.nearness(config, world, state))
+        near = None if task.label is None else task.label(world, state)
+        wanted = samples.target_of(config.encoder, observation, near)
         return samples.samples_of(config.encoder, observation, wanted)
 
     if group.several(config):
-        whole = jax.eval_shape(group.each(config, one), state)
+        whole = jax.eval_shape(task.map(one), state)
         shapes = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), whole)
     else:
         shapes = jax.eval_shape(one, jax.tree.map(lambda x: x[0], state))
@@ -219,7 +223,7 @@ def train_step(
     ring = _store(actors, action, time)
     flown, seen = _fly(config, world, actors, action)
     rings = _keep(config, world, actors, flown, seen, step)
-    spoilt = ~env.is_finite((networks.vae, networks.encoder, learner_of(config).network(networks.agent)))
+    spoilt = ~is_finite((networks.vae, networks.encoder, learner_of(config).network(networks.agent)))
     of_vae, networks = update_vae(config, axis, networks, rings, keys.vae, step)
     last = of_vae.metrics["reconstruction_loss"]
     of_agent, agent = learner_of(config).update(config, axis, networks.agent, Rings(ring, time, keys.dqn), last)
@@ -279,7 +283,7 @@ def _act(
     plan, envs = Plan.of(config), config.train.num_envs
     progress = Exploration(time * envs, (plan.scheduled - plan.warmup) * envs, actors.episodes)
     chosen, metrics = learner_of(config).act(config, networks.agent, actors.memory, keys.act, progress)
-    manoeuvre = jax.vmap(partial(_manoeuvre, config.encoder.hold_decisions))(actors.manoeuvre, keys.manoeuvre)
+    manoeuvre = jax.vmap(partial(_manoeuvre, config))(actors.manoeuvre, keys.manoeuvre)
     return jnp.where(warming, manoeuvre, chosen), manoeuvre, metrics
 
 
@@ -295,13 +299,14 @@ def _store(actors: Actors, action: Array, time: Array) -> replay.Rows:
     return jax.vmap(replay.write, in_axes=(0, 0, None))(actors.replay, rows, time)
 
 
-def _fly(config: Config, world: World, actors: Actors, action: Array) -> tuple[EnvState, env.Step]:
+def _fly(config: Config, world: World, actors: Actors, action: Array) -> tuple[EnvState, Step]:
     """Steps all environments, [S * E, ...]."""
-    each = one_by_one if config.train.debug else partial(group.each, config)
-    return each(lambda s, a: env.step(config, world, s, a))(jax.tree.map(flat, actors.env), flat(action))
+    task = task_of(config)
+    each = one_by_one if config.train.debug else task.map
+    return each(lambda s, a: task.step(world, s, a))(jax.tree.map(flat, actors.env), flat(action))
 
 
-def _remember(config: Config, networks: Networks, actors: Actors, seen: env.Step, step: Array) -> Array:
+def _remember(config: Config, networks: Networks, actors: Actors, seen: Step, step: Array) -> Array:
     """Returns memories [S * E, H, D] with the new observations, encoded once; new episodes or encoders begin empty."""
     forget = seen.is_reset | Plan.of(config).replaces_encoder(step)
     memory = jnp.where(forget[:, None, None], 0.0, flat(actors.memory))
@@ -313,10 +318,12 @@ def _shaped(shape: tuple[int, ...], tree: Any) -> Any:
     return jax.tree.map(lambda x: x.reshape(*shape, *x.shape[1:]), tree)
 
 
-def _manoeuvre(hold: int, held: Array, key: Array) -> Array:
-    """Returns random moves [E] that are held for `hold` decisions on average."""
+def _manoeuvre(config: Config, held: Array, key: Array) -> Array:
+    """Returns random moves [E] that are held for `encoder.hold_decisions` decisions on average."""
+    moves = task_of(config).actions
+    assert isinstance(moves, Discrete)
     coin, draw = jax.random.uniform(key, (2, *held.shape))
-    return jnp.where(coin < 1.0 / hold, (draw * len(ACTIONS)).astype(held.dtype), held)
+    return jnp.where(coin < 1.0 / config.encoder.hold_decisions, (draw * moves.n).astype(held.dtype), held)
 
 
 def _publish(config: Config, networks: Networks, step: Array) -> Networks:
@@ -329,7 +336,7 @@ def _publish(config: Config, networks: Networks, step: Array) -> Networks:
     return dataclasses.replace(networks, encoder=encoder)
 
 
-def _keep(config: Config, world: World, actors: Actors, flown: EnvState, seen: env.Step, step: Array) -> Samples | None:
+def _keep(config: Config, world: World, actors: Actors, flown: EnvState, seen: Step, step: Array) -> Samples | None:
     """Returns the VAE's rings [S, L, E, ...], with this step's observations [S * E, ...] if the VAE learns in it.
 
     Only then are labels rendered. None where there is no VAE.
@@ -343,7 +350,9 @@ def _keep(config: Config, world: World, actors: Actors, flown: EnvState, seen: e
     def target() -> vae.Target:
         near = None
         if embedding.needs_nearness(config):
-            near = group.each(config, partial(env.nearness, config, world))(flown)
+            task = task_of(config)
+            assert task.label is not None
+            near = task.map(partial(task.label, world))(flown)
         return samples.target_of(config.encoder, observation, near)
 
     nothing = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(target))

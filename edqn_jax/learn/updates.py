@@ -14,6 +14,7 @@ import optax
 from flax import struct
 from jax import Array, lax
 
+from edqn_jax.checks import is_finite
 from edqn_jax.config import Config
 from edqn_jax.keys import split_each
 from edqn_jax.learn import samples
@@ -25,7 +26,7 @@ from edqn_jax.learn.qnetwork import Params
 from edqn_jax.learn.samples import Samples
 from edqn_jax.native.all_sum import all_sum
 from edqn_jax.sim.sensors.sensor import sensor_of
-from edqn_jax.sim.task.env import is_finite
+from edqn_jax.sim.task.task import task_of
 
 VAE_METRICS = ("reconstruction_loss", "kl")
 
@@ -67,7 +68,7 @@ def update_vae(
         keys: [S] of the shards on this device, consumed.
         step: [] int32, of training.
     """
-    plan = Plan.of(config)
+    plan, task = Plan.of(config), task_of(config)
     if rings is None:
         return UpdateStats.none(*VAE_METRICS), networks
     share = config.encoder.batch_size // config.train.shards
@@ -82,7 +83,7 @@ def update_vae(
 
     def update(networks: Networks, keys: Array):
         draw_keys, noise_keys = split_each(keys, 2)
-        draw = lambda ring, key: samples.draw(config.encoder, ring, kept, share, key, mirror)  # noqa: E731
+        draw = lambda ring, key: samples.draw(config.encoder, ring, kept, share, key, task, mirror)  # noqa: E731
         batch = jax.vmap(draw)(rings, draw_keys)
         # Each shard draws its own noise, so that the layout on devices does not change it.
         noise = jax.vmap(lambda key: jax.random.normal(key, (share, config.encoder.code_size)))(noise_keys)

@@ -26,8 +26,7 @@ from edqn_jax.sim.physics import drone
 from edqn_jax.sim.physics.drone import Flight
 from edqn_jax.sim.scene.scene import Scene, scene_at
 from edqn_jax.sim.sensors import sensor
-from edqn_jax.sim.task import env
-from edqn_jax.sim.task.env import MOTION_SIZE
+from edqn_jax.sim.task.observation import MOTION_SIZE, OWN_SIZE, Observation, heading_velocity
 
 FINE = 8
 """How much finer than the drone's camera the RGB pictures for people are, per axis."""
@@ -124,7 +123,7 @@ class Sights:
             if embedding.needs_nearness(config):
                 nearness = sensor.nearness_image(config, now, position[-1], quaternion[-1])
             # What it knows of the goal is no part of a code.
-            observation = env.Observation(sensed=sensed, own=jnp.zeros(env.OWN_SIZE), motion=motion)
+            observation = Observation(sensed=sensed, own=jnp.zeros(OWN_SIZE), motion=motion)
             code = actor.code(actor.encode(params, actor.init(), observation))
             read = shows.encoder_input(config, sensed)
             assert read is not None
@@ -176,7 +175,7 @@ def coarse(picture: np.ndarray) -> np.ndarray:
 
 
 def own_motions(config: Config, flown: Mapping[str, np.ndarray], rows: np.ndarray) -> np.ndarray:
-    """Returns the own motions [D, MOTION_SIZE] at the last of each decision's rows [D, T], as `env.own_motion`.
+    """Returns the own motions [D, MOTION_SIZE] at the last of each decision's rows [D, T], as `own_motion`.
 
     The yaw rate is that of the heading between the last two rows, which a trajectory holds.
     """
@@ -185,7 +184,7 @@ def own_motions(config: Config, flown: Mapping[str, np.ndarray], rows: np.ndarra
     yaw = drone.yaw_of(jnp.asarray(now))
     rate = drone.wrap_angle(yaw - drone.yaw_of(jnp.asarray(before))) / config.drone.physics_dt_s
     velocity = np.stack([flown[name] for name in ("vx", "vy", "vz")], axis=-1)[last]
-    ahead = env.heading_velocity(config.env, yaw, jnp.asarray(velocity))
+    ahead = heading_velocity(config.env, yaw, jnp.asarray(velocity))
     moves = ACTIONS[flown["action"][last].astype(int)]
     return np.concatenate([ahead, np.asarray(rate)[:, None], moves], axis=-1).astype(np.float32)
 

@@ -102,7 +102,7 @@ def _loaded(folder: Path, file: Path) -> tuple[Config, PolicyParams]:
     if not layer:
         raise ConfigError(f"'{file}' is empty: it does not say what the policy beside it is")
     config = apply(Config(), layer, str(file))
-    validate(config)
+    validate(config, trains=False)
     params = load_params(folder / "checkpoints", file)
     fresh = jax.eval_shape(lambda: fresh_policy(config))
     if _shapes(params) != _shapes(fresh):

@@ -1,8 +1,9 @@
-"""The moves that a drone can make: one grid of directions in the heading frame, by number, vector or name."""
+"""Spaces of actions, and the moves: one grid of directions in the heading frame, by number, vector or name."""
 
 from __future__ import annotations
 
 import difflib
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
@@ -11,6 +12,28 @@ from jax.core import Tracer
 from jax.typing import ArrayLike
 
 from edqn_jax.errors import ConfigError
+
+
+class Box(NamedTuple):
+    """Arrays of float32 between two bounds."""
+
+    low: float
+    high: float
+    shape: tuple[int, ...]
+    dtype: Any = jnp.float32
+
+
+class Discrete(NamedTuple):
+    """Whole numbers 0..n-1."""
+
+    n: int
+    dtype: Any = jnp.int32
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Returns the shape of one, ()."""
+        return ()
+
 
 ACTIONS = np.stack(np.meshgrid(*[[-1, 0, 1]] * 3, indexing="ij"), -1).reshape(27, 3)
 """The 27 moves, {-1, 0, 1}^3: ahead, left, up in the heading frame."""
@@ -52,7 +75,7 @@ def move_number(move: str | ArrayLike) -> Array:
     25 25
     """
     if isinstance(move, str):
-        return jnp.int32(_number_of(_vector_of(move)))
+        return jnp.int32(named_move(move))
     if isinstance(move, Tracer):
         traced = jnp.asarray(_number_of(move) if move.shape == (3,) else move)
         return traced.astype(jnp.int32)
@@ -62,6 +85,15 @@ def move_number(move: str | ArrayLike) -> Array:
     if given.shape == (3,) and np.isin(given, (-1, 0, 1)).all():
         return jnp.int32(_number_of(given))
     raise ConfigError(f"a move is a number from 0 to 26, a vector of three from -1, 0 and 1, or a name, not {move!r}")
+
+
+def named_move(name: str) -> int:
+    """Returns the number 0..26 of a named move, without JAX.
+
+    Raises:
+        ConfigError: if there is no such move.
+    """
+    return int(_number_of(_vector_of(name)))
 
 
 def _number_of(vector):

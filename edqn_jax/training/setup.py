@@ -14,7 +14,7 @@ import numpy as np
 from jax.sharding import Mesh
 
 from edqn_jax.config import Config
-from edqn_jax.config.limits import validate
+from edqn_jax.config.limits import check_learns, validate
 from edqn_jax.devices import processes
 from edqn_jax.devices.devices import choose_devices
 from edqn_jax.devices.forks import check_not_forked
@@ -71,6 +71,7 @@ class Preparation:
         self.configs = _of_agents(config, agents)
         for each in self.configs:
             validate(each)
+            check_learns(each)
         self.config, self.display, self.pool, self.began = config, display, pool, time.perf_counter()
         display.phase("preparing worlds")
         self.devices = choose_devices(1 if config.train.debug else config.train.devices, config.train.shards)

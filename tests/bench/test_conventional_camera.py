@@ -16,7 +16,6 @@ from edqn_jax.sim.camera import camera as our_camera
 from edqn_jax.sim.scene.distance import signed_distance
 from edqn_jax.sim.sensors import events as our_events
 from edqn_jax.sim.sensors import sensor as our_sensor
-from edqn_jax.sim.task import env as our_env
 from tests.bench.conventional_course import paper
 from tests.oracles import camera_plain, event_fields, events_plain
 from tests.sim.drawn_scenes import every_kind, free_points
@@ -176,7 +175,7 @@ def test_the_fleet_sees_what_the_two_frames_show():
     for action in (22, 22, 25):
         fleet.record.action[:] = action
         fleet.step(restart=False)
-    first, last = our_env.frame_steps(config)
+    first, last = our_sensor.frame_steps(config)
     frames = [pictures(config.camera, paper(), fleet.path[:, at].copy())[0] for at in (first, last)]
     expected = np.zeros((2, config.camera.height * config.camera.width), np.int8)
     events.signed_counts(events.law_of(config.events), *(f.reshape(2, -1) for f in frames), expected)

@@ -32,6 +32,7 @@ from edqn_jax.sim.physics.drone import DroneState
 from edqn_jax.sim.sensors import events
 from edqn_jax.sim.task import env, outcomes
 from edqn_jax.sim.task.env import EnvState
+from edqn_jax.sim.task.observation import MOST_YAW_RATE, own_state
 from edqn_jax.sim.task.outcomes import Outcome
 from edqn_jax.sim.task.reward import configured_reward
 from tests.bench.conventional_course import course_of, fleet_of, paper, world_of
@@ -157,7 +158,7 @@ def test_one_decision_from_any_state_ends_where_ours_does_and_is_judged_alike():
     upright = fleet.state[:, 3] ** 2 + fleet.state[:, 6] ** 2 > 0.5
     assert upright.mean() > 0.9
     np.testing.assert_allclose(motion[upright, 3], ours[upright, 3], atol=10 * VELOCITY)
-    assert np.abs(motion[:, 3]).max() <= env.MOST_YAW_RATE
+    assert np.abs(motion[:, 3]).max() <= MOST_YAW_RATE
     np.testing.assert_array_equal(motion[:, 4:], ours[:, 4:])
 
 
@@ -167,9 +168,7 @@ def test_every_reward_is_ours_for_every_outcome(name):
     rules, rng = task.rules_of(config), np.random.default_rng(0)
     for outcome in Outcome:
         before, after, flown = rng.uniform(0, 100, 3)
-        ours = configured_reward(
-            config.env, config.agent.discount, jnp.int32(outcome), jnp.float32(before), jnp.float32(after), flown
-        )
+        ours = configured_reward(config.env, jnp.int32(outcome), jnp.float32(before), jnp.float32(after), flown)
         np.testing.assert_allclose(
             task.reward_of(rules, int(outcome), before, after, flown), ours, rtol=1e-5, atol=1e-4
         )
@@ -210,7 +209,7 @@ def test_a_reset_is_ours():
     DRONE.reset(options={"mission": 1})
     assert DRONE.step(22)[0]["motion"].any()
     got, info = DRONE.reset(seed=1, options={"mission": 1})
-    np.testing.assert_allclose(got["own"], env.own_state(CONFIG.env, paper(), jnp.asarray(goal), body), atol=1e-6)
+    np.testing.assert_allclose(got["own"], own_state(CONFIG.env, paper(), jnp.asarray(goal), body), atol=1e-6)
     np.testing.assert_allclose(DRONE.fleet.state[0, 3:7], body.quaternion, atol=1e-6)
     np.testing.assert_allclose(DRONE.fleet.yaw_setpoint[0], body.yaw_setpoint, atol=1e-6)
     assert not got["events"].any() and not got["motion"].any() and info["outcome"] == "RUNNING"

@@ -25,7 +25,7 @@ from edqn_jax.learn.perception import vae
 from edqn_jax.learn.perception.waves import cosines
 from edqn_jax.runs.directory import plain
 from edqn_jax.sim.sensors.events import EventField
-from edqn_jax.sim.task.env import MOTION_SIZE, OWN_SIZE
+from edqn_jax.sim.task.observation import MOTION_SIZE, OWN_SIZE
 from edqn_jax.sim.task.outcomes import Outcome
 from measurement.flags import configured
 from rivals import stack

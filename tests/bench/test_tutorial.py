@@ -22,7 +22,8 @@ from edqn_jax.sim.camera import camera
 from edqn_jax.sim.physics import drone
 from edqn_jax.sim.scene.mjcf import load_scene
 from edqn_jax.sim.sensors import events
-from edqn_jax.sim.task import env
+from edqn_jax.sim.task.action_sets import bearing, velocity_command
+from edqn_jax.sim.task.observation import own_state
 from tutorial_stack.control import thrusts
 from tutorial_stack.env import Look, TutorialDrone, event_image
 
@@ -96,16 +97,16 @@ def test_a_flight_is_that_of_edqn_jax(flown: TutorialDrone, world: Path) -> None
     observed, _ = flown.reset(seed=0)
     body = drone.hover(jnp.asarray(flown.start, jnp.float32), jnp.float32(0.0))
     scene, airframe = load_scene(world), drone.load_airframe(CONFIG.drone)
-    own = env.own_state(CONFIG.env, scene, jnp.asarray(flown.goal), body)
+    own = own_state(CONFIG.env, scene, jnp.asarray(flown.goal), body)
     np.testing.assert_allclose(observed[-10:], own, atol=1e-6)
     assert not observed[:-10].any()  # at rest nothing changes
     fly = jax.jit(partial(drone.fly, CONFIG.drone, airframe))
     for action in (move(1, 1, 0), move(1, 0, 1), move(0, -1, -1)):
-        command = env.velocity_command(CONFIG.env, jnp.int32(action), drone.yaw_of(body.quaternion))
-        body, _ = fly(body, command, env.bearing(CONFIG.env, body, jnp.asarray(flown.goal, jnp.float32)))
+        command = velocity_command(CONFIG.env, jnp.int32(action), drone.yaw_of(body.quaternion))
+        body, _ = fly(body, command, bearing(CONFIG.env, body, jnp.asarray(flown.goal, jnp.float32)))
         observed, reward, *_ = flown.step(action)
         np.testing.assert_allclose(flown.data.qpos[:3], body.position, atol=5e-3)  # float64 there
-        own = env.own_state(CONFIG.env, scene, jnp.asarray(flown.goal), body)
+        own = own_state(CONFIG.env, scene, jnp.asarray(flown.goal), body)
         np.testing.assert_allclose(observed[-10:], own, atol=5e-3)
         assert observed[:-10].any() and math.isfinite(reward)
 

@@ -273,6 +273,11 @@ def test_every_numeric_option_has_limits(group, option, nonsense):
         ("encoder", {"retrain_at": (1.0,)}, "encoder.retrain_at must be shares between 0 and 1"),
         ("encoder", {"retrain_at": (0.5,), "warmup_decisions": 0}, "warmup_decisions must be at least 1 where"),
         ("encoder", {"batch_size": 12}, r"encoder.batch_size must be a multiple of train.shards \(8\), such as 16"),
+        (
+            "env",
+            {"reward": "potential", "potential_discount": 0.9},
+            "must be 0.97, agent.discount, with env.reward potential",
+        ),
         ("env", {"heading": "flight"}, "env.position must be false with env.heading flight, not True"),
         ("agent", {"turn": True}, r"agent.turn needs a random world \(sparse, .*\), not 'paper': give --agent.no-turn"),
         (

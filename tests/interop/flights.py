@@ -15,7 +15,7 @@ from edqn_jax.sim.actions import ACTIONS
 from edqn_jax.sim.physics import drone
 from edqn_jax.sim.sensors import events
 from edqn_jax.sim.sensors.events import EventField
-from edqn_jax.sim.task import env
+from edqn_jax.sim.task.action_sets import heading_setpoint, velocity_command
 from tests.oracles import event_fields
 
 
@@ -45,7 +45,7 @@ def flown(policy: Policy, world: str = "medium", mission: int = 0, worlds: int =
         move, memory = policy.act(seen, memory)
         body = state.drone
         yaw = drone.yaw_of(body.quaternion)
-        command = env.velocity_command(config.env, move, yaw)
+        command = velocity_command(config.env, move, yaw)
         given = {
             "position": np.asarray(body.position),
             "quaternion": np.asarray(body.quaternion),
@@ -56,7 +56,7 @@ def flown(policy: Policy, world: str = "medium", mission: int = 0, worlds: int =
         }
         packet = events.expand(_field(config, seen.sensed))
         packet["t"] += until_us - window_us
-        setpoint = float(env.heading_setpoint(config.env, body, jax.numpy.asarray(goal), command))
+        setpoint = float(heading_setpoint(config.env, body, jax.numpy.asarray(goal), command))
         own, motion = np.asarray(seen.own), np.asarray(seen.motion)
         assert np.array_equal(motion[4:], last)
         decisions.append(Decided(packet, until_us, given, int(move), np.asarray(command), own, motion, setpoint))

@@ -23,8 +23,8 @@ from edqn_jax.interop.recordings.recording import Recording
 from edqn_jax.interop.recordings.seen_events import seen_by, window_ends
 from edqn_jax.learn.perception import vae
 from edqn_jax.learn.policy import Policy
-from edqn_jax.sim.task.env import Observation
 from edqn_jax.sim.task.environment import Environment
+from edqn_jax.sim.task.observation import Observation
 from tests.interop.recordings import some_recording
 
 pytestmark = pytest.mark.filterwarnings("ignore")  # jax2onnx and what it imports

@@ -215,7 +215,7 @@ def test_the_spaces_are_those_of_what_is_returned(kind: functional.Kind) -> None
     shapes = {name: box.shape for name, box in space.items()} if isinstance(space, dict) else space.shape
     assert jax.tree.map(lambda x: x.shape, observed) == shapes
     assert {x.dtype for x in jax.tree.leaves(observed)} == {jnp.dtype("float32")}
-    assert env.action_space(params).n == env.num_actions == 27
+    assert env.action_space(params) == functional.Discrete(env.num_actions) == functional.Discrete(27)
 
 
 def test_other_worlds_of_the_same_number_need_no_new_compilation() -> None:

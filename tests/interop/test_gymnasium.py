@@ -19,7 +19,7 @@ from edqn_jax.extras import require
 from edqn_jax.learn.actor import AgentActor
 from edqn_jax.learn.policy import Policy, fresh_policy
 from edqn_jax.sim.actions import move_number
-from edqn_jax.sim.task import env
+from edqn_jax.sim.task.observation import OWN_SIZE
 from edqn_jax.sim.task.outcomes import Outcome
 
 gymnasium = require("gymnasium", extra="gym")
@@ -174,7 +174,7 @@ def test_a_code_is_that_of_the_policy():
     pure = edqn_jax.make("medium", flown.config, worlds=3)
     observed, _ = made.reset(seed=1, options={"mission": 2})
     state, seen = pure.reset(1, 2)
-    empty = jnp.zeros((1, flown.config.encoder.code_size + env.OWN_SIZE))
+    empty = jnp.zeros((1, flown.config.encoder.code_size + OWN_SIZE))
     memory = empty
     for move in MOVES[:4, 0]:
         memory = AgentActor(flown.config).encode(flown.params, memory, seen)
@@ -288,7 +288,7 @@ def test_what_cannot_be_done_is_refused():
     with pytest.raises(gymnasium.error.InvalidAction, match="from 0 to 26"):
         made.step(27)
     for moves in (np.array([0, 27]), np.array([0]), np.array([0.0, 1.0])):
-        with pytest.raises(gymnasium.error.InvalidAction, match="2 whole numbers from 0 to 26"):
+        with pytest.raises(gymnasium.error.InvalidAction, match="2 actions, each a whole number from 0 to 26"):
             vector.step(moves)
     while not any(made.step(DOWN)[2:4]):
         pass

@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import jax
 import jax.flatten_util
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from jax import Array
+from scipy.stats import norm
 
 import ppo
+from edqn_jax.interop import functional
 
 SETTINGS = ppo.Settings()
+MOVES, VELOCITY = functional.Discrete(27), functional.Box(-1.0, 1.0, (3,))
 
 
 def rows(terminated: list[bool], ended: list[bool], valid: list[bool]) -> ppo.Row:
@@ -51,18 +56,34 @@ def test_a_truncated_episode_is_bootstrapped_from_its_final_observation(
 def test_a_step_spent_on_a_reset_is_not_learnt_from() -> None:
     episode = rows([False, True, False, False], [False, True, False, False], [True, True, False, True])
     flat = jax.tree.map(lambda x: x[:, 0], episode)
-    params = ppo.ActorCritic().init(jax.random.key(1), flat.observed)
+    params = ppo.ActorCritic(MOVES).init(jax.random.key(1), flat.observed)
 
     def gradient(changed: Array, row: int) -> Array:
         advantage = jnp.array([1.0, -2.0, 0.5, 1.5]).at[row].set(changed)
-        return jax.flatten_util.ravel_pytree(jax.grad(ppo.loss, argnums=1)(SETTINGS, params, flat, advantage))[0]
+        return jax.flatten_util.ravel_pytree(jax.grad(ppo.loss, argnums=2)(SETTINGS, MOVES, params, flat, advantage))[0]
 
     np.testing.assert_array_equal(gradient(jnp.array(0.5), 2), gradient(jnp.array(-70.0), 2))
     assert np.any(gradient(jnp.array(1.5), 3) != gradient(jnp.array(-70.0), 3))
 
 
-def test_it_trains_and_says_how_well(capsys: pytest.CaptureFixture[str]) -> None:
-    small = ppo.Settings(decisions=60_000, worlds=8, test_worlds=16, num_envs=64, minibatches=4, learning_rate=1e-3)
+def test_a_gaussian_policy_has_the_density_and_the_entropy_of_a_normal_distribution() -> None:
+    mean, deviation = np.array([0.3, -0.2, 0.0]), np.array([0.5, 1.0, 2.0])
+    said = jnp.asarray(np.concatenate([mean, np.log(deviation)]), jnp.float32)[None]
+    action = np.array([0.1, 1.0, -3.0])
+    density, entropy = ppo.likelihood(VELOCITY, said, jnp.asarray(action, jnp.float32)[None])
+    np.testing.assert_allclose(density, norm.logpdf(action, mean, deviation).sum(), rtol=1e-5)
+    np.testing.assert_allclose(entropy, norm.entropy(mean, deviation).sum(), rtol=1e-5)
+    many = ppo.drawn(VELOCITY, jnp.repeat(said, 20_000, axis=0), jax.random.key(0))
+    np.testing.assert_allclose(many.mean(axis=0), mean, atol=0.05)
+    np.testing.assert_allclose(many.std(axis=0), deviation, rtol=0.03)
+    np.testing.assert_allclose(ppo.best(VELOCITY, said[0]), mean, rtol=1e-6)
+
+
+@pytest.mark.parametrize("actions", ["moves", "velocity"])
+def test_it_trains_and_says_how_well(actions: Any, capsys: pytest.CaptureFixture[str]) -> None:
+    small = ppo.Settings(
+        actions=actions, decisions=60_000, worlds=8, test_worlds=16, num_envs=64, minibatches=4, learning_rate=1e-3
+    )
     ppo.main(small)
     *_, untrained, trained = capsys.readouterr().out.splitlines()
     before, after = (float(line.split("mean return ")[1].split(",")[0]) for line in (untrained, trained))

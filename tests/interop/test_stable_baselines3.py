@@ -154,6 +154,25 @@ def test_stable_baselines3_trains_through_it(algorithm, policy_name):
     assert len(rewards) == 4 and min(lengths) > 1
 
 
+@pytest.mark.parametrize(("actions", "size"), [("velocity", 3), ("body-rates", 4)])
+def test_sac_trains_with_continuous_actions(actions, size):
+    config = edqn_jax.make_config(
+        "medium", drone={"physics": "rigid_body"}, env={"actions": actions, "max_decisions": 20}
+    )
+    vector = drones(2, config=config, observation="kinematics")
+    assert vector.action_space == require("gymnasium").spaces.Box(-1.0, 1.0, (size,), np.float32)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # about what it runs on
+        model = library.SAC("MlpPolicy", vector, learning_starts=20, batch_size=16, seed=0, device="cpu")
+        before = [x.detach().clone() for x in model.actor.parameters()]
+        model.learn(60)
+    assert any(not bool((x == y).all()) for x, y in zip(before, model.actor.parameters(), strict=True))
+    held = model.replay_buffer
+    assert held.dones.sum() >= 2 and held.actions.shape[-1] == size
+    with pytest.raises(require("gymnasium").error.InvalidAction, match=f"2 actions, each {size} finite numbers"):
+        vector.step(np.full((2, size), np.nan))
+
+
 def test_missions_seeds_and_attributes_are_those_of_the_vector():
     vector = drones(3, observation="kinematics", render_mode="rgb_array")
     vector.seed(5)

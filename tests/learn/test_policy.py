@@ -17,7 +17,7 @@ from edqn_jax.learn.actor import AgentActor, PolicyParams, observation_size
 from edqn_jax.learn.perception import vae
 from edqn_jax.learn.policy import Policy, fresh_policy
 from edqn_jax.sim.actions import ACTIONS
-from edqn_jax.sim.task.env import MOTION_SIZE, OWN_SIZE, Observation
+from edqn_jax.sim.task.observation import MOTION_SIZE, OWN_SIZE, Observation
 from tests.oracles import event_fields
 
 CONFIG = Config(

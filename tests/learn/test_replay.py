@@ -13,10 +13,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from edqn_jax.config import AgentConfig
+from edqn_jax.config import AgentConfig, Config
 from edqn_jax.learn import replay
-from edqn_jax.sim.task.env import OWN_SIZE, turned
+from edqn_jax.sim.task.observation import OWN_SIZE, turned
 from edqn_jax.sim.task.outcomes import Outcome
+from edqn_jax.sim.task.task import task_of
 from tests.oracles import replay_plain
 
 ENVS, LENGTH, BATCH, LONGEST = 3, 17, 96, 80
@@ -213,7 +214,9 @@ def test_what_is_drawn_is_turned_in_whole_quarters_and_only_the_own_state_is() -
             action=jnp.zeros(ENVS, jnp.int32),
         )
         ring = write(ring, rows, jnp.int32(time))
-    drawn = jax.jit(replay.sample, static_argnums=(0, 3))(config, ring, jnp.int32(LENGTH - 1), 256, jax.random.key(0))
+    drawn = jax.jit(replay.sample, static_argnums=(0, 3, 5))(
+        config, ring, jnp.int32(LENGTH - 1), 256, jax.random.key(0), task_of(Config())
+    )
     rows = np.asarray(ring.observation).reshape(-1, 3 + OWN_SIZE)
     turned_rows = {row[:3].tobytes(): [] for row in rows}
     for quarters in range(4):

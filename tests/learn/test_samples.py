@@ -13,11 +13,13 @@ import pytest
 from edqn_jax.config import CameraConfig, Config, DroneConfig, EncoderConfig, EventsConfig
 from edqn_jax.learn import samples
 from edqn_jax.learn.perception import vae
+from edqn_jax.sim.actions import ACTIONS
 from edqn_jax.sim.physics import drone
 from edqn_jax.sim.scene.scene import UprightBoxes, build_scene, stack_scenes
 from edqn_jax.sim.task import env
-from edqn_jax.sim.task.env import MOTION_SIZE, Observation
 from edqn_jax.sim.task.missions import own_missions
+from edqn_jax.sim.task.observation import MIRRORED_MOTION, MOTION_SIZE, Observation
+from edqn_jax.sim.task.task import task_of
 from tests.oracles import event_fields
 
 ENVS, LENGTH = 3, 4
@@ -100,7 +102,8 @@ def test_what_is_stored_is_encoded_as_what_was_seen(architecture, even, alone) -
 
 def test_half_of_what_is_drawn_is_mirrored() -> None:
     ring, time = ring_after([True] * 3)
-    mirror = jax.jit(partial(samples.draw, dataclasses.replace(CONFIG, mirror=True)), static_argnums=2)
+    mirroring = dataclasses.replace(CONFIG, mirror=True)
+    mirror = jax.jit(partial(samples.draw, mirroring, task=task_of(Config())), static_argnums=2)
     turned = np.asarray(mirror(ring, jnp.int32(time), 256, jax.random.key(2)).motion[:, 1])
     # The motion of one sample in nine is 0, the same either way.
     assert (turned[:128] <= 0.0).all() and (turned[128:] >= 0.0).all()
@@ -119,7 +122,7 @@ def test_a_mirrored_sample_is_that_of_the_mirrored_image() -> None:
         observation = Observation(field, motion, motion)
         return samples.samples_of(config, observation, samples.target_of(config, observation, near))
 
-    got = samples.mirrored(sample(counts, near, motion))
+    got = samples.mirrored(sample(counts, near, motion), MIRRORED_MOTION)
     # To the left, turning left and the move to the left become those to the right.
     expected = sample(counts[:, ::-1], near[:, ::-1], jnp.array([1.0, -2, 3, -4, 5, -6, 7]))
     jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, atol=1e-5), got, expected)
@@ -146,12 +149,12 @@ def test_a_flight_to_the_right_is_the_mirror_of_one_to_the_left() -> None:
     def flown(side: int) -> samples.Samples:
         state = fresh
         for move in ((1, side, 0), (1, side, 1)):
-            number = np.flatnonzero((env.ACTIONS == move).all(axis=1))[0]
+            number = np.flatnonzero((ACTIONS == move).all(axis=1))[0]
             state, seen = step(state, jnp.asarray(number))
         wanted = samples.target_of(EncoderConfig(), seen.observation, env.nearness(config, world, state))
         return samples.samples_of(EncoderConfig(), seen.observation, wanted)
 
-    left, right = flown(1), samples.mirrored(flown(-1))
+    left, right = flown(1), samples.mirrored(flown(-1), MIRRORED_MOTION)
     assert np.abs(left.sensed.signed).sum() > 20  # type: ignore[union-attr]
     # A pixel on an edge may round the other way and then have an event more or less.
     assert np.mean(np.asarray(left.sensed.signed) != np.asarray(right.sensed.signed)) < 0.01  # type: ignore[union-attr]

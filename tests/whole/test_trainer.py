@@ -32,7 +32,8 @@ from edqn_jax.learn.plan import Plan
 from edqn_jax.learn.trainer import Trainer, TrainState
 from edqn_jax.sim.physics.disturbances import Disturbance
 from edqn_jax.sim.task import env
-from edqn_jax.sim.task.env import MOTION_SIZE, OWN_SIZE, Observation, World
+from edqn_jax.sim.task.env import World
+from edqn_jax.sim.task.observation import MOTION_SIZE, OWN_SIZE, Observation
 from edqn_jax.sim.task.outcomes import Outcome
 from tests.miniature import miniature_world
 

@@ -39,8 +39,10 @@ from edqn_jax.sim.scene.scene import Scene, moves, scene_at
 from edqn_jax.sim.sensors import sensor
 from edqn_jax.sim.sensors.sensor import DEPTH_SCALE, SensorMemory, distance_of, mount_rotation
 from edqn_jax.sim.task import env
+from edqn_jax.sim.task.action_sets import heading_setpoint
 from edqn_jax.sim.task.env import World
 from edqn_jax.sim.task.flights import Flights, at_start, tally
+from edqn_jax.sim.task.observation import View, heading_velocity, observe, poses_at_start, poses_seen, timed
 from edqn_jax.sim.task.outcomes import Outcome, judge
 from rivals.mapping.grid import Grid, MapConfig, empty_grid, grid_shape, update
 from rivals.mapping.route import RouteConfig, Router
@@ -194,7 +196,7 @@ def look(
         now = scene_at(scene, None if poses.time is None else poses.time[-1])
         depth = camera.depth(config.camera, now, body.position, rotation)
     else:
-        observation, sensed = env.observe(config, scene, goal, body, move, poses, sensed, noise)
+        observation, sensed = observe(config, View(scene, goal, body, move, poses), sensed, noise)
         memory = AgentActor(config).encode(params, memory, observation)
         depth = decoded_depth(config, params, memory)
         counts &= jnp.sum(body.velocity**2) >= pilot.seeing_m_s**2
@@ -228,13 +230,13 @@ def decide(
     asked = jnp.sqrt(jnp.sum(command**2) + 1e-9)
     command = command * jnp.minimum(1.0, speed / asked)
     turning = dataclasses.replace(config.env, heading="flight" if pilot.looks_ahead else "goal")
-    heading = env.heading_setpoint(turning, before, goal, command)
+    heading = heading_setpoint(turning, before, goal, command)
     after, flight = drone.fly(config.drone, world.airframe, before, command, heading)
     outcome, end, contact = judge(config, scene, goal, before.position, flight, flying.flights.decisions + 1)
     flights, _ = tally(config, scene, flying.flights, before.position, flight, outcome, end, contact)
-    move = env.heading_velocity(config.env, drone.yaw_of(before.quaternion), command)
+    move = heading_velocity(config.env, drone.yaw_of(before.quaternion), command)
     steps = flying.flights.decisions * config.drone.physics_steps + jnp.arange(1, config.drone.physics_steps + 1)
-    poses = env.poses_seen(config, before, env.timed(config, flight, steps if moves(scene) else None))
+    poses = poses_seen(config, before, timed(config, flight, steps if moves(scene) else None))
     running = flying.flights.outcome == Outcome.RUNNING
     keep = functools.partial(jax.tree.map, lambda new, old: jnp.where(running, new, old))
     thrown = launches.thrown(
@@ -281,7 +283,7 @@ def _begin(
     """Returns a drone at its start that has looked ahead once."""
     flying = at_rest(config, pilot, shape, world, mission, key)
     scene = env.scene_of(world, mission)
-    still = env.poses_at_start(config, scene, flying.drone)
+    still = poses_at_start(config, scene, flying.drone)
     return look(config, pilot, params, scene, world.missions.goal[mission], flying, jnp.zeros(3), still)
 
 

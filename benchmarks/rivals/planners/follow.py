@@ -25,7 +25,7 @@ from edqn_jax.planning.path import Task
 from edqn_jax.sim.physics import drone
 from edqn_jax.sim.physics.drone import Airframe, DroneState
 from edqn_jax.sim.scene.scene import Scene
-from edqn_jax.sim.task.env import bearing
+from edqn_jax.sim.task.action_sets import bearing
 from edqn_jax.sim.task.flights import Flights, at_start, tally
 from edqn_jax.sim.task.outcomes import Outcome, judge
 

@@ -21,7 +21,7 @@ from edqn_jax.learn.perception import embedding, vae
 from edqn_jax.learn.policy import Policy
 from edqn_jax.policies.functions import check_has_params
 from edqn_jax.sim.sensors import events
-from edqn_jax.sim.task.env import OWN_SIZE, Observation
+from edqn_jax.sim.task.observation import OWN_SIZE, Observation
 
 
 @dataclasses.dataclass(frozen=True)

@@ -14,6 +14,7 @@ from flax import struct
 from jax import Array, lax
 from jax.flatten_util import ravel_pytree
 
+from edqn_jax.checks import is_finite
 from edqn_jax.config import Config
 from edqn_jax.keys import split_each
 from edqn_jax.learn import qnetwork, replay
@@ -26,7 +27,7 @@ from edqn_jax.learn.plan import Plan
 from edqn_jax.learn.qnetwork import Params
 from edqn_jax.native.all_sum import all_sum
 from edqn_jax.sim.actions import ACTIONS
-from edqn_jax.sim.task.env import is_finite
+from edqn_jax.sim.task.task import task_of
 
 METRICS = ("q_loss", "mean_q")
 
@@ -67,7 +68,7 @@ def update_q(
     config: Config, axis: str | None, state: DqnState, rings: Rings, after: Array | float
 ) -> tuple[UpdateStats, DqnState]:
     """Updates the Q-network from the replay (Algorithm 1, steps 7-9); see `Learner.update`."""
-    agent = config.agent
+    agent, task = config.agent, task_of(config)
     share = agent.batch_size // config.train.shards
 
     # All of a network as one vector: what is done to each number of it is one operation, and not one for each layer.
@@ -80,7 +81,7 @@ def update_q(
         return batch_loss(agent, tree(q), tree(target), len(ACTIONS), batch)
 
     def update(state: DqnState, keys: Array):
-        batch = jax.vmap(lambda r, k: replay.sample(agent, r, rings.time, share, k))(rings.rows, keys)
+        batch = jax.vmap(lambda r, k: replay.sample(agent, r, rings.time, share, k, task))(rings.rows, keys)
         batch = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), batch)
         (total, (count, sum_q)), gradient = jax.value_and_grad(loss, has_aux=True)(state.q, state.target, batch)
         gradient, total, count, sum_q = all_sum((gradient, total, count, sum_q), axis, after)

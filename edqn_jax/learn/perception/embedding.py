@@ -11,7 +11,7 @@ from edqn_jax.config import Config
 from edqn_jax.learn.perception import vae
 from edqn_jax.learn.perception.code import Form, Params
 from edqn_jax.sim.sensors.sensor import sensor_of
-from edqn_jax.sim.task.env import Observation
+from edqn_jax.sim.task.observation import Observation
 
 
 def has_code(config: Config) -> bool:

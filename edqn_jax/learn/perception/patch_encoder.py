@@ -67,7 +67,7 @@ class PatchEncoder(nn.Module):
         """Returns mean and log-variance `[..., code_size]` of fields `[..., F, H, W]` or pictures `[..., C, H, W]`.
 
         Args:
-            motion: `[..., MOTION_SIZE]` own motion, see `sim.env.own_motion`.
+            motion: `[..., MOTION_SIZE]` own motion, see `sim.task.observation.own_motion`.
         """
         images = log_counts(sensed) if isinstance(sensed, EventField) else list(jnp.moveaxis(sensed, -3, 0))
         first, *later = self.config.patch_layers

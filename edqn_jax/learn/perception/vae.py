@@ -23,7 +23,7 @@ from edqn_jax.learn.perception.patch_encoder import PatchEncoder
 from edqn_jax.learn.perception.pooled_encoder import PooledEncoder
 from edqn_jax.learn.perception.waves import OUTPUT_SCALE, cosines, mirrored, wave_images
 from edqn_jax.sim.sensors.events import EventField
-from edqn_jax.sim.task.env import MOTION_SIZE
+from edqn_jax.sim.task.observation import MOTION_SIZE
 
 
 @struct.dataclass
@@ -174,7 +174,7 @@ def encode(config: EncoderConfig, params: Params, sensed: EventField | Array, mo
     The code that the agent sees is the mean.
 
     Args:
-        motion: `[..., MOTION_SIZE]` own motion, see `sim.env.own_motion`.
+        motion: `[..., MOTION_SIZE]` own motion, see `sim.task.observation.own_motion`.
     """
     encoder = _encoder(_of_kind(config, params), sensed)
     return encoder.apply({"params": params["encoder"]}, sensed, motion)  # type: ignore

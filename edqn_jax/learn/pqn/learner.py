@@ -15,6 +15,7 @@ import optax
 from flax import struct
 from jax import Array, lax
 
+from edqn_jax.checks import is_finite
 from edqn_jax.config import Config
 from edqn_jax.keys import split_each
 from edqn_jax.learn import qnetwork
@@ -28,7 +29,6 @@ from edqn_jax.learn.pqn.returns import Rollout, lambda_returns, rollout_of
 from edqn_jax.learn.qnetwork import Params, network_values
 from edqn_jax.native.all_sum import all_sum
 from edqn_jax.sim.actions import ACTIONS
-from edqn_jax.sim.task.env import is_finite
 
 METRICS = ("q_loss", "mean_q")
 

@@ -15,7 +15,7 @@ from PIL import Image
 from edqn_jax.config import Config
 from edqn_jax.learn.perception import embedding
 from edqn_jax.learn.policy import PolicyParams
-from edqn_jax.report.images import RECONSTRUCTED_EVENTS, Look, look_of, scale_of
+from edqn_jax.report.images import NEARNESS, RECONSTRUCTED_EVENTS, Look, look_of, scale_of
 from edqn_jax.report.sights import Shown, Sights
 from edqn_jax.sim.camera.camera import on_screen
 

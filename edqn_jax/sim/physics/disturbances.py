@@ -24,7 +24,6 @@ from flax import struct
 from jax import Array
 
 from edqn_jax.config import AirConfig, Config, MotorsConfig, NoiseConfig
-from edqn_jax.sim.actions import HOVER, move_number
 
 AIR_DENSITY = 1.225
 """Density of air at sea level, kg/m^3 (International Standard Atmosphere)."""
@@ -47,7 +46,9 @@ class Disturbance:
     gain: Array | None = None  # [R] flown thrust per commanded thrust
     lag_s: Array | None = None  # [] time constant of the thrusts
     thrust: Array | None = None  # [R] newtons, before the gain, as motors that lag have it now
-    move: Array | None = None  # [] int32, chosen in the decision before, flown in the next one
+    move: Array | None = (
+        None  # action chosen in the decision before, flown in the next one; None in what `draw` returns
+    )
     position_bias: Array | None = None  # [3] metres
     velocity_bias: Array | None = None  # [3] m/s
 
@@ -105,7 +106,6 @@ def draw(config: Config, hover_thrust: Array, key: Array) -> Disturbance | None:
         gain=_share(motors.gain_share, (4,), gain),
         lag_s=jax.random.uniform(lag, maxval=motors.lag_s) if motors.lag_s else None,
         thrust=jnp.full(4, hover_thrust) if motors.lag_s else None,
-        move=move_number(HOVER) if config.env.action_delay else None,
         position_bias=_normal(noise.position_bias_m, place),
         velocity_bias=_normal(noise.velocity_bias_m_s, speed),
     )

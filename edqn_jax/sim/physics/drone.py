@@ -16,7 +16,9 @@ import contextlib
 import dataclasses
 import functools
 import io
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -67,6 +69,25 @@ class DroneState:
     velocity: Array  # [3] m/s, world
     angular_velocity: Array  # [3] rad/s, body
     yaw_setpoint: Array  # [] radians
+
+
+@struct.dataclass
+class VelocityCommand:
+    """What the whole controller holds for one decision."""
+
+    velocity: Array  # [3] m/s, world
+    heading: Array  # [] radians, where the heading setpoint moves to
+
+
+@struct.dataclass
+class RateCommand:
+    """What the innermost loop alone holds for one decision; velocity, attitude and heading are the pilot's."""
+
+    thrust: Array  # [] newtons of all rotors together
+    rates: Array  # [3] rad/s about the body's axes
+
+
+Command = VelocityCommand | RateCommand
 
 
 @struct.dataclass
@@ -216,6 +237,13 @@ def _thrusts(
     collective = _collective_thrust(airframe, force[2], axes[2][2])
     # Computed once, and not again for each rotor.
     return _allocate(config, airframe, *materialised(jnp.stack([*torque, collective])))
+
+
+def rate_thrusts(config: DroneConfig, airframe: Airframe, state: DroneState, command: RateCommand) -> Array:
+    """Returns rotor thrusts [4] newtons towards commanded thrust and body rates, within the limits of `thrusts`."""
+    p, q, r = command.rates
+    torque = _torque(config, airframe, (p, q, r), tuple(state.angular_velocity))
+    return _allocate(config, airframe, *materialised(jnp.stack([*torque, command.thrust])))
 
 
 def _wanted_force(config: DroneConfig, airframe: Airframe, error: Scalars) -> Scalars:
@@ -417,55 +445,76 @@ def fly(
 
     The yaw setpoint moves towards `target_yaw` [] radians in the shorter direction, at most `max_yaw_rate_rad_s` fast.
     """
-    yaws = _setpoints(config, state, target_yaw)
+    return fly_command(config, airframe, state, VelocityCommand(velocity_command, target_yaw))
 
-    def body(state: DroneState, half_yaw: tuple[Array, Array]) -> tuple[DroneState, Flight]:
-        thrust = _thrusts(config, airframe, state, velocity_command, *half_yaw)
+
+def fly_command(
+    config: DroneConfig, airframe: Airframe, state: DroneState, command: Command
+) -> tuple[DroneState, Flight]:
+    """Flies one decision: `physics_steps` steps under a held command."""
+    control = _control(config, airframe, state, command)
+
+    def body(state: DroneState, given: Any) -> tuple[DroneState, Flight]:
+        thrust = control.thrusts(state, given)
         state = physics_step(config, airframe, state, thrust)
         return state, Flight(state.position, state.quaternion, state.velocity)
 
-    state, flight = jax.lax.scan(body, state, (jnp.cos(yaws / 2), jnp.sin(yaws / 2)))
-    return dataclasses.replace(state, yaw_setpoint=wrap_angle(yaws[-1])), flight
+    state, flight = jax.lax.scan(body, state, control.inputs, config.physics_steps)
+    return dataclasses.replace(state, yaw_setpoint=control.yaw_setpoint), flight
 
 
 def fly_disturbed(
-    config: Config,
-    airframe: Airframe,
-    state: DroneState,
-    disturbance: Disturbance,
-    velocity_command: Array,
-    target_yaw: Array,
-    key: Array,
+    config: Config, airframe: Airframe, state: DroneState, disturbance: Disturbance, command: Command, key: Array
 ) -> tuple[DroneState, Disturbance, Flight]:
-    """Flies one decision as `fly`, against a disturbance that the controller does not know of.
+    """Flies one decision as `fly_command`, against a disturbance that the controller does not know of.
 
     Args:
         config: of drone, air and motors.
         airframe: that the controller believes in.
-        state, velocity_command, target_yaw: as in `fly`.
+        state, command: as in `fly_command`.
         disturbance: of the episode, as of the decision before.
         key: consumed by gusts.
     """
-    yaws = _setpoints(config.drone, state, target_yaw)
+    control = _control(config.drone, airframe, state, command)
     dt_s = config.drone.physics_dt_s
 
     def body(
-        flying: tuple[DroneState, Disturbance], given: tuple[Array, Array, Array | None]
+        flying: tuple[DroneState, Disturbance], given: tuple[Any, Array | None]
     ) -> tuple[tuple[DroneState, Disturbance], Flight]:
-        (state, now), (cos, sin, white) = flying, given
-        command = _thrusts(config.drone, airframe, state, velocity_command, cos, sin)
-        now, thrust = disturbances.motor_step(config.motors, dt_s, now, command)
+        (state, now), (inputs, white) = flying, given
+        wanted = control.thrusts(state, inputs)
+        now, thrust = disturbances.motor_step(config.motors, dt_s, now, wanted)
         load = disturbances.load_of(config.air, now, state.velocity)
         state = physics_step(config.drone, airframe, state, thrust, load)
         if white is not None:
             now = disturbances.gust_step(config.air, dt_s, now, white)
         return (state, now), Flight(state.position, state.quaternion, state.velocity)
 
-    white = disturbances.white_noise(config, key)
-    (state, disturbance), flight = jax.lax.scan(
-        body, (state, disturbance), (jnp.cos(yaws / 2), jnp.sin(yaws / 2), white)
-    )
-    return dataclasses.replace(state, yaw_setpoint=wrap_angle(yaws[-1])), disturbance, flight
+    given = control.inputs, disturbances.white_noise(config, key)
+    (state, disturbance), flight = jax.lax.scan(body, (state, disturbance), given, config.drone.physics_steps)
+    return dataclasses.replace(state, yaw_setpoint=control.yaw_setpoint), disturbance, flight
+
+
+class _Control(NamedTuple):
+    """A controller during one decision."""
+
+    thrusts: Callable[[DroneState, Any], Array]
+    """(state, inputs of the physics step) → rotor thrusts [4] newtons."""
+    inputs: Any
+    """[physics_steps, ...]; None where there are none."""
+    yaw_setpoint: Array
+    """[] radians, after the decision."""
+
+
+def _control(config: DroneConfig, airframe: Airframe, state: DroneState, command: Command) -> _Control:
+    if isinstance(command, RateCommand):
+        return _Control(lambda now, _: rate_thrusts(config, airframe, now, command), None, state.yaw_setpoint)
+    yaws = _setpoints(config, state, command.heading)
+
+    def thrusts(now: DroneState, half_yaw: tuple[Array, Array]) -> Array:
+        return _thrusts(config, airframe, now, command.velocity, *half_yaw)
+
+    return _Control(thrusts, (jnp.cos(yaws / 2), jnp.sin(yaws / 2)), wrap_angle(yaws[-1]))
 
 
 def _setpoints(config: DroneConfig, state: DroneState, target_yaw: Array) -> Array:

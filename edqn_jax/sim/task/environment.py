@@ -25,7 +25,6 @@ from edqn_jax.devices.forks import check_not_forked
 from edqn_jax.devices.jax_settings import as_tested
 from edqn_jax.devices.sums import check_default_sums
 from edqn_jax.errors import ConfigError
-from edqn_jax.sim.actions import move_number
 from edqn_jax.sim.camera import camera
 from edqn_jax.sim.physics import drone
 from edqn_jax.sim.physics.drone import Flight
@@ -35,8 +34,10 @@ from edqn_jax.sim.scene.scene import Scene, scene_at, stack_scenes
 from edqn_jax.sim.sensors import events, sensor
 from edqn_jax.sim.sensors.events import EventField, EventMemory
 from edqn_jax.sim.task import env, group
-from edqn_jax.sim.task.env import EnvState, Observation, Step, World
+from edqn_jax.sim.task.action_sets import action_of
+from edqn_jax.sim.task.env import EnvState, Step, World
 from edqn_jax.sim.task.missions import own_missions
+from edqn_jax.sim.task.observation import Observation
 from edqn_jax.sim.task.reward import Reward
 from edqn_jax.sim.worlds.families import SPLITS, Split, random_pool, world_keys
 from edqn_jax.sim.worlds.moving import Moving
@@ -81,19 +82,20 @@ class Environment:
         return _reset(self.config, self.world, key, None if mission is None else jnp.asarray(mission, jnp.int32))
 
     @as_tested
-    def step(self, state: EnvState, move: str | ArrayLike) -> tuple[EnvState, Step]:
+    def step(self, state: EnvState, action: str | ArrayLike) -> tuple[EnvState, Step]:
         """Flies one decision (0.26 s), or resets to a drawn mission where the episode has ended.
 
         Args:
             state: as `reset` or `step` returned it.
-            move: number 0..26, vector [3] of -1, 0 and 1 (ahead, left, up in the heading frame), or name such as
-                `ahead`, `left up` or `hover`.
+            action: a move: number 0..26, vector [3] of -1, 0 and 1 (ahead, left, up in the heading frame), or name such
+                as `ahead`, `left up` or `hover`. With another `env.actions` its numbers, such as [3] in [-1, 1], beyond
+                which they are clipped.
 
         Raises:
-            ConfigError: if there is no such move.
+            ConfigError: if there is no such action.
         """
         check_not_forked()
-        return _step(self.config, self.world, state, move_number(move))
+        return _step(self.config, self.world, state, action_of(self.config, action))
 
     @as_tested
     def events(self, observation: Observation) -> np.ndarray:

@@ -16,6 +16,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+from flax import struct
 from jax import Array, lax
 
 from edqn_jax.config import Config
@@ -23,7 +24,7 @@ from edqn_jax.errors import ConfigError
 from edqn_jax.sim.physics.drone import Flight
 from edqn_jax.sim.scene.motion import Flown
 from edqn_jax.sim.scene.scene import PARKED, Scene
-from edqn_jax.sim.task.outcomes import Outcome
+from edqn_jax.sim.task.outcomes import Outcome, Verdict
 
 AXIS = "drones"
 """Name of the axis of a group's drones."""
@@ -86,10 +87,35 @@ def mission_of_block(config: Config, block: Array) -> Array:
     return together(block)[0] * config.env.drones + own_number()
 
 
-def resets_and_waits(ended: Array) -> tuple[Array, Array]:
-    """Returns whether a drone's next step is a reset, and whether it waits for others: [] bool each."""
+@struct.dataclass
+class Turn:
+    """What a step of one drone is spent on."""
+
+    is_reset: Array  # [] bool
+    waits: Array | None = None  # [] bool, for others of the group whose episodes go on; None for a drone alone
+
+    def goes_on(self, outcome: Array) -> Array:
+        """Returns whether others see a drone with this outcome [] after its decision, [] bool."""
+        on = outcome == Outcome.RUNNING
+        return on if self.waits is None else on & ~self.waits
+
+    def counted(self, decision: Array) -> Array:
+        """Returns the decisions [] of the episode after the step."""
+        count = jnp.where(self.is_reset, 0, decision + 1)
+        return count if self.waits is None else jnp.where(self.waits, decision, count)
+
+    def over(self, outcome: Array) -> Array:
+        """Returns whether the episode has ended after a step with this outcome, [] bool."""
+        over = outcome != Outcome.RUNNING
+        return over if self.waits is None else over | self.waits
+
+
+def turn_of(config: Config, ended: Array) -> Turn:
+    """Returns what the next step of a drone is spent on, whose episode has ended or not, [] bool."""
+    if not several(config):
+        return Turn(ended)
     over = jnp.all(together(ended))
-    return over, ended & ~over
+    return Turn(over, ended & ~over)
 
 
 def mates(config: Config, waits: Array) -> Array:
@@ -105,7 +131,7 @@ def mates(config: Config, waits: Array) -> Array:
 
 
 def present(config: Config, scene: Scene, first: Array, flight: Flight, is_there: Array) -> Scene:
-    """Returns the drone's world with the others in it.
+    """Returns the drone's world with the others in it; that of a drone alone as it is.
 
     Args:
         scene: one world.
@@ -113,6 +139,8 @@ def present(config: Config, scene: Scene, first: Array, flight: Flight, is_there
         flight: how it has flown since, with times.
         is_there: [] bool, whether the others see it.
     """
+    if not several(config):
+        return scene
     assert flight.time is not None
     path, is_there = others(config, (jnp.concatenate([first[None], flight.position]), is_there))
     dt = config.drone.physics_dt_s
@@ -125,30 +153,29 @@ def present(config: Config, scene: Scene, first: Array, flight: Flight, is_there
     return dataclasses.replace(scene, drones=flown)
 
 
-def collide(
-    config: Config, path: Array, flies: Array, outcome: Array, end_step: Array, contact: Array
-) -> tuple[Array, Array, Array, Array]:
+def collide(config: Config, path: Array, flies: Array, verdict: Verdict) -> Verdict:
     """Returns one drone's verdict among the others: a contact of two drones ends both, unless one has ended before.
 
+    At the same moment a contact of drones wins.
+
     Args:
+        config: of the group.
         path: [n + 1, 3] metres, before the first physics step and after each.
         flies: [] bool, whether it has not ended in an earlier decision.
-        outcome, end_step, contact: of the drone alone in its world, as `outcomes.judge` returns them.
-
-    Returns:
-        outcome, end_step and contact, and whether it hit a drone, [] bool. At the same moment a contact of drones wins.
+        verdict: of the drone alone in its world.
     """
+    outcome, end_step, contact = verdict.outcome, verdict.end_step, verdict.contact
     ends = (outcome != Outcome.RUNNING) & (outcome != Outcome.TIME_OUT)
     until = jnp.where(ends, end_step - 1 + contact, jnp.inf)
     paths, fly, untils = together((path, flies, until))
     hit = encounters(paths, fly, untils, 2 * config.drone.body_radius_m)[own_number()]
     hits = jnp.isfinite(hit)
     step = jnp.clip(jnp.ceil(jnp.where(hits, hit, 1.0)), 1, path.shape[0] - 1).astype(jnp.int32)
-    return (
-        jnp.where(hits, int(Outcome.COLLISION), outcome).astype(jnp.int32),
-        jnp.where(hits, step, end_step),
-        jnp.where(hits, hit - (step - 1), contact),
-        hits,
+    return Verdict(
+        outcome=jnp.where(hits, int(Outcome.COLLISION), outcome).astype(jnp.int32),
+        end_step=jnp.where(hits, step, end_step),
+        contact=jnp.where(hits, hit - (step - 1), contact),
+        hit_drone=hits,
     )
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import enum
 
 import jax.numpy as jnp
+from flax import struct
 from jax import Array
 
 from edqn_jax.config import Config
@@ -27,6 +28,16 @@ class Outcome(enum.IntEnum):
 def is_terminal(outcome: Array) -> Array:
     """Returns whether outcomes [...] cut the bootstrap, [...] bool: every end but a time-out."""
     return (outcome != Outcome.RUNNING) & (outcome != Outcome.TIME_OUT)
+
+
+@struct.dataclass
+class Verdict:
+    """How and when a decision ends. n physics steps."""
+
+    outcome: Array  # [] int32, an `Outcome`
+    end_step: Array  # [] int32 in 1..n, physics step of the outcome; n while running
+    contact: Array  # [] share of that step flown before a collision touched, 1 otherwise
+    hit_drone: Array | None = None  # [] bool, the collision was with a drone; None for a drone alone
 
 
 def judge(

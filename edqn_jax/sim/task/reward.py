@@ -20,7 +20,7 @@ class Transition:
     after: Array  # [3] metres, position 0.26 s later
     goal: Array  # [3] metres
     clearance: Array  # [] metres between the body's sphere and the nearest shape afterwards; negative inside one
-    move: Array  # [] int32, 0..26, see `sim.actions`; as chosen, also where `env.action_delay` flies it later
+    move: Array  # [] int32, 0..26, or numbers [A], see `env.actions`; as chosen, also where it is flown later
     outcome: Array  # [] int32, an `Outcome`
     configured: Array  # [] the reward that the configuration asks for
 
@@ -31,7 +31,6 @@ Reward = Callable[[Transition], Array]
 
 def configured_reward(
     config: EnvConfig,
-    discount: float,
     outcome: Array,
     before: Array,
     after: Array,
@@ -41,8 +40,8 @@ def configured_reward(
 
     `sparse` is Eq. 8. `progress` adds the metres gained towards the goal, times a weight, and
     subtracts a weight for each metre flown; `geodesic` is the same with distances around obstacles. `potential` adds
-    gamma * Phi(s') - Phi(s) with Phi = -weight * distance, and Phi = 0 at terminal states: the form that leaves the
-    optimal policy unchanged (Ng et al. 1999).
+    gamma * Phi(s') - Phi(s) with Phi = -weight * distance and gamma `env.potential_discount`, and Phi = 0 at terminal
+    states: the form that leaves the optimal policy unchanged (Ng et al. 1999).
 
     Args:
         before, after: [] distances to the goal, metres; straight, or along the shortest way (`geodesic`).
@@ -58,5 +57,5 @@ def configured_reward(
         total = total + config.progress_weight * (before - after) - config.path_weight * flown
     elif config.reward == "potential":
         terminal = is_terminal(outcome)
-        total = total + config.progress_weight * (before - jnp.where(terminal, 0.0, discount * after))
+        total = total + config.progress_weight * (before - jnp.where(terminal, 0.0, config.potential_discount * after))
     return jnp.where(outcome == Outcome.DIVERGED, 0.0, total)

@@ -25,7 +25,8 @@ from edqn_jax.runs.checkpoints.params import save_params
 from edqn_jax.runs.policies import load_run
 from edqn_jax.runs.provenance import workload
 from edqn_jax.sim.scene import mjcf
-from edqn_jax.sim.task.env import MOTION_SIZE, Observation, World
+from edqn_jax.sim.task.env import World
+from edqn_jax.sim.task.observation import MOTION_SIZE, Observation
 from tests.learn.moving_boxes import frames
 from tests.miniature import miniature_world
 from tests.whole.test_trainer import CONFIG

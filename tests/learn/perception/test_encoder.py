@@ -15,7 +15,7 @@ from edqn_jax.config import CameraConfig, EncoderConfig, EventsConfig
 from edqn_jax.learn.perception import pooled_encoder, vae
 from edqn_jax.learn.perception.code import Form, kl_divergence
 from edqn_jax.sim.sensors import events as ev
-from edqn_jax.sim.task.env import MOTION_SIZE
+from edqn_jax.sim.task.observation import MOTION_SIZE
 from tests.learn.moving_boxes import fields
 from tests.oracles import event_fields, pooled_encoder_plain
 

@@ -16,7 +16,7 @@ from edqn_jax.learn.perception import vae
 from edqn_jax.learn.perception.code import Form
 from edqn_jax.learn.perception.patch_encoder import log_counts, patch_places, patches
 from edqn_jax.sim.sensors import events as ev
-from edqn_jax.sim.task.env import MOTION_SIZE
+from edqn_jax.sim.task.observation import MOTION_SIZE
 from tests.oracles import event_fields, patch_encoder_plain
 
 SMALL = CameraConfig(width=10, height=6)  # no multiple of a patch's side

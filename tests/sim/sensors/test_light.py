@@ -22,6 +22,7 @@ from edqn_jax.sim.sensors import events as ev
 from edqn_jax.sim.sensors import light, photoreceptor
 from edqn_jax.sim.task import env
 from edqn_jax.sim.task.missions import own_missions
+from edqn_jax.sim.task.observation import MOTION_SIZE, OWN_SIZE, Observation
 from tests.miniature import WORLD
 from tests.sim.sensors.test_events import PAPER, host, memory_of, random_frames, run
 
@@ -144,7 +145,7 @@ def test_a_policy_acts_on_events_with_and_without_noise():
     for config in (quiet, noisy):
         memory = ev.reset_memory(config.events, 12, 16, jax.random.key(0))
         field, _ = ev.events(config.events, memory, frames, config.events.frame_times_s, jax.random.key(1))
-        seen.append(env.Observation(field, jnp.ones(env.OWN_SIZE), jnp.ones(env.MOTION_SIZE)))
+        seen.append(Observation(field, jnp.ones(OWN_SIZE), jnp.ones(MOTION_SIZE)))
     assert seen[0].sensed.count.shape[0] * 2 == seen[1].sensed.count.shape[0] == 2
     codes = [flies.code(each) for each in seen]
     np.testing.assert_array_equal(codes[0], codes[1])

@@ -20,6 +20,7 @@ from edqn_jax.learn.samples import Samples, mirrored
 from edqn_jax.sim.sensors import sensor
 from edqn_jax.sim.sensors.events import EventField, event_image, random_field
 from edqn_jax.sim.sensors.sensor import EVENT_FIELD, Image, Sensor
+from edqn_jax.sim.task.observation import MIRRORED_MOTION
 from tests.registries import keep_as_they_are
 
 H, W = 6, 8
@@ -82,11 +83,11 @@ def test_samples_are_mirrored_as_the_sensor_says() -> None:
     wanted = vae.Target(jnp.ones((4, 1, 3, 4)), jnp.zeros(4))
     samples = Samples(pictures, jnp.ones((4, 7)), wanted)
     signs = jnp.array([1.0, -1.0])[:, None, None]
-    found = mirrored(samples, lambda image: signs * jnp.flip(image, axis=-1)).sensed
+    found = mirrored(samples, MIRRORED_MOTION, lambda image: signs * jnp.flip(image, axis=-1)).sensed
     assert isinstance(found, jax.Array)
     np.testing.assert_array_equal(found[:, 0], pictures[:, 0, :, ::-1])
     np.testing.assert_array_equal(found[:, 1], -pictures[:, 1, :, ::-1])
-    np.testing.assert_array_equal(mirrored(samples).sensed, pictures[..., ::-1])
+    np.testing.assert_array_equal(mirrored(samples, MIRRORED_MOTION).sensed, pictures[..., ::-1])
 
 
 @pytest.mark.parametrize(

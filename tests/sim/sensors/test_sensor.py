@@ -26,7 +26,9 @@ from edqn_jax.sim.sensors import sensor
 from edqn_jax.sim.sensors.events import EventField
 from edqn_jax.sim.sensors.sensor import Sensor
 from edqn_jax.sim.task import env
+from edqn_jax.sim.task.action_sets import velocity_command
 from edqn_jax.sim.task.missions import own_missions
+from edqn_jax.sim.task.observation import MOTION_SIZE, OWN_SIZE, Observation
 from tests.miniature import WORLD
 from tests.oracles import camera_plain
 from tests.oracles.mujoco_depth import RayCaster
@@ -104,7 +106,7 @@ def test_depth_is_the_nearness_of_what_mujocos_rays_meet(scenes) -> None:
 def free_way(config, scene, caster, position, yaw) -> np.ndarray:
     """[26] metres along what each move commands, to a geom or to a face of the volume, by MuJoCo and by hand."""
     found = []
-    commands = jax.vmap(lambda move: env.velocity_command(config.env, move, yaw))(jnp.arange(len(ACTIONS)))
+    commands = jax.vmap(lambda move: velocity_command(config.env, move, yaw))(jnp.arange(len(ACTIONS)))
     for move, command in enumerate(np.asarray(commands, np.float64)):
         if move == STAY:
             assert not command.any()
@@ -324,7 +326,7 @@ def test_a_new_sensor_needs_only_its_entry_to_act(with_new_sensor, world) -> Non
     assert jax.tree.map(jnp.shape, step.observation.sensed) == jax.tree.map(jnp.shape, shown)
     assert workload(config, jax.tree.map(lambda x: x[0], world.pool))["frames_per_decision"] == 1
     params = policy.fresh_policy(config)
-    observation = env.Observation(shown, jnp.zeros(env.OWN_SIZE), jnp.zeros(env.MOTION_SIZE))
+    observation = Observation(shown, jnp.zeros(OWN_SIZE), jnp.zeros(MOTION_SIZE))
     code = embedding.embed(config, params.encoder, observation)
     assert code is not None and code.shape == (embedding.size(config),)
     if config.env.sensor == "row_means":

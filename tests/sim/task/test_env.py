@@ -21,8 +21,11 @@ from edqn_jax.sim.physics.drone import DroneState, Flight
 from edqn_jax.sim.scene.scene import UprightBoxes, build_scene, stack_scenes
 from edqn_jax.sim.sensors import events, sensor
 from edqn_jax.sim.task import env, outcomes
+from edqn_jax.sim.task.action_sets import bearing, heading_setpoint, velocity_command
+from edqn_jax.sim.task.decision import Decision, reset_decision
 from edqn_jax.sim.task.missions import Missions, own_missions
-from edqn_jax.sim.task.outcomes import Outcome
+from edqn_jax.sim.task.observation import MOST_YAW_RATE, MOTION_SIZE, OWN_SIZE, own_motion, own_state, turned
+from edqn_jax.sim.task.outcomes import Outcome, Verdict, judge
 from edqn_jax.sim.task.reward import configured_reward
 from edqn_jax.sim.worlds import geodesic
 from tests.planning.small_worlds import box, small_world
@@ -43,7 +46,7 @@ N = CONFIG.drone.physics_steps
 @jax.jit
 def judged(goal, before, positions, decision):
     still = Flight(position=positions, quaternion=jnp.zeros((N, 4)), velocity=jnp.zeros((N, 3)))
-    return env.judge(CONFIG, SCENE, goal, before, still, decision)
+    return judge(CONFIG, SCENE, goal, before, still, decision)
 
 
 def verdict(*, goal=GOAL, before=(10.0, 10.0, 10.0), decision=1, **at):
@@ -158,8 +161,8 @@ def test_only_a_time_out_is_a_truncation():
 # ------------------------------------------------------------------------------------------ rewards
 
 
-def rewarded(config, outcome, before, after, discount=0.99):
-    return float(configured_reward(config, discount, jnp.int32(outcome), jnp.float32(before), jnp.float32(after)))
+def rewarded(config, outcome, before, after):
+    return float(configured_reward(config, jnp.int32(outcome), jnp.float32(before), jnp.float32(after)))
 
 
 def test_the_papers_reward_is_eq_8_to_the_letter():
@@ -181,7 +184,7 @@ def test_progress_charges_for_the_metres_flown_and_the_other_forms_do_not():
         config = EnvConfig(reward=form, path_weight=0.5)
         distances = jnp.float32(9.0), jnp.float32(5.0)
         still, moved = (
-            configured_reward(config, 0.99, jnp.int32(Outcome.RUNNING), *distances, jnp.float32(metres))
+            configured_reward(config, jnp.int32(Outcome.RUNNING), *distances, jnp.float32(metres))
             for metres in (0.0, 6.0)
         )
         assert still - moved == pytest.approx(cost)
@@ -200,15 +203,12 @@ def test_progress_telescopes_to_the_distance_covered():
     "last", [Outcome.RUNNING, Outcome.TIME_OUT, Outcome.GOAL, Outcome.COLLISION, Outcome.LEFT_VOLUME]
 )
 def test_potential_shaping_shifts_every_discounted_return_by_the_first_potential(last):
-    config = EnvConfig(reward="potential", progress_weight=2.0, step_reward=-0.5)
-    plain = dataclasses.replace(config, reward="sparse")
     distances, discount = [40.0, 37.5, 38.0, 30.0, 21.0], 0.9
+    config = EnvConfig(reward="potential", progress_weight=2.0, step_reward=-0.5, potential_discount=discount)
+    plain = dataclasses.replace(config, reward="sparse")
     outcomes = [Outcome.RUNNING] * 3 + [last]
     steps = list(zip(outcomes, distances, distances[1:], strict=False))
-    difference = sum(
-        discount**t * (rewarded(config, *step, discount) - rewarded(plain, *step, discount))
-        for t, step in enumerate(steps)
-    )
+    difference = sum(discount**t * (rewarded(config, *step) - rewarded(plain, *step)) for t, step in enumerate(steps))
     # Sum of gamma^t (gamma Phi(t+1) - Phi(t)) = gamma^T Phi(T) - Phi(0), Phi = -2 d, and 0 at a terminal end.
     final = 0.0 if last in (Outcome.GOAL, Outcome.COLLISION, Outcome.LEFT_VOLUME) else -2.0 * 21.0
     assert difference == pytest.approx(discount**4 * final + 2.0 * 40.0, rel=1e-5)
@@ -235,7 +235,7 @@ def action(*move):
 
 def test_moves_are_commanded_in_the_heading_frame():
     config = EnvConfig(speed_m_s=4.0)
-    command = partial(env.velocity_command, config)
+    command = partial(velocity_command, config)
     np.testing.assert_allclose(command(action(1, 0, 0), jnp.float32(0.0)), [4, 0, 0], atol=1e-6)
     # Heading north: ahead is +y, left is -x.
     north = jnp.float32(np.pi / 2)
@@ -255,21 +255,21 @@ def body(position, yaw=0.0, velocity=(0.0, 0.0, 0.0), setpoint=None):
 def test_own_state_by_hand():
     # From (20, 10, 5) the goal (50, 50, 8) is 30 m east and 40 m north; nose north, 2 m/s west, 1 m/s up.
     state = body((20, 10, 5), np.pi / 2, velocity=(-2.0, 0.0, 1.0))
-    own = env.own_state(CONFIG.env, SCENE, jnp.array([50.0, 50.0, 8.0]), state)
+    own = own_state(CONFIG.env, SCENE, jnp.array([50.0, 50.0, 8.0]), state)
     expected = [
         1.956211, 1.194763,  # asinh(50 / 2) / 2 and asinh(3 / 2)
         0.0, 1.0,  # cosine and sine of the heading
         -1 / 3, -2 / 3, -0.6,  # of a volume of 60 x 60 x 25 m
         0.0, 0.5, 0.25,  # 2 m/s to the left and 1 m/s up, in units of 4
     ]  # fmt: skip
-    assert own.shape == (env.OWN_SIZE,)
+    assert own.shape == (OWN_SIZE,)
     np.testing.assert_allclose(own, expected, atol=1e-6)
 
 
 def test_without_the_position_the_goal_is_so_far_ahead_and_to_the_left():
     config = dataclasses.replace(CONFIG.env, position=False)
     state = body((20, 10, 5), np.pi / 2, velocity=(-2.0, 0.0, 1.0))
-    own = env.own_state(config, SCENE, jnp.array([50.0, 50.0, 8.0]), state)
+    own = own_state(config, SCENE, jnp.array([50.0, 50.0, 8.0]), state)
     expected = [
         1.844752, 1.194763,  # asinh(40 / 2) / 2 and asinh(3 / 2)
         0.0, 1.0,  # cosine and sine of the heading
@@ -278,7 +278,7 @@ def test_without_the_position_the_goal_is_so_far_ahead_and_to_the_left():
     ]  # fmt: skip
     np.testing.assert_allclose(own, expected, atol=1e-6)
     facing = body((20, 10, 5), np.arctan2(40, 30))
-    own, placed = (env.own_state(each, SCENE, jnp.array([50.0, 50.0, 8.0]), facing) for each in (config, CONFIG.env))
+    own, placed = (own_state(each, SCENE, jnp.array([50.0, 50.0, 8.0]), facing) for each in (config, CONFIG.env))
     np.testing.assert_allclose(own[jnp.array([0, 6])], [float(placed[0]), 0.0], atol=1e-6)
 
 
@@ -292,11 +292,11 @@ def test_a_turned_own_state_is_that_of_the_turned_world(quarters, position):
 
     def own(position, goal, yaw, velocity):
         state = body(position, yaw, velocity=velocity)
-        return env.own_state(config, SCENE, jnp.asarray(goal, jnp.float32), state)
+        return own_state(config, SCENE, jnp.asarray(goal, jnp.float32), state)
 
     start, goal, velocity = np.array([20.0, 10, 5]), np.array([50.0, 45, 8]), np.array([-2.0, 0.5, 1.0])
     there = turn @ (start - middle) + middle, turn @ (goal - middle) + middle, 0.4 + angle, turn @ velocity
-    found = env.turned(own(start, goal, 0.4, velocity), jnp.int32(quarters))
+    found = turned(own(start, goal, 0.4, velocity), jnp.int32(quarters))
     np.testing.assert_allclose(found, own(*there), atol=2e-6)
 
 
@@ -304,8 +304,8 @@ def test_own_motion_by_hand():
     # Nose north, 2 m/s west, 1 m/s up, turning left at 0.7 rad/s; the last move was ahead and down.
     state = body((20, 10, 5), np.pi / 2, velocity=(-2.0, 0.0, 1.0))
     state = dataclasses.replace(state, angular_velocity=jnp.array([0.3, -0.2, 0.7]))
-    motion = env.own_motion(CONFIG.env, state, jnp.array([1.0, 0.0, -1.0]))
-    assert motion.shape == (env.MOTION_SIZE,)
+    motion = own_motion(CONFIG.env, state, jnp.array([1.0, 0.0, -1.0]))
+    assert motion.shape == (MOTION_SIZE,)
     np.testing.assert_allclose(motion, [0.0, 0.5, 0.25, 0.7, 1.0, 0.0, -1.0], atol=1e-6)
 
 
@@ -329,25 +329,25 @@ def test_the_yaw_rate_of_a_drone_on_its_back_is_bounded():
     over = jnp.array([1e-3, 0.0, 1.0, 0.0], jnp.float32)  # pitched by nearly half a turn, and rolling
     state = dataclasses.replace(body((0, 0, 5)), quaternion=over, angular_velocity=jnp.array([3.0, 0.0, 0.0]))
     assert float(drone.yaw_rate_of(state)) < -1000.0
-    np.testing.assert_array_equal(env.own_motion(CONFIG.env, state, jnp.zeros(3))[3], -env.MOST_YAW_RATE)
+    np.testing.assert_array_equal(own_motion(CONFIG.env, state, jnp.zeros(3))[3], -MOST_YAW_RATE)
 
 
 def test_the_heading_setpoint_is_the_bearing_and_is_held_near_the_goal():
-    bearing = partial(env.bearing, CONFIG.env)
-    np.testing.assert_allclose(bearing(body((50, 40, 5)), GOAL), np.pi / 2, atol=1e-6)
-    np.testing.assert_allclose(bearing(body((55, 50, 20)), GOAL), np.pi, atol=1e-6)
+    towards = partial(bearing, CONFIG.env)
+    np.testing.assert_allclose(towards(body((50, 40, 5)), GOAL), np.pi / 2, atol=1e-6)
+    np.testing.assert_allclose(towards(body((55, 50, 20)), GOAL), np.pi, atol=1e-6)
     # 1.9 m beside it, however high above: what it was.
-    np.testing.assert_allclose(bearing(body((51.9, 50, 20), setpoint=0.3), GOAL), 0.3)
-    np.testing.assert_allclose(bearing(body((52.1, 50, 20), setpoint=0.3), GOAL), np.pi, atol=1e-6)
+    np.testing.assert_allclose(towards(body((51.9, 50, 20), setpoint=0.3), GOAL), 0.3)
+    np.testing.assert_allclose(towards(body((52.1, 50, 20), setpoint=0.3), GOAL), np.pi, atol=1e-6)
 
 
 def test_a_free_heading_follows_the_commanded_velocity_and_stays_without_one():
     config = dataclasses.replace(CONFIG.env, heading="flight", position=False)
-    setpoint = partial(env.heading_setpoint, config, body((50, 40, 5), setpoint=0.3), GOAL)
+    setpoint = partial(heading_setpoint, config, body((50, 40, 5), setpoint=0.3), GOAL)
     np.testing.assert_allclose(setpoint(jnp.array([-4.0, 4.0, 4.0])), 3 * np.pi / 4, atol=1e-6)
     np.testing.assert_allclose(setpoint(jnp.array([0.0, 0.0, 4.0])), 0.3)
     np.testing.assert_allclose(setpoint(jnp.zeros(3)), 0.3)
-    towards = env.heading_setpoint(CONFIG.env, body((50, 40, 5), setpoint=0.3), GOAL, jnp.array([-4.0, 4.0, 4.0]))
+    towards = heading_setpoint(CONFIG.env, body((50, 40, 5), setpoint=0.3), GOAL, jnp.array([-4.0, 4.0, 4.0]))
     np.testing.assert_allclose(towards, np.pi / 2, atol=1e-6)
 
 
@@ -390,18 +390,16 @@ def test_frames_are_rendered_at_the_configured_physics_steps():
 def test_a_reset_is_at_the_start_and_earns_nothing():
     start = body((5, 5, 5))
     still = Flight(position=jnp.ones((N, 3)), quaternion=jnp.zeros((N, 4)), velocity=jnp.ones((N, 3)))
-    flown = env._Decision(
+    flown = Decision(
         drone=body((9, 9, 9)),
         flight=still,
-        outcome=jnp.int32(Outcome.COLLISION),
-        end_step=jnp.int32(3),
-        contact=jnp.float32(0.5),
+        verdict=Verdict(jnp.int32(Outcome.COLLISION), jnp.int32(3), jnp.float32(0.5)),
         reward=jnp.float32(-100.0),
         broken=jnp.ones((), bool),
         unrewarded=jnp.ones((), bool),
     )
-    fresh = env._reset_in_place_of(flown, start)
-    assert fresh.reward == 0.0 and fresh.outcome == Outcome.RUNNING and not (fresh.broken | fresh.unrewarded)
+    fresh = reset_decision(flown, start)
+    assert fresh.reward == 0.0 and fresh.verdict.outcome == Outcome.RUNNING and not (fresh.broken | fresh.unrewarded)
     np.testing.assert_array_equal(fresh.flight.position, np.full((N, 3), 5.0))
     np.testing.assert_array_equal(fresh.flight.velocity, np.zeros((N, 3)))
 
@@ -516,9 +514,9 @@ def test_a_flight_ahead_reaches_its_goal_and_the_next_step_is_the_reset(reset, s
     np.testing.assert_array_equal(back.flight.position, np.tile(fresh.drone.position, (N, 1)))
     assert int(jnp.sum(back.observation.sensed.count)) == 0  # at rest nothing moves
     goal = world.missions.goal[fresh.mission]
-    np.testing.assert_allclose(back.observation.own, env.own_state(FLOWN.env, SCENE, goal, fresh.drone), atol=1e-6)
-    np.testing.assert_array_equal(back.observation.motion, np.zeros(env.MOTION_SIZE))  # at rest, after no move
-    np.testing.assert_array_equal(last.observation.motion[4:], env.ACTIONS[AHEAD])
+    np.testing.assert_allclose(back.observation.own, own_state(FLOWN.env, SCENE, goal, fresh.drone), atol=1e-6)
+    np.testing.assert_array_equal(back.observation.motion, np.zeros(MOTION_SIZE))  # at rest, after no move
+    np.testing.assert_array_equal(last.observation.motion[4:], ACTIONS[AHEAD])
 
 
 @pytest.mark.slow
@@ -620,7 +618,7 @@ def test_what_cannot_be_seen_or_rewarded_has_diverged_and_is_told_apart(world, r
     def ill(config, scene, poses, memory, key):  # beyond 100 m
         return jnp.where(poses.position[-1, 0] > 100.0, jnp.nan, jnp.ones((2, 3))), memory
 
-    monkeypatch.setattr(env.sensor, "sense", ill)
+    monkeypatch.setattr(sensor, "sense", ill)
     unpaid = dataclasses.replace(world, reward=lambda t: jnp.where(t.move == BACK, jnp.inf, 1.0))
     broken_step = jax.jit(lambda state, action: env.step(FLOWN, unpaid, state, action))
     state, _ = reset(jax.random.key(0), MISSION["long"])

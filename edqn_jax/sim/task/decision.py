@@ -1,0 +1,198 @@
+"""One decision of one drone in stages: command, fly, judge, reward; and the reset in a decision's place.
+
+Observing comes after it, in `observation.py`. `env.step` puts all together. An action that comes a decision late wraps
+the command, gusts wrap the flight, the other drones of a group wrap the verdict.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+from flax import struct
+from jax import Array
+
+from edqn_jax.checks import check_finite
+from edqn_jax.config import Config
+from edqn_jax.sim.physics import drone
+from edqn_jax.sim.physics.disturbances import Disturbance
+from edqn_jax.sim.physics.drone import Airframe, Command, DroneState, Flight
+from edqn_jax.sim.scene.distance import signed_distance
+from edqn_jax.sim.scene.scene import Scene, moves, scene_at
+from edqn_jax.sim.task import group
+from edqn_jax.sim.task.action_sets import action_set
+from edqn_jax.sim.task.observation import hold
+from edqn_jax.sim.task.outcomes import Outcome, Verdict, judge
+from edqn_jax.sim.task.reward import Reward, Transition, configured_reward
+from edqn_jax.sim.worlds import geodesic
+
+
+@struct.dataclass
+class Situation:
+    """What a decision begins with."""
+
+    scene: Scene  # with its motion
+    goal: Array  # [3] metres
+    drone: DroneState
+    decision: Array  # [] int32 taken before in this episode
+    ended: Array  # [] bool, the episode has ended
+    disturbance: Disturbance | None = None  # None where nothing disturbs
+
+
+@struct.dataclass
+class Payment:
+    """What a decision is paid by, beside the configuration."""
+
+    function: Reward | None = struct.field(pytree_node=False)  # in place of the configured reward
+    distances: geodesic.Field | None  # None where all distances are straight
+    number: Array  # [] int32, the world in the pool
+
+
+@struct.dataclass
+class Decision:
+    """What a decision, or the reset in its place, comes to. n physics steps."""
+
+    drone: DroneState
+    flight: Flight  # [n, ...]
+    verdict: Verdict
+    reward: Array
+    broken: Array  # [] bool, the body was not finite
+    unrewarded: Array  # [] bool, the reward was not, although the body was
+    disturbance: Disturbance | None = None
+
+
+def choose(condition: Array, yes, no):
+    """Returns `yes` where the condition [] holds, else `no`, leaf by leaf."""
+    return jax.tree.map(lambda a, b: jnp.where(condition, a, b), yes, no)
+
+
+def time_of(config: Config, decisions: Array) -> Array:
+    """Returns the seconds [] of an episode after so many decisions []."""
+    return (decisions * config.drone.physics_steps) * config.drone.physics_dt_s
+
+
+def decide(
+    config: Config, airframe: Airframe, payment: Payment, before: Situation, action: Array, gusts: Array | None
+) -> Decision:
+    """Returns the decision as flown, judged and rewarded.
+
+    A diverged body stays where it was, so that no NaN reaches an observation; a decision without a finite reward has
+    diverged, too.
+
+    Args:
+        config: of task and drone.
+        airframe: that the controller believes in.
+        payment: see there.
+        before: see there.
+        action: [] or [A], as chosen.
+        gusts: key, consumed; None where nothing changes how a drone flies.
+    """
+    flown, late = _delayed(config, before.disturbance, action)
+    command = action_set(config).command(config, airframe, before.drone, before.goal, flown)
+    after, disturbance, flight = _fly(config, airframe, before.drone, late, command, gusts)
+    verdict = _judge(config, before, flight)
+    reward = _reward(config, payment, before, after, action, verdict.outcome)
+    numbers = jnp.concatenate([after.position, after.quaternion, after.velocity, after.angular_velocity])
+    broken = ~jnp.all(jnp.isfinite(numbers))
+    check_finite(numbers, "the state of a drone")
+    check_finite(jnp.where(broken, 0.0, reward), "the reward of a decision")
+    unrewarded = ~broken & ~jnp.isfinite(reward)
+    ill, hit = broken | unrewarded, verdict.hit_drone
+    return Decision(
+        drone=choose(broken, before.drone, after),
+        flight=choose(broken, hold(before.drone, flight.position.shape[0]), flight),
+        verdict=dataclasses.replace(
+            verdict,
+            outcome=jnp.where(ill, int(Outcome.DIVERGED), verdict.outcome).astype(jnp.int32),
+            hit_drone=None if hit is None else hit & ~ill,
+        ),
+        reward=jnp.where(ill, 0.0, reward),
+        broken=broken,
+        unrewarded=unrewarded,
+        disturbance=choose(broken, before.disturbance, disturbance),
+    )
+
+
+def reset_decision(decision: Decision, start: DroneState, drawn: Disturbance | None = None) -> Decision:
+    """Returns a reset with the arrays of a decision: at `start` throughout, with no reward."""
+    verdict = decision.verdict
+    return dataclasses.replace(
+        decision,
+        drone=start,
+        flight=hold(start, decision.flight.position.shape[0]),
+        verdict=dataclasses.replace(
+            verdict,
+            outcome=jnp.full((), int(Outcome.RUNNING), jnp.int32),
+            hit_drone=None if verdict.hit_drone is None else jnp.zeros((), bool),
+        ),
+        reward=jnp.zeros(()),
+        broken=jnp.zeros((), bool),
+        unrewarded=jnp.zeros((), bool),
+        disturbance=drawn,
+    )
+
+
+def _delayed(config: Config, disturbance: Disturbance | None, action: Array) -> tuple[Array, Disturbance | None]:
+    """Returns the action that is flown now, and the disturbance with the one that is flown next."""
+    if not config.env.action_delay:
+        return action, disturbance
+    assert disturbance is not None and disturbance.move is not None
+    return disturbance.move, dataclasses.replace(disturbance, move=action)
+
+
+def _fly(
+    config: Config,
+    airframe: Airframe,
+    body: DroneState,
+    disturbance: Disturbance | None,
+    command: Command,
+    gusts: Array | None,
+) -> tuple[DroneState, Disturbance | None, Flight]:
+    """Flies a command, against the disturbance where it changes how a drone flies."""
+    if gusts is not None:
+        assert disturbance is not None
+        return drone.fly_disturbed(config, airframe, body, disturbance, command, gusts)
+    after, flight = drone.fly_command(config.drone, airframe, body, command)
+    return after, disturbance, flight
+
+
+def _judge(config: Config, before: Situation, flight: Flight) -> Verdict:
+    """Returns the outcome in the world and among the other drones."""
+    position = before.drone.position
+    verdict = Verdict(*judge(config, before.scene, before.goal, position, flight, before.decision + 1))
+    if not group.several(config):
+        return verdict
+    path = jnp.concatenate([position[None], flight.position])
+    return group.collide(config, path, ~before.ended, verdict)
+
+
+def _reward(
+    config: Config, payment: Payment, before: Situation, after: DroneState, action: Array, outcome: Array
+) -> Array:
+    """Returns the configured reward, or that of the user's function; where there are no distances all are straight."""
+    here, there, goal = before.drone.position, after.position, before.goal
+    moved = jnp.sqrt(jnp.sum((there - here) ** 2))
+    if config.env.reward == "geodesic" and payment.distances is not None:
+        left = geodesic.remaining(payment.distances, payment.number, goal, here)
+        gained = left - geodesic.remaining(payment.distances, payment.number, goal, there)
+        # Nobody gains more than the way flown: a drone that crashes into a thin wall ends behind it.
+        most = geodesic.LONGER * moved
+        still_left = left - jnp.clip(gained, -most, most)
+    else:
+        left, still_left = (jnp.sqrt(jnp.sum((goal - point) ** 2)) for point in (here, there))
+    configured = configured_reward(config.env, outcome, left, still_left, moved)
+    if payment.function is None:
+        return configured
+    scene = before.scene
+    afterwards = scene_at(scene, time_of(config, before.decision + 1) if moves(scene) else None)
+    transition = Transition(
+        before=here,
+        after=there,
+        goal=goal,
+        clearance=signed_distance(afterwards, there) - config.drone.body_radius_m,
+        move=action,
+        outcome=outcome,
+        configured=configured,
+    )
+    return jnp.asarray(payment.function(transition), jnp.float32)

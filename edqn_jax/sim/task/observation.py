@@ -1,0 +1,167 @@
+"""What a drone observes: what its sensor shows, its own state and its own motion; the poses at which a sensor looks."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jax import Array
+
+from edqn_jax.config import Config, EnvConfig
+from edqn_jax.sim.physics import disturbances, drone
+from edqn_jax.sim.physics.disturbances import Disturbance
+from edqn_jax.sim.physics.drone import DroneState, Flight
+from edqn_jax.sim.scene.scene import Scene, moves
+from edqn_jax.sim.sensors import sensor
+from edqn_jax.sim.sensors.sensor import Sensed, SensorMemory, frame_steps
+
+OWN_SIZE = 10
+"""Values of the drone's own state in an observation."""
+
+MOTION_SIZE = 7
+"""Values of the drone's own motion in an observation."""
+
+MOST_YAW_RATE = 10.0
+"""Bound of the yaw rate in an observation, rad/s."""
+
+MIRRORED_MOTION = (1.0, -1.0, 1.0, -1.0, 1.0, -1.0, 1.0)
+"""Factors [MOTION_SIZE] on the own motion when left and right are exchanged."""
+
+
+@struct.dataclass
+class Observation:
+    """What the agent may know: what its sensor shows, by default the events before the decision, and its own state."""
+
+    sensed: Sensed
+    own: Array  # [OWN_SIZE], see `own_state`
+    motion: Array  # [MOTION_SIZE], see `own_motion`; only the encoder sees it
+
+
+@struct.dataclass
+class View:
+    """One moment of a flight, to be observed."""
+
+    scene: Scene
+    goal: Array  # [3] metres
+    drone: DroneState
+    move: Array  # [3] as in `own_motion`
+    poses: Flight  # [T] at which the sensor looks, see `poses_seen`
+    disturbance: Disturbance | None = None  # whose errors own state and motion have; None where there are none
+
+
+def observe(config: Config, view: View, memory: SensorMemory, key: Array) -> tuple[Observation, SensorMemory]:
+    """Returns what the sensor shows, own state [OWN_SIZE] and motion [MOTION_SIZE].
+
+    Args:
+        config: of sensor and task.
+        view: what is looked at.
+        memory, key: as in `sensor.sense`.
+    """
+    state = view.drone
+    if view.disturbance is not None and disturbances.has_noise(config.noise):
+        key, errs = jax.random.split(key)
+        position, velocity = disturbances.believed(config.noise, view.disturbance, state.position, state.velocity, errs)
+        state = dataclasses.replace(state, position=position, velocity=velocity)
+    sensed, memory = sensor.sense(config, view.scene, view.poses, memory, key)
+    own = own_state(config.env, view.scene, view.goal, state)
+    return Observation(sensed=sensed, own=own, motion=own_motion(config.env, state, view.move)), memory
+
+
+def own_state(config: EnvConfig, scene: Scene, goal: Array, state: DroneState) -> Array:
+    """Returns the drone's own ten values [OWN_SIZE], each of order 1.
+
+    Horizontal distance and height to the goal (asinh(d / 2 m) / 2 and asinh(h / 2 m): metres count near the
+    goal, powers of ten far away), cosine and sine of the heading, own position scaled to [-1, 1] in the
+    flight volume (3), own velocity in the heading frame (3, in commanded speeds).
+
+    Without `config.position` the first value is of the metres ahead to the goal, the position's horizontal values are 0
+    and its height gives way to the metres to the left, in the heading frame and scaled as the distance.
+    """
+    yaw = drone.yaw_of(state.quaternion)
+    cos, sin = jnp.cos(yaw), jnp.sin(yaw)
+    way = goal - state.position
+    if config.position:
+        lower, upper = scene.volume[0], scene.volume[1]
+        distance = jnp.sqrt(way[0] ** 2 + way[1] ** 2)
+        place = 2 * (state.position - lower) / (upper - lower) - 1
+    else:
+        distance, left = cos * way[0] + sin * way[1], cos * way[1] - sin * way[0]
+        place = jnp.stack([jnp.zeros(()), jnp.zeros(()), jnp.arcsinh(left / 2.0) / 2.0])
+    towards = jnp.stack([jnp.arcsinh(distance / 2.0) / 2.0, jnp.arcsinh(way[2] / 2.0), cos, sin])
+    return jnp.concatenate([towards, place, heading_velocity(config, yaw, state.velocity)])
+
+
+def turned(own: Array, quarters: Array) -> Array:
+    """Returns own states [..., OWN_SIZE] as they would be with world and drone turned about the volume's middle.
+
+    Args:
+        own: in a volume that is as long as it is wide.
+        quarters: [...] int32, quarter turns to the left.
+    """
+    cos, sin = jnp.array([1.0, 0.0, -1.0, 0.0])[quarters], jnp.array([0.0, 1.0, 0.0, -1.0])[quarters]
+    towards_x, towards_y = own[..., 2:6:2], own[..., 3:6:2]  # of the heading, and of the position in the volume
+    x = cos[..., None] * towards_x - sin[..., None] * towards_y
+    y = sin[..., None] * towards_x + cos[..., None] * towards_y
+    pairs = jnp.stack([x, y], axis=-1).reshape(*x.shape[:-1], 4)
+    return jnp.concatenate([own[..., :2], pairs, own[..., 6:]], axis=-1)
+
+
+def own_motion(config: EnvConfig, state: DroneState, move: Array) -> Array:
+    """Returns what the drone knows of its own motion [MOTION_SIZE], each value of order 1.
+
+    Velocity in the heading frame (3, in commanded speeds), yaw rate (rad/s, at most `MOST_YAW_RATE`), last move (3).
+
+    Args:
+        config: says what a commanded speed is.
+        state: of the drone.
+        move: [3] direction in the heading frame that was commanded at the last decision, see `ActionSet.direction`; of
+            moves -1, 0 and 1, zeros at a start. With `env.action_delay` it is yet to be flown.
+    """
+    velocity = heading_velocity(config, drone.yaw_of(state.quaternion), state.velocity)
+    # Of a drone on its back the heading turns at any rate.
+    rate = jnp.clip(drone.yaw_rate_of(state), -MOST_YAW_RATE, MOST_YAW_RATE)
+    return jnp.concatenate([velocity, rate[None], move])
+
+
+def heading_velocity(config: EnvConfig, yaw: Array, velocity: Array) -> Array:
+    """Returns velocities [..., 3] m/s in the frame of headings [...] radians, in commanded speeds."""
+    vx, vy, vz = jnp.moveaxis(velocity / config.speed_m_s, -1, 0)
+    cos, sin = jnp.cos(yaw), jnp.sin(yaw)
+    return jnp.stack([cos * vx + sin * vy, cos * vy - sin * vx, vz], axis=-1)
+
+
+def poses_at_start(config: Config, scene: Scene, body: DroneState) -> Flight:
+    """Returns the poses [T] at which the sensor looks before an episode, in which the body is at rest."""
+    before = np.array(frame_steps(config)) - config.drone.physics_steps
+    return timed(config, hold(body, len(before)), jnp.asarray(before) if moves(scene) else None)
+
+
+def hold(body: DroneState, n: int) -> Flight:
+    """Returns n times the same pose."""
+    repeat: Callable[[Array], Array] = lambda x: jnp.broadcast_to(x, (n, *x.shape))  # noqa: E731
+    return Flight(position=repeat(body.position), quaternion=repeat(body.quaternion), velocity=repeat(body.velocity))
+
+
+def timed(config: Config, flight: Flight, steps: Array | None) -> Flight:
+    """Returns a flight with the times of its poses, taken after physics steps `steps` [n] of the episode.
+
+    Where nothing moves but the drone nobody asks for times, and there are none.
+    """
+    if steps is None:
+        return flight
+    return dataclasses.replace(flight, time=steps * config.drone.physics_dt_s)
+
+
+def poses_seen(config: Config, first: DroneState, flight: Flight) -> Flight:
+    """Returns the poses [T] at which the sensor looks, of those before the first and after each physics step."""
+    began = None if flight.time is None else flight.time[0] - config.drone.physics_dt_s
+    path = jax.tree.map(
+        lambda a, b: jnp.concatenate([a[None], b]),
+        Flight(position=first.position, quaternion=first.quaternion, velocity=first.velocity, time=began),
+        flight,
+    )
+    return jax.tree.map(lambda x: jnp.stack([x[i] for i in frame_steps(config)]), path)

@@ -1,0 +1,77 @@
+"""The contract of a task: what learners, rollouts and other libraries' environments ask of whatever is flown.
+
+    task = task_of(config)
+    state, observation = task.reset(world, key)
+    state, step = task.step(world, state, action)
+
+All functions are pure and of one drone; `map` maps them over environments. A `World` holds the arrays that they
+depend on.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Callable
+from typing import Any
+
+from jax import Array
+from jax.typing import ArrayLike
+
+from edqn_jax.config import Config
+from edqn_jax.sim.actions import Box, Discrete
+from edqn_jax.sim.task import env, group
+from edqn_jax.sim.task.action_sets import action_set
+from edqn_jax.sim.task.env import EnvState, Step, World
+from edqn_jax.sim.task.observation import MIRRORED_MOTION, MOTION_SIZE, OWN_SIZE, Observation, turned
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Task:
+    """Pure functions of one drone on its missions."""
+
+    actions: Discrete | Box
+    """What an action is."""
+    still: ArrayLike
+    """An action that holds the drone where it is."""
+    own_size: int
+    """Values of the own state in an observation."""
+    motion_size: int
+    """Values of the own motion in an observation."""
+    reset: Callable[[World, Array, Array | None], tuple[EnvState, Observation]]
+    """(world, key, mission [] or None, which draws one) → state, the first observation; the key is consumed."""
+    begin: Callable[[World, Array, Array | None], EnvState]
+    """(world, key, mission or None) → a state whose next step is a reset: nothing is observed before that."""
+    step: Callable[..., tuple[EnvState, Step]]
+    """(world, state, action, mission=None) → state, what the decision, or the reset in its place, led to."""
+    map: Callable[[Callable[..., Any]], Callable[..., Any]]
+    """Maps a function of one drone over environments [E, ...], in groups where several drones share a world."""
+    label: Callable[[World, EnvState], Array] | None = None
+    """(world, state) → how near things are [H, W], for training alone: no observation holds it."""
+    mirror: tuple[float, ...] | None = None
+    """Factors [motion_size] on the own motion when left and right are exchanged; None where that is no symmetry."""
+    turn: Callable[[Array, Array], Array] | None = None
+    """(own states [..., own_size], quarter turns [...]) → those of world and drone turned about the vertical."""
+
+
+@functools.cache
+def task_of(config: Config) -> Task:
+    """Returns the task that a configuration describes.
+
+    Raises:
+        ConfigError: if there are no such actions.
+    """
+    actions = action_set(config)
+    return Task(
+        actions=actions.space,
+        still=actions.still,
+        own_size=OWN_SIZE,
+        motion_size=MOTION_SIZE,
+        reset=lambda world, key, mission=None: env.reset(config, world, key, mission),
+        begin=lambda world, key, mission=None: env.ended(config, world, key, mission),
+        step=lambda world, state, action, mission=None: env.step(config, world, state, action, mission),
+        map=functools.partial(group.each, config),
+        label=lambda world, state: env.nearness(config, world, state),
+        mirror=MIRRORED_MOTION,
+        turn=turned,
+    )
