@@ -150,7 +150,10 @@ def test_every_kind_of_option_can_be_a_flag():
         (["train", "--num-envs", "0"], "train.num_envs must be at least 1, not 0"),
         (["train", "--agent.replay-size", "64"], "agent.replay_size must be at least agent.batch_size"),
         (["train", "--env.actions", "velocity"], "env.actions must be moves for training, not velocity"),
-        (["train", "--env.actions", "move"], "there is no set of actions 'move'; did you mean 'moves'?"),
+        (
+            ["train", "--env.actions", "move"],
+            "env.actions: there is no set of actions 'move'; did you mean 'moves', or",
+        ),
         (["train", "--agent.bach-size", "64"], "--agent.batch-size"),
         (["train", "--train.num-envs", "many"], "--train.num-envs"),
         (["train", "--seeds", "0"], "--seeds must be at least 1, not 0"),

@@ -11,10 +11,11 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from edqn_jax.cli import arguments, main, record
+from edqn_jax.cli import arguments, main
 from edqn_jax.config import WorldConfig
 from edqn_jax.config.loading import to_yaml
 from edqn_jax.errors import ConfigError
+from edqn_jax.interop import flight_files
 from edqn_jax.learn.policy import PolicyParams, fresh_policy
 from edqn_jax.report.animation import LAST_FRAME_S, MOST_FRAMES, SIZE, animate
 from edqn_jax.report.sights import FINE, Shown
@@ -122,7 +123,7 @@ def test_a_run_is_recorded_where_its_last_flight_was(flown, asked, world, tmp_pa
     def named(config, name, *_):
         raise ConfigError(f"asked for {name}")
 
-    monkeypatch.setattr(record, "load_missions", named)
+    monkeypatch.setattr(flight_files, "load_missions", named)
     assert main(["record", str(tmp_path), str(tmp_path / "flight.gif"), *asked]) == 2
     assert f"asked for {world}" in capsys.readouterr().err
 
