@@ -152,7 +152,7 @@ def test_every_kind_of_option_can_be_a_flag():
         (["train", "--env.actions", "velocity"], "env.actions must be moves for training, not velocity"),
         (
             ["train", "--env.actions", "move"],
-            "env.actions: there is no set of actions 'move'; did you mean 'moves', or",
+            "there is no set of actions 'move'; did you mean 'moves', or",
         ),
         (["train", "--agent.bach-size", "64"], "--agent.batch-size"),
         (["train", "--train.num-envs", "many"], "--train.num-envs"),
