@@ -39,7 +39,7 @@ def train_command(argv: Sequence[str], stops: Stops) -> None:
     several = options.coordinator_address, options.num_processes, options.process_id
     arguments = how_to_join(options.distributed, *several, os.environ)
 
-    start_jax()
+    start_jax(alone=arguments is None)
 
     import jax
 

@@ -34,14 +34,21 @@ def prepare_process() -> None:
         warnings.simplefilter("default")  # those of other packages would end the command
 
 
-def start_jax() -> None:
+def start_jax(*, alone: bool = True) -> None:
     """Imports JAX, with the settings that were tested; says so where the environment has others.
 
+    Args:
+        alone: whether no other process of the same run uses this machine's GPUs.
+
     Raises:
-        ConfigError: names the variable that JAX or XLA refuses.
+        ConfigError: names the variable that JAX or XLA refuses, or the GPU whose memory others use.
     """
     if "jax" not in sys.modules:
         _check_xla_flags(os.environ)
+        if alone:
+            from edqn_jax.devices.gpu_memory import check_gpus_are_free
+
+            check_gpus_are_free()
     try:
         import jax
     except ValueError as error:
@@ -83,15 +90,24 @@ def platforms_named() -> Iterator[None]:
 
 
 def check_devices() -> None:
-    """Raises if JAX finds no device of the kind that the environment asks for.
+    """Raises if JAX finds no device of the kind that the environment asks for, or one that it cannot use.
 
     Raises:
-        ConfigError: as `platforms_named`.
+        ConfigError: as `platforms_named`, or says what JAX says.
     """
     import jax
 
-    with platforms_named():
-        jax.devices()
+    try:
+        with platforms_named():
+            jax.devices()
+    except RuntimeError as error:
+        said = re.search(r"Unable to initialize backend '(\w+)': (?:\w+: )?([^(\n]*)", str(error))
+        if said is None:
+            raise
+        raise ConfigError(
+            f"JAX cannot use the devices of '{said[1]}': {said[2].strip()}; see what uses them (nvidia-smi), or set "
+            "JAX_PLATFORMS=cpu"
+        ) from None
 
 
 def _has_devices() -> bool:

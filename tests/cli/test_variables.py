@@ -105,3 +105,19 @@ def test_settings_that_are_not_used_are_told_in_one_line(capsys: pytest.CaptureF
     assert capsys.readouterr().err == f"edqn: {said} tested\n"
     start_jax()
     assert capsys.readouterr().err == ""
+
+
+def test_devices_that_jax_cannot_use_are_one_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
+    said = (
+        "Unable to initialize backend 'cuda': INTERNAL: no supported devices found for platform CUDA (you may need to"
+    )
+
+    def fails(*_):
+        raise RuntimeError(said)
+
+    monkeypatch.setattr(jax, "devices", fails)
+    for name in ("JAX_PLATFORMS", "JAX_PLATFORM_NAME"):
+        monkeypatch.delenv(name, raising=False)
+    wanted = "devices of 'cuda': no supported devices found for platform CUDA; see what uses them"
+    with pytest.raises(ConfigError, match=wanted):
+        check_devices()
