@@ -25,8 +25,8 @@ _PLUGINS = ("jax_cuda12_plugin", "jax_cuda13_plugin")
 def check_gpus_are_free(environ: Mapping[str, str] = os.environ) -> None:
     """Raises if what JAX takes of a GPU's memory when it starts is not free; must be called before JAX is first used.
 
-    Does nothing where JAX uses no NVIDIA GPU, where it takes memory as it needs it, and where `nvidia-smi` is missing or
-    does not answer.
+    Does nothing where JAX uses no NVIDIA GPU, where it takes memory as it needs it, and where `nvidia-smi` is missing
+    or does not answer.
 
     Args:
         environ: environment variables.

@@ -108,14 +108,8 @@ def test_settings_that_are_not_used_are_told_in_one_line(capsys: pytest.CaptureF
 
 
 def test_devices_that_jax_cannot_use_are_one_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
-    said = (
-        "Unable to initialize backend 'cuda': INTERNAL: no supported devices found for platform CUDA (you may need to"
-    )
-
-    def fails(*_):
-        raise RuntimeError(said)
-
-    monkeypatch.setattr(jax, "devices", fails)
+    said = "Unable to initialize backend 'cuda': INTERNAL: no supported devices found for platform CUDA (you may need"
+    monkeypatch.setattr(jax, "devices", refuses(RuntimeError(said)))
     for name in ("JAX_PLATFORMS", "JAX_PLATFORM_NAME"):
         monkeypatch.delenv(name, raising=False)
     wanted = "devices of 'cuda': no supported devices found for platform CUDA; see what uses them"
