@@ -320,7 +320,7 @@ def test_a_new_episode_begins_with_an_empty_memory() -> None:
         is_reset=jnp.array([True, False]), observation=Observation(None, own, own[:, :MOTION_SIZE])
     )
     actors: Any = SimpleNamespace(memory=jnp.full((1, 2, config.agent.history, OWN_SIZE), 7.0))
-    learner: Any = SimpleNamespace(encoder={})
+    learner: Any = SimpleNamespace(encoder={}, agent=SimpleNamespace(average={}))
     fresh, running = trainer._remember(config, learner, actors, seen, jnp.int32(Plan.of(config).warmup + 5))
     np.testing.assert_array_equal(fresh, [np.zeros(OWN_SIZE), own[0]])
     np.testing.assert_array_equal(running, [np.full(OWN_SIZE, 7.0), own[1]])
