@@ -27,4 +27,4 @@ def test_bad_input_is_one_sentence(capsys: pytest.CaptureFixture[str]) -> None:
     assert capsys.readouterr().err.count("\n") == 1
     with pytest.raises(SystemExit):
         interop.main(["--num-envs", "0"])
-    assert "--num-envs must be at least 1, not 0" in capsys.readouterr().err
+    assert "argument --num-envs: must be a whole number of at least 1, not 0" in capsys.readouterr().err

@@ -73,9 +73,8 @@ def test_what_the_kinds_of_observations_show_reaches_the_model() -> None:
     ):
         flies = sb3_policy(model, observation=kind, **options)  # type: ignore[arg-type]
         actor = FunctionActor(flies.function, flies.memory)
-        move, memory = jax.jit(actor.act)(None, actor.init(), seen, jax.random.key(0))
+        move, _ = jax.jit(actor.act)(None, actor.init(), seen, jax.random.key(0))
         assert move.dtype == np.int32 and 0 <= int(move) < 27 and len(model.asked) == 1
-        assert memory.shape == (size if kind == "code" else 0,)
 
 
 @pytest.mark.parametrize(

@@ -98,7 +98,7 @@ def test_what_the_replay_holds_never_leads_from_an_end_to_a_start():
 @pytest.mark.parametrize("observation", ["image", "code"])
 def test_it_flies_as_gymnasiums_vector_without_its_reset_rows(observation):
     options: dict[str, Any] = {"observation": observation, "worlds": 3}
-    options |= {"policy": policy(2), "config": None} if observation == "code" else {"config": small()}
+    options |= {"policy": policy(), "config": None} if observation == "code" else {"config": small()}
     ours, theirs = drones(2, **options), many_of(options)
     ours.seed(3)
     mine, (other, _) = ours.reset(), theirs.reset(seed=3)
