@@ -89,7 +89,7 @@ class FunctionPolicy:
     """
 
     function: Function
-    """(observation, memory, key) → action, memory. The action is a move: its number, vector or name."""
+    """Returns action and memory for an observation, a memory and a key; the action is the number, vector or name of a move."""
     config: Config | None = None
     """Drone, camera, sensor and task; None is the default for the world that is flown."""
     memory: Callable[[], Any] | None = None

@@ -41,13 +41,13 @@ class Task:
     reset: Callable[[World, Array, Array | None], tuple[EnvState, Observation]]
     """(world, key, mission [] or None, which draws one) → state, the first observation; the key is consumed."""
     begin: Callable[[World, Array, Array | None], EnvState]
-    """(world, key, mission or None) → a state whose next step is a reset: nothing is observed before that."""
+    """(world, key, mission or None) → a state whose next step is a reset; nothing is observed before that."""
     step: Callable[..., tuple[EnvState, Step]]
     """(world, state, action, mission=None) → state, what the decision, or the reset in its place, led to."""
     map: Callable[[Callable[..., Any]], Callable[..., Any]]
     """Maps a function of one drone over environments [E, ...], in groups where several drones share a world."""
     label: Callable[[World, EnvState], Array] | None = None
-    """(world, state) → how near things are [H, W], for training alone: no observation holds it."""
+    """(world, state) → how near things are [H, W], for training alone; no observation holds it."""
     mirror: tuple[float, ...] | None = None
     """Factors [motion_size] on the own motion when left and right are exchanged; None where that is no symmetry."""
     turn: Callable[[Array, Array], Array] | None = None
