@@ -89,7 +89,7 @@ class FunctionPolicy:
     """
 
     function: Function
-    """Returns action and memory for an observation, a memory and a key; the action is the number, vector or name of a move."""
+    """Returns action and memory of an observation, a memory and a key; an action is a move's number, vector or name."""
     config: Config | None = None
     """Drone, camera, sensor and task; None is the default for the world that is flown."""
     memory: Callable[[], Any] | None = None
