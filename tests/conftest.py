@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import gc
 import os
 import shutil
 import tempfile
@@ -62,6 +63,9 @@ LONGEST = (
 """
 
 use_cpu_devices(2)
+
+# A walk over all that JAX has traced frees next to nothing and takes a tenth of a session, so it comes seldom.
+gc.set_threshold(50_000, 50, 100)
 
 
 def pytest_configure(config: pytest.Config) -> None:
