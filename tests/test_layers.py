@@ -19,6 +19,7 @@ ORDER = (
         "files",
         "checks",
         "extras",
+        "user_code",
         "xla_flags",
         "xla",
         "sine",

@@ -7,7 +7,6 @@ import signal
 import sys
 from collections.abc import Sequence
 from importlib import metadata
-from pathlib import Path
 
 import tyro
 
@@ -36,6 +35,7 @@ from edqn_jax.cli.variables import check_devices, start_jax
 from edqn_jax.config.loading import nearest
 from edqn_jax.errors import CheckError, ConfigError, DivergedError, StoppedError, sentence
 from edqn_jax.extras import MissingPackageError
+from edqn_jax.user_code import load_module
 from edqn_jax.version import package_version
 
 DONE = 0
@@ -150,23 +150,13 @@ def import_module_or_file(name: str) -> None:
     """Imports what registers a user's own entries: a file that ends in .py, or a module, also of the current folder.
 
     Raises:
-        ConfigError: if there is none, or it makes arrays while it is imported, which fixes JAX's devices too soon.
+        ConfigError: as `load_module`, or if it makes arrays while it is imported, which fixes JAX's devices too soon.
     """
     start_jax()
 
     from edqn_jax.devices.forks import has_found_devices
 
-    module = Path(name).stem if name.endswith(".py") else name
-    folder = str(Path(name).resolve().parent if name.endswith(".py") else Path.cwd())
-    if name.endswith(".py") and not Path(name).is_file():
-        raise ConfigError(f"there is no file '{name}' to import")
-    sys.path.insert(0, folder)
-    try:
-        importlib.import_module(module)
-    except ModuleNotFoundError as error:
-        if error.name != module:
-            raise
-        raise ConfigError(f"there is no module '{name}' to import; give a file that ends in .py, or a module") from None
+    load_module(name)
     if has_found_devices():
         raise ConfigError(
             f"'{name}' computes with JAX while it is imported, before the devices are known; make its arrays within "

@@ -17,6 +17,9 @@ SHARES = ("XLA_CLIENT_MEM_FRACTION", "XLA_PYTHON_CLIENT_MEM_FRACTION")
 SHARE = 0.75
 """What it takes unless one of them says."""
 
+LEAST = 0.05
+"""A share that is worth a try."""
+
 _GIB_OF_MIB = 1 / 1024
 _QUERY = ("--query-gpu=name,memory.total,memory.free", "--format=csv,noheader,nounits")
 _PLUGINS = ("jax_cuda12_plugin", "jax_cuda13_plugin")
@@ -37,12 +40,14 @@ def check_gpus_are_free(environ: Mapping[str, str] = os.environ) -> None:
     if not _uses_cuda(environ):
         return
     share = share_taken(environ)
+    variable = next((name for name in SHARES if name in environ), SHARES[0])  # JAX refuses both at once
     for name, whole, free in _gpus(environ):
         if share is not None and free < share * whole:
+            left = int(100 * free / whole) / 100
+            remedy = f", or give each program its share, here at most {variable}={left:.2f}" if left >= LEAST else ""
             raise ConfigError(
-                f"the {name} has {free * _GIB_OF_MIB:.1f} GiB of memory free, but JAX takes "
-                f"{share * whole * _GIB_OF_MIB:.1f} GiB, {share:.0%} of it, when it starts; end what else uses it, or "
-                f"give each program its share, here at most {SHARES[1]}={int(100 * free / whole) / 100:.2f}"
+                f"the {name} has {free * _GIB_OF_MIB:.1f} GiB of memory free, but JAX takes {share:.0%} of all, "
+                f"{share * whole * _GIB_OF_MIB:.1f} GiB, when it starts; end what else uses it{remedy}"
             )
 
 

@@ -3,10 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import importlib
-import importlib.util
-import sys
-import traceback
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -21,8 +17,9 @@ from edqn_jax.errors import ConfigError
 from edqn_jax.learn.actor import Actor, AgentActor
 from edqn_jax.learn.policy import Policy
 from edqn_jax.policies import function_named
-from edqn_jax.sim.actions import move_number
+from edqn_jax.sim.actions import ACTIONS, move_number
 from edqn_jax.sim.task.env import Observation
+from edqn_jax.user_code import load_module
 
 Function = Callable[[Observation, Any, Array], tuple[Any, Any]]
 """(observation of one drone, memory, key consumed) → action, memory for the next observation; traced by JAX."""
@@ -65,8 +62,11 @@ class FunctionActor(Actor):
                 f"a policy's function must return a memory like the one that it is given, {before}, not {now}; "
                 "`memory` of FunctionPolicy returns the first one"
             )
+        if action is None:
+            raise ConfigError(f"a policy is {TAKES}; this one returned None in place of an action")
         if isinstance(action, str) or not jnp.issubdtype(jnp.asarray(action).dtype, jnp.floating):
-            action = move_number(action)
+            # A number that is computed is known in flight alone; what is flown is what is recorded.
+            action = jnp.clip(move_number(action), 0, len(ACTIONS) - 1)
         return jnp.asarray(action), after
 
 
@@ -127,14 +127,19 @@ def as_policy(policy: Policy | FunctionPolicy | Function, world: str | Path | No
     """Returns a policy as it is, and a function as one; the configuration that is not given is that of the world.
 
     Raises:
-        ConfigError: if it is neither.
+        ConfigError: if it is neither, or its actions are no moves.
     """
     if isinstance(policy, Policy):
         return policy
     own = policy if isinstance(policy, FunctionPolicy) else FunctionPolicy(policy)
-    if own.config is not None:
-        return own
-    return dataclasses.replace(own, config=make_config(None if world is None else str(world)))
+    if own.config is None:
+        return dataclasses.replace(own, config=make_config(None if world is None else str(world)))
+    if own.config.env.actions != "moves":
+        raise ConfigError(
+            f"evaluate, record and report fly moves, and env.actions of this policy is '{own.config.env.actions}'; fly "
+            "it with edqn_jax.make or the Gymnasium environment"
+        )
+    return own
 
 
 def config_of(policy: Policy | FunctionPolicy) -> Config:
@@ -169,32 +174,11 @@ def load_function(name: str) -> Policy | FunctionPolicy | Function:
     found = function_named(name)
     assert found is not None
     where, attribute = found
-    is_file = where.endswith(".py")
-    folder = str(Path(where).parent.resolve() if is_file else Path.cwd())
-    if folder not in sys.path:
-        sys.path.insert(0, folder)
-    try:
-        module = _module_of_file(Path(where)) if is_file else importlib.import_module(where)
-    except (Exception, SystemExit) as error:
-        line = next((each.lineno for each in reversed(traceback.extract_tb(error.__traceback__)) if is_file), None)
-        at = "" if line is None else f", line {line}"
-        raise ConfigError(f"'{where}' does not load: {type(error).__name__}: {error}{at}"[:300]) from error
+    module = load_module(where)
     if not hasattr(module, attribute):
         names = [each for each in vars(module) if not each.startswith("_")]
         raise ConfigError(f"'{where}' has no '{attribute}'{nearest(attribute, names)}")
     policy = getattr(module, attribute)
     if not isinstance(policy, Policy | FunctionPolicy) and (not callable(policy) or isinstance(policy, type)):
         raise ConfigError(f"'{name}' is of the type {type(policy).__name__}; a policy is {TAKES}, or a FunctionPolicy")
-    return getattr(module, attribute)
-
-
-def _module_of_file(file: Path) -> Any:
-    if not file.is_file():
-        raise ConfigError(f"there is no file '{file}'")
-    name = f"edqn_policy_{file.stem}"
-    spec = importlib.util.spec_from_file_location(name, file)
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[name] = module  # dataclasses look their module up
-    spec.loader.exec_module(module)
-    return module
+    return policy

@@ -43,8 +43,8 @@ def test_help_lists_what_a_file_or_a_module_registers_and_a_run_takes_it(tmp_pat
 @pytest.mark.parametrize(
     ("name", "text", "says"),
     [
-        ("nowhere.py", None, "there is no file 'nowhere.py' to import"),
-        ("nowhere", None, "there is no module 'nowhere' to import"),
+        ("nowhere.py", None, "there is no file 'nowhere.py'"),
+        ("nowhere", None, "there is no module 'nowhere'; give a file"),
         ("early.py", "import jax.numpy as jnp\njnp.zeros(3)", "'early.py' computes with JAX while it is imported"),
         ("taken.py", SENSOR.replace("mine", "events"), "there is a sensor 'events' already"),
     ],

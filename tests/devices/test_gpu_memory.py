@@ -31,12 +31,19 @@ def answers(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Answers:
 
 def test_a_gpu_of_which_others_use_most_is_refused_with_the_share_that_is_left(answers: Answers) -> None:
     environ = answers("NVIDIA H100 80GB HBM3, 81559, 20390\\n")
-    wanted = r"the NVIDIA H100 80GB HBM3 has 19.9 GiB of memory free, but JAX takes 59.7 GiB, 75% of it, .* at most "
-    with pytest.raises(ConfigError, match=wanted + "XLA_PYTHON_CLIENT_MEM_FRACTION=0.25"):
+    wanted = r"the NVIDIA H100 80GB HBM3 has 19.9 GiB of memory free, but JAX takes 75% of all, 59.7 GiB, .* at most "
+    with pytest.raises(ConfigError, match=wanted + "XLA_CLIENT_MEM_FRACTION=0.25"):
         check_gpus_are_free(environ)
+    with pytest.raises(ConfigError, match="at most XLA_PYTHON_CLIENT_MEM_FRACTION=0.25"):  # JAX refuses both
+        check_gpus_are_free(environ | {"XLA_PYTHON_CLIENT_MEM_FRACTION": "0.9"})
     check_gpus_are_free(environ | {"XLA_PYTHON_CLIENT_MEM_FRACTION": "0.25"})
     check_gpus_are_free(environ | {"XLA_PYTHON_CLIENT_PREALLOCATE": "false"})
     check_gpus_are_free(environ | {"JAX_PLATFORMS": "cpu"})
+
+
+def test_a_share_of_next_to_nothing_is_no_advice(answers: Answers) -> None:
+    with pytest.raises(ConfigError, match="when it starts; end what else uses it$"):
+        check_gpus_are_free(answers("A card, 81559, 300\\n"))
 
 
 def test_every_gpu_that_the_process_may_use_counts(answers: Answers, tmp_path: Path) -> None:

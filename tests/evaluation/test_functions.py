@@ -21,7 +21,7 @@ from edqn_jax.interop import functional
 from edqn_jax.interop.onnx_export import export_policy
 from edqn_jax.learn.actor import AgentActor
 from edqn_jax.learn.policy import Policy
-from edqn_jax.policies.functions import FunctionPolicy, load_function
+from edqn_jax.policies.functions import FunctionActor, FunctionPolicy, load_function
 from edqn_jax.sim.task.env import Observation
 from tests.miniature import WORLD
 from tests.policies import CONFIG, fresh
@@ -137,6 +137,7 @@ def test_a_bare_function_flies_as_the_worlds_default_does(monkeypatch: pytest.Mo
         (lambda o, m, k: 22, None, r"a function \(observation, memory, key\) -> \(action, memory\); this one .* int"),
         (lambda o, m, k: ("ahed", m), None, "did you mean 'ahead'"),
         (lambda o, m, k: (27, m), None, "number from 0 to 26"),
+        (lambda o, m, k: (None, m), None, "this one returned None in place of an action"),
         (lambda o, m, k: (o.own, m), None, r"actions are float32\[10\]; a move is a number from 0 to 26"),
         (lambda o, m, k: (22, o.own), None, r"the one that it is given, None, not float32\[10\]"),
         (lambda o, m, k: (22, {"n": m["n"] + 0.5}), lambda: {"n": 0}, r"\{'n': int32\[\]\}, not \{'n': float32\[\]\}"),
@@ -145,6 +146,22 @@ def test_a_bare_function_flies_as_the_worlds_default_does(monkeypatch: pytest.Mo
 def test_what_a_function_does_wrong_is_said(function: Any, memory: Any, says: str) -> None:
     with pytest.raises(ConfigError, match=says):
         flown(function, memory)
+
+
+def test_a_move_that_is_computed_and_does_not_exist_is_recorded_as_it_is_flown() -> None:
+    seen = edqn_jax.make("paper").reset(0, 0)[1]
+    for number, flies in ((100, 26), (-3, 0)):
+        actor = FunctionActor(lambda o, m, k, n=number: (jnp.argmax(o.own) * 0 + n, m))
+        assert int(jax.jit(actor.act)(None, None, seen, jax.random.key(0))[0]) == flies
+
+
+def test_other_actions_than_moves_are_refused_before_anything_flies() -> None:
+    config = edqn_jax.make_config("sparse", env={"actions": "velocity", "sensor": "blind"})
+    policy = edqn_jax.FunctionPolicy(lambda o, m, k: (jnp.zeros(3), m), config)
+    with pytest.raises(
+        ConfigError, match="report fly moves, and env.actions of this policy is 'velocity'; fly it with"
+    ):
+        edqn_jax.evaluate(policy)
 
 
 @dataclasses.dataclass
@@ -184,13 +201,14 @@ def test_a_function_is_found_in_a_file_and_in_a_module(file: Path, monkeypatch: 
         (f"{file}:climb", "has no 'climb'; did you mean 'climbs'"),
         (f"{file}:number", "is of the type int; a policy is a function"),
         (f"{file}:Climbs", "is of the type type"),
-        ("no_such_module:climbs", "'no_such_module' does not load: ModuleNotFoundError"),
+        ("no_such_module:climbs", "there is no module 'no_such_module'; give a file"),
     ):
         with pytest.raises(ConfigError, match=says):
             load_function(name)
-    file.write_text("one = 1\nraise RuntimeError('not today')\n")
+    fails = file.with_name("fails.py")
+    fails.write_text("one = 1\nraise RuntimeError('not today')\n")
     with pytest.raises(ConfigError, match="does not load: RuntimeError: not today, line 2"):
-        load_function(f"{file}:climbs")
+        load_function(f"{fails}:climbs")
 
 
 def test_the_commands_fly_a_function(file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
