@@ -181,4 +181,4 @@ def load_function(name: str) -> Policy | FunctionPolicy | Function:
     policy = getattr(module, attribute)
     if not isinstance(policy, Policy | FunctionPolicy) and (not callable(policy) or isinstance(policy, type)):
         raise ConfigError(f"'{name}' is of the type {type(policy).__name__}; a policy is {TAKES}, or a FunctionPolicy")
-    return policy
+    return policy  # pyright: ignore[reportReturnType]  # what it takes is seen when it is called
