@@ -12,7 +12,6 @@ import sys
 from collections import Counter
 from collections.abc import Sequence
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import jax
@@ -196,10 +195,7 @@ def table(rows: Sequence[dict[str, Any]]) -> str:
 def main(argv: Sequence[str] | None = None) -> int:
     """Returns exit code 0; 2 for invalid input."""
     parser = Parser("failures", __doc__, json="write a row for each collision to this file")
-    parser.add_argument("run", type=Path, help="folder of a run, or pretrained")
-    parser.add_argument("--world", help="--world of train.py (default: that of the run)")
-    parser.add_argument("--missions", type=int, default=1000, help="number of missions (default 1000)")
-    parser.add_argument("--seed", type=int, default=0, help="seed of the missions (default 0)")
+    parser.add_flights("folder of a run, or pretrained", missions=1000)
     parser.add_argument("--flights", type=at_least_one, default=50, help="most collisions to look at (default 50)")
     args = parser.parse(argv)
     use_cpu_devices()

@@ -13,7 +13,6 @@ import platform
 import sys
 from collections.abc import Sequence
 from importlib.metadata import version
-from pathlib import Path
 from typing import Any
 
 import jax
@@ -69,10 +68,7 @@ def table(rows: list[dict[str, Any]]) -> str:
 def main(argv: Sequence[str] | None = None) -> int:
     """Returns exit code 0 if all outcomes agree, 1 if one differs, 2 for invalid input."""
     parser = Parser("verdicts", __doc__)
-    parser.add_argument("run", type=Path, help="folder of a run")
-    parser.add_argument("--world", help="--world of train.py (default: that of the run)")
-    parser.add_argument("--missions", type=int, default=200, help="number of missions (default 200)")
-    parser.add_argument("--seed", type=int, default=0, help="seed of the missions (default 0)")
+    parser.add_flights("folder of a run", missions=200)
     args = parser.parse(argv)
     use_cpu_devices()
     config, params = load_run(args.run)

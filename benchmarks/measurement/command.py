@@ -36,6 +36,18 @@ class Parser(argparse.ArgumentParser):
         if json is not None:
             self.add_argument("--json", type=Path, help=json)
 
+    def add_flights(self, run: str, missions: int) -> None:
+        """Adds the run whose policy flies, and where: `run`, `--world`, `--missions` and `--seed`.
+
+        Args:
+            run: help of the run.
+            missions: flown unless another number is given.
+        """
+        self.add_argument("run", type=Path, help=run)
+        self.add_argument("--world", help="--world of train.py (default: that of the run)")
+        self.add_argument("--missions", type=int, default=missions, help=f"number of missions (default {missions})")
+        self.add_argument("--seed", type=int, default=0, help="seed of the missions (default 0)")
+
     def parse(self, words: Sequence[str] | None) -> argparse.Namespace:
         """Returns the options.
 

@@ -116,7 +116,7 @@ class FunctionalEnv:
         """
         mission = None if mission is None else jnp.asarray(mission, jnp.int32)
         flight, seen = self.task.reset(params.world, key, mission)
-        return self._observed(params, seen), State(flight)
+        return self.observe(params, seen), State(flight)
 
     @as_tested
     def step(
@@ -146,7 +146,7 @@ class FunctionalEnv:
             "episode_return": step.episode_return,
             "episode_length": step.episode_length,
         }
-        observed = self._observed(params, step.observation)
+        observed = self.observe(params, step.observation)
         truncated = step.outcome == Outcome.TIME_OUT
         return observed, State(flight), step.reward, is_terminal(step.outcome), truncated, info
 
@@ -169,7 +169,8 @@ class FunctionalEnv:
         info["final_observation"] = observed
         return choose(first, observed), choose(fresh, after), reward, terminated, truncated, info
 
-    def _observed(self, params: Params, seen: Observation) -> Observed:
+    def observe(self, params: Params, seen: Observation) -> Observed:
+        """Returns what is observed of what the drone knows: `seen` in the form that `observation` names."""
         own, motion = _numbers(seen.own), _numbers(seen.motion)
         if self.observation == "kinematics":
             return jnp.concatenate([own, motion])

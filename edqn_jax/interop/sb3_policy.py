@@ -63,7 +63,7 @@ def sb3_policy(
         return np.asarray(model.predict(observed, deterministic=deterministic)[0], answer.dtype)
 
     def act(seen: Observation, memory: Array, key: Array) -> tuple[Array, Array]:
-        observed = env._observed(params, seen)
+        observed = env.observe(params, seen)
         return jax.pure_callback(predict, answer, observed, vmap_method="broadcast_all"), memory
 
     return FunctionPolicy(act, config)

@@ -220,9 +220,12 @@ def sensor_of(config: Config) -> Sensor:
     """Returns the sensor that `config` names.
 
     Raises:
-        ConfigError: if there is none of that name.
+        ConfigError: if there is none of that name, or what was registered is no sensor.
     """
-    return SENSORS.get(config.env.sensor)
+    found = SENSORS.get(config.env.sensor)
+    if not isinstance(found, Sensor):
+        raise ConfigError(f"the sensor '{config.env.sensor}' must be an edqn_jax.Sensor, not {type(found).__name__}")
+    return found
 
 
 def frame_steps(config: Config) -> tuple[int, ...]:
