@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from concurrent.futures import Executor
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -16,11 +15,9 @@ from edqn_jax.report.flights import draw_path, draw_world
 from edqn_jax.report.images import NEARNESS, RECONSTRUCTED_EVENTS, draw_reconstruction, draw_sight, look_of
 from edqn_jax.report.sights import Sights, coarse, decision_rows, poses, times_of
 from edqn_jax.runs.directory import RunDirectory
+from edqn_jax.runs.record import Draw
 from edqn_jax.sim.camera.camera import on_screen
 from edqn_jax.sim.scene.scene import Scene
-
-if TYPE_CHECKING:
-    from edqn_jax.runs.record import Draw
 
 MOMENTS = 5
 """Moments of the flight that are shown."""
