@@ -1,0 +1,147 @@
+"""The outer test without OpenGL: events and flight of others, and the parts that are ours against the package."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+
+import numpy as np
+import pytest
+
+import edqn_jax
+from edqn_jax.interop.runner import Command
+from edqn_jax.learn.policy import Policy
+from edqn_jax.sim.task.environment import Environment
+from outer import event_cameras, flights
+from outer.poses import Track, heading_of
+
+import transfer  # isort: skip
+
+pytestmark = pytest.mark.filterwarnings("ignore")  # evlib, rotorpy, jax2onnx and what they import
+
+UPRIGHT = np.array([1.0, 0.0, 0.0, 0.0])
+
+
+@functools.cache
+def policy() -> Policy:
+    return edqn_jax.load_policy("pretrained")
+
+
+@functools.cache
+def medium() -> Environment:
+    return edqn_jax.make("medium", policy().config, worlds=2, split="test")
+
+
+def test_with_all_parts_our_own_it_flies_as_the_package_does():
+    args = transfer.parse(["--world", "medium", "--picture", "own", "--missions", "2"])
+    report = transfer.measure(args, show=lambda _: None)
+    for mission, ended in enumerate(report["missions"]):
+        state, seen = medium().reset(0, mission)
+        memory, decisions = None, 0
+        while not state.ended:
+            move, memory = policy().act(seen, memory)
+            state, step = medium().step(state, move)
+            seen, decisions = step.observation, decisions + 1
+        assert ended["outcome"] == edqn_jax.Outcome(int(step.outcome)).name.lower().replace("_", " ")
+        assert ended["decisions"] == decisions
+    assert (report["flown"], report["of"]) == (2, 2)
+    assert report["median_least_clearance_m"] > 0
+
+
+def rotorpy_after(velocity: tuple[float, float, float], seconds: float) -> tuple[flights.RotorPyFlight, Track]:
+    flight = flights.RotorPyFlight(np.array([0.0, 0.0, 5.0]), np.array([10.0, 0.0, 5.0]), 2.0)
+    command = Command(0, np.array(velocity, np.float32), 0.0, np.zeros(27, np.float32))
+    return flight, flight.fly(command, seconds)
+
+
+def test_rotorpy_hovers_and_loses_some_speed_to_drag():
+    _, still = rotorpy_after((0.0, 0.0, 0.0), 1.0)
+    assert np.abs(still.position - [0.0, 0.0, 5.0]).max() < 0.05
+    flight, _ = rotorpy_after((4.0, 0.0, 0.0), 3.0)
+    assert 3.3 < flight.body().velocity[0] < 3.95
+    assert np.abs(flight.body().velocity[1:]).max() < 0.1
+
+
+def test_rotorpy_turns_to_the_commanded_heading():
+    flight = flights.RotorPyFlight(np.array([0.0, 0.0, 5.0]), np.array([10.0, 0.0, 5.0]), 2.0)
+    command = Command(0, np.zeros(3, np.float32), 1.0, np.zeros(27, np.float32))
+    flight.fly(command, 0.3)
+    assert flight.body().yaw_rate > 0.5
+    flight.fly(command, 3.0)
+    assert abs(heading_of(flight.body().quaternion) - 1.0) < 0.1
+
+
+def straight_track() -> Track:
+    time = np.linspace(0.0, 1.0, 11)
+    return Track(time, np.stack([time, 0 * time, 0 * time], axis=1), np.tile(UPRIGHT, (11, 1)))
+
+
+def test_poses_between_poses():
+    position, quaternion = straight_track().at(0.55)
+    np.testing.assert_allclose(position, [0.55, 0, 0], atol=1e-12)
+    np.testing.assert_allclose(quaternion, UPRIGHT)
+
+
+def test_esim_counts_the_change_of_log_brightness():
+    """Brightness grows by a factor of e each second in one pixel: five events of 0.2 a second there, none elsewhere."""
+
+    def see(position: np.ndarray, _: np.ndarray) -> np.ndarray:
+        frame = np.full((4, 6), 0.3)
+        frame[1, 2] = 0.2 * np.exp(position[0])
+        return frame
+
+    camera = event_cameras.FrameByFrame(event_cameras.esim(), see, "level")
+    packet = camera.watch(straight_track(), 0.0, 1.0)
+    assert {(int(each["x"]), int(each["y"]), int(each["p"])) for each in packet} == {(2, 1, 1)}
+    assert 4 <= len(packet) <= 5
+    assert packet["t"].min() >= 0
+    assert packet["t"].max() < 1_000_000
+
+
+def test_levels_are_kept_between_windows_and_the_gap_makes_no_events():
+    def see(position: np.ndarray, _: np.ndarray) -> np.ndarray:
+        return np.full((2, 2), 0.1 * np.exp(2 * position[0]))
+
+    camera = event_cameras.FrameByFrame(event_cameras.esim(), see, "level")
+    camera.watch(straight_track(), 0.0, 0.1)
+    packet = camera.watch(straight_track(), 0.8, 1.0)
+    # 0.4 in the window is two thresholds.
+    assert 1 <= len(packet) / 4 <= 2
+    assert packet["t"].min() >= 800_000
+
+
+def test_v2e_is_named_with_where_it_is():
+    with pytest.raises(ImportError, match="github.com/SensorsINI/v2e"):
+        event_cameras.v2e()
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--picture", "own", "--look", "textured"], "leave it out"),
+        (["--world", "romms"], "rooms"),
+        (["--policy", "nowhere"], "nowhere"),
+    ],
+)
+def test_invalid_input_is_a_sentence(capsys, words, said):
+    assert transfer.main([*words, "--missions", "1"]) == 2
+    shown = capsys.readouterr().err
+    assert said in shown
+    assert "Traceback" not in shown
+
+
+@dataclasses.dataclass
+class Touch:
+    segment: int
+    fraction: float = 0.5
+
+
+def test_a_flight_that_meets_goal_and_wall_in_one_decision_ends_with_what_came_first():
+    config = policy().config
+    places = np.array([[0.0, 0, 1], [1, 0, 1], [2, 0, 1], [3, 0, 1]])
+    volume = np.array([[-5.0, -5, 0], [5, 5, 5]])
+
+    far = np.array([3 + config.env.goal_radius_m, 0, 1])
+    assert transfer._outcome(config, places, far, volume, None) == "goal"
+    assert transfer._outcome(config, places, far, volume, Touch(1)) == "collision"
+    assert transfer._outcome(config, places, far + [9, 0, 0], volume, None) is None
