@@ -14,7 +14,7 @@ import pytest
 from edqn_jax.config import AgentConfig, preset
 from edqn_jax.learn import exploration, optimiser, qnetwork, replay
 from edqn_jax.learn.dqn import losses
-from tests.learn import probes
+from tests.support import probes
 
 # --------------------------------------------------------------------------------- equations by hand
 

@@ -13,7 +13,7 @@ from edqn_jax.learn.plan import Plan
 from edqn_jax.learn.trainer import Episodes, Losses
 from edqn_jax.sim.task.outcomes import Outcome
 from edqn_jax.training.history import EndedEpisodes, Watch, chunk_metrics
-from tests.miniature import no_losses
+from tests.support.miniature import no_losses
 
 PLAN = Plan(total=100, scheduled=100, warmup=4, starts=6, vae_training=((0, 4),))
 

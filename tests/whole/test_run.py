@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from edqn_jax.config import CameraConfig, Config, TrainConfig, WorldConfig
+from edqn_jax.config import Config, TrainConfig, WorldConfig
 from edqn_jax.errors import ConfigError, StoppedError
 from edqn_jax.evaluation.missions import run_missions
 from edqn_jax.learn import trainer
@@ -25,20 +25,8 @@ from edqn_jax.runs.policies import load_run
 from edqn_jax.runs.record import train_run
 from edqn_jax.runs.stopping import Stop
 from edqn_jax.training.selection import Candidate, choose, first_success, is_due
-from tests.miniature import WORLD as MINIATURE_WORLD
-from tests.miniature import no_losses
-from tests.whole.test_trainer import CONFIG as SMALL
-
-CONFIG = dataclasses.replace(
-    SMALL,
-    camera=CameraConfig(width=8, height=6),
-    env=dataclasses.replace(SMALL.env, max_decisions=12),
-    world=WorldConfig(name=str(MINIATURE_WORLD), missions=32),
-    train=TrainConfig(num_envs=16, chunk_steps=4, total_steps=512, validation_every=128, validation_missions=4),
-)
-
-FIGURES = {"world", "path", "returns", "learning"}
-"""Names of the figures of every run."""
+from tests.support.configs import TINY_RUN
+from tests.support.miniature import no_losses
 
 
 @pytest.mark.slow
@@ -50,12 +38,12 @@ def test_a_run_stopped_before_any_validation_keeps_what_it_has_learnt(
         agent = state.learner.agent
         agent = dataclasses.replace(agent, average=jax.tree.map(lambda x: x + 1, agent.average))
         learner = dataclasses.replace(state.learner, agent=agent)
-        steps, none = CONFIG.train.chunk_steps, jnp.zeros((CONFIG.train.chunk_steps, 8, 2))
+        steps, none = TINY_RUN.train.chunk_steps, jnp.zeros((TINY_RUN.train.chunk_steps, 8, 2))
         return dataclasses.replace(state, learner=learner), (Episodes(none, none, none), no_losses(steps))
 
     monkeypatch.setattr(trainer.Trainer, "compile", lambda self: None)
     monkeypatch.setattr(trainer.Trainer, "chunk", chunk)
-    config = dataclasses.replace(CONFIG, train=dataclasses.replace(CONFIG.train, validation_every=0))
+    config = dataclasses.replace(TINY_RUN, train=dataclasses.replace(TINY_RUN.train, validation_every=0))
     run = RunDirectory(tmp_path / "stopped")
     with pytest.raises(StoppedError, match="stopped after 256 decisions"):
         train_run(config, run, Progress(), Stop(lambda: len(run.read_metrics()) == 4), drawing=prepare_gallery)

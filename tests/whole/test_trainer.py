@@ -13,16 +13,11 @@ import numpy as np
 import pytest
 
 from edqn_jax.config import (
-    AgentConfig,
     AirConfig,
     BodyConfig,
-    CameraConfig,
     Config,
-    DroneConfig,
-    EncoderConfig,
     MotorsConfig,
     NoiseConfig,
-    TrainConfig,
 )
 from edqn_jax.config.loading import make_config
 from edqn_jax.errors import ConfigError
@@ -35,37 +30,13 @@ from edqn_jax.sim.task import env
 from edqn_jax.sim.task.env import World
 from edqn_jax.sim.task.observation import MOTION_SIZE, OWN_SIZE, Observation
 from edqn_jax.sim.task.outcomes import Outcome
-from tests.miniature import miniature_world
-
-CONFIG = Config(
-    drone=DroneConfig(physics="rigid_body"),  # compiles in less time; the layout's tests fly with MJX
-    camera=CameraConfig(width=8, height=6),
-    encoder=EncoderConfig(
-        code_size=4,
-        patch_layers=(8, 4),
-        joint_layers=(16,),
-        decoder_hidden=(16,),
-        warmup_decisions=64,
-        warmup_updates_per_step=1,
-        batch_size=16,
-        replay_size=48,
-    ),
-    agent=AgentConfig(
-        hidden=(16,),
-        batch_size=16,
-        updates_per_step=2,
-        n_step=3,
-        history=2,
-        learning_starts=64,
-        replay_size=512,
-    ),
-    train=TrainConfig(num_envs=16, chunk_steps=4, total_steps=256),
-)
+from tests.support.configs import TINY
+from tests.support.miniature import miniature_world
 
 
 @pytest.fixture(scope="module")
 def world() -> World:
-    return miniature_world(CONFIG)
+    return miniature_world(TINY)
 
 
 def run(config: Config, world: World, devices: int) -> tuple[list[TrainState], list, int, Trainer]:
@@ -101,12 +72,12 @@ def _host(state: TrainState) -> TrainState:
 
 @pytest.fixture(scope="module")
 def on_one(world: World):
-    return run(CONFIG, world, 1)
+    return run(TINY, world, 1)
 
 
 @pytest.fixture(scope="module")
 def on_two(world: World):
-    return run(CONFIG, world, 2)
+    return run(TINY, world, 2)
 
 
 @pytest.mark.slow
@@ -118,8 +89,8 @@ def test_the_training_chunk_is_traced_exactly_once_in_a_run(on_two) -> None:
 
 @pytest.mark.slow
 def test_no_callback_to_the_host_hides_in_the_step(world: World) -> None:
-    state = jax.eval_shape(lambda k: trainer.init(CONFIG, world, k), jax.random.key(0))
-    jaxpr = jax.make_jaxpr(lambda s, n: trainer.run_steps(CONFIG, world, s, n))(state, jnp.arange(2))
+    state = jax.eval_shape(lambda k: trainer.init(TINY, world, k), jax.random.key(0))
+    jaxpr = jax.make_jaxpr(lambda s, n: trainer.run_steps(TINY, world, s, n))(state, jnp.arange(2))
     assert "callback" not in str(jaxpr)
 
 
@@ -145,8 +116,8 @@ def test_training_against_every_disturbance_stores_what_was_chosen_and_goes_on_f
     world: World,
 ) -> None:
     config = dataclasses.replace(
-        CONFIG,
-        env=dataclasses.replace(CONFIG.env, sensor="blind", action_delay=1, max_decisions=6),
+        TINY,
+        env=dataclasses.replace(TINY.env, sensor="blind", action_delay=1, max_decisions=6),
         air=AirConfig(wind_m_s=5.0, gusts_m_s=3.0),
         body=BodyConfig(mass_share=0.2, inertia_share=0.2),
         motors=MotorsConfig(gain_share=0.2, lag_s=0.05),
@@ -170,11 +141,11 @@ def test_training_against_every_disturbance_stores_what_was_chosen_and_goes_on_f
 
 def flown_on(made: Trainer, chunks: int, poison: Any = None) -> tuple[TrainState, Any]:
     """The state after so many chunks and the last one's losses; `poison` changes the state before the last."""
-    state, losses = made.init(CONFIG.train.seed), None
+    state, losses = made.init(TINY.train.seed), None
     for number in range(chunks):
         if poison is not None and number == chunks - 1:
             state = poison(state)
-        state, (_, losses) = made.chunk(state, number * CONFIG.train.chunk_steps)
+        state, (_, losses) = made.chunk(state, number * TINY.train.chunk_steps)
     assert losses is not None
     return _host(state), jax.tree.map(np.asarray, losses)
 
@@ -195,7 +166,7 @@ def changed(state: TrainState, path: str, change: Any) -> TrainState:
 
 @pytest.mark.slow
 def test_a_poisoned_parameter_stops_all_updates_and_spoils_no_saved_policy(on_one) -> None:
-    made, steps, updates = on_one[3], CONFIG.train.chunk_steps, CONFIG.agent.updates_per_step
+    made, steps, updates = on_one[3], TINY.train.chunk_steps, TINY.agent.updates_per_step
     clean, _ = flown_on(made, 3)
     state, losses = flown_on(
         made, 4, lambda state: changed(state, "learner.agent.q", lambda x: x.at[(0,) * x.ndim].set(np.nan))
@@ -213,15 +184,15 @@ def test_a_poisoned_parameter_stops_all_updates_and_spoils_no_saved_policy(on_on
 
 @pytest.mark.slow
 def test_a_poisoned_transition_costs_the_updates_that_meet_it_and_nothing_else(on_one) -> None:
-    made, plan = on_one[3], Plan.of(CONFIG)
-    written = 2 * CONFIG.train.chunk_steps - plan.warmup  # rows before the last chunk
+    made, plan = on_one[3], Plan.of(TINY)
+    written = 2 * TINY.train.chunk_steps - plan.warmup  # rows before the last chunk
 
     def poison(state: TrainState) -> TrainState:
         return changed(state, "actors.replay.reward", lambda x: x.at[0, written - 1, 0].set(np.nan))
 
     state, losses = flown_on(made, 3, poison)
     skipped = losses.health.gradient.sum()
-    assert 0 < skipped < CONFIG.train.chunk_steps * CONFIG.agent.updates_per_step
+    assert 0 < skipped < TINY.train.chunk_steps * TINY.agent.updates_per_step
     np.testing.assert_array_equal(losses.health.loss, losses.health.gradient)
     assert not losses.health.parameters.any() and finite(state.learner)
 
@@ -245,7 +216,7 @@ def test_drones_whose_physics_blows_up_are_reset_and_counted_and_the_others_fly_
 
 @pytest.mark.parametrize(("warmup_decisions", "steps"), [(0, 0), (33, 3), (64, 4), (65, 4), (10**6, 4)])
 def test_the_warm_up_is_whole_steps_and_a_quarter_of_the_run_at_most(warmup_decisions: int, steps: int) -> None:
-    config = dataclasses.replace(CONFIG, encoder=dataclasses.replace(CONFIG.encoder, warmup_decisions=warmup_decisions))
+    config = dataclasses.replace(TINY, encoder=dataclasses.replace(TINY.encoder, warmup_decisions=warmup_decisions))
     plan = Plan.of(config)
     assert (plan.total, plan.warmup, plan.learn_from) == (16, steps, steps + 5)  # n_step + history rows to learn from
 
@@ -253,7 +224,7 @@ def test_the_warm_up_is_whole_steps_and_a_quarter_of_the_run_at_most(warmup_deci
 @pytest.mark.slow
 def test_the_acting_encoder_changes_once_at_the_end_of_the_warm_up(on_one) -> None:
     states = on_one[0]
-    assert Plan.of(CONFIG).warmup == 4
+    assert Plan.of(TINY).warmup == 4
     start, warm, later, last = states[0].learner, states[1].learner, states[2].learner, states[-1].learner
     assert not _same(start.encoder, warm.encoder)
     assert _same(warm.encoder, warm.vae)
@@ -263,7 +234,7 @@ def test_the_acting_encoder_changes_once_at_the_end_of_the_warm_up(on_one) -> No
 @pytest.mark.slow
 def test_the_q_network_rests_until_there_is_enough_to_learn_from(on_one) -> None:
     states, returned, *_ = on_one
-    plan = Plan.of(CONFIG)
+    plan = Plan.of(TINY)
     losses = np.concatenate([losses.metrics["q_loss"] for _, losses in returned])
     assert np.isnan(losses[: plan.learn_from]).all()
     assert np.isfinite(losses[plan.learn_from :]).all()
@@ -276,7 +247,7 @@ def test_the_q_network_rests_until_there_is_enough_to_learn_from(on_one) -> None
 @pytest.mark.slow
 def test_the_replay_holds_what_the_environments_went_through(on_one) -> None:
     states, returned, *_ = on_one
-    plan, actors = Plan.of(CONFIG), states[-1].actors
+    plan, actors = Plan.of(TINY), states[-1].actors
     stored = plan.total - plan.warmup
     # [S, L, E] -> rows 1.. hold the outcome of the step before them.
     replayed = actors.replay.outcome[:, 1:stored].swapaxes(0, 1)
@@ -288,7 +259,7 @@ def test_the_replay_holds_what_the_environments_went_through(on_one) -> None:
 
 @pytest.mark.slow
 def test_nothing_is_learnt_from_what_stood_there_before_the_first_reset(world: World) -> None:
-    start = jax.jit(partial(trainer.init, CONFIG, world))(jax.random.key(0))
+    start = jax.jit(partial(trainer.init, TINY, world))(jax.random.key(0))
     actors = jax.tree.map(lambda x: x[0], start.actors)
     envs = actors.reward.shape[0]
 
@@ -301,7 +272,7 @@ def test_nothing_is_learnt_from_what_stood_there_before_the_first_reset(world: W
             action=jnp.zeros(envs, jnp.int32),
         )
 
-    agent = dataclasses.replace(CONFIG.agent, history=1)
+    agent = dataclasses.replace(TINY.agent, history=1)
     last = agent.n_step + 1  # room for two starts: the row before the first reset, and that reset
     write, sample = jax.jit(replay.write), jax.jit(partial(replay.sample, agent), static_argnums=2)
     ring = write(actors.replay, row(True, actors.outcome), jnp.int32(0))
@@ -314,7 +285,7 @@ def test_nothing_is_learnt_from_what_stood_there_before_the_first_reset(world: W
 
 
 def test_a_new_episode_begins_with_an_empty_memory() -> None:
-    config = dataclasses.replace(CONFIG, env=dataclasses.replace(CONFIG.env, sensor="blind"))
+    config = dataclasses.replace(TINY, env=dataclasses.replace(TINY.env, sensor="blind"))
     own = jnp.arange(1.0, 1.0 + 2 * OWN_SIZE).reshape(2, OWN_SIZE)
     seen: Any = SimpleNamespace(
         is_reset=jnp.array([True, False]), observation=Observation(None, own, own[:, :MOTION_SIZE])
@@ -328,12 +299,12 @@ def test_a_new_episode_begins_with_an_empty_memory() -> None:
 
 def retrained(**options: Any) -> Config:
     """64 steps, a warm-up of 4, a retraining of 2; the replay holds 5 steps before the DQN learns."""
-    encoder = dataclasses.replace(CONFIG.encoder, retrain_decisions=32, **options)
+    encoder = dataclasses.replace(TINY.encoder, retrain_decisions=32, **options)
     return dataclasses.replace(
-        CONFIG,
+        TINY,
         encoder=encoder,
-        drone=dataclasses.replace(CONFIG.drone, physics="rigid_body"),
-        train=dataclasses.replace(CONFIG.train, total_steps=1024),
+        drone=dataclasses.replace(TINY.drone, physics="rigid_body"),
+        train=dataclasses.replace(TINY.train, total_steps=1024),
     )
 
 
@@ -416,10 +387,10 @@ def test_labels_reach_the_vae_and_nothing_that_acts_before_it_does(world: World,
 def test_agents_that_train_together_train_as_each_alone(on_two, world: World) -> None:
     alone: Trainer = on_two[-1]
     other = dataclasses.replace(world, missions=jax.tree.map(lambda x: x[::-1], world.missions))
-    together = Trainer(CONFIG, [other, world], jax.devices()[:2])
+    together = Trainer(TINY, [other, world], jax.devices()[:2])
     state, two = alone.init(1), together.init([0, 1])
     learnt = False
-    for first in range(0, alone.plan.total, CONFIG.train.chunk_steps):
+    for first in range(0, alone.plan.total, TINY.train.chunk_steps):
         state, (episodes, losses) = alone.chunk(state, first)
         two, returned = together.chunk(two, first)
         second_episodes, second_losses = together.each(jax.tree.map(np.asarray, returned))[1]
@@ -437,13 +408,13 @@ def test_agents_that_train_together_train_as_each_alone(on_two, world: World) ->
 
 
 def test_environments_that_do_not_divide_into_shards_are_refused_with_a_sentence(world: World) -> None:
-    config = dataclasses.replace(CONFIG, train=dataclasses.replace(CONFIG.train, num_envs=12))
+    config = dataclasses.replace(TINY, train=dataclasses.replace(TINY.train, num_envs=12))
     with pytest.raises(ConfigError, match=r"num_envs \(12\).*multiples of train.shards \(8\)"):
         trainer.init(config, world, jax.random.key(0))
 
 
 def test_totals_round_up_to_whole_chunks() -> None:
-    config = dataclasses.replace(CONFIG, train=dataclasses.replace(CONFIG.train, total_steps=257))
+    config = dataclasses.replace(TINY, train=dataclasses.replace(TINY.train, total_steps=257))
     assert Plan.of(config).total == 20
 
 
