@@ -11,7 +11,7 @@ import pytest
 ROOT = Path(__file__).parents[1]
 SHARED = ("tests.conftest", "tests.support", "tests.oracles", "tests.mutants", "tests.fuzz")
 """What test modules may import of `tests`; the last two are programs of their own."""
-PROCESS = re.compile(r"^from tests\.\S+ import", re.MULTILINE)
+PROCESS = re.compile(r"^import .*\n(?:.*\n)*?from tests\.", re.MULTILINE)
 """In a string: the source of a process."""
 FILES = sorted((ROOT / "tests").rglob("*.py"))
 

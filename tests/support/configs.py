@@ -42,6 +42,12 @@ TINY = Config(
 """For `miniature_world`."""
 
 
+def retrained(retrain_at: tuple[float, ...]) -> Config:
+    """64 steps, a warm-up of 4, a retraining of 2; the replay holds 5 steps before the DQN learns."""
+    encoder = dataclasses.replace(TINY.encoder, retrain_decisions=32, retrain_at=retrain_at)
+    return dataclasses.replace(TINY, encoder=encoder, train=dataclasses.replace(TINY.train, total_steps=1024))
+
+
 TINY_RUN = dataclasses.replace(
     TINY,
     camera=CameraConfig(width=8, height=6),

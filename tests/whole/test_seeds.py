@@ -21,7 +21,6 @@ from edqn_jax.runs.seeds import train_seeds_run
 from edqn_jax.runs.stopping import Stop
 from edqn_jax.runs.verify import verify
 from edqn_jax.training import history
-from edqn_jax.training.history import mean_metrics
 from edqn_jax.training.loop import train, train_seeds
 from tests.support.configs import BLIND_RUN, FIGURES
 from tests.support.miniature import WORLD as MINIATURE_WORLD
@@ -113,18 +112,3 @@ def test_a_seed_that_diverges_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(trainer.Trainer, "chunk", poisoned)
     with pytest.raises(DivergedError, match="seed 1 diverged"):
         train_seeds(2, BLIND_RUN)
-
-
-def test_what_is_shown_of_several_agents_is_their_mean() -> None:
-    first = {"phase": "training", "decisions": 64, "success_rate": 0.5, "q_loss": None, "warm_up": None}
-    second = {"phase": "training", "decisions": 64, "success_rate": None, "q_loss": 0.1, "warm_up": None}
-    third = {"phase": "training", "decisions": 64, "success_rate": 0.7, "q_loss": 0.3, "warm_up": None}
-    mean = mean_metrics([first, second, third])
-    assert mean == {
-        "phase": "training",
-        "decisions": 64.0,
-        "success_rate": pytest.approx(0.6),
-        "q_loss": pytest.approx(0.2),
-        "warm_up": None,
-    }
-    assert mean_metrics([first]) is first

@@ -19,10 +19,8 @@ from edqn_jax.config import (
     MotorsConfig,
     NoiseConfig,
 )
-from edqn_jax.config.loading import make_config
 from edqn_jax.errors import ConfigError
 from edqn_jax.learn import replay, saved_state, trainer
-from edqn_jax.learn.learner import learner_of
 from edqn_jax.learn.plan import Plan
 from edqn_jax.learn.trainer import Trainer, TrainState
 from edqn_jax.sim.physics.disturbances import Disturbance
@@ -30,8 +28,10 @@ from edqn_jax.sim.task import env
 from edqn_jax.sim.task.env import World
 from edqn_jax.sim.task.observation import MOTION_SIZE, OWN_SIZE, Observation
 from edqn_jax.sim.task.outcomes import Outcome
-from tests.support.configs import TINY
+from tests.support.configs import TINY, retrained
 from tests.support.miniature import miniature_world
+
+RETRAINED = retrained((0.01,))
 
 
 @pytest.fixture(scope="module")
@@ -214,13 +214,6 @@ def test_drones_whose_physics_blows_up_are_reset_and_counted_and_the_others_fly_
     np.testing.assert_allclose(one, other, atol=1e-3)  # the Q-network is hardly another one by now
 
 
-@pytest.mark.parametrize(("warmup_decisions", "steps"), [(0, 0), (33, 3), (64, 4), (65, 4), (10**6, 4)])
-def test_the_warm_up_is_whole_steps_and_a_quarter_of_the_run_at_most(warmup_decisions: int, steps: int) -> None:
-    config = dataclasses.replace(TINY, encoder=dataclasses.replace(TINY.encoder, warmup_decisions=warmup_decisions))
-    plan = Plan.of(config)
-    assert (plan.total, plan.warmup, plan.learn_from) == (16, steps, steps + 5)  # n_step + history rows to learn from
-
-
 @pytest.mark.slow
 def test_the_acting_encoder_changes_once_at_the_end_of_the_warm_up(on_one) -> None:
     states = on_one[0]
@@ -297,66 +290,23 @@ def test_a_new_episode_begins_with_an_empty_memory() -> None:
     np.testing.assert_array_equal(running, [np.full(OWN_SIZE, 7.0), own[1]])
 
 
-def retrained(**options: Any) -> Config:
-    """64 steps, a warm-up of 4, a retraining of 2; the replay holds 5 steps before the DQN learns."""
-    encoder = dataclasses.replace(TINY.encoder, retrain_decisions=32, **options)
-    return dataclasses.replace(
-        TINY,
-        encoder=encoder,
-        drone=dataclasses.replace(TINY.drone, physics="rigid_body"),
-        train=dataclasses.replace(TINY.train, total_steps=1024),
-    )
-
-
-def test_a_retrained_encoder_begins_a_replay_of_its_own() -> None:
-    config = retrained(retrain_at=(0.25,))
-    plan, steps = Plan.of(config), jnp.arange(24)
-    assert (plan.total, plan.vae_training, plan.starts) == (64, ((0, 4), (16, 18)), 5)
-    assert np.flatnonzero(plan.trains_vae(steps)).tolist() == [0, 1, 2, 3, 16, 17]
-    assert np.flatnonzero(plan.replaces_encoder(steps)).tolist() == [3, 17]
-    assert plan.replay_time(steps).tolist() == [*[0] * 4, *range(14), *range(6)]
-    assert np.flatnonzero(learner_of(config).updates(config, plan.replay_time(steps))).tolist() == [*range(9, 18), 23]
-    # Every step in which the VAE learns adds a row to its ring, and no other does.
-    assert plan.samples_kept(config, steps).tolist() == [0, 1, 2, 3, *[4] * 13, 5, *[6] * 6]
-    always = dataclasses.replace(config, encoder=dataclasses.replace(config.encoder, keep_learning=True))
-    assert plan.samples_kept(always, steps).tolist() == list(range(24))
-
-
-@pytest.mark.parametrize(
-    ("retrain_at", "retrain_decisions", "times"),
-    [
-        ((0.01,), 32, ((0, 4), (11, 13))),  # not before the DQN has learnt for as long as it takes
-        ((0.25, 0.26), 32, ((0, 4), (16, 18), (25, 27))),  # one after another
-        ((0.25,), 10_000, ((0, 4), (17, 25))),  # an eighth of the run at most
-        ((0.7,), 32, ((0, 4),)),  # too late for the DQN to learn again
-    ],
-)
-def test_retrainings_leave_the_dqn_time(retrain_at, retrain_decisions, times) -> None:
-    config = retrained(retrain_at=retrain_at)
-    encoder = dataclasses.replace(config.encoder, retrain_decisions=retrain_decisions)
-    assert Plan.of(dataclasses.replace(config, encoder=encoder)).vae_training == times
-
-
-@pytest.mark.parametrize("decisions", [10_000, 60_000, 100_000, 200_000, 874_000, 3_200_000])
-def test_whatever_the_length_of_a_run_its_encoders_never_learn_at_once_or_in_vain(decisions: int) -> None:
-    plan = Plan.of(make_config("medium", train={"total_steps": decisions}))
-    ends = [0]
-    for first, end in plan.vae_training:
-        assert ends[-1] <= first < end
-        ends.append(end)
-    assert plan.total - ends[-1] >= plan.total // 4 or len(plan.vae_training) == 1
-    assert plan.vae_training[0] == (0, plan.warmup)
+@pytest.fixture(scope="module")
+def retraining(world: World) -> tuple[list[TrainState], list]:
+    """States before each of 15 steps and after the last, and what each returned; steps 11 and 12 retrain the VAE."""
+    step = jax.jit(lambda state, number: trainer.train_step(RETRAINED, world, None, state, number))
+    states, returned = [jax.jit(lambda key: trainer.init(RETRAINED, world, key))(jax.random.key(0))], []
+    for number in range(15):
+        state, out = step(states[-1], jnp.int32(number))
+        states.append(state)
+        returned.append(out)
+    return states, returned
 
 
 @pytest.mark.slow
-def test_the_encoder_that_acts_changes_when_the_vae_has_been_trained_and_never_else(world: World) -> None:
-    config = retrained(retrain_at=(0.01,))
-    state = jax.jit(lambda key: trainer.init(config, world, key))(jax.random.key(0))
-    step = jax.jit(lambda state, number: trainer.train_step(config, world, None, state, number))
+def test_the_encoder_that_acts_changes_when_the_vae_has_been_trained_and_never_else(retraining) -> None:
+    states, returned = retraining
     changed, learnt = [], []
-    for number in range(15):
-        before = state
-        state, (_, losses) = step(state, jnp.int32(number))
+    for number, (before, state, (_, losses)) in enumerate(zip(states, states[1:], returned, strict=False)):
         changed += [number] * (not _same(before.learner.encoder, state.learner.encoder))
         learnt += [number] * bool(np.isfinite(losses.metrics["reconstruction_loss"]))
         if number in (3, 12):  # nothing that was encoded with the old one is left in a memory
@@ -366,20 +316,16 @@ def test_the_encoder_that_acts_changes_when_the_vae_has_been_trained_and_never_e
 
 
 @pytest.mark.slow
-def test_labels_reach_the_vae_and_nothing_that_acts_before_it_does(world: World, monkeypatch) -> None:
+def test_labels_reach_the_vae_and_nothing_that_acts_before_it_does(retraining, world: World, monkeypatch) -> None:
     """With other labels in a retraining the VAE learns something else; all that is seen and done stays as it was."""
-    config = retrained(retrain_at=(0.01,))
-    (_, warmup), (first, end) = Plan.of(config).vae_training
-
-    def trained(state: TrainState, start: int, stop: int) -> tuple:
-        return jax.jit(lambda state: trainer.run_steps(config, world, state, jnp.arange(start, stop)))(state)
-
-    state, _ = trained(jax.jit(lambda key: trainer.init(config, world, key))(jax.random.key(0)), 0, first)
-    truly = trained(state, first, end - 1)
+    states, returned = retraining
+    (_, warmup), (first, end) = Plan.of(RETRAINED).vae_training
+    assert warmup < first < end - 1
     true = env.nearness
     monkeypatch.setattr(env, "nearness", lambda *given: 3.0 - true(*given))
-    falsely = trained(state, first, end - 1)
-    assert warmup < first and not _same(truly[0].learner.vae, falsely[0].learner.vae)
+    step = jax.jit(lambda state: trainer.train_step(RETRAINED, world, None, state, jnp.int32(first)))
+    truly, falsely = (states[first + 1], returned[first]), step(states[first])
+    assert not _same(truly[0].learner.vae, falsely[0].learner.vae)
     assert _same(_told(truly), _told(falsely))
 
 
@@ -411,11 +357,6 @@ def test_environments_that_do_not_divide_into_shards_are_refused_with_a_sentence
     config = dataclasses.replace(TINY, train=dataclasses.replace(TINY.train, num_envs=12))
     with pytest.raises(ConfigError, match=r"num_envs \(12\).*multiples of train.shards \(8\)"):
         trainer.init(config, world, jax.random.key(0))
-
-
-def test_totals_round_up_to_whole_chunks() -> None:
-    config = dataclasses.replace(TINY, train=dataclasses.replace(TINY.train, total_steps=257))
-    assert Plan.of(config).total == 20
 
 
 def _told(trained: tuple) -> tuple:
