@@ -24,8 +24,8 @@ from edqn_jax.sim.scene.distance import signed_distance
 from edqn_jax.sim.sensors.sensor import DEPTH_SCALE, nearness
 from edqn_jax.sim.task.env import nearness as nearness_of
 from edqn_jax.training import loop
-from tests.miniature import WORLD
-from tests.policies import CONFIG, always
+from tests.support.miniature import WORLD
+from tests.support.policies import CONFIG, always
 
 ROOT = Path(__file__).parents[1]
 

@@ -14,7 +14,7 @@ from edqn_jax.keys import integers, run_streams
 from edqn_jax.learn.trainer import InitialKeys, ShardKeys, init
 from edqn_jax.sim.task import env
 from edqn_jax.sim.worlds import families
-from tests.miniature import MINIATURE
+from tests.support.miniature import MINIATURE
 
 
 @pytest.mark.parametrize("below", [1, 2, 27, 1000])

@@ -14,7 +14,7 @@ from edqn_jax.sim.worlds.families import random_scene, world_key
 from rivals.planners import astar_compiled, snn
 from rivals.planners.planner import Budget
 from rivals.planners.solids import solid_table
-from tests.planning.small_worlds import RADIUS, assert_flyable, box, random_small_world, small_world
+from tests.support.small_worlds import RADIUS, assert_flyable, box, random_small_world, small_world
 
 
 def lattice_length(task: Task, cell: float = 0.5) -> float:

@@ -16,9 +16,9 @@ from edqn_jax.sim.camera import camera as our_camera
 from edqn_jax.sim.scene.distance import signed_distance
 from edqn_jax.sim.sensors import events as our_events
 from edqn_jax.sim.sensors import sensor as our_sensor
-from tests.bench.conventional_course import paper
 from tests.oracles import camera_plain, event_fields, events_plain
-from tests.sim.drawn_scenes import every_kind, free_points
+from tests.support.benchmarks.conventional_course import paper
+from tests.support.drawn_scenes import every_kind, free_points
 
 PLAIN = CameraConfig(texture_contrast=0.0)
 
@@ -138,7 +138,7 @@ def test_the_signed_distance_is_ours_for_every_kind_of_shape():
 
 
 def test_an_empty_world_is_free_everywhere():
-    from tests.sim.drawn_scenes import scene_of
+    from tests.support.drawn_scenes import scene_of
 
     geoms = world.compiled(world.text_of(scene_of())).geoms
     assert task.signed_distance(geoms, 1.0, 2.0, 3.0) == np.inf
@@ -167,7 +167,7 @@ def test_events_are_the_papers_law(change):
 
 
 def test_the_fleet_sees_what_the_two_frames_show():
-    from tests.bench.conventional_course import fleet_of
+    from tests.support.benchmarks.conventional_course import fleet_of
 
     config = Config()
     start, goal = np.array([[40.0, 22.0, 6.0], [20.0, 40.0, 5.0]]), np.array([[90.0, 90.0, 10.0]] * 2)
@@ -186,7 +186,7 @@ def test_the_fleet_sees_what_the_two_frames_show():
 
 
 def test_a_label_that_is_not_drawn_is_not_rendered():
-    from tests.bench.conventional_course import fleet_of
+    from tests.support.benchmarks.conventional_course import fleet_of
 
     config = dataclasses.replace(Config(), encoder=EncoderConfig(target="sensed"))
     fleet = fleet_of(config, np.array([[40.0, 22.0, 6.0]]), np.array([[90.0, 90.0, 10.0]]))

@@ -35,7 +35,7 @@ from edqn_jax.sim.task.env import EnvState
 from edqn_jax.sim.task.observation import MOST_YAW_RATE, own_state
 from edqn_jax.sim.task.outcomes import Outcome
 from edqn_jax.sim.task.reward import configured_reward
-from tests.bench.conventional_course import course_of, fleet_of, paper, world_of
+from tests.support.benchmarks.conventional_course import course_of, fleet_of, paper, world_of
 
 gymnasium_check = require("gymnasium.utils.env_checker")
 stable_baselines3_check = require("stable_baselines3.common.env_checker")

@@ -19,7 +19,7 @@ from edqn_jax.policies.functions import FunctionActor
 from edqn_jax.sim.actions import ACTIONS
 from edqn_jax.sim.scene.scene import stack_scenes
 from edqn_jax.sim.task.outcomes import Outcome
-from tests.bench.conventional_course import course_of, paper, world_of
+from tests.support.benchmarks.conventional_course import course_of, paper, world_of
 
 CONFIG = dataclasses.replace(Config(), camera=CameraConfig(width=8, height=6), env=EnvConfig(max_decisions=40))
 STARTS = np.array(

@@ -29,9 +29,9 @@ from edqn_jax.sim.task.observation import MOTION_SIZE, OWN_SIZE
 from edqn_jax.sim.task.outcomes import Outcome
 from measurement.flags import configured
 from rivals import stack
-from tests.bench.conventional_course import course_of
-from tests.benchmarks.rivals.uninstalled import hide
-from tests.miniature import MINIATURE
+from tests.support.benchmarks.conventional_course import course_of
+from tests.support.benchmarks.uninstalled import hide
+from tests.support.miniature import MINIATURE
 
 torch = require("torch")
 torch.set_num_threads(1)  # beside other tests a second one costs more than it does

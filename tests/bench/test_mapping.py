@@ -15,7 +15,7 @@ from edqn_jax.learn.policy import Policy
 from edqn_jax.runs.policies import save_policy
 from edqn_jax.sim.scene.mjcf import load_world
 from rivals.mapping.pilot import TUNED
-from tests.policies import CONFIG, fresh
+from tests.support.policies import CONFIG, fresh
 
 WORLD = """<mujoco><worldbody>
   <geom type="box" pos="6 5 2" size="1 5 2"/>

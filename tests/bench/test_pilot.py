@@ -23,7 +23,7 @@ from rivals.mapping import pilot
 from rivals.mapping.pilot import POINTS, Orders, PilotConfig, Piloted
 from rivals.mapping.route import RouteConfig, Router
 from rivals.planners.follow import SPACING_M, sampled
-from tests.policies import CONFIG, fresh
+from tests.support.policies import CONFIG, fresh
 
 CONFIG = dataclasses.replace(CONFIG, camera=dataclasses.replace(CONFIG.camera, width=32, height=24))
 

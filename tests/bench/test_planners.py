@@ -9,7 +9,7 @@ from edqn_jax.planning.path import Task
 from edqn_jax.sim.scene.mjcf import load_scene, resolve_world
 from edqn_jax.sim.worlds.families import random_scene, world_key
 from rivals.planners.planner import PLANNERS, Budget, load_planner
-from tests.planning.small_worlds import RADIUS, WITHOUT_A_WAY, assert_flyable, random_small_world, small_world
+from tests.support.small_worlds import RADIUS, WITHOUT_A_WAY, assert_flyable, random_small_world, small_world
 
 # A* hugs what it passes: its legs are checked every 2 cm, which misses 0.14 mm, and the judge is float32.
 TOLERANCE = {"A*": 2e-4, "A* 1 m": 2e-4}

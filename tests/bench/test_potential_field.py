@@ -11,7 +11,7 @@ from edqn_jax.sim.scene.distance import shape_distances
 from rivals.planners import potential_field
 from rivals.planners.planner import Budget
 from rivals.planners.solids import solid_table
-from tests.planning.small_worlds import RADIUS, assert_flyable, box, small_world
+from tests.support.small_worlds import RADIUS, assert_flyable, box, small_world
 
 CONFIG = potential_field.ApfConfig()
 

@@ -11,7 +11,7 @@ from edqn_jax.config import Config
 from edqn_jax.sim.scene.mjcf import write_scene
 from rivals.planners.planner import PLANNERS
 from rivals.planning import Planning
-from tests.planning.small_worlds import WITHOUT_A_WAY, box, small_world
+from tests.support.small_worlds import WITHOUT_A_WAY, box, small_world
 
 BUDGET_SECONDS = 0.5
 MISSIONS = {"open": small_world(box((4, -1, 0), (6, 5, 7))), **WITHOUT_A_WAY}

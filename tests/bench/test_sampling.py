@@ -7,8 +7,8 @@ import pytest
 
 from edqn_jax.extras import MissingPackageError
 from rivals.planners.planner import Budget, load_planner
-from tests.benchmarks.rivals.uninstalled import hide
-from tests.planning.small_worlds import WITHOUT_A_WAY, assert_flyable, box, small_world
+from tests.support.benchmarks.uninstalled import hide
+from tests.support.small_worlds import WITHOUT_A_WAY, assert_flyable, box, small_world
 
 LONG = 600.0  # seconds; the steps end it
 

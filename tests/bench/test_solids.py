@@ -13,8 +13,8 @@ import pytest
 from edqn_jax.sim.scene.distance import shape_distances
 from edqn_jax.sim.scene.scene import PARKED, scene_shapes
 from rivals.planners.solids import distance, leg_free, shape_distance, solid_table
-from tests.planning.small_worlds import box, small_world, true_distances
-from tests.sim.drawn_scenes import ball, every_kind, scene_of
+from tests.support.drawn_scenes import ball, every_kind, scene_of
+from tests.support.small_worlds import box, small_world, true_distances
 
 
 @pytest.mark.parametrize("seed", range(4))

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from measurement.parts import PARTS
-from tests.miniature import MINIATURE
+from tests.support.miniature import MINIATURE
 
 ROOT = Path(__file__).resolve().parents[2]
 

@@ -16,7 +16,7 @@ from edqn_jax.errors import ConfigError
 from edqn_jax.learn.trainer import Trainer
 from measurement import worker
 from measurement.whole import WHOLE
-from tests.miniature import MINIATURE
+from tests.support.miniature import MINIATURE
 
 ROOT = Path(__file__).resolve().parents[2]
 STUB = """

@@ -14,7 +14,7 @@ from edqn_jax.evaluation.missions import load_missions
 from edqn_jax.evaluation.rollouts import fly_on_all_devices
 from edqn_jax.sim.camera import camera
 from edqn_jax.sim.task.outcomes import Outcome
-from tests.policies import CONFIG, always
+from tests.support.policies import CONFIG, always
 
 WORLD = """<mujoco><worldbody>
   <geom type="plane" size="0 0 1"/>

@@ -15,7 +15,7 @@ from edqn_jax.keys import run_streams
 from edqn_jax.sim.actions import move_name
 from edqn_jax.sim.physics.drone import hover
 from edqn_jax.sim.task.outcomes import Outcome
-from tests.policies import CONFIG
+from tests.support.policies import CONFIG
 
 WORLD = """<mujoco><worldbody>
   <geom type="plane" size="0 0 1"/>

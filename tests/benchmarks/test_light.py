@@ -9,7 +9,7 @@ import pytest
 
 import light
 import success
-from tests.benchmarks.test_success import SMALL, untrained
+from tests.support.benchmarks.untrained_runs import SMALL, untrained
 
 
 def call(out: Path, *words: str) -> int:

@@ -19,7 +19,7 @@ from measurement.flags import configured
 from measurement.parts import PARTS, Moment, parts_of
 from measurement.timing import Part, Timed, depending_on, operations, size_of
 from measurement.whole import steady
-from tests.miniature import MINIATURE
+from tests.support.miniature import MINIATURE
 
 pytestmark = pytest.mark.slow
 

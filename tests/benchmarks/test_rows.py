@@ -10,7 +10,7 @@ import pytest
 from edqn_jax.errors import ConfigError
 from rivals import rows, table
 from rivals.planners.planner import PLANNERS
-from tests.benchmarks.turns import flights, row, turn
+from tests.support.benchmarks.turns import flights, row, turn
 
 
 def test_figures_are_of_flights_that_arrived_and_success_is_of_all() -> None:

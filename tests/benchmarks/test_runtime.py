@@ -19,8 +19,8 @@ from edqn_jax.sim.scene.mjcf import write_scene
 from measurement.child import ChildEndedError
 from rivals import stack, table
 from rivals.planners.planner import PLANNERS
-from tests.benchmarks.turns import flights, row, turn
-from tests.planning.small_worlds import WITHOUT_A_WAY, small_world
+from tests.support.benchmarks.turns import flights, row, turn
+from tests.support.small_worlds import WITHOUT_A_WAY, small_world
 
 
 @pytest.fixture

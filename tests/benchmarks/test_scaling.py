@@ -24,7 +24,7 @@ from edqn_jax.sim.scene.mjcf import check_scene, load_scene
 from edqn_jax.sim.scene.scene import obstacle_count
 from measurement.flags import configured
 from measurement.timing import size_of
-from tests.miniature import MINIATURE
+from tests.support.miniature import MINIATURE
 
 BASE = apply(configured([]), {"train": {"devices": 2}}, "the test")
 

@@ -13,7 +13,7 @@ from edqn_jax.learn.plan import Plan
 from edqn_jax.learn.trainer import Trainer
 from edqn_jax.runs.directory import plain
 from measurement.parts import parts_of
-from tests.miniature import MINIATURE
+from tests.support.miniature import MINIATURE
 
 
 def test_the_vae_learns_throughout_and_four_samples_are_replayed() -> None:

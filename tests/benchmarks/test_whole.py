@@ -11,7 +11,7 @@ import pytest
 from edqn_jax.evaluation.missions import run_missions
 from measurement.flags import configured
 from measurement.whole import WholeStep, steady
-from tests.miniature import MINIATURE, WORLD
+from tests.support.miniature import MINIATURE, WORLD
 
 
 @pytest.mark.slow

@@ -15,7 +15,6 @@ from edqn_jax.report.page.worlds import ball_data, world_data
 from edqn_jax.sim.scene.scene import PARKED, scene_at, take_scene
 from edqn_jax.sim.worlds.families import random_pool, world_keys
 from edqn_jax.sim.worlds.moving import Moving
-from tests.browser.test_report_page import browser as browser
 
 TIMES = [0.0, 0.7, 2.9, 4.4, 6.1, 13.3, 51.9, 203.7]
 

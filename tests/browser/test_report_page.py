@@ -8,8 +8,6 @@ from __future__ import annotations
 import dataclasses
 import io
 import json
-import os
-import shutil
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -21,17 +19,15 @@ from PIL import Image
 from edqn_jax.cli import main
 from edqn_jax.config import WorldConfig
 from edqn_jax.config.loading import to_yaml
-from edqn_jax.extras import require
 from edqn_jax.learn.policy import fresh_policy
 from edqn_jax.runs.checkpoints.params import save_params
 from edqn_jax.sim.scene.mjcf import write_scene
-from tests.policies import always
-from tests.report.test_sights import SMALL, world_with_a_box
+from tests.support.box_flight import SMALL, world_with_a_box
+from tests.support.policies import always
 
 PHONE = {"width": 390, "height": 844}
 DESK = {"width": 1360, "height": 900}
 HOSTILE = "<img src=x onerror=document.title='broken'>"
-FLAGS = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
 
 
 def write_run(folder: Path, move: tuple[int, int, int], seed: int) -> None:
@@ -58,15 +54,6 @@ def page_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     assert main(["report", str(folder / "ahead"), str(folder / HOSTILE), "--out", str(file)]) == 0
     assert file.stat().st_size < 15e6
     return file
-
-
-@pytest.fixture(scope="module")
-def browser() -> Iterator[Any]:
-    program = os.environ.get("CHROMIUM") or shutil.which("chromium")
-    with require("playwright.sync_api", extra="browser").sync_playwright() as play:
-        opened = play.chromium.launch(executable_path=program, args=FLAGS)
-        yield opened
-        opened.close()
 
 
 class Opened:

@@ -22,7 +22,7 @@ from edqn_jax.config.loading import RANDOM_WORLDS, make_config
 from edqn_jax.devices import devices
 from edqn_jax.errors import CheckError, ConfigError, DivergedError, StoppedError
 from edqn_jax.sim.scene.mjcf import SceneError
-from tests.processes import PATIENCE_S
+from tests.support.processes import PATIENCE_S
 
 ROOT = Path(__file__).parents[2]
 

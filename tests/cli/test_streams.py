@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from edqn_jax.cli.streams import Lasting, lasting_streams
-from tests.processes import PATIENCE_S
+from tests.support.processes import PATIENCE_S
 
 ROOT = Path(__file__).parents[2]
 

@@ -14,7 +14,7 @@ from edqn_jax.cli.arguments import parse_train
 from edqn_jax.cli.train import options_to_compare
 from edqn_jax.devices import processes
 from edqn_jax.errors import ConfigError
-from tests.processes import WORLD
+from tests.support.processes import WORLD
 
 
 def test_a_process_alone_does_its_work_and_hears_itself() -> None:

@@ -15,7 +15,7 @@ import pytest
 import edqn_jax
 from edqn_jax.devices.jax_settings import TESTED, as_tested, keep_tested_settings, others, set_as_tested
 from edqn_jax.interop import functional
-from tests.miniature import WORLD
+from tests.support.miniature import WORLD
 
 OTHER: dict[str, Any] = {
     "jax_enable_x64": True,

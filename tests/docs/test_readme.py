@@ -9,18 +9,13 @@ import pytest
 
 from edqn_jax.config import Config
 from edqn_jax.sim.scene.mjcf import check_scene, load_world
+from tests.support.pages import ROOT, blocks_of
 
-ROOT = Path(__file__).parents[2]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 
 
-def blocks(language: str) -> list[str]:
-    """The code blocks of a language."""
-    return re.findall(rf"```{language}\n(.*?)```", README, re.DOTALL)
-
-
 def test_the_python_examples_have_at_most_seven_lines() -> None:
-    assert [len(block.splitlines()) <= 7 for block in blocks("python")] == [True, True]
+    assert [len(block.splitlines()) <= 7 for block in blocks_of(ROOT / "README.md", "python")] == [True, True]
 
 
 def test_the_readme_is_read_in_two_minutes() -> None:
@@ -29,7 +24,7 @@ def test_the_readme_is_read_in_two_minutes() -> None:
 
 def test_the_drawn_world_can_be_flown(tmp_path: Path) -> None:
     file = tmp_path / "mine.xml"
-    file.write_text(blocks("xml")[0], encoding="utf-8")
+    file.write_text(blocks_of(ROOT / "README.md", "xml")[0], encoding="utf-8")
     loaded = load_world(file)
     check_scene(loaded.scene, Config().drone.body_radius_m, names=loaded.names, title="'mine.xml'")
 

@@ -29,7 +29,7 @@ from edqn_jax.runs.checkpoints.params import save_params
 from edqn_jax.runs.policies import load_run
 from edqn_jax.sim.task.flights import Closest, Flights
 from edqn_jax.sim.task.outcomes import Outcome
-from tests.policies import CONFIG, always
+from tests.support.policies import CONFIG, always
 
 
 @pytest.fixture(scope="module")

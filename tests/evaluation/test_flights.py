@@ -20,7 +20,7 @@ from edqn_jax.sim.scene.distance import signed_distance
 from edqn_jax.sim.scene.scene import take_scene
 from edqn_jax.sim.task.flights import Flights
 from edqn_jax.sim.task.outcomes import Outcome
-from tests.policies import CONFIG, always, that_sees
+from tests.support.policies import CONFIG, always, that_sees
 
 pytestmark = pytest.mark.slow
 

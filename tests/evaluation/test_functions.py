@@ -23,8 +23,8 @@ from edqn_jax.learn.actor import AgentActor
 from edqn_jax.learn.policy import Policy
 from edqn_jax.policies.functions import FunctionActor, FunctionPolicy, load_function
 from edqn_jax.sim.task.env import Observation
-from tests.miniature import WORLD
-from tests.policies import CONFIG, fresh
+from tests.support.miniature import WORLD
+from tests.support.policies import CONFIG, fresh
 
 BLIND = dataclasses.replace(
     CONFIG,

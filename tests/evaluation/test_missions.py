@@ -17,7 +17,7 @@ from edqn_jax.evaluation.missions import load_missions, missions_of_runs, run_mi
 from edqn_jax.sim.scene.distance import signed_distance
 from edqn_jax.sim.scene.mjcf import load_scene, resolve_world, write_scene
 from edqn_jax.sim.worlds import families
-from tests.planning.small_worlds import WITHOUT_A_WAY, small_world
+from tests.support.small_worlds import WITHOUT_A_WAY, small_world
 
 CONFIG = Config()
 

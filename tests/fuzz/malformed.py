@@ -33,7 +33,7 @@ from edqn_jax.runs.checkpoints.params import POLICY
 from edqn_jax.runs.checkpoints.states import Checkpoint
 from edqn_jax.runs.policies import load_policy, save_policy
 from edqn_jax.sim.scene.mjcf import check_scene, load_world
-from tests.policies import CONFIG, always
+from tests.support.policies import CONFIG, always
 
 HANGS = datetime.timedelta(seconds=10)
 """No input may take longer to be refused."""

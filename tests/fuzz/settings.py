@@ -28,7 +28,7 @@ FRESH = "fresh"
 """Stands for a folder that no other command uses."""
 
 TINY = (
-    *("--tuned-for", "cpu", "--world", str(ROOT / "tests" / "miniature.xml"), "--env.sensor", "blind"),
+    *("--tuned-for", "cpu", "--world", str(ROOT / "tests" / "support" / "miniature.xml"), "--env.sensor", "blind"),
     *("--num-envs", "16", "--total-steps", "512", "--agent.batch-size", "16", "--agent.replay-size", "512"),
     *("--agent.learning-starts", "64", "--train.chunk-steps", "16", "--camera.width", "8", "--camera.height", "6"),
     *("--drone.physics", "rigid_body", "--env.reward", "progress", "--agent.no-turn"),

@@ -13,8 +13,8 @@ import pytest
 
 from edqn_jax.cli import arguments
 from edqn_jax.cli.commands import take_imports
-from tests.docs.pages import PAGES, ROOT, SHELL, blocks_of, empty_module, name_of
-from tests.registries import keep_as_they_are
+from tests.support.pages import PAGES, ROOT, SHELL, blocks_of, empty_module, name_of
+from tests.support.registries import keep_as_they_are
 
 EXTRAS = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
 

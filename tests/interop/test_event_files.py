@@ -14,8 +14,8 @@ from edqn_jax.errors import ConfigError
 from edqn_jax.extras import MissingPackageError, require
 from edqn_jax.interop.recordings.event_files import read_events, write_events
 from edqn_jax.interop.recordings.recording import Recording
-from tests.interop.recordings import HEIGHT, WIDTH, some_events, some_recording
 from tests.oracles import event_words
+from tests.support.interop.recordings import HEIGHT, WIDTH, some_events, some_recording
 
 faery = require("faery", extra="events")
 h5py = require("h5py", extra="events")

@@ -14,9 +14,9 @@ from edqn_jax.extras import require
 from edqn_jax.interop.recordings.event_files import read_events
 from edqn_jax.interop.recordings.prophesee_words import EVT3
 from edqn_jax.sim.sensors.events import STREAM_DTYPE
-from tests.interop.recordings import HEIGHT, WIDTH, some_events
 from tests.oracles import event_words
 from tests.oracles.aedat4_bytes import aedat4
+from tests.support.interop.recordings import HEIGHT, WIDTH, some_events
 
 faery = require("faery", extra="events")
 h5py = require("h5py", extra="events")

@@ -25,7 +25,7 @@ from edqn_jax.learn.perception import vae
 from edqn_jax.learn.policy import Policy
 from edqn_jax.sim.task.environment import Environment
 from edqn_jax.sim.task.observation import Observation
-from tests.interop.recordings import some_recording
+from tests.support.interop.recordings import some_recording
 
 pytestmark = pytest.mark.filterwarnings("ignore")  # jax2onnx and what it imports
 

@@ -14,8 +14,8 @@ import pytest
 
 import edqn_jax
 from edqn_jax.config import Config
-from tests.docs.pages import PAGES, blocks_of, empty_module, name_of
-from tests.registries import keep_as_they_are
+from tests.support.pages import PAGES, blocks_of, empty_module, name_of
+from tests.support.registries import keep_as_they_are
 
 ELSEWHERE = ("README.md", *(f"docs/{page}.md" for page in ("deployment", "functional", "gymnasium", "sweeps")))
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import functools
 import warnings
 from typing import Any
 
@@ -12,44 +11,22 @@ import numpy as np
 import pytest
 
 import edqn_jax
-from edqn_jax.config import Config
-from edqn_jax.config.loading import make_config
 from edqn_jax.errors import ConfigError
 from edqn_jax.extras import require
 from edqn_jax.learn.actor import AgentActor
-from edqn_jax.learn.policy import Policy, fresh_policy
 from edqn_jax.sim.actions import move_number
 from edqn_jax.sim.task.observation import OWN_SIZE
 from edqn_jax.sim.task.outcomes import Outcome
+from tests.support.interop.gym import DOWN, HOVER, MOVES, many, policy, small
 
 gymnasium = require("gymnasium", extra="gym")
 interop = require("edqn_jax.interop.gymnasium")
 
 AHEAD = int(move_number("ahead"))
-DOWN = int(move_number("down"))
-HOVER = int(move_number("hover"))
-MOVES = np.random.default_rng(5).integers(0, 27, size=(12, 3))
-
-
-@functools.cache
-def small(world: str = "medium") -> Config:
-    """Few pixels: the camera is not what is tested here."""
-    config = make_config(world)
-    return dataclasses.replace(config, camera=dataclasses.replace(config.camera, width=16, height=12))
-
-
-@functools.cache
-def policy() -> Policy:
-    """One that has learnt nothing."""
-    return Policy(small(), fresh_policy(small()))
 
 
 def one(**options: Any) -> Any:
     return interop.DroneEnv("medium", small(), worlds=3, **options)
-
-
-def many(count: int = 3, **options: Any) -> Any:
-    return interop.DroneVectorEnv(count, "medium", small(), worlds=3, **options)
 
 
 def counts(image: np.ndarray) -> np.ndarray:

@@ -15,7 +15,7 @@ from edqn_jax.errors import ConfigError
 from edqn_jax.extras import require
 from edqn_jax.sim.actions import move_number
 from edqn_jax.sim.task.outcomes import Outcome
-from tests.interop.test_gymnasium import small
+from tests.support.interop.gym import small
 
 gymnasium = require("gymnasium", extra="gym")
 interop = require("edqn_jax.interop.gymnasium")

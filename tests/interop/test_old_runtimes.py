@@ -11,7 +11,7 @@ import pytest
 from edqn_jax.extras import require
 from edqn_jax.interop import runner
 from edqn_jax.interop.onnx_export import export_policy
-from tests.interop.test_runner import fresh
+from tests.support.interop.flights import untrained
 
 pytestmark = pytest.mark.filterwarnings("ignore")  # jax2onnx and what it imports
 
@@ -42,7 +42,7 @@ OPERATORS = {
 def test_a_policy_has_only_operators_that_old_runtimes_run(tmp_path: Path, groups: Any) -> None:
     onnx = require("onnx", extra="export")
     file = tmp_path / "policy.onnx"
-    export_policy(fresh(**groups), file, checks=5)
+    export_policy(untrained(**groups), file, checks=5)
     model = onnx.shape_inference.infer_shapes(onnx.load(file))
     assert [(each.domain, each.version) for each in model.opset_import] == [("", 18)]
     name_of = onnx.TensorProto.DataType.Name

@@ -10,7 +10,7 @@ import pytest
 
 import edqn_jax
 from edqn_jax.config import Config
-from tests.interop.tiny import tiny_trial
+from tests.support.interop.tiny import tiny_trial
 
 DOCS = Path(__file__).parents[2] / "docs"
 

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from edqn_jax.errors import ConfigError
 from edqn_jax.interop.recordings.recording import MICROSECONDS, Recording, found_unit, recording_of
-from tests.interop.recordings import some_events
+from tests.support.interop.recordings import some_events
 
 EVENTS = some_events()
 COLUMNS = {key: EVENTS[key] for key in "txyp"}

@@ -13,14 +13,13 @@ import numpy as np
 import pytest
 
 import edqn_jax
-from edqn_jax.config.loading import make_config
 from edqn_jax.errors import CheckError, ConfigError
 from edqn_jax.extras import MissingPackageError
 from edqn_jax.interop import onnx_export, runner
 from edqn_jax.interop.onnx_export import RUNNER, about_policy, export_policy
-from edqn_jax.learn.policy import Policy, fresh_policy
+from edqn_jax.learn.policy import Policy
 from edqn_jax.sim.sensors.events import STREAM_DTYPE
-from tests.interop.flights import Decided, flown
+from tests.support.interop.flights import Decided, flown, untrained
 
 pytestmark = pytest.mark.filterwarnings("ignore")  # jax2onnx and what it imports
 
@@ -51,12 +50,6 @@ print(moves)
 @functools.cache
 def pretrained() -> Policy:
     return edqn_jax.load_policy("pretrained")
-
-
-def fresh(**groups: Any) -> Policy:
-    """A policy that has learnt nothing."""
-    config = make_config("medium", drone={"physics": "rigid_body"}, camera={"width": 16, "height": 12}, **groups)
-    return Policy(config, fresh_policy(config))
 
 
 def event(t: int, x: int, y: int, p: int) -> np.ndarray:
@@ -110,7 +103,7 @@ def _way(each: Decided) -> np.ndarray:
     ids=["esim", "noise", "threshold", "event-image", "no-position", "pooled"],
 )
 def test_other_policies_fly_as_in_jax(tmp_path, groups):
-    policy = fresh(**groups)
+    policy = untrained(**groups)
     export_policy(policy, tmp_path / "policy.onnx", checks=50)
     decisions = flown(policy, most=25)
     assert sum(len(each.packet) for each in decisions) > 500
@@ -131,7 +124,7 @@ def test_it_flies_a_whole_flight_where_jax_cannot_be_imported(exported, tmp_path
 
 
 def test_own_state_and_motion_are_those_of_the_simulator():
-    for policy in (pretrained(), fresh(env={"position": False, "heading": "flight"})):
+    for policy in (pretrained(), untrained(env={"position": False, "heading": "flight"})):
         about = about_policy(policy.config)
         for each in flown(policy, most=12):
             given = {name: np.asarray(value, np.float32) for name, value in each.given.items()}
@@ -275,7 +268,7 @@ def test_the_runner_is_written_beside_it(exported):
 
 def test_nothing_is_written_where_onnx_and_jax_differ(tmp_path, monkeypatch):
     whole = onnx_export.decision
-    policy, calls = fresh(), []
+    policy, calls = untrained(), []
 
     def drifting(config, params):
         decide = whole(config, params)
@@ -302,13 +295,13 @@ def test_nothing_is_written_where_onnx_and_jax_differ(tmp_path, monkeypatch):
 )
 def test_policies_that_see_more_than_counts_are_refused(tmp_path, groups, says):
     with pytest.raises(ConfigError, match=says):
-        export_policy(fresh(**groups), tmp_path / "policy.onnx")
+        export_policy(untrained(**groups), tmp_path / "policy.onnx")
 
 
 def test_a_missing_package_names_its_extra(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "jax2onnx", None)
     with pytest.raises(MissingPackageError, match=r"pip install 'edqn-jax\[export\]'"):
-        export_policy(fresh(), tmp_path / "policy.onnx")
+        export_policy(untrained(), tmp_path / "policy.onnx")
 
 
 def test_other_files_are_no_policies(tmp_path, exported):

@@ -15,8 +15,8 @@ from edqn_jax.errors import ConfigError
 from edqn_jax.interop.sb3_policy import sb3_policy
 from edqn_jax.learn.policy import Policy
 from edqn_jax.policies.functions import FunctionActor
-from tests.miniature import WORLD
-from tests.policies import CONFIG, fresh
+from tests.support.miniature import WORLD
+from tests.support.policies import CONFIG, fresh
 
 BLIND = dataclasses.replace(
     CONFIG,

@@ -16,7 +16,7 @@ from edqn_jax.errors import ConfigError
 from edqn_jax.extras import require
 from edqn_jax.interop.sb3_policy import sb3_policy
 from edqn_jax.sim.task.outcomes import Outcome
-from tests.interop.test_gymnasium import DOWN, HOVER, MOVES, many, policy, small
+from tests.support.interop.gym import DOWN, HOVER, MOVES, many, policy, small
 
 library = require("stable_baselines3")
 interop = require("edqn_jax.interop.stable_baselines3")

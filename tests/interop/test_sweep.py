@@ -9,8 +9,8 @@ import pytest
 
 from edqn_jax.config import Config
 from edqn_jax.extras import require
-from tests.interop.tiny import tiny_trial
-from tests.miniature import WORLD
+from tests.support.interop.tiny import tiny_trial
+from tests.support.miniature import WORLD
 
 optuna = require("optuna", extra="sweep")
 sweep = require("sweep_optuna")

@@ -22,7 +22,7 @@ from edqn_jax.sim.task.outcomes import Outcome
 from edqn_jax.training.history import EndedEpisodes
 from edqn_jax.training.loop import Chunk
 from edqn_jax.training.selection import Candidate
-from tests.report.test_sights import world_with_a_box
+from tests.support.box_flight import world_with_a_box
 
 VALUES = {64: 1.5, 128: 2.5, 192: -3.0}
 """Mean return by decisions."""

@@ -18,7 +18,7 @@ from edqn_jax.learn import trainer
 from edqn_jax.learn.dqn.learner import DQN
 from edqn_jax.learn.learner import Learner, UpdateStats, learner_of
 from edqn_jax.learn.plan import Plan
-from tests.miniature import miniature_world
+from tests.support.miniature import miniature_world
 
 STEPS = 24
 

@@ -21,7 +21,7 @@ from edqn_jax.learn import qnetwork
 from edqn_jax.learn.actor import observation_size
 from edqn_jax.learn.dqn.learner import DQN
 from edqn_jax.learn.policy import Policy, fresh_policy
-from tests.registries import keep_as_they_are
+from tests.support.registries import keep_as_they_are
 
 
 class Linear(nn.Module):

@@ -13,18 +13,18 @@ from edqn_jax.learn import saved_state
 from edqn_jax.learn.plan import Plan
 from edqn_jax.learn.trainer import Trainer
 from edqn_jax.sim.task.env import World
-from tests.miniature import miniature_world
-from tests.whole.test_trainer import CONFIG
+from tests.support.configs import TINY
+from tests.support.miniature import miniature_world
 
 
 @pytest.fixture(scope="module")
 def world() -> World:
-    return miniature_world(CONFIG)
+    return miniature_world(TINY)
 
 
 @pytest.mark.slow
 def test_the_state_of_several_agents_comes_back_on_another_number_of_devices(world: World) -> None:
-    one, two = (Trainer(CONFIG, [world] * 2, jax.devices()[:count]) for count in (1, 2))
+    one, two = (Trainer(TINY, [world] * 2, jax.devices()[:count]) for count in (1, 2))
     state = two.init([3, 4])
     found = saved_state.to_host(two, state, done=0)
     shapes = {name: (array.shape, str(array.dtype)) for name, array in found.items()}
@@ -40,11 +40,11 @@ def test_the_state_of_several_agents_comes_back_on_another_number_of_devices(wor
 
 
 def test_what_no_later_step_reads_is_left_out_and_nothing_else(world: World) -> None:
-    trainer = Trainer(CONFIG, world, jax.devices()[:1])
+    trainer = Trainer(TINY, world, jax.devices()[:1])
     (_, end) = trainer.plan.vae_training[-1]
     before, after = (set(saved_state.expected(trainer, done)) for done in (end - 1, end))
     assert before > after and all(name.startswith(".actors.samples") for name in before - after)
-    learns_on = dataclasses.replace(CONFIG, encoder=dataclasses.replace(CONFIG.encoder, keep_learning=True))
+    learns_on = dataclasses.replace(TINY, encoder=dataclasses.replace(TINY.encoder, keep_learning=True))
     assert Plan.of(learns_on).reads_samples(learns_on, end)
 
 

@@ -17,7 +17,7 @@ from edqn_jax.sim.scene.mjcf import load_scene, resolve_world
 from edqn_jax.sim.scene.scene import Shape, stack_scenes
 from edqn_jax.sim.task.missions import spread_missions
 from edqn_jax.sim.worlds.free_points import cells_of
-from tests.planning.small_worlds import RADIUS, SIZE, box, enclosure, small_world
+from tests.support.small_worlds import RADIUS, SIZE, box, enclosure, small_world
 
 GOAL = np.array([10.0, 6.0, 3.0])
 

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-import io
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -17,37 +15,12 @@ from edqn_jax.config.loading import to_yaml
 from edqn_jax.errors import ConfigError
 from edqn_jax.interop import flight_files
 from edqn_jax.learn.policy import PolicyParams, fresh_policy
-from edqn_jax.report.animation import LAST_FRAME_S, MOST_FRAMES, SIZE, animate
-from edqn_jax.report.sights import FINE, Shown
+from edqn_jax.report.animation import LAST_FRAME_S, MOST_FRAMES, SIZE
 from edqn_jax.report.style import OUTCOME_COLOURS
 from edqn_jax.runs.checkpoints.params import save_params
 from edqn_jax.sim.scene.mjcf import write_scene
-from tests.policies import always
-from tests.report.test_sights import SMALL, world_with_a_box
-
-
-class Drawn:
-    """Sights that need no compiling."""
-
-    config, scene, has_image = SMALL, world_with_a_box(), True
-
-    def rgb(self, position: np.ndarray, quaternion: np.ndarray, time: np.ndarray) -> np.ndarray:
-        return np.full((SMALL.camera.height * FINE, SMALL.camera.width * FINE, 3), 0.2 + 0.02 * position[0])
-
-    def shown(self, params: object, flown: dict[str, np.ndarray]) -> Shown:
-        counts = np.random.default_rng(0).integers(-3, 4, (len(flown["t"]) // 13, 24, 32))
-        return Shown(counts, counts, counts, counts)
-
-
-def a_flight(decisions: float) -> dict[str, np.ndarray]:
-    t = 0.02 * np.arange(1, round(13 * decisions) + 1)
-    still = dict.fromkeys(("y", "qx", "qy", "qz", "vy", "vz"), 0 * t)
-    return {"t": t, "x": t, "z": 0 * t + 4, "qw": 0 * t + 1, "vx": 0 * t + 1} | still
-
-
-def recorded(sights: Any, decisions: float, outcome: str = "goal") -> Image.Image:
-    gif = animate(sights, fresh_policy(SMALL), a_flight(decisions), outcome, title="a box")
-    return Image.open(io.BytesIO(gif))
+from tests.support.box_flight import SMALL, Drawn, recorded, world_with_a_box
+from tests.support.policies import always
 
 
 def frames(image: Image.Image) -> int:

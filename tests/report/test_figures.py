@@ -5,8 +5,6 @@ from __future__ import annotations
 from importlib import import_module
 from pathlib import Path
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from matplotlib.collections import LineCollection, PathCollection
@@ -19,39 +17,11 @@ from edqn_jax.report.images import EVENTS, NEARNESS, draw_reconstruction, draw_s
 from edqn_jax.report.solids import MAP, View, cut_open, far_to_near, hidden, solids_of
 from edqn_jax.report.style import OUTCOME_COLOURS
 from edqn_jax.sim.scene.scene import (
-    PARKED,
-    Capsules,
-    Planes,
     Scene,
-    Spheres,
-    TiltedBoxes,
-    TiltedCylinders,
     UprightBoxes,
-    UprightCylinders,
     build_scene,
 )
-
-
-def a_scene() -> Scene:
-    """One shape of every kind, and a parked one of each."""
-
-    def points(*point: float) -> jax.Array:
-        return jnp.array([point, [PARKED] * 3])
-
-    grey, ones, long = jnp.full((2, 3), 0.5), jnp.ones(2), jnp.full(2, 4.0)
-    leaning = jnp.array([[0.6, 0.0, 0.8]] * 2)
-    return Scene(
-        boxes=UprightBoxes(points(30, 30, 5), jnp.array([[4.0, 6, 5], [0, 0, 0]]), jnp.array([0.3, 0]), grey),
-        cylinders=UprightCylinders(points(60, 20, 6), 3 * ones, 6 * ones, grey),
-        spheres=Spheres(points(50, 55, 9), 4 * ones, jnp.array([[0.9, 0.8, 0.1]] * 2)),
-        tilted_boxes=TiltedBoxes(points(80, 40, 9), jnp.ones((2, 3)), jnp.stack([jnp.eye(3)] * 2), grey),
-        capsules=Capsules(points(20, 70, 8), leaning, long, ones, grey),
-        tilted_cylinders=TiltedCylinders(points(70, 75, 8), leaning, long, ones, grey),
-        planes=Planes(jnp.zeros((1, 3)), jnp.array([[0, 0, 1.0]]), grey[:1]),
-        volume=jnp.array([[0.0, 0, 0], [110, 110, 25]]),
-        start=jnp.array([1.0, 1, 3]),
-        goal=jnp.array([90.0, 90, 10]),
-    )
+from tests.support.drawn_scenes import one_of_each_kind
 
 
 def a_flight(steps: int = 600) -> dict[str, np.ndarray]:
@@ -71,7 +41,7 @@ def texts(figure: Figure) -> str:
 
 
 def test_every_shape_but_the_parked_becomes_a_solid():
-    assert len(solids_of(a_scene())) == 6
+    assert len(solids_of(one_of_each_kind())) == 6
 
 
 def test_the_faces_of_a_solid_enclose_its_volume():
@@ -84,7 +54,7 @@ def test_the_faces_of_a_solid_enclose_its_volume():
         np.pi * 8 + np.pi * 4 / 3,
         4 / 3 * np.pi * 64,
     ]
-    for solid, volume in zip(solids_of(a_scene()), volumes, strict=True):
+    for solid, volume in zip(solids_of(one_of_each_kind()), volumes, strict=True):
         total = 0.0
         for face, normal in zip(solid.faces, solid.outward, strict=True):
             area = np.linalg.norm(np.cross(face, np.roll(face, -1, axis=0)).sum(0)) / 2
@@ -93,7 +63,7 @@ def test_the_faces_of_a_solid_enclose_its_volume():
 
 
 def test_a_solid_hides_what_is_behind_it_and_nothing_else():
-    box = solids_of(a_scene())[:1]
+    box = solids_of(one_of_each_kind())[:1]
     below_roof, above_roof, beside = [30, 30, 2], [30, 30, 12], [50, 30, 2]
     assert hidden(np.array([below_roof, above_roof, beside], float), box, MAP).tolist() == [
         True,
@@ -134,8 +104,8 @@ def test_a_ceiling_and_the_walls_before_the_eye_are_cut_away():
 
 
 def test_nothing_is_cut_away_in_the_open():
-    assert cut_open(a_scene(), OBLIQUE).note == cut_open(a_scene(), MAP).note == ""
-    assert len(cut_open(a_scene(), OBLIQUE).shown) == 6
+    assert cut_open(one_of_each_kind(), OBLIQUE).note == cut_open(one_of_each_kind(), MAP).note == ""
+    assert len(cut_open(one_of_each_kind(), OBLIQUE).shown) == 6
 
 
 def test_a_beam_is_no_ceiling():
@@ -161,7 +131,7 @@ def test_a_map_has_x_to_the_right_and_y_up():
 
 
 def test_the_world_is_drawn_in_proportion_with_start_and_goal(tmp_path):
-    figure = draw_world(a_scene(), tmp_path / "world.png")
+    figure = draw_world(one_of_each_kind(), tmp_path / "world.png")
     assert is_png(tmp_path / "world.png")
     assert figure.axes[0].get_aspect() == 1.0
     assert "start (1, 1, 3)" in texts(figure) and "goal (90, 90, 10)" in texts(figure)
@@ -169,7 +139,7 @@ def test_the_world_is_drawn_in_proportion_with_start_and_goal(tmp_path):
 
 @pytest.mark.slow
 def test_the_path_is_drawn_whole_in_both_views(tmp_path):
-    figure = draw_path(a_scene(), a_flight(), np.array([[1, 1, 3], [90, 90, 10.0]]), tmp_path / "path.png")
+    figure = draw_path(one_of_each_kind(), a_flight(), np.array([[1, 1, 3], [90, 90, 10.0]]), tmp_path / "path.png")
     assert is_png(tmp_path / "path.png")
     for axes in figure.axes[:2]:
         coloured = [c for c in axes.collections if isinstance(c, LineCollection) and c.get_array() is not None]
@@ -180,13 +150,13 @@ def test_the_path_is_drawn_whole_in_both_views(tmp_path):
 
 
 def test_a_flight_that_fails_says_how(tmp_path):
-    figure = draw_path(a_scene(), a_flight(50), None, tmp_path / "path.png", outcome="collision")
+    figure = draw_path(one_of_each_kind(), a_flight(50), None, tmp_path / "path.png", outcome="collision")
     assert "collision" in texts(figure) and "shortest path" not in texts(figure)
 
 
 @pytest.mark.slow
 def test_a_flight_of_one_step_can_be_drawn(tmp_path):
-    draw_path(a_scene(), a_flight(1), None, tmp_path / "path.png", outcome="left_volume")
+    draw_path(one_of_each_kind(), a_flight(1), None, tmp_path / "path.png", outcome="left_volume")
     assert is_png(tmp_path / "path.png")
 
 

@@ -23,8 +23,7 @@ from edqn_jax.sim.scene.scene import PARKED, Planes, Scene, Spheres, UprightBoxe
 from edqn_jax.sim.sensors import events
 from edqn_jax.sim.task import env
 from edqn_jax.sim.task.missions import own_missions
-from tests.report.test_animation import Drawn, a_flight, recorded
-from tests.report.test_sights import SMALL
+from tests.support.box_flight import SMALL, Drawn, a_flight, recorded
 
 RED, GREY = np.array([0.9, 0.05, 0.05]), np.full(3, 0.5)
 SLIDING = Motion((0, 4, 0), (0, -9, 0), (0, 9, 0), np.zeros((2, 3)), 0.0)

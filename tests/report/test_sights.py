@@ -11,32 +11,21 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from edqn_jax.config import CameraConfig, Config
+from edqn_jax.config import Config
 from edqn_jax.learn.perception import vae
 from edqn_jax.learn.policy import fresh_policy
 from edqn_jax.report.sights import FINE, Sights, coarse, decision_rows, own_motions, poses
 from edqn_jax.sim.actions import ACTIONS
 from edqn_jax.sim.camera import camera
 from edqn_jax.sim.physics import drone
-from edqn_jax.sim.scene.scene import Planes, Scene, UprightBoxes, build_scene, stack_scenes
+from edqn_jax.sim.scene.scene import stack_scenes
 from edqn_jax.sim.sensors import events, sensor
 from edqn_jax.sim.task import env
 from edqn_jax.sim.task.missions import own_missions
-from tests.policies import CONFIG
+from tests.support.box_flight import SMALL, world_with_a_box
 
-SMALL = dataclasses.replace(
-    CONFIG, camera=CameraConfig(), drone=dataclasses.replace(CONFIG.drone, physics="rigid_body")
-)
 HEIGHT, WIDTH = SMALL.camera.height, SMALL.camera.width
 MOVES = [(1, 0, 0), (1, 0, 0), (1, 1, 0), (1, 0, 1), (1, -1, 0), (1, 0, 0)]
-
-
-def world_with_a_box() -> Scene:
-    shapes = [
-        UprightBoxes(*map(np.asarray, ([12.0, 1, 4], [2.0, 2, 4], 0.3, [0.9] * 3))),  # pyright: ignore
-        Planes(*map(np.asarray, ([0.0] * 3, [0.0, 0, 1], [0.4] * 3))),  # pyright: ignore
-    ]
-    return build_scene(shapes, volume=[[-9, -9, 0], [40, 9, 20]], start=[0, 0, 4], goal=[30, 0, 4])
 
 
 def sights_of(config: Config) -> Sights:

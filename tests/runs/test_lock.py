@@ -18,7 +18,7 @@ from edqn_jax.runs.directory import RunDirectory, plan_run_directory
 from edqn_jax.runs.lock import LOCK, Lock
 from edqn_jax.runs.record import train_run
 from edqn_jax.runs.stopping import Stop
-from tests.processes import PATIENCE_S
+from tests.support.processes import PATIENCE_S
 
 HOLDER = """
 import sys, time

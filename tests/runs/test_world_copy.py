@@ -11,7 +11,7 @@ import pytest
 from edqn_jax.config.loading import make_config
 from edqn_jax.errors import ConfigError
 from edqn_jax.runs import world_copy
-from tests.miniature import WORLD
+from tests.support.miniature import WORLD
 
 
 @pytest.fixture

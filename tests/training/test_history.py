@@ -12,8 +12,8 @@ from edqn_jax.errors import DivergedError
 from edqn_jax.learn.plan import Plan
 from edqn_jax.learn.trainer import Episodes, Losses
 from edqn_jax.sim.task.outcomes import Outcome
-from edqn_jax.training.history import EndedEpisodes, Watch, chunk_metrics
-from tests.miniature import no_losses
+from edqn_jax.training.history import EndedEpisodes, Watch, chunk_metrics, mean_metrics
+from tests.support.miniature import no_losses
 
 PLAN = Plan(total=100, scheduled=100, warmup=4, starts=6, vae_training=((0, 4),))
 
@@ -103,3 +103,18 @@ def test_every_phase_of_a_run_has_its_name() -> None:
     assert [chunk["phase"] for chunk in chunks] == ["warm-up"] * 2 + ["training"] * 2 + ["retraining"] + [
         "training"
     ] * 3
+
+
+def test_what_is_shown_of_several_agents_is_their_mean() -> None:
+    first = {"phase": "training", "decisions": 64, "success_rate": 0.5, "q_loss": None, "warm_up": None}
+    second = {"phase": "training", "decisions": 64, "success_rate": None, "q_loss": 0.1, "warm_up": None}
+    third = {"phase": "training", "decisions": 64, "success_rate": 0.7, "q_loss": 0.3, "warm_up": None}
+    mean = mean_metrics([first, second, third])
+    assert mean == {
+        "phase": "training",
+        "decisions": 64.0,
+        "success_rate": pytest.approx(0.6),
+        "q_loss": pytest.approx(0.2),
+        "warm_up": None,
+    }
+    assert mean_metrics([first]) is first

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from pathlib import Path
 
 import jax
@@ -14,15 +13,9 @@ from edqn_jax.learn.policy import Policy, PolicyParams
 from edqn_jax.sim.task.outcomes import Outcome
 from edqn_jax.sim.task.reward import Transition
 from edqn_jax.training.loop import Chunk, TrainingResult, train
-from tests.whole.test_run import CONFIG
+from tests.support.configs import BLIND_RUN
 
-SMALL = dataclasses.replace(
-    CONFIG,
-    # This sensor is the quickest to compile.
-    env=dataclasses.replace(CONFIG.env, sensor="blind"),
-    train=dataclasses.replace(CONFIG.train, total_steps=256, validation_every=0),
-)
-CHUNK = SMALL.train.num_envs * SMALL.train.chunk_steps
+CHUNK = BLIND_RUN.train.num_envs * BLIND_RUN.train.chunk_steps
 """Decisions."""
 
 pytestmark = pytest.mark.slow
@@ -41,23 +34,23 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> tuple[TrainingResult, l
     folder = tmp_path_factory.mktemp("here")
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
-        result = train(SMALL, reward=one, callback=chunks.append)
+        result = train(BLIND_RUN, reward=one, callback=chunks.append)
     return result, chunks, list(folder.iterdir())
 
 
 def test_training_returns_policy_and_history_and_writes_nothing(trained) -> None:
     result, chunks, written = trained
     assert written == []
-    assert not result.stopped and result.decisions == SMALL.train.total_steps
+    assert not result.stopped and result.decisions == BLIND_RUN.train.total_steps
     assert [row["decisions"] for row in result.history.metrics] == list(
-        range(CHUNK, SMALL.train.total_steps + 1, CHUNK)
+        range(CHUNK, BLIND_RUN.train.total_steps + 1, CHUNK)
     )
     assert [chunk.metrics for chunk in chunks] == result.history.metrics
     assert [chunk.episodes for chunk in chunks] == result.history.episodes
     # It ends with a validation, and with the parameters that were validated.
-    assert [decisions for decisions, *_ in result.history.validations] == [SMALL.train.total_steps]
-    assert result.kept.decisions == SMALL.train.total_steps and result.kept is chunks[-1].kept
-    assert result.policy.config == SMALL
+    assert [decisions for decisions, *_ in result.history.validations] == [BLIND_RUN.train.total_steps]
+    assert result.kept.decisions == BLIND_RUN.train.total_steps and result.kept is chunks[-1].kept
+    assert result.policy.config == BLIND_RUN
     assert same(result.policy.params, result.kept.params)
 
 
@@ -66,7 +59,7 @@ def test_a_reward_of_ones_returns_the_length_of_each_episode(trained) -> None:
     outcomes, returns, lengths = (
         np.concatenate([getattr(ended, name) for ended in episodes]) for name in ("outcome", "episode_return", "length")
     )
-    assert len(outcomes) >= SMALL.train.num_envs and Outcome.DIVERGED not in outcomes
+    assert len(outcomes) >= BLIND_RUN.train.num_envs and Outcome.DIVERGED not in outcomes
     assert len(set(lengths)) > 1
     np.testing.assert_array_equal(returns, lengths)
 
@@ -78,7 +71,7 @@ def test_a_callback_that_returns_true_stops_after_its_chunk(trained) -> None:
         newest.append(chunk.policy())
         return chunk.metrics["decisions"] == 2 * CHUNK
 
-    result = train(SMALL, reward=one, callback=second)
+    result = train(BLIND_RUN, reward=one, callback=second)
     assert result.stopped and result.decisions == 2 * CHUNK
     # The same training as far as it went, and nothing validated: it ends with what it has come to.
     for ours, whole in zip(result.history.episodes, trained[0].history.episodes[:2], strict=True):

@@ -25,7 +25,7 @@ from edqn_jax.sim.task.outcomes import Outcome
 from edqn_jax.sim.task.reward import Reward, Transition
 from edqn_jax.sim.worlds import geodesic
 from edqn_jax.training.setup import config_for_reward, prepared
-from tests.training.test_loop import SMALL
+from tests.support.configs import BLIND_RUN
 
 CONFIG = dataclasses.replace(Config(), env=dataclasses.replace(Config().env, sensor="blind"))
 
@@ -123,8 +123,8 @@ def test_a_reward_of_ones_own_may_prefer_a_direction() -> None:
 @pytest.mark.slow
 def test_training_with_the_reward_geodesic_counts_metres_around_obstacles() -> None:
     world = str(scenes_folder() / "examples" / "corridor.xml")
-    task = dataclasses.replace(SMALL.env, reward="geodesic")
-    config = dataclasses.replace(SMALL, env=task, world=dataclasses.replace(SMALL.world, name=world))
+    task = dataclasses.replace(BLIND_RUN.env, reward="geodesic")
+    config = dataclasses.replace(BLIND_RUN, env=task, world=dataclasses.replace(BLIND_RUN.world, name=world))
     with prepared(config, agents=2) as preparation:
         distances = preparation.trainer.world.distances
         assert distances is not None and distances.remaining.ndim == 4  # one field for all agents

@@ -18,10 +18,10 @@ from edqn_jax.runs.directory import RunDirectory
 from edqn_jax.runs.record import train_run
 from edqn_jax.runs.stopping import Stop
 from edqn_jax.runs.verify import verify
-from tests.whole.test_run import CONFIG
+from tests.support.configs import TINY_RUN
 
 WORLD = WorldConfig(name="sparse", flown="", pool_size=2, missions=8, balls=3)
-BALLS = dataclasses.replace(CONFIG, world=WORLD, train=dataclasses.replace(CONFIG.train, devices=2))
+BALLS = dataclasses.replace(TINY_RUN, world=WORLD, train=dataclasses.replace(TINY_RUN.train, devices=2))
 
 
 @pytest.mark.slow

@@ -14,7 +14,7 @@ from edqn_jax.config import Config
 from edqn_jax.errors import CheckError
 from edqn_jax.learn.dqn import learner as dqn
 from edqn_jax.learn.trainer import Trainer, TrainState
-from tests.miniature import MINIATURE, miniature_world
+from tests.support.miniature import MINIATURE, miniature_world
 
 FLAGS = (
     *MINIATURE,

@@ -5,12 +5,12 @@ from __future__ import annotations
 import pytest
 
 import edqn_jax
-from tests.docs.test_readme import blocks
+from tests.support.pages import ROOT, blocks_of
 
 
 @pytest.mark.slow
 def test_the_readmes_examples_run(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    first, second = blocks("python")
+    first, second = blocks_of(ROOT / "README.md", "python")
     flown: dict = {}
     exec(first, flown)
     x, y, z = map(float, flown["step"].flight.position[-1])

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from edqn_jax.sim.task.outcomes import Outcome
-from tests.processes import PATIENCE_S, ROOT
-from tests.whole.layout_process import CONFIG, DECISIONS, DEVICES
+from tests.support.layout_process import CONFIG, DECISIONS, DEVICES
+from tests.support.processes import PATIENCE_S, ROOT
 
 pytestmark = pytest.mark.slow
 
@@ -22,7 +22,7 @@ Leaves = dict[str, np.ndarray]
 def layouts(tmp_path_factory: pytest.TempPathFactory) -> dict[int, Leaves]:
     """What each number of devices came to."""
     folder = tmp_path_factory.mktemp("layouts")
-    words = [sys.executable, "-m", "tests.whole.layout_process", str(folder)]
+    words = [sys.executable, "-m", "tests.support.layout_process", str(folder)]
     variables = {**os.environ, "PYTHONPATH": str(ROOT), "XLA_FLAGS": ""}  # the program that trains
     ended = subprocess.run(words, env=variables, capture_output=True, text=True, timeout=PATIENCE_S)
     assert ended.returncode == 0, ended.stderr

@@ -21,7 +21,7 @@ from edqn_jax.sim.scene.mjcf import load_world
 from edqn_jax.sim.scene.scene import scene_at
 from edqn_jax.sim.task.missions import random_missions
 from edqn_jax.sim.task.outcomes import Outcome
-from tests.policies import CONFIG, always
+from tests.support.policies import CONFIG, always
 
 RADIUS = 0.36
 WORLD = """

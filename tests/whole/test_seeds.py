@@ -21,14 +21,12 @@ from edqn_jax.runs.seeds import train_seeds_run
 from edqn_jax.runs.stopping import Stop
 from edqn_jax.runs.verify import verify
 from edqn_jax.training import history
-from edqn_jax.training.history import mean_metrics
 from edqn_jax.training.loop import train, train_seeds
-from tests.miniature import WORLD as MINIATURE_WORLD
-from tests.training.test_loop import SMALL
-from tests.whole.test_run import FIGURES
+from tests.support.configs import BLIND_RUN, FIGURES
+from tests.support.miniature import WORLD as MINIATURE_WORLD
 
 RANDOM = dataclasses.replace(
-    SMALL, world=WorldConfig(name="sparse", flown=str(MINIATURE_WORLD), pool_size=2, missions=8)
+    BLIND_RUN, world=WorldConfig(name="sparse", flown=str(MINIATURE_WORLD), pool_size=2, missions=8)
 )
 
 
@@ -49,7 +47,7 @@ def test_each_seed_leaves_a_run_and_all_of_them_a_summary(runs: tuple[RunDirecto
     assert summary["seeds"] == [0, 1] and len(summary["success_rates"]) == 2
     assert summary["flown_successes"] == sum(load["success"] for load in map(read, (run.of_seed(0), run.of_seed(1))))
     # All but the world that is flown at the end are test worlds.
-    assert summary["missions"] == SMALL.train.validation_missions - 1
+    assert summary["missions"] == BLIND_RUN.train.validation_missions - 1
     for seed in summary["seeds"]:
         own = run.of_seed(seed)
         assert load_policy(own.path).config.train.seed == seed
@@ -73,7 +71,7 @@ def test_the_runs_of_all_seeds_are_verified(runs: tuple[RunDirectory, dict]) -> 
 
 @pytest.mark.slow
 def test_a_seed_among_others_learns_what_it_learns_alone(runs: tuple[RunDirectory, dict]) -> None:
-    alone = train(dataclasses.replace(RANDOM, train=dataclasses.replace(SMALL.train, seed=1)))
+    alone = train(dataclasses.replace(RANDOM, train=dataclasses.replace(BLIND_RUN.train, seed=1)))
     together = load_policy(runs[0].of_seed(1).path)
     # Batched products round otherwise.
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-4), alone.policy.params, together.params)
@@ -91,14 +89,14 @@ def test_the_folder_of_several_seeds_is_no_policy(runs: tuple[RunDirectory, dict
 def test_stopping_stops_every_seed_and_keeps_their_policies(tmp_path: Path) -> None:
     run = RunDirectory(tmp_path / "stopped")
     with pytest.raises(StoppedError, match="stopped after 64 decisions; the policies are in"):
-        train_seeds_run(SMALL, 2, run, Progress(), Stop(lambda: True), drawing=prepare_gallery)
+        train_seeds_run(BLIND_RUN, 2, run, Progress(), Stop(lambda: True), drawing=prepare_gallery)
     assert [load_policy(run.of_seed(seed).path).config.train.seed for seed in (0, 1)] == [0, 1]
     assert not run.summary_file.exists()
 
 
 def test_no_agent_is_none_to_train() -> None:
     with pytest.raises(ConfigError, match="must be at least 1, not 0"):
-        train_seeds(0, SMALL)
+        train_seeds(0, BLIND_RUN)
 
 
 @pytest.mark.slow
@@ -113,19 +111,4 @@ def test_a_seed_that_diverges_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(history, "MOST_ILL_STEPS", 1)
     monkeypatch.setattr(trainer.Trainer, "chunk", poisoned)
     with pytest.raises(DivergedError, match="seed 1 diverged"):
-        train_seeds(2, SMALL)
-
-
-def test_what_is_shown_of_several_agents_is_their_mean() -> None:
-    first = {"phase": "training", "decisions": 64, "success_rate": 0.5, "q_loss": None, "warm_up": None}
-    second = {"phase": "training", "decisions": 64, "success_rate": None, "q_loss": 0.1, "warm_up": None}
-    third = {"phase": "training", "decisions": 64, "success_rate": 0.7, "q_loss": 0.3, "warm_up": None}
-    mean = mean_metrics([first, second, third])
-    assert mean == {
-        "phase": "training",
-        "decisions": 64.0,
-        "success_rate": pytest.approx(0.6),
-        "q_loss": pytest.approx(0.2),
-        "warm_up": None,
-    }
-    assert mean_metrics([first]) is first
+        train_seeds(2, BLIND_RUN)

@@ -16,8 +16,8 @@ from edqn_jax.config import Config
 from edqn_jax.config.loading import to_yaml
 from edqn_jax.runs.checkpoints.params import load_params
 from edqn_jax.runs.directory import RunDirectory
-from tests.processes import PATIENCE_S, WORLD, by_srun, one_process, to_the_end, two_processes
-from tests.whole.test_run import CONFIG
+from tests.support.configs import TINY_RUN
+from tests.support.processes import PATIENCE_S, WORLD, by_srun, one_process, to_the_end, two_processes
 
 
 def arguments_for(config: Config, folder: Path) -> list[str]:
@@ -38,14 +38,14 @@ def test_two_processes_train_the_policy_that_one_process_trains_on_two_devices(t
     together, alone = tmp_path / "together", tmp_path / "alone"
     together.mkdir()
     alone.mkdir()
-    argv = arguments_for(CONFIG, tmp_path)
+    argv = arguments_for(TINY_RUN, tmp_path)
     with two_processes(together, argv) as processes, one_process(alone, argv) as process:
         for code, output in to_the_end(*processes, process):
             assert code == 0, output
     notes = [json.loads(note.read_text()) for note in sorted(together.glob("note-*.json"))]
     # The shards, and the environments in them, are shared out: none is flown twice.
     assert [note["shards"] for note in notes] == [[[0, 1, 2, 3]], [[4, 5, 6, 7]]]
-    assert [note["environments"] for note in notes] == [CONFIG.train.num_envs // 2] * 2
+    assert [note["environments"] for note in notes] == [TINY_RUN.train.num_envs // 2] * 2
     # Both end with one train state, to the last bit, and with the same flights.
     first, second = (note["summary"] for note in notes)
     assert first["state_digest"] == second["state_digest"]
@@ -71,7 +71,8 @@ def _without_times(summary: dict) -> dict:
 @pytest.mark.slow
 def test_sigterm_for_one_process_of_slurms_stops_both_and_one_saves(tmp_path: Path) -> None:
     config = dataclasses.replace(
-        CONFIG, train=dataclasses.replace(CONFIG.train, total_steps=10**6, validation_every=0, checkpoint_every_s=0.0)
+        TINY_RUN,
+        train=dataclasses.replace(TINY_RUN.train, total_steps=10**6, validation_every=0, checkpoint_every_s=0.0),
     )
     argv = ["--no-learning", *arguments_for(config, tmp_path)]
     with two_processes(tmp_path, argv, by_srun) as processes:

@@ -30,18 +30,23 @@ from edqn_jax.runs.policies import load_run
 from edqn_jax.runs.record import train_run
 from edqn_jax.runs.stopping import Stop
 from edqn_jax.runs.verify import verify
-from tests.processes import ROOT
-from tests.whole.test_run import CONFIG, FIGURES
+from tests.support.configs import FIGURES, TINY_RUN
+from tests.support.processes import ROOT
 
 KILLED = """
 import sys, time
 from pathlib import Path
 from tests import conftest
-from tests.whole.test_run import CONFIG, Progress, RunDirectory, Stop, prepare_gallery, train_run
+from edqn_jax.report.gallery import prepare_gallery
+from edqn_jax.report.progress import Progress
 from edqn_jax.runs import keeper
+from edqn_jax.runs.directory import RunDirectory
+from edqn_jax.runs.record import train_run
+from edqn_jax.runs.stopping import Stop
+from tests.support.configs import TINY_RUN
 import dataclasses
 keeper.MOST_OVERHEAD = 1e9
-often = dataclasses.replace(CONFIG, train=dataclasses.replace(CONFIG.train, checkpoint_every_s=1e-3))
+often = dataclasses.replace(TINY_RUN, train=dataclasses.replace(TINY_RUN.train, checkpoint_every_s=1e-3))
 train_run(often, RunDirectory(Path(sys.argv[1])), Progress(), Stop(lambda: time.sleep(0.2)), drawing=prepare_gallery)
 """
 """A run with a checkpoint after every chunk, which takes long enough to be killed."""
@@ -50,14 +55,14 @@ train_run(often, RunDirectory(Path(sys.argv[1])), Progress(), Stop(lambda: time.
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory: pytest.TempPathFactory) -> tuple[RunDirectory, dict]:
     run = RunDirectory(tmp_path_factory.mktemp("runs") / "whole")
-    return run, train_run(CONFIG, run, Progress(), Stop(), drawing=prepare_gallery)
+    return run, train_run(TINY_RUN, run, Progress(), Stop(), drawing=prepare_gallery)
 
 
 @pytest.mark.slow
 def test_a_run_leaves_what_the_readme_promises(whole: tuple[RunDirectory, dict]) -> None:
     run, summary = whole
     assert json.loads(run.summary_file.read_text()) == plain(summary)
-    assert summary["reward"] == {"name": CONFIG.env.reward, "source_sha256": None}
+    assert summary["reward"] == {"name": TINY_RUN.env.reward, "source_sha256": None}
     figures = {file.stem for file in run.figures.glob("*.png")}
     assert figures == FIGURES | {"events", "reconstruction"}
     assert summary["train_decisions"] == 512 and summary["outcome"] in {"time_out", "collision", "left_volume"}
@@ -71,7 +76,7 @@ def test_a_run_leaves_what_the_readme_promises(whole: tuple[RunDirectory, dict])
     chosen = [row["decisions"] for row in validations if row["validation_spl"] == best][-1]
     assert (summary["parameters_from_decisions"], summary["validation_spl"]) == (chosen, best)
     config, _ = load_run(run.path)
-    assert config == CONFIG
+    assert config == TINY_RUN
 
 
 @pytest.mark.slow
@@ -79,7 +84,7 @@ def test_a_run_is_evaluated_and_says_what_was_flown(whole: tuple[RunDirectory, d
     run, summary = whole
     # As many missions as in a validation, and recorded: the program that has flown those flies these.
     figures, flights = tmp_path / "figures.json", tmp_path / "flights.npz"
-    missions = CONFIG.train.validation_missions
+    missions = TINY_RUN.train.validation_missions
     evaluate_command(EvaluateArgs(run.path, missions=missions, json=figures, trajectories=flights))
     found = json.loads(figures.read_text())
     assert found["missions"] == missions and len(np.load(flights)["outcome"]) == missions
@@ -97,7 +102,7 @@ def test_a_run_is_verified_and_what_was_changed_in_it_is_found(
     changed = RunDirectory(tmp_path / "changed")
     shutil.copytree(whole[0].path, changed.path)
     # The flights do not change: they need not be flown a third time.
-    flown = fly_on_all_devices(CONFIG, run_missions(CONFIG).final.world, load_run(changed.path)[1], 0, record=True)
+    flown = fly_on_all_devices(TINY_RUN, run_missions(TINY_RUN).final.world, load_run(changed.path)[1], 0, record=True)
     monkeypatch.setattr("edqn_jax.runs.verify.fly_on_all_devices", lambda *_, **__: flown)
 
     def wrong() -> set[str]:
@@ -159,7 +164,7 @@ def test_an_interrupted_run_that_is_continued_is_the_run_that_was_not(
     # As if it had been killed while it wrote.
     with run.metrics_file.open("a") as file:
         file.write('{"decisions": 25')
-    summary = train_run(CONFIG, dataclasses.replace(run, resume="must"), Progress(), Stop(), drawing=prepare_gallery)
+    summary = train_run(TINY_RUN, dataclasses.replace(run, resume="must"), Progress(), Stop(), drawing=prepare_gallery)
     assert 0 < summary["resumed_at_decisions"][0] < 512
     clocks = [name for name in summary if "seconds" in name or name == "resumed_at_decisions"]
     for name in [*clocks, "decisions_per_second"]:

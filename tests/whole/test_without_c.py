@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.processes import ROOT
+from tests.support.processes import ROOT
 
 SMALL = (
     *("--world", "paper", "--num-envs", "16", "--train.chunk-steps", "4", "--total-steps", "256"),

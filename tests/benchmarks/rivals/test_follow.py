@@ -21,7 +21,7 @@ from edqn_jax.sim.task.flights import Flights
 from edqn_jax.sim.task.outcomes import Outcome
 from rivals.planners import snn
 from rivals.planners.follow import SPACING_M, FollowConfig, compiled_follower, reserved, sampled, steer
-from tests.planning.small_worlds import RADIUS, SIZE, assert_flyable, box, enclosure, random_small_world, small_world
+from tests.support.small_worlds import RADIUS, SIZE, assert_flyable, box, enclosure, random_small_world, small_world
 
 CONFIG, FOLLOW = Config(), FollowConfig()
 AIRFRAME = drone.load_airframe(CONFIG.drone)

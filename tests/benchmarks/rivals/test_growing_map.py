@@ -10,7 +10,7 @@ from matplotlib.colors import ListedColormap
 from PIL import Image
 
 from rivals.mapping.growing_map import FREE, OCCUPIED, UNKNOWN, Moment, animate_growth, draw_growth, known_at
-from tests.report.test_figures import a_scene
+from tests.support.drawn_scenes import one_of_each_kind
 
 SHAPE = (22, 22, 5)
 CELL_M = 5.0
@@ -34,7 +34,7 @@ def test_a_cell_is_occupied_before_it_is_free_and_unknown_otherwise() -> None:
 
 def test_each_moment_is_a_column_with_its_map_and_its_distances(tmp_path: Path) -> None:
     moments = [a_moment(time) for time in (0.0, 2.6, 5.2)]
-    figure = draw_growth(a_scene(), CELL_M, moments, tmp_path / "map.png")
+    figure = draw_growth(one_of_each_kind(), CELL_M, moments, tmp_path / "map.png")
     with Image.open(tmp_path / "map.png") as picture:
         assert picture.size[0] > 1000
     maps, pictures = figure.axes[:3], figure.axes[3:6]
@@ -51,7 +51,9 @@ def test_each_moment_is_a_column_with_its_map_and_its_distances(tmp_path: Path) 
 
 
 def test_the_gif_has_a_frame_for_each_moment_and_rests_on_the_last() -> None:
-    gif = Image.open(io.BytesIO(animate_growth(a_scene(), CELL_M, [a_moment(time) for time in (0.0, 3.0)], "a map")))
+    gif = Image.open(
+        io.BytesIO(animate_growth(one_of_each_kind(), CELL_M, [a_moment(time) for time in (0.0, 3.0)], "a map"))
+    )
     assert gif.n_frames == 2  # type: ignore[attr-defined]
     seconds = []
     for frame in range(2):

@@ -9,8 +9,8 @@ from edqn_jax.extras import MissingPackageError, require
 from edqn_jax.planning.path import refusal
 from rivals.planners import snn
 from rivals.planners.planner import PLANNERS, load_planner
-from tests.benchmarks.rivals.uninstalled import hide
-from tests.planning.small_worlds import box, small_world
+from tests.support.benchmarks.uninstalled import hide
+from tests.support.small_worlds import box, small_world
 
 
 def test_a_planner_of_the_core_needs_nothing_else():

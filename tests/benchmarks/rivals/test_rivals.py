@@ -17,10 +17,10 @@ from edqn_jax.config import Config
 from edqn_jax.config.loading import to_yaml
 from edqn_jax.sim.scene.mjcf import write_scene
 from rivals import learners, planning, rival, table
-from tests.benchmarks.rivals.uninstalled import hide
-from tests.benchmarks.turns import row
-from tests.miniature import MINIATURE
-from tests.planning.small_worlds import WITHOUT_A_WAY, small_world
+from tests.support.benchmarks.turns import row
+from tests.support.benchmarks.uninstalled import hide
+from tests.support.miniature import MINIATURE
+from tests.support.small_worlds import WITHOUT_A_WAY, small_world
 
 TINY = (
     *(*MINIATURE, "--total-steps", "512", "--train.chunk-steps", "8", "--train.validation-every", "256"),

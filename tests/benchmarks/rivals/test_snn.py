@@ -18,7 +18,8 @@ from edqn_jax.sim.worlds.families import random_scene, world_key
 from rivals.planners import snn
 from rivals.planners.planner import Budget
 from tests.oracles.breadth_first import hop_counts
-from tests.planning.small_worlds import (
+from tests.support.drawn_scenes import every_kind
+from tests.support.small_worlds import (
     RADIUS,
     WITHOUT_A_WAY,
     assert_flyable,
@@ -27,7 +28,6 @@ from tests.planning.small_worlds import (
     small_world,
     true_distances,
 )
-from tests.sim.drawn_scenes import every_kind
 
 CONFIG = snn.SnnConfig()
 SMALL = (12, 12, 6)

@@ -27,11 +27,11 @@ from edqn_jax.runs.provenance import workload
 from edqn_jax.sim.scene import mjcf
 from edqn_jax.sim.task.env import World
 from edqn_jax.sim.task.observation import MOTION_SIZE, Observation
-from tests.learn.moving_boxes import frames
-from tests.miniature import miniature_world
-from tests.whole.test_trainer import CONFIG
+from tests.support.configs import TINY
+from tests.support.miniature import miniature_world
+from tests.support.moving_boxes import frames
 
-QUICK = dataclasses.replace(CONFIG, drone=dataclasses.replace(CONFIG.drone, physics="rigid_body"))
+QUICK = dataclasses.replace(TINY, drone=dataclasses.replace(TINY.drone, physics="rigid_body"))
 """Sensors do not depend on the physics, and these compile in less time; `test_trainer` trains with the default ones."""
 
 SENSORS = ("events", "frames", "frame-pair", "depth", "depth-motion", "event-image", "ranges", "blind")
@@ -39,13 +39,13 @@ CODED = SENSORS[:5]
 STEPS = 12
 
 
-def with_sensor(name: str, config: Config = CONFIG) -> Config:
+def with_sensor(name: str, config: Config = TINY) -> Config:
     return dataclasses.replace(config, env=dataclasses.replace(config.env, sensor=name))
 
 
 @pytest.fixture(scope="module")
 def world() -> World:
-    return miniature_world(CONFIG)
+    return miniature_world(TINY)
 
 
 # ------------------------------------------------------------------------------------------ the whole
@@ -113,7 +113,7 @@ def test_decisions_that_others_warm_up_in_are_learnt_in() -> None:
 
 def test_the_workload_says_what_is_drawn_and_learnt_from() -> None:
     scene = mjcf.load_scene(mjcf.resolve_world("paper"))
-    always = dataclasses.replace(CONFIG, encoder=dataclasses.replace(CONFIG.encoder, keep_learning=True, batch_size=32))
+    always = dataclasses.replace(TINY, encoder=dataclasses.replace(TINY.encoder, keep_learning=True, batch_size=32))
     found = {name: workload(with_sensor(name, always), scene) for name in SENSORS}
     assert [found[name]["sensor"] for name in SENSORS] == list(SENSORS)
     assert [found[name]["frames_per_decision"] for name in SENSORS] == [2, 1, 2, 1, 2, 2, 0, 0]

@@ -16,8 +16,8 @@ from edqn_jax.learn.perception import pooled_encoder, vae
 from edqn_jax.learn.perception.code import Form, kl_divergence
 from edqn_jax.sim.sensors import events as ev
 from edqn_jax.sim.task.observation import MOTION_SIZE
-from tests.learn.moving_boxes import fields
 from tests.oracles import event_fields, pooled_encoder_plain
+from tests.support.moving_boxes import fields
 
 CAMERA = CameraConfig()
 SMALL = CameraConfig(width=6, height=4)

@@ -17,7 +17,7 @@ from edqn_jax.learn.policy import Policy, PolicyParams
 from edqn_jax.runs.checkpoints import sealed
 from edqn_jax.runs.checkpoints.params import POLICY, load_params, save_params
 from edqn_jax.runs.policies import load_policy, save_policy
-from tests.policies import CONFIG, always
+from tests.support.policies import CONFIG, always
 
 FLIPS = 200
 

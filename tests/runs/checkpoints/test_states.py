@@ -15,27 +15,8 @@ import pytest
 from edqn_jax.errors import ConfigError
 from edqn_jax.runs.checkpoints import states
 from edqn_jax.runs.checkpoints.states import Checkpoint
-from tests.processes import PATIENCE_S
-
-ARRAYS = {
-    ".actors.env": np.arange(12, dtype=np.float32).reshape(3, 4),
-    ".learner['a.b/c']": np.array(True),
-    ".step": np.int32(7) * np.ones((), np.int32),
-}
-
-
-def saved(folder: Path, step: int, keep: int = 2) -> Path:
-    arrays = {**ARRAYS, ".step": np.asarray(step, np.int32)}
-    return states.save(folder, step, Checkpoint(arrays, {"done": step}, "train: {}\n", {"reward": "r"}), keep)
-
-
-def name(step: int) -> str:
-    return f"step-{step:09}.safetensors"
-
-
-def newest(folder: Path) -> tuple[Checkpoint | None, list[str]]:
-    said: list[str] = []
-    return states.newest(folder, lambda checkpoint: None, said.append), said
+from tests.support.checkpoints import ARRAYS, file_name, newest, saved
+from tests.support.processes import PATIENCE_S
 
 
 def flip(file: Path, bit: int) -> None:
@@ -61,7 +42,7 @@ def test_the_newest_are_kept_and_what_an_interrupted_one_left_is_removed(tmp_pat
     (tmp_path / "step-000000003.safetensors.partial").touch()
     for step in (1, 2, 10):
         saved(tmp_path, step)
-    assert sorted(place.name for place in tmp_path.iterdir()) == [name(2), name(10)]
+    assert sorted(place.name for place in tmp_path.iterdir()) == [file_name(2), file_name(10)]
     found, _ = newest(tmp_path)
     assert found is not None and found.arrays[".step"] == 10
 
@@ -73,7 +54,7 @@ def test_without_checkpoints_there_is_none(tmp_path: Path) -> None:
 def test_no_flipped_bit_and_no_cut_file_is_loaded_and_the_one_before_is_used(tmp_path: Path) -> None:
     saved(tmp_path / "good", 1)
     saved(tmp_path / "good", 2)
-    whole = tmp_path / "good" / name(2)
+    whole = tmp_path / "good" / file_name(2)
     size = whole.stat().st_size
     bits = np.random.default_rng(0).integers(0, 8 * size, 100).tolist()
     for damage in [*range(0, 64, 7), *bits, "cut", "longer", "empty"]:
@@ -139,14 +120,14 @@ def test_a_disk_with_too_little_space_is_noticed_before_anything_is_written(
     monkeypatch.setattr("edqn_jax.runs.checkpoints.sealed.shutil.disk_usage", lambda folder: usage(5_000_000))
     with pytest.raises(ConfigError, match="has 5 MB of free space, and 10 MB are needed"):
         saved(tmp_path, 2)
-    assert [place.name for place in tmp_path.iterdir()] == [name(1)]
+    assert [place.name for place in tmp_path.iterdir()] == [file_name(1)]
 
 
 FULL = """
 import resource, sys
 from pathlib import Path
 from edqn_jax.errors import ConfigError
-from tests.runs.checkpoints.test_states import name, newest, saved
+from tests.support.checkpoints import file_name, newest, saved
 folder, failed = Path(sys.argv[1]), 0
 saved(folder, 1)
 most = max(file.stat().st_size for file in folder.rglob("*") if file.is_file())
@@ -161,8 +142,8 @@ for limit in range(0, most + 1, max(most // 12, 1)):
     found, said = newest(folder)
     assert found is not None and not said
     names = {place.name for place in folder.iterdir()}
-    assert names <= {name(1), name(2)}, names
-    assert name(1) in names
+    assert names <= {file_name(1), file_name(2)}, names
+    assert file_name(1) in names
 print(failed)
 """
 

@@ -21,7 +21,7 @@ from edqn_jax.sim.scene.scene import Spheres, UprightBoxes, UprightCylinders, st
 from edqn_jax.sim.sensors import events as event_laws
 from edqn_jax.sim.worlds import families
 from tests.oracles import camera_plain
-from tests.sim.drawn_scenes import GROUND, ball, box, every_kind, free_points, pillar, rotation_of, scene_of
+from tests.support.drawn_scenes import GROUND, ball, box, every_kind, free_points, pillar, rotation_of, scene_of
 
 WINDOW_S = 0.04
 

@@ -11,7 +11,7 @@ from edqn_jax.config import CameraConfig
 from edqn_jax.sim.camera import camera, columns
 from edqn_jax.sim.scene.scene import stack_scenes, take_scene
 from tests.oracles import camera_plain
-from tests.sim.drawn_scenes import GROUND, ball, box, free_points, pillar, rotation_of, scene_of
+from tests.support.drawn_scenes import GROUND, ball, box, free_points, pillar, rotation_of, scene_of
 
 CONFIG = CameraConfig(width=16, height=12)
 ROUNDING = 2e-6

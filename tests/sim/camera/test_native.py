@@ -19,7 +19,7 @@ from edqn_jax.sim.camera import camera, columns, native
 from edqn_jax.sim.camera.camera import LUMA_WEIGHTS
 from edqn_jax.sim.scene.scene import PARKED, Scene, stack_scenes, take_scene, with_drones
 from edqn_jax.sim.worlds import families
-from tests.sim.drawn_scenes import GROUND, ball, box, every_kind, pillar, rotation_of, scene_of
+from tests.support.drawn_scenes import GROUND, ball, box, every_kind, pillar, rotation_of, scene_of
 
 CONFIG = CameraConfig()
 ROUNDING = 1e-4

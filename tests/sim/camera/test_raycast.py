@@ -26,7 +26,7 @@ from edqn_jax.sim.scene.scene import (
 )
 from tests.oracles import camera_plain
 from tests.oracles.mujoco_depth import RayCaster
-from tests.sim.drawn_scenes import GROUND, every_kind, free_points, rotation_of, scene_of
+from tests.support.drawn_scenes import GROUND, every_kind, free_points, rotation_of, scene_of
 
 MOUNTS = ("level", "body")
 ALBEDO = np.full(3, 0.5)

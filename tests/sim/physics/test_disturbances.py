@@ -24,7 +24,7 @@ from edqn_jax.sim.scene.scene import build_scene, stack_scenes
 from edqn_jax.sim.task import env
 from edqn_jax.sim.task.missions import Missions
 from tests.oracles import drone_mujoco
-from tests.sim.drawn_scenes import GROUND
+from tests.support.drawn_scenes import GROUND
 
 MAX_THRUST = 13.0
 ENGINES = ("mjx", "rigid_body")

@@ -25,8 +25,8 @@ from edqn_jax.sim.sensors import built_in, exposure, sensor
 from edqn_jax.sim.sensors.exposure import FrameMemory
 from edqn_jax.sim.task import env
 from edqn_jax.sim.task.missions import own_missions
-from tests.miniature import WORLD
 from tests.oracles import exposure_plain
+from tests.support.miniature import WORLD
 
 few = settings(max_examples=20, deadline=None, derandomize=True)
 REAL = ExposureConfig(real=True)

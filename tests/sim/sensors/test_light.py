@@ -23,8 +23,8 @@ from edqn_jax.sim.sensors import light, photoreceptor
 from edqn_jax.sim.task import env
 from edqn_jax.sim.task.missions import own_missions
 from edqn_jax.sim.task.observation import MOTION_SIZE, OWN_SIZE, Observation
-from tests.miniature import WORLD
-from tests.sim.sensors.test_events import PAPER, host, memory_of, random_frames, run
+from tests.support.event_frames import PAPER, host, memory_of, random_frames, run
+from tests.support.miniature import WORLD
 
 LIT = Config(
     camera=CameraConfig(width=16, height=12),

@@ -21,7 +21,7 @@ from edqn_jax.sim.sensors import sensor
 from edqn_jax.sim.sensors.events import EventField, event_image, random_field
 from edqn_jax.sim.sensors.sensor import EVENT_FIELD, Image, Sensor
 from edqn_jax.sim.task.observation import MIRRORED_MOTION
-from tests.registries import keep_as_they_are
+from tests.support.registries import keep_as_they_are
 
 H, W = 6, 8
 

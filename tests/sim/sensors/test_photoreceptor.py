@@ -22,9 +22,8 @@ from edqn_jax.sim.sensors import events as ev
 from edqn_jax.sim.sensors import photoreceptor, sensor
 from edqn_jax.sim.task import env
 from edqn_jax.sim.task.missions import own_missions
-from tests.miniature import WORLD
 from tests.oracles import photoreceptor_plain
-from tests.sim.sensors.test_events import (
+from tests.support.event_frames import (
     AIRSIM,
     ESIM,
     PAPER,
@@ -36,6 +35,7 @@ from tests.sim.sensors.test_events import (
     random_frames,
     run,
 )
+from tests.support.miniature import WORLD
 
 SLOW = {"bandwidth_hz": 30.0}
 few = settings(max_examples=12, deadline=None, derandomize=True)

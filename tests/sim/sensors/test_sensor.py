@@ -29,11 +29,11 @@ from edqn_jax.sim.task import env
 from edqn_jax.sim.task.action_sets import velocity_command
 from edqn_jax.sim.task.missions import own_missions
 from edqn_jax.sim.task.observation import MOTION_SIZE, OWN_SIZE, Observation
-from tests.miniature import WORLD
 from tests.oracles import camera_plain
 from tests.oracles.mujoco_depth import RayCaster
-from tests.sim.drawn_scenes import every_kind, free_points, rotation_of, scene_of
-from tests.whole.test_trainer import CONFIG as MINIATURE
+from tests.support.configs import TINY
+from tests.support.drawn_scenes import every_kind, free_points, rotation_of, scene_of
+from tests.support.miniature import WORLD
 
 CAMERA = CameraConfig(width=16, height=12)
 STAY = 13
@@ -311,9 +311,9 @@ def with_new_sensor(request, monkeypatch) -> Config:
     """A miniature that trains with a sensor that only the table knows."""
     monkeypatch.setitem(SENSORS._entries, request.param, NEW[request.param])
     return dataclasses.replace(
-        MINIATURE,
-        env=dataclasses.replace(MINIATURE.env, sensor=request.param),
-        drone=dataclasses.replace(MINIATURE.drone, physics="rigid_body"),  # compiles faster
+        TINY,
+        env=dataclasses.replace(TINY.env, sensor=request.param),
+        drone=dataclasses.replace(TINY.drone, physics="rigid_body"),  # compiles faster
     )
 
 

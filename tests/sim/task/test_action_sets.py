@@ -21,8 +21,8 @@ from edqn_jax.sim.task import env
 from edqn_jax.sim.task.action_sets import BODY_RATES, MOVES, VELOCITY, ActionSet, action_of, action_set, admitted
 from edqn_jax.sim.task.outcomes import Outcome
 from edqn_jax.sim.task.task import task_of
-from tests.miniature import miniature_world
 from tests.oracles import drone_mujoco
+from tests.support.miniature import miniature_world
 
 
 def configured(actions: str, **options: object) -> Config:

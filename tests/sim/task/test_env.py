@@ -28,8 +28,8 @@ from edqn_jax.sim.task.observation import MOST_YAW_RATE, MOTION_SIZE, OWN_SIZE, 
 from edqn_jax.sim.task.outcomes import Outcome, Verdict, judge
 from edqn_jax.sim.task.reward import configured_reward
 from edqn_jax.sim.worlds import geodesic
-from tests.planning.small_worlds import box, small_world
-from tests.sim.drawn_scenes import GROUND, rotation_of
+from tests.support.drawn_scenes import GROUND, rotation_of
+from tests.support.small_worlds import box, small_world
 
 CONFIG = Config(env=EnvConfig(reward="sparse", step_reward=-0.25, left_volume_reward=-70.0))
 GREY = np.full(3, 0.5)

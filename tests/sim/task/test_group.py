@@ -29,7 +29,7 @@ from edqn_jax.sim.task.environment import make
 from edqn_jax.sim.task.missions import Missions
 from edqn_jax.sim.task.outcomes import Outcome
 from tests.oracles.group_plain import walked
-from tests.sim.drawn_scenes import GROUND
+from tests.support.drawn_scenes import GROUND
 
 VOLUME = np.array([[0.0, 0.0, 0.0], [60.0, 40.0, 20.0]])
 AHEAD, HOVER, UP = (int(move_number(name)) for name in ("ahead", "hover", "up"))

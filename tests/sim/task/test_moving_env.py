@@ -29,7 +29,7 @@ from edqn_jax.sim.task.env import World
 from edqn_jax.sim.task.environment import Environment
 from edqn_jax.sim.task.missions import own_missions
 from edqn_jax.sim.task.outcomes import Outcome
-from tests.sim.drawn_scenes import GROUND
+from tests.support.drawn_scenes import GROUND
 
 CONFIG = make_config(
     "medium",

@@ -22,7 +22,7 @@ from edqn_jax.sim.task.missions import own_missions, random_missions, spread_mis
 from edqn_jax.sim.worlds import canyon, discs, families, forest, rooms
 from edqn_jax.sim.worlds.families import SPLITS, families_of, random_pool, random_scene, world_key, world_keys
 from edqn_jax.sim.worlds.free_points import CLEARANCE, FAR
-from tests.registries import keep_as_they_are
+from tests.support.registries import keep_as_they_are
 
 RADIUS = 0.36
 WORLDS = 24

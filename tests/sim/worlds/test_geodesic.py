@@ -17,7 +17,7 @@ from edqn_jax.sim.scene.scene import Scene, stack_scenes, take_scene
 from edqn_jax.sim.worlds import geodesic
 from edqn_jax.sim.worlds.families import random_pool, world_keys
 from tests.oracles import geodesic_plain
-from tests.planning.small_worlds import RADIUS, WITHOUT_A_WAY, box, random_small_world, small_world
+from tests.support.small_worlds import RADIUS, WITHOUT_A_WAY, box, random_small_world, small_world
 
 left = jax.jit(geodesic.remaining)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 
 from edqn_jax.config import Config
-from tests.miniature import WORLD
+from tests.support.miniature import WORLD
 
 
 def tiny_trial(config: Config) -> Config:

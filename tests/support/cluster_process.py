@@ -1,6 +1,6 @@
 """`edqn train` as one of several processes that train together, or alone, and a note of what became of it.
 
-    python -m tests.whole.cluster_process NOTE.json DEVICES [--no-learning] [arguments of edqn train]
+    python -m tests.support.cluster_process NOTE.json DEVICES [--no-learning] [arguments of edqn train]
 
 The process has DEVICES CPU devices. Its note holds the shards that it held and what `train_run` returned. To spare
 compiling, its camera sees waves that follow the pose, and it draws no pictures. `--no-learning` puts a state and
@@ -34,7 +34,7 @@ from edqn_jax.runs import record
 from edqn_jax.runs.directory import plain
 from edqn_jax.sim.camera import camera
 from edqn_jax.sim.scene.scene import Scene
-from tests.miniature import no_losses
+from tests.support.miniature import no_losses
 
 
 def waves(config: CameraConfig, scene: Scene, position: Array, rotation: Array) -> Array:

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from edqn_jax.sim.scene.distance import signed_distance
 from edqn_jax.sim.scene.scene import (
+    PARKED,
     Capsules,
     Planes,
     Scene,
@@ -82,3 +83,25 @@ def pillar(x, y, z, radius, half_height):
 
 def ball(x, y, z, radius):
     return Spheres(position=[x, y, z], radius=radius, albedo=BROWN)
+
+
+def one_of_each_kind() -> Scene:
+    """One shape of every kind, and a parked one of each."""
+
+    def points(*point: float) -> jax.Array:
+        return jnp.array([point, [PARKED] * 3])
+
+    grey, ones, long = jnp.full((2, 3), 0.5), jnp.ones(2), jnp.full(2, 4.0)
+    leaning = jnp.array([[0.6, 0.0, 0.8]] * 2)
+    return Scene(
+        boxes=UprightBoxes(points(30, 30, 5), jnp.array([[4.0, 6, 5], [0, 0, 0]]), jnp.array([0.3, 0]), grey),
+        cylinders=UprightCylinders(points(60, 20, 6), 3 * ones, 6 * ones, grey),
+        spheres=Spheres(points(50, 55, 9), 4 * ones, jnp.array([[0.9, 0.8, 0.1]] * 2)),
+        tilted_boxes=TiltedBoxes(points(80, 40, 9), jnp.ones((2, 3)), jnp.stack([jnp.eye(3)] * 2), grey),
+        capsules=Capsules(points(20, 70, 8), leaning, long, ones, grey),
+        tilted_cylinders=TiltedCylinders(points(70, 75, 8), leaning, long, ones, grey),
+        planes=Planes(jnp.zeros((1, 3)), jnp.array([[0, 0, 1.0]]), grey[:1]),
+        volume=jnp.array([[0.0, 0, 0], [110, 110, 25]]),
+        start=jnp.array([1.0, 1, 3]),
+        goal=jnp.array([90.0, 90, 10]),
+    )

@@ -10,7 +10,8 @@ import numpy as np
 
 import edqn_jax
 from edqn_jax.config import Config
-from edqn_jax.learn.policy import Policy
+from edqn_jax.config.loading import make_config
+from edqn_jax.learn.policy import Policy, fresh_policy
 from edqn_jax.sim.actions import ACTIONS
 from edqn_jax.sim.physics import drone
 from edqn_jax.sim.sensors import events
@@ -72,3 +73,9 @@ def _field(config: Config, sensed: Any) -> EventField:
         return sensed
     image = np.rint(np.sign(sensed) * np.expm1(np.abs(sensed)))
     return event_fields.field_of_counts(config.events, jax.numpy.asarray(image.reshape(config.camera.height, -1)))
+
+
+def untrained(**groups: Any) -> Policy:
+    """A policy that has learnt nothing."""
+    config = make_config("medium", drone={"physics": "rigid_body"}, camera={"width": 16, "height": 12}, **groups)
+    return Policy(config, fresh_policy(config))

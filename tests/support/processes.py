@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-ROOT = Path(__file__).parents[1]
+ROOT = Path(__file__).parents[2]
 
 WORLD = """<mujoco><worldbody>
   <site name="start" pos="2 2 3"/><site name="goal" pos="20 10 6"/>
@@ -50,7 +50,7 @@ def by_srun(port: int, number: int) -> tuple[list[str], dict[str, str]]:
 
 @contextmanager
 def two_processes(folder: Path, argv: list[str], launcher: Launcher = by_hand) -> Iterator[list[Process]]:
-    """`tests/whole/cluster_process.py` twice, in `folder`, a device each; neither outlives the block.
+    """`tests/support/cluster_process.py` twice, in `folder`, a device each; neither outlives the block.
 
     Their notes are `note-0.json` and `note-1.json`.
     """
@@ -69,7 +69,7 @@ def two_processes(folder: Path, argv: list[str], launcher: Launcher = by_hand) -
 
 @contextmanager
 def one_process(folder: Path, argv: list[str]) -> Iterator[Process]:
-    """`tests/whole/cluster_process.py` alone, in `folder`, with two devices; its note is `note.json`."""
+    """`tests/support/cluster_process.py` alone, in `folder`, with two devices; its note is `note.json`."""
     process = _start(folder, ["note.json", "2", *argv], {})
     try:
         yield process
@@ -86,7 +86,7 @@ def to_the_end(*processes: Process) -> list[tuple[int, str]]:
 def _start(folder: Path, argv: list[str], variables: dict[str, str]) -> Process:
     alone = {name: value for name, value in os.environ.items() if not name.startswith(LAUNCHERS)}
     return subprocess.Popen(
-        [sys.executable, "-m", "tests.whole.cluster_process", *argv],
+        [sys.executable, "-m", "tests.support.cluster_process", *argv],
         cwd=folder,
         env={**alone, "PYTHONPATH": str(ROOT), **variables},
         stdout=subprocess.PIPE,

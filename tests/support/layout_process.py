@@ -1,6 +1,6 @@
 """The same training on 1 and 8 simulated devices, and notes of what came of it.
 
-    python -m tests.whole.layout_process FOLDER
+    python -m tests.support.layout_process FOLDER
 
 On each number of devices: decisions without learning, epsilon-greedily with the fresh network and encoder, then one
 update of the DQN, and from the same moment one of the VAE. `FOLDER/N.npz` holds what N devices came to, by names:
@@ -22,7 +22,7 @@ from edqn_jax.devices.devices import use_cpu_devices
 from edqn_jax.learn.plan import Plan
 from edqn_jax.learn.trainer import Trainer
 from edqn_jax.sim.task.env import World
-from tests.miniature import miniature_world
+from tests.support.miniature import miniature_world
 
 DEVICES = (1, 8)
 
