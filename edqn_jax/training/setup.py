@@ -14,7 +14,7 @@ import numpy as np
 from jax.sharding import Mesh
 
 from edqn_jax.config import Config
-from edqn_jax.config.limits import check_learns, validate
+from edqn_jax.config.rules import check_learns, validate
 from edqn_jax.devices import processes
 from edqn_jax.devices.devices import choose_devices
 from edqn_jax.devices.forks import check_not_forked

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from edqn_jax.config import SENSORS, Config
-from edqn_jax.config.limits import validate
 from edqn_jax.config.loading import make_config
+from edqn_jax.config.rules import validate
 from edqn_jax.errors import ConfigError
 from edqn_jax.interop import functional
 from edqn_jax.learn.perception import embedding, vae
