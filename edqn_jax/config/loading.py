@@ -8,11 +8,9 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import difflib
 import re
-import types
 import typing
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal
 
@@ -25,7 +23,7 @@ from edqn_jax.config.presets import preset as named_preset
 from edqn_jax.config.profiles import PROFILES
 from edqn_jax.config.retired import LAST_COMMIT, RETIRED, is_off
 from edqn_jax.config.rules import validate
-from edqn_jax.errors import ConfigError
+from edqn_jax.errors import ConfigError, nearest
 
 MOST_BYTES = 1_000_000
 """Of a file of options that is worth reading."""
@@ -241,13 +239,6 @@ def to_yaml(config: Config) -> str:
     return yaml.safe_dump(plain, sort_keys=False, default_flow_style=None, width=100)
 
 
-def nearest(word: object, known: Iterable[str]) -> str:
-    """Returns `; did you mean '...'?` with the closest known word, else a list of the known words."""
-    known = list(known)
-    close = difflib.get_close_matches(str(word), known, n=1, cutoff=0.5)
-    return f"; did you mean '{close[0]}'?" if close else f"; known are {', '.join(known)}"
-
-
 class _StrictLoader(yaml.SafeLoader):
     """YAML in which a repeated key is an error and 1e-3 is a number."""
 
@@ -296,7 +287,7 @@ def _wanted(hint: Any) -> str:
 def _describe(value: Any) -> str:
     if isinstance(value, bool):
         return "true" if value else "false"
-    if value is None or isinstance(value, types.NoneType):
+    if value is None:
         return "nothing"
     if isinstance(value, Mapping):
         return "a group of keys"

@@ -6,15 +6,14 @@ before JAX is imported.
 
 from __future__ import annotations
 
-import difflib
 import importlib
 import itertools
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-from edqn_jax.errors import ConfigError
+from edqn_jax.errors import ConfigError, nearest
 
-FIRST = "your own, registered first (on the command line by --import)"
+OWN = "one that --import registers"
 """What else a name may be."""
 
 
@@ -83,10 +82,7 @@ class Registry:
             ConfigError: with the nearest name, or all of them.
         """
         if name not in self._entries:
-            near = difflib.get_close_matches(name, self._entries, n=1)
-            known = f"did you mean '{near[0]}'" if near else f"it must be one of {', '.join(self)}"
-            end = "?" if near else ""
-            raise ConfigError(f"{self.option}: there is no {self.kind} '{name}'; {known}, or {FIRST}{end}")
+            raise ConfigError(f"{self.option}: there is no {self.kind} '{name}'{nearest(name, self, f', or {OWN}')}")
 
     def get(self, name: str) -> Any:
         """Returns the entry of that name.

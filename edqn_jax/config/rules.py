@@ -7,7 +7,7 @@ from collections.abc import Iterator
 
 from edqn_jax.config.limits import between, check_limits, require
 from edqn_jax.config.options import Config
-from edqn_jax.config.registry import ACTION_SETS, FAMILIES, FIRST, LEARNERS, NETWORKS, SENSORS
+from edqn_jax.config.registry import ACTION_SETS, FAMILIES, LEARNERS, NETWORKS, OWN, SENSORS
 from edqn_jax.errors import ConfigError
 
 Rules = Iterator[tuple[bool, str, str]]
@@ -70,7 +70,7 @@ def _check_world(config: Config, trains: bool) -> None:
         )
     if world.flown:
         raise ConfigError(
-            f"world.flown is for random worlds ({families}, or {FIRST}) alone, '{world.name}' is flown itself: give "
+            f"world.flown is for random worlds ({families}, or {OWN}) alone, '{world.name}' is flown itself: give "
             "--world.flown '', or flown: '' in a file"
         )
     if trains and config.env.drones > 1:
@@ -79,7 +79,7 @@ def _check_world(config: Config, trains: bool) -> None:
         )
     if config.agent.turn:
         raise ConfigError(
-            f"agent.turn needs a random world ({families}, or {FIRST}), not '{world.name}': give --agent.no-turn, or "
+            f"agent.turn needs a random world ({families}, or {OWN}), not '{world.name}': give --agent.no-turn, or "
             "turn: false in a file"
         )
 

@@ -292,7 +292,7 @@ def test_no_numeric_option_can_be_nonsense(group, option, nonsense):
         (
             "world",
             {"flown": "my.xml"},
-            r"world.flown is for random worlds \(.*registered first.*\) alone, 'paper' is flown itself: give",
+            r"world.flown is for random worlds \(.*or one that --import registers\) alone, 'paper' is flown itself",
         ),
         (
             "world",
