@@ -23,9 +23,8 @@ from edqn_jax.config.limits import (
 class EncoderConfig:
     """The event VAE (section 3.2), or the VAE of another sensor's pictures, and when it learns."""
 
-    architecture: Literal["patches", "pooled"] = "patches"
-    """`patches`: events are counted per pixel, pixels are read in patches together with the own motion, patches are
-    joined. `pooled`: the paper's sum over all events, without the own motion."""
+    architecture: str = "patches"
+    """How the encoder reads what the sensor shows."""
     target: Literal["nearness", "sensed", "both"] = "nearness"
     """What the decoder draws. `nearness`: how near things are, a label of the simulator that only training needs;
     `sensed`: what the sensor shows, as in the paper; `both`."""

@@ -115,6 +115,24 @@ NETWORKS = Registry(
 """Q-networks: a flax module, made of `AgentConfig` and the number of moves, that maps stacked observations
 [..., history x observation] to a value of each move [..., moves]."""
 
+_ENCODERS = "edqn_jax.learn.perception"
+
+ENCODERS = Registry(
+    "encoder",
+    "encoder.architecture",
+    {
+        "patches": f"{_ENCODERS}.patch_encoder:PatchEncoder",
+        "pooled": f"{_ENCODERS}.pooled_encoder:PooledEncoder",
+    },
+    {
+        "patches": "events are counted per pixel, pixels are read in patches together with the own motion, patches are "
+        "joined",
+        "pooled": "the paper's sum over all events, without the own motion",
+    },
+)
+"""Encoders of the VAE: a flax module, made of `EncoderConfig` and of the image's height and width, that maps events or
+pictures and the own motion to mean and log-variance of the code, each [..., code_size]."""
+
 _SENSORS = "edqn_jax.sim.sensors.built_in"
 
 SENSORS = Registry(
