@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from edqn_jax.xla_flags import disable_ynn_fusions
 
 if TYPE_CHECKING:
-    from edqn_jax.config import FAMILIES, LEARNERS, NETWORKS, SENSORS, Config
+    from edqn_jax.config import ENCODERS, FAMILIES, LEARNERS, NETWORKS, SENSORS, Config
     from edqn_jax.config.loading import make_config
     from edqn_jax.devices.devices import use_cpu_devices
     from edqn_jax.errors import ConfigError, DivergedError, StoppedError
@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from edqn_jax.training.loop import Chunk, TrainingResult, train, train_seeds
 
 _MODULES = {
+    "ENCODERS": "config",
     "FAMILIES": "config",
     "LEARNERS": "config",
     "NETWORKS": "config",
@@ -71,6 +72,7 @@ _MODULES = {
 """The module of each public name."""
 
 __all__ = [
+    "ENCODERS",
     "FAMILIES",
     "LEARNERS",
     "NETWORKS",

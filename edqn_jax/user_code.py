@@ -33,11 +33,13 @@ def load_module(name: str) -> ModuleType:
     try:
         return importlib.import_module(name) if file is None else _module_of(file)
     except (Exception, SystemExit) as error:
-        if file is None and isinstance(error, ModuleNotFoundError) and name.startswith(error.name or " "):
+        missing = error.name if isinstance(error, ModuleNotFoundError) else None
+        if file is None and missing and f"{name}.".startswith(f"{missing}."):
             raise ConfigError(f"there is no module '{name}'; give a file that ends in .py, or a module") from None
         lines = [each.lineno for each in traceback.extract_tb(error.__traceback__) if each.filename == str(file)]
         at = f", line {lines[-1]}" if lines and not isinstance(error, SyntaxError) else ""
-        raise ConfigError(f"'{name}' does not load: {type(error).__name__}: {error}{at}"[:300]) from error
+        said = str(error) if isinstance(error, ConfigError) else f"{type(error).__name__}: {error}"
+        raise ConfigError(f"'{name}' does not load: {said}{at}"[:300]) from error
 
 
 def _module_of(file: Path) -> ModuleType:

@@ -60,3 +60,13 @@ def test_what_does_not_load_is_named_with_the_users_line(text: str, says: str, t
     for _ in range(2):  # the second time, too
         with pytest.raises(ConfigError, match=says):
             load_module(file)
+
+
+def test_a_module_that_is_there_and_misses_another_is_not_said_to_be_missing(tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    written(tmp_path / "no_such_thing_of_mine.py", "import no_such")
+    with pytest.raises(ConfigError, match="'no_such_thing_of_mine' does not load: .* No module named 'no_such'"):
+        load_module("no_such_thing_of_mine")
+    for name in ("no_such", "no_such.part", "json.no_such"):
+        with pytest.raises(ConfigError, match=f"there is no module '{name}'"):
+            load_module(name)

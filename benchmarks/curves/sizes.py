@@ -9,8 +9,8 @@ from typing import Any
 
 from curves.boxes import world_of_boxes
 from edqn_jax.config import Config
-from edqn_jax.config.limits import validate
 from edqn_jax.config.loading import Layer, apply
+from edqn_jax.config.rules import validate
 from edqn_jax.sim.scene.mjcf import write_scene
 
 BOXES = (8, 16, 30, 60, 120)

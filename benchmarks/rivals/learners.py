@@ -11,8 +11,8 @@ import jax
 import numpy as np
 
 from edqn_jax.config import Config
-from edqn_jax.config.limits import validate
 from edqn_jax.config.loading import apply
+from edqn_jax.config.rules import validate
 from edqn_jax.devices.devices import choose_devices
 from edqn_jax.errors import DivergedError
 from edqn_jax.evaluation.latency import decision_seconds

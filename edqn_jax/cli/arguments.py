@@ -31,8 +31,9 @@ from edqn_jax.cli.help import (
     with_conditions,
 )
 from edqn_jax.config import CONDITIONS, FAMILIES, Config
-from edqn_jax.config.limits import check_learns, validate
-from edqn_jax.config.loading import Layer, apply, resolve
+from edqn_jax.config.loading import apply, resolve
+from edqn_jax.config.presets import Layer
+from edqn_jax.config.rules import check_learns, validate
 from edqn_jax.devices.hardware import hardware
 from edqn_jax.devices.launch import Distributed
 from edqn_jax.errors import ConfigError

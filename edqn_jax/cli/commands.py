@@ -32,8 +32,7 @@ from edqn_jax.cli.help import ABOUT
 from edqn_jax.cli.signals import Stops
 from edqn_jax.cli.train import train_command
 from edqn_jax.cli.variables import check_devices, start_jax
-from edqn_jax.config.loading import nearest
-from edqn_jax.errors import CheckError, ConfigError, DivergedError, StoppedError, sentence
+from edqn_jax.errors import CheckError, ConfigError, DivergedError, StoppedError, nearest, sentence
 from edqn_jax.extras import MissingPackageError
 from edqn_jax.user_code import load_module
 from edqn_jax.version import package_version

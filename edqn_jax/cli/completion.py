@@ -12,8 +12,8 @@ import tyro
 
 from edqn_jax.cli.arguments import SHORT_NAMES, EvaluateArgs, RecordArgs, TrainOptions
 from edqn_jax.cli.help import REGISTERED, all_of_train, described, with_conditions
+from edqn_jax.config import CONDITIONS
 from edqn_jax.config.loading import make_config
-from edqn_jax.config.options import CONDITIONS
 
 FILES_TOO = {
     "bash": {

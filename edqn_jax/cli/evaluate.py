@@ -11,7 +11,7 @@ from rich.console import Console
 from rich.table import Table
 
 from edqn_jax.cli.arguments import EvaluateArgs
-from edqn_jax.config.loading import Layer
+from edqn_jax.config.presets import Layer
 from edqn_jax.errors import ConfigError
 from edqn_jax.evaluation.evaluate import evaluate
 from edqn_jax.evaluation.latency import decision_latency_ms

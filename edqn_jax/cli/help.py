@@ -13,7 +13,7 @@ import docstring_parser
 import tyro
 
 from edqn_jax.config import Config
-from edqn_jax.config.registry import FAMILIES, LEARNERS, NETWORKS, SENSORS, Registry
+from edqn_jax.config.registry import ENCODERS, FAMILIES, LEARNERS, NETWORKS, SENSORS, Registry
 
 TRAIN, EVALUATE, RECORD, REPORT = "edqn train", "edqn evaluate", "edqn record", "edqn report"
 VERIFY, EXPORT, EVENTS, COMPLETION = "edqn verify", "edqn export", "edqn events", "edqn completion"
@@ -108,7 +108,7 @@ COMMON = {
 """Options that `edqn train --help` shows, with what it says of them; `--help-all` has their whole texts."""
 
 REGISTERED: dict[str, Registry] = {
-    **{registry.option: registry for registry in (SENSORS, LEARNERS, NETWORKS, FAMILIES)},
+    **{registry.option: registry for registry in (SENSORS, ENCODERS, LEARNERS, NETWORKS, FAMILIES)},
     "world": FAMILIES,
 }
 """What an option names, by the option; of `world` and `world.name` also files."""
@@ -135,7 +135,7 @@ def show_train_help(options: Any, config: Config, short_names: Mapping[str, str]
         owner = getattr(config, group) if group else options
         flag = flag_of(name)
         kind = typing.get_type_hints(type(owner), include_extras=True)[option]
-        metavar = METAVARS.get(name, METAVARS.get(kind))
+        metavar = METAVARS.get(name, METAVARS.get(_bare(kind)))
         if typing.get_origin(kind) is typing.Literal:
             metavar, text = "WHICH", f"{text}: {', '.join(typing.get_args(kind))}"
         elif name in REGISTERED:
@@ -230,6 +230,11 @@ def described(
         hint = (kinds or {}).get(name, hints[option.name])
         fields.append((option.name, Annotated[hint, said], dataclasses.field(default=default)))
     return dataclasses.make_dataclass(kind.__name__, fields, namespace={"__doc__": kind.__doc__})
+
+
+def _bare(kind: Any) -> Any:
+    """Returns a type without its limits."""
+    return typing.get_args(kind)[0] if typing.get_origin(kind) is Annotated else kind
 
 
 def _nested(name: str, kind: type, shown: str) -> tuple[str, Any, Any]:

@@ -17,7 +17,8 @@ from edqn_jax.cli.arguments import TrainOptions, parse_train
 from edqn_jax.cli.signals import Stops
 from edqn_jax.cli.variables import check_devices, platforms_named, start_jax
 from edqn_jax.config import FAMILIES, Config
-from edqn_jax.config.loading import gpu_layers, to_yaml
+from edqn_jax.config.loading import to_yaml
+from edqn_jax.config.presets import gpu_layers
 from edqn_jax.devices.launch import how_to_join
 from edqn_jax.errors import ConfigError
 from edqn_jax.extras import SINKS

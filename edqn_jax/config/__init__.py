@@ -1,28 +1,26 @@
 """Every option, its default and its limits, and how a configuration is loaded."""
 
-from edqn_jax.config.options import (
-    CONDITIONS,
-    AgentConfig,
+from edqn_jax.config.learning import AgentConfig, EncoderConfig, TrainConfig
+from edqn_jax.config.options import CONDITIONS, Config
+from edqn_jax.config.presets import PRESETS, preset
+from edqn_jax.config.registry import ENCODERS, FAMILIES, LEARNERS, MIXTURES, NETWORKS, SENSORS
+from edqn_jax.config.simulation import (
     AirConfig,
     BodyConfig,
     CameraConfig,
-    Config,
     DroneConfig,
-    EncoderConfig,
     EnvConfig,
     EventsConfig,
     ExposureConfig,
     LightConfig,
     MotorsConfig,
     NoiseConfig,
-    TrainConfig,
     WorldConfig,
 )
-from edqn_jax.config.presets import PRESETS, preset
-from edqn_jax.config.registry import FAMILIES, LEARNERS, MIXTURES, NETWORKS, SENSORS
 
 __all__ = [
     "CONDITIONS",
+    "ENCODERS",
     "FAMILIES",
     "LEARNERS",
     "MIXTURES",

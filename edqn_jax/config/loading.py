@@ -8,158 +8,28 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import difflib
 import re
-import types
 import typing
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, Literal
 
 import yaml
 
-from edqn_jax.config.limits import shown, validate
+from edqn_jax.config.limits import shown
 from edqn_jax.config.options import CONDITIONS, Config
+from edqn_jax.config.presets import WORLD, Hardware, Layer, world_layers
 from edqn_jax.config.presets import preset as named_preset
 from edqn_jax.config.profiles import PROFILES
-from edqn_jax.config.registry import FAMILIES, has_detours
 from edqn_jax.config.retired import LAST_COMMIT, RETIRED, is_off
-from edqn_jax.errors import ConfigError
-
-Layer = Mapping[str, Mapping[str, Any]]
-
-Hardware = Literal["cpu", "gpu"]
-"""What defaults are chosen for."""
+from edqn_jax.config.rules import validate
+from edqn_jax.errors import ConfigError, nearest
 
 MOST_BYTES = 1_000_000
 """Of a file of options that is worth reading."""
 
 MOST_SHOWN = 80
 """Characters of a word that a message repeats."""
-
-WORLD = "medium"
-"""World of the `default` preset where nothing names one."""
-
-PAPERS_WORLD = "paper"
-"""The paper's map, in which the options of `Config` were found."""
-
-RANDOM_WORLDS: Layer = {
-    "world": {"flown": "paper", "pool_size": 4096, "missions": 32_768},
-    "train": {"total_steps": 1_500_000, "validation_every": 1_500_000, "validation_missions": 1024},
-    "encoder": {
-        "warmup_decisions": 65_536,
-        "replay_size": 65_536,
-        "retrain_at": (0.15,),
-        "retrain_decisions": 65_536,
-    },
-    "agent": {"updates_per_step": 4, "turn": True},
-    "events": {"threshold": 0.03, "tolerance": 0.03, "frame_times_s": (-0.08, 0.0)},
-}
-"""What random worlds change in the `default` preset: more decisions in more worlds, fewer updates for each, a longer
-window of events with lower thresholds, and an encoder that learns from more, and again from flights of the policy,
-since there only events tell where obstacles are. No direction is preferred, so what is replayed is turned. The last
-flight is through the paper's map, which training never uses (docs/ablation.md)."""
-
-CLOSED_WORLDS: Layer = {
-    "env": {"reward": "geodesic", "progress_weight": 6.0, "path_weight": 2.0, "potential_discount": 0.98},
-    "agent": {"discount": 0.98, "n_step": 5},
-}
-"""What rooms, forests and canyons change further: metres count along the way around obstacles, and more than the metres
-flown, since a drone that is paid for the straight line alone hovers where it ends (docs/results.md)."""
-
-DRAWN_WORLDS: Layer = {
-    "env": {
-        "reward": "geodesic",
-        "progress_weight": 6.0,
-        "path_weight": 2.0,
-        "collision_reward": -60.0,
-        "left_volume_reward": -60.0,
-    },
-    "train": {"total_steps": 3_000_000, "validation_every": 196_608},
-}
-"""What a user's own MJCF file changes: the reward counts metres along the way, since behind walls the straight line
-leads into a corner, and collisions cost less, since where ways are narrow training otherwise ends in hovering
-(docs/decisions/0019-metres-along-the-way.md)."""
-
-GPU: Layer = {
-    "world": {"pool_size": 16_384, "missions": 131_072},
-    "train": {
-        "num_envs": 16_384,
-        "chunk_steps": 16,
-        "total_steps": 60_000_000,
-        "validation_every": 2_097_152,
-        "validation_missions": 512,
-    },
-    "env": {"collision_reward": -300.0, "left_volume_reward": -300.0},
-    "encoder": {
-        "code_size": 64,
-        "patch_layers": (64, 16),
-        "joint_layers": (256, 128),
-        "warmup_decisions": 2_097_152,
-        "warmup_updates_per_step": 24,
-        "batch_size": 4096,
-        "replay_size": 524_288,
-        "retrain_at": (0.2, 0.5),
-        "retrain_decisions": 2_097_152,
-    },
-    "agent": {
-        "hidden": (256, 256),
-        "batch_size": 4096,
-        "updates_per_step": 8,
-        "replay_size": 1_048_576,
-        "exploration_end": 0.005,
-    },
-}
-"""What a GPU changes further for random worlds: as many environments as fill it, larger networks and updates, a larger
-pool of worlds, since a small one is learnt by heart, and collisions that cost more, which takes more decisions to learn
-(docs/ablation.md)."""
-
-
-GPU_CLOSED: Layer = {"agent": {"hidden": (512, 512)}}
-"""What a GPU changes further for rooms, forests and canyons."""
-
-GPU_MIXED: Layer = {"agent": {"hidden": (1024, 1024, 1024), "layer_norm": True, "replay_size": 2_097_152}}
-"""What a GPU changes further for one policy of all six families: a larger, normalised Q-network and a larger replay
-(docs/decisions/0022-one-policy-for-six-families.md)."""
-
-GPU_FROM_FILE: Layer = {
-    "train": {"num_envs": 2048, "chunk_steps": 32, "total_steps": 6_000_000, "validation_every": 2_000_000},
-    "encoder": {
-        "warmup_decisions": 131_072,
-        "warmup_updates_per_step": 12,
-        "batch_size": 1024,
-        "replay_size": 131_072,
-    },
-    "agent": {
-        "hidden": (256, 256),
-        "batch_size": 1024,
-        "replay_size": 1_048_576,
-        "learning_starts": 65_536,
-        "random_decisions": 16_384,
-    },
-}
-"""What a GPU changes for a world from a file: more environments and larger batches
-(docs/decisions/0014-gpu-defaults-and-seeds.md)."""
-
-
-def world_layers(world: str, tuned_for: Hardware) -> list[Layer]:
-    """Returns what a world and the hardware change in the `default` preset; later ones replace earlier ones."""
-    if world == PAPERS_WORLD:
-        return gpu_layers(world, tuned_for)
-    if world not in FAMILIES:
-        return [DRAWN_WORLDS, *gpu_layers(world, tuned_for)]
-    return [RANDOM_WORLDS, *([CLOSED_WORLDS] if has_detours(world) else []), *gpu_layers(world, tuned_for)]
-
-
-def gpu_layers(world: str, tuned_for: Hardware | Literal["auto"]) -> list[Layer]:
-    """Returns what a GPU changes for a world."""
-    if tuned_for != "gpu":
-        return []
-    if world not in FAMILIES:
-        return [GPU_FROM_FILE]
-    if world == "mixed":
-        return [GPU, GPU_MIXED]
-    return [GPU, GPU_CLOSED] if has_detours(world) else [GPU]
 
 
 def resolve(
@@ -369,13 +239,6 @@ def to_yaml(config: Config) -> str:
     return yaml.safe_dump(plain, sort_keys=False, default_flow_style=None, width=100)
 
 
-def nearest(word: object, known: Iterable[str]) -> str:
-    """Returns `; did you mean '...'?` with the closest known word, else a list of the known words."""
-    known = list(known)
-    close = difflib.get_close_matches(str(word), known, n=1, cutoff=0.5)
-    return f"; did you mean '{close[0]}'?" if close else f"; known are {', '.join(known)}"
-
-
 class _StrictLoader(yaml.SafeLoader):
     """YAML in which a repeated key is an error and 1e-3 is a number."""
 
@@ -424,7 +287,7 @@ def _wanted(hint: Any) -> str:
 def _describe(value: Any) -> str:
     if isinstance(value, bool):
         return "true" if value else "false"
-    if value is None or isinstance(value, types.NoneType):
+    if value is None:
         return "nothing"
     if isinstance(value, Mapping):
         return "a group of keys"

@@ -6,15 +6,14 @@ before JAX is imported.
 
 from __future__ import annotations
 
-import difflib
 import importlib
 import itertools
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-from edqn_jax.errors import ConfigError
+from edqn_jax.errors import ConfigError, nearest
 
-FIRST = "your own, registered first (on the command line by --import)"
+OWN = "one that --import registers"
 """What else a name may be."""
 
 
@@ -83,10 +82,7 @@ class Registry:
             ConfigError: with the nearest name, or all of them.
         """
         if name not in self._entries:
-            near = difflib.get_close_matches(name, self._entries, n=1)
-            known = f"did you mean '{near[0]}'" if near else f"it must be one of {', '.join(self)}"
-            end = "?" if near else ""
-            raise ConfigError(f"{self.option}: there is no {self.kind} '{name}'; {known}, or {FIRST}{end}")
+            raise ConfigError(f"{self.option}: there is no {self.kind} '{name}'{nearest(name, self, f', or {OWN}')}")
 
     def get(self, name: str) -> Any:
         """Returns the entry of that name.
@@ -118,6 +114,24 @@ NETWORKS = Registry(
 )
 """Q-networks: a flax module, made of `AgentConfig` and the number of moves, that maps stacked observations
 [..., history x observation] to a value of each move [..., moves]."""
+
+_ENCODERS = "edqn_jax.learn.perception"
+
+ENCODERS = Registry(
+    "encoder",
+    "encoder.architecture",
+    {
+        "patches": f"{_ENCODERS}.patch_encoder:PatchEncoder",
+        "pooled": f"{_ENCODERS}.pooled_encoder:PooledEncoder",
+    },
+    {
+        "patches": "events are counted per pixel, pixels are read in patches together with the own motion, patches are "
+        "joined",
+        "pooled": "the paper's sum over all events, without the own motion",
+    },
+)
+"""Encoders of the VAE: a flax module, made of `EncoderConfig` and of the image's height and width, that maps events or
+pictures and the own motion to mean and log-variance of the code, each [..., code_size]."""
 
 _SENSORS = "edqn_jax.sim.sensors.built_in"
 

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from edqn_jax.config import Config
+from edqn_jax.config import ENCODERS, Config
 from edqn_jax.errors import CheckError, ConfigError
 from edqn_jax.extras import require
 from edqn_jax.files import check_can_write, write_atomically
@@ -129,6 +129,11 @@ def about_policy(config: Config) -> dict[str, Any]:
     if sensor not in ("events", "event-image"):
         raise ConfigError(f"only policies that see events can be exported; the sensor of this one is '{sensor}'")
     encoder = config.encoder
+    if sensor == "events" and encoder.architecture in ENCODERS.own:
+        raise ConfigError(
+            f"this policy's encoder '{encoder.architecture}' is not the package's own, and may read more of events "
+            "than the counts that the runner has; encoders 'patches' and 'pooled' can be exported"
+        )
     if sensor == "events" and encoder.architecture == "pooled" and not _only_counts(config):
         raise ConfigError(
             "this policy's encoder is 'pooled' and sees when each event was, which the runner does not; encoders of "

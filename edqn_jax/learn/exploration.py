@@ -8,8 +8,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from edqn_jax.config import Config
-from edqn_jax.config.options import AgentConfig
+from edqn_jax.config import AgentConfig, Config
 from edqn_jax.learn.learner import Exploration, Metrics
 from edqn_jax.learn.qnetwork import Params, network_values
 

@@ -11,6 +11,7 @@ from jax import Array
 
 from edqn_jax.config import NETWORKS, AgentConfig
 from edqn_jax.errors import ConfigError
+from edqn_jax.learn.perception.layers import init_params
 from edqn_jax.sim.actions import ACTIONS
 
 Params = Any
@@ -55,16 +56,14 @@ def init_q(config: AgentConfig, observation_size: int, actions: int, key: Array)
         ConfigError: if the network does not map `[history * observation_size]` to `[actions]`, or has other variables.
     """
     inputs, network = jnp.zeros(config.history * observation_size), network_of(config, actions)
-    variables = network.init(key, inputs)
-    if set(variables) != {"params"}:
-        raise ConfigError(f"the network '{config.network}' must have parameters alone, not {', '.join(variables)}")
-    values = jax.eval_shape(network.apply, variables, inputs)
+    params = init_params(network, f"the network '{config.network}'", key, inputs)
+    values = jax.eval_shape(network.apply, {"params": params}, inputs)
     if jnp.shape(values) != (actions,):
         raise ConfigError(
             f"the network '{config.network}' must return [{actions}] values for [{inputs.size}] inputs, not "
             f"{list(jnp.shape(values))}"
         )
-    return variables["params"]
+    return params
 
 
 def q_values(config: AgentConfig, params: Params, actions: int, history: Array) -> Array:

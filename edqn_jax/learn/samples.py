@@ -158,7 +158,7 @@ def _stored(config: EncoderConfig, sensed: EventField | Array) -> Counts | Event
 
 def _counts_alone(config: EncoderConfig, field: EventField) -> bool:
     """Returns whether the encoder reads signed counts and no times of such fields."""
-    return config.architecture == "patches" or field.divides_window
+    return config.architecture == "patches" or (config.architecture == "pooled" and field.divides_window)
 
 
 def target_of(config: EncoderConfig, observation: Observation, nearness: Array | None) -> Target:

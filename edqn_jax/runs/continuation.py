@@ -6,8 +6,8 @@ import dataclasses
 from pathlib import Path
 
 from edqn_jax.config import Config
-from edqn_jax.config.limits import validate
 from edqn_jax.config.loading import apply, load_layer
+from edqn_jax.config.rules import validate
 from edqn_jax.errors import ConfigError
 from edqn_jax.runs.directory import SEED_FOLDER, RunDirectory
 

@@ -8,8 +8,8 @@ import jax
 import numpy as np
 
 from edqn_jax.config import Config
-from edqn_jax.config.limits import validate
 from edqn_jax.config.loading import apply, load_layer
+from edqn_jax.config.rules import validate
 from edqn_jax.devices.forks import check_not_forked
 from edqn_jax.devices.jax_settings import as_tested
 from edqn_jax.errors import ConfigError

@@ -14,7 +14,7 @@ import numpy as np
 from jax.sharding import Mesh
 
 from edqn_jax.config import Config
-from edqn_jax.config.limits import check_learns, validate
+from edqn_jax.config.rules import check_learns, validate
 from edqn_jax.devices import processes
 from edqn_jax.devices.devices import choose_devices
 from edqn_jax.devices.forks import check_not_forked
@@ -28,7 +28,7 @@ from edqn_jax.learn.policy import PolicyParams, fresh_policy
 from edqn_jax.learn.trainer import Trainer, TrainState
 from edqn_jax.planning.astar import Path as ShortestPath
 from edqn_jax.planning.astar import shortest_path
-from edqn_jax.sim.task.env import World
+from edqn_jax.sim.task.env import World, check_sensor
 from edqn_jax.sim.task.flights import Flights
 from edqn_jax.sim.task.reward import Reward
 from edqn_jax.sim.worlds import geodesic
@@ -78,6 +78,7 @@ class Preparation:
         # A world's file may be missing on one host.
         self.missions = processes.together(lambda: missions_of_runs(self.configs, reward))
         worlds = [missions.training.world for missions in self.missions]
+        check_sensor(config, worlds[0])
         if config.env.reward == "geodesic":  # agents that train together share their worlds
             distances = geodesic.fields(worlds[0].pool, config.drone.body_radius_m)
             worlds = [dataclasses.replace(world, distances=distances) for world in worlds]

@@ -18,7 +18,8 @@ from edqn_jax.cli import arguments, main, train
 from edqn_jax.cli.arguments import parse_train, train_flags
 from edqn_jax.cli.help import COMMON, flag_of
 from edqn_jax.config import Config, preset
-from edqn_jax.config.loading import RANDOM_WORLDS, make_config
+from edqn_jax.config.loading import make_config
+from edqn_jax.config.presets import RANDOM_WORLDS
 from edqn_jax.devices import devices
 from edqn_jax.errors import CheckError, ConfigError, DivergedError, StoppedError
 from edqn_jax.sim.scene.mjcf import SceneError
@@ -46,6 +47,7 @@ def trainer(monkeypatch):
         return behaviour.act(*call)
 
     seeds = types.ModuleType("edqn_jax.runs.seeds")
+    stand_in.__dict__["Draw"] = object  # what the gallery imports of it
     stand_in.__dict__["train_run"] = seeds.__dict__["train_seeds_run"] = train_run
     monkeypatch.setitem(sys.modules, "edqn_jax.runs.record", stand_in)
     monkeypatch.setitem(sys.modules, "edqn_jax.runs.seeds", seeds)

@@ -46,7 +46,12 @@ def test_help_lists_what_a_file_or_a_module_registers_and_a_run_takes_it(tmp_pat
         ("nowhere.py", None, "there is no file 'nowhere.py'"),
         ("nowhere", None, "there is no module 'nowhere'; give a file"),
         ("early.py", "import jax.numpy as jnp\njnp.zeros(3)", "'early.py' computes with JAX while it is imported"),
-        ("taken.py", SENSOR.replace("mine", "events"), "there is a sensor 'events' already"),
+        (
+            "twice.py",
+            2 * SENSOR,
+            "'twice.py' does not load: there is a sensor 'mine' already; give yours another name, l",
+        ),
+        ("fails.py", "raise ValueError('two\\nlines')", "'fails.py' does not load: ValueError: two\\nlines, line 1"),
     ],
 )
 def test_what_cannot_be_imported_is_named(tmp_path: Path, name: str, text: str | None, says: str) -> None:

@@ -9,9 +9,11 @@ from typing import Any, get_args, get_type_hints
 import pytest
 
 from edqn_jax.config import FAMILIES, PRESETS, Config, EventsConfig, preset
-from edqn_jax.config.limits import validate
-from edqn_jax.config.loading import RANDOM_WORLDS, apply, load_layer, make_config, resolve, to_yaml
+from edqn_jax.config.limits import limits_of
+from edqn_jax.config.loading import apply, load_layer, make_config, resolve, to_yaml
+from edqn_jax.config.presets import RANDOM_WORLDS
 from edqn_jax.config.profiles import PROFILES
+from edqn_jax.config.rules import validate
 from edqn_jax.errors import ConfigError
 
 
@@ -233,8 +235,15 @@ def numeric_options() -> list[tuple[str, str, object]]:
     ]
 
 
+@pytest.mark.parametrize("group", [group.name for group in dataclasses.fields(Config)])
+def test_every_option_that_is_a_number_or_a_list_says_its_limits_in_its_type(group):
+    section = getattr(Config(), group)
+    numbers = {name for name, value in vars(section).items() if type(value) in (int, float, tuple)}
+    assert numbers == {name for name, limits in limits_of(type(section)).items() if limits}
+
+
 @pytest.mark.parametrize(("group", "option", "nonsense"), numeric_options())
-def test_every_numeric_option_has_limits(group, option, nonsense):
+def test_no_numeric_option_can_be_nonsense(group, option, nonsense):
     with pytest.raises(ConfigError, match=f"{group}.{option} must be"):
         validate(changed(group, **{option: nonsense}))
 
@@ -283,7 +292,7 @@ def test_every_numeric_option_has_limits(group, option, nonsense):
         (
             "world",
             {"flown": "my.xml"},
-            r"world.flown is for random worlds \(.*registered first.*\) alone, 'paper' is flown itself: give",
+            r"world.flown is for random worlds \(.*or one that --import registers\) alone, 'paper' is flown itself",
         ),
         (
             "world",

@@ -24,8 +24,8 @@ from hypothesis import strategies as st
 from edqn_jax.cli import arguments
 from edqn_jax.cli.commands import BAD_INPUT
 from edqn_jax.config import Config
-from edqn_jax.config.limits import validate
 from edqn_jax.config.loading import resolve
+from edqn_jax.config.rules import validate
 from edqn_jax.errors import ConfigError, sentence
 from edqn_jax.learn.policy import Policy
 from edqn_jax.runs.checkpoints import states

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from edqn_jax.config import Config
-from edqn_jax.config.limits import validate
 from edqn_jax.config.loading import make_config
 from edqn_jax.config.registry import LEARNERS, Registry
+from edqn_jax.config.rules import validate
 from edqn_jax.errors import ConfigError
 from edqn_jax.learn import trainer
 from edqn_jax.learn.dqn.learner import DQN

@@ -69,7 +69,7 @@ def test_a_saved_policy_is_loaded_where_its_network_is_registered_alone(
     assert loaded.config.agent.network == "linear"
     jax.tree.map(np.testing.assert_array_equal, loaded.params.q, policy.params.q)
     monkeypatch.delitem(NETWORKS._entries, "linear")
-    with pytest.raises(ConfigError, match="there is no network 'linear'; it must be one of mlp, or your own, register"):
+    with pytest.raises(ConfigError, match="there is no network 'linear'; known are mlp, or one that --import reg"):
         edqn_jax.load_policy(tmp_path / "saved")
 
 

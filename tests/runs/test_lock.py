@@ -10,8 +10,7 @@ from pathlib import Path
 import filelock
 import pytest
 
-from edqn_jax.config import Config
-from edqn_jax.config.options import WorldConfig
+from edqn_jax.config import Config, WorldConfig
 from edqn_jax.errors import ConfigError
 from edqn_jax.report.progress import Progress
 from edqn_jax.runs.directory import RunDirectory, plan_run_directory

@@ -17,6 +17,8 @@ import jax.numpy as jnp
 from jax import Array
 from jax.nn.initializers import lecun_normal, zeros
 
+from edqn_jax.errors import ConfigError
+
 ROWS_OF_A_PART = 16_384
 """Rows that a part of a kernel's gradient sums over: a GPU takes several parts at once. Where the rows do not divide
 into as many parts, there are fewer, longer ones."""
@@ -35,6 +37,22 @@ class Dense(nn.Module):
         """Returns `[..., features]` of `[..., K]`."""
         y = product(x, self.param("kernel", self.kernel_init, (x.shape[-1], self.features)))
         return added(y, self.param("bias", self.bias_init, (self.features,))) if self.use_bias else y
+
+
+def init_params(module: nn.Module, name: str, key: Array, *inputs: Any) -> Any:
+    """Returns fresh parameters of a module for such inputs.
+
+    Args:
+        name: of the module, for messages.
+
+    Raises:
+        ConfigError: if the module has variables of other kinds.
+    """
+    variables = module.init(key, *inputs)
+    if set(variables) != {"params"}:
+        others = ", ".join(sorted(set(variables) - {"params"}))
+        raise ConfigError(f"{name} must have parameters{f' alone, not {others}' if others else ''}")
+    return variables["params"]
 
 
 @jax.custom_vjp

@@ -16,10 +16,10 @@ from flax import struct
 from jax import Array
 from jax.nn.initializers import zeros
 
-from edqn_jax.config import CameraConfig, EncoderConfig
+from edqn_jax.config import ENCODERS, CameraConfig, EncoderConfig
+from edqn_jax.errors import ConfigError
 from edqn_jax.learn.perception.code import EVENT_CHANNELS, Form, Params, kl_divergence
-from edqn_jax.learn.perception.layers import Dense
-from edqn_jax.learn.perception.patch_encoder import PatchEncoder
+from edqn_jax.learn.perception.layers import Dense, init_params
 from edqn_jax.learn.perception.pooled_encoder import PooledEncoder
 from edqn_jax.learn.perception.waves import OUTPUT_SCALE, cosines, mirrored, wave_images
 from edqn_jax.sim.sensors.events import EventField
@@ -145,6 +145,9 @@ def init_vae(
     Args:
         form: of what is encoded.
         layers: frame pairs F of an event field, or C of pictures.
+
+    Raises:
+        ConfigError: if there is no such encoder, or it does not return a code, or has other variables.
     """
     key_encoder, key_decoder = jax.random.split(key)
     decoder = Decoder(config, camera.height, camera.width, target_channels(config, form, layers))
@@ -152,20 +155,29 @@ def init_vae(
     nothing = when.astype(jnp.int32)
     silent = EventField(nothing, nothing.astype(jnp.int8), when, when, window_s=1.0)
     blank = silent if form is Form.EVENTS else when
-    encoder = _encoder(config, blank)
+    encoder, name = _encoder(config, blank), f"the encoder '{config.architecture}'"
+    params = init_params(encoder, name, key_encoder, blank, jnp.zeros(MOTION_SIZE))
+    two = jax.tree.map(lambda x: jnp.stack([x, x]), (blank, jnp.zeros(MOTION_SIZE)))
+    shapes = jax.tree.map(jnp.shape, jax.eval_shape(encoder.apply, {"params": params}, *two))
+    if shapes != 2 * ((2, config.code_size),):
+        raise ConfigError(
+            f"{name} must return mean and log-variance of the code, each [..., {config.code_size}]; of two "
+            f"observations it returns {shapes}"
+        )
     return {
-        "encoder": encoder.init(key_encoder, blank, jnp.zeros(MOTION_SIZE))["params"],
+        "encoder": params,
         "decoder": decoder.init(key_decoder, jnp.zeros(config.code_size))["params"],
     }
 
 
-def _encoder(config: EncoderConfig, sensed: EventField | Array) -> PatchEncoder | PooledEncoder:
+def _encoder(config: EncoderConfig, sensed: EventField | Array) -> nn.Module:
     """Returns the encoder of what is shown, or of shapes like it."""
     fields = isinstance(sensed, EventField)
     channels, height, width = (sensed.count if fields else sensed).shape[-3:]
-    if config.architecture == "patches":
-        return PatchEncoder(config, height, width)
-    return PooledEncoder(config, height, width, EVENT_CHANNELS if fields else channels, timed=fields)
+    encoder = ENCODERS.get(config.architecture)(config, height, width)
+    if isinstance(encoder, PooledEncoder) and not fields:
+        return encoder.clone(channels=channels, timed=False)
+    return encoder
 
 
 def encode(config: EncoderConfig, params: Params, sensed: EventField | Array, motion: Array) -> tuple[Array, Array]:
@@ -191,7 +203,7 @@ def frozen(
         form: of what is encoded.
         layers: C of pictures.
     """
-    if config.architecture == "patches":
+    if config.architecture != "pooled":
         return params
     timed = form is Form.EVENTS
     channels = EVENT_CHANNELS if timed else layers

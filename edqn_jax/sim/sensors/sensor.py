@@ -166,17 +166,18 @@ class Sensor:
         return found
 
     def check(self, config: Config, sensed: Sensed) -> None:
-        """Raises unless `sensed` has the shape that `shape` says.
+        """Raises unless `sensed` has the shape that `shape` says, in floating-point numbers.
 
         Raises:
-            ConfigError: names both.
+            ConfigError: names both shapes, or the type of the numbers.
         """
-        wanted = self.shape(config)
-        shown = jax.tree.map(jnp.shape, sensed)
-        if EVENT_FIELD not in self.shapes(config) and wanted != shown:
-            raise ConfigError(
-                f"the sensor '{config.env.sensor}' shows {shown}, but its shape is {wanted}; both must be the same"
-            )
+        wanted, name = self.shape(config), config.env.sensor
+        shown = jax.tree.map(lambda x: EVENT_FIELD if _is_field(x) else jnp.shape(x), sensed, is_leaf=_is_field)
+        if wanted != shown:
+            raise ConfigError(f"the sensor '{name}' shows {shown}, but its shape is {wanted}; both must be the same")
+        for numbers in jax.tree.leaves(sensed, is_leaf=_is_field):
+            if not (_is_field(numbers) or jnp.issubdtype(numbers.dtype, jnp.floating)):
+                raise ConfigError(f"the sensor '{name}' must show float32 numbers, not {numbers.dtype}")
 
     def example(self, config: Config) -> Sensed:
         """Returns random data of the form that the sensor shows, the same at every call."""
@@ -201,6 +202,10 @@ def signed_log(image: Array) -> Array:
     """Returns log(1 + count) of signed counts [...], with their sign."""
     counts = image.astype(jnp.float32)
     return jnp.sign(counts) * jnp.log1p(jnp.abs(counts))
+
+
+def _is_field(tree: Any) -> bool:
+    return isinstance(tree, EventField)
 
 
 def _is_shape(tree: Any) -> bool:

@@ -16,7 +16,8 @@ from flax import struct
 from jax import Array
 
 from edqn_jax.checks import check_finite, check_index, is_finite
-from edqn_jax.config import Config
+from edqn_jax.config import SENSORS, Config
+from edqn_jax.errors import ConfigError
 from edqn_jax.keys import integers
 from edqn_jax.sim.physics import disturbances, drone
 from edqn_jax.sim.physics.disturbances import Disturbance
@@ -271,6 +272,20 @@ def _sense(
     if _has_floats(observation.sensed):
         observation = choose(unseen, jax.tree.map(jnp.zeros_like, observation), observation)
     return observation, memory, unseen
+
+
+def check_sensor(config: Config, world: World) -> None:
+    """Raises if a registered sensor shows what is not finite in its very first observation; built-in ones never do.
+
+    Raises:
+        ConfigError: names the sensor.
+    """
+    name = config.env.sensor
+    if name not in SENSORS.own:
+        return
+    first = group.each(config, lambda key: reset(config, world, key)[1].sensed)
+    if not is_finite(jax.jit(first)(jax.random.split(jax.random.key(0), config.env.drones))):
+        raise ConfigError(f"the sensor '{name}' must show finite numbers, and shows NaN or Inf as a flight begins")
 
 
 def _step_of(

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 
 import edqn_jax
 from edqn_jax.config import CameraConfig, Config, DroneConfig, EnvConfig, ExposureConfig, LightConfig, WorldConfig
-from edqn_jax.config.limits import validate
+from edqn_jax.config.rules import validate
 from edqn_jax.errors import ConfigError
 from edqn_jax.sim.physics.drone import Flight, load_airframe
 from edqn_jax.sim.scene import mjcf

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from edqn_jax.config import SENSORS, Config
-from edqn_jax.config.limits import validate
 from edqn_jax.config.loading import make_config
+from edqn_jax.config.rules import validate
 from edqn_jax.errors import ConfigError
 from edqn_jax.interop import functional
 from edqn_jax.learn.perception import embedding, vae
@@ -20,7 +20,9 @@ from edqn_jax.learn.samples import Samples, mirrored
 from edqn_jax.sim.sensors import sensor
 from edqn_jax.sim.sensors.events import EventField, event_image, random_field
 from edqn_jax.sim.sensors.sensor import EVENT_FIELD, Image, Sensor
+from edqn_jax.sim.task.env import check_sensor
 from edqn_jax.sim.task.observation import MIRRORED_MOTION
+from tests.support.miniature import miniature_world
 from tests.support.registries import keep_as_they_are
 
 H, W = 6, 8
@@ -28,6 +30,10 @@ H, W = 6, 8
 
 def of_shape(shape: Any, **more: Any) -> Sensor:
     return Sensor(show=lambda *_: (None, None), shape=lambda config: shape, **more)
+
+
+def with_sensor(config: Config, name: str) -> Config:
+    return dataclasses.replace(config, env=dataclasses.replace(config.env, sensor=name))
 
 
 @pytest.fixture
@@ -41,11 +47,11 @@ def config(monkeypatch: pytest.MonkeyPatch) -> Config:
 def test_a_registered_sensor_is_a_choice_and_another_is_answered_with_the_nearest(config: Config) -> None:
     assert sensor.sensor_of(config).count_values(config) == 3 and embedding.size(config) == 3
     assert "`mine`: three numbers" in SENSORS.describe() and SENSORS.own == ("mine",)
-    wrong = dataclasses.replace(config, env=dataclasses.replace(config.env, sensor="mien"))
-    with pytest.raises(ConfigError, match="env.sensor: there is no sensor 'mien'; did you mean 'mine'?"):
+    wrong = with_sensor(config, "mien")
+    with pytest.raises(ConfigError, match="^env.sensor: there is no sensor 'mien'; did you mean 'mine'[?]$"):
         validate(wrong)
-    unknown = dataclasses.replace(config, env=dataclasses.replace(config.env, sensor="xyz"))
-    with pytest.raises(ConfigError, match="events, frames, .*, mine, or your own, registered first .*--import"):
+    unknown = with_sensor(config, "xyz")
+    with pytest.raises(ConfigError, match="; known are events, frames, .*, mine, or one that --import registers$"):
         validate(unknown)
 
 
@@ -112,19 +118,33 @@ def test_what_is_shown_must_have_the_shape_that_is_told(config: Config) -> None:
         of_shape((3,)).check(config, jnp.zeros(4))
     with pytest.raises(ConfigError, match="shows None, but its shape is"):
         of_shape((3,)).check(config, None)
+    with pytest.raises(ConfigError, match=r"'mine' shows \(3,\), but its shape is events"):
+        of_shape(EVENT_FIELD).check(config, jnp.zeros(3))
+
+
+def test_what_is_shown_must_be_finite_and_floating_point(config: Config) -> None:
+    for wrong, said in ((jnp.zeros(3, int), "int32"), (jnp.zeros(3, bool), "bool")):
+        with pytest.raises(ConfigError, match=f"the sensor 'mine' must show float32 numbers, not {said}"):
+            of_shape({"a": (3,)}).check(config, {"a": wrong})
+    world = miniature_world(config)
+    for name, number in (("ones", 1.0), ("spoilt", float("nan"))):
+        SENSORS.register(name, Sensor(lambda *_, shown=number: (jnp.full(3, shown), None), lambda config: (3,)))
+    check_sensor(with_sensor(config, "ones"), world)
+    with pytest.raises(ConfigError, match="the sensor 'spoilt' must show finite numbers, and shows NaN or Inf as a fl"):
+        check_sensor(with_sensor(config, "spoilt"), world)
 
 
 def test_the_functional_face_joins_a_tree_and_refuses_nothing(config: Config) -> None:
     space = functional.FunctionalEnv(config, "image").observation_space()
     assert isinstance(space, dict) and space["image"].shape == (3,)
     SENSORS.register("nothing", of_shape(None))
-    nothing = dataclasses.replace(config, env=dataclasses.replace(config.env, sensor="nothing"))
+    nothing = with_sensor(config, "nothing")
     with pytest.raises(ConfigError, match="the sensor 'nothing' shows nothing"):
         functional.make("paper", nothing)
 
 
 def test_what_is_registered_must_be_a_sensor(config: Config) -> None:
     SENSORS.register("bare", lambda *_: (None, None))
-    bare = dataclasses.replace(config, env=dataclasses.replace(config.env, sensor="bare"))
+    bare = with_sensor(config, "bare")
     with pytest.raises(ConfigError, match="the sensor 'bare' must be an edqn_jax.Sensor, not function"):
         sensor.sensor_of(bare)

@@ -14,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from edqn_jax.config import CameraConfig, Config, DroneConfig, EventsConfig
-from edqn_jax.config.limits import validate
+from edqn_jax.config.rules import validate
 from edqn_jax.sim.physics.drone import load_airframe
 from edqn_jax.sim.scene.mjcf import load_scene
 from edqn_jax.sim.scene.scene import stack_scenes

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 
 from edqn_jax.config import Config
-from edqn_jax.config.limits import check_learns, validate
 from edqn_jax.config.registry import ACTION_SETS
+from edqn_jax.config.rules import check_learns, validate
 from edqn_jax.errors import ConfigError
 from edqn_jax.sim.actions import ACTIONS, Discrete
 from edqn_jax.sim.physics.drone import RateCommand, fly_command, hover, load_airframe, mixer_of
