@@ -26,7 +26,7 @@ from edqn_jax.config import Config
 from edqn_jax.extras import require
 from edqn_jax.runs.provenance import workload
 from edqn_jax.sim.actions import ACTIONS
-from edqn_jax.sim.task.environment import Environment
+from edqn_jax.sim.environment import Environment
 from edqn_jax.sim.task.task import task_of
 from measurement import json_report
 from measurement.command import Parser, at_least_one, in_a_sentence

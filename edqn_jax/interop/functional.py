@@ -30,10 +30,10 @@ from edqn_jax.learn.perception.code import Params as EncoderParams
 from edqn_jax.learn.policy import Policy
 from edqn_jax.policies.functions import check_has_params
 from edqn_jax.sim.actions import Box, Discrete
+from edqn_jax.sim.environment import make as make_environment
 from edqn_jax.sim.sensors.sensor import sensor_of
 from edqn_jax.sim.task.action_sets import checked_action
 from edqn_jax.sim.task.env import EnvState, World
-from edqn_jax.sim.task.environment import make as make_environment
 from edqn_jax.sim.task.observation import Observation
 from edqn_jax.sim.task.outcomes import Outcome, is_terminal
 from edqn_jax.sim.task.reward import Reward

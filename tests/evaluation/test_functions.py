@@ -20,7 +20,7 @@ from edqn_jax.errors import ConfigError
 from edqn_jax.evaluation.trajectories import trajectory, trajectory_columns
 from edqn_jax.evaluation.verdicts import check_verdicts
 from edqn_jax.interop import functional
-from edqn_jax.interop.onnx_export import export_policy
+from edqn_jax.interop.deployment.onnx_export import export_policy
 from edqn_jax.learn.actor import AgentActor
 from edqn_jax.learn.policy import Policy
 from edqn_jax.policies.functions import FunctionActor, FunctionPolicy, load_function

@@ -16,8 +16,8 @@ import edqn_jax
 from edqn_jax.config.loading import make_config
 from edqn_jax.errors import CheckError, ConfigError
 from edqn_jax.extras import MissingPackageError
-from edqn_jax.interop import onnx_export, runner
-from edqn_jax.interop.onnx_export import RUNNER, about_policy, export_policy
+from edqn_jax.interop.deployment import onnx_export, runner
+from edqn_jax.interop.deployment.onnx_export import RUNNER, about_policy, export_policy
 from edqn_jax.learn.policy import Policy, fresh_policy
 from edqn_jax.sim.sensors.events import STREAM_DTYPE
 from tests.interop.flights import Decided, flown

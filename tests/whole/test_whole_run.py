@@ -29,7 +29,7 @@ from edqn_jax.runs.directory import RunDirectory, plain
 from edqn_jax.runs.policies import load_run
 from edqn_jax.runs.record import train_run
 from edqn_jax.runs.stopping import Stop
-from edqn_jax.runs.verify import verify
+from edqn_jax.runs.verification.verify import verify
 from tests.processes import ROOT
 from tests.whole.test_run import CONFIG, FIGURES
 
@@ -98,7 +98,7 @@ def test_a_run_is_verified_and_what_was_changed_in_it_is_found(
     shutil.copytree(whole[0].path, changed.path)
     # The flights do not change: they need not be flown a third time.
     flown = fly_on_all_devices(CONFIG, run_missions(CONFIG).final.world, load_run(changed.path)[1], 0, record=True)
-    monkeypatch.setattr("edqn_jax.runs.verify.fly_on_all_devices", lambda *_, **__: flown)
+    monkeypatch.setattr("edqn_jax.runs.verification.verify.fly_on_all_devices", lambda *_, **__: flown)
 
     def wrong() -> set[str]:
         return {finding.what for finding in verify(changed.path) if finding.right is False}

@@ -11,11 +11,11 @@ import numpy as np
 from edqn_jax.config import Config
 from edqn_jax.evaluation.trajectories import actions_of, directions
 from edqn_jax.interop.recordings.recording import Recording
+from edqn_jax.sim.environment import Environment
 from edqn_jax.sim.physics.drone import Flight
 from edqn_jax.sim.scene.launches import aim_along
 from edqn_jax.sim.task.action_sets import action_set
 from edqn_jax.sim.task.env import World, scene_of
-from edqn_jax.sim.task.environment import Environment
 
 
 def flight_recording(
