@@ -27,9 +27,9 @@ from edqn_jax.evaluation.missions import load_missions
 from edqn_jax.evaluation.rollouts import fly_on_all_devices
 from edqn_jax.evaluation.trajectories import trajectory
 from edqn_jax.extras import require
-from edqn_jax.interop.onnx_export import export_policy
+from edqn_jax.interop.deployment.onnx_export import export_policy
+from edqn_jax.interop.deployment.runner import Runner
 from edqn_jax.interop.recordings.flight_events import flight_recording
-from edqn_jax.interop.runner import Runner
 from edqn_jax.learn.policy import Policy
 from edqn_jax.runs.policies import load_policy
 from edqn_jax.runs.provenance import workload

@@ -31,9 +31,9 @@ from edqn_jax.evaluation.rollouts import flight_keys
 from edqn_jax.keys import run_streams
 from edqn_jax.sim.actions import DIRECTIONS, move_number
 from edqn_jax.sim.physics.drone import DroneState, yaw_of
-from edqn_jax.sim.task import env, group
-from edqn_jax.sim.task.env import World
+from edqn_jax.sim.task.env import EnvState, World
 from edqn_jax.sim.task.outcomes import Outcome
+from edqn_jax.sim.task.task import task_of
 from measurement import json_report
 from measurement.command import Parser, at_least_one, in_a_sentence
 from measurement.flags import judged_in_tests, split
@@ -61,16 +61,16 @@ GATES: dict[str, Callable[[DroneState, Array], Array]] = {"hover": hover, "strai
 @partial(jax.jit, static_argnums=(0, 2))
 def outcomes(config: Config, world: World, gate: str, key: Array) -> Array:
     """Returns the outcome [M] int32 of each of the world's M missions."""
-    number = jnp.arange(world.missions.scene.shape[0])
+    number, task = jnp.arange(world.missions.scene.shape[0]), task_of(config)
     keys, _ = flight_keys(key, len(number))
 
-    def decide(flying: tuple[env.EnvState, Array, Array]) -> tuple[env.EnvState, Array, Array]:
+    def decide(flying: tuple[EnvState, Array, Array]) -> tuple[EnvState, Array, Array]:
         state, outcome, _ = flying
         action = jax.vmap(GATES[gate])(state.drone, world.missions.goal[state.mission])
-        state, step = group.each(config, partial(env.step, config, world))(state, action, number)
+        state, step = task.map(partial(task.step, world))(state, action, number)
         return state, jnp.where(outcome == Outcome.RUNNING, step.outcome, outcome), step.episode_length
 
-    start = jax.vmap(partial(env.ended, config, world))(keys, number), jnp.zeros_like(number), number
+    start = jax.vmap(partial(task.begin, world))(keys, number), jnp.zeros_like(number), number
     return jax.lax.while_loop(lambda flying: jnp.any(flying[1] == Outcome.RUNNING), decide, start)[1]
 
 

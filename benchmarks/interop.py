@@ -26,8 +26,8 @@ from edqn_jax.config import Config
 from edqn_jax.extras import require
 from edqn_jax.runs.provenance import workload
 from edqn_jax.sim.actions import ACTIONS
-from edqn_jax.sim.task import env
-from edqn_jax.sim.task.environment import Environment
+from edqn_jax.sim.environment import Environment
+from edqn_jax.sim.task.task import task_of
 from measurement import json_report
 from measurement.command import Parser, at_least_one, in_a_sentence
 from measurement.flags import configured, split
@@ -54,11 +54,10 @@ def parse(argv: Sequence[str] | None = None) -> tuple[argparse.Namespace, Config
 
 def pure(environment: Environment, drones: int) -> Callable[[np.ndarray], None]:
     """Returns a step of many drones by the pure functions; what it makes stays on the device."""
-    config, world = environment.config, environment.world
-    step = jax.jit(jax.vmap(lambda state, move: env.step(config, world, state, move)), donate_argnums=0)
-    states, _ = jax.jit(jax.vmap(lambda key: env.reset(config, world, key)))(
-        jax.random.split(jax.random.key(0), drones)
-    )
+    task, world = task_of(environment.config), environment.world
+    step = jax.jit(jax.vmap(lambda state, move: task.step(world, state, move)), donate_argnums=0)
+    keys = jax.random.split(jax.random.key(0), drones)
+    states, _ = jax.jit(jax.vmap(lambda key: task.reset(world, key, None)))(keys)
 
     def advance(moves: np.ndarray) -> None:
         nonlocal states

@@ -33,8 +33,10 @@ from edqn_jax.learn.policy import Policy, fresh_policy
 from edqn_jax.runs.policies import load_policy
 from edqn_jax.sim.sensors.events import EventField
 from edqn_jax.sim.sensors.sensor import frames_per_decision
-from edqn_jax.sim.task import env, group
+from edqn_jax.sim.task import group
+from edqn_jax.sim.task.env import World
 from edqn_jax.sim.task.outcomes import Outcome
+from edqn_jax.sim.task.task import task_of
 from measurement import json_report
 from measurement.command import Parser, at_least_one, in_a_sentence
 from measurement.intervals import median_interval
@@ -64,20 +66,21 @@ def events_per_decision(policy: Policy, course: MissionSet) -> float:
 
 
 @partial(jax.jit, static_argnums=0)
-def _flown(config: Config, world: env.World, params: PolicyParams) -> tuple[jax.Array, jax.Array]:
+def _flown(config: Config, world: World, params: PolicyParams) -> tuple[jax.Array, jax.Array]:
     """Returns the events of all flights, and their decisions."""
     missions = world.missions.scene.shape[0]
     number, keys = jnp.arange(missions), jax.random.split(jax.random.key(0), missions)
-    actor = AgentActor(config)
+    actor, task = AgentActor(config), task_of(config)
+    step_all = jax.vmap(partial(task.step, world))
     act = jax.vmap(partial(actor.act, params, key=jax.random.key(1)))  # greedy: the key has no effect
-    state = jax.vmap(partial(env.ended, config, world))(keys, number)
-    state, first = jax.vmap(partial(env.step, config, world))(state, jnp.zeros(missions, jnp.int32), number)
+    state = jax.vmap(partial(task.begin, world))(keys, number)
+    state, first = step_all(state, jnp.zeros(missions, jnp.int32), number)
     memory = jnp.broadcast_to(actor.init(), (missions, *actor.init().shape))
 
     def decide(carry: Any, _: None) -> tuple[Any, tuple[jax.Array, jax.Array]]:
         state, seen, memory, flying = carry
         move, memory = act(memory, seen)
-        state, step = jax.vmap(partial(env.step, config, world))(state, move, number)
+        state, step = step_all(state, move, number)
         field = step.observation.sensed
         assert isinstance(field, EventField)
         events = jnp.sum(field.count, axis=(-3, -2, -1))

@@ -26,8 +26,8 @@ if TYPE_CHECKING:
     from edqn_jax.report.page.document import write_report
     from edqn_jax.runs.policies import load_policy, save_policy
     from edqn_jax.sim.actions import move_name, move_number
+    from edqn_jax.sim.environment import Environment, make
     from edqn_jax.sim.sensors.sensor import Sensor
-    from edqn_jax.sim.task.environment import Environment, make
     from edqn_jax.sim.task.outcomes import Outcome
     from edqn_jax.sim.task.reward import Transition
     from edqn_jax.sim.worlds.families import Family
@@ -43,7 +43,7 @@ _MODULES = {
     "Config": "config",
     "ConfigError": "errors",
     "DivergedError": "errors",
-    "Environment": "sim.task.environment",
+    "Environment": "sim.environment",
     "Evaluation": "evaluation.evaluate",
     "Family": "sim.worlds.families",
     "FunctionPolicy": "policies.functions",
@@ -57,7 +57,7 @@ _MODULES = {
     "draw_map": "report.flights",
     "evaluate": "evaluation.evaluate",
     "load_policy": "runs.policies",
-    "make": "sim.task.environment",
+    "make": "sim.environment",
     "make_config": "config.loading",
     "move_name": "sim.actions",
     "move_number": "sim.actions",

@@ -47,7 +47,8 @@ from edqn_jax.devices.sums import squared_norms
 from edqn_jax.evaluation import rollouts
 from edqn_jax.evaluation.missions import load_missions, run_missions
 from edqn_jax.files import check_can_write, write_atomically
-from edqn_jax.interop import functional, onnx_export
+from edqn_jax.interop import functional
+from edqn_jax.interop.deployment import onnx_export
 from edqn_jax.keys import run_streams
 from edqn_jax.learn.trainer import Trainer
 from edqn_jax.runs.policies import load_policy

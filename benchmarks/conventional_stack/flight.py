@@ -123,8 +123,7 @@ def control(airframe, state, vx, vy, vz, cos_half_yaw, sin_half_yaw, thrust):
     # Velocity -> specific force, within the largest accelerations and tilt.
     fz = airframe.gravity + clip(airframe.climb_gain * vz, -airframe.max_descent, airframe.max_climb)
     fx, fy = airframe.velocity_gain * vx, airframe.velocity_gain * vy
-    most = min(airframe.max_horizontal, airframe.max_lean * fz)
-    lean = min(1.0, most / math.sqrt(fx * fx + fy * fy + 1e-9))
+    lean = min(1.0, min(airframe.max_horizontal, airframe.max_lean * fz) / math.sqrt(fx * fx + fy * fy + 1e-9))
     fx, fy = fx * lean, fy * lean
     norm = 1.0 / math.sqrt(fx * fx + fy * fy + fz * fz)
 
@@ -155,8 +154,7 @@ def control(airframe, state, vx, vy, vz, cos_half_yaw, sin_half_yaw, thrust):
     collective = airframe.mass * fz * max(up_z, 0.0) / max(up_z * up_z, LEAST_LEVELNESS**2)
 
     # Rotor limits: torque about x and y, then collective thrust, then torque about z.
-    mixer, limit = airframe.mixer, airframe.max_thrust
-    low, high = math.inf, -math.inf
+    mixer, limit, low, high = airframe.mixer, airframe.max_thrust, math.inf, -math.inf
     for i in range(4):
         thrust[i] = mixer[i, 1] * torque_x + mixer[i, 2] * torque_y
         low, high = min(low, thrust[i]), max(high, thrust[i])

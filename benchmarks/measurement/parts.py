@@ -28,9 +28,8 @@ from edqn_jax.sim.physics import drone
 from edqn_jax.sim.physics.drone import DroneState
 from edqn_jax.sim.scene.scene import take_scene
 from edqn_jax.sim.sensors import events, sensor
-from edqn_jax.sim.task import env
 from edqn_jax.sim.task.action_sets import heading_setpoint, velocity_command
-from edqn_jax.sim.task.env import EnvState, World
+from edqn_jax.sim.task.env import EnvState, Step, World
 from edqn_jax.sim.task.outcomes import judge
 from edqn_jax.sim.task.task import task_of
 from measurement.timing import Part, depending_on, operations_of, size_of, unchanged
@@ -72,9 +71,9 @@ class Moment:
         return self.world.missions.goal[self.environments.mission]
 
     @cached_property
-    def next_step(self) -> env.Step:
+    def next_step(self) -> Step:
         """Returns the result of the next decision."""
-        step = jax.jit(jax.vmap(lambda s, a: env.step(self.config, self.world, s, a)))
+        step = jax.jit(jax.vmap(lambda s, a: task_of(self.config).step(self.world, s, a)))
         return step(self.environments, self.moves)[1]
 
     @property
@@ -216,7 +215,7 @@ def environment(now: Moment) -> Part:
 
     def body(world: World, carry):
         state, move = carry
-        after, step = jax.vmap(lambda s, a: env.step(now.config, world, s, a))(state, move)
+        after, step = jax.vmap(lambda s, a: task_of(now.config).step(world, s, a))(state, move)
         return unchanged(state, after, move), depending_on(move, step.observation, step.reward)
 
     return Part("environment", body, now.world, (now.environments, now.moves), countable=False)
@@ -229,7 +228,7 @@ def environment_without_resets(now: Moment) -> Part:
         state, move = carry
 
         def go_on(state: EnvState, move: Array):
-            return env.step(now.config, world, dataclasses.replace(state, ended=jnp.zeros((), bool)), move)
+            return task_of(now.config).step(world, dataclasses.replace(state, ended=jnp.zeros((), bool)), move)
 
         after, step = jax.vmap(go_on)(state, move)
         return unchanged(state, after, move), depending_on(move, step.observation, step.reward)

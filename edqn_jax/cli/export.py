@@ -5,7 +5,7 @@ from __future__ import annotations
 from rich.console import Console
 
 from edqn_jax.cli.arguments import ExportArgs
-from edqn_jax.interop.onnx_export import export_policy
+from edqn_jax.interop.deployment.onnx_export import export_policy
 from edqn_jax.runs.policies import load_policy, policy_digest
 
 

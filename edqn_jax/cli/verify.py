@@ -11,7 +11,7 @@ from rich.table import Table
 from edqn_jax.cli.arguments import VerifyArgs
 from edqn_jax.errors import CheckError
 from edqn_jax.files import check_can_write, write_atomically
-from edqn_jax.runs.verify import Finding, verify
+from edqn_jax.runs.verification.verify import Finding, verify
 
 
 def verify_command(args: VerifyArgs) -> None:

@@ -72,8 +72,8 @@ def evaluate(
     """Flies a policy greedily, every mission once, and measures.
 
     Args:
-        policy: from `train` or `load_policy`; or any function of an observation, a memory and a key that returns a move
-            and the memory, see `FunctionPolicy`.
+        policy: from `train` or `load_policy`; or any function of an observation, a memory and a key that returns an
+            action and the memory, see `FunctionPolicy`.
         world: `paper`, the name of random worlds (`config.FAMILIES`) or an MJCF file; None is where it was
             trained, of random worlds the test worlds.
         missions: how many. One in a world from a file goes from its start to its goal, more begin at random free

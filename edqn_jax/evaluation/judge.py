@@ -12,7 +12,7 @@ from the words of the file, too, by other formulas than the simulator's.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -303,33 +303,68 @@ def replay_contact(
     points = np.asarray(positions, dtype=np.float64)
     if points.ndim != 2 or points.shape[1] != 3 or len(points) < 2 or not np.isfinite(points).all():
         raise ValueError(f"positions must be finite metres of shape [n, 3] with n >= 2, not of shape {points.shape}")
-    # The way of the body and of whatever comes to meet it.
-    steps = np.linalg.norm(np.diff(points, axis=0), axis=1) + fastest(judge, step_s * len(points)) * step_s
-    jumps = any(body.said[0][0] == "throw" for body in judge.moving)  # a ball may appear between two steps
-    travelled = np.concatenate([[0.0], np.cumsum(steps)])
-
-    def place(distance: float) -> tuple[int, float]:
-        segment = min(int(np.searchsorted(travelled, distance, side="right")) - 1, len(steps) - 1)
-        if steps[segment] == 0.0:
-            return segment, 0.0
-        return segment, min(1.0, (distance - travelled[segment]) / steps[segment])
-
-    def at(distance: float) -> NDArray[np.float64]:
-        segment, fraction = place(distance)
-        return points[segment] + fraction * (points[segment + 1] - points[segment])
+    way = _Way(points, fastest(judge, step_s * len(points)) * step_s)
 
     def gap_at(distance: float) -> tuple[float, str]:
-        segment, fraction = place(distance)
-        return clearance(judge, at(distance), step_s * (segment + fraction), target)
+        segment, fraction = way.place(distance)
+        return clearance(judge, way.at(distance), step_s * (segment + fraction), target)
 
-    free, here, end = 0.0, 0.0, float(travelled[-1])
+    # A ball may appear between two steps.
+    here = _first_touch(way, gap_at, jumps=any(body.said[0][0] == "throw" for body in judge.moving))
+    if here is None:
+        return None
+    segment, fraction = way.place(here)
+    rest = way.travelled[segment + 1] - here
+    samples = np.linspace(here, way.travelled[segment + 1], 2 + int(rest / _DEPTH_SPACING_M))
+    x, y, z = way.at(here)
+    return Contact(
+        segment=segment,
+        fraction=float(fraction),
+        position=(float(x), float(y), float(z)),
+        geom=gap_at(here)[1],
+        depth=max(0.0, -min(gap_at(sample)[0] for sample in samples)),
+    )
+
+
+class _Way:
+    """The way of a body, by the metres that it and whatever comes to meet it have gone."""
+
+    def __init__(self, points: NDArray[np.float64], meets_m: float) -> None:
+        """Takes positions [n, 3] of the body, and the metres that others come nearer in each step at most."""
+        self.points, self.steps = points, np.linalg.norm(np.diff(points, axis=0), axis=1) + meets_m
+        self.travelled = np.concatenate([[0.0], np.cumsum(self.steps)])
+
+    def place(self, distance: float) -> tuple[int, float]:
+        """Returns the segment, and the fraction of it, at which so many metres have been gone."""
+        segment = min(int(np.searchsorted(self.travelled, distance, side="right")) - 1, len(self.steps) - 1)
+        if self.steps[segment] == 0.0:
+            return segment, 0.0
+        return segment, min(1.0, (distance - self.travelled[segment]) / self.steps[segment])
+
+    def at(self, distance: float) -> NDArray[np.float64]:
+        """Returns the position [3] of the body there."""
+        segment, fraction = self.place(distance)
+        return self.points[segment] + fraction * (self.points[segment + 1] - self.points[segment])
+
+
+def _first_touch(way: _Way, gap_at: Callable[[float], tuple[float, str]], jumps: bool) -> float | None:
+    """Returns the metres gone at the first contact; None without one.
+
+    Advances by the gap, which nothing can close sooner, and halves what the last advance left open.
+
+    Args:
+        way: of the body.
+        gap_at: metres to the nearest solid, and its name, for metres gone.
+        jumps: look after every physics step, since something may appear.
+    """
+    free, here, end = 0.0, 0.0, float(way.travelled[-1])
     while True:
         gap, _ = gap_at(here)
         if gap <= 0.0:
             break
         if here >= end:
             return None
-        ahead = travelled[min(place(here)[0] + 1, len(steps))] if jumps else end
+        ahead = way.travelled[min(way.place(here)[0] + 1, len(way.steps))] if jumps else end
         ahead = max(ahead, here + _SHORTEST_ADVANCE_M)
         free, here = here, min(end, ahead, here + max(gap, _SHORTEST_ADVANCE_M))
     while here - free > 1e-9:  # bisection; `free` never touches, `here` always does
@@ -338,15 +373,4 @@ def replay_contact(
             free = middle
         else:
             here = middle
-
-    segment, fraction = place(here)
-    rest = travelled[segment + 1] - here
-    samples = np.linspace(here, travelled[segment + 1], 2 + int(rest / _DEPTH_SPACING_M))
-    x, y, z = at(here)
-    return Contact(
-        segment=segment,
-        fraction=float(fraction),
-        position=(float(x), float(y), float(z)),
-        geom=gap_at(here)[1],
-        depth=max(0.0, -min(gap_at(sample)[0] for sample in samples)),
-    )
+    return here

@@ -19,11 +19,14 @@ from edqn_jax.devices.devices import compiler_options
 from edqn_jax.errors import ConfigError
 from edqn_jax.keys import run_streams
 from edqn_jax.learn.actor import Actor, AgentActor, blank_observation
-from edqn_jax.sim.task import env, group
-from edqn_jax.sim.task.env import EnvState, Step, World
+from edqn_jax.sim.actions import Discrete
+from edqn_jax.sim.task import group
+from edqn_jax.sim.task.action_sets import described
+from edqn_jax.sim.task.env import EnvState, Step, World, scene_of
 from edqn_jax.sim.task.flights import Flights, Record, at_start, tally
 from edqn_jax.sim.task.observation import Observation
 from edqn_jax.sim.task.outcomes import Outcome
+from edqn_jax.sim.task.task import task_of
 
 
 @dataclasses.dataclass(frozen=True)
@@ -83,7 +86,7 @@ def fly_missions(
         Flights of the M missions, on the devices.
 
     Raises:
-        ConfigError: if the actor's actions are no moves.
+        ConfigError: if the actor's actions are not those of `env.actions`.
         ValueError: if codes are to be shuffled and a device has only one mission.
     """
     program = _Program(config, actor or AgentActor(config), shuffle_codes, record)
@@ -154,8 +157,9 @@ def _fly_all(program: _Program, mesh: Mesh | None, world: World, params: Any, ke
 def _fly(program: _Program, world: World, params: Any, number: Array, keys: Array, key: Array) -> Flights:
     """Runs `fly_missions` on one device: missions `number` [M] with the environments' keys [M]."""
     config, actor, missions = program.config, program.actor, number.shape[0]
-    first = actor.init()
+    first, task = actor.init(), task_of(config)
     action = _action_of(config, actor, params)
+    step_all = task.map(partial(task.step, world))
 
     def decide(flying: _Flying) -> _Flying:
         key, act_key, shift_key = jax.random.split(flying.key, 3)
@@ -167,7 +171,7 @@ def _fly(program: _Program, world: World, params: Any, number: Array, keys: Arra
             seen = dataclasses.replace(seen, sensed=sensed)
         own_keys = jax.vmap(partial(jax.random.fold_in, act_key))(number)
         action, memory = jax.vmap(partial(actor.act, params))(flying.memory, seen, own_keys)
-        state, step = group.each(config, partial(env.step, config, world))(flying.state, action, number)
+        state, step = step_all(flying.state, action, number)
         flights, clearance = jax.vmap(partial(_tally, config, world))(flying.flights, flying.state, step)
         return _Flying(
             state=state,
@@ -180,9 +184,9 @@ def _fly(program: _Program, world: World, params: Any, number: Array, keys: Arra
         )
 
     # The first iteration resets every environment: the observation and the action before it are not used.
-    state = jax.vmap(partial(env.ended, config, world))(keys, number)
+    state = jax.vmap(partial(task.begin, world))(keys, number)
     actions = jnp.zeros((missions, *action.shape), action.dtype)
-    seen = jax.eval_shape(group.each(config, partial(env.step, config, world)), state, actions)[1].observation
+    seen = jax.eval_shape(step_all, state, actions)[1].observation
     flying = _Flying(
         state=state,
         observation=jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), seen),
@@ -199,14 +203,14 @@ def _fly(program: _Program, world: World, params: Any, number: Array, keys: Arra
 
 def _at_start(config: Config, world: World, state: EnvState) -> Flights:
     """Returns the tallies of one flight before its first step."""
-    flights = at_start(config, env.scene_of(world, state.mission), state.drone)
+    flights = at_start(config, scene_of(world, state.mission), state.drone)
     return dataclasses.replace(flights, hit_drone=jnp.zeros((), bool)) if group.several(config) else flights
 
 
 def _tally(config: Config, world: World, flights: Flights, before: EnvState, step: Step) -> tuple[Flights, Array]:
     """Returns the tallies of one flight after a step, and the clearance [n] after each of its physics steps."""
     running = (flights.outcome == Outcome.RUNNING) & ~step.is_reset
-    scene = env.scene_of(world, before.mission, before.aim)
+    scene = scene_of(world, before.mission, before.aim)
     verdict = step.outcome, step.end_step, step.contact
     after, clearance = tally(config, scene, flights, before.drone.position, step.flight, *verdict)
     after = dataclasses.replace(after, episode_return=step.episode_return, hit_drone=step.hit_drone)
@@ -217,15 +221,17 @@ def _action_of(config: Config, actor: Actor, params: Any) -> jax.ShapeDtypeStruc
     """Returns shape and type of an actor's actions.
 
     Raises:
-        ConfigError: if they are no moves.
+        ConfigError: if they are not those that the task flies.
     """
     act = partial(actor.act, key=jax.random.key(0))
     action = jax.eval_shape(act, params, actor.init(), blank_observation(config))[0]
-    if action.shape or not jnp.issubdtype(action.dtype, jnp.integer):
-        raise ConfigError(
-            f"this policy's actions are {action.dtype}{list(action.shape)}; a move is a number from 0 to 26, [] int, a "
-            "vector of three from -1, 0 and 1, or a name"
-        )
+    space = task_of(config).actions
+    kind = jnp.integer if isinstance(space, Discrete) else jnp.floating
+    if action.shape != space.shape or not jnp.issubdtype(action.dtype, kind):
+        wanted = "a move is a number from 0 to 26, [] int, a vector of three from -1, 0 and 1, or a name"
+        if config.env.actions != "moves":
+            wanted = f"an action of '{config.env.actions}' is {described(space)}"
+        raise ConfigError(f"this policy's actions are {action.dtype}{list(action.shape)}; {wanted}")
     return action
 
 

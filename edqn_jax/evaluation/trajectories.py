@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import tempfile
+from collections.abc import Mapping
 from pathlib import Path
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from edqn_jax.config import Config
 from edqn_jax.evaluation.missions import MissionSet
 from edqn_jax.files import write_atomically
+from edqn_jax.sim.physics.drone import DroneState, Flight, yaw_of
+from edqn_jax.sim.task.action_sets import action_set
 from edqn_jax.sim.task.flights import Flights
 from edqn_jax.sim.task.outcomes import Outcome
 
@@ -19,6 +23,18 @@ TRAJECTORY_COLUMNS = (
 )  # fmt: skip
 """Columns of `trajectory.csv`, one row a physics step: seconds, metres, a unit quaternion, m/s, the action's
 number, the reward of the decision and the distance of the body's sphere from the nearest shape."""
+
+
+def trajectory_columns(values: int | None = None) -> tuple[str, ...]:
+    """Returns the columns of `trajectory.csv` for actions of so many values; None for those that are one number.
+
+    >>> trajectory_columns(3)[11:14]
+    ('action_0', 'action_1', 'action_2')
+    """
+    if values is None:
+        return TRAJECTORY_COLUMNS
+    at = TRAJECTORY_COLUMNS.index("action")
+    return (*TRAJECTORY_COLUMNS[:at], *(f"action_{n}" for n in range(values)), *TRAJECTORY_COLUMNS[at + 1 :])
 
 
 def trajectory(config: Config, flights: Flights, mission: int = 0) -> dict[str, np.ndarray]:
@@ -43,7 +59,32 @@ def trajectory(config: Config, flights: Flights, mission: int = 0) -> dict[str, 
             whole.clearance[:steps],
         ]
     )
-    return dict(zip(TRAJECTORY_COLUMNS, values.T, strict=True))
+    columns = trajectory_columns(*whole.action.shape[1:])
+    return dict(zip(columns, values.T, strict=True))
+
+
+def actions_of(flown: Mapping[str, np.ndarray]) -> np.ndarray:
+    """Returns the actions [T] or [T, A] in the columns of a trajectory."""
+    values = [column for name, column in flown.items() if name.startswith("action_")]
+    return np.stack(values, axis=-1) if values else flown["action"]
+
+
+def directions(config: Config, poses: Flight, actions: np.ndarray) -> np.ndarray:
+    """Returns the directions [T, 3] that actions commanded, in the heading frame, see `ActionSet.direction`.
+
+    Args:
+        config: names the action set.
+        poses: [T] at the ends of the decisions; what a trajectory does not hold, rates and setpoint, is none.
+        actions: [T] or [T, A].
+    """
+    actions_flown = action_set(config)
+
+    def direction(pose: Flight, action: jax.Array) -> jax.Array:
+        still = jnp.zeros(3)
+        body = DroneState(pose.position, pose.quaternion, pose.velocity, still, yaw_of(pose.quaternion))
+        return actions_flown.direction(body, action)
+
+    return np.asarray(jax.vmap(direction)(poses, jnp.asarray(actions, actions_flown.space.dtype)))
 
 
 def write_trajectories(config: Config, missions: MissionSet, flights: Flights, file: Path) -> None:

@@ -30,9 +30,10 @@ from edqn_jax.learn.perception.code import Params as EncoderParams
 from edqn_jax.learn.policy import Policy
 from edqn_jax.policies.functions import check_has_params
 from edqn_jax.sim.actions import Box, Discrete
+from edqn_jax.sim.environment import make as make_environment
 from edqn_jax.sim.sensors.sensor import sensor_of
+from edqn_jax.sim.task.action_sets import checked_action
 from edqn_jax.sim.task.env import EnvState, World
-from edqn_jax.sim.task.environment import make as make_environment
 from edqn_jax.sim.task.observation import Observation
 from edqn_jax.sim.task.outcomes import Outcome, is_terminal
 from edqn_jax.sim.task.reward import Reward
@@ -130,14 +131,19 @@ class FunctionalEnv:
 
         Args:
             key: consumed, in place of the state's own; with `state.flight.key` flights are those of `edqn_jax.make`.
-            action: [] int, 0..26; with another `env.actions` numbers [A] in [-1, 1], beyond which they are clipped. One
-                that is not finite ends the episode as diverged.
+            action: [] int, 0..26; with another `env.actions` numbers [A] in [-1, 1], beyond which they are clipped.
+                Within `jax.jit`, `jax.vmap` and `jax.lax.scan` its numbers are not known yet: there another move flies
+                in place of one that does not exist, and numbers that are not finite end the episode as diverged.
 
         Returns:
             observation, state, reward [], terminated [] bool: goal, collision, volume left or diverged, truncated []
             bool: out of time, and info: `outcome` [] int32 of `edqn_jax.Outcome`, `is_success` [] bool, `is_reset` []
             bool, `episode_return` [] and `episode_length` [] int32 of the episode so far.
+
+        Raises:
+            ConfigError: if there is no such action.
         """
+        action = checked_action(self.config, action)
         flight, step = self.task.step(params.world, dataclasses.replace(state.flight, key=key), action)
         info = {
             "outcome": step.outcome,

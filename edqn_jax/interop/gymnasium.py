@@ -44,9 +44,9 @@ from edqn_jax.interop.functional import FunctionalEnv, Kind, Params
 from edqn_jax.learn.perception.code import Params as EncoderParams
 from edqn_jax.learn.policy import Policy
 from edqn_jax.sim.actions import Box, Discrete
+from edqn_jax.sim.environment import Environment
 from edqn_jax.sim.task.action_sets import described
 from edqn_jax.sim.task.env import EnvState
-from edqn_jax.sim.task.environment import Environment
 from edqn_jax.sim.task.outcomes import Outcome
 from edqn_jax.sim.task.reward import Reward
 

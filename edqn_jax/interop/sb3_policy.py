@@ -22,6 +22,7 @@ from edqn_jax.errors import ConfigError
 from edqn_jax.interop.functional import Box, FunctionalEnv, Kind, Params
 from edqn_jax.learn.policy import Policy
 from edqn_jax.policies.functions import FunctionPolicy
+from edqn_jax.sim.task.action_sets import described
 from edqn_jax.sim.task.env import Observation
 
 
@@ -44,7 +45,8 @@ def sb3_policy(
         deterministic: take the likeliest action, as an evaluation does, instead of a random one.
 
     Raises:
-        ConfigError: if the model was trained with other observations, or the arguments do not fit each other.
+        ConfigError: if the model was trained with other observations or actions, or the arguments do not fit each
+            other.
     """
     if observation not in get_args(Kind):
         raise ConfigError(f"observation must be one of {', '.join(get_args(Kind))}, not '{observation}'")
@@ -71,11 +73,11 @@ def sb3_policy(
 
 def _kind_of(kind: Any) -> Any:
     """Returns the type of an action in our programs: moves are int32 there, and of others float32."""
-    return np.int32 if np.issubdtype(kind, np.integer) else np.float32
+    return np.int32 if np.issubdtype(np.dtype(kind), np.integer) else np.float32
 
 
 def _check_fits(model: Any, env: FunctionalEnv) -> None:
-    """Raises unless a model's observations are those of an environment.
+    """Raises unless a model's observations and actions are those of an environment.
 
     Raises:
         ConfigError: names both.
@@ -89,4 +91,11 @@ def _check_fits(model: Any, env: FunctionalEnv) -> None:
         raise ConfigError(
             f"this model was trained with observations {trained}, and '{env.observation}' with the sensor "
             f"'{env.config.env.sensor}' is {wanted}; give `observation` and `config` of its environment"
+        )
+    actions = env.action_space()
+    kind = _kind_of(model.action_space.dtype)
+    if tuple(model.action_space.shape) != actions.shape or kind != _kind_of(actions.dtype):
+        raise ConfigError(
+            f"this model's actions are {np.dtype(kind)}{list(model.action_space.shape)}, and an action of "
+            f"'{env.config.env.actions}' is {described(actions)}; give `config` of its environment"
         )

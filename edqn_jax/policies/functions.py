@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import traceback
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -17,7 +18,8 @@ from edqn_jax.errors import ConfigError
 from edqn_jax.learn.actor import Actor, AgentActor
 from edqn_jax.learn.policy import Policy
 from edqn_jax.policies import function_named
-from edqn_jax.sim.actions import ACTIONS, move_number
+from edqn_jax.sim.actions import Discrete
+from edqn_jax.sim.task.action_sets import action_of, action_set, admitted
 from edqn_jax.sim.task.env import Observation
 from edqn_jax.user_code import load_module
 
@@ -27,6 +29,13 @@ Function = Callable[[Observation, Any, Array], tuple[Any, Any]]
 TAKES = "a function (observation, memory, key) -> (action, memory)"
 """What a policy of one's own is, in messages."""
 
+_ASKED_TOO_SOON = (
+    jax.errors.ConcretizationTypeError,
+    jax.errors.TracerArrayConversionError,
+    jax.errors.TracerIntegerConversionError,
+)
+"""What JAX raises where Python asks for a number that is known in flight alone."""
+
 
 @dataclasses.dataclass(frozen=True)
 class FunctionActor(Actor):
@@ -34,6 +43,7 @@ class FunctionActor(Actor):
 
     function: Function
     memory: Callable[[], Any] | None = None
+    config: Config = dataclasses.field(default_factory=Config)
 
     def init(self) -> Any:
         """Returns the memory of one drone at the beginning of an episode, as arrays; None where there is none."""
@@ -46,13 +56,20 @@ class FunctionActor(Actor):
         return memory, observation
 
     def decide(self, params: None, seen: tuple[Any, Observation], key: Array) -> tuple[Array, Any]:
-        """Returns the action, a move as its number [] int32, and the memory.
+        """Returns the action as it is flown, a move as its number [] int32, and the memory.
 
         Raises:
-            ConfigError: if the function does not return an action and a memory like the one that it was given.
+            ConfigError: if the function does not return an action and a memory like the one that it was given, or asks
+                for numbers that are known in flight alone.
         """
         memory, observation = seen
-        result = self.function(observation, memory, key)
+        try:
+            result = self.function(observation, memory, key)
+        except _ASKED_TOO_SOON as error:
+            raise ConfigError(
+                f"a policy's function is traced by JAX, so its numbers are known in flight alone, and `if`, `and`, "
+                f"float() or NumPy cannot ask for them{_line_of(error)}; write jnp.where, and jax.numpy for numpy"
+            ) from None
         if not (isinstance(result, tuple) and len(result) == 2):
             raise ConfigError(f"a policy is {TAKES}; this one returned {type(result).__name__}")
         action, after = result
@@ -64,10 +81,25 @@ class FunctionActor(Actor):
             )
         if action is None:
             raise ConfigError(f"a policy is {TAKES}; this one returned None in place of an action")
-        if isinstance(action, str) or not jnp.issubdtype(jnp.asarray(action).dtype, jnp.floating):
-            # A number that is computed is known in flight alone; what is flown is what is recorded.
-            action = jnp.clip(move_number(action), 0, len(ACTIONS) - 1)
-        return jnp.asarray(action), after
+        return self._flown(action), after
+
+    def _flown(self, action: Any) -> Array:
+        """Returns an action as it is flown and recorded: what is computed is cut off at the bounds of its space."""
+        space = action_set(self.config).space
+        if not isinstance(space, Discrete):
+            return admitted(space, action_of(self.config, action))
+        if not isinstance(action, str) and jnp.issubdtype(jnp.asarray(action).dtype, jnp.floating):
+            return jnp.asarray(action)  # no number of an action; what flies it says so
+        return jnp.clip(action_of(self.config, action), 0, space.n - 1)
+
+
+def _line_of(error: Exception) -> str:
+    """Returns the last line that is neither JAX's nor of this file, in words: where a function went wrong."""
+    library = str(Path(jax.__file__).parent)
+    for frame in reversed(traceback.extract_tb(error.__traceback__)):
+        if frame.filename != __file__ and not frame.filename.startswith(library):
+            return f" (line {frame.lineno} of '{Path(frame.filename).name}': {frame.line})"
+    return ""
 
 
 def _form(memory: Any) -> str:
@@ -89,7 +121,8 @@ class FunctionPolicy:
     """
 
     function: Function
-    """Returns action and memory of an observation, a memory and a key; an action is a move's number, vector or name."""
+    """Returns action and memory of an observation, a memory and a key; an action is a move's number, vector or name,
+    or what `env.actions` of the configuration says."""
     config: Config | None = None
     """Drone, camera, sensor and task; None is the default for the world that is flown."""
     memory: Callable[[], Any] | None = None
@@ -117,28 +150,18 @@ class FunctionPolicy:
         """Returns None: what a function knows is in it."""
         return None
 
-    @property
-    def actor(self) -> FunctionActor:
-        """Returns what flies."""
-        return FunctionActor(self.function, self.memory)
-
 
 def as_policy(policy: Policy | FunctionPolicy | Function, world: str | Path | None = None) -> Policy | FunctionPolicy:
     """Returns a policy as it is, and a function as one; the configuration that is not given is that of the world.
 
     Raises:
-        ConfigError: if it is neither, or its actions are no moves.
+        ConfigError: if it is neither.
     """
     if isinstance(policy, Policy):
         return policy
     own = policy if isinstance(policy, FunctionPolicy) else FunctionPolicy(policy)
     if own.config is None:
         return dataclasses.replace(own, config=make_config(None if world is None else str(world)))
-    if own.config.env.actions != "moves":
-        raise ConfigError(
-            f"evaluate, record and report fly moves, and env.actions of this policy is '{own.config.env.actions}'; fly "
-            "it with edqn_jax.make or the Gymnasium environment"
-        )
     return own
 
 
@@ -150,7 +173,9 @@ def config_of(policy: Policy | FunctionPolicy) -> Config:
 
 def actor_of(policy: Policy | FunctionPolicy, config: Config) -> Actor:
     """Returns what flies a policy under a configuration, which may have other conditions than the policy's own."""
-    return policy.actor if isinstance(policy, FunctionPolicy) else AgentActor(config)
+    if isinstance(policy, FunctionPolicy):
+        return FunctionActor(policy.function, policy.memory, config)
+    return AgentActor(config)
 
 
 def check_has_params(policy: Policy | FunctionPolicy, what: str) -> None:

@@ -7,7 +7,6 @@ from concurrent.futures import Executor
 import numpy as np
 
 from edqn_jax.config import Config
-from edqn_jax.evaluation.trajectories import TRAJECTORY_COLUMNS
 from edqn_jax.learn.perception import embedding
 from edqn_jax.learn.policy import PolicyParams
 from edqn_jax.report.curves import draw_learning, draw_returns
@@ -51,8 +50,7 @@ def draw_gallery(run: RunDirectory, sights: Sights, params: PolicyParams, shorte
         shortest: [P, 3] points of the shortest path, metres.
         outcome: how the flight ended, as `summary.json` says it.
     """
-    table = np.atleast_2d(np.loadtxt(run.trajectory_file, delimiter=",", skiprows=1))
-    flown: dict[str, np.ndarray] = dict(zip(TRAJECTORY_COLUMNS, table.T, strict=True))
+    flown = run.read_trajectory()
     goal_radius_m = sights.config.env.goal_radius_m
     draw_world(sights.scene, run.figures / "world.png")
     draw_path(sights.scene, flown, shortest, run.figures / "path.png", outcome, goal_radius_m)

@@ -17,10 +17,10 @@ from jax.stages import Compiled
 
 from edqn_jax.config import Config
 from edqn_jax.devices.devices import quick_compiler_options
+from edqn_jax.evaluation.trajectories import actions_of, directions
 from edqn_jax.learn.actor import AgentActor, PolicyParams
 from edqn_jax.learn.perception import embedding, vae
 from edqn_jax.learn.policy import fresh_policy
-from edqn_jax.sim.actions import ACTIONS
 from edqn_jax.sim.camera import camera
 from edqn_jax.sim.physics import drone
 from edqn_jax.sim.physics.drone import Flight
@@ -180,13 +180,13 @@ def own_motions(config: Config, flown: Mapping[str, np.ndarray], rows: np.ndarra
     The yaw rate is that of the heading between the last two rows, which a trajectory holds.
     """
     last = rows[:, -1]
-    (_, now), (_, before) = poses(flown, last), poses(flown, np.maximum(last - 1, 0))
+    (place, now), (_, before) = poses(flown, last), poses(flown, np.maximum(last - 1, 0))
     yaw = drone.yaw_of(jnp.asarray(now))
     rate = drone.wrap_angle(yaw - drone.yaw_of(jnp.asarray(before))) / config.drone.physics_dt_s
     velocity = np.stack([flown[name] for name in ("vx", "vy", "vz")], axis=-1)[last]
     ahead = heading_velocity(config.env, yaw, jnp.asarray(velocity))
-    moves = ACTIONS[flown["action"][last].astype(int)]
-    return np.concatenate([ahead, np.asarray(rate)[:, None], moves], axis=-1).astype(np.float32)
+    commanded = directions(config, Flight(place, now, velocity), actions_of(flown)[last])
+    return np.concatenate([ahead, np.asarray(rate)[:, None], commanded], axis=-1).astype(np.float32)
 
 
 def _compiled(program: Any, *arguments: Any) -> Compiled:

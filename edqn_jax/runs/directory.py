@@ -211,15 +211,13 @@ class RunDirectory:
         write_atomically(self.summary_file, json.dumps(plain(summary), indent=2, allow_nan=False) + "\n")
 
     def write_trajectory(self, columns: Mapping[str, np.ndarray]) -> None:
-        """Writes `trajectory.csv` from one [T] array for each of `evaluation.trajectories.TRAJECTORY_COLUMNS`.
+        """Writes `trajectory.csv` from the columns [T] of `evaluation.trajectories.trajectory`.
 
         Raises:
             ConfigError: if it cannot be written.
         """
-        from edqn_jax.evaluation.trajectories import TRAJECTORY_COLUMNS  # here: it imports JAX
-
-        table = np.stack([np.asarray(columns[name], np.float64) for name in TRAJECTORY_COLUMNS], axis=1)
-        lines = [",".join(TRAJECTORY_COLUMNS), *(",".join(f"{value:.7g}" for value in row) for row in table)]
+        table = np.stack([np.asarray(column, np.float64) for column in columns.values()], axis=1)
+        lines = [",".join(columns), *(",".join(f"{value:.7g}" for value in row) for row in table)]
         write_atomically(self.trajectory_file, "\n".join(lines) + "\n")
 
     def read_metrics(self) -> list[dict[str, Any]]:
@@ -232,14 +230,14 @@ class RunDirectory:
         Raises:
             ValueError: if it has other columns, or something that is no number.
         """
-        from edqn_jax.evaluation.trajectories import TRAJECTORY_COLUMNS  # here: it imports JAX
+        from edqn_jax.evaluation.trajectories import trajectory_columns  # here: it imports JAX
 
         with self.trajectory_file.open(encoding="utf-8", newline="") as file:
             header, *rows = csv.reader(file)
-        if tuple(header) != TRAJECTORY_COLUMNS or not rows:
+        values = sum(name.startswith("action_") for name in header)
+        if tuple(header) != trajectory_columns(values or None) or not rows:
             raise ValueError("it does not have the columns of a flight")
-        table = np.array(rows, dtype=np.float64)
-        return dict(zip(TRAJECTORY_COLUMNS, table.T, strict=True))
+        return dict(zip(header, np.array(rows, dtype=np.float64).T, strict=True))
 
     def read_episodes(self) -> dict[str, np.ndarray]:
         """Returns the columns of `episodes.csv`, each [episodes]."""

@@ -15,8 +15,8 @@ from edqn_jax.config.loading import make_config
 from edqn_jax.evaluation import latency
 from edqn_jax.evaluation.missions import load_missions
 from edqn_jax.learn.policy import Policy, fresh_policy
+from edqn_jax.sim.environment import Environment
 from edqn_jax.sim.sensors.events import EventField
-from edqn_jax.sim.task.environment import Environment
 
 
 @pytest.fixture(scope="module")

@@ -15,16 +15,21 @@ import pytest
 import edqn_jax
 from edqn_jax.cli import main
 from edqn_jax.config import Config
+from edqn_jax.config.registry import ACTION_SETS
 from edqn_jax.errors import ConfigError
+from edqn_jax.evaluation.trajectories import trajectory, trajectory_columns
 from edqn_jax.evaluation.verdicts import check_verdicts
 from edqn_jax.interop import functional
-from edqn_jax.interop.onnx_export import export_policy
+from edqn_jax.interop.deployment.onnx_export import export_policy
 from edqn_jax.learn.actor import AgentActor
 from edqn_jax.learn.policy import Policy
 from edqn_jax.policies.functions import FunctionActor, FunctionPolicy, load_function
+from edqn_jax.sim.actions import Discrete
+from edqn_jax.sim.task.action_sets import VELOCITY, ActionSet
 from edqn_jax.sim.task.env import Observation
 from tests.support.miniature import WORLD
 from tests.support.policies import CONFIG, fresh
+from tests.support.registries import keep_as_they_are
 
 BLIND = dataclasses.replace(
     CONFIG,
@@ -155,13 +160,61 @@ def test_a_move_that_is_computed_and_does_not_exist_is_recorded_as_it_is_flown()
         assert int(jax.jit(actor.act)(None, None, seen, jax.random.key(0))[0]) == flies
 
 
-def test_other_actions_than_moves_are_refused_before_anything_flies() -> None:
-    config = edqn_jax.make_config("sparse", env={"actions": "velocity", "sensor": "blind"})
-    policy = edqn_jax.FunctionPolicy(lambda o, m, k: (jnp.zeros(3), m), config)
-    with pytest.raises(
-        ConfigError, match="report fly moves, and env.actions of this policy is 'velocity'; fly it with"
+def commanded_by(actions: str) -> Config:
+    return dataclasses.replace(BLIND, env=dataclasses.replace(BLIND.env, actions=actions))
+
+
+def test_a_velocity_flies_as_the_move_of_its_numbers_and_is_recorded_as_it_is_flown() -> None:
+    config = commanded_by("velocity")
+    fast = flown(lambda o, m, k: (jnp.array([0.0, 0.0, 3.0]) + 0.0 * o.own[0], m), config=config)  # 3 is cut off
+    move = flown(lambda o, m, k: ("up", m))
+    for one, other in zip(
+        jax.tree.leaves(dataclasses.replace(fast.flights, record=None)),
+        jax.tree.leaves(dataclasses.replace(move.flights, record=None)),
+        strict=True,
     ):
-        edqn_jax.evaluate(policy)
+        np.testing.assert_array_equal(one, other)
+    there = np.isfinite(moves_of(fast)[..., 0])
+    assert np.all(moves_of(fast)[there] == [0.0, 0.0, 1.0]) and np.array_equal(there, moves_of(move) >= 0)
+    columns = trajectory(config, fast.flights, 1)
+    assert tuple(columns) == trajectory_columns(3) and set(columns["action_2"]) == {1.0}
+
+
+def test_body_rates_and_an_action_set_of_ones_own_fly(monkeypatch: pytest.MonkeyPatch) -> None:
+    config = commanded_by("body-rates")
+    rises = flown(lambda o, m, k: (jnp.array([1.0, 0.0, 0.0, 0.0]) + 0.0 * o.own[0], m), config=config)
+    z = rises.path(0)[:, 2]
+    assert z[-1] > z[0] and moves_of(rises).shape == (MISSIONS, 20, 4)
+
+    def command(config: Config, airframe: Any, state: Any, goal: jax.Array, action: jax.Array) -> Any:
+        return VELOCITY.command(config, airframe, state, goal, jnp.array([0.0, 0.0, 1.0]) * action)
+
+    throttle = ActionSet(Discrete(2), np.int32(0), command, lambda state, action: jnp.array([0.0, 0.0, 1.0]) * action)
+    keep_as_they_are(monkeypatch)
+    ACTION_SETS.register("throttle", throttle)
+    # A number beyond those that there are is cut off, and recorded as it is flown.
+    climbs = flown(lambda o, m, k: (jnp.argmax(o.own) * 0 + 7, m), config=commanded_by("throttle"))
+    assert set(np.unique(moves_of(climbs))) == {-1, 1} and climbs.path(0)[-1, 2] > climbs.path(0)[0, 2]
+
+
+@pytest.mark.parametrize(
+    ("actions", "function", "says"),
+    [
+        (
+            "velocity",
+            lambda o, m, k: ("ahead", m),
+            "action of 'velocity' is 3 finite numbers from -1 to 1, not 'ahead'",
+        ),
+        ("velocity", lambda o, m, k: ((0.0, np.inf, 0.0), m), "an action of 'velocity' is 3 finite numbers"),
+        ("velocity", lambda o, m, k: (o.own[:4], m), r"3 finite numbers from -1 to 1, not an array of shape \(4,\)"),
+        ("moves", lambda o, m, k: ("up" if o.own[0] > 0 else "down", m), r"write jnp.where"),
+        ("moves", lambda o, m, k: (int(np.sin(o.own[0])), m), r"\(line \d+ of 'test_functions.py': .*np.sin"),
+        ("velocity", lambda o, m, k: ((float(o.own[0]), 0.0, 0.0), m), "known in flight alone"),
+    ],
+)
+def test_what_is_no_action_or_asks_too_soon_is_said(actions: str, function: Any, says: str) -> None:
+    with pytest.raises(ConfigError, match=says):
+        flown(function, config=commanded_by(actions))
 
 
 @dataclasses.dataclass
@@ -249,3 +302,12 @@ def test_a_flight_of_a_function_is_recorded_with_what_it_saw(tmp_path: Path) -> 
     assert '"name":"brightness"' in text and "from the code" not in text and "predicted" not in text
     with pytest.raises(ConfigError, match=r"must end in \.gif or \.mp4"):
         edqn_jax.record(policy, tmp_path / "up.png")
+    policy = FunctionPolicy(
+        lambda observation, memory, key: ((0.0, 0.0, 1.0), memory),
+        dataclasses.replace(config, env=dataclasses.replace(config.env, actions="velocity")),
+    )
+    assert edqn_jax.record(policy, tmp_path / "fast.gif").outcome == done.outcome
+    edqn_jax.record(policy, tmp_path / "fast.npz")
+    with np.load(tmp_path / "fast.npz") as held:
+        assert np.all(held["flight_action"][1:] == [0.0, 0.0, 1.0]) and not held["flight_action"][0].any()
+        np.testing.assert_array_equal(held["flight_move"], held["flight_action"])

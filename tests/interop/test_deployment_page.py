@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from edqn_jax.interop import runner
-from edqn_jax.interop.onnx_export import export_policy
+from edqn_jax.interop.deployment import runner
+from edqn_jax.interop.deployment.onnx_export import export_policy
 from edqn_jax.runs.policies import load_policy
 
 DOCS = Path(__file__).parents[2] / "docs"

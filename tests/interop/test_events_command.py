@@ -17,13 +17,13 @@ import edqn_jax
 from edqn_jax.cli import main
 from edqn_jax.config import Config
 from edqn_jax.evaluation.missions import load_missions
-from edqn_jax.interop import runner
+from edqn_jax.interop.deployment import runner
 from edqn_jax.interop.recordings.event_files import read_events, write_events
 from edqn_jax.interop.recordings.recording import Recording
 from edqn_jax.interop.recordings.seen_events import seen_by, window_ends
 from edqn_jax.learn.perception import vae
 from edqn_jax.learn.policy import Policy
-from edqn_jax.sim.task.environment import Environment
+from edqn_jax.sim.environment import Environment
 from edqn_jax.sim.task.observation import Observation
 from tests.support.interop.recordings import some_recording
 

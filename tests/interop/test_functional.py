@@ -218,6 +218,25 @@ def test_the_spaces_are_those_of_what_is_returned(kind: functional.Kind) -> None
     assert env.action_space(params) == functional.Discrete(env.num_actions) == functional.Discrete(27)
 
 
+@pytest.mark.parametrize(
+    ("actions", "action", "says"),
+    [
+        ("moves", 27, "an action of 'moves' is a whole number from 0 to 26, not 27"),
+        ("moves", -1, "an action of 'moves' is a whole number from 0 to 26, not -1"),
+        ("moves", 1.5, "an action of 'moves' is a whole number from 0 to 26, not 1.5"),
+        ("velocity", (0.0, np.nan, 0.0), "an action of 'velocity' is 3 finite numbers from -1 to 1, not"),
+        ("body-rates", (0.0, 0.0, 0.0), "an action of 'body-rates' is 4 finite numbers from -1 to 1, not"),
+    ],
+)
+def test_an_action_that_there_is_not_is_refused_outside_of_jit(actions: str, action: Any, says: str) -> None:
+    config = dataclasses.replace(small(), env=dataclasses.replace(small().env, actions=actions))
+    env, params = made("kinematics", config=config)
+    _, state = jax.eval_shape(env.reset, jax.random.key(0), params)
+    for step in (env.step, env.step_autoreset):
+        with pytest.raises(ConfigError, match=says):
+            step(jax.random.key(0), state, jnp.asarray(action), params)
+
+
 def test_other_worlds_of_the_same_number_need_no_new_compilation() -> None:
     env, params = made("kinematics")
     _, others = made("kinematics", world_seed=1)

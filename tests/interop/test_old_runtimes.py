@@ -9,8 +9,8 @@ from typing import Any
 import pytest
 
 from edqn_jax.extras import require
-from edqn_jax.interop import runner
-from edqn_jax.interop.onnx_export import export_policy
+from edqn_jax.interop.deployment import runner
+from edqn_jax.interop.deployment.onnx_export import export_policy
 from tests.support.interop.flights import untrained
 
 pytestmark = pytest.mark.filterwarnings("ignore")  # jax2onnx and what it imports

@@ -15,8 +15,8 @@ import pytest
 import edqn_jax
 from edqn_jax.errors import CheckError, ConfigError
 from edqn_jax.extras import MissingPackageError
-from edqn_jax.interop import onnx_export, runner
-from edqn_jax.interop.onnx_export import RUNNER, about_policy, export_policy
+from edqn_jax.interop.deployment import onnx_export, runner
+from edqn_jax.interop.deployment.onnx_export import RUNNER, about_policy, export_policy
 from edqn_jax.learn.policy import Policy
 from edqn_jax.sim.sensors.events import STREAM_DTYPE
 from tests.support.interop.flights import Decided, flown, untrained

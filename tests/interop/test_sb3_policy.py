@@ -63,6 +63,29 @@ def test_a_model_flies_what_it_would_choose() -> None:
     assert len(np.unique(moves)) > 2
 
 
+class Pilot(Model):
+    """Flies up at full speed, as a model of continuous actions does."""
+
+    action_space = SimpleNamespace(shape=(3,), dtype=np.dtype(np.float32))
+
+    @staticmethod
+    def move_of(vector: np.ndarray) -> np.ndarray:
+        """Returns velocities [..., 3] of vectors [..., N]."""
+        return np.broadcast_to(np.float32([0.0, 0.0, 1.0]), (*vector.shape[:-1], 3))
+
+
+FAST = dataclasses.replace(BLIND, env=dataclasses.replace(BLIND.env, actions="velocity"))
+
+
+def test_a_model_of_continuous_actions_flies_and_its_numbers_are_recorded() -> None:
+    policy = sb3_policy(Pilot(vector=(17,)), FAST, observation="kinematics")
+    evaluation = edqn_jax.evaluate(policy, missions=1, record=True)
+    record = evaluation.flights.record
+    assert record is not None and evaluation.path()[-1, 2] > evaluation.path()[0, 2]
+    actions = np.asarray(record.action)[0]
+    assert np.all(actions[np.isfinite(actions[:, 0])] == [0.0, 0.0, 1.0])
+
+
 def test_what_the_kinds_of_observations_show_reaches_the_model() -> None:
     policy = Policy(CONFIG, fresh(CONFIG, 0))
     size = CONFIG.encoder.code_size
@@ -84,6 +107,8 @@ def test_what_the_kinds_of_observations_show_reaches_the_model() -> None:
         (Model(vector=(9,)), {"observation": "kinematics"}, r"\(9,\), and 'kinematics' .* 'blind' is \(17,\)"),
         (Model(vector=(17,)), {"observation": "codes"}, "observation must be one of image, code, kinematics"),
         (Model(vector=(17,)), {"observation": "code"}, "observation 'code' needs a policy"),
+        (Model(vector=(17,)), {"config": FAST, "observation": "kinematics"}, r"int32\[\], .*'velocity' is 3 finite"),
+        (Pilot(vector=(17,)), {"config": BLIND, "observation": "kinematics"}, r"float32\[3\], .*'moves' is a whole"),
     ],
 )
 def test_a_model_of_other_observations_is_refused(model: Any, options: Any, says: str) -> None:

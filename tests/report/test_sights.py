@@ -76,6 +76,11 @@ def test_own_motions_are_those_that_the_drone_knew(flight):
         motion[:, [0, 1, 2, 4, 5, 6]], steps.observation.motion[:, [0, 1, 2, 4, 5, 6]], atol=1e-5
     )
     assert np.abs(motion[:, 3]).max() > 0.01
+    config = dataclasses.replace(SMALL, env=dataclasses.replace(SMALL.env, actions="velocity"))
+    numbers = ACTIONS[flown["action"]].T.astype(float)
+    as_velocities = {name: column for name, column in flown.items() if name != "action"}
+    as_velocities |= {f"action_{axis}": values for axis, values in enumerate(numbers)}
+    np.testing.assert_array_equal(own_motions(config, as_velocities, decision_rows(config, flown)), motion)
 
 
 @pytest.mark.slow

@@ -14,7 +14,7 @@ import pytest
 from edqn_jax.config import Config, TrainConfig
 from edqn_jax.config.loading import resolve
 from edqn_jax.errors import ConfigError
-from edqn_jax.evaluation.trajectories import TRAJECTORY_COLUMNS
+from edqn_jax.evaluation.trajectories import TRAJECTORY_COLUMNS, trajectory_columns
 from edqn_jax.runs.directory import TO_BE_DRAWN, RunDirectory, plan_run_directory, version_of
 
 
@@ -198,6 +198,13 @@ def test_the_trajectory_has_the_columns_that_others_rely_on(run):
     header, row, _ = run.trajectory_file.read_text().splitlines()
     assert header == "t,x,y,z,qw,qx,qy,qz,vx,vy,vz,action,reward,clearance"
     assert row == ",".join(map(str, range(14)))
+    columns = trajectory_columns(3)
+    run.write_trajectory({name: np.full(2, index) for index, name in enumerate(columns)})
+    held = run.read_trajectory()
+    assert tuple(held) == columns and "action" not in held and held["action_2"].tolist() == [13, 13]
+    run.trajectory_file.write_text(run.trajectory_file.read_text().replace("action_1", "action_3"))
+    with pytest.raises(ValueError, match="columns of a flight"):
+        run.read_trajectory()
 
 
 def test_a_summary_that_cannot_be_written_leaves_the_old_one(run):

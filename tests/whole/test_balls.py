@@ -17,7 +17,7 @@ from edqn_jax.report.progress import Progress
 from edqn_jax.runs.directory import RunDirectory
 from edqn_jax.runs.record import train_run
 from edqn_jax.runs.stopping import Stop
-from edqn_jax.runs.verify import verify
+from edqn_jax.runs.verification.verify import verify
 from tests.support.configs import TINY_RUN
 
 WORLD = WorldConfig(name="sparse", flown="", pool_size=2, missions=8, balls=3)

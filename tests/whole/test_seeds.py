@@ -19,7 +19,7 @@ from edqn_jax.runs.directory import RunDirectory, plain
 from edqn_jax.runs.policies import load_policy
 from edqn_jax.runs.seeds import train_seeds_run
 from edqn_jax.runs.stopping import Stop
-from edqn_jax.runs.verify import verify
+from edqn_jax.runs.verification.verify import verify
 from edqn_jax.training import history
 from edqn_jax.training.loop import train, train_seeds
 from tests.support.configs import BLIND_RUN, FIGURES

@@ -29,7 +29,7 @@ from edqn_jax.runs.directory import RunDirectory, plain
 from edqn_jax.runs.policies import load_run
 from edqn_jax.runs.record import train_run
 from edqn_jax.runs.stopping import Stop
-from edqn_jax.runs.verify import verify
+from edqn_jax.runs.verification.verify import verify
 from tests.support.configs import FIGURES, TINY_RUN
 from tests.support.processes import ROOT
 
@@ -103,7 +103,7 @@ def test_a_run_is_verified_and_what_was_changed_in_it_is_found(
     shutil.copytree(whole[0].path, changed.path)
     # The flights do not change: they need not be flown a third time.
     flown = fly_on_all_devices(TINY_RUN, run_missions(TINY_RUN).final.world, load_run(changed.path)[1], 0, record=True)
-    monkeypatch.setattr("edqn_jax.runs.verify.fly_on_all_devices", lambda *_, **__: flown)
+    monkeypatch.setattr("edqn_jax.runs.verification.verify.fly_on_all_devices", lambda *_, **__: flown)
 
     def wrong() -> set[str]:
         return {finding.what for finding in verify(changed.path) if finding.right is False}

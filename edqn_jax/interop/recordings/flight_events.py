@@ -9,12 +9,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from edqn_jax.config import Config
+from edqn_jax.evaluation.trajectories import actions_of, directions
 from edqn_jax.interop.recordings.recording import Recording
-from edqn_jax.sim.actions import ACTIONS
+from edqn_jax.sim.environment import Environment
 from edqn_jax.sim.physics.drone import Flight
 from edqn_jax.sim.scene.launches import aim_along
+from edqn_jax.sim.task.action_sets import action_set
 from edqn_jax.sim.task.env import World, scene_of
-from edqn_jax.sim.task.environment import Environment
 
 
 def flight_recording(
@@ -47,7 +48,12 @@ def flight_recording(
         aim = aim_along(config, scene_of(world, jnp.asarray(0)), places)
     stream = Environment(sees, world).stream(poses, law="esim", aim=aim)
     steps = round(config.drone.physics_dt_s * 1e6)
-    moves = ACTIONS[flown["action"].astype(int)]
+    actions = np.concatenate([np.asarray(action_set(config).still)[None], actions_of(flown)])
+    commanded = directions(config, poses, actions)
+    if config.env.actions == "moves":
+        moves = {"move": commanded.astype(np.int8)}
+    else:
+        moves = {"move": commanded.astype(np.float32), "action": actions.astype(np.float32)}
     return Recording(
         stream,
         camera.width,
@@ -58,7 +64,7 @@ def flight_recording(
             "position": np.asarray(poses.position, np.float32),
             "quaternion": np.asarray(poses.quaternion, np.float32),
             "velocity": np.asarray(poses.velocity, np.float32),
-            "move": np.concatenate([np.zeros((1, 3)), moves]).astype(np.int8),
+            **moves,
         },
     )
 

@@ -73,7 +73,8 @@ class Recording:
     """Change of log brightness that made an event; None where it is not known."""
     flight: Mapping[str, NDArray] | None = None
     """Where the camera was: `t` [T] microseconds, `position` [T, 3], `quaternion` [T, 4], `velocity` [T, 3], `move`
-    [T, 3] of the decision that was being flown; None where it is not known."""
+    [T, 3] of the decision that was being flown, of other actions than moves the direction that was commanded, and their
+    numbers as `action`; None where it is not known."""
 
     @property
     def longest_pause_s(self) -> float:

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from edqn_jax.config import Config
 from edqn_jax.errors import ConfigError
-from edqn_jax.interop import runner
-from edqn_jax.interop.onnx_export import about_policy, field_of
+from edqn_jax.interop.deployment import runner
+from edqn_jax.interop.deployment.onnx_export import about_policy, field_of
 from edqn_jax.interop.recordings.recording import Recording
 from edqn_jax.learn.actor import AgentActor, PolicyParams
 from edqn_jax.learn.perception import embedding, vae

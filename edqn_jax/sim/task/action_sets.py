@@ -77,19 +77,30 @@ def action_of(config: Config, given: str | ArrayLike) -> Array:
     Raises:
         ConfigError: if there is no such action. Numbers that JAX is tracing are taken as they are.
     """
-    if config.env.actions == "moves":
-        return move_number(given)
-    space = action_set(config).space
+    return move_number(given) if config.env.actions == "moves" else checked_action(config, given)
+
+
+def checked_action(config: Config, given: ArrayLike) -> Array:
+    """Returns an action [] or [A] in the type of its space.
+
+    Raises:
+        ConfigError: if there is no such action. Numbers that JAX is tracing are taken as they are.
+    """
     if isinstance(given, Tracer):
         return given
+    space = action_set(config).space
+    numbered = isinstance(space, Discrete)
     try:
-        number = np.asarray(given, space.dtype)
+        number = np.asarray(given) if numbered else np.asarray(given, space.dtype)
+        exists = number.shape == space.shape and bool(np.isfinite(number).all())
     except (TypeError, ValueError):
-        number = np.zeros(0)
-    inside = not isinstance(space, Discrete) or np.all((number >= 0) & (number < space.n))
-    if number.shape != space.shape or not np.isfinite(number).all() or not inside:
-        raise ConfigError(f"an action of '{config.env.actions}' is {described(space)}, not {given!r}")
-    return jnp.asarray(number)
+        exists = False
+    if exists and numbered:
+        exists = np.issubdtype(number.dtype, np.integer) and 0 <= number < space.n
+    if not exists:
+        told = given.tolist() if isinstance(given, Array | np.ndarray) else given
+        raise ConfigError(f"an action of '{config.env.actions}' is {described(space)}, not {told!r}")
+    return jnp.asarray(number, space.dtype)
 
 
 def described(space: Discrete | Box) -> str:

@@ -35,7 +35,7 @@ class Record:
     quaternion: Array  # [M, T, 4]
     velocity: Array  # [M, T, 3] m/s
     clearance: Array  # [M, T] metres from the body's sphere to the nearest shape, at a contact cut off there
-    action: Array  # [M, D] int32, one a decision; -1 after the end
+    action: Array  # [M, D, ...] one a decision; after the end -1, or NaN where actions are in a box
     reward: Array  # [M, D] of each decision
 
 

@@ -21,7 +21,7 @@ from edqn_jax.learn.perception import embedding, vae
 from edqn_jax.learn.policy import fresh_policy
 from edqn_jax.sim.sensors.events import EventField, random_field
 from edqn_jax.sim.task.observation import MOTION_SIZE, Observation
-from tests.registries import keep_as_they_are
+from tests.support.registries import keep_as_they_are
 
 SMALL = CameraConfig(width=6, height=4)
 

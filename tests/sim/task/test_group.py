@@ -20,12 +20,12 @@ from edqn_jax.config import Config
 from edqn_jax.config.loading import make_config
 from edqn_jax.errors import ConfigError
 from edqn_jax.sim.actions import move_number
+from edqn_jax.sim.environment import make
 from edqn_jax.sim.physics import drone
 from edqn_jax.sim.scene.scene import build_scene, stack_scenes
 from edqn_jax.sim.sensors.events import event_image
 from edqn_jax.sim.task import env, group
 from edqn_jax.sim.task.env import World
-from edqn_jax.sim.task.environment import make
 from edqn_jax.sim.task.missions import Missions
 from edqn_jax.sim.task.outcomes import Outcome
 from tests.oracles.group_plain import walked

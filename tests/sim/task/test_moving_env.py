@@ -17,6 +17,7 @@ from edqn_jax.config.loading import make_config
 from edqn_jax.evaluation.rollouts import fly_missions
 from edqn_jax.learn.policy import fresh_policy
 from edqn_jax.sim.actions import move_number
+from edqn_jax.sim.environment import Environment
 from edqn_jax.sim.physics import drone
 from edqn_jax.sim.scene.distance import signed_distance
 from edqn_jax.sim.scene.launches import aim_along
@@ -26,7 +27,6 @@ from edqn_jax.sim.sensors import built_in, sensor
 from edqn_jax.sim.sensors.events import event_image
 from edqn_jax.sim.task import env
 from edqn_jax.sim.task.env import World
-from edqn_jax.sim.task.environment import Environment
 from edqn_jax.sim.task.missions import own_missions
 from edqn_jax.sim.task.outcomes import Outcome
 from tests.support.drawn_scenes import GROUND

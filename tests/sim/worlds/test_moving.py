@@ -12,10 +12,10 @@ import pytest
 from edqn_jax.config.loading import make_config
 from edqn_jax.errors import ConfigError
 from edqn_jax.evaluation.missions import load_missions
+from edqn_jax.sim.environment import make
 from edqn_jax.sim.scene.distance import signed_distance
 from edqn_jax.sim.scene.motion import due
 from edqn_jax.sim.scene.scene import PARKED, Scene, moves, scene_at, take_scene
-from edqn_jax.sim.task.environment import make
 from edqn_jax.sim.task.missions import own_missions, random_missions
 from edqn_jax.sim.worlds import canyon, families, forest
 from edqn_jax.sim.worlds.families import random_pool, world_keys

@@ -32,12 +32,12 @@ from edqn_jax.policies import no_run
 from edqn_jax.runs.checkpoints import states
 from edqn_jax.runs.checkpoints.states import Checkpoint
 from edqn_jax.runs.continuation import begun
-from edqn_jax.runs.derived import DIGITS, from_metrics, from_trajectory, same
 from edqn_jax.runs.directory import RunDirectory
 from edqn_jax.runs.keeper import kept_name
 from edqn_jax.runs.policies import load_run
 from edqn_jax.runs.provenance import digest_of, versions, workload
 from edqn_jax.runs.summaries import of_all_seeds, of_tests
+from edqn_jax.runs.verification.derived import DIGITS, from_metrics, from_trajectory, same
 from edqn_jax.runs.world_copy import WORLD
 from edqn_jax.sim.task import group
 from edqn_jax.sim.task.flights import Flights

@@ -1,4 +1,4 @@
-"""A policy as an ONNX file that a computer without JAX flies, by `interop/runner.py`. Needs the extra `export`."""
+"""A policy as an ONNX file that a computer without JAX flies, by `runner.py` beside it. Needs the extra `export`."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from edqn_jax.config import ENCODERS, Config
 from edqn_jax.errors import CheckError, ConfigError
 from edqn_jax.extras import require
 from edqn_jax.files import check_can_write, write_atomically
-from edqn_jax.interop import runner
+from edqn_jax.interop.deployment import runner
 from edqn_jax.learn.actor import AgentActor, Memory, PolicyParams, observation_size
 from edqn_jax.learn.policy import Policy
 from edqn_jax.learn.qnetwork import q_values
