@@ -19,7 +19,7 @@ from edqn_jax.config.options import (
     WorldConfig,
 )
 from edqn_jax.config.presets import PRESETS, preset
-from edqn_jax.config.registry import FAMILIES, LEARNERS, MIXTURES, NETWORKS, SENSORS
+from edqn_jax.config.registry import FAMILIES, LEARNERS, MIXTURES, NETWORKS, SENSORS, SHAPES
 
 __all__ = [
     "CONDITIONS",
@@ -29,6 +29,7 @@ __all__ = [
     "NETWORKS",
     "PRESETS",
     "SENSORS",
+    "SHAPES",
     "AgentConfig",
     "AirConfig",
     "BodyConfig",
