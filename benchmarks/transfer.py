@@ -31,8 +31,8 @@ from edqn_jax.config import Config
 from edqn_jax.errors import ConfigError
 from edqn_jax.evaluation.judge import clearance, load_judge, replay_contact
 from edqn_jax.evaluation.metrics import wilson_interval
-from edqn_jax.interop.onnx_export import export_policy
-from edqn_jax.interop.runner import Runner
+from edqn_jax.interop.deployment.onnx_export import export_policy
+from edqn_jax.interop.deployment.runner import Runner
 from edqn_jax.runs.policies import load_policy
 from edqn_jax.runs.provenance import workload
 from edqn_jax.sim.task.environment import Environment

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edqn_jax.extras import require
-from edqn_jax.interop.runner import Command
+from edqn_jax.interop.deployment.runner import Command
 from edqn_jax.sim.physics import drone
 from edqn_jax.sim.task.environment import Environment
 from outer.poses import Track

@@ -3,7 +3,7 @@
 from edqn_jax.config.learning import AgentConfig, EncoderConfig, TrainConfig
 from edqn_jax.config.options import CONDITIONS, Config
 from edqn_jax.config.presets import PRESETS, preset
-from edqn_jax.config.registry import ENCODERS, FAMILIES, LEARNERS, MIXTURES, NETWORKS, SENSORS
+from edqn_jax.config.registry import ENCODERS, FAMILIES, LEARNERS, MIXTURES, NETWORKS, SENSORS, SHAPES
 from edqn_jax.config.simulation import (
     AirConfig,
     BodyConfig,
@@ -27,6 +27,7 @@ __all__ = [
     "NETWORKS",
     "PRESETS",
     "SENSORS",
+    "SHAPES",
     "AgentConfig",
     "AirConfig",
     "BodyConfig",

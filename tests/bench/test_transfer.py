@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import edqn_jax
-from edqn_jax.interop.runner import Command
+from edqn_jax.interop.deployment.runner import Command
 from edqn_jax.learn.policy import Policy
 from edqn_jax.sim.task.environment import Environment
 from outer import event_cameras, flights
