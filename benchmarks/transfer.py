@@ -35,7 +35,7 @@ from edqn_jax.interop.deployment.onnx_export import export_policy
 from edqn_jax.interop.deployment.runner import Runner
 from edqn_jax.runs.policies import load_policy
 from edqn_jax.runs.provenance import workload
-from edqn_jax.sim.task.environment import Environment
+from edqn_jax.sim.environment import Environment
 from edqn_jax.sim.task.observation import MOST_YAW_RATE
 from measurement import json_report
 from measurement.command import Parser, at_least_one, in_a_sentence
@@ -163,10 +163,13 @@ def measure(args: argparse.Namespace, show: Callable[[str], None] = print) -> di
     ended: list[Flown] = []
     with tempfile.TemporaryDirectory() as folder:
         file = export_policy(policy, Path(folder) / "policy.onnx").file
-        camera = {} if args.events == "pair" else {"camera": (event_cameras.WIDE, event_cameras.HIGH)}
-        field_of_view = {} if args.events == "pair" else {"camera_fov_deg": config.camera.horizontal_fov_deg}
-        contrast = None if args.events == "pair" else event_cameras.CONTRAST
-        runner = Runner(file, **camera, **field_of_view, contrast=contrast)
+        pair = args.events == "pair"
+        runner = Runner(
+            file,
+            camera=None if pair else (event_cameras.WIDE, event_cameras.HIGH),
+            camera_fov_deg=None if pair else config.camera.horizontal_fov_deg,
+            contrast=None if pair else event_cameras.CONTRAST,
+        )
         for mission in range(args.missions):
             watcher, close = prepare_camera(args, config, environment, mission)
             try:

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from edqn_jax.extras import require
 from edqn_jax.interop.deployment.runner import Command
+from edqn_jax.sim.environment import Environment
 from edqn_jax.sim.physics import drone
-from edqn_jax.sim.task.environment import Environment
 from outer.poses import Track
 
 ROTORPY_STEP_S = 0.005

@@ -11,7 +11,7 @@ import pytest
 import edqn_jax
 from edqn_jax.interop.deployment.runner import Command
 from edqn_jax.learn.policy import Policy
-from edqn_jax.sim.task.environment import Environment
+from edqn_jax.sim.environment import Environment
 from outer import event_cameras, flights
 from outer.poses import Track, heading_of
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import edqn_jax
-from edqn_jax.sim.task.environment import Environment
+from edqn_jax.sim.environment import Environment
 from outer import pictures
 from outer.poses import camera_rotation
 
