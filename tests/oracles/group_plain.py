@@ -21,14 +21,16 @@ def walked(path: NDArray, flies: NDArray, until: NDArray, reach: float, parts: i
     path = np.asarray(path, np.float64)
     count, rows = path.shape[:2]
     hit = np.full(count, np.inf)
-    for moment in range((rows - 1) * parts + 1):
+    moments = np.arange((rows - 1) * parts + 1)
+    step = np.minimum(moments // parts, rows - 2)
+    share = (moments / parts - step)[:, None]
+    at = (1 - share) * path[:, step] + share * path[:, step + 1]
+    apart = np.linalg.norm(at[:, None] - at[None], axis=-1)  # [N, N, moments]
+    for moment in moments[(apart[np.triu_indices(count, 1)] <= reach).any(axis=0)]:
         time = moment / parts
-        step = min(moment // parts, rows - 2)
-        share = time - step
-        at = (1 - share) * path[:, step] + share * path[:, step + 1]
         while True:
             there = [i for i in range(count) if flies[i] and np.isinf(hit[i]) and time <= until[i]]
-            near = [(np.linalg.norm(at[i] - at[j]), i, j) for i in there for j in there if i < j]
+            near = [(apart[i, j, moment], i, j) for i in there for j in there if i < j]
             if not near or min(near)[0] > reach:
                 break
             _, i, j = min(near)

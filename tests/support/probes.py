@@ -133,7 +133,7 @@ TASK: Any = Task(
     motion_size=MOTION_SIZE,
     reset=_reset,  # type: ignore[arg-type]
     begin=_begin,  # type: ignore[arg-type]
-    step=_step,
+    step=_step,  # type: ignore[arg-type]
     map=jax.vmap,
 )
 

@@ -174,9 +174,8 @@ def _in_batches(family: str, moving: Moving, keys: Array) -> Scene:
     return jax.tree.map(lambda *leaves: jnp.concatenate(leaves)[:count], *drawn)
 
 
-@partial(jax.jit, static_argnums=(0, 2), static_argnames="moving")
 def _drawn(family: str, keys: Array, moving: Moving = STILL) -> Scene:
-    """Returns worlds of one family, one for each key [P]."""
+    """Returns worlds of one family, one for each key [P]; what moves is of a program of its own, which is small."""
     return _set_in_motion(family, moving, _standing(family, keys), keys)
 
 
@@ -189,11 +188,18 @@ def _set_in_motion(family: str, moving: Moving, scenes: Scene, keys: Array) -> S
     bodies = _family(family).bodies
     if not moving.balls and not (moving.share and bodies):
         return scenes
-    return jax.vmap(lambda scene, key: in_motion(scene, moving, bodies, jax.random.fold_in(key, MOTION_OF_WORLD)))(
-        scenes, keys
-    )
+    return _moved(family, moving, scenes, keys)
 
 
+@partial(jax.jit, static_argnums=(0, 1))
+def _moved(family: str, moving: Moving, scenes: Scene, keys: Array) -> Scene:
+    def one(scene: Scene, key: Array) -> Scene:
+        return in_motion(scene, moving, _family(family).bodies, jax.random.fold_in(key, MOTION_OF_WORLD))
+
+    return jax.vmap(one)(scenes, keys)
+
+
+@partial(jax.jit, static_argnums=0)
 def _standing(family: str, keys: Array) -> Scene:
     """Returns worlds in which nothing moves; one without a way is drawn again with another key."""
     how, edge = _family(family), _family(family).edge_m

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
@@ -37,6 +39,8 @@ QUICK = dataclasses.replace(TINY, drone=dataclasses.replace(TINY.drone, physics=
 SENSORS = ("events", "frames", "frame-pair", "depth", "depth-motion", "event-image", "ranges", "blind")
 CODED = SENSORS[:5]
 STEPS = 12
+KEYS = jax.random.split(jax.random.key(0))
+"""Of two seeds."""
 
 
 def with_sensor(name: str, config: Config = TINY) -> Config:
@@ -51,26 +55,41 @@ def world() -> World:
 # ------------------------------------------------------------------------------------------ the whole
 
 
+@pytest.fixture(scope="module")
+def traced(world: World) -> Callable[[str], tuple]:
+    """For a sensor, its configuration and what starts and trains two seeds, both traced.
+
+    An array as large as the camera's image is told by its size.
+    """
+
+    @functools.cache
+    def of(name: str) -> tuple:
+        config = dataclasses.replace(with_sensor(name, QUICK), camera=CameraConfig(width=11, height=7))
+        start = jax.jit(jax.vmap(lambda key: trainer.init(config, world, key))).trace(KEYS)
+        steps = jax.jit(jax.vmap(lambda state: trainer.run_steps(config, world, state, jnp.arange(STEPS))))
+        return config, start, steps.trace(start.out_info)
+
+    return of
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", SENSORS[1:])
-def test_the_training_step_learns_from_every_sensor(world: World, name: str) -> None:
-    config = with_sensor(name, QUICK)
-    plan = Plan.of(config)
-    before = jax.jit(lambda key: trainer.init(config, world, key))(jax.random.key(0))
-    train = jax.jit(lambda state: trainer.run_steps(config, world, state, jnp.arange(STEPS)))
-    after, (_, losses) = train(before)
+def test_the_training_step_learns_from_every_sensor_mapped_over_seeds(traced, name: str) -> None:
+    config, start, steps = traced(name)
+    plan, before = Plan.of(config), start.lower().compile()(KEYS)
+    after, (_, losses) = steps.lower().compile()(before)
     for leaf in jax.tree.leaves((after.learner, after.actors.memory, after.actors.replay)):
         assert np.isfinite(np.asarray(leaf)).all()
     for part in ("q", "target", "average"):
         assert moved(getattr(before.learner.agent, part), getattr(after.learner.agent, part)), part
     learns = np.arange(STEPS) >= plan.learn_from
-    np.testing.assert_array_equal(np.isfinite(losses.metrics["q_loss"]), learns)
+    np.testing.assert_array_equal(np.isfinite(losses.metrics["q_loss"]), [learns] * len(KEYS))
     assert learns.any() and not learns.all()
     sees = np.arange(STEPS) < plan.warmup
-    np.testing.assert_array_equal(np.isfinite(losses.metrics["reconstruction_loss"]), sees)
+    np.testing.assert_array_equal(np.isfinite(losses.metrics["reconstruction_loss"]), [sees] * len(KEYS))
     if name in CODED:
         assert plan.warmup == 4 and moved(before.learner.vae, after.learner.vae)
-        learnt = embedding.acting(config, after.learner.vae)  # what was learnt acts
+        learnt = jax.vmap(partial(embedding.acting, config))(after.learner.vae)  # what was learnt acts
         jax.tree.map(partial(np.testing.assert_allclose, atol=1e-6), learnt, after.learner.encoder)
     else:
         assert plan.warmup == 0 and after.learner.vae == after.learner.encoder == {}
@@ -83,25 +102,13 @@ def moved(one, two) -> bool:
 
 @pytest.mark.parametrize("name", SENSORS)
 @pytest.mark.slow
-def test_only_a_sensor_with_an_image_has_one_in_its_program_and_a_vae(world: World, name: str) -> None:
-    config = dataclasses.replace(with_sensor(name, QUICK), camera=CameraConfig(width=11, height=7))
-    state = jax.eval_shape(lambda key: trainer.init(config, world, key), jax.random.key(0))
-    program = str(jax.make_jaxpr(lambda s, n: trainer.run_steps(config, world, s, n))(state, jnp.arange(2)))
+def test_only_a_sensor_with_an_image_has_one_in_its_program_and_a_vae(traced, name: str) -> None:
+    _, start, steps = traced(name)
+    state, program = start.out_info, str(steps.jaxpr)
     assert ("pictures[" in program) is (name in (*CODED, "event-image"))
     assert ("7,11]" in program) is (name in (*CODED, "event-image"))  # an array as large as an image
     assert bool(jax.tree.leaves((state.learner.vae, state.learner.vae_optimiser))) is (name in CODED)
     assert (state.actors.env.memory is None) is (name not in ("events", "event-image"))
-
-
-@pytest.mark.parametrize("name", SENSORS)
-@pytest.mark.slow
-def test_training_can_be_mapped_over_seeds(world: World, name: str) -> None:
-    config = with_sensor(name, QUICK)
-    states = jax.eval_shape(jax.vmap(lambda key: trainer.init(config, world, key)), jax.random.split(jax.random.key(0)))
-    train = jax.vmap(lambda state: trainer.run_steps(config, world, state, jnp.arange(4)))
-    after, (episodes, losses) = jax.eval_shape(train, states)
-    assert losses.metrics["q_loss"].shape == (2, 4) and episodes.outcome.shape[:2] == (2, 4)
-    assert jax.tree.map(lambda x: x.shape, after) == jax.tree.map(lambda x: x.shape, states)
 
 
 def test_decisions_that_others_warm_up_in_are_learnt_in() -> None:

@@ -41,20 +41,24 @@ def frames(scenes: list[Scene], count: int, seed: int) -> tuple[Scene, jax.Array
     return scene, jnp.asarray(origin, jnp.float32), jnp.asarray(rotation, jnp.float32)
 
 
+@partial(jax.jit, static_argnums=(0, 1))
+def in_c(call: Callable, config: CameraConfig, scene: Scene, origin: jax.Array, rotation: jax.Array, weights):
+    """`call` is what calls C, of which a program holds one."""
+    pictures = native.pictures(config, scene, origin, rotation, weights)
+    return pictures, native.depths(config, scene, origin, rotation)
+
+
+@partial(jax.jit, static_argnums=0)
+def in_jax(config: CameraConfig, scene: Scene, origin: jax.Array, rotation: jax.Array, weights):
+    pictures = columns.pictures(config, camera.blend, scene, origin, rotation, weights)
+    return pictures, camera._depths(config, scene, origin, rotation)
+
+
 def drawn(config: CameraConfig, scene: Scene, origin: jax.Array, rotation: jax.Array) -> list[np.ndarray]:
     """Brightness and depth [M, H, W], first in C and then in JAX."""
     weights = jnp.broadcast_to(jnp.asarray(LUMA_WEIGHTS), origin.shape)
-    programs = [
-        lambda: (
-            native.pictures(config, scene, origin, rotation, weights),
-            native.depths(config, scene, origin, rotation),
-        ),
-        lambda: (
-            columns.pictures(config, camera.blend, scene, origin, rotation, weights),
-            camera._depths(config, scene, origin, rotation),
-        ),
-    ]
-    return [np.asarray(image) for program in programs for image in jax.jit(program)()]
+    given = config, scene, origin, rotation, weights
+    return [np.asarray(image) for image in (*in_c(native._call, *given), *in_jax(*given))]
 
 
 def agree(config: CameraConfig, scene: Scene, origin: jax.Array, rotation: jax.Array, ties: float = 0.0) -> None:
@@ -97,7 +101,7 @@ def test_c_draws_what_jax_draws(size: tuple[int, int]) -> None:
     config = dataclasses.replace(CONFIG, width=size[0], height=size[1])
     rng = np.random.default_rng(3)
     if native.is_at_hand("cpu"):
-        agree(config, *frames([crowd(rng) for _ in range(8)], 192, seed=4))
+        agree(config, *frames([crowd(rng) for _ in range(8)], 64, seed=4))
     else:  # then there is one camera, and the pictures of the package are its
         scene, origin, rotation = frames([crowd(rng)], 2, seed=4)
         assert np.isfinite(jax.vmap(partial(camera.luma, config))(scene, origin, rotation)).all()
@@ -149,7 +153,7 @@ def test_the_kernels_of_gpus_draw_what_jax_draws(
     monkeypatch.setattr(native, "_call", lambda target, *given: call(f"emulated_{target}", *given))
     config = dataclasses.replace(CONFIG, width=size[0], height=size[1])
     if kernels:
-        agree(config, *frames([world(np.random.default_rng(3))], 32, seed=4))
+        agree(config, *frames([world(np.random.default_rng(3))], 64, seed=4))
     else:
         assert shutil.which("cc") is None
 

@@ -60,16 +60,27 @@ def world_of(*ends) -> World:
     return World(drone.load_airframe(CONFIG.drone), stack_scenes([scene]), missions)
 
 
+@partial(jax.jit, static_argnums=0)
+def begin(config: Config, world: World, keys, number):
+    return jax.vmap(partial(env.ended, config, world))(keys, number)
+
+
+@partial(jax.jit, static_argnums=(0, 1))
+def step_of(config: Config, free: bool, world: World, states, moves, number):
+    """The world is an argument, so that one program flies in all."""
+    one = lambda s, a, m: env.step(config, world, s, a, None if free else m)  # noqa: E731
+    return group.each(config, one)(states, moves, number)
+
+
 def fly(world: World, moves, config: Config = CONFIG, missions=None, key: int = 0, free: bool = False):
     """Steps of all drones: the reset, and one for each row of moves [N]; with the states after each."""
     count = world.missions.scene.shape[0]
     number = jnp.arange(count) if missions is None else jnp.asarray(missions)
     keys = jax.vmap(partial(jax.random.fold_in, jax.random.key(key)))(number)
-    states = [jax.vmap(partial(env.ended, config, world))(keys, number)]
-    step = jax.jit(group.each(config, lambda s, a, m: env.step(config, world, s, a, None if free else m)))
+    states = [begin(config, world, keys, number)]
     steps = []
     for row in [[HOVER] * count, *moves]:
-        state, done = step(states[-1], jnp.asarray(row, jnp.int32), number)
+        state, done = step_of(config, free, world, states[-1], jnp.asarray(row, jnp.int32), number)
         states.append(state)
         steps.append(done)
     return states[1:], steps
