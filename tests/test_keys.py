@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from edqn_jax.cli.arguments import parse_train
+from edqn_jax.cli.train import parse_train
 from edqn_jax.evaluation.missions import mission_key, run_missions
 from edqn_jax.evaluation.rollouts import flight_keys
 from edqn_jax.keys import integers, run_streams

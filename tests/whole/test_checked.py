@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import pytest
 
-from edqn_jax.cli.arguments import parse_train
+from edqn_jax.cli.train import parse_train
 from edqn_jax.config import Config
 from edqn_jax.errors import CheckError
 from edqn_jax.learn.dqn import learner as dqn
