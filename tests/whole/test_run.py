@@ -17,7 +17,7 @@ from edqn_jax.evaluation.missions import run_missions
 from edqn_jax.learn import trainer
 from edqn_jax.learn.plan import Plan
 from edqn_jax.learn.policy import PolicyParams
-from edqn_jax.learn.trainer import Episodes
+from edqn_jax.learn.state import Episodes
 from edqn_jax.report.gallery import prepare_gallery
 from edqn_jax.report.progress import Progress
 from edqn_jax.runs.directory import RunDirectory

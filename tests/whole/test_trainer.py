@@ -26,10 +26,12 @@ from edqn_jax.config import (
 )
 from edqn_jax.config.loading import make_config
 from edqn_jax.errors import ConfigError
-from edqn_jax.learn import replay, saved_state, trainer
+from edqn_jax.learn import replay, saved_state
 from edqn_jax.learn.learner import learner_of
 from edqn_jax.learn.plan import Plan
-from edqn_jax.learn.trainer import Trainer, TrainState
+from edqn_jax.learn.state import TrainState, init
+from edqn_jax.learn.step import _remember, policy_of, run_steps, train_step
+from edqn_jax.learn.trainer import Trainer
 from edqn_jax.sim.physics.disturbances import Disturbance
 from edqn_jax.sim.task import env
 from edqn_jax.sim.task.env import World
@@ -71,7 +73,7 @@ def world() -> World:
 def run(config: Config, world: World, devices: int) -> tuple[list[TrainState], list, int, Trainer]:
     """States on the host after each chunk, what the chunks returned, how often the step was traced; the trainer."""
     traces = 0
-    step = trainer.train_step
+    step = train_step
 
     def counted(*args):
         nonlocal traces
@@ -79,7 +81,7 @@ def run(config: Config, world: World, devices: int) -> tuple[list[TrainState], l
         return step(*args)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(trainer, "train_step", counted)
+        patch.setattr("edqn_jax.learn.step.train_step", counted)
         made = Trainer(config, world, jax.devices()[:devices])
         state = made.init(config.train.seed)
         states, returned = [_host(state)], []
@@ -118,8 +120,8 @@ def test_the_training_chunk_is_traced_exactly_once_in_a_run(on_two) -> None:
 
 @pytest.mark.slow
 def test_no_callback_to_the_host_hides_in_the_step(world: World) -> None:
-    state = jax.eval_shape(lambda k: trainer.init(CONFIG, world, k), jax.random.key(0))
-    jaxpr = jax.make_jaxpr(lambda s, n: trainer.run_steps(CONFIG, world, s, n))(state, jnp.arange(2))
+    state = jax.eval_shape(lambda k: init(CONFIG, world, k), jax.random.key(0))
+    jaxpr = jax.make_jaxpr(lambda s, n: run_steps(CONFIG, world, s, n))(state, jnp.arange(2))
     assert "callback" not in str(jaxpr)
 
 
@@ -288,7 +290,7 @@ def test_the_replay_holds_what_the_environments_went_through(on_one) -> None:
 
 @pytest.mark.slow
 def test_nothing_is_learnt_from_what_stood_there_before_the_first_reset(world: World) -> None:
-    start = jax.jit(partial(trainer.init, CONFIG, world))(jax.random.key(0))
+    start = jax.jit(partial(init, CONFIG, world))(jax.random.key(0))
     actors = jax.tree.map(lambda x: x[0], start.actors)
     envs = actors.reward.shape[0]
 
@@ -321,7 +323,7 @@ def test_a_new_episode_begins_with_an_empty_memory() -> None:
     )
     actors: Any = SimpleNamespace(memory=jnp.full((1, 2, config.agent.history, OWN_SIZE), 7.0))
     learner: Any = SimpleNamespace(encoder={}, agent=SimpleNamespace(average={}))
-    fresh, running = trainer._remember(config, learner, actors, seen, jnp.int32(Plan.of(config).warmup + 5))
+    fresh, running = _remember(config, learner, actors, seen, jnp.int32(Plan.of(config).warmup + 5))
     np.testing.assert_array_equal(fresh, [np.zeros(OWN_SIZE), own[0]])
     np.testing.assert_array_equal(running, [np.full(OWN_SIZE, 7.0), own[1]])
 
@@ -380,8 +382,8 @@ def test_whatever_the_length_of_a_run_its_encoders_never_learn_at_once_or_in_vai
 @pytest.mark.slow
 def test_the_encoder_that_acts_changes_when_the_vae_has_been_trained_and_never_else(world: World) -> None:
     config = retrained(retrain_at=(0.01,))
-    state = jax.jit(lambda key: trainer.init(config, world, key))(jax.random.key(0))
-    step = jax.jit(lambda state, number: trainer.train_step(config, world, None, state, number))
+    state = jax.jit(lambda key: init(config, world, key))(jax.random.key(0))
+    step = jax.jit(lambda state, number: train_step(config, world, None, state, number))
     changed, learnt = [], []
     for number in range(15):
         before = state
@@ -401,9 +403,9 @@ def test_labels_reach_the_vae_and_nothing_that_acts_before_it_does(world: World,
     (_, warmup), (first, end) = Plan.of(config).vae_training
 
     def trained(state: TrainState, start: int, stop: int) -> tuple:
-        return jax.jit(lambda state: trainer.run_steps(config, world, state, jnp.arange(start, stop)))(state)
+        return jax.jit(lambda state: run_steps(config, world, state, jnp.arange(start, stop)))(state)
 
-    state, _ = trained(jax.jit(lambda key: trainer.init(config, world, key))(jax.random.key(0)), 0, first)
+    state, _ = trained(jax.jit(lambda key: init(config, world, key))(jax.random.key(0)), 0, first)
     truly = trained(state, first, end - 1)
     true = env.nearness
     monkeypatch.setattr(env, "nearness", lambda *given: 3.0 - true(*given))
@@ -429,17 +431,15 @@ def test_agents_that_train_together_train_as_each_alone(on_two, world: World) ->
             np.testing.assert_allclose(second_losses.metrics[name], losses.metrics[name], rtol=1e-4)
         learnt |= bool(np.isfinite(losses.metrics["q_loss"]).any())
     assert learnt
-    first, second = together.each(jax.tree.map(np.asarray, trainer.policy_of(together.config, two)))
+    first, second = together.each(jax.tree.map(np.asarray, policy_of(together.config, two)))
     assert not _same(first, second)
-    jax.tree.map(
-        partial(np.testing.assert_allclose, rtol=1e-3, atol=1e-5), second, trainer.policy_of(together.config, state)
-    )
+    jax.tree.map(partial(np.testing.assert_allclose, rtol=1e-3, atol=1e-5), second, policy_of(together.config, state))
 
 
 def test_environments_that_do_not_divide_into_shards_are_refused_with_a_sentence(world: World) -> None:
     config = dataclasses.replace(CONFIG, train=dataclasses.replace(CONFIG.train, num_envs=12))
     with pytest.raises(ConfigError, match=r"num_envs \(12\).*multiples of train.shards \(8\)"):
-        trainer.init(config, world, jax.random.key(0))
+        init(config, world, jax.random.key(0))
 
 
 def test_totals_round_up_to_whole_chunks() -> None:

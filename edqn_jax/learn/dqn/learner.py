@@ -22,9 +22,8 @@ from edqn_jax.learn.actor import observation_size
 from edqn_jax.learn.dqn.losses import batch_loss
 from edqn_jax.learn.exploration import explore
 from edqn_jax.learn.learner import Exploration, Learner, Metrics, Rings, UpdateStats
-from edqn_jax.learn.optimiser import optimiser, polyak, skip_nonfinite
 from edqn_jax.learn.plan import Plan
-from edqn_jax.learn.qnetwork import Params
+from edqn_jax.learn.qnetwork import Params, optimiser, polyak, skip_nonfinite
 from edqn_jax.native.all_sum import all_sum
 from edqn_jax.sim.actions import ACTIONS
 from edqn_jax.sim.task.task import task_of

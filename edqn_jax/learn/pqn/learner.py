@@ -23,10 +23,9 @@ from edqn_jax.learn.actor import observation_size
 from edqn_jax.learn.dqn.losses import td_loss, value_of
 from edqn_jax.learn.exploration import explore
 from edqn_jax.learn.learner import Exploration, Learner, Metrics, Rings, UpdateStats
-from edqn_jax.learn.optimiser import optimiser, polyak, skip_nonfinite
 from edqn_jax.learn.plan import Plan
 from edqn_jax.learn.pqn.returns import Rollout, lambda_returns, rollout_of
-from edqn_jax.learn.qnetwork import Params, network_values
+from edqn_jax.learn.qnetwork import Params, network_values, optimiser, polyak, skip_nonfinite
 from edqn_jax.native.all_sum import all_sum
 from edqn_jax.sim.actions import ACTIONS
 

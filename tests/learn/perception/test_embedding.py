@@ -15,12 +15,13 @@ import pytest
 from edqn_jax.config import CameraConfig, Config, EncoderConfig
 from edqn_jax.config.loading import to_yaml
 from edqn_jax.evaluation.latency import decision_latency_ms
-from edqn_jax.learn import trainer
 from edqn_jax.learn.actor import AgentActor, PolicyParams, observation_size
 from edqn_jax.learn.perception import embedding, pooled_encoder, vae
 from edqn_jax.learn.perception.code import Form
 from edqn_jax.learn.plan import Plan
 from edqn_jax.learn.policy import fresh_policy
+from edqn_jax.learn.state import init
+from edqn_jax.learn.step import run_steps
 from edqn_jax.runs.checkpoints.params import save_params
 from edqn_jax.runs.policies import load_run
 from edqn_jax.runs.provenance import workload
@@ -56,8 +57,8 @@ def world() -> World:
 def test_the_training_step_learns_from_every_sensor(world: World, name: str) -> None:
     config = with_sensor(name, QUICK)
     plan = Plan.of(config)
-    before = jax.jit(lambda key: trainer.init(config, world, key))(jax.random.key(0))
-    train = jax.jit(lambda state: trainer.run_steps(config, world, state, jnp.arange(STEPS)))
+    before = jax.jit(lambda key: init(config, world, key))(jax.random.key(0))
+    train = jax.jit(lambda state: run_steps(config, world, state, jnp.arange(STEPS)))
     after, (_, losses) = train(before)
     for leaf in jax.tree.leaves((after.learner, after.actors.memory, after.actors.replay)):
         assert np.isfinite(np.asarray(leaf)).all()
@@ -85,8 +86,8 @@ def moved(one, two) -> bool:
 @pytest.mark.slow
 def test_only_a_sensor_with_an_image_has_one_in_its_program_and_a_vae(world: World, name: str) -> None:
     config = dataclasses.replace(with_sensor(name, QUICK), camera=CameraConfig(width=11, height=7))
-    state = jax.eval_shape(lambda key: trainer.init(config, world, key), jax.random.key(0))
-    program = str(jax.make_jaxpr(lambda s, n: trainer.run_steps(config, world, s, n))(state, jnp.arange(2)))
+    state = jax.eval_shape(lambda key: init(config, world, key), jax.random.key(0))
+    program = str(jax.make_jaxpr(lambda s, n: run_steps(config, world, s, n))(state, jnp.arange(2)))
     assert ("pictures[" in program) is (name in (*CODED, "event-image"))
     assert ("7,11]" in program) is (name in (*CODED, "event-image"))  # an array as large as an image
     assert bool(jax.tree.leaves((state.learner.vae, state.learner.vae_optimiser))) is (name in CODED)
@@ -97,8 +98,8 @@ def test_only_a_sensor_with_an_image_has_one_in_its_program_and_a_vae(world: Wor
 @pytest.mark.slow
 def test_training_can_be_mapped_over_seeds(world: World, name: str) -> None:
     config = with_sensor(name, QUICK)
-    states = jax.eval_shape(jax.vmap(lambda key: trainer.init(config, world, key)), jax.random.split(jax.random.key(0)))
-    train = jax.vmap(lambda state: trainer.run_steps(config, world, state, jnp.arange(4)))
+    states = jax.eval_shape(jax.vmap(lambda key: init(config, world, key)), jax.random.split(jax.random.key(0)))
+    train = jax.vmap(lambda state: run_steps(config, world, state, jnp.arange(4)))
     after, (episodes, losses) = jax.eval_shape(train, states)
     assert losses.metrics["q_loss"].shape == (2, 4) and episodes.outcome.shape[:2] == (2, 4)
     assert jax.tree.map(lambda x: x.shape, after) == jax.tree.map(lambda x: x.shape, states)
