@@ -15,7 +15,6 @@ from flax import struct
 from jax import Array
 
 from edqn_jax.config import Config
-from edqn_jax.errors import ConfigError
 from edqn_jax.learn import replay, samples
 from edqn_jax.learn.actor import AgentActor, observation_size
 from edqn_jax.learn.learner import Metrics, learner_of
@@ -110,17 +109,8 @@ class InitialKeys(NamedTuple):
 
 
 def init(config: Config, world: World, key: Array) -> TrainState:
-    """Returns the state before the first step; a pure function of the key, so `vmap` maps it over seeds.
-
-    Raises:
-        ConfigError: if the environments or the batch do not divide into the shards.
-    """
+    """Returns the state before the first step; a pure function of the key, so `vmap` maps it over seeds."""
     shards, envs = config.train.shards, config.train.num_envs
-    if envs % shards or config.agent.batch_size % shards or config.encoder.batch_size % shards:
-        raise ConfigError(
-            f"train.num_envs ({envs}), agent.batch_size ({config.agent.batch_size}) and encoder.batch_size "
-            f"({config.encoder.batch_size}) must be multiples of train.shards ({shards})"
-        )
     keys = InitialKeys.split(key, envs, shards)
     # Nothing has been seen yet: the first step is every environment's reset.
     task = task_of(config)

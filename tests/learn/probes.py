@@ -16,7 +16,7 @@ import optax
 from jax import Array
 
 from edqn_jax.config import AgentConfig
-from edqn_jax.learn import optimiser, qnetwork, replay
+from edqn_jax.learn import qnetwork, replay
 from edqn_jax.learn.dqn import losses
 from edqn_jax.sim.task.outcomes import Outcome
 
@@ -94,7 +94,7 @@ def learn(config: AgentConfig, steps: int, task: Array, key: Array) -> Array:
     """Q [states, actions] after `steps` decisions of random exploration, one update each."""
     q_key, first_key, key = jax.random.split(key, 3)
     online = qnetwork.init_q(config, STATES, ACTIONS, q_key)
-    adam = optimiser.optimiser(config, steps)
+    adam = qnetwork.optimiser(config, steps)
     draw = partial(jax.random.randint, shape=(ENVS,), minval=0, maxval=ACTIONS)
     lives = Life(
         state=jax.vmap(partial(first_state, task))(jax.random.split(first_key, ENVS)),
@@ -118,7 +118,7 @@ def learn(config: AgentConfig, steps: int, task: Array, key: Array) -> Array:
         learned: qnetwork.Params = optax.apply_updates(online, change)
         warm = time > 4 * (config.n_step + config.history)
         learned, after = jax.tree.map(lambda a, b: jnp.where(warm, a, b), (learned, after), (online, state))
-        target = optimiser.polyak(learned, target, config.target_rate)
+        target = qnetwork.polyak(learned, target, config.target_rate)
         return (learned, target, after, lives, ring, action, key), None
 
     ring = replay.empty(replay.ring_length(config, ENVS), ENVS, STATES)
