@@ -28,7 +28,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from edqn_jax.cli.arguments import parse_train
+from edqn_jax.cli.train import parse_train
 from edqn_jax.config.loading import to_yaml
 from edqn_jax.devices.hardware import processor
 from edqn_jax.evaluation.metrics import wilson_interval

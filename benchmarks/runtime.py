@@ -30,7 +30,7 @@ from pathlib import Path
 from typing import Any
 
 from conventional_stack.settings import DRONES, supported
-from edqn_jax.cli.arguments import parse_train
+from edqn_jax.cli.train import parse_train
 from edqn_jax.config import FAMILIES, Config
 from edqn_jax.config.loading import nearest, to_yaml
 from edqn_jax.devices.hardware import cores

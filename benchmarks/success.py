@@ -37,7 +37,7 @@ import jax
 import numpy as np
 import yaml
 
-from edqn_jax.cli.arguments import parse_train
+from edqn_jax.cli.train import parse_train
 from edqn_jax.config import FAMILIES, Config
 from edqn_jax.config.loading import apply, to_yaml
 from edqn_jax.devices.devices import most_that_divide, use_cpu_devices

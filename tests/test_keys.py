@@ -7,11 +7,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from edqn_jax.cli.arguments import parse_train
+from edqn_jax.cli.train import parse_train
 from edqn_jax.evaluation.missions import mission_key, run_missions
 from edqn_jax.evaluation.rollouts import flight_keys
 from edqn_jax.keys import integers, run_streams
-from edqn_jax.learn.trainer import InitialKeys, ShardKeys, init
+from edqn_jax.learn.state import InitialKeys, init
+from edqn_jax.learn.step import ShardKeys
 from edqn_jax.sim.task import env
 from edqn_jax.sim.worlds import families
 from tests.support.miniature import MINIATURE

@@ -7,7 +7,7 @@ import dataclasses
 import jax
 
 from edqn_jax.config import Config
-from edqn_jax.learn import trainer
+from edqn_jax.learn.state import init
 from edqn_jax.sim.task.env import World
 from measurement.timing import size_of
 
@@ -28,7 +28,7 @@ class StateBytes:
 
 def state_bytes(config: Config, world: World) -> StateBytes:
     """Returns the bytes of the train state for a configuration."""
-    state = jax.eval_shape(lambda world, key: trainer.init(config, world, key), world, jax.random.key(0))
+    state = jax.eval_shape(lambda world, key: init(config, world, key), world, jax.random.key(0))
     actors, ring = state.actors, state.actors.replay
     environments = size_of(dataclasses.replace(actors, replay=None, samples=None, key=None))
     return StateBytes(

@@ -20,7 +20,8 @@ from edqn_jax.learn.learner import Rings, learner_of
 from edqn_jax.learn.perception import vae
 from edqn_jax.learn.plan import Plan
 from edqn_jax.learn.samples import Samples
-from edqn_jax.learn.trainer import AXIS, Actors, TrainState
+from edqn_jax.learn.state import Actors, TrainState
+from edqn_jax.learn.trainer import AXIS
 from edqn_jax.learn.updates import Networks
 from edqn_jax.sim.actions import ACTIONS
 from edqn_jax.sim.camera import camera, columns, native

@@ -19,7 +19,9 @@ from edqn_jax.evaluation.latency import decision_seconds
 from edqn_jax.evaluation.missions import RunMissions, run_missions
 from edqn_jax.evaluation.rollouts import fly_on_all_devices
 from edqn_jax.learn.policy import PolicyParams
-from edqn_jax.learn.trainer import Trainer, TrainState, policy_of
+from edqn_jax.learn.state import TrainState
+from edqn_jax.learn.step import policy_of
+from edqn_jax.learn.trainer import Trainer
 from edqn_jax.runs.provenance import workload
 from edqn_jax.sim.task.env import World
 from edqn_jax.sim.task.flights import Flights

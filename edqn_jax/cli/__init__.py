@@ -7,11 +7,11 @@ from collections.abc import Sequence
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Runs one command and returns its exit code, see `cli.commands.run`."""
-    from edqn_jax.cli.streams import lasting_streams, lost
+    from edqn_jax.cli.process.streams import lasting_streams, lost
 
     with lasting_streams() as outputs:
-        from edqn_jax.cli.signals import heard
-        from edqn_jax.cli.variables import prepare_process
+        from edqn_jax.cli.process.signals import heard
+        from edqn_jax.cli.process.variables import prepare_process
 
         prepare_process()
         with heard() as stops:

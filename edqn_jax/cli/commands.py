@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 import signal
 import sys
 from collections.abc import Sequence
@@ -10,28 +9,17 @@ from importlib import metadata
 
 import tyro
 
-from edqn_jax.cli.arguments import (
-    CompletionArgs,
-    EvaluateArgs,
-    EventsArgs,
-    ExportArgs,
-    RecordArgs,
-    ReportArgs,
-    TrainCommand,
-    VerifyArgs,
-    parse_completion,
-    parse_evaluate,
-    parse_events,
-    parse_export,
-    parse_record,
-    parse_report,
-    parse_verify,
-)
-from edqn_jax.cli.completion import completion_script
+from edqn_jax.cli.completion import CompletionArgs, completion_script, parse_completion
+from edqn_jax.cli.evaluate import EvaluateArgs, evaluate_command, parse_evaluate
+from edqn_jax.cli.events import EventsArgs, events_command, parse_events
+from edqn_jax.cli.export import ExportArgs, export_command, parse_export
 from edqn_jax.cli.help import ABOUT
-from edqn_jax.cli.signals import Stops
-from edqn_jax.cli.train import train_command
-from edqn_jax.cli.variables import check_devices, start_jax
+from edqn_jax.cli.process.signals import Stops
+from edqn_jax.cli.process.variables import check_devices, start_jax
+from edqn_jax.cli.record import RecordArgs, parse_record, record_command
+from edqn_jax.cli.report import ReportArgs, parse_report, report_command
+from edqn_jax.cli.train import TrainCommand, train_command
+from edqn_jax.cli.verify import VerifyArgs, parse_verify, verify_command
 from edqn_jax.errors import CheckError, ConfigError, DivergedError, StoppedError, nearest, sentence
 from edqn_jax.extras import MissingPackageError
 from edqn_jax.user_code import load_module
@@ -62,13 +50,14 @@ VERSIONS = ("jax", "mujoco", "mujoco-mjx")
 """Packages whose versions `edqn --version` names below its own."""
 
 OF_A_RUN = {
-    "evaluate": parse_evaluate,
-    "record": parse_record,
-    "report": parse_report,
-    "verify": parse_verify,
-    "export": parse_export,
-    "events": parse_events,
+    "evaluate": (parse_evaluate, evaluate_command),
+    "record": (parse_record, record_command),
+    "report": (parse_report, report_command),
+    "verify": (parse_verify, verify_command),
+    "export": (parse_export, export_command),
+    "events": (parse_events, events_command),
 }
+"""Commands on a finished run or a file: what parses their arguments, which does not import JAX, and what runs them."""
 
 
 def run(argv: Sequence[str] | None, stops: Stops) -> int:
@@ -165,7 +154,8 @@ def import_module_or_file(name: str) -> None:
 
 def _of_a_run(command: str, argv: Sequence[str]) -> None:
     """Runs a command on a finished run or a file; JAX is imported once the arguments are known to be right."""
-    args = OF_A_RUN[command](argv)
+    parse, run_command = OF_A_RUN[command]
+    args = parse(argv)
     start_jax()
 
     from edqn_jax.devices.cache import keep_programs
@@ -174,5 +164,4 @@ def _of_a_run(command: str, argv: Sequence[str]) -> None:
     use_cpu_devices()
     check_devices()
     keep_programs()
-    module = importlib.import_module(f"edqn_jax.cli.{command}")
-    getattr(module, f"{command}_command")(args)
+    run_command(args)

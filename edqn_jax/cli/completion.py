@@ -4,14 +4,19 @@ from __future__ import annotations
 
 import contextlib
 import io
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import tyro
+from tyro.conf import Positional, arg
 
-from edqn_jax.cli.arguments import SHORT_NAMES, EvaluateArgs, RecordArgs, TrainOptions
-from edqn_jax.cli.help import REGISTERED, all_of_train, described, with_conditions
+from edqn_jax.cli.arguments import parsed
+from edqn_jax.cli.evaluate import EvaluateArgs
+from edqn_jax.cli.help import COMPLETION, REGISTERED, all_of_train, described, with_conditions
+from edqn_jax.cli.record import RecordArgs
+from edqn_jax.cli.train import SHORT_NAMES, TrainOptions
 from edqn_jax.config import CONDITIONS
 from edqn_jax.config.loading import make_config
 
@@ -24,6 +29,24 @@ FILES_TOO = {
     "fish": {"complete --no-files": "complete"},
 }
 """What is replaced in tyro's scripts so that a shell offers files, such as runs and worlds, where nothing else fits."""
+
+
+@dataclass(frozen=True)
+class CompletionArgs:
+    """Print a script that completes commands, options and their values in a shell."""
+
+    shell: Annotated[Positional[Literal["bash", "zsh", "fish"]], arg(metavar="SHELL")]
+    """`bash`, `zsh` or `fish`."""
+
+
+def parse_completion(argv: Sequence[str]) -> CompletionArgs:
+    """Returns the arguments of `edqn completion`.
+
+    Raises:
+        ConfigError: if there is no such flag.
+        SystemExit: after printing, for --help and for what does not parse.
+    """
+    return parsed(CompletionArgs, argv, COMPLETION)
 
 
 def completion_script(shell: Literal["bash", "zsh", "fish"], kinds: Mapping[str, type]) -> str:

@@ -3,27 +3,83 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Annotated, Any
 
+import tyro
 from rich.console import Console
 from rich.table import Table
+from tyro.conf import Positional, arg
 
-from edqn_jax.cli.arguments import EvaluateArgs
+from edqn_jax.cli.arguments import Point, check_flags, check_run, flags_of, flags_of_group, print_notes
+from edqn_jax.cli.help import ABOUT, EVALUATE, asks_for_help, described, show, with_conditions
+from edqn_jax.config import CONDITIONS
 from edqn_jax.config.presets import Layer
 from edqn_jax.errors import ConfigError
-from edqn_jax.evaluation.evaluate import evaluate
-from edqn_jax.evaluation.latency import decision_latency_ms
-from edqn_jax.evaluation.metrics import clearance_text
-from edqn_jax.evaluation.trajectories import write_trajectories
 from edqn_jax.files import check_can_write, write_atomically
-from edqn_jax.learn.policy import Policy
 from edqn_jax.policies import function_named
-from edqn_jax.policies.functions import FunctionPolicy, actor_of, config_of
-from edqn_jax.runs.directory import plain
-from edqn_jax.runs.policies import find_policy, policy_digest, worlds_replaced
-from edqn_jax.runs.provenance import source_record, versions
+
+if TYPE_CHECKING:
+    from edqn_jax.learn.policy import Policy
+    from edqn_jax.policies.functions import FunctionPolicy
+
+
+@dataclass(frozen=True)
+class EvaluateArgs:
+    """Fly a policy on missions in any world and print metrics."""
+
+    run: Annotated[Positional[Path], arg(metavar="POLICY")]
+    """Folder of a run, or `pretrained`: the policy that comes with the package; or any function of your own, as
+    `module:name` or `path/to/file.py:name`."""
+    world: Annotated[str | None, arg(metavar="WORLD", help_behavior_hint="")] = None
+    """Where to fly: `paper`, an MJCF file, or test worlds of a family (default: where training was)."""
+    start: Annotated[Point | None, arg(metavar="X Y Z", help_behavior_hint="")] = None
+    """Start of every mission, metres (default: the world's; random free ones with --missions)."""
+    goal: Annotated[Point | None, arg(metavar="X Y Z", help_behavior_hint="")] = None
+    """Goal of every mission, metres (default: the world's; random free ones on random worlds)."""
+    missions: Annotated[int, arg(metavar="N")] = 1
+    """Number of missions."""
+    seed: Annotated[int, arg(metavar="S")] = 0
+    """Seed of the missions."""
+    shuffle_codes: Annotated[bool, arg(help_behavior_hint="")] = False
+    """Give each drone the events of another one at each decision, which measures how much the policy depends on its
+    events. For other sensors, permutes that observation."""
+    json: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
+    """Also write the metrics as JSON."""
+    trajectories: Annotated[Path | None, arg(metavar="FILE.npz", help_behavior_hint="")] = None
+    """Also write every flight, one pose per physics step."""
+    conditions: Annotated[Layer, tyro.conf.Fixed] = field(default_factory=dict)
+    """Options of `config.CONDITIONS` in place of the policy's own."""
+
+
+def parse_evaluate(argv: Sequence[str]) -> EvaluateArgs:
+    """Returns the checked arguments of `edqn evaluate`.
+
+    Raises:
+        ConfigError: if one is out of its limits, or there is no such run.
+        SystemExit: after printing, for --help and for arguments that do not parse.
+    """
+    kind = with_conditions(described(EvaluateArgs), CONDITIONS)
+    flags = {
+        flag: (group, option) for group, names in CONDITIONS.items() for flag, option in flags_of_group(group, names)
+    }
+    check_flags(argv, flags_of(EvaluateArgs) | set(flags), EVALUATE)
+    if asks_for_help(argv):
+        show(kind, EVALUATE, ABOUT[EVALUATE])
+    parsed: Any = tyro.cli(kind, args=argv, prog=EVALUATE)
+    conditions: dict[str, dict[str, Any]] = {}
+    for word in argv:
+        group, option = flags.get(word.partition("=")[0].replace("_", "-"), ("", ""))
+        if group:
+            conditions.setdefault(group, {})[option] = getattr(getattr(parsed, group), option)
+    own = {name: value for name, value in vars(parsed).items() if name not in CONDITIONS}
+    args = EvaluateArgs(**own, conditions=conditions)
+    if args.missions < 1:
+        raise ConfigError(f"--missions must be at least 1, not {args.missions}")
+    check_run(args.run)
+    return args
 
 
 def evaluate_command(args: EvaluateArgs) -> None:
@@ -32,6 +88,14 @@ def evaluate_command(args: EvaluateArgs) -> None:
     Raises:
         ConfigError: if the run, the world or a file to write is not as it should be.
     """
+    from edqn_jax.evaluation.evaluate import evaluate
+    from edqn_jax.evaluation.latency import decision_latency_ms
+    from edqn_jax.evaluation.trajectories import write_trajectories
+    from edqn_jax.policies.functions import actor_of, config_of
+    from edqn_jax.runs.directory import plain
+    from edqn_jax.runs.policies import find_policy
+    from edqn_jax.runs.provenance import versions
+
     for file in (args.json, args.trajectories):
         if file is not None:
             check_can_write(file)
@@ -61,9 +125,7 @@ def evaluate_command(args: EvaluateArgs) -> None:
         **evaluation.figures,
         "decision_latency_ms": decision_latency_ms(config, policy.params, actor=actor_of(policy, config)),
     }
-    notes = [] if args.world is not None else worlds_replaced(args.run)
-    for note in (*notes, *([evaluation.missions.note] if evaluation.missions.note is not None else [])):
-        Console().print(note, soft_wrap=True, markup=False, highlight=False)
+    print_notes(args.run, args.world, evaluation.missions.note)
     Console().print(report(figures))
     if args.json is not None:
         write_atomically(args.json, json.dumps(plain(figures), indent=2, allow_nan=False) + "\n")
@@ -73,6 +135,10 @@ def evaluate_command(args: EvaluateArgs) -> None:
 
 def _told_of(policy: Policy | FunctionPolicy, run: Path) -> dict[str, Any]:
     """Returns the SHA-256 of a saved policy, or the name of a function with that of its source."""
+    from edqn_jax.policies.functions import FunctionPolicy
+    from edqn_jax.runs.policies import policy_digest
+    from edqn_jax.runs.provenance import source_record
+
     if isinstance(policy, FunctionPolicy):
         return {"policy_function": source_record(policy.function)}
     return {} if function_named(run) else {"policy_sha256": policy_digest(run)}
@@ -86,6 +152,7 @@ def _named(conditions: Layer) -> Iterator[tuple[str, Any]]:
 
 def report(figures: dict[str, Any]) -> Table:
     """Returns the figures as a table for people."""
+    from edqn_jax.evaluation.metrics import clearance_text
 
     def number(value: float | None, form: str) -> str:
         return "–" if value is None else form.format(value)

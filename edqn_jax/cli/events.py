@@ -3,28 +3,95 @@
 from __future__ import annotations
 
 import json
-from typing import TYPE_CHECKING, Any
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
 from rich.console import Console
 from rich.table import Table
+from tyro.conf import Positional, arg
 
-from edqn_jax.cli.arguments import EventsArgs
+from edqn_jax.cli.arguments import Point, check_is_saved, check_run, parsed
+from edqn_jax.cli.help import EVENTS
+from edqn_jax.errors import ConfigError
 from edqn_jax.files import check_can_write, write_atomically
-from edqn_jax.interop.recordings.event_files import check_can_write_events, read_events, write_events
-from edqn_jax.interop.recordings.recording import Recording
-from edqn_jax.interop.recordings.seen_events import image_at, seen_by, window_ends
-from edqn_jax.runs.directory import plain
-from edqn_jax.runs.policies import load_policy
 
 if TYPE_CHECKING:
+    from edqn_jax.interop.recordings.recording import Recording
     from edqn_jax.report.recordings import Strip
+
 
 WINDOW_S = 0.05
 """Length of a window in pictures without a policy, seconds."""
 
 LONG_PAUSE_S = 1.0
 """Longest time between two events that is not told, seconds."""
+
+
+@dataclass(frozen=True)
+class EventsArgs:
+    """Say what a file of events holds; see it as a policy does; write it in another form."""
+
+    file: Annotated[Positional[Path], arg(metavar="FILE")]
+    """HDF5 in DSEC's layout (.h5, .hdf5), NumPy (.npz), text (.txt, .csv), or a camera's own file: .aedat4, .raw (EVT2,
+    EVT3), .dat, .es."""
+    size: Annotated[tuple[int, int] | None, arg(metavar="W H", help_behavior_hint="")] = None
+    """Pixels across and down, where the file does not say (default: what the file says)."""
+    time_unit: Annotated[Literal["s", "ms", "us", "ns"] | None, arg(help_behavior_hint="")] = None
+    """Unit of the times, where the file does not say (default: the only plausible one)."""
+    columns: Annotated[str | None, arg(metavar="t,x,y,p", help_behavior_hint="")] = None
+    """Order of a text's columns, where no line names them (default: t,x,y,p, refused where another order fits)."""
+    stream: Annotated[int | None, arg(metavar="N", help_behavior_hint="")] = None
+    """Which stream of events of an .aedat4 that has several, such as those of two cameras."""
+    start: Annotated[float | None, arg(metavar="S", help_behavior_hint="")] = None
+    """Leave out what is before this, seconds from the first event."""
+    stop: Annotated[float | None, arg(metavar="S", help_behavior_hint="")] = None
+    """Leave out what is from this on, seconds from the first event."""
+    policy: Annotated[Path | None, arg(metavar="RUN", help_behavior_hint="")] = None
+    """Run, or `pretrained`, at whose resolution and in whose windows the events are shown, and which encodes them."""
+    contrast: Annotated[float | None, arg(metavar="C", help_behavior_hint="")] = None
+    """Change of log brightness that makes an event in the camera (default: that of the policy)."""
+    fov: Annotated[float | None, arg(metavar="DEG", help_behavior_hint="")] = None
+    """The camera's horizontal field of view, degrees (default: its whole image is taken for the policy's)."""
+    velocity: Annotated[Point, arg(metavar="X Y Z")] = (0.0, 0.0, 0.0)
+    """Velocity ahead, to the left and up, m/s, where the file has no flight: the encoder reads events with it."""
+    yaw_rate: Annotated[float, arg(metavar="R")] = 0.0
+    """Yaw rate, rad/s to the left, likewise."""
+    window: Annotated[float | None, arg(metavar="S", help_behavior_hint="")] = None
+    """Length of a window in pictures in seconds (default: 0.05, a policy's own with --policy)."""
+    picture: Annotated[Path | None, arg(metavar="FILE.png|gif", help_behavior_hint="")] = None
+    """Also draw windows: six moments as a .png, or up to 120 as a .gif."""
+    out: Annotated[Path | None, arg(metavar="FILE.h5|npz|txt", help_behavior_hint="")] = None
+    """Also write the events, from --start to --stop."""
+    json: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
+    """Also write what was found as JSON."""
+
+
+def parse_events(argv: Sequence[str]) -> EventsArgs:
+    """Returns the checked arguments of `edqn events`.
+
+    Raises:
+        ConfigError: if one is out of its limits, or there is no such file or policy.
+        SystemExit: after printing, for --help and for what does not parse.
+    """
+    args = parsed(EventsArgs, argv, EVENTS)
+    if args.file.is_dir():
+        raise ConfigError(f"'{args.file}' is a folder; give a file of events")
+    if not args.file.is_file():
+        raise ConfigError(f"there is no file '{args.file}'")
+    for name, number in (("--contrast", args.contrast), ("--window", args.window)):
+        if number is not None and not number > 0.0:
+            raise ConfigError(f"{name} must be above 0, not {number}")
+    if args.window is not None and args.policy is not None:
+        raise ConfigError("--window and --policy cannot both be given: a policy has a window of its own")
+    if args.picture is not None and args.picture.suffix.lower() not in (".png", ".gif"):
+        raise ConfigError(f"'{args.picture}' must end in .png or .gif")
+    if args.policy is not None:
+        check_is_saved(args.policy, "--policy")
+        check_run(args.policy)
+    return args
 
 
 def events_command(args: EventsArgs) -> None:
@@ -34,20 +101,22 @@ def events_command(args: EventsArgs) -> None:
         ConfigError: if the file, the policy or a file to write is not as it should be.
         MissingPackageError: if the extra `events` is needed and not installed.
     """
+    from edqn_jax.interop.recordings.event_files import check_can_write_events, read_events, write_events
+    from edqn_jax.runs.directory import plain
+
     for file in (args.picture, args.json):
         if file is not None:
             check_can_write(file)
     if args.out is not None:
         check_can_write_events(args.out)
-    console = Console()
     whole = read_events(args.file, size=args.size, time_unit=args.time_unit, columns=args.columns, stream=args.stream)
     recording = whole.between(args.start, args.stop)
     figures: dict[str, Any] = {"file": str(args.file), **found(recording)}
     strips, times_s, period_s = _strips(args, recording, figures)
-    console.print(report(figures))
+    Console().print(report(figures))
     if args.policy is not None:
         for note in _notes(args, recording):
-            console.print(note, soft_wrap=True, markup=False, highlight=False)
+            print(note)
     if args.picture is not None:
         from edqn_jax.report.recordings import animate_recording, draw_recording
 
@@ -121,6 +190,9 @@ def _strips(args: EventsArgs, recording: Recording, figures: dict[str, Any]) -> 
     """Returns what there is to draw, when, and how long a frame is to be shown."""
     if args.policy is None and args.picture is None:
         return [], [], 0.0
+    from edqn_jax.interop.recordings.seen_events import image_at, seen_by, window_ends
+    from edqn_jax.runs.policies import load_policy
+
     begin = int(recording.events["t"][0])
     seen = None
     if args.policy is None:

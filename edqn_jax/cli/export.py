@@ -2,11 +2,43 @@
 
 from __future__ import annotations
 
-from rich.console import Console
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
 
-from edqn_jax.cli.arguments import ExportArgs
-from edqn_jax.interop.deployment.onnx_export import export_policy
-from edqn_jax.runs.policies import load_policy, policy_digest
+from tyro.conf import Positional, arg
+
+from edqn_jax.cli.arguments import check_is_saved, check_run, parsed
+from edqn_jax.cli.help import EXPORT
+from edqn_jax.errors import ConfigError
+
+
+@dataclass(frozen=True)
+class ExportArgs:
+    """Write a policy as ONNX, for a computer without JAX, and beside it the runner that flies it; compare both."""
+
+    run: Annotated[Positional[Path], arg(metavar="RUN")]
+    """Folder of the run, or `pretrained`: the policy that comes with the package."""
+    out: Annotated[Path, arg(metavar="FILE.onnx")]
+    """File to write; it replaces one of that name."""
+    checks: Annotated[int, arg(metavar="N")] = 1000
+    """Random inputs on which ONNX and JAX must choose the same moves, with values that agree to 1e-5 of the largest."""
+
+
+def parse_export(argv: Sequence[str]) -> ExportArgs:
+    """Returns the checked arguments of `edqn export`.
+
+    Raises:
+        ConfigError: if one is out of its limits, or there is no such run.
+        SystemExit: after printing, for --help and for what does not parse.
+    """
+    args = parsed(ExportArgs, argv, EXPORT)
+    if args.checks < 1000:
+        raise ConfigError(f"--checks must be at least 1000, not {args.checks}")
+    check_is_saved(args.run, EXPORT)
+    check_run(args.run)
+    return args
 
 
 def export_command(args: ExportArgs) -> None:
@@ -16,13 +48,13 @@ def export_command(args: ExportArgs) -> None:
         CheckError: if ONNX and JAX do not agree.
         ConfigError: if the run or the file to write is not as it should be.
     """
+    from edqn_jax.interop.deployment.onnx_export import export_policy
+    from edqn_jax.runs.policies import load_policy, policy_digest
+
     exported = export_policy(load_policy(args.run), args.out, checks=args.checks, digest=policy_digest(args.run))
     ties = f", {exported.ties} of them ties" if exported.ties else ""
-    Console().print(
+    print(
         f"'{exported.file}' has {exported.file.stat().st_size / 1e6:.1f} MB; on {exported.checks:,} random inputs it "
         f"chooses JAX's moves{ties}, and no value differs by more than {exported.largest_difference:.1e} of the "
         f"largest; '{exported.runner}' flies it with NumPy and onnxruntime",
-        soft_wrap=True,
-        markup=False,
-        highlight=False,
     )

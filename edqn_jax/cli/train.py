@@ -1,4 +1,4 @@
-"""`edqn train`: from arguments to a trained, flown and drawn run."""
+"""`edqn train`: its arguments, and from them to a trained, flown and drawn run."""
 
 from __future__ import annotations
 
@@ -8,24 +8,160 @@ import importlib.util
 import os
 import sys
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated, Literal
 
+import tyro
 from rich.console import Console
+from tyro.conf import arg
 
-from edqn_jax.cli.arguments import TrainOptions, parse_train
-from edqn_jax.cli.signals import Stops
-from edqn_jax.cli.variables import check_devices, platforms_named, start_jax
+from edqn_jax.cli.arguments import check_flags, flags_of_group
+from edqn_jax.cli.help import TRAIN, asks_for_help, flag_of, show_train_help
+from edqn_jax.cli.process.signals import Stops
+from edqn_jax.cli.process.variables import check_devices, platforms_named, start_jax
 from edqn_jax.config import FAMILIES, Config
-from edqn_jax.config.loading import to_yaml
+from edqn_jax.config.loading import apply, resolve, to_yaml
 from edqn_jax.config.presets import gpu_layers
-from edqn_jax.devices.launch import how_to_join
+from edqn_jax.config.rules import check_learns, validate
+from edqn_jax.devices.hardware import hardware
+from edqn_jax.devices.launch import Distributed, how_to_join
 from edqn_jax.errors import ConfigError
 from edqn_jax.extras import SINKS
-from edqn_jax.runs.directory import RunDirectory, plan_run_directory
+from edqn_jax.runs.continuation import begun, continued
+from edqn_jax.runs.directory import Resume, RunDirectory, plan_run_directory
 
 if TYPE_CHECKING:
     from edqn_jax.interop import tracking
+
+
+SHORT_NAMES = {
+    "--world": "--world.name",
+    "--num-envs": "--train.num-envs",
+    "--total-steps": "--train.total-steps",
+    "--seed": "--train.seed",
+    "--debug": "--train.debug",
+}
+"""Short names of common options."""
+
+PROFILE = "--events.profile"
+
+
+@dataclass(frozen=True)
+class TrainOptions:
+    preset: Literal["default", "paper"] = "default"
+    """`default`: the best agent known to us. `paper`: exactly Table 1 of the paper."""
+    tuned_for: Literal["auto", "cpu", "gpu"] = "auto"
+    """Hardware that environments, batches, networks and decisions are chosen for; `auto`: a GPU where a card and JAX's
+    plugin for it are found. The preset `paper` is the same on both."""
+    config: Annotated[Path | None, arg(metavar="FILE.yaml", help_behavior_hint="")] = None
+    """YAML file of options by group; overrides the preset, and flags override the file."""
+    seeds: Annotated[int | None, arg(metavar="K", help_behavior_hint="")] = None
+    """Train K policies, of the seeds from --seed on, side by side in one program; each gets a folder `seed-N` in the
+    folder of the run, whose summary has every seed's success and their interquartile mean."""
+    run_dir: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="")] = None
+    """Folder for the files of the run (default: a new, dated folder under runs/)."""
+    resume: Resume = "auto"
+    """What to do with a run in --run-dir: `auto` continues it from its newest checkpoint, `must` refuses to begin one,
+    `never` starts an unfinished one over. A run goes on with its own options; those that are given must be the same,
+    but for --total-steps, which may be more."""
+    track: Annotated[tuple[Literal["tensorboard", "wandb"], ...], arg(help_behavior_hint="")] = ()
+    """Also write the metrics for TensorBoard, or for Weights & Biases offline, or both, into the folder of the run
+    (extra `track`)."""
+    view: Annotated[Literal["rerun"] | None, arg(help_behavior_hint="")] = None
+    """Also write metrics and validation flights as `training.rrd` into the folder of the run and, where there is a
+    screen, show them live in the Rerun viewer (extra `viz`)."""
+    distributed: Distributed = "auto"
+    """Whether to train together with other processes, on one host or many: `auto` where --coordinator-address is given
+    or Slurm's srun has started several tasks, `must` in any cluster that JAX finds, `never` not at all."""
+    coordinator_address: Annotated[str | None, arg(metavar="HOST:PORT", help_behavior_hint="")] = None
+    """Address of process 0. Give this and the next two options to every process."""
+    num_processes: Annotated[int | None, arg(metavar="N", help_behavior_hint="")] = None
+    """Number of processes that train together."""
+    process_id: Annotated[int | None, arg(metavar="I", help_behavior_hint="")] = None
+    """Number of this process, from 0; process 0 writes the run directory."""
+
+
+@dataclass(frozen=True)
+class TrainCommand:
+    """Train a drone to fly from events, evaluate it and draw figures."""
+
+    options: Annotated[TrainOptions, arg(name="")] = field(default_factory=TrainOptions)
+    config: Annotated[Config, arg(name="")] = field(default_factory=Config)
+
+
+def parse_train(argv: Sequence[str]) -> tuple[TrainOptions, Config]:
+    """Returns the options, hardware decided, and the checked configuration of the arguments of `edqn train`.
+
+    Raises:
+        ConfigError: if the preset, the file or a value is invalid.
+        SystemExit: after printing, for --help, --help-all and for arguments that do not parse.
+    """
+    check_flags(argv, train_flags(), TRAIN)
+    argv = [_long_name(word) for word in argv]
+    # Preset, file and world decide the defaults that the other flags change and that --help shows.
+    everything = "--help-all" in argv
+    helped = everything or asks_for_help(argv)
+    argv = [word for word in argv if word not in ("-h", "--help", "--help-all")]
+    options, _ = tyro.cli(TrainOptions, args=argv, prog=TRAIN, return_unknown_args=True, add_help=False)
+    if options.seeds is not None and options.seeds < 1:
+        raise ConfigError(f"--seeds must be at least 1, not {options.seeds}")
+    tuned_for = hardware() if options.tuned_for == "auto" else options.tuned_for
+    options = dataclasses.replace(options, tuned_for=tuned_for)
+    folder = None if options.resume == "never" else options.run_dir
+    run = None if folder is None else begun(folder)
+    if run is not None and not _names_defaults(argv):
+        begins = run.config
+    else:
+        world = _parse_config(argv, resolve(options.preset, options.config)).world.name
+        begins = resolve(options.preset, options.config, world, tuned_for)
+    if any(word.partition("=")[0] == PROFILE for word in argv):
+        # What else is given changes one of the profile's figures.
+        profile = _parse_config(argv, begins).events.profile
+        begins = apply(begins, {"events": {"profile": profile}}, "the command line")
+    if helped:
+        show_train_help(TrainOptions(), begins, SHORT_NAMES, everything=everything)
+    config = _found_worlds(_parse_config(argv, begins))
+    validate(config)
+    check_learns(config)
+    if run is not None and folder is not None:
+        options = dataclasses.replace(options, seeds=run.seeds if options.seeds is None else options.seeds)
+        config = continued(folder, run, config, options.seeds)
+    return options, config
+
+
+def _names_defaults(argv: Sequence[str]) -> bool:
+    """Returns whether the words of a command say what options begin with, instead of those of the run."""
+    return any(word.partition("=")[0] in ("--preset", "--config", "--tuned-for", "--tuned_for") for word in argv)
+
+
+def _found_worlds(config: Config) -> Config:
+    """Returns the configuration with whole paths of its worlds' files."""
+    world = dataclasses.replace(config.world, name=_found(config.world.name), flown=_found(config.world.flown))
+    return dataclasses.replace(config, world=world)
+
+
+def _found(world: str) -> str:
+    """Returns the name of a world; of a file, its whole path, by which it is found again from any folder."""
+    return str(Path(world).resolve()) if world not in FAMILIES and Path(world).is_file() else world
+
+
+def train_flags() -> set[str]:
+    """Returns every flag of `edqn train`."""
+    flags = {flag_of(option.name) for option in dataclasses.fields(TrainOptions)} | set(SHORT_NAMES) | {"--help-all"}
+    for group in dataclasses.fields(Config):
+        names = [option.name for option in dataclasses.fields(getattr(Config(), group.name))]
+        flags |= {flag for flag, _ in flags_of_group(group.name, names)}
+    return flags
+
+
+def _long_name(word: str) -> str:
+    name, equals, value = word.partition("=")
+    return SHORT_NAMES.get(name.replace("_", "-"), name) + equals + value
+
+
+def _parse_config(argv: Sequence[str], base: Config) -> Config:
+    return tyro.cli(TrainCommand, args=argv, prog=TRAIN, default=TrainCommand(config=base)).config
 
 
 def train_command(argv: Sequence[str], stops: Stops) -> None:

@@ -3,15 +3,49 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import json
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
 
 from rich.console import Console
 from rich.table import Table
+from tyro.conf import Positional, arg
 
-from edqn_jax.cli.arguments import VerifyArgs
+from edqn_jax.cli.arguments import check_is_saved, parsed
+from edqn_jax.cli.help import VERIFY
 from edqn_jax.errors import CheckError
 from edqn_jax.files import check_can_write, write_atomically
-from edqn_jax.runs.verification.verify import Finding, verify
+from edqn_jax.policies import no_run
+
+if TYPE_CHECKING:
+    from edqn_jax.runs.verification.verify import Finding
+
+
+@dataclass(frozen=True)
+class VerifyArgs:
+    """Verify a finished run: derive its summary from its raw files, fly its flights again, have C MuJoCo judge them."""
+
+    run: Annotated[Positional[Path], arg(metavar="RUN")]
+    """Folder of the run, or of the runs of several seeds."""
+    json: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
+    """Also write what was found as JSON."""
+
+
+def parse_verify(argv: Sequence[str]) -> VerifyArgs:
+    """Returns the arguments of `edqn verify`.
+
+    Raises:
+        ConfigError: if there is no run.
+        SystemExit: after printing, for --help and for what does not parse.
+    """
+    args = parsed(VerifyArgs, argv, VERIFY)
+    check_is_saved(args.run, VERIFY)
+    if not (args.run / "config.yaml").is_file():
+        raise no_run(args.run)
+    return args
 
 
 def verify_command(args: VerifyArgs) -> None:
@@ -21,17 +55,18 @@ def verify_command(args: VerifyArgs) -> None:
         CheckError: if something is not as it was recorded.
         ConfigError: if there is no finished run, or the file to write cannot be written.
     """
+    from edqn_jax.runs.verification.verify import verify
+
     if args.json is not None:
         check_can_write(args.json)
-    console = Console()
-    findings = verify(args.run, lambda text: console.print(text, soft_wrap=True, markup=False, highlight=False))
-    console.print(report(findings))
+    findings = verify(args.run, functools.partial(print, flush=True))
+    Console().print(report(findings))
     if args.json is not None:
         found = {"run": str(args.run), "findings": [dataclasses.asdict(finding) for finding in findings]}
         write_atomically(args.json, json.dumps(found, indent=2) + "\n")
     wrong, unknown = (sum(finding.right is kind for finding in findings) for kind in (False, None))
-    console.print(f"{len(findings) - wrong - unknown} of {len(findings)} verified", highlight=False, end="")
-    console.print(f"; {unknown} could not be compared" if unknown else "", highlight=False)
+    left = f"; {unknown} could not be compared" if unknown else ""
+    print(f"{len(findings) - wrong - unknown} of {len(findings)} verified{left}")
     if wrong:
         raise CheckError(f"{wrong} of {len(findings)} things in '{args.run}' are not as they were recorded")
 

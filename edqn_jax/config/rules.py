@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterator
+from typing import Any
 
 from edqn_jax.config.limits import between, check_limits, require
 from edqn_jax.config.options import Config
@@ -47,7 +48,7 @@ def check_learns(config: Config) -> None:
         )
 
 
-def _value(config: Config, name: str) -> object:
+def _value(config: Config, name: str) -> Any:
     """Returns the value of an option `group.name`."""
     group, _, option = name.partition(".")
     return getattr(getattr(config, group), option)

@@ -1,4 +1,7 @@
-"""The Q-network: stacked observations in, one value per move out; `agent.network` may name one of your own."""
+"""The Q-network: stacked observations in, one value per move out; `agent.network` may name one of your own.
+
+Also what its learners share: its optimiser, and moving averages of parameters.
+"""
 
 from __future__ import annotations
 
@@ -7,6 +10,7 @@ from typing import Any
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
+import optax
 from jax import Array
 
 from edqn_jax.config import NETWORKS, AgentConfig
@@ -80,3 +84,19 @@ def network_values(config: AgentConfig, params: Params, memory: Array) -> Array:
 def greedy_moves(config: AgentConfig, params: Params, memory: Array) -> Array:
     """Returns the best moves [...] int32 for memories [..., H, D]."""
     return jnp.argmax(network_values(config, params, memory), axis=-1).astype(jnp.int32)
+
+
+def optimiser(config: AgentConfig, updates: int) -> optax.GradientTransformation:
+    """Returns Adam with a clipped global norm and a step size that falls linearly over `updates`."""
+    rate = optax.linear_schedule(config.learning_rate, config.final_learning_rate, max(updates, 1))
+    return optax.flatten(optax.chain(optax.clip_by_global_norm(config.max_gradient_norm), optax.adam(rate)))
+
+
+def skip_nonfinite(optimiser: optax.GradientTransformation) -> optax.GradientTransformation:
+    """Returns an optimiser that changes nothing where a gradient is not finite, however often."""
+    return optax.apply_if_finite(optimiser, max_consecutive_errors=2**31 - 1)
+
+
+def polyak(new: Params, old: Params, rate: float) -> Params:
+    """Returns old + rate (new - old), leaf by leaf: the target network's soft update, tau of Table 1."""
+    return optax.incremental_update(new, old, rate)

@@ -16,7 +16,8 @@ from jax import Array
 
 from edqn_jax.devices import processes
 from edqn_jax.errors import ConfigError
-from edqn_jax.learn.trainer import Trainer, TrainState
+from edqn_jax.learn.state import TrainState
+from edqn_jax.learn.trainer import Trainer
 
 Shape = tuple[tuple[int, ...], str]
 """Shape and type of an array on the host."""

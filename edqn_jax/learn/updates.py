@@ -19,10 +19,9 @@ from edqn_jax.config import Config
 from edqn_jax.keys import split_each
 from edqn_jax.learn import samples
 from edqn_jax.learn.learner import Metrics, State, UpdateStats, learner_of
-from edqn_jax.learn.optimiser import skip_nonfinite
 from edqn_jax.learn.perception import embedding, vae
 from edqn_jax.learn.plan import Plan
-from edqn_jax.learn.qnetwork import Params
+from edqn_jax.learn.qnetwork import Params, skip_nonfinite
 from edqn_jax.learn.samples import Samples
 from edqn_jax.native.all_sum import all_sum
 from edqn_jax.sim.sensors.sensor import sensor_of

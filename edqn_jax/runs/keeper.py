@@ -17,7 +17,7 @@ from edqn_jax.devices import processes
 from edqn_jax.errors import ConfigError
 from edqn_jax.learn import saved_state
 from edqn_jax.learn.policy import PolicyParams
-from edqn_jax.learn.trainer import policy_of
+from edqn_jax.learn.step import policy_of
 from edqn_jax.runs import world_copy
 from edqn_jax.runs.checkpoints import states
 from edqn_jax.runs.checkpoints.params import save_params

@@ -20,7 +20,7 @@ import numpy as np
 from edqn_jax.config import Config
 from edqn_jax.devices import processes
 from edqn_jax.learn.perception.embedding import has_code
-from edqn_jax.learn.trainer import TrainState
+from edqn_jax.learn.state import TrainState
 from edqn_jax.native import build
 from edqn_jax.sim.scene.scene import Scene, obstacle_count
 from edqn_jax.sim.sensors.sensor import frames_per_decision

@@ -20,7 +20,8 @@ from edqn_jax.evaluation.trajectories import trajectory
 from edqn_jax.learn import saved_state
 from edqn_jax.learn.plan import Plan
 from edqn_jax.learn.policy import PolicyParams
-from edqn_jax.learn.trainer import Trainer, TrainState
+from edqn_jax.learn.state import TrainState
+from edqn_jax.learn.trainer import Trainer
 from edqn_jax.runs import summaries, world_copy
 from edqn_jax.runs.directory import TO_BE_DRAWN, RunDirectory
 from edqn_jax.runs.keeper import Keeper

@@ -12,7 +12,7 @@ from edqn_jax.config import Config
 from edqn_jax.errors import DivergedError
 from edqn_jax.learn.learner import learner_of
 from edqn_jax.learn.plan import Plan
-from edqn_jax.learn.trainer import Episodes, Health, Losses
+from edqn_jax.learn.state import Episodes, Health, Losses
 from edqn_jax.learn.updates import VAE_METRICS
 from edqn_jax.sim.task.outcomes import Outcome
 

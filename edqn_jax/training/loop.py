@@ -21,7 +21,9 @@ from edqn_jax.devices import processes
 from edqn_jax.devices.jax_settings import as_tested
 from edqn_jax.evaluation.missions import MissionSet, RunMissions
 from edqn_jax.learn.policy import Policy, PolicyParams
-from edqn_jax.learn.trainer import Trainer, TrainState, policy_of
+from edqn_jax.learn.state import TrainState
+from edqn_jax.learn.step import policy_of
+from edqn_jax.learn.trainer import Trainer
 from edqn_jax.sim.task.flights import Flights
 from edqn_jax.sim.task.reward import Reward
 from edqn_jax.training.history import EndedEpisodes, History, Watch, chunk_metrics, mean_metrics

@@ -25,7 +25,8 @@ from edqn_jax.evaluation import rollouts
 from edqn_jax.evaluation.missions import MissionSet, missions_of_runs
 from edqn_jax.keys import run_streams
 from edqn_jax.learn.policy import PolicyParams, fresh_policy
-from edqn_jax.learn.trainer import Trainer, TrainState
+from edqn_jax.learn.state import TrainState
+from edqn_jax.learn.trainer import Trainer
 from edqn_jax.planning.astar import Path as ShortestPath
 from edqn_jax.planning.astar import shortest_path
 from edqn_jax.sim.task.env import World, check_sensor

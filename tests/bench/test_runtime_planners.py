@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from edqn_jax.cli.arguments import parse_train
+from edqn_jax.cli.train import parse_train
 from edqn_jax.config import Config
 from edqn_jax.sim.scene.mjcf import write_scene
 from rivals.planners.planner import PLANNERS

@@ -14,7 +14,8 @@ from jax.sharding import Mesh
 
 from edqn_jax.evaluation.missions import run_missions
 from edqn_jax.learn.plan import Plan
-from edqn_jax.learn.trainer import AXIS, init
+from edqn_jax.learn.state import init
+from edqn_jax.learn.trainer import AXIS
 from measurement.flags import configured
 from measurement.parts import PARTS, Moment, parts_of
 from measurement.timing import Part, Timed, depending_on, operations, size_of

@@ -18,7 +18,7 @@ from edqn_jax.config import Config
 from edqn_jax.config.loading import apply
 from edqn_jax.errors import ConfigError
 from edqn_jax.evaluation.missions import run_missions
-from edqn_jax.learn import trainer
+from edqn_jax.learn.state import init
 from edqn_jax.runs.directory import plain
 from edqn_jax.sim.scene.mjcf import check_scene, load_scene
 from edqn_jax.sim.scene.scene import obstacle_count
@@ -112,7 +112,7 @@ def test_state_bytes_are_exactly_those_of_the_arrays() -> None:
     config = configured(MINIATURE)
     world = run_missions(config).training.world
     counted = state_bytes(config, world)
-    state = jax.eval_shape(lambda world, key: trainer.init(config, world, key), world, jax.random.key(0))
+    state = jax.eval_shape(lambda world, key: init(config, world, key), world, jax.random.key(0))
     flown, stored = counted.environments * counted.environment, counted.replay_slots * counted.replay_slot
     assert flown + stored + counted.rest == size_of(state)
     assert (counted.environments, counted.replay_slots) == (16, config.agent.replay_size)

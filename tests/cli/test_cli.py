@@ -14,9 +14,10 @@ from pathlib import Path
 
 import pytest
 
-from edqn_jax.cli import arguments, main, train
-from edqn_jax.cli.arguments import parse_train, train_flags
+from edqn_jax.cli import commands, main, train
+from edqn_jax.cli.evaluate import EvaluateArgs, parse_evaluate
 from edqn_jax.cli.help import COMMON, flag_of
+from edqn_jax.cli.train import parse_train, train_flags
 from edqn_jax.config import Config, preset
 from edqn_jax.config.loading import make_config
 from edqn_jax.config.presets import RANDOM_WORLDS
@@ -51,7 +52,7 @@ def trainer(monkeypatch):
     stand_in.__dict__["train_run"] = seeds.__dict__["train_seeds_run"] = train_run
     monkeypatch.setitem(sys.modules, "edqn_jax.runs.record", stand_in)
     monkeypatch.setitem(sys.modules, "edqn_jax.runs.seeds", seeds)
-    monkeypatch.setattr(arguments, "hardware", lambda: "cpu")
+    monkeypatch.setattr(train, "hardware", lambda: "cpu")
     monkeypatch.setattr(devices, "use_cpu_devices", lambda count=None: None)
     return behaviour
 
@@ -154,7 +155,7 @@ def test_every_kind_of_option_can_be_a_flag():
         (["train", "--env.actions", "velocity"], "env.actions must be moves for training, not velocity"),
         (
             ["train", "--env.actions", "move"],
-            "there is no set of actions 'move'; did you mean 'moves', or",
+            "there is no set of actions 'move'; did you mean 'moves'?",
         ),
         (["train", "--agent.bach-size", "64"], "--agent.batch-size"),
         (["train", "--train.num-envs", "many"], "--train.num-envs"),
@@ -219,7 +220,7 @@ def test_several_seeds_are_trained_together(trainer):
     ],
 )
 def test_worlds_are_tuned_for_a_gpu_where_there_is_one(argv, envs, monkeypatch):
-    monkeypatch.setattr(arguments, "hardware", lambda: "gpu")
+    monkeypatch.setattr(train, "hardware", lambda: "gpu")
     assert parse_train(argv)[1].train.num_envs == envs
 
 
@@ -280,25 +281,21 @@ def test_a_signal_reaches_training_as_a_wish_to_stop(number, code, trainer, caps
 
 def test_evaluate_hands_on_what_was_asked_for(monkeypatch, tmp_path):
     (tmp_path / "config.yaml").touch()
-    stand_in = types.ModuleType("edqn_jax.cli.evaluate")
-    asked: list[arguments.EvaluateArgs] = []
-    stand_in.__dict__["evaluate_command"] = asked.append
-    monkeypatch.setitem(sys.modules, "edqn_jax.cli.evaluate", stand_in)
+    asked: list[EvaluateArgs] = []
+    monkeypatch.setitem(commands.OF_A_RUN, "evaluate", (parse_evaluate, asked.append))
     monkeypatch.setattr(devices, "use_cpu_devices", lambda count=None: None)
     argv = [str(tmp_path), "--world", "dense", "--start", "1", "2", "3", "--goal", "-4", "5.5", "6"]
     assert main(["evaluate", *argv, "--missions", "9", "--seed", "2", "--json", "a.json"]) == 0
-    whole = arguments.EvaluateArgs(
-        tmp_path, "dense", (1.0, 2.0, 3.0), (-4.0, 5.5, 6.0), missions=9, seed=2, json=Path("a.json")
-    )
+    whole = EvaluateArgs(tmp_path, "dense", (1.0, 2.0, 3.0), (-4.0, 5.5, 6.0), missions=9, seed=2, json=Path("a.json"))
     assert main(["evaluate", str(tmp_path), "--shuffle-codes", "--trajectories", "a.npz"]) == 0
-    assert asked == [whole, arguments.EvaluateArgs(tmp_path, shuffle_codes=True, trajectories=Path("a.npz"))]
+    assert asked == [whole, EvaluateArgs(tmp_path, shuffle_codes=True, trajectories=Path("a.npz"))]
     assert all(not each.conditions for each in asked)
 
 
 def test_evaluate_hands_on_the_disturbances_that_were_given_and_no_others(tmp_path):
     (tmp_path / "config.yaml").touch()
     words = ["--air.gusts-m-s", "5", "--air.no-drag", "--env.action_delay=1", "--body.mass-share", "0"]
-    given = arguments.parse_evaluate([str(tmp_path), *words]).conditions
+    given = parse_evaluate([str(tmp_path), *words]).conditions
     assert given == {"air": {"gusts_m_s": 5.0, "drag": False}, "env": {"action_delay": 1}, "body": {"mass_share": 0.0}}
     assert shown("evaluate", "--help").count("--air.gusts-m-s FLOAT") == 1
 

@@ -11,14 +11,14 @@ from collections.abc import Iterator
 
 import pytest
 
-from edqn_jax.cli.signals import ONE_S
+from edqn_jax.cli.process.signals import ONE_S
 
 SOON_S = 60
 """Seconds after which a process that should have ended at once hangs."""
 
 WORK = """
 import hashlib, sys, threading
-from edqn_jax.cli.signals import heard
+from edqn_jax.cli.process.signals import heard
 
 def unheard():
     "Gives no signal handler of Python's a chance, as XLA while it compiles."

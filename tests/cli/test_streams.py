@@ -13,7 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from edqn_jax.cli.streams import Lasting, lasting_streams
+from edqn_jax.cli.process.streams import Lasting, lasting_streams
 from tests.support.processes import PATIENCE_S
 
 ROOT = Path(__file__).parents[2]
@@ -21,7 +21,7 @@ ROOT = Path(__file__).parents[2]
 LIVE = """
 import sys, time
 from rich.console import Console
-from edqn_jax.cli.streams import lasting_streams
+from edqn_jax.cli.process.streams import lasting_streams
 from edqn_jax.report.progress import Progress
 with lasting_streams():
     progress = Progress(Console(force_terminal=True))
@@ -87,7 +87,7 @@ def test_a_live_panel_goes_on_whoever_reads(streams: str, tmp_path: Path) -> Non
 
 def test_no_file_gets_the_number_of_a_closed_stream(tmp_path: Path) -> None:
     opens = (
-        "import sys\nfrom edqn_jax.cli.streams import lasting_streams\n"
+        "import sys\nfrom edqn_jax.cli.process.streams import lasting_streams\n"
         "with lasting_streams(), open(sys.argv[1], 'w') as file:\n    file.write(str(file.fileno()))\n"
     )
     script = '"$PYTHON" -c "$1" "$2" <&- >&- 2>&-'

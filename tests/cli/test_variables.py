@@ -10,8 +10,8 @@ from collections.abc import Callable
 import jax
 import pytest
 
-from edqn_jax.cli import variables
-from edqn_jax.cli.variables import check_devices, prepare_process, start_jax
+from edqn_jax.cli.process import variables
+from edqn_jax.cli.process.variables import check_devices, prepare_process, start_jax
 from edqn_jax.errors import ConfigError
 
 

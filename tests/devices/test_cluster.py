@@ -10,8 +10,7 @@ import jax
 import numpy as np
 import pytest
 
-from edqn_jax.cli.arguments import parse_train
-from edqn_jax.cli.train import options_to_compare
+from edqn_jax.cli.train import options_to_compare, parse_train
 from edqn_jax.devices import processes
 from edqn_jax.errors import ConfigError
 from tests.support.processes import WORLD

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from edqn_jax.cli.arguments import parse_train
+from edqn_jax.cli.train import parse_train
 from edqn_jax.devices.launch import how_to_join
 
 PAGE = (Path(__file__).parents[2] / "docs" / "cluster.md").read_text(encoding="utf-8")

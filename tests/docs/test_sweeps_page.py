@@ -7,7 +7,7 @@ import shlex
 import subprocess
 from pathlib import Path
 
-from edqn_jax.cli.arguments import parse_train
+from edqn_jax.cli.train import parse_train
 
 PAGE = (Path(__file__).parents[2] / "docs" / "sweeps.md").read_text(encoding="utf-8")
 

@@ -12,13 +12,12 @@ import mujoco
 import numpy as np
 import pytest
 
-from edqn_jax.cli import evaluate
-from edqn_jax.cli.arguments import EvaluateArgs
-from edqn_jax.cli.evaluate import evaluate_command
+from edqn_jax.cli.evaluate import EvaluateArgs, evaluate_command
 from edqn_jax.config import Config
 from edqn_jax.config.loading import apply, to_yaml
 from edqn_jax.errors import ConfigError
 from edqn_jax.evaluation import evaluate as evaluation
+from edqn_jax.evaluation import latency
 from edqn_jax.evaluation.judge import load_judge, replay_contact
 from edqn_jax.evaluation.latency import decision_latency_ms
 from edqn_jax.evaluation.metrics import spl, summarise, wilson_interval
@@ -171,7 +170,7 @@ def test_the_command_shuffles_codes_only_when_asked_and_says_so(shuffle_codes, r
     monkeypatch.setattr(evaluation, "load_missions", lambda *_: MissionSet("paper", None, None))  # type: ignore[arg-type]
     monkeypatch.setattr(evaluation, "fly_on_all_devices", fly)
     monkeypatch.setattr(evaluation, "shortest_paths", lambda *_: np.full(4, 10.0))
-    monkeypatch.setattr(evaluate, "decision_latency_ms", lambda *_, **__: {"median": 1.0, "p99": 2.0})
+    monkeypatch.setattr(latency, "decision_latency_ms", lambda *_, **__: {"median": 1.0, "p99": 2.0})
     evaluate_command(EvaluateArgs(run, missions=4, shuffle_codes=shuffle_codes, json=tmp_path / "figures.json"))
     assert asked == [{"actor": AgentActor(CONFIG), "record": False, "shuffle_codes": shuffle_codes}]
     assert json.loads((tmp_path / "figures.json").read_text())["shuffled_codes"] is shuffle_codes
@@ -189,7 +188,7 @@ def test_the_command_flies_under_the_conditions_that_it_is_given_and_says_so(run
     monkeypatch.setattr(evaluation, "load_missions", lambda *_: MissionSet("paper", None, None))  # type: ignore[arg-type]
     monkeypatch.setattr(evaluation, "fly_on_all_devices", fly)
     monkeypatch.setattr(evaluation, "shortest_paths", lambda *_: np.full(4, 10.0))
-    monkeypatch.setattr(evaluate, "decision_latency_ms", lambda *_, **__: {"median": 1.0, "p99": 2.0})
+    monkeypatch.setattr(latency, "decision_latency_ms", lambda *_, **__: {"median": 1.0, "p99": 2.0})
     conditions = {"air": {"gusts_m_s": 5.0}, "env": {"action_delay": 1}}
     evaluate_command(EvaluateArgs(run, missions=4, conditions=conditions, json=tmp_path / "figures.json"))
     assert flown == [apply(CONFIG, conditions, "test")] != [CONFIG]

@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 from hypothesis import strategies as st
 
-from edqn_jax.cli import arguments
+from edqn_jax.cli import train
 from edqn_jax.cli.commands import BAD_INPUT
 from edqn_jax.config import Config
 from edqn_jax.config.loading import resolve
@@ -143,7 +143,7 @@ def read_options(text: str, folder: Path) -> None:
     validate(resolve("default", file, None, "cpu"))
 
 
-FLAGS = sorted(arguments.train_flags() | {"--no", "--world.nam", "-x", "extra"})
+FLAGS = sorted(train.train_flags() | {"--no", "--world.nam", "-x", "extra"})
 
 flags = st.lists(st.tuples(st.sampled_from(FLAGS), nasty), min_size=1, max_size=3)
 
@@ -155,7 +155,7 @@ def read_flags(drawn: list[tuple[str, str]], folder: Path) -> None:
     said = io.StringIO()
     try:
         with contextlib.redirect_stderr(said):
-            arguments.parse_train([word for word in words if word not in ("-h", "--help")])
+            train.parse_train([word for word in words if word not in ("-h", "--help")])
     except SystemExit as ending:
         box = said.getvalue()
         assert ending.code == BAD_INPUT and box.strip() and "Traceback" not in box and len(box) < 20_000, box[:2000]

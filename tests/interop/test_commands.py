@@ -11,8 +11,11 @@ from pathlib import Path
 
 import pytest
 
-from edqn_jax.cli import arguments
+from edqn_jax.cli import evaluate, events, export, record, report
+from edqn_jax.cli.arguments import check_flags
 from edqn_jax.cli.commands import take_imports
+from edqn_jax.cli.help import VERIFY
+from edqn_jax.cli.train import parse_train
 from tests.support.pages import PAGES, ROOT, SHELL, blocks_of, empty_module, name_of
 from tests.support.registries import keep_as_they_are
 
@@ -23,10 +26,10 @@ BLOCKS = [(name_of(page), code) for page in PAGES for code in blocks_of(page, *S
 RUNS = ("edqn evaluate", "edqn record", "edqn report", "edqn verify", "edqn export", "edqn events")
 
 PARSERS = {
-    "evaluate": arguments.parse_evaluate,
-    "record": arguments.parse_record,
-    "report": arguments.parse_report,
-    "export": arguments.parse_export,
+    "evaluate": evaluate.parse_evaluate,
+    "record": record.parse_record,
+    "report": report.parse_report,
+    "export": export.parse_export,
 }
 
 
@@ -51,21 +54,23 @@ def test_a_shell_block_is_a_script(page: str, code: str) -> None:
 
 @pytest.mark.parametrize(("page", "words"), COMMANDS, ids=[f"{page}: {' '.join(words)}" for page, words in COMMANDS])
 def test_a_command_parses(page: str, words: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(arguments, "_check_run", lambda folder: None)  # runs/DIR is a reader's
+    for command in (evaluate, record, report, export, events):
+        monkeypatch.setattr(command, "check_run", lambda folder: None)  # runs/DIR is a reader's
     words, imported = take_imports(words)
-    if imported:  # the page says what the file has in the first block that registers something
+    if imported:  # the page has what the file registers
         keep_as_they_are(monkeypatch)
-        code = next(code for code in blocks_of(ROOT / page, "python") if ".register(" in code)
+        found = [code for code in blocks_of(ROOT / page, "python") if ".register(" in code]
+        code = next((code for code in found if any(f'register("{word}"' in code for word in words)), found[0])
         exec(code, empty_module("imported_by_a_command", monkeypatch))
     if "train.py" in words or words[:2] == ["edqn", "train"]:
-        arguments.parse_train(words[words.index("train.py" if "train.py" in words else "train") + 1 :])
+        parse_train(words[words.index("train.py" if "train.py" in words else "train") + 1 :])
     elif words[0] == "edqn" and words[1] in PARSERS:
         PARSERS[words[1]](words[2:])
     elif words[:2] == ["edqn", "events"]:
         monkeypatch.setattr(Path, "is_file", lambda self: True)  # a reader's, too
-        arguments.parse_events(words[2:])
+        events.parse_events(words[2:])
     elif words[:2] == ["edqn", "verify"]:
-        arguments.check_flags(words[2:], {"--json"}, arguments.VERIFY)
+        check_flags(words[2:], {"--json"}, VERIFY)
     elif words[0] == "python" and words[1].startswith("benchmarks/"):
         assert (ROOT / words[1]).is_file()
         module = importlib.import_module(Path(words[1]).stem)

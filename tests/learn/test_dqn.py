@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from edqn_jax.config import AgentConfig, Config, EnvConfig, TrainConfig, preset
-from edqn_jax.learn import exploration, optimiser, qnetwork, replay
+from edqn_jax.learn import exploration, qnetwork, replay
 from edqn_jax.learn.dqn import losses
 from tests.support import probes
 
@@ -92,7 +92,7 @@ def test_a_double_batch_by_hand():
 
 def test_polyak_moves_by_its_rate():
     old, new = {"a": jnp.array([0.0, 8.0])}, {"a": jnp.array([4.0, 0.0])}
-    np.testing.assert_allclose(optimiser.polyak(new, old, 0.25)["a"], [1.0, 6.0])
+    np.testing.assert_allclose(qnetwork.polyak(new, old, 0.25)["a"], [1.0, 6.0])
 
 
 @pytest.mark.slow
@@ -157,7 +157,7 @@ def test_epsilon_falls_over_ten_episodes_of_each_environment_in_the_papers_form(
 
 def test_the_step_size_falls_linearly_and_the_gradient_is_clipped():
     config = AgentConfig(learning_rate=0.1, final_learning_rate=0.02, max_gradient_norm=1.0)
-    adam = optimiser.optimiser(config, 4)
+    adam = qnetwork.optimiser(config, 4)
     params = {"w": jnp.zeros(2)}
     state, sizes = adam.init(params), []
     for _ in range(6):

@@ -14,10 +14,11 @@ from edqn_jax.config.loading import make_config
 from edqn_jax.config.registry import LEARNERS, Registry
 from edqn_jax.config.rules import validate
 from edqn_jax.errors import ConfigError
-from edqn_jax.learn import trainer
 from edqn_jax.learn.dqn.learner import DQN
 from edqn_jax.learn.learner import Learner, UpdateStats, learner_of
 from edqn_jax.learn.plan import Plan
+from edqn_jax.learn.state import init
+from edqn_jax.learn.step import policy_of, run_steps
 from tests.support.miniature import miniature_world
 
 STEPS = 24
@@ -38,8 +39,8 @@ def miniature(learner: str) -> Config:
 
 def trained(config: Config):
     world = miniature_world(config)
-    before = jax.jit(lambda key: trainer.init(config, world, key))(jax.random.key(0))
-    after, (_, losses) = jax.jit(lambda s: trainer.run_steps(config, world, s, jnp.arange(STEPS)))(before)
+    before = jax.jit(lambda key: init(config, world, key))(jax.random.key(0))
+    after, (_, losses) = jax.jit(lambda s: run_steps(config, world, s, jnp.arange(STEPS)))(before)
     return before, after, losses
 
 
@@ -87,7 +88,7 @@ def test_a_learner_of_ones_own_is_trained_by_its_name_without_a_change_to_the_pa
     _, after, losses = trained(config)
     assert after.learner.agent["count"] == STEPS
     assert losses.metrics["height_of_hover"][-1] == 1.0 and "epsilon" not in losses.metrics
-    assert trainer.policy_of(config, after).q is after.learner.agent["q"]
+    assert policy_of(config, after).q is after.learner.agent["q"]
 
 
 def test_a_learner_that_there_is_not_is_answered_with_the_nearest():
@@ -106,5 +107,7 @@ def test_a_name_that_is_taken_or_no_name_is_refused():
         registry.register("a b", 1)
     registry.register("two-of-them", 2)
     assert registry.names == ("one", "two-of-them") and registry.get("two-of-them") == 2
-    with pytest.raises(ConfigError, match="must be one of one, two-of-them"):
+    with pytest.raises(
+        ConfigError, match="there is no thing 'xyz'; known are one, two-of-them, or one that --import registers$"
+    ):
         registry.check("xyz")

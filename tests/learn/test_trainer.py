@@ -20,9 +20,11 @@ from edqn_jax.config import (
     NoiseConfig,
 )
 from edqn_jax.errors import ConfigError
-from edqn_jax.learn import replay, saved_state, trainer
+from edqn_jax.learn import replay, saved_state
 from edqn_jax.learn.plan import Plan
-from edqn_jax.learn.trainer import Trainer, TrainState
+from edqn_jax.learn.state import TrainState, init
+from edqn_jax.learn.step import _remember, policy_of, run_steps, train_step
+from edqn_jax.learn.trainer import Trainer
 from edqn_jax.sim.physics.disturbances import Disturbance
 from edqn_jax.sim.task import env
 from edqn_jax.sim.task.env import World
@@ -42,7 +44,7 @@ def world() -> World:
 def run(config: Config, world: World, devices: int) -> tuple[list[TrainState], list, int, Trainer]:
     """States on the host after each chunk, what the chunks returned, how often the step was traced; the trainer."""
     traces = 0
-    step = trainer.train_step
+    step = train_step
 
     def counted(*args):
         nonlocal traces
@@ -50,7 +52,7 @@ def run(config: Config, world: World, devices: int) -> tuple[list[TrainState], l
         return step(*args)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(trainer, "train_step", counted)
+        patch.setattr("edqn_jax.learn.step.train_step", counted)
         made = Trainer(config, world, jax.devices()[:devices])
         state = made.init(config.train.seed)
         states, returned = [_host(state)], []
@@ -89,8 +91,8 @@ def test_the_training_chunk_is_traced_exactly_once_in_a_run(on_two) -> None:
 
 @pytest.mark.slow
 def test_no_callback_to_the_host_hides_in_the_step(world: World) -> None:
-    state = jax.eval_shape(lambda k: trainer.init(TINY, world, k), jax.random.key(0))
-    jaxpr = jax.make_jaxpr(lambda s, n: trainer.run_steps(TINY, world, s, n))(state, jnp.arange(2))
+    state = jax.eval_shape(lambda k: init(TINY, world, k), jax.random.key(0))
+    jaxpr = jax.make_jaxpr(lambda s, n: run_steps(TINY, world, s, n))(state, jnp.arange(2))
     assert "callback" not in str(jaxpr)
 
 
@@ -252,7 +254,7 @@ def test_the_replay_holds_what_the_environments_went_through(on_one) -> None:
 
 @pytest.mark.slow
 def test_nothing_is_learnt_from_what_stood_there_before_the_first_reset(world: World) -> None:
-    start = jax.jit(partial(trainer.init, TINY, world))(jax.random.key(0))
+    start = jax.jit(partial(init, TINY, world))(jax.random.key(0))
     actors = jax.tree.map(lambda x: x[0], start.actors)
     envs = actors.reward.shape[0]
 
@@ -285,7 +287,7 @@ def test_a_new_episode_begins_with_an_empty_memory() -> None:
     )
     actors: Any = SimpleNamespace(memory=jnp.full((1, 2, config.agent.history, OWN_SIZE), 7.0))
     learner: Any = SimpleNamespace(encoder={}, agent=SimpleNamespace(average={}))
-    fresh, running = trainer._remember(config, learner, actors, seen, jnp.int32(Plan.of(config).warmup + 5))
+    fresh, running = _remember(config, learner, actors, seen, jnp.int32(Plan.of(config).warmup + 5))
     np.testing.assert_array_equal(fresh, [np.zeros(OWN_SIZE), own[0]])
     np.testing.assert_array_equal(running, [np.full(OWN_SIZE, 7.0), own[1]])
 
@@ -293,8 +295,8 @@ def test_a_new_episode_begins_with_an_empty_memory() -> None:
 @pytest.fixture(scope="module")
 def retraining(world: World) -> tuple[list[TrainState], list]:
     """States before each of 15 steps and after the last, and what each returned; steps 11 and 12 retrain the VAE."""
-    step = jax.jit(lambda state, number: trainer.train_step(RETRAINED, world, None, state, number))
-    states, returned = [jax.jit(lambda key: trainer.init(RETRAINED, world, key))(jax.random.key(0))], []
+    step = jax.jit(lambda state, number: train_step(RETRAINED, world, None, state, number))
+    states, returned = [jax.jit(lambda key: init(RETRAINED, world, key))(jax.random.key(0))], []
     for number in range(15):
         state, out = step(states[-1], jnp.int32(number))
         states.append(state)
@@ -323,7 +325,7 @@ def test_labels_reach_the_vae_and_nothing_that_acts_before_it_does(retraining, w
     assert warmup < first < end - 1
     true = env.nearness
     monkeypatch.setattr(env, "nearness", lambda *given: 3.0 - true(*given))
-    step = jax.jit(lambda state: trainer.train_step(RETRAINED, world, None, state, jnp.int32(first)))
+    step = jax.jit(lambda state: train_step(RETRAINED, world, None, state, jnp.int32(first)))
     truly, falsely = (states[first + 1], returned[first]), step(states[first])
     assert not _same(truly[0].learner.vae, falsely[0].learner.vae)
     assert _same(_told(truly), _told(falsely))
@@ -346,17 +348,15 @@ def test_agents_that_train_together_train_as_each_alone(on_two, world: World) ->
             np.testing.assert_allclose(second_losses.metrics[name], losses.metrics[name], rtol=1e-4)
         learnt |= bool(np.isfinite(losses.metrics["q_loss"]).any())
     assert learnt
-    first, second = together.each(jax.tree.map(np.asarray, trainer.policy_of(together.config, two)))
+    first, second = together.each(jax.tree.map(np.asarray, policy_of(together.config, two)))
     assert not _same(first, second)
-    jax.tree.map(
-        partial(np.testing.assert_allclose, rtol=1e-3, atol=1e-5), second, trainer.policy_of(together.config, state)
-    )
+    jax.tree.map(partial(np.testing.assert_allclose, rtol=1e-3, atol=1e-5), second, policy_of(together.config, state))
 
 
 def test_environments_that_do_not_divide_into_shards_are_refused_with_a_sentence(world: World) -> None:
     config = dataclasses.replace(TINY, train=dataclasses.replace(TINY.train, num_envs=12))
     with pytest.raises(ConfigError, match=r"num_envs \(12\).*multiples of train.shards \(8\)"):
-        trainer.init(config, world, jax.random.key(0))
+        init(config, world, jax.random.key(0))
 
 
 def _told(trained: tuple) -> tuple:

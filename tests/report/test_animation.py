@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from edqn_jax.cli import arguments, main
+from edqn_jax.cli import main, record
 from edqn_jax.config import WorldConfig
 from edqn_jax.config.loading import to_yaml
 from edqn_jax.errors import ConfigError
@@ -116,7 +116,7 @@ def test_a_file_that_cannot_be_written_is_refused_at_once(file, says, run, tmp_p
 
 
 def test_an_mp4_without_its_package_is_refused_at_once(run, tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(arguments.importlib.util, "find_spec", lambda name: None)
+    monkeypatch.setattr(record.importlib.util, "find_spec", lambda name: None)
     assert main(["record", str(run), str(tmp_path / "flight.mp4")]) == 2
     assert "run pip install 'edqn-jax[video]'" in capsys.readouterr().err
 

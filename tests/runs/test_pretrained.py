@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 import edqn_jax
-from edqn_jax.cli.arguments import parse_train
+from edqn_jax.cli.train import parse_train
 from edqn_jax.policies import PRETRAINED, policy_folder
 from edqn_jax.runs.directory import version_of
 

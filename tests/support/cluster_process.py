@@ -27,7 +27,8 @@ from edqn_jax.devices import devices, hardware, processes
 from edqn_jax.evaluation import rollouts
 from edqn_jax.learn.dqn.learner import DqnState
 from edqn_jax.learn.policy import fresh_policy
-from edqn_jax.learn.trainer import Episodes, Losses, Trainer, TrainState
+from edqn_jax.learn.state import Episodes, Losses, TrainState
+from edqn_jax.learn.trainer import Trainer
 from edqn_jax.learn.updates import Networks
 from edqn_jax.report import gallery
 from edqn_jax.runs import record

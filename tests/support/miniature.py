@@ -10,7 +10,7 @@ import jax
 import numpy as np
 
 from edqn_jax.config import Config
-from edqn_jax.learn.trainer import Health, Losses
+from edqn_jax.learn.state import Health, Losses
 from edqn_jax.sim.physics import drone
 from edqn_jax.sim.scene import mjcf
 from edqn_jax.sim.scene.scene import stack_scenes

@@ -10,7 +10,7 @@ import pytest
 from edqn_jax.config import AgentConfig, Config, EncoderConfig, TrainConfig
 from edqn_jax.errors import DivergedError
 from edqn_jax.learn.plan import Plan
-from edqn_jax.learn.trainer import Episodes, Losses
+from edqn_jax.learn.state import Episodes, Losses
 from edqn_jax.sim.task.outcomes import Outcome
 from edqn_jax.training.history import EndedEpisodes, Watch, chunk_metrics, mean_metrics
 from tests.support.miniature import no_losses

@@ -9,11 +9,12 @@ import jax
 import jax.numpy as jnp
 import pytest
 
-from edqn_jax.cli.arguments import parse_train
+from edqn_jax.cli.train import parse_train
 from edqn_jax.config import Config
 from edqn_jax.errors import CheckError
 from edqn_jax.learn.dqn import learner as dqn
-from edqn_jax.learn.trainer import Trainer, TrainState
+from edqn_jax.learn.state import TrainState
+from edqn_jax.learn.trainer import Trainer
 from tests.support.miniature import MINIATURE, miniature_world
 
 FLAGS = (

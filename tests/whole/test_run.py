@@ -13,7 +13,7 @@ import pytest
 from edqn_jax.config import Config, WorldConfig
 from edqn_jax.errors import ConfigError, StoppedError
 from edqn_jax.learn import trainer
-from edqn_jax.learn.trainer import Episodes
+from edqn_jax.learn.state import Episodes
 from edqn_jax.report.gallery import prepare_gallery
 from edqn_jax.report.progress import Progress
 from edqn_jax.runs.directory import RunDirectory

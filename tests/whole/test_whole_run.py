@@ -16,8 +16,7 @@ import jax
 import numpy as np
 import pytest
 
-from edqn_jax.cli.arguments import EvaluateArgs
-from edqn_jax.cli.evaluate import evaluate_command
+from edqn_jax.cli.evaluate import EvaluateArgs, evaluate_command
 from edqn_jax.errors import ConfigError
 from edqn_jax.evaluation.missions import run_missions
 from edqn_jax.evaluation.rollouts import fly_on_all_devices

@@ -21,10 +21,9 @@ from edqn_jax.learn import qnetwork, replay
 from edqn_jax.learn.actor import observation_size
 from edqn_jax.learn.dqn.losses import batch_loss
 from edqn_jax.learn.exploration import explore
-from edqn_jax.learn.learner import Exploration, Learner, Metrics, Rings, UpdateStats
-from edqn_jax.learn.optimiser import optimiser, polyak, skip_nonfinite
+from edqn_jax.learn.learner import Learner, Rings, UpdateStats
 from edqn_jax.learn.plan import Plan
-from edqn_jax.learn.qnetwork import Params
+from edqn_jax.learn.qnetwork import Params, optimiser, polyak, skip_nonfinite
 from edqn_jax.native.all_sum import all_sum
 from edqn_jax.sim.actions import ACTIONS
 from edqn_jax.sim.task.task import task_of
@@ -119,15 +118,9 @@ def _each_network(change: Callable[[Any], Any], state: DqnState) -> DqnState:
     return dataclasses.replace(state, q=change(state.q), target=change(state.target), average=change(state.average))
 
 
-def _explore(
-    config: Config, state: DqnState, memory: Array, keys: Array, progress: Exploration
-) -> tuple[Array, Metrics]:
-    return explore(config, state.q, memory, keys, progress)
-
-
 DQN = Learner(
     init=init_state,
-    act=_explore,
+    act=lambda config, state, *rest: explore(config, state.q, *rest),
     decide=lambda config, params, memory: qnetwork.greedy_moves(config.agent, params, memory),
     ring_length=lambda config: replay.ring_length(config.agent, config.train.num_envs),
     starts=count_rows_before_updates,

@@ -22,11 +22,10 @@ from edqn_jax.learn import qnetwork
 from edqn_jax.learn.actor import observation_size
 from edqn_jax.learn.dqn.losses import td_loss, value_of
 from edqn_jax.learn.exploration import explore
-from edqn_jax.learn.learner import Exploration, Learner, Metrics, Rings, UpdateStats
-from edqn_jax.learn.optimiser import optimiser, polyak, skip_nonfinite
+from edqn_jax.learn.learner import Learner, Rings, UpdateStats
 from edqn_jax.learn.plan import Plan
 from edqn_jax.learn.pqn.returns import Rollout, lambda_returns, rollout_of
-from edqn_jax.learn.qnetwork import Params, network_values
+from edqn_jax.learn.qnetwork import Params, network_values, optimiser, polyak, skip_nonfinite
 from edqn_jax.native.all_sum import all_sum
 from edqn_jax.sim.actions import ACTIONS
 
@@ -142,15 +141,9 @@ def _in_minibatches(count: int, x: Array) -> Array:
     return jnp.moveaxis(cut, 0, 1).reshape(count, -1, *x.shape[2:])
 
 
-def _explore(
-    config: Config, state: PqnState, memory: Array, keys: Array, progress: Exploration
-) -> tuple[Array, Metrics]:
-    return explore(config, state.q, memory, keys, progress)
-
-
 PQN = Learner(
     init=init_state,
-    act=_explore,
+    act=lambda config, state, *rest: explore(config, state.q, *rest),
     decide=lambda config, params, memory: qnetwork.greedy_moves(config.agent, params, memory),
     ring_length=count_ring_rows,
     starts=count_rows_before_updates,

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from edqn_jax.cli.arguments import parse_train
+from edqn_jax.cli.train import parse_train
 from edqn_jax.config import Config
 from edqn_jax.config.loading import to_yaml
 from edqn_jax.sim.scene.mjcf import write_scene

@@ -17,12 +17,13 @@ import pytest
 from edqn_jax.config import CameraConfig, Config, EncoderConfig
 from edqn_jax.config.loading import to_yaml
 from edqn_jax.evaluation.latency import decision_latency_ms
-from edqn_jax.learn import trainer
 from edqn_jax.learn.actor import AgentActor, PolicyParams, observation_size
 from edqn_jax.learn.perception import embedding, pooled_encoder, vae
 from edqn_jax.learn.perception.code import Form
 from edqn_jax.learn.plan import Plan
 from edqn_jax.learn.policy import fresh_policy
+from edqn_jax.learn.state import init
+from edqn_jax.learn.step import run_steps
 from edqn_jax.runs.checkpoints.params import save_params
 from edqn_jax.runs.policies import load_run
 from edqn_jax.runs.provenance import workload
@@ -65,8 +66,8 @@ def traced(world: World) -> Callable[[str], tuple]:
     @functools.cache
     def of(name: str) -> tuple:
         config = dataclasses.replace(with_sensor(name, QUICK), camera=CameraConfig(width=11, height=7))
-        start = jax.jit(jax.vmap(lambda key: trainer.init(config, world, key))).trace(KEYS)
-        steps = jax.jit(jax.vmap(lambda state: trainer.run_steps(config, world, state, jnp.arange(STEPS))))
+        start = jax.jit(jax.vmap(lambda key: init(config, world, key))).trace(KEYS)
+        steps = jax.jit(jax.vmap(lambda state: run_steps(config, world, state, jnp.arange(STEPS))))
         return config, start, steps.trace(start.out_info)
 
     return of

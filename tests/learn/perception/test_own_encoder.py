@@ -87,6 +87,7 @@ def test_it_learns_inside_of_the_vae_and_the_agent_sees_its_mean(config: Config)
     assert jax.tree.all(moved)
     acting = embedding.acting(config, trained)
     seen = embedding.embed(config, acting, Observation(field, own=jnp.zeros((8, 1)), motion=motion))
+    assert seen is not None
     layer = acting["encoder"]["mean"]
     times = jnp.where(field.count > 0, field.t_first / field.window_s, 0.0).reshape(8, -1)
     mean = jnp.concatenate([times, motion], axis=-1) @ layer["kernel"] + layer["bias"]

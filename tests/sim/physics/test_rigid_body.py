@@ -11,7 +11,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from edqn_jax.cli.arguments import parse_train
+from edqn_jax.cli.train import parse_train
 from edqn_jax.config import Config
 from edqn_jax.errors import ConfigError
 from edqn_jax.runs.provenance import workload

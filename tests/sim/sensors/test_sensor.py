@@ -14,9 +14,11 @@ import pytest
 
 from edqn_jax.config import SENSORS, CameraConfig, Config, DroneConfig, EnvConfig
 from edqn_jax.evaluation.latency import decision_latency_ms
-from edqn_jax.learn import policy, trainer
+from edqn_jax.learn import policy
 from edqn_jax.learn.perception import embedding
 from edqn_jax.learn.plan import Plan
+from edqn_jax.learn.state import init
+from edqn_jax.learn.step import run_steps
 from edqn_jax.runs.provenance import workload
 from edqn_jax.sim.actions import ACTIONS, DIRECTIONS
 from edqn_jax.sim.physics.drone import Flight, hover, load_airframe
@@ -343,8 +345,8 @@ def test_a_new_sensor_needs_only_its_entry_to_act(with_new_sensor, world) -> Non
 def test_a_new_sensor_needs_only_its_entry_to_train(with_new_sensor, world) -> None:
     config = with_new_sensor
     steps = Plan.of(config).learn_from + 2
-    before = jax.jit(lambda key: trainer.init(config, world, key))(jax.random.key(0))
-    after, (_, losses) = jax.jit(lambda s: trainer.run_steps(config, world, s, jnp.arange(steps)))(before)
+    before = jax.jit(lambda key: init(config, world, key))(jax.random.key(0))
+    after, (_, losses) = jax.jit(lambda s: run_steps(config, world, s, jnp.arange(steps)))(before)
     assert np.isfinite(np.asarray(losses.metrics["q_loss"])[-1])
     assert np.isfinite(np.asarray(losses.metrics["reconstruction_loss"])).sum() == Plan.of(config).warmup
     if config.env.sensor == "row_means":
