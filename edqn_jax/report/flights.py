@@ -16,6 +16,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Circle
 
 from edqn_jax.devices.jax_settings import as_tested
+from edqn_jax.evaluation.trajectories import POSITION, VELOCITY, columns_of
 from edqn_jax.report.solids import (
     GROUND,
     MAP,
@@ -105,8 +106,7 @@ def draw_path(
         outcome: how the flight ended; unless it is `goal` its end is marked.
         goal_radius_m: the circle around the goal.
     """
-    points = np.stack([np.asarray(trajectory[name], np.float64) for name in ("x", "y", "z")], axis=1)
-    velocity = np.stack([np.asarray(trajectory[name], np.float64) for name in ("vx", "vy", "vz")], axis=1)
+    points, velocity = columns_of(trajectory, POSITION), columns_of(trajectory, VELOCITY)
     thin = np.unique(np.linspace(0, len(points) - 1, min(PATH_POINTS, len(points))).round().astype(int))
     points, speed = points[thin], np.linalg.norm(velocity[thin], axis=1)
     scale = Normalize(0.0, max(float(np.ceil(speed.max())), 1.0))
