@@ -130,12 +130,7 @@ def draw_path(
                 x, y = view.project(points[-1])
                 axes.plot(x, y, "X", ms=8, mfc=OUTCOME_COLOURS[outcome], mec="white", mew=0.8, zorder=10)
         bar = figure.colorbar(
-            ScalarMappable(scale, SPEED_COLOURS),
-            ax=above,
-            shrink=0.75,
-            aspect=28,
-            pad=0.03,
-            label="speed, m/s",
+            ScalarMappable(scale, SPEED_COLOURS), ax=above, shrink=0.75, aspect=28, pad=0.03, label="speed, m/s"
         )
         bar.outline.set_visible(False)  # pyright: ignore[reportCallIssue]
         figure.legend(handles=_path_legend(shortest is not None, outcome), loc="outside lower center", ncols=5)
@@ -270,12 +265,7 @@ def _draw_flown(
     axes.add_collection(halo)
     for which, width, alpha in ((covered, 1.2, 0.45), (~covered, 2.0, 1.0)):
         line = LineCollection(
-            list(pieces[which]),
-            cmap=SPEED_COLOURS,
-            norm=scale,
-            linewidths=width,
-            alpha=alpha,
-            capstyle="round",
+            list(pieces[which]), cmap=SPEED_COLOURS, norm=scale, linewidths=width, alpha=alpha, capstyle="round"
         )
         line.set_array(middle_speed[which])
         line.set_zorder(7)
