@@ -182,9 +182,10 @@ def own_motions(config: Config, flown: Mapping[str, np.ndarray], rows: np.ndarra
     (place, now), (_, before) = poses(flown, last), poses(flown, np.maximum(last - 1, 0))
     yaw = drone.yaw_of(jnp.asarray(now))
     rate = drone.wrap_angle(yaw - drone.yaw_of(jnp.asarray(before))) / config.drone.physics_dt_s
-    velocity = columns_of(flown, VELOCITY)[last]
-    ahead = heading_velocity(config.env, yaw, jnp.asarray(velocity))
-    commanded = directions(config, Flight(place, now, velocity), actions_of(flown)[last])
+    velocity = jnp.asarray(columns_of(flown, VELOCITY)[last])
+    ahead = heading_velocity(config.env, yaw, velocity)
+    after = Flight(jnp.asarray(place), jnp.asarray(now), velocity)
+    commanded = directions(config, after, actions_of(flown)[last])
     return np.concatenate([ahead, np.asarray(rate)[:, None], commanded], axis=-1).astype(np.float32)
 
 

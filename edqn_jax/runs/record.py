@@ -95,9 +95,9 @@ def train_run(
         of_each = _summaries(preparation, results, flights, reward, keeper.facts, seeds)
         if run is not None:
             progress.phase("drawing")
-            for folder, *outcome in zip(folders, results, flights, of_each, strict=True):
+            for folder, result, flown, of_run in zip(folders, results, flights, of_each, strict=True):
                 assert folder is not None
-                finish(folder, preparation, draw, *outcome, progress)
+                finish(folder, preparation, draw, result, flown, of_run, progress)
         summary = of_each[0]
         if seeds is not None:
             summary = summaries.of_all_seeds(config, preparation.missions[0].tests, flights, of_each)

@@ -80,7 +80,7 @@ def action_of(config: Config, given: str | ArrayLike) -> Array:
     return move_number(given) if config.env.actions == "moves" else checked_action(config, given)
 
 
-def checked_action(config: Config, given: ArrayLike) -> Array:
+def checked_action(config: Config, given: str | ArrayLike) -> Array:
     """Returns an action [] or [A] in the type of its space.
 
     Raises:
