@@ -16,25 +16,29 @@ import argparse
 import dataclasses
 import os
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
 
 from edqn_jax.config import FAMILIES, Config
 from edqn_jax.errors import ConfigError
-from edqn_jax.evaluation.latency import decision_call, in_turn, look_call
+from edqn_jax.evaluation.latency import decision_call, in_turn
 from edqn_jax.evaluation.missions import MissionSet, load_missions
 from edqn_jax.learn.actor import AgentActor, PolicyParams
 from edqn_jax.learn.policy import Policy, fresh_policy
 from edqn_jax.runs.policies import load_policy
+from edqn_jax.sim.physics.drone import Flight
+from edqn_jax.sim.scene.scene import Scene
 from edqn_jax.sim.sensors.events import EventField
-from edqn_jax.sim.sensors.sensor import frames_per_decision
+from edqn_jax.sim.sensors.sensor import SensorMemory, at_rest, frame_steps, frames_per_decision, sense
 from edqn_jax.sim.task import group
 from edqn_jax.sim.task.env import World
+from edqn_jax.sim.task.observation import MOTION_SIZE, OWN_SIZE, Observation
 from edqn_jax.sim.task.outcomes import Outcome
 from edqn_jax.sim.task.task import task_of
 from measurement import json_report
@@ -90,6 +94,34 @@ def _flown(config: Config, world: World, params: PolicyParams) -> tuple[jax.Arra
     carry = state, first.observation, memory, jnp.ones(missions, bool)
     _, (events, decisions) = jax.lax.scan(decide, carry, None, length=config.env.max_decisions)
     return jnp.sum(events), jnp.sum(decisions)
+
+
+def look_call(config: Config, params: PolicyParams, scene: Scene) -> Callable[[], int]:
+    """Returns what leads from poses on the host to an action there: pictures, events, code and Q-network.
+
+    Args:
+        scene: what the camera sees, level, from the world's own start, in a flight ahead.
+    """
+    steps = len(frame_steps(config))
+    place = np.asarray(scene.start) + np.linspace(-0.3, 0.0, steps)[:, None] * np.array([1.0, 0.0, 0.0])
+    poses = Flight(
+        position=jnp.asarray(place, jnp.float32),
+        quaternion=jnp.tile(jnp.array([1.0, 0.0, 0.0, 0.0]), (steps, 1)),
+        velocity=jnp.tile(jnp.array([4.0, 0.0, 0.0]), (steps, 1)),
+    )
+    before, actor = at_rest(config, jax.random.key(0)), AgentActor(config)
+    poses, before, memory = jax.tree.map(np.asarray, (poses, before, actor.init()))  # on the host
+
+    @jax.jit
+    def act(
+        params: PolicyParams, scene: Scene, poses: Flight, before: SensorMemory, memory: Array, key: Array
+    ) -> Array:
+        sensed, _ = sense(config, scene, poses, before, key)
+        seen = Observation(sensed=sensed, own=jnp.zeros(OWN_SIZE), motion=jnp.zeros(MOTION_SIZE))
+        return actor.act(params, memory, seen, key)[0]
+
+    params, scene, key = jax.device_put(params), jax.device_put(scene), jax.random.key(0)
+    return lambda: int(act(params, scene, poses, before, memory, key))
 
 
 def rows_of(policy: Policy, course: MissionSet, calls: int) -> list[dict[str, Any]]:

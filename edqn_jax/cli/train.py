@@ -208,14 +208,9 @@ def train_command(argv: Sequence[str], stops: Stops) -> None:
     sinks = None if run is None else _sinks_of(options, config, run, progress.message)
     stop = Stop(stops.requested, lambda: stops.obeyed(progress.message))
     try:
-        if options.seeds is None:
-            from edqn_jax.runs.record import train_run
+        from edqn_jax.runs.record import train_run
 
-            train_run(config, run, progress, stop, callback=sinks, drawing=prepare_gallery)
-        else:
-            from edqn_jax.runs.seeds import train_seeds_run
-
-            train_seeds_run(config, options.seeds, run, progress, stop, callback=sinks, drawing=prepare_gallery)
+        train_run(config, run, progress, stop, callback=sinks, drawing=prepare_gallery, seeds=options.seeds)
     except jax.errors.JaxRuntimeError as error:
         if arguments is None:
             raise

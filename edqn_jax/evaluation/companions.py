@@ -35,7 +35,7 @@ def scene_of_flight(config: Config, missions: MissionSet, flights: Flights | Non
     if scene.spheres.throw is not None:
         own = np.asarray(ends.start[mission])[None]
         if flights is not None:
-            own = np.concatenate([own, _recorded(flights)[mission]])
+            own = np.concatenate([own, np.asarray(flights.get_record().position[mission])])
         aim = aim_along(config, scene, own[:: config.drone.physics_steps])
         scene = dataclasses.replace(scene, aim=jax.tree.map(np.asarray, aim))
     if not group.several(config):
@@ -46,7 +46,7 @@ def scene_of_flight(config: Config, missions: MissionSet, flights: Flights | Non
     path = np.full((count - 1, 1 + config.env.max_decisions * steps, 3), PARKED, np.float32)
     if flights is not None:
         path[:, 0] = np.asarray(ends.start)[others]
-        flown = _recorded(flights)[others]
+        flown = np.asarray(flights.get_record().position)[others]
         path[:, 1:] = np.where(np.isnan(flown), PARKED, flown)
     table = Flown(
         path=jnp.asarray(path),
@@ -56,10 +56,3 @@ def scene_of_flight(config: Config, missions: MissionSet, flights: Flights | Non
     )
     own = {name: np.asarray(getattr(ends, name)[mission]) for name in ("start", "goal")}
     return dataclasses.replace(scene, **own, drones=jax.tree.map(np.asarray, table))
-
-
-def _recorded(flights: Flights) -> np.ndarray:
-    """Returns the positions [M, T, 3] of recorded flights."""
-    if flights.record is None:
-        raise ValueError("the flights were not recorded; fly them with record=True")
-    return np.asarray(flights.record.position)

@@ -294,7 +294,7 @@ def replay_contact(
     points = np.asarray(positions, dtype=np.float64)
     if points.ndim != 2 or points.shape[1] != 3 or len(points) < 2 or not np.isfinite(points).all():
         raise ValueError(f"positions must be finite metres of shape [n, 3] with n >= 2, not of shape {points.shape}")
-    way = _Way(points, fastest(judge, step_s * len(points)) * step_s)
+    way = Way(points, fastest(judge, step_s * len(points)) * step_s)
 
     def gap_at(distance: float) -> tuple[float, str]:
         segment, fraction = way.place(distance)
@@ -317,7 +317,7 @@ def replay_contact(
     )
 
 
-class _Way:
+class Way:
     """The way of a body, by the metres that it and whatever comes to meet it have gone."""
 
     def __init__(self, points: NDArray[np.float64], meets_m: float) -> None:
@@ -338,7 +338,7 @@ class _Way:
         return self.points[segment] + fraction * (self.points[segment + 1] - self.points[segment])
 
 
-def _first_touch(way: _Way, gap_at: Callable[[float], tuple[float, str]], jumps: bool) -> float | None:
+def _first_touch(way: Way, gap_at: Callable[[float], tuple[float, str]], jumps: bool) -> float | None:
     """Returns the metres gone at the first contact; None without one.
 
     Advances by the gap, which nothing can close sooner, and halves what the last advance left open.

@@ -1,4 +1,4 @@
-"""Decision latency: the time from an observation, or from the light that makes it, to an action."""
+"""Decision latency: the time from an observation to an action."""
 
 from __future__ import annotations
 
@@ -7,16 +7,10 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
-from jax import Array
 
 from edqn_jax.config import Config
-from edqn_jax.learn.actor import Actor, AgentActor, PolicyParams, blank_observation
-from edqn_jax.sim.physics.drone import Flight
-from edqn_jax.sim.scene.scene import Scene
-from edqn_jax.sim.sensors.sensor import SensorMemory, at_rest, frame_steps, sense
-from edqn_jax.sim.task.observation import MOTION_SIZE, OWN_SIZE, Observation
+from edqn_jax.learn.actor import Actor, AgentActor, blank_observation
 
 
 def decision_latency_ms(
@@ -45,34 +39,6 @@ def decision_call(config: Config, params: Any, actor: Actor | None = None) -> Ca
     act = jax.jit(lambda params, memory, seen, key: actor.act(params, memory, seen, key)[0])
     params, key = jax.device_put(params), jax.random.key(0)
     return lambda: np.asarray(act(params, memory, seen, key))
-
-
-def look_call(config: Config, params: PolicyParams, scene: Scene) -> Callable[[], int]:
-    """Returns what leads from poses on the host to an action there: pictures, events, code and Q-network.
-
-    Args:
-        scene: what the camera sees, level, from the world's own start, in a flight ahead.
-    """
-    steps = len(frame_steps(config))
-    place = np.asarray(scene.start) + np.linspace(-0.3, 0.0, steps)[:, None] * np.array([1.0, 0.0, 0.0])
-    poses = Flight(
-        position=jnp.asarray(place, jnp.float32),
-        quaternion=jnp.tile(jnp.array([1.0, 0.0, 0.0, 0.0]), (steps, 1)),
-        velocity=jnp.tile(jnp.array([4.0, 0.0, 0.0]), (steps, 1)),
-    )
-    before, actor = at_rest(config, jax.random.key(0)), AgentActor(config)
-    poses, before, memory = jax.tree.map(np.asarray, (poses, before, actor.init()))  # on the host
-
-    @jax.jit
-    def act(
-        params: PolicyParams, scene: Scene, poses: Flight, before: SensorMemory, memory: Array, key: Array
-    ) -> Array:
-        sensed, _ = sense(config, scene, poses, before, key)
-        seen = Observation(sensed=sensed, own=jnp.zeros(OWN_SIZE), motion=jnp.zeros(MOTION_SIZE))
-        return actor.act(params, memory, seen, key)[0]
-
-    params, scene, key = jax.device_put(params), jax.device_put(scene), jax.random.key(0)
-    return lambda: int(act(params, scene, poses, before, memory, key))
 
 
 def in_turn(works: Sequence[Callable[[], object]], calls: int, block: int = 1) -> np.ndarray:

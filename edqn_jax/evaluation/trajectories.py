@@ -18,9 +18,9 @@ from edqn_jax.sim.task.action_sets import action_set
 from edqn_jax.sim.task.flights import Flights
 from edqn_jax.sim.task.outcomes import Outcome
 
-TRAJECTORY_COLUMNS = (
-    "t", "x", "y", "z", "qw", "qx", "qy", "qz", "vx", "vy", "vz", "action", "reward", "clearance",
-)  # fmt: skip
+POSITION, ATTITUDE, VELOCITY = ("x", "y", "z"), ("qw", "qx", "qy", "qz"), ("vx", "vy", "vz")
+
+TRAJECTORY_COLUMNS = ("t", *POSITION, *ATTITUDE, *VELOCITY, "action", "reward", "clearance")
 """Columns of `trajectory.csv`, one row a physics step: seconds, metres, a unit quaternion, m/s, the action's
 number, the reward of the decision and the distance of the body's sphere from the nearest shape."""
 
@@ -43,10 +43,8 @@ def trajectory(config: Config, flights: Flights, mission: int = 0) -> dict[str, 
     Raises:
         ValueError: if the flights were not recorded.
     """
-    if flights.record is None:
-        raise ValueError("the flights were not recorded; fly them with record=True")
     steps = int(flights.physics_steps[mission])
-    whole = jax.tree.map(lambda leaf: np.asarray(leaf[mission]), flights.record)
+    whole = jax.tree.map(lambda leaf: np.asarray(leaf[mission]), flights.get_record())
     decision = np.arange(steps) // config.drone.physics_steps
     values = np.column_stack(
         [
@@ -63,10 +61,15 @@ def trajectory(config: Config, flights: Flights, mission: int = 0) -> dict[str, 
     return dict(zip(columns, values.T, strict=True))
 
 
+def columns_of(flown: Mapping[str, np.ndarray], names: tuple[str, ...]) -> np.ndarray:
+    """Returns columns of a trajectory beside each other, [T, names] float64."""
+    return np.stack([np.asarray(flown[name], np.float64) for name in names], axis=-1)
+
+
 def actions_of(flown: Mapping[str, np.ndarray]) -> np.ndarray:
     """Returns the actions [T] or [T, A] in the columns of a trajectory."""
-    values = [column for name, column in flown.items() if name.startswith("action_")]
-    return np.stack(values, axis=-1) if values else flown["action"]
+    names = tuple(name for name in flown if name.startswith("action_"))
+    return columns_of(flown, names) if names else flown["action"]
 
 
 def directions(config: Config, poses: Flight, actions: np.ndarray) -> np.ndarray:
@@ -99,9 +102,7 @@ def write_trajectories(config: Config, missions: MissionSet, flights: Flights, f
         ConfigError: if the file cannot be written.
         ValueError: if the flights were not recorded.
     """
-    record = flights.record
-    if record is None:
-        raise ValueError("the flights were not recorded; fly them with record=True")
+    record = flights.get_record()
     flown = jax.tree.map(np.asarray, missions.world.missions)
     heading = np.arctan2(*(flown.goal - flown.start)[:, 1::-1].T)
     level = np.zeros_like(heading)

@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 
 from edqn_jax.config import Config
-from edqn_jax.evaluation.judge import Judge, Target, fastest, load_judge, replay_contact
+from edqn_jax.evaluation.judge import Judge, Target, Way, fastest, load_judge, replay_contact
 from edqn_jax.evaluation.missions import MissionSet
 from edqn_jax.sim.task.flights import Flights
 from edqn_jax.sim.task.outcomes import Outcome
@@ -54,13 +54,11 @@ def check_verdicts(config: Config, missions: MissionSet, flights: Flights) -> li
     Raises:
         ValueError: if the flights were not recorded.
     """
-    if flights.record is None:
-        raise ValueError("the flights were not recorded; fly them with record=True")
     judges = judges_of(config, missions)
     flown = missions.world.missions
     scenes, starts, goals = np.asarray(flown.scene), np.asarray(flown.start), np.asarray(flown.goal)
     step_s, of_decision = config.drone.physics_dt_s, config.drone.physics_steps
-    positions = np.asarray(flights.record.position)
+    positions = np.asarray(flights.get_record().position)
     outcomes, steps = np.asarray(flights.outcome), np.asarray(flights.physics_steps)
     results = []
     for i, (scene, outcome, count) in enumerate(zip(scenes, outcomes, steps, strict=True)):
@@ -71,9 +69,8 @@ def check_verdicts(config: Config, missions: MissionSet, flights: Flights) -> li
         found = None if contact is None else contact.segment + contact.fraction
         apart = None
         if stated is not None and found is not None:
-            steps_m = np.linalg.norm(np.diff(path, axis=0), axis=1) + fastest(judges[scene], step_s * count) * step_s
-            travelled = np.concatenate([[0.0], np.cumsum(steps_m)])
-            apart = abs(float(np.diff(np.interp([stated, found], np.arange(count + 1), travelled))[0]))
+            way = Way(path, fastest(judges[scene], step_s * count) * step_s)
+            apart = abs(float(np.diff(np.interp([stated, found], np.arange(count + 1), way.travelled))[0]))
         touched = "" if contact is None else contact.geom
         results.append(Agreement(i, Outcome(int(outcome)), stated, found, apart, touched))
     return results

@@ -45,7 +45,7 @@ from edqn_jax.learn.perception.code import Params as EncoderParams
 from edqn_jax.learn.policy import Policy
 from edqn_jax.sim.actions import Box, Discrete
 from edqn_jax.sim.environment import Environment
-from edqn_jax.sim.task.action_sets import described
+from edqn_jax.sim.task.action_sets import are_actions, described
 from edqn_jax.sim.task.env import EnvState
 from edqn_jax.sim.task.outcomes import Outcome
 from edqn_jax.sim.task.reward import Reward
@@ -102,12 +102,7 @@ class _Task:
             gymnasium.error.InvalidAction: if they are none.
         """
         space, numbers = self.env.action_space(self.params), np.asarray(given)
-        good = numbers.shape == (*(() if count is None else (count,)), *space.shape)
-        if isinstance(space, Discrete):
-            good = good and np.issubdtype(numbers.dtype, np.integer) and 0 <= numbers.min() <= numbers.max() < space.n
-        else:
-            good = good and np.issubdtype(numbers.dtype, np.number) and bool(np.isfinite(numbers).all())
-        if not good:
+        if not are_actions(space, numbers, () if count is None else (count,)):
             wanted = "an action must be" if count is None else f"there must be {count} actions, each"
             raise gymnasium.error.InvalidAction(f"{wanted} {described(space)}")
         return numbers.astype(space.dtype)

@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 
-import jax
 import numpy as np
 import numpy.typing as npt
 
-from edqn_jax.sim.scene.distance import signed_distance
 from edqn_jax.sim.scene.scene import Scene
 
 MARGIN = 1e-3
@@ -72,17 +70,6 @@ def not_found(why: str, seconds: float = 0.0, steps: int = 0) -> PlannedPath:
     return PlannedPath(None, f"no path: {why}", seconds, steps, float("nan"), float("nan"))
 
 
-def refusal(task: Task) -> str | None:
-    """Returns why there cannot be a path if start or goal is outside the volume or not free, else None."""
-    lower, upper = np.asarray(task.scene.volume, np.float64)
-    for role, point in (("start", task.start), ("goal", task.goal)):
-        if not np.all((point >= lower) & (point <= upper)):
-            return f"the {role} {point_text(point)} lies outside the flight volume"
-        if _distance(task.scene, np.float32(point)) < task.body_radius + MARGIN:
-            return f"a sphere of {task.body_radius:g} m does not fit at the {role} {point_text(point)}"
-    return None
-
-
 def path_length(points: np.ndarray) -> float:
     """Returns the length of the line through points [N, 3], metres."""
     return float(np.linalg.norm(np.diff(points, axis=0), axis=1).sum())
@@ -91,6 +78,3 @@ def path_length(points: np.ndarray) -> float:
 def point_text(point: np.ndarray) -> str:
     """Returns a point [3], metres, as text: "(x, y, z)"."""
     return "(" + ", ".join(f"{value:g}" for value in point) + ")"
-
-
-_distance = jax.jit(signed_distance)

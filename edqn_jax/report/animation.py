@@ -19,13 +19,14 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Wedge
 from PIL import Image
 
+from edqn_jax.evaluation.trajectories import POSITION, columns_of
 from edqn_jax.extras import require
 from edqn_jax.learn.policy import PolicyParams
 from edqn_jax.report.flights import OBLIQUE, OTHER_COLOUR, draw_end_marks, draw_stage, others_paths
 from edqn_jax.report.images import look_of, scale_of
 from edqn_jax.report.sights import Sights, decision_rows, poses, times_of
 from edqn_jax.report.solids import MAP, View, faces_seen, hidden, moving_solids
-from edqn_jax.report.style import INK, LINE, MUTED, OUTCOME_COLOURS, OUTCOME_LABELS, STYLE
+from edqn_jax.report.style import INK, LINE, MUTED, OUTCOME_COLOURS, OUTCOME_LABELS, STYLE, frame
 from edqn_jax.sim.camera.camera import on_screen
 from edqn_jax.sim.scene.scene import moves
 
@@ -89,7 +90,7 @@ class _Stage:
         self, sights: Sights, params: PolicyParams | None, flown: Mapping[str, np.ndarray], title: str
     ) -> None:
         self._sights, self._flown = sights, flown
-        self._points = np.stack([flown[name] for name in ("x", "y", "z")], axis=-1).astype(np.float64)
+        self._points = columns_of(flown, POSITION)
         self._figure = Figure(figsize=(SIZE[0] / DOTS_PER_INCH, SIZE[1] / DOTS_PER_INCH), dpi=DOTS_PER_INCH)
         self._canvas = FigureCanvasAgg(self._figure)
         self._moving: list[Artist] = []
@@ -143,11 +144,7 @@ class _Stage:
         sights, camera = self._sights, self._sights.config.camera
         above, below = (self._figure.add_axes((0.015, y, 0.375, 0.415)) for y in (0.533, 0.06))
         for axes in (above, below):
-            axes.set(xticks=[], yticks=[])
-            axes.grid(False)
-            for spine in axes.spines.values():
-                spine.set(visible=True, color=MUTED, linewidth=0.8, animated=True, zorder=2.5)
-                self._moving.append(spine)
+            self._moving += frame(axes, linewidth=0.8, animated=True, zorder=2.5)
         above.set_title("What a person would see", fontsize=10)
         self._rgb = above.imshow(np.zeros((2, 2, 3)), animated=True, aspect="auto", interpolation="antialiased")
         self._moving.append(self._rgb)

@@ -16,6 +16,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Circle
 
 from edqn_jax.devices.jax_settings import as_tested
+from edqn_jax.evaluation.trajectories import POSITION, VELOCITY, columns_of
 from edqn_jax.report.solids import (
     GROUND,
     MAP,
@@ -105,8 +106,7 @@ def draw_path(
         outcome: how the flight ended; unless it is `goal` its end is marked.
         goal_radius_m: the circle around the goal.
     """
-    points = np.stack([np.asarray(trajectory[name], np.float64) for name in ("x", "y", "z")], axis=1)
-    velocity = np.stack([np.asarray(trajectory[name], np.float64) for name in ("vx", "vy", "vz")], axis=1)
+    points, velocity = columns_of(trajectory, POSITION), columns_of(trajectory, VELOCITY)
     thin = np.unique(np.linspace(0, len(points) - 1, min(PATH_POINTS, len(points))).round().astype(int))
     points, speed = points[thin], np.linalg.norm(velocity[thin], axis=1)
     scale = Normalize(0.0, max(float(np.ceil(speed.max())), 1.0))
@@ -130,12 +130,7 @@ def draw_path(
                 x, y = view.project(points[-1])
                 axes.plot(x, y, "X", ms=8, mfc=OUTCOME_COLOURS[outcome], mec="white", mew=0.8, zorder=10)
         bar = figure.colorbar(
-            ScalarMappable(scale, SPEED_COLOURS),
-            ax=above,
-            shrink=0.75,
-            aspect=28,
-            pad=0.03,
-            label="speed, m/s",
+            ScalarMappable(scale, SPEED_COLOURS), ax=above, shrink=0.75, aspect=28, pad=0.03, label="speed, m/s"
         )
         bar.outline.set_visible(False)  # pyright: ignore[reportCallIssue]
         figure.legend(handles=_path_legend(shortest is not None, outcome), loc="outside lower center", ncols=5)
@@ -270,12 +265,7 @@ def _draw_flown(
     axes.add_collection(halo)
     for which, width, alpha in ((covered, 1.2, 0.45), (~covered, 2.0, 1.0)):
         line = LineCollection(
-            list(pieces[which]),
-            cmap=SPEED_COLOURS,
-            norm=scale,
-            linewidths=width,
-            alpha=alpha,
-            capstyle="round",
+            list(pieces[which]), cmap=SPEED_COLOURS, norm=scale, linewidths=width, alpha=alpha, capstyle="round"
         )
         line.set_array(middle_speed[which])
         line.set_zorder(7)

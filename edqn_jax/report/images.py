@@ -13,7 +13,7 @@ from matplotlib.colors import Colormap, Normalize
 from matplotlib.figure import Figure
 
 from edqn_jax.config.registry import SENSORS
-from edqn_jax.report.style import COUNTS, INK, MUTED, POLARITY, drawing
+from edqn_jax.report.style import COUNTS, INK, POLARITY, drawing, frame
 
 
 @dataclasses.dataclass(frozen=True)
@@ -136,13 +136,7 @@ def _show(axes: Axes, picture: np.ndarray, scale: Normalize, look: Look) -> None
         axes.imshow(np.clip(picture, 0.0, 1.0), interpolation="nearest")
     else:
         axes.imshow(picture, cmap=look.colours, norm=scale, interpolation="nearest")
-    axes.set_xticks([])
-    axes.set_yticks([])
-    axes.grid(False)
-    for spine in axes.spines.values():
-        spine.set_visible(True)
-        spine.set_color(MUTED)
-        spine.set_linewidth(0.5)
+    frame(axes)
 
 
 def _colour_bar(figure: Figure, scale: Normalize, beside: np.ndarray, look: Look, label: str) -> None:

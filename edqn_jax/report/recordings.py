@@ -16,7 +16,7 @@ from PIL import Image
 
 from edqn_jax.report.animation import gif
 from edqn_jax.report.images import Look, scale_of
-from edqn_jax.report.style import MUTED, STYLE, drawing
+from edqn_jax.report.style import MUTED, STYLE, drawing, frame
 
 MOMENTS = 6
 """Moments of a still picture."""
@@ -96,9 +96,6 @@ def animate_recording(strips: Sequence[Strip], times_s: Sequence[float], period_
 
 
 def _image(axes, picture: NDArray, strip: Strip, scale) -> AxesImage:
-    axes.set(xticks=[], yticks=[])
-    axes.grid(False)
-    for spine in axes.spines.values():
-        spine.set(visible=True, color=MUTED, linewidth=0.5)
+    frame(axes)
     # A camera has more pixels than a picture: single events would be lost between its dots.
     return axes.imshow(picture, cmap=strip.look.colours, norm=scale, interpolation="antialiased")

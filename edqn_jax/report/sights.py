@@ -17,7 +17,7 @@ from jax.stages import Compiled
 
 from edqn_jax.config import Config
 from edqn_jax.devices.devices import quick_compiler_options
-from edqn_jax.evaluation.trajectories import actions_of, directions
+from edqn_jax.evaluation.trajectories import ATTITUDE, POSITION, VELOCITY, actions_of, columns_of, directions
 from edqn_jax.learn.actor import AgentActor, PolicyParams
 from edqn_jax.learn.perception import embedding, vae
 from edqn_jax.learn.policy import fresh_policy
@@ -157,9 +157,8 @@ def decision_rows(config: Config, flown: Mapping[str, np.ndarray]) -> np.ndarray
 
 def poses(flown: Mapping[str, np.ndarray], rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Returns positions [..., 3] in metres and attitudes [..., 4] of a trajectory at rows [...]."""
-    position = np.stack([flown[name] for name in ("x", "y", "z")], axis=-1)
-    quaternion = np.stack([flown[name] for name in ("qw", "qx", "qy", "qz")], axis=-1)
-    return position[rows].astype(np.float32), quaternion[rows].astype(np.float32)
+    position, quaternion = (columns_of(flown, names)[rows] for names in (POSITION, ATTITUDE))
+    return position.astype(np.float32), quaternion.astype(np.float32)
 
 
 def times_of(flown: Mapping[str, np.ndarray], rows: np.ndarray) -> np.ndarray:
@@ -183,9 +182,10 @@ def own_motions(config: Config, flown: Mapping[str, np.ndarray], rows: np.ndarra
     (place, now), (_, before) = poses(flown, last), poses(flown, np.maximum(last - 1, 0))
     yaw = drone.yaw_of(jnp.asarray(now))
     rate = drone.wrap_angle(yaw - drone.yaw_of(jnp.asarray(before))) / config.drone.physics_dt_s
-    velocity = np.stack([flown[name] for name in ("vx", "vy", "vz")], axis=-1)[last]
-    ahead = heading_velocity(config.env, yaw, jnp.asarray(velocity))
-    commanded = directions(config, Flight(place, now, velocity), actions_of(flown)[last])
+    velocity = jnp.asarray(columns_of(flown, VELOCITY)[last])
+    ahead = heading_velocity(config.env, yaw, velocity)
+    after = Flight(jnp.asarray(place), jnp.asarray(now), velocity)
+    commanded = directions(config, after, actions_of(flown)[last])
     return np.concatenate([ahead, np.asarray(rate)[:, None], commanded], axis=-1).astype(np.float32)
 
 

@@ -8,9 +8,11 @@ from pathlib import Path
 from typing import Any
 
 import matplotlib
+from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.colors import LinearSegmentedColormap
 from matplotlib.figure import Figure
+from matplotlib.spines import Spine
 
 OUTCOME_COLOURS = {
     "goal": "#009e73",
@@ -81,3 +83,12 @@ def drawing(width: float, height: float, file: Path) -> Iterator[Figure]:
         yield figure
         file.parent.mkdir(parents=True, exist_ok=True)
         canvas.print_png(file)  # `savefig` lays everything out twice
+
+
+def frame(axes: Axes, linewidth: float = 0.5, **style: Any) -> list[Spine]:
+    """Draws a line around a picture, without ticks and grid, and returns its four sides."""
+    axes.set(xticks=[], yticks=[])
+    axes.grid(False)
+    for spine in axes.spines.values():
+        spine.set(visible=True, color=MUTED, linewidth=linewidth, **style)
+    return list(axes.spines.values())

@@ -8,21 +8,17 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Executor
 from typing import Any, Protocol
 
-import jax
 import numpy as np
 
-from edqn_jax.config import FAMILIES, Config
+from edqn_jax.config import Config
 from edqn_jax.devices import processes
 from edqn_jax.errors import ConfigError, StoppedError
 from edqn_jax.evaluation.companions import scene_of_flight
-from edqn_jax.evaluation.metrics import clearance_text, clock, flight_summary
+from edqn_jax.evaluation.metrics import flight_summary
 from edqn_jax.evaluation.trajectories import trajectory
 from edqn_jax.learn import saved_state
-from edqn_jax.learn.plan import Plan
 from edqn_jax.learn.policy import PolicyParams
-from edqn_jax.learn.state import TrainState
-from edqn_jax.learn.trainer import Trainer
-from edqn_jax.runs import summaries, world_copy
+from edqn_jax.runs import messages, summaries, world_copy
 from edqn_jax.runs.directory import TO_BE_DRAWN, RunDirectory
 from edqn_jax.runs.keeper import Keeper
 from edqn_jax.runs.provenance import state_digest
@@ -60,6 +56,7 @@ def train_run(
     reward: Reward | None = None,
     callback: Callback | None = None,
     drawing: PrepareDrawing | None = None,
+    seeds: int | None = None,
 ) -> dict[str, Any]:
     """Trains, validates, flies and draws; writes everything to the run directory.
 
@@ -70,39 +67,67 @@ def train_run(
         stop: asked after each chunk; where one process is to stop, all do.
         reward, callback: as in `train`.
         drawing: of the run's pictures; None draws none.
+        seeds: trains so many agents in one program, whose seeds count up from `train.seed`; each has a run of its own
+            within `run`, which holds a summary of all. None is one agent, whose run is `run` itself.
 
     Returns:
-        the content of `summary.json`.
+        the content of `summary.json`, of several seeds that of all.
 
     Raises:
         ConfigError: before anything is written, if the run cannot be made; later, if one of its files cannot be.
         DivergedError: as `train`; the policy of the last checkpoint stays.
         StoppedError: after saving the policy, if it was asked to.
     """
-    with locked(run), prepared(config, reward, progress) as preparation:
-        progress.message(f"{trained_in(config)}, {described(preparation.devices)}")
-        if (note := preparation.missions[0].training.note) is not None:
-            progress.message(note)
-        keeper = Keeper(preparation, run, [run], reward, progress.message)
-        begin = opened(preparation, run, keeper, progress)
+    with locked(run), prepared(config, reward, progress, agents=seeds) as preparation:
+        progress.message(messages.beginning(preparation, seeds))
+        folders = [run if run is None or seeds is None else run.of_seed(c.train.seed) for c in preparation.configs]
+        keeper = Keeper(preparation, run, folders, reward, progress.message)
+        begin = opened(preparation, run, keeper, progress, seeds is not None)
         preparation.ready(begins=begin is None)  # until then a signal ends the command: nothing is lost yet
         with stop.obeyed():
-            (result,) = run_chunks(
-                preparation, recorded(lambda _: run, callback, stop.requested), keeper.save_if_due, begin
-            )
-        if processes.on_any(result.stopped or stop.requested()):
-            raise StoppedError(f"stopped after {result.decisions:,} decisions; {where_saved(run)}")
-        progress.phase("flying the mission")
+            after = recorded(lambda chunk: folders[chunk.agent], callback, stop.requested)
+            results = run_chunks(preparation, after, keeper.save_if_due, begin)
+        if processes.on_any(results[0].stopped or stop.requested()):
+            raise StoppedError(messages.stopped(run, results[0].decisions, seeds))
+        progress.phase("flying the mission" if seeds is None else "flying the missions")
         draw = None if run is None else prepare_to_draw(preparation, drawing)
-        flights = preparation.fly(preparation.missions[0].final, result.policy.params)
-        digest = state_digest(needed(preparation.trainer, result))  # the last that all processes do together
-        summary = summaries.of_run(preparation, result, flights, digest, reward) | keeper.facts
+        flights = [preparation.fly(preparation.missions[k].final, r.policy.params, k) for k, r in enumerate(results)]
+        of_each = _summaries(preparation, results, flights, reward, keeper.facts, seeds)
         if run is not None:
             progress.phase("drawing")
-            finish(run, preparation, draw, result, flights, summary, progress)
+            for folder, result, flown, of_run in zip(folders, results, flights, of_each, strict=True):
+                assert folder is not None
+                finish(folder, preparation, draw, result, flown, of_run, progress)
+        summary = of_each[0]
+        if seeds is not None:
+            summary = summaries.of_all_seeds(config, preparation.missions[0].tests, flights, of_each)
+            summary["total_seconds"] = time.perf_counter() - preparation.began
+        if run is not None:
+            if seeds is not None:
+                run.write_summary(summary)
             progress.stop()
-            progress.message(_verdict(summary, run))
+            progress.message(messages.verdict(summary, run))
     return summary
+
+
+def _summaries(
+    preparation: Preparation,
+    results: Sequence[TrainingResult],
+    flights: Sequence[Flights],
+    reward: Reward | None,
+    facts: dict[str, Any],
+    seeds: int | None,
+) -> list[dict[str, Any]]:
+    """Returns the content of each agent's `summary.json`; the last that all processes do together."""
+    trainer, steps = preparation.trainer, results[0].decisions // preparation.config.train.num_envs
+    state = saved_state.needed(trainer, results[0].state, steps)  # what a later step would read
+    together = facts if seeds is None else {"trained_together": seeds, **facts}
+    # One after the other: a state may be large.
+    digests = [state_digest(trainer.of_agent(state, number)) for number in range(len(results))]
+    return [
+        summaries.of_run(preparation, result, flown, digest, reward) | together
+        for result, flown, digest in zip(results, flights, digests, strict=True)
+    ]
 
 
 @contextlib.contextmanager
@@ -155,22 +180,10 @@ def opened(
 
     processes.together(prepare)
     if begin is not None:
-        progress.message(_continued(preparation.trainer.plan, begin.done, preparation.config))
+        progress.message(messages.continued_at(preparation.trainer.plan, begin.done, preparation.config))
     elif run is not None and run.resume != "never":
         progress.message("there is no checkpoint of the interrupted run; it begins anew")
     return begin
-
-
-def _continued(plan: Plan, done: int, config: Config) -> str:
-    """Returns that a run goes on, and what that means for its schedules, as lines for the screen."""
-    envs = config.train.num_envs
-    text = f"continued after {done * envs:,} of {plan.total * envs:,} decisions"
-    if plan.scheduled < plan.total:
-        text += (
-            f"; exploration and step size were planned for {plan.scheduled * envs:,} and stay from there on what they "
-            "are at that end, and the encoder is not trained again"
-        )
-    return text
 
 
 def recorded(
@@ -202,10 +215,6 @@ def record(run: RunDirectory | None, chunk: Chunk) -> None:
     columns = (column.tolist() for column in (ended.step, ended.episode_return, ended.length))
     run.append_episodes(zip(*columns, ended.named(), strict=True))
     run.append_metrics(chunk.metrics)
-
-
-def where_saved(run: RunDirectory | None) -> str:
-    return "the first process saves the policy" if run is None else f"the policy is in '{run.checkpoints}'"
 
 
 def prepare_to_draw(preparation: Preparation, drawing: PrepareDrawing | None) -> Draw | None:
@@ -251,71 +260,3 @@ def finish(
         progress.message(f"the figures are incomplete: {error}; everything else is in '{run.path}'")
     summary["total_seconds"] = time.perf_counter() - preparation.began
     run.write_summary(summary)
-
-
-def needed(trainer: Trainer, result: TrainingResult) -> TrainState:
-    """Returns the last state of a run without what no later step would read."""
-    return saved_state.needed(trainer, result.state, result.decisions // trainer.config.train.num_envs)
-
-
-def trained_in(config: Config) -> str:
-    """Returns what the training worlds are, for the screen."""
-    name = config.world.name
-    return f"{config.world.pool_size:,} random {name} worlds" if name in FAMILIES else f"world '{name}'"
-
-
-def described(devices: Sequence[jax.Device]) -> str:  # pyright: ignore[reportInvalidTypeForm]
-    count = len({device.process_index for device in devices})
-    return f"{len(devices)} {devices[0].platform} devices" + (f" of {count} processes" if count > 1 else "")
-
-
-def _verdict(summary: dict[str, Any], run: RunDirectory) -> str:
-    """Returns the last lines on the screen."""
-    ending = {
-        "goal": "reached the goal",
-        "collision": "ended in a collision",
-        "left_volume": "left the flight volume",
-        "time_out": "ran out of time",
-        "diverged": "diverged",
-    }[summary["outcome"]]
-    text = (
-        f"{_flight(summary)} {ending} after {count(summary['steps'], 'decision')} ({summary['flight_seconds']:.1f} s): "
-        f"{summary['path_length_m']:.1f} m flown, shortest path {summary['shortest_path_m']:.1f} m. "
-        f"{_nearest(summary)}"
-    )
-    if "test" in summary:
-        test = summary["test"]
-        low, high = test["interval"]
-        text += (
-            f"\nUnseen test worlds: {test['successes']} of {test['missions']} reached the goal "
-            f"({test['success_rate']:.0%}, 95 % Wilson interval {low:.0%} to {high:.0%})."
-        )
-    return (
-        f"{text}\nTook {clock(summary['total_seconds'])} in all, {clock(summary['train_seconds'])} of it training. "
-        f"Everything is in {run.path}"
-    )
-
-
-def _flight(summary: dict[str, Any]) -> str:
-    """Returns which flight the verdict is about."""
-    if summary["flown"] == summary["world"]:
-        return "The greedy flight"
-    return f"The greedy flight through {unseen(summary)},"
-
-
-def unseen(summary: dict[str, Any]) -> str:
-    """Returns what the world of the last flight of a run in random worlds is, for the screen."""
-    where = "the paper's map" if summary["flown"] == "paper" else f"'{summary['flown']}'"
-    return f"{where}, which training never used"
-
-
-def _nearest(summary: dict[str, Any]) -> str:
-    """Returns the closest approach as a sentence."""
-    if summary["outcome"] == "collision":
-        return f"It touched {'another drone' if summary.get('hit_drone') else 'an obstacle or the ground'}."
-    return f"The least clearance was {clearance_text(summary['min_clearance_m'])}."
-
-
-def count(number: int, noun: str) -> str:
-    """Returns `1 decision`, `2 decisions`."""
-    return f"{number:,} {noun}" + ("" if number == 1 else "s")

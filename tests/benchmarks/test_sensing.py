@@ -12,7 +12,6 @@ import pytest
 
 import sensing
 from edqn_jax.config.loading import make_config
-from edqn_jax.evaluation import latency
 from edqn_jax.evaluation.missions import load_missions
 from edqn_jax.learn.policy import Policy, fresh_policy
 from edqn_jax.sim.environment import Environment
@@ -85,9 +84,9 @@ def test_ratios_are_those_of_turns() -> None:
 def test_the_time_from_photons_to_move_is_that_of_pictures_and_networks(
     policy: Policy, sensor: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    drawn, sense = [], latency.sense
+    drawn, sense = [], sensing.sense
     monkeypatch.setattr(
-        latency, "sense", lambda config, *given: drawn.append(config.env.sensor) or sense(config, *given)
+        sensing, "sense", lambda config, *given: drawn.append(config.env.sensor) or sense(config, *given)
     )
     config = dataclasses.replace(policy.config, env=dataclasses.replace(policy.config.env, sensor=sensor))
     course = load_missions(policy.config, "medium", 1)

@@ -40,18 +40,16 @@ def trainer(monkeypatch):
     """Stands in for training: a function to set, and the calls that reached it."""
     stand_in = types.ModuleType("edqn_jax.runs.record")
     calls: list[tuple] = []
-    behaviour = types.SimpleNamespace(calls=calls, act=lambda *call: None, callbacks=[])
+    behaviour = types.SimpleNamespace(calls=calls, act=lambda *call: None, callbacks=[], seeds=[])
 
-    def train_run(*call, callback, drawing):
+    def train_run(*call, callback, drawing, seeds):
         calls.append(call)
         behaviour.callbacks.append(callback)
+        behaviour.seeds.append(seeds)
         return behaviour.act(*call)
 
-    seeds = types.ModuleType("edqn_jax.runs.seeds")
-    stand_in.__dict__["Draw"] = object  # what the gallery imports of it
-    stand_in.__dict__["train_run"] = seeds.__dict__["train_seeds_run"] = train_run
+    stand_in.__dict__.update(train_run=train_run, Draw=None)  # the gallery names `Draw` as a type
     monkeypatch.setitem(sys.modules, "edqn_jax.runs.record", stand_in)
-    monkeypatch.setitem(sys.modules, "edqn_jax.runs.seeds", seeds)
     monkeypatch.setattr(train, "hardware", lambda: "cpu")
     monkeypatch.setattr(devices, "use_cpu_devices", lambda count=None: None)
     return behaviour
@@ -205,8 +203,8 @@ def test_training_gets_the_configuration_and_a_folder_that_is_not_made_yet(train
 
 def test_several_seeds_are_trained_together(trainer):
     assert main(["train", "--seeds", "4", "--seed", "3", "--run-dir", "here"]) == 0
-    config, seeds, run = trainer.calls[0][:3]
-    assert (config.train.seed, seeds, run.path) == (3, 4, Path("here"))
+    config, run = trainer.calls[0][:2]
+    assert (config.train.seed, trainer.seeds, run.path) == (3, [4], Path("here"))
 
 
 @pytest.mark.parametrize(

@@ -71,7 +71,7 @@ class Pilot(Model):
     @staticmethod
     def move_of(vector: np.ndarray) -> np.ndarray:
         """Returns velocities [..., 3] of vectors [..., N]."""
-        return np.broadcast_to(np.float32([0.0, 0.0, 1.0]), (*vector.shape[:-1], 3))
+        return np.broadcast_to(np.array([0.0, 0.0, 1.0], np.float32), (*vector.shape[:-1], 3))
 
 
 FAST = dataclasses.replace(BLIND, env=dataclasses.replace(BLIND.env, actions="velocity"))

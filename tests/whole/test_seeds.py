@@ -17,7 +17,7 @@ from edqn_jax.report.gallery import prepare_gallery
 from edqn_jax.report.progress import Progress
 from edqn_jax.runs.directory import RunDirectory, plain
 from edqn_jax.runs.policies import load_policy
-from edqn_jax.runs.seeds import train_seeds_run
+from edqn_jax.runs.record import train_run
 from edqn_jax.runs.stopping import Stop
 from edqn_jax.runs.verification.verify import verify
 from edqn_jax.training import history
@@ -37,7 +37,7 @@ def read(run: RunDirectory) -> dict:
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory: pytest.TempPathFactory) -> tuple[RunDirectory, dict]:
     run = RunDirectory(tmp_path_factory.mktemp("runs") / "seeds")
-    return run, train_seeds_run(RANDOM, 2, run, Progress(), Stop(), drawing=prepare_gallery)
+    return run, train_run(RANDOM, run, Progress(), Stop(), drawing=prepare_gallery, seeds=2)
 
 
 @pytest.mark.slow
@@ -89,7 +89,7 @@ def test_the_folder_of_several_seeds_is_no_policy(runs: tuple[RunDirectory, dict
 def test_stopping_stops_every_seed_and_keeps_their_policies(tmp_path: Path) -> None:
     run = RunDirectory(tmp_path / "stopped")
     with pytest.raises(StoppedError, match="stopped after 64 decisions; the policies are in"):
-        train_seeds_run(BLIND_RUN, 2, run, Progress(), Stop(lambda: True), drawing=prepare_gallery)
+        train_run(BLIND_RUN, run, Progress(), Stop(lambda: True), drawing=prepare_gallery, seeds=2)
     assert [load_policy(run.of_seed(seed).path).config.train.seed for seed in (0, 1)] == [0, 1]
     assert not run.summary_file.exists()
 

@@ -18,8 +18,8 @@ import numpy as np
 from edqn_jax.extras import require
 from edqn_jax.planning.astar import shorten
 from edqn_jax.planning.lattice import edge_margin
-from edqn_jax.planning.path import PlannedPath, Task, found, not_found, refusal
-from rivals.planners.planner import Budget
+from edqn_jax.planning.path import PlannedPath, Task, found, not_found
+from rivals.planners.planner import Budget, refusal
 from rivals.planners.solids import distance, leg_free, solid_table
 
 numba = require("numba")

@@ -9,7 +9,11 @@ import dataclasses
 import importlib
 from typing import Protocol
 
-from edqn_jax.planning.path import PlannedPath, Task
+import jax
+import numpy as np
+
+from edqn_jax.planning.path import MARGIN, PlannedPath, Task, point_text
+from edqn_jax.sim.scene.distance import signed_distance
 
 
 @dataclasses.dataclass(frozen=True)
@@ -46,6 +50,17 @@ SAMPLING = (*IMPROVING, "RRT* first path", "BIT* first path")
 """Planners that sample at random, so that the path depends on the seed."""
 
 
+def refusal(task: Task) -> str | None:
+    """Returns why there cannot be a path if start or goal is outside the volume or not free, else None."""
+    lower, upper = np.asarray(task.scene.volume, np.float64)
+    for role, point in (("start", task.start), ("goal", task.goal)):
+        if not np.all((point >= lower) & (point <= upper)):
+            return f"the {role} {point_text(point)} lies outside the flight volume"
+        if _distance(task.scene, np.float32(point)) < task.body_radius + MARGIN:
+            return f"a sphere of {task.body_radius:g} m does not fit at the {role} {point_text(point)}"
+    return None
+
+
 def load_planner(name: str) -> Planner:
     """Returns the planner of that name.
 
@@ -55,3 +70,6 @@ def load_planner(name: str) -> Planner:
     """
     module, function = PLANNERS[name].split(".")
     return getattr(importlib.import_module(f"rivals.planners.{module}"), function)
+
+
+_distance = jax.jit(signed_distance)

@@ -21,8 +21,8 @@ import time
 import numpy as np
 
 from edqn_jax.extras import require
-from edqn_jax.planning.path import MARGIN, PlannedPath, Task, found, not_found, point_text, refusal
-from rivals.planners.planner import Budget
+from edqn_jax.planning.path import MARGIN, PlannedPath, Task, found, not_found, point_text
+from rivals.planners.planner import Budget, refusal
 from rivals.planners.solids import leg_free, shape_distance, solid_table
 
 numba = require("numba")

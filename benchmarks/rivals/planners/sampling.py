@@ -19,8 +19,8 @@ from typing import Any
 import numpy as np
 
 from edqn_jax.extras import require
-from edqn_jax.planning.path import MARGIN, PlannedPath, Task, not_found, path_length, refusal
-from rivals.planners.planner import Budget
+from edqn_jax.planning.path import MARGIN, PlannedPath, Task, not_found, path_length
+from rivals.planners.planner import Budget, refusal
 from rivals.planners.solids import leg_free, solid_table
 
 base = require("ompl.base")

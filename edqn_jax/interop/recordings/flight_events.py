@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from edqn_jax.config import Config
-from edqn_jax.evaluation.trajectories import actions_of, directions
+from edqn_jax.evaluation.trajectories import ATTITUDE, POSITION, VELOCITY, actions_of, columns_of, directions
 from edqn_jax.interop.recordings.recording import Recording
 from edqn_jax.sim.environment import Environment
 from edqn_jax.sim.physics.drone import Flight
@@ -77,10 +77,7 @@ def _from_start(world: World, flown: Mapping[str, np.ndarray]) -> Flight:
     start, goal = (np.asarray(each[0], np.float64) for each in (world.missions.start, world.missions.goal))
     half = np.arctan2(goal[1] - start[1], goal[0] - start[0]) / 2
     first = {"position": start, "quaternion": [np.cos(half), 0.0, 0.0, np.sin(half)], "velocity": np.zeros(3)}
-    names = {"position": "xyz", "quaternion": ("qw", "qx", "qy", "qz"), "velocity": ("vx", "vy", "vz")}
-    columns = {
-        key: jnp.asarray(np.vstack([first[key], np.column_stack([flown[name] for name in names[key]])]), jnp.float32)
-        for key in names
-    }
+    names = {"position": POSITION, "quaternion": ATTITUDE, "velocity": VELOCITY}
+    columns = {key: jnp.asarray(np.vstack([first[key], columns_of(flown, names[key])]), jnp.float32) for key in names}
     time = jnp.asarray(np.concatenate([[0.0], flown["t"]]), jnp.float32)
     return Flight(**columns, time=time)

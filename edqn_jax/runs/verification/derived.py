@@ -12,6 +12,7 @@ from edqn_jax.config import Config
 from edqn_jax.evaluation.judge import Judge, Target, clearance, replay_contact
 from edqn_jax.evaluation.metrics import EMPTY_M
 from edqn_jax.evaluation.missions import RunMissions
+from edqn_jax.evaluation.trajectories import POSITION, columns_of
 from edqn_jax.evaluation.verdicts import CONTACT_TOLERANCE_M
 from edqn_jax.sim.task.outcomes import Outcome
 from edqn_jax.training.selection import FLIES
@@ -53,7 +54,7 @@ def from_trajectory(
     """Returns what `summary.json` must say of the recorded flight, and how far numbers may be off; C MuJoCo judges."""
     flown = missions.final.world.missions
     start, goal = np.asarray(flown.start[0], np.float64), np.asarray(flown.goal[0], np.float64)
-    positions = np.column_stack([recorded[axis] for axis in "xyz"])
+    positions = columns_of(recorded, POSITION)
     path = np.concatenate([start[None], positions])
     lengths = np.linalg.norm(np.diff(path, axis=0), axis=1)
     steps, seconds, decision = len(positions), float(recorded["t"][-1]), config.drone.physics_steps

@@ -80,7 +80,7 @@ def action_of(config: Config, given: str | ArrayLike) -> Array:
     return move_number(given) if config.env.actions == "moves" else checked_action(config, given)
 
 
-def checked_action(config: Config, given: ArrayLike) -> Array:
+def checked_action(config: Config, given: str | ArrayLike) -> Array:
     """Returns an action [] or [A] in the type of its space.
 
     Raises:
@@ -89,18 +89,23 @@ def checked_action(config: Config, given: ArrayLike) -> Array:
     if isinstance(given, Tracer):
         return given
     space = action_set(config).space
-    numbered = isinstance(space, Discrete)
     try:
-        number = np.asarray(given) if numbered else np.asarray(given, space.dtype)
-        exists = number.shape == space.shape and bool(np.isfinite(number).all())
-    except (TypeError, ValueError):
-        exists = False
-    if exists and numbered:
-        exists = np.issubdtype(number.dtype, np.integer) and 0 <= number < space.n
-    if not exists:
+        numbers = np.asarray(given)
+    except ValueError:  # rows of several lengths
+        numbers = np.array(None)
+    if not are_actions(space, numbers):
         told = given.tolist() if isinstance(given, Array | np.ndarray) else given
         raise ConfigError(f"an action of '{config.env.actions}' is {described(space)}, not {told!r}")
-    return jnp.asarray(number, space.dtype)
+    return jnp.asarray(numbers, space.dtype)
+
+
+def are_actions(space: Discrete | Box, numbers: np.ndarray, many: tuple[int, ...] = ()) -> bool:
+    """Returns whether numbers [*many, ...] are actions of a space, which clips those of a box to its bounds."""
+    if numbers.shape != (*many, *space.shape):
+        return False
+    if isinstance(space, Discrete):
+        return np.issubdtype(numbers.dtype, np.integer) and bool(np.all((numbers >= 0) & (numbers < space.n)))
+    return np.issubdtype(numbers.dtype, np.number) and bool(np.isfinite(numbers).all())
 
 
 def described(space: Discrete | Box) -> str:

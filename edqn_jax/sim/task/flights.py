@@ -54,6 +54,16 @@ class Flights:
     record: Record | None
     hit_drone: Array | None = None  # [M] bool, the collision was with another drone; None where one flies alone
 
+    def get_record(self) -> Record:
+        """Returns the record.
+
+        Raises:
+            ValueError: if the flights were not recorded.
+        """
+        if self.record is None:
+            raise ValueError("the flights were not recorded; fly them with record=True")
+        return self.record
+
 
 def at_start(config: Config, scene: Scene, body: DroneState) -> Flights:
     """Tallies of one flight that begins with `body`."""

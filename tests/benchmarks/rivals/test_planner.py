@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 
 from edqn_jax.extras import MissingPackageError, require
-from edqn_jax.planning.path import refusal
 from rivals.planners import snn
-from rivals.planners.planner import PLANNERS, load_planner
+from rivals.planners.planner import PLANNERS, load_planner, refusal
 from tests.support.benchmarks.uninstalled import hide
 from tests.support.small_worlds import box, small_world
 

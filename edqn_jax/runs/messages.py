@@ -1,0 +1,120 @@
+"""What a recorded run tells on the screen: where it trains, that it goes on, and how it ended."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from edqn_jax.config import FAMILIES, Config
+from edqn_jax.evaluation.metrics import clearance_text, clock
+from edqn_jax.learn.plan import Plan
+from edqn_jax.runs.directory import RunDirectory
+from edqn_jax.training.setup import Preparation
+
+
+def beginning(preparation: Preparation, seeds: int | None) -> str:
+    """Returns where a run trains, and on a line of its own what was decided about its missions."""
+    world, devices = preparation.config.world, preparation.devices
+    text = f"{world.pool_size:,} random {world.name} worlds" if world.name in FAMILIES else f"world '{world.name}'"
+    text += "" if seeds is None else f", {seeds} seeds"
+    text += f", {len(devices)} {devices[0].platform} devices"
+    processes = len({device.process_index for device in devices})
+    text += f" of {processes} processes" if processes > 1 else ""
+    note = preparation.missions[0].training.note
+    return text if note is None else f"{text}\n{note}"
+
+
+def continued_at(plan: Plan, done: int, config: Config) -> str:
+    """Returns that a run goes on, and what that means for its schedules, as lines for the screen."""
+    envs = config.train.num_envs
+    text = f"continued after {done * envs:,} of {plan.total * envs:,} decisions"
+    if plan.scheduled < plan.total:
+        text += (
+            f"; exploration and step size were planned for {plan.scheduled * envs:,} and stay from there on what they "
+            "are at that end, and the encoder is not trained again"
+        )
+    return text
+
+
+def stopped(run: RunDirectory | None, decisions: int, seeds: int | None) -> str:
+    """Returns that a run was stopped, and where its policy is."""
+    what = "the policy" if seeds is None else "the policies"
+    if run is None:
+        where = f"the first process saves {what}"
+    elif seeds is None:
+        where = f"the policy is in '{run.checkpoints}'"
+    else:
+        where = f"the policies are in '{run.path}'"
+    return f"stopped after {decisions:,} decisions; {where}"
+
+
+def verdict(summary: dict[str, Any], run: RunDirectory) -> str:
+    """Returns the last lines on the screen, of one agent's run or of several seeds."""
+    return (_of_seeds(summary) if "seeds" in summary else _of_one(summary)) + f" {run.path}"
+
+
+def _of_one(summary: dict[str, Any]) -> str:
+    ending = {
+        "goal": "reached the goal",
+        "collision": "ended in a collision",
+        "left_volume": "left the flight volume",
+        "time_out": "ran out of time",
+        "diverged": "diverged",
+    }[summary["outcome"]]
+    text = (
+        f"{_flight(summary)} {ending} after {_count(summary['steps'], 'decision')} "
+        f"({summary['flight_seconds']:.1f} s): {summary['path_length_m']:.1f} m flown, "
+        f"shortest path {summary['shortest_path_m']:.1f} m. "
+        f"{_nearest(summary)}"
+    )
+    if "test" in summary:
+        test = summary["test"]
+        low, high = test["interval"]
+        text += (
+            f"\nUnseen test worlds: {test['successes']} of {test['missions']} reached the goal "
+            f"({test['success_rate']:.0%}, 95 % Wilson interval {low:.0%} to {high:.0%})."
+        )
+    return (
+        f"{text}\nTook {clock(summary['total_seconds'])} in all, {clock(summary['train_seconds'])} of it training. "
+        "Everything is in"
+    )
+
+
+def _of_seeds(summary: dict[str, Any]) -> str:
+    low, high = summary["success_interval"]
+    each = ", ".join(
+        f"seed {seed}: {rate:.1%}" for seed, rate in zip(summary["seeds"], summary["success_rates"], strict=True)
+    )
+    flown = summary["flown"] != summary["world"]
+    missions = "unseen test worlds" if summary["missions"] > 1 or flown else "the mission"
+    last = f"\n{summary['flown_successes']} of {len(summary['seeds'])} reached the goal of {_unseen(summary)}."
+    return (
+        f"Reached the goal in {missions}: {each}.\nInterquartile mean {summary['success_iqm']:.1%}, mean "
+        f"{summary['success_mean']:.1%} (95 % interval {low:.1%} to {high:.1%}).{last if flown else ''}\n"
+        f"Took {clock(summary['total_seconds'])} in all, {clock(summary['train_seconds'])} of it training. Each seed's "
+        "run is in"
+    )
+
+
+def _flight(summary: dict[str, Any]) -> str:
+    """Returns which flight the verdict is about."""
+    if summary["flown"] == summary["world"]:
+        return "The greedy flight"
+    return f"The greedy flight through {_unseen(summary)},"
+
+
+def _unseen(summary: dict[str, Any]) -> str:
+    """Returns what the world of the last flight of a run in random worlds is, for the screen."""
+    where = "the paper's map" if summary["flown"] == "paper" else f"'{summary['flown']}'"
+    return f"{where}, which training never used"
+
+
+def _nearest(summary: dict[str, Any]) -> str:
+    """Returns the closest approach as a sentence."""
+    if summary["outcome"] == "collision":
+        return f"It touched {'another drone' if summary.get('hit_drone') else 'an obstacle or the ground'}."
+    return f"The least clearance was {clearance_text(summary['min_clearance_m'])}."
+
+
+def _count(number: int, noun: str) -> str:
+    """Returns `1 decision`, `2 decisions`."""
+    return f"{number:,} {noun}" + ("" if number == 1 else "s")
