@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from edqn_jax.xla_flags import disable_ynn_fusions
 
 if TYPE_CHECKING:
-    from edqn_jax.config import ENCODERS, FAMILIES, LEARNERS, NETWORKS, SENSORS, Config
+    from edqn_jax.config import ENCODERS, FAMILIES, LEARNERS, NETWORKS, SENSORS, SHAPES, Config
     from edqn_jax.config.loading import make_config
     from edqn_jax.devices.devices import use_cpu_devices
     from edqn_jax.errors import ConfigError, DivergedError, StoppedError
@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from edqn_jax.runs.policies import load_policy, save_policy
     from edqn_jax.sim.actions import move_name, move_number
     from edqn_jax.sim.environment import Environment, make
+    from edqn_jax.sim.scene.shapes.kind import ShapeKind
     from edqn_jax.sim.sensors.sensor import Sensor
     from edqn_jax.sim.task.outcomes import Outcome
     from edqn_jax.sim.task.reward import Transition
@@ -39,6 +40,7 @@ _MODULES = {
     "LEARNERS": "config",
     "NETWORKS": "config",
     "SENSORS": "config",
+    "SHAPES": "config",
     "Chunk": "training.loop",
     "Config": "config",
     "ConfigError": "errors",
@@ -51,6 +53,7 @@ _MODULES = {
     "PlannedPath": "planning.path",
     "Policy": "learn.policy",
     "Sensor": "sim.sensors.sensor",
+    "ShapeKind": "sim.scene.shapes.kind",
     "StoppedError": "errors",
     "TrainingResult": "training.loop",
     "Transition": "sim.task.reward",
@@ -77,6 +80,7 @@ __all__ = [
     "LEARNERS",
     "NETWORKS",
     "SENSORS",
+    "SHAPES",
     "Chunk",
     "Config",
     "ConfigError",
@@ -89,6 +93,7 @@ __all__ = [
     "PlannedPath",
     "Policy",
     "Sensor",
+    "ShapeKind",
     "StoppedError",
     "TrainingResult",
     "Transition",

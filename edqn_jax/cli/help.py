@@ -13,7 +13,7 @@ import docstring_parser
 import tyro
 
 from edqn_jax.config import Config
-from edqn_jax.config.registry import ENCODERS, FAMILIES, LEARNERS, NETWORKS, SENSORS, Registry
+from edqn_jax.config.registry import AIRFRAMES, ENCODERS, FAMILIES, LEARNERS, NETWORKS, SENSORS, Registry
 
 TRAIN, EVALUATE, RECORD, REPORT = "edqn train", "edqn evaluate", "edqn record", "edqn report"
 VERIFY, EXPORT, EVENTS, COMPLETION = "edqn verify", "edqn export", "edqn events", "edqn completion"
@@ -108,7 +108,7 @@ COMMON = {
 """Options that `edqn train --help` shows, with what it says of them; `--help-all` has their whole texts."""
 
 REGISTERED: dict[str, Registry] = {
-    **{registry.option: registry for registry in (SENSORS, ENCODERS, LEARNERS, NETWORKS, FAMILIES)},
+    **{registry.option: registry for registry in (AIRFRAMES, SENSORS, ENCODERS, LEARNERS, NETWORKS, FAMILIES)},
     "world": FAMILIES,
 }
 """What an option names, by the option; of `world` and `world.name` also files."""

@@ -8,7 +8,7 @@ from typing import Any
 
 from edqn_jax.config.limits import between, check_limits, require
 from edqn_jax.config.options import Config
-from edqn_jax.config.registry import ACTION_SETS, ENCODERS, FAMILIES, LEARNERS, NETWORKS, OWN, SENSORS
+from edqn_jax.config.registry import ACTION_SETS, AIRFRAMES, ENCODERS, FAMILIES, LEARNERS, NETWORKS, OWN, SENSORS
 from edqn_jax.errors import ConfigError
 
 Rules = Iterator[tuple[bool, str, str]]
@@ -28,7 +28,7 @@ def validate(config: Config, *, trains: bool = True) -> None:
     for group in dataclasses.fields(config):
         check_limits(getattr(config, group.name), group.name)
     _check_world(config, trains)
-    for registry in (SENSORS, ENCODERS, LEARNERS, NETWORKS, ACTION_SETS):
+    for registry in (SENSORS, AIRFRAMES, ENCODERS, LEARNERS, NETWORKS, ACTION_SETS):
         registry.check(_value(config, registry.option))
     for rules in (_of_flights(config, trains), _of_training(config, trains), _of_learning(config)):
         for holds, name, limit in rules:

@@ -4,9 +4,19 @@ from __future__ import annotations
 
 import pytest
 
-from edqn_jax.config.registry import ACTION_SETS, ENCODERS, FAMILIES, LEARNERS, NETWORKS, SENSORS, SHAPES, Registry
+from edqn_jax.config.registry import (
+    ACTION_SETS,
+    AIRFRAMES,
+    ENCODERS,
+    FAMILIES,
+    LEARNERS,
+    NETWORKS,
+    SENSORS,
+    SHAPES,
+    Registry,
+)
 
-EVERY: tuple[Registry, ...] = (SENSORS, FAMILIES, LEARNERS, NETWORKS, ENCODERS, ACTION_SETS, SHAPES)
+EVERY: tuple[Registry, ...] = (SENSORS, FAMILIES, LEARNERS, NETWORKS, ENCODERS, ACTION_SETS, SHAPES, AIRFRAMES)
 
 
 def keep_as_they_are(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -351,5 +351,5 @@ def counted_layers(met: Hits, brightness: Array, rays: Rays, layers: Layers) -> 
         )
         return insert(layers, layer), None
 
-    given = (met.hit, met.depth, brightness)
-    return lax.scan(add, layers, tuple(jnp.broadcast_to(x, x.shape[:1] + shape) for x in given))[0]
+    hit, depth, bright = (jnp.broadcast_to(x, x.shape[:1] + shape) for x in (met.hit, met.depth, brightness))
+    return lax.scan(add, layers, (hit, depth, bright))[0]
