@@ -39,6 +39,7 @@ from edqn_jax.sim.task.env import EnvState, Step, World
 from edqn_jax.sim.task.missions import own_missions
 from edqn_jax.sim.task.observation import Observation
 from edqn_jax.sim.task.reward import Reward
+from edqn_jax.sim.task.task import task_of
 from edqn_jax.sim.worlds.families import SPLITS, Split, random_pool, world_keys
 from edqn_jax.sim.worlds.moving import Moving
 
@@ -218,8 +219,14 @@ def _file_pool(config: Config, name: str, count: int) -> Scene:
     return stack_scenes([loaded.scene])
 
 
-_reset = jax.jit(env.reset, static_argnums=0)
-_step = jax.jit(env.step, static_argnums=0)
+@functools.partial(jax.jit, static_argnums=0)
+def _reset(config: Config, world: World, key: Array, mission: Array | None) -> tuple[EnvState, Observation]:
+    return task_of(config).reset(world, key, mission)
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _step(config: Config, world: World, state: EnvState, action: Array) -> tuple[EnvState, Step]:
+    return task_of(config).step(world, state, action)
 
 
 @functools.partial(jax.jit, static_argnums=0)
