@@ -215,13 +215,13 @@ def test_a_world_without_a_way_is_a_sentence(run, tmp_path):
 @pytest.mark.slow
 def test_the_command_prints_and_writes_flights_that_anybody_can_check(run, tmp_path, capsys):
     figures_file, flights_file = tmp_path / "figures.json", tmp_path / "flights.npz"
-    args = EvaluateArgs(run, missions=200, seed=3, json=figures_file, trajectories=flights_file)
+    args = EvaluateArgs(run, missions=80, seed=3, json=figures_file, trajectories=flights_file)
     evaluate_command(args)
     assert "reached the goal" in capsys.readouterr().out
     figures = json.loads(figures_file.read_text())
     asked = {"missions", "successes", "success_rate", "interval", "collisions", "left_volume", "timeouts"}
     assert asked | {"diverged", "spl", "world", "seed", "decision_latency_ms"} <= set(figures)
-    assert (figures["missions"], figures["world"], figures["seed"]) == (200, "paper", 3)
+    assert (figures["missions"], figures["world"], figures["seed"]) == (80, "paper", 3)
     assert sorted(file.name for file in tmp_path.iterdir()) == ["figures.json", "flights.npz"]
 
     flights = np.load(flights_file)

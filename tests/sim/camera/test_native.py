@@ -107,13 +107,23 @@ def test_c_draws_what_jax_draws(size: tuple[int, int]) -> None:
         assert np.isfinite(jax.vmap(partial(camera.luma, config))(scene, origin, rotation)).all()
 
 
-@pytest.mark.parametrize("family", ["rooms", "forest", "canyon", "dense"])
+FAMILIES = ("rooms", "forest", "canyon", "dense")
+
+
+@pytest.fixture(scope="module")
+def worlds() -> dict[str, list[Scene]]:
+    """Four worlds of each family with as many places for shapes in all, so that one program draws them."""
+    pools = [families.random_pool(family, families.world_keys("training", 4)) for family in FAMILIES]
+    padded = stack_scenes([take_scene(pool, number) for pool in pools for number in range(4)])
+    each = [take_scene(padded, number) for number in range(16)]
+    return {family: each[4 * k : 4 * k + 4] for k, family in enumerate(FAMILIES)}
+
+
+@pytest.mark.parametrize("family", FAMILIES)
 @pytest.mark.slow
-def test_c_draws_the_worlds_of_a_family_as_jax_does(family: str) -> None:
+def test_c_draws_the_worlds_of_a_family_as_jax_does(worlds: dict[str, list[Scene]], family: str) -> None:
     if native.is_at_hand("cpu"):
-        pool = families.random_pool(family, families.world_keys("training", 4))
-        scenes = [take_scene(pool, number) for number in range(4)]
-        agree(CONFIG, *frames(scenes, 128, seed=8), ties=TIES)
+        agree(CONFIG, *frames(worlds[family], 128, seed=8), ties=TIES)
 
 
 @pytest.fixture(scope="module")
