@@ -1,4 +1,4 @@
-"""The drone in C MuJoCo with the cascaded controller of `edqn_jax/sim/physics/drone.py`, in numba."""
+"""The drone in C MuJoCo with the cascaded controller of `edqn_jax/sim/physics/controller.py`, in numba."""
 
 from __future__ import annotations
 
