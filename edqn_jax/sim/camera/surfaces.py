@@ -1,0 +1,183 @@
+"""Patterns of surfaces, each the average over a pixel: what `pictures.h` draws, in JAX.
+
+Over a pixel a phase is taken to change linearly, by `right` and `up` cycles from edge to edge. The average of a wave is
+then a product of two sincs, and that of a pulse train a second difference of its second integral. Both are of every
+such pixel exact, but for the approximations that `texture.py` names; averages of products are products of averages, and
+what is warped has the slope of the pixel's middle.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jax import Array
+
+from edqn_jax.sim.camera.raycast import Rays
+from edqn_jax.sim.camera.texture import box_filter, wave
+from edqn_jax.sim.scene.surface import CONTRAST, KIND, PATTERNS, PHASES, SHARES
+
+EDGE = 1.0 / 64
+"""Least width of an edge, periods: narrower ones would show the rounding of phases."""
+
+OVERTONE = 0.5
+"""Weight of the four finer waves of noise, relative to those that they are made of."""
+
+
+class Phase(NamedTuple):
+    """Cycles at the middle of each pixel, and their change over it."""
+
+    at: Array
+    right: Array
+    up: Array
+
+    def times(self, factor: float, other: Phase | None = None, weight: float = 0.0) -> Phase:
+        """Returns `factor` x this + `weight` x another phase."""
+        if other is None:
+            return Phase(*(factor * mine for mine in self))
+        return Phase(*(factor * mine + weight * its for mine, its in zip(self, other, strict=True)))
+
+    def shifted(self, cycles: float | Array) -> Phase:
+        """Returns this phase, `cycles` further."""
+        return self._replace(at=self.at + cycles)
+
+
+def smooth(phase: Phase) -> Array:
+    """Returns the average of a wave in [-1, 1] over each pixel."""
+    return box_filter(phase.right) * box_filter(phase.up) * wave(phase.at)
+
+
+def pulse(phase: Phase, width: float | Array) -> Array:
+    """Returns the average of pulses of height 1, less their mean, over each pixel.
+
+    Args:
+        phase: pulses are centred where it is whole.
+        width: of a pulse, a share of the period.
+    """
+    across, along = jnp.maximum(jnp.abs(phase.right), EDGE), jnp.maximum(jnp.abs(phase.up), EDGE)
+    outer, inner = (across + along) / 2, (across - along) / 2
+
+    def integral(at: Array) -> Array:
+        """Returns twice the second integral of the pulses, which has period 1 as they have."""
+        f = at - jnp.round(at)
+        beyond = jnp.maximum(jnp.abs(f) - width / 2, 0.0)
+        return (1 - width) * f * f - beyond * beyond
+
+    at = phase.at - jnp.round(phase.at)
+    sums = integral(at + outer) - integral(at + inner) - integral(at - inner) + integral(at - outer)
+    return sums / (2 * across * along)
+
+
+def _waves(shares: list[Array], phases: list[Phase]) -> Array:
+    return sum(share * smooth(phase) for share, phase in zip(shares, phases, strict=True))
+
+
+def overtones(p: list[Phase]) -> list[Phase]:
+    """Returns the four finer phases of noise."""
+    return [
+        p[2].times(1.0, p[3], 1.0),
+        p[2].times(2.0, p[1], -1.0),
+        p[3].times(2.0, p[0], 1.0),
+        p[2].times(3.0, p[3], -2.0),
+    ]
+
+
+def _noise(shares: list[Array], phases: list[Phase]) -> Array:
+    return _waves(shares, phases) + OVERTONE * _waves(shares, overtones(phases))
+
+
+def _checks(shares: list[Array], phases: list[Phase]) -> Array:
+    stripes, checks, across, width = shares
+    per_height = 1.0 / jnp.maximum(width, 1 - width)
+    first, second = (pulse(phase, width) * per_height for phase in phases[:2])
+    return stripes * first + checks * (first * second) + across * second
+
+
+def _bricks(shares: list[Array], phases: list[Phase]) -> Array:
+    tone, level_joint, upright_joint, _ = shares
+    along, courses = phases[:2]
+    level = pulse(courses.times(2.0).shifted(0.5), level_joint) + level_joint
+    even = pulse(courses, 0.5) + 0.5
+    here, shifted = (pulse(along.shifted(by), upright_joint) + upright_joint for by in (0.0, 0.5))
+    upright = even * here + (1 - even) * shifted
+    return tone * (level + upright - level * upright)
+
+
+def _posters(shares: list[Array], phases: list[Phase]) -> Array:
+    tone, depth, width, height = shares
+    fine = [phases[2], phases[3], phases[2].times(1.0, phases[3], 1.0), phases[2].times(2.0, phases[3], -1.0)]
+    picture = tone + depth * sum(smooth(phase) for phase in fine)
+    return (pulse(phases[0], width) + width) * (pulse(phases[1], height) + height) * picture
+
+
+def _warped(phase: Phase, by: Phase, amount: Array) -> Phase:
+    """Returns a phase plus `amount` x a wave of another."""
+    f = by.at - jnp.round(by.at)
+    slope = amount * (8.0 - 32.0 * jnp.abs(f))
+    return Phase(phase.at + amount * wave(by.at), phase.right + slope * by.right, phase.up + slope * by.up)
+
+
+def _wood(shares: list[Array], phases: list[Phase]) -> Array:
+    rings, warp, width, grain = shares
+    bent = _warped(_warped(phases[0], phases[1], warp), phases[2], 0.5 * warp)
+    return rings * pulse(bent, width) / jnp.maximum(width, 1 - width) + grain * smooth(phases[3])
+
+
+_OF_PATTERN = {
+    "waves": _waves,
+    "noise": _noise,
+    "checks": _checks,
+    "bricks": _bricks,
+    "posters": _posters,
+    "wood": _wood,
+}
+
+
+def relative_albedo(patterns: tuple[str, ...], numbers: list[Array], phases: list[Phase]) -> Array:
+    """Returns the albedo of pixels [...] relative to their surfaces' own: 1 + contrast x pattern.
+
+    Args:
+        patterns: those that surfaces may have.
+        numbers: the first `PHASES` numbers of each pixel's surface, each [...].
+        phases: its four phases, of [...].
+    """
+    shares = numbers[SHARES:PHASES]
+    drawn = jnp.zeros_like(phases[0].at)
+    for pattern in patterns:
+        if pattern != "blank":
+            here = numbers[KIND] == PATTERNS.index(pattern)
+            drawn = jnp.where(here, _OF_PATTERN[pattern](shares, phases), drawn)
+    return 1.0 + numbers[CONTRAST] * drawn
+
+
+def at_eye(numbers: Array, position: Array, origin: Array) -> Array:
+    """Returns surfaces [N, SURFACE_NUMBERS] whose shifts are the phases at `origin` [3], not at `position` [N, 3]."""
+    rows = numbers[:, PHASES:].reshape(-1, 4, 4)
+    apart = origin[None] - position
+    k = rows[..., :3]
+    phase = (k[..., 0] * apart[:, None, 0] + k[..., 1] * apart[:, None, 1]) + k[..., 2] * apart[:, None, 2]
+    phase = phase + rows[..., 3]
+    seen = jnp.concatenate([k, (phase - jnp.round(phase))[..., None]], axis=-1)
+    return jnp.concatenate([numbers[:, :PHASES], seen.reshape(-1, 16)], axis=1)
+
+
+def albedo_factor(
+    patterns: tuple[str, ...], surface: Array, rays: Rays, depth: Array, slope_right: Array, slope_up: Array
+) -> Array:
+    """Returns the pattern's factor on each pixel's brightness: [H, W].
+
+    Args:
+        patterns: those that surfaces may have.
+        surface: [H, W, SURFACE_NUMBERS] of `at_eye`, of the surface that each pixel shows.
+        depth: [H, W] finite.
+        slope_right, slope_up: [H, W] change of depth per pixel on the surface.
+    """
+    numbers = list(jnp.moveaxis(surface, -1, 0))
+    phases = []
+    for first in range(PHASES, PHASES + 16, 4):
+        kx, ky, kz, shift = numbers[first : first + 4]
+        along = (kx * rays.dx + ky * rays.dy) + kz * rays.dz
+        right = (kx * rays.right[0] + ky * rays.right[1] + kz * rays.right[2]) * rays.pitch
+        up = (kx * rays.up[0] + ky * rays.up[1] + kz * rays.up[2]) * rays.pitch
+        phases.append(Phase(shift + depth * along, depth * right + slope_right * along, depth * up + slope_up * along))
+    return relative_albedo(patterns, numbers[:PHASES], phases)

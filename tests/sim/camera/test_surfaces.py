@@ -1,0 +1,51 @@
+"""Averages of patterns over pixels, beside many samples."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from edqn_jax.sim.camera.surfaces import Phase, relative_albedo
+from edqn_jax.sim.scene.surface import PATTERNS, PHASES
+from tests.oracles import surfaces_plain
+
+SHARES = {
+    "blank": (0, 0, 0, 0),
+    "waves": (0.4, 0.3, 0.2, 0.1),
+    "noise": (0.3, 0.3, 0.2, 0.2),
+    "checks": (0.2, 0.6, 0.2, 0.4),
+    "bricks": (-1, 0.15, 0.1, 0),
+    "posters": (-0.2, 0.2, 0.4, 0.6),
+    "wood": (0.8, 0.3, 0.3, 0.2),
+}
+
+LARGEST = {"blank": 0, "waves": 0.13, "noise": 0.11, "checks": 0.15, "bricks": 0.07, "posters": 0.15, "wood": 0.1}
+TYPICAL = {"blank": 0, "waves": 0.017, "noise": 0.017, "checks": 0.02, "bricks": 0.012, "posters": 0.025, "wood": 0.015}
+"""Error of a pixel's pattern, whose amplitude is 1: at most, and root mean square. Waves err most beyond a period a
+pixel, where `texture.box_filter` has no side lobes; products of averages where an oblique corner is in the middle of
+the pixel; warped stripes where they turn within it."""
+
+
+@pytest.mark.parametrize("name", PATTERNS)
+def test_a_pixel_is_the_average_of_what_is_in_it(name: str) -> None:
+    rng = np.random.default_rng(0)
+    count = 400
+    at = rng.uniform(-3, 3, (4, count))
+    size, turn = 2.0 ** rng.uniform(-5, 1, count), rng.uniform(-np.pi, np.pi, (2, 4, count))
+    if name in ("checks", "bricks", "posters"):
+        turn[:, 1] = turn[:, 0] + np.pi / 2  # the first two phases are perpendicular, and the pixel is a square
+    turn[1] = turn[0] + np.pi / 2
+    right, up = size * np.cos(turn)
+    if name == "wood":
+        right[1:3] *= 0.2  # rings bend over several of their periods
+        up[1:3] *= 0.2
+    numbers = [jnp.full(count, x, jnp.float32) for x in (PATTERNS.index(name), 1.0, *SHARES[name])]
+    assert len(numbers) == PHASES
+    phases = [Phase(*(jnp.asarray(x[i], jnp.float32) for x in (at, right, up))) for i in range(4)]
+    drawn = np.asarray(jax.jit(lambda n, p: relative_albedo((name,), n, p))(numbers, phases)) - 1
+    error = drawn - surfaces_plain.pixel(name, SHARES[name], at, right, up)
+    assert np.abs(error).max() <= LARGEST[name]
+    assert np.sqrt(np.mean(error**2)) <= TYPICAL[name]
+    assert name == "blank" or np.std(drawn) > 0.05
