@@ -15,6 +15,7 @@ from edqn_jax.config.options import (
     LightConfig,
     MotorsConfig,
     NoiseConfig,
+    SurfaceConfig,
     TrainConfig,
     WorldConfig,
 )
@@ -42,6 +43,7 @@ __all__ = [
     "LightConfig",
     "MotorsConfig",
     "NoiseConfig",
+    "SurfaceConfig",
     "TrainConfig",
     "WorldConfig",
     "preset",

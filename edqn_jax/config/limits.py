@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import dataclasses
+import difflib
 import math
 from collections.abc import Iterable
 
 from edqn_jax.config.options import (
+    LOOKS,
     AgentConfig,
     AirConfig,
     BodyConfig,
@@ -21,6 +23,7 @@ from edqn_jax.config.options import (
     MotorsConfig,
     NoiseConfig,
     PqnConfig,
+    SurfaceConfig,
     TrainConfig,
     WorldConfig,
 )
@@ -41,6 +44,7 @@ def validate(config: Config, *, trains: bool = True) -> None:
     _world(config.world)
     _drone(config.drone)
     _camera(config.camera)
+    _surface(config.surface)
     _events(config.events, config.drone)
     _env(config.env)
     _air(config.air)
@@ -136,6 +140,17 @@ def _camera(camera: CameraConfig) -> None:
     _require(0 <= contrast < 1, "camera.texture_contrast", "at least 0 and less than 1", contrast)
     bright = all(0 <= value <= 1 for value in camera.sky_rgb)
     _require(bright, "camera.sky_rgb", "three shares between 0 and 1", camera.sky_rgb)
+
+
+def _surface(surface: SurfaceConfig) -> None:
+    near = difflib.get_close_matches(surface.pattern, LOOKS, n=1)
+    known = f"; did you mean '{near[0]}'?" if near else f"; it must be one of {', '.join(LOOKS)}"
+    if surface.pattern not in LOOKS:
+        raise ConfigError(f"surface.pattern: there is no pattern '{surface.pattern}'{known}")
+    _share(surface, "surface", ["contrast"])
+    _within(surface, "surface", ["shortest_m", "longest_m"], 0.05, 100.0)
+    spans = surface.shortest_m <= surface.longest_m
+    _require(spans, "surface.longest_m", f"at least surface.shortest_m, {surface.shortest_m:g}", surface.longest_m)
 
 
 def _events(events: EventsConfig, drone: DroneConfig) -> None:

@@ -110,6 +110,26 @@ class CameraConfig:
 
 
 @dataclass(frozen=True)
+class SurfaceConfig:
+    """What the faces of the shapes of a world look like; geometry is the same under every pattern."""
+
+    pattern: str = "plaid"
+    """`plaid`: one for all, of `camera.texture_*`. For each shape its own: `drawn` (any of the next four), `blank`,
+    `waves`, `noise`, `checks`; for tests, never among `drawn`: `bricks`, `posters`, `wood`. With a sun and a sky for
+    each world."""
+    contrast: float = 0.8
+    """Most amplitude of a pattern relative to the surface's brightness; a shape's is uniform from 0 to this."""
+    shortest_m: float = 0.2
+    """Shortest period of waves, noise and checks, metres; a shape's is log-uniform."""
+    longest_m: float = 10.0
+    """Longest period, metres."""
+
+
+LOOKS = ("plaid", "drawn", "blank", "waves", "noise", "checks", "bricks", "posters", "wood")
+"""Values of `surface.pattern`."""
+
+
+@dataclass(frozen=True)
 class EventsConfig:
     """From a pair of log-brightness frames to events (Eq. 2-5)."""
 
@@ -479,6 +499,7 @@ class Config:
     world: WorldConfig = field(default_factory=WorldConfig)
     drone: DroneConfig = field(default_factory=DroneConfig)
     camera: CameraConfig = field(default_factory=CameraConfig)
+    surface: SurfaceConfig = field(default_factory=SurfaceConfig)
     events: EventsConfig = field(default_factory=EventsConfig)
     env: EnvConfig = field(default_factory=EnvConfig)
     air: AirConfig = field(default_factory=AirConfig)
@@ -509,6 +530,7 @@ CONDITIONS: dict[str, tuple[str, ...]] = {
             ("noise", NoiseConfig),
             ("light", LightConfig),
             ("exposure", ExposureConfig),
+            ("surface", SurfaceConfig),
         )
     },
 }

@@ -7,6 +7,8 @@ meets them, they affect no distance, and no code needs a mask.
 Shapes may move (`motion.py`): their `position` is that at time 0, and `scene_at` is the world at another time, in
 which nothing moves any more. What does not ask for a time sees the world at time 0. A kind without motion has None in
 place of the arrays.
+
+Where shapes have no surface (`surface.py`), all carry the plaid of the camera's options.
 """
 
 from __future__ import annotations
@@ -39,6 +41,7 @@ from edqn_jax.sim.scene.motion import (
     thrown_to,
     top_speeds,
 )
+from edqn_jax.sim.scene.surface import Daylight, Surface, blank_surfaces
 
 PARKED = 1e6
 """Coordinate of absent shapes, metres along each axis."""
@@ -56,6 +59,7 @@ class UprightBoxes:
     yaw: Array  # [N] rotation about world z, radians
     albedo: Array  # [N, 3] RGB reflectance in [0, 1]
     motion: Motion | None = None
+    surface: Surface | None = None
 
 
 @struct.dataclass
@@ -67,6 +71,7 @@ class UprightCylinders:
     half_height: Array  # [N] metres
     albedo: Array  # [N, 3]
     motion: Motion | None = None
+    surface: Surface | None = None
 
 
 @struct.dataclass
@@ -76,6 +81,7 @@ class Spheres:
     albedo: Array  # [N, 3]
     motion: Motion | None = None
     throw: Throw | None = None
+    surface: Surface | None = None
 
 
 @struct.dataclass
@@ -87,6 +93,7 @@ class TiltedBoxes:
     rotation: Array  # [N, 3, 3] body-to-world; columns are the box's axes
     albedo: Array  # [N, 3]
     motion: Motion | None = None
+    surface: Surface | None = None
 
 
 @struct.dataclass
@@ -97,6 +104,7 @@ class Capsules:
     radius: Array  # [N] metres
     albedo: Array  # [N, 3]
     motion: Motion | None = None
+    surface: Surface | None = None
 
 
 @struct.dataclass
@@ -109,6 +117,7 @@ class TiltedCylinders:
     radius: Array  # [N] metres
     albedo: Array  # [N, 3]
     motion: Motion | None = None
+    surface: Surface | None = None
 
 
 @struct.dataclass
@@ -118,6 +127,7 @@ class Planes:
     position: Array  # [N, 3] any point of the plane, metres
     normal: Array  # [N, 3] unit
     albedo: Array  # [N, 3]
+    surface: Surface | None = None
 
 
 @struct.dataclass
@@ -136,6 +146,7 @@ class Scene:
     goal: Array  # [3] metres
     drones: Flown | None = None  # the others of a group, within one decision; in no pool of worlds
     aim: Aim | None = None  # of balls at the drone that flies; in no pool of worlds
+    daylight: Daylight | None = None  # None: that of the camera's options
 
 
 Shape = UprightBoxes | UprightCylinders | Spheres | TiltedBoxes | Capsules | TiltedCylinders | Planes
@@ -187,6 +198,8 @@ def scene_at(scene: Scene, time: Array | None) -> Scene:
 def with_drones(scene: Scene, position: Array, radius: Array) -> Scene:
     """Returns a world that stands, with K drones in it: spheres at `position` [K, 3] of `radius` [K], metres."""
     drones = Spheres(position, radius, jnp.broadcast_to(jnp.asarray(DRONE_RGB), position.shape))
+    if scene.spheres.surface is not None:
+        drones = dataclasses.replace(drones, surface=blank_surfaces(len(position), scene.spheres.surface.patterns))
     spheres = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), scene.spheres, drones)
     return dataclasses.replace(scene, spheres=spheres, drones=None)
 
@@ -231,7 +244,7 @@ def speeds(scene: Scene, time: Array) -> dict[str, Array]:
 
 def parked_shape(kind: type[S]) -> S:
     """Returns one absent shape of the kind (its dataclass): parked far away, with zero size."""
-    names = [field.name for field in dataclasses.fields(kind) if field.name not in _MOVING]
+    names = [field.name for field in dataclasses.fields(kind) if field.name not in (*_MOVING, "surface")]
     values: dict[str, Any] = {name: np.float32(0.0) for name in names} | {
         "position": np.array([0.0, 0.0, -PARKED]) if "normal" in names else np.full(3, PARKED),
         "half": np.zeros(3),
@@ -245,7 +258,9 @@ def parked_shape(kind: type[S]) -> S:
 
 def parked_like(shapes: S) -> S:
     """Returns one absent shape of the kind of `shapes`, which stands still where they have arrays of motion."""
-    rest = {name: still() for name, still in _MOVING.items() if getattr(shapes, name, None) is not None}
+    rest: dict[str, Any] = {name: still() for name, still in _MOVING.items() if getattr(shapes, name, None) is not None}
+    if shapes.surface is not None:
+        rest["surface"] = jax.tree.map(lambda leaf: np.zeros(leaf.shape[-1:]), shapes.surface)
     return dataclasses.replace(parked_shape(type(shapes)), **rest)
 
 
@@ -290,16 +305,31 @@ def build_scene(
             **{field.name: _stacked(members, field.name) for field in dataclasses.fields(dataclass)}
         )
     return Scene(
-        **fields,
+        **_all_with_surfaces(fields),
         volume=jnp.asarray(volume, jnp.float32),
         start=jnp.asarray(start, jnp.float32),
         goal=jnp.asarray(goal, jnp.float32),
     )
 
 
+def _all_with_surfaces(fields: dict[str, Any]) -> dict[str, Any]:
+    """Returns the kinds of one world, where any has surfaces with blank ones in place of those that have none."""
+    some = next((shapes.surface for shapes in fields.values() if shapes.surface is not None), None)
+    if some is None:
+        return fields
+    blank = {
+        kind: dataclasses.replace(shapes, surface=blank_surfaces(len(shapes.position), some.patterns))
+        for kind, shapes in fields.items()
+        if shapes.surface is None
+    }
+    return fields | blank
+
+
 def _stacked(members: Sequence[Any], name: str) -> Any:
     """Returns one field of single shapes as arrays [N, ...]; None where none of them moves in this manner."""
     values = [getattr(member, name) for member in members]
+    if name == "surface":
+        return _stacked_surfaces(values)
     if name not in _MOVING:
         # jax.tree would treat a position given as a list as a subtree, so fields are stacked by name.
         return jnp.asarray(np.stack(values), jnp.float32)
@@ -308,6 +338,16 @@ def _stacked(members: Sequence[Any], name: str) -> Any:
     rest = _MOVING[name]()
     whole = [rest if value is None else value for value in values]
     return type(rest)(**{field.name: _stacked(whole, field.name) for field in dataclasses.fields(rest)})
+
+
+def _stacked_surfaces(surfaces: Sequence[Surface | None]) -> Surface | None:
+    """Returns the surfaces of single shapes as arrays [N, ...]; None where none has any."""
+    some = next((surface for surface in surfaces if surface is not None), None)
+    if some is None:
+        return None
+    blank = np.zeros_like(some.numbers)
+    numbers = np.stack([blank if surface is None else surface.numbers for surface in surfaces])
+    return dataclasses.replace(some, numbers=jnp.asarray(numbers, jnp.float32))
 
 
 def scene_shapes(scene: Scene) -> list[Shape]:
@@ -348,7 +388,11 @@ def stack_scenes(scenes: Sequence[Scene]) -> Scene:
     """
     capacities = {kind: max(getattr(s, kind).position.shape[0] for s in scenes) for kind in KINDS}
     padded = [
-        build_scene(scene_shapes(s), volume=s.volume, start=s.start, goal=s.goal, capacities=capacities) for s in scenes
+        dataclasses.replace(
+            build_scene(scene_shapes(s), volume=s.volume, start=s.start, goal=s.goal, capacities=capacities),
+            daylight=s.daylight,
+        )
+        for s in scenes
     ]
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *[_able_to_move(s, padded) for s in padded])
 
