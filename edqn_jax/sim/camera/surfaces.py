@@ -1,9 +1,9 @@
 """Patterns of surfaces, each the average over a pixel: what `pictures.h` draws, in JAX.
 
 Over a pixel a phase is taken to change linearly, by `right` and `up` cycles from edge to edge. The average of a wave is
-then a product of two sincs, and that of a pulse train a second difference of its second integral. Both are of every
-such pixel exact, but for the approximations that `texture.py` names; averages of products are products of averages, and
-what is warped has the slope of the pixel's middle.
+then a product of two sincs (`texture.py`), and that of pulses a difference of their integral. Averages of products are
+taken for products of averages, and what is warped for as steep as it is in the pixel's middle. The errors are those of
+`tests/sim/camera/test_surfaces.py`.
 """
 
 from __future__ import annotations
@@ -50,22 +50,26 @@ def smooth(phase: Phase) -> Array:
 def pulse(phase: Phase, width: float | Array) -> Array:
     """Returns the average of pulses of height 1, less their mean, over each pixel.
 
+    The pixel is taken for as wide an interval of phases as its diagonal is, on which the average is exact; where both
+    of its edges are long, pulses fade as waves do, and are gone where each is a period.
+
     Args:
         phase: pulses are centred where it is whole.
         width: of a pulse, a share of the period.
     """
-    across, along = jnp.maximum(jnp.abs(phase.right), EDGE), jnp.maximum(jnp.abs(phase.up), EDGE)
-    outer, inner = (across + along) / 2, (across - along) / 2
+    across, along = jnp.abs(phase.right), jnp.abs(phase.up)
+    longer, shorter = jnp.maximum(across, along), jnp.minimum(across, along)
+    # The root of the squares' sum, to 3 %.
+    size = jnp.maximum(jnp.maximum(longer, 0.9 * longer + 0.47 * shorter), EDGE)
+    x = jnp.minimum(shorter * shorter, 1.0)
 
     def integral(at: Array) -> Array:
-        """Returns twice the second integral of the pulses, which has period 1 as they have."""
+        """Returns the integral of the pulses, which has period 1 as they have."""
         f = at - jnp.round(at)
-        beyond = jnp.maximum(jnp.abs(f) - width / 2, 0.0)
-        return (1 - width) * f * f - beyond * beyond
+        return jnp.clip(f, -width / 2, width / 2) - width * f
 
     at = phase.at - jnp.round(phase.at)
-    sums = integral(at + outer) - integral(at + inner) - integral(at - inner) + integral(at - outer)
-    return sums / (2 * across * along)
+    return (1.0 - x * x) * (integral(at + size / 2) - integral(at - size / 2)) / size
 
 
 def _waves(shares: list[Array], phases: list[Phase]) -> Array:

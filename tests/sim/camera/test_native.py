@@ -119,7 +119,7 @@ def kernels() -> bool:
     names = [f"-D{target}=emulated_{target}" for target in native.TARGETS]
     compiler = dataclasses.replace(build.C, flags=(*build.C.flags, "-xc", "-include", str(on_cpu), *names))
     targets = tuple(f"emulated_{target}" for target in native.TARGETS)
-    headers = (native.SOURCES["h"], on_cpu)
+    headers = (*native.HEADERS, on_cpu)
     return build.registered(native.SOURCES["cu"], targets, native.definitions(), compiler, headers)
 
 
