@@ -27,7 +27,7 @@ from edqn_jax.runs.policies import load_run
 from edqn_jax.sim.camera import camera
 from edqn_jax.sim.physics.drone import Flight, yaw_of
 from edqn_jax.sim.scene.distance import shape_distances, signed_distance
-from edqn_jax.sim.scene.scene import KINDS, Scene, parked_like, scene_at
+from edqn_jax.sim.scene.scene import Scene, parked_like, scene_at
 from edqn_jax.sim.sensors import sensor
 from edqn_jax.sim.sensors.events import EventField
 from edqn_jax.sim.task import group
@@ -71,15 +71,15 @@ def what_was_hit(scene: Scene, point: np.ndarray, yaw: float) -> tuple[str, int,
 def alone(scene: Scene, kind: str, index: int) -> Scene:
     """Returns the scene with one shape; all others are parked."""
     shapes: dict[str, Any] = {}
-    for name in KINDS:
-        kept = np.arange(getattr(scene, name).position.shape[0]) == (index if name == kind else -1)
-        away = parked_like(getattr(scene, name))
+    for name, own in scene.shapes().items():
+        kept = np.arange(own.position.shape[0]) == (index if name == kind else -1)
+        away = parked_like(own)
         shapes[name] = jax.tree.map(
             lambda own, none, kept=kept: jnp.where(kept.reshape(-1, *[1] * (own.ndim - 1)), own, none),
-            getattr(scene, name),
+            own,
             away,
         )
-    return scene.replace(**shapes)  # type: ignore[attr-defined]
+    return scene.with_shapes(shapes)
 
 
 @partial(jax.jit, static_argnums=0)

@@ -20,7 +20,7 @@ from edqn_jax.config.options import (
     WorldConfig,
 )
 from edqn_jax.config.presets import PRESETS, preset
-from edqn_jax.config.registry import FAMILIES, LEARNERS, MIXTURES, NETWORKS, SENSORS
+from edqn_jax.config.registry import FAMILIES, LEARNERS, MIXTURES, NETWORKS, SENSORS, SHAPES
 
 __all__ = [
     "CONDITIONS",
@@ -30,6 +30,7 @@ __all__ = [
     "NETWORKS",
     "PRESETS",
     "SENSORS",
+    "SHAPES",
     "AgentConfig",
     "AirConfig",
     "BodyConfig",

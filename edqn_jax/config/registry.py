@@ -173,6 +173,24 @@ FAMILIES = Registry(
 """Random worlds: `edqn_jax.sim.worlds.families.Family`, or a `Mixture` of some."""
 
 
+_SHAPES = "edqn_jax.sim.scene.shapes"
+
+SHAPES = Registry(
+    "kind of shape",
+    "shape",
+    {
+        "boxes": f"{_SHAPES}.upright_box:UPRIGHT_BOX",
+        "cylinders": f"{_SHAPES}.upright_cylinder:UPRIGHT_CYLINDER",
+        "spheres": f"{_SHAPES}.sphere:SPHERE",
+        "tilted_boxes": f"{_SHAPES}.tilted_box:TILTED_BOX",
+        "capsules": f"{_SHAPES}.capsule:CAPSULE",
+        "tilted_cylinders": f"{_SHAPES}.tilted_cylinder:TILTED_CYLINDER",
+        "planes": f"{_SHAPES}.plane:PLANE",
+    },
+)
+"""Kinds of shape of which worlds are made: `edqn_jax.sim.scene.shapes.kind.ShapeKind`. A geom is read by the first that
+takes it."""
+
 ACTION_SETS = Registry(
     "set of actions",
     "env.actions",

@@ -20,7 +20,9 @@ import mujoco
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from edqn_jax.sim.scene.mjcf import geom_of
 from edqn_jax.sim.scene.mjcf_motion import Said, as_ellipse, motions_of
+from edqn_jax.sim.scene.shapes.kind import reach_of, read_shape
 
 PROBE_NAME = "edqn_body_sphere"
 """Name of the sphere that is added to the world."""
@@ -235,20 +237,9 @@ def _moving(
 
 
 def _extent(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> NDArray[np.float64]:
-    """Returns the corners [2, 3] of the axis-aligned box around a geom, by MuJoCo's support of it along each axis."""
-    turn, size = data.geom_xmat[geom].reshape(3, 3), model.geom_size[geom]
-    kind, up = mujoco.mjtGeom(model.geom_type[geom]), np.abs(turn[:, 2])
-    aside = np.sqrt(np.maximum(1.0 - up**2, 0.0))
-    match kind:
-        case mujoco.mjtGeom.mjGEOM_SPHERE:
-            reach = np.full(3, size[0])
-        case mujoco.mjtGeom.mjGEOM_CAPSULE:
-            reach = size[0] + up * size[1]
-        case mujoco.mjtGeom.mjGEOM_CYLINDER:
-            reach = up * size[1] + aside * size[0]
-        case _:
-            reach = np.abs(turn) @ size
-    return data.geom_xpos[geom] + np.array([[-1.0], [1.0]]) * reach
+    """Returns the corners [2, 3] of the axis-aligned box around a geom, whose kind of shape says how far it reaches."""
+    shape = read_shape(geom_of(model, data, geom))
+    return np.asarray(shape.position + np.array([[-1.0], [1.0]]) * reach_of(shape))
 
 
 def clearance(judge: Judge, position: ArrayLike, time: float = 0.0, target: Target | None = None) -> tuple[float, str]:

@@ -6,17 +6,19 @@ import dataclasses
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import PolyCollection
 from matplotlib.patches import Polygon
 
-from edqn_jax.sim.scene.scene import KINDS, PARKED, Scene, scene_at
+from edqn_jax.config import SHAPES
+from edqn_jax.sim.scene.scene import PARKED, Scene, scene_at
+from edqn_jax.sim.scene.shapes.kind import ShapeKind
 
-AROUND = 36
-"""Corners of a circle."""
 SUN = np.array([-0.45, -0.6, 0.66])
 """Direction towards the light of the pictures; a unit vector, near enough."""
 GROUND = "#f4f3ef"
@@ -75,24 +77,7 @@ MAP = View(azimuth=-90.0, elevation=90.0)
 
 def solids_of(scene: Scene) -> list[Solid]:
     """Returns every shape of one world that is not parked; planes are left out, the ground is drawn by itself."""
-    found: list[Solid] = []
-    for position, half, yaw, albedo in present(scene.boxes, "position", "half", "yaw", "albedo"):
-        found.append(Solid(_box(position, half, _about_z(float(yaw))), albedo))
-    for position, half, rotation, albedo in present(scene.tilted_boxes, "position", "half", "rotation", "albedo"):
-        found.append(Solid(_box(position, half, rotation), albedo))
-    for position, radius, half, albedo in present(scene.cylinders, "position", "radius", "half_height", "albedo"):
-        found.append(Solid(_tube(position, np.array([0.0, 0.0, 1.0]), float(radius), float(half)), albedo))
-    for position, axis, half, radius, albedo in present(
-        scene.tilted_cylinders, "position", "axis", "half_length", "radius", "albedo"
-    ):
-        found.append(Solid(_tube(position, axis, float(radius), float(half)), albedo))
-    for position, axis, half, radius, albedo in present(
-        scene.capsules, "position", "axis", "half_length", "radius", "albedo"
-    ):
-        found.append(Solid(_round(position, axis, float(radius), float(half)), albedo))
-    for position, radius, albedo in present(scene.spheres, "position", "radius", "albedo"):
-        found.append(Solid(_round(position, np.array([0.0, 0.0, 1.0]), float(radius), 0.0), albedo))
-    return found
+    return [Solid(list(kind.faces(shape)), shape.albedo) for kind, shape in present(scene)]
 
 
 def standing(scene: Scene) -> Scene:
@@ -113,8 +98,8 @@ def moving_solids(scene: Scene, time: float) -> list[Solid]:
 def _only(scene: Scene, now: Scene, moving: bool) -> Scene:
     """Returns the world `now` with those shapes alone that move in `scene`, or that stand; the others are parked."""
     kept = {}
-    for kind in KINDS:
-        shapes, here = getattr(scene, kind), getattr(now, kind)
+    for kind, here in now.shapes().items():
+        shapes = scene.shapes()[kind]
         goes = np.zeros(here.position.shape[0], bool)
         if getattr(shapes, "motion", None) is not None:
             velocity, swing = np.asarray(shapes.motion.velocity), np.asarray(shapes.motion.swing)
@@ -123,7 +108,7 @@ def _only(scene: Scene, now: Scene, moving: bool) -> Scene:
             goes |= np.asarray(shapes.throw.early) > 0
         place = np.where((goes == moving)[:, None], np.asarray(here.position), PARKED)
         kept[kind] = dataclasses.replace(here, position=place)
-    return dataclasses.replace(now, **kept)
+    return now.with_shapes(kept)
 
 
 @dataclass(frozen=True)
@@ -246,61 +231,14 @@ def hidden(points: np.ndarray, solids: Sequence[Solid], view: View) -> np.ndarra
     return covered
 
 
-def present(shapes: object, *names: str) -> Iterator[tuple[np.ndarray, ...]]:
-    """Yields the rows of these fields, [n, ...] each and the first the position, of shapes that stand in the world."""
-    columns = [np.asarray(getattr(shapes, name), np.float64) for name in names]
-    for row in zip(*columns, strict=True):
-        if np.abs(row[0]).max() < PARKED / 10:
-            yield row
-
-
-def _about_z(yaw: float) -> np.ndarray:
-    c, s = np.cos(yaw), np.sin(yaw)
-    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-
-
-def _box(position: np.ndarray, half: np.ndarray, rotation: np.ndarray) -> list[np.ndarray]:
-    faces = []
-    for axis in range(3):
-        one, other = (axis + 1) % 3, (axis + 2) % 3
-        for side in (-1.0, 1.0):
-            ring = np.zeros((4, 3))
-            ring[:, axis] = side
-            ring[:, one] = [-1, 1, 1, -1]
-            ring[:, other] = [-1, -1, 1, 1]
-            faces.append(position + (ring * half) @ rotation.T)
-    return faces
-
-
-def _rings(position: np.ndarray, axis: np.ndarray, radii: np.ndarray, along: np.ndarray) -> np.ndarray:
-    """Returns circles around an axis, [circles, AROUND, 3]."""
-    aside = np.eye(3)[np.argmin(np.abs(axis))]
-    one = np.cross(axis, aside)
-    one /= np.linalg.norm(one)
-    other = np.cross(axis, one)
-    angle = np.linspace(0.0, 2 * np.pi, AROUND, endpoint=False)[:, None]
-    circle = np.cos(angle) * one + np.sin(angle) * other
-    return position + radii[:, None, None] * circle + along[:, None, None] * axis
-
-
-def _between(rings: np.ndarray) -> list[np.ndarray]:
-    """Returns the four-cornered faces between neighbouring circles."""
-    following = np.roll(rings, -1, axis=1)
-    corners = np.stack([rings[:-1], following[:-1], following[1:], rings[1:]], axis=2)
-    return list(corners.reshape(-1, 4, 3))
-
-
-def _tube(position: np.ndarray, axis: np.ndarray, radius: float, half: float) -> list[np.ndarray]:
-    rings = _rings(position, axis, np.full(2, radius), np.array([-half, half]))
-    return [*_between(rings), rings[0], rings[1]]
-
-
-def _round(position: np.ndarray, axis: np.ndarray, radius: float, half: float) -> list[np.ndarray]:
-    """Returns the faces of a capsule, or of a sphere where `half` is 0; flat poles keep faces from degenerating."""
-    angle = np.linspace(-np.pi / 2 + 0.05, np.pi / 2 - 0.05, 18)
-    along = radius * np.sin(angle) + half * np.sign(angle)
-    rings = _rings(position, axis, radius * np.cos(angle), along)
-    return [*_between(rings), rings[0], rings[-1]]
+def present(scene: Scene) -> Iterator[tuple[ShapeKind, Any]]:
+    """Yields kind and shape, of float64, of each that is drawn and stands in the world."""
+    for name, shapes in scene.shapes().items():
+        kind = SHAPES.get(name)
+        rows = jax.tree.map(lambda leaf: np.asarray(leaf, np.float64), shapes)
+        for i, place in enumerate(rows.position if kind.faces is not None else ()):
+            if np.abs(place).max() < PARKED / 10:
+                yield kind, jax.tree.map(lambda leaf, i=i: leaf[i], rows)
 
 
 def _ring_normal(face: np.ndarray) -> np.ndarray:

@@ -11,6 +11,7 @@ import math
 
 import numpy as np
 
+from edqn_jax.errors import ConfigError
 from edqn_jax.extras import require
 from edqn_jax.sim.scene.scene import (
     PARKED,
@@ -64,6 +65,8 @@ def _row(shape: Shape) -> np.ndarray:
             sizes[:2] = shape.half_length, shape.radius
         case Planes():
             kind, axes[0] = _PLANE, shape.normal
+        case _:
+            raise ConfigError(f"planners know the package's own kinds of shape alone, not {type(shape).__name__}")
     reach = {_PLANE: math.inf, _CAPSULE: float(np.sum(sizes))}.get(kind, float(np.linalg.norm(sizes)))
     return np.concatenate([[kind, reach], np.asarray(shape.position), sizes, axes.ravel()])
 

@@ -278,11 +278,28 @@
     return place.every((x, axis) => x >= world.lower[axis] - out && x <= world.upper[axis] + out) ? place : null;
   }
 
+  /** Returns a solid of flat faces, rings of corners in any orientation about a centre within. */
+  function geometryOf(faces) {
+    const corners = [];
+    for (const ring of faces) {
+      for (let i = 1; i + 1 < ring.length; i++) {
+        const [a, b, c] = [ring[0], ring[i], ring[i + 1]].map((corner) => new THREE.Vector3(...corner));
+        const outward = b.clone().sub(a).cross(c.clone().sub(a)).dot(a) > 0;
+        for (const corner of outward ? [a, b, c] : [a, c, b]) corners.push(corner.x, corner.y, corner.z);
+      }
+    }
+    const geometry = new THREE.BufferGeometry();
+    geometry.setAttribute("position", new THREE.Float32BufferAttribute(corners, 3));
+    geometry.computeVertexNormals();
+    return geometry;
+  }
+
   function solidOf(shape) {
     let geometry;
     if (shape.kind === "box") geometry = new THREE.BoxGeometry(...shape.half.map((half) => 2 * half));
     else if (shape.kind === "sphere") geometry = new THREE.SphereGeometry(shape.radius, 32, 20);
     else if (shape.kind === "capsule") geometry = new THREE.CapsuleGeometry(shape.radius, 2 * shape.half, 10, 28);
+    else if (shape.kind === "faces") geometry = geometryOf(shape.faces);
     else geometry = new THREE.CylinderGeometry(shape.radius, shape.radius, 2 * shape.half, 40);
     const solid = new THREE.Mesh(geometry, new THREE.MeshLambertMaterial({ color: shape.colour }));
     if (shape.turn) {

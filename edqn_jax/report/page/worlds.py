@@ -11,23 +11,25 @@ import numpy as np
 
 from edqn_jax.report.solids import closed_side, present, solids_of
 from edqn_jax.sim.scene.motion import NEVER, OUTSIDE_M, thrown_to
-from edqn_jax.sim.scene.scene import PARKED, Scene, aim_of
+from edqn_jax.sim.scene.scene import Scene, aim_of
+from edqn_jax.sim.scene.shapes.kind import ShapeKind
 
 
 def world_data(scene: Scene) -> dict[str, Any]:
     """Returns one world as plain JSON data: `lower` and `upper` of its volume, and `shapes`, lengths in metres.
 
-    A shape has its `kind` (box, cylinder, capsule, sphere), centre `at`, `colour`, and of its kind `half` and `turn`
-    (body-to-world, row by row), `radius`, `axis` and `half`. `closes` is the axis and the sign of the side of the
-    volume that a ceiling or an outer wall closes: the view leaves it out when it looks from there. `moves` says where a
-    shape is at another time.
+    A shape has its `kind` (box, cylinder, capsule, sphere, faces), centre `at`, `colour`, and of its kind `half` and
+    `turn` (body-to-world, row by row), `radius`, `axis` and `half`, or `faces`, rings of corners about the centre.
+    `closes` is the axis and the sign of the side of the volume that a ceiling or an outer wall closes: the view leaves
+    it out when it looks from there. `moves` says where a shape is at another time.
     """
     lower, upper = np.asarray(scene.volume, np.float64)
     shapes = []
-    for shape, solid, moves in zip(_shapes(scene), solids_of(scene), _motions(scene), strict=True):
+    for (kind, shape), solid in zip(present(scene), solids_of(scene), strict=True):
+        moves = _motion(shape)
         closes = None if moves else closed_side(solid, lower, upper)
-        shape |= {"colour": _hex(solid.colour)} | moves
-        shapes.append(shape | ({} if closes is None else {"closes": list(closes)}))
+        drawn = _drawing(kind, shape) | {"colour": _hex(solid.colour)} | moves
+        shapes.append(drawn | ({} if closes is None else {"closes": list(closes)}))
     return {"lower": rounded(lower), "upper": rounded(upper), "shapes": shapes}
 
 
@@ -36,19 +38,13 @@ def ball_data(scene: Scene) -> list[dict[str, Any]]:
     return list(_balls(scene))
 
 
-def _motions(scene: Scene) -> Iterator[dict[str, Any]]:
-    """Yields `moves` of every shape that is not parked, in the order of `solids_of`; nothing of those that stand."""
-    for kind in ("boxes", "tilted_boxes", "cylinders", "tilted_cylinders", "capsules", "spheres"):
-        shapes = getattr(scene, kind)
-        if shapes.motion is None:
-            yield from ({} for _ in present(shapes, "position"))
-            continue
-        names = [field.name for field in dataclasses.fields(shapes.motion)]
-        columns = [np.asarray(getattr(shapes.motion, name), np.float64) for name in names]
-        for place, *values in zip(np.asarray(shapes.position), *columns, strict=True):
-            if np.abs(place).max() < PARKED / 10:
-                moves = {name: rounded(value, 6) for name, value in zip(names, values, strict=True)}
-                yield {"moves": moves} if np.any(moves["velocity"]) or np.any(moves["swing"]) else {}
+def _motion(shape: Any) -> dict[str, Any]:
+    """Returns `moves` of a shape; nothing of one that stands."""
+    motion = getattr(shape, "motion", None)
+    if motion is None:
+        return {}
+    moves = {field.name: rounded(getattr(motion, field.name), 6) for field in dataclasses.fields(motion)}
+    return {"moves": moves} if np.any(moves["velocity"]) or np.any(moves["swing"]) else {}
 
 
 def _balls(scene: Scene) -> Iterator[dict[str, Any]]:
@@ -78,30 +74,20 @@ def _balls(scene: Scene) -> Iterator[dict[str, Any]]:
         }
 
 
-def _shapes(scene: Scene) -> Iterator[dict[str, Any]]:
-    """Yields every shape that is not parked, in the order of `solids_of`."""
-    for at, half, yaw in present(scene.boxes, "position", "half", "yaw"):
-        c, s = np.cos(yaw), np.sin(yaw)
-        yield {
-            "kind": "box",
-            "at": rounded(at),
-            "half": rounded(half),
-            "turn": rounded([c, -s, 0, s, c, 0, 0, 0, 1], 5),
-        }
-    for at, half, turn in present(scene.tilted_boxes, "position", "half", "rotation"):
-        yield {"kind": "box", "at": rounded(at), "half": rounded(half), "turn": rounded(turn.ravel(), 5)}
-    for at, radius, half in present(scene.cylinders, "position", "radius", "half_height"):
-        yield _along("cylinder", at, np.array([0.0, 0.0, 1.0]), half, radius)
-    for name, kind in (("tilted_cylinders", "cylinder"), ("capsules", "capsule")):
-        for at, axis, half, radius in present(getattr(scene, name), "position", "axis", "half_length", "radius"):
-            yield _along(kind, at, axis, half, radius)
-    for at, radius in present(scene.spheres, "position", "radius"):
-        yield {"kind": "sphere", "at": rounded(at), "radius": rounded(radius)}
-
-
-def _along(kind: str, at: np.ndarray, axis: np.ndarray, half: np.ndarray, radius: np.ndarray) -> dict[str, Any]:
-    sizes = {"half": rounded(half), "radius": rounded(radius)}
-    return {"kind": kind, "at": rounded(at), "axis": rounded(axis, 5), **sizes}
+def _drawing(kind: ShapeKind, shape: Any) -> dict[str, Any]:
+    """Returns what the view draws of a shape that stands in the world."""
+    if kind.page is None:
+        assert kind.faces is not None  # `present` yields what is drawn
+        sizes = {"kind": "faces", "faces": [face - shape.position for face in kind.faces(shape)]}
+    else:
+        sizes = kind.page(shape)
+    digits = {"turn": 5, "axis": 5}
+    numbers = {
+        name: [rounded(ring) for ring in value] if name == "faces" else rounded(value, digits.get(name, 3))
+        for name, value in sizes.items()
+        if name != "kind"
+    }
+    return {"kind": sizes["kind"], "at": rounded(shape.position), **numbers}
 
 
 def rounded(values: Any, digits: int = 3) -> Any:

@@ -25,6 +25,8 @@ from edqn_jax.sim.camera.primitive import draw_in_one_batch
 from edqn_jax.sim.camera.raycast import Rays, Values
 from edqn_jax.sim.camera.texture import texture
 from edqn_jax.sim.scene.scene import Scene
+from edqn_jax.sim.scene.shapes.kind import inverse
+from edqn_jax.sim.scene.shapes.plane import HORIZON_M
 from edqn_jax.xla import materialised
 
 LUMA_WEIGHTS = (0.299, 0.587, 0.114)
@@ -48,15 +50,15 @@ def _backdrop(config: CameraConfig, scene: Scene, origin: Array, rays: Rays, val
         # The plane's horizon is the line n . d = 0; the part of the pixel below it is covered by the plane.
         approach = normal[0] * rays.dx + normal[1] * rays.dy + normal[2] * rays.dz
         spread = jnp.abs(across) + jnp.abs(along)
-        covered = jnp.clip(0.5 - approach * raycast.inverse(spread), 0.0, 1.0)
+        covered = jnp.clip(0.5 - approach * inverse(spread), 0.0, 1.0)
         middle = (approach - spread / 2 + jnp.minimum(approach + spread / 2, 0.0)) / 2
-        t = -height * raycast.inverse(middle)
+        t = -height * inverse(middle)
         # On a plane t = h / (n . d), so dt = -t (n . d') / (n . d), exactly.
-        relative = -t * raycast.inverse(middle)
-        seen = (middle < 0) & (t > 0) & (t < raycast.HORIZON_M) & (t < depth)
+        relative = -t * inverse(middle)
+        seen = (middle < 0) & (t > 0) & (t < HORIZON_M) & (t < depth)
         depth = jnp.where(seen, t, depth)
         share = jnp.where(seen, covered, share)
-        shown = jnp.where(seen, raycast.shade(config, *normal) * value.planes[n], shown)
+        shown = jnp.where(seen, raycast.shade(config, *normal) * value["planes"][n], shown)
         slopes = jnp.where(seen, relative * across, slopes[0]), jnp.where(seen, relative * along, slopes[1])
     factor = texture(config, origin, rays, jnp.where(share > 0, depth, 0.0), *slopes)
     return behind + share * (shown * factor - behind)
@@ -67,10 +69,10 @@ def blend(config: CameraConfig, frame: Frame, rays: Rays, layers: Layers) -> Arr
     behind = _backdrop(config, frame.scene, frame.origin, rays, frame.value, frame.sky)
     for layer in reversed(layers):
         met = layer.closeness > 0
-        near = jnp.where(met, raycast.inverse(layer.closeness), 0.0)
+        near = jnp.where(met, inverse(layer.closeness), 0.0)
         level = layer.slope == coverage.LEVEL_FACE
         right = jnp.where(level, 0.0, -near * near * layer.slope)
-        up = jnp.where(level, -near * raycast.inverse(rays.dz) * rays.pitch, 0.0)
+        up = jnp.where(level, -near * inverse(rays.dz) * rays.pitch, 0.0)
         factor = texture(config, frame.origin, rays, near, right, up)
         behind = behind + jnp.where(met, layer.value * factor - layer.coverage * behind, 0.0)
     return behind
@@ -86,10 +88,8 @@ def _picture(config: CameraConfig, scene: Scene, origin: Array, rotation: Array,
     rays = raycast.camera_rays(config, rotation)
     many = raycast.camera_rays(config, rotation, config.samples_across, config.samples_down)
     layers = coverage.no_layers((config.height, config.width))
-    counted = raycast.other_surfaces(config, scene, origin, many, value)
-    counted += raycast.upright_surfaces(config, scene, origin, many, value)
-    for surfaces in counted:
-        layers = coverage.counted_layers(surfaces, many, layers)
+    for kind, met in raycast.hits(scene, origin, many, without=("spheres", "planes")).items():
+        layers = coverage.counted_layers(met, raycast.brightness_of(config, met, value[kind]), many, layers)
     layers = coverage.sphere_layers(config, scene, origin, rays, value, layers)
     sky = jnp.sum(jnp.asarray(config.sky_rgb) * weights)
     frame = Frame(origin=origin, heading=rotation[:2, 0], scene=scene, value=value, sky=sky)
@@ -153,7 +153,7 @@ def _depths(config: CameraConfig, scene: Scene, position: Array, rotation: Array
     """Returns the depth [M, H, W] metres along the optical axis; every array has a leading [M]."""
 
     def one(scene: Scene, position: Array, rotation: Array) -> Array:
-        return nearest_depth(config, scene, position, raycast.camera_rays(config, rotation))
+        return nearest_depth(scene, position, raycast.camera_rays(config, rotation))
 
     return jax.vmap(one)(scene, position, rotation)
 

@@ -26,7 +26,8 @@ from edqn_jax.config import CameraConfig
 from edqn_jax.sim.camera import coverage, raycast
 from edqn_jax.sim.camera.coverage import Layers
 from edqn_jax.sim.camera.raycast import Rays, Values
-from edqn_jax.sim.scene.scene import Scene, UprightBoxes, UprightCylinders, no_shapes
+from edqn_jax.sim.scene.scene import Scene, no_shapes
+from edqn_jax.sim.scene.shapes.kind import TINY
 from edqn_jax.xla import materialised
 
 SLOTS = (0, 2, 4, 8)
@@ -37,6 +38,9 @@ BLOCKS = 32
 
 SMALLEST_BLOCK = 256
 """Least number of columns in a block: below, starting a block's operations costs more than sorting saves."""
+
+EXACT = (*raycast.UPRIGHT, "spheres", "planes")
+"""Kinds of shape whose part of a pixel is known; whatever other kinds are registered is counted by rays."""
 
 WORD = 32
 """Shapes whose presence one integer holds, a bit each."""
@@ -123,8 +127,8 @@ def _frame(config: CameraConfig, scene: Scene, origin: Array, rotation: Array, w
     """Returns one frame, and the table [N + 1, F] of its upright shapes."""
     value = raycast.albedo_values(scene, weights)
     forward_x, forward_y = rotation[0, 0], rotation[1, 0]
-    heading = jnp.stack([forward_x, forward_y]) * lax.rsqrt(jnp.maximum(forward_x**2 + forward_y**2, raycast.TINY))
-    rest = dataclasses.replace(scene, boxes=no_shapes(UprightBoxes), cylinders=no_shapes(UprightCylinders))
+    heading = jnp.stack([forward_x, forward_y]) * lax.rsqrt(jnp.maximum(forward_x**2 + forward_y**2, TINY))
+    rest = scene.with_shapes({kind: no_shapes(kind) for kind in raycast.UPRIGHT})
     frame = Frame(
         origin=origin, heading=heading, scene=rest, value=value, sky=jnp.sum(jnp.asarray(config.sky_rgb) * weights)
     )
@@ -232,16 +236,16 @@ def _draw_any_number(config: CameraConfig, finish: Finish, batch: _Batch, column
 
 def _other_shapes(frame: Frame, spheres: bool) -> int:
     """Returns the number of shapes beside the upright ones, spheres only where they are drawn."""
-    kinds = ("tilted_boxes", "capsules", "tilted_cylinders", *(("spheres",) if spheres else ()))
-    return sum(getattr(frame.value, kind).shape[1] for kind in kinds)
+    without = EXACT if not spheres else tuple(kind for kind in EXACT if kind != "spheres")
+    return sum(value.shape[1] for kind, value in frame.value.items() if kind not in without)
 
 
 def _layers_of_others(config: CameraConfig, frame: Frame, u: Array, depth: int, spheres: bool) -> Layers:
     """Returns the `depth` nearest layers of one column, [H, 1] pixels, of all but the upright shapes."""
     layers = coverage.no_layers((config.height, 1), depth)
     many, rays = _rays(config, frame, u, config.samples_across, config.samples_down), _rays(config, frame, u)
-    for surfaces in raycast.other_surfaces(config, frame.scene, frame.origin, many, frame.value):
-        layers = coverage.counted_layers(surfaces, many, layers)
+    for kind, met in raycast.hits(frame.scene, frame.origin, many, without=EXACT).items():
+        layers = coverage.counted_layers(met, raycast.brightness_of(config, met, frame.value[kind]), many, layers)
     if spheres:
         layers = coverage.sphere_layers(config, frame.scene, frame.origin, rays, frame.value, layers)
     return layers
@@ -259,7 +263,7 @@ def _take_sides(
     index = jnp.stack(picks)
     rows = batch.tables.reshape(-1, batch.tables.shape[-1])
     picked = rows.at[columns.number[None] * (none + 1) + index].get(mode="promise_in_bounds")
-    boxes = columns.frame.value.boxes.shape[1]
+    boxes = columns.frame.value["boxes"].shape[1]
     mixed = index >= boxes if boxes < none else None
     return words, coverage.sides(config, picked, mixed, boxes, columns.frame.heading, columns.u)
 

@@ -1,8 +1,8 @@
 """The share of each pixel that each shape covers, kept as the few nearest layers.
 
 Coverage is exact for the sides and caps of upright boxes and cylinders under a level camera, where sides project to
-vertical lines and, within a column, each shape fills one interval of rows; for all other shapes it is counted over
-a few rays per pixel.
+vertical lines and, within a column, each shape fills one interval of rows. Edges of spheres are exact but for their
+curvature within a pixel. For all other kinds of shape it is counted over a few rays per pixel.
 """
 
 from __future__ import annotations
@@ -15,20 +15,10 @@ from flax import struct
 from jax import Array, lax
 
 from edqn_jax.config import CameraConfig
-from edqn_jax.sim.camera.raycast import (
-    TINY,
-    Rays,
-    Surfaces,
-    Values,
-    columns_of,
-    for_shapes,
-    inverse,
-    per_shape,
-    pitch_of,
-    shade,
-    unit_ball,
-)
+from edqn_jax.sim.camera.raycast import Rays, Values, columns_of, direction_of, pitch_of, shade
 from edqn_jax.sim.scene.scene import Scene, Spheres, UprightBoxes, UprightCylinders
+from edqn_jax.sim.scene.shapes.kind import TINY, Hits, inverse, per_shape
+from edqn_jax.sim.scene.shapes.sphere import nearest_to_centre
 from edqn_jax.xla import materialised
 
 NEAR_M = 0.05
@@ -138,9 +128,9 @@ def upright_table(config: CameraConfig, scene: Scene, origin: Array, heading: Ar
     """
     parts = []
     if scene.boxes.yaw.shape[0]:
-        parts.append(_boxes_in_table(config, scene.boxes, origin, heading, value.boxes))
+        parts.append(_boxes_in_table(config, scene.boxes, origin, heading, value["boxes"]))
     if scene.cylinders.radius.shape[0]:
-        parts.append(_cylinders_in_table(config, scene.cylinders, origin, heading, value.cylinders))
+        parts.append(_cylinders_in_table(config, scene.cylinders, origin, heading, value["cylinders"]))
     width = max((part.shape[1] for part in parts), default=2)
     parts = [jnp.pad(part, ((0, 0), (0, width - part.shape[1]))) for part in parts]
     return jnp.concatenate([*parts, jnp.zeros((1, width)).at[0, :2].set(jnp.asarray([jnp.inf, -jnp.inf]))])
@@ -314,19 +304,19 @@ def sphere_layers(
     config: CameraConfig, scene: Scene, origin: Array, rays: Rays, value: Values, layers: Layers
 ) -> Layers:
     """Adds layers of spheres, for any camera: coverage falls linearly over the pixel that the silhouette crosses."""
-    spheres, rays = scene.spheres, for_shapes(rays)
+    spheres, (dx, dy, dz) = scene.spheres, direction_of(rays)
     if spheres.radius.shape[0] == 0:
         return layers
     ox, oy, oz = (per_shape(origin[i] - spheres.position[:, i]) for i in range(3))
     radius = per_shape(spheres.radius)
-    depth, nearest, miss = unit_ball(ox, oy, oz, radius, rays)
+    depth, nearest, miss = nearest_to_centre((ox, oy, oz), radius, (dx, dy, dz))
     pixel = jnp.maximum(nearest, NEAR_M) * rays.pitch
     # A sphere smaller than a pixel covers no more than its own disc.
     most = jnp.minimum(jnp.pi * (radius / pixel) ** 2, 1.0)
     coverage = jnp.where(nearest > 0, jnp.clip(0.5 + (radius - miss) / pixel, 0.0, most), 0.0)
     per_miss = 1.0 / jnp.maximum(jnp.maximum(miss, radius), TINY)
-    normal = (ox + depth * rays.dx, oy + depth * rays.dy, oz + depth * rays.dz)
-    bright = shade(config, *(n * per_miss for n in normal)) * per_shape(value.spheres)
+    normal = (ox + depth * dx, oy + depth * dy, oz + depth * dz)
+    bright = shade(config, *(n * per_miss for n in normal)) * per_shape(value["spheres"])
     closeness = jnp.where(coverage > 0, 1.0 / jnp.maximum(depth, NEAR_M), 0.0)
     for n in range(coverage.shape[0]):
         share, flat = coverage[n], jnp.zeros_like(coverage[n])
@@ -334,24 +324,32 @@ def sphere_layers(
     return layers
 
 
-def counted_layers(surfaces: Surfaces, rays: Rays, layers: Layers) -> Layers:
-    """Adds layers of any shapes from `across` x `down` rays per pixel: the share of rays that meet the shape."""
+def counted_layers(met: Hits, brightness: Array, rays: Rays, layers: Layers) -> Layers:
+    """Adds layers of any shapes from `across` x `down` rays per pixel: the share of rays that meet the shape.
+
+    Args:
+        met: where the rays meet N shapes.
+        brightness: [N, R, C] there.
+        rays: of all pixels.
+        layers: of what was drawn before.
+    """
     shape = jnp.broadcast_shapes(rays.dx.shape, rays.dz.shape)
     rows, columns = shape[0] // rays.down, shape[1] // rays.across
 
     def mean(x: Array) -> Array:
         return jnp.mean(materialised(x).reshape(rays.down, rows, rays.across, columns), axis=(0, 2))
 
-    def add(layers: Layers, one: Surfaces) -> tuple[Layers, None]:
-        coverage = mean(one.hit.astype(jnp.float32))
-        inverse_depth = mean(jnp.where(one.hit, inverse(one.depth), 0.0))
+    def add(layers: Layers, one: tuple[Array, Array, Array]) -> tuple[Layers, None]:
+        hit, depth, bright = one
+        coverage = mean(hit.astype(jnp.float32))
+        inverse_depth = mean(jnp.where(hit, inverse(depth), 0.0))
         layer = Layer(
             closeness=inverse_depth / jnp.maximum(coverage, TINY),
             coverage=coverage,
-            value=mean(jnp.where(one.hit, one.value, 0.0)),
+            value=mean(jnp.where(hit, bright, 0.0)),
             slope=jnp.zeros_like(coverage),
         )
         return insert(layers, layer), None
 
-    many = jax.tree.map(lambda x: jnp.broadcast_to(x, x.shape[:1] + shape), surfaces)
-    return lax.scan(add, layers, many)[0]
+    given = (met.hit, met.depth, brightness)
+    return lax.scan(add, layers, tuple(jnp.broadcast_to(x, x.shape[:1] + shape) for x in given))[0]

@@ -1,8 +1,9 @@
 """Depth of the nearest surface along rays, for the sensors `depth` and `ranges` and for the encoder's labels.
 
 Whether a ray passes over or under an upright shape depends on its row alone under a level camera, and whether it
-passes beside the shape on its column alone. So both are computed once per row and column, and each pixel only compares
-them, one shape after another (docs/performance.md has the times).
+passes beside the shape on its column alone. So for upright boxes and cylinders both are computed once per row and
+column, and each pixel only compares them, one shape after another (docs/performance.md has the times). The other kinds
+of shape say themselves where rays meet them.
 
 N upright shapes; rays as in `raycast`.
 """
@@ -14,10 +15,10 @@ import jax.numpy as jnp
 from flax import struct
 from jax import Array, lax
 
-from edqn_jax.config import CameraConfig
 from edqn_jax.sim.camera import raycast
-from edqn_jax.sim.camera.raycast import Rays, inverse, per_shape
+from edqn_jax.sim.camera.raycast import Rays, direction_of
 from edqn_jax.sim.scene.scene import Scene, UprightBoxes, UprightCylinders
+from edqn_jax.sim.scene.shapes.kind import TINY, inverse, per_shape
 
 UNROLLED = 16
 """Shapes that one pass over the pixels compares; between passes a GPU writes all pixels and reads them again."""
@@ -36,24 +37,20 @@ class _Intervals:
     level_to: Array
 
 
-def nearest_depth(config: CameraConfig, scene: Scene, origin: Array, rays: Rays) -> Array:
+def nearest_depth(scene: Scene, origin: Array, rays: Rays) -> Array:
     """Returns the depth of the nearest surface along each ray: [R, C] metres, inf where there is none."""
     shape = jnp.broadcast_shapes(rays.dx.shape, rays.dz.shape)
     nearest = jnp.full(shape, jnp.inf)
-    value = raycast.albedo_values(scene, jnp.ones(3))
-    kinds = [raycast.plane_surfaces(config, scene, origin, rays, value)] if scene.planes.normal.shape[0] else []
-    kinds += raycast.sphere_surfaces(config, scene, origin, rays, value)
-    kinds += raycast.other_surfaces(config, scene, origin, rays, value)
-    for surfaces in kinds:
-        depth = jnp.where(surfaces.hit, surfaces.depth, jnp.inf)
+    for met in raycast.hits(scene, origin, rays, without=raycast.UPRIGHT).values():
+        depth = jnp.where(met.hit, met.depth, jnp.inf)
         whole = jnp.broadcast_to(depth, depth.shape[:1] + shape)
         # A reduction over the leading axis takes several times as long on a CPU.
         nearest = lax.scan(lambda found, one: (jnp.minimum(found, one), None), nearest, whole, unroll=UNROLLED)[0]
     uprights = []
     if scene.boxes.yaw.shape[0]:
-        uprights.append(_boxes(scene.boxes, origin, raycast.for_shapes(rays)))
+        uprights.append(_boxes(scene.boxes, origin, rays))
     if scene.cylinders.radius.shape[0]:
-        uprights.append(_cylinders(scene.cylinders, origin, raycast.for_shapes(rays)))
+        uprights.append(_cylinders(scene.cylinders, origin, rays))
     if not uprights:
         return nearest
     joined = jax.tree.map(lambda *parts: jnp.concatenate(parts), *uprights)
@@ -69,9 +66,10 @@ def _with_one_more(nearest: Array, intervals: _Intervals) -> tuple[Array, None]:
 
 def _boxes(boxes: UprightBoxes, origin: Array, rays: Rays) -> _Intervals:
     """Returns the intervals of upright boxes: beside its axis a ray is between two pairs of parallel faces."""
+    dx, dy, _ = direction_of(rays)
     cos, sin = per_shape(jnp.cos(boxes.yaw)), per_shape(jnp.sin(boxes.yaw))
     x, y = (per_shape(boxes.position[:, axis] - origin[axis]) for axis in range(2))
-    per_x, per_y = inverse(cos * rays.dx + sin * rays.dy), inverse(cos * rays.dy - sin * rays.dx)
+    per_x, per_y = inverse(cos * dx + sin * dy), inverse(cos * dy - sin * dx)
     middle = (cos * x + sin * y) * per_x, (cos * y - sin * x) * per_y
     reach = per_shape(boxes.half[:, 0]) * jnp.abs(per_x), per_shape(boxes.half[:, 1]) * jnp.abs(per_y)
     return _Intervals(
@@ -83,10 +81,11 @@ def _boxes(boxes: UprightBoxes, origin: Array, rays: Rays) -> _Intervals:
 
 def _cylinders(cylinders: UprightCylinders, origin: Array, rays: Rays) -> _Intervals:
     """Returns the intervals of upright cylinders: beside its axis a ray is within the circle."""
+    dx, dy, _ = direction_of(rays)
     ox, oy = (per_shape(origin[axis] - cylinders.position[:, axis]) for axis in range(2))
-    flat = jnp.maximum(rays.dx**2 + rays.dy**2, raycast.TINY)
-    nearest = -(ox * rays.dx + oy * rays.dy) / flat
-    inside = per_shape(cylinders.radius**2) - ((ox + nearest * rays.dx) ** 2 + (oy + nearest * rays.dy) ** 2)
+    flat = jnp.maximum(dx**2 + dy**2, TINY)
+    nearest = -(ox * dx + oy * dy) / flat
+    inside = per_shape(cylinders.radius**2) - ((ox + nearest * dx) ** 2 + (oy + nearest * dy) ** 2)
     reach = jnp.where(inside > 0, jnp.sqrt(jnp.maximum(inside, 0.0) / flat), -jnp.inf)
     heights = _level(cylinders.position[:, 2] - origin[2], cylinders.half_height, rays)
     return _Intervals(nearest - reach, nearest + reach, *heights)
@@ -94,6 +93,6 @@ def _cylinders(cylinders: UprightCylinders, origin: Array, rays: Rays) -> _Inter
 
 def _level(middle: Array, half: Array, rays: Rays) -> tuple[Array, Array]:
     """Returns the depths between which rays are between bottom and top: `middle` [N] above the eye +- `half` [N]."""
-    per_z = inverse(rays.dz)
+    per_z = inverse(rays.dz[None])
     at, reach = per_shape(middle) * per_z, per_shape(half) * jnp.abs(per_z)
     return at - reach, at + reach

@@ -1,7 +1,8 @@
 """The level camera in C, for CPUs and NVIDIA GPUs: calls `pictures.c` and `pictures.cu`.
 
 Where there is a C compiler, or on GPUs CUDA's, pictures and depth images are drawn by it; everywhere else by the same
-functions in JAX (`columns.py`, `depth.py`). All agree to rounding (`tests/sim/camera/test_native.py`).
+functions in JAX (`columns.py`, `depth.py`). All agree to rounding (`tests/sim/camera/test_native.py`). It knows the
+kinds of shape of `OPERANDS` alone: scenes with any other, one's own included, are drawn in JAX.
 """
 
 from __future__ import annotations
@@ -19,6 +20,8 @@ from edqn_jax.sim.camera import coverage, raycast, surfaces
 from edqn_jax.sim.camera.primitive import most_rows
 from edqn_jax.sim.camera.texture import WAVES
 from edqn_jax.sim.scene.scene import Scene
+from edqn_jax.sim.scene.shapes.kind import TINY
+from edqn_jax.sim.scene.shapes.plane import HORIZON_M
 from edqn_jax.sim.scene.surface import CONTRAST, KIND, PHASES, SHARES, SURFACE_NUMBERS
 
 SOURCES = {name: Path(__file__).with_name(f"pictures.{name}") for name in ("h", "c", "cu")}
@@ -43,8 +46,8 @@ NOWHERE = 1e29
 
 def can_draw(config: CameraConfig, scene: Scene, platform: str) -> bool:
     """Returns whether the library of "cpu" or "cuda" is at hand and draws such pictures; known when tracing."""
-    others = (scene.tilted_boxes, scene.capsules, scene.tilted_cylinders)
-    plain = config.mount == "level" and not any(kind.position.shape[-2] for kind in others)
+    others = [shapes for kind, shapes in scene.shapes().items() if kind not in OPERANDS]
+    plain = config.mount == "level" and not any(shapes.position.shape[-2] for shapes in others)
     shapes = [getattr(getattr(scene, kind), name) for kind, names in OPERANDS.items() for name in names]
     plain = plain and scene.planes.position.shape[-2] <= MOST_PLANES
     return plain and all(leaf.dtype == jnp.float32 for leaf in shapes) and is_at_hand(platform)
@@ -101,8 +104,8 @@ def is_at_hand(platform: str) -> bool:
 def definitions() -> tuple[str, ...]:
     """Returns the constants that the sources do not define, NAME=VALUE."""
     numbers = {
-        "TINY": raycast.TINY,
-        "HORIZON_M": raycast.HORIZON_M,
+        "TINY": TINY,
+        "HORIZON_M": HORIZON_M,
         "NEAR_M": coverage.NEAR_M,
         "FAR_U": coverage.FAR_U,
         "LEVEL_FACE": coverage.LEVEL_FACE,

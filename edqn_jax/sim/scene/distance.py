@@ -10,22 +10,8 @@ import jax.numpy as jnp
 from jax import Array, lax
 from jax.typing import ArrayLike
 
-from edqn_jax.sim.scene.scene import (
-    PARKED,
-    Capsules,
-    Planes,
-    Scene,
-    Spheres,
-    TiltedBoxes,
-    TiltedCylinders,
-    UprightBoxes,
-    UprightCylinders,
-    moves,
-    scene_at,
-    speeds,
-)
-
-_TINY = 1e-20  # under a square root, so that its gradient is finite; 1e-10 m is nothing
+from edqn_jax.config.registry import SHAPES
+from edqn_jax.sim.scene.scene import PARKED, Scene, moves, scene_at, speeds
 
 
 def shape_distances(scene: Scene, point: Array) -> dict[str, Array]:
@@ -36,23 +22,14 @@ def shape_distances(scene: Scene, point: Array) -> dict[str, Array]:
         point: [3] metres.
 
     Returns:
-        For every kind whose capacity is not zero, [N] metres: positive outside, negative inside, exact on
-        both sides of the surface.
+        For every kind whose capacity is not zero, [N] metres: positive outside, negative inside; of the built-in
+        kinds exact on both sides of the surface.
     """
     x, y, z = point[0], point[1], point[2]
-    rules = {
-        "boxes": _upright_boxes,
-        "cylinders": _upright_cylinders,
-        "spheres": _spheres,
-        "tilted_boxes": _tilted_boxes,
-        "capsules": _capsules,
-        "tilted_cylinders": _tilted_cylinders,
-        "planes": _planes,
-    }
     return {
-        kind: rule(getattr(scene, kind), x, y, z)
-        for kind, rule in rules.items()
-        if getattr(scene, kind).position.shape[0]
+        kind: SHAPES.get(kind).distance(shapes, x, y, z)
+        for kind, shapes in scene.shapes().items()
+        if shapes.position.shape[0]
     }
 
 
@@ -187,65 +164,3 @@ def _room(scene: Scene, point: Array, time: Array, seconds: Array) -> Array:
     for kind, speed in speeds(scene, time).items():
         distances[kind] = distances[kind] - speed * seconds
     return _least(distances)
-
-
-def _norm(*components: Array) -> Array:
-    return jnp.sqrt(jnp.maximum(sum(c * c for c in components), _TINY))
-
-
-def _solid(*gaps: Array) -> Array:
-    """Returns the signed distance, given the distances beyond each pair of faces (negative: within)."""
-    outside = _norm(*(jnp.maximum(gap, 0.0) for gap in gaps))
-    deepest = gaps[0]
-    for gap in gaps[1:]:
-        deepest = jnp.maximum(deepest, gap)
-    return jnp.where(deepest > 0, outside, deepest)
-
-
-def _offset(position: Array, x: Array, y: Array, z: Array) -> tuple[Array, Array, Array]:
-    return x - position[:, 0], y - position[:, 1], z - position[:, 2]
-
-
-def _upright_boxes(boxes: UprightBoxes, x: Array, y: Array, z: Array) -> Array:
-    dx, dy, dz = _offset(boxes.position, x, y, z)
-    c, s = jnp.cos(boxes.yaw), jnp.sin(boxes.yaw)
-    return _solid(
-        jnp.abs(c * dx + s * dy) - boxes.half[:, 0],
-        jnp.abs(c * dy - s * dx) - boxes.half[:, 1],
-        jnp.abs(dz) - boxes.half[:, 2],
-    )
-
-
-def _tilted_boxes(boxes: TiltedBoxes, x: Array, y: Array, z: Array) -> Array:
-    dx, dy, dz = _offset(boxes.position, x, y, z)
-    r = boxes.rotation
-    return _solid(*(jnp.abs(r[:, 0, i] * dx + r[:, 1, i] * dy + r[:, 2, i] * dz) - boxes.half[:, i] for i in range(3)))
-
-
-def _upright_cylinders(cylinders: UprightCylinders, x: Array, y: Array, z: Array) -> Array:
-    dx, dy, dz = _offset(cylinders.position, x, y, z)
-    return _solid(_norm(dx, dy) - cylinders.radius, jnp.abs(dz) - cylinders.half_height)
-
-
-def _tilted_cylinders(cylinders: TiltedCylinders, x: Array, y: Array, z: Array) -> Array:
-    dx, dy, dz = _offset(cylinders.position, x, y, z)
-    ax, ay, az = cylinders.axis[:, 0], cylinders.axis[:, 1], cylinders.axis[:, 2]
-    along = dx * ax + dy * ay + dz * az
-    radial = _norm(dx - along * ax, dy - along * ay, dz - along * az)
-    return _solid(radial - cylinders.radius, jnp.abs(along) - cylinders.half_length)
-
-
-def _spheres(spheres: Spheres, x: Array, y: Array, z: Array) -> Array:
-    return _norm(*_offset(spheres.position, x, y, z)) - spheres.radius
-
-
-def _capsules(capsules: Capsules, x: Array, y: Array, z: Array) -> Array:
-    dx, dy, dz = _offset(capsules.position, x, y, z)
-    ax, ay, az = capsules.axis[:, 0], capsules.axis[:, 1], capsules.axis[:, 2]
-    along = jnp.clip(dx * ax + dy * ay + dz * az, -capsules.half_length, capsules.half_length)
-    return _norm(dx - along * ax, dy - along * ay, dz - along * az) - capsules.radius
-
-
-def _planes(planes: Planes, x: Array, y: Array, z: Array) -> Array:
-    dx, dy, dz = _offset(planes.position, x, y, z)
-    return dx * planes.normal[:, 0] + dy * planes.normal[:, 1] + dz * planes.normal[:, 2]

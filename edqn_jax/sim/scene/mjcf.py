@@ -2,8 +2,8 @@
 
 An MJCF file that names no other file can be read. A world for the drone consists of
 
-* its static geoms (on the world body or on bodies welded to it): boxes, spheres, capsules, cylinders at
-  any rotation, and planes, which are solid below and infinite. A geom is read if it is visible in
+* its static geoms (on the world body or on bodies welded to it) of any registered kind of shape (`shapes/`), at any
+  rotation. Planes are solid below and infinite. A geom is read if it is visible in
   MuJoCo's viewer (groups 0 to 2) or if MuJoCo would collide with it (contype or conaffinity set): every
   visible geom is solid, and every solid geom is visible. Colour is the material's or the geom's own `rgba`; alpha
   and textures are ignored.
@@ -18,7 +18,6 @@ from __future__ import annotations
 
 import dataclasses
 import difflib
-import math
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Mapping
 from pathlib import Path
@@ -34,20 +33,8 @@ from edqn_jax.sim.scene.distance import shape_distances
 from edqn_jax.sim.scene.mjcf_files import SceneError, checked_text
 from edqn_jax.sim.scene.mjcf_motion import PREFIX, motions_of, set_in_motion, text_of
 from edqn_jax.sim.scene.motion import Throw, steady_aim, thrown_to
-from edqn_jax.sim.scene.scene import (
-    KINDS,
-    Capsules,
-    Planes,
-    Scene,
-    Shape,
-    Spheres,
-    TiltedBoxes,
-    TiltedCylinders,
-    UprightBoxes,
-    UprightCylinders,
-    build_scene,
-    scene_shapes,
-)
+from edqn_jax.sim.scene.scene import Planes, Scene, Shape, Spheres, build_scene, scene_shapes
+from edqn_jax.sim.scene.shapes.kind import LEVEL, Geom, kind_of, kinds, reach_of, read_shape
 
 VOLUME_MARGIN = 5.0
 """Metres around shapes and sites where a world names no `volume`."""
@@ -58,8 +45,6 @@ LONGEST_VOLUME = 500.0
 MOST_SHAPES = 500
 """Geoms of a world: 2 000 of them take 8 GB to train in."""
 
-_LEVEL = 1e-6  # an axis this near to vertical (sine of the angle) is vertical: 0.1 mm over 100 m
-
 
 @dataclasses.dataclass(frozen=True)
 class LoadedWorld:
@@ -67,7 +52,7 @@ class LoadedWorld:
 
     scene: Scene
     names: Mapping[str, tuple[str, ...]]
-    """For every kind (field of `Scene`), the name of each of its shapes, in order."""
+    """For every kind of shape, the name of each of its shapes, in order."""
     path: Path
     has_volume: bool
     """Whether the file says where the drone may fly."""
@@ -120,6 +105,49 @@ def load_world(path: str | Path) -> LoadedWorld:
     path = Path(path)
     if not path.is_file():
         raise SceneError(f"there is no scene file '{path.name}' in {path.parent.resolve()}")
+    model = _compiled(path)
+    data = mujoco.MjData(model)
+    mujoco.mj_kinematics(model, data)
+    said = motions_of(model, str(path))
+    shapes: list[Shape] = []
+    bodies: list[int] = []  # 0 of shapes that stand
+    names: dict[str, list[str]] = {kind: [] for kind in kinds()}
+    for geom in range(model.ngeom):
+        if model.geom_group[geom] >= 3 and not (model.geom_contype[geom] or model.geom_conaffinity[geom]):
+            continue
+        body = int(model.body_rootid[model.geom_bodyid[geom]])
+        shape = _shape(model, data, geom, path, moves=body in said)
+        shapes.append(shape)
+        bodies.append(body if body in said else 0)
+        names[kind_of(shape)[0]].append(_geom_name(model, geom))
+    sites = {model.site(i).name: data.site_xpos[i] for i in range(model.nsite)}
+    for name, where in sites.items():
+        if not np.all(np.isfinite(where)):
+            raise SceneError(f"{path}: the site '{name}' stands at no finite point; give its pos three numbers")
+    unknown = np.full(3, np.nan)
+    thrown = {body for body, motion in said.items() if motion[0][0] == "throw"}
+    stays = [shape for shape, body in zip(shapes, bodies, strict=True) if body not in thrown]
+    volume = _volume(model, data, stays, path)
+    for body, motion in said.items():
+        title = f"{path}: the body '{model.body(body).name}'"
+        of = [i for i, each in enumerate(bodies) if each == body]
+        if not of:
+            raise SceneError(f"{title} moves and has no solid geom; give it one")
+        faces = volume if "volume" in sites else None
+        moving = set_in_motion([shapes[i] for i in of], motion, data.xpos[body], faces, title)
+        for i, shape in zip(of, moving, strict=True):
+            shapes[i] = shape
+    ends = {role: sites.get(role, unknown) for role in ("start", "goal")}
+    scene = build_scene(shapes, volume=volume, **ends)
+    return LoadedWorld(scene, {kind: tuple(members) for kind, members in names.items()}, path, "volume" in sites)
+
+
+def _compiled(path: Path) -> mujoco.MjModel:
+    """Returns the model of a file, which names no other.
+
+    Raises:
+        SceneError: if MuJoCo cannot read it, or it has more geoms than `MOST_SHAPES`.
+    """
     text = checked_text(path)
     mujoco.set_mju_user_warning(lambda _: None)  # otherwise MuJoCo writes a log into the working folder
     try:
@@ -131,47 +159,7 @@ def load_world(path: str | Path) -> LoadedWorld:
         mujoco.set_mju_user_warning(None)
     if model.ngeom > MOST_SHAPES:
         raise SceneError(f"{path} has {model.ngeom:,} geoms; a world may have {MOST_SHAPES}")
-    data = mujoco.MjData(model)
-    mujoco.mj_kinematics(model, data)
-    said = motions_of(model, str(path))
-    shapes: list[Shape] = []
-    bodies: list[int] = []
-    names: dict[str, list[str]] = {kind: [] for kind in KINDS}
-    for geom in range(model.ngeom):
-        if model.geom_group[geom] >= 3 and not (model.geom_contype[geom] or model.geom_conaffinity[geom]):
-            continue
-        body = int(model.body_rootid[model.geom_bodyid[geom]])
-        shape = _shape(model, data, geom, path, moves=body in said)
-        shapes.append(shape)
-        bodies.append(body if body in said else 0)
-        kind = next(kind for kind, dataclass in KINDS.items() if isinstance(shape, dataclass))
-        names[kind].append(_geom_name(model, geom))
-    sites = {model.site(i).name: data.site_xpos[i] for i in range(model.nsite)}
-    for name, where in sites.items():
-        if not np.all(np.isfinite(where)):
-            raise SceneError(f"{path}: the site '{name}' stands at no finite point; give its pos three numbers")
-    unknown = np.full(3, np.nan)
-    thrown = {body for body, motion in said.items() if motion[0][0] == "throw"}
-    stays = [shape for shape, body in zip(shapes, bodies, strict=True) if body not in thrown]
-    volume = _volume(model, data, stays, path)
-    for body, motion in said.items():
-        of = [i for i, each in enumerate(bodies) if each == body]
-        if not of:
-            raise SceneError(f"{path}: the body '{model.body(body).name}' moves and has no solid geom; give it one")
-        title = f"{path}: the body '{model.body(body).name}'"
-        parts = [shapes[i] for i in of]
-        reaches = [np.zeros(3) if isinstance(part, Planes) else _reach(part) for part in parts]
-        faces = volume if "volume" in sites else None
-        moving = set_in_motion(parts, reaches, motion, data.xpos[body], faces, title)
-        for i, shape in zip(of, moving, strict=True):
-            shapes[i] = shape
-    scene = build_scene(
-        shapes,
-        volume=volume,
-        start=sites.get("start", unknown),
-        goal=sites.get("goal", unknown),
-    )
-    return LoadedWorld(scene, {kind: tuple(members) for kind, members in names.items()}, path, "volume" in sites)
+    return model
 
 
 def widened(scene: Scene, points: Mapping[str, ArrayLike], title: str) -> Scene:
@@ -320,17 +308,15 @@ def _launch(scene: Scene, one: Throw) -> np.ndarray:
 
 
 def _geom_name(model: mujoco.MjModel, geom: int) -> str:
-    kind = _kind_name(mujoco.mjtGeom(model.geom_type[geom]))
-    return model.geom(geom).name or f"geom number {geom} ({kind})"
+    return model.geom(geom).name or f"geom number {geom} ({_kind_name(model, geom)})"
 
 
-def _kind_name(kind: mujoco.mjtGeom) -> str:
-    return kind.name.removeprefix("mjGEOM_").lower()
+def _kind_name(model: mujoco.MjModel, geom: int) -> str:
+    return mujoco.mjtGeom(model.geom_type[geom]).name.removeprefix("mjGEOM_").lower()
 
 
 def _shape(model: mujoco.MjModel, data: mujoco.MjData, geom: int, path: Path, moves: bool) -> Shape:
     """Returns geom `geom` as a single shape, in the world's frame; `moves` if its mocap body may."""
-    kind = mujoco.mjtGeom(model.geom_type[geom])
     name = _geom_name(model, geom)
     body = model.geom_bodyid[geom]
     root = model.body_rootid[body]
@@ -345,59 +331,46 @@ def _shape(model: mujoco.MjModel, data: mujoco.MjData, geom: int, path: Path, mo
             f"{path}: geom '{name}' is on a body that can move; remove the mocap of body '{model.body(root).name}', or "
             f'say how it moves: <custom><text name="{said}" data="oscillate 0 2 0 4 0"/></custom>'
         )
-    material = model.geom_matid[geom]
-    albedo = (model.geom_rgba[geom] if material < 0 else model.mat_rgba[material])[:3]
-    position, rotation, size = data.geom_xpos[geom], data.geom_xmat[geom].reshape(3, 3), model.geom_size[geom]
-    if not all(np.all(np.isfinite(values)) for values in (position, rotation, size)):
+    found = geom_of(model, data, geom)
+    if not all(np.all(np.isfinite(values)) for values in (found.position, found.rotation, found.size)):
         raise SceneError(f"{path}: geom '{name}' has a place or a size that is not finite; give it numbers")
-    axis = rotation[:, 2]
-    upright = math.hypot(axis[0], axis[1]) < _LEVEL
-    match kind:
-        case mujoco.mjtGeom.mjGEOM_BOX:
-            return _box(position, rotation, size, albedo)
-        case mujoco.mjtGeom.mjGEOM_SPHERE:
-            return Spheres(position=position, radius=size[0], albedo=albedo)
-        case mujoco.mjtGeom.mjGEOM_CAPSULE:
-            return Capsules(position=position, axis=axis, half_length=size[1], radius=size[0], albedo=albedo)
-        case mujoco.mjtGeom.mjGEOM_CYLINDER if upright:
-            return UprightCylinders(position=position, radius=size[0], half_height=size[1], albedo=albedo)
-        case mujoco.mjtGeom.mjGEOM_CYLINDER:
-            return TiltedCylinders(position=position, axis=axis, half_length=size[1], radius=size[0], albedo=albedo)
-        case mujoco.mjtGeom.mjGEOM_PLANE:
-            return Planes(position=position, normal=axis, albedo=albedo)
-    raise SceneError(
-        f"{path}: geom '{name}' is of the unsupported kind {_kind_name(kind)}; use boxes, "
-        "spheres, capsules, cylinders or planes, or hide it in group 3 with contype and conaffinity 0"
+    shape = read_shape(found)
+    if shape is None:
+        *some, last = dict.fromkeys(kind.geom for kind in kinds().values())
+        raise SceneError(
+            f"{path}: geom '{name}' is of the unsupported kind {found.kind}; make it a {', '.join(some)} or {last}, or "
+            "hide it in group 3 with contype and conaffinity 0"
+        )
+    return shape
+
+
+def geom_of(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> Geom:
+    """Returns geom number `geom` of a model, in the world's frame."""
+    material = model.geom_matid[geom]
+    return Geom(
+        kind=_kind_name(model, geom),
+        position=data.geom_xpos[geom],
+        rotation=data.geom_xmat[geom].reshape(3, 3),
+        size=model.geom_size[geom],
+        albedo=(model.geom_rgba[geom] if material < 0 else model.mat_rgba[material])[:3],
     )
-
-
-def _box(position: np.ndarray, rotation: np.ndarray, size: np.ndarray, albedo: np.ndarray) -> Shape:
-    """Returns an upright box if any of its axes is vertical, else a tilted one."""
-    for vertical in (2, 0, 1):
-        if math.hypot(rotation[0, vertical], rotation[1, vertical]) < _LEVEL:
-            across, deep = ((0, 1), (1, 2), (0, 2))[(2, 0, 1).index(vertical)]
-            yaw = math.atan2(rotation[1, across], rotation[0, across])
-            half = size[[across, deep, vertical]]
-            return UprightBoxes(position=position, half=half, yaw=yaw, albedo=albedo)  # type: ignore[arg-type]
-    return TiltedBoxes(position=position, half=size, rotation=rotation, albedo=albedo)  # type: ignore[arg-type]
 
 
 def _volume(model: mujoco.MjModel, data: mujoco.MjData, shapes: list[Shape], path: Path) -> np.ndarray:
     for i in range(model.nsite):
         if model.site(i).name == "volume":
-            turned = np.abs(data.site_xmat[i].reshape(3, 3) - np.eye(3)).max() > _LEVEL
+            turned = np.abs(data.site_xmat[i].reshape(3, 3) - np.eye(3)).max() > LEVEL
             if model.site_type[i] != mujoco.mjtGeom.mjGEOM_BOX or turned:
                 raise SceneError(f"{path}: the site 'volume' must be a box that is not rotated")
             return data.site_xpos[i] + np.array([[-1.0], [1.0]]) * model.site_size[i]
     corners = [data.site_xpos[i] for i in range(model.nsite)]
     floors = []
     for shape in shapes:
-        if isinstance(shape, Planes):
-            if shape.normal[2] > 1 - _LEVEL:
-                floors.append(shape.position[2])
-            continue
-        reach = _reach(shape)
-        corners += [shape.position - reach, shape.position + reach]
+        reach = reach_of(shape)
+        if np.all(np.isfinite(reach)):
+            corners += [shape.position - reach, shape.position + reach]
+        elif isinstance(shape, Planes) and shape.normal[2] > 1 - LEVEL:
+            floors.append(shape.position[2])
     if not corners:
         raise SceneError(f"{path}: the size of the world is unknown; add a box site named 'volume'")
     lower, upper = np.min(corners, axis=0) - VOLUME_MARGIN, np.max(corners, axis=0) + VOLUME_MARGIN
@@ -406,50 +379,11 @@ def _volume(model: mujoco.MjModel, data: mujoco.MjData, shapes: list[Shape], pat
     return np.stack([lower, upper])
 
 
-def _reach(shape: Shape) -> np.ndarray:
-    """Returns the half extents [3] of the axis-aligned box around a shape."""
-    match shape:
-        case UprightBoxes():
-            c, s = abs(math.cos(shape.yaw)), abs(math.sin(shape.yaw))
-            x, y, z = shape.half
-            return np.array([c * x + s * y, s * x + c * y, z])
-        case TiltedBoxes():
-            return np.asarray(np.abs(shape.rotation) @ shape.half)
-        case UprightCylinders():
-            return np.array([shape.radius, shape.radius, shape.half_height])
-        case Spheres():
-            return np.full(3, shape.radius)
-        case Capsules():
-            return np.asarray(np.abs(shape.axis) * shape.half_length + shape.radius)
-        case TiltedCylinders():
-            across = np.sqrt(np.maximum(1.0 - np.asarray(shape.axis) ** 2, 0.0))
-            return np.asarray(np.abs(shape.axis) * shape.half_length + across * shape.radius)
-    raise TypeError(f"a {type(shape).__name__} has no finite extent")
-
-
 def _attributes(shape: Shape) -> dict[str, str]:
     """Returns the MJCF attributes of a geom."""
-    common = {"pos": _numbers(shape.position), "rgba": _numbers([*np.asarray(shape.albedo), 1.0])}
-    match shape:
-        case UprightBoxes():
-            own = {"type": "box", "size": _numbers(shape.half), "euler": _numbers([0.0, 0.0, shape.yaw])}
-        case TiltedBoxes():
-            quaternion = np.empty(4)
-            mujoco.mju_mat2Quat(quaternion, np.asarray(shape.rotation, np.float64).ravel())
-            own = {"type": "box", "size": _numbers(shape.half), "quat": _numbers(quaternion)}
-        case UprightCylinders():
-            own = {"type": "cylinder", "size": _numbers([shape.radius, shape.half_height])}
-        case TiltedCylinders():
-            size = _numbers([shape.radius, shape.half_length])
-            own = {"type": "cylinder", "size": size, "zaxis": _numbers(shape.axis)}
-        case Capsules():
-            size = _numbers([shape.radius, shape.half_length])
-            own = {"type": "capsule", "size": size, "zaxis": _numbers(shape.axis)}
-        case Spheres():
-            own = {"type": "sphere", "size": _numbers([shape.radius])}
-        case Planes():
-            own = {"type": "plane", "size": "0 0 1", "zaxis": _numbers(shape.normal)}
-    return {**own, **common}
+    kind = kind_of(shape)[1]
+    numbers = {**kind.write(shape), "pos": shape.position, "rgba": [*np.asarray(shape.albedo), 1.0]}
+    return {"type": kind.geom, **{name: _numbers(values) for name, values in numbers.items()}}
 
 
 def _numbers(values: object) -> str:

@@ -31,7 +31,8 @@ import numpy as np
 
 from edqn_jax.sim.scene.mjcf_files import SceneError
 from edqn_jax.sim.scene.motion import LEAST_LAUNCH_M, Throw, at_rest
-from edqn_jax.sim.scene.scene import PARKED, Planes, Shape, Spheres
+from edqn_jax.sim.scene.scene import PARKED, Shape, Spheres
+from edqn_jax.sim.scene.shapes.kind import kind_of, reach_of
 
 PREFIX = "motion:"
 """Of the name of a text that says how a body moves."""
@@ -111,7 +112,6 @@ def as_ellipse(said: Said) -> tuple[np.ndarray, np.ndarray, float, float]:
 
 def set_in_motion(
     shapes: Sequence[Shape],
-    reaches: Sequence[np.ndarray],
     said: Sequence[Said],
     at: np.ndarray,
     volume: np.ndarray | None,
@@ -121,7 +121,6 @@ def set_in_motion(
 
     Args:
         shapes: of the body, where they are at time 0.
-        reaches: [3] of each, half extents of the axis-aligned box around it, metres.
         said: of the body.
         at: [3] position of the body at time 0, metres.
         volume: [2, 3] corners of the flight volume, metres; None where the file names none.
@@ -130,8 +129,9 @@ def set_in_motion(
     Raises:
         SceneError: if the shapes cannot move so.
     """
-    if any(isinstance(shape, Planes) for shape in shapes):
-        raise SceneError(f"{title} has a plane, which has no end and cannot move; use a box")
+    for kind in (kind_of(shape)[1] for shape in shapes):
+        if kind.reach is None:
+            raise SceneError(f"{title} has a {kind.geom}, which has no end and cannot move; use a box")
     if said[0][0] == "throw":
         if len(shapes) != 1 or not isinstance(shapes[0], Spheres):
             raise SceneError(f"{title} is thrown and must be one sphere, nothing else")
@@ -141,7 +141,7 @@ def set_in_motion(
     for word, numbers in said:
         if word == "bounce":
             how = dataclasses.replace(how, velocity=np.array(numbers[:3]))
-            low, high = _walls(numbers, shapes, reaches, at, volume, title)
+            low, high = _walls(numbers, shapes, at, volume, title)
         else:
             a, b, rate, phase = as_ellipse((word, numbers))
             cos, sin = math.cos(phase), math.sin(phase)
@@ -163,7 +163,6 @@ def set_in_motion(
 def _walls(
     numbers: tuple[float, ...],
     shapes: Sequence[Shape],
-    reaches: Sequence[np.ndarray],
     at: np.ndarray,
     volume: np.ndarray | None,
     title: str,
@@ -175,9 +174,9 @@ def _walls(
     elif volume is None:
         raise SceneError(f"{title} bounces within the flight volume, which the file does not name; add a site 'volume'")
     else:
-        middle = np.stack([shape.position for shape in shapes])
-        low = volume[0] - np.min(middle - np.stack(reaches), axis=0)
-        high = volume[1] - np.max(middle + np.stack(reaches), axis=0)
+        middle, reach = np.stack([shape.position for shape in shapes]), np.stack([reach_of(shape) for shape in shapes])
+        low = volume[0] - np.min(middle - reach, axis=0)
+        high = volume[1] - np.max(middle + reach, axis=0)
         where = "within the flight volume"
     runs = np.array(numbers[:3]) != 0
     within = 1e-4  # metres; files round

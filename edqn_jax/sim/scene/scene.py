@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping, Sequence
-from typing import Any, TypeVar
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -25,11 +25,11 @@ from flax import struct
 from jax import Array
 from jax.typing import ArrayLike
 
+from edqn_jax.config.registry import SHAPES
 from edqn_jax.sim.scene.motion import (
     OUTSIDE_M,
     Aim,
     Flown,
-    Motion,
     Throw,
     at_rest,
     displacement,
@@ -41,93 +41,25 @@ from edqn_jax.sim.scene.motion import (
     thrown_to,
     top_speeds,
 )
+from edqn_jax.sim.scene.shapes.capsule import Capsules
+from edqn_jax.sim.scene.shapes.kind import PARKED, kind_of
+from edqn_jax.sim.scene.shapes.plane import Planes
+from edqn_jax.sim.scene.shapes.sphere import Spheres
+from edqn_jax.sim.scene.shapes.tilted_box import TiltedBoxes
+from edqn_jax.sim.scene.shapes.tilted_cylinder import TiltedCylinders
+from edqn_jax.sim.scene.shapes.upright_box import UprightBoxes
+from edqn_jax.sim.scene.shapes.upright_cylinder import UprightCylinders
 from edqn_jax.sim.scene.surface import Daylight, Surface, blank_surfaces
-
-PARKED = 1e6
-"""Coordinate of absent shapes, metres along each axis."""
 
 DRONE_RGB = (0.08, 0.08, 0.1)
 """Reflectance of other drones: dark, as airframes of carbon fibre are."""
 
 
-@struct.dataclass
-class UprightBoxes:
-    """Boxes rotated about the vertical only. N is the capacity."""
+Shape = Any
+"""One shape: a kind's dataclass whose fields lack the leading axis."""
 
-    position: Array  # [N, 3] centre, metres
-    half: Array  # [N, 3] half extents, metres
-    yaw: Array  # [N] rotation about world z, radians
-    albedo: Array  # [N, 3] RGB reflectance in [0, 1]
-    motion: Motion | None = None
-    surface: Surface | None = None
-
-
-@struct.dataclass
-class UprightCylinders:
-    """Cylinders whose axis is world z."""
-
-    position: Array  # [N, 3] centre, metres
-    radius: Array  # [N] metres
-    half_height: Array  # [N] metres
-    albedo: Array  # [N, 3]
-    motion: Motion | None = None
-    surface: Surface | None = None
-
-
-@struct.dataclass
-class Spheres:
-    position: Array  # [N, 3] centre, metres
-    radius: Array  # [N] metres
-    albedo: Array  # [N, 3]
-    motion: Motion | None = None
-    throw: Throw | None = None
-    surface: Surface | None = None
-
-
-@struct.dataclass
-class TiltedBoxes:
-    """Boxes at any rotation."""
-
-    position: Array  # [N, 3] centre, metres
-    half: Array  # [N, 3] half extents, metres
-    rotation: Array  # [N, 3, 3] body-to-world; columns are the box's axes
-    albedo: Array  # [N, 3]
-    motion: Motion | None = None
-    surface: Surface | None = None
-
-
-@struct.dataclass
-class Capsules:
-    position: Array  # [N, 3] centre, metres
-    axis: Array  # [N, 3] unit direction
-    half_length: Array  # [N] metres, of the straight part
-    radius: Array  # [N] metres
-    albedo: Array  # [N, 3]
-    motion: Motion | None = None
-    surface: Surface | None = None
-
-
-@struct.dataclass
-class TiltedCylinders:
-    """Cylinders with any axis."""
-
-    position: Array  # [N, 3] centre, metres
-    axis: Array  # [N, 3] unit direction
-    half_length: Array  # [N] metres
-    radius: Array  # [N] metres
-    albedo: Array  # [N, 3]
-    motion: Motion | None = None
-    surface: Surface | None = None
-
-
-@struct.dataclass
-class Planes:
-    """Half-spaces: solid below the plane, free on the side that the normal points to."""
-
-    position: Array  # [N, 3] any point of the plane, metres
-    normal: Array  # [N, 3] unit
-    albedo: Array  # [N, 3]
-    surface: Surface | None = None
+FIELDS = ("boxes", "cylinders", "spheres", "tilted_boxes", "capsules", "tilted_cylinders", "planes")
+"""Kinds that are fields of every `Scene`; any other registered kind is in `Scene.others` of those that have some."""
 
 
 @struct.dataclass
@@ -144,26 +76,21 @@ class Scene:
     volume: Array  # [2, 3] lower and upper corner of the flight volume, metres
     start: Array  # [3] metres
     goal: Array  # [3] metres
+    others: dict[str, Any] = dataclasses.field(default_factory=dict)  # shapes of further kinds, by kind
     drones: Flown | None = None  # the others of a group, within one decision; in no pool of worlds
     aim: Aim | None = None  # of balls at the drone that flies; in no pool of worlds
     daylight: Daylight | None = None  # None: that of the camera's options
 
+    def shapes(self) -> dict[str, Any]:
+        """Returns the shapes of every kind that the world has a place for, by kind."""
+        return {kind: getattr(self, kind) for kind in FIELDS} | self.others
 
-Shape = UprightBoxes | UprightCylinders | Spheres | TiltedBoxes | Capsules | TiltedCylinders | Planes
-"""One shape: a kind's dataclass whose fields lack the leading axis."""
+    def with_shapes(self, shapes: Mapping[str, Any]) -> Scene:
+        """Returns the same world with other shapes of these kinds."""
+        others = self.others | {kind: each for kind, each in shapes.items() if kind not in FIELDS}
+        fields = {kind: each for kind, each in shapes.items() if kind in FIELDS}
+        return dataclasses.replace(self, **fields, others=others)
 
-KINDS: dict[str, type[Shape]] = {
-    "boxes": UprightBoxes,
-    "cylinders": UprightCylinders,
-    "spheres": Spheres,
-    "tilted_boxes": TiltedBoxes,
-    "capsules": Capsules,
-    "tilted_cylinders": TiltedCylinders,
-    "planes": Planes,
-}
-"""The kinds of shape by the name of their field in `Scene`."""
-
-S = TypeVar("S", bound=Shape)
 
 _MOVING = {"motion": at_rest, "throw": not_thrown}
 """The fields of a kind that are None where nothing moves, and what stands for a shape that does not."""
@@ -171,7 +98,7 @@ _MOVING = {"motion": at_rest, "throw": not_thrown}
 
 def moves(scene: Scene) -> bool:
     """Returns whether any kind of shape has motion. Static: known when a program is traced."""
-    return scene.drones is not None or any(_moves(getattr(scene, kind)) for kind in KINDS)
+    return scene.drones is not None or any(map(_moves, scene.shapes().values()))
 
 
 def _moves(shapes: Shape) -> bool:
@@ -187,9 +114,8 @@ def scene_at(scene: Scene, time: Array | None) -> Scene:
         scene: one world; balls fly as its `aim` says, without one as `steady_aim`.
         time: None is time 0, before anything is thrown.
     """
-    moving = [kind for kind in KINDS if _moves(getattr(scene, kind))]
-    there = {kind: _standing(scene, getattr(scene, kind), time) for kind in moving}
-    now = dataclasses.replace(scene, **there, aim=None)
+    there = {kind: _standing(scene, shapes, time) for kind, shapes in scene.shapes().items() if _moves(shapes)}
+    now = dataclasses.replace(scene.with_shapes(there), aim=None)
     if scene.drones is None:
         return now
     return with_drones(now, flown_to(scene.drones, scene.drones.began if time is None else time), scene.drones.radius)
@@ -199,7 +125,7 @@ def with_drones(scene: Scene, position: Array, radius: Array) -> Scene:
     """Returns a world that stands, with K drones in it: spheres at `position` [K, 3] of `radius` [K], metres."""
     drones = Spheres(position, radius, jnp.broadcast_to(jnp.asarray(DRONE_RGB), position.shape))
     if scene.spheres.surface is not None:
-        drones = dataclasses.replace(drones, surface=blank_surfaces(len(position), scene.spheres.surface.patterns))
+        drones = dataclasses.replace(drones, surface=blank_surfaces(scene.spheres.surface.patterns, len(position)))
     spheres = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), scene.spheres, drones)
     return dataclasses.replace(scene, spheres=spheres, drones=None)
 
@@ -231,8 +157,8 @@ def speeds(scene: Scene, time: Array) -> dict[str, Array]:
     Between two times no shape moves further than at the mean of its bounds there, but for a ball that is launched in
     between, which is then `LEAST_LAUNCH_M` away. Other drones are not among them.
     """
-    shapes = {kind: getattr(scene, kind) for kind in KINDS}
-    bounds = {kind: top_speeds(each.motion) for kind, each in shapes.items() if getattr(each, "motion", None)}
+    shapes = scene.shapes().items()
+    bounds = {kind: top_speeds(each.motion) for kind, each in shapes if getattr(each, "motion", None)}
     throw = scene.spheres.throw
     if throw is not None:
         bounds["spheres"] = bounds.get("spheres", 0.0) + throw_speeds(throw, aim_of(scene, throw), time)
@@ -242,31 +168,17 @@ def speeds(scene: Scene, time: Array) -> dict[str, Array]:
 # ----------------------------------------------------------------------- building, pools of worlds
 
 
-def parked_shape(kind: type[S]) -> S:
-    """Returns one absent shape of the kind (its dataclass): parked far away, with zero size."""
-    names = [field.name for field in dataclasses.fields(kind) if field.name not in (*_MOVING, "surface")]
-    values: dict[str, Any] = {name: np.float32(0.0) for name in names} | {
-        "position": np.array([0.0, 0.0, -PARKED]) if "normal" in names else np.full(3, PARKED),
-        "half": np.zeros(3),
-        "rotation": np.eye(3),
-        "axis": np.array([0.0, 0.0, 1.0]),
-        "normal": np.array([0.0, 0.0, 1.0]),
-        "albedo": np.full(3, 0.5),
-    }
-    return kind(**{name: values[name] for name in names})
-
-
-def parked_like(shapes: S) -> S:
+def parked_like(shapes: Any) -> Any:
     """Returns one absent shape of the kind of `shapes`, which stands still where they have arrays of motion."""
     rest: dict[str, Any] = {name: still() for name, still in _MOVING.items() if getattr(shapes, name, None) is not None}
-    if shapes.surface is not None:
-        rest["surface"] = jax.tree.map(lambda leaf: np.zeros(leaf.shape[-1:]), shapes.surface)
-    return dataclasses.replace(parked_shape(type(shapes)), **rest)
+    if getattr(shapes, "surface", None) is not None:
+        rest["surface"] = blank_surfaces(shapes.surface.patterns)
+    return dataclasses.replace(kind_of(shapes)[1].parked, **rest)
 
 
-def no_shapes(kind: type[S]) -> S:
-    """Returns the kind's dataclass with capacity 0."""
-    return jax.tree.map(lambda leaf: jnp.zeros((0, *np.shape(leaf)), jnp.float32), parked_shape(kind))
+def no_shapes(kind: str, *lead: int) -> Any:
+    """Returns the arrays [*lead, 0, ...] of a kind of which there is no shape."""
+    return jax.tree.map(lambda leaf: jnp.zeros((*lead, 0, *np.shape(leaf)), jnp.float32), SHAPES.get(kind).parked)
 
 
 def build_scene(
@@ -289,40 +201,42 @@ def build_scene(
     Raises:
         ValueError: if a kind has more shapes than its capacity.
     """
-    fields = {}
-    for kind, dataclass in KINDS.items():
-        members = [shape for shape in shapes if isinstance(shape, dataclass)]
+    of_kind: dict[str, list[Shape]] = {kind: [] for kind in (*FIELDS, *(capacities or {}))}
+    for shape in shapes:
+        of_kind.setdefault(kind_of(shape)[0], []).append(shape)
+    arrays = {}
+    for kind, members in of_kind.items():
         capacity = (capacities or {}).get(kind, len(members))
         if len(members) > capacity:
             raise ValueError(
                 f"{len(members)} {kind} exceed the capacity of {capacity}; it must be at least their number"
             )
-        members += [parked_shape(dataclass)] * (capacity - len(members))
-        if not members:
-            fields[kind] = no_shapes(dataclass)
-            continue
-        fields[kind] = dataclass(
-            **{field.name: _stacked(members, field.name) for field in dataclasses.fields(dataclass)}
-        )
+        parked = SHAPES.get(kind).parked
+        members += [parked] * (capacity - len(members))
+        names = [field.name for field in dataclasses.fields(parked)]
+        stacked = {name: _stacked(members, name) for name in names} if members else {}
+        arrays[kind] = dataclasses.replace(parked, **stacked) if members else no_shapes(kind)
+    arrays = _all_with_surfaces(arrays)
     return Scene(
-        **_all_with_surfaces(fields),
+        **{kind: arrays.pop(kind) for kind in FIELDS},
+        others=arrays,
         volume=jnp.asarray(volume, jnp.float32),
         start=jnp.asarray(start, jnp.float32),
         goal=jnp.asarray(goal, jnp.float32),
     )
 
 
-def _all_with_surfaces(fields: dict[str, Any]) -> dict[str, Any]:
-    """Returns the kinds of one world, where any has surfaces with blank ones in place of those that have none."""
-    some = next((shapes.surface for shapes in fields.values() if shapes.surface is not None), None)
+def _all_with_surfaces(kinds: Mapping[str, Any]) -> dict[str, Any]:
+    """Returns the shapes of every kind; where any kind has surfaces, with blank ones for those that have none yet."""
+    some = next((each.surface for each in kinds.values() if getattr(each, "surface", None) is not None), None)
     if some is None:
-        return fields
-    blank = {
-        kind: dataclasses.replace(shapes, surface=blank_surfaces(len(shapes.position), some.patterns))
-        for kind, shapes in fields.items()
-        if shapes.surface is None
+        return dict(kinds)
+    return {
+        kind: dataclasses.replace(each, surface=blank_surfaces(some.patterns, *each.position.shape[:-1]))
+        if getattr(each, "surface", each) is None
+        else each
+        for kind, each in kinds.items()
     }
-    return fields | blank
 
 
 def _stacked(members: Sequence[Any], name: str) -> Any:
@@ -356,8 +270,8 @@ def scene_shapes(scene: Scene) -> list[Shape]:
     Balls yet to be thrown are among them, parked; shapes that stand still have no motion.
     """
     shapes: list[Shape] = []
-    for kind in KINDS:
-        arrays = jax.tree.map(np.asarray, getattr(scene, kind))
+    for each in scene.shapes().values():
+        arrays = jax.tree.map(np.asarray, each)
         present = np.all(np.abs(arrays.position) < PARKED / 2, axis=-1)
         if getattr(arrays, "throw", None) is not None:
             present |= arrays.throw.early > 0
@@ -378,7 +292,7 @@ def _without_rest(shape: Shape) -> Shape:
 
 def obstacle_count(scene: Scene) -> int:
     """Returns the number of shapes in one world without ground and other planes. On the host."""
-    return sum(not isinstance(shape, Planes) for shape in scene_shapes(scene))
+    return sum(kind_of(shape)[1].reach is not None for shape in scene_shapes(scene))
 
 
 def stack_scenes(scenes: Sequence[Scene]) -> Scene:
@@ -386,7 +300,7 @@ def stack_scenes(scenes: Sequence[Scene]) -> Scene:
 
     Where a kind moves in any of the worlds, it has arrays of motion in all.
     """
-    capacities = {kind: max(getattr(s, kind).position.shape[0] for s in scenes) for kind in KINDS}
+    capacities = {kind: _capacity(kind, scenes) for kind in _kinds_of(scenes)}
     padded = [
         dataclasses.replace(
             build_scene(scene_shapes(s), volume=s.volume, start=s.start, goal=s.goal, capacities=capacities),
@@ -400,15 +314,28 @@ def stack_scenes(scenes: Sequence[Scene]) -> Scene:
 def _able_to_move(scene: Any, others: Sequence[Any]) -> Any:
     """Returns a world, or a pool, with arrays of motion wherever any of the others has some."""
 
-    def filled(shapes: Any, kind: str) -> Any:
+    def filled(kind: str, shapes: Any) -> Any:
         absent = [
             name
             for name in _MOVING
-            if getattr(shapes, name, 0) is None and any(getattr(getattr(o, kind), name) is not None for o in others)
+            if getattr(shapes, name, 0) is None and any(getattr(each, name) is not None for each in others_of(kind))
         ]
         return dataclasses.replace(shapes, **{name: _MOVING[name](*shapes.position.shape[:-1]) for name in absent})
 
-    return dataclasses.replace(scene, **{kind: filled(getattr(scene, kind), kind) for kind in KINDS})
+    def others_of(kind: str) -> list[Any]:
+        return [other.shapes()[kind] for other in others if kind in other.shapes()]
+
+    return scene.with_shapes({kind: filled(kind, shapes) for kind, shapes in scene.shapes().items()})
+
+
+def _kinds_of(scenes: Sequence[Any]) -> list[str]:
+    """Returns the kinds that any of these worlds, or pools, has a place for."""
+    return list(dict.fromkeys(kind for scene in scenes for kind in scene.shapes()))
+
+
+def _capacity(kind: str, scenes: Sequence[Any]) -> int:
+    """Returns the largest capacity of a kind in these worlds, or pools."""
+    return max(scene.shapes()[kind].position.shape[-2] if kind in scene.shapes() else 0 for scene in scenes)
 
 
 def with_equal_capacities(pools: Sequence[Scene], like: Sequence[Any] = ()) -> list[Scene]:
@@ -421,10 +348,10 @@ def with_equal_capacities(pools: Sequence[Scene], like: Sequence[Any] = ()) -> l
         like: more pools whose capacities count, or the shapes of their arrays.
     """
 
-    def padded(kind: str, pool: Scene) -> Shape:
-        shapes = getattr(pool, kind)
+    def padded(kind: str, pool: Scene) -> Any:
+        shapes = pool.shapes()[kind]
         worlds, capacity = shapes.position.shape[:2]
-        missing = max(getattr(other, kind).position.shape[1] for other in (*pools, *like)) - capacity
+        missing = _capacity(kind, [*pools, *like]) - capacity
 
         def joined(here: Array, absent: npt.ArrayLike) -> Array:
             more = np.broadcast_to(np.asarray(absent, np.float32), (worlds, missing, *np.shape(absent)))
@@ -432,8 +359,14 @@ def with_equal_capacities(pools: Sequence[Scene], like: Sequence[Any] = ()) -> l
 
         return jax.tree.map(joined, shapes, parked_like(shapes))
 
-    able = [_able_to_move(pool, [*pools, *like]) for pool in pools]
-    return [dataclasses.replace(pool, **{kind: padded(kind, pool) for kind in KINDS}) for pool in able]
+    names = _kinds_of([*pools, *like])
+    whole = [
+        pool.with_shapes({kind: no_shapes(kind, pool.volume.shape[0]) for kind in names if kind not in pool.shapes()})
+        for pool in pools
+    ]
+    whole = [pool.with_shapes(_all_with_surfaces(pool.shapes())) for pool in whole]
+    able = [_able_to_move(pool, [*whole, *like]) for pool in whole]
+    return [pool.with_shapes({kind: padded(kind, pool) for kind in pool.shapes()}) for pool in able]
 
 
 def take_scene(pool: Scene, index: ArrayLike) -> Scene:

@@ -6,7 +6,7 @@ its shape. What the phases mean is the pattern's own.
 
 from __future__ import annotations
 
-import jax.numpy as jnp
+import numpy as np
 from flax import struct
 from jax import Array
 
@@ -24,7 +24,7 @@ SURFACE_NUMBERS = PHASES + 16
 class Surface:
     """The patterns of the shapes of one kind."""
 
-    numbers: Array  # [N, SURFACE_NUMBERS]
+    numbers: Array | np.ndarray  # [N, SURFACE_NUMBERS]
     patterns: tuple[str, ...] = struct.field(pytree_node=False)  # those that any shape of the world may have
 
 
@@ -37,6 +37,6 @@ class Daylight:
     sky: Array  # [3] RGB
 
 
-def blank_surfaces(count: int, patterns: tuple[str, ...]) -> Surface:
-    """Returns the surfaces of `count` shapes without a pattern."""
-    return Surface(jnp.zeros((count, SURFACE_NUMBERS)), patterns)
+def blank_surfaces(patterns: tuple[str, ...], *lead: int) -> Surface:
+    """Returns the surfaces of shapes [*lead] without a pattern."""
+    return Surface(np.zeros((*lead, SURFACE_NUMBERS), np.float32), patterns)

@@ -24,11 +24,12 @@ from edqn_jax.config import CameraConfig, Config
 from edqn_jax.config.registry import SENSORS
 from edqn_jax.errors import ConfigError
 from edqn_jax.sim.actions import DIRECTIONS
-from edqn_jax.sim.camera import camera, raycast
+from edqn_jax.sim.camera import camera
 from edqn_jax.sim.camera.depth import nearest_depth
 from edqn_jax.sim.camera.raycast import Rays
 from edqn_jax.sim.physics.drone import Flight
 from edqn_jax.sim.scene.scene import Scene, scene_at
+from edqn_jax.sim.scene.shapes.kind import TINY
 from edqn_jax.sim.sensors import events, exposure
 from edqn_jax.sim.sensors.events import EventField, EventMemory
 from edqn_jax.sim.sensors.exposure import FrameMemory
@@ -339,8 +340,8 @@ def ranges(config: CameraConfig, scene: Scene, position: Array, yaw: Array) -> A
         across=1,
         down=1,
     )
-    to_shape = nearest_depth(config, scene, position, rays)[0]
+    to_shape = nearest_depth(scene, position, rays)[0]
     lower, upper = (jnp.abs(corner - position)[:, None] for corner in scene.volume)
-    along = jnp.where(direction > 0, upper, lower) / jnp.maximum(jnp.abs(direction), raycast.TINY)
-    to_face = jnp.min(jnp.where(jnp.abs(direction) > raycast.TINY, along, jnp.inf), axis=0)
+    along = jnp.where(direction > 0, upper, lower) / jnp.maximum(jnp.abs(direction), TINY)
+    to_face = jnp.min(jnp.where(jnp.abs(direction) > TINY, along, jnp.inf), axis=0)
     return jnp.minimum(to_shape, to_face)

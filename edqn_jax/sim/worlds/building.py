@@ -9,13 +9,11 @@ from jax import Array
 from jax.typing import ArrayLike
 
 from edqn_jax.sim.scene.scene import (
+    FIELDS,
     PARKED,
-    Capsules,
     Planes,
     Scene,
     Spheres,
-    TiltedBoxes,
-    TiltedCylinders,
     UprightBoxes,
     UprightCylinders,
     no_shapes,
@@ -86,14 +84,10 @@ def world(
     spheres: Spheres | None = None,
 ) -> Scene:
     """Returns a world with these shapes and a free start and goal far apart, from uniform draws `ends` [2, K, 3]."""
+    given = {"boxes": boxes, "cylinders": cylinders, "spheres": spheres, "planes": planes}
+    shapes = {kind: no_shapes(kind) if given.get(kind) is None else given[kind] for kind in FIELDS}
     scene = Scene(
-        boxes=no_shapes(UprightBoxes) if boxes is None else boxes,
-        cylinders=no_shapes(UprightCylinders) if cylinders is None else cylinders,
-        spheres=no_shapes(Spheres) if spheres is None else spheres,
-        tilted_boxes=no_shapes(TiltedBoxes),
-        capsules=no_shapes(Capsules),
-        tilted_cylinders=no_shapes(TiltedCylinders),
-        planes=planes,
+        **shapes,
         volume=jnp.stack([jnp.zeros(3), jnp.stack([jnp.asarray(side, jnp.float32) for side in size])]),
         start=jnp.zeros(3),
         goal=jnp.zeros(3),

@@ -15,7 +15,8 @@ from jax import Array
 
 from edqn_jax.config import SurfaceConfig
 from edqn_jax.keys import LOOK_OF_WORLD
-from edqn_jax.sim.scene.scene import KINDS, PARKED, Scene
+from edqn_jax.sim.scene.scene import Scene
+from edqn_jax.sim.scene.shapes.kind import PARKED
 from edqn_jax.sim.scene.surface import PATTERNS, SURFACE_NUMBERS, Daylight, Surface
 from edqn_jax.sim.worlds.building import albedos, between
 
@@ -59,12 +60,12 @@ def _dressed(config: SurfaceConfig, pool: Scene, keys: Array) -> Scene:
 def _with_look(config: SurfaceConfig, scene: Scene, key: Array) -> Scene:
     of_world, of_shapes, of_light = jax.random.split(key, 3)
     world = jax.random.uniform(of_world, (_DRAWS,))
-    fields: dict[str, Any] = {}
-    for number, kind in enumerate(KINDS):
-        shapes = getattr(scene, kind)
-        draws = jax.random.uniform(jax.random.fold_in(of_shapes, number), (shapes.position.shape[0], _DRAWS))
-        fields[kind] = _with_surface(config, shapes, world, draws)
-    return dataclasses.replace(scene, **fields, daylight=_daylight(jax.random.uniform(of_light, (7,))))
+    dressed: dict[str, Any] = {}
+    for number, (kind, shapes) in enumerate(scene.shapes().items()):
+        if hasattr(shapes, "surface"):
+            draws = jax.random.uniform(jax.random.fold_in(of_shapes, number), (shapes.position.shape[0], _DRAWS))
+            dressed[kind] = _with_surface(config, shapes, world, draws)
+    return dataclasses.replace(scene.with_shapes(dressed), daylight=_daylight(jax.random.uniform(of_light, (7,))))
 
 
 def _daylight(draw: Array) -> Daylight:

@@ -15,7 +15,8 @@ from jax import Array, lax
 from edqn_jax.config import Config
 from edqn_jax.sim.scene.distance import shape_distances
 from edqn_jax.sim.scene.motion import Motion, Throw, at_rest
-from edqn_jax.sim.scene.scene import PARKED, Scene, Spheres, UprightBoxes, scene_at
+from edqn_jax.sim.scene.scene import PARKED, Scene, Spheres, scene_at
+from edqn_jax.sim.scene.shapes.kind import reach_of
 from edqn_jax.sim.worlds import building
 from edqn_jax.sim.worlds.free_points import CLEARANCE, early_times
 
@@ -155,12 +156,7 @@ def _motions(moving: Moving, draw: Array, runs: bool) -> Motion:
 
 def _between_faces(motion: Motion, shapes: Any, volume: Array) -> Motion:
     """Returns the motion with walls between which the shapes stay within the faces of the volume."""
-    if isinstance(shapes, UprightBoxes):
-        cos, sin = jnp.abs(jnp.cos(shapes.yaw)), jnp.abs(jnp.sin(shapes.yaw))
-        x, y = shapes.half[:, 0], shapes.half[:, 1]
-        reach = jnp.stack([cos * x + sin * y, sin * x + cos * y, jnp.zeros_like(x)], axis=1)
-    else:
-        reach = shapes.radius[:, None] * jnp.array([[1.0, 1.0, 0.0]])
+    reach = reach_of(shapes) * jnp.array([[1.0, 1.0, 0.0]])
     return dataclasses.replace(motion, low=volume[0][None] + reach, high=volume[1][None] - reach)
 
 

@@ -10,7 +10,11 @@ import jax.numpy as jnp
 from jax import Array, lax
 
 from edqn_jax.sim.scene.scene import Scene
+from edqn_jax.sim.scene.shapes.kind import reach_of
 from edqn_jax.sim.worlds.free_points import CLEARANCE
+
+KNOWN = ("boxes", "cylinders", "spheres", "planes")
+"""Kinds of shape of which the footprint is known; of any other it is the box around a shape."""
 
 LEVELS = 32
 """Bits of a word: the most nodes above each other."""
@@ -20,7 +24,7 @@ def has_way(scene: Scene, size: tuple[float, float, float], radius: float, edge:
     """Returns whether a sphere gets from the start to the goal, [] bool; False may be wrong in narrow places.
 
     Args:
-        scene: one world of level planes, upright boxes and cylinders, and spheres.
+        scene: one world; its planes are level.
         size: the volume's extent at most, metres: the lattice has as many nodes as fit into it.
         radius: of the sphere, metres; start and goal are `CLEARANCE` from all surfaces.
         edge: of the lattice, metres.
@@ -91,10 +95,22 @@ def _prisms(scene: Scene, x: Array, y: Array):
         dx, dy = x - shapes.position[number, 0], y - shapes.position[number, 1]
         return jnp.sqrt(dx**2 + dy**2) - shapes.radius[number]
 
+    def around(shapes):
+        """The axis-aligned box around a shape of any other kind."""
+        reach = reach_of(shapes)
+
+        def footprint(number: Array) -> Array:
+            beyond_x = jnp.maximum(jnp.abs(x - shapes.position[number, 0]) - reach[number, 0], 0.0)
+            beyond_y = jnp.maximum(jnp.abs(y - shapes.position[number, 1]) - reach[number, 1], 0.0)
+            return jnp.sqrt(beyond_x**2 + beyond_y**2)
+
+        return shapes, footprint, reach[:, 2]
+
     ends = (
         (boxes, box, boxes.half[:, 2]),
         (cylinders, lambda number: disc(cylinders, number), cylinders.half_height),
         (spheres, lambda number: disc(spheres, number), spheres.radius),
+        *(around(shapes) for kind, shapes in scene.shapes().items() if kind not in KNOWN and shapes.position.shape[0]),
     )
     for shapes, footprint, half in ends:
         if shapes.position.shape[0]:

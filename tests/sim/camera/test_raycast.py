@@ -156,7 +156,7 @@ def test_exactly_vertical_rays_meet_what_stands_straight_below_and_above(kind):
     origins = jnp.array([[10.0, 20.0, 15.0], [11.9, 20.0, 15.0], [12.1, 20.0, 15.0], [10.0, 20.0, -5.0]])
     flat, ways = jnp.zeros((1, 2)), jnp.array([[-1.0, 1.0]])  # down and up
     rays = raycast.Rays(flat, flat, ways, right=jnp.zeros(3), up=jnp.zeros(3), pitch=0.0, across=1, down=1)
-    found = jax.jit(jax.vmap(lambda origin: nearest_depth(CameraConfig(), scene, origin, rays)))(origins)[:, 0]
+    found = jax.jit(jax.vmap(lambda origin: nearest_depth(scene, origin, rays)))(origins)[:, 0]
     np.testing.assert_allclose(found, [[9.0, np.inf], [9.0, np.inf], [np.inf, np.inf], [np.inf, 5.0]], rtol=1e-6)
 
 

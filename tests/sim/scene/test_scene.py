@@ -14,7 +14,7 @@ from edqn_jax.sim.scene import distance
 from edqn_jax.sim.scene.distance import path_contact, segment_contact, shape_distances, signed_distance
 from edqn_jax.sim.scene.mjcf import load_world
 from edqn_jax.sim.scene.scene import (
-    KINDS,
+    FIELDS,
     PARKED,
     Capsules,
     Planes,
@@ -26,12 +26,12 @@ from edqn_jax.sim.scene.scene import (
     UprightCylinders,
     build_scene,
     obstacle_count,
-    parked_shape,
     scene_shapes,
     stack_scenes,
     take_scene,
     with_equal_capacities,
 )
+from edqn_jax.sim.scene.shapes.kind import kinds
 from tests.oracles import mujoco_distance
 
 EVERY_KIND = """
@@ -89,7 +89,7 @@ def compared(world):
     }
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", FIELDS)
 def test_distance_outside_agrees_with_mujoco(compared, kind):
     ours, theirs = compared[kind]
     outside = theirs > 0.01
@@ -98,7 +98,7 @@ def test_distance_outside_agrees_with_mujoco(compared, kind):
     np.testing.assert_allclose(ours[outside], theirs[outside], atol=1e-4)
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("kind", FIELDS)
 def test_inside_is_negative_exactly_where_mujoco_says_so(compared, kind):
     ours, theirs = compared[kind]
     clear = np.abs(theirs) > 1e-4
@@ -128,12 +128,12 @@ def test_an_empty_scene_is_infinitely_wide():
 
 def test_parked_shapes_change_nothing():
     ball = Spheres(position=[5, 5, 5], radius=1, albedo=GREY)
-    alone, padded = scene_of(ball), scene_of(ball, **dict.fromkeys(KINDS, 3))
+    alone, padded = scene_of(ball), scene_of(ball, **dict.fromkeys(FIELDS, 3))
     points = np.random.default_rng(2).uniform(0, 10, (20, 3)).astype(np.float32)
     np.testing.assert_allclose(distances_at(alone, points), distances_at(padded, points), atol=1e-5)
     assert obstacle_count(padded) == 1
-    for dataclass in KINDS.values():
-        assert obstacle_count(scene_of(parked_shape(dataclass))) == 0
+    for kind in kinds().values():
+        assert obstacle_count(scene_of(kind.parked)) == 0
 
 
 @pytest.mark.slow

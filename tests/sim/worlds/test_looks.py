@@ -13,7 +13,7 @@ from edqn_jax.config import Config, SurfaceConfig
 from edqn_jax.config.limits import validate
 from edqn_jax.config.options import LOOKS
 from edqn_jax.errors import ConfigError
-from edqn_jax.sim.scene.scene import KINDS, Scene, scene_shapes, stack_scenes, take_scene, with_equal_capacities
+from edqn_jax.sim.scene.scene import Scene, scene_shapes, stack_scenes, take_scene, with_equal_capacities
 from edqn_jax.sim.scene.surface import CONTRAST, KIND, PATTERNS, PHASES, SHARES
 from edqn_jax.sim.worlds.families import random_pool, world_keys, worlds_of
 from edqn_jax.sim.worlds.looks import BRIGHTEST, TRAINED, patterns_of, with_looks
@@ -39,9 +39,9 @@ def drawn() -> Scene:
 def test_plaid_worlds_have_no_look_and_others_are_the_same_bodies(drawn: Scene) -> None:
     plain = plain_pool()
     assert jax.tree.structure(pool_of("plaid")) == jax.tree.structure(plain)
-    for kind in KINDS:
-        for field in dataclasses.fields(getattr(plain, kind)):
-            before, after = (getattr(getattr(pool, kind), field.name) for pool in (plain, drawn))
+    for kind, shapes in plain.shapes().items():
+        for field in dataclasses.fields(shapes):
+            before, after = (getattr(pool.shapes()[kind], field.name) for pool in (plain, drawn))
             if field.name not in ("albedo", "surface"):
                 jax.tree.map(np.testing.assert_array_equal, before, after)
     for name in ("volume", "start", "goal"):

@@ -1,0 +1,1 @@
+"""Kinds of shape, a file each; `kind.py` says what the package asks of one."""
