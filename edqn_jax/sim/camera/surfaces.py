@@ -15,7 +15,8 @@ from jax import Array
 
 from edqn_jax.sim.camera.raycast import Rays
 from edqn_jax.sim.camera.texture import box_filter, wave
-from edqn_jax.sim.scene.surface import CONTRAST, KIND, PATTERNS, PHASES, SHARES
+from edqn_jax.sim.scene.scene import Scene
+from edqn_jax.sim.scene.surface import CONTRAST, KIND, PATTERNS, PHASES, SHARES, Surface, blank_surfaces
 
 EDGE = 1.0 / 64
 """Least width of an edge, periods: narrower ones would show the rounding of phases."""
@@ -154,7 +155,7 @@ def relative_albedo(patterns: tuple[str, ...], numbers: list[Array], phases: lis
     return 1.0 + numbers[CONTRAST] * drawn
 
 
-def at_eye(numbers: Array, position: Array, origin: Array) -> Array:
+def _at_eye(numbers: Array, position: Array, origin: Array) -> Array:
     """Returns surfaces [N, SURFACE_NUMBERS] whose shifts are the phases at `origin` [3], not at `position` [N, 3]."""
     rows = numbers[:, PHASES:].reshape(-1, 4, 4)
     apart = origin[None] - position
@@ -165,18 +166,38 @@ def at_eye(numbers: Array, position: Array, origin: Array) -> Array:
     return jnp.concatenate([numbers[:, :PHASES], seen.reshape(-1, 16)], axis=1)
 
 
+def surfaces_at_eye(scene: Scene, first: dict[str, int], origin: Array) -> Surface | None:
+    """Returns the surfaces of all shapes of a world, in the order of their numbers; None where they have none.
+
+    Args:
+        scene: one world.
+        first: number of the first shape of each kind (`raycast.first_numbers`).
+        origin: [3] metres, where the phases are taken.
+    """
+    own = scene.boxes.surface
+    if own is None:
+        return None
+    parts = []
+    for kind in sorted(first, key=first.__getitem__):
+        shapes = scene.shapes()[kind]
+        surface = getattr(shapes, "surface", None) or blank_surfaces((), shapes.position.shape[0])
+        parts.append(_at_eye(jnp.asarray(surface.numbers), shapes.position, origin))
+    return Surface(jnp.concatenate(parts), own.patterns)
+
+
 def albedo_factor(
-    patterns: tuple[str, ...], surface: Array, rays: Rays, depth: Array, slope_right: Array, slope_up: Array
+    surfaces: Surface, shape: Array, rays: Rays, depth: Array, slope_right: Array, slope_up: Array
 ) -> Array:
     """Returns the pattern's factor on each pixel's brightness: [H, W].
 
     Args:
-        patterns: those that surfaces may have.
-        surface: [H, W, SURFACE_NUMBERS] of `at_eye`, of the surface that each pixel shows.
+        surfaces: of `surfaces_at_eye`.
+        shape: [H, W] number of the shape that each pixel shows, as floats; any where `depth` is 0.
         depth: [H, W] finite.
         slope_right, slope_up: [H, W] change of depth per pixel on the surface.
     """
-    numbers = list(jnp.moveaxis(surface, -1, 0))
+    shown = surfaces.numbers.at[jnp.maximum(shape, 0).astype(jnp.int32)].get(mode="clip")
+    numbers = list(jnp.moveaxis(shown, -1, 0))
     phases = []
     for first in range(PHASES, PHASES + 16, 4):
         kx, ky, kz, shift = numbers[first : first + 4]
@@ -184,4 +205,4 @@ def albedo_factor(
         right = (kx * rays.right[0] + ky * rays.right[1] + kz * rays.right[2]) * rays.pitch
         up = (kx * rays.up[0] + ky * rays.up[1] + kz * rays.up[2]) * rays.pitch
         phases.append(Phase(shift + depth * along, depth * right + slope_right * along, depth * up + slope_up * along))
-    return relative_albedo(patterns, numbers[:PHASES], phases)
+    return relative_albedo(surfaces.patterns, numbers[:PHASES], phases)

@@ -32,7 +32,7 @@ BRIGHTEST = 0.95
 ELEVATION_DEG, AMBIENT, SKY = (20.0, 80.0), (0.2, 0.7), (0.35, 0.95)
 """Of the sun; the part of the light that comes from everywhere; grey of the sky."""
 
-BRICK_M, POSTER_M, RING_M = (0.3, 1.5), (1.5, 6.0), (0.1, 0.8)
+BRICK_M, POSTER_M, RING_M = (0.3, 1.5), (1.5, 6.0), (0.15, 1.0)
 """Length of bricks, distance of posters, width of a year's growth, as they occur; options do not change them."""
 
 _DRAWS = 40  # uniform numbers of a surface
@@ -233,9 +233,9 @@ def _wood(config: SurfaceConfig, draws: Array, along: Array, up: Array) -> Numbe
     """Stripes that bend over several of their periods, and a fine grain along them."""
     ring = _log_between(*RING_M, draws[:, 2])
     first, second = _turned(along, up, jnp.where(draws[:, 12] < 0.5, 0.0, jnp.pi / 2))
-    longer = ring * between((6.0, 12.0), draws[:, 13])
+    longer = ring * between((10.0, 25.0), draws[:, 13])
     vectors = [first / ring[:, None], (second + 0.3 * first) / longer[:, None]]
-    vectors += [(second - 0.6 * first) / (0.4 * longer[:, None]), (first + 0.05 * second) / (0.35 * ring[:, None])]
+    vectors += [(second - 0.6 * first) / (0.5 * longer[:, None]), (first + 0.05 * second) / (0.35 * ring[:, None])]
     strength = jnp.full(len(ring), 0.8)
     return [strength, between((0.3, 0.8), draws[:, 14]), between((0.25, 0.5), draws[:, 15]), 0.25 * strength], vectors
 
