@@ -334,7 +334,7 @@ def spheres_in_columns(config: CameraConfig, spheres: Spheres, origin: Array, he
 def sphere_layers(
     config: CameraConfig, scene: Scene, origin: Array, rays: Rays, value: Values, layers: Layers
 ) -> Layers:
-    """Adds layers of spheres, for any camera: coverage falls linearly over the pixel that the silhouette crosses."""
+    """Adds layers [H, W] of spheres, for any camera: coverage falls linearly over the pixel that an edge crosses."""
     spheres, (dx, dy, dz) = scene.spheres, direction_of(rays)
     if spheres.radius.shape[0] == 0:
         return layers

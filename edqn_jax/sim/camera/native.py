@@ -54,7 +54,7 @@ def can_draw(config: CameraConfig, scene: Scene, platform: str) -> bool:
 
 
 def pictures(config: CameraConfig, scene: Scene, origin: Array, rotation: Array, weights: Array) -> Array:
-    """Returns brightness [M, H, W] as `columns.pictures` does; arrays have a leading [L], see `primitive`."""
+    """Returns brightness [M, H, W] as `columns.pictures` does, origins in metres; leading [L] as in `primitive`."""
     return _call("edqn_pictures", config, scene, origin, rotation, weights)
 
 

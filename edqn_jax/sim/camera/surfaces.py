@@ -39,17 +39,17 @@ class Phase(NamedTuple):
         return Phase(*(factor * mine + weight * its for mine, its in zip(self, other, strict=True)))
 
     def shifted(self, cycles: float | Array) -> Phase:
-        """Returns this phase, `cycles` further."""
+        """Returns this phase [...], `cycles` further."""
         return self._replace(at=self.at + cycles)
 
 
 def smooth(phase: Phase) -> Array:
-    """Returns the average of a wave in [-1, 1] over each pixel."""
+    """Returns the average of a wave between -1 and 1 over each pixel: [...]."""
     return box_filter(phase.right) * box_filter(phase.up) * wave(phase.at)
 
 
 def pulse(phase: Phase, width: float | Array) -> Array:
-    """Returns the average of pulses of height 1, less their mean, over each pixel.
+    """Returns the average of pulses of height 1, less their mean, over each pixel: [...].
 
     The pixel is taken for as wide an interval of phases as its diagonal is, on which the average is exact; where both
     of its edges are long, pulses fade as waves do, and are gone where each is a period.

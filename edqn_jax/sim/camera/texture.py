@@ -39,7 +39,7 @@ def wave(phase: Array) -> Array:
 
 
 def box_filter(cycles: Array) -> Array:
-    """Returns the amplitude of a wave after a box average over `cycles` periods: sinc to 1.03 % below one, then 0."""
+    """Returns the amplitude [...] of a wave after an average over `cycles` [...]: sinc to 1.03 % below one, then 0."""
     x = jnp.minimum(cycles * cycles, 1.0)
     return (1.0 - x) * (1.0 - 0.55 * x)
 

@@ -15,7 +15,7 @@ from edqn_jax.sim.camera import camera
 from edqn_jax.sim.camera.surfaces import Phase, relative_albedo
 from edqn_jax.sim.scene.surface import PATTERNS, PHASES
 from tests.oracles import camera_plain, surfaces_plain
-from tests.sim.drawn_scenes import GROUND, box, every_kind, free_points, looking, pillar, rotation_of, scene_of
+from tests.sim.drawn_scenes import GROUND, box, looking, pillar, rotation_of, scene_of
 
 SHARES = {
     "blank": (0, 0, 0, 0),
@@ -57,19 +57,17 @@ def test_a_pixel_is_the_average_of_what_is_in_it(name: str) -> None:
     assert name == "blank" or np.std(drawn) > 0.05
 
 
-@pytest.mark.parametrize("mount, most", [("level", 0.02), ("body", 0.034)])
+@pytest.mark.parametrize("mount, most", [("level", 0.008), ("body", 0.009)])
 def test_pictures_of_every_pattern_agree_with_supersampling(mount: Literal["level", "body"], most: float) -> None:
-    """Where rays are counted, as for the body's camera, a face's slant is not known to the filter: it errs more."""
-    rng = np.random.default_rng(4)
-    upright = scene_of(GROUND, box(20, 30, 4, 3, 2, 5, 1), box(40, 30, 8, 6, 1, 6), pillar(30, 20, 6, 1.5, 6))
-    scene = looking(upright if mount == "level" else every_kind(rng, each=6))
-    config = CameraConfig(mount=mount)
-    position = free_points(scene, rng, 3, clearance=2.0)
+    """With a light of its own, from near enough to see what the patterns are."""
+    posts = [pillar(4 * x, 9.0, 3, 1.2, 3) for x in range(4)]
+    scene = looking(scene_of(GROUND, *(box(4 * x, 0.0, 2, 1.5, 1, 2, 0.3 * x) for x in range(6)), *posts))
     tilt = 0.3 if mount == "body" else 0.0
-    rotation = np.stack([rotation_of(tilt, -tilt, yaw) for yaw in (0.3, 2.0, 4.4)]).astype(np.float32)
-    drawn = jax.jit(jax.vmap(partial(camera.luma, config, scene)))(jnp.asarray(position), jnp.asarray(rotation))
-    fine = np.stack(
-        [camera_plain.luma(config, scene, *pose, samples=6) for pose in zip(position, rotation, strict=True)]
-    )
+    places = [(4.0 * x - 1, 4.5, 2.0) for x in range(6)]
+    rotation = np.stack([rotation_of(tilt, -tilt, (-1) ** x * 1.5) for x in range(6)]).astype(np.float32)
+    config = CameraConfig(mount=mount)
+    drawn = jax.jit(jax.vmap(partial(camera.luma, config, scene)))(jnp.array(places), jnp.asarray(rotation))
+    poses = zip(np.array(places), rotation, strict=True)
+    fine = np.stack([camera_plain.luma(config, scene, *pose, samples=8) for pose in poses])
     error = np.asarray(drawn) - fine
-    assert np.sqrt(np.mean(error**2)) < most and fine.std() > 0.1
+    assert np.sqrt(np.mean(error**2)) < most and fine.std() > 0.05
