@@ -37,7 +37,7 @@ from edqn_jax.files import write_atomically
 from edqn_jax.learn.actor import AgentActor, PolicyParams
 from edqn_jax.learn.policy import Policy
 from edqn_jax.runs.policies import load_policy
-from edqn_jax.sim.physics import drone
+from edqn_jax.sim.physics.airframe import load_airframe
 from edqn_jax.sim.scene.distance import signed_distance
 from edqn_jax.sim.scene.motion import Aim
 from edqn_jax.sim.scene.scene import Scene, scene_at
@@ -138,7 +138,7 @@ def with_options(base: PilotConfig, words: Sequence[str]) -> PilotConfig:
 def course_of(policy: Policy, family: str, split: families.Split, missions: int, first: int = 0) -> World:
     """Returns one mission in each of `missions` worlds of a split, from world `first` on."""
     pool = families.worlds_of(policy.config, family, split, missions, first=first)
-    return World(drone.load_airframe(policy.config.drone), pool, own_missions(pool))
+    return World(load_airframe(policy.config.drone), pool, own_missions(pool))
 
 
 def what_the_map_had(log_odds: np.ndarray, cell_m: float, scene: Scene, position: np.ndarray, radius: float) -> str:

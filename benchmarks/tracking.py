@@ -22,7 +22,9 @@ import numpy as np
 
 from edqn_jax.config import Config, DroneConfig
 from edqn_jax.files import write_atomically
-from edqn_jax.sim.physics.drone import DroneState, Flight, fly, hover, load_airframe, yaw_of
+from edqn_jax.sim.physics.airframe import load_airframe
+from edqn_jax.sim.physics.drone import DroneState, Flight, hover, yaw_of
+from edqn_jax.sim.physics.flight import fly
 from measurement.command import Parser, in_a_sentence
 
 Decide = Callable[[DroneState, jax.Array, jax.Array], tuple[DroneState, Flight]]

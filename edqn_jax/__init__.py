@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 from edqn_jax.xla_flags import disable_ynn_fusions
 
 if TYPE_CHECKING:
-    from edqn_jax.config import FAMILIES, LEARNERS, NETWORKS, SENSORS, Config
+    from edqn_jax.config import FAMILIES, LEARNERS, NETWORKS, SENSORS, SHAPES, Config
     from edqn_jax.config.loading import make_config
     from edqn_jax.devices.devices import use_cpu_devices
     from edqn_jax.errors import ConfigError, DivergedError, StoppedError
@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from edqn_jax.report.page.document import write_report
     from edqn_jax.runs.policies import load_policy, save_policy
     from edqn_jax.sim.actions import move_name, move_number
+    from edqn_jax.sim.scene.shapes.kind import ShapeKind
     from edqn_jax.sim.sensors.sensor import Sensor
     from edqn_jax.sim.task.environment import Environment, make
     from edqn_jax.sim.task.outcomes import Outcome
@@ -38,6 +39,7 @@ _MODULES = {
     "LEARNERS": "config",
     "NETWORKS": "config",
     "SENSORS": "config",
+    "SHAPES": "config",
     "Chunk": "training.loop",
     "Config": "config",
     "ConfigError": "errors",
@@ -50,6 +52,7 @@ _MODULES = {
     "PlannedPath": "planning.path",
     "Policy": "learn.policy",
     "Sensor": "sim.sensors.sensor",
+    "ShapeKind": "sim.scene.shapes.kind",
     "StoppedError": "errors",
     "TrainingResult": "training.loop",
     "Transition": "sim.task.reward",
@@ -75,6 +78,7 @@ __all__ = [
     "LEARNERS",
     "NETWORKS",
     "SENSORS",
+    "SHAPES",
     "Chunk",
     "Config",
     "ConfigError",
@@ -87,6 +91,7 @@ __all__ = [
     "PlannedPath",
     "Policy",
     "Sensor",
+    "ShapeKind",
     "StoppedError",
     "TrainingResult",
     "Transition",

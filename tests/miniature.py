@@ -11,7 +11,7 @@ import numpy as np
 
 from edqn_jax.config import Config
 from edqn_jax.learn.trainer import Health, Losses
-from edqn_jax.sim.physics import drone
+from edqn_jax.sim.physics.airframe import load_airframe
 from edqn_jax.sim.scene import mjcf
 from edqn_jax.sim.scene.scene import stack_scenes
 from edqn_jax.sim.task.env import World
@@ -41,4 +41,4 @@ def miniature_world(config: Config, own_start_fraction: float = 0.25) -> World:
     """64 missions in that world, so many of them from near its own start."""
     pool = stack_scenes([mjcf.load_scene(WORLD)])
     missions = spread_missions(pool, 64, own_start_fraction, 1.0, jax.random.key(1))
-    return World(airframe=drone.load_airframe(config.drone), pool=pool, missions=missions)
+    return World(airframe=load_airframe(config.drone), pool=pool, missions=missions)

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from edqn_jax.config.registry import FAMILIES, LEARNERS, NETWORKS, SENSORS, Registry
+from edqn_jax.config.registry import AIRFRAMES, FAMILIES, LEARNERS, NETWORKS, SENSORS, SHAPES, Registry
 
-EVERY: tuple[Registry, ...] = (SENSORS, FAMILIES, LEARNERS, NETWORKS)
+EVERY: tuple[Registry, ...] = (SENSORS, FAMILIES, LEARNERS, NETWORKS, SHAPES, AIRFRAMES)
 
 
 def keep_as_they_are(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,4 +1,4 @@
-"""The drone in C MuJoCo with the cascaded controller of `edqn_jax/sim/physics/drone.py`, in numba."""
+"""The drone in C MuJoCo with the cascaded controller of `edqn_jax/sim/physics/controller.py`, in numba."""
 
 from __future__ import annotations
 
@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from conventional_stack.c_mujoco import mj_step
 from edqn_jax.config import Config, DroneConfig
 from edqn_jax.extras import require
-from edqn_jax.sim.physics.drone import LEAST_LEVELNESS, c_model, mixer_of
+from edqn_jax.sim.physics.airframe import c_model, mixer_of
+from edqn_jax.sim.physics.controller import LEAST_LEVELNESS
 
 numba = require("numba")
 

@@ -17,7 +17,7 @@ from mujoco import rollout
 from edqn_jax.config import Config
 from edqn_jax.devices.hardware import cores
 from edqn_jax.learn.trainer import AXIS
-from edqn_jax.sim.physics import drone
+from edqn_jax.sim.physics.airframe import c_model
 
 ROLLOUT_STEPS = 130
 """Physics steps of C MuJoCo in one call for each drone: ten decisions."""
@@ -29,7 +29,7 @@ class Rollout:
     """C MuJoCo's threaded rollout of the same airframe on every core, with hover thrust and constraints disabled."""
 
     def __init__(self, config: Config) -> None:
-        model = drone.c_model(config.drone)
+        model = c_model(config.drone)
         model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
         threads, self.drones = cores(), config.train.num_envs
         data = mujoco.MjData(model)

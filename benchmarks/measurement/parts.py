@@ -25,7 +25,9 @@ from edqn_jax.learn.updates import Networks
 from edqn_jax.sim.actions import ACTIONS
 from edqn_jax.sim.camera import camera, columns, native
 from edqn_jax.sim.physics import drone
+from edqn_jax.sim.physics.controller import thrusts
 from edqn_jax.sim.physics.drone import DroneState
+from edqn_jax.sim.physics.flight import fly, physics_step
 from edqn_jax.sim.scene.scene import take_scene
 from edqn_jax.sim.sensors import events, sensor
 from edqn_jax.sim.task import env
@@ -109,7 +111,7 @@ def physics(now: Moment) -> Part:
     def one(world: World, body: DroneState, move: Array, goal: Array):
         command = velocity_command(config.env, move, drone.yaw_of(body.quaternion))
         heading = heading_setpoint(config.env, body, goal, command)
-        after, flight = drone.fly(config.drone, world.airframe, body, command, heading)
+        after, flight = fly(config.drone, world.airframe, body, command, heading)
         return after, flight.position
 
     def body(world: World, carry):
@@ -122,8 +124,8 @@ def physics(now: Moment) -> Part:
         state, move, goal = carry
 
         def step(state: DroneState, goal: Array) -> DroneState:
-            thrust = drone.thrusts(config.drone, world.airframe, state, goal)  # the goal stands for the velocity
-            return drone.physics_step(config.drone, world.airframe, state, thrust)
+            thrust = thrusts(config.drone, world.airframe, state, goal)  # the goal stands for the velocity
+            return physics_step(config.drone, world.airframe, state, thrust)
 
         return jax.vmap(step)(state, goal), move, goal
 

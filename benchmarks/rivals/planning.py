@@ -17,7 +17,7 @@ from edqn_jax.planning.astar import shortest_path
 from edqn_jax.planning.lattice import NoPathError
 from edqn_jax.planning.path import Task
 from edqn_jax.runs.provenance import workload
-from edqn_jax.sim.physics.drone import load_airframe
+from edqn_jax.sim.physics.airframe import load_airframe
 from edqn_jax.sim.scene.mjcf import check_scene, load_world, resolve_world
 from edqn_jax.sim.scene.scene import Scene, take_scene
 from edqn_jax.sim.task.outcomes import Outcome

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edqn_jax.config import DroneConfig
-from edqn_jax.sim.physics.drone import LEAST_LEVELNESS
+from edqn_jax.sim.physics.controller import LEAST_LEVELNESS
 
 Vector = NDArray[np.float64]
 

@@ -15,7 +15,7 @@ from edqn_jax.config import CameraConfig, Config, EventsConfig
 from edqn_jax.extras import require
 from edqn_jax.sim.actions import ACTIONS
 from edqn_jax.sim.camera.camera import LUMA_WEIGHTS
-from edqn_jax.sim.physics.drone import AIRFRAME_FILE, mixer_of
+from edqn_jax.sim.physics.airframe import SKYDIO_X2, mixer_of
 from edqn_jax.sim.sensors.events import max_events
 from tutorial_stack.control import thrusts
 
@@ -34,7 +34,7 @@ LARGEST = 100.0
 def world_with_drone(world: Path, config: Config) -> mujoco.MjModel:
     """Returns the world of an MJCF file with the airframe in it: a sphere that collides, and a camera, on its body."""
     spec = mujoco.MjSpec.from_file(str(world))
-    drone = mujoco.MjSpec.from_file(str(AIRFRAME_FILE))
+    drone = mujoco.MjSpec.from_file(str(SKYDIO_X2))
     body = drone.body("x2")
     for shape in list(drone.geoms):
         drone.delete(shape)
@@ -90,7 +90,7 @@ class TutorialDrone(gymnasium.Env):
         self.model = world_with_drone(world, config)
         self.data = mujoco.MjData(self.model)
         self.look = look(self.model, config.camera)
-        airframe = mujoco.MjModel.from_xml_path(str(AIRFRAME_FILE))
+        airframe = mujoco.MjModel.from_xml_path(str(SKYDIO_X2))
         self.mass, self.inertia = float(airframe.body_mass[1]), airframe.body_inertia[1].copy()
         self.mixer, self.most = mixer_of(airframe), float(airframe.actuator_ctrlrange[0, 1])
         mujoco.mj_forward(self.model, self.data)

@@ -13,7 +13,7 @@ import docstring_parser
 import tyro
 
 from edqn_jax.config import Config
-from edqn_jax.config.registry import FAMILIES, LEARNERS, NETWORKS, SENSORS, Registry
+from edqn_jax.config.registry import AIRFRAMES, FAMILIES, LEARNERS, NETWORKS, SENSORS, Registry
 
 TRAIN, EVALUATE, RECORD, REPORT = "edqn train", "edqn evaluate", "edqn record", "edqn report"
 VERIFY, EXPORT, EVENTS, COMPLETION = "edqn verify", "edqn export", "edqn events", "edqn completion"
@@ -109,7 +109,7 @@ COMMON = {
 """Options that `edqn train --help` shows, with what it says of them; `--help-all` has their whole texts."""
 
 REGISTERED: dict[str, Registry] = {
-    **{registry.option: registry for registry in (SENSORS, LEARNERS, NETWORKS, FAMILIES)},
+    **{registry.option: registry for registry in (AIRFRAMES, SENSORS, LEARNERS, NETWORKS, FAMILIES)},
     "world": FAMILIES,
 }
 """What an option names, by the option; of `world` and `world.name` also files."""

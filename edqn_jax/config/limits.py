@@ -27,7 +27,7 @@ from edqn_jax.config.options import (
     TrainConfig,
     WorldConfig,
 )
-from edqn_jax.config.registry import ACTION_SETS, FAMILIES, FIRST, LEARNERS, NETWORKS, SENSORS
+from edqn_jax.config.registry import ACTION_SETS, AIRFRAMES, FAMILIES, FIRST, LEARNERS, NETWORKS, SENSORS
 from edqn_jax.errors import ConfigError
 
 
@@ -61,6 +61,7 @@ def validate(config: Config, *, trains: bool = True) -> None:
     if trains:
         _potential(config)
     SENSORS.check(config.env.sensor)
+    AIRFRAMES.check(config.drone.airframe)
     LEARNERS.check(config.agent.learner)
     NETWORKS.check(config.agent.network)
     ACTION_SETS.check(config.env.actions)
@@ -122,7 +123,9 @@ def _world(world: WorldConfig) -> None:
 
 
 def _drone(drone: DroneConfig) -> None:
-    _positive(drone, "drone", [field.name for field in dataclasses.fields(drone) if field.name != "physics"])
+    _positive(
+        drone, "drone", [field.name for field in dataclasses.fields(drone) if field.name not in ("physics", "airframe")]
+    )
     tilt, descent = drone.max_tilt_rad, drone.max_descent_m_s2
     _require(tilt < math.pi / 2, "drone.max_tilt_rad", "less than pi/2", tilt)
     _require(descent < 9.81, "drone.max_descent_m_s2", "less than gravity, 9.81", descent)

@@ -43,6 +43,8 @@ class WorldConfig:
 class DroneConfig:
     """The airframe and its inner loops: velocity, attitude and body rate, all at the physics rate."""
 
+    airframe: str = "skydio_x2"
+    """Mass, inertia and rotors."""
     physics: Literal["mjx", "rigid_body"] = "mjx"
     """Physics engine. `rigid_body`: the closed form of MJX's equations for this airframe, which compiles sooner."""
     physics_dt_s: float = 0.02

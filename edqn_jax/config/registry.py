@@ -173,6 +173,14 @@ FAMILIES = Registry(
 """Random worlds: `edqn_jax.sim.worlds.families.Family`, or a `Mixture` of some."""
 
 
+AIRFRAMES = Registry(
+    "airframe",
+    "drone.airframe",
+    {"skydio_x2": "edqn_jax.sim.physics.airframe:SKYDIO_X2"},
+    {"skydio_x2": "the Skydio X2"},
+)
+"""Quadrotors: the `pathlib.Path` of an MJCF file of one free body and four motors, as `sim/physics/skydio_x2.xml`."""
+
 _SHAPES = "edqn_jax.sim.scene.shapes"
 
 SHAPES = Registry(
@@ -188,8 +196,8 @@ SHAPES = Registry(
         "planes": f"{_SHAPES}.plane:PLANE",
     },
 )
-"""Kinds of shape of which worlds are made: `edqn_jax.sim.scene.shapes.kind.ShapeKind`. A geom is read by the first that
-takes it."""
+"""Kinds of shape of which worlds are made: `edqn_jax.sim.scene.shapes.kind.ShapeKind`. A geom is read by the first
+that takes it."""
 
 ACTION_SETS = Registry(
     "set of actions",

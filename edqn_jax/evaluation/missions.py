@@ -16,7 +16,7 @@ from edqn_jax.keys import CROSSING_OF_WORLD, FILE_MISSIONS, run_streams
 from edqn_jax.planning.astar import shortest_path
 from edqn_jax.planning.free_space import holds, reachable
 from edqn_jax.planning.lattice import CELL_M, lattice_shape
-from edqn_jax.sim.physics import drone
+from edqn_jax.sim.physics.airframe import load_airframe
 from edqn_jax.sim.scene.mjcf import check_scene, load_world, mjcf_of, resolve_world, widened
 from edqn_jax.sim.scene.scene import Scene, take_scene, with_equal_capacities
 from edqn_jax.sim.task import group
@@ -122,7 +122,7 @@ def _random_run_missions(config: Config, training_key: jax.Array) -> RunMissions
     """
     name, flown, count = config.world.name, config.world.flown, config.train.validation_missions
     drones = config.env.drones
-    airframe = drone.load_airframe(config.drone)
+    airframe = load_airframe(config.drone)
     training_pool = families.worlds_of(config, name, "training", config.world.pool_size)
     training = _training_missions(training_pool, config, training_key)
     validation, test = (families.worlds_of(config, name, split, count // drones) for split in ("validation", "test"))
@@ -172,7 +172,7 @@ def _flown_in(pool: Scene, config: Config, split: families.Split, first: int = 0
         split: of the worlds.
         first: number of the first world.
     """
-    airframe, drones = drone.load_airframe(config.drone), config.env.drones
+    airframe, drones = load_airframe(config.drone), config.env.drones
     if not group.several(config):
         return World(airframe, pool, own_missions(pool))
     if pool.spheres.throw is not None:
@@ -213,7 +213,7 @@ def _pool_of(name: str, config: Config) -> Scene:
 def _file_run_missions(config: Config, training_key: jax.Array, validation_key: jax.Array) -> RunMissions:
     """Returns missions of a world from a file: all end at its goal, the final one begins at its start."""
     name, count = config.world.name, config.train.validation_missions
-    airframe, file = drone.load_airframe(config.drone), resolve_world(name)
+    airframe, file = load_airframe(config.drone), resolve_world(name)
     pool = _pool_of(name, config)
     spread, jitter = config.world.own_start_fraction, config.world.start_jitter_m
     cells, note = _with_a_way(pool, config, name, own_start=True)
@@ -348,7 +348,7 @@ def mission_key(seed: int) -> jax.Array:
 
 def _file_missions(config: Config, name: str, missions: int, seed: int, moved: dict[str, jax.Array]) -> MissionSet:
     """Returns one mission from start to goal of a world from a file, or many from random free starts."""
-    radius, airframe, file = config.drone.body_radius_m, drone.load_airframe(config.drone), resolve_world(name)
+    radius, airframe, file = config.drone.body_radius_m, load_airframe(config.drone), resolve_world(name)
     loaded = load_world(file)
     scene, note = dataclasses.replace(loaded.scene, **moved), None
     if moved and not loaded.has_volume:

@@ -77,7 +77,7 @@ MAP = View(azimuth=-90.0, elevation=90.0)
 
 def solids_of(scene: Scene) -> list[Solid]:
     """Returns every shape of one world that is not parked; planes are left out, the ground is drawn by itself."""
-    return [Solid(list(kind.faces(shape)), shape.albedo) for kind, shape in present(scene)]
+    return [Solid(list(kind.faces(shape)), shape.albedo) for kind, shape in present(scene) if kind.faces]
 
 
 def standing(scene: Scene) -> Scene:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from conventional_stack import world
 from conventional_stack.fleet import Course, Fleet, Record
 from edqn_jax.config import Config
-from edqn_jax.sim.physics import drone
+from edqn_jax.sim.physics.airframe import load_airframe
 from edqn_jax.sim.scene import mjcf
 from edqn_jax.sim.scene.scene import Scene, stack_scenes
 from edqn_jax.sim.task import env
@@ -35,7 +35,7 @@ def world_of(config: Config, start: NDArray, goal: NDArray) -> env.World:
         start=jnp.asarray(start, jnp.float32),
         goal=jnp.asarray(goal, jnp.float32),
     )
-    return env.World(drone.load_airframe(config.drone), stack_scenes([paper()]), missions)
+    return env.World(load_airframe(config.drone), stack_scenes([paper()]), missions)
 
 
 def fleet_of(config: Config, start: NDArray, goal: NDArray) -> Fleet:

@@ -13,7 +13,7 @@ import pytest
 
 from edqn_jax.errors import ConfigError
 from edqn_jax.learn.policy import Policy
-from edqn_jax.sim.physics import drone
+from edqn_jax.sim.physics.airframe import load_airframe
 from edqn_jax.sim.scene.mjcf import load_world
 from edqn_jax.sim.scene.scene import stack_scenes
 from edqn_jax.sim.task.env import World
@@ -46,7 +46,7 @@ def course(tmp_path_factory: pytest.TempPathFactory) -> World:
         file.write_text(WALL.format(y=y))
         scenes.append(load_world(file).scene)
     pool = stack_scenes(scenes)
-    return World(drone.load_airframe(CONFIG.drone), pool, own_missions(pool))
+    return World(load_airframe(CONFIG.drone), pool, own_missions(pool))
 
 
 @functools.cache
@@ -183,7 +183,7 @@ def hovering(tmp_path: Path, decisions: int, world: str = MOVING, **words: str) 
     file = tmp_path / "moving.xml"
     file.write_text(world.format(**words))
     pool = stack_scenes([load_world(file).scene])
-    flown = World(drone.load_airframe(CONFIG.drone), pool, own_missions(pool))
+    flown = World(load_airframe(CONFIG.drone), pool, own_missions(pool))
     number, shape = jnp.zeros((), jnp.int32), pilot.grid_shape(TRUE.map, pool.volume)
     flying = jax.jit(functools.partial(pilot._begin, CONFIG, TRUE, shape, flown, params()))(number, jax.random.key(0))
     step = jax.jit(functools.partial(pilot.decide, CONFIG, TRUE, flown, params()))

@@ -20,6 +20,9 @@ from edqn_jax.extras import require
 from edqn_jax.sim.actions import ACTIONS
 from edqn_jax.sim.camera import camera
 from edqn_jax.sim.physics import drone
+from edqn_jax.sim.physics.airframe import c_model, load_airframe, mixer_of
+from edqn_jax.sim.physics.controller import thrusts as thrusts_in_jax
+from edqn_jax.sim.physics.flight import fly
 from edqn_jax.sim.scene.mjcf import load_scene
 from edqn_jax.sim.sensors import events
 from edqn_jax.sim.task.action_sets import bearing, velocity_command
@@ -65,9 +68,9 @@ def move(*vector: int) -> int:
 
 
 def test_the_rotors_get_what_those_of_edqn_jax_get() -> None:
-    airframe, model = drone.load_airframe(CONFIG.drone), drone.c_model(CONFIG.drone)
-    one = (float(model.body_mass[1]), model.body_inertia[1], drone.mixer_of(model), 13.0, 9.81)
-    expected = jax.jit(partial(drone.thrusts, CONFIG.drone, airframe))
+    airframe, model = load_airframe(CONFIG.drone), c_model(CONFIG.drone)
+    one = (float(model.body_mass[1]), model.body_inertia[1], mixer_of(model), 13.0, 9.81)
+    expected = jax.jit(partial(thrusts_in_jax, CONFIG.drone, airframe))
     rng = np.random.default_rng(0)
     for _ in range(200):
         quaternion = rng.normal(size=4) + [3, 0, 0, 0]
@@ -96,14 +99,14 @@ def test_it_is_an_environment_of_gymnasium(flown: TutorialDrone) -> None:
 def test_a_flight_is_that_of_edqn_jax(flown: TutorialDrone, world: Path) -> None:
     observed, _ = flown.reset(seed=0)
     body = drone.hover(jnp.asarray(flown.start, jnp.float32), jnp.float32(0.0))
-    scene, airframe = load_scene(world), drone.load_airframe(CONFIG.drone)
+    scene, airframe = load_scene(world), load_airframe(CONFIG.drone)
     own = own_state(CONFIG.env, scene, jnp.asarray(flown.goal), body)
     np.testing.assert_allclose(observed[-10:], own, atol=1e-6)
     assert not observed[:-10].any()  # at rest nothing changes
-    fly = jax.jit(partial(drone.fly, CONFIG.drone, airframe))
+    fly_on = jax.jit(partial(fly, CONFIG.drone, airframe))
     for action in (move(1, 1, 0), move(1, 0, 1), move(0, -1, -1)):
         command = velocity_command(CONFIG.env, jnp.int32(action), drone.yaw_of(body.quaternion))
-        body, _ = fly(body, command, bearing(CONFIG.env, body, jnp.asarray(flown.goal, jnp.float32)))
+        body, _ = fly_on(body, command, bearing(CONFIG.env, body, jnp.asarray(flown.goal, jnp.float32)))
         observed, reward, *_ = flown.step(action)
         np.testing.assert_allclose(flown.data.qpos[:3], body.position, atol=5e-3)  # float64 there
         own = own_state(CONFIG.env, scene, jnp.asarray(flown.goal), body)

@@ -14,7 +14,7 @@ from edqn_jax.config import CameraConfig, Config, DroneConfig, EncoderConfig, Ev
 from edqn_jax.learn import samples
 from edqn_jax.learn.perception import vae
 from edqn_jax.sim.actions import ACTIONS
-from edqn_jax.sim.physics import drone
+from edqn_jax.sim.physics.airframe import load_airframe
 from edqn_jax.sim.scene.scene import UprightBoxes, build_scene, stack_scenes
 from edqn_jax.sim.task import env
 from edqn_jax.sim.task.missions import own_missions
@@ -142,7 +142,7 @@ def test_a_flight_to_the_right_is_the_mirror_of_one_to_the_left() -> None:
     ]
     scene = build_scene(shapes, volume=[[-9, -15, 0], [40, 15, 20]], start=[0, 0, 4], goal=[30, 0, 4])
     pool = stack_scenes([scene])
-    world = env.World(drone.load_airframe(config.drone), pool, own_missions(pool))
+    world = env.World(load_airframe(config.drone), pool, own_missions(pool))
     fresh, _ = env.reset(config, world, jax.random.key(0), jnp.asarray(0))
     step = jax.jit(partial(env.step, config, world))
 

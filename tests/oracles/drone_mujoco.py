@@ -7,11 +7,11 @@ from collections.abc import Callable
 import mujoco
 import numpy as np
 
-from edqn_jax.sim.physics.drone import AIRFRAME_FILE
+from edqn_jax.sim.physics.airframe import SKYDIO_X2
 
 
 def load() -> tuple[mujoco.MjModel, mujoco.MjData]:
-    model = mujoco.MjModel.from_xml_path(str(AIRFRAME_FILE))
+    model = mujoco.MjModel.from_xml_path(str(SKYDIO_X2))
     return model, mujoco.MjData(model)
 
 
@@ -56,7 +56,7 @@ def fly_loaded(
         lag_s: time constant of the rotors, which begin at `first` newtons.
         push: force [3] newtons at the centre of mass at a velocity [3] m/s, world.
     """
-    spec = mujoco.MjSpec.from_file(str(AIRFRAME_FILE))
+    spec = mujoco.MjSpec.from_file(str(SKYDIO_X2))
     body = spec.bodies[1]
     body.mass *= mass
     body.inertia = inertia * np.asarray(body.inertia)

@@ -17,7 +17,7 @@ from edqn_jax.report.page.worlds import ball_data, world_data
 from edqn_jax.report.sights import Sights, decision_rows, poses, times_of
 from edqn_jax.report.solids import MAP, cut_open, moving_solids, solids_of, standing
 from edqn_jax.sim.actions import move_number
-from edqn_jax.sim.physics import drone
+from edqn_jax.sim.physics.airframe import load_airframe
 from edqn_jax.sim.scene.motion import Motion, Throw
 from edqn_jax.sim.scene.scene import PARKED, Planes, Scene, Spheres, UprightBoxes, build_scene, stack_scenes
 from edqn_jax.sim.sensors import events
@@ -89,7 +89,7 @@ def test_an_animation_shows_obstacles_where_they_are_at_each_moment():
 def test_the_pictures_of_a_flight_are_those_that_the_drone_saw():
     scene = moving_world()
     pool = stack_scenes([scene])
-    world = env.World(drone.load_airframe(SMALL.drone), pool, own_missions(pool))
+    world = env.World(load_airframe(SMALL.drone), pool, own_missions(pool))
     state, _ = env.reset(SMALL, world, jax.random.key(3), jnp.asarray(0))
     actions = jnp.full(5, move_number("hover"))
     step = lambda state, action: env.step(SMALL, world, state, action)  # noqa: E731

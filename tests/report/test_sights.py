@@ -17,7 +17,7 @@ from edqn_jax.learn.policy import fresh_policy
 from edqn_jax.report.sights import FINE, Sights, coarse, decision_rows, own_motions, poses
 from edqn_jax.sim.actions import ACTIONS
 from edqn_jax.sim.camera import camera
-from edqn_jax.sim.physics import drone
+from edqn_jax.sim.physics.airframe import load_airframe
 from edqn_jax.sim.scene.scene import Planes, Scene, UprightBoxes, build_scene, stack_scenes
 from edqn_jax.sim.sensors import events, sensor
 from edqn_jax.sim.task import env
@@ -48,7 +48,7 @@ def sights_of(config: Config) -> Sights:
 def flight() -> tuple[dict[str, np.ndarray], env.Step]:
     """A flight as the columns of a trajectory, and as the steps that the drone took."""
     pool = stack_scenes([world_with_a_box()])
-    world = env.World(drone.load_airframe(SMALL.drone), pool, own_missions(pool))
+    world = env.World(load_airframe(SMALL.drone), pool, own_missions(pool))
     state, _ = env.reset(SMALL, world, jax.random.key(3), jnp.asarray(0))
     actions = jnp.array([np.flatnonzero((ACTIONS == move).all(axis=1))[0] for move in MOVES])
     _, steps = jax.jit(lambda state: jax.lax.scan(partial(env.step, SMALL, world), state, actions))(state)

@@ -33,6 +33,7 @@ from edqn_jax.learn.perception import embedding, vae
 from edqn_jax.sim.camera import camera
 from edqn_jax.sim.physics import disturbances, drone
 from edqn_jax.sim.physics.drone import DroneState, Flight
+from edqn_jax.sim.physics.flight import fly as fly_decision
 from edqn_jax.sim.scene import launches
 from edqn_jax.sim.scene.motion import Aim
 from edqn_jax.sim.scene.scene import Scene, moves, scene_at
@@ -231,7 +232,7 @@ def decide(
     command = command * jnp.minimum(1.0, speed / asked)
     turning = dataclasses.replace(config.env, heading="flight" if pilot.looks_ahead else "goal")
     heading = heading_setpoint(turning, before, goal, command)
-    after, flight = drone.fly(config.drone, world.airframe, before, command, heading)
+    after, flight = fly_decision(config.drone, world.airframe, before, command, heading)
     outcome, end, contact = judge(config, scene, goal, before.position, flight, flying.flights.decisions + 1)
     flights, _ = tally(config, scene, flying.flights, before.position, flight, outcome, end, contact)
     move = heading_velocity(config.env, drone.yaw_of(before.quaternion), command)

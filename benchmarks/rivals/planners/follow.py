@@ -23,7 +23,9 @@ from edqn_jax.devices.devices import compiler_options
 from edqn_jax.errors import ConfigError
 from edqn_jax.planning.path import Task
 from edqn_jax.sim.physics import drone
-from edqn_jax.sim.physics.drone import Airframe, DroneState
+from edqn_jax.sim.physics.airframe import Airframe
+from edqn_jax.sim.physics.drone import DroneState
+from edqn_jax.sim.physics.flight import fly
 from edqn_jax.sim.scene.scene import Scene
 from edqn_jax.sim.task.action_sets import bearing
 from edqn_jax.sim.task.flights import Flights, at_start, tally
@@ -130,7 +132,7 @@ def fly_path(
     def decide(flying: tuple[DroneState, Array, Flights]) -> tuple[DroneState, Array, Flights]:
         state, nearest, flights = flying
         command, nearest = steer(config.env, follow, points, nearest, state)
-        after, flight = drone.fly(config.drone, airframe, state, command, bearing(config.env, state, goal))
+        after, flight = fly(config.drone, airframe, state, command, bearing(config.env, state, goal))
         verdict = judge(config, scene, goal, state.position, flight, flights.decisions + 1)
         flights, _ = tally(config, scene, flights, state.position, flight, *verdict)
         return after, nearest, flights

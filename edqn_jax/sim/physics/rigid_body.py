@@ -7,40 +7,41 @@ the step change the velocities, and the changed velocities move and turn the bod
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import jax
 import jax.numpy as jnp
 from jax import Array
 
 
-def rigid_body_step(
-    dt_s: float,
-    mass: Array,
-    inertia: Array,
-    gravity: Array,
-    wrench: Array,
-    position: Array,
-    quaternion: Array,
-    velocity: Array,
-    angular_velocity: Array,
-    push: Array | None = None,
-) -> tuple[Array, Array, Array, Array]:
-    """Returns the body's state after `dt_s` seconds.
+class RigidBody(NamedTuple):
+    """What a free body is."""
+
+    mass: Array
+    """[] kg."""
+    inertia: Array
+    """[3] kg m^2 about the body's axes, which are the principal ones."""
+    gravity: Array
+    """[] m/s^2, downwards."""
+
+
+Motion = tuple[Array, Array, Array, Array]
+"""Position [3] of the centre of mass, metres, quaternion [4] w, x, y, z, body to world, velocity [3] m/s, world, and
+angular velocity [3] rad/s, body."""
+
+
+def rigid_body_step(dt_s: float, body: RigidBody, wrench: Array, motion: Motion, push: Array | None = None) -> Motion:
+    """Returns the body's motion after `dt_s` seconds; its quaternion has length 1.
 
     Args:
         dt_s: length of the step, seconds.
-        mass: [] kg.
-        inertia: [3] kg m^2 about the body's axes, which are the principal ones.
-        gravity: [] m/s^2, downwards.
+        body: its mass and inertia, and the gravity.
         wrench: [4] force along the body's z axis, newtons, and torque about its axes, newton metres.
-        position: [3] of the centre of mass, metres, world.
-        quaternion: [4] w, x, y, z; body to world.
-        velocity: [3] m/s, world.
-        angular_velocity: [3] rad/s, body.
+        motion: before the step.
         push: [3] further force at the centre of mass, newtons, world; None is none.
-
-    Returns:
-        position, quaternion, velocity, angular_velocity after the step; the quaternion has length 1.
     """
+    mass, inertia, gravity = body
+    position, quaternion, velocity, angular_velocity = motion
     force, torque_x, torque_y, torque_z = wrench
     w, x, y, z = quaternion
     p, q, r = angular_velocity

@@ -27,7 +27,9 @@ from edqn_jax.config.registry import ACTION_SETS
 from edqn_jax.errors import ConfigError
 from edqn_jax.sim.actions import ACTIONS, HOVER, Box, Discrete, move_number, named_move
 from edqn_jax.sim.physics import drone
-from edqn_jax.sim.physics.drone import Airframe, Command, DroneState, RateCommand, VelocityCommand
+from edqn_jax.sim.physics.airframe import Airframe
+from edqn_jax.sim.physics.controller import Command, RateCommand, VelocityCommand
+from edqn_jax.sim.physics.drone import DroneState
 
 
 @dataclasses.dataclass(frozen=True, eq=False)

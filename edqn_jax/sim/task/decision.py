@@ -15,9 +15,11 @@ from jax import Array
 
 from edqn_jax.checks import check_finite
 from edqn_jax.config import Config
-from edqn_jax.sim.physics import drone
+from edqn_jax.sim.physics.airframe import Airframe
+from edqn_jax.sim.physics.controller import Command
 from edqn_jax.sim.physics.disturbances import Disturbance
-from edqn_jax.sim.physics.drone import Airframe, Command, DroneState, Flight
+from edqn_jax.sim.physics.drone import DroneState, Flight
+from edqn_jax.sim.physics.flight import fly_command, fly_disturbed
 from edqn_jax.sim.scene.distance import signed_distance
 from edqn_jax.sim.scene.scene import Scene, moves, scene_at
 from edqn_jax.sim.task import group
@@ -152,8 +154,8 @@ def _fly(
     """Flies a command, against the disturbance where it changes how a drone flies."""
     if gusts is not None:
         assert disturbance is not None
-        return drone.fly_disturbed(config, airframe, body, disturbance, command, gusts)
-    after, flight = drone.fly_command(config.drone, airframe, body, command)
+        return fly_disturbed(config, airframe, body, disturbance, command, gusts)
+    after, flight = fly_command(config.drone, airframe, body, command)
     return after, disturbance, flight
 
 

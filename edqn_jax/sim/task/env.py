@@ -19,8 +19,9 @@ from edqn_jax.checks import check_finite, check_index, is_finite
 from edqn_jax.config import Config
 from edqn_jax.keys import integers
 from edqn_jax.sim.physics import disturbances, drone
+from edqn_jax.sim.physics.airframe import Airframe
 from edqn_jax.sim.physics.disturbances import Disturbance
-from edqn_jax.sim.physics.drone import Airframe, DroneState, Flight
+from edqn_jax.sim.physics.drone import DroneState, Flight
 from edqn_jax.sim.scene.launches import nobody_aimed_at, thrown
 from edqn_jax.sim.scene.motion import Aim
 from edqn_jax.sim.scene.scene import PARKED, Scene, moves, scene_at, take_scene, with_drones

@@ -26,7 +26,7 @@ from edqn_jax.devices.jax_settings import as_tested
 from edqn_jax.devices.sums import check_default_sums
 from edqn_jax.errors import ConfigError
 from edqn_jax.sim.camera import camera
-from edqn_jax.sim.physics import drone
+from edqn_jax.sim.physics.airframe import load_airframe
 from edqn_jax.sim.physics.drone import Flight
 from edqn_jax.sim.scene.mjcf import check_scene, load_world, mjcf_of, resolve_world
 from edqn_jax.sim.scene.motion import Aim
@@ -198,7 +198,7 @@ def make(
     config = make_config(name) if config is None else config
     group.check_alone(config, "edqn_jax.make")
     pool = _random_pool(config, name, worlds, seed, split) if name in FAMILIES else _file_pool(config, name, worlds)
-    return Environment(config, World(drone.load_airframe(config.drone), pool, own_missions(pool), reward))
+    return Environment(config, World(load_airframe(config.drone), pool, own_missions(pool), reward))
 
 
 def _random_pool(config: Config, name: str, count: int, seed: int, split: Split) -> Scene:

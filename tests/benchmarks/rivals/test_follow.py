@@ -16,6 +16,8 @@ from edqn_jax.config import Config
 from edqn_jax.errors import ConfigError
 from edqn_jax.planning.path import Task, path_length
 from edqn_jax.sim.physics import drone
+from edqn_jax.sim.physics.airframe import load_airframe
+from edqn_jax.sim.physics.flight import fly
 from edqn_jax.sim.scene.motion import not_thrown
 from edqn_jax.sim.task.flights import Flights
 from edqn_jax.sim.task.outcomes import Outcome
@@ -24,7 +26,7 @@ from rivals.planners.follow import SPACING_M, FollowConfig, compiled_follower, r
 from tests.planning.small_worlds import RADIUS, SIZE, assert_flyable, box, enclosure, random_small_world, small_world
 
 CONFIG, FOLLOW = Config(), FollowConfig()
-AIRFRAME = drone.load_airframe(CONFIG.drone)
+AIRFRAME = load_airframe(CONFIG.drone)
 
 
 def flown(task: Task, path) -> Flights:
@@ -66,12 +68,12 @@ def test_through_gaps_it_stays_on_the_path_as_closely_as_the_reserve_asks():
 @pytest.mark.slow
 def test_beside_a_straight_path_it_comes_back_without_crossing_it_by_more_than_the_tolerance():
     points = sampled(np.array([(0.0, 6.0, 3.0), (12.0, 6.0, 3.0)]))
-    fly = jax.jit(lambda state, command: drone.fly(CONFIG.drone, AIRFRAME, state, command, jnp.zeros(())))
+    fly_on = jax.jit(lambda state, command: fly(CONFIG.drone, AIRFRAME, state, command, jnp.zeros(())))
     state, nearest = drone.hover(jnp.array([1.0, 7.0, 3.0]), jnp.array(0.0)), np.int32(0)
     beside = []
     for _ in range(20):
         command, nearest = _steer()(points, nearest, state)
-        state, flight = fly(state, command)
+        state, flight = fly_on(state, command)
         beside += [float(y) - 6.0 for y in flight.position[:, 1]]
     assert nearest == 120  # it has not stopped beside the path, but come to its end: 11 m in 5.2 s
     assert min(beside) > -FOLLOW.tolerance_m

@@ -17,9 +17,12 @@ from edqn_jax.config import AirConfig, BodyConfig, Config, EnvConfig, MotorsConf
 from edqn_jax.config.loading import apply, load_layer
 from edqn_jax.policies import policy_folder
 from edqn_jax.sim.actions import ACTIONS, move_number
-from edqn_jax.sim.physics import disturbances, drone
+from edqn_jax.sim.physics import disturbances
+from edqn_jax.sim.physics.airframe import load_airframe
+from edqn_jax.sim.physics.controller import VelocityCommand
 from edqn_jax.sim.physics.disturbances import Disturbance, Load
-from edqn_jax.sim.physics.drone import DroneState, hover, load_airframe, physics_step
+from edqn_jax.sim.physics.drone import DroneState, hover
+from edqn_jax.sim.physics.flight import fly_disturbed, physics_step
 from edqn_jax.sim.scene.scene import build_scene, stack_scenes
 from edqn_jax.sim.task import env
 from edqn_jax.sim.task.missions import Missions
@@ -200,9 +203,9 @@ def test_gusts_have_the_deviations_and_the_correlation_times_of_dryden_from_thei
 def flown_disturbed(config: Config, disturbance: Disturbance, command, decisions: int, key=0):
     """State and disturbance after decisions at a held command, and all flights."""
     airframe = load_airframe(config.drone)
-    fly = jax.jit(lambda *given: drone.fly_disturbed(config, airframe, *given))
+    fly = jax.jit(lambda *given: fly_disturbed(config, airframe, *given))
     state, flights = hover(jnp.array([0.0, 0.0, 50.0]), jnp.float32(0.0)), []
-    held = drone.VelocityCommand(jnp.asarray(command, jnp.float32), jnp.float32(0.0))
+    held = VelocityCommand(jnp.asarray(command, jnp.float32), jnp.float32(0.0))
     for each in jax.random.split(jax.random.key(key), decisions):
         state, disturbance, flight = fly(state, disturbance, held, each)
         flights.append(flight)

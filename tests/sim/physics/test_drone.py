@@ -13,18 +13,11 @@ import pytest
 from mujoco import mjx
 
 from edqn_jax.config import Config
-from edqn_jax.sim.physics import drone
-from edqn_jax.sim.physics.drone import (
-    Airframe,
-    DroneState,
-    fly,
-    hover,
-    load_airframe,
-    physics_step,
-    thrusts,
-    wrap_angle,
-    yaw_of,
-)
+from edqn_jax.sim.physics import flight
+from edqn_jax.sim.physics.airframe import Airframe, load_airframe
+from edqn_jax.sim.physics.controller import thrusts
+from edqn_jax.sim.physics.drone import DroneState, hover, wrap_angle, yaw_of
+from edqn_jax.sim.physics.flight import _mjx_template, fly, physics_step
 from tests.oracles import drone_mujoco
 from tracking import Decide, batched_fly, manoeuvres, measure
 
@@ -330,9 +323,9 @@ def test_fly_traces_to_one_scan_without_callbacks(airframe):
 def test_it_flies_in_programs_of_different_meshes(airframe, axis, monkeypatch):
     mesh = jax.sharding.Mesh(np.array(jax.devices()[:1]), (axis,))
     spec = jax.sharding.PartitionSpec(axis)
-    monkeypatch.setattr(drone, "_mjx_step", inspect.unwrap(drone._mjx_step))  # traced in each, not once
+    monkeypatch.setattr(flight, "_mjx_step", inspect.unwrap(flight._mjx_step))  # traced in each, not once
     if axis == "env":  # the first: the template is made in its mesh
-        drone._mjx_template.cache_clear()
+        _mjx_template.cache_clear()
 
     def fall(place: jax.Array) -> jax.Array:
         return physics_step(CONFIG, airframe, hover(place, jnp.float32(0.0)), jnp.zeros(4)).velocity

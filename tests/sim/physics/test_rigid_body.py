@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from functools import partial
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -12,13 +14,17 @@ import numpy as np
 import pytest
 
 from edqn_jax.cli.arguments import parse_train
-from edqn_jax.config import Config
+from edqn_jax.config import Config, DroneConfig
+from edqn_jax.config.limits import validate
+from edqn_jax.config.registry import AIRFRAMES
 from edqn_jax.errors import ConfigError
 from edqn_jax.runs.provenance import workload
-from edqn_jax.sim.physics import drone
-from edqn_jax.sim.physics.drone import AIRFRAME_FILE, DroneState, hover, load_airframe, physics_step
+from edqn_jax.sim.physics.airframe import SKYDIO_X2, load_airframe
+from edqn_jax.sim.physics.drone import DroneState, hover
+from edqn_jax.sim.physics.flight import physics_step
 from edqn_jax.sim.scene.mjcf import load_scene, resolve_world
 from tests.oracles import drone_mujoco
+from tests.registries import keep_as_they_are
 from tracking import batched_fly
 
 MJX = Config().drone
@@ -114,7 +120,7 @@ def with_air(spec: mujoco.MjSpec) -> None:
 
 
 def with_a_joint(spec: mujoco.MjSpec) -> None:
-    arm = spec.bodies[1].add_body(mass=0.1, inertia=[0.1, 0.1, 0.1])
+    arm = spec.bodies[1].add_body(mass=0.1, inertia=[0.1, 0.1, 0.1], explicitinertial=True, ipos=[0, 0, 0])
     arm.add_joint()
 
 
@@ -130,16 +136,76 @@ def with_damping(spec: mujoco.MjSpec) -> None:
     spec.option.disableflags &= ~int(mujoco.mjtDisableBit.mjDSBL_EULERDAMP)
 
 
-@pytest.mark.parametrize("change", [with_air, with_a_joint, with_a_tilted_rotor, with_a_load, with_damping])
-def test_an_airframe_that_a_step_would_fly_wrongly_is_refused(change, monkeypatch: pytest.MonkeyPatch) -> None:
-    spec = mujoco.MjSpec.from_file(str(AIRFRAME_FILE))
-    for shape in list(spec.geoms):
-        spec.delete(shape)
-    monkeypatch.setattr(drone, "c_model", lambda config: spec.compile())
-    load_airframe(MJX)
+def with_a_stronger_rotor(spec: mujoco.MjSpec) -> None:
+    spec.actuators[0].ctrlrange = [0.0, 14.0]
+
+
+def with_a_longer_arm(spec: mujoco.MjSpec) -> None:
+    spec.sites[0].pos = [-0.2, -0.18, 0.0]
+
+
+def without_yaw(spec: mujoco.MjSpec) -> None:
+    for actuator in spec.actuators:
+        actuator.gear = [0, 0, 1, 0, 0, 0]
+
+
+def registered(spec: mujoco.MjSpec, folder: Path, monkeypatch: pytest.MonkeyPatch) -> DroneConfig:
+    """The drone of an airframe of one's own, `mine`."""
+    keep_as_they_are(monkeypatch)
+    (folder / "mine.xml").write_text(spec.to_xml(), encoding="utf-8")
+    AIRFRAMES.register("mine", folder / "mine.xml")
+    return dataclasses.replace(MJX, airframe="mine")
+
+
+FREE, QUADROTOR = "be one free body in a vacuum", "have four rotors of the same range"
+
+
+@pytest.mark.parametrize(
+    ("change", "what"),
+    [
+        *((change, FREE) for change in (with_air, with_a_joint, with_a_tilted_rotor, with_a_load, with_damping)),
+        *((change, QUADROTOR) for change in (with_a_stronger_rotor, with_a_longer_arm, without_yaw)),
+    ],
+)
+def test_an_airframe_that_would_be_flown_wrongly_is_refused(
+    change: Callable[[mujoco.MjSpec], None], what: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    spec = mujoco.MjSpec.from_file(str(SKYDIO_X2))
+    config = registered(spec, tmp_path, monkeypatch)
+    load_airframe(config)
     change(spec)
-    with pytest.raises(ConfigError, match=r"^'skydio_x2.xml' must be one free body in a vacuum"):
-        load_airframe(MJX)
+    (tmp_path / "mine.xml").write_text(spec.to_xml(), encoding="utf-8")
+    with pytest.raises(ConfigError, match=f"^the airframe 'mine' must {what}"):
+        load_airframe(config)
+
+
+def test_another_quadrotor_is_a_file_and_an_entry(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    spec = mujoco.MjSpec.from_file(str(SKYDIO_X2))
+    spec.bodies[1].mass *= 1.5
+    spec.bodies[1].inertia = 1.2 * np.array(spec.bodies[1].inertia)
+    heavy = registered(spec, tmp_path, monkeypatch)
+    validate(dataclasses.replace(Config(), drone=heavy))
+    airframe = load_airframe(heavy)
+    np.testing.assert_allclose(float(airframe.mass), 1.5 * 1.325, rtol=1e-6)
+    for physics in ("mjx", "rigid_body"):
+        config = dataclasses.replace(heavy, physics=physics)
+        state = hover(jnp.zeros(3), jnp.float32(0.0))
+        push = jnp.full(4, airframe.mass * 9.81 / 4 + 0.5)
+        risen = jax.jit(partial(physics_step, config, airframe))(state, push)
+        np.testing.assert_allclose(risen.velocity, [0, 0, 2.0 / (1.5 * 1.325) * config.physics_dt_s], atol=1e-5)
+
+
+def test_an_airframe_that_mujoco_cannot_read_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    config = registered(mujoco.MjSpec.from_file(str(SKYDIO_X2)), tmp_path, monkeypatch)
+    for break_it in ((tmp_path / "mine.xml").write_bytes, lambda _: (tmp_path / "mine.xml").unlink()):
+        break_it(b"<mujoco>")
+        with pytest.raises(ConfigError, match="^the airframe 'mine' is no MJCF that MuJoCo can read: [^\\n]*$"):
+            load_airframe(config)
+
+
+def test_an_airframe_that_there_is_not_is_refused() -> None:
+    with pytest.raises(ConfigError, match="drone.airframe: there is no airframe 'skydio_x3'; did you mean 'skydio_x2'"):
+        validate(dataclasses.replace(Config(), drone=dataclasses.replace(MJX, airframe="skydio_x3")))
 
 
 def test_it_is_asked_for_by_a_flag_and_every_report_says_so() -> None:

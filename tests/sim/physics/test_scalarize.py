@@ -12,7 +12,9 @@ import numpy as np
 import pytest
 
 from edqn_jax.config import Config
-from edqn_jax.sim.physics.drone import fly, hover, load_airframe, physics_step
+from edqn_jax.sim.physics.airframe import load_airframe
+from edqn_jax.sim.physics.drone import hover
+from edqn_jax.sim.physics.flight import fly, physics_step
 from edqn_jax.sim.physics.scalarize import number_by_number
 
 

@@ -18,7 +18,8 @@ import edqn_jax
 from edqn_jax.config import CameraConfig, Config, DroneConfig, EnvConfig, ExposureConfig, LightConfig, WorldConfig
 from edqn_jax.config.limits import validate
 from edqn_jax.errors import ConfigError
-from edqn_jax.sim.physics.drone import Flight, load_airframe
+from edqn_jax.sim.physics.airframe import load_airframe
+from edqn_jax.sim.physics.drone import Flight
 from edqn_jax.sim.scene import mjcf
 from edqn_jax.sim.scene.scene import scene_at, stack_scenes
 from edqn_jax.sim.sensors import built_in, exposure, sensor

@@ -15,7 +15,7 @@ from edqn_jax.config import CameraConfig, Config, DroneConfig, EventsConfig, Lig
 from edqn_jax.config.loading import flown_under
 from edqn_jax.errors import ConfigError
 from edqn_jax.learn import policy
-from edqn_jax.sim.physics.drone import load_airframe
+from edqn_jax.sim.physics.airframe import load_airframe
 from edqn_jax.sim.scene.mjcf import load_scene
 from edqn_jax.sim.scene.scene import stack_scenes
 from edqn_jax.sim.sensors import events as ev

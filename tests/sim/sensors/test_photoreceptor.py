@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from edqn_jax.config import CameraConfig, Config, DroneConfig, EventsConfig
 from edqn_jax.config.limits import validate
-from edqn_jax.sim.physics.drone import load_airframe
+from edqn_jax.sim.physics.airframe import load_airframe
 from edqn_jax.sim.scene.mjcf import load_scene
 from edqn_jax.sim.scene.scene import stack_scenes
 from edqn_jax.sim.sensors import events as ev

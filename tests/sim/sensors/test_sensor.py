@@ -19,7 +19,8 @@ from edqn_jax.learn.perception import embedding
 from edqn_jax.learn.plan import Plan
 from edqn_jax.runs.provenance import workload
 from edqn_jax.sim.actions import ACTIONS, DIRECTIONS
-from edqn_jax.sim.physics.drone import Flight, hover, load_airframe
+from edqn_jax.sim.physics.airframe import load_airframe
+from edqn_jax.sim.physics.drone import Flight, hover
 from edqn_jax.sim.scene import mjcf
 from edqn_jax.sim.scene.scene import stack_scenes, take_scene
 from edqn_jax.sim.sensors import sensor

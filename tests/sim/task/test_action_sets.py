@@ -16,7 +16,10 @@ from edqn_jax.config.limits import check_learns, validate
 from edqn_jax.config.registry import ACTION_SETS
 from edqn_jax.errors import ConfigError
 from edqn_jax.sim.actions import ACTIONS, Discrete
-from edqn_jax.sim.physics.drone import RateCommand, fly_command, hover, load_airframe, mixer_of
+from edqn_jax.sim.physics.airframe import load_airframe, mixer_of
+from edqn_jax.sim.physics.controller import RateCommand
+from edqn_jax.sim.physics.drone import hover
+from edqn_jax.sim.physics.flight import fly_command
 from edqn_jax.sim.task import env
 from edqn_jax.sim.task.action_sets import BODY_RATES, MOVES, VELOCITY, ActionSet, action_of, action_set, admitted
 from edqn_jax.sim.task.outcomes import Outcome

@@ -17,6 +17,7 @@ from edqn_jax.config import Config, EnvConfig, EventsConfig, preset
 from edqn_jax.sim.actions import ACTIONS
 from edqn_jax.sim.camera import camera
 from edqn_jax.sim.physics import drone
+from edqn_jax.sim.physics.airframe import load_airframe
 from edqn_jax.sim.physics.drone import DroneState, Flight
 from edqn_jax.sim.scene.scene import UprightBoxes, build_scene, stack_scenes
 from edqn_jax.sim.sensors import events, sensor
@@ -431,7 +432,7 @@ FLOWN = dataclasses.replace(
 @pytest.fixture(scope="module")
 def world():
     return env.World(
-        airframe=drone.load_airframe(FLOWN.drone),
+        airframe=load_airframe(FLOWN.drone),
         pool=stack_scenes([SCENE]),
         missions=Missions(
             scene=jnp.zeros(len(MISSIONS), jnp.int32),
@@ -680,7 +681,7 @@ def test_nobody_is_paid_for_a_way_through_a_wall():
     scene = small_world(box((5.9, -1.0, -1.0), (6.1, 10.0, 7.0)), start=(4.9, 2.0, 3.0), goal=(10.0, 2.0, 3.0)).scene
     pool = stack_scenes([scene])
     fields = geodesic.fields(pool, 0.36)
-    world = env.World(drone.load_airframe(CONFIG.drone), pool, own_missions(pool), distances=fields)
+    world = env.World(load_airframe(CONFIG.drone), pool, own_missions(pool), distances=fields)
     task = EnvConfig(sensor="blind", reward="geodesic", progress_weight=1.0, path_weight=0.0, step_reward=0.0)
     config = dataclasses.replace(CONFIG, env=task)
     step = jax.jit(partial(env.step, config, world))

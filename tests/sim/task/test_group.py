@@ -20,7 +20,7 @@ from edqn_jax.config import Config
 from edqn_jax.config.loading import make_config
 from edqn_jax.errors import ConfigError
 from edqn_jax.sim.actions import move_number
-from edqn_jax.sim.physics import drone
+from edqn_jax.sim.physics.airframe import load_airframe
 from edqn_jax.sim.scene.scene import build_scene, stack_scenes
 from edqn_jax.sim.sensors.events import event_image
 from edqn_jax.sim.task import env, group
@@ -57,7 +57,7 @@ def world_of(*ends) -> World:
     starts, goals = (np.array(points, np.float32) for points in zip(*ends, strict=True))
     scene = build_scene([GROUND], volume=VOLUME, start=starts[0], goal=goals[0])
     missions = Missions(jnp.zeros(len(ends), jnp.int32), jnp.asarray(starts), jnp.asarray(goals))
-    return World(drone.load_airframe(CONFIG.drone), stack_scenes([scene]), missions)
+    return World(load_airframe(CONFIG.drone), stack_scenes([scene]), missions)
 
 
 def fly(world: World, moves, config: Config = CONFIG, missions=None, key: int = 0, free: bool = False):

@@ -18,6 +18,7 @@ from edqn_jax.evaluation.rollouts import fly_missions
 from edqn_jax.learn.policy import fresh_policy
 from edqn_jax.sim.actions import move_number
 from edqn_jax.sim.physics import drone
+from edqn_jax.sim.physics.airframe import load_airframe
 from edqn_jax.sim.scene.distance import signed_distance
 from edqn_jax.sim.scene.launches import aim_along
 from edqn_jax.sim.scene.motion import Motion, Throw, aim_at, throw_speeds, thrown_to
@@ -57,7 +58,7 @@ def pillar(motion: Motion | None, x=18.0, y=16.0) -> UprightBoxes:
 def world_of(*shapes) -> World:
     scene = build_scene([GROUND, *shapes], volume=VOLUME, start=START, goal=GOAL)
     pool = stack_scenes([scene])
-    return World(drone.load_airframe(CONFIG.drone), pool, own_missions(pool))
+    return World(load_airframe(CONFIG.drone), pool, own_missions(pool))
 
 
 def configured(name: str) -> Config:

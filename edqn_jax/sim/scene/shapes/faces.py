@@ -29,7 +29,7 @@ def faces_of_tube(position: np.ndarray, axis: np.ndarray, radius: float, half: f
 
 
 def faces_of_capsule(position: np.ndarray, axis: np.ndarray, radius: float, half: float) -> list[np.ndarray]:
-    """Returns the faces of a capsule, or of a sphere where `half` is 0; flat poles keep faces from degenerating."""
+    """Returns the faces of a capsule, metres, of a sphere where `half` is 0; flat poles keep faces from shrinking."""
     angle = np.linspace(-np.pi / 2 + 0.05, np.pi / 2 - 0.05, 18)
     along = radius * np.sin(angle) + half * np.sign(angle)
     rings = _rings(position, axis, radius * np.cos(angle), along)

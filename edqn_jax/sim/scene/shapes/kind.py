@@ -16,6 +16,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import mujoco
 import numpy as np
 from flax import struct
 from jax import Array
@@ -47,23 +48,23 @@ class Hits:
 
     depth: Array  # of the first intersection, in lengths of the ray's direction
     hit: Array  # bool, whether there is one, at a positive depth
-    sides: Sequence[tuple[Array | None, Vector]]
+    sides: Sequence[tuple[Any, Vector]]
     """Which side is met, and its unit normal, outwards, world axes: the last whose condition holds; the first has
     none. So whatever depends on the normal of a flat side alone is computed once a shape, not once a ray."""
 
     @classmethod
     def of(cls, depth: Array, hit: Array, normal: Vector) -> Hits:
-        """Returns hits of shapes that are one round side, of that normal."""
+        """Returns hits [N, R, C], depths in metres, of shapes that are one round side, of that normal."""
         return cls(depth=depth, hit=hit, sides=((None, normal),))
 
     @property
     def normal(self) -> Vector:
-        """Returns the unit normal where each ray meets each shape."""
+        """Returns the unit normal where each ray meets each shape, three [N, R, C]."""
         x, y, z = (self.by_side(lambda *normal, i=i: normal[i]) for i in range(3))
         return x, y, z
 
     def by_side(self, of_normal: Callable[..., Array]) -> Array:
-        """Returns a function (nx, ny, nz) → array of the normal of the side that is met."""
+        """Returns a function (nx, ny, nz) → array of the normal of the side that is met, [N, R, C]."""
         (_, first), *others = self.sides
         found = of_normal(*first)
         for here, normal in others:
@@ -100,11 +101,11 @@ class ShapeKind:
     """
 
     parked: Any
-    """One absent shape, an instance of the dataclass: at `FAR`, of no size."""
+    """One absent shape, an instance of the dataclass, at `FAR`; its distances must be finite."""
     geom: str
     """MuJoCo's name of the geom that it is read from and written as."""
     distance: Callable[[Any, Array, Array, Array], Array]
-    """(shapes, x, y, z of a point) → [N] metres to each surface, negative inside; never more than it is."""
+    """(shapes, x, y, z of a point) → [N] metres to each surface, negative inside; less than that collides sooner."""
     meet: Callable[[Any, Array, Vector], Hits]
     """(shapes, origin [3] metres, direction of rays, three that broadcast to [1, R, C]) → where they meet shapes."""
     read: Callable[[Geom], Any]
@@ -153,6 +154,13 @@ def array_module(values: Any) -> Any:
     return jnp if isinstance(values, jax.Array) else np
 
 
+def quaternion_of(rotation: np.ndarray) -> np.ndarray:
+    """Returns the quaternion [4], w first, of a rotation [3, 3]."""
+    quaternion = np.empty(4)
+    mujoco.mju_mat2Quat(quaternion, np.asarray(rotation, np.float64).ravel())
+    return quaternion
+
+
 def inverse(x: Array) -> Array:
     """Returns 1 / x of [...], finite at 0."""
     return 1.0 / jnp.where(jnp.abs(x) < TINY, TINY, x)
@@ -164,9 +172,9 @@ def per_shape(x: Array) -> Array:
 
 
 def nearer_of(a: Hits, b: Hits) -> Hits:
-    """Returns the hits of the union of two solids of the same shapes: those that each ray meets first.
+    """Returns the hits [N, R, C] of the union of two solids of the same shapes: those that each ray meets first.
 
-    `b` has one side.
+    Depths are in metres; `b` has one side.
     """
     take_b = b.hit & (~a.hit | (b.depth < a.depth))
     ((_, normal),) = b.sides
@@ -175,12 +183,12 @@ def nearer_of(a: Hits, b: Hits) -> Hits:
 
 
 def norm(*components: Array) -> Array:
-    """Returns the length [...] of a vector, with a finite gradient at 0."""
+    """Returns the length [...] of a vector, metres, with a finite gradient at 0."""
     return jnp.sqrt(jnp.maximum(sum(c * c for c in components), 1e-20))  # 1e-10 m is nothing
 
 
 def solid_distance(*gaps: Array) -> Array:
-    """Returns the signed distance, given the distances beyond each pair of faces (negative: within)."""
+    """Returns the signed distance [N] metres, given the distances beyond each pair of faces (negative: within)."""
     outside = norm(*(jnp.maximum(gap, 0.0) for gap in gaps))
     deepest = gaps[0]
     for gap in gaps[1:]:
@@ -189,5 +197,5 @@ def solid_distance(*gaps: Array) -> Array:
 
 
 def offset(position: Array, x: Array, y: Array, z: Array) -> Vector:
-    """Returns a point less the positions [N, 3], [N] each."""
+    """Returns a point less the positions [N, 3], [N] metres each."""
     return x - position[:, 0], y - position[:, 1], z - position[:, 2]

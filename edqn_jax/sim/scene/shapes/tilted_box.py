@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import Any
 
 import jax.numpy as jnp
-import mujoco
 import numpy as np
 from flax import struct
 from jax import Array
@@ -21,6 +20,7 @@ from edqn_jax.sim.scene.shapes.kind import (
     inverse,
     offset,
     per_shape,
+    quaternion_of,
     solid_distance,
 )
 from edqn_jax.sim.scene.surface import Surface
@@ -57,7 +57,7 @@ def _meet(boxes: TiltedBoxes, origin: Array, ray: Vector) -> Hits:
 
 
 def slabs(o: Vector, d: Vector, half: Array, axes: tuple[Vector, Vector, Vector]) -> Hits:
-    """Returns where rays meet boxes, each three slabs.
+    """Returns where rays [N, R, C] meet boxes, each three slabs.
 
     Args:
         o, d: origin and direction in the box's frame, broadcast to [N, R, C].
@@ -65,7 +65,7 @@ def slabs(o: Vector, d: Vector, half: Array, axes: tuple[Vector, Vector, Vector]
         axes: of the box in the world, components [N].
     """
     enter, leave = jnp.asarray(-jnp.inf), jnp.asarray(jnp.inf)
-    sides: list[tuple[Array | None, Vector]] = []
+    sides: list[tuple[Any, Vector]] = []
     for i in range(3):
         per_d = inverse(d[i])
         middle, reach = -o[i] * per_d, per_shape(half[:, i]) * jnp.abs(per_d)
@@ -77,19 +77,13 @@ def slabs(o: Vector, d: Vector, half: Array, axes: tuple[Vector, Vector, Vector]
     return Hits(depth=enter, hit=(enter < leave) & (enter > 0), sides=sides)
 
 
-def _quaternion(box: Any) -> np.ndarray:
-    quaternion = np.empty(4)
-    mujoco.mju_mat2Quat(quaternion, np.asarray(box.rotation, np.float64).ravel())
-    return quaternion
-
-
 TILTED_BOX = ShapeKind(
     parked=TiltedBoxes(position=FAR, half=np.zeros(3), rotation=np.eye(3), albedo=GREY),  # type: ignore[arg-type]
     geom="box",
     distance=_distance,
     meet=_meet,
     read=lambda geom: TiltedBoxes(geom.position, geom.size, geom.rotation, geom.albedo),  # type: ignore[arg-type]
-    write=lambda box: {"size": box.half, "quat": _quaternion(box)},
+    write=lambda box: {"size": box.half, "quat": quaternion_of(box.rotation)},
     reach=lambda boxes: (abs(boxes.rotation) * boxes.half[..., None, :]).sum(-1),
     faces=lambda box: faces_of_box(box.position, box.half, box.rotation),
     page=lambda box: {"kind": "box", "half": box.half, "turn": box.rotation.ravel()},

@@ -53,7 +53,7 @@ class Tubes(NamedTuple):
 
 
 def meet_tubes(part: Tubes, origin: Array, ray: Vector, capped: bool) -> Hits:
-    """Returns where rays meet the round sides of capsules, or (`capped`) cylinders with flat ends."""
+    """Returns where rays from `origin` [3], metres, meet round sides of capsules, or (`capped`) whole cylinders."""
     dx, dy, dz = ray
     ox, oy, oz = (per_shape(origin[i] - part.position[:, i]) for i in range(3))
     ax, ay, az = (per_shape(part.axis[:, i]) for i in range(3))
