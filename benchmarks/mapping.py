@@ -49,7 +49,6 @@ from edqn_jax.sim.task.missions import own_missions
 from edqn_jax.sim.task.observation import MOTION_SIZE, OWN_SIZE, Observation
 from edqn_jax.sim.task.outcomes import Outcome
 from edqn_jax.sim.worlds import families
-from edqn_jax.sim.worlds.moving import Moving
 from measurement import json_report
 from measurement.command import Parser, in_a_sentence
 from measurement.intervals import difference_interval
@@ -138,7 +137,7 @@ def with_options(base: PilotConfig, words: Sequence[str]) -> PilotConfig:
 
 def course_of(policy: Policy, family: str, split: families.Split, missions: int, first: int = 0) -> World:
     """Returns one mission in each of `missions` worlds of a split, from world `first` on."""
-    pool = families.random_pool(family, families.world_keys(split, missions, first=first), Moving.of(policy.config))
+    pool = families.worlds_of(policy.config, family, split, missions, first=first)
     return World(load_airframe(policy.config.drone), pool, own_missions(pool))
 
 

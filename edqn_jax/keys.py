@@ -21,6 +21,9 @@ FAMILY_OF_WORLD = 1_000_003
 MOTION_OF_WORLD = 7_000_003
 """Folded into the key of a world to draw what moves in it."""
 
+LOOK_OF_WORLD = 8_000_009
+"""Folded into the key of a world to draw its patterns and its light."""
+
 CROSSING_OF_WORLD = 9_000_011
 """Folded into the key of a world to draw the missions of several drones in it."""
 

@@ -100,6 +100,7 @@ COMMON = {
     "drone.physics": "MJX, or its equations in closed form",
     "camera.width": "pixels across",
     "camera.height": "pixels down",
+    "surface.pattern": "what surfaces look like: one plaid, or drawn for each shape",
     "events.threshold": "change of log-brightness that makes an event",
     "agent.learning_rate": "Adam step size at the start",
     "agent.batch_size": "replayed samples per update",

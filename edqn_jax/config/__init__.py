@@ -15,6 +15,7 @@ from edqn_jax.config.simulation import (
     LightConfig,
     MotorsConfig,
     NoiseConfig,
+    SurfaceConfig,
     WorldConfig,
 )
 
@@ -41,6 +42,7 @@ __all__ = [
     "LightConfig",
     "MotorsConfig",
     "NoiseConfig",
+    "SurfaceConfig",
     "TrainConfig",
     "WorldConfig",
     "preset",

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
 
-from edqn_jax.errors import ConfigError
+from edqn_jax.errors import ConfigError, nearest
 
 
 @dataclass(frozen=True)
@@ -19,6 +19,8 @@ class Limit:
 
     says: str
     holds: Callable[[Any], bool]
+    names: tuple[str, ...] = ()
+    """That the value may be; of these the nearest is named."""
 
     def __repr__(self) -> str:
         return f"'{self.says}'"
@@ -42,6 +44,11 @@ def less_than(limit: float, said: str) -> Limit:
 def between(low: float, high: float) -> Limit:
     """Returns the limit of values from `low` to `high`."""
     return Limit(f"between {low:g} and {high:g}", lambda value: low <= value <= high)
+
+
+def one_of(names: tuple[str, ...]) -> Limit:
+    """Returns the limit of a value that is one of some names; what it says has all of them."""
+    return Limit(f"one of {', '.join(names)}", lambda value: value in names, names)
 
 
 COUNT = at_least(1)
@@ -81,7 +88,10 @@ def check_limits(section: Any, group: str) -> None:
     """
     for name, limits in limits_of(type(section)).items():
         for limit in limits:
-            require(limit.holds(getattr(section, name)), f"{group}.{name}", limit.says, getattr(section, name))
+            value = getattr(section, name)
+            if limit.names and not limit.holds(value):
+                raise ConfigError(f"{group}.{name}: there is no '{value}'{nearest(value, limit.names)}")
+            require(limit.holds(value), f"{group}.{name}", limit.says, value)
 
 
 def require(holds: bool, name: str, limit: str, value: object) -> None:

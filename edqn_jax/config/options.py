@@ -21,6 +21,7 @@ from edqn_jax.config.simulation import (
     LightConfig,
     MotorsConfig,
     NoiseConfig,
+    SurfaceConfig,
     WorldConfig,
 )
 
@@ -32,6 +33,7 @@ class Config:
     world: WorldConfig = field(default_factory=WorldConfig)
     drone: DroneConfig = field(default_factory=DroneConfig)
     camera: CameraConfig = field(default_factory=CameraConfig)
+    surface: SurfaceConfig = field(default_factory=SurfaceConfig)
     events: EventsConfig = field(default_factory=EventsConfig)
     env: EnvConfig = field(default_factory=EnvConfig)
     air: AirConfig = field(default_factory=AirConfig)
@@ -62,6 +64,7 @@ CONDITIONS: dict[str, tuple[str, ...]] = {
             ("noise", NoiseConfig),
             ("light", LightConfig),
             ("exposure", ExposureConfig),
+            ("surface", SurfaceConfig),
         )
     },
 }

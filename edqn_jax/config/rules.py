@@ -89,6 +89,9 @@ def _of_flights(config: Config, trains: bool) -> Rules:
     """Yields rules of what is flown and seen."""
     env, light, exposure, times = config.env, config.light, config.exposure, config.events.frame_times_s
     dt, window = config.drone.physics_dt_s, config.drone.physics_steps * config.drone.physics_dt_s
+    surface = config.surface
+    longest = f"at least surface.shortest_m ({surface.shortest_m:g})"
+    yield surface.shortest_m <= surface.longest_m, "surface.longest_m", longest
     # 0.26 / 0.02 is not exactly 13 in floating point, so a thousandth of a step is allowed.
     whole = all(abs(time / dt - round(time / dt)) < 1e-3 for time in times)
     yield whole, "events.frame_times_s", f"multiples of drone.physics_dt_s ({dt:g} s)"

@@ -24,6 +24,7 @@ from edqn_jax.config.limits import (
     at_most,
     between,
     less_than,
+    one_of,
 )
 
 
@@ -128,6 +129,26 @@ class CameraConfig:
     """Height of the sun over the horizon, degrees."""
     sky_rgb: Annotated[tuple[float, float, float], SHARES] = (0.62, 0.74, 0.9)
     """Brightness of the sky."""
+
+
+PATTERNS = ("plaid", "drawn", "blank", "waves", "noise", "checks", "bricks", "posters", "wood")
+"""Values of `surface.pattern`."""
+
+
+@dataclass(frozen=True)
+class SurfaceConfig:
+    """What the faces of the shapes of a world look like; geometry is the same under every pattern."""
+
+    pattern: Annotated[str, one_of(PATTERNS)] = "plaid"
+    """`plaid`: one for all, of `camera.texture_*`. For each shape its own: `drawn` (any of the next four), `blank`,
+    `waves`, `noise`, `checks`; for tests, never among `drawn`: `bricks`, `posters`, `wood`. With a sun and a sky for
+    each world."""
+    contrast: Annotated[float, SHARE] = 0.8
+    """Most amplitude of a pattern relative to the surface's brightness; a shape's is uniform from 0 to this."""
+    shortest_m: Annotated[float, between(0.05, 100)] = 0.2
+    """Shortest period of waves, noise and checks, metres; a shape's is log-uniform."""
+    longest_m: Annotated[float, between(0.05, 100)] = 10.0
+    """Longest period, metres."""
 
 
 @dataclass(frozen=True)

@@ -101,7 +101,18 @@ def evaluate(
         config, flown.world, policy.params, seed, actor=actor, record=record, shuffle_codes=shuffle_codes
     )
     shortest = shortest_paths(config, flown.world, np.asarray(flights.outcome) == Outcome.GOAL)
-    return Evaluation(flown, flights, summarise(flights, shortest, config.env.drones))
+    missions = dataclasses.replace(
+        flown, note=" ".join(filter(None, (flown.note, _unseen_look(policy, config)))) or None
+    )
+    return Evaluation(missions, flights, summarise(flights, shortest, config.env.drones))
+
+
+def _unseen_look(policy: Policy | FunctionPolicy, config: Config) -> str | None:
+    """Returns a sentence on a policy that has seen one plaid alone and flies under another look; None for others."""
+    pattern = config.surface.pattern
+    if isinstance(policy, FunctionPolicy) or policy.config.surface.pattern != "plaid" or pattern == "plaid":
+        return None
+    return f"this policy was trained with surface.pattern plaid alone; with {pattern} it sees what it never learnt"
 
 
 def _check_can_shuffle(config: Config, missions: int) -> None:

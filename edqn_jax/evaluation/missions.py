@@ -18,7 +18,7 @@ from edqn_jax.planning.free_space import holds, reachable
 from edqn_jax.planning.lattice import CELL_M, lattice_shape
 from edqn_jax.sim.physics.airframe import load_airframe
 from edqn_jax.sim.scene.mjcf import check_scene, load_world, mjcf_of, resolve_world, widened
-from edqn_jax.sim.scene.scene import Scene, stack_scenes, take_scene, with_equal_capacities
+from edqn_jax.sim.scene.scene import Scene, take_scene, with_equal_capacities
 from edqn_jax.sim.task import group
 from edqn_jax.sim.task.crossing import crossing_missions, own_crossings
 from edqn_jax.sim.task.env import World, scene_of
@@ -26,7 +26,6 @@ from edqn_jax.sim.task.missions import Missions, own_missions, random_missions, 
 from edqn_jax.sim.task.reward import Reward
 from edqn_jax.sim.worlds import families
 from edqn_jax.sim.worlds.free_points import Cells, cells_of, free_point
-from edqn_jax.sim.worlds.moving import Moving
 
 Point = tuple[float, float, float]
 
@@ -124,13 +123,9 @@ def _random_run_missions(config: Config, training_key: jax.Array) -> RunMissions
     name, flown, count = config.world.name, config.world.flown, config.train.validation_missions
     drones = config.env.drones
     airframe = load_airframe(config.drone)
-    moving = Moving.of(config)
-    training_pool = families.random_pool(name, families.world_keys("training", config.world.pool_size), moving)
+    training_pool = families.worlds_of(config, name, "training", config.world.pool_size)
     training = _training_missions(training_pool, config, training_key)
-    validation, test = (
-        families.random_pool(name, families.world_keys(split, count // drones), moving)
-        for split in ("validation", "test")
-    )
+    validation, test = (families.worlds_of(config, name, split, count // drones) for split in ("validation", "test"))
     if flown:
         validation, test, own = with_equal_capacities([validation, test, _pool_of(flown, config)])
         test = _before(own, test)
@@ -159,7 +154,7 @@ def final_missions(config: Config, most: int) -> MissionSet:
         missions = jax.tree.map(lambda leaf: leaf[:count], final.world.missions)
         return dataclasses.replace(final, world=dataclasses.replace(final.world, missions=missions))
     count = max(count // config.env.drones, 1) * config.env.drones
-    pool = families.random_pool(name, families.world_keys("test", count // config.env.drones), Moving.of(config))
+    pool = families.worlds_of(config, name, "test", count // config.env.drones)
     if flown:
         pool, own = with_equal_capacities([pool, _pool_of(flown, config)])
         pool = _before(own, pool)
@@ -212,7 +207,7 @@ def _pool_of(name: str, config: Config) -> Scene:
     loaded = load_world(resolve_world(name))
     radii = config.drone.body_radius_m, config.env.goal_radius_m
     check_scene(loaded.scene, radii[0], names=loaded.names, title=f"'{name}'", goal_radius=radii[1])
-    return stack_scenes([loaded.scene])
+    return families.world_of_file(config, loaded.scene)
 
 
 def _file_run_missions(config: Config, training_key: jax.Array, validation_key: jax.Array) -> RunMissions:
@@ -321,7 +316,7 @@ def load_missions(
 def _random_missions(config: Config, name: str, missions: int, seed: int, moved: dict[str, jax.Array]) -> MissionSet:
     """Returns one mission in each of `missions` test worlds, of N drones one block in each of `missions` / N."""
     count = missions // config.env.drones
-    pool = families.random_pool(name, families.world_keys("test", count, first=seed * count), Moving.of(config))
+    pool = families.worlds_of(config, name, "test", count, first=seed * count)
     if moved:
         many = {key: jnp.broadcast_to(value, (missions, 3)) for key, value in moved.items()}
         pool = dataclasses.replace(pool, **many)
@@ -363,13 +358,13 @@ def _file_missions(config: Config, name: str, missions: int, seed: int, moved: d
     if missions == 1:
         check_scene(scene, radius, names=loaded.names, title=f"'{name}'", goal_radius=config.env.goal_radius_m)
         shortest_path(scene, scene.start, scene.goal, radius)  # raises where there is no path
-        pool = stack_scenes([scene])
+        pool = families.world_of_file(config, scene)
         return MissionSet(name, World(airframe, pool, own_missions(pool)), file, note)
     probe_key, missions_key = jax.random.split(mission_key(seed))
     # The world's own start does not matter, any free point will do; the goal does.
     standing = dataclasses.replace(scene, start=free_point(scene, probe_key))
     check_scene(standing, radius, names=loaded.names, title=f"'{name}'")
-    pool = stack_scenes([scene])
+    pool = families.world_of_file(config, scene)
     cells, said = _with_a_way(pool, config, name)
     many = spread_missions(pool, missions, 0.0, 0.0, missions_key, cells)
     return MissionSet(name, World(airframe, pool, many), file, " ".join(filter(None, (note, said))) or None)

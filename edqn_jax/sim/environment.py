@@ -30,7 +30,7 @@ from edqn_jax.sim.physics.airframe import load_airframe
 from edqn_jax.sim.physics.drone import Flight
 from edqn_jax.sim.scene.mjcf import check_scene, load_world, mjcf_of, resolve_world
 from edqn_jax.sim.scene.motion import Aim
-from edqn_jax.sim.scene.scene import Scene, scene_at, stack_scenes
+from edqn_jax.sim.scene.scene import Scene, scene_at
 from edqn_jax.sim.sensors import events, sensor
 from edqn_jax.sim.sensors.events import EventField, EventMemory
 from edqn_jax.sim.task import env, group
@@ -40,8 +40,7 @@ from edqn_jax.sim.task.missions import own_missions
 from edqn_jax.sim.task.observation import Observation
 from edqn_jax.sim.task.reward import Reward
 from edqn_jax.sim.task.task import task_of
-from edqn_jax.sim.worlds.families import SPLITS, Split, random_pool, world_keys
-from edqn_jax.sim.worlds.moving import Moving
+from edqn_jax.sim.worlds.families import SPLITS, Split, world_of_file, worlds_of
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -208,7 +207,7 @@ def _random_pool(config: Config, name: str, count: int, seed: int, split: Split)
         raise ConfigError(f"split must be one of {', '.join(SPLITS)}, not '{split}'")
     if count < 1 or seed < 0:
         raise ConfigError(f"worlds must be at least 1 and seed at least 0, not {count} and {seed}")
-    return random_pool(name, world_keys(split, count, first=seed * count), Moving.of(config))
+    return worlds_of(config, name, split, count, first=seed * count)
 
 
 def _file_pool(config: Config, name: str, count: int) -> Scene:
@@ -216,7 +215,7 @@ def _file_pool(config: Config, name: str, count: int) -> Scene:
         raise ConfigError(f"worlds must be 1 for '{name}', which is one world, not {count}")
     loaded = load_world(resolve_world(name))
     check_scene(loaded.scene, config.drone.body_radius_m, names=loaded.names, title=f"'{name}'")
-    return stack_scenes([loaded.scene])
+    return world_of_file(config, loaded.scene)
 
 
 @functools.partial(jax.jit, static_argnums=0)

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edqn_jax.config import CameraConfig
+from edqn_jax.sim.camera import raycast
 from edqn_jax.sim.camera.texture import WAVES
 from edqn_jax.sim.scene.scene import (
     Capsules,
@@ -23,6 +24,8 @@ from edqn_jax.sim.scene.scene import (
     UprightCylinders,
     scene_shapes,
 )
+from edqn_jax.sim.scene.surface import Daylight
+from tests.oracles.surfaces_plain import factor
 
 
 def luma(config: CameraConfig, scene: Scene, position: NDArray, rotation: NDArray, samples: int = 8) -> NDArray:
@@ -33,7 +36,8 @@ def luma(config: CameraConfig, scene: Scene, position: NDArray, rotation: NDArra
 def rgb(config: CameraConfig, scene: Scene, position: NDArray, rotation: NDArray, samples: int = 8) -> NDArray:
     """[H, W, 3] linear colour from `samples` x `samples` rays per pixel."""
     rays = directions(config, np.asarray(rotation, np.float64), samples)
-    flat = colours(config, scene_shapes(scene), np.asarray(position, np.float64), rays.reshape(-1, 3))
+    light = raycast.daylight_of(config, scene.daylight)
+    flat = colours(config, scene_shapes(scene), np.asarray(position, np.float64), rays.reshape(-1, 3), light)
     shape = (config.height, samples, config.width, samples, 3)
     return flat.reshape(shape).mean(axis=(1, 3))
 
@@ -51,25 +55,30 @@ def directions(config: CameraConfig, rotation: NDArray, samples: int) -> NDArray
     return np.stack([np.ones_like(u), -u, v], axis=-1) @ rotation.T
 
 
-def colours(config: CameraConfig, shapes: list[Shape], origin: NDArray, rays: NDArray) -> NDArray:
+def colours(
+    config: CameraConfig, shapes: list[Shape], origin: NDArray, rays: NDArray, light: Daylight | None = None
+) -> NDArray:
     """[K, 3] what each ray [K, 3] sees."""
+    light = raycast.daylight_of(config, light)
     best = np.full(len(rays), np.inf)
-    shown = np.tile(np.asarray(config.sky_rgb), (len(rays), 1))
+    shown = np.tile(np.asarray(light.sky), (len(rays), 1))
     for shape in shapes:
         some = np.flatnonzero(_may_meet(shape, origin, rays))
         t, normal = meet(shape, origin, rays[some])
         nearer = t < best[some]
         some, t, normal = some[nearer], t[nearer], normal[nearer]
         best[some] = t
-        bright = _shade(config, normal) * _texture(config, origin + t[:, None] * rays[some])
+        points, surface = origin + t[:, None] * rays[some], shape.surface
+        plaid = surface is None
+        pattern = _texture(config, points) if plaid else factor(surface.numbers, shape.position, points)
+        bright = _shade(light, normal) * pattern
         shown[some] = bright[:, None] * np.asarray(shape.albedo, np.float64)
     return shown
 
 
-def _shade(config: CameraConfig, normal: NDArray) -> NDArray:
-    azimuth, elevation = np.radians(config.sun_azimuth_deg), np.radians(config.sun_elevation_deg)
-    sun = np.array([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)])
-    return config.ambient + (1 - config.ambient) * np.clip(normal @ sun, 0.0, None)
+def _shade(light: Daylight, normal: NDArray) -> NDArray:
+    ambient, sun = float(light.ambient), np.asarray(light.sun, np.float64)
+    return ambient + (1 - ambient) * np.clip(normal @ sun, 0.0, None)
 
 
 def _texture(config: CameraConfig, points: NDArray) -> NDArray:

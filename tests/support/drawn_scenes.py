@@ -4,11 +4,14 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 from numpy.typing import NDArray
 
+from edqn_jax.config import SurfaceConfig
 from edqn_jax.sim.scene.distance import signed_distance
 from edqn_jax.sim.scene.scene import (
     PARKED,
@@ -22,7 +25,11 @@ from edqn_jax.sim.scene.scene import (
     UprightBoxes,
     UprightCylinders,
     build_scene,
+    stack_scenes,
+    take_scene,
 )
+from edqn_jax.sim.scene.surface import PATTERNS, Surface
+from edqn_jax.sim.worlds.looks import with_looks
 
 VOLUME = np.array([[0.0, 0.0, 0.0], [60.0, 60.0, 25.0]])
 GROUND = Planes(position=np.zeros(3), normal=np.array([0.0, 0.0, 1.0]), albedo=np.array([0.37, 0.43, 0.35]))
@@ -105,3 +112,21 @@ def one_of_each_kind() -> Scene:
         start=jnp.array([1.0, 1, 3]),
         goal=jnp.array([90.0, 90, 10]),
     )
+PATTERNS_AT_ONCE = tuple(name for name in PATTERNS if name != "blank")
+
+
+def looking(scene: Scene, seed: int = 0) -> Scene:
+    """A world whose shapes have surfaces of every pattern, and a light of its own."""
+    number, parts = 0, []
+    for name in PATTERNS_AT_ONCE:
+        dressed = with_looks(stack_scenes([scene]), jax.random.key(seed)[None], SurfaceConfig(pattern=name))
+        parts.append(take_scene(dressed, 0))
+    for kind, shapes in scene.shapes().items():
+        which = (np.arange(shapes.position.shape[0]) + number) % len(parts)
+        number += len(which)
+        of_kind = [part.shapes()[kind] for part in parts]
+        numbers = np.stack([np.asarray(each.surface.numbers) for each in of_kind])[which, np.arange(len(which))]
+        albedo = np.stack([np.asarray(each.albedo) for each in of_kind])[which, np.arange(len(which))]
+        surface = Surface(jnp.asarray(numbers), PATTERNS_AT_ONCE)
+        scene = scene.with_shapes({kind: dataclasses.replace(shapes, albedo=jnp.asarray(albedo), surface=surface)})
+    return dataclasses.replace(scene, daylight=parts[0].daylight)

@@ -22,7 +22,8 @@ from edqn_jax.sim.camera.columns import Frame
 from edqn_jax.sim.camera.coverage import Layers
 from edqn_jax.sim.camera.depth import nearest_depth
 from edqn_jax.sim.camera.primitive import draw_in_one_batch
-from edqn_jax.sim.camera.raycast import Rays, Values
+from edqn_jax.sim.camera.raycast import Rays
+from edqn_jax.sim.camera.surfaces import albedo_factor, surfaces_at_eye
 from edqn_jax.sim.camera.texture import texture
 from edqn_jax.sim.scene.scene import Scene
 from edqn_jax.sim.scene.shapes.kind import inverse
@@ -35,14 +36,25 @@ LUMA_WEIGHTS = (0.299, 0.587, 0.114)
 Pixels = TypeVar("Pixels", Array, np.ndarray)
 
 
-def _backdrop(config: CameraConfig, scene: Scene, origin: Array, rays: Rays, value: Values, sky: Array) -> Array:
+def _factor(
+    config: CameraConfig, frame: Frame, shape: Array | None, rays: Rays, depth: Array, slopes: tuple[Array, Array]
+) -> Array:
+    """Returns the factor [H, W] of plaid or patterns; `shape` is the number of the shape that each pixel shows."""
+    if frame.surfaces is None or shape is None:
+        return texture(config, frame.origin, rays, depth, *slopes)
+    return albedo_factor(frame.surfaces, shape, rays, depth, *slopes)
+
+
+def _backdrop(config: CameraConfig, frame: Frame, rays: Rays) -> Array:
     """Returns brightness [H, W] of textured ground and other planes before the sky."""
+    scene, origin, value = frame.scene, frame.origin, frame.value
+    light, first = raycast.daylight_of(config, scene.daylight), raycast.first_numbers(value)["planes"]
     shape = jnp.broadcast_shapes(rays.dx.shape, rays.dz.shape)
-    behind = jnp.broadcast_to(sky, shape)
+    behind = jnp.broadcast_to(frame.sky, shape)
     if scene.planes.normal.shape[0] == 0:
         return behind
     depth, shown, share = jnp.full(shape, jnp.inf), jnp.zeros(shape), jnp.zeros(shape)
-    slopes = jnp.zeros(shape), jnp.zeros(shape)
+    slopes, number = (jnp.zeros(shape), jnp.zeros(shape)), jnp.zeros(shape)
     for n in range(scene.planes.normal.shape[0]):
         normal = scene.planes.normal[n]
         height = jnp.dot(origin - scene.planes.position[n], normal)
@@ -58,22 +70,23 @@ def _backdrop(config: CameraConfig, scene: Scene, origin: Array, rays: Rays, val
         seen = (middle < 0) & (t > 0) & (t < HORIZON_M) & (t < depth)
         depth = jnp.where(seen, t, depth)
         share = jnp.where(seen, covered, share)
-        shown = jnp.where(seen, raycast.shade(config, *normal) * value["planes"][n], shown)
+        shown = jnp.where(seen, raycast.shade(light, *normal) * value["planes"][n], shown)
         slopes = jnp.where(seen, relative * across, slopes[0]), jnp.where(seen, relative * along, slopes[1])
-    factor = texture(config, origin, rays, jnp.where(share > 0, depth, 0.0), *slopes)
+        number = jnp.where(seen, first + n, number)
+    factor = _factor(config, frame, number, rays, jnp.where(share > 0, depth, 0.0), slopes)
     return behind + share * (shown * factor - behind)
 
 
 def blend(config: CameraConfig, frame: Frame, rays: Rays, layers: Layers) -> Array:
     """Returns brightness [H, W] of the layers over ground and sky."""
-    behind = _backdrop(config, frame.scene, frame.origin, rays, frame.value, frame.sky)
+    behind = _backdrop(config, frame, rays)
     for layer in reversed(layers):
         met = layer.closeness > 0
         near = jnp.where(met, inverse(layer.closeness), 0.0)
         level = layer.slope == coverage.LEVEL_FACE
         right = jnp.where(level, 0.0, -near * near * layer.slope)
         up = jnp.where(level, -near * inverse(rays.dz) * rays.pitch, 0.0)
-        factor = texture(config, frame.origin, rays, near, right, up)
+        factor = _factor(config, frame, layer.shape, rays, near, (right, up))
         behind = behind + jnp.where(met, layer.value * factor - layer.coverage * behind, 0.0)
     return behind
 
@@ -87,12 +100,15 @@ def _picture(config: CameraConfig, scene: Scene, origin: Array, rotation: Array,
     value = raycast.albedo_values(scene, weights)
     rays = raycast.camera_rays(config, rotation)
     many = raycast.camera_rays(config, rotation, config.samples_across, config.samples_down)
-    layers = coverage.no_layers((config.height, config.width))
+    light, first = raycast.daylight_of(config, scene.daylight), raycast.first_numbers(value)
+    surfaces = surfaces_at_eye(scene, first, origin)
+    layers = coverage.no_layers((config.height, config.width), numbered=surfaces is not None)
     for kind, met in raycast.hits(scene, origin, many, without=("spheres", "planes")).items():
-        layers = coverage.counted_layers(met, raycast.brightness_of(config, met, value[kind]), many, layers)
+        bright = raycast.brightness_of(light, met, value[kind])
+        layers = coverage.counted_layers(met, bright, first[kind], many, layers)
     layers = coverage.sphere_layers(config, scene, origin, rays, value, layers)
-    sky = jnp.sum(jnp.asarray(config.sky_rgb) * weights)
-    frame = Frame(origin=origin, heading=rotation[:2, 0], scene=scene, value=value, sky=sky)
+    sky = jnp.sum(jnp.asarray(light.sky) * weights)
+    frame = Frame(origin=origin, heading=rotation[:2, 0], scene=scene, value=value, sky=sky, surfaces=surfaces)
     return materialised(blend(config, frame, rays, layers))
 
 

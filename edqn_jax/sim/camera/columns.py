@@ -26,8 +26,10 @@ from edqn_jax.config import CameraConfig
 from edqn_jax.sim.camera import coverage, raycast
 from edqn_jax.sim.camera.coverage import Layers
 from edqn_jax.sim.camera.raycast import Rays, Values
+from edqn_jax.sim.camera.surfaces import surfaces_at_eye
 from edqn_jax.sim.scene.scene import Scene, no_shapes
 from edqn_jax.sim.scene.shapes.kind import TINY
+from edqn_jax.sim.scene.surface import Surface
 from edqn_jax.xla import materialised
 
 SLOTS = (0, 2, 4, 8)
@@ -55,6 +57,7 @@ class Frame:
     scene: Scene  # without the upright boxes and cylinders
     value: Values
     sky: Array  # []
+    surfaces: Surface | None  # of all shapes (`surfaces.surfaces_at_eye`)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -130,7 +133,12 @@ def _frame(config: CameraConfig, scene: Scene, origin: Array, rotation: Array, w
     heading = jnp.stack([forward_x, forward_y]) * lax.rsqrt(jnp.maximum(forward_x**2 + forward_y**2, TINY))
     rest = scene.with_shapes({kind: no_shapes(kind) for kind in raycast.UPRIGHT})
     frame = Frame(
-        origin=origin, heading=heading, scene=rest, value=value, sky=jnp.sum(jnp.asarray(config.sky_rgb) * weights)
+        origin=origin,
+        heading=heading,
+        scene=rest,
+        value=value,
+        sky=jnp.sum(jnp.asarray(raycast.daylight_of(config, scene.daylight).sky) * weights),
+        surfaces=surfaces_at_eye(scene, raycast.first_numbers(value), origin),
     )
     return frame, coverage.upright_table(config, scene, origin, heading, value)
 
@@ -242,10 +250,12 @@ def _other_shapes(frame: Frame, spheres: bool) -> int:
 
 def _layers_of_others(config: CameraConfig, frame: Frame, u: Array, depth: int, spheres: bool) -> Layers:
     """Returns the `depth` nearest layers of one column, [H, 1] pixels, of all but the upright shapes."""
-    layers = coverage.no_layers((config.height, 1), depth)
+    layers = coverage.no_layers((config.height, 1), depth, numbered=frame.surfaces is not None)
+    light, first = raycast.daylight_of(config, frame.scene.daylight), raycast.first_numbers(frame.value)
     many, rays = _rays(config, frame, u, config.samples_across, config.samples_down), _rays(config, frame, u)
     for kind, met in raycast.hits(frame.scene, frame.origin, many, without=EXACT).items():
-        layers = coverage.counted_layers(met, raycast.brightness_of(config, met, frame.value[kind]), many, layers)
+        bright = raycast.brightness_of(light, met, frame.value[kind])
+        layers = coverage.counted_layers(met, bright, first[kind], many, layers)
     if spheres:
         layers = coverage.sphere_layers(config, frame.scene, frame.origin, rays, frame.value, layers)
     return layers
@@ -265,7 +275,10 @@ def _take_sides(
     picked = rows.at[columns.number[None] * (none + 1) + index].get(mode="promise_in_bounds")
     boxes = columns.frame.value["boxes"].shape[1]
     mixed = index >= boxes if boxes < none else None
-    return words, coverage.sides(config, picked, mixed, boxes, columns.frame.heading, columns.u)
+    own, numbers = columns.frame.scene.daylight, None if columns.frame.surfaces is None else index
+    light = own if own is None else dataclasses.replace(own, sun=jnp.moveaxis(own.sun, -1, 0))
+    light = raycast.daylight_of(config, light)
+    return words, coverage.sides(config, light, picked, mixed, boxes, columns.frame.heading, columns.u, numbers)
 
 
 def _take_one(words: list[Array], none: int) -> tuple[Array, list[Array]]:

@@ -15,10 +15,20 @@ from flax import struct
 from jax import Array, lax
 
 from edqn_jax.config import CameraConfig
-from edqn_jax.sim.camera.raycast import Rays, Values, columns_of, direction_of, pitch_of, shade
+from edqn_jax.sim.camera.raycast import (
+    Rays,
+    Values,
+    columns_of,
+    daylight_of,
+    direction_of,
+    first_numbers,
+    pitch_of,
+    shade,
+)
 from edqn_jax.sim.scene.scene import Scene, Spheres, UprightBoxes, UprightCylinders
 from edqn_jax.sim.scene.shapes.kind import TINY, Hits, inverse, per_shape
 from edqn_jax.sim.scene.shapes.sphere import nearest_to_centre
+from edqn_jax.sim.scene.surface import Daylight
 from edqn_jax.xla import materialised
 
 NEAR_M = 0.05
@@ -42,16 +52,22 @@ class Layer:
     coverage: Array  # [H, W] share of the pixel's area, in [0, 1]
     value: Array  # [H, W] brightness times coverage
     slope: Array  # [H, W] change of closeness per pixel rightwards; LEVEL_FACE on horizontal faces
+    shape: Array | None = None  # [H, W] its number (`raycast.first_numbers`), where shapes have surfaces of their own
 
 
 Layers = tuple[Layer, ...]
 """The nearest layers of each pixel, nearest first."""
 
 
-def no_layers(shape: tuple[int, ...], depth: int = DEPTH_OF_LAYERS) -> Layers:
-    """Returns `depth` empty layers of pixels [H, W] = `shape`."""
+def no_layers(shape: tuple[int, ...], depth: int = DEPTH_OF_LAYERS, numbered: bool = False) -> Layers:
+    """Returns `depth` empty layers of pixels [H, W] = `shape`; `numbered` ones say which shape they show."""
     none = jnp.zeros(shape)
-    return (Layer(closeness=none, coverage=none, value=none, slope=none),) * depth
+    layer = Layer(closeness=none, coverage=none, value=none, slope=none, shape=none if numbered else None)
+    return (layer,) * depth
+
+
+def _pick(where: Array, a: Array | None, b: Array | None) -> Array | None:
+    return None if a is None or b is None else jnp.where(where, a, b)
 
 
 def insert(layers: Layers, new: Layer) -> Layers:
@@ -65,6 +81,7 @@ def insert(layers: Layers, new: Layer) -> Layers:
                 coverage=jnp.where(nearer, new.coverage, old.coverage),
                 value=jnp.where(nearer, new.value, old.value),
                 slope=jnp.where(nearer, new.slope, old.slope),
+                shape=_pick(nearer, new.shape, old.shape),
             )
         )
         # The farther of the two is compared with the next layer.
@@ -73,6 +90,7 @@ def insert(layers: Layers, new: Layer) -> Layers:
             coverage=jnp.where(nearer, old.coverage, new.coverage),
             value=jnp.where(nearer, old.value, new.value),
             slope=jnp.where(nearer, old.slope, new.slope),
+            shape=_pick(nearer, old.shape, new.shape),
         )
     return tuple(kept)
 
@@ -126,17 +144,19 @@ def upright_table(config: CameraConfig, scene: Scene, origin: Array, heading: Ar
     Args:
         heading: [2] cosine and sine of the camera's.
     """
-    parts = []
+    parts, light = [], daylight_of(config, scene.daylight)
     if scene.boxes.yaw.shape[0]:
-        parts.append(_boxes_in_table(config, scene.boxes, origin, heading, value["boxes"]))
+        parts.append(_boxes_in_table(config, light, scene.boxes, origin, heading, value["boxes"]))
     if scene.cylinders.radius.shape[0]:
-        parts.append(_cylinders_in_table(config, scene.cylinders, origin, heading, value["cylinders"]))
+        parts.append(_cylinders_in_table(config, light, scene.cylinders, origin, heading, value["cylinders"]))
     width = max((part.shape[1] for part in parts), default=2)
     parts = [jnp.pad(part, ((0, 0), (0, width - part.shape[1]))) for part in parts]
     return jnp.concatenate([*parts, jnp.zeros((1, width)).at[0, :2].set(jnp.asarray([jnp.inf, -jnp.inf]))])
 
 
-def _boxes_in_table(config: CameraConfig, boxes: UprightBoxes, origin: Array, heading: Array, value: Array) -> Array:
+def _boxes_in_table(
+    config: CameraConfig, light: Daylight, boxes: UprightBoxes, origin: Array, heading: Array, value: Array
+) -> Array:
     left, right = _extent_of_boxes(boxes, origin, heading)
     cos, sin = jnp.cos(boxes.yaw), jnp.sin(boxes.yaw)
     ox, oy = origin[0] - boxes.position[:, 0], origin[1] - boxes.position[:, 1]
@@ -145,31 +165,31 @@ def _boxes_in_table(config: CameraConfig, boxes: UprightBoxes, origin: Array, he
     fx, fy = cos * heading[0] + sin * heading[1], cos * heading[1] - sin * heading[0]
     hx, hy, sx, sy, zero = boxes.half[:, 0], boxes.half[:, 1], jnp.sign(bx), jnp.sign(by), jnp.zeros_like(cos)
     # Of two opposite faces a ray enters by the one on the eye's side.
-    x_face = value * shade(config, sx * cos, sx * sin, zero)
-    y_face = value * shade(config, -sy * sin, sy * cos, zero)
+    x_face = value * shade(light, sx * cos, sx * sin, zero)
+    y_face = value * shade(light, -sy * sin, sy * cos, zero)
     # The edge between the two.
     ex, ey = sx * hx - bx, sy * hy - by
     corner = (ex * fy - ey * fx) * inverse(ex * fx + ey * fy)
-    heights = _heights(config, boxes.position[:, 2] - origin[2], boxes.half[:, 2], value)
+    heights = _heights(config, light, boxes.position[:, 2] - origin[2], boxes.half[:, 2], value)
     # Computed once: a GPU would otherwise compute each number for itself, with all that it depends on.
     found = materialised([left, right, *heights, bx, by, fx, fy, hx, hy, x_face, y_face, corner])
     return jnp.stack(found, axis=1)
 
 
 def _cylinders_in_table(
-    config: CameraConfig, cylinders: UprightCylinders, origin: Array, heading: Array, value: Array
+    config: CameraConfig, light: Daylight, cylinders: UprightCylinders, origin: Array, heading: Array, value: Array
 ) -> Array:
     left, right = _extent_of_cylinders(cylinders, origin, heading)
-    heights = _heights(config, cylinders.position[:, 2] - origin[2], cylinders.half_height, value)
+    heights = _heights(config, light, cylinders.position[:, 2] - origin[2], cylinders.half_height, value)
     ox, oy = origin[0] - cylinders.position[:, 0], origin[1] - cylinders.position[:, 1]
     return jnp.stack([left, right, *heights, ox, oy, cylinders.radius, value], axis=1)
 
 
-def _heights(config: CameraConfig, middle: Array, half: Array, value: Array) -> tuple[Array, ...]:
+def _heights(config: CameraConfig, light: Daylight, middle: Array, half: Array, value: Array) -> tuple[Array, ...]:
     """Returns bottom, top and visible horizontal face (0: none), each in rows x metres, and the face's brightness."""
     bottom, top = (middle - half) / pitch_of(config), (middle + half) / pitch_of(config)
     zero = jnp.zeros(())
-    above, below = shade(config, zero, zero, zero + 1), shade(config, zero, zero, zero - 1)
+    above, below = shade(light, zero, zero, zero + 1), shade(light, zero, zero, zero - 1)
     # The top from above, the bottom from below, none in between.
     cap = jnp.where(top < 0, top, jnp.maximum(bottom, 0.0))
     return bottom, top, cap, value * jnp.where(top < 0, above, below)
@@ -201,7 +221,7 @@ def _box_sides(values: tuple[Array, ...], low: Array, high: Array) -> tuple[Arra
 
 
 def _cylinder_sides(
-    config: CameraConfig, values: tuple[Array, ...], low: Array, high: Array, heading: Array
+    light: Daylight, values: tuple[Array, ...], low: Array, high: Array, heading: Array
 ) -> tuple[Array, ...]:
     """Returns the same of a cylinder's side."""
     ox, oy, radius, value = values
@@ -216,23 +236,32 @@ def _cylinder_sides(
     nx, ny = (ox + enter * dx) * per_radius, (oy + enter * dy) * per_radius
     # On the tangent plane n . (t d) is constant, so 1/t changes like n . d.
     lean = (nx * sin - ny * cos) * inverse(nx * dx + ny * dy)
-    return enter, s + reach, value * shade(config, nx, ny, jnp.zeros_like(nx)), lean
+    return enter, s + reach, value * shade(light, nx, ny, jnp.zeros_like(nx)), lean
 
 
 def sides(
-    config: CameraConfig, picked: Array, is_cylinder: Array | None, boxes: int, heading: Array, u: Array
+    config: CameraConfig,
+    light: Daylight,
+    picked: Array,
+    is_cylinder: Array | None,
+    boxes: int,
+    heading: Array,
+    u: Array,
+    numbers: Array | None = None,
 ) -> Array:
-    """Returns what the pixels of columns need of the shapes picked for them: [B, K, 11].
+    """Returns what the pixels of columns need of the shapes picked for them: [B, K, 11], or 12 with `numbers`.
 
     Share of the column's width, bottom and top row of the side, lowest and highest of the cap, brightness of both
-    times share, least and greatest closeness, closeness per row on the cap, lean.
+    times share, least and greatest closeness, closeness per row on the cap, lean, number.
 
     Args:
+        light: of each column; coordinates of the sun are the leading axis.
         picked: [K, B, F] rows of `upright_table`.
         is_cylinder: [K, B] bool.
         boxes: number of boxes in the table, before the cylinders, static.
         heading: [B, 2].
         u: [B] middle of each column.
+        numbers: [K, B] of the shapes.
     """
     pitch = pitch_of(config)
     left, right, bottom, top, cap, shown, *values = jnp.moveaxis(picked, -1, 0)
@@ -240,7 +269,7 @@ def sides(
     low, high = jnp.maximum(u - pitch / 2, left), jnp.minimum(u + pitch / 2, right)
     share = jnp.maximum(high - low, 0.0) / pitch
     low, high = jnp.where(share > 0, low, u), jnp.where(share > 0, high, u)
-    round_sides = partial(_cylinder_sides, config, tuple(values[:CYLINDER_VALUES]), low, high, heading.T)
+    round_sides = partial(_cylinder_sides, light, tuple(values[:CYLINDER_VALUES]), low, high, heading.T)
     if not boxes:
         enter, leave, side, lean = round_sides()
     else:
@@ -264,13 +293,14 @@ def sides(
         near,
         inverse(cap),
         lean * near * pitch,
+        *([] if numbers is None else [numbers.astype(jnp.float32)]),
     ]
     # Computed once: XLA would otherwise repeat all of it for every row.
     return materialised(jnp.moveaxis(materialised(jnp.stack(found)), (0, 1, 2), (2, 1, 0)))
 
 
 def insert_sides(config: CameraConfig, layers: Layers, columns: Array) -> Layers:
-    """Adds the shapes of one column, [K, 11] of `sides`, to the layers of its pixels [H, 1]."""
+    """Adds the shapes of one column, [K, 11 or 12] of `sides`, to the layers of its pixels [H, 1]."""
     for column in columns:
         layers = _insert_side(config, layers, column)
     return layers
@@ -278,7 +308,7 @@ def insert_sides(config: CameraConfig, layers: Layers, columns: Array) -> Layers
 
 @partial(jax.jit, static_argnums=0)  # traced once for all slots
 def _insert_side(config: CameraConfig, layers: Layers, column: Array) -> Layers:
-    share, bottom, top, cap_low, cap_high, side, shown, far, near, per_row, lean = column
+    share, bottom, top, cap_low, cap_high, side, shown, far, near, per_row, lean, *number = column
     row = (config.height / 2 - 0.5 - jnp.arange(config.height, dtype=jnp.float32))[:, None]
     rows_side = jnp.maximum(jnp.minimum(top, row + 0.5) - jnp.maximum(bottom, row - 0.5), 0.0)
     rows_cap = jnp.maximum(jnp.minimum(cap_high, row + 0.5) - jnp.maximum(cap_low, row - 0.5), 0.0)
@@ -288,6 +318,7 @@ def _insert_side(config: CameraConfig, layers: Layers, column: Array) -> Layers:
         coverage=coverage,
         value=rows_side * side + rows_cap * shown,
         slope=jnp.where(rows_cap > rows_side, LEVEL_FACE, lean),
+        shape=jnp.broadcast_to(number[0], coverage.shape) if number else None,
     )
     return insert(layers, layer)
 
@@ -303,7 +334,7 @@ def spheres_in_columns(config: CameraConfig, spheres: Spheres, origin: Array, he
 def sphere_layers(
     config: CameraConfig, scene: Scene, origin: Array, rays: Rays, value: Values, layers: Layers
 ) -> Layers:
-    """Adds layers of spheres, for any camera: coverage falls linearly over the pixel that the silhouette crosses."""
+    """Adds layers [H, W] of spheres, for any camera: coverage falls linearly over the pixel that an edge crosses."""
     spheres, (dx, dy, dz) = scene.spheres, direction_of(rays)
     if spheres.radius.shape[0] == 0:
         return layers
@@ -316,20 +347,24 @@ def sphere_layers(
     coverage = jnp.where(nearest > 0, jnp.clip(0.5 + (radius - miss) / pixel, 0.0, most), 0.0)
     per_miss = 1.0 / jnp.maximum(jnp.maximum(miss, radius), TINY)
     normal = (ox + depth * dx, oy + depth * dy, oz + depth * dz)
-    bright = shade(config, *(n * per_miss for n in normal)) * per_shape(value["spheres"])
+    light, number = daylight_of(config, scene.daylight), first_numbers(value)["spheres"]
+    bright = shade(light, *(n * per_miss for n in normal)) * per_shape(value["spheres"])
     closeness = jnp.where(coverage > 0, 1.0 / jnp.maximum(depth, NEAR_M), 0.0)
     for n in range(coverage.shape[0]):
         share, flat = coverage[n], jnp.zeros_like(coverage[n])
-        layers = insert(layers, Layer(closeness=closeness[n], coverage=share, value=share * bright[n], slope=flat))
+        shape = None if layers[0].shape is None else jnp.full_like(share, number + n)
+        layer = Layer(closeness=closeness[n], coverage=share, value=share * bright[n], slope=flat, shape=shape)
+        layers = insert(layers, layer)
     return layers
 
 
-def counted_layers(met: Hits, brightness: Array, rays: Rays, layers: Layers) -> Layers:
+def counted_layers(met: Hits, brightness: Array, first: int, rays: Rays, layers: Layers) -> Layers:
     """Adds layers of any shapes from `across` x `down` rays per pixel: the share of rays that meet the shape.
 
     Args:
         met: where the rays meet N shapes.
         brightness: [N, R, C] there.
+        first: number of the first of these shapes.
         rays: of all pixels.
         layers: of what was drawn before.
     """
@@ -339,8 +374,8 @@ def counted_layers(met: Hits, brightness: Array, rays: Rays, layers: Layers) -> 
     def mean(x: Array) -> Array:
         return jnp.mean(materialised(x).reshape(rays.down, rows, rays.across, columns), axis=(0, 2))
 
-    def add(layers: Layers, one: tuple[Array, Array, Array]) -> tuple[Layers, None]:
-        hit, depth, bright = one
+    def add(layers: Layers, one: tuple[Array, ...]) -> tuple[Layers, None]:
+        hit, depth, bright, *number = one
         coverage = mean(hit.astype(jnp.float32))
         inverse_depth = mean(jnp.where(hit, inverse(depth), 0.0))
         layer = Layer(
@@ -348,8 +383,12 @@ def counted_layers(met: Hits, brightness: Array, rays: Rays, layers: Layers) -> 
             coverage=coverage,
             value=mean(jnp.where(hit, bright, 0.0)),
             slope=jnp.zeros_like(coverage),
+            shape=jnp.broadcast_to(number[0], coverage.shape) if number else None,
         )
         return insert(layers, layer), None
 
-    hit, depth, bright = (jnp.broadcast_to(x, x.shape[:1] + shape) for x in (met.hit, met.depth, brightness))
-    return lax.scan(add, layers, (hit, depth, bright))[0]
+    given = (met.hit, met.depth, brightness)
+    many = tuple(jnp.broadcast_to(x, x.shape[:1] + shape) for x in given)
+    if layers[0].shape is not None:
+        many += (first + jnp.arange(many[0].shape[0], dtype=jnp.float32),)
+    return lax.scan(add, layers, many)[0]

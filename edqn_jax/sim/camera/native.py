@@ -16,14 +16,16 @@ from jax import Array
 
 from edqn_jax.config import CameraConfig
 from edqn_jax.native import build
-from edqn_jax.sim.camera import coverage, raycast
+from edqn_jax.sim.camera import coverage, raycast, surfaces
 from edqn_jax.sim.camera.primitive import most_rows
 from edqn_jax.sim.camera.texture import WAVES
 from edqn_jax.sim.scene.scene import Scene
 from edqn_jax.sim.scene.shapes.kind import TINY
 from edqn_jax.sim.scene.shapes.plane import HORIZON_M
+from edqn_jax.sim.scene.surface import CONTRAST, KIND, PHASES, SHARES, SURFACE_NUMBERS
 
 SOURCES = {name: Path(__file__).with_name(f"pictures.{name}") for name in ("h", "c", "cu")}
+HEADERS = (SOURCES["h"], Path(__file__).with_name("patterns.h"))
 
 OPERANDS = {
     "boxes": ("position", "half", "yaw", "albedo"),
@@ -52,7 +54,7 @@ def can_draw(config: CameraConfig, scene: Scene, platform: str) -> bool:
 
 
 def pictures(config: CameraConfig, scene: Scene, origin: Array, rotation: Array, weights: Array) -> Array:
-    """Returns brightness [M, H, W] as `columns.pictures` does; arrays have a leading [L], see `primitive`."""
+    """Returns brightness [M, H, W] as `columns.pictures` does, origins in metres; leading [L] as in `primitive`."""
     return _call("edqn_pictures", config, scene, origin, rotation, weights)
 
 
@@ -70,19 +72,33 @@ def _call(target: str, config: CameraConfig, scene: Scene, *frames: Array) -> Ar
     waves = np.array(
         [[*np.divide(w.direction, config.texture_period_m * w.octave), w.weight] for w in WAVES], np.float32
     )
-    first = [raycast.pitch_of(config), config.texture_contrast, config.ambient]
-    constants = np.array([*first, *raycast.sun_direction(config), *config.sky_rgb], np.float32)
+    constants = np.array([raycast.pitch_of(config), config.texture_contrast], np.float32)
     shapes = [getattr(getattr(scene, kind), name) for kind, names in OPERANDS.items() for name in names]
     origin, rotation, *weights = frames
+    looks = [_daylight(config, scene), *(_surfaces(scene, kind) for kind in OPERANDS)] if weights else []
     count = most_rows([*shapes, *frames])
     shape = jax.ShapeDtypeStruct((count, config.height, config.width), jnp.float32)
-    return jax.ffi.ffi_call(target, shape)(constants, u, v, waves, origin, rotation, *shapes, *weights)
+    return jax.ffi.ffi_call(target, shape)(constants, u, v, waves, origin, rotation, *shapes, *looks, *weights)
+
+
+def _daylight(config: CameraConfig, scene: Scene) -> Array | np.ndarray:
+    """Returns the light of each world: ambient share, direction of the sun, RGB of the sky: [L, 7]."""
+    light = scene.daylight
+    if light is None:
+        return np.array([[config.ambient, *raycast.sun_direction(config), *config.sky_rgb]], np.float32)
+    return jnp.concatenate([light.ambient[:, None], light.sun, light.sky], axis=1)
+
+
+def _surfaces(scene: Scene, kind: str) -> Array | np.ndarray:
+    """Returns the surfaces of a kind [L, N, SURFACE_NUMBERS]; N is 0 where shapes carry the plaid."""
+    surface = getattr(scene, kind).surface
+    return np.zeros((1, 0, SURFACE_NUMBERS), np.float32) if surface is None else surface.numbers
 
 
 def is_at_hand(platform: str) -> bool:
     """Returns whether the library of "cpu" or "cuda" is compiled, loaded and registered, which the first call does."""
     compiler, source = (build.C, SOURCES["c"]) if platform == "cpu" else (build.cuda(), SOURCES["cu"])
-    return compiler is not None and build.registered(source, TARGETS, definitions(), compiler, (SOURCES["h"],))
+    return compiler is not None and build.registered(source, TARGETS, definitions(), compiler, HEADERS)
 
 
 def definitions() -> tuple[str, ...]:
@@ -93,8 +109,12 @@ def definitions() -> tuple[str, ...]:
         "NEAR_M": coverage.NEAR_M,
         "FAR_U": coverage.FAR_U,
         "LEVEL_FACE": coverage.LEVEL_FACE,
+        "EDGE": surfaces.EDGE,
+        "OVERTONE": surfaces.OVERTONE,
     }
     counts = {"DEPTH_OF_LAYERS": coverage.DEPTH_OF_LAYERS, "MOST_PLANES": MOST_PLANES}
+    counts |= {"SURFACE_NUMBERS": SURFACE_NUMBERS, "KIND": KIND, "CONTRAST": CONTRAST}
+    counts |= {"SHARES": SHARES, "PHASES": PHASES}
     return (
         *(f"{name}={value:e}f" for name, value in numbers.items()),
         *(f"{name}={value}" for name, value in counts.items()),

@@ -54,6 +54,12 @@ static inline Lanes counted(void) {
   return number;
 }
 
+static inline float highest(Lanes x) {
+  float found = x[0];
+  for (int l = 1; l < LANES; ++l) found = x[l] > found ? x[l] : found;
+  return found;
+}
+
 #include "pictures.h"
 
 /* An upright shape that covers the columns [first, last), and its numbers: NUMBERS arrays of `stride`. */
@@ -70,6 +76,7 @@ typedef struct {
   Sides* sides;
   Extent* spheres;
   Layers* layers;
+  Pattern* patterns; /* by shape */
   int *covering, *found; /* shapes that cover each column, in order, and how many */
   int stride, most;
 } Work;
@@ -84,9 +91,10 @@ static int prepare(const Camera* c, const Shapes* s, Work* w) {
   w->layers = aligned_alloc(_Alignof(Layers), sizeof(Layers) * (size_t)(rows / LANES));
   w->u = malloc(sizeof(float) * (size_t)(w->stride + rows));
   w->spheres = malloc(sizeof(Extent) * (size_t)(s->spheres + 1));
+  w->patterns = malloc(sizeof(Pattern) * (size_t)(uprights + s->spheres + s->planes + 1));
   w->most = uprights + 1;
   w->found = malloc(sizeof(int) * (size_t)c->width * (size_t)(w->most + 1));
-  if (!w->numbers || !w->sides || !w->layers || !w->u || !w->found || !w->spheres) return 0;
+  if (!w->numbers || !w->sides || !w->layers || !w->u || !w->found || !w->spheres || !w->patterns) return 0;
   w->covering = w->found + c->width;
   w->v = w->u + w->stride;
   /* What lies beyond the image repeats its edge, so that all numbers are finite. */
@@ -96,7 +104,7 @@ static int prepare(const Camera* c, const Shapes* s, Work* w) {
 }
 
 static void release(Work* w) {
-  free(w->numbers), free(w->sides), free(w->layers), free(w->u), free(w->found), free(w->spheres);
+  free(w->numbers), free(w->sides), free(w->layers), free(w->u), free(w->found), free(w->spheres), free(w->patterns);
 }
 
 /* Draws one frame, [H, C]. */
@@ -106,6 +114,7 @@ static void draw(const Camera* c, const Shapes* s, const Eye* e, Work* w, float*
   Plane planes[MOST_PLANES];
   planes_of(c, s, e, planes);
   light_planes(c, s, e, planes);
+  for (int n = 0; n < s->boxes + s->cylinders + s->spheres + s->planes; ++n) w->patterns[n].kind = UNKNOWN;
   int visible = 0;
   for (int n = 0; n < s->boxes + s->cylinders; ++n) {
     Upright shape;
@@ -138,7 +147,7 @@ static void draw(const Camera* c, const Shapes* s, const Eye* e, Work* w, float*
       for (int b = 0; b < blocks; ++b) insert_side(c, numbers, w->stride, b * LANES, &w->layers[b]);
     }
     for (int b = 0; b < blocks; ++b) {
-      const Lanes behind = blend(c, planes, s->planes, e, waves, dx, dy, load(w->v + b * LANES), &w->layers[b]);
+      const Lanes behind = blend(c, s, planes, e, waves, w->patterns, dx, dy, load(w->v + b * LANES), &w->layers[b]);
       for (int l = 0; l < LANES && b * LANES + l < c->height; ++l)
         picture[(b * LANES + l) * c->width + column] = behind[l];
     }

@@ -41,6 +41,7 @@ FN Lanes absolute(Lanes x) { return fabsf(x); }
 FN Lanes roots(Lanes x) { return sqrtf(x); }
 FN int any_of(Mask where) { return where; }
 FN Lanes counted(void) { return 0; }
+FN float highest(Lanes x) { return x; }
 
 #include "pictures.h"
 
@@ -152,7 +153,7 @@ static __global__ void __launch_bounds__(THREADS, RESIDENT) draw(const Batch bat
     kept = uprights <= THREADS && found <= AT_ONCE;
     if (drawn)
       batch.pictures[((int64_t)m * c->height + row) * c->width + column] =
-          blend(c, frame.planes, s->planes, e, waves, dx, dy, dz, &layers);
+          blend(c, s, frame.planes, e, waves, 0, dx, dy, dz, &layers);
   }
 }
 

@@ -6,7 +6,7 @@
  *
  * Whoever includes this has defined: LANES, how many pixels are drawn at a time; Lanes and Mask, their numbers and
  * whether something holds of them; FN, how functions are declared; UNROLLED, before a loop; ALIGNED, of what is read at
- * once; and lanes, store, pick, lesser, greater, absolute, roots, any_of, counted of Lanes.
+ * once; and lanes, store, pick, lesser, greater, absolute, roots, any_of, counted, highest of Lanes.
  */
 
 #ifndef EDQN_PICTURES_H
@@ -52,6 +52,8 @@ typedef struct {
   const float *cylinder_position, *cylinder_radius, *cylinder_half, *cylinder_albedo;
   const float *sphere_position, *sphere_radius, *sphere_albedo;
   const float *plane_position, *plane_normal, *plane_albedo;
+  int patterned;                                                       /* whether shapes have surfaces of their own */
+  const float *box_surface, *cylinder_surface, *sphere_surface, *plane_surface; /* [SURFACE_NUMBERS] a shape */
 } Shapes;
 
 typedef struct {
@@ -89,10 +91,10 @@ FN void columns_between(const Camera* c, float left, float right, int* first, in
 
 /* --------------------------------------------------------------------- upright shapes and the columns they cover */
 
-enum { SHARE, BOTTOM, TOP, CAP_LOW, CAP_HIGH, SIDE, SHOWN, FAR, NEAR, PER_ROW, LEAN, NUMBERS };
+enum { SHARE, BOTTOM, TOP, CAP_LOW, CAP_HIGH, SIDE, SHOWN, FAR, NEAR, PER_ROW, LEAN, SHAPE, NUMBERS };
 
 typedef struct {
-  float left, right, bottom, top, cap, shown;
+  float left, right, bottom, top, cap, shown, shape;
 } Extent;
 
 FN void extent_of_box(const Eye* e, float x, float y, float hx, float hy, float cos, float sin, Extent* extent) {
@@ -156,6 +158,7 @@ FN void write_sides(const Camera* c, const Extent* e, Lanes share, Lanes enter, 
   store(numbers + NEAR * stride, near);
   store(numbers + PER_ROW * stride, lanes(inverse(e->cap)));
   store(numbers + LEAN * stride, lean * near * c->pitch);
+  store(numbers + SHAPE * stride, lanes(e->shape));
 }
 
 /* The part of the columns `u` that an extent covers: its ends; returns its share of the column's width. */
@@ -193,7 +196,7 @@ FN Mask meets_x_face(const Upright* b, Lanes u) {
 FN int upright_box(const Camera* c, const Shapes* s, const Eye* e, int n, Upright* b) {
   const float *position = s->box_position + 3 * n, *half = s->box_half + 3 * n;
   const float ox = e->origin[0] - position[0], oy = e->origin[1] - position[1];
-  b->is_box = 1, b->hx = half[0], b->hy = half[1];
+  b->is_box = 1, b->hx = half[0], b->hy = half[1], b->extent.shape = (float)n;
   if (out_of_sight(c, e, -ox, -oy, sqrtf(b->hx * b->hx + b->hy * b->hy))) return 0;
   const float cos = cosf(s->box_yaw[n]), sin = sinf(s->box_yaw[n]);
   extent_of_box(e, -ox, -oy, b->hx, b->hy, cos, sin, &b->extent);
@@ -227,7 +230,7 @@ FN void box_sides(const Camera* c, const Upright* b, Lanes u, float* numbers, in
 /* Returns whether cylinder `n` may cover a column, and what columns share of it. */
 FN int upright_cylinder(const Camera* c, const Shapes* s, const Eye* e, int n, Upright* p) {
   const float* position = s->cylinder_position + 3 * n;
-  p->is_box = 0, p->radius = s->cylinder_radius[n];
+  p->is_box = 0, p->radius = s->cylinder_radius[n], p->extent.shape = (float)(s->boxes + n);
   p->x = e->origin[0] - position[0], p->y = e->origin[1] - position[1];
   if (out_of_sight(c, e, -p->x, -p->y, p->radius)) return 0;
   extent_of_disc(e, -p->x, -p->y, p->radius, &p->extent);
@@ -269,7 +272,7 @@ FN void sides(const Camera* c, const Eye* e, const Upright* from, Lanes u, float
 /* -------------------------------------------------------------------------------------------- layers of a column */
 
 typedef struct {
-  Lanes closeness, coverage, value, slope;
+  Lanes closeness, coverage, value, slope, shape; /* shape: its number, boxes first, then cylinders, then spheres */
 } Layer;
 
 /* The nearest layers of LANES rows of a column, nearest first, and how many shapes were inserted. */
@@ -279,7 +282,7 @@ typedef struct {
 } Layers;
 
 FN void insert(Layers* layers, Layer added) {
-  const Layer none = {lanes(0), lanes(0), lanes(0), lanes(0)};
+  const Layer none = {lanes(0), lanes(0), lanes(0), lanes(0), lanes(0)};
   if (!layers->inserted++) {
     layers->layer[0] = added;
     for (int k = 1; k < DEPTH_OF_LAYERS; ++k) layers->layer[k] = none;
@@ -289,9 +292,11 @@ FN void insert(Layers* layers, Layer added) {
     const Layer old = layers->layer[k];
     const Mask nearer = added.closeness > old.closeness;
     const Layer front = {pick(nearer, added.closeness, old.closeness), pick(nearer, added.coverage, old.coverage),
-                         pick(nearer, added.value, old.value), pick(nearer, added.slope, old.slope)};
+                         pick(nearer, added.value, old.value), pick(nearer, added.slope, old.slope),
+                         pick(nearer, added.shape, old.shape)};
     const Layer back = {pick(nearer, old.closeness, added.closeness), pick(nearer, old.coverage, added.coverage),
-                        pick(nearer, old.value, added.value), pick(nearer, old.slope, added.slope)};
+                        pick(nearer, old.value, added.value), pick(nearer, old.slope, added.slope),
+                        pick(nearer, old.shape, added.shape)};
     layers->layer[k] = front, added = back;
   }
 }
@@ -309,7 +314,7 @@ FN void insert_side(const Camera* c, const float* n, int stride, int first, Laye
   const Lanes closeness = between(row * n[PER_ROW * stride], n[FAR * stride], n[NEAR * stride]);
   const Layer added = {pick(coverage > 0, closeness, lanes(0)), coverage,
                        of_side * n[SIDE * stride] + of_cap * n[SHOWN * stride],
-                       pick(of_cap > of_side, lanes(LEVEL_FACE), lanes(n[LEAN * stride]))};
+                       pick(of_cap > of_side, lanes(LEVEL_FACE), lanes(n[LEAN * stride])), lanes(n[SHAPE * stride])};
   insert(layers, added);
 }
 
@@ -333,7 +338,7 @@ FN void insert_sphere(const Camera* c, const Shapes* s, const Eye* e, int n, flo
   const Lanes bright =
       value * shades(c, (ox + depth * dx) * per_miss, (oy + depth * dy) * per_miss, (oz + depth * dz) * per_miss);
   const Layer added = {pick(coverage > 0, 1.0f / greater(depth, lanes(NEAR_M)), lanes(0)), coverage, coverage * bright,
-                       lanes(0)};
+                       lanes(0), lanes((float)(s->boxes + s->cylinders + n))};
   insert(layers, added);
 }
 
@@ -385,6 +390,35 @@ FN void textures(const Camera* c, const Wave* waves, float dx, float dy, Lanes d
   UNROLLED for (int k = 0; k < MEETINGS; ++k) factor[k] = 1.0f + c->contrast * factor[k];
 }
 
+/* ------------------------------------------------------------------------------------------------------- surfaces */
+
+#include "patterns.h"
+
+/* The pattern of shape `n`: boxes, cylinders, spheres, planes. */
+FN Pattern pattern_of_shape(const Camera* c, const Shapes* s, const Eye* e, int n) {
+  const int counts[4] = {s->boxes, s->cylinders, s->spheres, s->planes};
+  const float* places[4] = {s->box_position, s->cylinder_position, s->sphere_position, s->plane_position};
+  const float* surfaces[4] = {s->box_surface, s->cylinder_surface, s->sphere_surface, s->plane_surface};
+  const float up[3] = {0, 0, c->pitch}, right[3] = {e->sin * c->pitch, -e->cos * c->pitch, 0}, axis[3] = {0, 0, 1};
+  int kind = 0;
+  while (kind < 3 && n >= counts[kind]) n -= counts[kind++];
+  return pattern_of(surfaces[kind] + SURFACE_NUMBERS * n, places[kind] + 3 * n, e->origin, right, up, axis);
+}
+
+/* Returns the relative albedo of the shapes that LANES rays meet, 1 where their number is negative. Patterns that were
+ * found are kept in `known`, by shape, where that is not null. */
+FN Lanes albedo_of(const Camera* c, const Shapes* s, const Eye* e, Pattern* known, const Sight* sight, Lanes shape) {
+  Lanes factor = lanes(1);
+  for (float n = highest(shape); n >= 0; n = highest(shape)) {
+    Pattern one, *p = known ? &known[(int)n] : &one;
+    if (!known || p->kind == UNKNOWN) *p = pattern_of_shape(c, s, e, (int)n);
+    const Lanes found = relative_albedo(sight, p);
+    if (!any_of(shape != n)) return found;
+    factor = pick(shape == n, found, factor), shape = pick(shape == n, lanes(-1), shape);
+  }
+  return factor;
+}
+
 /* ------------------------------------------------------------------------------------------------- ground and sky */
 
 /* What all pixels of a frame share of a plane. */
@@ -411,11 +445,11 @@ FN void light_planes(const Camera* c, const Shapes* s, const Eye* e, Plane* plan
 }
 
 /* Where LANES rays, along `dz` in the column along (dx, dy), meet ground or another plane; its brightness without
- * texture, and which share of the pixels it covers. */
+ * texture, which share of the pixels it covers, and which it is, or -1. */
 FN void meet_planes(const Plane* planes, int count, float dx, float dy, Lanes dz, Meeting* at, Lanes* shown,
-                    Lanes* share) {
+                    Lanes* share, Lanes* which) {
   const Meeting none = {lanes(NOWHERE), lanes(0), lanes(0)};
-  *at = none, *shown = lanes(0), *share = lanes(0);
+  *at = none, *shown = lanes(0), *share = lanes(0), *which = lanes(-1);
   for (int n = 0; n < count; ++n) {
     const Plane* p = &planes[n];
     const Lanes approach = p->nx * dx + p->ny * dy + p->nz * dz;
@@ -424,7 +458,7 @@ FN void meet_planes(const Plane* planes, int count, float dx, float dy, Lanes dz
     const Lanes per_middle = inverses(middle), t = -p->height * per_middle, relative = -t * per_middle;
     const Mask seen = (middle < 0) & (t > 0) & (t < HORIZON_M) & (t < at->depth);
     *share = pick(seen, part, *share), *shown = pick(seen, lanes(p->value), *shown);
-    at->depth = pick(seen, t, at->depth);
+    at->depth = pick(seen, t, at->depth), *which = pick(seen, lanes((float)n), *which);
     at->right = pick(seen, relative * p->across, at->right), at->up = pick(seen, relative * p->along, at->up);
   }
   at->depth = pick(*share > 0, at->depth, lanes(0));
@@ -433,9 +467,22 @@ FN void meet_planes(const Plane* planes, int count, float dx, float dy, Lanes dz
 /* Coverage from which on what lies behind is not seen: 1 but for rounding. */
 #define WHOLE (1 - 1e-6f)
 
-/* Blends the layers of LANES rows over `count` planes and the sky. */
-FN Lanes blend(const Camera* c, const Plane* planes, int count, const Eye* e, const Wave* waves, float dx, float dy,
-               Lanes dz, const Layers* layers) {
+/* Writes what `textures` does, of shapes with surfaces of their own; `plane`: numbers of the planes behind layers. */
+FN void surfaces(const Camera* c, const Shapes* s, const Eye* e, Pattern* known, const float* ahead, Lanes high,
+                 const Meeting* at, const Layers* layers, unsigned wanted, Lanes plane, Lanes* factor) {
+  const int others = s->boxes + s->cylinders + s->spheres;
+  UNROLLED for (int k = 0; k < MEETINGS; ++k) {
+    if (!(wanted >> k & 1)) continue;
+    const Sight sight = {ahead, high, at[k]};
+    const Lanes shape = k < DEPTH_OF_LAYERS ? pick(layers->layer[k].closeness > 0, layers->layer[k].shape, lanes(-1))
+                                            : pick(plane >= 0, plane + (float)others, lanes(-1));
+    factor[k] = albedo_of(c, s, e, known, &sight, shape);
+  }
+}
+
+/* Blends the layers of LANES rows over planes and the sky. */
+FN Lanes blend(const Camera* c, const Shapes* s, const Plane* planes, const Eye* e, const Wave* waves,
+               Pattern* known, float dx, float dy, Lanes dz, const Layers* layers) {
   const int used = layers->inserted < DEPTH_OF_LAYERS ? layers->inserted : DEPTH_OF_LAYERS;
   int visible = 0, hidden = 0; /* layers before, and with, the first that covers all that lies behind it */
   UNROLLED for (int k = 0; k < DEPTH_OF_LAYERS; ++k) if (k < used && !hidden)
@@ -443,7 +490,7 @@ FN Lanes blend(const Camera* c, const Plane* planes, int count, const Eye* e, co
       hidden = !any_of(layers->layer[k].coverage < WHOLE);
 
   Meeting at[MEETINGS] = {{lanes(0), lanes(0), lanes(0)}};
-  Lanes factor[MEETINGS], shown = lanes(0), share = lanes(0);
+  Lanes factor[MEETINGS], shown = lanes(0), share = lanes(0), plane = lanes(-1);
   unsigned wanted = (1u << visible) - 1;
   UNROLLED for (int k = 0; k < DEPTH_OF_LAYERS; ++k) {
     if (k >= visible) continue;
@@ -454,10 +501,14 @@ FN Lanes blend(const Camera* c, const Plane* planes, int count, const Eye* e, co
     at[k].up = pick(level, -near * inverses(dz) * c->pitch, lanes(0));
   }
   if (!hidden) {
-    meet_planes(planes, count, dx, dy, dz, &at[DEPTH_OF_LAYERS], &shown, &share);
+    meet_planes(planes, s->planes, dx, dy, dz, &at[DEPTH_OF_LAYERS], &shown, &share, &plane);
     wanted |= (unsigned)(any_of(share > 0) != 0) << DEPTH_OF_LAYERS;
   }
-  textures(c, waves, dx, dy, dz, at, wanted, factor);
+  const float ahead[3] = {dx, dy, 0};
+  if (s->patterned)
+    surfaces(c, s, e, known, ahead, dz, at, layers, wanted, plane, factor);
+  else
+    textures(c, waves, dx, dy, dz, at, wanted, factor);
 
   Lanes behind = lanes(hidden ? 0 : e->sky);
   if (wanted >> DEPTH_OF_LAYERS & 1) behind += share * (shown * factor[DEPTH_OF_LAYERS] - behind);
@@ -564,7 +615,9 @@ enum {
   CYLINDERS = BOXES + 4,
   SPHERES = CYLINDERS + 4,
   PLANES = SPHERES + 3,
-  WEIGHTS = PLANES + 3, /* of pictures */
+  LIGHT = PLANES + 3, /* from here on of pictures alone */
+  SURFACES = LIGHT + 1,
+  WEIGHTS = SURFACES + 4,
   OPERANDS
 };
 
@@ -574,7 +627,7 @@ typedef struct {
   const float* data[OPERANDS];
   int64_t size[OPERANDS]; /* of a row */
   uint32_t serves[OPERANDS], frames;
-  int height, width, waves, boxes, cylinders, spheres, planes;
+  int height, width, waves, boxes, cylinders, spheres, planes, patterned;
   float* pictures;
 } Batch;
 
@@ -587,7 +640,9 @@ FN const float* of_frame(const Batch* b, int operand, uint32_t m) {
 FN void frame_of(const Batch* b, const float* const* of, Camera* c, Shapes* s, Eye* e) {
   const float *k = of[CONSTANTS], *r = of[ROTATION], scale = 1.0f / sqrtf(most(r[0] * r[0] + r[3] * r[3], TINY));
   c->height = b->height, c->width = b->width, c->waves = b->waves;
-  c->pitch = k[0], c->contrast = k[1], c->ambient = k[2], c->sun = k + 3, c->sky = k + 6;
+  const float* light = of[LIGHT];
+  c->pitch = k[0], c->contrast = k[1];
+  if (light) c->ambient = light[0], c->sun = light + 1, c->sky = light + 4;
   c->u = of[U], c->v = of[V], c->wave = of[WAVES];
   s->boxes = b->boxes, s->cylinders = b->cylinders, s->spheres = b->spheres, s->planes = b->planes;
   s->box_position = of[BOXES], s->box_half = of[BOXES + 1], s->box_yaw = of[BOXES + 2], s->box_albedo = of[BOXES + 3];
@@ -595,13 +650,16 @@ FN void frame_of(const Batch* b, const float* const* of, Camera* c, Shapes* s, E
   s->cylinder_half = of[CYLINDERS + 2], s->cylinder_albedo = of[CYLINDERS + 3];
   s->sphere_position = of[SPHERES], s->sphere_radius = of[SPHERES + 1], s->sphere_albedo = of[SPHERES + 2];
   s->plane_position = of[PLANES], s->plane_normal = of[PLANES + 1], s->plane_albedo = of[PLANES + 2];
+  s->patterned = b->patterned;
+  s->box_surface = of[SURFACES], s->cylinder_surface = of[SURFACES + 1];
+  s->sphere_surface = of[SURFACES + 2], s->plane_surface = of[SURFACES + 3];
   e->origin = of[ORIGIN], e->weights = of[WEIGHTS], e->cos = r[0] * scale, e->sin = r[3] * scale;
   e->sky = of[WEIGHTS] ? dot3(c->sky, e->weights) : 0;
 }
 
-/* Reads a call of XLA's into a batch; returns an error for XLA to raise, or 0. Depth images have no WEIGHTS. */
+/* Reads a call of XLA's into a batch; returns an error for XLA to raise, or 0. Depth images end before LIGHT. */
 static inline XLA_FFI_Error* batch_of(XLA_FFI_CallFrame* call, int weighted, Batch* b) {
-  const int operands = weighted ? OPERANDS : WEIGHTS;
+  const int operands = weighted ? OPERANDS : LIGHT;
   if (call->args.size != operands || call->rets.size != 1)
     return failed(call, XLA_FFI_Error_Code_INVALID_ARGUMENT,
                   "pictures were asked for with a number of operands that the library does not know; native.py must "
@@ -622,6 +680,7 @@ static inline XLA_FFI_Error* batch_of(XLA_FFI_CallFrame* call, int weighted, Bat
   b->waves = (int)arg[WAVES]->dims[0];
   b->boxes = (int)arg[BOXES]->dims[1], b->cylinders = (int)arg[CYLINDERS]->dims[1];
   b->spheres = (int)arg[SPHERES]->dims[1], b->planes = (int)arg[PLANES]->dims[1];
+  for (int i = SURFACES; weighted && i < WEIGHTS; ++i) b->patterned |= arg[i]->dims[1] > 0;
   if (b->waves > MOST_WAVES)
     return failed(call, XLA_FFI_Error_Code_INVALID_ARGUMENT,
                   "pictures have a texture of at most 8 waves; texture.WAVES must not have more");

@@ -21,6 +21,7 @@ from jax import Array, lax
 from edqn_jax.config import SHAPES, CameraConfig
 from edqn_jax.sim.scene.scene import Scene
 from edqn_jax.sim.scene.shapes.kind import TINY, Hits, Vector, per_shape
+from edqn_jax.sim.scene.surface import Daylight
 
 
 @struct.dataclass
@@ -134,10 +135,16 @@ def sun_direction(config: CameraConfig) -> tuple[float, float, float]:
     return flat * math.cos(azimuth), flat * math.sin(azimuth), math.sin(elevation)
 
 
-def shade(config: CameraConfig, nx: Array, ny: Array, nz: Array) -> Array:
+def daylight_of(config: CameraConfig, light: Daylight | None) -> Daylight:
+    """Returns the light of a world, that of the options where it has none of its own."""
+    own = Daylight(sun=sun_direction(config), ambient=config.ambient, sky=config.sky_rgb)  # type: ignore[arg-type]
+    return own if light is None else light
+
+
+def shade(light: Daylight, nx: Array, ny: Array, nz: Array) -> Array:
     """Returns the Lambert shade [...] of a unit normal under the sun: ambient + (1 - ambient) max(0, n . sun)."""
-    sx, sy, sz = sun_direction(config)
-    return config.ambient + (1 - config.ambient) * jnp.maximum(nx * sx + ny * sy + nz * sz, 0.0)
+    sx, sy, sz = light.sun[0], light.sun[1], light.sun[2]
+    return light.ambient + (1 - light.ambient) * jnp.maximum(nx * sx + ny * sy + nz * sz, 0.0)
 
 
 def direction_of(rays: Rays) -> Vector:
@@ -160,6 +167,13 @@ def hits(scene: Scene, origin: Array, rays: Rays, without: tuple[str, ...] = ())
     }
 
 
-def brightness_of(config: CameraConfig, met: Hits, value: Array) -> Array:
+def first_numbers(values: Values) -> dict[str, int]:
+    """Returns the number of the first shape of each kind, where all are counted: boxes, cylinders, others."""
+    kinds = sorted(values, key=lambda kind: (kind not in UPRIGHT, kind))
+    counts = [values[kind].shape[-1] for kind in kinds]
+    return {kind: sum(counts[:place]) for place, kind in enumerate(kinds)}
+
+
+def brightness_of(light: Daylight, met: Hits, value: Array) -> Array:
     """Returns the brightness without texture where rays meet shapes of albedo `value` [N]: shade times it [N, R, C]."""
-    return met.by_side(lambda *normal: shade(config, *normal) * per_shape(value))
+    return met.by_side(lambda *normal: shade(light, *normal) * per_shape(value))

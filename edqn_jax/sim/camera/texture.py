@@ -38,8 +38,8 @@ def wave(phase: Array) -> Array:
     return f * (8.0 - 16.0 * jnp.abs(f))
 
 
-def _box_filter(cycles: Array) -> Array:
-    """Returns the amplitude of a wave after a box average over `cycles` periods: sinc to 1.03 % below one, then 0."""
+def box_filter(cycles: Array) -> Array:
+    """Returns the amplitude [...] of a wave after an average over `cycles` [...]: sinc to 1.03 % below one, then 0."""
     x = jnp.minimum(cycles * cycles, 1.0)
     return (1.0 - x) * (1.0 - 0.55 * x)
 
@@ -66,6 +66,6 @@ def texture(
         at_origin = kx * origin[0] + ky * origin[1] + kz * origin[2]
         right = (kx * rays.right[0] + ky * rays.right[1] + kz * rays.right[2]) * rays.pitch
         up = (kx * rays.up[0] + ky * rays.up[1] + kz * rays.up[2]) * rays.pitch
-        left = _box_filter(depth * right + slope_right * along) * _box_filter(depth * up + slope_up * along)
+        left = box_filter(depth * right + slope_right * along) * box_filter(depth * up + slope_up * along)
         total = total + each.weight * left * wave(at_origin + depth * along)
     return 1.0 + config.texture_contrast * total

@@ -7,6 +7,8 @@ meets them, they affect no distance, and no code needs a mask.
 Shapes may move (`motion.py`): their `position` is that at time 0, and `scene_at` is the world at another time, in
 which nothing moves any more. What does not ask for a time sees the world at time 0. A kind without motion has None in
 place of the arrays.
+
+Where shapes have no surface (`surface.py`), all carry the plaid of the camera's options.
 """
 
 from __future__ import annotations
@@ -47,6 +49,7 @@ from edqn_jax.sim.scene.shapes.tilted_box import TiltedBoxes
 from edqn_jax.sim.scene.shapes.tilted_cylinder import TiltedCylinders
 from edqn_jax.sim.scene.shapes.upright_box import UprightBoxes
 from edqn_jax.sim.scene.shapes.upright_cylinder import UprightCylinders
+from edqn_jax.sim.scene.surface import Daylight, Surface, blank_surfaces
 
 DRONE_RGB = (0.08, 0.08, 0.1)
 """Reflectance of other drones: dark, as airframes of carbon fibre are."""
@@ -76,6 +79,7 @@ class Scene:
     others: dict[str, Any] = dataclasses.field(default_factory=dict)  # shapes of further kinds, by kind
     drones: Flown | None = None  # the others of a group, within one decision; in no pool of worlds
     aim: Aim | None = None  # of balls at the drone that flies; in no pool of worlds
+    daylight: Daylight | None = None  # None: that of the camera's options
 
     def shapes(self) -> dict[str, Any]:
         """Returns the shapes of every kind that the world has a place for, by kind."""
@@ -120,6 +124,8 @@ def scene_at(scene: Scene, time: Array | None) -> Scene:
 def with_drones(scene: Scene, position: Array, radius: Array) -> Scene:
     """Returns a world that stands, with K drones in it: spheres at `position` [K, 3] of `radius` [K], metres."""
     drones = Spheres(position, radius, jnp.broadcast_to(jnp.asarray(DRONE_RGB), position.shape))
+    if scene.spheres.surface is not None:
+        drones = dataclasses.replace(drones, surface=blank_surfaces(scene.spheres.surface.patterns, len(position)))
     spheres = jax.tree.map(lambda a, b: jnp.concatenate([a, b]), scene.spheres, drones)
     return dataclasses.replace(scene, spheres=spheres, drones=None)
 
@@ -164,7 +170,9 @@ def speeds(scene: Scene, time: Array) -> dict[str, Array]:
 
 def parked_like(shapes: Any) -> Any:
     """Returns one absent shape of the kind of `shapes`, which stands still where they have arrays of motion."""
-    rest = {name: still() for name, still in _MOVING.items() if getattr(shapes, name, None) is not None}
+    rest: dict[str, Any] = {name: still() for name, still in _MOVING.items() if getattr(shapes, name, None) is not None}
+    if getattr(shapes, "surface", None) is not None:
+        rest["surface"] = blank_surfaces(shapes.surface.patterns)
     return dataclasses.replace(kind_of(shapes)[1].parked, **rest)
 
 
@@ -208,6 +216,7 @@ def build_scene(
         names = [field.name for field in dataclasses.fields(parked)]
         stacked = {name: _stacked(members, name) for name in names} if members else {}
         arrays[kind] = dataclasses.replace(parked, **stacked) if members else no_shapes(kind)
+    arrays = _all_with_surfaces(arrays)
     return Scene(
         **{kind: arrays.pop(kind) for kind in FIELDS},
         others=arrays,
@@ -217,9 +226,24 @@ def build_scene(
     )
 
 
+def _all_with_surfaces(kinds: Mapping[str, Any]) -> dict[str, Any]:
+    """Returns the shapes of every kind; where any kind has surfaces, with blank ones for those that have none yet."""
+    some = next((each.surface for each in kinds.values() if getattr(each, "surface", None) is not None), None)
+    if some is None:
+        return dict(kinds)
+    return {
+        kind: dataclasses.replace(each, surface=blank_surfaces(some.patterns, *each.position.shape[:-1]))
+        if getattr(each, "surface", each) is None
+        else each
+        for kind, each in kinds.items()
+    }
+
+
 def _stacked(members: Sequence[Any], name: str) -> Any:
     """Returns one field of single shapes as arrays [N, ...]; None where none of them moves in this manner."""
     values = [getattr(member, name) for member in members]
+    if name == "surface":
+        return _stacked_surfaces(values)
     if name not in _MOVING:
         # jax.tree would treat a position given as a list as a subtree, so fields are stacked by name.
         return jnp.asarray(np.stack(values), jnp.float32)
@@ -228,6 +252,16 @@ def _stacked(members: Sequence[Any], name: str) -> Any:
     rest = _MOVING[name]()
     whole = [rest if value is None else value for value in values]
     return type(rest)(**{field.name: _stacked(whole, field.name) for field in dataclasses.fields(rest)})
+
+
+def _stacked_surfaces(surfaces: Sequence[Surface | None]) -> Surface | None:
+    """Returns the surfaces of single shapes as arrays [N, ...]; None where none has any."""
+    some = next((surface for surface in surfaces if surface is not None), None)
+    if some is None:
+        return None
+    blank = np.zeros_like(some.numbers)
+    numbers = np.stack([blank if surface is None else surface.numbers for surface in surfaces])
+    return dataclasses.replace(some, numbers=jnp.asarray(numbers, jnp.float32))
 
 
 def scene_shapes(scene: Scene) -> list[Shape]:
@@ -268,7 +302,11 @@ def stack_scenes(scenes: Sequence[Scene]) -> Scene:
     """
     capacities = {kind: _capacity(kind, scenes) for kind in _kinds_of(scenes)}
     padded = [
-        build_scene(scene_shapes(s), volume=s.volume, start=s.start, goal=s.goal, capacities=capacities) for s in scenes
+        dataclasses.replace(
+            build_scene(scene_shapes(s), volume=s.volume, start=s.start, goal=s.goal, capacities=capacities),
+            daylight=s.daylight,
+        )
+        for s in scenes
     ]
     return jax.tree.map(lambda *leaves: jnp.stack(leaves), *[_able_to_move(s, padded) for s in padded])
 
@@ -326,6 +364,7 @@ def with_equal_capacities(pools: Sequence[Scene], like: Sequence[Any] = ()) -> l
         pool.with_shapes({kind: no_shapes(kind, pool.volume.shape[0]) for kind in names if kind not in pool.shapes()})
         for pool in pools
     ]
+    whole = [pool.with_shapes(_all_with_surfaces(pool.shapes())) for pool in whole]
     able = [_able_to_move(pool, [*whole, *like]) for pool in whole]
     return [pool.with_shapes({kind: padded(kind, pool) for kind in pool.shapes()}) for pool in able]
 

@@ -14,12 +14,13 @@ import numpy as np
 from jax import Array, lax
 from jax.typing import ArrayLike
 
-from edqn_jax.config import FAMILIES, MIXTURES
+from edqn_jax.config import FAMILIES, MIXTURES, Config
 from edqn_jax.config.loading import nearest
 from edqn_jax.errors import ConfigError
 from edqn_jax.keys import FAMILY_OF_WORLD, MOTION_OF_WORLD, RANDOM_WORLDS, integers
-from edqn_jax.sim.scene.scene import Scene, take_scene, with_equal_capacities
+from edqn_jax.sim.scene.scene import Scene, stack_scenes, take_scene, with_equal_capacities
 from edqn_jax.sim.worlds import canyon, forest, open_worlds, rooms
+from edqn_jax.sim.worlds.looks import with_looks
 from edqn_jax.sim.worlds.moving import MOVING_SHARE, STILL, Bodies, Moving, in_motion
 from edqn_jax.sim.worlds.reachability import has_way
 
@@ -120,6 +121,17 @@ def random_pool(family: str, keys: Array, moving: Moving = STILL) -> Scene:
     pools = with_equal_capacities(drawn, shapes)
     order = np.argsort(np.concatenate([which for _, which in present]))
     return jax.tree.map(lambda *leaves: jnp.asarray(np.concatenate(leaves)[order]), *pools)
+
+
+def worlds_of(config: Config, family: str, split: Split, count: int, first: int = 0) -> Scene:
+    """Returns worlds `first`, `first + 1`, ... of a split as a configuration has them: what moves, and their looks."""
+    keys = world_keys(split, count, first)
+    return with_looks(random_pool(family, keys, Moving.of(config)), keys, config.surface)
+
+
+def world_of_file(config: Config, scene: Scene) -> Scene:
+    """Returns the pool of one world that a file describes, with the looks of the configuration."""
+    return with_looks(stack_scenes([scene]), jax.random.key(RANDOM_WORLDS)[None], config.surface)
 
 
 def _entry(name: str) -> Family | Mixture:

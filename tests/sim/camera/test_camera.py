@@ -14,7 +14,7 @@ import pytest
 
 from edqn_jax.config import CameraConfig, EventsConfig
 from edqn_jax.sim.camera import camera
-from edqn_jax.sim.camera.texture import _box_filter
+from edqn_jax.sim.camera.texture import box_filter
 from edqn_jax.sim.scene import mjcf
 from edqn_jax.sim.scene.distance import signed_distance
 from edqn_jax.sim.scene.scene import Spheres, UprightBoxes, UprightCylinders, stack_scenes, take_scene
@@ -387,8 +387,8 @@ def test_distant_texture_fades_to_the_plain_surface():
 
 def test_the_texture_filter_is_a_sinc_below_one_period_and_zero_beyond():
     cycles = np.linspace(-1.0, 1.0, 201, dtype=np.float32)
-    np.testing.assert_allclose(_box_filter(jnp.asarray(cycles)), np.sinc(cycles), atol=0.0105)
-    np.testing.assert_array_equal(_box_filter(jnp.array([1.0, 1.5, -30.0])), 0.0)
+    np.testing.assert_allclose(box_filter(jnp.asarray(cycles)), np.sinc(cycles), atol=0.0105)
+    np.testing.assert_array_equal(box_filter(jnp.array([1.0, 1.5, -30.0])), 0.0)
 
 
 @pytest.mark.parametrize("mount", ["level", "body"])

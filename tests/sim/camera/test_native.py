@@ -19,7 +19,7 @@ from edqn_jax.sim.camera import camera, columns, native
 from edqn_jax.sim.camera.camera import LUMA_WEIGHTS
 from edqn_jax.sim.scene.scene import PARKED, Scene, stack_scenes, take_scene, with_drones
 from edqn_jax.sim.worlds import families
-from tests.support.drawn_scenes import GROUND, ball, box, every_kind, pillar, rotation_of, scene_of
+from tests.support.drawn_scenes import GROUND, ball, box, every_kind, looking, pillar, rotation_of, scene_of
 
 CONFIG = CameraConfig()
 ROUNDING = 1e-4
@@ -107,6 +107,17 @@ def test_c_draws_what_jax_draws(size: tuple[int, int]) -> None:
         assert np.isfinite(jax.vmap(partial(camera.luma, config))(scene, origin, rotation)).all()
 
 
+def patterned_frames(rng: np.random.Generator) -> tuple[Scene, jax.Array, jax.Array]:
+    """As many as JAX draws with one of its branches, which is quick to compile."""
+    return frames([looking(crowd(rng), seed) for seed in range(4)], 8, seed=7)
+
+
+def test_c_draws_every_pattern_as_jax_does() -> None:
+    rng = np.random.default_rng(6)
+    if native.is_at_hand("cpu"):
+        agree(CONFIG, *patterned_frames(rng), ties=TIES)
+
+
 FAMILIES = ("rooms", "forest", "canyon", "dense")
 
 
@@ -133,7 +144,7 @@ def kernels() -> bool:
     names = [f"-D{target}=emulated_{target}" for target in native.TARGETS]
     compiler = dataclasses.replace(build.C, flags=(*build.C.flags, "-xc", "-include", str(on_cpu), *names))
     targets = tuple(f"emulated_{target}" for target in native.TARGETS)
-    headers = (native.SOURCES["h"], on_cpu)
+    headers = (*native.HEADERS, on_cpu)
     return build.registered(native.SOURCES["cu"], targets, native.definitions(), compiler, headers)
 
 
@@ -166,6 +177,13 @@ def test_the_kernels_of_gpus_draw_what_jax_draws(
         agree(config, *frames([world(np.random.default_rng(3))], 64, seed=4))
     else:
         assert shutil.which("cc") is None
+
+
+def test_the_kernels_of_gpus_draw_every_pattern(kernels: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    call = native._call
+    monkeypatch.setattr(native, "_call", lambda target, *given: call(f"emulated_{target}", *given))
+    if kernels:
+        agree(CONFIG, *patterned_frames(np.random.default_rng(8)), ties=TIES)
 
 
 def test_a_world_with_other_shapes_and_a_camera_on_the_body_are_drawn_by_jax() -> None:

@@ -163,7 +163,7 @@ def test_exactly_vertical_rays_meet_what_stands_straight_below_and_above(kind):
 def test_shade_is_brightest_towards_the_sun_and_ambient_behind():
     config = CameraConfig(sun_azimuth_deg=90.0, sun_elevation_deg=30.0, ambient=0.25)
     ways = np.array([[0, np.cos(np.pi / 6), 0.5], [0, -1, 0], [1, 0, 0], [0, 0, 1]], np.float32)
-    shades = raycast.shade(config, ways[:, 0], ways[:, 1], ways[:, 2])
+    shades = raycast.shade(raycast.daylight_of(config, None), ways[:, 0], ways[:, 1], ways[:, 2])
     np.testing.assert_allclose(shades, [1.0, 0.25, 0.25, 0.25 + 0.75 * 0.5], atol=1e-6)
 
 

@@ -26,6 +26,7 @@ from edqn_jax.sim.scene.shapes.kind import (
 )
 from edqn_jax.sim.scene.shapes.sphere import meet_balls
 from edqn_jax.sim.scene.shapes.tilted_cylinder import Tubes, meet_tubes
+from edqn_jax.sim.scene.surface import Surface
 
 
 @struct.dataclass
@@ -38,6 +39,7 @@ class Capsules:
     radius: Array  # [N] metres
     albedo: Array  # [N, 3]
     motion: Motion | None = None
+    surface: Surface | None = None
 
 
 def _distance(capsules: Capsules, x: Array, y: Array, z: Array) -> Array:

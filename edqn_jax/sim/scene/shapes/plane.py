@@ -8,6 +8,7 @@ from flax import struct
 from jax import Array
 
 from edqn_jax.sim.scene.shapes.kind import GREY, PARKED, UP, Hits, ShapeKind, Vector, inverse, offset, per_shape
+from edqn_jax.sim.scene.surface import Surface
 
 HORIZON_M = 1e5
 """Depth beyond which nothing is drawn: parked shapes and rounding at the horizon."""
@@ -20,6 +21,7 @@ class Planes:
     position: Array  # [N, 3] any point of the plane, metres
     normal: Array  # [N, 3] unit
     albedo: Array  # [N, 3]
+    surface: Surface | None = None
 
 
 def _distance(planes: Planes, x: Array, y: Array, z: Array) -> Array:

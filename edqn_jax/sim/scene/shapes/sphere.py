@@ -24,6 +24,7 @@ from edqn_jax.sim.scene.shapes.kind import (
     offset,
     per_shape,
 )
+from edqn_jax.sim.scene.surface import Surface
 
 
 @struct.dataclass
@@ -35,6 +36,7 @@ class Spheres:
     albedo: Array  # [N, 3]
     motion: Motion | None = None
     throw: Throw | None = None
+    surface: Surface | None = None
 
 
 def nearest_to_centre(away: Vector, radius: Array, ray: Vector) -> tuple[Array, Array, Array]:

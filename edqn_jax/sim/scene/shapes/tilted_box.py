@@ -23,6 +23,7 @@ from edqn_jax.sim.scene.shapes.kind import (
     quaternion_of,
     solid_distance,
 )
+from edqn_jax.sim.scene.surface import Surface
 
 
 @struct.dataclass
@@ -34,6 +35,7 @@ class TiltedBoxes:
     rotation: Array  # [N, 3, 3] body-to-world; columns are the box's axes
     albedo: Array  # [N, 3]
     motion: Motion | None = None
+    surface: Surface | None = None
 
 
 def _distance(boxes: TiltedBoxes, x: Array, y: Array, z: Array) -> Array:

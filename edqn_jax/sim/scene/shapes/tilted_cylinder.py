@@ -27,6 +27,7 @@ from edqn_jax.sim.scene.shapes.kind import (
     per_shape,
     solid_distance,
 )
+from edqn_jax.sim.scene.surface import Surface
 
 
 @struct.dataclass
@@ -39,6 +40,7 @@ class TiltedCylinders:
     radius: Array  # [N] metres
     albedo: Array  # [N, 3]
     motion: Motion | None = None
+    surface: Surface | None = None
 
 
 class Tubes(NamedTuple):

@@ -25,6 +25,7 @@ from edqn_jax.sim.scene.shapes.kind import (
     solid_distance,
 )
 from edqn_jax.sim.scene.shapes.tilted_box import slabs
+from edqn_jax.sim.scene.surface import Surface
 
 
 @struct.dataclass
@@ -36,6 +37,7 @@ class UprightBoxes:
     yaw: Array  # [N] rotation about world z, radians
     albedo: Array  # [N, 3] RGB reflectance in [0, 1]
     motion: Motion | None = None
+    surface: Surface | None = None
 
 
 def _distance(boxes: UprightBoxes, x: Array, y: Array, z: Array) -> Array:

@@ -25,6 +25,7 @@ from edqn_jax.sim.scene.shapes.kind import (
     solid_distance,
 )
 from edqn_jax.sim.scene.shapes.tilted_cylinder import Tubes, meet_tubes
+from edqn_jax.sim.scene.surface import Surface
 
 
 @struct.dataclass
@@ -36,6 +37,7 @@ class UprightCylinders:
     half_height: Array  # [N] metres
     albedo: Array  # [N, 3]
     motion: Motion | None = None
+    surface: Surface | None = None
 
 
 def _distance(cylinders: UprightCylinders, x: Array, y: Array, z: Array) -> Array:
