@@ -131,7 +131,7 @@ class CameraConfig:
     """Brightness of the sky."""
 
 
-PATTERNS = ("plaid", "drawn", "blank", "waves", "noise", "checks", "bricks", "posters", "wood")
+LOOKS = ("plaid", "drawn", "blank", "waves", "noise", "checks", "bricks", "posters", "wood")
 """Values of `surface.pattern`."""
 
 
@@ -139,7 +139,7 @@ PATTERNS = ("plaid", "drawn", "blank", "waves", "noise", "checks", "bricks", "po
 class SurfaceConfig:
     """What the faces of the shapes of a world look like; geometry is the same under every pattern."""
 
-    pattern: Annotated[str, one_of(PATTERNS)] = "plaid"
+    pattern: Annotated[str, one_of(LOOKS)] = "plaid"
     """`plaid`: one for all, of `camera.texture_*`. For each shape its own: `drawn` (any of the next four), `blank`,
     `waves`, `noise`, `checks`; for tests, never among `drawn`: `bricks`, `posters`, `wood`. With a sun and a sky for
     each world."""

@@ -112,6 +112,8 @@ def one_of_each_kind() -> Scene:
         start=jnp.array([1.0, 1, 3]),
         goal=jnp.array([90.0, 90, 10]),
     )
+
+
 PATTERNS_AT_ONCE = tuple(name for name in PATTERNS if name != "blank")
 
 

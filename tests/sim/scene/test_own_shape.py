@@ -33,8 +33,8 @@ from edqn_jax.sim.scene.scene import (
     with_equal_capacities,
 )
 from edqn_jax.sim.worlds.reachability import has_way
-from tests.docs.pages import ROOT, blocks_of, empty_module
 from tests.oracles import mujoco_distance
+from tests.support.pages import ROOT, blocks_of, empty_module
 from tests.support.registries import keep_as_they_are
 
 PAGE = ROOT / "docs/howto/own_shape.md"

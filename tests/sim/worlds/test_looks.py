@@ -11,7 +11,7 @@ import pytest
 
 from edqn_jax.config import Config, SurfaceConfig
 from edqn_jax.config.rules import validate
-from edqn_jax.config.options import LOOKS
+from edqn_jax.config.simulation import LOOKS
 from edqn_jax.errors import ConfigError
 from edqn_jax.sim.scene.scene import Scene, scene_shapes, stack_scenes, take_scene, with_equal_capacities
 from edqn_jax.sim.scene.surface import CONTRAST, KIND, PATTERNS, PHASES, SHARES
@@ -119,8 +119,8 @@ def test_shapes_that_move_have_looks() -> None:
 @pytest.mark.parametrize(
     "options, message",
     [
-        ({"pattern": "brick"}, "surface.pattern: there is no pattern 'brick'; did you mean 'bricks'?"),
-        ({"pattern": "xyz"}, "surface.pattern: there is no pattern 'xyz'; it must be one of plaid, drawn"),
+        ({"pattern": "brick"}, "surface.pattern: there is no 'brick'; did you mean 'bricks'?"),
+        ({"pattern": "xyz"}, "surface.pattern: there is no 'xyz'; known are plaid, drawn"),
         ({"contrast": 1.2}, "surface.contrast must be between 0 and 1, not 1.2"),
         ({"shortest_m": 3.0, "longest_m": 2.0}, "surface.longest_m must be at least surface.shortest_m, 3, not 2.0"),
         ({"shortest_m": 0.0}, "surface.shortest_m must be between 0.05 and 100, not 0.0"),
