@@ -21,7 +21,7 @@ from pytest_benchmark.fixture import BenchmarkFixture
 
 from edqn_jax.devices.devices import choose_devices, use_cpu_devices
 from edqn_jax.evaluation.missions import run_missions
-from edqn_jax.learn.plan import Plan
+from edqn_jax.learn.schedule import Schedule
 from edqn_jax.learn.trainer import AXIS, Trainer
 from measurement.flags import configured
 from measurement.parts import PARTS, Moment
@@ -44,7 +44,7 @@ def now() -> Moment:
     config = steady(config, config.train.chunk_steps)
     world = run_missions(config).training.world
     state = Trainer(config, world, jax.devices()[:1]).init(config.train.seed)
-    return Moment(config, world, dataclasses.replace(state, step=jnp.int32(Plan.of(config).learn_from)))
+    return Moment(config, world, dataclasses.replace(state, step=jnp.int32(Schedule.from_config(config).learn_from)))
 
 
 @pytest.mark.parametrize("name", PARTS)

@@ -26,7 +26,7 @@ from conventional_stack.settings import DRONES, PACKAGES, SETTINGS, supported
 from edqn_jax.config import Config
 from edqn_jax.devices.devices import use_cpu_devices
 from edqn_jax.evaluation.missions import run_missions
-from edqn_jax.runs.provenance import workload
+from edqn_jax.runs.provenance import describe_workload
 from edqn_jax.sim.scene.mjcf import load_scene, resolve_world
 from measurement import json_report
 from measurement.command import Parser, at_least_one, in_a_sentence
@@ -85,7 +85,7 @@ def measure(config: Config, decisions: int, repeats: int) -> dict[str, Any]:
     machine["versions"] |= {name: metadata.version(name) for name in PACKAGES}
     return {
         "workload": {
-            **workload(config, load_scene(resolve_world(config.world.name))),
+            **describe_workload(config, load_scene(resolve_world(config.world.name))),
             "physics": "c_mujoco",
             "world": config.world.name,
         },

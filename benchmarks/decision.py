@@ -24,7 +24,7 @@ from edqn_jax.config import Config
 from edqn_jax.evaluation.latency import decision_latency_ms
 from edqn_jax.evaluation.missions import run_missions
 from edqn_jax.learn.policy import fresh_policy
-from edqn_jax.runs.provenance import workload
+from edqn_jax.runs.provenance import describe_workload
 from measurement import json_report
 from measurement.command import Parser, in_a_sentence
 from measurement.flags import configured, split
@@ -50,7 +50,7 @@ def measure(config: Config, repeats: int, calls: int) -> dict[str, Any]:
     params = fresh_policy(config, 0)
     turns = [decision_latency_ms(config, params, calls) for _ in range(repeats)]
     return {
-        "workload": workload(config, run_missions(config).scene),
+        "workload": describe_workload(config, run_missions(config).scene),
         **json_report.machine(jax.devices()),
         "cores": 1,
         "decisions": repeats * calls,

@@ -25,14 +25,14 @@ import numpy as np
 from edqn_jax.errors import ConfigError
 from edqn_jax.evaluation.missions import load_missions
 from edqn_jax.evaluation.rollouts import fly_on_all_devices
-from edqn_jax.evaluation.trajectories import trajectory
-from edqn_jax.extras import require
+from edqn_jax.evaluation.trajectories import flight_trajectory
+from edqn_jax.extras import require_extra
 from edqn_jax.interop.deployment.onnx_export import export_policy
 from edqn_jax.interop.deployment.runner import Runner
 from edqn_jax.interop.recordings.flight_events import flight_recording
 from edqn_jax.learn.policy import Policy
 from edqn_jax.runs.policies import load_policy
-from edqn_jax.runs.provenance import workload
+from edqn_jax.runs.provenance import describe_workload
 from measurement import json_report
 from measurement.command import Parser, in_a_sentence
 
@@ -62,7 +62,7 @@ def measure(policy: Policy, camera: tuple[int, int] | None, repeats: int, calls:
     """Returns the report that `--json` writes: medians over `repeats` of the percentiles of `calls` decisions."""
     missions = load_missions(policy.config, WORLD, 1, 0, None, None)
     flights = fly_on_all_devices(policy.config, missions.world, policy.params, 0, record=True)
-    recording = flight_recording(policy.config, missions.world, trajectory(policy.config, flights), camera)
+    recording = flight_recording(policy.config, missions.world, flight_trajectory(policy.config, flights), camera)
     with tempfile.TemporaryDirectory() as folder:
         file = export_policy(policy, Path(folder) / "policy.onnx").file
         size = file.stat().st_size
@@ -74,9 +74,9 @@ def measure(policy: Policy, camera: tuple[int, int] | None, repeats: int, calls:
         milliseconds = 1e3 * _seconds(runner, given, calls)
         turns.append(dict(zip(("median", "p99"), np.percentile(milliseconds, [50, 99]), strict=True)))
     return {
-        "workload": workload(policy.config, missions.scene()),
+        "workload": describe_workload(policy.config, missions.scene()),
         **json_report.machine(jax.devices()),
-        "onnxruntime": require("onnxruntime", extra="export").__version__,
+        "onnxruntime": require_extra("onnxruntime", extra="export").__version__,
         "cores": 1,
         "decisions": repeats * calls,
         "camera": list(recording.size()),

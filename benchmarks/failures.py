@@ -27,7 +27,7 @@ from edqn_jax.runs.policies import load_run
 from edqn_jax.sim.camera import camera
 from edqn_jax.sim.physics.drone import Flight, yaw_of
 from edqn_jax.sim.scene.distance import shape_distances, signed_distance
-from edqn_jax.sim.scene.scene import Scene, parked_like, scene_at
+from edqn_jax.sim.scene.scene import Scene, absent_like, scene_at
 from edqn_jax.sim.sensors import sensor
 from edqn_jax.sim.sensors.events import EventField
 from edqn_jax.sim.task import group
@@ -73,7 +73,7 @@ def alone(scene: Scene, kind: str, index: int) -> Scene:
     shapes: dict[str, Any] = {}
     for name, own in scene.shapes().items():
         kept = np.arange(own.position.shape[0]) == (index if name == kind else -1)
-        away = parked_like(own)
+        away = absent_like(own)
         shapes[name] = jax.tree.map(
             lambda own, none, kept=kept: jnp.where(kept.reshape(-1, *[1] * (own.ndim - 1)), own, none),
             own,
@@ -95,7 +95,9 @@ def seen_of_it(config: Config, scene: Scene, only: Scene, poses: Flight) -> tupl
         position, rotation = poses.position[-1], sensor.mount_rotation(config, poses.quaternion[-1])
         assert poses.time is not None
         now = poses.time[-1]
-        whole, own = (camera.depth(config.camera, scene_at(each, now), position, rotation) for each in (scene, only))
+        whole, own = (
+            camera.render_depth(config.camera, scene_at(each, now), position, rotation) for each in (scene, only)
+        )
         shows = jnp.isfinite(own) & (own < whole + SAME_M)
         key = jax.random.key(0)
         field, _ = sensor.sense(config, scene, poses, sensor.at_rest(config, key), key)

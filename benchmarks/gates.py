@@ -31,7 +31,7 @@ from edqn_jax.evaluation.rollouts import flight_keys
 from edqn_jax.keys import run_streams
 from edqn_jax.sim.actions import DIRECTIONS, move_number
 from edqn_jax.sim.physics.drone import DroneState, yaw_of
-from edqn_jax.sim.task.env import EnvState, World
+from edqn_jax.sim.task.env import EnvParams, EnvState
 from edqn_jax.sim.task.outcomes import Outcome
 from edqn_jax.sim.task.task import task_of
 from measurement import json_report
@@ -59,7 +59,7 @@ GATES: dict[str, Callable[[DroneState, Array], Array]] = {"hover": hover, "strai
 
 
 @partial(jax.jit, static_argnums=(0, 2))
-def outcomes(config: Config, world: World, gate: str, key: Array) -> Array:
+def outcomes(config: Config, world: EnvParams, gate: str, key: Array) -> Array:
     """Returns the outcome [M] int32 of each of the world's M missions."""
     number, task = jnp.arange(world.missions.scene.shape[0]), task_of(config)
     keys, _ = flight_keys(key, len(number))

@@ -22,10 +22,10 @@ import numpy as np
 
 from edqn_jax.config import FAMILIES
 from edqn_jax.errors import ConfigError
-from edqn_jax.evaluation.intervals import drawn_rates, rate_interval
-from edqn_jax.extras import require
+from edqn_jax.evaluation.intervals import bootstrap_rates, rate_interval
+from edqn_jax.extras import require_extra
 from edqn_jax.runs.policies import load_policy
-from edqn_jax.runs.provenance import workload
+from edqn_jax.runs.provenance import describe_workload
 from measurement import json_report
 from measurement.command import Parser, at_least_one, in_a_sentence
 
@@ -106,7 +106,7 @@ def row(name: str, returns: list[np.ndarray], success: list[np.ndarray]) -> dict
     return {
         "name": name,
         "mean_return": float(flown.mean()),
-        "return_interval": interval(drawn_rates([flown])[0]),
+        "return_interval": interval(bootstrap_rates([flown])[0]),
         "success_rate": float(reached.mean()),
         "success_interval": rate_interval(reached),
         "returns_of_seeds": flown.mean(axis=1).tolist(),
@@ -126,8 +126,8 @@ def measure(args: argparse.Namespace) -> dict[str, Any]:
         MissingPackageError: if Gymnasium or stable-baselines3 is not installed.
     """
     began = time.perf_counter()
-    interop = require("edqn_jax.interop.stable_baselines3")
-    learner = require("stable_baselines3")
+    interop = require_extra("edqn_jax.interop.stable_baselines3")
+    learner = require_extra("stable_baselines3")
     policy = load_policy("pretrained") if args.observation == "code" else None
     options = {"world": args.world, "observation": args.observation, "policy": policy}
     test = interop.DroneVecEnv(NAME, args.missions, worlds=args.missions, world_seed=WORLDS, **options)
@@ -146,9 +146,9 @@ def measure(args: argparse.Namespace) -> dict[str, Any]:
             for kept, found in zip(flights[name], fly(model, test), strict=True):
                 kept.append(found)
             print(f"seed {seed}, {name}: mean return {flights[name][0][-1].mean():.1f}", flush=True)
-    before, after = (drawn_rates([np.stack(returns)])[0] for returns, _ in flights.values())
+    before, after = (bootstrap_rates([np.stack(returns)])[0] for returns, _ in flights.values())
     return {
-        "workload": workload(test.envs.task.config, test.envs.task.environment.scene()),
+        "workload": describe_workload(test.envs.task.config, test.envs.task.environment.scene()),
         **json_report.machine(jax.devices()),
         "environment": NAME,
         "world": args.world,

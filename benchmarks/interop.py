@@ -23,8 +23,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from edqn_jax.config import Config
-from edqn_jax.extras import require
-from edqn_jax.runs.provenance import workload
+from edqn_jax.extras import require_extra
+from edqn_jax.runs.provenance import describe_workload
 from edqn_jax.sim.actions import ACTIONS
 from edqn_jax.sim.environment import Environment
 from edqn_jax.sim.task.task import task_of
@@ -81,7 +81,7 @@ def measure(config: Config, drones: int, steps: int, repeats: int) -> dict[str, 
         ConfigError: if the world cannot be flown.
         MissingPackageError: if Gymnasium is not installed.
     """
-    interop = require("edqn_jax.interop.gymnasium", extra="gym")
+    interop = require_extra("edqn_jax.interop.gymnasium", extra="gym")
     vector, one = interop.DroneVectorEnv(drones, config=config), interop.DroneEnv(config=config)
     vector.reset(seed=0)
     one.reset(seed=0)
@@ -101,7 +101,7 @@ def measure(config: Config, drones: int, steps: int, repeats: int) -> dict[str, 
                 step(each)
             turns[name].append(steps * count / (time.perf_counter() - began))
     return {
-        "workload": workload(config, vector.task.environment.scene()),
+        "workload": describe_workload(config, vector.task.environment.scene()),
         **json_report.machine(jax.devices()),
         "drones": drones,
         "repeats": repeats,

@@ -26,9 +26,9 @@ from typing import Any
 
 import success
 from edqn_jax.config import FAMILIES, Config
-from edqn_jax.config.loading import flown_under
+from edqn_jax.config.loading import with_conditions
 from edqn_jax.devices.devices import most_that_divide, use_cpu_devices
-from edqn_jax.devices.hardware import cores
+from edqn_jax.devices.hardware import count_cores
 from edqn_jax.errors import ConfigError
 from edqn_jax.evaluation.missions import load_missions
 from edqn_jax.files import check_can_make
@@ -87,7 +87,7 @@ def measure_row(config: Config, args: argparse.Namespace, folder: Path) -> succe
     policies, _ = success.trained(config, args.seeds, folder)
     lights = []
     for lux in args.lux:
-        lit = flown_under(config, {"light": {"least_lux": lux, "most_lux": lux}}, "--lux")
+        lit = with_conditions(config, {"light": {"least_lux": lux, "most_lux": lux}}, "--lux")
         course = load_missions(lit, args.world, args.missions)
         lights.append({"lux": lux, "turns": success.turns_of(lit, policies, course.world, args.missions)})
     took = {"row_seconds": time.perf_counter() - began}
@@ -130,7 +130,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     for speed in [] if args.report else args.speeds:
         for sensor in args.sensors:
             config = config_of(args, sensor, speed)
-            use_cpu_devices(most_that_divide(config.train.shards, cores()))
+            use_cpu_devices(most_that_divide(config.train.shards, count_cores()))
             file = success.row_file(args.out, config, args.missions, f"light {args.lux} {args.seeds}")
             folder = success.policies_of(file)
             measure = functools.partial(measure_row, config, args, folder)

@@ -29,8 +29,8 @@ import numpy as np
 from edqn_jax.config import FAMILIES
 from edqn_jax.devices.devices import use_cpu_devices
 from edqn_jax.errors import ConfigError
-from edqn_jax.evaluation.latency import decision_seconds, in_turn
-from edqn_jax.evaluation.metrics import summarise
+from edqn_jax.evaluation.latency import decision_seconds, time_interleaved
+from edqn_jax.evaluation.metrics import summarise_flights
 from edqn_jax.evaluation.rollouts import fly_on_all_devices
 from edqn_jax.extras import MissingPackageError
 from edqn_jax.files import write_atomically
@@ -43,7 +43,7 @@ from edqn_jax.sim.scene.motion import Aim
 from edqn_jax.sim.scene.scene import Scene, scene_at
 from edqn_jax.sim.sensors.sensor import mount_rotation, sensor_of
 from edqn_jax.sim.task import env
-from edqn_jax.sim.task.env import World
+from edqn_jax.sim.task.env import EnvParams
 from edqn_jax.sim.task.flights import Flights
 from edqn_jax.sim.task.missions import own_missions
 from edqn_jax.sim.task.observation import MOTION_SIZE, OWN_SIZE, Observation
@@ -135,10 +135,10 @@ def with_options(base: PilotConfig, words: Sequence[str]) -> PilotConfig:
     return changed
 
 
-def course_of(policy: Policy, family: str, split: families.Split, missions: int, first: int = 0) -> World:
+def course_of(policy: Policy, family: str, split: families.Split, missions: int, first: int = 0) -> EnvParams:
     """Returns one mission in each of `missions` worlds of a split, from world `first` on."""
     pool = families.worlds_of(policy.config, family, split, missions, first=first)
-    return World(load_airframe(policy.config.drone), pool, own_missions(pool))
+    return EnvParams(load_airframe(policy.config.drone), pool, own_missions(pool))
 
 
 def what_the_map_had(log_odds: np.ndarray, cell_m: float, scene: Scene, position: np.ndarray, radius: float) -> str:
@@ -162,7 +162,7 @@ def what_the_map_had(log_odds: np.ndarray, cell_m: float, scene: Scene, position
     return UNSEEN if (near == 0).all() else TAKEN_FOR_FREE
 
 
-def decision_ms(policy: Policy, flown: PilotConfig, world: World, planning: np.ndarray, calls: int) -> np.ndarray:
+def decision_ms(policy: Policy, flown: PilotConfig, world: EnvParams, planning: np.ndarray, calls: int) -> np.ndarray:
     """Returns milliseconds [calls] of a decision: what JAX computes of data on the host, and a plan of a flight.
 
     Args:
@@ -190,11 +190,13 @@ def decision_ms(policy: Policy, flown: PilotConfig, world: World, planning: np.n
 
     known = grid.empty_grid(shape, jnp.asarray(volume[0]))
     params = jax.device_put(policy.params)
-    (seconds,) = in_turn([lambda: jax.block_until_ready(integrate(params, seen, memory, picture, known))], calls)
+    (seconds,) = time_interleaved(
+        [lambda: jax.block_until_ready(integrate(params, seen, memory, picture, known))], calls
+    )
     return 1e3 * (seconds + np.random.default_rng(0).choice(planning, calls))
 
 
-def pilot_row(policy: Policy, flown: PilotConfig, world: World, batch: int, calls: int) -> Row:
+def pilot_row(policy: Policy, flown: PilotConfig, world: EnvParams, batch: int, calls: int) -> Row:
     """Returns the row of a pilot."""
     had: list[str] = []
 
@@ -218,7 +220,7 @@ def pilot_row(policy: Policy, flown: PilotConfig, world: World, batch: int, call
     }
 
 
-def learned_row(policy: Policy, world: World, calls: int) -> Row:
+def learned_row(policy: Policy, world: EnvParams, calls: int) -> Row:
     """Returns the row of the learned agent."""
     flights = fly_on_all_devices(policy.config, world, policy.params)
     return figures(flights, 1e3 * decision_seconds(policy.config, policy.params, calls))
@@ -227,7 +229,7 @@ def learned_row(policy: Policy, world: World, calls: int) -> Row:
 def figures(flights: Flights, milliseconds: np.ndarray) -> Row:
     """Returns what the rows of all methods have; milliseconds [calls] of a decision."""
     return {
-        **summarise(flights),
+        **summarise_flights(flights),
         "decision_ms": float(np.median(milliseconds)),
         "decision_p99_ms": float(np.percentile(milliseconds, 99)),
         "arrived": (np.asarray(flights.outcome) == Outcome.GOAL).tolist(),
@@ -260,7 +262,7 @@ def table(rows: Sequence[Row]) -> str:
     return "\n".join(lines)
 
 
-def watched(policy: Policy, flown: PilotConfig, world: World) -> tuple[list[Moment], Outcome, Aim | None]:
+def watched(policy: Policy, flown: PilotConfig, world: EnvParams) -> tuple[list[Moment], Outcome, Aim | None]:
     """Returns what the pilot knew at each decision of the first mission, how it ended, and where balls were thrown."""
     moments: list[Moment] = []
     seconds = policy.config.drone.physics_steps * policy.config.drone.physics_dt_s

@@ -30,7 +30,7 @@ from typing import Any
 
 from edqn_jax.cli.train import parse_train
 from edqn_jax.config.loading import to_yaml
-from edqn_jax.devices.hardware import processor
+from edqn_jax.devices.hardware import describe_processor
 from edqn_jax.evaluation.metrics import wilson_interval
 from edqn_jax.files import write_atomically
 from measurement import json_report
@@ -301,7 +301,7 @@ def report_of(
     stated = summaries[0] if summaries else {"workload": {}, "versions": {}, "devices": []}
     return {
         "workload": {**stated["workload"], "world": args.world, "flags": args.flags},
-        "device": processor(),
+        "device": describe_processor(),
         "devices": stated["devices"],
         "versions": stated["versions"],
         "criteria": {"decisions": MOST_DECISIONS, "path_over_shortest": MOST_PATH, "wall_seconds": MOST_SECONDS},

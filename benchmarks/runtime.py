@@ -32,8 +32,8 @@ from typing import Any
 from conventional_stack.settings import DRONES, supported
 from edqn_jax.cli.train import parse_train
 from edqn_jax.config import FAMILIES, Config
-from edqn_jax.config.loading import nearest, to_yaml
-from edqn_jax.devices.hardware import cores
+from edqn_jax.config.loading import suggest_nearest, to_yaml
+from edqn_jax.devices.hardware import count_cores
 from edqn_jax.errors import ConfigError
 from measurement import json_report
 from measurement.child import Child, ChildEndedError
@@ -126,7 +126,7 @@ def parse(argv: Sequence[str] | None = None) -> Asked:
         args.budget = QUICK_BUDGET_SECONDS if args.quick else BUDGET_SECONDS
     for name in args.methods:
         if name not in METHODS:
-            raise ConfigError(f"there is no method '{name}'{nearest(name, METHODS)}")
+            raise ConfigError(f"there is no method '{name}'{suggest_nearest(name, METHODS)}")
     for name in ("seeds", "first_seed"):
         if getattr(args, name) < 0:
             raise ConfigError(f"--{name.replace('_', '-')} must be at least 0, not {getattr(args, name)}")
@@ -218,7 +218,7 @@ def launched(
         child = Child(ROOT, ROOT / "benchmarks" / "rivals" / "rival.py", words, folder / f"{number}.log")
         children[name] = stack.enter_context(child)
         waiting.append(name)
-        if len(waiting) >= cores():
+        if len(waiting) >= count_cores():
             settle(waiting.pop(0))
     for name in waiting:
         settle(name)

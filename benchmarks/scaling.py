@@ -33,7 +33,7 @@ from edqn_jax.config import Config
 from edqn_jax.devices.devices import choose_devices, use_cpu_devices
 from edqn_jax.errors import ConfigError
 from edqn_jax.evaluation.missions import RunMissions, run_missions
-from edqn_jax.runs.provenance import workload
+from edqn_jax.runs.provenance import describe_workload
 from measurement import json_report
 from measurement.ceilings import Rollout
 from measurement.command import Parser, at_least_one, in_a_sentence
@@ -121,7 +121,7 @@ def measure(base: Config, names: Sequence[str], quick: bool, repeats: int) -> di
             later = {chunked(point.config, decisions) for after in curves[number + 1 :] for point in after.points}
             runners = {config: runner for config, runner in runners.items() if config in later}
     return {
-        "workload": {**workload(steady(base, 1), reference.scene), "world": base.world.name},
+        "workload": {**describe_workload(steady(base, 1), reference.scene), "world": base.world.name},
         **json_report.machine(used),
         "repeats": repeats,
         "curves": summaries,
@@ -146,7 +146,7 @@ def _measure_curve(
             c_mujoco[place].append(rollout.turn())
     rows = []
     for place, (point, runner) in enumerate(zip(curve.points, runners, strict=True)):
-        many, stated = len(runner.devices), workload(runner.config, runner.scene)
+        many, stated = len(runner.devices), describe_workload(runner.config, runner.scene)
         us = [1e6 * many * each for each in seconds[place]]
         as_steps = [each * rate for each, rate in zip(seconds[place], c_mujoco[place], strict=True)]
         rows.append(

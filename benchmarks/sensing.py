@@ -27,7 +27,7 @@ from jax import Array
 
 from edqn_jax.config import FAMILIES, Config
 from edqn_jax.errors import ConfigError
-from edqn_jax.evaluation.latency import decision_call, in_turn
+from edqn_jax.evaluation.latency import decision_call, time_interleaved
 from edqn_jax.evaluation.missions import MissionSet, load_missions
 from edqn_jax.learn.actor import AgentActor, PolicyParams
 from edqn_jax.learn.policy import Policy, fresh_policy
@@ -37,7 +37,7 @@ from edqn_jax.sim.scene.scene import Scene
 from edqn_jax.sim.sensors.events import EventField
 from edqn_jax.sim.sensors.sensor import SensorMemory, at_rest, frame_steps, frames_per_decision, sense
 from edqn_jax.sim.task import group
-from edqn_jax.sim.task.env import World
+from edqn_jax.sim.task.env import EnvParams
 from edqn_jax.sim.task.observation import MOTION_SIZE, OWN_SIZE, Observation
 from edqn_jax.sim.task.outcomes import Outcome
 from edqn_jax.sim.task.task import task_of
@@ -70,7 +70,7 @@ def events_per_decision(policy: Policy, course: MissionSet) -> float:
 
 
 @partial(jax.jit, static_argnums=0)
-def _flown(config: Config, world: World, params: PolicyParams) -> tuple[jax.Array, jax.Array]:
+def _flown(config: Config, world: EnvParams, params: PolicyParams) -> tuple[jax.Array, jax.Array]:
     """Returns the events of all flights, and their decisions."""
     missions = world.missions.scene.shape[0]
     number, keys = jnp.arange(missions), jax.random.split(jax.random.key(0), missions)
@@ -133,7 +133,7 @@ def rows_of(policy: Policy, course: MissionSet, calls: int) -> list[dict[str, An
     params = [fresh_policy(config) for config in seen]
     looks = [look_call(config, each, course.scene()) for config, each in zip(seen, params, strict=True)]
     acts = [decision_call(config, each) for config, each in zip(seen, params, strict=True)]
-    look, act = (1e3 * in_turn(works, calls, BLOCK) for works in (looks, acts))
+    look, act = (1e3 * time_interleaved(works, calls, BLOCK) for works in (looks, acts))
     rows = []
     for number, (sensor, config) in enumerate(zip(SENSORS, seen, strict=True)):
         events = events_per_decision(policy, course) if sensor == "events" else None

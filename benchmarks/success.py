@@ -39,18 +39,18 @@ import yaml
 
 from edqn_jax.cli.train import parse_train
 from edqn_jax.config import FAMILIES, Config
-from edqn_jax.config.loading import apply, to_yaml
+from edqn_jax.config.loading import apply_layer, to_yaml
 from edqn_jax.devices.devices import most_that_divide, use_cpu_devices
-from edqn_jax.devices.hardware import cores
+from edqn_jax.devices.hardware import count_cores
 from edqn_jax.errors import ConfigError
 from edqn_jax.evaluation.intervals import interquartile_mean, rate_interval
-from edqn_jax.evaluation.metrics import known_lengths, spl
+from edqn_jax.evaluation.metrics import fill_unknown_lengths, spl
 from edqn_jax.evaluation.missions import load_missions
 from edqn_jax.evaluation.rollouts import fly_on_all_devices
 from edqn_jax.files import check_can_make
 from edqn_jax.learn.policy import Policy
 from edqn_jax.runs.policies import load_policy, save_policy
-from edqn_jax.sim.task.env import World
+from edqn_jax.sim.task.env import EnvParams
 from edqn_jax.training.loop import train_seeds
 from measurement import json_report
 from measurement.command import Parser, at_least_one, in_a_sentence
@@ -277,7 +277,7 @@ def _row(
 
 
 def turns_of(
-    config: Config, policies: Sequence[Policy], world: World, missions: int, shuffle_codes: bool = False
+    config: Config, policies: Sequence[Policy], world: EnvParams, missions: int, shuffle_codes: bool = False
 ) -> list[dict[str, Any]]:
     """Returns the flights of each policy through the same missions."""
     turns = []
@@ -313,7 +313,7 @@ def figures(row: Row, shortest: np.ndarray | None) -> dict[str, Any]:
     rates = arrived.mean(axis=1)
     weights = None
     if shortest is not None:
-        weights = [spl(arrived[k], flown[k], known_lengths(shortest, flown[k])) for k in range(len(arrived))]
+        weights = [spl(arrived[k], flown[k], fill_unknown_lengths(shortest, flown[k])) for k in range(len(arrived))]
     return {
         "success": float(rates.mean()),
         "interval": rate_interval(arrived),
@@ -405,7 +405,7 @@ def _wanted(args: argparse.Namespace) -> list[Wanted]:
         ConfigError: if an option is invalid, or a run cannot be flown.
     """
     if args.runs:
-        use_cpu_devices(cores())
+        use_cpu_devices(count_cores())
         runs = {run: load_policy(run) for run in args.runs}
         by_seed = sorted(runs, key=lambda run: runs[run].config.train.seed)
         policies = [runs[run] for run in by_seed]
@@ -417,7 +417,7 @@ def _wanted(args: argparse.Namespace) -> list[Wanted]:
             for file, config in zip(files, configs, strict=True)
         ]
     configs = [config_of(world, sensor, args.flags) for world in args.worlds for sensor in args.sensors]
-    use_cpu_devices(most_that_divide(configs[0].train.shards, cores()))
+    use_cpu_devices(most_that_divide(configs[0].train.shards, count_cores()))
     files = [row_file(args.out, config, args.missions, str(args.seeds)) for config in configs]
     return [
         Wanted(
@@ -431,7 +431,7 @@ def _wanted(args: argparse.Namespace) -> list[Wanted]:
 
 def _config_in(row: Row) -> Config:
     """Returns the configuration that a row was measured with."""
-    return apply(Config(), yaml.safe_load(row["options"]), "a row")
+    return apply_layer(Config(), yaml.safe_load(row["options"]), "a row")
 
 
 def _course(row: Row) -> str:
@@ -454,7 +454,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     shortest: dict[str, np.ndarray | None] = {}
     for row in [] if args.no_spl else rows:
         # Two cores search 1 000 worlds in 200 s.
-        in_time = time.perf_counter() - began + 0.4 * row["missions"] / cores() < 60 * args.minutes
+        in_time = time.perf_counter() - began + 0.4 * row["missions"] / count_cores() < 60 * args.minutes
         shortest[_course(row)] = shortest_paths(args.out, _config_in(row), row["missions"], in_time)
     print(table(rows, shortest))
     return 3 if left else 0

@@ -25,11 +25,11 @@ from jax.sharding import Mesh
 
 from edqn_jax.config import Config
 from edqn_jax.devices.devices import choose_devices, use_cpu_devices
-from edqn_jax.devices.hardware import cores
+from edqn_jax.devices.hardware import count_cores
 from edqn_jax.errors import ConfigError
 from edqn_jax.evaluation.missions import run_missions
 from edqn_jax.learn.trainer import AXIS
-from edqn_jax.runs.provenance import workload
+from edqn_jax.runs.provenance import describe_workload
 from measurement import json_report
 from measurement.ceilings import Rollout, ceilings
 from measurement.command import Parser, at_least_one, in_a_sentence
@@ -104,7 +104,7 @@ def measure(config: Config, repeats: int, parts: bool) -> dict[str, Any]:
             "us_per_decision": 1e6 * len(devices) / rate,
             "over_c_mujoco_rollout": statistics.median(ratios),
         },
-        {"name": "c_mujoco_rollout", "physics_steps_per_second": middle["c_mujoco_rollout"], "threads": cores()},
+        {"name": "c_mujoco_rollout", "physics_steps_per_second": middle["c_mujoco_rollout"], "threads": count_cores()},
     ]
     for part in timed:
         us = middle[part.part.name]
@@ -114,7 +114,7 @@ def measure(config: Config, repeats: int, parts: bool) -> dict[str, Any]:
     rows += differences(middle)
     rows += [{"name": name, "per_device": middle[name]} for name in limits]
     return {
-        "workload": {**workload(config, missions.scene), "world": config.world.name},
+        "workload": {**describe_workload(config, missions.scene), "world": config.world.name},
         **json_report.machine(devices),
         "decisions_per_second": rate,
         "compile_seconds": whole.compile_seconds,

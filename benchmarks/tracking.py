@@ -1,7 +1,7 @@
 """How well does the drone follow a commanded velocity?
 
-Simulates steps from rest to every action, reversals along the axes, and a hover with `fly`, the function that training
-uses. Prints a Markdown table.
+Simulates steps from rest to every action, reversals along the axes, and a hover with `fly_decision`, the function that
+training uses. Prints a Markdown table.
 
     python benchmarks/tracking.py
 """
@@ -23,8 +23,8 @@ import numpy as np
 from edqn_jax.config import Config, DroneConfig
 from edqn_jax.files import write_atomically
 from edqn_jax.sim.physics.airframe import load_airframe
-from edqn_jax.sim.physics.drone import DroneState, Flight, hover, yaw_of
-from edqn_jax.sim.physics.flight import fly
+from edqn_jax.sim.physics.drone import DroneState, Flight, hover_state, yaw_of
+from edqn_jax.sim.physics.flight import fly_decision
 from measurement.command import Parser, in_a_sentence
 
 Decide = Callable[[DroneState, jax.Array, jax.Array], tuple[DroneState, Flight]]
@@ -48,9 +48,9 @@ def manoeuvres(speed: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 def batched_fly(config: DroneConfig) -> Decide:
-    """Returns `fly` for a batch of drones, compiled."""
+    """Returns `fly_decision` for a batch of drones, compiled."""
     airframe = load_airframe(config)
-    mapped = jax.vmap(fly, (None, None, 0, 0, 0))
+    mapped = jax.vmap(fly_decision, (None, None, 0, 0, 0))
     return jax.jit(lambda state, command, yaw: mapped(config, airframe, state, command, yaw))
 
 
@@ -59,7 +59,7 @@ def measure(config: DroneConfig, speed: float, decide: Decide) -> list[dict[str,
     before, after = manoeuvres(speed)
     batch = len(before)
     yaw = jnp.zeros(batch)
-    state = jax.vmap(hover)(jnp.zeros((batch, 3)), yaw)
+    state = jax.vmap(hover_state)(jnp.zeros((batch, 3)), yaw)
     flights = []
     for decision in range(SETTLE_DECISIONS + RESPONSE_DECISIONS):
         command = before if decision < SETTLE_DECISIONS else after

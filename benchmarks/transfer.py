@@ -34,9 +34,9 @@ from edqn_jax.evaluation.metrics import wilson_interval
 from edqn_jax.interop.deployment.onnx_export import export_policy
 from edqn_jax.interop.deployment.runner import Runner
 from edqn_jax.runs.policies import load_policy
-from edqn_jax.runs.provenance import workload
+from edqn_jax.runs.provenance import describe_workload
 from edqn_jax.sim.environment import Environment
-from edqn_jax.sim.task.observation import MOST_YAW_RATE
+from edqn_jax.sim.task.observation import MAX_YAW_RATE
 from measurement import json_report
 from measurement.command import Parser, at_least_one, in_a_sentence
 from outer import event_cameras, flights, pictures
@@ -173,13 +173,13 @@ def measure(args: argparse.Namespace, show: Callable[[str], None] = print) -> di
         for mission in range(args.missions):
             watcher, close = prepare_camera(args, config, environment, mission)
             try:
-                flight = flights.start_flight(args.flight, environment, mission, MOST_YAW_RATE)
+                flight = flights.start_flight(args.flight, environment, mission, MAX_YAW_RATE)
                 ended.append(fly_mission(runner, flight, watcher, environment, mission))
             finally:
                 close()
             show(f"mission {mission}: {ended[-1].outcome}, {ended[-1].clearance_m:.2f} m clear at least")
     return {
-        "workload": workload(config, environment.scene(0)),
+        "workload": describe_workload(config, environment.scene(0)),
         **json_report.machine(jax.devices()),
         "cell": {name: str(getattr(args, name)) for name in CELL},
         "missions": [dataclasses.asdict(each) for each in ended],

@@ -31,8 +31,8 @@ from edqn_jax.config import FAMILIES, Config
 from edqn_jax.devices.devices import choose_devices, use_cpu_devices
 from edqn_jax.errors import ConfigError
 from edqn_jax.evaluation.missions import run_missions
-from edqn_jax.extras import require
-from edqn_jax.runs.provenance import workload
+from edqn_jax.extras import require_extra
+from edqn_jax.runs.provenance import describe_workload
 from edqn_jax.sim.scene.mjcf import load_scene, resolve_world
 from measurement import json_report
 from measurement.command import Parser, at_least_one, in_a_sentence
@@ -72,11 +72,11 @@ class Tutorial:
         """Starts the environments; `together` is the class of stable-baselines3's vector of them."""
         from tutorial_stack.env import TutorialDrone
 
-        world, vectors = resolve_world(config.world.name), require("stable_baselines3.common.vec_env")
+        world, vectors = resolve_world(config.world.name), require_extra("stable_baselines3.common.vec_env")
         self.environments = (together or vectors.SubprocVecEnv)(
             [partial(TutorialDrone, world, config, **options)] * drones
         )
-        self.dqn = require("stable_baselines3").DQN(
+        self.dqn = require_extra("stable_baselines3").DQN(
             "MlpPolicy",
             self.environments,
             policy_kwargs={"net_arch": list(config.agent.hidden)},
@@ -105,7 +105,7 @@ class Tutorial:
 
 def check(config: Config) -> None:
     """Raises ConfigError if the environments of the tutorials do not have what the configuration asks for."""
-    require("conventional_stack.fleet").check(config)
+    require_extra("conventional_stack.fleet").check(config)
     if config.world.name in FAMILIES:
         raise ConfigError(f"the tutorials' world must be 'paper' or an MJCF file, not '{config.world.name}'")
     if config.env.reward != "progress" or config.env.sensor != "events":
@@ -132,7 +132,7 @@ def measure(config: Config, drones: int, decisions: int, repeats: int) -> dict[s
     machine["versions"] |= {name: metadata.version(name) for name in PACKAGES}
     rates = [statistics.median(rate) for rate in zip(*turns, strict=True)]
     return {
-        "workload": workload(config, load_scene(resolve_world(config.world.name))),
+        "workload": describe_workload(config, load_scene(resolve_world(config.world.name))),
         **machine,
         "drones": drones,
         "decisions_per_turn": decisions,

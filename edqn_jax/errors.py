@@ -6,12 +6,12 @@ import difflib
 from collections.abc import Iterable
 
 
-def sentence(error: Exception) -> str:
+def error_sentence(error: Exception) -> str:
     """Returns what an error says in one line, with escapes in place of what no line can show, as in names of files."""
     return "".join(c if c.isprintable() else repr(c)[1:-1] for c in str(error))
 
 
-def nearest(word: object, known: Iterable[str], or_else: str = "") -> str:
+def suggest_nearest(word: object, known: Iterable[str], or_else: str = "") -> str:
     """Returns `; did you mean '...'?` with the closest known word, else a list of the known words and `or_else`."""
     known = list(known)
     close = difflib.get_close_matches(str(word), known, n=1, cutoff=0.5)

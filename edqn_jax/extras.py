@@ -13,7 +13,7 @@ class MissingPackageError(ImportError):
     """A package of an extra is not installed; the message names the command that installs it."""
 
 
-def require(package: str, extra: str = "bench") -> Any:
+def require_extra(package: str, extra: str = "bench") -> Any:
     """Imports and returns a package or module of an extra.
 
     Args:

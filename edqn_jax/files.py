@@ -14,7 +14,7 @@ VIDEO, EVENT_FILES = (".gif", ".mp4"), (".h5", ".hdf5", ".npz", ".txt")
 """Endings of the files of one flight that `edqn record` writes."""
 
 whole_files = threading.Lock()
-"""Held while a file is written: whoever holds it finds none half-written by this process."""
+"""Lock held during atomic writes."""
 
 
 def write_atomically(file: Path, content: str | bytes) -> None:
@@ -31,7 +31,7 @@ def write_atomically(file: Path, content: str | bytes) -> None:
         except OSError as error:
             with contextlib.suppress(OSError):
                 partial.unlink(missing_ok=True)
-            raise unwritable(file, error.strerror) from None
+            raise write_error(file, error.strerror) from None
 
 
 def check_can_write(file: Path) -> None:
@@ -42,9 +42,9 @@ def check_can_write(file: Path) -> None:
     """
     folder = file.absolute().parent
     if not os.path.isdir(folder):
-        raise unwritable(file, f"there is no folder '{folder}'")
+        raise write_error(file, f"there is no folder '{folder}'")
     if os.path.isdir(file):
-        raise unwritable(file, "it is a folder")
+        raise write_error(file, "it is a folder")
     _check_can_make(file, folder, name=file.name)
 
 
@@ -58,11 +58,11 @@ def check_can_make(folder: Path) -> None:
     while not there.exists() and there != there.parent:
         there = there.parent
     if not there.is_dir():
-        raise unwritable(folder, f"'{there}' is not a folder")
+        raise write_error(folder, f"'{there}' is not a folder")
     _check_can_make(folder, there)
 
 
-def unwritable(path: Path, reason: str | None) -> ConfigError:
+def write_error(path: Path, reason: str | None) -> ConfigError:
     """Returns the error for a file or folder that cannot be written; `reason` is None where the system gives none."""
     return ConfigError(f"'{path}' cannot be written: {reason or 'unknown reason'}")
 
@@ -73,4 +73,4 @@ def _check_can_make(path: Path, there: Path, name: str = "") -> None:
     try:
         os.rmdir(tempfile.mkdtemp(prefix=name, dir=there))
     except OSError as error:
-        raise unwritable(path, f"nothing can be created in '{there}' ({error.strerror or 'unknown reason'})") from None
+        raise write_error(path, f"nothing can be created in '{there}' ({error.strerror or 'unknown reason'})") from None

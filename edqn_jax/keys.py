@@ -48,7 +48,7 @@ def run_streams(seed: int) -> RunStreams:
     return RunStreams(*jax.random.split(root, len(RunStreams._fields)))
 
 
-def integers(key: Array, shape: tuple[int, ...], below: int | Array) -> Array:
+def uniform_integers(key: Array, shape: tuple[int, ...], below: int | Array) -> Array:
     """Integers [*shape] int32, uniform over 0 .. `below` - 1 but for a share of `below` / 2^32.
 
     One draw of bits, where `jax.random.randint` makes four to be exactly uniform.

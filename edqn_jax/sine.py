@@ -15,7 +15,7 @@ def sin_pi(z: Array) -> Array:
     return x * series * (1.0 - 2.0 * (turns - 2.0 * jnp.floor(0.5 * turns)))
 
 
-def turned_by(angle: Array) -> tuple[Array, Array]:
+def cosm1_and_sin(angle: Array) -> tuple[Array, Array]:
     """Returns `cos(x) - 1` and `sin(x)` of angles [...] in radians to 3e-7, both exactly 0 at 0.
 
     Of the half angle, so that one polynomial each does and no sign is needed: cos x - 1 = -2 sin(x / 2)^2 and

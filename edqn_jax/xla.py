@@ -10,6 +10,6 @@ from jax import lax
 Tree = TypeVar("Tree")
 
 
-def materialised(tree: Tree) -> Tree:
+def materialise_tree(tree: Tree) -> Tree:
     """Returns the same float32 arrays, computed once: an exact no-op that XLA does not fuse into their consumers."""
     return jax.tree.map(lambda x: lax.reduce_precision(x, exponent_bits=8, mantissa_bits=23), tree)

@@ -140,7 +140,7 @@ class Chunk:
         if self.trainer is None:
             self.trainer = Trainer(self.config, run_missions(self.config).training.world, jax.devices())
             state = self.trainer.init(0)
-            while self.done <= self.trainer.plan.learn_from:
+            while self.done <= self.trainer.schedule.learn_from:
                 state, _ = self.trainer.chunk(state, self.done)
                 self.done += 1
             self.state = jax.tree.map(_held, state)
@@ -174,12 +174,12 @@ def _step(drones: int, options: dict[str, Any]) -> Tree:
 
 
 def _decide(policy: Any, inputs: list[np.ndarray], options: dict[str, Any]) -> Tree:
-    decide = jax.jit(onnx_export.decision(policy.config, policy.params), compiler_options=options)
+    decide = jax.jit(onnx_export.decision_function(policy.config, policy.params), compiler_options=options)
     return jax.tree.map(_numbers, decide(*inputs))
 
 
 def _exactly(policy: Any, inputs: list[np.ndarray]) -> Tree:
-    return onnx_export._exactly(policy, [inputs])
+    return onnx_export._values_in_float64(policy, [inputs])
 
 
 def _policy_inputs(config: Config, count: int) -> list[np.ndarray]:

@@ -21,7 +21,7 @@ from edqn_jax.config import Config, SurfaceConfig
 from edqn_jax.config.options import LOOKS
 from edqn_jax.errors import ConfigError
 from edqn_jax.files import check_can_write
-from edqn_jax.report.style import drawing
+from edqn_jax.report.style import open_figure
 from edqn_jax.sim.camera import camera
 from edqn_jax.sim.scene.scene import Scene, take_scene
 from edqn_jax.sim.worlds.families import worlds_of
@@ -42,7 +42,7 @@ def view_of(scene: Scene) -> tuple[Array, Array]:
 
 def draw_patterns(file: Path, index: int = INDEX) -> None:
     """Writes a PNG with two pictures for each pattern, for people and as the drone sees it."""
-    with drawing(7.0, 6.2, file) as figure:
+    with open_figure(7.0, 6.2, file) as figure:
         panels = figure.subplots(5, 4).ravel()
         for axes in panels:
             axes.set_axis_off()
@@ -51,7 +51,7 @@ def draw_patterns(file: Path, index: int = INDEX) -> None:
             scene = take_scene(worlds_of(config, FAMILY, "test", 1, first=index), 0)
             position, rotation = view_of(scene)
             fine = jax.jit(partial(camera.fine_rgb, config.camera, FINE))(scene, position, rotation)
-            seen = jax.jit(partial(camera.luma, config.camera))(scene, position, rotation)
+            seen = jax.jit(partial(camera.render_luma, config.camera))(scene, position, rotation)
             for axes, picture in zip(panels[2 * place :], (fine, seen), strict=False):
                 axes.imshow(np.asarray(camera.on_screen(picture)), cmap="gray", vmin=0, vmax=1)
             panels[2 * place].set_title(pattern, fontsize=8)

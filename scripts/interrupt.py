@@ -97,7 +97,7 @@ def main(argv: Sequence[str] | None = None) -> int:
             else:
                 times, saved = interrupted(run, most, seconds, draw, args.signal)
             done += times
-            code = 0 if RunDirectory(run).finished else to_the_end(run, processes)
+            code = 0 if RunDirectory(run).is_finished else to_the_end(run, processes)
             if code == 0:
                 differs = first_difference(expected, ending(run))
             else:
@@ -172,7 +172,7 @@ def filled(run: Path, most: int, draw: random.Random) -> tuple[int, list[str]]:
         if ended.returncode not in (0, 2) or "Traceback" in said or (ended.returncode == 2 and "edqn: " not in said):
             raise SystemExit(f"'{run.name}' with files of {size} bytes ended with {ended.returncode}:\n{said}")
         saved.append(f"{newest(run)} ({size:,} bytes)")
-        if RunDirectory(run).finished:
+        if RunDirectory(run).is_finished:
             break
     return len(saved), saved
 
@@ -185,7 +185,7 @@ def bereft(run: Path, most: int, seconds: float, draw: random.Random) -> tuple[i
         while not (run / "config.yaml").exists() and all(process.poll() is None for process in both):
             time.sleep(0.1)  # until then they look for each other, five minutes at most
         time.sleep(draw.uniform(0.0, seconds))
-        if RunDirectory(run).finished or any(process.poll() is not None for process in both):
+        if RunDirectory(run).is_finished or any(process.poll() is not None for process in both):
             for process in both:
                 process.wait()
             break

@@ -19,7 +19,7 @@ from matplotlib.ticker import EngFormatter
 from edqn_jax.errors import ConfigError
 from edqn_jax.files import check_can_write
 from edqn_jax.report.curves import running_mean
-from edqn_jax.report.style import drawing
+from edqn_jax.report.style import open_figure
 from edqn_jax.runs.directory import RunDirectory
 
 WINDOW = 200
@@ -54,7 +54,7 @@ def draw_runs(groups: Mapping[str, Sequence[np.ndarray]], window: int, file: Pat
         file: PNG to write.
     """
     columns = min(len(groups), 2)
-    with drawing(7.0, 2.0 * -(-len(groups) // 2) + 0.3, file) as figure:
+    with open_figure(7.0, 2.0 * -(-len(groups) // 2) + 0.3, file) as figure:
         panels = figure.subplots(-(-len(groups) // columns), columns, sharex=True, squeeze=False).ravel()
         for axes, (title, runs) in zip(panels, groups.items(), strict=False):
             for number, returns in enumerate(runs):

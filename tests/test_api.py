@@ -106,7 +106,7 @@ def test_without_a_configuration_what_is_trained_is_that_of_the_command(monkeypa
         asked.append(config)
         raise InterruptedError
 
-    monkeypatch.setattr(loop, "prepared", prepared)
+    monkeypatch.setattr(loop, "set_up_training", prepared)
     for train in (edqn_jax.train, lambda: edqn_jax.train_seeds(2)):
         with pytest.raises(InterruptedError):
             train()

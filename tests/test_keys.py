@@ -10,8 +10,8 @@ import pytest
 from edqn_jax.cli.train import parse_train
 from edqn_jax.evaluation.missions import mission_key, run_missions
 from edqn_jax.evaluation.rollouts import flight_keys
-from edqn_jax.keys import integers, run_streams
-from edqn_jax.learn.state import InitialKeys, init
+from edqn_jax.keys import run_streams, uniform_integers
+from edqn_jax.learn.state import InitialKeys, init_state
 from edqn_jax.learn.step import ShardKeys
 from edqn_jax.sim.task import env
 from edqn_jax.sim.worlds import families
@@ -21,7 +21,7 @@ from tests.support.miniature import MINIATURE
 @pytest.mark.parametrize("below", [1, 2, 27, 1000])
 def test_integers_are_uniform_below_their_bound(below: int) -> None:
     count = 200_000
-    drawn = np.asarray(integers(jax.random.key(3), (count,), below))
+    drawn = np.asarray(uniform_integers(jax.random.key(3), (count,), below))
     assert drawn.dtype == np.int32 and drawn.min() >= 0 and drawn.max() < below
     counts = np.bincount(drawn, minlength=below)
     # Pearson's statistic has mean below - 1 and variance twice that; five deviations.
@@ -31,7 +31,7 @@ def test_integers_are_uniform_below_their_bound(below: int) -> None:
 
 def test_each_integer_has_its_own_bound() -> None:
     bounds = jnp.asarray([1, 5, 100, 2**31 - 1])
-    drawn = np.asarray(integers(jax.random.key(0), (5000, 4), bounds))
+    drawn = np.asarray(uniform_integers(jax.random.key(0), (5000, 4), bounds))
     assert (drawn >= 0).all() and (drawn < np.asarray(bounds)).all()
     assert drawn[:, 1].max() == 4 and drawn[:, 2].max() == 99 and drawn[:, 3].max() > 2**30
 
@@ -81,9 +81,9 @@ def test_a_run_derives_its_keys_from_its_streams_alone() -> None:
     """The environments of a run begin with the keys of the list above."""
     config = parse_train(MINIATURE)[1]
     world = run_missions(config).training.world
-    state = init(config, world, run_streams(5).learning)
+    state = init_state(config, world, run_streams(5).learning)
     initial = InitialKeys.split(run_streams(5).learning, config.train.num_envs, config.train.shards)
-    begun = jax.vmap(lambda key: env.ended(config, world, key))(initial.environments)
+    begun = jax.vmap(lambda key: env.before_reset(config, world, key))(initial.environments)
     np.testing.assert_array_equal(
         jax.random.key_data(state.actors.env.key).reshape(-1, 2), jax.random.key_data(begun.key)
     )

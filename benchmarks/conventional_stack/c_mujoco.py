@@ -9,10 +9,10 @@ from pathlib import Path
 
 import mujoco
 
-from edqn_jax.extras import require
+from edqn_jax.extras import require_extra
 
-types = require("numba").types
-llvm = require("llvmlite.binding")  # comes with numba
+types = require_extra("numba").types
+llvm = require_extra("llvmlite.binding")  # comes with numba
 
 # The bindings have loaded this file already; loading it again makes its symbols known to the linker.
 llvm.load_library_permanently(str(next(Path(mujoco.__file__).parent.glob("libmujoco*"))))

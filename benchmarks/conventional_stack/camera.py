@@ -14,14 +14,14 @@ from numpy.typing import NDArray
 
 from conventional_stack.c_mujoco import mj_multi_ray
 from edqn_jax.config import CameraConfig
-from edqn_jax.extras import require
+from edqn_jax.extras import require_extra
 from edqn_jax.sim.camera.camera import LUMA_WEIGHTS
 from edqn_jax.sim.camera.raycast import image_plane, pitch_of, sun_direction
 from edqn_jax.sim.camera.texture import WAVES
 from edqn_jax.sim.scene.shapes.plane import HORIZON_M
 from edqn_jax.sim.sensors.sensor import DEPTH_SCALE, HALF_NEAR_M
 
-numba = require("numba")
+numba = require_extra("numba")
 
 
 class Optics(NamedTuple):

@@ -8,12 +8,12 @@ import numpy as np
 
 from conventional_stack.fleet import Course, Fleet, Record
 from edqn_jax.config import Config
-from edqn_jax.extras import require
+from edqn_jax.extras import require_extra
 from edqn_jax.sim.actions import ACTIONS
 from edqn_jax.sim.task.observation import MOTION_SIZE, OWN_SIZE
 from edqn_jax.sim.task.outcomes import Outcome
 
-gymnasium = require("gymnasium")
+gymnasium = require_extra("gymnasium")
 spaces = gymnasium.spaces
 
 _LIMIT = 1e3

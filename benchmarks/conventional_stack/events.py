@@ -9,10 +9,10 @@ import math
 from typing import NamedTuple
 
 from edqn_jax.config import EventsConfig
-from edqn_jax.extras import require
+from edqn_jax.extras import require_extra
 from edqn_jax.sim.sensors.events import max_events
 
-numba = require("numba")
+numba = require_extra("numba")
 
 
 class Law(NamedTuple):

@@ -36,7 +36,7 @@ class Course:
     goal: NDArray[np.float64]  # [M, 3] metres
 
     @classmethod
-    def of(cls, ours: env.World) -> Course:
+    def of(cls, ours: env.EnvParams) -> Course:
         """Returns the missions of our environments.
 
         Raises:

@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 
 from conventional_stack.c_mujoco import mj_step
 from edqn_jax.config import Config, DroneConfig
-from edqn_jax.extras import require
+from edqn_jax.extras import require_extra
 from edqn_jax.sim.physics.airframe import c_model, mixer_of
 from edqn_jax.sim.physics.controller import LEAST_LEVELNESS
 
-numba = require("numba")
+numba = require_extra("numba")
 
 STATE = 13
 """Number of values of a drone's state: qpos (position, quaternion), qvel (velocity in the world, rates in the body)."""

@@ -12,10 +12,10 @@ from numpy.typing import NDArray
 from conventional_stack.fleet import Course, Fleet, Record
 from conventional_stack.task import RUNNING, signed_distance
 from edqn_jax.config import Config
-from edqn_jax.extras import require
+from edqn_jax.extras import require_extra
 from edqn_jax.sim.task.flights import Closest, Flights
 
-numba = require("numba")
+numba = require_extra("numba")
 
 Act = Callable[[NDArray[np.int8], NDArray[np.float32], NDArray[np.float32]], NDArray[np.int64]]
 """Returns the actions [M] for event counts [M, H, W], own states [M, 10] and own motions [M, 7]."""
@@ -25,7 +25,7 @@ def fly_missions(config: Config, course: Course, act: Act) -> Flights:
     """Flies each of the course's M missions once; a drone whose flight has ended continues without being counted.
 
     Returns:
-        the result of `evaluation.rollouts.fly_missions` in NumPy without a record, for `metrics.summarise`.
+        the result of `evaluation.rollouts.fly_missions` in NumPy without a record, for `metrics.summarise_flights`.
 
     Raises:
         ConfigError: if this stack does not support the configuration.

@@ -10,11 +10,11 @@ import numpy as np
 
 from conventional_stack.flight import clip, wrap_angle
 from edqn_jax.config import Config
-from edqn_jax.extras import require
-from edqn_jax.sim.task.observation import MOST_YAW_RATE
+from edqn_jax.extras import require_extra
+from edqn_jax.sim.task.observation import MAX_YAW_RATE
 from edqn_jax.sim.task.outcomes import Outcome
 
-numba = require("numba")
+numba = require_extra("numba")
 
 RUNNING, GOAL, COLLISION, LEFT_VOLUME, TIME_OUT, DIVERGED = (int(outcome) for outcome in Outcome)
 
@@ -123,7 +123,7 @@ def _first_verdict(geoms, rules, goal, path):
     """Returns the outcome of the first physics step that ends the episode, else RUNNING.
 
     Within a step the order is: not finite, contact, outside the volume, goal. Also returns that step, 1..n, and the
-    fraction of it before a contact, as `edqn_jax.sim.task.outcomes.judge`.
+    fraction of it before a contact, as `edqn_jax.sim.task.outcomes.judge_decision`.
     """
     gap = signed_distance(geoms, path[0, 0], path[0, 1], path[0, 2]) - rules.radius
     for step in range(1, len(path)):
@@ -229,5 +229,5 @@ def own_motion(moves, action, own, state, motion):
         p, q, r = state[i, 10], state[i, 11], state[i, 12]
         turn = w * (w * r + x * q - y * p) + z * (x * p + y * q + z * r)
         motion[i, :3] = own[i, 7:]
-        motion[i, 3] = clip(turn / max(w * w + z * z, 1e-9), -MOST_YAW_RATE, MOST_YAW_RATE)
+        motion[i, 3] = clip(turn / max(w * w + z * z, 1e-9), -MAX_YAW_RATE, MAX_YAW_RATE)
         motion[i, 4:] = moves[action[i]]

@@ -26,13 +26,13 @@ from conventional_stack.vec_env import CodedDrones, observed
 from conventional_stack.workers import SpreadFleet
 from edqn_jax.config import Config
 from edqn_jax.errors import ConfigError
-from edqn_jax.extras import require
-from edqn_jax.learn.plan import Plan
+from edqn_jax.extras import require_extra
+from edqn_jax.learn.schedule import Schedule
 from edqn_jax.sim.actions import ACTIONS
 from edqn_jax.sim.task.flights import Flights
 
-torch = require("torch")
-stable_baselines3 = require("stable_baselines3")
+torch = require_extra("torch")
+stable_baselines3 = require_extra("stable_baselines3")
 
 PARTS = (
     "physics",
@@ -151,7 +151,7 @@ class Training:
         """
         agent, drones = config.agent, config.train.num_envs
         check(config)
-        self.config, self.threads, self.plan = config, threads, Plan.of(config)
+        self.config, self.threads, self.plan = config, threads, Schedule.from_config(config)
         self.warm, self.seconds = 0, 0.0
         fleet = SpreadFleet(config, course, drones, processes, config.train.seed)
         self.learner = Learner(config.encoder, config.camera, config.train.seed)

@@ -14,13 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edqn_jax.config import CameraConfig, EncoderConfig
-from edqn_jax.extras import require
+from edqn_jax.extras import require_extra
 from edqn_jax.learn.perception.code import MAX_LOG_VARIANCE, MAX_MEAN
 from edqn_jax.learn.perception.patch_encoder import patch_places
 from edqn_jax.learn.perception.vae import init_vae
-from edqn_jax.learn.perception.waves import OUTPUT_SCALE, cosines
+from edqn_jax.learn.perception.waves import OUTPUT_SCALE, cosine_basis
 
-torch = require("torch")
+torch = require_extra("torch")
 nn = torch.nn
 
 Tensor = Any
@@ -100,7 +100,8 @@ class EventVAE(nn.Module):
         return torch.cat([level.clamp(min=0), level.neg_().clamp_(min=0)], dim=2)
 
     def target(self, counts: NDArray[np.int8], nearness: NDArray[np.float32]) -> Tensor:
-        """Returns what the decoder must draw: amplitudes [B, channels, P, Q] of `edqn_jax.learn.perception.vae.target`.
+        """Returns what the decoder must draw: amplitudes [B, channels, P, Q] of
+        `edqn_jax.learn.perception.vae.decoder_target`.
 
         Args:
             counts: [B, H, W] signed event counts.
@@ -159,7 +160,7 @@ def _blurred_waves(size: int, count: int, times: int) -> Tensor:
     A binomial (1, 2, 1) / 4 with edges repeated only scales a standing wave, by cos^2 of half its step per pixel.
     """
     factor = np.cos(0.5 * np.pi * np.arange(count) / size) ** (2 * times)
-    return torch.from_numpy((factor[:, None] * cosines(size, count)).astype(np.float32))
+    return torch.from_numpy((factor[:, None] * cosine_basis(size, count)).astype(np.float32))
 
 
 class Learner:

@@ -11,13 +11,13 @@ from numpy.typing import NDArray
 from conventional_stack.vae import Learner
 from conventional_stack.workers import SpreadFleet
 from edqn_jax.config import Config
-from edqn_jax.extras import require
+from edqn_jax.extras import require_extra
 from edqn_jax.sim.actions import ACTIONS
 from edqn_jax.sim.task.observation import OWN_SIZE
 from edqn_jax.sim.task.outcomes import Outcome
 
-spaces = require("gymnasium").spaces
-vec_env = require("stable_baselines3.common.vec_env")
+spaces = require_extra("gymnasium").spaces
+vec_env = require_extra("stable_baselines3.common.vec_env")
 
 
 def observed(config: Config, code: NDArray[np.float32], own: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator
 
-from edqn_jax.report.style import INK, LINE, MUTED, SECOND_LINE, drawing
+from edqn_jax.report.style import INK, LINE, MUTED, SECOND_LINE, open_figure
 
 COLUMNS = 3
 COST = "µs of one device per decision"
@@ -21,7 +21,7 @@ def draw_scaling(report: dict[str, Any], file: Path) -> Figure:
     """Writes the report of `scaling.measure` as a PNG and returns the figure."""
     curves = report["curves"]
     rows = math.ceil((len(curves) + 1) / COLUMNS)
-    with drawing(8.4, 0.5 + 2.5 * rows, file) as figure:
+    with open_figure(8.4, 0.5 + 2.5 * rows, file) as figure:
         grid = figure.subplots(rows, COLUMNS, squeeze=False).ravel()
         # The same range of costs in all panels, so that they can be compared.
         costs = [row[key] for row in report["rows"] for key in ("us_low", "us_high")]

@@ -9,7 +9,7 @@ from typing import Any
 
 from curves.boxes import world_of_boxes
 from edqn_jax.config import Config
-from edqn_jax.config.loading import Layer, apply
+from edqn_jax.config.loading import Layer, apply_layer
 from edqn_jax.config.rules import validate
 from edqn_jax.sim.scene.mjcf import write_scene
 
@@ -113,6 +113,6 @@ def changed(config: Config, **layer: Any) -> Config:
         ConfigError: if the result is invalid.
     """
     groups: Layer = layer
-    changed = apply(config, groups, "this size")
+    changed = apply_layer(config, groups, "this size")
     validate(changed)
     return changed

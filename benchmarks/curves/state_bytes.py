@@ -7,8 +7,8 @@ import dataclasses
 import jax
 
 from edqn_jax.config import Config
-from edqn_jax.learn.state import init
-from edqn_jax.sim.task.env import World
+from edqn_jax.learn.state import init_state
+from edqn_jax.sim.task.env import EnvParams
 from measurement.timing import size_of
 
 
@@ -26,9 +26,9 @@ class StateBytes:
     replay_slots: int
 
 
-def state_bytes(config: Config, world: World) -> StateBytes:
+def state_bytes(config: Config, world: EnvParams) -> StateBytes:
     """Returns the bytes of the train state for a configuration."""
-    state = jax.eval_shape(lambda world, key: init(config, world, key), world, jax.random.key(0))
+    state = jax.eval_shape(lambda world, key: init_state(config, world, key), world, jax.random.key(0))
     actors, ring = state.actors, state.actors.replay
     environments = size_of(dataclasses.replace(actors, replay=None, samples=None, key=None))
     return StateBytes(

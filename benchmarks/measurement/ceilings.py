@@ -15,7 +15,7 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from mujoco import rollout
 
 from edqn_jax.config import Config
-from edqn_jax.devices.hardware import cores
+from edqn_jax.devices.hardware import count_cores
 from edqn_jax.learn.trainer import AXIS
 from edqn_jax.sim.physics.airframe import c_model
 
@@ -31,7 +31,7 @@ class Rollout:
     def __init__(self, config: Config) -> None:
         model = c_model(config.drone)
         model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
-        threads, self.drones = cores(), config.train.num_envs
+        threads, self.drones = count_cores(), config.train.num_envs
         data = mujoco.MjData(model)
         data.qpos[2] = 10.0
         state = np.empty(mujoco.mj_stateSize(model, mujoco.mjtState.mjSTATE_FULLPHYSICS))

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from edqn_jax.evaluation.intervals import drawn_rates, percentiles, rate_interval
+from edqn_jax.evaluation.intervals import bootstrap_rates, percentile_interval, rate_interval
 
 
 def difference_interval(first: np.ndarray, second: np.ndarray) -> tuple[float, float]:
@@ -19,9 +19,9 @@ def difference_interval(first: np.ndarray, second: np.ndarray) -> tuple[float, f
     Raises:
         ValueError: if the numbers of missions differ.
     """
-    drawn = drawn_rates([first, second])
+    drawn = bootstrap_rates([first, second])
     if all(0 < np.mean(success) < 1 for success in (first, second)):
-        return percentiles(drawn[0] - drawn[1])
+        return percentile_interval(drawn[0] - drawn[1])
     (a, b), (low_a, high_a), (low_b, high_b) = (
         map(np.mean, (first, second)),
         rate_interval(first),

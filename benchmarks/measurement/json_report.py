@@ -7,18 +7,18 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from edqn_jax.devices.hardware import processor
+from edqn_jax.devices.hardware import describe_processor
 from edqn_jax.files import write_atomically
-from edqn_jax.runs.directory import plain
-from edqn_jax.runs.provenance import versions
+from edqn_jax.runs.directory import to_plain_json
+from edqn_jax.runs.provenance import package_versions
 
 
 def machine(devices: Sequence[Any]) -> dict[str, Any]:
     """Returns device and versions for a report measured on `devices`."""
     return {
-        "device": processor() if devices[0].platform == "cpu" else devices[0].device_kind,
+        "device": describe_processor() if devices[0].platform == "cpu" else devices[0].device_kind,
         "devices": [str(device) for device in devices],
-        "versions": versions(),
+        "versions": package_versions(),
     }
 
 
@@ -29,4 +29,4 @@ def write(file: Path | None, report: dict[str, Any]) -> None:
         ConfigError: if the file cannot be written.
     """
     if file is not None:
-        write_atomically(file, json.dumps(plain(report), indent=1, allow_nan=False) + "\n")
+        write_atomically(file, json.dumps(to_plain_json(report), indent=1, allow_nan=False) + "\n")

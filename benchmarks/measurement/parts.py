@@ -18,22 +18,22 @@ from edqn_jax.learn import qnetwork, replay, updates
 from edqn_jax.learn.exploration import epsilon_greedy
 from edqn_jax.learn.learner import Rings, learner_of
 from edqn_jax.learn.perception import vae
-from edqn_jax.learn.plan import Plan
 from edqn_jax.learn.samples import Samples
+from edqn_jax.learn.schedule import Schedule
 from edqn_jax.learn.state import Actors, TrainState
 from edqn_jax.learn.trainer import AXIS
 from edqn_jax.learn.updates import Networks
 from edqn_jax.sim.actions import ACTIONS
 from edqn_jax.sim.camera import camera, columns, native
 from edqn_jax.sim.physics import drone
-from edqn_jax.sim.physics.controller import thrusts
+from edqn_jax.sim.physics.controller import rotor_thrusts
 from edqn_jax.sim.physics.drone import DroneState
-from edqn_jax.sim.physics.flight import fly, physics_step
+from edqn_jax.sim.physics.flight import fly_decision, physics_step
 from edqn_jax.sim.scene.scene import take_scene
 from edqn_jax.sim.sensors import events, sensor
 from edqn_jax.sim.task.action_sets import heading_setpoint, velocity_command
-from edqn_jax.sim.task.env import EnvState, Step, World
-from edqn_jax.sim.task.outcomes import judge
+from edqn_jax.sim.task.env import EnvParams, EnvState, Step
+from edqn_jax.sim.task.outcomes import judge_decision
 from edqn_jax.sim.task.task import task_of
 from measurement.timing import Part, depending_on, operations_of, size_of, unchanged
 
@@ -46,7 +46,7 @@ class Moment:
     """The state of a training, from which the parts take their inputs."""
 
     config: Config
-    world: World
+    world: EnvParams
     state: TrainState
 
     @property
@@ -82,7 +82,7 @@ class Moment:
     @property
     def newest(self) -> Array:
         """Returns the number of the newest row of the replay."""
-        return jnp.int32(self.state.step - Plan.of(self.config).warmup)
+        return jnp.int32(self.state.step - Schedule.from_config(self.config).warmup)
 
     @property
     def sampled(self) -> int:
@@ -108,23 +108,23 @@ def physics(now: Moment) -> Part:
     """Returns the part of a decision's physics steps with the controller, without camera and outcome."""
     config = now.config
 
-    def one(world: World, body: DroneState, move: Array, goal: Array):
+    def one(world: EnvParams, body: DroneState, move: Array, goal: Array):
         command = velocity_command(config.env, move, drone.yaw_of(body.quaternion))
         heading = heading_setpoint(config.env, body, goal, command)
-        after, flight = fly(config.drone, world.airframe, body, command, heading)
+        after, flight = fly_decision(config.drone, world.airframe, body, command, heading)
         return after, flight.position
 
-    def body(world: World, carry):
+    def body(world: EnvParams, carry):
         state, move, goal = carry
         after, path = jax.vmap(partial(one, world))(state, move, goal)
         return after, depending_on(move, path), goal
 
-    def single(world: World, carry):
+    def single(world: EnvParams, carry):
         """Takes one physics step without the scan, of which XLA counts one iteration and what is around it."""
         state, move, goal = carry
 
         def step(state: DroneState, goal: Array) -> DroneState:
-            thrust = thrusts(config.drone, world.airframe, state, goal)  # the goal stands for the velocity
+            thrust = rotor_thrusts(config.drone, world.airframe, state, goal)  # the goal stands for the velocity
             return physics_step(config.drone, world.airframe, state, thrust)
 
         return jax.vmap(step)(state, goal), move, goal
@@ -136,11 +136,11 @@ def physics(now: Moment) -> Part:
 def outcome(now: Moment) -> Part:
     """Returns the part that determines the outcome of a decision."""
 
-    def body(world: World, carry):
+    def body(world: EnvParams, carry):
         before, flight, scene, goal = carry
-        judged = jax.vmap(lambda b, f, s, g: judge(now.config, take_scene(world.pool, s), g, b, f, jnp.int32(1)))(
-            before, flight, scene, goal
-        )
+        judged = jax.vmap(
+            lambda b, f, s, g: judge_decision(now.config, take_scene(world.pool, s), g, b, f, jnp.int32(1))
+        )(before, flight, scene, goal)
         return depending_on(before, judged), flight, scene, goal
 
     return Part(
@@ -152,12 +152,12 @@ def rendering(now: Moment) -> Part:
     """Returns the part that renders the frames of a decision."""
     steps = sensor.frame_steps(now.config)
 
-    def body(world: World, carry):
+    def body(world: EnvParams, carry):
         position, quaternion, scene = carry
 
         def one(position: Array, quaternion: Array, scene: Array) -> list[Array]:
             here = take_scene(world.pool, scene)
-            return [sensor.view(now.config, here, position[t], quaternion[t]) for t in range(len(steps))]
+            return [sensor.render_view(now.config, here, position[t], quaternion[t]) for t in range(len(steps))]
 
         frames = jax.vmap(one)(position, quaternion, scene)
         return depending_on(position, frames), quaternion, scene
@@ -178,7 +178,7 @@ def _drawing(now: Moment, position: Array, quaternion: Array) -> float | None:
     GPU, for cameras that do not draw by columns, and where the columns are drawn in C.
     """
     config = now.config.camera
-    if config.mount != "level" or jax.default_backend() != "cpu" or native.can_draw(config, now.world.pool, "cpu"):
+    if config.mount != "level" or jax.default_backend() != "cpu" or native.can_render(config, now.world.pool, "cpu"):
         return None
     times = position.shape[1]
     scene = jax.tree.map(
@@ -188,9 +188,9 @@ def _drawing(now: Moment, position: Array, quaternion: Array) -> float | None:
     turn = jax.vmap(partial(sensor.mount_rotation, now.config))(quaternion.reshape(-1, 4))
     weights = jnp.broadcast_to(jnp.asarray(camera.LUMA_WEIGHTS), (len(place), 3))
     given = (scene, place, turn, weights)
-    branches, branch = columns.draw_branches(config, *given)
-    laid = operations_of(lambda *given: columns.draw_branches(config, *given)[1], *given)
-    each = [operations_of(partial(draw, config, camera.blend), jnp.zeros(1, jnp.int32)) for draw in branches]
+    branches, branch = columns.render_branches(config, *given)
+    laid = operations_of(lambda *given: columns.render_branches(config, *given)[1], *given)
+    each = [operations_of(partial(draw, config, camera.blend_layers), jnp.zeros(1, jnp.int32)) for draw in branches]
     if laid is None:
         return None
     needed = np.bincount(np.asarray(branch), minlength=len(branches))
@@ -203,9 +203,9 @@ def sensing(now: Moment) -> Part:
 
     def body(_: None, carry):
         frames, memory, keys = carry
-        field, memory = jax.vmap(lambda f, m, k: events.events(config.events, m, f, config.events.frame_times_s, k))(
-            frames, memory, keys
-        )
+        field, memory = jax.vmap(
+            lambda f, m, k: events.generate_events(config.events, m, f, config.events.frame_times_s, k)
+        )(frames, memory, keys)
         return depending_on(frames, field), memory, keys
 
     shape = (len(config.events.frame_times_s), config.camera.height, config.camera.width)
@@ -216,7 +216,7 @@ def sensing(now: Moment) -> Part:
 def environment(now: Moment) -> Part:
     """Returns the part of the environment's whole step, always from the same state."""
 
-    def body(world: World, carry):
+    def body(world: EnvParams, carry):
         state, move = carry
         after, step = jax.vmap(lambda s, a: task_of(now.config).step(world, s, a))(state, move)
         return unchanged(state, after, move), depending_on(move, step.observation, step.reward)
@@ -227,7 +227,7 @@ def environment(now: Moment) -> Part:
 def environment_without_resets(now: Moment) -> Part:
     """Returns the same for environments that never end, from which the compiler removes the resets."""
 
-    def body(world: World, carry):
+    def body(world: EnvParams, carry):
         state, move = carry
 
         def go_on(state: EnvState, move: Array):
@@ -273,7 +273,7 @@ def _draw(now: Moment, ring: replay.Rows, keys: Array) -> tuple[Array, Any]:
 
     def batch(keys: Array, _: None):
         keys = _next(keys)
-        drawn = jax.vmap(lambda r, k: replay.sample(agent, r, newest, share, k, task))(ring, keys)
+        drawn = jax.vmap(lambda r, k: replay.sample_transitions(agent, r, newest, share, k, task))(ring, keys)
         return keys, jax.tree.map(jnp.sum, drawn)
 
     return jax.lax.scan(batch, keys, length=agent.updates_per_step)
@@ -298,7 +298,7 @@ def replaying(now: Moment) -> Part:
     def body(_: None, carry):
         ring, keys = carry
         row = jax.tree.map(lambda leaf: leaf[:, 0], ring)
-        ring = jax.vmap(replay.write, in_axes=(0, 0, None))(ring, row, now.newest)
+        ring = jax.vmap(replay.store_decision, in_axes=(0, 0, None))(ring, row, now.newest)
         keys, sums = _draw(now, ring, keys)
         return dataclasses.replace(ring, reward=depending_on(ring.reward, sums)), keys
 
@@ -369,7 +369,7 @@ PARTS: dict[str, Callable[[Moment], Part]] = {
 """Parts by the name of their row."""
 
 
-def parts_of(config: Config, world: World, state: TrainState, names: Sequence[str] = tuple(PARTS)) -> list[Part]:
+def parts_of(config: Config, world: EnvParams, state: TrainState, names: Sequence[str] = tuple(PARTS)) -> list[Part]:
     """Returns the named parts on a state of the training."""
     now = Moment(config, world, state)
     return [PARTS[name](now) for name in names]

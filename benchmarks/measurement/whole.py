@@ -38,7 +38,7 @@ def steady(config: Config, chunk_steps: int) -> Config:
 class WholeStep:
     """The compiled chunk of the training command, after the warm-up."""
 
-    def __init__(self, config: Config, world: env.World, devices: Sequence[Any]) -> None:
+    def __init__(self, config: Config, world: env.EnvParams, devices: Sequence[Any]) -> None:
         self.trainer = Trainer(config, world, devices)
         self.decisions = config.train.chunk_steps * config.train.num_envs
         state = self.trainer.init(config.train.seed)
@@ -47,7 +47,7 @@ class WholeStep:
         self.compile_seconds = time.perf_counter() - began
         self.done = 0
         self.state = state
-        while self.done < self.trainer.plan.learn_from:
+        while self.done < self.trainer.schedule.learn_from:
             self.turn()
 
     @property
@@ -66,7 +66,7 @@ class WholeStep:
         self.state, (_, losses) = self.trainer.chunk(self.state, self.done)
         q_loss = np.asarray(losses.metrics["q_loss"])
         seconds = time.perf_counter() - began
-        learns = self.done >= self.trainer.plan.learn_from
+        learns = self.done >= self.trainer.schedule.learn_from
         self.done += len(q_loss)
         learnt = [q_loss]
         if embedding.has_code(self.trainer.config):

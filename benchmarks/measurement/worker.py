@@ -25,7 +25,7 @@ import throughput
 from edqn_jax.devices.devices import choose_devices, use_cpu_devices
 from edqn_jax.evaluation.missions import run_missions
 from edqn_jax.learn.trainer import AXIS
-from edqn_jax.runs.provenance import workload
+from edqn_jax.runs.provenance import describe_workload
 from measurement import json_report
 from measurement.child import answers
 from measurement.parts import PARTS, parts_of
@@ -58,7 +58,7 @@ def prepare(wanted: Sequence[str], words: Sequence[str]) -> tuple[dict[str, Any]
     about = {
         "package": edqn_jax.__file__,
         "rows": [name for name in turns if not wanted or name in wanted],
-        "workload": {**workload(config, missions.scene), "world": config.world.name},
+        "workload": {**describe_workload(config, missions.scene), "world": config.world.name},
         **json_report.machine(devices),
     }
     return about, turns

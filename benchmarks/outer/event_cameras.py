@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edqn_jax.config import EventsConfig
-from edqn_jax.extras import MissingPackageError, require
+from edqn_jax.extras import MissingPackageError, require_extra
 from edqn_jax.sim.sensors.events import STREAM_DTYPE
 from outer.pictures import See
 from outer.poses import Track, camera_rotation
@@ -89,8 +89,8 @@ def esim() -> Any:
     Raises:
         MissingPackageError: if evlib, or PyTorch, on which its simulator stands, is not installed.
     """
-    simulation = require("evlib.simulation", extra="transfer")
-    require("torch", extra="transfer")
+    simulation = require_extra("evlib.simulation", extra="transfer")
+    require_extra("torch", extra="transfer")
     config = simulation.ESIMConfig(
         positive_threshold=CONTRAST,
         negative_threshold=CONTRAST,
@@ -98,7 +98,7 @@ def esim() -> Any:
         log_floor=EPSILON,
         device="cpu",
     )
-    simulator = require("evlib.simulation.esim", extra="transfer").ESIMSimulator(config)
+    simulator = require_extra("evlib.simulation.esim", extra="transfer").ESIMSimulator(config)
 
     def process(frame: NDArray[np.float64], time: float) -> NDArray:
         x, y, _, polarity = simulator.process_frame(255.0 * frame, time)
@@ -114,7 +114,7 @@ def v2e() -> Any:
         MissingPackageError: if v2e is not installed.
     """
     try:
-        emulator = require("v2ecore.emulator", extra="transfer").EventEmulator(
+        emulator = require_extra("v2ecore.emulator", extra="transfer").EventEmulator(
             pos_thres=CONTRAST,
             neg_thres=CONTRAST,
             sigma_thres=0.05,

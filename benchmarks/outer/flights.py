@@ -11,7 +11,7 @@ import jax
 import numpy as np
 from numpy.typing import NDArray
 
-from edqn_jax.extras import require
+from edqn_jax.extras import require_extra
 from edqn_jax.interop.deployment.runner import Command
 from edqn_jax.sim.environment import Environment
 from edqn_jax.sim.physics import drone
@@ -78,9 +78,11 @@ class RotorPyFlight:
     """
 
     def __init__(self, start: NDArray[np.float64], goal: NDArray[np.float64], max_yaw_rate: float) -> None:
-        vehicles = require("rotorpy.vehicles.multirotor", extra="transfer")
-        control = require("rotorpy.controllers.quadrotor_control", extra="transfer")
-        self._params: dict[str, Any] = require("rotorpy.vehicles.hummingbird_params", extra="transfer").quad_params
+        vehicles = require_extra("rotorpy.vehicles.multirotor", extra="transfer")
+        control = require_extra("rotorpy.controllers.quadrotor_control", extra="transfer")
+        self._params: dict[str, Any] = require_extra(
+            "rotorpy.vehicles.hummingbird_params", extra="transfer"
+        ).quad_params
         self._control = control.SE3Control(self._params)
         half = np.arctan2(goal[1] - start[1], goal[0] - start[0]) / 2
         hover = np.sqrt(self._params["mass"] * 9.81 / 4 / self._params["k_eta"])

@@ -135,7 +135,7 @@ def own_pictures(config: Config, environment: Environment, mission: int) -> See:
     from edqn_jax.sim.camera import camera
 
     scene = environment.scene(mission)
-    draw = jax.jit(lambda position, rotation: camera.luma(config.camera, scene, position, rotation))
+    draw = jax.jit(lambda position, rotation: camera.render_luma(config.camera, scene, position, rotation))
 
     def see(position: NDArray[np.float64], rotation: NDArray[np.float64]) -> NDArray[np.float64]:
         return np.asarray(draw(position.astype(np.float32), rotation.astype(np.float32)), np.float64)

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullLocator, PercentFormatter
 
 from edqn_jax.config import FAMILIES
-from edqn_jax.report.style import INK, LINE, MUTED, SECOND_LINE, drawing
+from edqn_jax.report.style import INK, LINE, MUTED, SECOND_LINE, open_figure
 from rivals.rows import Row, figures
 
 OURS = "E-DQN"
@@ -31,7 +31,7 @@ def draw_runtime(rows: Sequence[Row], file: Path) -> Figure:
     """Writes the rows as a PNG, with a line of panels for each world, and returns the figure."""
     worlds = list(dict.fromkeys(row["world"] for row in rows)) or ["no"]
     most = max((len([row for row in rows if row["world"] == world]) for world in worlds), default=1)
-    with drawing(11.0, 0.4 + len(worlds) * (1.2 + 0.21 * most), file) as figure:
+    with open_figure(11.0, 0.4 + len(worlds) * (1.2 + 0.21 * most), file) as figure:
         parts = figure.subfigures(len(worlds), 1, squeeze=False)[:, 0]
         for part, world in zip(parts, worlds, strict=True):
             there = [row for row in rows if row["world"] == world]

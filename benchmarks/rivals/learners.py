@@ -11,7 +11,7 @@ import jax
 import numpy as np
 
 from edqn_jax.config import Config
-from edqn_jax.config.loading import apply
+from edqn_jax.config.loading import apply_layer
 from edqn_jax.config.rules import validate
 from edqn_jax.devices.devices import choose_devices
 from edqn_jax.errors import DivergedError
@@ -22,12 +22,12 @@ from edqn_jax.learn.policy import PolicyParams
 from edqn_jax.learn.state import TrainState
 from edqn_jax.learn.step import policy_of
 from edqn_jax.learn.trainer import Trainer
-from edqn_jax.runs.provenance import workload
-from edqn_jax.sim.task.env import World
+from edqn_jax.runs.provenance import describe_workload
+from edqn_jax.sim.task.env import EnvParams
 from edqn_jax.sim.task.flights import Flights
 from edqn_jax.sim.task.outcomes import Outcome
-from edqn_jax.training.history import Watch
-from edqn_jax.training.selection import Candidate, choose, first_success, is_due, validated
+from edqn_jax.training.history import DivergenceMonitor
+from edqn_jax.training.selection import Candidate, choose_candidate, first_success, is_due, make_candidate
 from measurement import json_report
 
 LEARNERS = {
@@ -55,7 +55,7 @@ def flight_columns(flights: Flights, count: int) -> dict[str, list[Any]]:
 class Validation:
     """The validations of one training: its learning curve and the parameters that would be kept so far."""
 
-    def __init__(self, config: Config, missions: RunMissions, fly: Callable[[World, Any], Flights]) -> None:
+    def __init__(self, config: Config, missions: RunMissions, fly: Callable[[EnvParams, Any], Flights]) -> None:
         """Starts without validations; `fly(world, params)` flies every mission of a world once, greedily.
 
         In random worlds `world.flown` must be empty, so that all final missions are tests.
@@ -73,8 +73,8 @@ class Validation:
     def validate(self, params: Any, decisions: int, seconds: float) -> None:
         """Flies the validation missions and, if these parameters are kept, the test missions."""
         flights = self.fly(self.missions.validation.world, params)
-        latest = validated(self.config, self.missions, flights, params, decisions)
-        before, self.kept = self.kept, choose(self.config.train.keep, self.kept or latest, latest)
+        latest = make_candidate(self.config, self.missions, flights, params, decisions)
+        before, self.kept = self.kept, choose_candidate(self.config.train.keep, self.kept or latest, latest)
         if self.kept is not before:
             self.flights = flight_columns(self.fly(self.missions.final.world, params), self.judged)
         self.curve.append(
@@ -136,11 +136,11 @@ class Learner:
         self._fly(self.missions.final.world, self._policy(self.trainer.init(0)))
         self.about = {
             **json_report.machine(devices),
-            "workload": workload(config, self.missions.scene),
+            "workload": describe_workload(config, self.missions.scene),
             "compile_seconds": time.perf_counter() - began,
         }
 
-    def _fly(self, world: World, params: PolicyParams) -> Flights:
+    def _fly(self, world: EnvParams, params: PolicyParams) -> Flights:
         return fly_on_all_devices(self.config, world, params, self.config.train.seed)
 
     def _policy(self, state: TrainState) -> PolicyParams:
@@ -148,10 +148,10 @@ class Learner:
 
     def turn(self, seed: int) -> dict[str, Any]:
         """Trains and flies one seed and returns `Validation.result`. Seconds are of the chunks alone."""
-        config, plan, envs = self.config, self.trainer.plan, self.config.train.num_envs
+        config, plan, envs = self.config, self.trainer.schedule, self.config.train.num_envs
         validation = Validation(config, self.missions, self._fly)
         state = self.trainer.init(seed)
-        seconds, done, watch = 0.0, 0, Watch()
+        seconds, done, watch = 0.0, 0, DivergenceMonitor()
         seeded = dataclasses.replace(config, train=dataclasses.replace(config.train, seed=seed))
         while done < plan.total:
             began = time.perf_counter()
@@ -195,6 +195,6 @@ def sensing(config: Config, name: str) -> Config:
     Raises:
         ConfigError: if other options cannot be combined with that sensor.
     """
-    config = apply(config, {"env": {"sensor": LEARNERS[name]}}, name)
+    config = apply_layer(config, {"env": {"sensor": LEARNERS[name]}}, name)
     validate(config)
     return config

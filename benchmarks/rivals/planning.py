@@ -12,11 +12,11 @@ import jax
 import numpy as np
 
 from edqn_jax.config import FAMILIES, Config
-from edqn_jax.devices.hardware import cores, processor
+from edqn_jax.devices.hardware import count_cores, describe_processor
 from edqn_jax.planning.astar import shortest_path
 from edqn_jax.planning.lattice import NoPathError
-from edqn_jax.planning.path import Task
-from edqn_jax.runs.provenance import workload
+from edqn_jax.planning.path import PlanningTask
+from edqn_jax.runs.provenance import describe_workload
 from edqn_jax.sim.physics.airframe import load_airframe
 from edqn_jax.sim.scene.mjcf import check_scene, load_world, resolve_world
 from edqn_jax.sim.scene.scene import Scene, take_scene
@@ -42,7 +42,7 @@ def judged_scenes(config: Config, count: int) -> list[Scene]:
     name, radius = config.world.name, config.drone.body_radius_m
     if name in FAMILIES:
         pool = jax.tree.map(
-            np.asarray, families.random_pool(name, families.world_keys("test", count), Moving.of(config))
+            np.asarray, families.random_pool(name, families.world_keys("test", count), Moving.from_config(config))
         )
         return [take_scene(pool, index) for index in range(count)]
     loaded = load_world(resolve_world(name))
@@ -69,7 +69,7 @@ def shortest_lengths(config: Config, scenes: Sequence[Scene]) -> list[float | No
     if len(scenes) < MANY:
         return [length(scene) for scene in scenes]
     fresh = multiprocessing.get_context("spawn")  # because JAX's threads do not survive a fork
-    with ProcessPoolExecutor(cores(), fresh, initializer=keep_to_cpu) as pool:
+    with ProcessPoolExecutor(count_cores(), fresh, initializer=keep_to_cpu) as pool:
         return list(pool.map(length, scenes, chunksize=8))
 
 
@@ -90,8 +90,8 @@ class Planning:
         self.follower = compiled_follower()
         machine = json_report.machine(jax.devices())
         if name != "SNN":  # the others run on the CPU, whatever JAX's default device
-            machine |= {"device": processor(), "devices": []}
-        self.about = {**machine, "workload": workload(config, self.scenes[0])}
+            machine |= {"device": describe_processor(), "devices": []}
+        self.about = {**machine, "workload": describe_workload(config, self.scenes[0])}
         self._mission(self.scenes[0], 0)  # compiles what the planner does not compile before it measures time
 
     def turn(self, seed: int) -> dict[str, Any]:
@@ -107,7 +107,9 @@ class Planning:
 
     def _mission(self, scene: Scene, seed: int) -> dict[str, Any]:
         config, follow = self.config, FollowConfig()
-        task = Task.of(scene, body_radius=config.drone.body_radius_m, goal_radius=config.env.goal_radius_m)
+        task = PlanningTask.from_scene(
+            scene, body_radius=config.drone.body_radius_m, goal_radius=config.env.goal_radius_m
+        )
         plan = self.plan(reserved(task, follow), self.budget, seed)
         said = {"reason": plan.reason, "planning_seconds": plan.seconds}
         if plan.path is None:

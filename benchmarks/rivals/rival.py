@@ -15,11 +15,11 @@ from typing import Any, TextIO
 import jax
 
 from edqn_jax.config import Config
-from edqn_jax.config.loading import apply, load_layer
+from edqn_jax.config.loading import apply_layer, load_layer
 from edqn_jax.devices.devices import use_cpu_devices
 from edqn_jax.errors import ConfigError
 from edqn_jax.extras import MissingPackageError
-from edqn_jax.runs.directory import plain
+from edqn_jax.runs.directory import to_plain_json
 from measurement.child import answers
 from measurement.peak_memory import peak_of
 from rivals.learners import Learner
@@ -49,11 +49,11 @@ def method(name: str, config: Config, seconds: float, missions: int) -> Any:
 def main(stream: TextIO) -> None:
     """Answers until the input ends."""
     name, file, seconds, missions = sys.argv[1:]
-    config = apply(Config(), load_layer(Path(file)), file)
+    config = apply_layer(Config(), load_layer(Path(file)), file)
     use_cpu_devices()
 
     def send(what: dict[str, Any]) -> None:
-        print(json.dumps(plain(what), allow_nan=False), file=stream)
+        print(json.dumps(to_plain_json(what), allow_nan=False), file=stream)
 
     try:
         rival = method(name, config, float(seconds), int(missions))

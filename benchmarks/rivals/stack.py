@@ -16,10 +16,10 @@ import numpy as np
 from conventional_stack.settings import PACKAGES, SETTINGS
 from edqn_jax.config import Config
 from edqn_jax.devices.devices import choose_devices
-from edqn_jax.devices.hardware import processor
+from edqn_jax.devices.hardware import describe_processor
 from edqn_jax.evaluation.missions import run_missions
-from edqn_jax.runs.provenance import workload
-from edqn_jax.sim.task.env import World
+from edqn_jax.runs.provenance import describe_workload
+from edqn_jax.sim.task.env import EnvParams
 from edqn_jax.sim.task.flights import Flights
 from edqn_jax.sim.task.observation import MOTION_SIZE, OWN_SIZE
 from measurement import json_report
@@ -50,11 +50,11 @@ class Stack:
         self.stack, self.course = train, fleet.Course.of
         self.setting = self._fastest()
         machine = json_report.machine(choose_devices(1, config.train.shards))
-        machine |= {"device": processor()}  # whatever JAX's default device
+        machine |= {"device": describe_processor()}  # whatever JAX's default device
         machine["versions"] |= {name: metadata.version(name) for name in PACKAGES}
         self.about = {
             **machine,
-            "workload": {**workload(config, self.missions.scene), "physics": "c_mujoco"},
+            "workload": {**describe_workload(config, self.missions.scene), "physics": "c_mujoco"},
             "processes": self.setting[0],
             "torch_threads": self.setting[1],
         }
@@ -65,7 +65,7 @@ class Stack:
             turns = [list(timed.turn(number)["decisions_per_second"].values()) for number in range(CHOOSING_TURNS)]
         return SETTINGS[int(np.argmax(np.median(turns, axis=0)))]
 
-    def _fly(self, world: World, trained: Any) -> Flights:
+    def _fly(self, world: EnvParams, trained: Any) -> Flights:
         return self.stack.fly(trained, self.course(world))
 
     def turn(self, seed: int) -> dict[str, Any]:
@@ -133,7 +133,7 @@ class SteadyStep:
         """Compiles; `config` must let the VAE learn throughout."""
         devices, missions = choose_devices(config.train.devices, config.train.shards), run_missions(config)
         self.whole = WholeStep(config, missions.training.world, devices)
-        self.about = {**json_report.machine(devices), "workload": workload(config, missions.scene)}
+        self.about = {**json_report.machine(devices), "workload": describe_workload(config, missions.scene)}
 
     def turn(self, number: int) -> dict[str, Any]:
         """Returns the decisions per second of one chunk."""

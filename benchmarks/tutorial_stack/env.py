@@ -12,14 +12,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edqn_jax.config import CameraConfig, Config, EventsConfig
-from edqn_jax.extras import require
+from edqn_jax.extras import require_extra
 from edqn_jax.sim.actions import ACTIONS
 from edqn_jax.sim.camera.camera import LUMA_WEIGHTS
 from edqn_jax.sim.physics.airframe import SKYDIO_X2, mixer_of
 from edqn_jax.sim.sensors.events import max_events
 from tutorial_stack.control import thrusts
 
-gymnasium = require("gymnasium")
+gymnasium = require_extra("gymnasium")
 
 Picture = NDArray[np.uint8]
 Look = Callable[[mujoco.MjData], Picture]

@@ -7,18 +7,18 @@ from collections.abc import Sequence
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Runs one command and returns its exit code, see `cli.commands.run`."""
-    from edqn_jax.cli.process.streams import lasting_streams, lost
+    from edqn_jax.cli.process.streams import exit_code, lasting_streams
 
     with lasting_streams() as outputs:
-        from edqn_jax.cli.process.signals import heard
+        from edqn_jax.cli.process.signals import listen_to_signals
         from edqn_jax.cli.process.variables import prepare_process
 
         prepare_process()
-        with heard() as stops:
-            from edqn_jax.cli.commands import run  # takes a while: a signal may come meanwhile
+        with listen_to_signals() as stops:
+            from edqn_jax.cli.commands import run_command  # takes a while: a signal may come meanwhile
 
-            code = run(argv, stops)
-        return lost(outputs, code)
+            code = run_command(argv, stops)
+        return exit_code(outputs, code)
 
 
 __all__ = ["main"]

@@ -10,7 +10,7 @@ from typing import TypeVar
 
 import tyro
 
-from edqn_jax.cli.help import ABOUT, asks_for_help, described, flag_of, show
+from edqn_jax.cli.help import ABOUT, asks_for_help, flag_of, print_help, with_help_texts
 from edqn_jax.config import Config
 from edqn_jax.errors import ConfigError
 from edqn_jax.policies import function_named, no_run, policy_folder
@@ -29,7 +29,7 @@ def parsed(kind: type[Args], argv: Sequence[str], command: str) -> Args:
     """
     check_flags(argv, flags_of(kind), command)
     if asks_for_help(argv):
-        show(described(kind), command, ABOUT[command])
+        print_help(with_help_texts(kind), command, ABOUT[command])
     return tyro.cli(kind, args=argv, prog=command)
 
 

@@ -20,7 +20,7 @@ from edqn_jax.cli.record import RecordArgs, parse_record, record_command
 from edqn_jax.cli.report import ReportArgs, parse_report, report_command
 from edqn_jax.cli.train import TrainCommand, train_command
 from edqn_jax.cli.verify import VerifyArgs, parse_verify, verify_command
-from edqn_jax.errors import CheckError, ConfigError, DivergedError, StoppedError, nearest, sentence
+from edqn_jax.errors import CheckError, ConfigError, DivergedError, StoppedError, error_sentence, suggest_nearest
 from edqn_jax.extras import MissingPackageError
 from edqn_jax.user_code import load_module
 from edqn_jax.version import package_version
@@ -49,7 +49,7 @@ IMPORT = "--import"
 VERSIONS = ("jax", "mujoco", "mujoco-mjx")
 """Packages whose versions `edqn --version` names below its own."""
 
-OF_A_RUN = {
+RUN_COMMANDS = {
     "evaluate": (parse_evaluate, evaluate_command),
     "record": (parse_record, record_command),
     "report": (parse_report, report_command),
@@ -60,7 +60,7 @@ OF_A_RUN = {
 """Commands on a finished run or a file: what parses their arguments, which does not import JAX, and what runs them."""
 
 
-def run(argv: Sequence[str] | None, stops: Stops) -> int:
+def run_command(argv: Sequence[str] | None, stops: Stops) -> int:
     """Runs one command and returns its exit code.
 
     0 is done, 1 a check failed, 2 bad input, 3 diverged, 130 stopped by SIGINT, and 143 by SIGTERM.
@@ -75,10 +75,10 @@ def _dispatched(argv: list[str], stops: Stops) -> int:
     except SystemExit as ending:  # tyro has printed the help, or what is wrong
         return int(ending.code or DONE)
     except MissingPackageError as missing:
-        print(f"edqn: {sentence(missing)}", file=sys.stderr)
+        print(f"edqn: {error_sentence(missing)}", file=sys.stderr)
         return BAD_INPUT
     except (CheckError, ConfigError, DivergedError, StoppedError) as ending:
-        print(f"edqn: {sentence(ending)}", file=sys.stderr)
+        print(f"edqn: {error_sentence(ending)}", file=sys.stderr)
         if isinstance(ending, StoppedError):  # by a signal to this process, or to another of the cluster
             return BY_SIGNAL + (stops.number or signal.SIGTERM)
         if isinstance(ending, CheckError):
@@ -89,7 +89,7 @@ def _dispatched(argv: list[str], stops: Stops) -> int:
 
         if (full := memory_error(error, argv[0])) is None:
             raise
-        print(f"edqn: {sentence(full)}", file=sys.stderr)
+        print(f"edqn: {error_sentence(full)}", file=sys.stderr)
         return BAD_INPUT
 
 
@@ -100,7 +100,7 @@ def _dispatch(argv: Sequence[str], stops: Stops) -> int:
     command, rest = argv[0] if argv else "--help", argv[1:]
     if command == "train":
         train_command(rest, stops)
-    elif command in OF_A_RUN:
+    elif command in RUN_COMMANDS:
         _of_a_run(command, rest)
     elif command == "completion":
         print(completion_script(parse_completion(rest).shell, COMMANDS))
@@ -111,7 +111,9 @@ def _dispatch(argv: Sequence[str], stops: Stops) -> int:
     elif command in ("-h", "--help"):
         tyro.extras.subcommand_cli_from_dict(COMMANDS, prog="edqn", description=ABOUT["edqn"], args=["--help"])
     else:
-        raise ConfigError(f"there is no command '{command}'{nearest(command, [*COMMANDS, '--help', '--version'])}")
+        raise ConfigError(
+            f"there is no command '{command}'{suggest_nearest(command, [*COMMANDS, '--help', '--version'])}"
+        )
     return DONE
 
 
@@ -154,14 +156,14 @@ def import_module_or_file(name: str) -> None:
 
 def _of_a_run(command: str, argv: Sequence[str]) -> None:
     """Runs a command on a finished run or a file; JAX is imported once the arguments are known to be right."""
-    parse, run_command = OF_A_RUN[command]
+    parse, run_command = RUN_COMMANDS[command]
     args = parse(argv)
     start_jax()
 
-    from edqn_jax.devices.cache import keep_programs
+    from edqn_jax.devices.cache import enable_compilation_cache
     from edqn_jax.devices.devices import use_cpu_devices
 
     use_cpu_devices()
     check_devices()
-    keep_programs()
+    enable_compilation_cache()
     run_command(args)

@@ -14,7 +14,7 @@ from tyro.conf import Positional, arg
 
 from edqn_jax.cli.arguments import parsed
 from edqn_jax.cli.evaluate import EvaluateArgs
-from edqn_jax.cli.help import COMPLETION, REGISTERED, all_of_train, described, with_conditions
+from edqn_jax.cli.help import COMPLETION, REGISTERED, all_of_train, with_conditions, with_help_texts
 from edqn_jax.cli.record import RecordArgs
 from edqn_jax.cli.train import SHORT_NAMES, TrainOptions
 from edqn_jax.config import CONDITIONS
@@ -65,7 +65,7 @@ def completion_script(shell: Literal["bash", "zsh", "fish"], kinds: Mapping[str,
         "record": RecordArgs(somewhere, somewhere, world="paper"),
     }
     commands = {
-        name: described(kind, in_a_world.get(name), kinds=names if name in in_a_world else None)
+        name: with_help_texts(kind, in_a_world.get(name), kinds=names if name in in_a_world else None)
         for name, kind in kinds.items()
         if name != "train"
     }

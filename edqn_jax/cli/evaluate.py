@@ -14,7 +14,7 @@ from rich.table import Table
 from tyro.conf import Positional, arg
 
 from edqn_jax.cli.arguments import Point, check_flags, check_run, flags_of, flags_of_group, print_notes
-from edqn_jax.cli.help import ABOUT, EVALUATE, asks_for_help, described, show, with_conditions
+from edqn_jax.cli.help import ABOUT, EVALUATE, asks_for_help, print_help, with_conditions, with_help_texts
 from edqn_jax.config import CONDITIONS
 from edqn_jax.config.presets import Layer
 from edqn_jax.errors import ConfigError
@@ -61,13 +61,13 @@ def parse_evaluate(argv: Sequence[str]) -> EvaluateArgs:
         ConfigError: if one is out of its limits, or there is no such run.
         SystemExit: after printing, for --help and for arguments that do not parse.
     """
-    kind = with_conditions(described(EvaluateArgs), CONDITIONS)
+    kind = with_conditions(with_help_texts(EvaluateArgs), CONDITIONS)
     flags = {
         flag: (group, option) for group, names in CONDITIONS.items() for flag, option in flags_of_group(group, names)
     }
     check_flags(argv, flags_of(EvaluateArgs) | set(flags), EVALUATE)
     if asks_for_help(argv):
-        show(kind, EVALUATE, ABOUT[EVALUATE])
+        print_help(kind, EVALUATE, ABOUT[EVALUATE])
     parsed: Any = tyro.cli(kind, args=argv, prog=EVALUATE)
     conditions: dict[str, dict[str, Any]] = {}
     for word in argv:
@@ -92,9 +92,9 @@ def evaluate_command(args: EvaluateArgs) -> None:
     from edqn_jax.evaluation.latency import decision_latency_ms
     from edqn_jax.evaluation.trajectories import write_trajectories
     from edqn_jax.policies.functions import actor_of, config_of
-    from edqn_jax.runs.directory import plain
+    from edqn_jax.runs.directory import to_plain_json
     from edqn_jax.runs.policies import find_policy
-    from edqn_jax.runs.provenance import versions
+    from edqn_jax.runs.provenance import package_versions
 
     for file in (args.json, args.trajectories):
         if file is not None:
@@ -117,7 +117,7 @@ def evaluate_command(args: EvaluateArgs) -> None:
     figures = {
         "run": str(args.run),
         **_told_of(policy, args.run),
-        "versions": versions(),
+        "versions": package_versions(),
         "world": evaluation.missions.name,
         "seed": args.seed,
         "shuffled_codes": args.shuffle_codes,
@@ -126,9 +126,9 @@ def evaluate_command(args: EvaluateArgs) -> None:
         "decision_latency_ms": decision_latency_ms(config, policy.params, actor=actor_of(policy, config)),
     }
     print_notes(args.run, args.world, evaluation.missions.note)
-    Console().print(report(figures))
+    Console().print(figures_table(figures))
     if args.json is not None:
-        write_atomically(args.json, json.dumps(plain(figures), indent=2, allow_nan=False) + "\n")
+        write_atomically(args.json, json.dumps(to_plain_json(figures), indent=2, allow_nan=False) + "\n")
     if args.trajectories is not None:
         write_trajectories(config, evaluation.missions, evaluation.flights, args.trajectories)
 
@@ -150,7 +150,7 @@ def _named(conditions: Layer) -> Iterator[tuple[str, Any]]:
             yield f"{group}.{option}", value
 
 
-def report(figures: dict[str, Any]) -> Table:
+def figures_table(figures: dict[str, Any]) -> Table:
     """Returns the figures as a table for people."""
     from edqn_jax.evaluation.metrics import clearance_text
 

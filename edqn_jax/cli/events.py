@@ -102,7 +102,7 @@ def events_command(args: EventsArgs) -> None:
         MissingPackageError: if the extra `events` is needed and not installed.
     """
     from edqn_jax.interop.recordings.event_files import check_can_write_events, read_events, write_events
-    from edqn_jax.runs.directory import plain
+    from edqn_jax.runs.directory import to_plain_json
 
     for file in (args.picture, args.json):
         if file is not None:
@@ -111,26 +111,26 @@ def events_command(args: EventsArgs) -> None:
         check_can_write_events(args.out)
     whole = read_events(args.file, size=args.size, time_unit=args.time_unit, columns=args.columns, stream=args.stream)
     recording = whole.between(args.start, args.stop)
-    figures: dict[str, Any] = {"file": str(args.file), **found(recording)}
+    figures: dict[str, Any] = {"file": str(args.file), **recording_figures(recording)}
     strips, times_s, period_s = _strips(args, recording, figures)
-    Console().print(report(figures))
+    Console().print(recording_table(figures))
     if args.policy is not None:
         for note in _notes(args, recording):
             print(note)
     if args.picture is not None:
-        from edqn_jax.report.recordings import animate_recording, draw_recording
+        from edqn_jax.report.recordings import animate_recording, plot_recording
 
         if args.picture.suffix.lower() == ".gif":
             write_atomically(args.picture, animate_recording(strips, times_s, period_s))
         else:
-            draw_recording(strips, times_s, args.picture)
+            plot_recording(strips, times_s, args.picture)
     if args.out is not None:
         write_events(args.out, recording)
     if args.json is not None:
-        write_atomically(args.json, json.dumps(plain(figures), indent=2, allow_nan=False) + "\n")
+        write_atomically(args.json, json.dumps(to_plain_json(figures), indent=2, allow_nan=False) + "\n")
 
 
-def found(recording: Recording) -> dict[str, Any]:
+def recording_figures(recording: Recording) -> dict[str, Any]:
     """Returns what a recording holds, as figures."""
     events = recording.events
     known = recording.width is not None
@@ -154,7 +154,7 @@ def found(recording: Recording) -> dict[str, Any]:
     }
 
 
-def report(figures: dict[str, Any]) -> Table:
+def recording_table(figures: dict[str, Any]) -> Table:
     """Returns what a recording holds as a table for people."""
     table = Table(title=figures["file"], show_header=False, title_justify="left")
     table.add_column()
@@ -190,7 +190,7 @@ def _strips(args: EventsArgs, recording: Recording, figures: dict[str, Any]) -> 
     """Returns what there is to draw, when, and how long a frame is to be shown."""
     if args.policy is None and args.picture is None:
         return [], [], 0.0
-    from edqn_jax.interop.recordings.seen_events import image_at, seen_by, window_ends
+    from edqn_jax.interop.recordings.seen_events import image_at, observe_recording, window_ends
     from edqn_jax.runs.policies import load_policy
 
     begin = int(recording.events["t"][0])
@@ -201,7 +201,7 @@ def _strips(args: EventsArgs, recording: Recording, figures: dict[str, Any]) -> 
         period_s = window_us * 1e-6
     else:
         policy = load_policy(args.policy)
-        seen = seen_by(
+        seen = observe_recording(
             policy,
             recording,
             contrast=args.contrast,
@@ -224,10 +224,10 @@ def _strips(args: EventsArgs, recording: Recording, figures: dict[str, Any]) -> 
         return [], [], period_s
 
     from edqn_jax.report.images import EVENTS, NEARNESS, RECONSTRUCTED_EVENTS
-    from edqn_jax.report.recordings import MOMENTS, MOST_FRAMES, Strip, moments
+    from edqn_jax.report.recordings import MAX_FRAMES, MOMENTS, Strip, pick_windows
 
-    most = MOST_FRAMES if args.picture.suffix.lower() == ".gif" else MOMENTS
-    chosen = moments(len(ends), most)
+    most = MAX_FRAMES if args.picture.suffix.lower() == ".gif" else MOMENTS
+    chosen = pick_windows(len(ends), most)
     width, height = recording.size()
     images = np.stack([image_at(recording, int(ends[number]), window_us) for number in chosen])
     strips = [Strip(f"camera,\n{width} × {height}", images, EVENTS)]

@@ -128,7 +128,7 @@ def show_train_help(options: Any, config: Config, short_names: Mapping[str, str]
         everything: all options by group instead of `COMMON`.
     """
     if everything:
-        show(all_of_train(options, config, short_names), TRAIN, ABOUT[TRAIN])
+        print_help(all_of_train(options, config, short_names), TRAIN, ABOUT[TRAIN])
     short = {long: short for short, long in short_names.items()}
     fields = []
     for name, text in COMMON.items():
@@ -149,7 +149,7 @@ def show_train_help(options: Any, config: Config, short_names: Mapping[str, str]
     about = (
         f"{does}\n\nThese options are the ones that people use; `{TRAIN} --help-all` shows all {count}.\n\n{examples}"
     )
-    show(dataclasses.make_dataclass("Train", fields), TRAIN, about)
+    print_help(dataclasses.make_dataclass("Train", fields), TRAIN, about)
 
 
 def all_of_train(
@@ -160,10 +160,10 @@ def all_of_train(
     Args:
         kinds: types that options have instead of their own, by group and name.
     """
-    groups = [_nested("options", described(type(options), options), "")]
+    groups = [_nested("options", with_help_texts(type(options), options), "")]
     for group in dataclasses.fields(Config):
         value = getattr(config, group.name)
-        kind = described(type(value), value, f"{group.name}.", short_names, kinds)
+        kind = with_help_texts(type(value), value, f"{group.name}.", short_names, kinds)
         groups.append(_nested(group.name, kind, group.name))
     return dataclasses.make_dataclass("Train", groups)
 
@@ -172,25 +172,25 @@ def with_conditions(kind: type, conditions: Mapping[str, Collection[str]]) -> ty
     """Returns a dataclass of arguments and, by group, of options that may be given in place of a policy's own.
 
     Args:
-        kind: the arguments, as `described` returns them.
+        kind: the arguments, as `with_help_texts` returns them.
         conditions: names of these options by group.
     """
     config = Config()
     groups = [
-        _nested(name, described(type(group), group, f"{name}.", only=options), name)
+        _nested(name, with_help_texts(type(group), group, f"{name}.", only=options), name)
         for name, options in conditions.items()
         for group in (getattr(config, name),)
     ]
     return dataclasses.make_dataclass(kind.__name__, groups, bases=(kind,), namespace={"__doc__": kind.__doc__})
 
 
-def show(kind: type, command: str, about: str) -> NoReturn:
+def print_help(kind: type, command: str, about: str) -> NoReturn:
     """Prints the help of a dataclass of options and exits."""
     tyro.cli(kind, args=["--help"], prog=command, description=about)
     sys.exit(0)
 
 
-def described(
+def with_help_texts(
     kind: type,
     instance: Any = None,
     group: str = "",

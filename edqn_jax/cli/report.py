@@ -58,10 +58,10 @@ def report_command(args: ReportArgs) -> None:
     Raises:
         ConfigError: if a run or the file to write is not as it should be.
     """
-    from edqn_jax.report.page.document import report
+    from edqn_jax.report.page.document import build_report
 
     assert args.out is not None
     check_can_write(args.out)
-    page = report(args.runs, args.missions, functools.partial(print, flush=True)).encode()
+    page = build_report(args.runs, args.missions, functools.partial(print, flush=True)).encode()
     write_atomically(args.out, page)
     print(f"'{args.out}' has {len(page) / 1e6:.1f} MB; open it in a browser")

@@ -21,14 +21,14 @@ from edqn_jax.cli.help import TRAIN, asks_for_help, flag_of, show_train_help
 from edqn_jax.cli.process.signals import Stops
 from edqn_jax.cli.process.variables import check_devices, platforms_named, start_jax
 from edqn_jax.config import FAMILIES, Config
-from edqn_jax.config.loading import apply, resolve, to_yaml
+from edqn_jax.config.loading import apply_layer, resolve_config, to_yaml
 from edqn_jax.config.presets import gpu_layers
 from edqn_jax.config.rules import check_learns, validate
-from edqn_jax.devices.hardware import hardware
+from edqn_jax.devices.hardware import detect_hardware
 from edqn_jax.devices.launch import Distributed, how_to_join
 from edqn_jax.errors import ConfigError
 from edqn_jax.extras import SINKS
-from edqn_jax.runs.continuation import begun, continued
+from edqn_jax.runs.continuation import find_run, resume_config
 from edqn_jax.runs.directory import Resume, RunDirectory, plan_run_directory
 
 if TYPE_CHECKING:
@@ -106,19 +106,19 @@ def parse_train(argv: Sequence[str]) -> tuple[TrainOptions, Config]:
     options, _ = tyro.cli(TrainOptions, args=argv, prog=TRAIN, return_unknown_args=True, add_help=False)
     if options.seeds is not None and options.seeds < 1:
         raise ConfigError(f"--seeds must be at least 1, not {options.seeds}")
-    tuned_for = hardware() if options.tuned_for == "auto" else options.tuned_for
+    tuned_for = detect_hardware() if options.tuned_for == "auto" else options.tuned_for
     options = dataclasses.replace(options, tuned_for=tuned_for)
     folder = None if options.resume == "never" else options.run_dir
-    run = None if folder is None else begun(folder)
+    run = None if folder is None else find_run(folder)
     if run is not None and not _names_defaults(argv):
         begins = run.config
     else:
-        world = _parse_config(argv, resolve(options.preset, options.config)).world.name
-        begins = resolve(options.preset, options.config, world, tuned_for)
+        world = _parse_config(argv, resolve_config(options.preset, options.config)).world.name
+        begins = resolve_config(options.preset, options.config, world, tuned_for)
     if any(word.partition("=")[0] == PROFILE for word in argv):
         # What else is given changes one of the profile's figures.
         profile = _parse_config(argv, begins).events.profile
-        begins = apply(begins, {"events": {"profile": profile}}, "the command line")
+        begins = apply_layer(begins, {"events": {"profile": profile}}, "the command line")
     if helped:
         show_train_help(TrainOptions(), begins, SHORT_NAMES, everything=everything)
     config = _found_worlds(_parse_config(argv, begins))
@@ -126,7 +126,7 @@ def parse_train(argv: Sequence[str]) -> tuple[TrainOptions, Config]:
     check_learns(config)
     if run is not None and folder is not None:
         options = dataclasses.replace(options, seeds=run.seeds if options.seeds is None else options.seeds)
-        config = continued(folder, run, config, options.seeds)
+        config = resume_config(folder, run, config, options.seeds)
     return options, config
 
 
@@ -181,32 +181,34 @@ def train_command(argv: Sequence[str], stops: Stops) -> None:
     import jax
 
     from edqn_jax.devices import memory, processes
-    from edqn_jax.devices.cache import keep_programs
+    from edqn_jax.devices.cache import enable_compilation_cache
     from edqn_jax.devices.devices import most_that_divide, use_cpu_devices
-    from edqn_jax.devices.hardware import cores
+    from edqn_jax.devices.hardware import count_cores
     from edqn_jax.report.gallery import prepare_gallery
     from edqn_jax.report.progress import Progress
     from edqn_jax.runs.stopping import Stop
 
-    most = 1 if config.train.debug else most_that_divide(config.train.shards, cores())
+    most = 1 if config.train.debug else most_that_divide(config.train.shards, count_cores())
     use_cpu_devices(config.train.devices or most)
     if arguments is None:  # of several processes only the first could keep any
-        keep_programs()
+        enable_compilation_cache()
     process = 0
     if arguments is not None:
         print("edqn: waiting for the other processes, five minutes at most", file=sys.stderr)
         with platforms_named():
-            process = processes.join(arguments)
+            process = processes.join_cluster(arguments)
     check_devices()
-    processes.together(lambda: _check_gpu() if tuned_for_gpu(options, config) else None)
-    processes.check_alike(processes.together(lambda: options_to_compare(config)))
+    processes.run_synchronised(lambda: _check_gpu() if is_tuned_for_gpu(options, config) else None)
+    processes.check_equal(processes.run_synchronised(lambda: options_to_compare(config)))
     writes = process == 0
-    run = processes.together(lambda: plan_run_directory(options.run_dir, config, options.resume) if writes else None)
+    run = processes.run_synchronised(
+        lambda: plan_run_directory(options.run_dir, config, options.resume) if writes else None
+    )
     progress = Progress(Console(quiet=not writes))
-    if tuned_for_gpu(options, config):
+    if is_tuned_for_gpu(options, config):
         progress.message(_chosen(config))
     sinks = None if run is None else _sinks_of(options, config, run, progress.message)
-    stop = Stop(stops.requested, lambda: stops.obeyed(progress.message))
+    stop = Stop(stops.is_requested, lambda: stops.obey_signals(progress.message))
     try:
         from edqn_jax.runs.record import train_run
 
@@ -214,7 +216,7 @@ def train_command(argv: Sequence[str], stops: Stops) -> None:
     except jax.errors.JaxRuntimeError as error:
         if arguments is None:
             raise
-        processes.leave(error, memory.memory_error(error, "train"))
+        processes.abort_process(error, memory.memory_error(error, "train"))
     finally:
         if sinks is not None:
             sinks.close()
@@ -260,7 +262,7 @@ def _sinks_of(
     return tracking.Sinks({name: maker for name, maker in makers.items() if name in asked}, warn)
 
 
-def tuned_for_gpu(options: TrainOptions, config: Config) -> bool:
+def is_tuned_for_gpu(options: TrainOptions, config: Config) -> bool:
     """Returns whether defaults were chosen for a GPU."""
     return options.preset == "default" and bool(gpu_layers(config.world.name, options.tuned_for))
 
@@ -278,7 +280,7 @@ def options_to_compare(config: Config) -> str:
     from edqn_jax.sim.camera.camera import native
 
     world = dataclasses.replace(config.world, name=_held(config.world.name), flown=_held(config.world.flown))
-    in_c = native.is_at_hand("cpu" if jax.default_backend() == "cpu" else "cuda")
+    in_c = native.is_available("cpu" if jax.default_backend() == "cpu" else "cuda")
     return f"{to_yaml(dataclasses.replace(config, world=world))}in_c: {in_c}\n"
 
 

@@ -55,12 +55,12 @@ def verify_command(args: VerifyArgs) -> None:
         CheckError: if something is not as it was recorded.
         ConfigError: if there is no finished run, or the file to write cannot be written.
     """
-    from edqn_jax.runs.verification.verify import verify
+    from edqn_jax.runs.verification.verify import verify_run
 
     if args.json is not None:
         check_can_write(args.json)
-    findings = verify(args.run, functools.partial(print, flush=True))
-    Console().print(report(findings))
+    findings = verify_run(args.run, functools.partial(print, flush=True))
+    Console().print(findings_table(findings))
     if args.json is not None:
         found = {"run": str(args.run), "findings": [dataclasses.asdict(finding) for finding in findings]}
         write_atomically(args.json, json.dumps(found, indent=2) + "\n")
@@ -71,7 +71,7 @@ def verify_command(args: VerifyArgs) -> None:
         raise CheckError(f"{wrong} of {len(findings)} things in '{args.run}' are not as they were recorded")
 
 
-def report(findings: list[Finding]) -> Table:
+def findings_table(findings: list[Finding]) -> Table:
     """Returns the findings as a table for people."""
     table = Table(title_justify="left")
     table.add_column("verified")

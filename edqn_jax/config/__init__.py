@@ -2,7 +2,7 @@
 
 from edqn_jax.config.learning import AgentConfig, EncoderConfig, TrainConfig
 from edqn_jax.config.options import CONDITIONS, Config
-from edqn_jax.config.presets import PRESETS, preset
+from edqn_jax.config.presets import PRESETS, get_preset
 from edqn_jax.config.registry import ENCODERS, FAMILIES, LEARNERS, MIXTURES, NETWORKS, SENSORS, SHAPES
 from edqn_jax.config.simulation import (
     AirConfig,
@@ -45,5 +45,5 @@ __all__ = [
     "SurfaceConfig",
     "TrainConfig",
     "WorldConfig",
-    "preset",
+    "get_preset",
 ]

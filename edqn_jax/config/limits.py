@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any
 
-from edqn_jax.errors import ConfigError, nearest
+from edqn_jax.errors import ConfigError, suggest_nearest
 
 
 @dataclass(frozen=True)
@@ -90,7 +90,7 @@ def check_limits(section: Any, group: str) -> None:
         for limit in limits:
             value = getattr(section, name)
             if limit.names and not limit.holds(value):
-                raise ConfigError(f"{group}.{name}: there is no '{value}'{nearest(value, limit.names)}")
+                raise ConfigError(f"{group}.{name}: there is no '{value}'{suggest_nearest(value, limit.names)}")
             require(limit.holds(value), f"{group}.{name}", limit.says, value)
 
 
@@ -101,11 +101,11 @@ def require(holds: bool, name: str, limit: str, value: object) -> None:
         ConfigError: names the option, its limit and its value.
     """
     if not holds:
-        said = ", ".join(map(_short, value)) or "an empty list" if isinstance(value, tuple) else shown(value)
+        said = ", ".join(map(_short, value)) or "an empty list" if isinstance(value, tuple) else value_text(value)
         raise ConfigError(f"{name} must be {limit}, not {said}")
 
 
-def shown(value: object) -> str:
+def value_text(value: object) -> str:
     """Returns a value as text; a whole number of very many digits without them."""
     return "a huge number" if isinstance(value, int) and abs(value) >= 10**18 else str(value)
 
@@ -117,4 +117,4 @@ def _rises(values: Sequence[float]) -> bool:
 
 def _short(value: object) -> str:
     """Returns an item of a list as text."""
-    return f"{value:g}" if isinstance(value, float) else shown(value)
+    return f"{value:g}" if isinstance(value, float) else value_text(value)

@@ -16,23 +16,23 @@ from typing import Any, Literal
 
 import yaml
 
-from edqn_jax.config.limits import shown
+from edqn_jax.config.limits import value_text
 from edqn_jax.config.options import CONDITIONS, Config
 from edqn_jax.config.presets import WORLD, Hardware, Layer, world_layers
-from edqn_jax.config.presets import preset as named_preset
+from edqn_jax.config.presets import get_preset as named_preset
 from edqn_jax.config.profiles import PROFILES
 from edqn_jax.config.retired import LAST_COMMIT, RETIRED, is_off
 from edqn_jax.config.rules import validate
-from edqn_jax.errors import ConfigError, nearest
+from edqn_jax.errors import ConfigError, suggest_nearest
 
-MOST_BYTES = 1_000_000
+MAX_BYTES = 1_000_000
 """Of a file of options that is worth reading."""
 
-MOST_SHOWN = 80
+MAX_SHOWN = 80
 """Characters of a word that a message repeats."""
 
 
-def resolve(
+def resolve_config(
     preset_name: str = "default", file: Path | None = None, world: str | None = None, tuned_for: Hardware = "cpu"
 ) -> Config:
     """Returns the named preset, changed first by world and hardware and then by the file; checks types, not limits.
@@ -48,17 +48,17 @@ def resolve(
         ConfigError: names the key or the file, and what would be right.
     """
     layer = load_layer(file) if file is not None else {}
-    config = apply(named_preset(preset_name), layer, str(file))
+    config = apply_layer(named_preset(preset_name), layer, str(file))
     if world is None and preset_name == "default" and "name" not in layer.get("world", {}):
         world = WORLD
     if world is not None:
-        config = apply(config, {"world": {"name": world}}, "the command line")
+        config = apply_layer(config, {"world": {"name": world}}, "the command line")
     if preset_name != "default":
         return config
     tuned = named_preset(preset_name)
     for changes in world_layers(config.world.name, tuned_for):
-        tuned = apply(tuned, changes, "the world")
-    tuned = apply(tuned, layer, str(file))
+        tuned = apply_layer(tuned, changes, "the world")
+    tuned = apply_layer(tuned, layer, str(file))
     return dataclasses.replace(tuned, world=dataclasses.replace(tuned.world, name=config.world.name))
 
 
@@ -91,12 +91,14 @@ def make_config(
         world = given["name"]
     if tuned_for not in typing.get_args(Hardware):
         raise ConfigError(f"make_config: tuned_for must be 'cpu' or 'gpu', not {tuned_for!r}")
-    config = apply(resolve(preset, None if file is None else Path(file), world, tuned_for), groups, "make_config")
+    config = apply_layer(
+        resolve_config(preset, None if file is None else Path(file), world, tuned_for), groups, "make_config"
+    )
     validate(config)
     return config
 
 
-def flown_under(config: Config, conditions: Layer, source: str) -> Config:
+def with_conditions(config: Config, conditions: Layer, source: str) -> Config:
     """Returns the checked configuration of a policy that is flown under other conditions than it was trained under.
 
     Args:
@@ -107,7 +109,7 @@ def flown_under(config: Config, conditions: Layer, source: str) -> Config:
     Raises:
         ConfigError: if there is no such option, it is none of `CONDITIONS`, or it is out of its limits.
     """
-    changed = apply(config, conditions, source)
+    changed = apply_layer(config, conditions, source)
     for group, options in conditions.items():
         for option in options:
             if option not in CONDITIONS.get(group, ()):
@@ -127,13 +129,13 @@ def load_layer(file: Path) -> Layer:
     """
     try:
         with file.open("rb") as opened:
-            held = opened.read(MOST_BYTES + 1)
+            held = opened.read(MAX_BYTES + 1)
         text = held.decode("utf-8")
     except (OSError, UnicodeDecodeError) as error:
         reason = getattr(error, "strerror", None) or "it is not UTF-8 text"
         raise ConfigError(f"cannot read the configuration file '{file}': {reason}") from None
-    if len(held) > MOST_BYTES:
-        raise ConfigError(f"'{file}' has more than {MOST_BYTES:,} bytes, so it is no file of options")
+    if len(held) > MAX_BYTES:
+        raise ConfigError(f"'{file}' has more than {MAX_BYTES:,} bytes, so it is no file of options")
     return parse_layer(text, f"'{file}'")
 
 
@@ -161,7 +163,7 @@ def parse_layer(text: str, source: str) -> Layer:
     return layer
 
 
-def apply(config: Config, layer: Layer, source: str) -> Config:
+def apply_layer(config: Config, layer: Layer, source: str) -> Config:
     """Returns `config` with every key of the layer replaced; `events.profile` also replaces what it stands for.
 
     Options that the layer names beside a profile are not the profile's.
@@ -174,7 +176,7 @@ def apply(config: Config, layer: Layer, source: str) -> Config:
     for group, values in layer.items():
         if group not in groups:
             owners = [f"'{name}:'" for name in groups if str(group) in _keys(getattr(config, name))]
-            hint = f"; it belongs under {' or '.join(owners)}" if owners else nearest(group, groups)
+            hint = f"; it belongs under {' or '.join(owners)}" if owners else suggest_nearest(group, groups)
             raise ConfigError(f"{source}: there is no group '{_cut(group)}'{hint}")
         if not isinstance(values, Mapping):
             raise ConfigError(
@@ -185,8 +187,8 @@ def apply(config: Config, layer: Layer, source: str) -> Config:
         values = {key: value for key, value in values.items() if not _has_gone(f"{group}.{key}", value, source)}
         for key in values:
             if key not in hints:
-                raise ConfigError(f"{source}: there is no key '{group}.{_cut(key)}'{nearest(key, hints)}")
-        checked = {key: typed(value, hints[key], f"{source}: '{group}.{key}'") for key, value in values.items()}
+                raise ConfigError(f"{source}: there is no key '{group}.{_cut(key)}'{suggest_nearest(key, hints)}")
+        checked = {key: convert_type(value, hints[key], f"{source}: '{group}.{key}'") for key, value in values.items()}
         profile = PROFILES[checked["profile"]] if group == "events" and "profile" in checked else {}
         changed[group] = dataclasses.replace(section, **{**profile, **checked})
     return dataclasses.replace(config, **changed)
@@ -206,7 +208,7 @@ def _has_gone(name: str, value: Any, source: str) -> bool:
     return name in RETIRED
 
 
-def typed(value: Any, hint: Any, name: str) -> Any:
+def convert_type(value: Any, hint: Any, name: str) -> Any:
     """Returns `value` as the type `hint`.
 
     Converts whole numbers to floats and lists to tuples, and nothing else.
@@ -224,10 +226,10 @@ def typed(value: Any, hint: Any, name: str) -> Any:
         return value
     if origin is tuple and isinstance(value, list | tuple):
         if arguments[-1] is Ellipsis:
-            return tuple(typed(item, arguments[0], f"each of {name}") for item in value)
+            return tuple(convert_type(item, arguments[0], f"each of {name}") for item in value)
         if len(value) == len(arguments):
             pairs = zip(value, arguments, strict=True)
-            return tuple(typed(item, argument, f"each of {name}") for item, argument in pairs)
+            return tuple(convert_type(item, argument, f"each of {name}") for item, argument in pairs)
     raise ConfigError(f"{name} must be {_wanted(hint)}, not {_describe(value)}")
 
 
@@ -293,10 +295,10 @@ def _describe(value: Any) -> str:
         return "a group of keys"
     if isinstance(value, list | tuple):
         return f"a list of {len(value)}"
-    return f"the text '{_cut(value)}'" if isinstance(value, str) else shown(value)
+    return f"the text '{_cut(value)}'" if isinstance(value, str) else value_text(value)
 
 
 def _cut(word: object) -> str:
     """Returns a word of a file as text, the beginning alone of one that is very long."""
     text = str(word)
-    return text if len(text) <= MOST_SHOWN else f"{text[:MOST_SHOWN]}…"
+    return text if len(text) <= MAX_SHOWN else f"{text[:MAX_SHOWN]}…"

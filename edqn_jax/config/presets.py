@@ -147,7 +147,7 @@ def gpu_layers(world: str, tuned_for: Hardware | Literal["auto"]) -> list[Layer]
     return [GPU, GPU_CLOSED] if has_detours(world) else [GPU]
 
 
-def preset(name: str) -> Config:
+def get_preset(name: str) -> Config:
     """Returns the named preset.
 
     Raises:

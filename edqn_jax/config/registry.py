@@ -11,7 +11,7 @@ import itertools
 from collections.abc import Iterator, Mapping
 from typing import Any
 
-from edqn_jax.errors import ConfigError, nearest
+from edqn_jax.errors import ConfigError, suggest_nearest
 
 OWN = "one that --import registers"
 """What else a name may be."""
@@ -82,7 +82,9 @@ class Registry:
             ConfigError: with the nearest name, or all of them.
         """
         if name not in self._entries:
-            raise ConfigError(f"{self.option}: there is no {self.kind} '{name}'{nearest(name, self, f', or {OWN}')}")
+            raise ConfigError(
+                f"{self.option}: there is no {self.kind} '{name}'{suggest_nearest(name, self, f', or {OWN}')}"
+            )
 
     def get(self, name: str) -> Any:
         """Returns the entry of that name.

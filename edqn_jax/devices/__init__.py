@@ -1,1 +1,1 @@
-"""What JAX runs on: devices, kept programs, several processes."""
+"""Devices, JAX's settings, the compilation cache, several processes."""

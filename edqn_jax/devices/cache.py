@@ -13,14 +13,14 @@ from typing import Any
 
 import jax
 
-from edqn_jax.devices.hardware import cores
+from edqn_jax.devices.hardware import count_cores
 
-MOST_BYTES = 2**30
+MAX_BYTES = 2**30
 """Of kept programs; beyond this the older ones are deleted."""
 
 
-def keep_programs() -> None:
-    """Makes JAX keep what it compiles for the next command; must be called before anything is compiled.
+def enable_compilation_cache() -> None:
+    """Enables JAX's persistent compilation cache; must be called before anything is compiled.
 
     The folder is one for this kind of processor under `$XDG_CACHE_HOME/edqn_jax`, by default `~/.cache/edqn_jax`.
     Nothing is kept where that cannot be written, or with JAX_ENABLE_COMPILATION_CACHE=false; and whoever gives
@@ -40,7 +40,7 @@ def keep_programs() -> None:
 
 
 def private_folder() -> Path | None:
-    """Returns the folder of what is compiled for this kind of processor, made and not too full.
+    """Creates and returns the cache folder for this kind of CPU, trimmed to its size limit.
 
     None where it cannot be written, or where others may write: what is in it is run.
     """
@@ -53,7 +53,7 @@ def private_folder() -> Path | None:
             return None
         if not os.access(folder, os.W_OK):
             return None
-        _make_room(folder, MOST_BYTES)
+        _make_room(folder, MAX_BYTES)
     except (OSError, RuntimeError):  # there is no home
         return None
     return folder
@@ -63,19 +63,19 @@ def _folder() -> Path:
     """Returns where programs are kept: those of one processor may not run on another."""
     given = os.environ.get("XDG_CACHE_HOME", "")
     root = Path(given) if os.path.isabs(given) else Path.home() / ".cache"
-    return root / "edqn_jax" / f"programs-{hashlib.sha256(_abilities().encode()).hexdigest()[:12]}"
+    return root / "edqn_jax" / f"programs-{hashlib.sha256(_cpu_fingerprint().encode()).hexdigest()[:12]}"
 
 
-def _abilities() -> str:
-    """Returns what tells machines apart that do not run the same programs, or not as fast."""
+def _cpu_fingerprint() -> str:
+    """Returns a fingerprint of the CPU, for programs compiled for it."""
     cpuinfo = Path("/proc/cpuinfo")
     lines = cpuinfo.read_text(encoding="utf-8").splitlines() if cpuinfo.is_file() else []
     kinds = sorted({line for line in lines if line.startswith(("model name", "flags", "Features", "CPU part"))})
-    return "\n".join([platform.machine(), platform.processor(), f"{cores()} cores", *kinds])
+    return "\n".join([platform.machine(), platform.processor(), f"{count_cores()} cores", *kinds])
 
 
 def _make_room(folder: Path, most: int) -> None:
-    """Deletes what was written first, down to half of `most` bytes, where a folder holds more than `most`."""
+    """Deletes the oldest files, down to half of `most` bytes, if a folder holds more than `most`."""
     files = []
     for file in folder.rglob("*"):
         with contextlib.suppress(FileNotFoundError):  # another command makes room as well

@@ -7,28 +7,29 @@ import os
 
 import jax
 
-from edqn_jax.devices.hardware import cores
+from edqn_jax.devices.hardware import count_cores
 from edqn_jax.devices.sums import check_sums
 from edqn_jax.errors import ConfigError
 from edqn_jax.xla_flags import YNN_OPTION, read_flags
 
-ALIKE = "--xla_backend_extra_options=xla_cpu_disable_loop_unrolling"
+DETERMINISTIC_ROUNDING_FLAG = "--xla_backend_extra_options=xla_cpu_disable_loop_unrolling"
 """XLA flag that makes CPU programs round equally for every batch size (docs/decisions/0006)."""
 
 
 def use_cpu_devices(count: int | None = None) -> None:
     """Makes JAX present the CPU as `count` devices; must be called before JAX is first used.
 
-    None means one per core. Accelerators are found and preferred as before. Also adds `ALIKE` to `XLA_FLAGS`, so that
-    flights are equal on any number of devices, unless `XLA_FLAGS` already holds extra backend options.
+    None means one per core. Accelerators are found and preferred as before. Also adds `DETERMINISTIC_ROUNDING_FLAG` to
+    `XLA_FLAGS`, so that flights are equal on any number of devices, unless `XLA_FLAGS` already holds extra backend
+    options.
 
     Raises:
         RuntimeError: if JAX has already been used.
     """
-    jax.config.update("jax_num_cpu_devices", cores() if count is None else count)
+    jax.config.update("jax_num_cpu_devices", count_cores() if count is None else count)
     flags = read_flags()
     if "xla_backend_extra_options" not in flags:
-        os.environ["XLA_FLAGS"] = f"{flags} {ALIKE}".strip()
+        os.environ["XLA_FLAGS"] = f"{flags} {DETERMINISTIC_ROUNDING_FLAG}".strip()
     if jax.__version_info__[:2] == (0, 11):
         # Its new partitioner crashes where `shard_map` and a loop handle arrays without elements, as of a scene
         # without capsules. The old one does not.

@@ -12,10 +12,10 @@ from collections.abc import Mapping
 from edqn_jax.errors import ConfigError
 
 SHARES = ("XLA_CLIENT_MEM_FRACTION", "XLA_PYTHON_CLIENT_MEM_FRACTION")
-"""Variables that say which share of a GPU's memory JAX takes when it starts."""
+"""Environment variables for the share of GPU memory that JAX preallocates."""
 
 SHARE = 0.75
-"""What it takes unless one of them says."""
+"""Share that JAX preallocates by default."""
 
 LEAST = 0.05
 """A share that is worth a try."""
@@ -26,7 +26,7 @@ _PLUGINS = ("jax_cuda12_plugin", "jax_cuda13_plugin")
 
 
 def check_gpus_are_free(environ: Mapping[str, str] = os.environ) -> None:
-    """Raises if what JAX takes of a GPU's memory when it starts is not free; must be called before JAX is first used.
+    """Raises if the GPU memory that JAX preallocates is not free; must be called before JAX is first used.
 
     Does nothing where JAX uses no NVIDIA GPU, where it takes memory as it needs it, and where `nvidia-smi` is missing
     or does not answer.
@@ -52,7 +52,7 @@ def check_gpus_are_free(environ: Mapping[str, str] = os.environ) -> None:
 
 
 def share_taken(environ: Mapping[str, str]) -> float | None:
-    """Returns the share of a GPU's memory that JAX takes when it starts; None if it takes memory as it needs it."""
+    """Returns the share of GPU memory that JAX preallocates; None if preallocation is off."""
     preallocates = environ.get("XLA_PYTHON_CLIENT_PREALLOCATE", "").strip().lower() not in ("false", "0")
     if not preallocates or environ.get("XLA_PYTHON_CLIENT_ALLOCATOR", "").strip().lower() == "platform":
         return None
@@ -70,7 +70,7 @@ def _uses_cuda(environ: Mapping[str, str]) -> bool:
 
 
 def _gpus(environ: Mapping[str, str]) -> list[tuple[str, int, int]]:
-    """Returns name, MiB in all and MiB free of each GPU that this process may use; none where nobody knows."""
+    """Returns name, MiB in all and MiB free of each GPU that this process may use; empty if unknown."""
     program, visible = shutil.which("nvidia-smi", path=environ.get("PATH")), environ.get("CUDA_VISIBLE_DEVICES")
     if program is None or visible == "":
         return []

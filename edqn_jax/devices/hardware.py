@@ -17,7 +17,7 @@ CARDS = {"jax_cuda": ("nvidia[0-9]*", "dxg"), "jax_rocm": ("kfd",)}
 """Device files of the cards that each of JAX's plugins drives, by the beginning of its name."""
 
 
-def hardware(environ: Mapping[str, str] = os.environ, devices: Path = Path("/dev")) -> Literal["cpu", "gpu"]:
+def detect_hardware(environ: Mapping[str, str] = os.environ, devices: Path = Path("/dev")) -> Literal["cpu", "gpu"]:
     """Returns `gpu` where there is a GPU, JAX's plugin for it is installed, and the environment does not hide it.
 
     Args:
@@ -40,16 +40,16 @@ def _has_plugin(plugin: str) -> bool:
     return any(name.startswith(plugin) and name.endswith("_plugin") for name in names)
 
 
-def cores() -> int:
+def count_cores() -> int:
     """Returns the number of cores that this process may run on."""
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
 
 
-def processor() -> str:
+def describe_processor() -> str:
     """Returns the CPU's model name and the number of cores that this process may use."""
     cpuinfo = Path("/proc/cpuinfo")
     lines = cpuinfo.read_text(encoding="utf-8").splitlines() if cpuinfo.is_file() else []
     named = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
-    return f"{named[0] if named else platform.machine()}, {cores()} cores"
+    return f"{named[0] if named else platform.machine()}, {count_cores()} cores"

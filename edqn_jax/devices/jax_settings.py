@@ -16,13 +16,13 @@ Returned = TypeVar("Returned")
 
 
 class Setting(NamedTuple):
-    """A setting of JAX, what it is within the package, and why."""
+    """A JAX setting, its value within the package, and the reason."""
 
     value: Any
     context: Callable[[Any], contextlib.AbstractContextManager[Any]]
     """Sets it for a thread, until the end of a `with` block."""
     other: str
-    """What another value does."""
+    """Effect of other values."""
 
 
 TESTED = {
@@ -60,7 +60,7 @@ _UNSET = {
 _of_thread = threading.local()
 
 
-def others() -> list[str]:
+def untested_settings() -> list[str]:
     """Returns the names of the settings that are not as tested."""
     config: Any = jax.config
     guarded = config.jax_transfer_guard not in (None, "allow")
@@ -85,22 +85,22 @@ def set_as_tested() -> list[str]:
 
     if jax.config.jax_transfer_guard not in (None, "allow"):  # pyright: ignore[reportAttributeAccessIssue]
         update("jax_transfer_guard", "allow")  # which sets those of each direction, too
-    for name in others():
+    for name in untested_settings():
         update(name, TESTED[name].value)
     return told
 
 
 def keep_tested_settings() -> None:
-    """Makes the settings of this thread those that were tested, until it ends; for threads of a pool."""
-    _of_thread.settings = tested_settings()  # kept: one that is collected ends
+    """Applies the tested settings to this thread until it ends; for threads of a pool."""
+    _of_thread.settings = use_tested_settings()  # kept: one that is collected ends
     _of_thread.settings.__enter__()
 
 
 @contextlib.contextmanager
-def tested_settings() -> Iterator[None]:
+def use_tested_settings() -> Iterator[None]:
     """Makes the settings of this thread those that were tested, within the block; does nothing where they are."""
     with contextlib.ExitStack() as stack:
-        for name in others():
+        for name in untested_settings():
             stack.enter_context(TESTED[name].context(TESTED[name].value))
         yield
 
@@ -110,9 +110,9 @@ def as_tested(function: Callable[Given, Returned]) -> Callable[Given, Returned]:
 
     @functools.wraps(function)
     def with_settings(*args: Given.args, **kwargs: Given.kwargs) -> Returned:
-        if not others():
+        if not untested_settings():
             return function(*args, **kwargs)
-        with tested_settings():
+        with use_tested_settings():
             return function(*args, **kwargs)
 
     return with_settings

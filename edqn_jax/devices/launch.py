@@ -17,7 +17,7 @@ def how_to_join(
     process_id: int | None,
     environment: Mapping[str, str],
 ) -> dict[str, Any] | None:
-    """Returns the arguments for `processes.join`, or None for a process that trains alone.
+    """Returns the arguments for `processes.join_cluster`, or None for a process that trains alone.
 
     Args:
         distributed: `auto` joins if the next three are given or `srun` has started several tasks, `must` joins

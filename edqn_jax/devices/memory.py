@@ -40,7 +40,7 @@ def bytes_of(shapes: Any) -> int:
 def memory_of(device: Any) -> tuple[int, int] | None:
     """Returns the bytes of a device's memory, and how many of them are free; of a CPU, all that the process may use.
 
-    None where nobody knows.
+    None if unknown.
     """
     with contextlib.suppress(jax.errors.JaxRuntimeError, NotImplementedError):
         said: Mapping[str, int] = device.memory_stats() or {}
@@ -51,7 +51,7 @@ def memory_of(device: Any) -> tuple[int, int] | None:
 
 
 def host_bytes(limits: Sequence[Path] = LIMITS) -> int | None:
-    """Returns the memory of this machine, or the part of it that this process may use; None where nobody knows."""
+    """Returns the memory of this machine, or the part that this process may use; None if unknown."""
     found = []
     with contextlib.suppress(AttributeError, ValueError, OSError):  # not on every system
         found.append(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))
@@ -64,7 +64,7 @@ def host_bytes(limits: Sequence[Path] = LIMITS) -> int | None:
 def check_fits(state: Any, devices: Sequence[Any]) -> None:
     """Raises if a train state is larger than the free memory of a device; each holds all of it while it is made.
 
-    What is computed needs more, so one that passes may still be too large.
+    Temporaries need more, so a state that passes may still be too large.
 
     Args:
         state: arrays, or their shapes and types.

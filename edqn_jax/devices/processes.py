@@ -30,7 +30,7 @@ LONGEST_SENTENCE = 1024
 """Bytes of an error message that are sent to the other processes."""
 
 
-def join(arguments: Mapping[str, Any]) -> int:
+def join_cluster(arguments: Mapping[str, Any]) -> int:
     """Joins the other processes, waiting at most five minutes; must be called before JAX is first used.
 
     JAX ends the program, without an exception, if a process is missing.
@@ -63,7 +63,7 @@ def join(arguments: Mapping[str, Any]) -> int:
     return jax.process_index()
 
 
-def leave(error: Exception, own: ConfigError | None = None) -> NoReturn:
+def abort_process(error: Exception, own: ConfigError | None = None) -> NoReturn:
     """Ends this process, with a sentence, after an error that others of the cluster may have caused.
 
     At once: JAX would wait at the exit for those that are gone.
@@ -78,7 +78,7 @@ def leave(error: Exception, own: ConfigError | None = None) -> NoReturn:
     os._exit(1 if own is None else 2)
 
 
-def together(work: Callable[[], T]) -> T:
+def run_synchronised(work: Callable[[], T]) -> T:
     """Returns `work()`, or raises on every process if it fails on one; every process must call this.
 
     Raises:
@@ -100,7 +100,7 @@ def together(work: Callable[[], T]) -> T:
     return result  # type: ignore[return-value]
 
 
-def check_alike(text: str) -> None:
+def check_equal(text: str) -> None:
     """Raises on every process unless all have the same text, such as their options; every process must call this.
 
     Raises:
@@ -116,8 +116,8 @@ def check_alike(text: str) -> None:
         )
 
 
-def of_first(content: bytes | None) -> bytes:
-    """Returns what process 0 gives, on every process; every process must call this, all but that one with None."""
+def broadcast_from_first(content: bytes | None) -> bytes:
+    """Broadcasts the bytes of process 0; every process must call this, all others with None."""
     if not jax.distributed.is_initialized():
         assert content is not None
         return content
@@ -126,7 +126,7 @@ def of_first(content: bytes | None) -> bytes:
     return np.asarray(multihost_utils.broadcast_one_to_all(sent)).tobytes()
 
 
-def on_any(flag: bool) -> bool:
+def any_process(flag: bool) -> bool:
     """Returns whether `flag` is true on any process; every process must call this."""
     return bool(np.any(multihost_utils.process_allgather(np.asarray(flag))))
 
@@ -137,6 +137,6 @@ def replicate(tree: Any, mesh: Mesh) -> Any:
     return jax.device_put(jax.tree.map(np.asarray, tree), NamedSharding(mesh, PartitionSpec()))
 
 
-def fetch(tree: Tree) -> Tree:
+def fetch_global(tree: Tree) -> Tree:
     """Returns each array of a mesh of all processes, gathered on the host; every process must call this."""
     return multihost_utils.process_allgather(tree, tiled=True)

@@ -1,4 +1,4 @@
-"""What there is around a recorded flight in the world that its pictures are drawn of: other drones, and balls."""
+"""The scene of a recorded flight, for pictures: its world with other drones and balls."""
 
 from __future__ import annotations
 
@@ -11,14 +11,14 @@ import numpy as np
 from edqn_jax.config import Config
 from edqn_jax.evaluation.missions import MissionSet
 from edqn_jax.sim.scene.launches import aim_along
-from edqn_jax.sim.scene.motion import Flown
+from edqn_jax.sim.scene.motion import DroneTracks
 from edqn_jax.sim.scene.scene import PARKED, Scene
 from edqn_jax.sim.task import group
 from edqn_jax.sim.task.flights import Flights
 
 
 def scene_of_flight(config: Config, missions: MissionSet, flights: Flights | None = None, mission: int = 0) -> Scene:
-    """Returns the world of a mission as it was around its flight: balls where they were thrown, other drones.
+    """Returns the scene of a mission during its flight: with balls as they were thrown and the other drones.
 
     Args:
         config: of the flight.
@@ -38,7 +38,7 @@ def scene_of_flight(config: Config, missions: MissionSet, flights: Flights | Non
             own = np.concatenate([own, np.asarray(flights.get_record().position[mission])])
         aim = aim_along(config, scene, own[:: config.drone.physics_steps])
         scene = dataclasses.replace(scene, aim=jax.tree.map(np.asarray, aim))
-    if not group.several(config):
+    if not group.is_multi_drone(config):
         return scene
     count, steps = config.env.drones, config.drone.physics_steps
     first = mission - mission % count
@@ -46,9 +46,9 @@ def scene_of_flight(config: Config, missions: MissionSet, flights: Flights | Non
     path = np.full((count - 1, 1 + config.env.max_decisions * steps, 3), PARKED, np.float32)
     if flights is not None:
         path[:, 0] = np.asarray(ends.start)[others]
-        flown = np.asarray(flights.get_record().position)[others]
-        path[:, 1:] = np.where(np.isnan(flown), PARKED, flown)
-    table = Flown(
+        recorded = np.asarray(flights.get_record().position)[others]
+        path[:, 1:] = np.where(np.isnan(recorded), PARKED, recorded)
+    table = DroneTracks(
         path=jnp.asarray(path),
         radius=jnp.full(count - 1, config.drone.body_radius_m),
         began=jnp.zeros(()),

@@ -1,4 +1,4 @@
-"""A policy, flown greedily on missions of any world and measured."""
+"""Evaluates a policy greedily on missions of any world."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ import jax
 import numpy as np
 
 from edqn_jax.config import Config
-from edqn_jax.config.loading import Layer, flown_under
+from edqn_jax.config.loading import Layer, with_conditions
 from edqn_jax.devices.forks import check_not_forked
 from edqn_jax.devices.jax_settings import as_tested
 from edqn_jax.errors import ConfigError
-from edqn_jax.evaluation.metrics import shortest_paths, summarise
+from edqn_jax.evaluation.metrics import shortest_paths, summarise_flights
 from edqn_jax.evaluation.missions import MissionSet, Point, load_missions
 from edqn_jax.evaluation.rollouts import fly_on_all_devices
 from edqn_jax.learn.policy import Policy
@@ -92,19 +92,19 @@ def evaluate(
     """
     check_not_forked()
     policy = as_policy(policy, world)
-    config = flown_under(config_of(policy), conditions or {}, "evaluate")
+    config = with_conditions(config_of(policy), conditions or {}, "evaluate")
     if shuffle_codes:
         _check_can_shuffle(config, missions)
-    flown = load_missions(config, str(world or config.world.name), missions, seed, start, goal)
+    mission_set = load_missions(config, str(world or config.world.name), missions, seed, start, goal)
     actor = actor_of(policy, config)
     flights = fly_on_all_devices(
-        config, flown.world, policy.params, seed, actor=actor, record=record, shuffle_codes=shuffle_codes
+        config, mission_set.world, policy.params, seed, actor=actor, record=record, shuffle_codes=shuffle_codes
     )
-    shortest = shortest_paths(config, flown.world, np.asarray(flights.outcome) == Outcome.GOAL)
+    shortest = shortest_paths(config, mission_set.world, np.asarray(flights.outcome) == Outcome.GOAL)
     missions = dataclasses.replace(
-        flown, note=" ".join(filter(None, (flown.note, _unseen_look(policy, config)))) or None
+        mission_set, note=" ".join(filter(None, (mission_set.note, _unseen_look(policy, config)))) or None
     )
-    return Evaluation(missions, flights, summarise(flights, shortest, config.env.drones))
+    return Evaluation(missions, flights, summarise_flights(flights, shortest, config.env.drones))
 
 
 def _unseen_look(policy: Policy | FunctionPolicy, config: Config) -> str | None:

@@ -33,10 +33,10 @@ def rate_interval(success: np.ndarray) -> tuple[float, float]:
     if success.all() or not success.any():
         missions = success.shape[1]
         return wilson_interval(missions * int(success.all()), missions)
-    return percentiles(drawn_rates([success])[0])
+    return percentile_interval(bootstrap_rates([success])[0])
 
 
-def drawn_rates(strata: list[np.ndarray], draws: int = DRAWS, seed: int = 0) -> np.ndarray:
+def bootstrap_rates(strata: list[np.ndarray], draws: int = DRAWS, seed: int = 0) -> np.ndarray:
     """Returns success rates [strata, draws] of bootstrap draws; `strata` are [seeds, missions] bool, of equal missions.
 
     Raises:
@@ -56,7 +56,7 @@ def drawn_rates(strata: list[np.ndarray], draws: int = DRAWS, seed: int = 0) -> 
     return np.array(rates)
 
 
-def percentiles(values: np.ndarray) -> tuple[float, float]:
+def percentile_interval(values: np.ndarray) -> tuple[float, float]:
     """Returns the interval that holds 95 % of the values [N]."""
     low, high = np.percentile(values, [2.5, 97.5])
     return float(low), float(high)

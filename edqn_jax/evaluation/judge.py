@@ -56,8 +56,8 @@ class Contact:
 
 
 @dataclass(frozen=True)
-class Target:
-    """A flight: whom balls are thrown at."""
+class FlightTrack:
+    """A recorded flight, at which balls are thrown."""
 
     start: ArrayLike
     """[3] metres."""
@@ -85,8 +85,8 @@ class Moving:
     high: NDArray[np.float64]
     """[3] metres to the highest point."""
 
-    def at(self, time: float, target: Target) -> NDArray[np.float64]:
-        """Returns where it is [3], metres; `_AWAY_M` away before a ball is launched and after it has flown out."""
+    def at(self, time: float, target: FlightTrack) -> NDArray[np.float64]:
+        """Returns the position [3], metres; `_AWAY_M` away for a ball before launch and after its flight."""
         place = self.position.copy()
         for word, numbers in self.said:
             if word == "throw":
@@ -116,7 +116,7 @@ class Moving:
                 total += abs(rate) * float(np.linalg.norm(np.stack([a, b]), ord=2))
         return total
 
-    def _thrown(self, numbers: Sequence[float], time: float, target: Target) -> NDArray[np.float64]:
+    def _thrown(self, numbers: Sequence[float], time: float, target: FlightTrack) -> NDArray[np.float64]:
         share, early, speed, bearing, elevation, gravity, pace = numbers
         away = np.full(3, _AWAY_M)
         start, goal = (np.asarray(end, np.float64) for end in (target.start, target.goal))
@@ -147,7 +147,7 @@ class Moving:
         return place - (self.low + self.high) / 2 if inside else away
 
     def throw_speed(self, seconds: float) -> float:
-        """Returns a bound of its speed as a ball within so many seconds of a flight, m/s; 0 if it is none."""
+        """Returns a bound of the ball's speed within so many seconds of a flight, m/s; 0 for other bodies."""
         word, numbers = self.said[0]
         return numbers[2] + abs(numbers[5]) * (numbers[1] / 2 + seconds) if word == "throw" else 0.0
 
@@ -163,7 +163,7 @@ def _bounced(position: float, way: float, low: float, high: float) -> float:
 
 
 @dataclass(frozen=True)
-class Judge:
+class MujocoWorld:
     """A compiled world with the probe sphere. Build it with `load_judge`, once per world."""
 
     model: mujoco.MjModel
@@ -175,11 +175,11 @@ class Judge:
     reach: NDArray[np.float64]
     """[N] radius of each solid's bounding sphere, metres; inf for planes."""
     moving: tuple[Moving, ...] = ()
-    target: Target = Target((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+    target: FlightTrack = FlightTrack((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
     """From site `start` to site `goal` of the world, at a steady pace."""
 
 
-def load_judge(world: str | Path | mujoco.MjSpec, radius: float, volume: ArrayLike | None = None) -> Judge:
+def load_judge(world: str | Path | mujoco.MjSpec, radius: float, volume: ArrayLike | None = None) -> MujocoWorld:
     """Returns the world of an MJCF file (or a spec) with a probe sphere of `radius` metres.
 
     Args:
@@ -207,7 +207,7 @@ def load_judge(world: str | Path | mujoco.MjSpec, radius: float, volume: ArrayLi
     reach = np.where(plane, np.inf, model.geom_rbound[solids])
     moving = tuple(_moving(model, data, solids, volume))
     start, goal = (np.array(data.site(n).xpos) if n in _sites(model) else np.zeros(3) for n in ("start", "goal"))
-    return Judge(model, data, probe, solids, reach, moving, Target(start, goal))
+    return MujocoWorld(model, data, probe, solids, reach, moving, FlightTrack(start, goal))
 
 
 def _sites(model: mujoco.MjModel) -> list[str]:
@@ -242,7 +242,9 @@ def _extent(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> NDArray[np
     return np.asarray(shape.position + np.array([[-1.0], [1.0]]) * reach_of(shape))
 
 
-def clearance(judge: Judge, position: ArrayLike, time: float = 0.0, target: Target | None = None) -> tuple[float, str]:
+def clearance(
+    judge: MujocoWorld, position: ArrayLike, time: float = 0.0, target: FlightTrack | None = None
+) -> tuple[float, str]:
     """Returns the distance from the body sphere at `position` [3] to the nearest solid, and that solid's name.
 
     Metres, negative where they overlap; inf and "" in an empty world. What moves is where it is at `time` seconds;
@@ -269,13 +271,13 @@ def clearance(judge: Judge, position: ArrayLike, time: float = 0.0, target: Targ
     return float(nearest), judge.model.geom(name).name or f"geom {name}"
 
 
-def fastest(judge: Judge, seconds: float) -> float:
-    """Returns a bound of the speed of everything that moves within so many seconds of a flight, m/s."""
+def max_obstacle_speed(judge: MujocoWorld, seconds: float) -> float:
+    """Returns a bound of the speed of all obstacles within so many seconds of a flight, m/s."""
     return max((max(body.speed(), body.throw_speed(seconds)) for body in judge.moving), default=0.0)
 
 
 def replay_contact(
-    judge: Judge, positions: ArrayLike, step_s: float | None = None, target: Target | None = None
+    judge: MujocoWorld, positions: ArrayLike, step_s: float | None = None, target: FlightTrack | None = None
 ) -> Contact | None:
     """Returns the first contact of the body sphere along the segments between `positions` [n, 3], n >= 2, or None.
 
@@ -294,7 +296,7 @@ def replay_contact(
     points = np.asarray(positions, dtype=np.float64)
     if points.ndim != 2 or points.shape[1] != 3 or len(points) < 2 or not np.isfinite(points).all():
         raise ValueError(f"positions must be finite metres of shape [n, 3] with n >= 2, not of shape {points.shape}")
-    way = Way(points, fastest(judge, step_s * len(points)) * step_s)
+    way = Way(points, max_obstacle_speed(judge, step_s * len(points)) * step_s)
 
     def gap_at(distance: float) -> tuple[float, str]:
         segment, fraction = way.place(distance)

@@ -23,11 +23,11 @@ def decision_latency_ms(
 
 def decision_seconds(config: Config, params: Any, calls: int, *, actor: Actor | None = None) -> np.ndarray:
     """Returns the seconds [calls] that each of `calls` decisions takes, from arrays on the host to an action there."""
-    return in_turn([decision_call(config, params, actor)], calls)[0]
+    return time_interleaved([decision_call(config, params, actor)], calls)[0]
 
 
 def decision_call(config: Config, params: Any, actor: Actor | None = None) -> Callable[[], np.ndarray]:
-    """Returns what makes one decision, from arrays on the host to an action [] or [...] there.
+    """Returns a callable that runs one decision, from host arrays to an action [] or [...] on the host.
 
     Args:
         config: of the policy.
@@ -41,7 +41,7 @@ def decision_call(config: Config, params: Any, actor: Actor | None = None) -> Ca
     return lambda: np.asarray(act(params, memory, seen, key))
 
 
-def in_turn(works: Sequence[Callable[[], object]], calls: int, block: int = 1) -> np.ndarray:
+def time_interleaved(works: Sequence[Callable[[], object]], calls: int, block: int = 1) -> np.ndarray:
     """Returns the seconds [works, calls] of each call, after a first one of each that compiles.
 
     `block` calls of each follow one another before the next one's turn, so that all of them meet the same machine.

@@ -12,7 +12,7 @@ from edqn_jax.config import Config
 from edqn_jax.planning.astar import shortest_path
 from edqn_jax.planning.lattice import NoPathError
 from edqn_jax.sim.scene.scene import take_scene
-from edqn_jax.sim.task.env import World
+from edqn_jax.sim.task.env import EnvParams
 from edqn_jax.sim.task.flights import Flights
 from edqn_jax.sim.task.outcomes import Outcome
 
@@ -31,24 +31,26 @@ def wilson_interval(successes: int, missions: int, z: float = 1.959964) -> tuple
     return max(0.0, middle - half), min(1.0, middle + half)
 
 
-def spl(success: np.ndarray, flown: np.ndarray, shortest: np.ndarray) -> float:
+def spl(success: np.ndarray, path_lengths: np.ndarray, shortest: np.ndarray) -> float:
     """Returns success weighted by path length (Anderson et al. 2018): mean of S l / max(p, l) over missions [M].
 
     The shortest path of a failed mission is not used and may be NaN.
     """
-    weight = shortest[success] / np.maximum(flown[success], shortest[success])
+    weight = shortest[success] / np.maximum(path_lengths[success], shortest[success])
     return float(np.sum(weight) / len(success))
 
 
-def known_lengths(shortest: np.ndarray, flown: np.ndarray) -> np.ndarray:
+def fill_unknown_lengths(shortest: np.ndarray, path_lengths: np.ndarray) -> np.ndarray:
     """Returns lengths [M] of shortest paths, metres, where unknown those flown, which have a weight of 1 in the SPL."""
-    return np.where(np.isfinite(shortest), shortest, flown)
+    return np.where(np.isfinite(shortest), shortest, path_lengths)
 
 
-def shortest_paths(config: Config, world: World, wanted: np.ndarray) -> np.ndarray:
+def shortest_paths(config: Config, env_params: EnvParams, wanted: np.ndarray) -> np.ndarray:
     """Returns the length [M] of A*'s path for each of the `wanted` [M] missions, metres; NaN for the others."""
-    scene_of, starts, goals = (np.asarray(x) for x in (world.missions.scene, world.missions.start, world.missions.goal))
-    pool = jax.tree.map(np.asarray, world.pool)
+    scene_of, starts, goals = (
+        np.asarray(x) for x in (env_params.missions.scene, env_params.missions.start, env_params.missions.goal)
+    )
+    pool = jax.tree.map(np.asarray, env_params.pool)
     lengths = np.full(len(starts), np.nan)
     for i in np.flatnonzero(wanted):
         try:
@@ -59,7 +61,7 @@ def shortest_paths(config: Config, world: World, wanted: np.ndarray) -> np.ndarr
     return lengths
 
 
-def summarise(flights: Flights, shortest: np.ndarray | None = None, drones: int = 1) -> dict[str, Any]:
+def summarise_flights(flights: Flights, shortest: np.ndarray | None = None, drones: int = 1) -> dict[str, Any]:
     """Returns the metrics of a set of flights.
 
     Args:
@@ -79,7 +81,7 @@ def summarise(flights: Flights, shortest: np.ndarray | None = None, drones: int 
     counts = {kind: int(np.sum(outcome == kind)) for kind in Outcome}
     success = outcome == Outcome.GOAL
     low, high = wilson_interval(counts[Outcome.GOAL], len(outcome))
-    flown = np.asarray(flights.path_length_m, np.float64)
+    path_lengths = np.asarray(flights.path_length_m, np.float64)
 
     def mean(values: Any, over: np.ndarray) -> float | None:
         chosen = np.asarray(values, np.float64)[over]
@@ -98,7 +100,7 @@ def summarise(flights: Flights, shortest: np.ndarray | None = None, drones: int 
         "path_over_shortest": None,
         "decisions": mean(flights.decisions, success),
         "flight_seconds": mean(flights.flight_seconds, success),
-        "path_length_m": mean(flown, success),
+        "path_length_m": mean(path_lengths, success),
         "return": mean(flights.episode_return, np.ones_like(success)),
         "min_clearance_m": float(np.min(flights.closest.distance[success])) if success.any() else None,
     }
@@ -109,8 +111,8 @@ def summarise(flights: Flights, shortest: np.ndarray | None = None, drones: int 
         figures |= {"groups": len(whole), "groups_arrived": int(whole.sum())}
     if shortest is not None:
         known = success & np.isfinite(shortest)
-        figures["spl"] = spl(success, flown, known_lengths(shortest, flown))
-        figures["path_over_shortest"] = mean(flown / np.where(known, shortest, 1.0), known)
+        figures["spl"] = spl(success, path_lengths, fill_unknown_lengths(shortest, path_lengths))
+        figures["path_over_shortest"] = mean(path_lengths / np.where(known, shortest, 1.0), known)
     return figures
 
 
@@ -138,7 +140,7 @@ def flight_summary(flights: Flights, mission: int = 0) -> dict[str, Any]:
     }
 
 
-def clock(seconds: float) -> str:
+def format_duration(seconds: float) -> str:
     """Returns `m:ss`, or `h:mm:ss` from an hour on."""
     minutes, rest = divmod(int(seconds), 60)
     hours, minutes = divmod(minutes, 60)

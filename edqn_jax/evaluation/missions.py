@@ -14,14 +14,14 @@ from edqn_jax.config import FAMILIES, Config
 from edqn_jax.errors import ConfigError
 from edqn_jax.keys import CROSSING_OF_WORLD, FILE_MISSIONS, run_streams
 from edqn_jax.planning.astar import shortest_path
-from edqn_jax.planning.free_space import holds, reachable
+from edqn_jax.planning.free_space import find_reachable, is_reachable
 from edqn_jax.planning.lattice import CELL_M, lattice_shape
 from edqn_jax.sim.physics.airframe import load_airframe
-from edqn_jax.sim.scene.mjcf import check_scene, load_world, mjcf_of, resolve_world, widened
+from edqn_jax.sim.scene.mjcf import check_scene, load_world, mjcf_of, resolve_world, widen_volume
 from edqn_jax.sim.scene.scene import Scene, take_scene, with_equal_capacities
 from edqn_jax.sim.task import group
 from edqn_jax.sim.task.crossing import crossing_missions, own_crossings
-from edqn_jax.sim.task.env import World, scene_of
+from edqn_jax.sim.task.env import EnvParams, scene_of
 from edqn_jax.sim.task.missions import Missions, own_missions, random_missions, spread_missions
 from edqn_jax.sim.task.reward import Reward
 from edqn_jax.sim.worlds import families
@@ -36,7 +36,7 @@ class MissionSet:
 
     name: str
     """Name that the world was asked for by."""
-    world: World
+    world: EnvParams
     file: Path | None = None
     """MJCF file of the only world; None for random worlds."""
     note: str | None = None
@@ -46,7 +46,7 @@ class MissionSet:
         """Returns the world of one mission."""
         return scene_of(self.world, jnp.asarray(mission))
 
-    def rewarded_by(self, reward: Reward | None) -> MissionSet:
+    def with_reward(self, reward: Reward | None) -> MissionSet:
         """Returns the same missions with this reward; None is the configured one."""
         return dataclasses.replace(self, world=dataclasses.replace(self.world, reward=reward))
 
@@ -93,7 +93,7 @@ def run_missions(config: Config, reward: Reward | None = None) -> RunMissions:
     else:
         missions = _file_run_missions(config, keys.training_missions, keys.validation_missions)
     return dataclasses.replace(
-        missions, **{name: getattr(missions, name).rewarded_by(reward) for name in ("training", "validation", "final")}
+        missions, **{name: getattr(missions, name).with_reward(reward) for name in ("training", "validation", "final")}
     )
 
 
@@ -120,21 +120,21 @@ def _random_run_missions(config: Config, training_key: jax.Array) -> RunMissions
 
     Where `world.flown` names a world, the first final mission, or block of them, is in that world.
     """
-    name, flown, count = config.world.name, config.world.flown, config.train.validation_missions
+    name, final_name, count = config.world.name, config.world.flown, config.train.validation_missions
     drones = config.env.drones
     airframe = load_airframe(config.drone)
     training_pool = families.worlds_of(config, name, "training", config.world.pool_size)
     training = _training_missions(training_pool, config, training_key)
     validation, test = (families.worlds_of(config, name, split, count // drones) for split in ("validation", "test"))
-    if flown:
-        validation, test, own = with_equal_capacities([validation, test, _pool_of(flown, config)])
-        test = _before(own, test)
+    if final_name:
+        validation, test, own = with_equal_capacities([validation, test, _pool_of(final_name, config)])
+        test = _prepend(own, test)
     return RunMissions(
-        training=MissionSet(name, World(airframe, training_pool, training)),
-        validation=MissionSet(name, _flown_in(validation, config, "validation")),
-        final=MissionSet(name, _flown_in(test, config, "test")),
+        training=MissionSet(name, EnvParams(airframe, training_pool, training)),
+        validation=MissionSet(name, _env_params_of(validation, config, "validation")),
+        final=MissionSet(name, _env_params_of(test, config, "test")),
         near_start=np.ones(count, bool),
-        tests=count - drones if flown else count,
+        tests=count - drones if final_name else count,
     )
 
 
@@ -148,20 +148,20 @@ def final_missions(config: Config, most: int) -> MissionSet:
     Raises:
         ConfigError: as `run_missions`.
     """
-    name, flown, count = config.world.name, config.world.flown, min(most, config.train.validation_missions)
+    name, final_name, count = config.world.name, config.world.flown, min(most, config.train.validation_missions)
     if name not in FAMILIES:
         final = run_missions(config).final
         missions = jax.tree.map(lambda leaf: leaf[:count], final.world.missions)
         return dataclasses.replace(final, world=dataclasses.replace(final.world, missions=missions))
     count = max(count // config.env.drones, 1) * config.env.drones
     pool = families.worlds_of(config, name, "test", count // config.env.drones)
-    if flown:
-        pool, own = with_equal_capacities([pool, _pool_of(flown, config)])
-        pool = _before(own, pool)
-    return MissionSet(name, _flown_in(pool, config, "test"))
+    if final_name:
+        pool, own = with_equal_capacities([pool, _pool_of(final_name, config)])
+        pool = _prepend(own, pool)
+    return MissionSet(name, _env_params_of(pool, config, "test"))
 
 
-def _flown_in(pool: Scene, config: Config, split: families.Split, first: int = 0) -> World:
+def _env_params_of(pool: Scene, config: Config, split: families.Split, first: int = 0) -> EnvParams:
     """Returns one mission in each world of the pool, its own, or one block of missions that cross.
 
     The own mission of a world is then that of its block's first drone.
@@ -173,17 +173,17 @@ def _flown_in(pool: Scene, config: Config, split: families.Split, first: int = 0
         first: number of the first world.
     """
     airframe, drones = load_airframe(config.drone), config.env.drones
-    if not group.several(config):
-        return World(airframe, pool, own_missions(pool))
+    if not group.is_multi_drone(config):
+        return EnvParams(airframe, pool, own_missions(pool))
     if pool.spheres.throw is not None:
         raise ConfigError(f"with env.drones {drones} the world must throw no balls, which are for one drone alone")
     keys = families.world_keys(split, pool.start.shape[0], first)
     missions = own_crossings(pool, drones, jax.vmap(lambda key: jax.random.fold_in(key, CROSSING_OF_WORLD))(keys))
     pool = dataclasses.replace(pool, start=missions.start[::drones], goal=missions.goal[::drones])
-    return World(airframe, pool, missions)
+    return EnvParams(airframe, pool, missions)
 
 
-def _before(own: Scene, pool: Scene) -> Scene:
+def _prepend(own: Scene, pool: Scene) -> Scene:
     """Returns a pool with the world `own`, a pool of one, before all others, and without its last."""
     return jax.tree.map(lambda one, many: jnp.asarray(np.concatenate([one, many])[:-1]), own, pool)
 
@@ -193,7 +193,7 @@ def _training_missions(pool: Scene, config: Config, key: jax.Array) -> Missions:
 
     Of several drones they are blocks that cross.
     """
-    if group.several(config):
+    if group.is_multi_drone(config):
         return crossing_missions(pool, config.env.drones, config.world.missions // config.env.drones, key)
     return random_missions(pool, config.world.missions, key, own_goals=config.env.reward == "geodesic")
 
@@ -226,10 +226,10 @@ def _file_run_missions(config: Config, training_key: jax.Array, validation_key: 
     final = jax.tree.map(lambda one, many: jnp.concatenate([one, many[1:]]), own, validation)
     final = dataclasses.replace(final, scene=final.scene.astype(jnp.int32))
     return RunMissions(
-        training=MissionSet(name, World(airframe, pool, training), file, note),
-        validation=MissionSet(name, World(airframe, pool, validation), file),
-        final=MissionSet(name, World(airframe, pool, final), file),
-        near_start=_near(validation, np.asarray(pool.start[0]), near),
+        training=MissionSet(name, EnvParams(airframe, pool, training), file, note),
+        validation=MissionSet(name, EnvParams(airframe, pool, validation), file),
+        final=MissionSet(name, EnvParams(airframe, pool, final), file),
+        near_start=_starts_near(validation, np.asarray(pool.start[0]), near),
         tests=0,
     )
 
@@ -252,16 +252,16 @@ def _with_a_way(pool: Scene, config: Config, name: str, own_start: bool = False)
     scene, radius = take_scene(pool, 0), config.drone.body_radius_m
     if own_start:
         lattice_shape(scene, np.asarray(scene.start, np.float64), CELL_M)  # A* searches the way from there
-    found = reachable(scene, radius)
+    found = find_reachable(scene, radius)
     if found.lost == 0.0:
         return None, None
-    if own_start and not holds(found, scene.start):
+    if own_start and not is_reachable(found, scene.start):
         shortest_path(scene, scene.start, scene.goal, radius)  # raises, before anything is compiled
     cells = cells_of(scene, found.is_way, found.corner, found.edge_m)
     return cells, f"{found.lost:.0%} of the free space of '{name}' has no way to the goal: no mission begins there"
 
 
-def _near(missions: Missions, start: np.ndarray, jitter_m: float) -> np.ndarray:
+def _starts_near(missions: Missions, start: np.ndarray, jitter_m: float) -> np.ndarray:
     """Returns [M] whether each mission begins within `jitter_m` of `start` [3] along each axis."""
     apart = np.abs(np.asarray(missions.start) - start).max(axis=1)
     return apart <= jitter_m + 1e-3  # positions are rounded to float32
@@ -302,7 +302,7 @@ def load_missions(
         if point is not None and not np.all(np.isfinite(point)):
             raise ConfigError(f"--{role} must be three finite numbers, metres, not {' '.join(f'{x:g}' for x in point)}")
     moved = {k: jnp.asarray(v, jnp.float32) for k, v in (("start", start), ("goal", goal)) if v is not None}
-    if group.several(config):
+    if group.is_multi_drone(config):
         _check_group(config, name, missions, moved)
     if name in FAMILIES:
         return _random_missions(config, name, missions, seed, moved)
@@ -323,7 +323,7 @@ def _random_missions(config: Config, name: str, missions: int, seed: int, moved:
         for index in range(missions):
             title = f"test world {seed * missions + index} ({name})"
             check_scene(take_scene(pool, index), config.drone.body_radius_m, title=title)
-    return MissionSet(name, _flown_in(pool, config, "test", seed * count))
+    return MissionSet(name, _env_params_of(pool, config, "test", seed * count))
 
 
 def _check_group(config: Config, name: str, missions: int, moved: dict[str, jax.Array]) -> None:
@@ -352,14 +352,14 @@ def _file_missions(config: Config, name: str, missions: int, seed: int, moved: d
     loaded = load_world(file)
     scene, note = dataclasses.replace(loaded.scene, **moved), None
     if moved and not loaded.has_volume:
-        scene = widened(scene, moved, f"'{name}'")
+        scene = widen_volume(scene, moved, f"'{name}'")
         if not np.array_equal(scene.volume, loaded.scene.volume):
             note = f"'{name}' names no flight volume: it is flown in {_box(scene)}, around its shapes, start and goal"
     if missions == 1:
         check_scene(scene, radius, names=loaded.names, title=f"'{name}'", goal_radius=config.env.goal_radius_m)
         shortest_path(scene, scene.start, scene.goal, radius)  # raises where there is no path
         pool = families.world_of_file(config, scene)
-        return MissionSet(name, World(airframe, pool, own_missions(pool)), file, note)
+        return MissionSet(name, EnvParams(airframe, pool, own_missions(pool)), file, note)
     probe_key, missions_key = jax.random.split(mission_key(seed))
     # The world's own start does not matter, any free point will do; the goal does.
     standing = dataclasses.replace(scene, start=free_point(scene, probe_key))
@@ -367,7 +367,7 @@ def _file_missions(config: Config, name: str, missions: int, seed: int, moved: d
     pool = families.world_of_file(config, scene)
     cells, said = _with_a_way(pool, config, name)
     many = spread_missions(pool, missions, 0.0, 0.0, missions_key, cells)
-    return MissionSet(name, World(airframe, pool, many), file, " ".join(filter(None, (note, said))) or None)
+    return MissionSet(name, EnvParams(airframe, pool, many), file, " ".join(filter(None, (note, said))) or None)
 
 
 def _box(scene: Scene) -> str:

@@ -21,9 +21,9 @@ from edqn_jax.keys import run_streams
 from edqn_jax.learn.actor import Actor, AgentActor, blank_observation
 from edqn_jax.sim.actions import Discrete
 from edqn_jax.sim.task import group
-from edqn_jax.sim.task.action_sets import described
-from edqn_jax.sim.task.env import EnvState, Step, World, scene_of
-from edqn_jax.sim.task.flights import Flights, Record, at_start, tally
+from edqn_jax.sim.task.action_sets import describe_space
+from edqn_jax.sim.task.env import EnvParams, EnvState, Step, scene_of
+from edqn_jax.sim.task.flights import Flights, Record, at_start, update_tallies
 from edqn_jax.sim.task.observation import Observation
 from edqn_jax.sim.task.outcomes import Outcome
 from edqn_jax.sim.task.task import task_of
@@ -31,7 +31,7 @@ from edqn_jax.sim.task.task import task_of
 
 @dataclasses.dataclass(frozen=True)
 class _Program:
-    """What a compiled program depends on, beside its arrays and devices."""
+    """Static arguments of a compiled program, except for devices."""
 
     config: Config
     actor: Actor
@@ -54,7 +54,7 @@ class _Flying:
 
 def fly_missions(
     config: Config,
-    world: World,
+    env_params: EnvParams,
     params: Any,
     key: Array,
     *,
@@ -90,12 +90,12 @@ def fly_missions(
         ValueError: if codes are to be shuffled and a device has only one mission.
     """
     program = _Program(config, actor or AgentActor(config), shuffle_codes, record)
-    return _compiled_for(mesh)(program, mesh, world, params, key)
+    return _compiled_for(mesh)(program, mesh, env_params, params, key)
 
 
 def fly_on_all_devices(
     config: Config,
-    world: World,
+    env_params: EnvParams,
     params: Any,
     seed: int = 0,
     *,
@@ -105,18 +105,20 @@ def fly_on_all_devices(
 ) -> Flights:
     """Runs `fly_missions` on all devices and returns the flights on the host."""
     mesh = Mesh(np.asarray(jax.devices()), ("mission",))
-    world, params = jax.device_put((world, params), NamedSharding(mesh, PartitionSpec()))
+    env_params, params = jax.device_put((env_params, params), NamedSharding(mesh, PartitionSpec()))
     key = run_streams(seed).flights
     flights = fly_missions(
-        config, world, params, key, actor=actor, record=record, shuffle_codes=shuffle_codes, mesh=mesh
+        config, env_params, params, key, actor=actor, record=record, shuffle_codes=shuffle_codes, mesh=mesh
     )
     return jax.tree.map(np.asarray, flights)
 
 
-def traced(config: Config, world: World, params: Any, key: Array, *, record: bool, mesh: Mesh) -> jax.stages.Lowered:
+def trace_missions(
+    config: Config, env_params: EnvParams, params: Any, key: Array, *, record: bool, mesh: Mesh
+) -> jax.stages.Lowered:
     """Returns the program that `fly_missions` runs for the agent, to be compiled ahead of its first call."""
     program = _Program(config, AgentActor(config), False, record)
-    return _compiled_for(mesh).lower(program, mesh, world, params, key)
+    return _compiled_for(mesh).lower(program, mesh, env_params, params, key)
 
 
 def flight_keys(key: Array, missions: int) -> tuple[Array, Array]:
@@ -135,8 +137,8 @@ def _compiled(platform: str):
     return jax.jit(_fly_all, static_argnums=(0, 1), compiler_options=compiler_options(platform))
 
 
-def _fly_all(program: _Program, mesh: Mesh | None, world: World, params: Any, key: Array) -> Flights:
-    missions = world.missions.scene.shape[0]
+def _fly_all(program: _Program, mesh: Mesh | None, env_params: EnvParams, params: Any, key: Array) -> Flights:
+    missions = env_params.missions.scene.shape[0]
     devices = 1 if mesh is None else mesh.size
     reset_keys, loop_key = flight_keys(key, missions)
     # Every device flies equally many missions, whole groups; the first ones are repeated to fill up.
@@ -150,29 +152,29 @@ def _fly_all(program: _Program, mesh: Mesh | None, world: World, params: Any, ke
         (axis,) = mesh.axis_names
         specs = PartitionSpec(), PartitionSpec(), PartitionSpec(axis), PartitionSpec(axis), PartitionSpec()
         fly = jax.shard_map(fly, mesh=mesh, in_specs=specs, out_specs=PartitionSpec(axis), check_vma=False)
-    flights = fly(world, params, number, keys, loop_key)
+    flights = fly(env_params, params, number, keys, loop_key)
     return jax.tree.map(lambda leaf: leaf[:missions], flights)
 
 
-def _fly(program: _Program, world: World, params: Any, number: Array, keys: Array, key: Array) -> Flights:
+def _fly(program: _Program, env_params: EnvParams, params: Any, number: Array, keys: Array, key: Array) -> Flights:
     """Runs `fly_missions` on one device: missions `number` [M] with the environments' keys [M]."""
     config, actor, missions = program.config, program.actor, number.shape[0]
     first, task = actor.init(), task_of(config)
     action = _action_of(config, actor, params)
-    step_all = task.map(partial(task.step, world))
+    step_all = task.map(partial(task.step, env_params))
 
     def decide(flying: _Flying) -> _Flying:
         key, act_key, shift_key = jax.random.split(flying.key, 3)
         seen = flying.observation
         if program.shuffle_codes:
             shift = jax.random.randint(shift_key, (), 1, missions)
-            # What a code tells of obstacles is in the sensor's output alone; the own motion stays.
+            # Only the sensor's output tells of obstacles, so the own motion is not shuffled.
             sensed = jax.tree.map(lambda x: jnp.roll(x, shift, axis=0), seen.sensed)
             seen = dataclasses.replace(seen, sensed=sensed)
         own_keys = jax.vmap(partial(jax.random.fold_in, act_key))(number)
         action, memory = jax.vmap(partial(actor.act, params))(flying.memory, seen, own_keys)
         state, step = step_all(flying.state, action, number)
-        flights, clearance = jax.vmap(partial(_tally, config, world))(flying.flights, flying.state, step)
+        flights, clearance = jax.vmap(partial(_tally, config, env_params))(flying.flights, flying.state, step)
         return _Flying(
             state=state,
             observation=step.observation,
@@ -184,14 +186,14 @@ def _fly(program: _Program, world: World, params: Any, number: Array, keys: Arra
         )
 
     # The first iteration resets every environment: the observation and the action before it are not used.
-    state = jax.vmap(partial(task.begin, world))(keys, number)
+    state = jax.vmap(partial(task.begin, env_params))(keys, number)
     actions = jnp.zeros((missions, *action.shape), action.dtype)
     seen = jax.eval_shape(step_all, state, actions)[1].observation
     flying = _Flying(
         state=state,
         observation=jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), seen),
         memory=jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (missions, *leaf.shape)), first),
-        flights=jax.vmap(partial(_at_start, config, world))(state),
+        flights=jax.vmap(partial(_at_start, config, env_params))(state),
         record=_blank(config, missions, action) if program.record else None,
         decision=jnp.full((), -1),
         key=key,
@@ -201,18 +203,20 @@ def _fly(program: _Program, world: World, params: Any, number: Array, keys: Arra
     return dataclasses.replace(flying.flights, record=whole)
 
 
-def _at_start(config: Config, world: World, state: EnvState) -> Flights:
+def _at_start(config: Config, env_params: EnvParams, state: EnvState) -> Flights:
     """Returns the tallies of one flight before its first step."""
-    flights = at_start(config, scene_of(world, state.mission), state.drone)
-    return dataclasses.replace(flights, hit_drone=jnp.zeros((), bool)) if group.several(config) else flights
+    flights = at_start(config, scene_of(env_params, state.mission), state.drone)
+    return dataclasses.replace(flights, hit_drone=jnp.zeros((), bool)) if group.is_multi_drone(config) else flights
 
 
-def _tally(config: Config, world: World, flights: Flights, before: EnvState, step: Step) -> tuple[Flights, Array]:
+def _tally(
+    config: Config, env_params: EnvParams, flights: Flights, before: EnvState, step: Step
+) -> tuple[Flights, Array]:
     """Returns the tallies of one flight after a step, and the clearance [n] after each of its physics steps."""
     running = (flights.outcome == Outcome.RUNNING) & ~step.is_reset
-    scene = scene_of(world, before.mission, before.aim)
+    scene = scene_of(env_params, before.mission, before.aim)
     verdict = step.outcome, step.end_step, step.contact
-    after, clearance = tally(config, scene, flights, before.drone.position, step.flight, *verdict)
+    after, clearance = update_tallies(config, scene, flights, before.drone.position, step.flight, *verdict)
     after = dataclasses.replace(after, episode_return=step.episode_return, hit_drone=step.hit_drone)
     return jax.tree.map(lambda new, old: jnp.where(running, new, old), after, flights), clearance
 
@@ -230,7 +234,7 @@ def _action_of(config: Config, actor: Actor, params: Any) -> jax.ShapeDtypeStruc
     if action.shape != space.shape or not jnp.issubdtype(action.dtype, kind):
         wanted = "a move is a number from 0 to 26, [] int, a vector of three from -1, 0 and 1, or a name"
         if config.env.actions != "moves":
-            wanted = f"an action of '{config.env.actions}' is {described(space)}"
+            wanted = f"an action of '{config.env.actions}' is {describe_space(space)}"
         raise ConfigError(f"this policy's actions are {action.dtype}{list(action.shape)}; {wanted}")
     return action
 
@@ -252,7 +256,7 @@ def _blank(config: Config, missions: int, action: jax.ShapeDtypeStruct) -> Recor
 
 
 def _no_action(kind: Any) -> float | int:
-    """Returns what stands in a record in place of an action after a flight's end."""
+    """Returns the filler for actions in a record after a flight's end."""
     return -1 if jnp.issubdtype(kind, jnp.integer) else jnp.nan
 
 
@@ -267,12 +271,12 @@ def _write(flying: _Flying, action: Array, step: Step, clearance: Array) -> Reco
         return None
     running = (flying.flights.outcome == Outcome.RUNNING) & ~step.is_reset
     steps = jnp.arange(clearance.shape[1])[None]
-    flown = running[:, None] & (steps < step.end_step[:, None])
+    is_flown = running[:, None] & (steps < step.end_step[:, None])
     row = Record(
-        position=jnp.where(flown[..., None], step.flight.position, jnp.nan),
-        quaternion=jnp.where(flown[..., None], step.flight.quaternion, jnp.nan),
-        velocity=jnp.where(flown[..., None], step.flight.velocity, jnp.nan),
-        clearance=jnp.where(flown, clearance, jnp.nan),
+        position=jnp.where(is_flown[..., None], step.flight.position, jnp.nan),
+        quaternion=jnp.where(is_flown[..., None], step.flight.quaternion, jnp.nan),
+        velocity=jnp.where(is_flown[..., None], step.flight.velocity, jnp.nan),
+        clearance=jnp.where(is_flown, clearance, jnp.nan),
         action=_where(running, action, jnp.full_like(action, _no_action(action.dtype))),
         reward=jnp.where(running, step.reward, jnp.nan),
     )

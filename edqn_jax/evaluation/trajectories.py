@@ -37,7 +37,7 @@ def trajectory_columns(values: int | None = None) -> tuple[str, ...]:
     return (*TRAJECTORY_COLUMNS[:at], *(f"action_{n}" for n in range(values)), *TRAJECTORY_COLUMNS[at + 1 :])
 
 
-def trajectory(config: Config, flights: Flights, mission: int = 0) -> dict[str, np.ndarray]:
+def flight_trajectory(config: Config, flights: Flights, mission: int = 0) -> dict[str, np.ndarray]:
     """Returns one recorded flight as the columns of `trajectory.csv`, each [T], one row after each physics step.
 
     Raises:
@@ -103,13 +103,13 @@ def write_trajectories(config: Config, missions: MissionSet, flights: Flights, f
         ValueError: if the flights were not recorded.
     """
     record = flights.get_record()
-    flown = jax.tree.map(np.asarray, missions.world.missions)
-    heading = np.arctan2(*(flown.goal - flown.start)[:, 1::-1].T)
+    host_missions = jax.tree.map(np.asarray, missions.world.missions)
+    heading = np.arctan2(*(host_missions.goal - host_missions.start)[:, 1::-1].T)
     level = np.zeros_like(heading)
     facing = np.column_stack([np.cos(heading / 2), level, level, np.sin(heading / 2)])
     longest = int(np.max(flights.physics_steps))
     columns = {
-        "positions": np.concatenate([flown.start[:, None], record.position[:, :longest]], axis=1),
+        "positions": np.concatenate([host_missions.start[:, None], record.position[:, :longest]], axis=1),
         "attitudes": np.concatenate([facing[:, None], record.quaternion[:, :longest]], axis=1),
         "times": config.drone.physics_dt_s * np.arange(longest + 1),
         "lengths": flights.physics_steps + 1,
@@ -122,9 +122,9 @@ def write_trajectories(config: Config, missions: MissionSet, flights: Flights, f
         "closest_time": flights.closest.time,
         "closest_position": flights.closest.position,
         "closest_attitude": flights.closest.quaternion,
-        "scene": flown.scene,
-        "start": flown.start,
-        "goal": flown.goal,
+        "scene": host_missions.scene,
+        "start": host_missions.start,
+        "goal": host_missions.goal,
         "mjcf": np.array(missions.mjcf()),
         **({} if flights.hit_drone is None else {"hit_drone": flights.hit_drone}),
         "body_radius_m": np.float64(config.drone.body_radius_m),

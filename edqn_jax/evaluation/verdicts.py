@@ -8,7 +8,7 @@ import mujoco
 import numpy as np
 
 from edqn_jax.config import Config
-from edqn_jax.evaluation.judge import Judge, Target, Way, fastest, load_judge, replay_contact
+from edqn_jax.evaluation.judge import FlightTrack, MujocoWorld, Way, load_judge, max_obstacle_speed, replay_contact
 from edqn_jax.evaluation.missions import MissionSet
 from edqn_jax.sim.task.flights import Flights
 from edqn_jax.sim.task.outcomes import Outcome
@@ -55,28 +55,32 @@ def check_verdicts(config: Config, missions: MissionSet, flights: Flights) -> li
         ValueError: if the flights were not recorded.
     """
     judges = judges_of(config, missions)
-    flown = missions.world.missions
-    scenes, starts, goals = np.asarray(flown.scene), np.asarray(flown.start), np.asarray(flown.goal)
+    pool_missions = missions.world.missions
+    scenes, starts, goals = (
+        np.asarray(pool_missions.scene),
+        np.asarray(pool_missions.start),
+        np.asarray(pool_missions.goal),
+    )
     step_s, of_decision = config.drone.physics_dt_s, config.drone.physics_steps
     positions = np.asarray(flights.get_record().position)
     outcomes, steps = np.asarray(flights.outcome), np.asarray(flights.physics_steps)
     results = []
     for i, (scene, outcome, count) in enumerate(zip(scenes, outcomes, steps, strict=True)):
         path = np.concatenate([starts[i][None], positions[i, :count]]).astype(np.float64)
-        target = Target(starts[i], goals[i], path[::of_decision], step_s * of_decision)
+        target = FlightTrack(starts[i], goals[i], path[::of_decision], step_s * of_decision)
         contact = replay_contact(judges[scene], path, step_s, target)
         stated = count - 1 + float(flights.contact[i]) if outcome == Outcome.COLLISION else None
         found = None if contact is None else contact.segment + contact.fraction
         apart = None
         if stated is not None and found is not None:
-            way = Way(path, fastest(judges[scene], step_s * count) * step_s)
+            way = Way(path, max_obstacle_speed(judges[scene], step_s * count) * step_s)
             apart = abs(float(np.diff(np.interp([stated, found], np.arange(count + 1), way.travelled))[0]))
         touched = "" if contact is None else contact.geom
         results.append(Agreement(i, Outcome(int(outcome)), stated, found, apart, touched))
     return results
 
 
-def judges_of(config: Config, missions: MissionSet) -> list[Judge]:
+def judges_of(config: Config, missions: MissionSet) -> list[MujocoWorld]:
     """Returns the worlds of missions in C MuJoCo, each with a probe of the drone's radius."""
     radius, volumes = config.drone.body_radius_m, np.asarray(missions.world.pool.volume)
     specs = (mujoco.MjSpec.from_string(text) for text in missions.mjcf())

@@ -1,1 +1,1 @@
-"""The task as other libraries want it."""
+"""Interfaces to other libraries: environments, recordings, ONNX, tracking."""

@@ -26,7 +26,7 @@ class Drone:
 
 @struct.dataclass
 class Decided:
-    """What a decision comes to, as Gymnasium wants it; of many drones with a leading [N]."""
+    """Result of one decision in Gymnasium's terms; with a leading [N] for many drones."""
 
     observed: Any
     reward: Array
@@ -37,15 +37,15 @@ class Decided:
 
 @dataclasses.dataclass(frozen=True)
 class Program:
-    """What a compiled program depends on, beside its arrays."""
+    """Static arguments of a compiled program."""
 
     env: FunctionalEnv
-    world: Any  # structure of a `World`
+    world: Any  # structure of a `EnvParams`
     limit: int | None = None  # decisions after which an episode is cut, beside the task's own time-out
 
 
 Leaves = list[Array]
-"""Arrays of a `World`. JAX calls a compiled function in a quarter less time where no argument is a typed key or an
+"""Arrays of a `EnvParams`. JAX calls a compiled function in a quarter less time where no argument is a typed key or an
 object whose fields it has to ask for in Python; so worlds go in as lists, and keys as their data."""
 
 

@@ -12,7 +12,7 @@ from edqn_jax.errors import ConfigError
 from edqn_jax.evaluation.companions import scene_of_flight
 from edqn_jax.evaluation.missions import MissionSet, Point, load_missions
 from edqn_jax.evaluation.rollouts import fly_on_all_devices
-from edqn_jax.evaluation.trajectories import trajectory
+from edqn_jax.evaluation.trajectories import flight_trajectory
 from edqn_jax.files import EVENT_FILES, VIDEO, check_can_write, write_atomically
 from edqn_jax.learn.policy import Policy
 from edqn_jax.policies.functions import Function, FunctionPolicy, actor_of, as_policy, config_of
@@ -69,7 +69,7 @@ def record(
     policy = as_policy(policy, world)
     config = config_of(policy)
     # Of several drones the whole group is flown, and the first one's flight is shown.
-    own = config.world.name if group.several(config) else config.world.flown or config.world.name
+    own = config.world.name if group.is_multi_drone(config) else config.world.flown or config.world.name
     missions = load_missions(config, str(world or own), config.env.drones, seed, start, goal)
     if suffix in VIDEO:
         flights = _write_video(file, policy, config, missions, seed)
@@ -81,17 +81,17 @@ def record(
 def _write_video(
     file: Path, policy: Policy | FunctionPolicy, config: Config, missions: MissionSet, seed: int
 ) -> Flights:
-    from edqn_jax.report.animation import animate
-    from edqn_jax.report.sights import Sights
+    from edqn_jax.report.animation import animate_flight
+    from edqn_jax.report.sights import FlightRenderer
 
     scene = scene_of_flight(config, missions)
     with ThreadPoolExecutor(2, thread_name_prefix="compiling") as pool:
-        sights = Sights(config, scene, pool, decodes=isinstance(policy, Policy))
-        flights = _flown(policy, config, missions, seed)
+        sights = FlightRenderer(config, scene, pool, decodes=isinstance(policy, Policy))
+        flights = _fly_missions(policy, config, missions, seed)
         sights = sights.in_world(scene_of_flight(config, missions, flights))
         name = missions.name if missions.file is None else Path(missions.name).stem
-        flight, ended = trajectory(config, flights), _ending(flights)
-        video = animate(sights, policy.params, flight, ended, title=f"world '{name}'", form=file.suffix.lower())
+        flight, ended = flight_trajectory(config, flights), _ending(flights)
+        video = animate_flight(sights, policy.params, flight, ended, title=f"world '{name}'", form=file.suffix.lower())
     write_atomically(file, video)
     return flights
 
@@ -109,12 +109,12 @@ def _write_events(
 
     group.check_alone(config, "`edqn record` of events")
     check_can_write_events(file)
-    flights = _flown(policy, config, missions, seed)
-    write_events(file, flight_recording(config, missions.world, trajectory(config, flights), size))
+    flights = _fly_missions(policy, config, missions, seed)
+    write_events(file, flight_recording(config, missions.world, flight_trajectory(config, flights), size))
     return flights
 
 
-def _flown(policy: Policy | FunctionPolicy, config: Config, missions: MissionSet, seed: int) -> Flights:
+def _fly_missions(policy: Policy | FunctionPolicy, config: Config, missions: MissionSet, seed: int) -> Flights:
     actor = actor_of(policy, config)
     return fly_on_all_devices(config, missions.world, policy.params, seed, actor=actor, record=True)
 

@@ -33,7 +33,7 @@ from edqn_jax.sim.actions import Box, Discrete
 from edqn_jax.sim.environment import make as make_environment
 from edqn_jax.sim.sensors.sensor import sensor_of
 from edqn_jax.sim.task.action_sets import checked_action
-from edqn_jax.sim.task.env import EnvState, World
+from edqn_jax.sim.task.env import EnvParams, EnvState
 from edqn_jax.sim.task.observation import Observation
 from edqn_jax.sim.task.outcomes import Outcome, is_terminal
 from edqn_jax.sim.task.reward import Reward
@@ -56,7 +56,7 @@ Observed = Any
 class Params:
     """Arrays that an environment depends on; others of the same shapes need no new compilation."""
 
-    world: World
+    world: EnvParams
     encoder: EncoderParams  # {} unless codes are observed
 
 
@@ -102,7 +102,7 @@ class FunctionalEnv:
         if self.observation == "kinematics":
             return _box(own + motion)
         if self.observation == "code":
-            return _box(embedding.size(self.config) + own + motion)
+            return _box(embedding.embedding_size(self.config) + own + motion)
         image = jax.eval_shape(lambda: _image_of(self.config)).shape
         return {"image": _box(*image), "own": _box(own), "motion": _box(motion)}
 

@@ -28,7 +28,7 @@ from edqn_jax.config import Config
 from edqn_jax.devices.forks import check_not_forked, lacks_threads
 from edqn_jax.devices.jax_settings import as_tested
 from edqn_jax.errors import ConfigError
-from edqn_jax.extras import require
+from edqn_jax.extras import require_extra
 from edqn_jax.interop import functional
 from edqn_jax.interop.drone_programs import (
     Drone,
@@ -45,12 +45,12 @@ from edqn_jax.learn.perception.code import Params as EncoderParams
 from edqn_jax.learn.policy import Policy
 from edqn_jax.sim.actions import Box, Discrete
 from edqn_jax.sim.environment import Environment
-from edqn_jax.sim.task.action_sets import are_actions, described
+from edqn_jax.sim.task.action_sets import are_actions, describe_space
 from edqn_jax.sim.task.env import EnvState
 from edqn_jax.sim.task.outcomes import Outcome
 from edqn_jax.sim.task.reward import Reward
 
-gymnasium = require("gymnasium", extra="gym")
+gymnasium = require_extra("gymnasium", extra="gym")
 
 SEEDS = 2**32
 """Seeds that differ; larger ones begin again at 0."""
@@ -104,7 +104,7 @@ class _Task:
         space, numbers = self.env.action_space(self.params), np.asarray(given)
         if not are_actions(space, numbers, () if count is None else (count,)):
             wanted = "an action must be" if count is None else f"there must be {count} actions, each"
-            raise gymnasium.error.InvalidAction(f"{wanted} {described(space)}")
+            raise gymnasium.error.InvalidAction(f"{wanted} {describe_space(space)}")
         return numbers.astype(space.dtype)
 
     def mission(self, options: dict[str, Any] | None, count: int | None) -> Array | None:

@@ -22,7 +22,7 @@ from edqn_jax.errors import ConfigError
 from edqn_jax.interop.functional import Box, FunctionalEnv, Kind, Params
 from edqn_jax.learn.policy import Policy
 from edqn_jax.policies.functions import FunctionPolicy
-from edqn_jax.sim.task.action_sets import described
+from edqn_jax.sim.task.action_sets import describe_space
 from edqn_jax.sim.task.env import Observation
 
 
@@ -97,5 +97,5 @@ def _check_fits(model: Any, env: FunctionalEnv) -> None:
     if tuple(model.action_space.shape) != actions.shape or kind != _kind_of(actions.dtype):
         raise ConfigError(
             f"this model's actions are {np.dtype(kind)}{list(model.action_space.shape)}, and an action of "
-            f"'{env.config.env.actions}' is {described(actions)}; give `config` of its environment"
+            f"'{env.config.env.actions}' is {describe_space(actions)}; give `config` of its environment"
         )

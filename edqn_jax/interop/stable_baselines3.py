@@ -17,12 +17,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edqn_jax.errors import ConfigError
-from edqn_jax.extras import require
+from edqn_jax.extras import require_extra
 from edqn_jax.sim.task.outcomes import Outcome
 
-gymnasium = require("gymnasium", extra="gym")
-require("edqn_jax.interop.gymnasium", extra="gym")  # registers the names
-vec_env = require("stable_baselines3.common.vec_env", extra="bench")
+gymnasium = require_extra("gymnasium", extra="gym")
+require_extra("edqn_jax.interop.gymnasium", extra="gym")  # registers the names
+vec_env = require_extra("stable_baselines3.common.vec_env", extra="bench")
 
 
 class DroneVecEnv(vec_env.VecEnv):

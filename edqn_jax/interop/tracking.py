@@ -22,7 +22,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from edqn_jax.config import Config
-from edqn_jax.extras import SINKS, require
+from edqn_jax.extras import SINKS, require_extra
 from edqn_jax.report.solids import solids_of
 from edqn_jax.report.style import OUTCOME_COLOURS
 from edqn_jax.sim.task.outcomes import Outcome
@@ -91,7 +91,7 @@ class TensorBoard:
         Raises:
             MissingPackageError: if it is not installed.
         """
-        self._package, self._folder = require(*SINKS["tensorboard"]), Path(folder)
+        self._package, self._folder = require_extra(*SINKS["tensorboard"]), Path(folder)
         self._writer: Any = None
 
     def __call__(self, chunk: Chunk) -> None:
@@ -100,7 +100,7 @@ class TensorBoard:
         if self._writer is None:
             # What an interrupted run wrote after its last checkpoint is written once more: drop it.
             self._writer = self._package.SummaryWriter(str(self._folder), purge_step=step)
-        for name, value in numbers(chunk.metrics).items():
+        for name, value in numeric_metrics(chunk.metrics).items():
             self._writer.add_scalar(name, value, step)
         self._writer.flush()
 
@@ -124,7 +124,7 @@ class Wandb:
         Raises:
             MissingPackageError: if `wandb` is not installed.
         """
-        wandb = require(*SINKS["wandb"])
+        wandb = require_extra(*SINKS["wandb"])
         self._run = wandb.init(
             mode="offline",
             dir=str(folder),
@@ -139,7 +139,7 @@ class Wandb:
 
     def __call__(self, chunk: Chunk) -> None:
         """Logs the chunk's numbers at its decisions."""
-        self._run.log(numbers(chunk.metrics), step=chunk.metrics["decisions"])
+        self._run.log(numeric_metrics(chunk.metrics), step=chunk.metrics["decisions"])
 
     def close(self) -> None:
         """Ends the run."""
@@ -159,7 +159,7 @@ class Rerun:
         Raises:
             MissingPackageError: if `rerun-sdk` is not installed.
         """
-        self._rerun = rerun = require(*SINKS["rerun"])
+        self._rerun = rerun = require_extra(*SINKS["rerun"])
         self._stream = rerun.RecordingStream("edqn_jax")
         sinks = [rerun.FileSink(str(file))]
         if _has_screen() if spawn is None else spawn:
@@ -171,12 +171,12 @@ class Rerun:
     def __call__(self, chunk: Chunk) -> None:
         """Logs the chunk's numbers and, of a chunk with a validation, its flights."""
         self._stream.set_time("decisions", sequence=chunk.metrics["decisions"])
-        for name, value in numbers(chunk.metrics).items():
+        for name, value in numeric_metrics(chunk.metrics).items():
             self._stream.log(f"metrics/{name}", self._rerun.Scalars(value))
         if chunk.validation is not None:
-            self._draw(*chunk.validation)
+            self._log_flight(*chunk.validation)
 
-    def _draw(self, missions: Any, flights: Any) -> None:
+    def _log_flight(self, missions: Any, flights: Any) -> None:
         """Draws the world of the first mission, and the flights of all missions in it."""
         if not self._drawn:
             self._stream.log("world/solids", self._mesh(missions.scene(0)), static=True)
@@ -213,7 +213,7 @@ class Rerun:
         self._stream.disconnect()
 
 
-def numbers(metrics: Mapping[str, Any]) -> dict[str, float]:
+def numeric_metrics(metrics: Mapping[str, Any]) -> dict[str, float]:
     """Returns the numbers of a line of `metrics.jsonl` by their names, but for the decisions."""
     return {
         name: float(value)

@@ -41,7 +41,7 @@ class Actor(abc.ABC):
 
     @abc.abstractmethod
     def encode(self, params: Any, memory: Any, observation: Observation) -> Any:
-        """Returns what is to be decided on: the memory with a new observation in it."""
+        """Returns the memory with a new observation in it, the input of `decide`."""
 
     @abc.abstractmethod
     def decide(self, params: Any, seen: Any, key: Array) -> tuple[Array, Any]:
@@ -54,7 +54,7 @@ class Actor(abc.ABC):
 
 @struct.dataclass
 class PolicyParams:
-    """All that a policy knows."""
+    """Parameters of a policy: encoder and Q-network."""
 
     encoder: Params  # {} where nothing is encoded
     q: Params
@@ -67,7 +67,7 @@ def blank_observation(config: Config) -> Observation:
 
 def observation_size(config: Config) -> int:
     """Returns D, the length of what is seen, the last move where the Q-network sees it, and the own state."""
-    return embedding.size(config) + (MOVE_SIZE if config.agent.last_move else 0) + OWN_SIZE
+    return embedding.embedding_size(config) + (MOVE_SIZE if config.agent.last_move else 0) + OWN_SIZE
 
 
 @dataclasses.dataclass(frozen=True)
@@ -90,7 +90,7 @@ class AgentActor(Actor):
         return learner_of(self.config).decide(self.config, params.q, seen), seen
 
     def embed(self, params: PolicyParams, observation: Observation) -> Array | None:
-        """Returns what the network sees of what the sensor shows, [..., C]; None where that is nothing.
+        """Returns the embedding [..., C] of the sensor's output; None if there is no output.
 
         Args:
             params: of which the encoder is read.

@@ -20,12 +20,12 @@ from jax.experimental import checkify
 from edqn_jax.config import Config
 from edqn_jax.errors import CheckError
 from edqn_jax.learn.learner import learner_of
-from edqn_jax.learn.updates import flat
+from edqn_jax.learn.updates import merge_shards
 from edqn_jax.sim.actions import ACTIONS
-from edqn_jax.sim.task.env import EnvState, Step, World
+from edqn_jax.sim.task.env import EnvParams, EnvState, Step
 from edqn_jax.sim.task.task import task_of
 
-Run = Callable[[World, Any, Array], tuple[Any, Any]]
+Run = Callable[[EnvParams, Any, Array], tuple[Any, Any]]
 """A chunk: from world, train state and the numbers of its steps to the state and what it returns."""
 
 
@@ -37,7 +37,7 @@ def one_by_one(function: Callable[..., Any]) -> Callable[..., Any]:
 class CheckedChunk:
     """Runs chunks and raises at the first fault."""
 
-    def __init__(self, config: Config, run: Run, world: World, state: Any, steps: Array) -> None:
+    def __init__(self, config: Config, run: Run, env_params: EnvParams, state: Any, steps: Array) -> None:
         """Compiles.
 
         Args:
@@ -53,20 +53,20 @@ class CheckedChunk:
         trial = checkify.checkify(partial(_decide, config), errors=checkify.index_checks)
         try:
             with jax.debug_key_reuse(True):
-                self._run = jax.jit(checkify.checkify(run, errors=errors)).lower(world, state, steps).compile()
-                self._trial = jax.jit(trial).lower(world, state.actors.env).compile()
+                self._run = jax.jit(checkify.checkify(run, errors=errors)).lower(env_params, state, steps).compile()
+                self._trial = jax.jit(trial).lower(env_params, state.actors.env).compile()
         except jax.errors.KeyReuseError as reuse:
             raise CheckError(f"--debug: a random key is used twice: {_line(reuse)}") from reuse
 
-    def __call__(self, world: World, state: Any, steps: Array) -> tuple[Any, Any]:
+    def __call__(self, env_params: EnvParams, state: Any, steps: Array) -> tuple[Any, Any]:
         """Returns what the chunk returns.
 
         Raises:
             CheckError: names what is wrong, and where.
         """
         _check_shapes(self._config, state)
-        error, (after, found) = self._run(world, state, steps)
-        on_trial, _ = self._trial(world, after.actors.env)
+        error, (after, found) = self._run(env_params, state, steps)
+        on_trial, _ = self._trial(env_params, after.actors.env)
         first = f"in training steps {int(steps[0])} to {int(steps[-1])}"
         for failed in (error, on_trial):
             if (said := failed.get()) is not None:
@@ -75,12 +75,12 @@ class CheckedChunk:
         return after, found
 
 
-def _decide(config: Config, world: World, state: EnvState) -> Step:
+def _decide(config: Config, env_params: EnvParams, state: EnvState) -> Step:
     """Takes a decision of every environment [S, E], each with another move."""
-    state = jax.tree.map(flat, state)
+    state = jax.tree.map(merge_shards, state)
     count = state.decision.shape[0]
     moves = jnp.arange(count, dtype=jnp.int32) % len(ACTIONS)
-    return one_by_one(lambda state, move: task_of(config).step(world, state, move)[1])(state, moves)
+    return one_by_one(lambda state, move: task_of(config).step(env_params, state, move)[1])(state, moves)
 
 
 def _check_shapes(config: Config, state: Any) -> None:

@@ -13,7 +13,9 @@ from edqn_jax.learn.learner import Exploration, Metrics
 from edqn_jax.learn.qnetwork import Params, network_values
 
 
-def explore(config: Config, params: Params, memory: Array, keys: Array, progress: Exploration) -> tuple[Array, Metrics]:
+def epsilon_greedy_moves(
+    config: Config, params: Params, memory: Array, keys: Array, progress: Exploration
+) -> tuple[Array, Metrics]:
     """Returns epsilon-greedy moves [S, E] int32 of a Q-network, and epsilon.
 
     Args:
@@ -22,7 +24,7 @@ def explore(config: Config, params: Params, memory: Array, keys: Array, progress
         keys: [S] of the shards, consumed.
         progress: where the run stands.
     """
-    epsilon = exploration(config.agent, progress.decisions, progress.total, progress.episodes)
+    epsilon = exploration_rate(config.agent, progress.decisions, progress.total, progress.episodes)
     values = partial(network_values, config.agent, params)
     moves = jax.vmap(lambda m, k, e: epsilon_greedy(values(m), e, k))(memory, keys, epsilon)
     return moves, {"epsilon": jnp.mean(epsilon)}
@@ -30,12 +32,12 @@ def explore(config: Config, params: Params, memory: Array, keys: Array, progress
 
 def epsilon_greedy(q: Array, epsilon: Array, key: Array) -> Array:
     """Chooses the best action of `q` [..., A], or with probability `epsilon` [...] a random one: [...] int32."""
-    coin, draw = jax.random.uniform(key, (2, *q.shape[:-1]))
-    random = jnp.floor(draw * q.shape[-1])
+    coin, choice = jax.random.uniform(key, (2, *q.shape[:-1]))
+    random = jnp.floor(choice * q.shape[-1])
     return jnp.where(coin < epsilon, random, jnp.argmax(q, axis=-1)).astype(jnp.int32)
 
 
-def exploration(config: AgentConfig, decisions: Array, total: int, episodes: Array) -> Array:
+def exploration_rate(config: AgentConfig, decisions: Array, total: int, episodes: Array) -> Array:
     """Returns epsilon [...]: random at first, then falling linearly.
 
     Args:

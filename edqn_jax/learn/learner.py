@@ -1,4 +1,4 @@
-"""The contract of a learner: what the training step asks of whatever learns to choose moves.
+"""The contract of a learner: the pure functions that the training step calls.
 
 A learner is a bag of pure functions, named in `agent.learner` and found in `config.registry.LEARNERS`:
 
@@ -35,7 +35,7 @@ Metrics = dict[str, Array]
 
 
 class Exploration(NamedTuple):
-    """Where a run stands, for what depends on its progress."""
+    """Progress of a run, for schedules."""
 
     decisions: Array  # [] int32, of all environments since the learner began
     total: int  # decisions that it will have
@@ -43,7 +43,7 @@ class Exploration(NamedTuple):
 
 
 class Rings(NamedTuple):
-    """What an update reads."""
+    """Inputs of an update."""
 
     rows: replay.Rows  # [S, L, E, ...] the shards of this device
     time: Array  # [] int32, of the newest row, counted since the rings began
@@ -52,7 +52,7 @@ class Rings(NamedTuple):
 
 @struct.dataclass
 class UpdateStats:
-    """What the updates of one network in one training step come to."""
+    """Mean loss, metrics and counts of non-finite updates of one network in one training step."""
 
     metrics: Metrics
     ill_losses: Array
@@ -61,12 +61,12 @@ class UpdateStats:
     """[] int32 updates whose gradient was not finite, which were skipped."""
 
     @classmethod
-    def none(cls, *names: str) -> UpdateStats:
+    def without_updates(cls, *names: str) -> UpdateStats:
         """Returns the statistics of a step without updates, with these metrics."""
         return cls({name: jnp.float32(jnp.nan) for name in names}, jnp.int32(0), jnp.int32(0))
 
     @classmethod
-    def of(cls, loss: Array, metrics: Metrics, gradient_is_finite: Array) -> UpdateStats:
+    def from_updates(cls, loss: Array, metrics: Metrics, gradient_is_finite: Array) -> UpdateStats:
         """Returns the statistics of updates [U]; metrics [U] are averaged over those with a finite loss."""
         finite = jnp.isfinite(loss)
         count = jnp.sum(finite)

@@ -27,7 +27,7 @@ def fresh_policy(config: Config, seed: int = 0) -> PolicyParams:
     encoder_key, agent_key = jax.random.split(jax.random.key(seed))
     learner = learner_of(config)
     return PolicyParams(
-        encoder=embedding.acting(config, embedding.init(config, encoder_key)),
+        encoder=embedding.inference_params(config, embedding.init_params(config, encoder_key)),
         q=learner.policy(learner.init(config, agent_key)),
     )
 
@@ -121,8 +121,8 @@ def _described(kind: tuple[Any, float | None]) -> str:
 
 @functools.partial(jax.jit, static_argnums=0)
 def _depth(config: Config, params: Params, code: Array) -> Array:
-    drawn = vae.decode(config.encoder, config.camera, params, code)[..., -1, :, :]
-    return distance_of(drawn / DEPTH_SCALE)
+    decoded = vae.decode(config.encoder, config.camera, params, code)[..., -1, :, :]
+    return distance_of(decoded / DEPTH_SCALE)
 
 
 @functools.partial(jax.jit, static_argnums=0)

@@ -86,7 +86,7 @@ def greedy_moves(config: AgentConfig, params: Params, memory: Array) -> Array:
     return jnp.argmax(network_values(config, params, memory), axis=-1).astype(jnp.int32)
 
 
-def optimiser(config: AgentConfig, updates: int) -> optax.GradientTransformation:
+def make_optimiser(config: AgentConfig, updates: int) -> optax.GradientTransformation:
     """Returns Adam with a clipped global norm and a step size that falls linearly over `updates`."""
     rate = optax.linear_schedule(config.learning_rate, config.final_learning_rate, max(updates, 1))
     return optax.flatten(optax.chain(optax.clip_by_global_norm(config.max_gradient_norm), optax.adam(rate)))
@@ -97,6 +97,6 @@ def skip_nonfinite(optimiser: optax.GradientTransformation) -> optax.GradientTra
     return optax.apply_if_finite(optimiser, max_consecutive_errors=2**31 - 1)
 
 
-def polyak(new: Params, old: Params, rate: float) -> Params:
+def polyak_update(new: Params, old: Params, rate: float) -> Params:
     """Returns old + rate (new - old), leaf by leaf: the target network's soft update, tau of Table 1."""
     return optax.incremental_update(new, old, rate)

@@ -20,7 +20,7 @@ from jax import Array
 
 from edqn_jax.checks import check_index
 from edqn_jax.config import AgentConfig
-from edqn_jax.keys import integers
+from edqn_jax.keys import uniform_integers
 from edqn_jax.sim.task.outcomes import Outcome
 from edqn_jax.sim.task.task import Task
 
@@ -48,7 +48,7 @@ class Batch:
     weight: Array  # [B] 1 for a sample, 0 for a row that starts nothing (an episode's last) or led to a divergence
 
 
-def empty(length: int, envs: int, observation_size: int) -> Rows:
+def empty_ring(length: int, envs: int, observation_size: int) -> Rows:
     """Returns a ring of `length` decisions of the `envs` environments of one shard."""
     return Rows(
         observation=jnp.zeros((length, envs, observation_size)),
@@ -64,13 +64,13 @@ def ring_length(config: AgentConfig, total_envs: int) -> int:
     return max(config.replay_size // total_envs, config.n_step + config.history + 1)
 
 
-def write(ring: Rows, rows: Rows, time: Array) -> Rows:
+def store_decision(ring: Rows, rows: Rows, time: Array) -> Rows:
     """Stores one decision; `time` [] int32 counts decisions since the replay began, from 0."""
     at = time % ring.reward.shape[0]
     return jax.tree.map(lambda old, new: old.at[at].set(new.astype(old.dtype)), ring, rows)
 
 
-def stacked(rows: Array, is_reset: Array) -> Array:
+def stack_observations(rows: Array, is_reset: Array) -> Array:
     """Returns observations [H, D] in time order with those of earlier episodes zeroed; `is_reset` [H]."""
     # An observation belongs to the newest one's episode if no reset comes after it.
     later = jnp.cumsum(is_reset[::-1].astype(jnp.int32))[::-1]
@@ -78,12 +78,14 @@ def stacked(rows: Array, is_reset: Array) -> Array:
     return jnp.where((after == 0)[:, None], rows, 0.0)
 
 
-def sample(config: AgentConfig, ring: Rows, time: Array, batch: int, key: Array, task: Task | None = None) -> Batch:
+def sample_transitions(
+    config: AgentConfig, ring: Rows, time: Array, batch: int, key: Array, task: Task | None = None
+) -> Batch:
     """Draws B = `batch` transitions of one shard, uniform over the rows that can start one.
 
     Args:
         ring: [L, E, ...].
-        time: the newest row's, as in `write`.
+        time: the newest row's, as in `store_decision`.
         key: consumed.
         task: that was flown; None will do where `config.turn` is off.
     """
@@ -91,17 +93,17 @@ def sample(config: AgentConfig, ring: Rows, time: Array, batch: int, key: Array,
     n, h = config.n_step, config.history
     age_key, env_key, *more = jax.random.split(key, 3 if config.turn else 2)
     oldest = jnp.minimum(time + 1, length) - h
-    age = n + integers(age_key, (batch,), jnp.maximum(oldest, n) - n + 1)
-    env = integers(env_key, (batch,), envs)
+    age = n + uniform_integers(age_key, (batch,), jnp.maximum(oldest, n) - n + 1)
+    env = uniform_integers(env_key, (batch,), envs)
     check_index(env, envs, "the replay's environments")
     check_index(age - n, oldest - n + 1, "the decisions that can start a transition")
-    drawn = jax.vmap(lambda a, e: _transition(config, ring, time - a, e))(age, env)
+    transitions = jax.vmap(lambda a, e: _transition(config, ring, time - a, e))(age, env)
     if not config.turn:
-        return drawn
-    quarters = jnp.broadcast_to(integers(more[0], (batch, 1), 4), (batch, h))
+        return transitions
+    quarters = jnp.broadcast_to(uniform_integers(more[0], (batch, 1), 4), (batch, h))
     assert task is not None
-    history, next_history = (_turned(task, each, quarters) for each in (drawn.history, drawn.next_history))
-    return dataclasses.replace(drawn, history=history, next_history=next_history)
+    history, next_history = (_turned(task, each, quarters) for each in (transitions.history, transitions.next_history))
+    return dataclasses.replace(transitions, history=history, next_history=next_history)
 
 
 def _turned(task: Task, history: Array, quarters: Array) -> Array:
@@ -112,7 +114,7 @@ def _turned(task: Task, history: Array, quarters: Array) -> Array:
 
 
 def _transition(config: AgentConfig, ring: Rows, start: Array, env: Array) -> Batch:
-    """Returns the n-step transition that begins at row `start` (counted like `write`'s time) of one environment."""
+    """Returns the n-step transition that begins at row `start` of one environment, counted as in `store_decision`."""
     length = ring.reward.shape[0]
     n, h = config.n_step, config.history
     # Rows start-h+1 .. start+n; the last n are what the start's action led to.
@@ -126,12 +128,12 @@ def _transition(config: AgentConfig, ring: Rows, start: Array, env: Array) -> Ba
     observations = ring.observation[at, env]
     newest = jax.lax.dynamic_slice_in_dim
     return Batch(
-        history=stacked(observations[:h], resets[:h]),
+        history=stack_observations(observations[:h], resets[:h]),
         action=ring.action[at[h - 1], env].astype(jnp.int32),
         returns=jnp.sum(running * discounts * rewards[h:]),
         discount=jnp.where(terminal, 0.0, config.discount**steps),
-        next_history=stacked(newest(observations, steps, h), newest(resets, steps, h)),
-        # Of what diverged, nobody knows where the action led to.
+        next_history=stack_observations(newest(observations, steps, h), newest(resets, steps, h)),
+        # Diverged transitions get weight 0.
         weight=((outcomes[h - 1] == Outcome.RUNNING) & (outcomes[h + steps - 1] != Outcome.DIVERGED)).astype(
             jnp.float32
         ),

@@ -20,7 +20,7 @@ from jax import Array
 
 from edqn_jax.checks import check_index
 from edqn_jax.config import EncoderConfig
-from edqn_jax.keys import integers
+from edqn_jax.keys import uniform_integers
 from edqn_jax.learn.perception import vae
 from edqn_jax.learn.perception.vae import Target
 from edqn_jax.sim.sensors.events import EventField
@@ -28,7 +28,7 @@ from edqn_jax.sim.sensors.sensor import flip_left_right
 from edqn_jax.sim.task.observation import Observation
 from edqn_jax.sim.task.task import Task
 
-MOST_EVENTS = 2**15 - 1
+MAX_EVENTS = 2**15 - 1
 """More events of a pixel than this are stored as this many."""
 
 
@@ -44,7 +44,7 @@ class Counts:
 
 @struct.dataclass
 class Samples:
-    """What a VAE update is given, or a ring of it with leading [L, E]."""
+    """Inputs of a VAE update, or a ring of them with leading [L, E]."""
 
     sensed: Counts | EventField | Array  # a picture is an array
     motion: Array  # [..., MOTION_SIZE]
@@ -58,7 +58,7 @@ def samples_of(config: EncoderConfig, observation: Observation, wanted: Target) 
     return Samples(_stored(config, sensed), observation.motion, wanted)
 
 
-def empty(config: EncoderConfig, one: Samples, envs: int, total_envs: int) -> Samples:
+def empty_ring(config: EncoderConfig, one: Samples, envs: int, total_envs: int) -> Samples:
     """Returns a ring for one shard's `envs` of `total_envs` environments, like `one` sample, which may be a shape.
 
     Its last row is not part of the ring: what must not be kept is written there.
@@ -72,7 +72,7 @@ def ring_length(config: EncoderConfig, total_envs: int) -> int:
     return max(config.replay_size // total_envs, 1)
 
 
-def write(ring: Samples, rows: Samples, time: Array, keep: Array) -> Samples:
+def store_samples(ring: Samples, rows: Samples, time: Array, keep: Array) -> Samples:
     """Returns the ring with the samples [E, ...] of one decision.
 
     Args:
@@ -84,7 +84,7 @@ def write(ring: Samples, rows: Samples, time: Array, keep: Array) -> Samples:
     return jax.tree.map(lambda old, new: old.at[at].set(new), ring, rows)
 
 
-def draw(
+def sample_batch(
     config: EncoderConfig,
     ring: Samples,
     time: Array,
@@ -104,25 +104,27 @@ def draw(
     rows, envs = ring.motion.shape[:2]
     row_key, env_key, *coin_key = jax.random.split(key, 2 + count % 2)
     oldest = jnp.maximum(time - (rows - 1), 0)
-    row = (oldest + integers(row_key, (count,), time - oldest)) % (rows - 1)
-    env = integers(env_key, (count,), envs)
+    row = (oldest + uniform_integers(row_key, (count,), time - oldest)) % (rows - 1)
+    env = uniform_integers(env_key, (count,), envs)
     check_index(env, envs, "the samples' environments")
     check_index(row, jnp.minimum(time, rows - 1), "the samples that have been kept")
-    drawn = jax.tree.map(lambda leaf: leaf[row, env], ring)
+    batch = jax.tree.map(lambda leaf: leaf[row, env], ring)
     if not config.mirror:
-        return drawn
+        return batch
     assert task is not None and task.mirror is not None
     # Half of them; of an odd number the one in the middle is mirrored or not.
     half = count // 2
-    reflected = mirrored(drawn, task.mirror, mirror)
+    reflected = mirror_samples(batch, task.mirror, mirror)
     turned = jax.tree.map(lambda leaf: leaf[: half + 1 if coin_key else half], reflected)
     if coin_key:
         middle = jax.random.bernoulli(*coin_key)
-        turned = jax.tree.map(lambda new, old: new.at[half].set(jnp.where(middle, new[half], old[half])), turned, drawn)
-    return jax.tree.map(lambda new, old: jnp.concatenate([new, old[len(new) :]]), turned, drawn)
+        turned = jax.tree.map(lambda new, old: new.at[half].set(jnp.where(middle, new[half], old[half])), turned, batch)
+    return jax.tree.map(lambda new, old: jnp.concatenate([new, old[len(new) :]]), turned, batch)
 
 
-def mirrored(samples: Samples, factors: Sequence[float], mirror: Callable[[Array], Array] = flip_left_right) -> Samples:
+def mirror_samples(
+    samples: Samples, factors: Sequence[float], mirror: Callable[[Array], Array] = flip_left_right
+) -> Samples:
     """Returns samples [...] as they would be with left and right exchanged.
 
     Args:
@@ -139,8 +141,8 @@ def mirrored(samples: Samples, factors: Sequence[float], mirror: Callable[[Array
     )
 
 
-def read(samples: Samples) -> EventField | Array:
-    """Returns what the sensor showed in samples, as the encoder takes it."""
+def to_encoder_input(samples: Samples) -> EventField | Array:
+    """Returns the sensor's output in samples, as the encoder's input."""
     stored = samples.sensed
     if not isinstance(stored, Counts):
         return stored
@@ -152,7 +154,7 @@ def read(samples: Samples) -> EventField | Array:
 def _stored(config: EncoderConfig, sensed: EventField | Array) -> Counts | EventField | Array:
     if not isinstance(sensed, EventField) or not _counts_alone(config, sensed):
         return sensed
-    signed = (jnp.minimum(sensed.count, MOST_EVENTS) * sensed.polarity).astype(jnp.int16)
+    signed = (jnp.minimum(sensed.count, MAX_EVENTS) * sensed.polarity).astype(jnp.int16)
     return Counts(signed, sensed.window_s, sensed.divides_window, sensed.with_noise)
 
 
@@ -162,6 +164,6 @@ def _counts_alone(config: EncoderConfig, field: EventField) -> bool:
 
 
 def target_of(config: EncoderConfig, observation: Observation, nearness: Array | None) -> Target:
-    """Returns what the decoder must draw of observations, without a unit, see `vae.target`."""
+    """Returns the decoder's target for observations, without a unit, see `vae.decoder_target`."""
     assert isinstance(observation.sensed, EventField | Array)
-    return vae.in_waves(config, vae.target(config, observation.sensed, nearness))
+    return vae.in_waves(config, vae.decoder_target(config, observation.sensed, nearness))

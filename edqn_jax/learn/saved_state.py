@@ -23,25 +23,30 @@ Shape = tuple[tuple[int, ...], str]
 """Shape and type of an array on the host."""
 
 
-def needed(trainer: Trainer, state: TrainState, done: int) -> TrainState:
+def drop_spent_samples(trainer: Trainer, state: TrainState, done: int) -> TrainState:
     """Returns the state after `done` steps without the VAE's samples if the VAE never learns again."""
-    if trainer.plan.reads_samples(trainer.config, done):
+    if trainer.schedule.reads_samples(trainer.config, done):
         return state
     return dataclasses.replace(state, actors=dataclasses.replace(state.actors, samples=None))
 
 
 def to_host(trainer: Trainer, state: TrainState, done: int) -> dict[str, np.ndarray]:
     """Returns the arrays of the state after `done` steps; every process must call this."""
-    return {name: processes.fetch(_plain(leaf)) for name, leaf in _named(needed(trainer, state, done)).items()}
+    return {
+        name: processes.fetch_global(_plain(leaf))
+        for name, leaf in _named(drop_spent_samples(trainer, state, done)).items()
+    }
 
 
-def expected(trainer: Trainer, done: int) -> dict[str, Shape]:
+def state_shapes(trainer: Trainer, done: int) -> dict[str, Shape]:
     """Returns the names, shapes and types of the arrays of a state after `done` steps."""
-    shapes = jax.eval_shape(lambda state: jax.tree.map(_plain, state), needed(trainer, trainer.shapes(), done))
+    shapes = jax.eval_shape(
+        lambda state: jax.tree.map(_plain, state), drop_spent_samples(trainer, trainer.shapes(), done)
+    )
     return {name: (leaf.shape, str(leaf.dtype)) for name, leaf in _named(shapes).items()}
 
 
-def check(found: Mapping[str, Shape], wanted: Mapping[str, Shape]) -> None:
+def check_shapes(found: Mapping[str, Shape], wanted: Mapping[str, Shape]) -> None:
     """Raises unless a saved state has the arrays that a run needs.
 
     Raises:
@@ -57,7 +62,7 @@ def check(found: Mapping[str, Shape], wanted: Mapping[str, Shape]) -> None:
 
 
 def from_host(trainer: Trainer, arrays: Mapping[str, np.ndarray]) -> TrainState:
-    """Returns the state of arrays with the names, shapes and types that `expected` gives, laid out over the devices."""
+    """Returns the state of arrays as `state_shapes` describes them, laid out over the devices."""
 
     def placed(path: Any, leaf: jax.ShapeDtypeStruct) -> Array:
         found = arrays.get(jax.tree_util.keystr(path))

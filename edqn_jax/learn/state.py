@@ -22,7 +22,7 @@ from edqn_jax.learn.perception import embedding
 from edqn_jax.learn.samples import Samples
 from edqn_jax.learn.updates import Networks, init_networks
 from edqn_jax.sim.task import group
-from edqn_jax.sim.task.env import EnvState, World
+from edqn_jax.sim.task.env import EnvParams, EnvState
 from edqn_jax.sim.task.outcomes import Outcome
 from edqn_jax.sim.task.task import task_of
 
@@ -57,7 +57,7 @@ class TrainState:
 
 @struct.dataclass
 class Episodes:
-    """What ended in each training step: [S, E]; an environment that goes on has outcome RUNNING."""
+    """Episodes that ended in each training step: [S, E]; other environments have outcome RUNNING."""
 
     outcome: Array
     length: Array
@@ -91,7 +91,7 @@ class Losses:
 
 
 class InitialKeys(NamedTuple):
-    """What the key of a run's learning is split into."""
+    """Keys split from the key of a run's learning."""
 
     learner: Array
     environments: Array  # [N] by the environment's global number
@@ -108,15 +108,15 @@ class InitialKeys(NamedTuple):
         )
 
 
-def init(config: Config, world: World, key: Array) -> TrainState:
+def init_state(config: Config, env_params: EnvParams, key: Array) -> TrainState:
     """Returns the state before the first step; a pure function of the key, so `vmap` maps it over seeds."""
     shards, envs = config.train.shards, config.train.num_envs
     keys = InitialKeys.split(key, envs, shards)
     # Nothing has been seen yet: the first step is every environment's reset.
     task = task_of(config)
-    state = task.map(lambda k: task.begin(world, k, None))(keys.environments)
+    state = task.map(lambda k: task.begin(env_params, k, None))(keys.environments)
     networks, memory = init_networks(config, keys.learner), AgentActor(config).init()
-    ring = replay.empty(learner_of(config).ring_length(config), envs // shards, observation_size(config))
+    ring = replay.empty_ring(learner_of(config).ring_length(config), envs // shards, observation_size(config))
     whole = Actors(
         env=state,
         memory=jnp.broadcast_to(memory, (envs, *memory.shape)),
@@ -131,29 +131,29 @@ def init(config: Config, world: World, key: Array) -> TrainState:
     )
     actors = jax.tree.map(lambda x: x.reshape(shards, envs // shards, *x.shape[1:]), whole).replace(
         replay=jax.tree.map(lambda x: jnp.broadcast_to(x, (shards, *x.shape)), ring),
-        samples=_empty_samples(config, world, state),
+        samples=_empty_samples(config, env_params, state),
         key=keys.shards,
     )
     return TrainState(actors=actors, learner=networks, step=jnp.zeros((), jnp.int32))
 
 
-def _empty_samples(config: Config, world: World, state: EnvState) -> Samples | None:
+def _empty_samples(config: Config, env_params: EnvParams, state: EnvState) -> Samples | None:
     """Returns the rings [S, L, E, ...] of what the VAE learns from; None where there is no VAE."""
     if not embedding.has_code(config):
         return None
     task, shards, envs = task_of(config), config.train.shards, config.train.num_envs
 
     def one(state: EnvState) -> Samples:
-        step = task.step(world, state, task.still)[1]
+        step = task.step(env_params, state, task.still)[1]
         observation = embedding.as_encoder_input(config, step.observation)
-        near = None if task.label is None else task.label(world, state)
+        near = None if task.label is None else task.label(env_params, state)
         wanted = samples.target_of(config.encoder, observation, near)
         return samples.samples_of(config.encoder, observation, wanted)
 
-    if group.several(config):
+    if group.is_multi_drone(config):
         whole = jax.eval_shape(task.map(one), state)
         shapes = jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape[1:], x.dtype), whole)
     else:
         shapes = jax.eval_shape(one, jax.tree.map(lambda x: x[0], state))
-    ring = samples.empty(config.encoder, shapes, envs // shards, envs)
+    ring = samples.empty_ring(config.encoder, shapes, envs // shards, envs)
     return jax.tree.map(lambda x: jnp.broadcast_to(x, (shards, *x.shape)), ring)

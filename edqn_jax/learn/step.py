@@ -21,20 +21,20 @@ from edqn_jax.learn.actor import AgentActor, PolicyParams
 from edqn_jax.learn.checked import one_by_one
 from edqn_jax.learn.learner import Exploration, Metrics, Rings, learner_of
 from edqn_jax.learn.perception import embedding, vae
-from edqn_jax.learn.plan import Plan
 from edqn_jax.learn.samples import Samples
+from edqn_jax.learn.schedule import Schedule
 from edqn_jax.learn.state import NO_START, Actors, Episodes, Health, Losses, TrainState
-from edqn_jax.learn.updates import Networks, flat, update_vae
+from edqn_jax.learn.updates import Networks, merge_shards, update_vae
 from edqn_jax.native.all_sum import all_sum
 from edqn_jax.sim.actions import Discrete
 from edqn_jax.sim.task import group
-from edqn_jax.sim.task.env import EnvState, Step, World
+from edqn_jax.sim.task.env import EnvParams, EnvState, Step
 from edqn_jax.sim.task.outcomes import Outcome
 from edqn_jax.sim.task.task import task_of
 
 
 class ShardKeys(NamedTuple):
-    """What the keys [S] of the shards are split into in each step; every one is consumed."""
+    """Keys split from those of the shards [S] in each step; each is consumed."""
 
     act: Array
     manoeuvre: Array
@@ -50,7 +50,7 @@ class ShardKeys(NamedTuple):
 
 
 def train_step(
-    config: Config, world: World, axis: str | None, state: TrainState, step: Array
+    config: Config, env_params: EnvParams, axis: str | None, state: TrainState, step: Array
 ) -> tuple[TrainState, tuple[Episodes, Losses]]:
     """Takes one decision in every environment, and learns (Algorithm 1).
 
@@ -58,42 +58,44 @@ def train_step(
         axis: name of the mesh axis over which the shards of `state.actors` are spread; None on one device.
         step: [] int32, the number of this step from 0; steers the phases.
     """
-    plan, actors, networks = Plan.of(config), state.actors, state.learner
+    schedule, actors, networks = Schedule.from_config(config), state.actors, state.learner
     keys = ShardKeys.split(actors.key)
-    warming = step < plan.warmup
-    time = plan.replay_time(step)
+    in_warmup = step < schedule.warmup
+    time = schedule.replay_time(step)
 
-    action, manoeuvre, acted = _act(config, networks, actors, keys, jnp.maximum(step - plan.warmup, 0), warming)
+    action, manoeuvre, acted = _act(config, networks, actors, keys, jnp.maximum(step - schedule.warmup, 0), in_warmup)
     ring = _store(actors, action, time)
-    flown, seen = _fly(config, world, actors, action)
-    rings = _keep(config, world, actors, flown, seen, step)
-    spoilt = ~is_finite((networks.vae, networks.encoder, learner_of(config).network(networks.agent)))
+    env_state, timestep = _fly(config, env_params, actors, action)
+    rings = _store_samples(config, env_params, actors, env_state, timestep, step)
+    params_nonfinite = ~is_finite((networks.vae, networks.encoder, learner_of(config).network(networks.agent)))
     of_vae, networks = update_vae(config, axis, networks, rings, keys.vae, step)
     last = of_vae.metrics["reconstruction_loss"]
     of_agent, agent = learner_of(config).update(config, axis, networks.agent, Rings(ring, time, keys.dqn), last)
-    networks = _publish(config, dataclasses.replace(networks, agent=agent), step)
-    memory = _remember(config, networks, actors, seen, step)
+    networks = _refresh_acting_encoder(config, dataclasses.replace(networks, agent=agent), step)
+    memory = _encode_observations(config, networks, actors, timestep, step)
 
     shaped = partial(_shaped, actors.reward.shape)
-    outcome, reward = shaped(seen.outcome), shaped(seen.reward)
+    outcome, reward = shaped(timestep.outcome), shaped(timestep.reward)
     actors = Actors(
-        env=shaped(flown),
+        env=shaped(env_state),
         memory=shaped(memory),
         reward=reward,
-        outcome=outcome if seen.waits is None else jnp.where(shaped(seen.waits), NO_START, outcome),
-        is_reset=shaped(seen.is_reset),
+        outcome=outcome if timestep.waits is None else jnp.where(shaped(timestep.waits), NO_START, outcome),
+        is_reset=shaped(timestep.is_reset),
         manoeuvre=manoeuvre,
-        episodes=actors.episodes + ((outcome != Outcome.RUNNING) & ~warming),
+        episodes=actors.episodes + ((outcome != Outcome.RUNNING) & ~in_warmup),
         replay=ring,
         samples=rings,
         key=keys.next,
     )
-    episodes = Episodes(outcome=outcome, length=shaped(seen.episode_length), episode_return=shaped(seen.episode_return))
+    episodes = Episodes(
+        outcome=outcome, length=shaped(timestep.episode_length), episode_return=shaped(timestep.episode_return)
+    )
     part = outcome.shape[0] / config.train.shards  # of all shards, on this device
     means, broken = all_sum(
         (
-            {name: jnp.where(warming, jnp.nan, value * part) for name, value in acted.items()},
-            {name: jnp.sum(getattr(seen.broken, name), dtype=jnp.int32) for name in _OF_A_DECISION},
+            {name: jnp.where(in_warmup, jnp.nan, value * part) for name, value in acted.items()},
+            {name: jnp.sum(getattr(timestep.broken, name), dtype=jnp.int32) for name in _STEP_COUNTERS},
         ),
         axis,
         after=next(iter(of_agent.metrics.values()), last),
@@ -102,7 +104,7 @@ def train_step(
         metrics={**of_agent.metrics, **of_vae.metrics, **means},
         health=Health(
             **broken,
-            parameters=spoilt.astype(jnp.int32),
+            parameters=params_nonfinite.astype(jnp.int32),
             loss=of_agent.ill_losses + of_vae.ill_losses,
             gradient=of_agent.ill_gradients + of_vae.ill_gradients,
         ),
@@ -110,7 +112,7 @@ def train_step(
     return TrainState(actors=actors, learner=networks, step=step + 1), (episodes, losses)
 
 
-_OF_A_DECISION = ("physics_state", "observation", "reward")
+_STEP_COUNTERS = ("physics_state", "observation", "reward")
 
 
 def _act(
@@ -121,15 +123,15 @@ def _act(
     Returns:
         action, the held manoeuvres, each [S, E], and the learner's metrics.
     """
-    plan, envs = Plan.of(config), config.train.num_envs
-    progress = Exploration(time * envs, (plan.scheduled - plan.warmup) * envs, actors.episodes)
+    schedule, envs = Schedule.from_config(config), config.train.num_envs
+    progress = Exploration(time * envs, (schedule.scheduled - schedule.warmup) * envs, actors.episodes)
     chosen, metrics = learner_of(config).act(config, networks.agent, actors.memory, keys.act, progress)
-    manoeuvre = jax.vmap(partial(_manoeuvre, config))(actors.manoeuvre, keys.manoeuvre)
+    manoeuvre = jax.vmap(partial(_held_moves, config))(actors.manoeuvre, keys.manoeuvre)
     return jnp.where(warming, manoeuvre, chosen), manoeuvre, metrics
 
 
 def _store(actors: Actors, action: Array, time: Array) -> replay.Rows:
-    """Returns the replay with where every environment is and what it does there."""
+    """Returns the replay with every environment's observation and action."""
     rows = replay.Rows(
         observation=actors.memory[..., -1, :],
         reward=actors.reward,
@@ -137,21 +139,21 @@ def _store(actors: Actors, action: Array, time: Array) -> replay.Rows:
         is_reset=actors.is_reset,
         action=action,
     )
-    return jax.vmap(replay.write, in_axes=(0, 0, None))(actors.replay, rows, time)
+    return jax.vmap(replay.store_decision, in_axes=(0, 0, None))(actors.replay, rows, time)
 
 
-def _fly(config: Config, world: World, actors: Actors, action: Array) -> tuple[EnvState, Step]:
+def _fly(config: Config, env_params: EnvParams, actors: Actors, action: Array) -> tuple[EnvState, Step]:
     """Steps all environments, [S * E, ...]."""
     task = task_of(config)
     each = one_by_one if config.train.debug else task.map
-    return each(lambda s, a: task.step(world, s, a))(jax.tree.map(flat, actors.env), flat(action))
+    return each(lambda s, a: task.step(env_params, s, a))(jax.tree.map(merge_shards, actors.env), merge_shards(action))
 
 
-def _remember(config: Config, networks: Networks, actors: Actors, seen: Step, step: Array) -> Array:
+def _encode_observations(config: Config, networks: Networks, actors: Actors, timestep: Step, step: Array) -> Array:
     """Returns memories [S * E, H, D] with the new observations, encoded once; new episodes or encoders begin empty."""
-    forget = seen.is_reset | Plan.of(config).replaces_encoder(step)
-    memory = jnp.where(forget[:, None, None], 0.0, flat(actors.memory))
-    return AgentActor(config).encode(_acting(config, networks), memory, seen.observation)
+    forget = timestep.is_reset | Schedule.from_config(config).replaces_encoder(step)
+    memory = jnp.where(forget[:, None, None], 0.0, merge_shards(actors.memory))
+    return AgentActor(config).encode(_acting(config, networks), memory, timestep.observation)
 
 
 def _shaped(shape: tuple[int, ...], tree: Any) -> Any:
@@ -159,67 +161,69 @@ def _shaped(shape: tuple[int, ...], tree: Any) -> Any:
     return jax.tree.map(lambda x: x.reshape(*shape, *x.shape[1:]), tree)
 
 
-def _manoeuvre(config: Config, held: Array, key: Array) -> Array:
+def _held_moves(config: Config, held: Array, key: Array) -> Array:
     """Returns random moves [E] that are held for `encoder.hold_decisions` decisions on average."""
     moves = task_of(config).actions
     assert isinstance(moves, Discrete)
-    coin, draw = jax.random.uniform(key, (2, *held.shape))
-    return jnp.where(coin < 1.0 / config.encoder.hold_decisions, (draw * moves.n).astype(held.dtype), held)
+    coin, choice = jax.random.uniform(key, (2, *held.shape))
+    return jnp.where(coin < 1.0 / config.encoder.hold_decisions, (choice * moves.n).astype(held.dtype), held)
 
 
-def _publish(config: Config, networks: Networks, step: Array) -> Networks:
+def _refresh_acting_encoder(config: Config, networks: Networks, step: Array) -> Networks:
     """Copies the VAE to the encoder that acts, in the step after which the replay begins anew."""
     encoder = lax.cond(
-        Plan.of(config).replaces_encoder(step),
-        lambda: embedding.acting(config, networks.vae),
+        Schedule.from_config(config).replaces_encoder(step),
+        lambda: embedding.inference_params(config, networks.vae),
         lambda: networks.encoder,
     )
     return dataclasses.replace(networks, encoder=encoder)
 
 
-def _keep(config: Config, world: World, actors: Actors, flown: EnvState, seen: Step, step: Array) -> Samples | None:
+def _store_samples(
+    config: Config, env_params: EnvParams, actors: Actors, env_state: EnvState, timestep: Step, step: Array
+) -> Samples | None:
     """Returns the VAE's rings [S, L, E, ...], with this step's observations [S * E, ...] if the VAE learns in it.
 
     Only then are labels rendered. None where there is no VAE.
     """
     if actors.samples is None:
         return None
-    plan = Plan.of(config)
-    keep = plan.trains_vae(step) | config.encoder.keep_learning
-    observation = embedding.as_encoder_input(config, seen.observation)
+    schedule = Schedule.from_config(config)
+    keep = schedule.trains_vae(step) | config.encoder.keep_learning
+    observation = embedding.as_encoder_input(config, timestep.observation)
 
     def target() -> vae.Target:
         near = None
         if embedding.needs_nearness(config):
             task = task_of(config)
             assert task.label is not None
-            near = task.map(partial(task.label, world))(flown)
+            near = task.map(partial(task.label, env_params))(env_state)
         return samples.target_of(config.encoder, observation, near)
 
     nothing = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), jax.eval_shape(target))
     wanted = lax.cond(keep, target, lambda: nothing)
     rows = samples.samples_of(config.encoder, observation, wanted)
-    if group.several(config):
-        assert seen.waits is not None
-        mate = group.mates(config, seen.waits)
+    if group.is_multi_drone(config):
+        assert timestep.waits is not None
+        mate = group.active_partner_index(config, timestep.waits)
         rows = jax.tree.map(lambda x: x[mate], rows)
-    write = jax.vmap(samples.write, in_axes=(0, 0, None, None))
-    return write(actors.samples, _shaped(actors.reward.shape, rows), plan.samples_kept(config, step), keep)
+    write = jax.vmap(samples.store_samples, in_axes=(0, 0, None, None))
+    return write(actors.samples, _shaped(actors.reward.shape, rows), schedule.samples_kept(config, step), keep)
 
 
 def run_steps(
-    config: Config, world: World, state: TrainState, steps: Array, axis: str | None = None
+    config: Config, env_params: EnvParams, state: TrainState, steps: Array, axis: str | None = None
 ) -> tuple[TrainState, tuple[Episodes, Losses]]:
     """Takes a chunk: the training steps numbered `steps` [K], scanned. Pure; `vmap` it over states for many seeds.
 
     Returns:
         state, (episodes [K, S, E], losses [K]).
     """
-    return lax.scan(partial(train_step, config, world, axis), state, steps)
+    return lax.scan(partial(train_step, config, env_params, axis), state, steps)
 
 
 def policy_of(config: Config, state: TrainState) -> PolicyParams:
-    """Returns what evaluation flies: the acting encoder and the averaged Q-network."""
+    """Returns the parameters for evaluation: acting encoder and averaged Q-network."""
     return _acting(config, state.learner)
 
 

@@ -22,16 +22,16 @@ from edqn_jax.devices import processes
 from edqn_jax.devices.devices import compiler_options
 from edqn_jax.keys import run_streams
 from edqn_jax.learn.checked import CheckedChunk
-from edqn_jax.learn.plan import Plan
-from edqn_jax.learn.state import Episodes, Losses, TrainState, init
+from edqn_jax.learn.schedule import Schedule
+from edqn_jax.learn.state import Episodes, Losses, TrainState, init_state
 from edqn_jax.learn.step import run_steps
-from edqn_jax.sim.task.env import World
+from edqn_jax.sim.task.env import EnvParams
 
 AXIS = "env"
 """Name of the mesh axis that shards are spread over."""
 
 
-def _laid(shapes: Any, sharding: NamedSharding) -> Any:
+def _with_sharding(shapes: Any, sharding: NamedSharding) -> Any:
     return jax.tree.map(lambda x: jax.ShapeDtypeStruct(x.shape, x.dtype, sharding=sharding), shapes)
 
 
@@ -45,7 +45,7 @@ class Trainer:
     def __init__(
         self,
         config: Config,
-        world: World | Sequence[World],
+        env_params: EnvParams | Sequence[EnvParams],
         devices: Sequence[jax.Device],  # pyright: ignore[reportInvalidTypeForm]
     ):
         """Prepares one agent, or as many as there are worlds: they learn side by side in one program.
@@ -57,18 +57,20 @@ class Trainer:
             devices: over which the environments of every agent are spread.
         """
         self.config = config
-        self.plan = Plan.of(config)
-        self.agents = None if isinstance(world, World) else len(world)
+        self.schedule = Schedule.from_config(config)
+        self.agents = None if isinstance(env_params, EnvParams) else len(env_params)
         self.mesh = Mesh(np.asarray(devices), (AXIS,))
         self.replicated = NamedSharding(self.mesh, PartitionSpec())
-        self.world = processes.replicate(world if isinstance(world, World) else _joined(world), self.mesh)
+        self.world = processes.replicate(
+            env_params if isinstance(env_params, EnvParams) else _stack_missions(env_params), self.mesh
+        )
         self._traced: jax.stages.Lowered | None = None
         self._shapes: TrainState | None = None
         self._chunk = None
 
     def init(self, seed: int | Sequence[int]) -> TrainState:
         """Returns the state before the first step, laid out over the devices; of several agents, one seed for each."""
-        make = jax.jit(self._each(lambda world, key: init(self.config, world, key), 0))
+        make = jax.jit(self._each(lambda env_params, key: init_state(self.config, env_params, key), 0))
         keys = [run_streams(number).learning for number in ([seed] if isinstance(seed, int) else seed)]
         # Made whole and then cut: made in parts it would be rounded otherwise. `device_put` reaches no other process.
         whole = make(self.world, keys[0] if self.agents is None else jnp.stack(keys))
@@ -98,12 +100,12 @@ class Trainer:
     def _shaped(self) -> TrainState:
         key = jax.random.key(0)
         keys = key if self.agents is None else jax.random.split(key, self.agents)
-        shapes = jax.eval_shape(self._each(partial(init, self.config), 0), self.world, keys)
+        shapes = jax.eval_shape(self._each(partial(init_state, self.config), 0), self.world, keys)
         layout = self._layout()
         return TrainState(
-            actors=_laid(shapes.actors, layout.actors),
-            learner=_laid(shapes.learner, layout.learner),
-            step=_laid(shapes.step, layout.step),
+            actors=_with_sharding(shapes.actors, layout.actors),
+            learner=_with_sharding(shapes.learner, layout.learner),
+            step=_with_sharding(shapes.step, layout.step),
         )
 
     def compile(self) -> None:
@@ -132,7 +134,9 @@ class Trainer:
         spread, same = self._spread(), PartitionSpec()
         specs: Any = TrainState(actors=spread, learner=same, step=same)  # pyright: ignore[reportArgumentType]
         run = jax.shard_map(
-            self._each(lambda world, state, steps: run_steps(self.config, world, state, steps, AXIS), 0, None),
+            self._each(
+                lambda env_params, state, steps: run_steps(self.config, env_params, state, steps, AXIS), 0, None
+            ),
             mesh=self.mesh,
             in_specs=(same, specs, same),
             out_specs=(specs, (self._spread(None), same)),
@@ -168,7 +172,7 @@ class Trainer:
         return tree if self.agents is None else jax.tree.map(lambda leaf: leaf[number], tree)
 
 
-def _joined(worlds: Sequence[World]) -> World:
+def _stack_missions(worlds: Sequence[EnvParams]) -> EnvParams:
     """Returns the first world with the missions of all, [K, M]."""
     missions = jax.tree.map(lambda *leaves: jnp.stack(leaves), *(world.missions for world in worlds))
     return dataclasses.replace(worlds[0], missions=missions)

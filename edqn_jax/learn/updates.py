@@ -1,4 +1,4 @@
-"""What learns in a training step: the VAE of the perception here, the learner of moves by its contract.
+"""Updates of a training step: the VAE's are here, the Q-network's in its learner.
 
 Both add their gradients up over the devices, so that the networks stay the same on every one.
 """
@@ -20,9 +20,9 @@ from edqn_jax.keys import split_each
 from edqn_jax.learn import samples
 from edqn_jax.learn.learner import Metrics, State, UpdateStats, learner_of
 from edqn_jax.learn.perception import embedding, vae
-from edqn_jax.learn.plan import Plan
 from edqn_jax.learn.qnetwork import Params, skip_nonfinite
 from edqn_jax.learn.samples import Samples
+from edqn_jax.learn.schedule import Schedule
 from edqn_jax.native.all_sum import all_sum
 from edqn_jax.sim.sensors.sensor import sensor_of
 from edqn_jax.sim.task.task import task_of
@@ -43,11 +43,11 @@ class Networks:
 def init_networks(config: Config, key: Array) -> Networks:
     """Returns networks that have learnt nothing, with their optimisers; `key` is consumed."""
     vae_key, agent_key = jax.random.split(key)
-    vae = embedding.init(config, vae_key)
+    vae = embedding.init_params(config, vae_key)
     return Networks(
         vae=vae,
         vae_optimiser=_vae_optimiser(config).init(vae) if vae else None,
-        encoder=embedding.acting(config, vae),
+        encoder=embedding.inference_params(config, vae),
         agent=learner_of(config).init(config, agent_key),
     )
 
@@ -67,26 +67,26 @@ def update_vae(
         keys: [S] of the shards on this device, consumed.
         step: [] int32, of training.
     """
-    plan, task = Plan.of(config), task_of(config)
+    schedule, task = Schedule.from_config(config), task_of(config)
     if rings is None:
-        return UpdateStats.none(*VAE_METRICS), networks
+        return UpdateStats.without_updates(*VAE_METRICS), networks
     share = config.encoder.batch_size // config.train.shards
-    kept = plan.samples_kept(config, step) + 1
+    kept = schedule.samples_kept(config, step) + 1
     part = keys.shape[0] / config.train.shards  # of all shards, on this device
     mirror = sensor_of(config).mirror
 
     def loss(params: Params, batch: Samples, noise: Array):
-        sensed = samples.read(batch)
+        sensed = samples.to_encoder_input(batch)
         total, parts = vae.vae_loss(config.encoder, params, sensed, batch.motion, batch.wanted, noise)
         return total * part, parts
 
     def update(networks: Networks, keys: Array):
         draw_keys, noise_keys = split_each(keys, 2)
-        draw = lambda ring, key: samples.draw(config.encoder, ring, kept, share, key, task, mirror)  # noqa: E731
-        batch = jax.vmap(draw)(rings, draw_keys)
+        sample = lambda ring, key: samples.sample_batch(config.encoder, ring, kept, share, key, task, mirror)  # noqa: E731
+        batch = jax.vmap(sample)(rings, draw_keys)
         # Each shard draws its own noise, so that the layout on devices does not change it.
         noise = jax.vmap(lambda key: jax.random.normal(key, (share, config.encoder.code_size)))(noise_keys)
-        batch, noise = jax.tree.map(flat, (batch, noise))
+        batch, noise = jax.tree.map(merge_shards, (batch, noise))
         gradient, parts = jax.grad(loss, has_aux=True)(networks.vae, batch, noise)
         found = gradient, jax.tree.map(lambda x: jnp.mean(x) * part, parts)
         gradient, parts = all_sum(found, axis, after=0.0)
@@ -98,16 +98,18 @@ def update_vae(
         networks, found = lax.scan(update, networks, split_each(keys, updates))
         reconstruction, kl, finite = found
         metrics: Metrics = dict(zip(VAE_METRICS, (reconstruction, kl), strict=True))
-        return UpdateStats.of(reconstruction, metrics, finite), networks
+        return UpdateStats.from_updates(reconstruction, metrics, finite), networks
 
     def rest(networks: Networks):
         if config.encoder.keep_learning:
             return learn(networks, 1)
-        return UpdateStats.none(*VAE_METRICS), networks
+        return UpdateStats.without_updates(*VAE_METRICS), networks
 
-    return lax.cond(plan.trains_vae(step), lambda x: learn(x, config.encoder.warmup_updates_per_step), rest, networks)
+    return lax.cond(
+        schedule.trains_vae(step), lambda x: learn(x, config.encoder.warmup_updates_per_step), rest, networks
+    )
 
 
-def flat(x: Array) -> Array:
+def merge_shards(x: Array) -> Array:
     """Returns [S * E, ...] of [S, E, ...]."""
     return x.reshape(-1, *x.shape[2:])

@@ -57,7 +57,7 @@ C = Compiler(
 
 
 @functools.cache
-def cuda() -> Compiler | None:
+def cuda_compiler() -> Compiler | None:
     """Returns the compiler for NVIDIA GPUs like the first of this process; None where there is none."""
     try:
         major, minor = str(jax.local_devices(backend="cuda")[0].compute_capability).split(".")
@@ -70,7 +70,7 @@ def cuda() -> Compiler | None:
 
 
 @functools.cache
-def compiler(of: Compiler | None = C) -> str | None:
+def compiler_version(of: Compiler | None = C) -> str | None:
     """Returns the name and version of a compiler in its own words; None where it is not used."""
     command = None if of is None else _command(of)
     if of is None or command is None:
@@ -101,7 +101,7 @@ def _command(of: Compiler) -> list[str] | None:
     return None if found is None else [found, *words[1:]]
 
 
-def registered(
+def ensure_registered(
     source: Path,
     targets: tuple[str, ...],
     definitions: tuple[str, ...] = (),

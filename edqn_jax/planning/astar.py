@@ -30,7 +30,7 @@ from jax import Array
 from edqn_jax.config import FAMILIES, Config
 from edqn_jax.errors import ConfigError
 from edqn_jax.planning.lattice import CELL_M, FINE_M, STEPS, Lattice, NoPathError, is_small, leg_touches
-from edqn_jax.planning.path import PlannedPath, found, not_found, path_length, point_text
+from edqn_jax.planning.path import PlannedPath, not_found, path_as_plan, path_length, point_text
 from edqn_jax.sim.scene.mjcf import check_scene, load_world, resolve_world
 from edqn_jax.sim.scene.scene import Scene
 from edqn_jax.sim.worlds.families import random_scene, world_key
@@ -84,7 +84,7 @@ def shortest_path(
     last = float(np.linalg.norm(goal - points[-1]))
     if last > 0.0:
         points = np.concatenate([points, goal[None]])
-    tight = shorten(points, functools.partial(leg_touches, scene, radius=radius))
+    tight = shorten_path(points, functools.partial(leg_touches, scene, radius=radius))
     return Path(tight, path_length(tight), length + last)
 
 
@@ -104,7 +104,7 @@ def plan(scene: Scene, *, body_radius: float = 0.36) -> PlannedPath:
     except NoPathError as error:
         reason = str(error).removeprefix("there is no path: ")
         return not_found(reason, time.perf_counter() - began)
-    return found(path.points, time.perf_counter() - began, steps=0)
+    return path_as_plan(path.points, time.perf_counter() - began, steps=0)
 
 
 def _search(lattice: Lattice, source: int, target: int) -> tuple[np.ndarray, float]:
@@ -177,7 +177,7 @@ Touches = Callable[[np.ndarray, np.ndarray], bool]
 """Returns whether the sphere touches anything on the straight line between two points [3]."""
 
 
-def shorten(points: np.ndarray, touches: Touches) -> np.ndarray:
+def shorten_path(points: np.ndarray, touches: Touches) -> np.ndarray:
     """Shortens a path [K, 3], metres, by line of sight and by cutting corners until a round gains less than 1 cm."""
     points = _skip_ahead(points, touches)
     while True:

@@ -36,7 +36,7 @@ class Reachable:
     """Share of the free cells that have no way; niches between shapes, as small as `NICHES`, are not counted."""
 
 
-def reachable(scene: Scene, radius: float, cell: float | None = None) -> Reachable:
+def find_reachable(scene: Scene, radius: float, cell: float | None = None) -> Reachable:
     """Returns from where in a world a sphere has a way to the goal.
 
     Args:
@@ -50,11 +50,11 @@ def reachable(scene: Scene, radius: float, cell: float | None = None) -> Reachab
         NoPathError: if the sphere does not fit at the goal.
     """
     if cell is None:
-        found = reachable(scene, radius, COARSE_M)
+        found = find_reachable(scene, radius, COARSE_M)
         if found.lost > 0.0:
-            found = reachable(scene, radius, CELL_M)
-        if not holds(found, scene.start) and is_small(scene, FINE_M):
-            found = reachable(scene, radius, FINE_M)
+            found = find_reachable(scene, radius, CELL_M)
+        if not is_reachable(found, scene.start) and is_small(scene, FINE_M):
+            found = find_reachable(scene, radius, FINE_M)
         return found
     lattice = Lattice(scene, np.asarray(scene.goal, np.float64), radius, cell)
     lattice.compute_all_distances()
@@ -68,7 +68,7 @@ def reachable(scene: Scene, radius: float, cell: float | None = None) -> Reachab
     return Reachable(way, lattice.middle(np.array(0)), cell, lost if lost > NICHES else 0.0)
 
 
-def holds(found: Reachable, point: np.ndarray | Array) -> bool:
+def is_reachable(found: Reachable, point: np.ndarray | Array) -> bool:
     """Returns whether there is a way from the cell that a point [3], metres, is in."""
     at = np.round((np.asarray(point) - found.corner) / found.edge_m).astype(int)
     return bool(np.all((at >= 0) & (at < found.is_way.shape))) and bool(found.is_way[tuple(at)])

@@ -22,7 +22,7 @@ from edqn_jax.sim.scene.scene import Scene
 STEPS = np.array([step for step in itertools.product((-1, 0, 1), repeat=3) if any(step)])
 """From a cell to its neighbours, [26, 3] cells."""
 
-MOST_CELLS = 40_000_000
+MAX_CELLS = 40_000_000
 """Cells of the largest lattice: ten times those of the paper's world in cells of 0.5 m, and more."""
 
 CELL_M, FINE_M = 0.5, 0.25
@@ -54,11 +54,11 @@ def lattice_shape(scene: Scene, start: np.ndarray, cell: float) -> tuple[np.ndar
     origin = np.floor((start - lower) / cell + 1e-5).astype(np.int64)
     shape = origin + np.floor((upper - start) / cell + 1e-5).astype(np.int64) + 1
     size = math.prod(map(int, np.maximum(shape, 1)))
-    if size > MOST_CELLS:
+    if size > MAX_CELLS:
         sides = " x ".join(f"{side:g}" for side in upper - lower)
         raise ConfigError(
             f"the flight volume of {sides} m has {size / 1e6:,.0f} million cells of {cell:g} m, and a way is "
-            f"searched in at most {MOST_CELLS / 1e6:,.0f} million; give a smaller site 'volume'"
+            f"searched in at most {MAX_CELLS / 1e6:,.0f} million; give a smaller site 'volume'"
         )
     return origin, shape
 

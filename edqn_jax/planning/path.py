@@ -14,7 +14,7 @@ MARGIN = 1e-3
 
 
 @dataclasses.dataclass(frozen=True)
-class Task:
+class PlanningTask:
     """Find a path for a sphere through a known world; its centre stays within the scene's flight volume."""
 
     scene: Scene
@@ -26,7 +26,7 @@ class Task:
     """Metres. A planner that need not end at the goal itself may end this near, if the straight line there is free."""
 
     @classmethod
-    def of(cls, scene: Scene, *, body_radius: float, goal_radius: float = 2.0) -> Task:
+    def from_scene(cls, scene: Scene, *, body_radius: float, goal_radius: float = 2.0) -> PlanningTask:
         """Returns the task from the scene's own start to its goal; radii in metres."""
         start, goal = (np.asarray(point, np.float64) for point in (scene.start, scene.goal))
         return cls(scene, start, goal, body_radius, goal_radius)
@@ -59,7 +59,7 @@ class PlannedPath:
         return float("nan") if self.path is None else path_length(self.path)
 
 
-def found(path: npt.ArrayLike, seconds: float, steps: int) -> PlannedPath:
+def path_as_plan(path: npt.ArrayLike, seconds: float, steps: int) -> PlannedPath:
     """Returns the plan of a planner that finds only one path [n, 3] metres."""
     path = np.asarray(path, np.float64)
     return PlannedPath(path, "", seconds, steps, seconds, path_length(path))

@@ -13,13 +13,13 @@ import jax.numpy as jnp
 from jax import Array
 
 from edqn_jax.config import Config
-from edqn_jax.config.loading import make_config, nearest
+from edqn_jax.config.loading import make_config, suggest_nearest
 from edqn_jax.errors import ConfigError
 from edqn_jax.learn.actor import Actor, AgentActor
 from edqn_jax.learn.policy import Policy
 from edqn_jax.policies import function_named
 from edqn_jax.sim.actions import Discrete
-from edqn_jax.sim.task.action_sets import action_of, action_set, admitted
+from edqn_jax.sim.task.action_sets import action_of, action_set, clip_action
 from edqn_jax.sim.task.env import Observation
 from edqn_jax.user_code import load_module
 
@@ -87,7 +87,7 @@ class FunctionActor(Actor):
         """Returns an action as it is flown and recorded: what is computed is cut off at the bounds of its space."""
         space = action_set(self.config).space
         if not isinstance(space, Discrete):
-            return admitted(space, action_of(self.config, action))
+            return clip_action(space, action_of(self.config, action))
         if not isinstance(action, str) and jnp.issubdtype(jnp.asarray(action).dtype, jnp.floating):
             return jnp.asarray(action)  # no number of an action; what flies it says so
         return jnp.clip(action_of(self.config, action), 0, space.n - 1)
@@ -147,7 +147,7 @@ class FunctionPolicy:
 
     @property
     def params(self) -> None:
-        """Returns None: what a function knows is in it."""
+        """Returns None: a function has no parameters."""
         return None
 
 
@@ -202,7 +202,7 @@ def load_function(name: str) -> Policy | FunctionPolicy | Function:
     module = load_module(where)
     if not hasattr(module, attribute):
         names = [each for each in vars(module) if not each.startswith("_")]
-        raise ConfigError(f"'{where}' has no '{attribute}'{nearest(attribute, names)}")
+        raise ConfigError(f"'{where}' has no '{attribute}'{suggest_nearest(attribute, names)}")
     policy = getattr(module, attribute)
     if not isinstance(policy, Policy | FunctionPolicy) and (not callable(policy) or isinstance(policy, type)):
         raise ConfigError(f"'{name}' is of the type {type(policy).__name__}; a policy is {TAKES}, or a FunctionPolicy")

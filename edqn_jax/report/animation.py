@@ -20,15 +20,15 @@ from matplotlib.patches import Wedge
 from PIL import Image
 
 from edqn_jax.evaluation.trajectories import POSITION, columns_of
-from edqn_jax.extras import require
+from edqn_jax.extras import require_extra
 from edqn_jax.learn.policy import PolicyParams
-from edqn_jax.report.flights import OBLIQUE, OTHER_COLOUR, draw_end_marks, draw_stage, others_paths
+from edqn_jax.report.flights import OBLIQUE, OTHER_COLOUR, others_paths, plot_end_marks, plot_stage
 from edqn_jax.report.images import look_of, scale_of
-from edqn_jax.report.sights import Sights, decision_rows, poses, times_of
-from edqn_jax.report.solids import MAP, View, faces_seen, hidden, moving_solids
+from edqn_jax.report.sights import FlightRenderer, decision_rows, times_of, trajectory_poses
+from edqn_jax.report.solids import MAP, View, faces_seen, is_occluded, moving_solids
 from edqn_jax.report.style import INK, LINE, MUTED, OUTCOME_COLOURS, OUTCOME_LABELS, STYLE, frame
 from edqn_jax.sim.camera.camera import on_screen
-from edqn_jax.sim.scene.scene import moves
+from edqn_jax.sim.scene.scene import has_motion
 
 SIZE = (800, 540)
 """Width and height of the GIF, pixels."""
@@ -36,7 +36,7 @@ FRAME_S = 0.1
 """Seconds for which a frame is shown."""
 LAST_FRAME_S = 2.5
 """Seconds for which the last frame is shown, with the outcome."""
-MOST_FRAMES = 120
+MAX_FRAMES = 120
 """Frames of the longest GIF but for the last; a longer flight shows every other decision, or fewer."""
 COLOURS = 128
 """Colours of all frames together; more make the file larger and no better to look at."""
@@ -49,10 +49,10 @@ SIGHT_M = 9.0
 """Length of the field of view on the map, metres, in a volume of 100 m; it is as much shorter in a smaller one."""
 
 
-def animate(
-    sights: Sights,
+def animate_flight(
+    sights: FlightRenderer,
     params: PolicyParams | None,
-    flown: Mapping[str, np.ndarray],
+    trajectory: Mapping[str, np.ndarray],
     outcome: str,
     title: str,
     form: str = ".gif",
@@ -70,27 +70,27 @@ def animate(
     Raises:
         MissingPackageError: if the extra is not installed.
     """
-    rows = decision_rows(sights.config, flown)[:, -1]
-    every = -(-len(rows) // MOST_FRAMES)
+    rows = decision_rows(sights.config, trajectory)[:, -1]
+    every = -(-len(rows) // MAX_FRAMES)
     shown = np.arange(every - 1, len(rows), every)
     speed_up = every * sights.config.drone.physics_steps * sights.config.drone.physics_dt_s / FRAME_S
     with matplotlib.rc_context(STYLE):
-        stage = _Stage(sights, params, flown, f"{title}, {speed_up:.1f} times as fast as flown")
+        stage = _Stage(sights, params, trajectory, f"{title}, {speed_up:.1f} times as fast as flown")
         frames = [stage.frame(int(number), int(rows[number])) for number in shown]
-        frames.append(stage.frame(len(rows) - 1, len(flown["t"]) - 1, outcome))
+        frames.append(stage.frame(len(rows) - 1, len(trajectory["t"]) - 1, outcome))
     if form == ".mp4":
         return _mp4(frames + [frames[-1]] * (round(LAST_FRAME_S / FRAME_S) - 1))
-    return gif(frames, [FRAME_S] * len(shown) + [LAST_FRAME_S])
+    return encode_gif(frames, [FRAME_S] * len(shown) + [LAST_FRAME_S])
 
 
 class _Stage:
     """The figure of which all frames are pictures; what moves is drawn over a background that is drawn once."""
 
     def __init__(
-        self, sights: Sights, params: PolicyParams | None, flown: Mapping[str, np.ndarray], title: str
+        self, sights: FlightRenderer, params: PolicyParams | None, trajectory: Mapping[str, np.ndarray], title: str
     ) -> None:
-        self._sights, self._flown = sights, flown
-        self._points = columns_of(flown, POSITION)
+        self._sights, self._trajectory = sights, trajectory
+        self._points = columns_of(trajectory, POSITION)
         self._figure = Figure(figsize=(SIZE[0] / DOTS_PER_INCH, SIZE[1] / DOTS_PER_INCH), dpi=DOTS_PER_INCH)
         self._canvas = FigureCanvasAgg(self._figure)
         self._moving: list[Artist] = []
@@ -106,14 +106,18 @@ class _Stage:
 
     def frame(self, decision: int, row: int, outcome: str = "") -> Image.Image:
         """Returns the picture of a decision, with the path up to a row of the trajectory."""
-        seen_at = decision_rows(self._sights.config, self._flown)[decision, -1]
-        self._rgb.set_data(on_screen(self._sights.rgb(*poses(self._flown, seen_at), times_of(self._flown, seen_at))))
+        seen_at = decision_rows(self._sights.config, self._trajectory)[decision, -1]
+        self._rgb.set_data(
+            on_screen(
+                self._sights.rgb(*trajectory_poses(self._trajectory, seen_at), times_of(self._trajectory, seen_at))
+            )
+        )
         if self._shown is not None:
             self._sensed.set_data(self._shown[decision])
         for view in (self._oblique, self._map):
-            view.advance(row, float(self._flown["t"][row]))
+            view.advance(row, float(self._trajectory["t"][row]))
         self._sight.set_center(tuple(self._points[row, :2]))
-        heading = _heading_deg(*(self._flown[name][row] for name in ("qw", "qz")))
+        heading = _heading_deg(*(self._trajectory[name][row] for name in ("qw", "qz")))
         half = self._sights.config.camera.horizontal_fov_deg / 2
         self._sight.set_theta1(heading - half)
         self._sight.set_theta2(heading + half)
@@ -129,10 +133,10 @@ class _Stage:
         return Image.fromarray(np.asarray(self._canvas.buffer_rgba())[..., :3])
 
     def _state(self, row: int) -> str:
-        flown = self._flown
-        speed = np.linalg.norm([flown[name][row] for name in ("vx", "vy", "vz")])
+        trajectory = self._trajectory
+        speed = np.linalg.norm([trajectory[name][row] for name in ("vx", "vy", "vz")])
         away = np.linalg.norm(self._points[row] - np.asarray(self._sights.scene.goal))
-        return f"time  {flown['t'][row]:.1f} s\nspeed  {speed:.1f} m/s\nto the goal  {away:.0f} m"
+        return f"time  {trajectory['t'][row]:.1f} s\nspeed  {speed:.1f} m/s\nto the goal  {away:.0f} m"
 
     def _words(self, x: float, y: float, **style: Any) -> Any:
         text = self._figure.text(x, y, "", color=INK, animated=True, **style)
@@ -158,7 +162,7 @@ class _Stage:
             return
         look = look_of(name)
         below.set_title(f"What the drone sees: {look.name}, {camera.width} × {camera.height}", fontsize=10)
-        self._shown = sights.shown(params, self._flown).image
+        self._shown = sights.shown(params, self._trajectory).image
         if look.signed:
             below.set_xlabel("red where it grows brighter, blue where darker", color=MUTED, fontsize=8, labelpad=3)
         scale = scale_of(self._shown, look, share=0.75)  # quiet moments are to be seen, too
@@ -185,13 +189,13 @@ class _Stage:
 class _PathView:
     """The world from one side, and the path so far in it: faint where a solid hides it."""
 
-    def __init__(self, axes: Axes, view: View, sights: Sights, points: np.ndarray) -> None:
+    def __init__(self, axes: Axes, view: View, sights: FlightRenderer, points: np.ndarray) -> None:
         self.axes, self._view, self._scene = axes, view, sights.scene
-        solids = draw_stage(axes, view, sights.scene, sights.config.env.goal_radius_m, outlines=False)
-        draw_end_marks(axes, view, points[0], np.asarray(sights.scene.goal, np.float64))
+        solids = plot_stage(axes, view, sights.scene, sights.config.env.goal_radius_m, outlines=False)
+        plot_end_marks(axes, view, points[0], np.asarray(sights.scene.goal, np.float64))
         axes.set_aspect("equal", anchor="C")
         self._flat = view.project(points)
-        covered = hidden(points, solids, view)[:, None]
+        covered = is_occluded(points, solids, view)[:, None]
         self._visible = np.where(covered, np.nan, self._flat)
         styles = ({"lw": 1.4, "alpha": 0.4, "color": LINE}, {"lw": 4.4, "color": "white"}, {"lw": 2.4, "color": LINE})
         self._lines = [
@@ -209,7 +213,7 @@ class _PathView:
 
     def advance(self, row: int, time: float) -> None:
         """Draws the path up to a row of the trajectory, and the obstacles that move where they are at its time."""
-        if moves(self._scene):
+        if has_motion(self._scene):
             rings, colours = faces_seen(self._view, moving_solids(self._scene, time))
             self._obstacles.set(verts=rings, facecolors=colours, edgecolors=colours)
         for line, points in zip(self._lines, (self._flat, self._visible, self._visible), strict=True):
@@ -227,7 +231,7 @@ def _heading_deg(w: float, z: float) -> float:
     return float(np.degrees(2 * np.arctan2(z, w)))
 
 
-def gif(frames: list[Image.Image], seconds: list[float], colours: int = COLOURS) -> bytes:
+def encode_gif(frames: list[Image.Image], seconds: list[float], colours: int = COLOURS) -> bytes:
     """Returns the frames as a GIF with one palette, of which each frame stores what has changed.
 
     Args:
@@ -253,7 +257,7 @@ def gif(frames: list[Image.Image], seconds: list[float], colours: int = COLOURS)
 
 def _mp4(frames: list[Image.Image]) -> bytes:
     """Returns the frames, each shown for `FRAME_S`, as an MP4 that browsers and slides play."""
-    ffmpeg = require("imageio_ffmpeg", extra="video")
+    ffmpeg = require_extra("imageio_ffmpeg", extra="video")
     with tempfile.TemporaryDirectory() as folder:  # an MP4 is finished by going back in the file
         file = Path(folder) / "flight.mp4"
         writer = ffmpeg.write_frames(

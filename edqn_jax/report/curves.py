@@ -12,10 +12,10 @@ from matplotlib.collections import PathCollection
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, PercentFormatter
 
-from edqn_jax.report.style import INK, LINE, OUTCOME_COLOURS, OUTCOME_LABELS, SECOND_LINE, drawing
+from edqn_jax.report.style import INK, LINE, OUTCOME_COLOURS, OUTCOME_LABELS, SECOND_LINE, open_figure
 
 
-def draw_returns(episodes: Mapping[str, np.ndarray], file: Path) -> Figure:
+def plot_returns(episodes: Mapping[str, np.ndarray], file: Path) -> Figure:
     """Draws return against episode, a point each in its outcome's colour, with the running mean and the shares.
 
     Args:
@@ -24,7 +24,7 @@ def draw_returns(episodes: Mapping[str, np.ndarray], file: Path) -> Figure:
     """
     returns, outcomes = np.asarray(episodes["return"], np.float64), np.asarray(episodes["outcome"])
     number = np.arange(1, len(returns) + 1)
-    with drawing(7.0, 4.2, file) as figure:
+    with open_figure(7.0, 4.2, file) as figure:
         above, below = figure.subplots(2, 1, sharex=True, height_ratios=(3.0, 1.0))
         size = float(np.clip(30_000 / max(len(returns), 1), 1.0, 12.0))
         for name, colour in OUTCOME_COLOURS.items():
@@ -45,14 +45,14 @@ def draw_returns(episodes: Mapping[str, np.ndarray], file: Path) -> Figure:
                 if isinstance(handle, PathCollection):
                     handle.set_sizes([18.0])
                     handle.set_alpha(1.0)
-        _draw_shares(below, outcomes)
+        _plot_shares(below, outcomes)
         below.set_xlabel("episode")
         below.xaxis.set_major_formatter(EngFormatter(sep=""))
         below.set_xlim(0, len(returns) + 1)
     return figure
 
 
-def draw_learning(metrics: Sequence[Mapping[str, Any]], file: Path) -> Figure:
+def plot_learning(metrics: Sequence[Mapping[str, Any]], file: Path) -> Figure:
     """Draws success, exploration and losses over decisions, written to `file` as PNG.
 
     Args:
@@ -60,7 +60,7 @@ def draw_learning(metrics: Sequence[Mapping[str, Any]], file: Path) -> Figure:
             `validation_success`, `epsilon`, `q_loss`, `reconstruction_loss`, `kl` and `warm_up`.
         file: PNG to write.
     """
-    with drawing(7.0, 4.4, file) as figure:
+    with open_figure(7.0, 4.4, file) as figure:
         (success, exploration), (q_loss, vae) = figure.subplots(2, 2)
         exploration.sharex(success)
         q_loss.sharex(success)  # the VAE may learn for a short while only, so its axis is its own
@@ -98,7 +98,7 @@ def running_mean(values: np.ndarray, window: int) -> np.ndarray:
     return (sums[window:] - sums[:-window]) / window
 
 
-def _draw_shares(axes: Axes, outcomes: np.ndarray) -> None:
+def _plot_shares(axes: Axes, outcomes: np.ndarray) -> None:
     """Draws stacked shares of the outcomes in up to 120 equal stretches of the run."""
     stretches = np.array_split(outcomes, min(120, max(len(outcomes), 1)))
     edges = np.cumsum([0, *(len(stretch) for stretch in stretches)])

@@ -22,14 +22,14 @@ from edqn_jax.report.solids import (
     MAP,
     Solid,
     View,
-    cut_open,
-    draw_outlines,
-    draw_shadows,
-    draw_solids,
-    hidden,
-    standing,
+    is_occluded,
+    make_cutaway,
+    plot_outlines,
+    plot_shadows,
+    plot_solids,
+    static_scene,
 )
-from edqn_jax.report.style import INK, MUTED, OUTCOME_COLOURS, OUTCOME_LABELS, drawing
+from edqn_jax.report.style import INK, MUTED, OUTCOME_COLOURS, OUTCOME_LABELS, open_figure
 from edqn_jax.sim.scene.scene import PARKED, Scene
 
 OBLIQUE = View(azimuth=-62.0, elevation=34.0)
@@ -46,16 +46,16 @@ PATH_POINTS = 1500
 
 
 @as_tested
-def draw_world(scene: Scene, file: Path) -> Figure:
+def plot_world(scene: Scene, file: Path) -> Figure:
     """Draws the world's solids with start and goal, in proportion, written to `file` as PNG."""
     start, goal = _ends(scene)
     volume = np.asarray(scene.volume, np.float64)
-    with drawing(7.0, 4.0, file) as figure:
+    with open_figure(7.0, 4.0, file) as figure:
         axes = figure.add_subplot()
-        _draw_ground(axes, OBLIQUE, volume)
-        _draw_obstacles(axes, OBLIQUE, scene)
+        _plot_ground(axes, OBLIQUE, volume)
+        _plot_obstacles(axes, OBLIQUE, scene)
         for point, name, colour in ((start, "start", START_COLOUR), (goal, "goal", GOAL_COLOUR)):
-            _draw_stem(axes, OBLIQUE, point, colour)
+            _plot_stem(axes, OBLIQUE, point, colour)
             x, y = OBLIQUE.project(point)
             label = f"{name} ({point[0]:g}, {point[1]:g}, {point[2]:g})"
             axes.annotate(
@@ -69,7 +69,7 @@ def draw_world(scene: Scene, file: Path) -> Figure:
                 bbox={"boxstyle": "round,pad=0.2", "fc": "white", "ec": "none", "alpha": 0.8},
                 zorder=9,
             )
-        draw_end_marks(axes, OBLIQUE, start, goal)
+        plot_end_marks(axes, OBLIQUE, start, goal)
     return figure
 
 
@@ -82,11 +82,11 @@ def draw_map(axes: Axes, scene: Scene, goal_radius_m: float = 2.0) -> None:
         scene: one world.
         goal_radius_m: the circle around the goal.
     """
-    draw_stage(axes, MAP, scene, goal_radius_m)
-    draw_end_marks(axes, MAP, *_ends(scene))
+    plot_stage(axes, MAP, scene, goal_radius_m)
+    plot_end_marks(axes, MAP, *_ends(scene))
 
 
-def draw_path(
+def plot_path(
     scene: Scene,
     trajectory: Mapping[str, np.ndarray],
     shortest: np.ndarray | None,
@@ -111,21 +111,21 @@ def draw_path(
     points, speed = points[thin], np.linalg.norm(velocity[thin], axis=1)
     scale = Normalize(0.0, max(float(np.ceil(speed.max())), 1.0))
     start, goal = points[0], _ends(scene)[1]
-    with drawing(9.6, 3.9, file) as figure:
+    with open_figure(9.6, 3.9, file) as figure:
         oblique, above = figure.subplots(1, 2, width_ratios=(1.75, 1.0))
         for axes, view in ((oblique, OBLIQUE), (above, MAP)):
-            solids = draw_stage(axes, view, scene, goal_radius_m)
+            solids = plot_stage(axes, view, scene, goal_radius_m)
             if view is OBLIQUE:
                 floor = view.project(points * [1, 1, 0])
                 axes.plot(*floor.T, color=MUTED, lw=0.7, alpha=0.7, zorder=1.5)
             if shortest is not None:
-                _draw_shortest(axes, view, np.asarray(shortest, np.float64), solids)
+                _plot_shortest(axes, view, np.asarray(shortest, np.float64), solids)
             for other in others_paths(scene):
                 axes.plot(
                     *view.project(other[:: len(other) // PATH_POINTS + 1]).T, color=OTHER_COLOUR, lw=1.0, zorder=5.5
                 )
-            _draw_flown(axes, view, points, speed, scale, solids)
-            draw_end_marks(axes, view, start, goal)
+            _plot_flown(axes, view, points, speed, scale, solids)
+            plot_end_marks(axes, view, start, goal)
             if outcome != "goal":
                 x, y = view.project(points[-1])
                 axes.plot(x, y, "X", ms=8, mfc=OUTCOME_COLOURS[outcome], mec="white", mew=0.8, zorder=10)
@@ -145,7 +145,7 @@ def others_paths(scene: Scene) -> list[np.ndarray]:
     return [path[path[:, 0] < PARKED / 2] for path in paths]
 
 
-def draw_stage(axes: Axes, view: View, scene: Scene, goal_radius_m: float, outlines: bool = True) -> list[Solid]:
+def plot_stage(axes: Axes, view: View, scene: Scene, goal_radius_m: float, outlines: bool = True) -> list[Solid]:
     """Draws the world in which a flight is shown, its goal marked; returns the solids that hide what is behind them.
 
     Args:
@@ -156,23 +156,23 @@ def draw_stage(axes: Axes, view: View, scene: Scene, goal_radius_m: float, outli
         outlines: whether what moves is outlined where it is at time 0.
     """
     goal = _ends(scene)[1]
-    _draw_ground(axes, view, np.asarray(scene.volume, np.float64))
-    solids = _draw_obstacles(axes, view, scene if outlines else standing(scene))
+    _plot_ground(axes, view, np.asarray(scene.volume, np.float64))
+    solids = _plot_obstacles(axes, view, scene if outlines else static_scene(scene))
     if view is MAP:
         circle = Circle((goal[0], goal[1]), goal_radius_m, fill=False, ec=GOAL_COLOUR, lw=0.8)
         axes.add_patch(circle).set_zorder(6)
     else:
-        _draw_stem(axes, view, goal, GOAL_COLOUR)
+        _plot_stem(axes, view, goal, GOAL_COLOUR)
     return solids
 
 
-def _draw_obstacles(axes: Axes, view: View, scene: Scene) -> list[Solid]:
+def _plot_obstacles(axes: Axes, view: View, scene: Scene) -> list[Solid]:
     """Draws the world without what would hide it, says so, and returns the solids that hide what is behind them."""
-    world = cut_open(scene, view)
+    world = make_cutaway(scene, view)
     if view is not MAP:
-        draw_shadows(axes, view, world.shown, _corners(np.asarray(scene.volume, np.float64)))
-    draw_solids(axes, view, world.shown)
-    draw_outlines(axes, view, [*world.near_walls, *world.moving])
+        plot_shadows(axes, view, world.shown, _corners(np.asarray(scene.volume, np.float64)))
+    plot_solids(axes, view, world.shown)
+    plot_outlines(axes, view, [*world.near_walls, *world.moving])
     if world.note:
         axes.set_title(world.note, fontsize=7, weight="normal", color=MUTED)
     return world.shown
@@ -182,7 +182,7 @@ def _ends(scene: Scene) -> tuple[np.ndarray, np.ndarray]:
     return np.asarray(scene.start, np.float64), np.asarray(scene.goal, np.float64)
 
 
-def _draw_ground(axes: Axes, view: View, volume: np.ndarray) -> None:
+def _plot_ground(axes: Axes, view: View, volume: np.ndarray) -> None:
     """Draws the volume's floor with a 10 m grid, labelled edges and a scale of height."""
     (x0, y0, _), (x1, y1, top) = volume
     floor = [view.project(_corners(volume))]
@@ -233,33 +233,33 @@ def _corners(volume: np.ndarray) -> np.ndarray:
     return np.array([[x0, y0, 0.0], [x1, y0, 0.0], [x1, y1, 0.0], [x0, y1, 0.0]])
 
 
-def _draw_stem(axes: Axes, view: View, point: np.ndarray, colour: str) -> None:
+def _plot_stem(axes: Axes, view: View, point: np.ndarray, colour: str) -> None:
     stem = view.project(np.stack([point * [1, 1, 0], point]))
     axes.plot(*stem.T, color=colour, lw=0.8, zorder=8)
     axes.plot(*stem[0], "o", ms=2.0, color=colour, zorder=8)
 
 
-def draw_end_marks(axes: Axes, view: View, start: np.ndarray, goal: np.ndarray) -> None:
+def plot_end_marks(axes: Axes, view: View, start: np.ndarray, goal: np.ndarray) -> None:
     """Marks start and goal, each [3] metres, above all else."""
     axes.plot(*view.project(start), "o", ms=6, mfc="white", mec=START_COLOUR, mew=1.8, zorder=9)
     axes.plot(*view.project(goal), "*", ms=12, mfc=GOAL_COLOUR, mec="white", mew=0.8, zorder=9)
 
 
-def _draw_shortest(axes: Axes, view: View, corners: np.ndarray, solids: Sequence[Solid]) -> None:
+def _plot_shortest(axes: Axes, view: View, corners: np.ndarray, solids: Sequence[Solid]) -> None:
     legs = [np.linspace(one, other, 200) for one, other in zip(corners, corners[1:], strict=False)]
     points = np.concatenate(legs)
-    flat, covered = view.project(points), hidden(points, solids, view)[:, None]
+    flat, covered = view.project(points), is_occluded(points, solids, view)[:, None]
     style: dict[str, Any] = {"color": SHORTEST_COLOUR, "ls": (0, (4, 2.5)), "zorder": 5}
     axes.plot(*np.where(covered, flat, np.nan).T, lw=0.7, alpha=0.45, **style)
     axes.plot(*np.where(covered, np.nan, flat).T, lw=1.2, **style)
 
 
-def _draw_flown(
+def _plot_flown(
     axes: Axes, view: View, points: np.ndarray, speed: np.ndarray, scale: Normalize, solids: Sequence[Solid]
 ) -> None:
     flat = view.project(points)
     pieces = np.stack([flat[:-1], flat[1:]], axis=1)
-    covered = hidden((points[:-1] + points[1:]) / 2, solids, view)
+    covered = is_occluded((points[:-1] + points[1:]) / 2, solids, view)
     middle_speed = (speed[:-1] + speed[1:]) / 2
     halo = LineCollection(list(pieces[~covered]), colors="white", linewidths=HALO, capstyle="round", zorder=6)
     axes.add_collection(halo)

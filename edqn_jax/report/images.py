@@ -13,7 +13,7 @@ from matplotlib.colors import Colormap, Normalize
 from matplotlib.figure import Figure
 
 from edqn_jax.config.registry import SENSORS
-from edqn_jax.report.style import COUNTS, INK, POLARITY, drawing, frame
+from edqn_jax.report.style import COUNTS, INK, POLARITY, frame, open_figure
 
 
 @dataclasses.dataclass(frozen=True)
@@ -40,7 +40,7 @@ RECONSTRUCTED_EVENTS = Look("events", "events per pixel\n(ON + OFF)", COUNTS)
 """The VAE's reconstruction of events: their number per pixel, whatever the sign."""
 
 
-def draw_sight(
+def plot_sight(
     rgb: np.ndarray,
     native_rgb: np.ndarray,
     shown: np.ndarray,
@@ -63,7 +63,7 @@ def draw_sight(
     rows = [("RGB", rgb), (f"RGB, {size}", native_rgb), (f"{look.name}, {size}", shown)]
     moments = len(shown)
     scale = scale_of(shown, look)
-    with drawing(1.75 * moments + 0.9, 4.1, file) as figure:
+    with open_figure(1.75 * moments + 0.9, 4.1, file) as figure:
         grid = figure.subplots(len(rows), moments, squeeze=False)
         for row, (name, pictures) in enumerate(rows):
             for column, picture in enumerate(np.asarray(pictures)):
@@ -80,9 +80,9 @@ def draw_sight(
     return figure
 
 
-def draw_reconstruction(
+def plot_reconstruction(
     targets: np.ndarray,
-    drawn: np.ndarray,
+    decoded: np.ndarray,
     file: Path,
     look: Look = RECONSTRUCTED_EVENTS,
     seen: tuple[np.ndarray, Look] | None = None,
@@ -96,19 +96,19 @@ def draw_reconstruction(
         look: of both.
         seen: [N, h, w] what the sensor showed, and its look, for a row above.
     """
-    targets, drawn = np.asarray(targets), np.asarray(drawn)
+    targets, decoded = np.asarray(targets), np.asarray(decoded)
     scale = Normalize(0.0, _largest(targets)) if look is RECONSTRUCTED_EVENTS else scale_of(targets, look)
     name = look.name if seen is None else f"true {look.name}"
-    rows = [(f"{name}, blurred", targets, scale, look), ("from the code", drawn, scale, look)]
+    rows = [(f"{name}, blurred", targets, scale, look), ("from the code", decoded, scale, look)]
     if seen is not None:
         rows.insert(0, (seen[1].name, np.asarray(seen[0]), scale_of(seen[0], seen[1]), seen[1]))
-    with drawing(1.35 * len(targets) + 0.9, 1.15 * len(rows) + 0.15, file) as figure:
+    with open_figure(1.35 * len(targets) + 0.9, 1.15 * len(rows) + 0.15, file) as figure:
         grid = figure.subplots(len(rows), len(targets), squeeze=False)
         for line, (name, pictures, colours, row_look) in zip(grid, rows, strict=True):
             for axes, picture in zip(line, pictures, strict=True):
                 _show(axes, picture, colours, row_look)
             line[0].set_ylabel(name, fontsize=8)
-        for axes, wanted, made in zip(grid[-1], targets, drawn, strict=True):
+        for axes, wanted, made in zip(grid[-1], targets, decoded, strict=True):
             error = float(np.sqrt(np.mean((wanted - made) ** 2)))
             axes.set_xlabel(f"RMS error {error:.2f}", fontsize=7, labelpad=2)
         _colour_bar(figure, scale, grid, look, look.unit)

@@ -13,7 +13,7 @@ from rich.progress_bar import ProgressBar
 from rich.table import Table
 from rich.text import Text
 
-from edqn_jax.evaluation.metrics import clock
+from edqn_jax.evaluation.metrics import format_duration
 
 SHOWN = {
     "decisions_per_second": ("decisions/s", "{:,.0f}"),
@@ -63,7 +63,7 @@ class Progress:
         if self._console.is_terminal:
             self._start_live()
         elif not returning:
-            self.message(f"[{clock(self.elapsed_s)}] {name}")
+            self.message(f"[{format_duration(self.elapsed_s)}] {name}")
 
     def update(self, metrics: Mapping[str, Any]) -> None:
         """Takes in new values: `phase`, `decisions`, and any of `SHOWN`; others are not shown."""
@@ -110,7 +110,7 @@ class Progress:
         if self._measured <= 0:
             return "–"
         left = max(self._total - self._decisions(), 0) * self._measured_s / self._measured
-        return clock(max(left - (time.monotonic() - (self._updated or (0.0, 0))[0]), 0.0))
+        return format_duration(max(left - (time.monotonic() - (self._updated or (0.0, 0))[0]), 0.0))
 
     def _values(self) -> list[tuple[str, str]]:
         return [
@@ -121,7 +121,7 @@ class Progress:
 
     def _line(self) -> str:
         share = self._decisions() / self._total if self._total else 0.0
-        head = f"[{clock(self.elapsed_s)}] {self._phase} {self._decisions():,} ({share:.0%})"
+        head = f"[{format_duration(self.elapsed_s)}] {self._phase} {self._decisions():,} ({share:.0%})"
         values = "".join(f"  {label} {value}" for label, value in self._values())
         return f"{head}{values}  training left {self._remaining()}"
 
@@ -130,8 +130,8 @@ class Progress:
         head.add_column()
         head.add_column(ratio=1)
         head.add_column(justify="right")
-        phase = Text(f"{self._phase} {clock(time.monotonic() - self._phase_started)}", style="bold")
-        total = f"{clock(self.elapsed_s)} in all"
+        phase = Text(f"{self._phase} {format_duration(time.monotonic() - self._phase_started)}", style="bold")
+        total = f"{format_duration(self.elapsed_s)} in all"
         if self._total:
             bar = ProgressBar(total=self._total, completed=self._decisions())
             done = f"{self._decisions():,} / {self._total:,}"

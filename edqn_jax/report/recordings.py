@@ -14,14 +14,14 @@ from matplotlib.image import AxesImage
 from numpy.typing import NDArray
 from PIL import Image
 
-from edqn_jax.report.animation import gif
+from edqn_jax.report.animation import encode_gif
 from edqn_jax.report.images import Look, scale_of
-from edqn_jax.report.style import MUTED, STYLE, drawing, frame
+from edqn_jax.report.style import MUTED, STYLE, frame, open_figure
 
 MOMENTS = 6
 """Moments of a still picture."""
 
-MOST_FRAMES = 120
+MAX_FRAMES = 120
 """Frames of the longest GIF; of a longer recording every other window is shown, or fewer."""
 
 COLOURS = 256
@@ -42,12 +42,12 @@ class Strip:
     look: Look
 
 
-def moments(windows: int, most: int) -> NDArray[np.int64]:
+def pick_windows(windows: int, most: int) -> NDArray[np.int64]:
     """Returns the numbers [M] of at most `most` windows, evenly from the first to the last."""
     return np.unique(np.linspace(0, windows - 1, min(windows, most)).round().astype(np.int64))
 
 
-def draw_recording(strips: Sequence[Strip], times_s: Sequence[float], file: Path) -> Figure:
+def plot_recording(strips: Sequence[Strip], times_s: Sequence[float], file: Path) -> Figure:
     """Draws strips of pictures under each other, one column a moment.
 
     Args:
@@ -55,7 +55,7 @@ def draw_recording(strips: Sequence[Strip], times_s: Sequence[float], file: Path
         times_s: [M] seconds since the first event.
         file: PNG to write.
     """
-    with drawing(1.75 * len(times_s) + 0.6, 1.45 * len(strips) + 0.2, file) as figure:
+    with open_figure(1.75 * len(times_s) + 0.6, 1.45 * len(strips) + 0.2, file) as figure:
         grid = figure.subplots(len(strips), len(times_s), squeeze=False)
         for line, strip in zip(grid, strips, strict=True):
             scale = scale_of(strip.pictures, strip.look)
@@ -92,7 +92,7 @@ def animate_recording(strips: Sequence[Strip], times_s: Sequence[float], period_
             clock.set_text(f"t = {time:.2f} s")
             canvas.draw()
             frames.append(Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3]))
-    return gif(frames, [float(np.clip(period_s, FASTEST_S, SLOWEST_S))] * len(frames), COLOURS)
+    return encode_gif(frames, [float(np.clip(period_s, FASTEST_S, SLOWEST_S))] * len(frames), COLOURS)
 
 
 def _image(axes, picture: NDArray, strip: Strip, scale) -> AxesImage:

@@ -33,7 +33,7 @@ FINE = 8
 
 
 @dataclasses.dataclass(frozen=True)
-class Shown:
+class SensorImages:
     """The sensor's images at D decisions, with the VAE's targets and reconstructions."""
 
     image: np.ndarray
@@ -48,10 +48,10 @@ class Shown:
 
 
 _Images = tuple[Array, ...]
-"""As the fields of `Shown`, without the last two where there is no decoder."""
+"""As the fields of `SensorImages`, without the last two where there is no decoder."""
 
 
-class Sights:
+class FlightRenderer:
     """Programs that draw images in one world; compiled in the background, since that takes seconds."""
 
     def __init__(self, config: Config, scene: Scene, pool: Executor, *, decodes: bool = True) -> None:
@@ -70,25 +70,27 @@ class Sights:
         self._shown = pool.submit(self._compile_shown) if self.has_image else None
         self._rgb = pool.submit(self._compile_rgb)
 
-    def in_world(self, scene: Scene) -> Sights:
+    def in_world(self, scene: Scene) -> FlightRenderer:
         """Returns the same programs for another world whose arrays have the same shapes."""
         other = copy.copy(self)
         other.scene = scene
         return other
 
-    def shown(self, params: PolicyParams | None, flown: Mapping[str, np.ndarray]) -> Shown:
-        """Returns what the sensor shows at each decision of a flight, and what the VAE makes of it.
+    def shown(self, params: PolicyParams | None, trajectory: Mapping[str, np.ndarray]) -> SensorImages:
+        """Returns the sensor's images at each decision of a flight, and their reconstructions.
 
         Args:
             params: whose VAE; None without a decoder.
             flown: the columns of `trajectory.csv`, as `decision_rows`.
         """
         assert self._shown is not None, "this sensor shows no image"
-        rows = decision_rows(self.config, flown)
+        rows = decision_rows(self.config, trajectory)
         padded = np.pad(rows, ((0, self.config.env.max_decisions - len(rows)), (0, 0)), mode="edge")
-        motions = own_motions(self.config, flown, padded)
-        found = self._shown.result()(self.scene, params, *poses(flown, padded), times_of(flown, padded), motions)
-        return Shown(*(np.asarray(leaf)[: len(rows)] for leaf in found))
+        motions = own_motions(self.config, trajectory, padded)
+        found = self._shown.result()(
+            self.scene, params, *trajectory_poses(trajectory, padded), times_of(trajectory, padded), motions
+        )
+        return SensorImages(*(np.asarray(leaf)[: len(rows)] for leaf in found))
 
     def rgb(self, position: np.ndarray, quaternion: np.ndarray, time: npt.ArrayLike = 0.0) -> np.ndarray:
         """Returns the linear RGB [FINE H, FINE W, 3] of the drone's camera at a pose and a time, a ray per pixel."""
@@ -116,21 +118,21 @@ class Sights:
             here = Flight(position, quaternion, jnp.zeros_like(position), time)
             now = scene_at(scene, time[-1])
             sensed, memory = sensor.sense(config, scene, here, memory, key)
-            image, luma = shows.picture(config, sensed), sensor.view(config, now, position[-1], quaternion[-1])
+            image, luma = shows.picture(config, sensed), sensor.render_view(config, now, position[-1], quaternion[-1])
             if params is None:
                 return memory, (image, luma)
             nearness = None
             if embedding.needs_nearness(config):
                 nearness = sensor.nearness_image(config, now, position[-1], quaternion[-1])
-            # What it knows of the goal is no part of a code.
+            # The goal is not part of a code.
             observation = Observation(sensed=sensed, own=jnp.zeros(OWN_SIZE), motion=motion)
             code = actor.code(actor.encode(params, actor.init(), observation))
             read = shows.encoder_input(config, sensed)
             assert read is not None
-            target = vae.target(config.encoder, read, nearness)
+            target = vae.decoder_target(config.encoder, read, nearness)
             made = vae.decode(config.encoder, config.camera, params.encoder, code)
-            drawn = (_drawn(config, channels) for channels in (target, made))
-            return memory, (image, luma, *drawn)
+            pictures = (_as_picture(config, channels) for channels in (target, made))
+            return memory, (image, luma, *pictures)
 
         keys = jax.random.split(rest, len(position))
         before = sensor.at_rest(config, start)
@@ -144,48 +146,51 @@ class Sights:
         return _compiled(picture, self.scene, *_blank_poses())
 
 
-def decision_rows(config: Config, flown: Mapping[str, np.ndarray]) -> np.ndarray:
+def decision_rows(config: Config, trajectory: Mapping[str, np.ndarray]) -> np.ndarray:
     """Returns the rows [D, T] of a trajectory at which the sensor looks, T of them for each whole decision.
 
     Args:
         flown: the columns of `trajectory.csv`, each [rows]; row k stands after physics step k + 1.
     """
-    n, steps = config.drone.physics_steps, len(flown["t"])
+    n, steps = config.drone.physics_steps, len(trajectory["t"])
     decisions = np.arange(max(steps // n, 1))[:, None]
     return np.clip(decisions * n + np.array(sensor.frame_steps(config)) - 1, 0, steps - 1)
 
 
-def poses(flown: Mapping[str, np.ndarray], rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def trajectory_poses(trajectory: Mapping[str, np.ndarray], rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Returns positions [..., 3] in metres and attitudes [..., 4] of a trajectory at rows [...]."""
-    position, quaternion = (columns_of(flown, names)[rows] for names in (POSITION, ATTITUDE))
+    position, quaternion = (columns_of(trajectory, names)[rows] for names in (POSITION, ATTITUDE))
     return position.astype(np.float32), quaternion.astype(np.float32)
 
 
-def times_of(flown: Mapping[str, np.ndarray], rows: np.ndarray) -> np.ndarray:
+def times_of(trajectory: Mapping[str, np.ndarray], rows: np.ndarray) -> np.ndarray:
     """Returns the times [...] of a trajectory at rows [...], seconds."""
-    return np.asarray(flown["t"])[rows].astype(np.float32)
+    return np.asarray(trajectory["t"])[rows].astype(np.float32)
 
 
-def coarse(picture: np.ndarray) -> np.ndarray:
+def downsample_picture(picture: np.ndarray) -> np.ndarray:
     """Returns a linear RGB picture [..., FINE H, FINE W, 3] at the drone's resolution, [..., H, W, 3]."""
     *many, height, width, channels = picture.shape
     blocks = picture.reshape(*many, height // FINE, FINE, width // FINE, FINE, channels)
     return blocks.mean(axis=(-4, -2))
 
 
-def own_motions(config: Config, flown: Mapping[str, np.ndarray], rows: np.ndarray) -> np.ndarray:
+def own_motions(config: Config, trajectory: Mapping[str, np.ndarray], rows: np.ndarray) -> np.ndarray:
     """Returns the own motions [D, MOTION_SIZE] at the last of each decision's rows [D, T], as `own_motion`.
 
     The yaw rate is that of the heading between the last two rows, which a trajectory holds.
     """
     last = rows[:, -1]
-    (place, now), (_, before) = poses(flown, last), poses(flown, np.maximum(last - 1, 0))
+    (place, now), (_, before) = (
+        trajectory_poses(trajectory, last),
+        trajectory_poses(trajectory, np.maximum(last - 1, 0)),
+    )
     yaw = drone.yaw_of(jnp.asarray(now))
     rate = drone.wrap_angle(yaw - drone.yaw_of(jnp.asarray(before))) / config.drone.physics_dt_s
-    velocity = jnp.asarray(columns_of(flown, VELOCITY)[last])
+    velocity = jnp.asarray(columns_of(trajectory, VELOCITY)[last])
     ahead = heading_velocity(config.env, yaw, velocity)
     after = Flight(jnp.asarray(place), jnp.asarray(now), velocity)
-    commanded = directions(config, after, actions_of(flown)[last])
+    commanded = directions(config, after, actions_of(trajectory)[last])
     return np.concatenate([ahead, np.asarray(rate)[:, None], commanded], axis=-1).astype(np.float32)
 
 
@@ -198,8 +203,8 @@ def _blank_poses(*shape: int) -> tuple[jax.ShapeDtypeStruct, ...]:
     return tuple(jax.ShapeDtypeStruct((*shape, *size), np.float32) for size in ((3,), (4,), ()))
 
 
-def _drawn(config: Config, channels: Array) -> Array:
-    """Returns what there is to look at in a target [C, H, W] of `vae.target`: [H, W], in the units of what is shown."""
+def _as_picture(config: Config, channels: Array) -> Array:
+    """Returns the channel to display, [H, W] in its units, of a target [C, H, W] of `vae.decoder_target`."""
     if embedding.needs_nearness(config):
         return channels[-1]
     return sensor.sensor_of(config).picture_of_target(config, channels)

@@ -77,10 +77,10 @@ MAP = View(azimuth=-90.0, elevation=90.0)
 
 def solids_of(scene: Scene) -> list[Solid]:
     """Returns every shape of one world that is not parked; planes are left out, the ground is drawn by itself."""
-    return [Solid(list(kind.faces(shape)), shape.albedo) for kind, shape in present(scene) if kind.faces]
+    return [Solid(list(kind.faces(shape)), shape.albedo) for kind, shape in standing_rows(scene) if kind.faces]
 
 
-def standing(scene: Scene) -> Scene:
+def static_scene(scene: Scene) -> Scene:
     """Returns one world without the shapes that move, and without drones."""
     scene = dataclasses.replace(scene, drones=None)
     return _only(scene, scene_at(scene, None), moving=False)
@@ -112,7 +112,7 @@ def _only(scene: Scene, now: Scene, moving: bool) -> Scene:
 
 
 @dataclass(frozen=True)
-class CutOpen:
+class CutawayView:
     """A world's solids for one view, sorted into what is drawn and what would hide all the rest."""
 
     shown: list[Solid]
@@ -131,7 +131,7 @@ class CutOpen:
         return "; ".join(notes + (["outlined: what moves, as at the start"] if self.moving else []))
 
 
-def cut_open(scene: Scene, view: View) -> CutOpen:
+def make_cutaway(scene: Scene, view: View) -> CutawayView:
     """Returns a world as it is drawn: without its ceiling, without outer walls before the eye, and what moves apart.
 
     A ceiling is a box or another shape in the upper half of the volume that covers nearly all of it, or a plane
@@ -142,18 +142,18 @@ def cut_open(scene: Scene, view: View) -> CutOpen:
     planes = zip(np.asarray(scene.planes.position), np.asarray(scene.planes.normal), strict=True)
     has_ceiling = any(normal[2] < -0.9 and middle < position[2] < PARKED / 10 for position, normal in planes)
     shown, near_walls = [], []
-    for solid in solids_of(standing(scene)):
-        side = closed_side(solid, lower, upper)
+    for solid in solids_of(static_scene(scene)):
+        side = boundary_side(solid, lower, upper)
         if side == (2, 1):
             has_ceiling = True
         elif side is not None and side[1] * view.towards[side[0]] > 1e-6:
             near_walls.append(solid)
         else:
             shown.append(solid)
-    return CutOpen(shown, near_walls, has_ceiling, moving_solids(scene, 0.0))
+    return CutawayView(shown, near_walls, has_ceiling, moving_solids(scene, 0.0))
 
 
-def closed_side(solid: Solid, lower: np.ndarray, upper: np.ndarray) -> tuple[int, int] | None:
+def boundary_side(solid: Solid, lower: np.ndarray, upper: np.ndarray) -> tuple[int, int] | None:
     """Returns which side of the volume from `lower` [3] to `upper` [3] a solid closes: its axis, and -1 or 1.
 
     A ceiling closes (2, 1), an outer wall a side of axis 0 or 1; None of other solids.
@@ -175,7 +175,7 @@ def _at_rim(axis: int, side: float, low: np.ndarray, high: np.ndarray, lower: np
     return bool(low[axis] >= upper[axis] - within if side > 0 else high[axis] <= lower[axis] + within)
 
 
-def draw_outlines(axes: Axes, view: View, solids: Sequence[Solid]) -> None:
+def plot_outlines(axes: Axes, view: View, solids: Sequence[Solid]) -> None:
     """Draws the edges of the faces that look at the eye, so that the view goes through."""
     rings = [
         view.project(face)
@@ -187,7 +187,7 @@ def draw_outlines(axes: Axes, view: View, solids: Sequence[Solid]) -> None:
     axes.add_collection(edges)
 
 
-def draw_solids(axes: Axes, view: View, solids: Sequence[Solid]) -> None:
+def plot_solids(axes: Axes, view: View, solids: Sequence[Solid]) -> None:
     """Draws the solids, the far ones first, each as its faces that look at the eye."""
     rings, colours = faces_seen(view, solids)
     # Edges in the face's own colour close the hairline between neighbouring faces.
@@ -206,7 +206,7 @@ def faces_seen(view: View, solids: Sequence[Solid]) -> tuple[list[np.ndarray], l
     return rings, colours
 
 
-def draw_shadows(axes: Axes, view: View, solids: Sequence[Solid], floor: np.ndarray) -> None:
+def plot_shadows(axes: Axes, view: View, solids: Sequence[Solid], floor: np.ndarray) -> None:
     """Draws the solids' shadows on the ground, as far as the floor's [4, 3] corners reach."""
     fallen = [view.project(_shadow(face)) for solid in solids for face in solid.faces]
     shadows = PolyCollection(fallen, facecolors=SHADOW, edgecolors="none", zorder=1)
@@ -214,7 +214,7 @@ def draw_shadows(axes: Axes, view: View, solids: Sequence[Solid], floor: np.ndar
     shadows.set_clip_path(Polygon(view.project(floor), transform=axes.transData))
 
 
-def hidden(points: np.ndarray, solids: Sequence[Solid], view: View) -> np.ndarray:
+def is_occluded(points: np.ndarray, solids: Sequence[Solid], view: View) -> np.ndarray:
     """Returns which of the points [P, 3], metres, a solid hides from the eye, [P] bool: clips rays by convex bodies."""
     covered = np.zeros(len(points), bool)
     for solid in solids:
@@ -231,7 +231,7 @@ def hidden(points: np.ndarray, solids: Sequence[Solid], view: View) -> np.ndarra
     return covered
 
 
-def present(scene: Scene) -> Iterator[tuple[ShapeKind, Any]]:
+def standing_rows(scene: Scene) -> Iterator[tuple[ShapeKind, Any]]:
     """Yields kind and shape, of float64, of each that is drawn and stands in the world."""
     for name, shapes in scene.shapes().items():
         kind = SHAPES.get(name)

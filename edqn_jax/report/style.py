@@ -75,7 +75,7 @@ DOTS_PER_INCH = 220
 
 
 @contextmanager
-def drawing(width: float, height: float, file: Path) -> Iterator[Figure]:
+def open_figure(width: float, height: float, file: Path) -> Iterator[Figure]:
     """Makes a figure of `width` x `height` inches in the project's style, written to `file` at the end of the block."""
     with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(width, height), dpi=DOTS_PER_INCH, layout="constrained")

@@ -6,7 +6,7 @@ import dataclasses
 from pathlib import Path
 
 from edqn_jax.config import Config
-from edqn_jax.config.loading import apply, load_layer
+from edqn_jax.config.loading import apply_layer, load_layer
 from edqn_jax.config.rules import validate
 from edqn_jax.errors import ConfigError
 from edqn_jax.runs.directory import SEED_FOLDER, RunDirectory
@@ -19,7 +19,7 @@ MAY_CHANGE = (
 
 
 @dataclasses.dataclass(frozen=True)
-class Begun:
+class ExistingRun:
     """A run that a folder holds."""
 
     config: Config
@@ -27,7 +27,7 @@ class Begun:
     """Agents with folders of their own; None for a run of one agent."""
 
 
-def begun(folder: Path) -> Begun | None:
+def find_run(folder: Path) -> ExistingRun | None:
     """Returns the run that a folder holds; None where there is none.
 
     Raises:
@@ -43,13 +43,13 @@ def begun(folder: Path) -> Begun | None:
     layer = load_layer(run.config_file)
     if not layer:
         raise ConfigError(f"'{run.config_file}' is empty: it does not say what the run in '{folder}' is")
-    config = apply(Config(), layer, str(run.config_file))
+    config = apply_layer(Config(), layer, str(run.config_file))
     validate(config)
-    return Begun(config, seeds or None)
+    return ExistingRun(config, seeds or None)
 
 
-def continued(folder: Path, run: Begun, config: Config, seeds: int | None) -> Config:
-    """Returns the options that a run goes on with: its own, and what was asked for where it may change.
+def resume_config(folder: Path, run: ExistingRun, config: Config, seeds: int | None) -> Config:
+    """Returns the options of a continued run: its own, with the given ones where they may change.
 
     Args:
         folder: of the run, for messages.
@@ -64,7 +64,7 @@ def continued(folder: Path, run: Begun, config: Config, seeds: int | None) -> Co
             f"'{folder}' holds {_described(run.seeds)}, not {_described(seeds)}; leave --seeds out to continue it, or "
             "give another folder"
         )
-    differ = [name for name in differences(run.config, config) if name not in MAY_CHANGE]
+    differ = [name for name in option_differences(run.config, config) if name not in MAY_CHANGE]
     if differ:
         said = "; ".join(f"{name} was {_of(run.config, name)} and is now {_of(config, name)}" for name in differ)
         raise ConfigError(
@@ -79,7 +79,7 @@ def continued(folder: Path, run: Begun, config: Config, seeds: int | None) -> Co
     return dataclasses.replace(config, train=dataclasses.replace(config.train, schedule_steps=schedule))
 
 
-def differences(one: Config, other: Config) -> list[str]:
+def option_differences(one: Config, other: Config) -> list[str]:
     """Returns the names of the options in which two configurations differ, such as `agent.n_step`."""
     return [
         f"{group.name}.{option.name}"
@@ -89,7 +89,7 @@ def differences(one: Config, other: Config) -> list[str]:
     ]
 
 
-def _schedule(run: Begun) -> int:
+def _schedule(run: ExistingRun) -> int:
     return run.config.train.schedule_steps
 
 

@@ -16,9 +16,9 @@ from typing import Any, Literal
 import numpy as np
 
 from edqn_jax.config import Config
-from edqn_jax.config.loading import apply, load_layer, to_yaml
+from edqn_jax.config.loading import apply_layer, load_layer, to_yaml
 from edqn_jax.errors import ConfigError
-from edqn_jax.files import check_can_make, unwritable, write_atomically
+from edqn_jax.files import check_can_make, write_atomically, write_error
 from edqn_jax.runs.lock import LOCK, Lock
 from edqn_jax.version import package_version
 
@@ -41,15 +41,15 @@ SEED_FOLDER = "seed-"
 
 @dataclass(frozen=True)
 class RunDirectory:
-    """A run directory. `locked` makes it on disk, `begin` writes what a run begins with."""
+    """A run directory. `hold_lock` makes it on disk, `begin` writes what a run begins with."""
 
     path: Path
     must_be_new: bool = False
-    """Whether `locked` refuses an existing folder: another run may have created it meanwhile."""
+    """Whether `hold_lock` refuses an existing folder: another run may have created it meanwhile."""
     resume: Resume = "never"
     """Whether a run in it is continued: `must` refuses to begin one anew."""
     was_empty: bool = False
-    """Whether `locked` refuses a folder with a run in it: none was there before."""
+    """Whether `hold_lock` refuses a folder with a run in it."""
 
     @property
     def config_file(self) -> Path:
@@ -80,7 +80,7 @@ class RunDirectory:
         return self.path / "checkpoints"
 
     @property
-    def finished(self) -> bool:
+    def is_finished(self) -> bool:
         """Whether the run has nothing left to do: it has a summary, and its figures are drawn or cannot be."""
         try:
             return json.loads(self.summary_file.read_text(encoding="utf-8")).get("figures") != TO_BE_DRAWN
@@ -100,7 +100,7 @@ class RunDirectory:
         return RunDirectory(self.path / f"{SEED_FOLDER}{seed}")
 
     @contextlib.contextmanager
-    def locked(self) -> Iterator[None]:
+    def hold_lock(self) -> Iterator[None]:
         """Makes the folder if there is none, and locks it until the end of the `with` block.
 
         A folder that it made is deleted again if nothing has been written to it by then.
@@ -115,14 +115,14 @@ class RunDirectory:
                 if not there:
                     held.callback(self._remove_if_empty)
                 held.enter_context(Lock(self.path))
-                if (self.finished and self.resume == "never") or (self.was_empty and self.config_file.exists()):
+                if (self.is_finished and self.resume == "never") or (self.was_empty and self.config_file.exists()):
                     raise ConfigError(f"another run was made in '{self.path}' meanwhile; give another folder")
             except FileExistsError as error:
                 if self.must_be_new:
                     raise ConfigError(f"another run has just created '{self.path}'; start this one again") from None
-                raise unwritable(self.path, f"'{error.filename}' is in the way; move it away") from None
+                raise write_error(self.path, f"'{error.filename}' is in the way; move it away") from None
             except OSError as error:
-                raise unwritable(self.path, error.strerror) from None
+                raise write_error(self.path, error.strerror) from None
             yield
 
     def _remove_if_empty(self) -> None:
@@ -152,9 +152,9 @@ class RunDirectory:
             for run, config in zip(runs, configs, strict=True):
                 run._begin_agent(config)
         except FileExistsError as error:
-            raise unwritable(self.path, f"'{error.filename}' is in the way; move it away") from None
+            raise write_error(self.path, f"'{error.filename}' is in the way; move it away") from None
         except OSError as error:
-            raise unwritable(self.path, error.strerror) from None
+            raise write_error(self.path, error.strerror) from None
 
     def _begin_agent(self, config: Config) -> None:
         """Makes the folders of an agent's run, `config.yaml` and the header of `episodes.csv`."""
@@ -183,7 +183,7 @@ class RunDirectory:
             for run in runs:
                 run.figures.mkdir(exist_ok=True)
         except OSError as error:
-            raise unwritable(self.path, error.strerror) from None
+            raise write_error(self.path, error.strerror) from None
 
     def append_metrics(self, metrics: Mapping[str, Any]) -> None:
         """Adds one line to `metrics.jsonl`.
@@ -191,7 +191,7 @@ class RunDirectory:
         Raises:
             ConfigError: if it cannot be written.
         """
-        _append(self.metrics_file, json.dumps(plain(metrics), allow_nan=False) + "\n")
+        _append(self.metrics_file, json.dumps(to_plain_json(metrics), allow_nan=False) + "\n")
 
     def append_episodes(self, episodes: Iterable[tuple[int, float, int, str]]) -> None:
         """Adds rows of `EPISODE_COLUMNS` to `episodes.csv`.
@@ -208,7 +208,7 @@ class RunDirectory:
         Raises:
             ConfigError: if it cannot be written.
         """
-        write_atomically(self.summary_file, json.dumps(plain(summary), indent=2, allow_nan=False) + "\n")
+        write_atomically(self.summary_file, json.dumps(to_plain_json(summary), indent=2, allow_nan=False) + "\n")
 
     def write_trajectory(self, columns: Mapping[str, np.ndarray]) -> None:
         """Writes `trajectory.csv` from the columns [T] of `evaluation.trajectories.trajectory`.
@@ -271,14 +271,14 @@ def plan_run_directory(given: Path | None, config: Config, resume: Resume = "aut
     try:
         taken = given.exists()
     except OSError as error:  # a name that the file system does not accept
-        raise unwritable(given, error.strerror) from None
+        raise write_error(given, error.strerror) from None
     if taken and not given.is_dir():
         raise ConfigError(f"--run-dir '{given}' is a file; give a folder")
     # A run that could not write its options, on a full disk, has left empty folders.
     occupied = taken and any(path.name != LOCK and not path.is_dir() for path in given.rglob("*"))
     if occupied and not _is_ours(run.config_file):
         raise ConfigError(f"--run-dir '{given}' holds files that are not an edqn run; give a new or empty folder")
-    if run.finished and (resume == "never" or not _asks_for_more(run, config)):
+    if run.is_finished and (resume == "never" or not _asks_for_more(run, config)):
         more = "" if resume == "never" else ", or more decisions with --total-steps to continue it"
         raise ConfigError(f"--run-dir '{given}' holds a finished run; give another folder{more}")
     if resume == "must" and not occupied:
@@ -289,7 +289,7 @@ def plan_run_directory(given: Path | None, config: Config, resume: Resume = "aut
 
 def _asks_for_more(run: RunDirectory, config: Config) -> bool:
     """Returns whether a finished run is to take more decisions than it has."""
-    before = apply(Config(), load_layer(run.config_file), str(run.config_file))
+    before = apply_layer(Config(), load_layer(run.config_file), str(run.config_file))
     return config.train.total_steps > before.train.total_steps
 
 
@@ -307,16 +307,16 @@ def version_of(config_file: Path) -> str | None:
     return first.removeprefix(_VERSION).strip() if first.startswith(_VERSION) else None
 
 
-def plain(value: Any) -> Any:
+def to_plain_json(value: Any) -> Any:
     """Returns `value` as plain JSON data: NumPy and JAX arrays as numbers and lists, NaN and Inf as None."""
     if isinstance(value, Mapping):
-        return {str(key): plain(item) for key, item in value.items()}
+        return {str(key): to_plain_json(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
-        return [plain(item) for item in value]
+        return [to_plain_json(item) for item in value]
     if isinstance(value, Path):
         return str(value)
     if hasattr(value, "tolist"):
-        return plain(value.tolist())
+        return to_plain_json(value.tolist())
     if isinstance(value, float) and not math.isfinite(value):
         return None
     return value
@@ -327,7 +327,7 @@ def _append(file: Path, text: str) -> None:
         with file.open("a", encoding="utf-8", newline="") as opened:
             opened.write(text)
     except OSError as error:
-        raise unwritable(file, error.strerror) from None
+        raise write_error(file, error.strerror) from None
 
 
 def _fresh(parent: Path, config: Config) -> Path:
@@ -343,7 +343,7 @@ def _fresh(parent: Path, config: Config) -> Path:
 def _is_ours(config_file: Path) -> bool:
     """Returns whether `config.yaml` is a configuration of this package."""
     try:
-        apply(Config(), load_layer(config_file), str(config_file))
+        apply_layer(Config(), load_layer(config_file), str(config_file))
     except ConfigError:
         return False
     return True

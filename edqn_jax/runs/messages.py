@@ -5,13 +5,13 @@ from __future__ import annotations
 from typing import Any
 
 from edqn_jax.config import FAMILIES, Config
-from edqn_jax.evaluation.metrics import clearance_text, clock
-from edqn_jax.learn.plan import Plan
+from edqn_jax.evaluation.metrics import clearance_text, format_duration
+from edqn_jax.learn.schedule import Schedule
 from edqn_jax.runs.directory import RunDirectory
-from edqn_jax.training.setup import Preparation
+from edqn_jax.training.setup import TrainingSetup
 
 
-def beginning(preparation: Preparation, seeds: int | None) -> str:
+def describe_start(preparation: TrainingSetup, seeds: int | None) -> str:
     """Returns where a run trains, and on a line of its own what was decided about its missions."""
     world, devices = preparation.config.world, preparation.devices
     text = f"{world.pool_size:,} random {world.name} worlds" if world.name in FAMILIES else f"world '{world.name}'"
@@ -23,19 +23,19 @@ def beginning(preparation: Preparation, seeds: int | None) -> str:
     return text if note is None else f"{text}\n{note}"
 
 
-def continued_at(plan: Plan, done: int, config: Config) -> str:
+def describe_continuation(schedule: Schedule, done: int, config: Config) -> str:
     """Returns that a run goes on, and what that means for its schedules, as lines for the screen."""
     envs = config.train.num_envs
-    text = f"continued after {done * envs:,} of {plan.total * envs:,} decisions"
-    if plan.scheduled < plan.total:
+    text = f"continued after {done * envs:,} of {schedule.total * envs:,} decisions"
+    if schedule.scheduled < schedule.total:
         text += (
-            f"; exploration and step size were planned for {plan.scheduled * envs:,} and stay from there on what they "
-            "are at that end, and the encoder is not trained again"
+            f"; exploration and step size were planned for {schedule.scheduled * envs:,} and stay from there on "
+            "what they are at that end, and the encoder is not trained again"
         )
     return text
 
 
-def stopped(run: RunDirectory | None, decisions: int, seeds: int | None) -> str:
+def describe_stop(run: RunDirectory | None, decisions: int, seeds: int | None) -> str:
     """Returns that a run was stopped, and where its policy is."""
     what = "the policy" if seeds is None else "the policies"
     if run is None:
@@ -74,7 +74,8 @@ def _of_one(summary: dict[str, Any]) -> str:
             f"({test['success_rate']:.0%}, 95 % Wilson interval {low:.0%} to {high:.0%})."
         )
     return (
-        f"{text}\nTook {clock(summary['total_seconds'])} in all, {clock(summary['train_seconds'])} of it training. "
+        f"{text}\nTook {format_duration(summary['total_seconds'])} in all, "
+        f"{format_duration(summary['train_seconds'])} of it training. "
         "Everything is in"
     )
 
@@ -84,13 +85,14 @@ def _of_seeds(summary: dict[str, Any]) -> str:
     each = ", ".join(
         f"seed {seed}: {rate:.1%}" for seed, rate in zip(summary["seeds"], summary["success_rates"], strict=True)
     )
-    flown = summary["flown"] != summary["world"]
-    missions = "unseen test worlds" if summary["missions"] > 1 or flown else "the mission"
-    last = f"\n{summary['flown_successes']} of {len(summary['seeds'])} reached the goal of {_unseen(summary)}."
+    has_final_world = summary["flown"] != summary["world"]
+    missions = "unseen test worlds" if summary["missions"] > 1 or has_final_world else "the mission"
+    last = f"\n{summary['flown_successes']} of {len(summary['seeds'])} reached the goal of {_last_world(summary)}."
     return (
         f"Reached the goal in {missions}: {each}.\nInterquartile mean {summary['success_iqm']:.1%}, mean "
-        f"{summary['success_mean']:.1%} (95 % interval {low:.1%} to {high:.1%}).{last if flown else ''}\n"
-        f"Took {clock(summary['total_seconds'])} in all, {clock(summary['train_seconds'])} of it training. Each seed's "
+        f"{summary['success_mean']:.1%} (95 % interval {low:.1%} to {high:.1%}).{last if has_final_world else ''}\n"
+        f"Took {format_duration(summary['total_seconds'])} in all, "
+        f"{format_duration(summary['train_seconds'])} of it training. Each seed's "
         "run is in"
     )
 
@@ -99,11 +101,11 @@ def _flight(summary: dict[str, Any]) -> str:
     """Returns which flight the verdict is about."""
     if summary["flown"] == summary["world"]:
         return "The greedy flight"
-    return f"The greedy flight through {_unseen(summary)},"
+    return f"The greedy flight through {_last_world(summary)},"
 
 
-def _unseen(summary: dict[str, Any]) -> str:
-    """Returns what the world of the last flight of a run in random worlds is, for the screen."""
+def _last_world(summary: dict[str, Any]) -> str:
+    """Describes the world of the last flight of a run in random worlds, for the screen."""
     where = "the paper's map" if summary["flown"] == "paper" else f"'{summary['flown']}'"
     return f"{where}, which training never used"
 

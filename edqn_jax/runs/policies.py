@@ -8,7 +8,7 @@ import jax
 import numpy as np
 
 from edqn_jax.config import Config
-from edqn_jax.config.loading import apply, load_layer
+from edqn_jax.config.loading import apply_layer, load_layer
 from edqn_jax.config.rules import validate
 from edqn_jax.devices.forks import check_not_forked
 from edqn_jax.devices.jax_settings import as_tested
@@ -18,8 +18,8 @@ from edqn_jax.learn.policy import Policy, PolicyParams, fresh_policy
 from edqn_jax.policies import function_named, no_run, policy_folder
 from edqn_jax.policies.functions import FunctionPolicy, as_policy, check_has_params, load_function
 from edqn_jax.runs import world_copy
-from edqn_jax.runs.checkpoints.params import load_params, save_params, saved_at
-from edqn_jax.runs.checkpoints.sealed import digest
+from edqn_jax.runs.checkpoints.params import load_params, policy_file, save_params
+from edqn_jax.runs.checkpoints.sealed import file_digest
 from edqn_jax.runs.directory import SEED_FOLDER, config_text, version_of
 from edqn_jax.version import package_version
 
@@ -101,7 +101,7 @@ def _loaded(folder: Path, file: Path) -> tuple[Config, PolicyParams]:
     layer = load_layer(file)
     if not layer:
         raise ConfigError(f"'{file}' is empty: it does not say what the policy beside it is")
-    config = apply(Config(), layer, str(file))
+    config = apply_layer(Config(), layer, str(file))
     validate(config, trains=False)
     params = load_params(folder / "checkpoints", file)
     fresh = jax.eval_shape(lambda: fresh_policy(config))
@@ -110,7 +110,7 @@ def _loaded(folder: Path, file: Path) -> tuple[Config, PolicyParams]:
             f"the policy in '{folder}' does not have the shapes that its config.yaml asks for in edqn_jax "
             f"{package_version()}; fly it with the version that trained it, or train it anew"
         )
-    return world_copy.flown_in(folder, config)[0], params
+    return world_copy.with_copied_worlds(folder, config)[0], params
 
 
 def worlds_replaced(run: Path) -> list[str]:
@@ -122,8 +122,8 @@ def worlds_replaced(run: Path) -> list[str]:
     if function_named(run) is not None:
         return []
     folder = policy_folder(run)
-    config = apply(Config(), load_layer(folder / "config.yaml"), str(folder / "config.yaml"))
-    return world_copy.flown_in(folder, config)[1]
+    config = apply_layer(Config(), load_layer(folder / "config.yaml"), str(folder / "config.yaml"))
+    return world_copy.with_copied_worlds(folder, config)[1]
 
 
 def policy_digest(run: Path) -> str:
@@ -132,7 +132,7 @@ def policy_digest(run: Path) -> str:
     Raises:
         ConfigError: if there is no policy.
     """
-    return digest(saved_at(policy_folder(run) / "checkpoints"))
+    return file_digest(policy_file(policy_folder(run) / "checkpoints"))
 
 
 def _shapes(params: PolicyParams) -> PolicyParams:

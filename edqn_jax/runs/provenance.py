@@ -27,7 +27,7 @@ from edqn_jax.sim.sensors.sensor import frames_per_decision
 from edqn_jax.sim.task.reward import Reward
 
 
-def workload(config: Config, scene: Scene) -> dict[str, Any]:
+def describe_workload(config: Config, scene: Scene) -> dict[str, Any]:
     """Returns the workload that a figure was measured for, as in the JSON of runs and benchmarks."""
     agent, envs = config.agent, config.train.num_envs
     return {
@@ -47,13 +47,13 @@ def workload(config: Config, scene: Scene) -> dict[str, Any]:
     }
 
 
-def versions() -> dict[str, str]:
+def package_versions() -> dict[str, str]:
     """Returns the versions of Python, of packages, and of the compilers of C, that figures depend on."""
     names = ("jax", "mujoco", "mujoco-mjx", "flax", "optax", "numpy")
     packages = {name: metadata.version(name) for name in names}
-    cuda = build.cuda()
+    cuda = build.cuda_compiler()
     compilers = {"C compiler": build.C} | ({} if cuda is None else {"CUDA compiler": cuda})
-    in_c = {name: build.compiler(each) or "none" for name, each in compilers.items()}
+    in_c = {name: build.compiler_version(each) or "none" for name, each in compilers.items()}
     return {"python": platform.python_version(), **packages, **in_c}
 
 
@@ -63,7 +63,7 @@ def state_digest(state: TrainState) -> str:
         jax.random.key_data(leaf) if jnp.issubdtype(leaf.dtype, jax.dtypes.prng_key) else leaf
         for leaf in jax.tree.leaves(state)
     )
-    return digest_of(np.asarray(processes.fetch(leaf)) for leaf in leaves)
+    return digest_of(np.asarray(processes.fetch_global(leaf)) for leaf in leaves)
 
 
 def digest_of(arrays: Iterable[np.ndarray]) -> str:

@@ -15,19 +15,19 @@ from edqn_jax.devices import processes
 from edqn_jax.errors import ConfigError, StoppedError
 from edqn_jax.evaluation.companions import scene_of_flight
 from edqn_jax.evaluation.metrics import flight_summary
-from edqn_jax.evaluation.trajectories import trajectory
+from edqn_jax.evaluation.trajectories import flight_trajectory
 from edqn_jax.learn import saved_state
 from edqn_jax.learn.policy import PolicyParams
 from edqn_jax.runs import messages, summaries, world_copy
+from edqn_jax.runs.checkpointer import Checkpointer
 from edqn_jax.runs.directory import TO_BE_DRAWN, RunDirectory
-from edqn_jax.runs.keeper import Keeper
 from edqn_jax.runs.provenance import state_digest
 from edqn_jax.runs.stopping import Stop
 from edqn_jax.sim.scene.scene import Scene
 from edqn_jax.sim.task.flights import Flights
 from edqn_jax.sim.task.reward import Reward
-from edqn_jax.training.loop import Callback, Chunk, Standing, TrainingResult, run_chunks
-from edqn_jax.training.setup import Display, Preparation, prepared
+from edqn_jax.training.loop import Callback, Chunk, RunProgress, TrainingResult, run_chunks
+from edqn_jax.training.setup import Display, TrainingSetup, set_up_training
 
 
 class Screen(Display, Protocol):
@@ -78,26 +78,26 @@ def train_run(
         DivergedError: as `train`; the policy of the last checkpoint stays.
         StoppedError: after saving the policy, if it was asked to.
     """
-    with locked(run), prepared(config, reward, progress, agents=seeds) as preparation:
-        progress.message(messages.beginning(preparation, seeds))
+    with lock_run(run), set_up_training(config, reward, progress, agents=seeds) as preparation:
+        progress.message(messages.describe_start(preparation, seeds))
         folders = [run if run is None or seeds is None else run.of_seed(c.train.seed) for c in preparation.configs]
-        keeper = Keeper(preparation, run, folders, reward, progress.message)
-        begin = opened(preparation, run, keeper, progress, seeds is not None)
+        keeper = Checkpointer(preparation, run, folders, reward, progress.message)
+        begin = open_run(preparation, run, keeper, progress, seeds is not None)
         preparation.ready(begins=begin is None)  # until then a signal ends the command: nothing is lost yet
-        with stop.obeyed():
-            after = recorded(lambda chunk: folders[chunk.agent], callback, stop.requested)
+        with stop.obey_signals():
+            after = recording_callback(lambda chunk: folders[chunk.agent], callback, stop.is_requested)
             results = run_chunks(preparation, after, keeper.save_if_due, begin)
-        if processes.on_any(results[0].stopped or stop.requested()):
-            raise StoppedError(messages.stopped(run, results[0].decisions, seeds))
+        if processes.any_process(results[0].stopped or stop.is_requested()):
+            raise StoppedError(messages.describe_stop(run, results[0].decisions, seeds))
         progress.phase("flying the mission" if seeds is None else "flying the missions")
-        draw = None if run is None else prepare_to_draw(preparation, drawing)
+        plot = None if run is None else prepare_to_plot(preparation, drawing)
         flights = [preparation.fly(preparation.missions[k].final, r.policy.params, k) for k, r in enumerate(results)]
         of_each = _summaries(preparation, results, flights, reward, keeper.facts, seeds)
         if run is not None:
             progress.phase("drawing")
             for folder, result, flown, of_run in zip(folders, results, flights, of_each, strict=True):
                 assert folder is not None
-                finish(folder, preparation, draw, result, flown, of_run, progress)
+                finish_run(folder, preparation, plot, result, flown, of_run, progress)
         summary = of_each[0]
         if seeds is not None:
             summary = summaries.of_all_seeds(config, preparation.missions[0].tests, flights, of_each)
@@ -111,7 +111,7 @@ def train_run(
 
 
 def _summaries(
-    preparation: Preparation,
+    preparation: TrainingSetup,
     results: Sequence[TrainingResult],
     flights: Sequence[Flights],
     reward: Reward | None,
@@ -120,7 +120,7 @@ def _summaries(
 ) -> list[dict[str, Any]]:
     """Returns the content of each agent's `summary.json`; the last that all processes do together."""
     trainer, steps = preparation.trainer, results[0].decisions // preparation.config.train.num_envs
-    state = saved_state.needed(trainer, results[0].state, steps)  # what a later step would read
+    state = saved_state.drop_spent_samples(trainer, results[0].state, steps)  # what a later step would read
     together = facts if seeds is None else {"trained_together": seeds, **facts}
     # One after the other: a state may be large.
     digests = [state_digest(trainer.of_agent(state, number)) for number in range(len(results))]
@@ -131,29 +131,29 @@ def _summaries(
 
 
 @contextlib.contextmanager
-def locked(run: RunDirectory | None) -> Iterator[None]:
+def lock_run(run: RunDirectory | None) -> Iterator[None]:
     """Keeps other runs out of the folder, which is made if there is none; every process must call this.
 
     Raises:
         ConfigError: if the folder cannot be made, or another run goes on in it.
     """
     with contextlib.ExitStack() as held:
-        processes.together(lambda: None if run is None else held.enter_context(run.locked()))
+        processes.run_synchronised(lambda: None if run is None else held.enter_context(run.hold_lock()))
         yield
 
 
-def opened(
-    preparation: Preparation, run: RunDirectory | None, keeper: Keeper, progress: Screen, seeds: bool = False
-) -> Standing | None:
-    """Returns where the run in the locked folder stood if it is continued; else begins it.
+def open_run(
+    preparation: TrainingSetup, run: RunDirectory | None, keeper: Checkpointer, progress: Screen, seeds: bool = False
+) -> RunProgress | None:
+    """Returns the progress of the run in the locked folder if it is continued; else begins it.
 
     Raises:
         ConfigError: if the folder cannot be written, or its run cannot be continued.
     """
     configs = preparation.configs
     begin = None
-    if processes.on_any(run is not None and run.resume != "never"):
-        begin = keeper.restored()
+    if processes.any_process(run is not None and run.resume != "never"):
+        begin = keeper.restore_newest()
 
     def prepare() -> None:
         if run is None:
@@ -173,20 +173,20 @@ def opened(
             )
         else:
             run.begin(configs, seeds)
-            world_copy.keep(run.path, preparation.config)
+            world_copy.copy_worlds(run.path, preparation.config)
             for folder in keeper.folders if seeds else []:
                 assert folder is not None
-                world_copy.keep(folder.path, preparation.config)
+                world_copy.copy_worlds(folder.path, preparation.config)
 
-    processes.together(prepare)
+    processes.run_synchronised(prepare)
     if begin is not None:
-        progress.message(messages.continued_at(preparation.trainer.plan, begin.done, preparation.config))
+        progress.message(messages.describe_continuation(preparation.trainer.schedule, begin.done, preparation.config))
     elif run is not None and run.resume != "never":
         progress.message("there is no checkpoint of the interrupted run; it begins anew")
     return begin
 
 
-def recorded(
+def recording_callback(
     run_of: Callable[[Chunk], RunDirectory | None], callback: Callback | None, stop: Callable[[], bool]
 ) -> Callback:
     """Returns the callback of a recorded run: writes the chunk to the run of its agent, then calls `callback`.
@@ -195,14 +195,14 @@ def recorded(
     """
 
     def after(chunk: Chunk) -> bool:
-        record(run_of(chunk), chunk)
+        record_chunk(run_of(chunk), chunk)
         ended = callback is not None and callback(chunk) is True
         return ended or stop()
 
     return after
 
 
-def record(run: RunDirectory | None, chunk: Chunk) -> None:
+def record_chunk(run: RunDirectory | None, chunk: Chunk) -> None:
     """Appends a chunk to the files of the run.
 
     Raises:
@@ -213,11 +213,11 @@ def record(run: RunDirectory | None, chunk: Chunk) -> None:
     ended = chunk.episodes
     # As Python's numbers: a GPU ends thousands of episodes in a chunk.
     columns = (column.tolist() for column in (ended.step, ended.episode_return, ended.length))
-    run.append_episodes(zip(*columns, ended.named(), strict=True))
+    run.append_episodes(zip(*columns, ended.outcome_names(), strict=True))
     run.append_metrics(chunk.metrics)
 
 
-def prepare_to_draw(preparation: Preparation, drawing: PrepareDrawing | None) -> Draw | None:
+def prepare_to_plot(preparation: TrainingSetup, drawing: PrepareDrawing | None) -> Draw | None:
     """Starts to compile the programs that draw the final flight, while it is flown."""
     if drawing is None:
         return None
@@ -225,10 +225,10 @@ def prepare_to_draw(preparation: Preparation, drawing: PrepareDrawing | None) ->
     return drawing(preparation.config, scene, preparation.pool)
 
 
-def finish(
+def finish_run(
     run: RunDirectory,
-    preparation: Preparation,
-    draw: Draw | None,
+    preparation: TrainingSetup,
+    plot: Draw | None,
     result: TrainingResult,
     flights: Flights,
     summary: dict[str, Any],
@@ -241,14 +241,14 @@ def finish(
     Raises:
         ConfigError: if flight or summary cannot be written.
     """
-    run.write_trajectory(trajectory(preparation.config, flights))
+    run.write_trajectory(flight_trajectory(preparation.config, flights))
     summary["total_seconds"] = time.perf_counter() - preparation.began
     run.write_summary({**summary, "figures": TO_BE_DRAWN})
     try:
-        if draw is None:
+        if plot is None:
             summary["figures"] = "not asked for"
         else:
-            draw(
+            plot(
                 run,
                 scene_of_flight(preparation.config, preparation.missions[0].final, flights),
                 result.policy.params,

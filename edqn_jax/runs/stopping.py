@@ -10,9 +10,9 @@ from contextlib import AbstractContextManager
 
 @dataclasses.dataclass(frozen=True)
 class Stop:
-    """What a run asks after each chunk; by default nothing stops it."""
+    """Stop request that a run polls after each chunk; by default it never stops."""
 
-    requested: Callable[[], bool] = lambda: False
+    is_requested: Callable[[], bool] = lambda: False
     """Whether to stop; if it returns True on one process, all stop."""
-    obeyed: Callable[[], AbstractContextManager[None]] = contextlib.nullcontext
-    """Surrounds the time in which the run asks: outside of it a signal ends the process."""
+    obey_signals: Callable[[], AbstractContextManager[None]] = contextlib.nullcontext
+    """Context in which the run polls: outside of it a signal ends the process."""

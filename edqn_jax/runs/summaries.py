@@ -10,20 +10,20 @@ import jax
 import numpy as np
 
 from edqn_jax.config import Config
-from edqn_jax.devices.hardware import processor
+from edqn_jax.devices.hardware import describe_processor
 from edqn_jax.evaluation.intervals import interquartile_mean, rate_interval
-from edqn_jax.evaluation.metrics import flight_summary, summarise
-from edqn_jax.runs.provenance import reward_record, versions, workload
+from edqn_jax.evaluation.metrics import flight_summary, summarise_flights
+from edqn_jax.runs.provenance import describe_workload, package_versions, reward_record
 from edqn_jax.sim.task.flights import Flights
 from edqn_jax.sim.task.outcomes import Outcome
 from edqn_jax.sim.task.reward import Reward
 from edqn_jax.training.loop import TrainingResult
 from edqn_jax.training.selection import first_success
-from edqn_jax.training.setup import Preparation
+from edqn_jax.training.setup import TrainingSetup
 
 
 def of_run(
-    preparation: Preparation, result: TrainingResult, flights: Flights, digest: str, reward: Reward | None
+    preparation: TrainingSetup, result: TrainingResult, flights: Flights, digest: str, reward: Reward | None
 ) -> dict[str, Any]:
     """Returns the content of `summary.json`."""
     config = result.policy.config
@@ -46,10 +46,10 @@ def of_run(
         "validation_spl": result.kept.spl,
         "parameters_from_decisions": result.kept.decisions,
         "reward": reward_record(config, reward),
-        "workload": workload(config, preparation.missions[0].training.scene()),
+        "workload": describe_workload(config, preparation.missions[0].training.scene()),
         "devices": [str(device) for device in preparation.devices],
-        "processor": processor(),
-        "versions": versions(),
+        "processor": describe_processor(),
+        "versions": package_versions(),
         "state_digest": digest,
         "figures": "drawn",  # by the time that anybody reads it
     }
@@ -61,12 +61,12 @@ def of_run(
 
 def of_tests(tests: int, flights: Flights) -> dict[str, Any]:
     """Returns the metrics of the last `tests` flights, those through unseen random worlds."""
-    return summarise(jax.tree.map(lambda x: x[-tests:], dataclasses.replace(flights, record=None)))
+    return summarise_flights(jax.tree.map(lambda x: x[-tests:], dataclasses.replace(flights, record=None)))
 
 
 def of_all_seeds(config: Config, tests: int, flights: list[Flights], summaries: list[dict[str, Any]]) -> dict[str, Any]:
-    """Returns what the seeds say together: in random worlds of all test missions, elsewhere of the one mission."""
-    arrived = np.array([np.asarray(flown.outcome) == Outcome.GOAL for flown in flights])
+    """Returns the summary over seeds: of all test missions in random worlds, elsewhere of the one mission."""
+    arrived = np.array([np.asarray(agent_flights.outcome) == Outcome.GOAL for agent_flights in flights])
     arrived = arrived[:, -tests:] if tests else arrived[:, :1]
     rates = arrived.mean(axis=1)
     return {

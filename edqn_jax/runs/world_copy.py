@@ -12,8 +12,8 @@ from pathlib import Path
 
 from edqn_jax.config import FAMILIES, Config, WorldConfig
 from edqn_jax.errors import ConfigError, DamagedError
-from edqn_jax.files import unwritable
-from edqn_jax.runs.checkpoints.sealed import digest, sync
+from edqn_jax.files import write_error
+from edqn_jax.runs.checkpoints.sealed import file_digest, sync_to_disk
 from edqn_jax.sim.scene.mjcf import SceneError, resolve_world
 
 WORLD = "world"
@@ -25,7 +25,7 @@ SUMS = "SHA256SUMS"
 _ROLES = ("name", "flown")
 
 
-def keep(folder: Path, config: Config) -> None:
+def copy_worlds(folder: Path, config: Config) -> None:
     """Copies the files of a run's worlds into its folder; what was there is replaced by the whole of it.
 
     Raises:
@@ -43,13 +43,13 @@ def keep(folder: Path, config: Config) -> None:
                 shutil.copyfile(resolve_world(getattr(config.world, role)), partial / f"{role}.xml")
             (partial / SUMS).write_text(_sums(partial), encoding="utf-8")
             for path in (*partial.iterdir(), partial):
-                sync(path)
+                sync_to_disk(path)
             partial.rename(copies)
     except OSError as error:
-        raise unwritable(copies, error.strerror) from None
+        raise write_error(copies, error.strerror) from None
 
 
-def flown_in(folder: Path, config: Config) -> tuple[Config, list[str]]:
+def with_copied_worlds(folder: Path, config: Config) -> tuple[Config, list[str]]:
     """Returns a run's configuration with its copies in place of worlds that are missing or others now.
 
     Args:
@@ -123,7 +123,7 @@ def _sums(copies: Path) -> str:
         if path.is_symlink() or not path.is_file():
             raise DamagedError(f"'{copies}' is damaged: '{path.name}' is no file")
     names = sorted(path.name for path in copies.iterdir() if path.name != SUMS)
-    return "".join(f"{digest(copies / name)}  {name}\n" for name in names)
+    return "".join(f"{file_digest(copies / name)}  {name}\n" for name in names)
 
 
 def _roles(world: WorldConfig) -> list[str]:

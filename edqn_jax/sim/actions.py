@@ -75,7 +75,7 @@ def move_number(move: str | ArrayLike) -> Array:
     25 25
     """
     if isinstance(move, str):
-        return jnp.int32(named_move(move))
+        return jnp.int32(parse_move(move))
     if isinstance(move, Tracer):
         traced = jnp.asarray(_number_of(move) if move.shape == (3,) else move)
         return traced.astype(jnp.int32)
@@ -87,7 +87,7 @@ def move_number(move: str | ArrayLike) -> Array:
     raise ConfigError(f"a move is a number from 0 to 26, a vector of three from -1, 0 and 1, or a name, not {move!r}")
 
 
-def named_move(name: str) -> int:
+def parse_move(name: str) -> int:
     """Returns the number 0..26 of a named move, without JAX.
 
     Raises:

@@ -35,7 +35,7 @@ from edqn_jax.sim.sensors import events, sensor
 from edqn_jax.sim.sensors.events import EventField, EventMemory
 from edqn_jax.sim.task import env, group
 from edqn_jax.sim.task.action_sets import action_of
-from edqn_jax.sim.task.env import EnvState, Step, World
+from edqn_jax.sim.task.env import EnvParams, EnvState, Step
 from edqn_jax.sim.task.missions import own_missions
 from edqn_jax.sim.task.observation import Observation
 from edqn_jax.sim.task.reward import Reward
@@ -52,7 +52,7 @@ class Environment:
     """
 
     config: Config
-    world: World
+    world: EnvParams
 
     @property
     def missions(self) -> int:
@@ -107,7 +107,7 @@ class Environment:
         Raises:
             ConfigError: if the sensor is not the event camera.
         """
-        return events.expand(self._field(observation))
+        return events.to_stream(self._field(observation))
 
     @as_tested
     def event_image(self, observation: Observation) -> np.ndarray:
@@ -143,7 +143,7 @@ class Environment:
         """
         sees = dataclasses.replace(self.config, events=dataclasses.replace(self.config.events, law=law))
         scene = env.scene_of(self.world, jnp.asarray(mission), aim)
-        return events.expand(_stream(sees, scene, flight))
+        return events.to_stream(_stream(sees, scene, flight))
 
     @as_tested
     def picture(self, state: EnvState, scale: int = 8) -> Array:
@@ -199,7 +199,7 @@ def make(
     config = make_config(name) if config is None else config
     group.check_alone(config, "edqn_jax.make")
     pool = _random_pool(config, name, worlds, seed, split) if name in FAMILIES else _file_pool(config, name, worlds)
-    return Environment(config, World(load_airframe(config.drone), pool, own_missions(pool), reward))
+    return Environment(config, EnvParams(load_airframe(config.drone), pool, own_missions(pool), reward))
 
 
 def _random_pool(config: Config, name: str, count: int, seed: int, split: Split) -> Scene:
@@ -219,31 +219,31 @@ def _file_pool(config: Config, name: str, count: int) -> Scene:
 
 
 @functools.partial(jax.jit, static_argnums=0)
-def _reset(config: Config, world: World, key: Array, mission: Array | None) -> tuple[EnvState, Observation]:
-    return task_of(config).reset(world, key, mission)
+def _reset(config: Config, env_params: EnvParams, key: Array, mission: Array | None) -> tuple[EnvState, Observation]:
+    return task_of(config).reset(env_params, key, mission)
 
 
 @functools.partial(jax.jit, static_argnums=0)
-def _step(config: Config, world: World, state: EnvState, action: Array) -> tuple[EnvState, Step]:
-    return task_of(config).step(world, state, action)
+def _step(config: Config, env_params: EnvParams, state: EnvState, action: Array) -> tuple[EnvState, Step]:
+    return task_of(config).step(env_params, state, action)
 
 
 @functools.partial(jax.jit, static_argnums=0)
 def _stream(config: Config, scene: Scene, flight: Flight) -> EventField:
     def see(pose: Flight) -> Array:
-        return sensor.view(config, scene_at(scene, pose.time), pose.position, pose.quaternion)
+        return sensor.render_view(config, scene_at(scene, pose.time), pose.position, pose.quaternion)
 
     frames = jax.lax.map(see, flight)
     times = tuple(config.drone.physics_dt_s * np.arange(frames.shape[0]))
     key, noise = jax.random.split(jax.random.key(0))
     memory = SENSORS.get("events").at_rest(config, key)
     assert isinstance(memory, EventMemory)
-    return events.events(config.events, memory, frames, times, noise, continuous=True)[0]
+    return events.generate_events(config.events, memory, frames, times, noise, continuous=True)[0]
 
 
 @functools.partial(jax.jit, static_argnums=0)
 def _depth(config: Config, scene: Scene, position: Array, quaternion: Array) -> Array:
-    return camera.depth(config.camera, scene, position, sensor.mount_rotation(config, quaternion))
+    return camera.render_depth(config.camera, scene, position, sensor.mount_rotation(config, quaternion))
 
 
 @functools.partial(jax.jit, static_argnums=(0, 1))

@@ -11,12 +11,12 @@ import numpy as np
 from edqn_jax.config import Config
 from edqn_jax.errors import DivergedError
 from edqn_jax.learn.learner import learner_of
-from edqn_jax.learn.plan import Plan
+from edqn_jax.learn.schedule import Schedule
 from edqn_jax.learn.state import Episodes, Health, Losses
 from edqn_jax.learn.updates import VAE_METRICS
 from edqn_jax.sim.task.outcomes import Outcome
 
-MOST_ILL_STEPS = 100
+MAX_DIVERGED_STEPS = 100
 """Training steps without a useful update, or with as many diverged decisions, after which a run is given up."""
 
 _IN_WORDS = {int(outcome): outcome.name.lower() for outcome in Outcome}
@@ -32,7 +32,7 @@ class EndedEpisodes:
     outcome: np.ndarray  # [E] int, an `Outcome`
 
     @classmethod
-    def of(cls, episodes: Episodes, first: int, envs: int) -> EndedEpisodes:
+    def from_chunk(cls, episodes: Episodes, first: int, envs: int) -> EndedEpisodes:
         """Returns the episodes that ended in a chunk whose first training step is `first`."""
         outcome, length, gain = (
             np.asarray(x).reshape(len(x), -1) for x in (episodes.outcome, episodes.length, episodes.episode_return)
@@ -40,7 +40,7 @@ class EndedEpisodes:
         rows, columns = np.nonzero(outcome)
         return cls((first + rows + 1) * envs, gain[rows, columns], length[rows, columns], outcome[rows, columns])
 
-    def named(self) -> list[str]:
+    def outcome_names(self) -> list[str]:
         """Returns the outcomes in words."""
         return [_IN_WORDS[kind] for kind in self.outcome.tolist()]
 
@@ -52,7 +52,7 @@ class History:
     metrics: list[dict[str, Any]] = dataclasses.field(default_factory=list)
     """One dictionary a chunk, as in `metrics.jsonl`."""
     episodes: list[EndedEpisodes] = dataclasses.field(default_factory=list)
-    """What ended in each chunk."""
+    """Episodes that ended in each chunk."""
     validations: list[tuple[int, float, float]] = dataclasses.field(default_factory=list)
     """Decisions, seconds since the start and success rate near the start of each validation."""
 
@@ -85,7 +85,7 @@ def chunk_metrics(
     envs, steps = config.train.num_envs, _steps(losses)
     whole = ended.episode_return[ended.outcome != Outcome.DIVERGED]
     return {
-        "phase": _phase(Plan.of(config), first + steps - 1),
+        "phase": _phase(Schedule.from_config(config), first + steps - 1),
         "decisions": (first + steps) * envs,
         "decisions_per_second": steps * envs / seconds,
         "episodes": episodes,
@@ -111,11 +111,11 @@ def mean_metrics(agents: Sequence[dict[str, Any]]) -> dict[str, Any]:
     return means
 
 
-def _phase(plan: Plan, step: int) -> str:
+def _phase(schedule: Schedule, step: int) -> str:
     """Returns the name of what training step `step` belongs to."""
-    if step < plan.warmup:
+    if step < schedule.warmup:
         return "warm-up"
-    return "retraining" if bool(plan.trains_vae(np.asarray(step))) else "training"
+    return "retraining" if bool(schedule.trains_vae(np.asarray(step))) else "training"
 
 
 def _warm_up(config: Config, first: int, losses: Losses) -> dict[str, Any] | None:
@@ -125,7 +125,7 @@ def _warm_up(config: Config, first: int, losses: Losses) -> dict[str, Any] | Non
     begin in it, and nothing moves.
     """
     steps = np.arange(first, first + _steps(losses))
-    wanted = (steps > 0) & (steps < Plan.of(config).warmup)
+    wanted = (steps > 0) & (steps < Schedule.from_config(config).warmup)
     if not wanted.any():
         return None
     return {
@@ -134,7 +134,7 @@ def _warm_up(config: Config, first: int, losses: Losses) -> dict[str, Any] | Non
     }
 
 
-class Watch:
+class DivergenceMonitor:
     """Counts how long a run has learnt nothing because numbers were not finite."""
 
     def __init__(self) -> None:
@@ -147,21 +147,22 @@ class Watch:
         """Whether something was learnt in the newest chunk."""
         return self._ill_steps == 0
 
-    def check(self, plan: Plan, config: Config, done: int, losses: Losses) -> None:
+    def check(self, schedule: Schedule, config: Config, done: int, losses: Losses) -> None:
         """Takes in a chunk that ended with training step `done`.
 
         A chunk is ill if every update in it was skipped, or if a quarter of its decisions diverged.
 
         Raises:
-            DivergedError: after `MOST_ILL_STEPS` training steps of ill chunks in a row; names the quantity that was the
+            DivergedError: after `MAX_DIVERGED_STEPS` training steps of ill chunks in a row; names the quantity that was
+            the
                 first not to be finite, the step and the run's seed.
         """
         steps, health = _steps(losses), losses.health
         numbers = np.arange(done - steps, done)
-        learns = np.asarray(learner_of(config).updates(config, plan.replay_time(numbers)))
-        updates = np.where(numbers >= plan.warmup, learns, 0)
-        trained = np.asarray(plan.trains_vae(numbers))
-        rest = int(config.encoder.keep_learning and bool(plan.vae_training))
+        learns = np.asarray(learner_of(config).updates(config, schedule.replay_time(numbers)))
+        updates = np.where(numbers >= schedule.warmup, learns, 0)
+        trained = np.asarray(schedule.trains_vae(numbers))
+        rest = int(config.encoder.keep_learning and bool(schedule.vae_training))
         updates = updates + np.where(trained, config.encoder.warmup_updates_per_step, rest)
         skipped = int(np.sum(health.gradient))
         diverged = int(np.sum(health.physics_state) + np.sum(health.observation) + np.sum(health.reward))
@@ -172,7 +173,7 @@ class Watch:
         if self._ill_steps == 0:
             self._first = _first_broken(health, numbers)
         self._ill_steps += steps
-        if self._ill_steps >= MOST_ILL_STEPS:
+        if self._ill_steps >= MAX_DIVERGED_STEPS:
             raise DivergedError(
                 f"training with seed {config.train.seed} diverged: {self._first}, and nothing was learnt in "
                 f"{self._ill_steps} training steps after it"

@@ -26,9 +26,9 @@ from edqn_jax.learn.step import policy_of
 from edqn_jax.learn.trainer import Trainer
 from edqn_jax.sim.task.flights import Flights
 from edqn_jax.sim.task.reward import Reward
-from edqn_jax.training.history import EndedEpisodes, History, Watch, chunk_metrics, mean_metrics
-from edqn_jax.training.selection import Candidate, choose, is_due, validated
-from edqn_jax.training.setup import Preparation, prepared
+from edqn_jax.training.history import DivergenceMonitor, EndedEpisodes, History, chunk_metrics, mean_metrics
+from edqn_jax.training.selection import Candidate, choose_candidate, is_due, make_candidate
+from edqn_jax.training.setup import TrainingSetup, set_up_training
 
 
 @dataclasses.dataclass(frozen=True)
@@ -54,8 +54,8 @@ Callback = Callable[[Chunk], bool | None]
 
 
 @dataclasses.dataclass(frozen=True)
-class AgentStanding:
-    """What the host knows of an agent after a chunk."""
+class AgentProgress:
+    """Progress of an agent after a chunk, on the host."""
 
     kept: Candidate
     episodes: int
@@ -65,8 +65,8 @@ class AgentStanding:
 
 
 @dataclasses.dataclass(frozen=True)
-class Standing:
-    """Where a run stands after a chunk: everything that its rest depends on."""
+class RunProgress:
+    """State of a run after a chunk, complete for continuing it."""
 
     state: TrainState
     done: int
@@ -76,7 +76,7 @@ class Standing:
     train_seconds: float
     elapsed_s: float
     """Since the run began, interruptions left out."""
-    agents: list[AgentStanding]
+    agents: list[AgentProgress]
     healthy: bool = True
     """Whether every agent learnt something in the chunk."""
 
@@ -89,7 +89,7 @@ class Standing:
         ]
 
 
-Saver = Callable[[Standing, bool], None]
+Saver = Callable[[RunProgress, bool], None]
 """Called after each chunk with where the run stands, and whether the chunk was the last; every process calls it."""
 
 
@@ -127,7 +127,7 @@ def train(
         DivergedError: if numbers are not finite for so long that nothing is learnt any more.
         CheckError: with `train.debug`, at the first fault.
     """
-    with prepared(config or make_config(), reward) as preparation:
+    with set_up_training(config or make_config(), reward) as preparation:
         return run_chunks(preparation, callback)[0]
 
 
@@ -140,15 +140,15 @@ def train_seeds(
     Args:
         seeds: how many; they are `train.seed`, `train.seed + 1` and so on.
     """
-    with prepared(config or make_config(), reward, agents=seeds) as preparation:
+    with set_up_training(config or make_config(), reward, agents=seeds) as preparation:
         return run_chunks(preparation, callback)
 
 
 def run_chunks(
-    preparation: Preparation,
+    preparation: TrainingSetup,
     callback: Callback | None = None,
     saver: Saver | None = None,
-    begin: Standing | None = None,
+    begin: RunProgress | None = None,
 ) -> list[TrainingResult]:
     """Trains what was prepared, chunk after chunk; returns the result of each agent.
 
@@ -169,10 +169,10 @@ def run_chunks(
         loop = _Loop(preparation, callback, [Candidate(params) for params in _policies(trainer, state)])
     else:
         state = begin.state
-        loop = _Loop.continued(preparation, callback, begin)
+        loop = _Loop.resume_from(preparation, callback, begin)
         del begin  # its state is donated
     envs = preparation.config.train.num_envs
-    preparation.display.phase("training", total=trainer.plan.total * envs, done=loop.done * envs)
+    preparation.display.phase("training", total=trainer.schedule.total * envs, done=loop.done * envs)
     while not loop.ended:
         state = loop.advance(state)
         if saver is not None:
@@ -194,29 +194,29 @@ def run_chunks(
 
 @dataclasses.dataclass
 class _Agent:
-    """What the host keeps of an agent."""
+    """Host-side state of an agent."""
 
     config: Config
     missions: RunMissions
     kept: Candidate
     history: History = dataclasses.field(default_factory=History)
-    watch: Watch = dataclasses.field(default_factory=Watch)
+    watch: DivergenceMonitor = dataclasses.field(default_factory=DivergenceMonitor)
 
 
 class _Loop:
     """State of the host loop, which changes from chunk to chunk."""
 
-    def __init__(self, preparation: Preparation, callback: Callback | None, first: Sequence[Candidate]) -> None:
+    def __init__(self, preparation: TrainingSetup, callback: Callback | None, first: Sequence[Candidate]) -> None:
         self.preparation, self.callback = preparation, callback
-        self.config, self.plan = preparation.config, preparation.trainer.plan
+        self.config, self.schedule = preparation.config, preparation.trainer.schedule
         self.agents = [_Agent(*each) for each in zip(preparation.configs, preparation.missions, first, strict=True)]
         self.done, self.checked = 0, 0  # training steps; decisions before the last validation
         self.train_seconds = 0.0
         self.stopped = False
 
     @classmethod
-    def continued(cls, preparation: Preparation, callback: Callback | None, begin: Standing) -> _Loop:
-        """Returns the loop as it was where a run stood."""
+    def resume_from(cls, preparation: TrainingSetup, callback: Callback | None, begin: RunProgress) -> _Loop:
+        """Returns the loop restored from a run's progress."""
         loop = cls(preparation, callback, [agent.kept for agent in begin.agents])
         loop.done, loop.checked, loop.train_seconds = begin.done, begin.checked, begin.train_seconds
         preparation.began -= begin.elapsed_s
@@ -224,9 +224,9 @@ class _Loop:
             agent.history = History(validations=list(stood.validations), earlier_episodes=stood.episodes)
         return loop
 
-    def standing(self, state: TrainState) -> Standing:
-        """Returns where the run stands."""
-        return Standing(
+    def standing(self, state: TrainState) -> RunProgress:
+        """Returns the run's progress."""
+        return RunProgress(
             state=state,
             done=self.done,
             checked=self.checked,
@@ -234,20 +234,20 @@ class _Loop:
             elapsed_s=time.perf_counter() - self.preparation.began,
             healthy=all(agent.watch.healthy for agent in self.agents),
             agents=[
-                AgentStanding(agent.kept, agent.history.episode_count, list(agent.history.validations))
+                AgentProgress(agent.kept, agent.history.episode_count, list(agent.history.validations))
                 for agent in self.agents
             ],
         )
 
     @property
-    def finished(self) -> bool:
+    def is_finished(self) -> bool:
         """Whether the requested number of decisions, or of episodes by every agent, is reached."""
         most = self.config.train.max_episodes
-        return self.done >= self.plan.total or 0 < most <= min(agent.history.episode_count for agent in self.agents)
+        return self.done >= self.schedule.total or 0 < most <= min(agent.history.episode_count for agent in self.agents)
 
     @property
     def ended(self) -> bool:
-        return self.finished or self.stopped
+        return self.is_finished or self.stopped
 
     def keeps_validated(self, agent: _Agent) -> bool:
         """Whether the run ends with validated parameters instead of the newest."""
@@ -258,11 +258,11 @@ class _Loop:
         state, chunks = self._run(state)
         policies = functools.cache(lambda: _policies(self.preparation.trainer, state))
         metrics = [measured for _, measured in chunks]
-        flown: list[tuple[MissionSet, Flights] | None] = [None] * len(self.agents)
-        if self.finished or is_due(self.config, self.plan, self.checked, self.done):
+        validation_flights: list[tuple[MissionSet, Flights] | None] = [None] * len(self.agents)
+        if self.is_finished or is_due(self.config, self.schedule, self.checked, self.done):
             validations = self._validate(policies())
             metrics = [before | found for before, (found, _) in zip(metrics, validations, strict=True)]
-            flown = [flights for _, flights in validations]
+            validation_flights = [flights for _, flights in validations]
         self.preparation.display.update(mean_metrics(metrics))
         stop = False
         for number, agent in enumerate(self.agents):
@@ -271,9 +271,11 @@ class _Loop:
                 newest = functools.partial(
                     lambda agent, number: Policy(agent.config, policies()[number]), agent, number
                 )
-                chunk = Chunk(metrics[number], chunks[number][0], agent.kept, newest, number, flown[number])
+                chunk = Chunk(
+                    metrics[number], chunks[number][0], agent.kept, newest, number, validation_flights[number]
+                )
                 stop |= self.callback(chunk) is True
-        self.stopped = processes.on_any(stop) and not self.finished
+        self.stopped = processes.any_process(stop) and not self.is_finished
         return state
 
     def _run(self, state: TrainState) -> tuple[TrainState, list[tuple[EndedEpisodes, dict[str, Any]]]]:
@@ -286,11 +288,11 @@ class _Loop:
         self.done += self.config.train.chunk_steps
         chunks = []
         for agent, ended, lost in zip(
-            self.agents, trainer.each(processes.fetch(episodes)), trainer.each(losses), strict=True
+            self.agents, trainer.each(processes.fetch_global(episodes)), trainer.each(losses), strict=True
         ):
-            ended = EndedEpisodes.of(ended, first, self.config.train.num_envs)
+            ended = EndedEpisodes.from_chunk(ended, first, self.config.train.num_envs)
             agent.history.episodes.append(ended)
-            agent.watch.check(self.plan, agent.config, self.done, lost)
+            agent.watch.check(self.schedule, agent.config, self.done, lost)
             count = agent.history.episode_count
             chunks.append((ended, chunk_metrics(self.config, first, ended, lost, seconds, count)))
         return state, chunks
@@ -303,8 +305,8 @@ class _Loop:
         found = []
         for number, (agent, params) in enumerate(zip(self.agents, policies, strict=True)):
             flights = preparation.fly(agent.missions.validation, params, number)
-            latest = validated(self.config, agent.missions, flights, params, self.checked)
-            agent.kept = choose(self.config.train.keep, agent.kept, latest)
+            latest = make_candidate(self.config, agent.missions, flights, params, self.checked)
+            agent.kept = choose_candidate(self.config.train.keep, agent.kept, latest)
             since = time.perf_counter() - preparation.began
             agent.history.validations.append((self.checked, since, latest.success_near_start))
             metrics = {

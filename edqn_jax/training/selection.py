@@ -1,4 +1,4 @@
-"""Validation: when it is due, what its flights say of the parameters, and which parameters a run ends with."""
+"""Validation: when it is due, its scores, and which parameters a run keeps."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ import numpy as np
 from edqn_jax.config import Config
 from edqn_jax.evaluation.metrics import spl
 from edqn_jax.evaluation.missions import RunMissions
-from edqn_jax.learn.plan import Plan
 from edqn_jax.learn.policy import PolicyParams
+from edqn_jax.learn.schedule import Schedule
 from edqn_jax.sim.task.flights import Flights
 from edqn_jax.sim.task.missions import Missions
 from edqn_jax.sim.task.outcomes import Outcome
@@ -33,17 +33,17 @@ class Candidate:
     decisions: int = 0  # trained before that validation, in all environments
 
 
-def is_due(config: Config, plan: Plan, checked: int, done: int) -> bool:
+def is_due(config: Config, schedule: Schedule, checked: int, done: int) -> bool:
     """Returns whether a validation is due after `done` training steps, the last one after `checked` decisions."""
     every = config.train.validation_every
     # On crossing a multiple, never on equality: right for any number of environments.
-    return every > 0 and done * config.train.num_envs // every > checked // every and done > plan.learn_from
+    return every > 0 and done * config.train.num_envs // every > checked // every and done > schedule.learn_from
 
 
-def validated(
+def make_candidate(
     config: Config, missions: RunMissions, flights: Flights, params: PolicyParams, decisions: int
 ) -> Candidate:
-    """Returns the candidate that the flights of a validation make of the parameters that flew them."""
+    """Returns the candidate for parameters, scored by the flights of their validation."""
     arrived = np.asarray(flights.outcome) == Outcome.GOAL
     straight = _straight(missions.validation.world.missions, config.env.goal_radius_m)
     return Candidate(
@@ -61,7 +61,7 @@ def _straight(missions: Missions, goal_radius_m: float) -> np.ndarray:
     return np.maximum(apart - goal_radius_m, 1e-3)
 
 
-def choose(keep: Literal["best", "last"], kept: Candidate, latest: Candidate) -> Candidate:
+def choose_candidate(keep: Literal["best", "last"], kept: Candidate, latest: Candidate) -> Candidate:
     """Returns which of the two a run would end with: `best` by SPL, the latest among equals; `last` the latest."""
     return latest if keep == "last" or latest.spl >= kept.spl else kept
 

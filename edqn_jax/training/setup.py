@@ -29,7 +29,7 @@ from edqn_jax.learn.state import TrainState
 from edqn_jax.learn.trainer import Trainer
 from edqn_jax.planning.astar import Path as ShortestPath
 from edqn_jax.planning.astar import shortest_path
-from edqn_jax.sim.task.env import World, check_sensor
+from edqn_jax.sim.task.env import EnvParams, check_sensor
 from edqn_jax.sim.task.flights import Flights
 from edqn_jax.sim.task.reward import Reward
 from edqn_jax.sim.worlds import geodesic
@@ -55,8 +55,8 @@ class Silent:
         pass
 
 
-class Preparation:
-    """Devices, missions, programs and the first state of a run; made by `prepared`."""
+class TrainingSetup:
+    """Devices, missions, programs and the first state of a run; made by `set_up_training`."""
 
     def __init__(
         self, config: Config, reward: Reward | None, display: Display, pool: Executor, agents: int | None
@@ -77,11 +77,11 @@ class Preparation:
         display.phase("preparing worlds")
         self.devices = choose_devices(1 if config.train.debug else config.train.devices, config.train.shards)
         # A world's file may be missing on one host.
-        self.missions = processes.together(lambda: missions_of_runs(self.configs, reward))
+        self.missions = processes.run_synchronised(lambda: missions_of_runs(self.configs, reward))
         worlds = [missions.training.world for missions in self.missions]
         check_sensor(config, worlds[0])
         if config.env.reward == "geodesic":  # agents that train together share their worlds
-            distances = geodesic.fields(worlds[0].pool, config.drone.body_radius_m)
+            distances = geodesic.distance_fields(worlds[0].pool, config.drone.body_radius_m)
             worlds = [dataclasses.replace(world, distances=distances) for world in worlds]
         self.trainer = Trainer(config, worlds[0] if agents is None else worlds, self.devices)
         check_fits(self.trainer.shapes(), [each for each in self.devices if each in jax.local_devices()])
@@ -91,10 +91,10 @@ class Preparation:
         self.trainer.trace()
         self._compiled = _in_background(pool, self.trainer.compile, began)
         placed = self._placed(self.missions[0].validation, fresh_policy(self.config), 0)
-        flights = rollouts.traced(self.config, *placed, record=True, mesh=self.mesh)
+        flights = rollouts.trace_missions(self.config, *placed, record=True, mesh=self.mesh)
         self._rollouts_compiled = _in_background(pool, flights.compile, began)
         self._first: TrainState | None = None
-        self.shortest = processes.together(self._shortest)
+        self.shortest = processes.run_synchronised(self._shortest)
 
     def ready(self, begins: bool) -> float:
         """Waits until training can go on, and returns the seconds that its program took.
@@ -117,13 +117,15 @@ class Preparation:
         """Returns the missions, flown greedily and recorded; sensor noise is the same each time."""
         self._rollouts_compiled.result()
         placed = self._placed(missions, params, agent)
-        return processes.fetch(rollouts.fly_missions(self.config, *placed, record=True, mesh=self.mesh))
+        return processes.fetch_global(rollouts.fly_missions(self.config, *placed, record=True, mesh=self.mesh))
 
     def _shortest(self) -> ShortestPath:
         scene = self.missions[0].scene
         return shortest_path(scene, scene.start, scene.goal, self.config.drone.body_radius_m)
 
-    def _placed(self, missions: MissionSet, params: PolicyParams, agent: int) -> tuple[World, PolicyParams, jax.Array]:
+    def _placed(
+        self, missions: MissionSet, params: PolicyParams, agent: int
+    ) -> tuple[EnvParams, PolicyParams, jax.Array]:
         """World, parameters and key as `fly_missions` takes them."""
         key = run_streams(self.configs[agent].train.seed).flights
         return *processes.replicate((missions.world, params), self.mesh), key
@@ -149,10 +151,10 @@ def _of_agents(config: Config, agents: int | None) -> list[Config]:
 
 
 @contextlib.contextmanager
-def prepared(
+def set_up_training(
     config: Config, reward: Reward | None = None, display: Display | None = None, agents: int | None = None
-) -> Iterator[Preparation]:
-    """Prepares a run; where the block ends with an error, nobody waits for what is still being compiled.
+) -> Iterator[TrainingSetup]:
+    """Prepares a run; pending compilations are cancelled if the block ends with an error.
 
     Args:
         config: of the run; its seed is that of the first agent.
@@ -167,7 +169,7 @@ def prepared(
     check_not_forked()
     pool = ThreadPoolExecutor(max_workers=2, thread_name_prefix="compiling", initializer=keep_tested_settings)
     try:
-        yield Preparation(config, reward, display or Silent(), pool, agents)
+        yield TrainingSetup(config, reward, display or Silent(), pool, agents)
     finally:
         pool.shutdown(wait=False, cancel_futures=True)
 

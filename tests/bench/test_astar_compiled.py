@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from edqn_jax.planning import astar, lattice
-from edqn_jax.planning.path import PlannedPath, Task
+from edqn_jax.planning.path import PlannedPath, PlanningTask
 from edqn_jax.sim.scene.mjcf import load_scene, resolve_world
 from edqn_jax.sim.worlds.families import random_scene, world_key
 from rivals.planners import astar_compiled, snn
@@ -17,7 +17,7 @@ from rivals.planners.solids import solid_table
 from tests.support.small_worlds import RADIUS, assert_flyable, box, random_small_world, small_world
 
 
-def lattice_length(task: Task, cell: float = 0.5) -> float:
+def lattice_length(task: PlanningTask, cell: float = 0.5) -> float:
     """Returns the length of the compiled search's path, including the last leg to the goal; inf if there is no path."""
     lower, upper = np.asarray(task.scene.volume, np.float64)
     margin = lattice.edge_margin(cell, task.body_radius)
@@ -27,7 +27,7 @@ def lattice_length(task: Task, cell: float = 0.5) -> float:
     return length + np.linalg.norm(task.goal - points[-1]) if len(points) else np.inf
 
 
-def assert_like_the_plain_one(task: Task, plan: PlannedPath, cell: float = 0.5) -> None:
+def assert_like_the_plain_one(task: PlanningTask, plan: PlannedPath, cell: float = 0.5) -> None:
     try:
         plain = astar.shortest_path(task.scene, task.start, task.goal, task.body_radius, cell)
     except astar.NoPathError:
@@ -55,7 +55,7 @@ def test_in_random_small_worlds_the_lattice_path_is_as_short_as_the_plain_ones(s
 def test_in_large_worlds_too(world):
     name, *index = world.split()
     scene = random_scene(name, world_key("test", int(index[0]))) if index else load_scene(resolve_world(name))
-    task = Task.of(scene, body_radius=RADIUS)
+    task = PlanningTask.from_scene(scene, body_radius=RADIUS)
     assert_like_the_plain_one(task, astar_compiled.plan(task))
 
 

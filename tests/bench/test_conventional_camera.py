@@ -77,7 +77,9 @@ def test_off_the_silhouettes_a_picture_is_ours():
     pose, yaw = poses(scene, 16, seed=7)
     got, hits = pictures(config, scene, pose)
     rotations = jnp.asarray(np.stack([turn(angle) for angle in yaw]), jnp.float32)
-    ours = jax.jit(jax.vmap(partial(our_camera.luma, config, scene)))(jnp.asarray(pose[:, :3], jnp.float32), rotations)
+    ours = jax.jit(jax.vmap(partial(our_camera.render_luma, config, scene)))(
+        jnp.asarray(pose[:, :3], jnp.float32), rotations
+    )
     error = np.abs(got - np.asarray(ours))
     face = inside(hits, got.shape)
     assert face.sum() > 3000
@@ -162,7 +164,7 @@ def test_events_are_the_papers_law(change):
     # And ours; its float32 logarithm may count one more or less where a change is a whole number of tolerances.
     memory = our_events.reset_memory(config, before.shape[0], before.shape[1], jax.random.key(0))
     frames = jnp.asarray(np.stack([before, after]), jnp.float32)
-    field, _ = our_events.events(config, memory, frames, config.frame_times_s, jax.random.key(0))
+    field, _ = our_events.generate_events(config, memory, frames, config.frame_times_s, jax.random.key(0))
     assert np.mean(np.asarray(event_fields.signed_count(field)) != counts) < 0.02
 
 

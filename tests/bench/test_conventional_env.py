@@ -26,19 +26,19 @@ from edqn_jax.config import (
     LightConfig,
 )
 from edqn_jax.errors import ConfigError
-from edqn_jax.extras import require
+from edqn_jax.extras import require_extra
 from edqn_jax.sim.physics import drone
 from edqn_jax.sim.physics.drone import DroneState
 from edqn_jax.sim.sensors import events
 from edqn_jax.sim.task import env, outcomes
 from edqn_jax.sim.task.env import EnvState
-from edqn_jax.sim.task.observation import MOST_YAW_RATE, own_state
+from edqn_jax.sim.task.observation import MAX_YAW_RATE, own_state
 from edqn_jax.sim.task.outcomes import Outcome
 from edqn_jax.sim.task.reward import configured_reward
 from tests.support.benchmarks.conventional_course import course_of, fleet_of, paper, world_of
 
-gymnasium_check = require("gymnasium.utils.env_checker")
-stable_baselines3_check = require("stable_baselines3.common.env_checker")
+gymnasium_check = require_extra("gymnasium.utils.env_checker")
+stable_baselines3_check = require_extra("stable_baselines3.common.env_checker")
 
 CONFIG = Config()
 
@@ -158,7 +158,7 @@ def test_one_decision_from_any_state_ends_where_ours_does_and_is_judged_alike():
     upright = fleet.state[:, 3] ** 2 + fleet.state[:, 6] ** 2 > 0.5
     assert upright.mean() > 0.9
     np.testing.assert_allclose(motion[upright, 3], ours[upright, 3], atol=10 * VELOCITY)
-    assert np.abs(motion[:, 3]).max() <= MOST_YAW_RATE
+    assert np.abs(motion[:, 3]).max() <= MAX_YAW_RATE
     np.testing.assert_array_equal(motion[:, 4:], ours[:, 4:])
 
 
@@ -183,7 +183,7 @@ def test_whole_flights_are_ours_until_they_end_and_end_alike(mission, legs):
     start = STARTS[mission].astype(np.float32)
     world = world_of(CONFIG, start[None], GOALS[:1])
     ahead = GOALS[0] - start
-    body = drone.hover(jnp.asarray(start), jnp.arctan2(ahead[1], ahead[0]))
+    body = drone.hover_state(jnp.asarray(start), jnp.arctan2(ahead[1], ahead[0]))
     state = begun(jax.tree.map(lambda x: x[None], body), np.zeros(1))
     DRONE.reset(options={"mission": mission})
     fleet = DRONE.fleet
@@ -205,7 +205,7 @@ def test_whole_flights_are_ours_until_they_end_and_end_alike(mission, legs):
 
 def test_a_reset_is_ours():
     start, goal = STARTS[1], GOALS[1]
-    body = drone.hover(jnp.asarray(start), jnp.arctan2(goal[1] - start[1], goal[0] - start[0]))
+    body = drone.hover_state(jnp.asarray(start), jnp.arctan2(goal[1] - start[1], goal[0] - start[0]))
     DRONE.reset(options={"mission": 1})
     assert DRONE.step(22)[0]["motion"].any()
     got, info = DRONE.reset(seed=1, options={"mission": 1})

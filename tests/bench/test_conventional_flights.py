@@ -14,7 +14,7 @@ from conventional_stack.flights import fly_missions
 from edqn_jax.config import CameraConfig, Config, EnvConfig
 from edqn_jax.errors import ConfigError
 from edqn_jax.evaluation import rollouts as our_flights
-from edqn_jax.evaluation.metrics import summarise
+from edqn_jax.evaluation.metrics import summarise_flights
 from edqn_jax.policies.functions import FunctionActor
 from edqn_jax.sim.actions import ACTIONS
 from edqn_jax.sim.scene.scene import stack_scenes
@@ -64,7 +64,7 @@ def test_outcome_path_clearance_and_time_are_ours():
         expected = getattr(ours.closest, name)
         np.testing.assert_allclose(getattr(got.closest, name), expected, atol=5e-3, err_msg=name)
     np.testing.assert_allclose(got.closest.time, ours.closest.time, atol=1e-3)
-    figures = summarise(got)
+    figures = summarise_flights(got)
     assert figures["successes"] == 2 and figures["path_length_m"] == pytest.approx(np.mean(got.path_length_m[[0, 4]]))
 
 

@@ -20,10 +20,10 @@ from conventional_stack.vec_env import CodedDrones
 from conventional_stack.workers import SpreadFleet
 from edqn_jax.config import CameraConfig, Config, EncoderConfig
 from edqn_jax.errors import ConfigError
-from edqn_jax.extras import MissingPackageError, require
+from edqn_jax.extras import MissingPackageError, require_extra
 from edqn_jax.learn.perception import vae
-from edqn_jax.learn.perception.waves import cosines
-from edqn_jax.runs.directory import plain
+from edqn_jax.learn.perception.waves import cosine_basis
+from edqn_jax.runs.directory import to_plain_json
 from edqn_jax.sim.sensors.events import EventField
 from edqn_jax.sim.task.observation import MOTION_SIZE, OWN_SIZE
 from edqn_jax.sim.task.outcomes import Outcome
@@ -33,7 +33,7 @@ from tests.support.benchmarks.conventional_course import course_of
 from tests.support.benchmarks.uninstalled import hide
 from tests.support.miniature import MINIATURE
 
-torch = require("torch")
+torch = require_extra("torch")
 torch.set_num_threads(1)  # beside other tests a second one costs more than it does
 
 CONFIG = supported(Config())
@@ -110,7 +110,7 @@ def test_codes_and_drawings_of_our_parameters_are_ours(camera, config):
         np.testing.assert_allclose(mine.numpy(), expected, atol=TOLERANCE, rtol=TOLERANCE)
     np.testing.assert_array_equal(theirs.code(theirs.patches(counts), motion), got[0].numpy())
     rows, columns = drawn.shape[-2:]
-    image = cosines(camera.height, rows).T @ drawn @ cosines(camera.width, columns)
+    image = cosine_basis(camera.height, rows).T @ drawn @ cosine_basis(camera.width, columns)
     expected = vae.decode(config, camera, params, ours[0])
     assert np.ptp(expected) > 0.5
     np.testing.assert_allclose(image, expected, atol=TOLERANCE, rtol=TOLERANCE)
@@ -120,7 +120,7 @@ def test_codes_and_drawings_of_our_parameters_are_ours(camera, config):
 def test_what_is_drawn_and_its_loss_are_ours(camera, config):
     params, theirs = twins(camera, config)
     counts, motion, near = sensed(camera, 8)
-    wanted = vae.in_waves(config, vae.target(config, field_of(counts), jnp.asarray(near)))
+    wanted = vae.in_waves(config, vae.decoder_target(config, field_of(counts), jnp.asarray(near)))
     got = theirs.target(counts, near)
     assert np.ptp(wanted.amplitudes) > 1.0
     np.testing.assert_allclose(got.numpy(), wanted.amplitudes, atol=TOLERANCE, rtol=TOLERANCE)
@@ -407,7 +407,7 @@ def test_the_command_says_what_it_measured(monkeypatch, tmp_path, capsys):
     assert [row["processes"] for row in report["rows"]] == [1, 2]
     assert report["decisions_per_second"] == max(row["decisions_per_second"] for row in report["rows"])
     assert report["workload"]["replayed_samples_per_decision"] == 4 and report["workload"]["physics"] == "c_mujoco"
-    assert "torch" in report["versions"] and plain(report) == report
+    assert "torch" in report["versions"] and to_plain_json(report) == report
     assert "| rays |" in capsys.readouterr().out
 
 

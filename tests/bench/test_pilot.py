@@ -16,7 +16,7 @@ from edqn_jax.learn.policy import Policy
 from edqn_jax.sim.physics.airframe import load_airframe
 from edqn_jax.sim.scene.mjcf import load_world
 from edqn_jax.sim.scene.scene import stack_scenes
-from edqn_jax.sim.task.env import World
+from edqn_jax.sim.task.env import EnvParams
 from edqn_jax.sim.task.missions import own_missions
 from edqn_jax.sim.task.outcomes import Outcome
 from rivals.mapping import pilot
@@ -38,7 +38,7 @@ TRUE = PilotConfig(depth="true")
 
 
 @pytest.fixture(scope="module")
-def course(tmp_path_factory: pytest.TempPathFactory) -> World:
+def course(tmp_path_factory: pytest.TempPathFactory) -> EnvParams:
     """A wall across that leaves 4 m at one side, and its mirror image."""
     scenes = []
     for y in (8, 12):
@@ -46,7 +46,7 @@ def course(tmp_path_factory: pytest.TempPathFactory) -> World:
         file.write_text(WALL.format(y=y))
         scenes.append(load_world(file).scene)
     pool = stack_scenes(scenes)
-    return World(load_airframe(CONFIG.drone), pool, own_missions(pool))
+    return EnvParams(load_airframe(CONFIG.drone), pool, own_missions(pool))
 
 
 @functools.cache
@@ -55,7 +55,7 @@ def params():
 
 
 @pytest.mark.slow
-def test_with_true_depth_it_flies_around_a_wall_on_the_side_that_is_open(course: World) -> None:
+def test_with_true_depth_it_flies_around_a_wall_on_the_side_that_is_open(course: EnvParams) -> None:
     sides: list[np.ndarray] = []
 
     def watch(flying: Piloted, orders: Orders) -> None:
@@ -71,10 +71,10 @@ def test_with_true_depth_it_flies_around_a_wall_on_the_side_that_is_open(course:
 
 
 @pytest.mark.slow
-def test_it_does_not_know_what_its_sensor_does_not_show(course: World, monkeypatch) -> None:
+def test_it_does_not_know_what_its_sensor_does_not_show(course: EnvParams, monkeypatch) -> None:
     # A camera that sees nothing: the straight line leads into the wall.
     nothing = lambda config, *_: jnp.full((config.height, config.width), jnp.inf)  # noqa: E731
-    monkeypatch.setattr(pilot.camera, "depth", nothing)
+    monkeypatch.setattr(pilot.camera, "render_depth", nothing)
     pilot._programs.cache_clear()
     flights, _ = pilot.fly(CONFIG, TRUE, course, params(), jax.random.key(0), batch=2)
     pilot._programs.cache_clear()
@@ -84,7 +84,7 @@ def test_it_does_not_know_what_its_sensor_does_not_show(course: World, monkeypat
 
 
 @pytest.mark.slow
-def test_flights_do_not_depend_on_which_fly_side_by_side(course: World) -> None:
+def test_flights_do_not_depend_on_which_fly_side_by_side(course: EnvParams) -> None:
     together, alone = (pilot.fly(CONFIG, TRUE, course, params(), jax.random.key(0), batch=n)[0] for n in (3, 1))
     np.testing.assert_array_equal(together.outcome, alone.outcome)
     # Programs of another batch round the last bits otherwise, and a plan may then take another one of two equal ways.
@@ -92,7 +92,7 @@ def test_flights_do_not_depend_on_which_fly_side_by_side(course: World) -> None:
 
 
 @pytest.mark.slow
-def test_decoded_depth_comes_from_the_sensor_alone(course: World) -> None:
+def test_decoded_depth_comes_from_the_sensor_alone(course: EnvParams) -> None:
     # With events of a still camera there are none, so both worlds look the same and the maps stay as they were.
     decoded = PilotConfig(depth="decoded", seeing_m_s=0.0)
     begin, _ = pilot._programs("cpu")
@@ -142,7 +142,7 @@ def test_the_follower_gets_points_at_its_spacing() -> None:
     np.testing.assert_allclose(points[105:], np.broadcast_to([13.25, 10.25, 4.25], (POINTS - 105, 3)), atol=1e-5)
 
 
-def test_the_command_never_exceeds_the_limit_and_a_flight_that_is_over_stays_so(course: World) -> None:
+def test_the_command_never_exceeds_the_limit_and_a_flight_that_is_over_stays_so(course: EnvParams) -> None:
     shape = pilot.grid_shape(TRUE.map, course.pool.volume)
     flying = pilot.at_rest(CONFIG, TRUE, shape, course, jnp.zeros((), jnp.int32), jax.random.key(0))
     points = sampled(np.array([[3.0, 10.0, 4.0], [9.0, 10.0, 4.0]]))
@@ -183,7 +183,7 @@ def hovering(tmp_path: Path, decisions: int, world: str = MOVING, **words: str) 
     file = tmp_path / "moving.xml"
     file.write_text(world.format(**words))
     pool = stack_scenes([load_world(file).scene])
-    flown = World(load_airframe(CONFIG.drone), pool, own_missions(pool))
+    flown = EnvParams(load_airframe(CONFIG.drone), pool, own_missions(pool))
     number, shape = jnp.zeros((), jnp.int32), pilot.grid_shape(TRUE.map, pool.volume)
     flying = jax.jit(functools.partial(pilot._begin, CONFIG, TRUE, shape, flown, params()))(number, jax.random.key(0))
     step = jax.jit(functools.partial(pilot.decide, CONFIG, TRUE, flown, params()))
@@ -233,7 +233,7 @@ def test_a_flight_that_is_over_keeps_the_map_of_its_last_command(tmp_path: Path)
 
 
 @pytest.mark.slow
-def test_what_has_landed_comes_with_its_number(course: World) -> None:
+def test_what_has_landed_comes_with_its_number(course: EnvParams) -> None:
     short = dataclasses.replace(CONFIG, env=dataclasses.replace(CONFIG.env, max_decisions=2))
     found: list[tuple[int, int]] = []
 

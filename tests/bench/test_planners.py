@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from edqn_jax.planning.path import Task
+from edqn_jax.planning.path import PlanningTask
 from edqn_jax.sim.scene.mjcf import load_scene, resolve_world
 from edqn_jax.sim.worlds.families import random_scene, world_key
 from rivals.planners.planner import PLANNERS, Budget, load_planner
@@ -49,7 +49,7 @@ def test_every_path_in_a_small_world_is_free(name, seed):
 def test_every_path_in_a_large_world_is_free(name, world):
     kind, *index = world.split()
     scene = random_scene(kind, world_key("test", int(index[0]))) if index else load_scene(resolve_world(kind))
-    task = Task.of(scene, body_radius=RADIUS)
+    task = PlanningTask.from_scene(scene, body_radius=RADIUS)
     plan = load_planner(name)(task, Budget(seconds=600.0, steps=4000 if name in ("RRT*", "BIT*") else None))
     if name == "APF" and not plan.found:
         assert "local minimum" in plan.reason or "drives the drone into" in plan.reason

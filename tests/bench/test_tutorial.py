@@ -16,16 +16,16 @@ import pytest
 import tutorial
 from edqn_jax.config import CameraConfig, Config
 from edqn_jax.errors import ConfigError
-from edqn_jax.extras import require
+from edqn_jax.extras import require_extra
 from edqn_jax.sim.actions import ACTIONS
 from edqn_jax.sim.camera import camera
 from edqn_jax.sim.physics import drone
 from edqn_jax.sim.physics.airframe import c_model, load_airframe, mixer_of
-from edqn_jax.sim.physics.controller import thrusts as thrusts_in_jax
-from edqn_jax.sim.physics.flight import fly
+from edqn_jax.sim.physics.controller import rotor_thrusts as thrusts_in_jax
+from edqn_jax.sim.physics.flight import fly_decision
 from edqn_jax.sim.scene.mjcf import load_scene
 from edqn_jax.sim.sensors import events
-from edqn_jax.sim.task.action_sets import bearing, velocity_command
+from edqn_jax.sim.task.action_sets import heading_to_goal, velocity_command
 from edqn_jax.sim.task.observation import own_state
 from tutorial_stack.control import thrusts
 from tutorial_stack.env import Look, TutorialDrone, event_image
@@ -87,26 +87,26 @@ def test_the_events_are_those_of_the_papers_law() -> None:
     law = dataclasses.replace(CONFIG.events, threshold=0.15, tolerance=0.1)
     luma = jnp.asarray(np.stack([before, after]) @ np.array(camera.LUMA_WEIGHTS) / 255.0)
     memory = events.reset_memory(law, 24, 32, jax.random.key(0))
-    field, _ = events.events(law, memory, luma, law.frame_times_s, jax.random.key(1))
+    field, _ = events.generate_events(law, memory, luma, law.frame_times_s, jax.random.key(1))
     expected = np.asarray(field.polarity * np.log1p(field.count))
     assert (np.abs(event_image(law, before, after) - expected) > 1e-6).mean() < 0.005  # counts at a whole number
 
 
 def test_it_is_an_environment_of_gymnasium(flown: TutorialDrone) -> None:
-    require("gymnasium.utils.env_checker").check_env(flown, skip_render_check=True)
+    require_extra("gymnasium.utils.env_checker").check_env(flown, skip_render_check=True)
 
 
 def test_a_flight_is_that_of_edqn_jax(flown: TutorialDrone, world: Path) -> None:
     observed, _ = flown.reset(seed=0)
-    body = drone.hover(jnp.asarray(flown.start, jnp.float32), jnp.float32(0.0))
+    body = drone.hover_state(jnp.asarray(flown.start, jnp.float32), jnp.float32(0.0))
     scene, airframe = load_scene(world), load_airframe(CONFIG.drone)
     own = own_state(CONFIG.env, scene, jnp.asarray(flown.goal), body)
     np.testing.assert_allclose(observed[-10:], own, atol=1e-6)
     assert not observed[:-10].any()  # at rest nothing changes
-    fly_on = jax.jit(partial(fly, CONFIG.drone, airframe))
+    fly_on = jax.jit(partial(fly_decision, CONFIG.drone, airframe))
     for action in (move(1, 1, 0), move(1, 0, 1), move(0, -1, -1)):
         command = velocity_command(CONFIG.env, jnp.int32(action), drone.yaw_of(body.quaternion))
-        body, _ = fly_on(body, command, bearing(CONFIG.env, body, jnp.asarray(flown.goal, jnp.float32)))
+        body, _ = fly_on(body, command, heading_to_goal(CONFIG.env, body, jnp.asarray(flown.goal, jnp.float32)))
         observed, reward, *_ = flown.step(action)
         np.testing.assert_allclose(flown.data.qpos[:3], body.position, atol=5e-3)  # float64 there
         own = own_state(CONFIG.env, scene, jnp.asarray(flown.goal), body)
@@ -134,7 +134,7 @@ def test_a_flight_ends_at_the_goal_at_a_wall_at_the_fence_and_at_its_last_decisi
 
 
 def test_stable_baselines3_trains_on_it(world: Path) -> None:
-    one_process = require("stable_baselines3.common.vec_env").DummyVecEnv
+    one_process = require_extra("stable_baselines3.common.vec_env").DummyVecEnv
     config = dataclasses.replace(CONFIG, world=dataclasses.replace(CONFIG.world, name=str(world)))
     with tutorial.Tutorial(config, 2, one_process, look=painted) as trained:
         before = [p.detach().clone() for p in trained.dqn.q_net.parameters()]

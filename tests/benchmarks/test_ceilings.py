@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from edqn_jax.devices.hardware import cores
+from edqn_jax.devices.hardware import count_cores
 from measurement import ceilings
 from measurement.flags import configured
 
@@ -18,7 +18,7 @@ def test_c_mujoco_flies_the_same_airframe_on_every_core_and_every_step_is_counte
     measured = ceilings.Rollout(config)
     assert measured.model.opt.timestep == config.drone.physics_dt_s
     assert measured.model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
-    assert len(measured.data) == cores()
+    assert len(measured.data) == count_cores()
     states, _ = measured.pool.rollout(measured.model, measured.data, measured.start, measured.control)
     assert states.shape[:2] == (16, ceilings.ROLLOUT_STEPS)
     # time, then place and attitude: it hovers, and each step is really taken.

@@ -73,11 +73,11 @@ def test_a_shape_alone_is_all_that_is_left(course) -> None:
     scene = course.scene()
     only = failures.alone(scene, "spheres", 0)
     at, level = jnp.array([50.0, 30.0, 3.0]), jnp.eye(3)
-    image = np.asarray(camera.depth(CONFIG.camera, only, at, level))
+    image = np.asarray(camera.render_depth(CONFIG.camera, only, at, level))
     assert np.isfinite(image).any() and np.isinf(image).any()
     # The rays beside the middle, atan(1 / 8) off along both axes, meet the ball 1.741 m beside its centre.
     assert image.min() == pytest.approx(9.847 - np.sqrt(2.0**2 - 1.741**2), abs=2e-3)
-    assert np.isinf(np.asarray(camera.depth(CONFIG.camera, failures.alone(scene, "boxes", 0), at, level))).all()
+    assert np.isinf(np.asarray(camera.render_depth(CONFIG.camera, failures.alone(scene, "boxes", 0), at, level))).all()
 
 
 def test_the_table_counts_what_rows_have_in_common() -> None:

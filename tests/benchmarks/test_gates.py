@@ -13,7 +13,7 @@ import gates
 from edqn_jax.evaluation.missions import load_missions
 from edqn_jax.keys import run_streams
 from edqn_jax.sim.actions import move_name
-from edqn_jax.sim.physics.drone import hover
+from edqn_jax.sim.physics.drone import hover_state
 from edqn_jax.sim.task.outcomes import Outcome
 from tests.support.policies import CONFIG
 
@@ -43,7 +43,7 @@ def outcome(folder: Path, inside: str, gate: str) -> Outcome:
     ],
 )
 def test_straight_is_the_move_nearest_to_the_goals_direction(way: tuple[float, ...], yaw: float, move: str) -> None:
-    body = hover(jnp.array([1.0, 2.0, 30.0]), jnp.float32(yaw))
+    body = hover_state(jnp.array([1.0, 2.0, 30.0]), jnp.float32(yaw))
     assert move_name(gates.straight(body, body.position + jnp.array(way))) == move
 
 

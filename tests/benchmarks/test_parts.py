@@ -13,8 +13,8 @@ from jax import Array
 from jax.sharding import Mesh
 
 from edqn_jax.evaluation.missions import run_missions
-from edqn_jax.learn.plan import Plan
-from edqn_jax.learn.state import init
+from edqn_jax.learn.schedule import Schedule
+from edqn_jax.learn.state import init_state
 from edqn_jax.learn.trainer import AXIS
 from measurement.flags import configured
 from measurement.parts import PARTS, Moment, parts_of
@@ -30,8 +30,8 @@ def now() -> Moment:
     """A fresh state that is told it is past the beginning."""
     config = steady(configured((*MINIATURE, "--drone.physics", "mjx")), 8)
     world = run_missions(config).training.world
-    state = jax.jit(lambda world, key: init(config, world, key))(world, jax.random.key(0))
-    return Moment(config, world, dataclasses.replace(state, step=jnp.int32(Plan.of(config).learn_from)))
+    state = jax.jit(lambda world, key: init_state(config, world, key))(world, jax.random.key(0))
+    return Moment(config, world, dataclasses.replace(state, step=jnp.int32(Schedule.from_config(config).learn_from)))
 
 
 def with_steps(now: Moment, steps: int) -> Part:

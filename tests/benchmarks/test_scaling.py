@@ -15,18 +15,18 @@ from curves.boxes import MOST, world_of_boxes
 from curves.figure import draw_scaling
 from curves.state_bytes import StateBytes, state_bytes
 from edqn_jax.config import Config
-from edqn_jax.config.loading import apply
+from edqn_jax.config.loading import apply_layer
 from edqn_jax.errors import ConfigError
 from edqn_jax.evaluation.missions import run_missions
-from edqn_jax.learn.state import init
-from edqn_jax.runs.directory import plain
+from edqn_jax.learn.state import init_state
+from edqn_jax.runs.directory import to_plain_json
 from edqn_jax.sim.scene.mjcf import check_scene, load_scene
 from edqn_jax.sim.scene.scene import obstacle_count
 from measurement.flags import configured
 from measurement.timing import size_of
 from tests.support.miniature import MINIATURE
 
-BASE = apply(configured([]), {"train": {"devices": 2}}, "the test")
+BASE = apply_layer(configured([]), {"train": {"devices": 2}}, "the test")
 
 
 def test_a_slope_is_the_power_between_the_ends() -> None:
@@ -80,7 +80,7 @@ def test_each_curve_changes_one_thing_in_multiples_of_what_was_asked_for(quick: 
 
 
 def test_a_size_that_cannot_be_run_is_told_in_a_sentence(tmp_path: Path) -> None:
-    odd = apply(BASE, {"camera": {"width": 1}}, "the test")
+    odd = apply_layer(BASE, {"camera": {"width": 1}}, "the test")
     with pytest.raises(ConfigError, match="camera"):
         scaling.CURVES["pixels"](odd, False, tmp_path)
 
@@ -112,7 +112,7 @@ def test_state_bytes_are_exactly_those_of_the_arrays() -> None:
     config = configured(MINIATURE)
     world = run_missions(config).training.world
     counted = state_bytes(config, world)
-    state = jax.eval_shape(lambda world, key: init(config, world, key), world, jax.random.key(0))
+    state = jax.eval_shape(lambda world, key: init_state(config, world, key), world, jax.random.key(0))
     flown, stored = counted.environments * counted.environment, counted.replay_slots * counted.replay_slot
     assert flown + stored + counted.rest == size_of(state)
     assert (counted.environments, counted.replay_slots) == (16, config.agent.replay_size)
@@ -167,7 +167,7 @@ def test_sizes_take_turns_and_the_report_says_what_came_of_them(
     assert curves["devices"]["efficiency"] == pytest.approx(0.5)
     assert report["memory"]["temporary_bytes_per_environment"] == 1600 * 2 / 16
     assert report["workload"]["vae_samples_per_decision"] == 1
-    assert json.dumps(plain(report), allow_nan=False)
+    assert json.dumps(to_plain_json(report), allow_nan=False)
     shown = scaling.table(report)
     assert "Pixels: slope 1.00" in shown and "All devices together reach 50%" in shown
     drawn = draw_scaling(report, figure)

@@ -59,7 +59,7 @@ def test_it_says_what_each_sensor_costs(
     def in_turn(works: list[tuple[str, str]], *_: int) -> np.ndarray:
         return np.array([taken[sensor] if kind == "look" else [0.001] * 3 for kind, sensor in works])
 
-    monkeypatch.setattr(sensing, "in_turn", in_turn)
+    monkeypatch.setattr(sensing, "time_interleaved", in_turn)
     file = tmp_path / "sensing.json"
     assert sensing.main(["--worlds", "medium", "--missions", "1", "--json", str(file)]) == 0
     rows = json.loads(file.read_text())["rows"]
@@ -69,7 +69,7 @@ def test_it_says_what_each_sensor_costs(
 
 def test_works_are_timed_in_turns() -> None:
     order: list[str] = []
-    taken = sensing.in_turn([lambda: order.append("a"), lambda: order.append("b")], 5, block=2)
+    taken = sensing.time_interleaved([lambda: order.append("a"), lambda: order.append("b")], 5, block=2)
     assert "".join(order) == "ab" + "aabb" + "aabb" + "ab"  # one of each that compiles, then blocks
     assert taken.shape == (2, 5) and np.all(taken >= 0.0)
 
@@ -91,7 +91,7 @@ def test_the_time_from_photons_to_move_is_that_of_pictures_and_networks(
     config = dataclasses.replace(policy.config, env=dataclasses.replace(policy.config.env, sensor=sensor))
     course = load_missions(policy.config, "medium", 1)
     look = sensing.look_call(config, fresh_policy(config), course.scene())
-    taken = sensing.in_turn([look], 3)
+    taken = sensing.time_interleaved([look], 3)
     assert taken.shape == (1, 3) and np.all(taken > 0.0) and drawn == [sensor]
 
 

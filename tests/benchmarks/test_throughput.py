@@ -9,9 +9,9 @@ import pytest
 
 import throughput
 from edqn_jax.errors import ConfigError
-from edqn_jax.learn.plan import Plan
+from edqn_jax.learn.schedule import Schedule
 from edqn_jax.learn.trainer import Trainer
-from edqn_jax.runs.directory import plain
+from edqn_jax.runs.directory import to_plain_json
 from measurement.parts import parts_of
 from tests.support.miniature import MINIATURE
 
@@ -20,7 +20,7 @@ def test_the_vae_learns_throughout_and_four_samples_are_replayed() -> None:
     _, config = throughput.parse([])
     assert config.encoder.keep_learning
     assert config.agent.updates_per_step * config.agent.batch_size == 4 * config.train.num_envs
-    plan = Plan.of(config)
+    plan = Schedule.from_config(config)
     # The timed chunks come after the beginning, in which less is learnt.
     assert plan.warmup == config.train.chunk_steps and plan.learn_from <= 2 * config.train.chunk_steps
 
@@ -35,7 +35,7 @@ def test_another_sensor_is_timed_as_a_whole_only() -> None:
     with pytest.raises(ConfigError, match="blind needs --whole-only"):
         throughput.parse(words)
     args, config = throughput.parse(["--whole-only", *words])
-    assert args.whole_only and config.env.sensor == "blind" and Plan.of(config).warmup == 0
+    assert args.whole_only and config.env.sensor == "blind" and Schedule.from_config(config).warmup == 0
 
 
 @pytest.mark.slow
@@ -69,7 +69,7 @@ def test_parts_are_timed_beside_their_floors_and_c_mujoco(monkeypatch: pytest.Mo
     assert "dqn_update" not in rows  # what it is subtracted from was not timed
     assert report["workload"]["vae_samples_per_decision"] == 1
     assert "C MuJoCo rollout" in throughput.table(report)
-    assert json.dumps(plain(report), allow_nan=False)
+    assert json.dumps(to_plain_json(report), allow_nan=False)
 
 
 def test_rows_by_subtraction_say_so() -> None:

@@ -20,7 +20,7 @@ def test_what_is_timed_is_training_past_its_beginning(monkeypatch: pytest.Monkey
     config = steady(configured((*MINIATURE, *quick)), 4)
     whole = WholeStep(config, run_missions(config).training.world, jax.devices()[:2])
     # Three chunks, to warm up and to fill the replay: what is timed from here on is all alike.
-    assert whole.done == 12 >= whole.trainer.plan.learn_from
+    assert whole.done == 12 >= whole.trainer.schedule.learn_from
     before = jax.tree.map(np.asarray, (whole.state.learner.agent.q, whole.state.learner.vae))
     assert whole.turn() > 0
     after = jax.tree.map(np.asarray, (whole.state.learner.agent.q, whole.state.learner.vae))

@@ -18,7 +18,7 @@ from edqn_jax.cli import commands, main, train
 from edqn_jax.cli.evaluate import EvaluateArgs, parse_evaluate
 from edqn_jax.cli.help import COMMON, flag_of
 from edqn_jax.cli.train import parse_train, train_flags
-from edqn_jax.config import Config, preset
+from edqn_jax.config import Config, get_preset
 from edqn_jax.config.loading import make_config
 from edqn_jax.config.presets import RANDOM_WORLDS
 from edqn_jax.devices import devices
@@ -50,7 +50,7 @@ def trainer(monkeypatch):
 
     stand_in.__dict__.update(train_run=train_run, Draw=None)  # the gallery names `Draw` as a type
     monkeypatch.setitem(sys.modules, "edqn_jax.runs.record", stand_in)
-    monkeypatch.setattr(train, "hardware", lambda: "cpu")
+    monkeypatch.setattr(train, "detect_hardware", lambda: "cpu")
     monkeypatch.setattr(devices, "use_cpu_devices", lambda count=None: None)
     return behaviour
 
@@ -86,7 +86,7 @@ def test_flags_win_over_the_file_and_the_file_over_the_preset(tmp_path):
     file.write_text("agent: {batch_size: 256, n_step: 3}\n")
     _, config = parse_train(["--preset", "paper", "--config", str(file), "--agent.n-step", "7"])
     assert (config.agent.batch_size, config.agent.n_step) == (256, 7)
-    assert config.agent.hidden == preset("paper").agent.hidden
+    assert config.agent.hidden == get_preset("paper").agent.hidden
 
 
 @pytest.mark.parametrize(
@@ -218,7 +218,7 @@ def test_several_seeds_are_trained_together(trainer):
     ],
 )
 def test_worlds_are_tuned_for_a_gpu_where_there_is_one(argv, envs, monkeypatch):
-    monkeypatch.setattr(train, "hardware", lambda: "gpu")
+    monkeypatch.setattr(train, "detect_hardware", lambda: "gpu")
     assert parse_train(argv)[1].train.num_envs == envs
 
 
@@ -259,10 +259,10 @@ def test_each_ending_of_training_has_its_exit_code(ending, code, trainer, capsys
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 143), (signal.SIGINT, 130)])
 def test_a_signal_reaches_training_as_a_wish_to_stop(number, code, trainer, capsys):
     def act(config, run, progress, stop):
-        assert not stop.requested()
-        with stop.obeyed():
+        assert not stop.is_requested()
+        with stop.obey_signals():
             os.kill(os.getpid(), number)
-            while not stop.requested():
+            while not stop.is_requested():
                 time.sleep(0.01)
         raise StoppedError("stopped after saving")
 
@@ -280,7 +280,7 @@ def test_a_signal_reaches_training_as_a_wish_to_stop(number, code, trainer, caps
 def test_evaluate_hands_on_what_was_asked_for(monkeypatch, tmp_path):
     (tmp_path / "config.yaml").touch()
     asked: list[EvaluateArgs] = []
-    monkeypatch.setitem(commands.OF_A_RUN, "evaluate", (parse_evaluate, asked.append))
+    monkeypatch.setitem(commands.RUN_COMMANDS, "evaluate", (parse_evaluate, asked.append))
     monkeypatch.setattr(devices, "use_cpu_devices", lambda count=None: None)
     argv = [str(tmp_path), "--world", "dense", "--start", "1", "2", "3", "--goal", "-4", "5.5", "6"]
     assert main(["evaluate", *argv, "--missions", "9", "--seed", "2", "--json", "a.json"]) == 0

@@ -18,14 +18,14 @@ SOON_S = 60
 
 WORK = """
 import hashlib, sys, threading
-from edqn_jax.cli.process.signals import heard
+from edqn_jax.cli.process.signals import listen_to_signals
 
 def unheard():
     "Gives no signal handler of Python's a chance, as XLA while it compiles."
     print("ready", flush=True)
     hashlib.pbkdf2_hmac("sha256", b"", b"", 2**31 - 1)
 
-with heard() as stops:
+with listen_to_signals() as stops:
     if sys.argv[1] == "obeyed":
         with stops.obeyed(lambda text: print(text, flush=True)):
             unheard()

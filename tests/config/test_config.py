@@ -8,9 +8,9 @@ from typing import Any, get_args, get_type_hints
 
 import pytest
 
-from edqn_jax.config import FAMILIES, PRESETS, Config, EventsConfig, preset
+from edqn_jax.config import FAMILIES, PRESETS, Config, EventsConfig, get_preset
 from edqn_jax.config.limits import limits_of
-from edqn_jax.config.loading import apply, load_layer, make_config, resolve, to_yaml
+from edqn_jax.config.loading import apply_layer, load_layer, make_config, resolve_config, to_yaml
 from edqn_jax.config.presets import RANDOM_WORLDS
 from edqn_jax.config.profiles import PROFILES
 from edqn_jax.config.rules import validate
@@ -30,48 +30,48 @@ def changed(group: str, **options: Any) -> Config:
 
 @pytest.mark.parametrize("name", PRESETS)
 def test_every_preset_is_valid(name):
-    validate(preset(name))
+    validate(get_preset(name))
 
 
 @pytest.mark.parametrize("name", PRESETS)
 def test_a_written_configuration_reads_back_the_same(name, tmp_path):
-    config = preset(name)
-    assert apply(Config(), load_layer(write(tmp_path, to_yaml(config))), "file") == config
+    config = get_preset(name)
+    assert apply_layer(Config(), load_layer(write(tmp_path, to_yaml(config))), "file") == config
 
 
 def test_the_file_wins_over_the_preset_and_leaves_the_rest(tmp_path):
-    config = resolve("paper", write(tmp_path, "agent: {batch_size: 256}\n"))
+    config = resolve_config("paper", write(tmp_path, "agent: {batch_size: 256}\n"))
     assert config == dataclasses.replace(
-        preset("paper"), agent=dataclasses.replace(preset("paper").agent, batch_size=256)
+        get_preset("paper"), agent=dataclasses.replace(get_preset("paper").agent, batch_size=256)
     )
 
 
 def test_an_empty_file_changes_nothing(tmp_path):
-    assert resolve(file=write(tmp_path, "# nothing\n")) == resolve()
+    assert resolve_config(file=write(tmp_path, "# nothing\n")) == resolve_config()
 
 
 @pytest.mark.parametrize("world", FAMILIES)
 def test_a_random_world_brings_its_own_budget(world):
-    assert resolve(world=world).train.total_steps == RANDOM_WORLDS["train"]["total_steps"]
+    assert resolve_config(world=world).train.total_steps == RANDOM_WORLDS["train"]["total_steps"]
 
 
 def test_a_gpu_brings_its_own_sizes_and_files_and_the_papers_preset_keep_theirs(tmp_path):
-    medium = resolve(world="medium", tuned_for="gpu")
+    medium = resolve_config(world="medium", tuned_for="gpu")
     validate(medium)
     assert medium.train.num_envs == 16_384
     assert medium.events.threshold == RANDOM_WORLDS["events"]["threshold"]  # of random worlds on any hardware
     assert medium.world.name == "medium" and medium.world.pool_size > Config().world.pool_size
-    own = resolve(world="paper", tuned_for="gpu")
+    own = resolve_config(world="paper", tuned_for="gpu")
     assert (own.train.num_envs, own.agent.batch_size, own.events) == (2048, 1024, Config().events)
     file = write(tmp_path, "train: {num_envs: 64}\n")
-    assert resolve(file=file, world="medium", tuned_for="gpu").train.num_envs == 64
-    assert resolve("paper", tuned_for="gpu") == preset("paper")
+    assert resolve_config(file=file, world="medium", tuned_for="gpu").train.num_envs == 64
+    assert resolve_config("paper", tuned_for="gpu") == get_preset("paper")
     with pytest.raises(ConfigError, match="must be 'cpu' or 'gpu', not 'tpu'"):
         make_config("medium", tuned_for="tpu")  # type: ignore[arg-type]
 
 
 def test_random_worlds_have_their_own_warm_up_and_the_papers_preset_its_own_agent():
-    medium, paper = resolve(world="medium"), preset("paper")
+    medium, paper = resolve_config(world="medium"), get_preset("paper")
     assert (medium.agent.learning_rate, paper.agent.learning_rate, paper.agent.history) == (1e-3, 4e-4, 1)
     assert (medium.encoder.warmup_decisions, medium.encoder.retrain_at) == (65_536, (0.15,))
     assert (paper.encoder.warmup_updates_per_step, paper.encoder.retrain_at) == (12, ())
@@ -80,7 +80,7 @@ def test_random_worlds_have_their_own_warm_up_and_the_papers_preset_its_own_agen
 
 @pytest.mark.parametrize("hardware", ["cpu", "gpu"])
 def test_worlds_with_walls_are_learnt_along_their_ways_and_open_ones_are_not(hardware):
-    rooms, mixed, medium = (resolve(world=name, tuned_for=hardware) for name in ("rooms", "mixed", "medium"))
+    rooms, mixed, medium = (resolve_config(world=name, tuned_for=hardware) for name in ("rooms", "mixed", "medium"))
     larger = {"hidden", "layer_norm", "replay_size"} if hardware == "gpu" else set()
     kept = {name: value for name, value in dataclasses.asdict(rooms.agent).items() if name not in larger}
     assert rooms.env == mixed.env and kept.items() <= dataclasses.asdict(mixed.agent).items()
@@ -90,14 +90,14 @@ def test_worlds_with_walls_are_learnt_along_their_ways_and_open_ones_are_not(har
 
 
 def test_a_world_that_somebody_drew_is_learnt_along_its_ways_and_the_papers_map_is_not(tmp_path):
-    drawn, paper = resolve(world="house.xml"), resolve(world="paper")
+    drawn, paper = resolve_config(world="house.xml"), resolve_config(world="paper")
     assert paper == dataclasses.replace(Config(), world=dataclasses.replace(Config().world, name="paper"))
     assert (drawn.env.reward, drawn.env.collision_reward) == ("geodesic", -60.0)
     assert drawn.train.total_steps > paper.train.total_steps and drawn.agent == paper.agent
-    assert resolve(world="house.xml", tuned_for="gpu").env.reward == "geodesic"
+    assert resolve_config(world="house.xml", tuned_for="gpu").env.reward == "geodesic"
     file = write(tmp_path, "env: {reward: progress}\n")
-    assert resolve(file=file, world="house.xml").env.reward == "progress"
-    assert resolve("paper", world="house.xml").env.reward == "sparse"
+    assert resolve_config(file=file, world="house.xml").env.reward == "progress"
+    assert resolve_config("paper", world="house.xml").env.reward == "sparse"
 
 
 def test_a_profile_is_its_figures_and_what_is_given_beside_it_wins(tmp_path):
@@ -111,10 +111,10 @@ def test_a_profile_is_its_figures_and_what_is_given_beside_it_wins(tmp_path):
     sensitive = make_config("medium", events={"threshold": 0.05, "profile": "dvs", "shot_rate_hz": 0.0}).events
     assert (sensitive.threshold, sensitive.tolerance, sensitive.shot_rate_hz) == (0.05, 0.2, 0.0)
     file = write(tmp_path, "events: {profile: dark, leak_rate_hz: 1.0}\n")
-    dark = resolve(file=file, world="medium").events
+    dark = resolve_config(file=file, world="medium").events
     assert (dark.threshold, dark.bandwidth_hz, dark.leak_rate_hz) == (0.2, 3.0, 1.0)
     config = make_config("medium", file=file)
-    assert apply(Config(), load_layer(write(tmp_path, to_yaml(config))), "file") == config
+    assert apply_layer(Config(), load_layer(write(tmp_path, to_yaml(config))), "file") == config
     ideal = make_config("medium", file=file, events={"profile": "ideal"}).events
     assert (ideal.bandwidth_hz, ideal.leak_rate_hz, ideal.threshold) == (0.0, 0.0, 0.2)
     assert make_config("medium", events={"profile": "ideal"}).events == base
@@ -129,28 +129,28 @@ def test_every_profile_names_the_same_faults_and_is_valid(name):
 
 def test_a_random_world_in_the_file_brings_its_budget_too(tmp_path):
     assert (
-        resolve(file=write(tmp_path, "world: {name: dense}\n")).train.total_steps
+        resolve_config(file=write(tmp_path, "world: {name: dense}\n")).train.total_steps
         == RANDOM_WORLDS["train"]["total_steps"]
     )
 
 
 def test_a_budget_in_the_file_wins_over_the_random_world(tmp_path):
     file = write(tmp_path, "train: {total_steps: 1024}\n")
-    config = resolve(file=file, world="medium")
+    config = resolve_config(file=file, world="medium")
     assert (config.world.name, config.train.total_steps) == ("medium", 1024)
 
 
 def test_the_papers_preset_keeps_its_budget_on_random_worlds():
-    assert resolve("paper", world="medium").train.total_steps == 500_000
+    assert resolve_config("paper", world="medium").train.total_steps == 500_000
 
 
 def test_numbers_in_scientific_notation_and_infinity_are_numbers(tmp_path):
-    agent = resolve(file=write(tmp_path, "agent: {learning_rate: 1e-3, max_gradient_norm: .inf}\n")).agent
+    agent = resolve_config(file=write(tmp_path, "agent: {learning_rate: 1e-3, max_gradient_norm: .inf}\n")).agent
     assert (agent.learning_rate, agent.max_gradient_norm) == (1e-3, float("inf"))
 
 
 def test_a_whole_number_may_stand_for_a_float():
-    discount = apply(Config(), {"agent": {"discount": 1}}, "file").agent.discount
+    discount = apply_layer(Config(), {"agent": {"discount": 1}}, "file").agent.discount
     assert isinstance(discount, float) and discount == 1.0
 
 
@@ -160,11 +160,11 @@ def test_a_whole_number_may_stand_for_a_float():
 )
 def test_an_option_that_is_no_longer_there_may_be_off_but_not_on(name, off, on):
     group, option = name.split(".")
-    assert apply(Config(), {group: {option: off}}, "config.yaml") == Config()
+    assert apply_layer(Config(), {group: {option: off}}, "config.yaml") == Config()
     with pytest.raises(
         ConfigError, match=rf"config.yaml: '{name}' is no longer an option, and .*{on}.* commit e3f1c6b"
     ):
-        apply(Config(), {group: {option: on}}, "config.yaml")
+        apply_layer(Config(), {group: {option: on}}, "config.yaml")
 
 
 @pytest.mark.parametrize(
@@ -203,26 +203,26 @@ def test_a_mistake_in_the_file_is_named_with_what_would_be_right(text, says, tmp
     monkeypatch.chdir(tmp_path)
     Path("options.yaml").write_text(text)
     with pytest.raises(ConfigError) as error:
-        resolve(file=Path("options.yaml"))
+        resolve_config(file=Path("options.yaml"))
     assert says in str(error.value)
     assert "\n" not in str(error.value)
 
 
 def test_a_missing_file_is_named(tmp_path):
     with pytest.raises(ConfigError, match="cannot read the configuration file .*nowhere.yaml"):
-        resolve(file=tmp_path / "nowhere.yaml")
+        resolve_config(file=tmp_path / "nowhere.yaml")
 
 
 def test_a_file_without_end_is_not_read_to_its_end():
     with pytest.raises(ConfigError, match="'/dev/zero' has more than 1,000,000 bytes, so it is no file of options"):
-        resolve("default", Path("/dev/zero"))
+        resolve_config("default", Path("/dev/zero"))
 
 
 def test_a_file_that_is_not_text_is_named(tmp_path):
     file = tmp_path / "picture.yaml"
     file.write_bytes(b"\xff\xfe\x00\x80")
     with pytest.raises(ConfigError, match="picture.yaml"):
-        resolve(file=file)
+        resolve_config(file=file)
 
 
 def numeric_options() -> list[tuple[str, str, object]]:

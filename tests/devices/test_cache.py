@@ -13,8 +13,8 @@ from edqn_jax.devices import cache
 
 COMMAND = """
 import jax
-from edqn_jax.devices.cache import keep_programs
-keep_programs()
+from edqn_jax.devices.cache import enable_compilation_cache
+enable_compilation_cache()
 print(jax.jit(lambda x: x * 3 + 1)(2.0), jax.config.jax_compilation_cache_dir)
 """
 

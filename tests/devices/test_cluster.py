@@ -20,24 +20,24 @@ def test_a_process_alone_does_its_work_and_hears_itself() -> None:
     def fail() -> None:
         raise ConfigError("a world that is missing")
 
-    assert processes.together(lambda: 3) == 3
+    assert processes.run_synchronised(lambda: 3) == 3
     with pytest.raises(ConfigError, match="a world that is missing"):
-        processes.together(fail)
-    assert processes.on_any(True) and not processes.on_any(False)
+        processes.run_synchronised(fail)
+    assert processes.any_process(True) and not processes.any_process(False)
 
 
 @pytest.mark.parametrize(("theirs", "alike"), [("train: {seed: 0}", True), ("train: {seed: 1}", False)])
 def test_processes_with_different_options_all_hear_of_it(theirs: str, alike: bool, monkeypatch) -> None:
     ours = "train: {seed: 0}"
-    processes.check_alike(ours)  # alone there is nobody to differ from
+    processes.check_equal(ours)  # alone there is nobody to differ from
     digest = np.frombuffer(hashlib.sha256(theirs.encode()).digest(), np.uint8)
     monkeypatch.setattr(jax.distributed, "is_initialized", lambda: True)
     monkeypatch.setattr(processes.multihost_utils, "process_allgather", lambda own: np.stack([own, digest]))
     if alike:
-        processes.check_alike(ours)
+        processes.check_equal(ours)
     else:
         with pytest.raises(ConfigError, match="the processes have different options or world files"):
-            processes.check_alike(ours)
+            processes.check_equal(ours)
 
 
 def test_processes_may_keep_a_world_file_in_different_folders_but_not_another_world(tmp_path: Path) -> None:
@@ -63,7 +63,7 @@ def joined(monkeypatch: pytest.MonkeyPatch) -> list[dict]:
 
 def test_a_process_joins_as_it_was_told_and_keeps_sigterm_for_itself(joined) -> None:
     jax.config.update("jax_enable_preemption_service", True)
-    assert processes.join({"process_id": 0}) == 0
+    assert processes.join_cluster({"process_id": 0}) == 0
     assert joined == [{"process_id": 0, "heartbeat_timeout_seconds": processes.HEARTBEAT_S}]
     assert not jax.config.values["jax_enable_preemption_service"]
 
@@ -71,7 +71,7 @@ def test_a_process_joins_as_it_was_told_and_keeps_sigterm_for_itself(joined) -> 
 def test_processes_with_different_numbers_of_devices_are_refused(joined, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(jax, "devices", lambda: [SimpleNamespace(process_index=process) for process in (0, 0, 1)])
     with pytest.raises(ConfigError, match="equally many devices, not 1 and 2; on CPUs --train.devices"):
-        processes.join({})
+        processes.join_cluster({})
 
 
 def test_where_there_is_no_cluster_the_flags_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -80,4 +80,4 @@ def test_where_there_is_no_cluster_the_flags_are_named(monkeypatch: pytest.Monke
 
     monkeypatch.setattr(jax.distributed, "initialize", initialize)
     with pytest.raises(ConfigError, match="no cluster to join; give --coordinator-address, .*should be defined"):
-        processes.join({})
+        processes.join_cluster({})

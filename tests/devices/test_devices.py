@@ -15,7 +15,7 @@ import pytest
 
 from edqn_jax.devices import devices
 from edqn_jax.devices.devices import choose_devices, most_that_divide, use_cpu_devices
-from edqn_jax.devices.hardware import cores
+from edqn_jax.devices.hardware import count_cores
 from edqn_jax.errors import ConfigError
 
 
@@ -74,7 +74,7 @@ def test_what_processes_cannot_share_is_named(three_of_each_of_two, requested, s
 def test_devices_cannot_be_made_once_jax_runs():
     jax.devices()
     with pytest.raises(RuntimeError):
-        use_cpu_devices(2 + cores())
+        use_cpu_devices(2 + count_cores())
 
 
 @pytest.mark.parametrize(
@@ -92,8 +92,8 @@ def test_only_jax_0_11_is_told_to_use_the_old_partitioner(version, partitioner, 
 @pytest.mark.parametrize(
     ("given", "then"),
     [
-        ("", devices.ALIKE),
-        ("--xla_cpu_max_isa=AVX", f"--xla_cpu_max_isa=AVX {devices.ALIKE}"),
+        ("", devices.DETERMINISTIC_ROUNDING_FLAG),
+        ("--xla_cpu_max_isa=AVX", f"--xla_cpu_max_isa=AVX {devices.DETERMINISTIC_ROUNDING_FLAG}"),
         ("--xla_backend_extra_options=a", "--xla_backend_extra_options=a"),
     ],
 )
@@ -131,7 +131,7 @@ def test_flags_of_xla_in_a_file_are_kept(tmp_path: Path, monkeypatch: pytest.Mon
     monkeypatch.setattr(jax.config, "update", lambda *_: None)
     monkeypatch.setenv("XLA_FLAGS", str(file))
     use_cpu_devices(1)
-    assert os.environ["XLA_FLAGS"] == f"--xla_cpu_enable_fast_math=false {devices.ALIKE}"
+    assert os.environ["XLA_FLAGS"] == f"--xla_cpu_enable_fast_math=false {devices.DETERMINISTIC_ROUNDING_FLAG}"
 
 
 def test_what_tests_compile_is_quick_to_compile_though_the_package_adds_a_flag_of_its_own() -> None:

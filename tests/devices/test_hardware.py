@@ -8,11 +8,11 @@ from types import SimpleNamespace
 import pytest
 
 from edqn_jax.devices import hardware as module
-from edqn_jax.devices.hardware import hardware
+from edqn_jax.devices.hardware import detect_hardware
 
 
 def installed(monkeypatch: pytest.MonkeyPatch, *names: str) -> None:
-    """Makes these the only modules that can be imported, as far as `hardware` looks."""
+    """Makes these the only modules that can be imported, as far as `detect_hardware` looks."""
     modules = [SimpleNamespace(name=name) for name in names]
     monkeypatch.setattr(module.pkgutil, "iter_modules", lambda: modules)
 
@@ -42,7 +42,7 @@ def test_a_card_with_its_plugin_is_a_gpu(
 ) -> None:
     (tmp_path / card).touch()
     installed(monkeypatch, plugin)
-    assert hardware({}, tmp_path) == found
+    assert detect_hardware({}, tmp_path) == found
 
 
 @pytest.mark.parametrize(
@@ -58,4 +58,4 @@ def test_a_card_with_its_plugin_is_a_gpu(
     ],
 )
 def test_the_environment_can_hide_it(environ: dict[str, str], found: str, with_card: Path) -> None:
-    assert hardware(environ, with_card) == found
+    assert detect_hardware(environ, with_card) == found

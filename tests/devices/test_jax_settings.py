@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 import edqn_jax
-from edqn_jax.devices.jax_settings import TESTED, as_tested, keep_tested_settings, others, set_as_tested
+from edqn_jax.devices.jax_settings import TESTED, as_tested, keep_tested_settings, set_as_tested, untested_settings
 from edqn_jax.interop import functional
 from tests.support.miniature import WORLD
 
@@ -51,11 +51,11 @@ def set_for_process(**values: Any) -> Iterator[None]:
 
 @pytest.mark.parametrize(("name", "value"), OTHER.items())
 def test_a_function_of_the_package_runs_with_the_tested_value(name: str, value: Any) -> None:
-    assert others() == []
+    assert untested_settings() == []
     with set_for_process(**{name: value}):
-        assert others()
-        assert as_tested(others)() == []
-        assert others()  # and the user's own again
+        assert untested_settings()
+        assert as_tested(untested_settings)() == []
+        assert untested_settings()  # and the user's own again
 
 
 @pytest.mark.parametrize(("name", "value"), OTHER.items())
@@ -63,7 +63,7 @@ def test_a_command_sets_the_tested_value_and_tells_the_variable(name: str, value
     with set_for_process(**{name: value}):
         (told,) = set_as_tested()
         assert told.startswith(f"{name.upper()}=")
-        assert others() == [] and set_as_tested() == []
+        assert untested_settings() == [] and set_as_tested() == []
 
 
 def test_a_thread_of_a_pool_keeps_the_tested_settings() -> None:
@@ -72,8 +72,8 @@ def test_a_thread_of_a_pool_keeps_the_tested_settings() -> None:
         ThreadPoolExecutor(1, initializer=keep_tested_settings) as kept,
         ThreadPoolExecutor(1) as other,
     ):
-        assert kept.submit(others).result() == [] and kept.submit(others).result() == []
-        assert other.submit(others).result() == ["jax_enable_x64"]
+        assert kept.submit(untested_settings).result() == [] and kept.submit(untested_settings).result() == []
+        assert other.submit(untested_settings).result() == ["jax_enable_x64"]
 
 
 def wide(tree: Any) -> set[str]:

@@ -67,7 +67,7 @@ def test_a_training_is_refused_before_it_is_compiled(monkeypatch: pytest.MonkeyP
     monkeypatch.setattr(setup.Trainer, "trace", lambda trainer: pytest.fail("it was traced"))
     with (
         pytest.raises(ConfigError, match="the train state takes .* GiB of memory, but this machine has 0.00 GiB"),
-        setup.prepared(make_config("paper")),
+        setup.set_up_training(make_config("paper")),
     ):
         pass
 

@@ -14,13 +14,13 @@ import pytest
 
 from edqn_jax.cli.evaluate import EvaluateArgs, evaluate_command
 from edqn_jax.config import Config
-from edqn_jax.config.loading import apply, to_yaml
+from edqn_jax.config.loading import apply_layer, to_yaml
 from edqn_jax.errors import ConfigError
 from edqn_jax.evaluation import evaluate as evaluation
 from edqn_jax.evaluation import latency
 from edqn_jax.evaluation.judge import load_judge, replay_contact
 from edqn_jax.evaluation.latency import decision_latency_ms
-from edqn_jax.evaluation.metrics import spl, summarise, wilson_interval
+from edqn_jax.evaluation.metrics import spl, summarise_flights, wilson_interval
 from edqn_jax.evaluation.missions import MissionSet
 from edqn_jax.learn.actor import AgentActor
 from edqn_jax.learn.policy import fresh_policy
@@ -81,7 +81,7 @@ def four_flights() -> Flights:
 
 
 def test_figures_of_four_flights_are_those_worked_out_by_hand():
-    figures = summarise(four_flights(), np.array([10.0, 20.0, np.nan, np.nan]))
+    figures = summarise_flights(four_flights(), np.array([10.0, 20.0, np.nan, np.nan]))
     assert (figures["missions"], figures["successes"], figures["success_rate"]) == (4, 2, 0.5)
     kinds = ("collisions", "left_volume", "timeouts", "diverged")
     assert [figures[kind] for kind in kinds] == [1, 0, 1, 0]
@@ -95,7 +95,7 @@ def test_figures_of_four_flights_are_those_worked_out_by_hand():
 
 
 def test_without_shortest_paths_there_is_no_spl():
-    assert summarise(four_flights())["spl"] is None
+    assert summarise_flights(four_flights())["spl"] is None
 
 
 @pytest.mark.slow
@@ -191,7 +191,7 @@ def test_the_command_flies_under_the_conditions_that_it_is_given_and_says_so(run
     monkeypatch.setattr(latency, "decision_latency_ms", lambda *_, **__: {"median": 1.0, "p99": 2.0})
     conditions = {"air": {"gusts_m_s": 5.0}, "env": {"action_delay": 1}}
     evaluate_command(EvaluateArgs(run, missions=4, conditions=conditions, json=tmp_path / "figures.json"))
-    assert flown == [apply(CONFIG, conditions, "test")] != [CONFIG]
+    assert flown == [apply_layer(CONFIG, conditions, "test")] != [CONFIG]
     figures = json.loads((tmp_path / "figures.json").read_text())
     assert figures["conditions"] == {"air.gusts_m_s": 5.0, "env.action_delay": 1}
     said = capsys.readouterr().out

@@ -14,7 +14,7 @@ from edqn_jax.evaluation import rollouts
 from edqn_jax.evaluation.metrics import flight_summary
 from edqn_jax.evaluation.missions import MissionSet, load_missions
 from edqn_jax.evaluation.rollouts import fly_missions, fly_on_all_devices
-from edqn_jax.evaluation.trajectories import TRAJECTORY_COLUMNS, trajectory
+from edqn_jax.evaluation.trajectories import TRAJECTORY_COLUMNS, flight_trajectory
 from edqn_jax.evaluation.verdicts import check_verdicts
 from edqn_jax.sim.scene.distance import signed_distance
 from edqn_jax.sim.scene.scene import take_scene
@@ -165,7 +165,7 @@ def test_a_recorded_flight_becomes_columns_and_a_summary_and_compiles_nothing_an
     layout = NamedSharding(mesh, PartitionSpec())
     world, params = jax.device_put((course.world, always((1, 0, 0))), layout)
     key = jax.random.key(0)
-    rollouts.traced(CONFIG, world, params, key, record=True, mesh=mesh).compile()
+    rollouts.trace_missions(CONFIG, world, params, key, record=True, mesh=mesh).compile()
     another_key = jax.random.key(1)
     compiled: list[str] = []
     jax.monitoring.register_event_duration_secs_listener(lambda event, *_, **__: compiled.append(event))
@@ -175,7 +175,7 @@ def test_a_recorded_flight_becomes_columns_and_a_summary_and_compiles_nothing_an
     assert "/jax/core/compile/backend_compile_duration" not in compiled
     mission = int(np.flatnonzero(np.asarray(flown.outcome) == Outcome.COLLISION)[0])
     start = np.asarray(world.missions.start[mission])
-    columns = trajectory(CONFIG, flown, mission)
+    columns = flight_trajectory(CONFIG, flown, mission)
     summary = flight_summary(flown, mission)
     assert tuple(columns) == TRAJECTORY_COLUMNS
     assert {len(column) for column in columns.values()} == {int(flown.physics_steps[mission])}

@@ -17,7 +17,7 @@ from edqn_jax.cli import main
 from edqn_jax.config import Config
 from edqn_jax.config.registry import ACTION_SETS
 from edqn_jax.errors import ConfigError
-from edqn_jax.evaluation.trajectories import trajectory, trajectory_columns
+from edqn_jax.evaluation.trajectories import flight_trajectory, trajectory_columns
 from edqn_jax.evaluation.verdicts import check_verdicts
 from edqn_jax.interop import functional
 from edqn_jax.interop.deployment.onnx_export import export_policy
@@ -176,7 +176,7 @@ def test_a_velocity_flies_as_the_move_of_its_numbers_and_is_recorded_as_it_is_fl
         np.testing.assert_array_equal(one, other)
     there = np.isfinite(moves_of(fast)[..., 0])
     assert np.all(moves_of(fast)[there] == [0.0, 0.0, 1.0]) and np.array_equal(there, moves_of(move) >= 0)
-    columns = trajectory(config, fast.flights, 1)
+    columns = flight_trajectory(config, fast.flights, 1)
     assert tuple(columns) == trajectory_columns(3) and set(columns["action_2"]) == {1.0}
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from edqn_jax.evaluation.intervals import drawn_rates, rate_interval
+from edqn_jax.evaluation.intervals import bootstrap_rates, rate_interval
 from edqn_jax.evaluation.metrics import wilson_interval
 from measurement.intervals import difference_interval
 
@@ -27,7 +27,7 @@ def test_seeds_that_agree_leave_the_missions_chance_and_missions_that_agree_the_
     # 6 of 20 seeds, each the same in every mission: a binomial of 20, 0.1025.
     seeds = np.tile((np.arange(20) < 6)[:, None], (1, 50))
     for success, deviation in ((missions, 0.0458), (seeds, 0.1025)):
-        drawn = drawn_rates([success])[0]
+        drawn = bootstrap_rates([success])[0]
         assert drawn.mean() == pytest.approx(0.3, abs=0.005)
         assert drawn.std() == pytest.approx(deviation, rel=0.05)
     low, high = rate_interval(missions)
@@ -37,7 +37,7 @@ def test_seeds_that_agree_leave_the_missions_chance_and_missions_that_agree_the_
 def test_a_draw_of_seeds_keeps_each_seeds_missions_together() -> None:
     # Half of the seeds fly all, half none: whatever the missions, a draw is a whole number of fifths.
     success = np.tile((np.arange(5) < 2)[:, None], (1, 7))
-    np.testing.assert_allclose(np.unique(drawn_rates([success])[0]), np.arange(6) / 5, atol=1e-12)
+    np.testing.assert_allclose(np.unique(bootstrap_rates([success])[0]), np.arange(6) / 5, atol=1e-12)
 
 
 def test_missions_are_drawn_for_both_methods_alike_and_seeds_for_each() -> None:
@@ -65,7 +65,7 @@ def test_an_interval_over_seeds_and_missions_covers_the_true_rate() -> None:
     def covers() -> bool:
         # How good a seed is, and how hard a mission, add up: the true rate over all of both is a half.
         skill, ease = draw.normal(0, 0.5, (8, 1)), draw.normal(0, 1.0, (1, 40))
-        drawn = drawn_rates([skill + ease + draw.normal(0, 1.0, (8, 40)) > 0], draws=400)[0]
+        drawn = bootstrap_rates([skill + ease + draw.normal(0, 1.0, (8, 40)) > 0], draws=400)[0]
         low, high = np.percentile(drawn, [2.5, 97.5])
         return low <= 0.5 <= high
 

@@ -8,11 +8,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from edqn_jax.config.loading import flown_under, make_config
+from edqn_jax.config.loading import make_config, with_conditions
 from edqn_jax.errors import ConfigError
 from edqn_jax.evaluation.companions import scene_of_flight
 from edqn_jax.evaluation.evaluate import evaluate
-from edqn_jax.evaluation.metrics import summarise
+from edqn_jax.evaluation.metrics import summarise_flights
 from edqn_jax.evaluation.missions import final_missions, load_missions, run_missions
 from edqn_jax.runs.policies import load_policy
 from edqn_jax.sim.scene.scene import PARKED, scene_at
@@ -28,7 +28,7 @@ def flown():
     policy = load_policy("pretrained")
     conditions = {"env": {"drones": DRONES}}
     return (
-        flown_under(policy.config, conditions, "test"),
+        with_conditions(policy.config, conditions, "test"),
         evaluate(policy, "medium", missions=DRONES * GROUPS, conditions=conditions, record=True),
     )
 
@@ -71,7 +71,7 @@ def test_figures_count_drones_groups_and_what_was_hit(flown):
     assert figures["success_rate"] == arrived.mean()
     assert figures["groups_arrived"] == arrived.reshape(GROUPS, DRONES).all(1).sum()
     assert figures["collisions_with_drones"] == evaluation.flights.hit_drone.sum() <= figures["collisions"]
-    alone = summarise(dataclasses.replace(evaluation.flights, hit_drone=None))
+    alone = summarise_flights(dataclasses.replace(evaluation.flights, hit_drone=None))
     assert not {"groups", "collisions_with_drones"} & set(alone)
 
 
@@ -141,4 +141,4 @@ def test_what_several_drones_cannot_fly_is_said_in_a_sentence(arguments, said):
 
 def test_a_number_of_drones_that_training_could_not_have_is_flown():
     policy = load_policy("pretrained")  # trained with 16,384 environments, in worlds with the reward geodesic
-    assert flown_under(policy.config, {"env": {"drones": 3}}, "test").env.drones == 3
+    assert with_conditions(policy.config, {"env": {"drones": 3}}, "test").env.drones == 3

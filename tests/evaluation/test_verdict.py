@@ -6,7 +6,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from edqn_jax.evaluation.judge import Judge, clearance, load_judge, replay_contact
+from edqn_jax.evaluation.judge import MujocoWorld, clearance, load_judge, replay_contact
 from edqn_jax.evaluation.verdicts import CONTACT_TOLERANCE_M, Agreement
 from edqn_jax.sim.task.outcomes import Outcome
 
@@ -33,7 +33,7 @@ TOPS |= {"cylinder": (50.0, 7.0), "seen": (80.0, 6.0)}
 
 
 @pytest.fixture(scope="module")
-def judge() -> Judge:
+def judge() -> MujocoWorld:
     return load_judge(mujoco.MjSpec.from_string(WORLD), RADIUS)
 
 

@@ -24,9 +24,9 @@ from hypothesis import strategies as st
 from edqn_jax.cli import train
 from edqn_jax.cli.commands import BAD_INPUT
 from edqn_jax.config import Config
-from edqn_jax.config.loading import resolve
+from edqn_jax.config.loading import resolve_config
 from edqn_jax.config.rules import validate
-from edqn_jax.errors import ConfigError, sentence
+from edqn_jax.errors import ConfigError, error_sentence
 from edqn_jax.learn.policy import Policy
 from edqn_jax.runs.checkpoints import states
 from edqn_jax.runs.checkpoints.params import POLICY
@@ -95,7 +95,7 @@ def refusal(kind: Kind, drawn: Any) -> str | None:
         try:
             kind.read(drawn, Path(name))
         except ConfigError as error:
-            said = sentence(error)
+            said = error_sentence(error)
             assert 8 < len(said) < 1000, said
             return said
         return None
@@ -140,7 +140,7 @@ def mutated(draw: st.DrawFn, text: str) -> str:
 def read_options(text: str, folder: Path) -> None:
     file = folder / "options.yaml"
     file.write_bytes(text.encode(errors="surrogateescape"))
-    validate(resolve("default", file, None, "cpu"))
+    validate(resolve_config("default", file, None, "cpu"))
 
 
 FLAGS = sorted(train.train_flags() | {"--no", "--world.nam", "-x", "extra"})
@@ -243,7 +243,7 @@ def saved(kind: str) -> Path:
         if kind == "policy":
             save_policy(Policy(CONFIG, always((1, 0, 0))), folder)
         else:
-            states.save(folder, 7, Checkpoint(_ARRAYS, {"done": 7}, "train: {}\n", {"reward": "null"}), 1)
+            states.save_checkpoint(folder, 7, Checkpoint(_ARRAYS, {"done": 7}, "train: {}\n", {"reward": "null"}), 1)
     return folder
 
 
@@ -304,7 +304,7 @@ def read_damaged(kind: str, sealed: bool) -> Callable[[tuple[str, int, int], Pat
             reseal(file)
         if kind == "policy":
             load_policy(place)
-        elif states.newest(place, lambda _: None, lambda _: None) is None:
+        elif states.newest_checkpoint(place, lambda _: None, lambda _: None) is None:
             raise ConfigError("its only file is gone")
 
     return read

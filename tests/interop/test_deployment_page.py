@@ -62,5 +62,5 @@ def test_attitudes_are_those_of_px4():
         found = Rotation.from_quat(there["quaternion_from_ned"](q), scalar_first=True).as_matrix()
         np.testing.assert_allclose(found, swap @ turn.as_matrix() @ flip, atol=1e-12)
     level = Rotation.from_euler("z", 30, degrees=True).as_quat(scalar_first=True)  # 30 degrees east of north
-    yaw = runner.heading(there["quaternion_from_ned"](level).astype(np.float32))
+    yaw = runner.heading_of(there["quaternion_from_ned"](level).astype(np.float32))
     assert np.degrees(yaw) == pytest.approx(60.0, abs=1e-4)

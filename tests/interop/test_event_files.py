@@ -11,14 +11,14 @@ import numpy as np
 import pytest
 
 from edqn_jax.errors import ConfigError
-from edqn_jax.extras import MissingPackageError, require
+from edqn_jax.extras import MissingPackageError, require_extra
 from edqn_jax.interop.recordings.event_files import read_events, write_events
 from edqn_jax.interop.recordings.recording import Recording
 from tests.oracles import event_words
 from tests.support.interop.recordings import HEIGHT, WIDTH, some_events, some_recording
 
-faery = require("faery", extra="events")
-h5py = require("h5py", extra="events")
+faery = require_extra("faery", extra="events")
+h5py = require_extra("h5py", extra="events")
 
 CAMERAS = ("a.aedat4", "evt2.raw", "evt3.raw", "a.dat", "a.es")
 
@@ -99,7 +99,7 @@ def test_hdf5_is_in_dsecs_layout(tmp_path):
 
 def test_dsecs_own_files_are_read(tmp_path):
     """Without a size, its index and offset at the top, compressed with Blosc."""
-    plugin, events = require("hdf5plugin", extra="events"), some_events()
+    plugin, events = require_extra("hdf5plugin", extra="events"), some_events()
     since = (events["t"] - events["t"][0]).astype(np.uint32)
     with h5py.File(tmp_path / "events.h5", "w") as opened:
         columns = {"x": events["x"], "y": events["y"], "p": (events["p"] > 0).astype(np.uint8), "t": since}

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from edqn_jax.errors import ConfigError
-from edqn_jax.extras import require
+from edqn_jax.extras import require_extra
 from edqn_jax.interop.recordings.event_files import read_events
 from edqn_jax.interop.recordings.prophesee_words import EVT3
 from edqn_jax.sim.sensors.events import STREAM_DTYPE
@@ -18,8 +18,8 @@ from tests.oracles import event_words
 from tests.oracles.aedat4_bytes import aedat4
 from tests.support.interop.recordings import HEIGHT, WIDTH, some_events
 
-faery = require("faery", extra="events")
-h5py = require("h5py", extra="events")
+faery = require_extra("faery", extra="events")
+h5py = require_extra("h5py", extra="events")
 
 SIZE = (WIDTH, HEIGHT)
 

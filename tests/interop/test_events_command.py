@@ -20,7 +20,7 @@ from edqn_jax.evaluation.missions import load_missions
 from edqn_jax.interop.deployment import runner
 from edqn_jax.interop.recordings.event_files import read_events, write_events
 from edqn_jax.interop.recordings.recording import Recording
-from edqn_jax.interop.recordings.seen_events import seen_by, window_ends
+from edqn_jax.interop.recordings.seen_events import observe_recording, window_ends
 from edqn_jax.learn.perception import vae
 from edqn_jax.learn.policy import Policy
 from edqn_jax.sim.environment import Environment
@@ -108,7 +108,7 @@ def test_a_policy_sees_in_a_recorded_flight_what_it_saw_when_it_flew(flight):
     """Its own frames make the same changes of brightness as those of the finer camera, averaged."""
     policy = edqn_jax.load_policy("pretrained")
     recording = read_events(flight)
-    seen = seen_by(policy, recording)
+    seen = observe_recording(policy, recording)
     missions = load_missions(policy.config, "sparse", 1, 0, None, None)
     environment = Environment(policy.config, missions.world)
     state, observation = environment.reset(0, 0)

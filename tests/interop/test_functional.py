@@ -16,13 +16,13 @@ import edqn_jax
 from edqn_jax.config import AirConfig, BodyConfig, Config, NoiseConfig
 from edqn_jax.config.loading import make_config
 from edqn_jax.errors import ConfigError
-from edqn_jax.extras import require
+from edqn_jax.extras import require_extra
 from edqn_jax.interop import functional
 from edqn_jax.learn.policy import Policy, fresh_policy
 from edqn_jax.sim.actions import move_number
 from edqn_jax.sim.task.outcomes import Outcome
 
-interop = require("edqn_jax.interop.gymnasium")
+interop = require_extra("edqn_jax.interop.gymnasium")
 
 DOWN, HOVER = int(move_number("down")), int(move_number("hover"))
 MOVES = np.random.default_rng(5).integers(0, 27, size=(40, 3))

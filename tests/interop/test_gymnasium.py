@@ -12,15 +12,15 @@ import pytest
 
 import edqn_jax
 from edqn_jax.errors import ConfigError
-from edqn_jax.extras import require
+from edqn_jax.extras import require_extra
 from edqn_jax.learn.actor import AgentActor
 from edqn_jax.sim.actions import move_number
 from edqn_jax.sim.task.observation import OWN_SIZE
 from edqn_jax.sim.task.outcomes import Outcome
 from tests.support.interop.gym import DOWN, HOVER, MOVES, many, policy, small
 
-gymnasium = require("gymnasium", extra="gym")
-interop = require("edqn_jax.interop.gymnasium")
+gymnasium = require_extra("gymnasium", extra="gym")
+interop = require_extra("edqn_jax.interop.gymnasium")
 
 AHEAD = int(move_number("ahead"))
 
@@ -39,8 +39,8 @@ def counts(image: np.ndarray) -> np.ndarray:
 def test_it_passes_the_checks_of_gymnasium_and_of_stable_baselines3(observation):
     options = {"config": small(), "worlds": 3, "observation": observation, "render_mode": "rgb_array"}
     checked = gymnasium.make("EDQN/Random-v0", **options).unwrapped
-    require("gymnasium.utils.env_checker").check_env(checked)
-    require("stable_baselines3.common.env_checker").check_env(checked)
+    require_extra("gymnasium.utils.env_checker").check_env(checked)
+    require_extra("stable_baselines3.common.env_checker").check_env(checked)
 
 
 @pytest.mark.parametrize(("name", "world"), [("Paper", "paper"), ("Random", "medium")])
@@ -213,7 +213,7 @@ def test_an_own_reward_is_paid():
 
 @pytest.mark.parametrize("algorithm", ["DQN", "PPO"])
 def test_stable_baselines3_trains_on_it(algorithm):
-    library = require("stable_baselines3")
+    library = require_extra("stable_baselines3")
     options = {"learning_starts": 32} if algorithm == "DQN" else {"n_steps": 64}
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # about what it runs on

@@ -12,13 +12,13 @@ import pytest
 import edqn_jax
 from edqn_jax.devices import forks
 from edqn_jax.errors import ConfigError
-from edqn_jax.extras import require
+from edqn_jax.extras import require_extra
 from edqn_jax.sim.actions import move_number
 from edqn_jax.sim.task.outcomes import Outcome
 from tests.support.interop.gym import small
 
-gymnasium = require("gymnasium", extra="gym")
-interop = require("edqn_jax.interop.gymnasium")
+gymnasium = require_extra("gymnasium", extra="gym")
+interop = require_extra("edqn_jax.interop.gymnasium")
 
 HOVER = int(move_number("hover"))
 OPTIONS: dict[str, Any] = {"observation": "kinematics", "worlds": 2}

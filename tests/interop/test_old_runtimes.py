@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from edqn_jax.extras import require
+from edqn_jax.extras import require_extra
 from edqn_jax.interop.deployment import runner
 from edqn_jax.interop.deployment.onnx_export import export_policy
 from tests.support.interop.flights import untrained
@@ -40,7 +40,7 @@ OPERATORS = {
     ids=["patches", "noise", "event-image", "pooled"],
 )
 def test_a_policy_has_only_operators_that_old_runtimes_run(tmp_path: Path, groups: Any) -> None:
-    onnx = require("onnx", extra="export")
+    onnx = require_extra("onnx", extra="export")
     file = tmp_path / "policy.onnx"
     export_policy(untrained(**groups), file, checks=5)
     model = onnx.shape_inference.infer_shapes(onnx.load(file))
@@ -63,7 +63,7 @@ def test_the_runner_is_python_3_8() -> None:
 
 
 def test_why_a_file_cannot_be_run_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    onnxruntime, onnx = require("onnxruntime", extra="export"), require("onnx", extra="export")
+    onnxruntime, onnx = require_extra("onnxruntime", extra="export"), require_extra("onnx", extra="export")
     file = tmp_path / "policy.onnx"
     for content in (b"no policy", b""):
         file.write_bytes(content)

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from edqn_jax.errors import ConfigError
-from edqn_jax.interop.recordings.recording import MICROSECONDS, Recording, found_unit, recording_of
+from edqn_jax.interop.recordings.recording import MICROSECONDS, Recording, infer_time_unit, recording_of
 from tests.support.interop.recordings import some_events
 
 EVENTS = some_events()
@@ -39,22 +39,22 @@ def test_given_units_become_microseconds(unit):
 )
 def test_the_only_plausible_unit_is_found(seconds, events, scale, whole, unit):
     t = np.linspace(0.0, seconds * scale, events)
-    assert found_unit("f", np.rint(t).astype(np.int64) if whole else t) == unit
+    assert infer_time_unit("f", np.rint(t).astype(np.int64) if whole else t) == unit
 
 
 @pytest.mark.parametrize("unit", MICROSECONDS)
 def test_times_since_1970_say_their_unit(unit):
     since = 1_750_000_000 + np.linspace(0.0, 10.0, 1000)
     times = since if unit == "s" else np.rint(since * 1e6 / MICROSECONDS[unit]).astype(np.int64)
-    assert found_unit("f", times) == unit
+    assert infer_time_unit("f", times) == unit
 
 
 def test_a_clock_that_runs_for_minutes_does_not_show_seconds_since_1970():
     """1.5e9 us after the camera began; and 1.5e12 ns, which as milliseconds would last 14 hours."""
     since = np.linspace(0.0, 20e6, 1_000_000)
-    assert found_unit("f", (1.5e9 + since).astype(np.int64)) == "us"
+    assert infer_time_unit("f", (1.5e9 + since).astype(np.int64)) == "us"
     with pytest.raises(ConfigError, match="us or ns"):
-        found_unit("f", (1.5e12 + np.linspace(0.0, 50e6, 10_000)).astype(np.int64))
+        infer_time_unit("f", (1.5e12 + np.linspace(0.0, 50e6, 10_000)).astype(np.int64))
 
 
 @pytest.mark.parametrize(
@@ -68,7 +68,7 @@ def test_a_clock_that_runs_for_minutes_does_not_show_seconds_since_1970():
 )
 def test_an_ambiguous_unit_is_refused_with_the_option_to_give(t, units):
     with pytest.raises(ConfigError, match=f"{units}; give --time-unit s, ms, us or ns"):
-        found_unit("f", t)
+        infer_time_unit("f", t)
 
 
 @given(st.sampled_from([(0, 1), (-1, 1), (False, True), (0.0, 1.0)]), st.integers(1, 50), st.randoms())

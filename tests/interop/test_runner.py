@@ -128,7 +128,7 @@ def test_own_state_and_motion_are_those_of_the_simulator():
         about = about_policy(policy.config)
         for each in flown(policy, most=12):
             given = {name: np.asarray(value, np.float32) for name, value in each.given.items()}
-            yaw, speed = runner.heading(given["quaternion"]), given["velocity"]
+            yaw, speed = runner.heading_of(given["quaternion"]), given["velocity"]
             own = runner.own_state(about, given["position"], yaw, speed, given["goal"], given["volume"])
             motion = runner.own_motion(about, yaw, speed, given["yaw_rate"], each.motion[4:])
             np.testing.assert_allclose(own, each.own, atol=2e-6)  # some float32 roundings of numbers of order 1
@@ -173,7 +173,7 @@ ABOUT = {
 
 def counts(packet: np.ndarray, camera: tuple[int, int] | None = None, **options: Any) -> np.ndarray:
     fov = options.pop("fov", None)
-    return runner.counted(
+    return runner.count_events(
         ABOUT | options.pop("about", {}), packet, 0, grid=runner.Grid.of(ABOUT, camera, fov), **options
     )
 
@@ -201,10 +201,10 @@ def test_a_wider_camera_is_cropped_and_a_narrower_one_leaves_a_margin():
     # tan(126.87 deg / 2) = 2: the middle half of the image is what the policy sees.
     wide = runner.Grid.of(ABOUT, (16, 8), 126.8699)
     assert wide.columns.tolist() == [-1] * 4 + [0, 0, 1, 1, 2, 2, 3, 3] + [-1] * 4
-    assert runner.counted(ABOUT, packet, 0, grid=wide).any()
+    assert runner.count_events(ABOUT, packet, 0, grid=wide).any()
     narrow = runner.Grid.of(ABOUT, (16, 8), 53.1301)
     assert narrow.columns.tolist() == [1] * 8 + [2] * 8
-    assert not runner.counted(ABOUT, packet, 0, grid=narrow)[..., [0, 3]].any()
+    assert not runner.count_events(ABOUT, packet, 0, grid=narrow)[..., [0, 3]].any()
 
 
 def test_pairs_of_frames_are_counted_apart():
@@ -267,7 +267,7 @@ def test_the_runner_is_written_beside_it(exported):
 
 
 def test_nothing_is_written_where_onnx_and_jax_differ(tmp_path, monkeypatch):
-    whole = onnx_export.decision
+    whole = onnx_export.decision_function
     policy, calls = untrained(), []
 
     def drifting(config, params):
@@ -280,7 +280,7 @@ def test_nothing_is_written_where_onnx_and_jax_differ(tmp_path, monkeypatch):
 
         return changed
 
-    monkeypatch.setattr(onnx_export, "decision", drifting)
+    monkeypatch.setattr(onnx_export, "decision_function", drifting)
     with pytest.raises(CheckError, match="ONNX and JAX differ by .* nothing was written"):
         export_policy(policy, tmp_path / "policy.onnx", checks=5)
     assert not list(tmp_path.iterdir())

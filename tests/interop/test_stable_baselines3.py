@@ -13,13 +13,13 @@ import pytest
 import edqn_jax
 from edqn_jax.config import DroneConfig
 from edqn_jax.errors import ConfigError
-from edqn_jax.extras import require
+from edqn_jax.extras import require_extra
 from edqn_jax.interop.sb3_policy import sb3_policy
 from edqn_jax.sim.task.outcomes import Outcome
 from tests.support.interop.gym import DOWN, HOVER, MOVES, many, policy, small
 
-library = require("stable_baselines3")
-interop = require("edqn_jax.interop.stable_baselines3")
+library = require_extra("stable_baselines3")
+interop = require_extra("edqn_jax.interop.stable_baselines3")
 
 
 def drones(count: int = 3, **options: Any) -> Any:
@@ -123,7 +123,7 @@ def test_it_flies_as_gymnasiums_vector_without_its_reset_rows(observation):
 
 
 def many_of(options: dict[str, Any]) -> Any:
-    gymnasium = require("gymnasium")
+    gymnasium = require_extra("gymnasium")
     return gymnasium.make_vec("EDQN/Random-v0", num_envs=2, **options)
 
 
@@ -160,7 +160,7 @@ def test_sac_trains_with_continuous_actions(actions, size):
         "medium", drone={"physics": "rigid_body"}, env={"actions": actions, "max_decisions": 20}
     )
     vector = drones(2, config=config, observation="kinematics")
-    assert vector.action_space == require("gymnasium").spaces.Box(-1.0, 1.0, (size,), np.float32)
+    assert vector.action_space == require_extra("gymnasium").spaces.Box(-1.0, 1.0, (size,), np.float32)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # about what it runs on
         model = library.SAC("MlpPolicy", vector, learning_starts=20, batch_size=16, seed=0, device="cpu")
@@ -169,7 +169,7 @@ def test_sac_trains_with_continuous_actions(actions, size):
     assert any(not bool((x == y).all()) for x, y in zip(before, model.actor.parameters(), strict=True))
     held = model.replay_buffer
     assert held.dones.sum() >= 2 and held.actions.shape[-1] == size
-    with pytest.raises(require("gymnasium").error.InvalidAction, match=f"2 actions, each {size} finite numbers"):
+    with pytest.raises(require_extra("gymnasium").error.InvalidAction, match=f"2 actions, each {size} finite numbers"):
         vector.step(np.full((2, size), np.nan))
 
 

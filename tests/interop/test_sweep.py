@@ -8,12 +8,12 @@ from typing import Any
 import pytest
 
 from edqn_jax.config import Config
-from edqn_jax.extras import require
+from edqn_jax.extras import require_extra
 from tests.support.interop.tiny import tiny_trial
 from tests.support.miniature import WORLD
 
-optuna = require("optuna", extra="sweep")
-sweep = require("sweep_optuna")
+optuna = require_extra("optuna", extra="sweep")
+sweep = require_extra("sweep_optuna")
 
 
 def tiny(storage: Path, trials: int) -> Any:

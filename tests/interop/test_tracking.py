@@ -16,7 +16,7 @@ import pytest
 
 from edqn_jax.cli import main
 from edqn_jax.config import Config
-from edqn_jax.extras import require
+from edqn_jax.extras import require_extra
 from edqn_jax.interop.tracking import Rerun, Sinks, TensorBoard, Wandb
 from edqn_jax.sim.task.outcomes import Outcome
 from edqn_jax.training.history import EndedEpisodes
@@ -60,7 +60,7 @@ def a_validation() -> Any:
 
 def scalars(folder: Path) -> list[tuple[int, float]]:
     """Returns the mean returns that TensorBoard itself reads."""
-    accumulator = require("tensorboard.backend.event_processing.event_accumulator", "track")
+    accumulator = require_extra("tensorboard.backend.event_processing.event_accumulator", "track")
     events = accumulator.EventAccumulator(str(folder))
     events.Reload()
     assert "q_loss" not in events.Tags()["scalars"]  # it has no value
@@ -106,7 +106,7 @@ def contents(log: bytes) -> Iterator[bytes]:
 
 def whole_log(file: Path) -> list[Any]:
     """Returns the records of a `.wandb` file once it has the last, which its own process may write after `finish`."""
-    record = require("wandb.proto.wandb_internal_pb2", "track").Record
+    record = require_extra("wandb.proto.wandb_internal_pb2", "track").Record
     until = time.monotonic() + 60.0
     while True:
         rows = [record.FromString(content) for content in contents(file.read_bytes())]
@@ -137,7 +137,7 @@ def test_rerun_reads_metrics_and_flights_back(tmp_path: Path) -> None:
         sink(chunk(decisions, value, validation=a_validation() if decisions == 128 else None))
     sink.close()
     found: dict[str, list[Any]] = {}
-    for part in require("rerun.chunk", "viz").RrdReader(str(file)).stream():
+    for part in require_extra("rerun.chunk", "viz").RrdReader(str(file)).stream():
         found.setdefault(part.entity_path, []).append(part.to_record_batch())
     assert {"/world/solids", "/world/flights", "/world/ends"} < set(found) and "/metrics/q_loss" not in found
     rows = {}

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from edqn_jax.config import AgentConfig, Config, EnvConfig, TrainConfig, preset
+from edqn_jax.config import AgentConfig, Config, EnvConfig, TrainConfig, get_preset
 from edqn_jax.learn import exploration, qnetwork, replay
 from edqn_jax.learn.dqn import losses
 from tests.support import probes
@@ -23,13 +23,13 @@ Q_NEXT = jnp.array([2.0, 5.0, 3.0])
 
 
 def test_the_target_is_eq_10():
-    assert losses.target(RETURNS, DISCOUNT, Q_NEXT, Q_NEXT) == pytest.approx(1.0 + 0.9 * 5.0)
-    assert losses.target(RETURNS, jnp.float32(0.0), Q_NEXT, Q_NEXT) == 1.0
+    assert losses.td_target(RETURNS, DISCOUNT, Q_NEXT, Q_NEXT) == pytest.approx(1.0 + 0.9 * 5.0)
+    assert losses.td_target(RETURNS, jnp.float32(0.0), Q_NEXT, Q_NEXT) == 1.0
 
 
 def test_double_learning_lets_one_network_choose_and_the_other_judge():
     online = jnp.array([9.0, 1.0, 2.0])
-    assert losses.target(RETURNS, DISCOUNT, Q_NEXT, online) == pytest.approx(1.0 + 0.9 * 2.0)
+    assert losses.td_target(RETURNS, DISCOUNT, Q_NEXT, online) == pytest.approx(1.0 + 0.9 * 2.0)
 
 
 def test_the_loss_is_eq_9():
@@ -92,7 +92,7 @@ def test_a_double_batch_by_hand():
 
 def test_polyak_moves_by_its_rate():
     old, new = {"a": jnp.array([0.0, 8.0])}, {"a": jnp.array([4.0, 0.0])}
-    np.testing.assert_allclose(qnetwork.polyak(new, old, 0.25)["a"], [1.0, 6.0])
+    np.testing.assert_allclose(qnetwork.polyak_update(new, old, 0.25)["a"], [1.0, 6.0])
 
 
 @pytest.mark.slow
@@ -111,7 +111,7 @@ def test_dueling_heads_have_no_mean_advantage():
 
 
 def test_the_papers_network_is_two_layers_of_sixteen():
-    config = preset("paper").agent
+    config = get_preset("paper").agent
     params = jax.eval_shape(partial(qnetwork.init_q, config, 42, 27), jax.random.key(0))
     # 42 x 16 + 16, 16 x 16 + 16, 16 x 27 + 27: Table 1.
     assert sum(leaf.size for leaf in jax.tree.leaves(params)) == 688 + 272 + 459
@@ -134,7 +134,7 @@ def test_epsilon_greedy_mixes_as_told():
 
 
 def epsilon(config, decisions, episodes=(0, 0), total=10_000):
-    values = exploration.exploration(config, jnp.int32(decisions), total, jnp.array(episodes))
+    values = exploration.exploration_rate(config, jnp.int32(decisions), total, jnp.array(episodes))
     assert values.shape == (2,)
     return np.asarray(values)
 
@@ -149,7 +149,7 @@ def test_epsilon_falls_over_a_share_of_the_run():
 
 
 def test_epsilon_falls_over_ten_episodes_of_each_environment_in_the_papers_form():
-    config = preset("paper").agent
+    config = get_preset("paper").agent
     assert (epsilon(config, 999, (10, 30)) == 1.0).all()
     np.testing.assert_allclose(epsilon(config, 1000, (0, 5)), [1.0, 0.505], rtol=1e-5)
     np.testing.assert_allclose(epsilon(config, 1000, (10, 30)), 0.01, rtol=1e-4)
@@ -157,7 +157,7 @@ def test_epsilon_falls_over_ten_episodes_of_each_environment_in_the_papers_form(
 
 def test_the_step_size_falls_linearly_and_the_gradient_is_clipped():
     config = AgentConfig(learning_rate=0.1, final_learning_rate=0.02, max_gradient_norm=1.0)
-    adam = qnetwork.optimiser(config, 4)
+    adam = qnetwork.make_optimiser(config, 4)
     params = {"w": jnp.zeros(2)}
     state, sizes = adam.init(params), []
     for _ in range(6):

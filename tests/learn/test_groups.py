@@ -16,7 +16,7 @@ from edqn_jax.config.loading import make_config
 from edqn_jax.errors import ConfigError
 from edqn_jax.evaluation.missions import run_missions
 from edqn_jax.learn import replay
-from edqn_jax.learn.state import init
+from edqn_jax.learn.state import init_state
 from edqn_jax.learn.step import train_step
 from edqn_jax.sim.task.outcomes import Outcome
 
@@ -60,7 +60,7 @@ def trained():
     """A state after training, and of each step whether its environments [E] waited, and what ended."""
     config = configured()
     world = run_missions(config).training.world
-    state = jax.jit(partial(init, config, world))(jax.random.key(0))
+    state = jax.jit(partial(init_state, config, world))(jax.random.key(0))
 
     def one(state, step):
         after, (episodes, losses) = train_step(config, world, None, state, step)

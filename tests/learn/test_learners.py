@@ -16,8 +16,8 @@ from edqn_jax.config.rules import validate
 from edqn_jax.errors import ConfigError
 from edqn_jax.learn.dqn.learner import DQN
 from edqn_jax.learn.learner import Learner, UpdateStats, learner_of
-from edqn_jax.learn.plan import Plan
-from edqn_jax.learn.state import init
+from edqn_jax.learn.schedule import Schedule
+from edqn_jax.learn.state import init_state
 from edqn_jax.learn.step import policy_of, run_steps
 from tests.support.miniature import miniature_world
 
@@ -39,7 +39,7 @@ def miniature(learner: str) -> Config:
 
 def trained(config: Config):
     world = miniature_world(config)
-    before = jax.jit(lambda key: init(config, world, key))(jax.random.key(0))
+    before = jax.jit(lambda key: init_state(config, world, key))(jax.random.key(0))
     after, (_, losses) = jax.jit(lambda s: run_steps(config, world, s, jnp.arange(STEPS)))(before)
     return before, after, losses
 
@@ -53,7 +53,7 @@ def moved(before, after) -> bool:
 def test_pqn_learns_at_the_end_of_each_rollout_in_the_step_that_trains_dqn():
     config = miniature("pqn")
     before, after, losses = trained(config)
-    plan = Plan.of(config)
+    plan = Schedule.from_config(config)
     steps = np.arange(STEPS)
     due = np.asarray(learner_of(config).updates(config, plan.replay_time(steps))) * (steps >= plan.warmup)
     assert plan.warmup == 4 and np.flatnonzero(due).tolist() == [9, 13, 17, 21] and set(due[due > 0]) == {4}
@@ -69,7 +69,7 @@ def test_a_learner_of_ones_own_is_trained_by_its_name_without_a_change_to_the_pa
         return jnp.full(memory.shape[:2], 13), {"height_of_hover": jnp.float32(1.0)}
 
     def count(config, axis, state, rings, after):
-        return UpdateStats.none("count"), state | {"count": state["count"] + 1}
+        return UpdateStats.without_updates("count"), state | {"count": state["count"] + 1}
 
     mine = Learner(
         init=lambda config, key: {"q": DQN.init(config, key).q, "count": jnp.int32(0)},

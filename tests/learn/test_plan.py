@@ -10,20 +10,20 @@ import pytest
 
 from edqn_jax.config.loading import make_config
 from edqn_jax.learn.learner import learner_of
-from edqn_jax.learn.plan import Plan
+from edqn_jax.learn.schedule import Schedule
 from tests.support.configs import TINY, retrained
 
 
 @pytest.mark.parametrize(("warmup_decisions", "steps"), [(0, 0), (33, 3), (64, 4), (65, 4), (10**6, 4)])
 def test_the_warm_up_is_whole_steps_and_a_quarter_of_the_run_at_most(warmup_decisions: int, steps: int) -> None:
     config = dataclasses.replace(TINY, encoder=dataclasses.replace(TINY.encoder, warmup_decisions=warmup_decisions))
-    plan = Plan.of(config)
+    plan = Schedule.from_config(config)
     assert (plan.total, plan.warmup, plan.learn_from) == (16, steps, steps + 5)  # n_step + history rows to learn from
 
 
 def test_a_retrained_encoder_begins_a_replay_of_its_own() -> None:
     config = retrained((0.25,))
-    plan, steps = Plan.of(config), jnp.arange(24)
+    plan, steps = Schedule.from_config(config), jnp.arange(24)
     assert (plan.total, plan.vae_training, plan.starts) == (64, ((0, 4), (16, 18)), 5)
     assert np.flatnonzero(plan.trains_vae(steps)).tolist() == [0, 1, 2, 3, 16, 17]
     assert np.flatnonzero(plan.replaces_encoder(steps)).tolist() == [3, 17]
@@ -47,12 +47,12 @@ def test_a_retrained_encoder_begins_a_replay_of_its_own() -> None:
 def test_retrainings_leave_the_dqn_time(retrain_at, retrain_decisions, times) -> None:
     config = retrained(retrain_at)
     encoder = dataclasses.replace(config.encoder, retrain_decisions=retrain_decisions)
-    assert Plan.of(dataclasses.replace(config, encoder=encoder)).vae_training == times
+    assert Schedule.from_config(dataclasses.replace(config, encoder=encoder)).vae_training == times
 
 
 @pytest.mark.parametrize("decisions", [10_000, 60_000, 100_000, 200_000, 874_000, 3_200_000])
 def test_whatever_the_length_of_a_run_its_encoders_never_learn_at_once_or_in_vain(decisions: int) -> None:
-    plan = Plan.of(make_config("medium", train={"total_steps": decisions}))
+    plan = Schedule.from_config(make_config("medium", train={"total_steps": decisions}))
     ends = [0]
     for first, end in plan.vae_training:
         assert ends[-1] <= first < end
@@ -63,4 +63,4 @@ def test_whatever_the_length_of_a_run_its_encoders_never_learn_at_once_or_in_vai
 
 def test_totals_round_up_to_whole_chunks() -> None:
     config = dataclasses.replace(TINY, train=dataclasses.replace(TINY.train, total_steps=257))
-    assert Plan.of(config).total == 20
+    assert Schedule.from_config(config).total == 20

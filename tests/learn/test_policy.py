@@ -81,7 +81,7 @@ def test_memory_stacks_an_episode_as_the_replay_does(params, act):
     for now, each in enumerate(seen):
         _, memory = act(params, memory, each, jax.random.key(now))
         window = slice(now + 1, now + 1 + history)
-        trained_on = replay.stacked(jnp.asarray(rows[window]), jnp.asarray(resets[window]))
+        trained_on = replay.stack_observations(jnp.asarray(rows[window]), jnp.asarray(resets[window]))
         # Two compilations, hence not to the last digit.
         np.testing.assert_allclose(memory, trained_on, atol=1e-5)
 

@@ -47,7 +47,7 @@ def test_a_rollout_is_what_a_plain_walk_through_the_rows_finds():
     length, steps, history, decisions, size = 9, 23, 2, 5, 3
     draw = np.random.default_rng(4)
     written = []
-    ring = jax.tree.map(lambda leaf: leaf[:, 0], replay.empty(length, 1, size))
+    ring = jax.tree.map(lambda leaf: leaf[:, 0], replay.empty_ring(length, 1, size))
     ended = False
     for time in range(steps):
         outcome = Outcome.RUNNING if ended else draw.choice([Outcome.RUNNING] * 3 + [Outcome.GOAL, Outcome.DIVERGED])
@@ -60,7 +60,7 @@ def test_a_rollout_is_what_a_plain_walk_through_the_rows_finds():
         )
         ended = outcome != Outcome.RUNNING
         written.append(row)
-        ring = replay.write(ring, row, jnp.int32(time))
+        ring = replay.store_decision(ring, row, jnp.int32(time))
     found = rollout_of(ring, jnp.int32(steps - 1), decisions, history)
     for number in range(decisions + 1):
         now = steps - 1 - decisions + number

@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 
 from edqn_jax.config import AgentConfig, Config
 from edqn_jax.learn import replay
-from edqn_jax.sim.task.observation import OWN_SIZE, turned
+from edqn_jax.sim.task.observation import OWN_SIZE, rotate_own_state
 from edqn_jax.sim.task.outcomes import Outcome
 from edqn_jax.sim.task.task import task_of
 from tests.oracles import replay_plain
@@ -58,10 +58,10 @@ def written(config: AgentConfig, rows: replay.Rows, decisions) -> replay.Rows:
 
     def store(ring, time):
         row = jax.tree.map(lambda x: x[time], rows)
-        kept = replay.write(ring, row, time)
+        kept = replay.store_decision(ring, row, time)
         return jax.tree.map(lambda a, b: jnp.where(time < decisions, a, b), kept, ring), None
 
-    return jax.lax.scan(store, replay.empty(replay.ring_length(config, ENVS), ENVS, 2), jnp.arange(LONGEST))[0]
+    return jax.lax.scan(store, replay.empty_ring(replay.ring_length(config, ENVS), ENVS, 2), jnp.arange(LONGEST))[0]
 
 
 def ring_of(config: AgentConfig, life: list[list[replay_plain.Row]]) -> replay.Rows:
@@ -82,7 +82,7 @@ def ring_of(config: AgentConfig, life: list[list[replay_plain.Row]]) -> replay.R
     return written(config, rows, decisions)
 
 
-sampled = jax.jit(replay.sample, static_argnums=(0, 3))
+sampled = jax.jit(replay.sample_transitions, static_argnums=(0, 3))
 
 
 def starts(batch: replay.Batch) -> list[tuple[int, int]]:
@@ -174,7 +174,7 @@ def test_without_an_end_the_bootstrap_is_n_steps_away():
 
 def test_history_is_blank_before_a_reset():
     rows = np.arange(1.0, 9.0).reshape(4, 2)
-    stacked = partial(replay.stacked, jnp.asarray(rows))
+    stacked = partial(replay.stack_observations, jnp.asarray(rows))
     np.testing.assert_array_equal(stacked(jnp.zeros(4, bool)), rows)
     np.testing.assert_array_equal(stacked(jnp.array([True, False, False, False])), rows)
     expected = rows * np.array([[0], [0], [1], [1]])
@@ -187,7 +187,7 @@ def test_the_ring_is_as_long_as_its_share_and_never_too_short_for_a_transition()
     config = AgentConfig(replay_size=1000, n_step=5, history=3)
     assert replay.ring_length(config, 10) == 100
     assert replay.ring_length(config, 500) == 9
-    ring = replay.empty(replay.ring_length(config, 10), 4, 7)
+    ring = replay.empty_ring(replay.ring_length(config, 10), 4, 7)
     assert ring.observation.shape == (100, 4, 7) and ring.reward.shape == (100, 4)
 
 
@@ -195,16 +195,20 @@ def test_the_ring_is_as_long_as_its_share_and_never_too_short_for_a_transition()
 @pytest.mark.slow
 def test_the_replay_is_strict():
     config = agent(3, 2)
-    ring = replay.empty(replay.ring_length(config, ENVS), ENVS, 5)
+    ring = replay.empty_ring(replay.ring_length(config, ENVS), ENVS, 5)
     rows = jax.tree.map(lambda x: x[0], ring)
-    ring = jax.jit(replay.write)(ring, rows, jnp.int32(20))
+    ring = jax.jit(replay.store_decision)(ring, rows, jnp.int32(20))
     batch = sampled(config, ring, jnp.int32(20), 8, jax.random.key(0))
     assert batch.history.shape == (8, 2, 5) and batch.action.dtype == jnp.int32
 
 
 def test_what_is_drawn_is_turned_in_whole_quarters_and_only_the_own_state_is() -> None:
-    rng, config, write = np.random.default_rng(5), dataclasses.replace(agent(3, 2), turn=True), jax.jit(replay.write)
-    ring = replay.empty(replay.ring_length(config, ENVS), ENVS, 3 + OWN_SIZE)
+    rng, config, write = (
+        np.random.default_rng(5),
+        dataclasses.replace(agent(3, 2), turn=True),
+        jax.jit(replay.store_decision),
+    )
+    ring = replay.empty_ring(replay.ring_length(config, ENVS), ENVS, 3 + OWN_SIZE)
     for time in range(LENGTH):
         rows = replay.Rows(
             observation=jnp.asarray(rng.normal(size=(ENVS, 3 + OWN_SIZE)), jnp.float32),
@@ -214,14 +218,14 @@ def test_what_is_drawn_is_turned_in_whole_quarters_and_only_the_own_state_is() -
             action=jnp.zeros(ENVS, jnp.int32),
         )
         ring = write(ring, rows, jnp.int32(time))
-    drawn = jax.jit(replay.sample, static_argnums=(0, 3, 5))(
+    drawn = jax.jit(replay.sample_transitions, static_argnums=(0, 3, 5))(
         config, ring, jnp.int32(LENGTH - 1), 256, jax.random.key(0), task_of(Config())
     )
     rows = np.asarray(ring.observation).reshape(-1, 3 + OWN_SIZE)
     turned_rows = {row[:3].tobytes(): [] for row in rows}
     for quarters in range(4):
         for row, own in zip(
-            rows, np.asarray(turned(jnp.asarray(rows[:, 3:]), jnp.full(len(rows), quarters))), strict=True
+            rows, np.asarray(rotate_own_state(jnp.asarray(rows[:, 3:]), jnp.full(len(rows), quarters))), strict=True
         ):
             turned_rows[row[:3].tobytes()].append(own)
     turns = Counter()

@@ -26,8 +26,8 @@ ENVS, LENGTH = 3, 4
 CONFIG = EncoderConfig(replay_size=2 * ENVS * LENGTH, target="sensed", mirror=False)  # of two shards
 SMALL = CameraConfig(width=6, height=4)
 
-write = jax.jit(samples.write)
-draw = jax.jit(partial(samples.draw, CONFIG), static_argnums=2)
+write = jax.jit(samples.store_samples)
+draw = jax.jit(partial(samples.sample_batch, CONFIG), static_argnums=2)
 
 
 def decision(number: int, config: EncoderConfig = CONFIG, *, even: bool = True) -> samples.Samples:
@@ -43,7 +43,7 @@ def decision(number: int, config: EncoderConfig = CONFIG, *, even: bool = True) 
 
 def ring_after(kept: list[bool]) -> tuple[samples.Samples, int]:
     one = jax.tree.map(lambda x: x[0], decision(0))
-    ring, time = samples.empty(CONFIG, one, ENVS, 2 * ENVS), 0
+    ring, time = samples.empty_ring(CONFIG, one, ENVS, 2 * ENVS), 0
     for number, keep in enumerate(kept):
         ring = write(ring, decision(number), jnp.int32(time), jnp.asarray(keep))
         time += keep
@@ -95,7 +95,7 @@ def test_what_is_stored_is_encoded_as_what_was_seen(architecture, even, alone) -
     stored = samples.samples_of(config, observation, wanted)
     assert isinstance(stored.sensed, samples.Counts) == alone
     params = vae.init_vae(config, SMALL, jax.random.key(0))
-    read, shown = (vae.encode(config, params, sensed, motion) for sensed in (samples.read(stored), field))
+    read, shown = (vae.encode(config, params, sensed, motion) for sensed in (samples.to_encoder_input(stored), field))
     for one, two in zip(read, shown, strict=True):
         np.testing.assert_array_equal(one, two)
 
@@ -103,7 +103,7 @@ def test_what_is_stored_is_encoded_as_what_was_seen(architecture, even, alone) -
 def test_half_of_what_is_drawn_is_mirrored() -> None:
     ring, time = ring_after([True] * 3)
     mirroring = dataclasses.replace(CONFIG, mirror=True)
-    mirror = jax.jit(partial(samples.draw, mirroring, task=task_of(Config())), static_argnums=2)
+    mirror = jax.jit(partial(samples.sample_batch, mirroring, task=task_of(Config())), static_argnums=2)
     turned = np.asarray(mirror(ring, jnp.int32(time), 256, jax.random.key(2)).motion[:, 1])
     # The motion of one sample in nine is 0, the same either way.
     assert (turned[:128] <= 0.0).all() and (turned[128:] >= 0.0).all()
@@ -122,7 +122,7 @@ def test_a_mirrored_sample_is_that_of_the_mirrored_image() -> None:
         observation = Observation(field, motion, motion)
         return samples.samples_of(config, observation, samples.target_of(config, observation, near))
 
-    got = samples.mirrored(sample(counts, near, motion), MIRRORED_MOTION)
+    got = samples.mirror_samples(sample(counts, near, motion), MIRRORED_MOTION)
     # To the left, turning left and the move to the left become those to the right.
     expected = sample(counts[:, ::-1], near[:, ::-1], jnp.array([1.0, -2, 3, -4, 5, -6, 7]))
     jax.tree.map(lambda x, y: np.testing.assert_allclose(x, y, atol=1e-5), got, expected)
@@ -142,7 +142,7 @@ def test_a_flight_to_the_right_is_the_mirror_of_one_to_the_left() -> None:
     ]
     scene = build_scene(shapes, volume=[[-9, -15, 0], [40, 15, 20]], start=[0, 0, 4], goal=[30, 0, 4])
     pool = stack_scenes([scene])
-    world = env.World(load_airframe(config.drone), pool, own_missions(pool))
+    world = env.EnvParams(load_airframe(config.drone), pool, own_missions(pool))
     fresh, _ = env.reset(config, world, jax.random.key(0), jnp.asarray(0))
     step = jax.jit(partial(env.step, config, world))
 
@@ -154,7 +154,7 @@ def test_a_flight_to_the_right_is_the_mirror_of_one_to_the_left() -> None:
         wanted = samples.target_of(EncoderConfig(), seen.observation, env.nearness(config, world, state))
         return samples.samples_of(EncoderConfig(), seen.observation, wanted)
 
-    left, right = flown(1), samples.mirrored(flown(-1), MIRRORED_MOTION)
+    left, right = flown(1), samples.mirror_samples(flown(-1), MIRRORED_MOTION)
     assert np.abs(left.sensed.signed).sum() > 20  # type: ignore[union-attr]
     # A pixel on an edge may round the other way and then have an event more or less.
     assert np.mean(np.asarray(left.sensed.signed) != np.asarray(right.sensed.signed)) < 0.01  # type: ignore[union-attr]

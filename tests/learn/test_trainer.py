@@ -21,13 +21,13 @@ from edqn_jax.config import (
 )
 from edqn_jax.errors import ConfigError
 from edqn_jax.learn import replay, saved_state
-from edqn_jax.learn.plan import Plan
-from edqn_jax.learn.state import TrainState, init
-from edqn_jax.learn.step import _remember, policy_of, run_steps, train_step
+from edqn_jax.learn.schedule import Schedule
+from edqn_jax.learn.state import TrainState, init_state
+from edqn_jax.learn.step import _encode_observations, policy_of, run_steps, train_step
 from edqn_jax.learn.trainer import Trainer
 from edqn_jax.sim.physics.disturbances import Disturbance
 from edqn_jax.sim.task import env
-from edqn_jax.sim.task.env import World
+from edqn_jax.sim.task.env import EnvParams
 from edqn_jax.sim.task.observation import MOTION_SIZE, OWN_SIZE, Observation
 from edqn_jax.sim.task.outcomes import Outcome
 from tests.support.configs import TINY, retrained
@@ -37,11 +37,11 @@ RETRAINED = retrained((0.01,))
 
 
 @pytest.fixture(scope="module")
-def world() -> World:
+def world() -> EnvParams:
     return miniature_world(TINY)
 
 
-def run(config: Config, world: World, devices: int) -> tuple[list[TrainState], list, int, Trainer]:
+def run(config: Config, world: EnvParams, devices: int) -> tuple[list[TrainState], list, int, Trainer]:
     """States on the host after each chunk, what the chunks returned, how often the step was traced; the trainer."""
     traces = 0
     step = train_step
@@ -56,7 +56,7 @@ def run(config: Config, world: World, devices: int) -> tuple[list[TrainState], l
         made = Trainer(config, world, jax.devices()[:devices])
         state = made.init(config.train.seed)
         states, returned = [_host(state)], []
-        for first in range(0, made.plan.total, config.train.chunk_steps):
+        for first in range(0, made.schedule.total, config.train.chunk_steps):
             state, out = made.chunk(state, first)
             states.append(_host(state))
             returned.append(jax.tree.map(np.asarray, out))
@@ -73,12 +73,12 @@ def _host(state: TrainState) -> TrainState:
 
 
 @pytest.fixture(scope="module")
-def on_one(world: World):
+def on_one(world: EnvParams):
     return run(TINY, world, 1)
 
 
 @pytest.fixture(scope="module")
-def on_two(world: World):
+def on_two(world: EnvParams):
     return run(TINY, world, 2)
 
 
@@ -90,8 +90,8 @@ def test_the_training_chunk_is_traced_exactly_once_in_a_run(on_two) -> None:
 
 
 @pytest.mark.slow
-def test_no_callback_to_the_host_hides_in_the_step(world: World) -> None:
-    state = jax.eval_shape(lambda k: init(TINY, world, k), jax.random.key(0))
+def test_no_callback_to_the_host_hides_in_the_step(world: EnvParams) -> None:
+    state = jax.eval_shape(lambda k: init_state(TINY, world, k), jax.random.key(0))
     jaxpr = jax.make_jaxpr(lambda s, n: run_steps(TINY, world, s, n))(state, jnp.arange(2))
     assert "callback" not in str(jaxpr)
 
@@ -115,7 +115,7 @@ def test_parameters_agree_on_one_device_and_two_after_the_first_updates(on_one, 
 
 @pytest.mark.slow
 def test_training_against_every_disturbance_stores_what_was_chosen_and_goes_on_from_what_was_saved(
-    world: World,
+    world: EnvParams,
 ) -> None:
     config = dataclasses.replace(
         TINY,
@@ -186,7 +186,7 @@ def test_a_poisoned_parameter_stops_all_updates_and_spoils_no_saved_policy(on_on
 
 @pytest.mark.slow
 def test_a_poisoned_transition_costs_the_updates_that_meet_it_and_nothing_else(on_one) -> None:
-    made, plan = on_one[3], Plan.of(TINY)
+    made, plan = on_one[3], Schedule.from_config(TINY)
     written = 2 * TINY.train.chunk_steps - plan.warmup  # rows before the last chunk
 
     def poison(state: TrainState) -> TrainState:
@@ -219,7 +219,7 @@ def test_drones_whose_physics_blows_up_are_reset_and_counted_and_the_others_fly_
 @pytest.mark.slow
 def test_the_acting_encoder_changes_once_at_the_end_of_the_warm_up(on_one) -> None:
     states = on_one[0]
-    assert Plan.of(TINY).warmup == 4
+    assert Schedule.from_config(TINY).warmup == 4
     start, warm, later, last = states[0].learner, states[1].learner, states[2].learner, states[-1].learner
     assert not _same(start.encoder, warm.encoder)
     assert _same(warm.encoder, warm.vae)
@@ -229,7 +229,7 @@ def test_the_acting_encoder_changes_once_at_the_end_of_the_warm_up(on_one) -> No
 @pytest.mark.slow
 def test_the_q_network_rests_until_there_is_enough_to_learn_from(on_one) -> None:
     states, returned, *_ = on_one
-    plan = Plan.of(TINY)
+    plan = Schedule.from_config(TINY)
     losses = np.concatenate([losses.metrics["q_loss"] for _, losses in returned])
     assert np.isnan(losses[: plan.learn_from]).all()
     assert np.isfinite(losses[plan.learn_from :]).all()
@@ -242,7 +242,7 @@ def test_the_q_network_rests_until_there_is_enough_to_learn_from(on_one) -> None
 @pytest.mark.slow
 def test_the_replay_holds_what_the_environments_went_through(on_one) -> None:
     states, returned, *_ = on_one
-    plan, actors = Plan.of(TINY), states[-1].actors
+    plan, actors = Schedule.from_config(TINY), states[-1].actors
     stored = plan.total - plan.warmup
     # [S, L, E] -> rows 1.. hold the outcome of the step before them.
     replayed = actors.replay.outcome[:, 1:stored].swapaxes(0, 1)
@@ -253,8 +253,8 @@ def test_the_replay_holds_what_the_environments_went_through(on_one) -> None:
 
 
 @pytest.mark.slow
-def test_nothing_is_learnt_from_what_stood_there_before_the_first_reset(world: World) -> None:
-    start = jax.jit(partial(init, TINY, world))(jax.random.key(0))
+def test_nothing_is_learnt_from_what_stood_there_before_the_first_reset(world: EnvParams) -> None:
+    start = jax.jit(partial(init_state, TINY, world))(jax.random.key(0))
     actors = jax.tree.map(lambda x: x[0], start.actors)
     envs = actors.reward.shape[0]
 
@@ -269,7 +269,7 @@ def test_nothing_is_learnt_from_what_stood_there_before_the_first_reset(world: W
 
     agent = dataclasses.replace(TINY.agent, history=1)
     last = agent.n_step + 1  # room for two starts: the row before the first reset, and that reset
-    write, sample = jax.jit(replay.write), jax.jit(partial(replay.sample, agent), static_argnums=2)
+    write, sample = jax.jit(replay.store_decision), jax.jit(partial(replay.sample_transitions, agent), static_argnums=2)
     ring = write(actors.replay, row(True, actors.outcome), jnp.int32(0))
     for time in range(1, last + 1):
         ring = write(ring, row(time == 1, jnp.full(envs, int(Outcome.RUNNING))), jnp.int32(time))
@@ -287,16 +287,18 @@ def test_a_new_episode_begins_with_an_empty_memory() -> None:
     )
     actors: Any = SimpleNamespace(memory=jnp.full((1, 2, config.agent.history, OWN_SIZE), 7.0))
     learner: Any = SimpleNamespace(encoder={}, agent=SimpleNamespace(average={}))
-    fresh, running = _remember(config, learner, actors, seen, jnp.int32(Plan.of(config).warmup + 5))
+    fresh, running = _encode_observations(
+        config, learner, actors, seen, jnp.int32(Schedule.from_config(config).warmup + 5)
+    )
     np.testing.assert_array_equal(fresh, [np.zeros(OWN_SIZE), own[0]])
     np.testing.assert_array_equal(running, [np.full(OWN_SIZE, 7.0), own[1]])
 
 
 @pytest.fixture(scope="module")
-def retraining(world: World) -> tuple[list[TrainState], list]:
+def retraining(world: EnvParams) -> tuple[list[TrainState], list]:
     """States before each of 15 steps and after the last, and what each returned; steps 11 and 12 retrain the VAE."""
     step = jax.jit(lambda state, number: train_step(RETRAINED, world, None, state, number))
-    states, returned = [jax.jit(lambda key: init(RETRAINED, world, key))(jax.random.key(0))], []
+    states, returned = [jax.jit(lambda key: init_state(RETRAINED, world, key))(jax.random.key(0))], []
     for number in range(15):
         state, out = step(states[-1], jnp.int32(number))
         states.append(state)
@@ -318,10 +320,10 @@ def test_the_encoder_that_acts_changes_when_the_vae_has_been_trained_and_never_e
 
 
 @pytest.mark.slow
-def test_labels_reach_the_vae_and_nothing_that_acts_before_it_does(retraining, world: World, monkeypatch) -> None:
+def test_labels_reach_the_vae_and_nothing_that_acts_before_it_does(retraining, world: EnvParams, monkeypatch) -> None:
     """With other labels in a retraining the VAE learns something else; all that is seen and done stays as it was."""
     states, returned = retraining
-    (_, warmup), (first, end) = Plan.of(RETRAINED).vae_training
+    (_, warmup), (first, end) = Schedule.from_config(RETRAINED).vae_training
     assert warmup < first < end - 1
     true = env.nearness
     monkeypatch.setattr(env, "nearness", lambda *given: 3.0 - true(*given))
@@ -332,13 +334,13 @@ def test_labels_reach_the_vae_and_nothing_that_acts_before_it_does(retraining, w
 
 
 @pytest.mark.slow
-def test_agents_that_train_together_train_as_each_alone(on_two, world: World) -> None:
+def test_agents_that_train_together_train_as_each_alone(on_two, world: EnvParams) -> None:
     alone: Trainer = on_two[-1]
     other = dataclasses.replace(world, missions=jax.tree.map(lambda x: x[::-1], world.missions))
     together = Trainer(TINY, [other, world], jax.devices()[:2])
     state, two = alone.init(1), together.init([0, 1])
     learnt = False
-    for first in range(0, alone.plan.total, TINY.train.chunk_steps):
+    for first in range(0, alone.schedule.total, TINY.train.chunk_steps):
         state, (episodes, losses) = alone.chunk(state, first)
         two, returned = together.chunk(two, first)
         second_episodes, second_losses = together.each(jax.tree.map(np.asarray, returned))[1]
@@ -353,10 +355,10 @@ def test_agents_that_train_together_train_as_each_alone(on_two, world: World) ->
     jax.tree.map(partial(np.testing.assert_allclose, rtol=1e-3, atol=1e-5), second, policy_of(together.config, state))
 
 
-def test_environments_that_do_not_divide_into_shards_are_refused_with_a_sentence(world: World) -> None:
+def test_environments_that_do_not_divide_into_shards_are_refused_with_a_sentence(world: EnvParams) -> None:
     config = dataclasses.replace(TINY, train=dataclasses.replace(TINY.train, num_envs=12))
     with pytest.raises(ConfigError, match=r"num_envs \(12\).*multiples of train.shards \(8\)"):
-        init(config, world, jax.random.key(0))
+        init_state(config, world, jax.random.key(0))
 
 
 def _told(trained: tuple) -> tuple:

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from edqn_jax.native import build
-from edqn_jax.native.build import registered
+from edqn_jax.native.build import ensure_registered
 
 SOURCE = """
 #include "handler.h"
@@ -35,17 +35,17 @@ def test_without_a_compiler_nothing_is_registered(
     named: str, source: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("CC", named)
-    assert not registered(source, ("edqn_test_a",), ("NAME=edqn_test_a",)) and not kept(tmp_path)
+    assert not ensure_registered(source, ("edqn_test_a",), ("NAME=edqn_test_a",)) and not kept(tmp_path)
 
 
 def test_it_can_be_switched_off(source: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(build.SWITCH, "0")
-    assert not registered(source, ("edqn_test_b",), ("NAME=edqn_test_b",)) and not kept(tmp_path)
+    assert not ensure_registered(source, ("edqn_test_b",), ("NAME=edqn_test_b",)) and not kept(tmp_path)
 
 
 def test_a_source_that_does_not_compile_leaves_nothing(source: Path, tmp_path: Path) -> None:
     source.write_text("no C at all", encoding="utf-8")
-    assert not registered(source, ("edqn_test_c",), ("NAME=edqn_test_c",)) and not kept(tmp_path)
+    assert not ensure_registered(source, ("edqn_test_c",), ("NAME=edqn_test_c",)) and not kept(tmp_path)
 
 
 def test_a_compiler_that_writes_no_library_is_as_none(
@@ -56,16 +56,16 @@ def test_a_compiler_that_writes_no_library_is_as_none(
     broken.write_text(words, encoding="utf-8")
     broken.chmod(0o755)
     monkeypatch.setenv("CC", str(broken))
-    assert not registered(source, ("edqn_test_d",), ("NAME=edqn_test_d",))
+    assert not ensure_registered(source, ("edqn_test_d",), ("NAME=edqn_test_d",))
 
 
 def test_what_is_compiled_once_is_kept(source: Path, tmp_path: Path) -> None:
     names = ("edqn_test_e",)
-    if registered(source, names, ("NAME=edqn_test_e",)):
+    if ensure_registered(source, names, ("NAME=edqn_test_e",)):
         (first,) = kept(tmp_path)
         made = first.stat().st_mtime_ns
         build._registered.cache_clear()
-        assert registered(source, names, ("NAME=edqn_test_e",))
+        assert ensure_registered(source, names, ("NAME=edqn_test_e",))
         assert kept(tmp_path) == [first] and first.stat().st_mtime_ns == made
 
 
@@ -76,7 +76,7 @@ def test_where_nothing_can_be_kept_it_is_compiled_and_leaves_nothing(
     scratch = tmp_path / "scratch"
     scratch.mkdir()
     monkeypatch.setattr(tempfile, "tempdir", str(scratch))
-    assert registered(source, ("edqn_test_f",), ("NAME=edqn_test_f",)) is (shutil.which("cc") is not None)
+    assert ensure_registered(source, ("edqn_test_f",), ("NAME=edqn_test_f",)) is (shutil.which("cc") is not None)
     assert not list(scratch.rglob("*")) and not kept(tmp_path)
 
 
@@ -99,9 +99,9 @@ def test_a_library_that_says_that_it_cannot_be_used_here_is_not(source: Path, ca
     usable = "const char *edqn_unusable(void) { return 0; }\n"
     source.write_text(SOURCE + usable, encoding="utf-8")
     compiler = shutil.which("cc") is not None
-    assert registered(source, ("edqn_test_k",), ("NAME=edqn_test_k",)) is compiler and not caplog.records
+    assert ensure_registered(source, ("edqn_test_k",), ("NAME=edqn_test_k",)) is compiler and not caplog.records
     source.write_text(SOURCE + usable.replace("return 0", 'return "the driver is too old"'), encoding="utf-8")
-    assert not registered(source, ("edqn_test_l",), ("NAME=edqn_test_l",))
+    assert not ensure_registered(source, ("edqn_test_l",), ("NAME=edqn_test_l",))
     assert ("JAX does its work more slowly: the driver is too old" in caplog.text) is compiler
 
 
@@ -111,7 +111,7 @@ def test_what_an_included_header_says_is_compiled_anew_when_it_changes(source: P
         header.write_text(f"#define NAME {name}\n", encoding="utf-8")
         source.write_text('#include "name.h"\n' + SOURCE, encoding="utf-8")
         compiler = shutil.which("cc") is not None
-        assert registered(source, (name,), (), build.C, (header,)) is compiler
+        assert ensure_registered(source, (name,), (), build.C, (header,)) is compiler
         assert len(kept(tmp_path)) == (count + 1 if compiler else 0)
 
 
@@ -119,15 +119,15 @@ def test_the_compiler_may_have_options_and_a_failure_is_told(
     source: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.setenv("CC", "cc -DBEFORE=1")
-    build.compiler.cache_clear()
+    build.compiler_version.cache_clear()
     if shutil.which("cc") is None:
-        assert build.compiler() is None
+        assert build.compiler_version() is None
         return
     source.write_text(SOURCE.replace("#include", "#if BEFORE != 1\n#error no option\n#endif\n#include"))
-    assert registered(source, ("edqn_test_h",), ("NAME=edqn_test_h",)) and not caplog.records
-    assert not registered(source, ("edqn_test_j",), ("NAME=other_name",))
+    assert ensure_registered(source, ("edqn_test_h",), ("NAME=edqn_test_h",)) and not caplog.records
+    assert not ensure_registered(source, ("edqn_test_j",), ("NAME=other_name",))
     assert "nothing.c could not be compiled or loaded, JAX does its work more slowly" in caplog.text
     monkeypatch.setenv(build.SWITCH, "0")
-    build.compiler.cache_clear()
-    assert build.compiler() is None
-    build.compiler.cache_clear()
+    build.compiler_version.cache_clear()
+    assert build.compiler_version() is None
+    build.compiler_version.cache_clear()

@@ -6,10 +6,10 @@ import struct
 
 import numpy as np
 
-from edqn_jax.extras import require
+from edqn_jax.extras import require_extra
 
-lz4 = require("lz4.frame", extra="events")
-zstandard = require("zstandard", extra="events")
+lz4 = require_extra("lz4.frame", extra="events")
+zstandard = require_extra("zstandard", extra="events")
 
 PACKERS = {0: bytes, 1: lz4.compress, 3: zstandard.ZstdCompressor().compress}
 """By the number of the compression: none, LZ4, Zstandard."""

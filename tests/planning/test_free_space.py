@@ -11,7 +11,7 @@ import pytest
 
 from edqn_jax.errors import ConfigError
 from edqn_jax.planning.astar import shortest_path
-from edqn_jax.planning.free_space import reachable
+from edqn_jax.planning.free_space import find_reachable
 from edqn_jax.planning.lattice import NoPathError
 from edqn_jax.sim.scene.mjcf import load_scene, resolve_world
 from edqn_jax.sim.scene.scene import Shape, stack_scenes
@@ -50,7 +50,7 @@ def a_path(scene, start: np.ndarray) -> bool:
 )
 def test_there_is_a_way_from_where_astar_finds_one(shapes: list[Shape], closed: bool) -> None:
     scene = small_world(*shapes, goal=tuple(GOAL)).scene
-    found = reachable(scene, RADIUS, 0.5)
+    found = find_reachable(scene, RADIUS, 0.5)
     draw = np.random.default_rng(0)
     free = 0
     for _ in range(60):
@@ -67,13 +67,13 @@ def test_there_is_a_way_from_where_astar_finds_one(shapes: list[Shape], closed: 
 
 
 def test_what_is_open_is_seen_on_a_coarse_lattice() -> None:
-    assert reachable(small_world(goal=tuple(GOAL)).scene, RADIUS).edge_m == 1.0
+    assert find_reachable(small_world(goal=tuple(GOAL)).scene, RADIUS).edge_m == 1.0
     closed = small_world(*wall(0.6), start=(8.0, 6.0, 3.0), goal=tuple(GOAL)).scene
-    assert reachable(closed, RADIUS).edge_m == 0.5
+    assert find_reachable(closed, RADIUS).edge_m == 0.5
 
 
 def test_the_papers_world_is_open() -> None:
-    found = reachable(load_scene(resolve_world("paper")), RADIUS)
+    found = find_reachable(load_scene(resolve_world("paper")), RADIUS)
     assert (found.edge_m, found.lost) == (1.0, 0.0)
 
 
@@ -85,24 +85,24 @@ def test_a_door_between_the_cells_is_found_with_finer_ones() -> None:
     for cell in (0.5, None):
         with pytest.raises(NoPathError) if cell else contextlib.nullcontext():
             assert shortest_path(scene, start, goal, RADIUS, cell).length_m == pytest.approx(8.0, abs=0.1)
-    found = reachable(scene, RADIUS)
+    found = find_reachable(scene, RADIUS)
     assert (found.edge_m, found.lost) == (0.25, 0.0)
 
 
 def test_a_goal_in_a_wall_and_a_volume_without_end_are_refused() -> None:
     scene = small_world(box((9.5, 5.5, 2.5), (10.5, 6.5, 3.5)), goal=tuple(GOAL)).scene
     with pytest.raises(NoPathError, match=r"does not fit at the goal \(10, 6, 3\)"):
-        reachable(scene, RADIUS)
+        find_reachable(scene, RADIUS)
     huge = dataclasses.replace(scene, volume=np.array([(0.0, 0.0, 0.0), (500.0, 500.0, 400.0)], np.float32))
     with pytest.raises(ConfigError, match="volume of 500 x 500 x 400 m has 10. million cells of 1 m"):
-        reachable(huge, RADIUS)
+        find_reachable(huge, RADIUS)
 
 
 @pytest.mark.parametrize("own", [0.0, 1.0])
 def test_missions_begin_where_there_is_a_way(own: float) -> None:
     """Behind the wall is more than half of the volume; the own start is beside it, on the goal's side."""
     scene = small_world(*wall(0.6), start=(6.8, 6.0, 3.0), goal=tuple(GOAL)).scene
-    found = reachable(scene, RADIUS)
+    found = find_reachable(scene, RADIUS)
     cells = cells_of(scene, found.is_way, found.corner, found.edge_m)
     missions = spread_missions(stack_scenes([scene]), 256, own, 3.0, jax.random.key(0), cells)
     starts = np.asarray(missions.start)

@@ -15,7 +15,7 @@ from edqn_jax.config.loading import to_yaml
 from edqn_jax.errors import ConfigError
 from edqn_jax.interop import flight_files
 from edqn_jax.learn.policy import PolicyParams, fresh_policy
-from edqn_jax.report.animation import LAST_FRAME_S, MOST_FRAMES, SIZE
+from edqn_jax.report.animation import LAST_FRAME_S, MAX_FRAMES, SIZE
 from edqn_jax.report.style import OUTCOME_COLOURS
 from edqn_jax.runs.checkpoints.params import save_params
 from edqn_jax.sim.scene.mjcf import write_scene
@@ -43,7 +43,7 @@ def test_there_is_a_frame_for_each_decision_and_one_for_the_end():
 
 @pytest.mark.slow
 def test_a_long_flight_leaves_decisions_out():
-    assert frames(recorded(Drawn(), MOST_FRAMES + 10)) == (MOST_FRAMES + 10) // 2 + 1
+    assert frames(recorded(Drawn(), MAX_FRAMES + 10)) == (MAX_FRAMES + 10) // 2 + 1
 
 
 @pytest.mark.slow

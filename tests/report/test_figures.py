@@ -11,10 +11,10 @@ from matplotlib.collections import LineCollection, PathCollection
 from matplotlib.colors import to_rgba
 from matplotlib.figure import Figure
 
-from edqn_jax.report.curves import draw_learning, draw_returns, running_mean
-from edqn_jax.report.flights import OBLIQUE, draw_path, draw_world
-from edqn_jax.report.images import EVENTS, NEARNESS, draw_reconstruction, draw_sight
-from edqn_jax.report.solids import MAP, View, cut_open, far_to_near, hidden, solids_of
+from edqn_jax.report.curves import plot_learning, plot_returns, running_mean
+from edqn_jax.report.flights import OBLIQUE, plot_path, plot_world
+from edqn_jax.report.images import EVENTS, NEARNESS, plot_reconstruction, plot_sight
+from edqn_jax.report.solids import MAP, View, far_to_near, is_occluded, make_cutaway, solids_of
 from edqn_jax.report.style import OUTCOME_COLOURS
 from edqn_jax.sim.scene.scene import (
     Scene,
@@ -65,14 +65,14 @@ def test_the_faces_of_a_solid_enclose_its_volume():
 def test_a_solid_hides_what_is_behind_it_and_nothing_else():
     box = solids_of(one_of_each_kind())[:1]
     below_roof, above_roof, beside = [30, 30, 2], [30, 30, 12], [50, 30, 2]
-    assert hidden(np.array([below_roof, above_roof, beside], float), box, MAP).tolist() == [
+    assert is_occluded(np.array([below_roof, above_roof, beside], float), box, MAP).tolist() == [
         True,
         False,
         False,
     ]
     level = View(azimuth=0.0, elevation=0.0)
     behind, in_front = [10, 30, 5], [45, 30, 5]
-    assert hidden(np.array([behind, in_front, [10, 30, 15]], float), box, level).tolist() == [
+    assert is_occluded(np.array([behind, in_front, [10, 30, 15]], float), box, level).tolist() == [
         True,
         False,
         False,
@@ -98,22 +98,22 @@ BEAM = a_box((15, 10, 5.5), (15, 1, 0.5))
 
 def test_a_ceiling_and_the_walls_before_the_eye_are_cut_away():
     hall = a_hall(CEILING)
-    oblique, above = cut_open(hall, OBLIQUE), cut_open(hall, MAP)
+    oblique, above = make_cutaway(hall, OBLIQUE), make_cutaway(hall, MAP)
     assert (len(oblique.shown), len(oblique.near_walls), oblique.note) == (3, 2, "ceiling and near walls cut away")
     assert (len(above.shown), len(above.near_walls), above.note) == (5, 0, "ceiling cut away")
 
 
 def test_nothing_is_cut_away_in_the_open():
-    assert cut_open(one_of_each_kind(), OBLIQUE).note == cut_open(one_of_each_kind(), MAP).note == ""
-    assert len(cut_open(one_of_each_kind(), OBLIQUE).shown) == 6
+    assert make_cutaway(one_of_each_kind(), OBLIQUE).note == make_cutaway(one_of_each_kind(), MAP).note == ""
+    assert len(make_cutaway(one_of_each_kind(), OBLIQUE).shown) == 6
 
 
 def test_a_beam_is_no_ceiling():
-    assert cut_open(a_hall(BEAM), MAP).note == ""
+    assert make_cutaway(a_hall(BEAM), MAP).note == ""
 
 
 def test_a_picture_says_what_was_cut_away(tmp_path):
-    figure = draw_world(a_hall(CEILING), tmp_path / "world.png")
+    figure = plot_world(a_hall(CEILING), tmp_path / "world.png")
     assert is_png(tmp_path / "world.png")
     assert figure.axes[0].get_title(loc="left") == "ceiling and near walls cut away"
 
@@ -131,7 +131,7 @@ def test_a_map_has_x_to_the_right_and_y_up():
 
 
 def test_the_world_is_drawn_in_proportion_with_start_and_goal(tmp_path):
-    figure = draw_world(one_of_each_kind(), tmp_path / "world.png")
+    figure = plot_world(one_of_each_kind(), tmp_path / "world.png")
     assert is_png(tmp_path / "world.png")
     assert figure.axes[0].get_aspect() == 1.0
     assert "start (1, 1, 3)" in texts(figure) and "goal (90, 90, 10)" in texts(figure)
@@ -139,7 +139,7 @@ def test_the_world_is_drawn_in_proportion_with_start_and_goal(tmp_path):
 
 @pytest.mark.slow
 def test_the_path_is_drawn_whole_in_both_views(tmp_path):
-    figure = draw_path(one_of_each_kind(), a_flight(), np.array([[1, 1, 3], [90, 90, 10.0]]), tmp_path / "path.png")
+    figure = plot_path(one_of_each_kind(), a_flight(), np.array([[1, 1, 3], [90, 90, 10.0]]), tmp_path / "path.png")
     assert is_png(tmp_path / "path.png")
     for axes in figure.axes[:2]:
         coloured = [c for c in axes.collections if isinstance(c, LineCollection) and c.get_array() is not None]
@@ -150,19 +150,19 @@ def test_the_path_is_drawn_whole_in_both_views(tmp_path):
 
 
 def test_a_flight_that_fails_says_how(tmp_path):
-    figure = draw_path(one_of_each_kind(), a_flight(50), None, tmp_path / "path.png", outcome="collision")
+    figure = plot_path(one_of_each_kind(), a_flight(50), None, tmp_path / "path.png", outcome="collision")
     assert "collision" in texts(figure) and "shortest path" not in texts(figure)
 
 
 @pytest.mark.slow
 def test_a_flight_of_one_step_can_be_drawn(tmp_path):
-    draw_path(one_of_each_kind(), a_flight(1), None, tmp_path / "path.png", outcome="left_volume")
+    plot_path(one_of_each_kind(), a_flight(1), None, tmp_path / "path.png", outcome="left_volume")
     assert is_png(tmp_path / "path.png")
 
 
 def test_every_episode_is_a_point_in_its_outcomes_colour(tmp_path):
     outcomes = np.array(["goal"] * 70 + ["collision"] * 20 + ["time_out"] * 9 + ["left_volume"])
-    figure = draw_returns({"return": np.linspace(-100, 100, 100), "outcome": outcomes}, tmp_path / "returns.png")
+    figure = plot_returns({"return": np.linspace(-100, 100, 100), "outcome": outcomes}, tmp_path / "returns.png")
     assert is_png(tmp_path / "returns.png")
     points = {c.get_gid(): c for c in figure.axes[0].collections if isinstance(c, PathCollection)}
     counts = {name: len(np.asarray(c.get_offsets())) for name, c in points.items()}
@@ -173,7 +173,7 @@ def test_every_episode_is_a_point_in_its_outcomes_colour(tmp_path):
 
 
 def test_a_run_without_episodes_still_has_its_picture(tmp_path):
-    draw_returns({"return": np.array([]), "outcome": np.array([], str)}, tmp_path / "returns.png")
+    plot_returns({"return": np.array([]), "outcome": np.array([], str)}, tmp_path / "returns.png")
     assert is_png(tmp_path / "returns.png")
 
 
@@ -200,7 +200,7 @@ def test_learning_shows_each_metric_where_a_line_has_it(tmp_path):
     metrics = [{"decisions": 100 * i, "reconstruction_loss": 1.0 / i, "kl": 2.0} for i in range(1, 5)]
     metrics += [{"decisions": 100 * i, "q_loss": 0.1, "epsilon": 0.5, "success_rate": 0.2} for i in range(5, 9)]
     metrics += [{"decisions": 900, "validation_success": 0.75}, {"decisions": 950, "q_loss": None}]
-    figure = draw_learning(metrics, tmp_path / "learning.png")
+    figure = plot_learning(metrics, tmp_path / "learning.png")
     assert is_png(tmp_path / "learning.png")
     lines = {line.get_gid(): line for axes in figure.axes for line in axes.get_lines()}
     points = {str(name): len(np.asarray(line.get_xdata())) for name, line in lines.items()}
@@ -218,7 +218,7 @@ def test_the_warm_up_is_a_curve_of_its_training_steps(tmp_path):
     steps = {"decisions": [10, 20, 30], "reconstruction_loss": [9.0, 6.0, 4.0], "kl": [1.0, 2.0, 3.0]}
     metrics = [{"decisions": 40, "reconstruction_loss": 6.3, "kl": 2.0, "warm_up": steps}]
     metrics += [{"decisions": 80, "reconstruction_loss": 3.0, "kl": 3.5, "warm_up": None}]
-    figure = draw_learning(metrics, tmp_path / "learning.png")
+    figure = plot_learning(metrics, tmp_path / "learning.png")
     lines = {line.get_gid(): line for axes in figure.axes for line in axes.get_lines()}
     assert list(np.asarray(lines["reconstruction_loss"].get_xdata())) == [10, 20, 30, 80]
     assert list(np.asarray(lines["kl"].get_ydata())) == [1.0, 2.0, 3.0, 3.5]
@@ -229,13 +229,13 @@ def test_the_vae_has_no_line_where_it_did_not_learn(tmp_path):
         {"decisions": 100 * i, "reconstruction_loss": None if 3 <= i < 6 else 1.0, "q_loss": 0.1} for i in range(9)
     ]
     metrics += [{"decisions": 900, "reconstruction_loss": None}]
-    figure = draw_learning(metrics, tmp_path / "learning.png")
+    figure = plot_learning(metrics, tmp_path / "learning.png")
     (line,) = (line for axes in figure.axes for line in axes.get_lines() if line.get_gid() == "reconstruction_loss")
     assert np.isfinite(np.asarray(line.get_ydata(), float)).tolist() == [True] * 3 + [False] * 3 + [True] * 3
 
 
 def test_learning_can_be_drawn_before_anything_was_learned(tmp_path):
-    draw_learning([], tmp_path / "learning.png")
+    plot_learning([], tmp_path / "learning.png")
     assert is_png(tmp_path / "learning.png")
 
 
@@ -243,7 +243,7 @@ def test_events_stand_below_the_image_that_made_them(tmp_path):
     counts = np.zeros((3, 24, 32), np.int8)
     counts[1, 4, 5], counts[2, 6, 7] = 3, -2
     rgb = np.random.default_rng(0).random((3, 96, 128, 3))
-    figure = draw_sight(rgb, rgb[:, ::4, ::4], counts, tmp_path / "events.png", times_s=[0.26, 1.3, 2.6])
+    figure = plot_sight(rgb, rgb[:, ::4, ::4], counts, tmp_path / "events.png", times_s=[0.26, 1.3, 2.6])
     assert is_png(tmp_path / "events.png")
     drawn = [np.asarray(axes.images[0].get_array()) for axes in figure.axes if axes.images]
     np.testing.assert_allclose(drawn[1], rgb[1])
@@ -254,7 +254,7 @@ def test_events_stand_below_the_image_that_made_them(tmp_path):
 def test_reconstructions_share_the_colours_of_the_events(tmp_path):
     counts = np.zeros((2, 24, 32))
     counts[:, 3:9, 10] = 4
-    figure = draw_reconstruction(counts, counts * 0.5, tmp_path / "reconstruction.png")
+    figure = plot_reconstruction(counts, counts * 0.5, tmp_path / "reconstruction.png")
     assert is_png(tmp_path / "reconstruction.png")
     limits = {axes.images[0].get_clim() for axes in figure.axes[:4]}
     assert limits == {(0.0, 4.0)}
@@ -266,7 +266,7 @@ def test_nearness_is_drawn_below_the_events_that_it_was_told_from(tmp_path):
     counts, near = np.zeros((2, 24, 32)), np.full((2, 24, 32), 0.5)
     counts[:, 3:9, 10], near[:, 3:9, 8:14] = -4, 2.0
     seen = (counts, EVENTS)
-    figure = draw_reconstruction(near, near * 0.75, tmp_path / "reconstruction.png", NEARNESS, seen)
+    figure = plot_reconstruction(near, near * 0.75, tmp_path / "reconstruction.png", NEARNESS, seen)
     assert is_png(tmp_path / "reconstruction.png")
     pictures = [np.asarray(axes.images[0].get_array()) for axes in figure.axes[:6]]
     for row, expected in enumerate((counts, near, near * 0.75)):
@@ -277,5 +277,5 @@ def test_nearness_is_drawn_below_the_events_that_it_was_told_from(tmp_path):
 
 def test_silent_windows_can_be_drawn(tmp_path):
     silent = np.zeros((2, 24, 32), np.int32)
-    draw_reconstruction(silent, silent * 1.0, tmp_path / "reconstruction.png")
+    plot_reconstruction(silent, silent * 1.0, tmp_path / "reconstruction.png")
     assert is_png(tmp_path / "reconstruction.png")

@@ -12,10 +12,10 @@ import numpy as np
 import pytest
 
 from edqn_jax.learn.policy import fresh_policy
-from edqn_jax.report.flights import draw_path, draw_world
+from edqn_jax.report.flights import plot_path, plot_world
 from edqn_jax.report.page.worlds import ball_data, world_data
-from edqn_jax.report.sights import Sights, decision_rows, poses, times_of
-from edqn_jax.report.solids import MAP, cut_open, moving_solids, solids_of, standing
+from edqn_jax.report.sights import FlightRenderer, decision_rows, times_of, trajectory_poses
+from edqn_jax.report.solids import MAP, make_cutaway, moving_solids, solids_of, static_scene
 from edqn_jax.sim.actions import move_number
 from edqn_jax.sim.physics.airframe import load_airframe
 from edqn_jax.sim.scene.motion import Motion, Throw
@@ -46,7 +46,7 @@ def moving_world() -> Scene:
 
 def test_solids_that_move_are_where_they_are_at_a_time_and_the_others_stand():
     scene = moving_world()
-    assert len(solids_of(standing(scene))) == 1
+    assert len(solids_of(static_scene(scene))) == 1
     for time, middle in ((0.0, -6.0), (1.5, 0.0), (4.0, 8.0)):
         box = moving_solids(scene, time)[0]
         np.testing.assert_allclose(box.corners.mean(0), [12, middle, 4], atol=1e-4)
@@ -55,14 +55,14 @@ def test_solids_that_move_are_where_they_are_at_a_time_and_the_others_stand():
 
 
 def test_a_still_picture_outlines_what_moves_and_says_so(tmp_path):
-    world = cut_open(moving_world(), MAP)
+    world = make_cutaway(moving_world(), MAP)
     assert len(world.shown) == 1 and len(world.moving) == 1
-    assert "outlined: what moves, as at the start" in draw_world(moving_world(), tmp_path / "world.png").axes[
+    assert "outlined: what moves, as at the start" in plot_world(moving_world(), tmp_path / "world.png").axes[
         0
     ].get_title("left")
-    flown = draw_path(moving_world(), a_flight(4), None, tmp_path / "path.png")
+    flown = plot_path(moving_world(), a_flight(4), None, tmp_path / "path.png")
     assert all("outlined: what moves" in axes.get_title("left") for axes in flown.axes[:2])
-    assert cut_open(standing(moving_world()), MAP).note == ""
+    assert make_cutaway(static_scene(moving_world()), MAP).note == ""
 
 
 def red_middle(gif, frame: int) -> np.ndarray:
@@ -88,7 +88,7 @@ def test_an_animation_shows_obstacles_where_they_are_at_each_moment():
 def test_the_pictures_of_a_flight_are_those_that_the_drone_saw():
     scene = moving_world()
     pool = stack_scenes([scene])
-    world = env.World(load_airframe(SMALL.drone), pool, own_missions(pool))
+    world = env.EnvParams(load_airframe(SMALL.drone), pool, own_missions(pool))
     state, _ = env.reset(SMALL, world, jax.random.key(3), jnp.asarray(0))
     actions = jnp.full(5, move_number("hover"))
     step = lambda state, action: env.step(SMALL, world, state, action)  # noqa: E731
@@ -99,12 +99,12 @@ def test_the_pictures_of_a_flight_are_those_that_the_drone_saw():
     flown["t"] = SMALL.drone.physics_dt_s * np.arange(1, len(flown["x"]) + 1)
     flown["action"] = np.repeat(actions, SMALL.drone.physics_steps)
     with ThreadPoolExecutor(2) as threads:
-        sights = Sights(SMALL, scene, threads)
+        sights = FlightRenderer(SMALL, scene, threads)
     seen = np.asarray(jax.vmap(events.event_image)(steps.observation.sensed))
     assert np.abs(seen).sum() > 100  # of the obstacle's own motion
     np.testing.assert_array_equal(sights.shown(fresh_policy(SMALL), flown).image, seen)
     rows = decision_rows(SMALL, flown)[:, -1]
-    one, other = (sights.rgb(*poses(flown, row), times_of(flown, row)) for row in rows[[0, -1]])
+    one, other = (sights.rgb(*trajectory_poses(flown, row), times_of(flown, row)) for row in rows[[0, -1]])
     assert np.abs(one - other).max() > 0.2
 
 
@@ -118,4 +118,4 @@ def test_the_page_knows_how_shapes_move():
     assert (moves["hit"], moves["early"], moves["speed"], moves["aim"]) == (3.75, 1.5, 6.0, [15, 0, 4])
     turned = [np.cos(0.2) * np.cos(0.3), np.cos(0.2) * np.sin(0.3), np.sin(0.2)]
     np.testing.assert_allclose(moves["from"], turned, atol=1e-5)
-    assert not any("moves" in shape for shape in world_data(standing(moving_world()))["shapes"])
+    assert not any("moves" in shape for shape in world_data(static_scene(moving_world()))["shapes"])

@@ -19,9 +19,9 @@ from PIL import Image
 from edqn_jax.cli import main
 from edqn_jax.config import Config
 from edqn_jax.report.page import document
-from edqn_jax.report.page.contents import COLUMNS, _by_interest, curves, flight_data, script_text
-from edqn_jax.report.page.flown import FlownRun, folders_of, names_of
-from edqn_jax.report.page.pictures import LEVELS, strip
+from edqn_jax.report.page.contents import COLUMNS, _by_interest, flight_data, learning_curves, script_text
+from edqn_jax.report.page.evaluated import EvaluatedRun, folders_of, names_of
+from edqn_jax.report.page.pictures import LEVELS, picture_strip
 from edqn_jax.report.page.worlds import world_data
 from edqn_jax.sim.scene.mjcf import load_scene
 from edqn_jax.sim.task.flights import Closest, Flights, Record
@@ -45,7 +45,7 @@ ROOM = """
 """
 
 
-def a_run(steps: int = 40, name: str = "a run") -> FlownRun:
+def a_run(steps: int = 40, name: str = "a run") -> EvaluatedRun:
     """A flight straight along x of a policy that is not there."""
     config = Config()
     x = np.arange(1, steps + 1, dtype=np.float32)
@@ -74,7 +74,7 @@ def a_run(steps: int = 40, name: str = "a run") -> FlownRun:
     ends = SimpleNamespace(start=np.zeros((1, 3)), goal=np.ones((1, 3)), scene=np.zeros(1, int))
     missions: Any = SimpleNamespace(name="paper", world=SimpleNamespace(missions=ends))
     params: Any = None
-    return FlownRun(name, config, "train: {}", params, missions, flights, {}, [], {}, [])
+    return EvaluatedRun(name, config, "train: {}", params, missions, flights, {}, [], {}, [])
 
 
 def test_a_world_has_every_shape_with_its_size_and_colour(tmp_path: Path) -> None:
@@ -108,7 +108,7 @@ def test_curves_are_running_means_at_the_last_of_their_episodes() -> None:
     steps = np.arange(40)
     episodes = {"step": 10 * steps, "return": 1.0 * steps, "outcome": np.where(steps < 20, "collision", "goal")}
     metrics = [{"decisions": 5, "validation_success": None}, {"decisions": 9, "validation_success": 0.5}]
-    found = curves(dataclasses.replace(a_run(), episodes=episodes, metrics=metrics))
+    found = learning_curves(dataclasses.replace(a_run(), episodes=episodes, metrics=metrics))
     assert found["window"] == 4
     assert (found["return"]["x"][0], found["return"]["y"][0]) == (30, 1.5)
     assert (found["success"]["y"][0], found["success"]["y"][-1]) == (0, 1)
@@ -116,16 +116,16 @@ def test_curves_are_running_means_at_the_last_of_their_episodes() -> None:
 
 
 def test_a_function_was_trained_nowhere() -> None:
-    assert document.figures(a_run())["trained in"] == "–"
+    assert document.run_figures(a_run())["trained in"] == "–"
 
 
 def test_a_run_without_episodes_has_no_curves() -> None:
-    assert curves(a_run()) == {}
+    assert learning_curves(a_run()) == {}
 
 
 def test_pictures_stand_one_below_the_other_in_the_colours_of_their_scale() -> None:
     images = np.stack([np.zeros((3, 4)), np.ones((3, 4))])
-    picture = Image.open(io.BytesIO(base64.b64decode(strip(images, Normalize(0, 1), "gray"))))
+    picture = Image.open(io.BytesIO(base64.b64decode(picture_strip(images, Normalize(0, 1), "gray"))))
     assert (picture.size, picture.mode) == ((4, 6), "P")
     pixels = np.asarray(picture.convert("L"))
     assert np.all(pixels[:3] == 0) and np.all(pixels[3:] == 255) and LEVELS <= 256
@@ -147,12 +147,12 @@ def test_whatever_a_folder_says_is_escaped() -> None:
         summary={"processor": HOSTILE, "versions": {HOSTILE: HOSTILE}, "outcome": HOSTILE},
         notes=[HOSTILE],
     )
-    page = document.document([run, run], {"version": HOSTILE, "made": "now", "runs": [{"name": HOSTILE}]})
+    page = document.build_html([run, run], {"version": HOSTILE, "made": "now", "runs": [{"name": HOSTILE}]})
     assert "<img" not in page and page.count("&lt;img src=x onerror=alert(1)&gt;&amp;") >= 8
 
 
 def test_the_page_names_no_address_to_load_from() -> None:
-    page = document.document([a_run()], {"version": "1", "made": "now"})
+    page = document.build_html([a_run()], {"version": "1", "made": "now"})
     for mark in ("src=", "href=", "url(", "@import"):
         assert mark not in page.replace("img-src", ""), mark
     assert "default-src 'none'" in page
@@ -188,11 +188,11 @@ def test_what_cannot_be_shown_is_refused_with_one_sentence(arguments, says, tmp_
 
 
 def test_a_run_whose_files_are_damaged_is_refused(tmp_path, monkeypatch, capsys) -> None:
-    from edqn_jax.report.page import flown
+    from edqn_jax.report.page import evaluated
 
     (tmp_path / "config.yaml").write_text("train: {seed: 0}")
     (tmp_path / "metrics.jsonl").write_text("{not JSON")
-    monkeypatch.setattr(flown, "load_run", lambda folder: (Config(), jnp.zeros(())))
+    monkeypatch.setattr(evaluated, "load_run", lambda folder: (Config(), jnp.zeros(())))
     assert main(["report", str(tmp_path)]) == 2
     assert "is not as a run writes it" in capsys.readouterr().err
     assert not (tmp_path / "report.html").exists()

@@ -7,7 +7,7 @@ import io
 import pytest
 from rich.console import Console
 
-from edqn_jax.report.progress import Progress, clock
+from edqn_jax.report.progress import Progress, format_duration
 
 
 def shown(terminal: bool, every_s: float) -> str:
@@ -73,4 +73,4 @@ def test_stopping_what_never_started_is_harmless():
 
 @pytest.mark.parametrize(("seconds", "text"), [(0.4, "0:00"), (75, "1:15"), (3675, "1:01:15")])
 def test_clock_reads_like_one(seconds, text):
-    assert clock(seconds) == text
+    assert format_duration(seconds) == text

@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 
 from edqn_jax.report.images import EVENTS, NEARNESS
-from edqn_jax.report.recordings import Strip, animate_recording, draw_recording, moments
+from edqn_jax.report.recordings import Strip, animate_recording, pick_windows, plot_recording
 
 RNG = np.random.default_rng(0)
 STRIPS = [
@@ -22,11 +22,11 @@ TIMES_S = [0.0, 0.1, 0.2, 0.3]
 
 @pytest.mark.parametrize(("windows", "most", "wanted"), [(3, 6, [0, 1, 2]), (11, 6, [0, 2, 4, 6, 8, 10]), (1, 6, [0])])
 def test_moments_go_evenly_from_the_first_window_to_the_last(windows, most, wanted):
-    assert moments(windows, most).tolist() == wanted
+    assert pick_windows(windows, most).tolist() == wanted
 
 
 def test_a_still_picture_has_a_row_a_strip_and_a_column_a_moment(tmp_path: Path):
-    figure = draw_recording(STRIPS, TIMES_S, tmp_path / "a.png")
+    figure = plot_recording(STRIPS, TIMES_S, tmp_path / "a.png")
     assert len(figure.axes) == len(STRIPS) * len(TIMES_S)
     assert [axes.get_title() for axes in figure.axes[:4]] == [f"t = {time:.2f} s" for time in TIMES_S]
     assert figure.axes[1].get_xlabel() == f"{np.abs(STRIPS[0].pictures[1]).sum()} net events"

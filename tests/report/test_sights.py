@@ -14,7 +14,14 @@ import pytest
 from edqn_jax.config import Config
 from edqn_jax.learn.perception import vae
 from edqn_jax.learn.policy import fresh_policy
-from edqn_jax.report.sights import FINE, Sights, coarse, decision_rows, own_motions, poses
+from edqn_jax.report.sights import (
+    FINE,
+    FlightRenderer,
+    decision_rows,
+    downsample_picture,
+    own_motions,
+    trajectory_poses,
+)
 from edqn_jax.sim.actions import ACTIONS
 from edqn_jax.sim.camera import camera
 from edqn_jax.sim.physics.airframe import load_airframe
@@ -28,16 +35,16 @@ HEIGHT, WIDTH = SMALL.camera.height, SMALL.camera.width
 MOVES = [(1, 0, 0), (1, 0, 0), (1, 1, 0), (1, 0, 1), (1, -1, 0), (1, 0, 0)]
 
 
-def sights_of(config: Config) -> Sights:
+def sights_of(config: Config) -> FlightRenderer:
     with ThreadPoolExecutor(2) as threads:
-        return Sights(config, world_with_a_box(), threads)
+        return FlightRenderer(config, world_with_a_box(), threads)
 
 
 @pytest.fixture(scope="module")
 def flight() -> tuple[dict[str, np.ndarray], env.Step]:
     """A flight as the columns of a trajectory, and as the steps that the drone took."""
     pool = stack_scenes([world_with_a_box()])
-    world = env.World(load_airframe(SMALL.drone), pool, own_missions(pool))
+    world = env.EnvParams(load_airframe(SMALL.drone), pool, own_missions(pool))
     state, _ = env.reset(SMALL, world, jax.random.key(3), jnp.asarray(0))
     actions = jnp.array([np.flatnonzero((ACTIONS == move).all(axis=1))[0] for move in MOVES])
     _, steps = jax.jit(lambda state: jax.lax.scan(partial(env.step, SMALL, world), state, actions))(state)
@@ -52,7 +59,7 @@ def flight() -> tuple[dict[str, np.ndarray], env.Step]:
 
 
 @pytest.fixture(scope="module")
-def sights() -> Sights:
+def sights() -> FlightRenderer:
     return sights_of(SMALL)
 
 
@@ -87,9 +94,9 @@ def test_own_motions_are_those_that_the_drone_knew(flight):
 def test_the_true_nearness_is_what_the_sensor_depth_would_show(sights, flight):
     flown, _ = flight
     shown = sights.shown(fresh_policy(SMALL), flown)
-    position, quaternion = poses(flown, decision_rows(SMALL, flown)[:, -1])
+    position, quaternion = trajectory_poses(flown, decision_rows(SMALL, flown)[:, -1])
     true = jax.vmap(lambda p, q: sensor.nearness_image(SMALL, sights.scene, p, q))(position, quaternion)
-    wanted = vae.target(SMALL.encoder, jnp.zeros((len(MOVES), HEIGHT, WIDTH)), true)[:, 0]
+    wanted = vae.decoder_target(SMALL.encoder, jnp.zeros((len(MOVES), HEIGHT, WIDTH)), true)[:, 0]
     np.testing.assert_allclose(shown.target, wanted, atol=1e-4)  # another program rounds otherwise
     assert shown.target.std() > 0.05 and shown.reconstruction.std() < shown.target.std()
 
@@ -97,12 +104,12 @@ def test_the_true_nearness_is_what_the_sensor_depth_would_show(sights, flight):
 @pytest.mark.slow
 def test_a_fine_picture_is_the_drones_own_with_smaller_pixels(sights, flight):
     flown, _ = flight
-    pose = poses(flown, decision_rows(SMALL, flown)[-1, -1])
+    pose = trajectory_poses(flown, decision_rows(SMALL, flown)[-1, -1])
     fine = sights.rgb(*pose)
     assert fine.shape == (HEIGHT * FINE, WIDTH * FINE, 3)
     position, quaternion = map(jnp.asarray, pose)
-    own = camera.rgb(SMALL.camera, sights.scene, position, sensor.mount_rotation(SMALL, quaternion))
-    assert np.abs(coarse(fine) - own).mean() < 0.01
+    own = camera.render_rgb(SMALL.camera, sights.scene, position, sensor.mount_rotation(SMALL, quaternion))
+    assert np.abs(downsample_picture(fine) - own).mean() < 0.01
 
 
 def test_the_rows_of_a_decision_are_where_the_sensor_looks():

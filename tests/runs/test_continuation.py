@@ -12,8 +12,8 @@ from edqn_jax.cli.train import parse_train
 from edqn_jax.config import Config
 from edqn_jax.config.loading import make_config
 from edqn_jax.errors import ConfigError
-from edqn_jax.learn.plan import Plan
-from edqn_jax.runs.continuation import differences
+from edqn_jax.learn.schedule import Schedule
+from edqn_jax.runs.continuation import option_differences
 from edqn_jax.runs.directory import RunDirectory, plan_run_directory
 
 
@@ -22,7 +22,7 @@ def run(tmp_path: Path) -> RunDirectory:
     """An unfinished run that was started with --world paper --agent.n-step 5."""
     run = RunDirectory(tmp_path / "run")
     _, config = parse_train(["--world", "paper", "--agent.n-step", "5"])
-    with run.locked():
+    with run.hold_lock():
         run.begin([config])
     return run
 
@@ -61,7 +61,7 @@ def test_what_changes_nothing_before_may_change(run: RunDirectory, flags: list[s
 
 
 def test_a_longer_run_keeps_the_schedule_of_its_first_length(run: RunDirectory) -> None:
-    with run.locked():
+    with run.hold_lock():
         run.reopen([asked(run, "--total-steps", "700000")])
     twice = asked(run, "--total-steps", "900000")
     assert (twice.train.total_steps, twice.train.schedule_steps) == (900_000, 500_000)
@@ -72,7 +72,7 @@ def test_a_longer_run_keeps_the_schedule_of_its_first_length(run: RunDirectory) 
 def test_the_schedule_of_a_longer_run_is_that_of_the_shorter_one() -> None:
     short = make_config("medium")
     long = make_config("medium", train={"total_steps": 3_000_000, "schedule_steps": short.train.total_steps})
-    plans = [Plan.of(config) for config in (short, long)]
+    plans = [Schedule.from_config(config) for config in (short, long)]
     assert plans[1].total > plans[0].total == plans[1].scheduled
     assert dataclasses.replace(plans[1], total=plans[0].total) == plans[0]
 
@@ -80,7 +80,7 @@ def test_the_schedule_of_a_longer_run_is_that_of_the_shorter_one() -> None:
 def test_the_number_of_seeds_is_the_runs(tmp_path: Path) -> None:
     run = RunDirectory(tmp_path / "run")
     configs = [make_config("paper", train={"seed": seed}) for seed in (0, 1)]
-    with run.locked():
+    with run.hold_lock():
         run.begin(configs, seeds=True)
     assert parse_train(["--run-dir", str(run.path)])[0].seeds == 2
     with pytest.raises(ConfigError, match="holds runs of 2 seeds, not runs of 3 seeds; leave --seeds out to continue"):
@@ -95,4 +95,4 @@ def test_an_empty_configuration_is_not_taken_for_the_defaults(run: RunDirectory)
 
 def test_differences_are_named_as_in_a_file() -> None:
     one, other = make_config("paper"), make_config("paper", agent={"n_step": 7}, train={"seed": 3})
-    assert differences(one, other) == ["agent.n_step", "train.seed"] and not differences(one, one)
+    assert option_differences(one, other) == ["agent.n_step", "train.seed"] and not option_differences(one, one)

@@ -15,11 +15,11 @@ import pytest
 from edqn_jax.config import Config, TrainConfig
 from edqn_jax.errors import ConfigError
 from edqn_jax.learn.policy import PolicyParams
-from edqn_jax.runs import keeper
+from edqn_jax.runs import checkpointer
+from edqn_jax.runs.checkpointer import MAX_OVERHEAD, Checkpointer
 from edqn_jax.runs.directory import RunDirectory
-from edqn_jax.runs.keeper import MOST_OVERHEAD, Keeper
 from edqn_jax.sim.task.reward import Reward
-from edqn_jax.training.loop import AgentStanding, Standing
+from edqn_jax.training.loop import AgentProgress, RunProgress
 from edqn_jax.training.selection import Candidate
 
 CONFIG = Config(train=TrainConfig(checkpoint_every_s=15.0))
@@ -39,30 +39,30 @@ class Clock:
 @pytest.fixture
 def clock(monkeypatch: pytest.MonkeyPatch) -> Iterator[Clock]:
     clock = Clock()
-    monkeypatch.setattr(keeper, "time", clock)
-    monkeypatch.setattr(keeper.saved_state, "to_host", lambda trainer, state, done: dict(STATE))
+    monkeypatch.setattr(checkpointer, "time", clock)
+    monkeypatch.setattr(checkpointer.saved_state, "to_host", lambda trainer, state, done: dict(STATE))
     shapes = {name: (array.shape, str(array.dtype)) for name, array in STATE.items()}
-    monkeypatch.setattr(keeper.saved_state, "expected", lambda trainer, done: shapes)
-    monkeypatch.setattr(keeper.saved_state, "from_host", lambda trainer, arrays: arrays)
-    monkeypatch.setattr(Standing, "policies", lambda self, trainer, configs: [PARAMS])
+    monkeypatch.setattr(checkpointer.saved_state, "state_shapes", lambda trainer, done: shapes)
+    monkeypatch.setattr(checkpointer.saved_state, "from_host", lambda trainer, arrays: arrays)
+    monkeypatch.setattr(RunProgress, "policies", lambda self, trainer, configs: [PARAMS])
     yield clock
 
 
-def kept(tmp_path: Path, config: Config = CONFIG, reward: Reward | None = None) -> tuple[Keeper, list[str]]:
+def kept(tmp_path: Path, config: Config = CONFIG, reward: Reward | None = None) -> tuple[Checkpointer, list[str]]:
     run, said = RunDirectory(tmp_path / "run"), []
     if not run.path.exists():
-        with run.locked():
+        with run.hold_lock():
             run.begin([config])
     newest = jax.tree.map(lambda leaf: leaf + 7.0, PARAMS)
     learner = SimpleNamespace(encoder=newest.encoder, agent=SimpleNamespace(average=newest.q))
     trainer = SimpleNamespace(shapes=lambda: SimpleNamespace(learner=learner), each=lambda tree: [tree])
     preparation = SimpleNamespace(config=config, configs=[config], trainer=trainer)
-    return Keeper(preparation, run, [run], reward, said.append), said  # type: ignore[arg-type]
+    return Checkpointer(preparation, run, [run], reward, said.append), said  # type: ignore[arg-type]
 
 
-def standing(done: int) -> Standing:
-    agent = AgentStanding(Candidate(PARAMS, spl=0.5, success=0.75, decisions=256), 12, [(256, 1.5, 0.5)])
-    return Standing(state=None, done=done, checked=256, train_seconds=2.0, elapsed_s=9.0, agents=[agent])  # type: ignore[arg-type]
+def standing(done: int) -> RunProgress:
+    agent = AgentProgress(Candidate(PARAMS, spl=0.5, success=0.75, decisions=256), 12, [(256, 1.5, 0.5)])
+    return RunProgress(state=None, done=done, checked=256, train_seconds=2.0, elapsed_s=9.0, agents=[agent])  # type: ignore[arg-type]
 
 
 def steps(tmp_path: Path) -> list[int]:
@@ -73,18 +73,18 @@ def test_checkpoints_are_so_far_apart_that_saving_takes_little_time(
     tmp_path: Path, clock: Clock, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     made, _ = kept(tmp_path, dataclasses.replace(CONFIG, train=TrainConfig(checkpoint_every_s=15.0, checkpoints=99)))
-    save = keeper.states.save
+    save = checkpointer.states.save_checkpoint
 
     def slow(*arguments):
         clock.now += 1.5
         return save(*arguments)
 
-    monkeypatch.setattr(keeper.states, "save", slow)
+    monkeypatch.setattr(checkpointer.states, "save_checkpoint", slow)
     for second in range(1, 200):
         clock.now = max(clock.now, float(second))
         made.save_if_due(standing(second), last=second == 199)
     assert steps(tmp_path) == [15, 67, 119, 171, 199]  # then every 1.5 s / 3 % after the end of the one before
-    assert 1.5 / MOST_OVERHEAD == 50.0 and made.facts["checkpoint_seconds"] == 5 * 1.5
+    assert 1.5 / MAX_OVERHEAD == 50.0 and made.facts["checkpoint_seconds"] == 5 * 1.5
 
 
 def test_none_is_saved_where_none_is_asked_for(tmp_path: Path, clock: Clock) -> None:
@@ -102,7 +102,7 @@ def test_a_full_disk_does_not_end_a_training_before_its_end(
     def full(*_):
         raise ConfigError("'there' cannot be written: No space left on device")
 
-    monkeypatch.setattr(keeper.states, "save", full)
+    monkeypatch.setattr(checkpointer.states, "save_checkpoint", full)
     clock.now = 20.0
     made.save_if_due(standing(2), last=False)
     assert said == [
@@ -116,7 +116,7 @@ def test_a_full_disk_does_not_end_a_training_before_its_end(
 def test_a_run_stands_where_it_stood(tmp_path: Path, clock: Clock) -> None:
     kept(tmp_path)[0].save_if_due(standing(8), last=True)
     made, said = kept(tmp_path)
-    found = made.restored()
+    found = made.restore_newest()
     assert found is not None and not said
     plain = dataclasses.replace(found, state=None, agents=[])  # type: ignore[arg-type]
     assert plain == dataclasses.replace(standing(8), agents=[])
@@ -136,7 +136,7 @@ def test_where_a_file_of_the_run_was_changed_the_checkpoint_before_is_used(tmp_p
     made.save_if_due(standing(2), last=True)
     made.run.metrics_file.write_text('{"decisions": 2}\n')
     again, said = kept(tmp_path)
-    found = again.restored()
+    found = again.restore_newest()
     assert found is not None and found.done == 1 and "is passed over: " in said[0]
     assert not made.run.metrics_file.exists()  # there was none then
 
@@ -148,18 +148,18 @@ def test_another_reward_is_refused_by_name(tmp_path: Path, clock: Clock) -> None
         return transition.configured
 
     with pytest.raises(ConfigError, match=r"trained with the reward 'progress', not with '.*mine' \([0-9a-f]{8}\)"):
-        kept(tmp_path, reward=mine)[0].restored()
+        kept(tmp_path, reward=mine)[0].restore_newest()
     assert steps(tmp_path) == [1]  # nothing is wrong with it
 
 
 @pytest.mark.parametrize("which", ["edqn_jax", "jax"])
 def test_another_version_is_named(tmp_path: Path, clock: Clock, monkeypatch: pytest.MonkeyPatch, which: str) -> None:
-    versions = keeper.states.versions()
+    versions = checkpointer.states.checkpoint_versions()
     with monkeypatch.context() as older:
-        older.setattr(keeper.states, "versions", lambda: {**versions, which: "0.0.9"})
+        older.setattr(checkpointer.states, "checkpoint_versions", lambda: {**versions, which: "0.0.9"})
         kept(tmp_path)[0].save_if_due(standing(1), last=True)
     made, said = kept(tmp_path)
     refused = pytest.raises(ConfigError, match="saved by edqn_jax 0.0.9, which edqn_jax .* cannot continue")
     with refused if which == "edqn_jax" else contextlib.nullcontext():
-        assert made.restored() is not None
+        assert made.restore_newest() is not None
     assert said == ([] if which == "edqn_jax" else [f"jax is {jax.__version__} and was 0.0.9: rounding may differ"])

@@ -31,15 +31,15 @@ with Lock(Path(sys.argv[1])):
 
 def test_a_folder_that_a_run_holds_is_refused_whole_and_free_when_it_has_ended(tmp_path: Path) -> None:
     run = RunDirectory(tmp_path / "run")
-    with run.locked():
+    with run.hold_lock():
         run.begin([Config()])
         run.append_metrics({"decisions": 1})
         again = plan_run_directory(run.path, Config(), "never")
         with pytest.raises(ConfigError, match=r"run' is in use: process \d+ on .* writes a run there; give another"):
-            again.locked().__enter__()
+            again.hold_lock().__enter__()
         assert run.read_metrics() == [{"decisions": 1}]
     assert not (run.path / LOCK).exists()
-    with again.locked():
+    with again.hold_lock():
         pass
 
 
@@ -47,7 +47,7 @@ def test_a_folder_is_locked_before_anything_is_prepared(tmp_path: Path) -> None:
     # Preparing takes minutes; here it would fail at once, since there is no such world.
     config = dataclasses.replace(Config(), world=WorldConfig(name=str(tmp_path / "missing.xml")))
     run = RunDirectory(tmp_path / "run")
-    with run.locked(), pytest.raises(ConfigError, match="is in use"):
+    with run.hold_lock(), pytest.raises(ConfigError, match="is in use"):
         train_run(config, run, Progress(), Stop())
 
 

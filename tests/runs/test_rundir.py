@@ -12,14 +12,14 @@ import numpy as np
 import pytest
 
 from edqn_jax.config import Config, TrainConfig
-from edqn_jax.config.loading import resolve
+from edqn_jax.config.loading import resolve_config
 from edqn_jax.errors import ConfigError
 from edqn_jax.evaluation.trajectories import TRAJECTORY_COLUMNS, trajectory_columns
 from edqn_jax.runs.directory import TO_BE_DRAWN, RunDirectory, plan_run_directory, version_of
 
 
 def begin(run: RunDirectory, seeds: list[Config] | None = None) -> None:
-    with run.locked():
+    with run.hold_lock():
         run.begin(seeds or [Config()], seeds is not None)
 
 
@@ -39,7 +39,7 @@ def test_planning_makes_nothing(tmp_path, monkeypatch):
 
 def test_a_fresh_folder_is_dated_names_world_and_seed_and_is_never_an_old_one(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    config = resolve(world="medium")
+    config = resolve_config(world="medium")
     first = plan_run_directory(None, config)
     begin(first)
     second = plan_run_directory(None, config)
@@ -58,7 +58,7 @@ def test_of_two_runs_that_plan_the_same_fresh_folder_one_gets_it(tmp_path, monke
 
 
 def test_the_resolved_configuration_reads_back(run):
-    assert resolve(file=run.config_file) == Config()
+    assert resolve_config(file=run.config_file) == Config()
 
 
 def test_a_foreign_folder_is_refused_and_left_alone(tmp_path):
@@ -126,9 +126,9 @@ def test_a_finished_run_is_continued_for_more_decisions(run):
     run.write_summary({"success": True, "figures": "drawn"})
     more = dataclasses.replace(Config(), train=TrainConfig(total_steps=10**6))
     assert plan_run_directory(run.path, more).resume == "auto"
-    with dataclasses.replace(run, resume="auto").locked():
+    with dataclasses.replace(run, resume="auto").hold_lock():
         run.reopen([more])
-    assert not run.summary_file.exists() and resolve(file=run.config_file) == more
+    assert not run.summary_file.exists() and resolve_config(file=run.config_file) == more
 
 
 def test_resume_must_needs_a_run(tmp_path):

@@ -11,8 +11,8 @@ from PIL import Image
 
 from edqn_jax.config import CameraConfig
 from edqn_jax.learn.policy import fresh_policy
-from edqn_jax.report.animation import animate
-from edqn_jax.report.sights import FINE, Shown
+from edqn_jax.report.animation import animate_flight
+from edqn_jax.report.sights import FINE, SensorImages
 from edqn_jax.sim.scene.scene import Planes, Scene, UprightBoxes, build_scene
 from tests.support.policies import CONFIG
 
@@ -37,9 +37,9 @@ class Drawn:
     def rgb(self, position: np.ndarray, quaternion: np.ndarray, time: np.ndarray) -> np.ndarray:
         return np.full((SMALL.camera.height * FINE, SMALL.camera.width * FINE, 3), 0.2 + 0.02 * position[0])
 
-    def shown(self, params: object, flown: dict[str, np.ndarray]) -> Shown:
+    def shown(self, params: object, flown: dict[str, np.ndarray]) -> SensorImages:
         counts = np.random.default_rng(0).integers(-3, 4, (len(flown["t"]) // 13, 24, 32))
-        return Shown(counts, counts, counts, counts)
+        return SensorImages(counts, counts, counts, counts)
 
 
 def a_flight(decisions: float) -> dict[str, np.ndarray]:
@@ -49,5 +49,5 @@ def a_flight(decisions: float) -> dict[str, np.ndarray]:
 
 
 def recorded(sights: Any, decisions: float, outcome: str = "goal") -> Image.Image:
-    gif = animate(sights, fresh_policy(SMALL), a_flight(decisions), outcome, title="a box")
+    gif = animate_flight(sights, fresh_policy(SMALL), a_flight(decisions), outcome, title="a box")
     return Image.open(io.BytesIO(gif))

@@ -18,7 +18,9 @@ ARRAYS = {
 
 def saved(folder: Path, step: int, keep: int = 2) -> Path:
     arrays = {**ARRAYS, ".step": np.asarray(step, np.int32)}
-    return states.save(folder, step, Checkpoint(arrays, {"done": step}, "train: {}\n", {"reward": "r"}), keep)
+    return states.save_checkpoint(
+        folder, step, Checkpoint(arrays, {"done": step}, "train: {}\n", {"reward": "r"}), keep
+    )
 
 
 def file_name(step: int) -> str:
@@ -27,4 +29,4 @@ def file_name(step: int) -> str:
 
 def newest(folder: Path) -> tuple[Checkpoint | None, list[str]]:
     said: list[str] = []
-    return states.newest(folder, lambda checkpoint: None, said.append), said
+    return states.newest_checkpoint(folder, lambda checkpoint: None, said.append), said

@@ -32,14 +32,14 @@ from edqn_jax.learn.trainer import Trainer
 from edqn_jax.learn.updates import Networks
 from edqn_jax.report import gallery
 from edqn_jax.runs import record
-from edqn_jax.runs.directory import plain
+from edqn_jax.runs.directory import to_plain_json
 from edqn_jax.sim.camera import camera
 from edqn_jax.sim.scene.scene import Scene
 from tests.support.miniature import no_losses
 
 
 def waves(config: CameraConfig, scene: Scene, position: Array, rotation: Array) -> Array:
-    """Stands for `camera.luma`."""
+    """Stands for `camera.render_luma`."""
     del scene
     across, down = jnp.arange(config.width), jnp.arange(config.height)[:, None]
     return 0.5 + 0.4 * jnp.sin(across * position[0] + down * position[1] + rotation[0, 0])
@@ -81,15 +81,15 @@ if __name__ == "__main__":
         noted["summary"] = train_run(*arguments, **options)
         return noted["summary"]
 
-    hardware.cores = devices.cores = lambda: int(count)
-    camera.luma = waves
+    hardware.count_cores = devices.count_cores = lambda: int(count)
+    camera.render_luma = waves
     gallery.prepare_gallery = lambda *_: lambda *_: None
     Trainer.init, record.train_run = noting_init, noting_run
     if argv[:1] == ["--no-learning"]:
         del argv[0]
         Trainer.init, Trainer.compile, Trainer.chunk = only_a_policy, lambda self: None, no_learning
         Trainer.trace = lambda self: None
-        rollouts.traced = lambda *_, **__: SimpleNamespace(compile=lambda: None)
+        rollouts.trace_missions = lambda *_, **__: SimpleNamespace(compile=lambda: None)
     code = main(["train", *argv])
-    Path(note).write_text(json.dumps(plain(noted)), encoding="utf-8")
+    Path(note).write_text(json.dumps(to_plain_json(noted)), encoding="utf-8")
     sys.exit(code)

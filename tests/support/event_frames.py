@@ -32,7 +32,7 @@ ESIM = EventsConfig(law="esim", contrast_on=0.12, contrast_off=0.09, refractory_
 
 @partial(jax.jit, static_argnames=("config", "times", "continuous"))
 def run(config, memory, frames, times=TIMES, continuous=False):
-    return ev.events(config, memory, frames, times, jax.random.key(KEY), continuous=continuous)
+    return ev.generate_events(config, memory, frames, times, jax.random.key(KEY), continuous=continuous)
 
 
 @partial(jax.jit, static_argnames=("config", "height", "width"))

@@ -19,9 +19,9 @@ import numpy as np
 
 from edqn_jax.config import AgentConfig, CameraConfig, Config, EncoderConfig, EnvConfig, TrainConfig
 from edqn_jax.devices.devices import use_cpu_devices
-from edqn_jax.learn.plan import Plan
+from edqn_jax.learn.schedule import Schedule
 from edqn_jax.learn.trainer import Trainer
-from edqn_jax.sim.task.env import World
+from edqn_jax.sim.task.env import EnvParams
 from tests.support.miniature import miniature_world
 
 DEVICES = (1, 8)
@@ -54,7 +54,7 @@ CONFIG = Config(
     ),
     train=TrainConfig(num_envs=64, chunk_steps=1, total_steps=64 * 64),
 )
-"""A chunk is one step, so the number that it is given says what is done in it (`Plan`): the first step is the
+"""A chunk is one step, so the number that it is given says what is done in it (`Schedule`): the first step is the
 warm-up, in which the VAE learns, the next ones only fly, and from `learn_from` on the DQN learns.
 """
 
@@ -69,9 +69,9 @@ def leaves_of(name: str, tree: Any) -> dict[str, np.ndarray]:
     return {name + jax.tree_util.keystr(path): data(leaf) for path, leaf in found}
 
 
-def fly_and_learn(config: Config, world: World, devices: int) -> dict[str, np.ndarray]:
+def fly_and_learn(config: Config, world: EnvParams, devices: int) -> dict[str, np.ndarray]:
     """What so many devices come to."""
-    plan, made = Plan.of(config), Trainer(config, world, jax.devices()[:devices])
+    plan, made = Schedule.from_config(config), Trainer(config, world, jax.devices()[:devices])
     assert (plan.warmup, plan.learn_from) == (1, 1 + DECISIONS)
     state = made.init(config.train.seed)
     came_to = leaves_of("flown/0", state.actors)

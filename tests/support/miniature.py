@@ -14,7 +14,7 @@ from edqn_jax.learn.state import Health, Losses
 from edqn_jax.sim.physics.airframe import load_airframe
 from edqn_jax.sim.scene import mjcf
 from edqn_jax.sim.scene.scene import stack_scenes
-from edqn_jax.sim.task.env import World
+from edqn_jax.sim.task.env import EnvParams
 from edqn_jax.sim.task.missions import spread_missions
 
 MINIATURE = (
@@ -37,8 +37,8 @@ def no_losses(steps: int) -> Losses:
     return Losses(metrics=dict.fromkeys(names, zeros), health=health)
 
 
-def miniature_world(config: Config, own_start_fraction: float = 0.25) -> World:
+def miniature_world(config: Config, own_start_fraction: float = 0.25) -> EnvParams:
     """64 missions in that world, so many of them from near its own start."""
     pool = stack_scenes([mjcf.load_scene(WORLD)])
     missions = spread_missions(pool, 64, own_start_fraction, 1.0, jax.random.key(1))
-    return World(airframe=load_airframe(config.drone), pool=pool, missions=missions)
+    return EnvParams(airframe=load_airframe(config.drone), pool=pool, missions=missions)

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from edqn_jax.config import CameraConfig, EventsConfig
-from edqn_jax.sim.sensors.events import EventField, events, reset_memory
+from edqn_jax.sim.sensors.events import EventField, generate_events, reset_memory
 
 BOXES = 5
 
@@ -54,6 +54,6 @@ def fields(camera: CameraConfig, config: EventsConfig, key: Array, number: int, 
 
     def one(key: Array) -> EventField:
         memory = reset_memory(config, camera.height, camera.width, key)
-        return events(config, memory, frames(camera, key, side), config.frame_times_s, key)[0]
+        return generate_events(config, memory, frames(camera, key, side), config.frame_times_s, key)[0]
 
     return jax.vmap(one)(jax.random.split(key, number))

@@ -22,7 +22,7 @@ from edqn_jax.config import Config
 from edqn_jax.learn.actor import observation_size
 from edqn_jax.learn.trainer import Trainer, TrainState
 from edqn_jax.sim.actions import ACTIONS, Discrete
-from edqn_jax.sim.task.env import Broken, Step, World
+from edqn_jax.sim.task.env import EnvParams, NonFinite, Step
 from edqn_jax.sim.task.observation import MOTION_SIZE, OWN_SIZE, Observation
 from edqn_jax.sim.task.outcomes import Outcome
 from edqn_jax.sim.task.task import Task
@@ -121,7 +121,7 @@ def _step(world: Any, life: Life, action: Array, mission: Array | None = None) -
         flight=None,  # type: ignore[arg-type]
         end_step=jnp.int32(1),
         contact=jnp.ones(()),
-        broken=Broken(sound, sound, sound),
+        broken=NonFinite(sound, sound, sound),
     )
     return after, step
 
@@ -143,7 +143,7 @@ def trained(config: Config, probes: Sequence[str] = PROBES) -> TrainState:
 
     No configuration names a task but the drone's, so the modules of `learn` are made to find this one.
     """
-    worlds: Any = [World(airframe=None, pool=None, missions=jnp.int32(PROBES.index(each))) for each in probes]  # type: ignore
+    worlds: Any = [EnvParams(airframe=None, pool=None, missions=jnp.int32(PROBES.index(each))) for each in probes]  # type: ignore
     with pytest.MonkeyPatch.context() as patch:
         for name, module in list(sys.modules.items()):
             if name.startswith("edqn_jax.learn") and hasattr(module, "task_of"):

@@ -11,7 +11,7 @@ import jax
 import numpy as np
 from numpy.typing import NDArray
 
-from edqn_jax.planning.path import Task
+from edqn_jax.planning.path import PlanningTask
 from edqn_jax.sim.scene.distance import signed_distance
 from edqn_jax.sim.scene.scene import Planes, Scene, Shape, UprightBoxes, build_scene
 
@@ -21,11 +21,11 @@ GROUND = Planes(position=np.zeros(3), normal=np.array([0.0, 0.0, 1.0]), albedo=G
 SIZE = (12.0, 12.0, 6.0)
 
 
-def small_world(*shapes: Shape, start=(2.0, 6.0, 3.0), goal=(10.0, 6.0, 3.0)) -> Task:
+def small_world(*shapes: Shape, start=(2.0, 6.0, 3.0), goal=(10.0, 6.0, 3.0)) -> PlanningTask:
     """A task in a small volume over level ground; its capacities never vary, so that it compiles once."""
     volume = [(0.0, 0.0, 0.0), SIZE]
     scene = build_scene([GROUND, *shapes], volume=volume, start=start, goal=goal, capacities={"boxes": 8})
-    return Task.of(scene, body_radius=RADIUS)
+    return PlanningTask.from_scene(scene, body_radius=RADIUS)
 
 
 def box(lower, upper) -> UprightBoxes:
@@ -52,7 +52,7 @@ WITHOUT_A_WAY = {
 }
 
 
-def random_small_world(seed: int, shapes: int = 7) -> Task:
+def random_small_world(seed: int, shapes: int = 7) -> PlanningTask:
     """Turned blocks at random around a free start and goal; there need not be a way."""
     rng = np.random.default_rng(seed)
     ends = np.array([(1.0, 1.0, 1.0), (11.0, 11.0, 5.0)])
@@ -74,7 +74,7 @@ def true_distances(scene: Scene, points: NDArray) -> NDArray:
     return np.asarray(_distances(scene, padded))[: len(points)]
 
 
-def assert_flyable(task: Task, path: NDArray | None, tolerance: float = 0.0) -> None:
+def assert_flyable(task: PlanningTask, path: NDArray | None, tolerance: float = 0.0) -> None:
     """From start to goal, within the volume, and nothing nearer than the radius at any whole centimetre."""
     assert path is not None
     np.testing.assert_allclose(path[[0, -1]], [task.start, task.goal], atol=1e-9)

@@ -9,13 +9,13 @@ import pytest
 
 from edqn_jax.config import AgentConfig, Config, EncoderConfig, TrainConfig
 from edqn_jax.errors import DivergedError
-from edqn_jax.learn.plan import Plan
+from edqn_jax.learn.schedule import Schedule
 from edqn_jax.learn.state import Episodes, Losses
 from edqn_jax.sim.task.outcomes import Outcome
-from edqn_jax.training.history import EndedEpisodes, Watch, chunk_metrics, mean_metrics
+from edqn_jax.training.history import DivergenceMonitor, EndedEpisodes, chunk_metrics, mean_metrics
 from tests.support.miniature import no_losses
 
-PLAN = Plan(total=100, scheduled=100, warmup=4, starts=6, vae_training=((0, 4),))
+PLAN = Schedule(total=100, scheduled=100, warmup=4, starts=6, vae_training=((0, 4),))
 
 
 CONFIG = Config(
@@ -46,7 +46,7 @@ def ill(step: int = 0, **counts: int) -> Losses:
 def test_what_learns_nothing_for_a_hundred_steps_is_given_up_and_what_spoilt_it_is_named(
     first: dict[str, int], then: dict[str, int], says: str
 ) -> None:
-    watch = Watch()
+    watch = DivergenceMonitor()
     watch.check(PLAN, CONFIG, 120, no_losses(40))
     watch.check(PLAN, CONFIG, 160, ill(**first))
     watch.check(PLAN, CONFIG, 200, ill(**(first | then)))
@@ -58,7 +58,7 @@ def test_what_learns_nothing_for_a_hundred_steps_is_given_up_and_what_spoilt_it_
     "mild", [{"loss": 3, "gradient": 3}, {"physics_state": 1}, {"reward": 1}, {"gradient": 4, "step": 1}]
 )
 def test_what_still_learns_goes_on(mild: dict[str, int]) -> None:
-    watch = Watch()
+    watch = DivergenceMonitor()
     for done in range(120, 600, 40):
         watch.check(PLAN, CONFIG, done, ill(**mild))
     for done in range(600, 1200, 80):  # ill chunks, but never in a row
@@ -69,13 +69,13 @@ def test_what_still_learns_goes_on(mild: dict[str, int]) -> None:
 def test_an_idle_warm_up_is_not_ill() -> None:
     plan = dataclasses.replace(PLAN, total=1000, warmup=900, vae_training=())
     for done in range(40, 800, 40):
-        Watch().check(plan, CONFIG, done, no_losses(40))
+        DivergenceMonitor().check(plan, CONFIG, done, no_losses(40))
 
 
 def test_what_diverged_is_counted_and_not_averaged() -> None:
     outcome = np.array([[[Outcome.GOAL, Outcome.DIVERGED]]])
     episodes = Episodes(outcome, np.ones((1, 1, 2), int), np.array([[[8.0, 999.0]]]))  # type: ignore[arg-type]
-    ended = EndedEpisodes.of(episodes, first=0, envs=2)
+    ended = EndedEpisodes.from_chunk(episodes, first=0, envs=2)
     found = chunk_metrics(CONFIG, 0, ended, ill(gradient=2), 1.0, 2)
     assert (found["diverged"], found["mean_return"], found["success_rate"]) == (1, 8.0, 0.5)
     assert found["skipped_updates"] == 80
@@ -86,9 +86,9 @@ def test_ended_episodes_are_those_with_an_outcome_counted_in_decisions_of_all_en
     outcome[0, 1, 2], outcome[1, 0, 1] = Outcome.GOAL, Outcome.TIME_OUT
     numbers = np.arange(12).reshape(2, 2, 3)
     episodes = Episodes(outcome, 10 + numbers, 100.0 + numbers)  # type: ignore[arg-type]
-    ended = EndedEpisodes.of(episodes, first=4, envs=6)
+    ended = EndedEpisodes.from_chunk(episodes, first=4, envs=6)
     assert ended.step.tolist() == [5 * 6, 6 * 6]
-    assert ended.named() == ["goal", "time_out"]
+    assert ended.outcome_names() == ["goal", "time_out"]
     assert ended.length.tolist() == [15, 17] and ended.episode_return.tolist() == [105.0, 107.0]
 
 
@@ -97,8 +97,8 @@ def test_every_phase_of_a_run_has_its_name() -> None:
     encoder = EncoderConfig(warmup_decisions=16 * 16, retrain_at=(0.5,), retrain_decisions=8 * 16)
     train = TrainConfig(num_envs=16, total_steps=64 * 16, chunk_steps=8)
     config = Config(encoder=encoder, agent=AgentConfig(learning_starts=64), train=train)
-    assert Plan.of(config).vae_training == ((0, 16), (32, 40))
-    ended = EndedEpisodes.of(Episodes(*np.zeros((3, 1, 1, 16), int)), first=0, envs=16)  # type: ignore[arg-type]
+    assert Schedule.from_config(config).vae_training == ((0, 16), (32, 40))
+    ended = EndedEpisodes.from_chunk(Episodes(*np.zeros((3, 1, 1, 16), int)), first=0, envs=16)  # type: ignore[arg-type]
     chunks = [chunk_metrics(config, first, ended, no_losses(8), 1.0, 0) for first in range(0, 64, 8)]
     assert [chunk["phase"] for chunk in chunks] == ["warm-up"] * 2 + ["training"] * 2 + ["retraining"] + [
         "training"

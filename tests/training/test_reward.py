@@ -24,7 +24,7 @@ from edqn_jax.sim.task import env
 from edqn_jax.sim.task.outcomes import Outcome
 from edqn_jax.sim.task.reward import Reward, Transition
 from edqn_jax.sim.worlds import geodesic
-from edqn_jax.training.setup import config_for_reward, prepared
+from edqn_jax.training.setup import config_for_reward, set_up_training
 from tests.support.configs import BLIND_RUN
 
 CONFIG = dataclasses.replace(Config(), env=dataclasses.replace(Config().env, sensor="blind"))
@@ -125,10 +125,10 @@ def test_training_with_the_reward_geodesic_counts_metres_around_obstacles() -> N
     world = str(scenes_folder() / "examples" / "corridor.xml")
     task = dataclasses.replace(BLIND_RUN.env, reward="geodesic")
     config = dataclasses.replace(BLIND_RUN, env=task, world=dataclasses.replace(BLIND_RUN.world, name=world))
-    with prepared(config, agents=2) as preparation:
+    with set_up_training(config, agents=2) as preparation:
         distances = preparation.trainer.world.distances
         assert distances is not None and distances.remaining.ndim == 4  # one field for all agents
         scene = preparation.missions[0].scene
-        way = geodesic.remaining(distances, jnp.int32(0), scene.goal, scene.start)
+        way = geodesic.distance_to_goal(distances, jnp.int32(0), scene.goal, scene.start)
         assert float(way) > 1.15 * float(jnp.linalg.norm(scene.goal - scene.start))
         preparation.ready(begins=False)

@@ -8,9 +8,9 @@ import pytest
 
 from edqn_jax.config import Config, TrainConfig, WorldConfig
 from edqn_jax.evaluation.missions import run_missions
-from edqn_jax.learn.plan import Plan
 from edqn_jax.learn.policy import PolicyParams
-from edqn_jax.training.selection import Candidate, choose, first_success, is_due
+from edqn_jax.learn.schedule import Schedule
+from edqn_jax.training.selection import Candidate, choose_candidate, first_success, is_due
 
 
 @pytest.mark.parametrize(
@@ -31,7 +31,7 @@ def test_a_run_ends_with_the_parameters_of_the_best_spl_or_the_last(
     kept = Candidate(params)
     for number, weighted in enumerate(spls, 1):
         # The success rate falls all the while: it must not count.
-        kept = choose(keep, kept, Candidate(params, weighted, 1 / number, decisions=100 * number))
+        kept = choose_candidate(keep, kept, Candidate(params, weighted, 1 / number, decisions=100 * number))
     assert kept.decisions == ends_with
 
 
@@ -59,7 +59,7 @@ def test_a_validation_is_due_where_a_multiple_is_crossed_once_there_was_learning
     every: int, checked: int, done: int, due: bool
 ) -> None:
     config = Config(train=TrainConfig(num_envs=16, validation_every=every))
-    assert is_due(config, Plan(total=200, scheduled=200, warmup=0, starts=5, vae_training=()), checked, done) is due
+    assert is_due(config, Schedule(total=200, scheduled=200, warmup=0, starts=5, vae_training=()), checked, done) is due
 
 
 @pytest.mark.slow

@@ -17,7 +17,7 @@ from edqn_jax.report.progress import Progress
 from edqn_jax.runs.directory import RunDirectory
 from edqn_jax.runs.record import train_run
 from edqn_jax.runs.stopping import Stop
-from edqn_jax.runs.verification.verify import verify
+from edqn_jax.runs.verification.verify import verify_run
 from tests.support.configs import TINY_RUN
 
 WORLD = WorldConfig(name="sparse", flown="", pool_size=2, missions=8, balls=3)
@@ -29,7 +29,7 @@ def test_a_run_among_balls_is_drawn_and_verified(tmp_path: Path) -> None:
     run = RunDirectory(tmp_path / "run")
     train_run(BALLS, run, Progress(), Stop(), drawing=prepare_gallery)
     summary = json.loads(run.summary_file.read_text())
-    assert [finding for finding in verify(run.path) if not finding.right] == []
+    assert [finding for finding in verify_run(run.path) if not finding.right] == []
     assert summary["devices"][1] and (run.figures / "path.png").is_file()
     flown = {name: np.asarray(column) for name, column in run.read_trajectory().items()}
     mission = run_missions(BALLS).final.world

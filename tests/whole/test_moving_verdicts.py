@@ -12,7 +12,7 @@ import pytest
 
 from edqn_jax.config.loading import make_config
 from edqn_jax.evaluation.companions import scene_of_flight
-from edqn_jax.evaluation.judge import Target, clearance, fastest, load_judge, replay_contact
+from edqn_jax.evaluation.judge import FlightTrack, clearance, load_judge, max_obstacle_speed, replay_contact
 from edqn_jax.evaluation.missions import MissionSet, load_missions
 from edqn_jax.evaluation.rollouts import fly_missions
 from edqn_jax.evaluation.verdicts import check_verdicts
@@ -130,13 +130,13 @@ def test_a_world_that_moves_needs_the_time_of_a_step(judge):
     with pytest.raises(ValueError, match="the world moves: .* step_s"):
         replay_contact(judge, [[3, 10, 5], [4, 10, 5]])
     # The fastest is the curved ball: 7 m/s, and gravity for half of its 2.5 s and for 3 s more.
-    assert abs(fastest(judge, 3.0) - (7 + 9.81 * (1.25 + 3.0))) < 1e-9
+    assert abs(max_obstacle_speed(judge, 3.0) - (7 + 9.81 * (1.25 + 3.0))) < 1e-9
 
 
 def test_a_still_world_is_judged_as_before():
     still = load_judge(mujoco.MjSpec.from_string("<mujoco><worldbody><geom size='1'/></worldbody></mujoco>"), RADIUS)
     contact = replay_contact(still, [[-3, 0, 0], [3, 0, 0]])
-    assert contact == replay_contact(still, [[-3, 0, 0], [3, 0, 0]], 0.02, Target((0, 0, 0), (1, 0, 0)))
+    assert contact == replay_contact(still, [[-3, 0, 0], [3, 0, 0]], 0.02, FlightTrack((0, 0, 0), (1, 0, 0)))
     assert contact is not None and abs(contact.fraction - (3 - 1.36) / 6) < 1e-6
     assert still.moving == ()
 

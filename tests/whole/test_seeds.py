@@ -15,11 +15,11 @@ from edqn_jax.errors import ConfigError, DivergedError, StoppedError
 from edqn_jax.learn import trainer
 from edqn_jax.report.gallery import prepare_gallery
 from edqn_jax.report.progress import Progress
-from edqn_jax.runs.directory import RunDirectory, plain
+from edqn_jax.runs.directory import RunDirectory, to_plain_json
 from edqn_jax.runs.policies import load_policy
 from edqn_jax.runs.record import train_run
 from edqn_jax.runs.stopping import Stop
-from edqn_jax.runs.verification.verify import verify
+from edqn_jax.runs.verification.verify import verify_run
 from edqn_jax.training import history
 from edqn_jax.training.loop import train, train_seeds
 from tests.support.configs import BLIND_RUN, FIGURES
@@ -43,7 +43,7 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> tuple[RunDirectory, dict]:
 @pytest.mark.slow
 def test_each_seed_leaves_a_run_and_all_of_them_a_summary(runs: tuple[RunDirectory, dict]) -> None:
     run, summary = runs
-    assert read(run) == plain(summary)
+    assert read(run) == to_plain_json(summary)
     assert summary["seeds"] == [0, 1] and len(summary["success_rates"]) == 2
     assert summary["flown_successes"] == sum(load["success"] for load in map(read, (run.of_seed(0), run.of_seed(1))))
     # All but the world that is flown at the end are test worlds.
@@ -64,7 +64,7 @@ def test_each_seed_leaves_a_run_and_all_of_them_a_summary(runs: tuple[RunDirecto
 
 @pytest.mark.slow
 def test_the_runs_of_all_seeds_are_verified(runs: tuple[RunDirectory, dict]) -> None:
-    findings = verify(runs[0].path)
+    findings = verify_run(runs[0].path)
     assert [finding for finding in findings if not finding.right] == []
     assert {"seed-1: the test worlds, flown again", "summary.json of all seeds"} < {each.what for each in findings}
 
@@ -108,7 +108,7 @@ def test_a_seed_that_diverges_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
         health = dataclasses.replace(losses.health, gradient=losses.health.gradient.at[1].set(999))
         return state, (episodes, dataclasses.replace(losses, health=health))
 
-    monkeypatch.setattr(history, "MOST_ILL_STEPS", 1)
+    monkeypatch.setattr(history, "MAX_DIVERGED_STEPS", 1)
     monkeypatch.setattr(trainer.Trainer, "chunk", poisoned)
     with pytest.raises(DivergedError, match="seed 1 diverged"):
         train_seeds(2, BLIND_RUN)

@@ -24,11 +24,11 @@ from edqn_jax.evaluation.trajectories import TRAJECTORY_COLUMNS
 from edqn_jax.report.gallery import prepare_gallery
 from edqn_jax.report.progress import Progress
 from edqn_jax.runs.checkpoints.params import POLICY, save_params
-from edqn_jax.runs.directory import RunDirectory, plain
+from edqn_jax.runs.directory import RunDirectory, to_plain_json
 from edqn_jax.runs.policies import load_run
 from edqn_jax.runs.record import train_run
 from edqn_jax.runs.stopping import Stop
-from edqn_jax.runs.verification.verify import verify
+from edqn_jax.runs.verification.verify import verify_run
 from tests.support.configs import FIGURES, TINY_RUN
 from tests.support.processes import ROOT
 
@@ -38,13 +38,13 @@ from pathlib import Path
 from tests import conftest
 from edqn_jax.report.gallery import prepare_gallery
 from edqn_jax.report.progress import Progress
-from edqn_jax.runs import keeper
+from edqn_jax.runs import checkpointer
 from edqn_jax.runs.directory import RunDirectory
 from edqn_jax.runs.record import train_run
 from edqn_jax.runs.stopping import Stop
 from tests.support.configs import TINY_RUN
 import dataclasses
-keeper.MOST_OVERHEAD = 1e9
+checkpointer.MAX_OVERHEAD = 1e9
 often = dataclasses.replace(TINY_RUN, train=dataclasses.replace(TINY_RUN.train, checkpoint_every_s=1e-3))
 train_run(often, RunDirectory(Path(sys.argv[1])), Progress(), Stop(lambda: time.sleep(0.2)), drawing=prepare_gallery)
 """
@@ -60,7 +60,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> tuple[RunDirectory, dict]
 @pytest.mark.slow
 def test_a_run_leaves_what_the_readme_promises(whole: tuple[RunDirectory, dict]) -> None:
     run, summary = whole
-    assert json.loads(run.summary_file.read_text()) == plain(summary)
+    assert json.loads(run.summary_file.read_text()) == to_plain_json(summary)
     assert summary["reward"] == {"name": TINY_RUN.env.reward, "source_sha256": None}
     figures = {file.stem for file in run.figures.glob("*.png")}
     assert figures == FIGURES | {"events", "reconstruction"}
@@ -96,7 +96,7 @@ def test_a_run_is_evaluated_and_says_what_was_flown(whole: tuple[RunDirectory, d
 def test_a_run_is_verified_and_what_was_changed_in_it_is_found(
     whole: tuple[RunDirectory, dict], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    findings = verify(whole[0].path)
+    findings = verify_run(whole[0].path)
     assert [finding for finding in findings if not finding.right] == []
     changed = RunDirectory(tmp_path / "changed")
     shutil.copytree(whole[0].path, changed.path)
@@ -105,7 +105,7 @@ def test_a_run_is_verified_and_what_was_changed_in_it_is_found(
     monkeypatch.setattr("edqn_jax.runs.verification.verify.fly_on_all_devices", lambda *_, **__: flown)
 
     def wrong() -> set[str]:
-        return {finding.what for finding in verify(changed.path) if finding.right is False}
+        return {finding.what for finding in verify_run(changed.path) if finding.right is False}
 
     assert wrong() == set()
     rewrite(changed.summary_file, '"path_length_m": ', '"path_length_m": 1')
@@ -134,11 +134,11 @@ def test_a_run_is_verified_and_what_was_changed_in_it_is_found(
     for damaged in ({**summary, "devices": 3}, {"figures": "drawn"}):
         changed.write_summary(damaged)
         with pytest.raises(ConfigError, match="a file of the run in .* is not as a run writes it"):
-            verify(changed.path)
+            verify_run(changed.path)
     changed.write_summary(summary)
     rewrite(changed.summary_file, '"figures": "drawn"', '"figures": "to be drawn"')
     with pytest.raises(ConfigError, match="is not finished; continue it with edqn train"):
-        verify(changed.path)
+        verify_run(changed.path)
 
 
 def rewrite(file: Path, old: str, new: str) -> None:

@@ -26,7 +26,7 @@ from jax.typing import ArrayLike
 from edqn_jax.config import CameraConfig
 from edqn_jax.errors import ConfigError
 from edqn_jax.sim.camera import raycast
-from edqn_jax.sim.scene.shapes.kind import TINY, inverse
+from edqn_jax.sim.scene.shapes.kind import TINY, safe_inverse
 
 MOST_CELLS = 40_000_000
 """Cells of the largest grid, as of the planners' largest lattice."""
@@ -164,7 +164,7 @@ def _seen(
         along = direction[:, axis]
         # The planes that bound the cells along this axis, in the order in which the ray crosses them.
         plane = jnp.where(along[:, None] > 0, here[axis] + 1 + planes, here[axis] - planes)
-        at = jnp.where(jnp.abs(along[:, None]) > TINY, (plane - start[axis]) * inverse(along)[:, None], jnp.inf)
+        at = jnp.where(jnp.abs(along[:, None]) > TINY, (plane - start[axis]) * safe_inverse(along)[:, None], jnp.inf)
         reached = jnp.where(jnp.isfinite(at), at, 0.0)[..., None] * direction[:, None] + start
         cell = jnp.floor(reached).at[..., axis].set(jnp.where(along[:, None] > 0, plane, plane - 1))
         cells.append(cell)

@@ -18,8 +18,8 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, Patch
 from PIL import Image
 
-from edqn_jax.report.animation import gif
-from edqn_jax.report.style import LINE, MUTED, SECOND_LINE, STYLE, drawing
+from edqn_jax.report.animation import encode_gif
+from edqn_jax.report.style import LINE, MUTED, SECOND_LINE, STYLE, open_figure
 from edqn_jax.sim.scene.distance import signed_distance
 from edqn_jax.sim.scene.scene import Scene, scene_at
 from edqn_jax.sim.sensors.sensor import nearness
@@ -74,7 +74,7 @@ def draw_growth(scene: Scene, cell_m: float, moments: Sequence[Moment], file: Pa
     lower, upper = np.asarray(scene.volume)
     tall = (upper[1] - lower[1]) / (upper[0] - lower[0])
     wide = 2.5
-    with drawing(wide * len(moments) + 0.2, wide * tall + wide * 0.75 + 0.8, file) as figure:
+    with open_figure(wide * len(moments) + 0.2, wide * tall + wide * 0.75 + 0.8, file) as figure:
         rows = figure.subplots(2, len(moments), squeeze=False, gridspec_kw={"height_ratios": [tall, 0.75]})
         for above, below, moment in zip(*rows, moments, strict=True):
             _draw_known(above, scene, cell_m, moment)
@@ -102,7 +102,7 @@ def animate_growth(scene: Scene, cell_m: float, moments: Sequence[Moment], title
             figure.legend(handles=_legend(), loc="outside lower center", ncols=7, frameon=False, fontsize=7)
             canvas.draw()
             frames.append(Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3]))
-    return gif(frames, [FRAME_S] * (len(frames) - 1) + [LAST_FRAME_S])
+    return encode_gif(frames, [FRAME_S] * (len(frames) - 1) + [LAST_FRAME_S])
 
 
 def _draw_known(axes: Axes, scene: Scene, cell_m: float, moment: Moment) -> None:

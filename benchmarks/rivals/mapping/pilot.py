@@ -33,18 +33,18 @@ from edqn_jax.learn.perception import embedding, vae
 from edqn_jax.sim.camera import camera
 from edqn_jax.sim.physics import disturbances, drone
 from edqn_jax.sim.physics.drone import DroneState, Flight
-from edqn_jax.sim.physics.flight import fly as fly_decision
+from edqn_jax.sim.physics.flight import fly_decision as fly_decision
 from edqn_jax.sim.scene import launches
 from edqn_jax.sim.scene.motion import Aim
-from edqn_jax.sim.scene.scene import Scene, moves, scene_at
+from edqn_jax.sim.scene.scene import Scene, has_motion, scene_at
 from edqn_jax.sim.sensors import sensor
 from edqn_jax.sim.sensors.sensor import DEPTH_SCALE, SensorMemory, distance_of, mount_rotation
 from edqn_jax.sim.task import env
 from edqn_jax.sim.task.action_sets import heading_setpoint
-from edqn_jax.sim.task.env import World
-from edqn_jax.sim.task.flights import Flights, at_start, tally
-from edqn_jax.sim.task.observation import View, heading_velocity, observe, poses_at_start, poses_seen, timed
-from edqn_jax.sim.task.outcomes import Outcome, judge
+from edqn_jax.sim.task.env import EnvParams
+from edqn_jax.sim.task.flights import Flights, at_start, update_tallies
+from edqn_jax.sim.task.observation import View, heading_velocity, observe, poses_at_start, poses_seen, with_times
+from edqn_jax.sim.task.outcomes import Outcome, judge_decision
 from rivals.mapping.grid import Grid, MapConfig, empty_grid, grid_shape, update
 from rivals.mapping.route import RouteConfig, Router
 from rivals.planners.follow import FollowConfig, sampled, steer
@@ -195,7 +195,7 @@ def look(
     sensed, memory = flying.sensed, flying.memory
     if pilot.depth == "true":
         now = scene_at(scene, None if poses.time is None else poses.time[-1])
-        depth = camera.depth(config.camera, now, body.position, rotation)
+        depth = camera.render_depth(config.camera, now, body.position, rotation)
     else:
         observation, sensed = observe(config, View(scene, goal, body, move, poses), sensed, noise)
         memory = AgentActor(config).encode(params, memory, observation)
@@ -208,7 +208,7 @@ def look(
 def decide(
     config: Config,
     pilot: PilotConfig,
-    world: World,
+    world: EnvParams,
     params: PolicyParams,
     mission: Array,
     flying: Piloted,
@@ -233,14 +233,14 @@ def decide(
     turning = dataclasses.replace(config.env, heading="flight" if pilot.looks_ahead else "goal")
     heading = heading_setpoint(turning, before, goal, command)
     after, flight = fly_decision(config.drone, world.airframe, before, command, heading)
-    outcome, end, contact = judge(config, scene, goal, before.position, flight, flying.flights.decisions + 1)
-    flights, _ = tally(config, scene, flying.flights, before.position, flight, outcome, end, contact)
+    outcome, end, contact = judge_decision(config, scene, goal, before.position, flight, flying.flights.decisions + 1)
+    flights, _ = update_tallies(config, scene, flying.flights, before.position, flight, outcome, end, contact)
     move = heading_velocity(config.env, drone.yaw_of(before.quaternion), command)
     steps = flying.flights.decisions * config.drone.physics_steps + jnp.arange(1, config.drone.physics_steps + 1)
-    poses = poses_seen(config, before, timed(config, flight, steps if moves(scene) else None))
+    poses = poses_seen(config, before, with_times(config, flight, steps if has_motion(scene) else None))
     running = flying.flights.outcome == Outcome.RUNNING
     keep = functools.partial(jax.tree.map, lambda new, old: jnp.where(running, new, old))
-    thrown = launches.thrown(
+    thrown = launches.update_aim(
         config, scene, flying.aim, flights.decisions, after.position, after.position - before.position
     )
     # Before looking, so that the map, by far the largest part, need not be chosen as a whole.
@@ -253,13 +253,13 @@ def decide(
 
 
 def at_rest(
-    config: Config, pilot: PilotConfig, shape: tuple[int, int, int], world: World, mission: Array, key: Array
+    config: Config, pilot: PilotConfig, shape: tuple[int, int, int], world: EnvParams, mission: Array, key: Array
 ) -> Piloted:
     """Returns a drone at a mission's start [] int32, facing the goal, with an empty map of `shape` cells."""
     scene = env.scene_of(world, mission)
     start, goal = world.missions.start[mission], world.missions.goal[mission]
     key, rest = jax.random.split(key)
-    body = drone.hover(start, jnp.arctan2(goal[1] - start[1], goal[0] - start[0]))
+    body = drone.hover_state(start, jnp.arctan2(goal[1] - start[1], goal[0] - start[0]))
     return Piloted(
         drone=body,
         memory=AgentActor(config).init(),
@@ -268,7 +268,7 @@ def at_rest(
         depth=jnp.full((config.camera.height, config.camera.width), jnp.inf),
         flights=at_start(config, scene, body),
         key=key,
-        aim=launches.thrown(config, scene, launches.nobody_aimed_at(world.pool), jnp.int32(0), start, jnp.zeros(3)),
+        aim=launches.update_aim(config, scene, launches.initial_aim(world.pool), jnp.int32(0), start, jnp.zeros(3)),
     )
 
 
@@ -276,7 +276,7 @@ def _begin(
     config: Config,
     pilot: PilotConfig,
     shape: tuple[int, int, int],
-    world: World,
+    world: EnvParams,
     params: PolicyParams,
     mission: Array,
     key: Array,
@@ -328,7 +328,7 @@ def order(
 def fly(
     config: Config,
     pilot: PilotConfig,
-    world: World,
+    world: EnvParams,
     params: PolicyParams,
     key: Array,
     *,

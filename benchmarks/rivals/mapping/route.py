@@ -22,10 +22,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from edqn_jax.extras import require
-from edqn_jax.planning.astar import shorten
+from edqn_jax.extras import require_extra
+from edqn_jax.planning.astar import shorten_path
 
-numba = require("numba")
+numba = require_extra("numba")
 
 OCCUPIED_WEIGHT = 1000.0
 """Weight of an occupied cell: rather a detour of 1 km than a metre through it."""
@@ -130,7 +130,7 @@ class Router:
             points = np.concatenate([points, goal[None]])
         known = self._map(log_odds, goal)
         # Only through cells of weight 1, where the straight line is the cheapest way.
-        tight = shorten(points, lambda a, b: _heaviest(known, (a - lower) / cell, (b - lower) / cell) > 1.0)
+        tight = shorten_path(points, lambda a, b: _heaviest(known, (a - lower) / cell, (b - lower) / cell) > 1.0)
         return Route(tight, expanded)
 
     def seen_m(self, log_odds: np.ndarray, points: np.ndarray) -> float:

@@ -15,14 +15,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from edqn_jax.extras import require
-from edqn_jax.planning.astar import shorten
+from edqn_jax.extras import require_extra
+from edqn_jax.planning.astar import shorten_path
 from edqn_jax.planning.lattice import edge_margin
-from edqn_jax.planning.path import PlannedPath, Task, found, not_found
+from edqn_jax.planning.path import PlannedPath, PlanningTask, not_found, path_as_plan
 from rivals.planners.planner import Budget, refusal
 from rivals.planners.solids import distance, leg_free, solid_table
 
-numba = require("numba")
+numba = require_extra("numba")
 
 CELL_M, COARSE_CELL_M = 0.5, 1.0
 """Cell size of the lattice in metres; the coarse one is that of the SNN."""
@@ -256,7 +256,7 @@ def search(table, start, goal, lower, upper, cell, radius, margin, limit):
 
 
 def plan(
-    task: Task,
+    task: PlanningTask,
     budget: Budget = Budget(),  # noqa: B008 (it is frozen)
     seed: int = 0,
     cell: float = CELL_M,
@@ -277,10 +277,10 @@ def plan(
     if how == _FOUND:
         if np.any(points[-1] != goal):
             points = np.concatenate([points, goal[None]])
-        points = shorten(points, lambda a, b: not leg_free(table, a, b, task.body_radius))
+        points = shorten_path(points, lambda a, b: not leg_free(table, a, b, task.body_radius))
     seconds = time.perf_counter() - began
     if how == _FOUND:
-        return found(points, seconds, expanded)
+        return path_as_plan(points, seconds, expanded)
     why = {
         _BLOCKED: "every path is blocked",
         _ENCLOSED: f"the goal is enclosed within {cell:g} m",
@@ -289,7 +289,7 @@ def plan(
     return not_found(why[how], seconds, expanded)
 
 
-def plan_coarse(task: Task, budget: Budget = Budget(), seed: int = 0) -> PlannedPath:  # noqa: B008
+def plan_coarse(task: PlanningTask, budget: Budget = Budget(), seed: int = 0) -> PlannedPath:  # noqa: B008
     """Returns the shortest path on a lattice of `COARSE_CELL_M`, which has an eighth of the cells, shortened."""
     return plan(task, budget, seed, COARSE_CELL_M)
 

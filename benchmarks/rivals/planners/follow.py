@@ -21,15 +21,15 @@ from jax import Array
 from edqn_jax.config import Config, EnvConfig
 from edqn_jax.devices.devices import compiler_options
 from edqn_jax.errors import ConfigError
-from edqn_jax.planning.path import Task
+from edqn_jax.planning.path import PlanningTask
 from edqn_jax.sim.physics import drone
 from edqn_jax.sim.physics.airframe import Airframe
 from edqn_jax.sim.physics.drone import DroneState
-from edqn_jax.sim.physics.flight import fly
+from edqn_jax.sim.physics.flight import fly_decision
 from edqn_jax.sim.scene.scene import Scene
-from edqn_jax.sim.task.action_sets import bearing
-from edqn_jax.sim.task.flights import Flights, at_start, tally
-from edqn_jax.sim.task.outcomes import Outcome, judge
+from edqn_jax.sim.task.action_sets import heading_to_goal
+from edqn_jax.sim.task.flights import Flights, at_start, update_tallies
+from edqn_jax.sim.task.outcomes import Outcome, judge_decision
 
 SPACING_M = 0.1
 """Metres between the points of a sampled path."""
@@ -54,7 +54,7 @@ class FollowConfig:
     """Time after the delay in which the commanded velocity would reach the point ahead, seconds."""
 
 
-def reserved(task: Task, config: FollowConfig = FollowConfig()) -> Task:  # noqa: B008 (it is frozen)
+def reserved(task: PlanningTask, config: FollowConfig = FollowConfig()) -> PlanningTask:  # noqa: B008 (it is frozen)
     """Returns the task with a larger body and a smaller volume, by the reserve; start and goal stay in the volume."""
     lower, upper = np.asarray(task.scene.volume, np.float64)
     lower = np.minimum(lower + config.reserve_m, np.minimum(task.start, task.goal))
@@ -127,14 +127,14 @@ def fly_path(
     if scene.spheres.throw is not None:
         raise ConfigError("planned paths are flown where no balls are thrown; world.balls must be 0")
     away = goal - points[0]
-    body = drone.hover(points[0], jnp.arctan2(away[1], away[0]))
+    body = drone.hover_state(points[0], jnp.arctan2(away[1], away[0]))
 
     def decide(flying: tuple[DroneState, Array, Flights]) -> tuple[DroneState, Array, Flights]:
         state, nearest, flights = flying
         command, nearest = steer(config.env, follow, points, nearest, state)
-        after, flight = fly(config.drone, airframe, state, command, bearing(config.env, state, goal))
-        verdict = judge(config, scene, goal, state.position, flight, flights.decisions + 1)
-        flights, _ = tally(config, scene, flights, state.position, flight, *verdict)
+        after, flight = fly_decision(config.drone, airframe, state, command, heading_to_goal(config.env, state, goal))
+        verdict = judge_decision(config, scene, goal, state.position, flight, flights.decisions + 1)
+        flights, _ = update_tallies(config, scene, flights, state.position, flight, *verdict)
         return after, nearest, flights
 
     flying = body, jnp.zeros((), jnp.int32), at_start(config, scene, body)

@@ -12,7 +12,7 @@ from typing import Protocol
 import jax
 import numpy as np
 
-from edqn_jax.planning.path import MARGIN, PlannedPath, Task, point_text
+from edqn_jax.planning.path import MARGIN, PlannedPath, PlanningTask, point_text
 from edqn_jax.sim.scene.distance import signed_distance
 
 
@@ -28,7 +28,7 @@ class Budget:
 class Planner(Protocol):
     """Returns a plan for a task. Only planners that sample use the seed."""
 
-    def __call__(self, task: Task, budget: Budget = ..., seed: int = ...) -> PlannedPath: ...
+    def __call__(self, task: PlanningTask, budget: Budget = ..., seed: int = ...) -> PlannedPath: ...
 
 
 PLANNERS = {
@@ -50,7 +50,7 @@ SAMPLING = (*IMPROVING, "RRT* first path", "BIT* first path")
 """Planners that sample at random, so that the path depends on the seed."""
 
 
-def refusal(task: Task) -> str | None:
+def refusal(task: PlanningTask) -> str | None:
     """Returns why there cannot be a path if start or goal is outside the volume or not free, else None."""
     lower, upper = np.asarray(task.scene.volume, np.float64)
     for role, point in (("start", task.start), ("goal", task.goal)):

@@ -20,12 +20,12 @@ import time
 
 import numpy as np
 
-from edqn_jax.extras import require
-from edqn_jax.planning.path import MARGIN, PlannedPath, Task, found, not_found, point_text
+from edqn_jax.extras import require_extra
+from edqn_jax.planning.path import MARGIN, PlannedPath, PlanningTask, not_found, path_as_plan, point_text
 from rivals.planners.planner import Budget, refusal
 from rivals.planners.solids import leg_free, shape_distance, solid_table
 
-numba = require("numba")
+numba = require_extra("numba")
 
 STEPS = 20_000
 """Maximum number of steps unless the budget sets another."""
@@ -120,7 +120,7 @@ def descend(table, start, goal, volume, radius, goal_radius, gains, step, patien
 
 
 def plan(
-    task: Task,
+    task: PlanningTask,
     budget: Budget = Budget(),  # noqa: B008 (it is frozen)
     seed: int = 0,
     config: ApfConfig = ApfConfig(),  # noqa: B008
@@ -149,7 +149,7 @@ def plan(
     )
     seconds, taken = time.perf_counter() - began, count - 1
     if how == _ARRIVED:
-        return found(np.concatenate([points[:count], task.goal[None]]), seconds, taken)
+        return path_as_plan(np.concatenate([points[:count], task.goal[None]]), seconds, taken)
     last = point_text(np.round(points[count - 1], 1))
     why = {
         _MINIMUM: f"a local minimum of the potential at {last}",

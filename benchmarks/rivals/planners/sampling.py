@@ -18,14 +18,14 @@ from typing import Any
 
 import numpy as np
 
-from edqn_jax.extras import require
-from edqn_jax.planning.path import MARGIN, PlannedPath, Task, not_found, path_length
+from edqn_jax.extras import require_extra
+from edqn_jax.planning.path import MARGIN, PlannedPath, PlanningTask, not_found, path_length
 from rivals.planners.planner import Budget, refusal
 from rivals.planners.solids import leg_free, solid_table
 
-base = require("ompl.base")
-geometric = require("ompl.geometric")
-util = require("ompl.util")
+base = require_extra("ompl.base")
+geometric = require_extra("ompl.geometric")
+util = require_extra("ompl.util")
 
 
 class _Legs(base.MotionValidator):
@@ -39,27 +39,27 @@ class _Legs(base.MotionValidator):
         return leg_free(self.table, tuple(start[0:3]), tuple(end[0:3]), self.radius)
 
 
-def rrt_star(task: Task, budget: Budget = Budget(), seed: int = 0) -> PlannedPath:  # noqa: B008 (it is frozen)
+def rrt_star(task: PlanningTask, budget: Budget = Budget(), seed: int = 0) -> PlannedPath:  # noqa: B008 (it is frozen)
     """Returns the shortest path that RRT* finds within the budget."""
     return _plan(geometric.RRTstar, task, budget, seed)
 
 
-def rrt_star_first(task: Task, budget: Budget = Budget(), seed: int = 0) -> PlannedPath:  # noqa: B008
+def rrt_star_first(task: PlanningTask, budget: Budget = Budget(), seed: int = 0) -> PlannedPath:  # noqa: B008
     """Returns the first path that RRT* finds within the budget."""
     return _plan(geometric.RRTstar, task, budget, seed, ends_with_first=True)
 
 
-def bit_star(task: Task, budget: Budget = Budget(), seed: int = 0) -> PlannedPath:  # noqa: B008
+def bit_star(task: PlanningTask, budget: Budget = Budget(), seed: int = 0) -> PlannedPath:  # noqa: B008
     """Returns the shortest path that BIT* finds within the budget."""
     return _plan(geometric.BITstar, task, budget, seed)
 
 
-def bit_star_first(task: Task, budget: Budget = Budget(), seed: int = 0) -> PlannedPath:  # noqa: B008
+def bit_star_first(task: PlanningTask, budget: Budget = Budget(), seed: int = 0) -> PlannedPath:  # noqa: B008
     """Returns the first path that BIT* finds within the budget."""
     return _plan(geometric.BITstar, task, budget, seed, ends_with_first=True)
 
 
-def _plan(algorithm: Any, task: Task, budget: Budget, seed: int, ends_with_first: bool = False) -> PlannedPath:
+def _plan(algorithm: Any, task: PlanningTask, budget: Budget, seed: int, ends_with_first: bool = False) -> PlannedPath:
     refused = refusal(task)
     if refused:
         return not_found(refused)

@@ -34,7 +34,7 @@ from flax import struct
 from jax import Array, lax
 from jax.typing import ArrayLike
 
-from edqn_jax.planning.path import MARGIN, PlannedPath, Task, found, not_found
+from edqn_jax.planning.path import MARGIN, PlannedPath, PlanningTask, not_found, path_as_plan
 from edqn_jax.sim.scene.distance import segment_contact, shape_distances, signed_distance
 from edqn_jax.sim.scene.scene import Scene
 from rivals.planners.planner import Budget, refusal
@@ -361,7 +361,7 @@ def _compiled(config: SnnConfig, shape: tuple[int, int, int], cell: float, struc
 
 
 def plan(
-    task: Task,
+    task: PlanningTask,
     budget: Budget = Budget(),  # noqa: B008 (it is frozen)
     seed: int = 0,
     config: SnnConfig = SnnConfig(),  # noqa: B008
@@ -394,4 +394,4 @@ def plan(
         return not_found(why, seconds, taken)
     if not walk.arrived:
         return not_found("the synaptic vector field does not lead to the goal", seconds, taken)
-    return found(path, seconds, taken)
+    return path_as_plan(path, seconds, taken)

@@ -12,7 +12,7 @@ import math
 import numpy as np
 
 from edqn_jax.errors import ConfigError
-from edqn_jax.extras import require
+from edqn_jax.extras import require_extra
 from edqn_jax.sim.scene.scene import (
     PARKED,
     Capsules,
@@ -27,7 +27,7 @@ from edqn_jax.sim.scene.scene import (
     scene_shapes,
 )
 
-numba = require("numba")
+numba = require_extra("numba")
 
 _BOX, _CYLINDER, _CAPSULE, _PLANE = range(4)
 _STRIDE = 0.02  # metres; undetected penetration of at most 0.01^2 / 2 r = 0.14 mm

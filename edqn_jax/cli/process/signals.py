@@ -30,7 +30,7 @@ _WAITS_S = 2.0
 
 
 class Stops:
-    """What signals have asked for."""
+    """Stop requests by signals."""
 
     def __init__(self) -> None:
         """Ends the process at the first signal."""
@@ -40,13 +40,13 @@ class Stops:
         self._tell: Callable[[str], None] | None = None
         self._lock = threading.Lock()
 
-    def requested(self) -> bool:
+    def is_requested(self) -> bool:
         """Returns whether work has been asked to stop."""
         return self.number is not None
 
     @contextlib.contextmanager
-    def obeyed(self, tell: Callable[[str], None]) -> Iterator[None]:
-        """Within the block, the first signal is a request that `requested` returns; `tell` says so to people."""
+    def obey_signals(self, tell: Callable[[str], None]) -> Iterator[None]:
+        """Within the block, the first signal is a request that `is_requested` returns; `tell` says so to people."""
         with self._lock:
             self._tell = tell
         try:
@@ -55,7 +55,7 @@ class Stops:
             with self._lock:
                 self._tell = None
 
-    def hear(self, number: int) -> None:
+    def on_signal(self, number: int) -> None:
         """Notes a signal, or ends the process."""
         with self._lock:
             tell = self._tell
@@ -70,7 +70,7 @@ class Stops:
 
 
 @contextlib.contextmanager
-def heard() -> Iterator[Stops]:
+def listen_to_signals() -> Iterator[Stops]:
     """Listens to signals within the block; where Python allows no handlers, only to those that it hears itself."""
     stops = Stops()
     try:
@@ -87,7 +87,7 @@ def heard() -> Iterator[Stops]:
             while numbers := listening.recv(16):
                 for number in numbers:
                     if number in HEARD:
-                        stops.hear(number)
+                        stops.on_signal(number)
 
     threading.Thread(target=listen, name="signals", daemon=True).start()
     try:

@@ -15,7 +15,7 @@ import time
 from collections.abc import Iterator, Sequence
 
 NOBODY_READS = (errno.EPIPE, errno.EIO)
-"""Why nothing can be written where a reader has enough or a terminal is gone: nobody misses it."""
+"""Errors of writing to a closed pipe or terminal, which are ignored."""
 
 CANNOT_WRITE = 2
 """Exit code of a command that is done, but whose output could not be written."""
@@ -81,7 +81,7 @@ def lasting_streams() -> Iterator[list[Lasting]]:
         sys.stdout, sys.stderr = before
 
 
-def lost(outputs: Sequence[Lasting], code: int) -> int:
+def exit_code(outputs: Sequence[Lasting], code: int) -> int:
     """Returns the exit code of a command that ended with `code`, and says so where its output could not be written.
 
     A reader that has enough, as `head` may, or a terminal that is gone leaves the code as it is.

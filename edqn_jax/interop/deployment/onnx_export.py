@@ -17,7 +17,7 @@ from jax import Array
 
 from edqn_jax.config import ENCODERS, Config
 from edqn_jax.errors import CheckError, ConfigError
-from edqn_jax.extras import require
+from edqn_jax.extras import require_extra
 from edqn_jax.files import check_can_write, write_atomically
 from edqn_jax.interop.deployment import runner
 from edqn_jax.learn.actor import AgentActor, Memory, PolicyParams, observation_size
@@ -27,7 +27,7 @@ from edqn_jax.policies.functions import check_has_params
 from edqn_jax.sim.actions import ACTIONS, move_name
 from edqn_jax.sim.sensors import events
 from edqn_jax.sim.sensors.events import EventField
-from edqn_jax.sim.task.observation import MOST_YAW_RATE, MOTION_SIZE, OWN_SIZE, Observation
+from edqn_jax.sim.task.observation import MAX_YAW_RATE, MOTION_SIZE, OWN_SIZE, Observation
 from edqn_jax.version import package_version
 
 RUNNER = "edqn_runner.py"
@@ -59,7 +59,7 @@ class Exported:
     """Inputs whose best moves are equally good within the tolerance, so that either may be chosen."""
 
 
-def export_policy(flown: Policy, file: str | Path, *, checks: int = CHECKS, digest: str | None = None) -> Exported:
+def export_policy(policy: Policy, file: str | Path, *, checks: int = CHECKS, digest: str | None = None) -> Exported:
     """Writes a policy as ONNX with all that the runner must know, and a copy of the runner beside it.
 
     Before anything is written, ONNX and JAX are given the same random inputs.
@@ -75,21 +75,21 @@ def export_policy(flown: Policy, file: str | Path, *, checks: int = CHECKS, dige
         ConfigError: if the policy is a function, does not see events, or sees more of them than their counts, or the
             file cannot be written.
     """
-    check_has_params(flown, "an ONNX file")
+    check_has_params(policy, "an ONNX file")
     file = Path(file)
     if file.suffix.lower() != ".onnx":
         raise ConfigError(f"'{file}' must end in .onnx")
     beside = file.with_name(RUNNER)
     for each in (file, beside):
         check_can_write(each)
-    jax2onnx = require("jax2onnx", extra="export")
-    require("onnxruntime", extra="export")
-    about = about_policy(flown.config)
-    decide = decision(flown.config, flown.params)
+    jax2onnx = require_extra("jax2onnx", extra="export")
+    require_extra("onnxruntime", extra="export")
+    about = about_policy(policy.config)
+    decide = decision_function(policy.config, policy.params)
     with _without_warnings():
         model = jax2onnx.to_onnx(
             decide,
-            inputs=_shapes(flown.config),
+            inputs=_shapes(policy.config),
             model_name="edqn_jax_policy",
             opset=OPSET,
             input_names=INPUTS,
@@ -97,7 +97,7 @@ def export_policy(flown: Policy, file: str | Path, *, checks: int = CHECKS, dige
         )
     model.ir_version = IR_VERSION
     model.producer_name, model.producer_version = "edqn_jax", package_version()
-    difference, ties = _compared(flown, model.SerializeToString(), checks)
+    difference, ties = _compare(policy, model.SerializeToString(), checks)
     about["checked"] = {"inputs": checks, "largest_difference": difference, "ties": ties}
     about["policy_sha256"] = digest
     entry = model.metadata_props.add()
@@ -168,13 +168,13 @@ def about_policy(config: Config) -> dict[str, Any]:
         "heading_hold_m": config.env.heading_hold_m,
         "max_yaw_rate_rad_s": config.drone.max_yaw_rate_rad_s,
         "knows_position": config.env.position,
-        "most_yaw_rate": MOST_YAW_RATE,
+        "most_yaw_rate": MAX_YAW_RATE,
         "actions": ACTIONS.tolist(),
         "action_names": [move_name(move) for move in range(len(ACTIONS))],
     }
 
 
-def decision(config: Config, params: PolicyParams) -> Callable[..., tuple[Array, Array]]:
+def decision_function(config: Config, params: PolicyParams) -> Callable[..., tuple[Array, Array]]:
     """Returns the function that is exported: counts, own state, own motion and memory to values and memory.
 
     All with a leading [1]: counts [1, F, 2, H, W] int32 of ON and OFF events, own [1, OWN_SIZE], motion
@@ -253,31 +253,31 @@ def _random_inputs(config: Config, rng: np.random.Generator) -> list[np.ndarray]
     return [number.astype(np.int32), *(each.astype(np.float32) for each in numbers)]
 
 
-def _exactly(flown: Policy, inputs: list[list[np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:
+def _values_in_float64(policy: Policy, inputs: list[list[np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:
     """Returns values [N, 27] and memories of N inputs by JAX in double precision, so that only ONNX rounds."""
 
     def double(x: Array | np.ndarray) -> np.ndarray:
         return np.asarray(x, np.float64 if np.issubdtype(x.dtype, np.floating) else None)
 
     with jax.enable_x64(True):
-        decide = decision(flown.config, jax.tree.map(double, flown.params))
+        decide = decision_function(policy.config, jax.tree.map(double, policy.params))
         values, memory = jax.jit(decide)(*(double(np.concatenate(each)) for each in zip(*inputs, strict=True)))
         return np.asarray(values), np.asarray(memory)
 
 
-def _compared(flown: Policy, model: bytes, checks: int) -> tuple[float, int]:
+def _compare(policy: Policy, model: bytes, checks: int) -> tuple[float, int]:
     """Returns the largest difference of any value, as a share of its input's largest, and how many best moves are ties.
 
     Raises:
         CheckError: if a value or a move differs.
     """
-    onnxruntime = require("onnxruntime", extra="export")
+    onnxruntime = require_extra("onnxruntime", extra="export")
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = 1
     session = onnxruntime.InferenceSession(model, options, ["CPUExecutionProvider"])
     rng, largest, ties = np.random.default_rng(0), 0.0, 0
-    inputs = [_random_inputs(flown.config, rng) for _ in range(checks)]
-    in_jax = _exactly(flown, inputs)
+    inputs = [_random_inputs(policy.config, rng) for _ in range(checks)]
+    in_jax = _values_in_float64(policy, inputs)
     for number, given in enumerate(inputs):
         wanted, remembered = (each[number : number + 1] for each in in_jax)
         values, memory = session.run(list(OUTPUTS), dict(zip(INPUTS, given, strict=True)))

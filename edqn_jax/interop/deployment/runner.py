@@ -154,8 +154,8 @@ class Runner:
             raise ValueError("volume must be its lowest and its highest corner, each coordinate of the first the lower")
         turn = _numbers("yaw_rate", yaw_rate, ())
         move = self._last_move if last_move is None else _numbers("last_move", last_move, (3,))
-        yaw = heading(attitude)
-        counts = counted(self.about, packet, until_us - self.window_us, grid=self._grid, contrast=self._contrast)
+        yaw = heading_of(attitude)
+        counts = count_events(self.about, packet, until_us - self.window_us, grid=self._grid, contrast=self._contrast)
         values, memory = self._session.run(
             ["values", "memory_after"],
             {
@@ -251,7 +251,7 @@ def _hull(places: NDArray[np.int64]) -> tuple[int, int]:
     return int(seen.min()), int(seen.max()) + 1
 
 
-def counted(
+def count_events(
     about: Mapping[str, Any],
     packet: NDArray,
     start_us: int,
@@ -309,7 +309,7 @@ def _own_grid(about: Mapping[str, Any]) -> tuple[NDArray, NDArray, NDArray]:
     return np.arange(width), np.arange(height), np.ones((height, width), np.int64)
 
 
-def heading(quaternion: NDArray[np.float32]) -> np.float32:
+def heading_of(quaternion: NDArray[np.float32]) -> np.float32:
     """Returns the heading of an attitude [4], radians: its twist about the vertical."""
     angle = np.float32(2) * np.arctan2(quaternion[3], quaternion[0])
     return angle - np.float32(2 * np.pi) * np.round(angle / np.float32(2 * np.pi))

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edqn_jax.errors import ConfigError
-from edqn_jax.extras import require
+from edqn_jax.extras import require_extra
 from edqn_jax.interop.recordings.recording import Recording, recording_of
 
 MAGIC = b"#!AER-DAT4.0\r\n"
@@ -144,9 +144,9 @@ def _decompressor(file: Path, compression: int) -> Callable[[bytes], bytes]:
     if compression == 0:
         return bytes
     if compression in (1, 2):
-        return require("lz4.frame", extra="events").decompress
+        return require_extra("lz4.frame", extra="events").decompress
     if compression in (3, 4):
-        zstandard = require("zstandard", extra="events")
+        zstandard = require_extra("zstandard", extra="events")
 
         def unpack(packet: bytes) -> bytes:
             try:

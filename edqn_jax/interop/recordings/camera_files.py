@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from edqn_jax.errors import ConfigError
-from edqn_jax.extras import require
+from edqn_jax.extras import require_extra
 from edqn_jax.interop.recordings.aedat4 import read_aedat4
 from edqn_jax.interop.recordings.prophesee_files import read_prophesee
 from edqn_jax.interop.recordings.recording import Recording, recording_of
@@ -52,7 +52,7 @@ def _read_event_stream(file: Path) -> Recording:
     Raises:
         ConfigError: if faery cannot read it.
     """
-    faery = require("faery", extra="events")
+    faery = require_extra("faery", extra="events")
     # A fault in faery's compiled part is a `PanicException`, which is no `Exception`.
     try:
         decoder = faery.events_stream_from_file(file, file_type="es")

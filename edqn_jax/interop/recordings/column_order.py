@@ -8,12 +8,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edqn_jax.errors import ConfigError
-from edqn_jax.interop.recordings.recording import MOST_PIXELS
+from edqn_jax.interop.recordings.recording import MAX_PIXELS
 
 ORDER = ("t", "x", "y", "p")
 """The usual one: the event camera dataset of Zurich, ESIM, v2e."""
 
-MOST_STEPS_BACK = 0.2
+MAX_STEPS_BACK = 0.2
 """Largest share of steps back in a column of times: sorted files have none, and random columns half."""
 
 ORDERS = [order for order in itertools.permutations(ORDER) if order.index("x") < order.index("y")]
@@ -49,11 +49,11 @@ def _may_be_time(column: NDArray) -> bool:
     if not _may_be_pixel(column) and not _may_be_polarity(column):
         return True
     steps = np.diff(column)
-    return bool(column[-1] > column[0] and np.mean(steps < 0) <= MOST_STEPS_BACK and not _may_be_polarity(column))
+    return bool(column[-1] > column[0] and np.mean(steps < 0) <= MAX_STEPS_BACK and not _may_be_polarity(column))
 
 
 def _may_be_pixel(column: NDArray) -> bool:
-    return bool(np.all((column >= 0) & (column < MOST_PIXELS) & (column == np.floor(column))))
+    return bool(np.all((column >= 0) & (column < MAX_PIXELS) & (column == np.floor(column))))
 
 
 def _may_be_polarity(column: NDArray) -> bool:

@@ -21,11 +21,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from edqn_jax.errors import ConfigError
-from edqn_jax.extras import require
+from edqn_jax.extras import require_extra
 from edqn_jax.interop.recordings.recording import (
     Recording,
     TimeUnit,
-    named_columns,
+    match_columns,
     one_number,
     recording_of,
     whole_number,
@@ -41,8 +41,8 @@ def read_hdf5(file: Path, size: tuple[int, int] | None, time_unit: TimeUnit | No
         ConfigError: if it is damaged, or not of this layout.
         MissingPackageError: if h5py is not installed.
     """
-    h5py = require("h5py", extra="events")
-    require("hdf5plugin", extra="events")  # DSEC's files are compressed with Blosc
+    h5py = require_extra("h5py", extra="events")
+    require_extra("hdf5plugin", extra="events")  # DSEC's files are compressed with Blosc
     try:
         with h5py.File(file, "r") as opened:
             columns, others = _columns(file, opened)
@@ -61,7 +61,7 @@ def read_hdf5(file: Path, size: tuple[int, int] | None, time_unit: TimeUnit | No
 
 def _columns(file: Path, opened: Any) -> tuple[dict[str, NDArray], dict[str, Any]]:
     group = opened.get("events")
-    names = named_columns(group) if _is_group(group) else None
+    names = match_columns(group) if _is_group(group) else None
     if names is None or any(_is_group(group[key]) for key in names.values()):
         raise ConfigError(
             f"'{file}' is not in DSEC's layout, a group 'events' with columns x, y, p and t; "
@@ -138,7 +138,7 @@ def hdf5_bytes(recording: Recording) -> bytes:
     Raises:
         MissingPackageError: if h5py is not installed.
     """
-    h5py = require("h5py", extra="events")
+    h5py = require_extra("h5py", extra="events")
     events = recording.events
     offset = int(events["t"][0]) if len(events) else 0
     since = events["t"] - offset

@@ -19,7 +19,7 @@ from edqn_jax.interop.recordings.recording import (
     MICROSECONDS,
     Recording,
     TimeUnit,
-    named_columns,
+    match_columns,
     one_number,
     recording_of,
     whole_number,
@@ -77,8 +77,8 @@ def _columns(file: Path, held: dict[str, NDArray]) -> dict[str, NDArray]:
     Raises:
         ConfigError: if there are none, or several.
     """
-    tables = {key: value for key, value in held.items() if named_columns(_fields(value)) is not None}
-    if (names := named_columns(key for key in held if key not in tables)) is not None:
+    tables = {key: value for key, value in held.items() if match_columns(_fields(value)) is not None}
+    if (names := match_columns(key for key in held if key not in tables)) is not None:
         return {key: held[names[key]] for key in names}
     if len(tables) != 1:
         shapes = ", ".join(f"{key} {list(np.shape(value))}" for key, value in list(held.items())[:6]) or "nothing"
@@ -86,7 +86,7 @@ def _columns(file: Path, held: dict[str, NDArray]) -> dict[str, NDArray]:
             f"'{file}' must have arrays t, x, y and p, or one structured array with these fields; it holds {shapes}"
         )
     ((_, table),) = tables.items()
-    return {key: table[name] for key, name in (named_columns(_fields(table)) or {}).items()}
+    return {key: table[name] for key, name in (match_columns(_fields(table)) or {}).items()}
 
 
 def _fields(value: object) -> tuple[str, ...]:

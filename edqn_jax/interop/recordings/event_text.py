@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from edqn_jax.errors import ConfigError
 from edqn_jax.interop.recordings.column_order import ORDER, check_usual_order
-from edqn_jax.interop.recordings.recording import COLUMN_NAMES, Recording, TimeUnit, named_columns, recording_of
+from edqn_jax.interop.recordings.recording import COLUMN_NAMES, Recording, TimeUnit, match_columns, recording_of
 
 UNITS: dict[str, TimeUnit] = {
     "s": "s",
@@ -138,7 +138,7 @@ def _read_header(line: str, said: _Said) -> None:
             unit = UNITS[timed[2]]
         elif word in COLUMN_NAMES:
             names.append(word)
-    if named_columns(names) is not None:
+    if match_columns(names) is not None:
         said.order, said.unit = tuple(COLUMN_NAMES[word] for word in names), unit
     if len(size) == 2:
         said.size = size["width"], size["height"]

@@ -15,11 +15,11 @@ from edqn_jax.sim.environment import Environment
 from edqn_jax.sim.physics.drone import Flight
 from edqn_jax.sim.scene.launches import aim_along
 from edqn_jax.sim.task.action_sets import action_set
-from edqn_jax.sim.task.env import World, scene_of
+from edqn_jax.sim.task.env import EnvParams, scene_of
 
 
 def flight_recording(
-    config: Config, world: World, flown: Mapping[str, np.ndarray], size: tuple[int, int] | None = None
+    config: Config, env_params: EnvParams, trajectory: Mapping[str, np.ndarray], size: tuple[int, int] | None = None
 ) -> Recording:
     """Returns the events of a flight, with a frame at every physics step, and where the camera was.
 
@@ -41,14 +41,14 @@ def flight_recording(
         camera=camera,
         events=dataclasses.replace(law, contrast_on=contrast, contrast_off=off),
     )
-    poses = _from_start(world, flown)
+    poses = _from_start(env_params, trajectory)
     aim = None
-    if world.pool.spheres.throw is not None:
+    if env_params.pool.spheres.throw is not None:
         places = poses.position[:: config.drone.physics_steps]
-        aim = aim_along(config, scene_of(world, jnp.asarray(0)), places)
-    stream = Environment(sees, world).stream(poses, law="esim", aim=aim)
+        aim = aim_along(config, scene_of(env_params, jnp.asarray(0)), places)
+    stream = Environment(sees, env_params).stream(poses, law="esim", aim=aim)
     steps = round(config.drone.physics_dt_s * 1e6)
-    actions = np.concatenate([np.asarray(action_set(config).still)[None], actions_of(flown)])
+    actions = np.concatenate([np.asarray(action_set(config).still)[None], actions_of(trajectory)])
     commanded = directions(config, poses, actions)
     if config.env.actions == "moves":
         moves = {"move": commanded.astype(np.int8)}
@@ -69,15 +69,17 @@ def flight_recording(
     )
 
 
-def _from_start(world: World, flown: Mapping[str, np.ndarray]) -> Flight:
+def _from_start(env_params: EnvParams, trajectory: Mapping[str, np.ndarray]) -> Flight:
     """Returns the poses of a flight: at rest at the mission's start, facing the goal, then after each physics step.
 
     Each has its time.
     """
-    start, goal = (np.asarray(each[0], np.float64) for each in (world.missions.start, world.missions.goal))
+    start, goal = (np.asarray(each[0], np.float64) for each in (env_params.missions.start, env_params.missions.goal))
     half = np.arctan2(goal[1] - start[1], goal[0] - start[0]) / 2
     first = {"position": start, "quaternion": [np.cos(half), 0.0, 0.0, np.sin(half)], "velocity": np.zeros(3)}
     names = {"position": POSITION, "quaternion": ATTITUDE, "velocity": VELOCITY}
-    columns = {key: jnp.asarray(np.vstack([first[key], columns_of(flown, names[key])]), jnp.float32) for key in names}
-    time = jnp.asarray(np.concatenate([[0.0], flown["t"]]), jnp.float32)
+    columns = {
+        key: jnp.asarray(np.vstack([first[key], columns_of(trajectory, names[key])]), jnp.float32) for key in names
+    }
+    time = jnp.asarray(np.concatenate([[0.0], trajectory["t"]]), jnp.float32)
     return Flight(**columns, time=time)

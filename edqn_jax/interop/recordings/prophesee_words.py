@@ -13,9 +13,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from edqn_jax.interop.recordings.recording import MOST_BACK_US
+from edqn_jax.interop.recordings.recording import MAX_BACK_US
 
-MOST_AHEAD_US = 10_000_000
+MAX_AHEAD_US = 10_000_000
 """Longest pause in which a clock may begin again at zero, as in Prophesee's own decoder."""
 
 
@@ -44,8 +44,8 @@ class Words(NamedTuple):
 def running_clock(values: NDArray, period: int, tick_us: int) -> NDArray[np.int64]:
     """Returns the values [M] of a clock that begins again at zero, counted on over these beginnings.
 
-    A smaller value is a new beginning where that is at most `MOST_AHEAD_US`, or half a period, later; otherwise the
-    clock stepped back. A larger one may be a step back over a beginning, of at most `MOST_BACK_US`.
+    A smaller value is a new beginning where that is at most `MAX_AHEAD_US`, or half a period, later; otherwise the
+    clock stepped back. A larger one may be a step back over a beginning, of at most `MAX_BACK_US`.
 
     Args:
         values: whole numbers from 0 to `period` - 1.
@@ -54,8 +54,8 @@ def running_clock(values: NDArray, period: int, tick_us: int) -> NDArray[np.int6
     """
     values = values.astype(np.int64)
     step = np.diff(values)
-    ahead = min(MOST_AHEAD_US // tick_us, period // 2)
-    behind = min(MOST_BACK_US // tick_us, period // 2 - 1)
+    ahead = min(MAX_AHEAD_US // tick_us, period // 2)
+    behind = min(MAX_BACK_US // tick_us, period // 2 - 1)
     begins = (step < 0) & (step + period <= ahead)
     slips = (step > 0) & (period - step <= behind)
     return values + period * np.cumsum(np.concatenate(([0], begins.astype(np.int64) - slips)))[: len(values)]

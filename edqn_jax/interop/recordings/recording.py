@@ -43,10 +43,10 @@ COLUMN_NAMES = {
 }
 """What files call the columns, in lower case."""
 
-MOST_BACK_US = 1_000_000
+MAX_BACK_US = 1_000_000
 """Furthest that time may go back from one event to the next; events that are less out of order are sorted."""
 
-MOST_PIXELS = 2**16
+MAX_PIXELS = 2**16
 """Bound of each side of an image."""
 
 
@@ -160,11 +160,11 @@ def recording_of(
             raise ConfigError(f"the column {key} of '{name}' is not all finite numbers")
     for key, limit in (("x", size and size[0]), ("y", size and size[1])):
         _check_pixels(name, key, columns[key], limit)
-    unit = time_unit or found_unit(name, columns["t"])
+    unit = time_unit or infer_time_unit(name, columns["t"])
     events = np.empty(len(columns["t"]), STREAM_DTYPE)
     events["t"] = _microseconds(name, columns["t"], unit) + offset_us
     events["x"], events["y"] = columns["x"], columns["y"]
-    events["p"], polarity = signs(name, columns["p"])
+    events["p"], polarity = polarity_signs(name, columns["p"])
     events, out_of_order = _in_order(name, events)
     width, height = size or (None, None)
     return Recording(
@@ -179,7 +179,7 @@ def recording_of(
     )
 
 
-def found_unit(name: str, t: NDArray) -> TimeUnit:
+def infer_time_unit(name: str, t: NDArray) -> TimeUnit:
     """Returns the only unit in which times [N] are plausible: since 1970, or by length, rate and resolution.
 
     Raises:
@@ -207,7 +207,7 @@ def found_unit(name: str, t: NDArray) -> TimeUnit:
     raise ConfigError(f"'{name}' does not say the unit of its times, {which}; give --time-unit s, ms, us or ns")
 
 
-def named_columns(names: Iterable[str]) -> dict[str, str] | None:
+def match_columns(names: Iterable[str]) -> dict[str, str] | None:
     """Returns which of the names is that of t, x, y and p; None unless there is one of each."""
     found: dict[str, str] = {}
     for name in names:
@@ -246,7 +246,7 @@ def whole_number(name: str, key: str, value: ArrayLike) -> int:
     return int(number)
 
 
-def signs(name: str, p: NDArray) -> tuple[NDArray[np.int8], str]:
+def polarity_signs(name: str, p: NDArray) -> tuple[NDArray[np.int8], str]:
     """Returns polarities [N] as -1 and 1, and how the file writes them.
 
     Raises:
@@ -269,8 +269,8 @@ def _check_pixels(name: str, key: str, column: NDArray, limit: int | None) -> No
         raise ConfigError(
             f"'{name}' has pixels {key} that are no whole numbers, such as {column[column % 1 != 0][0]:g}"
         )
-    if lowest < 0 or highest >= MOST_PIXELS or (limit is not None and highest >= limit):
-        most = (limit or MOST_PIXELS) - 1
+    if lowest < 0 or highest >= MAX_PIXELS or (limit is not None and highest >= limit):
+        most = (limit or MAX_PIXELS) - 1
         raise ConfigError(f"'{name}' has pixels {key} from {lowest:g} to {highest:g}; they must be from 0 to {most}")
 
 
@@ -292,7 +292,7 @@ def _in_order(name: str, events: NDArray) -> tuple[NDArray, int]:
     """
     back = np.maximum.accumulate(events["t"]) - events["t"]
     furthest = int(back.argmax())
-    if back[furthest] > MOST_BACK_US:
+    if back[furthest] > MAX_BACK_US:
         raise ConfigError(
             f"time goes back by {back[furthest] * 1e-6:g} s at event {furthest:,} of '{name}': it is damaged, or "
             "several recordings in one file"

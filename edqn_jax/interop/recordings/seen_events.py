@@ -26,7 +26,7 @@ from edqn_jax.sim.task.observation import OWN_SIZE, Observation
 
 @dataclasses.dataclass(frozen=True)
 class Seen:
-    """What a policy sees at D moments of a recording."""
+    """Observations of a policy at D times of a recording."""
 
     until_us: NDArray[np.int64]
     """[D] end of each window, on the recording's clock."""
@@ -68,7 +68,7 @@ def image_at(recording: Recording, end_us: int, window_us: int) -> NDArray[np.in
     return (on - off).reshape(height, width).astype(np.int32)
 
 
-def seen_by(
+def observe_recording(
     policy: Policy,
     recording: Recording,
     *,
@@ -77,7 +77,7 @@ def seen_by(
     velocity: tuple[float, float, float] = (0.0, 0.0, 0.0),
     yaw_rate: float = 0.0,
 ) -> Seen:
-    """Returns what a policy sees of a recording at each of its decisions.
+    """Returns the policy's observations of a recording, one per decision.
 
     Args:
         policy: with an encoder of events.
@@ -90,7 +90,7 @@ def seen_by(
     Raises:
         ConfigError: if the policy does not encode events, or the camera cannot stand for the policy's.
     """
-    check_has_params(policy, "seen_by")
+    check_has_params(policy, "observe_recording")
     config = policy.config
     if config.env.sensor != "events":
         raise ConfigError(f"only policies with the sensor 'events' encode events, not '{config.env.sensor}'")
@@ -109,7 +109,7 @@ def seen_by(
     last = np.searchsorted(stream["t"], ends)
     counts = np.stack(
         [
-            runner.counted(about, stream[a:b], int(end) - window_us, grid=grid, contrast=contrast)
+            runner.count_events(about, stream[a:b], int(end) - window_us, grid=grid, contrast=contrast)
             for a, b, end in zip(first, last, ends, strict=True)
         ]
     )
@@ -128,7 +128,7 @@ def _motion(
         move = np.clip(np.rint(given / about["speed_m_s"]), -1, 1)
         return runner.own_motion(about, np.float32(0), given, yaw_rate, move)
     now = max(int(np.searchsorted(flight["t"], end_us, side="right")) - 1, 1)
-    yaw, before = (runner.heading(flight["quaternion"][row].astype(np.float32)) for row in (now, now - 1))
+    yaw, before = (runner.heading_of(flight["quaternion"][row].astype(np.float32)) for row in (now, now - 1))
     turned = (yaw - before + np.pi) % (2 * np.pi) - np.pi
     rate = turned / (float(flight["t"][now] - flight["t"][now - 1]) * 1e-6)
     return runner.own_motion(about, yaw, flight["velocity"][now].astype(np.float32), rate, flight["move"][now])
@@ -140,12 +140,12 @@ def _encoded(config: Config, params: PolicyParams, counts: Array, motion: Array)
 
     def one(given: tuple[Array, Array]) -> tuple[Array, Array]:
         field = field_of(config, given[0])
-        # What a policy knows of its goal is no part of a code.
+        # The goal is not part of a code.
         seen = Observation(sensed=field, own=jnp.zeros(OWN_SIZE), motion=given[1])
         code = actor.code(actor.encode(params, actor.init(), seen))
         channels = vae.decode(config.encoder, config.camera, params.encoder, code)
         nearness = embedding.needs_nearness(config)
-        drawn = channels[-1] if nearness else jnp.sum(jnp.expm1(channels), axis=-3)
-        return events.event_image(field), drawn
+        decoded = channels[-1] if nearness else jnp.sum(jnp.expm1(channels), axis=-3)
+        return events.event_image(field), decoded
 
     return jax.jit(lambda c, m: jax.lax.map(one, (c, m)))(counts, motion)

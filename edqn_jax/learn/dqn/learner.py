@@ -20,10 +20,10 @@ from edqn_jax.keys import split_each
 from edqn_jax.learn import qnetwork, replay
 from edqn_jax.learn.actor import observation_size
 from edqn_jax.learn.dqn.losses import batch_loss
-from edqn_jax.learn.exploration import explore
+from edqn_jax.learn.exploration import epsilon_greedy_moves
 from edqn_jax.learn.learner import Learner, Rings, UpdateStats
-from edqn_jax.learn.plan import Plan
-from edqn_jax.learn.qnetwork import Params, optimiser, polyak, skip_nonfinite
+from edqn_jax.learn.qnetwork import Params, make_optimiser, polyak_update, skip_nonfinite
+from edqn_jax.learn.schedule import Schedule
 from edqn_jax.native.all_sum import all_sum
 from edqn_jax.sim.actions import ACTIONS
 from edqn_jax.sim.task.task import task_of
@@ -48,8 +48,10 @@ def init_state(config: Config, key: Array) -> DqnState:
 
 
 def _optimiser(config: Config) -> optax.GradientTransformation:
-    plan = Plan.of(config)
-    return skip_nonfinite(optimiser(config.agent, (plan.scheduled - plan.learn_from) * config.agent.updates_per_step))
+    schedule = Schedule.from_config(config)
+    return skip_nonfinite(
+        make_optimiser(config.agent, (schedule.scheduled - schedule.learn_from) * config.agent.updates_per_step)
+    )
 
 
 def count_rows_before_updates(config: Config) -> int:
@@ -80,7 +82,7 @@ def update_q(
         return batch_loss(agent, tree(q), tree(target), len(ACTIONS), batch)
 
     def update(state: DqnState, keys: Array):
-        batch = jax.vmap(lambda r, k: replay.sample(agent, r, rings.time, share, k, task))(rings.rows, keys)
+        batch = jax.vmap(lambda r, k: replay.sample_transitions(agent, r, rings.time, share, k, task))(rings.rows, keys)
         batch = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), batch)
         (total, (count, sum_q)), gradient = jax.value_and_grad(loss, has_aux=True)(state.q, state.target, batch)
         gradient, total, count, sum_q = all_sum((gradient, total, count, sum_q), axis, after)
@@ -90,7 +92,7 @@ def update_q(
 
         def followed(old: Array, rate: float) -> Array:
             """Follows `q`, unless it may be `q` that is not finite."""
-            return jnp.where(finite, polyak(q, old, rate), old)
+            return jnp.where(finite, polyak_update(q, old, rate), old)
 
         state = DqnState(
             q=q,
@@ -104,11 +106,11 @@ def update_q(
     def learn(state: DqnState):
         many = split_each(rings.keys, agent.updates_per_step)
         state, (loss, mean_q, finite) = lax.scan(update, _each_network(vector, state), many)
-        stats = UpdateStats.of(loss, dict(zip(METRICS, (loss, mean_q), strict=True)), finite)
+        stats = UpdateStats.from_updates(loss, dict(zip(METRICS, (loss, mean_q), strict=True)), finite)
         return stats, _each_network(tree, state)
 
     def rest(state: DqnState):
-        return UpdateStats.none(*METRICS), state
+        return UpdateStats.without_updates(*METRICS), state
 
     return lax.cond(count_updates(config, rings.time) > 0, learn, rest, state)
 
@@ -120,7 +122,7 @@ def _each_network(change: Callable[[Any], Any], state: DqnState) -> DqnState:
 
 DQN = Learner(
     init=init_state,
-    act=lambda config, state, *rest: explore(config, state.q, *rest),
+    act=lambda config, state, *rest: epsilon_greedy_moves(config, state.q, *rest),
     decide=lambda config, params, memory: qnetwork.greedy_moves(config.agent, params, memory),
     ring_length=lambda config: replay.ring_length(config.agent, config.train.num_envs),
     starts=count_rows_before_updates,

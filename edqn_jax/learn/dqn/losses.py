@@ -25,7 +25,7 @@ def value_of(q: Array, a: Array) -> Array:
     return jnp.sum(jnp.where(jnp.arange(q.shape[-1]) == a, q, 0.0))
 
 
-def target(returns: Array, discount: Array, q_next: Array, q_select: Array) -> Array:
+def td_target(returns: Array, discount: Array, q_next: Array, q_select: Array) -> Array:
     """Returns Eq. 7 and 10, y = r + gamma max_a Q(s', a) (1 - done), or its n-step and double forms.
 
     Args:
@@ -36,9 +36,9 @@ def target(returns: Array, discount: Array, q_next: Array, q_select: Array) -> A
             van Hasselt et al. 2016).
 
     >>> q_next = jnp.array([3.0, 1.0])
-    >>> print(target(jnp.array(1.0), jnp.array(0.5), q_next, q_next))
+    >>> print(td_target(jnp.array(1.0), jnp.array(0.5), q_next, q_next))
     2.5
-    >>> print(target(jnp.array(1.0), jnp.array(0.5), q_next, jnp.array([0.0, 1.0])))  # double: the other one chooses
+    >>> print(td_target(jnp.array(1.0), jnp.array(0.5), q_next, jnp.array([0.0, 1.0])))  # double: the other one chooses
     1.5
     """
     chex.assert_rank([returns, discount, q_next, q_select], [0, 0, 1, 1])
@@ -69,7 +69,7 @@ def batch_loss(config: AgentConfig, params: Params, target_params: Params, actio
     q_next = q_values(config, target_params, actions, batch.next_history)
     q_select = q_values(config, params, actions, batch.next_history) if config.double else q_next
     returns = config.reward_scale * batch.returns
-    y = jax.vmap(target)(returns, batch.discount, q_next, q_select)
+    y = jax.vmap(td_target)(returns, batch.discount, q_next, q_select)
     losses = jax.vmap(lambda q, a, y: td_loss(q, a, y, config.huber_delta))(q, batch.action, y)
     taken = jax.vmap(value_of)(q, batch.action)
     return jnp.sum(batch.weight * losses), (jnp.sum(batch.weight), jnp.sum(batch.weight * taken))

@@ -1,1 +1,1 @@
-"""What the encoder learns: event VAE, its encoders, and what the Q-network sees of each sensor."""
+"""Perception: event VAE, its encoders, and the embedding of each sensor for the Q-network."""

@@ -25,8 +25,8 @@ def needs_nearness(config: Config) -> bool:
     return has_code(config) and vae.needs_nearness(config.encoder)
 
 
-def size(config: Config) -> int:
-    """Returns the number of values that the Q-network sees of what the sensor shows."""
+def embedding_size(config: Config) -> int:
+    """Returns the size of the embedding of the sensor's output."""
     return code_size(config) + sensor_of(config).count_values(config)
 
 
@@ -40,7 +40,7 @@ def as_encoder_input(config: Config, observation: Observation) -> Observation:
     return dataclasses.replace(observation, sensed=sensor_of(config).encoder_input(config, observation.sensed))
 
 
-def init(config: Config, key: Array) -> Params:
+def init_params(config: Config, key: Array) -> Params:
     """Returns fresh parameters of the VAE; {} where there is none."""
     if not has_code(config):
         return {}
@@ -48,12 +48,12 @@ def init(config: Config, key: Array) -> Params:
     return vae.init_vae(config.encoder, config.camera, key, form=form, layers=layers)
 
 
-def acting(config: Config, params: Params) -> Params:
-    """Returns the parameters in the form that `embed` evaluates fastest, no longer trainable; {} of {}."""
+def inference_params(config: Config, params: Params) -> Params:
+    """Returns the parameters in the form that `embed` evaluates fastest, not trainable; {} for {}."""
     if not params:
         return {}
     form, layers = _shape(config)
-    return vae.frozen(config.encoder, config.camera, params, form=form, layers=layers)
+    return vae.freeze_params(config.encoder, config.camera, params, form=form, layers=layers)
 
 
 def embed(config: Config, params: Params, observation: Observation) -> Array | None:

@@ -35,8 +35,8 @@ class Dense(nn.Module):
     @nn.compact
     def __call__(self, x: Array) -> Array:
         """Returns `[..., features]` of `[..., K]`."""
-        y = product(x, self.param("kernel", self.kernel_init, (x.shape[-1], self.features)))
-        return added(y, self.param("bias", self.bias_init, (self.features,))) if self.use_bias else y
+        y = shared_matmul(x, self.param("kernel", self.kernel_init, (x.shape[-1], self.features)))
+        return add_shared(y, self.param("bias", self.bias_init, (self.features,))) if self.use_bias else y
 
 
 def init_params(module: nn.Module, name: str, key: Array, *inputs: Any) -> Any:
@@ -56,13 +56,13 @@ def init_params(module: nn.Module, name: str, key: Array, *inputs: Any) -> Any:
 
 
 @jax.custom_vjp
-def product(x: Array, kernel: Array) -> Array:
+def shared_matmul(x: Array, kernel: Array) -> Array:
     """Returns `x @ kernel`, `[..., F]`, of rows `[..., K]` and a kernel `[K, F]` that all of them share."""
     return x @ kernel
 
 
 def _product(x: Array, kernel: Array) -> tuple[Array, tuple[Array, Array]]:
-    return product(x, kernel), (x, kernel)
+    return shared_matmul(x, kernel), (x, kernel)
 
 
 def _product_gradient(kept: tuple[Array, Array], change: Array) -> tuple[Array, Array]:
@@ -74,13 +74,13 @@ def _product_gradient(kept: tuple[Array, Array], change: Array) -> tuple[Array, 
 
 
 @jax.custom_vjp
-def added(x: Array, shared: Array) -> Array:
+def add_shared(x: Array, shared: Array) -> Array:
     """Returns `x + shared`, `[..., *S]`, of rows `[..., *S]` and one array `[*S]` that is added to all of them."""
     return x + shared.reshape((1,) * (x.ndim - shared.ndim) + shared.shape)
 
 
 def _added(x: Array, shared: Array) -> tuple[Array, Array]:
-    return added(x, shared), shared
+    return add_shared(x, shared), shared
 
 
 def _added_gradient(shared: Array, change: Array) -> tuple[Array, Array]:
@@ -88,5 +88,5 @@ def _added_gradient(shared: Array, change: Array) -> tuple[Array, Array]:
     return change, (jnp.ones(rows.shape[0]) @ rows).reshape(shared.shape)
 
 
-product.defvjp(_product, _product_gradient)
-added.defvjp(_added, _added_gradient)
+shared_matmul.defvjp(_product, _product_gradient)
+add_shared.defvjp(_added, _added_gradient)

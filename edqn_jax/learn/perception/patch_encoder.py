@@ -15,7 +15,7 @@ from jax import Array
 
 from edqn_jax.config import EncoderConfig
 from edqn_jax.learn.perception.code import CodeHead
-from edqn_jax.learn.perception.layers import Dense, added
+from edqn_jax.learn.perception.layers import Dense, add_shared
 from edqn_jax.sim.sensors.events import EventField
 
 
@@ -33,7 +33,7 @@ def log_counts(field: EventField) -> list[Array]:
     return [pair[..., row, :, :] for row in range(pairs[0].shape[-3]) for pair in pairs]
 
 
-def patches(image: Array, pixels: int) -> Array:
+def to_patches(image: Array, pixels: int) -> Array:
     """Cuts images `[..., H, W]` into square patches of `pixels` x `pixels`: `[..., N, K]`, row by row.
 
     Images whose sides are no multiples of `pixels` are padded with zeros at the right and at the bottom.
@@ -73,13 +73,13 @@ class PatchEncoder(nn.Module):
         first, *later = self.config.patch_layers
         # One product for each channel: joined to one array first, they take twice as long on a CPU.
         products = [
-            Dense(first, use_bias=number == 0, name=f"channel_{number}")(patches(image, self.config.patch_pixels))
+            Dense(first, use_bias=number == 0, name=f"channel_{number}")(to_patches(image, self.config.patch_pixels))
             for number, image in enumerate(images)
         ]
         z = sum(products[1:], products[0])
         # A layer over patch, place and motion together; what all patches or all fields share is computed once.
         place = patch_places(self.height, self.width, self.config.patch_pixels)
-        z = added(z, Dense(first, use_bias=False, name="place")(jnp.asarray(place)))
+        z = add_shared(z, Dense(first, use_bias=False, name="place")(jnp.asarray(place)))
         z += Dense(first, use_bias=False, name="motion")(motion)[..., None, :]
         z = nn.relu(z)
         for number, size in enumerate(later, start=1):

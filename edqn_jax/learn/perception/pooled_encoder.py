@@ -24,7 +24,7 @@ from jax import Array
 
 from edqn_jax.config import EncoderConfig
 from edqn_jax.learn.perception.code import EVENT_CHANNELS, CodeHead
-from edqn_jax.learn.perception.waves import mirrored, polarities, wave_table
+from edqn_jax.learn.perception.waves import channel_polarities, paired_relu_init, wave_table
 from edqn_jax.sim.sensors.events import EventField
 from edqn_jax.sine import sin_pi
 
@@ -107,7 +107,7 @@ class PixelNetwork(nn.Module):
 
     def everywhere(self) -> Array:
         y, x = jnp.divmod(jnp.arange(self.height * self.width), self.width)
-        return jnp.stack([self.at(x, y, jnp.full(x.shape, p)) for p in polarities(self.channels)])
+        return jnp.stack([self.at(x, y, jnp.full(x.shape, p)) for p in channel_polarities(self.channels)])
 
     def at(self, x: Array, y: Array, p: Array) -> Array:
         place = positional_encoding(x.astype(jnp.float32), y.astype(jnp.float32), self.width, self.height)
@@ -130,8 +130,8 @@ class PooledEncoder(nn.Module):
         kind = {"table": PixelTable, "network": PixelNetwork}[self.config.pixel_features]
         temporal = 1 if self.timed else 1 + 2 * self.config.time_frequencies
         self.pixels = kind(temporal * self.config.features, self.height, self.width, self.channels)
-        self.hidden = nn.Dense(self.config.hidden, kernel_init=mirrored(inputs=False, outputs=True))
-        self.code = CodeHead(self.config.code_size, mean_init=mirrored(inputs=True, outputs=False))
+        self.hidden = nn.Dense(self.config.hidden, kernel_init=paired_relu_init(inputs=False, outputs=True))
+        self.code = CodeHead(self.config.code_size, mean_init=paired_relu_init(inputs=True, outputs=False))
 
     def __call__(self, sensed: EventField | Array, motion: Array) -> tuple[Array, Array]:
         """Returns mean and log-variance `[..., code_size]` of fields or pictures; the own motion is not used."""

@@ -1,7 +1,8 @@
 """The event VAE (section 3.2): an encoder, a code, a decoder of ReLU layers (Eq. 6); also for pictures.
 
 The encoder reads what the sensor shows and the drone's own motion; nothing else reaches the code. The decoder draws
-`target`: what the sensor shows, which is the paper's VAE, or how near things are, a label that only training needs.
+`decoder_target`: what the sensor shows, which is the paper's VAE, or how near things are, a label that only training
+needs.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from edqn_jax.errors import ConfigError
 from edqn_jax.learn.perception.code import EVENT_CHANNELS, Form, Params, kl_divergence
 from edqn_jax.learn.perception.layers import Dense, init_params
 from edqn_jax.learn.perception.pooled_encoder import PooledEncoder
-from edqn_jax.learn.perception.waves import OUTPUT_SCALE, cosines, mirrored, wave_images
+from edqn_jax.learn.perception.waves import OUTPUT_SCALE, cosine_basis, paired_relu_init, wave_images
 from edqn_jax.sim.sensors.events import EventField
 from edqn_jax.sim.task.observation import MOTION_SIZE
 
@@ -36,7 +37,7 @@ class Losses:
 
 @struct.dataclass
 class Target:
-    """What the decoder must draw, in the standing waves that it can draw."""
+    """Target of the decoder, as coefficients of standing waves."""
 
     amplitudes: Array  # [..., channels, P, Q]
     beyond: Array  # [...] squared image left in all other waves
@@ -54,21 +55,21 @@ class Decoder(nn.Module):
     def __call__(self, code: Array) -> Array:
         z = code
         for layer, size in enumerate(self.config.decoder_hidden):
-            z = nn.relu(Dense(size, kernel_init=mirrored(inputs=layer > 0, outputs=True))(z))
-        shape = (self.channels, *_drawn(self.config, self.height, self.width))
+            z = nn.relu(Dense(size, kernel_init=paired_relu_init(inputs=layer > 0, outputs=True))(z))
+        shape = (self.channels, *_output_size(self.config, self.height, self.width))
         kernel = self.param("kernel", wave_images(self.height, self.width), (z.shape[-1], *shape))
         bias = self.param("bias", zeros, shape)
         amplitudes = z @ kernel.reshape(z.shape[-1], -1)
         return OUTPUT_SCALE * (amplitudes.reshape(*z.shape[:-1], *shape) + bias)
 
 
-def _drawn(config: EncoderConfig, height: int, width: int) -> tuple[int, int]:
+def _output_size(config: EncoderConfig, height: int, width: int) -> tuple[int, int]:
     """Returns P and Q, the number of standing waves down and across that the decoder outputs."""
     return tuple(max(1, round(config.decoder_bandwidth * size)) for size in (height, width))  # type: ignore
 
 
 def target_channels(config: EncoderConfig, form: Form, layers: int = 1) -> int:
-    """Returns the number of channels that the decoder draws, see `target`.
+    """Returns the number of channels that the decoder draws, see `decoder_target`.
 
     Args:
         form: of what is encoded.
@@ -83,8 +84,8 @@ def needs_nearness(config: EncoderConfig) -> bool:
     return config.target != "sensed"
 
 
-def target(config: EncoderConfig, sensed: EventField | Array, nearness: Array | None = None) -> Array:
-    """Returns what the decoder must draw, `[..., channels, H, W]`, blurred.
+def decoder_target(config: EncoderConfig, sensed: EventField | Array, nearness: Array | None = None) -> Array:
+    """Returns the target of the decoder, `[..., channels, H, W]`, blurred.
 
     Of `sensed`, log(1 + count) of ON and of OFF events, or the pictures; of `nearness`, the label; of `both`, all
     of these. Events have two channels because their number shows how near things are, and in a signed image the ON and
@@ -129,8 +130,8 @@ def _blur(size: int, times: int) -> np.ndarray:
 def in_waves(config: EncoderConfig, image: Array) -> Target:
     """Returns a target `[..., channels, H, W]` in the standing waves that the decoder draws."""
     height, width = image.shape[-2:]
-    rows, columns = _drawn(config, height, width)
-    amplitudes = jnp.asarray(cosines(height, rows)) @ image @ jnp.asarray(cosines(width, columns).T)
+    rows, columns = _output_size(config, height, width)
+    amplitudes = jnp.asarray(cosine_basis(height, rows)) @ image @ jnp.asarray(cosine_basis(width, columns).T)
     # The waves are orthonormal, so squares add up over them as over pixels.
     axes = (-3, -2, -1)
     beyond = jnp.sum(jnp.square(image), axis=axes) - jnp.sum(jnp.square(amplitudes), axis=axes)
@@ -192,7 +193,7 @@ def encode(config: EncoderConfig, params: Params, sensed: EventField | Array, mo
     return encoder.apply({"params": params["encoder"]}, sensed, motion)  # type: ignore
 
 
-def frozen(
+def freeze_params(
     config: EncoderConfig, camera: CameraConfig, params: Params, *, form: Form = Form.EVENTS, layers: int = 1
 ) -> Params:
     """Returns the parameters in the form that encodes fastest: the pooled encoder's pixel features as a table.
@@ -224,10 +225,10 @@ def embed(config: EncoderConfig, params: Params, sensed: EventField | Array, mot
 
 
 def decode(config: EncoderConfig, camera: CameraConfig, params: Params, code: Array) -> Array:
-    """Returns the decoder's drawing of `target`, `[..., channels, H, W]`, from a code `[..., code_size]`."""
+    """Decodes a code `[..., code_size]` into an estimate of `decoder_target`, `[..., channels, H, W]`."""
     found = _waves_of(config, camera.height, camera.width, params, code)
     rows, columns = found.shape[-2:]
-    return jnp.asarray(cosines(camera.height, rows).T) @ found @ jnp.asarray(cosines(camera.width, columns))
+    return jnp.asarray(cosine_basis(camera.height, rows).T) @ found @ jnp.asarray(cosine_basis(camera.width, columns))
 
 
 def _waves_of(config: EncoderConfig, height: int, width: int, params: Params, code: Array) -> Array:
@@ -251,13 +252,13 @@ def vae_loss(
     Args:
         sensed: field `[..., F, H, W]` or pictures `[..., C, H, W]`.
         motion: `[..., MOTION_SIZE]` own motion.
-        wanted: what the decoder must draw, see `target` and `in_waves`.
+        wanted: what the decoder must draw, see `decoder_target` and `in_waves`.
         noise: `[..., code_size]` standard normal, which draws the codes (reparametrised).
     """
     mean, log_variance = encode(config, params, sensed, motion)
     code = mean + jnp.exp(0.5 * log_variance) * noise
     height, width = (sensed.count if isinstance(sensed, EventField) else sensed).shape[-2:]
-    drawn = _waves_of(config, height, width, params, code)
-    error = jnp.sum(jnp.square(drawn - wanted.amplitudes), axis=(-3, -2, -1)) + wanted.beyond
+    decoded = _waves_of(config, height, width, params, code)
+    error = jnp.sum(jnp.square(decoded - wanted.amplitudes), axis=(-3, -2, -1)) + wanted.beyond
     losses = Losses(reconstruction=jnp.mean(error), kl=jnp.mean(kl_divergence(mean, log_variance)))
     return losses.reconstruction + config.kl_weight * losses.kl, losses

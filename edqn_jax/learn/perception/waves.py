@@ -18,7 +18,7 @@ OUTPUT_SCALE = 2.0
 """Constant factor on the decoder's amplitudes; with it the VAE learns as fast as one that decodes single pixels."""
 
 
-def cosines(size: int, count: int) -> np.ndarray:
+def cosine_basis(size: int, count: int) -> np.ndarray:
     """Returns the `count` lowest standing waves of `size` pixels as orthonormal rows: `[count, size]` (the DCT-II)."""
     place = (np.arange(size) + 0.5) / size
     rows = np.cos(np.pi * np.arange(count)[:, None] * place) * np.sqrt(2.0 / size)
@@ -32,14 +32,14 @@ def lowest_waves(height: int, width: int, rows: int, columns: int) -> np.ndarray
     return np.argsort(np.argsort(frequency, axis=None, kind="stable")).reshape(rows, columns) < WAVES
 
 
-def waves(height: int, width: int) -> Array:
+def standing_waves(height: int, width: int) -> Array:
     """Returns the `WAVES` lowest standing waves of the image (products of cosines), rms 1: `[WAVES, H, W]`."""
     down, across = np.nonzero(lowest_waves(height, width, height, width))
-    image = cosines(height, height)[down][:, :, None] * cosines(width, width)[across][:, None, :]
+    image = cosine_basis(height, height)[down][:, :, None] * cosine_basis(width, width)[across][:, None, :]
     return jnp.asarray(image * np.sqrt(height * width), jnp.float32)
 
 
-def mirrored(*, inputs: bool, outputs: bool) -> Callable[..., Array]:
+def paired_relu_init(*, inputs: bool, outputs: bool) -> Callable[..., Array]:
     """Returns an initialiser of ReLU layers that makes the untrained network linear.
 
     Units come in pairs of opposite sign and are read in pairs of opposite sign: relu(a) - relu(-a) = a. The positions
@@ -90,15 +90,15 @@ def wave_table(height: int, width: int) -> Callable[..., Array]:
 
     def init(key: Array, shape: tuple[int, ...]) -> Array:
         key_odd, key_even = jax.random.split(key)
-        basis = waves(height, width).reshape(-1, height * width).T
+        basis = standing_waves(height, width).reshape(-1, height * width).T
         mix = lecun_normal()
         odd = basis @ mix(key_odd, (basis.shape[1], shape[-1]))
         even = basis @ mix(key_even, (basis.shape[1], shape[-1]))
-        return jnp.stack([even + polarity * odd for polarity in polarities(shape[0])])
+        return jnp.stack([even + polarity * odd for polarity in channel_polarities(shape[0])])
 
     return init
 
 
-def polarities(channels: int) -> np.ndarray:
+def channel_polarities(channels: int) -> np.ndarray:
     """Returns the polarity of each channel, `[channels]`: 1 and -1 of ON and OFF, evenly between them of more."""
     return np.linspace(1.0, 1.0 if channels == 1 else -1.0, channels)

@@ -21,11 +21,11 @@ from edqn_jax.keys import split_each
 from edqn_jax.learn import qnetwork
 from edqn_jax.learn.actor import observation_size
 from edqn_jax.learn.dqn.losses import td_loss, value_of
-from edqn_jax.learn.exploration import explore
+from edqn_jax.learn.exploration import epsilon_greedy_moves
 from edqn_jax.learn.learner import Learner, Rings, UpdateStats
-from edqn_jax.learn.plan import Plan
 from edqn_jax.learn.pqn.returns import Rollout, lambda_returns, rollout_of
-from edqn_jax.learn.qnetwork import Params, network_values, optimiser, polyak, skip_nonfinite
+from edqn_jax.learn.qnetwork import Params, make_optimiser, network_values, polyak_update, skip_nonfinite
+from edqn_jax.learn.schedule import Schedule
 from edqn_jax.native.all_sum import all_sum
 from edqn_jax.sim.actions import ACTIONS
 
@@ -58,9 +58,9 @@ def init_state(config: Config, key: Array) -> PqnState:
 
 
 def _optimiser(config: Config) -> optax.GradientTransformation:
-    plan, pqn = Plan.of(config), config.pqn
-    rollouts = (plan.scheduled - plan.warmup) // pqn.rollout
-    return skip_nonfinite(optimiser(config.agent, rollouts * pqn.epochs * pqn.minibatches))
+    schedule, pqn = Schedule.from_config(config), config.pqn
+    rollouts = (schedule.scheduled - schedule.warmup) // pqn.rollout
+    return skip_nonfinite(make_optimiser(config.agent, rollouts * pqn.epochs * pqn.minibatches))
 
 
 def count_rows_before_updates(config: Config) -> int:
@@ -107,7 +107,7 @@ def update_q(
         gradient = jax.tree.map(lambda x: x / count, gradient)
         change, optimiser = _optimiser(config).update(gradient, state.q_optimiser, state.q)
         q, finite = optax.apply_updates(state.q, change), is_finite(gradient)
-        followed = polyak(q, state.average, pqn.average_rate)
+        followed = polyak_update(q, state.average, pqn.average_rate)
         average = jax.tree.map(lambda new, old: jnp.where(finite, new, old), followed, state.average)
         return PqnState(q=q, average=average, q_optimiser=optimiser), (total / count, sum_q / count, finite)
 
@@ -127,10 +127,10 @@ def update_q(
 
         state, numbers = lax.scan(epoch, state, orders)
         loss, mean_q, finite = (x.reshape(-1) for x in numbers)
-        return UpdateStats.of(loss, dict(zip(METRICS, (loss, mean_q), strict=True)), finite), state
+        return UpdateStats.from_updates(loss, dict(zip(METRICS, (loss, mean_q), strict=True)), finite), state
 
     def rest(state: PqnState):
-        return UpdateStats.none(*METRICS), state
+        return UpdateStats.without_updates(*METRICS), state
 
     return lax.cond(count_updates(config, rings.time) > 0, learn, rest, state)
 
@@ -143,7 +143,7 @@ def _in_minibatches(count: int, x: Array) -> Array:
 
 PQN = Learner(
     init=init_state,
-    act=lambda config, state, *rest: explore(config, state.q, *rest),
+    act=lambda config, state, *rest: epsilon_greedy_moves(config, state.q, *rest),
     decide=lambda config, params, memory: qnetwork.greedy_moves(config.agent, params, memory),
     ring_length=count_ring_rows,
     starts=count_rows_before_updates,

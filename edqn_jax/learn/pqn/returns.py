@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from flax import struct
 from jax import Array, lax
 
-from edqn_jax.learn.replay import Rows, stacked
+from edqn_jax.learn.replay import Rows, stack_observations
 from edqn_jax.sim.task.outcomes import Outcome, is_terminal
 
 
@@ -30,7 +30,7 @@ def rollout_of(ring: Rows, time: Array, decisions: int, history: int) -> Rollout
     """Returns the newest decisions of one environment from a ring [L, ...] of at least `decisions` + `history` rows.
 
     Args:
-        time: [] int32, of the newest row, as in `replay.write`.
+        time: [] int32, of the newest row, as in `replay.store_decision`.
         decisions: T.
         history: H.
     """
@@ -40,7 +40,7 @@ def rollout_of(ring: Rows, time: Array, decisions: int, history: int) -> Rollout
     windows = jnp.arange(decisions + 1)[:, None] + jnp.arange(history)
     arrived, began = rows.outcome[history:].astype(jnp.int32), rows.outcome[history - 1 : -1]
     return Rollout(
-        history=jax.vmap(stacked)(rows.observation[windows], rows.is_reset[windows]),
+        history=jax.vmap(stack_observations)(rows.observation[windows], rows.is_reset[windows]),
         action=rows.action[history - 1 : -1].astype(jnp.int32),
         reward=rows.reward[history:],
         outcome=arrived,

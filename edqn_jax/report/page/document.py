@@ -11,18 +11,18 @@ from typing import Any
 
 from edqn_jax.devices.jax_settings import as_tested
 from edqn_jax.errors import ConfigError
-from edqn_jax.evaluation.metrics import clearance_text, summarise
+from edqn_jax.evaluation.metrics import clearance_text, summarise_flights
 from edqn_jax.files import check_can_write, write_atomically
 from edqn_jax.learn.policy import Policy
 from edqn_jax.policies import function_named
 from edqn_jax.policies.functions import Function, FunctionPolicy, as_policy, load_function
 from edqn_jax.report.page.contents import RUN_COLOURS, add_pictures, page_data, script_text
-from edqn_jax.report.page.flown import FlownRun, fly_policy, fly_run, folders_of, names_of
+from edqn_jax.report.page.evaluated import EvaluatedRun, fly_policy, fly_run, folders_of, names_of
 from edqn_jax.report.style import OUTCOME_LABELS
 
-MOST_BYTES = 15_000_000
+MAX_BYTES = 15_000_000
 """Size of the page at most."""
-MOST_FLIGHTS = 256
+MAX_FLIGHTS = 256
 """Flights of all runs of a page together at most."""
 
 _LIBRARIES = ("three.min.js", "uPlot.iife.min.js")
@@ -39,7 +39,7 @@ def write_report(policies: Sequence[Shown], file: str | Path, *, missions: int =
     Args:
         policies: folders of runs, `pretrained`, policies, and functions, see `FunctionPolicy`.
         file: to write.
-        missions: flights of each at most; of all together at most `MOST_FLIGHTS`.
+        missions: flights of each at most; of all together at most `MAX_FLIGHTS`.
 
     Raises:
         ConfigError: if there is nothing to show, a folder holds no run, a policy cannot fly, they are too many for one
@@ -48,10 +48,10 @@ def write_report(policies: Sequence[Shown], file: str | Path, *, missions: int =
     check_can_write(Path(file))
     if not policies or missions < 1:
         raise ConfigError(f"a report needs a policy and at least 1 of its missions, not {len(policies)} and {missions}")
-    write_atomically(Path(file), report(policies, missions).encode())
+    write_atomically(Path(file), build_report(policies, missions).encode())
 
 
-def report(shown: Sequence[Shown], most: int, message: Callable[[str], None] = lambda _: None) -> str:
+def build_report(shown: Sequence[Shown], most: int, message: Callable[[str], None] = lambda _: None) -> str:
     """Returns the page of runs and policies, their evaluation missions flown anew, those of folders first.
 
     Args:
@@ -67,17 +67,17 @@ def report(shown: Sequence[Shown], most: int, message: Callable[[str], None] = l
     single = list(dict.fromkeys(each for folder in paths for each in folders_of(folder)))
     policies = [*named.items(), *((_own_name(each), each) for each in shown if not _is_name(each))]
     count = len(single) + len(policies)
-    if count > MOST_FLIGHTS:
-        raise ConfigError(f"{count} runs are too many for one page; give at most {MOST_FLIGHTS}")
-    most = min(most, MOST_FLIGHTS // count)
+    if count > MAX_FLIGHTS:
+        raise ConfigError(f"{count} runs are too many for one page; give at most {MAX_FLIGHTS}")
+    most = min(most, MAX_FLIGHTS // count)
     runs = [fly_run(folder, name, most, message) for folder, name in zip(single, names_of(single), strict=True)]
     runs += [fly_policy(as_policy(policy), name, most, message) for name, policy in policies]
     data = page_data(runs)
-    left = MOST_BYTES - len(document(runs, data).encode()) - 100_000
+    left = MAX_BYTES - len(build_html(runs, data).encode()) - 100_000
     if left < 0:
-        raise ConfigError(f"the page would have more than {MOST_BYTES / 1e6:g} MB; give fewer runs, or --missions")
+        raise ConfigError(f"the page would have more than {MAX_BYTES / 1e6:g} MB; give fewer runs, or --missions")
     add_pictures(data, runs, left - 200 * sum(len(run["flights"]) for run in data["runs"]), message)
-    return document(runs, data)
+    return build_html(runs, data)
 
 
 def _is_name(shown: Shown) -> bool:
@@ -90,7 +90,7 @@ def _own_name(policy: Any) -> str:
     return getattr(function, "__name__", type(function).__name__)
 
 
-def document(runs: Sequence[FlownRun], data: dict[str, Any]) -> str:
+def build_html(runs: Sequence[EvaluatedRun], data: dict[str, Any]) -> str:
     """Returns the HTML; everything that comes from a file is escaped."""
     title = runs[0].name if len(runs) == 1 else f"{len(runs)} runs"
     parts = {
@@ -101,8 +101,8 @@ def document(runs: Sequence[FlownRun], data: dict[str, Any]) -> str:
             for number, run in enumerate(runs)
             for note in run.notes
         ),
-        "comparison": comparison(runs),
-        "options": options(runs),
+        "comparison": comparison_table(runs),
+        "options": options_table(runs),
         "style": _asset("vendored/uPlot.min.css") + _asset("page.css"),
         "libraries": "".join(f"<script>{_asset(f'vendored/{name}')}</script>" for name in _LIBRARIES),
         "data": script_text(data),
@@ -113,9 +113,9 @@ def document(runs: Sequence[FlownRun], data: dict[str, Any]) -> str:
     return pieces[0] + "".join(parts[name] + rest for name, _, rest in (piece.partition("}}") for piece in pieces[1:]))
 
 
-def comparison(runs: Sequence[FlownRun]) -> str:
+def comparison_table(runs: Sequence[EvaluatedRun]) -> str:
     """Returns the table of the runs' figures: a row a figure, a column a run."""
-    columns = [figures(run) for run in runs]
+    columns = [run_figures(run) for run in runs]
     head = "".join(f"<th>{_tag(run, number, runs, always=True)}</th>" for number, run in enumerate(runs))
     rows = "".join(
         f"<tr><th>{escape(name)}</th>" + "".join(f"<td>{escape(column[name])}</td>" for column in columns) + "</tr>"
@@ -124,10 +124,10 @@ def comparison(runs: Sequence[FlownRun]) -> str:
     return f"<table><thead><tr><th></th>{head}</tr></thead><tbody>{rows}</tbody></table>"
 
 
-def figures(run: FlownRun) -> dict[str, str]:
+def run_figures(run: EvaluatedRun) -> dict[str, str]:
     """Returns what a run is compared by, as text; a dash where it is not known."""
-    summary, flown = run.summary, summarise(run.flights)
-    low, high = flown["interval"]
+    summary, metrics = run.summary, summarise_flights(run.flights)
+    low, high = metrics["interval"]
 
     def of(name: str, form: str) -> str:
         value = summary.get(name)
@@ -140,20 +140,22 @@ def figures(run: FlownRun) -> dict[str, str]:
     if isinstance(shortest, int | float):
         path += f" (shortest {shortest:.1f} m)"
     # No-break spaces before the percent signs.
-    share = f"{100 * flown['success_rate']:.1f}\u00a0%; 95\u00a0% Wilson {100 * low:.0f} to {100 * high:.0f}\u00a0%"
+    share = f"{100 * metrics['success_rate']:.1f}\u00a0%; 95\u00a0% Wilson {100 * low:.0f} to {100 * high:.0f}\u00a0%"
     return {
         "trained in": "–" if run.params is None else Path(run.config.world.name).name,
         "sensor": run.config.env.sensor,
         "seed": str(run.config.train.seed),
-        "flights on this page": f"{flown['missions']} in {Path(run.missions.name).name}"
+        "flights on this page": f"{metrics['missions']} in {Path(run.missions.name).name}"
         + (f", first in {Path(run.config.world.flown).name}" if run.config.world.flown else ""),
-        "reached the goal": f"{flown['successes']} ({share})",
-        "collisions": str(flown["collisions"]),
-        "time-outs": str(flown["timeouts"]),
-        "left the volume": str(flown["left_volume"]),
-        "mean return": f"{flown['return']:.1f}",
-        "mean flight time of successes": "–" if flown["flight_seconds"] is None else f"{flown['flight_seconds']:.1f} s",
-        "least clearance of successes": clearance_text(flown["min_clearance_m"]),
+        "reached the goal": f"{metrics['successes']} ({share})",
+        "collisions": str(metrics["collisions"]),
+        "time-outs": str(metrics["timeouts"]),
+        "left the volume": str(metrics["left_volume"]),
+        "mean return": f"{metrics['return']:.1f}",
+        "mean flight time of successes": "–"
+        if metrics["flight_seconds"] is None
+        else f"{metrics['flight_seconds']:.1f} s",
+        "least clearance of successes": clearance_text(metrics["min_clearance_m"]),
         "first flight": first,
         "its path": path,
         "training decisions": of("train_decisions", "{:,}"),
@@ -164,7 +166,7 @@ def figures(run: FlownRun) -> dict[str, str]:
     }
 
 
-def options(runs: Sequence[FlownRun]) -> str:
+def options_table(runs: Sequence[EvaluatedRun]) -> str:
     """Returns the runs' options and versions; of several runs, first what differs between them."""
     parts = [_differences(runs)] if len(runs) > 1 else []
     for number, run in enumerate(runs):
@@ -178,7 +180,7 @@ def options(runs: Sequence[FlownRun]) -> str:
     return "".join(parts)
 
 
-def _differences(runs: Sequence[FlownRun]) -> str:
+def _differences(runs: Sequence[EvaluatedRun]) -> str:
     """Returns a table of the options in which the runs differ."""
     columns = [_lines(run) for run in runs]
     differ = [name for name in columns[0] if len({column.get(name) for column in columns}) > 1]
@@ -197,7 +199,7 @@ def _differences(runs: Sequence[FlownRun]) -> str:
     )
 
 
-def _lines(run: FlownRun) -> dict[str, str]:
+def _lines(run: EvaluatedRun) -> dict[str, str]:
     """Returns the options of a run as text, by their names with their groups."""
     return {
         f"{group}.{name}": str(value)
@@ -206,7 +208,7 @@ def _lines(run: FlownRun) -> dict[str, str]:
     }
 
 
-def _tag(run: FlownRun, number: int, runs: Sequence[FlownRun], *, always: bool = False) -> str:
+def _tag(run: EvaluatedRun, number: int, runs: Sequence[EvaluatedRun], *, always: bool = False) -> str:
     """Returns a run's name behind a dot of its colour; nothing of a single run unless `always`."""
     if len(runs) == 1 and not always:
         return ""

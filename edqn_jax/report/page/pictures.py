@@ -16,7 +16,7 @@ from edqn_jax.config import Config
 from edqn_jax.learn.perception import embedding
 from edqn_jax.learn.policy import PolicyParams
 from edqn_jax.report.images import NEARNESS, RECONSTRUCTED_EVENTS, Look, look_of, scale_of
-from edqn_jax.report.sights import Shown, Sights
+from edqn_jax.report.sights import FlightRenderer, SensorImages
 from edqn_jax.sim.camera.camera import on_screen
 
 LEVELS = 64
@@ -26,7 +26,9 @@ NEARNESS_COLOURS = "inferno"
 """Bright is near, black far away."""
 
 
-def flight_pictures(sights: Sights, params: PolicyParams | None, flown: Mapping[str, np.ndarray]) -> dict[str, Any]:
+def flight_pictures(
+    sights: FlightRenderer, params: PolicyParams | None, trajectory: Mapping[str, np.ndarray]
+) -> dict[str, Any]:
     """Returns the pictures of a flight as plain JSON data, one frame for each whole decision.
 
     `width`, `height` of a frame, the number of `frames`, and of each of the `panels` its `name` and `png`, base64:
@@ -38,7 +40,7 @@ def flight_pictures(sights: Sights, params: PolicyParams | None, flown: Mapping[
         flown: the columns of `trajectory.csv`.
     """
     config = sights.config
-    shown, look = sights.shown(params, flown), look_of(config.env.sensor)
+    shown, look = sights.shown(params, trajectory), look_of(config.env.sensor)
     panels = [
         ("brightness", on_screen(shown.luma), Normalize(0.0, 1.0), "gray"),
         (look.name, shown.image, scale_of(shown.image, look, share=0.75), look.colours),
@@ -49,32 +51,34 @@ def flight_pictures(sights: Sights, params: PolicyParams | None, flown: Mapping[
         "width": width,
         "height": height,
         "frames": count,
-        "panels": [{"name": name, "png": strip(images, norm, colour)} for name, images, norm, colour in panels],
+        "panels": [{"name": name, "png": picture_strip(images, norm, colour)} for name, images, norm, colour in panels],
     }
 
 
-def _decoded(config: Config, shown: Shown, look: Look) -> list[tuple[str, np.ndarray, Normalize, str | Colormap]]:
+def _decoded(
+    config: Config, shown: SensorImages, look: Look
+) -> list[tuple[str, np.ndarray, Normalize, str | Colormap]]:
     """Returns name, images, scale and colours of what a decoder draws and of what it should draw, if there is one."""
     if shown.reconstruction is None or shown.target is None:
         return []
     nearness = embedding.needs_nearness(config)
-    drawn = NEARNESS if nearness else RECONSTRUCTED_EVENTS if look.signed else look
-    colours = NEARNESS_COLOURS if nearness else drawn.colours
+    title = NEARNESS if nearness else RECONSTRUCTED_EVENTS if look.signed else look
+    colours = NEARNESS_COLOURS if nearness else title.colours
     # Quiet moments are to be seen, too.
-    scale = Normalize(0.0, max(float(np.quantile(shown.target, 0.999)), 1e-6)) if drawn.signed is False else None
-    scale = scale or scale_of(shown.target, drawn)
+    scale = Normalize(0.0, max(float(np.quantile(shown.target, 0.999)), 1e-6)) if title.signed is False else None
+    scale = scale or scale_of(shown.target, title)
     return [
         (
-            f"predicted {drawn.name}" if nearness else f"{drawn.name}, from the code",
+            f"predicted {title.name}" if nearness else f"{title.name}, from the code",
             shown.reconstruction,
             scale,
             colours,
         ),
-        (f"true {drawn.name}" if nearness else f"{drawn.name}, blurred", shown.target, scale, colours),
+        (f"true {title.name}" if nearness else f"{title.name}, blurred", shown.target, scale, colours),
     ]
 
 
-def strip(images: np.ndarray, norm: Normalize, colours: str | Colormap) -> str:
+def picture_strip(images: np.ndarray, norm: Normalize, colours: str | Colormap) -> str:
     """Returns images [D, H, W] as one PNG [D H, W] in colours, base64."""
     colour_map = matplotlib.colormaps[colours] if isinstance(colours, str) else colours
     levels = np.asarray(np.clip(norm(np.asarray(images, np.float64)), 0, 1)) * (LEVELS - 1)

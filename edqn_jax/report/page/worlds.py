@@ -9,8 +9,8 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from edqn_jax.report.solids import closed_side, present, solids_of
-from edqn_jax.sim.scene.motion import NEVER, OUTSIDE_M, thrown_to
+from edqn_jax.report.solids import boundary_side, solids_of, standing_rows
+from edqn_jax.sim.scene.motion import NEVER, OUTSIDE_M, ball_positions
 from edqn_jax.sim.scene.scene import Scene, aim_of
 from edqn_jax.sim.scene.shapes.kind import ShapeKind
 
@@ -25,12 +25,12 @@ def world_data(scene: Scene) -> dict[str, Any]:
     """
     lower, upper = np.asarray(scene.volume, np.float64)
     shapes = []
-    for (kind, shape), solid in zip(present(scene), solids_of(scene), strict=True):
+    for (kind, shape), solid in zip(standing_rows(scene), solids_of(scene), strict=True):
         moves = _motion(shape)
-        closes = None if moves else closed_side(solid, lower, upper)
+        closes = None if moves else boundary_side(solid, lower, upper)
         drawn = _drawing(kind, shape) | {"colour": _hex(solid.colour)} | moves
         shapes.append(drawn | ({} if closes is None else {"closes": list(closes)}))
-    return {"lower": rounded(lower), "upper": rounded(upper), "shapes": shapes}
+    return {"lower": round_values(lower), "upper": round_values(upper), "shapes": shapes}
 
 
 def ball_data(scene: Scene) -> list[dict[str, Any]]:
@@ -43,7 +43,7 @@ def _motion(shape: Any) -> dict[str, Any]:
     motion = getattr(shape, "motion", None)
     if motion is None:
         return {}
-    moves = {field.name: rounded(getattr(motion, field.name), 6) for field in dataclasses.fields(motion)}
+    moves = {field.name: round_values(getattr(motion, field.name), 6) for field in dataclasses.fields(motion)}
     return {"moves": moves} if np.any(moves["velocity"]) or np.any(moves["swing"]) else {}
 
 
@@ -56,19 +56,19 @@ def _balls(scene: Scene) -> Iterator[dict[str, Any]]:
     hits, aims = np.asarray(aim.launch + throw.early), np.asarray(aim.point)
     # A second before the hit, without gravity, it is so far away from there.
     straight = dataclasses.replace(throw, gravity=jnp.zeros_like(throw.gravity))
-    before = np.stack([thrown_to(straight, aim, hit - 1.0)[i] for i, hit in enumerate(hits)])
+    before = np.stack([ball_positions(straight, aim, hit - 1.0)[i] for i, hit in enumerate(hits)])
     for i in np.flatnonzero((np.asarray(throw.early) > 0) & (np.asarray(aim.launch) < NEVER)):
         speed, colour = float(throw.speed[i]), np.asarray(scene.spheres.albedo[i])
         moves = {"hit": float(hits[i]), "early": float(throw.early[i]), "speed": speed, "outside": OUTSIDE_M}
         moves |= {
             "gravity": float(throw.gravity[i]),
-            "aim": rounded(aims[i]),
-            "from": rounded((before[i] - aims[i]) / speed, 6),
+            "aim": round_values(aims[i]),
+            "from": round_values((before[i] - aims[i]) / speed, 6),
         }
         yield {
             "kind": "sphere",
-            "at": rounded(aims[i]),
-            "radius": rounded(scene.spheres.radius[i]),
+            "at": round_values(aims[i]),
+            "radius": round_values(scene.spheres.radius[i]),
             "colour": _hex(colour),
             "moves": moves,
         }
@@ -77,20 +77,20 @@ def _balls(scene: Scene) -> Iterator[dict[str, Any]]:
 def _drawing(kind: ShapeKind, shape: Any) -> dict[str, Any]:
     """Returns what the view draws of a shape that stands in the world."""
     if kind.page is None:
-        assert kind.faces is not None  # `present` yields what is drawn
+        assert kind.faces is not None  # `standing_rows` yields what is drawn
         sizes = {"kind": "faces", "faces": [face - shape.position for face in kind.faces(shape)]}
     else:
         sizes = kind.page(shape)
     digits = {"turn": 5, "axis": 5}
     numbers = {
-        name: [rounded(ring) for ring in value] if name == "faces" else rounded(value, digits.get(name, 3))
+        name: [round_values(ring) for ring in value] if name == "faces" else round_values(value, digits.get(name, 3))
         for name, value in sizes.items()
         if name != "kind"
     }
-    return {"kind": sizes["kind"], "at": rounded(shape.position), **numbers}
+    return {"kind": sizes["kind"], "at": round_values(shape.position), **numbers}
 
 
-def rounded(values: Any, digits: int = 3) -> Any:
+def round_values(values: Any, digits: int = 3) -> Any:
     """Returns numbers as plain data, rounded; by default to millimetres."""
     return (np.round(np.asarray(values, np.float64), digits) + 0.0).tolist()
 

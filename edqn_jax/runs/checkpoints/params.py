@@ -13,7 +13,7 @@ from flax.traverse_util import flatten_dict, unflatten_dict
 from edqn_jax.errors import ConfigError
 from edqn_jax.learn.policy import PolicyParams
 from edqn_jax.runs.checkpoints import sealed
-from edqn_jax.runs.checkpoints.sealed import digest
+from edqn_jax.runs.checkpoints.sealed import file_digest
 
 POLICY = f"policy{sealed.SUFFIX}"
 """The policy's file within `checkpoints/`."""
@@ -35,8 +35,8 @@ def save_params(folder: Path, params: PolicyParams, config_file: Path | None = N
     Raises:
         ConfigError: if it cannot be written; a policy that was there is there still.
     """
-    facts = {} if config_file is None else {CONFIG: digest(config_file)}
-    sealed.write(folder / POLICY, flatten_dict({"encoder": params.encoder, "q": params.q}, sep="/"), facts)
+    facts = {} if config_file is None else {CONFIG: file_digest(config_file)}
+    sealed.write_sealed(folder / POLICY, flatten_dict({"encoder": params.encoder, "q": params.q}, sep="/"), facts)
 
 
 def load_params(folder: Path, config_file: Path | None = None) -> PolicyParams:
@@ -49,9 +49,9 @@ def load_params(folder: Path, config_file: Path | None = None) -> PolicyParams:
     Raises:
         ConfigError: if there is none, or it is damaged or unreadable.
     """
-    saved = saved_at(folder)
-    arrays, facts = sealed.read(saved)
-    if config_file is not None and CONFIG in facts and facts[CONFIG] != digest(config_file):
+    saved = policy_file(folder)
+    arrays, facts = sealed.load_sealed(saved)
+    if config_file is not None and CONFIG in facts and facts[CONFIG] != file_digest(config_file):
         raise ConfigError(f"'{config_file}' has changed since the policy beside it was saved; put the old one back")
     tree = {"encoder": {}, **unflatten_dict(arrays, sep="/")}
     if set(tree) != {"encoder", "q"}:
@@ -59,7 +59,7 @@ def load_params(folder: Path, config_file: Path | None = None) -> PolicyParams:
     return PolicyParams(encoder=tree["encoder"], q=tree["q"])
 
 
-def saved_at(folder: Path) -> Path:
+def policy_file(folder: Path) -> Path:
     """Returns the file of the policy in a run's `checkpoints/`.
 
     Raises:

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from edqn_jax.errors import ConfigError, DamagedError
-from edqn_jax.files import unwritable
+from edqn_jax.files import write_error
 
 SUFFIX = ".safetensors"
 
@@ -31,7 +31,7 @@ _OPEN = "0" * 64  # the digits of a seal that is yet to be made
 _SPARE = 10_000_000  # bytes that stay free on the disk, beside what a file takes
 
 
-def write(file: Path, arrays: Mapping[str, Any], texts: Mapping[str, str]) -> None:
+def write_sealed(file: Path, arrays: Mapping[str, Any], texts: Mapping[str, str]) -> None:
     """Writes a file in place of the one before; when it returns, all of it is on the disk.
 
     Until then the one before is whole. Only the calling process writes, even if it is one of several.
@@ -60,17 +60,17 @@ def write(file: Path, arrays: Mapping[str, Any], texts: Mapping[str, str]) -> No
             opened.write(header.replace(_OPEN.encode(), summed.hexdigest().encode(), 1))
             for piece in data:
                 opened.write(piece)
-        sync(partial)
+        sync_to_disk(partial)
         partial.replace(file)
-        sync(file.parent)
+        sync_to_disk(file.parent)
     except OSError as error:
         with contextlib.suppress(OSError):
             partial.unlink(missing_ok=True)
-        raise unwritable(file, error.strerror) from None
+        raise write_error(file, error.strerror) from None
 
 
-def read(file: Path) -> tuple[dict[str, np.ndarray], dict[str, str]]:
-    """Returns arrays and texts of a file that `write` wrote, if it is as it was written, to the last bit.
+def load_sealed(file: Path) -> tuple[dict[str, np.ndarray], dict[str, str]]:
+    """Returns arrays and texts of a file that `write_sealed` wrote, if it is as it was written, to the last bit.
 
     Raises:
         DamagedError: if a bit of it has changed, or it was cut.
@@ -97,13 +97,13 @@ def read(file: Path) -> tuple[dict[str, np.ndarray], dict[str, str]]:
         raise ConfigError(f"'{file}' does not hold the arrays that it names") from None
 
 
-def digest(file: Path) -> str:
+def file_digest(file: Path) -> str:
     """Returns the SHA-256 of a file, in hexadecimal digits."""
     with file.open("rb") as opened:
         return hashlib.file_digest(opened, "sha256").hexdigest()
 
 
-def sync(path: Path) -> None:
+def sync_to_disk(path: Path) -> None:
     """Writes what the system still holds of a file or folder to the disk; of a file alone where folders cannot be."""
     if os.name == "nt" and path.is_dir():
         return

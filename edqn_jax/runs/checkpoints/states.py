@@ -19,7 +19,7 @@ import jax
 import numpy as np
 
 from edqn_jax.errors import ConfigError, DamagedError
-from edqn_jax.files import unwritable
+from edqn_jax.files import write_error
 from edqn_jax.runs.checkpoints import sealed
 from edqn_jax.version import package_version
 
@@ -30,7 +30,7 @@ _PIECE = 1 << 20  # bytes
 
 @dataclasses.dataclass(frozen=True)
 class Checkpoint:
-    """What a run is continued from."""
+    """Arrays and texts that a run is continued from."""
 
     arrays: dict[str, np.ndarray]
     """Train state and the parameters kept so far, by name; none of them is empty."""
@@ -44,7 +44,7 @@ class Checkpoint:
     """Where it was read from."""
 
 
-def save(folder: Path, step: int, checkpoint: Checkpoint, keep: int) -> Path:
+def save_checkpoint(folder: Path, step: int, checkpoint: Checkpoint, keep: int) -> Path:
     """Writes a checkpoint into `folder`, a run's `checkpoints/`, and deletes all but the `keep` newest.
 
     Raises:
@@ -53,14 +53,14 @@ def save(folder: Path, step: int, checkpoint: Checkpoint, keep: int) -> Path:
     file = folder / f"step-{step:09}{sealed.SUFFIX}"
     remove_partials(folder)
     host = json.dumps(checkpoint.host, allow_nan=False)
-    sealed.write(file, checkpoint.arrays, {**checkpoint.facts, _HOST: host, _CONFIG: checkpoint.config})
+    sealed.write_sealed(file, checkpoint.arrays, {**checkpoint.facts, _HOST: host, _CONFIG: checkpoint.config})
     for _, older in list(_newest_first(folder))[keep:]:
         with contextlib.suppress(OSError):
             older.unlink()
     return file
 
 
-def newest(
+def newest_checkpoint(
     folder: Path, usable: Callable[[Checkpoint], None], message: Callable[[str], None], *, set_aside: bool = True
 ) -> Checkpoint | None:
     """Returns the newest checkpoint that is undamaged and usable; None if there never was one.
@@ -97,13 +97,13 @@ def newest(
     return None
 
 
-def versions() -> dict[str, str]:
+def checkpoint_versions() -> dict[str, str]:
     """Returns the versions that a checkpoint belongs to."""
     return {"edqn_jax": package_version(), "jax": jax.__version__}
 
 
-def grown(files: Mapping[str, Path]) -> dict[str, list[Any]]:
-    """Returns length and SHA-256 of each of a run's growing files, written to the disk.
+def log_digests(files: Mapping[str, Path]) -> dict[str, list[Any]]:
+    """Syncs a run's append-only files; returns length and SHA-256 of each.
 
     Raises:
         OSError: if one cannot be read or written to the disk.
@@ -111,13 +111,13 @@ def grown(files: Mapping[str, Path]) -> dict[str, list[Any]]:
     found = {}
     for name, file in files.items():
         if file.is_file():
-            sealed.sync(file)
-            found[name] = [file.stat().st_size, sealed.digest(file)]
+            sealed.sync_to_disk(file)
+            found[name] = [file.stat().st_size, sealed.file_digest(file)]
     return found
 
 
-def check_grown(files: Mapping[str, Path], said: Mapping[str, list[Any]]) -> None:
-    """Raises unless each file begins with what it held when a checkpoint was saved.
+def check_log_prefix(files: Mapping[str, Path], said: Mapping[str, list[Any]]) -> None:
+    """Raises unless each file begins with its content at the time of a checkpoint.
 
     Raises:
         ConfigError: names the first file that does not.
@@ -127,8 +127,8 @@ def check_grown(files: Mapping[str, Path], said: Mapping[str, list[Any]]) -> Non
             raise ConfigError(f"'{files.get(name, name)}' does not begin with what it held when it was saved")
 
 
-def cut_back(files: Mapping[str, Path], said: Mapping[str, list[Any]]) -> None:
-    """Cuts each file to what it held when a checkpoint was saved; deletes those that it did not have.
+def truncate_logs(files: Mapping[str, Path], said: Mapping[str, list[Any]]) -> None:
+    """Truncates each file to its length at a checkpoint; deletes files that did not exist then.
 
     Raises:
         ConfigError: if one cannot be written.
@@ -141,7 +141,7 @@ def cut_back(files: Mapping[str, Path], said: Mapping[str, list[Any]]) -> None:
             else:
                 file.unlink(missing_ok=True)
         except OSError as error:
-            raise unwritable(file, error.strerror) from None
+            raise write_error(file, error.strerror) from None
 
 
 def remove_partials(folder: Path) -> None:
@@ -157,7 +157,7 @@ def _read(file: Path) -> Checkpoint:
     Raises:
         ConfigError: if it is damaged or unreadable.
     """
-    arrays, texts = sealed.read(file)
+    arrays, texts = sealed.load_sealed(file)
     try:
         host, config = json.loads(texts.pop(_HOST)), texts.pop(_CONFIG)
     except (ValueError, KeyError, TypeError, RecursionError):
@@ -177,7 +177,7 @@ def _set_aside(file: Path) -> None:
     try:
         file.replace(file.with_name(file.name + ".damaged"))
     except OSError as error:
-        raise unwritable(file, error.strerror) from None
+        raise write_error(file, error.strerror) from None
 
 
 def _digest_of_first(file: Path, length: int) -> str | None:

@@ -1,4 +1,4 @@
-"""What the summary of a run must say, derived from its raw files alone."""
+"""Derives the summary of a run from its raw files alone."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any, TypeGuard
 import numpy as np
 
 from edqn_jax.config import Config
-from edqn_jax.evaluation.judge import Judge, Target, clearance, replay_contact
+from edqn_jax.evaluation.judge import FlightTrack, MujocoWorld, clearance, replay_contact
 from edqn_jax.evaluation.metrics import EMPTY_M
 from edqn_jax.evaluation.missions import RunMissions
 from edqn_jax.evaluation.trajectories import POSITION, columns_of
@@ -49,17 +49,17 @@ def from_metrics(config: Config, metrics: Sequence[Mapping[str, Any]]) -> dict[s
 
 
 def from_trajectory(
-    config: Config, missions: RunMissions, judge: Judge, recorded: Mapping[str, np.ndarray]
+    config: Config, missions: RunMissions, judge: MujocoWorld, recorded: Mapping[str, np.ndarray]
 ) -> tuple[dict[str, Any], dict[str, float]]:
     """Returns what `summary.json` must say of the recorded flight, and how far numbers may be off; C MuJoCo judges."""
-    flown = missions.final.world.missions
-    start, goal = np.asarray(flown.start[0], np.float64), np.asarray(flown.goal[0], np.float64)
+    pool_missions = missions.final.world.missions
+    start, goal = np.asarray(pool_missions.start[0], np.float64), np.asarray(pool_missions.goal[0], np.float64)
     positions = columns_of(recorded, POSITION)
     path = np.concatenate([start[None], positions])
     lengths = np.linalg.norm(np.diff(path, axis=0), axis=1)
     steps, seconds, decision = len(positions), float(recorded["t"][-1]), config.drone.physics_steps
     step_s = config.drone.physics_dt_s
-    target = Target(start, goal, path[::decision], step_s * decision)
+    target = FlightTrack(start, goal, path[::decision], step_s * decision)
     contact = replay_contact(judge, path, step_s, target)
     ends = [clearance(judge, point, step_s * row, target)[0] for row, point in enumerate(path)]
     if contact is not None:
@@ -96,12 +96,12 @@ def from_trajectory(
     }
 
 
-def same(one: Any, other: Any, within: float = 0.0) -> bool:
+def is_same(one: Any, other: Any, within: float = 0.0) -> bool:
     """Returns whether two values of JSON are equal, numbers up to the digits of files or `within`."""
     if isinstance(one, Mapping) and isinstance(other, Mapping):
-        return one.keys() == other.keys() and all(same(one[name], other[name]) for name in one)
+        return one.keys() == other.keys() and all(is_same(one[name], other[name]) for name in one)
     if isinstance(one, Sequence) and isinstance(other, Sequence) and not isinstance(one, str):
-        return len(one) == len(other) and all(map(same, one, other))
+        return len(one) == len(other) and all(map(is_same, one, other))
     if _is_number(one) and _is_number(other):
         if min(one, other) >= EMPTY_M:  # clearances where there is nothing to hit
             return True

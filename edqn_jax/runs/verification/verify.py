@@ -17,40 +17,40 @@ import jax
 import numpy as np
 
 from edqn_jax.config import Config
-from edqn_jax.devices.hardware import processor
+from edqn_jax.devices.hardware import describe_processor
 from edqn_jax.errors import ConfigError
 from edqn_jax.evaluation.metrics import flight_summary
 from edqn_jax.evaluation.missions import RunMissions, missions_of_runs
 from edqn_jax.evaluation.rollouts import fly_on_all_devices
-from edqn_jax.evaluation.trajectories import trajectory
+from edqn_jax.evaluation.trajectories import flight_trajectory
 from edqn_jax.evaluation.verdicts import check_verdicts, judges_of
 from edqn_jax.learn import saved_state
 from edqn_jax.learn.policy import PolicyParams
 from edqn_jax.learn.trainer import Trainer
 from edqn_jax.planning.astar import shortest_path
 from edqn_jax.policies import no_run
+from edqn_jax.runs.checkpointer import agent_array_name
 from edqn_jax.runs.checkpoints import states
 from edqn_jax.runs.checkpoints.states import Checkpoint
-from edqn_jax.runs.continuation import begun
+from edqn_jax.runs.continuation import find_run
 from edqn_jax.runs.directory import RunDirectory
-from edqn_jax.runs.keeper import kept_name
 from edqn_jax.runs.policies import load_run
-from edqn_jax.runs.provenance import digest_of, versions, workload
+from edqn_jax.runs.provenance import describe_workload, digest_of, package_versions
 from edqn_jax.runs.summaries import of_all_seeds, of_tests
-from edqn_jax.runs.verification.derived import DIGITS, from_metrics, from_trajectory, same
+from edqn_jax.runs.verification.derived import DIGITS, from_metrics, from_trajectory, is_same
 from edqn_jax.runs.world_copy import WORLD
 from edqn_jax.sim.task import group
 from edqn_jax.sim.task.flights import Flights
 from edqn_jax.training.selection import first_success
 
 _OF_A_CHECKPOINT = ("resumed_at_decisions", "reward", "first_success_seconds")
-"""What only a checkpoint tells."""
+"""Keys of a summary that only a checkpoint can verify."""
 
 NOT_DERIVED = (
     *("compile_seconds", "total_seconds", "checkpoint_seconds", "devices", "processor", "versions", "figures"),
     *("state_digest", "trained_together"),
 )
-"""What `summary.json` says of clocks and machine, which nothing else tells, and what is verified by itself."""
+"""Keys of `summary.json` about clocks and machine, which cannot be derived, and keys that are verified separately."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -64,7 +64,7 @@ class Finding:
     """None where there is nothing left to compare."""
 
 
-def verify(folder: Path, message: Callable[[str], None] = lambda _: None) -> list[Finding]:
+def verify_run(folder: Path, message: Callable[[str], None] = lambda _: None) -> list[Finding]:
     """Verifies a finished run, or those of all seeds that were trained together.
 
     Args:
@@ -83,14 +83,14 @@ def verify(folder: Path, message: Callable[[str], None] = lambda _: None) -> lis
 
 
 def _verified(folder: Path, message: Callable[[str], None]) -> list[Finding]:
-    found = begun(folder)
+    found = find_run(folder)
     if found is None:
         raise no_run(folder)
     run = RunDirectory(folder)
     runs = [run] if found.seeds is None else [run.of_seed(found.config.train.seed + k) for k in range(found.seeds)]
     policies = [load_run(each.path) for each in runs]
     configs, summaries = [config for config, _ in policies], [_read_summary(each) for each in runs]
-    if group.several(configs[0]):
+    if group.is_multi_drone(configs[0]):
         raise ConfigError(
             f"`edqn verify` is for runs of one drone, and env.drones is {configs[0].env.drones}: "
             "C MuJoCo, which judges collisions, knows of no other drones"
@@ -101,7 +101,7 @@ def _verified(folder: Path, message: Callable[[str], None]) -> list[Finding]:
         recorded = [summary["state_digest"] for summary in summaries]
         findings += _of_checkpoint(checkpoint, run, runs, configs, missions, recorded, found.seeds)
         findings.append(_of_policies(checkpoint, configs, [params for _, params in policies]))
-    flown = []
+    flights_of_seeds = []
     for number, (each, summary, of_run) in enumerate(zip(runs, summaries, missions, strict=True)):
         config, params = policies[number]
         message(f"flying {of_run.final.world.missions.scene.shape[0]} missions of '{each.path}' again")
@@ -112,16 +112,16 @@ def _verified(folder: Path, message: Callable[[str], None]) -> list[Finding]:
             dataclasses.replace(finding, what=name + finding.what)
             for finding in _of_agent(each, config, of_run, summary, flights, agent)
         ]
-        flown.append(flights)
+        flights_of_seeds.append(flights)
     if found.seeds is not None:
-        derived = of_all_seeds(configs[0], missions[0].tests, flown, summaries)
+        derived = of_all_seeds(configs[0], missions[0].tests, flights_of_seeds, summaries)
         findings.append(_compared("summary.json of all seeds", _read_summary(run), derived))
     return findings
 
 
 @dataclasses.dataclass(frozen=True)
 class _Saved:
-    """What the last checkpoint knows of an agent's run beside its state."""
+    """Facts of an agent's run in the last checkpoint, beside its state."""
 
     agent: dict[str, Any]
     host: dict[str, Any]
@@ -140,7 +140,7 @@ def _read_summary(run: RunDirectory) -> dict[str, Any]:
     Raises:
         ConfigError: if there is none.
     """
-    if not run.finished:
+    if not run.is_finished:
         raise ConfigError(
             f"the run in '{run.path}' is not finished; continue it with edqn train --run-dir '{run.path}'"
         )
@@ -151,10 +151,10 @@ def _read_summary(run: RunDirectory) -> dict[str, Any]:
 
 
 def _last_checkpoint(run: RunDirectory) -> tuple[Checkpoint | None, list[Finding]]:
-    """Returns the last checkpoint, and what is to be said where there is none that can be read."""
+    """Returns the last checkpoint, and findings if it cannot be read."""
     said: list[str] = []
     try:
-        checkpoint = states.newest(run.checkpoints, lambda _: None, said.append, set_aside=False)
+        checkpoint = states.newest_checkpoint(run.checkpoints, lambda _: None, said.append, set_aside=False)
     except ConfigError as error:
         return None, [Finding("last checkpoint", said[0] if said else str(error), False)]
     if said:
@@ -178,7 +178,7 @@ def _of_checkpoint(
     worlds = [each.training.world for each in missions]
     trainer = Trainer(configs[0], worlds[0] if seeds is None else worlds, jax.devices()[:1])
     done = checkpoint.host["done"]
-    expected = saved_state.expected(trainer, done).items()
+    expected = saved_state.state_shapes(trainer, done).items()
     arrays = [checkpoint.arrays.get(name, np.zeros(shape, kind)) for name, (shape, kind) in expected]
     digests = [digest_of(arrays if seeds is None else [array[k] for array in arrays]) for k in range(len(configs))]
     alike = digests == list(recorded)
@@ -191,7 +191,7 @@ def _of_checkpoint(
     findings.append(Finding("config.yaml", f"it is {_not(alike)}as at the last checkpoint", alike))
     said = checkpoint.host["files"]
     files = {str(f.relative_to(run.path)): f for each in runs for f in (each.metrics_file, each.episodes_file)}
-    differ = [name for name, file in files.items() if states.grown({name: file}) != {name: said.get(name)}]
+    differ = [name for name, file in files.items() if states.log_digests({name: file}) != {name: said.get(name)}]
     findings.append(
         Finding(
             "metrics.jsonl and episodes.csv",
@@ -210,7 +210,7 @@ def _of_policies(checkpoint: Checkpoint, configs: Sequence[Config], policies: Se
             continue  # ended before its first validation: the checkpoint holds none
         compared += 1
         for path, leaf in jax.tree_util.tree_leaves_with_path(params):
-            held = checkpoint.arrays.get(kept_name(number, path))
+            held = checkpoint.arrays.get(agent_array_name(number, path))
             if np.size(leaf) and (held is None or not np.array_equal(held, leaf)):
                 return Finding("policy", "it is not the one that the last checkpoint says the run ended with", False)
     if compared == 0:
@@ -226,7 +226,7 @@ def _of_agent(
     flights: Flights,
     saved: _Saved | None,
 ) -> list[Finding]:
-    """Returns what is found of one agent's run."""
+    """Returns the findings of one agent's run."""
     first = judges_of(config, missions.final)[int(missions.final.world.missions.scene[0])]
     metrics, recorded = run.read_metrics(), run.read_trajectory()
     of_training = from_metrics(config, metrics)
@@ -235,7 +235,7 @@ def _of_agent(
     described = {
         "shortest_path_m": shortest_path(scene, scene.start, scene.goal, config.drone.body_radius_m).length_m,
         "seed": config.train.seed,
-        "workload": workload(config, missions.training.scene()),
+        "workload": describe_workload(config, missions.training.scene()),
     }
     worlds = {"world": config.world.name, "flown": config.world.flown or config.world.name}
     # The file of a world that has moved is the run's own copy.
@@ -250,8 +250,8 @@ def _of_agent(
         _compared("summary.json from trajectory.csv", summary, of_flight, within),
         _compared("summary.json from config.yaml and world", summary, described),
         *([] if saved is None else [_compared("summary.json from the last checkpoint", summary, told)]),
-        *_untold(summary, {*of_training, *of_flight, *described, *told, *worlds}, missions.tests > 0),
-        _flown_again(config, summary, recorded, flights, elsewhere),
+        *_unverified_keys(summary, {*of_training, *of_flight, *described, *told, *worlds}, missions.tests > 0),
+        _fly_again(config, summary, recorded, flights, elsewhere),
         *_tests_again(missions, summary, flights, elsewhere),
         Finding(
             "verdicts by C MuJoCo",
@@ -261,8 +261,8 @@ def _of_agent(
     ]
 
 
-def _untold(summary: Mapping[str, Any], derived: set[str], tests: bool) -> list[Finding]:
-    """Returns that a summary says what nothing tells, if it does."""
+def _unverified_keys(summary: Mapping[str, Any], derived: set[str], tests: bool) -> list[Finding]:
+    """Returns a finding for keys of a summary that cannot be verified, if there are any."""
     known = derived | {*NOT_DERIVED, *_OF_A_CHECKPOINT} | ({"test"} if tests else set())
     more = sorted(summary.keys() - known)
     return [Finding("summary.json", f"it has {', '.join(more)}, which no run has", False)] if more else []
@@ -289,7 +289,7 @@ def _not(same: bool) -> str:
 
 
 def _episodes_and_metrics(run: RunDirectory, metrics: Sequence[Mapping[str, Any]]) -> Finding:
-    """Returns whether `episodes.csv` and `metrics.jsonl` say the same of every chunk."""
+    """Returns whether `episodes.csv` and `metrics.jsonl` agree on every chunk."""
     what, episodes = "episodes.csv and metrics.jsonl", run.read_episodes()
     before = 0
     for row in metrics:
@@ -299,7 +299,7 @@ def _episodes_and_metrics(run: RunDirectory, metrics: Sequence[Mapping[str, Any]
         share = float(np.mean(ended == "goal")) if len(ended) else None
         mean = float(np.mean(whole)) if len(whole) else None
         alike = row["episodes"] == until and row["diverged"] == np.count_nonzero(ended == "diverged")
-        if not (alike and same(row["success_rate"], share) and same(row["mean_return"], mean, DIGITS * 1e3)):
+        if not (alike and is_same(row["success_rate"], share) and is_same(row["mean_return"], mean, DIGITS * 1e3)):
             return Finding(what, f"they differ in the chunk that ends with decision {row['decisions']:,}", False)
         before = until
     if before != len(episodes["step"]):
@@ -307,7 +307,7 @@ def _episodes_and_metrics(run: RunDirectory, metrics: Sequence[Mapping[str, Any]
     return Finding(what, f"they agree on {before:,} episodes in {len(metrics):,} chunks", True)
 
 
-def _flown_again(
+def _fly_again(
     config: Config,
     summary: Mapping[str, Any],
     recorded: Mapping[str, np.ndarray],
@@ -316,7 +316,7 @@ def _flown_again(
 ) -> Finding:
     """Returns whether the policy flies the recorded flight once more, column by column."""
     what = "the flight, flown again"
-    again, path = flight_summary(flights), trajectory(config, flights)
+    again, path = flight_summary(flights), flight_trajectory(config, flights)
     ended = f"{again['outcome']} after {again['steps']} decisions"
     if elsewhere is not None:
         alike = "as recorded" if again["outcome"] == summary["outcome"] else f"recorded as {summary['outcome']}"
@@ -348,13 +348,13 @@ def _recorded_elsewhere(summary: Mapping[str, Any], saved: _Saved | None) -> str
     device = str(summary["devices"][0]).partition(":")[0]
     if device != jax.default_backend() and (device, jax.default_backend()) != ("cuda", "gpu"):
         return f"on a {device.upper()}"
-    here = versions()
+    here = package_versions()
     recorded = dict(summary["versions"]) | ({} if saved is None else {"jax": saved.versions["jax"]})
     other = {name: said for name, said in recorded.items() if here.get(name) != said}
     if other:
         return "with " + ", ".join(f"{name} {said}" for name, said in other.items())
     machine = _model(summary.get("processor"))
-    return None if machine in (None, _model(processor())) else f"on an {machine}"
+    return None if machine in (None, _model(describe_processor())) else f"on an {machine}"
 
 
 def _model(described: str | None) -> str | None:
@@ -369,7 +369,7 @@ def _compared(
     differ = [
         f"{name} is {recorded.get(name)} and should be {value}"
         for name, value in found.items()
-        if not same(recorded.get(name), value, (within or {}).get(name, 0.0))
+        if not is_same(recorded.get(name), value, (within or {}).get(name, 0.0))
     ]
     if differ:
         return Finding(what, "; ".join(differ), False)

@@ -21,14 +21,14 @@ from edqn_jax.sim.camera import columns, coverage, native, raycast
 from edqn_jax.sim.camera.columns import Frame
 from edqn_jax.sim.camera.coverage import Layers
 from edqn_jax.sim.camera.depth import nearest_depth
-from edqn_jax.sim.camera.primitive import draw_in_one_batch
+from edqn_jax.sim.camera.primitive import render_in_one_batch
 from edqn_jax.sim.camera.raycast import Rays
 from edqn_jax.sim.camera.surfaces import albedo_factor, surfaces_at_eye
-from edqn_jax.sim.camera.texture import texture
+from edqn_jax.sim.camera.texture import texture_factor
 from edqn_jax.sim.scene.scene import Scene
-from edqn_jax.sim.scene.shapes.kind import inverse
+from edqn_jax.sim.scene.shapes.kind import safe_inverse
 from edqn_jax.sim.scene.shapes.plane import HORIZON_M
-from edqn_jax.xla import materialised
+from edqn_jax.xla import materialise_tree
 
 LUMA_WEIGHTS = (0.299, 0.587, 0.114)
 """Weights of R, G and B in Eq. 1."""
@@ -41,7 +41,7 @@ def _factor(
 ) -> Array:
     """Returns the factor [H, W] of plaid or patterns; `shape` is the number of the shape that each pixel shows."""
     if frame.surfaces is None or shape is None:
-        return texture(config, frame.origin, rays, depth, *slopes)
+        return texture_factor(config, frame.origin, rays, depth, *slopes)
     return albedo_factor(frame.surfaces, shape, rays, depth, *slopes)
 
 
@@ -62,30 +62,30 @@ def _backdrop(config: CameraConfig, frame: Frame, rays: Rays) -> Array:
         # The plane's horizon is the line n . d = 0; the part of the pixel below it is covered by the plane.
         approach = normal[0] * rays.dx + normal[1] * rays.dy + normal[2] * rays.dz
         spread = jnp.abs(across) + jnp.abs(along)
-        covered = jnp.clip(0.5 - approach * inverse(spread), 0.0, 1.0)
+        covered = jnp.clip(0.5 - approach * safe_inverse(spread), 0.0, 1.0)
         middle = (approach - spread / 2 + jnp.minimum(approach + spread / 2, 0.0)) / 2
-        t = -height * inverse(middle)
+        t = -height * safe_inverse(middle)
         # On a plane t = h / (n . d), so dt = -t (n . d') / (n . d), exactly.
-        relative = -t * inverse(middle)
+        relative = -t * safe_inverse(middle)
         seen = (middle < 0) & (t > 0) & (t < HORIZON_M) & (t < depth)
         depth = jnp.where(seen, t, depth)
         share = jnp.where(seen, covered, share)
-        shown = jnp.where(seen, raycast.shade(light, *normal) * value["planes"][n], shown)
+        shown = jnp.where(seen, raycast.lambert_shade(light, *normal) * value["planes"][n], shown)
         slopes = jnp.where(seen, relative * across, slopes[0]), jnp.where(seen, relative * along, slopes[1])
         number = jnp.where(seen, first + n, number)
     factor = _factor(config, frame, number, rays, jnp.where(share > 0, depth, 0.0), slopes)
     return behind + share * (shown * factor - behind)
 
 
-def blend(config: CameraConfig, frame: Frame, rays: Rays, layers: Layers) -> Array:
+def blend_layers(config: CameraConfig, frame: Frame, rays: Rays, layers: Layers) -> Array:
     """Returns brightness [H, W] of the layers over ground and sky."""
     behind = _backdrop(config, frame, rays)
     for layer in reversed(layers):
         met = layer.closeness > 0
-        near = jnp.where(met, inverse(layer.closeness), 0.0)
+        near = jnp.where(met, safe_inverse(layer.closeness), 0.0)
         level = layer.slope == coverage.LEVEL_FACE
         right = jnp.where(level, 0.0, -near * near * layer.slope)
-        up = jnp.where(level, -near * inverse(rays.dz) * rays.pitch, 0.0)
+        up = jnp.where(level, -near * safe_inverse(rays.dz) * rays.pitch, 0.0)
         factor = _factor(config, frame, layer.shape, rays, near, (right, up))
         behind = behind + jnp.where(met, layer.value * factor - layer.coverage * behind, 0.0)
     return behind
@@ -96,7 +96,9 @@ def _picture(config: CameraConfig, scene: Scene, origin: Array, rotation: Array,
     if config.mount == "level":
         image = (scene, origin, rotation, weights)
         size = (config.height, config.width)
-        return draw_in_one_batch(columns.pictures, (config, blend), image, size, natively=_pictures_natively)
+        return render_in_one_batch(
+            columns.render_columns, (config, blend_layers), image, size, natively=_pictures_natively
+        )
     value = raycast.albedo_values(scene, weights)
     rays = raycast.camera_rays(config, rotation)
     many = raycast.camera_rays(config, rotation, config.samples_across, config.samples_down)
@@ -105,14 +107,14 @@ def _picture(config: CameraConfig, scene: Scene, origin: Array, rotation: Array,
     layers = coverage.no_layers((config.height, config.width), numbered=surfaces is not None)
     for kind, met in raycast.hits(scene, origin, many, without=("spheres", "planes")).items():
         bright = raycast.brightness_of(light, met, value[kind])
-        layers = coverage.counted_layers(met, bright, first[kind], many, layers)
+        layers = coverage.add_sampled_layers(met, bright, first[kind], many, layers)
     layers = coverage.sphere_layers(config, scene, origin, rays, value, layers)
     sky = jnp.sum(jnp.asarray(light.sky) * weights)
     frame = Frame(origin=origin, heading=rotation[:2, 0], scene=scene, value=value, sky=sky, surfaces=surfaces)
-    return materialised(blend(config, frame, rays, layers))
+    return materialise_tree(blend_layers(config, frame, rays, layers))
 
 
-def luma(config: CameraConfig, scene: Scene, position: Array, rotation: Array) -> Array:
+def render_luma(config: CameraConfig, scene: Scene, position: Array, rotation: Array) -> Array:
     """Returns linear luma of the scene, each pixel the average over its area.
 
     Shade and texture multiply R, G and B alike, so the luma of Eq. 1 needs one channel, not three.
@@ -128,8 +130,8 @@ def luma(config: CameraConfig, scene: Scene, position: Array, rotation: Array) -
     return _picture(config, scene, position, rotation, jnp.asarray(LUMA_WEIGHTS))
 
 
-def rgb(config: CameraConfig, scene: Scene, position: Array, rotation: Array) -> Array:
-    """Returns linear RGB seen from `position` [3], metres: [H, W, 3] in [0, 1]; `luma` is its weighted sum in Eq. 1."""
+def render_rgb(config: CameraConfig, scene: Scene, position: Array, rotation: Array) -> Array:
+    """Returns linear RGB [H, W, 3] in [0, 1] from `position` [3], metres; `render_luma` is its weighted sum (Eq. 1)."""
     channels = jax.vmap(lambda weights: _picture(config, scene, position, rotation, weights))(jnp.eye(3))
     return jnp.moveaxis(channels, 0, -1)
 
@@ -143,7 +145,7 @@ def fine_rgb(config: CameraConfig, scale: int, scene: Scene, position: Array, ro
     # Fine pixels need only one ray each, and the body-mounted camera's program is the quickest to compile.
     size = {"width": config.width * scale, "height": config.height * scale}
     lens = dataclasses.replace(config, **size, mount="body", samples_across=1, samples_down=1)
-    return rgb(lens, scene, position, rotation)
+    return render_rgb(lens, scene, position, rotation)
 
 
 def on_screen(linear: Pixels) -> Pixels:
@@ -151,9 +153,9 @@ def on_screen(linear: Pixels) -> Pixels:
     return linear.clip(0.0, 1.0) ** (1 / 2.2)
 
 
-def depth(config: CameraConfig, scene: Scene, position: Array, rotation: Array) -> Array:
+def render_depth(config: CameraConfig, scene: Scene, position: Array, rotation: Array) -> Array:
     """Returns the distance along each pixel's central ray: [H, W] metres, inf where the ray meets nothing."""
-    nearest = draw_in_one_batch(
+    nearest = render_in_one_batch(
         _depths, (config,), (scene, position, rotation), (config.height, config.width), natively=_depths_natively
     )
     rays = raycast.camera_rays(config, rotation)
@@ -161,8 +163,8 @@ def depth(config: CameraConfig, scene: Scene, position: Array, rotation: Array) 
 
 
 def _pictures_natively(platform: str, config: CameraConfig, _: columns.Finish, *image: Any) -> Array | None:
-    """Returns brightness [M, H, W] by the library in C, which blends as `blend` does; None where it cannot draw it."""
-    return native.pictures(config, *image) if native.can_draw(config, image[0], platform) else None
+    """Returns brightness [M, H, W] by the library in C, blended as by `blend_layers`; None if unsupported."""
+    return native.render_luma(config, *image) if native.can_render(config, image[0], platform) else None
 
 
 def _depths(config: CameraConfig, scene: Scene, position: Array, rotation: Array) -> Array:
@@ -177,5 +179,7 @@ def _depths(config: CameraConfig, scene: Scene, position: Array, rotation: Array
 def _depths_natively(
     platform: str, config: CameraConfig, scene: Scene, position: Array, rotation: Array
 ) -> Array | None:
-    """Returns `_depths` by the library in C; None where it cannot draw them."""
-    return native.depths(config, scene, position, rotation) if native.can_draw(config, scene, platform) else None
+    """Returns `_depths` by the library in C; None if unsupported."""
+    return (
+        native.render_depth(config, scene, position, rotation) if native.can_render(config, scene, platform) else None
+    )

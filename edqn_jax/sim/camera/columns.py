@@ -30,7 +30,7 @@ from edqn_jax.sim.camera.surfaces import surfaces_at_eye
 from edqn_jax.sim.scene.scene import Scene, no_shapes
 from edqn_jax.sim.scene.shapes.kind import TINY
 from edqn_jax.sim.scene.surface import Surface
-from edqn_jax.xla import materialised
+from edqn_jax.xla import materialise_tree
 
 SLOTS = (0, 2, 4, 8)
 """Capacities of the branches, upright shapes per column; columns with more are drawn in a loop over their shapes."""
@@ -70,7 +70,7 @@ class _Rows:
     @classmethod
     def of(cls, frames: Frame) -> _Rows:
         _, frame = ravel_pytree(jax.tree.map(lambda x: jnp.zeros(x.shape[1:]), frames))
-        return cls(materialised(jax.vmap(lambda one: ravel_pytree(one)[0])(frames)), frame)
+        return cls(materialise_tree(jax.vmap(lambda one: ravel_pytree(one)[0])(frames)), frame)
 
     def take(self, numbers: Array) -> Frame:
         """Returns the frames of these numbers, [B, ...]."""
@@ -84,14 +84,14 @@ Branch = Callable[[CameraConfig, Finish, Array], Array]
 """Draws the columns numbered [B] of a batch: brightness [B, H]."""
 
 
-def pictures(
+def render_columns(
     config: CameraConfig, finish: Finish, scene: Scene, origin: Array, rotation: Array, weights: Array
 ) -> Array:
     """Returns brightness [M, H, W] of scenes from origin [3], metres, and rotation [3, 3] under weights [3] of RGB.
 
     Every array has a leading [M]. All frames must come in one batch: only together can their columns be sorted.
     """
-    branches, branch = draw_branches(config, scene, origin, rotation, weights)
+    branches, branch = render_branches(config, scene, origin, rotation, weights)
 
     # Sorted by the branch that they need, in blocks; each block takes the branch of its last column, the fullest.
     count, width = origin.shape[0], config.width
@@ -102,7 +102,7 @@ def pictures(
     if blocks == 1:
         # There is nothing to sort, and the last branch alone compiles several times faster than all of them.
         drawn = branches[-1](config, finish, numbers)
-        return materialised(drawn.reshape(count, width, config.height).swapaxes(1, 2))
+        return materialise_tree(drawn.reshape(count, width, config.height).swapaxes(1, 2))
     order = jnp.sort(branch * size + numbers) % size
     padded = jnp.concatenate([order, jnp.broadcast_to(order[-1], (blocks * block - size,))])
     drawn = lax.map(
@@ -111,17 +111,17 @@ def pictures(
     )
     place = jnp.zeros(size, jnp.int32).at[order].set(numbers, unique_indices=True)
     unsorted = drawn.reshape(-1, config.height).at[place].get(mode="promise_in_bounds")
-    return materialised(unsorted.reshape(count, width, config.height).swapaxes(1, 2))
+    return materialise_tree(unsorted.reshape(count, width, config.height).swapaxes(1, 2))
 
 
-def draw_branches(
+def render_branches(
     config: CameraConfig, scene: Scene, origin: Array, rotation: Array, weights: Array
 ) -> tuple[list[Branch], Array]:
     """Returns the branches, ordered by capacity, and [Q] the index of the first that suffices for each column.
 
     Every array has a leading [M]; origins are in metres.
     """
-    frames, tables = materialised(jax.vmap(partial(_frame, config))(scene, origin, rotation, weights))
+    frames, tables = materialise_tree(jax.vmap(partial(_frame, config))(scene, origin, rotation, weights))
     words = jax.vmap(partial(_presence, config))(tables)
     return _branches(config, frames, tables, words)
 
@@ -155,20 +155,20 @@ def _presence(config: CameraConfig, table: Array) -> Array:
 
 
 def _branches(config: CameraConfig, frames: Frame, tables: Array, words: Array) -> tuple[list[Branch], Array]:
-    """Returns `draw_branches` of frames, their tables [M, N + 1, F] and the presence words [M, words, C]."""
+    """Returns `render_branches` of frames, their tables [M, N + 1, F] and the presence words [M, words, C]."""
     shapes, spheres = tables.shape[1] - 1, frames.scene.spheres.radius.shape[1]
     capacities = [n for n in SLOTS if n < shapes] + ([shapes] if shapes <= SLOTS[-1] else [])
     present = jnp.sum(lax.population_count(words), axis=1)
     needed = jnp.sum(jnp.stack([present > n for n in capacities]), axis=0, dtype=jnp.int32)
     batch = _Batch(_Rows.of(frames), tables, words)
-    branches: list[Branch] = [partial(_draw, batch, n, spheres > 0 and n == capacities[-1]) for n in capacities]
+    branches: list[Branch] = [partial(_render, batch, n, spheres > 0 and n == capacities[-1]) for n in capacities]
     if spheres:
         seen = jax.vmap(partial(coverage.spheres_in_columns, config))(
             frames.scene.spheres, frames.origin, frames.heading
         )
         needed = jnp.where(seen, jnp.maximum(needed, len(capacities) - 1), needed)
     if shapes > capacities[-1]:
-        branches.append(partial(_draw, batch, None, True))
+        branches.append(partial(_render, batch, None, True))
     return branches, needed.reshape(-1)
 
 
@@ -191,7 +191,9 @@ class _Columns:
     words: list[Array]  # each [B], presence
 
 
-def _draw(batch: _Batch, slots: int | None, spheres: bool, config: CameraConfig, finish: Finish, which: Array) -> Array:
+def _render(
+    batch: _Batch, slots: int | None, spheres: bool, config: CameraConfig, finish: Finish, which: Array
+) -> Array:
     """Returns brightness [B, H] of the columns numbered `which` [B].
 
     Args:
@@ -200,8 +202,8 @@ def _draw(batch: _Batch, slots: int | None, spheres: bool, config: CameraConfig,
     """
     columns = _take_columns(config, batch, which)
     if slots is None:
-        return _draw_any_number(config, finish, batch, columns, spheres)
-    return _draw_in_slots(config, finish, batch, columns, slots, spheres)
+        return _render_any_number(config, finish, batch, columns, spheres)
+    return _render_in_slots(config, finish, batch, columns, slots, spheres)
 
 
 def _take_columns(config: CameraConfig, batch: _Batch, which: Array) -> _Columns:
@@ -212,7 +214,7 @@ def _take_columns(config: CameraConfig, batch: _Batch, which: Array) -> _Columns
     return _Columns(number, frame, u, words)
 
 
-def _draw_in_slots(
+def _render_in_slots(
     config: CameraConfig, finish: Finish, batch: _Batch, columns: _Columns, slots: int, spheres: bool
 ) -> Array:
     """Returns brightness [B, H] of columns that at most `slots` upright shapes cover."""
@@ -228,7 +230,7 @@ def _draw_in_slots(
     return jax.vmap(one)(columns.frame, columns.u, sides)
 
 
-def _draw_any_number(config: CameraConfig, finish: Finish, batch: _Batch, columns: _Columns, spheres: bool) -> Array:
+def _render_any_number(config: CameraConfig, finish: Finish, batch: _Batch, columns: _Columns, spheres: bool) -> Array:
     """Returns brightness [B, H] of columns that any number of upright shapes cover, one shape after another."""
     layers = jax.vmap(lambda f, u: _layers_of_others(config, f, u, coverage.DEPTH_OF_LAYERS, spheres))(
         columns.frame, columns.u
@@ -255,7 +257,7 @@ def _layers_of_others(config: CameraConfig, frame: Frame, u: Array, depth: int, 
     many, rays = _rays(config, frame, u, config.samples_across, config.samples_down), _rays(config, frame, u)
     for kind, met in raycast.hits(frame.scene, frame.origin, many, without=EXACT).items():
         bright = raycast.brightness_of(light, met, frame.value[kind])
-        layers = coverage.counted_layers(met, bright, first[kind], many, layers)
+        layers = coverage.add_sampled_layers(met, bright, first[kind], many, layers)
     if spheres:
         layers = coverage.sphere_layers(config, frame.scene, frame.origin, rays, frame.value, layers)
     return layers
@@ -278,7 +280,7 @@ def _take_sides(
     own, numbers = columns.frame.scene.daylight, None if columns.frame.surfaces is None else index
     light = own if own is None else dataclasses.replace(own, sun=jnp.moveaxis(own.sun, -1, 0))
     light = raycast.daylight_of(config, light)
-    return words, coverage.sides(config, light, picked, mixed, boxes, columns.frame.heading, columns.u, numbers)
+    return words, coverage.column_sides(config, light, picked, mixed, boxes, columns.frame.heading, columns.u, numbers)
 
 
 def _take_one(words: list[Array], none: int) -> tuple[Array, list[Array]]:

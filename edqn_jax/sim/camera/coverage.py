@@ -22,14 +22,14 @@ from edqn_jax.sim.camera.raycast import (
     daylight_of,
     direction_of,
     first_numbers,
+    lambert_shade,
     pitch_of,
-    shade,
 )
 from edqn_jax.sim.scene.scene import Scene, Spheres, UprightBoxes, UprightCylinders
-from edqn_jax.sim.scene.shapes.kind import TINY, Hits, inverse, per_shape
+from edqn_jax.sim.scene.shapes.kind import TINY, Hits, per_shape, safe_inverse
 from edqn_jax.sim.scene.shapes.sphere import nearest_to_centre
 from edqn_jax.sim.scene.surface import Daylight
-from edqn_jax.xla import materialised
+from edqn_jax.xla import materialise_tree
 
 NEAR_M = 0.05
 """Shapes are clipped at this depth before they are projected; the body sphere is wider."""
@@ -70,7 +70,7 @@ def _pick(where: Array, a: Array | None, b: Array | None) -> Array | None:
     return None if a is None or b is None else jnp.where(where, a, b)
 
 
-def insert(layers: Layers, new: Layer) -> Layers:
+def insert_layer(layers: Layers, new: Layer) -> Layers:
     """Adds one shape's layer and keeps the nearest at every pixel. Where its coverage is 0 its closeness must be 0."""
     kept = []
     for old in layers:
@@ -105,7 +105,7 @@ def _extent_of_boxes(boxes: UprightBoxes, origin: Array, forward: Array) -> tupl
     ahead, right = x * forward[0] + y * forward[1], x * forward[1] - y * forward[0]
     # Corners in front, and where edges cross the near plane.
     ahead_next, right_next = jnp.roll(ahead, -1, axis=1), jnp.roll(right, -1, axis=1)
-    share = (NEAR_M - ahead) * inverse(ahead_next - ahead)
+    share = (NEAR_M - ahead) * safe_inverse(ahead_next - ahead)
     crossing = (ahead < NEAR_M) != (ahead_next < NEAR_M)
     u = jnp.concatenate([right / jnp.maximum(ahead, NEAR_M), (right + share * (right_next - right)) / NEAR_M], axis=1)
     shown = jnp.concatenate([ahead >= NEAR_M, crossing], axis=1)
@@ -165,14 +165,14 @@ def _boxes_in_table(
     fx, fy = cos * heading[0] + sin * heading[1], cos * heading[1] - sin * heading[0]
     hx, hy, sx, sy, zero = boxes.half[:, 0], boxes.half[:, 1], jnp.sign(bx), jnp.sign(by), jnp.zeros_like(cos)
     # Of two opposite faces a ray enters by the one on the eye's side.
-    x_face = value * shade(light, sx * cos, sx * sin, zero)
-    y_face = value * shade(light, -sy * sin, sy * cos, zero)
+    x_face = value * lambert_shade(light, sx * cos, sx * sin, zero)
+    y_face = value * lambert_shade(light, -sy * sin, sy * cos, zero)
     # The edge between the two.
     ex, ey = sx * hx - bx, sy * hy - by
-    corner = (ex * fy - ey * fx) * inverse(ex * fx + ey * fy)
+    corner = (ex * fy - ey * fx) * safe_inverse(ex * fx + ey * fy)
     heights = _heights(config, light, boxes.position[:, 2] - origin[2], boxes.half[:, 2], value)
     # Computed once: a GPU would otherwise compute each number for itself, with all that it depends on.
-    found = materialised([left, right, *heights, bx, by, fx, fy, hx, hy, x_face, y_face, corner])
+    found = materialise_tree([left, right, *heights, bx, by, fx, fy, hx, hy, x_face, y_face, corner])
     return jnp.stack(found, axis=1)
 
 
@@ -189,7 +189,7 @@ def _heights(config: CameraConfig, light: Daylight, middle: Array, half: Array, 
     """Returns bottom, top and visible horizontal face (0: none), each in rows x metres, and the face's brightness."""
     bottom, top = (middle - half) / pitch_of(config), (middle + half) / pitch_of(config)
     zero = jnp.zeros(())
-    above, below = shade(light, zero, zero, zero + 1), shade(light, zero, zero, zero - 1)
+    above, below = lambert_shade(light, zero, zero, zero + 1), lambert_shade(light, zero, zero, zero - 1)
     # The top from above, the bottom from below, none in between.
     cap = jnp.where(top < 0, top, jnp.maximum(bottom, 0.0))
     return bottom, top, cap, value * jnp.where(top < 0, above, below)
@@ -203,7 +203,7 @@ def _box_sides(values: tuple[Array, ...], low: Array, high: Array) -> tuple[Arra
     bx, by, fx, fy, hx, hy, x_face, y_face, corner = values
 
     def slabs(u: Array) -> tuple[Array, ...]:
-        ix, iy = inverse(fx + u * fy), inverse(fy - u * fx)
+        ix, iy = safe_inverse(fx + u * fy), safe_inverse(fy - u * fx)
         return ix, iy, -bx * ix, -by * iy, hx * jnp.abs(ix), hy * jnp.abs(iy)
 
     ix, iy, mx, my, reach_x, reach_y = slabs((low + high) / 2)
@@ -214,7 +214,7 @@ def _box_sides(values: tuple[Array, ...], low: Array, high: Array) -> tuple[Arra
         _, _, mx, my, reach_x, reach_y = slabs(u)
         return jnp.where(mx - reach_x > my - reach_y, x_face, y_face)
 
-    share = jnp.clip((corner - low) * inverse(high - low), 0.0, 1.0)
+    share = jnp.clip((corner - low) * safe_inverse(high - low), 0.0, 1.0)
     at_low, at_high = face(low), face(high)
     side = jnp.where(at_low == at_high, at_low, share * at_low + (1 - share) * at_high)
     return jnp.maximum(mx - reach_x, my - reach_y), jnp.minimum(mx + reach_x, my + reach_y), side, lean
@@ -235,11 +235,11 @@ def _cylinder_sides(
     per_radius = 1.0 / jnp.maximum(radius, TINY)
     nx, ny = (ox + enter * dx) * per_radius, (oy + enter * dy) * per_radius
     # On the tangent plane n . (t d) is constant, so 1/t changes like n . d.
-    lean = (nx * sin - ny * cos) * inverse(nx * dx + ny * dy)
-    return enter, s + reach, value * shade(light, nx, ny, jnp.zeros_like(nx)), lean
+    lean = (nx * sin - ny * cos) * safe_inverse(nx * dx + ny * dy)
+    return enter, s + reach, value * lambert_shade(light, nx, ny, jnp.zeros_like(nx)), lean
 
 
-def sides(
+def column_sides(
     config: CameraConfig,
     light: Daylight,
     picked: Array,
@@ -291,16 +291,16 @@ def sides(
         shown * share,
         jnp.where(cap == 0, near, far),  # without a cap, closeness is the side's
         near,
-        inverse(cap),
+        safe_inverse(cap),
         lean * near * pitch,
         *([] if numbers is None else [numbers.astype(jnp.float32)]),
     ]
     # Computed once: XLA would otherwise repeat all of it for every row.
-    return materialised(jnp.moveaxis(materialised(jnp.stack(found)), (0, 1, 2), (2, 1, 0)))
+    return materialise_tree(jnp.moveaxis(materialise_tree(jnp.stack(found)), (0, 1, 2), (2, 1, 0)))
 
 
 def insert_sides(config: CameraConfig, layers: Layers, columns: Array) -> Layers:
-    """Adds the shapes of one column, [K, 11 or 12] of `sides`, to the layers of its pixels [H, 1]."""
+    """Adds the shapes of one column, [K, 11 or 12] of `column_sides`, to the layers of its pixels [H, 1]."""
     for column in columns:
         layers = _insert_side(config, layers, column)
     return layers
@@ -320,7 +320,7 @@ def _insert_side(config: CameraConfig, layers: Layers, column: Array) -> Layers:
         slope=jnp.where(rows_cap > rows_side, LEVEL_FACE, lean),
         shape=jnp.broadcast_to(number[0], coverage.shape) if number else None,
     )
-    return insert(layers, layer)
+    return insert_layer(layers, layer)
 
 
 def spheres_in_columns(config: CameraConfig, spheres: Spheres, origin: Array, heading: Array) -> Array:
@@ -348,17 +348,17 @@ def sphere_layers(
     per_miss = 1.0 / jnp.maximum(jnp.maximum(miss, radius), TINY)
     normal = (ox + depth * dx, oy + depth * dy, oz + depth * dz)
     light, number = daylight_of(config, scene.daylight), first_numbers(value)["spheres"]
-    bright = shade(light, *(n * per_miss for n in normal)) * per_shape(value["spheres"])
+    bright = lambert_shade(light, *(n * per_miss for n in normal)) * per_shape(value["spheres"])
     closeness = jnp.where(coverage > 0, 1.0 / jnp.maximum(depth, NEAR_M), 0.0)
     for n in range(coverage.shape[0]):
         share, flat = coverage[n], jnp.zeros_like(coverage[n])
         shape = None if layers[0].shape is None else jnp.full_like(share, number + n)
         layer = Layer(closeness=closeness[n], coverage=share, value=share * bright[n], slope=flat, shape=shape)
-        layers = insert(layers, layer)
+        layers = insert_layer(layers, layer)
     return layers
 
 
-def counted_layers(met: Hits, brightness: Array, first: int, rays: Rays, layers: Layers) -> Layers:
+def add_sampled_layers(met: Hits, brightness: Array, first: int, rays: Rays, layers: Layers) -> Layers:
     """Adds layers of any shapes from `across` x `down` rays per pixel: the share of rays that meet the shape.
 
     Args:
@@ -372,12 +372,12 @@ def counted_layers(met: Hits, brightness: Array, first: int, rays: Rays, layers:
     rows, columns = shape[0] // rays.down, shape[1] // rays.across
 
     def mean(x: Array) -> Array:
-        return jnp.mean(materialised(x).reshape(rays.down, rows, rays.across, columns), axis=(0, 2))
+        return jnp.mean(materialise_tree(x).reshape(rays.down, rows, rays.across, columns), axis=(0, 2))
 
     def add(layers: Layers, one: tuple[Array, ...]) -> tuple[Layers, None]:
         hit, depth, bright, *number = one
         coverage = mean(hit.astype(jnp.float32))
-        inverse_depth = mean(jnp.where(hit, inverse(depth), 0.0))
+        inverse_depth = mean(jnp.where(hit, safe_inverse(depth), 0.0))
         layer = Layer(
             closeness=inverse_depth / jnp.maximum(coverage, TINY),
             coverage=coverage,
@@ -385,7 +385,7 @@ def counted_layers(met: Hits, brightness: Array, first: int, rays: Rays, layers:
             slope=jnp.zeros_like(coverage),
             shape=jnp.broadcast_to(number[0], coverage.shape) if number else None,
         )
-        return insert(layers, layer), None
+        return insert_layer(layers, layer), None
 
     given = (met.hit, met.depth, brightness)
     many = tuple(jnp.broadcast_to(x, x.shape[:1] + shape) for x in given)

@@ -18,7 +18,7 @@ from jax import Array, lax
 from edqn_jax.sim.camera import raycast
 from edqn_jax.sim.camera.raycast import Rays, direction_of
 from edqn_jax.sim.scene.scene import Scene, UprightBoxes, UprightCylinders
-from edqn_jax.sim.scene.shapes.kind import TINY, inverse, per_shape
+from edqn_jax.sim.scene.shapes.kind import TINY, per_shape, safe_inverse
 
 UNROLLED = 16
 """Shapes that one pass over the pixels compares; between passes a GPU writes all pixels and reads them again."""
@@ -69,7 +69,7 @@ def _boxes(boxes: UprightBoxes, origin: Array, rays: Rays) -> _Intervals:
     dx, dy, _ = direction_of(rays)
     cos, sin = per_shape(jnp.cos(boxes.yaw)), per_shape(jnp.sin(boxes.yaw))
     x, y = (per_shape(boxes.position[:, axis] - origin[axis]) for axis in range(2))
-    per_x, per_y = inverse(cos * dx + sin * dy), inverse(cos * dy - sin * dx)
+    per_x, per_y = safe_inverse(cos * dx + sin * dy), safe_inverse(cos * dy - sin * dx)
     middle = (cos * x + sin * y) * per_x, (cos * y - sin * x) * per_y
     reach = per_shape(boxes.half[:, 0]) * jnp.abs(per_x), per_shape(boxes.half[:, 1]) * jnp.abs(per_y)
     return _Intervals(
@@ -93,6 +93,6 @@ def _cylinders(cylinders: UprightCylinders, origin: Array, rays: Rays) -> _Inter
 
 def _level(middle: Array, half: Array, rays: Rays) -> tuple[Array, Array]:
     """Returns the depths between which rays are between bottom and top: `middle` [N] above the eye +- `half` [N]."""
-    per_z = inverse(rays.dz[None])
+    per_z = safe_inverse(rays.dz[None])
     at, reach = per_shape(middle) * per_z, per_shape(half) * jnp.abs(per_z)
     return at - reach, at + reach

@@ -44,21 +44,24 @@ NOWHERE = 1e29
 """Depths beyond this, in metres, are those of rays that meet nothing."""
 
 
-def can_draw(config: CameraConfig, scene: Scene, platform: str) -> bool:
+def can_render(config: CameraConfig, scene: Scene, platform: str) -> bool:
     """Returns whether the library of "cpu" or "cuda" is at hand and draws such pictures; known when tracing."""
     others = [shapes for kind, shapes in scene.shapes().items() if kind not in OPERANDS]
     plain = config.mount == "level" and not any(shapes.position.shape[-2] for shapes in others)
     shapes = [getattr(getattr(scene, kind), name) for kind, names in OPERANDS.items() for name in names]
     plain = plain and scene.planes.position.shape[-2] <= MOST_PLANES
-    return plain and all(leaf.dtype == jnp.float32 for leaf in shapes) and is_at_hand(platform)
+    return plain and all(leaf.dtype == jnp.float32 for leaf in shapes) and is_available(platform)
 
 
-def pictures(config: CameraConfig, scene: Scene, origin: Array, rotation: Array, weights: Array) -> Array:
-    """Returns brightness [M, H, W] as `columns.pictures` does, origins in metres; leading [L] as in `primitive`."""
+def render_luma(config: CameraConfig, scene: Scene, origin: Array, rotation: Array, weights: Array) -> Array:
+    """Returns brightness [M, H, W] as `columns.render_columns` does; leading [L] as in `primitive`.
+
+    Origins are in metres.
+    """
     return _call("edqn_pictures", config, scene, origin, rotation, weights)
 
 
-def depths(config: CameraConfig, scene: Scene, origin: Array, rotation: Array) -> Array:
+def render_depth(config: CameraConfig, scene: Scene, origin: Array, rotation: Array) -> Array:
     """Returns the depth [M, H, W] metres along the middle ray of each pixel, inf where there is nothing.
 
     As `depth.nearest_depth` does; arrays have a leading [L], see `primitive`.
@@ -95,13 +98,13 @@ def _surfaces(scene: Scene, kind: str) -> Array | np.ndarray:
     return np.zeros((1, 0, SURFACE_NUMBERS), np.float32) if surface is None else surface.numbers
 
 
-def is_at_hand(platform: str) -> bool:
+def is_available(platform: str) -> bool:
     """Returns whether the library of "cpu" or "cuda" is compiled, loaded and registered, which the first call does."""
-    compiler, source = (build.C, SOURCES["c"]) if platform == "cpu" else (build.cuda(), SOURCES["cu"])
-    return compiler is not None and build.registered(source, TARGETS, definitions(), compiler, HEADERS)
+    compiler, source = (build.C, SOURCES["c"]) if platform == "cpu" else (build.cuda_compiler(), SOURCES["cu"])
+    return compiler is not None and build.ensure_registered(source, TARGETS, compiler_definitions(), compiler, HEADERS)
 
 
-def definitions() -> tuple[str, ...]:
+def compiler_definitions() -> tuple[str, ...]:
     """Returns the constants that the sources do not define, NAME=VALUE."""
     numbers = {
         "TINY": TINY,

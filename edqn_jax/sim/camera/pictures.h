@@ -1,5 +1,5 @@
 /* What pictures and depth images of a level camera are made of, for `pictures.c` (CPUs) and `pictures.cu` (GPUs): the
- * functions `columns.pictures` and `depth.nearest_depth` in C.
+ * functions `columns.render_columns` and `depth.nearest_depth` in C.
  *
  * The mathematics, its order and its words are those of `coverage.py`, `camera.py`, `texture.py` and `depth.py`;
  * constants in capitals that are not defined here come from there. M frames, H rows, C columns.
@@ -261,7 +261,7 @@ FN int upright(const Camera* c, const Shapes* s, const Eye* e, int n, Upright* f
   return n < s->boxes ? upright_box(c, s, e, n, found) : upright_cylinder(c, s, e, n - s->boxes, found);
 }
 
-/* Writes what the columns at `u` need of an upright shape (`coverage.sides`): NUMBERS numbers, `stride` apart. */
+/* Writes what the columns at `u` need of an upright shape (`coverage.column_sides`): NUMBERS numbers, `stride` apart. */
 FN void sides(const Camera* c, const Eye* e, const Upright* from, Lanes u, float* numbers, int stride) {
   if (from->is_box)
     box_sides(c, from, u, numbers, stride);
@@ -686,7 +686,7 @@ static inline XLA_FFI_Error* batch_of(XLA_FFI_CallFrame* call, int weighted, Bat
                   "pictures have a texture of at most 8 waves; texture.WAVES must not have more");
   if (b->planes > MOST_PLANES)
     return failed(call, XLA_FFI_Error_Code_INVALID_ARGUMENT,
-                  "pictures have at most 8 planes; native.can_draw must refuse more");
+                  "pictures have at most 8 planes; native.can_render must refuse more");
   return 0;
 }
 

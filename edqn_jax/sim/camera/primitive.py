@@ -21,26 +21,26 @@ from jax.interpreters import batching, mlir
 Static = tuple[Hashable, ...]
 
 
-def draw_in_one_batch(
-    draw: Callable[..., Array],
+def render_in_one_batch(
+    render: Callable[..., Array],
     static: Static,
     arguments: tuple[Any, ...],
     shape: tuple[int, int],
     natively: Callable[..., Array | None],
 ) -> Array:
-    """Returns one picture, [H, W] float32; all pictures that it is mapped to are drawn by one call of `draw`.
+    """Returns one picture, [H, W] float32; all pictures that it is mapped to are drawn by one call of `render`.
 
     Args:
-        draw: `draw(*static, *arguments)` returns pictures [M, H, W] of arguments with a leading [M]. A function of a
+        draw: `render(*static, *arguments)` returns pictures [M, H, W] of arguments with a leading [M]. A function of a
             module, not one made for the call: compiled programs are cached by its identity.
         static: arguments that are known when tracing.
         arguments: pytrees of arrays, of one picture.
         shape: H, W.
         natively: `natively(platform, *static, *arguments)` draws where the program is compiled for "cpu" or "cuda", of
-            arguments with leading [L] (see `_pictures_p`); or returns None if it cannot, and `draw` does.
+            arguments with leading [L] (see `_pictures_p`); or returns None if it cannot, and `render` does.
     """
     leaves, tree = jax.tree.flatten(arguments)
-    parameters = {"draw": draw, "static": static, "tree": tree, "shape": shape, "natively": natively}
+    parameters = {"render": render, "static": static, "tree": tree, "shape": shape, "natively": natively}
     return _pictures_p.bind(*(leaf[None] for leaf in leaves), **parameters)[0]
 
 
@@ -52,24 +52,24 @@ row.
 """
 
 
-def _draw(*leaves: Array, draw: Callable[..., Array], static: Static, tree: Any, **_: Any) -> Array:
+def _render(*leaves: Array, render: Callable[..., Array], static: Static, tree: Any, **_: Any) -> Array:
     count = most_rows(leaves)
-    return draw(
+    return render(
         *static, *jax.tree.unflatten(tree, [jnp.repeat(leaf, count // leaf.shape[0], axis=0) for leaf in leaves])
     )
 
 
-def _draw_natively(
+def _render_natively(
     platform: str,
     *leaves: Array,
-    draw: Callable[..., Array],
+    render: Callable[..., Array],
     natively: Callable[..., Array | None],
     static: Static,
     tree: Any,
     **_: Any,
 ) -> Array:
     found = natively(platform, *static, *jax.tree.unflatten(tree, leaves))
-    return _draw(*leaves, draw=draw, static=static, tree=tree) if found is None else found
+    return _render(*leaves, render=render, static=static, tree=tree) if found is None else found
 
 
 def most_rows(leaves: Sequence[Any]) -> int:
@@ -96,9 +96,9 @@ def _batch(leaves: Sequence[Array], axes: Sequence[int | None], **parameters: An
 
 
 _pictures_p.def_abstract_eval(_abstract)
-_pictures_p.def_impl(jax.jit(_pictures_p.bind, static_argnames=("draw", "static", "tree", "shape", "natively")))
+_pictures_p.def_impl(jax.jit(_pictures_p.bind, static_argnames=("render", "static", "tree", "shape", "natively")))
 batching.primitive_batchers[_pictures_p] = _batch
-mlir.register_lowering(_pictures_p, mlir.lower_fun(_draw, multiple_results=False))
+mlir.register_lowering(_pictures_p, mlir.lower_fun(_render, multiple_results=False))
 for _platform in ("cpu", "cuda"):
-    _lowering = mlir.lower_fun(partial(_draw_natively, _platform), multiple_results=False)
+    _lowering = mlir.lower_fun(partial(_render_natively, _platform), multiple_results=False)
     mlir.register_lowering(_pictures_p, _lowering, platform=_platform)

@@ -141,7 +141,7 @@ def daylight_of(config: CameraConfig, light: Daylight | None) -> Daylight:
     return own if light is None else light
 
 
-def shade(light: Daylight, nx: Array, ny: Array, nz: Array) -> Array:
+def lambert_shade(light: Daylight, nx: Array, ny: Array, nz: Array) -> Array:
     """Returns the Lambert shade [...] of a unit normal under the sun: ambient + (1 - ambient) max(0, n . sun)."""
     sx, sy, sz = light.sun[0], light.sun[1], light.sun[2]
     return light.ambient + (1 - light.ambient) * jnp.maximum(nx * sx + ny * sy + nz * sz, 0.0)
@@ -176,4 +176,4 @@ def first_numbers(values: Values) -> dict[str, int]:
 
 def brightness_of(light: Daylight, met: Hits, value: Array) -> Array:
     """Returns the brightness without texture where rays meet shapes of albedo `value` [N]: shade times it [N, R, C]."""
-    return met.by_side(lambda *normal: shade(light, *normal) * per_shape(value))
+    return met.by_side(lambda *normal: lambert_shade(light, *normal) * per_shape(value))

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from edqn_jax.sim.camera.raycast import Rays
-from edqn_jax.sim.camera.texture import box_filter, wave
+from edqn_jax.sim.camera.texture import box_filter, smooth_wave
 from edqn_jax.sim.scene.scene import Scene
 from edqn_jax.sim.scene.surface import CONTRAST, KIND, PATTERNS, PHASES, SHARES, Surface, blank_surfaces
 
@@ -45,7 +45,7 @@ class Phase(NamedTuple):
 
 def smooth(phase: Phase) -> Array:
     """Returns the average of a wave between -1 and 1 over each pixel: [...]."""
-    return box_filter(phase.right) * box_filter(phase.up) * wave(phase.at)
+    return box_filter(phase.right) * box_filter(phase.up) * smooth_wave(phase.at)
 
 
 def pulse(phase: Phase, width: float | Array) -> Array:
@@ -119,7 +119,7 @@ def _warped(phase: Phase, by: Phase, amount: Array) -> Phase:
     """Returns a phase plus `amount` x a wave of another."""
     f = by.at - jnp.round(by.at)
     slope = amount * (8.0 - 32.0 * jnp.abs(f))
-    return Phase(phase.at + amount * wave(by.at), phase.right + slope * by.right, phase.up + slope * by.up)
+    return Phase(phase.at + amount * smooth_wave(by.at), phase.right + slope * by.right, phase.up + slope * by.up)
 
 
 def _wood(shares: list[Array], phases: list[Phase]) -> Array:

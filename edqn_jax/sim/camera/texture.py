@@ -32,7 +32,7 @@ WAVES = (
 )
 
 
-def wave(phase: Array) -> Array:
+def smooth_wave(phase: Array) -> Array:
     """Returns a smooth wave of period 1 in [-1, 1]: parabolas that approximate sin(2 pi phase)."""
     f = phase - jnp.round(phase)
     return f * (8.0 - 16.0 * jnp.abs(f))
@@ -45,7 +45,7 @@ def box_filter(cycles: Array) -> Array:
 
 
 @partial(jax.jit, static_argnums=0)  # traced once for all layers
-def texture(
+def texture_factor(
     config: CameraConfig, origin: Array, rays: Rays, depth: Array, slope_right: Array, slope_up: Array
 ) -> Array:
     """Returns the texture's factor on each pixel's brightness: [H, W], 1 on average.
@@ -67,5 +67,5 @@ def texture(
         right = (kx * rays.right[0] + ky * rays.right[1] + kz * rays.right[2]) * rays.pitch
         up = (kx * rays.up[0] + ky * rays.up[1] + kz * rays.up[2]) * rays.pitch
         left = box_filter(depth * right + slope_right * along) * box_filter(depth * up + slope_up * along)
-        total = total + each.weight * left * wave(at_origin + depth * along)
+        total = total + each.weight * left * smooth_wave(at_origin + depth * along)
     return 1.0 + config.texture_contrast * total

@@ -18,7 +18,7 @@ from jax import Array
 from edqn_jax.config import DroneConfig
 from edqn_jax.sim.physics.airframe import Airframe
 from edqn_jax.sim.physics.drone import DroneState, Scalars, body_axes, wrap_angle
-from edqn_jax.xla import materialised
+from edqn_jax.xla import materialise_tree
 
 LEAST_LEVELNESS = 0.4
 """Cosine of the tilt beyond which thrust no longer increases to hold the height."""
@@ -26,7 +26,7 @@ LEAST_LEVELNESS = 0.4
 
 @struct.dataclass
 class VelocityCommand:
-    """What the whole controller holds for one decision."""
+    """Setpoints of the controller for one decision."""
 
     velocity: Array  # [3] m/s, world
     heading: Array  # [] radians, where the heading setpoint moves to
@@ -34,7 +34,7 @@ class VelocityCommand:
 
 @struct.dataclass
 class RateCommand:
-    """What the innermost loop alone holds for one decision; velocity, attitude and heading are the pilot's."""
+    """Setpoints of the innermost loop for one decision: thrust and body rates."""
 
     thrust: Array  # [] newtons of all rotors together
     rates: Array  # [3] rad/s about the body's axes
@@ -73,7 +73,7 @@ def _setpoints(config: DroneConfig, state: DroneState, target_yaw: Array) -> Arr
     return state.yaw_setpoint + jnp.clip(wrap_angle(target_yaw - state.yaw_setpoint), -most, most)
 
 
-def thrusts(config: DroneConfig, airframe: Airframe, state: DroneState, velocity_command: Array) -> Array:
+def rotor_thrusts(config: DroneConfig, airframe: Airframe, state: DroneState, velocity_command: Array) -> Array:
     """Returns rotor thrusts [4] newtons towards `velocity_command` [3] m/s (world) and the state's yaw setpoint.
 
     The velocity error gives a wanted specific force, its direction a wanted tilt of the body, the missing turn wanted
@@ -104,14 +104,14 @@ def _thrusts(
     torque = _torque(config, airframe, rates, (p, q, r))
     collective = _collective_thrust(airframe, force[2], axes[2][2])
     # Computed once, and not again for each rotor.
-    return _allocate(config, airframe, *materialised(jnp.stack([*torque, collective])))
+    return _allocate(config, airframe, *materialise_tree(jnp.stack([*torque, collective])))
 
 
 def rate_thrusts(config: DroneConfig, airframe: Airframe, state: DroneState, command: RateCommand) -> Array:
-    """Returns rotor thrusts [4] newtons towards commanded thrust and body rates, within the limits of `thrusts`."""
+    """Returns rotor thrusts [4] newtons for commanded thrust and body rates, within limits of `rotor_thrusts`."""
     p, q, r = command.rates
     torque = _torque(config, airframe, (p, q, r), tuple(state.angular_velocity))
-    return _allocate(config, airframe, *materialised(jnp.stack([*torque, command.thrust])))
+    return _allocate(config, airframe, *materialise_tree(jnp.stack([*torque, command.thrust])))
 
 
 def _wanted_force(config: DroneConfig, airframe: Airframe, error: Scalars) -> Scalars:

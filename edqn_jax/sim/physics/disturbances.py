@@ -1,5 +1,5 @@
-"""What a drone flies against: wind, gusts and drag, another body and other motors than the controller believes in,
-moves that come a decision late, and errors of what it knows of itself.
+"""Disturbances: wind, gusts and drag, body and motors that differ from the controller's model,
+moves that are delayed by a decision, and errors of the state estimate.
 
 All is drawn anew for each episode; with every option off there is no state and nothing is computed.
 
@@ -36,7 +36,7 @@ GUST_STATES = 5
 
 @struct.dataclass
 class Disturbance:
-    """What an episode flies against, and what it carries from step to step; None for everything that is off. R = 4."""
+    """Disturbances of an episode, with the state they carry from step to step; None for all that are off. R = 4."""
 
     ahead: Array | None = None  # [2] horizontal unit vector that the wind blows along, and u of the gusts
     wind: Array | None = None  # [] m/s, steady
@@ -47,7 +47,7 @@ class Disturbance:
     lag_s: Array | None = None  # [] time constant of the thrusts
     thrust: Array | None = None  # [R] newtons, before the gain, as motors that lag have it now
     move: Array | None = (
-        None  # action chosen in the decision before, flown in the next one; None in what `draw` returns
+        None  # action chosen in the decision before, flown in the next one; None in what `sample_disturbance` returns
     )
     position_bias: Array | None = None  # [3] metres
     velocity_bias: Array | None = None  # [3] m/s
@@ -55,7 +55,7 @@ class Disturbance:
 
 @struct.dataclass
 class Load:
-    """What a body bears in one physics step besides its rotors' thrust, and what it is; None is nominal."""
+    """External load on a body in one physics step, and its mass and inertia; None is nominal."""
 
     force: Array | None = None  # [3] newtons at the centre of mass, world
     mass: Array | None = None  # [] flown mass per nominal mass
@@ -63,7 +63,7 @@ class Load:
 
 
 def any_on(config: Config) -> bool:
-    """Returns whether anything disturbs a flight; without it an environment has no `Disturbance`."""
+    """Returns whether any disturbance is on; if not, an environment has no `Disturbance`."""
     return changes_flight(config) or bool(config.env.action_delay) or has_noise(config.noise)
 
 
@@ -83,8 +83,8 @@ def has_noise(noise: NoiseConfig) -> bool:
     return any((noise.position_m, noise.velocity_m_s, noise.position_bias_m, noise.velocity_bias_m_s))
 
 
-def draw(config: Config, hover_thrust: Array, key: Array) -> Disturbance | None:
-    """Returns what an episode flies against, from its beginning on; None if everything is off.
+def sample_disturbance(config: Config, hover_thrust: Array, key: Array) -> Disturbance | None:
+    """Samples the disturbances of an episode; None if all are off.
 
     Args:
         config: which disturbances there are, and their sizes.
@@ -100,7 +100,7 @@ def draw(config: Config, hover_thrust: Array, key: Array) -> Disturbance | None:
     return Disturbance(
         ahead=jnp.stack([jnp.cos(angle), jnp.sin(angle)]) if blows else None,
         wind=jax.random.uniform(wind, maxval=air.wind_m_s) if air.wind_m_s else None,
-        gusts=first_gusts(gusts) if air.gusts_m_s else None,
+        gusts=stationary_gusts(gusts) if air.gusts_m_s else None,
         mass=_share(body.mass_share, (), mass),
         inertia=_share(body.inertia_share, (), inertia),
         gain=_share(motors.gain_share, (4,), gain),
@@ -152,7 +152,7 @@ def gust_scales(air: AirConfig) -> GustScales:
     )
 
 
-def first_gusts(key: Array) -> Array:
+def stationary_gusts(key: Array) -> Array:
     """Returns states of the gusts' filters [GUST_STATES] that are distributed as after a long time; `key` is consumed.
 
     A filter of two states x, y has the covariance [[1, 1/2], [1/2, 1/2]].
@@ -226,7 +226,7 @@ def air_velocity(air: AirConfig, disturbance: Disturbance) -> Array:
     return jnp.stack([cos * along - sin * across, sin * along + cos * across, up])
 
 
-def drag(air: AirConfig, velocity: Array, through: Array) -> Array:
+def drag_force(air: AirConfig, velocity: Array, through: Array) -> Array:
     """Returns the drag [3] newtons on a body at `velocity` [3] m/s in air that moves at `through` [3] m/s, world.
 
     (c + rho / 2 C_d A abs(v)) v with v the velocity of the air relative to the body: linear for the rotors (Faessler,
@@ -242,15 +242,15 @@ def drag(air: AirConfig, velocity: Array, through: Array) -> Array:
 
 
 def white_noise(config: Config, key: Array) -> Array | None:
-    """Returns what drives the gusts of one decision, [physics steps, GUST_STATES]; None without gusts."""
+    """Returns the white noise of one decision's gusts, [physics steps, GUST_STATES]; None without gusts."""
     if not config.air.gusts_m_s:
         return None
     return jax.random.normal(key, (config.drone.physics_steps, GUST_STATES))
 
 
 def load_of(air: AirConfig, disturbance: Disturbance, velocity: Array) -> Load:
-    """Returns what a body that flies at `velocity` [3] m/s (world) bears."""
-    force = drag(air, velocity, air_velocity(air, disturbance)) if has_air(air) else None
+    """Returns the external load on a body at `velocity` [3] m/s (world)."""
+    force = drag_force(air, velocity, air_velocity(air, disturbance)) if has_air(air) else None
     return Load(force=force, mass=disturbance.mass, inertia=disturbance.inertia)
 
 
@@ -275,10 +275,10 @@ def motor_step(
 # ------------------------------------------------------------------------------------ what is known
 
 
-def believed(
+def estimate_state(
     noise: NoiseConfig, disturbance: Disturbance, position: Array, velocity: Array, key: Array
 ) -> tuple[Array, Array]:
-    """Returns own position [3] metres and velocity [3] m/s as the drone believes them to be; `key` is consumed."""
+    """Returns the drone's estimate of its position [3] metres and velocity [3] m/s; `key` is consumed."""
     first, second = jax.random.split(key)
     position = _sum(position, disturbance.position_bias, _normal(noise.position_m, first))
     return position, _sum(velocity, disturbance.velocity_bias, _normal(noise.velocity_m_s, second))

@@ -38,7 +38,7 @@ class Flight:
     time: Array | None = None  # [n] seconds of the episode, in a world that moves
 
 
-def hover(position: Array, yaw: Array) -> DroneState:
+def hover_state(position: Array, yaw: Array) -> DroneState:
     """Returns the state at rest and level at `position` [3] metres, nose and setpoint at `yaw` [] radians."""
     zero = jnp.zeros((), jnp.float32)
     yaw = jnp.asarray(yaw, jnp.float32)

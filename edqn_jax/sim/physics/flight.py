@@ -24,8 +24,8 @@ from edqn_jax.sim.physics.controller import Command, VelocityCommand, control_of
 from edqn_jax.sim.physics.disturbances import Disturbance, Load
 from edqn_jax.sim.physics.drone import DroneState, Flight, body_axes
 from edqn_jax.sim.physics.rigid_body import RigidBody, rigid_body_step
-from edqn_jax.sim.physics.scalarize import number_by_number
-from edqn_jax.xla import materialised
+from edqn_jax.sim.physics.scalarize import scalarize
+from edqn_jax.xla import materialise_tree
 
 with contextlib.redirect_stdout(io.StringIO()):  # it prints that Warp, which is not used here, is missing
     from mujoco import mjx
@@ -139,11 +139,11 @@ def _mjx_step(config: DroneConfig, state: DroneState, applied: Array) -> tuple[A
 
     with jax.numpy_rank_promotion("allow"):  # MJX's own arithmetic relies on it
         # Computed once, and not again for each number that is read.
-        force = materialised(applied)
-        return number_by_number(integrated)(state, materialised(number_by_number(acceleration)(state, force)))
+        force = materialise_tree(applied)
+        return scalarize(integrated)(state, materialise_tree(scalarize(acceleration)(state, force)))
 
 
-def fly(
+def fly_decision(
     config: DroneConfig, airframe: Airframe, state: DroneState, velocity_command: Array, target_yaw: Array
 ) -> tuple[DroneState, Flight]:
     """Flies one decision: `physics_steps` steps at a held `velocity_command` [3] m/s (world).

@@ -26,7 +26,7 @@ Numbers = np.ndarray
 """Constants in their own dtype; or objects, each a constant or a traced array []."""
 
 
-def number_by_number(function: Callable[..., Any]) -> Callable[..., Any]:
+def scalarize(function: Callable[..., Any]) -> Callable[..., Any]:
     """Returns `function` evaluated number by number: the same finite results to rounding.
 
     Signs of zeros may differ, NaN and infinity times a constant 0 are 0, and derivatives are those of the operations,

@@ -11,7 +11,7 @@ from jax import Array, lax
 from jax.typing import ArrayLike
 
 from edqn_jax.config.registry import SHAPES
-from edqn_jax.sim.scene.scene import PARKED, Scene, moves, scene_at, speeds
+from edqn_jax.sim.scene.scene import PARKED, Scene, has_motion, scene_at, speed_bounds
 
 
 def shape_distances(scene: Scene, point: Array) -> dict[str, Array]:
@@ -109,7 +109,7 @@ def path_contact(scene: Scene, path: Array, radius: ArrayLike, times: Array | No
     Returns:
         touch: [n] bool, True for the first segment that touches alone. fraction: [n], 1 where nothing touches.
     """
-    if not moves(scene):
+    if not has_motion(scene):
         times = None
     if times is None:
         gap = jax.vmap(lambda point: signed_distance(scene, point))(path) - radius
@@ -161,6 +161,6 @@ def _searched_at_once(
 def _room(scene: Scene, point: Array, time: Array, seconds: Array) -> Array:
     """Returns `signed_distance` at `time` [] less what each shape may move within `seconds` []."""
     distances = shape_distances(scene_at(scene, time), point)
-    for kind, speed in speeds(scene, time).items():
+    for kind, speed in speed_bounds(scene, time).items():
         distances[kind] = distances[kind] - speed * seconds
     return _least(distances)

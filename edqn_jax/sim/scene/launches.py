@@ -1,4 +1,4 @@
-"""Balls that are thrown at a drone: when, and at where it will be if it goes on as in its last decision.
+"""Balls that are thrown at a drone: launch times, and aim at its extrapolated position.
 
 How a ball flies once it is aimed is in `motion.py`.
 """
@@ -13,17 +13,17 @@ from jax import Array, lax
 from jax.typing import ArrayLike
 
 from edqn_jax.config import Config
-from edqn_jax.sim.scene.motion import AT_ONCE_S, Aim, aim_at, due, no_aim
+from edqn_jax.sim.scene.motion import TIME_TOLERANCE_S, Aim, aim_at, launch_times, no_aim
 from edqn_jax.sim.scene.scene import Scene
 
 
-def nobody_aimed_at(pool: Scene) -> Aim | None:
+def initial_aim(pool: Scene) -> Aim | None:
     """Returns the aim of one flight's balls before any is thrown; None where no world of the pool has any."""
     throw = pool.spheres.throw
     return None if throw is None else no_aim(jax.tree.map(lambda leaf: leaf[0], throw))
 
 
-def thrown(config: Config, scene: Scene, aim: Aim | None, decision: Array, here: Array, moved: Array) -> Aim | None:
+def update_aim(config: Config, scene: Scene, aim: Aim | None, decision: Array, here: Array, moved: Array) -> Aim | None:
     """Returns the aim with that of the balls which are thrown as decision [] int32 begins.
 
     A ball is thrown at the beginning of the decision in which it is due.
@@ -40,7 +40,9 @@ def thrown(config: Config, scene: Scene, aim: Aim | None, decision: Array, here:
     if throw is None or aim is None:
         return None
     steps, dt_s = config.drone.physics_steps, config.drone.physics_dt_s
-    begins = jnp.floor((due(throw, scene.start, scene.goal) + AT_ONCE_S) / (steps * dt_s)).astype(jnp.int32)
+    begins = jnp.floor((launch_times(throw, scene.start, scene.goal) + TIME_TOLERANCE_S) / (steps * dt_s)).astype(
+        jnp.int32
+    )
     now = begins == decision
     new = aim_at(throw, scene.goal, scene.volume, (decision * steps) * dt_s, here, moved, steps * dt_s)
     return jax.tree.map(lambda a, b: jnp.where(now if a.ndim == 1 else now[:, None], a, b), new, aim)
@@ -59,9 +61,9 @@ def aim_along(config: Config, scene: Scene, places: ArrayLike) -> Aim:
     assert throw is not None
     moved = jnp.diff(here, axis=0, prepend=here[:1])
 
-    def decide(aim: Aim, flown: tuple[Array, Array, Array]) -> tuple[Aim, None]:
-        decision, place, way = flown
-        flies, new = jnp.all(jnp.isfinite(place)), thrown(config, scene, aim, decision, place, way)
+    def decide(aim: Aim, step: tuple[Array, Array, Array]) -> tuple[Aim, None]:
+        decision, place, way = step
+        flies, new = jnp.all(jnp.isfinite(place)), update_aim(config, scene, aim, decision, place, way)
         return jax.tree.map(lambda a, b: jnp.where(flies, a, b), new, aim), None
 
     return lax.scan(decide, no_aim(throw), (jnp.arange(len(here)), here, moved))[0]

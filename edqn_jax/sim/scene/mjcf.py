@@ -11,7 +11,7 @@ An MJCF file that names no other file can be read. A world for the drone consist
 * two sites `start` and `goal`, of which only the positions are read.
 * a box site `volume`, not rotated: the space that the drone may fly in. Without one, the box around all
   shapes and sites, `VOLUME_MARGIN` wider on every side, but not below a level plane; an evaluation whose start or goal
-  lies outside that box widens it (`widened`).
+  lies outside that box widens it (`widen_volume`).
 """
 
 from __future__ import annotations
@@ -30,9 +30,9 @@ from jax.typing import ArrayLike
 
 from edqn_jax.config import FAMILIES
 from edqn_jax.sim.scene.distance import shape_distances
-from edqn_jax.sim.scene.mjcf_files import SceneError, checked_text
+from edqn_jax.sim.scene.mjcf_files import SceneError, load_checked_text
 from edqn_jax.sim.scene.mjcf_motion import PREFIX, motions_of, set_in_motion, text_of
-from edqn_jax.sim.scene.motion import Throw, steady_aim, thrown_to
+from edqn_jax.sim.scene.motion import Throw, ball_positions, steady_aim
 from edqn_jax.sim.scene.scene import Planes, Scene, Shape, Spheres, build_scene, scene_shapes
 from edqn_jax.sim.scene.shapes.kind import LEVEL, Geom, kind_of, kinds, reach_of, read_shape
 
@@ -42,7 +42,7 @@ VOLUME_MARGIN = 5.0
 LONGEST_VOLUME = 500.0
 """Most metres along an axis of a flight volume; A*'s lattice must hold it."""
 
-MOST_SHAPES = 500
+MAX_SHAPES = 500
 """Geoms of a world: 2 000 of them take 8 GB to train in."""
 
 
@@ -146,9 +146,9 @@ def _compiled(path: Path) -> mujoco.MjModel:
     """Returns the model of a file, which names no other.
 
     Raises:
-        SceneError: if MuJoCo cannot read it, or it has more geoms than `MOST_SHAPES`.
+        SceneError: if MuJoCo cannot read it, or it has more geoms than `MAX_SHAPES`.
     """
-    text = checked_text(path)
+    text = load_checked_text(path)
     mujoco.set_mju_user_warning(lambda _: None)  # otherwise MuJoCo writes a log into the working folder
     try:
         model = mujoco.MjModel.from_xml_string(text)
@@ -157,12 +157,12 @@ def _compiled(path: Path) -> mujoco.MjModel:
         raise SceneError(f"{path} is not an MJCF that MuJoCo can read: {reason}") from None
     finally:
         mujoco.set_mju_user_warning(None)
-    if model.ngeom > MOST_SHAPES:
-        raise SceneError(f"{path} has {model.ngeom:,} geoms; a world may have {MOST_SHAPES}")
+    if model.ngeom > MAX_SHAPES:
+        raise SceneError(f"{path} has {model.ngeom:,} geoms; a world may have {MAX_SHAPES}")
     return model
 
 
-def widened(scene: Scene, points: Mapping[str, ArrayLike], title: str) -> Scene:
+def widen_volume(scene: Scene, points: Mapping[str, ArrayLike], title: str) -> Scene:
     """Returns a scene whose flight volume also holds `points`, each [3], with `VOLUME_MARGIN` around those outside.
 
     Args:
@@ -304,7 +304,7 @@ def _launch(scene: Scene, one: Throw) -> np.ndarray:
     """Returns where a ball is launched at a drone between the world's own start and goal, [3] metres."""
     throw = jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], one)
     aim = steady_aim(throw, scene.start, scene.goal)
-    return np.asarray(thrown_to(throw, aim, aim.launch[0]))[0]
+    return np.asarray(ball_positions(throw, aim, aim.launch[0]))[0]
 
 
 def _geom_name(model: mujoco.MjModel, geom: int) -> str:

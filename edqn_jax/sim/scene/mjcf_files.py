@@ -1,7 +1,7 @@
 """The text of an MJCF world, checked before MuJoCo reads it.
 
-A world may come from a stranger, so it is one file that names no other, and it declares nothing that takes much memory.
-MuJoCo is given what was checked, written anew, never a path: so nothing is read in two ways.
+A world may be untrusted, so it is one file without references, and it declares nothing that takes much memory.
+MuJoCo gets the checked elements, serialised again, never a path, so both parse the same.
 """
 
 from __future__ import annotations
@@ -14,13 +14,13 @@ from pathlib import Path
 from edqn_jax.errors import ConfigError
 from edqn_jax.sim.scene import mjcf_xml
 
-MOST_BYTES = 20_000_000
+MAX_BYTES = 20_000_000
 """Of a world's file."""
 
-MOST_COPIES = 10_000
+MAX_COPIES = 10_000
 """That `replicate` elements within each other may ask for."""
 
-MOST_PIXELS = 4096
+MAX_PIXELS = 4096
 """Width and height of a texture, which is not drawn."""
 
 FOREIGN = ("include", "model", "attach", "plugin", "extension", "flexcomp", "composite", "hfield", "skin", "size")
@@ -31,7 +31,7 @@ class SceneError(ConfigError):
     """A world that cannot be flown; the message says what to change."""
 
 
-def checked_text(path: Path) -> str:
+def load_checked_text(path: Path) -> str:
     """Returns the text of a world's file as XML of its elements alone.
 
     Raises:
@@ -39,8 +39,8 @@ def checked_text(path: Path) -> str:
     """
     try:
         size = path.stat().st_size
-        if size > MOST_BYTES:
-            raise SceneError(f"'{path}' has {size:,} bytes; a world may have {MOST_BYTES:,}")
+        if size > MAX_BYTES:
+            raise SceneError(f"'{path}' has {size:,} bytes; a world may have {MAX_BYTES:,}")
         content = path.read_bytes()
     except (OSError, RuntimeError) as error:
         raise SceneError(f"cannot read the world '{path}': {getattr(error, 'strerror', None) or error}") from None
@@ -51,7 +51,7 @@ def checked_text(path: Path) -> str:
     except UnicodeDecodeError:
         text = content.decode("latin-1")  # MuJoCo asks no name for its encoding
     try:
-        tree, text = mjcf_xml.parse(text)
+        tree, text = mjcf_xml.parse_xml(text)
     except mjcf_xml.SubsetError:
         raise SceneError(f"{path} has a <!DOCTYPE> that declares something; a world needs none") from None
     except mjcf_xml.MarkupError as error:
@@ -80,8 +80,8 @@ def _check_elements(tree: ElementTree.Element, path: Path) -> None:
             )
         if element.tag in ("texture", "numeric"):
             for name in ("width", "height", "size"):
-                if _number(element.get(name)) > MOST_PIXELS:
-                    raise SceneError(f"{path} has <{element.tag} {name}=...> of more than {MOST_PIXELS}")
+                if _number(element.get(name)) > MAX_PIXELS:
+                    raise SceneError(f"{path} has <{element.tag} {name}=...> of more than {MAX_PIXELS}")
 
 
 def _check_copies(tree: ElementTree.Element, path: Path) -> None:
@@ -96,8 +96,8 @@ def _check_copies(tree: ElementTree.Element, path: Path) -> None:
         if element.tag == "replicate":
             copies *= max(_number(element.get("count")), 1.0)
             total += copies
-        if total > MOST_COPIES:
-            raise SceneError(f"{path} asks for {total:,.0f} copies by replicate; a world may have {MOST_COPIES:,}")
+        if total > MAX_COPIES:
+            raise SceneError(f"{path} asks for {total:,.0f} copies by replicate; a world may have {MAX_COPIES:,}")
         pending += [(child, copies) for child in element]
 
 

@@ -32,7 +32,7 @@ class SubsetError(MarkupError):
     """A declaration holds other declarations, which parsers end differently."""
 
 
-def parse(text: str) -> tuple[ElementTree.Element, str]:
+def parse_xml(text: str) -> tuple[ElementTree.Element, str]:
     """Returns the first element of a document, and the document as XML of that element alone.
 
     Raises:

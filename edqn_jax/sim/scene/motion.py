@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from flax import struct
 from jax import Array
 
-from edqn_jax.sine import turned_by
+from edqn_jax.sine import cosm1_and_sin
 
 
 @struct.dataclass
@@ -54,13 +54,13 @@ NEVER = 1e6
 LEAST_LAUNCH_M = 3.0
 """Metres from the drone at which a ball is launched at least, so that none hits within its first physics step."""
 
-AT_ONCE_S = 1e-3
+TIME_TOLERANCE_S = 1e-3
 """Times that differ by less are the same: times of physics steps are rounded. A ball is absent at its launch."""
 
 
 @struct.dataclass
-class Flown:
-    """Where K other drones have flown during n physics steps, as a table."""
+class DroneTracks:
+    """Tracks of K other drones over n physics steps."""
 
     path: Array  # [K, n + 1, 3] metres, before the first physics step and after each
     radius: Array  # [K] metres, 0 of a drone that is absent
@@ -68,16 +68,16 @@ class Flown:
     step_s: Array  # [] seconds between two places of the path
 
 
-def flown_to(flown: Flown, time: Array) -> Array:
-    """Returns where these drones are at `time` [] seconds: [K, 3] metres, on a straight line between physics steps."""
-    last = flown.path.shape[1] - 1
-    steps = jnp.clip((time - flown.began) / flown.step_s, 0.0, last)
-    # A time of a physics step is one but for rounding, and nobody is halfway to `PARKED`.
+def positions_at(tracks: DroneTracks, time: Array) -> Array:
+    """Returns the positions [K, 3] metres of these drones at `time` [] seconds, linear between physics steps."""
+    last = tracks.path.shape[1] - 1
+    steps = jnp.clip((time - tracks.began) / tracks.step_s, 0.0, last)
+    # Times of physics steps are rounded, and no drone is interpolated towards `PARKED`.
     whole = jnp.round(steps)
     steps = jnp.where(jnp.abs(steps - whole) < 1e-2, whole, steps)
     before = jnp.clip(jnp.floor(steps).astype(jnp.int32), 0, last - 1)
     share = steps - before
-    return flown.path[:, before] + share * (flown.path[:, before + 1] - flown.path[:, before])
+    return tracks.path[:, before] + share * (tracks.path[:, before + 1] - tracks.path[:, before])
 
 
 OUTSIDE_M = 1.0
@@ -95,7 +95,7 @@ def displacement(motion: Motion, position: Array, time: Array) -> Array:
         position: [N, 3] metres at time 0, between the walls where there is a velocity.
     """
     # One array per coordinate, so that CPUs take all shapes of a kind in vectors.
-    back, ahead = turned_by(motion.rate * time)
+    back, ahead = cosm1_and_sin(motion.rate * time)
     around = [motion.swing[:, 0, axis] * back + motion.swing[:, 1, axis] * ahead for axis in range(3)]
     along = [_along(motion, position, axis, time) for axis in range(3)]
     return jnp.stack([line + turn for line, turn in zip(along, around, strict=True)], axis=1)
@@ -121,7 +121,7 @@ def top_speeds(motion: Motion) -> Array:
     return line + jnp.abs(motion.rate) * longest
 
 
-def due(throw: Throw, start: Array, goal: Array) -> Array:
+def launch_times(throw: Throw, start: Array, goal: Array) -> Array:
     """Returns when the balls would be launched at a drone that flies from `start` to `goal` [3], metres: [N] s."""
     way = jnp.sqrt(jnp.sum((goal - start) ** 2))
     # Nothing is launched before the episode begins.
@@ -131,12 +131,12 @@ def due(throw: Throw, start: Array, goal: Array) -> Array:
 def steady_aim(throw: Throw, start: Array, goal: Array) -> Aim:
     """Returns the aim at a drone that flies straight from `start` to `goal` [3], metres, at a steady pace.
 
-    It stands for flights that nobody has flown: in pictures and files of a world alone.
+    It is used without a flight: in pictures and files of a world alone.
     """
-    way, launch = goal - start, due(throw, start, goal)
+    way, launch = goal - start, launch_times(throw, start, goal)
     length = jnp.sqrt(jnp.sum(way**2))
-    flown = jnp.minimum(throw.pace * (launch + throw.early), length)
-    point = start[None] + (flown / jnp.maximum(length, 1e-6))[:, None] * way[None]
+    distance = jnp.minimum(throw.pace * (launch + throw.early), length)
+    point = start[None] + (distance / jnp.maximum(length, 1e-6))[:, None] * way[None]
     return Aim(launch=launch, point=point, heading=jnp.full_like(launch, jnp.arctan2(way[1], way[0])))
 
 
@@ -177,7 +177,7 @@ def _comes_from(throw: Throw, heading: Array) -> Array:
     return jnp.stack([level * jnp.cos(turned), level * jnp.sin(turned), jnp.sin(throw.elevation)], axis=1)
 
 
-def thrown_to(throw: Throw, aim: Aim, time: Array) -> Array:
+def ball_positions(throw: Throw, aim: Aim, time: Array) -> Array:
     """Returns where the balls are at `time` [] seconds: [N, 3] metres, whether or not they have been launched.
 
     Without gravity it is a straight line; with it, the parabola from the same point of launch to the same hit.
@@ -194,14 +194,14 @@ def in_flight(throw: Throw, aim: Aim, time: Array, outside: Array) -> Array:
     Args:
         outside: [N] bool, whether it is beyond the flight volume.
     """
-    return (throw.early > 0) & (time > aim.launch + AT_ONCE_S) & ~outside
+    return (throw.early > 0) & (time > aim.launch + TIME_TOLERANCE_S) & ~outside
 
 
 def throw_speeds(throw: Throw, aim: Aim, time: Array) -> Array:
     """Returns a bound [N] m/s of the speeds of balls at `time` [] seconds, convex in time; 0 before their launch."""
     after = time - aim.launch - throw.early
     speed = throw.speed + jnp.abs(throw.gravity * (after + throw.early / 2))
-    return jnp.where((throw.early > 0) & (time > aim.launch + AT_ONCE_S), speed, 0.0)
+    return jnp.where((throw.early > 0) & (time > aim.launch + TIME_TOLERANCE_S), speed, 0.0)
 
 
 def at_rest(*lead: int) -> Motion:
@@ -216,5 +216,5 @@ def at_rest(*lead: int) -> Motion:
 
 
 def not_thrown(*lead: int) -> Throw:
-    """Returns the throw of spheres [*lead] that nobody throws."""
+    """Returns a `Throw` of zeros for spheres [*lead] that are not thrown."""
     return Throw(*[jnp.zeros(lead)] * 7)

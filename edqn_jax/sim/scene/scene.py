@@ -29,16 +29,16 @@ from edqn_jax.config.registry import SHAPES
 from edqn_jax.sim.scene.motion import (
     OUTSIDE_M,
     Aim,
-    Flown,
+    DroneTracks,
     Throw,
     at_rest,
+    ball_positions,
     displacement,
-    flown_to,
     in_flight,
     not_thrown,
+    positions_at,
     steady_aim,
     throw_speeds,
-    thrown_to,
     top_speeds,
 )
 from edqn_jax.sim.scene.shapes.capsule import Capsules
@@ -77,7 +77,7 @@ class Scene:
     start: Array  # [3] metres
     goal: Array  # [3] metres
     others: dict[str, Any] = dataclasses.field(default_factory=dict)  # shapes of further kinds, by kind
-    drones: Flown | None = None  # the others of a group, within one decision; in no pool of worlds
+    drones: DroneTracks | None = None  # the others of a group, within one decision; in no pool of worlds
     aim: Aim | None = None  # of balls at the drone that flies; in no pool of worlds
     daylight: Daylight | None = None  # None: that of the camera's options
 
@@ -96,7 +96,7 @@ _MOVING = {"motion": at_rest, "throw": not_thrown}
 """The fields of a kind that are None where nothing moves, and what stands for a shape that does not."""
 
 
-def moves(scene: Scene) -> bool:
+def has_motion(scene: Scene) -> bool:
     """Returns whether any kind of shape has motion. Static: known when a program is traced."""
     return scene.drones is not None or any(map(_moves, scene.shapes().values()))
 
@@ -106,7 +106,7 @@ def _moves(shapes: Shape) -> bool:
 
 
 def scene_at(scene: Scene, time: Array | None) -> Scene:
-    """Returns the world as it stands at `time` [] seconds of the episode, without motion; a still world is returned.
+    """Returns the scene at `time` [] seconds of the episode, without motion; a static scene is returned as it is.
 
     The one place where shapes move: the camera and the collisions both see what it returns.
 
@@ -118,7 +118,9 @@ def scene_at(scene: Scene, time: Array | None) -> Scene:
     now = dataclasses.replace(scene.with_shapes(there), aim=None)
     if scene.drones is None:
         return now
-    return with_drones(now, flown_to(scene.drones, scene.drones.began if time is None else time), scene.drones.radius)
+    return with_drones(
+        now, positions_at(scene.drones, scene.drones.began if time is None else time), scene.drones.radius
+    )
 
 
 def with_drones(scene: Scene, position: Array, radius: Array) -> Scene:
@@ -139,7 +141,7 @@ def _standing(scene: Scene, shapes: Any, time: Array | None) -> Any:
         return dataclasses.replace(shapes, position=place, motion=None)
     if shapes.throw is not None and time is not None:
         aim = aim_of(scene, shapes.throw)
-        ball = thrown_to(shapes.throw, aim, time)
+        ball = ball_positions(shapes.throw, aim, time)
         beyond = (shapes.radius + OUTSIDE_M)[:, None]
         outside = jnp.any((ball < scene.volume[0][None] - beyond) | (ball > scene.volume[1][None] + beyond), axis=1)
         place = jnp.where(in_flight(shapes.throw, aim, time, outside)[:, None], ball, place)
@@ -151,7 +153,7 @@ def aim_of(scene: Scene, throw: Throw) -> Aim:
     return steady_aim(throw, scene.start, scene.goal) if scene.aim is None else scene.aim
 
 
-def speeds(scene: Scene, time: Array) -> dict[str, Array]:
+def speed_bounds(scene: Scene, time: Array) -> dict[str, Array]:
     """Returns a bound [N] m/s of the speed of every shape at `time` [] seconds, of the kinds that move.
 
     Between two times no shape moves further than at the mean of its bounds there, but for a ball that is launched in
@@ -168,7 +170,7 @@ def speeds(scene: Scene, time: Array) -> dict[str, Array]:
 # ----------------------------------------------------------------------- building, pools of worlds
 
 
-def parked_like(shapes: Any) -> Any:
+def absent_like(shapes: Any) -> Any:
     """Returns one absent shape of the kind of `shapes`, which stands still where they have arrays of motion."""
     rest: dict[str, Any] = {name: still() for name, still in _MOVING.items() if getattr(shapes, name, None) is not None}
     if getattr(shapes, "surface", None) is not None:
@@ -357,7 +359,7 @@ def with_equal_capacities(pools: Sequence[Scene], like: Sequence[Any] = ()) -> l
             more = np.broadcast_to(np.asarray(absent, np.float32), (worlds, missing, *np.shape(absent)))
             return jnp.asarray(np.concatenate([np.asarray(here), more], axis=1))
 
-        return jax.tree.map(joined, shapes, parked_like(shapes))
+        return jax.tree.map(joined, shapes, absent_like(shapes))
 
     names = _kinds_of([*pools, *like])
     whole = [

@@ -22,11 +22,11 @@ from edqn_jax.sim.sensors.sensor import (
     SensorMemory,
     brightness,
     last_view,
+    move_ranges,
     nearness,
     nearness_image,
-    ranges,
+    render_view,
     signed_log,
-    view,
 )
 
 CHANGE_SCALE = 0.1
@@ -39,7 +39,7 @@ values, 3 m/s at a distance of 4 m."""
 
 def _views(config: Config, scene: Scene, poses: Flight) -> Array:
     """Returns the luma frames [T, H, W] at poses [T], each of the world as it stands at its own time."""
-    see = lambda p, q, t: view(config, scene_at(scene, t), p, q)  # noqa: E731
+    see = lambda p, q, t: render_view(config, scene_at(scene, t), p, q)  # noqa: E731
     return jax.vmap(see)(poses.position, poses.quaternion, poses.time)
 
 
@@ -49,7 +49,7 @@ def _show_events(
     frames = _views(config, scene, poses)
     assert isinstance(memory, EventMemory)
     options = config.events
-    return events.events(options, memory, frames, options.frame_times_s, key, continuous=options.stream)
+    return events.generate_events(options, memory, frames, options.frame_times_s, key, continuous=options.stream)
 
 
 def _show_event_image(
@@ -65,7 +65,7 @@ def _event_memory(config: Config, key: Array) -> SensorMemory:
     lux = None
     if light.is_on(config.light):
         key, drawing = jax.random.split(key)
-        lux = light.draw(config.light, drawing)
+        lux = light.sample_illuminance(config.light, drawing)
     return events.reset_memory(config.events, config.camera.height, config.camera.width, key, lux)
 
 
@@ -76,7 +76,7 @@ def _show_frame(
         frames, memory = _exposed(config, scene, poses, memory, key)
         return brightness(config, frames), memory
     scene, position, quaternion = last_view(scene, poses)
-    return brightness(config, view(config, scene, position, quaternion))[None], None
+    return brightness(config, render_view(config, scene, position, quaternion))[None], None
 
 
 def _exposed(
@@ -89,14 +89,14 @@ def _exposed(
     """
     assert isinstance(memory, FrameMemory)
     options, dt, lux = config.exposure, config.drone.physics_dt_s, memory.lux
-    time, gain = exposure.settings(options, lux, memory.metered)
+    time, gain = exposure.exposure_settings(options, lux, memory.metered)
     of_frame = exposure.steps_touched(options, dt) + 1
     windows = jax.tree.map(lambda x: x.reshape(-1, of_frame, *x.shape[1:]), poses)
     within = jax.vmap(lambda window: exposure.poses_within(window, dt, time, options.sub_frames))(windows)
     views = _views(config, scene, jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), within))
     luma = jnp.mean(views.reshape(-1, options.sub_frames, *views.shape[1:]), axis=1)
-    frames = exposure.develop(options, luma, lux, time, gain, key)
-    metered = exposure.metered(options, frames[-1], lux, time, gain)
+    frames = exposure.develop_picture(options, luma, lux, time, gain, key)
+    metered = exposure.meter_brightness(options, frames[-1], lux, time, gain)
     return frames, FrameMemory(lux=lux, metered=metered)
 
 
@@ -145,7 +145,7 @@ def _show_ranges(
     config: Config, scene: Scene, poses: Flight, memory: SensorMemory, key: Array
 ) -> tuple[Sensed, SensorMemory]:
     scene, position, quaternion = last_view(scene, poses)
-    return nearness(ranges(config.camera, scene, position, drone.yaw_of(quaternion))), None
+    return nearness(move_ranges(config.camera, scene, position, drone.yaw_of(quaternion))), None
 
 
 def _show_nothing(

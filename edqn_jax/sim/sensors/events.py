@@ -1,11 +1,11 @@
 """Events from brightness frames: Eq. 1-5 of the paper, in its order, under three event laws.
 
 Inside the compiled step events are never a list. Between two frames a pixel's events all have one polarity
-and even spacing, so `EventField` holds them exactly; `expand` turns it into the `(t, x, y, p)` stream that
+and even spacing, so `EventField` holds them exactly; `to_stream` turns it into the `(t, x, y, p)` stream that
 people exchange.
 
 With noise a pixel may have events of both polarities between two frames: the rows of a field are then the ON events
-of every frame pair and after them the OFF events, and in a row noise and signal of a pixel are one (`merged`).
+of every frame pair and after them the OFF events, and in a row noise and signal of a pixel are one (`merge_fields`).
 
 Shapes: T frames, F = T - 1 frame pairs (2 F rows in an `EventField` when noise events are on), H rows, W columns.
 """
@@ -65,7 +65,7 @@ class EventMemory:
     lag: Array | None = None  # [H, W] esim with finite bandwidth: what the photoreceptor shows minus log brightness
 
 
-def luma(rgb: Array) -> Array:
+def rgb_to_luma(rgb: Array) -> Array:
     """Returns the grey value inside Eq. 1: `[..., 3]` linear RGB to `[...]`."""
     red, green, blue = LUMA_WEIGHTS
     return red * rgb[..., 0] + green * rgb[..., 1] + blue * rgb[..., 2]
@@ -151,7 +151,7 @@ def reset_memory(config: EventsConfig, height: int, width: int, key: Array, lux:
         hot = jax.random.bernoulli(key_hot, config.hot_pixel_fraction, (height, width))
     if config.law != "esim":
         return EventMemory(residual=None, last_event=None, gain=gain, hot=hot, lux=lux)
-    contrast_on, contrast_off = _both(gain, config.contrast_on, config.contrast_off)
+    contrast_on, contrast_off = _thresholds(gain, config.contrast_on, config.contrast_off)
     share = jax.random.uniform(key_residual, (height, width))
     return EventMemory(
         residual=share * (contrast_on + contrast_off) - contrast_off,
@@ -163,7 +163,7 @@ def reset_memory(config: EventsConfig, height: int, width: int, key: Array, lux:
     )
 
 
-def events(
+def generate_events(
     config: EventsConfig,
     memory: EventMemory,
     frames: Array,
@@ -203,7 +203,7 @@ def events(
     if config.bandwidth_hz > 0.0:
         assert current is not None
         lag = memory.lag if continuous and memory.lag is not None else jnp.zeros(frames.shape[1:])
-        level, lag = photoreceptor.follow(config.bandwidth_hz, level, times, current, lag)
+        level, lag = photoreceptor.filter_log_brightness(config.bandwidth_hz, level, times, current, lag)
         memory = dataclasses.replace(memory, lag=lag if config.law == "esim" else None)
     if config.law == "esim":
         field, memory = _esim(config, memory, level, times, continuous)
@@ -213,7 +213,7 @@ def events(
     if noisy:
         shot = 1.0 if current is None else photoreceptor.shot_noise(current)
         noise = noise_events(config, memory.hot, field.count, times, key, shot)
-        field = merged(config, by_polarity(field), noise, times)
+        field = merge_fields(config, split_polarity(field), noise, times)
     even = divides_window(config, len(times))
     return dataclasses.replace(field, window_s=window_s, divides_window=even, with_noise=noisy), memory
 
@@ -254,7 +254,7 @@ def event_picture(image: NDArray, background: str = "white") -> NDArray[np.uint8
     return np.rint(paper + strength * (ink - paper)).astype(np.uint8)
 
 
-def expand(field: EventField, window_start_us: int = 0) -> NDArray:
+def to_stream(field: EventField, window_start_us: int = 0) -> NDArray:
     """Returns the stream of a field: [N] of `STREAM_DTYPE`, sorted by time (host side, NumPy).
 
     Times are rounded to the microsecond. Ties keep the order row, column.
@@ -273,7 +273,7 @@ def expand(field: EventField, window_start_us: int = 0) -> NDArray:
     return stream[np.argsort(stream["t"], kind="stable")]
 
 
-def _both(gain: Array | None, on: float, off: float) -> tuple[Array, Array]:
+def _thresholds(gain: Array | None, on: float, off: float) -> tuple[Array, Array]:
     """Returns ON and OFF thresholds, each a scalar or `[H, W]` with the sensor's mismatch."""
     if gain is None:
         return jnp.float32(on), jnp.float32(off)
@@ -305,7 +305,7 @@ def _esim(
     assert memory.residual is not None and memory.last_event is not None
     last_event = memory.last_event if continuous else jnp.full_like(memory.last_event, -jnp.inf)
     starts, ends = jnp.asarray(times[:-1], jnp.float32), jnp.asarray(times[1:], jnp.float32)
-    contrasts = _both(memory.gain, config.contrast_on, config.contrast_off)
+    contrasts = _thresholds(memory.gain, config.contrast_on, config.contrast_off)
 
     def pair(carry: tuple[Array, Array], xs: tuple[Array, ...]) -> tuple[tuple[Array, Array], EventField]:
         return _esim_pair(config, contrasts, carry, xs)
@@ -386,11 +386,11 @@ def noise_events(
     lengths = np.diff(times)
     intervals = jnp.asarray(lengths, jnp.float32)[:, None, None]
     limits = [max_events(config, dt) for dt in lengths]
-    drawn = poisson(key_count, rates * intervals, max(limits))
+    counts = sample_poisson(key_count, rates * intervals, max(limits))
     limit = jnp.array(limits, jnp.int32)[:, None, None]
     room = jnp.maximum(limit - signal, 0)
-    on = jnp.minimum(drawn[0], room)
-    count = jnp.concatenate([on, jnp.minimum(drawn[1], room - on)])
+    on = jnp.minimum(counts[0], room)
+    count = jnp.concatenate([on, jnp.minimum(counts[1], room - on)])
     intervals, starts = jnp.tile(intervals, (2, 1, 1)), jnp.tile(jnp.asarray(times[:-1], jnp.float32), 2)[:, None, None]
     step = intervals / jnp.maximum(count, 1)
     # A window is half open; float32 may round a phase of nearly 1 up to its end.
@@ -399,31 +399,31 @@ def noise_events(
     return EventField(count, jnp.where(count > 0, sign, 0).astype(jnp.int8), starts + phase, step, 0.0)
 
 
-MOST_BY_INVERSION = 16
+MAX_BY_INVERSION = 16
 
 
-def poisson(key: Array, mean: Array, most: int) -> Array:
+def sample_poisson(key: Array, mean: Array, most: int) -> Array:
     """Returns Poisson counts of a mean [...], int32, to probabilities of 2^-23.
 
     For `most` <= MOST_BY_INVERSION counts are capped at `most`, otherwise they are not capped. Capped ones, as
     refractory pixels have, come from one uniform number by inversion, at a small part of the cost of
     `jax.random.poisson`.
     """
-    if most > MOST_BY_INVERSION:
+    if most > MAX_BY_INVERSION:
         return jax.random.poisson(key, mean, mean.shape, dtype=jnp.int32)
-    drawn = jax.random.uniform(key, mean.shape)
+    uniforms = jax.random.uniform(key, mean.shape)
     probability = below = jnp.exp(-mean)
     count = jnp.zeros(mean.shape, jnp.int32)
     for number in range(most):
-        # Above the median, what is less probable than a step of `drawn` is left out: float32's sum may end below 1.
+        # Above the median, what is less probable than a step of `uniforms` is left out: float32's sum may end below 1.
         possible = (below < 0.5) | (probability > 2.0**-24)
-        count = count + ((drawn >= below) & possible)
+        count = count + ((uniforms >= below) & possible)
         probability = probability * mean / (number + 1)
         below = below + probability
     return count
 
 
-def by_polarity(field: EventField) -> EventField:
+def split_polarity(field: EventField) -> EventField:
     """Returns a field [F, H, W] as the ON events of its rows and then the OFF events, [2 F, H, W]."""
     signs = (field.polarity > 0, field.polarity < 0)
     twice = jax.tree.map(lambda leaf: jnp.concatenate([leaf, leaf]), field)
@@ -433,8 +433,9 @@ def by_polarity(field: EventField) -> EventField:
     )
 
 
-def merged(config: EventsConfig, one: EventField, other: EventField, times: NDArray) -> EventField:
-    """Returns the events of two fields [2 F, H, W] of `by_polarity` in one: nothing tells which field an event is of.
+def merge_fields(config: EventsConfig, one: EventField, other: EventField, times: NDArray) -> EventField:
+    """Returns the events of two fields [2 F, H, W] of `split_polarity` in one: the source field of an event is not
+    kept.
 
     Counts are added. Where both have events in a row, they are spaced evenly from the first to the last of all, at
     least a refractory period apart.

@@ -33,7 +33,7 @@ DARKEST = 1e-3
 
 @struct.dataclass
 class FrameMemory:
-    """What a camera that takes frames carries from one decision to the next."""
+    """State of a frame camera between decisions."""
 
     lux: Array  # [] illuminance of the episode
     metered: Array  # [] mean brightness of the last picture, as a share of a surface that faces the sun
@@ -43,7 +43,7 @@ def at_rest(config: Config, key: Array) -> FrameMemory | None:
     """Returns the memory before the first decision; None for a perfect camera. `key` is consumed."""
     if not config.exposure.real:
         return None
-    return FrameMemory(lux=light.draw(config.light, key), metered=jnp.float32(AT_REST))
+    return FrameMemory(lux=light.sample_illuminance(config.light, key), metered=jnp.float32(AT_REST))
 
 
 def steps_touched(exposure: ExposureConfig, dt_s: float) -> int:
@@ -60,7 +60,7 @@ def pose_times(config: Config, frame_times_s: tuple[float, ...]) -> tuple[float,
     return tuple(time - dt * step for time in frame_times_s for step in back)
 
 
-def settings(exposure: ExposureConfig, lux: Array, metered: Array) -> tuple[Array, Array]:
+def exposure_settings(exposure: ExposureConfig, lux: Array, metered: Array) -> tuple[Array, Array]:
     """Returns exposure time [] seconds and gain [] with which a picture of mean brightness `metered` is at the target.
 
     The time comes first; gain, which amplifies noise as well, is what the longest exposure leaves to be done.
@@ -101,7 +101,7 @@ def poses_within(poses: Flight, dt_s: float, time: Array, count: int) -> Flight:
     )
 
 
-def develop(exposure: ExposureConfig, luma: Array, lux: Array, time: Array, gain: Array, key: Array) -> Array:
+def develop_picture(exposure: ExposureConfig, luma: Array, lux: Array, time: Array, gain: Array, key: Array) -> Array:
     """Returns the picture [...] of mean luma [...]: 8-bit levels as shares of white. `key` is consumed.
 
     The Poisson distribution of electrons is taken for a normal one of its variance, which is far off only where there
@@ -120,11 +120,11 @@ def develop(exposure: ExposureConfig, luma: Array, lux: Array, time: Array, gain
     return jnp.clip(levels, 0.0, WHITE) / WHITE
 
 
-def metered(exposure: ExposureConfig, picture: Array, lux: Array, time: Array, gain: Array) -> Array:
-    """Returns the mean brightness [] that a picture [...] says of its scene; where it clips, the scene has more.
+def meter_brightness(exposure: ExposureConfig, picture: Array, lux: Array, time: Array, gain: Array) -> Array:
+    """Returns the mean scene brightness [] estimated from a picture [...], a lower bound where it clips.
 
     Args:
         picture: shares of white.
-        lux, time, gain: illuminance in lux, seconds of exposure, and gain, as in `develop`.
+        lux, time, gain: illuminance in lux, seconds of exposure, and gain, as in `develop_picture`.
     """
     return jnp.mean(picture) * exposure.full_well_e / (exposure.sensitivity_e_lux_s * lux * time * gain)

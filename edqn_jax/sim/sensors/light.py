@@ -20,7 +20,7 @@ def is_on(light: LightConfig) -> bool:
     return light.most_lux > 0.0
 
 
-def draw(light: LightConfig, key: Array) -> Array:
+def sample_illuminance(light: LightConfig, key: Array) -> Array:
     """Returns an episode's illuminance [] lux, log-uniform between the least and the most; `key` is consumed."""
     least, most = math.log(light.least_lux), math.log(light.most_lux)
     return jnp.exp(jax.random.uniform(key, minval=least, maxval=most))

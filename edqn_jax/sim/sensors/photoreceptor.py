@@ -50,8 +50,10 @@ def between_frames(photocurrents: Array) -> Array:
     return 0.5 * (photocurrents[:-1] + photocurrents[1:])
 
 
-def follow(cutoff_hz: float, level: Array, times: NDArray, current: Array, lag: Array) -> tuple[Array, Array]:
-    """Returns what photoreceptors make of log brightness [T, H, W], and their lag after the last frame [H, W].
+def filter_log_brightness(
+    cutoff_hz: float, level: Array, times: NDArray, current: Array, lag: Array
+) -> tuple[Array, Array]:
+    """Low-pass filters log brightness [T, H, W]; returns it and the lag after the last frame [H, W].
 
     y' = 2 pi f (x - y) with f = `cutoff_hz` x photocurrent. For x that changes by d within the time t between two
     frames the lag y - x becomes lag e^-r - d (1 - e^-r) / r, with r = 2 pi f t.

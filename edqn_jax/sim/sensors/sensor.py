@@ -1,4 +1,4 @@
-"""What a sensor is: what a drone sees of the world around it, and all that other code asks about that.
+"""The contract of a sensor: its output, and how other modules label, draw and embed it.
 
 A new sensor is a `Sensor`, registered under a name for `env.sensor`; nothing else has to know it:
 
@@ -72,7 +72,7 @@ def flip_left_right(image: Array) -> Array:
 
 @dataclasses.dataclass(frozen=True)
 class Sensor:
-    """Everything that the rest of the code asks about one sensor. T frame times."""
+    """Functions and labels of one sensor. T frame times."""
 
     show: Callable[[Config, Scene, Flight, Any, Array], tuple[Sensed, Any]]
     """As `sense`."""
@@ -99,7 +99,7 @@ class Sensor:
         return seen[0] if len(seen) == 1 else jnp.concatenate(seen, axis=-3) if seen else None
 
     def values(self, config: Config, sensed: Sensed) -> Array | None:
-        """Returns what the Q-network sees as it is, [..., V] joined, or None."""
+        """Returns the values [..., V] for the Q-network, concatenated, or None."""
         seen = self._parts(config, sensed, _is_of_values)
         return seen[0] if len(seen) == 1 else jnp.concatenate(seen, axis=-1) if seen else None
 
@@ -124,7 +124,8 @@ class Sensor:
         return seen[..., self.image.picture, :, :]
 
     def picture_of_target(self, config: Config, channels: Array) -> Array:
-        """Returns the picture [..., H, W] of what a decoder draws of this sensor, [..., C, H, W] of `vae.target`.
+        """Returns the picture [..., H, W] of what a decoder draws of this sensor, [..., C, H, W] of
+        `vae.decoder_target`.
 
         Of events it is their number, ON plus OFF.
         """
@@ -250,9 +251,9 @@ def frames_per_decision(config: Config) -> int:
     return len(frame_steps(config)) // poses * config.exposure.sub_frames
 
 
-def view(config: Config, scene: Scene, position: Array, quaternion: Array) -> Array:
+def render_view(config: Config, scene: Scene, position: Array, quaternion: Array) -> Array:
     """Returns the camera's luma frame [H, W] on a body at `position` [3], metres, with attitude `quaternion` [4]."""
-    return camera.luma(config.camera, scene, position, mount_rotation(config, quaternion))
+    return camera.render_luma(config.camera, scene, position, mount_rotation(config, quaternion))
 
 
 def mount_rotation(config: Config, quaternion: Array) -> Array:
@@ -277,7 +278,7 @@ def at_rest(config: Config, key: Array) -> SensorMemory:
 
 
 def sense(config: Config, scene: Scene, poses: Flight, memory: SensorMemory, key: Array) -> tuple[Sensed, SensorMemory]:
-    """Returns what the sensor shows at the end of a decision, and its memory after it.
+    """Returns the sensor's output at the end of a decision, and its next memory.
 
     Args:
         scene: one world; each pose sees it as it stands at the pose's time.
@@ -311,7 +312,7 @@ def brightness(config: Config, luma: Array) -> Array:
 
 def nearness_image(config: Config, scene: Scene, position: Array, quaternion: Array) -> Array:
     """Returns what `depth` shows [H, W] from a body at `position` [3], metres, with attitude `quaternion` [4]."""
-    metres = camera.depth(config.camera, scene, position, mount_rotation(config, quaternion))
+    metres = camera.render_depth(config.camera, scene, position, mount_rotation(config, quaternion))
     return DEPTH_SCALE * nearness(metres)
 
 
@@ -325,7 +326,7 @@ def distance_of(nearness: Array) -> Array:
     return HALF_NEAR_M * (1.0 / jnp.clip(nearness, 0.0, 1.0) - 1.0)
 
 
-def ranges(config: CameraConfig, scene: Scene, position: Array, yaw: Array) -> Array:
+def move_ranges(config: CameraConfig, scene: Scene, position: Array, yaw: Array) -> Array:
     """Returns metres [26] from `position` [3] to the nearest shape or face of the flight volume along each move.
 
     Exact rays from the body's centre along `moves.DIRECTIONS` at heading `yaw` [] radians. The centre must be inside

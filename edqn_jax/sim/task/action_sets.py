@@ -25,7 +25,7 @@ from edqn_jax.checks import check_finite, check_index
 from edqn_jax.config import Config, EnvConfig
 from edqn_jax.config.registry import ACTION_SETS
 from edqn_jax.errors import ConfigError
-from edqn_jax.sim.actions import ACTIONS, HOVER, Box, Discrete, move_number, named_move
+from edqn_jax.sim.actions import ACTIONS, HOVER, Box, Discrete, move_number, parse_move
 from edqn_jax.sim.physics import drone
 from edqn_jax.sim.physics.airframe import Airframe
 from edqn_jax.sim.physics.controller import Command, RateCommand, VelocityCommand
@@ -55,7 +55,7 @@ def action_set(config: Config) -> ActionSet:
     return ACTION_SETS.get(config.env.actions)
 
 
-def admitted(space: Discrete | Box, action: Array) -> Array:
+def clip_action(space: Discrete | Box, action: Array) -> Array:
     """Returns an action [] or [A] as it is flown: of a box clipped to its bounds, and NaN where it is not finite.
 
     NaN lets the decision diverge, as any other number that is not finite.
@@ -65,7 +65,7 @@ def admitted(space: Discrete | Box, action: Array) -> Array:
     """
     action = jnp.asarray(action, space.dtype)
     if action.shape != space.shape:
-        raise ConfigError(f"an action is {described(space)}, not an array of shape {action.shape}")
+        raise ConfigError(f"an action is {describe_space(space)}, not an array of shape {action.shape}")
     if isinstance(space, Discrete):
         check_index(action, space.n, "the moves")
         return action
@@ -97,7 +97,7 @@ def checked_action(config: Config, given: str | ArrayLike) -> Array:
         numbers = np.array(None)
     if not are_actions(space, numbers):
         told = given.tolist() if isinstance(given, Array | np.ndarray) else given
-        raise ConfigError(f"an action of '{config.env.actions}' is {described(space)}, not {told!r}")
+        raise ConfigError(f"an action of '{config.env.actions}' is {describe_space(space)}, not {told!r}")
     return jnp.asarray(numbers, space.dtype)
 
 
@@ -110,7 +110,7 @@ def are_actions(space: Discrete | Box, numbers: np.ndarray, many: tuple[int, ...
     return np.issubdtype(numbers.dtype, np.number) and bool(np.isfinite(numbers).all())
 
 
-def described(space: Discrete | Box) -> str:
+def describe_space(space: Discrete | Box) -> str:
     """Returns what an action is, in words."""
     if isinstance(space, Discrete):
         return f"a whole number from 0 to {space.n - 1}"
@@ -129,7 +129,7 @@ def world_velocity(config: EnvConfig, direction: Array, yaw: Array) -> Array:
     return jnp.stack([cos * move[0] - sin * move[1], sin * move[0] + cos * move[1], move[2]])
 
 
-def bearing(config: EnvConfig, state: DroneState, goal: Array) -> Array:
+def heading_to_goal(config: EnvConfig, state: DroneState, goal: Array) -> Array:
     """Heading setpoint [] radians of the next decision: towards the goal [3], or held when it is (nearly) overhead."""
     ahead = goal - state.position
     near = ahead[0] ** 2 + ahead[1] ** 2 < config.heading_hold_m**2
@@ -137,13 +137,13 @@ def bearing(config: EnvConfig, state: DroneState, goal: Array) -> Array:
 
 
 def heading_setpoint(config: EnvConfig, state: DroneState, goal: Array, command: Array) -> Array:
-    """Heading setpoint [] radians of the next decision: `bearing`, or along the commanded velocity.
+    """Heading setpoint [] radians of the next decision: `heading_to_goal`, or along the commanded velocity.
 
     Args:
         command: [3] m/s in the world; without a horizontal part the setpoint stays.
     """
     if config.heading == "goal":
-        return bearing(config, state, goal)
+        return heading_to_goal(config, state, goal)
     level = command[0] ** 2 + command[1] ** 2
     return jnp.where(level > 0, jnp.arctan2(command[1], command[0]), state.yaw_setpoint)
 
@@ -158,7 +158,7 @@ def _move(config: Config, airframe: Airframe, state: DroneState, goal: Array, ac
 
 MOVES = ActionSet(
     space=Discrete(len(ACTIONS)),
-    still=np.int32(named_move(HOVER)),
+    still=np.int32(parse_move(HOVER)),
     command=_move,
     direction=lambda state, action: jnp.asarray(ACTIONS, jnp.float32)[action],
 )

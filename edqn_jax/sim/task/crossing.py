@@ -14,11 +14,11 @@ from jax import Array, lax
 
 from edqn_jax.sim.scene.scene import PARKED, Scene, take_scene
 from edqn_jax.sim.task.missions import Missions
-from edqn_jax.sim.worlds.free_points import ALTITUDES, CLEARANCE, FAR, TRIES, fenced, least_distances
+from edqn_jax.sim.worlds.free_points import ALTITUDES, CLEARANCE, FAR, TRIES, inner_bounds, least_distances
 
 APART = 5.0
 """Metres between any two starts of a block, and between any two goals: both goal spheres and drones have room."""
-LONGER = 1.5
+MAX_DETOUR = 1.5
 """Ways are at most so many times as long as the shortest of random missions."""
 LEVEL = 2.0
 """Starts and goals are at most so many metres above or below the common point, if there is room."""
@@ -53,16 +53,18 @@ def own_crossings(pool: Scene, drones: int, keys: Array) -> Missions:
 
 def _in_worlds(pool: Scene, drones: int, index: Array, keys: Array) -> Missions:
     # One after the other: a block has as many candidates as many single missions.
-    ends = lax.map(lambda each: block(take_scene(pool, each[0]), drones, each[1]), (index, keys), batch_size=64)
+    ends = lax.map(
+        lambda each: sample_crossing(take_scene(pool, each[0]), drones, each[1]), (index, keys), batch_size=64
+    )
     start, goal = (end.reshape(-1, 3) for end in ends)
     return Missions(scene=jnp.repeat(index, drones), start=start, goal=goal)
 
 
-def block(scene: Scene, drones: int, key: Array) -> tuple[Array, Array]:
+def sample_crossing(scene: Scene, drones: int, key: Array) -> tuple[Array, Array]:
     """Returns starts and goals [N, 3], metres, of drones whose straight ways meet near a common point.
 
     All are free as those of other missions are, starts `APART` from each other and goals, too, and each goal is as far
-    from its start as in `free_points.far_apart`, at most `LONGER` times as far, if candidates allow. Where no
+    from its start as in `free_points.far_apart`, at most `MAX_DETOUR` times as far, if candidates allow. Where no
     candidate meets all of this, it is the one that violates it least.
 
     Args:
@@ -70,15 +72,15 @@ def block(scene: Scene, drones: int, key: Array) -> tuple[Array, Array]:
         drones: N.
         key: consumed.
     """
-    lower, upper = fenced(scene)
+    lower, upper = inner_bounds(scene)
     lower, upper = lower.at[2].max(ALTITUDES[0]), upper.at[2].min(ALTITUDES[1])
     middle_key, turn_key, start_key, goal_key = jax.random.split(key, 4)
-    draw = jax.random.uniform(middle_key, (5,))
-    middle = lower + (0.5 + OFF_CENTRE * (2 * draw[:3] - 1)).at[2].set(draw[2]) * (upper - lower)
+    uniforms = jax.random.uniform(middle_key, (5,))
+    middle = lower + (0.5 + OFF_CENTRE * (2 * uniforms[:3] - 1)).at[2].set(uniforms[2]) * (upper - lower)
     least = jnp.minimum(FAR, (scene.volume[1, 0] - scene.volume[0, 0]) / 2)
-    radius = least / 2 * (1 + (LONGER - 1) * draw[3])
+    radius = least / 2 * (1 + (MAX_DETOUR - 1) * uniforms[3])
     turns = jnp.arange(drones) + TURN * (jax.random.uniform(turn_key, (drones,)) - 0.5)
-    angle = 2 * jnp.pi * (draw[4] + turns / drones)
+    angle = 2 * jnp.pi * (uniforms[4] + turns / drones)
     around = radius * jnp.stack([jnp.cos(angle), jnp.sin(angle), jnp.zeros(drones)], axis=1)
 
     def near(place: Array, draws: Array) -> Array:
@@ -90,8 +92,8 @@ def block(scene: Scene, drones: int, key: Array) -> tuple[Array, Array]:
         """Free points [N, 3] near places, apart from each other, each at least so far from its point of `froms`."""
 
         def one(chosen: Array, each: tuple[Array, Array, Array, Array]) -> tuple[Array, Array]:
-            number, place, draw, begin = each
-            points = near(place, draw)
+            number, place, uniforms, begin = each
+            points = near(place, uniforms)
             short = jnp.minimum(least_distances(scene, points) - CLEARANCE, 0.0)
             short += jnp.minimum(jnp.min(_between(points, chosen), axis=1) - APART, 0.0)
             short += jnp.minimum(_between(points, begin[None])[:, 0] - least, 0.0)

@@ -21,18 +21,18 @@ from edqn_jax.sim.physics.disturbances import Disturbance
 from edqn_jax.sim.physics.drone import DroneState, Flight
 from edqn_jax.sim.physics.flight import fly_command, fly_disturbed
 from edqn_jax.sim.scene.distance import signed_distance
-from edqn_jax.sim.scene.scene import Scene, moves, scene_at
+from edqn_jax.sim.scene.scene import Scene, has_motion, scene_at
 from edqn_jax.sim.task import group
 from edqn_jax.sim.task.action_sets import action_set
-from edqn_jax.sim.task.observation import hold
-from edqn_jax.sim.task.outcomes import Outcome, Verdict, judge
+from edqn_jax.sim.task.observation import repeat_pose
+from edqn_jax.sim.task.outcomes import Outcome, Verdict, judge_decision
 from edqn_jax.sim.task.reward import Reward, Transition, configured_reward
 from edqn_jax.sim.worlds import geodesic
 
 
 @struct.dataclass
 class Situation:
-    """What a decision begins with."""
+    """State of one drone before a decision."""
 
     scene: Scene  # with its motion
     goal: Array  # [3] metres
@@ -44,7 +44,7 @@ class Situation:
 
 @struct.dataclass
 class Payment:
-    """What a decision is paid by, beside the configuration."""
+    """Inputs of the reward beside the configuration."""
 
     function: Reward | None = struct.field(pytree_node=False)  # in place of the configured reward
     distances: geodesic.Field | None  # None where all distances are straight
@@ -53,7 +53,7 @@ class Payment:
 
 @struct.dataclass
 class Decision:
-    """What a decision, or the reset in its place, comes to. n physics steps."""
+    """Result of one decision, or of the reset that replaces it. n physics steps."""
 
     drone: DroneState
     flight: Flight  # [n, ...]
@@ -64,7 +64,7 @@ class Decision:
     disturbance: Disturbance | None = None
 
 
-def choose(condition: Array, yes, no):
+def select_tree(condition: Array, yes, no):
     """Returns `yes` where the condition [] holds, else `no`, leaf by leaf."""
     return jax.tree.map(lambda a, b: jnp.where(condition, a, b), yes, no)
 
@@ -74,7 +74,7 @@ def time_of(config: Config, decisions: Array) -> Array:
     return (decisions * config.drone.physics_steps) * config.drone.physics_dt_s
 
 
-def decide(
+def take_decision(
     config: Config, airframe: Airframe, payment: Payment, before: Situation, action: Array, gusts: Array | None
 ) -> Decision:
     """Returns the decision as flown, judged and rewarded.
@@ -90,8 +90,8 @@ def decide(
         action: [] or [A], as chosen.
         gusts: key, consumed; None where nothing changes how a drone flies.
     """
-    flown, late = _delayed(config, before.disturbance, action)
-    command = action_set(config).command(config, airframe, before.drone, before.goal, flown)
+    applied_action, late = _delayed(config, before.disturbance, action)
+    command = action_set(config).command(config, airframe, before.drone, before.goal, applied_action)
     after, disturbance, flight = _fly(config, airframe, before.drone, late, command, gusts)
     verdict = _judge(config, before, flight)
     reward = _reward(config, payment, before, after, action, verdict.outcome)
@@ -102,8 +102,8 @@ def decide(
     unrewarded = ~broken & ~jnp.isfinite(reward)
     ill, hit = broken | unrewarded, verdict.hit_drone
     return Decision(
-        drone=choose(broken, before.drone, after),
-        flight=choose(broken, hold(before.drone, flight.position.shape[0]), flight),
+        drone=select_tree(broken, before.drone, after),
+        flight=select_tree(broken, repeat_pose(before.drone, flight.position.shape[0]), flight),
         verdict=dataclasses.replace(
             verdict,
             outcome=jnp.where(ill, int(Outcome.DIVERGED), verdict.outcome).astype(jnp.int32),
@@ -112,17 +112,17 @@ def decide(
         reward=jnp.where(ill, 0.0, reward),
         broken=broken,
         unrewarded=unrewarded,
-        disturbance=choose(broken, before.disturbance, disturbance),
+        disturbance=select_tree(broken, before.disturbance, disturbance),
     )
 
 
-def reset_decision(decision: Decision, start: DroneState, drawn: Disturbance | None = None) -> Decision:
+def reset_decision(decision: Decision, start: DroneState, disturbance: Disturbance | None = None) -> Decision:
     """Returns a reset with the arrays of a decision: at `start` throughout, with no reward."""
     verdict = decision.verdict
     return dataclasses.replace(
         decision,
         drone=start,
-        flight=hold(start, decision.flight.position.shape[0]),
+        flight=repeat_pose(start, decision.flight.position.shape[0]),
         verdict=dataclasses.replace(
             verdict,
             outcome=jnp.full((), int(Outcome.RUNNING), jnp.int32),
@@ -131,7 +131,7 @@ def reset_decision(decision: Decision, start: DroneState, drawn: Disturbance | N
         reward=jnp.zeros(()),
         broken=jnp.zeros((), bool),
         unrewarded=jnp.zeros((), bool),
-        disturbance=drawn,
+        disturbance=disturbance,
     )
 
 
@@ -151,7 +151,7 @@ def _fly(
     command: Command,
     gusts: Array | None,
 ) -> tuple[DroneState, Disturbance | None, Flight]:
-    """Flies a command, against the disturbance where it changes how a drone flies."""
+    """Flies a command under the disturbance, if that changes the dynamics."""
     if gusts is not None:
         assert disturbance is not None
         return fly_disturbed(config, airframe, body, disturbance, command, gusts)
@@ -162,11 +162,11 @@ def _fly(
 def _judge(config: Config, before: Situation, flight: Flight) -> Verdict:
     """Returns the outcome in the world and among the other drones."""
     position = before.drone.position
-    verdict = Verdict(*judge(config, before.scene, before.goal, position, flight, before.decision + 1))
-    if not group.several(config):
+    verdict = Verdict(*judge_decision(config, before.scene, before.goal, position, flight, before.decision + 1))
+    if not group.is_multi_drone(config):
         return verdict
     path = jnp.concatenate([position[None], flight.position])
-    return group.collide(config, path, ~before.ended, verdict)
+    return group.judge_contacts(config, path, ~before.ended, verdict)
 
 
 def _reward(
@@ -176,10 +176,10 @@ def _reward(
     here, there, goal = before.drone.position, after.position, before.goal
     moved = jnp.sqrt(jnp.sum((there - here) ** 2))
     if config.env.reward == "geodesic" and payment.distances is not None:
-        left = geodesic.remaining(payment.distances, payment.number, goal, here)
-        gained = left - geodesic.remaining(payment.distances, payment.number, goal, there)
-        # Nobody gains more than the way flown: a drone that crashes into a thin wall ends behind it.
-        most = geodesic.LONGER * moved
+        left = geodesic.distance_to_goal(payment.distances, payment.number, goal, here)
+        gained = left - geodesic.distance_to_goal(payment.distances, payment.number, goal, there)
+        # Gains are at most the length flown: a drone that crashes into a thin wall ends behind it.
+        most = geodesic.MAX_LATTICE_RATIO * moved
         still_left = left - jnp.clip(gained, -most, most)
     else:
         left, still_left = (jnp.sqrt(jnp.sum((goal - point) ** 2)) for point in (here, there))
@@ -187,7 +187,7 @@ def _reward(
     if payment.function is None:
         return configured
     scene = before.scene
-    afterwards = scene_at(scene, time_of(config, before.decision + 1) if moves(scene) else None)
+    afterwards = scene_at(scene, time_of(config, before.decision + 1) if has_motion(scene) else None)
     transition = Transition(
         before=here,
         after=there,

@@ -18,30 +18,30 @@ from jax import Array
 from edqn_jax.checks import check_finite, check_index, is_finite
 from edqn_jax.config import SENSORS, Config
 from edqn_jax.errors import ConfigError
-from edqn_jax.keys import integers
+from edqn_jax.keys import uniform_integers
 from edqn_jax.sim.physics import disturbances, drone
 from edqn_jax.sim.physics.airframe import Airframe
 from edqn_jax.sim.physics.disturbances import Disturbance
 from edqn_jax.sim.physics.drone import DroneState, Flight
-from edqn_jax.sim.scene.launches import nobody_aimed_at, thrown
+from edqn_jax.sim.scene.launches import initial_aim, update_aim
 from edqn_jax.sim.scene.motion import Aim
-from edqn_jax.sim.scene.scene import PARKED, Scene, moves, scene_at, take_scene, with_drones
+from edqn_jax.sim.scene.scene import PARKED, Scene, has_motion, scene_at, take_scene, with_drones
 from edqn_jax.sim.sensors import sensor
 from edqn_jax.sim.sensors.sensor import SensorMemory
 from edqn_jax.sim.task import group
-from edqn_jax.sim.task.action_sets import action_set, admitted
-from edqn_jax.sim.task.decision import Decision, Payment, Situation, choose, decide, reset_decision, time_of
+from edqn_jax.sim.task.action_sets import action_set, clip_action
+from edqn_jax.sim.task.decision import Decision, Payment, Situation, reset_decision, select_tree, take_decision, time_of
 from edqn_jax.sim.task.group import Turn
 from edqn_jax.sim.task.missions import Missions
-from edqn_jax.sim.task.observation import Observation, View, observe, poses_at_start, poses_seen, timed
+from edqn_jax.sim.task.observation import Observation, View, observe, poses_at_start, poses_seen, with_times
 from edqn_jax.sim.task.outcomes import Outcome
 from edqn_jax.sim.task.reward import Reward
 from edqn_jax.sim.worlds import geodesic
 
 
 @struct.dataclass
-class World:
-    """Where environments fly: P worlds and the missions that resets draw from."""
+class EnvParams:
+    """Parameters of environments: airframe, pool of P scenes, missions and reward."""
 
     airframe: Airframe
     pool: Scene  # every array with a leading [P]
@@ -66,8 +66,8 @@ class EnvState:
 
 
 @struct.dataclass
-class Broken:
-    """What was not finite in a decision, which has therefore diverged: [] bool each."""
+class NonFinite:
+    """Which quantities of a diverged decision are not finite: [] bool each."""
 
     physics_state: Array
     observation: Array
@@ -76,7 +76,7 @@ class Broken:
 
 @struct.dataclass
 class Step:
-    """What one decision led to. n physics steps."""
+    """Result of one step. n physics steps."""
 
     observation: Observation
     reward: Array  # [] float32, unscaled
@@ -87,7 +87,7 @@ class Step:
     flight: Flight  # [n, ...] after each physics step; for a reset, the new start throughout
     end_step: Array  # [] int32, physics step (1..n) at which the outcome fell; n while running
     contact: Array  # [] share of that step flown before a collision touched, 1 otherwise
-    broken: Broken
+    broken: NonFinite
     waits: Array | None = None  # [] bool, the episode has ended and that of others in the group has not
     hit_drone: Array | None = None  # [] bool, the collision was with a drone; both None for a drone alone
 
@@ -101,54 +101,58 @@ class _Start:
     disturbance: Disturbance | None  # what the episode will fly against
 
 
-def _start(config: Config, world: World, mission: Array, key: Array) -> _Start:
-    start, goal = world.missions.start[mission], world.missions.goal[mission]
+def _start(config: Config, env_params: EnvParams, mission: Array, key: Array) -> _Start:
+    start, goal = env_params.missions.start[mission], env_params.missions.goal[mission]
     yaw = jnp.arctan2(goal[1] - start[1], goal[0] - start[0])
-    drawn = None
+    disturbance = None
     if disturbances.any_on(config):
         key, drawing = jax.random.split(key)
-        drawn = disturbances.draw(config, world.airframe.mass * world.airframe.gravity / 4, drawing)
-    if drawn is not None and config.env.action_delay:
-        drawn = dataclasses.replace(drawn, move=jnp.asarray(action_set(config).still))
-    return _Start(drone.hover(start, yaw), sensor.at_rest(config, key), drawn)
+        disturbance = disturbances.sample_disturbance(
+            config, env_params.airframe.mass * env_params.airframe.gravity / 4, drawing
+        )
+    if disturbance is not None and config.env.action_delay:
+        disturbance = dataclasses.replace(disturbance, move=jnp.asarray(action_set(config).still))
+    return _Start(drone.hover_state(start, yaw), sensor.at_rest(config, key), disturbance)
 
 
-def nearness(config: Config, world: World, state: EnvState) -> Array:
+def nearness(config: Config, env_params: EnvParams, state: EnvState) -> Array:
     """Returns what the sensor `depth` would show of an environment now: [H, W], without a unit.
 
     A label for training: no observation holds it. With several drones as `step`.
     """
-    scene = scene_now(config, world, state)
-    if group.several(config):
-        there, is_there = group.others(config, (state.drone.position, ~state.ended))
+    scene = scene_now(config, env_params, state)
+    if group.is_multi_drone(config):
+        there, is_there = group.other_drones(config, (state.drone.position, ~state.ended))
         there = jnp.where(is_there[:, None], there, PARKED)
         scene = with_drones(scene, there, jnp.where(is_there, config.drone.body_radius_m, 0.0))
     return sensor.nearness_image(config, scene, state.drone.position, state.drone.quaternion)
 
 
-def reset(config: Config, world: World, key: Array, mission: Array | None = None) -> tuple[EnvState, Observation]:
+def reset(
+    config: Config, env_params: EnvParams, key: Array, mission: Array | None = None
+) -> tuple[EnvState, Observation]:
     """Returns a fresh environment on a mission drawn from the pool, or on the given one, [] int32."""
     key, noise = jax.random.split(key)
-    state = dataclasses.replace(ended(config, world, key, mission), ended=jnp.zeros((), bool))
-    scene, actions = scene_of(world, state.mission), action_set(config)
+    state = dataclasses.replace(before_reset(config, env_params, key, mission), ended=jnp.zeros((), bool))
+    scene, actions = scene_of(env_params, state.mission), action_set(config)
     view = View(
         scene=scene,
-        goal=world.missions.goal[state.mission],
+        goal=env_params.missions.goal[state.mission],
         drone=state.drone,
         move=actions.direction(state.drone, jnp.asarray(actions.still)),
         poses=poses_at_start(config, scene, state.drone),
         disturbance=state.disturbance,
     )
     observation, memory = observe(config, view, state.memory, noise)
-    aim = thrown(config, scene, state.aim, state.decision, state.drone.position, jnp.zeros(3))
+    aim = update_aim(config, scene, state.aim, state.decision, state.drone.position, jnp.zeros(3))
     return dataclasses.replace(state, memory=memory, aim=aim), observation
 
 
-def ended(config: Config, world: World, key: Array, mission: Array | None = None) -> EnvState:
+def before_reset(config: Config, env_params: EnvParams, key: Array, mission: Array | None = None) -> EnvState:
     """Returns an environment whose next step is a reset; it needs no picture. The mission [] is as in `reset`."""
-    key, draw, rest = jax.random.split(key, 3)
-    mission = _drawn_mission(config, world, draw) if mission is None else mission
-    start = _start(config, world, mission, rest)
+    key, mission_key, rest = jax.random.split(key, 3)
+    mission = _sample_mission(config, env_params, mission_key) if mission is None else mission
+    start = _start(config, env_params, mission, rest)
     return EnvState(
         drone=start.drone,
         mission=mission.astype(jnp.int32),
@@ -158,19 +162,19 @@ def ended(config: Config, world: World, key: Array, mission: Array | None = None
         episode_return=jnp.zeros(()),
         key=key,
         disturbance=start.disturbance,
-        aim=nobody_aimed_at(world.pool),
+        aim=initial_aim(env_params.pool),
     )
 
 
-def _drawn_mission(config: Config, world: World, key: Array) -> Array:
-    count = world.missions.scene.shape[0]
-    if group.several(config):
-        return group.mission_of_block(config, integers(key, (), count // config.env.drones))
-    return integers(key, (), count)
+def _sample_mission(config: Config, env_params: EnvParams, key: Array) -> Array:
+    count = env_params.missions.scene.shape[0]
+    if group.is_multi_drone(config):
+        return group.mission_of_block(config, uniform_integers(key, (), count // config.env.drones))
+    return uniform_integers(key, (), count)
 
 
 class _Keys(NamedTuple):
-    """What the key of an environment is split into at each step; every one is consumed."""
+    """Keys split from an environment's key at each step; each is consumed."""
 
     next: Array
     mission: Array
@@ -188,11 +192,11 @@ class _Keys(NamedTuple):
 
 
 def step(
-    config: Config, world: World, state: EnvState, action: Array, mission: Array | None = None
+    config: Config, env_params: EnvParams, state: EnvState, action: Array, mission: Array | None = None
 ) -> tuple[EnvState, Step]:
     """Takes one decision of one drone, or its reset if its episode has ended.
 
-    With several drones it must be mapped by `group.each`; a drone whose episode has ended waits until all of its
+    With several drones it must be mapped by `group.map_drones`; a drone whose episode has ended waits until all of its
     group have ended, and is absent meanwhile.
 
     Args:
@@ -200,26 +204,26 @@ def step(
         mission: [] int, which one a reset takes; None draws one. Those of a group are a block of N in a row.
     """
     actions = action_set(config)
-    action, keys = admitted(actions.space, action), _Keys.split(config, state.key)
+    action, keys = clip_action(actions.space, action), _Keys.split(config, state.key)
     turn = group.turn_of(config, state.ended)
-    fresh = _drawn_mission(config, world, keys.mission) if mission is None else mission
+    fresh = _sample_mission(config, env_params, keys.mission) if mission is None else mission
     mission = jnp.where(turn.is_reset, fresh, state.mission).astype(jnp.int32)
-    check_index(mission, world.missions.scene.shape[0], "the missions")
-    goal = world.missions.goal[mission]
-    scene = scene_of(world, mission, choose(turn.is_reset, nobody_aimed_at(world.pool), state.aim))
-    start = _start(config, world, mission, keys.start)
+    check_index(mission, env_params.missions.scene.shape[0], "the missions")
+    goal = env_params.missions.goal[mission]
+    scene = scene_of(env_params, mission, select_tree(turn.is_reset, initial_aim(env_params.pool), state.aim))
+    start = _start(config, env_params, mission, keys.start)
 
     # For an ended environment the decision is computed and dropped.
-    payment = Payment(world.reward, world.distances, world.missions.scene[state.mission])
+    payment = Payment(env_params.reward, env_params.distances, env_params.missions.scene[state.mission])
     before = Situation(scene, goal, state.drone, state.decision, state.ended, state.disturbance)
-    done = decide(config, world.airframe, payment, before, action, keys.gusts)
+    done = take_decision(config, env_params.airframe, payment, before, action, keys.gusts)
     done = _taken(config, turn, before, start, done)
-    first = choose(turn.is_reset, start.drone, state.drone)
+    first = select_tree(turn.is_reset, start.drone, state.drone)
     view = View(
-        scene=group.present(config, scene, first.position, done.flight, turn.goes_on(done.verdict.outcome)),
+        scene=group.add_other_drones(config, scene, first.position, done.flight, turn.goes_on(done.verdict.outcome)),
         goal=goal,
         drone=done.drone,
-        move=choose(
+        move=select_tree(
             turn.is_reset,
             actions.direction(done.drone, jnp.asarray(actions.still)),
             actions.direction(done.drone, action),
@@ -227,36 +231,36 @@ def step(
         poses=poses_seen(config, first, done.flight),
         disturbance=done.disturbance,
     )
-    memory = choose(turn.is_reset, start.memory, state.memory)
-    observation, memory, unseen = _sense(config, turn, view, memory, keys.noise)
-    outcome = jnp.where(unseen, int(Outcome.DIVERGED), done.verdict.outcome)
-    decision = turn.counted(state.decision)
+    memory = select_tree(turn.is_reset, start.memory, state.memory)
+    observation, memory, observation_nonfinite = _sense(config, turn, view, memory, keys.noise)
+    outcome = jnp.where(observation_nonfinite, int(Outcome.DIVERGED), done.verdict.outcome)
+    decision = turn.decisions_after(state.decision)
     moved = jnp.where(turn.is_reset, 0.0, done.drone.position - first.position)
     after = EnvState(
         drone=done.drone,
         mission=mission,
         decision=decision,
-        ended=turn.over(outcome),
+        ended=turn.is_over(outcome),
         memory=memory,
         episode_return=jnp.where(turn.is_reset, 0.0, state.episode_return + done.reward),
         key=keys.next,
         disturbance=done.disturbance,
-        aim=thrown(config, view.scene, scene.aim, decision, done.drone.position, moved),
+        aim=update_aim(config, view.scene, scene.aim, decision, done.drone.position, moved),
     )
-    return after, _step_of(turn, after, done, outcome, observation, unseen)
+    return after, _step_of(turn, after, done, outcome, observation, observation_nonfinite)
 
 
 def _taken(config: Config, turn: Turn, before: Situation, start: _Start, done: Decision) -> Decision:
     """Returns the decision, or the reset or the wait in its place, with the times of its poses where anything moves."""
-    done = choose(turn.is_reset, reset_decision(done, start.drone, start.disturbance), done)
+    done = select_tree(turn.is_reset, reset_decision(done, start.drone, start.disturbance), done)
     if turn.waits is not None:
-        done = choose(turn.waits, reset_decision(done, before.drone, before.disturbance), done)
-    if not moves(before.scene) and not group.several(config):
+        done = select_tree(turn.waits, reset_decision(done, before.drone, before.disturbance), done)
+    if not has_motion(before.scene) and not group.is_multi_drone(config):
         return done
     # The time before a start is negative: what moves has moved before.
     n = config.drone.physics_steps
     steps = jnp.where(turn.is_reset, -n, before.decision * n) + jnp.arange(1, n + 1)
-    return dataclasses.replace(done, flight=timed(config, done.flight, steps))
+    return dataclasses.replace(done, flight=with_times(config, done.flight, steps))
 
 
 def _sense(
@@ -267,15 +271,15 @@ def _sense(
     for number in jax.tree.leaves(observation.sensed):
         check_finite(number, "what a sensor shows")
     # Own state and motion are of a finite body; counts of events are whole numbers, and nothing is checked.
-    unseen = ~is_finite(observation.sensed)
+    observation_nonfinite = ~is_finite(observation.sensed)
     if turn.waits is not None:
-        unseen &= ~turn.waits
+        observation_nonfinite &= ~turn.waits
     if _has_floats(observation.sensed):
-        observation = choose(unseen, jax.tree.map(jnp.zeros_like, observation), observation)
-    return observation, memory, unseen
+        observation = select_tree(observation_nonfinite, jax.tree.map(jnp.zeros_like, observation), observation)
+    return observation, memory, observation_nonfinite
 
 
-def check_sensor(config: Config, world: World) -> None:
+def check_sensor(config: Config, env_params: EnvParams) -> None:
     """Raises if a registered sensor shows what is not finite in its very first observation; built-in ones never do.
 
     Raises:
@@ -284,13 +288,13 @@ def check_sensor(config: Config, world: World) -> None:
     name = config.env.sensor
     if name not in SENSORS.own:
         return
-    first = group.each(config, lambda key: reset(config, world, key)[1].sensed)
+    first = group.map_drones(config, lambda key: reset(config, env_params, key)[1].sensed)
     if not is_finite(jax.jit(first)(jax.random.split(jax.random.key(0), config.env.drones))):
         raise ConfigError(f"the sensor '{name}' must show finite numbers, and shows NaN or Inf as a flight begins")
 
 
 def _step_of(
-    turn: Turn, after: EnvState, done: Decision, outcome: Array, observation: Observation, unseen: Array
+    turn: Turn, after: EnvState, done: Decision, outcome: Array, observation: Observation, observation_nonfinite: Array
 ) -> Step:
     return Step(
         observation=observation,
@@ -302,7 +306,7 @@ def _step_of(
         flight=done.flight,
         end_step=done.verdict.end_step,
         contact=done.verdict.contact,
-        broken=Broken(physics_state=done.broken, observation=unseen, reward=done.unrewarded),
+        broken=NonFinite(physics_state=done.broken, observation=observation_nonfinite, reward=done.unrewarded),
         waits=turn.waits,
         hit_drone=done.verdict.hit_drone,
     )
@@ -312,19 +316,21 @@ def _has_floats(tree: object) -> bool:
     return any(jnp.issubdtype(leaf.dtype, jnp.floating) for leaf in jax.tree.leaves(tree))
 
 
-def scene_of(world: World, mission: Array, aim: Aim | None = None) -> Scene:
+def scene_of(env_params: EnvParams, mission: Array, aim: Aim | None = None) -> Scene:
     """Returns the world of a mission [] int32, with its motion; balls are thrown at the mission's own drone.
 
     Args:
         aim: of the flight; None is that of a drone of steady pace.
     """
-    scene = take_scene(world.pool, world.missions.scene[mission])
-    if not moves(scene):
+    scene = take_scene(env_params.pool, env_params.missions.scene[mission])
+    if not has_motion(scene):
         return scene
-    return dataclasses.replace(scene, start=world.missions.start[mission], goal=world.missions.goal[mission], aim=aim)
+    return dataclasses.replace(
+        scene, start=env_params.missions.start[mission], goal=env_params.missions.goal[mission], aim=aim
+    )
 
 
-def scene_now(config: Config, world: World, state: EnvState) -> Scene:
-    """Returns the world of an environment as it stands now, after its last decision."""
-    scene = scene_of(world, state.mission, state.aim)
-    return scene_at(scene, time_of(config, state.decision) if moves(scene) else None)
+def scene_now(config: Config, env_params: EnvParams, state: EnvState) -> Scene:
+    """Returns the scene of an environment at its present time, after its last decision."""
+    scene = scene_of(env_params, state.mission, state.aim)
+    return scene_at(scene, time_of(config, state.decision) if has_motion(scene) else None)

@@ -86,7 +86,7 @@ def at_start(config: Config, scene: Scene, body: DroneState) -> Flights:
     )
 
 
-def tally(
+def update_tallies(
     config: Config,
     scene: Scene,
     flights: Flights,
@@ -112,7 +112,7 @@ def tally(
         the tallies, and the clearance [n] after each physics step, metres.
     """
     steps = jnp.arange(config.drone.physics_steps)
-    flown = steps < end_step
+    is_flown = steps < end_step
     share = jnp.where(steps == end_step - 1, contact, 1.0)
     begin = jnp.concatenate([before[None], flight.position[:-1]])
     segment = share[:, None] * (flight.position - begin)
@@ -121,7 +121,7 @@ def tally(
 
     distance = jax.vmap(lambda point, time: signed_distance(scene_at(scene, time), point))(end, times)
     clearance = distance - config.drone.body_radius_m
-    least = jnp.argmin(jnp.where(flown, clearance, jnp.inf))
+    least = jnp.argmin(jnp.where(is_flown, clearance, jnp.inf))
     closest = Closest(
         distance=clearance[least],
         time=times[least],
@@ -135,7 +135,7 @@ def tally(
         physics_steps=flights.physics_steps + end_step,
         contact=contact,
         episode_return=flights.episode_return,
-        path_length_m=flights.path_length_m + jnp.sum(jnp.where(flown, jnp.sqrt(jnp.sum(segment**2, axis=-1)), 0.0)),
+        path_length_m=flights.path_length_m + jnp.sum(jnp.where(is_flown, jnp.sqrt(jnp.sum(segment**2, axis=-1)), 0.0)),
         flight_seconds=times[end_step - 1],
         closest=jax.tree.map(lambda new, old: jnp.where(closer, new, old), closest, flights.closest),
         record=None,

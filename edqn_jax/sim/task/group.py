@@ -1,9 +1,9 @@
 """Several drones in one world: what the drones of a group are to each other.
 
 N drones (`env.drones`) that stand next to each other in an array of environments are one group: they share world,
-clock and end, and nothing else. Functions stay those of one drone; `each` maps them so that a drone can ask for the
-others of its group, by the name of the mapped axis. A decision has two parts: first each drone flies, knowing of none,
-then each is judged and sees, in a world in which the others are spheres that move as they have just flown.
+clock and end, and nothing else. Functions stay those of one drone; `map_drones` maps them so that a drone can gather
+the others of its group over the named axis. A decision has two parts: first each drone flies, knowing of none, then
+each is judged and sees, in a world in which the others are spheres that move as they have just flown.
 
 A drone whose episode has ended is absent, and waits until all of its group have ended; then all are reset together.
 """
@@ -22,7 +22,7 @@ from jax import Array, lax
 from edqn_jax.config import Config
 from edqn_jax.errors import ConfigError
 from edqn_jax.sim.physics.drone import Flight
-from edqn_jax.sim.scene.motion import Flown
+from edqn_jax.sim.scene.motion import DroneTracks
 from edqn_jax.sim.scene.scene import PARKED, Scene
 from edqn_jax.sim.task.outcomes import Outcome, Verdict
 
@@ -30,7 +30,7 @@ AXIS = "drones"
 """Name of the axis of a group's drones."""
 
 
-def several(config: Config) -> bool:
+def is_multi_drone(config: Config) -> bool:
     """Returns whether drones fly in groups; known when tracing."""
     return config.env.drones > 1
 
@@ -41,21 +41,21 @@ def check_alone(config: Config, caller: str) -> None:
     Raises:
         ConfigError: if drones fly in groups.
     """
-    if several(config):
+    if is_multi_drone(config):
         raise ConfigError(
             f"{caller} flies one drone: env.drones must be 1, not {config.env.drones}; "
             "`edqn train` and `edqn evaluate` fly several"
         )
 
 
-def each(config: Config, function: Callable[..., Any]) -> Callable[..., Any]:
+def map_drones(config: Config, function: Callable[..., Any]) -> Callable[..., Any]:
     """Returns a function of one drone mapped over environments [E, ...], groups of N one after the other.
 
     Args:
         config: says N, which divides E.
-        function: of arrays of one drone; within it `together` and what needs it can be called.
+        function: of arrays of one drone; within it `gather_group` and what needs it can be called.
     """
-    if not several(config):
+    if not is_multi_drone(config):
         return jax.vmap(function)
     in_groups = jax.vmap(jax.vmap(function, axis_name=AXIS))
 
@@ -66,8 +66,8 @@ def each(config: Config, function: Callable[..., Any]) -> Callable[..., Any]:
     return mapped
 
 
-def together(tree: Any) -> Any:
-    """Returns the arrays of all drones of the group, with a leading [N], to one of them; see `each`."""
+def gather_group(tree: Any) -> Any:
+    """Returns the arrays of all drones of the group, with a leading [N], to one of them; see `map_drones`."""
     return lax.all_gather(tree, AXIS)
 
 
@@ -76,20 +76,20 @@ def own_number() -> Array:
     return lax.axis_index(AXIS)
 
 
-def others(config: Config, tree: Any) -> Any:
+def other_drones(config: Config, tree: Any) -> Any:
     """Returns the arrays [N - 1, ...] of all others, of one drone's own."""
     which = (own_number() + 1 + jnp.arange(config.env.drones - 1)) % config.env.drones
-    return jax.tree.map(lambda x: x[which], together(tree))
+    return jax.tree.map(lambda x: x[which], gather_group(tree))
 
 
 def mission_of_block(config: Config, block: Array) -> Array:
     """Returns the drone's own mission [] int32 of the block [] int32 that the group's first drone has drawn."""
-    return together(block)[0] * config.env.drones + own_number()
+    return gather_group(block)[0] * config.env.drones + own_number()
 
 
 @struct.dataclass
 class Turn:
-    """What a step of one drone is spent on."""
+    """Whether a drone's step is a decision, a reset or a wait."""
 
     is_reset: Array  # [] bool
     waits: Array | None = None  # [] bool, for others of the group whose episodes go on; None for a drone alone
@@ -99,26 +99,26 @@ class Turn:
         on = outcome == Outcome.RUNNING
         return on if self.waits is None else on & ~self.waits
 
-    def counted(self, decision: Array) -> Array:
+    def decisions_after(self, decision: Array) -> Array:
         """Returns the decisions [] of the episode after the step."""
         count = jnp.where(self.is_reset, 0, decision + 1)
         return count if self.waits is None else jnp.where(self.waits, decision, count)
 
-    def over(self, outcome: Array) -> Array:
+    def is_over(self, outcome: Array) -> Array:
         """Returns whether the episode has ended after a step with this outcome, [] bool."""
         over = outcome != Outcome.RUNNING
         return over if self.waits is None else over | self.waits
 
 
 def turn_of(config: Config, ended: Array) -> Turn:
-    """Returns what the next step of a drone is spent on, whose episode has ended or not, [] bool."""
-    if not several(config):
+    """Returns the kind of a drone's next step from whether its episode `ended`, [] bool."""
+    if not is_multi_drone(config):
         return Turn(ended)
-    over = jnp.all(together(ended))
+    over = jnp.all(gather_group(ended))
     return Turn(over, ended & ~over)
 
 
-def mates(config: Config, waits: Array) -> Array:
+def active_partner_index(config: Config, waits: Array) -> Array:
     """Returns for each environment [E] its own index, for one that waits that of the first of its group that flies.
 
     Args:
@@ -130,30 +130,30 @@ def mates(config: Config, waits: Array) -> Array:
     return jnp.where(waits, jnp.repeat(first, config.env.drones), number)
 
 
-def present(config: Config, scene: Scene, first: Array, flight: Flight, is_there: Array) -> Scene:
-    """Returns the drone's world with the others in it; that of a drone alone as it is.
+def add_other_drones(config: Config, scene: Scene, first: Array, flight: Flight, is_there: Array) -> Scene:
+    """Returns the scene with the other drones added; unchanged for a single drone.
 
     Args:
         scene: one world.
         first: [3] metres, where the drone itself was before the decision.
         flight: how it has flown since, with times.
-        is_there: [] bool, whether the others see it.
+        is_there: [] bool, whether the drone is visible to the others.
     """
-    if not several(config):
+    if not is_multi_drone(config):
         return scene
     assert flight.time is not None
-    path, is_there = others(config, (jnp.concatenate([first[None], flight.position]), is_there))
+    path, is_there = other_drones(config, (jnp.concatenate([first[None], flight.position]), is_there))
     dt = config.drone.physics_dt_s
-    flown = Flown(
+    tracks = DroneTracks(
         path=jnp.where(is_there[:, None, None], path, PARKED),
         radius=jnp.where(is_there, config.drone.body_radius_m, 0.0),
         began=flight.time[0] - dt,
         step_s=jnp.float32(dt),
     )
-    return dataclasses.replace(scene, drones=flown)
+    return dataclasses.replace(scene, drones=tracks)
 
 
-def collide(config: Config, path: Array, flies: Array, verdict: Verdict) -> Verdict:
+def judge_contacts(config: Config, path: Array, flies: Array, verdict: Verdict) -> Verdict:
     """Returns one drone's verdict among the others: a contact of two drones ends both, unless one has ended before.
 
     At the same moment a contact of drones wins.
@@ -167,8 +167,8 @@ def collide(config: Config, path: Array, flies: Array, verdict: Verdict) -> Verd
     outcome, end_step, contact = verdict.outcome, verdict.end_step, verdict.contact
     ends = (outcome != Outcome.RUNNING) & (outcome != Outcome.TIME_OUT)
     until = jnp.where(ends, end_step - 1 + contact, jnp.inf)
-    paths, fly, untils = together((path, flies, until))
-    hit = encounters(paths, fly, untils, 2 * config.drone.body_radius_m)[own_number()]
+    paths, fly, untils = gather_group((path, flies, until))
+    hit = contact_times(paths, fly, untils, 2 * config.drone.body_radius_m)[own_number()]
     hits = jnp.isfinite(hit)
     step = jnp.clip(jnp.ceil(jnp.where(hits, hit, 1.0)), 1, path.shape[0] - 1).astype(jnp.int32)
     return Verdict(
@@ -179,10 +179,10 @@ def collide(config: Config, path: Array, flies: Array, verdict: Verdict) -> Verd
     )
 
 
-def encounters(path: Array, flies: Array, until: Array, reach: float) -> Array:
+def contact_times(path: Array, flies: Array, until: Array, reach: float) -> Array:
     """Returns when each drone of a group hits another, [N] in physics steps from 0, inf where it does not.
 
-    Contacts are taken in the order of time; whoever has ended hits nobody any more.
+    Contacts are taken in the order of time; a drone that has ended hits no other.
 
     Args:
         path: [N, n + 1, 3] metres.
@@ -191,7 +191,7 @@ def encounters(path: Array, flies: Array, until: Array, reach: float) -> Array:
         reach: metres between the centres of two that touch.
     """
     count = path.shape[0]
-    meet = jax.vmap(jax.vmap(lambda a, b: meeting(a, b, reach), (None, 0)), (0, None))(path, path)
+    meet = jax.vmap(jax.vmap(lambda a, b: pair_contact_time(a, b, reach), (None, 0)), (0, None))(path, path)
     possible = meet <= jnp.minimum(until[:, None], until[None, :])
     possible &= flies[:, None] & flies[None, :] & ~jnp.eye(count, dtype=bool)
     meet = jnp.where(possible, meet, jnp.inf)
@@ -205,7 +205,7 @@ def encounters(path: Array, flies: Array, until: Array, reach: float) -> Array:
     return hit
 
 
-def meeting(one: Array, other: Array, reach: float) -> Array:
+def pair_contact_time(one: Array, other: Array, reach: float) -> Array:
     """Returns when two spheres that move straight within each physics step first touch: [] physics steps, inf if never.
 
     Seen from the other, one moves along a segment `d0 + f d`, f in [0, 1]; they touch where its length is `reach`. The

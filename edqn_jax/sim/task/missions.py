@@ -15,12 +15,12 @@ from edqn_jax.sim.worlds.free_points import (
     CLEARANCE,
     TRIES,
     Cells,
+    contains,
     far_apart,
     far_from,
     first_free,
     in_cells,
-    is_in,
-    scatter,
+    scatter_points,
 )
 
 AWAY = 5.0
@@ -52,12 +52,12 @@ def random_missions(pool: Scene, count: int, key: Array, own_goals: bool = False
         own_goals: whether all missions in a world end at its own goal.
     """
 
-    def mission(index: Array, draw: Array) -> Missions:
+    def mission(index: Array, uniforms: Array) -> Missions:
         scene = take_scene(pool, index)
         if own_goals:
             # The same conditions with the ends exchanged.
-            return Missions(scene=index, start=far_from(scene, draw[0], scene.goal), goal=scene.goal)
-        start, goal = far_apart(scene, draw)
+            return Missions(scene=index, start=far_from(scene, uniforms[0], scene.goal), goal=scene.goal)
+        start, goal = far_apart(scene, uniforms)
         return Missions(scene=index, start=start, goal=goal)
 
     scene_key, points_key = jax.random.split(key)
@@ -89,17 +89,17 @@ def spread_missions(
             everywhere.
     """
 
-    def mission(own: Array, index: Array, draw: Array) -> Missions:
+    def mission(own: Array, index: Array, uniforms: Array) -> Missions:
         scene = take_scene(pool, index)
-        points = scatter(scene, draw[0]) if cells is None else in_cells(cells, draw[0])
+        points = scatter_points(scene, uniforms[0]) if cells is None else in_cells(cells, uniforms[0])
         anywhere = first_free(scene, points, CLEARANCE, scene.goal, AWAY)
         lower = jnp.minimum(scene.volume[0] + 0.5, scene.start)
         upper = jnp.maximum(scene.volume[1] - 0.5, scene.start)
         # The start itself comes last: it is chosen if no other candidate is free.
-        shift = (jnp.asarray(jitter) * (2.0 * draw[1] - 1.0)).at[-1].set(0.0)
+        shift = (jnp.asarray(jitter) * (2.0 * uniforms[1] - 1.0)).at[-1].set(0.0)
         near = jnp.clip(scene.start[None] + shift, lower[None], upper[None])
         if cells is not None:
-            near = jnp.where(jax.vmap(partial(is_in, cells))(near)[:, None], near, scene.start)
+            near = jnp.where(jax.vmap(partial(contains, cells))(near)[:, None], near, scene.start)
         start = jnp.where(own, first_free(scene, near, CLEARANCE), anywhere)
         return Missions(scene=index, start=start, goal=scene.goal)
 

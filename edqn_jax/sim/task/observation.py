@@ -1,4 +1,4 @@
-"""What a drone observes: what its sensor shows, its own state and its own motion; the poses at which a sensor looks."""
+"""Observations: sensor output, own state and own motion; the poses at which a sensor samples."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from edqn_jax.config import Config, EnvConfig
 from edqn_jax.sim.physics import disturbances, drone
 from edqn_jax.sim.physics.disturbances import Disturbance
 from edqn_jax.sim.physics.drone import DroneState, Flight
-from edqn_jax.sim.scene.scene import Scene, moves
+from edqn_jax.sim.scene.scene import Scene, has_motion
 from edqn_jax.sim.sensors import sensor
 from edqn_jax.sim.sensors.sensor import Sensed, SensorMemory, frame_steps
 
@@ -25,7 +25,7 @@ OWN_SIZE = 10
 MOTION_SIZE = 7
 """Values of the drone's own motion in an observation."""
 
-MOST_YAW_RATE = 10.0
+MAX_YAW_RATE = 10.0
 """Bound of the yaw rate in an observation, rad/s."""
 
 MIRRORED_MOTION = (1.0, -1.0, 1.0, -1.0, 1.0, -1.0, 1.0)
@@ -34,7 +34,7 @@ MIRRORED_MOTION = (1.0, -1.0, 1.0, -1.0, 1.0, -1.0, 1.0)
 
 @struct.dataclass
 class Observation:
-    """What the agent may know: what its sensor shows, by default the events before the decision, and its own state."""
+    """Observation of one drone: sensor output, by default the events before the decision, and own state."""
 
     sensed: Sensed
     own: Array  # [OWN_SIZE], see `own_state`
@@ -54,17 +54,19 @@ class View:
 
 
 def observe(config: Config, view: View, memory: SensorMemory, key: Array) -> tuple[Observation, SensorMemory]:
-    """Returns what the sensor shows, own state [OWN_SIZE] and motion [MOTION_SIZE].
+    """Returns sensor output, own state [OWN_SIZE] and own motion [MOTION_SIZE], and the sensor's memory.
 
     Args:
         config: of sensor and task.
-        view: what is looked at.
+        view: scene, goal and poses to observe.
         memory, key: as in `sensor.sense`.
     """
     state = view.drone
     if view.disturbance is not None and disturbances.has_noise(config.noise):
         key, errs = jax.random.split(key)
-        position, velocity = disturbances.believed(config.noise, view.disturbance, state.position, state.velocity, errs)
+        position, velocity = disturbances.estimate_state(
+            config.noise, view.disturbance, state.position, state.velocity, errs
+        )
         state = dataclasses.replace(state, position=position, velocity=velocity)
     sensed, memory = sensor.sense(config, view.scene, view.poses, memory, key)
     own = own_state(config.env, view.scene, view.goal, state)
@@ -95,7 +97,7 @@ def own_state(config: EnvConfig, scene: Scene, goal: Array, state: DroneState) -
     return jnp.concatenate([towards, place, heading_velocity(config, yaw, state.velocity)])
 
 
-def turned(own: Array, quarters: Array) -> Array:
+def rotate_own_state(own: Array, quarters: Array) -> Array:
     """Returns own states [..., OWN_SIZE] as they would be with world and drone turned about the volume's middle.
 
     Args:
@@ -111,9 +113,9 @@ def turned(own: Array, quarters: Array) -> Array:
 
 
 def own_motion(config: EnvConfig, state: DroneState, move: Array) -> Array:
-    """Returns what the drone knows of its own motion [MOTION_SIZE], each value of order 1.
+    """Returns the own motion [MOTION_SIZE], each value of order 1.
 
-    Velocity in the heading frame (3, in commanded speeds), yaw rate (rad/s, at most `MOST_YAW_RATE`), last move (3).
+    Velocity in the heading frame (3, in commanded speeds), yaw rate (rad/s, at most `MAX_YAW_RATE`), last move (3).
 
     Args:
         config: says what a commanded speed is.
@@ -123,7 +125,7 @@ def own_motion(config: EnvConfig, state: DroneState, move: Array) -> Array:
     """
     velocity = heading_velocity(config, drone.yaw_of(state.quaternion), state.velocity)
     # Of a drone on its back the heading turns at any rate.
-    rate = jnp.clip(drone.yaw_rate_of(state), -MOST_YAW_RATE, MOST_YAW_RATE)
+    rate = jnp.clip(drone.yaw_rate_of(state), -MAX_YAW_RATE, MAX_YAW_RATE)
     return jnp.concatenate([velocity, rate[None], move])
 
 
@@ -137,19 +139,19 @@ def heading_velocity(config: EnvConfig, yaw: Array, velocity: Array) -> Array:
 def poses_at_start(config: Config, scene: Scene, body: DroneState) -> Flight:
     """Returns the poses [T] at which the sensor looks before an episode, in which the body is at rest."""
     before = np.array(frame_steps(config)) - config.drone.physics_steps
-    return timed(config, hold(body, len(before)), jnp.asarray(before) if moves(scene) else None)
+    return with_times(config, repeat_pose(body, len(before)), jnp.asarray(before) if has_motion(scene) else None)
 
 
-def hold(body: DroneState, n: int) -> Flight:
+def repeat_pose(body: DroneState, n: int) -> Flight:
     """Returns n times the same pose."""
     repeat: Callable[[Array], Array] = lambda x: jnp.broadcast_to(x, (n, *x.shape))  # noqa: E731
     return Flight(position=repeat(body.position), quaternion=repeat(body.quaternion), velocity=repeat(body.velocity))
 
 
-def timed(config: Config, flight: Flight, steps: Array | None) -> Flight:
+def with_times(config: Config, flight: Flight, steps: Array | None) -> Flight:
     """Returns a flight with the times of its poses, taken after physics steps `steps` [n] of the episode.
 
-    Where nothing moves but the drone nobody asks for times, and there are none.
+    In a static scene the times are None.
     """
     if steps is None:
         return flight

@@ -11,7 +11,7 @@ from jax import Array
 from edqn_jax.config import Config
 from edqn_jax.sim.physics.drone import Flight
 from edqn_jax.sim.scene.distance import path_contact
-from edqn_jax.sim.scene.scene import Scene, moves
+from edqn_jax.sim.scene.scene import Scene, has_motion
 
 
 class Outcome(enum.IntEnum):
@@ -40,7 +40,7 @@ class Verdict:
     hit_drone: Array | None = None  # [] bool, the collision was with a drone; None for a drone alone
 
 
-def judge(
+def judge_decision(
     config: Config, scene: Scene, goal: Array, before: Array, flight: Flight, decision: Array
 ) -> tuple[Array, Array, Array]:
     """Returns the outcome of one decision: the earliest physics step wins, and at the same step a collision wins.
@@ -57,7 +57,7 @@ def judge(
     """
     n = flight.position.shape[0]
     path = jnp.concatenate([before[None], flight.position])
-    times = ((decision - 1) * n + jnp.arange(n + 1)) * config.drone.physics_dt_s if moves(scene) else None
+    times = ((decision - 1) * n + jnp.arange(n + 1)) * config.drone.physics_dt_s if has_motion(scene) else None
     touch, contact = path_contact(scene, path, config.drone.body_radius_m, times)
     at = flight.position
     apart = at - goal[None]

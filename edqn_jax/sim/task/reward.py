@@ -34,12 +34,12 @@ def configured_reward(
     outcome: Array,
     before: Array,
     after: Array,
-    flown: Array | float = 0.0,
+    path_m: Array | float = 0.0,
 ) -> Array:
     """Returns the configured reward [] of one decision.
 
     `sparse` is Eq. 8. `progress` adds the metres gained towards the goal, times a weight, and
-    subtracts a weight for each metre flown; `geodesic` is the same with distances around obstacles. `potential` adds
+    subtracts a weight for each metre flown; `geodesic` uses distances around obstacles. `potential` adds
     gamma * Phi(s') - Phi(s) with Phi = -weight * distance and gamma `env.potential_discount`, and Phi = 0 at terminal
     states: the form that leaves the optimal policy unchanged (Ng et al. 1999).
 
@@ -54,7 +54,7 @@ def configured_reward(
     )
     total = at_end + config.step_reward
     if config.reward in ("progress", "geodesic"):
-        total = total + config.progress_weight * (before - after) - config.path_weight * flown
+        total = total + config.progress_weight * (before - after) - config.path_weight * path_m
     elif config.reward == "potential":
         terminal = is_terminal(outcome)
         total = total + config.progress_weight * (before - jnp.where(terminal, 0.0, config.potential_discount * after))

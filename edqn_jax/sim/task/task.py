@@ -1,10 +1,10 @@
-"""The contract of a task: what learners, rollouts and other libraries' environments ask of whatever is flown.
+"""The contract of a task: pure functions that learners, rollouts and other libraries' environments call.
 
     task = task_of(config)
     state, observation = task.reset(world, key)
     state, step = task.step(world, state, action)
 
-All functions are pure and of one drone; `map` maps them over environments. A `World` holds the arrays that they
+All functions are pure and of one drone; `map` maps them over environments. A `EnvParams` holds the arrays that they
 depend on.
 """
 
@@ -22,8 +22,8 @@ from edqn_jax.config import Config
 from edqn_jax.sim.actions import Box, Discrete
 from edqn_jax.sim.task import env, group
 from edqn_jax.sim.task.action_sets import action_set
-from edqn_jax.sim.task.env import EnvState, Step, World
-from edqn_jax.sim.task.observation import MIRRORED_MOTION, MOTION_SIZE, OWN_SIZE, Observation, turned
+from edqn_jax.sim.task.env import EnvParams, EnvState, Step
+from edqn_jax.sim.task.observation import MIRRORED_MOTION, MOTION_SIZE, OWN_SIZE, Observation, rotate_own_state
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -38,16 +38,16 @@ class Task:
     """Values of the own state in an observation."""
     motion_size: int
     """Values of the own motion in an observation."""
-    reset: Callable[[World, Array, Array | None], tuple[EnvState, Observation]]
-    """(world, key, mission [] or None, which draws one) → state, the first observation; the key is consumed."""
-    begin: Callable[[World, Array, Array | None], EnvState]
-    """(world, key, mission or None) → a state whose next step is a reset; nothing is observed before that."""
+    reset: Callable[[EnvParams, Array, Array | None], tuple[EnvState, Observation]]
+    """(env_params, key, mission [] or None, which samples one) → state, the first observation; the key is consumed."""
+    begin: Callable[[EnvParams, Array, Array | None], EnvState]
+    """(env_params, key, mission or None) → a state whose next step is a reset; nothing is observed before that."""
     step: Callable[..., tuple[EnvState, Step]]
-    """(world, state, action, mission=None) → state, what the decision, or the reset in its place, led to."""
+    """(env_params, state, action, mission=None) → state, result of the decision or of the reset that replaces it."""
     map: Callable[[Callable[..., Any]], Callable[..., Any]]
     """Maps a function of one drone over environments [E, ...], in groups where several drones share a world."""
-    label: Callable[[World, EnvState], Array] | None = None
-    """(world, state) → how near things are [H, W], for training alone; no observation holds it."""
+    label: Callable[[EnvParams, EnvState], Array] | None = None
+    """(env_params, state) → how near things are [H, W], for training alone; no observation holds it."""
     mirror: tuple[float, ...] | None = None
     """Factors [motion_size] on the own motion when left and right are exchanged; None where that is no symmetry."""
     turn: Callable[[Array, Array], Array] | None = None
@@ -67,11 +67,11 @@ def task_of(config: Config) -> Task:
         still=actions.still,
         own_size=OWN_SIZE,
         motion_size=MOTION_SIZE,
-        reset=lambda world, key, mission=None: env.reset(config, world, key, mission),
-        begin=lambda world, key, mission=None: env.ended(config, world, key, mission),
-        step=lambda world, state, action, mission=None: env.step(config, world, state, action, mission),
-        map=functools.partial(group.each, config),
-        label=lambda world, state: env.nearness(config, world, state),
+        reset=lambda env_params, key, mission=None: env.reset(config, env_params, key, mission),
+        begin=lambda env_params, key, mission=None: env.before_reset(config, env_params, key, mission),
+        step=lambda env_params, state, action, mission=None: env.step(config, env_params, state, action, mission),
+        map=functools.partial(group.map_drones, config),
+        label=lambda env_params, state: env.nearness(config, env_params, state),
         mirror=MIRRORED_MOTION,
-        turn=turned,
+        turn=rotate_own_state,
     )

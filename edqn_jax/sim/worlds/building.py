@@ -29,7 +29,7 @@ COLOUR_DRAWS = 5
 """Random numbers that a colour takes."""
 
 
-def boxes(present: Array, position: Array, half: Array, yaw: Array, albedo: Array) -> UprightBoxes:
+def make_boxes(present: Array, position: Array, half: Array, yaw: Array, albedo: Array) -> UprightBoxes:
     """Returns those of N boxes that are `present` [N] bool; the others are parked."""
     return UprightBoxes(
         position=jnp.where(present[:, None], position, PARKED),
@@ -39,7 +39,7 @@ def boxes(present: Array, position: Array, half: Array, yaw: Array, albedo: Arra
     )
 
 
-def cylinders(
+def make_cylinders(
     present: Array, position: Array, radius: Array, half_height: ArrayLike, albedo: Array
 ) -> UprightCylinders:
     """Returns those of N upright cylinders that are `present` [N] bool; the others are parked."""
@@ -51,7 +51,7 @@ def cylinders(
     )
 
 
-def spheres(present: Array, position: Array, radius: Array, albedo: Array) -> Spheres:
+def make_spheres(present: Array, position: Array, radius: Array, albedo: Array) -> Spheres:
     """Returns those of N spheres that are `present` [N] bool; the others are parked."""
     return Spheres(
         position=jnp.where(present[:, None], position, PARKED),
@@ -60,7 +60,7 @@ def spheres(present: Array, position: Array, radius: Array, albedo: Array) -> Sp
     )
 
 
-def ground() -> Planes:
+def make_ground() -> Planes:
     """Returns level ground at height 0."""
     return Planes(position=jnp.zeros((1, 3)), normal=jnp.array([[0.0, 0.0, 1.0]]), albedo=jnp.array([GROUND_RGB]))
 
@@ -75,7 +75,7 @@ def floor_and_ceiling(height: ArrayLike, albedo: Array) -> Planes:
     )
 
 
-def world(
+def build_scene(
     size: Size,
     ends: Array,
     planes: Planes,
@@ -96,13 +96,13 @@ def world(
     return dataclasses.replace(scene, start=start, goal=goal)
 
 
-def between(span: tuple[float | Array, float | Array], draw: Array) -> Array:
+def scale_uniforms(span: tuple[float | Array, float | Array], uniforms: Array) -> Array:
     """Returns numbers [...] from the first to the second of `span`, from uniform draws [...]."""
-    return span[0] + (span[1] - span[0]) * draw
+    return span[0] + (span[1] - span[0]) * uniforms
 
 
-def albedos(draw: Array) -> Array:
+def make_albedos(uniforms: Array) -> Array:
     """Returns albedos [N, 3] from uniform draws [N, 5]: greys of all values, about half of them with a tint."""
-    grey = 0.15 + 0.7 * draw[:, :1]
-    tint = 0.5 * draw[:, 1:4] - 0.25
-    return jnp.clip(grey + jnp.where(draw[:, 4:] < 0.5, tint, 0.0), 0.05, 0.95)
+    grey = 0.15 + 0.7 * uniforms[:, :1]
+    tint = 0.5 * uniforms[:, 1:4] - 0.25
+    return jnp.clip(grey + jnp.where(uniforms[:, 4:] < 0.5, tint, 0.0), 0.05, 0.95)

@@ -37,7 +37,7 @@ BODIES = {
 """Bodies, as `moving` moves them: all parts of a building are one."""
 
 
-def draw(key: Array) -> Scene:
+def sample_canyon(key: Array) -> Scene:
     """Returns a random canyon, a start and a goal.
 
     The free space is connected by construction, as that of a forest: each building stands in a disc, the discs are
@@ -54,9 +54,9 @@ def draw(key: Array) -> Scene:
     plan = plans.reshape(buildings, _OF_A_BUILDING)
     is_large = jnp.arange(buildings) < LARGE
     narrow, wide = (jnp.where(is_large, large, small) for large, small in zip(*REACHES, strict=True))
-    reach = building.between((narrow, wide), plan[:, 0])
+    reach = building.scale_uniforms((narrow, wide), plan[:, 0])
     candidates = discs.across_the_edge(reach, places.reshape(buildings, discs.PLACES, 2), SIZE[:2], _EDGE)
-    x, y, placed = discs.place(reach, candidates, GAP)
+    x, y, placed = discs.place_discs(reach, candidates, GAP)
     low, high, there = jax.vmap(_parts)(reach, plan[:, 1], plan[:, 2], is_large)
 
     # A building that reaches over the edge opens towards the middle: what opens outwards would be closed.
@@ -75,16 +75,16 @@ def draw(key: Array) -> Scene:
     )
     # Of small buildings the last parts, which they never have, are left out.
     kept = jnp.flatnonzero(is_large[:, None] | (jnp.arange(_PARTS) < _PARTS // 2)[None], size=parts)
-    return building.world(
+    return building.build_scene(
         SIZE,
         ends.reshape(2, TRIES, 3),
-        building.ground(),
-        building.boxes(
+        building.make_ground(),
+        building.make_boxes(
             (there & placed[:, None]).reshape(-1)[kept],
             turned.reshape(-1, 3)[kept],
             ((high - low) / 2).reshape(-1, 3)[kept],
             jnp.repeat(yaw, _PARTS)[kept],
-            building.albedos(colours.reshape(parts, -1)),
+            building.make_albedos(colours.reshape(parts, -1)),
         ),
     )
 
@@ -103,7 +103,7 @@ def _parts(reach: Array, kind: Array, level: Array, is_large: Array) -> tuple[Ar
     """
     top, w = SIZE[2], WALL
     side = 0.7 * reach  # of the largest square, from the middle
-    shelf, standing, hanging = (building.between(span, level) for span in (SHELF_HEIGHT, STANDING, HANGING))
+    shelf, standing, hanging = (building.scale_uniforms(span, level) for span in (SHELF_HEIGHT, STANDING, HANGING))
     courtyard = (
         ((side - w, -side, 0.0), (side, side, top)),
         ((-side, side - w, 0.0), (side, side, top)),

@@ -12,7 +12,7 @@ PLACES = 64
 """Candidate positions for each disc."""
 
 
-def place(reach: Array, candidates: Array, gap: float) -> tuple[Array, Array, Array]:
+def place_discs(reach: Array, candidates: Array, gap: float) -> tuple[Array, Array, Array]:
     """Returns positions for discs that are `gap` apart, chosen one after the other.
 
     Args:
@@ -42,24 +42,24 @@ def place(reach: Array, candidates: Array, gap: float) -> tuple[Array, Array, Ar
     return x, y, placed
 
 
-def inside(reach: Array, draw: Array, size: tuple[float, float], margin: float) -> Array:
+def candidates_inside(reach: Array, uniforms: Array, size: tuple[float, float], margin: float) -> Array:
     """Returns candidates [N, K, 2] for discs that end `margin` metres inside a floor, from uniform draws [N, K, 2]."""
     lower = jnp.broadcast_to(margin + reach[:, None, None], (reach.shape[0], 1, 2))
     upper = jnp.array(size)[None, None] - lower
-    return lower + draw * (upper - lower)
+    return lower + uniforms * (upper - lower)
 
 
-def across_the_edge(reach: Array, draw: Array, size: tuple[float, float], room: float) -> Array:
+def across_the_edge(reach: Array, uniforms: Array, size: tuple[float, float], room: float) -> Array:
     """Returns candidates [N, K, 2] for discs with their middles on a floor, from uniform draws [N, K, 2].
 
     A disc may reach over one side of the floor, so that nobody can fly along its edge, but it stays `room` metres from
     at least one side of each corner: no corner is cut off.
     """
     sides = jnp.array(size)[None, None]
-    places = draw * sides
+    places = uniforms * sides
     least = reach[:, None, None] + room
     in_a_corner = jnp.all(jnp.minimum(places, sides - places) < least, axis=2, keepdims=True)
     # Moved out of the corner along y.
-    along = least[..., 0] + draw[..., 1] * (sides[..., 1] - 2.0 * least[..., 0])
+    along = least[..., 0] + uniforms[..., 1] * (sides[..., 1] - 2.0 * least[..., 0])
     moved = jnp.stack([places[..., 0], along], axis=2)
     return jnp.where(in_a_corner, moved, places)

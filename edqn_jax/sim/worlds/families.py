@@ -15,9 +15,9 @@ from jax import Array, lax
 from jax.typing import ArrayLike
 
 from edqn_jax.config import FAMILIES, MIXTURES, Config
-from edqn_jax.config.loading import nearest
+from edqn_jax.config.loading import suggest_nearest
 from edqn_jax.errors import ConfigError
-from edqn_jax.keys import FAMILY_OF_WORLD, MOTION_OF_WORLD, RANDOM_WORLDS, integers
+from edqn_jax.keys import FAMILY_OF_WORLD, MOTION_OF_WORLD, RANDOM_WORLDS, uniform_integers
 from edqn_jax.sim.scene.scene import Scene, stack_scenes, take_scene, with_equal_capacities
 from edqn_jax.sim.worlds import canyon, forest, open_worlds, rooms
 from edqn_jax.sim.worlds.looks import with_looks
@@ -27,7 +27,7 @@ from edqn_jax.sim.worlds.reachability import has_way
 RADIUS_M = 0.36
 """Of the sphere that has a way in every random world; the drone's."""
 
-_AT_ONCE = 64  # worlds that are drawn by one call
+_BATCH = 64  # worlds that are drawn by one call
 
 # ------------------------------------------------------------------------------------------- seeds
 
@@ -79,21 +79,23 @@ class Mixture:
 
 
 def _open(density: str) -> Family:
-    return Family(partial(open_worlds.draw, density), open_worlds.SIZE, None, open_worlds.bodies(density))
+    return Family(
+        partial(open_worlds.sample_open_world, density), open_worlds.SIZE, None, open_worlds.body_slots(density)
+    )
 
 
 SPARSE, MEDIUM, DENSE = (_open(density) for density in open_worlds.SHAPES)
 MOVING = dataclasses.replace(MEDIUM, moving_share=MOVING_SHARE)
-ROOMS = Family(rooms.draw, (rooms.SIDE, rooms.SIDE, rooms.HEIGHT[1]), detours=True)  # walls stand
-FOREST = Family(forest.draw, forest.SIZE, bodies=forest.BODIES, detours=True)
-CANYON = Family(canyon.draw, canyon.SIZE, edge_m=0.7, bodies=canyon.BODIES, detours=True)
+ROOMS = Family(rooms.sample_rooms, (rooms.SIDE, rooms.SIDE, rooms.HEIGHT[1]), detours=True)  # walls stand
+FOREST = Family(forest.sample_forest, forest.SIZE, bodies=forest.BODIES, detours=True)
+CANYON = Family(canyon.sample_canyon, canyon.SIZE, edge_m=0.7, bodies=canyon.BODIES, detours=True)
 OPEN, MIXED = Mixture(MIXTURES["open"]), Mixture(MIXTURES["mixed"], detours=True)
 
 
 def random_scene(family: str, key: Array, moving: Moving = STILL) -> Scene:
     """Returns a random world with a start, a goal, and a way between them for a sphere of `RADIUS_M`.
 
-    What moves does so on top of the world that the key gives without it, and the way is one at time 0.
+    Motion is added to the static world of the same key; reachability is checked at time 0.
 
     Args:
         family: of `FAMILIES`; a world of a mixture is of one of its families.
@@ -105,7 +107,7 @@ def random_scene(family: str, key: Array, moving: Moving = STILL) -> Scene:
     """
     if isinstance(_entry(family), Mixture):
         family = families_of(family, key[None])[0]
-    return take_scene(_drawn(family, key[None], _moving_in(family, moving)), 0)
+    return take_scene(_sample_worlds(family, key[None], _moving_in(family, moving)), 0)
 
 
 def random_pool(family: str, keys: Array, moving: Moving = STILL) -> Scene:
@@ -117,8 +119,8 @@ def random_pool(family: str, keys: Array, moving: Moving = STILL) -> Scene:
     present = [(str(name), np.flatnonzero(names == name)) for name in np.unique(names)]
     # Padded for all families of the mixture, also for one that none of these worlds is of.
     shapes = [jax.eval_shape(partial(_unchecked, name, _moving_in(name, moving)), keys) for name in mixture.shares]
-    drawn = [_in_batches(name, _moving_in(name, moving), keys[which]) for name, which in present]
-    pools = with_equal_capacities(drawn, shapes)
+    by_family = [_in_batches(name, _moving_in(name, moving), keys[which]) for name, which in present]
+    pools = with_equal_capacities(by_family, shapes)
     order = np.argsort(np.concatenate([which for _, which in present]))
     return jax.tree.map(lambda *leaves: jnp.asarray(np.concatenate(leaves)[order]), *pools)
 
@@ -126,7 +128,7 @@ def random_pool(family: str, keys: Array, moving: Moving = STILL) -> Scene:
 def worlds_of(config: Config, family: str, split: Split, count: int, first: int = 0) -> Scene:
     """Returns worlds `first`, `first + 1`, ... of a split as a configuration has them: what moves, and their looks."""
     keys = world_keys(split, count, first)
-    return with_looks(random_pool(family, keys, Moving.of(config)), keys, config.surface)
+    return with_looks(random_pool(family, keys, Moving.from_config(config)), keys, config.surface)
 
 
 def world_of_file(config: Config, scene: Scene) -> Scene:
@@ -141,7 +143,7 @@ def _entry(name: str) -> Family | Mixture:
         ConfigError: if there is none of that name.
     """
     if name not in FAMILIES:
-        raise ConfigError(f"there are no random worlds '{name}'{nearest(name, FAMILIES)}")
+        raise ConfigError(f"there are no random worlds '{name}'{suggest_nearest(name, FAMILIES)}")
     return FAMILIES.get(name)
 
 
@@ -158,7 +160,7 @@ def _family(name: str) -> Family:
 
 
 def _moving_in(family: str, moving: Moving) -> Moving:
-    """Returns what moves in a family."""
+    """Returns the `Moving` of a family."""
     return dataclasses.replace(moving, share=moving.share or _family(family).moving_share)
 
 
@@ -167,7 +169,7 @@ def families_of(mixture: str, keys: Array) -> list[str]:
     entry = _entry(mixture)
     assert isinstance(entry, Mixture), f"{mixture} is one family"
     families = [family for family, share in entry.shares.items() for _ in range(share)]
-    numbers = jax.vmap(lambda key: integers(jax.random.fold_in(key, FAMILY_OF_WORLD), (), len(families)))(keys)
+    numbers = jax.vmap(lambda key: uniform_integers(jax.random.fold_in(key, FAMILY_OF_WORLD), (), len(families)))(keys)
     return [families[number] for number in np.asarray(numbers)]
 
 
@@ -175,24 +177,24 @@ def _in_batches(family: str, moving: Moving, keys: Array) -> Scene:
     """Returns a pool of one family, drawn in batches of one size, so that one program draws pools of every size."""
     count = keys.shape[0]
     if count <= 1:
-        return _drawn(family, keys, moving)
+        return _sample_worlds(family, keys, moving)
     # As data: the first key is used once more to fill the last batch.
     data = np.asarray(jax.random.key_data(keys))
-    data = np.concatenate([data, np.broadcast_to(data[:1], (-count % _AT_ONCE, *data.shape[1:]))])
-    batches = [jax.random.wrap_key_data(jnp.asarray(data[i : i + _AT_ONCE])) for i in range(0, count, _AT_ONCE)]
+    data = np.concatenate([data, np.broadcast_to(data[:1], (-count % _BATCH, *data.shape[1:]))])
+    batches = [jax.random.wrap_key_data(jnp.asarray(data[i : i + _BATCH])) for i in range(0, count, _BATCH)]
     # XLA uses one core for a batch.
     with ThreadPoolExecutor(thread_name_prefix="drawing") as pool:
-        drawn = list(pool.map(partial(_drawn, family, moving=moving), batches))
-    return jax.tree.map(lambda *leaves: jnp.concatenate(leaves)[:count], *drawn)
+        batches_of_worlds = list(pool.map(partial(_sample_worlds, family, moving=moving), batches))
+    return jax.tree.map(lambda *leaves: jnp.concatenate(leaves)[:count], *batches_of_worlds)
 
 
-def _drawn(family: str, keys: Array, moving: Moving = STILL) -> Scene:
+def _sample_worlds(family: str, keys: Array, moving: Moving = STILL) -> Scene:
     """Returns worlds of one family, one for each key [P]; what moves is of a program of its own, which is small."""
     return _set_in_motion(family, moving, _standing(family, keys), keys)
 
 
 def _unchecked(family: str, moving: Moving, keys: Array) -> Scene:
-    """Returns what `_drawn` returns, but for worlds without a way, which are kept."""
+    """As `_sample_worlds`, without the reachability check."""
     return _set_in_motion(family, moving, jax.vmap(_family(family).draw)(keys), keys)
 
 

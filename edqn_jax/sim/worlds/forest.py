@@ -28,7 +28,7 @@ BODIES = {"cylinders": tuple(range(TREES)), "boxes": tuple(range(WITH_BRANCH))}
 """Bodies, as `moving` moves them: trunk and branch are one."""
 
 
-def draw(key: Array) -> Scene:
+def sample_forest(key: Array) -> Scene:
     """Returns a random forest, a start and a goal.
 
     The free space is connected by construction. A tree is a disc seen from above, and the discs, grown by the drone's
@@ -44,23 +44,23 @@ def draw(key: Array) -> Scene:
     draws = jax.random.uniform(key, (sum(counts),))
     sizes, places, colours, ends = jnp.split(draws, [sum(counts[:1]), sum(counts[:2]), sum(counts[:3])])
     size = sizes.reshape(TREES, _OF_A_TREE)
-    trunk = building.between(TRUNK_RADIUS, size[:, 0])
-    length = building.between(BRANCH_LENGTH, size[:WITH_BRANCH, 1])
+    trunk = building.scale_uniforms(TRUNK_RADIUS, size[:, 0])
+    length = building.scale_uniforms(BRANCH_LENGTH, size[:WITH_BRANCH, 1])
     yaw, height = 2 * jnp.pi * size[:WITH_BRANCH, 2], 1.0 + (SIZE[2] - 2.0) * size[:WITH_BRANCH, 3]
     tip = jnp.hypot(length, BRANCH_HALF_WIDTH)
     reach = trunk.at[:WITH_BRANCH].max(tip)
     candidates = discs.across_the_edge(reach, places.reshape(TREES, discs.PLACES, 2), SIZE[:2], _EDGE)
-    x, y, placed = discs.place(reach, candidates, GAP)
-    albedo = building.albedos(colours.reshape(shapes, -1))
+    x, y, placed = discs.place_discs(reach, candidates, GAP)
+    albedo = building.make_albedos(colours.reshape(shapes, -1))
 
     standing = jnp.stack([x, y, jnp.full(TREES, SIZE[2] / 2)], axis=1)
     middle = jnp.stack([jnp.cos(yaw), jnp.sin(yaw)], axis=1) * length[:, None] / 2
     branch = jnp.column_stack([standing[:WITH_BRANCH, :2] + middle, height])
     half = jnp.stack([length / 2, *2 * [jnp.full(WITH_BRANCH, BRANCH_HALF_WIDTH)]], axis=1)
-    return building.world(
+    return building.build_scene(
         SIZE,
         ends.reshape(2, TRIES, 3),
-        building.ground(),
-        building.boxes(placed[:WITH_BRANCH], branch, half, yaw, albedo[TREES:]),
-        building.cylinders(placed, standing, trunk, SIZE[2] / 2, albedo[:TREES]),
+        building.make_ground(),
+        building.make_boxes(placed[:WITH_BRANCH], branch, half, yaw, albedo[TREES:]),
+        building.make_cylinders(placed, standing, trunk, SIZE[2] / 2, albedo[:TREES]),
     )

@@ -13,7 +13,7 @@ from jax import Array, lax
 from jax.typing import ArrayLike
 
 from edqn_jax.sim.scene.distance import signed_distance
-from edqn_jax.sim.scene.scene import Scene, moves, scene_at
+from edqn_jax.sim.scene.scene import Scene, has_motion, scene_at
 
 CLEARANCE = 1.0
 """Metres between a random start or goal and the nearest surface."""
@@ -67,35 +67,35 @@ def free_point(
     Returns:
         [3] metres.
     """
-    points = scatter(scene, jax.random.uniform(key, (TRIES, 3)), altitudes)
+    points = scatter_points(scene, jax.random.uniform(key, (TRIES, 3)), altitudes)
     return first_free(scene, points, clearance, away_from, distance)
 
 
-def far_apart(scene: Scene, draw: Array) -> tuple[Array, Array]:
+def far_apart(scene: Scene, uniforms: Array) -> tuple[Array, Array]:
     """Returns a free start and a free goal, each [3], from uniform draws [2, K, 3].
 
     They are `FAR` metres apart, or half as far as the volume is long.
     """
-    start = first_free(scene, scatter(scene, draw[0], ALTITUDES), CLEARANCE)
-    return start, far_from(scene, draw[1], start)
+    start = first_free(scene, scatter_points(scene, uniforms[0], ALTITUDES), CLEARANCE)
+    return start, far_from(scene, uniforms[1], start)
 
 
-def far_from(scene: Scene, draw: Array, point: Array) -> Array:
+def far_from(scene: Scene, uniforms: Array, point: Array) -> Array:
     """Returns a free point [3], metres, as far from `point` as a start is from its goal, from uniform draws [K, 3]."""
     distance = jnp.minimum(FAR, (scene.volume[1, 0] - scene.volume[0, 0]) / 2)
-    return first_free(scene, scatter(scene, draw, ALTITUDES), CLEARANCE, point, distance)
+    return first_free(scene, scatter_points(scene, uniforms, ALTITUDES), CLEARANCE, point, distance)
 
 
-def scatter(scene: Scene, draw: Array, altitudes: tuple[float, float] | None = None) -> Array:
+def scatter_points(scene: Scene, uniforms: Array, altitudes: tuple[float, float] | None = None) -> Array:
     """Returns points [K, 3] of the flight volume, a margin inside its faces, from uniform draws [K, 3]."""
-    lower, upper = fenced(scene)
+    lower, upper = inner_bounds(scene)
     if altitudes is not None:
         lower = lower.at[2].max(altitudes[0])
         upper = upper.at[2].min(altitudes[1])
-    return lower[None] + draw * (upper - lower)[None]
+    return lower[None] + uniforms * (upper - lower)[None]
 
 
-def fenced(scene: Scene) -> tuple[Array, Array]:
+def inner_bounds(scene: Scene) -> tuple[Array, Array]:
     """Returns the lower and the upper corner [3] of where random points may be, inside the faces of the volume."""
     return scene.volume[0] + jnp.array(_FENCE[0]), scene.volume[1] - jnp.array(_FENCE[1])
 
@@ -110,7 +110,7 @@ def cells_of(scene: Scene, is_one: np.ndarray, corner: np.ndarray, edge_m: float
         edge_m: of the cubes, metres.
     """
     every = np.argwhere(is_one)
-    lower, upper = map(np.asarray, fenced(scene))
+    lower, upper = map(np.asarray, inner_bounds(scene))
     middles = corner + edge_m * every
     inside = np.all((middles >= lower) & (middles <= upper), axis=1)
     return Cells(
@@ -121,16 +121,16 @@ def cells_of(scene: Scene, is_one: np.ndarray, corner: np.ndarray, edge_m: float
     )
 
 
-def in_cells(cells: Cells, draw: Array) -> Array:
+def in_cells(cells: Cells, uniforms: Array) -> Array:
     """Returns points [K, 3] uniform over the cells, from uniform draws [K, 3]."""
     count = cells.chosen.shape[0]
-    chosen = jnp.minimum((draw[:, 0] * count).astype(jnp.int32), count - 1)
+    chosen = jnp.minimum((uniforms[:, 0] * count).astype(jnp.int32), count - 1)
     # The last digits of a number are as good as another one.
-    within = jnp.stack([draw[:, 1], (1024.0 * draw[:, 1]) % 1.0, draw[:, 2]], axis=1) - 0.5
+    within = jnp.stack([uniforms[:, 1], (1024.0 * uniforms[:, 1]) % 1.0, uniforms[:, 2]], axis=1) - 0.5
     return cells.corner[None] + cells.edge_m * (cells.chosen[chosen] + within)
 
 
-def is_in(cells: Cells, point: Array) -> Array:
+def contains(cells: Cells, point: Array) -> Array:
     """Returns whether a point [3], metres, lies in one of the cells."""
     at = jnp.round((point - cells.corner) / cells.edge_m).astype(jnp.int32)
     inside = jnp.all((at >= 0) & (at < jnp.array(cells.is_one.shape)))
@@ -159,7 +159,7 @@ def early_times() -> Array:
 
 def least_distances(scene: Scene, points: Array) -> Array:
     """Returns the least distance [K] of points [K, 3] to the nearest surface at any of `early_times`, metres."""
-    if not moves(scene):
+    if not has_motion(scene):
         return jax.vmap(partial(signed_distance, scene))(points)
     unthrown = dataclasses.replace(scene, spheres=dataclasses.replace(scene.spheres, throw=None))
 

@@ -1,4 +1,4 @@
-"""How far it is to the goal around what stands in the way: a field per world, for the reward `geodesic`.
+"""Distance to the goal around obstacles: a field per world, for the reward `geodesic`.
 
 A lattice of nodes over the volume, each of which has room for the drone. Around a node a ball with the radius of its
 clearance is free, so wherever two balls meet, a point passes straight from node to node: through a gap that is a little
@@ -21,17 +21,17 @@ from jax import Array, lax
 from edqn_jax.sim.scene.distance import signed_distance
 from edqn_jax.sim.scene.scene import Scene
 
-MOST_NODES = 500_000
+MAX_NODES = 500_000
 """Nodes of the field of a single world."""
 FINEST_M = 0.5
 """Edge of the lattice at least, metres."""
 POOL_NODES = (40, 40, 9)
 """Nodes of the field of each world of a pool, whatever its volume."""
 
-LONGER = 1.13
+MAX_LATTICE_RATIO = 1.13
 """Lengths along axes and diagonals over straight ones, at most."""
 
-_AT_ONCE = 128  # worlds of a pool
+_BATCH = 128  # worlds of a pool
 
 _SIDES = np.array([*itertools.product((-1, 0, 1), repeat=2)])
 _CHANGE_M = 1e-3  # of no node in a round: no way is shortened any more
@@ -49,22 +49,22 @@ class Field:
     edge: Array  # [P] metres
 
 
-def nodes(size: tuple[float, float, float], most: int = MOST_NODES) -> tuple[int, int, int]:
+def nodes_per_side(size: tuple[float, float, float], most: int = MAX_NODES) -> tuple[int, int, int]:
     """Returns so many nodes along each side of a volume, metres, that there are about `most` of them, or fewer."""
     edge = max(FINEST_M, (math.prod(size) / most) ** (1 / 3))
     across, along, levels = (max(2, math.ceil(side / edge)) for side in size)
     return across, along, levels
 
 
-def fields(pool: Scene, radius: float) -> Field:
+def distance_fields(pool: Scene, radius: float) -> Field:
     """Returns the fields of a pool of worlds [P], whose nodes have `radius` metres of room; of a single world, finer.
 
     Its arrays are on the host: of many worlds they take gigabytes.
     """
     worlds = pool.start.shape[0]
     across, along, high = map(float, pool.volume[0, 1] - pool.volume[0, 0])
-    shape = POOL_NODES if worlds > 1 else nodes((across, along, high))
-    parts = [jax.tree.map(lambda leaf, i=i: leaf[i : i + _AT_ONCE], pool) for i in range(0, worlds, _AT_ONCE)]
+    shape = POOL_NODES if worlds > 1 else nodes_per_side((across, along, high))
+    parts = [jax.tree.map(lambda leaf, i=i: leaf[i : i + _BATCH], pool) for i in range(0, worlds, _BATCH)]
     # XLA uses one core for a part.
     with ThreadPoolExecutor(thread_name_prefix="ways") as threads:
         found = list(threads.map(lambda part: jax.tree.map(np.asarray, _fields(part, shape, radius)), parts))
@@ -151,8 +151,8 @@ def _shifted(plane: Array, fill: float) -> Array:
     return jnp.stack([padded[1 + i : 1 + i + a, 1 + j : 1 + j + b] for i, j in _SIDES])
 
 
-def remaining(of: Field, world: Array, goal: Array, point: Array) -> Array:
-    """Returns how far it is from a point [3] to the goal [3] of one of the worlds, metres.
+def distance_to_goal(of: Field, world: Array, goal: Array, point: Array) -> Array:
+    """Returns the distance from a point [3] to the goal [3] in one of the worlds, metres.
 
     It is interpolated between those nodes of the point's cell whose balls hold the point, which count the more the
     deeper they hold it; where none does, the way leads over the best of the free ones; where there is none of these

@@ -18,7 +18,7 @@ from edqn_jax.keys import LOOK_OF_WORLD
 from edqn_jax.sim.scene.scene import Scene
 from edqn_jax.sim.scene.shapes.kind import PARKED
 from edqn_jax.sim.scene.surface import PATTERNS, SURFACE_NUMBERS, Daylight, Surface
-from edqn_jax.sim.worlds.building import albedos, between
+from edqn_jax.sim.worlds.building import make_albedos, scale_uniforms
 
 TRAINED = {"blank": 0.2, "waves": 0.3, "noise": 0.25, "checks": 0.25}
 """Shares of the patterns of `drawn`."""
@@ -69,12 +69,12 @@ def _with_look(config: SurfaceConfig, scene: Scene, key: Array) -> Scene:
 
 
 def _daylight(draw: Array) -> Daylight:
-    azimuth, elevation = 2 * jnp.pi * draw[0], jnp.radians(between(ELEVATION_DEG, draw[1]))
+    azimuth, elevation = 2 * jnp.pi * draw[0], jnp.radians(scale_uniforms(ELEVATION_DEG, draw[1]))
     flat = jnp.cos(elevation)
     return Daylight(
         sun=jnp.stack([flat * jnp.cos(azimuth), flat * jnp.sin(azimuth), jnp.sin(elevation)]),
-        ambient=between(AMBIENT, draw[2]),
-        sky=jnp.clip(between(SKY, draw[3]) + 0.2 * draw[4:7] - 0.1, 0.05, BRIGHTEST),
+        ambient=scale_uniforms(AMBIENT, draw[2]),
+        sky=jnp.clip(scale_uniforms(SKY, draw[3]) + 0.2 * draw[4:7] - 0.1, 0.05, BRIGHTEST),
     )
 
 
@@ -93,7 +93,7 @@ def _with_surface(config: SurfaceConfig, shapes: Any, world: Array, draws: Array
     shift = jnp.einsum("nij,nj->ni", k, centre) + draws[:, 3:7]
     phases = jnp.concatenate([k, (shift - jnp.round(shift))[..., None]], axis=-1).reshape(-1, 16)
     numbers = jnp.concatenate([which[:, None], contrast[:, None], shares, phases], axis=1)
-    colour = jnp.minimum(albedos(draws[:, 7:12]), BRIGHTEST / (1.0 + contrast[:, None]))
+    colour = jnp.minimum(make_albedos(draws[:, 7:12]), BRIGHTEST / (1.0 + contrast[:, None]))
     return dataclasses.replace(shapes, albedo=colour, surface=Surface(numbers, patterns_of(config)))
 
 
@@ -199,7 +199,7 @@ def _checks(config: SurfaceConfig, draws: Array, along: Array, up: Array) -> Num
     first, second = jnp.where(swap, second, first), jnp.where(swap, first, second)
     period = _period(config, draws[:, 2])
     other = jnp.clip(period * _log_between(0.4, 2.5, draws[:, 15]), config.shortest_m, config.longest_m)
-    width = jnp.where(stripes, between((0.2, 0.8), draws[:, 16]), 0.5)
+    width = jnp.where(stripes, scale_uniforms((0.2, 0.8), draws[:, 16]), 0.5)
     shares = [jnp.where(stripes, 1.0, jnp.where(crossed, 0.5, zero)), jnp.where(stripes | crossed, zero, 1.0)]
     shares += [jnp.where(crossed, 0.5, zero), width]
     none = jnp.zeros_like(along)
@@ -209,8 +209,8 @@ def _checks(config: SurfaceConfig, draws: Array, along: Array, up: Array) -> Num
 def _bricks(config: SurfaceConfig, draws: Array, along: Array, up: Array) -> Numbers:
     """Courses of bricks, shifted by half a brick, with joints that are darker or lighter."""
     length = _log_between(*BRICK_M, draws[:, 2])
-    height = length * between((0.25, 0.5), draws[:, 13])
-    joint = between((0.1, 0.25), draws[:, 14])  # share of a course's height
+    height = length * scale_uniforms((0.25, 0.5), draws[:, 13])
+    joint = scale_uniforms((0.1, 0.25), draws[:, 14])  # share of a course's height
     tone = jnp.where(draws[:, 12] < 0.5, -1.0, 1.0)
     none = jnp.zeros_like(along)
     vectors = [along / length[:, None], up / (2 * height[:, None]), none, none]
@@ -220,12 +220,17 @@ def _bricks(config: SurfaceConfig, draws: Array, along: Array, up: Array) -> Num
 def _posters(config: SurfaceConfig, draws: Array, along: Array, up: Array) -> Numbers:
     """Rectangles of noise on blank walls."""
     apart = _log_between(*POSTER_M, draws[:, 2])
-    fine = apart * between((0.1, 0.4), draws[:, 13])
-    tone = between((-0.4, 0.4), draws[:, 12])
+    fine = apart * scale_uniforms((0.1, 0.4), draws[:, 13])
+    tone = scale_uniforms((-0.4, 0.4), draws[:, 12])
     first, second = _turned(along, up, 2 * jnp.pi * draws[:, 14])
-    vectors = [along / apart[:, None], up / (apart * between((0.5, 1.0), draws[:, 15]))[:, None]]
+    vectors = [along / apart[:, None], up / (apart * scale_uniforms((0.5, 1.0), draws[:, 15]))[:, None]]
     vectors += [first / fine[:, None], (second + 0.4 * first) / (0.6 * fine[:, None])]
-    shares = [tone, jnp.full(len(tone), 0.15), between((0.3, 0.7), draws[:, 16]), between((0.3, 0.7), draws[:, 17])]
+    shares = [
+        tone,
+        jnp.full(len(tone), 0.15),
+        scale_uniforms((0.3, 0.7), draws[:, 16]),
+        scale_uniforms((0.3, 0.7), draws[:, 17]),
+    ]
     return shares, vectors
 
 
@@ -233,11 +238,16 @@ def _wood(config: SurfaceConfig, draws: Array, along: Array, up: Array) -> Numbe
     """Stripes that bend over several of their periods, and a fine grain along them."""
     ring = _log_between(*RING_M, draws[:, 2])
     first, second = _turned(along, up, jnp.where(draws[:, 12] < 0.5, 0.0, jnp.pi / 2))
-    longer = ring * between((10.0, 25.0), draws[:, 13])
+    longer = ring * scale_uniforms((10.0, 25.0), draws[:, 13])
     vectors = [first / ring[:, None], (second + 0.3 * first) / longer[:, None]]
     vectors += [(second - 0.6 * first) / (0.5 * longer[:, None]), (first + 0.05 * second) / (0.35 * ring[:, None])]
     strength = jnp.full(len(ring), 0.8)
-    return [strength, between((0.3, 0.8), draws[:, 14]), between((0.25, 0.5), draws[:, 15]), 0.25 * strength], vectors
+    return [
+        strength,
+        scale_uniforms((0.3, 0.8), draws[:, 14]),
+        scale_uniforms((0.25, 0.5), draws[:, 15]),
+        0.25 * strength,
+    ], vectors
 
 
 _OF_PATTERN = {

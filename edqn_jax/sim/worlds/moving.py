@@ -43,7 +43,7 @@ ELEVATION = math.radians(20.0)
 
 @dataclasses.dataclass(frozen=True)
 class Moving:
-    """What moves in random worlds, as options of `world` have it; nothing by default."""
+    """Motion in random worlds, from options of `world`; none by default."""
 
     share: float = 0.0
     speed_m_s: float = 3.0
@@ -54,8 +54,8 @@ class Moving:
     """Of the drone that balls are thrown at."""
 
     @classmethod
-    def of(cls, config: Config) -> Moving:
-        """Returns what moves in the random worlds of a configuration."""
+    def from_config(cls, config: Config) -> Moving:
+        """Returns the motion options of a configuration's random worlds."""
         world = config.world
         return cls(
             share=world.moving_share,
@@ -129,17 +129,17 @@ def _are_single(bodies: Bodies, count: int) -> bool:
     return sum(len(numbers) for numbers in bodies.values()) == count
 
 
-def _motions(moving: Moving, draw: Array, runs: bool) -> Motion:
+def _motions(moving: Moving, uniforms: Array, runs: bool) -> Motion:
     """Returns the motions of bodies [B] from uniform draws [B, 6], without walls; a share of them stands."""
-    speed = moving.speed_m_s * building.between((SLOWEST, 1.0), draw[:, 1])
-    heading, phase = 2 * jnp.pi * draw[:, 2], 2 * jnp.pi * draw[:, 3]
-    reach = building.between(SWING, draw[:, 4])
-    sort = jnp.floor(draw[:, 5] * 3 if runs else 1 + draw[:, 5] * 2)
-    go = draw[:, 0] < moving.share
+    speed = moving.speed_m_s * building.scale_uniforms((SLOWEST, 1.0), uniforms[:, 1])
+    heading, phase = 2 * jnp.pi * uniforms[:, 2], 2 * jnp.pi * uniforms[:, 3]
+    reach = building.scale_uniforms(SWING, uniforms[:, 4])
+    sort = jnp.floor(uniforms[:, 5] * 3 if runs else 1 + uniforms[:, 5] * 2)
+    go = uniforms[:, 0] < moving.share
     none = jnp.zeros_like(reach)
     along = jnp.stack([jnp.cos(heading), jnp.sin(heading), none], axis=1)
     across = jnp.stack([-jnp.sin(heading), jnp.cos(heading), none], axis=1)
-    turns = jnp.where(draw[:, 2] * 1024.0 % 1.0 < 0.5, -1.0, 1.0)  # of either hand
+    turns = jnp.where(uniforms[:, 2] * 1024.0 % 1.0 < 0.5, -1.0, 1.0)  # of either hand
     # It is somewhere on its line or circle at time 0, as far as `phase` says.
     circle = jnp.where((go & (sort == 2))[:, None], reach[:, None] * across, 0.0)
     line = jnp.where((go & (sort > 0))[:, None], reach[:, None] * along, 0.0)
@@ -163,22 +163,22 @@ def _between_faces(motion: Motion, shapes: Any, volume: Array) -> Motion:
 def _with_balls(scene: Scene, moving: Moving, key: Array) -> Scene:
     """Returns the world with balls that are thrown at the drone on its way; the first meets it first."""
     count = moving.balls
-    draw = jax.random.uniform(key, (count, 5 + building.COLOUR_DRAWS))
-    share = building.between(SHARES, (jnp.arange(count) + draw[:, 0]) / count)
+    uniforms = jax.random.uniform(key, (count, 5 + building.COLOUR_DRAWS))
+    share = building.scale_uniforms(SHARES, (jnp.arange(count) + uniforms[:, 0]) / count)
     one = jnp.ones(count)
     throw = Throw(
         share=share,
-        early=building.between(EARLY, draw[:, 1]),
+        early=building.scale_uniforms(EARLY, uniforms[:, 1]),
         speed=moving.ball_speed_m_s * one,
-        bearing=BEARING * (2 * draw[:, 2] - 1),
-        elevation=ELEVATION * draw[:, 3],
+        bearing=BEARING * (2 * uniforms[:, 2] - 1),
+        elevation=ELEVATION * uniforms[:, 3],
         gravity=moving.ball_gravity_m_s2 * one,
         pace=moving.pace_m_s * one,
     )
     balls = Spheres(
         position=jnp.full((count, 3), PARKED),
-        radius=building.between(BALL_RADIUS, draw[:, 4]),
-        albedo=building.albedos(draw[:, 5:]),
+        radius=building.scale_uniforms(BALL_RADIUS, uniforms[:, 4]),
+        albedo=building.make_albedos(uniforms[:, 5:]),
         motion=None if scene.spheres.motion is None else at_rest(count),
         throw=throw,
     )

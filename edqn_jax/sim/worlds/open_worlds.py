@@ -20,7 +20,7 @@ GAP = 3.0
 """Free metres between the footprints of any two shapes, and between them and the faces of the volume."""
 
 
-def bodies(density: str) -> dict[str, tuple[int, ...]]:
+def body_slots(density: str) -> dict[str, tuple[int, ...]]:
     """Returns the bodies of the worlds of a density, as `moving` moves them: every shape is one."""
     blocks, pillars, balls = SHAPES[density]
     ends = {"boxes": blocks, "cylinders": blocks + pillars, "spheres": blocks + pillars + balls}
@@ -28,7 +28,7 @@ def bodies(density: str) -> dict[str, tuple[int, ...]]:
     return {kind: tuple(range(ends[kind] - counts[kind], ends[kind])) for kind in ends}
 
 
-def draw(density: str, key: Array) -> Scene:
+def sample_open_world(density: str, key: Array) -> Scene:
     """Returns a random world: blocks, pillars and balls over level ground, a start and a goal.
 
     The free space is connected by construction, so there is always a path from start to goal. The
@@ -52,7 +52,7 @@ def draw(density: str, key: Array) -> Scene:
     )
     size = sizes.reshape(count, 4)
     first, second = blocks, blocks + pillars
-    sides = building.between(HALF_WIDTHS[density], size[:first, :2])
+    sides = building.scale_uniforms(HALF_WIDTHS[density], size[:first, :2])
     block_height = 4.0 + 20.0 * size[:first, 2]
     pillar_radius, pillar_height = 0.5 + 1.5 * size[first:second, 0], 8.0 + 17.0 * size[first:second, 1]
     ball_radius = 1.5 + 2.5 * size[second:, 0]
@@ -60,19 +60,19 @@ def draw(density: str, key: Array) -> Scene:
     ball_height = ball_radius + size[second:, 1] * (SIZE[2] - 2.0 - 2.0 * ball_radius)
 
     reach = jnp.concatenate([jnp.hypot(sides[:, 0], sides[:, 1]), pillar_radius, ball_radius])
-    candidates = discs.inside(reach, places.reshape(count, discs.PLACES, 2), SIZE[:2], GAP)
-    x, y, placed = discs.place(reach, candidates, GAP)
+    candidates = discs.candidates_inside(reach, places.reshape(count, discs.PLACES, 2), SIZE[:2], GAP)
+    x, y, placed = discs.place_discs(reach, candidates, GAP)
     z = jnp.concatenate([block_height / 2, pillar_height / 2, ball_height])
     position = jnp.stack([x, y, z], axis=1)
-    albedo = building.albedos(colours.reshape(count, -1))
+    albedo = building.make_albedos(colours.reshape(count, -1))
 
     a, b, c = slice(first), slice(first, second), slice(second, None)
     half = jnp.column_stack([sides, block_height / 2])
-    return building.world(
+    return building.build_scene(
         SIZE,
         ends.reshape(2, TRIES, 3),
-        building.ground(),
-        building.boxes(placed[a], position[a], half, jnp.pi * size[a, 3], albedo[a]),
-        building.cylinders(placed[b], position[b], pillar_radius, pillar_height / 2, albedo[b]),
-        building.spheres(placed[c], position[c], ball_radius, albedo[c]),
+        building.make_ground(),
+        building.make_boxes(placed[a], position[a], half, jnp.pi * size[a, 3], albedo[a]),
+        building.make_cylinders(placed[b], position[b], pillar_radius, pillar_height / 2, albedo[b]),
+        building.make_spheres(placed[c], position[c], ball_radius, albedo[c]),
     )

@@ -35,7 +35,7 @@ _PIECES = 4  # of a wall: left and right of its opening, below, above
 _OF_A_WALL = 6
 
 
-def draw(key: Array) -> Scene:
+def sample_rooms(key: Array) -> Scene:
     """Returns random rooms, a start and a goal.
 
     The free space is connected by construction: every wall between two rooms has an opening, a window of 2.2 by 2.0 m
@@ -49,7 +49,7 @@ def draw(key: Array) -> Scene:
     counts = (1 + lines, _WALLS * _OF_A_WALL, colours, 2 * TRIES * 3)
     draws = jax.random.uniform(key, (sum(counts),))
     plan, walls, shades, ends = jnp.split(draws, [sum(counts[:1]), sum(counts[:2]), sum(counts[:3])])
-    height = building.between(HEIGHT, plan[0])
+    height = building.scale_uniforms(HEIGHT, plan[0])
     even = SIDE / ROOMS * jnp.arange(1, ROOMS)[None]
     # Along x and along y: [2, ROOMS + 1] metres, where walls stand, outer ones included.
     stands = even + SHIFT * (2.0 * plan[1:].reshape(2, ROOMS - 1) - 1.0)
@@ -69,32 +69,36 @@ def draw(key: Array) -> Scene:
 
     outer_low, outer_high = _outer_walls(height)
     low, high = jnp.concatenate([low, outer_low]), jnp.concatenate([high, outer_high])
-    albedo = building.albedos(shades.reshape(_WALLS + 5, -1))
+    albedo = building.make_albedos(shades.reshape(_WALLS + 5, -1))
     of_walls = jnp.concatenate([jnp.repeat(albedo[:_WALLS], _PIECES, axis=0), albedo[_WALLS:-1]])
     present = jnp.concatenate([there.reshape(-1), jnp.ones(4, bool)])
-    return building.world(
+    return building.build_scene(
         (SIDE, SIDE, height),
         ends.reshape(2, TRIES, 3),
         building.floor_and_ceiling(height, albedo[-1]),
-        building.boxes(present, (low + high) / 2, (high - low) / 2, jnp.zeros(shapes), of_walls),
+        building.make_boxes(present, (low + high) / 2, (high - low) / 2, jnp.zeros(shapes), of_walls),
     )
 
 
-def _openings(draw: Array, begin: Array, end: Array, height: Array) -> Array:
+def _openings(uniforms: Array, begin: Array, end: Array, height: Array) -> Array:
     """Returns the openings of N walls [N, 4], metres: from, to along the wall, and from, to in height.
 
     A wall that is left out is all opening.
     """
-    width = building.between(OPENING_WIDTH, draw[:, 0])
+    width = building.scale_uniforms(OPENING_WIDTH, uniforms[:, 0])
     room = end - begin - width - 2 * _PIER
-    left = begin + _PIER + room * draw[:, 1]
-    is_window, is_missing = draw[:, 2] < WINDOWS, draw[:, 3] < MISSING
-    tall = jnp.where(is_window, building.between(WINDOW_HEIGHT, draw[:, 4]), building.between(DOOR_HEIGHT, draw[:, 4]))
+    left = begin + _PIER + room * uniforms[:, 1]
+    is_window, is_missing = uniforms[:, 2] < WINDOWS, uniforms[:, 3] < MISSING
+    tall = jnp.where(
+        is_window,
+        building.scale_uniforms(WINDOW_HEIGHT, uniforms[:, 4]),
+        building.scale_uniforms(DOOR_HEIGHT, uniforms[:, 4]),
+    )
     tall = jnp.minimum(tall, height - 2 * SILL_M)
-    bottom = jnp.where(is_window, SILL_M + (height - 2 * SILL_M - tall) * draw[:, 5], 0.0)
-    drawn = jnp.stack([left, left + width, bottom, bottom + tall], axis=1)
+    bottom = jnp.where(is_window, SILL_M + (height - 2 * SILL_M - tall) * uniforms[:, 5], 0.0)
+    openings = jnp.stack([left, left + width, bottom, bottom + tall], axis=1)
     whole = jnp.stack([begin, end, jnp.zeros_like(begin), jnp.broadcast_to(height, begin.shape)], axis=1)
-    return jnp.where(is_missing[:, None], whole, drawn)
+    return jnp.where(is_missing[:, None], whole, openings)
 
 
 def _pieces(opening: Array, begin: Array, end: Array, height: Array) -> tuple[Array, Array, Array]:

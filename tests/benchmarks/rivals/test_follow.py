@@ -14,10 +14,10 @@ from hypothesis import strategies as st
 
 from edqn_jax.config import Config
 from edqn_jax.errors import ConfigError
-from edqn_jax.planning.path import Task, path_length
+from edqn_jax.planning.path import PlanningTask, path_length
 from edqn_jax.sim.physics import drone
 from edqn_jax.sim.physics.airframe import load_airframe
-from edqn_jax.sim.physics.flight import fly
+from edqn_jax.sim.physics.flight import fly_decision
 from edqn_jax.sim.scene.motion import not_thrown
 from edqn_jax.sim.task.flights import Flights
 from edqn_jax.sim.task.outcomes import Outcome
@@ -29,7 +29,7 @@ CONFIG, FOLLOW = Config(), FollowConfig()
 AIRFRAME = load_airframe(CONFIG.drone)
 
 
-def flown(task: Task, path) -> Flights:
+def flown(task: PlanningTask, path) -> Flights:
     goal, points = np.float32(task.goal), sampled(np.asarray(path, np.float64))
     return jax.device_get(compiled_follower()(CONFIG, FOLLOW, AIRFRAME, task.scene, goal, points))
 
@@ -68,8 +68,8 @@ def test_through_gaps_it_stays_on_the_path_as_closely_as_the_reserve_asks():
 @pytest.mark.slow
 def test_beside_a_straight_path_it_comes_back_without_crossing_it_by_more_than_the_tolerance():
     points = sampled(np.array([(0.0, 6.0, 3.0), (12.0, 6.0, 3.0)]))
-    fly_on = jax.jit(lambda state, command: fly(CONFIG.drone, AIRFRAME, state, command, jnp.zeros(())))
-    state, nearest = drone.hover(jnp.array([1.0, 7.0, 3.0]), jnp.array(0.0)), np.int32(0)
+    fly_on = jax.jit(lambda state, command: fly_decision(CONFIG.drone, AIRFRAME, state, command, jnp.zeros(())))
+    state, nearest = drone.hover_state(jnp.array([1.0, 7.0, 3.0]), jnp.array(0.0)), np.int32(0)
     beside = []
     for _ in range(20):
         command, nearest = _steer()(points, nearest, state)
@@ -154,7 +154,7 @@ def _steer():
 @pytest.mark.slow
 def test_it_is_never_faster_than_a_learner_along_an_axis_and_never_goes_back(at, velocity, nearest):
     points = sampled(np.array([(1.0, 1.0, 1.0), (6.0, 1.0, 1.0), (6.0, 6.0, 5.0)]))
-    state = drone.hover(jnp.array(at), jnp.array(0.3))
+    state = drone.hover_state(jnp.array(at), jnp.array(0.3))
     state = dataclasses.replace(state, velocity=jnp.array(velocity) - 3.0)
     command, now = _steer()(points, np.int32(nearest), state)
     assert np.linalg.norm(command) <= CONFIG.env.speed_m_s + 1e-4

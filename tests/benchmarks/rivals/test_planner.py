@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from edqn_jax.extras import MissingPackageError, require
+from edqn_jax.extras import MissingPackageError, require_extra
 from rivals.planners import snn
 from rivals.planners.planner import PLANNERS, load_planner, refusal
 from tests.support.benchmarks.uninstalled import hide
@@ -28,7 +28,7 @@ def test_a_broken_package_is_not_a_missing_one(tmp_path, monkeypatch):
     (tmp_path / "broken_inside.py").write_text("import nothing_of_this_name\n")
     monkeypatch.syspath_prepend(tmp_path)
     with pytest.raises(ModuleNotFoundError, match="nothing_of_this_name") as raised:
-        require("broken_inside")
+        require_extra("broken_inside")
     assert not isinstance(raised.value, MissingPackageError)
 
 

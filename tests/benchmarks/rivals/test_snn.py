@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from edqn_jax.planning.path import MARGIN, Task
+from edqn_jax.planning.path import MARGIN, PlanningTask
 from edqn_jax.sim.scene.mjcf import load_scene, resolve_world
 from edqn_jax.sim.worlds.families import random_scene, world_key
 from rivals.planners import snn
@@ -227,7 +227,7 @@ def test_the_path_does_not_begin_backwards(start, goal):
 def test_every_path_in_a_large_world_is_free(world):
     name, *index = world.split()
     scene = random_scene(name, world_key("test", int(index[0]))) if index else load_scene(resolve_world(name))
-    task = Task.of(scene, body_radius=RADIUS)
+    task = PlanningTask.from_scene(scene, body_radius=RADIUS)
     plan = snn.plan(task)
     assert_flyable(task, plan.path)
     # A path of steps between 26 neighbours is at most 1.13 times too long in the open, and obstacles cost more.

@@ -20,15 +20,15 @@ from edqn_jax.evaluation.latency import decision_latency_ms
 from edqn_jax.learn.actor import AgentActor, PolicyParams, observation_size
 from edqn_jax.learn.perception import embedding, pooled_encoder, vae
 from edqn_jax.learn.perception.code import Form
-from edqn_jax.learn.plan import Plan
 from edqn_jax.learn.policy import fresh_policy
-from edqn_jax.learn.state import init
+from edqn_jax.learn.schedule import Schedule
+from edqn_jax.learn.state import init_state
 from edqn_jax.learn.step import run_steps
 from edqn_jax.runs.checkpoints.params import save_params
 from edqn_jax.runs.policies import load_run
-from edqn_jax.runs.provenance import workload
+from edqn_jax.runs.provenance import describe_workload
 from edqn_jax.sim.scene import mjcf
-from edqn_jax.sim.task.env import World
+from edqn_jax.sim.task.env import EnvParams
 from edqn_jax.sim.task.observation import MOTION_SIZE, Observation
 from tests.support.configs import TINY
 from tests.support.miniature import miniature_world
@@ -49,7 +49,7 @@ def with_sensor(name: str, config: Config = TINY) -> Config:
 
 
 @pytest.fixture(scope="module")
-def world() -> World:
+def world() -> EnvParams:
     return miniature_world(TINY)
 
 
@@ -57,7 +57,7 @@ def world() -> World:
 
 
 @pytest.fixture(scope="module")
-def traced(world: World) -> Callable[[str], tuple]:
+def traced(world: EnvParams) -> Callable[[str], tuple]:
     """For a sensor, its configuration and what starts and trains two seeds, both traced.
 
     An array as large as the camera's image is told by its size.
@@ -66,7 +66,7 @@ def traced(world: World) -> Callable[[str], tuple]:
     @functools.cache
     def of(name: str) -> tuple:
         config = dataclasses.replace(with_sensor(name, QUICK), camera=CameraConfig(width=11, height=7))
-        start = jax.jit(jax.vmap(lambda key: init(config, world, key))).trace(KEYS)
+        start = jax.jit(jax.vmap(lambda key: init_state(config, world, key))).trace(KEYS)
         steps = jax.jit(jax.vmap(lambda state: run_steps(config, world, state, jnp.arange(STEPS))))
         return config, start, steps.trace(start.out_info)
 
@@ -77,7 +77,7 @@ def traced(world: World) -> Callable[[str], tuple]:
 @pytest.mark.parametrize("name", SENSORS[1:])
 def test_the_training_step_learns_from_every_sensor_mapped_over_seeds(traced, name: str) -> None:
     config, start, steps = traced(name)
-    plan, before = Plan.of(config), start.lower().compile()(KEYS)
+    plan, before = Schedule.from_config(config), start.lower().compile()(KEYS)
     after, (_, losses) = steps.lower().compile()(before)
     for leaf in jax.tree.leaves((after.learner, after.actors.memory, after.actors.replay)):
         assert np.isfinite(np.asarray(leaf)).all()
@@ -90,7 +90,7 @@ def test_the_training_step_learns_from_every_sensor_mapped_over_seeds(traced, na
     np.testing.assert_array_equal(np.isfinite(losses.metrics["reconstruction_loss"]), [sees] * len(KEYS))
     if name in CODED:
         assert plan.warmup == 4 and moved(before.learner.vae, after.learner.vae)
-        learnt = jax.vmap(partial(embedding.acting, config))(after.learner.vae)  # what was learnt acts
+        learnt = jax.vmap(partial(embedding.inference_params, config))(after.learner.vae)  # what was learnt acts
         jax.tree.map(partial(np.testing.assert_allclose, atol=1e-6), learnt, after.learner.encoder)
     else:
         assert plan.warmup == 0 and after.learner.vae == after.learner.encoder == {}
@@ -113,7 +113,7 @@ def test_only_a_sensor_with_an_image_has_one_in_its_program_and_a_vae(traced, na
 
 
 def test_decisions_that_others_warm_up_in_are_learnt_in() -> None:
-    plans = {name: Plan.of(with_sensor(name)) for name in SENSORS}
+    plans = {name: Schedule.from_config(with_sensor(name)) for name in SENSORS}
     assert len({plan.total for plan in plans.values()}) == 1
     assert [plans[name].warmup for name in SENSORS] == [4, 4, 4, 4, 4, 0, 0, 0]
     assert [plans[name].learn_from for name in SENSORS] == [9, 9, 9, 9, 9, 5, 5, 5]
@@ -122,7 +122,7 @@ def test_decisions_that_others_warm_up_in_are_learnt_in() -> None:
 def test_the_workload_says_what_is_drawn_and_learnt_from() -> None:
     scene = mjcf.load_scene(mjcf.resolve_world("paper"))
     always = dataclasses.replace(TINY, encoder=dataclasses.replace(TINY.encoder, keep_learning=True, batch_size=32))
-    found = {name: workload(with_sensor(name, always), scene) for name in SENSORS}
+    found = {name: describe_workload(with_sensor(name, always), scene) for name in SENSORS}
     assert [found[name]["sensor"] for name in SENSORS] == list(SENSORS)
     assert [found[name]["frames_per_decision"] for name in SENSORS] == [2, 1, 2, 1, 2, 2, 0, 0]
     assert [found[name]["vae_samples_per_decision"] for name in SENSORS] == [2, 2, 2, 2, 2, 0, 0, 0]
@@ -164,7 +164,8 @@ def shapes(params) -> dict[str, tuple[int, ...]]:
 def test_the_code_of_a_picture_has_the_sizes_of_the_code_of_events(kind) -> None:
     config = dataclasses.replace(Config(), encoder=EncoderConfig("pooled", "sensed", pixel_features=kind))
     events, frames, pair, depth, motion = (
-        shapes(jax.eval_shape(partial(embedding.init, with_sensor(name, config)), jax.random.key(0))) for name in CODED
+        shapes(jax.eval_shape(partial(embedding.init_params, with_sensor(name, config)), jax.random.key(0)))
+        for name in CODED
     )
     assert pair["decoder/kernel"] == events["decoder/kernel"] and pair.keys() == frames.keys()
     assert motion == pair
@@ -212,7 +213,7 @@ def test_the_code_of_pictures_is_learnt() -> None:
         params, state = carry
         pick_key, noise_key = jax.random.split(key)
         some = pictures[jax.random.randint(pick_key, (64,), 0, 1024)]
-        wanted = vae.in_waves(config, vae.target(config, some))
+        wanted = vae.in_waves(config, vae.decoder_target(config, some))
         noise = jax.random.normal(noise_key, (64, config.code_size))
         gradient = jax.grad(lambda p: vae.vae_loss(config, p, some, still, wanted, noise)[0])(params)
         change, state = optimiser.update(gradient, state, params)
@@ -221,7 +222,7 @@ def test_the_code_of_pictures_is_learnt() -> None:
     keys = jax.random.split(jax.random.key(2), 300)
     (params, _), _ = jax.jit(lambda c: jax.lax.scan(update, c, keys))((params, optimiser.init(params)))
     unseen = draw(jax.random.split(jax.random.key(3), 256))[:, None]
-    wanted = vae.target(config, unseen)
+    wanted = vae.decoder_target(config, unseen)
     made = jax.jit(partial(vae.decode, config, camera))(params, vae.embed(config, params, unseen, still))
     left = float(jnp.sum((wanted - made) ** 2) / jnp.sum((wanted - wanted.mean(0)) ** 2))
     # 1 is the mean picture, 0.56 was reached: five boxes at random places fit a code of 32 no better in 300 updates.

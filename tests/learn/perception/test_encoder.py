@@ -41,7 +41,7 @@ def encode(config, params, sensed):
 
 def loss_of(config, params, sensed, key):
     """The loss of fields whose own motion does not matter."""
-    wanted = vae.in_waves(config, vae.target(config, sensed))
+    wanted = vae.in_waves(config, vae.decoder_target(config, sensed))
     noise = jax.random.normal(key, (*wanted.beyond.shape, config.code_size))
     return vae.vae_loss(config, params, sensed, STILL, wanted, noise)
 
@@ -115,7 +115,7 @@ def test_dense_encoder_pools_single_events(kind, field):
 def test_pixel_features_written_out_give_the_same_codes(kind, form):
     config = dataclasses.replace(CONFIG, pixel_features=kind, features=8, hidden=16, code_size=5)
     params = vae.init_vae(config, SMALL, jax.random.key(0), form=form)
-    table = vae.frozen(config, SMALL, params, form=form)
+    table = vae.freeze_params(config, SMALL, params, form=form)
     assert "table" in table["encoder"]["pixels"] and table["decoder"] is params["decoder"]
     field, picture = ragged_field(6), jax.random.normal(jax.random.key(1), (1, SMALL.height, SMALL.width))
     sensed = field if form is Form.EVENTS else picture
@@ -126,7 +126,7 @@ def test_pixel_features_written_out_give_the_same_codes(kind, form):
         events = event_list(field)
         codes = (pooled_encoder_plain.encode_events(config, p, SMALL, *events)[0] for p in (params, table))
         np.testing.assert_allclose(*codes, rtol=1e-5, atol=1e-5)
-    again = vae.frozen(config, SMALL, table, form=form)
+    again = vae.freeze_params(config, SMALL, table, form=form)
     assert jax.tree.all(jax.tree.map(np.array_equal, table, again))
 
 
@@ -224,7 +224,7 @@ def test_the_error_over_waves_is_the_error_over_pixels(bandwidth):
     mean, log_variance = jax.jit(encode, static_argnums=0)(config, params, field)
     noise = jnp.exp(0.5 * log_variance) * jax.random.normal(jax.random.key(2), mean.shape)
     image = jax.jit(vae.decode, static_argnums=(0, 1))(config, SMALL, params, mean + noise)
-    expected = jnp.sum(jnp.square(image - vae.target(config, field)))
+    expected = jnp.sum(jnp.square(image - vae.decoder_target(config, field)))
     np.testing.assert_allclose(losses.reconstruction, expected, rtol=1e-5)
 
 
@@ -232,10 +232,10 @@ def test_the_target_keeps_polarities_apart_and_compresses_counts():
     image = np.zeros((1, SMALL.height, SMALL.width), np.int8)
     image[0, 2, 3], image[0, 0, 0] = 7, -1
     field = event_fields.field_of_counts(EventsConfig(), jnp.asarray(image[0]))
-    sharp = vae.target(dataclasses.replace(CONFIG, target_blur=0), field)
+    sharp = vae.decoder_target(dataclasses.replace(CONFIG, target_blur=0), field)
     expected = np.log1p(np.stack([np.maximum(image[0], 0), np.maximum(-image[0], 0)]).astype(np.float32))
     np.testing.assert_allclose(sharp, expected, rtol=1e-6)
-    blurred = vae.target(dataclasses.replace(CONFIG, target_blur=1), field)
+    blurred = vae.decoder_target(dataclasses.replace(CONFIG, target_blur=1), field)
     np.testing.assert_allclose(blurred.sum(), sharp.sum(), rtol=1e-5)
     np.testing.assert_allclose(blurred[0, 2, 3], sharp[0, 2, 3] / 4.0, rtol=1e-5)
 
@@ -268,13 +268,13 @@ def trained():
 @jax.jit
 def error_of(params, field):
     image = vae.decode(CONFIG, CAMERA, params, embed(CONFIG, params, field))
-    return jnp.mean(jnp.sum(jnp.square(image - vae.target(CONFIG, field)), axis=(-3, -2, -1)))
+    return jnp.mean(jnp.sum(jnp.square(image - vae.decoder_target(CONFIG, field)), axis=(-3, -2, -1)))
 
 
 @pytest.mark.slow
 def test_training_reconstructs_unseen_windows_better_than_any_constant(trained):
     before, after, losses, unseen = trained
-    target = vae.target(CONFIG, unseen)
+    target = vae.decoder_target(CONFIG, unseen)
     constant = float(jnp.mean(jnp.sum(jnp.square(target - target.mean(0)), axis=(-3, -2, -1))))
     assert float(error_of(after, unseen)) < 0.8 * constant
     assert float(error_of(after, unseen)) < 0.8 * float(error_of(before, unseen))

@@ -32,8 +32,8 @@ def test_a_layer_is_that_of_flax_with_its_gradients(rows: tuple[int, ...], use_b
 
 def test_what_is_added_to_all_rows_collects_the_gradients_of_all() -> None:
     x, shared = jnp.arange(24.0).reshape(2, 2, 2, 3), jnp.ones((2, 3))
-    np.testing.assert_array_equal(layers.added(x, shared), x + 1.0)
+    np.testing.assert_array_equal(layers.add_shared(x, shared), x + 1.0)
     weight = jnp.arange(24.0).reshape(x.shape)
-    of_x, of_shared = jax.grad(lambda x, s: jnp.sum(weight * layers.added(x, s)), argnums=(0, 1))(x, shared)
+    of_x, of_shared = jax.grad(lambda x, s: jnp.sum(weight * layers.add_shared(x, s)), argnums=(0, 1))(x, shared)
     np.testing.assert_array_equal(of_x, weight)
     np.testing.assert_array_equal(of_shared, weight.sum(axis=(0, 1)))

@@ -73,7 +73,7 @@ def test_it_learns_inside_of_the_vae_and_the_agent_sees_its_mean(config: Config)
     rng = np.random.default_rng(0)
     field = jax.tree.map(lambda *x: jnp.stack(x), *(random_field(config.events, 4, 6, rng) for _ in range(8)))
     motion = jnp.asarray(rng.normal(size=(8, MOTION_SIZE)), jnp.float32)
-    wanted = vae.in_waves(config.encoder, vae.target(config.encoder, field))
+    wanted = vae.in_waves(config.encoder, vae.decoder_target(config.encoder, field))
     loss = jax.jit(
         jax.value_and_grad(lambda p: vae.vae_loss(config.encoder, p, field, motion, wanted, jnp.zeros((8, 3)))[0])
     )
@@ -85,7 +85,7 @@ def test_it_learns_inside_of_the_vae_and_the_agent_sees_its_mean(config: Config)
     assert loss(trained)[0] < 0.8 * before
     moved = jax.tree.map(lambda a, b: bool(jnp.any(a != b)), trained, params)["encoder"]  # pyright: ignore
     assert jax.tree.all(moved)
-    acting = embedding.acting(config, trained)
+    acting = embedding.inference_params(config, trained)
     seen = embedding.embed(config, acting, Observation(field, own=jnp.zeros((8, 1)), motion=motion))
     assert seen is not None
     layer = acting["encoder"]["mean"]
@@ -100,7 +100,7 @@ def test_its_samples_keep_the_times_of_events(config: Config) -> None:
     even = dataclasses.replace(field, divides_window=True)
     observation = Observation(even, own=jnp.zeros(1), motion=jnp.zeros(MOTION_SIZE))
     wanted = samples.target_of(config.encoder, observation, None)
-    kept = samples.read(samples.samples_of(config.encoder, observation, wanted))
+    kept = samples.to_encoder_input(samples.samples_of(config.encoder, observation, wanted))
     assert isinstance(kept, EventField)
     np.testing.assert_array_equal(kept.t_first, field.t_first)
 

@@ -14,7 +14,7 @@ import pytest
 from edqn_jax.config import CameraConfig, EncoderConfig, EventsConfig
 from edqn_jax.learn.perception import vae
 from edqn_jax.learn.perception.code import Form
-from edqn_jax.learn.perception.patch_encoder import log_counts, patch_places, patches
+from edqn_jax.learn.perception.patch_encoder import log_counts, patch_places, to_patches
 from edqn_jax.sim.sensors import events as ev
 from edqn_jax.sim.task.observation import MOTION_SIZE
 from tests.oracles import event_fields, patch_encoder_plain
@@ -82,7 +82,7 @@ def test_both_polarities_of_a_pixel_are_counted_apart() -> None:
 
 def test_patches_are_cut_row_by_row_and_padded_with_zeros() -> None:
     image = jnp.arange(1.0, 61.0).reshape(6, 10)
-    cut = np.asarray(patches(image, 4))
+    cut = np.asarray(to_patches(image, 4))
     assert cut.shape == (6, 16)
     np.testing.assert_array_equal(cut[1].reshape(4, 4), image[:4, 4:8])
     np.testing.assert_array_equal(cut[5].reshape(4, 4)[:2, :2], image[4:, 8:])
@@ -137,13 +137,14 @@ def test_the_decoder_draws_what_the_target_holds(target, form, channels) -> None
     params = fresh(config, SMALL, jax.random.key(0), form=form)
     sensed = random_field(3, 1) if form is Form.EVENTS else jnp.ones((1, SMALL.height, SMALL.width))
     near = jnp.asarray(np.random.default_rng(4).random((SMALL.height, SMALL.width)), jnp.float32)
-    image = vae.target(config, sensed, near)
+    image = vae.decoder_target(config, sensed, near)
     assert image.shape == vae.decode(config, SMALL, params, jnp.zeros(5)).shape == (channels, SMALL.height, SMALL.width)
     if target != "sensed":
         np.testing.assert_array_equal(image[-1], near)
     if target != "nearness":
         np.testing.assert_array_equal(
-            image[: channels - (target == "both")], vae.target(dataclasses.replace(config, target="sensed"), sensed)
+            image[: channels - (target == "both")],
+            vae.decoder_target(dataclasses.replace(config, target="sensed"), sensed),
         )
 
 
@@ -161,7 +162,7 @@ def test_nearness_is_learnt_from_events_and_motion_and_not_from_events_alone() -
     motion = np.zeros((512, MOTION_SIZE), np.float32)
     motion[:, 0] = speed
     wanted = vae.in_waves(
-        config, vae.target(config, fields, jnp.asarray(np.broadcast_to(near[:, None, None], (512, 8, 8))))
+        config, vae.decoder_target(config, fields, jnp.asarray(np.broadcast_to(near[:, None, None], (512, 8, 8))))
     )
 
     def error_after(motion) -> float:

@@ -107,7 +107,7 @@ def test_a_checkpoint_that_is_whole_keeps_its_name_whatever_else_is_wrong(tmp_pa
         raise ConfigError("'metrics.jsonl' is lost")
 
     with pytest.raises(ConfigError, match="can be used"):
-        states.newest(tmp_path, unusable, said.append)
+        states.newest_checkpoint(tmp_path, unusable, said.append)
     assert said == ["the checkpoint after training step 1 is passed over: 'metrics.jsonl' is lost"]
     assert newest(tmp_path)[0] is not None
 
@@ -158,13 +158,13 @@ def test_a_disk_that_fills_at_any_write_leaves_the_checkpoint_before(tmp_path: P
 def test_growing_files_are_checked_and_cut_back_to_what_they_held(tmp_path: Path) -> None:
     files = {"a.csv": tmp_path / "a.csv", "later.csv": tmp_path / "later.csv"}
     files["a.csv"].write_text("1\n2\n")
-    said = states.grown(files)
+    said = states.log_digests(files)
     files["a.csv"].write_text("1\n2\n3\n4")
     files["later.csv"].write_text("5\n")
-    states.check_grown(files, said)
-    states.cut_back(files, said)
+    states.check_log_prefix(files, said)
+    states.truncate_logs(files, said)
     assert files["a.csv"].read_text() == "1\n2\n" and not files["later.csv"].exists()
     for changed in ("1\n3\n", "1\n"):
         files["a.csv"].write_text(changed)
         with pytest.raises(ConfigError, match=r"a.csv' does not begin with what it held when it was saved"):
-            states.check_grown(files, said)
+            states.check_log_prefix(files, said)

@@ -29,7 +29,7 @@ WINDOW_S = 0.04
 @partial(jax.jit, static_argnums=0)
 def images(config, pool, index, positions, rotations):
     """Luma [K, H, W] of K poses, each in its own world of the pool."""
-    return jax.vmap(lambda i, p, r: camera.luma(config, take_scene(pool, i), p, r))(index, positions, rotations)
+    return jax.vmap(lambda i, p, r: camera.render_luma(config, take_scene(pool, i), p, r))(index, positions, rotations)
 
 
 def references(config, scenes, index, positions, rotations, samples=8):
@@ -267,12 +267,12 @@ def test_awkward_places_are_seen_right():
 
 @partial(jax.jit, static_argnums=0)
 def luma_of(config, scene, position, rotation):
-    return camera.luma(config, scene, position, rotation)
+    return camera.render_luma(config, scene, position, rotation)
 
 
 @partial(jax.jit, static_argnums=0)
 def luma_and_colours(config, scene, position, rotation):
-    return camera.luma(config, scene, position, rotation), camera.rgb(config, scene, position, rotation)
+    return camera.render_luma(config, scene, position, rotation), camera.render_rgb(config, scene, position, rotation)
 
 
 @pytest.fixture(scope="module")
@@ -289,7 +289,7 @@ def test_luma_is_eq_1s_weighting_of_the_colours_and_they_are_right(view, mount):
     config = CameraConfig(mount=mount)
     grey, colour = luma_and_colours(config, *view)
     assert colour.shape == (24, 32, 3)
-    np.testing.assert_allclose(event_laws.luma(colour), grey, atol=1e-5)  # float32
+    np.testing.assert_allclose(event_laws.rgb_to_luma(colour), grey, atol=1e-5)  # float32
     scene, position, rotation = view
     reference = camera_plain.rgb(config, scene, np.asarray(position, np.float64), np.asarray(rotation), 8)
     assert np.abs(np.ptp(reference, axis=2)).mean() > 0.05  # red is not blue
@@ -349,7 +349,7 @@ def test_a_shape_that_is_not_there_is_not_seen():
 
 def test_an_empty_world_is_sky():
     config = CameraConfig(sky_rgb=(0.5, 0.25, 1.0))
-    sky = jax.jit(partial(camera.rgb, config))(scene_of(), jnp.zeros(3), jnp.eye(3))
+    sky = jax.jit(partial(camera.render_rgb, config))(scene_of(), jnp.zeros(3), jnp.eye(3))
     np.testing.assert_allclose(sky, np.broadcast_to((0.5, 0.25, 1.0), (24, 32, 3)), rtol=1e-6)
 
 
@@ -392,7 +392,7 @@ def test_the_texture_filter_is_a_sinc_below_one_period_and_zero_beyond():
 
 
 @pytest.mark.parametrize("mount", ["level", "body"])
-@pytest.mark.parametrize("picture", [camera.luma, camera.rgb])
+@pytest.mark.parametrize("picture", [camera.render_luma, camera.render_rgb])
 def test_the_camera_promotes_no_ranks(strict_jax, view, mount, picture):
     traced = jax.eval_shape(partial(picture, CameraConfig(mount=mount)), *view)
     assert traced.dtype == jnp.float32

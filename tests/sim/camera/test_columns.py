@@ -45,7 +45,9 @@ def crowd(rng, boxes, cylinders, spheres):
 @pytest.mark.slow
 def test_columns_with_more_shapes_than_any_capacity_are_drawn_completely(count):
     scene, position, rotation = scene_of(GROUND, *stairs(count)), (4.0, 20.0, 9.0), rotation_of(0, 0, 0.05)
-    seen = jax.jit(partial(camera.luma, CONFIG))(scene, jnp.asarray(position), jnp.asarray(rotation, jnp.float32))
+    seen = jax.jit(partial(camera.render_luma, CONFIG))(
+        scene, jnp.asarray(position), jnp.asarray(rotation, jnp.float32)
+    )
     plain = camera_plain.luma(CONFIG, scene, np.array(position), rotation, samples=8)
     # Reached: rms 0.016 and 0.19 in one pixel; many edges stand in it, three of which are kept.
     assert np.sqrt(np.mean((seen - plain) ** 2)) < 0.02 and np.abs(seen - plain).max() < 0.25
@@ -62,7 +64,7 @@ def test_a_picture_does_not_depend_on_blocks_and_on_how_it_is_mapped(monkeypatch
     rotations = np.stack([rotation_of(0, 0, yaw) for yaw in rng.uniform(-np.pi, np.pi, 64)]).astype(np.float32)
 
     def one(i, p, r):
-        return camera.luma(CONFIG, take_scene(pool, i), p, r)
+        return camera.render_luma(CONFIG, take_scene(pool, i), p, r)
 
     poses = (index, positions, rotations)
     blocks = jax.jit(jax.vmap(one))(*poses)

@@ -44,13 +44,13 @@ def frames(scenes: list[Scene], count: int, seed: int) -> tuple[Scene, jax.Array
 @partial(jax.jit, static_argnums=(0, 1))
 def in_c(call: Callable, config: CameraConfig, scene: Scene, origin: jax.Array, rotation: jax.Array, weights):
     """`call` is what calls C, of which a program holds one."""
-    pictures = native.pictures(config, scene, origin, rotation, weights)
-    return pictures, native.depths(config, scene, origin, rotation)
+    pictures = native.render_luma(config, scene, origin, rotation, weights)
+    return pictures, native.render_depth(config, scene, origin, rotation)
 
 
 @partial(jax.jit, static_argnums=0)
 def in_jax(config: CameraConfig, scene: Scene, origin: jax.Array, rotation: jax.Array, weights):
-    pictures = columns.pictures(config, camera.blend, scene, origin, rotation, weights)
+    pictures = columns.render_columns(config, camera.blend_layers, scene, origin, rotation, weights)
     return pictures, camera._depths(config, scene, origin, rotation)
 
 
@@ -82,7 +82,7 @@ def crowd(rng: np.random.Generator) -> Scene:
 
 
 def test_the_library_is_at_hand_wherever_there_is_a_compiler() -> None:
-    assert native.is_at_hand("cpu") is (shutil.which("cc") is not None)
+    assert native.is_available("cpu") is (shutil.which("cc") is not None)
 
 
 def test_both_draw_the_other_drones_and_neither_those_that_are_absent() -> None:
@@ -100,11 +100,11 @@ def test_both_draw_the_other_drones_and_neither_those_that_are_absent() -> None:
 def test_c_draws_what_jax_draws(size: tuple[int, int]) -> None:
     config = dataclasses.replace(CONFIG, width=size[0], height=size[1])
     rng = np.random.default_rng(3)
-    if native.is_at_hand("cpu"):
+    if native.is_available("cpu"):
         agree(config, *frames([crowd(rng) for _ in range(8)], 64, seed=4))
     else:  # then there is one camera, and the pictures of the package are its
         scene, origin, rotation = frames([crowd(rng)], 2, seed=4)
-        assert np.isfinite(jax.vmap(partial(camera.luma, config))(scene, origin, rotation)).all()
+        assert np.isfinite(jax.vmap(partial(camera.render_luma, config))(scene, origin, rotation)).all()
 
 
 def patterned_frames(rng: np.random.Generator) -> tuple[Scene, jax.Array, jax.Array]:
@@ -114,7 +114,7 @@ def patterned_frames(rng: np.random.Generator) -> tuple[Scene, jax.Array, jax.Ar
 
 def test_c_draws_every_pattern_as_jax_does() -> None:
     rng = np.random.default_rng(6)
-    if native.is_at_hand("cpu"):
+    if native.is_available("cpu"):
         agree(CONFIG, *patterned_frames(rng), ties=TIES)
 
 
@@ -133,7 +133,7 @@ def worlds() -> dict[str, list[Scene]]:
 @pytest.mark.parametrize("family", FAMILIES)
 @pytest.mark.slow
 def test_c_draws_the_worlds_of_a_family_as_jax_does(worlds: dict[str, list[Scene]], family: str) -> None:
-    if native.is_at_hand("cpu"):
+    if native.is_available("cpu"):
         agree(CONFIG, *frames(worlds[family], 128, seed=8), ties=TIES)
 
 
@@ -145,7 +145,7 @@ def kernels() -> bool:
     compiler = dataclasses.replace(build.C, flags=(*build.C.flags, "-xc", "-include", str(on_cpu), *names))
     targets = tuple(f"emulated_{target}" for target in native.TARGETS)
     headers = (*native.HEADERS, on_cpu)
-    return build.registered(native.SOURCES["cu"], targets, native.definitions(), compiler, headers)
+    return build.ensure_registered(native.SOURCES["cu"], targets, native.compiler_definitions(), compiler, headers)
 
 
 def crowded_forest(rng: np.random.Generator) -> Scene:
@@ -188,19 +188,19 @@ def test_the_kernels_of_gpus_draw_every_pattern(kernels: bool, monkeypatch: pyte
 
 def test_a_world_with_other_shapes_and_a_camera_on_the_body_are_drawn_by_jax() -> None:
     rng = np.random.default_rng(0)
-    assert not native.can_draw(CONFIG, every_kind(rng), "cpu")
-    assert not native.can_draw(dataclasses.replace(CONFIG, mount="body"), crowd(rng), "cpu")
+    assert not native.can_render(CONFIG, every_kind(rng), "cpu")
+    assert not native.can_render(dataclasses.replace(CONFIG, mount="body"), crowd(rng), "cpu")
     walls = [GROUND] * native.MOST_PLANES
-    assert native.can_draw(CONFIG, scene_of(*walls), "cpu") is native.is_at_hand("cpu")
-    assert not native.can_draw(CONFIG, scene_of(*walls, GROUND), "cpu")
-    assert native.can_draw(CONFIG, crowd(rng), "cpu") is native.is_at_hand("cpu")
+    assert native.can_render(CONFIG, scene_of(*walls), "cpu") is native.is_available("cpu")
+    assert not native.can_render(CONFIG, scene_of(*walls, GROUND), "cpu")
+    assert native.can_render(CONFIG, crowd(rng), "cpu") is native.is_available("cpu")
 
 
 def test_a_frame_is_the_same_to_the_bit_however_it_is_mapped() -> None:
     """Worlds of their own, a world for every four frames, and one world for all."""
     scene, origin, rotation = frames([crowd(np.random.default_rng(1))], 12, seed=2)
     world = jax.tree.map(lambda leaf: leaf[0], scene)
-    one = partial(camera.luma, CONFIG)
+    one = partial(camera.render_luma, CONFIG)
     own = jax.vmap(one)(scene, origin, rotation)
     folded = jax.tree.map(lambda leaf: leaf.reshape(3, 4, *leaf.shape[1:]), (origin, rotation))
     three = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (3, *leaf.shape)), world)
@@ -214,7 +214,7 @@ def test_a_frame_is_the_same_to_the_bit_however_it_is_mapped() -> None:
 
 def test_poses_that_are_not_finite_spoil_their_own_frame_alone() -> None:
     scene, origin, rotation = frames([crowd(np.random.default_rng(1))], 6, seed=2)
-    draw = jax.vmap(partial(camera.luma, CONFIG))
+    draw = jax.vmap(partial(camera.render_luma, CONFIG))
     good = np.asarray(draw(scene, origin, rotation))
     bad = np.asarray(draw(scene, origin.at[1].set(jnp.nan).at[4].set(jnp.inf), rotation.at[2].set(jnp.nan)))
     np.testing.assert_array_equal(bad[[0, 3, 5]], good[[0, 3, 5]])

@@ -34,7 +34,7 @@ ALBEDO = np.full(3, 0.5)
 
 @partial(jax.jit, static_argnums=0)
 def depths(config, scene, positions, rotations):
-    return jax.vmap(lambda p, r: camera.depth(config, scene, p, r))(positions, rotations)
+    return jax.vmap(lambda p, r: camera.render_depth(config, scene, p, r))(positions, rotations)
 
 
 def random_poses(scene, rng, count):
@@ -163,7 +163,7 @@ def test_exactly_vertical_rays_meet_what_stands_straight_below_and_above(kind):
 def test_shade_is_brightest_towards_the_sun_and_ambient_behind():
     config = CameraConfig(sun_azimuth_deg=90.0, sun_elevation_deg=30.0, ambient=0.25)
     ways = np.array([[0, np.cos(np.pi / 6), 0.5], [0, -1, 0], [1, 0, 0], [0, 0, 1]], np.float32)
-    shades = raycast.shade(raycast.daylight_of(config, None), ways[:, 0], ways[:, 1], ways[:, 2])
+    shades = raycast.lambert_shade(raycast.daylight_of(config, None), ways[:, 0], ways[:, 1], ways[:, 2])
     np.testing.assert_allclose(shades, [1.0, 0.25, 0.25, 0.25 + 0.75 * 0.5], atol=1e-6)
 
 
@@ -173,7 +173,7 @@ def test_rays_and_depth_promote_no_ranks(mount):
     config = CameraConfig(mount=mount, width=8, height=6)
     scene = scene_of(GROUND, *ALONE.values())
     shape = jax.eval_shape(
-        lambda p, r: camera.depth(config, scene, p, r), jax.ShapeDtypeStruct((3,), jnp.float32),
+        lambda p, r: camera.render_depth(config, scene, p, r), jax.ShapeDtypeStruct((3,), jnp.float32),
         jax.ShapeDtypeStruct((3, 3), jnp.float32),
     )  # fmt: skip
     assert shape.shape == (6, 8) and shape.dtype == jnp.float32

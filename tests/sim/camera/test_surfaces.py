@@ -66,7 +66,7 @@ def test_pictures_of_every_pattern_agree_with_supersampling(mount: Literal["leve
     places = [(4.0 * x - 1, 4.5, 2.0) for x in range(6)]
     rotation = np.stack([rotation_of(tilt, -tilt, (-1) ** x * 1.5) for x in range(6)]).astype(np.float32)
     config = CameraConfig(mount=mount)
-    drawn = jax.jit(jax.vmap(partial(camera.luma, config, scene)))(jnp.array(places), jnp.asarray(rotation))
+    drawn = jax.jit(jax.vmap(partial(camera.render_luma, config, scene)))(jnp.array(places), jnp.asarray(rotation))
     poses = zip(np.array(places), rotation, strict=True)
     fine = np.stack([camera_plain.luma(config, scene, *pose, samples=8) for pose in poses])
     error = np.asarray(drawn) - fine

@@ -14,14 +14,14 @@ import pytest
 import scipy.linalg
 
 from edqn_jax.config import AirConfig, BodyConfig, Config, EnvConfig, MotorsConfig, NoiseConfig
-from edqn_jax.config.loading import apply, load_layer
+from edqn_jax.config.loading import apply_layer, load_layer
 from edqn_jax.policies import policy_folder
 from edqn_jax.sim.actions import ACTIONS, move_number
 from edqn_jax.sim.physics import disturbances
 from edqn_jax.sim.physics.airframe import load_airframe
 from edqn_jax.sim.physics.controller import VelocityCommand
 from edqn_jax.sim.physics.disturbances import Disturbance, Load
-from edqn_jax.sim.physics.drone import DroneState, hover
+from edqn_jax.sim.physics.drone import DroneState, hover_state
 from edqn_jax.sim.physics.flight import fly_disturbed, physics_step
 from edqn_jax.sim.scene.scene import build_scene, stack_scenes
 from edqn_jax.sim.task import env
@@ -103,7 +103,7 @@ def test_a_hundred_steps_in_wind_with_slow_uneven_motors_agree_with_c_mujoco_wit
         apart = wind - velocity
         return (0.4 + 0.5 * 1.225 * 0.05 * np.linalg.norm(apart)) * apart
 
-    state = hover(jnp.array([1.0, -2.0, 30.0]), jnp.float32(0.4))
+    state = hover_state(jnp.array([1.0, -2.0, 30.0]), jnp.float32(0.4))
     state = dataclasses.replace(state, angular_velocity=jnp.array([0.5, -0.3, 0.2]))
     qpos = np.concatenate([state.position, state.quaternion])
     qvel = np.concatenate([state.velocity, state.angular_velocity])
@@ -169,7 +169,7 @@ def test_gusts_have_the_deviations_and_the_correlation_times_of_dryden_from_thei
     @jax.jit
     def flown(key):
         first, rest = jax.random.split(key)
-        begun = jax.vmap(disturbances.first_gusts)(jax.random.split(first, runs))
+        begun = jax.vmap(disturbances.stationary_gusts)(jax.random.split(first, runs))
 
         def step(gusts, key):
             white = jax.random.normal(key, gusts.shape)
@@ -192,7 +192,7 @@ def test_gusts_have_the_deviations_and_the_correlation_times_of_dryden_from_thei
         np.testing.assert_allclose(found, [np.exp(-share[0]), across[1], across[2]], atol=0.01)
     crossed = [np.mean(unit[:, i] * unit[:, j]) for i, j in ((0, 1), (0, 2), (1, 2))]
     np.testing.assert_allclose(crossed, 0.0, atol=0.01)
-    begun = jax.vmap(disturbances.first_gusts)(jax.random.split(jax.random.key(1), 40_000))
+    begun = jax.vmap(disturbances.stationary_gusts)(jax.random.split(jax.random.key(1), 40_000))
     first = np.stack(jax.vmap(partial(disturbances.gust_velocity, air))(begun))
     np.testing.assert_allclose(first.std(axis=1), wanted, rtol=0.015)  # 40,000 draws: 0.4 %
 
@@ -204,7 +204,7 @@ def flown_disturbed(config: Config, disturbance: Disturbance, command, decisions
     """State and disturbance after decisions at a held command, and all flights."""
     airframe = load_airframe(config.drone)
     fly = jax.jit(lambda *given: fly_disturbed(config, airframe, *given))
-    state, flights = hover(jnp.array([0.0, 0.0, 50.0]), jnp.float32(0.0)), []
+    state, flights = hover_state(jnp.array([0.0, 0.0, 50.0]), jnp.float32(0.0)), []
     held = VelocityCommand(jnp.asarray(command, jnp.float32), jnp.float32(0.0))
     for each in jax.random.split(jax.random.key(key), decisions):
         state, disturbance, flight = fly(state, disturbance, held, each)
@@ -236,7 +236,7 @@ def test_the_controller_gives_the_nominal_thrust_so_that_a_light_drone_rises_and
 @pytest.mark.slow
 def test_both_engines_fly_the_same_disturbed_flight():
     given = Config(air=AIR, body=BodyConfig(0.2, 0.2), motors=MotorsConfig(0.2, 0.05))
-    disturbance = disturbances.draw(given, jnp.float32(3.25), jax.random.key(2))
+    disturbance = disturbances.sample_disturbance(given, jnp.float32(3.25), jax.random.key(2))
     assert disturbance is not None
     (mjx, _, _), (closed, _, _) = (
         flown_disturbed(with_engine(engine, given), disturbance, (3.0, -2.0, 1.0), 12) for engine in ENGINES
@@ -264,13 +264,13 @@ EVERYTHING = dataclasses.replace(
 
 
 @pytest.fixture(scope="module")
-def world() -> env.World:
+def world() -> env.EnvParams:
     scene = build_scene([GROUND], volume=VOLUME, start=list(START), goal=list(GOAL))
     missions = Missions(scene=jnp.zeros(1, jnp.int32), start=jnp.array([START]), goal=jnp.array([GOAL]))
-    return env.World(airframe=load_airframe(QUIET.drone), pool=stack_scenes([scene]), missions=missions)
+    return env.EnvParams(airframe=load_airframe(QUIET.drone), pool=stack_scenes([scene]), missions=missions)
 
 
-def flown(config: Config, world: env.World, moves, seed: int = 0) -> tuple[list[Any], Any, list[Any]]:
+def flown(config: Config, world: env.EnvParams, moves, seed: int = 0) -> tuple[list[Any], Any, list[Any]]:
     """States after a reset and after each move, the first observation, and what the moves led to."""
     state, observation = jax.jit(partial(env.reset, config, world))(jax.random.key(seed))
     step = jax.jit(partial(env.step, config, world))
@@ -285,7 +285,7 @@ def flown(config: Config, world: env.World, moves, seed: int = 0) -> tuple[list[
 def test_with_everything_off_there_is_no_state_and_nothing_is_drawn(world):
     assert not disturbances.any_on(Config()) and not disturbances.changes_flight(Config())
     assert flown(QUIET, world, [AHEAD])[0][1].disturbance is None
-    assert disturbances.draw(Config(), jnp.float32(3.0), jax.random.key(0)) is None
+    assert disturbances.sample_disturbance(Config(), jnp.float32(3.0), jax.random.key(0)) is None
 
 
 @pytest.mark.parametrize(
@@ -305,14 +305,14 @@ def test_with_everything_off_there_is_no_state_and_nothing_is_drawn(world):
 )
 def test_every_switch_turns_on_its_own_disturbance_alone(change, fields):
     config = dataclasses.replace(Config(), **change)
-    drawn = disturbances.draw(config, jnp.float32(3.0), jax.random.key(0))
+    drawn = disturbances.sample_disturbance(config, jnp.float32(3.0), jax.random.key(0))
     assert drawn is not None
     assert {name for name, value in vars(drawn).items() if value is not None} == fields
 
 
 def test_draws_are_uniform_within_their_limits_and_differ_between_episodes():
     keys = jax.random.split(jax.random.key(0), 4000)
-    drawn: Any = jax.vmap(lambda key: disturbances.draw(EVERYTHING, jnp.float32(3.0), key))(keys)
+    drawn: Any = jax.vmap(lambda key: disturbances.sample_disturbance(EVERYTHING, jnp.float32(3.0), key))(keys)
     # Mean and deviation of 4000 uniform numbers: to 0.5 % and 1 % of the range.
     for value, low, high in (
         (drawn.mass, 0.8, 1.2),
@@ -395,7 +395,9 @@ def test_noise_is_white_and_a_bias_stays():
     noise = NoiseConfig(position_m=0.5, velocity_m_s=0.3)
     biased = Disturbance(position_bias=jnp.array([1.0, 2.0, 3.0]))
     keys = jax.random.split(jax.random.key(0), 20_000)
-    place, speed = jax.vmap(lambda key: disturbances.believed(noise, biased, jnp.ones(3), jnp.zeros(3), key))(keys)
+    place, speed = jax.vmap(lambda key: disturbances.estimate_state(noise, biased, jnp.ones(3), jnp.zeros(3), key))(
+        keys
+    )
     # 20,000 draws: means to 1/140 of a deviation.
     np.testing.assert_allclose(place.mean(axis=0), [2.0, 3.0, 4.0], atol=0.02)
     np.testing.assert_allclose(place.std(axis=0), 0.5, rtol=0.02)
@@ -408,4 +410,4 @@ def test_noise_is_white_and_a_bias_stays():
 def test_a_policy_that_was_saved_before_there_were_disturbances_loads_without_any():
     saved = load_layer(policy_folder(Path("pretrained")) / "config.yaml")
     assert not {"air", "body", "motors", "noise"} & set(saved) and "action_delay" not in saved["env"]
-    assert not disturbances.any_on(apply(Config(), saved, "config.yaml"))
+    assert not disturbances.any_on(apply_layer(Config(), saved, "config.yaml"))

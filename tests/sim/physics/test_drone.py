@@ -15,15 +15,15 @@ from mujoco import mjx
 from edqn_jax.config import Config
 from edqn_jax.sim.physics import flight
 from edqn_jax.sim.physics.airframe import Airframe, load_airframe
-from edqn_jax.sim.physics.controller import thrusts
-from edqn_jax.sim.physics.drone import DroneState, hover, wrap_angle, yaw_of
-from edqn_jax.sim.physics.flight import _mjx_template, fly, physics_step
+from edqn_jax.sim.physics.controller import rotor_thrusts
+from edqn_jax.sim.physics.drone import DroneState, hover_state, wrap_angle, yaw_of
+from edqn_jax.sim.physics.flight import _mjx_template, fly_decision, physics_step
 from tests.oracles import drone_mujoco
 from tracking import Decide, batched_fly, manoeuvres, measure
 
 CONFIG = Config().drone
 SPEED = Config().env.speed_m_s
-BATCH = len(manoeuvres(SPEED)[0])  # one shape, so that `fly` compiles once
+BATCH = len(manoeuvres(SPEED)[0])  # one shape, so that `fly_decision` compiles once
 ROTORS = np.array([[-0.14, -0.18, 0.05], [-0.14, 0.18, 0.05], [0.14, 0.18, 0.08], [0.14, -0.18, 0.08]])
 MAX_THRUST = 13.0
 
@@ -45,7 +45,7 @@ def step(airframe):
 
 @pytest.fixture(scope="module")
 def thrust_of(airframe):
-    return jax.jit(lambda state, command: thrusts(CONFIG, airframe, state, command))
+    return jax.jit(lambda state, command: rotor_thrusts(CONFIG, airframe, state, command))
 
 
 def tumbling(seed: int, count: int) -> DroneState:
@@ -67,7 +67,7 @@ def tilted(angle: np.ndarray, about: np.ndarray) -> DroneState:
     """At rest, leaning by angle [B] about horizontal axes at azimuth about [B], radians."""
     cos, sin = np.cos(angle / 2), np.sin(angle / 2)
     quaternion = np.stack([cos, sin * np.cos(about), sin * np.sin(about), 0 * sin], axis=1)
-    level = jax.vmap(hover)(jnp.zeros((len(angle), 3)), jnp.zeros(len(angle)))
+    level = jax.vmap(hover_state)(jnp.zeros((len(angle), 3)), jnp.zeros(len(angle)))
     return dataclasses.replace(level, quaternion=jnp.asarray(quaternion, jnp.float32))
 
 
@@ -121,7 +121,7 @@ def test_the_mixer_gives_the_wrench_asked_for_in_c_mujoco(airframe):
 def test_a_hundred_steps_agree_with_c_mujoco_within_a_millimetre(step):
     rng = np.random.default_rng(1)
     sequence = np.clip(3.25 + rng.normal(0, 0.4, (100, 4)), 0, MAX_THRUST)
-    state = hover(jnp.array([1.0, -2.0, 30.0]), jnp.float32(0.4))
+    state = hover_state(jnp.array([1.0, -2.0, 30.0]), jnp.float32(0.4))
     state = dataclasses.replace(state, angular_velocity=jnp.array([0.5, -0.3, 0.2]))
     qpos = np.concatenate([state.position, state.quaternion])
     places, speeds = drone_mujoco.fly_thrusts(qpos, np.concatenate([state.velocity, state.angular_velocity]), sequence)
@@ -180,7 +180,9 @@ def test_a_decision_is_its_physics_steps_one_by_one(decide, thrust_of, step):
 @pytest.mark.slow
 def test_heading_is_the_yaw_of_a_level_drone_and_a_lean_does_not_move_it():
     yaws = jnp.linspace(-3.1, 3.1, 7)
-    np.testing.assert_allclose(jax.vmap(lambda yaw: yaw_of(hover(jnp.zeros(3), yaw).quaternion))(yaws), yaws, atol=1e-6)
+    np.testing.assert_allclose(
+        jax.vmap(lambda yaw: yaw_of(hover_state(jnp.zeros(3), yaw).quaternion))(yaws), yaws, atol=1e-6
+    )
     leaning = tilted(np.full(BATCH, 1.1), np.linspace(0, 6, BATCH))
     np.testing.assert_allclose(yaw_of(leaning.quaternion), 0.0, atol=1e-6)
     np.testing.assert_allclose(wrap_angle(jnp.array([3.5, -3.5])), [3.5 - 2 * np.pi, 2 * np.pi - 3.5], atol=1e-6)
@@ -188,7 +190,7 @@ def test_heading_is_the_yaw_of_a_level_drone_and_a_lean_does_not_move_it():
 
 @pytest.mark.parametrize("error", [0.3, -0.3, 3.0, -3.0])
 def test_a_heading_error_turns_the_drone_the_way_that_shrinks_it(thrust_of, error):
-    state = hover(jnp.zeros(3), jnp.float32(1.0))
+    state = hover_state(jnp.zeros(3), jnp.float32(1.0))
     state = dataclasses.replace(state, yaw_setpoint=wrap_angle(jnp.float32(1.0 + error)))
     thrust = thrust_of(state, jnp.zeros(3))
     qpos = np.concatenate([state.position, state.quaternion])
@@ -199,7 +201,7 @@ def test_a_heading_error_turns_the_drone_the_way_that_shrinks_it(thrust_of, erro
 
 @pytest.mark.slow
 def test_the_setpoint_moves_at_its_rate_limit_by_the_shorter_way_and_the_drone_follows(decide):
-    states = jax.vmap(hover)(jnp.zeros((BATCH, 3)), jnp.full(BATCH, 3.0))
+    states = jax.vmap(hover_state)(jnp.zeros((BATCH, 3)), jnp.full(BATCH, 3.0))
     targets = jnp.linspace(-3.0, 2.0, BATCH)
     commands = jnp.zeros((BATCH, 3))
     most = CONFIG.max_yaw_rate_rad_s * CONFIG.physics_dt_s * CONFIG.physics_steps
@@ -234,7 +236,7 @@ def torque_about_x(airframe: Airframe, thrust: jax.Array) -> float:
 
 @pytest.mark.parametrize("climb", [-40.0, 40.0])
 def test_neither_climb_nor_turn_weakens_the_torque_that_rights_the_drone(airframe, thrust_of, climb):
-    level = hover(jnp.zeros(3), jnp.float32(0.0))
+    level = hover_state(jnp.zeros(3), jnp.float32(0.0))
     rolling = dataclasses.replace(level, angular_velocity=jnp.array([4.0, 0, 0]))
     alone = torque_about_x(airframe, thrust_of(rolling, jnp.zeros(3)))
     busy = dataclasses.replace(rolling, yaw_setpoint=jnp.float32(2.0))
@@ -297,7 +299,7 @@ def test_the_drone_recovers_from_a_tilt_of_45_degrees_on_the_spot(decide):
 @pytest.mark.slow
 def test_a_hundred_thousand_random_decisions_never_diverge_nor_tip_the_drone_over(decide):
     rng = np.random.default_rng(4)
-    states = jax.vmap(hover)(jnp.zeros((BATCH, 3)), jnp.zeros(BATCH))
+    states = jax.vmap(hover_state)(jnp.zeros((BATCH, 3)), jnp.zeros(BATCH))
     fastest, steepest = 0.0, 1.0
     for _ in range(-(-100_000 // BATCH)):
         commands = SPEED * rng.integers(-1, 2, (BATCH, 3)).astype(np.float32)
@@ -313,8 +315,10 @@ def test_a_hundred_thousand_random_decisions_never_diverge_nor_tip_the_drone_ove
 
 
 def test_fly_traces_to_one_scan_without_callbacks(airframe):
-    state = hover(jnp.zeros(3), jnp.float32(0.0))
-    program = str(jax.make_jaxpr(lambda s, c, y: fly(CONFIG, airframe, s, c, y))(state, jnp.zeros(3), jnp.float32(0.0)))
+    state = hover_state(jnp.zeros(3), jnp.float32(0.0))
+    program = str(
+        jax.make_jaxpr(lambda s, c, y: fly_decision(CONFIG, airframe, s, c, y))(state, jnp.zeros(3), jnp.float32(0.0))
+    )
     assert "callback" not in program
     assert program.count("length=13") == 1
 
@@ -328,7 +332,7 @@ def test_it_flies_in_programs_of_different_meshes(airframe, axis, monkeypatch):
         _mjx_template.cache_clear()
 
     def fall(place: jax.Array) -> jax.Array:
-        return physics_step(CONFIG, airframe, hover(place, jnp.float32(0.0)), jnp.zeros(4)).velocity
+        return physics_step(CONFIG, airframe, hover_state(place, jnp.float32(0.0)), jnp.zeros(4)).velocity
 
     falling = jax.shard_map(jax.vmap(fall), mesh=mesh, in_specs=spec, out_specs=spec, check_vma=False)
     np.testing.assert_allclose(jax.jit(falling)(jnp.zeros((2, 3)))[:, 2], -9.81 * CONFIG.physics_dt_s, rtol=1e-5)

@@ -18,9 +18,9 @@ from edqn_jax.config import Config, DroneConfig
 from edqn_jax.config.registry import AIRFRAMES
 from edqn_jax.config.rules import validate
 from edqn_jax.errors import ConfigError
-from edqn_jax.runs.provenance import workload
+from edqn_jax.runs.provenance import describe_workload
 from edqn_jax.sim.physics.airframe import SKYDIO_X2, load_airframe
-from edqn_jax.sim.physics.drone import DroneState, hover
+from edqn_jax.sim.physics.drone import DroneState, hover_state
 from edqn_jax.sim.physics.flight import physics_step
 from edqn_jax.sim.scene.mjcf import load_scene, resolve_world
 from tests.oracles import drone_mujoco
@@ -85,7 +85,7 @@ def test_a_hundred_steps_agree_with_c_mujoco_within_a_millimetre() -> None:
     sequence = np.clip(3.25 + rng.normal(0, 0.4, (100, 4)), 0, MAX_THRUST)
     airframe = load_airframe(CLOSED)
     step = jax.jit(lambda state, thrust: physics_step(CLOSED, airframe, state, thrust))
-    state = hover(jnp.array([1.0, -2.0, 30.0]), jnp.float32(0.4))
+    state = hover_state(jnp.array([1.0, -2.0, 30.0]), jnp.float32(0.4))
     state = dataclasses.replace(state, angular_velocity=jnp.array([0.5, -0.3, 0.2]))
     qpos = np.concatenate([state.position, state.quaternion])
     places, speeds = drone_mujoco.fly_thrusts(qpos, np.concatenate([state.velocity, state.angular_velocity]), sequence)
@@ -101,7 +101,7 @@ def test_a_hundred_steps_agree_with_c_mujoco_within_a_millimetre() -> None:
 @pytest.mark.slow
 def test_flights_of_random_moves_are_those_of_mjx() -> None:
     rng = np.random.default_rng(2)
-    start = jax.vmap(hover)(jnp.zeros((COUNT, 3)), jnp.zeros(COUNT))
+    start = jax.vmap(hover_state)(jnp.zeros((COUNT, 3)), jnp.zeros(COUNT))
     flies = [batched_fly(drone) for drone in (MJX, CLOSED)]
     states = [start, start]
     for _ in range(20):
@@ -189,7 +189,7 @@ def test_another_quadrotor_is_a_file_and_an_entry(tmp_path: Path, monkeypatch: p
     np.testing.assert_allclose(float(airframe.mass), 1.5 * 1.325, rtol=1e-6)
     for physics in ("mjx", "rigid_body"):
         config = dataclasses.replace(heavy, physics=physics)
-        state = hover(jnp.zeros(3), jnp.float32(0.0))
+        state = hover_state(jnp.zeros(3), jnp.float32(0.0))
         push = jnp.full(4, airframe.mass * 9.81 / 4 + 0.5)
         risen = jax.jit(partial(physics_step, config, airframe))(state, push)
         np.testing.assert_allclose(risen.velocity, [0, 0, 2.0 / (1.5 * 1.325) * config.physics_dt_s], atol=1e-5)
@@ -212,4 +212,4 @@ def test_it_is_asked_for_by_a_flag_and_every_report_says_so() -> None:
     scene = load_scene(resolve_world("paper"))
     for words, physics in (([], "mjx"), (["--drone.physics", "rigid_body"], "rigid_body")):
         _, config = parse_train(words)
-        assert config.drone.physics == workload(config, scene)["physics"] == physics
+        assert config.drone.physics == describe_workload(config, scene)["physics"] == physics

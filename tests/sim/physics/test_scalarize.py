@@ -13,9 +13,9 @@ import pytest
 
 from edqn_jax.config import Config
 from edqn_jax.sim.physics.airframe import load_airframe
-from edqn_jax.sim.physics.drone import hover
-from edqn_jax.sim.physics.flight import fly, physics_step
-from edqn_jax.sim.physics.scalarize import number_by_number
+from edqn_jax.sim.physics.drone import hover_state
+from edqn_jax.sim.physics.flight import fly_decision, physics_step
+from edqn_jax.sim.physics.scalarize import scalarize
 
 
 @jax.custom_vjp
@@ -81,7 +81,7 @@ def test_the_results_are_those_of_the_function(function: Callable) -> None:
         a, b = (jnp.asarray(rng.normal(size=(*batch, 3)), jnp.float32) for _ in range(2))
         mapped = jax.vmap if batch else lambda same: same
         expected = jax.jit(mapped(function))(a, b)
-        got = jax.jit(mapped(number_by_number(function)))(a, b)
+        got = jax.jit(mapped(scalarize(function)))(a, b)
         assert jax.tree.structure(got) == jax.tree.structure(expected)
         for one, other in zip(jax.tree.leaves(got), jax.tree.leaves(expected), strict=True):
             assert (one.shape, one.dtype) == (other.shape, other.dtype)
@@ -92,7 +92,7 @@ def test_nothing_is_multiplied_with_zeros_and_ones() -> None:
     def rotated(a, b):
         return (jnp.eye(3) @ jnp.stack([a, b, a]) @ jnp.diag(jnp.array([1.0, 0.0, 1.0])))[0] + 0.0 * b
 
-    jaxpr = jax.make_jaxpr(number_by_number(rotated))(jnp.ones(3), jnp.ones(3))
+    jaxpr = jax.make_jaxpr(scalarize(rotated))(jnp.ones(3), jnp.ones(3))
     names = {equation.primitive.name for equation in jaxpr.eqns}
     assert not names & {"dot_general", "mul", "add", "gather", "transpose"}
 
@@ -116,11 +116,11 @@ def test_nothing_is_multiplied_with_zeros_and_ones() -> None:
 )
 def test_what_cannot_be_evaluated_so_is_refused(function: Callable, message: str) -> None:
     with pytest.raises(NotImplementedError, match=message):
-        jax.jit(number_by_number(function))(jnp.ones(3))
+        jax.jit(scalarize(function))(jnp.ones(3))
 
 
 def test_a_number_times_a_constant_zero_is_zero_whatever_it_is() -> None:
-    zeroed = jax.jit(number_by_number(lambda a: a @ jnp.asarray(TABLE)))(jnp.array([1.0, np.nan, np.inf]))
+    zeroed = jax.jit(scalarize(lambda a: a @ jnp.asarray(TABLE)))(jnp.array([1.0, np.nan, np.inf]))
     np.testing.assert_array_equal(zeroed[0], 1.0)
     assert not np.isfinite(zeroed[1:]).any()
 
@@ -128,7 +128,7 @@ def test_a_number_times_a_constant_zero_is_zero_whatever_it_is() -> None:
 def test_no_nan_and_no_infinity_passes_a_physics_step_unseen() -> None:
     config = Config().drone
     airframe = load_airframe(config)
-    state = hover(jnp.zeros(3), jnp.float32(0.3))
+    state = hover_state(jnp.zeros(3), jnp.float32(0.3))
     leaves, tree = jax.tree.flatten(dataclasses.replace(state, yaw_setpoint=jnp.float32(0)))
     step = jax.jit(lambda state, thrust: physics_step(config, airframe, state, thrust))
 
@@ -147,8 +147,8 @@ def test_no_nan_and_no_infinity_passes_a_physics_step_unseen() -> None:
 
 def test_a_physics_step_computes_nothing_twice() -> None:
     config = Config().drone
-    drones = jax.vmap(hover)(jnp.zeros((8, 3)), jnp.zeros(8))
-    flown = jax.vmap(lambda drone: fly(config, load_airframe(config), drone, jnp.ones(3), jnp.float32(0)))
+    drones = jax.vmap(hover_state)(jnp.zeros((8, 3)), jnp.zeros(8))
+    flown = jax.vmap(lambda drone: fly_decision(config, load_airframe(config), drone, jnp.ones(3), jnp.float32(0)))
     cost: Any = jax.jit(flown).lower(drones).compile().cost_analysis()
     # XLA counts one of the steps: 1,500 operations a drone. Were accelerations fused into what reads them, 5,200.
     assert 500 < cost["flops"] / 8 < 3000

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from edqn_jax.sim.scene import mjcf_files
-from edqn_jax.sim.scene.mjcf import MOST_SHAPES, SceneError, load_world
+from edqn_jax.sim.scene.mjcf import MAX_SHAPES, SceneError, load_world
 
 SITES = '<site name="start" pos="1 1 2"/><site name="goal" pos="9 1 2"/>'
 
@@ -76,9 +76,9 @@ def test_copies_and_sizes_have_limits(tmp_path: Path, monkeypatch: pytest.Monkey
     copies = '<replicate count="2000" offset="1 0 0">' * 2 + '<geom size="1"/>' + "</replicate>" * 2
     with pytest.raises(SceneError, match=r"asks for 4,00\d,000 copies by replicate; a world may have 10,000"):
         load_world(world(tmp_path, f"<worldbody>{copies}</worldbody>"))
-    many = "".join(f'<geom size="0.1" pos="{x} 0 0"/>' for x in range(MOST_SHAPES + 1))
-    with pytest.raises(SceneError, match=f"has {MOST_SHAPES + 1} geoms; a world may have {MOST_SHAPES}"):
+    many = "".join(f'<geom size="0.1" pos="{x} 0 0"/>' for x in range(MAX_SHAPES + 1))
+    with pytest.raises(SceneError, match=f"has {MAX_SHAPES + 1} geoms; a world may have {MAX_SHAPES}"):
         load_world(world(tmp_path, f"<worldbody>{many}</worldbody>"))
-    monkeypatch.setattr(mjcf_files, "MOST_BYTES", 100)
+    monkeypatch.setattr(mjcf_files, "MAX_BYTES", 100)
     with pytest.raises(SceneError, match=r"has 1\d\d bytes; a world may have 100"):
         load_world(world(tmp_path, ""))

@@ -200,7 +200,7 @@ def test_of_files_with_pieces_put_in_mujoco_and_we_read_the_same_ones_alike(tmp_
         except ValueError:
             wanted = None
         try:
-            model = mujoco.MjModel.from_xml_string(mjcf_xml.parse(text)[1])
+            model = mujoco.MjModel.from_xml_string(mjcf_xml.parse_xml(text)[1])
             found = [model.geom(i).name for i in range(model.ngeom)]
         except mjcf_xml.SubsetError:
             continue

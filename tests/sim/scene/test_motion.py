@@ -24,10 +24,10 @@ from edqn_jax.sim.scene.scene import (
     UprightBoxes,
     UprightCylinders,
     build_scene,
-    moves,
+    has_motion,
     scene_at,
     scene_shapes,
-    speeds,
+    speed_bounds,
     stack_scenes,
     take_scene,
     with_equal_capacities,
@@ -95,7 +95,7 @@ def places(scene: Scene, times):
 
 def test_a_still_world_is_the_same_object_at_every_time():
     still = scene_of(ball([5, 5, 5]))
-    assert not moves(still)
+    assert not has_motion(still)
     at = scene_at(still, jnp.float32(3.0))
     assert all(a is b for a, b in zip(jax.tree.leaves(at), jax.tree.leaves(still), strict=True))
     traced = jax.make_jaxpr(lambda p, t: path_contact(still, p, RADIUS, t))(jnp.zeros((4, 3)), jnp.zeros(4))
@@ -105,9 +105,9 @@ def test_a_still_world_is_the_same_object_at_every_time():
 
 def test_shapes_stand_at_their_positions_at_time_zero_and_nothing_moves_in_the_world_at_a_time():
     scene = moving_world()
-    assert moves(scene)
+    assert has_motion(scene)
     at = jax.jit(scene_at)(scene, jnp.float32(0.0))
-    assert not moves(at)
+    assert not has_motion(at)
     for kind in ("boxes", "cylinders", "spheres"):
         np.testing.assert_array_equal(getattr(at, kind).position, getattr(scene, kind).position, err_msg=kind)
     later = scene_at(scene, jnp.float32(1.0))
@@ -220,14 +220,14 @@ def _positions(scene, times):
 
 @jax.jit
 def _fastest(scene, times):
-    return jax.vmap(lambda t: jnp.max(speeds(scene, t)["spheres"]))(times)
+    return jax.vmap(lambda t: jnp.max(speed_bounds(scene, t)["spheres"]))(times)
 
 
 def test_the_bound_of_an_ellipse_is_its_top_speed():
     scene = scene_of(UprightCylinders(position=[1, 1, 1], radius=1, half_height=1, albedo=GREY, motion=CIRCLING))
-    np.testing.assert_allclose(speeds(scene, jnp.float32(0))["cylinders"], [3.0], rtol=1e-6)
+    np.testing.assert_allclose(speed_bounds(scene, jnp.float32(0))["cylinders"], [3.0], rtol=1e-6)
     swaying = scene_of(ball([5, 5, 5], motion=SWAYING))
-    np.testing.assert_allclose(speeds(swaying, jnp.float32(0))["spheres"], [1.9 * np.hypot(1.5, 0.5)], rtol=1e-6)
+    np.testing.assert_allclose(speed_bounds(swaying, jnp.float32(0))["spheres"], [1.9 * np.hypot(1.5, 0.5)], rtol=1e-6)
 
 
 # ---------------------------------------------------------------------------------------- pools

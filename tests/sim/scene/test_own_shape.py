@@ -19,7 +19,7 @@ from edqn_jax.config import SHAPES, CameraConfig
 from edqn_jax.errors import ConfigError
 from edqn_jax.evaluation.judge import load_judge, replay_contact
 from edqn_jax.report.page.worlds import world_data
-from edqn_jax.report.solids import MAP, cut_open, draw_solids, solids_of
+from edqn_jax.report.solids import MAP, make_cutaway, plot_solids, solids_of
 from edqn_jax.sim.camera import camera, native
 from edqn_jax.sim.scene import mjcf
 from edqn_jax.sim.scene.distance import path_contact, shape_distances
@@ -84,9 +84,9 @@ def test_a_drone_that_flies_into_it_collides_where_the_judge_says(world: Path) -
 @pytest.mark.parametrize("mount", ["level", "body"])
 def test_the_camera_sees_it_as_mujoco_does(world: Path, mount: Any) -> None:
     scene, config = mjcf.load_scene(world), dataclasses.replace(CONFIG, mount=mount)
-    assert not native.can_draw(config, scene, "cpu")  # C knows built-in kinds alone
+    assert not native.can_render(config, scene, "cpu")  # C knows built-in kinds alone
     position, ahead = jnp.array([7.0, 10.0, 5.0]), jnp.eye(3)
-    depth = np.asarray(jax.jit(partial(camera.depth, config, scene))(position, ahead))
+    depth = np.asarray(jax.jit(partial(camera.render_depth, config, scene))(position, ahead))
     model = mujoco.MjModel.from_xml_path(str(world))
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
@@ -99,11 +99,11 @@ def test_the_camera_sees_it_as_mujoco_does(world: Path, mount: Any) -> None:
                 np.testing.assert_allclose(depth[row, column], theirs, rtol=1e-4)
                 is_egg[row, column] = True
     assert is_egg.sum() > 20
-    luma = np.asarray(jax.jit(partial(camera.luma, config, scene))(position, ahead))
+    luma = np.asarray(jax.jit(partial(camera.render_luma, config, scene))(position, ahead))
     without = mjcf.load_scene(world).with_shapes(
         {"ellipsoids": jax.tree.map(lambda x: x[:0], scene.others["ellipsoids"])}
     )
-    changed = np.abs(luma - np.asarray(jax.jit(partial(camera.luma, config, without))(position, ahead))) > 1e-3
+    changed = np.abs(luma - np.asarray(jax.jit(partial(camera.render_luma, config, without))(position, ahead))) > 1e-3
     assert changed[is_egg].mean() > 0.9 and (changed & ~is_egg).sum() < 40  # those of its edge
 
 
@@ -135,7 +135,7 @@ def test_it_is_drawn_in_figures_and_on_the_page(world: Path) -> None:
     (solid,) = solids_of(scene)
     radii = np.linalg.norm(solid.corners - np.array([15, 10, 4]), axis=1)
     assert 1.9 < radii.min() < 2.1 and 3.8 < radii.max() < 4.01
-    draw_solids(Figure().add_subplot(), MAP, cut_open(scene, MAP).shown)
+    plot_solids(Figure().add_subplot(), MAP, make_cutaway(scene, MAP).shown)
     (shape,) = world_data(scene)["shapes"]
     assert shape["kind"] == "faces" and shape["at"] == [15, 10, 4] and len(shape["faces"]) == len(solid.faces)
 

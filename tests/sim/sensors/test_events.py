@@ -57,7 +57,7 @@ def far_from_a_step(distance: np.ndarray, slack: float = 1e-4) -> bool:
 
 def test_luma_is_the_weighted_sum_of_equation_1():
     rgb = jnp.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 1.0, 1.0]])
-    np.testing.assert_allclose(ev.luma(rgb), [0.299, 0.587, 0.114, 1.0], rtol=1e-6)
+    np.testing.assert_allclose(ev.rgb_to_luma(rgb), [0.299, 0.587, 0.114, 1.0], rtol=1e-6)
 
 
 def test_log_brightness_of_black_is_finite_and_of_white_is_near_zero():
@@ -83,7 +83,7 @@ def test_paper_law_equals_the_plain_loop(seed):
     assume(far_from_a_step(change[change > 0] / PAPER.tolerance))
     field, _ = run(PAPER, memory_of(PAPER, 0), jnp.asarray(frames))
     plain = events_plain.paper(level, np.array(TIMES), PAPER.threshold, PAPER.tolerance, PAPER.refractory_ns)
-    assert_same_events(ev.expand(host(field)), plain)
+    assert_same_events(ev.to_stream(host(field)), plain)
     assert plain
 
 
@@ -102,7 +102,7 @@ def test_esim_law_equals_the_plain_loop(seed, law):
         config.contrast_off,
         config.refractory_ns,
     )
-    assert_same_events(ev.expand(host(field)), plain)
+    assert_same_events(ev.to_stream(host(field)), plain)
     assert plain
 
 
@@ -154,7 +154,7 @@ def test_a_binding_refractory_period_keeps_a_pixels_events_apart(law):
     field = host(run(config, memory, frames)[0])
     free = host(run(unbound, memory, frames)[0])
     assert field.count.sum() < free.count.sum()
-    stream = ev.expand(field)
+    stream = ev.to_stream(field)
     for y in range(HEIGHT):
         for x in range(WIDTH):
             t = stream["t"][(stream["x"] == x) & (stream["y"] == y)]
@@ -188,11 +188,11 @@ def test_streaming_frame_by_frame_equals_one_long_window(law):
     config, frames = LAWS[law], long_flight(2, 41)
     times = tuple(0.02 * k for k in range(41))
     memory = memory_of(config, 4)
-    whole = ev.expand(host(run(config, memory, jnp.asarray(frames), times, True)[0]))
+    whole = ev.to_stream(host(run(config, memory, jnp.asarray(frames), times, True)[0]))
     parts = []
     for k in range(40):
         field, memory = run(config, memory, jnp.asarray(frames[k : k + 2]), (0.0, 0.02), True)
-        parts.append(ev.expand(host(field), window_start_us=20_000 * k))
+        parts.append(ev.to_stream(host(field), window_start_us=20_000 * k))
     streamed = np.concatenate(parts)
     order = ("t", "x", "y")
     whole, streamed = (s[np.lexsort([s[n] for n in order])] for s in (whole, streamed))
@@ -217,7 +217,7 @@ def test_esim_windows_are_half_open():
     frames = jnp.full((3, HEIGHT, WIDTH), 0.2).at[1:].set((0.2 + ESIM.log_epsilon) * rise - ESIM.log_epsilon)
     memory = memory_of(ESIM, 0).replace(residual=jnp.zeros((HEIGHT, WIDTH)))
     field = host(run(ESIM, memory, frames)[0])
-    stream = ev.expand(field)
+    stream = ev.to_stream(field)
     assert np.all(field.count == [[[3]], [[0]]])
     assert stream["t"].max() == 19_999
     np.testing.assert_array_equal(event_fields.collect(stream, TIMES, HEIGHT, WIDTH).count, field.count)
@@ -229,7 +229,7 @@ def test_expansion_is_sorted_inside_the_window_and_lossless_both_ways(seed, law)
     config = LAWS[law]
     field = host(run(config, memory_of(config, seed), jnp.asarray(random_frames(seed)))[0])
     start_us = seed * 1000
-    stream = ev.expand(field, start_us)
+    stream = ev.to_stream(field, start_us)
     assert np.all(np.diff(stream["t"]) >= 0)
     if len(stream):
         assert start_us <= stream["t"][0] and stream["t"][-1] < start_us + 40_000
@@ -240,7 +240,7 @@ def test_expansion_is_sorted_inside_the_window_and_lossless_both_ways(seed, law)
         true, found = (f.t_first + k * f.t_step.astype(np.float64) for f in (field, back))
         # Each stamp is the microsecond nearest to the truth, and the line is within half of one of the stamp.
         assert np.all(np.abs(true - found)[field.count > k] <= 1.0e-6 + 1e-9)
-    again = ev.expand(back, start_us)
+    again = ev.to_stream(back, start_us)
     np.testing.assert_array_equal(np.sort(stream), np.sort(again))
 
 
@@ -255,7 +255,7 @@ def test_a_stream_of_evenly_spaced_events_survives_collection(data):
     stream["x"], stream["y"], stream["p"] = 2, 1, -1
     field = event_fields.collect(stream, (0.0, 0.02), HEIGHT, WIDTH)
     assert field.count.sum() == field.count[0, 1, 2] == count
-    np.testing.assert_array_equal(ev.expand(field), stream)
+    np.testing.assert_array_equal(ev.to_stream(field), stream)
 
 
 def test_collect_refuses_a_stream_that_no_field_can_hold():
@@ -270,7 +270,7 @@ def test_collect_refuses_a_stream_that_no_field_can_hold():
 
 def test_an_empty_window_has_an_empty_stream():
     still = jnp.full((3, HEIGHT, WIDTH), 0.5)
-    stream = ev.expand(host(run(PAPER, memory_of(PAPER, 0), still)[0]))
+    stream = ev.to_stream(host(run(PAPER, memory_of(PAPER, 0), still)[0]))
     assert len(stream) == 0
     assert not np.any(event_fields.collect(stream, TIMES, HEIGHT, WIDTH).count)
 
@@ -316,9 +316,9 @@ def test_the_event_picture_paints_on_red_and_off_blue():
 
 def test_frames_and_times_must_match():
     with pytest.raises(ValueError, match="two frames"):
-        ev.events(PAPER, memory_of(PAPER, 0), jnp.ones((1, 2, 2)), (0.0,), jax.random.key(0))
+        ev.generate_events(PAPER, memory_of(PAPER, 0), jnp.ones((1, 2, 2)), (0.0,), jax.random.key(0))
     with pytest.raises(ValueError, match="rising"):
-        ev.events(PAPER, memory_of(PAPER, 0), jnp.ones((2, 2, 2)), (0.0, 0.0), jax.random.key(0))
+        ev.generate_events(PAPER, memory_of(PAPER, 0), jnp.ones((2, 2, 2)), (0.0, 0.0), jax.random.key(0))
 
 
 NOISY = EventsConfig(leak_rate_hz=20.0, shot_rate_hz=40.0, hot_pixel_fraction=0.1, hot_pixel_rate_hz=400.0)
@@ -340,7 +340,7 @@ def test_noise_rates_are_the_configured_ones():
     assert abs(count[hot].mean() / (460.0 * 0.04) - 1.0) < 0.02
     off = (field.count * (field.polarity < 0)).sum(0)[~hot].mean() / (20.0 * 0.04)
     assert abs(off - 1.0) < 0.03
-    t = ev.expand(field)["t"]
+    t = ev.to_stream(field)["t"]
     assert t[0] >= 0 and t[-1] < 40_000
     # Uniform in time: the mean of n uniform stamps has standard error 0.04 / sqrt(12 n) = 3e-5 s.
     assert abs(t.mean() * 1e-6 - 0.02) < 2e-4
@@ -357,9 +357,9 @@ def parts(config, memory, frames):
     """Signal and noise apart, and what the camera shows; one key."""
     quiet = dataclasses.replace(config, **dict.fromkeys(BUSY, 0.0))
     key, times = jax.random.key(KEY), np.array(TIMES)
-    signal, _ = ev.events(quiet, memory, frames, TIMES, key)
+    signal, _ = ev.generate_events(quiet, memory, frames, TIMES, key)
     noise = ev.noise_events(config, memory.hot, signal.count, times - times[0], key)
-    shown, _ = ev.events(config, memory, frames, TIMES, key)
+    shown, _ = ev.generate_events(config, memory, frames, TIMES, key)
     return signal, noise, shown
 
 
@@ -367,7 +367,7 @@ def parts(config, memory, frames):
 @pytest.mark.parametrize("mean", [0.0, 0.05, 0.4, 3.0, 120.0])
 def test_counts_of_noise_are_poisson_cut_off_at_the_most(mean, most):
     many = 200_000
-    counts = np.asarray(jax.jit(ev.poisson, static_argnums=2)(jax.random.key(KEY), jnp.full(many, mean), most))
+    counts = np.asarray(jax.jit(ev.sample_poisson, static_argnums=2)(jax.random.key(KEY), jnp.full(many, mean), most))
     terms = [math.exp(k * math.log(mean) - mean - math.lgamma(k + 1)) if mean else float(k == 0) for k in range(most)]
     expected = np.array([*terms, max(1 - sum(terms), 0.0)])
     found = np.bincount(np.minimum(counts, most), minlength=most + 1) / many
@@ -378,7 +378,7 @@ def test_counts_of_noise_are_poisson_cut_off_at_the_most(mean, most):
 def test_no_mean_makes_bursts_of_noise(monkeypatch):
     monkeypatch.setattr(jax.random, "uniform", lambda key, shape: jnp.full(shape, 1 - 2.0**-23))
     means = jnp.asarray(np.geomspace(1e-6, 4, 5000), jnp.float32)
-    counts = np.asarray(ev.poisson(jax.random.key(0), means, 16))
+    counts = np.asarray(ev.sample_poisson(jax.random.key(0), means, 16))
     # Less than one window in 2^27 has more events than these.
     mean = np.asarray(means, float)
     assert np.all(counts <= 4 + 2 * mean + 6 * np.sqrt(mean))
@@ -399,10 +399,10 @@ def test_each_frame_pair_has_the_noise_of_its_own_length():
 def test_signal_and_noise_are_merged_as_by_the_plain_loop(seed, law):
     config = dataclasses.replace(FIRING[law], **BUSY)
     signal, noise, shown = map(host, parts(config, memory_of(config, seed), jnp.asarray(random_frames(seed))))
-    one, other = ([(t * 1e-6, x, y, p) for t, x, y, p in ev.expand(each).tolist()] for each in (signal, noise))
+    one, other = ([(t * 1e-6, x, y, p) for t, x, y, p in ev.to_stream(each).tolist()] for each in (signal, noise))
     plain = events_plain.merged(one, other, np.array(TIMES), config.refractory_ns)
     assert min(len(one), len(other)) > 5
-    stream = ev.expand(shown)
+    stream = ev.to_stream(shown)
     for name, field in (("count", shown.count), ("stream", stream)):
         assert (field.sum() if name == "count" else len(field)) == len(plain)
     ours = np.sort(stream, order=["y", "x", "p", "t"])
@@ -419,11 +419,11 @@ def test_no_row_tells_noise_from_signal(law):
     config = dataclasses.replace(FIRING[law], **BUSY)
     signal, noise, shown = parts(config, memory_of(config, 3), jnp.asarray(random_frames(3)))
     times = np.array(TIMES) - TIMES[0]
-    split = ev.by_polarity(signal)
+    split = ev.split_polarity(signal)
     assert np.all(np.asarray(shown.polarity[:2]) >= 0) and np.all(np.asarray(shown.polarity[2:]) <= 0)
     for half in (slice(0, 2), slice(2, 4)):
         assert np.any(split.count[half]) and np.any(noise.count[half])
-    exchanged = ev.merged(config, noise, split, times)
+    exchanged = ev.merge_fields(config, noise, split, times)
     has = np.asarray(shown.count) > 0
     for name in ("count", "polarity", "t_first", "t_step"):
         one, other = (np.asarray(getattr(field, name)) for field in (shown, exchanged))
@@ -457,5 +457,5 @@ def test_threshold_mismatch_spreads_where_pixels_begin_to_fire():
 
 
 def test_a_perfect_sensor_draws_no_random_numbers():
-    trace = jax.make_jaxpr(lambda k, f: ev.events(PAPER, ev.EventMemory(None, None, None, None), f, TIMES, k))
+    trace = jax.make_jaxpr(lambda k, f: ev.generate_events(PAPER, ev.EventMemory(None, None, None, None), f, TIMES, k))
     assert "random" not in str(trace(jax.random.key(0), jnp.ones((3, 2, 2))))

@@ -42,7 +42,7 @@ def config_of(name: str, exposed: ExposureConfig = REAL, **groups) -> Config:
 @few
 @given(lux=st.floats(0.1, 10_000.0), mean=st.floats(0.01, 1.0))
 def test_time_and_gain_are_the_least_that_reach_the_target(lux, mean):
-    time, gain = exposure.settings(REAL, jnp.float32(lux), jnp.float32(mean))
+    time, gain = exposure.exposure_settings(REAL, jnp.float32(lux), jnp.float32(mean))
     plain = exposure_plain.settings(lux, mean, 0.4, 1e-4, 0.02, 4.0, 6000.0, 10_000.0)
     # A step of the search is 5e-5 of the time.
     np.testing.assert_allclose([time, gain], plain, rtol=2e-4)
@@ -71,7 +71,9 @@ def test_sub_frames_are_taken_where_the_drone_was(seed, steps, share):
 def test_levels_are_those_of_the_plain_camera(seed, lux, gain):
     luma = np.random.default_rng(seed).random((4, 5)).astype(np.float32)
     key, time = jax.random.key(seed), 0.4 * 10_000 / (6000 * lux)
-    shown = exposure.develop(REAL, jnp.asarray(luma), jnp.float32(lux), jnp.float32(time), jnp.float32(gain), key)
+    shown = exposure.develop_picture(
+        REAL, jnp.asarray(luma), jnp.float32(lux), jnp.float32(time), jnp.float32(gain), key
+    )
     random = np.asarray(jax.random.normal(key, (4, 5)))
     plain = [
         exposure_plain.level(6000 * lux * time * e, z, gain, 18.0, 10_000.0)
@@ -88,7 +90,7 @@ QUIET = dataclasses.replace(REAL, read_noise_e=0.0, full_well_e=1e12, sensitivit
 
 def taken(options: ExposureConfig, luma, lux: float, time: float, gain: float = 1.0, seed: int = 0) -> np.ndarray:
     args = (jnp.float32(lux), jnp.float32(time), jnp.float32(gain), jax.random.key(seed))
-    return np.asarray(exposure.develop(options, jnp.asarray(luma), *args))
+    return np.asarray(exposure.develop_picture(options, jnp.asarray(luma), *args))
 
 
 def test_quantisation_errs_by_at_most_half_a_level():
@@ -120,7 +122,7 @@ def test_noise_is_that_of_photons_and_of_reading(electrons):
 def test_less_light_is_noisier_and_too_much_clips():
     luma, noise, means = np.full(20_000, 0.5, np.float32), [], []
     for lux in (0.1, 1.0, 10.0, 100.0, 1000.0, 10_000.0):
-        time, gain = exposure.settings(REAL, jnp.float32(lux), jnp.float32(0.5))
+        time, gain = exposure.exposure_settings(REAL, jnp.float32(lux), jnp.float32(0.5))
         picture = taken(REAL, luma, lux, float(time), float(gain))
         noise.append(picture.std() / picture.mean())
         means.append(picture.mean())
@@ -148,7 +150,7 @@ def poses_of(config: Config, position, quaternion) -> Flight:
 
 def perfect(config: Config, scene, position, yaw: float) -> np.ndarray:
     attitude = jnp.array([np.cos(yaw / 2), 0.0, 0.0, np.sin(yaw / 2)])
-    return np.asarray(jax.jit(lambda p: sensor.view(config, scene, p, attitude))(jnp.asarray(position)))
+    return np.asarray(jax.jit(lambda p: sensor.render_view(config, scene, p, attitude))(jnp.asarray(position)))
 
 
 HERE = np.array([5.0, 5.0, 3.0])
@@ -198,7 +200,7 @@ def test_what_moves_is_smeared_where_the_drone_stands_still():
     slow = dataclasses.replace(REAL, shortest_s=0.02, read_noise_e=0.0)
     config = dataclasses.replace(config_of("frames", slow), world=WorldConfig(name="moving", moving_speed_m_s=5.0))
     scene, rng = edqn_jax.make("moving", config, seed=1).scene(0), np.random.default_rng(0)
-    at = jax.jit(lambda t, p: sensor.view(config, scene_at(scene, t), p, jnp.asarray(UPRIGHT)))
+    at = jax.jit(lambda t, p: sensor.render_view(config, scene_at(scene, t), p, jnp.asarray(UPRIGHT)))
     # Somewhere where something moves in the picture.
     places = [np.array([x, y, 3.0], np.float32) for x, y in rng.uniform(10.0, 90.0, (60, 2))]
     place = max(places, key=lambda p: np.abs(at(4.0, p) - at(4.02, p)).max())
@@ -231,7 +233,7 @@ def test_a_pair_of_real_frames_has_one_exposure_and_its_change(scene):
 def test_the_camera_adapts_to_the_light_within_two_decisions():
     pool = stack_scenes([mjcf.load_scene(WORLD)])
     config = dataclasses.replace(config_of("frames"), light=LightConfig(300.0, 300.0))
-    world = env.World(load_airframe(config.drone), pool, own_missions(pool))
+    world = env.EnvParams(load_airframe(config.drone), pool, own_missions(pool))
     state, _ = jax.jit(lambda key: env.reset(config, world, key))(jax.random.key(0))
     step = jax.jit(lambda s: env.step(config, world, s, 13))
     for _ in range(2):

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from edqn_jax.config import CameraConfig, Config, DroneConfig, EventsConfig, LightConfig
-from edqn_jax.config.loading import flown_under
+from edqn_jax.config.loading import with_conditions
 from edqn_jax.errors import ConfigError
 from edqn_jax.learn import policy
 from edqn_jax.sim.physics.airframe import load_airframe
@@ -38,16 +38,18 @@ DARK = dataclasses.replace(LIT, light=LightConfig())
 @pytest.fixture(scope="module")
 def world():
     pool = stack_scenes([load_scene(WORLD)])
-    return env.World(load_airframe(Config().drone), pool, own_missions(pool))
+    return env.EnvParams(load_airframe(Config().drone), pool, own_missions(pool))
 
 
 def test_an_illuminance_is_log_uniform():
-    lux = np.asarray(jax.vmap(lambda key: light.draw(LIT.light, key))(jax.random.split(jax.random.key(0), 4000)))
+    lux = np.asarray(
+        jax.vmap(lambda key: light.sample_illuminance(LIT.light, key))(jax.random.split(jax.random.key(0), 4000))
+    )
     assert lux.min() >= 0.1 and lux.max() <= 10_000
     # 4000 draws: a share has a standard error of 0.8 %, and each decade has a fifth.
     shares = np.histogram(np.log10(lux), bins=[-1, 0, 1, 2, 3, 4])[0] / 4000
     np.testing.assert_allclose(shares, 0.2, atol=0.03)
-    assert float(light.draw(LightConfig(7.0, 7.0), jax.random.key(1))) == pytest.approx(7.0, rel=1e-6)
+    assert float(light.sample_illuminance(LightConfig(7.0, 7.0), jax.random.key(1))) == pytest.approx(7.0, rel=1e-6)
 
 
 def test_an_episode_keeps_its_light_and_the_next_one_has_another(world):
@@ -62,9 +64,9 @@ def test_an_episode_keeps_its_light_and_the_next_one_has_another(world):
 
 
 def test_without_light_no_sensor_knows_of_it(world):
-    state = jax.eval_shape(lambda key: env.ended(DARK, world, key), jax.random.key(0))
+    state = jax.eval_shape(lambda key: env.before_reset(DARK, world, key), jax.random.key(0))
     assert state.memory.lux is None
-    state = jax.eval_shape(lambda key: env.ended(Config(), world, key), jax.random.key(0))
+    state = jax.eval_shape(lambda key: env.before_reset(Config(), world, key), jax.random.key(0))
     assert len(jax.tree.leaves(state.memory)) == 0
 
 
@@ -122,17 +124,17 @@ def test_shot_noise_follows_brightness_where_a_pixel_has_a_bandwidth():
 
 
 def test_a_policy_is_flown_in_other_light_than_it_was_trained_in():
-    darker = flown_under(Config(), {"light": {"least_lux": 0.5, "most_lux": 0.5}}, "conditions")
+    darker = with_conditions(Config(), {"light": {"least_lux": 0.5, "most_lux": 0.5}}, "conditions")
     assert darker.light == LightConfig(0.5, 0.5)
     with pytest.raises(ConfigError, match=r"light.least_lux must be at most light.most_lux \(0.5\)"):
-        flown_under(darker, {"light": {"least_lux": 2.0}}, "conditions")
+        with_conditions(darker, {"light": {"least_lux": 2.0}}, "conditions")
 
 
 def test_a_policy_is_flown_with_another_sensor_than_it_was_trained_with():
-    noisy = flown_under(Config(), {"events": {"profile": "dvs", "shot_rate_hz": 1.0}}, "conditions")
+    noisy = with_conditions(Config(), {"events": {"profile": "dvs", "shot_rate_hz": 1.0}}, "conditions")
     assert (noisy.events.bandwidth_hz, noisy.events.threshold, noisy.events.shot_rate_hz) == (30.0, 0.2, 1.0)
     with pytest.raises(ConfigError, match="'events.law' is a policy's own; .* of events the pixels' thresholds"):
-        flown_under(Config(), {"events": {"law": "esim"}}, "conditions")
+        with_conditions(Config(), {"events": {"law": "esim"}}, "conditions")
 
 
 def test_a_policy_acts_on_events_with_and_without_noise():
@@ -144,7 +146,7 @@ def test_a_policy_acts_on_events_with_and_without_noise():
     seen = []
     for config in (quiet, noisy):
         memory = ev.reset_memory(config.events, 12, 16, jax.random.key(0))
-        field, _ = ev.events(config.events, memory, frames, config.events.frame_times_s, jax.random.key(1))
+        field, _ = ev.generate_events(config.events, memory, frames, config.events.frame_times_s, jax.random.key(1))
         seen.append(Observation(field, jnp.ones(OWN_SIZE), jnp.ones(MOTION_SIZE)))
     assert seen[0].sensed.count.shape[0] * 2 == seen[1].sensed.count.shape[0] == 2
     codes = [flies.code(each) for each in seen]

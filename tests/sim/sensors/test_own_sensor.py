@@ -16,7 +16,7 @@ from edqn_jax.config.rules import validate
 from edqn_jax.errors import ConfigError
 from edqn_jax.interop import functional
 from edqn_jax.learn.perception import embedding, vae
-from edqn_jax.learn.samples import Samples, mirrored
+from edqn_jax.learn.samples import Samples, mirror_samples
 from edqn_jax.sim.sensors import sensor
 from edqn_jax.sim.sensors.events import EventField, event_image, random_field
 from edqn_jax.sim.sensors.sensor import EVENT_FIELD, Image, Sensor
@@ -45,7 +45,7 @@ def config(monkeypatch: pytest.MonkeyPatch) -> Config:
 
 
 def test_a_registered_sensor_is_a_choice_and_another_is_answered_with_the_nearest(config: Config) -> None:
-    assert sensor.sensor_of(config).count_values(config) == 3 and embedding.size(config) == 3
+    assert sensor.sensor_of(config).count_values(config) == 3 and embedding.embedding_size(config) == 3
     assert "`mine`: three numbers" in SENSORS.describe() and SENSORS.own == ("mine",)
     wrong = with_sensor(config, "mien")
     with pytest.raises(ConfigError, match="^env.sensor: there is no sensor 'mien'; did you mean 'mine'[?]$"):
@@ -89,11 +89,11 @@ def test_samples_are_mirrored_as_the_sensor_says() -> None:
     wanted = vae.Target(jnp.ones((4, 1, 3, 4)), jnp.zeros(4))
     samples = Samples(pictures, jnp.ones((4, 7)), wanted)
     signs = jnp.array([1.0, -1.0])[:, None, None]
-    found = mirrored(samples, MIRRORED_MOTION, lambda image: signs * jnp.flip(image, axis=-1)).sensed
+    found = mirror_samples(samples, MIRRORED_MOTION, lambda image: signs * jnp.flip(image, axis=-1)).sensed
     assert isinstance(found, jax.Array)
     np.testing.assert_array_equal(found[:, 0], pictures[:, 0, :, ::-1])
     np.testing.assert_array_equal(found[:, 1], -pictures[:, 1, :, ::-1])
-    np.testing.assert_array_equal(mirrored(samples, MIRRORED_MOTION).sensed, pictures[..., ::-1])
+    np.testing.assert_array_equal(mirror_samples(samples, MIRRORED_MOTION).sensed, pictures[..., ::-1])
 
 
 @pytest.mark.parametrize(

@@ -47,7 +47,7 @@ def test_a_photoreceptor_follows_its_differential_equation(seed, cutoff):
     luma, lag = random_frames(seed), np.random.default_rng(seed).normal(0, 0.3, (4, 5)).astype(np.float32)
     level, times = levels(PAPER, luma), np.array([0.0, 0.01, 0.05])
     current = photoreceptor.between_frames(photoreceptor.photocurrent(jnp.asarray(luma)))
-    shown, last = photoreceptor.follow(cutoff, jnp.asarray(level), times, current, jnp.asarray(lag))
+    shown, last = photoreceptor.filter_log_brightness(cutoff, jnp.asarray(level), times, current, jnp.asarray(lag))
     plain = photoreceptor_plain.follow(cutoff, level, times, luma, lag)
     # Heun's rule in steps of 1e-5 s is good to 1e-5; levels of up to 7 in float32.
     np.testing.assert_allclose(shown, plain, atol=3e-5)
@@ -57,8 +57,8 @@ def test_a_photoreceptor_follows_its_differential_equation(seed, cutoff):
 def test_a_frame_in_between_that_is_on_the_line_changes_nothing():
     level = jnp.stack([jnp.zeros((2, 2)), jnp.full((2, 2), 0.5), jnp.full((2, 2), 2.0)])
     current, lag = jnp.full((2, 2, 2), 0.4), jnp.full((2, 2), -0.1)
-    fine, _ = photoreceptor.follow(20.0, level, np.array([0.0, 0.01, 0.04]), current, lag)
-    coarse, _ = photoreceptor.follow(20.0, level[::2], np.array([0.0, 0.04]), current[:1], lag)
+    fine, _ = photoreceptor.filter_log_brightness(20.0, level, np.array([0.0, 0.01, 0.04]), current, lag)
+    coarse, _ = photoreceptor.filter_log_brightness(20.0, level[::2], np.array([0.0, 0.04]), current[:1], lag)
     np.testing.assert_allclose(fine[-1], coarse[-1], rtol=1e-6)
 
 
@@ -67,7 +67,7 @@ def test_a_step_of_a_white_pixel_is_followed_to_63_percent_in_the_time_constant(
     time_constant = 1 / (2 * np.pi * 30.0)
     level = jnp.array([0.0, 1.0, 1.0])[:, None, None]
     times = np.array([0.0, 1e-7, time_constant])
-    shown, _ = photoreceptor.follow(30.0, level, times, jnp.ones((2, 1, 1)), jnp.zeros((1, 1)))
+    shown, _ = photoreceptor.filter_log_brightness(30.0, level, times, jnp.ones((2, 1, 1)), jnp.zeros((1, 1)))
     assert abs(float(shown[-1, 0, 0]) - (1 - np.exp(-1))) < 1e-4
 
 
@@ -90,7 +90,7 @@ def test_the_same_contrast_makes_fewer_events_in_a_dark_pixel_than_in_a_bright_o
     memory = ev.reset_memory(config, 1, 3, jax.random.key(0))
     if memory.residual is not None:
         memory = dataclasses.replace(memory, residual=jnp.zeros((1, 3)))
-    field, _ = ev.events(config, memory, frames, (0.0, 0.04), jax.random.key(0))
+    field, _ = ev.generate_events(config, memory, frames, (0.0, 0.04), jax.random.key(0))
     dark, middle, bright = np.asarray(field.count[0, 0])
     assert 0 <= dark < middle < bright <= np.log(2) / 0.09
 
@@ -140,7 +140,7 @@ def test_what_esim_shows_is_the_photoreceptor_within_one_threshold():
 
 
 def test_infinite_bandwidth_traces_nothing():
-    trace = jax.make_jaxpr(lambda k, f: ev.events(PAPER, ev.EventMemory(None, None, None, None), f, TIMES, k))
+    trace = jax.make_jaxpr(lambda k, f: ev.generate_events(PAPER, ev.EventMemory(None, None, None, None), f, TIMES, k))
     plain = str(trace(jax.random.key(0), jnp.ones((3, 2, 2))))
     assert "exp" not in plain and EventsConfig().bandwidth_hz == 0
 
@@ -154,7 +154,7 @@ def test_decisions_of_a_stream_are_one_recording_of_the_flight():
     config = Config(camera=camera, drone=drone, events=options)
     validate(config)
     pool = stack_scenes([load_scene(WORLD)])
-    world = env.World(load_airframe(drone), pool, own_missions(pool))
+    world = env.EnvParams(load_airframe(drone), pool, own_missions(pool))
     begun, _ = jax.jit(lambda key: env.reset(config, world, key))(jax.random.key(0))
     step, state, steps = jax.jit(lambda s, move: env.step(config, world, s, move)), begun, []
     for move in (26, 22, 4):
@@ -166,7 +166,7 @@ def test_decisions_of_a_stream_are_one_recording_of_the_flight():
     body, scene = begun.drone, jax.tree.map(lambda x: x[0], pool)
     position = jnp.concatenate([body.position[None], *(each.flight.position for each in steps)])
     quaternion = jnp.concatenate([body.quaternion[None], *(each.flight.quaternion for each in steps)])
-    frames = jax.jit(jax.vmap(lambda p, q: sensor.view(config, scene, p, q)))(position, quaternion)
+    frames = jax.jit(jax.vmap(lambda p, q: sensor.render_view(config, scene, p, q)))(position, quaternion)
     whole, end = run(options, begun.memory, frames, tuple(0.02 * k for k in range(40)), True)
     streamed = np.concatenate([field.count * field.polarity for field in fields])
     recorded = np.asarray(whole.count * whole.polarity)

@@ -16,13 +16,13 @@ from edqn_jax.config import SENSORS, CameraConfig, Config, DroneConfig, EnvConfi
 from edqn_jax.evaluation.latency import decision_latency_ms
 from edqn_jax.learn import policy
 from edqn_jax.learn.perception import embedding
-from edqn_jax.learn.plan import Plan
-from edqn_jax.learn.state import init
+from edqn_jax.learn.schedule import Schedule
+from edqn_jax.learn.state import init_state
 from edqn_jax.learn.step import run_steps
-from edqn_jax.runs.provenance import workload
+from edqn_jax.runs.provenance import describe_workload
 from edqn_jax.sim.actions import ACTIONS, DIRECTIONS
 from edqn_jax.sim.physics.airframe import load_airframe
-from edqn_jax.sim.physics.drone import Flight, hover
+from edqn_jax.sim.physics.drone import Flight, hover_state
 from edqn_jax.sim.scene import mjcf
 from edqn_jax.sim.scene.scene import stack_scenes, take_scene
 from edqn_jax.sim.sensors import sensor
@@ -52,7 +52,7 @@ def shown(config, scene, positions, yaws):
     """[M, ...] of what the sensor shows at rest."""
 
     def one(position, yaw):
-        body = hover(position, yaw)
+        body = hover_state(position, yaw)
         still = Flight(*(jnp.stack([x] * 2) for x in (body.position, body.quaternion, body.velocity)))
         return sensor.sense(config, scene, still, sensor.at_rest(config, jax.random.key(0)), jax.random.key(1))[0]
 
@@ -169,7 +169,7 @@ def test_nearness_is_bounded_and_falls_with_distance() -> None:
 @pytest.fixture(scope="module")
 def world():
     pool = stack_scenes([mjcf.load_scene(WORLD)])
-    return env.World(load_airframe(Config().drone), pool, own_missions(pool))
+    return env.EnvParams(load_airframe(Config().drone), pool, own_missions(pool))
 
 
 @pytest.mark.slow
@@ -241,7 +241,7 @@ SHAPES = {
 def test_what_a_decision_draws(world, name: str, frames: int) -> None:
     config = config_of(name)
     assert sensor.frames_per_decision(config) == frames
-    state = jax.eval_shape(lambda key: env.ended(config, world, key), jax.random.key(0))
+    state = jax.eval_shape(lambda key: env.before_reset(config, world, key), jax.random.key(0))
     program = jax.make_jaxpr(lambda s: env.step(config, world, s, 0))(state)
     drawn = [e.outvars[0].aval.shape for e in program.jaxpr.eqns if e.primitive.name == "pictures"]  # type: ignore
     # Two frames of a window are drawn together; where nothing moves, no second depth is needed to know that.
@@ -276,12 +276,12 @@ def test_a_camera_on_the_body_sees_the_ground_rise_and_ranges_do_not_care(world)
 
 def _show_row_means(config, scene, poses, memory, key):
     """Mean brightness of each row of the newest frame, and the number of decisions."""
-    frame = sensor.view(config, scene, poses.position[-1], poses.quaternion[-1])
+    frame = sensor.render_view(config, scene, poses.position[-1], poses.quaternion[-1])
     return jnp.mean(sensor.brightness(config, frame), axis=-1), memory + 1
 
 
 def _show_negative(config, scene, poses, memory, key):
-    frame = sensor.view(config, scene, poses.position[-1], poses.quaternion[-1])
+    frame = sensor.render_view(config, scene, poses.position[-1], poses.quaternion[-1])
     return -sensor.brightness(config, frame)[None], memory
 
 
@@ -323,20 +323,20 @@ def with_new_sensor(request, monkeypatch) -> Config:
 @pytest.mark.slow
 def test_a_new_sensor_needs_only_its_entry_to_act(with_new_sensor, world) -> None:
     config = with_new_sensor
-    state = jax.eval_shape(lambda key: env.ended(config, world, key), jax.random.key(0))
+    state = jax.eval_shape(lambda key: env.before_reset(config, world, key), jax.random.key(0))
     state, step = jax.eval_shape(lambda s: env.step(config, world, s, 0), state)
     shown = sensor.sensor_of(config).example(config)
     assert jax.tree.map(jnp.shape, step.observation.sensed) == jax.tree.map(jnp.shape, shown)
-    assert workload(config, jax.tree.map(lambda x: x[0], world.pool))["frames_per_decision"] == 1
+    assert describe_workload(config, jax.tree.map(lambda x: x[0], world.pool))["frames_per_decision"] == 1
     params = policy.fresh_policy(config)
     observation = Observation(shown, jnp.zeros(OWN_SIZE), jnp.zeros(MOTION_SIZE))
     code = embedding.embed(config, params.encoder, observation)
-    assert code is not None and code.shape == (embedding.size(config),)
+    assert code is not None and code.shape == (embedding.embedding_size(config),)
     if config.env.sensor == "row_means":
         np.testing.assert_array_equal(code, shown)
         assert state.memory.shape == () and not params.encoder
     if config.env.sensor == "tree":
-        assert embedding.code_size(config) == embedding.size(config) - 3 == config.encoder.code_size
+        assert embedding.code_size(config) == embedding.embedding_size(config) - 3 == config.encoder.code_size
         np.testing.assert_array_equal(code[-3:], shown["rows"])
         assert policy.Policy(config, params).code(observation).shape == (config.encoder.code_size,)
     assert decision_latency_ms(config, params, calls=1)["median"] > 0.0
@@ -345,11 +345,11 @@ def test_a_new_sensor_needs_only_its_entry_to_act(with_new_sensor, world) -> Non
 @pytest.mark.slow
 def test_a_new_sensor_needs_only_its_entry_to_train(with_new_sensor, world) -> None:
     config = with_new_sensor
-    steps = Plan.of(config).learn_from + 2
-    before = jax.jit(lambda key: init(config, world, key))(jax.random.key(0))
+    steps = Schedule.from_config(config).learn_from + 2
+    before = jax.jit(lambda key: init_state(config, world, key))(jax.random.key(0))
     after, (_, losses) = jax.jit(lambda s: run_steps(config, world, s, jnp.arange(steps)))(before)
     assert np.isfinite(np.asarray(losses.metrics["q_loss"])[-1])
-    assert np.isfinite(np.asarray(losses.metrics["reconstruction_loss"])).sum() == Plan.of(config).warmup
+    assert np.isfinite(np.asarray(losses.metrics["reconstruction_loss"])).sum() == Schedule.from_config(config).warmup
     if config.env.sensor == "row_means":
         np.testing.assert_array_equal(after.actors.env.memory >= 1, True)  # what it carries is carried
     assert all(np.all(np.isfinite(leaf)) for leaf in jax.tree.leaves(after.learner))

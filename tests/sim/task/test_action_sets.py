@@ -18,10 +18,10 @@ from edqn_jax.errors import ConfigError
 from edqn_jax.sim.actions import ACTIONS, Discrete
 from edqn_jax.sim.physics.airframe import load_airframe, mixer_of
 from edqn_jax.sim.physics.controller import RateCommand
-from edqn_jax.sim.physics.drone import hover
+from edqn_jax.sim.physics.drone import hover_state
 from edqn_jax.sim.physics.flight import fly_command
 from edqn_jax.sim.task import env
-from edqn_jax.sim.task.action_sets import BODY_RATES, MOVES, VELOCITY, ActionSet, action_of, action_set, admitted
+from edqn_jax.sim.task.action_sets import BODY_RATES, MOVES, VELOCITY, ActionSet, action_of, action_set, clip_action
 from edqn_jax.sim.task.outcomes import Outcome
 from edqn_jax.sim.task.task import task_of
 from tests.oracles import drone_mujoco
@@ -40,7 +40,7 @@ def configured(actions: str, **options: object) -> Config:
 CONFIG = configured("body-rates")
 LATE = configured("velocity", action_delay=1)
 AIRFRAME = load_airframe(CONFIG.drone)
-BODY = hover(jnp.zeros(3), jnp.float32(0.0))
+BODY = hover_state(jnp.zeros(3), jnp.float32(0.0))
 WEIGHT = float(AIRFRAME.mass * AIRFRAME.gravity)
 
 
@@ -65,7 +65,7 @@ def rates():
 @pytest.mark.parametrize("heading", ["goal", "flight"])
 def test_a_velocity_that_is_a_move_commands_the_same_to_the_bit(heading):
     config = configured("moves", heading=heading, position=heading == "goal")
-    body, goal = hover(jnp.array([3.0, 4.0, 5.0]), jnp.float32(0.7)), jnp.array([30.0, -2.0, 8.0])
+    body, goal = hover_state(jnp.array([3.0, 4.0, 5.0]), jnp.float32(0.7)), jnp.array([30.0, -2.0, 8.0])
     by_number = jax.vmap(lambda a: MOVES.command(config, AIRFRAME, body, goal, a))(jnp.arange(27))
     by_vector = jax.vmap(lambda a: VELOCITY.command(config, AIRFRAME, body, goal, a))(jnp.asarray(ACTIONS, jnp.float32))
     jax.tree.map(np.testing.assert_array_equal, by_number, by_vector)
@@ -119,7 +119,7 @@ def test_no_rate_and_the_weight_hover_and_twice_the_weight_rises_with_gravity(ra
 def test_body_rates_fly_as_c_mujoco_under_a_plain_control_law():
     """The law in NumPy: torque from the rates' error and the gyroscopic torque, through the rotors' layout inverted."""
     config, thrust, wanted = CONFIG.drone, 1.2 * WEIGHT, np.array([0.8, -0.5, 0.1])
-    start = hover(jnp.array([1.0, -2.0, 30.0]), jnp.float32(0.4))
+    start = hover_state(jnp.array([1.0, -2.0, 30.0]), jnp.float32(0.4))
     command = RateCommand(jnp.float32(thrust), jnp.asarray(wanted, jnp.float32))
     _, flight = jax.jit(lambda state: fly_command(config, AIRFRAME, state, command))(start)
 
@@ -164,7 +164,7 @@ def test_what_is_no_velocity_is_refused_in_words(given):
 
 def test_an_action_of_another_shape_is_refused_where_numbers_are_not_known_yet():
     with pytest.raises(ConfigError, match=r"an action is 4 finite numbers from -1 to 1, not an array of shape \(3,\)"):
-        jax.eval_shape(partial(admitted, BODY_RATES.space), jnp.zeros(3))
+        jax.eval_shape(partial(clip_action, BODY_RATES.space), jnp.zeros(3))
 
 
 def test_an_action_set_of_ones_own_is_found_by_its_name():

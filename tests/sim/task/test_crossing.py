@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from edqn_jax.sim.scene.distance import signed_distance
-from edqn_jax.sim.scene.scene import Scene, moves, scene_at, take_scene
-from edqn_jax.sim.task.crossing import APART, block, crossing_missions, own_crossings
+from edqn_jax.sim.scene.scene import Scene, has_motion, scene_at, take_scene
+from edqn_jax.sim.task.crossing import APART, crossing_missions, own_crossings, sample_crossing
 from edqn_jax.sim.worlds.families import random_pool, world_keys
 from edqn_jax.sim.worlds.free_points import CLEARANCE, FAR, early_times
 from edqn_jax.sim.worlds.moving import Moving
@@ -34,7 +34,7 @@ def clearance(pool: Scene, points: np.ndarray) -> np.ndarray:
 
     def one(world, point):
         scene = take_scene(pool, world)
-        times = early_times() if moves(scene) else jnp.zeros(1)
+        times = early_times() if has_motion(scene) else jnp.zeros(1)
         return jnp.min(jax.vmap(lambda time: signed_distance(scene_at(scene, time), point))(times))
 
     return np.asarray(jax.vmap(lambda world, of: jax.vmap(partial(one, world))(of))(jnp.arange(WORLDS), points))
@@ -85,7 +85,7 @@ def test_each_block_is_of_one_world_and_another_key_gives_other_blocks():
 
 def test_where_no_candidate_is_free_of_all_the_one_that_violates_least_is_taken_and_no_number_is_lost():
     pool = random_pool("rooms", world_keys("validation", 1), Moving())
-    start, goal = block(take_scene(pool, 0), 40, jax.random.key(0))  # there is no place for forty
+    start, goal = sample_crossing(take_scene(pool, 0), 40, jax.random.key(0))  # there is no place for forty
     assert np.isfinite(start).all() and np.isfinite(goal).all()
     lower, upper = np.asarray(pool.volume[0])
     assert (np.asarray(start) > lower).all() and (np.asarray(goal) < upper).all()

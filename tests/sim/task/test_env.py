@@ -13,7 +13,7 @@ import mujoco
 import numpy as np
 import pytest
 
-from edqn_jax.config import Config, EnvConfig, EventsConfig, preset
+from edqn_jax.config import Config, EnvConfig, EventsConfig, get_preset
 from edqn_jax.sim.actions import ACTIONS
 from edqn_jax.sim.camera import camera
 from edqn_jax.sim.physics import drone
@@ -22,11 +22,11 @@ from edqn_jax.sim.physics.drone import DroneState, Flight
 from edqn_jax.sim.scene.scene import UprightBoxes, build_scene, stack_scenes
 from edqn_jax.sim.sensors import events, sensor
 from edqn_jax.sim.task import env, outcomes
-from edqn_jax.sim.task.action_sets import bearing, heading_setpoint, velocity_command
+from edqn_jax.sim.task.action_sets import heading_setpoint, heading_to_goal, velocity_command
 from edqn_jax.sim.task.decision import Decision, reset_decision
 from edqn_jax.sim.task.missions import Missions, own_missions
-from edqn_jax.sim.task.observation import MOST_YAW_RATE, MOTION_SIZE, OWN_SIZE, own_motion, own_state, turned
-from edqn_jax.sim.task.outcomes import Outcome, Verdict, judge
+from edqn_jax.sim.task.observation import MAX_YAW_RATE, MOTION_SIZE, OWN_SIZE, own_motion, own_state, rotate_own_state
+from edqn_jax.sim.task.outcomes import Outcome, Verdict, judge_decision
 from edqn_jax.sim.task.reward import configured_reward
 from edqn_jax.sim.worlds import geodesic
 from tests.support.drawn_scenes import GROUND, rotation_of
@@ -47,7 +47,7 @@ N = CONFIG.drone.physics_steps
 @jax.jit
 def judged(goal, before, positions, decision):
     still = Flight(position=positions, quaternion=jnp.zeros((N, 4)), velocity=jnp.zeros((N, 3)))
-    return judge(CONFIG, SCENE, goal, before, still, decision)
+    return judge_decision(CONFIG, SCENE, goal, before, still, decision)
 
 
 def verdict(*, goal=GOAL, before=(10.0, 10.0, 10.0), decision=1, **at):
@@ -167,7 +167,7 @@ def rewarded(config, outcome, before, after):
 
 
 def test_the_papers_reward_is_eq_8_to_the_letter():
-    config = preset("paper").env
+    config = get_preset("paper").env
     expected = {Outcome.GOAL: 100.0, Outcome.COLLISION: -100.0}
     for outcome in Outcome:
         assert rewarded(config, outcome, 9.0, 5.0) == expected.get(outcome, 0.0)
@@ -248,7 +248,7 @@ def test_moves_are_commanded_in_the_heading_frame():
 
 
 def body(position, yaw=0.0, velocity=(0.0, 0.0, 0.0), setpoint=None):
-    state = drone.hover(jnp.asarray(position, jnp.float32), jnp.float32(yaw))
+    state = drone.hover_state(jnp.asarray(position, jnp.float32), jnp.float32(yaw))
     state = dataclasses.replace(state, velocity=jnp.asarray(velocity, jnp.float32))
     return state if setpoint is None else dataclasses.replace(state, yaw_setpoint=jnp.float32(setpoint))
 
@@ -297,7 +297,7 @@ def test_a_turned_own_state_is_that_of_the_turned_world(quarters, position):
 
     start, goal, velocity = np.array([20.0, 10, 5]), np.array([50.0, 45, 8]), np.array([-2.0, 0.5, 1.0])
     there = turn @ (start - middle) + middle, turn @ (goal - middle) + middle, 0.4 + angle, turn @ velocity
-    found = turned(own(start, goal, 0.4, velocity), jnp.int32(quarters))
+    found = rotate_own_state(own(start, goal, 0.4, velocity), jnp.int32(quarters))
     np.testing.assert_allclose(found, own(*there), atol=2e-6)
 
 
@@ -330,11 +330,11 @@ def test_the_yaw_rate_of_a_drone_on_its_back_is_bounded():
     over = jnp.array([1e-3, 0.0, 1.0, 0.0], jnp.float32)  # pitched by nearly half a turn, and rolling
     state = dataclasses.replace(body((0, 0, 5)), quaternion=over, angular_velocity=jnp.array([3.0, 0.0, 0.0]))
     assert float(drone.yaw_rate_of(state)) < -1000.0
-    np.testing.assert_array_equal(own_motion(CONFIG.env, state, jnp.zeros(3))[3], -MOST_YAW_RATE)
+    np.testing.assert_array_equal(own_motion(CONFIG.env, state, jnp.zeros(3))[3], -MAX_YAW_RATE)
 
 
 def test_the_heading_setpoint_is_the_bearing_and_is_held_near_the_goal():
-    towards = partial(bearing, CONFIG.env)
+    towards = partial(heading_to_goal, CONFIG.env)
     np.testing.assert_allclose(towards(body((50, 40, 5)), GOAL), np.pi / 2, atol=1e-6)
     np.testing.assert_allclose(towards(body((55, 50, 20)), GOAL), np.pi, atol=1e-6)
     # 1.9 m beside it, however high above: what it was.
@@ -431,7 +431,7 @@ FLOWN = dataclasses.replace(
 
 @pytest.fixture(scope="module")
 def world():
-    return env.World(
+    return env.EnvParams(
         airframe=load_airframe(FLOWN.drone),
         pool=stack_scenes([SCENE]),
         missions=Missions(
@@ -484,7 +484,7 @@ def test_a_fresh_environment_rests_at_its_start_and_faces_its_goal(reset):
 @pytest.mark.slow
 def test_the_first_step_of_an_ended_environment_shows_what_a_reset_shows(reset, world):
     begun, seen = reset(jax.random.key(0), MISSION["fence"])
-    waiting = env.ended(FLOWN, world, jax.random.key(0))
+    waiting = env.before_reset(FLOWN, world, jax.random.key(0))
     state, first = jax.jit(lambda s: env.step(FLOWN, world, s, AHEAD, MISSION["fence"]))(waiting)
     assert bool(first.is_reset) and not state.ended and state.mission == MISSION["fence"]
     assert first.outcome == Outcome.RUNNING and first.reward == 0.0 and first.episode_length == 0
@@ -557,10 +557,10 @@ def test_the_limit_ends_an_episode_at_exactly_its_last_decision_without_cutting_
 def test_events_are_those_between_the_configured_frames_of_the_flight(reset, step):
     _, steps = fly(reset, step, "wall", [action(0, 1, 1)] * 3)
     result = steps[-1]
-    see = jax.jit(lambda p, q: camera.luma(FLOWN.camera, SCENE, p, sensor.mount_rotation(FLOWN, q)))
+    see = jax.jit(lambda p, q: camera.render_luma(FLOWN.camera, SCENE, p, sensor.mount_rotation(FLOWN, q)))
     frames = jnp.stack([see(result.flight.position[i], result.flight.quaternion[i]) for i in (10, 12)])
     memory = events.reset_memory(FLOWN.events, 24, 32, jax.random.key(0))
-    field, _ = events.events(FLOWN.events, memory, frames, (-0.04, 0.0), jax.random.key(1))
+    field, _ = events.generate_events(FLOWN.events, memory, frames, (-0.04, 0.0), jax.random.key(1))
     got = result.observation.sensed
     assert int(jnp.sum(field.count)) > 20
     # Two compilations may differ in the last digit, and with it in a rare event on the threshold.
@@ -586,7 +586,9 @@ def test_the_action_is_taken_in_the_heading_at_the_decision_and_the_nose_turns_t
 def test_with_a_free_heading_the_nose_turns_to_where_the_drone_is_told_to_fly(world):
     task = dataclasses.replace(FLOWN.env, sensor="blind", heading="flight", position=False)
     config = dataclasses.replace(FLOWN, env=task)
-    state = dataclasses.replace(env.ended(config, world, jax.random.key(0), MISSION["long"]), ended=jnp.array(False))
+    state = dataclasses.replace(
+        env.before_reset(config, world, jax.random.key(0), MISSION["long"]), ended=jnp.array(False)
+    )
     yaw = float(state.drone.yaw_setpoint)
     take = jax.jit(partial(env.step, config, world))
     left, step = take(state, action(0, 1, 0))
@@ -668,7 +670,7 @@ def test_no_key_is_used_twice_and_no_rank_is_promoted(world, law):
     # Leak checks do not get past MJX. Tracing is enough: both checks are made there.
     task = dataclasses.replace(FLOWN.env, reward="geodesic")
     config = dataclasses.replace(FLOWN, env=task, events=EventsConfig(law=law, threshold_mismatch=0.1))
-    world = dataclasses.replace(world, distances=geodesic.fields(world.pool, 0.36))
+    world = dataclasses.replace(world, distances=geodesic.distance_fields(world.pool, 0.36))
     with jax.numpy_rank_promotion("raise"), jax.debug_key_reuse(True):
         state, _ = jax.jit(partial(env.reset, config, world)).trace(jax.random.key(0)).out_info
         after, _ = jax.jit(partial(env.step, config, world)).trace(state, AHEAD).out_info
@@ -680,17 +682,17 @@ def test_nobody_is_paid_for_a_way_through_a_wall():
     """A drone that crashes into a thin wall ends the decision behind it, where the goal is many metres nearer."""
     scene = small_world(box((5.9, -1.0, -1.0), (6.1, 10.0, 7.0)), start=(4.9, 2.0, 3.0), goal=(10.0, 2.0, 3.0)).scene
     pool = stack_scenes([scene])
-    fields = geodesic.fields(pool, 0.36)
-    world = env.World(load_airframe(CONFIG.drone), pool, own_missions(pool), distances=fields)
+    fields = geodesic.distance_fields(pool, 0.36)
+    world = env.EnvParams(load_airframe(CONFIG.drone), pool, own_missions(pool), distances=fields)
     task = EnvConfig(sensor="blind", reward="geodesic", progress_weight=1.0, path_weight=0.0, step_reward=0.0)
     config = dataclasses.replace(CONFIG, env=task)
     step = jax.jit(partial(env.step, config, world))
     state, _ = env.reset(config, world, jax.random.key(0))
-    left = [float(geodesic.remaining(fields, jnp.int32(0), scene.goal, state.drone.position))]
+    left = [float(geodesic.distance_to_goal(fields, jnp.int32(0), scene.goal, state.drone.position))]
     while not state.ended:
         before = state.drone.position
         state, done = step(state, AHEAD)
-        left.append(float(geodesic.remaining(fields, jnp.int32(0), scene.goal, state.drone.position)))
+        left.append(float(geodesic.distance_to_goal(fields, jnp.int32(0), scene.goal, state.drone.position)))
         moved = float(jnp.linalg.norm(state.drone.position - before))
         crashed = done.outcome == Outcome.COLLISION
         assert float(done.reward) - (task.collision_reward if crashed else 0.0) <= 1.13 * moved + 1e-4

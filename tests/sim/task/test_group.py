@@ -25,7 +25,7 @@ from edqn_jax.sim.physics.airframe import load_airframe
 from edqn_jax.sim.scene.scene import build_scene, stack_scenes
 from edqn_jax.sim.sensors.events import event_image
 from edqn_jax.sim.task import env, group
-from edqn_jax.sim.task.env import World
+from edqn_jax.sim.task.env import EnvParams
 from edqn_jax.sim.task.missions import Missions
 from edqn_jax.sim.task.outcomes import Outcome
 from tests.oracles.group_plain import walked
@@ -52,27 +52,27 @@ CONFIG = configured(2)
 N, RADIUS = CONFIG.drone.physics_steps, CONFIG.drone.body_radius_m
 
 
-def world_of(*ends) -> World:
+def world_of(*ends) -> EnvParams:
     """Level ground, and one mission for each (start, goal)."""
     starts, goals = (np.array(points, np.float32) for points in zip(*ends, strict=True))
     scene = build_scene([GROUND], volume=VOLUME, start=starts[0], goal=goals[0])
     missions = Missions(jnp.zeros(len(ends), jnp.int32), jnp.asarray(starts), jnp.asarray(goals))
-    return World(load_airframe(CONFIG.drone), stack_scenes([scene]), missions)
+    return EnvParams(load_airframe(CONFIG.drone), stack_scenes([scene]), missions)
 
 
 @partial(jax.jit, static_argnums=0)
-def begin(config: Config, world: World, keys, number):
-    return jax.vmap(partial(env.ended, config, world))(keys, number)
+def begin(config: Config, world: EnvParams, keys, number):
+    return jax.vmap(partial(env.before_reset, config, world))(keys, number)
 
 
 @partial(jax.jit, static_argnums=(0, 1))
-def step_of(config: Config, free: bool, world: World, states, moves, number):
+def step_of(config: Config, free: bool, world: EnvParams, states, moves, number):
     """The world is an argument, so that one program flies in all."""
     one = lambda s, a, m: env.step(config, world, s, a, None if free else m)  # noqa: E731
-    return group.each(config, one)(states, moves, number)
+    return group.map_drones(config, one)(states, moves, number)
 
 
-def fly(world: World, moves, config: Config = CONFIG, missions=None, key: int = 0, free: bool = False):
+def fly(world: EnvParams, moves, config: Config = CONFIG, missions=None, key: int = 0, free: bool = False):
     """Steps of all drones: the reset, and one for each row of moves [N]; with the states after each."""
     count = world.missions.scene.shape[0]
     number = jnp.arange(count) if missions is None else jnp.asarray(missions)
@@ -155,8 +155,8 @@ def test_all_of_a_group_are_reset_to_the_missions_of_one_block_in_their_order():
     ends = [((10 + 2 * i, 5 + 7 * k, 6), (50, 5 + 7 * k, 6)) for k in range(5) for i in range(3)]
     config, world = configured(3), world_of(*ends)
     keys = jax.random.split(jax.random.key(3), 30)
-    state = group.each(config, partial(env.ended, config, world))(keys)
-    state, _ = jax.jit(group.each(config, partial(env.step, config, world)))(state, jnp.zeros(30, jnp.int32))
+    state = group.map_drones(config, partial(env.before_reset, config, world))(keys)
+    state, _ = jax.jit(group.map_drones(config, partial(env.step, config, world)))(state, jnp.zeros(30, jnp.int32))
     drawn = np.asarray(state.mission).reshape(10, 3)
     assert np.array_equal(drawn % 3, np.tile(np.arange(3), (10, 1)))
     assert np.array_equal(drawn // 3, np.repeat(drawn[:, :1] // 3, 3, axis=1))
@@ -204,7 +204,7 @@ def _differ(a, b):
 
 @jax.jit
 def ENCOUNTERS(path, flies, until):
-    return group.encounters(path, flies, until, 2 * RADIUS)
+    return group.contact_times(path, flies, until, 2 * RADIUS)
 
 
 def test_who_has_been_hit_hits_nobody_any_more():
@@ -254,12 +254,12 @@ def test_the_label_shows_the_others_where_they_are_after_the_decision():
     config = configured(2, sensor="depth")
     world = world_of(((10, 20, 10), (50, 20, 10)), ((13, 20, 10), (50, 20, 10)))
     states, steps = fly(world, [[HOVER, AHEAD]] * 3, config)
-    label = jax.jit(group.each(config, partial(env.nearness, config, world)))(states[-1])
+    label = jax.jit(group.map_drones(config, partial(env.nearness, config, world)))(states[-1])
     # `depth` shows the same: one way through the decision's path, the other through the states alone.
     assert np.allclose(label, np.asarray(steps[-1].observation.sensed)[:, 0], atol=1e-4)
     assert float(label[0].max()) > 1.0
     over = dataclasses.replace(states[-1], ended=jnp.array([False, True]))
-    assert float(jax.jit(group.each(config, partial(env.nearness, config, world)))(over)[0].max()) < 0.9
+    assert float(jax.jit(group.map_drones(config, partial(env.nearness, config, world)))(over)[0].max()) < 0.9
 
 
 # ------------------------------------------------------------------------------------------- groups
@@ -291,21 +291,21 @@ def test_a_drone_that_meets_nobody_flies_and_sees_as_alone():
 
 def test_one_drone_is_mapped_as_ever_and_asks_nobody():
     config, world = configured(1), world_of(((10, 20, 6), (50, 20, 6)))
-    states = jax.vmap(partial(env.ended, config, world))(
+    states = jax.vmap(partial(env.before_reset, config, world))(
         jax.random.split(jax.random.key(0), 3), jnp.zeros(3, jnp.int32)
     )
     moves = jnp.zeros(3, jnp.int32)
     step = partial(env.step, config, world)
     mapped, plain = (
         [equation.primitive.name for equation in jax.make_jaxpr(each(step))(states, moves).jaxpr.eqns]
-        for each in (partial(group.each, config), jax.vmap)
+        for each in (partial(group.map_drones, config), jax.vmap)
     )
     assert mapped == plain and "all_gather" not in mapped
 
 
 def test_a_drone_that_waits_is_replaced_by_the_first_of_its_group_that_flies():
     waits = jnp.array([False, True, True, True, True, False, False, False, False])
-    assert list(group.mates(configured(3), waits)) == [0, 0, 0, 5, 5, 5, 6, 7, 8]
+    assert list(group.active_partner_index(configured(3), waits)) == [0, 0, 0, 5, 5, 5, 6, 7, 8]
 
 
 def test_what_flies_one_drone_refuses_several_in_a_sentence():

@@ -22,12 +22,12 @@ from edqn_jax.sim.physics import drone
 from edqn_jax.sim.physics.airframe import load_airframe
 from edqn_jax.sim.scene.distance import signed_distance
 from edqn_jax.sim.scene.launches import aim_along
-from edqn_jax.sim.scene.motion import Motion, Throw, aim_at, throw_speeds, thrown_to
+from edqn_jax.sim.scene.motion import Motion, Throw, aim_at, ball_positions, throw_speeds
 from edqn_jax.sim.scene.scene import PARKED, Spheres, UprightBoxes, build_scene, scene_at, stack_scenes
 from edqn_jax.sim.sensors import built_in, sensor
 from edqn_jax.sim.sensors.events import event_image
 from edqn_jax.sim.task import env
-from edqn_jax.sim.task.env import World
+from edqn_jax.sim.task.env import EnvParams
 from edqn_jax.sim.task.missions import own_missions
 from edqn_jax.sim.task.outcomes import Outcome
 from tests.support.drawn_scenes import GROUND
@@ -55,17 +55,17 @@ def pillar(motion: Motion | None, x=18.0, y=16.0) -> UprightBoxes:
     return UprightBoxes(position=[x, y, 6], half=[0.5, 1, 6], yaw=0.2, albedo=DARK, motion=motion)
 
 
-def world_of(*shapes) -> World:
+def world_of(*shapes) -> EnvParams:
     scene = build_scene([GROUND, *shapes], volume=VOLUME, start=START, goal=GOAL)
     pool = stack_scenes([scene])
-    return World(load_airframe(CONFIG.drone), pool, own_missions(pool))
+    return EnvParams(load_airframe(CONFIG.drone), pool, own_missions(pool))
 
 
 def configured(name: str) -> Config:
     return dataclasses.replace(CONFIG, env=dataclasses.replace(CONFIG.env, sensor=name))
 
 
-def fly(world: World, actions, config: Config = CONFIG):
+def fly(world: EnvParams, actions, config: Config = CONFIG):
     """Steps of one environment from its start: the states before them, and what they led to."""
     state, first = jax.jit(env.reset, static_argnums=0)(config, world, jax.random.key(0), jnp.int32(0))
     step = jax.jit(env.step, static_argnums=0)
@@ -284,13 +284,13 @@ def test_no_ball_begins_close_to_the_drone_and_none_is_slower_than_it_may_be():
     moved = jnp.asarray(rng.uniform(-1.7, 1.7, (many, 3)), jnp.float32)
     with jax.numpy_rank_promotion("raise"):
         aim = aim_at(throw, jnp.float32([50, 20, 6]), jnp.asarray(VOLUME, jnp.float32), 1.3, here, moved, 0.26)
-        thrown_to(throw, aim, jnp.float32(2.0))
-    begin = np.asarray(thrown_to(throw, aim, jnp.float32(1.3)), np.float64)
+        ball_positions(throw, aim, jnp.float32(2.0))
+    begin = np.asarray(ball_positions(throw, aim, jnp.float32(1.3)), np.float64)
     assert np.linalg.norm(begin - np.asarray(here), axis=1).min() >= 3.0 - 1e-3
     at_drone = np.abs(np.asarray(aim.point - here)).max(1) == 0
     assert 0 < at_drone.mean() < 0.3
     for time in np.linspace(1.32, 5, 12):
-        one, two = (np.asarray(thrown_to(throw, aim, jnp.float32(t)), np.float64) for t in (time, time + 0.02))
+        one, two = (np.asarray(ball_positions(throw, aim, jnp.float32(t)), np.float64) for t in (time, time + 0.02))
         bound = np.maximum(*(np.asarray(throw_speeds(throw, aim, jnp.float32(t))) for t in (time, time + 0.02)))
         assert (np.linalg.norm(two - one, axis=1) / 0.02 <= bound * 1.001 + 2e-3).all()
 

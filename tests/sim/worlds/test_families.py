@@ -14,7 +14,7 @@ from edqn_jax.config import FAMILIES, MIXTURES
 from edqn_jax.config.loading import make_config
 from edqn_jax.errors import ConfigError
 from edqn_jax.planning.astar import shortest_path
-from edqn_jax.planning.free_space import reachable
+from edqn_jax.planning.free_space import find_reachable
 from edqn_jax.sim.scene.distance import signed_distance
 from edqn_jax.sim.scene.mjcf import check_scene, load_world, write_scene
 from edqn_jax.sim.scene.scene import Scene, obstacle_count, scene_shapes, take_scene
@@ -70,7 +70,7 @@ def test_a_key_makes_one_world_and_another_key_another(pools, family):
 
 @pytest.mark.slow
 def test_a_pool_does_not_depend_on_how_many_are_drawn_at_once(pools, monkeypatch):
-    monkeypatch.setattr(families, "_AT_ONCE", 5)
+    monkeypatch.setattr(families, "_BATCH", 5)
     again = random_pool("rooms", world_keys("validation", 12))
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b[:12], rtol=1e-5, atol=1e-4), again, pools["rooms"])
 
@@ -114,7 +114,7 @@ def test_there_is_a_path_in_every_random_world(pools, family):
 @pytest.mark.slow
 def test_there_is_a_way_from_everywhere_so_that_missions_may_begin_anywhere(pools, family):
     scene = take_scene(pools[family], 1)  # the canyon has a courtyard at the edge
-    found = reachable(scene, RADIUS, 0.5)
+    found = find_reachable(scene, RADIUS, 0.5)
     cells = found.corner + found.edge_m * np.argwhere(~found.is_way)
     clearance = jax.vmap(partial(signed_distance, scene))(jnp.asarray(cells, jnp.float32))
     assert (clearance < CLEARANCE).all()
@@ -178,7 +178,7 @@ def test_hard_worlds_are_the_same_as_mjcf(pools, family, tmp_path):
 def test_a_world_without_a_way_is_drawn_again(monkeypatch):
     def draw(key):
         """Rooms with a wall all across, for two keys of three."""
-        scene = rooms.draw(key)
+        scene = rooms.sample_rooms(key)
         wall = jax.random.key_data(key)[-1] % 3 > 0
         half = scene.boxes.half.at[0].set(jnp.where(wall, jnp.array([0.2, 18.0, 4.0]), scene.boxes.half[0]))
         position = scene.boxes.position.at[0].set(jnp.where(wall, scene.volume[1] / 2, scene.boxes.position[0]))
@@ -188,11 +188,13 @@ def test_a_world_without_a_way_is_drawn_again(monkeypatch):
         return dataclasses.replace(scene, boxes=boxes, start=start, goal=goal)
 
     monkeypatch.setitem(FAMILIES._entries, "walled", dataclasses.replace(families.ROOMS, draw=draw))
-    pool = families._drawn("walled", world_keys("training", 12))
+    pool = families._sample_worlds("walled", world_keys("training", 12))
     half = np.asarray(pool.boxes.half[:, 0])
     assert not (half[:, 1] == 18.0).any()
     # Most first attempts had the wall, so most worlds are another than the first.
-    first = jax.vmap(lambda key: rooms.draw(jax.random.fold_in(key, 0)).boxes.half[0])(world_keys("training", 12))
+    first = jax.vmap(lambda key: rooms.sample_rooms(jax.random.fold_in(key, 0)).boxes.half[0])(
+        world_keys("training", 12)
+    )
     assert 0 < np.isclose(half, first).all(axis=1).sum() < 8
 
 
@@ -223,6 +225,6 @@ def test_worlds_and_missions_reuse_no_key_and_promote_no_rank():
     with jax.debug_key_reuse(True), jax.numpy_rank_promotion("raise"), jax.checking_leaks():
         for family in ("sparse", *HARD):
             # Not by `random_pool`, which draws in threads, where none of this holds.
-            pool = families._drawn(family, world_keys("training", 2))
+            pool = families._sample_worlds(family, world_keys("training", 2))
             random_missions(pool, 4, jax.random.key(0))
             spread_missions(pool, 4, 0.5, 1.0, jax.random.key(1))

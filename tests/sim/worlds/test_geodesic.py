@@ -19,11 +19,11 @@ from edqn_jax.sim.worlds.families import random_pool, world_keys
 from tests.oracles import geodesic_plain
 from tests.support.small_worlds import RADIUS, WITHOUT_A_WAY, box, random_small_world, small_world
 
-left = jax.jit(geodesic.remaining)
+left = jax.jit(geodesic.distance_to_goal)
 
 
 def one(scene: Scene) -> geodesic.Field:
-    return geodesic.fields(stack_scenes([scene]), RADIUS)
+    return geodesic.distance_fields(stack_scenes([scene]), RADIUS)
 
 
 @pytest.mark.slow
@@ -61,7 +61,7 @@ def test_the_way_from_the_start_is_about_as_long_as_astars(name):
 @pytest.mark.parametrize("family", ["rooms", "forest", "canyon", "dense"])
 def test_worlds_of_a_pool_have_ways_of_their_own_and_none_is_shorter_than_the_straight_line(family):
     pool = random_pool(family, world_keys("validation", 3))
-    fields = geodesic.fields(pool, RADIUS)
+    fields = geodesic.distance_fields(pool, RADIUS)
     assert fields.remaining.shape == (3, *geodesic.POOL_NODES)
     for i in range(3):
         scene = take_scene(pool, i)

@@ -14,8 +14,8 @@ from edqn_jax.errors import ConfigError
 from edqn_jax.evaluation.missions import load_missions
 from edqn_jax.sim.environment import make
 from edqn_jax.sim.scene.distance import signed_distance
-from edqn_jax.sim.scene.motion import due
-from edqn_jax.sim.scene.scene import PARKED, Scene, moves, scene_at, take_scene
+from edqn_jax.sim.scene.motion import launch_times
+from edqn_jax.sim.scene.scene import PARKED, Scene, has_motion, scene_at, take_scene
 from edqn_jax.sim.task.missions import own_missions, random_missions
 from edqn_jax.sim.worlds import canyon, families, forest
 from edqn_jax.sim.worlds.families import random_pool, world_keys
@@ -44,9 +44,9 @@ def places(scene: Scene, times):
 
 def test_at_time_zero_a_moving_world_is_the_still_one_of_the_same_key(pools):
     still = pools["still"]
-    assert not moves(still)
+    assert not has_motion(still)
     for name in ("moving", "everything"):
-        assert moves(pools[name])
+        assert has_motion(pools[name])
         now = jax.vmap(lambda scene: scene_at(scene, jnp.float32(0.0)))(pools[name])
         for kind in KINDS:
             ours, theirs = getattr(now, kind), getattr(still, kind)
@@ -187,7 +187,7 @@ def test_balls_meet_a_drone_that_flies_straight_and_come_from_ahead(pools):
     for i in range(WORLDS):
         scene = take_scene(pool, i)
         throw = jax.tree.map(lambda x: x[-3:], scene.spheres.throw)
-        hits = np.asarray(due(throw, scene.start, scene.goal) + throw.early)
+        hits = np.asarray(launch_times(throw, scene.start, scene.goal) + throw.early)
         assert (np.diff(hits) > 0).all() and (hits >= np.asarray(throw.early)).all()
         way = np.asarray(scene.goal - scene.start, np.float64)
         for ball, hit in enumerate(hits):
@@ -216,7 +216,7 @@ def test_moving_worlds_reuse_no_key_and_promote_no_rank():
     with jax.debug_key_reuse(True), jax.numpy_rank_promotion("raise"), jax.checking_leaks():
         for family in ("sparse", "forest"):
             # Not by `random_pool`, which draws in threads, where none of this holds.
-            pool = families._drawn(family, world_keys("training", 2), EVERYTHING)
+            pool = families._sample_worlds(family, world_keys("training", 2), EVERYTHING)
             random_missions(pool, 4, jax.random.key(0))
             jax.jit(lambda pool: scene_at(take_scene(pool, 0), jnp.float32(1.0)))(pool)
 
@@ -231,7 +231,7 @@ def test_environments_and_evaluations_fly_in_what_the_configuration_says():
         assert jax.tree.structure(pool) == jax.tree.structure(expected)
         jax.tree.map(np.testing.assert_array_equal, pool, expected)
     flown = load_missions(make_config("medium"), "moving", 2).world.pool
-    assert moves(flown) and flown.spheres.throw is None
+    assert has_motion(flown) and flown.spheres.throw is None
 
 
 @pytest.mark.parametrize(

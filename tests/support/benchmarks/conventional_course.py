@@ -28,14 +28,14 @@ def course_of(start: NDArray, goal: NDArray) -> Course:
     return Course(world.text_of(paper()), np.asarray(start, np.float64), np.asarray(goal, np.float64))
 
 
-def world_of(config: Config, start: NDArray, goal: NDArray) -> env.World:
+def world_of(config: Config, start: NDArray, goal: NDArray) -> env.EnvParams:
     """Returns the same missions for our environment."""
     missions = Missions(
         scene=jnp.zeros(len(start), jnp.int32),
         start=jnp.asarray(start, jnp.float32),
         goal=jnp.asarray(goal, jnp.float32),
     )
-    return env.World(load_airframe(config.drone), stack_scenes([paper()]), missions)
+    return env.EnvParams(load_airframe(config.drone), stack_scenes([paper()]), missions)
 
 
 def fleet_of(config: Config, start: NDArray, goal: NDArray) -> Fleet:

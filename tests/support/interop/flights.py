@@ -55,7 +55,7 @@ def flown(policy: Policy, world: str = "medium", mission: int = 0, worlds: int =
             "goal": goal,
             "volume": volume,
         }
-        packet = events.expand(_field(config, seen.sensed))
+        packet = events.to_stream(_field(config, seen.sensed))
         packet["t"] += until_us - window_us
         setpoint = float(heading_setpoint(config.env, body, jax.numpy.asarray(goal), command))
         own, motion = np.asarray(seen.own), np.asarray(seen.motion)

@@ -10,11 +10,11 @@ import numpy as np
 
 from edqn_jax.config import Config
 from edqn_jax.config.loading import make_config
-from edqn_jax.extras import require
+from edqn_jax.extras import require_extra
 from edqn_jax.learn.policy import Policy, fresh_policy
 from edqn_jax.sim.actions import move_number
 
-interop = require("edqn_jax.interop.gymnasium")
+interop = require_extra("edqn_jax.interop.gymnasium")
 
 DOWN = int(move_number("down"))
 HOVER = int(move_number("hover"))

@@ -161,7 +161,7 @@ def quaternion_of(rotation: np.ndarray) -> np.ndarray:
     return quaternion
 
 
-def inverse(x: Array) -> Array:
+def safe_inverse(x: Array) -> Array:
     """Returns 1 / x of [...], finite at 0."""
     return 1.0 / jnp.where(jnp.abs(x) < TINY, TINY, x)
 

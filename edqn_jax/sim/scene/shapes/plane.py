@@ -7,7 +7,7 @@ import numpy as np
 from flax import struct
 from jax import Array
 
-from edqn_jax.sim.scene.shapes.kind import GREY, PARKED, UP, Hits, ShapeKind, Vector, inverse, offset, per_shape
+from edqn_jax.sim.scene.shapes.kind import GREY, PARKED, UP, Hits, ShapeKind, Vector, offset, per_shape, safe_inverse
 from edqn_jax.sim.scene.surface import Surface
 
 HORIZON_M = 1e5
@@ -34,7 +34,7 @@ def _meet(planes: Planes, origin: Array, ray: Vector) -> Hits:
     nx, ny, nz = (per_shape(planes.normal[:, i]) for i in range(3))
     height = per_shape(jnp.sum((origin[None] - planes.position) * planes.normal, axis=-1))
     approach = nx * ray[0] + ny * ray[1] + nz * ray[2]
-    t = -height * inverse(approach)
+    t = -height * safe_inverse(approach)
     return Hits.of(t, (approach < 0) & (t > 0) & (t < HORIZON_M), (nx, ny, nz))
 
 

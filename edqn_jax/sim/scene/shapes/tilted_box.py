@@ -17,10 +17,10 @@ from edqn_jax.sim.scene.shapes.kind import (
     Hits,
     ShapeKind,
     Vector,
-    inverse,
     offset,
     per_shape,
     quaternion_of,
+    safe_inverse,
     solid_distance,
 )
 from edqn_jax.sim.scene.surface import Surface
@@ -67,7 +67,7 @@ def slabs(o: Vector, d: Vector, half: Array, axes: tuple[Vector, Vector, Vector]
     enter, leave = jnp.asarray(-jnp.inf), jnp.asarray(jnp.inf)
     sides: list[tuple[Any, Vector]] = []
     for i in range(3):
-        per_d = inverse(d[i])
+        per_d = safe_inverse(d[i])
         middle, reach = -o[i] * per_d, per_shape(half[:, i]) * jnp.abs(per_d)
         x, y, z = (per_shape(a) for a in axes[i])
         near = middle - reach

@@ -21,10 +21,10 @@ from edqn_jax.sim.scene.shapes.kind import (
     ShapeKind,
     Vector,
     array_module,
-    inverse,
     norm,
     offset,
     per_shape,
+    safe_inverse,
     solid_distance,
 )
 from edqn_jax.sim.scene.surface import Surface
@@ -74,7 +74,7 @@ def meet_tubes(part: Tubes, origin: Array, ray: Vector, capped: bool) -> Hits:
     if not capped:
         on_side = (inside > 0) & (jnp.abs(axis_o + side_t * axis_d) <= per_shape(part.half_length))
         return Hits.of(side_t, on_side & (side_t > 0), side)
-    per_d = inverse(axis_d)
+    per_d = safe_inverse(axis_d)
     middle, half = -axis_o * per_d, per_shape(part.half_length) * jnp.abs(per_d)
     enter, leave = jnp.maximum(side_t, middle - half), jnp.minimum(s + reach, middle + half)
     hit = (inside > 0) & (enter < leave) & (enter > 0)

@@ -1,4 +1,4 @@
-"""When what is trained: the numbers of training steps that follow from a configuration.
+"""The training schedule: numbers of training steps that follow from a configuration.
 
 The warm-up comes first, then the learner learns; each retraining of the VAE gives the agent a new encoder, and the
 rings begin anew.
@@ -19,7 +19,7 @@ from edqn_jax.learn.perception import embedding
 
 
 @dataclasses.dataclass(frozen=True)
-class Plan:
+class Schedule:
     """Numbers of training steps; static."""
 
     total: int
@@ -32,7 +32,7 @@ class Plan:
     """Of the warm-up and of each retraining of the VAE, the first step and the step after the last."""
 
     @classmethod
-    def of(cls, config: Config) -> Plan:
+    def from_config(cls, config: Config) -> Schedule:
         """Returns the plan of a configuration.
 
         Total decisions round up to whole chunks, the warm-up to whole steps; it takes a quarter at most.

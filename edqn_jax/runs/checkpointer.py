@@ -12,7 +12,7 @@ import jax
 import numpy as np
 
 from edqn_jax.config import Config
-from edqn_jax.config.loading import apply, parse_layer
+from edqn_jax.config.loading import apply_layer, parse_layer
 from edqn_jax.devices import processes
 from edqn_jax.errors import ConfigError
 from edqn_jax.learn import saved_state
@@ -22,27 +22,27 @@ from edqn_jax.runs import world_copy
 from edqn_jax.runs.checkpoints import states
 from edqn_jax.runs.checkpoints.params import save_params
 from edqn_jax.runs.checkpoints.states import Checkpoint
-from edqn_jax.runs.continuation import MAY_CHANGE, differences
+from edqn_jax.runs.continuation import MAY_CHANGE, option_differences
 from edqn_jax.runs.directory import RunDirectory, config_text
 from edqn_jax.runs.provenance import reward_record
 from edqn_jax.sim.task.reward import Reward
-from edqn_jax.training.loop import AgentStanding, Standing
+from edqn_jax.training.loop import AgentProgress, RunProgress
 from edqn_jax.training.selection import Candidate
-from edqn_jax.training.setup import Preparation
+from edqn_jax.training.setup import TrainingSetup
 
-MOST_OVERHEAD = 0.03
+MAX_OVERHEAD = 0.03
 """Share of the time that saving may take: where it takes longer, checkpoints are further apart."""
 
 _KEPT = "kept"
 """Beginning of the names of parameters that an agent keeps."""
 
 
-class Keeper:
-    """Saves where a run stands every few seconds and at its end; reads it again."""
+class Checkpointer:
+    """Saves checkpoints of a run every few seconds and at its end; restores them."""
 
     def __init__(
         self,
-        preparation: Preparation,
+        preparation: TrainingSetup,
         run: RunDirectory | None,
         folders: Sequence[RunDirectory | None],
         reward: Reward | None,
@@ -71,7 +71,7 @@ class Keeper:
         """What `summary.json` says of interruptions and checkpoints."""
         return {"resumed_at_decisions": self.resumed_at, "checkpoint_seconds": self.seconds}
 
-    def save_if_due(self, standing: Standing, last: bool) -> None:
+    def save_if_due(self, standing: RunProgress, last: bool) -> None:
         """Saves checkpoint and policies if it is time or `last`; every process must call this after each chunk.
 
         Where no checkpoints are asked for, the policies are saved at the end all the same.
@@ -82,12 +82,12 @@ class Keeper:
         every = self.config.train.checkpoint_every_s
         if every == 0:
             if last:
-                processes.together(lambda: self.save_policies(standing))
+                processes.run_synchronised(lambda: self.save_policies(standing))
             return
         if not (last or standing.healthy):
             return  # the checkpoints from before are worth more
         since = time.monotonic() - self._saved_at
-        if not (last or processes.on_any(since >= max(every, self._took / MOST_OVERHEAD))):
+        if not (last or processes.any_process(since >= max(every, self._took / MAX_OVERHEAD))):
             return
         began = time.monotonic()
         try:
@@ -100,7 +100,7 @@ class Keeper:
         self._took = self._saved_at - began
         self.seconds += self._took
 
-    def restored(self) -> Standing | None:
+    def restore_newest(self) -> RunProgress | None:
         """Returns where the run stood at its newest checkpoint, its files cut back to then; None if there is none.
 
         Every process must call this.
@@ -119,19 +119,21 @@ class Keeper:
                     raise
                 raise ConfigError(f"a checkpoint does not hold what it must: {error!r}"[:300]) from None
 
-        processes.together(read)
+        processes.run_synchronised(read)
         checkpoint = found[0]
         text = None
         if self.run is not None:
             text = json.dumps(None if checkpoint is None else checkpoint.host).encode()
-        host = json.loads(processes.of_first(text))
+        host = json.loads(processes.broadcast_from_first(text))
         if host is None:
             return None
         arrays = self._of_all(checkpoint, host["done"])
-        processes.together(lambda: None if self.run is None else states.cut_back(self._files(), host["files"]))
+        processes.run_synchronised(
+            lambda: None if self.run is None else states.truncate_logs(self._files(), host["files"])
+        )
         return self._standing(host, arrays)
 
-    def save_policies(self, standing: Standing) -> None:
+    def save_policies(self, standing: RunProgress) -> None:
         """Saves the policy that each agent would end with now.
 
         Raises:
@@ -142,7 +144,7 @@ class Keeper:
             if folder is not None:
                 save_params(folder.checkpoints, policy, folder.config_file)
 
-    def _save(self, standing: Standing) -> None:
+    def _save(self, standing: RunProgress) -> None:
         arrays = saved_state.to_host(self.preparation.trainer, standing.state, standing.done)
 
         def write() -> None:
@@ -153,17 +155,17 @@ class Keeper:
                 arrays={name: array for name, array in {**arrays, **kept}.items() if array.size},
                 host=self._host(standing),
                 config=config_text(self.config),
-                facts={**states.versions(), "reward": json.dumps(self.reward, sort_keys=True)},
+                facts={**states.checkpoint_versions(), "reward": json.dumps(self.reward, sort_keys=True)},
             )
-            states.save(self.run.checkpoints, standing.done, checkpoint, self.config.train.checkpoints)
+            states.save_checkpoint(self.run.checkpoints, standing.done, checkpoint, self.config.train.checkpoints)
             self.save_policies(standing)
 
-        processes.together(write)
+        processes.run_synchronised(write)
 
-    def _host(self, standing: Standing) -> dict[str, Any]:
+    def _host(self, standing: RunProgress) -> dict[str, Any]:
         assert self.run is not None
         try:
-            files = states.grown(self._files())
+            files = states.log_digests(self._files())
         except OSError as error:
             raise ConfigError(f"a file of the run in '{self.run.path}' cannot be read: {error.strerror}") from None
         agents = [
@@ -199,14 +201,14 @@ class Keeper:
         states.remove_partials(run.checkpoints)
 
         def usable(checkpoint: Checkpoint) -> None:
-            states.check_grown(self._files(), checkpoint.host["files"])
+            states.check_log_prefix(self._files(), checkpoint.host["files"])
 
-        checkpoint = states.newest(run.checkpoints, usable, self.message)
+        checkpoint = states.newest_checkpoint(run.checkpoints, usable, self.message)
         if checkpoint is None:
             return None
         world_copy.check_unchanged(run.path, self.config)
         where = f"the checkpoint in '{checkpoint.file}'"
-        wrote, here = checkpoint.facts.get("edqn_jax"), states.versions()
+        wrote, here = checkpoint.facts.get("edqn_jax"), states.checkpoint_versions()
         if wrote != here["edqn_jax"]:
             raise ConfigError(
                 f"{where} was saved by edqn_jax {wrote}, which edqn_jax {here['edqn_jax']} cannot continue; use that "
@@ -214,8 +216,8 @@ class Keeper:
             )
         if checkpoint.facts.get("jax") != here["jax"]:
             self.message(f"jax is {here['jax']} and was {checkpoint.facts.get('jax')}: rounding may differ")
-        own = apply(Config(), parse_layer(checkpoint.config, where), where)
-        differ = [name for name in differences(own, self.config) if name not in MAY_CHANGE]
+        own = apply_layer(Config(), parse_layer(checkpoint.config, where), where)
+        differ = [name for name in option_differences(own, self.config) if name not in MAY_CHANGE]
         if differ:
             raise ConfigError(f"{where} is of a run with other options: {', '.join(differ)}")
         rewarded = json.loads(checkpoint.facts.get("reward", "null"))
@@ -226,14 +228,14 @@ class Keeper:
             )
         found = {name: (array.shape, str(array.dtype)) for name, array in checkpoint.arrays.items()}
         try:
-            saved_state.check(found, self._expected(checkpoint.host["done"]))
+            saved_state.check_shapes(found, self._expected(checkpoint.host["done"]))
         except ConfigError as error:
             raise ConfigError(f"{where} does not fit the run: {error}") from None
         return checkpoint
 
     def _expected(self, done: int) -> dict[str, saved_state.Shape]:
         """Returns the arrays of a checkpoint after `done` steps; empty ones are not saved."""
-        of_state = saved_state.expected(self.preparation.trainer, done)
+        of_state = saved_state.state_shapes(self.preparation.trainer, done)
         kept = {name: (array.shape, str(array.dtype)) for name, array in _named_kept(self._fresh()).items()}
         return {name: shape for name, shape in {**of_state, **kept}.items() if 0 not in shape[0]}
 
@@ -246,20 +248,22 @@ class Keeper:
 
     def _of_all(self, checkpoint: Checkpoint | None, done: int) -> dict[str, np.ndarray]:
         """Returns the arrays of process 0's checkpoint, on every process; empty ones are made anew."""
-        of_state = saved_state.expected(self.preparation.trainer, done)
+        of_state = saved_state.state_shapes(self.preparation.trainer, done)
         arrays = {name: np.zeros(shape, kind) for name, (shape, kind) in of_state.items() if 0 in shape}
         for name, (shape, kind) in self._expected(done).items():
             held = None if checkpoint is None else checkpoint.arrays[name].tobytes()
-            arrays[name] = np.frombuffer(processes.of_first(held), kind).reshape(shape)
+            arrays[name] = np.frombuffer(processes.broadcast_from_first(held), kind).reshape(shape)
         return arrays
 
-    def _standing(self, host: dict[str, Any], arrays: dict[str, np.ndarray]) -> Standing:
+    def _standing(self, host: dict[str, Any], arrays: dict[str, np.ndarray]) -> RunProgress:
         kept = [
-            jax.tree_util.tree_map_with_path(lambda path, leaf, n=n: arrays.get(kept_name(n, path), leaf), params)
+            jax.tree_util.tree_map_with_path(
+                lambda path, leaf, n=n: arrays.get(agent_array_name(n, path), leaf), params
+            )
             for n, params in enumerate(self._fresh())
         ]
         agents = [
-            AgentStanding(
+            AgentProgress(
                 kept=Candidate(params, **{name: agent[name] for name in _scores()}),
                 episodes=agent["episodes"],
                 validations=[(found[0], found[1], found[2]) for found in agent["validations"]],
@@ -267,7 +271,7 @@ class Keeper:
             for params, agent in zip(kept, host["agents"], strict=True)
         ]
         self.resumed_at = [*host["resumed_at"], host["done"] * self.config.train.num_envs]
-        return Standing(
+        return RunProgress(
             state=saved_state.from_host(self.preparation.trainer, arrays),
             done=host["done"],
             checked=host["checked"],
@@ -276,24 +280,24 @@ class Keeper:
             agents=agents,
         )
 
-    def _decisions(self, standing: Standing) -> int:
+    def _decisions(self, standing: RunProgress) -> int:
         return standing.done * self.config.train.num_envs
 
 
 def _scores() -> list[str]:
-    """Returns the names of what is known of kept parameters beside them."""
+    """Returns the names of the scores that are saved with kept parameters."""
     return [field.name for field in dataclasses.fields(Candidate) if field.name != "params"]
 
 
 def _named_kept(agents: Sequence[PolicyParams]) -> dict[str, np.ndarray]:
     return {
-        kept_name(number, path): np.asarray(leaf)
+        agent_array_name(number, path): np.asarray(leaf)
         for number, params in enumerate(agents)
         for path, leaf in jax.tree_util.tree_leaves_with_path(params)
     }
 
 
-def kept_name(agent: int, path: Any) -> str:
+def agent_array_name(agent: int, path: Any) -> str:
     """Returns the name in a checkpoint of an array of the parameters that an agent keeps."""
     return f"{_KEPT}[{agent}]{jax.tree_util.keystr(path)}"
 

@@ -25,7 +25,7 @@ from edqn_jax.sim.task.outcomes import Outcome
 
 
 @dataclasses.dataclass(frozen=True)
-class FlownRun:
+class EvaluatedRun:
     """A run and its evaluation flights."""
 
     name: str
@@ -58,7 +58,7 @@ def folders_of(run: Path) -> list[Path]:
     return sorted(seeds, key=lambda folder: int(folder.name.removeprefix(SEED_FOLDER))) or [run]
 
 
-def fly_run(folder: Path, name: str, most: int, message: Callable[[str], None] = lambda _: None) -> FlownRun:
+def fly_run(folder: Path, name: str, most: int, message: Callable[[str], None] = lambda _: None) -> EvaluatedRun:
     """Reads a run and flies its evaluation missions anew, as at its end.
 
     Args:
@@ -81,7 +81,7 @@ def fly_run(folder: Path, name: str, most: int, message: Callable[[str], None] =
             raise ValueError("something other than an object in a file of JSON")
     except (AttributeError, LookupError, OSError, RecursionError, TypeError, ValueError) as error:
         raise ConfigError(f"a file of the run in '{folder}' is not as a run writes it: {error}"[:300]) from None
-    missions, flights = _flown(config, params, AgentActor(config), most, f"'{folder}'", message)
+    missions, flights = _evaluate(config, params, AgentActor(config), most, f"'{folder}'", message)
     count, notes = len(flights.outcome), worlds_replaced(folder)
     if count < config.train.validation_missions:
         notes.append(f"{count} of the run's {config.train.validation_missions} evaluation flights are on this page.")
@@ -91,12 +91,12 @@ def fly_run(folder: Path, name: str, most: int, message: Callable[[str], None] =
             f"The last flight was recorded as {summary['outcome']} and ends as {ended} when it is flown here, where "
             "rounding is another."
         )
-    return FlownRun(name, config, text, params, missions, flights, summary, metrics, episodes, notes)
+    return EvaluatedRun(name, config, text, params, missions, flights, summary, metrics, episodes, notes)
 
 
 def fly_policy(
     policy: Policy | FunctionPolicy, name: str, most: int, message: Callable[[str], None] = lambda _: None
-) -> FlownRun:
+) -> EvaluatedRun:
     """Flies a policy that no folder holds on the missions that a run of its configuration ends with.
 
     Args:
@@ -109,11 +109,11 @@ def fly_policy(
         ConfigError: if it cannot fly there.
     """
     config = config_of(policy)
-    missions, flights = _flown(config, policy.params, actor_of(policy, config), most, f"'{name}'", message)
-    return FlownRun(name, config, config_text(config), policy.params, missions, flights, {}, [], {}, [])
+    missions, flights = _evaluate(config, policy.params, actor_of(policy, config), most, f"'{name}'", message)
+    return EvaluatedRun(name, config, config_text(config), policy.params, missions, flights, {}, [], {}, [])
 
 
-def _flown(
+def _evaluate(
     config: Config, params: PolicyParams | None, actor: Actor, most: int, name: str, message: Callable[[str], None]
 ) -> tuple[MissionSet, Flights]:
     missions = final_missions(config, most)
