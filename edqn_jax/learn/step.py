@@ -73,7 +73,6 @@ def train_step(
     of_agent, agent = learner_of(config).update(config, axis, networks.agent, Rings(ring, time, keys.dqn), last)
     networks = _refresh_acting_encoder(config, dataclasses.replace(networks, agent=agent), step)
     memory = _encode_observations(config, networks, actors, timestep, step)
-
     shaped = partial(_shaped, actors.reward.shape)
     outcome, reward = shaped(timestep.outcome), shaped(timestep.reward)
     actors = Actors(
