@@ -27,7 +27,7 @@ def unheard():
 
 with listen_to_signals() as stops:
     if sys.argv[1] == "obeyed":
-        with stops.obeyed(lambda text: print(text, flush=True)):
+        with stops.obey_signals(lambda text: print(text, flush=True)):
             unheard()
     unheard()
 """

@@ -19,7 +19,6 @@ from edqn_jax.config import (
     MotorsConfig,
     NoiseConfig,
 )
-from edqn_jax.errors import ConfigError
 from edqn_jax.learn import replay, saved_state
 from edqn_jax.learn.schedule import Schedule
 from edqn_jax.learn.state import TrainState, init_state
@@ -353,12 +352,6 @@ def test_agents_that_train_together_train_as_each_alone(on_two, world: EnvParams
     first, second = together.each(jax.tree.map(np.asarray, policy_of(together.config, two)))
     assert not _same(first, second)
     jax.tree.map(partial(np.testing.assert_allclose, rtol=1e-3, atol=1e-5), second, policy_of(together.config, state))
-
-
-def test_environments_that_do_not_divide_into_shards_are_refused_with_a_sentence(world: EnvParams) -> None:
-    config = dataclasses.replace(TINY, train=dataclasses.replace(TINY.train, num_envs=12))
-    with pytest.raises(ConfigError, match=r"num_envs \(12\).*multiples of train.shards \(8\)"):
-        init_state(config, world, jax.random.key(0))
 
 
 def _told(trained: tuple) -> tuple:
