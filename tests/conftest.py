@@ -16,7 +16,7 @@ QUICK_TO_COMPILE = (
 """XLA's flags with which a program compiles in less than half the time: what runs once need not be fast.
 
 Nor is it cut up for several threads, since each core has another process. What the package compiles with options of
-its own (`compiler_options`) keeps their level of optimisation.
+its own (`compiler_options`) has this level, too.
 """
 
 # For the processes that tests start as well, and before the package is imported, which adds its own. Whoever gives

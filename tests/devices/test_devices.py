@@ -112,10 +112,16 @@ def asked_anew() -> Iterator[None]:
     devices.compiler_options.cache_clear()
 
 
-def test_xla_knows_our_options_and_accelerators_have_none(asked_anew):
+def test_xla_knows_our_options_and_accelerators_have_none(asked_anew, monkeypatch):
+    monkeypatch.setenv("XLA_FLAGS", "")
     known = {"xla_cpu_experimental_ynn_fusion_type", "xla_backend_optimization_level"}
     assert set(devices.compiler_options("cpu")) == known
     assert devices.compiler_options("tpu") == {}
+
+
+def test_a_level_of_optimisation_that_somebody_chose_is_kept(asked_anew, monkeypatch):
+    monkeypatch.setenv("XLA_FLAGS", "--xla_backend_optimization_level=0")
+    assert "xla_backend_optimization_level" not in devices.compiler_options("cpu")
 
 
 def test_an_option_that_xla_does_not_know_is_left_out(asked_anew, monkeypatch):
