@@ -101,10 +101,9 @@ def evaluate(
         config, mission_set.world, policy.params, seed, actor=actor, record=record, shuffle_codes=shuffle_codes
     )
     shortest = shortest_paths(config, mission_set.world, np.asarray(flights.outcome) == Outcome.GOAL)
-    missions = dataclasses.replace(
-        mission_set, note=" ".join(filter(None, (mission_set.note, _unseen_look(policy, config)))) or None
-    )
-    return Evaluation(missions, flights, summarise_flights(flights, shortest, config.env.drones))
+    notes = " ".join(filter(None, (mission_set.note, _unseen_look(policy, config))))
+    mission_set = dataclasses.replace(mission_set, note=notes or None)
+    return Evaluation(mission_set, flights, summarise_flights(flights, shortest, config.env.drones))
 
 
 def _unseen_look(policy: Policy | FunctionPolicy, config: Config) -> str | None:

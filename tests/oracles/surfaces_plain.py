@@ -30,10 +30,11 @@ def pattern(name: str, shares: ArrayLike, q: NDArray) -> NDArray:
         case "blank":
             return np.zeros(q.shape[1:])
         case "waves":
-            return sum(share * wave(phase) for share, phase in zip((a, b, c, d), q, strict=True))
+            return np.sum([share * wave(phase) for share, phase in zip((a, b, c, d), q, strict=True)], axis=0)
         case "noise":
             finer = (q[2] + q[3], 2 * q[2] - q[1], 2 * q[3] + q[0], 3 * q[2] - 2 * q[3])
-            return sum(s * (wave(p) + 0.5 * wave(f)) for s, p, f in zip((a, b, c, d), q, finer, strict=True))
+            parts = zip((a, b, c, d), q, finer, strict=True)
+            return np.sum([share * (wave(phase) + 0.5 * wave(fine)) for share, phase, fine in parts], axis=0)
         case "checks":
             first, second = stripes(q[0], d), stripes(q[1], d)
             return a * first + b * first * second + c * second
@@ -52,10 +53,10 @@ def pattern(name: str, shares: ArrayLike, q: NDArray) -> NDArray:
 def pixel(name: str, shares: ArrayLike, at: NDArray, right: NDArray, up: NDArray, samples: int = 32) -> NDArray:
     """The average of a pattern over pixels, whose phases [4, ...] change by `right` and `up` from edge to edge."""
     steps = (np.arange(samples) + 0.5) / samples - 0.5
-    total = 0.0
+    total = np.zeros(at.shape[1:])
     for x in steps:
         for y in steps:
-            total = total + pattern(name, shares, at + x * right + y * up)
+            total += pattern(name, shares, at + x * right + y * up)
     return total / samples**2
 
 

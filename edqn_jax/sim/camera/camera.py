@@ -9,6 +9,7 @@ box-filtered over the pixel (`texture.py`).
 from __future__ import annotations
 
 import dataclasses
+from functools import partial
 from typing import Any, TypeVar
 
 import jax
@@ -93,12 +94,19 @@ def blend_layers(config: CameraConfig, frame: Frame, rays: Rays, layers: Layers)
 
 def _picture(config: CameraConfig, scene: Scene, origin: Array, rotation: Array, weights: Array) -> Array:
     """Returns brightness [H, W] under `weights` [3] of RGB."""
-    if config.mount == "level":
-        image = (scene, origin, rotation, weights)
-        size = (config.height, config.width)
-        return render_in_one_batch(
-            columns.render_columns, (config, blend_layers), image, size, natively=_pictures_natively
-        )
+    draw = columns.render_columns if config.mount == "level" else _tilted_pictures
+    image, size = (scene, origin, rotation, weights), (config.height, config.width)
+    return render_in_one_batch(draw, (config, blend_layers), image, size, natively=_pictures_natively)
+
+
+def _tilted_pictures(config: CameraConfig, finish: columns.Finish, *image: Any) -> Array:
+    """Returns what `columns.render_columns` does, of a camera that takes the full attitude."""
+    return jax.vmap(partial(_tilted_picture, config, finish))(*image)
+
+
+def _tilted_picture(
+    config: CameraConfig, finish: columns.Finish, scene: Scene, origin: Array, rotation: Array, weights: Array
+) -> Array:
     value = raycast.albedo_values(scene, weights)
     rays = raycast.camera_rays(config, rotation)
     many = raycast.camera_rays(config, rotation, config.samples_across, config.samples_down)
@@ -111,7 +119,7 @@ def _picture(config: CameraConfig, scene: Scene, origin: Array, rotation: Array,
     layers = coverage.sphere_layers(config, scene, origin, rays, value, layers)
     sky = jnp.sum(jnp.asarray(light.sky) * weights)
     frame = Frame(origin=origin, heading=rotation[:2, 0], scene=scene, value=value, sky=sky, surfaces=surfaces)
-    return materialise_tree(blend_layers(config, frame, rays, layers))
+    return materialise_tree(finish(config, frame, rays, layers))
 
 
 def render_luma(config: CameraConfig, scene: Scene, position: Array, rotation: Array) -> Array:
@@ -180,6 +188,5 @@ def _depths_natively(
     platform: str, config: CameraConfig, scene: Scene, position: Array, rotation: Array
 ) -> Array | None:
     """Returns `_depths` by the library in C; None if unsupported."""
-    return (
-        native.render_depth(config, scene, position, rotation) if native.can_render(config, scene, platform) else None
-    )
+    can = config.mount == "level" and native.can_render(config, scene, platform)
+    return native.render_depth(config, scene, position, rotation) if can else None

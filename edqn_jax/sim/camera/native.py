@@ -1,7 +1,7 @@
-"""The level camera in C, for CPUs and NVIDIA GPUs: calls `pictures.c` and `pictures.cu`.
+"""Cameras in C: the level one for CPUs and NVIDIA GPUs, pictures of one on the body for CPUs.
 
-Where there is a C compiler, or on GPUs CUDA's, pictures and depth images are drawn by it; everywhere else by the same
-functions in JAX (`columns.py`, `depth.py`). All agree to rounding (`tests/sim/camera/test_native.py`). It knows the
+Where there is a C compiler, or on GPUs CUDA's, they are drawn by `pictures.c` and `pictures.cu`; everywhere else by the
+same functions in JAX (`columns.py`, `depth.py`). All agree to rounding (`tests/sim/camera/test_native.py`). C knows the
 kinds of shape of `OPERANDS` alone: scenes with any other, one's own included, are drawn in JAX.
 """
 
@@ -25,7 +25,7 @@ from edqn_jax.sim.scene.shapes.plane import HORIZON_M
 from edqn_jax.sim.scene.surface import CONTRAST, KIND, PHASES, SHARES, SURFACE_NUMBERS
 
 SOURCES = {name: Path(__file__).with_name(f"pictures.{name}") for name in ("h", "c", "cu")}
-HEADERS = (SOURCES["h"], Path(__file__).with_name("patterns.h"))
+HEADERS = (SOURCES["h"], Path(__file__).with_name("patterns.h"), Path(__file__).with_name("tilted.h"))
 
 OPERANDS = {
     "boxes": ("position", "half", "yaw", "albedo"),
@@ -47,17 +47,14 @@ NOWHERE = 1e29
 def can_render(config: CameraConfig, scene: Scene, platform: str) -> bool:
     """Returns whether the library of "cpu" or "cuda" is at hand and draws such pictures; known when tracing."""
     others = [shapes for kind, shapes in scene.shapes().items() if kind not in OPERANDS]
-    plain = config.mount == "level" and not any(shapes.position.shape[-2] for shapes in others)
+    plain = (config.mount == "level" or platform == "cpu") and not any(shapes.position.shape[-2] for shapes in others)
     shapes = [getattr(getattr(scene, kind), name) for kind, names in OPERANDS.items() for name in names]
     plain = plain and scene.planes.position.shape[-2] <= MOST_PLANES
     return plain and all(leaf.dtype == jnp.float32 for leaf in shapes) and is_available(platform)
 
 
 def render_luma(config: CameraConfig, scene: Scene, origin: Array, rotation: Array, weights: Array) -> Array:
-    """Returns brightness [M, H, W] as `columns.render_columns` does; leading [L] as in `primitive`.
-
-    Origins are in metres.
-    """
+    """Returns brightness [M, H, W] as `columns.render_columns` does, origins in metres; leading [L] as in `primitive`."""
     return _call("edqn_pictures", config, scene, origin, rotation, weights)
 
 
@@ -75,7 +72,8 @@ def _call(target: str, config: CameraConfig, scene: Scene, *frames: Array) -> Ar
     waves = np.array(
         [[*np.divide(w.direction, config.texture_period_m * w.octave), w.weight] for w in WAVES], np.float32
     )
-    constants = np.array([raycast.pitch_of(config), config.texture_contrast], np.float32)
+    tilted = config.mount == "body", config.samples_across, config.samples_down
+    constants = np.array([raycast.pitch_of(config), config.texture_contrast, *tilted], np.float32)
     shapes = [getattr(getattr(scene, kind), name) for kind, names in OPERANDS.items() for name in names]
     origin, rotation, *weights = frames
     looks = [_daylight(config, scene), *(_surfaces(scene, kind) for kind in OPERANDS)] if weights else []

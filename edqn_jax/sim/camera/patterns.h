@@ -10,7 +10,8 @@ enum { UNKNOWN = -1, BLANK, OF_WAVES, OF_NOISE, OF_CHECKS, OF_BRICKS, OF_POSTERS
 
 /* What all pixels of a frame share of a phase of a surface. */
 typedef struct {
-  float k[3], at_eye, right, up, axis; /* cycles a metre; cycles at the eye; changes of k . ray over a pixel, by `high` */
+  float k[3], at_eye;    /* cycles a metre; cycles at the eye */
+  float right, up, axis; /* changes of k . ray over a pixel, and by `high` */
 } Row;
 
 typedef struct {

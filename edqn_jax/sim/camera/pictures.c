@@ -1,5 +1,5 @@
-/* Pictures and depth images of a level camera, for CPUs, as handlers of XLA's foreign function interface (`native.py`
- * compiles and registers them). What they are made of is in `pictures.h`.
+/* Pictures and depth images for CPUs, as handlers of XLA's foreign function interface (`native.py` compiles and
+ * registers them). What they are made of is in `pictures.h`; pictures of a camera on the body, in `tilted.h`.
  *
  * A column is drawn at a time, since few shapes cover one, and of its rows LANES at a time, in vectors as GCC and Clang
  * have them for any processor.
@@ -61,6 +61,7 @@ static inline float highest(Lanes x) {
 }
 
 #include "pictures.h"
+#include "tilted.h"
 
 /* An upright shape that covers the columns [first, last), and its numbers: NUMBERS arrays of `stride`. */
 typedef struct {
@@ -77,6 +78,8 @@ typedef struct {
   Extent* spheres;
   Layers* layers;
   Pattern* patterns; /* by shape */
+  Tilted* tilted;
+  float* heights; /* of the tilted ones' faces */
   int *covering, *found; /* shapes that cover each column, in order, and how many */
   int stride, most;
 } Work;
@@ -92,9 +95,12 @@ static int prepare(const Camera* c, const Shapes* s, Work* w) {
   w->u = malloc(sizeof(float) * (size_t)(w->stride + rows));
   w->spheres = malloc(sizeof(Extent) * (size_t)(s->spheres + 1));
   w->patterns = malloc(sizeof(Pattern) * (size_t)(uprights + s->spheres + s->planes + 1));
+  w->tilted = malloc(sizeof(Tilted) * (size_t)(uprights + 1));
+  w->heights = malloc(sizeof(float) * (c->tilted ? (size_t)uprights * 12 * (size_t)(c->across * w->stride) + 1 : 1));
   w->most = uprights + 1;
   w->found = malloc(sizeof(int) * (size_t)c->width * (size_t)(w->most + 1));
-  if (!w->numbers || !w->sides || !w->layers || !w->u || !w->found || !w->spheres || !w->patterns) return 0;
+  if (!w->numbers || !w->sides || !w->layers || !w->u || !w->found || !w->spheres) return 0;
+  if (!w->patterns || !w->tilted || !w->heights) return 0;
   w->covering = w->found + c->width;
   w->v = w->u + w->stride;
   /* What lies beyond the image repeats its edge, so that all numbers are finite. */
@@ -104,7 +110,49 @@ static int prepare(const Camera* c, const Shapes* s, Work* w) {
 }
 
 static void release(Work* w) {
-  free(w->numbers), free(w->sides), free(w->layers), free(w->u), free(w->found), free(w->spheres), free(w->patterns);
+  free(w->numbers), free(w->sides), free(w->layers), free(w->u), free(w->found), free(w->spheres);
+  free(w->patterns), free(w->tilted), free(w->heights);
+}
+
+/* Writes a column of blended layers. */
+static void finish(const Camera* c, const Shapes* s, const Plane* planes, const Eye* e, const Wave* waves, Work* w,
+                   const float* ahead, float* column) {
+  for (int b = 0; b < rounded_up(c->height) / LANES; ++b) {
+    const Lanes behind = blend(c, s, planes, e, waves, w->patterns, ahead, load(w->v + b * LANES), &w->layers[b]);
+    for (int l = 0; l < LANES && b * LANES + l < c->height; ++l) column[(b * LANES + l) * c->width] = behind[l];
+  }
+}
+
+/* Draws one frame of a camera that is fixed to the body, [H, C]. */
+static void draw_tilted(const Camera* c, const Shapes* s, const Eye* e, Work* w, const Wave* waves,
+                        const Plane* planes, float* picture) {
+  const int blocks = rounded_up(c->height) / LANES, of_shape = 12 * c->across * w->stride;
+  int visible = 0;
+  for (int n = 0; n < s->boxes + s->cylinders; ++n) {
+    Tilted* p = &w->tilted[visible];
+    if (!tilted_shape(c, s, e, n, p)) continue;
+    float* heights = w->heights + (size_t)visible++ * of_shape;
+    for (int first = p->first / LANES * LANES; first < p->last; first += LANES)
+      write_heights(c, p, load(w->u + first), heights + first, w->stride);
+  }
+  for (int n = 0; n < s->spheres; ++n) w->spheres[n] = extent_of_sphere(c, s, e, n);
+  for (int column = 0; column < c->width; ++column) {
+    float ahead[3];
+    ray_ahead(e, c->u[column], ahead);
+    for (int b = 0; b < blocks; ++b) w->layers[b].inserted = 0;
+    for (int n = 0; n < visible; ++n)
+      if (column >= w->tilted[n].first && column < w->tilted[n].last)
+        insert_tilted(c, &w->tilted[n], c->u[column], w->v, w->heights + (size_t)n * of_shape + column, w->stride,
+                      w->layers);
+    for (int n = 0; n < s->spheres; ++n) {
+      const Extent* p = &w->spheres[n];
+      if (c->u[column] < p->left || c->u[column] > p->right) continue;
+      for (int b = 0; b < blocks; ++b)
+        if (w->v[b * LANES] > p->bottom && w->v[b * LANES + LANES - 1] < p->top)
+          insert_sphere(c, s, e, n, ahead, load(w->v + b * LANES), &w->layers[b]);
+    }
+    finish(c, s, planes, e, waves, w, ahead, picture + column);
+  }
 }
 
 /* Draws one frame, [H, C]. */
@@ -115,6 +163,10 @@ static void draw(const Camera* c, const Shapes* s, const Eye* e, Work* w, float*
   planes_of(c, s, e, planes);
   light_planes(c, s, e, planes);
   for (int n = 0; n < s->boxes + s->cylinders + s->spheres + s->planes; ++n) w->patterns[n].kind = UNKNOWN;
+  if (c->tilted) {
+    draw_tilted(c, s, e, w, waves, planes, picture);
+    return;
+  }
   int visible = 0;
   for (int n = 0; n < s->boxes + s->cylinders; ++n) {
     Upright shape;
@@ -137,20 +189,18 @@ static void draw(const Camera* c, const Shapes* s, const Eye* e, Work* w, float*
     }
   const int blocks = rounded_up(c->height) / LANES;
   for (int column = 0; column < c->width; ++column) {
-    const float u = c->u[column], dx = e->cos + u * e->sin, dy = e->sin - u * e->cos;
+    const float u = c->u[column];
+    float ahead[3];
+    ray_ahead(e, u, ahead);
     for (int b = 0; b < blocks; ++b) w->layers[b].inserted = 0;
     for (int n = 0; n < s->spheres; ++n) /* A silhouette fades over half a pixel on either side. */
       if (u + 1.5f * c->pitch > w->spheres[n].left && u - 1.5f * c->pitch < w->spheres[n].right)
-        for (int b = 0; b < blocks; ++b) insert_sphere(c, s, e, n, u, load(w->v + b * LANES), &w->layers[b]);
+        for (int b = 0; b < blocks; ++b) insert_sphere(c, s, e, n, ahead, load(w->v + b * LANES), &w->layers[b]);
     for (int n = 0; n < w->found[column]; ++n) {
       const float* numbers = w->sides[w->covering[column * w->most + n]].numbers + column;
       for (int b = 0; b < blocks; ++b) insert_side(c, numbers, w->stride, b * LANES, &w->layers[b]);
     }
-    for (int b = 0; b < blocks; ++b) {
-      const Lanes behind = blend(c, s, planes, e, waves, w->patterns, dx, dy, load(w->v + b * LANES), &w->layers[b]);
-      for (int l = 0; l < LANES && b * LANES + l < c->height; ++l)
-        picture[(b * LANES + l) * c->width + column] = behind[l];
-    }
+    finish(c, s, planes, e, waves, w, ahead, picture + column);
   }
 }
 

@@ -111,7 +111,8 @@ static __global__ void __launch_bounds__(THREADS, RESIDENT) draw(const Batch bat
 
   const int uprights = s->boxes + s->cylinders, across = column_of(t), column = left + across;
   const int in_image = column < c->width;
-  const float u = c->u[in_image ? column : c->width - 1], dx = e->cos + u * e->sin, dy = e->sin - u * e->cos;
+  float ahead[3];
+  ray_ahead(e, c->u[in_image ? column : c->width - 1], ahead);
   int found = 0, kept = 0; /* kept: all that is shown stays in shared memory */
   for (int first = 0; first < c->height; first += ROWS) {
     const int row = first + row_of(t), drawn = in_image && row < c->height;
@@ -119,7 +120,7 @@ static __global__ void __launch_bounds__(THREADS, RESIDENT) draw(const Batch bat
     Layers layers;
     layers.inserted = 0;
     if (drawn)
-      for (int n = 0; n < s->spheres; ++n) insert_sphere(c, s, e, n, u, dz, &layers);
+      for (int n = 0; n < s->spheres; ++n) insert_sphere(c, s, e, n, ahead, dz, &layers);
     for (int base = 0; base < uprights; base += THREADS) {
       if (!kept) {
         Upright shape;
@@ -153,7 +154,7 @@ static __global__ void __launch_bounds__(THREADS, RESIDENT) draw(const Batch bat
     kept = uprights <= THREADS && found <= AT_ONCE;
     if (drawn)
       batch.pictures[((int64_t)m * c->height + row) * c->width + column] =
-          blend(c, s, frame.planes, e, waves, 0, dx, dy, dz, &layers);
+          blend(c, s, frame.planes, e, waves, 0, ahead, dz, &layers);
   }
 }
 

@@ -39,7 +39,7 @@ FN Lanes nearest_whole(Lanes x) { return (x + 12582912.0f) - 12582912.0f; }
 /* ------------------------------------------------------------------------------------------- what is drawn */
 
 typedef struct {
-  int height, width, waves;
+  int height, width, waves, tilted, across, down; /* across, down: rays a pixel, of a tilted image */
   float pitch, contrast, ambient;
   const float *sun, *sky; /* [3] each */
   const float *u, *v;     /* [C], [H] middles of pixels in the image plane */
@@ -59,7 +59,13 @@ typedef struct {
 typedef struct {
   const float *origin, *weights; /* [3] each */
   float cos, sin, sky;
+  float forward[3], right[3], up[3]; /* of the image, in the world */
 } Eye;
+
+/* The ray of a column at `u` at height 0 of the image; one at height `v` has v x e->up more. */
+FN void ray_ahead(const Eye* e, float u, float* ahead) {
+  UNROLLED for (int i = 0; i < 3; ++i) ahead[i] = e->forward[i] + u * e->right[i];
+}
 
 FN float dot3(const float* a, const float* b) { return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]; }
 
@@ -318,11 +324,12 @@ FN void insert_side(const Camera* c, const float* n, int stride, int first, Laye
   insert(layers, added);
 }
 
-/* Adds sphere `n` to the layers of the LANES rows along `dz` of the column at `u`. */
-FN void insert_sphere(const Camera* c, const Shapes* s, const Eye* e, int n, float u, Lanes dz, Layers* layers) {
+/* Adds sphere `n` to the layers of the LANES rows at heights `high` of a column. */
+FN void insert_sphere(const Camera* c, const Shapes* s, const Eye* e, int n, const float* ahead, Lanes high,
+                      Layers* layers) {
   const float *position = s->sphere_position + 3 * n, radius = s->sphere_radius[n];
   const float ox = e->origin[0] - position[0], oy = e->origin[1] - position[1], oz = e->origin[2] - position[2];
-  const float dx = e->cos + u * e->sin, dy = e->sin - u * e->cos;
+  const Lanes dx = ahead[0] + e->up[0] * high, dy = ahead[1] + e->up[1] * high, dz = ahead[2] + e->up[2] * high;
   const Lanes a = dx * dx + dy * dy + dz * dz;
   const Lanes nearest = -(ox * dx + oy * dy + oz * dz) / a;
   const Lanes px = ox + nearest * dx, py = oy + nearest * dy, pz = oz + nearest * dz;
@@ -348,14 +355,14 @@ FN void insert_sphere(const Camera* c, const Shapes* s, const Eye* e, int n, flo
 
 /* What all pixels of a frame share of each wave of the texture. */
 typedef struct ALIGNED {
-  float kx, ky, kz, weight, at_origin, right, up;
+  float k[3], weight, at_origin, right, up, per_high;
 } Wave;
 
 FN void waves_of(const Camera* c, const Eye* e, Wave* waves) {
   for (int i = 0; i < c->waves; ++i) {
     const float* k = c->wave + 4 * i;
-    const Wave wave = {k[0],           k[1], k[2], k[3], dot3(k, e->origin), (k[0] * e->sin - k[1] * e->cos) * c->pitch,
-                       k[2] * c->pitch};
+    const float right = dot3(k, e->right), up = dot3(k, e->up);
+    const Wave wave = {{k[0], k[1], k[2]}, k[3], dot3(k, e->origin), right * c->pitch, up * c->pitch, up};
     waves[i] = wave;
   }
 }
@@ -372,13 +379,14 @@ typedef struct {
 
 #define MEETINGS (DEPTH_OF_LAYERS + 1) /* with layers, and with what is behind them */
 
-/* Writes the texture's factor on LANES rows of a column at those meetings whose bit of `wanted` is set. */
-FN void textures(const Camera* c, const Wave* waves, float dx, float dy, Lanes dz, const Meeting* at, unsigned wanted,
-                 Lanes* factor) {
+/* Writes the texture's factor on LANES rows, at heights `high`, of a column at those meetings whose bit of `wanted` is
+ * set. */
+FN void textures(const Camera* c, const Wave* waves, const float* ahead, Lanes high, const Meeting* at,
+                 unsigned wanted, Lanes* factor) {
   UNROLLED for (int k = 0; k < MEETINGS; ++k) factor[k] = lanes(0);
   for (int i = 0; i < c->waves; ++i) {
     const Wave w = waves[i];
-    const Lanes along = (w.kx * dx + w.ky * dy) + w.kz * dz;
+    const Lanes along = dot3(w.k, ahead) + w.per_high * high;
     UNROLLED for (int k = 0; k < MEETINGS; ++k) {
       if (!(wanted >> k & 1)) continue;
       const Lanes phase = w.at_origin + at[k].depth * along, f = phase - nearest_whole(phase);
@@ -399,10 +407,11 @@ FN Pattern pattern_of_shape(const Camera* c, const Shapes* s, const Eye* e, int 
   const int counts[4] = {s->boxes, s->cylinders, s->spheres, s->planes};
   const float* places[4] = {s->box_position, s->cylinder_position, s->sphere_position, s->plane_position};
   const float* surfaces[4] = {s->box_surface, s->cylinder_surface, s->sphere_surface, s->plane_surface};
-  const float up[3] = {0, 0, c->pitch}, right[3] = {e->sin * c->pitch, -e->cos * c->pitch, 0}, axis[3] = {0, 0, 1};
+  float right[3], up[3];
+  UNROLLED for (int i = 0; i < 3; ++i) right[i] = e->right[i] * c->pitch, up[i] = e->up[i] * c->pitch;
   int kind = 0;
   while (kind < 3 && n >= counts[kind]) n -= counts[kind++];
-  return pattern_of(surfaces[kind] + SURFACE_NUMBERS * n, places[kind] + 3 * n, e->origin, right, up, axis);
+  return pattern_of(surfaces[kind] + SURFACE_NUMBERS * n, places[kind] + 3 * n, e->origin, right, up, e->up);
 }
 
 /* Returns the relative albedo of the shapes that LANES rays meet, 1 where their number is negative. Patterns that were
@@ -423,17 +432,18 @@ FN Lanes albedo_of(const Camera* c, const Shapes* s, const Eye* e, Pattern* know
 
 /* What all pixels of a frame share of a plane. */
 typedef struct {
-  float nx, ny, nz, height; /* normal; of the eye above it */
-  float across, along, spread, value;
+  float normal[3], height; /* of the eye above it */
+  float per_high, across, along, spread, value;
 } Plane;
 
 FN void planes_of(const Camera* c, const Shapes* s, const Eye* e, Plane* planes) {
   for (int n = 0; n < s->planes; ++n) {
     const float *normal = s->plane_normal + 3 * n, *at = s->plane_position + 3 * n;
     Plane* p = &planes[n];
-    p->nx = normal[0], p->ny = normal[1], p->nz = normal[2];
-    p->height = (e->origin[0] - at[0]) * p->nx + (e->origin[1] - at[1]) * p->ny + (e->origin[2] - at[2]) * p->nz;
-    p->across = (p->nx * e->sin - p->ny * e->cos) * c->pitch, p->along = p->nz * c->pitch;
+    const float above[3] = {e->origin[0] - at[0], e->origin[1] - at[1], e->origin[2] - at[2]};
+    p->normal[0] = normal[0], p->normal[1] = normal[1], p->normal[2] = normal[2];
+    p->height = dot3(above, normal), p->per_high = dot3(normal, e->up);
+    p->across = dot3(normal, e->right) * c->pitch, p->along = p->per_high * c->pitch;
     p->spread = fabsf(p->across) + fabsf(p->along);
   }
 }
@@ -441,18 +451,19 @@ FN void planes_of(const Camera* c, const Shapes* s, const Eye* e, Plane* planes)
 /* Their brightness, which depth images do without. */
 FN void light_planes(const Camera* c, const Shapes* s, const Eye* e, Plane* planes) {
   for (int n = 0; n < s->planes; ++n)
-    planes[n].value = shade(c, planes[n].nx, planes[n].ny, planes[n].nz) * dot3(s->plane_albedo + 3 * n, e->weights);
+    planes[n].value = shade(c, planes[n].normal[0], planes[n].normal[1], planes[n].normal[2]) *
+                      dot3(s->plane_albedo + 3 * n, e->weights);
 }
 
-/* Where LANES rays, along `dz` in the column along (dx, dy), meet ground or another plane; its brightness without
+/* Where LANES rays of a column, at heights `high`, meet ground or another plane; its brightness without
  * texture, which share of the pixels it covers, and which it is, or -1. */
-FN void meet_planes(const Plane* planes, int count, float dx, float dy, Lanes dz, Meeting* at, Lanes* shown,
+FN void meet_planes(const Plane* planes, int count, const float* ahead, Lanes high, Meeting* at, Lanes* shown,
                     Lanes* share, Lanes* which) {
   const Meeting none = {lanes(NOWHERE), lanes(0), lanes(0)};
   *at = none, *shown = lanes(0), *share = lanes(0), *which = lanes(-1);
   for (int n = 0; n < count; ++n) {
     const Plane* p = &planes[n];
-    const Lanes approach = p->nx * dx + p->ny * dy + p->nz * dz;
+    const Lanes approach = dot3(p->normal, ahead) + p->per_high * high;
     const Lanes part = between(0.5f - approach * inverse(p->spread), 0, 1);
     const Lanes middle = (approach - p->spread / 2 + lesser(approach + p->spread / 2, lanes(0))) / 2;
     const Lanes per_middle = inverses(middle), t = -p->height * per_middle, relative = -t * per_middle;
@@ -482,7 +493,7 @@ FN void surfaces(const Camera* c, const Shapes* s, const Eye* e, Pattern* known,
 
 /* Blends the layers of LANES rows over planes and the sky. */
 FN Lanes blend(const Camera* c, const Shapes* s, const Plane* planes, const Eye* e, const Wave* waves,
-               Pattern* known, float dx, float dy, Lanes dz, const Layers* layers) {
+               Pattern* known, const float* ahead, Lanes high, const Layers* layers) {
   const int used = layers->inserted < DEPTH_OF_LAYERS ? layers->inserted : DEPTH_OF_LAYERS;
   int visible = 0, hidden = 0; /* layers before, and with, the first that covers all that lies behind it */
   UNROLLED for (int k = 0; k < DEPTH_OF_LAYERS; ++k) if (k < used && !hidden)
@@ -498,17 +509,16 @@ FN Lanes blend(const Camera* c, const Shapes* s, const Plane* planes, const Eye*
     const Mask level = layer->slope == LEVEL_FACE;
     const Lanes near = pick(layer->closeness > 0, inverses(layer->closeness), lanes(0));
     at[k].depth = near, at[k].right = pick(level, lanes(0), -near * near * layer->slope);
-    at[k].up = pick(level, -near * inverses(dz) * c->pitch, lanes(0));
+    at[k].up = pick(level, -near * inverses(high) * c->pitch, lanes(0));
   }
   if (!hidden) {
-    meet_planes(planes, s->planes, dx, dy, dz, &at[DEPTH_OF_LAYERS], &shown, &share, &plane);
+    meet_planes(planes, s->planes, ahead, high, &at[DEPTH_OF_LAYERS], &shown, &share, &plane);
     wanted |= (unsigned)(any_of(share > 0) != 0) << DEPTH_OF_LAYERS;
   }
-  const float ahead[3] = {dx, dy, 0};
   if (s->patterned)
-    surfaces(c, s, e, known, ahead, dz, at, layers, wanted, plane, factor);
+    surfaces(c, s, e, known, ahead, high, at, layers, wanted, plane, factor);
   else
-    textures(c, waves, dx, dy, dz, at, wanted, factor);
+    textures(c, waves, ahead, high, at, wanted, factor);
 
   Lanes behind = lanes(hidden ? 0 : e->sky);
   if (wanted >> DEPTH_OF_LAYERS & 1) behind += share * (shown * factor[DEPTH_OF_LAYERS] - behind);
@@ -587,7 +597,8 @@ FN Lanes nearest_of_others(const Shapes* s, const Plane* planes, const Eye* e, f
   Lanes nearest = lanes(NOWHERE);
   for (int n = 0; n < s->planes; ++n) {
     const Plane* p = &planes[n];
-    const Lanes approach = p->nx * dx + p->ny * dy + p->nz * dz, t = -p->height * inverses(approach);
+    const float ahead = p->normal[0] * dx + p->normal[1] * dy;
+    const Lanes approach = ahead + p->normal[2] * dz, t = -p->height * inverses(approach);
     nearest = pick((approach < 0) & (t > 0) & (t < HORIZON_M) & (t < nearest), t, nearest);
   }
   for (int n = 0; n < s->spheres; ++n) {
@@ -641,7 +652,7 @@ FN void frame_of(const Batch* b, const float* const* of, Camera* c, Shapes* s, E
   const float *k = of[CONSTANTS], *r = of[ROTATION], scale = 1.0f / sqrtf(most(r[0] * r[0] + r[3] * r[3], TINY));
   c->height = b->height, c->width = b->width, c->waves = b->waves;
   const float* light = of[LIGHT];
-  c->pitch = k[0], c->contrast = k[1];
+  c->tilted = k[2] != 0, c->pitch = k[0], c->contrast = k[1], c->across = (int)k[3], c->down = (int)k[4];
   if (light) c->ambient = light[0], c->sun = light + 1, c->sky = light + 4;
   c->u = of[U], c->v = of[V], c->wave = of[WAVES];
   s->boxes = b->boxes, s->cylinders = b->cylinders, s->spheres = b->spheres, s->planes = b->planes;
@@ -655,6 +666,11 @@ FN void frame_of(const Batch* b, const float* const* of, Camera* c, Shapes* s, E
   s->sphere_surface = of[SURFACES + 2], s->plane_surface = of[SURFACES + 3];
   e->origin = of[ORIGIN], e->weights = of[WEIGHTS], e->cos = r[0] * scale, e->sin = r[3] * scale;
   e->sky = of[WEIGHTS] ? dot3(c->sky, e->weights) : 0;
+  const float forward[3] = {e->cos, e->sin, 0}, right[3] = {e->sin, -e->cos, 0}, up[3] = {0, 0, 1};
+  UNROLLED for (int i = 0; i < 3; ++i) {
+    e->forward[i] = c->tilted ? r[3 * i] : forward[i], e->right[i] = c->tilted ? -r[3 * i + 1] : right[i];
+    e->up[i] = c->tilted ? r[3 * i + 2] : up[i];
+  }
 }
 
 /* Reads a call of XLA's into a batch; returns an error for XLA to raise, or 0. Depth images end before LIGHT. */

@@ -8,6 +8,7 @@ taken for products of averages, and what is warped for as steep as it is in the 
 
 from __future__ import annotations
 
+import functools
 from typing import NamedTuple
 
 import jax.numpy as jnp
@@ -74,7 +75,8 @@ def pulse(phase: Phase, width: float | Array) -> Array:
 
 
 def _waves(shares: list[Array], phases: list[Phase]) -> Array:
-    return sum(share * smooth(phase) for share, phase in zip(shares, phases, strict=True))
+    parts = [share * smooth(phase) for share, phase in zip(shares, phases, strict=True)]
+    return functools.reduce(jnp.add, parts)
 
 
 def overtones(p: list[Phase]) -> list[Phase]:
@@ -196,7 +198,7 @@ def albedo_factor(
         depth: [H, W] finite.
         slope_right, slope_up: [H, W] change of depth per pixel on the surface.
     """
-    shown = surfaces.numbers.at[jnp.maximum(shape, 0).astype(jnp.int32)].get(mode="clip")
+    shown = jnp.asarray(surfaces.numbers).at[jnp.maximum(shape, 0).astype(jnp.int32)].get(mode="clip")
     numbers = list(jnp.moveaxis(shown, -1, 0))
     phases = []
     for first in range(PHASES, PHASES + 16, 4):

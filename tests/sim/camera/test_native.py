@@ -7,6 +7,7 @@ import shutil
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
+from typing import Literal
 
 import jax
 import jax.numpy as jnp
@@ -137,6 +138,27 @@ def test_c_draws_the_worlds_of_a_family_as_jax_does(worlds: dict[str, list[Scene
         agree(CONFIG, *frames(worlds[family], 128, seed=8), ties=TIES)
 
 
+@pytest.mark.parametrize("size", [(32, 24), (13, 7)], ids=["usual", "no multiple of a vector"])
+@pytest.mark.parametrize("patterned", [False, True], ids=["plaid", "patterns"])
+def test_c_draws_what_jax_does_of_a_camera_on_the_body(size: tuple[int, int], patterned: bool) -> None:
+    if not native.is_available("cpu"):
+        return
+    config = dataclasses.replace(CONFIG, width=size[0], height=size[1], mount="body")
+    rng = np.random.default_rng(12)
+    worlds = [looking(crowd(rng), seed) if patterned else crowd(rng) for seed in range(4)]
+    scene, origin, _ = frames(worlds, 96, seed=13)
+    tilts = np.concatenate([rng.uniform(-0.6, 0.6, (96, 2)), rng.uniform(-np.pi, np.pi, (96, 1))], axis=1)
+    rotation = jnp.asarray(np.stack([rotation_of(*tilt) for tilt in tilts]), jnp.float32)
+    weights = jnp.broadcast_to(jnp.asarray(LUMA_WEIGHTS), origin.shape)
+    picture = np.asarray(jax.jit(partial(native.render_luma, config))(scene, origin, rotation, weights))
+    plain = np.asarray(
+        jax.jit(partial(camera._tilted_pictures, config, camera.blend_layers))(scene, origin, rotation, weights)
+    )
+    differ = np.abs(picture - plain) > ROUNDING
+    assert np.isfinite(picture).all() and np.mean(differ) <= TIES, (np.mean(differ), np.abs(picture - plain).max())
+    assert picture.std() > 0.05
+
+
 @pytest.fixture(scope="module")
 def kernels() -> bool:
     """Whether the kernels of GPUs are registered for the CPU, where there is a compiler."""
@@ -186,10 +208,12 @@ def test_the_kernels_of_gpus_draw_every_pattern(kernels: bool, monkeypatch: pyte
         agree(CONFIG, *patterned_frames(np.random.default_rng(8)), ties=TIES)
 
 
-def test_a_world_with_other_shapes_and_a_camera_on_the_body_are_drawn_by_jax() -> None:
+def test_a_world_with_other_shapes_is_drawn_by_jax_and_on_gpus_a_camera_on_the_body() -> None:
     rng = np.random.default_rng(0)
     assert not native.can_render(CONFIG, every_kind(rng), "cpu")
-    assert not native.can_render(dataclasses.replace(CONFIG, mount="body"), crowd(rng), "cpu")
+    tilted = dataclasses.replace(CONFIG, mount="body")
+    assert native.can_render(tilted, crowd(rng), "cpu") is native.is_available("cpu")
+    assert not native.can_render(tilted, crowd(rng), "cuda")
     walls = [GROUND] * native.MOST_PLANES
     assert native.can_render(CONFIG, scene_of(*walls), "cpu") is native.is_available("cpu")
     assert not native.can_render(CONFIG, scene_of(*walls, GROUND), "cpu")
@@ -212,9 +236,10 @@ def test_a_frame_is_the_same_to_the_bit_however_it_is_mapped() -> None:
         np.testing.assert_array_equal(own, other)
 
 
-def test_poses_that_are_not_finite_spoil_their_own_frame_alone() -> None:
+@pytest.mark.parametrize("mount", ["level", "body"])
+def test_poses_that_are_not_finite_spoil_their_own_frame_alone(mount: Literal["level", "body"]) -> None:
     scene, origin, rotation = frames([crowd(np.random.default_rng(1))], 6, seed=2)
-    draw = jax.vmap(partial(camera.render_luma, CONFIG))
+    draw = jax.vmap(partial(camera.render_luma, dataclasses.replace(CONFIG, mount=mount)))
     good = np.asarray(draw(scene, origin, rotation))
     bad = np.asarray(draw(scene, origin.at[1].set(jnp.nan).at[4].set(jnp.inf), rotation.at[2].set(jnp.nan)))
     np.testing.assert_array_equal(bad[[0, 3, 5]], good[[0, 3, 5]])

@@ -1,5 +1,7 @@
 """Looks of random worlds."""
 
+# pyright: reportOptionalMemberAccess=false
+
 from __future__ import annotations
 
 import dataclasses

@@ -1,0 +1,257 @@
+/* Upright shapes under a camera that is fixed to the body, where no side is a vertical line: coverage is counted over a
+ * few rays a pixel, as `coverage.counted_layers` does; `pictures.c` includes this.
+ *
+ * Faces of boxes are convex and flat: the rays of one column meet one in an interval of heights, and closeness is
+ * linear in the image. So a column's intervals are computed once for all of its rows.
+ */
+
+#ifndef EDQN_TILTED_H
+#define EDQN_TILTED_H
+
+#define CUT_M 1e-3f /* nearest depth of what is projected */
+#define MOST_CORNERS 8 /* of a rectangle that a plane cuts: 5, or twice 4 of numbers that are not finite */
+
+/* A face of a box in the image, convex, and what is seen there. */
+typedef struct {
+  int corners;
+  float u[MOST_CORNERS], v[MOST_CORNERS];
+  float at_zero, per_u, per_v, bright; /* closeness there, its changes; brightness */
+} Face;
+
+/* A box or a cylinder, in its own frame. */
+typedef struct {
+  int is_box, first, last, faces; /* columns that it may cover, the last excluded; faces that are seen */
+  float origin[3], forward[3], right[3], up[3]; /* the eye from its middle; the image's axes */
+  float half[3], radius, value, shape, sun[2];
+  float bright[3]; /* of the faces that the eye may see; of a cylinder the third, of its end */
+  Face face[6];    /* of a cylinder those of the box around it, which faces the eye; all six from within */
+} Tilted;
+
+/* What LANES rays meet: whether, how close it is, and the brightness there. */
+typedef struct {
+  Mask hit;
+  Lanes closeness, bright;
+} Met;
+
+/* Rays d meet a cylinder of radius r at closeness k where |o k + d| = r k, with the eye at o from its axis: solved
+ * without a division by what differs between rays. Its end, where the eye is beyond it, lies in a plane. */
+FN Met meet_cylinder(const Camera* c, const Tilted* p, float u, Lanes v) {
+  const float x = p->origin[0], z = p->origin[2], r2 = p->radius * p->radius, beyond = fabsf(z) - p->half[2];
+  const Lanes dx = (p->forward[0] + u * p->right[0]) + v * p->up[0];
+  const Lanes dy = (p->forward[1] + u * p->right[1]) + v * p->up[1];
+  const Lanes dz = (p->forward[2] + u * p->right[2]) + v * p->up[2];
+  Met met = {v != v, lanes(0), lanes(0)};
+  if (x > p->radius) {
+    const Lanes under = r2 * (dx * dx + dy * dy) - x * x * dy * dy;
+    const Lanes k = (roots(greater(under, lanes(0))) - x * dx) / (x * x - r2);
+    met.hit = (under > 0) & (k > 0) & (absolute(z * k + dz) <= p->half[2] * k);
+    if (any_of(met.hit)) {
+      const Lanes lit = ((x * k + dx) * p->sun[0] + dy * p->sun[1]) / (p->radius * greater(k, lanes(TINY)));
+      met.closeness = k, met.bright = p->value * (c->ambient + (1 - c->ambient) * greater(lit, lanes(0)));
+    }
+  }
+  if (beyond > 0) {
+    const Lanes k = dz / (z > 0 ? -beyond : beyond), px = x * k + dx;
+    const Mask on_end = (k > 0) & (px * px + dy * dy <= r2 * k * k);
+    met.hit |= on_end, met.closeness = pick(on_end, k, met.closeness);
+    met.bright = pick(on_end, lanes(p->bright[2]), met.bright);
+  }
+  return met;
+}
+
+/* Sets a face of a box from its axis and side: what of it is in front of the near plane; returns whether any is. */
+FN int face_of(const Tilted* p, int axis, float side, Face* f) {
+  const int one = (axis + 1) % 3, other = (axis + 2) % 3;
+  float at[4][3], ahead[4];
+  for (int i = 0; i < 4; ++i) {
+    at[i][axis] = side * p->half[axis] - p->origin[axis];
+    at[i][one] = (i == 1 || i == 2 ? p->half[one] : -p->half[one]) - p->origin[one];
+    at[i][other] = (i >= 2 ? p->half[other] : -p->half[other]) - p->origin[other];
+    ahead[i] = dot3(at[i], p->forward);
+  }
+  f->corners = 0;
+  for (int i = 0; i < 4; ++i) {
+    const int j = (i + 1) & 3;
+    if (ahead[i] >= CUT_M) {
+      f->u[f->corners] = dot3(at[i], p->right) / ahead[i], f->v[f->corners++] = dot3(at[i], p->up) / ahead[i];
+    }
+    if ((ahead[i] >= CUT_M) != (ahead[j] >= CUT_M)) {
+      const float share = (CUT_M - ahead[i]) / (ahead[j] - ahead[i]);
+      float cut[3];
+      for (int k = 0; k < 3; ++k) cut[k] = at[i][k] + share * (at[j][k] - at[i][k]);
+      f->u[f->corners] = dot3(cut, p->right) / CUT_M, f->v[f->corners++] = dot3(cut, p->up) / CUT_M;
+    }
+  }
+  const float plane = inverse(side * p->half[axis] - p->origin[axis]);
+  f->at_zero = p->forward[axis] * plane, f->per_u = p->right[axis] * plane, f->per_v = p->up[axis] * plane;
+  f->bright = p->bright[axis];
+  return f->corners > 2;
+}
+
+/* Sets the faces that the eye may see and the columns that they cover; returns whether there are any. */
+FN int faces_of(const Camera* c, Tilted* p) {
+  float left = NOWHERE, right = -NOWHERE;
+  int outside = 0;
+  for (int k = 0; k < 3; ++k) outside |= fabsf(p->origin[k]) > p->half[k];
+  if (!outside && p->is_box) return 0;
+  p->faces = 0;
+  for (int k = 0; k < 3; ++k)
+    for (float side = -1; side < 2; side += 2) {
+      Face* f = &p->face[p->faces];
+      if (outside && !(side * p->origin[k] > p->half[k])) continue;
+      if (!face_of(p, k, side, f)) continue;
+      for (int i = 0; i < f->corners; ++i) left = least(left, f->u[i]), right = most(right, f->u[i]);
+      ++p->faces;
+    }
+  columns_between(c, left, right, &p->first, &p->last);
+  return p->faces && p->first < p->last;
+}
+
+/* The heights between which LANES columns at `u` are on a face; empty if the first is above the second. */
+FN void heights_on(const Face* f, Lanes u, Lanes* low, Lanes* high) {
+  *low = lanes(NOWHERE), *high = lanes(-NOWHERE);
+  for (int i = 0; i < f->corners; ++i) {
+    const int j = i + 1 < f->corners ? i + 1 : 0;
+    const float from = least(f->u[i], f->u[j]), to = most(f->u[i], f->u[j]);
+    const float slope = (f->v[j] - f->v[i]) * inverse(f->u[j] - f->u[i]);
+    const Mask here = (u >= from) & (u < to);
+    const Lanes v = f->v[i] + (u - f->u[i]) * slope;
+    *low = pick(here & (v < *low), v, *low), *high = pick(here & (v > *high), v, *high);
+  }
+}
+
+/* Whether no part of a ball about a place, `to` [3] from the eye, can be in the image. */
+FN int ball_out_of_sight(const Camera* c, const Eye* e, const float* to, float radius) {
+  const float ahead = dot3(to, e->forward), right = fabsf(dot3(to, e->right)), up = fabsf(dot3(to, e->up));
+  const float edge = 0.5f * c->pitch * c->width, top = 0.5f * c->pitch * c->height;
+  return ahead + radius < 0 || right - edge * ahead > radius * sqrtf(1 + edge * edge) ||
+         up - top * ahead > radius * sqrtf(1 + top * top);
+}
+
+/* Returns whether upright shape `n`, boxes first, may be seen, and what pixels need of it. */
+FN int tilted_shape(const Camera* c, const Shapes* s, const Eye* e, int n, Tilted* p) {
+  const int is_box = n < s->boxes, i = is_box ? n : n - s->boxes;
+  const float* at = is_box ? s->box_position + 3 * i : s->cylinder_position + 3 * i;
+  const float away[3] = {e->origin[0] - at[0], e->origin[1] - at[1], e->origin[2] - at[2]};
+  const float to[3] = {-away[0], -away[1], -away[2]}, *half = s->box_half + 3 * i;
+  const float radius = is_box ? 0 : s->cylinder_radius[i], tall = is_box ? 0 : s->cylinder_half[i];
+  const float reach = sqrtf(is_box ? dot3(half, half) : radius * radius + tall * tall);
+  if (ball_out_of_sight(c, e, to, reach * 1.0001f + 1e-3f)) return 0;
+  const float flat = most(sqrtf(away[0] * away[0] + away[1] * away[1]), TINY);
+  const float cos = is_box ? cosf(s->box_yaw[i]) : away[0] / flat, sin = is_box ? sinf(s->box_yaw[i]) : away[1] / flat;
+  const float axes[3][3] = {{cos, sin, 0}, {-sin, cos, 0}, {0, 0, 1}};
+  p->is_box = is_box, p->shape = (float)n, p->radius = radius;
+  for (int k = 0; k < 3; ++k) {
+    p->origin[k] = dot3(axes[k], away), p->forward[k] = dot3(axes[k], e->forward);
+    p->right[k] = dot3(axes[k], e->right), p->up[k] = dot3(axes[k], e->up);
+    p->half[k] = is_box ? half[k] : k < 2 ? radius : tall;
+  }
+  p->value = dot3(is_box ? s->box_albedo + 3 * i : s->cylinder_albedo + 3 * i, e->weights);
+  p->sun[0] = dot3(axes[0], c->sun), p->sun[1] = dot3(axes[1], c->sun);
+  for (int k = 0; k < 3; ++k) {
+    const float sign = p->origin[k] > 0 ? 1 : -1;
+    p->bright[k] = p->value * shade(c, sign * axes[k][0], sign * axes[k][1], sign * axes[k][2]);
+  }
+  return faces_of(c, p);
+}
+
+/* Writes the heights between which a shape's faces are seen in the columns from `first` on, at every ray across: of
+ * face f and ray a, low and high, `stride` apart. */
+FN void write_heights(const Camera* c, const Tilted* p, Lanes u, float* heights, int stride) {
+  for (int f = 0; f < p->faces; ++f)
+    for (int a = 0; a < c->across; ++a) {
+      Lanes low, high;
+      heights_on(&p->face[f], u + c->pitch * ((a + 0.5f) / c->across - 0.5f), &low, &high);
+      float* to = heights + 2 * (f * c->across + a) * stride;
+      store(to, low), store(to + stride, high);
+    }
+}
+
+/* Adds what LANES rows at `high` of a column at `u` show of a box. */
+FN void insert_box(const Camera* c, const Tilted* p, float u, Lanes high, const float* heights, int stride,
+                   Layers* layers) {
+  Lanes count = lanes(0), closeness = lanes(0), value = lanes(0);
+  for (int n = 0; n < p->faces; ++n) {
+    const Face* f = &p->face[n];
+    Lanes on_face = lanes(0);
+    for (int a = 0; a < c->across; ++a, heights += 2 * stride) {
+      const float low = heights[0], top = heights[stride];
+      if (low > top) continue;
+      const float shift = c->pitch * ((a + 0.5f) / c->across - 0.5f), ahead = f->at_zero + (u + shift) * f->per_u;
+      for (int d = 0; d < c->down; ++d) {
+        const Lanes v = high + c->pitch * ((d + 0.5f) / c->down - 0.5f);
+        const Mask hit = (v >= low) & (v < top);
+        on_face += pick(hit, lanes(1), lanes(0)), closeness += pick(hit, ahead + v * f->per_v, lanes(0));
+      }
+    }
+    count += on_face, value += f->bright * on_face;
+  }
+  if (!any_of(count > 0)) return;
+  const float per_ray = 1.0f / (c->across * c->down);
+  const Layer added = {closeness / greater(count, lanes(TINY)), count * per_ray, value * per_ray, lanes(0),
+                       lanes(p->shape)};
+  insert(layers, added);
+}
+
+/* The same of a cylinder. */
+FN void insert_cylinder(const Camera* c, const Tilted* p, float u, Lanes high, const float* heights, int stride,
+                        Layers* layers) {
+  Lanes count = lanes(0), closeness = lanes(0), value = lanes(0);
+  for (int a = 0; a < c->across; ++a) {
+    float low = NOWHERE, top = -NOWHERE;
+    for (int f = 0; f < p->faces; ++f) {
+      const float* of = heights + 2 * (f * c->across + a) * stride;
+      low = least(low, of[0]), top = most(top, of[stride]);
+    }
+    if (low > top || !any_of((high + c->pitch > low) & (high - c->pitch < top))) continue;
+    for (int d = 0; d < c->down; ++d) {
+      const Met met = meet_cylinder(c, p, u + c->pitch * ((a + 0.5f) / c->across - 0.5f),
+                                    high + c->pitch * ((d + 0.5f) / c->down - 0.5f));
+      count += pick(met.hit, lanes(1), lanes(0)), value += pick(met.hit, met.bright, lanes(0));
+      closeness += pick(met.hit, met.closeness, lanes(0));
+    }
+  }
+  if (!any_of(count > 0)) return;
+  const float per_ray = 1.0f / (c->across * c->down);
+  const Layer added = {closeness / greater(count, lanes(TINY)), count * per_ray, value * per_ray, lanes(0),
+                       lanes(p->shape)};
+  insert(layers, added);
+}
+
+/* The part of the image, a pixel and a half wider, in which a sphere may be seen. */
+FN Extent extent_of_sphere(const Camera* c, const Shapes* s, const Eye* e, int n) {
+  const float *at = s->sphere_position + 3 * n, r = s->sphere_radius[n], margin = 1.5f * c->pitch;
+  const float to[3] = {at[0] - e->origin[0], at[1] - e->origin[1], at[2] - e->origin[2]};
+  const float ahead = dot3(to, e->forward), right = dot3(to, e->right), up = dot3(to, e->up);
+  const float near = ahead - r, far = ahead + r;
+  Extent found = {-FAR_U, FAR_U, -FAR_U, FAR_U, 0, 0, 0};
+  if (near > NEAR_M) {
+    found.left = (right - r) / (right > r ? far : near) - margin;
+    found.right = (right + r) / (right > -r ? near : far) + margin;
+    found.bottom = (up - r) / (up > r ? far : near) - margin, found.top = (up + r) / (up > -r ? near : far) + margin;
+  }
+  if (far < 0) found.left = NOWHERE;
+  return found;
+}
+
+/* Adds a shape to the layers of the rows of a column at `u`, of heights `v` and in blocks of LANES. */
+FN void insert_tilted(const Camera* c, const Tilted* p, float u, const float* v, const float* heights, int stride,
+                      Layers* layers) {
+  float low = NOWHERE, high = -NOWHERE;
+  for (int k = 0; k < p->faces * c->across; ++k) {
+    low = least(low, heights[2 * k * stride]), high = most(high, heights[(2 * k + 1) * stride]);
+  }
+  if (low > high) return;
+  /* A pixel of which no ray across meets the box around a cylinder may not meet it either. */
+  const float reach = c->pitch;
+  for (int first = 0; first < c->height; first += LANES, ++layers) {
+    const int last = first + LANES < c->height ? first + LANES - 1 : c->height - 1;
+    if (v[first] + reach < low || v[last] - reach > high) continue;
+    if (p->is_box)
+      insert_box(c, p, u, load(v + first), heights, stride, layers);
+    else
+      insert_cylinder(c, p, u, load(v + first), heights, stride, layers);
+  }
+}
+
+#endif
