@@ -18,7 +18,7 @@ import numpy as np
 from jax import Array
 
 from edqn_jax.config import Config, SurfaceConfig
-from edqn_jax.config.options import LOOKS
+from edqn_jax.config.simulation import LOOKS
 from edqn_jax.errors import ConfigError
 from edqn_jax.files import check_can_write
 from edqn_jax.report.style import open_figure

@@ -54,7 +54,10 @@ def can_render(config: CameraConfig, scene: Scene, platform: str) -> bool:
 
 
 def render_luma(config: CameraConfig, scene: Scene, origin: Array, rotation: Array, weights: Array) -> Array:
-    """Returns brightness [M, H, W] as `columns.render_columns` does, origins in metres; leading [L] as in `primitive`."""
+    """Returns brightness [M, H, W] as `columns.render_columns` does; leading [L] as in `primitive`.
+
+    Origins are in metres.
+    """
     return _call("edqn_pictures", config, scene, origin, rotation, weights)
 
 
