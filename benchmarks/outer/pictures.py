@@ -24,9 +24,6 @@ LUMA = np.array([0.299, 0.587, 0.114])
 FINER = 8
 """Pixels of the renderer along each side of a pixel that is shown; their mean is its brightness."""
 
-NEAR_M = 0.05
-"""Nothing nearer than this is drawn; the body's radius is larger."""
-
 LOOKS = ("plain", "textured", "shadows")
 """`plain`: one colour a shape. `textured`: noise and checks, light drawn. `shadows`: plain, with cast shadows."""
 
@@ -100,7 +97,6 @@ def mujoco_pictures(spec: mujoco.MjSpec, camera: CameraConfig) -> MujocoPictures
         ConfigError: if there is no OpenGL to draw with.
     """
     spec = spec.copy()
-    spec.visual.map.znear = NEAR_M / max(spec.stat.extent, 1e-6)
     down = np.degrees(2 * np.arctan(np.tan(np.radians(camera.horizontal_fov_deg) / 2) * camera.height / camera.width))
     spec.worldbody.add_camera(name="outer", fovy=down)
     model = spec.compile()
@@ -114,14 +110,13 @@ def mujoco_pictures(spec: mujoco.MjSpec, camera: CameraConfig) -> MujocoPictures
             f"MuJoCo cannot draw with MUJOCO_GL={os.environ.get('MUJOCO_GL', '')!r} ({' '.join(str(error).split())}); "
             "install EGL (Debian: libegl1) or OSMesa (libosmesa6) and name it in MUJOCO_GL: egl or osmesa"
         ) from None
-    seen, number = mujoco.MjvOption(), model.camera("outer").id
-    seen.sitegroup[:] = 0
+    number = model.camera("outer").id
 
     def see(position: NDArray[np.float64], rotation: NDArray[np.float64]) -> NDArray[np.float64]:
         data.cam_xpos[number] = position
         # MuJoCo's cameras look along -z with x to the right.
         data.cam_xmat[number] = np.stack([-rotation[:, 1], rotation[:, 2], -rotation[:, 0]], axis=1).reshape(-1)
-        renderer.update_scene(data, number, seen)
+        renderer.update_scene(data, number)
         fine = renderer.render() @ LUMA / 255.0
         return fine.reshape(camera.height, finer, camera.width, finer).mean((1, 3))
 

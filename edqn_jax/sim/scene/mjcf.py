@@ -45,6 +45,9 @@ LONGEST_VOLUME = 500.0
 MAX_SHAPES = 500
 """Geoms of a world: 2 000 of them take 8 GB to train in."""
 
+_NEAR_M = 0.05
+"""Nothing nearer to a camera than this is drawn by MuJoCo; well within the drone's body."""
+
 
 @dataclasses.dataclass(frozen=True)
 class LoadedWorld:
@@ -260,10 +263,11 @@ def mjcf_of(scene: Scene, *, title: str = "world") -> str:
     ElementTree.SubElement(root, "compiler", angle="radian")
     visual = ElementTree.SubElement(root, "visual")
     ElementTree.SubElement(visual, "headlight", ambient="0.35 0.35 0.35", diffuse="0.4 0.4 0.4")
-    ElementTree.SubElement(visual, "map", zfar="50")
     lower, upper = np.asarray(scene.volume)
     middle, half = (lower + upper) / 2, (upper - lower) / 2
-    ElementTree.SubElement(root, "statistic", center=_numbers(middle), extent=_numbers([np.max(half)]))
+    extent = np.max(half)
+    ElementTree.SubElement(visual, "map", znear=_numbers([_NEAR_M / extent]), zfar="50")
+    ElementTree.SubElement(root, "statistic", center=_numbers(middle), extent=_numbers([extent]))
     asset = ElementTree.SubElement(root, "asset")
     ElementTree.SubElement(
         asset, "texture", type="skybox", builtin="gradient", width="256", height="256",
@@ -275,12 +279,8 @@ def mjcf_of(scene: Scene, *, title: str = "world") -> str:
     for role, where in (("start", scene.start), ("goal", scene.goal)):
         if np.all(np.isfinite(where)):
             colour = "0.1 0.6 1 1" if role == "start" else "0.1 0.8 0.2 1"
-            ElementTree.SubElement(world, "site", name=role, pos=_numbers(where), size="0.5", rgba=colour)
-    # Group 3 is hidden in the viewer by default.
-    ElementTree.SubElement(
-        world, "site", name="volume", type="box", group="3", pos=_numbers(middle), size=_numbers(half),
-        rgba="0.2 0.4 1 0.1",
-    )  # fmt: skip
+            _add_site(world, role, pos=_numbers(where), size="0.5", rgba=colour)
+    _add_site(world, "volume", type="box", pos=_numbers(middle), size=_numbers(half), rgba="0.2 0.4 1 0.1")
     counts: dict[str, int] = {}
     custom = ElementTree.Element("custom")
     for shape in scene_shapes(scene):
@@ -298,6 +298,11 @@ def mjcf_of(scene: Scene, *, title: str = "world") -> str:
         root.append(custom)
     ElementTree.indent(root)
     return ElementTree.tostring(root, encoding="unicode") + "\n"
+
+
+def _add_site(world: ElementTree.Element, name: str, **attributes: str) -> None:
+    """Adds a site in group 3, which the viewer and cameras do not show unless asked to."""
+    ElementTree.SubElement(world, "site", name=name, group="3", **attributes)
 
 
 def _launch(scene: Scene, one: Throw) -> np.ndarray:

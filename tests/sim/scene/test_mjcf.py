@@ -321,3 +321,13 @@ def test_every_kind_survives_being_written(tmp_path):
     )
     write_scene(scene, tmp_path / "all.xml")
     assert_same_scene(load_scene(tmp_path / "all.xml"), scene)
+
+
+def test_a_camera_in_a_written_world_sees_its_solids_alone_and_all_that_the_body_may_come_near_to(tmp_path):
+    """MuJoCo shows sites of the groups 0 to 2, and draws from `znear` times the model's extent on."""
+    scene = build_scene([], volume=[[0, 0, 0], [10, 20, 30]], start=[1, 1, 1], goal=[9, 9, 9])
+    write_scene(scene, tmp_path / "empty.xml")
+    model = mujoco.MjModel.from_xml_path(str(tmp_path / "empty.xml"))
+    assert {model.site(number).name for number in range(model.nsite)} == {"start", "goal", "volume"}
+    assert (model.site_group >= 3).all()
+    assert 0 < model.vis.map.znear * model.stat.extent < RADIUS / 2
