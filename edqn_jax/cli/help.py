@@ -102,6 +102,7 @@ COMMON = {
     "camera.height": "pixels down",
     "surface.pattern": "what surfaces look like: one plaid, or drawn for each shape",
     "events.threshold": "change of log-brightness that makes an event",
+    "agent.learner": "how it learns",
     "agent.learning_rate": "Adam step size at the start",
     "agent.batch_size": "replayed samples per update",
     "agent.discount": "gamma, per decision",

@@ -40,6 +40,7 @@ SHORT_NAMES = {
     "--num-envs": "--train.num-envs",
     "--total-steps": "--train.total-steps",
     "--seed": "--train.seed",
+    "--learner": "--agent.learner",
     "--debug": "--train.debug",
 }
 """Short names of common options."""
