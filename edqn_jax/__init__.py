@@ -12,7 +12,17 @@ from typing import TYPE_CHECKING, Any
 from edqn_jax.xla_flags import disable_ynn_fusions
 
 if TYPE_CHECKING:
-    from edqn_jax.config import ENCODERS, FAMILIES, LEARNERS, NETWORKS, SENSORS, SHAPES, Config
+    from edqn_jax.config import (
+        ACTION_SETS,
+        AIRFRAMES,
+        ENCODERS,
+        FAMILIES,
+        LEARNERS,
+        NETWORKS,
+        SENSORS,
+        SHAPES,
+        Config,
+    )
     from edqn_jax.config.loading import make_config
     from edqn_jax.devices.devices import use_cpu_devices
     from edqn_jax.errors import ConfigError, DivergedError, StoppedError
@@ -35,6 +45,8 @@ if TYPE_CHECKING:
     from edqn_jax.training.loop import Chunk, TrainingResult, train, train_seeds
 
 _MODULES = {
+    "ACTION_SETS": "config",
+    "AIRFRAMES": "config",
     "ENCODERS": "config",
     "FAMILIES": "config",
     "LEARNERS": "config",
@@ -75,6 +87,8 @@ _MODULES = {
 """The module of each public name."""
 
 __all__ = [
+    "ACTION_SETS",
+    "AIRFRAMES",
     "ENCODERS",
     "FAMILIES",
     "LEARNERS",

@@ -42,7 +42,7 @@ class Airframe(NamedTuple):
     gravity: float
     max_thrust: float
     inertia: NDArray[np.float64]  # [3]
-    mixer: NDArray[np.float64]  # [4, 4], see `edqn_jax.sim.physics.drone.Airframe`
+    mixer: NDArray[np.float64]  # [4, 4], see `edqn_jax.sim.physics.airframe.Airframe`
 
 
 class Command(NamedTuple):
@@ -110,7 +110,7 @@ def wrap_angle(angle):
 
 @numba.njit(cache=True, error_model="numpy")
 def control(airframe, state, vx, vy, vz, cos_half_yaw, sin_half_yaw, thrust):
-    """Computes rotor thrusts as `edqn_jax.sim.physics.drone.thrusts` does, line by line.
+    """Computes rotor thrusts as `edqn_jax.sim.physics.controller.rotor_thrusts` does, line by line.
 
     Args:
         state: [13].

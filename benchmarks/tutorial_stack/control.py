@@ -25,7 +25,9 @@ def thrusts(
     velocity: Vector,
     yaw: float,
 ) -> Vector:
-    """Returns rotor thrusts [4] newtons as `edqn_jax.sim.physics.drone.thrusts`: velocity, tilt, body rates, torque.
+    """Returns rotor thrusts [4] newtons as `edqn_jax.sim.physics.controller.rotor_thrusts`.
+
+    Loops of velocity, tilt, body rates and torque.
 
     Args:
         config: gains and limits.

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Runs one command and returns its exit code, see `cli.commands.run`."""
+    """Runs one command and returns its exit code, see `cli.commands.run_command`."""
     from edqn_jax.cli.process.streams import exit_code, lasting_streams
 
     with lasting_streams() as outputs:

@@ -3,7 +3,17 @@
 from edqn_jax.config.learning import AgentConfig, EncoderConfig, TrainConfig
 from edqn_jax.config.options import CONDITIONS, Config
 from edqn_jax.config.presets import PRESETS, get_preset
-from edqn_jax.config.registry import ENCODERS, FAMILIES, LEARNERS, MIXTURES, NETWORKS, SENSORS, SHAPES
+from edqn_jax.config.registry import (
+    ACTION_SETS,
+    AIRFRAMES,
+    ENCODERS,
+    FAMILIES,
+    LEARNERS,
+    MIXTURES,
+    NETWORKS,
+    SENSORS,
+    SHAPES,
+)
 from edqn_jax.config.simulation import (
     AirConfig,
     BodyConfig,
@@ -20,6 +30,8 @@ from edqn_jax.config.simulation import (
 )
 
 __all__ = [
+    "ACTION_SETS",
+    "AIRFRAMES",
     "CONDITIONS",
     "ENCODERS",
     "FAMILIES",

@@ -33,7 +33,7 @@ class Evaluation:
     """Arrays on the host: outcome [M], decisions [M], path_length_m [M] and so on; `record` has every pose, positions
     [M, T, 3] metres, NaN after a flight's end, if it was asked for."""
     figures: dict[str, Any]
-    """Success rate with its 95 % Wilson interval, SPL, collisions and so on; see `evaluation.metrics.summarise`."""
+    """Success rate with its 95 % Wilson interval, SPL, collisions and so on, see `metrics.summarise_flights`."""
 
     @property
     def success_rate(self) -> float:

@@ -72,7 +72,7 @@ def fly_missions(
 
     Args:
         config: configuration of the policy and its world.
-        world: the missions.
+        env_params: the missions.
         params: parameters of the policy.
         key: consumed; sensor noise, the shuffling and an actor that is not greedy depend on it.
         actor: what flies; None is the agent of `config`.

@@ -40,12 +40,12 @@ class Program:
     """Static arguments of a compiled program."""
 
     env: FunctionalEnv
-    world: Any  # structure of a `EnvParams`
+    world: Any  # structure of an `EnvParams`
     limit: int | None = None  # decisions after which an episode is cut, beside the task's own time-out
 
 
 Leaves = list[Array]
-"""Arrays of a `EnvParams`. JAX calls a compiled function in a quarter less time where no argument is a typed key or an
+"""Arrays of an `EnvParams`. JAX calls a compiled function in a quarter less time where no argument is a typed key or an
 object whose fields it has to ask for in Python; so worlds go in as lists, and keys as their data."""
 
 

@@ -43,7 +43,7 @@ class CheckedChunk:
         Args:
             config: of the run.
             run: does not spread over devices.
-            world, state, steps: as chunks get them; of the state, the shapes are enough.
+            env_params, state, steps: as chunks get them; of the state, the shapes are enough.
 
         Raises:
             CheckError: if a random key is used twice.

@@ -52,7 +52,7 @@ class Trainer:
 
         Args:
             config: of all agents.
-            world: of the one agent, or one for each of K agents, which may differ in their missions alone. States,
+            env_params: of the one agent, or one for each of K agents, which may differ in their missions alone. States,
                 episodes and losses of several agents have a leading [K].
             devices: over which the environments of every agent are spread.
         """

@@ -62,7 +62,7 @@ def animate_flight(
     Args:
         sights: of the world in which the flight was flown.
         params: of the policy that flew; None of a function.
-        flown: the columns of `trajectory.csv`, each [rows].
+        trajectory: the columns of `trajectory.csv`, each [rows].
         outcome: how the flight ended, a key of `OUTCOME_LABELS`.
         title: stands above the world.
         form: `.gif` or `.mp4`, which needs the extra `video`.

@@ -91,7 +91,7 @@ def plot_reconstruction(
 
     Args:
         targets: [N, h, w] blurred events, ON plus OFF, blurred pictures or blurred nearness.
-        drawn: [N, h, w] by the decoder, in the same units.
+        decoded: [N, h, w] by the decoder, in the same units.
         file: PNG to write.
         look: of both.
         seen: [N, h, w] what the sensor showed, and its look, for a row above.

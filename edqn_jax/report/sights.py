@@ -81,7 +81,7 @@ class FlightRenderer:
 
         Args:
             params: whose VAE; None without a decoder.
-            flown: the columns of `trajectory.csv`, as `decision_rows`.
+            trajectory: the columns of `trajectory.csv`, as `decision_rows`.
         """
         assert self._shown is not None, "this sensor shows no image"
         rows = decision_rows(self.config, trajectory)
@@ -150,7 +150,7 @@ def decision_rows(config: Config, trajectory: Mapping[str, np.ndarray]) -> np.nd
     """Returns the rows [D, T] of a trajectory at which the sensor looks, T of them for each whole decision.
 
     Args:
-        flown: the columns of `trajectory.csv`, each [rows]; row k stands after physics step k + 1.
+        trajectory: the columns of `trajectory.csv`, each [rows]; row k stands after physics step k + 1.
     """
     n, steps = config.drone.physics_steps, len(trajectory["t"])
     decisions = np.arange(max(steps // n, 1))[:, None]

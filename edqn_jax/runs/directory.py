@@ -211,7 +211,7 @@ class RunDirectory:
         write_atomically(self.summary_file, json.dumps(to_plain_json(summary), indent=2, allow_nan=False) + "\n")
 
     def write_trajectory(self, columns: Mapping[str, np.ndarray]) -> None:
-        """Writes `trajectory.csv` from the columns [T] of `evaluation.trajectories.trajectory`.
+        """Writes `trajectory.csv` from the columns [T] of `evaluation.trajectories.flight_trajectory`.
 
         Raises:
             ConfigError: if it cannot be written.

@@ -119,7 +119,7 @@ def train(
 
     Args:
         config: without it what `train.py` trains without flags, on a CPU; `edqn_jax.make_config` makes others.
-        reward: replaces the configured reward; see `sim.reward.Transition` for what it is given.
+        reward: replaces the configured reward; see `sim.task.reward.Transition` for what it is given.
         callback: called after each chunk; training stops where it returns True.
 
     Raises:

@@ -74,6 +74,26 @@ def test_public_names_have_docstrings() -> None:
     assert len(without) <= (1 - LEAST) * len(names), without
 
 
+def unknown_arguments(node: ast.FunctionDef) -> set[str]:
+    """Returns the names that the section `Args:` of a docstring explains and the function does not have."""
+    _, _, section = (ast.get_docstring(node) or "").partition("Args:\n")
+    section = re.split(r"\n(?=\S)", section)[0]
+    explained = re.findall(r"^    (\w+(?:, \w+)*):", section, re.MULTILINE)
+    args = node.args
+    known = {arg.arg for arg in (*args.posonlyargs, *args.args, *args.kwonlyargs, args.vararg, args.kwarg) if arg}
+    return {name for names in explained for name in names.split(", ")} - known
+
+
+def test_arguments_that_docstrings_explain_are_there() -> None:
+    functions = [(name, node) for name, node in everything() if isinstance(node, ast.FunctionDef)]
+    assert sum("Args:\n" in (ast.get_docstring(node) or "") for _, node in functions) > 100
+    assert {name: found for name, node in functions if (found := unknown_arguments(node))} == {}
+    told = 'def f(a, *, b):\n    """Returns 1.\n\n    Args:\n        a: one.\n        c: none.\n    """'
+    (wrong,) = ast.parse(told).body
+    assert isinstance(wrong, ast.FunctionDef)
+    assert unknown_arguments(wrong) == {"c"}
+
+
 def test_functions_of_arrays_name_their_shapes() -> None:
     of_arrays = [(name, ast.get_docstring(node) or "") for name, node in everything() if arrays_of(node)]
     without = [name for name, text in of_arrays if not SHAPE.search(text)]

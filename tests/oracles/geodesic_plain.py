@@ -1,4 +1,4 @@
-"""Ways on the nodes of `sim.geodesic`, by a library's Dijkstra over every pair of neighbours whose balls meet."""
+"""Ways on nodes of `sim.worlds.geodesic`, by a library's Dijkstra over every pair of neighbours whose balls meet."""
 
 from __future__ import annotations
 

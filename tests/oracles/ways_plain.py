@@ -1,4 +1,4 @@
-"""Whether there is a way, in NumPy and float64: the lattice of `sim.ways`, node by node, and a library's labels."""
+"""Whether there is a way, in NumPy and float64: the lattice of `sim.worlds.reachability`, node by node, and a library's labels."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from edqn_jax.sim.worlds.free_points import CLEARANCE
 
 
 def has_way(scene: Scene, size: tuple[float, float, float], radius: float, edge: float) -> bool:
-    """As `sim.ways.has_way`."""
+    """As `sim.worlds.reachability.has_way`."""
     counts = [int(side / edge) for side in size]
     lower, upper = np.asarray(scene.volume, np.float64)
     free = np.zeros(counts, bool)

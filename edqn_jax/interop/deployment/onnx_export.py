@@ -65,7 +65,7 @@ def export_policy(policy: Policy, file: str | Path, *, checks: int = CHECKS, dig
     Before anything is written, ONNX and JAX are given the same random inputs.
 
     Args:
-        flown: a policy that sees events.
+        policy: a policy that sees events.
         file: to write; its name ends in .onnx.
         checks: how many random inputs.
         digest: SHA-256 of the policy, for the file's metadata.

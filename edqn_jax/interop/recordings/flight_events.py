@@ -28,8 +28,8 @@ def flight_recording(
 
     Args:
         config: of the policy that flew.
-        world: of the flight, with one mission.
-        flown: the columns of `trajectory.csv`, one row after each physics step.
+        env_params: of the flight, with one mission.
+        trajectory: the columns of `trajectory.csv`, one row after each physics step.
         size: width and height of the image; None is the policy's own.
     """
     law = config.events

@@ -37,7 +37,7 @@ def flight_pictures(
     Args:
         sights: of the world of the flight; its sensor shows an image.
         params: of the policy that flew; None of a function, which draws nothing.
-        flown: the columns of `trajectory.csv`.
+        trajectory: the columns of `trajectory.csv`.
     """
     config = sights.config
     shown, look = sights.shown(params, trajectory), look_of(config.env.sensor)

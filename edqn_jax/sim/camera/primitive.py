@@ -31,8 +31,8 @@ def render_in_one_batch(
     """Returns one picture, [H, W] float32; all pictures that it is mapped to are drawn by one call of `render`.
 
     Args:
-        draw: `render(*static, *arguments)` returns pictures [M, H, W] of arguments with a leading [M]. A function of a
-            module, not one made for the call: compiled programs are cached by its identity.
+        render: `render(*static, *arguments)` returns pictures [M, H, W] of arguments with a leading [M]. A function of
+            a module, not one made for the call: compiled programs are cached by its identity.
         static: arguments that are known when tracing.
         arguments: pytrees of arrays, of one picture.
         shape: H, W.

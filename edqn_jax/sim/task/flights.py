@@ -104,7 +104,7 @@ def update_tallies(
         flights: of one flight that is not over.
         before: [3] metres, position before the first physics step.
         flight: n physics steps.
-        outcome: as `env.judge` has it, like the next two.
+        outcome: as `outcomes.judge_decision` has it, like the next two.
         end_step: in 1..n.
         contact: share of that step.
 

@@ -45,7 +45,7 @@ def configured_reward(
 
     Args:
         before, after: [] distances to the goal, metres; straight, or along the shortest way (`geodesic`).
-        flown: [] metres flown.
+        path_m: [] metres flown.
     """
     at_end = jnp.select(
         [outcome == Outcome.GOAL, outcome == Outcome.COLLISION, outcome == Outcome.LEFT_VOLUME],

@@ -4,7 +4,7 @@
     state, observation = task.reset(world, key)
     state, step = task.step(world, state, action)
 
-All functions are pure and of one drone; `map` maps them over environments. A `EnvParams` holds the arrays that they
+All functions are pure and of one drone; `map` maps them over environments. `EnvParams` holds the arrays that they
 depend on.
 """
 
