@@ -212,8 +212,7 @@ SHAPES = Registry(
         "planes": f"{_SHAPES}.plane:PLANE",
     },
 )
-"""Kinds of shape of which worlds are made: `edqn_jax.sim.scene.shapes.kind.ShapeKind`. A geom is read by the first
-that takes it."""
+"""Each kind of shape is an `edqn_jax.sim.scene.shapes.kind.ShapeKind`. A geom is read by the first that takes it."""
 
 ACTION_SETS = Registry(
     "set of actions",
