@@ -1,4 +1,4 @@
-"""Whether there is a way, in NumPy and float64: the lattice of `sim.worlds.reachability`, node by node, and a library's labels."""
+"""Whether there is a way, in NumPy and float64: the nodes of `sim.worlds.reachability` and a library's labels."""
 
 from __future__ import annotations
 

@@ -302,7 +302,7 @@ def mjcf_of(scene: Scene, *, title: str = "world") -> str:
 
 def _add_site(world: ElementTree.Element, name: str, **attributes: str) -> None:
     """Adds a site in group 3, which the viewer and cameras do not show unless asked to."""
-    ElementTree.SubElement(world, "site", name=name, group="3", **attributes)
+    ElementTree.SubElement(world, "site", {"name": name, "group": "3", **attributes})
 
 
 def _launch(scene: Scene, one: Throw) -> np.ndarray:
