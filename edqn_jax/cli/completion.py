@@ -14,7 +14,7 @@ from tyro.conf import Positional, arg
 
 from edqn_jax.cli.arguments import parsed
 from edqn_jax.cli.evaluate import EvaluateArgs
-from edqn_jax.cli.help import COMPLETION, REGISTERED, all_of_train, with_conditions, with_help_texts
+from edqn_jax.cli.help import COMPLETION, NAMED, all_of_train, with_conditions, with_help_texts
 from edqn_jax.cli.record import RecordArgs
 from edqn_jax.cli.train import SHORT_NAMES, TrainOptions
 from edqn_jax.config import CONDITIONS
@@ -56,8 +56,8 @@ def completion_script(shell: Literal["bash", "zsh", "fish"], kinds: Mapping[str,
         shell: for which.
         kinds: the dataclass of each command's options.
     """
-    names: dict[str, Any] = {name: Literal[tuple(registry)] for name, registry in REGISTERED.items()}
-    worlds: Any = Literal[("paper", *REGISTERED["world"])]  # those that have a name; others are files
+    names: dict[str, Any] = {option: Literal[tuple(choices)] for option, choices in NAMED.items()}
+    worlds: Any = Literal[("paper", *NAMED["world"])]  # those that have a name; others are files
     names |= dict.fromkeys(("world", "world.name", "world.flown"), worlds)
     somewhere = Path()
     in_a_world = {

@@ -14,6 +14,7 @@ import tyro
 
 from edqn_jax.config import Config
 from edqn_jax.config.registry import AIRFRAMES, ENCODERS, FAMILIES, LEARNERS, NETWORKS, SENSORS, Registry
+from edqn_jax.config.simulation import LOOKS
 
 TRAIN, EVALUATE, RECORD, REPORT = "edqn train", "edqn evaluate", "edqn record", "edqn report"
 VERIFY, EXPORT, EVENTS, COMPLETION = "edqn verify", "edqn export", "edqn events", "edqn completion"
@@ -113,7 +114,10 @@ REGISTERED: dict[str, Registry] = {
     **{registry.option: registry for registry in (AIRFRAMES, SENSORS, ENCODERS, LEARNERS, NETWORKS, FAMILIES)},
     "world": FAMILIES,
 }
-"""What an option names, by the option; of `world` and `world.name` also files."""
+"""Registries of what an option names, by the option; of `world` and `world.name` also files."""
+
+NAMED: Mapping[str, Collection[str]] = {**REGISTERED, "surface.pattern": LOOKS}
+"""The names that an option takes, by the option."""
 
 METAVARS = {int: "N", float: "X", str: "WORLD", "track": "WHICH [WHICH]", "view": "WHICH"}
 """What stands for a value of a type, or of one option, in the short help."""
@@ -140,8 +144,8 @@ def show_train_help(options: Any, config: Config, short_names: Mapping[str, str]
         metavar = METAVARS.get(name, METAVARS.get(_bare(kind)))
         if typing.get_origin(kind) is typing.Literal:
             metavar, text = "WHICH", f"{text}: {', '.join(typing.get_args(kind))}"
-        elif name in REGISTERED:
-            metavar, text = "WORLD" if group == "world" else "WHICH", f"{text}: {', '.join(REGISTERED[name])}"
+        elif name in NAMED:
+            metavar, text = "WORLD" if group == "world" else "WHICH", f"{text}: {', '.join(NAMED[name])}"
         said = Annotated[kind, tyro.conf.arg(name=short.get(flag, flag)[2:], metavar=metavar, help=text)]
         fields.append((name.replace(".", "_"), said, dataclasses.field(default=getattr(owner, option))))
     groups = [options, *(getattr(config, group.name) for group in dataclasses.fields(Config))]

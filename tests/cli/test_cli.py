@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import os
 import re
 import signal
@@ -16,9 +17,10 @@ import pytest
 
 from edqn_jax.cli import commands, main, train
 from edqn_jax.cli.evaluate import EvaluateArgs, parse_evaluate
-from edqn_jax.cli.help import COMMON, flag_of
+from edqn_jax.cli.help import COMMON, NAMED, flag_of
 from edqn_jax.cli.train import parse_train, train_flags
 from edqn_jax.config import Config, get_preset
+from edqn_jax.config.limits import limits_of
 from edqn_jax.config.loading import make_config
 from edqn_jax.config.presets import RANDOM_WORLDS
 from edqn_jax.devices import devices
@@ -65,6 +67,17 @@ def test_the_world_of_a_file_stands_without_a_flag(tmp_path, trainer):
     file = tmp_path / "options.yaml"
     file.write_text("world: {name: paper}\n")
     assert parse_train(["--config", str(file)])[1] == parse_train(["--world", "paper"])[1] == Config()
+
+
+def test_help_and_completion_list_the_names_that_a_limit_has():
+    limited = {
+        f"{group.name}.{option}": limit.names
+        for group in dataclasses.fields(Config)
+        for option, limits in limits_of(type(getattr(Config(), group.name))).items()
+        for limit in limits
+        if limit.names
+    }
+    assert limited and {option: tuple(NAMED.get(option, ())) for option in limited} == limited
 
 
 @pytest.mark.parametrize("words", [["--events.profile", "dvs"], ["--events.profile=dvs"]])
