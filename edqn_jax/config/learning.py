@@ -32,6 +32,8 @@ class EncoderConfig:
     """Values in the code z."""
     patch_pixels: Annotated[int, COUNT] = 4
     """Side of a square patch, pixels (`patches`)."""
+    patch_overlap: Annotated[int, NOT_NEGATIVE] = 0
+    """Pixels by which a patch reaches into those around it, on each side (`patches`)."""
     patch_layers: Annotated[tuple[int, ...], WIDTHS] = (32, 16)
     """Widths of the ReLU layers that all patches share (`patches`)."""
     joint_layers: Annotated[tuple[int, ...], WIDTHS] = (128, 128)

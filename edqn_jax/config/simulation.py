@@ -231,6 +231,11 @@ class EnvConfig:
     """Reward per metre gained towards the goal (`progress`, `geodesic`, `potential`)."""
     path_weight: Annotated[float, NOT_NEGATIVE] = 1.5
     """Reward lost per metre flown (`progress`, `geodesic`), so that detours cost something."""
+    closeness_weight: Annotated[float, NOT_NEGATIVE] = 0.0
+    """Reward lost by a decision that ends at an obstacle; less in proportion to the clearance, and none from
+    `closeness_m` on. 0 is off, in any reward."""
+    closeness_m: Annotated[float, POSITIVE] = 0.6
+    """Clearance of the body's sphere from which on closeness costs nothing, metres."""
     potential_discount: Annotated[float, SHARE] = 0.97
     """gamma of the potential (`potential`), the same as `agent.discount`: with another, another policy is the best."""
     goal_reward: Annotated[float, FINITE] = 100.0

@@ -8,6 +8,8 @@ N is the number of patches, K the number of pixels in one.
 
 from __future__ import annotations
 
+from functools import partial
+
 import flax.linen as nn
 import jax.numpy as jnp
 import numpy as np
@@ -33,18 +35,36 @@ def log_counts(field: EventField) -> list[Array]:
     return [pair[..., row, :, :] for row in range(pairs[0].shape[-3]) for pair in pairs]
 
 
-def to_patches(image: Array, pixels: int) -> Array:
+def to_patches(image: Array, pixels: int, overlap: int = 0) -> Array:
     """Cuts images `[..., H, W]` into square patches of `pixels` x `pixels`: `[..., N, K]`, row by row.
 
-    Images whose sides are no multiples of `pixels` are padded with zeros at the right and at the bottom.
+    Images whose sides are no multiples of `pixels` are padded with zeros at the right and at the bottom; patches that
+    reach beyond the image see zeros there.
+
+    Args:
+        overlap: by how many pixels each side of a patch reaches into the patches around it; K is then
+            (pixels + 2 overlap)^2.
     """
     *batch, height, width = image.shape
     rows, columns = -(-height // pixels), -(-width // pixels)
+    if overlap:
+        flat = image.reshape(*batch, height * width)
+        return jnp.take(flat, _pixels_of_patches(height, width, pixels, overlap), axis=-1, mode="fill", fill_value=0.0)
     missing = rows * pixels - height, columns * pixels - width
     if any(missing):
         image = jnp.pad(image, [(0, 0)] * len(batch) + [(0, size) for size in missing])
     cut = image.reshape(*batch, rows, pixels, columns, pixels).swapaxes(-3, -2)
     return cut.reshape(*batch, rows * columns, pixels * pixels)
+
+
+def _pixels_of_patches(height: int, width: int, pixels: int, overlap: int) -> np.ndarray:
+    """Returns the number of each pixel of each patch in the image, row by row, `[N, K]`; `height * width` outside."""
+    rows, columns = -(-height // pixels), -(-width // pixels)
+    window = np.arange(-overlap, pixels + overlap)
+    down = (np.arange(rows) * pixels)[:, None, None, None] + window[:, None]
+    across = (np.arange(columns) * pixels)[:, None, None] + window
+    inside = (down >= 0) & (down < height) & (across >= 0) & (across < width)
+    return np.where(inside, down * width + across, height * width).reshape(rows * columns, -1)
 
 
 def patch_places(height: int, width: int, pixels: int) -> np.ndarray:
@@ -72,8 +92,9 @@ class PatchEncoder(nn.Module):
         images = log_counts(sensed) if isinstance(sensed, EventField) else list(jnp.moveaxis(sensed, -3, 0))
         first, *later = self.config.patch_layers
         # One product for each channel: joined to one array first, they take twice as long on a CPU.
+        cut = partial(to_patches, pixels=self.config.patch_pixels, overlap=self.config.patch_overlap)
         products = [
-            Dense(first, use_bias=number == 0, name=f"channel_{number}")(to_patches(image, self.config.patch_pixels))
+            Dense(first, use_bias=number == 0, name=f"channel_{number}")(cut(image))
             for number, image in enumerate(images)
         ]
         z = sum(products[1:], products[0])

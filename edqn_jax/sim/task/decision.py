@@ -183,16 +183,20 @@ def _reward(
         still_left = left - jnp.clip(gained, -most, most)
     else:
         left, still_left = (jnp.sqrt(jnp.sum((goal - point) ** 2)) for point in (here, there))
-    configured = configured_reward(config.env, outcome, left, still_left, moved)
+    clearance = None
+    if config.env.closeness_weight or payment.function is not None:
+        scene = before.scene
+        afterwards = scene_at(scene, time_of(config, before.decision + 1) if has_motion(scene) else None)
+        clearance = signed_distance(afterwards, there) - config.drone.body_radius_m
+    configured = configured_reward(config.env, outcome, left, still_left, moved, clearance)
     if payment.function is None:
         return configured
-    scene = before.scene
-    afterwards = scene_at(scene, time_of(config, before.decision + 1) if has_motion(scene) else None)
+    assert clearance is not None
     transition = Transition(
         before=here,
         after=there,
         goal=goal,
-        clearance=signed_distance(afterwards, there) - config.drone.body_radius_m,
+        clearance=clearance,
         move=action,
         outcome=outcome,
         configured=configured,

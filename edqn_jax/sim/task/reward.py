@@ -35,17 +35,20 @@ def configured_reward(
     before: Array,
     after: Array,
     path_m: Array | float = 0.0,
+    clearance: Array | None = None,
 ) -> Array:
     """Returns the configured reward [] of one decision.
 
     `sparse` is Eq. 8. `progress` adds the metres gained towards the goal, times a weight, and
     subtracts a weight for each metre flown; `geodesic` uses distances around obstacles. `potential` adds
     gamma * Phi(s') - Phi(s) with Phi = -weight * distance and gamma `env.potential_discount`, and Phi = 0 at terminal
-    states: the form that leaves the optimal policy unchanged (Ng et al. 1999).
+    states: the form that leaves the optimal policy unchanged (Ng et al. 1999). With `closeness_weight`, all of them
+    lose the more the nearer the decision ended to an obstacle.
 
     Args:
         before, after: [] distances to the goal, metres; straight, or along the shortest way (`geodesic`).
         path_m: [] metres flown.
+        clearance: [] metres to the nearest obstacle afterwards; needed with `closeness_weight`.
     """
     at_end = jnp.select(
         [outcome == Outcome.GOAL, outcome == Outcome.COLLISION, outcome == Outcome.LEFT_VOLUME],
@@ -58,4 +61,7 @@ def configured_reward(
     elif config.reward == "potential":
         terminal = is_terminal(outcome)
         total = total + config.progress_weight * (before - jnp.where(terminal, 0.0, config.potential_discount * after))
+    if config.closeness_weight:
+        assert clearance is not None, "closeness needs the clearance"
+        total = total - config.closeness_weight * jnp.clip(1.0 - clearance / config.closeness_m, 0.0, 1.0)
     return jnp.where(outcome == Outcome.DIVERGED, 0.0, total)

@@ -90,6 +90,29 @@ def test_patches_are_cut_row_by_row_and_padded_with_zeros() -> None:
     np.testing.assert_allclose(patch_places(6, 10, 4)[:3], [[-0.6, -1 / 3], [0.2, -1 / 3], [1.0, -1 / 3]], atol=1e-6)
 
 
+def test_patches_that_overlap_see_the_pixels_around_them_and_zeros_beyond_the_image() -> None:
+    image = np.arange(1.0, 61.0).reshape(6, 10)
+    cut = np.asarray(to_patches(jnp.stack([jnp.asarray(image), -jnp.asarray(image)]), 4, overlap=2))
+    wide = np.pad(image, [(2, 4), (2, 4)])
+    for number in range(6):
+        row, column = divmod(number, 3)
+        window = wide[4 * row : 4 * row + 8, 4 * column : 4 * column + 8].ravel()
+        np.testing.assert_array_equal(cut[0, number], window)
+        np.testing.assert_array_equal(cut[1, number], -window)
+
+
+def test_an_encoder_of_overlapping_patches_reads_what_lies_beside_a_patch() -> None:
+    fields = [random_field(1, 1), random_field(2, 1)]
+    shapes = []
+    for overlap in (0, 2):
+        config = dataclasses.replace(CONFIG, patch_overlap=overlap)
+        params = fresh(config, SMALL, jax.random.key(0))
+        shapes.append(params["encoder"]["channel_0"]["kernel"].shape[0])
+        codes = [encode(config, params, field, jnp.asarray(MOTION))[0] for field in fields]
+        assert np.abs(codes[0] - codes[1]).max() > 1e-3
+    assert shapes == [CONFIG.patch_pixels**2, (CONFIG.patch_pixels + 4) ** 2]
+
+
 def test_the_same_events_mean_something_else_under_another_motion() -> None:
     params = fresh(CONFIG, SMALL, jax.random.key(0))
     field = random_field(1, 1)

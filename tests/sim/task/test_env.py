@@ -191,6 +191,17 @@ def test_progress_charges_for_the_metres_flown_and_the_other_forms_do_not():
         assert still - moved == pytest.approx(cost)
 
 
+def test_closeness_costs_in_proportion_and_nothing_from_its_distance_on():
+    config = EnvConfig(reward="progress", closeness_weight=3.0, closeness_m=0.6)
+    far, *near = (
+        float(configured_reward(config, jnp.int32(Outcome.RUNNING), 9.0, 5.0, 4.0, jnp.float32(clearance)))
+        for clearance in (0.6, 2.0, 0.3, 0.0, -0.1)
+    )
+    assert [far - each for each in near] == pytest.approx([0.0, 1.5, 3.0, 3.0], abs=1e-5)
+    plain = dataclasses.replace(config, closeness_weight=0.0)
+    assert far == float(configured_reward(plain, jnp.int32(Outcome.RUNNING), 9.0, 5.0, 4.0))
+
+
 def test_progress_telescopes_to_the_distance_covered():
     config = EnvConfig(reward="progress", progress_weight=2.0, step_reward=0.0, path_weight=0.0)
     distances = [40.0, 37.5, 38.0, 30.0, 21.0]
