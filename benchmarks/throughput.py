@@ -33,7 +33,7 @@ from edqn_jax.runs.provenance import describe_workload
 from measurement import json_report
 from measurement.ceilings import Rollout, ceilings
 from measurement.command import Parser, at_least_one, in_a_sentence
-from measurement.flags import configured, split
+from measurement.flags import parse_config, split
 from measurement.parts import parts_of
 from measurement.timing import Timed
 from measurement.whole import WHOLE, WholeStep, steady
@@ -60,7 +60,7 @@ def parse(argv: Sequence[str] | None = None) -> tuple[argparse.Namespace, Config
     parser.add_argument("--quick", action="store_true", help="one short turn of each row")
     parser.add_argument("--whole-only", action="store_true", help="do not time the parts")
     args = parser.parse(words)
-    config = configured(flags)
+    config = parse_config(flags)
     if config.env.sensor != "events" and not args.whole_only:
         raise ConfigError(f"parts can be timed only for env.sensor events; {config.env.sensor} needs --whole-only")
     if config.env.drones > 1 and not args.whole_only:

@@ -36,7 +36,7 @@ from edqn_jax.runs.provenance import describe_workload
 from edqn_jax.sim.scene.mjcf import load_scene, resolve_world
 from measurement import json_report
 from measurement.command import Parser, at_least_one, in_a_sentence
-from measurement.flags import configured, split
+from measurement.flags import parse_config, split
 from measurement.whole import WholeStep, steady
 
 DRONES = 8
@@ -62,7 +62,7 @@ def parse(argv: Sequence[str] | None = None) -> tuple[argparse.Namespace, Config
     )
     parser.add_argument("--repeats", type=at_least_one, default=REPEATS, help=f"turns of each row (default {REPEATS})")
     args = parser.parse(words)
-    return args, steady(configured(flags), 64)
+    return args, steady(parse_config(flags), 64)
 
 
 class Tutorial:

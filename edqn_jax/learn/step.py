@@ -73,7 +73,7 @@ def train_step(
     of_agent, agent = learner_of(config).update(config, axis, networks.agent, Rings(ring, time, keys.dqn), last)
     networks = _refresh_acting_encoder(config, dataclasses.replace(networks, agent=agent), step)
     memory = _encode_observations(config, networks, actors, timestep, step)
-    shaped = partial(_shaped, actors.reward.shape)
+    shaped = partial(_by_shard, actors.reward.shape)
     outcome, reward = shaped(timestep.outcome), shaped(timestep.reward)
     actors = Actors(
         env=shaped(env_state),
@@ -155,7 +155,7 @@ def _encode_observations(config: Config, networks: Networks, actors: Actors, tim
     return AgentActor(config).encode(_acting(config, networks), memory, timestep.observation)
 
 
-def _shaped(shape: tuple[int, ...], tree: Any) -> Any:
+def _by_shard(shape: tuple[int, ...], tree: Any) -> Any:
     """Returns [S, E, ...] of [S * E, ...]."""
     return jax.tree.map(lambda x: x.reshape(*shape, *x.shape[1:]), tree)
 
@@ -207,7 +207,7 @@ def _store_samples(
         mate = group.active_partner_index(config, timestep.waits)
         rows = jax.tree.map(lambda x: x[mate], rows)
     write = jax.vmap(samples.store_samples, in_axes=(0, 0, None, None))
-    return write(actors.samples, _shaped(actors.reward.shape, rows), schedule.samples_kept(config, step), keep)
+    return write(actors.samples, _by_shard(actors.reward.shape, rows), schedule.samples_kept(config, step), keep)
 
 
 def run_steps(

@@ -69,7 +69,7 @@ class TrainingSetup:
             ConfigError: if the configuration is invalid, the world cannot be flown, or memory is too small.
         """
         config = config_for_reward(config, reward)
-        self.configs = _of_agents(config, agents)
+        self.configs = _agent_configs(config, agents)
         for each in self.configs:
             validate(each)
             check_learns(each)
@@ -138,7 +138,7 @@ def config_for_reward(config: Config, reward: Reward | None) -> Config:
     return dataclasses.replace(config, agent=dataclasses.replace(config.agent, turn=False))
 
 
-def _of_agents(config: Config, agents: int | None) -> list[Config]:
+def _agent_configs(config: Config, agents: int | None) -> list[Config]:
     """Returns the configuration of each agent: the seeds of several are those from the configured one on."""
     if agents is None:
         return [config]

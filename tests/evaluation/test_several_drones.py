@@ -10,8 +10,8 @@ import pytest
 
 from edqn_jax.config.loading import make_config, with_conditions
 from edqn_jax.errors import ConfigError
-from edqn_jax.evaluation.companions import scene_of_flight
 from edqn_jax.evaluation.evaluate import evaluate
+from edqn_jax.evaluation.flight_scene import scene_of_flight
 from edqn_jax.evaluation.metrics import summarise_flights
 from edqn_jax.evaluation.missions import final_missions, load_missions, run_missions
 from edqn_jax.runs.policies import load_policy

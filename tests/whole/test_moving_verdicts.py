@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from edqn_jax.config.loading import make_config
-from edqn_jax.evaluation.companions import scene_of_flight
+from edqn_jax.evaluation.flight_scene import scene_of_flight
 from edqn_jax.evaluation.judge import FlightTrack, clearance, load_judge, max_obstacle_speed, replay_contact
 from edqn_jax.evaluation.missions import MissionSet, load_missions
 from edqn_jax.evaluation.rollouts import fly_missions

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from edqn_jax.evaluation.companions import scene_of_flight
+from edqn_jax.evaluation.flight_scene import scene_of_flight
 from edqn_jax.evaluation.trajectories import flight_trajectory
 from edqn_jax.report.curves import running_mean
 from edqn_jax.report.page.evaluated import EvaluatedRun
