@@ -42,7 +42,7 @@ def now() -> Moment:
     """
     config = parse_config(os.environ.get("EDQN_FLAGS", "").split())
     config = steady(config, config.train.chunk_steps)
-    world = run_missions(config).training.world
+    world = run_missions(config).training.env_params
     state = Trainer(config, world, jax.devices()[:1]).init(config.train.seed)
     return Moment(config, world, dataclasses.replace(state, step=jnp.int32(Schedule.from_config(config).learn_from)))
 

@@ -63,7 +63,7 @@ def measure(config: Config, decisions: int, repeats: int) -> dict[str, Any]:
     from conventional_stack.fleet import Course
     from conventional_stack.train import Steady
 
-    course = Course.of(run_missions(config).training.world)
+    course = Course.of(run_missions(config).training.env_params)
     turns: dict[tuple[int, int], list[float]] = {setting: [] for setting in SETTINGS}
     with ExitStack() as stack:
         runs = {setting: stack.enter_context(Steady(config, course, *setting)) for setting in SETTINGS}

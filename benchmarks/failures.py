@@ -204,7 +204,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     config, params = load_run(args.run)
     group.check_alone(config, "this benchmark")
     missions = load_missions(config, args.world or config.world.name, args.missions, args.seed)
-    flights = jax.tree.map(np.asarray, fly_on_all_devices(config, missions.world, params, args.seed, record=True))
+    flights = jax.tree.map(np.asarray, fly_on_all_devices(config, missions.env_params, params, args.seed, record=True))
     (collided,) = np.nonzero(flights.outcome == Outcome.COLLISION)
     rows = [look_back(config, missions, flights, int(mission)) for mission in collided[: args.flights]]
     counts = Counter(Outcome(int(kind)).name.lower() for kind in flights.outcome)

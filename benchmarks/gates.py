@@ -89,7 +89,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     print(f"| gate | success | 95 % interval | {' | '.join(names)} |\n| --- | ---: | --- |{' ---: |' * len(names)}")
     rows = []
     for gate in GATES:
-        flown = np.asarray(outcomes(config, missions.world, gate, run_streams(0).flights))
+        flown = np.asarray(outcomes(config, missions.env_params, gate, run_streams(0).flights))
         counts = Counter(Outcome(int(kind)).name.lower().replace("_", " ") for kind in flown)
         low, high = rate_interval((flown == Outcome.GOAL)[None])
         rows.append({"gate": gate, "missions": args.missions, "interval": [low, high], **counts})

@@ -59,7 +59,7 @@ class Runner:
     def __init__(self, config: Config, missions: RunMissions) -> None:
         self.config, self.scene = config, missions.scene
         self.devices = choose_devices(config.train.devices, config.train.shards)
-        self.whole = WholeStep(config, missions.training.world, self.devices)
+        self.whole = WholeStep(config, missions.training.env_params, self.devices)
         self.chunks = math.ceil(TURN_SECONDS * self.whole.turn() / self.whole.decisions)
 
     @property
@@ -127,7 +127,7 @@ def measure(base: Config, names: Sequence[str], quick: bool, repeats: int) -> di
         **json_report.machine(used),
         "repeats": repeats,
         "curves": summaries,
-        "memory": memory_of(state_bytes(base, reference.training.world), temporary),
+        "memory": memory_of(state_bytes(base, reference.training.env_params), temporary),
         "rows": rows,
     }
 

@@ -259,7 +259,7 @@ def _row(
 ) -> Row:
     """Flies the test missions and returns the row."""
     course = load_missions(config, config.world.name, missions)
-    turns = turns_of(config, policies, course.world, missions, shuffle_codes)
+    turns = turns_of(config, policies, course.env_params, missions, shuffle_codes)
     return {
         "benchmark": "success",
         "world": config.world.name,

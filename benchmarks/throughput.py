@@ -73,11 +73,11 @@ def measure(config: Config, repeats: int, parts: bool) -> dict[str, Any]:
     missions = run_missions(config)
     devices = choose_devices(config.train.devices, config.train.shards)
     mesh = Mesh(np.asarray(devices), (AXIS,))
-    whole = WholeStep(config, missions.training.world, devices)
+    whole = WholeStep(config, missions.training.env_params, devices)
     # A copy, because the next chunk is given the state itself.
     host = jax.tree.map(lambda x: jax.device_put(x, devices[0]).copy(), whole.state)
     timed = (
-        [Timed(part, mesh, config.train.num_envs) for part in parts_of(config, missions.training.world, host)]
+        [Timed(part, mesh, config.train.num_envs) for part in parts_of(config, missions.training.env_params, host)]
         if parts
         else []
     )

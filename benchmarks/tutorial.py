@@ -122,7 +122,7 @@ def measure(config: Config, drones: int, decisions: int, repeats: int) -> dict[s
         MissingPackageError: if a package of the extra `bench` is not installed.
     """
     check(config)
-    ours = WholeStep(config, run_missions(config).training.world, choose_devices(0, config.train.shards))
+    ours = WholeStep(config, run_missions(config).training.env_params, choose_devices(0, config.train.shards))
     turns: list[tuple[float, float]] = []
     with Tutorial(config, drones) as tutorial:
         tutorial.turn(2 * drones)  # the first decisions are random and nothing is learnt

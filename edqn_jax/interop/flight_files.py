@@ -110,13 +110,13 @@ def _write_events(
     group.check_alone(config, "`edqn record` of events")
     check_can_write_events(file)
     flights = _fly_missions(policy, config, missions, seed)
-    write_events(file, flight_recording(config, missions.world, flight_trajectory(config, flights), size))
+    write_events(file, flight_recording(config, missions.env_params, flight_trajectory(config, flights), size))
     return flights
 
 
 def _fly_missions(policy: Policy | FunctionPolicy, config: Config, missions: MissionSet, seed: int) -> Flights:
     actor = actor_of(policy, config)
-    return fly_on_all_devices(config, missions.world, policy.params, seed, actor=actor, record=True)
+    return fly_on_all_devices(config, missions.env_params, policy.params, seed, actor=actor, record=True)
 
 
 def _ending(flights: Flights) -> str:

@@ -29,7 +29,7 @@ pytestmark = pytest.mark.slow
 def now() -> Moment:
     """A fresh state that is told it is past the beginning."""
     config = steady(parse_config((*MINIATURE, "--drone.physics", "mjx")), 8)
-    world = run_missions(config).training.world
+    world = run_missions(config).training.env_params
     state = jax.jit(lambda world, key: init_state(config, world, key))(world, jax.random.key(0))
     return Moment(config, world, dataclasses.replace(state, step=jnp.int32(Schedule.from_config(config).learn_from)))
 

@@ -110,7 +110,7 @@ def test_there_is_a_gap_between_any_two_boxes() -> None:
 @pytest.mark.slow
 def test_state_bytes_are_exactly_those_of_the_arrays() -> None:
     config = parse_config(MINIATURE)
-    world = run_missions(config).training.world
+    world = run_missions(config).training.env_params
     counted = state_bytes(config, world)
     state = jax.eval_shape(lambda world, key: init_state(config, world, key), world, jax.random.key(0))
     flown, stored = counted.environments * counted.environment, counted.replay_slots * counted.replay_slot

@@ -70,7 +70,7 @@ def flight_data(run: EvaluatedRun, mission: int) -> dict[str, Any]:
     last = len(columns["t"]) - 1
     rows = np.unique(np.append(np.arange(0, last + 1, every), last))
     table = np.stack([columns[name][rows] for name in COLUMNS], axis=1).astype("<f4")
-    pool_missions = run.missions.world.missions
+    pool_missions = run.missions.env_params.missions
     return {
         "mission": mission,
         "outcome": run.outcomes[mission],

@@ -52,7 +52,7 @@ def from_trajectory(
     config: Config, missions: RunMissions, judge: MujocoWorld, recorded: Mapping[str, np.ndarray]
 ) -> tuple[dict[str, Any], dict[str, float]]:
     """Returns what `summary.json` must say of the recorded flight, and how far numbers may be off; C MuJoCo judges."""
-    pool_missions = missions.final.world.missions
+    pool_missions = missions.final.env_params.missions
     start, goal = np.asarray(pool_missions.start[0], np.float64), np.asarray(pool_missions.goal[0], np.float64)
     positions = columns_of(recorded, POSITION)
     path = np.concatenate([start[None], positions])

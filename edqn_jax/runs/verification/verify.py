@@ -104,8 +104,8 @@ def _verified(folder: Path, message: Callable[[str], None]) -> list[Finding]:
     flights_of_seeds = []
     for number, (each, summary, of_run) in enumerate(zip(runs, summaries, missions, strict=True)):
         config, params = policies[number]
-        message(f"flying {of_run.final.world.missions.scene.shape[0]} missions of '{each.path}' again")
-        flights = fly_on_all_devices(config, of_run.final.world, params, config.train.seed, record=True)
+        message(f"flying {of_run.final.env_params.missions.scene.shape[0]} missions of '{each.path}' again")
+        flights = fly_on_all_devices(config, of_run.final.env_params, params, config.train.seed, record=True)
         agent = None if checkpoint is None else _Saved.of(checkpoint, number)
         name = "" if found.seeds is None else f"{each.path.name}: "
         findings += [
@@ -175,7 +175,7 @@ def _verify_checkpoint(
     seeds: int | None,
 ) -> list[Finding]:
     """Returns whether the state, the options and the growing files are those of the last checkpoint, a sealed one."""
-    worlds = [each.training.world for each in missions]
+    worlds = [each.training.env_params for each in missions]
     trainer = Trainer(configs[0], worlds[0] if seeds is None else worlds, jax.devices()[:1])
     done = checkpoint.host["done"]
     expected = saved_state.state_shapes(trainer, done).items()
@@ -227,7 +227,7 @@ def _verify_agent(
     saved: _Saved | None,
 ) -> list[Finding]:
     """Returns the findings of one agent's run."""
-    first = judges_of(config, missions.final)[int(missions.final.world.missions.scene[0])]
+    first = judges_of(config, missions.final)[int(missions.final.env_params.missions.scene[0])]
     metrics, recorded = run.read_metrics(), run.read_trajectory()
     of_training = from_metrics(config, metrics)
     of_flight, within = from_trajectory(config, missions, first, recorded)
