@@ -23,7 +23,7 @@ from edqn_jax.devices.devices import choose_devices, use_cpu_devices
 from edqn_jax.evaluation.missions import run_missions
 from edqn_jax.learn.schedule import Schedule
 from edqn_jax.learn.trainer import AXIS, Trainer
-from measurement.flags import configured
+from measurement.flags import parse_config
 from measurement.parts import PARTS, Moment
 from measurement.timing import Timed
 from measurement.whole import steady
@@ -40,9 +40,9 @@ def now() -> Moment:
 
     The environment variable EDQN_FLAGS sets options of train.py; without it the reference workload is timed.
     """
-    config = configured(os.environ.get("EDQN_FLAGS", "").split())
+    config = parse_config(os.environ.get("EDQN_FLAGS", "").split())
     config = steady(config, config.train.chunk_steps)
-    world = run_missions(config).training.world
+    world = run_missions(config).training.env_params
     state = Trainer(config, world, jax.devices()[:1]).init(config.train.seed)
     return Moment(config, world, dataclasses.replace(state, step=jnp.int32(Schedule.from_config(config).learn_from)))
 

@@ -34,7 +34,7 @@ from edqn_jax.errors import ConfigError
 from measurement import json_report
 from measurement.child import Child, ChildEndedError
 from measurement.command import Parser, at_least_one, in_a_sentence
-from measurement.flags import configured, split
+from measurement.flags import parse_config, split
 from measurement.intervals import median_interval
 from measurement.parts import PARTS
 from measurement.whole import WHOLE
@@ -84,7 +84,7 @@ def check_committed(root: Path, commits: Mapping[str, str]) -> None:
 
 
 @contextlib.contextmanager
-def checked_out(root: Path, commit: str, folder: Path) -> Iterator[Path]:
+def check_out(root: Path, commit: str, folder: Path) -> Iterator[Path]:
     """Checks the commit out into a worktree at `folder`, which is removed after the block.
 
     Raises:
@@ -190,7 +190,7 @@ def measure(
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
         workers = []
         for side, commit in zip("ab", commits, strict=True):
-            checkout = stack.enter_context(checked_out(root, commit, folder / f"{side}-{commit[:10]}"))
+            checkout = stack.enter_context(check_out(root, commit, folder / f"{side}-{commit[:10]}"))
             workers.append(stack.enter_context(Worker(checkout, rows, words, folder / f"{side}.log")))
         for worker in workers:
             worker.wait_until_ready()
@@ -262,7 +262,7 @@ def parse(argv: Sequence[str] | None = None) -> tuple[argparse.Namespace, list[s
     for row in args.rows:
         if row not in (WHOLE, *PARTS):
             raise ConfigError(f"there is no row '{row}'; there are {', '.join((WHOLE, *PARTS))}")
-    configured(flags)  # raises before anything is checked out
+    parse_config(flags)  # raises before anything is checked out
     return args, [*(["--quick"] if args.quick else []), "--", *flags]
 
 

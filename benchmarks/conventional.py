@@ -22,7 +22,7 @@ from typing import Any
 
 import jax
 
-from conventional_stack.settings import DRONES, PACKAGES, SETTINGS, supported
+from conventional_stack.settings import DRONES, PACKAGES, SETTINGS, supported_config
 from edqn_jax.config import Config
 from edqn_jax.devices.devices import use_cpu_devices
 from edqn_jax.evaluation.missions import run_missions
@@ -30,7 +30,7 @@ from edqn_jax.runs.provenance import describe_workload
 from edqn_jax.sim.scene.mjcf import load_scene, resolve_world
 from measurement import json_report
 from measurement.command import Parser, at_least_one, in_a_sentence
-from measurement.flags import configured, split
+from measurement.flags import parse_config, split
 from measurement.whole import steady
 
 DECISIONS = 20_480
@@ -50,7 +50,7 @@ def parse(argv: Sequence[str] | None = None) -> tuple[argparse.Namespace, Config
     )
     parser.add_argument("--repeats", type=at_least_one, default=REPEATS, help=f"turns of each row (default {REPEATS})")
     args = parser.parse(words)
-    return args, steady(supported(configured(["--num-envs", str(DRONES), *flags])), 4)
+    return args, steady(supported_config(parse_config(["--num-envs", str(DRONES), *flags])), 4)
 
 
 def measure(config: Config, decisions: int, repeats: int) -> dict[str, Any]:
@@ -63,7 +63,7 @@ def measure(config: Config, decisions: int, repeats: int) -> dict[str, Any]:
     from conventional_stack.fleet import Course
     from conventional_stack.train import Steady
 
-    course = Course.of(run_missions(config).training.world)
+    course = Course.of(run_missions(config).training.env_params)
     turns: dict[tuple[int, int], list[float]] = {setting: [] for setting in SETTINGS}
     with ExitStack() as stack:
         runs = {setting: stack.enter_context(Steady(config, course, *setting)) for setting in SETTINGS}

@@ -27,7 +27,7 @@ from edqn_jax.learn.policy import fresh_policy
 from edqn_jax.runs.provenance import describe_workload
 from measurement import json_report
 from measurement.command import Parser, in_a_sentence
-from measurement.flags import configured, split
+from measurement.flags import parse_config, split
 
 REPEATS, CALLS = 5, 2000
 
@@ -42,7 +42,7 @@ def parse(argv: Sequence[str] | None = None) -> tuple[argparse.Namespace, Config
     parser = Parser("decision", __doc__)
     parser.add_argument("--quick", action="store_true", help=f"{CALLS // 10} decisions instead of {REPEATS} x {CALLS}")
     args = parser.parse(words)
-    return args, configured(flags)
+    return args, parse_config(flags)
 
 
 def measure(config: Config, repeats: int, calls: int) -> dict[str, Any]:

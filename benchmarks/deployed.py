@@ -61,13 +61,13 @@ def parse(argv: Sequence[str] | None = None) -> argparse.Namespace:
 def measure(policy: Policy, camera: tuple[int, int] | None, repeats: int, calls: int) -> dict[str, Any]:
     """Returns the report that `--json` writes: medians over `repeats` of the percentiles of `calls` decisions."""
     missions = load_missions(policy.config, WORLD, 1, 0, None, None)
-    flights = fly_on_all_devices(policy.config, missions.world, policy.params, 0, record=True)
-    recording = flight_recording(policy.config, missions.world, flight_trajectory(policy.config, flights), camera)
+    flights = fly_on_all_devices(policy.config, missions.env_params, policy.params, 0, record=True)
+    recording = flight_recording(policy.config, missions.env_params, flight_trajectory(policy.config, flights), camera)
     with tempfile.TemporaryDirectory() as folder:
         file = export_policy(policy, Path(folder) / "policy.onnx").file
         size = file.stat().st_size
         runner = Runner(file, camera=recording.size())
-    given = _decisions(runner, recording, missions.world)
+    given = _decisions(runner, recording, missions.env_params)
     turns = []
     for _ in range(repeats):
         runner.reset()

@@ -20,7 +20,7 @@ import numpy as np
 
 from edqn_jax.config import Config
 from edqn_jax.devices.devices import use_cpu_devices
-from edqn_jax.evaluation.companions import scene_of_flight
+from edqn_jax.evaluation.flight_scene import scene_of_flight
 from edqn_jax.evaluation.missions import MissionSet, load_missions
 from edqn_jax.evaluation.rollouts import fly_on_all_devices
 from edqn_jax.runs.policies import load_run
@@ -57,7 +57,7 @@ LAST = 4
 """Decisions before the collision whose windows' events are counted: the last second, of which windows cover a part."""
 
 
-def what_was_hit(scene: Scene, point: np.ndarray, yaw: float) -> tuple[str, int, str]:
+def find_hit_shape(scene: Scene, point: np.ndarray, yaw: float) -> tuple[str, int, str]:
     """Returns kind and index of the shape nearest to `point` [3], and on which side of a drone heading `yaw` it is."""
     distances = {kind: np.asarray(each) for kind, each in shape_distances(scene, jnp.asarray(point)).items()}
     kind = min(distances, key=lambda name: distances[name].min())
@@ -83,7 +83,7 @@ def alone(scene: Scene, kind: str, index: int) -> Scene:
 
 
 @partial(jax.jit, static_argnums=0)
-def seen_of_it(config: Config, scene: Scene, only: Scene, poses: Flight) -> tuple[jax.Array, jax.Array]:
+def count_visible(config: Config, scene: Scene, only: Scene, poses: Flight) -> tuple[jax.Array, jax.Array]:
     """Returns how many pixels show the shape at each of K decisions, and how many events these pixels have: [K] each.
 
     Args:
@@ -136,10 +136,10 @@ def look_back(config: Config, missions: MissionSet, flights: Flights, mission: i
     scene = scene_of_flight(config, missions, flights, mission)
     then = config.drone.physics_dt_s * (steps - 1 + float(flights.contact[mission]))
     heading = float(yaw_of(jnp.asarray(quaternion[-1])))
-    kind, index, side = what_was_hit(scene_at(scene, jnp.float32(then)), point, heading)
+    kind, index, side = find_hit_shape(scene_at(scene, jnp.float32(then)), point, heading)
     pixels, events = (
         np.asarray(values)
-        for values in seen_of_it(
+        for values in count_visible(
             config, scene, alone(scene, kind, index), poses_of(config, position, quaternion, decisions)
         )
     )
@@ -204,7 +204,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     config, params = load_run(args.run)
     group.check_alone(config, "this benchmark")
     missions = load_missions(config, args.world or config.world.name, args.missions, args.seed)
-    flights = jax.tree.map(np.asarray, fly_on_all_devices(config, missions.world, params, args.seed, record=True))
+    flights = jax.tree.map(np.asarray, fly_on_all_devices(config, missions.env_params, params, args.seed, record=True))
     (collided,) = np.nonzero(flights.outcome == Outcome.COLLISION)
     rows = [look_back(config, missions, flights, int(mission)) for mission in collided[: args.flights]]
     counts = Counter(Outcome(int(kind)).name.lower() for kind in flights.outcome)

@@ -36,7 +36,7 @@ from edqn_jax.sim.task.outcomes import Outcome
 from edqn_jax.sim.task.task import task_of
 from measurement import json_report
 from measurement.command import Parser, at_least_one, in_a_sentence
-from measurement.flags import judged_in_tests, split
+from measurement.flags import split, with_test_worlds_only
 
 
 def hover(body: DroneState, goal: Array) -> Array:
@@ -82,14 +82,14 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--world", default="moving", choices=FAMILIES, help="(default moving)")
     parser.add_argument("--missions", type=at_least_one, default=1000, help="test missions (default 1000)")
     args = parser.parse(words)
-    config = judged_in_tests(parse_train(["--world", args.world, "--env.sensor", "blind", *flags])[1])
+    config = with_test_worlds_only(parse_train(["--world", args.world, "--env.sensor", "blind", *flags])[1])
     use_cpu_devices()
     missions = load_missions(config, args.world, args.missions)
     names = [outcome.name.lower().replace("_", " ") for outcome in Outcome if outcome != Outcome.RUNNING]
     print(f"| gate | success | 95 % interval | {' | '.join(names)} |\n| --- | ---: | --- |{' ---: |' * len(names)}")
     rows = []
     for gate in GATES:
-        flown = np.asarray(outcomes(config, missions.world, gate, run_streams(0).flights))
+        flown = np.asarray(outcomes(config, missions.env_params, gate, run_streams(0).flights))
         counts = Counter(Outcome(int(kind)).name.lower().replace("_", " ") for kind in flown)
         low, high = rate_interval((flown == Outcome.GOAL)[None])
         rows.append({"gate": gate, "missions": args.missions, "interval": [low, high], **counts})

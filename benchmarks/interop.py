@@ -30,7 +30,7 @@ from edqn_jax.sim.environment import Environment
 from edqn_jax.sim.task.task import task_of
 from measurement import json_report
 from measurement.command import Parser, at_least_one, in_a_sentence
-from measurement.flags import configured, split
+from measurement.flags import parse_config, split
 
 DRONES = 256
 STEPS = 200
@@ -49,7 +49,7 @@ def parse(argv: Sequence[str] | None = None) -> tuple[argparse.Namespace, Config
     parser.add_argument("--steps", type=at_least_one, default=STEPS, help=f"steps of a turn (default {STEPS})")
     parser.add_argument("--repeats", type=at_least_one, default=REPEATS, help=f"turns of each row (default {REPEATS})")
     args = parser.parse(words)
-    return args, configured(flags)
+    return args, parse_config(flags)
 
 
 def pure(environment: Environment, drones: int) -> Callable[[np.ndarray], None]:

@@ -89,7 +89,7 @@ def measure_row(config: Config, args: argparse.Namespace, folder: Path) -> succe
     for lux in args.lux:
         lit = with_conditions(config, {"light": {"least_lux": lux, "most_lux": lux}}, "--lux")
         course = load_missions(lit, args.world, args.missions)
-        lights.append({"lux": lux, "turns": success.turns_of(lit, policies, course.world, args.missions)})
+        lights.append({"lux": lux, "turns": success.turns_of(lit, policies, course.env_params, args.missions)})
     took = {"row_seconds": time.perf_counter() - began}
     return row | took | {"benchmark": "light", "speed_m_s": config.env.speed_m_s, "lights": lights}
 

@@ -141,7 +141,7 @@ def course_of(policy: Policy, family: str, split: families.Split, missions: int,
     return EnvParams(load_airframe(policy.config.drone), pool, own_missions(pool))
 
 
-def what_the_map_had(log_odds: np.ndarray, cell_m: float, scene: Scene, position: np.ndarray, radius: float) -> str:
+def look_up_contact(log_odds: np.ndarray, cell_m: float, scene: Scene, position: np.ndarray, radius: float) -> str:
     """Returns what a map had of the place that a body touches: `KNOWN`, `TAKEN_FOR_FREE` or `UNSEEN`.
 
     It is known if a cell is occupied within a cell of that place, unseen if all of these are unknown.
@@ -207,7 +207,7 @@ def pilot_row(policy: Policy, flown: PilotConfig, world: EnvParams, batch: int, 
             aim = jax.tree.map(lambda leaf, lane=lane: leaf[lane], flying.aim)
             scene = scene_at(env.scene_of(world, jnp.asarray(missions[lane]), aim), time_s[lane])
             log_odds = np.asarray(flying.grid.log_odds[lane])
-            had.append(what_the_map_had(log_odds, flown.map.cell_m, scene, position[lane], radius))
+            had.append(look_up_contact(log_odds, flown.map.cell_m, scene, position[lane], radius))
 
     flights, planning = pilot.fly(
         policy.config, flown, world, policy.params, jax.random.key(0), batch=batch, landed=landed
@@ -262,7 +262,9 @@ def table(rows: Sequence[Row]) -> str:
     return "\n".join(lines)
 
 
-def watched(policy: Policy, flown: PilotConfig, world: EnvParams) -> tuple[list[Moment], Outcome, Aim | None]:
+def record_first_flight(
+    policy: Policy, flown: PilotConfig, world: EnvParams
+) -> tuple[list[Moment], Outcome, Aim | None]:
     """Returns what the pilot knew at each decision of the first mission, how it ended, and where balls were thrown."""
     moments: list[Moment] = []
     seconds = policy.config.drone.physics_steps * policy.config.drone.physics_dt_s
@@ -291,7 +293,7 @@ def draw(policy: Policy, args: argparse.Namespace) -> None:
     method = args.methods[0]
     flown = with_options(TUNED[method], args.set)
     world = course_of(policy, args.worlds[0], args.split, 1, first=args.mission)
-    moments, outcome, aim = watched(policy, flown, world)
+    moments, outcome, aim = record_first_flight(policy, flown, world)
     scene = env.scene_of(world, jnp.asarray(0), aim)
     if args.figure.suffix == ".png":
         chosen = np.unique(np.linspace(0, len(moments) - 1, PICTURES).round().astype(int))

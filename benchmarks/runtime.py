@@ -29,7 +29,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from conventional_stack.settings import DRONES, supported
+from conventional_stack.settings import DRONES, supported_config
 from edqn_jax.cli.train import parse_train
 from edqn_jax.config import FAMILIES, Config
 from edqn_jax.config.loading import suggest_nearest, to_yaml
@@ -38,15 +38,15 @@ from edqn_jax.errors import ConfigError
 from measurement import json_report
 from measurement.child import Child, ChildEndedError
 from measurement.command import Parser, in_a_sentence
-from measurement.flags import configured as for_timing
-from measurement.flags import judged_in_tests, split
+from measurement.flags import parse_config as for_timing
+from measurement.flags import split, with_test_worlds_only
 from measurement.whole import steady
 from rivals import table
 from rivals.figure import draw_runtime
 from rivals.learners import LEARNERS, sensing
 from rivals.planners.planner import IMPROVING, PLANNERS
 from rivals.planning import judged_scenes, keep_to_cpu, shortest_lengths
-from rivals.rows import Row, figures, joined, worth
+from rivals.rows import Row, figures, join_rows, worth
 from rivals.stack import STACK, STEADY
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -136,8 +136,8 @@ def parse(argv: Sequence[str] | None = None) -> Asked:
     if args.figure is not None and args.figure.suffix != ".png":
         raise ConfigError(f"--figure must end in .png, not '{args.figure}'")
     added = [read(file) for file in args.add]
-    joined(row for report in added for row in report["rows"])  # raises before anything is measured
-    configs = {world: configured(world, flags, args.quick) for world in (args.worlds if args.seeds else [])}
+    join_rows(row for report in added for row in report["rows"])  # raises before anything is measured
+    configs = {world: config_for_world(world, flags, args.quick) for world in (args.worlds if args.seeds else [])}
     return Asked(args, configs, flags, added)
 
 
@@ -150,13 +150,13 @@ def check_worlds(worlds: Sequence[str]) -> None:
             raise ConfigError(f"'{other}' and '{world}' would have rows of the same name; rename one of the files")
 
 
-def configured(world: str, flags: Sequence[str], quick: bool) -> Config:
+def config_for_world(world: str, flags: Sequence[str], quick: bool) -> Config:
     """Returns the configuration of `train.py` for that world, with `POINTS` validations and test missions alone.
 
     Raises:
         ConfigError: if it is invalid.
     """
-    config = judged_in_tests(parse_train(["--world", world, *(QUICK if quick else ()), *flags])[1])
+    config = with_test_worlds_only(parse_train(["--world", world, *(QUICK if quick else ()), *flags])[1])
     if not quick and not any(flag.replace("_", "-").startswith("--train.validation-every") for flag in flags):
         every = -(-config.train.total_steps // POINTS)
         config = dataclasses.replace(config, train=dataclasses.replace(config.train, validation_every=every))
@@ -184,7 +184,7 @@ def read(file: Path) -> dict[str, Any]:
 # ------------------------------------------------------------------------------------------ running
 
 
-def launched(
+def launch_children(
     stack: contextlib.ExitStack, wanted: dict[str, Config], budget: float = 0.0, count: int = 0
 ) -> tuple[dict[str, Child], dict[str, dict[str, Any]]]:
     """Starts a child for each method and waits until they are ready; as many start at once as there are cores.
@@ -262,7 +262,7 @@ def config_of(asked: Asked, world: str, name: str, has_path: bool) -> Config:
         return config
     if not has_path:
         raise ConfigError("there is no path from start to goal, so train.py rejects this world")
-    return supported(config) if name == STACK else sensing(config, name)
+    return supported_config(config) if name == STACK else sensing(config, name)
 
 
 def missions_of(asked: Asked, world: str) -> int:
@@ -300,7 +300,7 @@ def measure_world(asked: Asked, world: str) -> Iterator[list[Row]]:
         except ConfigError as error:
             row["reason"] = str(error)
     with contextlib.ExitStack() as stack:
-        children, said = launched(stack, wanted, args.budget, missions_of(asked, world))
+        children, said = launch_children(stack, wanted, args.budget, missions_of(asked, world))
         for name, about in said.items():
             rows[name] |= about
         began = time.perf_counter()
@@ -334,9 +334,9 @@ def measure_rates(asked: Asked) -> dict[str, Any] | None:
     config = for_timing(["--world", "paper", "--num-envs", str(DRONES), *asked.flags])
     ours, theirs = STEADY
     # A short warm-up for the conventional stack, for which the decisions of one of our chunks take minutes.
-    wanted = {theirs: steady(supported(config), 4), ours: steady(config, config.train.chunk_steps)}
+    wanted = {theirs: steady(supported_config(config), 4), ours: steady(config, config.train.chunk_steps)}
     with contextlib.ExitStack() as stack:
-        children, said = launched(stack, wanted)
+        children, said = launch_children(stack, wanted)
         report: dict[str, Any] = {"turns": {}, "reason": None, **said[ours]}
         for name in STEADY:
             if name not in children:
@@ -401,7 +401,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     rates = [*([measured] if measured else []), *(rate for report in asked.added for rate in report["rates"])]
     complaints = []
     try:
-        rows = joined([*rows, *(row for report in asked.added for row in report["rows"])])
+        rows = join_rows([*rows, *(row for report in asked.added for row in report["rows"])])
     except ConfigError as error:  # the new rows must not be lost
         complaints.append(f"{error}; the added rows are left out")
     try:

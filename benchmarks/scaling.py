@@ -27,7 +27,7 @@ from pathlib import Path
 from typing import Any
 
 from curves.figure import draw_scaling
-from curves.sizes import CURVES, Curve, changed
+from curves.sizes import CURVES, Curve, replace_options
 from curves.state_bytes import StateBytes, state_bytes
 from edqn_jax.config import Config
 from edqn_jax.devices.devices import choose_devices, use_cpu_devices
@@ -37,7 +37,7 @@ from edqn_jax.runs.provenance import describe_workload
 from measurement import json_report
 from measurement.ceilings import Rollout
 from measurement.command import Parser, at_least_one, in_a_sentence
-from measurement.flags import configured, split
+from measurement.flags import parse_config, split
 from measurement.whole import WholeStep, steady
 
 REPEATS, QUICK_REPEATS = 7, 3
@@ -59,7 +59,7 @@ class Runner:
     def __init__(self, config: Config, missions: RunMissions) -> None:
         self.config, self.scene = config, missions.scene
         self.devices = choose_devices(config.train.devices, config.train.shards)
-        self.whole = WholeStep(config, missions.training.world, self.devices)
+        self.whole = WholeStep(config, missions.training.env_params, self.devices)
         self.chunks = math.ceil(TURN_SECONDS * self.whole.turn() / self.whole.decisions)
 
     @property
@@ -74,7 +74,7 @@ class Runner:
         return seconds / (self.chunks * self.whole.decisions), cores
 
 
-def chunked(config: Config, decisions: int) -> Config:
+def with_chunks_of(config: Config, decisions: int) -> Config:
     """Returns the steady workload in chunks of about `decisions`, with a short warm-up, which is not timed."""
     config = steady(config, max(STEPS, decisions // config.train.num_envs))
     return dataclasses.replace(config, encoder=dataclasses.replace(config.encoder, warmup_updates_per_step=1))
@@ -87,7 +87,7 @@ def measure(base: Config, names: Sequence[str], quick: bool, repeats: int) -> di
         ConfigError: if a size is invalid, or there is nothing to measure.
     """
     used = choose_devices(base.train.devices, base.train.shards)
-    base = changed(base, train={"devices": len(used)})
+    base = replace_options(base, train={"devices": len(used)})
     decisions = QUICK_DECISIONS if quick else DECISIONS
     if used[0].platform != "cpu":  # the start of a chunk this short would take a large part of its time
         decisions = max(decisions, base.train.num_envs * base.train.chunk_steps)
@@ -104,7 +104,7 @@ def measure(base: Config, names: Sequence[str], quick: bool, repeats: int) -> di
         if not curves:
             raise ConfigError("there is only one device, so there is no curve of devices")
         for number, curve in enumerate(curves):
-            configs = [chunked(point.config, decisions) for point in curve.points]
+            configs = [with_chunks_of(point.config, decisions) for point in curve.points]
             for point, config in zip(curve.points, configs, strict=True):
                 where = (config.world, config.drone)
                 if where not in laid:
@@ -112,20 +112,22 @@ def measure(base: Config, names: Sequence[str], quick: bool, repeats: int) -> di
                 if config not in runners:
                     print(f"{curve.name}: compiling {point.label}", file=sys.stderr, flush=True)
                     runners[config] = Runner(config, laid[where])
-                if config == chunked(base, decisions):
+                if config == with_chunks_of(base, decisions):
                     temporary = runners[config].temporary_bytes_per_environment
             some, summary = _measure_curve(curve, [runners[config] for config in configs], rollout, repeats)
             rows += some
             summaries.append(summary)
             # Runners that later curves share are kept; the memory of the others is freed.
-            later = {chunked(point.config, decisions) for after in curves[number + 1 :] for point in after.points}
+            later = {
+                with_chunks_of(point.config, decisions) for after in curves[number + 1 :] for point in after.points
+            }
             runners = {config: runner for config, runner in runners.items() if config in later}
     return {
         "workload": {**describe_workload(steady(base, 1), reference.scene), "world": base.world.name},
         **json_report.machine(used),
         "repeats": repeats,
         "curves": summaries,
-        "memory": memory_of(state_bytes(base, reference.training.world), temporary),
+        "memory": memory_of(state_bytes(base, reference.training.env_params), temporary),
         "rows": rows,
     }
 
@@ -288,7 +290,7 @@ def parse(argv: Sequence[str] | None = None) -> tuple[argparse.Namespace, Config
     args = parser.parse(words)
     if args.repeats is None:
         args.repeats = QUICK_REPEATS if args.quick else REPEATS
-    return args, configured(flags)
+    return args, parse_config(flags)
 
 
 @in_a_sentence

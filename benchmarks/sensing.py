@@ -65,7 +65,7 @@ def parse(argv: Sequence[str] | None = None) -> argparse.Namespace:
 
 def events_per_decision(policy: Policy, course: MissionSet) -> float:
     """Returns the mean number of events that a drone gets for a decision, in greedy flights of the missions."""
-    count, decisions = _flown(policy.config, course.world, policy.params)
+    count, decisions = _flown(policy.config, course.env_params, policy.params)
     return float(count) / float(decisions)
 
 

@@ -54,7 +54,7 @@ from edqn_jax.sim.task.env import EnvParams
 from edqn_jax.training.loop import train_seeds
 from measurement import json_report
 from measurement.command import Parser, at_least_one, in_a_sentence
-from measurement.flags import judged_in_tests, split
+from measurement.flags import split, with_test_worlds_only
 from rivals.learners import flight_columns
 from rivals.planning import judged_scenes, shortest_lengths
 
@@ -102,7 +102,7 @@ def config_of(world: str, sensor: str, flags: Sequence[str]) -> Config:
     Raises:
         ConfigError: if the options are invalid.
     """
-    config = judged_in_tests(parse_train(["--world", world, "--env.sensor", sensor, *flags])[1])
+    config = with_test_worlds_only(parse_train(["--world", world, "--env.sensor", sensor, *flags])[1])
     # What is flown at the end is what was learnt at the end: no choice by validation, no time for it.
     train = dataclasses.replace(config.train, validation_every=0, validation_missions=config.env.drones, keep="last")
     return dataclasses.replace(config, train=train)
@@ -259,7 +259,7 @@ def _row(
 ) -> Row:
     """Flies the test missions and returns the row."""
     course = load_missions(config, config.world.name, missions)
-    turns = turns_of(config, policies, course.world, missions, shuffle_codes)
+    turns = turns_of(config, policies, course.env_params, missions, shuffle_codes)
     return {
         "benchmark": "success",
         "world": config.world.name,
@@ -398,7 +398,7 @@ def train_all(wanted: Sequence[Wanted], until: float) -> None:
         print(f"{policies_of(one.file)}: trained, {took[-1]:.0f} s", file=sys.stderr)
 
 
-def _wanted(args: argparse.Namespace) -> list[Wanted]:
+def _select_rows(args: argparse.Namespace) -> list[Wanted]:
     """Returns the rows that the arguments ask for, and makes JAX present as many devices as they use.
 
     Raises:
@@ -446,7 +446,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     args = parse(argv)
     check_can_make(args.out)
     rows = read_rows(args.out)
-    wanted = [] if args.report else _wanted(args)
+    wanted = [] if args.report else _select_rows(args)
     if args.train_only:
         train_all(wanted, began + 60 * args.minutes)
         return 3

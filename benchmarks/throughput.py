@@ -33,7 +33,7 @@ from edqn_jax.runs.provenance import describe_workload
 from measurement import json_report
 from measurement.ceilings import Rollout, ceilings
 from measurement.command import Parser, at_least_one, in_a_sentence
-from measurement.flags import configured, split
+from measurement.flags import parse_config, split
 from measurement.parts import parts_of
 from measurement.timing import Timed
 from measurement.whole import WHOLE, WholeStep, steady
@@ -60,7 +60,7 @@ def parse(argv: Sequence[str] | None = None) -> tuple[argparse.Namespace, Config
     parser.add_argument("--quick", action="store_true", help="one short turn of each row")
     parser.add_argument("--whole-only", action="store_true", help="do not time the parts")
     args = parser.parse(words)
-    config = configured(flags)
+    config = parse_config(flags)
     if config.env.sensor != "events" and not args.whole_only:
         raise ConfigError(f"parts can be timed only for env.sensor events; {config.env.sensor} needs --whole-only")
     if config.env.drones > 1 and not args.whole_only:
@@ -73,11 +73,11 @@ def measure(config: Config, repeats: int, parts: bool) -> dict[str, Any]:
     missions = run_missions(config)
     devices = choose_devices(config.train.devices, config.train.shards)
     mesh = Mesh(np.asarray(devices), (AXIS,))
-    whole = WholeStep(config, missions.training.world, devices)
+    whole = WholeStep(config, missions.training.env_params, devices)
     # A copy, because the next chunk is given the state itself.
     host = jax.tree.map(lambda x: jax.device_put(x, devices[0]).copy(), whole.state)
     timed = (
-        [Timed(part, mesh, config.train.num_envs) for part in parts_of(config, missions.training.world, host)]
+        [Timed(part, mesh, config.train.num_envs) for part in parts_of(config, missions.training.env_params, host)]
         if parts
         else []
     )

@@ -36,7 +36,7 @@ from edqn_jax.runs.provenance import describe_workload
 from edqn_jax.sim.scene.mjcf import load_scene, resolve_world
 from measurement import json_report
 from measurement.command import Parser, at_least_one, in_a_sentence
-from measurement.flags import configured, split
+from measurement.flags import parse_config, split
 from measurement.whole import WholeStep, steady
 
 DRONES = 8
@@ -62,7 +62,7 @@ def parse(argv: Sequence[str] | None = None) -> tuple[argparse.Namespace, Config
     )
     parser.add_argument("--repeats", type=at_least_one, default=REPEATS, help=f"turns of each row (default {REPEATS})")
     args = parser.parse(words)
-    return args, steady(configured(flags), 64)
+    return args, steady(parse_config(flags), 64)
 
 
 class Tutorial:
@@ -122,7 +122,7 @@ def measure(config: Config, drones: int, decisions: int, repeats: int) -> dict[s
         MissingPackageError: if a package of the extra `bench` is not installed.
     """
     check(config)
-    ours = WholeStep(config, run_missions(config).training.world, choose_devices(0, config.train.shards))
+    ours = WholeStep(config, run_missions(config).training.env_params, choose_devices(0, config.train.shards))
     turns: list[tuple[float, float]] = []
     with Tutorial(config, drones) as tutorial:
         tutorial.turn(2 * drones)  # the first decisions are random and nothing is learnt

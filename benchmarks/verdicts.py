@@ -74,7 +74,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     config, params = load_run(args.run)
     group.check_alone(config, "this benchmark")
     course = load_missions(config, args.world or config.world.name, args.missions, args.seed)
-    flights = fly_on_all_devices(config, course.world, params, args.seed, record=True)
+    flights = fly_on_all_devices(config, course.env_params, params, args.seed, record=True)
     results = check_verdicts(config, course, flights)
     rows = rows_of(results)
     print(table(rows))

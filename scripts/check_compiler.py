@@ -138,7 +138,7 @@ class Chunk:
     def run(self, options: dict[str, Any]) -> Tree:
         """Compiles the chunk and returns the state after it, from the same state every time."""
         if self.trainer is None:
-            self.trainer = Trainer(self.config, run_missions(self.config).training.world, jax.devices())
+            self.trainer = Trainer(self.config, run_missions(self.config).training.env_params, jax.devices())
             state = self.trainer.init(0)
             while self.done <= self.trainer.schedule.learn_from:
                 state, _ = self.trainer.chunk(state, self.done)
@@ -149,13 +149,13 @@ class Chunk:
         assert self.trainer._traced is not None
         chunk = self.trainer._traced.compile(options)
         state = jax.tree.map(_placed, self.state, self.layout)
-        return jax.tree.map(_numbers, chunk(self.trainer.world, state, self.trainer._steps(self.done)))
+        return jax.tree.map(_numbers, chunk(self.trainer.env_params, state, self.trainer._steps(self.done)))
 
 
 def _fly(policy: Any, missions: int, options: dict[str, Any]) -> Tree:
     """Returns the first two decisions of greedy flights, before a tipped move makes two flights of one."""
     short = dataclasses.replace(policy.config, env=dataclasses.replace(policy.config.env, max_decisions=2))
-    world = load_missions(short, "rooms", missions).world
+    world = load_missions(short, "rooms", missions).env_params
     program = jax.jit(rollouts._fly_all, static_argnums=(0, 1, 2, 3), compiler_options=options)
     key = run_streams(0).flights
     return jax.tree.map(_numbers, program(short, False, True, None, world, policy.params, key))

@@ -229,7 +229,7 @@ def test_pictures_and_depth_are_drawn_within_programs_of_ones_own() -> None:
 
 def test_the_worlds_of_a_split_are_those_of_its_missions() -> None:
     test, training = (edqn_jax.make("sparse", QUICK, worlds=3, split=split) for split in ("test", "training"))
-    evaluated = load_missions(QUICK, "sparse", 3, 0).world.pool
+    evaluated = load_missions(QUICK, "sparse", 3, 0).env_params.pool
     np.testing.assert_array_equal(test.world.pool.start, evaluated.start)
     np.testing.assert_array_equal(test.world.pool.goal, evaluated.goal)
     assert np.any(test.world.pool.start != training.world.pool.start)

@@ -20,7 +20,7 @@ AGENT = {"history": 1, "huber_delta": 1.0, "learning_rate": 2e-3, "target_rate":
 as E-DQN did while it was such an agent."""
 
 
-def supported(config: Config) -> Config:
+def supported_config(config: Config) -> Config:
     """Returns the configuration with `AGENT` in place of what is E-DQN's default; what was set otherwise stays."""
     default = AgentConfig()
     changes = {name: value for name, value in AGENT.items() if getattr(config.agent, name) == getattr(default, name)}

@@ -22,7 +22,7 @@ from conventional_stack.fleet import Course
 from conventional_stack.flights import fly_missions
 from conventional_stack.stopwatch import Stopwatch
 from conventional_stack.vae import EventVAE, Learner
-from conventional_stack.vec_env import CodedDrones, observed
+from conventional_stack.vec_env import CodedDrones, make_observations
 from conventional_stack.workers import SpreadFleet
 from edqn_jax.config import Config
 from edqn_jax.errors import ConfigError
@@ -65,7 +65,7 @@ class Trained:
     def act(self, events: NDArray[np.int8], own: NDArray[np.float32], motion: NDArray[np.float32]) -> NDArray[np.int64]:
         """Returns the best actions [M] for event counts [M, H, W], own states [M, 10] and own motions [M, 7]."""
         code = self.vae.code(self.vae.patches(events), motion)
-        observation = torch.from_numpy(observed(self.config, code, own))
+        observation = torch.from_numpy(make_observations(self.config, code, own))
         with torch.inference_mode():
             return self.q(observation).argmax(dim=1).numpy()
 

@@ -20,7 +20,7 @@ spaces = require_extra("gymnasium").spaces
 vec_env = require_extra("stable_baselines3.common.vec_env")
 
 
-def observed(config: Config, code: NDArray[np.float32], own: NDArray[np.float32]) -> NDArray[np.float32]:
+def make_observations(config: Config, code: NDArray[np.float32], own: NDArray[np.float32]) -> NDArray[np.float32]:
     """Returns observations [N, code_size + 10] of codes [N, code_size] and own states [N, 10]."""
     return np.concatenate([config.agent.code_scale * code, own], axis=1, dtype=np.float32)
 
@@ -50,7 +50,7 @@ class CodedDrones(vec_env.VecEnv):
         """Starts new missions and returns the observations [N, code_size + 10]."""
         self.fleet.reset()
         record, vae = self.fleet.record, self.learner.acting
-        return observed(self.config, vae.code(vae.patches(record.events), record.motion), record.own)
+        return make_observations(self.config, vae.code(vae.patches(record.events), record.motion), record.own)
 
     def step_async(self, actions: np.ndarray) -> None:
         """Sets the actions [N] of the next step."""
@@ -68,14 +68,14 @@ class CodedDrones(vec_env.VecEnv):
                 wanted = vae.target(record.events, record.nearness)
                 for _ in range(self.updates):
                     self.learner.update(patches, record.motion, wanted)
-        observations = observed(self.config, codes, record.own)
+        observations = make_observations(self.config, codes, record.own)
         infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
         ended = np.flatnonzero(record.outcome)
         if len(ended):
-            final = observed(self.config, codes[ended], record.final_own[ended])
+            final = make_observations(self.config, codes[ended], record.final_own[ended])
             # There are no events and no motion at the start of a mission.
             nothing = vae.code(vae.patches(np.zeros_like(record.events[:1])), np.zeros_like(record.motion[:1]))
-            observations[ended] = observed(self.config, nothing.repeat(len(ended), axis=0), record.own[ended])
+            observations[ended] = make_observations(self.config, nothing.repeat(len(ended), axis=0), record.own[ended])
             for i, last in zip(ended, final, strict=True):
                 timed_out = bool(record.outcome[i] == Outcome.TIME_OUT)
                 infos[i] = {"terminal_observation": last, "TimeLimit.truncated": timed_out}

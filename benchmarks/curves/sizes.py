@@ -43,7 +43,9 @@ def pixels(base: Config, quick: bool, folder: Path) -> Curve:
     for times in (1, 2) if quick else (0.5, 1, 2, 3):
         width, height = round(times * base.camera.width), round(times * base.camera.height)
         points.append(
-            Point(width * height, f"{width} × {height}", changed(base, camera={"width": width, "height": height}))
+            Point(
+                width * height, f"{width} × {height}", replace_options(base, camera={"width": width, "height": height})
+            )
         )
     return Curve("pixels", 1.0, tuple(points))
 
@@ -54,7 +56,7 @@ def obstacles(base: Config, quick: bool, folder: Path) -> Curve:
     for count in BOXES[::4] if quick else BOXES:
         file = folder / f"{count}-boxes.xml"
         write_scene(world_of_boxes(count), file, title=f"{count} boxes")
-        points.append(Point(count, str(count), changed(base, world={"name": str(file)})))
+        points.append(Point(count, str(count), replace_options(base, world={"name": str(file)})))
     return Curve("obstacles", 1.0, tuple(points))
 
 
@@ -72,7 +74,9 @@ def physics_steps(base: Config, quick: bool, folder: Path) -> Curve:
     points = []
     for times in (1, 4) if quick else (1, 2, 4):
         steps, dt = times * base.drone.physics_steps, base.drone.physics_dt_s / times
-        points.append(Point(steps, str(steps), changed(base, drone={"physics_steps": steps, "physics_dt_s": dt})))
+        points.append(
+            Point(steps, str(steps), replace_options(base, drone={"physics_steps": steps, "physics_dt_s": dt}))
+        )
     return Curve("physics steps", 1.0, tuple(points))
 
 
@@ -86,7 +90,9 @@ def devices(base: Config, quick: bool, folder: Path) -> Curve:
             size * count // most for size in (base.train.num_envs, base.agent.batch_size, base.agent.replay_size)
         )
         agent = {"batch_size": batch, "replay_size": replay}
-        points.append(Point(count, str(count), changed(base, train={"num_envs": envs, "devices": count}, agent=agent)))
+        points.append(
+            Point(count, str(count), replace_options(base, train={"num_envs": envs, "devices": count}, agent=agent))
+        )
     return Curve("devices", 0.0, tuple(points))
 
 
@@ -103,10 +109,10 @@ def with_environments(base: Config, count: int) -> Config:
     """Returns `base` with another number of environments and the same replayed samples per decision."""
     agent = base.agent
     updates = max(1, round(agent.updates_per_step * count / base.train.num_envs))
-    return changed(base, train={"num_envs": count}, agent={"updates_per_step": updates})
+    return replace_options(base, train={"num_envs": count}, agent={"updates_per_step": updates})
 
 
-def changed(config: Config, **layer: Any) -> Config:
+def replace_options(config: Config, **layer: Any) -> Config:
     """Returns `config` with the given options of its groups replaced.
 
     Raises:

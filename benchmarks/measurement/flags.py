@@ -20,12 +20,12 @@ def split(words: Sequence[str]) -> tuple[list[str], list[str]]:
     return words[:cut], words[cut + 1 :]
 
 
-def judged_in_tests(config: Config) -> Config:
+def with_test_worlds_only(config: Config) -> Config:
     """Returns the configuration with test worlds alone at the end of a run in random worlds."""
     return dataclasses.replace(config, world=dataclasses.replace(config.world, flown=""))
 
 
-def configured(flags: Sequence[str]) -> Config:
+def parse_config(flags: Sequence[str]) -> Config:
     """Returns the configuration of train.py with these options, with `SAMPLES` unless they set the updates per step.
 
     Without a world or a file among them it is the reference workload: the paper's world.
@@ -35,7 +35,7 @@ def configured(flags: Sequence[str]) -> Config:
     """
     named = any(flag.partition("=")[0] in ("--world", "--world.name", "--config") for flag in flags)
     _, config = parse_train(flags if named else ["--world", "paper", *flags])
-    config = judged_in_tests(config)
+    config = with_test_worlds_only(config)
     if any(flag.replace("_", "-").startswith(("--agent.updates-per-step", "--config")) for flag in flags):
         return config
     updates = math.ceil(SAMPLES * config.train.num_envs / config.agent.batch_size)

@@ -35,7 +35,7 @@ from edqn_jax.sim.task.action_sets import heading_setpoint, velocity_command
 from edqn_jax.sim.task.env import EnvParams, EnvState, Step
 from edqn_jax.sim.task.outcomes import judge_decision
 from edqn_jax.sim.task.task import task_of
-from measurement.timing import Part, depending_on, operations_of, size_of, unchanged
+from measurement.timing import Part, depending_on, force_computation, operations_of, size_of
 
 _ROWS, _SAME = PartitionSpec(AXIS), PartitionSpec()
 _LEARNER_AND_KEYS = (_ROWS, (_SAME, _ROWS))
@@ -219,7 +219,7 @@ def environment(now: Moment) -> Part:
     def body(world: EnvParams, carry):
         state, move = carry
         after, step = jax.vmap(lambda s, a: task_of(now.config).step(world, s, a))(state, move)
-        return unchanged(state, after, move), depending_on(move, step.observation, step.reward)
+        return force_computation(state, after, move), depending_on(move, step.observation, step.reward)
 
     return Part("environment", body, now.world, (now.environments, now.moves), countable=False)
 
@@ -234,7 +234,7 @@ def environment_without_resets(now: Moment) -> Part:
             return task_of(now.config).step(world, dataclasses.replace(state, ended=jnp.zeros((), bool)), move)
 
         after, step = jax.vmap(go_on)(state, move)
-        return unchanged(state, after, move), depending_on(move, step.observation, step.reward)
+        return force_computation(state, after, move), depending_on(move, step.observation, step.reward)
 
     carry = (now.environments, now.moves)
     return Part("environment_without_resets", body, now.world, carry, countable=False)

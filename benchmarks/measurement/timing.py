@@ -47,7 +47,7 @@ def depending_on(value: Array, *results: Any) -> Array:
     return jnp.where(total > 1e30, value + 1, value)
 
 
-def unchanged(before: Any, after: Any, value: Array) -> Any:
+def force_computation(before: Any, after: Any, value: Array) -> Any:
     """Returns `before` so that the compiler must compute all of `after`; `value` must not be negative anywhere."""
     never = jnp.any(value < 0)
     return jax.tree.map(lambda old, new: jnp.where(never, new, old), before, after)

@@ -46,14 +46,14 @@ def prepare(wanted: Sequence[str], words: Sequence[str]) -> tuple[dict[str, Any]
     _, config = throughput.parse(words)
     missions = run_missions(config)
     devices = choose_devices(config.train.devices, config.train.shards)
-    whole = WholeStep(config, missions.training.world, devices)
+    whole = WholeStep(config, missions.training.env_params, devices)
     turns: dict[str, Callable[[], float]] = {WHOLE: lambda: 1e6 * len(devices) / whole.turn()}
     names = [name for name in PARTS if not wanted or name in wanted]
     if names:
         # A copy, because the next chunk is given the state itself.
         state = jax.tree.map(lambda x: jax.device_put(x, devices[0]).copy(), whole.state)
         mesh = Mesh(np.asarray(devices), (AXIS,))
-        for part in parts_of(config, missions.training.world, state, names):
+        for part in parts_of(config, missions.training.env_params, state, names):
             turns[part.name] = Timed(part, mesh, config.train.num_envs).turn
     about = {
         "package": edqn_jax.__file__,

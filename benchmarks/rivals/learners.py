@@ -72,11 +72,11 @@ class Validation:
 
     def validate(self, params: Any, decisions: int, seconds: float) -> None:
         """Flies the validation missions and, if these parameters are kept, the test missions."""
-        flights = self.fly(self.missions.validation.world, params)
+        flights = self.fly(self.missions.validation.env_params, params)
         latest = make_candidate(self.config, self.missions, flights, params, decisions)
         before, self.kept = self.kept, choose_candidate(self.config.train.keep, self.kept or latest, latest)
         if self.kept is not before:
-            self.flights = flight_columns(self.fly(self.missions.final.world, params), self.judged)
+            self.flights = flight_columns(self.fly(self.missions.final.env_params, params), self.judged)
         self.curve.append(
             {
                 "decisions": decisions,
@@ -130,10 +130,10 @@ class Learner:
         """
         self.config, self.missions = config, run_missions(config)
         devices = choose_devices(config.train.devices, config.train.shards)
-        self.trainer = Trainer(config, self.missions.training.world, devices)
+        self.trainer = Trainer(config, self.missions.training.env_params, devices)
         began = time.perf_counter()
         self.trainer.compile()
-        self._fly(self.missions.final.world, self._policy(self.trainer.init(0)))
+        self._fly(self.missions.final.env_params, self._policy(self.trainer.init(0)))
         self.about = {
             **json_report.machine(devices),
             "workload": describe_workload(config, self.missions.scene),

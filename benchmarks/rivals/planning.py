@@ -24,7 +24,7 @@ from edqn_jax.sim.task.outcomes import Outcome
 from edqn_jax.sim.worlds import families
 from edqn_jax.sim.worlds.moving import Moving
 from measurement import json_report
-from rivals.planners.follow import FollowConfig, compiled_follower, reserved, sampled
+from rivals.planners.follow import FollowConfig, compiled_follower, sample_path, with_reserve
 from rivals.planners.planner import Budget, load_planner
 
 MANY = 64
@@ -110,11 +110,11 @@ class Planning:
         task = PlanningTask.from_scene(
             scene, body_radius=config.drone.body_radius_m, goal_radius=config.env.goal_radius_m
         )
-        plan = self.plan(reserved(task, follow), self.budget, seed)
+        plan = self.plan(with_reserve(task, follow), self.budget, seed)
         said = {"reason": plan.reason, "planning_seconds": plan.seconds}
         if plan.path is None:
             return {**NOT_FLOWN, **said, "planned_m": None}
-        goal, points = np.float32(task.goal), sampled(plan.path)
+        goal, points = np.float32(task.goal), sample_path(plan.path)
         flight = jax.device_get(self.follower(config, follow, self.airframe, scene, goal, points))
         return {
             "outcome": Outcome(int(flight.outcome)).name.lower(),

@@ -20,7 +20,7 @@ from rivals.planners.planner import SAMPLING
 Row = dict[str, Any]
 
 
-def joined(rows: Iterable[Row]) -> list[Row]:
+def join_rows(rows: Iterable[Row]) -> list[Row]:
     """Joins the rows of the same method, world, device and settings into one row with all seeds.
 
     A row of a method that could not run is left out if the method ran in another row of that world.

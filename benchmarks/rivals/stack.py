@@ -79,7 +79,7 @@ class Stack:
             workers = peak_of_workers()  # during training, because they end with it
             validation.validate(trained, trained.decisions, trained.seconds)
 
-        trained = self.stack.train(config, self.course(self.missions.training.world), *self.setting, validate)
+        trained = self.stack.train(config, self.course(self.missions.training.env_params), *self.setting, validate)
         turn = validation.result(seed, trained.decisions, trained.seconds, self._decision_seconds)
         return {**turn, "workers_peak_bytes": workers}
 
@@ -110,7 +110,7 @@ class SteadyStack(contextlib.ExitStack):
         from conventional_stack.train import Steady
 
         super().__init__()
-        course = Course.of(run_missions(config).training.world)
+        course = Course.of(run_missions(config).training.env_params)
         self.decisions = decisions
         self.runs = {setting: self.enter_context(Steady(config, course, *setting)) for setting in SETTINGS}
         self.about: dict[str, Any] = {}
@@ -132,7 +132,7 @@ class SteadyStep:
     def __init__(self, config: Config) -> None:
         """Compiles; `config` must let the VAE learn throughout."""
         devices, missions = choose_devices(config.train.devices, config.train.shards), run_missions(config)
-        self.whole = WholeStep(config, missions.training.world, devices)
+        self.whole = WholeStep(config, missions.training.env_params, devices)
         self.about = {**json_report.machine(devices), "workload": describe_workload(config, missions.scene)}
 
     def turn(self, number: int) -> dict[str, Any]:

@@ -116,7 +116,7 @@ class TutorialDrone(gymnasium.Env):
         self.data.qpos[:] = [*self.start, math.cos(self.yaw / 2), 0.0, 0.0, math.sin(self.yaw / 2)]
         mujoco.mj_forward(self.model, self.data)
         picture = self.look(self.data)
-        return self._observed(event_image(self.config.events, picture, picture)), {}
+        return self._make_observation(event_image(self.config.events, picture, picture)), {}
 
     def step(self, action: int) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
         """Flies one decision."""
@@ -148,7 +148,7 @@ class TutorialDrone(gymnasium.Env):
         ends = {"goal": task.goal_reward, "collision": task.collision_reward, "left_volume": task.left_volume_reward}
         reward += ends.get(outcome, 0.0)
         out_of_time = not outcome and self.decisions >= task.max_decisions
-        observation = self._observed(event_image(self.config.events, *pictures))
+        observation = self._make_observation(event_image(self.config.events, *pictures))
         return observation, float(reward), bool(outcome), out_of_time, {"outcome": outcome}
 
     def _turn(self, bearing: float) -> None:
@@ -168,7 +168,7 @@ class TutorialDrone(gymnasium.Env):
             return "left_volume"
         return ""
 
-    def _observed(self, events: NDArray[np.float32]) -> NDArray[np.float32]:
+    def _make_observation(self, events: NDArray[np.float32]) -> NDArray[np.float32]:
         """Returns the event image and the ten own values of `edqn_jax.sim.task.observation.own_state` as one vector."""
         position, velocity = self.data.qpos[:3], self.data.qvel[:3] / self.config.env.speed_m_s
         w, x, y, z = self.data.qpos[3:]

@@ -20,7 +20,7 @@ Point = tuple[float, float, float]
 Args = TypeVar("Args")
 
 
-def parsed(kind: type[Args], argv: Sequence[str], command: str) -> Args:
+def parse_arguments(kind: type[Args], argv: Sequence[str], command: str) -> Args:
     """Returns the arguments of a command.
 
     Raises:
@@ -50,9 +50,9 @@ def check_flags(argv: Sequence[str], known: Iterable[str], command: str) -> None
 
 
 def _nearest_flag(flag: str, known: Iterable[str]) -> str | None:
-    """Returns the flag that somebody meant who shortened, misspelt or left out the group of one; None if none is near.
+    """Returns the flag nearest to an unknown one: shortened, without its group or misspelt; None if none is near.
 
-    A flag that goes on as the given one does comes first, then one of that name in a group, then one spelt alike.
+    Flags that begin with the given one come first, then those of that name in a group, then similar spellings.
     """
     shortest_first = sorted(known, key=lambda name: (len(name), name))
     bare = flag.removeprefix("--")

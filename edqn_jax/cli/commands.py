@@ -65,10 +65,10 @@ def run_command(argv: Sequence[str] | None, stops: Stops) -> int:
 
     0 is done, 1 a check failed, 2 bad input, 3 diverged, 130 stopped by SIGINT, and 143 by SIGTERM.
     """
-    return _dispatched(list(sys.argv[1:] if argv is None else argv), stops)
+    return _exit_code_of(list(sys.argv[1:] if argv is None else argv), stops)
 
 
-def _dispatched(argv: list[str], stops: Stops) -> int:
+def _exit_code_of(argv: list[str], stops: Stops) -> int:
     """Runs one command and returns the exit code of its ending."""
     try:
         return _dispatch(argv, stops)
@@ -101,7 +101,7 @@ def _dispatch(argv: Sequence[str], stops: Stops) -> int:
     if command == "train":
         train_command(rest, stops)
     elif command in RUN_COMMANDS:
-        _of_a_run(command, rest)
+        _dispatch_run_command(command, rest)
     elif command == "completion":
         print(completion_script(parse_completion(rest).shell, COMMANDS))
     elif command == "--version":
@@ -154,7 +154,7 @@ def import_module_or_file(name: str) -> None:
         )
 
 
-def _of_a_run(command: str, argv: Sequence[str]) -> None:
+def _dispatch_run_command(command: str, argv: Sequence[str]) -> None:
     """Runs a command on a finished run or a file; JAX is imported once the arguments are known to be right."""
     parse, run_command = RUN_COMMANDS[command]
     args = parse(argv)

@@ -12,7 +12,7 @@ from typing import Annotated, Any, Literal
 import tyro
 from tyro.conf import Positional, arg
 
-from edqn_jax.cli.arguments import parsed
+from edqn_jax.cli.arguments import parse_arguments
 from edqn_jax.cli.evaluate import EvaluateArgs
 from edqn_jax.cli.help import COMPLETION, NAMED, all_of_train, with_conditions, with_help_texts
 from edqn_jax.cli.record import RecordArgs
@@ -46,7 +46,7 @@ def parse_completion(argv: Sequence[str]) -> CompletionArgs:
         ConfigError: if there is no such flag.
         SystemExit: after printing, for --help and for what does not parse.
     """
-    return parsed(CompletionArgs, argv, COMPLETION)
+    return parse_arguments(CompletionArgs, argv, COMPLETION)
 
 
 def completion_script(shell: Literal["bash", "zsh", "fish"], kinds: Mapping[str, type]) -> str:

@@ -116,12 +116,12 @@ def evaluate_command(args: EvaluateArgs) -> None:
     config = config_of(policy)
     figures = {
         "run": str(args.run),
-        **_told_of(policy, args.run),
+        **_policy_source(policy, args.run),
         "versions": package_versions(),
         "world": evaluation.missions.name,
         "seed": args.seed,
         "shuffled_codes": args.shuffle_codes,
-        "conditions": dict(_named(args.conditions)),
+        "conditions": dict(_flatten_conditions(args.conditions)),
         **evaluation.figures,
         "decision_latency_ms": decision_latency_ms(config, policy.params, actor=actor_of(policy, config)),
     }
@@ -133,7 +133,7 @@ def evaluate_command(args: EvaluateArgs) -> None:
         write_trajectories(config, evaluation.missions, evaluation.flights, args.trajectories)
 
 
-def _told_of(policy: Policy | FunctionPolicy, run: Path) -> dict[str, Any]:
+def _policy_source(policy: Policy | FunctionPolicy, run: Path) -> dict[str, Any]:
     """Returns the SHA-256 of a saved policy, or the name of a function with that of its source."""
     from edqn_jax.policies.functions import FunctionPolicy
     from edqn_jax.runs.policies import policy_digest
@@ -144,7 +144,7 @@ def _told_of(policy: Policy | FunctionPolicy, run: Path) -> dict[str, Any]:
     return {} if function_named(run) else {"policy_sha256": policy_digest(run)}
 
 
-def _named(conditions: Layer) -> Iterator[tuple[str, Any]]:
+def _flatten_conditions(conditions: Layer) -> Iterator[tuple[str, Any]]:
     for group, options in conditions.items():
         for option, value in options.items():
             yield f"{group}.{option}", value

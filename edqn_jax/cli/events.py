@@ -13,7 +13,7 @@ from rich.console import Console
 from rich.table import Table
 from tyro.conf import Positional, arg
 
-from edqn_jax.cli.arguments import Point, check_is_saved, check_run, parsed
+from edqn_jax.cli.arguments import Point, check_is_saved, check_run, parse_arguments
 from edqn_jax.cli.help import EVENTS
 from edqn_jax.errors import ConfigError
 from edqn_jax.files import check_can_write, write_atomically
@@ -76,7 +76,7 @@ def parse_events(argv: Sequence[str]) -> EventsArgs:
         ConfigError: if one is out of its limits, or there is no such file or policy.
         SystemExit: after printing, for --help and for what does not parse.
     """
-    args = parsed(EventsArgs, argv, EVENTS)
+    args = parse_arguments(EventsArgs, argv, EVENTS)
     if args.file.is_dir():
         raise ConfigError(f"'{args.file}' is a folder; give a file of events")
     if not args.file.is_file():

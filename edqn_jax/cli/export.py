@@ -9,7 +9,7 @@ from typing import Annotated
 
 from tyro.conf import Positional, arg
 
-from edqn_jax.cli.arguments import check_is_saved, check_run, parsed
+from edqn_jax.cli.arguments import check_is_saved, check_run, parse_arguments
 from edqn_jax.cli.help import EXPORT
 from edqn_jax.errors import ConfigError
 
@@ -33,7 +33,7 @@ def parse_export(argv: Sequence[str]) -> ExportArgs:
         ConfigError: if one is out of its limits, or there is no such run.
         SystemExit: after printing, for --help and for what does not parse.
     """
-    args = parsed(ExportArgs, argv, EXPORT)
+    args = parse_arguments(ExportArgs, argv, EXPORT)
     if args.checks < 1000:
         raise ConfigError(f"--checks must be at least 1000, not {args.checks}")
     check_is_saved(args.run, EXPORT)

@@ -10,7 +10,7 @@ from typing import Annotated
 
 from tyro.conf import Positional, arg
 
-from edqn_jax.cli.arguments import Point, check_run, parsed, print_notes
+from edqn_jax.cli.arguments import Point, check_run, parse_arguments, print_notes
 from edqn_jax.cli.help import RECORD
 from edqn_jax.errors import ConfigError
 from edqn_jax.files import EVENT_FILES, VIDEO
@@ -45,7 +45,7 @@ def parse_record(argv: Sequence[str]) -> RecordArgs:
         ConfigError: if the file's ending, its size or a missing package forbids it, or there is no run.
         SystemExit: after printing, for --help and for what does not parse.
     """
-    args = parsed(RecordArgs, argv, RECORD)
+    args = parse_arguments(RecordArgs, argv, RECORD)
     suffix = args.file.suffix.lower()
     if suffix not in VIDEO + EVENT_FILES:
         raise ConfigError(f"'{args.file}' must end in .gif or .mp4 for a video, or in .h5, .npz or .txt for events")

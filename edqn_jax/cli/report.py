@@ -11,7 +11,7 @@ from typing import Annotated
 
 from tyro.conf import Positional, arg
 
-from edqn_jax.cli.arguments import check_run, parsed
+from edqn_jax.cli.arguments import check_run, parse_arguments
 from edqn_jax.cli.help import REPORT
 from edqn_jax.errors import ConfigError
 from edqn_jax.files import check_can_write, write_atomically
@@ -38,7 +38,7 @@ def parse_report(argv: Sequence[str]) -> ReportArgs:
         ConfigError: if a folder holds no run, or another argument is out of its limits.
         SystemExit: after printing, for --help and for what does not parse.
     """
-    args = parsed(ReportArgs, argv, REPORT)
+    args = parse_arguments(ReportArgs, argv, REPORT)
     if not args.runs:
         raise ConfigError("give the folder of a run, such as edqn report runs/DIR")
     if args.missions < 1:

@@ -122,7 +122,7 @@ def parse_train(argv: Sequence[str]) -> tuple[TrainOptions, Config]:
         begins = apply_layer(begins, {"events": {"profile": profile}}, "the command line")
     if helped:
         show_train_help(TrainOptions(), begins, SHORT_NAMES, everything=everything)
-    config = _found_worlds(_parse_config(argv, begins))
+    config = _with_world_paths(_parse_config(argv, begins))
     validate(config)
     check_learns(config)
     if run is not None and folder is not None:
@@ -136,13 +136,15 @@ def _names_defaults(argv: Sequence[str]) -> bool:
     return any(word.partition("=")[0] in ("--preset", "--config", "--tuned-for", "--tuned_for") for word in argv)
 
 
-def _found_worlds(config: Config) -> Config:
+def _with_world_paths(config: Config) -> Config:
     """Returns the configuration with whole paths of its worlds' files."""
-    world = dataclasses.replace(config.world, name=_found(config.world.name), flown=_found(config.world.flown))
+    world = dataclasses.replace(
+        config.world, name=_find_world(config.world.name), flown=_find_world(config.world.flown)
+    )
     return dataclasses.replace(config, world=world)
 
 
-def _found(world: str) -> str:
+def _find_world(world: str) -> str:
     """Returns the name of a world; of a file, its whole path, by which it is found again from any folder."""
     return str(Path(world).resolve()) if world not in FAMILIES and Path(world).is_file() else world
 
@@ -207,7 +209,7 @@ def train_command(argv: Sequence[str], stops: Stops) -> None:
     )
     progress = Progress(Console(quiet=not writes))
     if is_tuned_for_gpu(options, config):
-        progress.message(_chosen(config))
+        progress.message(_describe_choice(config))
     sinks = None if run is None else _sinks_of(options, config, run, progress.message)
     stop = Stop(stops.is_requested, lambda: stops.obey_signals(progress.message))
     try:
@@ -280,12 +282,14 @@ def options_to_compare(config: Config) -> str:
 
     from edqn_jax.sim.camera.camera import native
 
-    world = dataclasses.replace(config.world, name=_held(config.world.name), flown=_held(config.world.flown))
+    world = dataclasses.replace(
+        config.world, name=_world_digest(config.world.name), flown=_world_digest(config.world.flown)
+    )
     in_c = native.is_available("cpu" if jax.default_backend() == "cpu" else "cuda")
     return f"{to_yaml(dataclasses.replace(config, world=world))}in_c: {in_c}\n"
 
 
-def _held(world: str) -> str:
+def _world_digest(world: str) -> str:
     """Returns the name of a random world or of none, and of a file the SHA-256 of what it holds.
 
     Raises:
@@ -319,7 +323,7 @@ def _check_gpu() -> None:
         )
 
 
-def _chosen(config: Config) -> str:
+def _describe_choice(config: Config) -> str:
     """Returns what was chosen for a GPU, as a line for the screen."""
     train, agent = config.train, config.agent
     return (

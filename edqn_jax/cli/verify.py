@@ -14,7 +14,7 @@ from rich.console import Console
 from rich.table import Table
 from tyro.conf import Positional, arg
 
-from edqn_jax.cli.arguments import check_is_saved, parsed
+from edqn_jax.cli.arguments import check_is_saved, parse_arguments
 from edqn_jax.cli.help import VERIFY
 from edqn_jax.errors import CheckError
 from edqn_jax.files import check_can_write, write_atomically
@@ -41,7 +41,7 @@ def parse_verify(argv: Sequence[str]) -> VerifyArgs:
         ConfigError: if there is no run.
         SystemExit: after printing, for --help and for what does not parse.
     """
-    args = parsed(VerifyArgs, argv, VERIFY)
+    args = parse_arguments(VerifyArgs, argv, VERIFY)
     check_is_saved(args.run, VERIFY)
     if not (args.run / "config.yaml").is_file():
         raise no_run(args.run)

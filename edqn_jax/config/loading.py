@@ -177,7 +177,7 @@ def apply_layer(config: Config, layer: Layer, source: str) -> Config:
         if group not in groups:
             owners = [f"'{name}:'" for name in groups if str(group) in _keys(getattr(config, name))]
             hint = f"; it belongs under {' or '.join(owners)}" if owners else suggest_nearest(group, groups)
-            raise ConfigError(f"{source}: there is no group '{_cut(group)}'{hint}")
+            raise ConfigError(f"{source}: there is no group '{_shorten_word(group)}'{hint}")
         if not isinstance(values, Mapping):
             raise ConfigError(
                 f"{source}: '{group}' must hold keys such as '{_example(config, group)}', not {_describe(values)}"
@@ -187,7 +187,9 @@ def apply_layer(config: Config, layer: Layer, source: str) -> Config:
         values = {key: value for key, value in values.items() if not _has_gone(f"{group}.{key}", value, source)}
         for key in values:
             if key not in hints:
-                raise ConfigError(f"{source}: there is no key '{group}.{_cut(key)}'{suggest_nearest(key, hints)}")
+                raise ConfigError(
+                    f"{source}: there is no key '{group}.{_shorten_word(key)}'{suggest_nearest(key, hints)}"
+                )
         checked = {key: convert_type(value, hints[key], f"{source}: '{group}.{key}'") for key, value in values.items()}
         profile = PROFILES[checked["profile"]] if group == "events" and "profile" in checked else {}
         changed[group] = dataclasses.replace(section, **{**profile, **checked})
@@ -254,7 +256,7 @@ class _StrictLoader(yaml.SafeLoader):
             key = key_node.value
             if key in seen:
                 raise yaml.constructor.ConstructorError(
-                    problem=f"the key '{_cut(key)}' is given twice", problem_mark=key_node.start_mark
+                    problem=f"the key '{_shorten_word(key)}' is given twice", problem_mark=key_node.start_mark
                 )
             seen.add(key)
         return super().construct_mapping(node, deep)
@@ -295,10 +297,10 @@ def _describe(value: Any) -> str:
         return "a group of keys"
     if isinstance(value, list | tuple):
         return f"a list of {len(value)}"
-    return f"the text '{_cut(value)}'" if isinstance(value, str) else value_text(value)
+    return f"the text '{_shorten_word(value)}'" if isinstance(value, str) else value_text(value)
 
 
-def _cut(word: object) -> str:
+def _shorten_word(word: object) -> str:
     """Returns a word of a file as text, the beginning alone of one that is very long."""
     text = str(word)
     return text if len(text) <= MAX_SHOWN else f"{text[:MAX_SHOWN]}…"

@@ -30,7 +30,7 @@ def validate(config: Config, *, trains: bool = True) -> None:
     _check_world(config, trains)
     for registry in (SENSORS, AIRFRAMES, ENCODERS, LEARNERS, NETWORKS, ACTION_SETS):
         registry.check(_value(config, registry.option))
-    for rules in (_of_flights(config, trains), _of_training(config, trains), _of_learning(config)):
+    for rules in (_flight_rules(config, trains), _training_rules(config, trains), _learning_rules(config)):
         for holds, name, limit in rules:
             require(holds, name, limit, _value(config, name))
 
@@ -85,7 +85,7 @@ def _check_world(config: Config, trains: bool) -> None:
         )
 
 
-def _of_flights(config: Config, trains: bool) -> Rules:
+def _flight_rules(config: Config, trains: bool) -> Rules:
     """Yields rules of what is flown and seen."""
     env, light, exposure, times = config.env, config.light, config.exposure, config.events.frame_times_s
     dt, window = config.drone.physics_dt_s, config.drone.physics_steps * config.drone.physics_dt_s
@@ -123,7 +123,7 @@ def _of_flights(config: Config, trains: bool) -> Rules:
         yield same, "env.potential_discount", f"{gamma:g}, agent.discount, with env.reward potential"
 
 
-def _of_learning(config: Config) -> Rules:
+def _learning_rules(config: Config) -> Rules:
     """Yields rules of what learns, and of what it learns from."""
     encoder, agent, envs = config.encoder, config.agent, config.train.num_envs
     warmed = not encoder.retrain_at or encoder.warmup_decisions > 0
@@ -139,7 +139,7 @@ def _of_learning(config: Config) -> Rules:
     yield size >= rows * envs, "agent.replay_size", limit
 
 
-def _of_training(config: Config, trains: bool) -> Rules:
+def _training_rules(config: Config, trains: bool) -> Rules:
     """Yields rules of a run, its shards, devices and missions."""
     train, drones, shards = config.train, config.env.drones, config.train.shards
     scheduled = train.schedule_steps <= train.total_steps

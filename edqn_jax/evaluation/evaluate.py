@@ -98,9 +98,9 @@ def evaluate(
     mission_set = load_missions(config, str(world or config.world.name), missions, seed, start, goal)
     actor = actor_of(policy, config)
     flights = fly_on_all_devices(
-        config, mission_set.world, policy.params, seed, actor=actor, record=record, shuffle_codes=shuffle_codes
+        config, mission_set.env_params, policy.params, seed, actor=actor, record=record, shuffle_codes=shuffle_codes
     )
-    shortest = shortest_paths(config, mission_set.world, np.asarray(flights.outcome) == Outcome.GOAL)
+    shortest = shortest_paths(config, mission_set.env_params, np.asarray(flights.outcome) == Outcome.GOAL)
     notes = " ".join(filter(None, (mission_set.note, _unseen_look(policy, config))))
     mission_set = dataclasses.replace(mission_set, note=notes or None)
     return Evaluation(mission_set, flights, summarise_flights(flights, shortest, config.env.drones))

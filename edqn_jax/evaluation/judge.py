@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from edqn_jax.sim.scene.mjcf import geom_of
-from edqn_jax.sim.scene.mjcf_motion import Said, as_ellipse, motions_of
+from edqn_jax.sim.scene.mjcf_motion import MotionSpec, as_ellipse, motions_of
 from edqn_jax.sim.scene.shapes.kind import reach_of, read_shape
 
 PROBE_NAME = "edqn_body_sphere"
@@ -77,7 +77,7 @@ class Moving:
     """Its number among the mocap bodies."""
     position: NDArray[np.float64]
     """[3] at time 0, metres."""
-    said: Sequence[Said]
+    specs: Sequence[MotionSpec]
     volume: NDArray[np.float64]
     """[2, 3] between which it bounces where the file names no limits, and beyond which a ball is no more, metres."""
     low: NDArray[np.float64]
@@ -88,9 +88,9 @@ class Moving:
     def at(self, time: float, target: FlightTrack) -> NDArray[np.float64]:
         """Returns the position [3], metres; `_AWAY_M` away for a ball before launch and after its flight."""
         place = self.position.copy()
-        for word, numbers in self.said:
+        for word, numbers in self.specs:
             if word == "throw":
-                return self._thrown(numbers, time, target)
+                return self._ball_position(numbers, time, target)
             if word == "bounce":
                 low, high = self.volume[0] - self.low, self.volume[1] - self.high
                 if len(numbers) == 9:
@@ -98,7 +98,7 @@ class Moving:
                 for axis in range(3):
                     if numbers[axis]:
                         one = self.position[axis], numbers[axis] * time, low[axis], high[axis]
-                        place[axis] += _bounced(*one) - self.position[axis]
+                        place[axis] += _reflect(*one) - self.position[axis]
             else:
                 a, b, rate, phase = as_ellipse((word, numbers))
                 place += a * (math.cos(phase + rate * time) - math.cos(phase))
@@ -108,7 +108,7 @@ class Moving:
     def speed(self) -> float:
         """Returns a bound of its speed, m/s."""
         total = 0.0
-        for word, numbers in self.said:
+        for word, numbers in self.specs:
             if word == "bounce":
                 total += float(np.linalg.norm(numbers[:3]))
             elif word != "throw":
@@ -116,7 +116,7 @@ class Moving:
                 total += abs(rate) * float(np.linalg.norm(np.stack([a, b]), ord=2))
         return total
 
-    def _thrown(self, numbers: Sequence[float], time: float, target: FlightTrack) -> NDArray[np.float64]:
+    def _ball_position(self, numbers: Sequence[float], time: float, target: FlightTrack) -> NDArray[np.float64]:
         share, early, speed, bearing, elevation, gravity, pace = numbers
         away = np.full(3, _AWAY_M)
         start, goal = (np.asarray(end, np.float64) for end in (target.start, target.goal))
@@ -148,11 +148,11 @@ class Moving:
 
     def throw_speed(self, seconds: float) -> float:
         """Returns a bound of the ball's speed within so many seconds of a flight, m/s; 0 for other bodies."""
-        word, numbers = self.said[0]
+        word, numbers = self.specs[0]
         return numbers[2] + abs(numbers[5]) * (numbers[1] / 2 + seconds) if word == "throw" else 0.0
 
 
-def _bounced(position: float, way: float, low: float, high: float) -> float:
+def _reflect(position: float, way: float, low: float, high: float) -> float:
     """Returns where a point ends that runs `way` metres from `position` and turns back at `low` and `high`."""
     while way:
         wall = high if way > 0 else low
@@ -218,8 +218,8 @@ def _moving(
     model: mujoco.MjModel, data: mujoco.MjData, solids: NDArray[np.int64], volume: ArrayLike | None
 ) -> list[Moving]:
     """Returns the bodies that move."""
-    said = motions_of(model, "the world")
-    if not said:
+    motions = motions_of(model, "the world")
+    if not motions:
         return []
     if volume is None:
         if "volume" not in _sites(model):
@@ -227,12 +227,12 @@ def _moving(
         site = model.site("volume").id
         volume = data.site_xpos[site] + np.array([[-1.0], [1.0]]) * model.site_size[site]
     found = []
-    for body, words in said.items():
+    for body, specs in motions.items():
         geoms = [int(geom) for geom in solids if model.body_rootid[model.geom_bodyid[geom]] == body]
         place = np.array(data.xpos[body])
         extents = np.stack([_extent(model, data, geom) for geom in geoms]) - place
         low, high = extents[:, 0].min(0), extents[:, 1].max(0)
-        found.append(Moving(int(model.body_mocapid[body]), place, words, np.asarray(volume, np.float64), low, high))
+        found.append(Moving(int(model.body_mocapid[body]), place, specs, np.asarray(volume, np.float64), low, high))
     return found
 
 
@@ -303,7 +303,7 @@ def replay_contact(
         return clearance(judge, way.at(distance), step_s * (segment + fraction), target)
 
     # A ball may appear between two steps.
-    here = _first_touch(way, gap_at, jumps=any(body.said[0][0] == "throw" for body in judge.moving))
+    here = _first_touch(way, gap_at, jumps=any(body.specs[0][0] == "throw" for body in judge.moving))
     if here is None:
         return None
     segment, fraction = way.place(here)
@@ -320,15 +320,15 @@ def replay_contact(
 
 
 class Way:
-    """The way of a body, by the metres that it and whatever comes to meet it have gone."""
+    """A body's path, parameterised by distance: its own plus the most that obstacles move meanwhile."""
 
     def __init__(self, points: NDArray[np.float64], meets_m: float) -> None:
-        """Takes positions [n, 3] of the body, and the metres that others come nearer in each step at most."""
+        """Takes positions [n, 3] of the body and the most that obstacles move in a step, both in metres."""
         self.points, self.steps = points, np.linalg.norm(np.diff(points, axis=0), axis=1) + meets_m
         self.travelled = np.concatenate([[0.0], np.cumsum(self.steps)])
 
     def place(self, distance: float) -> tuple[int, float]:
-        """Returns the segment, and the fraction of it, at which so many metres have been gone."""
+        """Returns the segment at this distance, metres, and the fraction of the segment."""
         segment = min(int(np.searchsorted(self.travelled, distance, side="right")) - 1, len(self.steps) - 1)
         if self.steps[segment] == 0.0:
             return segment, 0.0

@@ -36,7 +36,7 @@ class MissionSet:
 
     name: str
     """Name that the world was asked for by."""
-    world: EnvParams
+    env_params: EnvParams
     file: Path | None = None
     """MJCF file of the only world; None for random worlds."""
     note: str | None = None
@@ -44,17 +44,17 @@ class MissionSet:
 
     def scene(self, mission: int = 0) -> Scene:
         """Returns the world of one mission."""
-        return scene_of(self.world, jnp.asarray(mission))
+        return scene_of(self.env_params, jnp.asarray(mission))
 
     def with_reward(self, reward: Reward | None) -> MissionSet:
         """Returns the same missions with this reward; None is the configured one."""
-        return dataclasses.replace(self, world=dataclasses.replace(self.world, reward=reward))
+        return dataclasses.replace(self, env_params=dataclasses.replace(self.env_params, reward=reward))
 
     def mjcf(self) -> list[str]:
         """Returns every world of the pool as MJCF: the file it was read from, or written from the arrays."""
         if self.file is not None:
             return [self.file.read_text(encoding="utf-8")]
-        pool = jax.tree.map(np.asarray, self.world.pool)
+        pool = jax.tree.map(np.asarray, self.env_params.pool)
         return [mjcf_of(take_scene(pool, i), title=f"{self.name} {i}") for i in range(pool.start.shape[0])]
 
 
@@ -108,9 +108,9 @@ def missions_of_runs(configs: Sequence[Config], reward: Reward | None = None) ->
         return [first, *(run_missions(config, reward) for config in configs[1:])]
     others = []
     for config in configs[1:]:
-        key, world = run_streams(config.train.seed).training_missions, first.training.world
+        key, world = run_streams(config.train.seed).training_missions, first.training.env_params
         missions = _training_missions(world.pool, config, key)
-        training = dataclasses.replace(first.training, world=dataclasses.replace(world, missions=missions))
+        training = dataclasses.replace(first.training, env_params=dataclasses.replace(world, missions=missions))
         others.append(dataclasses.replace(first, training=training))
     return [first, *others]
 
@@ -151,8 +151,8 @@ def final_missions(config: Config, most: int) -> MissionSet:
     name, final_name, count = config.world.name, config.world.flown, min(most, config.train.validation_missions)
     if name not in FAMILIES:
         final = run_missions(config).final
-        missions = jax.tree.map(lambda leaf: leaf[:count], final.world.missions)
-        return dataclasses.replace(final, world=dataclasses.replace(final.world, missions=missions))
+        missions = jax.tree.map(lambda leaf: leaf[:count], final.env_params.missions)
+        return dataclasses.replace(final, env_params=dataclasses.replace(final.env_params, missions=missions))
     count = max(count // config.env.drones, 1) * config.env.drones
     pool = families.worlds_of(config, name, "test", count // config.env.drones)
     if final_name:

@@ -178,7 +178,7 @@ def _fly(program: _Program, env_params: EnvParams, params: Any, number: Array, k
         return _Flying(
             state=state,
             observation=step.observation,
-            memory=jax.tree.map(lambda new, begun: _where(step.is_reset, begun, new), memory, first),
+            memory=jax.tree.map(lambda new, begun: _select_missions(step.is_reset, begun, new), memory, first),
             flights=flights,
             record=_write(flying, action, step, clearance),
             decision=flying.decision + 1,
@@ -260,7 +260,7 @@ def _no_action(kind: Any) -> float | int:
     return -1 if jnp.issubdtype(kind, jnp.integer) else jnp.nan
 
 
-def _where(chosen: Array, new: Array, old: Array) -> Array:
+def _select_missions(chosen: Array, new: Array, old: Array) -> Array:
     """Returns new rows [...] or [M, ...] where `chosen` [M], and old ones [M, ...] elsewhere."""
     return jnp.where(chosen.reshape(-1, *(1 for _ in old.shape[1:])), new, old)
 
@@ -277,7 +277,7 @@ def _write(flying: _Flying, action: Array, step: Step, clearance: Array) -> Reco
         quaternion=jnp.where(is_flown[..., None], step.flight.quaternion, jnp.nan),
         velocity=jnp.where(is_flown[..., None], step.flight.velocity, jnp.nan),
         clearance=jnp.where(is_flown, clearance, jnp.nan),
-        action=_where(running, action, jnp.full_like(action, _no_action(action.dtype))),
+        action=_select_missions(running, action, jnp.full_like(action, _no_action(action.dtype))),
         reward=jnp.where(running, step.reward, jnp.nan),
     )
     return jax.tree.map(lambda whole, new: whole.at[flying.decision].set(new), flying.record, row)

@@ -103,7 +103,7 @@ def write_trajectories(config: Config, missions: MissionSet, flights: Flights, f
         ValueError: if the flights were not recorded.
     """
     record = flights.get_record()
-    host_missions = jax.tree.map(np.asarray, missions.world.missions)
+    host_missions = jax.tree.map(np.asarray, missions.env_params.missions)
     heading = np.arctan2(*(host_missions.goal - host_missions.start)[:, 1::-1].T)
     level = np.zeros_like(heading)
     facing = np.column_stack([np.cos(heading / 2), level, level, np.sin(heading / 2)])

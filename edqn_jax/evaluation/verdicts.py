@@ -55,7 +55,7 @@ def check_verdicts(config: Config, missions: MissionSet, flights: Flights) -> li
         ValueError: if the flights were not recorded.
     """
     judges = judges_of(config, missions)
-    pool_missions = missions.world.missions
+    pool_missions = missions.env_params.missions
     scenes, starts, goals = (
         np.asarray(pool_missions.scene),
         np.asarray(pool_missions.start),
@@ -82,6 +82,6 @@ def check_verdicts(config: Config, missions: MissionSet, flights: Flights) -> li
 
 def judges_of(config: Config, missions: MissionSet) -> list[MujocoWorld]:
     """Returns the worlds of missions in C MuJoCo, each with a probe of the drone's radius."""
-    radius, volumes = config.drone.body_radius_m, np.asarray(missions.world.pool.volume)
+    radius, volumes = config.drone.body_radius_m, np.asarray(missions.env_params.pool.volume)
     specs = (mujoco.MjSpec.from_string(text) for text in missions.mjcf())
     return [load_judge(spec, radius, volume) for spec, volume in zip(specs, volumes, strict=True)]

@@ -9,7 +9,7 @@ from pathlib import Path
 from edqn_jax.config import Config
 from edqn_jax.devices.jax_settings import as_tested
 from edqn_jax.errors import ConfigError
-from edqn_jax.evaluation.companions import scene_of_flight
+from edqn_jax.evaluation.flight_scene import scene_of_flight
 from edqn_jax.evaluation.missions import MissionSet, Point, load_missions
 from edqn_jax.evaluation.rollouts import fly_on_all_devices
 from edqn_jax.evaluation.trajectories import flight_trajectory
@@ -110,13 +110,13 @@ def _write_events(
     group.check_alone(config, "`edqn record` of events")
     check_can_write_events(file)
     flights = _fly_missions(policy, config, missions, seed)
-    write_events(file, flight_recording(config, missions.world, flight_trajectory(config, flights), size))
+    write_events(file, flight_recording(config, missions.env_params, flight_trajectory(config, flights), size))
     return flights
 
 
 def _fly_missions(policy: Policy | FunctionPolicy, config: Config, missions: MissionSet, seed: int) -> Flights:
     actor = actor_of(policy, config)
-    return fly_on_all_devices(config, missions.world, policy.params, seed, actor=actor, record=True)
+    return fly_on_all_devices(config, missions.env_params, policy.params, seed, actor=actor, record=True)
 
 
 def _ending(flights: Flights) -> str:

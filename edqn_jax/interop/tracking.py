@@ -181,7 +181,7 @@ class Rerun:
         if not self._drawn:
             self._stream.log("world/solids", self._mesh(missions.scene(0)), static=True)
             self._drawn = True
-        scene = np.asarray(missions.world.missions.scene)
+        scene = np.asarray(missions.env_params.missions.scene)
         here = np.flatnonzero(scene == scene[0])
         lengths = np.asarray(flights.physics_steps)
         paths = [np.asarray(flights.record.position[i])[: int(lengths[i])] for i in here]

@@ -102,11 +102,13 @@ def sample_transitions(
         return transitions
     quarters = jnp.broadcast_to(uniform_integers(more[0], (batch, 1), 4), (batch, h))
     assert task is not None
-    history, next_history = (_turned(task, each, quarters) for each in (transitions.history, transitions.next_history))
+    history, next_history = (
+        _rotate_own_states(task, each, quarters) for each in (transitions.history, transitions.next_history)
+    )
     return dataclasses.replace(transitions, history=history, next_history=next_history)
 
 
-def _turned(task: Task, history: Array, quarters: Array) -> Array:
+def _rotate_own_states(task: Task, history: Array, quarters: Array) -> Array:
     """Returns observations [B, H, D] with own states turned by quarters [B, H]; those before an episode stay zero."""
     assert task.turn is not None
     seen, own = jnp.split(history, [history.shape[-1] - task.own_size], axis=-1)

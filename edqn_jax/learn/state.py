@@ -39,7 +39,7 @@ class Actors:
     reward: Array  # [S, E] for arriving where the environment is
     outcome: Array  # [S, E]
     is_reset: Array  # [S, E]
-    manoeuvre: Array  # [S, E] the held move of the warm-up
+    manoeuvre: Array  # [S, E] the held move of the warm-up; checkpoints have it under this name
     episodes: Array  # [S, E] episodes finished since the DQN started
     replay: replay.Rows  # [S, L, E, ...]
     samples: Samples | None  # [S, L, E, ...] what the VAE learns from; None where there is none

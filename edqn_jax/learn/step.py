@@ -37,7 +37,7 @@ class ShardKeys(NamedTuple):
     """Keys split from those of the shards [S] in each step; each is consumed."""
 
     act: Array
-    manoeuvre: Array
+    held_move: Array
     vae: Array
     dqn: Array
     next: Array
@@ -63,7 +63,7 @@ def train_step(
     in_warmup = step < schedule.warmup
     time = schedule.replay_time(step)
 
-    action, manoeuvre, acted = _act(config, networks, actors, keys, jnp.maximum(step - schedule.warmup, 0), in_warmup)
+    action, held_move, acted = _act(config, networks, actors, keys, jnp.maximum(step - schedule.warmup, 0), in_warmup)
     ring = _store(actors, action, time)
     env_state, timestep = _fly(config, env_params, actors, action)
     rings = _store_samples(config, env_params, actors, env_state, timestep, step)
@@ -73,7 +73,7 @@ def train_step(
     of_agent, agent = learner_of(config).update(config, axis, networks.agent, Rings(ring, time, keys.dqn), last)
     networks = _refresh_acting_encoder(config, dataclasses.replace(networks, agent=agent), step)
     memory = _encode_observations(config, networks, actors, timestep, step)
-    shaped = partial(_shaped, actors.reward.shape)
+    shaped = partial(_by_shard, actors.reward.shape)
     outcome, reward = shaped(timestep.outcome), shaped(timestep.reward)
     actors = Actors(
         env=shaped(env_state),
@@ -81,7 +81,7 @@ def train_step(
         reward=reward,
         outcome=outcome if timestep.waits is None else jnp.where(shaped(timestep.waits), NO_START, outcome),
         is_reset=shaped(timestep.is_reset),
-        manoeuvre=manoeuvre,
+        manoeuvre=held_move,
         episodes=actors.episodes + ((outcome != Outcome.RUNNING) & ~in_warmup),
         replay=ring,
         samples=rings,
@@ -115,18 +115,18 @@ _STEP_COUNTERS = ("physics_state", "observation", "reward")
 
 
 def _act(
-    config: Config, networks: Networks, actors: Actors, keys: ShardKeys, time: Array, warming: Array
+    config: Config, networks: Networks, actors: Actors, keys: ShardKeys, time: Array, in_warmup: Array
 ) -> tuple[Array, Array, Metrics]:
-    """Chooses moves [S, E]: held random manoeuvres in the warm-up, then the learner's (Algorithm 1, step 5).
+    """Chooses moves [S, E]: random held moves in the warm-up, then the learner's (Algorithm 1, step 5).
 
     Returns:
-        action, the held manoeuvres, each [S, E], and the learner's metrics.
+        action and held move, each [S, E], and the learner's metrics.
     """
     schedule, envs = Schedule.from_config(config), config.train.num_envs
     progress = Exploration(time * envs, (schedule.scheduled - schedule.warmup) * envs, actors.episodes)
     chosen, metrics = learner_of(config).act(config, networks.agent, actors.memory, keys.act, progress)
-    manoeuvre = jax.vmap(partial(_held_moves, config))(actors.manoeuvre, keys.manoeuvre)
-    return jnp.where(warming, manoeuvre, chosen), manoeuvre, metrics
+    held_move = jax.vmap(partial(_held_moves, config))(actors.manoeuvre, keys.held_move)
+    return jnp.where(in_warmup, held_move, chosen), held_move, metrics
 
 
 def _store(actors: Actors, action: Array, time: Array) -> replay.Rows:
@@ -155,7 +155,7 @@ def _encode_observations(config: Config, networks: Networks, actors: Actors, tim
     return AgentActor(config).encode(_acting(config, networks), memory, timestep.observation)
 
 
-def _shaped(shape: tuple[int, ...], tree: Any) -> Any:
+def _by_shard(shape: tuple[int, ...], tree: Any) -> Any:
     """Returns [S, E, ...] of [S * E, ...]."""
     return jax.tree.map(lambda x: x.reshape(*shape, *x.shape[1:]), tree)
 
@@ -207,7 +207,7 @@ def _store_samples(
         mate = group.active_partner_index(config, timestep.waits)
         rows = jax.tree.map(lambda x: x[mate], rows)
     write = jax.vmap(samples.store_samples, in_axes=(0, 0, None, None))
-    return write(actors.samples, _shaped(actors.reward.shape, rows), schedule.samples_kept(config, step), keep)
+    return write(actors.samples, _by_shard(actors.reward.shape, rows), schedule.samples_kept(config, step), keep)
 
 
 def run_steps(

@@ -61,7 +61,7 @@ class Trainer:
         self.agents = None if isinstance(env_params, EnvParams) else len(env_params)
         self.mesh = Mesh(np.asarray(devices), (AXIS,))
         self.replicated = NamedSharding(self.mesh, PartitionSpec())
-        self.world = processes.replicate(
+        self.env_params = processes.replicate(
             env_params if isinstance(env_params, EnvParams) else _stack_missions(env_params), self.mesh
         )
         self._traced: jax.stages.Lowered | None = None
@@ -73,14 +73,14 @@ class Trainer:
         make = jax.jit(self._each(lambda env_params, key: init_state(self.config, env_params, key), 0))
         keys = [run_streams(number).learning for number in ([seed] if isinstance(seed, int) else seed)]
         # Made whole and then cut: made in parts it would be rounded otherwise. `device_put` reaches no other process.
-        whole = make(self.world, keys[0] if self.agents is None else jnp.stack(keys))
+        whole = make(self.env_params, keys[0] if self.agents is None else jnp.stack(keys))
         return jax.jit(lambda state: state, out_shardings=self._layout())(whole)
 
     def _each(self, function: Callable[..., Any], *axes: int | None) -> Callable[..., Any]:
         """Returns `function(world, *arguments)` for all agents; `axes` are those of the other arguments."""
         if self.agents is None:
             return function
-        missions = dataclasses.replace(self.world, airframe=None, pool=None, missions=0, distances=None)
+        missions = dataclasses.replace(self.env_params, airframe=None, pool=None, missions=0, distances=None)
         return jax.vmap(function, in_axes=(missions, *axes))
 
     def _spread(self, *before: None) -> PartitionSpec:
@@ -100,7 +100,7 @@ class Trainer:
     def _shaped(self) -> TrainState:
         key = jax.random.key(0)
         keys = key if self.agents is None else jax.random.split(key, self.agents)
-        shapes = jax.eval_shape(self._each(partial(init_state, self.config), 0), self.world, keys)
+        shapes = jax.eval_shape(self._each(partial(init_state, self.config), 0), self.env_params, keys)
         layout = self._layout()
         return TrainState(
             actors=_with_sharding(shapes.actors, layout.actors),
@@ -118,7 +118,7 @@ class Trainer:
         """
         if self.config.train.debug:
             run = partial(run_steps, self.config)
-            self._chunk = CheckedChunk(self.config, run, self.world, self.shapes(), self._steps(0))
+            self._chunk = CheckedChunk(self.config, run, self.env_params, self.shapes(), self._steps(0))
             return
         self.trace()
         assert self._traced is not None
@@ -142,7 +142,7 @@ class Trainer:
             out_specs=(specs, (self._spread(None), same)),
             check_vma=False,
         )
-        self._traced = jax.jit(run, donate_argnums=1).lower(self.world, state, self._steps(0))
+        self._traced = jax.jit(run, donate_argnums=1).lower(self.env_params, state, self._steps(0))
 
     def _steps(self, first: int) -> Array:
         numbers = np.arange(first, first + self.config.train.chunk_steps, dtype=np.int32)
@@ -161,7 +161,7 @@ class Trainer:
         if self._chunk is None:
             self.compile()
         assert self._chunk is not None
-        return self._chunk(self.world, state, self._steps(first))
+        return self._chunk(self.env_params, state, self._steps(first))
 
     def each(self, tree: Any) -> list[Any]:
         """Returns the arrays of each agent, of arrays that have a leading [K] if there are several."""

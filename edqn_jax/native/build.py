@@ -135,7 +135,7 @@ def _registered(
         with contextlib.ExitStack() as scratch:
             # Where nothing can be kept, the file is not needed once it is loaded.
             folder = private_folder() or Path(scratch.enter_context(tempfile.TemporaryDirectory()))
-            library = _loaded(command, by.flags, source, definitions, folder, headers)
+            library = _load_library(command, by.flags, source, definitions, folder, headers)
         _check_usable(library)
         for target in targets:
             handler = jax.ffi.pycapsule(getattr(library, target))
@@ -164,7 +164,7 @@ def _check_usable(library: ctypes.CDLL) -> None:
             raise OSError(reason.decode(errors="replace"))
 
 
-def _loaded(
+def _load_library(
     compiler: list[str],
     flags: tuple[str, ...],
     source: Path,

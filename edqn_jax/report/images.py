@@ -87,7 +87,7 @@ def plot_reconstruction(
     look: Look = RECONSTRUCTED_EVENTS,
     seen: tuple[np.ndarray, Look] | None = None,
 ) -> Figure:
-    """Draws what the decoder must draw above what it draws from the code, on one colour scale.
+    """Plots the decoder's targets above its reconstructions, on one colour scale.
 
     Args:
         targets: [N, h, w] blurred events, ON plus OFF, blurred pictures or blurred nearness.

@@ -127,7 +127,7 @@ class Checkpointer:
         host = json.loads(processes.broadcast_from_first(text))
         if host is None:
             return None
-        arrays = self._of_all(checkpoint, host["done"])
+        arrays = self._broadcast_arrays(checkpoint, host["done"])
         processes.run_synchronised(
             lambda: None if self.run is None else states.truncate_logs(self._files(), host["files"])
         )
@@ -223,17 +223,17 @@ class Checkpointer:
         rewarded = json.loads(checkpoint.facts.get("reward", "null"))
         if rewarded != self.reward:
             raise ConfigError(
-                f"{where} was trained with the reward {_named(rewarded)}, not with {_named(self.reward)}; a run goes "
-                "on with its own reward"
+                f"{where} was trained with the reward {_reward_label(rewarded)}, not with {_reward_label(self.reward)};"
+                " a run goes on with its own reward"
             )
         found = {name: (array.shape, str(array.dtype)) for name, array in checkpoint.arrays.items()}
         try:
-            saved_state.check_shapes(found, self._expected(checkpoint.host["done"]))
+            saved_state.check_shapes(found, self._checkpoint_arrays(checkpoint.host["done"]))
         except ConfigError as error:
             raise ConfigError(f"{where} does not fit the run: {error}") from None
         return checkpoint
 
-    def _expected(self, done: int) -> dict[str, saved_state.Shape]:
+    def _checkpoint_arrays(self, done: int) -> dict[str, saved_state.Shape]:
         """Returns the arrays of a checkpoint after `done` steps; empty ones are not saved."""
         of_state = saved_state.state_shapes(self.preparation.trainer, done)
         kept = {name: (array.shape, str(array.dtype)) for name, array in _named_kept(self._fresh()).items()}
@@ -246,11 +246,11 @@ class Checkpointer:
         zeros = jax.tree.map(lambda leaf: np.zeros(leaf.shape, leaf.dtype), whole)
         return trainer.each(zeros)
 
-    def _of_all(self, checkpoint: Checkpoint | None, done: int) -> dict[str, np.ndarray]:
+    def _broadcast_arrays(self, checkpoint: Checkpoint | None, done: int) -> dict[str, np.ndarray]:
         """Returns the arrays of process 0's checkpoint, on every process; empty ones are made anew."""
         of_state = saved_state.state_shapes(self.preparation.trainer, done)
         arrays = {name: np.zeros(shape, kind) for name, (shape, kind) in of_state.items() if 0 in shape}
-        for name, (shape, kind) in self._expected(done).items():
+        for name, (shape, kind) in self._checkpoint_arrays(done).items():
             held = None if checkpoint is None else checkpoint.arrays[name].tobytes()
             arrays[name] = np.frombuffer(processes.broadcast_from_first(held), kind).reshape(shape)
         return arrays
@@ -302,7 +302,7 @@ def agent_array_name(agent: int, path: Any) -> str:
     return f"{_KEPT}[{agent}]{jax.tree_util.keystr(path)}"
 
 
-def _named(record: dict[str, str | None] | None) -> str:
+def _reward_label(record: dict[str, str | None] | None) -> str:
     """Returns a reward's name as text, with the beginning of its digest."""
     if record is None:
         return "that it does not name"

@@ -91,7 +91,7 @@ class RunDirectory:
 
     @property
     def holds_results(self) -> bool:
-        """Whether something would be lost if a run were begun here anew: a summary, a policy or a checkpoint."""
+        """Whether a new run here would delete results: a summary, a policy or a checkpoint."""
         folders = (self.checkpoints, *self.path.glob(f"{SEED_FOLDER}*/checkpoints"))
         return self.summary_file.exists() or any(any(folder.iterdir()) for folder in folders if folder.is_dir())
 
@@ -164,9 +164,9 @@ class RunDirectory:
         write_atomically(self.episodes_file, ",".join(EPISODE_COLUMNS) + "\n")
 
     def reopen(self, configs: Sequence[Config], seeds: bool = False) -> None:
-        """Prepares the locked folder of a run that is continued; what it has stays.
+        """Prepares the locked folder of a continued run; its files are kept.
 
-        Only a run that is continued beyond its end has other options, and a summary that is none any more.
+        A run that is continued beyond its end gets its new options written, and its outdated summary deleted.
 
         Args:
             configs, seeds: as in `begin`.
@@ -288,7 +288,7 @@ def plan_run_directory(given: Path | None, config: Config, resume: Resume = "aut
 
 
 def _asks_for_more(run: RunDirectory, config: Config) -> bool:
-    """Returns whether a finished run is to take more decisions than it has."""
+    """Returns whether a finished run is asked for more decisions than it has taken."""
     before = apply_layer(Config(), load_layer(run.config_file), str(run.config_file))
     return config.train.total_steps > before.train.total_steps
 

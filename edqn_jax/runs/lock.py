@@ -28,7 +28,7 @@ class Lock(contextlib.AbstractContextManager["Lock"]):
         self._held: int | None = None  # descriptor of the file
         self.file = folder / LOCK
         while self._held is None:  # whoever held it before may just have removed the file
-            self._held = _taken(self.file)
+            self._held = _lock_file(self.file)
 
     def __exit__(self, *_: object) -> None:
         if self._held is not None:
@@ -46,7 +46,7 @@ class Lock(contextlib.AbstractContextManager["Lock"]):
         os.close(held)
 
 
-def _taken(file: Path) -> int | None:
+def _lock_file(file: Path) -> int | None:
     """Returns the descriptor of the locked file; None if it is no longer the one in the folder.
 
     Raises:

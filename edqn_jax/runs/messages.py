@@ -1,4 +1,4 @@
-"""What a recorded run tells on the screen: where it trains, that it goes on, and how it ended."""
+"""Screen messages of a recorded run: devices, continuation, stop and results."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from edqn_jax.training.setup import TrainingSetup
 
 
 def describe_start(preparation: TrainingSetup, seeds: int | None) -> str:
-    """Returns where a run trains, and on a line of its own what was decided about its missions."""
+    """Returns a line on the devices that a run trains on, and another on its missions if there is a note."""
     world, devices = preparation.config.world, preparation.devices
     text = f"{world.pool_size:,} random {world.name} worlds" if world.name in FAMILIES else f"world '{world.name}'"
     text += "" if seeds is None else f", {seeds} seeds"
@@ -24,7 +24,7 @@ def describe_start(preparation: TrainingSetup, seeds: int | None) -> str:
 
 
 def describe_continuation(schedule: Schedule, done: int, config: Config) -> str:
-    """Returns that a run goes on, and what that means for its schedules, as lines for the screen."""
+    """Returns lines for the screen on the continuation of a run and its effect on schedules."""
     envs = config.train.num_envs
     text = f"continued after {done * envs:,} of {schedule.total * envs:,} decisions"
     if schedule.scheduled < schedule.total:
@@ -36,7 +36,7 @@ def describe_continuation(schedule: Schedule, done: int, config: Config) -> str:
 
 
 def describe_stop(run: RunDirectory | None, decisions: int, seeds: int | None) -> str:
-    """Returns that a run was stopped, and where its policy is."""
+    """Returns the message of a stopped run, with the location of its policy."""
     what = "the policy" if seeds is None else "the policies"
     if run is None:
         where = f"the first process saves {what}"

@@ -35,7 +35,7 @@ def load_policy(run: str | Path) -> Policy:
 
 
 def find_policy(name: str | Path, world: str | Path | None = None) -> Policy | FunctionPolicy:
-    """Returns what a command is given to fly: what `load_policy` returns, or a function.
+    """Returns the policy that a command names: one that `load_policy` loads, or a function.
 
     Args:
         name: as `load_policy`, or `module:name` or `path/to/file.py:name` of a function.
@@ -114,7 +114,7 @@ def _loaded(folder: Path, file: Path) -> tuple[Config, PolicyParams]:
 
 
 def worlds_replaced(run: Path) -> list[str]:
-    """Returns a sentence for each world that a run's own copy is flown in place of; none of a function.
+    """Returns a sentence for each world that is replaced by the run's own copy; none for a function.
 
     Raises:
         ConfigError: if the run's configuration or its copies are damaged.

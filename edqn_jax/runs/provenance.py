@@ -101,7 +101,7 @@ def source_record(function: Any) -> dict[str, str | None]:
 
 def _name(reward: Any) -> str:
     """Returns the name of a reward function; of a lambda, also where it stands."""
-    inner = reward.func if isinstance(reward, functools.partial) else _unwrapped(reward)
+    inner = reward.func if isinstance(reward, functools.partial) else _unwrap(reward)
     if inner is not reward:
         return _name(inner)
     name = getattr(reward, "__qualname__", None)
@@ -119,7 +119,7 @@ def _parts(reward: Any) -> Iterator[str]:
     Raises:
         OSError, TypeError: if Python cannot find the source.
     """
-    reward = _unwrapped(reward)
+    reward = _unwrap(reward)
     if isinstance(reward, functools.partial):
         yield from _parts(reward.func)
         yield _text((reward.args, sorted(reward.keywords.items())))
@@ -147,7 +147,7 @@ def _parts_of_object(thing: Any) -> Iterator[str]:
         yield _text(sorted(attributes.items()))
 
 
-def _unwrapped(reward: Any) -> Any:
+def _unwrap(reward: Any) -> Any:
     """Returns the function that `jax.jit` or another decorator wraps."""
     try:
         return inspect.unwrap(reward)

@@ -13,7 +13,7 @@ import numpy as np
 from edqn_jax.config import Config
 from edqn_jax.devices import processes
 from edqn_jax.errors import ConfigError, StoppedError
-from edqn_jax.evaluation.companions import scene_of_flight
+from edqn_jax.evaluation.flight_scene import scene_of_flight
 from edqn_jax.evaluation.metrics import flight_summary
 from edqn_jax.evaluation.trajectories import flight_trajectory
 from edqn_jax.learn import saved_state
@@ -37,7 +37,7 @@ class Screen(Display, Protocol):
         """Prints a line that stays."""
 
     def stop(self) -> None:
-        """Ends the display; what it shows stays."""
+        """Ends the display and leaves its last state on the screen."""
 
 
 Draw = Callable[[RunDirectory, Scene, PolicyParams, np.ndarray, str], None]
@@ -100,7 +100,7 @@ def train_run(
                 finish_run(folder, preparation, plot, result, flown, of_run, progress)
         summary = of_each[0]
         if seeds is not None:
-            summary = summaries.of_all_seeds(config, preparation.missions[0].tests, flights, of_each)
+            summary = summaries.summarize_seeds(config, preparation.missions[0].tests, flights, of_each)
             summary["total_seconds"] = time.perf_counter() - preparation.began
         if run is not None:
             if seeds is not None:
@@ -125,7 +125,7 @@ def _summaries(
     # One after the other: a state may be large.
     digests = [state_digest(trainer.of_agent(state, number)) for number in range(len(results))]
     return [
-        summaries.of_run(preparation, result, flown, digest, reward) | together
+        summaries.summarize_run(preparation, result, flown, digest, reward) | together
         for result, flown, digest in zip(results, flights, digests, strict=True)
     ]
 
@@ -236,7 +236,7 @@ def finish_run(
 ) -> None:
     """Writes the flight of the mission that the run is judged by, the summary and all pictures.
 
-    Whatever keeps pictures from being drawn, the run is finished and its summary is there.
+    If pictures cannot be drawn, the run still finishes with its summary.
 
     Raises:
         ConfigError: if flight or summary cannot be written.

@@ -22,7 +22,7 @@ from edqn_jax.training.selection import first_success
 from edqn_jax.training.setup import TrainingSetup
 
 
-def of_run(
+def summarize_run(
     preparation: TrainingSetup, result: TrainingResult, flights: Flights, digest: str, reward: Reward | None
 ) -> dict[str, Any]:
     """Returns the content of `summary.json`."""
@@ -55,16 +55,18 @@ def of_run(
     }
     tests = preparation.missions[0].tests
     if tests:
-        summary["test"] = of_tests(tests, flights)
+        summary["test"] = summarize_tests(tests, flights)
     return summary
 
 
-def of_tests(tests: int, flights: Flights) -> dict[str, Any]:
+def summarize_tests(tests: int, flights: Flights) -> dict[str, Any]:
     """Returns the metrics of the last `tests` flights, those through unseen random worlds."""
     return summarise_flights(jax.tree.map(lambda x: x[-tests:], dataclasses.replace(flights, record=None)))
 
 
-def of_all_seeds(config: Config, tests: int, flights: list[Flights], summaries: list[dict[str, Any]]) -> dict[str, Any]:
+def summarize_seeds(
+    config: Config, tests: int, flights: list[Flights], summaries: list[dict[str, Any]]
+) -> dict[str, Any]:
     """Returns the summary over seeds: of all test missions in random worlds, elsewhere of the one mission."""
     arrived = np.array([np.asarray(agent_flights.outcome) == Outcome.GOAL for agent_flights in flights])
     arrived = arrived[:, -tests:] if tests else arrived[:, :1]

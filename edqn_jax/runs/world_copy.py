@@ -26,7 +26,7 @@ _ROLES = ("name", "flown")
 
 
 def copy_worlds(folder: Path, config: Config) -> None:
-    """Copies the files of a run's worlds into its folder; what was there is replaced by the whole of it.
+    """Copies the files of a run's worlds into its folder, in place of all earlier copies.
 
     Raises:
         ConfigError: if a world has no file, or a copy cannot be written.
@@ -63,26 +63,26 @@ def with_copied_worlds(folder: Path, config: Config) -> tuple[Config, list[str]]
         ConfigError: if the copies are damaged.
     """
     world, notes = config.world, []
-    for role, why, copy in _changed(folder, config):
+    for role, why, copy in _changed_worlds(folder, config):
         notes.append(f"the world '{getattr(world, role)}' {why}; the run's own copy is flown, '{copy}'")
         world = dataclasses.replace(world, **{role: str(copy)})
     return dataclasses.replace(config, world=world), notes
 
 
 def check_unchanged(folder: Path, config: Config) -> None:
-    """Raises unless the worlds of a run that is to be continued are those that it was begun in.
+    """Raises ConfigError if the worlds of a continued run have changed since it began.
 
     Raises:
         ConfigError: says where the run's own copy is.
     """
-    changed = _changed(folder, config)
+    changed = _changed_worlds(folder, config)
     if changed:
         role, why, copy = changed[0]
         raise ConfigError(f"the world '{getattr(config.world, role)}' {why}; put back the run's own copy, '{copy}'")
 
 
-def _changed(folder: Path, config: Config) -> list[tuple[str, str, Path]]:
-    """Returns of each world that differs from its copy its role, how it differs, and the copy."""
+def _changed_worlds(folder: Path, config: Config) -> list[tuple[str, str, Path]]:
+    """Returns role, difference and copy of each world that differs from its copy."""
     if not (folder / WORLD).is_dir():
         return []
     _check(folder / WORLD)
@@ -100,7 +100,7 @@ def _changed(folder: Path, config: Config) -> list[tuple[str, str, Path]]:
 
 
 def _check(copies: Path) -> None:
-    """Raises unless copies are as they were made.
+    """Raises ConfigError if a copy has changed since it was made.
 
     Raises:
         DamagedError: names the first one that is not.

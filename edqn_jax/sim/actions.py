@@ -31,7 +31,7 @@ class Discrete(NamedTuple):
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """Returns the shape of one, ()."""
+        """Returns the shape of one action, ()."""
         return ()
 
 

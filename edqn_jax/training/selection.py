@@ -45,7 +45,7 @@ def make_candidate(
 ) -> Candidate:
     """Returns the candidate for parameters, scored by the flights of their validation."""
     arrived = np.asarray(flights.outcome) == Outcome.GOAL
-    straight = _straight(missions.validation.world.missions, config.env.goal_radius_m)
+    straight = _straight(missions.validation.env_params.missions, config.env.goal_radius_m)
     return Candidate(
         params,
         spl=spl(arrived, np.asarray(flights.path_length_m), straight),

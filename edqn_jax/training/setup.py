@@ -69,7 +69,7 @@ class TrainingSetup:
             ConfigError: if the configuration is invalid, the world cannot be flown, or memory is too small.
         """
         config = config_for_reward(config, reward)
-        self.configs = _of_agents(config, agents)
+        self.configs = _agent_configs(config, agents)
         for each in self.configs:
             validate(each)
             check_learns(each)
@@ -78,7 +78,7 @@ class TrainingSetup:
         self.devices = choose_devices(1 if config.train.debug else config.train.devices, config.train.shards)
         # A world's file may be missing on one host.
         self.missions = processes.run_synchronised(lambda: missions_of_runs(self.configs, reward))
-        worlds = [missions.training.world for missions in self.missions]
+        worlds = [missions.training.env_params for missions in self.missions]
         check_sensor(config, worlds[0])
         if config.env.reward == "geodesic":  # agents that train together share their worlds
             distances = geodesic.distance_fields(worlds[0].pool, config.drone.body_radius_m)
@@ -128,7 +128,7 @@ class TrainingSetup:
     ) -> tuple[EnvParams, PolicyParams, jax.Array]:
         """World, parameters and key as `fly_missions` takes them."""
         key = run_streams(self.configs[agent].train.seed).flights
-        return *processes.replicate((missions.world, params), self.mesh), key
+        return *processes.replicate((missions.env_params, params), self.mesh), key
 
 
 def config_for_reward(config: Config, reward: Reward | None) -> Config:
@@ -138,7 +138,7 @@ def config_for_reward(config: Config, reward: Reward | None) -> Config:
     return dataclasses.replace(config, agent=dataclasses.replace(config.agent, turn=False))
 
 
-def _of_agents(config: Config, agents: int | None) -> list[Config]:
+def _agent_configs(config: Config, agents: int | None) -> list[Config]:
     """Returns the configuration of each agent: the seeds of several are those from the configured one on."""
     if agents is None:
         return [config]

@@ -13,7 +13,7 @@ import pytest
 
 import conventional
 from conventional_stack.fleet import Record
-from conventional_stack.settings import supported
+from conventional_stack.settings import supported_config
 from conventional_stack.train import Steady, Trained, Training, fly, train
 from conventional_stack.vae import EventVAE, Learner
 from conventional_stack.vec_env import CodedDrones
@@ -27,7 +27,7 @@ from edqn_jax.runs.directory import to_plain_json
 from edqn_jax.sim.sensors.events import EventField
 from edqn_jax.sim.task.observation import MOTION_SIZE, OWN_SIZE
 from edqn_jax.sim.task.outcomes import Outcome
-from measurement.flags import configured
+from measurement.flags import parse_config
 from rivals import stack
 from tests.support.benchmarks.conventional_course import course_of
 from tests.support.benchmarks.uninstalled import hide
@@ -36,7 +36,7 @@ from tests.support.miniature import MINIATURE
 torch = require_extra("torch")
 torch.set_num_threads(1)  # beside other tests a second one costs more than it does
 
-CONFIG = supported(Config())
+CONFIG = supported_config(Config())
 START, GOAL = np.array([[20.0, 40.0, 12.0]]), np.array([[90.0, 90.0, 10.0]])
 
 
@@ -272,8 +272,8 @@ def miniature() -> Config:
     return conventional.parse(["--", *MINIATURE])[1]
 
 
-SHORT = supported(
-    configured([*MINIATURE, "--train.chunk-steps", "16", "--total-steps", "1024", "--train.validation-every", "300"])
+SHORT = supported_config(
+    parse_config([*MINIATURE, "--train.chunk-steps", "16", "--total-steps", "1024", "--train.validation-every", "300"])
 )
 """A whole training: 256 decisions of warm-up, 768 of the DQN."""
 

@@ -46,7 +46,7 @@ def test_what_a_map_had_of_a_place_that_was_hit(tmp_path: Path) -> None:
     touching = np.array([5.0 - 0.36, 5.25, 2.25], np.float32)
 
     def had(log_odds: np.ndarray) -> str:
-        return mapping.what_the_map_had(log_odds, 0.5, scene, touching, 0.36)
+        return mapping.look_up_contact(log_odds, 0.5, scene, touching, 0.36)
 
     log_odds = np.zeros((20, 20, 8))
     assert had(log_odds) == mapping.UNSEEN

@@ -22,7 +22,7 @@ from edqn_jax.sim.task.outcomes import Outcome
 from rivals.mapping import pilot
 from rivals.mapping.pilot import POINTS, Orders, PilotConfig, Piloted
 from rivals.mapping.route import RouteConfig, Router
-from rivals.planners.follow import SPACING_M, sampled
+from rivals.planners.follow import SPACING_M, sample_path
 from tests.support.policies import CONFIG, fresh
 
 CONFIG = dataclasses.replace(CONFIG, camera=dataclasses.replace(CONFIG.camera, width=32, height=24))
@@ -145,7 +145,7 @@ def test_the_follower_gets_points_at_its_spacing() -> None:
 def test_the_command_never_exceeds_the_limit_and_a_flight_that_is_over_stays_so(course: EnvParams) -> None:
     shape = pilot.grid_shape(TRUE.map, course.pool.volume)
     flying = pilot.at_rest(CONFIG, TRUE, shape, course, jnp.zeros((), jnp.int32), jax.random.key(0))
-    points = sampled(np.array([[3.0, 10.0, 4.0], [9.0, 10.0, 4.0]]))
+    points = sample_path(np.array([[3.0, 10.0, 4.0], [9.0, 10.0, 4.0]]))
     step = jax.jit(functools.partial(pilot.decide, CONFIG, TRUE, course, params()))
     for _ in range(4):
         flying = step(jnp.zeros((), jnp.int32), flying, points, jnp.float32(1.5))
@@ -187,7 +187,7 @@ def hovering(tmp_path: Path, decisions: int, world: str = MOVING, **words: str) 
     number, shape = jnp.zeros((), jnp.int32), pilot.grid_shape(TRUE.map, pool.volume)
     flying = jax.jit(functools.partial(pilot._begin, CONFIG, TRUE, shape, flown, params()))(number, jax.random.key(0))
     step = jax.jit(functools.partial(pilot.decide, CONFIG, TRUE, flown, params()))
-    points = sampled(np.array([[3.0, 10.0, 4.0], [3.5, 10.0, 4.0]]))
+    points = sample_path(np.array([[3.0, 10.0, 4.0], [3.5, 10.0, 4.0]]))
     seen = [flying]
     for _ in range(decisions):
         seen.append(step(number, seen[-1], points, jnp.float32(1e-4)))

@@ -132,16 +132,16 @@ def test_only_the_next_part_is_returned() -> None:
 def test_what_is_seen_of_a_way_ends_where_the_body_might_touch_what_is_unknown_or_occupied() -> None:
     router = Router(OPEN, CELL, VOLUME)
     way = np.array([START, GOAL])
-    assert router.seen_m(free(), way) == pytest.approx(np.linalg.norm(GOAL - START))
+    assert router.known_length_m(free(), way) == pytest.approx(np.linalg.norm(GOAL - START))
     unknown = free()
     unknown[6:] = 0.0  # from x = 5 on, so from 4.5 on the body might touch it
-    assert router.seen_m(unknown, way) == pytest.approx(4.5 - START[0], abs=CELL / 2)
+    assert router.known_length_m(unknown, way) == pytest.approx(4.5 - START[0], abs=CELL / 2)
     beside = free()
     beside[6, 5] = 0.0  # one cell beside the way
-    assert router.seen_m(beside, way) == pytest.approx(5.0 - START[0], abs=CELL / 2)
+    assert router.known_length_m(beside, way) == pytest.approx(5.0 - START[0], abs=CELL / 2)
     wall = free()
     wall[9, 4, 2] = 1.0  # its middle at x = 6.75, so cells from 6.75 - 0.75 on touch
-    assert router.seen_m(wall, way) == pytest.approx(7.0 - OPEN.touch_m - START[0], abs=CELL)
+    assert router.known_length_m(wall, way) == pytest.approx(7.0 - OPEN.touch_m - START[0], abs=CELL)
 
 
 def test_a_way_keeps_its_distance_from_the_fence_except_at_the_goal() -> None:

@@ -8,13 +8,13 @@ import pytest
 
 from edqn_jax.devices.hardware import count_cores
 from measurement import ceilings
-from measurement.flags import configured
+from measurement.flags import parse_config
 
 
 def test_c_mujoco_flies_the_same_airframe_on_every_core_and_every_step_is_counted(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    config = configured(["--num-envs", "16"])
+    config = parse_config(["--num-envs", "16"])
     measured = ceilings.Rollout(config)
     assert measured.model.opt.timestep == config.drone.physics_dt_s
     assert measured.model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_CONSTRAINT

@@ -94,7 +94,7 @@ def test_a_dirty_tree_matters_only_to_the_commit_that_is_checked_out(repository:
 
 def test_a_worktree_holds_the_commit_and_leaves_nothing_behind(repository: Path, tmp_path: Path) -> None:
     slow = compare.find_commit(repository, "slow")
-    with compare.checked_out(repository, slow, tmp_path / "a") as checkout:
+    with compare.check_out(repository, slow, tmp_path / "a") as checkout:
         assert (checkout / OLD).is_file() and not (checkout / NEW).exists()
     assert not (tmp_path / "a").exists()
     assert len(git(repository, "worktree", "list").splitlines()) == 1

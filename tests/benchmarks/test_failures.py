@@ -33,7 +33,7 @@ def course(tmp_path_factory: pytest.TempPathFactory):
 
 
 def flown(course, move: tuple[int, int, int]) -> dict:
-    flights = fly_on_all_devices(CONFIG, course.world, always(move), record=True)
+    flights = fly_on_all_devices(CONFIG, course.env_params, always(move), record=True)
     flights = jax.tree.map(np.asarray, flights)
     assert flights.outcome[0] == Outcome.COLLISION
     return failures.look_back(CONFIG, course, flights, 0)

@@ -28,7 +28,7 @@ WORLD = """<mujoco><worldbody>
 def outcome(folder: Path, inside: str, gate: str) -> Outcome:
     file = folder / "world.xml"
     file.write_text(WORLD.format(inside))
-    world = load_missions(CONFIG, str(file)).world
+    world = load_missions(CONFIG, str(file)).env_params
     return Outcome(int(gates.outcomes(CONFIG, world, gate, run_streams(0).flights)[0]))
 
 
@@ -59,7 +59,7 @@ def test_who_hovers_stays_until_time_is_out(tmp_path: Path) -> None:
 
 def test_several_drones_that_fly_straight_hit_each_other() -> None:
     together = dataclasses.replace(CONFIG, env=dataclasses.replace(CONFIG.env, drones=4, max_decisions=200))
-    world = load_missions(together, "sparse", 8).world
+    world = load_missions(together, "sparse", 8).env_params
     found = gates.outcomes(together, world, "straight", run_streams(0).flights)
     alone = gates.outcomes(CONFIG, world, "straight", run_streams(0).flights)
     assert np.sum(found == Outcome.COLLISION) > np.sum(alone == Outcome.COLLISION)

@@ -16,7 +16,7 @@ from edqn_jax.evaluation.missions import run_missions
 from edqn_jax.learn.schedule import Schedule
 from edqn_jax.learn.state import init_state
 from edqn_jax.learn.trainer import AXIS
-from measurement.flags import configured
+from measurement.flags import parse_config
 from measurement.parts import PARTS, Moment, parts_of
 from measurement.timing import Part, Timed, depending_on, operations, size_of
 from measurement.whole import steady
@@ -28,8 +28,8 @@ pytestmark = pytest.mark.slow
 @pytest.fixture(scope="module")
 def now() -> Moment:
     """A fresh state that is told it is past the beginning."""
-    config = steady(configured((*MINIATURE, "--drone.physics", "mjx")), 8)
-    world = run_missions(config).training.world
+    config = steady(parse_config((*MINIATURE, "--drone.physics", "mjx")), 8)
+    world = run_missions(config).training.env_params
     state = jax.jit(lambda world, key: init_state(config, world, key))(world, jax.random.key(0))
     return Moment(config, world, dataclasses.replace(state, step=jnp.int32(Schedule.from_config(config).learn_from)))
 

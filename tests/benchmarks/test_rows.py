@@ -45,18 +45,18 @@ def test_a_planner_that_draws_nothing_counts_once_but_is_timed_every_time(name: 
 def test_rows_of_several_files_become_one_with_the_seeds_of_all() -> None:
     parts = [row("E-DQN", [turn(seed, flights("goal", "goal"))]) for seed in (0, 1)]
     elsewhere = row("E-DQN", [turn(0, flights("goal", "goal"))], device="another machine")
-    joined = rows.joined([*parts, elsewhere])
+    joined = rows.join_rows([*parts, elsewhere])
     assert [[one["seed"] for one in row["turns"]] for row in joined] == [[0, 1], [0]]
     assert len(parts[0]["turns"]) == 1  # what was read stays as it was
     with pytest.raises(ConfigError, match="seed 0 of E-DQN on medium occurs twice"):
-        rows.joined([parts[0], parts[0]])
+        rows.join_rows([parts[0], parts[0]])
 
 
 def test_a_row_that_could_not_run_gives_way_to_one_that_ran_elsewhere() -> None:
     missing = row("A*", [], device=None, reason="numba is not installed")
-    assert rows.joined([missing, row("SNN", [])]) == [missing, row("SNN", [])]
+    assert rows.join_rows([missing, row("SNN", [])]) == [missing, row("SNN", [])]
     ran = row("A*", [turn(0, flights("goal"))])
-    assert rows.joined([missing, ran]) == [ran]
+    assert rows.join_rows([missing, ran]) == [ran]
 
 
 def test_events_are_worth_what_flies_at_equal_decisions_and_at_equal_wall_time() -> None:

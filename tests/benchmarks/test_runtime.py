@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 import runtime
-from conventional_stack.settings import supported
+from conventional_stack.settings import supported_config
 from edqn_jax.config import Config
 from edqn_jax.errors import ConfigError
 from edqn_jax.sim.scene.mjcf import write_scene
@@ -302,17 +302,17 @@ def test_rows_with_other_options_are_other_rows(clear: Path) -> None:
 
 
 def test_rivals_are_judged_in_test_worlds_and_timed_in_the_papers() -> None:
-    assert runtime.configured("medium", [], quick=True).world.flown == ""
+    assert runtime.config_for_world("medium", [], quick=True).world.flown == ""
     assert runtime.for_timing([]).world.name == "paper"
     assert runtime.for_timing(["--world", "medium"]).world.flown == ""
 
 
 def test_the_conventional_stack_has_its_own_agent_unless_told_otherwise() -> None:
     ours = Config()
-    theirs = supported(ours).agent
+    theirs = supported_config(ours).agent
     assert (theirs.history, theirs.huber_delta) == (1, 1.0) and theirs.hidden == ours.agent.hidden
     told = dataclasses.replace(ours, agent=dataclasses.replace(ours.agent, learning_rate=5e-4))
-    assert supported(told).agent.learning_rate == 5e-4
+    assert supported_config(told).agent.learning_rate == 5e-4
 
 
 def test_the_script_states_its_length(capsys: pytest.CaptureFixture[str]) -> None:

@@ -22,11 +22,11 @@ from edqn_jax.learn.state import init_state
 from edqn_jax.runs.directory import to_plain_json
 from edqn_jax.sim.scene.mjcf import check_scene, load_scene
 from edqn_jax.sim.scene.scene import obstacle_count
-from measurement.flags import configured
+from measurement.flags import parse_config
 from measurement.timing import size_of
 from tests.support.miniature import MINIATURE
 
-BASE = apply_layer(configured([]), {"train": {"devices": 2}}, "the test")
+BASE = apply_layer(parse_config([]), {"train": {"devices": 2}}, "the test")
 
 
 def test_a_slope_is_the_power_between_the_ends() -> None:
@@ -88,7 +88,7 @@ def test_a_size_that_cannot_be_run_is_told_in_a_sentence(tmp_path: Path) -> None
 @pytest.mark.slow
 def test_one_device_has_no_curve_of_devices() -> None:
     with pytest.raises(ConfigError, match="only one device"):
-        scaling.measure(configured([*MINIATURE, "--train.devices", "1"]), ["devices"], True, 1)
+        scaling.measure(parse_config([*MINIATURE, "--train.devices", "1"]), ["devices"], True, 1)
 
 
 def test_worlds_of_fewer_boxes_are_a_part_of_those_of_more_and_can_be_flown() -> None:
@@ -109,8 +109,8 @@ def test_there_is_a_gap_between_any_two_boxes() -> None:
 
 @pytest.mark.slow
 def test_state_bytes_are_exactly_those_of_the_arrays() -> None:
-    config = configured(MINIATURE)
-    world = run_missions(config).training.world
+    config = parse_config(MINIATURE)
+    world = run_missions(config).training.env_params
     counted = state_bytes(config, world)
     state = jax.eval_shape(lambda world, key: init_state(config, world, key), world, jax.random.key(0))
     flown, stored = counted.environments * counted.environment, counted.replay_slots * counted.replay_slot

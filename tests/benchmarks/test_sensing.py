@@ -29,7 +29,7 @@ def test_events_are_those_of_flights_one_by_one(policy: Policy) -> None:
     course = load_missions(policy.config, "medium", 3)
     counted = sensing.events_per_decision(policy, course)
     events, decisions = 0, 0
-    environment = Environment(policy.config, course.world)
+    environment = Environment(policy.config, course.env_params)
     for mission in range(3):
         state, seen = environment.reset(0, mission)
         memory = None

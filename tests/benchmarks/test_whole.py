@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from edqn_jax.evaluation.missions import run_missions
-from measurement.flags import configured
+from measurement.flags import parse_config
 from measurement.whole import WholeStep, steady
 from tests.support.miniature import MINIATURE, WORLD
 
@@ -17,8 +17,8 @@ from tests.support.miniature import MINIATURE, WORLD
 @pytest.mark.slow
 def test_what_is_timed_is_training_past_its_beginning(monkeypatch: pytest.MonkeyPatch) -> None:
     quick = ("--drone.physics", "rigid_body", "--world", str(WORLD))  # what is timed is no claim about these
-    config = steady(configured((*MINIATURE, *quick)), 4)
-    whole = WholeStep(config, run_missions(config).training.world, jax.devices()[:2])
+    config = steady(parse_config((*MINIATURE, *quick)), 4)
+    whole = WholeStep(config, run_missions(config).training.env_params, jax.devices()[:2])
     # Three chunks, to warm up and to fill the replay: what is timed from here on is all alike.
     assert whole.done == 12 >= whole.trainer.schedule.learn_from
     before = jax.tree.map(np.asarray, (whole.state.learner.agent.q, whole.state.learner.vae))

@@ -33,15 +33,15 @@ N = CONFIG.drone.physics_steps
 def course() -> MissionSet:
     """The paper's world, each mission level with the goal: straight ahead is the goal, or a block first."""
     course = load_missions(CONFIG, "paper", MISSIONS)
-    missions = course.world.missions
+    missions = course.env_params.missions
     level = dataclasses.replace(missions, start=missions.start.at[:, 2].set(missions.goal[:, 2]))
     # A lowered or raised start may stand in a block: such a flight collides at once, which is a case as well.
-    return dataclasses.replace(course, world=dataclasses.replace(course.world, missions=level))
+    return dataclasses.replace(course, env_params=dataclasses.replace(course.env_params, missions=level))
 
 
 @pytest.fixture(scope="module")
 def ahead(course) -> Flights:
-    return fly_on_all_devices(CONFIG, course.world, always((1, 0, 0)), record=True)
+    return fly_on_all_devices(CONFIG, course.env_params, always((1, 0, 0)), record=True)
 
 
 def test_straight_ahead_ends_at_the_goal_or_at_a_block(ahead):
@@ -50,10 +50,10 @@ def test_straight_ahead_ends_at_the_goal_or_at_a_block(ahead):
 
 
 def test_straight_up_leaves_the_volume_and_hovering_runs_out_of_time(course):
-    up = fly_on_all_devices(CONFIG, course.world, always((0, 0, 1)), record=True)
+    up = fly_on_all_devices(CONFIG, course.env_params, always((0, 0, 1)), record=True)
     inside = np.asarray(up.physics_steps) > 1  # not begun in a block
     assert set(up.outcome[inside]) == {Outcome.LEFT_VOLUME}
-    still = fly_on_all_devices(CONFIG, course.world, always((0, 0, 0)), record=True)
+    still = fly_on_all_devices(CONFIG, course.env_params, always((0, 0, 0)), record=True)
     assert set(still.outcome[inside]) == {Outcome.TIME_OUT}
     assert set(still.decisions[inside]) == {CONFIG.env.max_decisions}
     seconds = CONFIG.env.max_decisions * N * DT
@@ -76,11 +76,11 @@ def test_nothing_counts_after_the_end(ahead):
 
 
 def test_tallies_are_those_of_the_recorded_path_cut_at_the_contact(course, ahead):
-    pool = course.world.pool
+    pool = course.env_params.pool
     distance = jax.jit(jax.vmap(lambda at: signed_distance(take_scene(pool, 0), at)))
     for i in range(20):
         steps = ahead.physics_steps[i]
-        path = np.concatenate([course.world.missions.start[i][None], ahead.record.position[i, :steps]])
+        path = np.concatenate([course.env_params.missions.start[i][None], ahead.record.position[i, :steps]])
         path[-1] = path[-2] + ahead.contact[i] * (path[-1] - path[-2])
         length = np.linalg.norm(np.diff(path, axis=0), axis=1).sum()
         assert ahead.path_length_m[i] == pytest.approx(length, rel=1e-4)  # float32 sums of 100 m
@@ -107,7 +107,7 @@ def test_a_collision_is_closest_at_its_contact(ahead):
 def test_a_goal_is_reached_within_its_radius_at_the_last_step_and_not_before(course, ahead):
     for i in np.flatnonzero(ahead.outcome == Outcome.GOAL):
         path = ahead.record.position[i, : ahead.physics_steps[i]]
-        apart = np.linalg.norm(path - np.asarray(course.world.missions.goal[i]), axis=1)
+        apart = np.linalg.norm(path - np.asarray(course.env_params.missions.goal[i]), axis=1)
         assert apart[-1] < CONFIG.env.goal_radius_m <= apart[-2]
 
 
@@ -136,7 +136,7 @@ def test_a_wrong_verdict_is_noticed(course, ahead):
 
 
 def test_shuffling_moves_the_codes_and_nothing_else(course):
-    world = course.world
+    world = course.env_params
 
     def decisions(codes: bool, own: bool, shuffled: bool) -> np.ndarray:
         params = that_sees(codes, own)
@@ -154,7 +154,7 @@ def test_shuffling_moves_the_codes_and_nothing_else(course):
 
 
 def test_one_mission_has_nobody_to_shuffle_with(course):
-    world = course.world
+    world = course.env_params
     alone = dataclasses.replace(world, missions=jax.tree.map(lambda leaf: leaf[:1], world.missions))
     with pytest.raises(ValueError, match="at least two missions"):
         fly_missions(CONFIG, alone, always((0, 0, 0)), jax.random.key(0), shuffle_codes=True)
@@ -163,7 +163,7 @@ def test_one_mission_has_nobody_to_shuffle_with(course):
 def test_a_recorded_flight_becomes_columns_and_a_summary_and_compiles_nothing_anew(course):
     mesh = Mesh(np.asarray(jax.devices()), ("mission",))
     layout = NamedSharding(mesh, PartitionSpec())
-    world, params = jax.device_put((course.world, always((1, 0, 0))), layout)
+    world, params = jax.device_put((course.env_params, always((1, 0, 0))), layout)
     key = jax.random.key(0)
     rollouts.trace_missions(CONFIG, world, params, key, record=True, mesh=mesh).compile()
     another_key = jax.random.key(1)

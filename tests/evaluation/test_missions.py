@@ -25,26 +25,26 @@ CONFIG = Config()
 @pytest.mark.slow
 def test_one_mission_in_a_file_is_its_own():
     course = load_missions(CONFIG, "paper")
-    np.testing.assert_allclose(course.world.missions.start, [[1, 1, 3]])
-    np.testing.assert_allclose(course.world.missions.goal, [[90, 90, 10]])
+    np.testing.assert_allclose(course.env_params.missions.start, [[1, 1, 3]])
+    np.testing.assert_allclose(course.env_params.missions.goal, [[90, 90, 10]])
     assert course.mjcf() == [resolve_world("paper").read_text()]
 
 
 @pytest.mark.slow
 def test_many_missions_in_a_file_start_all_over_and_go_to_its_goal():
-    missions = load_missions(CONFIG, "paper", 50).world.missions
+    missions = load_missions(CONFIG, "paper", 50).env_params.missions
     np.testing.assert_allclose(missions.goal, np.tile([90, 90, 10], (50, 1)))
     assert np.all(np.std(np.asarray(missions.start), axis=0) > [20, 20, 4])  # uniform: 31, 31 and 6.4 m
-    others = load_missions(CONFIG, "paper", 50, seed=1).world.missions
+    others = load_missions(CONFIG, "paper", 50, seed=1).env_params.missions
     assert not np.any(np.all(missions.start == others.start, axis=1))
 
 
 @pytest.mark.slow
 def test_start_and_goal_may_be_given():
-    missions = load_missions(CONFIG, "paper", start=(2, 3, 4), goal=(3, 100, 20)).world.missions
+    missions = load_missions(CONFIG, "paper", start=(2, 3, 4), goal=(3, 100, 20)).env_params.missions
     np.testing.assert_allclose(missions.start, [[2, 3, 4]])
     np.testing.assert_allclose(missions.goal, [[3, 100, 20]])
-    many = load_missions(CONFIG, "paper", 5, goal=(3, 100, 20)).world.missions
+    many = load_missions(CONFIG, "paper", 5, goal=(3, 100, 20)).env_params.missions
     np.testing.assert_allclose(many.goal, np.tile([3, 100, 20], (5, 1)))
 
 
@@ -57,14 +57,14 @@ def test_validation_begins_where_training_does(fraction: float, near: float) -> 
     )
     missions = run_missions(config)
     assert missions.near_start.mean() == near
-    starts = np.asarray(missions.validation.world.missions.start)
+    starts = np.asarray(missions.validation.env_params.missions.start)
     apart = np.abs(starts[missions.near_start] - [1.0, 1.0, 3.0]).max(axis=1)
     assert (apart <= 1.0 + 1e-3).all() and len(np.unique(starts, axis=0)) == 40
 
 
 def test_random_worlds_are_the_test_split_and_each_has_one_mission():
     course = load_missions(CONFIG, "sparse", 4, seed=2)
-    pool, missions = course.world.pool, course.world.missions
+    pool, missions = course.env_params.pool, course.env_params.missions
     assert missions.scene.tolist() == [0, 1, 2, 3]
     np.testing.assert_array_equal(missions.start, pool.start)
     expected = families.random_pool("sparse", families.world_keys("test", 4, first=8))
@@ -76,7 +76,7 @@ def test_a_random_world_as_mjcf_is_the_world_that_was_flown():
     texts = course.mjcf()
     assert len(texts) == 4
     model = mujoco.MjSpec.from_string(texts[3]).compile()
-    np.testing.assert_allclose(model.site("start").pos, course.world.pool.start[3], atol=1e-5)
+    np.testing.assert_allclose(model.site("start").pos, course.env_params.pool.start[3], atol=1e-5)
 
 
 def inside_a_block() -> tuple[float, float, float]:
@@ -164,17 +164,17 @@ def test_a_run_in_random_worlds_ends_with_the_world_that_is_to_be_flown_and_then
         run_missions(make_config("sparse", world={**sizes, "flown": flown}, train=count)) for flown in ("", "paper")
     )
     assert (here.tests, there.tests) == (3, 2)
-    city, flown = load_scene(resolve_world("paper")), there.final.world
+    city, flown = load_scene(resolve_world("paper")), there.final.env_params
     np.testing.assert_array_equal(flown.missions.start[0], city.start)
     np.testing.assert_array_equal(flown.missions.goal[0], city.goal)
     point = jnp.array([31.0, 33.0, 4.0])
     assert signed_distance(there.scene, point) == pytest.approx(float(signed_distance(city, point)), abs=1e-5)
     # The others are the test worlds, and validation is what it was.
-    np.testing.assert_array_equal(flown.missions.start[1:], here.final.world.missions.start[:2])
-    np.testing.assert_array_equal(flown.pool.spheres.position[1:], here.final.world.pool.spheres.position[:2])
+    np.testing.assert_array_equal(flown.missions.start[1:], here.final.env_params.missions.start[:2])
+    np.testing.assert_array_equal(flown.pool.spheres.position[1:], here.final.env_params.pool.spheres.position[:2])
     np.testing.assert_array_equal(flown.missions.scene, range(3))
-    np.testing.assert_array_equal(there.validation.world.missions.start, here.validation.world.missions.start)
-    jax.tree.map(lambda a, b: np.testing.assert_array_equal(a.shape, b.shape), there.validation.world, flown)
+    np.testing.assert_array_equal(there.validation.env_params.missions.start, here.validation.env_params.missions.start)
+    jax.tree.map(lambda a, b: np.testing.assert_array_equal(a.shape, b.shape), there.validation.env_params, flown)
 
 
 @pytest.mark.slow
@@ -185,8 +185,8 @@ def test_runs_of_several_seeds_have_the_missions_of_each_alone(name):
     together = missions_of_runs(configs)
     for own, alone in zip(together, map(run_missions, configs), strict=True):
         for kind in ("training", "validation", "final"):
-            jax.tree.map(np.testing.assert_array_equal, getattr(own, kind).world, getattr(alone, kind).world)
-    first, second = (each.training.world.missions.start for each in together)
+            jax.tree.map(np.testing.assert_array_equal, getattr(own, kind).env_params, getattr(alone, kind).env_params)
+    first, second = (each.training.env_params.missions.start for each in together)
     assert not np.array_equal(first, second)
 
 

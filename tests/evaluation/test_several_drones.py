@@ -10,8 +10,8 @@ import pytest
 
 from edqn_jax.config.loading import make_config, with_conditions
 from edqn_jax.errors import ConfigError
-from edqn_jax.evaluation.companions import scene_of_flight
 from edqn_jax.evaluation.evaluate import evaluate
+from edqn_jax.evaluation.flight_scene import scene_of_flight
 from edqn_jax.evaluation.metrics import summarise_flights
 from edqn_jax.evaluation.missions import final_missions, load_missions, run_missions
 from edqn_jax.runs.policies import load_policy
@@ -35,7 +35,7 @@ def flown():
 
 def paths_of(evaluation):
     """Returns the places [M, 1 + T, 3] of all flights, and when each ended [M], in physics steps."""
-    flights, missions = evaluation.flights, evaluation.missions.world.missions
+    flights, missions = evaluation.flights, evaluation.missions.env_params.missions
     paths = np.concatenate([np.asarray(missions.start)[:, None], flights.record.position], axis=1)
     return paths.astype(np.float64), flights.physics_steps - 1 + flights.contact
 
@@ -84,7 +84,7 @@ def test_the_others_are_in_a_flights_pictures_where_they_were_and_only_while_the
     assert before.drones is not None and scene.drones is not None
     assert [np.shape(x) for x in before.drones.path] == [np.shape(x) for x in scene.drones.path]
     assert (before.drones.path == PARKED).all()
-    assert np.array_equal(scene.goal, evaluation.missions.world.missions.goal[mission])
+    assert np.array_equal(scene.goal, evaluation.missions.env_params.missions.goal[mission])
     others = [DRONES, DRONES + 2, DRONES + 3]
     for step in (0, 1, int(min(steps[others])), int(max(steps[others])) + 3):
         seen = np.asarray(scene_at(scene, jnp.float32(step * dt)).spheres.position)[-3:]
@@ -98,13 +98,13 @@ def test_one_block_of_missions_is_flown_in_each_test_world_and_blocks_of_other_s
     config = make_config("medium", env={"drones": DRONES})
     alone = load_missions(make_config("medium"), "medium", 6)
     first, second = (load_missions(config, "medium", DRONES * 3, seed) for seed in (0, 1))
-    assert np.array_equal(first.world.missions.scene, np.repeat(np.arange(3), DRONES))
+    assert np.array_equal(first.env_params.missions.scene, np.repeat(np.arange(3), DRONES))
     for part, of in ((first, slice(0, 3)), (second, slice(3, 6))):
-        assert np.array_equal(part.world.pool.boxes.position, alone.world.pool.boxes.position[of])
-    assert not np.isin(np.asarray(first.world.missions.start), np.asarray(second.world.missions.start)).any()
+        assert np.array_equal(part.env_params.pool.boxes.position, alone.env_params.pool.boxes.position[of])
+    assert not np.isin(np.asarray(first.env_params.missions.start), np.asarray(second.env_params.missions.start)).any()
     # The same however many are flown.
     more = load_missions(config, "medium", DRONES * 5)
-    assert np.array_equal(more.world.missions.start[: DRONES * 3], first.world.missions.start)
+    assert np.array_equal(more.env_params.missions.start[: DRONES * 3], first.env_params.missions.start)
 
 
 def test_a_run_is_validated_and_judged_by_whole_groups_the_first_of_them_in_the_flown_world():
@@ -113,14 +113,14 @@ def test_a_run_is_validated_and_judged_by_whole_groups_the_first_of_them_in_the_
     )
     missions = run_missions(config)
     scenes = [
-        np.asarray(each.world.missions.scene) for each in (missions.training, missions.validation, missions.final)
+        np.asarray(each.env_params.missions.scene) for each in (missions.training, missions.validation, missions.final)
     ]
     assert [len(each) for each in scenes] == [32, 16, 16] and missions.tests == 12
     for of in scenes:
         assert (of.reshape(-1, DRONES) == of[::DRONES, None]).all()
-    final = missions.final.world
+    final = missions.final.env_params
     assert np.array_equal(final.pool.start, final.missions.start[::DRONES])
-    assert np.array_equal(final_missions(config, 10).world.missions.start, final.missions.start[:8])
+    assert np.array_equal(final_missions(config, 10).env_params.missions.start, final.missions.start[:8])
     assert len(final.missions.start) == len(np.unique(np.asarray(final.missions.start), axis=0))
 
 

@@ -110,7 +110,7 @@ def test_a_policy_sees_in_a_recorded_flight_what_it_saw_when_it_flew(flight):
     recording = read_events(flight)
     seen = observe_recording(policy, recording)
     missions = load_missions(policy.config, "sparse", 1, 0, None, None)
-    environment = Environment(policy.config, missions.world)
+    environment = Environment(policy.config, missions.env_params)
     state, observation = environment.reset(0, 0)
     memory, images, nears = None, [], []
     for _ in seen.until_us:

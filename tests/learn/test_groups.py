@@ -59,7 +59,7 @@ def configured(**groups) -> Config:
 def trained():
     """A state after training, and of each step whether its environments [E] waited, and what ended."""
     config = configured()
-    world = run_missions(config).training.world
+    world = run_missions(config).training.env_params
     state = jax.jit(partial(init_state, config, world))(jax.random.key(0))
 
     def one(state, step):

@@ -86,12 +86,12 @@ def test_a_damaged_library_is_made_anew(source: Path, tmp_path: Path) -> None:
         folders = tmp_path / "whole", tmp_path / "damaged"
         for folder in folders:
             folder.mkdir()
-        build._loaded(command, build.C.flags, source, ("NAME=edqn_test_g",), folders[0])
+        build._load_library(command, build.C.flags, source, ("NAME=edqn_test_g",), folders[0])
         (whole,) = folders[0].iterdir()
         # In another folder: a library that is loaded already is not read again.
         damaged = folders[1] / whole.name
         damaged.write_bytes(whole.read_bytes()[:100])
-        assert build._loaded(command, build.C.flags, source, ("NAME=edqn_test_g",), folders[1]).edqn_test_g
+        assert build._load_library(command, build.C.flags, source, ("NAME=edqn_test_g",), folders[1]).edqn_test_g
         assert list(folders[1].iterdir()) == [damaged] and damaged.stat().st_size == whole.stat().st_size
 
 

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable
 
+import jax
+import jax.numpy as jnp
 import mujoco
 import numpy as np
 
 from edqn_jax.sim.physics.airframe import SKYDIO_X2
+from edqn_jax.sim.physics.drone import DroneState, hover_state
 
 
 def load() -> tuple[mujoco.MjModel, mujoco.MjData]:
@@ -26,6 +30,22 @@ def fly_thrusts(qpos: np.ndarray, qvel: np.ndarray, thrusts: np.ndarray) -> tupl
         places.append(data.qpos.copy())
         speeds.append(data.qvel.copy())
     return np.array(places), np.array(speeds)
+
+
+def check_hundred_steps(step: Callable[[DroneState, jax.Array], DroneState]) -> None:
+    """Asserts that 100 steps under random thrusts stay within a millimetre of those of C MuJoCo."""
+    sequence = np.clip(3.25 + np.random.default_rng(1).normal(0, 0.4, (100, 4)), 0, 13.0)
+    state = hover_state(jnp.array([1.0, -2.0, 30.0]), jnp.float32(0.4))
+    state = dataclasses.replace(state, angular_velocity=jnp.array([0.5, -0.3, 0.2]))
+    qpos = np.concatenate([state.position, state.quaternion])
+    places, speeds = fly_thrusts(qpos, np.concatenate([state.velocity, state.angular_velocity]), sequence)
+    assert np.linalg.norm(places[-1, :3] - qpos[:3]) > 5  # it went somewhere
+    for thrust, place, speed in zip(sequence, places, speeds, strict=True):
+        state = step(state, jnp.asarray(thrust, jnp.float32))
+        np.testing.assert_allclose(state.position, place[:3], atol=1e-3)
+        np.testing.assert_allclose(state.quaternion, place[3:], atol=1e-4)
+        np.testing.assert_allclose(state.velocity, speed[:3], atol=1e-3)
+        np.testing.assert_allclose(state.angular_velocity, speed[3:], atol=1e-3)
 
 
 def acceleration(qpos: np.ndarray, qvel: np.ndarray, thrust: np.ndarray) -> np.ndarray:

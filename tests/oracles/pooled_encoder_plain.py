@@ -41,5 +41,5 @@ def encode_events(
         pooled = jnp.einsum("...nf,...nc->...cf", of_pixels * (p != 0)[..., None], phi)
         return encoder._head(pooled.reshape(*pooled.shape[:-2], -1), POOL_SCALE)
 
-    encoder = PooledEncoder(vae._of_kind(config, params), camera.height, camera.width)
+    encoder = PooledEncoder(vae._with_features_of(config, params), camera.height, camera.width)
     return encoder.apply({"params": params["encoder"]}, method=sparse)  # type: ignore

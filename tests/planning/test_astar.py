@@ -18,6 +18,7 @@ from edqn_jax.planning.lattice import NoPathError
 from edqn_jax.sim.scene.distance import signed_distance
 from edqn_jax.sim.scene.scene import Scene, Shape, Spheres, UprightBoxes, UprightCylinders, build_scene
 from tests.oracles import dijkstra
+from tests.support.small_worlds import box
 
 RADIUS = 0.36
 GREY = np.full(3, 0.5)
@@ -26,11 +27,6 @@ CAPACITIES = {"boxes": 6, "cylinders": 2, "spheres": 2}  # the same in every tes
 
 def small_world(*shapes, size=(10.0, 10.0, 4.0)) -> Scene:
     return build_scene(shapes, volume=[(0, 0, 0), size], start=[0, 0, 0], goal=size, capacities=CAPACITIES)
-
-
-def box(lower, upper) -> UprightBoxes:
-    lower, upper = np.array(lower, float), np.array(upper, float)
-    return UprightBoxes(position=(lower + upper) / 2, half=(upper - lower) / 2, yaw=np.float32(0), albedo=GREY)
 
 
 def test_in_the_open_the_path_is_the_straight_line():

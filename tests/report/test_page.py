@@ -72,7 +72,7 @@ def a_run(steps: int = 40, name: str = "a run") -> EvaluatedRun:
         record=record,
     )
     ends = SimpleNamespace(start=np.zeros((1, 3)), goal=np.ones((1, 3)), scene=np.zeros(1, int))
-    missions: Any = SimpleNamespace(name="paper", world=SimpleNamespace(missions=ends))
+    missions: Any = SimpleNamespace(name="paper", env_params=SimpleNamespace(missions=ends))
     params: Any = None
     return EvaluatedRun(name, config, "train: {}", params, missions, flights, {}, [], {}, [])
 

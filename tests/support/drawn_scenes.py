@@ -92,6 +92,13 @@ def ball(x, y, z, radius):
     return Spheres(position=[x, y, z], radius=radius, albedo=BROWN)
 
 
+@jax.jit
+def clearances(pool, missions, points):
+    """Metres [M] from points [M, 3] to the nearest surface in the worlds of M missions."""
+    at = jax.vmap(lambda index, point: signed_distance(take_scene(pool, index), point))
+    return at(missions.scene, points)
+
+
 def one_of_each_kind() -> Scene:
     """One shape of every kind, and a parked one of each."""
 

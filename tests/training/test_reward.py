@@ -43,7 +43,7 @@ class Bonus:
 @pytest.mark.slow
 def test_a_reward_is_given_the_decision_that_was_flown_and_gives_what_is_paid() -> None:
     course = load_missions(CONFIG, "paper")
-    world, radius = course.world, CONFIG.drone.body_radius_m
+    world, radius = course.env_params, CONFIG.drone.body_radius_m
     judge = load_judge(mujoco.MjSpec.from_string(course.mjcf()[0]), radius)
 
     @jax.jit
@@ -126,7 +126,7 @@ def test_training_with_the_reward_geodesic_counts_metres_around_obstacles() -> N
     task = dataclasses.replace(BLIND_RUN.env, reward="geodesic")
     config = dataclasses.replace(BLIND_RUN, env=task, world=dataclasses.replace(BLIND_RUN.world, name=world))
     with set_up_training(config, agents=2) as preparation:
-        distances = preparation.trainer.world.distances
+        distances = preparation.trainer.env_params.distances
         assert distances is not None and distances.remaining.ndim == 4  # one field for all agents
         scene = preparation.missions[0].scene
         way = geodesic.distance_to_goal(distances, jnp.int32(0), scene.goal, scene.start)

@@ -32,7 +32,7 @@ def test_a_run_among_balls_is_drawn_and_verified(tmp_path: Path) -> None:
     assert [finding for finding in verify_run(run.path) if not finding.right] == []
     assert summary["devices"][1] and (run.figures / "path.png").is_file()
     flown = {name: np.asarray(column) for name, column in run.read_trajectory().items()}
-    mission = run_missions(BALLS).final.world
+    mission = run_missions(BALLS).final.env_params
     one = dataclasses.replace(mission, missions=_first(mission.missions))
     assert len(flight_recording(BALLS, one, flown).events)
 

@@ -117,10 +117,10 @@ def test_a_move_that_does_not_exist_is_named(checked: Trainer, learning: TrainSt
 
 
 def test_an_index_inside_the_environment_is_checked(checked: Trainer, learning: TrainState) -> None:
-    world = checked.world
+    world = checked.env_params
     missions = dataclasses.replace(world.missions, scene=world.missions.scene + 1)
     beyond = trainer_of(CHECKED)
-    beyond.world, beyond._chunk = dataclasses.replace(world, missions=missions), checked._chunk
+    beyond.env_params, beyond._chunk = dataclasses.replace(world, missions=missions), checked._chunk
     assert "out-of-bounds indexing" in fault(beyond, learning)
 
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from edqn_jax.config.loading import make_config
-from edqn_jax.evaluation.companions import scene_of_flight
+from edqn_jax.evaluation.flight_scene import scene_of_flight
 from edqn_jax.evaluation.judge import FlightTrack, clearance, load_judge, max_obstacle_speed, replay_contact
 from edqn_jax.evaluation.missions import MissionSet, load_missions
 from edqn_jax.evaluation.rollouts import fly_missions
@@ -146,15 +146,17 @@ def course() -> MissionSet:
     moving = {"moving_share": 0.8, "moving_speed_m_s": 4.0, "balls": 4}
     course = load_missions(make_config("medium", world=moving), "medium", 60)
     # Balls are thrown at the missions' drones, which begin elsewhere than the worlds' own.
-    missions = random_missions(course.world.pool, 60, jax.random.key(5))
-    return dataclasses.replace(course, world=dataclasses.replace(course.world, missions=missions))
+    missions = random_missions(course.env_params.pool, 60, jax.random.key(5))
+    return dataclasses.replace(course, env_params=dataclasses.replace(course.env_params, missions=missions))
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("move", [(1, 0, 0), (0, 0, 0)])
 def test_every_verdict_on_a_flight_among_moving_obstacles_is_mujocos(course, move):
     config = dataclasses.replace(CONFIG, env=dataclasses.replace(CONFIG.env, max_decisions=50))
-    flights = jax.tree.map(np.asarray, fly_missions(config, course.world, always(move), jax.random.key(0), record=True))
+    flights = jax.tree.map(
+        np.asarray, fly_missions(config, course.env_params, always(move), jax.random.key(0), record=True)
+    )
     results = check_verdicts(config, course, flights)
     outcomes = np.array([result.outcome for result in results])
     assert (outcomes == Outcome.COLLISION).sum() > 5
@@ -177,7 +179,7 @@ def test_a_drone_is_hit_by_balls_where_the_world_of_its_flight_has_them(physics_
         world=make_config("sparse", world={"balls": 3}).world,
     )
     course = load_missions(config, "sparse", 16)
-    flights = fly_missions(config, course.world, always((0, 0, 0)), jax.random.key(0), record=True)
+    flights = fly_missions(config, course.env_params, always((0, 0, 0)), jax.random.key(0), record=True)
     flights = jax.tree.map(np.asarray, flights)
     assert (flights.outcome == Outcome.COLLISION).sum() > 12  # they hover
     assert all(result.agrees for result in check_verdicts(config, course, flights))

@@ -101,7 +101,9 @@ def test_a_run_is_verified_and_what_was_changed_in_it_is_found(
     changed = RunDirectory(tmp_path / "changed")
     shutil.copytree(whole[0].path, changed.path)
     # The flights do not change: they need not be flown a third time.
-    flown = fly_on_all_devices(TINY_RUN, run_missions(TINY_RUN).final.world, load_run(changed.path)[1], 0, record=True)
+    flown = fly_on_all_devices(
+        TINY_RUN, run_missions(TINY_RUN).final.env_params, load_run(changed.path)[1], 0, record=True
+    )
     monkeypatch.setattr("edqn_jax.runs.verification.verify.fly_on_all_devices", lambda *_, **__: flown)
 
     def wrong() -> set[str]:

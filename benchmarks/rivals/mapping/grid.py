@@ -126,7 +126,7 @@ def update(
     first = jnp.clip(first, 0, jnp.asarray(grid.log_odds.shape) - jnp.asarray(size))
     part = jax.lax.dynamic_slice(grid.log_odds, first, size)
     rays = raycast.camera_rays(camera, rotation)
-    passed, ended = _seen(config, size, start - first, _directions(rays, depth.shape), depth.ravel())
+    passed, ended = _find_free_cells(config, size, start - first, _directions(rays, depth.shape), depth.ravel())
     change = jnp.where(ended, config.hit, jnp.where(passed, config.miss, 0.0)) * counts
     part = jnp.clip(part + change, config.least, config.most)
     return dataclasses.replace(grid, log_odds=jax.lax.dynamic_update_slice(grid.log_odds, part, first))
@@ -138,7 +138,7 @@ def _directions(rays: raycast.Rays, shape: tuple[int, ...]) -> Array:
     return ray / jnp.sqrt(jnp.sum(ray**2, axis=1, keepdims=True))
 
 
-def _seen(
+def _find_free_cells(
     config: MapConfig, size: tuple[int, ...], start: Array, direction: Array, depth: Array
 ) -> tuple[Array, Array]:
     """Returns which cells of a grid of `size` rays pass, their own first one included, and in which rays end.
@@ -170,12 +170,12 @@ def _seen(
         cells.append(cell)
         entered.append(at)
     when = jnp.concatenate(entered, axis=1)
-    passed = _marked(size, jnp.concatenate(cells, axis=1), when < freed[:, None])
+    passed = _mark_cells(size, jnp.concatenate(cells, axis=1), when < freed[:, None])
     end = jnp.floor(start + length[:, None] * direction)
-    return passed, _marked(size, end, meets)
+    return passed, _mark_cells(size, end, meets)
 
 
-def _marked(size: tuple[int, ...], cells: Array, wanted: Array) -> Array:
+def _mark_cells(size: tuple[int, ...], cells: Array, wanted: Array) -> Array:
     """Returns [X, Y, Z] bool: whether a cell is among those of `cells` [..., 3] that are `wanted` [...] and inside."""
     inside = jnp.all((cells >= 0) & (cells < jnp.asarray(size, cells.dtype)), axis=-1)
     index = jnp.clip(cells, 0, jnp.asarray(size, cells.dtype) - 1).astype(jnp.int32)

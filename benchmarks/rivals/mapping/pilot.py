@@ -43,11 +43,11 @@ from edqn_jax.sim.task import env
 from edqn_jax.sim.task.action_sets import heading_setpoint
 from edqn_jax.sim.task.env import EnvParams
 from edqn_jax.sim.task.flights import Flights, at_start, update_tallies
-from edqn_jax.sim.task.observation import View, heading_velocity, observe, poses_at_start, poses_seen, with_times
+from edqn_jax.sim.task.observation import View, heading_velocity, observe, poses_at_start, sensor_poses, with_times
 from edqn_jax.sim.task.outcomes import Outcome, judge_decision
 from rivals.mapping.grid import Grid, MapConfig, empty_grid, grid_shape, update
 from rivals.mapping.route import RouteConfig, Router
-from rivals.planners.follow import FollowConfig, sampled, steer
+from rivals.planners.follow import FollowConfig, sample_path, steer
 
 POINTS = 128
 """Points, `planners.follow.SPACING_M` apart, of the part of a plan that the follower is given."""
@@ -237,7 +237,7 @@ def decide(
     flights, _ = update_tallies(config, scene, flying.flights, before.position, flight, outcome, end, contact)
     move = heading_velocity(config.env, drone.yaw_of(before.quaternion), command)
     steps = flying.flights.decisions * config.drone.physics_steps + jnp.arange(1, config.drone.physics_steps + 1)
-    poses = poses_seen(config, before, with_times(config, flight, steps if has_motion(scene) else None))
+    poses = sensor_poses(config, before, with_times(config, flight, steps if has_motion(scene) else None))
     running = flying.flights.outcome == Outcome.RUNNING
     keep = functools.partial(jax.tree.map, lambda new, old: jnp.where(running, new, old))
     thrown = launches.update_aim(
@@ -318,11 +318,11 @@ def order(
     route = router.plan(log_odds, position, goal)
     speed = pilot.speed_m_s
     if pilot.braking_m_s2 > 0:
-        free = router.seen_m(log_odds, route.points)
+        free = router.known_length_m(log_odds, route.points)
         # v with v t + v^2 / 2 a = free: the way until it brakes, and that of braking.
         lag = pilot.braking_m_s2 * pilot.reaction_s
         speed = min(speed, max(pilot.least_m_s, -lag + float(np.sqrt(lag**2 + 2 * pilot.braking_m_s2 * free))))
-    return sampled(route.points)[:POINTS], speed, route.expanded
+    return sample_path(route.points)[:POINTS], speed, route.expanded
 
 
 def fly(

@@ -133,11 +133,11 @@ class Router:
         tight = shorten_path(points, lambda a, b: _heaviest(known, (a - lower) / cell, (b - lower) / cell) > 1.0)
         return Route(tight, expanded)
 
-    def seen_m(self, log_odds: np.ndarray, points: np.ndarray) -> float:
+    def known_length_m(self, log_odds: np.ndarray, points: np.ndarray) -> float:
         """Returns the length, metres, of the part of a way [N, 3], metres, in which the body is known to be free."""
         lower = self.volume[0]
         known = self._map(log_odds, points[-1])
-        return self.cell * float(_seen(known, (points - lower) / self.cell))
+        return self.cell * float(_known_length(known, (points - lower) / self.cell))
 
     def _map(self, log_odds: np.ndarray, goal: np.ndarray) -> _Map:
         config, (lower, upper) = self.config, self.volume
@@ -300,7 +300,7 @@ def _heaviest(known, a, b):
 
 
 @numba.njit(nogil=True)
-def _seen(known, points):
+def _known_length(known, points):
     """Returns the length of the part of a way [N, 3] in which the body is known to be free; both in cells."""
     total = 0.0
     for leg in range(points.shape[0] - 1):

@@ -4,7 +4,7 @@ Airframe, controller, decision period and rules of the outcome are those of a le
 follower commands a velocity towards a point ahead on the path, of at most `env.speed_m_s`, a learned policy's speed
 along each axis. The point is the furthest within reach for which the straight line there stays within a tolerance of
 the path, or no further from it than the drone is now. Straight legs are therefore flown fast, and the follower slows
-down before corners and cuts them by less than the reserve that `reserved` tasks make planners keep.
+down before corners and cuts them by less than the reserve that `with_reserve` makes planners keep.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ class FollowConfig:
     """Time after the delay in which the commanded velocity would reach the point ahead, seconds."""
 
 
-def reserved(task: PlanningTask, config: FollowConfig = FollowConfig()) -> PlanningTask:  # noqa: B008 (it is frozen)
+def with_reserve(task: PlanningTask, config: FollowConfig = FollowConfig()) -> PlanningTask:  # noqa: B008 (it is frozen)
     """Returns the task with a larger body and a smaller volume, by the reserve; start and goal stay in the volume."""
     lower, upper = np.asarray(task.scene.volume, np.float64)
     lower = np.minimum(lower + config.reserve_m, np.minimum(task.start, task.goal))
@@ -65,7 +65,7 @@ def reserved(task: PlanningTask, config: FollowConfig = FollowConfig()) -> Plann
     return dataclasses.replace(task, scene=scene, body_radius=task.body_radius + config.reserve_m)
 
 
-def sampled(path: np.ndarray) -> np.ndarray:
+def sample_path(path: np.ndarray) -> np.ndarray:
     """Returns points [K, 3] every `SPACING_M` along a path [N, 3], metres; the last is repeated to fill K."""
     along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))])
     count = math.ceil(along[-1] / SPACING_M) + 1
@@ -81,7 +81,7 @@ def steer(
     Args:
         config: for the speed limit.
         follow: how closely and how fast.
-        points: [K, 3] from `sampled`, metres.
+        points: [K, 3] from `sample_path`, metres.
         nearest: [] int32, index of the nearest point at the previous decision; the search starts there.
         state: of the drone.
 
@@ -114,7 +114,7 @@ def steer(
 def fly_path(
     config: Config, follow: FollowConfig, airframe: Airframe, scene: Scene, goal: Array, points: Array
 ) -> Flights:
-    """Flies once along points [K, 3] from `sampled`, from rest at the first, facing the goal [3].
+    """Flies once along points [K, 3] from `sample_path`, from rest at the first, facing the goal [3].
 
     Pure; `config` and `follow` are static. The scene's own start and goal are not used.
 

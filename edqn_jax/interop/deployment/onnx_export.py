@@ -183,7 +183,7 @@ def decision_function(config: Config, params: PolicyParams) -> Callable[..., tup
     params = jax.tree.map(np.asarray, params)  # constants of the file
 
     def decide(counts: Array, own: Array, motion: Array, memory: Memory) -> tuple[Array, Array]:
-        observation = Observation(sensed=_sensed(config, counts), own=own, motion=motion)
+        observation = Observation(sensed=_sense(config, counts), own=own, motion=motion)
         after = AgentActor(config).encode(params, memory, observation)
         return q_values(config.agent, params.q, len(ACTIONS), after), after
 
@@ -221,7 +221,7 @@ def field_of(config: Config, counts: Array) -> EventField:
     )
 
 
-def _sensed(config: Config, counts: Array) -> EventField | Array:
+def _sense(config: Config, counts: Array) -> EventField | Array:
     """Returns what the sensor shows where a camera counts these events."""
     if config.env.sensor == "events":
         return field_of(config, counts)

@@ -55,7 +55,7 @@ def read_aedat4(file: Path, size: tuple[int, int] | None = None, number: int | N
         raise ConfigError(f"'{file}' does not begin as an AEDAT4 does: it is damaged, or of another kind")
     try:
         compression, end, streams, begin = _header(content)
-        stream = _chosen(file, streams, number)
+        stream = _select_stream(file, streams, number)
         decompress = _decompressor(file, compression)
         packets = [_events(decompress(packet)) for packet in _packets(content, begin, end, stream.number)]
     except (struct.error, ValueError, ElementTree.ParseError, RuntimeError, MemoryError, KeyError) as error:
@@ -100,7 +100,7 @@ def _streams(described: ElementTree.Element) -> list[Stream]:
     return found
 
 
-def _chosen(file: Path, streams: list[Stream], number: int | None) -> Stream:
+def _select_stream(file: Path, streams: list[Stream], number: int | None) -> Stream:
     """Returns the stream of a number, or the only one.
 
     Raises:

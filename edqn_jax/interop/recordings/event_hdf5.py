@@ -67,12 +67,12 @@ def _columns(file: Path, opened: Any) -> tuple[dict[str, NDArray], dict[str, Any
             f"'{file}' is not in DSEC's layout, a group 'events' with columns x, y, p and t; "
             f"it holds {_contents(opened)}"
         )
-    columns = {key: _held(group[name]) for key, name in names.items()}
+    columns = {key: _read_dataset(group[name]) for key, name in names.items()}
 
     def found(name: str) -> NDArray | None:
         for place in (opened, group):
             if name in place:
-                return _held(place[name])
+                return _read_dataset(place[name])
         return None
 
     offset, index, said = found("t_offset"), found("ms_to_idx"), group.attrs
@@ -86,11 +86,11 @@ def _columns(file: Path, opened: Any) -> tuple[dict[str, NDArray], dict[str, Any
             else None
         ),
         "contrast": one_number(str(file), "contrast", said["contrast"]) if "contrast" in said else None,
-        "flight": {key: _held(flight[key]) for key in flight} if _is_group(flight) else None,
+        "flight": {key: _read_dataset(flight[key]) for key in flight} if _is_group(flight) else None,
     }
 
 
-def _held(place: Any) -> NDArray:
+def _read_dataset(place: Any) -> NDArray:
     """Returns what a data set holds; HDF5 has some that hold nothing, without a shape."""
     return np.zeros(0) if getattr(place, "shape", ()) is None else np.asarray(place)
 

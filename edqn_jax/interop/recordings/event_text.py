@@ -74,7 +74,7 @@ def read_text(
     lines = text.split("\n")
     said = _beginning(file, lines, given is not None)
     body = lines[said.lines :]
-    if not any(_bare(line) for line in body):
+    if not any(_strip_comment(line) for line in body):
         raise ConfigError(f"'{file}' holds no events")
     order = given or said.order or ORDER
     held = _numbers(file, body, order, said.lines)
@@ -102,8 +102,8 @@ def _beginning(file: Path, lines: list[str], is_order_given: bool) -> _Said:
     """
     said = _Said()
     for line in lines:
-        words = [word for word in re.split(r"[,;\s]+", _bare(line)) if word]
-        sides = None if said.size else re.fullmatch(r"(\d+)(?:\s*[x,;]\s*|\s+)(\d+)", _bare(line))
+        words = [word for word in re.split(r"[,;\s]+", _strip_comment(line)) if word]
+        sides = None if said.size else re.fullmatch(r"(\d+)(?:\s*[x,;]\s*|\s+)(\d+)", _strip_comment(line))
         is_event = words and not sides and all(_is_number(word) or word.lower() in _WORDS for word in words)
         if is_event or (words and said.order is not None and said.lines and not sides):
             break
@@ -165,7 +165,7 @@ def _numbers(file: Path, lines: list[str], order: tuple[str, ...], before: int) 
             continue
         return {key: held[key] for key in order}
     for number, line in enumerate(plain.split("\n")):
-        words = _bare(line).split()
+        words = _strip_comment(line).split()
         if words and (len(words) != len(order) or not all(map(_is_number, words))):
             raise ConfigError(
                 f"each line of '{file}' must hold {len(order)} numbers, {', '.join(order)}; "
@@ -174,8 +174,8 @@ def _numbers(file: Path, lines: list[str], order: tuple[str, ...], before: int) 
     raise ConfigError(f"each line of '{file}' must hold {len(order)} numbers, {', '.join(order)}")
 
 
-def _bare(line: str) -> str:
-    """Returns a line without quotes and what is a comment."""
+def _strip_comment(line: str) -> str:
+    """Returns a line without quotes and comment."""
     return re.split("[#%]", line, maxsplit=1)[0].replace('"', "").strip()
 
 

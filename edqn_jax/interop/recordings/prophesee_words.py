@@ -91,14 +91,16 @@ def decode_evt3(words: NDArray) -> Columns:
     # Each word of bits moves its base on by as many columns as it has bits.
     width = np.select([kind == 0x2, kind == 0x5], [0, 8], 12)
     moved = np.append(np.cumsum(width) - width, 0)
-    pixel = np.where(is_vector, _chosen(values[base_at], base), value)
-    since = moved[:-1] - moved[_chosen(np.searchsorted(at, base_at), base)]
+    pixel = np.where(is_vector, _take_or_first(values[base_at], base), value)
+    since = moved[:-1] - moved[_take_or_first(np.searchsorted(at, base_at), base)]
     column = (pixel & 0x7FF).astype(np.int64) + np.where(is_vector, since, 0)
 
     clock = running_clock(values[high_at], 1 << 12, 1 << 12)
     change_at = high_at[np.flatnonzero(np.diff(clock, prepend=-1))]
-    is_low_known = _chosen(low_at, low) > _chosen(change_at, _latest(change_at, at))
-    t = (_chosen(clock, high) << 12) + np.where(is_low_known & (low >= 0), _chosen(values[low_at], low), 0)
+    is_low_known = _take_or_first(low_at, low) > _take_or_first(change_at, _latest(change_at, at))
+    t = (_take_or_first(clock, high) << 12) + np.where(
+        is_low_known & (low >= 0), _take_or_first(values[low_at], low), 0
+    )
 
     known = (high >= 0) & (row >= 0) & ~(is_vector & (base < 0))
     count = np.where(known, np.bitwise_count(bits), 0).astype(np.int64)
@@ -109,7 +111,7 @@ def decode_evt3(words: NDArray) -> Columns:
     return Columns(
         t[event],
         column[event] + shift,
-        _chosen(values[row_at] & 0x7FF, row)[event],
+        _take_or_first(values[row_at] & 0x7FF, row)[event],
         (pixel >> 11).astype(np.int8)[event],
         int(np.bitwise_count(bits[~known]).sum()),
     )
@@ -132,6 +134,6 @@ def _latest(places: NDArray, at: NDArray) -> NDArray[np.int64]:
     return np.searchsorted(places, at) - 1
 
 
-def _chosen(values: NDArray, index: NDArray) -> NDArray:
+def _take_or_first(values: NDArray, index: NDArray) -> NDArray:
     """Returns values [K] at an index [N]; where it is -1, the first, or 0 if there are none."""
     return (values if len(values) else np.zeros(1, values.dtype))[np.maximum(index, 0)]

@@ -114,7 +114,7 @@ def observe_recording(
         ]
     )
     motion = np.stack([_motion(about, recording, int(end), velocity, yaw_rate) for end in ends])
-    image, decoded = _encoded(config, policy.params, jnp.asarray(counts), jnp.asarray(motion))
+    image, decoded = _encode_and_decode(config, policy.params, jnp.asarray(counts), jnp.asarray(motion))
     return Seen(ends, np.asarray(image), np.asarray(decoded), embedding.needs_nearness(config))
 
 
@@ -134,7 +134,7 @@ def _motion(
     return runner.own_motion(about, yaw, flight["velocity"][now].astype(np.float32), rate, flight["move"][now])
 
 
-def _encoded(config: Config, params: PolicyParams, counts: Array, motion: Array) -> tuple[Array, Array]:
+def _encode_and_decode(config: Config, params: PolicyParams, counts: Array, motion: Array) -> tuple[Array, Array]:
     """Returns signed event images and what is drawn of the codes, each [D, H, W]."""
     actor = AgentActor(config)
 

@@ -90,15 +90,15 @@ def update_q(
         change, optimiser = _optimiser(config).update(gradient, state.q_optimiser, state.q)
         q, finite = optax.apply_updates(state.q, change), is_finite(gradient)
 
-        def followed(old: Array, rate: float) -> Array:
+        def follow(old: Array, rate: float) -> Array:
             """Follows `q`, unless it may be `q` that is not finite."""
             return jnp.where(finite, polyak_update(q, old, rate), old)
 
         state = DqnState(
             q=q,
             q_optimiser=optimiser,
-            target=followed(state.target, agent.target_rate),
-            average=followed(state.average, agent.average_rate),
+            target=follow(state.target, agent.target_rate),
+            average=follow(state.average, agent.average_rate),
         )
         count = jnp.maximum(count, 1.0)
         return state, (total / count, sum_q / count, finite)

@@ -31,12 +31,12 @@ def embedding_size(config: Config) -> int:
 
 
 def code_size(config: Config) -> int:
-    """Returns the number of these that are a code, which come first; 0 where there is no VAE."""
+    """Returns the length of the VAE's code, with which the embedding begins; 0 without a VAE."""
     return config.encoder.code_size if has_code(config) else 0
 
 
 def as_encoder_input(config: Config, observation: Observation) -> Observation:
-    """Returns observations [...] with that of what the sensor shows which the VAE reads, a field or pictures."""
+    """Returns observations [...] whose `sensed` is the VAE's input, an event field or pictures."""
     return dataclasses.replace(observation, sensed=sensor_of(config).encoder_input(config, observation.sensed))
 
 

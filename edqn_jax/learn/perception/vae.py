@@ -99,7 +99,7 @@ def decoder_target(config: EncoderConfig, sensed: EventField | Array, nearness: 
     """
     channels = []
     if config.target != "nearness":
-        channels.append(_shown(sensed))
+        channels.append(_input_channels(sensed))
     if needs_nearness(config):
         assert nearness is not None, "this target needs the label"
         channels.append(nearness[..., None, :, :])
@@ -110,7 +110,7 @@ def decoder_target(config: EncoderConfig, sensed: EventField | Array, nearness: 
     return jnp.asarray(_blur(height, config.target_blur)) @ image @ jnp.asarray(_blur(width, config.target_blur).T)
 
 
-def _shown(sensed: EventField | Array) -> Array:
+def _input_channels(sensed: EventField | Array) -> Array:
     """Returns what the sensor shows as channels `[..., C, H, W]`, summed over the window."""
     if not isinstance(sensed, EventField):
         return sensed
@@ -189,7 +189,7 @@ def encode(config: EncoderConfig, params: Params, sensed: EventField | Array, mo
     Args:
         motion: `[..., MOTION_SIZE]` own motion, see `sim.task.observation.own_motion`.
     """
-    encoder = _encoder(_of_kind(config, params), sensed)
+    encoder = _encoder(_with_features_of(config, params), sensed)
     return encoder.apply({"params": params["encoder"]}, sensed, motion)  # type: ignore
 
 
@@ -208,12 +208,12 @@ def freeze_params(
         return params
     timed = form is Form.EVENTS
     channels = EVENT_CHANNELS if timed else layers
-    encoder = PooledEncoder(_of_kind(config, params), camera.height, camera.width, channels, timed)
+    encoder = PooledEncoder(_with_features_of(config, params), camera.height, camera.width, channels, timed)
     table = encoder.apply({"params": params["encoder"]}, method=lambda encoder: encoder.pixels.everywhere())
     return {**params, "encoder": {**params["encoder"], "pixels": {"table": table}}}
 
 
-def _of_kind(config: EncoderConfig, params: Params) -> EncoderConfig:
+def _with_features_of(config: EncoderConfig, params: Params) -> EncoderConfig:
     """Returns `config` with the kind of pixel features that these parameters have: a table in a frozen encoder."""
     tables = "table" in params["encoder"].get("pixels", {})
     return dataclasses.replace(config, pixel_features="table") if tables else config

@@ -123,7 +123,7 @@ def update_q(
 
         def epoch(state: PqnState, order: Array):
             mixed = jax.vmap(lambda s, o: jax.tree.map(lambda x: x[o], s))(found, order)
-            return lax.scan(update, state, jax.tree.map(partial(_in_minibatches, pqn.minibatches), mixed))
+            return lax.scan(update, state, jax.tree.map(partial(_split_minibatches, pqn.minibatches), mixed))
 
         state, numbers = lax.scan(epoch, state, orders)
         loss, mean_q, finite = (x.reshape(-1) for x in numbers)
@@ -135,7 +135,7 @@ def update_q(
     return lax.cond(count_updates(config, rings.time) > 0, learn, rest, state)
 
 
-def _in_minibatches(count: int, x: Array) -> Array:
+def _split_minibatches(count: int, x: Array) -> Array:
     """Returns [M, S * N / M, ...] of [S, N, ...]."""
     cut = x.reshape(x.shape[0], count, -1, *x.shape[2:])
     return jnp.moveaxis(cut, 0, 1).reshape(count, -1, *x.shape[2:])

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from edqn_jax.evaluation.companions import scene_of_flight
+from edqn_jax.evaluation.flight_scene import scene_of_flight
 from edqn_jax.evaluation.trajectories import flight_trajectory
 from edqn_jax.report.curves import running_mean
 from edqn_jax.report.page.evaluated import EvaluatedRun
@@ -70,7 +70,7 @@ def flight_data(run: EvaluatedRun, mission: int) -> dict[str, Any]:
     last = len(columns["t"]) - 1
     rows = np.unique(np.append(np.arange(0, last + 1, every), last))
     table = np.stack([columns[name][rows] for name in COLUMNS], axis=1).astype("<f4")
-    pool_missions = run.missions.world.missions
+    pool_missions = run.missions.env_params.missions
     return {
         "mission": mission,
         "outcome": run.outcomes[mission],

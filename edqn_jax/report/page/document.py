@@ -85,7 +85,7 @@ def _is_name(shown: Shown) -> bool:
 
 
 def _own_name(policy: Any) -> str:
-    """Returns the name of a function, and of what has none that of its type."""
+    """Returns the name of a function; of a callable without a name, that of its type."""
     function = getattr(policy, "function", policy)
     return getattr(function, "__name__", type(function).__name__)
 

@@ -117,10 +117,10 @@ def _evaluate(
     config: Config, params: PolicyParams | None, actor: Actor, most: int, name: str, message: Callable[[str], None]
 ) -> tuple[MissionSet, Flights]:
     missions = final_missions(config, most)
-    count = missions.world.missions.scene.shape[0]
+    count = missions.env_params.missions.scene.shape[0]
     message(f"flying {count} mission{'' if count == 1 else 's'} of {name}")
     seed = config.train.seed
-    return missions, fly_on_all_devices(config, missions.world, params, seed, actor=actor, record=True)
+    return missions, fly_on_all_devices(config, missions.env_params, params, seed, actor=actor, record=True)
 
 
 def names_of(folders: Sequence[Path]) -> list[str]:

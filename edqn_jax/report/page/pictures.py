@@ -44,7 +44,7 @@ def flight_pictures(
     panels = [
         ("brightness", on_screen(shown.luma), Normalize(0.0, 1.0), "gray"),
         (look.name, shown.image, scale_of(shown.image, look, share=0.75), look.colours),
-        *_decoded(config, shown, look),
+        *_decoder_images(config, shown, look),
     ]
     count, height, width = shown.image.shape
     return {
@@ -55,7 +55,7 @@ def flight_pictures(
     }
 
 
-def _decoded(
+def _decoder_images(
     config: Config, shown: SensorImages, look: Look
 ) -> list[tuple[str, np.ndarray, Normalize, str | Colormap]]:
     """Returns name, images, scale and colours of what a decoder draws and of what it should draw, if there is one."""

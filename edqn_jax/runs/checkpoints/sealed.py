@@ -32,9 +32,9 @@ _SPARE = 10_000_000  # bytes that stay free on the disk, beside what a file take
 
 
 def write_sealed(file: Path, arrays: Mapping[str, Any], texts: Mapping[str, str]) -> None:
-    """Writes a file in place of the one before; when it returns, all of it is on the disk.
+    """Replaces a file atomically; on return it is synced to the disk.
 
-    Until then the one before is whole. Only the calling process writes, even if it is one of several.
+    Until then the previous file stays intact. Only the calling process writes, even if it is one of several.
 
     Args:
         file: its folder may be missing.
@@ -70,7 +70,7 @@ def write_sealed(file: Path, arrays: Mapping[str, Any], texts: Mapping[str, str]
 
 
 def load_sealed(file: Path) -> tuple[dict[str, np.ndarray], dict[str, str]]:
-    """Returns arrays and texts of a file that `write_sealed` wrote, if it is as it was written, to the last bit.
+    """Returns arrays and texts of a file that `write_sealed` wrote, after verifying its checksum.
 
     Raises:
         DamagedError: if a bit of it has changed, or it was cut.
@@ -104,7 +104,7 @@ def file_digest(file: Path) -> str:
 
 
 def sync_to_disk(path: Path) -> None:
-    """Writes what the system still holds of a file or folder to the disk; of a file alone where folders cannot be."""
+    """Syncs a file or folder to the disk; only files where folders cannot be synced."""
     if os.name == "nt" and path.is_dir():
         return
     opened = os.open(path, os.O_RDONLY)

@@ -65,7 +65,7 @@ def newest_checkpoint(
 ) -> Checkpoint | None:
     """Returns the newest checkpoint that is undamaged and usable; None if there never was one.
 
-    Damaged ones are renamed, so that nothing of them is read again; others are passed over.
+    Damaged ones are renamed and never read again; unusable ones are skipped.
 
     Args:
         folder: a run's `checkpoints/`.
@@ -166,7 +166,7 @@ def _read(file: Path) -> Checkpoint:
 
 
 def _newest_first(folder: Path) -> Iterator[tuple[int, Path]]:
-    """Yields step and file of each complete checkpoint."""
+    """Yields step and file of each complete checkpoint, newest first."""
     found: Iterable[Path] = folder.iterdir() if folder.is_dir() else ()
     numbered = [(int(match[1]), file) for file in found if (match := _NAME.fullmatch(file.name))]
     yield from sorted(numbered, reverse=True)

@@ -25,7 +25,7 @@ CLEARANCE_M = 2e-3
 
 
 def from_metrics(config: Config, metrics: Sequence[Mapping[str, Any]]) -> dict[str, Any]:
-    """Returns what `summary.json` must say of the training, from the lines of `metrics.jsonl`."""
+    """Returns the expected training entries of `summary.json`, from the lines of `metrics.jsonl`."""
     checked = [row for row in metrics if row.get("validation_spl") is not None]
     # Of equal ones the latest.
     best = max(enumerate(checked), key=lambda each: (each[1]["validation_spl"], each[0]))[1] if checked else None
@@ -52,7 +52,7 @@ def from_trajectory(
     config: Config, missions: RunMissions, judge: MujocoWorld, recorded: Mapping[str, np.ndarray]
 ) -> tuple[dict[str, Any], dict[str, float]]:
     """Returns what `summary.json` must say of the recorded flight, and how far numbers may be off; C MuJoCo judges."""
-    pool_missions = missions.final.world.missions
+    pool_missions = missions.final.env_params.missions
     start, goal = np.asarray(pool_missions.start[0], np.float64), np.asarray(pool_missions.goal[0], np.float64)
     positions = columns_of(recorded, POSITION)
     path = np.concatenate([start[None], positions])

@@ -36,7 +36,7 @@ from edqn_jax.runs.continuation import find_run
 from edqn_jax.runs.directory import RunDirectory
 from edqn_jax.runs.policies import load_run
 from edqn_jax.runs.provenance import describe_workload, digest_of, package_versions
-from edqn_jax.runs.summaries import of_all_seeds, of_tests
+from edqn_jax.runs.summaries import summarize_seeds, summarize_tests
 from edqn_jax.runs.verification.derived import DIGITS, from_metrics, from_trajectory, is_same
 from edqn_jax.runs.world_copy import WORLD
 from edqn_jax.sim.task import group
@@ -99,23 +99,23 @@ def _verified(folder: Path, message: Callable[[str], None]) -> list[Finding]:
     checkpoint, findings = _last_checkpoint(run)
     if checkpoint is not None:
         recorded = [summary["state_digest"] for summary in summaries]
-        findings += _of_checkpoint(checkpoint, run, runs, configs, missions, recorded, found.seeds)
-        findings.append(_of_policies(checkpoint, configs, [params for _, params in policies]))
+        findings += _verify_checkpoint(checkpoint, run, runs, configs, missions, recorded, found.seeds)
+        findings.append(_verify_policies(checkpoint, configs, [params for _, params in policies]))
     flights_of_seeds = []
     for number, (each, summary, of_run) in enumerate(zip(runs, summaries, missions, strict=True)):
         config, params = policies[number]
-        message(f"flying {of_run.final.world.missions.scene.shape[0]} missions of '{each.path}' again")
-        flights = fly_on_all_devices(config, of_run.final.world, params, config.train.seed, record=True)
+        message(f"flying {of_run.final.env_params.missions.scene.shape[0]} missions of '{each.path}' again")
+        flights = fly_on_all_devices(config, of_run.final.env_params, params, config.train.seed, record=True)
         agent = None if checkpoint is None else _Saved.of(checkpoint, number)
         name = "" if found.seeds is None else f"{each.path.name}: "
         findings += [
             dataclasses.replace(finding, what=name + finding.what)
-            for finding in _of_agent(each, config, of_run, summary, flights, agent)
+            for finding in _verify_agent(each, config, of_run, summary, flights, agent)
         ]
         flights_of_seeds.append(flights)
     if found.seeds is not None:
-        derived = of_all_seeds(configs[0], missions[0].tests, flights_of_seeds, summaries)
-        findings.append(_compared("summary.json of all seeds", _read_summary(run), derived))
+        derived = summarize_seeds(configs[0], missions[0].tests, flights_of_seeds, summaries)
+        findings.append(_compare_values("summary.json of all seeds", _read_summary(run), derived))
     return findings
 
 
@@ -165,7 +165,7 @@ def _last_checkpoint(run: RunDirectory) -> tuple[Checkpoint | None, list[Finding
     return checkpoint, []
 
 
-def _of_checkpoint(
+def _verify_checkpoint(
     checkpoint: Checkpoint,
     run: RunDirectory,
     runs: Sequence[RunDirectory],
@@ -175,7 +175,7 @@ def _of_checkpoint(
     seeds: int | None,
 ) -> list[Finding]:
     """Returns whether the state, the options and the growing files are those of the last checkpoint, a sealed one."""
-    worlds = [each.training.world for each in missions]
+    worlds = [each.training.env_params for each in missions]
     trainer = Trainer(configs[0], worlds[0] if seeds is None else worlds, jax.devices()[:1])
     done = checkpoint.host["done"]
     expected = saved_state.state_shapes(trainer, done).items()
@@ -202,7 +202,7 @@ def _of_checkpoint(
     return findings
 
 
-def _of_policies(checkpoint: Checkpoint, configs: Sequence[Config], policies: Sequence[PolicyParams]) -> Finding:
+def _verify_policies(checkpoint: Checkpoint, configs: Sequence[Config], policies: Sequence[PolicyParams]) -> Finding:
     """Returns whether the saved policies are those that the last checkpoint says the run ended with."""
     compared = 0
     for number, (config, params) in enumerate(zip(configs, policies, strict=True)):
@@ -218,7 +218,7 @@ def _of_policies(checkpoint: Checkpoint, configs: Sequence[Config], policies: Se
     return Finding("policy", "it is the one that the run ended with, by its last checkpoint", True)
 
 
-def _of_agent(
+def _verify_agent(
     run: RunDirectory,
     config: Config,
     missions: RunMissions,
@@ -227,7 +227,7 @@ def _of_agent(
     saved: _Saved | None,
 ) -> list[Finding]:
     """Returns the findings of one agent's run."""
-    first = judges_of(config, missions.final)[int(missions.final.world.missions.scene[0])]
+    first = judges_of(config, missions.final)[int(missions.final.env_params.missions.scene[0])]
     metrics, recorded = run.read_metrics(), run.read_trajectory()
     of_training = from_metrics(config, metrics)
     of_flight, within = from_trajectory(config, missions, first, recorded)
@@ -243,13 +243,13 @@ def _of_agent(
     told = {} if saved is None else _from_checkpoint(saved)
     agreed = check_verdicts(config, missions.final, flights)
     wrong = [each.mission for each in agreed if not each.agrees]
-    elsewhere = _recorded_elsewhere(summary, saved)
+    elsewhere = _describe_recording(summary, saved)
     return [
         _episodes_and_metrics(run, metrics),
-        _compared("summary.json from metrics.jsonl", summary, of_training),
-        _compared("summary.json from trajectory.csv", summary, of_flight, within),
-        _compared("summary.json from config.yaml and world", summary, described),
-        *([] if saved is None else [_compared("summary.json from the last checkpoint", summary, told)]),
+        _compare_values("summary.json from metrics.jsonl", summary, of_training),
+        _compare_values("summary.json from trajectory.csv", summary, of_flight, within),
+        _compare_values("summary.json from config.yaml and world", summary, described),
+        *([] if saved is None else [_compare_values("summary.json from the last checkpoint", summary, told)]),
         *_unverified_keys(summary, {*of_training, *of_flight, *described, *told, *worlds}, missions.tests > 0),
         _fly_again(config, summary, recorded, flights, elsewhere),
         *_tests_again(missions, summary, flights, elsewhere),
@@ -269,7 +269,7 @@ def _unverified_keys(summary: Mapping[str, Any], derived: set[str], tests: bool)
 
 
 def _from_checkpoint(saved: _Saved) -> dict[str, Any]:
-    """Returns what `summary.json` must say of the training, by the last checkpoint."""
+    """Returns the expected training entries of `summary.json`, from the last checkpoint."""
     since = first_success([(found[0], found[1], found[2]) for found in saved.agent["validations"]])
     return {
         "train_seconds": saved.host["train_seconds"],
@@ -336,14 +336,14 @@ def _tests_again(
     """Returns whether the test worlds end as recorded when they are flown once more."""
     if not missions.tests:
         return []
-    what, again = "the test worlds, flown again", of_tests(missions.tests, flights)
+    what, again = "the test worlds, flown again", summarize_tests(missions.tests, flights)
     if elsewhere is not None:
         says = f"{again['successes']} of {again['missions']} reach the goal, {summary['test']['successes']} {elsewhere}"
         return [Finding(what, says, None)]
-    return [_compared(what, summary.get("test") or {}, again)]
+    return [_compare_values(what, summary.get("test") or {}, again)]
 
 
-def _recorded_elsewhere(summary: Mapping[str, Any], saved: _Saved | None) -> str | None:
+def _describe_recording(summary: Mapping[str, Any], saved: _Saved | None) -> str | None:
     """Returns on what other hardware or with what other versions a run was recorded; None if they are those here."""
     device = str(summary["devices"][0]).partition(":")[0]
     if device != jax.default_backend() and (device, jax.default_backend()) != ("cuda", "gpu"):
@@ -362,7 +362,7 @@ def _model(described: str | None) -> str | None:
     return None if described is None else described.rpartition(",")[0]
 
 
-def _compared(
+def _compare_values(
     what: str, recorded: Mapping[str, Any], found: Mapping[str, Any], within: Mapping[str, float] | None = None
 ) -> Finding:
     """Returns whether all values that were found are those recorded."""

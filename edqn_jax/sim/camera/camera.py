@@ -100,7 +100,7 @@ def _picture(config: CameraConfig, scene: Scene, origin: Array, rotation: Array,
 
 
 def _tilted_pictures(config: CameraConfig, finish: columns.Finish, *image: Any) -> Array:
-    """Returns what `columns.render_columns` does, of a camera that takes the full attitude."""
+    """Returns brightness as `columns.render_columns` does, for a camera that turns with the body."""
     return jax.vmap(partial(_tilted_picture, config, finish))(*image)
 
 

@@ -245,7 +245,7 @@ def _render_any_number(config: CameraConfig, finish: Finish, batch: _Batch, colu
 
 
 def _other_shapes(frame: Frame, spheres: bool) -> int:
-    """Returns the number of shapes beside the upright ones, spheres only where they are drawn."""
+    """Returns the number of shapes that are not upright; spheres count only where they are drawn."""
     without = EXACT if not spheres else tuple(kind for kind in EXACT if kind != "spheres")
     return sum(value.shape[1] for kind, value in frame.value.items() if kind not in without)
 

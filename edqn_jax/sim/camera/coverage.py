@@ -113,7 +113,7 @@ def _extent_of_boxes(boxes: UprightBoxes, origin: Array, forward: Array) -> tupl
 
 
 def _extent_of_cylinders(cylinders: UprightCylinders, origin: Array, forward: Array) -> tuple[Array, Array]:
-    """Returns the same for upright cylinders, from their two tangents through the camera."""
+    """Returns the same extents of upright cylinders, from their two tangents through the camera."""
     return _extent_of_discs(cylinders.position, cylinders.radius, origin, forward)
 
 

@@ -39,7 +39,7 @@ class Phase(NamedTuple):
             return Phase(*(factor * mine for mine in self))
         return Phase(*(factor * mine + weight * its for mine, its in zip(self, other, strict=True)))
 
-    def shifted(self, cycles: float | Array) -> Phase:
+    def shift(self, cycles: float | Array) -> Phase:
         """Returns this phase [...], `cycles` further."""
         return self._replace(at=self.at + cycles)
 
@@ -103,9 +103,9 @@ def _checks(shares: list[Array], phases: list[Phase]) -> Array:
 def _bricks(shares: list[Array], phases: list[Phase]) -> Array:
     tone, level_joint, upright_joint, _ = shares
     along, courses = phases[:2]
-    level = pulse(courses.times(2.0).shifted(0.5), level_joint) + level_joint
+    level = pulse(courses.times(2.0).shift(0.5), level_joint) + level_joint
     even = pulse(courses, 0.5) + 0.5
-    here, shifted = (pulse(along.shifted(by), upright_joint) + upright_joint for by in (0.0, 0.5))
+    here, shifted = (pulse(along.shift(by), upright_joint) + upright_joint for by in (0.0, 0.5))
     upright = even * here + (1 - even) * shifted
     return tone * (level + upright - level * upright)
 
@@ -117,7 +117,7 @@ def _posters(shares: list[Array], phases: list[Phase]) -> Array:
     return (pulse(phases[0], width) + width) * (pulse(phases[1], height) + height) * picture
 
 
-def _warped(phase: Phase, by: Phase, amount: Array) -> Phase:
+def _warp(phase: Phase, by: Phase, amount: Array) -> Phase:
     """Returns a phase plus `amount` x a wave of another."""
     f = by.at - jnp.round(by.at)
     slope = amount * (8.0 - 32.0 * jnp.abs(f))
@@ -126,7 +126,7 @@ def _warped(phase: Phase, by: Phase, amount: Array) -> Phase:
 
 def _wood(shares: list[Array], phases: list[Phase]) -> Array:
     rings, warp, width, grain = shares
-    bent = _warped(_warped(phases[0], phases[1], warp), phases[2], 0.5 * warp)
+    bent = _warp(_warp(phases[0], phases[1], warp), phases[2], 0.5 * warp)
     return rings * pulse(bent, width) / jnp.maximum(width, 1 - width) + grain * smooth(phases[3])
 
 

@@ -37,7 +37,7 @@ class Airframe:
 
 
 def c_model(config: DroneConfig) -> mujoco.MjModel:
-    """Returns the airframe as C MuJoCo compiles it, without the shapes that only a viewer needs.
+    """Returns the airframe's C MuJoCo model, without shapes that only a viewer needs.
 
     Raises:
         ConfigError: if there is no such airframe, or MuJoCo cannot read its file.

@@ -96,7 +96,7 @@ def _thrusts(
     p, q, r = state.angular_velocity
     vx, vy, vz = velocity_command - state.velocity
 
-    force = _wanted_force(config, airframe, (vx, vy, vz))
+    force = _target_force(config, airframe, (vx, vy, vz))
     axes = body_axes(w, x, y, z)
     direction = _in_body_frame(axes, force)
     turn = _wanted_yaw_rate(config, w, z, cos_half_yaw, sin_half_yaw)
@@ -114,7 +114,7 @@ def rate_thrusts(config: DroneConfig, airframe: Airframe, state: DroneState, com
     return _allocate(config, airframe, *materialise_tree(jnp.stack([*torque, command.thrust])))
 
 
-def _wanted_force(config: DroneConfig, airframe: Airframe, error: Scalars) -> Scalars:
+def _target_force(config: DroneConfig, airframe: Airframe, error: Scalars) -> Scalars:
     """Returns the wanted specific force m/s^2 (world): acceleration plus gravity, for a velocity `error` m/s.
 
     Within the largest accelerations and the largest tilt.

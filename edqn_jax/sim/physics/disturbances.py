@@ -68,7 +68,7 @@ def any_on(config: Config) -> bool:
 
 
 def changes_flight(config: Config) -> bool:
-    """Returns whether the body flies otherwise than the controller believes."""
+    """Returns whether the body's dynamics differ from the controller's model."""
     body, motors = config.body, config.motors
     return has_air(config.air) or any((body.mass_share, body.inertia_share, motors.gain_share, motors.lag_s))
 
@@ -79,7 +79,7 @@ def has_air(air: AirConfig) -> bool:
 
 
 def has_noise(noise: NoiseConfig) -> bool:
-    """Returns whether the drone errs about its own position or velocity."""
+    """Returns whether the estimate of the drone's position or velocity has errors."""
     return any((noise.position_m, noise.velocity_m_s, noise.position_bias_m, noise.velocity_bias_m_s))
 
 

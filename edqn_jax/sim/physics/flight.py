@@ -171,7 +171,7 @@ def fly_command(
 def fly_disturbed(
     config: Config, airframe: Airframe, state: DroneState, disturbance: Disturbance, command: Command, key: Array
 ) -> tuple[DroneState, Disturbance, Flight]:
-    """Flies one decision as `fly_command`, against a disturbance that the controller does not know of.
+    """Flies one decision as `fly_command`, under a disturbance that is unknown to the controller.
 
     Args:
         config: of drone, air and motors.

@@ -15,7 +15,7 @@ from jax import Array
 
 
 class RigidBody(NamedTuple):
-    """What a free body is."""
+    """Constants of a free rigid body."""
 
     mass: Array
     """[] kg."""

@@ -88,7 +88,7 @@ def _evaluated(closed: ClosedJaxpr, arguments: Sequence[Numbers]) -> list[Number
 
 
 def _as_constants(numbers: Numbers, variable: Any) -> Numbers:
-    """Returns the numbers in their variable's dtype if all are constants, as they are otherwise."""
+    """Returns the numbers in their variable's dtype if all are constants, unchanged otherwise."""
     if _traced(numbers) and not all(map(_constant, numbers.flat)):
         return numbers
     return numbers.astype(variable.aval.dtype)
@@ -104,9 +104,9 @@ def _results(equation: Any, operands: list[Numbers]) -> list[Numbers]:
     if name in _LAYOUT:
         return [_LAYOUT[name](params, *operands)]
     if not any(map(_traced, operands)):
-        return _of_constants(equation, operands)
+        return _fold_constants(equation, operands)
     if name in _REDUCTIONS:
-        return [_reduced(_REDUCTIONS[name], operands[0], params["axes"])]
+        return [_reduce(_REDUCTIONS[name], operands[0], params["axes"])]
     if name == "dot_general":
         if params["preferred_element_type"] not in (None, equation.invars[0].aval.dtype):
             raise NotImplementedError("a product cannot be summed in another dtype number by number; convert before it")
@@ -138,7 +138,7 @@ def _sliced(params: dict[str, Any], x: Numbers) -> Numbers:
 def _places(
     shape: Sequence[int], indices: Numbers, sizes: Sequence[int], window: Sequence[int], dropped: Any, mapped: Any
 ) -> Numbers:
-    """Returns the place [...] of all that is read or written, in an array of `shape` that is made flat.
+    """Returns the flat indices [...], in an array of `shape`, of all elements that are read or written.
 
     All places of a window that is not in bounds are -1.
 
@@ -184,7 +184,7 @@ def _gathered(params: dict[str, Any], x: Numbers, indices: Numbers) -> Numbers:
     return x.reshape(-1)[places]
 
 
-def _scattered(params: dict[str, Any], x: Numbers, indices: Numbers, new: Numbers, *, add: bool) -> Numbers:
+def _scatter(params: dict[str, Any], x: Numbers, indices: Numbers, new: Numbers, *, add: bool) -> Numbers:
     """Returns `x` with numbers written at indices, or added; windows out of bounds are left out."""
     numbers = _dimension_numbers(params)
     if not add and params["update_jaxpr"] is not None:
@@ -215,8 +215,8 @@ _LAYOUT: dict[str, Callable[..., Numbers]] = {
     "concatenate": lambda params, *parts: np.concatenate(_same_kind(parts), params["dimension"]),
     "stack": lambda params, *parts: np.stack(_same_kind(parts), params["axis"]),
     "gather": _gathered,
-    "scatter": functools.partial(_scattered, add=False),
-    "scatter-add": functools.partial(_scattered, add=True),
+    "scatter": functools.partial(_scatter, add=False),
+    "scatter-add": functools.partial(_scatter, add=True),
 }
 
 # ---------------------------------------------------------------------------------------------------- arithmetic
@@ -234,7 +234,7 @@ _ELEMENTWISE = frozenset(
 )
 
 
-def _of_constants(equation: Any, operands: Sequence[Any]) -> list[Numbers]:
+def _fold_constants(equation: Any, operands: Sequence[Any]) -> list[Numbers]:
     """Returns the results of an equation whose operands are all constants, as constants."""
     name = equation.primitive.name
     if name in _NUMPY:
@@ -251,7 +251,7 @@ def _is(number: Any, value: int) -> bool:
 
 
 def _simpler(name: str, a: Any, b: Any) -> Any:
-    """Returns a sum, difference, product or quotient if a constant spares computing it; None otherwise."""
+    """Returns a sum, difference, product or quotient if a constant operand makes it trivial; None otherwise."""
     if name in ("add", "add_any", "sub") and _is(b, 0):
         return a
     if name in ("add", "add_any") and _is(a, 0):
@@ -287,7 +287,7 @@ _REDUCTIONS: dict[str, Callable[[Any, Any], Any]] = {
 }
 
 
-def _reduced(combine: Callable[[Any, Any], Any], x: Numbers, axes: Sequence[int]) -> Numbers:
+def _reduce(combine: Callable[[Any, Any], Any], x: Numbers, axes: Sequence[int]) -> Numbers:
     """Returns `x` with the numbers along `axes` combined, first to last."""
     kept = [axis for axis in range(x.ndim) if axis not in axes]
     rows = x.transpose([*kept, *axes]).reshape([*(x.shape[axis] for axis in kept), -1])
@@ -298,7 +298,7 @@ def _reduced(combine: Callable[[Any, Any], Any], x: Numbers, axes: Sequence[int]
 
 
 def _product(dimensions: Any, a: Numbers, b: Numbers) -> Numbers:
-    """Returns the sums of products of `dot_general`: axes in common, then those of `a`, then those of `b`."""
+    """Returns the result of `dot_general`; its axes are the common ones, then those of `a`, then those of `b`."""
     (over_a, over_b), (shared_a, shared_b) = dimensions
 
     def rows(x: Numbers, over: Sequence[int], shared: Sequence[int]) -> tuple[Numbers, list[int]]:
@@ -314,7 +314,7 @@ def _product(dimensions: Any, a: Numbers, b: Numbers) -> Numbers:
 
 
 def _elementwise(equation: Any, operands: list[Numbers]) -> Numbers:
-    """Returns an equation's result, computed for each number unless a constant spares it."""
+    """Returns the result of an elementwise equation, simplified where an operand is constant."""
     name, dtypes = equation.primitive.name, [atom.aval.dtype for atom in equation.invars]
     shape = np.broadcast_shapes(*(x.shape for x in operands))
     result = np.empty(shape, object)
@@ -326,7 +326,7 @@ def _elementwise(equation: Any, operands: list[Numbers]) -> Numbers:
         if simpler is not None:
             result[index] = simpler
         elif all(map(_constant, numbers)):
-            result[index] = _of_constants(equation, list(map(np.asarray, numbers, dtypes)))[0][()]
+            result[index] = _fold_constants(equation, list(map(np.asarray, numbers, dtypes)))[0][()]
         else:
             given = [jnp.asarray(number, dtype) for number, dtype in zip(numbers, dtypes, strict=True)]
             result[index] = equation.primitive.bind(*given, **equation.params)

@@ -119,7 +119,7 @@ def path_contact(scene: Scene, path: Array, radius: ArrayLike, times: Array | No
     length = jnp.sqrt(jnp.sum((path[1:] - path[:-1]) ** 2, axis=1))
     near = ~(gap[:-1] + gap[1:] > length)  # a path that is not finite is near everything
     given = (scene, path, radius, times, near)
-    return lax.platform_dependent(*given, cpu=_searched_in_turn, default=_searched_at_once)
+    return lax.platform_dependent(*given, cpu=_search_in_turn, default=_search_at_once)
 
 
 def _contact_in(
@@ -130,7 +130,7 @@ def _contact_in(
     return segment_contact(scene, path[number], path[number + 1], radius, times=when)
 
 
-def _searched_in_turn(
+def _search_in_turn(
     scene: Scene, path: Array, radius: ArrayLike, times: Array | None, near: Array
 ) -> tuple[Array, Array]:
     """Searches the segments that are near, one after the other, up to the first that touches."""
@@ -147,10 +147,10 @@ def _searched_in_turn(
     return lax.while_loop(lambda carry: jnp.any(carry[0]), search, nothing)[1:]
 
 
-def _searched_at_once(
+def _search_at_once(
     scene: Scene, path: Array, radius: ArrayLike, times: Array | None, near: Array
 ) -> tuple[Array, Array]:
-    """Searches all segments: a GPU takes longer to ask whether one of them is left than to search them."""
+    """Searches all segments at once: on a GPU a check whether any is left takes longer than the search."""
     numbers = jnp.arange(near.shape[0])
     touches, at = jax.vmap(lambda number: _contact_in(scene, path, radius, times, number))(numbers)
     touches &= near
@@ -159,7 +159,7 @@ def _searched_at_once(
 
 
 def _room(scene: Scene, point: Array, time: Array, seconds: Array) -> Array:
-    """Returns `signed_distance` at `time` [] less what each shape may move within `seconds` []."""
+    """Returns `signed_distance` at `time` [] minus the most that each shape can move within `seconds` []."""
     distances = shape_distances(scene_at(scene, time), point)
     for kind, speed in speed_bounds(scene, time).items():
         distances[kind] = distances[kind] - speed * seconds

@@ -24,7 +24,7 @@ def initial_aim(pool: Scene) -> Aim | None:
 
 
 def update_aim(config: Config, scene: Scene, aim: Aim | None, decision: Array, here: Array, moved: Array) -> Aim | None:
-    """Returns the aim with that of the balls which are thrown as decision [] int32 begins.
+    """Returns the aim after adding the balls that are thrown at the beginning of decision [] int32.
 
     A ball is thrown at the beginning of the decision in which it is due.
 

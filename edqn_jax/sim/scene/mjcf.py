@@ -108,10 +108,10 @@ def load_world(path: str | Path) -> LoadedWorld:
     path = Path(path)
     if not path.is_file():
         raise SceneError(f"there is no scene file '{path.name}' in {path.parent.resolve()}")
-    model = _compiled(path)
+    model = _compile_model(path)
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
-    said = motions_of(model, str(path))
+    motions = motions_of(model, str(path))
     shapes: list[Shape] = []
     bodies: list[int] = []  # 0 of shapes that stand
     names: dict[str, list[str]] = {kind: [] for kind in kinds()}
@@ -119,19 +119,19 @@ def load_world(path: str | Path) -> LoadedWorld:
         if model.geom_group[geom] >= 3 and not (model.geom_contype[geom] or model.geom_conaffinity[geom]):
             continue
         body = int(model.body_rootid[model.geom_bodyid[geom]])
-        shape = _shape(model, data, geom, path, moves=body in said)
+        shape = _shape(model, data, geom, path, moves=body in motions)
         shapes.append(shape)
-        bodies.append(body if body in said else 0)
+        bodies.append(body if body in motions else 0)
         names[kind_of(shape)[0]].append(_geom_name(model, geom))
     sites = {model.site(i).name: data.site_xpos[i] for i in range(model.nsite)}
     for name, where in sites.items():
         if not np.all(np.isfinite(where)):
             raise SceneError(f"{path}: the site '{name}' stands at no finite point; give its pos three numbers")
     unknown = np.full(3, np.nan)
-    thrown = {body for body, motion in said.items() if motion[0][0] == "throw"}
+    thrown = {body for body, motion in motions.items() if motion[0][0] == "throw"}
     stays = [shape for shape, body in zip(shapes, bodies, strict=True) if body not in thrown]
     volume = _volume(model, data, stays, path)
-    for body, motion in said.items():
+    for body, motion in motions.items():
         title = f"{path}: the body '{model.body(body).name}'"
         of = [i for i, each in enumerate(bodies) if each == body]
         if not of:
@@ -145,7 +145,7 @@ def load_world(path: str | Path) -> LoadedWorld:
     return LoadedWorld(scene, {kind: tuple(members) for kind, members in names.items()}, path, "volume" in sites)
 
 
-def _compiled(path: Path) -> mujoco.MjModel:
+def _compile_model(path: Path) -> mujoco.MjModel:
     """Returns the model of a file, which names no other.
 
     Raises:
@@ -286,13 +286,13 @@ def mjcf_of(scene: Scene, *, title: str = "world") -> str:
     for shape in scene_shapes(scene):
         attributes = _attributes(shape)
         number = counts[attributes["type"]] = counts.get(attributes["type"], 0) + 1
-        name, parent, said = f"{attributes['type']}{number}", world, text_of(shape)
-        if said is not None:
+        name, parent, text = f"{attributes['type']}{number}", world, text_of(shape)
+        if text is not None:
             throw = shape.throw if isinstance(shape, Spheres) else None
             place = shape.position if throw is None else _launch(scene, throw)
             attributes.pop("pos")
             parent = ElementTree.SubElement(world, "body", name=f"moving {name}", mocap="true", pos=_numbers(place))
-            ElementTree.SubElement(custom, "text", name=f"{PREFIX}moving {name}", data=said)
+            ElementTree.SubElement(custom, "text", name=f"{PREFIX}moving {name}", data=text)
         ElementTree.SubElement(parent, "geom", {"name": name, **attributes})
     if len(custom):
         root.append(custom)
@@ -331,10 +331,10 @@ def _shape(model: mujoco.MjModel, data: mujoco.MjData, geom: int, path: Path, mo
             "nothing is simulated but the drone"
         )
     if model.body_mocapid[root] >= 0 and not moves:
-        said = f"{PREFIX}{model.body(root).name}"
+        text = f"{PREFIX}{model.body(root).name}"
         raise SceneError(
             f"{path}: geom '{name}' is on a body that can move; remove the mocap of body '{model.body(root).name}', or "
-            f'say how it moves: <custom><text name="{said}" data="oscillate 0 2 0 4 0"/></custom>'
+            f'say how it moves: <custom><text name="{text}" data="oscillate 0 2 0 4 0"/></custom>'
         )
     found = geom_of(model, data, geom)
     if not all(np.all(np.isfinite(values)) for values in (found.position, found.rotation, found.size)):

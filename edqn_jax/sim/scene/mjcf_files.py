@@ -64,7 +64,7 @@ def load_checked_text(path: Path) -> str:
 
 
 def _check_elements(tree: ElementTree.Element, path: Path) -> None:
-    """Raises if an element names a file, or is none of a static world.
+    """Raises SceneError if an element names a file or is not allowed in a world.
 
     Raises:
         SceneError: names the element.
@@ -85,7 +85,7 @@ def _check_elements(tree: ElementTree.Element, path: Path) -> None:
 
 
 def _check_copies(tree: ElementTree.Element, path: Path) -> None:
-    """Raises if `replicate` elements ask for more copies than a world can have.
+    """Raises SceneError if `replicate` elements make more copies than a world may have.
 
     Raises:
         SceneError: says how many.
@@ -102,7 +102,7 @@ def _check_copies(tree: ElementTree.Element, path: Path) -> None:
 
 
 def _number(text: str | None) -> float:
-    """Returns an attribute as a number; 0 if it is missing or none, which MuJoCo says better."""
+    """Returns an attribute as a number; 0 if it is missing or no number (MuJoCo then reports it)."""
     try:
         value = float(text or 0)
     except ValueError:

@@ -42,12 +42,12 @@ FASTEST = 100.0
 
 _COUNTS = {"bounce": (3, 9), "oscillate": (5,), "circle": (3,), "ellipse": (8,), "throw": (7,)}
 
-Said = tuple[str, tuple[float, ...]]
-"""A word and its numbers."""
+MotionSpec = tuple[str, tuple[float, ...]]
+"""A kind of motion, such as "bounce", and its numbers."""
 
 
-def motions_of(model: mujoco.MjModel, title: str) -> dict[int, list[Said]]:
-    """Returns what a world says of how its mocap bodies move, by the number of the body.
+def motions_of(model: mujoco.MjModel, title: str) -> dict[int, list[MotionSpec]]:
+    """Returns the motions of a world's mocap bodies, by the number of the body.
 
     Args:
         model: of the world.
@@ -66,20 +66,20 @@ def motions_of(model: mujoco.MjModel, title: str) -> dict[int, list[Said]]:
             raise SceneError(f"{title}: the text '{name}' must name a body with mocap=\"true\"")
         begin = model.text_adr[i]
         data = bytes(model.text_data[begin : begin + model.text_size[i]]).rstrip(b"\0").decode()
-        found[body] = _parsed(data, f"{title}: the text '{name}'")
+        found[body] = _parse_motions(data, f"{title}: the text '{name}'")
     return found
 
 
-def _parsed(data: str, title: str) -> list[Said]:
-    said = [_one(part.split(), title) for part in data.split(";")]
-    words = [word for word, _ in said]
+def _parse_motions(data: str, title: str) -> list[MotionSpec]:
+    specs = [_parse_motion(part.split(), title) for part in data.split(";")]
+    words = [word for word, _ in specs]
     swings = [word for word in words if word not in ("bounce", "throw")]
     if words.count("bounce") > 1 or len(swings) > 1 or ("throw" in words and len(words) > 1):
         raise SceneError(f"{title} must be one motion, or a bounce and another one, not '{data}'")
-    return said
+    return specs
 
 
-def _one(words: Sequence[str], title: str) -> Said:
+def _parse_motion(words: Sequence[str], title: str) -> MotionSpec:
     if not words or words[0] not in _COUNTS:
         raise SceneError(f"{title} must begin with {', '.join(_COUNTS)}, not '{' '.join(words)[:80]}'")
     word, counts = words[0], _COUNTS[words[0]]
@@ -99,9 +99,9 @@ def _one(words: Sequence[str], title: str) -> Said:
     return word, tuple(numbers)
 
 
-def as_ellipse(said: Said) -> tuple[np.ndarray, np.ndarray, float, float]:
+def as_ellipse(spec: MotionSpec) -> tuple[np.ndarray, np.ndarray, float, float]:
     """Returns half axes [3] in metres, rate in rad/s and phase in rad of `oscillate`, `circle` or `ellipse`."""
-    word, numbers = said
+    word, numbers = spec
     if word == "ellipse":
         return np.array(numbers[:3]), np.array(numbers[3:6]), numbers[6], numbers[7]
     rate, phase = 2 * math.pi / numbers[-2], 2 * math.pi * numbers[-1]
@@ -112,16 +112,16 @@ def as_ellipse(said: Said) -> tuple[np.ndarray, np.ndarray, float, float]:
 
 def set_in_motion(
     shapes: Sequence[Shape],
-    said: Sequence[Said],
+    specs: Sequence[MotionSpec],
     at: np.ndarray,
     volume: np.ndarray | None,
     title: str,
 ) -> list[Shape]:
-    """Returns the shapes of one body with the motion that is said of it.
+    """Returns the shapes of one body with this motion.
 
     Args:
         shapes: of the body, where they are at time 0.
-        said: of the body.
+        specs: motion of the body.
         at: [3] position of the body at time 0, metres.
         volume: [2, 3] corners of the flight volume, metres; None where the file names none.
         title: of the world and the body in messages.
@@ -132,13 +132,13 @@ def set_in_motion(
     for kind in (kind_of(shape)[1] for shape in shapes):
         if kind.reach is None:
             raise SceneError(f"{title} has a {kind.geom}, which has no end and cannot move; use a box")
-    if said[0][0] == "throw":
+    if specs[0][0] == "throw":
         if len(shapes) != 1 or not isinstance(shapes[0], Spheres):
             raise SceneError(f"{title} is thrown and must be one sphere, nothing else")
-        return [_thrown(shapes[0], said[0][1], title)]
+        return [_thrown(shapes[0], specs[0][1], title)]
     how: Any = jax.tree.map(np.asarray, at_rest())
     low = high = np.zeros(3)
-    for word, numbers in said:
+    for word, numbers in specs:
         if word == "bounce":
             how = dataclasses.replace(how, velocity=np.array(numbers[:3]))
             low, high = _walls(numbers, shapes, at, volume, title)
@@ -195,19 +195,19 @@ def _thrown(ball: Spheres, numbers: tuple[float, ...], title: str) -> Spheres:
 
 
 def text_of(shape: Shape) -> str | None:
-    """Returns what a world says of a single shape that moves, on a body at its position; None where it stands."""
+    """Returns the motion of a single shape as text for MJCF, on a body at its position; None if it stands still."""
     throw, motion = getattr(shape, "throw", None), getattr(shape, "motion", None)
     if throw is not None:
         turned = math.degrees(throw.bearing), math.degrees(throw.elevation)
         return _text("throw", throw.share, throw.early, throw.speed, *turned, throw.gravity, throw.pace)
     if motion is None:
         return None
-    said = []
+    texts = []
     if np.any(motion.velocity):
-        said.append(_text("bounce", *motion.velocity, *motion.low, *motion.high))
+        texts.append(_text("bounce", *motion.velocity, *motion.low, *motion.high))
     if np.any(motion.swing) and motion.rate:
-        said.append(_text("ellipse", *np.ravel(motion.swing), motion.rate, 0.0))
-    return "; ".join(said)
+        texts.append(_text("ellipse", *np.ravel(motion.swing), motion.rate, 0.0))
+    return "; ".join(texts)
 
 
 def _text(word: str, *numbers: Any) -> str:

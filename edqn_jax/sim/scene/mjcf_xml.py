@@ -71,7 +71,7 @@ class _Reader:
         return self.root, "".join(self.written)
 
     def _markup(self, begin: int) -> int:
-        """Reads what begins with '<' there; returns where it ends."""
+        """Reads the markup that begins with '<' at an index; returns the index of its end."""
         for mark, closing in (("<?", "?>"), ("<!--", "-->"), ("<![CDATA[", "]]>"), ("<!", ">")):
             if not self.text.startswith(mark, begin):
                 continue
@@ -99,7 +99,7 @@ class _Reader:
             key, double, single = pair.groups()
             if key in attributes:
                 raise self._error(pair.start(1), f"<{name}> has '{key}' twice")
-            attributes[key] = _decoded(single if double is None else double)
+            attributes[key] = _decode_attribute(single if double is None else double)
             at = pair.end()
         last = _CLOSED.match(self.text, at)
         if last is None:
@@ -110,13 +110,13 @@ class _Reader:
         return last.end()
 
     def _take(self, name: str, attributes: dict[str, str], empty: bool, begin: int, end: int) -> None:
-        """Enters an opening tag into the tree."""
+        """Adds the element of an opening tag to the tree."""
         element = ElementTree.Element(name, attributes)
         if self.opened:
             self.opened[-1][0].append(element)
         elif self.root is None:
             self.root = element
-        words = [f"<{name}", *(f"{key}={_quoted(value)}" for key, value in attributes.items())]
+        words = [f"<{name}", *(f"{key}={_quote(value)}" for key, value in attributes.items())]
         if not empty:
             self.opened.append((element, begin))
         if len(self.opened) > DEEPEST:
@@ -124,7 +124,7 @@ class _Reader:
         self._write(element, " ".join(words) + ("/>" if empty else ">"), self.text.count("\n", begin, end))
 
     def _close(self, name: str, begin: int, end: int) -> int:
-        """Takes a closing tag; returns where to go on: nowhere after one that closes nothing, which ends a document."""
+        """Reads a closing tag; returns where to continue, or the end if it closes nothing, which ends the document."""
         if not self.opened:
             return len(self.text)
         element, _ = self.opened[-1]
@@ -144,7 +144,7 @@ class _Reader:
         return MarkupError(f"line {self.text.count(chr(10), 0, at) + 1}: {reason}")
 
 
-def _decoded(value: str) -> str:
+def _decode_attribute(value: str) -> str:
     """Returns an attribute's value with its references replaced; those that tinyxml2 does not know stay as they are."""
 
     def character(found: re.Match[str]) -> str:
@@ -162,6 +162,6 @@ def _decoded(value: str) -> str:
     return _REFERENCE.sub(character, value).partition("\0")[0]
 
 
-def _quoted(value: str) -> str:
+def _quote(value: str) -> str:
     """Returns a value in quotes, with line breaks as they are."""
     return quoteattr(value).replace("&#10;", "\n").replace("&#9;", "\t")

@@ -25,7 +25,7 @@ class Motion:
 
 @struct.dataclass
 class Throw:
-    """Which spheres are balls, when they are due, and from where they come at a drone.
+    """Which spheres are thrown balls, when they are due, and from which direction they come.
 
     A ball is absent before its launch, and wherever it is outside of the flight volume.
     """
@@ -41,7 +41,7 @@ class Throw:
 
 @struct.dataclass
 class Aim:
-    """At what each ball is thrown in one flight, and when."""
+    """Target and time of each thrown ball in one flight."""
 
     launch: Array  # [N] seconds of the episode; `NEVER` of balls that are yet to be thrown
     point: Array  # [N, 3] metres, where it would meet the drone
@@ -141,14 +141,14 @@ def steady_aim(throw: Throw, start: Array, goal: Array) -> Aim:
 
 
 def no_aim(throw: Throw) -> Aim:
-    """Returns the aim of balls [N] that are all yet to be thrown."""
+    """Returns the aim of balls [N] before any is thrown."""
     return Aim(launch=jnp.full_like(throw.share, NEVER), point=jnp.zeros((*throw.share.shape, 3)), heading=throw.share)
 
 
 def aim_at(throw: Throw, goal: Array, volume: Array, launch: Array, here: Array, moved: Array, step_s: float) -> Aim:
-    """Returns the aim of balls that are thrown at where the drone will be if it goes on as in its last decision.
+    """Returns the aim of balls at the drone's position extrapolated from its last decision.
 
-    A ball that would then begin within `LEAST_LAUNCH_M` of the drone is thrown at where it is.
+    A ball that would then begin within `LEAST_LAUNCH_M` of the drone is aimed at the present position.
 
     Args:
         throw: of N balls.

@@ -82,7 +82,7 @@ class Scene:
     daylight: Daylight | None = None  # None: that of the camera's options
 
     def shapes(self) -> dict[str, Any]:
-        """Returns the shapes of every kind that the world has a place for, by kind."""
+        """Returns the arrays of every kind of shape of the world, by kind."""
         return {kind: getattr(self, kind) for kind in FIELDS} | self.others
 
     def with_shapes(self, shapes: Mapping[str, Any]) -> Scene:
@@ -124,7 +124,7 @@ def scene_at(scene: Scene, time: Array | None) -> Scene:
 
 
 def with_drones(scene: Scene, position: Array, radius: Array) -> Scene:
-    """Returns a world that stands, with K drones in it: spheres at `position` [K, 3] of `radius` [K], metres."""
+    """Returns a static world with K drones: spheres at `position` [K, 3] of `radius` [K], metres."""
     drones = Spheres(position, radius, jnp.broadcast_to(jnp.asarray(DRONE_RGB), position.shape))
     if scene.spheres.surface is not None:
         drones = dataclasses.replace(drones, surface=blank_surfaces(scene.spheres.surface.patterns, len(position)))
@@ -133,7 +133,7 @@ def with_drones(scene: Scene, position: Array, radius: Array) -> Scene:
 
 
 def _standing(scene: Scene, shapes: Any, time: Array | None) -> Any:
-    """Returns the shapes of one kind where they stand at a time."""
+    """Returns the shapes of one kind at their positions at a time, without motion."""
     place = shapes.position
     if shapes.motion is not None and time is not None:
         place = place + displacement(shapes.motion, place, time)
@@ -149,7 +149,7 @@ def _standing(scene: Scene, shapes: Any, time: Array | None) -> Any:
 
 
 def aim_of(scene: Scene, throw: Throw) -> Aim:
-    """Returns at what the balls of one world are thrown."""
+    """Returns the aim of the balls of one world."""
     return steady_aim(throw, scene.start, scene.goal) if scene.aim is None else scene.aim
 
 
@@ -179,7 +179,7 @@ def absent_like(shapes: Any) -> Any:
 
 
 def no_shapes(kind: str, *lead: int) -> Any:
-    """Returns the arrays [*lead, 0, ...] of a kind of which there is no shape."""
+    """Returns the arrays [*lead, 0, ...] of a kind without shapes."""
     return jax.tree.map(lambda leaf: jnp.zeros((*lead, 0, *np.shape(leaf)), jnp.float32), SHAPES.get(kind).parked)
 
 
@@ -216,7 +216,7 @@ def build_scene(
         parked = SHAPES.get(kind).parked
         members += [parked] * (capacity - len(members))
         names = [field.name for field in dataclasses.fields(parked)]
-        stacked = {name: _stacked(members, name) for name in names} if members else {}
+        stacked = {name: _stack_field(members, name) for name in names} if members else {}
         arrays[kind] = dataclasses.replace(parked, **stacked) if members else no_shapes(kind)
     arrays = _all_with_surfaces(arrays)
     return Scene(
@@ -241,11 +241,11 @@ def _all_with_surfaces(kinds: Mapping[str, Any]) -> dict[str, Any]:
     }
 
 
-def _stacked(members: Sequence[Any], name: str) -> Any:
+def _stack_field(members: Sequence[Any], name: str) -> Any:
     """Returns one field of single shapes as arrays [N, ...]; None where none of them moves in this manner."""
     values = [getattr(member, name) for member in members]
     if name == "surface":
-        return _stacked_surfaces(values)
+        return _stack_surfaces(values)
     if name not in _MOVING:
         # jax.tree would treat a position given as a list as a subtree, so fields are stacked by name.
         return jnp.asarray(np.stack(values), jnp.float32)
@@ -253,10 +253,10 @@ def _stacked(members: Sequence[Any], name: str) -> Any:
         return None
     rest = _MOVING[name]()
     whole = [rest if value is None else value for value in values]
-    return type(rest)(**{field.name: _stacked(whole, field.name) for field in dataclasses.fields(rest)})
+    return type(rest)(**{field.name: _stack_field(whole, field.name) for field in dataclasses.fields(rest)})
 
 
-def _stacked_surfaces(surfaces: Sequence[Surface | None]) -> Surface | None:
+def _stack_surfaces(surfaces: Sequence[Surface | None]) -> Surface | None:
     """Returns the surfaces of single shapes as arrays [N, ...]; None where none has any."""
     some = next((surface for surface in surfaces if surface is not None), None)
     if some is None:
@@ -283,7 +283,7 @@ def scene_shapes(scene: Scene) -> list[Shape]:
 
 
 def _without_rest(shape: Shape) -> Shape:
-    """Returns a single shape with None in place of a motion or a throw that moves nothing."""
+    """Returns a single shape in which motion or throw is None if it is zero."""
     motion, throw = getattr(shape, "motion", None), getattr(shape, "throw", None)
     if motion is not None and not np.any(motion.velocity) and not (np.any(motion.swing) and motion.rate):
         shape = dataclasses.replace(shape, motion=None)
@@ -314,7 +314,7 @@ def stack_scenes(scenes: Sequence[Scene]) -> Scene:
 
 
 def _able_to_move(scene: Any, others: Sequence[Any]) -> Any:
-    """Returns a world, or a pool, with arrays of motion wherever any of the others has some."""
+    """Returns a world, or a pool, with arrays of motion for every kind that has them in any of the others."""
 
     def filled(kind: str, shapes: Any) -> Any:
         absent = [
@@ -331,7 +331,7 @@ def _able_to_move(scene: Any, others: Sequence[Any]) -> Any:
 
 
 def _kinds_of(scenes: Sequence[Any]) -> list[str]:
-    """Returns the kinds that any of these worlds, or pools, has a place for."""
+    """Returns the kinds that have a capacity above 0 in any of these worlds or pools."""
     return list(dict.fromkeys(kind for scene in scenes for kind in scene.shapes()))
 
 

@@ -73,13 +73,13 @@ def _show_frame(
     config: Config, scene: Scene, poses: Flight, memory: SensorMemory, key: Array
 ) -> tuple[Sensed, SensorMemory]:
     if config.exposure.real:
-        frames, memory = _exposed(config, scene, poses, memory, key)
+        frames, memory = _expose(config, scene, poses, memory, key)
         return brightness(config, frames), memory
     scene, position, quaternion = last_view(scene, poses)
     return brightness(config, render_view(config, scene, position, quaternion))[None], None
 
 
-def _exposed(
+def _expose(
     config: Config, scene: Scene, poses: Flight, memory: SensorMemory, key: Array
 ) -> tuple[Array, SensorMemory]:
     """Returns pictures [T, H, W] that a camera takes, as shares of white, and its memory; see `exposure`.
@@ -109,7 +109,7 @@ def _show_frame_pair(
     encoder would have to take the small difference of two large numbers.
     """
     if config.exposure.real:
-        frames, memory = _exposed(config, scene, poses, memory, key)
+        frames, memory = _expose(config, scene, poses, memory, key)
     else:
         frames = _views(config, scene, poses)
     frames = brightness(config, frames)
@@ -126,7 +126,7 @@ def _show_depth(
 def _show_depth_motion(
     config: Config, scene: Scene, poses: Flight, memory: SensorMemory, key: Array
 ) -> tuple[Sensed, SensorMemory]:
-    """Returns what `depth` shows, and the rate at which it changed by the obstacles' own motion alone.
+    """Returns the image of `depth`, and its rate of change due to the obstacles' own motion alone.
 
     Both depths are seen from the last pose, so that the drone's own motion does not show.
     """

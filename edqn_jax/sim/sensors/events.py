@@ -23,7 +23,6 @@ from jax import Array
 from numpy.typing import NDArray
 
 from edqn_jax.config import EventsConfig
-from edqn_jax.sim.camera.camera import LUMA_WEIGHTS
 from edqn_jax.sim.sensors import photoreceptor
 
 STREAM_DTYPE = np.dtype([("t", "<i8"), ("x", "<u2"), ("y", "<u2"), ("p", "i1")])
@@ -63,12 +62,6 @@ class EventMemory:
     hot: Array | None  # [H, W] bool, pixels that fire on their own
     lux: Array | None = None  # [] illuminance of the episode; None where there is always enough light
     lag: Array | None = None  # [H, W] esim with finite bandwidth: what the photoreceptor shows minus log brightness
-
-
-def rgb_to_luma(rgb: Array) -> Array:
-    """Returns the grey value inside Eq. 1: `[..., 3]` linear RGB to `[...]`."""
-    red, green, blue = LUMA_WEIGHTS
-    return red * rgb[..., 0] + green * rgb[..., 1] + blue * rgb[..., 2]
 
 
 def log_brightness(config: EventsConfig, intensity: Array) -> Array:

@@ -194,7 +194,7 @@ class Sensor:
         return jax.tree.map(random, self.shape(config), is_leaf=_is_shape)
 
     def _parts(self, config: Config, sensed: Sensed, chosen: Callable[[Any], bool]) -> list[Any]:
-        """Returns those parts of what is shown whose shapes are chosen."""
+        """Returns the parts of a sensor's output whose shapes meet a condition."""
         tree = jax.tree.structure(self.shape(config), is_leaf=_is_shape)
         pairs = zip(self.shapes(config), tree.flatten_up_to(sensed), strict=True)
         return [part for shape, part in pairs if chosen(shape)]
@@ -322,7 +322,7 @@ def nearness(distance: Array) -> Array:
 
 
 def distance_of(nearness: Array) -> Array:
-    """Returns the metres [...] of which `nearness` is that; 0 above 1, infinity from 0 down."""
+    """Returns the distance [...], metres, of a `nearness`: its inverse; 0 above 1, infinity at 0 and below."""
     return HALF_NEAR_M * (1.0 / jnp.clip(nearness, 0.0, 1.0) - 1.0)
 
 

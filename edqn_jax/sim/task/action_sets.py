@@ -56,7 +56,7 @@ def action_set(config: Config) -> ActionSet:
 
 
 def clip_action(space: Discrete | Box, action: Array) -> Array:
-    """Returns an action [] or [A] as it is flown: of a box clipped to its bounds, and NaN where it is not finite.
+    """Returns an action [] or [A] as it is flown: in a box clipped to its bounds, NaN where it is not finite.
 
     NaN lets the decision diverge, as any other number that is not finite.
 

@@ -84,19 +84,19 @@ def sample_crossing(scene: Scene, drones: int, key: Array) -> tuple[Array, Array
     around = radius * jnp.stack([jnp.cos(angle), jnp.sin(angle), jnp.zeros(drones)], axis=1)
 
     def near(place: Array, draws: Array) -> Array:
-        """Candidates [K, 3], the first at the place itself and each further from it at most."""
+        """Returns candidates [K, 3]: the first at the place itself, later ones from a growing region around it."""
         reach = jnp.linspace(0.0, 1.0, TRIES)[:, None] * jnp.array([ASIDE, ASIDE, LEVEL])
         return jnp.clip(place[None] + reach * (2 * draws - 1), lower[None], upper[None])
 
     def placed(places: Array, draws: Array, froms: Array, least: Array) -> Array:
-        """Free points [N, 3] near places, apart from each other, each at least so far from its point of `froms`."""
+        """Returns free points [N, 3] near places, apart from each other, each `least` from its point of `froms`."""
 
         def one(chosen: Array, each: tuple[Array, Array, Array, Array]) -> tuple[Array, Array]:
             number, place, uniforms, begin = each
             points = near(place, uniforms)
             short = jnp.minimum(least_distances(scene, points) - CLEARANCE, 0.0)
-            short += jnp.minimum(jnp.min(_between(points, chosen), axis=1) - APART, 0.0)
-            short += jnp.minimum(_between(points, begin[None])[:, 0] - least, 0.0)
+            short += jnp.minimum(jnp.min(_pair_distances(points, chosen), axis=1) - APART, 0.0)
+            short += jnp.minimum(_pair_distances(points, begin[None])[:, 0] - least, 0.0)
             found = points[jnp.argmax(short)]
             return chosen.at[number].set(found), found
 
@@ -111,6 +111,6 @@ def sample_crossing(scene: Scene, drones: int, key: Array) -> tuple[Array, Array
     return start, goal
 
 
-def _between(points: Array, others: Array) -> Array:
+def _pair_distances(points: Array, others: Array) -> Array:
     """Returns metres [K, A] between points [K, 3] and others [A, 3]."""
     return jnp.sqrt(jnp.sum((points[:, None] - others[None]) ** 2, axis=-1))

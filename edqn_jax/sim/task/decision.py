@@ -90,7 +90,7 @@ def take_decision(
         action: [] or [A], as chosen.
         gusts: key, consumed; None where nothing changes how a drone flies.
     """
-    applied_action, late = _delayed(config, before.disturbance, action)
+    applied_action, late = _delay_action(config, before.disturbance, action)
     command = action_set(config).command(config, airframe, before.drone, before.goal, applied_action)
     after, disturbance, flight = _fly(config, airframe, before.drone, late, command, gusts)
     verdict = _judge(config, before, flight)
@@ -135,7 +135,7 @@ def reset_decision(decision: Decision, start: DroneState, disturbance: Disturban
     )
 
 
-def _delayed(config: Config, disturbance: Disturbance | None, action: Array) -> tuple[Array, Disturbance | None]:
+def _delay_action(config: Config, disturbance: Disturbance | None, action: Array) -> tuple[Array, Disturbance | None]:
     """Returns the action that is flown now, and the disturbance with the one that is flown next."""
     if not config.env.action_delay:
         return action, disturbance
@@ -172,7 +172,7 @@ def _judge(config: Config, before: Situation, flight: Flight) -> Verdict:
 def _reward(
     config: Config, payment: Payment, before: Situation, after: DroneState, action: Array, outcome: Array
 ) -> Array:
-    """Returns the configured reward, or that of the user's function; where there are no distances all are straight."""
+    """Returns the configured reward or that of the user's function; without distance fields, distances are straight."""
     here, there, goal = before.drone.position, after.position, before.goal
     moved = jnp.sqrt(jnp.sum((there - here) ** 2))
     if config.env.reward == "geodesic" and payment.distances is not None:

@@ -33,7 +33,7 @@ from edqn_jax.sim.task.action_sets import action_set, clip_action
 from edqn_jax.sim.task.decision import Decision, Payment, Situation, reset_decision, select_tree, take_decision, time_of
 from edqn_jax.sim.task.group import Turn
 from edqn_jax.sim.task.missions import Missions
-from edqn_jax.sim.task.observation import Observation, View, observe, poses_at_start, poses_seen, with_times
+from edqn_jax.sim.task.observation import Observation, View, observe, poses_at_start, sensor_poses, with_times
 from edqn_jax.sim.task.outcomes import Outcome
 from edqn_jax.sim.task.reward import Reward
 from edqn_jax.sim.worlds import geodesic
@@ -228,7 +228,7 @@ def step(
             actions.direction(done.drone, jnp.asarray(actions.still)),
             actions.direction(done.drone, action),
         ),
-        poses=poses_seen(config, first, done.flight),
+        poses=sensor_poses(config, first, done.flight),
         disturbance=done.disturbance,
     )
     memory = select_tree(turn.is_reset, start.memory, state.memory)
@@ -251,7 +251,7 @@ def step(
 
 
 def _taken(config: Config, turn: Turn, before: Situation, start: _Start, done: Decision) -> Decision:
-    """Returns the decision, or the reset or the wait in its place, with the times of its poses where anything moves."""
+    """Returns the decision, or the reset or wait that replaces it; with times of its poses if anything moves."""
     done = select_tree(turn.is_reset, reset_decision(done, start.drone, start.disturbance), done)
     if turn.waits is not None:
         done = select_tree(turn.waits, reset_decision(done, before.drone, before.disturbance), done)
@@ -280,7 +280,7 @@ def _sense(
 
 
 def check_sensor(config: Config, env_params: EnvParams) -> None:
-    """Raises if a registered sensor shows what is not finite in its very first observation; built-in ones never do.
+    """Raises ConfigError if a registered sensor's first observation is not finite; built-in sensors are not checked.
 
     Raises:
         ConfigError: names the sensor.

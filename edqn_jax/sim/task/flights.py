@@ -66,7 +66,7 @@ class Flights:
 
 
 def at_start(config: Config, scene: Scene, body: DroneState) -> Flights:
-    """Tallies of one flight that begins with `body`."""
+    """Returns the tallies of a flight that begins at `body`."""
     zero, none = jnp.zeros(()), jnp.zeros((), jnp.int32)
     return Flights(
         outcome=none,
@@ -96,7 +96,7 @@ def update_tallies(
     end_step: Array,
     contact: Array,
 ) -> tuple[Flights, Array]:
-    """The tallies of one flight after one more decision, its return aside.
+    """Returns the tallies of one flight after one more decision; the return is added elsewhere.
 
     Args:
         config: body and physics.

@@ -49,7 +49,7 @@ class View:
     goal: Array  # [3] metres
     drone: DroneState
     move: Array  # [3] as in `own_motion`
-    poses: Flight  # [T] at which the sensor looks, see `poses_seen`
+    poses: Flight  # [T] at which the sensor looks, see `sensor_poses`
     disturbance: Disturbance | None = None  # whose errors own state and motion have; None where there are none
 
 
@@ -158,8 +158,8 @@ def with_times(config: Config, flight: Flight, steps: Array | None) -> Flight:
     return dataclasses.replace(flight, time=steps * config.drone.physics_dt_s)
 
 
-def poses_seen(config: Config, first: DroneState, flight: Flight) -> Flight:
-    """Returns the poses [T] at which the sensor looks, of those before the first and after each physics step."""
+def sensor_poses(config: Config, first: DroneState, flight: Flight) -> Flight:
+    """Returns the sensor's poses [T], selected from the pose before the decision and those after each physics step."""
     began = None if flight.time is None else flight.time[0] - config.drone.physics_dt_s
     path = jax.tree.map(
         lambda a, b: jnp.concatenate([a[None], b]),

@@ -1,4 +1,4 @@
-"""What random worlds of every family are built of: shapes that may be absent, their colours, floor and volume."""
+"""Building blocks of random worlds: shapes that may be absent, their colours, floor and volume."""
 
 from __future__ import annotations
 

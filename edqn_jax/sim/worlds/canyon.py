@@ -121,7 +121,7 @@ def _parts(reach: Array, kind: Array, level: Array, is_large: Array) -> tuple[Ar
     tower = (((-0.6 * reach, -0.6 * reach, 0.0), (0.6 * reach, 0.6 * reach, top)),)
     nothing = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
     kinds = [(*parts, *[nothing] * (_PARTS - len(parts))) for parts in (tower, overhang, slabs, courtyard)]
-    corners = jnp.stack([_stacked(parts) for parts in kinds])
+    corners = jnp.stack([_stack_corners(parts) for parts in kinds])
     kinds_of_it = jnp.where(is_large, 4, 3)
     number = jnp.minimum((kind * kinds_of_it).astype(jnp.int32), kinds_of_it - 1)
     chosen = corners[number]
@@ -129,6 +129,6 @@ def _parts(reach: Array, kind: Array, level: Array, is_large: Array) -> tuple[Ar
     return chosen[:, 0], chosen[:, 1], there
 
 
-def _stacked(parts) -> Array:
+def _stack_corners(parts) -> Array:
     """Returns corners [4, 2, 3] from nested tuples of numbers."""
     return jnp.stack([jnp.stack([jnp.stack([jnp.asarray(x, jnp.float32) for x in c]) for c in part]) for part in parts])

@@ -189,7 +189,7 @@ def _in_batches(family: str, moving: Moving, keys: Array) -> Scene:
 
 
 def _sample_worlds(family: str, keys: Array, moving: Moving = STILL) -> Scene:
-    """Returns worlds of one family, one for each key [P]; what moves is of a program of its own, which is small."""
+    """Returns worlds of one family, one for each key [P]; motion is added by a small program of its own."""
     return _set_in_motion(family, moving, _standing(family, keys), keys)
 
 
@@ -215,7 +215,7 @@ def _moved(family: str, moving: Moving, scenes: Scene, keys: Array) -> Scene:
 
 @partial(jax.jit, static_argnums=0)
 def _standing(family: str, keys: Array) -> Scene:
-    """Returns worlds in which nothing moves; one without a way is drawn again with another key."""
+    """Returns static worlds; a world without a path to the goal is sampled again with another key."""
     how, edge = _family(family), _family(family).edge_m
     if edge is None:
         return jax.vmap(how.draw)(keys)

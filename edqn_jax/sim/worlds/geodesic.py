@@ -50,7 +50,7 @@ class Field:
 
 
 def nodes_per_side(size: tuple[float, float, float], most: int = MAX_NODES) -> tuple[int, int, int]:
-    """Returns so many nodes along each side of a volume, metres, that there are about `most` of them, or fewer."""
+    """Returns the number of nodes along each side of a volume, metres, with about `most` nodes in all, or fewer."""
     edge = max(FINEST_M, (math.prod(size) / most) ** (1 / 3))
     across, along, levels = (max(2, math.ceil(side / edge)) for side in size)
     return across, along, levels
@@ -107,7 +107,7 @@ def _positions(corner: Array, edge: Array, shape: tuple[int, int, int]) -> Array
 
 
 def _spread(seeds: Array, is_free: Array, clearance: Array, edge: Array) -> Array:
-    """Returns the lengths of the shortest ways to the seeds, which have theirs [X, Y, Z].
+    """Returns the lengths [X, Y, Z] of the shortest paths to the seeds, from the seeds' own lengths [X, Y, Z].
 
     Sweeps plane by plane along each axis, there and back, until nothing becomes shorter: a way with few bends takes few
     rounds, however long it is.
@@ -135,7 +135,7 @@ def _swept(planes: Array, around: Array, edge: Array, backwards: bool) -> Array:
 
     def plane(before: tuple[Array, Array], here: tuple[Array, Array]) -> tuple[tuple[Array, Array], Array]:
         (length, ball), (own, own_ball) = before, here
-        lengths, balls = _shifted(length, jnp.inf), _shifted(ball, -jnp.inf)
+        lengths, balls = _neighbour_planes(length, jnp.inf), _neighbour_planes(ball, -jnp.inf)
         meets = balls + own_ball[None] >= weights
         own = jnp.minimum(own, jnp.min(jnp.where(meets, lengths + weights, jnp.inf), axis=0))
         return (own, own_ball), own
@@ -144,7 +144,7 @@ def _swept(planes: Array, around: Array, edge: Array, backwards: bool) -> Array:
     return lax.scan(plane, nothing, (planes, around), reverse=backwards)[1]
 
 
-def _shifted(plane: Array, fill: float) -> Array:
+def _neighbour_planes(plane: Array, fill: float) -> Array:
     """Returns a plane [A, B] as seen from its nine neighbours, [9, A, B]."""
     padded = jnp.pad(plane, 1, constant_values=fill)
     a, b = plane.shape

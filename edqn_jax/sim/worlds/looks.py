@@ -46,11 +46,11 @@ def with_looks(pool: Scene, keys: Array, config: SurfaceConfig) -> Scene:
         keys: [P] of the worlds; a look is drawn from a key of its own.
         config: static.
     """
-    return pool if config.pattern == "plaid" else _dressed(config, pool, keys)
+    return pool if config.pattern == "plaid" else _add_looks(config, pool, keys)
 
 
 @partial(jax.jit, static_argnums=0)
-def _dressed(config: SurfaceConfig, pool: Scene, keys: Array) -> Scene:
+def _add_looks(config: SurfaceConfig, pool: Scene, keys: Array) -> Scene:
     def one(scene: Scene, key: Array) -> Scene:
         return _with_look(config, scene, jax.random.fold_in(key, LOOK_OF_WORLD))
 
@@ -165,7 +165,7 @@ def _unit(draws: Array) -> Array:
     return jnp.stack([flat * jnp.cos(turn), flat * jnp.sin(turn), z], axis=1)
 
 
-def _turned(along: Array, up: Array, angle: Array) -> tuple[Array, Array]:
+def _rotate_in_face(along: Array, up: Array, angle: Array) -> tuple[Array, Array]:
     """Returns two directions [N, 3] turned within the face by angles [N]."""
     cos, sin = jnp.cos(angle)[:, None], jnp.sin(angle)[:, None]
     return cos * along + sin * up, cos * up - sin * along
@@ -194,7 +194,7 @@ def _checks(config: SurfaceConfig, draws: Array, along: Array, up: Array) -> Num
     """Stripes, checks, or stripes that cross, of hard edges; half of them turned within the face."""
     style, zero = draws[:, 12], jnp.zeros(len(draws))
     stripes, crossed = style < 1 / 3, style > 2 / 3
-    first, second = _turned(along, up, jnp.where(draws[:, 13] < 0.5, 0.0, 2 * jnp.pi * draws[:, 14]))
+    first, second = _rotate_in_face(along, up, jnp.where(draws[:, 13] < 0.5, 0.0, 2 * jnp.pi * draws[:, 14]))
     swap = (draws[:, 17] < 0.5)[:, None]
     first, second = jnp.where(swap, second, first), jnp.where(swap, first, second)
     period = _period(config, draws[:, 2])
@@ -222,7 +222,7 @@ def _posters(config: SurfaceConfig, draws: Array, along: Array, up: Array) -> Nu
     apart = _log_between(*POSTER_M, draws[:, 2])
     fine = apart * scale_uniforms((0.1, 0.4), draws[:, 13])
     tone = scale_uniforms((-0.4, 0.4), draws[:, 12])
-    first, second = _turned(along, up, 2 * jnp.pi * draws[:, 14])
+    first, second = _rotate_in_face(along, up, 2 * jnp.pi * draws[:, 14])
     vectors = [along / apart[:, None], up / (apart * scale_uniforms((0.5, 1.0), draws[:, 15]))[:, None]]
     vectors += [first / fine[:, None], (second + 0.4 * first) / (0.6 * fine[:, None])]
     shares = [
@@ -237,7 +237,7 @@ def _posters(config: SurfaceConfig, draws: Array, along: Array, up: Array) -> Nu
 def _wood(config: SurfaceConfig, draws: Array, along: Array, up: Array) -> Numbers:
     """Stripes that bend over several of their periods, and a fine grain along them."""
     ring = _log_between(*RING_M, draws[:, 2])
-    first, second = _turned(along, up, jnp.where(draws[:, 12] < 0.5, 0.0, jnp.pi / 2))
+    first, second = _rotate_in_face(along, up, jnp.where(draws[:, 12] < 0.5, 0.0, jnp.pi / 2))
     longer = ring * scale_uniforms((10.0, 25.0), draws[:, 13])
     vectors = [first / ring[:, None], (second + 0.3 * first) / longer[:, None]]
     vectors += [(second - 0.6 * first) / (0.5 * longer[:, None]), (first + 0.05 * second) / (0.35 * ring[:, None])]

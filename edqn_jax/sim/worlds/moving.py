@@ -72,7 +72,7 @@ STILL = Moving()
 
 
 def in_motion(scene: Scene, moving: Moving, bodies: Bodies, key: Array) -> Scene:
-    """Returns a world that stands, set in motion; at time 0 it is the same.
+    """Returns a static world with motion added; at time 0 it is unchanged.
 
     Each body moves with probability `moving.share`: a third of those that move run along a straight line between the
     faces of the volume, a third sway along a line, a third circle, all of them level and at a steady speed (swaying: at

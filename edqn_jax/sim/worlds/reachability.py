@@ -1,4 +1,4 @@
-"""Whether there is a way from a world's start to its goal: a quick check, which finds no way that is not there.
+"""A quick check whether a path leads from a world's start to its goal; it reports none that does not exist.
 
 Nodes of a lattice are free where a sphere of radius and half an edge fits, so a drone passes straight between two
 neighbours along an axis. Shapes are taken for upright prisms around them. A column of nodes is one word, a bit each.
@@ -21,7 +21,7 @@ LEVELS = 32
 
 
 def has_way(scene: Scene, size: tuple[float, float, float], radius: float, edge: float) -> Array:
-    """Returns whether a sphere gets from the start to the goal, [] bool; False may be wrong in narrow places.
+    """Returns whether a path for the sphere leads from start to goal, [] bool; may be False wrongly in narrow places.
 
     Args:
         scene: one world; its planes are level.

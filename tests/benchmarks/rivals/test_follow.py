@@ -22,7 +22,7 @@ from edqn_jax.sim.scene.motion import not_thrown
 from edqn_jax.sim.task.flights import Flights
 from edqn_jax.sim.task.outcomes import Outcome
 from rivals.planners import snn
-from rivals.planners.follow import SPACING_M, FollowConfig, compiled_follower, reserved, sampled, steer
+from rivals.planners.follow import SPACING_M, FollowConfig, compiled_follower, sample_path, steer, with_reserve
 from tests.support.small_worlds import RADIUS, SIZE, assert_flyable, box, enclosure, random_small_world, small_world
 
 CONFIG, FOLLOW = Config(), FollowConfig()
@@ -30,7 +30,7 @@ AIRFRAME = load_airframe(CONFIG.drone)
 
 
 def flown(task: PlanningTask, path) -> Flights:
-    goal, points = np.float32(task.goal), sampled(np.asarray(path, np.float64))
+    goal, points = np.float32(task.goal), sample_path(np.asarray(path, np.float64))
     return jax.device_get(compiled_follower()(CONFIG, FOLLOW, AIRFRAME, task.scene, goal, points))
 
 
@@ -67,7 +67,7 @@ def test_through_gaps_it_stays_on_the_path_as_closely_as_the_reserve_asks():
 
 @pytest.mark.slow
 def test_beside_a_straight_path_it_comes_back_without_crossing_it_by_more_than_the_tolerance():
-    points = sampled(np.array([(0.0, 6.0, 3.0), (12.0, 6.0, 3.0)]))
+    points = sample_path(np.array([(0.0, 6.0, 3.0), (12.0, 6.0, 3.0)]))
     fly_on = jax.jit(lambda state, command: fly_decision(CONFIG.drone, AIRFRAME, state, command, jnp.zeros(())))
     state, nearest = drone.hover_state(jnp.array([1.0, 7.0, 3.0]), jnp.array(0.0)), np.int32(0)
     beside = []
@@ -102,7 +102,7 @@ def test_a_path_out_of_the_volume_leaves_it_and_one_that_ends_early_runs_out_of_
 @pytest.mark.slow
 def test_what_a_planner_draws_with_the_reserve_is_flown_without_contact(seed):
     task = random_small_world(seed, shapes=3)
-    held = reserved(task, FOLLOW)
+    held = with_reserve(task, FOLLOW)
     plan = snn.plan(held)
     if plan.path is None:
         assert plan.reason.startswith("no path")
@@ -114,7 +114,7 @@ def test_what_a_planner_draws_with_the_reserve_is_flown_without_contact(seed):
 
 def test_the_reserve_enlarges_the_body_and_draws_in_the_fence_but_for_the_ends():
     task = small_world(start=(0.1, 6.0, 3.0), goal=(10.0, 12.0, 3.0))
-    held = reserved(task, FOLLOW)
+    held = with_reserve(task, FOLLOW)
     assert held.body_radius == pytest.approx(RADIUS + FOLLOW.reserve_m)
     lower, upper = np.asarray(held.scene.volume)
     np.testing.assert_allclose(lower, (0.1, FOLLOW.reserve_m, FOLLOW.reserve_m), atol=1e-6)
@@ -124,7 +124,9 @@ def test_the_reserve_enlarges_the_body_and_draws_in_the_fence_but_for_the_ends()
 
 def test_a_goal_that_only_the_reserve_does_not_fit_at_is_refused_in_a_sentence():
     task = small_world(*enclosure((10.0, 6.0, 3.0), inner=0.5))
-    assert snn.plan(reserved(task, FOLLOW)).reason.startswith("no path: a sphere of 0.66 m does not fit at the goal")
+    assert snn.plan(with_reserve(task, FOLLOW)).reason.startswith(
+        "no path: a sphere of 0.66 m does not fit at the goal"
+    )
 
 
 POINT = st.tuples(*[st.floats(0.0, side) for side in SIZE])
@@ -134,7 +136,7 @@ POINT = st.tuples(*[st.floats(0.0, side) for side in SIZE])
 @given(st.lists(POINT, min_size=2, max_size=6))
 def test_samples_stand_on_the_path_at_most_a_spacing_apart(points):
     path = np.array(points)
-    samples = sampled(path)
+    samples = sample_path(path)
     np.testing.assert_allclose(samples[[0, -1]], path[[0, -1]], atol=1e-5)
     assert np.linalg.norm(np.diff(samples, axis=0), axis=1).max() <= SPACING_M + 1e-5
     begin, leg = path[:-1], np.diff(path, axis=0)
@@ -153,7 +155,7 @@ def _steer():
 @given(POINT, POINT, st.integers(0, 60))
 @pytest.mark.slow
 def test_it_is_never_faster_than_a_learner_along_an_axis_and_never_goes_back(at, velocity, nearest):
-    points = sampled(np.array([(1.0, 1.0, 1.0), (6.0, 1.0, 1.0), (6.0, 6.0, 5.0)]))
+    points = sample_path(np.array([(1.0, 1.0, 1.0), (6.0, 1.0, 1.0), (6.0, 6.0, 5.0)]))
     state = drone.hover_state(jnp.array(at), jnp.array(0.3))
     state = dataclasses.replace(state, velocity=jnp.array(velocity) - 3.0)
     command, now = _steer()(points, np.int32(nearest), state)

@@ -68,7 +68,7 @@ def test_a_planner_says_no_path_where_there_is_none(tmp_path: Path, monkeypatch:
 def test_the_judged_worlds_are_those_that_training_ends_with() -> None:
     _, config = parse_train([*MINIATURE, "--world", "medium", "--world.flown", "", "--world.pool-size", "4"])
     scenes = planning.judged_scenes(config, 2)
-    final = learners.run_missions(config).final.world
+    final = learners.run_missions(config).final.env_params
     for index, scene in enumerate(scenes):
         np.testing.assert_array_equal(scene.start, final.missions.start[index])
         np.testing.assert_array_equal(scene.goal, final.missions.goal[index])

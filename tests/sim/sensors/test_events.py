@@ -55,11 +55,6 @@ def far_from_a_step(distance: np.ndarray, slack: float = 1e-4) -> bool:
     return bool(np.all(np.abs(distance - np.round(distance)) > slack))
 
 
-def test_luma_is_the_weighted_sum_of_equation_1():
-    rgb = jnp.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0], [1.0, 1.0, 1.0]])
-    np.testing.assert_allclose(ev.rgb_to_luma(rgb), [0.299, 0.587, 0.114, 1.0], rtol=1e-6)
-
-
 def test_log_brightness_of_black_is_finite_and_of_white_is_near_zero():
     config = EventsConfig()
     np.testing.assert_allclose(

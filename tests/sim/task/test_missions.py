@@ -12,10 +12,11 @@ import pytest
 
 from edqn_jax.sim.scene.distance import signed_distance
 from edqn_jax.sim.scene.mjcf import load_scene, resolve_world
-from edqn_jax.sim.scene.scene import Spheres, build_scene, stack_scenes, take_scene
+from edqn_jax.sim.scene.scene import Spheres, build_scene, stack_scenes
 from edqn_jax.sim.task.missions import AWAY, random_missions, spread_missions
 from edqn_jax.sim.worlds.families import random_pool, world_keys
 from edqn_jax.sim.worlds.free_points import CLEARANCE, FAR, free_point
+from tests.support.drawn_scenes import clearances
 
 WORLDS, MISSIONS = 24, 512
 
@@ -23,12 +24,6 @@ WORLDS, MISSIONS = 24, 512
 @pytest.fixture(scope="module")
 def paper():
     return stack_scenes([load_scene(resolve_world("paper"))])
-
-
-@jax.jit
-def clearances(pool, missions, points):
-    at = jax.vmap(lambda index, point: signed_distance(take_scene(pool, index), point))
-    return at(missions.scene, points)
 
 
 @pytest.mark.slow

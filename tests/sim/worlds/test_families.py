@@ -22,6 +22,7 @@ from edqn_jax.sim.task.missions import own_missions, random_missions, spread_mis
 from edqn_jax.sim.worlds import canyon, discs, families, forest, rooms
 from edqn_jax.sim.worlds.families import SPLITS, families_of, random_pool, random_scene, world_key, world_keys
 from edqn_jax.sim.worlds.free_points import CLEARANCE, FAR
+from tests.support.drawn_scenes import clearances
 from tests.support.registries import keep_as_they_are
 
 RADIUS = 0.36
@@ -32,12 +33,6 @@ HARD = ("rooms", "forest", "canyon")
 @pytest.fixture(scope="module")
 def pools():
     return {family: random_pool(family, world_keys("validation", WORLDS)) for family in FAMILIES}
-
-
-@jax.jit
-def clearances(pool, missions, points):
-    at = jax.vmap(lambda index, point: signed_distance(take_scene(pool, index), point))
-    return at(missions.scene, points)
 
 
 def test_the_splits_never_share_a_world():

@@ -226,11 +226,11 @@ def test_environments_and_evaluations_fly_in_what_the_configuration_says():
     expected = random_pool("medium", world_keys("test", 2), Moving(share=1.0, speed_m_s=2.0, balls=2))
     for pool in (
         make("medium", config, worlds=2, split="test").world.pool,
-        load_missions(config, "medium", 2).world.pool,
+        load_missions(config, "medium", 2).env_params.pool,
     ):
         assert jax.tree.structure(pool) == jax.tree.structure(expected)
         jax.tree.map(np.testing.assert_array_equal, pool, expected)
-    flown = load_missions(make_config("medium"), "moving", 2).world.pool
+    flown = load_missions(make_config("medium"), "moving", 2).env_params.pool
     assert has_motion(flown) and flown.spheres.throw is None
 
 

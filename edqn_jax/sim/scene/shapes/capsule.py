@@ -15,7 +15,6 @@ from edqn_jax.sim.scene.shapes.kind import (
     FAR,
     GREY,
     UP,
-    Geom,
     Hits,
     ShapeKind,
     Vector,
@@ -25,7 +24,7 @@ from edqn_jax.sim.scene.shapes.kind import (
     offset,
 )
 from edqn_jax.sim.scene.shapes.sphere import meet_balls
-from edqn_jax.sim.scene.shapes.tilted_cylinder import Tubes, meet_tubes
+from edqn_jax.sim.scene.shapes.tilted_cylinder import Tubes, meet_tubes, read_round, write_round
 from edqn_jax.sim.scene.surface import Surface
 
 
@@ -59,14 +58,6 @@ def _meet(capsules: Capsules, origin: Array, ray: Vector) -> Hits:
     return whole
 
 
-def _read(geom: Geom) -> Capsules:
-    radius, half, _ = geom.size
-    axis = geom.rotation[:, 2]
-    return Capsules(
-        position=geom.position, axis=axis, half_length=half, radius=radius, albedo=geom.albedo  # type: ignore[arg-type]
-    )  # fmt: skip
-
-
 def _reach(capsules: Any) -> Any:
     xp = array_module(capsules.axis)
     return abs(capsules.axis) * xp.expand_dims(capsules.half_length, -1) + xp.expand_dims(capsules.radius, -1)
@@ -79,8 +70,8 @@ CAPSULE = ShapeKind(
     geom="capsule",
     distance=_distance,
     meet=_meet,
-    read=_read,
-    write=lambda one: {"size": [one.radius, one.half_length], "zaxis": one.axis},
+    read=lambda geom: Capsules(**read_round(geom)),
+    write=write_round,
     reach=_reach,
     faces=lambda one: faces_of_capsule(one.position, one.axis, float(one.radius), float(one.half_length)),
     page=lambda one: {"kind": "capsule", "axis": one.axis, "half": one.half_length, "radius": one.radius},

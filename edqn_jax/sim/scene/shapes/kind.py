@@ -54,7 +54,7 @@ class Hits:
 
     @classmethod
     def of(cls, depth: Array, hit: Array, normal: Vector) -> Hits:
-        """Returns hits [N, R, C], depths in metres, of shapes that are one round side, of that normal."""
+        """Returns hits [N, R, C], depths in metres, of shapes with a single side, of that normal."""
         return cls(depth=depth, hit=hit, sides=((None, normal),))
 
     @property

@@ -96,12 +96,21 @@ def _meet(cylinders: TiltedCylinders, origin: Array, ray: Vector) -> Hits:
     return meet_tubes(part, origin, ray, capped=True)
 
 
-def _read(geom: Geom) -> TiltedCylinders:
+def read_round(geom: Geom) -> dict[str, Any]:
+    """Returns the fields of a round solid along the geom's z axis, as `TiltedCylinders` and capsules have them."""
     radius, half, _ = geom.size
-    axis = geom.rotation[:, 2]
-    return TiltedCylinders(
-        position=geom.position, axis=axis, half_length=half, radius=radius, albedo=geom.albedo  # type: ignore[arg-type]
-    )  # fmt: skip
+    return {
+        "position": geom.position,
+        "axis": geom.rotation[:, 2],
+        "half_length": half,
+        "radius": radius,
+        "albedo": geom.albedo,
+    }
+
+
+def write_round(one: Any) -> dict[str, Any]:
+    """Returns the MJCF attributes that `read_round` reads, of a single shape."""
+    return {"size": [one.radius, one.half_length], "zaxis": one.axis}
 
 
 def _reach(cylinders: Any) -> Any:
@@ -118,8 +127,8 @@ TILTED_CYLINDER = ShapeKind(
     geom="cylinder",
     distance=_distance,
     meet=_meet,
-    read=_read,
-    write=lambda one: {"size": [one.radius, one.half_length], "zaxis": one.axis},
+    read=lambda geom: TiltedCylinders(**read_round(geom)),
+    write=write_round,
     reach=_reach,
     faces=lambda one: faces_of_tube(one.position, one.axis, float(one.radius), float(one.half_length)),
     page=lambda one: {"kind": "cylinder", "axis": one.axis, "half": one.half_length, "radius": one.radius},

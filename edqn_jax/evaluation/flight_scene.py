@@ -31,7 +31,7 @@ def scene_of_flight(config: Config, missions: MissionSet, flights: Flights | Non
         ValueError: if the flights were not recorded.
     """
     scene = jax.tree.map(np.asarray, missions.scene(mission))
-    ends = missions.world.missions
+    ends = missions.env_params.missions
     if scene.spheres.throw is not None:
         own = np.asarray(ends.start[mission])[None]
         if flights is not None:
