@@ -23,6 +23,7 @@ from jax import Array
 from edqn_jax.config import Config
 from edqn_jax.config.registry import LEARNERS
 from edqn_jax.learn import replay
+from edqn_jax.user_code import check_functions
 
 State = Any
 """Parameters and optimisers of a learner, a pytree; the same on every device."""
@@ -102,6 +103,27 @@ class Learner:
     """Returns the parameters that learn, which are watched for numbers that are not finite."""
     policy: Callable[[State], Params]
     """Returns the parameters that fly."""
+
+    def __post_init__(self) -> None:
+        """Checks what each function takes.
+
+        Raises:
+            ConfigError: names the function and its arguments.
+        """
+        check_functions(
+            self,
+            {
+                "init": "config, key",
+                "act": "config, state, memory, keys, exploration",
+                "decide": "config, params, memory",
+                "ring_length": "config",
+                "starts": "config",
+                "updates": "config, number",
+                "update": "config, axis, state, rings, after",
+                "network": "state",
+                "policy": "state",
+            },
+        )
 
 
 def learner_of(config: Config) -> Learner:

@@ -21,7 +21,7 @@ from edqn_jax.policies import function_named
 from edqn_jax.sim.actions import Discrete
 from edqn_jax.sim.task.action_sets import action_of, action_set, clip_action
 from edqn_jax.sim.task.env import Observation
-from edqn_jax.user_code import load_module
+from edqn_jax.user_code import check_takes, load_module
 
 Function = Callable[[Observation, Any, Array], tuple[Any, Any]]
 """(observation of one drone, memory, key consumed) → action, memory for the next observation; traced by JAX."""
@@ -132,7 +132,7 @@ class FunctionPolicy:
         """Checks what can be checked before it flies.
 
         Raises:
-            ConfigError: if the function or `memory` cannot be called, or the function has no hash.
+            ConfigError: if the function or `memory` cannot be called, or the function has no hash or other arguments.
         """
         if not callable(self.function) or isinstance(self.function, type):
             raise ConfigError(f"a policy is {TAKES}, not {self.function!r}")
@@ -144,6 +144,7 @@ class FunctionPolicy:
             ) from None
         if self.memory is not None and not callable(self.memory):
             raise ConfigError(f"memory must be a function that returns the first memory, not {self.memory!r}")
+        check_takes(self.function, "observation, memory, key", "a policy")
 
     @property
     def params(self) -> None:

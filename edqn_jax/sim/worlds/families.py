@@ -23,6 +23,7 @@ from edqn_jax.sim.worlds import canyon, forest, open_worlds, rooms
 from edqn_jax.sim.worlds.looks import with_looks
 from edqn_jax.sim.worlds.moving import MOVING_SHARE, STILL, Bodies, Moving, in_motion
 from edqn_jax.sim.worlds.reachability import has_way
+from edqn_jax.user_code import check_functions
 
 RADIUS_M = 0.36
 """Of the sphere that has a way in every random world; the drone's."""
@@ -67,6 +68,18 @@ class Family:
     detours: bool = False
     """Whether the straight line to the goal is seldom free; options then begin as in rooms (`CLOSED_WORLDS`)."""
 
+    def __post_init__(self) -> None:
+        """Checks what `draw` takes, and the sizes.
+
+        Raises:
+            ConfigError: names the field and what it must be.
+        """
+        check_functions(self, {"draw": "key"})
+        if np.shape(self.size) != (3,) or not all(metres > 0 for metres in self.size):
+            raise ConfigError(f"`size` of Family must be three lengths above 0, metres, not {self.size!r}")
+        if self.edge_m is not None and not self.edge_m > 0:
+            raise ConfigError(f"`edge_m` of Family must be metres above 0, or None, not {self.edge_m!r}")
+
 
 @dataclasses.dataclass(frozen=True)
 class Mixture:
@@ -76,6 +89,20 @@ class Mixture:
     """By the name of the family."""
     detours: bool = False
     """As of `Family`."""
+
+    def __post_init__(self) -> None:
+        """Checks the shares.
+
+        Raises:
+            ConfigError: if they are no whole numbers above 0 by name.
+        """
+        shares = self.shares
+        if not (isinstance(shares, Mapping) and shares and all(_is_share(*each) for each in shares.items())):
+            raise ConfigError(f"`shares` of Mixture must be whole numbers above 0 by name of a family, not {shares!r}")
+
+
+def _is_share(name: object, share: object) -> bool:
+    return isinstance(name, str) and isinstance(share, int) and share > 0
 
 
 def _open(density: str) -> Family:

@@ -141,10 +141,3 @@ def test_the_functional_face_joins_a_tree_and_refuses_nothing(config: Config) ->
     nothing = with_sensor(config, "nothing")
     with pytest.raises(ConfigError, match="the sensor 'nothing' shows nothing"):
         functional.make("paper", nothing)
-
-
-def test_what_is_registered_must_be_a_sensor(config: Config) -> None:
-    SENSORS.register("bare", lambda *_: (None, None))
-    bare = with_sensor(config, "bare")
-    with pytest.raises(ConfigError, match="the sensor 'bare' must be an edqn_jax.Sensor, not function"):
-        sensor.sensor_of(bare)
