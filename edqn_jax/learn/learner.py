@@ -13,7 +13,7 @@ learner asks for, one ring for each of S logical shards with E environments each
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -32,7 +32,25 @@ Params = Any
 """Parameters that fly, a pytree."""
 
 Metrics = dict[str, Array]
-"""[] float32 by name, NaN where nothing was learnt; `metrics.jsonl` and the live display show them."""
+"""[] float32 by name, NaN where nothing was learnt; `metrics.jsonl`, the live display and the figures show them."""
+
+VAE_METRICS = ("reconstruction_loss", "kl")
+
+RUN_METRICS = (
+    *("phase", "decisions", "decisions_per_second", "episodes", "success_rate", "mean_return", "diverged"),
+    *("skipped_updates", "warm_up", "validation_success", "validation_mission", "validation_spl"),
+)
+"""What `metrics.jsonl` has of every run, whatever learns in it."""
+
+
+def learner_metrics(rows: Iterable[Mapping[str, Any]]) -> list[str]:
+    """Returns the names of the learner's own numbers in lines of `metrics.jsonl`, in the order in which they come."""
+    own: dict[str, None] = {}
+    for row in rows:
+        for name, value in row.items():
+            if name not in (*RUN_METRICS, *VAE_METRICS) and isinstance(value, int | float):
+                own[name] = None
+    return list(own)
 
 
 class Exploration(NamedTuple):
