@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from edqn_jax.checks import tree_form
 from edqn_jax.config import Config
 from edqn_jax.config.loading import make_config, suggest_nearest
 from edqn_jax.errors import ConfigError
@@ -73,7 +74,7 @@ class FunctionActor(Actor):
         if not (isinstance(result, tuple) and len(result) == 2):
             raise ConfigError(f"a policy is {TAKES}; this one returned {type(result).__name__}")
         action, after = result
-        before, now = _form(memory), _form(after)
+        before, now = tree_form(memory), tree_form(after)
         if before != now:
             raise ConfigError(
                 f"a policy's function must return a memory like the one that it is given, {before}, not {now}; "
@@ -100,16 +101,6 @@ def _line_of(error: Exception) -> str:
         if frame.filename != __file__ and not frame.filename.startswith(library):
             return f" (line {frame.lineno} of '{Path(frame.filename).name}': {frame.line})"
     return ""
-
-
-def _form(memory: Any) -> str:
-    """Returns what a memory is made of, in words: types and shapes of its arrays, and how they are held together."""
-    leaves, tree = jax.tree.flatten(memory)
-    arrays = [jnp.asarray(leaf) for leaf in leaves]
-    text = str(tree).removeprefix("PyTreeDef(").removesuffix(")")
-    for each in arrays:
-        text = text.replace("*", f"{each.dtype}{list(each.shape)}", 1)
-    return text
 
 
 @dataclasses.dataclass(frozen=True)

@@ -20,6 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from edqn_jax.checks import first_difference
 from edqn_jax.config import CameraConfig, Config
 from edqn_jax.config.registry import SENSORS
 from edqn_jax.errors import ConfigError
@@ -33,7 +34,7 @@ from edqn_jax.sim.scene.shapes.kind import TINY
 from edqn_jax.sim.sensors import events, exposure
 from edqn_jax.sim.sensors.events import EventField, EventMemory
 from edqn_jax.sim.sensors.exposure import FrameMemory
-from edqn_jax.user_code import check_functions
+from edqn_jax.user_code import check_functions, describe_object
 
 Sensed = Any
 """What a sensor shows, an `EventField`, an array, a tree of these, or None; see `Sensor.shape`."""
@@ -252,8 +253,14 @@ def sensor_of(config: Config) -> Sensor:
 
 def frame_steps(config: Config) -> tuple[int, ...]:
     """Returns the physics steps of a decision, 0..n, after which the sensor needs a pose."""
-    n = config.drone.physics_steps
-    return tuple(n + round(t / config.drone.physics_dt_s) for t in sensor_of(config).frame_times_s(config))
+    n, times = config.drone.physics_steps, sensor_of(config).frame_times_s(config)
+    steps = tuple(n + round(t / config.drone.physics_dt_s) for t in times)
+    if not steps or not 0 <= min(steps) <= max(steps) <= n:
+        raise ConfigError(
+            f"`frame_times_s` of the sensor '{config.env.sensor}' must be times from "
+            f"{-n * config.drone.physics_dt_s:g} to 0 s, relative to the end of a decision, not {times}"
+        )
+    return steps
 
 
 def frames_per_decision(config: Config) -> int:
@@ -302,12 +309,23 @@ def sense(config: Config, scene: Scene, poses: Flight, memory: SensorMemory, key
         key: consumed only by noise.
 
     Raises:
-        ConfigError: if the sensor does not show what its `shape` says.
+        ConfigError: if the sensor does not show what its `shape` says, or returns another memory than it is given.
     """
-    sensor = sensor_of(config)
-    sensed, memory = sensor.show(config, scene, poses, memory, key)
+    sensor, name = sensor_of(config), config.env.sensor
+    shown = sensor.show(config, scene, poses, memory, key)
+    if not (isinstance(shown, tuple) and len(shown) == 2):
+        raise ConfigError(
+            f"`show` of the sensor '{name}' must return what is shown and its memory, not {describe_object(shown)}"
+        )
+    sensed, after = shown
     sensor.check(config, sensed)
-    return sensed, memory
+    difference = first_difference(memory, after)
+    if difference:
+        raise ConfigError(
+            f"`show` of the sensor '{name}' must return a memory like the one that it is given, and {difference}; "
+            "`at_rest` returns the first one"
+        )
+    return sensed, after
 
 
 def last_view(scene: Scene, poses: Flight) -> tuple[Scene, Array, Array]:
