@@ -14,7 +14,7 @@ from jax import Array
 
 from edqn_jax.checks import tree_form
 from edqn_jax.config import Config
-from edqn_jax.config.loading import make_config, suggest_nearest
+from edqn_jax.config.loading import check_config, make_config, suggest_nearest
 from edqn_jax.errors import ConfigError
 from edqn_jax.learn.actor import Actor, AgentActor
 from edqn_jax.learn.policy import Policy
@@ -123,8 +123,10 @@ class FunctionPolicy:
         """Checks what can be checked before it flies.
 
         Raises:
-            ConfigError: if the function or `memory` cannot be called, or the function has no hash or other arguments.
+            ConfigError: if the function or `memory` cannot be called, the function has no hash or other arguments, or
+                `config` is no configuration.
         """
+        check_config(self.config)
         if not callable(self.function) or isinstance(self.function, type):
             raise ConfigError(f"a policy is {TAKES}, not {self.function!r}")
         try:

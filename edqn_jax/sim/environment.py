@@ -20,7 +20,7 @@ from jax import Array
 from jax.typing import ArrayLike
 
 from edqn_jax.config import FAMILIES, SENSORS, Config
-from edqn_jax.config.loading import make_config
+from edqn_jax.config.loading import check_config, make_config
 from edqn_jax.devices.forks import check_not_forked
 from edqn_jax.devices.jax_settings import as_tested
 from edqn_jax.devices.sums import check_default_sums
@@ -195,6 +195,7 @@ def make(
     """
     check_not_forked()
     check_default_sums()
+    check_config(config)
     check_reward(reward)
     name = str(world) if world is not None else (config or Config()).world.name
     config = make_config(name) if config is None else config
