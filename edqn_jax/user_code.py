@@ -85,7 +85,7 @@ def check_takes(function: Any, arguments: str, what: str, wanted: str = "a funct
 
     Args:
         function: to be called.
-        arguments: their names, such as `config, key`.
+        arguments: their names, such as `config, key`; empty for none.
         what: it is, for messages.
         wanted: what it must be, before its arguments.
 
@@ -99,7 +99,7 @@ def check_takes(function: Any, arguments: str, what: str, wanted: str = "a funct
     except (TypeError, ValueError):
         return
     try:
-        signature.bind(*arguments.split(", "))
+        signature.bind(*filter(None, arguments.split(", ")))
     except TypeError:
         takes = ", ".join(signature.parameters)
         raise ConfigError(f"{what} must be {wanted} ({arguments}), not one of ({takes})") from None

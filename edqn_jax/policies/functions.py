@@ -138,6 +138,8 @@ class FunctionPolicy:
         if self.memory is not None and not callable(self.memory):
             raise ConfigError(f"memory must be a function that returns the first memory, not {self.memory!r}")
         check_takes(self.function, "observation, memory, key", "a policy")
+        if self.memory is not None:
+            check_takes(self.memory, "", "memory")
 
     @property
     def params(self) -> None:

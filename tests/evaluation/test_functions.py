@@ -227,6 +227,8 @@ class Unhashable:
 def test_a_function_with_other_arguments_is_refused_where_it_is_given(function: Any) -> None:
     with pytest.raises(ConfigError, match=r"^a policy must be a function \(observation, memory, key\), not one of \("):
         edqn_jax.evaluate(function)
+    with pytest.raises(ConfigError, match=r"^memory must be a function \(\), not one of \(key\)$"):
+        FunctionPolicy(lambda o, m, k: (0, m), memory=lambda key: 0)  # type: ignore[arg-type, misc]
 
 
 def test_what_a_function_raises_itself_is_not_changed() -> None:
