@@ -34,13 +34,14 @@ Params = Any
 Metrics = dict[str, Array]
 """[] float32 by name, NaN where nothing was learnt; `metrics.jsonl`, the live display and the figures show them."""
 
-VAE_METRICS = ("reconstruction_loss", "kl")
-
 RUN_METRICS = (
     *("phase", "decisions", "decisions_per_second", "episodes", "success_rate", "mean_return", "diverged"),
     *("skipped_updates", "warm_up", "validation_success", "validation_mission", "validation_spl"),
 )
 """What `metrics.jsonl` has of every run, whatever learns in it."""
+
+VAE_METRICS = ("reconstruction_loss", "kl")
+"""What it has of perception."""
 
 
 def learner_metrics(rows: Iterable[Mapping[str, Any]]) -> list[str]:

@@ -252,7 +252,11 @@ def sensor_of(config: Config) -> Sensor:
 
 
 def frame_steps(config: Config) -> tuple[int, ...]:
-    """Returns the physics steps of a decision, 0..n, after which the sensor needs a pose."""
+    """Returns the physics steps of a decision, 0..n, after which the sensor needs a pose.
+
+    Raises:
+        ConfigError: if there is none, or one is before the decision or after it.
+    """
     n, times = config.drone.physics_steps, sensor_of(config).frame_times_s(config)
     steps = tuple(n + round(t / config.drone.physics_dt_s) for t in times)
     if not steps or not 0 <= min(steps) <= max(steps) <= n:
