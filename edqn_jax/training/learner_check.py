@@ -59,7 +59,7 @@ def check_learner(config: Config) -> None:
     moves, acted = _pair(config, "act", act, state, memory, keys, _numbers(), _numbers(shards, envs))
     _check_integers(config, "act", moves, shards, envs)
     _check_metrics(config, "act", acted)
-    rows = jax.eval_shape(partial(replay.empty_ring, length, envs, size))
+    rows: Any = jax.eval_shape(partial(replay.empty_ring, length, envs, size))
     rows = jax.tree.map(lambda x: jax.ShapeDtypeStruct((shards, *x.shape), x.dtype), rows)
     last = jax.ShapeDtypeStruct((), jnp.float32)
     update = partial(learner.update, config, None)
@@ -79,7 +79,8 @@ def _wrong(config: Config, function: str, wanted: str, found: str) -> ConfigErro
     return ConfigError(f"`{function}` of the learner '{config.agent.learner}' must return {wanted}, not {found}")
 
 
-def _numbers(*shape: int) -> jax.ShapeDtypeStruct:
+def _numbers(*shape: int) -> Any:
+    """Returns shape and type of whole numbers [*shape]."""
     return jax.ShapeDtypeStruct(shape, jnp.int32)
 
 

@@ -47,7 +47,7 @@ def write_report(policies: Shown | Sequence[Shown], file: str | Path, *, mission
             page, or the file cannot be written.
     """
     check_can_write(Path(file))
-    shown: list[Shown] = list(policies) if isinstance(policies, Sequence) and not _is_name(policies) else [policies]  # pyright: ignore
+    shown: list[Any] = list(policies) if isinstance(policies, Sequence) and not _is_name(policies) else [policies]
     if not shown or missions < 1:
         raise ConfigError(f"a report needs a policy and at least 1 of its missions, not {len(shown)} and {missions}")
     write_atomically(Path(file), build_report(shown, missions).encode())

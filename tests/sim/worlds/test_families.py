@@ -230,7 +230,7 @@ def test_a_family_without_a_way_ends_with_its_name(monkeypatch):
     FAMILIES.register("both", families.Mixture({"closed": 1, "sparse": 1}))
     with pytest.raises(ConfigError, match="family of random worlds 'closed'"):
         random_pool("both", world_keys("training", 8))
-    FAMILIES.register("nothing", families.Family(lambda key: None, open_worlds.SIZE))
+    FAMILIES.register("nothing", families.Family(lambda key: None, open_worlds.SIZE))  # type: ignore[arg-type]
     with pytest.raises(ConfigError, match="`draw` of the family of random worlds 'nothing' must return a Scene, not N"):
         edqn_jax.make("nothing")
 
