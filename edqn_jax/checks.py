@@ -1,4 +1,7 @@
-"""Checks inside compiled programs, which only `--debug` makes; otherwise they leave nothing in the program."""
+"""Checks inside compiled programs, which only `--debug` makes, and of trees of arrays while they are traced.
+
+Neither leaves anything in the program otherwise.
+"""
 
 from __future__ import annotations
 
@@ -30,3 +33,27 @@ def is_finite(tree: object) -> Array:
     """Returns whether every number of a tree's arrays is finite, [] bool; whole numbers are."""
     sums = [jnp.sum(leaf) for leaf in jax.tree.leaves(tree) if jnp.issubdtype(leaf.dtype, jnp.floating)]
     return jnp.isfinite(sum(sums, jnp.zeros(())))
+
+
+def tree_form(tree: object) -> str:
+    """Returns what a tree is made of, in words: types and shapes of its arrays, and how they are held together."""
+    leaves, structure = jax.tree.flatten(tree)
+    text = str(structure).removeprefix("PyTreeDef(").removesuffix(")")
+    for leaf in leaves:
+        array = leaf if hasattr(leaf, "dtype") else jnp.asarray(leaf)
+        text = text.replace("*", f"{array.dtype}{list(array.shape)}", 1)
+    return text
+
+
+def first_difference(before: object, after: object) -> str | None:
+    """Returns where types, shapes or the structure of two trees first differ, in words; None where they do not."""
+    old, new = (
+        {jax.tree_util.keystr(path): tree_form(leaf) for path, leaf in jax.tree_util.tree_leaves_with_path(tree)}
+        for tree in (before, after)
+    )
+    for path in old | new:
+        if old.get(path) != new.get(path):
+            return f"{path or 'it'} is {new.get(path, 'missing')}, not {old.get(path, 'missing')}"
+    if jax.tree.structure(before) != jax.tree.structure(after):
+        return f"the parts are held in {type(after).__name__}, not {type(before).__name__}"
+    return None

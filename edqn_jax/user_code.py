@@ -1,14 +1,18 @@
-"""Modules of users: what `--import` names, and files in which a policy stands."""
+"""Code of users: modules that `--import` names, files in which a policy stands, and functions that are handed over."""
 
 from __future__ import annotations
 
+import dataclasses
 import hashlib
 import importlib
 import importlib.util
+import inspect
 import sys
 import traceback
+from collections.abc import Mapping
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 from edqn_jax.errors import ConfigError
 
@@ -61,3 +65,58 @@ def _module_of(file: Path) -> ModuleType:
         del sys.modules[name]
         raise
     return module
+
+
+def describe_object(thing: object) -> str:
+    """Returns what somebody gave, in a few words."""
+    if isinstance(thing, type):
+        return f"the class {thing.__name__}"
+    if thing is None or isinstance(thing, str | int | float):
+        return repr(thing)[:80]
+    if inspect.isroutine(thing):
+        return f"the function {thing.__name__}"
+    return f"an object of the type {type(thing).__name__}"
+
+
+def check_takes(function: Any, arguments: str, what: str, wanted: str = "a function") -> None:
+    """Raises unless something can be called with so many arguments by their place.
+
+    What has no signature, as some functions in C, is taken as it is.
+
+    Args:
+        function: to be called.
+        arguments: their names, such as `config, key`; empty for none.
+        what: it is, for messages.
+        wanted: what it must be, before its arguments.
+
+    Raises:
+        ConfigError: names what it must take, and what it takes.
+    """
+    if not callable(function):
+        raise ConfigError(f"{what} must be {wanted} ({arguments}), not {describe_object(function)}")
+    try:
+        signature = inspect.signature(function)
+    except (TypeError, ValueError):
+        return
+    try:
+        signature.bind(*filter(None, arguments.split(", ")))
+    except TypeError:
+        takes = ", ".join(signature.parameters)
+        raise ConfigError(f"{what} must be {wanted} ({arguments}), not one of ({takes})") from None
+
+
+def check_functions(contract: Any, arguments: Mapping[str, str]) -> None:
+    """Raises unless the functions in the fields of a dataclass take their arguments; optional ones may be None.
+
+    Args:
+        contract: instance of the dataclass.
+        arguments: by field, as of `check_takes`.
+
+    Raises:
+        ConfigError: names the field.
+    """
+    defaults = {field.name: field.default for field in dataclasses.fields(contract)}
+    for name, takes in arguments.items():
+        function = getattr(contract, name)
+        if not (function is None and defaults[name] is None):
+            check_takes(function, takes, f"`{name}` of {type(contract).__name__}")

@@ -18,7 +18,9 @@ from matplotlib.figure import Figure
 
 import edqn_jax
 from edqn_jax.evaluation.missions import load_missions
+from edqn_jax.interop import functional
 from edqn_jax.learn.perception import vae
+from edqn_jax.report.page import document
 from edqn_jax.sim.actions import ACTIONS
 from edqn_jax.sim.scene.distance import signed_distance
 from edqn_jax.sim.sensors.sensor import DEPTH_SCALE, nearness
@@ -266,3 +268,43 @@ def test_no_module_imports_what_only_unix_has() -> None:
         for name in ([node.module or ""] if isinstance(node, ast.ImportFrom) else [each.name for each in node.names])
     }
     assert len(files) > 100 and not {(file, name) for file, name in imported if name in UNIX}
+
+
+@pytest.mark.parametrize("config", [{"train": {"seed": 1}}, {}, "medium", edqn_jax.Config])
+def test_what_is_no_configuration_is_refused_where_it_is_given(config) -> None:
+    for give in (
+        lambda: edqn_jax.make("paper", config),
+        lambda: edqn_jax.train(config),
+        lambda: edqn_jax.train_seeds(2, config),
+        lambda: edqn_jax.FunctionPolicy(lambda observation, memory, key: (0, memory), config),
+        lambda: functional.make("paper", config),
+    ):
+        with pytest.raises(edqn_jax.ConfigError, match=r"^config must be an edqn_jax.Config, such as edqn_jax.make_c"):
+            give()
+    if not isinstance(config, str):
+        with pytest.raises(
+            edqn_jax.ConfigError, match="^make_config: the first argument must be the name of a world, n"
+        ):
+            edqn_jax.make_config(config)
+        if not isinstance(config, dict):
+            with pytest.raises(edqn_jax.ConfigError, match="^evaluate: conditions must be options by group"):
+                edqn_jax.evaluate(lambda observation, memory, key: (0, memory), conditions=config)
+
+
+def test_a_page_is_of_one_policy_or_of_a_list(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    asked = []
+    monkeypatch.setattr(document, "build_report", lambda shown, most: asked.append(shown) or "page")
+    policy = edqn_jax.FunctionPolicy(lambda observation, memory, key: (0, memory))
+    for shown in (policy, policy.function, "pretrained", tmp_path):
+        edqn_jax.write_report(shown, tmp_path / "page.html")
+        edqn_jax.write_report([shown], tmp_path / "page.html")
+        edqn_jax.write_report((shown, policy), tmp_path / "page.html")
+        assert asked[-3:] == [[shown], [shown], [shown, policy]]
+    with pytest.raises(edqn_jax.ConfigError, match="a report needs a policy"):
+        edqn_jax.write_report([], tmp_path / "page.html")
+
+
+@pytest.mark.parametrize("shown", [None, 3])
+def test_a_page_of_what_is_no_policy_is_refused(shown, tmp_path: Path) -> None:
+    with pytest.raises(edqn_jax.ConfigError, match=r"a policy is a function \(observation, memory, key\)"):
+        edqn_jax.write_report(shown, tmp_path / "page.html")

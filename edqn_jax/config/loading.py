@@ -24,6 +24,7 @@ from edqn_jax.config.profiles import PROFILES
 from edqn_jax.config.retired import LAST_COMMIT, RETIRED, is_off
 from edqn_jax.config.rules import validate
 from edqn_jax.errors import ConfigError, suggest_nearest
+from edqn_jax.user_code import describe_object
 
 MAX_BYTES = 1_000_000
 """Of a file of options that is worth reading."""
@@ -86,6 +87,11 @@ def make_config(
     Raises:
         ConfigError: names the option and what would be right.
     """
+    if world is not None and not isinstance(world, str | Path):
+        raise ConfigError(
+            f"make_config: the first argument must be the name of a world, not {describe_object(world)}; groups of "
+            "options are given by their names, such as make_config('medium', train={'seed': 1})"
+        )
     given = groups.get("world")
     if world is None and isinstance(given, Mapping) and isinstance(given.get("name"), str):
         world = given["name"]
@@ -96,6 +102,19 @@ def make_config(
     )
     validate(config)
     return config
+
+
+def check_config(config: object) -> None:
+    """Raises unless something is a configuration, or None for the default.
+
+    Raises:
+        ConfigError: says what makes one.
+    """
+    if config is not None and not isinstance(config, Config):
+        raise ConfigError(
+            f"config must be an edqn_jax.Config, such as edqn_jax.make_config('medium') returns, not "
+            f"{describe_object(config)}"
+        )
 
 
 def with_conditions(config: Config, conditions: Layer, source: str) -> Config:
@@ -109,6 +128,11 @@ def with_conditions(config: Config, conditions: Layer, source: str) -> Config:
     Raises:
         ConfigError: if there is no such option, it is none of `CONDITIONS`, or it is out of its limits.
     """
+    if not isinstance(conditions, Mapping):
+        raise ConfigError(
+            f"{source}: conditions must be options by group, such as {{'air': {{'gusts_m_s': 5.0}}}}, not "
+            f"{describe_object(conditions)}"
+        )
     changed = apply_layer(config, conditions, source)
     for group, options in conditions.items():
         for option in options:

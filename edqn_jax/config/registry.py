@@ -1,27 +1,83 @@
 """Registries: what can be named in an option, the package's own entries and other people's.
 
 Built-in entries are held as `module:name` and imported when they are first asked for, so that the names are known
-before JAX is imported.
+before JAX is imported. What somebody registers is checked at once, by the function that a registry is made with.
 """
 
 from __future__ import annotations
 
 import importlib
 import itertools
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
+from pathlib import Path
 from typing import Any
 
 from edqn_jax.errors import ConfigError, suggest_nearest
+from edqn_jax.user_code import check_takes, describe_object
 
 OWN = "one that --import registers"
 """What else a name may be."""
+
+Take = Callable[[str, Any], Any]
+"""(the entry in words, what was given) → the entry as it is held; raises ConfigError if it is none."""
+
+
+def instance_of(wanted: str, *classes: str) -> Take:
+    """Returns a check that takes instances of these classes, `module:name`, which are `wanted` in words."""
+
+    def take(what: str, entry: Any) -> Any:
+        if not isinstance(entry, tuple(map(_import_name, classes))):
+            raise ConfigError(f"{what} must be {wanted}, not {describe_object(entry)}")
+        return entry
+
+    return take
+
+
+def module_made_of(arguments: str) -> Take:
+    """Returns a check that takes classes of flax modules, and functions, which are called with these arguments."""
+    wanted = "the class of a flax module, or a function that makes one, of"
+
+    def take(what: str, entry: Any) -> Any:
+        if isinstance(entry, type) and not issubclass(entry, _import_name("flax.linen:Module")):
+            raise ConfigError(f"{what} must be {wanted} ({arguments}), not {describe_object(entry)}")
+        check_takes(entry, arguments, what, wanted)
+        return entry
+
+    return take
+
+
+def existing_file(what: str, entry: Any) -> Path:
+    """Returns the absolute path of a file, of its path as text or `Path`.
+
+    Raises:
+        ConfigError: if it is none, or there is no such file.
+    """
+    if not isinstance(entry, str | Path):
+        raise ConfigError(f"{what} must be the path of an MJCF file, not {describe_object(entry)}")
+    file = Path(entry).expanduser().resolve()
+    if not file.is_file():
+        raise ConfigError(f"{what} must be the path of an MJCF file, and there is no file '{entry}'")
+    return file
+
+
+def _import_name(name: str) -> Any:
+    """Imports what `module:name` stands for."""
+    module, _, attribute = name.partition(":")
+    return getattr(importlib.import_module(module), attribute)
 
 
 class Registry:
     """Entries of one kind by name."""
 
     def __init__(
-        self, kind: str, option: str, entries: Mapping[str, str], about: Mapping[str, str] | None = None
+        self,
+        kind: str,
+        option: str,
+        entries: Mapping[str, str],
+        about: Mapping[str, str] | None = None,
+        *,
+        take: Take,
+        reserved: Collection[str] = (),
     ) -> None:
         """Holds built-in entries.
 
@@ -30,9 +86,13 @@ class Registry:
             option: that names one, such as `agent.learner`.
             entries: `module:name` by name.
             about: what help texts say of entries, by name.
+            take: checks what is registered.
+            reserved: names that the option has for something else.
         """
         self.kind = kind
         self.option = option
+        self._take = take
+        self._reserved = reserved
         self._built_in = tuple(entries)
         self._entries: dict[str, Any] = dict(entries)
         self._about = dict(about or {})
@@ -66,13 +126,20 @@ class Registry:
         """Adds an entry of one's own, with what help texts say of it.
 
         Raises:
-            ConfigError: if the name is taken or is no identifier with hyphens.
+            ConfigError: if the name is taken, reserved, or no identifier with hyphens, or the entry is not what the
+                registry is of.
         """
-        if not name.replace("-", "_").isidentifier():
-            raise ConfigError(f"the name of a {self.kind} must be letters, digits, - and _, not '{name}'")
+        if not isinstance(name, str) or name.startswith("-") or not name.replace("-", "_").isidentifier():
+            raise ConfigError(
+                f"the name of a {self.kind} must be letters, digits, - and _, and begin with a letter, not {name!r}"
+            )
         if name in self._entries:
-            raise ConfigError(f"there is a {self.kind} '{name}' already; give yours another name")
-        self._entries[name] = entry
+            raise ConfigError(f"the {self.kind} '{name}' is there already; give yours another name")
+        if name in self._reserved:
+            raise ConfigError(f"'{name}' is something else in {self.option}; give your {self.kind} another name")
+        if not isinstance(about, str):
+            raise ConfigError(f"`about` of the {self.kind} '{name}' must be text, not {describe_object(about)}")
+        self._entries[name] = self._take(f"the {self.kind} '{name}'", entry)
         self._about[name] = about
 
     def check(self, name: str) -> None:
@@ -95,8 +162,7 @@ class Registry:
         self.check(name)
         entry = self._entries[name]
         if isinstance(entry, str):
-            module, _, attribute = entry.partition(":")
-            entry = self._entries[name] = getattr(importlib.import_module(module), attribute)
+            entry = self._entries[name] = _import_name(entry)
         return entry
 
 
@@ -105,6 +171,7 @@ LEARNERS = Registry(
     "agent.learner",
     {"dqn": "edqn_jax.learn.dqn.learner:DQN", "pqn": "edqn_jax.learn.pqn.learner:PQN"},
     {"dqn": "from a replay", "pqn": "from fresh rollouts (options `pqn.*`)"},
+    take=instance_of("an edqn_jax.learn.learner.Learner", "edqn_jax.learn.learner:Learner"),
 )
 """How the network that chooses moves learns: `edqn_jax.learn.learner.Learner`."""
 
@@ -113,6 +180,7 @@ NETWORKS = Registry(
     "agent.network",
     {"mlp": "edqn_jax.learn.qnetwork:QNetwork"},
     {"mlp": "ReLU layers of `agent.hidden`"},
+    take=module_made_of("config, moves"),
 )
 """Q-networks: a flax module, made of `AgentConfig` and the number of moves, that maps stacked observations
 [..., history x observation] to a value of each move [..., moves]."""
@@ -131,6 +199,7 @@ ENCODERS = Registry(
         "joined",
         "pooled": "the paper's sum over all events, without the own motion",
     },
+    take=module_made_of("config, height, width"),
 )
 """Encoders of the VAE: a flax module, made of `EncoderConfig` and of the image's height and width, that maps events or
 pictures and the own motion to mean and log-variance of the code, each [..., code_size]."""
@@ -160,6 +229,7 @@ SENSORS = Registry(
         "depth-motion": "that and how it changes by the obstacles' own motion",
         "ranges": "the true free distance along each move",
     },
+    take=instance_of("an edqn_jax.Sensor", "edqn_jax.sim.sensors.sensor:Sensor"),
 )
 """What a drone sees of the world: `edqn_jax.sim.sensors.sensor.Sensor`. `events` is the method's; the others are
 compared with it at the same budget."""
@@ -185,6 +255,12 @@ FAMILIES = Registry(
         "mixed": "all six, a quarter of them open",
         "moving": "medium ones in which obstacles move",
     },
+    take=instance_of(
+        "an edqn_jax.Family, or a Mixture of some",
+        "edqn_jax.sim.worlds.families:Family",
+        "edqn_jax.sim.worlds.families:Mixture",
+    ),
+    reserved=("paper",),
 )
 """Random worlds: `edqn_jax.sim.worlds.families.Family`, or a `Mixture` of some."""
 
@@ -194,8 +270,9 @@ AIRFRAMES = Registry(
     "drone.airframe",
     {"skydio_x2": "edqn_jax.sim.physics.airframe:SKYDIO_X2"},
     {"skydio_x2": "the Skydio X2"},
+    take=existing_file,
 )
-"""Quadrotors: the `pathlib.Path` of an MJCF file of one free body and four motors, as `sim/physics/skydio_x2.xml`."""
+"""Quadrotors: the path of an MJCF file of one free body and four motors, as `sim/physics/skydio_x2.xml`."""
 
 _SHAPES = "edqn_jax.sim.scene.shapes"
 
@@ -211,6 +288,7 @@ SHAPES = Registry(
         "tilted_cylinders": f"{_SHAPES}.tilted_cylinder:TILTED_CYLINDER",
         "planes": f"{_SHAPES}.plane:PLANE",
     },
+    take=instance_of("an edqn_jax.ShapeKind", f"{_SHAPES}.kind:ShapeKind"),
 )
 """Each kind of shape is an `edqn_jax.sim.scene.shapes.kind.ShapeKind`. A geom is read by the first that takes it."""
 
@@ -227,6 +305,7 @@ ACTION_SETS = Registry(
         "velocity": "[-1, 1]^3 times it",
         "body-rates": "thrust and rates about the body's axes",
     },
+    take=instance_of("an edqn_jax.sim.task.action_sets.ActionSet", "edqn_jax.sim.task.action_sets:ActionSet"),
 )
 """What actions are and what they command: `edqn_jax.sim.task.action_sets.ActionSet`."""
 

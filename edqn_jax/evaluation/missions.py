@@ -23,7 +23,7 @@ from edqn_jax.sim.task import group
 from edqn_jax.sim.task.crossing import crossing_missions, own_crossings
 from edqn_jax.sim.task.env import EnvParams, scene_of
 from edqn_jax.sim.task.missions import Missions, own_missions, random_missions, spread_missions
-from edqn_jax.sim.task.reward import Reward
+from edqn_jax.sim.task.reward import Reward, check_reward
 from edqn_jax.sim.worlds import families
 from edqn_jax.sim.worlds.free_points import Cells, cells_of, free_point
 
@@ -47,7 +47,12 @@ class MissionSet:
         return scene_of(self.env_params, jnp.asarray(mission))
 
     def with_reward(self, reward: Reward | None) -> MissionSet:
-        """Returns the same missions with this reward; None is the configured one."""
+        """Returns the same missions with this reward; None is the configured one.
+
+        Raises:
+            ConfigError: if the reward takes anything but a transition.
+        """
+        check_reward(reward)
         return dataclasses.replace(self, env_params=dataclasses.replace(self.env_params, reward=reward))
 
     def mjcf(self) -> list[str]:

@@ -21,7 +21,7 @@ from flax import struct
 from jax import Array
 
 from edqn_jax.config import FAMILIES, Config
-from edqn_jax.config.loading import make_config
+from edqn_jax.config.loading import check_config, make_config
 from edqn_jax.devices.jax_settings import as_tested
 from edqn_jax.errors import ConfigError
 from edqn_jax.learn.actor import AgentActor, PolicyParams
@@ -215,6 +215,7 @@ def make(
     Raises:
         ConfigError: if the arguments do not fit each other, or the world cannot be flown.
     """
+    check_config(config)
     if observation not in get_args(Kind):
         raise ConfigError(f"observation must be one of {', '.join(get_args(Kind))}, not '{observation}'")
     if (policy is not None) != (observation == "code"):

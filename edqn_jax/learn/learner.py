@@ -13,7 +13,7 @@ learner asks for, one ring for each of S logical shards with E environments each
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -23,6 +23,7 @@ from jax import Array
 from edqn_jax.config import Config
 from edqn_jax.config.registry import LEARNERS
 from edqn_jax.learn import replay
+from edqn_jax.user_code import check_functions
 
 State = Any
 """Parameters and optimisers of a learner, a pytree; the same on every device."""
@@ -31,7 +32,26 @@ Params = Any
 """Parameters that fly, a pytree."""
 
 Metrics = dict[str, Array]
-"""[] float32 by name, NaN where nothing was learnt; `metrics.jsonl` and the live display show them."""
+"""[] float32 by name, NaN where nothing was learnt; `metrics.jsonl`, the live display and the figures show them."""
+
+RUN_METRICS = (
+    *("phase", "decisions", "decisions_per_second", "episodes", "success_rate", "mean_return", "diverged"),
+    *("skipped_updates", "warm_up", "validation_success", "validation_mission", "validation_spl"),
+)
+"""What `metrics.jsonl` has of every run, whatever learns in it."""
+
+VAE_METRICS = ("reconstruction_loss", "kl")
+"""What it has of perception."""
+
+
+def learner_metrics(rows: Iterable[Mapping[str, Any]]) -> list[str]:
+    """Returns the names of the learner's own numbers in lines of `metrics.jsonl`, in the order in which they come."""
+    own: dict[str, None] = {}
+    for row in rows:
+        for name, value in row.items():
+            if name not in (*RUN_METRICS, *VAE_METRICS) and isinstance(value, int | float):
+                own[name] = None
+    return list(own)
 
 
 class Exploration(NamedTuple):
@@ -102,6 +122,27 @@ class Learner:
     """Returns the parameters that learn, which are watched for numbers that are not finite."""
     policy: Callable[[State], Params]
     """Returns the parameters that fly."""
+
+    def __post_init__(self) -> None:
+        """Checks what each function takes.
+
+        Raises:
+            ConfigError: names the function and its arguments.
+        """
+        check_functions(
+            self,
+            {
+                "init": "config, key",
+                "act": "config, state, memory, keys, exploration",
+                "decide": "config, params, memory",
+                "ring_length": "config",
+                "starts": "config",
+                "updates": "config, number",
+                "update": "config, axis, state, rings, after",
+                "network": "state",
+                "policy": "state",
+            },
+        )
 
 
 def learner_of(config: Config) -> Learner:

@@ -60,7 +60,7 @@ def init_q(config: AgentConfig, observation_size: int, actions: int, key: Array)
         ConfigError: if the network does not map `[history * observation_size]` to `[actions]`, or has other variables.
     """
     inputs, network = jnp.zeros(config.history * observation_size), network_of(config, actions)
-    params = init_params(network, f"the network '{config.network}'", key, inputs)
+    params = init_params(network, f"the network '{config.network}'", key, x=inputs)
     values = jax.eval_shape(network.apply, {"params": params}, inputs)
     if jnp.shape(values) != (actions,):
         raise ConfigError(

@@ -78,7 +78,7 @@ class Trainer:
 
     def _each(self, function: Callable[..., Any], *axes: int | None) -> Callable[..., Any]:
         """Returns `function(world, *arguments)` for all agents; `axes` are those of the other arguments."""
-        if self.agents is None:
+        if self.agents is None:  # K = 1 computes the same bits, and compiles an eighth to a fifth longer
             return function
         missions = dataclasses.replace(self.env_params, airframe=None, pool=None, missions=0, distances=None)
         return jax.vmap(function, in_axes=(missions, *axes))

@@ -18,7 +18,7 @@ from edqn_jax.checks import is_finite
 from edqn_jax.config import Config
 from edqn_jax.keys import split_each
 from edqn_jax.learn import samples
-from edqn_jax.learn.learner import Metrics, State, UpdateStats, learner_of
+from edqn_jax.learn.learner import VAE_METRICS, Metrics, State, UpdateStats, learner_of
 from edqn_jax.learn.perception import embedding, vae
 from edqn_jax.learn.qnetwork import Params, skip_nonfinite
 from edqn_jax.learn.samples import Samples
@@ -26,8 +26,6 @@ from edqn_jax.learn.schedule import Schedule
 from edqn_jax.native.all_sum import all_sum
 from edqn_jax.sim.sensors.sensor import sensor_of
 from edqn_jax.sim.task.task import task_of
-
-VAE_METRICS = ("reconstruction_loss", "kl")
 
 
 @struct.dataclass

@@ -12,8 +12,9 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from edqn_jax.checks import tree_form
 from edqn_jax.config import Config
-from edqn_jax.config.loading import make_config, suggest_nearest
+from edqn_jax.config.loading import check_config, make_config, suggest_nearest
 from edqn_jax.errors import ConfigError
 from edqn_jax.learn.actor import Actor, AgentActor
 from edqn_jax.learn.policy import Policy
@@ -21,7 +22,7 @@ from edqn_jax.policies import function_named
 from edqn_jax.sim.actions import Discrete
 from edqn_jax.sim.task.action_sets import action_of, action_set, clip_action
 from edqn_jax.sim.task.env import Observation
-from edqn_jax.user_code import load_module
+from edqn_jax.user_code import check_takes, load_module
 
 Function = Callable[[Observation, Any, Array], tuple[Any, Any]]
 """(observation of one drone, memory, key consumed) → action, memory for the next observation; traced by JAX."""
@@ -73,7 +74,7 @@ class FunctionActor(Actor):
         if not (isinstance(result, tuple) and len(result) == 2):
             raise ConfigError(f"a policy is {TAKES}; this one returned {type(result).__name__}")
         action, after = result
-        before, now = _form(memory), _form(after)
+        before, now = tree_form(memory), tree_form(after)
         if before != now:
             raise ConfigError(
                 f"a policy's function must return a memory like the one that it is given, {before}, not {now}; "
@@ -102,16 +103,6 @@ def _line_of(error: Exception) -> str:
     return ""
 
 
-def _form(memory: Any) -> str:
-    """Returns what a memory is made of, in words: types and shapes of its arrays, and how they are held together."""
-    leaves, tree = jax.tree.flatten(memory)
-    arrays = [jnp.asarray(leaf) for leaf in leaves]
-    text = str(tree).removeprefix("PyTreeDef(").removesuffix(")")
-    for each in arrays:
-        text = text.replace("*", f"{each.dtype}{list(each.shape)}", 1)
-    return text
-
-
 @dataclasses.dataclass(frozen=True)
 class FunctionPolicy:
     """A policy that is a function, for `evaluate`, `record` and `write_report`.
@@ -132,8 +123,10 @@ class FunctionPolicy:
         """Checks what can be checked before it flies.
 
         Raises:
-            ConfigError: if the function or `memory` cannot be called, or the function has no hash.
+            ConfigError: if the function or `memory` cannot be called, the function has no hash or other arguments, or
+                `config` is no configuration.
         """
+        check_config(self.config)
         if not callable(self.function) or isinstance(self.function, type):
             raise ConfigError(f"a policy is {TAKES}, not {self.function!r}")
         try:
@@ -144,6 +137,9 @@ class FunctionPolicy:
             ) from None
         if self.memory is not None and not callable(self.memory):
             raise ConfigError(f"memory must be a function that returns the first memory, not {self.memory!r}")
+        check_takes(self.function, "observation, memory, key", "a policy")
+        if self.memory is not None:
+            check_takes(self.memory, "", "memory")
 
     @property
     def params(self) -> None:

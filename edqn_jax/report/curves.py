@@ -12,7 +12,14 @@ from matplotlib.collections import PathCollection
 from matplotlib.figure import Figure
 from matplotlib.ticker import EngFormatter, PercentFormatter
 
+from edqn_jax.learn.learner import VAE_METRICS, learner_metrics
 from edqn_jax.report.style import INK, LINE, OUTCOME_COLOURS, OUTCOME_LABELS, SECOND_LINE, open_figure
+
+KNOWN = {"epsilon": "Exploration", "q_loss": "Q loss (Eq. 9)", "mean_q": "Mean of Q"}
+"""Metrics of the package's learners, in the order in which they are drawn, and their titles."""
+
+MAX_OWN = 6
+"""Other metrics of a learner that are drawn, the first ones."""
 
 
 def plot_returns(episodes: Mapping[str, np.ndarray], file: Path) -> Figure:
@@ -53,43 +60,71 @@ def plot_returns(episodes: Mapping[str, np.ndarray], file: Path) -> Figure:
 
 
 def plot_learning(metrics: Sequence[Mapping[str, Any]], file: Path) -> Figure:
-    """Draws success, exploration and losses over decisions, written to `file` as PNG.
+    """Draws success, the learner's metrics and the VAE's losses over decisions, written to `file` as PNG.
 
     Args:
         metrics: the lines of `metrics.jsonl`: `decisions`, and whatever a line has of `success_rate`,
-            `validation_success`, `epsilon`, `q_loss`, `reconstruction_loss`, `kl` and `warm_up`.
+            `validation_success`, `reconstruction_loss`, `kl` and `warm_up`. What else is a number is the learner's,
+            and each of these has axes of its own, the first `MAX_OWN` of them.
         file: PNG to write.
     """
-    with open_figure(7.0, 4.4, file) as figure:
-        (success, exploration), (q_loss, vae) = figure.subplots(2, 2)
-        exploration.sharex(success)
-        q_loss.sharex(success)  # the VAE may learn for a short while only, so its axis is its own
+    own = [name for name in learner_metrics(metrics) if name not in KNOWN]
+    named = {name for row in metrics for name in row if row[name] is not None}
+    shown = [name for name in KNOWN if name in named] + own[:MAX_OWN]
+    vae = [name for name in VAE_METRICS if name in named or "warm_up" in named]
+    rows = max(2, -(-(1 + len(shown) + bool(vae)) // 2))
+    with open_figure(7.0, 2.2 * rows, file) as figure:
+        free = list(figure.subplots(rows, 2).flat)
+        success = free.pop(0)
         _line(success, metrics, "success_rate", LINE, "training episodes")
         _line(success, metrics, "validation_success", SECOND_LINE, "validation missions, greedy", marker="o")
         success.set_title("Success")
         success.set_ylim(-0.03, 1.03)
         success.yaxis.set_major_formatter(PercentFormatter(1.0))
-        _line(exploration, metrics, "epsilon", LINE, "ε")
-        exploration.set_title("Exploration")
-        exploration.set_ylabel("share of random actions ε")
-        exploration.set_ylim(-0.03, 1.03)
-        _line(q_loss, metrics, "q_loss", LINE, "Q-network")
-        q_loss.set_title("Q loss (Eq. 9)")
-        fine = _each_step(metrics)
-        _line(vae, fine, "reconstruction_loss", LINE, "reconstruction", broken=True)
-        _line(vae, fine, "kl", SECOND_LINE, "KL, before its weight", broken=True)
-        vae.set_title("VAE loss (reconstruction + KL)")
-        success.xaxis.set_major_formatter(EngFormatter(sep=""))
-        for axes in (q_loss, vae):
-            if any(np.any(np.asarray(line.get_ydata()) > 0) for line in axes.get_lines()):
-                axes.set_yscale("log")
-            axes.set_xlabel("decisions")
+        drawn = [success]
+        for name in shown:
+            drawn.append(free.pop(0))
+            drawn[-1].sharex(success)
+            _plot_metric(drawn[-1], metrics, name)
+        if vae:
+            drawn.append(free.pop(0))
+            _plot_vae(drawn[-1], metrics)  # it may learn for a short while only, so its axis is its own
+        for axes in drawn:
             axes.xaxis.set_major_formatter(EngFormatter(sep=""))
-        vae.set_visible(bool(vae.get_lines()))  # not every sensor has one
-        for axes in (success, vae):
-            if axes.get_lines():
-                axes.legend(loc="best")
+        for axes in drawn[-2:]:
+            axes.set_xlabel("decisions")
+        for axes in free:
+            axes.set_visible(False)
+        if success.get_lines():
+            success.legend(loc="best")
     return figure
+
+
+def _plot_metric(axes: Axes, metrics: Sequence[Mapping[str, Any]], name: str) -> None:
+    """Draws a metric of the learner over decisions."""
+    _line(axes, metrics, name, LINE, name)
+    axes.set_title(KNOWN.get(name, name.replace("_", " ")))
+    if name == "epsilon":
+        axes.set_ylabel("share of random actions ε")
+        axes.set_ylim(-0.03, 1.03)
+    elif name == "q_loss":
+        _scale_logarithmically(axes)
+
+
+def _plot_vae(axes: Axes, metrics: Sequence[Mapping[str, Any]]) -> None:
+    """Draws the VAE's losses over decisions, in the warm-up those of each step."""
+    fine = _each_step(metrics)
+    _line(axes, fine, "reconstruction_loss", LINE, "reconstruction", broken=True)
+    _line(axes, fine, "kl", SECOND_LINE, "KL, before its weight", broken=True)
+    axes.set_title("VAE loss (reconstruction + KL)")
+    _scale_logarithmically(axes)
+    if axes.get_lines():
+        axes.legend(loc="best")
+
+
+def _scale_logarithmically(axes: Axes) -> None:
+    if any(np.any(np.asarray(line.get_ydata()) > 0) for line in axes.get_lines()):
+        axes.set_yscale("log")
 
 
 def running_mean(values: np.ndarray, window: int) -> np.ndarray:

@@ -14,6 +14,7 @@ from rich.table import Table
 from rich.text import Text
 
 from edqn_jax.evaluation.metrics import format_duration
+from edqn_jax.learn.learner import learner_metrics
 
 SHOWN = {
     "decisions_per_second": ("decisions/s", "{:,.0f}"),
@@ -23,10 +24,15 @@ SHOWN = {
     "mean_return": ("return", "{:.1f}"),
     "epsilon": ("ε", "{:.2f}"),
     "q_loss": ("Q loss", "{:.3g}"),
+    "mean_q": ("mean Q", "{:.3g}"),
     "reconstruction_loss": ("reconstruction", "{:.3g}"),
     "kl": ("KL", "{:.3g}"),
 }
-"""Metrics that are shown, in this order: name in `metrics.jsonl`, label and format."""
+"""Metrics that are shown, in this order: name in `metrics.jsonl`, label and format. Others of a learner come after
+them by their names."""
+
+MAX_OWN = 6
+"""Metrics of a learner that are shown by their names, the first ones."""
 
 LASTING = ("episodes", "success_rate", "validation_success", "mean_return")
 """Metrics that stay on show until a newer value comes; the others vanish where a chunk has none."""
@@ -66,7 +72,7 @@ class Progress:
             self.message(f"[{format_duration(self.elapsed_s)}] {name}")
 
     def update(self, metrics: Mapping[str, Any]) -> None:
-        """Takes in new values: `phase`, `decisions`, and any of `SHOWN`; others are not shown."""
+        """Takes in new values: `phase`, `decisions`, any of `SHOWN`, and what else a learner tells."""
         lasting = {key: self._metrics[key] for key in LASTING if key in self._metrics}
         self._metrics = lasting | {key: value for key, value in metrics.items() if value is not None}
         self._phase = str(metrics.get("phase", self._phase))
@@ -113,9 +119,11 @@ class Progress:
         return format_duration(max(left - (time.monotonic() - (self._updated or (0.0, 0))[0]), 0.0))
 
     def _values(self) -> list[tuple[str, str]]:
+        own = [name for name in learner_metrics([self._metrics]) if name not in SHOWN][:MAX_OWN]
+        shown = SHOWN | {name: (name.replace("_", " "), "{:.3g}") for name in own}
         return [
             (label, form.format(float(self._metrics[name])))
-            for name, (label, form) in SHOWN.items()
+            for name, (label, form) in shown.items()
             if name in self._metrics
         ]
 

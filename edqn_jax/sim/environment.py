@@ -20,7 +20,7 @@ from jax import Array
 from jax.typing import ArrayLike
 
 from edqn_jax.config import FAMILIES, SENSORS, Config
-from edqn_jax.config.loading import make_config
+from edqn_jax.config.loading import check_config, make_config
 from edqn_jax.devices.forks import check_not_forked
 from edqn_jax.devices.jax_settings import as_tested
 from edqn_jax.devices.sums import check_default_sums
@@ -38,7 +38,7 @@ from edqn_jax.sim.task.action_sets import action_of
 from edqn_jax.sim.task.env import EnvParams, EnvState, Step
 from edqn_jax.sim.task.missions import own_missions
 from edqn_jax.sim.task.observation import Observation
-from edqn_jax.sim.task.reward import Reward
+from edqn_jax.sim.task.reward import Reward, check_reward
 from edqn_jax.sim.task.task import task_of
 from edqn_jax.sim.worlds.families import SPLITS, Split, world_of_file, worlds_of
 
@@ -195,6 +195,8 @@ def make(
     """
     check_not_forked()
     check_default_sums()
+    check_config(config)
+    check_reward(reward)
     name = str(world) if world is not None else (config or Config()).world.name
     config = make_config(name) if config is None else config
     group.check_alone(config, "edqn_jax.make")

@@ -10,10 +10,9 @@ import numpy as np
 
 from edqn_jax.config import Config
 from edqn_jax.errors import DivergedError
-from edqn_jax.learn.learner import learner_of
+from edqn_jax.learn.learner import VAE_METRICS, learner_of
 from edqn_jax.learn.schedule import Schedule
 from edqn_jax.learn.state import Episodes, Health, Losses
-from edqn_jax.learn.updates import VAE_METRICS
 from edqn_jax.sim.task.outcomes import Outcome
 
 MAX_DIVERGED_STEPS = 100

@@ -16,7 +16,7 @@ import jax
 import numpy as np
 
 from edqn_jax.config import Config
-from edqn_jax.config.loading import make_config
+from edqn_jax.config.loading import check_config, make_config
 from edqn_jax.devices import processes
 from edqn_jax.devices.jax_settings import as_tested
 from edqn_jax.evaluation.missions import MissionSet, RunMissions
@@ -127,7 +127,7 @@ def train(
         DivergedError: if numbers are not finite for so long that nothing is learnt any more.
         CheckError: with `train.debug`, at the first fault.
     """
-    with set_up_training(config or make_config(), reward) as preparation:
+    with set_up_training(_given(config), reward) as preparation:
         return run_chunks(preparation, callback)[0]
 
 
@@ -140,8 +140,13 @@ def train_seeds(
     Args:
         seeds: how many; they are `train.seed`, `train.seed + 1` and so on.
     """
-    with set_up_training(config or make_config(), reward, agents=seeds) as preparation:
+    with set_up_training(_given(config), reward, agents=seeds) as preparation:
         return run_chunks(preparation, callback)
+
+
+def _given(config: Config | None) -> Config:
+    check_config(config)
+    return make_config() if config is None else config
 
 
 def run_chunks(

@@ -31,8 +31,9 @@ from edqn_jax.planning.astar import Path as ShortestPath
 from edqn_jax.planning.astar import shortest_path
 from edqn_jax.sim.task.env import EnvParams, check_sensor
 from edqn_jax.sim.task.flights import Flights
-from edqn_jax.sim.task.reward import Reward
+from edqn_jax.sim.task.reward import Reward, check_reward
 from edqn_jax.sim.worlds import geodesic
+from edqn_jax.training.learner_check import check_learner
 
 
 class Display(Protocol):
@@ -68,11 +69,13 @@ class TrainingSetup:
         Raises:
             ConfigError: if the configuration is invalid, the world cannot be flown, or memory is too small.
         """
+        check_reward(reward)
         config = config_for_reward(config, reward)
         self.configs = _agent_configs(config, agents)
         for each in self.configs:
             validate(each)
             check_learns(each)
+        check_learner(config)
         self.config, self.display, self.pool, self.began = config, display, pool, time.perf_counter()
         display.phase("preparing worlds")
         self.devices = choose_devices(1 if config.train.debug else config.train.devices, config.train.shards)

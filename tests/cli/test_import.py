@@ -49,7 +49,7 @@ def test_help_lists_what_a_file_or_a_module_registers_and_a_run_takes_it(tmp_pat
         (
             "twice.py",
             2 * SENSOR,
-            "'twice.py' does not load: there is a sensor 'mine' already; give yours another name, l",
+            "'twice.py' does not load: the sensor 'mine' is there already; give yours another name, l",
         ),
         ("fails.py", "raise ValueError('two\\nlines')", "'fails.py' does not load: ValueError: two\\nlines, line 1"),
     ],

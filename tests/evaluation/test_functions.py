@@ -223,6 +223,22 @@ class Unhashable:
         return "up", memory
 
 
+@pytest.mark.parametrize("function", [lambda: 0, lambda observation: 0, lambda o, m, k, more: (0, m)])
+def test_a_function_with_other_arguments_is_refused_where_it_is_given(function: Any) -> None:
+    with pytest.raises(ConfigError, match=r"^a policy must be a function \(observation, memory, key\), not one of \("):
+        edqn_jax.evaluate(function)
+    with pytest.raises(ConfigError, match=r"^memory must be a function \(\), not one of \(key\)$"):
+        FunctionPolicy(lambda o, m, k: (0, m), memory=lambda key: 0)  # type: ignore[arg-type, misc]
+
+
+def test_what_a_function_raises_itself_is_not_changed() -> None:
+    def fails(observation: Observation, memory: Any, key: jax.Array) -> Any:
+        raise KeyError("my own")
+
+    with pytest.raises(KeyError, match="my own"):
+        flown(fails)
+
+
 @pytest.mark.parametrize("thing", [3, Config, "ahead"])
 def test_what_is_no_policy_is_refused(thing: Any) -> None:
     with pytest.raises(ConfigError, match="a policy is a function"):

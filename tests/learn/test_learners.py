@@ -11,7 +11,7 @@ import pytest
 
 from edqn_jax.config import Config
 from edqn_jax.config.loading import make_config
-from edqn_jax.config.registry import LEARNERS, Registry
+from edqn_jax.config.registry import LEARNERS
 from edqn_jax.config.rules import validate
 from edqn_jax.errors import ConfigError
 from edqn_jax.learn.dqn.learner import DQN
@@ -96,18 +96,3 @@ def test_a_learner_that_there_is_not_is_answered_with_the_nearest():
     wrong = dataclasses.replace(config, agent=dataclasses.replace(config.agent, learner="pqm"))
     with pytest.raises(ConfigError, match="agent.learner: there is no learner 'pqm'; did you mean 'pqn'?"):
         validate(wrong)
-
-
-def test_a_name_that_is_taken_or_no_name_is_refused():
-    registry = Registry("thing", "a.thing", {"one": "edqn_jax.errors:ConfigError"})
-    assert registry.get("one") is ConfigError
-    with pytest.raises(ConfigError, match="there is a thing 'one' already"):
-        registry.register("one", 1)
-    with pytest.raises(ConfigError, match="letters, digits, - and _, not 'a b'"):
-        registry.register("a b", 1)
-    registry.register("two-of-them", 2)
-    assert registry.names == ("one", "two-of-them") and registry.get("two-of-them") == 2
-    with pytest.raises(
-        ConfigError, match="there is no thing 'xyz'; known are one, two-of-them, or one that --import registers$"
-    ):
-        registry.check("xyz")

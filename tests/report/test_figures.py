@@ -214,6 +214,17 @@ def test_learning_shows_each_metric_where_a_line_has_it(tmp_path):
     }
 
 
+def test_metrics_of_a_learner_of_ones_own_have_axes_and_what_it_lacks_has_none(tmp_path):
+    many = {f"number_{i}": 1.0 for i in range(9)}
+    metrics = [{"decisions": 100 * i, "phase": "training", "temperature": 1.0 / i} | many for i in range(1, 5)]
+    figure = plot_learning(metrics, tmp_path / "learning.png")
+    assert is_png(tmp_path / "learning.png")
+    titles = [axes.get_title("left") for axes in figure.axes if axes.get_visible()]
+    assert titles == ["Success", "temperature", *(f"number {i}" for i in range(5))]
+    (line,) = figure.axes[1].get_lines()
+    np.testing.assert_allclose(np.asarray(line.get_ydata()), [1, 1 / 2, 1 / 3, 1 / 4])
+
+
 def test_the_warm_up_is_a_curve_of_its_training_steps(tmp_path):
     steps = {"decisions": [10, 20, 30], "reconstruction_loss": [9.0, 6.0, 4.0], "kl": [1.0, 2.0, 3.0]}
     metrics = [{"decisions": 40, "reconstruction_loss": 6.3, "kl": 2.0, "warm_up": steps}]

@@ -52,6 +52,23 @@ def test_a_loss_that_a_chunk_does_not_have_is_not_shown_again():
     assert "validation 50.0%" in second
 
 
+@pytest.mark.parametrize("terminal", [False, True])
+def test_what_a_learner_of_ones_own_tells_is_shown_by_its_name(terminal: bool) -> None:
+    out = io.StringIO()
+    progress = Progress(Console(file=out, force_terminal=terminal, width=160), every_s=0.0)
+    progress.phase("training", total=1000)
+    many = {f"number_{i}": i for i in range(9)}
+    progress.update(
+        {"phase": "training", "decisions": 100, "diverged": 7, "warm_up": {"kl": [1.0]}, "validation_spl": 0.5}
+        | {"soft_temperature": 0.125, "q_loss": None, "words": "none"}
+        | many
+    )
+    progress.stop()
+    text = out.getvalue()
+    assert "soft temperature" in text and "0.125" in text and "number 4" in text and "number 5" not in text
+    assert not any(word in text for word in ("Q loss", "diverged", "spl", "warm", "words"))
+
+
 def test_the_estimate_is_made_of_training_alone(monkeypatch):
     """A warm-up at 1 decision a second and a retraining at 2 do not count: 600 decisions left at 10 a second."""
     now, out = [0.0], io.StringIO()

@@ -6,6 +6,7 @@ import dataclasses
 import importlib.util
 import sys
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -13,10 +14,13 @@ import mujoco
 import numpy as np
 import pytest
 
+import edqn_jax
 from edqn_jax.config import Config
 from edqn_jax.config.loading import make_config
+from edqn_jax.errors import ConfigError
 from edqn_jax.evaluation.judge import clearance, load_judge
 from edqn_jax.evaluation.missions import load_missions
+from edqn_jax.interop import functional
 from edqn_jax.runs.provenance import reward_record
 from edqn_jax.sim.actions import ACTIONS
 from edqn_jax.sim.scene.mjcf import scenes_folder
@@ -38,6 +42,43 @@ class Bonus:
     def __call__(self, transition):
         return transition.configured + {}
 """
+
+
+@pytest.mark.parametrize("reward", [lambda: 0.0, lambda before, after: 0.0, "sparse"])
+def test_what_cannot_be_a_reward_is_refused_where_it_is_given(reward: Any) -> None:
+    for give in (
+        lambda: edqn_jax.make("paper", reward=reward),
+        lambda: edqn_jax.train(CONFIG, reward=reward),
+        lambda: functional.make("paper", CONFIG, observation="kinematics", reward=reward),
+    ):
+        with pytest.raises(ConfigError, match=r"^a reward must be a function \(transition\), not "):
+            give()
+
+
+@pytest.mark.parametrize(
+    ("returned", "told"),
+    [
+        (None, "None"),
+        ("high", "'high'"),
+        (jnp.zeros(3), r"an array of shape \(3,\)"),
+        ([1.0], "an object of"),
+    ],
+)
+def test_a_reward_that_returns_no_number_is_told_so(returned: Any, told: str) -> None:
+    environment = edqn_jax.make("paper", CONFIG, reward=lambda transition: returned)
+    state, _ = environment.reset()
+    with pytest.raises(ConfigError, match=rf"^a reward must return one number, a float32 \[\], not {told}"):
+        environment.step(state, "up")
+
+
+def test_what_a_reward_raises_itself_is_not_changed() -> None:
+    def mine(transition: Transition) -> Any:
+        raise KeyError("my own")
+
+    environment = edqn_jax.make("paper", CONFIG, reward=mine)
+    state, _ = environment.reset()
+    with pytest.raises(KeyError, match="my own"):
+        environment.step(state, "up")
 
 
 @pytest.mark.slow

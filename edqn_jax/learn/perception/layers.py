@@ -18,6 +18,7 @@ from jax import Array
 from jax.nn.initializers import lecun_normal, zeros
 
 from edqn_jax.errors import ConfigError
+from edqn_jax.user_code import check_takes, describe_object
 
 ROWS_OF_A_PART = 16_384
 """Rows that a part of a kernel's gradient sums over: a GPU takes several parts at once. Where the rows do not divide
@@ -39,16 +40,19 @@ class Dense(nn.Module):
         return add_shared(y, self.param("bias", self.bias_init, (self.features,))) if self.use_bias else y
 
 
-def init_params(module: nn.Module, name: str, key: Array, *inputs: Any) -> Any:
-    """Returns fresh parameters of a module for such inputs.
+def init_params(module: Any, name: str, key: Array, **inputs: Any) -> Any:
+    """Returns fresh parameters of a module for such inputs, which are given by their place.
 
     Args:
         name: of the module, for messages.
 
     Raises:
-        ConfigError: if the module has variables of other kinds.
+        ConfigError: if it is no module, takes other inputs, or has variables of other kinds.
     """
-    variables = module.init(key, *inputs)
+    if not isinstance(module, nn.Module):
+        raise ConfigError(f"{name} must be a flax module, and what makes it returned {describe_object(module)}")
+    check_takes(module, ", ".join(inputs), f"`__call__` of {name}")
+    variables = module.init(key, *inputs.values())
     if set(variables) != {"params"}:
         others = ", ".join(sorted(set(variables) - {"params"}))
         raise ConfigError(f"{name} must have parameters{f' alone, not {others}' if others else ''}")

@@ -157,7 +157,7 @@ def init_vae(
     silent = EventField(nothing, nothing.astype(jnp.int8), when, when, window_s=1.0)
     blank = silent if form is Form.EVENTS else when
     encoder, name = _encoder(config, blank), f"the encoder '{config.architecture}'"
-    params = init_params(encoder, name, key_encoder, blank, jnp.zeros(MOTION_SIZE))
+    params = init_params(encoder, name, key_encoder, sensed=blank, motion=jnp.zeros(MOTION_SIZE))
     two = jax.tree.map(lambda x: jnp.stack([x, x]), (blank, jnp.zeros(MOTION_SIZE)))
     shapes = jax.tree.map(jnp.shape, jax.eval_shape(encoder.apply, {"params": params}, *two))
     if shapes != 2 * ((2, config.code_size),):

@@ -33,11 +33,12 @@ Shown = str | Path | Policy | FunctionPolicy | Function
 
 
 @as_tested
-def write_report(policies: Sequence[Shown], file: str | Path, *, missions: int = 128) -> None:
+def write_report(policies: Shown | Sequence[Shown], file: str | Path, *, missions: int = 128) -> None:
     """Writes the page of runs and policies as one HTML file, which replaces a file of that name.
 
     Args:
-        policies: folders of runs, `pretrained`, policies, and functions, see `FunctionPolicy`.
+        policies: folders of runs, `pretrained`, policies, and functions, see `FunctionPolicy`; one, or several in a
+            list.
         file: to write.
         missions: flights of each at most; of all together at most `MAX_FLIGHTS`.
 
@@ -46,9 +47,10 @@ def write_report(policies: Sequence[Shown], file: str | Path, *, missions: int =
             page, or the file cannot be written.
     """
     check_can_write(Path(file))
-    if not policies or missions < 1:
-        raise ConfigError(f"a report needs a policy and at least 1 of its missions, not {len(policies)} and {missions}")
-    write_atomically(Path(file), build_report(policies, missions).encode())
+    shown: list[Any] = list(policies) if isinstance(policies, Sequence) and not _is_name(policies) else [policies]
+    if not shown or missions < 1:
+        raise ConfigError(f"a report needs a policy and at least 1 of its missions, not {len(shown)} and {missions}")
+    write_atomically(Path(file), build_report(shown, missions).encode())
 
 
 def build_report(shown: Sequence[Shown], most: int, message: Callable[[str], None] = lambda _: None) -> str:
@@ -80,7 +82,7 @@ def build_report(shown: Sequence[Shown], most: int, message: Callable[[str], Non
     return build_html(runs, data)
 
 
-def _is_name(shown: Shown) -> bool:
+def _is_name(shown: Shown | Sequence[Shown]) -> bool:
     return isinstance(shown, str | Path)
 
 

@@ -20,6 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
+from edqn_jax.checks import first_difference
 from edqn_jax.config import CameraConfig, Config
 from edqn_jax.config.registry import SENSORS
 from edqn_jax.errors import ConfigError
@@ -33,6 +34,7 @@ from edqn_jax.sim.scene.shapes.kind import TINY
 from edqn_jax.sim.sensors import events, exposure
 from edqn_jax.sim.sensors.events import EventField, EventMemory
 from edqn_jax.sim.sensors.exposure import FrameMemory
+from edqn_jax.user_code import check_functions, describe_object
 
 Sensed = Any
 """What a sensor shows, an `EventField`, an array, a tree of these, or None; see `Sensor.shape`."""
@@ -92,6 +94,23 @@ class Sensor:
     """How what is shown is drawn; None where it is not."""
     mirror: Callable[[Array], Array] = flip_left_right
     """Returns pictures [..., C, H, W], or images of events, as they would be with left and right exchanged."""
+
+    def __post_init__(self) -> None:
+        """Checks what each function takes.
+
+        Raises:
+            ConfigError: names the function and its arguments.
+        """
+        check_functions(
+            self,
+            {
+                "show": "config, scene, poses, memory, key",
+                "shape": "config",
+                "frame_times_s": "config",
+                "at_rest": "config, key",
+                "mirror": "pictures",
+            },
+        )
 
     def encoder_input(self, config: Config, sensed: Sensed) -> EventField | Array | None:
         """Returns what the VAE reads: a field [..., F, H, W], pictures [..., C, H, W] joined, or None."""
@@ -227,18 +246,25 @@ def sensor_of(config: Config) -> Sensor:
     """Returns the sensor that `config` names.
 
     Raises:
-        ConfigError: if there is none of that name, or what was registered is no sensor.
+        ConfigError: if there is none of that name.
     """
-    found = SENSORS.get(config.env.sensor)
-    if not isinstance(found, Sensor):
-        raise ConfigError(f"the sensor '{config.env.sensor}' must be an edqn_jax.Sensor, not {type(found).__name__}")
-    return found
+    return SENSORS.get(config.env.sensor)
 
 
 def frame_steps(config: Config) -> tuple[int, ...]:
-    """Returns the physics steps of a decision, 0..n, after which the sensor needs a pose."""
-    n = config.drone.physics_steps
-    return tuple(n + round(t / config.drone.physics_dt_s) for t in sensor_of(config).frame_times_s(config))
+    """Returns the physics steps of a decision, 0..n, after which the sensor needs a pose.
+
+    Raises:
+        ConfigError: if there is none, or one is before the decision or after it.
+    """
+    n, times = config.drone.physics_steps, sensor_of(config).frame_times_s(config)
+    steps = tuple(n + round(t / config.drone.physics_dt_s) for t in times)
+    if not steps or not 0 <= min(steps) <= max(steps) <= n:
+        raise ConfigError(
+            f"`frame_times_s` of the sensor '{config.env.sensor}' must be times from "
+            f"{-n * config.drone.physics_dt_s:g} to 0 s, relative to the end of a decision, not {times}"
+        )
+    return steps
 
 
 def frames_per_decision(config: Config) -> int:
@@ -287,12 +313,23 @@ def sense(config: Config, scene: Scene, poses: Flight, memory: SensorMemory, key
         key: consumed only by noise.
 
     Raises:
-        ConfigError: if the sensor does not show what its `shape` says.
+        ConfigError: if the sensor does not show what its `shape` says, or returns another memory than it is given.
     """
-    sensor = sensor_of(config)
-    sensed, memory = sensor.show(config, scene, poses, memory, key)
+    sensor, name = sensor_of(config), config.env.sensor
+    shown = sensor.show(config, scene, poses, memory, key)
+    if not (isinstance(shown, tuple) and len(shown) == 2):
+        raise ConfigError(
+            f"`show` of the sensor '{name}' must return what is shown and its memory, not {describe_object(shown)}"
+        )
+    sensed, after = shown
     sensor.check(config, sensed)
-    return sensed, memory
+    difference = first_difference(memory, after)
+    if difference:
+        raise ConfigError(
+            f"`show` of the sensor '{name}' must return a memory like the one that it is given, and {difference}; "
+            "`at_rest` returns the first one"
+        )
+    return sensed, after
 
 
 def last_view(scene: Scene, poses: Flight) -> tuple[Scene, Array, Array]:

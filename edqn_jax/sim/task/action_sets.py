@@ -30,6 +30,7 @@ from edqn_jax.sim.physics import drone
 from edqn_jax.sim.physics.airframe import Airframe
 from edqn_jax.sim.physics.controller import Command, RateCommand, VelocityCommand
 from edqn_jax.sim.physics.drone import DroneState
+from edqn_jax.user_code import check_functions, describe_object
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -44,6 +45,18 @@ class ActionSet:
     direction: Callable[[DroneState, Array], Array]
     """(state after the decision, action) → the commanded direction [3] in the heading frame, each value of order 1:
     the end of the own motion."""
+
+    def __post_init__(self) -> None:
+        """Checks the space, the action that stands still, and what each function takes.
+
+        Raises:
+            ConfigError: names the field and what it must be.
+        """
+        if not isinstance(self.space, Discrete | Box):
+            raise ConfigError(f"`space` of ActionSet must be Discrete or Box, not {describe_object(self.space)}")
+        if not are_actions(self.space, np.asarray(self.still)):
+            raise ConfigError(f"`still` of ActionSet must be {describe_space(self.space)}, not {self.still!r}")
+        check_functions(self, {"command": "config, airframe, state, goal, action", "direction": "state, action"})
 
 
 def action_set(config: Config) -> ActionSet:

@@ -26,7 +26,7 @@ from edqn_jax.sim.task import group
 from edqn_jax.sim.task.action_sets import action_set
 from edqn_jax.sim.task.observation import repeat_pose
 from edqn_jax.sim.task.outcomes import Outcome, Verdict, judge_decision
-from edqn_jax.sim.task.reward import Reward, Transition, configured_reward
+from edqn_jax.sim.task.reward import Reward, Transition, configured_reward, reward_of
 from edqn_jax.sim.worlds import geodesic
 
 
@@ -201,4 +201,4 @@ def _reward(
         outcome=outcome,
         configured=configured,
     )
-    return jnp.asarray(payment.function(transition), jnp.float32)
+    return reward_of(payment.function, transition)

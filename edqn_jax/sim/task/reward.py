@@ -5,11 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import jax.numpy as jnp
+import numpy as np
 from flax import struct
 from jax import Array
 
 from edqn_jax.config import EnvConfig
+from edqn_jax.errors import ConfigError
 from edqn_jax.sim.task.outcomes import Outcome, is_terminal
+from edqn_jax.user_code import check_takes, describe_object
 
 
 @struct.dataclass
@@ -27,6 +30,30 @@ class Transition:
 
 Reward = Callable[[Transition], Array]
 """A user's reward: one decision of one drone to a float32 []; it is traced by JAX and mapped over environments."""
+
+
+def check_reward(function: Reward | None) -> None:
+    """Raises unless a reward can be called with a transition; None is the configured one.
+
+    Raises:
+        ConfigError: says what it must take.
+    """
+    if function is not None:
+        check_takes(function, "transition", "a reward")
+
+
+def reward_of(function: Reward, transition: Transition) -> Array:
+    """Returns the reward [] float32 of a user's function.
+
+    Raises:
+        ConfigError: if it returns anything but one number.
+    """
+    found = function(transition)
+    if not isinstance(found, Array | np.ndarray | np.generic | int | float):
+        raise ConfigError(f"a reward must return one number, a float32 [], not {describe_object(found)}")
+    if jnp.shape(found):
+        raise ConfigError(f"a reward must return one number, a float32 [], not an array of shape {jnp.shape(found)}")
+    return jnp.asarray(found, jnp.float32)
 
 
 def configured_reward(

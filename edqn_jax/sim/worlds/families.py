@@ -23,11 +23,15 @@ from edqn_jax.sim.worlds import canyon, forest, open_worlds, rooms
 from edqn_jax.sim.worlds.looks import with_looks
 from edqn_jax.sim.worlds.moving import MOVING_SHARE, STILL, Bodies, Moving, in_motion
 from edqn_jax.sim.worlds.reachability import has_way
+from edqn_jax.user_code import check_functions, describe_object
 
 RADIUS_M = 0.36
 """Of the sphere that has a way in every random world; the drone's."""
 
 _BATCH = 64  # worlds that are drawn by one call
+
+MAX_DRAWS = 256
+"""Draws of one world until there is a way in it; a family in which one draw in ten has a way fails in one of 10^11."""
 
 # ------------------------------------------------------------------------------------------- seeds
 
@@ -67,6 +71,18 @@ class Family:
     detours: bool = False
     """Whether the straight line to the goal is seldom free; options then begin as in rooms (`CLOSED_WORLDS`)."""
 
+    def __post_init__(self) -> None:
+        """Checks what `draw` takes, and the sizes.
+
+        Raises:
+            ConfigError: names the field and what it must be.
+        """
+        check_functions(self, {"draw": "key"})
+        if np.shape(self.size) != (3,) or not all(metres > 0 for metres in self.size):
+            raise ConfigError(f"`size` of Family must be three lengths above 0, metres, not {self.size!r}")
+        if self.edge_m is not None and not self.edge_m > 0:
+            raise ConfigError(f"`edge_m` of Family must be metres above 0, or None, not {self.edge_m!r}")
+
 
 @dataclasses.dataclass(frozen=True)
 class Mixture:
@@ -76,6 +92,20 @@ class Mixture:
     """By the name of the family."""
     detours: bool = False
     """As of `Family`."""
+
+    def __post_init__(self) -> None:
+        """Checks the shares.
+
+        Raises:
+            ConfigError: if they are no whole numbers above 0 by name.
+        """
+        shares = self.shares
+        if not (isinstance(shares, Mapping) and shares and all(_is_share(*each) for each in shares.items())):
+            raise ConfigError(f"`shares` of Mixture must be whole numbers above 0 by name of a family, not {shares!r}")
+
+
+def _is_share(name: object, share: object) -> bool:
+    return isinstance(name, str) and isinstance(share, int) and share > 0
 
 
 def _open(density: str) -> Family:
@@ -189,13 +219,37 @@ def _in_batches(family: str, moving: Moving, keys: Array) -> Scene:
 
 
 def _sample_worlds(family: str, keys: Array, moving: Moving = STILL) -> Scene:
-    """Returns worlds of one family, one for each key [P]; motion is added by a small program of its own."""
-    return _set_in_motion(family, moving, _standing(family, keys), keys)
+    """Returns worlds of one family, one for each key [P]; motion is added by a small program of its own.
+
+    Raises:
+        ConfigError: if one of them has no way after `MAX_DRAWS` draws.
+    """
+    scenes, passable = _standing(family, keys)
+    if not np.all(passable):
+        raise ConfigError(
+            f"the family of random worlds '{family}' drew one world {MAX_DRAWS} times without a way from start to goal "
+            f"for a sphere of {RADIUS_M} m; its `draw` must leave one, or its `edge_m` be finer than the gaps"
+        )
+    return _set_in_motion(family, moving, scenes, keys)
 
 
 def _unchecked(family: str, moving: Moving, keys: Array) -> Scene:
     """As `_sample_worlds`, without the reachability check."""
-    return _set_in_motion(family, moving, jax.vmap(_family(family).draw)(keys), keys)
+    return _set_in_motion(family, moving, jax.vmap(partial(_drawn, family))(keys), keys)
+
+
+def _drawn(family: str, key: Array) -> Scene:
+    """Returns a world of a family, whether there is a way in it or not.
+
+    Raises:
+        ConfigError: if `draw` of the family returns something else.
+    """
+    scene = _family(family).draw(key)
+    if not isinstance(scene, Scene):
+        raise ConfigError(
+            f"`draw` of the family of random worlds '{family}' must return a Scene, not {describe_object(scene)}"
+        )
+    return scene
 
 
 def _set_in_motion(family: str, moving: Moving, scenes: Scene, keys: Array) -> Scene:
@@ -214,18 +268,21 @@ def _moved(family: str, moving: Moving, scenes: Scene, keys: Array) -> Scene:
 
 
 @partial(jax.jit, static_argnums=0)
-def _standing(family: str, keys: Array) -> Scene:
-    """Returns static worlds; a world without a path to the goal is sampled again with another key."""
+def _standing(family: str, keys: Array) -> tuple[Scene, Array]:
+    """Returns static worlds, and whether each [P] has a path to the goal; one without is sampled again."""
     how, edge = _family(family), _family(family).edge_m
     if edge is None:
-        return jax.vmap(how.draw)(keys)
+        return jax.vmap(partial(_drawn, family))(keys), jnp.ones(keys.shape, bool)
 
-    def drawn(key: Array) -> Scene:
+    def one(key: Array) -> tuple[Scene, Array]:
         def attempt(number: Array) -> tuple[Array, Scene, Array]:
-            scene = how.draw(jax.random.fold_in(key, number))
+            scene = _drawn(family, jax.random.fold_in(key, number))
             return number, scene, has_way(scene, how.size, RADIUS_M, edge)
 
-        first = attempt(jnp.zeros((), jnp.int32))
-        return lax.while_loop(lambda state: ~state[2], lambda state: attempt(state[0] + 1), first)[1]
+        def goes_on(state: tuple[Array, Scene, Array]) -> Array:
+            return ~state[2] & (state[0] < MAX_DRAWS - 1)
 
-    return jax.vmap(drawn)(keys)
+        first = attempt(jnp.zeros((), jnp.int32))
+        return lax.while_loop(goes_on, lambda state: attempt(state[0] + 1), first)[1:]
+
+    return jax.vmap(one)(keys)

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import edqn_jax
 from edqn_jax.config import SENSORS, Config
 from edqn_jax.config.loading import make_config
 from edqn_jax.config.rules import validate
@@ -143,8 +144,40 @@ def test_the_functional_face_joins_a_tree_and_refuses_nothing(config: Config) ->
         functional.make("paper", nothing)
 
 
-def test_what_is_registered_must_be_a_sensor(config: Config) -> None:
-    SENSORS.register("bare", lambda *_: (None, None))
-    bare = with_sensor(config, "bare")
-    with pytest.raises(ConfigError, match="the sensor 'bare' must be an edqn_jax.Sensor, not function"):
-        sensor.sensor_of(bare)
+@pytest.mark.parametrize(
+    ("made", "says"),
+    [
+        (
+            {"show": lambda *_: None},
+            "^`show` of the sensor 'wrong' must return what .* and its memory, not None",
+        ),
+        ({"show": lambda *_: (None, None)}, r"^the sensor 'wrong' shows None, but its shape is \(3,\)"),
+        (
+            {"show": lambda c, s, p, memory, k: (jnp.zeros(3), memory + 0.5), "at_rest": lambda c, key: jnp.int32(0)},
+            r"^`show` of the sensor 'wrong' must .* a memory .*, and it is float32\[\], not int32\[\]; `at_rest`",
+        ),
+        (
+            {"show": lambda *_: (jnp.zeros(3), {"a": jnp.zeros(2)})},
+            r"must return a memory like .*, and \['a'\] is float32\[2\], not missing; `at_rest` returns the first one",
+        ),
+        (
+            {"frame_times_s": lambda c: (0.5,)},
+            r"^`frame_times_s` of .* from -0.26 to 0 s, .*\(0.5,\)",
+        ),
+        ({"frame_times_s": lambda c: ()}, r"^`frame_times_s` of the sensor 'wrong' must be times .*, not \(\)"),
+    ],
+)
+def test_what_a_sensor_returns_wrongly_is_said(config: Config, made: dict[str, Any], says: str) -> None:
+    given = {"show": lambda *_: (jnp.zeros(3), None), "shape": lambda c: (3,)} | made
+    SENSORS.register("wrong", Sensor(**given))
+    with pytest.raises(ConfigError, match=says):
+        edqn_jax.make("paper", with_sensor(config, "wrong")).reset()
+
+
+def test_what_a_sensor_raises_itself_is_not_changed(config: Config) -> None:
+    def fails(*_: Any) -> Any:
+        raise KeyError("my own")
+
+    SENSORS.register("fails", Sensor(fails, lambda c: (3,)))
+    with pytest.raises(KeyError, match="my own"):
+        edqn_jax.make("paper", with_sensor(config, "fails")).reset()

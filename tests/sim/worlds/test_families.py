@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+import edqn_jax
 from edqn_jax.config import FAMILIES, MIXTURES
 from edqn_jax.config.loading import make_config
 from edqn_jax.errors import ConfigError
@@ -19,7 +20,7 @@ from edqn_jax.sim.scene.distance import signed_distance
 from edqn_jax.sim.scene.mjcf import check_scene, load_world, write_scene
 from edqn_jax.sim.scene.scene import Scene, obstacle_count, scene_shapes, take_scene
 from edqn_jax.sim.task.missions import own_missions, random_missions, spread_missions
-from edqn_jax.sim.worlds import canyon, discs, families, forest, rooms
+from edqn_jax.sim.worlds import canyon, discs, families, forest, open_worlds, rooms
 from edqn_jax.sim.worlds.families import SPLITS, families_of, random_pool, random_scene, world_key, world_keys
 from edqn_jax.sim.worlds.free_points import CLEARANCE, FAR
 from tests.support.drawn_scenes import clearances
@@ -206,6 +207,27 @@ def test_a_family_of_ones_own_and_a_mixture_with_it_are_worlds_by_their_names(mo
     FAMILIES.register("nested", families.Mixture({"some": 1}))
     with pytest.raises(ConfigError, match="'some' are a mixture; a mixture must be of families"):
         random_pool("nested", keys)
+
+
+def test_a_family_without_a_way_ends_with_its_name(monkeypatch):
+    keep_as_they_are(monkeypatch)
+    monkeypatch.setattr(families, "MAX_DRAWS", 3)
+
+    def draw(key):
+        """The goal is out of the volume."""
+        scene = open_worlds.sample_open_world("sparse", key)
+        return dataclasses.replace(scene, goal=scene.volume[1] + 2.0)
+
+    FAMILIES.register("closed", families.Family(draw, open_worlds.SIZE, edge_m=2.0))
+    with pytest.raises(ConfigError, match="family of random worlds 'closed' drew one world 3 times without a way from"):
+        random_pool("closed", world_keys("training", 2))
+    # Among worlds that have one, and of a mixture.
+    FAMILIES.register("both", families.Mixture({"closed": 1, "sparse": 1}))
+    with pytest.raises(ConfigError, match="family of random worlds 'closed'"):
+        random_pool("both", world_keys("training", 8))
+    FAMILIES.register("nothing", families.Family(lambda key: None, open_worlds.SIZE))  # type: ignore[arg-type]
+    with pytest.raises(ConfigError, match="`draw` of the family of random worlds 'nothing' must return a Scene, not N"):
+        edqn_jax.make("nothing")
 
 
 def test_an_unknown_family_names_the_nearest_or_those_there_are():

@@ -22,6 +22,7 @@ from flax import struct
 from jax import Array
 
 from edqn_jax.config.registry import SHAPES
+from edqn_jax.user_code import check_functions
 
 PARKED = 1e6
 """Coordinate of absent shapes, metres along each axis."""
@@ -118,6 +119,25 @@ class ShapeKind:
     """A single shape → rings of corners [k, 3], metres, of a convex solid for pictures; None if it is not drawn."""
     page: Callable[[Any], dict[str, Any]] | None = None
     """A single shape → `kind` and sizes of a solid that `report/page/page.js` knows; None draws its faces."""
+
+    def __post_init__(self) -> None:
+        """Checks what each function takes.
+
+        Raises:
+            ConfigError: names the function and its arguments.
+        """
+        check_functions(
+            self,
+            {
+                "distance": "shapes, x, y, z",
+                "meet": "shapes, origin, direction",
+                "read": "geom",
+                "write": "shape",
+                "reach": "shapes",
+                "faces": "shape",
+                "page": "shape",
+            },
+        )
 
 
 def kinds() -> dict[str, ShapeKind]:
