@@ -46,6 +46,8 @@ class EvaluateArgs:
     shuffle_codes: Annotated[bool, arg(help_behavior_hint="")] = False
     """Give each drone the events of another one at each decision, which measures how much the policy depends on its
     events. For other sensors, permutes that observation."""
+    decoder: Annotated[bool, arg(help_behavior_hint="")] = False
+    """Also measure the error of the distances that the decoder predicts from the code, over pixels nearer than 10 m."""
     json: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
     """Also write the metrics as JSON."""
     trajectories: Annotated[Path | None, arg(metavar="FILE.npz", help_behavior_hint="")] = None
@@ -111,6 +113,7 @@ def evaluate_command(args: EvaluateArgs) -> None:
         goal=args.goal,
         record=args.trajectories is not None,
         shuffle_codes=args.shuffle_codes,
+        decoder=args.decoder,
         conditions=args.conditions,
     )
     config = config_of(policy)
@@ -184,8 +187,24 @@ def figures_table(figures: dict[str, Any]) -> Table:
     table.add_row("decisions", number(figures["decisions"], "{:.1f}"))
     table.add_row("flight time", number(figures["flight_seconds"], "{:.1f} s"))
     table.add_row("least clearance", clearance_text(figures["min_clearance_m"]))
+    if "decoder" in figures:
+        _add_decoder(table, figures["decoder"])
     table.add_section()
     table.add_row("one decision", "", style="bold")
     table.add_row("latency, median", f"{latency['median']:.2f} ms")
     table.add_row("latency, 99th percentile", f"{latency['p99']:.2f} ms")
     return table
+
+
+def _add_decoder(table: Table, figures: dict[str, Any]) -> None:
+    """Adds the error of the predicted distance."""
+
+    def error(which: str) -> str:
+        relative, metres = figures[f"relative_{which}"], figures[f"metres_{which}"]
+        return "–" if relative is None or metres is None else f"{relative:.0%}, {metres:.2f} m"
+
+    table.add_section()
+    table.add_row(f"predicted distance below {figures['near_m']:.0f} m", "", style="bold")
+    table.add_row("error, median", error("median"))
+    table.add_row("error, 90th percentile", error("p90"))
+    table.add_row("frames", f"{figures['frames']:,}")

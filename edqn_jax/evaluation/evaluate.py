@@ -14,6 +14,7 @@ from edqn_jax.config.loading import Layer, with_conditions
 from edqn_jax.devices.forks import check_not_forked
 from edqn_jax.devices.jax_settings import as_tested
 from edqn_jax.errors import ConfigError
+from edqn_jax.evaluation.decoder import check_predicts_distance, summarise_errors
 from edqn_jax.evaluation.metrics import shortest_paths, summarise_flights
 from edqn_jax.evaluation.missions import MissionSet, Point, load_missions
 from edqn_jax.evaluation.rollouts import fly_on_all_devices
@@ -67,6 +68,7 @@ def evaluate(
     goal: Point | None = None,
     record: bool = False,
     shuffle_codes: bool = False,
+    decoder: bool = False,
     conditions: Layer | None = None,
 ) -> Evaluation:
     """Flies a policy greedily, every mission once, and measures.
@@ -83,27 +85,41 @@ def evaluate(
         start, goal: of every mission, metres, in place of the world's.
         record: keep every pose.
         shuffle_codes: give each drone the observation of another one's sensor at each decision.
+        decoder: also measure the error of the distances that the policy's decoder predicts: `figures["decoder"]`, see
+            `decoder.summarise_errors`. True distances are then rendered at every decision.
         conditions: wind and other disturbances, and drones, in place of the policy's own, by group, such as
             `{"air": {"gusts_m_s": 5.0}}`; see `config.CONDITIONS`.
 
     Raises:
         ConfigError: if there is no such world or condition, the missions cannot be flown, the policy cannot fly, or
-            there is nothing to shuffle.
+            there is nothing to shuffle, or no decoder that predicts distance.
     """
     check_not_forked()
     policy = as_policy(policy, world)
     config = with_conditions(config_of(policy), conditions or {}, "evaluate")
     if shuffle_codes:
         _check_can_shuffle(config, missions)
-    mission_set = load_missions(config, str(world or config.world.name), missions, seed, start, goal)
     actor = actor_of(policy, config)
+    if decoder:
+        check_predicts_distance(config, actor)
+    mission_set = load_missions(config, str(world or config.world.name), missions, seed, start, goal)
     flights = fly_on_all_devices(
-        config, mission_set.env_params, policy.params, seed, actor=actor, record=record, shuffle_codes=shuffle_codes
+        config,
+        mission_set.env_params,
+        policy.params,
+        seed,
+        actor=actor,
+        record=record,
+        shuffle_codes=shuffle_codes,
+        decoder_errors=decoder,
     )
     shortest = shortest_paths(config, mission_set.env_params, np.asarray(flights.outcome) == Outcome.GOAL)
     notes = " ".join(filter(None, (mission_set.note, _unseen_look(policy, config))))
     mission_set = dataclasses.replace(mission_set, note=notes or None)
-    return Evaluation(mission_set, flights, summarise_flights(flights, shortest, config.env.drones))
+    figures = summarise_flights(flights, shortest, config.env.drones)
+    if flights.decoder_errors is not None:
+        figures["decoder"] = summarise_errors(np.asarray(flights.decoder_errors), int(np.sum(flights.decisions)))
+    return Evaluation(mission_set, flights, figures)
 
 
 def _unseen_look(policy: Policy | FunctionPolicy, config: Config) -> str | None:

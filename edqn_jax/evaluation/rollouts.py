@@ -17,6 +17,7 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from edqn_jax.config import Config
 from edqn_jax.devices.devices import compiler_options
 from edqn_jax.errors import ConfigError
+from edqn_jax.evaluation import decoder
 from edqn_jax.keys import run_streams
 from edqn_jax.learn.actor import Actor, AgentActor, blank_observation
 from edqn_jax.sim.actions import Discrete
@@ -37,6 +38,7 @@ class _Program:
     actor: Actor
     shuffle_codes: bool
     record: bool
+    decoder: bool
 
 
 @struct.dataclass
@@ -48,6 +50,7 @@ class _Flying:
     memory: Any  # [M, ...] of the actor
     flights: Flights  # record not in it
     record: Record | None  # decision first: [D, M, ...]
+    decoder_errors: Array | None  # [M, 2, BINS]
     decision: Array  # [] int32, -1 is the reset
     key: Array
 
@@ -61,6 +64,7 @@ def fly_missions(
     actor: Actor | None = None,
     shuffle_codes: bool = False,
     record: bool = False,
+    decoder_errors: bool = False,
     mesh: Mesh | None = None,
 ) -> Flights:
     """Flies each of the world's M missions once, greedily.
@@ -79,6 +83,8 @@ def fly_missions(
         shuffle_codes: give each environment the sensor's output of another one, permuted anew at each decision,
             but its own state: measures how much the policy depends on its sensor.
         record: keep every pose of the flights.
+        decoder_errors: compare the distances that the decoder predicts with the true ones, see `decoder`; of an agent
+            whose decoder predicts distance.
         mesh: devices, along one axis, to spread the missions over; flights do not depend on it, except for
             which codes are exchanged.
 
@@ -89,7 +95,7 @@ def fly_missions(
         ConfigError: if the actor's actions are not those of `env.actions`.
         ValueError: if codes are to be shuffled and a device has only one mission.
     """
-    program = _Program(config, actor or AgentActor(config), shuffle_codes, record)
+    program = _Program(config, actor or AgentActor(config), shuffle_codes, record, decoder_errors)
     return _compiled_for(mesh)(program, mesh, env_params, params, key)
 
 
@@ -102,13 +108,22 @@ def fly_on_all_devices(
     actor: Actor | None = None,
     record: bool = False,
     shuffle_codes: bool = False,
+    decoder_errors: bool = False,
 ) -> Flights:
     """Runs `fly_missions` on all devices and returns the flights on the host."""
     mesh = Mesh(np.asarray(jax.devices()), ("mission",))
     env_params, params = jax.device_put((env_params, params), NamedSharding(mesh, PartitionSpec()))
     key = run_streams(seed).flights
     flights = fly_missions(
-        config, env_params, params, key, actor=actor, record=record, shuffle_codes=shuffle_codes, mesh=mesh
+        config,
+        env_params,
+        params,
+        key,
+        actor=actor,
+        record=record,
+        shuffle_codes=shuffle_codes,
+        decoder_errors=decoder_errors,
+        mesh=mesh,
     )
     return jax.tree.map(np.asarray, flights)
 
@@ -117,7 +132,7 @@ def trace_missions(
     config: Config, env_params: EnvParams, params: Any, key: Array, *, record: bool, mesh: Mesh
 ) -> jax.stages.Lowered:
     """Returns the program that `fly_missions` runs for the agent, to be compiled ahead of its first call."""
-    program = _Program(config, AgentActor(config), False, record)
+    program = _Program(config, AgentActor(config), False, record, False)
     return _compiled_for(mesh).lower(program, mesh, env_params, params, key)
 
 
@@ -181,6 +196,7 @@ def _fly(program: _Program, env_params: EnvParams, params: Any, number: Array, k
             memory=jax.tree.map(lambda new, begun: _select_missions(step.is_reset, begun, new), memory, first),
             flights=flights,
             record=_write(flying, action, step, clearance),
+            decoder_errors=_add_errors(program, env_params, params, flying, memory, step),
             decision=flying.decision + 1,
             key=key,
         )
@@ -195,12 +211,13 @@ def _fly(program: _Program, env_params: EnvParams, params: Any, number: Array, k
         memory=jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (missions, *leaf.shape)), first),
         flights=jax.vmap(partial(_at_start, config, env_params))(state),
         record=_blank(config, missions, action) if program.record else None,
+        decoder_errors=jnp.zeros((missions, 2, decoder.BINS), jnp.int32) if program.decoder else None,
         decision=jnp.full((), -1),
         key=key,
     )
     flying = jax.lax.while_loop(lambda f: jnp.any(f.flights.outcome == Outcome.RUNNING), decide, flying)
     whole = None if flying.record is None else _by_mission(flying.record)
-    return dataclasses.replace(flying.flights, record=whole)
+    return dataclasses.replace(flying.flights, record=whole, decoder_errors=flying.decoder_errors)
 
 
 def _at_start(config: Config, env_params: EnvParams, state: EnvState) -> Flights:
@@ -281,6 +298,26 @@ def _write(flying: _Flying, action: Array, step: Step, clearance: Array) -> Reco
         reward=jnp.where(running, step.reward, jnp.nan),
     )
     return jax.tree.map(lambda whole, new: whole.at[flying.decision].set(new), flying.record, row)
+
+
+def _add_errors(
+    program: _Program, env_params: EnvParams, params: Any, flying: _Flying, memory: Any, step: Step
+) -> Array | None:
+    """Returns the histograms [M, 2, BINS] with the decoder's errors on what running flights acted on.
+
+    Args:
+        memory: of the agent after it acted, whose newest code is that of the observation.
+        step: what its action led to.
+    """
+    if flying.decoder_errors is None:
+        return None
+    actor, task = program.actor, task_of(program.config)
+    assert isinstance(actor, AgentActor) and task.label is not None
+    true = decoder.metres_of(task.map(partial(task.label, env_params))(flying.state))
+    predicted = decoder.predicted_distance(program.config, params.encoder, actor.code(memory))
+    running = (flying.flights.outcome == Outcome.RUNNING) & ~step.is_reset
+    new = jax.vmap(decoder.error_histograms)(predicted, true)
+    return flying.decoder_errors + jnp.where(running[:, None, None], new, 0)
 
 
 def _by_mission(record: Record) -> Record:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import io
 import tempfile
 import warnings
@@ -19,11 +20,12 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Wedge
 from PIL import Image
 
+from edqn_jax.evaluation.decoder import NEAR_M
 from edqn_jax.evaluation.trajectories import POSITION, columns_of
 from edqn_jax.extras import require_extra
 from edqn_jax.learn.policy import PolicyParams
 from edqn_jax.report.flights import OBLIQUE, OTHER_COLOUR, others_paths, plot_end_marks, plot_stage
-from edqn_jax.report.images import look_of, scale_of
+from edqn_jax.report.images import error_caption, look_of, scale_of
 from edqn_jax.report.sights import FlightRenderer, decision_rows, times_of, trajectory_poses
 from edqn_jax.report.solids import MAP, View, faces_seen, is_occluded, moving_solids
 from edqn_jax.report.style import INK, LINE, MUTED, OUTCOME_COLOURS, OUTCOME_LABELS, STYLE, frame
@@ -44,6 +46,8 @@ VIVID_COLOURS = 48
 """Those of them that are kept for vivid colours."""
 VIVID = 60
 """Difference of the channels, of 255, from which on a colour is vivid."""
+DISTANCE_COLOURS = "inferno_r"
+"""Bright is near, black far away."""
 DOTS_PER_INCH = 100
 SIGHT_M = 9.0
 """Length of the field of view on the map, metres, in a volume of 100 m; it is as much shorter in a smaller one."""
@@ -83,6 +87,25 @@ def animate_flight(
     return encode_gif(frames, [FRAME_S] * len(shown) + [LAST_FRAME_S])
 
 
+@dataclasses.dataclass(frozen=True)
+class _Layout:
+    """Where things are in the figure: left, bottom, width and height, as shares of its own."""
+
+    sensor: tuple[float, float, float, float]
+    map: tuple[float, float, float, float]
+    state: tuple[float, float]
+    ending: tuple[float, float]
+    state_separator: str
+    title_size: float
+
+
+WITHOUT_DISTANCE = _Layout((0.015, 0.06, 0.375, 0.415), (0.44, 0.045, 0.29, 0.40), (0.77, 0.37), (0.77, 0.10), "\n", 10)
+WITH_DISTANCE = _Layout(
+    (0.015, 0.06, 0.235, 0.26), (0.795, 0.045, 0.2, 0.31), (0.015, 0.44), (0.755, 0.413), "      ", 9
+)
+"""With predicted and true distance beside what the sensor shows."""
+
+
 class _Stage:
     """The figure of which all frames are pictures; what moves is drawn over a background that is drawn once."""
 
@@ -94,13 +117,17 @@ class _Stage:
         self._figure = Figure(figsize=(SIZE[0] / DOTS_PER_INCH, SIZE[1] / DOTS_PER_INCH), dpi=DOTS_PER_INCH)
         self._canvas = FigureCanvasAgg(self._figure)
         self._moving: list[Artist] = []
-        self._add_pictures(params)
+        self._shown = sights.shown(params, trajectory) if sights.has_image else None
+        predicts = self._shown is not None and self._shown.predicted is not None
+        self._layout = WITH_DISTANCE if predicts else WITHOUT_DISTANCE
+        self._add_pictures()
+        self._add_distances()
         self._oblique = self._add_view((0.405, 0.47, 0.59, 0.435), OBLIQUE)
-        self._map = self._add_view((0.44, 0.045, 0.29, 0.40), MAP)
+        self._map = self._add_view(self._layout.map, MAP)
         self._figure.text(0.41, 0.963, title, fontsize=9, color=MUTED)
         self._add_sight()
-        self._text = self._words(0.77, 0.37, fontsize=12, va="top", linespacing=1.6)
-        self._ending = self._words(0.77, 0.10, fontsize=14, weight="bold")
+        self._text = self._words(*self._layout.state, fontsize=12, va="top", linespacing=1.6)
+        self._ending = self._words(*self._layout.ending, fontsize=14, weight="bold")
         self._canvas.draw()
         self._background = self._canvas.copy_from_bbox(self._figure.bbox)
 
@@ -113,7 +140,8 @@ class _Stage:
             )
         )
         if self._shown is not None:
-            self._sensed.set_data(self._shown[decision])
+            self._sensed.set_data(self._shown.image[decision])
+        self._show_distances(decision)
         for view in (self._oblique, self._map):
             view.advance(row, float(self._trajectory["t"][row]))
         self._sight.set_center(tuple(self._points[row, :2]))
@@ -136,40 +164,68 @@ class _Stage:
         trajectory = self._trajectory
         speed = np.linalg.norm([trajectory[name][row] for name in ("vx", "vy", "vz")])
         away = np.linalg.norm(self._points[row] - np.asarray(self._sights.scene.goal))
-        return f"time  {trajectory['t'][row]:.1f} s\nspeed  {speed:.1f} m/s\nto the goal  {away:.0f} m"
+        told = f"time  {trajectory['t'][row]:.1f} s", f"speed  {speed:.1f} m/s", f"to the goal  {away:.0f} m"
+        return self._layout.state_separator.join(told)
 
     def _words(self, x: float, y: float, **style: Any) -> Any:
         text = self._figure.text(x, y, "", color=INK, animated=True, **style)
         self._moving.append(text)
         return text
 
-    def _add_pictures(self, params: PolicyParams | None) -> None:
+    def _add_pictures(self) -> None:
         """Adds the view for people above what the sensor shows."""
         sights, camera = self._sights, self._sights.config.camera
-        above, below = (self._figure.add_axes((0.015, y, 0.375, 0.415)) for y in (0.533, 0.06))
+        above, below = (self._figure.add_axes(place) for place in ((0.015, 0.533, 0.375, 0.415), self._layout.sensor))
         for axes in (above, below):
             self._moving += frame(axes, linewidth=0.8, animated=True, zorder=2.5)
         above.set_title("What a person would see", fontsize=10)
         self._rgb = above.imshow(np.zeros((2, 2, 3)), animated=True, aspect="auto", interpolation="antialiased")
         self._moving.append(self._rgb)
-        self._shown = None
         name = sights.config.env.sensor
-        if not sights.has_image:
+        if self._shown is None:
             below.set_title("What the drone sees", fontsize=10)
             below.text(
                 0.5, 0.5, f"no image: its sensor is '{name}'", ha="center", fontsize=10, transform=below.transAxes
             )
             return
         look = look_of(name)
-        below.set_title(f"What the drone sees: {look.name}, {camera.width} × {camera.height}", fontsize=10)
-        self._shown = sights.shown(params, self._trajectory).image
+        title = f"{look.name}, {camera.width} × {camera.height}"
+        full = self._layout is WITHOUT_DISTANCE
+        below.set_title(f"What the drone sees: {title}" if full else title, fontsize=self._layout.title_size)
         if look.signed:
-            below.set_xlabel("red where it grows brighter, blue where darker", color=MUTED, fontsize=8, labelpad=3)
-        scale = scale_of(self._shown, look, share=0.75)  # quiet moments are to be seen, too
+            words = "red where it grows brighter, blue where darker" if full else "red brighter, blue darker"
+            below.set_xlabel(words, color=MUTED, fontsize=8, labelpad=3)
+        scale = scale_of(self._shown.image, look, share=0.75)  # quiet moments are to be seen, too
         self._sensed = below.imshow(
-            self._shown[0], cmap=look.colours, norm=scale, animated=True, aspect="auto", interpolation="nearest"
+            self._shown.image[0], cmap=look.colours, norm=scale, animated=True, aspect="auto", interpolation="nearest"
         )
         self._moving.append(self._sensed)
+
+    def _add_distances(self) -> None:
+        """Adds the distance that the decoder predicts and the true one, if it predicts any."""
+        self._distances: list[tuple[Any, np.ndarray]] = []
+        shown = self._shown
+        if shown is None or shown.predicted is None or shown.distance is None:
+            return
+        left, bottom, width, height = self._layout.sensor
+        for column, (name, metres) in enumerate((("predicted", shown.predicted), ("true", shown.distance)), start=1):
+            axes = self._figure.add_axes((left + column * (width + 0.012), bottom, width, height))
+            self._moving += frame(axes, linewidth=0.8, animated=True, zorder=2.5)
+            axes.set_title(f"{name} distance", fontsize=self._layout.title_size)
+            picture = axes.imshow(
+                metres[0], cmap=DISTANCE_COLOURS, vmin=0.0, vmax=2 * NEAR_M, animated=True, aspect="auto"
+            )
+            self._distances.append((picture, metres))
+            self._moving.append(picture)
+        words = f"bright is near, dark {2 * NEAR_M:.0f} m or more"
+        self._figure.text(left + 2.5 * width + 0.024, 0.022, words, fontsize=8, color=MUTED, ha="center")
+        self._error = self._words(left + 1.5 * width + 0.012, 0.022, fontsize=8, ha="center")
+
+    def _show_distances(self, decision: int) -> None:
+        for picture, metres in self._distances:
+            picture.set_data(np.minimum(metres[decision], 2 * NEAR_M))
+        if self._distances:
+            self._error.set_text(error_caption(*(metres[decision] for _, metres in self._distances)))
 
     def _add_view(self, place: tuple[float, float, float, float], view: View) -> _PathView:
         axes = self._figure.add_axes(place)

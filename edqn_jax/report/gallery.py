@@ -87,7 +87,10 @@ def _plot_what_it_sees(
     title = NEARNESS if draws_nearness else RECONSTRUCTED_EVENTS if look.signed else look
     # A target made of what is shown says nothing more than that.
     seen = (shown.image[moments], look) if draws_nearness else None
-    plot_reconstruction(shown.target[moments], shown.reconstruction[moments], file, title, seen)
+    distances = None
+    if shown.predicted is not None and shown.distance is not None:
+        distances = shown.predicted[moments], shown.distance[moments]
+    plot_reconstruction(shown.target[moments], shown.reconstruction[moments], file, title, seen, distances)
 
 
 def _busiest(events: np.ndarray, parts: int) -> np.ndarray:

@@ -13,6 +13,7 @@ from matplotlib.colors import Colormap, Normalize
 from matplotlib.figure import Figure
 
 from edqn_jax.config.registry import SENSORS
+from edqn_jax.evaluation.decoder import NEAR_M, median_error
 from edqn_jax.report.style import COUNTS, INK, POLARITY, frame, open_figure
 
 
@@ -86,6 +87,7 @@ def plot_reconstruction(
     file: Path,
     look: Look = RECONSTRUCTED_EVENTS,
     seen: tuple[np.ndarray, Look] | None = None,
+    distances: tuple[np.ndarray, np.ndarray] | None = None,
 ) -> Figure:
     """Plots the decoder's targets above its reconstructions, on one colour scale.
 
@@ -95,6 +97,7 @@ def plot_reconstruction(
         file: PNG to write.
         look: of both.
         seen: [N, h, w] what the sensor showed, and its look, for a row above.
+        distances: predicted and true [N, h, w] metres; the captions then say the error of these.
     """
     targets, decoded = np.asarray(targets), np.asarray(decoded)
     scale = Normalize(0.0, _largest(targets)) if look is RECONSTRUCTED_EVENTS else scale_of(targets, look)
@@ -108,11 +111,22 @@ def plot_reconstruction(
             for axes, picture in zip(line, pictures, strict=True):
                 _show(axes, picture, colours, row_look)
             line[0].set_ylabel(name, fontsize=8)
-        for axes, wanted, made in zip(grid[-1], targets, decoded, strict=True):
-            error = float(np.sqrt(np.mean((wanted - made) ** 2)))
-            axes.set_xlabel(f"RMS error {error:.2f}", fontsize=7, labelpad=2)
+        for number, axes in enumerate(grid[-1]):
+            if distances is None:
+                caption = f"RMS error {np.sqrt(np.mean((targets[number] - decoded[number]) ** 2)):.2f}"
+            else:
+                caption = error_caption(distances[0][number], distances[1][number])
+            axes.set_xlabel(caption, fontsize=7, labelpad=2)
         _colour_bar(figure, scale, grid, look, look.unit)
     return figure
+
+
+def error_caption(predicted: np.ndarray, true: np.ndarray) -> str:
+    """Returns the median error of predicted distances [..., h, w] for people, or that nothing is near."""
+    error = median_error(predicted, true)
+    if error is None:
+        return f"nothing within {NEAR_M:.0f} m"
+    return f"distance off by {error:.0%}" if np.isfinite(error) else "predicted far away"
 
 
 def scale_of(shown: np.ndarray, look: Look, share: float = 0.98) -> Normalize:

@@ -17,6 +17,7 @@ from jax.stages import Compiled
 
 from edqn_jax.config import Config
 from edqn_jax.devices.devices import quick_compiler_options
+from edqn_jax.evaluation.decoder import metres_of, predicted_distance
 from edqn_jax.evaluation.trajectories import ATTITUDE, POSITION, VELOCITY, actions_of, columns_of, directions
 from edqn_jax.learn.actor import AgentActor, PolicyParams
 from edqn_jax.learn.perception import embedding, vae
@@ -45,10 +46,15 @@ class SensorImages:
     where there is no decoder."""
     reconstruction: np.ndarray | None = None
     """[D, H, W] what it draws from the code, in the same units."""
+    distance: np.ndarray | None = None
+    """[D, H, W] true distance along each pixel's ray, metres, infinity where there is nothing; None where the decoder
+    does not predict it."""
+    predicted: np.ndarray | None = None
+    """[D, H, W] the distance that it predicts."""
 
 
 _Images = tuple[Array, ...]
-"""As the fields of `SensorImages`, without the last two where there is no decoder."""
+"""As the fields of `SensorImages`, without those at the end that are None."""
 
 
 class FlightRenderer:
@@ -132,7 +138,10 @@ class FlightRenderer:
             target = vae.decoder_target(config.encoder, read, nearness)
             made = vae.decode(config.encoder, config.camera, params.encoder, code)
             pictures = (_as_picture(config, channels) for channels in (target, made))
-            return memory, (image, luma, *pictures)
+            if nearness is None:
+                return memory, (image, luma, *pictures)
+            predicted = predicted_distance(config, params.encoder, code)
+            return memory, (image, luma, *pictures, metres_of(nearness), predicted)
 
         keys = jax.random.split(rest, len(position))
         before = sensor.at_rest(config, start)

@@ -16,6 +16,7 @@ from edqn_jax.errors import ConfigError
 from edqn_jax.interop import flight_files
 from edqn_jax.learn.policy import PolicyParams, fresh_policy
 from edqn_jax.report.animation import LAST_FRAME_S, MAX_FRAMES, SIZE
+from edqn_jax.report.sights import SensorImages
 from edqn_jax.report.style import OUTCOME_COLOURS
 from edqn_jax.runs.checkpoints.params import save_params
 from edqn_jax.sim.scene.mjcf import write_scene
@@ -124,3 +125,24 @@ def test_an_mp4_without_its_package_is_refused_at_once(run, tmp_path, monkeypatc
 def test_a_folder_without_a_run_is_refused(tmp_path, capsys):
     assert main(["record", str(tmp_path), str(tmp_path / "flight.gif")]) == 2
     assert "there is no run in" in capsys.readouterr().err
+
+
+class Predicting(Drawn):
+    """Sights of a policy whose decoder predicts distance, this many times the true one."""
+
+    def __init__(self, factor: float) -> None:
+        self.factor = factor
+
+    def shown(self, params: object, flown: dict[str, np.ndarray]) -> SensorImages:
+        true = np.full((len(flown["t"]) // 13, 24, 32), 4.0)
+        images = super().shown(params, flown)
+        return dataclasses.replace(images, distance=true, predicted=true * self.factor)
+
+
+def test_predicted_distance_stands_beside_the_true_one():
+    good, bad = (np.asarray(recorded(Predicting(factor), 1).convert("RGB"), int) for factor in (1.0, 3.0))
+    rows, columns = np.nonzero(np.abs(good - bad).max(axis=2) > 100)
+    # The picture of the prediction alone and its caption, left of the true one.
+    assert len(rows) > 10_000 and rows.min() > 360 and columns.min() > 200 and columns.max() < 405
+    plain = np.asarray(recorded(Drawn(), 1).convert("RGB"), int)
+    assert np.abs(plain - good)[360:, 210:].max() > 100

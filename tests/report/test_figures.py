@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 
 from edqn_jax.report.curves import plot_learning, plot_returns, running_mean
 from edqn_jax.report.flights import OBLIQUE, plot_path, plot_world
-from edqn_jax.report.images import EVENTS, NEARNESS, plot_reconstruction, plot_sight
+from edqn_jax.report.images import EVENTS, NEARNESS, error_caption, plot_reconstruction, plot_sight
 from edqn_jax.report.solids import MAP, View, far_to_near, is_occluded, make_cutaway, solids_of
 from edqn_jax.report.style import OUTCOME_COLOURS
 from edqn_jax.sim.scene.scene import (
@@ -290,3 +290,14 @@ def test_silent_windows_can_be_drawn(tmp_path):
     silent = np.zeros((2, 24, 32), np.int32)
     plot_reconstruction(silent, silent * 1.0, tmp_path / "reconstruction.png")
     assert is_png(tmp_path / "reconstruction.png")
+
+
+def test_the_caption_of_a_prediction_says_how_far_its_distance_is_off(tmp_path):
+    true = np.full((2, 6, 8), 4.0)
+    distances = true * np.array([1.25, 1.5])[:, None, None], true
+    near = np.random.default_rng(0).random(true.shape)
+    figure = plot_reconstruction(near, near, tmp_path / "reconstruction.png", NEARNESS, distances=distances)
+    captions = [axes.get_xlabel() for axes in figure.axes]
+    assert "distance off by 25%" in captions and "distance off by 50%" in captions
+    assert error_caption(true, np.full(true.shape, np.inf)) == "nothing within 10 m"
+    assert error_caption(np.full(true.shape, np.inf), true) == "predicted far away"

@@ -15,7 +15,7 @@ from PIL import Image
 from edqn_jax.config import Config
 from edqn_jax.learn.perception import embedding
 from edqn_jax.learn.policy import PolicyParams
-from edqn_jax.report.images import NEARNESS, RECONSTRUCTED_EVENTS, Look, look_of, scale_of
+from edqn_jax.report.images import NEARNESS, RECONSTRUCTED_EVENTS, Look, error_caption, look_of, scale_of
 from edqn_jax.report.sights import FlightRenderer, SensorImages
 from edqn_jax.sim.camera.camera import on_screen
 
@@ -69,13 +69,19 @@ def _decoder_images(
     scale = scale or scale_of(shown.target, title)
     return [
         (
-            f"predicted {title.name}" if nearness else f"{title.name}, from the code",
+            f"predicted {title.name}{_error_of(shown)}" if nearness else f"{title.name}, from the code",
             shown.reconstruction,
             scale,
             colours,
         ),
         (f"true {title.name}" if nearness else f"{title.name}, blurred", shown.target, scale, colours),
     ]
+
+
+def _error_of(shown: SensorImages) -> str:
+    """Returns the error of the predicted distances of a flight as the end of a panel's name."""
+    assert shown.predicted is not None and shown.distance is not None
+    return f" ({error_caption(shown.predicted, shown.distance)})"
 
 
 def picture_strip(images: np.ndarray, norm: Normalize, colours: str | Colormap) -> str:

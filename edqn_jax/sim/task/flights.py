@@ -53,6 +53,7 @@ class Flights:
     closest: Closest
     record: Record | None
     hit_drone: Array | None = None  # [M] bool, the collision was with another drone; None where one flies alone
+    decoder_errors: Array | None = None  # [M, 2, bins] of `evaluation.decoder`, if they were asked for
 
     def get_record(self) -> Record:
         """Returns the record.

@@ -1,0 +1,106 @@
+"""What does a policy see and fly when surfaces look otherwise?
+
+Flies a policy through the same test missions under every `surface.pattern`, and prints success with its Wilson
+interval, collisions, and the error of the distance that the decoder predicts, over pixels nearer than 10 m:
+median and 90th percentile, relative to the true distance and in metres. A policy without such a decoder has
+dashes there.
+
+    python benchmarks/looks.py --policy pretrained --world rooms --missions 200 --json looks.json
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import jax
+
+from edqn_jax.config.simulation import LOOKS
+from edqn_jax.errors import ConfigError
+from edqn_jax.evaluation.decoder import check_predicts_distance
+from edqn_jax.evaluation.evaluate import evaluate
+from edqn_jax.learn.actor import AgentActor
+from edqn_jax.learn.policy import Policy
+from edqn_jax.runs.policies import load_policy
+from measurement import json_report
+from measurement.command import Parser, at_least_one, in_a_sentence
+
+HEAD = (
+    "| surface.pattern | reached the goal | collisions | error, median | 90th percentile | frames |\n"
+    "| --- | --- | ---: | ---: | ---: | ---: |"
+)
+
+
+def parse(argv: Sequence[str] | None = None) -> argparse.Namespace:
+    """Returns the parsed arguments.
+
+    Raises:
+        ConfigError: if the file of `--json` cannot be written.
+    """
+    parser = Parser("looks", __doc__)
+    parser.add_argument("--policy", type=Path, default=Path("pretrained"), help="folder of a run, or pretrained")
+    parser.add_argument("--world", default="rooms", help="random worlds by name (default rooms)")
+    parser.add_argument("--looks", nargs="+", default=list(LOOKS), choices=LOOKS, help="(default all)")
+    parser.add_argument("--missions", type=at_least_one, default=200, help="number for each look (default 200)")
+    parser.add_argument("--seed", type=int, default=0, help="seed of the missions (default 0)")
+    return parser.parse(argv)
+
+
+def measure(args: argparse.Namespace, show: Callable[[str], None] = print) -> dict[str, Any]:
+    """Returns the report that `--json` writes, and shows a row for each look."""
+    policy = load_policy(args.policy)
+    decoder = predicts_distance(policy)
+    show(HEAD)
+    looks = []
+    for look in args.looks:
+        flown = evaluate(
+            policy,
+            args.world,
+            missions=args.missions,
+            seed=args.seed,
+            decoder=decoder,
+            conditions={"surface": {"pattern": look}},
+        )
+        looks.append({"pattern": look, **flown.figures})
+        show(row(looks[-1]))
+    cell = {"policy": str(args.policy), "world": args.world, "seed": args.seed}
+    return {**json_report.machine(jax.devices()), "cell": cell, "looks": looks}
+
+
+def predicts_distance(policy: Policy) -> bool:
+    """Returns whether a policy has a decoder that predicts distance."""
+    try:
+        check_predicts_distance(policy.config, AgentActor(policy.config))
+    except ConfigError:
+        return False
+    return True
+
+
+def row(look: dict[str, Any]) -> str:
+    """Returns a look's figures as a row of a Markdown table."""
+    low, high = look["interval"]
+    success = f"{look['success_rate']:.1%} ({100 * low:.1f} to {100 * high:.1f})"
+    decoder = look.get("decoder", {})
+    errors = (_error(decoder, which) for which in ("median", "p90"))
+    frames = f"{decoder['frames']:,}" if decoder else "–"
+    return f"| `{look['pattern']}` | {success} | {look['collisions']} | {' | '.join(errors)} | {frames} |"
+
+
+def _error(decoder: dict[str, Any], which: str) -> str:
+    relative, metres = (decoder.get(f"{unit}_{which}") for unit in ("relative", "metres"))
+    return "–" if relative is None or metres is None else f"{relative:.0%}, {metres:.2f} m"
+
+
+@in_a_sentence
+def main(argv: Sequence[str] | None = None) -> int:
+    """Returns exit code 0, or 2 for invalid input."""
+    args = parse(argv)
+    json_report.write(args.json, measure(args))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
