@@ -116,10 +116,14 @@ def evaluate(
     shortest = shortest_paths(config, mission_set.env_params, np.asarray(flights.outcome) == Outcome.GOAL)
     notes = " ".join(filter(None, (mission_set.note, _unseen_look(policy, config))))
     mission_set = dataclasses.replace(mission_set, note=notes or None)
+    return Evaluation(mission_set, flights, _figures(config, flights, shortest))
+
+
+def _figures(config: Config, flights: Flights, shortest: np.ndarray) -> dict[str, Any]:
     figures = summarise_flights(flights, shortest, config.env.drones)
     if flights.decoder_errors is not None:
         figures["decoder"] = summarise_errors(np.asarray(flights.decoder_errors), int(np.sum(flights.decisions)))
-    return Evaluation(mission_set, flights, figures)
+    return figures
 
 
 def _unseen_look(policy: Policy | FunctionPolicy, config: Config) -> str | None:

@@ -31,14 +31,26 @@ from edqn_jax.sim.task.task import task_of
 
 
 @dataclasses.dataclass(frozen=True)
+class Extras:
+    """What flights do beside flying."""
+
+    record: bool = False
+    """Keep every pose."""
+    shuffle_codes: bool = False
+    """Give each environment the sensor's output of another one, permuted anew at each decision, but its own state:
+    measures how much the policy depends on its sensor."""
+    decoder_errors: bool = False
+    """Compare the distances that the decoder predicts with the true ones, see `decoder`; of an agent whose decoder
+    predicts distance."""
+
+
+@dataclasses.dataclass(frozen=True)
 class _Program:
     """Static arguments of a compiled program, except for devices."""
 
     config: Config
     actor: Actor
-    shuffle_codes: bool
-    record: bool
-    decoder: bool
+    extras: Extras
 
 
 @struct.dataclass
@@ -62,9 +74,7 @@ def fly_missions(
     key: Array,
     *,
     actor: Actor | None = None,
-    shuffle_codes: bool = False,
-    record: bool = False,
-    decoder_errors: bool = False,
+    extras: Extras = Extras(),
     mesh: Mesh | None = None,
 ) -> Flights:
     """Flies each of the world's M missions once, greedily.
@@ -80,11 +90,7 @@ def fly_missions(
         params: parameters of the policy.
         key: consumed; sensor noise, the shuffling and an actor that is not greedy depend on it.
         actor: what flies; None is the agent of `config`.
-        shuffle_codes: give each environment the sensor's output of another one, permuted anew at each decision,
-            but its own state: measures how much the policy depends on its sensor.
-        record: keep every pose of the flights.
-        decoder_errors: compare the distances that the decoder predicts with the true ones, see `decoder`; of an agent
-            whose decoder predicts distance.
+        extras: recording and measuring.
         mesh: devices, along one axis, to spread the missions over; flights do not depend on it, except for
             which codes are exchanged.
 
@@ -95,7 +101,7 @@ def fly_missions(
         ConfigError: if the actor's actions are not those of `env.actions`.
         ValueError: if codes are to be shuffled and a device has only one mission.
     """
-    program = _Program(config, actor or AgentActor(config), shuffle_codes, record, decoder_errors)
+    program = _Program(config, actor or AgentActor(config), extras)
     return _compiled_for(mesh)(program, mesh, env_params, params, key)
 
 
@@ -114,17 +120,8 @@ def fly_on_all_devices(
     mesh = Mesh(np.asarray(jax.devices()), ("mission",))
     env_params, params = jax.device_put((env_params, params), NamedSharding(mesh, PartitionSpec()))
     key = run_streams(seed).flights
-    flights = fly_missions(
-        config,
-        env_params,
-        params,
-        key,
-        actor=actor,
-        record=record,
-        shuffle_codes=shuffle_codes,
-        decoder_errors=decoder_errors,
-        mesh=mesh,
-    )
+    extras = Extras(record, shuffle_codes, decoder_errors)
+    flights = fly_missions(config, env_params, params, key, actor=actor, extras=extras, mesh=mesh)
     return jax.tree.map(np.asarray, flights)
 
 
@@ -132,7 +129,7 @@ def trace_missions(
     config: Config, env_params: EnvParams, params: Any, key: Array, *, record: bool, mesh: Mesh
 ) -> jax.stages.Lowered:
     """Returns the program that `fly_missions` runs for the agent, to be compiled ahead of its first call."""
-    program = _Program(config, AgentActor(config), False, record, False)
+    program = _Program(config, AgentActor(config), Extras(record=record))
     return _compiled_for(mesh).lower(program, mesh, env_params, params, key)
 
 
@@ -159,7 +156,7 @@ def _fly_all(program: _Program, mesh: Mesh | None, env_params: EnvParams, params
     # Every device flies equally many missions, whole groups; the first ones are repeated to fill up.
     unit = devices * program.config.env.drones
     number = jnp.arange(-(-missions // unit) * unit) % missions
-    if program.shuffle_codes and number.shape[0] // devices < 2:
+    if program.extras.shuffle_codes and number.shape[0] // devices < 2:
         raise ValueError("shuffling codes needs at least two missions on each device")
     keys = reset_keys[number]
     fly = partial(_fly, program)
@@ -181,7 +178,7 @@ def _fly(program: _Program, env_params: EnvParams, params: Any, number: Array, k
     def decide(flying: _Flying) -> _Flying:
         key, act_key, shift_key = jax.random.split(flying.key, 3)
         seen = flying.observation
-        if program.shuffle_codes:
+        if program.extras.shuffle_codes:
             shift = jax.random.randint(shift_key, (), 1, missions)
             # Only the sensor's output tells of obstacles, so the own motion is not shuffled.
             sensed = jax.tree.map(lambda x: jnp.roll(x, shift, axis=0), seen.sensed)
@@ -210,8 +207,8 @@ def _fly(program: _Program, env_params: EnvParams, params: Any, number: Array, k
         observation=jax.tree.map(lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), seen),
         memory=jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (missions, *leaf.shape)), first),
         flights=jax.vmap(partial(_at_start, config, env_params))(state),
-        record=_blank(config, missions, action) if program.record else None,
-        decoder_errors=jnp.zeros((missions, 2, decoder.BINS), jnp.int32) if program.decoder else None,
+        record=_blank(config, missions, action) if program.extras.record else None,
+        decoder_errors=jnp.zeros((missions, 2, decoder.BINS), jnp.int32) if program.extras.decoder_errors else None,
         decision=jnp.full((), -1),
         key=key,
     )

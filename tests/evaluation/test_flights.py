@@ -13,7 +13,7 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from edqn_jax.evaluation import rollouts
 from edqn_jax.evaluation.metrics import flight_summary
 from edqn_jax.evaluation.missions import MissionSet, load_missions
-from edqn_jax.evaluation.rollouts import fly_missions, fly_on_all_devices
+from edqn_jax.evaluation.rollouts import Extras, fly_missions, fly_on_all_devices
 from edqn_jax.evaluation.trajectories import TRAJECTORY_COLUMNS, flight_trajectory
 from edqn_jax.evaluation.verdicts import check_verdicts
 from edqn_jax.sim.scene.distance import signed_distance
@@ -143,7 +143,9 @@ def test_shuffling_moves_the_codes_and_nothing_else(course):
         if not shuffled:  # on two devices
             flown = fly_on_all_devices(CONFIG, world, params, record=True)
         else:  # on one: the layout must not matter either
-            flown = fly_missions(CONFIG, world, params, jax.random.key(0), shuffle_codes=True, record=True)
+            flown = fly_missions(
+                CONFIG, world, params, jax.random.key(0), extras=Extras(shuffle_codes=True, extras=Extras(record=True))
+            )
         assert flown.record is not None
         return np.asarray(flown.record.action)
 
@@ -157,7 +159,7 @@ def test_one_mission_has_nobody_to_shuffle_with(course):
     world = course.env_params
     alone = dataclasses.replace(world, missions=jax.tree.map(lambda leaf: leaf[:1], world.missions))
     with pytest.raises(ValueError, match="at least two missions"):
-        fly_missions(CONFIG, alone, always((0, 0, 0)), jax.random.key(0), shuffle_codes=True)
+        fly_missions(CONFIG, alone, always((0, 0, 0)), jax.random.key(0), extras=Extras(shuffle_codes=True))
 
 
 def test_a_recorded_flight_becomes_columns_and_a_summary_and_compiles_nothing_anew(course):
@@ -169,8 +171,8 @@ def test_a_recorded_flight_becomes_columns_and_a_summary_and_compiles_nothing_an
     another_key = jax.random.key(1)
     compiled: list[str] = []
     jax.monitoring.register_event_duration_secs_listener(lambda event, *_, **__: compiled.append(event))
-    flown = fly_missions(CONFIG, world, params, key, record=True, mesh=mesh)
-    fly_missions(CONFIG, world, params, another_key, record=True, mesh=mesh)
+    flown = fly_missions(CONFIG, world, params, key, extras=Extras(record=True), mesh=mesh)
+    fly_missions(CONFIG, world, params, another_key, extras=Extras(record=True), mesh=mesh)
     jax.monitoring.clear_event_listeners()
     assert "/jax/core/compile/backend_compile_duration" not in compiled
     mission = int(np.flatnonzero(np.asarray(flown.outcome) == Outcome.COLLISION)[0])

@@ -14,7 +14,7 @@ from edqn_jax.config.loading import make_config
 from edqn_jax.evaluation.flight_scene import scene_of_flight
 from edqn_jax.evaluation.judge import FlightTrack, clearance, load_judge, max_obstacle_speed, replay_contact
 from edqn_jax.evaluation.missions import MissionSet, load_missions
-from edqn_jax.evaluation.rollouts import fly_missions
+from edqn_jax.evaluation.rollouts import Extras, fly_missions
 from edqn_jax.evaluation.verdicts import check_verdicts
 from edqn_jax.sim.scene.distance import path_contact, signed_distance
 from edqn_jax.sim.scene.mjcf import load_world
@@ -155,7 +155,7 @@ def course() -> MissionSet:
 def test_every_verdict_on_a_flight_among_moving_obstacles_is_mujocos(course, move):
     config = dataclasses.replace(CONFIG, env=dataclasses.replace(CONFIG.env, max_decisions=50))
     flights = jax.tree.map(
-        np.asarray, fly_missions(config, course.env_params, always(move), jax.random.key(0), record=True)
+        np.asarray, fly_missions(config, course.env_params, always(move), jax.random.key(0), extras=Extras(record=True))
     )
     results = check_verdicts(config, course, flights)
     outcomes = np.array([result.outcome for result in results])
@@ -179,7 +179,7 @@ def test_a_drone_is_hit_by_balls_where_the_world_of_its_flight_has_them(physics_
         world=make_config("sparse", world={"balls": 3}).world,
     )
     course = load_missions(config, "sparse", 16)
-    flights = fly_missions(config, course.env_params, always((0, 0, 0)), jax.random.key(0), record=True)
+    flights = fly_missions(config, course.env_params, always((0, 0, 0)), jax.random.key(0), extras=Extras(record=True))
     flights = jax.tree.map(np.asarray, flights)
     assert (flights.outcome == Outcome.COLLISION).sum() > 12  # they hover
     assert all(result.agrees for result in check_verdicts(config, course, flights))

@@ -14,7 +14,7 @@ import pytest
 
 from edqn_jax.config import Config
 from edqn_jax.config.loading import make_config
-from edqn_jax.evaluation.rollouts import fly_missions
+from edqn_jax.evaluation.rollouts import Extras, fly_missions
 from edqn_jax.learn.policy import fresh_policy
 from edqn_jax.sim.actions import move_number
 from edqn_jax.sim.environment import Environment
@@ -305,7 +305,7 @@ def test_a_mission_has_its_balls_thrown_at_its_own_drone():
 
 def test_the_clearance_of_a_flight_is_to_shapes_as_they_move():
     world = world_of(pillar(sliding(), x=14.0))
-    flights = fly_missions(CONFIG, world, fresh_policy(CONFIG), jax.random.key(0), record=True)
+    flights = fly_missions(CONFIG, world, fresh_policy(CONFIG), jax.random.key(0), extras=Extras(record=True))
     record, scene = flights.record, env.scene_of(world, jnp.int32(0))
     assert record is not None
     steps = int(flights.physics_steps[0]) - 1  # the last may be cut off at a contact
