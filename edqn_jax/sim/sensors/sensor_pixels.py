@@ -15,6 +15,9 @@ from jax import Array
 MOST_SMALL = 4.0
 """Largest mean of which Poisson counts are drawn by inversion; larger ones are nearly normal."""
 
+TINY = 1e-30
+"""Probability that is none."""
+
 TERMS = 18
 """Of the inversion: a count of `MOST_SMALL` is larger in one of 10^7."""
 
@@ -38,7 +41,7 @@ def count_all(expected: Array, pixels: int, key: Array) -> Array:
     spread = jnp.sqrt(pixels * part * (1.0 - part))
     drawn = jnp.round(pixels * expected + spread * jax.random.normal(key, expected.shape))
     low, high = pixels * jnp.floor(expected), pixels * jnp.ceil(expected)
-    return jnp.clip(drawn, low, high).astype(jnp.int32)
+    return jax.lax.optimization_barrier(jnp.clip(drawn, low, high).astype(jnp.int32))
 
 
 def follow(residual: Array, change: Array, on: Array, off: Array) -> tuple[Array, Array]:
@@ -71,8 +74,11 @@ def sample_poisson(key: Array, mean: Array) -> Array:
     count = jnp.zeros(mean.shape, jnp.int32)
     for number in range(TERMS):
         count = count + (uniforms >= below)
-        probability = probability * small / (number + 1)
+        # At least that of a normal number, since a CPU is slow with denormal ones.
+        probability = jnp.maximum(probability * small / (number + 1), TINY)
         below = below + probability
     normal = jax.random.normal(many, mean.shape)
     large = jnp.round(mean + jnp.sqrt(mean) * normal + (normal * normal - 1.0) / 6.0)
-    return jnp.where(mean > MOST_SMALL, jnp.maximum(large, 0.0).astype(jnp.int32), count)
+    drawn = jnp.where(mean > MOST_SMALL, jnp.maximum(large, 0.0).astype(jnp.int32), count)
+    # Without it XLA draws them again for each use of the counts, at ten times the cost on a CPU.
+    return jax.lax.optimization_barrier(drawn)
