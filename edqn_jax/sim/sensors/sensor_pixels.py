@@ -41,7 +41,7 @@ def count_all(expected: Array, pixels: int, key: Array) -> Array:
     spread = jnp.sqrt(pixels * part * (1.0 - part))
     drawn = jnp.round(pixels * expected + spread * jax.random.normal(key, expected.shape))
     low, high = pixels * jnp.floor(expected), pixels * jnp.ceil(expected)
-    return jax.lax.optimization_barrier(jnp.clip(drawn, low, high).astype(jnp.int32))
+    return jnp.clip(drawn, low, high).astype(jnp.int32)
 
 
 def follow(residual: Array, change: Array, on: Array, off: Array) -> tuple[Array, Array]:
@@ -70,15 +70,17 @@ def sample_poisson(key: Array, mean: Array) -> Array:
     few, many = jax.random.split(key)
     small = jnp.minimum(mean, MOST_SMALL)
     uniforms = jax.random.uniform(few, mean.shape)
-    probability = below = jnp.exp(-small)
-    count = jnp.zeros(mean.shape, jnp.int32)
-    for number in range(TERMS):
-        count = count + (uniforms >= below)
-        # At least that of a normal number, since a CPU is slow with denormal ones.
-        probability = jnp.maximum(probability * small / (number + 1), TINY)
-        below = below + probability
     normal = jax.random.normal(many, mean.shape)
-    large = jnp.round(mean + jnp.sqrt(mean) * normal + (normal * normal - 1.0) / 6.0)
-    drawn = jnp.where(mean > MOST_SMALL, jnp.maximum(large, 0.0).astype(jnp.int32), count)
-    # Without it XLA draws them again for each use of the counts, at ten times the cost on a CPU.
-    return jax.lax.optimization_barrier(drawn)
+    large = jnp.maximum(jnp.round(mean + jnp.sqrt(mean) * normal + (normal * normal - 1.0) / 6.0), 0.0)
+
+    def term(number: Array, carry: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+        count, probability, below = carry
+        count = count + jnp.where((mean <= MOST_SMALL) & (uniforms >= below), 1.0, 0.0)
+        # At least that of a normal number, since a CPU is slow with denormal ones.
+        probability = jnp.maximum(probability * small / (number + 1.0), TINY)
+        return count, probability, below + probability
+
+    # A loop, since XLA draws what is not one again for each use of the counts, at ten times the cost on a CPU.
+    none = jnp.exp(-small)
+    first = jnp.where(mean > MOST_SMALL, large, 0.0), none, none
+    return jax.lax.fori_loop(0, TERMS, term, first, unroll=6)[0].astype(jnp.int32)
