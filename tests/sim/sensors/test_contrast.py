@@ -78,7 +78,8 @@ def test_only_sensors_of_events_have_a_contrast_to_know():
         other = dataclasses.replace(DRAWN, env=dataclasses.replace(DRAWN.env, sensor=sensor))
         assert task_of(other).own_size == OWN_SIZE and task_of(other).motion_size == MOTION_SIZE
     task = task_of(DRAWN)
-    assert task.own_size == OWN_SIZE + 1 and len(task.mirror) == task.motion_size and task.mirror[-1] == 1.0
+    assert task.own_size == OWN_SIZE + 1 and task.mirror is not None
+    assert len(task.mirror) == task.motion_size and task.mirror[-1] == 1.0
     assert rotate_own_state(jnp.arange(11.0), jnp.int32(1))[-1] == 10.0
 
 
