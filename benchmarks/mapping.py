@@ -34,19 +34,19 @@ from edqn_jax.evaluation.metrics import summarise_flights
 from edqn_jax.evaluation.rollouts import fly_on_all_devices
 from edqn_jax.extras import MissingPackageError
 from edqn_jax.files import write_atomically
-from edqn_jax.learn.actor import AgentActor, PolicyParams
+from edqn_jax.learn.actor import AgentActor, PolicyParams, blank_observation
 from edqn_jax.learn.policy import Policy
 from edqn_jax.runs.policies import load_policy
 from edqn_jax.sim.physics.airframe import load_airframe
 from edqn_jax.sim.scene.distance import signed_distance
 from edqn_jax.sim.scene.motion import Aim
 from edqn_jax.sim.scene.scene import Scene, scene_at
-from edqn_jax.sim.sensors.sensor import mount_rotation, sensor_of
+from edqn_jax.sim.sensors.sensor import mount_rotation
 from edqn_jax.sim.task import env
 from edqn_jax.sim.task.env import EnvParams
 from edqn_jax.sim.task.flights import Flights
 from edqn_jax.sim.task.missions import own_missions
-from edqn_jax.sim.task.observation import MOTION_SIZE, OWN_SIZE, Observation
+from edqn_jax.sim.task.observation import Observation
 from edqn_jax.sim.task.outcomes import Outcome
 from edqn_jax.sim.worlds import families
 from measurement import json_report
@@ -174,8 +174,7 @@ def decision_ms(policy: Policy, flown: PilotConfig, world: EnvParams, planning: 
     """
     config, volume = policy.config, np.asarray(world.pool.volume)
     shape = grid.grid_shape(flown.map, volume)
-    seen = Observation(sensed=sensor_of(config).example(config), own=jnp.zeros(OWN_SIZE), motion=jnp.zeros(MOTION_SIZE))
-    seen, memory = jax.tree.map(np.asarray, (seen, AgentActor(config).init()))
+    seen, memory = jax.tree.map(np.asarray, (blank_observation(config), AgentActor(config).init()))
     picture = np.full((config.camera.height, config.camera.width), 5.0, np.float32)
     position = np.asarray(world.missions.start)[0]
     rotation = mount_rotation(config, jnp.array([1.0, 0.0, 0.0, 0.0]))

@@ -38,7 +38,7 @@ from edqn_jax.sim.sensors.events import EventField
 from edqn_jax.sim.sensors.sensor import SensorMemory, at_rest, frame_steps, frames_per_decision, sense
 from edqn_jax.sim.task import group
 from edqn_jax.sim.task.env import EnvParams
-from edqn_jax.sim.task.observation import MOTION_SIZE, OWN_SIZE, Observation
+from edqn_jax.sim.task.observation import Observation, motion_size, own_size
 from edqn_jax.sim.task.outcomes import Outcome
 from edqn_jax.sim.task.task import task_of
 from measurement import json_report
@@ -117,7 +117,7 @@ def look_call(config: Config, params: PolicyParams, scene: Scene) -> Callable[[]
         params: PolicyParams, scene: Scene, poses: Flight, before: SensorMemory, memory: Array, key: Array
     ) -> Array:
         sensed, _ = sense(config, scene, poses, before, key)
-        seen = Observation(sensed=sensed, own=jnp.zeros(OWN_SIZE), motion=jnp.zeros(MOTION_SIZE))
+        seen = Observation(sensed=sensed, own=jnp.zeros(own_size(config)), motion=jnp.zeros(motion_size(config)))
         return actor.act(params, memory, seen, key)[0]
 
     params, scene, key = jax.device_put(params), jax.device_put(scene), jax.random.key(0)

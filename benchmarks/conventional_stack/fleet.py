@@ -96,6 +96,11 @@ def check(config: Config) -> None:
         raise ConfigError("the conventional stack supports only the noiseless 'paper' event law between two frames")
     if light.is_on(config.light):
         raise ConfigError("the conventional stack supports only events without light; set light.most_lux to 0")
+    if sensor.most_contrast or sensor.sensor_pixels > 1:
+        raise ConfigError(
+            "the conventional stack supports only one contrast and one sensor pixel for each of ours; set "
+            "events.most_contrast to 0 and events.sensor_pixels to 1"
+        )
     if config.encoder.retrain_at:
         raise ConfigError(
             "the conventional stack supports only a VAE that is trained once; leave encoder.retrain_at empty"

@@ -120,20 +120,24 @@ def check_config(config: object) -> None:
 def with_conditions(config: Config, conditions: Layer, source: str) -> Config:
     """Returns the checked configuration of a policy that is flown under other conditions than it was trained under.
 
+    A profile is flown in full, and thresholds that are given are the contrast that a policy which knows it is told,
+    unless the options of what is drawn are given beside them.
+
     Args:
         config: of the policy.
         conditions: options of `CONDITIONS` by group.
         source: of them, for messages.
 
     Raises:
-        ConfigError: if there is no such option, it is none of `CONDITIONS`, or it is out of its limits.
+        ConfigError: if there is no such option, it is none of `CONDITIONS`, or it is out of its limits; if it would
+            give a contrast to a policy that knows none, or take it away.
     """
     if not isinstance(conditions, Mapping):
         raise ConfigError(
             f"{source}: conditions must be options by group, such as {{'air': {{'gusts_m_s': 5.0}}}}, not "
             f"{describe_object(conditions)}"
         )
-    changed = apply_layer(config, conditions, source)
+    changed = _with_known_contrast(config, apply_layer(config, conditions, source), conditions, source)
     for group, options in conditions.items():
         for option in options:
             if option not in CONDITIONS.get(group, ()):
@@ -143,6 +147,36 @@ def with_conditions(config: Config, conditions: Layer, source: str) -> Config:
                 )
     validate(changed, trains=False)
     return changed
+
+
+def _with_known_contrast(config: Config, changed: Config, conditions: Layer, source: str) -> Config:
+    """Returns `changed` with the event sensor that `conditions` describe in place of one that is drawn.
+
+    Raises:
+        ConfigError: if the policy of `config` cannot know its contrast, or has to.
+    """
+    given, law = conditions.get("events", {}), changed.events
+    knows, drawn = config.events.most_contrast > 0, law.most_contrast > 0
+    if not knows and (drawn or law.least_contrast > 0):
+        raise ConfigError(
+            f"{source}: this policy was trained without events.most_contrast and knows no contrast; give "
+            "events.threshold and events.tolerance instead"
+        )
+    if knows and not drawn and {"least_contrast", "most_contrast"} & set(given):
+        raise ConfigError(
+            f"{source}: this policy knows the contrast of its sensor: events.least_contrast and events.most_contrast "
+            f"must be between 0.01 and 1, not {law.least_contrast:g} and {law.most_contrast:g}"
+        )
+    options: dict[str, Any] = {}
+    if "profile" in given and "faults_share" not in given:
+        options["faults_share"] = 0.0
+    thresholds = {"paper": {"tolerance", "threshold"}, "esim": {"contrast_on", "contrast_off"}}
+    named = {*given, *PROFILES[law.profile]} if "profile" in given else set(given)
+    sets = thresholds.get(law.law, {"airsim_tolerance"}) & named
+    if knows and sets and not {"least_contrast", "most_contrast"} & set(given):
+        contrast = {"paper": law.tolerance, "airsim": law.airsim_tolerance, "esim": law.contrast_on}[law.law]
+        options |= {"least_contrast": contrast, "most_contrast": contrast}
+    return dataclasses.replace(changed, events=dataclasses.replace(law, **options))
 
 
 def load_layer(file: Path) -> Layer:

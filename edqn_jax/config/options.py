@@ -53,7 +53,7 @@ CONDITIONS: dict[str, tuple[str, ...]] = {
     "events": (
         *("profile", "threshold", "tolerance", "contrast_on", "contrast_off", "refractory_ns", "bandwidth_hz"),
         *("threshold_mismatch", "leak_rate_hz", "shot_rate_hz", "hot_pixel_fraction", "hot_pixel_rate_hz"),
-        "reference_lux",
+        *("reference_lux", "least_contrast", "most_contrast", "faults_share", "sensor_pixels"),
     ),
     **{
         group: tuple(option.name for option in fields(kind))

@@ -9,6 +9,7 @@ from typing import Any
 from edqn_jax.config.limits import between, check_limits, require
 from edqn_jax.config.options import Config
 from edqn_jax.config.registry import ACTION_SETS, AIRFRAMES, ENCODERS, FAMILIES, LEARNERS, NETWORKS, OWN, SENSORS
+from edqn_jax.config.simulation import EventsConfig
 from edqn_jax.errors import ConfigError
 
 Rules = Iterator[tuple[bool, str, str]]
@@ -106,6 +107,7 @@ def _flight_rules(config: Config, trains: bool) -> Rules:
         yield lit.holds(light.most_lux), "light.most_lux", lit.says
         least = light.least_lux <= light.most_lux
         yield least, "light.least_lux", f"at most light.most_lux ({light.most_lux:g})"
+    yield from _event_sensor_rules(config.events)
     shortest = exposure.shortest_s <= exposure.longest_s
     yield shortest, "exposure.shortest_s", f"at most exposure.longest_s ({exposure.longest_s:g})"
     if exposure.real:
@@ -121,6 +123,18 @@ def _flight_rules(config: Config, trains: bool) -> Rules:
         gamma = config.agent.discount
         same = env.reward != "potential" or env.potential_discount == gamma
         yield same, "env.potential_discount", f"{gamma:g}, agent.discount, with env.reward potential"
+
+
+def _event_sensor_rules(events: EventsConfig) -> Rules:
+    """Yields rules of event sensors that differ from episode to episode, or average many pixels."""
+    if (events.least_contrast, events.most_contrast) != (0.0, 0.0):
+        drawn = between(0.01, 1)
+        yield drawn.holds(events.least_contrast), "events.least_contrast", drawn.says
+        yield drawn.holds(events.most_contrast), "events.most_contrast", drawn.says
+        most = f"at most events.most_contrast ({events.most_contrast:g})"
+        yield events.least_contrast <= events.most_contrast, "events.least_contrast", most
+    one = events.sensor_pixels == 1 or events.law != "airsim"
+    yield one, "events.sensor_pixels", "1 with events.law airsim, which has no pixels that differ"
 
 
 def _learning_rules(config: Config) -> Rules:

@@ -194,6 +194,17 @@ class EventsConfig:
     """Events per second of a hot pixel."""
     reference_lux: Annotated[float, POSITIVE] = 10.0
     """Illuminance in which `bandwidth_hz` and `shot_rate_hz` are a white and a black pixel's, where `light` is on."""
+    least_contrast: Annotated[float, NOT_NEGATIVE] = 0.0
+    """Least contrast of a sensor that is drawn for each episode and known to the networks, log-uniform from this to
+    `most_contrast`: the thresholds of the law scale with it. From 0.01 on; 0 is off: thresholds are those above."""
+    most_contrast: Annotated[float, NOT_NEGATIVE] = 0.0
+    """Most contrast, log-brightness change per event; up to 1, and 0 is off."""
+    faults_share: Annotated[float, SHARE] = 0.0
+    """How far an episode's sensor may be better than this one: its share of mismatch, noise, refractory period and
+    smear is uniform from 1 minus this to 1. 0 is off."""
+    sensor_pixels: Annotated[int, COUNT, at_most(1000)] = 1
+    """Pixels of the real sensor that one of ours stands for: 117 for 346 x 260 over 32 x 24. Counts are then the mean
+    of so many pixels, whose faults average out; laws `paper` and `esim`."""
 
 
 @dataclass(frozen=True)

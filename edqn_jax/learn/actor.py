@@ -20,7 +20,7 @@ from edqn_jax.learn.learner import learner_of
 from edqn_jax.learn.perception import embedding
 from edqn_jax.learn.qnetwork import Params
 from edqn_jax.sim.sensors.sensor import sensor_of
-from edqn_jax.sim.task.observation import MOTION_SIZE, OWN_SIZE, Observation
+from edqn_jax.sim.task.observation import Observation, motion_size, own_size
 
 MOVE_SIZE = 3
 """Values of the last move, which end the own motion (`sim.task.observation.own_motion`)."""
@@ -62,12 +62,13 @@ class PolicyParams:
 
 def blank_observation(config: Config) -> Observation:
     """Returns an observation of one drone in which nothing is seen, with the shapes and types of any other."""
-    return Observation(sensor_of(config).example(config), own=jnp.zeros(OWN_SIZE), motion=jnp.zeros(MOTION_SIZE))
+    own, motion = jnp.zeros(own_size(config)), jnp.zeros(motion_size(config))
+    return Observation(sensor_of(config).example(config), own=own, motion=motion)
 
 
 def observation_size(config: Config) -> int:
     """Returns D, the length of what is seen, the last move where the Q-network sees it, and the own state."""
-    return embedding.embedding_size(config) + (MOVE_SIZE if config.agent.last_move else 0) + OWN_SIZE
+    return embedding.embedding_size(config) + (MOVE_SIZE if config.agent.last_move else 0) + own_size(config)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -10,6 +10,7 @@ nothing else of them is read.
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable, Sequence
 
 import jax
@@ -40,6 +41,7 @@ class Counts:
     window_s: float = struct.field(pytree_node=False)
     divides_window: bool = struct.field(pytree_node=False)
     with_noise: bool = struct.field(pytree_node=False)
+    unit: Array | None = None  # [...] as of the field
 
 
 @struct.dataclass
@@ -47,7 +49,7 @@ class Samples:
     """Inputs of a VAE update, or a ring of them with leading [L, E]."""
 
     sensed: Counts | EventField | Array  # a picture is an array
-    motion: Array  # [..., MOTION_SIZE]
+    motion: Array  # [..., motion_size]
     wanted: Target
 
 
@@ -128,14 +130,17 @@ def mirror_samples(
     """Returns samples [...] as they would be with left and right exchanged.
 
     Args:
-        factors: [MOTION_SIZE] of the own motion.
+        factors: [motion_size] of the own motion.
         mirror: of the sensor, see `Sensor.mirror`.
     """
     # The standing waves across the image that change their sign are the odd ones.
     amplitudes = samples.wanted.amplitudes
     signs = jnp.asarray(1.0 - 2.0 * (np.arange(amplitudes.shape[-1]) % 2), jnp.float32)
+    mirrored = jax.tree.map(mirror, samples.sensed)
+    if isinstance(samples.sensed, Counts | EventField):
+        mirrored = dataclasses.replace(mirrored, unit=samples.sensed.unit)
     return Samples(
-        sensed=jax.tree.map(mirror, samples.sensed),
+        sensed=mirrored,
         motion=samples.motion * jnp.asarray(factors),
         wanted=Target(amplitudes * signs, samples.wanted.beyond),
     )
@@ -148,14 +153,15 @@ def to_encoder_input(samples: Samples) -> EventField | Array:
         return stored
     count, polarity = jnp.abs(stored.signed).astype(jnp.int32), jnp.sign(stored.signed).astype(jnp.int8)
     unread = jnp.zeros(count.shape)
-    return EventField(count, polarity, unread, unread, stored.window_s, stored.divides_window, stored.with_noise)
+    kind = stored.window_s, stored.divides_window, stored.with_noise
+    return EventField(count, polarity, unread, unread, *kind, stored.unit)
 
 
 def _stored(config: EncoderConfig, sensed: EventField | Array) -> Counts | EventField | Array:
     if not isinstance(sensed, EventField) or not _counts_alone(config, sensed):
         return sensed
     signed = (jnp.minimum(sensed.count, MAX_EVENTS) * sensed.polarity).astype(jnp.int16)
-    return Counts(signed, sensed.window_s, sensed.divides_window, sensed.with_noise)
+    return Counts(signed, sensed.window_s, sensed.divides_window, sensed.with_noise, sensed.unit)
 
 
 def _counts_alone(config: EncoderConfig, field: EventField) -> bool:

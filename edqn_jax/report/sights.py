@@ -27,7 +27,7 @@ from edqn_jax.sim.physics import drone
 from edqn_jax.sim.physics.drone import Flight
 from edqn_jax.sim.scene.scene import Scene, scene_at
 from edqn_jax.sim.sensors import sensor
-from edqn_jax.sim.task.observation import MOTION_SIZE, OWN_SIZE, Observation, heading_velocity
+from edqn_jax.sim.task.observation import MOTION_SIZE, Observation, heading_velocity, own_size, with_contrast
 
 FINE = 8
 """How much finer than the drone's camera the RGB pictures for people are, per axis."""
@@ -131,7 +131,9 @@ class FlightRenderer:
             if embedding.needs_nearness(config):
                 nearness = sensor.nearness_image(config, now, position[-1], quaternion[-1])
             # The goal is not part of a code.
-            observation = Observation(sensed=sensed, own=jnp.zeros(OWN_SIZE), motion=motion)
+            observation = Observation(
+                sensed, own=jnp.zeros(own_size(config)), motion=with_contrast(config, memory, motion)
+            )
             code = actor.code(actor.encode(params, actor.init(), observation))
             read = shows.encoder_input(config, sensed)
             assert read is not None

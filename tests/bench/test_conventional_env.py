@@ -260,6 +260,8 @@ def test_who_ended_starts_anew_within_the_step():
         {"events": EventsConfig(bandwidth_hz=30.0)},
         {"light": LightConfig(1.0, 100.0)},
         {"events": EventsConfig(frame_times_s=(-0.08, -0.04, 0.0))},
+        {"events": EventsConfig(least_contrast=0.1, most_contrast=0.2)},
+        {"events": EventsConfig(sensor_pixels=4)},
         {"camera": CameraConfig(mount="body")},
         {"encoder": EncoderConfig(retrain_at=(0.5,))},
         {"env": EnvConfig(position=False)},

@@ -319,6 +319,15 @@ def test_no_numeric_option_can_be_nonsense(group, option, nonsense):
         ("light", {"most_lux": 100.0}, "light.least_lux must be between 0.1 and 10000, not 0.0"),
         ("light", {"least_lux": 1.0, "most_lux": 20_000.0}, "light.most_lux must be between 0.1 and 10000, not 20000"),
         ("light", {"least_lux": 9.0, "most_lux": 1.0}, r"light.least_lux must be at most light.most_lux \(1\), not 9"),
+        ("events", {"most_contrast": 0.2}, "events.least_contrast must be between 0.01 and 1, not 0.0"),
+        ("events", {"least_contrast": 0.1, "most_contrast": 2.0}, "most_contrast must be between 0.01 and 1, not 2.0"),
+        (
+            "events",
+            {"least_contrast": 0.3, "most_contrast": 0.1},
+            r"events.least_contrast must be at most events.most_contrast \(0.1\), not 0.3",
+        ),
+        ("events", {"faults_share": 1.5}, "events.faults_share must be between 0 and 1"),
+        ("events", {"sensor_pixels": 4, "law": "airsim"}, "events.sensor_pixels must be 1 with events.law airsim"),
     ],
 )
 def test_what_cannot_be_run_is_named_with_its_limits(group, options, says):

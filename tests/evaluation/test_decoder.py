@@ -30,7 +30,7 @@ def test_the_figures_are_the_quantiles_over_near_pixels():
     rng = np.random.default_rng(0)
     true = rng.uniform(0.2, 20.0, (40, 24, 32)).astype(np.float32)
     predicted = (true * rng.lognormal(0.0, 0.5, true.shape)).astype(np.float32)
-    histograms = np.asarray(jax.vmap(error_histograms)(predicted, true))
+    histograms = np.asarray(jax.vmap(error_histograms)(jnp.asarray(predicted), jnp.asarray(true)))
     figures = summarise_errors(histograms, 40)
     near = true < NEAR_M
     metres = np.abs(predicted - true)[near]

@@ -144,7 +144,7 @@ def test_shuffling_moves_the_codes_and_nothing_else(course):
             flown = fly_on_all_devices(CONFIG, world, params, record=True)
         else:  # on one: the layout must not matter either
             flown = fly_missions(
-                CONFIG, world, params, jax.random.key(0), extras=Extras(shuffle_codes=True, extras=Extras(record=True))
+                CONFIG, world, params, jax.random.key(0), extras=Extras(shuffle_codes=True, record=True)
             )
         assert flown.record is not None
         return np.asarray(flown.record.action)

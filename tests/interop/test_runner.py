@@ -57,7 +57,7 @@ def event(t: int, x: int, y: int, p: int) -> np.ndarray:
 
 
 def fly(file: Path, decisions: list[Decided]) -> tuple[list[int], list[runner.Command]]:
-    flier = runner.Runner(file)
+    flier = runner.Runner(file, contrast=decisions[0].contrast)
     commands = [flier.decide(each.packet, each.until_us, **each.given) for each in decisions]
     return [command.move for command in commands], commands
 
@@ -95,12 +95,14 @@ def _way(each: Decided) -> np.ndarray:
     [
         {"events": {"law": "esim", "frame_times_s": (-0.08, -0.04, 0.0)}},
         {"events": {"leak_rate_hz": 5.0, "shot_rate_hz": 5.0}},
+        {"events": {"least_contrast": 0.02, "most_contrast": 0.05, "leak_rate_hz": 1.0}},
+        {"env": {"sensor": "event-image"}, "events": {"least_contrast": 0.02, "most_contrast": 0.05}},
         {"events": {"threshold": 0.08, "tolerance": 0.02}, "agent": {"history": 4, "dueling": False}},
         {"env": {"sensor": "event-image"}},
         {"env": {"position": False, "heading": "flight"}},
         {"encoder": {"architecture": "pooled"}, "agent": {"history": 1, "layer_norm": True}},
     ],
-    ids=["esim", "noise", "threshold", "event-image", "no-position", "pooled"],
+    ids=["esim", "noise", "contrast", "contrast-image", "threshold", "event-image", "no-position", "pooled"],
 )
 def test_other_policies_fly_as_in_jax(tmp_path, groups):
     policy = untrained(**groups)
@@ -194,6 +196,33 @@ def test_on_and_off_events_of_a_pixel_cancel_unless_the_policy_knows_noise():
 def test_an_event_of_a_coarser_contrast_is_several():
     assert counts(event(1, 0, 0, -1), contrast=0.25)[0, :, 0, 0].tolist() == [0, 2]
     assert counts(event(1, 0, 0, -1), contrast=0.05).sum() == 0
+
+
+KNOWN = {"default": 0.08, "middle": 0.1, "half_range": 2.0}
+
+
+def test_a_policy_that_knows_its_contrast_counts_the_cameras_own_events_and_is_told():
+    packet = np.concatenate([event(1, 0, 0, 1)] * 3)
+    assert counts(packet, contrast=0.3, about={"known_contrast": KNOWN})[0, :, 0, 0].tolist() == [3, 0]
+    about, own = ABOUT | {"known_contrast": KNOWN}, np.arange(3, dtype=np.float32)
+    told = runner.with_contrast(about, own, runner.camera_contrast(about, 0.3))
+    assert told.dtype == np.float32
+    np.testing.assert_allclose(told, [0, 1, 2, np.log(3.0) / 2.0], rtol=1e-6)
+    unsaid = runner.with_contrast(about, own, runner.camera_contrast(about))
+    np.testing.assert_allclose(unsaid[3], np.log(0.8) / 2.0, rtol=1e-6)
+    assert runner.with_contrast(ABOUT, own, 0.3) is own and runner.camera_contrast(ABOUT) is None
+
+
+def test_a_policy_of_many_pixels_counts_the_mean_of_the_cameras():
+    packet = np.concatenate([event(5, x, y, 1) for x in (2, 3) for y in (0, 1)][:3])
+    found = counts(packet, (8, 4), about={"sensor_pixels": 100, "known_contrast": KNOWN})
+    assert found[0, 0, 0, 1] == 75 and found.sum() == 75
+
+
+@pytest.mark.parametrize("contrast", [0.0, -0.1, np.nan, np.inf])
+def test_a_contrast_that_no_camera_has_is_refused(exported, contrast):
+    with pytest.raises(ValueError, match="contrast must be more than 0"):
+        runner.Runner(exported, contrast=contrast)
 
 
 def test_a_wider_camera_is_cropped_and_a_narrower_one_leaves_a_margin():

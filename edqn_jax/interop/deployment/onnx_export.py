@@ -25,9 +25,15 @@ from edqn_jax.learn.policy import Policy
 from edqn_jax.learn.qnetwork import q_values
 from edqn_jax.policies.functions import check_has_params
 from edqn_jax.sim.actions import ACTIONS, move_name
-from edqn_jax.sim.sensors import events
+from edqn_jax.sim.sensors import contrast, events
 from edqn_jax.sim.sensors.events import EventField
-from edqn_jax.sim.task.observation import MAX_YAW_RATE, MOTION_SIZE, OWN_SIZE, Observation
+from edqn_jax.sim.task.observation import (
+    MAX_YAW_RATE,
+    Observation,
+    knows_contrast,
+    motion_size,
+    own_size,
+)
 from edqn_jax.version import package_version
 
 RUNNER = "edqn_runner.py"
@@ -157,7 +163,9 @@ def about_policy(config: Config) -> dict[str, Any]:
         "law": law.law,
         "contrast_on": on,
         "contrast_off": off,
-        "least_count": max(1, least),
+        "least_count": max(1, least) if law.sensor_pixels == 1 else 1,
+        "known_contrast": _known_contrast(config),
+        "sensor_pixels": law.sensor_pixels,
         "counts_net": not events.has_noise(config.events),
         "history": config.agent.history,
         "observation_size": observation_size(config),
@@ -174,24 +182,37 @@ def about_policy(config: Config) -> dict[str, Any]:
     }
 
 
+def _known_contrast(config: Config) -> dict[str, float] | None:
+    """Returns the contrast that a policy which knows it assumes, and its scale; None where it knows none."""
+    if not knows_contrast(config):
+        return None
+    return {
+        "default": (config.events.least_contrast * config.events.most_contrast) ** 0.5,
+        "middle": contrast.MIDDLE,
+        "half_range": contrast.HALF_RANGE,
+    }
+
+
 def decision_function(config: Config, params: PolicyParams) -> Callable[..., tuple[Array, Array]]:
     """Returns the function that is exported: counts, own state, own motion and memory to values and memory.
 
-    All with a leading [1]: counts [1, F, 2, H, W] int32 of ON and OFF events, own [1, OWN_SIZE], motion
-    [1, MOTION_SIZE], memory [1, history, D]; values [1, 27].
+    All with a leading [1]: counts [1, F, 2, H, W] int32 of ON and OFF events, own [1, own_size], motion
+    [1, motion_size], memory [1, history, D]; values [1, 27].
     """
     params = jax.tree.map(np.asarray, params)  # constants of the file
 
     def decide(counts: Array, own: Array, motion: Array, memory: Memory) -> tuple[Array, Array]:
-        observation = Observation(sensed=_sense(config, counts), own=own, motion=motion)
+        observation = Observation(sensed=_sense(config, counts, motion), own=own, motion=motion)
         after = AgentActor(config).encode(params, memory, observation)
         return q_values(config.agent, params.q, len(ACTIONS), after), after
 
     return decide
 
 
-def field_of(config: Config, counts: Array) -> EventField:
+def field_of(config: Config, counts: Array, motion: Array) -> EventField:
     """Returns the event field [..., F, H, W] of counts [..., F, 2, H, W] of ON and OFF events.
+
+    The own motion [..., motion_size] tells the contrast, where the policy knows it.
 
     Of a policy that was trained with noise it is [..., 2 F, H, W]: ON and OFF apart. Times are those of Eq. 5.
     Polarities are int32.
@@ -218,14 +239,24 @@ def field_of(config: Config, counts: Array) -> EventField:
         window_s=float(edges[-1]),
         divides_window=_only_counts(config),
         with_noise=events.has_noise(config.events),
+        unit=_unit(config, motion),
     )
 
 
-def _sense(config: Config, counts: Array) -> EventField | Array:
+def _unit(config: Config, motion: Array) -> Array | None:
+    """Returns what an event counts [...] with own motions [..., motion_size]; None where it is 1."""
+    known = contrast.contrast_of(motion[..., -1]) if knows_contrast(config) else None
+    unit = events.unit_of(config.events, known)
+    return None if unit is None else jnp.broadcast_to(unit, motion.shape[:-1])
+
+
+def _sense(config: Config, counts: Array, motion: Array) -> EventField | Array:
     """Returns what the sensor shows where a camera counts these events."""
     if config.env.sensor == "events":
-        return field_of(config, counts)
+        return field_of(config, counts, motion)
     image = jnp.sum(counts[..., 0, :, :] - counts[..., 1, :, :], axis=-3).astype(jnp.float32)
+    unit = _unit(config, motion)
+    image = image if unit is None else image * unit[..., None, None]
     shown = jnp.sign(image) * jnp.log1p(jnp.abs(image))  # as sim.sensor has it
     return shown.reshape(*shown.shape[:-2], -1)
 
@@ -238,7 +269,7 @@ def _only_counts(config: Config) -> bool:
 def _shapes(config: Config) -> list[jax.ShapeDtypeStruct]:
     pairs = len(config.events.frame_times_s) - 1
     counts = (1, pairs, 2, config.camera.height, config.camera.width)
-    numbers = [(1, OWN_SIZE), (1, MOTION_SIZE), (1, config.agent.history, observation_size(config))]
+    numbers = [(1, own_size(config)), (1, motion_size(config)), (1, config.agent.history, observation_size(config))]
     return [jax.ShapeDtypeStruct(counts, np.int32), *(jax.ShapeDtypeStruct(shape, np.float32) for shape in numbers)]
 
 

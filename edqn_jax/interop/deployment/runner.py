@@ -67,11 +67,13 @@ class Runner:
             file: ONNX, as `edqn export` writes it.
             camera: width and height of the camera's image, pixels; None is the policy's own resolution.
             camera_fov_deg: the camera's horizontal field of view; None takes its whole image for the policy's.
-            contrast: change of log brightness that makes an event in the camera; None is the policy's own.
+            contrast: change of log brightness that makes an event in the camera, which a policy that knows it is told;
+                None is the policy's own, or the middle of those that it was trained with.
             threads: of onnxruntime; the network is so small that one is fastest.
 
         Raises:
-            ValueError: if the file is no exported policy, or the camera cannot stand for the policy's.
+            ValueError: if the file is no exported policy, or the camera cannot stand for the policy's, or the contrast
+                is not above 0.
         """
         import onnxruntime  # pyright: ignore[reportMissingImports]
 
@@ -88,7 +90,7 @@ class Runner:
         self.about = _about(self._session.get_modelmeta().custom_metadata_map, path)
         """What the policy expects, as `edqn export` wrote it."""
         self._grid = Grid.of(self.about, camera, camera_fov_deg)
-        self._contrast = contrast
+        self._contrast = camera_contrast(self.about, contrast)
         self._actions = np.asarray(self.about["actions"], np.float32)
         shape = next(given.shape for given in self._session.get_inputs() if given.name == "memory")
         self._empty = np.zeros(shape, np.float32)
@@ -160,8 +162,8 @@ class Runner:
             ["values", "memory_after"],
             {
                 "counts": counts[None],
-                "own": own_state(self.about, place, yaw, speed, aim, bounds)[None],
-                "motion": own_motion(self.about, yaw, speed, turn, move)[None],
+                "own": self._told(own_state(self.about, place, yaw, speed, aim, bounds)),
+                "motion": self._told(own_motion(self.about, yaw, speed, turn, move)),
                 "memory": self._memory,
             },
         )
@@ -171,6 +173,10 @@ class Runner:
         wanted = self.velocity_of(best, float(yaw))
         self._yaw = self._setpoint(place, float(yaw), aim, wanted)
         return Command(best, wanted, self._yaw, values[0])
+
+    def _told(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Returns own values as the network takes them, [1, N]."""
+        return with_contrast(self.about, values, self._contrast)[None]
 
     def velocity_of(self, move: int, yaw: float) -> NDArray[np.float32]:
         """Returns the velocity [3] m/s in the world that a move commands at a heading in radians."""
@@ -251,6 +257,30 @@ def _hull(places: NDArray[np.int64]) -> tuple[int, int]:
     return int(seen.min()), int(seen.max()) + 1
 
 
+def camera_contrast(about: Mapping[str, Any], contrast: float | None = None) -> float | None:
+    """Returns the contrast of a camera: as given, or as a policy that knows it was trained with; None is its own.
+
+    Raises:
+        ValueError: if it is not above 0.
+    """
+    if contrast is not None and not 0.0 < contrast < np.inf:
+        raise ValueError(
+            "contrast must be more than 0, the change of log brightness that makes an event in the camera, not "
+            f"{contrast}"
+        )
+    known = about.get("known_contrast")
+    return known["default"] if contrast is None and known else contrast
+
+
+def with_contrast(about: Mapping[str, Any], values: NDArray[np.float32], contrast: float | None) -> NDArray[np.float32]:
+    """Returns own values [N] with that of the camera's contrast after them, for a policy that knows it."""
+    known = about.get("known_contrast")
+    if not known:
+        return values
+    own = known["default"] if contrast is None else contrast
+    return np.append(values, np.float32(np.log(own / known["middle"]) / known["half_range"]))
+
+
 def count_events(
     about: Mapping[str, Any],
     packet: NDArray,
@@ -265,7 +295,8 @@ def count_events(
     to one of the policy's are averaged, and the policy's own threshold and tolerance (Eq. 2 and 4) make events of the
     mean change. So a pixel's ON and OFF events within one pair of frames cancel, as they do for two frames; only a
     policy that was trained with sensor noise counts them apart. At the policy's own resolution and contrast every count
-    is that of the events themselves.
+    is that of the events themselves. A policy that knows the contrast counts in the camera's own; of one that was
+    trained with the mean of many pixels, a count is that of so many pixels together.
 
     Args:
         about: of the policy, see `Runner.about`.
@@ -293,12 +324,16 @@ def count_events(
     shape = (edges.size - 1, 2, about["height"], about["width"])
     cell = np.ravel_multi_index((pair[seen], (window["p"][seen] < 0).astype(np.int64), row[seen], column[seen]), shape)
     number = np.bincount(cell, minlength=int(np.prod(shape))).reshape(shape)
-    per_event = [1.0 if contrast is None else contrast / own for own in (about["contrast_on"], about["contrast_off"])]
+    told = contrast is None or about.get("known_contrast")
+    per_event = [1.0 if told else contrast / own for own in (about["contrast_on"], about["contrast_off"])]
     change = number * np.asarray(per_event)[:, None, None] / np.maximum(pixels, 1)
     if about["counts_net"]:
         # In contrasts of the policy, which may differ between ON and OFF.
         log_change = change[:, 0] * about["contrast_on"] - change[:, 1] * about["contrast_off"]
         change = np.stack([log_change / about["contrast_on"], -log_change / about["contrast_off"]], axis=1)
+    together = about.get("sensor_pixels", 1)
+    if together > 1:
+        return np.rint(np.maximum(change, 0.0) * together).astype(np.int32)
     # Rounding must not take away what is exactly one event.
     counts = np.floor(np.maximum(change, 0.0) + 1e-6).astype(np.int32)
     return np.where(counts >= about["least_count"], counts, 0).astype(np.int32)

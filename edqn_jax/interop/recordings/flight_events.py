@@ -14,8 +14,12 @@ from edqn_jax.interop.recordings.recording import Recording
 from edqn_jax.sim.environment import Environment
 from edqn_jax.sim.physics.drone import Flight
 from edqn_jax.sim.scene.launches import aim_along
+from edqn_jax.sim.sensors.contrast import nominal_contrast
 from edqn_jax.sim.task.action_sets import action_set
 from edqn_jax.sim.task.env import EnvParams, scene_of
+
+ONE_SENSOR = {"least_contrast": 0.0, "most_contrast": 0.0, "faults_share": 0.0, "sensor_pixels": 1}
+"""Options of events of a sensor of which nothing is drawn."""
 
 
 def flight_recording(
@@ -24,7 +28,8 @@ def flight_recording(
     """Returns the events of a flight, with a frame at every physics step, and where the camera was.
 
     The camera is an ESIM sensor, which remembers each pixel's level from frame to frame. Where the policy's own law has
-    no memory (`paper`, `airsim`), the contrast of an event is that law's tolerance.
+    no memory (`paper`, `airsim`), the contrast of an event is that law's tolerance. It has all of its faults and the
+    configured contrast, whatever was drawn in the flight, and each of its pixels is one pixel.
 
     Args:
         config: of the policy that flew.
@@ -33,13 +38,13 @@ def flight_recording(
         size: width and height of the image; None is the policy's own.
     """
     law = config.events
-    contrast = {"paper": law.tolerance, "airsim": law.airsim_tolerance, "esim": law.contrast_on}[law.law]
+    contrast = nominal_contrast(law)
     off = law.contrast_off if law.law == "esim" else contrast
     camera = config.camera if size is None else dataclasses.replace(config.camera, width=size[0], height=size[1])
     sees = dataclasses.replace(
         config,
         camera=camera,
-        events=dataclasses.replace(law, contrast_on=contrast, contrast_off=off),
+        events=dataclasses.replace(law, contrast_on=contrast, contrast_off=off, **ONE_SENSOR),
     )
     poses = _from_start(env_params, trajectory)
     aim = None

@@ -21,7 +21,7 @@ from edqn_jax.learn.perception import embedding, vae
 from edqn_jax.learn.policy import Policy
 from edqn_jax.policies.functions import check_has_params
 from edqn_jax.sim.sensors import events
-from edqn_jax.sim.task.observation import OWN_SIZE, Observation
+from edqn_jax.sim.task.observation import Observation, own_size
 
 
 @dataclasses.dataclass(frozen=True)
@@ -101,7 +101,10 @@ def observe_recording(
         raise
     except ValueError as error:
         raise ConfigError(str(error)) from None
-    contrast = recording.contrast if contrast is None else contrast
+    try:
+        contrast = runner.camera_contrast(about, recording.contrast if contrast is None else contrast)
+    except ValueError as error:
+        raise ConfigError(str(error)) from None
     window_us = about["frame_times_us"][-1] - about["frame_times_us"][0]
     ends = window_ends(recording, window_us, round(about["decision_s"] * 1e6))
     stream = recording.events
@@ -113,7 +116,8 @@ def observe_recording(
             for a, b, end in zip(first, last, ends, strict=True)
         ]
     )
-    motion = np.stack([_motion(about, recording, int(end), velocity, yaw_rate) for end in ends])
+    motions = (_motion(about, recording, int(end), velocity, yaw_rate) for end in ends)
+    motion = np.stack([runner.with_contrast(about, each, contrast) for each in motions])
     image, decoded = _encode_and_decode(config, policy.params, jnp.asarray(counts), jnp.asarray(motion))
     return Seen(ends, np.asarray(image), np.asarray(decoded), embedding.needs_nearness(config))
 
@@ -139,9 +143,9 @@ def _encode_and_decode(config: Config, params: PolicyParams, counts: Array, moti
     actor = AgentActor(config)
 
     def one(given: tuple[Array, Array]) -> tuple[Array, Array]:
-        field = field_of(config, given[0])
+        field = field_of(config, *given)
         # The goal is not part of a code.
-        seen = Observation(sensed=field, own=jnp.zeros(OWN_SIZE), motion=given[1])
+        seen = Observation(sensed=field, own=jnp.zeros(own_size(config)), motion=given[1])
         code = actor.code(actor.encode(params, actor.init(), seen))
         channels = vae.decode(config.encoder, config.camera, params.encoder, code)
         nearness = embedding.needs_nearness(config)

@@ -11,7 +11,7 @@ from edqn_jax.config import Config
 from edqn_jax.learn.perception import vae
 from edqn_jax.learn.perception.code import Form, Params
 from edqn_jax.sim.sensors.sensor import sensor_of
-from edqn_jax.sim.task.observation import Observation
+from edqn_jax.sim.task.observation import Observation, motion_size
 
 
 def has_code(config: Config) -> bool:
@@ -45,7 +45,8 @@ def init_params(config: Config, key: Array) -> Params:
     if not has_code(config):
         return {}
     form, layers = _shape(config)
-    return vae.init_vae(config.encoder, config.camera, key, form=form, layers=layers)
+    motion = motion_size(config)
+    return vae.init_vae(config.encoder, config.camera, key, form=form, layers=layers, motion=motion)
 
 
 def inference_params(config: Config, params: Params) -> Params:

@@ -18,7 +18,7 @@ from jax import Array
 from edqn_jax.config import EncoderConfig
 from edqn_jax.learn.perception.code import CodeHead
 from edqn_jax.learn.perception.layers import Dense, add_shared
-from edqn_jax.sim.sensors.events import EventField
+from edqn_jax.sim.sensors.events import EventField, in_units
 
 
 def log_counts(field: EventField) -> list[Array]:
@@ -26,7 +26,7 @@ def log_counts(field: EventField) -> list[Array]:
 
     With noise, a pixel's ON and OFF events between two frames stand in rows of their own.
     """
-    level = jnp.log(1.0 + field.count.astype(jnp.float32))
+    level = jnp.log(1.0 + in_units(field))
     if field.with_noise:
         pairs = jnp.split(level, 2, axis=-3)
     else:
@@ -87,7 +87,7 @@ class PatchEncoder(nn.Module):
         """Returns mean and log-variance `[..., code_size]` of fields `[..., F, H, W]` or pictures `[..., C, H, W]`.
 
         Args:
-            motion: `[..., MOTION_SIZE]` own motion, see `sim.task.observation.own_motion`.
+            motion: `[..., motion_size]` own motion, see `sim.task.observation.own_motion`.
         """
         images = log_counts(sensed) if isinstance(sensed, EventField) else list(jnp.moveaxis(sensed, -3, 0))
         first, *later = self.config.patch_layers

@@ -46,7 +46,17 @@ def temporal_sums(frequencies: int, field: EventField) -> list[Array | None]:
 
     The geometric series of n phasors a step apart is Dirichlet's kernel, `sin(n x) / sin(x)`, times the
     middle phasor. Half turns are subtracted from x first: the kernel is then stable where sin(x) vanishes.
+
+    Sums are in the field's units, see `events.in_units`.
     """
+    sums = _sums_of_events(frequencies, field)
+    if field.unit is None:
+        return sums
+    return [None if each is None else each * field.unit[..., None, None, None] for each in sums]
+
+
+def _sums_of_events(frequencies: int, field: EventField) -> list[Array | None]:
+    """Returns the sums of `temporal_sums` over events, each of which counts 1."""
     n = field.count.astype(jnp.float32)
     if field.divides_window:
         sums: list[Array | None] = [n]

@@ -23,7 +23,7 @@ from edqn_jax.learn.perception.code import EVENT_CHANNELS, Form, Params, kl_dive
 from edqn_jax.learn.perception.layers import Dense, init_params
 from edqn_jax.learn.perception.pooled_encoder import PooledEncoder
 from edqn_jax.learn.perception.waves import OUTPUT_SCALE, cosine_basis, paired_relu_init, wave_images
-from edqn_jax.sim.sensors.events import EventField
+from edqn_jax.sim.sensors.events import EventField, in_units
 from edqn_jax.sim.task.observation import MOTION_SIZE
 
 
@@ -114,8 +114,9 @@ def _input_channels(sensed: EventField | Array) -> Array:
     """Returns what the sensor shows as channels `[..., C, H, W]`, summed over the window."""
     if not isinstance(sensed, EventField):
         return sensed
-    on = jnp.sum(jnp.where(sensed.polarity > 0, sensed.count, 0), axis=-3)
-    off = jnp.sum(jnp.where(sensed.polarity < 0, sensed.count, 0), axis=-3)
+    counts = sensed.count if sensed.unit is None else in_units(sensed)
+    on = jnp.sum(jnp.where(sensed.polarity > 0, counts, 0), axis=-3)
+    off = jnp.sum(jnp.where(sensed.polarity < 0, counts, 0), axis=-3)
     return jnp.log1p(jnp.stack([on, off], axis=-3).astype(jnp.float32))
 
 
@@ -139,13 +140,20 @@ def in_waves(config: EncoderConfig, image: Array) -> Target:
 
 
 def init_vae(
-    config: EncoderConfig, camera: CameraConfig, key: Array, *, form: Form = Form.EVENTS, layers: int = 1
+    config: EncoderConfig,
+    camera: CameraConfig,
+    key: Array,
+    *,
+    form: Form = Form.EVENTS,
+    layers: int = 1,
+    motion: int = MOTION_SIZE,
 ) -> Params:
     """Returns fresh parameters, `{"encoder": ..., "decoder": ...}`, for the camera's resolution.
 
     Args:
         form: of what is encoded.
         layers: frame pairs F of an event field, or C of pictures.
+        motion: values of the own motion, see `sim.task.observation.motion_size`.
 
     Raises:
         ConfigError: if there is no such encoder, or it does not return a code, or has other variables.
@@ -157,8 +165,8 @@ def init_vae(
     silent = EventField(nothing, nothing.astype(jnp.int8), when, when, window_s=1.0)
     blank = silent if form is Form.EVENTS else when
     encoder, name = _encoder(config, blank), f"the encoder '{config.architecture}'"
-    params = init_params(encoder, name, key_encoder, sensed=blank, motion=jnp.zeros(MOTION_SIZE))
-    two = jax.tree.map(lambda x: jnp.stack([x, x]), (blank, jnp.zeros(MOTION_SIZE)))
+    params = init_params(encoder, name, key_encoder, sensed=blank, motion=jnp.zeros(motion))
+    two = jax.tree.map(lambda x: jnp.stack([x, x]), (blank, jnp.zeros(motion)))
     shapes = jax.tree.map(jnp.shape, jax.eval_shape(encoder.apply, {"params": params}, *two))
     if shapes != 2 * ((2, config.code_size),):
         raise ConfigError(
@@ -187,7 +195,7 @@ def encode(config: EncoderConfig, params: Params, sensed: EventField | Array, mo
     The code that the agent sees is the mean.
 
     Args:
-        motion: `[..., MOTION_SIZE]` own motion, see `sim.task.observation.own_motion`.
+        motion: `[..., motion_size]` own motion, see `sim.task.observation.own_motion`.
     """
     encoder = _encoder(_with_features_of(config, params), sensed)
     return encoder.apply({"params": params["encoder"]}, sensed, motion)  # type: ignore
@@ -251,7 +259,7 @@ def vae_loss(
 
     Args:
         sensed: field `[..., F, H, W]` or pictures `[..., C, H, W]`.
-        motion: `[..., MOTION_SIZE]` own motion.
+        motion: `[..., motion_size]` own motion.
         wanted: what the decoder must draw, see `decoder_target` and `in_waves`.
         noise: `[..., code_size]` standard normal, which draws the codes (reparametrised).
     """

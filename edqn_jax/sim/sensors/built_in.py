@@ -58,7 +58,7 @@ def _show_event_image(
     """Returns log(1 + count) of each pixel's ON minus OFF events, with their sign."""
     field, memory = _show_events(config, scene, poses, memory, key)
     assert isinstance(field, EventField)
-    return signed_log(events.event_image(field)).ravel(), memory
+    return signed_log(events.image_in_units(field)).ravel(), memory
 
 
 def _event_memory(config: Config, key: Array) -> SensorMemory:
@@ -165,6 +165,7 @@ def _pictures(count: int, config: Config) -> tuple[int, int, int]:
 EVENTS = Sensor(
     show=_show_events,
     shape=lambda config: EVENT_FIELD,
+    makes_events=True,
     frame_times_s=_window,
     draws_frames=True,
     at_rest=_event_memory,
@@ -174,6 +175,7 @@ EVENTS = Sensor(
 EVENT_IMAGE = Sensor(
     show=_show_event_image,
     shape=lambda config: (config.camera.width * config.camera.height,),
+    makes_events=True,
     frame_times_s=_window,
     draws_frames=True,
     at_rest=_event_memory,

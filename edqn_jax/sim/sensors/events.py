@@ -23,7 +23,7 @@ from jax import Array
 from numpy.typing import NDArray
 
 from edqn_jax.config import EventsConfig
-from edqn_jax.sim.sensors import photoreceptor
+from edqn_jax.sim.sensors import contrast, photoreceptor, sensor_pixels
 
 STREAM_DTYPE = np.dtype([("t", "<i8"), ("x", "<u2"), ("y", "<u2"), ("p", "i1")])
 """One event of a stream: time in microseconds, column, row, polarity in {-1, +1}."""
@@ -33,6 +33,9 @@ AIRSIM_EPSILON = 0.001
 
 MIN_THRESHOLD_GAIN = 0.1
 """Mismatch never makes a threshold smaller than this share of the nominal one."""
+
+LEAST_SHARE = 1e-3
+"""Of its faults that an episode's sensor always has, so that their inverse is finite."""
 
 MICROSECOND = 1e-6
 
@@ -50,6 +53,9 @@ class EventField:
     """Whether `t_first` is 0 and `t_step` the window over `count` everywhere: Eq. 5 between one pair of frames."""
     with_noise: bool = struct.field(pytree_node=False, default=False)
     """Whether the rows are the ON events of every frame pair and then the OFF events, 2 F in all."""
+    unit: Array | None = None
+    """[] what an event counts for the encoder, see `in_units`; None is 1. With `sensor_pixels` counts are of all these
+    pixels together."""
 
 
 @struct.dataclass
@@ -58,10 +64,12 @@ class EventMemory:
 
     residual: Array | None  # [H, W] esim: log brightness of the last frame minus the pixel's reference level
     last_event: Array | None  # [H, W] esim: time of the last event, seconds from the end of the last window
-    gain: Array | None  # [2, H, W] threshold mismatch of ON and OFF, relative to the nominal threshold
-    hot: Array | None  # [H, W] bool, pixels that fire on their own
+    gain: Array | None  # [2, H, W] or [2, 1, 1] thresholds of ON and OFF, relative to the configured ones
+    hot: Array | None  # [H, W] bool, pixels that fire on their own; with `sensor_pixels` how many do, int32
     lux: Array | None = None  # [] illuminance of the episode; None where there is always enough light
     lag: Array | None = None  # [H, W] esim with finite bandwidth: what the photoreceptor shows minus log brightness
+    contrast: Array | None = None  # [] log-brightness change per event; None where it is not drawn
+    faults: Array | None = None  # [] share of its faults that the episode's sensor has; None is all
 
 
 def log_brightness(config: EventsConfig, intensity: Array) -> Array:
@@ -134,26 +142,82 @@ def reset_memory(config: EventsConfig, height: int, width: int, key: Array, lux:
     Args:
         lux: [] illuminance of the scene; None where light does not matter.
     """
+    drawn, faults = None, None
+    if contrast.is_drawn(config):
+        key, drawing = jax.random.split(key)
+        drawn = contrast.sample_contrast(config, drawing)
+    if config.faults_share > 0.0:
+        key, drawing = jax.random.split(key)
+        least = max(1.0 - config.faults_share, LEAST_SHARE)
+        faults = jax.random.uniform(drawing, minval=least, maxval=1.0)
     key_residual, key_gain, key_hot = jax.random.split(key, 3)
-    gain = None
-    if config.threshold_mismatch > 0.0:
-        noise = jax.random.normal(key_gain, (2, height, width))
-        gain = jnp.maximum(1.0 + config.threshold_mismatch * noise, MIN_THRESHOLD_GAIN)
+    gain = _gain(config, (height, width), drawn, faults, key_gain)
     hot = None
     if config.hot_pixel_fraction > 0.0:
-        hot = jax.random.bernoulli(key_hot, config.hot_pixel_fraction, (height, width))
+        share = config.hot_pixel_fraction * _or_1(faults)
+        if config.sensor_pixels > 1:
+            hot = sensor_pixels.sample_poisson(key_hot, jnp.full((height, width), config.sensor_pixels * share))
+        else:
+            hot = jax.random.bernoulli(key_hot, share, (height, width))
+    memory = EventMemory(residual=None, last_event=None, gain=gain, hot=hot, lux=lux, contrast=drawn, faults=faults)
     if config.law != "esim":
-        return EventMemory(residual=None, last_event=None, gain=gain, hot=hot, lux=lux)
+        return memory
     contrast_on, contrast_off = _thresholds(gain, config.contrast_on, config.contrast_off)
     share = jax.random.uniform(key_residual, (height, width))
-    return EventMemory(
-        residual=share * (contrast_on + contrast_off) - contrast_off,
+    residual = share * (contrast_on + contrast_off) - contrast_off
+    if config.sensor_pixels > 1:
+        residual = share * 0.5 * (contrast_on + contrast_off)
+    return dataclasses.replace(
+        memory,
+        residual=residual,
         last_event=jnp.full((height, width), -jnp.inf),
-        gain=gain,
-        hot=hot,
-        lux=lux,
         lag=jnp.zeros((height, width)) if config.bandwidth_hz > 0.0 else None,
     )
+
+
+def _gain(
+    config: EventsConfig, size: tuple[int, int], drawn: Array | None, faults: Array | None, key: Array
+) -> Array | None:
+    """Returns the thresholds relative to the configured ones [2, H, W], or [2, 1, 1] where pixels do not differ; None
+    is 1.
+    """
+    gain = None if drawn is None else jnp.full((2, 1, 1), drawn / contrast.nominal_contrast(config))
+    if config.threshold_mismatch > 0.0:
+        noise, mismatch = jax.random.normal(key, (2, *size)), config.threshold_mismatch * _or_1(faults)
+        mean = 1.0
+        if config.sensor_pixels > 1:
+            mean = 1.0 / sensor_pixels.mean_sensitivity(mismatch)
+            mismatch = mismatch / config.sensor_pixels**0.5
+        relative = jnp.maximum(mean + mismatch * noise, MIN_THRESHOLD_GAIN)
+        gain = relative if gain is None else gain * relative
+    return gain
+
+
+def _or_1(share: Array | None) -> Array | float:
+    return 1.0 if share is None else share
+
+
+def is_scaled(config: EventsConfig) -> bool:
+    """Returns whether fields have a `unit`."""
+    return contrast.is_drawn(config) or config.sensor_pixels > 1
+
+
+def unit_of(config: EventsConfig, drawn: Array | None) -> Array | None:
+    """Returns what an event of sensors of contrasts [...] counts for the encoder [...]; None where it is 1."""
+    if not is_scaled(config):
+        return None
+    known = jnp.float32(1.0) if drawn is None else drawn / contrast.REFERENCE
+    return known / config.sensor_pixels
+
+
+def in_units(field: EventField) -> Array:
+    """Returns the counts [..., F, H, W] float32 as encoders read them.
+
+    Where the contrast is drawn, they are log-brightness changes over `contrast.REFERENCE`; of sensors with several
+    pixels under one of ours they are the mean of these.
+    """
+    counts = field.count.astype(jnp.float32)
+    return counts if field.unit is None else counts * field.unit[..., None, None, None]
 
 
 def generate_events(
@@ -188,6 +252,7 @@ def generate_events(
         )
     times = times - times[0]
     window_s = float(times[-1])
+    key, dither = jax.random.split(key) if config.sensor_pixels > 1 else (key, key)
     level = airsim_log_brightness(frames) if config.law == "airsim" else log_brightness(config, frames)
     light = 1.0 if memory.lux is None else memory.lux / config.reference_lux
     current = None
@@ -196,19 +261,22 @@ def generate_events(
     if config.bandwidth_hz > 0.0:
         assert current is not None
         lag = memory.lag if continuous and memory.lag is not None else jnp.zeros(frames.shape[1:])
-        level, lag = photoreceptor.filter_log_brightness(config.bandwidth_hz, level, times, current, lag)
+        faster = current if memory.faults is None else current / memory.faults
+        level, lag = photoreceptor.filter_log_brightness(config.bandwidth_hz, level, times, faster, lag)
         memory = dataclasses.replace(memory, lag=lag if config.law == "esim" else None)
-    if config.law == "esim":
+    if config.sensor_pixels > 1:
+        field, memory = _many_pixels(config, memory, level, times, dither)
+    elif config.law == "esim":
         field, memory = _esim(config, memory, level, times, continuous)
     else:
-        field = _frame_pairs(config, memory.gain, level, times)
+        field = _frame_pairs(config, memory, level, times)
     noisy = has_noise(config)
     if noisy:
         shot = 1.0 if current is None else photoreceptor.shot_noise(current)
-        noise = noise_events(config, memory.hot, field.count, times, key, shot)
-        field = merge_fields(config, split_polarity(field), noise, times)
-    even = divides_window(config, len(times))
-    return dataclasses.replace(field, window_s=window_s, divides_window=even, with_noise=noisy), memory
+        noise = noise_events(config, memory.hot, field.count, times, key, shot, memory.faults)
+        field = merge_fields(config, split_polarity(field), noise, times, memory.faults)
+    even, unit = divides_window(config, len(times)), unit_of(config, memory.contrast)
+    return dataclasses.replace(field, window_s=window_s, divides_window=even, with_noise=noisy, unit=unit), memory
 
 
 def divides_window(config: EventsConfig, frames: int) -> bool:
@@ -221,13 +289,19 @@ def event_image(field: EventField) -> Array:
     return jnp.sum(field.count * field.polarity, axis=-3)
 
 
+def image_in_units(field: EventField) -> Array:
+    """Returns ON minus OFF events per pixel over the window `[..., H, W]`, as encoders read them, see `in_units`."""
+    return event_image(field) if field.unit is None else jnp.sum(in_units(field) * field.polarity, axis=-3)
+
+
 def random_field(config: EventsConfig, height: int, width: int, rng: np.random.Generator) -> EventField:
     """Returns a field [F, H, W] of 0 to 2 events per pixel and frame pair, all at time 0; for measurements."""
     shape = (max(len(config.frame_times_s) - 1, 1), height, width)
     count, times = jnp.asarray(rng.integers(0, 3, shape), jnp.int32), jnp.zeros(shape)
     window_s = config.frame_times_s[-1] - config.frame_times_s[0]
     even = divides_window(config, len(config.frame_times_s))
-    return EventField(count, jnp.sign(count).astype(jnp.int8), times, times, window_s, even)
+    unit = jnp.ones(()) if is_scaled(config) else None
+    return EventField(count, jnp.sign(count).astype(jnp.int8), times, times, window_s, even, unit=unit)
 
 
 def event_picture(image: NDArray, background: str = "white") -> NDArray[np.uint8]:
@@ -273,10 +347,51 @@ def _thresholds(gain: Array | None, on: float, off: float) -> tuple[Array, Array
     return gain[0] * on, gain[1] * off
 
 
-def _frame_pairs(config: EventsConfig, gain: Array | None, level: Array, times: NDArray) -> EventField:
+def _refractory_s(config: EventsConfig, faults: Array | None) -> Array | float:
+    """Returns the least seconds between two events, [] or a number; of many pixels the mean of these."""
+    period = config.refractory_ns * 1e-9
+    return period if faults is None and config.sensor_pixels == 1 else period * _or_1(faults) / config.sensor_pixels
+
+
+def _limits(config: EventsConfig, times: NDArray, faults: Array | None) -> Array:
+    """Returns the most events of all sensor pixels between two frames [F, 1, 1] int32."""
+    if faults is None and config.sensor_pixels == 1:
+        return jnp.array([max_events(config, dt) for dt in np.diff(times)], jnp.int32)[:, None, None]
+    # Rounding must not take away the event that just fits.
+    whole = jnp.floor(jnp.asarray(np.diff(times) / (config.refractory_ns * 1e-9)) / _or_1(faults) + 1e-4)
+    return config.sensor_pixels * jnp.minimum(whole, 1e6).astype(jnp.int32)[:, None, None]
+
+
+def _many_pixels(
+    config: EventsConfig, memory: EventMemory, level: Array, times: NDArray, key: Array
+) -> tuple[EventField, EventMemory]:
+    """Returns the events of `sensor_pixels` pixels together under each of ours, evenly spaced between two frames."""
+    intervals, change = np.diff(times), jnp.diff(level, axis=0)
+    if config.law == "esim":
+        on, off = _thresholds(memory.gain, config.contrast_on, config.contrast_off)
+        assert memory.residual is not None
+
+        def pair(residual: Array, change: Array) -> tuple[Array, Array]:
+            expected, residual = sensor_pixels.follow(residual, change, on, off)
+            return residual, expected
+
+        residual, signed = jax.lax.scan(pair, memory.residual, change, unroll=min(len(intervals), 2))
+        memory = dataclasses.replace(memory, residual=residual)
+    else:
+        on, off = _thresholds(memory.gain, config.tolerance, config.tolerance)
+        signed = change / jnp.where(change > 0.0, on, off)
+    drawn = sensor_pixels.count_all(jnp.abs(signed), config.sensor_pixels, key)
+    count = jnp.minimum(drawn, _limits(config, times, memory.faults))
+    starts = jnp.asarray(times[:-1, None, None], jnp.float32)
+    t_first, t_step = event_times(count, starts, jnp.asarray(intervals[:, None, None], jnp.float32))
+    polarity = jnp.where(count > 0, jnp.sign(signed), 0.0).astype(jnp.int8)
+    return EventField(count, polarity, t_first, t_step, 0.0), memory
+
+
+def _frame_pairs(config: EventsConfig, memory: EventMemory, level: Array, times: NDArray) -> EventField:
     """Returns the events of the memoryless laws, `paper` and `airsim`."""
-    intervals = np.diff(times)
-    limit = jnp.array([max_events(config, dt) for dt in intervals], jnp.int32)[:, None, None]
+    intervals, gain = np.diff(times), memory.gain
+    limit = _limits(config, times, memory.faults)
     before, after = level[:-1], level[1:]
     change = after - before
     scale: Array | float = 1.0 if gain is None else jnp.where(change > 0.0, gain[0], gain[1])
@@ -301,7 +416,7 @@ def _esim(
     contrasts = _thresholds(memory.gain, config.contrast_on, config.contrast_off)
 
     def pair(carry: tuple[Array, Array], xs: tuple[Array, ...]) -> tuple[tuple[Array, Array], EventField]:
-        return _esim_pair(config, contrasts, carry, xs)
+        return _esim_pair(config, memory.faults, contrasts, carry, xs)
 
     carry, field = jax.lax.scan(
         pair,
@@ -315,6 +430,7 @@ def _esim(
 
 def _esim_pair(
     config: EventsConfig,
+    faults: Array | None,
     contrasts: tuple[Array, Array],
     carry: tuple[Array, Array],
     pair: tuple[Array, ...],
@@ -337,7 +453,7 @@ def _esim_pair(
     step = jnp.minimum(contrast * slowness, (latest - first) / jnp.maximum(crossings - 1, 1))
     count = crossings
     if config.refractory_ns > 0.0:
-        refractory = config.refractory_ns * 1e-9
+        refractory = _refractory_s(config, faults)
         # Evenly spaced crossings give evenly spaced events: skip the first few, then take every stride-th.
         spacing = jnp.maximum(step, 1e-12)
         skipped = jnp.maximum(jnp.ceil((last_event + refractory - first) / spacing), 0.0)
@@ -357,7 +473,13 @@ def has_noise(config: EventsConfig) -> bool:
 
 
 def noise_events(
-    config: EventsConfig, hot: Array | None, signal: Array, times: NDArray, key: Array, shot: Array | float = 1.0
+    config: EventsConfig,
+    hot: Array | None,
+    signal: Array,
+    times: NDArray,
+    key: Array,
+    shot: Array | float = 1.0,
+    faults: Array | None = None,
 ) -> EventField:
     """Returns the noise events of every frame pair, ON and then OFF [2 F, H, W]: Poisson counts, evenly spaced.
 
@@ -370,17 +492,22 @@ def noise_events(
         times: [T] seconds of the frames.
         key: consumed.
         shot: [F, H, W] or scalar factor on the rate of shot noise.
+        faults: [] share of its faults that the sensor has; None is all.
     """
     key_count, key_phase = jax.random.split(key)
     pairs = signal.shape[0]
     firing = 0.0 if hot is None else config.hot_pixel_rate_hz * hot
-    off = 0.5 * config.shot_rate_hz * shot
-    rates = jnp.stack([jnp.broadcast_to(rate, signal.shape) for rate in (config.leak_rate_hz + off + firing, off)])
+    all_pixels = config.sensor_pixels if faults is None else config.sensor_pixels * faults
+    off = 0.5 * config.shot_rate_hz * shot * all_pixels
+    on = config.leak_rate_hz * all_pixels + off + firing
+    rates = jnp.stack([jnp.broadcast_to(rate, signal.shape) for rate in (on, off)])
     lengths = np.diff(times)
     intervals = jnp.asarray(lengths, jnp.float32)[:, None, None]
-    limits = [max_events(config, dt) for dt in lengths]
-    counts = sample_poisson(key_count, rates * intervals, max(limits))
-    limit = jnp.array(limits, jnp.int32)[:, None, None]
+    if faults is None and config.sensor_pixels == 1:
+        counts = sample_poisson(key_count, rates * intervals, max(max_events(config, dt) for dt in lengths))
+    else:
+        counts = sensor_pixels.sample_poisson(key_count, rates * intervals)
+    limit = _limits(config, times, faults)
     room = jnp.maximum(limit - signal, 0)
     on = jnp.minimum(counts[0], room)
     count = jnp.concatenate([on, jnp.minimum(counts[1], room - on)])
@@ -426,7 +553,9 @@ def split_polarity(field: EventField) -> EventField:
     )
 
 
-def merge_fields(config: EventsConfig, one: EventField, other: EventField, times: NDArray) -> EventField:
+def merge_fields(
+    config: EventsConfig, one: EventField, other: EventField, times: NDArray, faults: Array | None = None
+) -> EventField:
     """Returns the events of two fields [2 F, H, W] of `split_polarity` in one: the source field of an event is not
     kept.
 
@@ -435,6 +564,7 @@ def merge_fields(config: EventsConfig, one: EventField, other: EventField, times
 
     Args:
         times: [T] seconds of the frames.
+        faults: [] share of its faults that the sensor has; None is all.
     """
     count = one.count + other.count
     fields = (one, other)
@@ -442,7 +572,7 @@ def merge_fields(config: EventsConfig, one: EventField, other: EventField, times
     lasts = [jnp.where(field.count > 0, field.t_first + (field.count - 1) * field.t_step, 0.0) for field in fields]
     first, last = jnp.minimum(*firsts), jnp.maximum(*lasts)
     gaps = jnp.maximum(count - 1, 1)
-    step = jnp.maximum((last - first) / gaps, config.refractory_ns * 1e-9)
+    step = jnp.maximum((last - first) / gaps, _refractory_s(config, faults))
     starts, ends = (jnp.tile(jnp.asarray(t, jnp.float32), 2)[:, None, None] for t in (times[:-1], times[1:]))
     first = jnp.clip(first, starts, jnp.maximum(ends - MICROSECOND - gaps * step, starts))
     alone, still = other.count == 0, one.count == 0

@@ -86,6 +86,8 @@ class Sensor:
     """Times of the T poses that `show` needs, seconds relative to the end of a decision; each is a physics step."""
     draws_frames: bool = False
     """Whether `show` draws a picture at each of these times."""
+    makes_events: bool = False
+    """Whether its memory is an `EventMemory`, whose contrast the networks know where it is drawn."""
     exposes: bool = False
     """Whether its pictures are taken as `exposure` has it, over the poses up to a frame's time."""
     at_rest: Callable[[Config, Array], Any] = lambda config, key: None
@@ -161,7 +163,7 @@ class Sensor:
         """
         shapes = self.shapes(config)
         parts = self._parts(config, sensed, lambda shape: True)
-        arrays = [signed_log(events.event_image(x)) if isinstance(x, EventField) else x for x in parts]
+        arrays = [signed_log(events.image_in_units(x)) if isinstance(x, EventField) else x for x in parts]
         if len(arrays) == 1:
             return arrays[0]
         axes = [2 if shape == EVENT_FIELD else len(shape) for shape in shapes]

@@ -16,14 +16,15 @@ from edqn_jax.sim.physics import disturbances, drone
 from edqn_jax.sim.physics.disturbances import Disturbance
 from edqn_jax.sim.physics.drone import DroneState, Flight
 from edqn_jax.sim.scene.scene import Scene, has_motion
-from edqn_jax.sim.sensors import sensor
-from edqn_jax.sim.sensors.sensor import Sensed, SensorMemory, frame_steps
+from edqn_jax.sim.sensors import contrast, sensor
+from edqn_jax.sim.sensors.events import EventMemory
+from edqn_jax.sim.sensors.sensor import Sensed, SensorMemory, frame_steps, sensor_of
 
 OWN_SIZE = 10
-"""Values of the drone's own state in an observation."""
+"""Values of the drone's own state in an observation, without what `own_size` adds."""
 
 MOTION_SIZE = 7
-"""Values of the drone's own motion in an observation."""
+"""Values of the drone's own motion in an observation, without what `motion_size` adds."""
 
 MAX_YAW_RATE = 10.0
 """Bound of the yaw rate in an observation, rad/s."""
@@ -37,8 +38,8 @@ class Observation:
     """Observation of one drone: sensor output, by default the events before the decision, and own state."""
 
     sensed: Sensed
-    own: Array  # [OWN_SIZE], see `own_state`
-    motion: Array  # [MOTION_SIZE], see `own_motion`; only the encoder sees it
+    own: Array  # [own_size], see `own_state` and `with_contrast`
+    motion: Array  # [motion_size], see `own_motion` and `with_contrast`; only the encoder sees it
 
 
 @struct.dataclass
@@ -53,8 +54,36 @@ class View:
     disturbance: Disturbance | None = None  # whose errors own state and motion have; None where there are none
 
 
+def knows_contrast(config: Config) -> bool:
+    """Returns whether the networks know the contrast of the episode's event sensor, as one more value."""
+    return contrast.is_drawn(config.events) and sensor_of(config).makes_events
+
+
+def own_size(config: Config) -> int:
+    """Returns the number of values of the own state in an observation."""
+    return OWN_SIZE + knows_contrast(config)
+
+
+def motion_size(config: Config) -> int:
+    """Returns the number of values of the own motion in an observation."""
+    return MOTION_SIZE + knows_contrast(config)
+
+
+def mirrored_motion(config: Config) -> tuple[float, ...]:
+    """Returns factors [motion_size] on the own motion when left and right are exchanged."""
+    return (*MIRRORED_MOTION, *[1.0] * knows_contrast(config))
+
+
+def with_contrast(config: Config, memory: SensorMemory, values: Array) -> Array:
+    """Returns own values [N] with that of the episode's contrast after them, where the networks know it."""
+    if not knows_contrast(config):
+        return values
+    assert isinstance(memory, EventMemory) and memory.contrast is not None
+    return jnp.concatenate([values, contrast.value_of(memory.contrast)[None]])
+
+
 def observe(config: Config, view: View, memory: SensorMemory, key: Array) -> tuple[Observation, SensorMemory]:
-    """Returns sensor output, own state [OWN_SIZE] and own motion [MOTION_SIZE], and the sensor's memory.
+    """Returns sensor output, own state [own_size] and own motion [motion_size], and the sensor's memory.
 
     Args:
         config: of sensor and task.
@@ -69,8 +98,9 @@ def observe(config: Config, view: View, memory: SensorMemory, key: Array) -> tup
         )
         state = dataclasses.replace(state, position=position, velocity=velocity)
     sensed, memory = sensor.sense(config, view.scene, view.poses, memory, key)
-    own = own_state(config.env, view.scene, view.goal, state)
-    return Observation(sensed=sensed, own=own, motion=own_motion(config.env, state, view.move)), memory
+    own = with_contrast(config, memory, own_state(config.env, view.scene, view.goal, state))
+    motion = with_contrast(config, memory, own_motion(config.env, state, view.move))
+    return Observation(sensed=sensed, own=own, motion=motion), memory
 
 
 def own_state(config: EnvConfig, scene: Scene, goal: Array, state: DroneState) -> Array:
@@ -101,7 +131,7 @@ def rotate_own_state(own: Array, quarters: Array) -> Array:
     """Returns own states [..., OWN_SIZE] as they would be with world and drone turned about the volume's middle.
 
     Args:
-        own: in a volume that is as long as it is wide.
+        own: in a volume that is as long as it is wide; what follows the first `OWN_SIZE` values does not turn.
         quarters: [...] int32, quarter turns to the left.
     """
     cos, sin = jnp.array([1.0, 0.0, -1.0, 0.0])[quarters], jnp.array([0.0, 1.0, 0.0, -1.0])[quarters]

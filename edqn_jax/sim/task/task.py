@@ -23,7 +23,13 @@ from edqn_jax.sim.actions import Box, Discrete
 from edqn_jax.sim.task import env, group
 from edqn_jax.sim.task.action_sets import action_set
 from edqn_jax.sim.task.env import EnvParams, EnvState, Step
-from edqn_jax.sim.task.observation import MIRRORED_MOTION, MOTION_SIZE, OWN_SIZE, Observation, rotate_own_state
+from edqn_jax.sim.task.observation import (
+    Observation,
+    mirrored_motion,
+    motion_size,
+    own_size,
+    rotate_own_state,
+)
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -65,13 +71,13 @@ def task_of(config: Config) -> Task:
     return Task(
         actions=actions.space,
         still=actions.still,
-        own_size=OWN_SIZE,
-        motion_size=MOTION_SIZE,
+        own_size=own_size(config),
+        motion_size=motion_size(config),
         reset=lambda env_params, key, mission=None: env.reset(config, env_params, key, mission),
         begin=lambda env_params, key, mission=None: env.before_reset(config, env_params, key, mission),
         step=lambda env_params, state, action, mission=None: env.step(config, env_params, state, action, mission),
         map=functools.partial(group.map_drones, config),
         label=lambda env_params, state: env.nearness(config, env_params, state),
-        mirror=MIRRORED_MOTION,
+        mirror=mirrored_motion(config),
         turn=rotate_own_state,
     )

@@ -14,9 +14,10 @@ from edqn_jax.config.loading import make_config
 from edqn_jax.learn.policy import Policy, fresh_policy
 from edqn_jax.sim.actions import ACTIONS
 from edqn_jax.sim.physics import drone
-from edqn_jax.sim.sensors import events
+from edqn_jax.sim.sensors import contrast, events
 from edqn_jax.sim.sensors.events import EventField
 from edqn_jax.sim.task.action_sets import heading_setpoint, velocity_command
+from edqn_jax.sim.task.observation import knows_contrast
 from tests.oracles import event_fields
 
 
@@ -32,6 +33,8 @@ class Decided:
     own: np.ndarray
     motion: np.ndarray
     setpoint: float
+    contrast: float | None
+    """Of the camera, where the policy is told it."""
 
 
 def flown(policy: Policy, world: str = "medium", mission: int = 0, worlds: int = 1, most: int = 1000) -> list[Decided]:
@@ -55,23 +58,25 @@ def flown(policy: Policy, world: str = "medium", mission: int = 0, worlds: int =
             "goal": goal,
             "volume": volume,
         }
-        packet = events.to_stream(_field(config, seen.sensed))
+        told = float(contrast.contrast_of(seen.motion[-1])) if knows_contrast(config) else None
+        packet = events.to_stream(_field(config, seen.sensed, told))
         packet["t"] += until_us - window_us
         setpoint = float(heading_setpoint(config.env, body, jax.numpy.asarray(goal), command))
         own, motion = np.asarray(seen.own), np.asarray(seen.motion)
-        assert np.array_equal(motion[4:], last)
-        decisions.append(Decided(packet, until_us, given, int(move), np.asarray(command), own, motion, setpoint))
+        assert np.array_equal(motion[4:7], last)
+        decisions.append(Decided(packet, until_us, given, int(move), np.asarray(command), own, motion, setpoint, told))
         last = ACTIONS[int(move)]
         state, step = environment.step(state, move)
         seen, until_us = step.observation, until_us + 260_000
     return decisions
 
 
-def _field(config: Config, sensed: Any) -> EventField:
+def _field(config: Config, sensed: Any, told: float | None) -> EventField:
     """The events that were seen; of `event-image`, some that would show the same image."""
     if isinstance(sensed, EventField):
         return sensed
-    image = np.rint(np.sign(sensed) * np.expm1(np.abs(sensed)))
+    unit = 1.0 if told is None else told / contrast.REFERENCE
+    image = np.rint(np.sign(sensed) * np.expm1(np.abs(sensed)) / unit)
     return event_fields.field_of_counts(config.events, jax.numpy.asarray(image.reshape(config.camera.height, -1)))
 
 
