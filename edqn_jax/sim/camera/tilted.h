@@ -1,5 +1,5 @@
 /* Upright shapes under a camera that is fixed to the body, where no side is a vertical line: coverage is counted over a
- * few rays a pixel, as `coverage.counted_layers` does; `pictures.c` includes this.
+ * few rays a pixel, as `coverage.add_sampled_layers` does; `pictures.c` includes this.
  *
  * Faces of boxes are convex and flat: the rays of one column meet one in an interval of heights, and closeness is
  * linear in the image. So a column's intervals are computed once for all of its rows.
@@ -20,9 +20,10 @@ typedef struct {
 
 /* A box or a cylinder, in its own frame. */
 typedef struct {
-  int is_box, first, last, faces; /* columns that it may cover, the last excluded; faces that are seen */
+  int is_box, number, first, last, faces; /* of all; columns that it may cover, the last excluded; faces seen */
   float origin[3], forward[3], right[3], up[3]; /* the eye from its middle; the image's axes */
-  float half[3], radius, value, shape, sun[2];
+  float half[3], radius, value, sun[2];
+  Turn turn; /* of its axes */
   float bright[3]; /* of the faces that the eye may see; of a cylinder the third, of its end */
   Face face[6];    /* of a cylinder those of the box around it, which faces the eye; all six from within */
 } Tilted;
@@ -128,6 +129,19 @@ FN int ball_out_of_sight(const Camera* c, const Eye* e, const float* to, float r
          up - top * ahead > radius * sqrtf(1 + top * top);
 }
 
+/* Sets brightness of a shape with these axes; depth images do without. */
+FN void light_tilted(const Camera* c, const Shapes* s, const Eye* e, const float axes[3][3], Tilted* p) {
+  memset(p->bright, 0, sizeof p->bright);
+  if (!e->weights) return;
+  const float* albedo = p->is_box ? s->box_albedo + 3 * p->number : s->cylinder_albedo + 3 * (p->number - s->boxes);
+  p->value = dot3(albedo, e->weights);
+  p->sun[0] = dot3(axes[0], c->sun), p->sun[1] = dot3(axes[1], c->sun);
+  for (int k = 0; k < 3; ++k) {
+    const float sign = p->origin[k] > 0 ? 1 : -1;
+    p->bright[k] = p->value * shade(c, sign * axes[k][0], sign * axes[k][1], sign * axes[k][2]);
+  }
+}
+
 /* Returns whether upright shape `n`, boxes first, may be seen, and what pixels need of it. */
 FN int tilted_shape(const Camera* c, const Shapes* s, const Eye* e, int n, Tilted* p) {
   const int is_box = n < s->boxes, i = is_box ? n : n - s->boxes;
@@ -137,22 +151,39 @@ FN int tilted_shape(const Camera* c, const Shapes* s, const Eye* e, int n, Tilte
   const float radius = is_box ? 0 : s->cylinder_radius[i], tall = is_box ? 0 : s->cylinder_half[i];
   const float reach = sqrtf(is_box ? dot3(half, half) : radius * radius + tall * tall);
   if (ball_out_of_sight(c, e, to, reach * 1.0001f + 1e-3f)) return 0;
-  const float flat = most(sqrtf(away[0] * away[0] + away[1] * away[1]), TINY);
-  const float cos = is_box ? cosf(s->box_yaw[i]) : away[0] / flat, sin = is_box ? sinf(s->box_yaw[i]) : away[1] / flat;
+  const float flat = sqrtf(away[0] * away[0] + away[1] * away[1]);
+  const int on_axis = flat < TINY; /* of a cylinder, whose frame faces the eye: then any does */
+  const float cos = is_box ? cosf(s->box_yaw[i]) : on_axis ? 1 : away[0] / flat;
+  const float sin = is_box ? sinf(s->box_yaw[i]) : on_axis ? 0 : away[1] / flat;
   const float axes[3][3] = {{cos, sin, 0}, {-sin, cos, 0}, {0, 0, 1}};
-  p->is_box = is_box, p->shape = (float)n, p->radius = radius;
+  p->is_box = is_box, p->number = n, p->radius = radius;
   for (int k = 0; k < 3; ++k) {
     p->origin[k] = dot3(axes[k], away), p->forward[k] = dot3(axes[k], e->forward);
     p->right[k] = dot3(axes[k], e->right), p->up[k] = dot3(axes[k], e->up);
     p->half[k] = is_box ? half[k] : k < 2 ? radius : tall;
   }
-  p->value = dot3(is_box ? s->box_albedo + 3 * i : s->cylinder_albedo + 3 * i, e->weights);
-  p->sun[0] = dot3(axes[0], c->sun), p->sun[1] = dot3(axes[1], c->sun);
-  for (int k = 0; k < 3; ++k) {
-    const float sign = p->origin[k] > 0 ? 1 : -1;
-    p->bright[k] = p->value * shade(c, sign * axes[k][0], sign * axes[k][1], sign * axes[k][2]);
-  }
+  p->turn.cos = cos, p->turn.sin = sin;
+  light_tilted(c, s, e, axes, p);
   return faces_of(c, p);
+}
+
+/* The heights between which LANES columns at `u` are on any face of a shape; empty if the first is above the second. */
+FN void heights_of_shape(const Tilted* p, Lanes u, Lanes* low, Lanes* high) {
+  *low = lanes(NOWHERE), *high = lanes(-NOWHERE);
+  for (int f = 0; f < p->faces; ++f) {
+    Lanes from, to;
+    heights_on(&p->face[f], u, &from, &to);
+    *low = lesser(*low, from), *high = greater(*high, to);
+  }
+}
+
+/* Lowers `nearest` of LANES rows at heights `v` of a column to the depth at which their middle rays meet a shape. */
+FN Lanes nearer_tilted(const Shapes* s, const Eye* e, const Tilted* p, const float* ahead, Lanes v, Lanes nearest) {
+  const Turn none = {1, 0}, turn = p->is_box ? p->turn : none;
+  const Lanes dx = ahead[0] + e->up[0] * v, dy = ahead[1] + e->up[1] * v, dz = ahead[2] + e->up[2] * v;
+  Lanes from, to;
+  beside(s, e, p->number, turn, dx, dy, &from, &to);
+  return nearer_upright(level_of(s, e, p->number), from, to, inverses(dz), nearest);
 }
 
 /* Writes the heights between which a shape's faces are seen in the columns from `first` on, at every ray across: of
@@ -189,7 +220,7 @@ FN void insert_box(const Camera* c, const Tilted* p, float u, Lanes high, const 
   if (!any_of(count > 0)) return;
   const float per_ray = 1.0f / (c->across * c->down);
   const Layer added = {closeness / greater(count, lanes(TINY)), count * per_ray, value * per_ray, lanes(0),
-                       lanes(p->shape)};
+                       lanes((float)p->number)};
   insert(layers, added);
 }
 
@@ -214,7 +245,7 @@ FN void insert_cylinder(const Camera* c, const Tilted* p, float u, Lanes high, c
   if (!any_of(count > 0)) return;
   const float per_ray = 1.0f / (c->across * c->down);
   const Layer added = {closeness / greater(count, lanes(TINY)), count * per_ray, value * per_ray, lanes(0),
-                       lanes(p->shape)};
+                       lanes((float)p->number)};
   insert(layers, added);
 }
 
