@@ -42,10 +42,14 @@ static inline Lanes roots(Lanes x) {
 }
 
 static inline int any_of(Mask where) {
+#ifdef __AVX__
+  return !_mm256_testz_si256((__m256i)where, (__m256i)where);
+#else
   const Pairs two = (Pairs)where;
   int64_t found = 0;
   for (int l = 0; l < LANES / 2; ++l) found |= two[l];
   return found != 0;
+#endif
 }
 
 static inline Lanes counted(void) {
@@ -96,7 +100,7 @@ static int prepare(const Camera* c, const Shapes* s, Work* w) {
   w->spheres = malloc(sizeof(Extent) * (size_t)(s->spheres + 1));
   w->patterns = malloc(sizeof(Pattern) * (size_t)(uprights + s->spheres + s->planes + 1));
   w->tilted = malloc(sizeof(Tilted) * (size_t)(uprights + 1));
-  w->heights = malloc(sizeof(float) * (c->tilted ? (size_t)uprights * 12 * (size_t)(c->across * w->stride) + 1 : 1));
+  w->heights = malloc(sizeof(float) * (c->tilted ? (size_t)(uprights * HEIGHTS(c->across) * w->stride) + 1 : 1));
   w->most = uprights + 1;
   w->found = malloc(sizeof(int) * (size_t)c->width * (size_t)(w->most + 1));
   if (!w->numbers || !w->sides || !w->layers || !w->u || !w->found || !w->spheres) return 0;
@@ -126,24 +130,33 @@ static void finish(const Camera* c, const Shapes* s, const Plane* planes, const 
 /* Draws one frame of a camera that is fixed to the body, [H, C]. */
 static void draw_tilted(const Camera* c, const Shapes* s, const Eye* e, Work* w, const Wave* waves,
                         const Plane* planes, float* picture) {
-  const int blocks = rounded_up(c->height) / LANES, of_shape = 12 * c->across * w->stride;
+  const int blocks = rounded_up(c->height) / LANES, of_shape = HEIGHTS(c->across) * w->stride;
+  Bounds bounds;
+  bounds_of(c, e, &bounds);
   int visible = 0;
+  memset(w->found, 0, sizeof(int) * (size_t)c->width);
   for (int n = 0; n < s->boxes + s->cylinders; ++n) {
     Tilted* p = &w->tilted[visible];
-    if (!tilted_shape(c, s, e, n, p)) continue;
-    float* heights = w->heights + (size_t)visible++ * of_shape;
+    if (!tilted_shape(c, s, e, &bounds, n, p)) continue;
+    float* heights = w->heights + (size_t)visible * of_shape;
     for (int first = p->first / LANES * LANES; first < p->last; first += LANES)
       write_heights(c, p, load(w->u + first), heights + first, w->stride);
+    for (int column = p->first; column < p->last; ++column) {
+      w->covering[column * w->most + w->found[column]] = visible;
+      w->found[column] += heights[column] < heights[w->stride + column];
+    }
+    ++visible;
   }
   for (int n = 0; n < s->spheres; ++n) w->spheres[n] = extent_of_sphere(c, s, e, n);
   for (int column = 0; column < c->width; ++column) {
     float ahead[3];
     ray_ahead(e, c->u[column], ahead);
     for (int b = 0; b < blocks; ++b) w->layers[b].inserted = 0;
-    for (int n = 0; n < visible; ++n)
-      if (column >= w->tilted[n].first && column < w->tilted[n].last)
-        insert_tilted(c, &w->tilted[n], c->u[column], w->v, w->heights + (size_t)n * of_shape + column, w->stride,
-                      w->layers);
+    for (int k = 0; k < w->found[column]; ++k) {
+      const int n = w->covering[column * w->most + k];
+      insert_tilted(c, &w->tilted[n], c->u[column], w->v, w->heights + (size_t)n * of_shape + column, w->stride,
+                    w->layers);
+    }
     for (int n = 0; n < s->spheres; ++n) {
       const Extent* p = &w->spheres[n];
       if (c->u[column] < p->left || c->u[column] > p->right) continue;
@@ -207,16 +220,24 @@ static void draw(const Camera* c, const Shapes* s, const Eye* e, Work* w, float*
 /* Depth along the middle ray of every pixel of a camera that is fixed to the body, [H, C]. */
 static void measure_tilted(const Camera* c, const Shapes* s, const Eye* e, Work* w, const Plane* planes,
                            float* picture) {
+  Bounds bounds;
+  bounds_of(c, e, &bounds);
   int visible = 0;
+  memset(w->found, 0, sizeof(int) * (size_t)c->width);
   for (int n = 0; n < s->boxes + s->cylinders; ++n) {
     Tilted* p = &w->tilted[visible];
-    if (!tilted_shape(c, s, e, n, p)) continue;
-    float* heights = w->heights + (size_t)(2 * visible++) * w->stride;
+    if (!tilted_shape(c, s, e, &bounds, n, p)) continue;
+    float* heights = w->heights + (size_t)(2 * visible) * w->stride;
     for (int first = p->first / LANES * LANES; first < p->last; first += LANES) {
       Lanes low, high;
       heights_of_shape(p, load(w->u + first), &low, &high);
       store(heights + first, low - c->pitch), store(heights + w->stride + first, high + c->pitch);
     }
+    for (int column = p->first; column < p->last; ++column) {
+      w->covering[column * w->most + w->found[column]] = visible;
+      w->found[column] += heights[column] < heights[w->stride + column];
+    }
+    ++visible;
   }
   for (int column = 0; column < c->width; ++column) {
     float ahead[3], *nearest = w->nearest;
@@ -225,10 +246,10 @@ static void measure_tilted(const Camera* c, const Shapes* s, const Eye* e, Work*
       const Lanes v = load(w->v + row), dx = ahead[0] + e->up[0] * v, dy = ahead[1] + e->up[1] * v;
       store(nearest + row, nearest_of_others(s, planes, e, dx, dy, ahead[2] + e->up[2] * v));
     }
-    for (int n = 0; n < visible; ++n) {
+    for (int k = 0; k < w->found[column]; ++k) {
+      const int n = w->covering[column * w->most + k];
       const Tilted* p = &w->tilted[n];
       const float* heights = w->heights + (size_t)(2 * n) * w->stride + column;
-      if (column < p->first || column >= p->last || heights[0] > heights[w->stride]) continue;
       for (int row = 0; row < c->height; row += LANES) {
         const int last = row + LANES < c->height ? row + LANES - 1 : c->height - 1;
         if (w->v[row] < heights[0] || w->v[last] > heights[w->stride]) continue;
