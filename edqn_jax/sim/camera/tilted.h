@@ -9,6 +9,8 @@
 #define EDQN_TILTED_H
 
 #define CUT_M 1e-3f /* nearest depth of what is projected */
+/* Called twice: a call of its own would change how GCC rounds the level camera's pictures, within one file. */
+#define INLINED __attribute__((always_inline))
 #define MOST_CORNERS 8 /* of a rectangle that a plane cuts: 5, or twice 4 of numbers that are not finite */
 
 /* A face of a box in the image, convex, and what is seen there. */
@@ -159,7 +161,7 @@ FN void light_tilted(const Camera* c, const Shapes* s, const Eye* e, const float
 }
 
 /* Returns whether upright shape `n`, boxes first, may be seen, and what pixels need of it. */
-FN int tilted_shape(const Camera* c, const Shapes* s, const Eye* e, const Bounds* bounds, int n, Tilted* p) {
+FN INLINED int tilted_shape(const Camera* c, const Shapes* s, const Eye* e, const Bounds* bounds, int n, Tilted* p) {
   const int is_box = n < s->boxes, i = is_box ? n : n - s->boxes;
   const float* at = is_box ? s->box_position + 3 * i : s->cylinder_position + 3 * i;
   const float away[3] = {e->origin[0] - at[0], e->origin[1] - at[1], e->origin[2] - at[2]};
