@@ -188,5 +188,5 @@ def _depths_natively(
     platform: str, config: CameraConfig, scene: Scene, position: Array, rotation: Array
 ) -> Array | None:
     """Returns `_depths` by the library in C; None if unsupported."""
-    can = config.mount == "level" and native.can_render(config, scene, platform)
+    can = native.can_render(config, scene, platform)
     return native.render_depth(config, scene, position, rotation) if can else None

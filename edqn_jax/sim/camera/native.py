@@ -1,4 +1,4 @@
-"""Cameras in C: the level one for CPUs and NVIDIA GPUs, pictures of one on the body for CPUs.
+"""Cameras in C: the level one for CPUs and NVIDIA GPUs, one on the body for CPUs.
 
 Where there is a C compiler, or on GPUs CUDA's, they are drawn by `pictures.c` and `pictures.cu`; everywhere else by the
 same functions in JAX (`columns.py`, `depth.py`). All agree to rounding (`tests/sim/camera/test_native.py`). C knows the

@@ -1,5 +1,5 @@
 /* Pictures and depth images for CPUs, as handlers of XLA's foreign function interface (`native.py` compiles and
- * registers them). What they are made of is in `pictures.h`; pictures of a camera on the body, in `tilted.h`.
+ * registers them). What they are made of is in `pictures.h`; those of a camera on the body, in `tilted.h`.
  *
  * A column is drawn at a time, since few shapes cover one, and of its rows LANES at a time, in vectors as GCC and Clang
  * have them for any processor.
@@ -73,7 +73,7 @@ typedef struct {
 
 /* Memory for the frames of one call. */
 typedef struct {
-  float *numbers, *u, *v;
+  float *numbers, *u, *v, *nearest; /* nearest: depths of a column */
   Sides* sides;
   Extent* spheres;
   Layers* layers;
@@ -92,17 +92,17 @@ static int prepare(const Camera* c, const Shapes* s, Work* w) {
   w->numbers = malloc(sizeof(float) * ((size_t)uprights * NUMBERS * w->stride + 1));
   w->sides = malloc(sizeof(Sides) * (size_t)(uprights + 1));
   w->layers = aligned_alloc(_Alignof(Layers), sizeof(Layers) * (size_t)(rows / LANES));
-  w->u = malloc(sizeof(float) * (size_t)(w->stride + rows));
+  w->u = malloc(sizeof(float) * (size_t)(w->stride + 2 * rows));
   w->spheres = malloc(sizeof(Extent) * (size_t)(s->spheres + 1));
   w->patterns = malloc(sizeof(Pattern) * (size_t)(uprights + s->spheres + s->planes + 1));
   w->tilted = malloc(sizeof(Tilted) * (size_t)(uprights + 1));
-  w->heights = malloc(sizeof(float) * (c->tilted ? (size_t)uprights * 12 * (size_t)(c->across * w->stride) + 1 : 1));
+  w->heights = malloc(sizeof(float) * (c->tilted ? (size_t)(uprights * HEIGHTS(c->across) * w->stride) + 1 : 1));
   w->most = uprights + 1;
   w->found = malloc(sizeof(int) * (size_t)c->width * (size_t)(w->most + 1));
   if (!w->numbers || !w->sides || !w->layers || !w->u || !w->found || !w->spheres) return 0;
   if (!w->patterns || !w->tilted || !w->heights) return 0;
   w->covering = w->found + c->width;
-  w->v = w->u + w->stride;
+  w->v = w->u + w->stride, w->nearest = w->v + rows;
   /* What lies beyond the image repeats its edge, so that all numbers are finite. */
   for (int i = 0; i < w->stride; ++i) w->u[i] = c->u[i < c->width ? i : c->width - 1];
   for (int i = 0; i < rows; ++i) w->v[i] = c->v[i < c->height ? i : c->height - 1];
@@ -126,24 +126,33 @@ static void finish(const Camera* c, const Shapes* s, const Plane* planes, const 
 /* Draws one frame of a camera that is fixed to the body, [H, C]. */
 static void draw_tilted(const Camera* c, const Shapes* s, const Eye* e, Work* w, const Wave* waves,
                         const Plane* planes, float* picture) {
-  const int blocks = rounded_up(c->height) / LANES, of_shape = 12 * c->across * w->stride;
+  const int blocks = rounded_up(c->height) / LANES, of_shape = HEIGHTS(c->across) * w->stride;
+  Bounds bounds;
+  bounds_of(c, e, &bounds);
   int visible = 0;
+  memset(w->found, 0, sizeof(int) * (size_t)c->width);
   for (int n = 0; n < s->boxes + s->cylinders; ++n) {
     Tilted* p = &w->tilted[visible];
-    if (!tilted_shape(c, s, e, n, p)) continue;
-    float* heights = w->heights + (size_t)visible++ * of_shape;
+    if (!tilted_shape(c, s, e, &bounds, n, p)) continue;
+    float* heights = w->heights + (size_t)visible * of_shape;
     for (int first = p->first / LANES * LANES; first < p->last; first += LANES)
       write_heights(c, p, load(w->u + first), heights + first, w->stride);
+    for (int column = p->first; column < p->last; ++column) {
+      w->covering[column * w->most + w->found[column]] = visible;
+      w->found[column] += heights[column] < heights[w->stride + column];
+    }
+    ++visible;
   }
   for (int n = 0; n < s->spheres; ++n) w->spheres[n] = extent_of_sphere(c, s, e, n);
   for (int column = 0; column < c->width; ++column) {
     float ahead[3];
     ray_ahead(e, c->u[column], ahead);
     for (int b = 0; b < blocks; ++b) w->layers[b].inserted = 0;
-    for (int n = 0; n < visible; ++n)
-      if (column >= w->tilted[n].first && column < w->tilted[n].last)
-        insert_tilted(c, &w->tilted[n], c->u[column], w->v, w->heights + (size_t)n * of_shape + column, w->stride,
-                      w->layers);
+    for (int k = 0; k < w->found[column]; ++k) {
+      const int n = w->covering[column * w->most + k];
+      insert_tilted(c, &w->tilted[n], c->u[column], w->v, w->heights + (size_t)n * of_shape + column, w->stride,
+                    w->layers);
+    }
     for (int n = 0; n < s->spheres; ++n) {
       const Extent* p = &w->spheres[n];
       if (c->u[column] < p->left || c->u[column] > p->right) continue;
@@ -204,10 +213,57 @@ static void draw(const Camera* c, const Shapes* s, const Eye* e, Work* w, float*
   }
 }
 
+/* Depth along the middle ray of every pixel of a camera that is fixed to the body, [H, C]. */
+static void measure_tilted(const Camera* c, const Shapes* s, const Eye* e, Work* w, const Plane* planes,
+                           float* picture) {
+  Bounds bounds;
+  bounds_of(c, e, &bounds);
+  int visible = 0;
+  memset(w->found, 0, sizeof(int) * (size_t)c->width);
+  for (int n = 0; n < s->boxes + s->cylinders; ++n) {
+    Tilted* p = &w->tilted[visible];
+    if (!tilted_shape(c, s, e, &bounds, n, p)) continue;
+    float* heights = w->heights + (size_t)(2 * visible) * w->stride;
+    for (int first = p->first / LANES * LANES; first < p->last; first += LANES) {
+      Lanes low, high;
+      heights_of_shape(p, load(w->u + first), &low, &high);
+      store(heights + first, low - c->pitch), store(heights + w->stride + first, high + c->pitch);
+    }
+    for (int column = p->first; column < p->last; ++column) {
+      w->covering[column * w->most + w->found[column]] = visible;
+      w->found[column] += heights[column] < heights[w->stride + column];
+    }
+    ++visible;
+  }
+  for (int column = 0; column < c->width; ++column) {
+    float ahead[3], *nearest = w->nearest;
+    ray_ahead(e, c->u[column], ahead);
+    for (int row = 0; row < c->height; row += LANES) {
+      const Lanes v = load(w->v + row), dx = ahead[0] + e->up[0] * v, dy = ahead[1] + e->up[1] * v;
+      store(nearest + row, nearest_of_others(s, planes, e, dx, dy, ahead[2] + e->up[2] * v));
+    }
+    for (int k = 0; k < w->found[column]; ++k) {
+      const int n = w->covering[column * w->most + k];
+      const Tilted* p = &w->tilted[n];
+      const float* heights = w->heights + (size_t)(2 * n) * w->stride + column;
+      for (int row = 0; row < c->height; row += LANES) {
+        const int last = row + LANES < c->height ? row + LANES - 1 : c->height - 1;
+        if (w->v[row] < heights[0] || w->v[last] > heights[w->stride]) continue;
+        store(nearest + row, nearer_tilted(s, e, p, ahead, load(w->v + row), load(nearest + row)));
+      }
+    }
+    for (int row = 0; row < c->height; ++row) picture[row * c->width + column] = nearest[row];
+  }
+}
+
 /* Depth along the middle ray of every pixel of one frame, [H, C]; NOWHERE where there is nothing. */
 static void measure(const Camera* c, const Shapes* s, const Eye* e, Work* w, float* picture) {
   Plane planes[MOST_PLANES];
   planes_of(c, s, e, planes);
+  if (c->tilted) {
+    measure_tilted(c, s, e, w, planes, picture);
+    return;
+  }
   memset(w->found, 0, sizeof(int) * (size_t)c->width);
   for (int n = 0; n < s->boxes + s->cylinders; ++n) {
     if (upright_out_of_sight(c, s, e, n)) continue;
@@ -228,11 +284,11 @@ static void measure(const Camera* c, const Shapes* s, const Eye* e, Work* w, flo
     const float dx = e->cos + c->u[column] * e->sin, dy = e->sin - c->u[column] * e->cos;
     for (int first = 0; first < c->height; first += LANES) {
       const Lanes dz = load(w->v + first), per_z = inverses(dz);
-      Lanes nearest = nearest_of_others(s, planes, e, dx, dy, dz);
+      Lanes nearest = nearest_of_others(s, planes, e, lanes(dx), lanes(dy), dz);
       for (int k = 0; k < w->found[column]; ++k) {
         const int n = w->covering[column * w->most + k];
         const float* from = w->numbers + (size_t)n * NUMBERS * w->stride + column;
-        nearest = nearer_upright(level_of(s, e, n), from[0], from[w->stride], per_z, nearest);
+        nearest = nearer_upright(level_of(s, e, n), lanes(from[0]), lanes(from[w->stride]), per_z, nearest);
       }
       for (int l = 0; l < LANES && first + l < c->height; ++l) picture[(first + l) * c->width + column] = nearest[l];
     }

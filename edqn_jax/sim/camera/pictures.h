@@ -546,9 +546,9 @@ FN Level level_of(const Shapes* s, const Eye* e, int n) {
 
 /* Lowers `nearest` of LANES rows to the depth at which rays are both beside an upright shape's axis, from `from` to
  * `to`, and between its bottom and its top. */
-FN Lanes nearer_upright(Level level, float from, float to, Lanes per_z, Lanes nearest) {
+FN Lanes nearer_upright(Level level, Lanes from, Lanes to, Lanes per_z, Lanes nearest) {
   const Lanes at = level.middle * per_z, reach = level.half * absolute(per_z);
-  const Lanes enter = greater(lanes(from), at - reach), leave = lesser(lanes(to), at + reach);
+  const Lanes enter = greater(from, at - reach), leave = lesser(to, at + reach);
   return pick((enter < leave) & (enter > 0) & (enter < nearest), enter, nearest);
 }
 
@@ -564,7 +564,7 @@ FN Turn turn_of(const Shapes* s, int n) {
   return turn;
 }
 
-/* Depths between which the rays of LANES columns are beside the axis of upright shape `n`; boxes come first. */
+/* Depths between which LANES rays are beside the axis of upright shape `n`; boxes come first. */
 FN void beside(const Shapes* s, const Eye* e, int n, Turn turn, Lanes dx, Lanes dy, Lanes* from, Lanes* to) {
   const int is_box = n < s->boxes, i = is_box ? n : n - s->boxes;
   const float* position = is_box ? s->box_position + 3 * i : s->cylinder_position + 3 * i;
@@ -592,12 +592,12 @@ FN int upright_out_of_sight(const Camera* c, const Shapes* s, const Eye* e, int 
   return out_of_sight(c, e, at[0] - e->origin[0], at[1] - e->origin[1], radius);
 }
 
-/* Depths at which LANES rays, along `dz` in the column along (dx, dy), meet a plane or a sphere; else NOWHERE. */
-FN Lanes nearest_of_others(const Shapes* s, const Plane* planes, const Eye* e, float dx, float dy, Lanes dz) {
+/* Depths at which LANES rays along (dx, dy, dz) meet a plane or a sphere; else NOWHERE. */
+FN Lanes nearest_of_others(const Shapes* s, const Plane* planes, const Eye* e, Lanes dx, Lanes dy, Lanes dz) {
   Lanes nearest = lanes(NOWHERE);
   for (int n = 0; n < s->planes; ++n) {
     const Plane* p = &planes[n];
-    const float ahead = p->normal[0] * dx + p->normal[1] * dy;
+    const Lanes ahead = p->normal[0] * dx + p->normal[1] * dy;
     const Lanes approach = ahead + p->normal[2] * dz, t = -p->height * inverses(approach);
     nearest = pick((approach < 0) & (t > 0) & (t < HORIZON_M) & (t < nearest), t, nearest);
   }

@@ -1,5 +1,5 @@
 /* Upright shapes under a camera that is fixed to the body, where no side is a vertical line: coverage is counted over a
- * few rays a pixel, as `coverage.counted_layers` does; `pictures.c` includes this.
+ * few rays a pixel, as `coverage.add_sampled_layers` does; `pictures.c` includes this.
  *
  * Faces of boxes are convex and flat: the rays of one column meet one in an interval of heights, and closeness is
  * linear in the image. So a column's intervals are computed once for all of its rows.
@@ -9,6 +9,8 @@
 #define EDQN_TILTED_H
 
 #define CUT_M 1e-3f /* nearest depth of what is projected */
+/* Called twice: a call of its own would change how GCC rounds the level camera's pictures, within one file. */
+#define INLINED __attribute__((always_inline))
 #define MOST_CORNERS 8 /* of a rectangle that a plane cuts: 5, or twice 4 of numbers that are not finite */
 
 /* A face of a box in the image, convex, and what is seen there. */
@@ -20,9 +22,10 @@ typedef struct {
 
 /* A box or a cylinder, in its own frame. */
 typedef struct {
-  int is_box, first, last, faces; /* columns that it may cover, the last excluded; faces that are seen */
+  int is_box, number, first, last, faces; /* of all; columns that it may cover, the last excluded; faces seen */
   float origin[3], forward[3], right[3], up[3]; /* the eye from its middle; the image's axes */
-  float half[3], radius, value, shape, sun[2];
+  float half[3], radius, value, sun[2];
+  Turn turn; /* of its axes */
   float bright[3]; /* of the faces that the eye may see; of a cylinder the third, of its end */
   Face face[6];    /* of a cylinder those of the box around it, which faces the eye; all six from within */
 } Tilted;
@@ -43,7 +46,7 @@ FN Met meet_cylinder(const Camera* c, const Tilted* p, float u, Lanes v) {
   Met met = {v != v, lanes(0), lanes(0)};
   if (x > p->radius) {
     const Lanes under = r2 * (dx * dx + dy * dy) - x * x * dy * dy;
-    const Lanes k = (roots(greater(under, lanes(0))) - x * dx) / (x * x - r2);
+    const Lanes k = (roots(greater(under, lanes(0))) - x * dx) * (1 / (x * x - r2));
     met.hit = (under > 0) & (k > 0) & (absolute(z * k + dz) <= p->half[2] * k);
     if (any_of(met.hit)) {
       const Lanes lit = ((x * k + dx) * p->sun[0] + dy * p->sun[1]) / (p->radius * greater(k, lanes(TINY)));
@@ -120,51 +123,105 @@ FN void heights_on(const Face* f, Lanes u, Lanes* low, Lanes* high) {
   }
 }
 
-/* Whether no part of a ball about a place, `to` [3] from the eye, can be in the image. */
-FN int ball_out_of_sight(const Camera* c, const Eye* e, const float* to, float radius) {
-  const float ahead = dot3(to, e->forward), right = fabsf(dot3(to, e->right)), up = fabsf(dot3(to, e->up));
+/* The planes that bound what can be in the image, with normals outwards; lengths of their horizontal parts. */
+typedef struct {
+  float normal[5][3], flat[5];
+} Bounds;
+
+FN void bounds_of(const Camera* c, const Eye* e, Bounds* b) {
   const float edge = 0.5f * c->pitch * c->width, top = 0.5f * c->pitch * c->height;
-  return ahead + radius < 0 || right - edge * ahead > radius * sqrtf(1 + edge * edge) ||
-         up - top * ahead > radius * sqrtf(1 + top * top);
+  for (int i = 0; i < 3; ++i) {
+    b->normal[0][i] = -e->forward[i];
+    b->normal[1][i] = e->right[i] - edge * e->forward[i], b->normal[2][i] = -e->right[i] - edge * e->forward[i];
+    b->normal[3][i] = e->up[i] - top * e->forward[i], b->normal[4][i] = -e->up[i] - top * e->forward[i];
+  }
+  for (int k = 0; k < 5; ++k)
+    b->flat[k] = sqrtf(b->normal[k][0] * b->normal[k][0] + b->normal[k][1] * b->normal[k][1]);
 }
 
-/* Returns whether upright shape `n`, boxes first, may be seen, and what pixels need of it. */
-FN int tilted_shape(const Camera* c, const Shapes* s, const Eye* e, int n, Tilted* p) {
-  const int is_box = n < s->boxes, i = is_box ? n : n - s->boxes;
-  const float* at = is_box ? s->box_position + 3 * i : s->cylinder_position + 3 * i;
-  const float away[3] = {e->origin[0] - at[0], e->origin[1] - at[1], e->origin[2] - at[2]};
-  const float to[3] = {-away[0], -away[1], -away[2]}, *half = s->box_half + 3 * i;
-  const float radius = is_box ? 0 : s->cylinder_radius[i], tall = is_box ? 0 : s->cylinder_half[i];
-  const float reach = sqrtf(is_box ? dot3(half, half) : radius * radius + tall * tall);
-  if (ball_out_of_sight(c, e, to, reach * 1.0001f + 1e-3f)) return 0;
-  const float flat = most(sqrtf(away[0] * away[0] + away[1] * away[1]), TINY);
-  const float cos = is_box ? cosf(s->box_yaw[i]) : away[0] / flat, sin = is_box ? sinf(s->box_yaw[i]) : away[1] / flat;
-  const float axes[3][3] = {{cos, sin, 0}, {-sin, cos, 0}, {0, 0, 1}};
-  p->is_box = is_box, p->shape = (float)n, p->radius = radius;
-  for (int k = 0; k < 3; ++k) {
-    p->origin[k] = dot3(axes[k], away), p->forward[k] = dot3(axes[k], e->forward);
-    p->right[k] = dot3(axes[k], e->right), p->up[k] = dot3(axes[k], e->up);
-    p->half[k] = is_box ? half[k] : k < 2 ? radius : tall;
-  }
-  p->value = dot3(is_box ? s->box_albedo + 3 * i : s->cylinder_albedo + 3 * i, e->weights);
+/* Whether no part of an upright cylinder, its middle `to` [3] from the eye, can be in the image. */
+FN int out_of_bounds(const Bounds* b, const float* to, float radius, float half) {
+  const float r = radius * 1.0001f + 1e-3f, h = half * 1.0001f + 1e-3f;
+  int out = 0;
+  for (int k = 0; k < 5; ++k) out |= dot3(b->normal[k], to) > r * b->flat[k] + h * fabsf(b->normal[k][2]);
+  return out;
+}
+
+/* Sets brightness of a shape with these axes; depth images do without. */
+FN void light_tilted(const Camera* c, const Shapes* s, const Eye* e, const float axes[3][3], Tilted* p) {
+  memset(p->bright, 0, sizeof p->bright);
+  if (!e->weights) return;
+  const float* albedo = p->is_box ? s->box_albedo + 3 * p->number : s->cylinder_albedo + 3 * (p->number - s->boxes);
+  p->value = dot3(albedo, e->weights);
   p->sun[0] = dot3(axes[0], c->sun), p->sun[1] = dot3(axes[1], c->sun);
   for (int k = 0; k < 3; ++k) {
     const float sign = p->origin[k] > 0 ? 1 : -1;
     p->bright[k] = p->value * shade(c, sign * axes[k][0], sign * axes[k][1], sign * axes[k][2]);
   }
+}
+
+/* Returns whether upright shape `n`, boxes first, may be seen, and what pixels need of it. */
+FN INLINED int tilted_shape(const Camera* c, const Shapes* s, const Eye* e, const Bounds* bounds, int n, Tilted* p) {
+  const int is_box = n < s->boxes, i = is_box ? n : n - s->boxes;
+  const float* at = is_box ? s->box_position + 3 * i : s->cylinder_position + 3 * i;
+  const float away[3] = {e->origin[0] - at[0], e->origin[1] - at[1], e->origin[2] - at[2]};
+  const float to[3] = {-away[0], -away[1], -away[2]}, *half = s->box_half + 3 * i;
+  const float radius = is_box ? sqrtf(half[0] * half[0] + half[1] * half[1]) : s->cylinder_radius[i];
+  const float tall = is_box ? half[2] : s->cylinder_half[i];
+  if (out_of_bounds(bounds, to, radius, tall)) return 0;
+  const float flat = sqrtf(away[0] * away[0] + away[1] * away[1]);
+  const int on_axis = flat < TINY; /* of a cylinder, whose frame faces the eye: then any does */
+  const float cos = is_box ? cosf(s->box_yaw[i]) : on_axis ? 1 : away[0] / flat;
+  const float sin = is_box ? sinf(s->box_yaw[i]) : on_axis ? 0 : away[1] / flat;
+  const float axes[3][3] = {{cos, sin, 0}, {-sin, cos, 0}, {0, 0, 1}};
+  p->is_box = is_box, p->number = n, p->radius = radius;
+  for (int k = 0; k < 3; ++k) {
+    p->origin[k] = dot3(axes[k], away), p->forward[k] = dot3(axes[k], e->forward);
+    p->right[k] = dot3(axes[k], e->right), p->up[k] = dot3(axes[k], e->up);
+    p->half[k] = is_box ? half[k] : k < 2 ? radius : tall;
+  }
+  p->turn.cos = cos, p->turn.sin = sin;
+  light_tilted(c, s, e, axes, p);
   return faces_of(c, p);
 }
 
-/* Writes the heights between which a shape's faces are seen in the columns from `first` on, at every ray across: of
- * face f and ray a, low and high, `stride` apart. */
+/* The heights between which LANES columns at `u` are on any face of a shape; empty if the first is above the second. */
+FN void heights_of_shape(const Tilted* p, Lanes u, Lanes* low, Lanes* high) {
+  *low = lanes(NOWHERE), *high = lanes(-NOWHERE);
+  for (int f = 0; f < p->faces; ++f) {
+    Lanes from, to;
+    heights_on(&p->face[f], u, &from, &to);
+    *low = lesser(*low, from), *high = greater(*high, to);
+  }
+}
+
+/* Lowers `nearest` of LANES rows at heights `v` of a column to the depth at which their middle rays meet a shape. */
+FN Lanes nearer_tilted(const Shapes* s, const Eye* e, const Tilted* p, const float* ahead, Lanes v, Lanes nearest) {
+  const Turn none = {1, 0}, turn = p->is_box ? p->turn : none;
+  const Lanes dx = ahead[0] + e->up[0] * v, dy = ahead[1] + e->up[1] * v, dz = ahead[2] + e->up[2] * v;
+  Lanes from, to;
+  beside(s, e, p->number, turn, dx, dy, &from, &to);
+  return nearer_upright(level_of(s, e, p->number), from, to, inverses(dz), nearest);
+}
+
+#define HEIGHTS(across) (2 + 12 * (across)) /* arrays of `stride` that `write_heights` writes at most */
+
+/* Writes what LANES columns at `u` need of a shape, in arrays that are `stride` apart: the heights between which rows
+ * may show it, then low and high of every ray across, of a box for each of its faces. */
 FN void write_heights(const Camera* c, const Tilted* p, Lanes u, float* heights, int stride) {
-  for (int f = 0; f < p->faces; ++f)
-    for (int a = 0; a < c->across; ++a) {
-      Lanes low, high;
-      heights_on(&p->face[f], u + c->pitch * ((a + 0.5f) / c->across - 0.5f), &low, &high);
-      float* to = heights + 2 * (f * c->across + a) * stride;
+  Lanes lowest = lanes(NOWHERE), highest = lanes(-NOWHERE), low, high;
+  float* to = heights + 2 * stride;
+  for (int f = 0; f < (p->is_box ? p->faces : 1); ++f)
+    for (int a = 0; a < c->across; ++a, to += 2 * stride) {
+      const Lanes at = u + c->pitch * ((a + 0.5f) / c->across - 0.5f);
+      if (p->is_box)
+        heights_on(&p->face[f], at, &low, &high);
+      else
+        heights_of_shape(p, at, &low, &high);
       store(to, low), store(to + stride, high);
+      lowest = lesser(lowest, low), highest = greater(highest, high);
     }
+  store(heights, lowest - c->pitch), store(heights + stride, highest + c->pitch);
 }
 
 /* Adds what LANES rows at `high` of a column at `u` show of a box. */
@@ -189,7 +246,7 @@ FN void insert_box(const Camera* c, const Tilted* p, float u, Lanes high, const 
   if (!any_of(count > 0)) return;
   const float per_ray = 1.0f / (c->across * c->down);
   const Layer added = {closeness / greater(count, lanes(TINY)), count * per_ray, value * per_ray, lanes(0),
-                       lanes(p->shape)};
+                       lanes((float)p->number)};
   insert(layers, added);
 }
 
@@ -198,11 +255,7 @@ FN void insert_cylinder(const Camera* c, const Tilted* p, float u, Lanes high, c
                         Layers* layers) {
   Lanes count = lanes(0), closeness = lanes(0), value = lanes(0);
   for (int a = 0; a < c->across; ++a) {
-    float low = NOWHERE, top = -NOWHERE;
-    for (int f = 0; f < p->faces; ++f) {
-      const float* of = heights + 2 * (f * c->across + a) * stride;
-      low = least(low, of[0]), top = most(top, of[stride]);
-    }
+    const float low = heights[2 * a * stride], top = heights[(2 * a + 1) * stride];
     if (low > top || !any_of((high + c->pitch > low) & (high - c->pitch < top))) continue;
     for (int d = 0; d < c->down; ++d) {
       const Met met = meet_cylinder(c, p, u + c->pitch * ((a + 0.5f) / c->across - 0.5f),
@@ -214,7 +267,7 @@ FN void insert_cylinder(const Camera* c, const Tilted* p, float u, Lanes high, c
   if (!any_of(count > 0)) return;
   const float per_ray = 1.0f / (c->across * c->down);
   const Layer added = {closeness / greater(count, lanes(TINY)), count * per_ray, value * per_ray, lanes(0),
-                       lanes(p->shape)};
+                       lanes((float)p->number)};
   insert(layers, added);
 }
 
@@ -237,20 +290,13 @@ FN Extent extent_of_sphere(const Camera* c, const Shapes* s, const Eye* e, int n
 /* Adds a shape to the layers of the rows of a column at `u`, of heights `v` and in blocks of LANES. */
 FN void insert_tilted(const Camera* c, const Tilted* p, float u, const float* v, const float* heights, int stride,
                       Layers* layers) {
-  float low = NOWHERE, high = -NOWHERE;
-  for (int k = 0; k < p->faces * c->across; ++k) {
-    low = least(low, heights[2 * k * stride]), high = most(high, heights[(2 * k + 1) * stride]);
-  }
-  if (low > high) return;
-  /* A pixel of which no ray across meets the box around a cylinder may not meet it either. */
-  const float reach = c->pitch;
   for (int first = 0; first < c->height; first += LANES, ++layers) {
     const int last = first + LANES < c->height ? first + LANES - 1 : c->height - 1;
-    if (v[first] + reach < low || v[last] - reach > high) continue;
+    if (v[first] < heights[0] || v[last] > heights[stride]) continue;
     if (p->is_box)
-      insert_box(c, p, u, load(v + first), heights, stride, layers);
+      insert_box(c, p, u, load(v + first), heights + 2 * stride, stride, layers);
     else
-      insert_cylinder(c, p, u, load(v + first), heights, stride, layers);
+      insert_cylinder(c, p, u, load(v + first), heights + 2 * stride, stride, layers);
   }
 }
 
