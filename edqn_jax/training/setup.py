@@ -120,7 +120,8 @@ class TrainingSetup:
         """Returns the missions, flown greedily and recorded; sensor noise is the same each time."""
         self._rollouts_compiled.result()
         placed = self._placed(missions, params, agent)
-        return processes.fetch_global(rollouts.fly_missions(self.config, *placed, record=True, mesh=self.mesh))
+        recorded = rollouts.Extras(record=True)
+        return processes.fetch_global(rollouts.fly_missions(self.config, *placed, extras=recorded, mesh=self.mesh))
 
     def _shortest(self) -> ShortestPath:
         scene = self.missions[0].scene
