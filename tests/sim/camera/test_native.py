@@ -35,7 +35,7 @@ def frames(scenes: list[Scene], count: int, seed: int) -> tuple[Scene, jax.Array
     """Frames anywhere in the worlds' volumes, inside of shapes as well: scenes, origins and rotations [count, ...]."""
     rng = np.random.default_rng(seed)
     pool = stack_scenes(scenes)
-    scene = jax.tree.map(lambda leaf: jnp.asarray(np.asarray(leaf)[rng.integers(0, len(scenes), count)]), pool)
+    scene = jax.tree.map(lambda leaf: jax.device_put(np.asarray(leaf)[rng.integers(0, len(scenes), count)]), pool)
     low, high = np.asarray(scene.volume[:, 0]), np.asarray(scene.volume[:, 1])
     origin = low + (high - low) * rng.random((count, 3))
     rotation = np.stack([rotation_of(0, 0, yaw) for yaw in rng.uniform(-np.pi, np.pi, count)])
