@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import jax
@@ -180,7 +181,8 @@ def absent_like(shapes: Any) -> Any:
 
 def no_shapes(kind: str, *lead: int) -> Any:
     """Returns the arrays [*lead, 0, ...] of a kind without shapes."""
-    return jax.tree.map(lambda leaf: jnp.zeros((*lead, 0, *np.shape(leaf)), jnp.float32), SHAPES.get(kind).parked)
+    parked = SHAPES.get(kind).parked
+    return jax.tree.map(lambda leaf: jax.device_put(np.zeros((*lead, 0, *np.shape(leaf)), np.float32)), parked)
 
 
 def build_scene(
@@ -310,7 +312,8 @@ def stack_scenes(scenes: Sequence[Scene]) -> Scene:
         )
         for s in scenes
     ]
-    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *[_able_to_move(s, padded) for s in padded])
+    # `jnp.stack` and `jnp.asarray` would compile a program for every shape of array.
+    return jax.tree.map(lambda *leaves: jax.device_put(np.stack(leaves)), *[_able_to_move(s, padded) for s in padded])
 
 
 def _able_to_move(scene: Any, others: Sequence[Any]) -> Any:
@@ -357,7 +360,7 @@ def with_equal_capacities(pools: Sequence[Scene], like: Sequence[Any] = ()) -> l
 
         def joined(here: Array, absent: npt.ArrayLike) -> Array:
             more = np.broadcast_to(np.asarray(absent, np.float32), (worlds, missing, *np.shape(absent)))
-            return jnp.asarray(np.concatenate([np.asarray(here), more], axis=1))
+            return jax.device_put(np.concatenate([np.asarray(here), more], axis=1))
 
         return jax.tree.map(joined, shapes, absent_like(shapes))
 
@@ -371,6 +374,7 @@ def with_equal_capacities(pools: Sequence[Scene], like: Sequence[Any] = ()) -> l
     return [pool.with_shapes({kind: padded(kind, pool) for kind in pool.shapes()}) for pool in able]
 
 
+@partial(jax.jit, inline=True)  # one program, not one for each shape of array
 def take_scene(pool: Scene, index: ArrayLike) -> Scene:
     """Returns world `index` [] of a pool."""
     return jax.tree.map(lambda leaf: leaf[index], pool)

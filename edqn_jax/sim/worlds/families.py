@@ -152,7 +152,7 @@ def random_pool(family: str, keys: Array, moving: Moving = STILL) -> Scene:
     by_family = [_in_batches(name, _moving_in(name, moving), keys[which]) for name, which in present]
     pools = with_equal_capacities(by_family, shapes)
     order = np.argsort(np.concatenate([which for _, which in present]))
-    return jax.tree.map(lambda *leaves: jnp.asarray(np.concatenate(leaves)[order]), *pools)
+    return jax.tree.map(lambda *leaves: jax.device_put(np.concatenate(leaves)[order]), *pools)
 
 
 def worlds_of(config: Config, family: str, split: Split, count: int, first: int = 0) -> Scene:
@@ -215,7 +215,8 @@ def _in_batches(family: str, moving: Moving, keys: Array) -> Scene:
     # XLA uses one core for a batch.
     with ThreadPoolExecutor(thread_name_prefix="drawing") as pool:
         batches_of_worlds = list(pool.map(partial(_sample_worlds, family, moving=moving), batches))
-    return jax.tree.map(lambda *leaves: jnp.concatenate(leaves)[:count], *batches_of_worlds)
+    # `jnp.concatenate` and `jnp.asarray` would compile a program for every shape of array.
+    return jax.tree.map(lambda *leaves: jax.device_put(np.concatenate(leaves)[:count]), *batches_of_worlds)
 
 
 def _sample_worlds(family: str, keys: Array, moving: Moving = STILL) -> Scene:

@@ -18,7 +18,7 @@ from edqn_jax.config import CameraConfig
 from edqn_jax.native import build
 from edqn_jax.sim.camera import camera, columns, native
 from edqn_jax.sim.camera.camera import LUMA_WEIGHTS
-from edqn_jax.sim.scene.scene import PARKED, Scene, stack_scenes, take_scene, with_drones
+from edqn_jax.sim.scene.scene import PARKED, Scene, stack_scenes, take_scene, with_drones, with_equal_capacities
 from edqn_jax.sim.worlds import families
 from tests.support.drawn_scenes import GROUND, ball, box, every_kind, looking, pillar, rotation_of, scene_of
 
@@ -35,7 +35,7 @@ def frames(scenes: list[Scene], count: int, seed: int) -> tuple[Scene, jax.Array
     """Frames anywhere in the worlds' volumes, inside of shapes as well: scenes, origins and rotations [count, ...]."""
     rng = np.random.default_rng(seed)
     pool = stack_scenes(scenes)
-    scene = jax.tree.map(lambda leaf: leaf[rng.integers(0, len(scenes), count)], pool)
+    scene = jax.tree.map(lambda leaf: jax.device_put(np.asarray(leaf)[rng.integers(0, len(scenes), count)]), pool)
     low, high = np.asarray(scene.volume[:, 0]), np.asarray(scene.volume[:, 1])
     origin = low + (high - low) * rng.random((count, 3))
     rotation = np.stack([rotation_of(0, 0, yaw) for yaw in rng.uniform(-np.pi, np.pi, count)])
@@ -56,11 +56,27 @@ def in_jax(config: CameraConfig, scene: Scene, origin: jax.Array, rotation: jax.
     return pictures, camera._depths(config, scene, origin, rotation)
 
 
+AT_ONCE = 64
+"""Frames that JAX draws at once."""
+
+
+def roomy() -> Scene:
+    """A pool with as many places for shapes as any world here needs."""
+    return stack_scenes([scene_of(GROUND, GROUND, boxes=96, cylinders=320, spheres=16)])
+
+
 def drawn(config: CameraConfig, scene: Scene, origin: jax.Array, rotation: jax.Array) -> list[np.ndarray]:
-    """Brightness and depth [M, H, W], first in C and then in JAX."""
+    """Brightness and depth [M, H, W], first in C and then in JAX.
+
+    Pictures of the usual size are drawn by one program of JAX, whatever the world.
+    """
     weights = jnp.broadcast_to(jnp.asarray(LUMA_WEIGHTS), origin.shape)
-    given = config, scene, origin, rotation, weights
-    return [np.asarray(image) for image in (*in_c(native._call, *given), *in_jax(*given))]
+    shared = config == CONFIG and scene.boxes.surface is None
+    padded = with_equal_capacities([scene], [roomy()])[0] if shared else scene
+    given = jax.tree.map(np.asarray, (padded, origin, rotation, weights))
+    parts = [jax.tree.map(lambda leaf, i=i: leaf[i : i + AT_ONCE], given) for i in range(0, len(origin), AT_ONCE)]
+    plain = [np.concatenate(images) for images in zip(*(in_jax(config, *part) for part in parts), strict=True)]
+    return [np.asarray(image) for image in in_c(native._call, config, scene, origin, rotation, weights)] + plain
 
 
 def agree(config: CameraConfig, scene: Scene, origin: jax.Array, rotation: jax.Array, ties: float = 0.0) -> None:
@@ -89,11 +105,13 @@ def test_the_library_is_at_hand_wherever_there_is_a_compiler() -> None:
 
 
 def test_both_draw_the_other_drones_and_neither_those_that_are_absent() -> None:
+    if not native.is_available("cpu"):
+        return
     scene, origin, rotation = frames([crowd(np.random.default_rng(3))], 64, seed=4)
     ahead = np.asarray(rotation)[:, :, 0] * 3.0 + np.random.default_rng(5).normal(0, 0.5, (64, 3))
     place = np.stack([np.asarray(origin) + ahead, np.full((64, 3), PARKED)], axis=1).astype(np.float32)
     radius = jnp.broadcast_to(jnp.array([0.36, 0.0]), (64, 2))
-    among = jax.vmap(with_drones)(scene, jnp.asarray(place), radius)
+    among = jax.jit(jax.vmap(with_drones))(scene, jnp.asarray(place), radius)
     agree(CONFIG, among, origin, rotation)
     apart = np.abs(drawn(CONFIG, among, origin, rotation)[0] - drawn(CONFIG, scene, origin, rotation)[0])
     assert (apart.max(axis=(1, 2)) > 0.05).mean() > 0.4  # the others' drones are behind something
@@ -232,16 +250,18 @@ def test_a_world_with_other_shapes_is_drawn_by_jax_and_on_gpus_a_camera_on_the_b
 def test_a_frame_is_the_same_to_the_bit_however_it_is_mapped() -> None:
     """Worlds of their own, a world for every four frames, and one world for all."""
     scene, origin, rotation = frames([crowd(np.random.default_rng(1))], 12, seed=2)
-    world = jax.tree.map(lambda leaf: leaf[0], scene)
+    world = take_scene(scene, 0)
     one = partial(camera.render_luma, CONFIG)
-    own = jax.vmap(one)(scene, origin, rotation)
-    folded = jax.tree.map(lambda leaf: leaf.reshape(3, 4, *leaf.shape[1:]), (origin, rotation))
-    three = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (3, *leaf.shape)), world)
-    shared = jax.vmap(jax.vmap(one, in_axes=(None, 0, 0)))(three, *folded)
-    single = jax.vmap(one, in_axes=(None, 0, 0))(world, origin, rotation)
-    inverted = jax.vmap(jax.vmap(one, in_axes=(0, None, None)), in_axes=(None, 0, 0))(three, origin, rotation)
-    alone = jnp.stack([one(world, o, r) for o, r in zip(origin, rotation, strict=True)])
-    for other in (shared.reshape(own.shape), single, inverted[:, 2], alone):
+    own = jax.jit(jax.vmap(one))(scene, origin, rotation)
+    folded = [np.reshape(leaf, (3, 4, *leaf.shape[1:])) for leaf in (origin, rotation)]
+    three = jax.tree.map(lambda leaf: np.broadcast_to(leaf, (3, *leaf.shape)), world)
+    shared = jax.jit(jax.vmap(jax.vmap(one, in_axes=(None, 0, 0))))(three, *folded)
+    single = jax.jit(jax.vmap(one, in_axes=(None, 0, 0)))(world, origin, rotation)
+    inverted = jax.jit(jax.vmap(jax.vmap(one, in_axes=(0, None, None)), in_axes=(None, 0, 0)))(three, origin, rotation)
+    alone = np.stack(
+        [jax.jit(one)(world, *pose) for pose in zip(np.asarray(origin), np.asarray(rotation), strict=True)]
+    )
+    for other in (np.reshape(shared, own.shape), single, np.asarray(inverted)[:, 2], alone):
         np.testing.assert_array_equal(own, other)
 
 
@@ -251,7 +271,7 @@ def test_poses_that_are_not_finite_spoil_their_own_frame_alone(
     mount: Literal["level", "body"], render: Callable[..., jax.Array]
 ) -> None:
     scene, origin, rotation = frames([crowd(np.random.default_rng(1))], 6, seed=2)
-    draw = jax.vmap(partial(render, dataclasses.replace(CONFIG, mount=mount)))
+    draw = jax.jit(jax.vmap(partial(render, dataclasses.replace(CONFIG, mount=mount))))
     good = np.asarray(draw(scene, origin, rotation))
     bad = np.asarray(draw(scene, origin.at[1].set(jnp.nan).at[4].set(jnp.inf), rotation.at[2].set(jnp.nan)))
     np.testing.assert_array_equal(bad[[0, 3, 5]], good[[0, 3, 5]])

@@ -110,7 +110,7 @@ def test_shapes_stand_at_their_positions_at_time_zero_and_nothing_moves_in_the_w
     assert not has_motion(at)
     for kind in ("boxes", "cylinders", "spheres"):
         np.testing.assert_array_equal(getattr(at, kind).position, getattr(scene, kind).position, err_msg=kind)
-    later = scene_at(scene, jnp.float32(1.0))
+    later = jax.jit(scene_at)(scene, jnp.float32(1.0))
     apart = np.linalg.norm(np.asarray(later.boxes.position - scene.boxes.position), axis=1)
     assert apart[0] > 1 and apart[1] == apart[2] == 0  # the second stands, the third is parked
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -34,6 +33,9 @@ HARD = ("rooms", "forest", "canyon")
 @pytest.fixture(scope="module")
 def pools():
     return {family: random_pool(family, world_keys("validation", WORLDS)) for family in FAMILIES}
+
+
+distances = jax.jit(jax.vmap(signed_distance, in_axes=(None, 0)))
 
 
 def test_the_splits_never_share_a_world():
@@ -88,7 +90,7 @@ def test_worlds_of_a_mixture_are_of_its_families_in_their_shares(pools, mixture)
 @pytest.mark.slow
 def test_start_and_goal_are_free_and_far_apart(pools, family):
     pool = pools[family]
-    missions = own_missions(pool)
+    missions = jax.tree.map(np.asarray, own_missions(pool))
     far = np.minimum(FAR, np.asarray(pool.volume[:, 1, 0]) / 2)
     assert (np.linalg.norm(missions.start - missions.goal, axis=1) >= far).all()
     assert (clearances(pool, missions, missions.start) >= CLEARANCE).all()
@@ -112,8 +114,7 @@ def test_there_is_a_way_from_everywhere_so_that_missions_may_begin_anywhere(pool
     scene = take_scene(pools[family], 1)  # the canyon has a courtyard at the edge
     found = find_reachable(scene, RADIUS, 0.5)
     cells = found.corner + found.edge_m * np.argwhere(~found.is_way)
-    clearance = jax.vmap(partial(signed_distance, scene))(jnp.asarray(cells, jnp.float32))
-    assert (clearance < CLEARANCE).all()
+    assert (np.asarray(distances(scene, jnp.asarray(cells, jnp.float32))) < CLEARANCE).all()
 
 
 def test_no_corner_is_cut_off():
@@ -144,14 +145,13 @@ def test_the_families_are_what_they_are_called(pools):
         assert rooms.HEIGHT[0] <= height <= rooms.HEIGHT[1] and scene.planes.position.shape[0] == 2
         # Outer walls, and up to four pieces of each of the walls between rooms.
         assert 4 + 12 <= obstacle_count(scene) <= 4 + 4 * 12
-    trees = pools["forest"].cylinders
+    trees, boxes = (jax.tree.map(np.asarray, each) for each in (pools["forest"].cylinders, pools["canyon"].boxes))
     apart = np.linalg.norm(trees.position[:, :, None, :2] - trees.position[:, None, :, :2], axis=-1)
     surfaces = apart - trees.radius[:, :, None] - trees.radius[:, None, :] + 1e9 * np.eye(forest.TREES)
     nearest = surfaces.min(axis=2)
     assert nearest.min() >= forest.GAP - 1e-3 and 2.0 < np.median(nearest) < 3.0
-    low = pools["canyon"].boxes.position[..., 2] - pools["canyon"].boxes.half[..., 2]
-    high = pools["canyon"].boxes.position[..., 2] + pools["canyon"].boxes.half[..., 2]
-    there = np.asarray(low) < 1e3
+    low, high = boxes.position[..., 2] - boxes.half[..., 2], boxes.position[..., 2] + boxes.half[..., 2]
+    there = low < 1e3
     assert (high[there] <= canyon.SIZE[2] + 1e-4).all()
     full = there & (low < 1e-3) & (high > canyon.SIZE[2] - 1e-3)
     hanging = there & (low > 1.0)
@@ -167,7 +167,7 @@ def test_hard_worlds_are_the_same_as_mjcf(pools, family, tmp_path):
     check_scene(world.scene, RADIUS, names=world.names)
     lower, upper = np.asarray(scene.volume)
     points = np.random.default_rng(0).uniform(lower, upper, (500, 3)).astype(np.float32)
-    ours, theirs = (jax.vmap(lambda point, of=of: signed_distance(of, point))(points) for of in (scene, world.scene))
+    ours, theirs = (distances(of, points) for of in (scene, world.scene))
     np.testing.assert_allclose(ours, theirs, atol=2e-5)  # written with some digits
 
 
@@ -188,9 +188,8 @@ def test_a_world_without_a_way_is_drawn_again(monkeypatch):
     half = np.asarray(pool.boxes.half[:, 0])
     assert not (half[:, 1] == 18.0).any()
     # Most first attempts had the wall, so most worlds are another than the first.
-    first = jax.vmap(lambda key: rooms.sample_rooms(jax.random.fold_in(key, 0)).boxes.half[0])(
-        world_keys("training", 12)
-    )
+    first_half = jax.jit(jax.vmap(lambda key: rooms.sample_rooms(jax.random.fold_in(key, 0)).boxes.half[0]))
+    first = first_half(world_keys("training", 12))
     assert 0 < np.isclose(half, first).all(axis=1).sum() < 8
 
 
