@@ -36,7 +36,7 @@ from edqn_jax.interop.deployment.runner import Runner
 from edqn_jax.runs.policies import load_policy
 from edqn_jax.runs.provenance import describe_workload
 from edqn_jax.sim.environment import Environment
-from edqn_jax.sim.task.observation import MAX_YAW_RATE
+from edqn_jax.sim.task.observation import MAX_YAW_RATE, knows_contrast
 from measurement import json_report
 from measurement.command import Parser, at_least_one, in_a_sentence
 from outer import event_cameras, flights, pictures
@@ -137,7 +137,7 @@ def prepare_camera(
 ) -> tuple[event_cameras.EventCamera, Callable[[], None]]:
     """Returns a camera that watches a mission, and what closes it."""
     lens = config.camera
-    if args.events != "pair":
+    if has_fine_camera(args, config):
         lens = dataclasses.replace(lens, width=event_cameras.WIDE, height=event_cameras.HIGH)
     if args.picture == "own":
         see = pictures.own_pictures(dataclasses.replace(config, camera=lens), environment, mission)
@@ -152,6 +152,18 @@ def prepare_camera(
     return event_cameras.FrameByFrame(emulator, see, args.mount), close
 
 
+def has_fine_camera(args: argparse.Namespace, config: Config) -> bool:
+    """Returns whether the events are those of a camera of more pixels than the policy has."""
+    return args.events != "pair" or config.events.sensor_pixels > 1
+
+
+def contrast_of(args: argparse.Namespace, config: Config) -> float | None:
+    """Returns the contrast that the runner is told; None is the policy's own."""
+    if args.events != "pair":
+        return event_cameras.CONTRAST
+    return config.events.tolerance if knows_contrast(config) else None
+
+
 def _nothing() -> None: ...
 
 
@@ -163,12 +175,12 @@ def measure(args: argparse.Namespace, show: Callable[[str], None] = print) -> di
     ended: list[Flown] = []
     with tempfile.TemporaryDirectory() as folder:
         file = export_policy(policy, Path(folder) / "policy.onnx").file
-        pair = args.events == "pair"
+        fine = has_fine_camera(args, config)
         runner = Runner(
             file,
-            camera=None if pair else (event_cameras.WIDE, event_cameras.HIGH),
-            camera_fov_deg=None if pair else config.camera.horizontal_fov_deg,
-            contrast=None if pair else event_cameras.CONTRAST,
+            camera=(event_cameras.WIDE, event_cameras.HIGH) if fine else None,
+            camera_fov_deg=config.camera.horizontal_fov_deg if fine else None,
+            contrast=contrast_of(args, config),
         )
         for mission in range(args.missions):
             watcher, close = prepare_camera(args, config, environment, mission)

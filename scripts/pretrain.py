@@ -1,6 +1,7 @@
-"""Makes the policy that comes with the package: trains five seeds, measures the best and writes its model card.
+"""Makes a policy that comes with the package: trains five seeds, measures the best and writes its model card.
 
     python scripts/pretrain.py --run runs/pretrained --out edqn_jax/policies/pretrained
+    python scripts/pretrain.py --looks --run runs/looks --out edqn_jax/policies/pretrained-looks
 
 Training needs a GPU: for `mixed` worlds 24 minutes on two H100, 16 of them training (`train.py ... --train.devices 2`,
 with the options that this script has), for `open` ones eight on one. Where --run holds the seeds already, the best is
@@ -37,11 +38,26 @@ SEEDS = 5
 FLAGS = ("--tuned-for", "gpu", "--world.flown", "", "--train.keep", "last")
 """Options of train.py beside the world, what depends on it, and the number of seeds."""
 
+LOOKS = (
+    *("--surface.pattern", "drawn", "--events.frame-times-s", "-0.16", "-0.08", "0.0"),
+    *("--events.profile", "dvs", "--events.least-contrast", "0.03", "--events.most-contrast", "0.3"),
+    *("--events.faults-share", "1", "--events.sensor-pixels", "117"),
+    *("--encoder.patch-layers", "128", "64", "24", "--encoder.joint-layers", "512", "256"),
+    *("--encoder.patch-overlap", "2", "--encoder.warmup-updates-per-step", "64"),
+    *("--encoder.retrain-at", "0.12", "0.35", "--encoder.retrain-decisions", "6291456"),
+    *("--train.validation-missions", "64"),
+)
+"""Further options of the policy of any look (`--looks`): surfaces and event sensors that are drawn, a third frame, from
+which motion shows, and an encoder that is larger and learns five times as long (docs/surfaces.md)."""
+
 VALIDATED_EVERY = {"open": 20_000_000, "mixed": 0}
 """Decisions between validations, by the worlds; 0 validates at the end alone: several seeds take minutes for one."""
 
 DECISIONS = {"open": 60_000_000, "mixed": 300_000_000}
 """Decisions of each seed, by the worlds that can be trained on."""
+
+OF_LOOKS = 150_000_000
+"""Decisions of each seed of the policy of any look."""
 
 MISSIONS = 1000
 """Test worlds of each family; training never uses them."""
@@ -92,6 +108,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--run", type=Path, required=True, help="folder of the runs; trained if there are none")
     parser.add_argument("--out", type=Path, required=True, help="folder of policy and card; replaced")
     parser.add_argument("--world", choices=sorted(DECISIONS), default="mixed", help="to train on (default mixed)")
+    parser.add_argument("--looks", action="store_true", help="with surfaces and event sensors that are drawn")
     parser.add_argument("--missions", type=int, default=MISSIONS, help=f"test worlds of a family (default {MISSIONS})")
     parser.add_argument("--trained", help="where and how long the run was trained, if its summary.json does not say")
     parser.add_argument("--commit", help="commit that the run was trained at; needed if it is not trained now")
@@ -104,7 +121,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     try:
         _check_replaceable(args.out)
         if not trained:
-            _train(args.run, args.world)
+            _train(args.run, args.world, args.looks)
         use_cpu_devices()
         run = best_of(args.run)
         policy = load_policy(run)
@@ -167,10 +184,12 @@ def card_of(
     )
 
 
-def options_of(world: str) -> list[str]:
+def options_of(world: str, looks: bool = False) -> list[str]:
     """Returns the options of train.py for these worlds, without seeds and folder."""
-    numbers = {"--total-steps": DECISIONS[world], "--train.validation-every": VALIDATED_EVERY[world]}
-    return [*FLAGS, "--world", world, *(word for name, number in numbers.items() for word in (name, str(number)))]
+    decisions = OF_LOOKS if looks else DECISIONS[world]
+    numbers = {"--total-steps": decisions, "--train.validation-every": VALIDATED_EVERY[world]}
+    words = [*FLAGS, "--world", world, *(word for name, number in numbers.items() for word in (name, str(number)))]
+    return [*words, *LOOKS] if looks else words
 
 
 def families_of(policy: Policy) -> list[str]:
@@ -218,8 +237,8 @@ def _paper(figures: dict[str, Any], radius: float) -> str:
     )
 
 
-def _train(run: Path, world: str) -> None:
-    asked = [*options_of(world), "--seeds", str(SEEDS), "--run-dir", str(run)]
+def _train(run: Path, world: str, looks: bool) -> None:
+    asked = [*options_of(world, looks), "--seeds", str(SEEDS), "--run-dir", str(run)]
     code = subprocess.run([sys.executable, str(ROOT / "train.py"), *asked]).returncode
     if code:
         raise ConfigError(f"the training in '{run}' ended with exit code {code}; what it printed says why")

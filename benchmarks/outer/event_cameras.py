@@ -38,10 +38,15 @@ class EventCamera(Protocol):
 
 
 class PairCamera:
-    """The policy's own law between frames at its own times: the paper's Eq. 2-5."""
+    """The policy's own law between frames at its own times: the paper's Eq. 2-5.
+
+    Pixels of which many stand for one of the policy's (`events.sensor_pixels`) have reference levels anywhere between
+    two of their events.
+    """
 
     def __init__(self, law: EventsConfig, see: See, mount: str) -> None:
         self._law, self._see, self._mount = law, see, mount
+        self._phases = np.random.default_rng(0)
 
     def watch(self, track: Track, since: float, until: float) -> NDArray:
         """Returns the events between the frames before `until`."""
@@ -50,9 +55,7 @@ class PairCamera:
         packets = []
         for before, after, first, last in zip(frames, frames[1:], times, times[1:], strict=False):
             change = after - before
-            count = np.where(
-                np.abs(change) > self._law.threshold, np.floor(np.abs(change) / self._law.tolerance), 0
-            ).astype(int)
+            count = self._count(np.abs(change))
             row, column = np.nonzero(count)
             many = count[row, column]
             order = np.concatenate([np.arange(n) for n in many]) if len(many) else np.zeros(0)
@@ -62,6 +65,12 @@ class PairCamera:
             packet["p"] = np.repeat(np.sign(change[row, column]).astype(np.int8), many)
             packets.append(packet)
         return np.concatenate(packets)
+
+    def _count(self, change: NDArray[np.float64]) -> NDArray[np.int64]:
+        """Returns the events [H, W] of each pixel's change of log brightness, without sign."""
+        if self._law.sensor_pixels > 1:
+            return np.floor(change / self._law.tolerance + self._phases.random(change.shape)).astype(int)
+        return np.where(change > self._law.threshold, np.floor(change / self._law.tolerance), 0).astype(int)
 
 
 class FrameByFrame:

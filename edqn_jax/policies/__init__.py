@@ -8,8 +8,10 @@ from pathlib import Path
 
 from edqn_jax.errors import ConfigError
 
-PRETRAINED = "pretrained"
-"""Name of the policy for random worlds, open and closed ones."""
+PRETRAINED, LOOKS = "pretrained", "pretrained-looks"
+"""Names of the policies for random worlds, open and closed ones: of one plaid, and of surfaces of any look."""
+
+SHIPPED = (PRETRAINED, LOOKS)
 
 
 def function_named(name: str | Path) -> tuple[str, str] | None:
@@ -26,14 +28,14 @@ def policy_folder(run: Path) -> Path:
 
     A folder of that name in the current one takes precedence.
     """
-    return Path(__file__).parent / PRETRAINED if str(run) == PRETRAINED and not run.is_dir() else run
+    return Path(__file__).parent / run if str(run) in SHIPPED and not run.is_dir() else run
 
 
 def no_run(folder: Path) -> ConfigError:
     """Returns the error of a folder that holds no run, or of one that is not there."""
     if folder.is_dir():
         return ConfigError(f"there is no run in '{folder}': it holds no config.yaml")
-    near = difflib.get_close_matches(str(folder), [PRETRAINED])
+    near = difflib.get_close_matches(str(folder), SHIPPED)
     return ConfigError(
         f"there is no run in '{folder}': " + (f"did you mean '{near[0]}'?" if near else "no such folder")
     )

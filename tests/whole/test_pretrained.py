@@ -12,18 +12,20 @@ import pytest
 
 import edqn_jax
 from edqn_jax.cli.train import parse_train
-from edqn_jax.policies import PRETRAINED, policy_folder
+from edqn_jax.policies import LOOKS, PRETRAINED, SHIPPED, policy_folder
 from edqn_jax.runs.directory import version_of
 
 FOLDER = policy_folder(Path(PRETRAINED))
 
 
-def test_it_is_small_has_no_pickle_and_says_who_wrote_it() -> None:
-    files = [file for file in FOLDER.rglob("*") if file.is_file()]
-    assert sum(file.stat().st_size for file in files) < 12e6
+@pytest.mark.parametrize("name", SHIPPED)
+def test_it_is_small_has_no_pickle_and_says_who_wrote_it(name: str) -> None:
+    folder = policy_folder(Path(name))
+    files = [file for file in folder.rglob("*") if file.is_file()]
+    assert files and sum(file.stat().st_size for file in files) < 13e6
     # A pickle of protocol 2 or later begins with 0x80 and its protocol.
     assert not [file for file in files if file.read_bytes()[:2] in (b"\x80\x02", b"\x80\x03", b"\x80\x04", b"\x80\x05")]
-    assert version_of(FOLDER / "config.yaml") is not None
+    assert version_of(folder / "config.yaml") is not None
 
 
 def test_a_folder_of_that_name_goes_first(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -42,6 +44,13 @@ def test_its_card_tells_of_its_training() -> None:
         assert re.search(rf"^\| {family} \| 1000 \| (9\d|100)\.\d% \| ", card, re.MULTILINE), family
 
 
+def test_the_card_of_the_policy_of_any_look_has_a_row_for_each_look_and_family() -> None:
+    card, config = (policy_folder(Path(LOOKS)) / "README.md").read_text(), edqn_jax.load_policy(LOOKS).config
+    assert f"{config.train.total_steps:,}" in card and config.surface.pattern == "drawn"
+    for look in ("drawn", "blank", "bricks", "posters", "wood"):
+        assert re.search(rf"^\| `{look}` (\| \d+\.\d ){{6}}\|$", card, re.MULTILINE), look
+
+
 def test_saved_files_name_no_folder_of_the_computer_that_wrote_them(tmp_path: Path) -> None:
     edqn_jax.save_policy(edqn_jax.load_policy(PRETRAINED), tmp_path / "mine")
     for folder, path in ((tmp_path, str(tmp_path).encode()), (FOLDER, b".partial")):
@@ -55,17 +64,18 @@ def test_a_near_miss_of_its_name_is_answered_with_it(tmp_path: Path) -> None:
         edqn_jax.load_policy(tmp_path)
 
 
-def test_its_script_trains_with_its_options(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("name", SHIPPED)
+def test_its_script_trains_with_its_options(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.syspath_prepend(str(Path(__file__).parents[2] / "scripts"))
-    options = edqn_jax.load_policy(PRETRAINED).config
+    options = edqn_jax.load_policy(name).config
     script = import_module("pretrain")
-    _, asked = parse_train(script.options_of(options.world.name))
+    _, asked = parse_train(script.options_of(options.world.name, looks=name == LOOKS))
     # Where it ran and how often it saved say nothing of what was learnt.
     elsewhere = {
         name: getattr(options.train, name) for name in ("seed", "devices", "checkpoint_every_s", "checkpoints")
     }
     assert dataclasses.replace(asked, train=dataclasses.replace(asked.train, **elsewhere)) == options
-    assert len(script.families_of(edqn_jax.load_policy(PRETRAINED))) == 6
+    assert len(script.families_of(edqn_jax.load_policy(name))) == 6
     for world in script.DECISIONS:
         assert parse_train(script.options_of(world))[1].world.name == world
 

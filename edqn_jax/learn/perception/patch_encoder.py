@@ -48,8 +48,8 @@ def to_patches(image: Array, pixels: int, overlap: int = 0) -> Array:
     *batch, height, width = image.shape
     rows, columns = -(-height // pixels), -(-width // pixels)
     if overlap:
-        flat = image.reshape(*batch, height * width)
-        return jnp.take(flat, _pixels_of_patches(height, width, pixels, overlap), axis=-1, mode="fill", fill_value=0.0)
+        flat = jnp.pad(image.reshape(*batch, height * width), [(0, 0)] * len(batch) + [(0, 1)])  # the last one is 0
+        return jnp.take(flat, _pixels_of_patches(height, width, pixels, overlap), axis=-1)
     missing = rows * pixels - height, columns * pixels - width
     if any(missing):
         image = jnp.pad(image, [(0, 0)] * len(batch) + [(0, size) for size in missing])
