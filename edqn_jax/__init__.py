@@ -32,8 +32,8 @@ if TYPE_CHECKING:
     from edqn_jax.planning.astar import plan
     from edqn_jax.planning.path import PlannedPath
     from edqn_jax.policies.functions import FunctionPolicy
-    from edqn_jax.report.flights import draw_map
     from edqn_jax.report.page.document import write_report
+    from edqn_jax.report.worlds.flights import draw_map
     from edqn_jax.runs.policies import load_policy, save_policy
     from edqn_jax.sim.actions import move_name, move_number
     from edqn_jax.sim.environment import Environment, make
@@ -69,7 +69,7 @@ _MODULES = {
     "StoppedError": "errors",
     "TrainingResult": "training.loop",
     "Transition": "sim.task.reward",
-    "draw_map": "report.flights",
+    "draw_map": "report.worlds.flights",
     "evaluate": "evaluation.evaluate",
     "load_policy": "runs.policies",
     "make": "sim.environment",

@@ -20,6 +20,7 @@ ORDER = (
         "checks",
         "extras",
         "user_code",
+        "registries",
         "xla_flags",
         "xla",
         "sine",

@@ -23,8 +23,8 @@ import numpy as np
 
 from edqn_jax.config import Config
 from edqn_jax.extras import SINKS, require_extra
-from edqn_jax.report.solids import solids_of
 from edqn_jax.report.style import OUTCOME_COLOURS
+from edqn_jax.report.worlds.solids import solids_of
 from edqn_jax.sim.task.outcomes import Outcome
 from edqn_jax.training.loop import Chunk
 

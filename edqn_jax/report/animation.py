@@ -24,11 +24,11 @@ from edqn_jax.evaluation.decoder import NEAR_M
 from edqn_jax.evaluation.trajectories import POSITION, columns_of
 from edqn_jax.extras import require_extra
 from edqn_jax.learn.policy import PolicyParams
-from edqn_jax.report.flights import OBLIQUE, OTHER_COLOUR, others_paths, plot_end_marks, plot_stage
 from edqn_jax.report.images import error_caption, look_of, scale_of
 from edqn_jax.report.sights import FlightRenderer, decision_rows, times_of, trajectory_poses
-from edqn_jax.report.solids import MAP, View, faces_seen, is_occluded, moving_solids
 from edqn_jax.report.style import INK, LINE, MUTED, OUTCOME_COLOURS, OUTCOME_LABELS, STYLE, frame
+from edqn_jax.report.worlds.flights import OBLIQUE, OTHER_COLOUR, others_paths, plot_end_marks, plot_stage
+from edqn_jax.report.worlds.solids import MAP, View, faces_seen, is_occluded, moving_solids
 from edqn_jax.sim.camera.camera import on_screen
 from edqn_jax.sim.scene.scene import has_motion
 

@@ -10,9 +10,9 @@ from edqn_jax.config import Config
 from edqn_jax.learn.perception import embedding
 from edqn_jax.learn.policy import PolicyParams
 from edqn_jax.report.curves import plot_learning, plot_returns
-from edqn_jax.report.flights import plot_path, plot_world
 from edqn_jax.report.images import NEARNESS, RECONSTRUCTED_EVENTS, look_of, plot_reconstruction, plot_sight
 from edqn_jax.report.sights import FlightRenderer, decision_rows, downsample_picture, times_of, trajectory_poses
+from edqn_jax.report.worlds.flights import plot_path, plot_world
 from edqn_jax.runs.directory import RunDirectory
 from edqn_jax.runs.record import Draw
 from edqn_jax.sim.camera.camera import on_screen

@@ -12,10 +12,10 @@ from matplotlib.colors import to_rgba
 from matplotlib.figure import Figure
 
 from edqn_jax.report.curves import plot_learning, plot_returns, running_mean
-from edqn_jax.report.flights import OBLIQUE, plot_path, plot_world
 from edqn_jax.report.images import EVENTS, NEARNESS, error_caption, plot_reconstruction, plot_sight
-from edqn_jax.report.solids import MAP, View, far_to_near, is_occluded, make_cutaway, solids_of
 from edqn_jax.report.style import OUTCOME_COLOURS
+from edqn_jax.report.worlds.flights import OBLIQUE, plot_path, plot_world
+from edqn_jax.report.worlds.solids import MAP, View, far_to_near, is_occluded, make_cutaway, solids_of
 from edqn_jax.sim.scene.scene import (
     Scene,
     UprightBoxes,

@@ -9,7 +9,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from edqn_jax.report.solids import boundary_side, solids_of, standing_rows
+from edqn_jax.report.worlds.solids import boundary_side, solids_of, standing_rows
 from edqn_jax.sim.scene.motion import NEVER, OUTSIDE_M, ball_positions
 from edqn_jax.sim.scene.scene import Scene, aim_of
 from edqn_jax.sim.scene.shapes.kind import ShapeKind

@@ -17,7 +17,8 @@ from matplotlib.patches import Circle
 
 from edqn_jax.devices.jax_settings import as_tested
 from edqn_jax.evaluation.trajectories import POSITION, VELOCITY, columns_of
-from edqn_jax.report.solids import (
+from edqn_jax.report.style import INK, MUTED, OUTCOME_COLOURS, OUTCOME_LABELS, open_figure
+from edqn_jax.report.worlds.solids import (
     GROUND,
     MAP,
     Solid,
@@ -29,7 +30,6 @@ from edqn_jax.report.solids import (
     plot_solids,
     static_scene,
 )
-from edqn_jax.report.style import INK, MUTED, OUTCOME_COLOURS, OUTCOME_LABELS, open_figure
 from edqn_jax.sim.scene.scene import PARKED, Scene
 
 OBLIQUE = View(azimuth=-62.0, elevation=34.0)

@@ -1,0 +1,1 @@
+"""Worlds and flights through them, drawn for people."""
