@@ -26,8 +26,8 @@ FINER = 8
 """Pixels of the renderer along each side of a pixel that is shown; their mean is its brightness."""
 
 LOOKS = ("plain", "textured", "shadows", "own")
-"""`plain`: one colour a shape. `textured`: noise and checks, light drawn. `shadows`: plain, with cast shadows. `own`: the
-patterns and the light that our camera sees."""
+"""`plain`: one colour a shape. `textured`: noise and checks, light drawn. `shadows`: plain, with cast shadows.
+`own`: the patterns and the light that our camera sees."""
 
 TEXELS = 32
 """Of a texture along each side."""

@@ -73,8 +73,8 @@ class Environment:
     def write_painted(self, file: str | Path, mission: int = 0) -> None:
         """Writes the world of a mission as an MJCF file NAME.xml with textures, PNGs in NAME_textures beside it.
 
-        MuJoCo shows the patterns and the light there that the drone's camera sees. The file names others, so that `make`
-        does not read it; it reads `mjcf`, which has the same looks as numbers.
+        MuJoCo shows the patterns and the light there that the drone's camera sees. The file names others, so that
+        `make` does not read it; it reads `mjcf`, which has the same looks as numbers.
 
         Raises:
             ConfigError: if a file cannot be written.

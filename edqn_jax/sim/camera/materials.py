@@ -50,7 +50,7 @@ _SPLIT = np.array(
         [[1, 0, 0], [0, -1, 0], [0, 0, 1]],
         [[-1, 0, 0], [0, -1, 0], [0, 0, -1]],
     ],
-    float,
+    np.float32,
 )
 """[6, 3, 3]: of each face of a cube the directions to the right and down in its picture, and outwards."""
 
@@ -111,7 +111,7 @@ def write_painted(config: CameraConfig, scene: Scene, file: Path, *, title: str 
     Raises:
         ConfigError: if a file cannot be written.
     """
-    from PIL import Image  # takes longer than all else that a first picture needs
+    from PIL import Image  # no other world needs it
 
     text = mjcf_of(_lit(config, scene), title=title)
     root = ElementTree.fromstring(text)
@@ -177,17 +177,18 @@ def _surface_of(config: CameraConfig, shape: Shape, geom: Geom) -> Surface:
     return Surface(np.array(numbers, np.float32), ("waves",))
 
 
-def _paint(surface: Surface, shape: Shape, corners: NDArray[np.float64]) -> NDArray[np.uint8]:
+def _paint(surface: Surface, shape: Shape, corners: NDArray[np.floating]) -> NDArray[np.uint8]:
     """Returns the colours [F, n, n, 3] of texels, from their corners [F, n + 1, n + 1, 3], metres from the centre."""
+    corners = corners.astype(np.float32)
     upper, lower = corners[:, :-1], corners[:, 1:]
     right = (upper[:, :, 1:] - upper[:, :, :-1] + lower[:, :, 1:] - lower[:, :, :-1]) / 2
     down = (lower[:, :, :-1] - upper[:, :, :-1] + lower[:, :, 1:] - upper[:, :, 1:]) / 2
     middle = (upper[:, :, :-1] + upper[:, :, 1:] + lower[:, :, :-1] + lower[:, :, 1:]) / 4
-    points = np.stack([middle, right, down], axis=3).reshape(-1, 3, 3).astype(np.float32)
+    points = np.stack([middle, right, down], axis=3).reshape(-1, 3, 3)
     padded = np.pad(points, ((0, -len(points) % _CHUNK), (0, 0), (0, 0))).reshape(-1, _CHUNK, 3, 3)
     numbers = jnp.asarray(surface.numbers, jnp.float32)
     factor = np.concatenate([np.asarray(_factors(surface.patterns, numbers, each)) for each in padded])
-    colours = factor[: len(points), None] * np.asarray(shape.albedo)
+    colours = factor[: len(points), None] * np.asarray(shape.albedo, np.float32)
     return np.round(255 * np.clip(colours, 0.0, 1.0)).astype(np.uint8).reshape(*middle.shape[:3], 3)
 
 
@@ -205,19 +206,19 @@ def _factors(patterns: tuple[str, ...], numbers: Array, points: Array) -> Array:
 # ----------------------------------------------------------------------- places of texels
 
 
-def _cube(geom: Geom) -> NDArray[np.float64]:
+def _cube(geom: Geom) -> NDArray[np.floating]:
     """Returns the places [6, n + 1, n + 1, 3] of texels' corners on a solid, metres from its centre, world axes."""
     reach = {"sphere": geom.size[[0, 0, 0]], "cylinder": geom.size[[0, 0, 1]], "capsule": geom.size[[0, 0, 1]]}
     size = reach.get(geom.kind, geom.size)
     wanted = 2 * float(size.max()) * TEXELS_A_METRE
     n = int(2 ** np.clip(np.ceil(np.log2(wanted)), np.log2(FEWEST_TEXELS), np.log2(MOST_TEXELS)))
-    at = np.linspace(-1.0, 1.0, n + 1)
+    at = np.linspace(-1.0, 1.0, n + 1, dtype=np.float32)
     right, down, out = (_SPLIT[:, i, None, None, :] for i in range(3))
     towards = out + at[None, None, :, None] * right + at[None, :, None, None] * down
-    return _ON_UNIT[geom.kind](towards, size) @ geom.rotation.T
+    return _ON_UNIT[geom.kind](towards, size.astype(np.float32)) @ geom.rotation.T.astype(np.float32)
 
 
-def _on_capsule(towards: NDArray[np.float64], size: NDArray[np.float64]) -> NDArray[np.float64]:
+def _on_capsule(towards: NDArray[np.floating], size: NDArray[np.floating]) -> NDArray[np.floating]:
     """Returns points of a capsule: MuJoCo scales its cylinder to unit size, and its ends apart."""
     wide, high = np.hypot(towards[..., 0], towards[..., 1]), np.abs(towards[..., 2])
     within = high <= wide
@@ -229,15 +230,15 @@ def _on_capsule(towards: NDArray[np.float64], size: NDArray[np.float64]) -> NDAr
     return np.concatenate([size[0] * point[..., :2], (np.sign(point[..., 2]) * height)[..., None]], axis=-1)
 
 
-def _on_cylinder(towards: NDArray[np.float64], size: NDArray[np.float64]) -> NDArray[np.float64]:
+def _on_cylinder(towards: NDArray[np.floating], size: NDArray[np.floating]) -> NDArray[np.floating]:
     return size * towards / np.maximum(np.hypot(towards[..., 0], towards[..., 1]), np.abs(towards[..., 2]))[..., None]
 
 
-def _on_ball(towards: NDArray[np.float64], size: NDArray[np.float64]) -> NDArray[np.float64]:
+def _on_ball(towards: NDArray[np.floating], size: NDArray[np.floating]) -> NDArray[np.floating]:
     return size * towards / np.linalg.norm(towards, axis=-1, keepdims=True)
 
 
-_ON_UNIT: dict[str, Callable[[NDArray[np.float64], NDArray[np.float64]], NDArray[np.float64]]] = {
+_ON_UNIT: dict[str, Callable[[NDArray[np.floating], NDArray[np.floating]], NDArray[np.floating]]] = {
     "box": lambda towards, size: size * towards,
     "cylinder": _on_cylinder,
     "capsule": _on_capsule,
@@ -247,7 +248,7 @@ _ON_UNIT: dict[str, Callable[[NDArray[np.float64], NDArray[np.float64]], NDArray
 """Directions [..., 3] within a unit solid and its half extents [3] to points [..., 3] of its surface, metres."""
 
 
-def _tile(geom: Geom, scene: Scene) -> tuple[NDArray[np.float64], tuple[int, int], float]:
+def _tile(geom: Geom, scene: Scene) -> tuple[NDArray[np.floating], tuple[int, int], float]:
     """Returns the places of a plane's texels, by how many they are rolled in its picture, and the tile's side, metres.
 
     The places are [1, n + 1, n + 1, 3], of corners, from the plane's centre, and lie around the middle of the flight
