@@ -141,7 +141,9 @@ def test_a_world_that_brings_its_patterns_is_flown_with_them_under_plaid_which_i
     said = {}
     for pattern, config in {"plaid": none, "checks": make_config("medium", surface={"pattern": "checks"})}.items():
         course = load_missions(config, str(tmp_path / "bricks.xml"))
-        said[pattern] = course.scene().boxes.surface.patterns, course.note
+        surface = course.scene().boxes.surface
+        assert surface is not None
+        said[pattern] = surface.patterns, course.note
     assert said["plaid"][0] == ("bricks",) and "has patterns of its own, and no plaid" in said["plaid"][1]
     assert said["checks"] == (("checks",), None)
 
