@@ -88,7 +88,7 @@ def fly_mission(
     """
     config, scene = environment.config, environment.scene(mission)
     goal, volume = np.asarray(scene.goal, np.float64), np.asarray(scene.volume, np.float64)
-    judge = load_judge(pictures.spec_of(environment.mjcf(mission), "plain", 0), config.drone.body_radius_m)
+    judge = load_judge(pictures.spec_of(environment, mission, "plain", 0), config.drone.body_radius_m)
     body = flight.body()
     track = Track(np.zeros(1), body.position[None], body.quaternion[None])
     window = runner.window_us / 1e6
@@ -143,7 +143,7 @@ def prepare_camera(
         see = pictures.own_pictures(dataclasses.replace(config, camera=lens), environment, mission)
         close: Callable[[], None] = _nothing
     else:
-        spec = pictures.spec_of(environment.mjcf(mission), args.look, args.seed * 10_000 + mission)
+        spec = pictures.spec_of(environment, mission, args.look, args.seed * 10_000 + mission)
         drawn = pictures.mujoco_pictures(spec, lens)
         see, close = drawn.see, drawn.close
     if args.events == "pair":

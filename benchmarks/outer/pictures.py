@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from edqn_jax.config import CameraConfig, Config
 from edqn_jax.errors import ConfigError
+from edqn_jax.sim.camera.materials import painted_spec
 from edqn_jax.sim.environment import Environment
 
 LUMA = np.array([0.299, 0.587, 0.114])
@@ -24,8 +25,9 @@ LUMA = np.array([0.299, 0.587, 0.114])
 FINER = 8
 """Pixels of the renderer along each side of a pixel that is shown; their mean is its brightness."""
 
-LOOKS = ("plain", "textured", "shadows")
-"""`plain`: one colour a shape. `textured`: noise and checks, light drawn. `shadows`: plain, with cast shadows."""
+LOOKS = ("plain", "textured", "shadows", "own")
+"""`plain`: one colour a shape. `textured`: noise and checks, light drawn. `shadows`: plain, with cast shadows.
+`own`: the patterns and the light that our camera sees."""
 
 TEXELS = 32
 """Of a texture along each side."""
@@ -34,15 +36,19 @@ See = Callable[[NDArray[np.float64], NDArray[np.float64]], NDArray[np.float64]]
 """From a camera's position [3], metres, and rotation [3, 3], x ahead, to brightness [H, W] in [0, 1]."""
 
 
-def spec_of(mjcf: str, look: str, seed: int) -> mujoco.MjSpec:
-    """Returns a world with a look.
+def spec_of(environment: Environment, mission: int, look: str, seed: int) -> mujoco.MjSpec:
+    """Returns the world of a mission with a look.
 
     Args:
-        mjcf: the world.
+        environment: whose world it is.
+        mission: number of the mission.
         look: one of `LOOKS`.
         seed: of what the look draws: textures, tints and light.
     """
-    spec = mujoco.MjSpec.from_string(mjcf)
+    if look == "own":
+        spec = painted_spec(environment.config.camera, environment.scene(mission))
+    else:
+        spec = mujoco.MjSpec.from_string(environment.mjcf(mission))
     spec.visual.global_.offwidth, spec.visual.global_.offheight = 1024, 1024
     spec.visual.quality.shadowsize = 8192 if look == "shadows" else 0
     for light in spec.lights:

@@ -360,6 +360,8 @@ def _file_missions(config: Config, name: str, missions: int, seed: int, moved: d
         scene = widen_volume(scene, moved, f"'{name}'")
         if not np.array_equal(scene.volume, loaded.scene.volume):
             note = f"'{name}' names no flight volume: it is flown in {_box(scene)}, around its shapes, start and goal"
+    if scene.boxes.surface is not None and config.surface.pattern == "plaid":
+        note = " ".join(filter(None, (note, f"'{name}' has patterns of its own, and no plaid")))
     if missions == 1:
         check_scene(scene, radius, names=loaded.names, title=f"'{name}'", goal_radius=config.env.goal_radius_m)
         shortest_path(scene, scene.start, scene.goal, radius)  # raises where there is no path

@@ -25,7 +25,7 @@ from edqn_jax.devices.forks import check_not_forked
 from edqn_jax.devices.jax_settings import as_tested
 from edqn_jax.devices.sums import check_default_sums
 from edqn_jax.errors import ConfigError
-from edqn_jax.sim.camera import camera
+from edqn_jax.sim.camera import camera, materials
 from edqn_jax.sim.physics.airframe import load_airframe
 from edqn_jax.sim.physics.drone import Flight
 from edqn_jax.sim.scene.mjcf import check_scene, load_world, mjcf_of, resolve_world
@@ -68,6 +68,19 @@ class Environment:
     def mjcf(self, mission: int = 0) -> str:
         """Returns the world of a mission as the text of an MJCF file, which MuJoCo and `make` open."""
         return mjcf_of(self.scene(mission), title=f"{self.config.world.name} {mission}")
+
+    @as_tested
+    def write_painted(self, file: str | Path, mission: int = 0) -> None:
+        """Writes the world of a mission as an MJCF file NAME.xml with textures, PNGs in NAME_textures beside it.
+
+        MuJoCo shows the patterns and the light there that the drone's camera sees. The file names others, so that
+        `make` does not read it; it reads `mjcf`, which has the same looks as numbers.
+
+        Raises:
+            ConfigError: if a file cannot be written.
+        """
+        title = f"{self.config.world.name} {mission}"
+        materials.write_painted(self.config.camera, self.scene(mission), Path(file), title=title)
 
     @as_tested
     def reset(self, key: int | Array = 0, mission: int | Array | None = None) -> tuple[EnvState, Observation]:

@@ -16,6 +16,7 @@ from edqn_jax.errors import ConfigError
 from edqn_jax.evaluation.missions import load_missions, missions_of_runs, run_missions
 from edqn_jax.sim.scene.distance import signed_distance
 from edqn_jax.sim.scene.mjcf import load_scene, resolve_world, write_scene
+from edqn_jax.sim.scene.scene import take_scene
 from edqn_jax.sim.worlds import families
 from tests.support.small_worlds import WITHOUT_A_WAY, small_world
 
@@ -131,6 +132,20 @@ def test_what_cannot_be_trained_in_is_refused_before_anything_is_compiled(tmp_pa
 def test_a_start_inside_a_wall_names_the_wall():
     with pytest.raises(ConfigError, match=r"the start .* lies inside '\w+'"):
         load_missions(CONFIG, "paper", start=inside_a_block())
+
+
+def test_a_world_that_brings_its_patterns_is_flown_with_them_under_plaid_which_is_said(tmp_path):
+    bricks, none = make_config("medium", surface={"pattern": "bricks"}), Config()
+    pool = families.world_of_file(bricks, load_scene(resolve_world("paper")))
+    write_scene(take_scene(pool, 0), tmp_path / "bricks.xml")
+    said = {}
+    for pattern, config in {"plaid": none, "checks": make_config("medium", surface={"pattern": "checks"})}.items():
+        course = load_missions(config, str(tmp_path / "bricks.xml"))
+        surface = course.scene().boxes.surface
+        assert surface is not None
+        said[pattern] = surface.patterns, course.note
+    assert said["plaid"][0] == ("bricks",) and "has patterns of its own, and no plaid" in said["plaid"][1]
+    assert said["checks"] == (("checks",), None)
 
 
 def test_a_world_without_a_volume_is_flown_in_the_box_that_holds_start_and_goal(tmp_path):

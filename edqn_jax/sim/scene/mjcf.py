@@ -6,7 +6,7 @@ An MJCF file that names no other file can be read. A world for the drone consist
   rotation. Planes are solid below and infinite. A geom is read if it is visible in
   MuJoCo's viewer (groups 0 to 2) or if MuJoCo would collide with it (contype or conaffinity set): every
   visible geom is solid, and every solid geom is visible. Colour is the material's or the geom's own `rgba`; alpha
-  and textures are ignored.
+  and textures are ignored. Patterns and light are those of `<custom>` numerics (`mjcf_looks.py`).
 * its moving geoms, on mocap bodies whose motion a text says (`mjcf_motion.py`).
 * two sites `start` and `goal`, of which only the positions are read.
 * a box site `volume`, not rotated: the space that the drone may fly in. Without one, the box around all
@@ -19,6 +19,7 @@ from __future__ import annotations
 import dataclasses
 import difflib
 import xml.etree.ElementTree as ElementTree
+from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -29,8 +30,10 @@ import numpy as np
 from jax.typing import ArrayLike
 
 from edqn_jax.config import FAMILIES
+from edqn_jax.sim.scene import mjcf_looks
 from edqn_jax.sim.scene.distance import shape_distances
 from edqn_jax.sim.scene.mjcf_files import SceneError, load_checked_text
+from edqn_jax.sim.scene.mjcf_looks import numbers_text
 from edqn_jax.sim.scene.mjcf_motion import PREFIX, motions_of, set_in_motion, text_of
 from edqn_jax.sim.scene.motion import Throw, ball_positions, steady_aim
 from edqn_jax.sim.scene.scene import Planes, Scene, Shape, Spheres, build_scene, scene_shapes
@@ -44,9 +47,6 @@ LONGEST_VOLUME = 500.0
 
 MAX_SHAPES = 500
 """Geoms of a world: 2 000 of them take 8 GB to train in."""
-
-_NEAR_M = 0.05
-"""Nothing nearer to a camera than this is drawn by MuJoCo; well within the drone's body."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -114,6 +114,7 @@ def load_world(path: str | Path) -> LoadedWorld:
     motions = motions_of(model, str(path))
     shapes: list[Shape] = []
     bodies: list[int] = []  # 0 of shapes that stand
+    geoms: list[str] = []
     names: dict[str, list[str]] = {kind: [] for kind in kinds()}
     for geom in range(model.ngeom):
         if model.geom_group[geom] >= 3 and not (model.geom_contype[geom] or model.geom_conaffinity[geom]):
@@ -121,8 +122,9 @@ def load_world(path: str | Path) -> LoadedWorld:
         body = int(model.body_rootid[model.geom_bodyid[geom]])
         shape = _shape(model, data, geom, path, moves=body in motions)
         shapes.append(shape)
+        geoms.append(_geom_name(model, geom))
         bodies.append(body if body in motions else 0)
-        names[kind_of(shape)[0]].append(_geom_name(model, geom))
+        names[kind_of(shape)[0]].append(geoms[-1])
     sites = {model.site(i).name: data.site_xpos[i] for i in range(model.nsite)}
     for name, where in sites.items():
         if not np.all(np.isfinite(where)):
@@ -140,8 +142,10 @@ def load_world(path: str | Path) -> LoadedWorld:
         moving = set_in_motion([shapes[i] for i in of], motion, data.xpos[body], faces, title)
         for i, shape in zip(of, moving, strict=True):
             shapes[i] = shape
+    shapes = mjcf_looks.with_surfaces(model, shapes, geoms, str(path))
     ends = {role: sites.get(role, unknown) for role in ("start", "goal")}
-    scene = build_scene(shapes, volume=volume, **ends)
+    daylight = mjcf_looks.daylight_of(model, str(path))
+    scene = dataclasses.replace(build_scene(shapes, volume=volume, **ends), daylight=daylight)
     return LoadedWorld(scene, {kind: tuple(members) for kind, members in names.items()}, path, "volume" in sites)
 
 
@@ -261,43 +265,44 @@ def mjcf_of(scene: Scene, *, title: str = "world") -> str:
     """
     root = ElementTree.Element("mujoco", model=title)
     ElementTree.SubElement(root, "compiler", angle="radian")
-    visual = ElementTree.SubElement(root, "visual")
-    ElementTree.SubElement(visual, "headlight", ambient="0.35 0.35 0.35", diffuse="0.4 0.4 0.4")
-    lower, upper = np.asarray(scene.volume)
-    middle, half = (lower + upper) / 2, (upper - lower) / 2
-    extent = np.max(half)
-    ElementTree.SubElement(visual, "map", znear=_numbers([_NEAR_M / extent]), zfar="50")
-    ElementTree.SubElement(root, "statistic", center=_numbers(middle), extent=_numbers([extent]))
-    asset = ElementTree.SubElement(root, "asset")
-    ElementTree.SubElement(
-        asset, "texture", type="skybox", builtin="gradient", width="256", height="256",
-        rgb1="0.45 0.62 0.85", rgb2="0.85 0.9 0.95",
-    )  # fmt: skip
+    mjcf_looks.add_visuals(root, scene)
     world = ElementTree.SubElement(root, "worldbody")
-    sun = _numbers([middle[0], middle[1], upper[2] + 50.0])
-    ElementTree.SubElement(world, "light", directional="true", pos=sun, dir="0.5 0.3 -0.8")
+    mjcf_looks.add_sun(world, scene)
     for role, where in (("start", scene.start), ("goal", scene.goal)):
         if np.all(np.isfinite(where)):
             colour = "0.1 0.6 1 1" if role == "start" else "0.1 0.8 0.2 1"
-            _add_site(world, role, pos=_numbers(where), size="0.5", rgba=colour)
-    _add_site(world, "volume", type="box", pos=_numbers(middle), size=_numbers(half), rgba="0.2 0.4 1 0.1")
-    counts: dict[str, int] = {}
+            _add_site(world, role, pos=numbers_text(where), size="0.5", rgba=colour)
+    lower, upper = np.asarray(scene.volume)
+    middle, half = (lower + upper) / 2, (upper - lower) / 2
+    _add_site(world, "volume", type="box", pos=numbers_text(middle), size=numbers_text(half), rgba="0.2 0.4 1 0.1")
     custom = ElementTree.Element("custom")
-    for shape in scene_shapes(scene):
+    shapes = named_shapes(scene)
+    for name, shape in shapes:
         attributes = _attributes(shape)
-        number = counts[attributes["type"]] = counts.get(attributes["type"], 0) + 1
-        name, parent, text = f"{attributes['type']}{number}", world, text_of(shape)
+        parent, text = world, text_of(shape)
         if text is not None:
             throw = shape.throw if isinstance(shape, Spheres) else None
             place = shape.position if throw is None else _launch(scene, throw)
             attributes.pop("pos")
-            parent = ElementTree.SubElement(world, "body", name=f"moving {name}", mocap="true", pos=_numbers(place))
+            parent = ElementTree.SubElement(world, "body", name=f"moving {name}", mocap="true", pos=numbers_text(place))
             ElementTree.SubElement(custom, "text", name=f"{PREFIX}moving {name}", data=text)
         ElementTree.SubElement(parent, "geom", {"name": name, **attributes})
+    mjcf_looks.add_numbers(custom, scene, shapes)
     if len(custom):
         root.append(custom)
     ElementTree.indent(root)
     return ElementTree.tostring(root, encoding="unicode") + "\n"
+
+
+def named_shapes(scene: Scene) -> list[tuple[str, Shape]]:
+    """Returns the shapes of `scene_shapes`, each after the name of its geom in `mjcf_of`."""
+    counts: Counter[str] = Counter()
+    named = []
+    for shape in scene_shapes(scene):
+        geom = kind_of(shape)[1].geom
+        counts[geom] += 1
+        named.append((f"{geom}{counts[geom]}", shape))
+    return named
 
 
 def _add_site(world: ElementTree.Element, name: str, **attributes: str) -> None:
@@ -388,12 +393,7 @@ def _attributes(shape: Shape) -> dict[str, str]:
     """Returns the MJCF attributes of a geom."""
     kind = kind_of(shape)[1]
     numbers = {**kind.write(shape), "pos": shape.position, "rgba": [*np.asarray(shape.albedo), 1.0]}
-    return {"type": kind.geom, **{name: _numbers(values) for name, values in numbers.items()}}
-
-
-def _numbers(values: object) -> str:
-    """Formats numbers with enough digits to restore a float32."""
-    return " ".join(f"{float(value):.9g}" for value in np.asarray(values).ravel())
+    return {"type": kind.geom, **{name: numbers_text(values) for name, values in numbers.items()}}
 
 
 def _point(point: np.ndarray) -> str:
