@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from edqn_jax.config import CameraConfig, Config
 from edqn_jax.errors import ConfigError
-from edqn_jax.sim.camera.materials import painted_spec
+from edqn_jax.sim.camera.painting.materials import painted_spec
 from edqn_jax.sim.environment import Environment
 
 LUMA = np.array([0.299, 0.587, 0.114])

@@ -25,7 +25,8 @@ from edqn_jax.devices.forks import check_not_forked
 from edqn_jax.devices.jax_settings import as_tested
 from edqn_jax.devices.sums import check_default_sums
 from edqn_jax.errors import ConfigError
-from edqn_jax.sim.camera import camera, materials
+from edqn_jax.sim.camera import camera
+from edqn_jax.sim.camera.painting import materials
 from edqn_jax.sim.physics.airframe import load_airframe
 from edqn_jax.sim.physics.drone import Flight
 from edqn_jax.sim.scene.mjcf import check_scene, load_world, mjcf_of, resolve_world

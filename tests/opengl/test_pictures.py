@@ -16,7 +16,7 @@ import pytest
 import edqn_jax
 from edqn_jax.config import CameraConfig
 from edqn_jax.sim.camera import camera
-from edqn_jax.sim.camera.materials import painted_spec
+from edqn_jax.sim.camera.painting.materials import painted_spec
 from edqn_jax.sim.environment import Environment
 from edqn_jax.sim.scene.mjcf import mjcf_of
 from edqn_jax.sim.scene.scene import Capsules, Spheres, TiltedBoxes, TiltedCylinders

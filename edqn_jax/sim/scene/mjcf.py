@@ -6,8 +6,8 @@ An MJCF file that names no other file can be read. A world for the drone consist
   rotation. Planes are solid below and infinite. A geom is read if it is visible in
   MuJoCo's viewer (groups 0 to 2) or if MuJoCo would collide with it (contype or conaffinity set): every
   visible geom is solid, and every solid geom is visible. Colour is the material's or the geom's own `rgba`; alpha
-  and textures are ignored. Patterns and light are those of `<custom>` numerics (`mjcf_looks.py`).
-* its moving geoms, on mocap bodies whose motion a text says (`mjcf_motion.py`).
+  and textures are ignored. Patterns and light are those of `<custom>` numerics (`mjcf_parts/looks.py`).
+* its moving geoms, on mocap bodies whose motion a text says (`mjcf_parts/motion.py`).
 * two sites `start` and `goal`, of which only the positions are read.
 * a box site `volume`, not rotated: the space that the drone may fly in. Without one, the box around all
   shapes and sites, `VOLUME_MARGIN` wider on every side, but not below a level plane; an evaluation whose start or goal
@@ -30,11 +30,11 @@ import numpy as np
 from jax.typing import ArrayLike
 
 from edqn_jax.config import FAMILIES
-from edqn_jax.sim.scene import mjcf_looks
 from edqn_jax.sim.scene.distance import shape_distances
-from edqn_jax.sim.scene.mjcf_files import SceneError, load_checked_text
-from edqn_jax.sim.scene.mjcf_looks import numbers_text
-from edqn_jax.sim.scene.mjcf_motion import PREFIX, motions_of, set_in_motion, text_of
+from edqn_jax.sim.scene.mjcf_parts import looks as mjcf_looks
+from edqn_jax.sim.scene.mjcf_parts.files import SceneError, load_checked_text
+from edqn_jax.sim.scene.mjcf_parts.looks import numbers_text
+from edqn_jax.sim.scene.mjcf_parts.motion import PREFIX, motions_of, set_in_motion, text_of
 from edqn_jax.sim.scene.motion import Throw, ball_positions, steady_aim
 from edqn_jax.sim.scene.scene import Planes, Scene, Shape, Spheres, build_scene, scene_shapes
 from edqn_jax.sim.scene.shapes.kind import LEVEL, Geom, kind_of, kinds, reach_of, read_shape

@@ -13,8 +13,8 @@ import pytest
 
 from edqn_jax.config import CameraConfig
 from edqn_jax.errors import ConfigError
-from edqn_jax.sim.camera import materials
-from edqn_jax.sim.camera.materials import painted_spec, write_painted
+from edqn_jax.sim.camera.painting import materials
+from edqn_jax.sim.camera.painting.materials import painted_spec, write_painted
 from edqn_jax.sim.scene.mjcf import SceneError, load_scene, mjcf_of
 from edqn_jax.sim.scene.scene import Scene
 from edqn_jax.sim.scene.surface import Surface

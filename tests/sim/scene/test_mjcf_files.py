@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from edqn_jax.sim.scene import mjcf_files
 from edqn_jax.sim.scene.mjcf import MAX_SHAPES, SceneError, load_world
+from edqn_jax.sim.scene.mjcf_parts import files as mjcf_files
 
 SITES = '<site name="start" pos="1 1 2"/><site name="goal" pos="9 1 2"/>'
 

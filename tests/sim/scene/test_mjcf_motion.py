@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from edqn_jax.sim.scene.mjcf import check_scene, load_world, mjcf_of, write_scene
-from edqn_jax.sim.scene.mjcf_files import SceneError
+from edqn_jax.sim.scene.mjcf_parts.files import SceneError
 from edqn_jax.sim.scene.scene import PARKED, scene_at, scene_shapes, take_scene
 from edqn_jax.sim.worlds.families import random_pool, world_keys
 from edqn_jax.sim.worlds.moving import Moving

@@ -8,8 +8,8 @@ from pathlib import Path
 import mujoco
 import pytest
 
-from edqn_jax.sim.scene import mjcf_xml
 from edqn_jax.sim.scene.mjcf import SceneError, load_world
+from edqn_jax.sim.scene.mjcf_parts import xml as mjcf_xml
 
 GEOM = '<geom name="block" type="box" pos="11 7 3" size="1 2 3"/>'
 WORLD = f"""<mujoco>

@@ -4,7 +4,7 @@
 
 A numeric `surface:` with the name of a geom holds the `SURFACE_NUMBERS` numbers of its pattern (`surface.py`), and one
 named `daylight` the direction to the sun, the ambient share of the light and the sky's RGB. MuJoCo shows neither;
-`sim/camera/materials.py` makes pictures of patterns. Light is written as MuJoCo's own too, so that it shades as the
+`painting/materials.py` of the camera makes pictures of patterns. Light is written as MuJoCo's own too, so that it shades as the
 package's camera does, and is read from the numeric alone.
 """
 
@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from edqn_jax.sim.scene.mjcf_files import SceneError
+from edqn_jax.sim.scene.mjcf_parts.files import SceneError
 from edqn_jax.sim.scene.scene import Scene, Shape
 from edqn_jax.sim.scene.surface import CONTRAST, KIND, PATTERNS, SURFACE_NUMBERS, Daylight, Surface
 

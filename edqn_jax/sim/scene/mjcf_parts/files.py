@@ -12,7 +12,7 @@ import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 
 from edqn_jax.errors import ConfigError
-from edqn_jax.sim.scene import mjcf_xml
+from edqn_jax.sim.scene.mjcf_parts import xml as mjcf_xml
 
 MAX_BYTES = 20_000_000
 """Of a world's file."""

@@ -29,7 +29,7 @@ import jax
 import mujoco
 import numpy as np
 
-from edqn_jax.sim.scene.mjcf_files import SceneError
+from edqn_jax.sim.scene.mjcf_parts.files import SceneError
 from edqn_jax.sim.scene.motion import LEAST_LAUNCH_M, Throw, at_rest
 from edqn_jax.sim.scene.scene import PARKED, Shape, Spheres
 from edqn_jax.sim.scene.shapes.kind import kind_of, reach_of

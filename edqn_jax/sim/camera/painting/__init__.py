@@ -1,0 +1,1 @@
+"""Pictures of worlds for renderers of others."""
