@@ -4,8 +4,8 @@
 
 A numeric `surface:` with the name of a geom holds the `SURFACE_NUMBERS` numbers of its pattern (`surface.py`), and one
 named `daylight` the direction to the sun, the ambient share of the light and the sky's RGB. MuJoCo shows neither;
-`painting/materials.py` of the camera makes pictures of patterns. Light is written as MuJoCo's own too, so that it shades as the
-package's camera does, and is read from the numeric alone.
+`painting/materials.py` of the camera makes pictures of patterns. Light is written as MuJoCo's own too, so that it
+shades as the package's camera does, and is read from the numeric alone.
 """
 
 from __future__ import annotations
