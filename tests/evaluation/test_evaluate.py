@@ -172,7 +172,8 @@ def test_the_command_shuffles_codes_only_when_asked_and_says_so(shuffle_codes, r
     monkeypatch.setattr(evaluation, "shortest_paths", lambda *_: np.full(4, 10.0))
     monkeypatch.setattr(latency, "decision_latency_ms", lambda *_, **__: {"median": 1.0, "p99": 2.0})
     evaluate_command(EvaluateArgs(run, missions=4, shuffle_codes=shuffle_codes, json=tmp_path / "figures.json"))
-    assert asked == [{"actor": AgentActor(CONFIG), "record": False, "shuffle_codes": shuffle_codes}]
+    flags = {"record": False, "shuffle_codes": shuffle_codes, "decoder_errors": False}
+    assert asked == [{"actor": AgentActor(CONFIG), **flags}]
     assert json.loads((tmp_path / "figures.json").read_text())["shuffled_codes"] is shuffle_codes
     assert ("shuffled codes" in capsys.readouterr().out) is shuffle_codes
 

@@ -246,7 +246,10 @@ def test_a_stream_of_evenly_spaced_events_survives_collection(data):
     step = data.draw(st.floats(1.0, 300.0))
     count = data.draw(st.integers(1, 40))
     stream = np.zeros(count, ev.STREAM_DTYPE)
-    stream["t"] = np.rint(start + step * np.arange(count)).astype(np.int64)
+    stamps = start + step * np.arange(count)
+    # Halves are rounded to even, up and down, which only the very same line does.
+    assume(np.all(np.abs(stamps % 1.0 - 0.5) > 1e-3))
+    stream["t"] = np.rint(stamps).astype(np.int64)
     stream["x"], stream["y"], stream["p"] = 2, 1, -1
     field = event_fields.collect(stream, (0.0, 0.02), HEIGHT, WIDTH)
     assert field.count.sum() == field.count[0, 1, 2] == count
