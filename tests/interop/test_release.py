@@ -20,6 +20,7 @@ WHEEL = {*WANTED, "edqn_jax-0.1.0.dist-info/METADATA", "edqn_jax-0.1.0.dist-info
         "edqn_jax/sim/physics/skydio_x2.xml",
         "edqn_jax/py.typed",
         "edqn_jax/policies/pretrained/config.yaml",
+        "edqn_jax/policies/pretrained-looks/config.yaml",
         "edqn_jax-0.1.0.dist-info/licenses/LICENSE",
     ],
 )
