@@ -47,7 +47,7 @@ def a_validation() -> Any:
     """Two flights in one world."""
     world = world_with_a_box()
     missions = SimpleNamespace(
-        scene=lambda number: world, world=SimpleNamespace(missions=SimpleNamespace(scene=np.zeros(2, int)))
+        scene=lambda number: world, env_params=SimpleNamespace(missions=SimpleNamespace(scene=np.zeros(2, int)))
     )
     path = np.cumsum(np.full((2, 9, 3), 0.5, np.float32), axis=1)
     flights = SimpleNamespace(
