@@ -18,6 +18,7 @@ ELSEWHERE = {
     "CONTRIBUTING.md": "contributing",
     "CHANGELOG.md": "changelog",
     "edqn_jax/policies/pretrained/README.md": "pretrained",
+    "edqn_jax/policies/pretrained-looks/README.md": "pretrained-looks",
 }
 """Page of the site that shows Markdown from outside of `docs/`; in the repository it has a link alone."""
 
