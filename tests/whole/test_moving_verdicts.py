@@ -90,7 +90,7 @@ def test_both_have_everything_in_the_same_place_at_every_time(world, judge):
 def test_each_ball_is_absent_before_its_launch_in_both(world, judge):
     names = {clearance(judge, point, time)[1] for point, time in (((17.2, 10, 5.4), 3.4), ((17.2, 10, 5.4), 1.2))}
     assert len(names) == 2
-    ball = [body for body in judge.moving if body.said[0][0] == "throw"]
+    ball = [body for body in judge.moving if body.specs[0][0] == "throw"]
     for each in ball:
         present = [np.abs(each.at(t, judge.target)).max() < 1e5 for t in np.arange(0, 30, 0.1)]
         assert not present[0] and any(present) and not present[-1]
