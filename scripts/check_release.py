@@ -26,12 +26,13 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
 
-SHIPPED = ("pretrained", "pretrained-looks")
-"""Policies of the package."""
-
 IN_BOTH = (
     *("sim/physics/skydio_x2.xml", "py.typed"),
-    *(f"policies/{name}/{file}" for name in SHIPPED for file in ("config.yaml", "README.md")),
+    *(
+        f"policies/{config.parent.name}/{file}"
+        for config in sorted((ROOT / "edqn_jax" / "policies").glob("*/config.yaml"))
+        for file in ("config.yaml", "README.md")
+    ),
 )
 """Files of the package that are not Python, beside worlds and checkpoints."""
 

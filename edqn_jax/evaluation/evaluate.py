@@ -120,6 +120,7 @@ def evaluate(
 
 
 def _figures(config: Config, flights: Flights, shortest: np.ndarray) -> dict[str, Any]:
+    """Returns the figures of flights, with the decoder's error where it was measured."""
     figures = summarise_flights(flights, shortest, config.env.drones)
     if flights.decoder_errors is not None:
         figures["decoder"] = summarise_errors(np.asarray(flights.decoder_errors), int(np.sum(flights.decisions)))

@@ -98,6 +98,35 @@ def test_esim_counts_the_change_of_log_brightness():
     assert packet["t"].max() < 1_000_000
 
 
+def test_the_pixels_of_a_pair_of_frames_have_no_dead_band_where_many_stand_for_one():
+    """A change of 0.3 thresholds makes no event in one pixel, and one in 0.3 of many; 1.3 make one, and 1.3."""
+    law = edqn_jax.make_config(events={"threshold": 0.2, "tolerance": 0.2, "frame_times_s": (-0.1, 0.0)}).events
+
+    def see(position: np.ndarray, _: np.ndarray) -> np.ndarray:
+        frame = np.full((200, 200), 0.5)
+        frame[:, :100] *= np.exp(0.6 * position[0])
+        frame[:, 100:] *= np.exp(-2.6 * position[0])
+        return frame
+
+    for pixels, rising, falling in ((1, 0.0, 1.0), (117, 0.3, 1.3)):
+        camera = event_cameras.PairCamera(dataclasses.replace(law, sensor_pixels=pixels), see, "level")
+        packet = camera.watch(straight_track(), 0.4, 0.5)
+        left = packet["x"] < 100
+        assert set(packet["p"][left]) <= {1} and set(packet["p"][~left]) == {-1}
+        # 20,000 pixels of each kind: the mean of their dither is within 0.02 of the change, six deviations.
+        means = np.array([left.sum(), (~left).sum()]) / 20_000
+        np.testing.assert_allclose(means, [rising, falling], atol=0.02 if pixels > 1 else 0.0)
+
+
+@pytest.mark.parametrize("events", ["pair", "esim"])
+def test_the_runner_is_told_the_contrast_of_the_camera_that_watches(events: str):
+    args = transfer.parse(["--events", events])
+    one, looks = policy().config, edqn_jax.load_policy("pretrained-looks").config
+    assert transfer.has_fine_camera(args, looks) and transfer.has_fine_camera(args, one) is (events == "esim")
+    assert transfer.contrast_of(args, looks) == 0.2
+    assert transfer.contrast_of(args, one) == (None if events == "pair" else 0.2)
+
+
 def test_levels_are_kept_between_windows_and_the_gap_makes_no_events():
     def see(position: np.ndarray, _: np.ndarray) -> np.ndarray:
         return np.full((2, 2), 0.1 * np.exp(2 * position[0]))

@@ -98,11 +98,12 @@ def _way(each: Decided) -> np.ndarray:
         {"events": {"least_contrast": 0.02, "most_contrast": 0.05, "leak_rate_hz": 1.0}},
         {"env": {"sensor": "event-image"}, "events": {"least_contrast": 0.02, "most_contrast": 0.05}},
         {"events": {"threshold": 0.08, "tolerance": 0.02}, "agent": {"history": 4, "dueling": False}},
+        {"encoder": {"patch_overlap": 2}, "events": {"frame_times_s": (-0.16, -0.08, 0.0)}},
         {"env": {"sensor": "event-image"}},
         {"env": {"position": False, "heading": "flight"}},
         {"encoder": {"architecture": "pooled"}, "agent": {"history": 1, "layer_norm": True}},
     ],
-    ids=["esim", "noise", "contrast", "contrast-image", "threshold", "event-image", "no-position", "pooled"],
+    ids=["esim", "noise", "contrast", "contrast-image", "threshold", "overlap", "event-image", "no-position", "pooled"],
 )
 def test_other_policies_fly_as_in_jax(tmp_path, groups):
     policy = untrained(**groups)

@@ -19,8 +19,11 @@ def counts(events: Sequence[Event], pairs: int, height: int, width: int) -> np.n
     return total
 
 
-def code(params: Any, events: Sequence[Event], motion: np.ndarray, pairs: int, height: int, width: int, side: int):
-    """Returns mean and log-variance of one window's events; `params` are those of the encoder."""
+def code(
+    params: Any, events: Sequence[Event], motion: np.ndarray, pairs: int, size: tuple[int, int], side: int, overlap: int
+):
+    """Returns mean and log-variance of one window's events; `params` are those of the encoder, `size` is (H, W)."""
+    height, width = size
     level = np.log(1.0 + counts(events, pairs, height, width)).reshape(2 * pairs, height, width)
     rows, columns = -(-height // side), -(-width // side)
     layers = [params[name] for name in sorted(params) if name.startswith("patch_")]
@@ -29,11 +32,11 @@ def code(params: Any, events: Sequence[Event], motion: np.ndarray, pairs: int, h
     features = []
     for row in range(rows):
         for column in range(columns):
-            patch = np.zeros((2 * pairs, side, side))
-            for y in range(side):
-                for x in range(side):
-                    if row * side + y < height and column * side + x < width:
-                        patch[:, y, x] = level[:, row * side + y, column * side + x]
+            patch = np.zeros((2 * pairs, side + 2 * overlap, side + 2 * overlap))
+            for y in range(-overlap, side + overlap):
+                for x in range(-overlap, side + overlap):
+                    if 0 <= row * side + y < height and 0 <= column * side + x < width:
+                        patch[:, overlap + y, overlap + x] = level[:, row * side + y, column * side + x]
             across = 2.0 * (column + 0.5) * side / width - 1.0
             down = 2.0 * (row + 0.5) * side / height - 1.0
             z = _relu(np.concatenate([patch.ravel(), [across, down], motion]), kernel, params["channel_0"]["bias"])

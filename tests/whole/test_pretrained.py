@@ -95,9 +95,10 @@ def test_the_best_seed_is_that_of_the_validation_worlds(tmp_path: Path, monkeypa
     assert best_of(tmp_path).name == "seed-2"
 
 
+@pytest.mark.parametrize("name", SHIPPED)
 @pytest.mark.slow
-def test_it_flies_the_papers_world_which_it_was_not_trained_on() -> None:
-    policy = edqn_jax.load_policy(PRETRAINED)
+def test_it_flies_the_papers_world_which_it_was_not_trained_on(name: str) -> None:
+    policy = edqn_jax.load_policy(name)
     figures = edqn_jax.evaluate(policy, "paper").figures
     assert figures["success_rate"] == 1.0 and figures["decisions"] <= 188
     assert figures["min_clearance_m"] >= 1.5 * policy.config.drone.body_radius_m

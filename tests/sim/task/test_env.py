@@ -21,9 +21,9 @@ from edqn_jax.sim.physics.airframe import load_airframe
 from edqn_jax.sim.physics.drone import DroneState, Flight
 from edqn_jax.sim.scene.scene import UprightBoxes, build_scene, stack_scenes
 from edqn_jax.sim.sensors import events, sensor
-from edqn_jax.sim.task import env, outcomes
+from edqn_jax.sim.task import decision, env, outcomes
 from edqn_jax.sim.task.action_sets import heading_setpoint, heading_to_goal, velocity_command
-from edqn_jax.sim.task.decision import Decision, reset_decision
+from edqn_jax.sim.task.decision import Decision, Payment, Situation, reset_decision
 from edqn_jax.sim.task.missions import Missions, own_missions
 from edqn_jax.sim.task.observation import MAX_YAW_RATE, MOTION_SIZE, OWN_SIZE, own_motion, own_state, rotate_own_state
 from edqn_jax.sim.task.outcomes import Outcome, Verdict, judge_decision
@@ -200,6 +200,25 @@ def test_closeness_costs_in_proportion_and_nothing_from_its_distance_on():
     assert [far - each for each in near] == pytest.approx([0.0, 1.5, 3.0, 3.0], abs=1e-5)
     plain = dataclasses.replace(config, closeness_weight=0.0)
     assert far == float(configured_reward(plain, jnp.int32(Outcome.RUNNING), 9.0, 5.0, 4.0))
+
+
+@pytest.mark.parametrize("metres", [0.1, 0.4, 1.0])
+def test_a_decision_pays_for_how_close_it_ended_to_an_obstacle(metres):
+    """The wall's face is the plane x = 29."""
+    radius, weight, reach = CONFIG.drone.body_radius_m, 3.0, 0.6
+    end = body((29.0 - radius - metres, 30.0, 5.0))
+    before = Situation(SCENE, GOAL, body((20.0, 30.0, 5.0)), jnp.int32(0), jnp.zeros((), bool))
+    payment = Payment(None, None, jnp.int32(0))
+    paid = [
+        float(decision_reward(Config(env=EnvConfig(closeness_weight=w, closeness_m=reach)), payment, before, end))
+        for w in (0.0, weight)
+    ]
+    assert paid[0] - paid[1] == pytest.approx(weight * max(0.0, 1.0 - metres / reach), abs=1e-4)
+
+
+@partial(jax.jit, static_argnums=0)
+def decision_reward(config, payment, before, end):
+    return decision._reward(config, payment, before, end, jnp.int32(22), jnp.int32(Outcome.RUNNING))
 
 
 def test_progress_telescopes_to_the_distance_covered():
