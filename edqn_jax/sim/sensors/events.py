@@ -23,7 +23,7 @@ from jax import Array
 from numpy.typing import NDArray
 
 from edqn_jax.config import EventsConfig
-from edqn_jax.sim.sensors import contrast, photoreceptor, sensor_pixels
+from edqn_jax.sim.sensors import contrast, photoreceptor, poisson, sensor_pixels
 
 STREAM_DTYPE = np.dtype([("t", "<i8"), ("x", "<u2"), ("y", "<u2"), ("p", "i1")])
 """One event of a stream: time in microseconds, column, row, polarity in {-1, +1}."""
@@ -156,7 +156,7 @@ def reset_memory(config: EventsConfig, height: int, width: int, key: Array, lux:
     if config.hot_pixel_fraction > 0.0:
         share = config.hot_pixel_fraction * _or_1(faults)
         if config.sensor_pixels > 1:
-            hot = sensor_pixels.sample_poisson(key_hot, jnp.full((height, width), config.sensor_pixels * share))
+            hot = poisson.sample_counts(key_hot, jnp.full((height, width), config.sensor_pixels * share))
         else:
             hot = jax.random.bernoulli(key_hot, share, (height, width))
     memory = EventMemory(residual=None, last_event=None, gain=gain, hot=hot, lux=lux, contrast=drawn, faults=faults)
@@ -504,9 +504,9 @@ def noise_events(
     lengths = np.diff(times)
     intervals = jnp.asarray(lengths, jnp.float32)[:, None, None]
     if faults is None and config.sensor_pixels == 1:
-        counts = sample_poisson(key_count, rates * intervals, max(max_events(config, dt) for dt in lengths))
+        counts = poisson.sample_capped(key_count, rates * intervals, max(max_events(config, dt) for dt in lengths))
     else:
-        counts = sensor_pixels.sample_poisson(key_count, rates * intervals)
+        counts = poisson.sample_counts(key_count, rates * intervals)
     limit = _limits(config, times, faults)
     room = jnp.maximum(limit - signal, 0)
     on = jnp.minimum(counts[0], room)
@@ -517,30 +517,6 @@ def noise_events(
     phase = jnp.minimum(jax.random.uniform(key_phase, count.shape) * step, intervals - (count - 1) * step - MICROSECOND)
     sign = jnp.repeat(jnp.array([1, -1], jnp.int8), pairs)[:, None, None]
     return EventField(count, jnp.where(count > 0, sign, 0).astype(jnp.int8), starts + phase, step, 0.0)
-
-
-MAX_BY_INVERSION = 16
-
-
-def sample_poisson(key: Array, mean: Array, most: int) -> Array:
-    """Returns Poisson counts of a mean [...], int32, to probabilities of 2^-23.
-
-    For `most` <= MOST_BY_INVERSION counts are capped at `most`, otherwise they are not capped. Capped ones, as
-    refractory pixels have, come from one uniform number by inversion, at a small part of the cost of
-    `jax.random.poisson`.
-    """
-    if most > MAX_BY_INVERSION:
-        return jax.random.poisson(key, mean, mean.shape, dtype=jnp.int32)
-    uniforms = jax.random.uniform(key, mean.shape)
-    probability = below = jnp.exp(-mean)
-    count = jnp.zeros(mean.shape, jnp.int32)
-    for number in range(most):
-        # Above the median, what is less probable than a step of `uniforms` is left out: float32's sum may end below 1.
-        possible = (below < 0.5) | (probability > 2.0**-24)
-        count = count + ((uniforms >= below) & possible)
-        probability = probability * mean / (number + 1)
-        below = below + probability
-    return count
 
 
 def split_polarity(field: EventField) -> EventField:

@@ -12,15 +12,6 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-MOST_SMALL = 4.0
-"""Largest mean of which Poisson counts are drawn by inversion; larger ones are nearly normal."""
-
-TINY = 1e-30
-"""Probability that is none."""
-
-TERMS = 18
-"""Of the inversion: a count of `MOST_SMALL` is larger in one of 10^7."""
-
 
 def mean_sensitivity(mismatch: Array | float) -> Array | float:
     """Returns the mean of 1 / threshold over pixels whose thresholds are normal about 1, to 1 % up to 0.3.
@@ -60,27 +51,3 @@ def follow(residual: Array, change: Array, on: Array, off: Array) -> tuple[Array
     moved, band = residual + change, 0.5 * (on + off)
     beyond = jnp.maximum(moved - band, 0.0) / on - jnp.maximum(-moved, 0.0) / off
     return beyond, jnp.clip(moved, 0.0, band)
-
-
-def sample_poisson(key: Array, mean: Array) -> Array:
-    """Returns Poisson counts of means [...], int32: by inversion up to `MOST_SMALL`, beyond normal with their skewness.
-
-    At a small part of the cost of `jax.random.poisson`, whose loops run until the last of all is found.
-    """
-    few, many = jax.random.split(key)
-    small = jnp.minimum(mean, MOST_SMALL)
-    uniforms = jax.random.uniform(few, mean.shape)
-    normal = jax.random.normal(many, mean.shape)
-    large = jnp.maximum(jnp.round(mean + jnp.sqrt(mean) * normal + (normal * normal - 1.0) / 6.0), 0.0)
-
-    def term(number: Array, carry: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
-        count, probability, below = carry
-        count = count + jnp.where((mean <= MOST_SMALL) & (uniforms >= below), 1.0, 0.0)
-        # At least that of a normal number, since a CPU is slow with denormal ones.
-        probability = jnp.maximum(probability * small / (number + 1.0), TINY)
-        return count, probability, below + probability
-
-    # A loop, since XLA draws what is not one again for each use of the counts, at ten times the cost on a CPU.
-    none = jnp.exp(-small)
-    first = jnp.where(mean > MOST_SMALL, large, 0.0), none, none
-    return jax.lax.fori_loop(0, TERMS, term, first, unroll=6)[0].astype(jnp.int32)

@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 
 from edqn_jax.config import Config, EventsConfig
 from edqn_jax.sim.sensors import events as ev
+from edqn_jax.sim.sensors import poisson
 from tests.oracles import event_fields, events_plain
 from tests.support.event_frames import (
     AIRSIM,
@@ -365,7 +366,9 @@ def parts(config, memory, frames):
 @pytest.mark.parametrize("mean", [0.0, 0.05, 0.4, 3.0, 120.0])
 def test_counts_of_noise_are_poisson_cut_off_at_the_most(mean, most):
     many = 200_000
-    counts = np.asarray(jax.jit(ev.sample_poisson, static_argnums=2)(jax.random.key(KEY), jnp.full(many, mean), most))
+    counts = np.asarray(
+        jax.jit(poisson.sample_capped, static_argnums=2)(jax.random.key(KEY), jnp.full(many, mean), most)
+    )
     terms = [math.exp(k * math.log(mean) - mean - math.lgamma(k + 1)) if mean else float(k == 0) for k in range(most)]
     expected = np.array([*terms, max(1 - sum(terms), 0.0)])
     found = np.bincount(np.minimum(counts, most), minlength=most + 1) / many
@@ -376,7 +379,7 @@ def test_counts_of_noise_are_poisson_cut_off_at_the_most(mean, most):
 def test_no_mean_makes_bursts_of_noise(monkeypatch):
     monkeypatch.setattr(jax.random, "uniform", lambda key, shape: jnp.full(shape, 1 - 2.0**-23))
     means = jnp.asarray(np.geomspace(1e-6, 4, 5000), jnp.float32)
-    counts = np.asarray(ev.sample_poisson(jax.random.key(0), means, 16))
+    counts = np.asarray(poisson.sample_capped(jax.random.key(0), means, 16))
     # Less than one window in 2^27 has more events than these.
     mean = np.asarray(means, float)
     assert np.all(counts <= 4 + 2 * mean + 6 * np.sqrt(mean))

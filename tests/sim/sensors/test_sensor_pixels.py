@@ -13,7 +13,7 @@ import pytest
 
 from edqn_jax.config import EventsConfig
 from edqn_jax.sim.sensors import events as ev
-from edqn_jax.sim.sensors import sensor_pixels
+from edqn_jax.sim.sensors import poisson
 from tests.oracles import sensor_pixels_plain as plain
 from tests.support.event_frames import TIMES, host, memory_of, run
 
@@ -74,7 +74,7 @@ def test_noise_is_the_mean_of_the_noise_of_all_pixels():
 
 @pytest.mark.parametrize("mean", [0.05, 1.0, 3.9, 4.1, 40.0])
 def test_poisson_counts_have_the_mean_and_the_spread_of_theirs(mean):
-    drawn = np.asarray(sensor_pixels.sample_poisson(jax.random.key(0), jnp.full(40_000, mean)))
+    drawn = np.asarray(poisson.sample_counts(jax.random.key(0), jnp.full(40_000, mean)))
     assert drawn.min() >= 0
     assert drawn.mean() == pytest.approx(mean, abs=5 * (mean / 40_000) ** 0.5 + 0.002 * mean)
     assert drawn.var() == pytest.approx(mean, rel=0.05 if mean > 0.1 else 0.12)
