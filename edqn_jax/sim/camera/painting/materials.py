@@ -117,12 +117,13 @@ def write_painted(config: CameraConfig, scene: Scene, file: Path, *, title: str 
     root = ElementTree.fromstring(text)
     asset, geoms = root.find("asset"), {geom.get("name"): geom for geom in root.iter("geom")}
     assert asset is not None
+    materials = _bake(config, scene, text)
     folder = file.with_name(f"{file.stem}_textures")
     try:
         folder.mkdir(exist_ok=True)
     except OSError as error:
         raise write_error(folder, error.strerror) from None
-    for material in _bake(config, scene, text):
+    for material in materials:
         name, picture = material.geom, io.BytesIO()
         Image.fromarray(material.faces.reshape(-1, *material.faces.shape[2:])).save(picture, format="PNG")
         write_atomically(folder / f"{name}.png", picture.getvalue())

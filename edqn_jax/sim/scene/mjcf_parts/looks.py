@@ -117,8 +117,8 @@ def with_surfaces(model: mujoco.MjModel, shapes: Sequence[Shape], names: Sequenc
     Raises:
         SceneError: if a numeric names no geom of these, or its numbers are no pattern.
     """
-    said = {name.removeprefix(PREFIX): row for name, row in _numerics(model).items() if name.startswith(PREFIX)}
-    for name, row in said.items():
+    rows = {name.removeprefix(PREFIX): row for name, row in _numerics(model).items() if name.startswith(PREFIX)}
+    for name, row in rows.items():
         if name not in names:
             raise SceneError(f"{title}: the numeric '{PREFIX}{name}' names no solid geom '{name}'")
         if len(row) != SURFACE_NUMBERS or not np.all(np.isfinite(row)):
@@ -128,14 +128,14 @@ def with_surfaces(model: mujoco.MjModel, shapes: Sequence[Shape], names: Sequenc
                 f"{title}: the numeric '{PREFIX}{name}' must begin with a pattern, 0 to {len(PATTERNS) - 1}, and a "
                 "contrast from 0 to 1"
             )
-    used = {int(row[KIND]) for row in said.values()}
+    used = {int(row[KIND]) for row in rows.values()}
     patterns = tuple(pattern for number, pattern in enumerate(PATTERNS) if number in used)
-    dressed = []
+    found = []
     for shape, name in zip(shapes, names, strict=True):
-        if name in said and hasattr(shape, "surface"):
-            shape = dataclasses.replace(shape, surface=Surface(np.asarray(said[name], np.float32), patterns))
-        dressed.append(shape)
-    return dressed
+        if name in rows and hasattr(shape, "surface"):
+            shape = dataclasses.replace(shape, surface=Surface(np.asarray(rows[name], np.float32), patterns))
+        found.append(shape)
+    return found
 
 
 def _numerics(model: mujoco.MjModel) -> dict[str, np.ndarray]:
