@@ -1,4 +1,4 @@
-"""Cameras in C: the level one for CPUs and NVIDIA GPUs, one on the body for CPUs.
+"""Cameras in C and CUDA, level ones and those on the body.
 
 Where there is a C compiler, or on GPUs CUDA's, they are drawn by `pictures.c` and `pictures.cu`; everywhere else by the
 same functions in JAX (`columns.py`, `depth.py`). All agree to rounding (`tests/sim/camera/test_native.py`). C knows the
@@ -38,19 +38,19 @@ OPERANDS = {
 MOST_PLANES = 8
 """A scene with more is drawn by JAX."""
 
-TARGETS = ("edqn_pictures", "edqn_depths")
+TARGETS = ("edqn_pictures", "edqn_depths", "edqn_tilted_pictures", "edqn_tilted_depths")
 
 NOWHERE = 1e29
 """Depths beyond this, in metres, are those of rays that meet nothing."""
 
 
-def can_render(config: CameraConfig, scene: Scene, platform: str) -> bool:
+def can_render(scene: Scene, platform: str) -> bool:
     """Returns whether the library of "cpu" or "cuda" is at hand and draws such pictures; known when tracing."""
     others = [shapes for kind, shapes in scene.shapes().items() if kind not in OPERANDS]
-    plain = (config.mount == "level" or platform == "cpu") and not any(shapes.position.shape[-2] for shapes in others)
     shapes = [getattr(getattr(scene, kind), name) for kind, names in OPERANDS.items() for name in names]
-    plain = plain and scene.planes.position.shape[-2] <= MOST_PLANES
-    return plain and all(leaf.dtype == jnp.float32 for leaf in shapes) and is_available(platform)
+    known = not any(shapes.position.shape[-2] for shapes in others)
+    known = known and scene.planes.position.shape[-2] <= MOST_PLANES
+    return known and all(leaf.dtype == jnp.float32 for leaf in shapes) and is_available(platform)
 
 
 def render_luma(config: CameraConfig, scene: Scene, origin: Array, rotation: Array, weights: Array) -> Array:
@@ -58,7 +58,7 @@ def render_luma(config: CameraConfig, scene: Scene, origin: Array, rotation: Arr
 
     Origins are in metres.
     """
-    return _call("edqn_pictures", config, scene, origin, rotation, weights)
+    return _call(_target("pictures", config), config, scene, origin, rotation, weights)
 
 
 def render_depth(config: CameraConfig, scene: Scene, origin: Array, rotation: Array) -> Array:
@@ -66,8 +66,12 @@ def render_depth(config: CameraConfig, scene: Scene, origin: Array, rotation: Ar
 
     As `depth.nearest_depth` does; arrays have a leading [L], see `primitive`.
     """
-    found = _call("edqn_depths", config, scene, origin, rotation)
+    found = _call(_target("depths", config), config, scene, origin, rotation)
     return jnp.where(found > NOWHERE, jnp.inf, found)
+
+
+def _target(drawn: str, config: CameraConfig) -> str:
+    return f"edqn_{drawn}" if config.mount == "level" else f"edqn_tilted_{drawn}"
 
 
 def _call(target: str, config: CameraConfig, scene: Scene, *frames: Array) -> Array:
@@ -75,8 +79,8 @@ def _call(target: str, config: CameraConfig, scene: Scene, *frames: Array) -> Ar
     waves = np.array(
         [[*np.divide(w.direction, config.texture_period_m * w.octave), w.weight] for w in WAVES], np.float32
     )
-    tilted = config.mount == "body", config.samples_across, config.samples_down
-    constants = np.array([raycast.pitch_of(config), config.texture_contrast, *tilted], np.float32)
+    rays = config.mount == "body", config.samples_across, config.samples_down
+    constants = np.array([raycast.pitch_of(config), config.texture_contrast, *rays], np.float32)
     shapes = [getattr(getattr(scene, kind), name) for kind, names in OPERANDS.items() for name in names]
     origin, rotation, *weights = frames
     looks = [_daylight(config, scene), *(_surfaces(scene, kind) for kind in OPERANDS)] if weights else []

@@ -328,3 +328,7 @@ static XLA_FFI_Error* each_frame(XLA_FFI_CallFrame* call, Render* render, int we
 XLA_FFI_Error* edqn_pictures(XLA_FFI_CallFrame* call) { return each_frame(call, draw, 1); }
 
 XLA_FFI_Error* edqn_depths(XLA_FFI_CallFrame* call) { return each_frame(call, measure, 0); }
+
+XLA_FFI_Error* edqn_tilted_pictures(XLA_FFI_CallFrame* call) { return edqn_pictures(call); }
+
+XLA_FFI_Error* edqn_tilted_depths(XLA_FFI_CallFrame* call) { return edqn_depths(call); }

@@ -1,5 +1,5 @@
-/* Pictures and depth images of a level camera, for NVIDIA GPUs, as handlers of XLA's foreign function interface
- * (`native.py` compiles and registers them). What they are made of is in `pictures.h`.
+/* Pictures and depth images for NVIDIA GPUs, as handlers of XLA's foreign function interface (`native.py` compiles and
+ * registers them). What they are made of is in `pictures.h`; those of a camera on the body, in `tilted.h`.
  *
  * A block of threads draws a strip of COLUMNS columns of a frame, ROWS rows of it at a time, a thread a pixel. First it
  * gathers the upright shapes that the strip may show; then, AT_ONCE of them at a time, what the strip's columns need of
@@ -28,11 +28,15 @@
 #define THREADS (COLUMNS * ROWS)
 #define AT_ONCE 16
 #define MEASURED_AT_ONCE 32
+#define TILTED_AT_ONCE 6
+#define TILTED_RESIDENT 4
+#define ROOM_FOR_HEIGHTS (TILTED_AT_ONCE * HEIGHTS(3) * COLUMNS) /* of fewer shapes at once, with more rays a pixel */
 
 typedef float Lanes;
 typedef int Mask;
 
 FN Lanes lanes(float x) { return x; }
+FN Lanes load(const float* from) { return *from; }
 FN void store(float* to, Lanes x) { *to = x; }
 FN Lanes pick(Mask where, Lanes a, Lanes b) { return where ? a : b; }
 FN Lanes lesser(Lanes a, Lanes b) { return a < b ? a : b; }
@@ -44,6 +48,7 @@ FN Lanes counted(void) { return 0; }
 FN float highest(Lanes x) { return x; }
 
 #include "pictures.h"
+#include "tilted.h"
 
 /* What the threads of a block share of their frame. */
 typedef struct {
@@ -212,8 +217,130 @@ static __global__ void __launch_bounds__(THREADS, RESIDENT) measure(const Batch 
   }
 }
 
+static __global__ void __launch_bounds__(THREADS, TILTED_RESIDENT) draw_tilted(const Batch batch) {
+  __shared__ Frame frame;
+  __shared__ Wave waves[MOST_WAVES];
+  __shared__ Bounds bounds;
+  __shared__ Gathered gathered;
+  __shared__ Tilted shapes[TILTED_AT_ONCE];
+  __shared__ unsigned covering[COLUMNS];
+  __shared__ float heights[ROOM_FOR_HEIGHTS];
+  const int t = threadIdx.x, strips = (batch.width + COLUMNS - 1) / COLUMNS;
+  const uint32_t m = blockIdx.x / strips;
+  const int left = (int)(blockIdx.x % strips) * COLUMNS, right = left + COLUMNS;
+  share_frame(&batch, m, &frame);
+  const Camera* c = &frame.camera;
+  const Shapes* s = &frame.shapes;
+  const Eye* e = &frame.eye;
+  if (t == THREADS - 1) waves_of(c, e, waves);
+  if (t == THREADS - 33) light_planes(c, s, e, frame.planes);
+  if (t == THREADS - 65) bounds_of(c, e, &bounds);
+  __syncthreads();
+
+  const int uprights = s->boxes + s->cylinders, across = column_of(t), column = left + across;
+  const int in_image = column < c->width, of_shape = HEIGHTS(c->across) * COLUMNS;
+  const int at_once = most(1, least(TILTED_AT_ONCE, ROOM_FOR_HEIGHTS / of_shape));
+  const float u = c->u[in_image ? column : c->width - 1];
+  float ahead[3];
+  ray_ahead(e, u, ahead);
+  int found = 0, listed = 0, kept = 0; /* listed, kept: all that is shown is in the list, in shared memory */
+  for (int first = 0; first < c->height; first += ROWS) {
+    const int row = first + row_of(t), drawn = in_image && row < c->height;
+    const float v = c->v[row < c->height ? row : c->height - 1];
+    Layers layers;
+    layers.inserted = 0;
+    for (int base = 0; base < uprights; base += THREADS) {
+      if (!listed) {
+        Tilted shape;
+        const int n = base + t;
+        const int shown = n < uprights && tilted_shape(c, s, e, &bounds, n, &shape) && shape.first < right &&
+                          shape.last > left;
+        __syncthreads(); /* nobody is at the list of the pass before */
+        found = gather(&gathered, n, shown);
+      }
+      for (int k = 0; k < found; k += at_once) {
+        const int many = found - k < at_once ? found - k : at_once;
+        if (!kept) {
+          __syncthreads();
+          if (t < COLUMNS) covering[t] = 0;
+          if (t < many) tilted_shape(c, s, e, &bounds, gathered.list[k + t], &shapes[t]);
+          __syncthreads();
+          for (int task = t; task < many * COLUMNS; task += THREADS) {
+            const int which = task / COLUMNS, x = task % COLUMNS, at = left + x;
+            if (at < shapes[which].first || at >= shapes[which].last) continue;
+            float* of = heights + which * of_shape + x;
+            write_heights(c, &shapes[which], c->u[at], of, COLUMNS);
+            if (of[0] < of[COLUMNS]) atomicOr(&covering[x], 1u << which);
+          }
+          __syncthreads();
+        }
+        if (drawn)
+          for (unsigned left_over = covering[across]; left_over; left_over &= left_over - 1) {
+            const int which = __ffs((int)left_over) - 1;
+            const float* of = heights + which * of_shape + across;
+            if (v >= of[0] && v <= of[COLUMNS]) insert_rows(c, &shapes[which], u, v, of, COLUMNS, &layers);
+          }
+      }
+    }
+    listed = uprights <= THREADS, kept = listed && found <= at_once;
+    if (!drawn) continue;
+    for (int n = 0; n < s->spheres; ++n) insert_sphere(c, s, e, n, ahead, v, &layers);
+    batch.pictures[((int64_t)m * c->height + row) * c->width + column] =
+        blend(c, s, frame.planes, e, waves, 0, ahead, v, &layers);
+  }
+}
+
+static __global__ void __launch_bounds__(THREADS, TILTED_RESIDENT) measure_tilted(const Batch batch) {
+  __shared__ Frame frame;
+  __shared__ Bounds bounds;
+  __shared__ Gathered gathered;
+  __shared__ Level levels[THREADS];
+  __shared__ Turn turns[THREADS];
+  const int t = threadIdx.x, strips = (batch.width + COLUMNS - 1) / COLUMNS;
+  const uint32_t m = blockIdx.x / strips;
+  const int left = (int)(blockIdx.x % strips) * COLUMNS, right = left + COLUMNS;
+  share_frame(&batch, m, &frame);
+  const Camera* c = &frame.camera;
+  const Shapes* s = &frame.shapes;
+  const Eye* e = &frame.eye;
+  if (t == 0) bounds_of(c, e, &bounds);
+  __syncthreads();
+  const int uprights = s->boxes + s->cylinders, column = left + column_of(t), in_image = column < c->width;
+  float ahead[3];
+  ray_ahead(e, c->u[in_image ? column : c->width - 1], ahead);
+  int found = 0, listed = 0;
+  for (int first = 0; first < c->height; first += ROWS) {
+    const int row = first + row_of(t), drawn = in_image && row < c->height;
+    const float v = c->v[row < c->height ? row : c->height - 1];
+    const float dx = ahead[0] + e->up[0] * v, dy = ahead[1] + e->up[1] * v, dz = ahead[2] + e->up[2] * v;
+    const float per_z = inverses(dz);
+    float nearest = nearest_of_others(s, frame.planes, e, dx, dy, dz);
+    for (int base = 0; base < uprights; base += THREADS) {
+      if (!listed) {
+        Tilted shape;
+        const int n = base + t;
+        const int shown = n < uprights && tilted_shape(c, s, e, &bounds, n, &shape) && shape.first < right &&
+                          shape.last > left;
+        __syncthreads(); /* nobody is at the list of the pass before */
+        found = gather(&gathered, n, shown);
+        if (t < found) levels[t] = level_of(s, e, gathered.list[t]), turns[t] = turn_of(s, gathered.list[t]);
+        __syncthreads();
+      }
+      for (int k = 0; k < found; ++k) {
+        float from, to;
+        beside(s, e, gathered.list[k], turns[k], dx, dy, &from, &to);
+        nearest = nearer_upright(levels[k], from, to, per_z, nearest);
+      }
+    }
+    listed = uprights <= THREADS;
+    if (drawn) batch.pictures[((int64_t)m * c->height + row) * c->width + column] = nearest;
+  }
+}
+
 KERNEL_ON_CPU(draw)
 KERNEL_ON_CPU(measure)
+KERNEL_ON_CPU(draw_tilted)
+KERNEL_ON_CPU(measure_tilted)
 
 /* Launches a kernel on all frames of a call. */
 #define DRAW(kernel, weighted)                                                                         \
@@ -231,6 +358,10 @@ KERNEL_ON_CPU(measure)
 EXPORTED XLA_FFI_Error* edqn_pictures(XLA_FFI_CallFrame* call) { DRAW(draw, 1); }
 
 EXPORTED XLA_FFI_Error* edqn_depths(XLA_FFI_CallFrame* call) { DRAW(measure, 0); }
+
+EXPORTED XLA_FFI_Error* edqn_tilted_pictures(XLA_FFI_CallFrame* call) { DRAW(draw_tilted, 1); }
+
+EXPORTED XLA_FFI_Error* edqn_tilted_depths(XLA_FFI_CallFrame* call) { DRAW(measure_tilted, 0); }
 
 #ifdef __CUDACC__
 /* Returns why the kernels cannot be run on this machine, or 0. Asks nothing that would take memory on a card. */

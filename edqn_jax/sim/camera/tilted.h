@@ -1,5 +1,5 @@
 /* Upright shapes under a camera that is fixed to the body, where no side is a vertical line: coverage is counted over a
- * few rays a pixel, as `coverage.add_sampled_layers` does; `pictures.c` includes this.
+ * few rays a pixel, as `coverage.add_sampled_layers` does; `pictures.c` and `pictures.cu` include this.
  *
  * Faces of boxes are convex and flat: the rays of one column meet one in an interval of heights, and closeness is
  * linear in the image. So a column's intervals are computed once for all of its rows.
@@ -287,16 +287,22 @@ FN Extent extent_of_sphere(const Camera* c, const Shapes* s, const Eye* e, int n
   return found;
 }
 
+/* Adds what LANES rows at `high` of a column at `u` show of a shape, which `write_heights` wrote `heights` of. */
+FN void insert_rows(const Camera* c, const Tilted* p, float u, Lanes high, const float* heights, int stride,
+                    Layers* layers) {
+  if (p->is_box)
+    insert_box(c, p, u, high, heights + 2 * stride, stride, layers);
+  else
+    insert_cylinder(c, p, u, high, heights + 2 * stride, stride, layers);
+}
+
 /* Adds a shape to the layers of the rows of a column at `u`, of heights `v` and in blocks of LANES. */
 FN void insert_tilted(const Camera* c, const Tilted* p, float u, const float* v, const float* heights, int stride,
                       Layers* layers) {
   for (int first = 0; first < c->height; first += LANES, ++layers) {
     const int last = first + LANES < c->height ? first + LANES - 1 : c->height - 1;
     if (v[first] < heights[0] || v[last] > heights[stride]) continue;
-    if (p->is_box)
-      insert_box(c, p, u, load(v + first), heights + 2 * stride, stride, layers);
-    else
-      insert_cylinder(c, p, u, load(v + first), heights + 2 * stride, stride, layers);
+    insert_rows(c, p, u, load(v + first), heights, stride, layers);
   }
 }
 
