@@ -191,7 +191,7 @@ def _noise(config: SurfaceConfig, draws: Array, along: Array, up: Array) -> Numb
 
 
 def _checks(config: SurfaceConfig, draws: Array, along: Array, up: Array) -> Numbers:
-    """Stripes, checks, or stripes that cross, of hard edges; half of them turned within the face."""
+    """Stripes, checks, or stripes that cross, of hard edges and any width; half of them turned within the face."""
     style, zero = draws[:, 12], jnp.zeros(len(draws))
     stripes, crossed = style < 1 / 3, style > 2 / 3
     first, second = _rotate_in_face(along, up, jnp.where(draws[:, 13] < 0.5, 0.0, 2 * jnp.pi * draws[:, 14]))
@@ -199,7 +199,7 @@ def _checks(config: SurfaceConfig, draws: Array, along: Array, up: Array) -> Num
     first, second = jnp.where(swap, second, first), jnp.where(swap, first, second)
     period = _period(config, draws[:, 2])
     other = jnp.clip(period * _log_between(0.4, 2.5, draws[:, 15]), config.shortest_m, config.longest_m)
-    width = jnp.where(stripes, scale_uniforms((0.2, 0.8), draws[:, 16]), 0.5)
+    width = scale_uniforms((0.2, 0.8), draws[:, 16])
     shares = [jnp.where(stripes, 1.0, jnp.where(crossed, 0.5, zero)), jnp.where(stripes | crossed, zero, 1.0)]
     shares += [jnp.where(crossed, 0.5, zero), width]
     none = jnp.zeros_like(along)
