@@ -15,6 +15,7 @@ from edqn_jax.config.limits import (
     NOT_NEGATIVE,
     ON_OR_OFF,
     POSITIVE,
+    RATE,
     RISING_TIMES,
     SHARE,
     SHARES,
@@ -226,6 +227,8 @@ class EnvConfig:
     many environments in a row, and as many missions, are one group (docs/several_drones.md)."""
     action_delay: Annotated[int, ON_OR_OFF] = 0
     """Decisions between choosing a move and flying it: 0, or 1, with which the first decision of an episode hovers."""
+    delay_share: Annotated[float, RATE] = 1.0
+    """Share of the episodes, drawn for each, in which `action_delay` delays."""
     heading: Literal["goal", "flight"] = "goal"
     """Where the drone and its camera turn to. `goal`: towards the goal. `flight`: towards where a move flies;
     needs `position` to be false."""

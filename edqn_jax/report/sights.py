@@ -27,7 +27,14 @@ from edqn_jax.sim.physics import drone
 from edqn_jax.sim.physics.drone import Flight
 from edqn_jax.sim.scene.scene import Scene, scene_at
 from edqn_jax.sim.sensors import sensor
-from edqn_jax.sim.task.observation import MOTION_SIZE, Observation, heading_velocity, own_size, with_contrast
+from edqn_jax.sim.task.observation import (
+    Observation,
+    heading_velocity,
+    lean_motion_size,
+    own_size,
+    with_contrast,
+    with_lean,
+)
 
 FINE = 8
 """How much finer than the drone's camera the RGB pictures for people are, per axis."""
@@ -106,13 +113,13 @@ class FlightRenderer:
         config, decisions = self.config, self.config.env.max_decisions
         looks = len(sensor.frame_steps(config))
         params = jax.eval_shape(lambda: fresh_policy(config)) if self._decodes else None
-        motion = jax.ShapeDtypeStruct((decisions, MOTION_SIZE), np.float32)
+        motion = jax.ShapeDtypeStruct((decisions, lean_motion_size(config)), np.float32)
         return _compiled(self._all_shown, self.scene, params, *_blank_poses(decisions, looks), motion)
 
     def _all_shown(
         self, scene: Scene, params: PolicyParams | None, position: Array, quaternion: Array, time: Array, motion: Array
     ) -> _Images:
-        """The images of `shown` at [D, T, ...] poses and times with own motions [D, MOTION_SIZE].
+        """The images of `shown` at [D, T, ...] poses and times with own motions of `own_motions`.
 
         The sensor carries its memory from each decision to the next.
         """
@@ -187,7 +194,7 @@ def downsample_picture(picture: np.ndarray) -> np.ndarray:
 
 
 def own_motions(config: Config, trajectory: Mapping[str, np.ndarray], rows: np.ndarray) -> np.ndarray:
-    """Returns the own motions [D, MOTION_SIZE] at the last of each decision's rows [D, T], as `own_motion`.
+    """Returns the own motions [D, lean_motion_size] at the last of each decision's rows [D, T].
 
     The yaw rate is that of the heading between the last two rows, which a trajectory holds.
     """
@@ -202,7 +209,8 @@ def own_motions(config: Config, trajectory: Mapping[str, np.ndarray], rows: np.n
     ahead = heading_velocity(config.env, yaw, velocity)
     after = Flight(jnp.asarray(place), jnp.asarray(now), velocity)
     commanded = directions(config, after, actions_of(trajectory)[last])
-    return np.concatenate([ahead, np.asarray(rate)[:, None], commanded], axis=-1).astype(np.float32)
+    motion = jnp.concatenate([ahead, rate[:, None], commanded], axis=-1)
+    return np.asarray(with_lean(config, jnp.asarray(now), motion), np.float32)
 
 
 def _compiled(program: Any, *arguments: Any) -> Compiled:

@@ -100,10 +100,22 @@ def _way(each: Decided) -> np.ndarray:
         {"events": {"threshold": 0.08, "tolerance": 0.02}, "agent": {"history": 4, "dueling": False}},
         {"encoder": {"patch_overlap": 2}, "events": {"frame_times_s": (-0.16, -0.08, 0.0)}},
         {"env": {"sensor": "event-image"}},
+        {"camera": {"mount": "body"}, "events": {"profile": "dvs", "least_contrast": 0.03, "most_contrast": 0.3}},
         {"env": {"position": False, "heading": "flight"}},
         {"encoder": {"architecture": "pooled"}, "agent": {"history": 1, "layer_norm": True}},
     ],
-    ids=["esim", "noise", "contrast", "contrast-image", "threshold", "overlap", "event-image", "no-position", "pooled"],
+    ids=[
+        "esim",
+        "noise",
+        "contrast",
+        "contrast-image",
+        "threshold",
+        "overlap",
+        "event-image",
+        "body",
+        "no-position",
+        "pooled",
+    ],
 )
 def test_other_policies_fly_as_in_jax(tmp_path, groups):
     policy = untrained(**groups)
@@ -127,13 +139,15 @@ def test_it_flies_a_whole_flight_where_jax_cannot_be_imported(exported, tmp_path
 
 
 def test_own_state_and_motion_are_those_of_the_simulator():
-    for policy in (pretrained(), untrained(env={"position": False, "heading": "flight"})):
+    lean = untrained(camera={"mount": "body"})
+    for policy in (pretrained(), untrained(env={"position": False, "heading": "flight"}), lean):
         about = about_policy(policy.config)
         for each in flown(policy, most=12):
             given = {name: np.asarray(value, np.float32) for name, value in each.given.items()}
             yaw, speed = runner.heading_of(given["quaternion"]), given["velocity"]
             own = runner.own_state(about, given["position"], yaw, speed, given["goal"], given["volume"])
-            motion = runner.own_motion(about, yaw, speed, given["yaw_rate"], each.motion[4:])
+            motion = runner.own_motion(about, yaw, speed, given["yaw_rate"], each.motion[4:7])
+            motion = runner.with_lean(about, given["quaternion"], motion)
             np.testing.assert_allclose(own, each.own, atol=2e-6)  # some float32 roundings of numbers of order 1
             np.testing.assert_allclose(motion, each.motion, atol=2e-6)
 

@@ -31,6 +31,7 @@ from edqn_jax.sim.task.observation import (
     MAX_YAW_RATE,
     Observation,
     knows_contrast,
+    leans,
     motion_size,
     own_size,
 )
@@ -165,6 +166,7 @@ def about_policy(config: Config) -> dict[str, Any]:
         "contrast_off": off,
         "least_count": max(1, least) if law.sensor_pixels == 1 else 1,
         "known_contrast": _known_contrast(config),
+        "knows_lean": leans(config),
         "sensor_pixels": law.sensor_pixels,
         "counts_net": not events.has_noise(config.events),
         "history": config.agent.history,

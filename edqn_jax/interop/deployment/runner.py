@@ -163,7 +163,7 @@ class Runner:
             {
                 "counts": counts[None],
                 "own": self._told(own_state(self.about, place, yaw, speed, aim, bounds)),
-                "motion": self._told(own_motion(self.about, yaw, speed, turn, move)),
+                "motion": self._told(with_lean(self.about, attitude, own_motion(self.about, yaw, speed, turn, move))),
                 "memory": self._memory,
             },
         )
@@ -382,6 +382,17 @@ def own_motion(
     most = about["most_yaw_rate"]
     rate = np.clip(np.float32(yaw_rate), -most, most)
     return np.concatenate([_ahead(about, yaw, velocity), [rate], move]).astype(np.float32)
+
+
+def with_lean(
+    about: Mapping[str, Any], quaternion: NDArray[np.float32], motion: NDArray[np.float32]
+) -> NDArray[np.float32]:
+    """Returns an own motion [7] with roll and pitch of an attitude [4], radians, for a policy that knows them."""
+    if not about.get("knows_lean"):
+        return motion
+    w, x, y, z = quaternion
+    roll = np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
+    return np.append(motion, [roll, np.arcsin(np.clip(2 * (w * y - z * x), -1, 1))]).astype(np.float32)
 
 
 def _ahead(about: Mapping[str, Any], yaw: np.float32, velocity: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -46,6 +46,7 @@ class Disturbance:
     gain: Array | None = None  # [R] flown thrust per commanded thrust
     lag_s: Array | None = None  # [] time constant of the thrusts
     thrust: Array | None = None  # [R] newtons, before the gain, as motors that lag have it now
+    late: Array | None = None  # [] bool, whether moves are delayed; None where they are in every episode, or in none
     move: Array | None = (
         None  # action chosen in the decision before, flown in the next one; None in what `sample_disturbance` returns
     )
@@ -93,6 +94,10 @@ def sample_disturbance(config: Config, hover_thrust: Array, key: Array) -> Distu
     """
     if not any_on(config):
         return None
+    late = None
+    if config.env.action_delay and config.env.delay_share < 1:
+        key, delay = jax.random.split(key)
+        late = jax.random.bernoulli(delay, config.env.delay_share)
     azimuth, wind, gusts, mass, inertia, gain, lag, place, speed = jax.random.split(key, 9)
     air, body, motors, noise = config.air, config.body, config.motors, config.noise
     angle = jax.random.uniform(azimuth, maxval=2 * math.pi)
@@ -106,6 +111,7 @@ def sample_disturbance(config: Config, hover_thrust: Array, key: Array) -> Distu
         gain=_share(motors.gain_share, (4,), gain),
         lag_s=jax.random.uniform(lag, maxval=motors.lag_s) if motors.lag_s else None,
         thrust=jnp.full(4, hover_thrust) if motors.lag_s else None,
+        late=late,
         position_bias=_normal(noise.position_bias_m, place),
         velocity_bias=_normal(noise.velocity_bias_m_s, speed),
     )

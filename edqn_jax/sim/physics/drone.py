@@ -61,6 +61,16 @@ def yaw_of(quaternion: Array) -> Array:
     return wrap_angle(2 * jnp.arctan2(quaternion[..., 3], quaternion[..., 0]))
 
 
+def roll_and_pitch_of(quaternion: Array) -> Array:
+    """Returns roll in [-pi, pi] and pitch in [-pi/2, pi/2] of quaternions [..., 4], radians: [..., 2].
+
+    The last two angles of turns about z, then y, then x, of the body; a body that looks down pitches by more than 0.
+    """
+    w, x, y, z = jnp.moveaxis(quaternion, -1, 0)
+    roll = jnp.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
+    return jnp.stack([roll, jnp.arcsin(jnp.clip(2 * (w * y - z * x), -1.0, 1.0))], axis=-1)
+
+
 def yaw_rate_of(state: DroneState) -> Array:
     """Returns the rate [] of the heading of `yaw_of`, rad/s; of a level body, its angular velocity about z."""
     w, x, y, z = state.quaternion

@@ -140,7 +140,8 @@ def _delay_action(config: Config, disturbance: Disturbance | None, action: Array
     if not config.env.action_delay:
         return action, disturbance
     assert disturbance is not None and disturbance.move is not None
-    return disturbance.move, dataclasses.replace(disturbance, move=action)
+    before = disturbance.move if disturbance.late is None else jnp.where(disturbance.late, disturbance.move, action)
+    return before, dataclasses.replace(disturbance, move=action)
 
 
 def _fly(

@@ -39,7 +39,7 @@ class Observation:
 
     sensed: Sensed
     own: Array  # [own_size], see `own_state` and `with_contrast`
-    motion: Array  # [motion_size], see `own_motion` and `with_contrast`; only the encoder sees it
+    motion: Array  # [motion_size], see `own_motion`, `with_lean` and `with_contrast`; only the encoder sees it
 
 
 @struct.dataclass
@@ -59,6 +59,11 @@ def knows_contrast(config: Config) -> bool:
     return contrast.is_drawn(config.events) and sensor_of(config).makes_events
 
 
+def leans(config: Config) -> bool:
+    """Returns whether the camera leans with the body, so that the own motion has the body's roll and pitch."""
+    return config.camera.mount == "body"
+
+
 def own_size(config: Config) -> int:
     """Returns the number of values of the own state in an observation."""
     return OWN_SIZE + knows_contrast(config)
@@ -66,12 +71,22 @@ def own_size(config: Config) -> int:
 
 def motion_size(config: Config) -> int:
     """Returns the number of values of the own motion in an observation."""
-    return MOTION_SIZE + knows_contrast(config)
+    return lean_motion_size(config) + knows_contrast(config)
+
+
+def lean_motion_size(config: Config) -> int:
+    """Returns the number of values of `with_lean`."""
+    return MOTION_SIZE + 2 * leans(config)
 
 
 def mirrored_motion(config: Config) -> tuple[float, ...]:
     """Returns factors [motion_size] on the own motion when left and right are exchanged."""
-    return (*MIRRORED_MOTION, *[1.0] * knows_contrast(config))
+    return (*MIRRORED_MOTION, *(-1.0, 1.0) * leans(config), *[1.0] * knows_contrast(config))
+
+
+def with_lean(config: Config, quaternion: Array, motion: Array) -> Array:
+    """Returns own motions [..., MOTION_SIZE] with roll and pitch of attitudes [..., 4], radians, if a camera leans."""
+    return jnp.concatenate([motion, drone.roll_and_pitch_of(quaternion)], axis=-1) if leans(config) else motion
 
 
 def with_contrast(config: Config, memory: SensorMemory, values: Array) -> Array:
@@ -99,7 +114,8 @@ def observe(config: Config, view: View, memory: SensorMemory, key: Array) -> tup
         state = dataclasses.replace(state, position=position, velocity=velocity)
     sensed, memory = sensor.sense(config, view.scene, view.poses, memory, key)
     own = with_contrast(config, memory, own_state(config.env, view.scene, view.goal, state))
-    motion = with_contrast(config, memory, own_motion(config.env, state, view.move))
+    motion = with_lean(config, state.quaternion, own_motion(config.env, state, view.move))
+    motion = with_contrast(config, memory, motion)
     return Observation(sensed=sensed, own=own, motion=motion), memory
 
 

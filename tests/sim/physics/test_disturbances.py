@@ -24,7 +24,7 @@ from edqn_jax.sim.physics.disturbances import Disturbance, Load
 from edqn_jax.sim.physics.drone import DroneState, hover_state
 from edqn_jax.sim.physics.flight import fly_disturbed, physics_step
 from edqn_jax.sim.scene.scene import build_scene, stack_scenes
-from edqn_jax.sim.task import env
+from edqn_jax.sim.task import decision, env
 from edqn_jax.sim.task.missions import Missions
 from tests.oracles import drone_mujoco
 from tests.support.drawn_scenes import GROUND
@@ -374,6 +374,26 @@ def test_a_delayed_move_is_flown_one_decision_later_and_known_at_once(world):
     for move, step, state in zip(moves, late, states[1:], strict=True):
         np.testing.assert_array_equal(step.observation.motion[4:], ACTIONS[move])
         assert state.disturbance.move == move
+
+
+def test_a_share_of_the_episodes_is_late_and_each_from_its_first_decision_to_its_last(world):
+    env_config = dataclasses.replace(QUIET.env, action_delay=1, delay_share=0.3)
+    config = dataclasses.replace(QUIET, env=env_config)
+    keys = jax.random.split(jax.random.key(0), 2000)
+    late = jax.vmap(lambda key: disturbances.sample_disturbance(config, jnp.float32(1.0), key).late)(keys)
+    assert 0.25 < float(jnp.mean(late)) < 0.35  # five deviations of 2,000 draws
+    prompt_moves = [decision_flown(config, bool(each)) for each in (False, True)]
+    assert prompt_moves == [[AHEAD, BACK], [0, AHEAD]]
+
+
+def decision_flown(config, late):
+    """The moves that are flown of ahead and back, after move 0."""
+    disturbance, moves = Disturbance(late=jnp.asarray(late), move=jnp.int32(0)), []
+    for action in (AHEAD, BACK):
+        move, disturbance = decision._delay_action(config, disturbance, jnp.int32(action))
+        assert int(disturbance.move) == action
+        moves.append(int(move))
+    return moves
 
 
 def test_noise_changes_what_is_known_and_nothing_that_is_flown(world):

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from edqn_jax.config import Config, EnvConfig, EventsConfig, get_preset
 from edqn_jax.sim.actions import ACTIONS
@@ -25,7 +26,17 @@ from edqn_jax.sim.task import decision, env, outcomes
 from edqn_jax.sim.task.action_sets import heading_setpoint, heading_to_goal, velocity_command
 from edqn_jax.sim.task.decision import Decision, Payment, Situation, reset_decision
 from edqn_jax.sim.task.missions import Missions, own_missions
-from edqn_jax.sim.task.observation import MAX_YAW_RATE, MOTION_SIZE, OWN_SIZE, own_motion, own_state, rotate_own_state
+from edqn_jax.sim.task.observation import (
+    MAX_YAW_RATE,
+    MOTION_SIZE,
+    OWN_SIZE,
+    mirrored_motion,
+    motion_size,
+    own_motion,
+    own_state,
+    rotate_own_state,
+    with_lean,
+)
 from edqn_jax.sim.task.outcomes import Outcome, Verdict, judge_decision
 from edqn_jax.sim.task.reward import configured_reward
 from edqn_jax.sim.worlds import geodesic
@@ -338,6 +349,25 @@ def test_own_motion_by_hand():
     motion = own_motion(CONFIG.env, state, jnp.array([1.0, 0.0, -1.0]))
     assert motion.shape == (MOTION_SIZE,)
     np.testing.assert_allclose(motion, [0.0, 0.5, 0.25, 0.7, 1.0, 0.0, -1.0], atol=1e-6)
+
+
+def test_roll_and_pitch_are_the_last_of_three_turns():
+    turns = Rotation.random(200, random_state=3)
+    _, pitch, roll = turns.as_euler("ZYX").T
+    found = drone.roll_and_pitch_of(jnp.asarray(np.roll(turns.as_quat(), 1, axis=1)))
+    np.testing.assert_allclose(found, np.stack([roll, pitch], axis=1), atol=2e-6)
+
+
+@pytest.mark.parametrize("mount", ["level", "body"])
+def test_a_drone_whose_camera_leans_knows_how_it_leans_itself(mount):
+    config = dataclasses.replace(CONFIG, camera=dataclasses.replace(CONFIG.camera, mount=mount))
+    attitude = np.roll(Rotation.from_euler("ZYX", [0.5, 0.2, -0.3]).as_quat(), 1)
+    motion = with_lean(config, jnp.asarray(attitude), jnp.arange(7.0))
+    np.testing.assert_allclose(motion, [*range(7), *([-0.3, 0.2] if mount == "body" else [])], atol=1e-6)
+    mirrored = np.roll(Rotation.from_euler("ZYX", [-0.5, 0.2, 0.3]).as_quat(), 1)
+    assert len(mirrored_motion(config)) == motion_size(config) == len(motion)
+    reflected = with_lean(config, jnp.asarray(mirrored), motion[:7] * jnp.array(mirrored_motion(config)[:7]))
+    np.testing.assert_allclose(reflected, motion * np.array(mirrored_motion(config)), atol=1e-6)
 
 
 def test_the_yaw_rate_is_that_of_the_heading_however_the_drone_leans():

@@ -82,5 +82,6 @@ def _field(config: Config, sensed: Any, told: float | None) -> EventField:
 
 def untrained(**groups: Any) -> Policy:
     """A policy that has learnt nothing."""
-    config = make_config("medium", drone={"physics": "rigid_body"}, camera={"width": 16, "height": 12}, **groups)
+    camera = {"width": 16, "height": 12} | groups.pop("camera", {})
+    config = make_config("medium", drone={"physics": "rigid_body"}, camera=camera, **groups)
     return Policy(config, fresh_policy(config))
