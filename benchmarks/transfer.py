@@ -61,13 +61,15 @@ def parse(argv: Sequence[str] | None = None) -> argparse.Namespace:
         ConfigError: if the file of `--json` cannot be written, or two options do not go together.
     """
     parser = Parser("transfer", __doc__)
-    parser.add_argument("--policy", type=Path, default=Path("pretrained"), help="folder of a run, or pretrained")
+    parser.add_argument(
+        "--policy", type=Path, default=Path("pretrained"), help="folder of a run, or a policy of the package"
+    )
     parser.add_argument("--world", default="rooms", help="random worlds by name (default rooms)")
     parser.add_argument("--picture", choices=("mujoco", "own"), default="mujoco", help="who draws (default mujoco)")
     parser.add_argument("--look", choices=pictures.LOOKS, default="plain", help="of MuJoCo's picture (default plain)")
     parser.add_argument("--events", choices=("pair", "esim", "v2e"), default="pair", help="whose law (default pair)")
     parser.add_argument("--flight", choices=("own", "rotorpy"), default="own", help="who flies (default own)")
-    parser.add_argument("--mount", choices=("level", "body"), default="level", help="of the camera (default level)")
+    parser.add_argument("--mount", choices=("level", "body"), help="of the camera (default the policy's own)")
     parser.add_argument("--missions", type=at_least_one, default=20, help="number of missions (default 20)")
     parser.add_argument("--seed", type=int, default=0, help="seed of missions and looks (default 0)")
     args = parser.parse(argv)
@@ -152,6 +154,18 @@ def prepare_camera(
     return event_cameras.FrameByFrame(emulator, see, args.mount), close
 
 
+def notes(args: argparse.Namespace, config: Config) -> list[str]:
+    """Returns a sentence on each thing that the policy never saw in its training."""
+    said = []
+    if args.mount != config.camera.mount:
+        said.append(
+            f"this policy was trained with camera.mount {config.camera.mount} alone, and flies with {args.mount}"
+        )
+    if config.surface.pattern == "plaid" and args.picture == "mujoco":
+        said.append(f"this policy was trained with surface.pattern plaid alone; MuJoCo's picture is {args.look}")
+    return said
+
+
 def has_fine_camera(args: argparse.Namespace, config: Config) -> bool:
     """Returns whether the events are those of a camera of more pixels than the policy has."""
     return args.events != "pair" or config.events.sensor_pixels > 1
@@ -171,6 +185,9 @@ def measure(args: argparse.Namespace, show: Callable[[str], None] = print) -> di
     """Returns the report that `--json` writes, and shows each mission's end."""
     policy = load_policy(args.policy)
     config = policy.config
+    args.mount = args.mount or config.camera.mount
+    for note in notes(args, config):
+        show(note)
     environment = edqn_jax.make(args.world, config, worlds=args.missions, seed=args.seed, split="test")
     ended: list[Flown] = []
     with tempfile.TemporaryDirectory() as folder:

@@ -48,6 +48,26 @@ def test_with_all_parts_our_own_it_flies_as_the_package_does():
     assert report["median_least_clearance_m"] > 0
 
 
+@pytest.mark.parametrize(
+    "words, config, told",
+    [
+        (
+            ["--mount", "body"],
+            {},
+            ["camera.mount level alone", "surface.pattern plaid alone; MuJoCo's picture is plain"],
+        ),
+        (["--picture", "own"], {}, []),
+        (["--look", "textured"], {"surface": {"pattern": "drawn"}}, []),
+        (["--mount", "level"], {"surface": {"pattern": "drawn"}, "camera": {"mount": "body"}}, ["flies with level"]),
+    ],
+)
+def test_what_a_policy_never_saw_is_said(words, config, told):
+    args = transfer.parse(words)
+    args.mount = args.mount or edqn_jax.make_config("rooms", **config).camera.mount
+    said = transfer.notes(args, edqn_jax.make_config("rooms", **config))
+    assert len(said) == len(told) and all(part in each for part, each in zip(told, said, strict=True))
+
+
 def rotorpy_after(velocity: tuple[float, float, float], seconds: float) -> tuple[flights.RotorPyFlight, Track]:
     flight = flights.RotorPyFlight(np.array([0.0, 0.0, 5.0]), np.array([10.0, 0.0, 5.0]), 2.0)
     command = Command(0, np.array(velocity, np.float32), 0.0, np.zeros(27, np.float32))
