@@ -40,11 +40,11 @@ FLAGS = ("--tuned-for", "gpu", "--world.flown", "", "--train.keep", "last")
 
 LOOKS = (
     *("--surface.pattern", "drawn", "--events.frame-times-s", "-0.16", "-0.08", "0.0"),
-    *("--events.profile", "dvs", "--events.least-contrast", "0.03", "--events.most-contrast", "0.3"),
+    *("--events.profile", "dvs", "--events.least-contrast", "0.02", "--events.most-contrast", "0.3"),
     *("--events.faults-share", "1", "--events.sensor-pixels", "117"),
     *("--encoder.patch-layers", "128", "64", "24", "--encoder.joint-layers", "512", "256"),
     *("--encoder.patch-overlap", "2", "--encoder.warmup-updates-per-step", "64"),
-    *("--encoder.retrain-at", "0.12", "0.35", "--encoder.retrain-decisions", "6291456"),
+    *("--encoder.retrain-at", "0.08", "0.3", "--encoder.retrain-decisions", "6291456"),
     *("--train.validation-missions", "64"),
 )
 """Further options of the policy of any look (`--looks`): surfaces and event sensors that are drawn, a third frame, from
@@ -56,7 +56,7 @@ VALIDATED_EVERY = {"open": 20_000_000, "mixed": 0}
 DECISIONS = {"open": 60_000_000, "mixed": 300_000_000}
 """Decisions of each seed, by the worlds that can be trained on."""
 
-OF_LOOKS = 150_000_000
+OF_LOOKS = 190_000_000
 """Decisions of each seed of the policy of any look."""
 
 MISSIONS = 1000
