@@ -107,6 +107,7 @@ def fly_mission(
             yaw_rate=body.yaw_rate,
             goal=goal,
             volume=volume,
+            attitudes=[track.at(now + 1e-6 * each)[1] for each in runner.about["frame_times_us"]],
         )
         way = flight.fly(command, runner.period_s)
         places = np.concatenate([track.position[-1:], way.position])

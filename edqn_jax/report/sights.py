@@ -210,7 +210,8 @@ def own_motions(config: Config, trajectory: Mapping[str, np.ndarray], rows: np.n
     after = Flight(jnp.asarray(place), jnp.asarray(now), velocity)
     commanded = directions(config, after, actions_of(trajectory)[last])
     motion = jnp.concatenate([ahead, rate[:, None], commanded], axis=-1)
-    return np.asarray(with_lean(config, jnp.asarray(now), motion), np.float32)
+    attitudes = jnp.asarray(trajectory_poses(trajectory, rows)[1])
+    return np.asarray(with_lean(config, attitudes, motion), np.float32)
 
 
 def _compiled(program: Any, *arguments: Any) -> Compiled:

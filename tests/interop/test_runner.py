@@ -147,9 +147,11 @@ def test_own_state_and_motion_are_those_of_the_simulator():
             yaw, speed = runner.heading_of(given["quaternion"]), given["velocity"]
             own = runner.own_state(about, given["position"], yaw, speed, given["goal"], given["volume"])
             motion = runner.own_motion(about, yaw, speed, given["yaw_rate"], each.motion[4:7])
-            motion = runner.with_lean(about, given["quaternion"], motion)
+            motion = runner.with_lean(about, given["attitudes"], motion)
             np.testing.assert_allclose(own, each.own, atol=2e-6)  # some float32 roundings of numbers of order 1
             np.testing.assert_allclose(motion, each.motion, atol=2e-6)
+    with pytest.raises(ValueError, match="leans with the body; give its 2 attitudes"):
+        runner.with_lean(about_policy(lean.config), None, np.zeros(7, np.float32))
 
 
 def test_it_remembers_until_it_is_reset(exported):

@@ -24,6 +24,7 @@ from edqn_jax.report.sights import (
 )
 from edqn_jax.sim.actions import ACTIONS
 from edqn_jax.sim.camera import camera
+from edqn_jax.sim.physics import drone
 from edqn_jax.sim.physics.airframe import load_airframe
 from edqn_jax.sim.scene.scene import stack_scenes
 from edqn_jax.sim.sensors import events, sensor
@@ -83,6 +84,11 @@ def test_own_motions_are_those_that_the_drone_knew(flight):
         motion[:, [0, 1, 2, 4, 5, 6]], steps.observation.motion[:, [0, 1, 2, 4, 5, 6]], atol=1e-5
     )
     assert np.abs(motion[:, 3]).max() > 0.01
+    leaning = dataclasses.replace(SMALL, camera=dataclasses.replace(SMALL.camera, mount="body"))
+    lean = own_motions(leaning, flown, decision_rows(SMALL, flown))[:, 7:]
+    assert lean.shape == (len(MOVES), 4) and np.abs(lean).max() > 0.01
+    leant = drone.roll_and_pitch_of(steps.flight.quaternion[:, -1])
+    np.testing.assert_allclose(lean[:, 2:], leant, atol=1e-4)  # of attitudes that were written as text
     config = dataclasses.replace(SMALL, env=dataclasses.replace(SMALL.env, actions="velocity"))
     numbers = ACTIONS[flown["action"]].T.astype(float)
     as_velocities = {name: column for name, column in flown.items() if name != "action"}

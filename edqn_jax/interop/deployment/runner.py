@@ -125,6 +125,7 @@ class Runner:
         goal: ArrayLike,
         volume: ArrayLike,
         last_move: ArrayLike | None = None,
+        attitudes: ArrayLike | None = None,
     ) -> Command:
         """Returns the command for the next `period_s` seconds, and remembers the observation.
 
@@ -139,9 +140,11 @@ class Runner:
             goal: [3] metres in the world.
             volume: [2, 3] lowest and highest corner of the flight volume, metres in the world.
             last_move: [3] of -1, 0 and 1, as flown since the last decision; None is the move that this runner chose.
+            attitudes: [F, 4] the quaternions at the times `about["frame_times_us"]` before the decision, in their
+                order; only for a policy whose camera leans with the body (`about["knows_lean"]`), which needs them.
 
         Raises:
-            ValueError: if an argument has another shape or is not finite, or an event is outside of the image.
+            ValueError: if an argument is missing or of another shape or not finite, or an event outside of the image.
         """
         place, attitude, speed = (
             _numbers(name, given, (size,))
@@ -163,7 +166,7 @@ class Runner:
             {
                 "counts": counts[None],
                 "own": self._told(own_state(self.about, place, yaw, speed, aim, bounds)),
-                "motion": self._told(with_lean(self.about, attitude, own_motion(self.about, yaw, speed, turn, move))),
+                "motion": self._told(with_lean(self.about, attitudes, own_motion(self.about, yaw, speed, turn, move))),
                 "memory": self._memory,
             },
         )
@@ -385,14 +388,22 @@ def own_motion(
 
 
 def with_lean(
-    about: Mapping[str, Any], quaternion: NDArray[np.float32], motion: NDArray[np.float32]
+    about: Mapping[str, Any], attitudes: ArrayLike | None, motion: NDArray[np.float32]
 ) -> NDArray[np.float32]:
-    """Returns an own motion [7] with roll and pitch of an attitude [4], radians, for a policy that knows them."""
+    """Returns an own motion [7] with roll and pitch of attitudes [F, 4], radians, for a policy that knows them.
+
+    Raises:
+        ValueError: if they are not given, or not one for each frame.
+    """
     if not about.get("knows_lean"):
         return motion
-    w, x, y, z = quaternion
+    frames = len(about["frame_times_us"])
+    if attitudes is None:
+        raise ValueError(f"this policy's camera leans with the body; give its {frames} attitudes, one for each frame")
+    w, x, y, z = _numbers("attitudes", attitudes, (frames, 4)).T
     roll = np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
-    return np.append(motion, [roll, np.arcsin(np.clip(2 * (w * y - z * x), -1, 1))]).astype(np.float32)
+    pitch = np.arcsin(np.clip(2 * (w * y - z * x), -1, 1))
+    return np.concatenate([motion, np.stack([roll, pitch], axis=1).ravel()]).astype(np.float32)
 
 
 def _ahead(about: Mapping[str, Any], yaw: np.float32, velocity: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -130,14 +130,15 @@ def _motion(
     if flight is None:
         given = np.asarray(velocity, np.float32)
         move = np.clip(np.rint(given / about["speed_m_s"]), -1, 1)
-        level = np.array([1, 0, 0, 0], np.float32)
+        level = np.tile(np.array([1, 0, 0, 0], np.float32), (len(about["frame_times_us"]), 1))
         return runner.with_lean(about, level, runner.own_motion(about, np.float32(0), given, yaw_rate, move))
     now = max(int(np.searchsorted(flight["t"], end_us, side="right")) - 1, 1)
     yaw, before = (runner.heading_of(flight["quaternion"][row].astype(np.float32)) for row in (now, now - 1))
     turned = (yaw - before + np.pi) % (2 * np.pi) - np.pi
     rate = turned / (float(flight["t"][now] - flight["t"][now - 1]) * 1e-6)
     motion = runner.own_motion(about, yaw, flight["velocity"][now].astype(np.float32), rate, flight["move"][now])
-    return runner.with_lean(about, flight["quaternion"][now].astype(np.float32), motion)
+    frames = np.searchsorted(flight["t"], end_us + np.asarray(about["frame_times_us"]), side="right") - 1
+    return runner.with_lean(about, flight["quaternion"][np.maximum(frames, 0)].astype(np.float32), motion)
 
 
 def _encode_and_decode(config: Config, params: PolicyParams, counts: Array, motion: Array) -> tuple[Array, Array]:

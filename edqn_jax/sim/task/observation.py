@@ -76,17 +76,29 @@ def motion_size(config: Config) -> int:
 
 def lean_motion_size(config: Config) -> int:
     """Returns the number of values of `with_lean`."""
-    return MOTION_SIZE + 2 * leans(config)
+    return MOTION_SIZE + 2 * len(frame_steps(config)) * leans(config)
 
 
 def mirrored_motion(config: Config) -> tuple[float, ...]:
     """Returns factors [motion_size] on the own motion when left and right are exchanged."""
-    return (*MIRRORED_MOTION, *(-1.0, 1.0) * leans(config), *[1.0] * knows_contrast(config))
+    lean = (lean_motion_size(config) - MOTION_SIZE) // 2
+    return (*MIRRORED_MOTION, *(-1.0, 1.0) * lean, *[1.0] * knows_contrast(config))
 
 
-def with_lean(config: Config, quaternion: Array, motion: Array) -> Array:
-    """Returns own motions [..., MOTION_SIZE] with roll and pitch of attitudes [..., 4], radians, if a camera leans."""
-    return jnp.concatenate([motion, drone.roll_and_pitch_of(quaternion)], axis=-1) if leans(config) else motion
+def with_lean(config: Config, quaternions: Array, motion: Array) -> Array:
+    """Returns own motions [..., MOTION_SIZE] with roll and pitch, radians, at each frame, if the camera leans.
+
+    Between two frames a drone turns by more than its surroundings pass by, so where it leant at each must be known.
+
+    Args:
+        config: of camera and sensor.
+        quaternions: [..., T, 4] when the sensor looked.
+        motion: of `own_motion`.
+    """
+    if not leans(config):
+        return motion
+    angles = drone.roll_and_pitch_of(quaternions)
+    return jnp.concatenate([motion, angles.reshape(*angles.shape[:-2], -1)], axis=-1)
 
 
 def with_contrast(config: Config, memory: SensorMemory, values: Array) -> Array:
@@ -114,7 +126,7 @@ def observe(config: Config, view: View, memory: SensorMemory, key: Array) -> tup
         state = dataclasses.replace(state, position=position, velocity=velocity)
     sensed, memory = sensor.sense(config, view.scene, view.poses, memory, key)
     own = with_contrast(config, memory, own_state(config.env, view.scene, view.goal, state))
-    motion = with_lean(config, state.quaternion, own_motion(config.env, state, view.move))
+    motion = with_lean(config, view.poses.quaternion, own_motion(config.env, state, view.move))
     motion = with_contrast(config, memory, motion)
     return Observation(sensed=sensed, own=own, motion=motion), memory
 

@@ -359,15 +359,18 @@ def test_roll_and_pitch_are_the_last_of_three_turns():
 
 
 @pytest.mark.parametrize("mount", ["level", "body"])
-def test_a_drone_whose_camera_leans_knows_how_it_leans_itself(mount):
+def test_a_drone_whose_camera_leans_knows_how_it_leant_at_each_frame(mount):
     config = dataclasses.replace(CONFIG, camera=dataclasses.replace(CONFIG.camera, mount=mount))
-    attitude = np.roll(Rotation.from_euler("ZYX", [0.5, 0.2, -0.3]).as_quat(), 1)
-    motion = with_lean(config, jnp.asarray(attitude), jnp.arange(7.0))
-    np.testing.assert_allclose(motion, [*range(7), *([-0.3, 0.2] if mount == "body" else [])], atol=1e-6)
-    mirrored = np.roll(Rotation.from_euler("ZYX", [-0.5, 0.2, 0.3]).as_quat(), 1)
-    assert len(mirrored_motion(config)) == motion_size(config) == len(motion)
-    reflected = with_lean(config, jnp.asarray(mirrored), motion[:7] * jnp.array(mirrored_motion(config)[:7]))
-    np.testing.assert_allclose(reflected, motion * np.array(mirrored_motion(config)), atol=1e-6)
+    angles = np.array([[0.5, 0.2, -0.3], [0.6, -0.1, 0.4]])  # about z, y and x at both frames
+    attitudes, mirrored = (
+        jnp.asarray(np.roll(Rotation.from_euler("ZYX", each).as_quat(), 1, axis=1))
+        for each in (angles, angles * [-1, 1, -1])
+    )
+    motion = with_lean(config, attitudes, jnp.arange(7.0))
+    np.testing.assert_allclose(motion, [*range(7), *([-0.3, 0.2, 0.4, -0.1] if mount == "body" else [])], atol=1e-6)
+    factors = jnp.array(mirrored_motion(config))
+    assert len(factors) == motion_size(config) == len(motion)
+    np.testing.assert_allclose(with_lean(config, mirrored, (motion * factors)[:7]), motion * factors, atol=1e-6)
 
 
 def test_the_yaw_rate_is_that_of_the_heading_however_the_drone_leans():

@@ -16,6 +16,7 @@ from edqn_jax.sim.actions import ACTIONS
 from edqn_jax.sim.physics import drone
 from edqn_jax.sim.sensors import contrast, events
 from edqn_jax.sim.sensors.events import EventField
+from edqn_jax.sim.sensors.sensor import frame_steps
 from edqn_jax.sim.task.action_sets import heading_setpoint, velocity_command
 from edqn_jax.sim.task.observation import knows_contrast
 from tests.oracles import event_fields
@@ -45,6 +46,7 @@ def flown(policy: Policy, world: str = "medium", mission: int = 0, worlds: int =
     window_us = round(1e6 * (config.events.frame_times_s[-1] - config.events.frame_times_s[0]))
     state, seen = environment.reset(3, mission)
     memory, last, decisions, until_us = None, np.zeros(3), [], 5_000_000
+    path = np.tile(np.asarray(state.drone.quaternion), (config.drone.physics_steps + 1, 1))
     while not state.ended and len(decisions) < most:
         move, memory = policy.act(seen, memory)
         body = state.drone
@@ -57,6 +59,7 @@ def flown(policy: Policy, world: str = "medium", mission: int = 0, worlds: int =
             "yaw_rate": float(drone.yaw_rate_of(body)),
             "goal": goal,
             "volume": volume,
+            "attitudes": path[list(frame_steps(config))],
         }
         told = float(contrast.contrast_of(seen.motion[-1])) if knows_contrast(config) else None
         packet = events.to_stream(_field(config, seen.sensed, told))
@@ -66,7 +69,9 @@ def flown(policy: Policy, world: str = "medium", mission: int = 0, worlds: int =
         assert np.array_equal(motion[4:7], last)
         decisions.append(Decided(packet, until_us, given, int(move), np.asarray(command), own, motion, setpoint, told))
         last = ACTIONS[int(move)]
+        path = np.asarray(body.quaternion)[None]
         state, step = environment.step(state, move)
+        path = np.concatenate([path, np.asarray(step.flight.quaternion)])
         seen, until_us = step.observation, until_us + 260_000
     return decisions
 
