@@ -140,8 +140,7 @@ class Runner:
             goal: [3] metres in the world.
             volume: [2, 3] lowest and highest corner of the flight volume, metres in the world.
             last_move: [3] of -1, 0 and 1, as flown since the last decision; None is the move that this runner chose.
-            attitudes: [F, 4] the quaternions at the times `about["frame_times_us"]` before the decision, in their
-                order; only for a policy whose camera leans with the body (`about["knows_lean"]`), which needs them.
+            attitudes: [F, 4] quaternions at `about["frame_times_us"]` from now, for a camera that leans with the body.
 
         Raises:
             ValueError: if an argument is missing or of another shape or not finite, or an event outside of the image.
