@@ -145,14 +145,8 @@ class Runner:
         Raises:
             ValueError: if an argument is missing or of another shape or not finite, or an event outside of the image.
         """
-        place, attitude, speed = (
-            _numbers(name, given, (size,))
-            for name, given, size in (
-                ("position", position, 3),
-                ("quaternion", quaternion, 4),
-                ("velocity", velocity, 3),
-            )
-        )
+        place, speed = _numbers("position", position, (3,)), _numbers("velocity", velocity, (3,))
+        attitude = _numbers("quaternion", quaternion, (4,))
         aim, bounds = _numbers("goal", goal, (3,)), _numbers("volume", volume, (2, 3))
         if not np.all(bounds[0] < bounds[1]):
             raise ValueError("volume must be its lowest and its highest corner, each coordinate of the first the lower")
