@@ -49,10 +49,17 @@ def check_flags(argv: Sequence[str], known: Iterable[str], command: str) -> None
             raise ConfigError(f"there is no option '{flag}'; {hint}")
 
 
+def _initials(flag: str) -> str:
+    """Returns a flag with the initials of its last name: `agent.lr` of `--agent.learning-rate`."""
+    group, dot, name = flag.removeprefix("--").rpartition(".")
+    return group + dot + "".join(word[:1] for word in name.split("-"))
+
+
 def _nearest_flag(flag: str, known: Iterable[str]) -> str | None:
     """Returns the flag nearest to an unknown one: shortened, without its group or misspelt; None if none is near.
 
-    Flags that begin with the given one come first, then those of that name in a group, then similar spellings.
+    Flags that begin with the given one come first, then those of that name in a group, then those of these initials
+    (`lr`, `agent.lr`), then similar spellings.
     """
     shortest_first = sorted(known, key=lambda name: (len(name), name))
     bare = flag.removeprefix("--")
@@ -60,6 +67,7 @@ def _nearest_flag(flag: str, known: Iterable[str]) -> str | None:
         lambda name: len(bare) > 1 and name.startswith(flag),
         lambda name: name.endswith(f".{bare}"),
         lambda name: len(bare) > 1 and name.rpartition(".")[2].startswith(bare),
+        lambda name: len(bare) > 1 and _initials(name) in (bare, f"{name.removeprefix('--').partition('.')[0]}.{bare}"),
     ):
         meant = [name for name in shortest_first if is_meant(name)]
         if meant:

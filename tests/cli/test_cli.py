@@ -377,7 +377,9 @@ def test_what_the_short_help_shows_is_an_option(name):
         ("--sensr", "--env.sensor"),
         ("--camera.widht", "--camera.width"),
         ("--total_step", "--total-steps"),
-        ("--lr", None),
+        ("--lr", "--agent.learning-rate"),
+        ("--encoder.lr", "--encoder.learning-rate"),
+        ("--qx", None),
     ],
 )
 def test_a_flag_that_is_short_or_wrong_leads_to_the_one_that_was_meant(flag, meant):
