@@ -25,13 +25,13 @@ CELL_M = 0.1
 MARGIN_M = 0.5
 """Metres around a mesh that its grid reaches, more than a drone's radius."""
 
-MOST_VALUES = 256**3
-"""Of a grid, and of all grids of a world: 64 MiB."""
+MOST_VALUES = 2**22
+"""Of a grid, and of all grids of a world: programs hold each of them eight times, 128 MiB."""
 
 MOST_TRIANGLES = 1_000_000
 
 _FINEST_M = 0.025
-_FINE_VALUES = 2**17  # of a grid that has cells below CELL_M, for thin meshes
+_FINE_VALUES = 2**16  # of a grid that has cells below CELL_M, for thin meshes
 _BAND = 3  # cells around the surface in which interpolation is compared with exact distances
 _UNSEEN = 1.2  # how much larger the excess of interpolation may be between those points
 _DENT = 1e-3  # share of its hull that a convex mesh may leave empty

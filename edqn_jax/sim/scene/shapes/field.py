@@ -7,6 +7,7 @@ mesh, and as the nearest point of the grid together with the distance there.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from functools import lru_cache
 from typing import Any, NamedTuple
@@ -35,7 +36,7 @@ from edqn_jax.sim.scene.shapes.kind import (
 )
 from edqn_jax.sim.scene.surface import Surface
 
-STEPS = 32
+STEPS = 16
 """Of a ray through a field, each as long as the distance where it begins."""
 
 TOUCHES = 1e-6
@@ -60,19 +61,26 @@ class Fields:
 
 
 class _Table(NamedTuple):
-    """All grids as one array of values, and a row for each grid."""
+    """All grids as one array, and a row for each grid."""
 
-    values: np.ndarray
-    first: np.ndarray  # [G] index of its first value
+    cells: np.ndarray  # [cells, 8] values at the corners, so that one gather reads all of a cell
+    first: np.ndarray  # [G] number of its first cell
     counts: np.ndarray  # [G, 3] values along each axis
     cell: np.ndarray  # [G] metres
 
 
+def _cells(values: np.ndarray) -> np.ndarray:
+    """Returns the values at the corners of each cell [cells, 8]."""
+    x, y, z = values.shape
+    parts = [values[i : x - 1 + i, j : y - 1 + j, k : z - 1 + k] for i in range(2) for j in range(2) for k in range(2)]
+    return np.stack([part.ravel() for part in parts], axis=1)
+
+
 @lru_cache(maxsize=8)
 def _table(grids: tuple[Grid, ...]) -> _Table:
-    sizes = [grid.values.size for grid in grids]
+    sizes = [math.prod(n - 1 for n in grid.values.shape) for grid in grids]
     return _Table(
-        np.concatenate([grid.values.ravel() for grid in grids]),
+        np.concatenate([_cells(grid.values) for grid in grids]),
         np.cumsum([0, *sizes[:-1]]).astype(np.int32),
         np.array([grid.values.shape for grid in grids], np.int32),
         np.array([grid.cell for grid in grids], np.float32),
@@ -90,10 +98,10 @@ def _interpolate(fields: Fields, place: Vector) -> tuple[Array, Vector]:
         at = jnp.clip(place[i] / cell + last / 2, 0.0, last)
         lower.append(jnp.minimum(at.astype(jnp.int32), last - 1))
         part.append(at - lower[i])
-    across, along = counts[..., 1] * counts[..., 2], counts[..., 2]
+    across, along = (counts[..., 1] - 1) * (counts[..., 2] - 1), counts[..., 2] - 1
     first = jnp.asarray(table.first)[number] + lower[0] * across + lower[1] * along + lower[2]
-    values = jnp.asarray(table.values)
-    corner = [[[values[first + i * across + j * along + k] for k in range(2)] for j in range(2)] for i in range(2)]
+    eight = jnp.asarray(table.cells).at[first].get(mode="promise_in_bounds")
+    corner = [[[eight[..., 4 * i + 2 * j + k] for k in range(2)] for j in range(2)] for i in range(2)]
 
     def between(low: Array, high: Array, axis: int) -> Array:
         return low + part[axis] * (high - low)
