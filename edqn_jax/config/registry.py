@@ -142,6 +142,7 @@ SHAPES = Registry(
         "capsules": f"{_SHAPES}.capsule:CAPSULE",
         "tilted_cylinders": f"{_SHAPES}.tilted_cylinder:TILTED_CYLINDER",
         "planes": f"{_SHAPES}.plane:PLANE",
+        "fields": f"{_SHAPES}.field:FIELD",
     },
     take=instance_of("an edqn_jax.ShapeKind", f"{_SHAPES}.kind:ShapeKind"),
 )

@@ -20,7 +20,7 @@ import mujoco
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from edqn_jax.sim.scene.mjcf import geom_of
+from edqn_jax.sim.scene.mjcf_parts.geoms import geom_of
 from edqn_jax.sim.scene.mjcf_parts.motion import MotionSpec, as_ellipse, motions_of
 from edqn_jax.sim.scene.shapes.kind import reach_of, read_shape
 

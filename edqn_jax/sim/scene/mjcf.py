@@ -33,11 +33,12 @@ from edqn_jax.config import FAMILIES
 from edqn_jax.sim.scene.distance import shape_distances
 from edqn_jax.sim.scene.mjcf_parts import looks as mjcf_looks
 from edqn_jax.sim.scene.mjcf_parts.files import SceneError, load_checked_text
+from edqn_jax.sim.scene.mjcf_parts.geoms import check_grids, geom_name, shape_of
 from edqn_jax.sim.scene.mjcf_parts.looks import numbers_text
 from edqn_jax.sim.scene.mjcf_parts.motion import PREFIX, motions_of, set_in_motion, text_of
 from edqn_jax.sim.scene.motion import Throw, ball_positions, steady_aim
 from edqn_jax.sim.scene.scene import Planes, Scene, Shape, Spheres, build_scene, scene_shapes
-from edqn_jax.sim.scene.shapes.kind import LEVEL, Geom, kind_of, kinds, reach_of, read_shape
+from edqn_jax.sim.scene.shapes.kind import LEVEL, kind_of, kinds, reach_of
 
 VOLUME_MARGIN = 5.0
 """Metres around shapes and sites where a world names no `volume`."""
@@ -120,9 +121,10 @@ def load_world(path: str | Path) -> LoadedWorld:
         if model.geom_group[geom] >= 3 and not (model.geom_contype[geom] or model.geom_conaffinity[geom]):
             continue
         body = int(model.body_rootid[model.geom_bodyid[geom]])
-        shape = _shape(model, data, geom, path, moves=body in motions)
+        shape = shape_of(model, data, geom, str(path), moves=body in motions)
         shapes.append(shape)
-        geoms.append(_geom_name(model, geom))
+        check_grids(shapes, str(path))
+        geoms.append(geom_name(model, geom))
         bodies.append(body if body in motions else 0)
         names[kind_of(shape)[0]].append(geoms[-1])
     sites = {model.site(i).name: data.site_xpos[i] for i in range(model.nsite)}
@@ -265,7 +267,7 @@ def mjcf_of(scene: Scene, *, title: str = "world") -> str:
     """
     root = ElementTree.Element("mujoco", model=title)
     ElementTree.SubElement(root, "compiler", angle="radian")
-    mjcf_looks.add_visuals(root, scene)
+    asset = mjcf_looks.add_visuals(root, scene)
     world = ElementTree.SubElement(root, "worldbody")
     mjcf_looks.add_sun(world, scene)
     for role, where in (("start", scene.start), ("goal", scene.goal)):
@@ -279,6 +281,11 @@ def mjcf_of(scene: Scene, *, title: str = "world") -> str:
     shapes = named_shapes(scene)
     for name, shape in shapes:
         attributes = _attributes(shape)
+        made = kind_of(shape)[1].asset
+        if made is not None:
+            mesh = {key: numbers_text(values) for key, values in made(shape).items()}
+            ElementTree.SubElement(asset, "mesh", {"name": name, **mesh})
+            attributes["mesh"] = name
         parent, text = world, text_of(shape)
         if text is not None:
             throw = shape.throw if isinstance(shape, Spheres) else None
@@ -315,55 +322,6 @@ def _launch(scene: Scene, one: Throw) -> np.ndarray:
     throw = jax.tree.map(lambda leaf: jnp.asarray(leaf)[None], one)
     aim = steady_aim(throw, scene.start, scene.goal)
     return np.asarray(ball_positions(throw, aim, aim.launch[0]))[0]
-
-
-def _geom_name(model: mujoco.MjModel, geom: int) -> str:
-    return model.geom(geom).name or f"geom number {geom} ({_kind_name(model, geom)})"
-
-
-def _kind_name(model: mujoco.MjModel, geom: int) -> str:
-    return mujoco.mjtGeom(model.geom_type[geom]).name.removeprefix("mjGEOM_").lower()
-
-
-def _shape(model: mujoco.MjModel, data: mujoco.MjData, geom: int, path: Path, moves: bool) -> Shape:
-    """Returns geom `geom` as a single shape, in the world's frame; `moves` if its mocap body may."""
-    name = _geom_name(model, geom)
-    body = model.geom_bodyid[geom]
-    root = model.body_rootid[body]
-    if model.body_weldid[body] != model.body_weldid[root] or model.body_dofnum[root]:
-        raise SceneError(
-            f"{path}: geom '{name}' is on a body that can move; remove the joints of body '{model.body(body).name}', "
-            "nothing is simulated but the drone"
-        )
-    if model.body_mocapid[root] >= 0 and not moves:
-        text = f"{PREFIX}{model.body(root).name}"
-        raise SceneError(
-            f"{path}: geom '{name}' is on a body that can move; remove the mocap of body '{model.body(root).name}', or "
-            f'say how it moves: <custom><text name="{text}" data="oscillate 0 2 0 4 0"/></custom>'
-        )
-    found = geom_of(model, data, geom)
-    if not all(np.all(np.isfinite(values)) for values in (found.position, found.rotation, found.size)):
-        raise SceneError(f"{path}: geom '{name}' has a place or a size that is not finite; give it numbers")
-    shape = read_shape(found)
-    if shape is None:
-        *some, last = dict.fromkeys(kind.geom for kind in kinds().values())
-        raise SceneError(
-            f"{path}: geom '{name}' is of the unsupported kind {found.kind}; make it a {', '.join(some)} or {last}, or "
-            "hide it in group 3 with contype and conaffinity 0"
-        )
-    return shape
-
-
-def geom_of(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> Geom:
-    """Returns geom number `geom` of a model, in the world's frame."""
-    material = model.geom_matid[geom]
-    return Geom(
-        kind=_kind_name(model, geom),
-        position=data.geom_xpos[geom],
-        rotation=data.geom_xmat[geom].reshape(3, 3),
-        size=model.geom_size[geom],
-        albedo=(model.geom_rgba[geom] if material < 0 else model.mat_rgba[material])[:3],
-    )
 
 
 def _volume(model: mujoco.MjModel, data: mujoco.MjData, shapes: list[Shape], path: Path) -> np.ndarray:

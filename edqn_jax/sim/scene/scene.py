@@ -176,7 +176,29 @@ def absent_like(shapes: Any) -> Any:
     rest: dict[str, Any] = {name: still() for name, still in _MOVING.items() if getattr(shapes, name, None) is not None}
     if getattr(shapes, "surface", None) is not None:
         rest["surface"] = blank_surfaces(shapes.surface.patterns)
+    rest |= {name: getattr(shapes, name) for name in _static_names(shapes)}
     return dataclasses.replace(kind_of(shapes)[1].parked, **rest)
+
+
+def _static_names(shapes: Any) -> list[str]:
+    """Returns the fields of a kind's dataclass that are no arrays."""
+    return [field.name for field in dataclasses.fields(shapes) if not field.metadata.get("pytree_node", True)]
+
+
+def _shared(kind: str, several: Sequence[Any]) -> list[Any]:
+    """Returns shapes of one kind with equal static fields."""
+    share = SHAPES.get(kind).share
+    return list(several if share is None or not several else share(several))
+
+
+def _with_shared(scenes: Sequence[Any]) -> list[Any]:
+    """Returns worlds, or pools, in which each kind has equal static fields."""
+    found = list(scenes)
+    for kind in _kinds_of(scenes):
+        has = [i for i, scene in enumerate(found) if kind in scene.shapes()]
+        for i, shapes in zip(has, _shared(kind, [found[i].shapes()[kind] for i in has]), strict=True):
+            found[i] = found[i].with_shapes({kind: shapes})
+    return found
 
 
 def no_shapes(kind: str, *lead: int) -> Any:
@@ -216,10 +238,10 @@ def build_scene(
                 f"{len(members)} {kind} exceed the capacity of {capacity}; it must be at least their number"
             )
         parked = SHAPES.get(kind).parked
-        members += [parked] * (capacity - len(members))
-        names = [field.name for field in dataclasses.fields(parked)]
-        stacked = {name: _stack_field(members, name) for name in names} if members else {}
-        arrays[kind] = dataclasses.replace(parked, **stacked) if members else no_shapes(kind)
+        members = _shared(kind, [*members, *[parked] * (capacity - len(members))])
+        names = [field.name for field in dataclasses.fields(parked) if field.name not in _static_names(parked)]
+        stacked = {name: _stack_field(members, name) for name in names if members}
+        arrays[kind] = dataclasses.replace(members[0], **stacked) if members else no_shapes(kind)
     arrays = _all_with_surfaces(arrays)
     return Scene(
         **{kind: arrays.pop(kind) for kind in FIELDS},
@@ -312,6 +334,7 @@ def stack_scenes(scenes: Sequence[Scene]) -> Scene:
         )
         for s in scenes
     ]
+    padded = _with_shared(padded)
     # `jnp.stack` and `jnp.asarray` would compile a program for every shape of array.
     return jax.tree.map(lambda *leaves: jax.device_put(np.stack(leaves)), *[_able_to_move(s, padded) for s in padded])
 
@@ -370,6 +393,7 @@ def with_equal_capacities(pools: Sequence[Scene], like: Sequence[Any] = ()) -> l
         for pool in pools
     ]
     whole = [pool.with_shapes(_all_with_surfaces(pool.shapes())) for pool in whole]
+    whole = _with_shared([*like, *whole])[len(like) :]
     able = [_able_to_move(pool, [*whole, *like]) for pool in whole]
     return [pool.with_shapes({kind: padded(kind, pool) for kind in pool.shapes()}) for pool in able]
 

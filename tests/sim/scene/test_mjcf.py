@@ -169,7 +169,7 @@ def test_a_geom_that_cannot_be_taken_is_named(world_of):
         world_of(ENDS + '<geom name="egg" type="ellipsoid" size="1 2 1"/>')
     assert all(
         part in message(raised)
-        for part in ("'egg'", "ellipsoid", "world.xml", "make it a box, cylinder, sphere, capsule or plane")
+        for part in ("'egg'", "ellipsoid", "world.xml", "make it a box, cylinder, sphere, capsule, plane or mesh")
     )
 
 

@@ -33,6 +33,7 @@ def world(folder: Path, inside: str) -> Path:
             '<asset><texture type="2d" builtin="flat" width="100000" height="9"/></asset>',
             "width=...> of more than 4096",
         ),
+        ('<asset><mesh builtin="supersphere" params="9000 1 1"/></asset>', "params=...> of more than 100"),
         ('<custom><numeric name="a" size="900000000"/></custom>', "size=...> of more than 4096"),
         ('<worldbody><flexcomp name="a" type="grid" count="60 60 60"/></worldbody>', "has <flexcomp>"),
     ],

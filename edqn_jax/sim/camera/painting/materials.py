@@ -25,7 +25,8 @@ from edqn_jax.files import write_atomically, write_error
 from edqn_jax.sim.camera.raycast import daylight_of
 from edqn_jax.sim.camera.surfaces import Phase, relative_albedo
 from edqn_jax.sim.camera.texture import WAVES
-from edqn_jax.sim.scene.mjcf import geom_of, mjcf_of, named_shapes
+from edqn_jax.sim.scene.mjcf import mjcf_of, named_shapes
+from edqn_jax.sim.scene.mjcf_parts.geoms import geom_of
 from edqn_jax.sim.scene.scene import Scene, Shape
 from edqn_jax.sim.scene.shapes.kind import Geom
 from edqn_jax.sim.scene.surface import CONTRAST, PATTERNS, PHASES, Surface

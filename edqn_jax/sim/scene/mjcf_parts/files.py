@@ -23,6 +23,9 @@ MAX_COPIES = 10_000
 MAX_PIXELS = 4096
 """Width and height of a texture, which is not drawn."""
 
+MAX_PARAMETER = 100
+"""Of a mesh that MuJoCo makes: the number of its triangles grows with the square."""
+
 FOREIGN = ("include", "model", "attach", "plugin", "extension", "flexcomp", "composite", "hfield", "skin", "size")
 """Elements that name other files, run other code or make much of little; a static world needs none of them."""
 
@@ -78,6 +81,9 @@ def _check_elements(tree: ElementTree.Element, path: Path) -> None:
                 f"{path} names the file '{element.get(named[0])}' in <{element.tag}>; a world is one file, and colours "
                 "are those of its geoms"
             )
+        made = max([0.0, *map(_number, element.get("params", "").split())])
+        if element.tag == "mesh" and made > MAX_PARAMETER:
+            raise SceneError(f"{path} has <mesh params=...> of more than {MAX_PARAMETER}")
         if element.tag in ("texture", "numeric"):
             for name in ("width", "height", "size"):
                 if _number(element.get(name)) > MAX_PIXELS:

@@ -34,8 +34,12 @@ def numbers_text(values: object) -> str:
     return " ".join(f"{float(value):.9g}" for value in np.asarray(values).ravel())
 
 
-def add_visuals(root: ElementTree.Element, scene: Scene) -> None:
-    """Adds to an MJCF what MuJoCo's pictures need of a world: how far they reach, sky and ambient light."""
+def add_visuals(root: ElementTree.Element, scene: Scene) -> ElementTree.Element:
+    """Adds to an MJCF what MuJoCo's pictures need of a world: how far they reach, sky and ambient light.
+
+    Returns:
+        its `<asset>`.
+    """
     lower, upper = np.asarray(scene.volume)
     extent = np.max(upper - lower) / 2
     daylight = scene.daylight
@@ -55,6 +59,7 @@ def add_visuals(root: ElementTree.Element, scene: Scene) -> None:
     asset = ElementTree.SubElement(root, "asset")
     gradient = {"type": "skybox", "builtin": "gradient", "width": "256", "height": "256"}
     ElementTree.SubElement(asset, "texture", gradient | sky)
+    return asset
 
 
 def add_sun(world: ElementTree.Element, scene: Scene) -> None:

@@ -87,6 +87,8 @@ class Geom:
     """[3] metres, as MuJoCo has it."""
     albedo: np.ndarray
     """[3]"""
+    mesh: tuple[np.ndarray, np.ndarray] | None = None
+    """Vertices [V, 3], metres, in the geom's axes, and the triangles [F, 3] of a mesh; None: it is none."""
 
     def is_upright(self, axis: int = 2) -> bool:
         """Returns whether one of its axes is vertical."""
@@ -113,6 +115,10 @@ class ShapeKind:
     """A geom of that name → a single shape, or None if another kind is to read it."""
     write: Callable[[Any], dict[str, Any]]
     """A single shape → attributes of its geom beside type, pos and rgba: numbers."""
+    asset: Callable[[Any], dict[str, Any]] | None = None
+    """A single shape → attributes of the mesh that its geom names: numbers; None: it names none."""
+    share: Callable[[Sequence[Any]], Sequence[Any]] | None = None
+    """Shapes of several worlds, single or not → the same with equal static fields; None: there are none."""
     reach: Callable[[Any], Any] | None = None
     """Shapes, single or not → half extents [..., 3] of the axis-aligned boxes around them, metres; None: endless."""
     faces: Callable[[Any], Sequence[np.ndarray]] | None = None
@@ -133,6 +139,8 @@ class ShapeKind:
                 "meet": "shapes, origin, direction",
                 "read": "geom",
                 "write": "shape",
+                "asset": "shape",
+                "share": "several",
                 "reach": "shapes",
                 "faces": "shape",
                 "page": "shape",

@@ -1,0 +1,257 @@
+"""Grids of signed distances of convex meshes, made on the host before anything is compiled.
+
+Between the points of a grid a distance is interpolated, which is too large beside edges and corners. So values are
+lowered there by as much as the interpolation exceeds the exact distance at points half a cell apart.
+
+V vertices, F triangles; distances in metres, negative inside.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+from functools import lru_cache
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import maximum_filter
+from scipy.spatial import ConvexHull, QhullError
+
+from edqn_jax.errors import ConfigError
+
+CELL_M = 0.1
+"""Largest cell of a grid, metres."""
+
+MARGIN_M = 0.5
+"""Metres around a mesh that its grid reaches, more than a drone's radius."""
+
+MOST_VALUES = 2**22
+"""Of a grid, and of all grids of a world: programs hold each of them eight times, 128 MiB."""
+
+MOST_TRIANGLES = 1_000_000
+
+_FINEST_M = 0.025
+_FINE_VALUES = 2**16  # of a grid that has cells below CELL_M, for thin meshes
+_BAND = 3  # cells around the surface in which interpolation is compared with exact distances
+_UNSEEN = 1.2  # how much larger the excess of interpolation may be between those points
+_DENT = 1e-3  # share of its hull that a convex mesh may leave empty
+_BLOCK = 4  # points along each side of a block that shares candidates
+_AT_ONCE = 2**22  # numbers of an intermediate array
+
+Numbers = NDArray[np.float64]
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Grid:
+    """A grid of distances about the middle of a mesh's box; grids of equal content are equal."""
+
+    values: NDArray[np.float32]  # [X, Y, Z], its middle in the middle of the box
+    cell: float
+    half: Numbers  # [3] half extents of the mesh's box
+    vertices: Numbers  # [V, 3] of the mesh's hull, about the middle of the box
+    faces: NDArray[np.int64]  # [F, 3] anticlockwise from outside
+    digest: bytes
+
+    @classmethod
+    def of(
+        cls, values: NDArray[np.floating], cell: float, half: Numbers, vertices: Numbers, faces: NDArray[np.integer]
+    ) -> Grid:
+        """Returns a grid of such contents."""
+        content = (np.asarray(values, np.float32), np.asarray(cell), half, vertices, faces)
+        digest = hashlib.sha256(b"".join(np.ascontiguousarray(part).tobytes() for part in content)).digest()
+        return cls(content[0], float(cell), half, vertices, np.asarray(faces, np.int64), digest)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Grid) and self.digest == other.digest
+
+    def __hash__(self) -> int:
+        return hash(self.digest)
+
+
+def grid_of_mesh(vertices: Numbers, faces: NDArray[np.integer], cell: float | None = None) -> tuple[Grid, Numbers]:
+    """Returns the grid of a convex mesh, and the middle [3] of the mesh's box.
+
+    Args:
+        vertices: [V, 3] metres.
+        faces: [F, 3] vertices of each triangle, anticlockwise from outside.
+        cell: metres; None takes `CELL_M`, and less for thin meshes as long as the grid is small.
+
+    Raises:
+        ConfigError: if the mesh is not closed and convex, or is too large.
+    """
+    vertices, faces = np.asarray(vertices, np.float64), np.asarray(faces, np.int64)
+    check_mesh(vertices, faces)
+    return _grid(vertices.tobytes(), faces.tobytes(), cell)
+
+
+@lru_cache(maxsize=32)
+def _grid(vertices: bytes, faces: bytes, cell: float | None) -> tuple[Grid, Numbers]:
+    """Returns `grid_of_mesh` of the bytes of a mesh, so that geoms of one mesh share a grid."""
+    given = np.frombuffer(vertices).reshape(-1, 3)
+    corners, rings = hull_of(given)
+    filled = _volume(given[np.frombuffer(faces, np.int64).reshape(-1, 3)]) / _volume(corners[rings])
+    if filled < 1 - _DENT:
+        raise ConfigError(
+            f"the mesh is not convex: it fills {100 * filled:.1f} % of its convex hull, with which MuJoCo collides; "
+            "make it of convex meshes"
+        )
+    low, high = corners.min(0), corners.max(0)
+    middle, half = (low + high) / 2, (high - low) / 2
+    cell = _cell_for(half) if cell is None else cell
+    count = float(np.prod(_counts(half, cell)))
+    if not count <= MOST_VALUES:
+        raise ConfigError(
+            f"the mesh measures {' x '.join(f'{2 * side:.4g}' for side in half)} m, and its distances on a grid of "
+            f"{cell:g} m would be {count:,.0f} values; a mesh may have {MOST_VALUES:,}, so make it of smaller ones, or "
+            "of boxes"
+        )
+    values = _lowered_values(corners - middle, rings, half, cell)
+    return Grid.of(values, cell, half, corners - middle, rings), middle
+
+
+def check_mesh(vertices: Numbers, faces: NDArray[np.integer]) -> None:
+    """Raises unless a mesh [V, 3], metres, of triangles [F, 3] is finite, small, closed and turned outwards.
+
+    Raises:
+        ConfigError: says what is wrong and what would be right.
+    """
+    if len(faces) > MOST_TRIANGLES:
+        raise ConfigError(f"the mesh has {len(faces):,} triangles; it may have {MOST_TRIANGLES:,}")
+    if not np.all(np.isfinite(vertices)):
+        raise ConfigError("the mesh has a vertex that is not finite; give it numbers")
+    _, same = np.unique(vertices, axis=0, return_inverse=True)
+    corners = same.reshape(-1)[faces]
+    corners = corners[(corners != np.roll(corners, 1, axis=1)).all(1)]
+    there = (corners * len(vertices) + np.roll(corners, -1, axis=1)).ravel()
+    back = (np.roll(corners, -1, axis=1) * len(vertices) + corners).ravel()
+    lone = int(np.sum(~np.isin(there, back))) + len(there) - len(np.unique(there))
+    if lone or not len(corners):
+        raise ConfigError(
+            f"the mesh is not watertight: {lone:,} edges of its {len(faces):,} triangles have none beside them that is "
+            "turned as they are; close it, every triangle anticlockwise from outside"
+        )
+    if _volume(vertices[faces]) < 0:
+        raise ConfigError("the mesh is inside out; list the corners of each triangle anticlockwise from outside")
+
+
+def _volume(triangles: Numbers) -> float:
+    """Returns the volume within a closed mesh of triangles [F, 3, 3], negative if it is inside out."""
+    a, b, c = np.moveaxis(triangles - triangles.mean((0, 1)), 1, 0)
+    return float(np.sum(np.cross(a, b) * c) / 6)
+
+
+def hull_of(vertices: Numbers) -> tuple[Numbers, NDArray[np.int64]]:
+    """Returns vertices [V, 3] and triangles [F, 3], anticlockwise from outside, of the convex hull of points [P, 3].
+
+    Raises:
+        ConfigError: if all lie in a plane.
+    """
+    try:
+        hull = ConvexHull(vertices)
+    except QhullError:
+        raise ConfigError("the mesh is flat; use a thin box, or a plane") from None
+    a, b, c = np.moveaxis(vertices[hull.simplices], 1, 0)
+    outwards = np.sum(np.cross(b - a, c - a) * hull.equations[:, :3], axis=1) > 0
+    rings = np.where(outwards[:, None], hull.simplices, hull.simplices[:, ::-1])
+    used, numbers = np.unique(rings, return_inverse=True)
+    return vertices[used], numbers.reshape(-1, 3)
+
+
+def _counts(half: Numbers, cell: float) -> Numbers:
+    """Returns the number of values along each axis, an odd one."""
+    return 2 * np.ceil((half + MARGIN_M) / cell) + 1
+
+
+def _cell_for(half: Numbers) -> float:
+    cell = float(np.clip(half.min(), _FINEST_M, CELL_M))
+    while cell < CELL_M and np.prod(_counts(half, cell)) > _FINE_VALUES:
+        cell = min(2 * cell, CELL_M)
+    return cell
+
+
+def _lowered_values(vertices: Numbers, faces: NDArray[np.integer], half: Numbers, cell: float) -> Numbers:
+    """Returns distances [X, Y, Z] between which interpolation is not too large, of a mesh about its box's middle."""
+    axes = [cell * (np.arange(n) - (n - 1) / 2) for n in _counts(half, cell)]
+    shape = tuple(map(len, axes))
+    points = np.stack(np.meshgrid(*axes, indexing="ij"), -1)
+    exact = convex_distances(points.reshape(-1, 3), vertices, faces).reshape(shape)
+    fine = exact
+    for axis in range(3):
+        fine = _with_middles(fine, axis)
+    near = np.abs(fine) < _BAND * cell
+    at = np.argwhere(near)
+    between = cell * (at - (np.array(fine.shape) - 1) / 2) / 2
+    excess = np.zeros(fine.shape)
+    excess[near] = _UNSEEN * (fine[near] - convex_distances(between, vertices, faces))
+    lowering = maximum_filter(excess, size=5)[::2, ::2, ::2]
+    # Further away the distance bends by at most 1 / distance in two directions.
+    far = exact > (_BAND - 1) * cell
+    lowering[far] = np.maximum(lowering[far], cell**2 / (4 * exact[far]))
+    return exact - lowering
+
+
+def _with_middles(values: Numbers, axis: int) -> Numbers:
+    """Returns values with those halfway between neighbours along an axis, by interpolation."""
+    moved = np.moveaxis(values, axis, 0)
+    more = np.empty((2 * len(moved) - 1, *moved.shape[1:]))
+    more[::2], more[1::2] = moved, (moved[1:] + moved[:-1]) / 2
+    return np.moveaxis(more, 0, axis)
+
+
+def convex_distances(points: Numbers, vertices: Numbers, faces: NDArray[np.integer]) -> Numbers:
+    """Returns the exact signed distances [P] of points [P, 3] to a closed convex mesh, metres."""
+    triangles = vertices[faces]
+    normals = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
+    lengths = np.linalg.norm(normals, axis=1)
+    triangles, normals = triangles[lengths > 0], (normals[lengths > 0].T / lengths[lengths > 0]).T
+    offsets = np.sum(normals * triangles[:, 0], axis=1)
+    step = max(1, _AT_ONCE // len(triangles))
+    # Inside, the nearest point lies on the nearest plane.
+    parts = (points[i : i + step] for i in range(0, len(points), step))
+    found = np.concatenate([np.zeros(0), *(np.max(part @ normals.T - offsets, axis=1) for part in parts)])
+    out = np.flatnonzero(found > 0)
+    if len(out):
+        found[out] = _outer_distances(points[out], triangles, normals)
+    return found
+
+
+def _outer_distances(points: Numbers, triangles: Numbers, normals: Numbers) -> Numbers:
+    """Returns the distances [P] of points [P, 3] outside of a convex mesh; blocks of points share candidates."""
+    middles = triangles.mean(1)
+    radii = np.linalg.norm(triangles - middles[:, None], axis=2).max(1)
+    low, high = points.min(0), points.max(0)
+    side = _BLOCK * max(float(np.prod(high - low) / len(points)) ** (1 / 3), 1e-6)
+    _, block = np.unique(np.floor((points - low) / side).astype(np.int64), axis=0, return_inverse=True)
+    block = block.reshape(-1)
+    order = np.argsort(block, kind="stable")
+    found = np.empty(len(points))
+    for members in np.split(order, np.flatnonzero(np.diff(block[order])) + 1):
+        centre = points[members].mean(0)
+        reach = np.linalg.norm(points[members] - centre, axis=1).max()
+        away = np.linalg.norm(middles - centre, axis=1)
+        near = away - radii <= away.min() + 2 * reach + 1e-9
+        # The nearest point lies on a triangle whose plane the point is above of.
+        near[near] = np.sum((centre - middles[near]) * normals[near], axis=1) >= -reach - 1e-9
+        step = max(1, _AT_ONCE // max(1, int(near.sum())))
+        for part in (members[i : i + step] for i in range(0, len(members), step)):
+            found[part] = _to_triangles(points[part] - centre, triangles[near] - centre, normals[near])
+    return found
+
+
+def _to_triangles(points: Numbers, triangles: Numbers, normals: Numbers) -> Numbers:
+    """Returns the distance [P] of points [P, 3] to the nearest of triangles [K, 3, 3]."""
+    edges = np.roll(triangles, -1, axis=1) - triangles
+    height = points @ normals.T - np.sum(normals * triangles[:, 0], axis=1)
+    above = np.ones(height.shape, bool)
+    beside = np.full(height.shape, np.inf)
+    squares = np.sum(points**2, axis=1)[:, None]
+    for i in range(3):
+        start, edge = triangles[:, i], edges[:, i]
+        outward = np.cross(edge, normals)
+        above &= points @ outward.T <= np.sum(outward * start, axis=1)
+        along = points @ edge.T - np.sum(edge * start, axis=1)
+        length = np.maximum(np.sum(edge**2, axis=1), 1e-300)
+        share = np.clip(along / length, 0.0, 1.0)
+        to_start = squares - 2 * points @ start.T + np.sum(start**2, axis=1)
+        np.minimum(beside, to_start - share * (2 * along - share * length), out=beside)
+    return np.sqrt(np.maximum(np.where(above, height**2, beside), 0.0).min(1))

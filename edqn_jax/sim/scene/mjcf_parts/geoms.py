@@ -1,0 +1,106 @@
+"""Geoms of an MJCF world as shapes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import mujoco
+import numpy as np
+
+from edqn_jax.errors import ConfigError
+from edqn_jax.sim.scene.mesh_field import MOST_VALUES
+from edqn_jax.sim.scene.mjcf_parts.files import SceneError
+from edqn_jax.sim.scene.mjcf_parts.motion import PREFIX
+from edqn_jax.sim.scene.scene import Shape
+from edqn_jax.sim.scene.shapes.kind import Geom, kinds, read_shape
+
+
+def geom_name(model: mujoco.MjModel, geom: int) -> str:
+    """Returns the name of a geom, or its number and kind where it has none."""
+    return model.geom(geom).name or f"geom number {geom} ({_kind_name(model, geom)})"
+
+
+def _kind_name(model: mujoco.MjModel, geom: int) -> str:
+    return mujoco.mjtGeom(model.geom_type[geom]).name.removeprefix("mjGEOM_").lower()
+
+
+def shape_of(model: mujoco.MjModel, data: mujoco.MjData, geom: int, title: str, moves: bool) -> Shape:
+    """Returns a geom as a single shape, in the world's frame.
+
+    Args:
+        model: of the world.
+        data: with the places of its bodies.
+        geom: number of the geom.
+        title: of the world in messages.
+        moves: whether its mocap body may.
+
+    Raises:
+        SceneError: if the geom moves otherwise, is not finite, or is of no kind that is known.
+    """
+    name = geom_name(model, geom)
+    body = model.geom_bodyid[geom]
+    root = model.body_rootid[body]
+    if model.body_weldid[body] != model.body_weldid[root] or model.body_dofnum[root]:
+        raise SceneError(
+            f"{title}: geom '{name}' is on a body that can move; remove the joints of body '{model.body(body).name}', "
+            "nothing is simulated but the drone"
+        )
+    if model.body_mocapid[root] >= 0 and not moves:
+        text = f"{PREFIX}{model.body(root).name}"
+        raise SceneError(
+            f"{title}: geom '{name}' is on a body that can move; remove the mocap of body '{model.body(root).name}', "
+            f'or say how it moves: <custom><text name="{text}" data="oscillate 0 2 0 4 0"/></custom>'
+        )
+    found = geom_of(model, data, geom)
+    if not all(np.all(np.isfinite(values)) for values in (found.position, found.rotation, found.size)):
+        raise SceneError(f"{title}: geom '{name}' has a place or a size that is not finite; give it numbers")
+    if moves and found.mesh is not None:
+        raise SceneError(f"{title}: geom '{name}' is a mesh on a body that moves; only what stands may have meshes")
+    try:
+        shape = read_shape(found)
+    except ConfigError as error:
+        raise SceneError(f"{title}: geom '{name}': {error}") from None
+    if shape is None:
+        *some, last = dict.fromkeys(kind.geom for kind in kinds().values())
+        raise SceneError(
+            f"{title}: geom '{name}' is of the unsupported kind {found.kind}; make it a {', '.join(some)} or {last}, "
+            "or hide it in group 3 with contype and conaffinity 0"
+        )
+    return shape
+
+
+def check_grids(shapes: Sequence[Shape], title: str) -> None:
+    """Checks that the grids of all shapes of a world together are small enough.
+
+    Raises:
+        SceneError: names the most that they may be.
+    """
+    grids = {grid for shape in shapes for grid in getattr(shape, "grids", ())}
+    count = sum(grid.values.size for grid in grids)
+    if count > MOST_VALUES:
+        raise SceneError(
+            f"{title}: the grids of its meshes hold more than {MOST_VALUES:,} values; give it fewer meshes"
+        )
+
+
+def _mesh_of(model: mujoco.MjModel, geom: int) -> tuple[np.ndarray, np.ndarray] | None:
+    """Returns vertices [V, 3], metres, and triangles [F, 3] of a geom that is a mesh."""
+    if model.geom_type[geom] != mujoco.mjtGeom.mjGEOM_MESH:
+        return None
+    mesh = model.geom_dataid[geom]
+    vertex, face = model.mesh_vertadr[mesh], model.mesh_faceadr[mesh]
+    vertices = model.mesh_vert[vertex : vertex + model.mesh_vertnum[mesh]]
+    return vertices, model.mesh_face[face : face + model.mesh_facenum[mesh]]
+
+
+def geom_of(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> Geom:
+    """Returns geom number `geom` of a model, in the world's frame."""
+    material = model.geom_matid[geom]
+    return Geom(
+        kind=_kind_name(model, geom),
+        position=data.geom_xpos[geom],
+        rotation=data.geom_xmat[geom].reshape(3, 3),
+        size=model.geom_size[geom],
+        albedo=(model.geom_rgba[geom] if material < 0 else model.mat_rgba[material])[:3],
+        mesh=_mesh_of(model, geom),
+    )

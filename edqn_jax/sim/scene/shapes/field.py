@@ -1,0 +1,218 @@
+"""Fields: solids of any form, here convex meshes, as grids of signed distances (`sim/scene/mesh_field.py`).
+
+The grids are static: constants of a program, not rows of a world's arrays, which the camera copies for each column.
+Between its values a distance is interpolated; beyond its grid a field is at least as far away as the box around the
+mesh, and as the nearest point of the grid together with the distance there.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from functools import lru_cache
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from flax import struct
+from jax import Array, lax
+
+from edqn_jax.sim.scene.mesh_field import Grid, grid_of_mesh, hull_of
+from edqn_jax.sim.scene.motion import Motion
+from edqn_jax.sim.scene.shapes.kind import (
+    FAR,
+    GREY,
+    PARKED,
+    Geom,
+    Hits,
+    ShapeKind,
+    Vector,
+    norm,
+    offset,
+    per_shape,
+    quaternion_of,
+    safe_inverse,
+)
+from edqn_jax.sim.scene.surface import Surface
+
+STEPS = 16
+"""Of a ray through a field, each as long as the distance where it begins."""
+
+TOUCHES = 1e-6
+"""Metres that are none."""
+
+_NEAR = 0.1  # of a cell: a ray that ends nearer to a surface meets it
+_MOST_FACES = 400  # of a solid in pictures
+
+
+@struct.dataclass
+class Fields:
+    """Solids of which distances are known on grids."""
+
+    position: Array  # [N, 3] middle of the box around the solid, metres
+    rotation: Array  # [N, 3, 3] body-to-world
+    half: Array  # [N, 3] half extents of that box along its own axes, metres
+    grid: Array  # [N] number of its grid
+    albedo: Array  # [N, 3]
+    motion: Motion | None = None
+    surface: Surface | None = None
+    grids: tuple[Grid, ...] = struct.field(pytree_node=False, default=())
+
+
+class _Table(NamedTuple):
+    """All grids as one array, and a row for each grid."""
+
+    cells: np.ndarray  # [cells, 8] values at the corners, so that one gather reads all of a cell
+    first: np.ndarray  # [G] number of its first cell
+    counts: np.ndarray  # [G, 3] values along each axis
+    cell: np.ndarray  # [G] metres
+
+
+def _cells(values: np.ndarray) -> np.ndarray:
+    """Returns the values at the corners of each cell [cells, 8]."""
+    x, y, z = values.shape
+    parts = [values[i : x - 1 + i, j : y - 1 + j, k : z - 1 + k] for i in range(2) for j in range(2) for k in range(2)]
+    return np.stack([part.ravel() for part in parts], axis=1)
+
+
+@lru_cache(maxsize=8)
+def _table(grids: tuple[Grid, ...]) -> _Table:
+    sizes = [math.prod(n - 1 for n in grid.values.shape) for grid in grids]
+    return _Table(
+        np.concatenate([_cells(grid.values) for grid in grids]),
+        np.cumsum([0, *sizes[:-1]]).astype(np.int32),
+        np.array([grid.values.shape for grid in grids], np.int32),
+        np.array([grid.cell for grid in grids], np.float32),
+    )
+
+
+def _interpolate(fields: Fields, place: Vector) -> tuple[Array, Vector]:
+    """Returns distances [N, ...] at places in each field's own axes, and their slopes; outside those of the border."""
+    table, number = _table(fields.grids), fields.grid.astype(jnp.int32)
+    number = number.reshape(number.shape + (1,) * (place[0].ndim - 1))
+    counts, cell = jnp.asarray(table.counts)[number], jnp.asarray(table.cell)[number]
+    lower, part = [], []
+    for i in range(3):
+        last = counts[..., i] - 1
+        at = jnp.clip(place[i] / cell + last / 2, 0.0, last)
+        lower.append(jnp.minimum(at.astype(jnp.int32), last - 1))
+        part.append(at - lower[i])
+    across, along = (counts[..., 1] - 1) * (counts[..., 2] - 1), counts[..., 2] - 1
+    first = jnp.asarray(table.first)[number] + lower[0] * across + lower[1] * along + lower[2]
+    eight = jnp.asarray(table.cells).at[first].get(mode="promise_in_bounds")
+    corner = [[[eight[..., 4 * i + 2 * j + k] for k in range(2)] for j in range(2)] for i in range(2)]
+
+    def between(low: Array, high: Array, axis: int) -> Array:
+        return low + part[axis] * (high - low)
+
+    z = [[between(corner[i][j][0], corner[i][j][1], 2) for j in range(2)] for i in range(2)]
+    y = [between(z[i][0], z[i][1], 1) for i in range(2)]
+    across_z = [[corner[i][j][1] - corner[i][j][0] for j in range(2)] for i in range(2)]
+    slope_z = [between(across_z[i][0], across_z[i][1], 1) for i in range(2)]
+    slopes = (
+        y[1] - y[0],
+        between(z[0][1] - z[0][0], z[1][1] - z[1][0], 0),
+        between(slope_z[0], slope_z[1], 0),
+    )
+    return between(y[0], y[1], 0), slopes
+
+
+def _distance(fields: Fields, x: Array, y: Array, z: Array) -> Array:
+    away, r = offset(fields.position, x, y, z), fields.rotation
+    place: Any = tuple(sum(r[:, j, i] * away[j] for j in range(3)) for i in range(3))
+    table, number = _table(fields.grids), fields.grid.astype(jnp.int32)
+    reach = (jnp.asarray(table.counts)[number] - 1) * (jnp.asarray(table.cell)[number] / 2)[:, None]
+    beyond = norm(*(jnp.maximum(jnp.abs(place[i]) - reach[:, i], 0.0) for i in range(3)))
+    to_box = norm(*(jnp.maximum(jnp.abs(place[i]) - fields.half[:, i], 0.0) for i in range(3)))
+    inside, _ = _interpolate(fields, place)
+    # The grid's border lies between a point beyond it and the solid, at a right or a blunt angle.
+    found = jnp.where(beyond > TOUCHES, norm(beyond, jnp.maximum(inside, 0.0)), inside)
+    return jnp.where(to_box > TOUCHES, jnp.maximum(found, to_box), found)
+
+
+def _meet(fields: Fields, origin: Array, ray: Vector) -> Hits:
+    """Returns where rays meet fields: they advance by the distance, within the box around each solid."""
+    turn = [[per_shape(fields.rotation[:, j, i]) for j in range(3)] for i in range(3)]
+    away = [per_shape(origin[i] - fields.position[:, i]) for i in range(3)]
+    o: Any = [sum(turn[i][j] * away[j] for j in range(3)) for i in range(3)]
+    d: Any = [sum(turn[i][j] * ray[j] for j in range(3)) for i in range(3)]
+    cell = per_shape(jnp.asarray(_table(fields.grids).cell)[fields.grid.astype(jnp.int32)])
+    enter, leave = jnp.zeros(()), jnp.asarray(jnp.inf)
+    for i in range(3):
+        per_d = safe_inverse(d[i])
+        middle, reach = -o[i] * per_d, per_shape(fields.half[:, i]) * jnp.abs(per_d)
+        enter, leave = jnp.maximum(enter, middle - reach), jnp.minimum(leave, middle + reach)
+    per_length = lax.rsqrt(ray[0] ** 2 + ray[1] ** 2 + ray[2] ** 2)
+
+    def at(depth: Array) -> tuple[Array, Vector]:
+        return _interpolate(fields, (o[0] + depth * d[0], o[1] + depth * d[1], o[2] + depth * d[2]))
+
+    def advance(_: Array, depth: Array) -> Array:
+        return depth + jnp.maximum(at(depth)[0], 0.0) * per_length
+
+    depth = lax.fori_loop(0, STEPS, advance, enter)
+    left, slopes = at(depth)
+    hit = (depth > 0) & (depth < leave) & (left < _NEAR * cell)
+    scale = safe_inverse(norm(*slopes))
+    normal: Any = tuple(scale * sum(turn[i][j] * slopes[i] for i in range(3)) for j in range(3))
+    return Hits.of(depth, hit, normal)
+
+
+def _read(geom: Geom) -> Fields | None:
+    if geom.mesh is None:
+        return None
+    grid, middle = grid_of_mesh(*geom.mesh)
+    position = geom.position + geom.rotation @ middle
+    return Fields(position, geom.rotation, grid.half, np.float32(0), geom.albedo, grids=(grid,))  # type: ignore[arg-type]
+
+
+def grid_of(one: Fields) -> Grid:
+    """Returns the grid of a single field."""
+    return one.grids[int(one.grid)]
+
+
+def _asset(one: Fields) -> dict[str, Any]:
+    grid = grid_of(one)
+    return {"vertex": grid.vertices, "face": grid.faces}
+
+
+def _faces(one: Fields) -> list[np.ndarray]:
+    vertices, faces = grid_of(one).vertices, grid_of(one).faces
+    if len(faces) > _MOST_FACES:
+        # The hull of the vertices that reach furthest in directions spread over the sphere.
+        number, count = np.arange(_MOST_FACES // 4) + 0.5, _MOST_FACES // 4
+        height, turned = 1 - 2 * number / count, np.pi * (1 + 5**0.5) * number
+        around = np.sqrt(1 - height**2)
+        towards = np.stack([around * np.cos(turned), around * np.sin(turned), height], axis=1)
+        vertices, faces = hull_of(vertices[np.unique([np.argmax(vertices @ one) for one in towards])])
+    return list((one.position + vertices @ np.asarray(one.rotation).T)[faces])
+
+
+def _share(several: Sequence[Fields]) -> list[Fields]:
+    """Returns fields, single or not, with one tuple of grids, in which each grid stands once."""
+    grids = tuple(dict.fromkeys(grid for each in several for grid in each.grids))
+
+    def numbered(each: Fields) -> Fields:
+        if each.grids == grids:
+            return each
+        numbers = np.array([grids.index(grid) for grid in each.grids], np.float32)[np.asarray(each.grid, np.int32)]
+        return each.replace(grid=jax.device_put(numbers) if isinstance(each.grid, Array) else numbers, grids=grids)  # type: ignore[attr-defined]
+
+    return [numbered(each) for each in several]
+
+
+_NOTHING = Grid.of(np.full((2, 2, 2), PARKED), 1.0, np.zeros(3), np.zeros((0, 3)), np.zeros((0, 3), np.int64))
+
+FIELD = ShapeKind(
+    parked=Fields(FAR, np.eye(3), np.zeros(3), np.float32(0), GREY, grids=(_NOTHING,)),  # type: ignore[arg-type]
+    geom="mesh",
+    distance=_distance,
+    meet=_meet,
+    read=_read,
+    write=lambda one: {"quat": quaternion_of(one.rotation)},
+    asset=_asset,
+    share=_share,
+    reach=lambda fields: (abs(fields.rotation) * fields.half[..., None, :]).sum(-1),
+    faces=_faces,
+)
