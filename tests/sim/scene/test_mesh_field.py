@@ -51,6 +51,22 @@ def test_between_its_values_a_grid_is_at_most_half_a_cell_too_small_and_never_to
     assert error[np.abs(exact) < 0.2].max() < 0.01 and error[exact > 0].max() < 0.01
 
 
+def test_distances_to_a_mesh_of_many_triangles_are_at_most_a_little_too_small() -> None:
+    points = np.random.default_rng(2).uniform(-1.5, 1.5, (2000, 3))
+    away = np.linalg.norm(points, axis=1) - 1
+    vertices, faces = ball(1000)
+    smallest = np.linalg.norm(vertices[faces].mean(1), axis=1).min()
+    found = convex_distances(points, vertices, faces)
+    near = np.abs(away) < 0.5
+    assert np.all(np.abs(found[near] - away[near]) < 0.006) and np.all(found <= away + 1 - smallest + 1e-9)
+    # A lid of a fine cylinder is flat, and its rim is round further out.
+    turn = np.linspace(0, 2 * np.pi, 400, endpoint=False)
+    ring = np.stack([np.cos(turn), np.sin(turn), np.ones(400)], axis=1)
+    asked = np.array([[0.3, 0.2, 1.3], [1.3, 0, 1.4], [1.4, 0.1, 0.2]])
+    found = convex_distances(asked, *hull(np.concatenate([ring, ring * [1, 1, -1]])))
+    np.testing.assert_allclose(found, [0.3, 0.5, np.hypot(1.4, 0.1) - 1], atol=0.005)
+
+
 def test_a_thin_mesh_has_small_cells_and_a_large_one_none_below_a_decimetre() -> None:
     assert grid_of_mesh(*hull(CUBE * [0.02, 0.02, 0.3]))[0].cell == 0.05
     assert grid_of_mesh(*hull(CUBE * [6, 0.05, 2]))[0].cell == CELL_M

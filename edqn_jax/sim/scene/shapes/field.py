@@ -18,7 +18,7 @@ import numpy as np
 from flax import struct
 from jax import Array, lax
 
-from edqn_jax.sim.scene.mesh_field import Grid, grid_of_mesh, hull_of
+from edqn_jax.sim.scene.mesh_field import Grid, grid_of_mesh, hull_of, spread_directions
 from edqn_jax.sim.scene.motion import Motion
 from edqn_jax.sim.scene.shapes.kind import (
     FAR,
@@ -180,11 +180,8 @@ def _asset(one: Fields) -> dict[str, Any]:
 def _faces(one: Fields) -> list[np.ndarray]:
     vertices, faces = grid_of(one).vertices, grid_of(one).faces
     if len(faces) > _MOST_FACES:
-        # The hull of the vertices that reach furthest in directions spread over the sphere.
-        number, count = np.arange(_MOST_FACES // 4) + 0.5, _MOST_FACES // 4
-        height, turned = 1 - 2 * number / count, np.pi * (1 + 5**0.5) * number
-        around = np.sqrt(1 - height**2)
-        towards = np.stack([around * np.cos(turned), around * np.sin(turned), height], axis=1)
+        # The hull of the vertices that reach furthest in directions all around.
+        towards = spread_directions(_MOST_FACES // 4)
         vertices, faces = hull_of(vertices[np.unique([np.argmax(vertices @ one) for one in towards])])
     return list((one.position + vertices @ np.asarray(one.rotation).T)[faces])
 
