@@ -178,7 +178,7 @@ def _drawing(now: Moment, position: Array, quaternion: Array) -> float | None:
     GPU, for cameras that do not draw by columns, and where the columns are drawn in C.
     """
     config = now.config.camera
-    if config.mount != "level" or jax.default_backend() != "cpu" or native.can_render(config, now.world.pool, "cpu"):
+    if config.mount != "level" or jax.default_backend() != "cpu" or native.can_render(now.world.pool, "cpu"):
         return None
     times = position.shape[1]
     scene = jax.tree.map(

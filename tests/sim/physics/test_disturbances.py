@@ -376,22 +376,26 @@ def test_a_delayed_move_is_flown_one_decision_later_and_known_at_once(world):
         assert state.disturbance.move == move
 
 
-def test_a_share_of_the_episodes_is_late_and_each_from_its_first_decision_to_its_last(world):
-    env_config = dataclasses.replace(QUIET.env, action_delay=1, delay_share=0.3)
-    config = dataclasses.replace(QUIET, env=env_config)
-    keys = jax.random.split(jax.random.key(0), 2000)
-    late = jax.vmap(lambda key: disturbances.sample_disturbance(config, jnp.float32(1.0), key).late)(keys)
+def test_a_share_of_the_episodes_is_late_and_each_from_its_first_decision_to_its_last():
+    config = dataclasses.replace(QUIET, env=dataclasses.replace(QUIET.env, action_delay=1, delay_share=0.3))
+
+    def is_late(key: jax.Array) -> Any:
+        drawn = disturbances.sample_disturbance(config, jnp.float32(1.0), key)
+        assert drawn is not None
+        return drawn.late
+
+    late = jax.vmap(is_late)(jax.random.split(jax.random.key(0), 2000))
     assert 0.25 < float(jnp.mean(late)) < 0.35  # five deviations of 2,000 draws
-    prompt_moves = [decision_flown(config, bool(each)) for each in (False, True)]
-    assert prompt_moves == [[AHEAD, BACK], [0, AHEAD]]
+    assert moves_flown(config, late=False) == [AHEAD, BACK]
+    assert moves_flown(config, late=True) == [0, AHEAD]
 
 
-def decision_flown(config, late):
+def moves_flown(config: Config, late: bool) -> list[int]:
     """The moves that are flown of ahead and back, after move 0."""
     disturbance, moves = Disturbance(late=jnp.asarray(late), move=jnp.int32(0)), []
     for action in (AHEAD, BACK):
         move, disturbance = decision._delay_action(config, disturbance, jnp.int32(action))
-        assert int(disturbance.move) == action
+        assert disturbance is not None and disturbance.move == action
         moves.append(int(move))
     return moves
 

@@ -352,7 +352,7 @@ def test_own_motion_by_hand():
 
 
 def test_roll_and_pitch_are_the_last_of_three_turns():
-    turns = Rotation.random(200, random_state=3)
+    turns = Rotation.from_quat(np.random.default_rng(3).normal(size=(200, 4)))
     _, pitch, roll = turns.as_euler("ZYX").T
     found = drone.roll_and_pitch_of(jnp.asarray(np.roll(turns.as_quat(), 1, axis=1)))
     np.testing.assert_allclose(found, np.stack([roll, pitch], axis=1), atol=2e-6)
