@@ -171,7 +171,7 @@ def render_depth(config: CameraConfig, scene: Scene, position: Array, rotation: 
 
 
 def _pictures_natively(platform: str, config: CameraConfig, _: columns.Finish, *image: Any) -> Array | None:
-    """Returns brightness [M, H, W] by the library in C, blended as by `blend_layers`; None if unsupported."""
+    """Returns brightness [M, H, W] by the library in C or CUDA, blended as by `blend_layers`; None if unsupported."""
     return native.render_luma(config, *image) if native.can_render(image[0], platform) else None
 
 
@@ -187,6 +187,6 @@ def _depths(config: CameraConfig, scene: Scene, position: Array, rotation: Array
 def _depths_natively(
     platform: str, config: CameraConfig, scene: Scene, position: Array, rotation: Array
 ) -> Array | None:
-    """Returns `_depths` by the library in C; None if unsupported."""
+    """Returns `_depths` by the library in C or CUDA; None if unsupported."""
     can = native.can_render(scene, platform)
     return native.render_depth(config, scene, position, rotation) if can else None

@@ -217,6 +217,18 @@ static __global__ void __launch_bounds__(THREADS, RESIDENT) measure(const Batch 
   }
 }
 
+/* Lists the upright shapes from `base` on, at most one a thread, that a camera on the body may show between two columns;
+ * returns how many they are. Every thread of the block calls it. */
+FN int gather_tilted(const Frame* f, const Bounds* bounds, int base, int left, int right, Gathered* gathered) {
+  Tilted shape;
+  const int n = base + threadIdx.x;
+  const int shown = n < f->shapes.boxes + f->shapes.cylinders &&
+                    tilted_shape(&f->camera, &f->shapes, &f->eye, bounds, n, &shape) && shape.first < right &&
+                    shape.last > left;
+  __syncthreads(); /* nobody is at the list of the pass before */
+  return gather(gathered, n, shown);
+}
+
 static __global__ void __launch_bounds__(THREADS, TILTED_RESIDENT) draw_tilted(const Batch batch) {
   __shared__ Frame frame;
   __shared__ Wave waves[MOST_WAVES];
@@ -251,12 +263,7 @@ static __global__ void __launch_bounds__(THREADS, TILTED_RESIDENT) draw_tilted(c
     layers.inserted = 0;
     for (int base = 0; base < uprights; base += THREADS) {
       if (!listed) {
-        Tilted shape;
-        const int n = base + t;
-        const int shown = n < uprights && tilted_shape(c, s, e, &bounds, n, &shape) && shape.first < right &&
-                          shape.last > left;
-        __syncthreads(); /* nobody is at the list of the pass before */
-        found = gather(&gathered, n, shown);
+        found = gather_tilted(&frame, &bounds, base, left, right, &gathered);
       }
       for (int k = 0; k < found; k += at_once) {
         const int many = found - k < at_once ? found - k : at_once;
@@ -317,12 +324,7 @@ static __global__ void __launch_bounds__(THREADS, TILTED_RESIDENT) measure_tilte
     float nearest = nearest_of_others(s, frame.planes, e, dx, dy, dz);
     for (int base = 0; base < uprights; base += THREADS) {
       if (!listed) {
-        Tilted shape;
-        const int n = base + t;
-        const int shown = n < uprights && tilted_shape(c, s, e, &bounds, n, &shape) && shape.first < right &&
-                          shape.last > left;
-        __syncthreads(); /* nobody is at the list of the pass before */
-        found = gather(&gathered, n, shown);
+        found = gather_tilted(&frame, &bounds, base, left, right, &gathered);
         if (t < found) levels[t] = level_of(s, e, gathered.list[t]), turns[t] = turn_of(s, gathered.list[t]);
         __syncthreads();
       }

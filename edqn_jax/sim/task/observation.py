@@ -88,7 +88,7 @@ def mirrored_motion(config: Config) -> tuple[float, ...]:
 def with_lean(config: Config, quaternions: Array, motion: Array) -> Array:
     """Returns own motions [..., MOTION_SIZE] with roll and pitch, radians, at each frame, if the camera leans.
 
-    Between two frames a drone turns by more than its surroundings pass by, so where it leant at each must be known.
+    A body that turns between two frames moves the whole picture, so how it leant at each must be known.
 
     Args:
         config: of camera and sensor.
