@@ -132,7 +132,7 @@ class CameraConfig:
     """Brightness of the sky."""
 
 
-LOOKS = ("plaid", "drawn", "blank", "waves", "noise", "checks", "bricks", "posters", "wood")
+LOOKS = ("plaid", "drawn", "blank", "waves", "noise", "checks", "spots", "bricks", "posters", "wood")
 """Values of `surface.pattern`."""
 
 
@@ -141,13 +141,13 @@ class SurfaceConfig:
     """What the faces of the shapes of a world look like; geometry is the same under every pattern."""
 
     pattern: Annotated[str, one_of(LOOKS)] = "plaid"
-    """`plaid`: one for all, of `camera.texture_*`. For each shape its own: `drawn` (any of the next four), `blank`,
-    `waves`, `noise`, `checks`; for tests, never among `drawn`: `bricks`, `posters`, `wood`. With a sun and a sky for
-    each world."""
+    """`plaid`: one for all, of `camera.texture_*`. For each shape its own: `drawn` (any of the next five), `blank`,
+    `waves`, `noise`, `checks`, `spots`; for tests, never among `drawn`: `bricks`, `posters`, `wood`. With a sun and a
+    sky for each world."""
     contrast: Annotated[float, SHARE] = 0.8
     """Most amplitude of a pattern relative to the surface's brightness; a shape's is uniform from 0 to this."""
     shortest_m: Annotated[float, between(0.05, 100)] = 0.2
-    """Shortest period of waves, noise and checks, metres; a shape's is log-uniform."""
+    """Shortest period of waves, noise, checks and spots, metres; a shape's is log-uniform."""
     longest_m: Annotated[float, between(0.05, 100)] = 10.0
     """Longest period, metres."""
 

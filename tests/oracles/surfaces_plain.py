@@ -19,6 +19,12 @@ def within(phase: NDArray, width: float) -> NDArray:
     return (np.abs(phase - np.round(phase)) < width / 2).astype(float)
 
 
+def trapezoid(phase: NDArray, width: float, edge: float) -> NDArray:
+    """1 around the whole numbers, 0 far from them, and straight slopes of width `edge` whose middles are `width` apart."""
+    away = np.abs(phase - np.round(phase))
+    return np.clip((width / 2 - away) / edge + 0.5, 0.0, 1.0)
+
+
 def stripes(phase: NDArray, width: float) -> NDArray:
     return (within(phase, width) - width) / max(width, 1 - width)
 
@@ -45,6 +51,9 @@ def pattern(name: str, shares: ArrayLike, q: NDArray) -> NDArray:
         case "posters":
             fine = (q[2], q[3], q[2] + q[3], 2 * q[2] - q[3])
             return within(q[0], c) * within(q[1], d) * (a + b * sum(wave(p) for p in fine))
+        case "spots":
+            fine = (q[2], q[3], 2 * q[3] + q[2])
+            return trapezoid(q[0], c, d) * trapezoid(q[1], c, d) * (a + b * sum(wave(p) for p in fine))
         case "wood":
             return a * stripes(q[0] + b * wave(q[1]) + 0.5 * b * wave(q[2]), c) + d * wave(q[3])
     raise ValueError(name)

@@ -6,7 +6,7 @@
 #define EDQN_PATTERNS_H
 
 /* By the number that KIND holds. */
-enum { UNKNOWN = -1, BLANK, OF_WAVES, OF_NOISE, OF_CHECKS, OF_BRICKS, OF_POSTERS, OF_WOOD };
+enum { UNKNOWN = -1, BLANK, OF_WAVES, OF_NOISE, OF_CHECKS, OF_BRICKS, OF_POSTERS, OF_WOOD, OF_SPOTS };
 
 /* What all pixels of a frame share of a phase of a surface. */
 typedef struct {
@@ -78,14 +78,17 @@ FN Lanes integral_of_pulses(Lanes at, float width) {
   return between(f, -width / 2, width / 2) - width * f;
 }
 
-FN Lanes pulse(Phase p, float width) {
+/* Pulses whose slopes are `edge` wide. */
+FN Lanes soft_pulse(Phase p, float width, float edge) {
   const Lanes across = absolute(p.right), along = absolute(p.up);
   const Lanes longer = greater(across, along), shorter = lesser(across, along);
-  const Lanes size = greater(greater(longer, 0.9f * longer + 0.47f * shorter), lanes(EDGE));
+  const Lanes size = greater(greater(longer, 0.9f * longer + 0.47f * shorter), lanes(edge));
   const Lanes x = lesser(shorter * shorter, lanes(1)), at = fraction(p.at);
   const Lanes change = integral_of_pulses(at + size / 2, width) - integral_of_pulses(at - size / 2, width);
   return (1.0f - x * x) * change / size;
 }
+
+FN Lanes pulse(Phase p, float width) { return soft_pulse(p, width, EDGE); }
 
 FN Phase warped(Phase p, Phase by, float amount) {
   const Lanes f = fraction(by.at), slope = amount * (8.0f - 32.0f * absolute(f));
@@ -142,6 +145,15 @@ FN Lanes wood(const Sight* s, const Pattern* p) {
   return p->share[0] * pulse(bent, width) / most(width, 1 - width) + p->share[3] * smooth(phase_of(s, &p->row[3]));
 }
 
+FN Lanes spots(const Sight* s, const Pattern* p) {
+  const float width = p->share[2], edge = p->share[3];
+  const Lanes across = soft_pulse(phase_of(s, &p->row[0]), width, edge) + width;
+  const Lanes here = across * (soft_pulse(phase_of(s, &p->row[1]), width, edge) + width);
+  if (p->share[1] == 0) return p->share[0] * here;
+  const Phase c = phase_of(s, &p->row[2]), d = phase_of(s, &p->row[3]);
+  return here * (p->share[0] + p->share[1] * (smooth(c) + smooth(d) + smooth(sum_of(2, d, 1, c))));
+}
+
 /* The albedo of a surface relative to its own. */
 FN Lanes relative_albedo(const Sight* s, const Pattern* p) {
   if (p->contrast == 0) return lanes(1);
@@ -152,7 +164,8 @@ FN Lanes relative_albedo(const Sight* s, const Pattern* p) {
     case OF_CHECKS: return 1.0f + p->contrast * checks(s, p);
     case OF_BRICKS: return 1.0f + p->contrast * bricks(s, p);
     case OF_POSTERS: return 1.0f + p->contrast * posters(s, p);
-    default: return 1.0f + p->contrast * wood(s, p);
+    case OF_WOOD: return 1.0f + p->contrast * wood(s, p);
+    default: return 1.0f + p->contrast * spots(s, p);
   }
 }
 

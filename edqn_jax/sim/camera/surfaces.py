@@ -49,7 +49,7 @@ def smooth(phase: Phase) -> Array:
     return box_filter(phase.right) * box_filter(phase.up) * smooth_wave(phase.at)
 
 
-def pulse(phase: Phase, width: float | Array) -> Array:
+def pulse(phase: Phase, width: float | Array, edge: float | Array = EDGE) -> Array:
     """Returns the average of pulses of height 1, less their mean, over each pixel: [...].
 
     The pixel is taken for as wide an interval of phases as its diagonal is, on which the average is exact; where both
@@ -58,11 +58,12 @@ def pulse(phase: Phase, width: float | Array) -> Array:
     Args:
         phase: pulses are centred where it is whole.
         width: of a pulse, a share of the period.
+        edge: width of its slopes, a share of the period.
     """
     across, along = jnp.abs(phase.right), jnp.abs(phase.up)
     longer, shorter = jnp.maximum(across, along), jnp.minimum(across, along)
     # The root of the squares' sum, to 3 %.
-    size = jnp.maximum(jnp.maximum(longer, 0.9 * longer + 0.47 * shorter), EDGE)
+    size = jnp.maximum(jnp.maximum(longer, 0.9 * longer + 0.47 * shorter), edge)
     x = jnp.minimum(shorter * shorter, 1.0)
 
     def integral(at: Array) -> Array:
@@ -117,6 +118,13 @@ def _posters(shares: list[Array], phases: list[Phase]) -> Array:
     return (pulse(phases[0], width) + width) * (pulse(phases[1], height) + height) * picture
 
 
+def _spots(shares: list[Array], phases: list[Phase]) -> Array:
+    tone, depth, width, edge = shares
+    fine = [phases[2], phases[3], phases[3].times(2.0, phases[2], 1.0)]
+    here = (pulse(phases[0], width, edge) + width) * (pulse(phases[1], width, edge) + width)
+    return here * (tone + depth * sum(smooth(phase) for phase in fine))
+
+
 def _warp(phase: Phase, by: Phase, amount: Array) -> Phase:
     """Returns a phase plus `amount` x a wave of another."""
     f = by.at - jnp.round(by.at)
@@ -137,6 +145,7 @@ _OF_PATTERN = {
     "bricks": _bricks,
     "posters": _posters,
     "wood": _wood,
+    "spots": _spots,
 }
 
 

@@ -10,7 +10,7 @@ import numpy as np
 from flax import struct
 from jax import Array
 
-PATTERNS = ("blank", "waves", "noise", "checks", "bricks", "posters", "wood")
+PATTERNS = ("blank", "waves", "noise", "checks", "bricks", "posters", "wood", "spots")
 """By the number that `KIND` holds."""
 
 KIND, CONTRAST, SHARES, PHASES = 0, 1, 2, 6

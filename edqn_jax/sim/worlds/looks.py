@@ -20,7 +20,7 @@ from edqn_jax.sim.scene.shapes.kind import PARKED
 from edqn_jax.sim.scene.surface import PATTERNS, SURFACE_NUMBERS, Daylight, Surface
 from edqn_jax.sim.worlds.building import make_albedos, scale_uniforms
 
-TRAINED = {"blank": 0.2, "waves": 0.3, "noise": 0.25, "checks": 0.25}
+TRAINED = {"blank": 0.15, "waves": 0.2, "noise": 0.2, "checks": 0.2, "spots": 0.25}
 """Shares of the patterns of `drawn`."""
 
 ALIKE = 0.4
@@ -250,6 +250,22 @@ def _wood(config: SurfaceConfig, draws: Array, along: Array, up: Array) -> Numbe
     ], vectors
 
 
+def _spots(config: SurfaceConfig, draws: Array, along: Array, up: Array) -> Numbers:
+    """Patches of another tone, most of them with something finer in them; their edges are hard or fade."""
+    apart = _period(config, draws[:, 2])
+    other = apart * _log_between(0.4, 2.5, draws[:, 12])
+    signed = 2 * draws[:, 13] - 1
+    tone = 0.8 * signed * jnp.abs(signed)
+    depth = jnp.where(draws[:, 14] < 0.3, 0.0, (1 - jnp.abs(tone)) / 3)
+    fine = jnp.maximum(apart * _log_between(0.05, 0.5, draws[:, 15]), config.shortest_m)
+    width = scale_uniforms((0.15, 0.7), draws[:, 16])
+    edge = jnp.minimum(width, 1 - width) * _log_between(1 / 16, 1.0, draws[:, 17])
+    directions = [_unit(draws[:, 20 + 2 * n : 22 + 2 * n]) for n in range(4)]
+    sizes = [apart, other, fine, fine * (0.5 + draws[:, 18])]
+    vectors = [direction / size[:, None] for direction, size in zip(directions, sizes, strict=True)]
+    return [tone, depth, width, edge], vectors
+
+
 _OF_PATTERN = {
     "waves": _waves,
     "noise": _noise,
@@ -257,4 +273,5 @@ _OF_PATTERN = {
     "bricks": _bricks,
     "posters": _posters,
     "wood": _wood,
+    "spots": _spots,
 }

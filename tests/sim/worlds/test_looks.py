@@ -78,6 +78,7 @@ def test_no_pattern_leaves_the_range_of_its_contrast() -> None:
             "checks": a + b + c,
             "posters": a + 4 * b,
             "wood": a + d,
+            "spots": a + 3 * b,
         }
         assert most.get(pattern, a).max() <= 1.2501
 
