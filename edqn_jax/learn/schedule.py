@@ -59,6 +59,16 @@ class Schedule:
             trained |= (first <= step) & (step < end)
         return trained
 
+    def vae_rate(self, config: Config, step: Array) -> Array | float:
+        """Returns the step size of the VAE in step `[]`: in each of its trainings it falls to the final one."""
+        first, last = config.encoder.learning_rate, config.encoder.final_learning_rate
+        if first == last:
+            return first
+        done = jnp.zeros(())
+        for start, end in self.vae_training:
+            done = jnp.where((start <= step) & (step < end), (step - start) / (end - start), done)
+        return first + done * (last - first)
+
     def samples_kept(self, config: Config, step: Array) -> Array:
         """Returns how many steps before steps `[...]` gave the VAE something to learn from, int32."""
         if config.encoder.keep_learning:

@@ -44,14 +44,15 @@ def init_networks(config: Config, key: Array) -> Networks:
     vae = embedding.init_params(config, vae_key)
     return Networks(
         vae=vae,
-        vae_optimiser=_vae_optimiser(config).init(vae) if vae else None,
+        vae_optimiser=_vae_optimiser(config.encoder.learning_rate).init(vae) if vae else None,
         encoder=embedding.inference_params(config, vae),
         agent=learner_of(config).init(config, agent_key),
     )
 
 
-def _vae_optimiser(config: Config) -> optax.GradientTransformation:
-    return skip_nonfinite(optax.flatten(optax.adam(config.encoder.learning_rate)))
+def _vae_optimiser(rate: Array | float) -> optax.GradientTransformation:
+    """Returns Adam of a step size []."""
+    return skip_nonfinite(optax.flatten(optax.adam(rate)))
 
 
 def update_vae(
@@ -70,6 +71,7 @@ def update_vae(
         return UpdateStats.without_updates(*VAE_METRICS), networks
     share = config.encoder.batch_size // config.train.shards
     kept = schedule.samples_kept(config, step) + 1
+    rate = schedule.vae_rate(config, step)
     part = keys.shape[0] / config.train.shards  # of all shards, on this device
     mirror = sensor_of(config).mirror
 
@@ -88,7 +90,7 @@ def update_vae(
         gradient, parts = jax.grad(loss, has_aux=True)(networks.vae, batch, noise)
         found = gradient, jax.tree.map(lambda x: jnp.mean(x) * part, parts)
         gradient, parts = all_sum(found, axis, after=0.0)
-        change, optimiser = _vae_optimiser(config).update(gradient, networks.vae_optimiser, networks.vae)
+        change, optimiser = _vae_optimiser(rate).update(gradient, networks.vae_optimiser, networks.vae)
         networks = dataclasses.replace(networks, vae=optax.apply_updates(networks.vae, change), vae_optimiser=optimiser)
         return networks, (parts.reconstruction, parts.kl, is_finite(gradient))
 
