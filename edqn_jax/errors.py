@@ -31,7 +31,7 @@ class DivergedError(RuntimeError):
 
 
 class CheckError(RuntimeError):
-    """A check of `--debug` or `edqn verify` failed; the message says which."""
+    """A check of `--debug`, `edqn verify` or `edqn check` failed; the message says which."""
 
 
 class StoppedError(RuntimeError):

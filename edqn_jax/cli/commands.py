@@ -9,6 +9,7 @@ from importlib import metadata
 
 import tyro
 
+from edqn_jax.cli.check import CheckArgs, check_command, parse_check
 from edqn_jax.cli.completion import CompletionArgs, completion_script, parse_completion
 from edqn_jax.cli.evaluate import EvaluateArgs, evaluate_command, parse_evaluate
 from edqn_jax.cli.events import EventsArgs, events_command, parse_events
@@ -35,6 +36,7 @@ BY_SIGNAL = 128
 COMMANDS = {
     "train": TrainCommand,
     "evaluate": EvaluateArgs,
+    "check": CheckArgs,
     "record": RecordArgs,
     "report": ReportArgs,
     "verify": VerifyArgs,
@@ -51,13 +53,14 @@ VERSIONS = ("jax", "mujoco", "mujoco-mjx")
 
 RUN_COMMANDS = {
     "evaluate": (parse_evaluate, evaluate_command),
+    "check": (parse_check, check_command),
     "record": (parse_record, record_command),
     "report": (parse_report, report_command),
     "verify": (parse_verify, verify_command),
     "export": (parse_export, export_command),
     "events": (parse_events, events_command),
 }
-"""Commands on a finished run or a file: what parses their arguments, which does not import JAX, and what runs them."""
+"""Commands on a finished run, a world or a file: what parses their arguments, without JAX, and what runs them."""
 
 
 def run_command(argv: Sequence[str] | None, stops: Stops) -> int:
@@ -155,7 +158,7 @@ def import_module_or_file(name: str) -> None:
 
 
 def _dispatch_run_command(command: str, argv: Sequence[str]) -> None:
-    """Runs a command on a finished run or a file; JAX is imported once the arguments are known to be right."""
+    """Runs a command on a finished run, a world or a file; JAX is imported once the arguments are known to be right."""
     parse, run_command = RUN_COMMANDS[command]
     args = parse(argv)
     start_jax()

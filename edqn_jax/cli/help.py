@@ -18,6 +18,7 @@ from edqn_jax.config.simulation import LOOKS
 
 TRAIN, EVALUATE, RECORD, REPORT = "edqn train", "edqn evaluate", "edqn record", "edqn report"
 VERIFY, EXPORT, EVENTS, COMPLETION = "edqn verify", "edqn export", "edqn events", "edqn completion"
+CHECK = "edqn check"
 
 ABOUT = {
     "edqn": """Train drones to fly through unknown obstacles from the events of a simulated camera, and fly them.
@@ -27,6 +28,7 @@ the name of a module), before or after a command, it knows the sensors, worlds, 
 registers (docs/howto/own_sensor.md).
 
 Examples:
+  edqn check mine.xml                        will it fly there?
   edqn train                                 train in random worlds for some minutes; files under runs/
   edqn evaluate pretrained --world mine.xml  fly the policy that comes with the package
   edqn record pretrained flight.gif          see it fly
@@ -37,6 +39,14 @@ Examples:
   edqn train                                       medium random worlds, then the paper's map, unseen
   edqn train --world mine.xml --run-dir runs/mine  your own world; the same command continues the run
   edqn train --preset paper --world paper          Table 1 of the paper""",
+    CHECK: """Say whether a policy can fly in a world: what its geoms became, its tightest way, its size, what it costs.
+
+Ends with 0 if it will fly, 1 if it will not, and 2 for a file that cannot be read.
+
+Examples:
+  edqn check mine.xml --out mine.png
+  edqn check mine.xml --policy runs/DIR --start 2 2 3 --goal 40 30 6
+  edqn check rooms --seed 3""",
     EVALUATE: """Fly a policy on missions in any world and print metrics.
 
 Options with a group, such as --air.gusts-m-s, disturb the flights; without them they are as in training.

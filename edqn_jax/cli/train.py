@@ -187,6 +187,7 @@ def train_command(argv: Sequence[str], stops: Stops) -> None:
     from edqn_jax.devices.cache import enable_compilation_cache
     from edqn_jax.devices.devices import most_that_divide, use_cpu_devices
     from edqn_jax.devices.hardware import count_cores
+    from edqn_jax.evaluation.world_check import warn_of_training
     from edqn_jax.report.gallery import prepare_gallery
     from edqn_jax.report.progress import Progress
     from edqn_jax.runs.stopping import Stop
@@ -210,6 +211,8 @@ def train_command(argv: Sequence[str], stops: Stops) -> None:
     progress = Progress(Console(quiet=not writes))
     if is_tuned_for_gpu(options, config):
         progress.message(_describe_choice(config))
+    for warning in warn_of_training(config) if writes else ():
+        progress.message(warning)
     sinks = None if run is None else _sinks_of(options, config, run, progress.message)
     stop = Stop(stops.is_requested, lambda: stops.obey_signals(progress.message))
     try:

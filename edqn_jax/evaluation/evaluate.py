@@ -16,7 +16,8 @@ from edqn_jax.devices.jax_settings import as_tested
 from edqn_jax.errors import ConfigError
 from edqn_jax.evaluation.decoder import check_predicts_distance, summarise_errors
 from edqn_jax.evaluation.metrics import shortest_paths, summarise_flights
-from edqn_jax.evaluation.missions import MissionSet, Point, load_missions
+from edqn_jax.evaluation.missions import MissionSet, load_missions
+from edqn_jax.evaluation.places import Point
 from edqn_jax.evaluation.rollouts import fly_on_all_devices
 from edqn_jax.learn.policy import Policy
 from edqn_jax.policies.functions import Function, FunctionPolicy, actor_of, as_policy, config_of

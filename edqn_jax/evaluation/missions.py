@@ -12,12 +12,13 @@ import numpy as np
 
 from edqn_jax.config import FAMILIES, Config
 from edqn_jax.errors import ConfigError
+from edqn_jax.evaluation.places import Point, check_seed, moved_ends, place_in_file
 from edqn_jax.keys import CROSSING_OF_WORLD, FILE_MISSIONS, run_streams
 from edqn_jax.planning.astar import shortest_path
 from edqn_jax.planning.free_space import find_reachable, is_reachable
 from edqn_jax.planning.lattice import CELL_M, lattice_shape
 from edqn_jax.sim.physics.airframe import load_airframe
-from edqn_jax.sim.scene.mjcf import check_scene, load_world, mjcf_of, resolve_world, widen_volume
+from edqn_jax.sim.scene.mjcf import check_scene, load_world, mjcf_of, resolve_world
 from edqn_jax.sim.scene.scene import Scene, take_scene, with_equal_capacities
 from edqn_jax.sim.task import group
 from edqn_jax.sim.task.crossing import crossing_missions, own_crossings
@@ -26,8 +27,6 @@ from edqn_jax.sim.task.missions import Missions, own_missions, random_missions, 
 from edqn_jax.sim.task.reward import Reward, check_reward
 from edqn_jax.sim.worlds import families
 from edqn_jax.sim.worlds.free_points import Cells, cells_of, free_point
-
-Point = tuple[float, float, float]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -300,15 +299,10 @@ def load_missions(
     """
     if missions < 1:
         raise ConfigError(f"--missions must be at least 1, not {missions}")
-    if seed < 0 or (seed + 1) * missions >= 2**31:
-        last = 2**31 // missions - 2
-        raise ConfigError(f"--seed must be from 0 to {last} for {missions} missions, not {seed}")
-    for role, point in (("start", start), ("goal", goal)):
-        if point is not None and not np.all(np.isfinite(point)):
-            raise ConfigError(f"--{role} must be three finite numbers, metres, not {' '.join(f'{x:g}' for x in point)}")
-    moved = {k: jnp.asarray(v, jnp.float32) for k, v in (("start", start), ("goal", goal)) if v is not None}
+    check_seed(seed, missions)
+    moved = moved_ends(start, goal)
     if group.is_multi_drone(config):
-        _check_group(config, name, missions, moved)
+        check_group(config, name, missions, moved)
     if name in FAMILIES:
         return _random_missions(config, name, missions, seed, moved)
     if missions > 1 and start is not None:
@@ -331,7 +325,7 @@ def _random_missions(config: Config, name: str, missions: int, seed: int, moved:
     return MissionSet(name, _env_params_of(pool, config, "test", seed * count))
 
 
-def _check_group(config: Config, name: str, missions: int, moved: dict[str, jax.Array]) -> None:
+def check_group(config: Config, name: str, missions: int, moved: dict[str, jax.Array]) -> None:
     """Refuses what several drones cannot fly.
 
     Raises:
@@ -355,13 +349,8 @@ def _file_missions(config: Config, name: str, missions: int, seed: int, moved: d
     """Returns one mission from start to goal of a world from a file, or many from random free starts."""
     radius, airframe, file = config.drone.body_radius_m, load_airframe(config.drone), resolve_world(name)
     loaded = load_world(file)
-    scene, note = dataclasses.replace(loaded.scene, **moved), None
-    if moved and not loaded.has_volume:
-        scene = widen_volume(scene, moved, f"'{name}'")
-        if not np.array_equal(scene.volume, loaded.scene.volume):
-            note = f"'{name}' names no flight volume: it is flown in {_box(scene)}, around its shapes, start and goal"
-    if scene.boxes.surface is not None and config.surface.pattern == "plaid":
-        note = " ".join(filter(None, (note, f"'{name}' has patterns of its own, and no plaid")))
+    placed = place_in_file(config, name, loaded, moved)
+    scene, note = placed.scene, placed.note
     if missions == 1:
         check_scene(scene, radius, names=loaded.names, title=f"'{name}'", goal_radius=config.env.goal_radius_m)
         shortest_path(scene, scene.start, scene.goal, radius)  # raises where there is no path
@@ -375,8 +364,3 @@ def _file_missions(config: Config, name: str, missions: int, seed: int, moved: d
     cells, said = _with_a_way(pool, config, name)
     many = spread_missions(pool, missions, 0.0, 0.0, missions_key, cells)
     return MissionSet(name, EnvParams(airframe, pool, many), file, " ".join(filter(None, (note, said))) or None)
-
-
-def _box(scene: Scene) -> str:
-    lower, upper = np.asarray(scene.volume)
-    return "x, y, z = " + ", ".join(f"{low:g} to {high:g}" for low, high in zip(lower, upper, strict=True)) + " m"

@@ -10,7 +10,8 @@ from edqn_jax.config import Config
 from edqn_jax.devices.jax_settings import as_tested
 from edqn_jax.errors import ConfigError
 from edqn_jax.evaluation.flight_scene import scene_of_flight
-from edqn_jax.evaluation.missions import MissionSet, Point, load_missions
+from edqn_jax.evaluation.missions import MissionSet, load_missions
+from edqn_jax.evaluation.places import Point
 from edqn_jax.evaluation.rollouts import fly_on_all_devices
 from edqn_jax.evaluation.trajectories import flight_trajectory
 from edqn_jax.files import EVENT_FILES, VIDEO, check_can_write, write_atomically

@@ -79,7 +79,7 @@ def shortest_path(
                 f"there is no path: a sphere of {radius:g} m does not fit at the {role} {point_text(point)}"
             )
     target = lattice.cell_near(goal)
-    cells, length = _search(lattice, int(lattice.flat(lattice.origin)), target)
+    cells, length = search_lattice(lattice, int(lattice.flat(lattice.origin)), target)
     points = start + cell * (lattice.index(cells) - lattice.origin)
     last = float(np.linalg.norm(goal - points[-1]))
     if last > 0.0:
@@ -107,8 +107,16 @@ def plan(scene: Scene, *, body_radius: float = 0.36) -> PlannedPath:
     return path_as_plan(path.points, time.perf_counter() - began, steps=0)
 
 
-def _search(lattice: Lattice, source: int, target: int) -> tuple[np.ndarray, float]:
+def search_lattice(
+    lattice: Lattice, source: int, target: int, price: np.ndarray | None = None
+) -> tuple[np.ndarray, float]:
     """Returns the flat cells of the shortest path from source to target, and its length in metres.
+
+    Args:
+        lattice: says which cells are passable.
+        source: flat index of the first cell.
+        target: flat index of the last cell.
+        price: [cells] factors of at least 1 by which a step into a cell is longer; None: as long as it is.
 
     Raises:
         NoPathError: if there is no path.
@@ -139,7 +147,7 @@ def _search(lattice: Lattice, source: int, target: int) -> tuple[np.ndarray, flo
         inside = np.all((at >= 0) & (at < lattice.shape), axis=-1)
         row, step = np.nonzero(inside)
         origins, cells = now[row], now[row] + offsets[step]
-        reached = g[origins] + lengths[step]
+        reached = g[origins] + (lengths[step] if price is None else lengths[step] * price[cells])
         better = reached < g[cells] - tiny
         origins, cells, step, reached = origins[better], cells[better], step[better], reached[better]
         estimate = reached + _free_length(lattice.index(cells), goal, lattice.cell)

@@ -95,7 +95,7 @@ class Lattice:
 
     def distances(self, points: np.ndarray) -> np.ndarray:
         """Returns the signed distances [E] metres of points [E, 3]."""
-        return _batched(_signed_distances, self.scene, points)
+        return clearances(self.scene, points)
 
     def compute_all_distances(self) -> None:
         """Computes the distances of all cells."""
@@ -133,6 +133,11 @@ class Lattice:
             if not leg_touches(self.scene, middles[i], point, self.radius):
                 return int(self.flat(corners[i]))
         raise NoPathError(f"there is no path: the goal {point_text(point)} is enclosed within {self.cell:g} m")
+
+
+def clearances(scene: Scene, points: np.ndarray) -> np.ndarray:
+    """Returns the signed distances [E] metres from points [E, 3], metres, to the nearest surface of a scene."""
+    return _batched(_signed_distances, scene, points)
 
 
 def edge_margin(cell: float, radius: float) -> float:

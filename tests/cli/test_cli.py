@@ -348,6 +348,7 @@ def test_help_fits_a_screen_and_has_the_defaults_of_the_world(flag):
         (["--help"], "Train drones to fly"),
         (["train", "--help"], "Train a drone"),
         (["evaluate", "--help"], "Fly a policy"),
+        (["check", "--help"], "Say whether a policy can fly"),
         (["record", "--help"], "Fly a policy"),
         (["report", "--help"], "Write one HTML file"),
         (["verify", "--help"], "Verify a finished run"),
@@ -405,6 +406,7 @@ def test_the_versions_are_those_of_the_packages():
         (["evaluate", "runs/", "--world", "me"], ["medium"]),
         (["evaluate", "runs/", "--air.gusts"], ["--air.gusts-m-s"]),
         (["record", "runs/", "--go"], ["--goal"]),
+        (["check", "me"], ["medium"]),
     ],
 )
 def test_bash_completes_commands_options_and_values(words, offered, completion):

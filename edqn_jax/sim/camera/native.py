@@ -7,6 +7,7 @@ kinds of shape of `OPERANDS` alone: scenes with any other, one's own included, a
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 import jax
@@ -46,11 +47,16 @@ NOWHERE = 1e29
 
 def can_render(scene: Scene, platform: str) -> bool:
     """Returns whether the library of "cpu" or "cuda" is at hand and draws such pictures; known when tracing."""
-    others = [shapes for kind, shapes in scene.shapes().items() if kind not in OPERANDS]
     shapes = [getattr(getattr(scene, kind), name) for kind, names in OPERANDS.items() for name in names]
-    known = not any(shapes.position.shape[-2] for shapes in others)
-    known = known and scene.planes.position.shape[-2] <= MOST_PLANES
-    return known and all(leaf.dtype == jnp.float32 for leaf in shapes) and is_available(platform)
+    known = not kinds_for_jax(scene) and all(leaf.dtype == jnp.float32 for leaf in shapes)
+    return known and is_available(platform)
+
+
+def kinds_for_jax(scene: Scene) -> list[str]:
+    """Returns the kinds of shape because of which a scene, or a pool, is drawn by JAX alone; none if C can draw it."""
+    counts = {kind: shapes.position.shape[-2] for kind, shapes in scene.shapes().items()}
+    most = dict.fromkeys(OPERANDS, math.inf) | {"planes": MOST_PLANES}
+    return [kind for kind, count in counts.items() if count > most.get(kind, 0)]
 
 
 def render_luma(config: CameraConfig, scene: Scene, origin: Array, rotation: Array, weights: Array) -> Array:

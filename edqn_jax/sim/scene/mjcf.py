@@ -33,7 +33,7 @@ from edqn_jax.config import FAMILIES
 from edqn_jax.sim.scene.distance import shape_distances
 from edqn_jax.sim.scene.mjcf_parts import looks as mjcf_looks
 from edqn_jax.sim.scene.mjcf_parts.files import SceneError, load_checked_text
-from edqn_jax.sim.scene.mjcf_parts.geoms import check_grids, geom_name, shape_of
+from edqn_jax.sim.scene.mjcf_parts.geoms import check_grids, geom_name, is_solid, shape_of
 from edqn_jax.sim.scene.mjcf_parts.looks import numbers_text
 from edqn_jax.sim.scene.mjcf_parts.motion import PREFIX, motions_of, set_in_motion, text_of
 from edqn_jax.sim.scene.motion import Throw, ball_positions, steady_aim
@@ -109,7 +109,7 @@ def load_world(path: str | Path) -> LoadedWorld:
     path = Path(path)
     if not path.is_file():
         raise SceneError(f"there is no scene file '{path.name}' in {path.parent.resolve()}")
-    model = _compile_model(path)
+    model = compile_model(path)
     data = mujoco.MjData(model)
     mujoco.mj_kinematics(model, data)
     motions = motions_of(model, str(path))
@@ -118,7 +118,7 @@ def load_world(path: str | Path) -> LoadedWorld:
     geoms: list[str] = []
     names: dict[str, list[str]] = {kind: [] for kind in kinds()}
     for geom in range(model.ngeom):
-        if model.geom_group[geom] >= 3 and not (model.geom_contype[geom] or model.geom_conaffinity[geom]):
+        if not is_solid(model, geom):
             continue
         body = int(model.body_rootid[model.geom_bodyid[geom]])
         shape = shape_of(model, data, geom, str(path), moves=body in motions)
@@ -151,7 +151,7 @@ def load_world(path: str | Path) -> LoadedWorld:
     return LoadedWorld(scene, {kind: tuple(members) for kind, members in names.items()}, path, "volume" in sites)
 
 
-def _compile_model(path: Path) -> mujoco.MjModel:
+def compile_model(path: Path) -> mujoco.MjModel:
     """Returns the model of a file, which names no other.
 
     Raises:

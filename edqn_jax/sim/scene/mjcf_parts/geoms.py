@@ -17,10 +17,16 @@ from edqn_jax.sim.scene.shapes.kind import Geom, kinds, read_shape
 
 def geom_name(model: mujoco.MjModel, geom: int) -> str:
     """Returns the name of a geom, or its number and kind where it has none."""
-    return model.geom(geom).name or f"geom number {geom} ({_kind_name(model, geom)})"
+    return model.geom(geom).name or f"geom number {geom} ({kind_name(model, geom)})"
 
 
-def _kind_name(model: mujoco.MjModel, geom: int) -> str:
+def is_solid(model: mujoco.MjModel, geom: int) -> bool:
+    """Returns whether a geom is part of the world: visible in MuJoCo's viewer, or collided with."""
+    return bool(model.geom_group[geom] < 3 or model.geom_contype[geom] or model.geom_conaffinity[geom])
+
+
+def kind_name(model: mujoco.MjModel, geom: int) -> str:
+    """Returns MuJoCo's name of a geom's kind, such as `box`."""
     return mujoco.mjtGeom(model.geom_type[geom]).name.removeprefix("mjGEOM_").lower()
 
 
@@ -97,7 +103,7 @@ def geom_of(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> Geom:
     """Returns geom number `geom` of a model, in the world's frame."""
     material = model.geom_matid[geom]
     return Geom(
-        kind=_kind_name(model, geom),
+        kind=kind_name(model, geom),
         position=data.geom_xpos[geom],
         rotation=data.geom_xmat[geom].reshape(3, 3),
         size=model.geom_size[geom],

@@ -1,0 +1,83 @@
+"""`edqn check`: exit codes, the table, and the files that were asked for."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from edqn_jax.cli import main
+from edqn_jax.devices import devices
+from tests.support.corridors import corridor
+
+
+@pytest.fixture(autouse=True)
+def elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nothing that a test makes lands in the repository; the devices are those of the tests."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(devices, "use_cpu_devices", lambda count=None: None)
+
+
+def test_a_world_that_is_flown_ends_with_0_and_writes_what_was_asked_for(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = corridor(tmp_path, 1.4)
+    assert main(["check", file.name]) == 0
+    said = capsys.readouterr()
+    assert "it will fly" in said.out and "0.70 m of clearance, 1.9 body radii" in said.out
+    assert "is tight at (12, 6, 2.5)" in said.out and "2 × box" in said.out and not said.err
+    assert list(tmp_path.iterdir()) == [file]
+    assert main(["check", "corridor.xml", "--out", "map.png", "--json", "found.json"]) == 0
+    assert Path("map.png").read_bytes().startswith(b"\x89PNG")
+    found = json.loads(Path("found.json").read_text())
+    assert found["flies"] and found["way"]["clearance_m"] == pytest.approx(0.7, abs=0.01)
+    assert found["policy"] == "pretrained" and len(found["geoms"]) == 3 and len(found["trained_in_m"]) == 6
+
+
+def test_a_world_that_is_not_flown_ends_with_1_and_says_why(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    corridor(tmp_path, 0.0)
+    assert main(["check", "corridor.xml", "--out", "map.png", "--json", "found.json"]) == 1
+    said = capsys.readouterr()
+    assert "it will not fly" in said.out
+    assert (
+        said.err.startswith("edqn: 'corridor.xml' has no way from its start to its goal") and said.err.count("\n") == 1
+    )
+    assert Path("map.png").is_file() and not json.loads(Path("found.json").read_text())["flies"]
+
+
+def test_what_is_refused_is_in_the_table_and_nothing_is_drawn(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    corridor(tmp_path, 3.0, '<geom name="egg" type="ellipsoid" size="1 2 3" pos="6 6 3"/>')
+    assert main(["check", "corridor.xml", "--out", "map.png"]) == 1
+    said = capsys.readouterr()
+    assert "1 × refused" in said.out and "egg: is of the unsupported kind ellipsoid" in said.out
+    assert "'egg' is of the unsupported kind ellipsoid; make it a box" in said.err
+    assert not Path("map.png").exists()
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        (["nowhere.xml"], "there is no scene file 'nowhere.xml'"),
+        (["mediun"], "did you mean 'medium'?"),
+        (["bad.xml"], "bad.xml is not an MJCF"),
+        (["corridor.xml", "--out", "map.jpg"], "--out 'map.jpg' must end in .png"),
+        (["corridor.xml", "--out", "nowhere/map.png"], "there is no folder"),
+        (["corridor.xml", "--policy", "nowhere"], "there is no run in 'nowhere'"),
+        (["corridor.xml", "--start", "nan", "1", "2"], "--start must be three finite numbers"),
+        (["corridor.xml", "--strat", "1", "1", "2"], "did you mean '--start'?"),
+        (["rooms", "--seed", "-1"], "--seed must be from 0"),
+    ],
+)
+def test_invalid_input_ends_with_2_a_sentence_and_nothing_written(
+    words: list[str], says: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "bad.xml").write_text("<mujoco><worldbody>")
+    corridor(tmp_path, 3.0)
+    before = sorted(tmp_path.iterdir())
+    assert main(["check", *words]) == 2
+    said = capsys.readouterr()
+    assert says in said.err and said.err.count("\n") == 1
+    assert sorted(tmp_path.iterdir()) == before
