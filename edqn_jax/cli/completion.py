@@ -13,7 +13,6 @@ import tyro
 from tyro.conf import Positional, arg
 
 from edqn_jax.cli.arguments import parse_arguments
-from edqn_jax.cli.check import CheckArgs
 from edqn_jax.cli.evaluate import EvaluateArgs
 from edqn_jax.cli.help import COMPLETION, NAMED, all_of_train, with_conditions, with_help_texts
 from edqn_jax.cli.record import RecordArgs
@@ -62,7 +61,6 @@ def completion_script(shell: Literal["bash", "zsh", "fish"], kinds: Mapping[str,
     names |= dict.fromkeys(("world", "world.name", "world.flown"), worlds)
     somewhere = Path()
     in_a_world = {
-        "check": CheckArgs("paper"),
         "evaluate": EvaluateArgs(somewhere, "paper"),
         "record": RecordArgs(somewhere, somewhere, world="paper"),
     }

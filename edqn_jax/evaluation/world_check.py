@@ -28,8 +28,10 @@ from edqn_jax.sim.task import group
 from edqn_jax.sim.worlds.families import Family, Mixture
 
 MARGIN_M = 0.6
-"""Metres of clearance beyond the body's radius below which a way is called tight: the policy of the package flew 64 %
-of 200 missions through three walls with doors of 2 m, and 26 % where they were 1.4 m wide."""
+"""Metres of clearance beyond the body's radius below which a way is called tight.
+
+In 40 x 20 x 6 m with three walls, each with a door as high, `pretrained` flew 26 % of 200 missions from random starts
+where doors were 1.4 m wide, 48 % of 1.7 m, 64 % of 2 m and 78 % of 2.6 m."""
 
 LARGER = 1.5
 """A world is much larger than those of training if a side is so many times as long."""

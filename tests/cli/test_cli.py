@@ -406,7 +406,7 @@ def test_the_versions_are_those_of_the_packages():
         (["evaluate", "runs/", "--world", "me"], ["medium"]),
         (["evaluate", "runs/", "--air.gusts"], ["--air.gusts-m-s"]),
         (["record", "runs/", "--go"], ["--goal"]),
-        (["check", "me"], ["medium"]),
+        (["check", "mine.xml", "--pol"], ["--policy"]),
     ],
 )
 def test_bash_completes_commands_options_and_values(words, offered, completion):

@@ -24,7 +24,8 @@ def drawn(folder: Path, *shapes: Shape, flies: bool = True) -> Figure:
 
 def circles(figure: Figure, axes: int) -> list[tuple[float, float, float]]:
     found = [patch for patch in figure.axes[axes].patches if isinstance(patch, Circle)]
-    return [(*map(float, patch.get_center()), float(patch.get_radius())) for patch in found]
+    places = [np.asarray(patch.get_center()) for patch in found]
+    return [(place[0], place[1], patch.get_radius()) for place, patch in zip(places, found, strict=True)]
 
 
 def test_the_tightest_place_is_marked_on_the_map_and_measured_in_a_level_section(tmp_path: Path) -> None:
