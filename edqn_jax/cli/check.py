@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 from tyro.conf import Positional, arg
 
@@ -58,6 +59,8 @@ def parse_check(argv: Sequence[str]) -> CheckArgs:
     args = parse_arguments(CheckArgs, argv, CHECK)
     if args.out is not None and args.out.suffix.lower() != ".png":
         raise ConfigError(f"--out '{args.out}' must end in .png")
+    if args.out is not None and args.json is not None and args.out.resolve() == args.json.resolve():
+        raise ConfigError(f"--out and --json are both '{args.out}'; give two files")
     check_run(args.policy)
     return args
 
@@ -107,23 +110,23 @@ def check_command(args: CheckArgs) -> None:
 def check_table(found: WorldCheck, policy: str) -> Table:
     """Returns what was found as a table for people."""
     flies = "it will fly" if found.refusal is None else "it will not fly"
-    table = Table(title=f"{found.name}: {flies}", show_header=False, title_justify="left")
+    table = Table(title=escape(f"{found.name}: {flies}"), show_header=False, title_justify="left")
     table.add_column()
     table.add_column()
     if found.survey is not None:
         geoms = found.survey.geoms
         for (geom, became), fates in _grouped(fate for fate in geoms if fate.became is not None).items():
-            table.add_row(f"{len(fates)} × {geom}", f"{_words(became)}: {_names(fates)}")
+            _add_row(table, f"{len(fates)} × {geom}", f"{_words(became)}: {_names(fates)}")
         for why, fates in _by_reason(geoms).items():
             refused = fates[0].is_refused
             row = "refused" if refused else "left out"
-            table.add_row(f"{len(fates)} × {row}", f"{_names(fates)}: {why}", style="red" if refused else None)
+            _add_row(table, f"{len(fates)} × {row}", f"{_names(fates)}: {why}", style="red" if refused else None)
         for each in found.survey.ignored:
-            table.add_row("not used", each)
+            _add_row(table, "not used", each)
         table.add_section()
     else:
         for kind, count in found.shapes.items():
-            table.add_row(f"{count} ×", _words(kind))
+            _add_row(table, f"{count} ×", _words(kind))
         table.add_section()
     if found.scene is not None:
         _add_space(table, found, policy)
@@ -137,21 +140,22 @@ def _add_space(table: Table, found: WorldCheck, policy: str) -> None:
     """Adds volume and way."""
     assert found.scene is not None
     low, high = np.asarray(found.scene.volume, np.float64)
-    table.add_row("flight volume", f"{_sides(high - low)} m")
+    _add_row(table, "flight volume", f"{_sides(high - low)} m")
     if found.trained_in:
         names: dict[str, list[str]] = {}
         for name, size in found.trained_in.items():
             names.setdefault(f"{_sides(size)} m", []).append(name)
         sizes = "\n".join(f"{size} ({', '.join(of_size)})" for size, of_size in names.items())
-        table.add_row(f"'{policy}' knows", sizes)
+        _add_row(table, f"'{policy}' knows", sizes)
     if found.moving:
-        table.add_row("shapes that move", f"{found.moving}; the way is that at the start")
+        _add_row(table, "shapes that move", f"{found.moving}; the way is that at the start")
     if found.way is None:
         return
     way, radius = found.way, found.config.drone.body_radius_m
     at = ", ".join(f"{x:.1f}" for x in way.points[way.tightest])
-    table.add_row("widest way", f"{way.length_m:.1f} m long")
-    table.add_row(
+    _add_row(table, "widest way", f"{way.length_m:.1f} m long")
+    _add_row(
+        table,
         "its tightest place",
         f"{way.clearance_m:.2f} m of clearance, {way.clearance_m / radius:.1f} body radii; at ({at}), beside "
         f"{found.nearest}",
@@ -162,12 +166,18 @@ def _add_space(table: Table, found: WorldCheck, policy: str) -> None:
 def _add_cost(table: Table, cost: Cost) -> None:
     """Adds what a world takes."""
     by = "C, on GPUs CUDA" if not cost.drawn_by_jax else f"JAX alone, because of its {_words(*cost.drawn_by_jax)}"
-    table.add_row("pictures are drawn by", f"{by}; about {_rounded(cost.picture_us)} µs each on two CPU cores")
-    table.add_row(
+    _add_row(table, "pictures are drawn by", f"{by}; about {_rounded(cost.picture_us)} µs each on two CPU cores")
+    _add_row(
+        table,
         "memory",
         f"{_bytes(cost.world_bytes)}; in a training of {cost.num_envs} environments some "
         f"{_bytes(cost.training_bytes)} more",
     )
+
+
+def _add_row(table: Table, name: str, value: str, style: str | None = None) -> None:
+    """Adds a row of plain text: names in files may look like the markup of tables."""
+    table.add_row(escape(name), escape(value), style=style)
 
 
 def _grouped(fates: Iterable[GeomFate]) -> dict[tuple[str, str], list[GeomFate]]:

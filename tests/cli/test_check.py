@@ -3,13 +3,21 @@
 from __future__ import annotations
 
 import json
+import sys
+import types
+from importlib import import_module
 from pathlib import Path
 
 import pytest
 
-from edqn_jax.cli import main
+from edqn_jax.cli import evaluate, main
 from edqn_jax.devices import devices
+from edqn_jax.evaluation import latency
+from edqn_jax.evaluation.missions import load_missions
+from edqn_jax.learn.policy import Policy
 from tests.support.corridors import corridor
+
+evaluation = import_module("edqn_jax.evaluation.evaluate")
 
 
 @pytest.fixture(autouse=True)
@@ -57,6 +65,40 @@ def test_what_is_refused_is_in_the_table_and_nothing_is_drawn(
     assert not Path("map.png").exists()
 
 
+def test_names_that_look_like_markup_are_printed_as_they_are(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    corridor(tmp_path, 3.0, '<geom name="[/b] [red]x" size=".2" pos="6 2 1"/>')
+    assert main(["check", "corridor.xml"]) == 0
+    assert "spheres: [/b] [red]x" in capsys.readouterr().out
+
+
+def test_evaluate_prints_the_warnings(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def flown(policy: Policy, world: str, **_: object) -> types.SimpleNamespace:
+        return types.SimpleNamespace(missions=load_missions(policy.config, world), figures={})
+
+    corridor(tmp_path, 1.4)
+    monkeypatch.setattr(evaluation, "evaluate", flown)
+    monkeypatch.setattr(latency, "decision_latency_ms", lambda *_, **__: {})
+    monkeypatch.setattr(evaluate, "figures_table", lambda _: "")
+    assert main(["evaluate", "pretrained", "--world", "corridor.xml"]) == 0
+    assert "the widest way of 'corridor.xml' is tight at" in capsys.readouterr().out
+
+
+def test_train_prints_the_warnings(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    stand_in = types.ModuleType("edqn_jax.runs.record")
+    stand_in.__dict__.update(train_run=lambda *_, **__: None, Draw=None)
+    monkeypatch.setitem(sys.modules, "edqn_jax.runs.record", stand_in)
+    corridor(tmp_path, 1.4)
+    assert main(["train", "--world", "corridor.xml", "--tuned-for", "cpu", "--run-dir", "here"]) == 0
+    said = " ".join(capsys.readouterr().out.split())
+    assert "is tight at" in said and "m, 1.9 radii of the body" in said
+
+
 @pytest.mark.parametrize(
     ("words", "says"),
     [
@@ -64,6 +106,7 @@ def test_what_is_refused_is_in_the_table_and_nothing_is_drawn(
         (["mediun"], "did you mean 'medium'?"),
         (["bad.xml"], "bad.xml is not an MJCF"),
         (["corridor.xml", "--out", "map.jpg"], "--out 'map.jpg' must end in .png"),
+        (["corridor.xml", "--out", "map.png", "--json", "./map.png"], "--out and --json are both 'map.png'"),
         (["corridor.xml", "--out", "nowhere/map.png"], "there is no folder"),
         (["corridor.xml", "--policy", "nowhere"], "there is no run in 'nowhere'"),
         (["corridor.xml", "--start", "nan", "1", "2"], "--start must be three finite numbers"),

@@ -39,6 +39,7 @@ TINY = (
 COMMANDS: Mapping[str, tuple[str, ...]] = {
     "train": ("train", *TINY, "--run-dir", FRESH),
     "evaluate": ("evaluate", RUN, "--missions", "2", "--json", FRESH + ".json"),
+    "check": ("check", "paper", "--policy", RUN, "--out", FRESH + ".png"),
     "record": ("record", RUN, FRESH + ".gif"),
     "report": ("report", RUN, "--missions", "1", "--out", FRESH + ".html"),
     "verify": ("verify", RUN),

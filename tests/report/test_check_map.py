@@ -19,7 +19,7 @@ from tests.support.small_worlds import RADIUS, box, small_world
 def drawn(folder: Path, *shapes: Shape, flies: bool = True) -> Figure:
     scene = small_world(*shapes).scene
     way = find_widest_way(scene, RADIUS)
-    return plot_check(scene, way, RADIUS, "a world", "a text", folder / "map.png", flies=flies)
+    return plot_check(scene, way, RADIUS, "a $world_$", "a $text_$", folder / "map.png", flies=flies)
 
 
 def circles(figure: Figure, axes: int) -> list[tuple[float, float, float]]:
@@ -53,5 +53,5 @@ def test_a_title_is_green_where_it_flies_and_a_world_without_a_way_is_drawn_alon
 ) -> None:
     figure = drawn(tmp_path, box((5.9, 0, 0), (6.1, 12, 6)), flies=flies)
     assert len(figure.axes) == 1
-    assert figure.get_suptitle() == "a world"
+    assert figure.get_suptitle() == "a $world_$"
     assert figure._suptitle.get_color() == colour  # type: ignore[attr-defined]

@@ -59,9 +59,10 @@ def plot_check(
     """
     colour = OUTCOME_COLOURS["goal"] if flies else TIGHT_COLOUR
     with open_figure(9.6 if way is not None else 6.4, 5.0, file) as figure:
-        figure.suptitle(title, x=0.01, ha="left", fontsize=13, weight="bold", color=colour)
+        plain = {"x": 0.01, "ha": "left", "parse_math": False}  # a file's name may hold dollars
+        figure.suptitle(title, fontsize=13, weight="bold", color=colour, **plain)
         lines = (textwrap.fill(line, _CHARACTERS) for line in text.splitlines())
-        figure.supxlabel("\n".join(lines), x=0.01, ha="left", fontsize=7.5, color=MUTED)
+        figure.supxlabel("\n".join(lines), fontsize=7.5, color=MUTED, **plain)
         if way is None:
             draw_map(figure.add_subplot(), scene, goal_radius_m)
             return figure

@@ -201,7 +201,7 @@ def _plot_ground(axes: Axes, view: View, volume: np.ndarray) -> None:
     for y in _ticks(y0, y1, step):
         _label(axes, view, np.array([y_edge + outwards, y, 0]), f"{y:g}")
     _label(axes, view, np.array([(x0 + x1) / 2, y0 - 4 * out, 0]), "x, m")
-    _label(axes, view, np.array([y_edge + 2.9 * outwards, (y0 + y1) / 2, 0]), "y, m")
+    _label(axes, view, np.array([y_edge + 3.4 * outwards, (y0 + y1) / 2, 0]), "y, m")
     if not from_above:
         post = view.project(np.array([[x0, y0, 0], [x0, y0, top]], np.float64))
         axes.plot(*post.T, color=MUTED, lw=0.8, zorder=3)
