@@ -20,7 +20,7 @@ from edqn_jax.planning.path import point_text
 from edqn_jax.planning.widest import WidestWay, find_widest_way, is_roomy
 from edqn_jax.sim.camera.native import kinds_for_jax
 from edqn_jax.sim.scene.distance import shape_distances
-from edqn_jax.sim.scene.mjcf import SceneError, check_scene, load_world, resolve_world
+from edqn_jax.sim.scene.mjcf import SceneError, check_scene, check_volume, load_world, resolve_world
 from edqn_jax.sim.scene.scene import Scene, scene_shapes
 from edqn_jax.sim.scene.shapes.kind import kind_of
 from edqn_jax.sim.scene.survey import Survey, survey_world
@@ -73,7 +73,7 @@ class WorldCheck:
     survey: Survey | None = None
     """Of a file."""
     scene: Scene | None = None
-    """None if it cannot be read."""
+    """None if it cannot be read, or has no volume."""
     way: WidestWay | None = None
     nearest: str = ""
     """Shape nearest to the tightest place."""
@@ -155,6 +155,10 @@ def check_world(
             return found
     placed = place_world(config, name, seed, start, goal)
     scene, radius = placed.scene, config.drone.body_radius_m
+    try:
+        check_volume(scene, placed.title)
+    except SceneError as error:
+        return dataclasses.replace(found, refusal=str(error))
     found = dataclasses.replace(found, scene=scene, note=placed.note, cost=estimate_cost(config, scene))
     try:
         check_scene(scene, radius, names=placed.names, title=placed.title, goal_radius=config.env.goal_radius_m)

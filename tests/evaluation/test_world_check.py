@@ -129,6 +129,14 @@ def test_each_geom_that_is_refused_has_its_reason(tmp_path: Path) -> None:
     assert sum(fate.became is not None for fate in found.survey.geoms) == 3
 
 
+@pytest.mark.parametrize(("size", "said"), [("12 1e-9 3", "is empty"), ("1200 6 3", "is longer than 500 m")])
+def test_a_volume_in_which_nothing_flies_is_named_and_not_drawn(size: str, said: str, tmp_path: Path) -> None:
+    file = corridor(tmp_path, WIDE)
+    file.write_text(file.read_text().replace('size="12.0 6 3"', f'size="{size}"'))
+    found = check_world(ROOMS, str(file))
+    assert found.scene is None and found.refusal is not None and said in found.refusal
+
+
 @pytest.mark.parametrize("text", ["<mujoco><worldbody>", "not a world", "<mujoco/>"])
 def test_a_file_that_cannot_be_read_is_invalid_input(text: str, tmp_path: Path) -> None:
     (tmp_path / "bad.xml").write_text(text)

@@ -41,6 +41,11 @@ def test_the_tightest_place_is_marked_on_the_map_and_measured_in_a_level_section
     assert np.asarray(dot)[0][1] == pytest.approx(0.7, abs=0.01)
 
 
+def test_a_shape_without_bounds_leaves_the_map_as_large_as_the_volume(tmp_path: Path) -> None:
+    figure = drawn(tmp_path, box((-1e20, -1e20, -1), (1e20, 1e20, 0.1)))
+    assert np.ptp(figure.axes[0].get_xlim()) == pytest.approx(12.0, rel=0.1)
+
+
 def test_what_is_near_above_and_below_is_shown_in_an_upright_section(tmp_path: Path) -> None:
     figure = drawn(tmp_path, box((5.9, 0, 0), (6.1, 12, 2.3)), box((5.9, 0, 3.7), (6.1, 12, 6)))
     assert figure.axes[1].get_ylabel() == "z, m"

@@ -28,6 +28,7 @@ CLEARANCE = LinearSegmentedColormap.from_list("clearance", [TIGHT_COLOUR, "#e69f
 _CLOSE_UP_M = 2.5  # half the side of the section around the tightest place, at least
 _WIDE = 1.5  # width of it over its height
 _PIXELS = 241  # along each side of it
+_BEYOND = 0.03  # of the volume's longer side, shown around it
 _CHARACTERS = 150  # of a line of text
 _DIRECTIONS = 500  # in which the nearest surface is looked for
 _STEEP = 0.7  # of a unit vector: what is nearest is then above or below
@@ -64,12 +65,12 @@ def plot_check(
         lines = (textwrap.fill(line, _CHARACTERS) for line in text.splitlines())
         figure.supxlabel("\n".join(lines), fontsize=7.5, color=MUTED, **plain)
         if way is None:
-            draw_map(figure.add_subplot(), scene, goal_radius_m)
+            _plot_map(figure.add_subplot(), scene, goal_radius_m)
             return figure
         grid = figure.add_gridspec(2, 2, width_ratios=(1.35, 1.0), height_ratios=(1.45, 1.0))
         scale = Normalize(radius, radius + COMFORT_M)
         above = figure.add_subplot(grid[:, 0])
-        draw_map(above, scene, goal_radius_m)
+        _plot_map(above, scene, goal_radius_m)
         hidden = is_occluded(way.points, make_cutaway(scene, MAP).shown, MAP)
         _plot_way(above, way.points[:, :2], way.clearance, scale, hidden)
         reach = max(_CLOSE_UP_M, 1.4 * way.clearance_m)
@@ -77,6 +78,14 @@ def plot_check(
         _plot_section(figure.add_subplot(grid[0, 1]), scene, way, radius, reach, scale)
         _plot_profile(figure.add_subplot(grid[1, 1]), way, radius, scale)
     return figure
+
+
+def _plot_map(axes: Axes, scene: Scene, goal_radius_m: float) -> None:
+    """Draws the world from above as far as its volume reaches, however large its shapes are."""
+    draw_map(axes, scene, goal_radius_m)
+    (x0, y0, _), (x1, y1, _) = np.asarray(scene.volume, np.float64)
+    beyond = _BEYOND * max(x1 - x0, y1 - y0)
+    axes.set(xlim=(x0 - beyond, x1 + beyond), ylim=(y0 - beyond, y1 + beyond))
 
 
 def _plot_way(

@@ -195,6 +195,22 @@ def widen_volume(scene: Scene, points: Mapping[str, ArrayLike], title: str) -> S
     return dataclasses.replace(scene, volume=jnp.asarray(np.stack([lower, upper]), jnp.float32))
 
 
+def check_volume(scene: Scene, title: str) -> np.ndarray:
+    """Returns the lower and upper corner of a flight volume, [2, 3] metres.
+
+    Raises:
+        SceneError: if the volume is empty or longer than `LONGEST_VOLUME` along an axis.
+    """
+    lower, upper = volume = np.asarray(scene.volume)
+    if not np.all(upper > lower):
+        raise SceneError(f"the flight volume of {title}, {_point(lower)} to {_point(upper)}, is empty")
+    if not np.all(upper - lower <= LONGEST_VOLUME):
+        raise SceneError(
+            f"the flight volume of {title}, {_point(lower)} to {_point(upper)}, is longer than {LONGEST_VOLUME:g} m"
+        )
+    return volume
+
+
 def check_scene(
     scene: Scene,
     body_radius: float,
@@ -216,13 +232,7 @@ def check_scene(
         SceneError: if either is missing, outside the flight volume or too close to a shape, if the start is at the goal
             already, or if the volume is empty or longer than `LONGEST_VOLUME` along an axis.
     """
-    lower, upper = np.asarray(scene.volume)
-    if not np.all(upper > lower):
-        raise SceneError(f"the flight volume of {title}, {_point(lower)} to {_point(upper)}, is empty")
-    if not np.all(upper - lower <= LONGEST_VOLUME):
-        raise SceneError(
-            f"the flight volume of {title}, {_point(lower)} to {_point(upper)}, is longer than {LONGEST_VOLUME:g} m"
-        )
+    lower, upper = check_volume(scene, title)
     for role, where in (("start", scene.start), ("goal", scene.goal)):
         point = np.asarray(where)
         if not np.all(np.isfinite(point)):
