@@ -20,7 +20,7 @@ def within(phase: NDArray, width: float) -> NDArray:
 
 
 def trapezoid(phase: NDArray, width: float, edge: float) -> NDArray:
-    """1 around the whole numbers, 0 far from them, and straight slopes of width `edge` whose middles are `width` apart."""
+    """1 around the whole numbers, 0 far off; slopes of width `edge` between, whose middles are `width` apart."""
     away = np.abs(phase - np.round(phase))
     return np.clip((width / 2 - away) / edge + 0.5, 0.0, 1.0)
 

@@ -77,7 +77,7 @@ def test_a_geom_of_which_nothing_is_said_is_blank_beside_others(tmp_path: Path) 
     [
         ("surface:door", STRIPES, "names no solid geom 'door'"),
         ("surface:it", "3 0.5", f"must have {SURFACE_NUMBERS} finite numbers"),
-        ("surface:it", STRIPES.replace("3 ", "7 ", 1), "must begin with a pattern, 0 to 6"),
+        ("surface:it", STRIPES.replace("3 ", "8 ", 1), "must begin with a pattern, 0 to 7"),
         ("surface:it", STRIPES.replace("0.5", "1.5", 1), "a contrast from 0 to 1"),
         ("daylight", "0 0 1 0.5 1 1", "'daylight' must have a direction of length 1"),
         ("daylight", "0 0 2 0.5 1 1 1", "'daylight' must have a direction of length 1"),
