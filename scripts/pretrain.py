@@ -45,10 +45,12 @@ LOOKS = (
     *("--encoder.patch-layers", "128", "64", "24", "--encoder.joint-layers", "512", "256"),
     *("--encoder.patch-overlap", "2", "--encoder.warmup-updates-per-step", "64"),
     *("--encoder.retrain-at", "0.08", "0.3", "--encoder.retrain-decisions", "6291456"),
+    *("--encoder.final-learning-rate", "1e-4", "--env.closeness-weight", "0.25", "--air.drag"),
+    *("--body.mass-share", "0.2", "--motors.gain-share", "0.2", "--motors.lag-s", "0.05"),
     *("--train.validation-missions", "64"),
 )
 """Further options of the policy of any look (`--looks`): surfaces and event sensors that are drawn, a third frame, from
-which motion shows, and an encoder that is larger and learns five times as long (docs/surfaces.md)."""
+which motion shows, an encoder that is larger and learns five times as long (docs/surfaces.md), and errors of tracking."""
 
 VALIDATED_EVERY = {"open": 20_000_000, "mixed": 0}
 """Decisions between validations, by the worlds; 0 validates at the end alone: several seeds take minutes for one."""
@@ -56,7 +58,7 @@ VALIDATED_EVERY = {"open": 20_000_000, "mixed": 0}
 DECISIONS = {"open": 60_000_000, "mixed": 300_000_000}
 """Decisions of each seed, by the worlds that can be trained on."""
 
-OF_LOOKS = 190_000_000
+OF_LOOKS = 220_000_000
 """Decisions of each seed of the policy of any look."""
 
 MISSIONS = 1000

@@ -20,6 +20,9 @@ from outer.poses import Track
 ROTORPY_STEP_S = 0.005
 """How often RotorPy's controller acts."""
 
+SETPOINT_M_S2 = 8.0
+"""How fast the velocity changes that RotorPy's controller is given, as an autopilot limits it."""
+
 
 @dataclasses.dataclass(frozen=True)
 class Body:
@@ -74,10 +77,13 @@ class RotorPyFlight:
     """RotorPy's quadrotor with drag and motor lag, flown by its SE3 controller with the velocity as its reference.
 
     The reference's position is where the drone is, so that the controller follows the velocity alone: in proportion,
-    since it has no integral part, and drag takes its share.
+    since it has no integral part, and drag takes its share. It knows no limit of acceleration: a velocity that jumps
+    by 8 m/s tilts the drone by 80 degrees and turns it by up to 180, so the reference changes by `SETPOINT_M_S2`.
     """
 
-    def __init__(self, start: NDArray[np.float64], goal: NDArray[np.float64], max_yaw_rate: float) -> None:
+    def __init__(
+        self, start: NDArray[np.float64], goal: NDArray[np.float64], max_yaw_rate: float, setpoint_m_s2: float
+    ) -> None:
         vehicles = require_extra("rotorpy.vehicles.multirotor", extra="transfer")
         control = require_extra("rotorpy.controllers.quadrotor_control", extra="transfer")
         self._params: dict[str, Any] = require_extra(
@@ -97,6 +103,7 @@ class RotorPyFlight:
         with contextlib.redirect_stdout(io.StringIO()):
             self._vehicle = vehicles.Multirotor(self._params, self._state, control_abstraction="cmd_motor_speeds")
         self._yaw, self._max_yaw_rate = 2 * half, max_yaw_rate
+        self._velocity, self._setpoint_m_s2 = np.zeros(3), setpoint_m_s2
 
     def body(self) -> Body:
         """Returns what the drone knows of itself now."""
@@ -116,9 +123,12 @@ class RotorPyFlight:
         for step in range(round(seconds / ROTORPY_STEP_S)):
             short = np.angle(np.exp(1j * (command.yaw - self._yaw)))
             self._yaw += float(np.clip(short, -most, most))
+            change = np.asarray(command.velocity, np.float64) - self._velocity
+            size = max(float(np.linalg.norm(change)), 1e-9)
+            self._velocity = self._velocity + change * min(1.0, self._setpoint_m_s2 * ROTORPY_STEP_S / size)
             wanted = {
                 "x": self._state["x"],
-                "x_dot": np.asarray(command.velocity, np.float64),
+                "x_dot": self._velocity,
                 "x_ddot": np.zeros(3),
                 "yaw": self._yaw,
                 "yaw_dot": 0.0,
@@ -133,12 +143,13 @@ class RotorPyFlight:
 
 
 def start_flight(kind: str, environment: Environment, mission: int, max_yaw_rate: float) -> Flight:
-    """Returns a drone at rest at a mission's start, facing the goal; `kind` is `own` or `rotorpy`.
+    """Returns a drone at rest at a mission's start, facing the goal; `kind` is `own`, `rotorpy` or `rotorpy-steps`.
 
     Raises:
         MissingPackageError: if RotorPy is not installed.
     """
     if kind == "own":
         return OwnFlight(environment, mission)
+    limit = np.inf if kind == "rotorpy-steps" else SETPOINT_M_S2
     scene = jax.tree.map(np.asarray, environment.scene(mission))
-    return RotorPyFlight(np.asarray(scene.start, np.float64), np.asarray(scene.goal, np.float64), max_yaw_rate)
+    return RotorPyFlight(np.asarray(scene.start, np.float64), np.asarray(scene.goal, np.float64), max_yaw_rate, limit)

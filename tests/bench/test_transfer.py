@@ -11,6 +11,7 @@ import pytest
 import edqn_jax
 from edqn_jax.interop.deployment.runner import Command
 from edqn_jax.learn.policy import Policy
+from edqn_jax.sim.actions import ACTIONS
 from edqn_jax.sim.environment import Environment
 from outer import event_cameras, flights
 from outer.poses import Track, heading_of
@@ -68,8 +69,12 @@ def test_what_a_policy_never_saw_is_said(words, config, told):
     assert len(said) == len(told) and all(part in each for part, each in zip(told, said, strict=True))
 
 
+def rotorpy(setpoint_m_s2: float = flights.SETPOINT_M_S2) -> flights.RotorPyFlight:
+    return flights.RotorPyFlight(np.array([0.0, 0.0, 5.0]), np.array([10.0, 0.0, 5.0]), 2.0, setpoint_m_s2)
+
+
 def rotorpy_after(velocity: tuple[float, float, float], seconds: float) -> tuple[flights.RotorPyFlight, Track]:
-    flight = flights.RotorPyFlight(np.array([0.0, 0.0, 5.0]), np.array([10.0, 0.0, 5.0]), 2.0)
+    flight = rotorpy()
     command = Command(0, np.array(velocity, np.float32), 0.0, np.zeros(27, np.float32))
     return flight, flight.fly(command, seconds)
 
@@ -82,8 +87,19 @@ def test_rotorpy_hovers_and_loses_some_speed_to_drag():
     assert np.abs(flight.body().velocity[1:]).max() < 0.1
 
 
+@pytest.mark.parametrize("limit, turned_deg", [(flights.SETPOINT_M_S2, (0, 20)), (np.inf, (60, 360))])
+def test_a_setpoint_that_jumps_makes_rotorpys_controller_turn_the_drone(limit, turned_deg):
+    flight, turned = rotorpy(limit), []
+    for move in ACTIONS[np.random.default_rng(3).integers(0, len(ACTIONS), 8)]:
+        velocity = 4 * move / max(1.0, np.linalg.norm(move))
+        command = Command(0, velocity.astype(np.float32), 0.0, np.zeros(27, np.float32))
+        turned += [abs(heading_of(each)) for each in flight.fly(command, 0.26).quaternion]
+    least, most = np.radians(turned_deg)
+    assert least <= max(turned) <= most
+
+
 def test_rotorpy_turns_to_the_commanded_heading():
-    flight = flights.RotorPyFlight(np.array([0.0, 0.0, 5.0]), np.array([10.0, 0.0, 5.0]), 2.0)
+    flight = rotorpy()
     command = Command(0, np.zeros(3, np.float32), 1.0, np.zeros(27, np.float32))
     flight.fly(command, 0.3)
     assert flight.body().yaw_rate > 0.5
