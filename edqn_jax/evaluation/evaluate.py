@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -70,6 +71,7 @@ def evaluate(
     shuffle_codes: bool = False,
     decoder: bool = False,
     conditions: Layer | None = None,
+    phase: Callable[[str], None] = lambda _: None,
 ) -> Evaluation:
     """Flies a policy greedily, every mission once, and measures.
 
@@ -89,6 +91,7 @@ def evaluate(
             `decoder.summarise_errors`. True distances are then rendered at every decision.
         conditions: wind and other disturbances, and drones, in place of the policy's own, by group, such as
             `{"air": {"gusts_m_s": 5.0}}`; see `config.CONDITIONS`.
+        phase: called with the name of each phase as it begins, such as `compiling`.
 
     Raises:
         ConfigError: if there is no such world or condition, the missions cannot be flown, the policy cannot fly, or
@@ -102,6 +105,7 @@ def evaluate(
     actor = actor_of(policy, config)
     if decoder:
         check_predicts_distance(config, actor)
+    phase("preparing worlds")
     mission_set = load_missions(config, str(world or config.world.name), missions, seed, start, goal)
     flights = fly_on_all_devices(
         config,
@@ -112,7 +116,9 @@ def evaluate(
         record=record,
         shuffle_codes=shuffle_codes,
         decoder_errors=decoder,
+        phase=phase,
     )
+    phase("shortest paths")
     shortest = shortest_paths(config, mission_set.env_params, np.asarray(flights.outcome) == Outcome.GOAL)
     notes = " ".join(filter(None, (mission_set.note, _unseen_look(policy, config))))
     mission_set = dataclasses.replace(mission_set, note=notes or None)
