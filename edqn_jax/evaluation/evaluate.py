@@ -71,7 +71,7 @@ def evaluate(
     shuffle_codes: bool = False,
     decoder: bool = False,
     conditions: Layer | None = None,
-    phase: Callable[[str], None] = lambda _: None,
+    phase: Callable[[str], None] | None = None,
 ) -> Evaluation:
     """Flies a policy greedily, every mission once, and measures.
 
@@ -98,6 +98,7 @@ def evaluate(
             there is nothing to shuffle, or no decoder that predicts distance.
     """
     check_not_forked()
+    phase = phase or (lambda _: None)
     policy = as_policy(policy, world)
     config = with_conditions(config_of(policy), conditions or {}, "evaluate")
     if shuffle_codes:

@@ -22,6 +22,7 @@ import numpy as np
 from jax import Array, lax
 
 from edqn_jax.devices.hardware import count_cores
+from edqn_jax.devices.jax_settings import keep_tested_settings
 from edqn_jax.planning.astar import shortest_path
 from edqn_jax.planning.lattice import NoPathError, touches_on_leg
 from edqn_jax.planning.tightening import CORNERS, tighten
@@ -65,7 +66,7 @@ def shortest_lengths(
 
     numbers = range(len(scene_of))
     first = [length(number) for number in numbers[:1]]  # compiles
-    with ThreadPoolExecutor(count_cores(), thread_name_prefix="shortest") as threads:
+    with ThreadPoolExecutor(count_cores(), "shortest", initializer=keep_tested_settings) as threads:
         return np.array([*first, *threads.map(length, numbers[1:])])
 
 

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from edqn_jax.devices.jax_settings import use_tested_settings
 from edqn_jax.planning import corridor
 from edqn_jax.planning.astar import shorten_path, shortest_path
 from edqn_jax.planning.corridor import shortest_lengths
@@ -90,6 +91,16 @@ def test_missions_are_those_of_their_worlds():
     assert found[0] > found[2] + 0.2
     assert found[2] == pytest.approx(8.0)
     assert found[1] == pytest.approx(np.linalg.norm(goals[1] - starts[1]), rel=1e-6)
+
+
+def test_threads_keep_the_settings_that_were_tested():
+    scenes = [small_world().scene] * 3
+    jax.config.update("jax_enable_x64", True)
+    try:
+        with use_tested_settings():
+            np.testing.assert_allclose(lengths_in(*scenes), 8.0, rtol=1e-6)
+    finally:
+        jax.config.update("jax_enable_x64", False)
 
 
 def test_of_no_missions_there_are_no_lengths():
