@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
-from collections.abc import Iterator, Sequence
+import sys
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -105,18 +107,20 @@ def evaluate_command(args: EvaluateArgs) -> None:
     if args.json is not None and args.trajectories is not None and args.json.resolve() == args.trajectories.resolve():
         raise ConfigError(f"--json and --trajectories are both '{args.json}'; give two files")
     policy = find_policy(args.run, args.world)
-    evaluation = evaluate(
-        policy,
-        args.world,
-        missions=args.missions,
-        seed=args.seed,
-        start=args.start,
-        goal=args.goal,
-        record=args.trajectories is not None,
-        shuffle_codes=args.shuffle_codes,
-        decoder=args.decoder,
-        conditions=args.conditions,
-    )
+    with _shown_phases() as phase:
+        evaluation = evaluate(
+            policy,
+            args.world,
+            missions=args.missions,
+            seed=args.seed,
+            start=args.start,
+            goal=args.goal,
+            record=args.trajectories is not None,
+            shuffle_codes=args.shuffle_codes,
+            decoder=args.decoder,
+            conditions=args.conditions,
+            phase=phase,
+        )
     config = config_of(policy)
     figures = {
         "run": str(args.run),
@@ -137,6 +141,21 @@ def evaluate_command(args: EvaluateArgs) -> None:
         write_atomically(args.json, json.dumps(to_plain_json(figures), indent=2, allow_nan=False) + "\n")
     if args.trajectories is not None:
         write_trajectories(config, evaluation.missions, evaluation.flights, args.trajectories)
+
+
+@contextlib.contextmanager
+def _shown_phases() -> Iterator[Callable[[str], None]]:
+    """Yields a function that shows a phase, with its clock, on standard error where that is a terminal."""
+    from edqn_jax.report.progress import Progress
+
+    if not sys.stderr.isatty():
+        yield lambda _: None
+        return
+    progress = Progress(Console(stderr=True))
+    try:
+        yield progress.phase
+    finally:
+        progress.stop()
 
 
 def _policy_source(policy: Policy | FunctionPolicy, run: Path) -> dict[str, Any]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -71,6 +72,7 @@ def evaluate(
     shuffle_codes: bool = False,
     decoder: bool = False,
     conditions: Layer | None = None,
+    phase: Callable[[str], None] | None = None,
 ) -> Evaluation:
     """Flies a policy greedily, every mission once, and measures.
 
@@ -90,12 +92,14 @@ def evaluate(
             `decoder.summarise_errors`. True distances are then rendered at every decision.
         conditions: wind and other disturbances, and drones, in place of the policy's own, by group, such as
             `{"air": {"gusts_m_s": 5.0}}`; see `config.CONDITIONS`.
+        phase: called with the name of each phase as it begins, such as `compiling`.
 
     Raises:
         ConfigError: if there is no such world or condition, the missions cannot be flown, the policy cannot fly, or
             there is nothing to shuffle, or no decoder that predicts distance.
     """
     check_not_forked()
+    phase = phase or (lambda _: None)
     policy = as_policy(policy, world)
     config = with_conditions(config_of(policy), conditions or {}, "evaluate")
     if shuffle_codes:
@@ -103,6 +107,7 @@ def evaluate(
     actor = actor_of(policy, config)
     if decoder:
         check_predicts_distance(config, actor)
+    phase("preparing worlds")
     mission_set = load_missions(config, str(world or config.world.name), missions, seed, start, goal)
     flights = fly_on_all_devices(
         config,
@@ -113,7 +118,9 @@ def evaluate(
         record=record,
         shuffle_codes=shuffle_codes,
         decoder_errors=decoder,
+        phase=phase,
     )
+    phase("shortest paths")
     shortest = shortest_paths(config, mission_set.env_params, np.asarray(flights.outcome) == Outcome.GOAL)
     notes = " ".join(filter(None, (mission_set.note, _unseen_look(policy, config))))
     mission_set = dataclasses.replace(mission_set, note=notes or None)

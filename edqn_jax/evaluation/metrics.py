@@ -5,13 +5,10 @@ from __future__ import annotations
 import math
 from typing import Any
 
-import jax
 import numpy as np
 
 from edqn_jax.config import Config
-from edqn_jax.planning.astar import shortest_path
-from edqn_jax.planning.lattice import NoPathError
-from edqn_jax.sim.scene.scene import take_scene
+from edqn_jax.planning.corridor import shortest_lengths
 from edqn_jax.sim.task.env import EnvParams
 from edqn_jax.sim.task.flights import Flights
 from edqn_jax.sim.task.outcomes import Outcome
@@ -46,18 +43,11 @@ def fill_unknown_lengths(shortest: np.ndarray, path_lengths: np.ndarray) -> np.n
 
 
 def shortest_paths(config: Config, env_params: EnvParams, wanted: np.ndarray) -> np.ndarray:
-    """Returns the length [M] of A*'s path for each of the `wanted` [M] missions, metres; NaN for the others."""
-    scene_of, starts, goals = (
-        np.asarray(x) for x in (env_params.missions.scene, env_params.missions.start, env_params.missions.goal)
-    )
-    pool = jax.tree.map(np.asarray, env_params.pool)
-    lengths = np.full(len(starts), np.nan)
-    for i in np.flatnonzero(wanted):
-        try:
-            scene = take_scene(pool, scene_of[i])
-            lengths[i] = shortest_path(scene, starts[i], goals[i], config.drone.body_radius_m).length_m
-        except NoPathError:
-            continue  # a gap too narrow for the half-metre lattice
+    """Returns the length [M] of the shortest path of each `wanted` [M] mission, metres; NaN for others, and without."""
+    missions, chosen = env_params.missions, np.flatnonzero(wanted)
+    scene_of, starts, goals = (np.asarray(x)[chosen] for x in (missions.scene, missions.start, missions.goal))
+    lengths = np.full(len(wanted), np.nan)
+    lengths[chosen] = shortest_lengths(env_params.pool, scene_of, starts, goals, config.drone.body_radius_m)
     return lengths
 
 

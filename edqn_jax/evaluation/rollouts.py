@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+from collections.abc import Callable
 from functools import partial
 from typing import Any
 
@@ -115,13 +116,16 @@ def fly_on_all_devices(
     record: bool = False,
     shuffle_codes: bool = False,
     decoder_errors: bool = False,
+    phase: Callable[[str], None] = lambda _: None,
 ) -> Flights:
-    """Runs `fly_missions` on all devices and returns the flights on the host."""
+    """Runs `fly_missions` on all devices and returns the flights on the host; `phase` is called as a phase begins."""
+    phase("compiling")
     mesh = Mesh(np.asarray(jax.devices()), ("mission",))
     env_params, params = jax.device_put((env_params, params), NamedSharding(mesh, PartitionSpec()))
     key = run_streams(seed).flights
     extras = Extras(record, shuffle_codes, decoder_errors)
     flights = fly_missions(config, env_params, params, key, actor=actor, extras=extras, mesh=mesh)
+    phase("flying")  # compiled, and not waited for
     return jax.tree.map(np.asarray, flights)
 
 

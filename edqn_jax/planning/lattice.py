@@ -30,7 +30,9 @@ CELL_M, FINE_M = 0.5, 0.25
 
 _MOST_FINE = 4_000_000  # cells that a second search may take
 
-_STRIDE = 0.02  # metres; undetected penetration of at most 0.01^2 / 2 r = 0.14 mm
+STRIDE_M = 0.02
+"""Shortest step of a check along a leg; undetected penetration of at most 0.01^2 / 2 r = 0.14 mm."""
+
 _LANES = (64, 512, 4096, 32768)  # batches are padded to one of these, to compile few programs
 
 
@@ -151,12 +153,19 @@ def edge_margin(cell: float, radius: float) -> float:
 
 def leg_touches(scene: Scene, start: np.ndarray, end: np.ndarray, radius: float) -> bool:
     """Returns whether a sphere touches anything on the straight leg from `start` [3] to `end` [3], metres."""
-    return bool(_long_touches(scene, np.float32(start), np.float32(end), np.float32(radius)))
+    return bool(_touches_on_leg(scene, np.float32(start), np.float32(end), np.float32(radius)))
 
 
-@jax.jit
-def _long_touches(scene: Scene, start: Array, end: Array, radius: Array) -> Array:
-    """Returns whether the sphere touches anything on a straight leg of any length, in steps of the clearance."""
+def touches_on_leg(scene: Scene, start: Array, end: Array, radius: Array, stride: float = STRIDE_M) -> Array:
+    """Returns whether the sphere touches anything on a straight leg of any length, in steps of the clearance.
+
+    Args:
+        scene: one world.
+        start: [3] metres.
+        end: [3] metres.
+        radius: [] metres.
+        stride: metres, of the shortest step.
+    """
     length = jnp.sqrt(jnp.sum((end - start) ** 2))
     direction = (end - start) / jnp.maximum(length, 1e-9)
 
@@ -165,12 +174,16 @@ def _long_touches(scene: Scene, start: Array, end: Array, radius: Array) -> Arra
 
     def walk(state: tuple[Array, Array]) -> tuple[Array, Array]:
         along, free = state
-        along = jnp.minimum(along + jnp.maximum(free, _STRIDE), length)
+        along = jnp.minimum(along + jnp.maximum(free, stride), length)
         return along, gap(along)
 
-    zero = jnp.zeros(())
-    _, free = jax.lax.while_loop(lambda s: (s[0] < length) & (s[1] >= 0), walk, (zero, gap(zero)))
+    # From a stride before the start: the distance is written once in the program, which is then compiled sooner.
+    before = jnp.asarray(-stride, jnp.float32), jnp.zeros(())
+    _, free = jax.lax.while_loop(lambda s: (s[0] < length) & (s[1] >= 0), walk, before)
     return free < 0
+
+
+_touches_on_leg = jax.jit(touches_on_leg)
 
 
 @jax.jit

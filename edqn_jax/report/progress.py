@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import time
 from collections.abc import Mapping
 from typing import Any
@@ -95,7 +96,13 @@ class Progress:
     def _start_live(self) -> None:
         if self._live is None:
             # Drawn anew by a thread of its own, so that the clock runs on while the host waits.
-            self._live = Live(get_renderable=self._panel, console=self._console, refresh_per_second=4)
+            # What is printed meanwhile appears above it, unless it goes into a pipe.
+            self._live = Live(
+                get_renderable=self._panel,
+                console=self._console,
+                refresh_per_second=4,
+                redirect_stdout=sys.stdout.isatty(),
+            )
             self._live.start()
 
     def _decisions(self) -> int:

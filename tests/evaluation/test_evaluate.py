@@ -5,6 +5,8 @@ from __future__ import annotations
 import dataclasses
 import json
 import re
+import sys
+from collections.abc import Callable
 from importlib.metadata import version
 from pathlib import Path
 
@@ -20,12 +22,12 @@ from edqn_jax.evaluation import evaluate as evaluation
 from edqn_jax.evaluation import latency
 from edqn_jax.evaluation.judge import load_judge, replay_contact
 from edqn_jax.evaluation.latency import decision_latency_ms
-from edqn_jax.evaluation.metrics import spl, summarise_flights, wilson_interval
-from edqn_jax.evaluation.missions import MissionSet
+from edqn_jax.evaluation.metrics import shortest_paths, spl, summarise_flights, wilson_interval
+from edqn_jax.evaluation.missions import MissionSet, load_missions
 from edqn_jax.learn.actor import AgentActor
 from edqn_jax.learn.policy import fresh_policy
 from edqn_jax.runs.checkpoints.params import save_params
-from edqn_jax.runs.policies import load_run
+from edqn_jax.runs.policies import load_policy, load_run
 from edqn_jax.sim.task.flights import Closest, Flights
 from edqn_jax.sim.task.outcomes import Outcome
 from tests.support.policies import CONFIG, always
@@ -162,7 +164,7 @@ def test_a_policy_that_sees_nothing_has_nothing_to_shuffle(tmp_path):
 def test_the_command_shuffles_codes_only_when_asked_and_says_so(shuffle_codes, run, tmp_path, monkeypatch, capsys):
     asked = []
 
-    def fly(*_: object, **options: object) -> Flights:
+    def fly(*_: object, phase: object, **options: object) -> Flights:
         asked.append(options)
         return four_flights()
 
@@ -204,6 +206,37 @@ def test_the_command_flies_under_the_conditions_that_it_is_given_and_says_so(run
         evaluate_command(EvaluateArgs(run, conditions={"body": {"mass_share": 2.0}}))
     with pytest.raises(ConfigError, match="'agent.history' is a policy's own; conditions are env, events, air, body"):
         evaluate_command(EvaluateArgs(run, conditions={"agent": {"history": 3}}))
+
+
+@pytest.mark.parametrize("terminal", [False, True])
+def test_a_terminal_sees_the_phases_and_a_pipe_nothing(terminal, run, tmp_path, monkeypatch, capsys):
+    def fly(*_: object, phase: Callable[[str], None], **__: object) -> Flights:
+        phase("flying")
+        return four_flights()
+
+    # Stand-ins for what would compile.
+    monkeypatch.setattr(evaluation, "load_missions", lambda *_: MissionSet("paper", None, None))  # type: ignore[arg-type]
+    monkeypatch.setattr(evaluation, "fly_on_all_devices", fly)
+    monkeypatch.setattr(evaluation, "shortest_paths", lambda *_: np.full(4, 10.0))
+    monkeypatch.setattr(latency, "decision_latency_ms", lambda *_, **__: {"median": 1.0, "p99": 2.0})
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: terminal)
+    monkeypatch.setenv("TERM", "xterm")
+    evaluate_command(EvaluateArgs(run, missions=4))
+    said = capsys.readouterr()
+    assert "reached the goal" in said.out
+    assert "in all" not in said.out
+    assert ("shortest paths 0:00" in said.err) is terminal
+    assert terminal or said.err == ""
+    evaluation.evaluate(load_policy(run), missions=4)
+    assert capsys.readouterr() == ("", "")
+
+
+def test_only_wanted_missions_have_shortest_paths():
+    missions = load_missions(CONFIG, "paper", 3)
+    lengths = shortest_paths(CONFIG, missions.env_params, np.array([False, True, False]))
+    apart = np.linalg.norm(missions.env_params.missions.goal - missions.env_params.missions.start, axis=1)
+    assert np.isnan(lengths[[0, 2]]).all()
+    assert apart[1] * (1 - 1e-6) <= lengths[1] <= 1.4 * apart[1]
 
 
 @pytest.mark.slow

@@ -20,6 +20,7 @@ from jax import Array, lax
 
 from edqn_jax.sim.scene.distance import signed_distance
 from edqn_jax.sim.scene.scene import Scene
+from edqn_jax.sim.worlds.sweeps import spread, steps_aside
 
 MAX_NODES = 500_000
 """Nodes of the field of a single world."""
@@ -33,8 +34,6 @@ MAX_LATTICE_RATIO = 1.13
 
 _BATCH = 128  # worlds of a pool
 
-_SIDES = np.array([*itertools.product((-1, 0, 1), repeat=2)])
-_CHANGE_M = 1e-3  # of no node in a round: no way is shortened any more
 _LEAST = 1e-6  # of weights that are worth dividing by
 _CORNERS = np.array([*itertools.product((0, 1), repeat=3)])
 
@@ -96,7 +95,9 @@ def _field(scene: Scene, shape: tuple[int, int, int], radius: float) -> Field:
     seen = is_free & (apart <= jnp.maximum(clearance, signed_distance(scene, scene.goal)))
     # Where not even the ball around a node reaches the goal, the way begins at the nearest nodes.
     seen = jnp.where(jnp.any(seen), seen, is_free & (apart <= math.sqrt(3) * edge))
-    remaining = _spread(jnp.where(seen, apart, jnp.inf), is_free, clearance, edge)
+    lengths = edge * jnp.sqrt(1.0 + jnp.sum(jnp.asarray(steps_aside(1)) ** 2, axis=1))
+    balls = jnp.where(is_free, clearance, -jnp.inf)
+    remaining = spread(jnp.where(seen, apart, jnp.inf), balls, jnp.broadcast_to(lengths, (3, *lengths.shape)))
     return Field(remaining=remaining, clearance=jnp.where(is_free, clearance, 0.0), corner=corner, edge=edge)
 
 
@@ -104,51 +105,6 @@ def _positions(corner: Array, edge: Array, shape: tuple[int, int, int]) -> Array
     """Returns the positions of the nodes [X, Y, Z, 3], metres."""
     grid = jnp.stack(jnp.meshgrid(*(jnp.arange(n, dtype=jnp.float32) for n in shape), indexing="ij"), axis=-1)
     return corner[None, None, None] + edge * grid
-
-
-def _spread(seeds: Array, is_free: Array, clearance: Array, edge: Array) -> Array:
-    """Returns the lengths [X, Y, Z] of the shortest paths to the seeds, from the seeds' own lengths [X, Y, Z].
-
-    Sweeps plane by plane along each axis, there and back, until nothing becomes shorter: a way with few bends takes few
-    rounds, however long it is.
-    """
-    balls = jnp.where(is_free, clearance, -jnp.inf)
-
-    def round_of_sweeps(state: tuple[Array, Array]) -> tuple[Array, Array]:
-        before, _ = state
-        after = before
-        for axis in range(3):
-            planes, around = jnp.moveaxis(after, axis, 0), jnp.moveaxis(balls, axis, 0)
-            for backwards in (False, True):
-                planes = _swept(planes, around, edge, backwards)
-            after = jnp.moveaxis(planes, 0, axis)
-        # inf - inf is NaN, and no change.
-        return after, jnp.any(before - after > _CHANGE_M)
-
-    return lax.while_loop(lambda state: state[1], round_of_sweeps, (seeds, jnp.array(True)))[0]
-
-
-def _swept(planes: Array, around: Array, edge: Array, backwards: bool) -> Array:
-    """Returns lengths [N, A, B], each plane shortened by ways over the one before it; `around` are the balls."""
-    sides = jnp.asarray(_SIDES)
-    weights = edge * jnp.sqrt(1.0 + jnp.sum(sides**2, axis=1))[:, None, None]
-
-    def plane(before: tuple[Array, Array], here: tuple[Array, Array]) -> tuple[tuple[Array, Array], Array]:
-        (length, ball), (own, own_ball) = before, here
-        lengths, balls = _neighbour_planes(length, jnp.inf), _neighbour_planes(ball, -jnp.inf)
-        meets = balls + own_ball[None] >= weights
-        own = jnp.minimum(own, jnp.min(jnp.where(meets, lengths + weights, jnp.inf), axis=0))
-        return (own, own_ball), own
-
-    nothing = jnp.full_like(planes[0], jnp.inf), jnp.full_like(around[0], -jnp.inf)
-    return lax.scan(plane, nothing, (planes, around), reverse=backwards)[1]
-
-
-def _neighbour_planes(plane: Array, fill: float) -> Array:
-    """Returns a plane [A, B] as seen from its nine neighbours, [9, A, B]."""
-    padded = jnp.pad(plane, 1, constant_values=fill)
-    a, b = plane.shape
-    return jnp.stack([padded[1 + i : 1 + i + a, 1 + j : 1 + j + b] for i, j in _SIDES])
 
 
 def distance_to_goal(of: Field, world: Array, goal: Array, point: Array) -> Array:
