@@ -68,7 +68,7 @@ def parse(argv: Sequence[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--picture", choices=("mujoco", "own"), default="mujoco", help="who draws (default mujoco)")
     parser.add_argument("--look", choices=pictures.LOOKS, default="plain", help="of MuJoCo's picture (default plain)")
     parser.add_argument("--events", choices=("pair", "esim", "v2e"), default="pair", help="whose law (default pair)")
-    parser.add_argument("--flight", choices=("own", "rotorpy", "rotorpy-steps"), default="own", help="who flies (default own)")
+    parser.add_argument("--flight", choices=flights.KINDS, default="own", help="who flies (default own)")
     parser.add_argument("--mount", choices=("level", "body"), help="of the camera (default the policy's own)")
     parser.add_argument("--missions", type=at_least_one, default=20, help="number of missions (default 20)")
     parser.add_argument("--seed", type=int, default=0, help="seed of missions and looks (default 0)")

@@ -49,8 +49,8 @@ LOOKS = (
     *("--body.mass-share", "0.2", "--motors.gain-share", "0.2", "--motors.lag-s", "0.05"),
     *("--train.validation-missions", "64"),
 )
-"""Further options of the policy of any look (`--looks`): surfaces and event sensors that are drawn, a third frame, from
-which motion shows, an encoder that is larger and learns five times as long (docs/surfaces.md), and errors of tracking."""
+"""Further options of the policy of any look (`--looks`, docs/surfaces.md): surfaces and event sensors that are drawn, a
+third frame, from which motion shows, an encoder that is larger and learns five times as long, errors of tracking."""
 
 VALIDATED_EVERY = {"open": 20_000_000, "mixed": 0}
 """Decisions between validations, by the worlds; 0 validates at the end alone: several seeds take minutes for one."""

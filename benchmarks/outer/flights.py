@@ -17,6 +17,9 @@ from edqn_jax.sim.environment import Environment
 from edqn_jax.sim.physics import drone
 from outer.poses import Track
 
+KINDS = ("own", "rotorpy", "rotorpy-steps")
+"""Who flies. `rotorpy-steps`: its controller's setpoint jumps with each command."""
+
 ROTORPY_STEP_S = 0.005
 """How often RotorPy's controller acts."""
 
@@ -143,7 +146,7 @@ class RotorPyFlight:
 
 
 def start_flight(kind: str, environment: Environment, mission: int, max_yaw_rate: float) -> Flight:
-    """Returns a drone at rest at a mission's start, facing the goal; `kind` is `own`, `rotorpy` or `rotorpy-steps`.
+    """Returns a drone at rest at a mission's start, facing the goal; `kind` is one of `KINDS`.
 
     Raises:
         MissingPackageError: if RotorPy is not installed.
