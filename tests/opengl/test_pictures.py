@@ -79,7 +79,7 @@ def alike(one: np.ndarray, other: np.ndarray) -> float:
 def test_a_world_has_its_own_look_in_mujocos_picture(tmp_path: Path):
     """The ground shows the pattern where ours has it, also from a file."""
     config = medium().config
-    config = dataclasses.replace(config, surface=dataclasses.replace(config.surface, pattern="drawn"))
+    config = dataclasses.replace(config, surface=dataclasses.replace(config.surface, pattern="checks"))
     world = edqn_jax.make("medium", config, split="test")
     where = np.asarray(world.scene(0).start, np.float64), _towards_goal()
     ours = pictures.own_pictures(config, world, 0)(*where)
