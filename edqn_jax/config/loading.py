@@ -41,8 +41,8 @@ def resolve_config(
     Args:
         preset_name: one of `config.PRESETS`; world and hardware change only `default`.
         file: a YAML file.
-        world: name of the world given by a flag; None takes that of the file, else `config.presets.WORLD` (the paper's, in
-            the preset `paper`).
+        world: name of the world given by a flag; None takes that of the file, else `config.presets.WORLD`, or the
+            paper's in the preset `paper`.
         tuned_for: hardware that the defaults are chosen for.
 
     Raises:
