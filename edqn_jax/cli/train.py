@@ -21,13 +21,14 @@ from edqn_jax.cli.help import TRAIN, asks_for_help, flag_of, show_train_help
 from edqn_jax.cli.process.signals import Stops
 from edqn_jax.cli.process.variables import check_devices, platforms_named, start_jax
 from edqn_jax.config import FAMILIES, Config
-from edqn_jax.config.loading import apply_layer, resolve_config, to_yaml
+from edqn_jax.config.loading import apply_layer, load_layer, resolve_config, to_yaml
 from edqn_jax.config.presets import gpu_layers
 from edqn_jax.config.rules import check_learns, validate
 from edqn_jax.devices.hardware import detect_hardware
 from edqn_jax.devices.launch import Distributed, how_to_join
 from edqn_jax.errors import ConfigError
 from edqn_jax.extras import SINKS
+from edqn_jax.policies import no_run, policy_folder
 from edqn_jax.runs.continuation import find_run, resume_config
 from edqn_jax.runs.directory import Resume, RunDirectory, plan_run_directory
 
@@ -60,6 +61,10 @@ class TrainOptions:
     seeds: Annotated[int | None, arg(metavar="K", help_behavior_hint="")] = None
     """Train K policies, of the seeds from --seed on, side by side in one program; each gets a folder `seed-N` in the
     folder of the run, whose summary has every seed's success and their interquartile mean."""
+    start_from: Annotated[Path | None, arg(metavar="POLICY", help_behavior_hint="")] = None
+    """Begin with the networks of a policy: the folder of a run, or `pretrained` or `pretrained-looks`. Camera, sensor,
+    encoder and network are then its own, the encoder learns no more unless `encoder.warmup_decisions` says so, and a
+    tenth of the moves are random at first."""
     run_dir: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="")] = None
     """Folder for the files of the run (default: a new, dated folder under runs/)."""
     resume: Resume = "auto"
@@ -116,6 +121,8 @@ def parse_train(argv: Sequence[str]) -> tuple[TrainOptions, Config]:
     else:
         world = _parse_config(argv, resolve_config(options.preset, options.config)).world.name
         begins = resolve_config(options.preset, options.config, world, tuned_for)
+    if options.start_from is not None:
+        begins = begin_with(begins, options.start_from)
     if any(word.partition("=")[0] == PROFILE for word in argv):
         # What else is given changes one of the profile's figures.
         profile = _parse_config(argv, begins).events.profile
@@ -129,6 +136,26 @@ def parse_train(argv: Sequence[str]) -> tuple[TrainOptions, Config]:
         options = dataclasses.replace(options, seeds=run.seeds if options.seeds is None else options.seeds)
         config = resume_config(folder, run, config, options.seeds)
     return options, config
+
+
+def begin_with(config: Config, policy: Path) -> Config:
+    """Returns options with those of a policy that its networks depend on.
+
+    Raises:
+        ConfigError: if there is no such policy.
+    """
+    file = policy_folder(policy) / "config.yaml"
+    if not file.is_file():
+        raise no_run(file.parent)
+    known = apply_layer(Config(), load_layer(file), str(file))
+    task, learns = dataclasses.asdict(known), ("warmup_decisions", "retrain_at", "batch_size", "replay_size")
+    layer = {group: task[group] for group in ("camera", "surface", "events", "exposure", "light")}
+    layer["env"] = {name: task["env"][name] for name in ("sensor", "actions", "position", "heading")}
+    layer["encoder"] = {name: value for name, value in task["encoder"].items() if name not in learns}
+    layer["encoder"] |= {"warmup_decisions": 0, "retrain_at": ()}
+    names = ("network", "hidden", "history", "last_move", "code_scale", "layer_norm", "dueling")
+    layer["agent"] = {name: task["agent"][name] for name in names} | {"exploration_start": 0.1}
+    return apply_layer(config, layer, f"the policy '{policy}'")
 
 
 def _names_defaults(argv: Sequence[str]) -> bool:
@@ -216,9 +243,12 @@ def train_command(argv: Sequence[str], stops: Stops) -> None:
     sinks = None if run is None else _sinks_of(options, config, run, progress.message)
     stop = Stop(stops.is_requested, lambda: stops.obey_signals(progress.message))
     try:
+        from edqn_jax.runs.policies import load_policy
         from edqn_jax.runs.record import train_run
 
-        train_run(config, run, progress, stop, callback=sinks, drawing=prepare_gallery, seeds=options.seeds)
+        start = None if options.start_from is None else load_policy(options.start_from)
+        others = {"drawing": prepare_gallery, "seeds": options.seeds, "start": start}
+        train_run(config, run, progress, stop, callback=sinks, **others)
     except jax.errors.JaxRuntimeError as error:
         if arguments is None:
             raise

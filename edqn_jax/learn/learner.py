@@ -122,6 +122,9 @@ class Learner:
     """Returns the parameters that learn, which are watched for numbers that are not finite."""
     policy: Callable[[State], Params]
     """Returns the parameters that fly."""
+    begin_from: Callable[[Config, State, Params], State] | None = None
+    """(config, state that has learnt nothing, parameters that fly) → state that begins with them; None if it never
+    does."""
 
     def __post_init__(self) -> None:
         """Checks what each function takes.
@@ -129,9 +132,11 @@ class Learner:
         Raises:
             ConfigError: names the function and its arguments.
         """
+        begins = {} if self.begin_from is None else {"begin_from": "config, state, params"}
         check_functions(
             self,
             {
+                **begins,
                 "init": "config, key",
                 "act": "config, state, memory, keys, exploration",
                 "decide": "config, params, memory",

@@ -22,9 +22,11 @@ from edqn_jax.devices import processes
 from edqn_jax.devices.devices import compiler_options
 from edqn_jax.keys import run_streams
 from edqn_jax.learn.checked import CheckedChunk
+from edqn_jax.learn.policy import Policy
 from edqn_jax.learn.schedule import Schedule
 from edqn_jax.learn.state import Episodes, Losses, TrainState, init_state
 from edqn_jax.learn.step import run_steps
+from edqn_jax.learn.updates import begin_networks
 from edqn_jax.sim.task.env import EnvParams
 
 AXIS = "env"
@@ -68,9 +70,25 @@ class Trainer:
         self._shapes: TrainState | None = None
         self._chunk = None
 
-    def init(self, seed: int | Sequence[int]) -> TrainState:
-        """Returns the state before the first step, laid out over the devices; of several agents, one seed for each."""
-        make = jax.jit(self._each(lambda env_params, key: init_state(self.config, env_params, key), 0))
+    def init(self, seed: int | Sequence[int], start: Policy | None = None) -> TrainState:
+        """Returns the state before the first step, laid out over the devices.
+
+        Args:
+            seed: of several agents, one for each.
+            start: policy whose networks all agents begin with.
+
+        Raises:
+            ConfigError: if its networks have other shapes, or the learner cannot begin with any.
+        """
+
+        def begin(env_params: EnvParams, key: Array) -> TrainState:
+            state = init_state(self.config, env_params, key)
+            if start is None:
+                return state
+            networks = begin_networks(self.config, state.learner, start.config, start.params)
+            return dataclasses.replace(state, learner=networks)
+
+        make = jax.jit(self._each(begin, 0))
         keys = [run_streams(number).learning for number in ([seed] if isinstance(seed, int) else seed)]
         # Made whole and then cut: made in parts it would be rounded otherwise. `device_put` reaches no other process.
         whole = make(self.env_params, keys[0] if self.agents is None else jnp.stack(keys))

@@ -16,8 +16,10 @@ from jax import Array, lax
 
 from edqn_jax.checks import is_finite
 from edqn_jax.config import Config
+from edqn_jax.errors import ConfigError
 from edqn_jax.keys import split_each
 from edqn_jax.learn import samples
+from edqn_jax.learn.actor import PolicyParams
 from edqn_jax.learn.learner import VAE_METRICS, Metrics, State, UpdateStats, learner_of
 from edqn_jax.learn.perception import embedding, vae
 from edqn_jax.learn.qnetwork import Params, skip_nonfinite
@@ -47,6 +49,41 @@ def init_networks(config: Config, key: Array) -> Networks:
         vae_optimiser=_vae_optimiser(config.encoder.learning_rate).init(vae) if vae else None,
         encoder=embedding.inference_params(config, vae),
         agent=learner_of(config).init(config, agent_key),
+    )
+
+
+def begin_networks(config: Config, fresh: Networks, known: Config, policy: PolicyParams) -> Networks:
+    """Returns networks that begin with those of a policy; their optimisers have seen nothing.
+
+    Where the own motion has values that the policy did not know, as with a camera on the body, their weights begin at
+    0.
+
+    Args:
+        config: of the run.
+        fresh: networks that have learnt nothing.
+        known: configuration of the policy.
+        policy: its parameters.
+
+    Raises:
+        ConfigError: if the learner cannot, or the networks of the run have other shapes.
+    """
+    learner = learner_of(config)
+    if learner.begin_from is None:
+        raise ConfigError(f"the learner '{config.agent.learner}' cannot begin with a policy: it has no `begin_from`")
+    vae = embedding.grow_motion(config, known, policy.encoder)
+    wanted, found = (
+        jax.tree.map(jnp.shape, each) for each in ((fresh.vae, learner.policy(fresh.agent)), (vae, policy.q))
+    )
+    if wanted != found:
+        raise ConfigError(
+            "the networks of this run have other shapes than those of the policy that it is to begin with; give the "
+            "policy's own options of camera, sensor, encoder and agent"
+        )
+    return dataclasses.replace(
+        fresh,
+        vae=vae,
+        encoder=embedding.inference_params(config, vae),
+        agent=learner.begin_from(config, fresh.agent, policy.q),
     )
 
 

@@ -17,7 +17,7 @@ from edqn_jax.evaluation.flight_scene import scene_of_flight
 from edqn_jax.evaluation.metrics import flight_summary
 from edqn_jax.evaluation.trajectories import flight_trajectory
 from edqn_jax.learn import saved_state
-from edqn_jax.learn.policy import PolicyParams
+from edqn_jax.learn.policy import Policy, PolicyParams
 from edqn_jax.runs import messages, summaries, world_copy
 from edqn_jax.runs.checkpointer import Checkpointer
 from edqn_jax.runs.directory import TO_BE_DRAWN, RunDirectory
@@ -57,6 +57,7 @@ def train_run(
     callback: Callback | None = None,
     drawing: PrepareDrawing | None = None,
     seeds: int | None = None,
+    start: Policy | None = None,
 ) -> dict[str, Any]:
     """Trains, validates, flies and draws; writes everything to the run directory.
 
@@ -69,6 +70,7 @@ def train_run(
         drawing: of the run's pictures; None draws none.
         seeds: trains so many agents in one program, whose seeds count up from `train.seed`; each has a run of its own
             within `run`, which holds a summary of all. None is one agent, whose run is `run` itself.
+        start: policy whose networks training begins with, unless it continues a run.
 
     Returns:
         the content of `summary.json`, of several seeds that of all.
@@ -78,7 +80,7 @@ def train_run(
         DivergedError: as `train`; the policy of the last checkpoint stays.
         StoppedError: after saving the policy, if it was asked to.
     """
-    with lock_run(run), set_up_training(config, reward, progress, agents=seeds) as preparation:
+    with lock_run(run), set_up_training(config, reward, progress, agents=seeds, start=start) as preparation:
         progress.message(messages.describe_start(preparation, seeds))
         folders = [run if run is None or seeds is None else run.of_seed(c.train.seed) for c in preparation.configs]
         keeper = Checkpointer(preparation, run, folders, reward, progress.message)

@@ -113,7 +113,11 @@ class TrainingResult:
 
 @as_tested
 def train(
-    config: Config | None = None, *, reward: Reward | None = None, callback: Callback | None = None
+    config: Config | None = None,
+    *,
+    reward: Reward | None = None,
+    callback: Callback | None = None,
+    start: Policy | None = None,
 ) -> TrainingResult:
     """Trains a policy and returns it with the history of its training; nothing is written.
 
@@ -121,26 +125,33 @@ def train(
         config: without it what `train.py` trains without flags, on a CPU; `edqn_jax.make_config` makes others.
         reward: replaces the configured reward; see `sim.task.reward.Transition` for what it is given.
         callback: called after each chunk; training stops where it returns True.
+        start: policy whose networks training begins with; camera, sensor, encoder and network are as in its config.
 
     Raises:
-        ConfigError: if the configuration is invalid or the world cannot be flown.
+        ConfigError: if the configuration is invalid, the world cannot be flown, or `start` has networks of other
+            shapes.
         DivergedError: if numbers are not finite for so long that nothing is learnt any more.
         CheckError: with `train.debug`, at the first fault.
     """
-    with set_up_training(_given(config), reward) as preparation:
+    with set_up_training(_given(config), reward, start=start) as preparation:
         return run_chunks(preparation, callback)[0]
 
 
 @as_tested
 def train_seeds(
-    seeds: int, config: Config | None = None, *, reward: Reward | None = None, callback: Callback | None = None
+    seeds: int,
+    config: Config | None = None,
+    *,
+    reward: Reward | None = None,
+    callback: Callback | None = None,
+    start: Policy | None = None,
 ) -> list[TrainingResult]:
     """Trains one policy for each of several seeds, in one compiled program; arguments and errors as `train`.
 
     Args:
         seeds: how many; they are `train.seed`, `train.seed + 1` and so on.
     """
-    with set_up_training(_given(config), reward, agents=seeds) as preparation:
+    with set_up_training(_given(config), reward, agents=seeds, start=start) as preparation:
         return run_chunks(preparation, callback)
 
 

@@ -24,7 +24,7 @@ from edqn_jax.errors import ConfigError
 from edqn_jax.evaluation import rollouts
 from edqn_jax.evaluation.missions import MissionSet, missions_of_runs
 from edqn_jax.keys import run_streams
-from edqn_jax.learn.policy import PolicyParams, fresh_policy
+from edqn_jax.learn.policy import Policy, PolicyParams, fresh_policy
 from edqn_jax.learn.state import TrainState
 from edqn_jax.learn.trainer import Trainer
 from edqn_jax.planning.astar import Path as ShortestPath
@@ -34,6 +34,7 @@ from edqn_jax.sim.task.flights import Flights
 from edqn_jax.sim.task.reward import Reward, check_reward
 from edqn_jax.sim.worlds import geodesic
 from edqn_jax.training.learner_check import check_learner
+from edqn_jax.user_code import describe_object
 
 
 class Display(Protocol):
@@ -60,7 +61,13 @@ class TrainingSetup:
     """Devices, missions, programs and the first state of a run; made by `set_up_training`."""
 
     def __init__(
-        self, config: Config, reward: Reward | None, display: Display, pool: Executor, agents: int | None
+        self,
+        config: Config,
+        reward: Reward | None,
+        display: Display,
+        pool: Executor,
+        agents: int | None,
+        start: Policy | None,
     ) -> None:
         """Compiles in the background while the shortest path is searched.
 
@@ -70,6 +77,10 @@ class TrainingSetup:
             ConfigError: if the configuration is invalid, the world cannot be flown, or memory is too small.
         """
         check_reward(reward)
+        if start is not None and not isinstance(start, Policy):
+            raise ConfigError(
+                f"training can begin with a policy that has parameters, not with {describe_object(start)}"
+            )
         config = config_for_reward(config, reward)
         self.configs = _agent_configs(config, agents)
         for each in self.configs:
@@ -77,6 +88,7 @@ class TrainingSetup:
             check_learns(each)
         check_learner(config)
         self.config, self.display, self.pool, self.began = config, display, pool, time.perf_counter()
+        self.start = start
         display.phase("preparing worlds")
         self.devices = choose_devices(1 if config.train.debug else config.train.devices, config.train.shards)
         # A world's file may be missing on one host.
@@ -106,7 +118,7 @@ class TrainingSetup:
         """
         if begins and self._first is None:
             seeds = [config.train.seed for config in self.configs]
-            self._first = self.trainer.init(seeds[0] if self.trainer.agents is None else seeds)
+            self._first = self.trainer.init(seeds[0] if self.trainer.agents is None else seeds, self.start)
         return self._compiled.result()
 
     def take_first(self) -> TrainState:
@@ -156,7 +168,11 @@ def _agent_configs(config: Config, agents: int | None) -> list[Config]:
 
 @contextlib.contextmanager
 def set_up_training(
-    config: Config, reward: Reward | None = None, display: Display | None = None, agents: int | None = None
+    config: Config,
+    reward: Reward | None = None,
+    display: Display | None = None,
+    agents: int | None = None,
+    start: Policy | None = None,
 ) -> Iterator[TrainingSetup]:
     """Prepares a run; pending compilations are cancelled if the block ends with an error.
 
@@ -165,6 +181,7 @@ def set_up_training(
         reward: as in `train`.
         display: of the progress.
         agents: how many are trained in one program; None is one, compiled as such.
+        start: policy whose networks they begin with.
 
     Raises:
         ConfigError: if the configuration is invalid or the world cannot be flown, or the process was forked after JAX
@@ -173,7 +190,7 @@ def set_up_training(
     check_not_forked()
     pool = ThreadPoolExecutor(max_workers=2, thread_name_prefix="compiling", initializer=keep_tested_settings)
     try:
-        yield TrainingSetup(config, reward, display or Silent(), pool, agents)
+        yield TrainingSetup(config, reward, display or Silent(), pool, agents, start)
     finally:
         pool.shutdown(wait=False, cancel_futures=True)
 

@@ -47,6 +47,11 @@ def init_state(config: Config, key: Array) -> DqnState:
     return DqnState(q=q, target=q, average=q, q_optimiser=_optimiser(config).init(q))
 
 
+def begin_from(config: Config, state: DqnState, params: Params) -> DqnState:
+    """Returns the state with the Q-network of a policy; its optimiser has seen nothing."""
+    return dataclasses.replace(state, q=params, target=params, average=params)
+
+
 def _optimiser(config: Config) -> optax.GradientTransformation:
     schedule = Schedule.from_config(config)
     return skip_nonfinite(
@@ -130,4 +135,5 @@ DQN = Learner(
     update=update_q,
     network=lambda state: state.q,
     policy=lambda state: state.average,
+    begin_from=begin_from,
 )

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+from typing import Any
 
+import jax
 import jax.numpy as jnp
 from jax import Array
 
@@ -11,7 +13,7 @@ from edqn_jax.config import Config
 from edqn_jax.learn.perception import vae
 from edqn_jax.learn.perception.code import Form, Params
 from edqn_jax.sim.sensors.sensor import sensor_of
-from edqn_jax.sim.task.observation import Observation, motion_size
+from edqn_jax.sim.task.observation import Observation, knows_contrast, lean_motion_size, motion_size
 
 
 def has_code(config: Config) -> bool:
@@ -47,6 +49,31 @@ def init_params(config: Config, key: Array) -> Params:
     form, layers = _shape(config)
     motion = motion_size(config)
     return vae.init_vae(config.encoder, config.camera, key, form=form, layers=layers, motion=motion)
+
+
+def grow_motion(config: Config, known: Config, params: Params) -> Params:
+    """Returns a VAE's parameters for an own motion of more values, which begin with weights of 0.
+
+    Args:
+        config: of the new own motion.
+        known: with which the parameters were trained; they are returned as they are where it has as many values.
+        params: of an encoder of patches; {} without a VAE.
+    """
+    more_lean = lean_motion_size(config) - lean_motion_size(known)
+    told, more_told = motion_size(known) - lean_motion_size(known), knows_contrast(config) - knows_contrast(known)
+    if not params or max(more_lean, more_told) <= 0 or min(more_lean, more_told) < 0:
+        return params
+
+    def grow(path: tuple[Any, ...], array: Array) -> Array:
+        """Adds rows to the layers that read the own motion, which is the last of what they read."""
+        layer, name = (key.key for key in path[-2:])
+        if layer not in ("motion", "joint_0") or name != "kernel":
+            return array
+        before, contrast = array[: len(array) - told], array[len(array) - told :]
+        blank = [jnp.zeros((more, array.shape[1])) for more in (more_lean, more_told)]
+        return jnp.concatenate([before, blank[0], contrast, blank[1]])
+
+    return {**params, "encoder": jax.tree_util.tree_map_with_path(grow, params["encoder"])}
 
 
 def inference_params(config: Config, params: Params) -> Params:

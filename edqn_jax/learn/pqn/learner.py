@@ -6,6 +6,7 @@ estimate; layer normalisation (`agent.layer_norm`) is what keeps it stable.
 
 from __future__ import annotations
 
+import dataclasses
 from functools import partial
 from typing import Any
 
@@ -55,6 +56,11 @@ def init_state(config: Config, key: Array) -> PqnState:
     """Returns a network that has learnt nothing; `key` is consumed."""
     q = qnetwork.init_q(config.agent, observation_size(config), len(ACTIONS), key)
     return PqnState(q=q, average=q, q_optimiser=_optimiser(config).init(q))
+
+
+def begin_from(config: Config, state: PqnState, params: Params) -> PqnState:
+    """Returns the state with the Q-network of a policy; its optimiser has seen nothing."""
+    return dataclasses.replace(state, q=params, average=params)
 
 
 def _optimiser(config: Config) -> optax.GradientTransformation:
@@ -151,4 +157,5 @@ PQN = Learner(
     update=update_q,
     network=lambda state: state.q,
     policy=lambda state: state.average,
+    begin_from=begin_from,
 )
