@@ -16,7 +16,7 @@ from edqn_jax.files import write_error
 from edqn_jax.runs.checkpoints.sealed import file_digest, sync_to_disk
 from edqn_jax.sim.scene.mjcf import SceneError, resolve_world
 
-WORLD = "world"
+COPIES = "world"
 """The folder of the copies within that of a run."""
 
 SUMS = "SHA256SUMS"
@@ -31,8 +31,8 @@ def copy_worlds(folder: Path, config: Config) -> None:
     Raises:
         ConfigError: if a world has no file, or a copy cannot be written.
     """
-    copies = folder / WORLD
-    partial = copies.with_name(f"{WORLD}.partial")
+    copies = folder / COPIES
+    partial = copies.with_name(f"{COPIES}.partial")
     try:
         for place in (partial, copies):
             shutil.rmtree(place, ignore_errors=True)
@@ -83,14 +83,14 @@ def check_unchanged(folder: Path, config: Config) -> None:
 
 def _changed_worlds(folder: Path, config: Config) -> list[tuple[str, str, Path]]:
     """Returns role, difference and copy of each world that differs from its copy."""
-    if not (folder / WORLD).is_dir():
+    if not (folder / COPIES).is_dir():
         return []
-    _check(folder / WORLD)
+    _check(folder / COPIES)
     found = []
     for role in _roles(config.world):
-        name, copy = getattr(config.world, role), folder / WORLD / f"{role}.xml"
+        name, copy = getattr(config.world, role), folder / COPIES / f"{role}.xml"
         if not copy.is_file():
-            raise ConfigError(f"'{folder / WORLD}' has no copy of the world '{name}'")
+            raise ConfigError(f"'{folder / COPIES}' has no copy of the world '{name}'")
         try:
             if resolve_world(name).read_bytes() != copy.read_bytes():
                 found.append((role, "has changed since the run began", copy))

@@ -44,7 +44,7 @@ def trainer(monkeypatch):
     calls: list[tuple] = []
     behaviour = types.SimpleNamespace(calls=calls, act=lambda *call: None, callbacks=[], seeds=[])
 
-    def train_run(*call, callback, drawing, seeds):
+    def train_run(*call, callback, drawing, seeds, start):
         calls.append(call)
         behaviour.callbacks.append(callback)
         behaviour.seeds.append(seeds)

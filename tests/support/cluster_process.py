@@ -26,7 +26,7 @@ from edqn_jax.config import CameraConfig
 from edqn_jax.devices import devices, hardware, processes
 from edqn_jax.evaluation import rollouts
 from edqn_jax.learn.dqn.learner import DqnState
-from edqn_jax.learn.policy import fresh_policy
+from edqn_jax.learn.policy import Policy, fresh_policy
 from edqn_jax.learn.state import Episodes, Losses, TrainState
 from edqn_jax.learn.trainer import Trainer
 from edqn_jax.learn.updates import Networks
@@ -45,7 +45,7 @@ def waves(config: CameraConfig, scene: Scene, position: Array, rotation: Array) 
     return 0.5 + 0.4 * jnp.sin(across * position[0] + down * position[1] + rotation[0, 0])
 
 
-def only_a_policy(self: Trainer, seed: int | Sequence[int]) -> TrainState:
+def only_a_policy(self: Trainer, seed: int | Sequence[int], start: Policy | None = None) -> TrainState:
     """Stands for the state before the first step: of all of it, parameters."""
     assert isinstance(seed, int)
     params = fresh_policy(self.config, seed)
@@ -70,8 +70,8 @@ if __name__ == "__main__":
     noted: dict[str, Any] = {}
     init, train_run = Trainer.init, record.train_run
 
-    def noting_init(self: Trainer, seed: int | Sequence[int]) -> TrainState:
-        state = init(self, seed)
+    def noting_init(self: Trainer, seed: int | Sequence[int], start: Policy | None = None) -> TrainState:
+        state = init(self, seed, start)
         parts = state.actors.reward.addressable_shards
         noted["shards"] = [list(range(8))[part.index[0]] for part in parts]
         noted["environments"] = sum(part.data.size for part in parts)

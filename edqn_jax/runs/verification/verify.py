@@ -38,7 +38,7 @@ from edqn_jax.runs.policies import load_run
 from edqn_jax.runs.provenance import describe_workload, digest_of, package_versions
 from edqn_jax.runs.summaries import summarize_seeds, summarize_tests
 from edqn_jax.runs.verification.derived import DIGITS, from_metrics, from_trajectory, is_same
-from edqn_jax.runs.world_copy import WORLD
+from edqn_jax.runs.world_copy import COPIES
 from edqn_jax.sim.task import group
 from edqn_jax.sim.task.flights import Flights
 from edqn_jax.training.selection import first_success
@@ -239,7 +239,7 @@ def _verify_agent(
     }
     worlds = {"world": config.world.name, "flown": config.world.flown or config.world.name}
     # The file of a world that has moved is the run's own copy.
-    described |= {name: value for name, value in worlds.items() if WORLD not in Path(value).parts[-2:]}
+    described |= {name: value for name, value in worlds.items() if COPIES not in Path(value).parts[-2:]}
     told = {} if saved is None else _from_checkpoint(saved)
     agreed = check_verdicts(config, missions.final, flights)
     wrong = [each.mission for each in agreed if not each.agrees]
