@@ -56,8 +56,9 @@ class EncoderConfig:
     """beta: weight of the KL term per image against the reconstruction error per image."""
     learning_rate: Annotated[float, POSITIVE] = 2e-3
     """Adam step size of the VAE."""
-    final_learning_rate: Annotated[float, POSITIVE] = 2e-3
-    """Step size at the end of the warm-up and of each retraining, to which it falls linearly in each of them."""
+    final_learning_rate: Annotated[float, NOT_NEGATIVE] = 0.0
+    """Step size at the end of the warm-up and of each retraining, to which it changes linearly in each of them; 0 keeps
+    `learning_rate`."""
     warmup_decisions: Annotated[int, NOT_NEGATIVE] = 16_384
     """Decisions of the warm-up, random manoeuvres from which the VAE learns before the DQN starts; at most a quarter of
     all decisions. Unused by the sensors `event-image`, `ranges` and `blind`, which have no VAE."""

@@ -60,9 +60,9 @@ class Schedule:
         return trained
 
     def vae_rate(self, config: Config, step: Array) -> Array | float:
-        """Returns the step size of the VAE in step `[]`: in each of its trainings it falls to the final one."""
+        """Returns the step size of the VAE in step `[]`: in each of its trainings it changes to the final one."""
         first, last = config.encoder.learning_rate, config.encoder.final_learning_rate
-        if first == last:
+        if not last:
             return first
         done = jnp.zeros(())
         for start, end in self.vae_training:

@@ -35,6 +35,16 @@ def test_a_retrained_encoder_begins_a_replay_of_its_own() -> None:
     assert plan.samples_kept(always, steps).tolist() == list(range(24))
 
 
+def test_the_step_size_of_the_vae_changes_in_each_of_its_trainings_or_stays() -> None:
+    config = retrained((0.25,))
+    plan, falls = Schedule.from_config(config), {"learning_rate": 1e-3, "final_learning_rate": 2e-4}
+    falling = dataclasses.replace(config, encoder=dataclasses.replace(config.encoder, **falls))
+    rates = [float(plan.vae_rate(falling, jnp.asarray(step))) for step in (0, 2, 3, 10, 16, 17)]
+    np.testing.assert_allclose(rates, [1e-3, 6e-4, 4e-4, 1e-3, 1e-3, 6e-4], rtol=1e-5)
+    stays = dataclasses.replace(config, encoder=dataclasses.replace(config.encoder, learning_rate=3e-4))
+    assert plan.vae_rate(stays, jnp.asarray(3)) == 3e-4
+
+
 @pytest.mark.parametrize(
     ("retrain_at", "retrain_decisions", "times"),
     [

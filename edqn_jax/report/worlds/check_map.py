@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.collections import LineCollection
 from matplotlib.colors import LinearSegmentedColormap, Normalize
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
@@ -16,7 +15,7 @@ from edqn_jax.devices.jax_settings import as_tested
 from edqn_jax.planning.lattice import clearances
 from edqn_jax.planning.widest import COMFORT_M, ENDS_M, WidestWay
 from edqn_jax.report.style import INK, MUTED, OUTCOME_COLOURS, open_figure
-from edqn_jax.report.worlds.flights import draw_map
+from edqn_jax.report.worlds.flights import draw_map, plot_coloured
 from edqn_jax.report.worlds.solids import MAP, is_occluded, make_cutaway
 from edqn_jax.sim.scene.mesh_field import spread_directions
 from edqn_jax.sim.scene.scene import Scene
@@ -93,18 +92,8 @@ def _plot_way(
 ) -> None:
     """Draws a way [K, 2], metres, coloured by its clearance [K] metres; faint where it is `hidden` [K]."""
     thin = np.unique(np.linspace(0, len(flat) - 1, min(1500, len(flat))).round().astype(int))
-    flat, clearance = flat[thin], clearance[thin]
-    pieces, middle = np.stack([flat[:-1], flat[1:]], axis=1), (clearance[:-1] + clearance[1:]) / 2
-    faint = np.zeros(len(pieces), bool) if hidden is None else hidden[thin][1:]
-    seen = list(pieces[~faint])
-    axes.add_collection(LineCollection(seen, colors="white", linewidths=4.2, capstyle="round", zorder=6))
-    for which, width, alpha in ((faint, 1.4, 0.5), (~faint, 2.6, 1.0)):
-        line = LineCollection(
-            list(pieces[which]), cmap=CLEARANCE, norm=scale, linewidths=width, alpha=alpha, capstyle="round"
-        )
-        line.set_array(middle[which])
-        line.set_zorder(7)
-        axes.add_collection(line)
+    faint = np.zeros(len(thin) - 1, bool) if hidden is None else hidden[thin][1:]
+    plot_coloured(axes, flat[thin], clearance[thin], faint, width=2.6, cmap=CLEARANCE, norm=scale)
 
 
 def _mark(axes: Axes, place: np.ndarray, reach: float) -> None:

@@ -37,7 +37,7 @@ SPEED_COLOURS = "viridis"
 START_COLOUR = "#0072b2"
 GOAL_COLOUR = OUTCOME_COLOURS["goal"]
 SHORTEST_COLOUR = "#c2185b"
-HALO = 3.4
+HALO = 1.4  # points by which a halo is wider than its line
 OTHER_COLOUR = "#5a5a66"
 """Of the other drones of a group, and of their paths."""
 TICK: dict[str, Any] = {"fontsize": 7, "color": INK, "ha": "center", "va": "center"}
@@ -257,17 +257,25 @@ def _plot_shortest(axes: Axes, view: View, corners: np.ndarray, solids: Sequence
 def _plot_flown(
     axes: Axes, view: View, points: np.ndarray, speed: np.ndarray, scale: Normalize, solids: Sequence[Solid]
 ) -> None:
-    flat = view.project(points)
-    pieces = np.stack([flat[:-1], flat[1:]], axis=1)
     covered = is_occluded((points[:-1] + points[1:]) / 2, solids, view)
-    middle_speed = (speed[:-1] + speed[1:]) / 2
-    halo = LineCollection(list(pieces[~covered]), colors="white", linewidths=HALO, capstyle="round", zorder=6)
+    plot_coloured(axes, view.project(points), speed, covered, cmap=SPEED_COLOURS, norm=scale)
+
+
+def plot_coloured(
+    axes: Axes, flat: np.ndarray, values: np.ndarray, faint: np.ndarray, *, width: float = 2.0, **colours: Any
+) -> None:
+    """Draws a line through points [K, 2], coloured by values [K], with a halo; thin where a piece [K - 1] is `faint`.
+
+    Args:
+        width: points.
+        colours: `cmap` and `norm` of the values.
+    """
+    pieces, middle = np.stack([flat[:-1], flat[1:]], axis=1), (values[:-1] + values[1:]) / 2
+    halo = LineCollection(list(pieces[~faint]), colors="white", linewidths=width + HALO, capstyle="round", zorder=6)
     axes.add_collection(halo)
-    for which, width, alpha in ((covered, 1.2, 0.45), (~covered, 2.0, 1.0)):
-        line = LineCollection(
-            list(pieces[which]), cmap=SPEED_COLOURS, norm=scale, linewidths=width, alpha=alpha, capstyle="round"
-        )
-        line.set_array(middle_speed[which])
+    for which, wide, alpha in ((faint, 0.6 * width, 0.45), (~faint, width, 1.0)):
+        line = LineCollection(list(pieces[which]), linewidths=wide, alpha=alpha, capstyle="round", **colours)
+        line.set_array(middle[which])
         line.set_zorder(7)
         axes.add_collection(line)
 
