@@ -140,6 +140,8 @@ def _event_sensor_rules(events: EventsConfig) -> Rules:
 def _learning_rules(config: Config) -> Rules:
     """Yields rules of what learns, and of what it learns from."""
     encoder, agent, envs = config.encoder, config.agent, config.train.num_envs
+    leans = not encoder.levelled or (config.camera.mount == "body" and config.env.sensor == "events")
+    yield leans, "encoder.levelled", "false unless camera.mount is body and env.sensor is events"
     warmed = not encoder.retrain_at or encoder.warmup_decisions > 0
     yield warmed, "encoder.warmup_decisions", "at least 1 where encoder.retrain_at is given"
     falls = agent.exploration_end <= agent.exploration_start

@@ -136,13 +136,13 @@ class FlightRenderer:
                 return memory, (image, luma)
             nearness = None
             if embedding.needs_nearness(config):
-                nearness = sensor.nearness_image(config, now, position[-1], quaternion[-1])
+                nearness = sensor.label_image(config, now, position[-1], quaternion[-1])
             # The goal is not part of a code.
             observation = Observation(
                 sensed, own=jnp.zeros(own_size(config)), motion=with_contrast(config, memory, motion)
             )
             code = actor.code(actor.encode(params, actor.init(), observation))
-            read = shows.encoder_input(config, sensed)
+            read = embedding.as_encoder_input(config, observation).sensed
             assert read is not None
             target = vae.decoder_target(config.encoder, read, nearness)
             made = vae.decode(config.encoder, config.camera, params.encoder, code)

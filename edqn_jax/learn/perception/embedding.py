@@ -12,8 +12,10 @@ from jax import Array
 from edqn_jax.config import Config
 from edqn_jax.learn.perception import vae
 from edqn_jax.learn.perception.code import Form, Params
+from edqn_jax.learn.perception.levelling import level_events
+from edqn_jax.sim.sensors.events import EventField
 from edqn_jax.sim.sensors.sensor import sensor_of
-from edqn_jax.sim.task.observation import Observation, knows_contrast, lean_motion_size, motion_size
+from edqn_jax.sim.task.observation import Observation, knows_contrast, lean_motion_size, lean_of, motion_size
 
 
 def has_code(config: Config) -> bool:
@@ -39,7 +41,12 @@ def code_size(config: Config) -> int:
 
 def as_encoder_input(config: Config, observation: Observation) -> Observation:
     """Returns observations [...] whose `sensed` is the VAE's input, an event field or pictures."""
-    return dataclasses.replace(observation, sensed=sensor_of(config).encoder_input(config, observation.sensed))
+    read = sensor_of(config).encoder_input(config, observation.sensed)
+    if config.encoder.levelled:
+        assert isinstance(read, EventField)
+        lean = lean_of(config, observation.motion)
+        read = level_events(config.camera, read, lean, whole=config.events.sensor_pixels == 1)
+    return dataclasses.replace(observation, sensed=read)
 
 
 def init_params(config: Config, key: Array) -> Params:

@@ -355,6 +355,15 @@ def nearness_image(config: Config, scene: Scene, position: Array, quaternion: Ar
     return DEPTH_SCALE * nearness(metres)
 
 
+def label_image(config: Config, scene: Scene, position: Array, quaternion: Array) -> Array:
+    """Returns what the decoder must draw of how near things are, as `nearness_image`; level with `encoder.levelled`."""
+    if config.encoder.levelled:
+        level = dataclasses.replace(config.camera, mount="level")
+        # Of the whole attitude a level camera keeps the heading of body x, to which roll and pitch are relative.
+        return DEPTH_SCALE * nearness(camera.render_depth(level, scene, position, mount_rotation(config, quaternion)))
+    return nearness_image(config, scene, position, quaternion)
+
+
 def nearness(distance: Array) -> Array:
     """Returns `1 / (1 + distance / HALF_NEAR_M)` of metres [...]: 1 at contact, 0 at infinity, steepest near 0."""
     return 1.0 / (1.0 + distance / HALF_NEAR_M)

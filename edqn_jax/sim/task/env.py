@@ -116,7 +116,7 @@ def _start(config: Config, env_params: EnvParams, mission: Array, key: Array) ->
 
 
 def nearness(config: Config, env_params: EnvParams, state: EnvState) -> Array:
-    """Returns what the sensor `depth` would show of an environment now: [H, W], without a unit.
+    """Returns how near things are from an environment now: [H, W] as `sensor.label_image`, without a unit.
 
     A label for training: no observation holds it. With several drones as `step`.
     """
@@ -125,7 +125,7 @@ def nearness(config: Config, env_params: EnvParams, state: EnvState) -> Array:
         there, is_there = group.other_drones(config, (state.drone.position, ~state.ended))
         there = jnp.where(is_there[:, None], there, PARKED)
         scene = with_drones(scene, there, jnp.where(is_there, config.drone.body_radius_m, 0.0))
-    return sensor.nearness_image(config, scene, state.drone.position, state.drone.quaternion)
+    return sensor.label_image(config, scene, state.drone.position, state.drone.quaternion)
 
 
 def reset(

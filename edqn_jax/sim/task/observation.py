@@ -101,6 +101,11 @@ def with_lean(config: Config, quaternions: Array, motion: Array) -> Array:
     return jnp.concatenate([motion, angles.reshape(*angles.shape[:-2], -1)], axis=-1)
 
 
+def lean_of(config: Config, motion: Array) -> Array:
+    """Returns the roll and pitch [..., T, 2] in own motions [..., motion_size] of a camera that leans, see `with_lean`."""
+    return motion[..., MOTION_SIZE : lean_motion_size(config)].reshape(*motion.shape[:-1], -1, 2)
+
+
 def with_contrast(config: Config, memory: SensorMemory, values: Array) -> Array:
     """Returns own values [N] with that of the episode's contrast after them, where the networks know it."""
     if not knows_contrast(config):

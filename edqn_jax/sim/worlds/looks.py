@@ -1,6 +1,7 @@
 """What random worlds look like: patterns, albedo and light, drawn from the world's key and apart from its geometry.
 
-Shapes of a kind and of one albedo, as the pieces of a wall are, get one pattern, which runs on from piece to piece.
+Shapes of a kind and of one albedo, as the pieces of a wall are, get one pattern, which runs on from piece to piece; in
+some of the `drawn` worlds each piece has its own.
 """
 
 from __future__ import annotations
@@ -25,6 +26,10 @@ TRAINED = {"blank": 0.15, "waves": 0.2, "noise": 0.2, "checks": 0.2, "spots": 0.
 
 ALIKE = 0.4
 """Share of the worlds of which all shapes have one pattern, of one period and contrast."""
+
+APART = 0.3
+"""Share of the `drawn` worlds in which the pieces of a wall have surfaces of their own, as in others' worlds, where each
+solid has its own material: a pattern then ends where nothing ends."""
 
 BRIGHTEST = 0.95
 """Most that any point of a surface reflects."""
@@ -83,7 +88,10 @@ def _with_surface(config: SurfaceConfig, shapes: Any, world: Array, draws: Array
     if not draws.shape[0]:
         return dataclasses.replace(shapes, surface=Surface(jnp.zeros((0, SURFACE_NUMBERS)), patterns_of(config)))
     alike = jnp.all(shapes.albedo[:, None] == shapes.albedo[None], axis=-1)
-    draws = draws[jnp.argmax(alike, axis=1)]
+    first = jnp.argmax(alike, axis=1)
+    if config.pattern == "drawn":
+        first = jnp.where(world[-2] < APART, jnp.arange(len(draws)), first)
+    draws = draws[first]
     # The first numbers say which pattern, of which contrast and period.
     draws = jnp.where((world[-1] < ALIKE) & (jnp.arange(_DRAWS) < 3), world, draws)
     which = _which(config, draws[:, 0])
