@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import dataclasses
 
-import jax
 import jax.numpy as jnp
 from jax import Array
 
@@ -32,7 +31,7 @@ def level_events(camera: CameraConfig, field: EventField, lean: Array, *, whole:
         field: R rows, one a frame pair, or of ON and then of OFF events.
         lean: [..., T, 2] roll and pitch at each frame, radians, as `drone.roll_and_pitch_of` has them; between two
             frames the body leans as their mean.
-        whole: whether the nearest pixel's count is taken as it is: where a pixel has few events, a share of one is none.
+        whole: whether the nearest pixel's count is taken as it is; of few events a share would be rounded to none.
     """
     rows, columns, seen = level_places(camera, (lean[..., :-1, :] + lean[..., 1:, :]) / 2)
     if field.with_noise:

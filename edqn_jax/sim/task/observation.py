@@ -102,7 +102,7 @@ def with_lean(config: Config, quaternions: Array, motion: Array) -> Array:
 
 
 def lean_of(config: Config, motion: Array) -> Array:
-    """Returns the roll and pitch [..., T, 2] in own motions [..., motion_size] of a camera that leans, see `with_lean`."""
+    """Returns roll and pitch [..., T, 2] in own motions [..., motion_size] of a camera that leans, see `with_lean`."""
     return motion[..., MOTION_SIZE : lean_motion_size(config)].reshape(*motion.shape[:-1], -1, 2)
 
 

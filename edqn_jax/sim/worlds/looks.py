@@ -28,8 +28,8 @@ ALIKE = 0.4
 """Share of the worlds of which all shapes have one pattern, of one period and contrast."""
 
 APART = 0.3
-"""Share of the `drawn` worlds in which the pieces of a wall have surfaces of their own, as in others' worlds, where each
-solid has its own material: a pattern then ends where nothing ends."""
+"""Share of the `drawn` worlds in which the pieces of a wall have surfaces of their own, as in worlds of others, where
+each solid has its own material: a pattern then ends where nothing ends."""
 
 BRIGHTEST = 0.95
 """Most that any point of a surface reflects."""

@@ -118,7 +118,10 @@ def _sample(picture: np.ndarray, row: float, column: float, whole: bool) -> floa
 def test_the_encoder_reads_levelled_events() -> None:
     """Moving the events and turning the camera are the same to the encoder's input."""
     config = make_config(
-        "medium", camera={"mount": "body"}, encoder={"levelled": True}, events={"least_contrast": 0.1, "most_contrast": 0.2}
+        "medium",
+        camera={"mount": "body"},
+        encoder={"levelled": True},
+        events={"least_contrast": 0.1, "most_contrast": 0.2},
     )
     signed = np.random.default_rng(2).integers(-9, 9, (1, 24, 32))
     motion = jnp.concatenate([jnp.zeros(7), jnp.array([0.2, 0.1, 0.3, 0.2]), jnp.ones(1)])
