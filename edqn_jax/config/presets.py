@@ -43,14 +43,14 @@ RANDOM_WORLDS: Layer = {
 """What random worlds change in the `default` preset: more decisions in more worlds, fewer updates for each, a longer
 window of events with lower thresholds, and an encoder that learns from more, and again from flights of the policy,
 since there only events tell where obstacles are. No direction is preferred, so what is replayed is turned. The last
-flight is through the paper's map, which training never uses (docs/ablation.md)."""
+flight is through the paper's map, which training never uses (docs/results/random_worlds.md)."""
 
 CLOSED_WORLDS: Layer = {
     "env": {"reward": "geodesic", "progress_weight": 6.0, "path_weight": 2.0, "potential_discount": 0.98},
     "agent": {"discount": 0.98, "n_step": 5},
 }
 """What rooms, forests and canyons change further: metres count along the way around obstacles, and more than the metres
-flown, since a drone that is paid for the straight line alone hovers where it ends (docs/results.md)."""
+flown, since a drone that is paid for the straight line alone hovers where it ends (docs/results/paper.md)."""
 
 DRAWN_WORLDS: Layer = {
     "env": {
