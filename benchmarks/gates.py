@@ -22,7 +22,6 @@ import jax.numpy as jnp
 import numpy as np
 from jax import Array
 
-from edqn_jax.cli.train import parse_train
 from edqn_jax.config import FAMILIES, Config
 from edqn_jax.devices.devices import use_cpu_devices
 from edqn_jax.evaluation.intervals import rate_interval
@@ -36,7 +35,7 @@ from edqn_jax.sim.task.outcomes import Outcome
 from edqn_jax.sim.task.task import task_of
 from measurement import json_report
 from measurement.command import Parser, at_least_one, in_a_sentence
-from measurement.flags import split, with_test_worlds_only
+from measurement.flags import parse_options, split, with_test_worlds_only
 
 
 def hover(body: DroneState, goal: Array) -> Array:
@@ -82,7 +81,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--world", default="moving", choices=FAMILIES, help="(default moving)")
     parser.add_argument("--missions", type=at_least_one, default=1000, help="test missions (default 1000)")
     args = parser.parse(words)
-    config = with_test_worlds_only(parse_train(["--world", args.world, "--env.sensor", "blind", *flags])[1])
+    config = with_test_worlds_only(parse_options(["--world", args.world, "--env.sensor", "blind", *flags]))
     use_cpu_devices()
     missions = load_missions(config, args.world, args.missions)
     names = [outcome.name.lower().replace("_", " ") for outcome in Outcome if outcome != Outcome.RUNNING]

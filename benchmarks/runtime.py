@@ -30,7 +30,6 @@ from pathlib import Path
 from typing import Any
 
 from conventional_stack.settings import DRONES, supported_config
-from edqn_jax.cli.train import parse_train
 from edqn_jax.config import FAMILIES, Config
 from edqn_jax.config.loading import suggest_nearest, to_yaml
 from edqn_jax.devices.hardware import count_cores
@@ -39,7 +38,7 @@ from measurement import json_report
 from measurement.child import Child, ChildEndedError
 from measurement.command import Parser, in_a_sentence
 from measurement.flags import parse_config as for_timing
-from measurement.flags import split, with_test_worlds_only
+from measurement.flags import parse_options, split, with_test_worlds_only
 from measurement.whole import steady
 from rivals import table
 from rivals.figure import draw_runtime
@@ -156,7 +155,7 @@ def config_for_world(world: str, flags: Sequence[str], quick: bool) -> Config:
     Raises:
         ConfigError: if it is invalid.
     """
-    config = with_test_worlds_only(parse_train(["--world", world, *(QUICK if quick else ()), *flags])[1])
+    config = with_test_worlds_only(parse_options(["--world", world, *(QUICK if quick else ()), *flags]))
     if not quick and not any(flag.replace("_", "-").startswith("--train.validation-every") for flag in flags):
         every = -(-config.train.total_steps // POINTS)
         config = dataclasses.replace(config, train=dataclasses.replace(config.train, validation_every=every))

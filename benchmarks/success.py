@@ -37,7 +37,6 @@ import jax
 import numpy as np
 import yaml
 
-from edqn_jax.cli.train import parse_train
 from edqn_jax.config import FAMILIES, Config
 from edqn_jax.config.loading import apply_layer, to_yaml
 from edqn_jax.devices.devices import most_that_divide, use_cpu_devices
@@ -54,7 +53,7 @@ from edqn_jax.sim.task.env import EnvParams
 from edqn_jax.training.loop import train_seeds
 from measurement import json_report
 from measurement.command import Parser, at_least_one, in_a_sentence
-from measurement.flags import split, with_test_worlds_only
+from measurement.flags import parse_options, split, with_test_worlds_only
 from rivals.learners import flight_columns
 from rivals.planning import judged_scenes, shortest_lengths
 
@@ -102,7 +101,7 @@ def config_of(world: str, sensor: str, flags: Sequence[str]) -> Config:
     Raises:
         ConfigError: if the options are invalid.
     """
-    config = with_test_worlds_only(parse_train(["--world", world, "--env.sensor", sensor, *flags])[1])
+    config = with_test_worlds_only(parse_options(["--world", world, "--env.sensor", sensor, *flags]))
     # What is flown at the end is what was learnt at the end: no choice by validation, no time for it.
     train = dataclasses.replace(config.train, validation_every=0, validation_missions=config.env.drones, keep="last")
     return dataclasses.replace(config, train=train)

@@ -13,11 +13,25 @@ SAMPLES = 4
 """Replayed samples per decision unless the options set another number."""
 
 
+ONE_LOOK = ("--surface.pattern", "plaid")
+"""What is flown unless options say otherwise: every figure of the pages was measured in worlds of one plaid."""
+
+
 def split(words: Sequence[str]) -> tuple[list[str], list[str]]:
     """Returns the arguments of the benchmark, and those after --, which are options of train.py."""
     words = list(words)
     cut = words.index("--") if "--" in words else len(words)
     return words[:cut], words[cut + 1 :]
+
+
+def parse_options(flags: Sequence[str]) -> Config:
+    """Returns the configuration of train.py with these options, in worlds of one look unless they name another.
+
+    Raises:
+        ConfigError: if it is invalid.
+    """
+    named = any(flag.partition("=")[0] in ("--surface.pattern", "--config") for flag in flags)
+    return parse_train([*(() if named else ONE_LOOK), *flags])[1]
 
 
 def with_test_worlds_only(config: Config) -> Config:
@@ -34,8 +48,7 @@ def parse_config(flags: Sequence[str]) -> Config:
         ConfigError: if it is invalid.
     """
     named = any(flag.partition("=")[0] in ("--world", "--world.name", "--config") for flag in flags)
-    _, config = parse_train(flags if named else ["--world", "paper", *flags])
-    config = with_test_worlds_only(config)
+    config = with_test_worlds_only(parse_options(flags if named else ["--world", "paper", *flags]))
     if any(flag.replace("_", "-").startswith(("--agent.updates-per-step", "--config")) for flag in flags):
         return config
     updates = math.ceil(SAMPLES * config.train.num_envs / config.agent.batch_size)

@@ -39,8 +39,10 @@ RANDOM_WORLDS: Layer = {
     },
     "agent": {"updates_per_step": 4, "turn": True},
     "events": {"threshold": 0.03, "tolerance": 0.03, "frame_times_s": (-0.08, 0.0)},
+    "surface": {"pattern": "drawn"},
 }
-"""What random worlds change in the `default` preset: more decisions in more worlds, fewer updates for each, a longer
+"""What random worlds change in the `default` preset: surfaces that look otherwise in each, since of one look a policy
+learns its size in place of distance (docs/surfaces.md); more decisions in more worlds, fewer updates for each, a longer
 window of events with lower thresholds, and an encoder that learns from more, and again from flights of the policy,
 since there only events tell where obstacles are. No direction is preferred, so what is replayed is turned. The last
 flight is through the paper's map, which training never uses (docs/results/random_worlds.md)."""
