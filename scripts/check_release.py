@@ -47,6 +47,9 @@ import edqn_jax
 assert not Path(edqn_jax.__file__).is_relative_to(sys.argv[1]), "this is the checkout, not what was installed"
 policy = edqn_jax.load_policy("pretrained")
 state, observation = edqn_jax.make("paper").reset()
+from edqn_jax.native.shipped import shipped_library
+from edqn_jax.sim.camera.native import is_available
+assert is_available("cpu") or shipped_library() is None, "the library in C of the wheel cannot be used"
 evaluation = edqn_jax.evaluate(policy, "paper")
 print(f"one flight of the pretrained policy through the paper's map: {evaluation.outcomes[0]}")
 """
