@@ -210,9 +210,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     counts = Counter(Outcome(int(kind)).name.lower() for kind in flights.outcome)
     print(", ".join(f"{count} {name}" for name, count in counts.most_common()))
     print(table(rows) if rows else "no flight collided")
-    if args.json is not None:
-        report = {"benchmark": "failures", "world": missions.name, "seed": args.seed, "outcomes": counts, "rows": rows}
-        json_report.write(args.json, report | json_report.machine(jax.devices()))
+    report = {"benchmark": "failures", "world": missions.name, "seed": args.seed, "outcomes": counts, "rows": rows}
+    json_report.write(args.json, report | json_report.machine(jax.devices()))
     return 0
 
 

@@ -94,9 +94,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         rows.append({"gate": gate, "missions": args.missions, "interval": [low, high], **counts})
         cells = " | ".join(str(counts[name]) for name in names)
         print(f"| {gate} | {counts['goal'] / args.missions:.1%} | {low:.1%} to {high:.1%} | {cells} |", flush=True)
-    if args.json is not None:
-        report = {"benchmark": "gates", "world": args.world, "options": flags, "rows": rows}
-        json_report.write(args.json, report | json_report.machine(jax.devices()))
+    report = {"benchmark": "gates", "world": args.world, "options": flags, "rows": rows}
+    json_report.write(args.json, report | json_report.machine(jax.devices()))
     return 0
 
 

@@ -327,9 +327,8 @@ def main(argv: Sequence[str] | None = None) -> int:
             rows.append({"name": f"{family} {name}", "world": family, "method": name, **measure[name]()})
             print(f"{family}, {METHODS[name]}: {rows[-1]['success_rate']:.1%}", file=sys.stderr)
     print(table(rows))
-    if args.json is not None:
-        report = {"benchmark": "mapping", "split": args.split, "policy": str(args.policy), "rows": rows}
-        json_report.write(args.json, report | json_report.machine(jax.devices()))
+    report = {"benchmark": "mapping", "split": args.split, "policy": str(args.policy), "rows": rows}
+    json_report.write(args.json, report | json_report.machine(jax.devices()))
     return 0
 
 

@@ -282,7 +282,7 @@ def measure(asked: Asked) -> list[Row]:
         new: list[Row] = []
         for new in measure_world(asked, world):
             if asked.words.json is not None:
-                json_report.write(asked.words.json, report_of([*rows, *new], []))
+                json_report.write_row(asked.words.json, report_of([*rows, *new], []))
         rows += new
     return rows
 
@@ -405,7 +405,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         complaints.append(f"{error}; the added rows are left out")
     try:
         if asked.words.json is not None:
-            json_report.write(asked.words.json, report_of(rows, rates))
+            json_report.write_row(asked.words.json, report_of(rows, rates))
         if asked.words.figure is not None:
             draw_runtime(rows, asked.words.figure)
     except ConfigError as error:

@@ -10,6 +10,11 @@ an environment and of a slot of the replay are counted as well.
 
 Takes about 12 minutes on two cores, with --quick about 4, because each size is compiled. Arguments after -- are
 options of train.py; sizes are multiples of the values that they set.
+
+    python benchmarks/scaling.py --cores 1 2 4 8 16 --environments 128 512 --lines cores.jsonl
+
+trains on so many cores alone, with as many environments on each, in turns with the fewest cores and with C MuJoCo's
+rollout on as many threads. Rows are printed and written as they end, each after about a minute.
 """
 
 from __future__ import annotations
@@ -17,7 +22,9 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import itertools
+import json
 import math
+import os
 import statistics
 import sys
 import tempfile
@@ -26,6 +33,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import jax
+
+from curves.cores import HEAD, Plan, line, measure_rows, with_cores
 from curves.figure import draw_scaling
 from curves.sizes import CURVES, Curve, replace_options
 from curves.state_bytes import StateBytes, state_bytes
@@ -33,6 +43,8 @@ from edqn_jax.config import Config
 from edqn_jax.devices.devices import choose_devices, use_cpu_devices
 from edqn_jax.errors import ConfigError
 from edqn_jax.evaluation.missions import RunMissions, run_missions
+from edqn_jax.files import check_can_write
+from edqn_jax.runs.directory import to_plain_json
 from edqn_jax.runs.provenance import describe_workload
 from measurement import json_report
 from measurement.ceilings import Rollout
@@ -48,6 +60,8 @@ STEPS = 16
 TURN_SECONDS = 0.5
 """Minimum duration of a turn of one size."""
 MILLION = 1_000_000
+ENVIRONMENTS, LIMIT_S = 128, 180
+"""Environments on each core as in the reference workload on two, and seconds of a row of `--cores`."""
 
 
 # --------------------------------------------------------------------------------- what is measured
@@ -287,10 +301,52 @@ def parse(argv: Sequence[str] | None = None) -> tuple[argparse.Namespace, Config
         "--repeats", type=at_least_one, help=f"turns of each size (default {REPEATS}, quick {QUICK_REPEATS})"
     )
     parser.add_argument("--figure", type=Path, help="write a picture of the curves to this PNG file")
+    many = parser.add_argument_group("training on more and more cores, instead of the curves")
+    many.add_argument("--cores", nargs="+", type=at_least_one, metavar="N", help="numbers of cores")
+    many.add_argument(
+        "--environments",
+        nargs="+",
+        type=at_least_one,
+        default=[ENVIRONMENTS],
+        metavar="N",
+        help=f"environments on each core (default {ENVIRONMENTS})",
+    )
+    many.add_argument("--lines", type=Path, help="append each row to this file when it ends, as a line of JSON")
+    many.add_argument(
+        "--row-limit", type=at_least_one, default=LIMIT_S, help=f"seconds a row may take (default {LIMIT_S})"
+    )
     args = parser.parse(words)
+    if args.lines is not None:
+        check_can_write(args.lines)
     if args.repeats is None:
         args.repeats = QUICK_REPEATS if args.quick else REPEATS
-    return args, parse_config(flags)
+    if args.cores:
+        keep_to_cpu()
+    config = parse_config(flags)
+    for count, environments in itertools.product(args.cores or (), args.environments):
+        with_cores(config, count, environments)  # says what is invalid before anything is measured
+    args.flags = tuple(flags)
+    return args, config
+
+
+def keep_to_cpu() -> None:
+    """Keeps JAX, here and in processes that are started, from cards."""
+    os.environ["JAX_PLATFORMS"] = "cpu"
+    jax.config.update("jax_platforms", "cpu")
+
+
+def measure_cores(args: argparse.Namespace) -> dict[str, Any]:
+    """Prints the rows of `--cores` as they end, and writes each as a line; returns the report that `--json` writes."""
+    plan = Plan(tuple(args.cores), tuple(args.environments), args.repeats, args.row_limit, args.flags)
+    rows = []
+    with tempfile.TemporaryDirectory() as folder:
+        for row in measure_rows(plan, Path(folder)):
+            print(f"{'' if rows else HEAD}\n{line(row)}".lstrip("\n"), flush=True)
+            rows.append(row)
+            if args.lines is not None:
+                with args.lines.open("a", encoding="utf-8") as file:
+                    file.write(json.dumps(to_plain_json(row), allow_nan=False) + "\n")
+    return {"benchmark": "cores", "repeats": args.repeats, "rows": rows}
 
 
 @in_a_sentence
@@ -298,6 +354,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     """Returns exit code 0 after the measurement, 2 for invalid input."""
     use_cpu_devices()
     args, config = parse(argv)
+    if args.cores:
+        json_report.write(args.json, measure_cores(args))
+        return 0
     report = measure(config, args.curves, args.quick, args.repeats)
     print(table(report))
     json_report.write(args.json, report)

@@ -193,17 +193,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     courses = [load_missions(policy.config, world, args.missions) for world in args.worlds]
     rows = [row for course in courses for row in rows_of(policy, course, args.calls)]
     print(table(rows))
-    if args.json is not None:
-        json_report.write(
-            args.json,
-            {
-                **json_report.machine(jax.devices()),
-                "cores": 1,
-                "missions": args.missions,
-                "calls": args.calls,
-                "rows": rows,
-            },
-        )
+    report = {"cores": 1, "missions": args.missions, "calls": args.calls, "rows": rows}
+    json_report.write(args.json, json_report.machine(jax.devices()) | report)
     return 0
 
 

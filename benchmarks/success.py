@@ -210,7 +210,7 @@ def trained(config: Config, seeds: int, folder: Path) -> tuple[list[Policy], dic
         "commit": _commit(),
         **json_report.machine(jax.devices()),
     }
-    json_report.write(file, training)
+    json_report.write_row(file, training)
     return policies, training
 
 
@@ -301,7 +301,7 @@ def shortest_paths(out: Path, config: Config, missions: int, search: bool) -> np
     if not search:
         return None
     lengths = shortest_lengths(config, judged_scenes(config, missions))
-    json_report.write(file, {"world": config.world.name, "lengths": lengths})
+    json_report.write_row(file, {"world": config.world.name, "lengths": lengths})
     return np.array(lengths, float)
 
 
@@ -372,7 +372,7 @@ def measure(wanted: Sequence[Wanted], rows: list[Row], until: float) -> int:
     while left and time.perf_counter() + longest < until:
         row = left[0].measure()
         left[0].file.parent.mkdir(parents=True, exist_ok=True)
-        json_report.write(left[0].file, row)
+        json_report.write_row(left[0].file, row)
         rows.append(row)
         longest = max(row["row_seconds"] for row in rows[-len(wanted) :])
         print(f"{left[0].file.name}: {figures(row, None)['success']:.2%}, {row['row_seconds']:.0f} s", file=sys.stderr)

@@ -33,6 +33,7 @@ from edqn_jax.runs.provenance import describe_workload
 from measurement import json_report
 from measurement.ceilings import Rollout, ceilings
 from measurement.command import Parser, at_least_one, in_a_sentence
+from measurement.conditions import Watch, conditions
 from measurement.flags import parse_config, split
 from measurement.parts import parts_of
 from measurement.timing import Timed
@@ -85,6 +86,7 @@ def measure(config: Config, repeats: int, parts: bool) -> dict[str, Any]:
     c_mujoco = Rollout(config)
 
     turns: dict[str, list[float]] = {}
+    watch = Watch()
     for _ in range(repeats):  # in turns, so that a change in the machine's speed affects all rows
         turns.setdefault("whole", []).append(whole.turn())
         turns.setdefault("c_mujoco_rollout", []).append(c_mujoco.turn())
@@ -92,6 +94,7 @@ def measure(config: Config, repeats: int, parts: bool) -> dict[str, Any]:
             turns.setdefault(name, []).append(turn())
         for part in timed:
             turns.setdefault(part.part.name, []).append(part.turn())
+    seen = conditions(watch)
     middle = {name: statistics.median(values) for name, values in turns.items()}
 
     rate, physics = middle["whole"], config.drone.physics_steps
@@ -116,6 +119,7 @@ def measure(config: Config, repeats: int, parts: bool) -> dict[str, Any]:
     return {
         "workload": {**describe_workload(config, missions.scene), "world": config.world.name},
         **json_report.machine(devices),
+        "conditions": seen,
         "decisions_per_second": rate,
         "compile_seconds": whole.compile_seconds,
         "repeats": repeats,

@@ -9,7 +9,6 @@ training uses. Prints a Markdown table.
 from __future__ import annotations
 
 import itertools
-import json
 import platform
 import sys
 from collections.abc import Callable, Sequence
@@ -21,10 +20,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from edqn_jax.config import Config, DroneConfig
-from edqn_jax.files import write_atomically
 from edqn_jax.sim.physics.airframe import load_airframe
 from edqn_jax.sim.physics.drone import DroneState, Flight, hover_state, yaw_of
 from edqn_jax.sim.physics.flight import fly_decision
+from measurement import json_report
 from measurement.command import Parser, in_a_sentence
 
 Decide = Callable[[DroneState, jax.Array, jax.Array], tuple[DroneState, Flight]]
@@ -140,20 +139,19 @@ def main(argv: Sequence[str] | None = None) -> int:
     config = Config()
     rows = measure(config.drone, config.env.speed_m_s, batched_fly(config.drone))
     print(table(rows))
-    if args.json is not None:
-        workload = {
-            "physics_steps_per_decision": config.drone.physics_steps,
-            "physics_dt": config.drone.physics_dt_s,
-            "num_envs": len(rows),
-            "physics": config.drone.physics,
-        }
-        report = {
-            "workload": workload,
-            "device": f"{jax.devices()[0].device_kind} ({platform.machine()})",
-            "versions": {name: version(name) for name in ("jax", "mujoco", "mujoco-mjx")},
-            "rows": rows,
-        }
-        write_atomically(args.json, json.dumps(report, indent=1) + "\n")
+    workload = {
+        "physics_steps_per_decision": config.drone.physics_steps,
+        "physics_dt": config.drone.physics_dt_s,
+        "num_envs": len(rows),
+        "physics": config.drone.physics,
+    }
+    report = {
+        "workload": workload,
+        "device": f"{jax.devices()[0].device_kind} ({platform.machine()})",
+        "versions": {name: version(name) for name in ("jax", "mujoco", "mujoco-mjx")},
+        "rows": rows,
+    }
+    json_report.write(args.json, report)
     return 0
 
 

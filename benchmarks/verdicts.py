@@ -8,7 +8,6 @@ for any other outcome. The exit code is 1 if one outcome differs.
 
 from __future__ import annotations
 
-import json
 import platform
 import sys
 from collections.abc import Sequence
@@ -22,10 +21,10 @@ from edqn_jax.devices.devices import use_cpu_devices
 from edqn_jax.evaluation.missions import load_missions
 from edqn_jax.evaluation.rollouts import fly_on_all_devices
 from edqn_jax.evaluation.verdicts import CONTACT_TOLERANCE_M, Agreement, check_verdicts
-from edqn_jax.files import write_atomically
 from edqn_jax.runs.policies import load_run
 from edqn_jax.sim.task import group
 from edqn_jax.sim.task.outcomes import Outcome
+from measurement import json_report
 from measurement.command import Parser, in_a_sentence
 
 
@@ -81,22 +80,21 @@ def main(argv: Sequence[str] | None = None) -> int:
     for result in results:
         if not result.agrees:
             print(f"mission {result.mission}: {result}")
-    if args.json is not None:
-        report = {
-            "workload": {
-                "physics_steps_per_decision": config.drone.physics_steps,
-                "physics_dt": config.drone.physics_dt_s,
-                "missions": args.missions,
-                "seed": args.seed,
-                "world": course.name,
-                "contact_tolerance_m": CONTACT_TOLERANCE_M,
-                "physics": config.drone.physics,
-            },
-            "device": f"{jax.devices()[0].device_kind} ({platform.machine()})",
-            "versions": {name: version(name) for name in ("jax", "mujoco", "mujoco-mjx")},
-            "rows": rows,
-        }
-        write_atomically(args.json, json.dumps(report, indent=1) + "\n")
+    report = {
+        "workload": {
+            "physics_steps_per_decision": config.drone.physics_steps,
+            "physics_dt": config.drone.physics_dt_s,
+            "missions": args.missions,
+            "seed": args.seed,
+            "world": course.name,
+            "contact_tolerance_m": CONTACT_TOLERANCE_M,
+            "physics": config.drone.physics,
+        },
+        "device": f"{jax.devices()[0].device_kind} ({platform.machine()})",
+        "versions": {name: version(name) for name in ("jax", "mujoco", "mujoco-mjx")},
+        "rows": rows,
+    }
+    json_report.write(args.json, report)
     return int(not all(result.agrees for result in results))
 
 

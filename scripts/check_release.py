@@ -4,9 +4,10 @@
     python scripts/check_release.py --python python3.13
     python scripts/check_release.py --final --out dist
 
-Checks which files both hold, and that wheels built from checkout and sdist hold the same. Then, for each Python,
-installs the wheel and runs `edqn`, loads the pretrained policy, makes the paper's world and flies once. Needs the
-extra `release`.
+Checks which files both hold, that wheels built from checkout and sdist hold the same, and that a wheel has the library
+in C where there is a compiler, and can be built where there is none. Then, for each Python, installs the wheel and runs
+`edqn`, loads the pretrained policy, makes the paper's world and flies once, without a compiler. Needs the extra
+`release`.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ import tarfile
 import tempfile
 import tomllib
 import zipfile
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
@@ -36,6 +37,9 @@ IN_BOTH = (
 )
 """Files of the package that are not Python, beside worlds and checkpoints."""
 
+LIBRARY = re.compile(r"edqn_jax/native/built/(edqn-[\w-]+\.so|compiler\.txt)")
+"""Files of the library in C, which a wheel has that was built where there is a compiler."""
+
 FLIES = """
 import sys
 from pathlib import Path
@@ -43,6 +47,9 @@ import edqn_jax
 assert not Path(edqn_jax.__file__).is_relative_to(sys.argv[1]), "this is the checkout, not what was installed"
 policy = edqn_jax.load_policy("pretrained")
 state, observation = edqn_jax.make("paper").reset()
+from edqn_jax.native.shipped import shipped_library
+from edqn_jax.sim.camera.native import is_available
+assert is_available("cpu") or shipped_library() is None, "the library in C of the wheel cannot be used"
 evaluation = edqn_jax.evaluate(policy, "paper")
 print(f"one flight of the pretrained policy through the paper's map: {evaluation.outcomes[0]}")
 """
@@ -73,7 +80,7 @@ def check_wheel(names: Iterable[str], wanted: set[str]) -> None:
     wanted = wanted | {f"edqn_jax/{name}" for name in IN_BOTH}
     if missing := sorted(wanted - inside):
         raise ReleaseError(f"the wheel lacks {', '.join(missing)}")
-    if surplus := sorted(inside - wanted):
+    if surplus := sorted(name for name in inside - wanted if not LIBRARY.fullmatch(name)):
         raise ReleaseError(f"the wheel should not hold {', '.join(surplus)}")
     if not any(re.search(r"\.dist-info/(licenses/)?LICENSE$", name) for name in held):
         raise ReleaseError("the wheel lacks LICENSE")
@@ -127,8 +134,34 @@ def names_of(file: Path) -> list[str]:
         return [member.name for member in archive if member.isfile()]
 
 
+def has_library(wheel: Path) -> bool:
+    """Returns whether a wheel has the library in C.
+
+    Raises:
+        ReleaseError: if its name says otherwise: only with the library is it of one platform.
+    """
+    held = any(LIBRARY.fullmatch(name) for name in names_of(wheel))
+    if wheel.stem.endswith("-any") is held:
+        raise ReleaseError(f"{wheel.name} has {'a' if held else 'no'} library in C")
+    return held
+
+
+def check_libraries(wheel: Path, folder: Path) -> None:
+    """Raises if a wheel lacks the library in C although there is a compiler, or cannot be built without one.
+
+    Raises:
+        ReleaseError: says which.
+    """
+    if has_library(wheel) is not (shutil.which("cc") is not None):
+        raise ReleaseError(f"{wheel.name} has the library in C where there is no compiler, or none where there is one")
+    if has_library(_wheel_of_the_checkout(folder, {"CC": "no-such-compiler"})):
+        raise ReleaseError("a wheel that was built without a compiler has a library in C")
+
+
 def try_out(wheel: Path, python: str, version: str, folder: Path) -> None:
     """Installs the wheel for a Python into a fresh environment, and uses it outside of the checkout.
+
+    Nothing but Python is on the path then, so what is in C comes from the wheel.
 
     Raises:
         ReleaseError: if a command fails or the version is another.
@@ -136,15 +169,19 @@ def try_out(wheel: Path, python: str, version: str, folder: Path) -> None:
     _run([python, "-m", "venv", str(folder / "venv")])
     bin_ = folder / "venv" / "bin"
     _run([str(bin_ / "pip"), "install", "--quiet", "--disable-pip-version-check", str(wheel)])
-    said = _run([str(bin_ / "edqn"), "--version"], folder, quiet=True)
+    alone = {"PATH": str(bin_), "CC": ""}
+    said = _run([str(bin_ / "edqn"), "--version"], folder, quiet=True, variables=alone)
     if said.splitlines()[0] != f"edqn-jax {version}":
         raise ReleaseError(f"edqn --version says '{said.splitlines()[0]}', not 'edqn-jax {version}'")
     print(f"{python}: {', '.join(said.splitlines())}", flush=True)
-    _run([str(bin_ / "python"), "-c", FLIES, str(ROOT)], folder)
+    if has_library(wheel) and not re.search(r"^library in C: for \S+, in the package$", said, re.MULTILINE):
+        raise ReleaseError("edqn --version does not say that the library in C is in the package")
+    _run([str(bin_ / "python"), "-c", FLIES, str(ROOT)], folder, variables=alone)
     _run(
         [str(bin_ / "edqn"), "evaluate", "pretrained", "--world", "sparse", "--json", "figures.json"],
         folder,
         quiet=True,
+        variables=alone,
     )
     if not (folder / "figures.json").is_file():
         raise ReleaseError("edqn evaluate wrote no figures.json")
@@ -164,13 +201,16 @@ def _can_run(python: str) -> bool:
     return subprocess.run([python, "-c", "import venv, ssl"], capture_output=True, check=False).returncode == 0
 
 
-def _run(words: list[str], folder: Path | None = None, quiet: bool = False) -> str:
-    """Runs a command outside of the checkout and returns what it printed.
+def _run(
+    words: list[str], folder: Path | None = None, quiet: bool = False, variables: Mapping[str, str] | None = None
+) -> str:
+    """Runs a command outside of the checkout, with variables of the environment, and returns what it printed.
 
     Raises:
         ReleaseError: with what it said, if it fails.
     """
     environment = {name: value for name, value in os.environ.items() if name not in ("PYTHONPATH", "VIRTUAL_ENV")}
+    environment |= variables or {}
     done = subprocess.run(words, cwd=folder, env=environment, capture_output=True, text=True, check=False)
     if done.returncode:
         raise ReleaseError(f"{' '.join(words[:4])} failed:\n{done.stdout}{done.stderr}")
@@ -205,6 +245,7 @@ def main(argv: list[str] | None = None) -> int:
             if set(names_of(again)) != set(names_of(wheel)):
                 apart = sorted(set(names_of(again)) ^ set(names_of(wheel)))
                 raise ReleaseError(f"wheels of checkout and sdist differ in {', '.join(apart)}")
+            check_libraries(wheel, folder / "without")
             print(f"{wheel.name}: {len(names_of(wheel))} files, the same from checkout and sdist", flush=True)
             for number, python in enumerate(pythons):
                 place = folder / str(number)
@@ -220,8 +261,8 @@ def main(argv: list[str] | None = None) -> int:
     return 0
 
 
-def _wheel_of_the_checkout(folder: Path) -> Path:
-    _run([sys.executable, "-m", "build", "--wheel", "--outdir", str(folder), str(ROOT)])
+def _wheel_of_the_checkout(folder: Path, variables: Mapping[str, str] | None = None) -> Path:
+    _run([sys.executable, "-m", "build", "--wheel", "--outdir", str(folder), str(ROOT)], variables=variables)
     (wheel,) = folder.glob("*.whl")
     return wheel
 

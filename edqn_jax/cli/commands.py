@@ -23,6 +23,7 @@ from edqn_jax.cli.train import TrainCommand, train_command
 from edqn_jax.cli.verify import VerifyArgs, parse_verify, verify_command
 from edqn_jax.errors import CheckError, ConfigError, DivergedError, StoppedError, error_sentence, suggest_nearest
 from edqn_jax.extras import MissingPackageError
+from edqn_jax.native.shipped import describe_library
 from edqn_jax.user_code import load_module
 from edqn_jax.version import package_version
 
@@ -111,6 +112,7 @@ def _dispatch(argv: Sequence[str], stops: Stops) -> int:
         print(f"edqn-jax {package_version()}")
         for package in VERSIONS:
             print(f"{package} {metadata.version(package)}")
+        print(f"library in C: {describe_library()}")
     elif command in ("-h", "--help"):
         tyro.extras.subcommand_cli_from_dict(COMMANDS, prog="edqn", description=ABOUT["edqn"], args=["--help"])
     else:

@@ -47,9 +47,16 @@ def count_cores() -> int:
     return os.cpu_count() or 1
 
 
-def describe_processor() -> str:
-    """Returns the CPU's model name and the number of cores that this process may use."""
-    cpuinfo = Path("/proc/cpuinfo")
+def describe_processor(cpuinfo: Path = Path("/proc/cpuinfo")) -> str:
+    """Returns the CPU's model name, on x86 family, model and stepping, and the number of cores of this process.
+
+    Virtual machines often name processors of several generations alike, so the numbers tell them apart.
+    """
     lines = cpuinfo.read_text(encoding="utf-8").splitlines() if cpuinfo.is_file() else []
-    named = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
-    return f"{named[0] if named else platform.machine()}, {count_cores()} cores"
+    first: dict[str, str] = {}
+    for name, _, value in (line.partition(":") for line in lines):
+        first.setdefault(name.strip(), value.strip())
+    keys = {"cpu family": "family", "model": "model", "stepping": "stepping"}
+    said = ", ".join(f"{name} {first[key]}" for key, name in keys.items() if key in first)
+    named = first.get("model name", platform.machine()) + (f" ({said})" if said else "")
+    return f"{named}, {count_cores()} cores"

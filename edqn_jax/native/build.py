@@ -1,4 +1,5 @@
-"""Functions in C that XLA calls, on CPUs or GPUs: compiled once for this machine, kept beside compiled programs.
+"""Functions in C that XLA calls, on CPUs or GPUs: those that a wheel brings, or compiled once for this machine and
+kept beside compiled programs.
 
 Whoever uses one has the same function in JAX for where there is no compiler, and a test that both agree.
 """
@@ -11,23 +12,21 @@ import dataclasses
 import functools
 import hashlib
 import logging
-import os
 import shlex
-import shutil
 import subprocess
 import tempfile
 import threading
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import jax
 
 from edqn_jax.devices.cache import private_folder
-
-SWITCH = "EDQN_JAX_NATIVE"
-"""Environment variable; with 0 nothing in C is used."""
+from edqn_jax.native import shipped
 
 _ONE_AT_A_TIME = threading.Lock()
+
+_SHIPPED_SOURCES = tuple(Path(__file__).parents[1] / source for source in shipped.SOURCES)
 
 HEADER = Path(__file__).with_name("handler.h")
 
@@ -44,13 +43,9 @@ class Compiler:
 
 
 C = Compiler(
-    "CC",
-    "cc",
-    (
-        *("-std=gnu11", "-O3", "-march=native", "-fPIC", "-shared"),
-        # What vector instructions need. Comparisons of NaN are never relied on.
-        *("-fno-math-errno", "-fno-trapping-math", "-ffinite-math-only", "-fno-signed-zeros"),
-    ),
+    shipped.NAMED,
+    shipped.USUAL,
+    (*shipped.FLAGS, "-march=native"),
     "cpu",
     0,
 )
@@ -71,7 +66,12 @@ def cuda_compiler() -> Compiler | None:
 
 @functools.cache
 def compiler_version(of: Compiler | None = C) -> str | None:
-    """Returns the name and version of a compiler in its own words; None where it is not used."""
+    """Returns the name and version of a compiler in its own words; None where it is not used.
+
+    Of a library that the package brings, also the kind of processor that it was compiled for.
+    """
+    if of is C and (found := shipped.shipped_library()) is not None:
+        return f"{shipped.shipped_compiler()}, for {found[0]} in the wheel"
     command = None if of is None else _command(of)
     if of is None or command is None:
         return None
@@ -90,15 +90,7 @@ def _version(command: Sequence[str]) -> str:
 
 def _command(of: Compiler) -> list[str] | None:
     """Returns the compiler that is named, else the usual one, with its options; None if none is to be used."""
-    if os.environ.get(SWITCH, "1") == "0":
-        return None
-    named = os.environ.get(of.variable, "")
-    try:
-        words = shlex.split(named) or [of.usual]
-    except ValueError:  # a quotation without its end, which names no compiler
-        words = [named]
-    found = shutil.which(words[0])
-    return None if found is None else [found, *words[1:]]
+    return None if shipped.is_switched_off() else shipped.find_compiler(of.variable, of.usual)
 
 
 def ensure_registered(
@@ -108,10 +100,11 @@ def ensure_registered(
     by: Compiler = C,
     headers: tuple[Path, ...] = (),
 ) -> bool:
-    """Compiles and loads a source, and registers its handlers with XLA; returns whether that was possible.
+    """Loads a source's library and registers its handlers with XLA; returns whether that was possible.
 
-    Where there is a compiler and it was not, a warning says why. It may export `edqn_unusable`, which returns why it
-    cannot be used on this machine, or a null pointer.
+    It is the one that the package brings; where there is none, or CC names a compiler, it is compiled here. Where that
+    was not possible, a warning says why. The source may export `edqn_unusable`, which returns why it cannot be used on
+    this machine, or a null pointer.
 
     Args:
         source: C, with XLA's header for foreign functions.
@@ -128,14 +121,29 @@ def ensure_registered(
 def _registered(
     source: Path, targets: tuple[str, ...], definitions: tuple[str, ...], by: Compiler, headers: tuple[Path, ...]
 ) -> bool:
+    brought = shipped.shipped_library() if by is C and source in _SHIPPED_SOURCES and not definitions else None
+    if brought is not None and _register(lambda: ctypes.CDLL(str(brought[1])), source, targets, by):
+        return True
     command = _command(by)
-    if command is None:
-        return False
+    return command is not None and _register(
+        lambda: _compiled(command, source, definitions, by, headers), source, targets, by
+    )
+
+
+def _compiled(
+    command: list[str], source: Path, definitions: tuple[str, ...], by: Compiler, headers: tuple[Path, ...]
+) -> ctypes.CDLL:
+    """Returns the library, from where such files are kept or compiled now."""
+    with contextlib.ExitStack() as scratch:
+        # Where nothing can be kept, the file is not needed once it is loaded.
+        folder = private_folder() or Path(scratch.enter_context(tempfile.TemporaryDirectory()))
+        return _load_library(command, by.flags, source, definitions, folder, headers)
+
+
+def _register(load: Callable[[], ctypes.CDLL], source: Path, targets: tuple[str, ...], by: Compiler) -> bool:
+    """Loads a library and registers its handlers with XLA; returns whether that was possible, and warns if not."""
     try:
-        with contextlib.ExitStack() as scratch:
-            # Where nothing can be kept, the file is not needed once it is loaded.
-            folder = private_folder() or Path(scratch.enter_context(tempfile.TemporaryDirectory()))
-            library = _load_library(command, by.flags, source, definitions, folder, headers)
+        library = load()
         _check_usable(library)
         for target in targets:
             handler = jax.ffi.pycapsule(getattr(library, target))

@@ -25,6 +25,7 @@ from edqn_jax.config.loading import make_config
 from edqn_jax.config.presets import RANDOM_WORLDS
 from edqn_jax.devices import devices
 from edqn_jax.errors import CheckError, ConfigError, DivergedError, StoppedError
+from edqn_jax.native.shipped import describe_library
 from edqn_jax.sim.scene.mjcf import SceneError
 from tests.support.processes import PATIENCE_S
 
@@ -391,7 +392,7 @@ def test_a_flag_that_is_short_or_wrong_leads_to_the_one_that_was_meant(flag, mea
 
 def test_the_versions_are_those_of_the_packages():
     versions = [f"{name} {metadata.version(name)}" for name in ("edqn-jax", "jax", "mujoco", "mujoco-mjx")]
-    assert shown("--version").splitlines() == versions
+    assert shown("--version").splitlines() == [*versions, f"library in C: {describe_library()}"]
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import pytest
 
 from edqn_jax.devices import hardware as module
-from edqn_jax.devices.hardware import detect_hardware
+from edqn_jax.devices.hardware import describe_processor, detect_hardware
 
 
 def installed(monkeypatch: pytest.MonkeyPatch, *names: str) -> None:
@@ -59,3 +59,14 @@ def test_a_card_with_its_plugin_is_a_gpu(
 )
 def test_the_environment_can_hide_it(environ: dict[str, str], found: str, with_card: Path) -> None:
     assert detect_hardware(environ, with_card) == found
+
+
+def test_a_processor_is_told_from_one_of_the_same_name(tmp_path: Path) -> None:
+    file = tmp_path / "cpuinfo"
+    file.write_text(
+        "processor\t: 0\ncpu family\t: 25\nmodel\t\t: 17\nmodel name\t: AMD EPYC\nstepping\t: 1\n\nmodel\t: 9\n"
+    )
+    cores = f"{module.count_cores()} cores"
+    assert describe_processor(file) == f"AMD EPYC (family 25, model 17, stepping 1), {cores}"
+    file.write_text("processor : 0\nCPU part : 0xd40\n")  # Arm has other numbers
+    assert describe_processor(file) == describe_processor(tmp_path / "none") == f"{module.platform.machine()}, {cores}"

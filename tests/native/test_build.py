@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from edqn_jax.native import build
+from edqn_jax.native import build, shipped
 from edqn_jax.native.build import ensure_registered
 
 SOURCE = """
@@ -20,7 +20,7 @@ XLA_FFI_Error *NAME(XLA_FFI_CallFrame *call) { return asked_for_version(call) ? 
 @pytest.fixture
 def source(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-    monkeypatch.delenv(build.SWITCH, raising=False)
+    monkeypatch.delenv(shipped.SWITCH, raising=False)
     file = tmp_path / "nothing.c"
     file.write_text(SOURCE, encoding="utf-8")
     return file
@@ -39,7 +39,7 @@ def test_without_a_compiler_nothing_is_registered(
 
 
 def test_it_can_be_switched_off(source: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv(build.SWITCH, "0")
+    monkeypatch.setenv(shipped.SWITCH, "0")
     assert not ensure_registered(source, ("edqn_test_b",), ("NAME=edqn_test_b",)) and not kept(tmp_path)
 
 
@@ -127,7 +127,7 @@ def test_the_compiler_may_have_options_and_a_failure_is_told(
     assert ensure_registered(source, ("edqn_test_h",), ("NAME=edqn_test_h",)) and not caplog.records
     assert not ensure_registered(source, ("edqn_test_j",), ("NAME=other_name",))
     assert "nothing.c could not be compiled or loaded, JAX does its work more slowly" in caplog.text
-    monkeypatch.setenv(build.SWITCH, "0")
+    monkeypatch.setenv(shipped.SWITCH, "0")
     build.compiler_version.cache_clear()
     assert build.compiler_version() is None
     build.compiler_version.cache_clear()

@@ -17,16 +17,14 @@ from jax import Array
 
 from edqn_jax.config import CameraConfig
 from edqn_jax.native import build
-from edqn_jax.sim.camera import coverage, raycast, surfaces
+from edqn_jax.sim.camera import raycast
 from edqn_jax.sim.camera.primitive import most_rows
 from edqn_jax.sim.camera.texture import WAVES
 from edqn_jax.sim.scene.scene import Scene
-from edqn_jax.sim.scene.shapes.kind import TINY
-from edqn_jax.sim.scene.shapes.plane import HORIZON_M
-from edqn_jax.sim.scene.surface import CONTRAST, KIND, PHASES, SHARES, SURFACE_NUMBERS
+from edqn_jax.sim.scene.surface import SURFACE_NUMBERS
 
 SOURCES = {name: Path(__file__).with_name(f"pictures.{name}") for name in ("h", "c", "cu")}
-HEADERS = (SOURCES["h"], Path(__file__).with_name("patterns.h"), Path(__file__).with_name("tilted.h"))
+HEADERS = (SOURCES["h"], *(Path(__file__).with_name(f"{name}.h") for name in ("constants", "patterns", "tilted")))
 
 OPERANDS = {
     "boxes": ("position", "half", "yaw", "albedo"),
@@ -110,26 +108,6 @@ def _surfaces(scene: Scene, kind: str) -> Array | np.ndarray:
 
 
 def is_available(platform: str) -> bool:
-    """Returns whether the library of "cpu" or "cuda" is compiled, loaded and registered, which the first call does."""
+    """Returns whether the library of "cpu" or "cuda" is loaded and registered, which the first call does."""
     compiler, source = (build.C, SOURCES["c"]) if platform == "cpu" else (build.cuda_compiler(), SOURCES["cu"])
-    return compiler is not None and build.ensure_registered(source, TARGETS, compiler_definitions(), compiler, HEADERS)
-
-
-def compiler_definitions() -> tuple[str, ...]:
-    """Returns the constants that the sources do not define, NAME=VALUE."""
-    numbers = {
-        "TINY": TINY,
-        "HORIZON_M": HORIZON_M,
-        "NEAR_M": coverage.NEAR_M,
-        "FAR_U": coverage.FAR_U,
-        "LEVEL_FACE": coverage.LEVEL_FACE,
-        "EDGE": surfaces.EDGE,
-        "OVERTONE": surfaces.OVERTONE,
-    }
-    counts = {"DEPTH_OF_LAYERS": coverage.DEPTH_OF_LAYERS, "MOST_PLANES": MOST_PLANES}
-    counts |= {"SURFACE_NUMBERS": SURFACE_NUMBERS, "KIND": KIND, "CONTRAST": CONTRAST}
-    counts |= {"SHARES": SHARES, "PHASES": PHASES}
-    return (
-        *(f"{name}={value:e}f" for name, value in numbers.items()),
-        *(f"{name}={value}" for name, value in counts.items()),
-    )
+    return compiler is not None and build.ensure_registered(source, TARGETS, by=compiler, headers=HEADERS)

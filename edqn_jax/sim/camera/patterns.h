@@ -1,5 +1,5 @@
 /* Patterns of surfaces, each the average over LANES pixels of a column: `surfaces.py` in C, in its words. Constants in
- * capitals that are not defined here come from there and from `scene/surface.py`. `pictures.h` includes this.
+ * capitals come from there and from `scene/surface.py`, through `constants.h`. `pictures.h` includes this.
  */
 
 #ifndef EDQN_PATTERNS_H

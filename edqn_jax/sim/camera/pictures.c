@@ -13,7 +13,11 @@
 #include <immintrin.h>
 #endif
 
+#if defined(__SSE2__) && !defined(__AVX__)
+#define LANES 4
+#else
 #define LANES 8
+#endif
 #define FN static inline
 #define UNROLLED
 #define ALIGNED

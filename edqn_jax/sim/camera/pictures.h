@@ -2,7 +2,7 @@
  * functions `columns.render_columns` and `depth.nearest_depth` in C.
  *
  * The mathematics, its order and its words are those of `coverage.py`, `camera.py`, `texture.py` and `depth.py`;
- * constants in capitals that are not defined here come from there. M frames, H rows, C columns.
+ * constants in capitals come from there, through `constants.h`. M frames, H rows, C columns.
  *
  * Whoever includes this has defined: LANES, how many pixels are drawn at a time; Lanes and Mask, their numbers and
  * whether something holds of them; FN, how functions are declared; UNROLLED, before a loop; ALIGNED, of what is read at
@@ -16,6 +16,7 @@
 #include <stdint.h>
 #include <string.h>
 
+#include "constants.h"
 #include "handler.h"
 
 #define NOWHERE 1e30f

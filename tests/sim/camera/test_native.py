@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 import shutil
 from collections.abc import Callable
 from functools import partial
@@ -16,9 +17,11 @@ import pytest
 
 from edqn_jax.config import CameraConfig
 from edqn_jax.native import build
-from edqn_jax.sim.camera import camera, columns, native
+from edqn_jax.sim.camera import camera, columns, coverage, native, surfaces
 from edqn_jax.sim.camera.camera import LUMA_WEIGHTS
+from edqn_jax.sim.scene import surface
 from edqn_jax.sim.scene.scene import PARKED, Scene, stack_scenes, take_scene, with_drones, with_equal_capacities
+from edqn_jax.sim.scene.shapes import kind, plane
 from edqn_jax.sim.worlds import families
 from tests.support.drawn_scenes import GROUND, ball, box, every_kind, looking, pillar, rotation_of, scene_of
 
@@ -102,6 +105,22 @@ def crowd(rng: np.random.Generator) -> Scene:
 
 def test_the_library_is_at_hand_wherever_there_is_a_compiler() -> None:
     assert native.is_available("cpu") is (shutil.which("cc") is not None)
+
+
+def test_constants_are_the_same_in_c_and_in_python() -> None:
+    texts = dict(re.findall(r"^#define (\w+) ([-\w.]+)", native.HEADERS[1].read_text(), re.MULTILINE))
+    places = {
+        **dict.fromkeys(("NEAR_M", "FAR_U", "LEVEL_FACE", "DEPTH_OF_LAYERS"), coverage),
+        **dict.fromkeys(("EDGE", "OVERTONE"), surfaces),
+        **dict.fromkeys(("SURFACE_NUMBERS", "KIND", "CONTRAST", "SHARES", "PHASES"), surface),
+        **{"TINY": kind, "HORIZON_M": plane, "MOST_PLANES": native},
+    }
+    assert texts.keys() == places.keys()
+    assert {name: float(text.rstrip("f")) for name, text in texts.items()} == {
+        name: getattr(place, name) for name, place in places.items()
+    }
+    whole = {name for name, text in texts.items() if not text.endswith("f")}
+    assert whole == {name for name, place in places.items() if isinstance(getattr(place, name), int)}
 
 
 def test_both_draw_the_other_drones_and_neither_those_that_are_absent() -> None:
@@ -198,7 +217,7 @@ def kernels() -> bool:
     compiler = dataclasses.replace(build.C, flags=(*build.C.flags, "-xc", "-include", str(on_cpu), *names))
     targets = tuple(f"emulated_{target}" for target in native.TARGETS)
     headers = (*native.HEADERS, on_cpu)
-    return build.ensure_registered(native.SOURCES["cu"], targets, native.compiler_definitions(), compiler, headers)
+    return build.ensure_registered(native.SOURCES["cu"], targets, by=compiler, headers=headers)
 
 
 def crowded_forest(rng: np.random.Generator) -> Scene:
