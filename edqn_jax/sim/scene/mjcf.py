@@ -1,6 +1,7 @@
 """Reads and writes worlds as MJCF, MuJoCo's file format.
 
-An MJCF file that names no other file can be read. A world for the drone consists of
+An MJCF file can be read that names no other file but meshes and height fields in its folder. A world for the drone
+consists of
 
 * its static geoms (on the world body or on bodies welded to it) of any registered kind of shape (`shapes/`), at any
   rotation. Planes are solid below and infinite. A geom is read if it is visible in

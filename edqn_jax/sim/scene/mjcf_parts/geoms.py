@@ -11,6 +11,7 @@ from edqn_jax.errors import ConfigError
 from edqn_jax.sim.scene.mesh_field import MOST_VALUES
 from edqn_jax.sim.scene.mjcf_parts.files import SceneError
 from edqn_jax.sim.scene.mjcf_parts.motion import PREFIX
+from edqn_jax.sim.scene.mjcf_parts.solids import ellipsoid_mesh, field_mesh
 from edqn_jax.sim.scene.scene import Shape
 from edqn_jax.sim.scene.shapes.kind import Geom, kinds, read_shape
 
@@ -60,8 +61,10 @@ def shape_of(model: mujoco.MjModel, data: mujoco.MjData, geom: int, title: str, 
     found = geom_of(model, data, geom)
     if not all(np.all(np.isfinite(values)) for values in (found.position, found.rotation, found.size)):
         raise SceneError(f"{title}: geom '{name}' has a place or a size that is not finite; give it numbers")
-    if moves and found.mesh is not None:
-        raise SceneError(f"{title}: geom '{name}' is a mesh on a body that moves; only what stands may have meshes")
+    if moves and found.mesh is not None and not any(kind.geom == found.kind != "mesh" for kind in kinds().values()):
+        raise SceneError(
+            f"{title}: geom '{name}' is of the kind {found.kind} on a body that moves; only what stands may be"
+        )
     try:
         shape = read_shape(found)
     except ConfigError as error:
@@ -90,13 +93,17 @@ def check_grids(shapes: Sequence[Shape], title: str) -> None:
 
 
 def _mesh_of(model: mujoco.MjModel, geom: int) -> tuple[np.ndarray, np.ndarray] | None:
-    """Returns vertices [V, 3], metres, and triangles [F, 3] of a geom that is a mesh."""
-    if model.geom_type[geom] != mujoco.mjtGeom.mjGEOM_MESH:
+    """Returns vertices [V, 3], metres, and triangles [F, 3] of a mesh, an ellipsoid or a height field."""
+    kind, data = model.geom_type[geom], model.geom_dataid[geom]
+    if kind == mujoco.mjtGeom.mjGEOM_ELLIPSOID:
+        return ellipsoid_mesh(tuple(model.geom_size[geom]))
+    if kind == mujoco.mjtGeom.mjGEOM_HFIELD:
+        return field_mesh(model, data)
+    if kind != mujoco.mjtGeom.mjGEOM_MESH:
         return None
-    mesh = model.geom_dataid[geom]
-    vertex, face = model.mesh_vertadr[mesh], model.mesh_faceadr[mesh]
-    vertices = model.mesh_vert[vertex : vertex + model.mesh_vertnum[mesh]]
-    return vertices, model.mesh_face[face : face + model.mesh_facenum[mesh]]
+    vertex, face = model.mesh_vertadr[data], model.mesh_faceadr[data]
+    vertices = model.mesh_vert[vertex : vertex + model.mesh_vertnum[data]]
+    return vertices, model.mesh_face[face : face + model.mesh_facenum[data]]
 
 
 def geom_of(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> Geom:

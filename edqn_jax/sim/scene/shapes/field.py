@@ -1,4 +1,4 @@
-"""Fields: solids of any form, here convex meshes, as grids of signed distances (`sim/scene/mesh_field.py`).
+"""Fields: solids of any form as grids of signed distances (`sim/scene/mesh_field.py`).
 
 The grids are static: constants of a program, not rows of a world's arrays, which the camera copies for each column.
 Between its values a distance is interpolated; beyond its grid a field is at least as far away as the box around the
@@ -18,8 +18,10 @@ import numpy as np
 from flax import struct
 from jax import Array, lax
 
+from edqn_jax.sim.scene.grid_boxes import boxes_of_grid
 from edqn_jax.sim.scene.mesh_field import Grid, grid_of_mesh, hull_of, spread_directions
 from edqn_jax.sim.scene.motion import Motion
+from edqn_jax.sim.scene.shapes.faces import faces_of_box
 from edqn_jax.sim.scene.shapes.kind import (
     FAR,
     GREY,
@@ -186,6 +188,16 @@ def _faces(one: Fields) -> list[np.ndarray]:
     return list((one.position + vertices @ np.asarray(one.rotation).T)[faces])
 
 
+def _parts(one: Fields) -> list[list[np.ndarray]]:
+    grid = grid_of(one)
+    if grid.is_convex:
+        return [_faces(one)]
+    return [
+        faces_of_box(one.position + one.rotation @ (low + high) / 2, (high - low) / 2, one.rotation)
+        for low, high in boxes_of_grid(grid)
+    ]
+
+
 def _share(several: Sequence[Fields]) -> list[Fields]:
     """Returns fields, single or not, with one tuple of grids, in which each grid stands once."""
     grids = tuple(dict.fromkeys(grid for each in several for grid in each.grids))
@@ -212,4 +224,5 @@ FIELD = ShapeKind(
     share=_share,
     reach=lambda fields: (abs(fields.rotation) * fields.half[..., None, :]).sum(-1),
     faces=_faces,
+    parts=_parts,
 )

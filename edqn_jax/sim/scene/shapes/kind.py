@@ -88,7 +88,8 @@ class Geom:
     albedo: np.ndarray
     """[3]"""
     mesh: tuple[np.ndarray, np.ndarray] | None = None
-    """Vertices [V, 3], metres, in the geom's axes, and the triangles [F, 3] of a mesh; None: it is none."""
+    """Vertices [V, 3], metres, in the geom's axes, and triangles [F, 3] of a mesh, an ellipsoid or a height field;
+    None: it is none of them."""
 
     def is_upright(self, axis: int = 2) -> bool:
         """Returns whether one of its axes is vertical."""
@@ -123,6 +124,8 @@ class ShapeKind:
     """Shapes, single or not → half extents [..., 3] of the axis-aligned boxes around them, metres; None: endless."""
     faces: Callable[[Any], Sequence[np.ndarray]] | None = None
     """A single shape → rings of corners [k, 3], metres, of a convex solid for pictures; None if it is not drawn."""
+    parts: Callable[[Any], Sequence[Sequence[np.ndarray]]] | None = None
+    """A single shape → several convex solids for pictures, each as `faces`; None: it is the one of `faces`."""
     page: Callable[[Any], dict[str, Any]] | None = None
     """A single shape → `kind` and sizes of a solid that `report/page/page.js` knows; None draws its faces."""
 
@@ -143,6 +146,7 @@ class ShapeKind:
                 "share": "several",
                 "reach": "shapes",
                 "faces": "shape",
+                "parts": "shape",
                 "page": "shape",
             },
         )
@@ -166,8 +170,11 @@ def kind_of(shape: Any) -> tuple[str, ShapeKind]:
 
 
 def read_shape(geom: Geom) -> Any:
-    """Returns a geom as a single shape of the first kind that takes it; None if there is none."""
-    found = (kind.read(geom) for kind in kinds().values() if kind.geom == geom.kind)
+    """Returns a geom as a single shape of the first kind that takes it; None if there is none.
+
+    What has a mesh is read as one where no kind is for its name.
+    """
+    found = (kind.read(geom) for name in (geom.kind, "mesh") for kind in kinds().values() if kind.geom == name)
     return next((shape for shape in found if shape is not None), None)
 
 
