@@ -202,8 +202,9 @@ def _cell_for(half: Numbers, is_convex: bool) -> float:
 def _lowered_values_of_solid(triangles: Numbers, half: Numbers, cell: float) -> Numbers:
     """Returns distances [X, Y, Z] as `_lowered_values`, of triangles [F, 3, 3] of any closed mesh."""
     counts = _counts(half, cell).astype(int)
-    exact, middles = solid_distances(triangles, counts, cell)
-    between = functools.reduce(_means, range(3), exact.astype(np.float64))
+    found, middles = solid_distances(triangles, counts, cell)
+    exact = found.astype(np.float64)
+    between = functools.reduce(_means, range(3), exact)
     near = np.abs(middles) < (_BAND - 1) * cell
     excess = np.zeros(middles.shape)
     excess[near] = np.maximum(_UNSEEN * (between[near] - middles[near]), 0.0)

@@ -32,7 +32,7 @@ _THREADS = 2
 _PAIRS = 2**20  # numbers of an intermediate array
 _BESIDE = (3.1e-5, 1.7e-5)  # of a cell: no line upwards meets an edge of a mesh that is aligned to the lattice
 
-Numbers = NDArray[np.float64]
+Numbers = NDArray[np.floating]
 Integers = NDArray[np.int64]
 
 

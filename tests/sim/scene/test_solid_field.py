@@ -18,7 +18,12 @@ TURN = Rotation.from_euler("xyz", [20, 35, 50], degrees=True).as_matrix()
 
 def boxes(*bounds: list[list[float]]) -> trimesh.Trimesh:
     """Overlapping boxes."""
-    return trimesh.util.concatenate([trimesh.creation.box(bounds=each) for each in bounds])
+    parts = [trimesh.creation.box(bounds=each) for each in bounds]
+    return trimesh.Trimesh(
+        np.concatenate([part.vertices for part in parts]),
+        np.concatenate([part.faces + 8 * i for i, part in enumerate(parts)]),
+        process=False,
+    )
 
 
 def corner(thick: float) -> trimesh.Trimesh:

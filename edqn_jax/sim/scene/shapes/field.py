@@ -41,6 +41,9 @@ from edqn_jax.sim.scene.surface import Surface
 STEPS = 16
 """Of a ray through a field, each as long as the distance where it begins."""
 
+SLACK_M = 0.1
+"""Metres that a distance may be too small near a surface, in corners of cells of `CELL_M`."""
+
 TOUCHES = 1e-6
 """Metres that are none."""
 
@@ -189,11 +192,11 @@ def _faces(one: Fields) -> list[np.ndarray]:
 
 
 def _parts(one: Fields) -> list[list[np.ndarray]]:
-    grid = grid_of(one)
+    grid, turn = grid_of(one), np.asarray(one.rotation)
     if grid.is_convex:
         return [_faces(one)]
     return [
-        faces_of_box(one.position + one.rotation @ (low + high) / 2, (high - low) / 2, one.rotation)
+        faces_of_box(one.position + turn @ (low + high) / 2, (high - low) / 2, turn)
         for low, high in boxes_of_grid(grid)
     ]
 
@@ -222,6 +225,7 @@ FIELD = ShapeKind(
     write=lambda one: {"quat": quaternion_of(one.rotation)},
     asset=_asset,
     share=_share,
+    slack=SLACK_M,
     reach=lambda fields: (abs(fields.rotation) * fields.half[..., None, :]).sum(-1),
     faces=_faces,
     parts=_parts,

@@ -120,6 +120,8 @@ class ShapeKind:
     """A single shape → attributes of the mesh that its geom names: numbers; None: it names none."""
     share: Callable[[Sequence[Any]], Sequence[Any]] | None = None
     """Shapes of several worlds, single or not → the same with equal static fields; None: there are none."""
+    slack: float = 0.0
+    """Metres that distances near a surface may be too small: a collision there is no error."""
     reach: Callable[[Any], Any] | None = None
     """Shapes, single or not → half extents [..., 3] of the axis-aligned boxes around them, metres; None: endless."""
     faces: Callable[[Any], Sequence[np.ndarray]] | None = None
