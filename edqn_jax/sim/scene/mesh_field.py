@@ -38,6 +38,9 @@ MOST_VALUES = 2**22
 
 MOST_TRIANGLES = 500_000
 
+MOST_THICKNESS_M = 1.0
+"""Of a surface, metres."""
+
 _FINEST_M = 0.025
 _FINE_VALUES = 2**16  # of a grid that has cells below CELL_M, for thin meshes
 _BAND = 3  # cells around the surface in which interpolation is compared with exact distances
@@ -61,6 +64,7 @@ class Grid:
     vertices: Numbers  # [V, 3] about the middle of the box; of a convex mesh those of its hull
     faces: NDArray[np.int64]  # [F, 3] anticlockwise from outside
     is_convex: bool
+    thickness: float  # metres of a surface; 0 of a closed mesh
     digest: bytes
 
     @classmethod
@@ -72,11 +76,12 @@ class Grid:
         vertices: Numbers,
         faces: NDArray[np.integer],
         is_convex: bool = True,
+        thickness: float = 0.0,
     ) -> Grid:
         """Returns a grid of such contents."""
-        content = (np.asarray(values, np.float32), np.asarray(cell), half, vertices, faces)
+        content = (np.asarray(values, np.float32), np.asarray([cell, thickness]), half, vertices, faces)
         digest = hashlib.sha256(b"".join(np.ascontiguousarray(part).tobytes() for part in content)).digest()
-        return cls(content[0], float(cell), half, vertices, np.asarray(faces, np.int64), is_convex, digest)
+        return cls(content[0], float(cell), half, vertices, np.asarray(faces, np.int64), is_convex, thickness, digest)
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, Grid) and self.digest == other.digest
@@ -85,30 +90,37 @@ class Grid:
         return hash(self.digest)
 
 
-def grid_of_mesh(vertices: Numbers, faces: NDArray[np.integer], cell: float | None = None) -> tuple[Grid, Numbers]:
-    """Returns the grid of a closed mesh, and the middle [3] of the mesh's box.
+def grid_of_mesh(
+    vertices: Numbers, faces: NDArray[np.integer], cell: float | None = None, thickness: float = 0.0
+) -> tuple[Grid, Numbers]:
+    """Returns the grid of a closed mesh, or of a surface with a thickness, and the middle [3] of its box.
 
     Args:
         vertices: [V, 3] metres.
         faces: [F, 3] vertices of each triangle, anticlockwise from outside; parts may overlap.
         cell: metres; None takes `CELL_M`, less for small meshes as long as the grid is small, and more for large ones.
+        thickness: metres, half of them to either side of the triangles, which need not close anything then; 0 is a
+            closed mesh.
 
     Raises:
         ConfigError: if the mesh is not closed, or is too large.
     """
     vertices, faces = np.asarray(vertices, np.float64), np.asarray(faces, np.int64)
-    check_mesh(vertices, faces)
-    return _grid(vertices.tobytes(), faces.tobytes(), cell)
+    check_finite(vertices, faces)
+    if not thickness:
+        check_mesh(vertices, faces)
+    elif not 0 < thickness <= MOST_THICKNESS_M:
+        raise ConfigError(f"the mesh has a thickness of {thickness:g} m; it must be above 0, to {MOST_THICKNESS_M:g} m")
+    return _grid(vertices.tobytes(), faces.tobytes(), cell, float(thickness))
 
 
 @lru_cache(maxsize=32)
-def _grid(vertices: bytes, faces: bytes, cell: float | None) -> tuple[Grid, Numbers]:
+def _grid(vertices: bytes, faces: bytes, cell: float | None, thickness: float) -> tuple[Grid, Numbers]:
     """Returns `grid_of_mesh` of the bytes of a mesh, so that geoms of one mesh share a grid."""
     given, triangles = np.frombuffer(vertices).reshape(-1, 3), np.frombuffer(faces, np.int64).reshape(-1, 3)
-    corners, rings = hull_of(given)
-    low, high = corners.min(0), corners.max(0)
+    low, high = given.min(0) - thickness / 2, given.max(0) + thickness / 2
     middle, half = (low + high) / 2, (high - low) / 2
-    is_convex = is_hull(given, triangles)
+    is_convex = not thickness and is_hull(given, triangles)
     cell = _cell_for(half, is_convex) if cell is None else cell
     if not np.prod(_counts(half, cell)) <= MOST_VALUES:
         raise ConfigError(
@@ -117,10 +129,11 @@ def _grid(vertices: bytes, faces: bytes, cell: float | None) -> tuple[Grid, Numb
             "it of smaller ones, or of boxes"
         )
     if is_convex:
+        corners, rings = hull_of(given)
         values = _lowered_values(corners - middle, rings, half, cell)
         return Grid.of(values, cell, half, corners - middle, rings), middle
-    values = _lowered_values_of_solid((given - middle)[triangles], half, cell)
-    return Grid.of(values, cell, half, given - middle, triangles, is_convex=False), middle
+    values = _lowered_values_of_solid((given - middle)[triangles], half, cell, thickness)
+    return Grid.of(values, cell, half, given - middle, triangles, is_convex=False, thickness=thickness), middle
 
 
 def is_hull(vertices: Numbers, faces: NDArray[np.integer]) -> bool:
@@ -134,8 +147,8 @@ def is_hull(vertices: Numbers, faces: NDArray[np.integer]) -> bool:
     return bool(abs(filled - 1) <= _DENT)
 
 
-def check_mesh(vertices: Numbers, faces: NDArray[np.integer]) -> None:
-    """Raises unless a mesh [V, 3], metres, of triangles [F, 3] is finite, small, closed and turned outwards.
+def check_finite(vertices: Numbers, faces: NDArray[np.integer]) -> None:
+    """Raises unless a mesh [V, 3], metres, of triangles [F, 3] is finite and small.
 
     Raises:
         ConfigError: says what is wrong and what would be right.
@@ -144,6 +157,14 @@ def check_mesh(vertices: Numbers, faces: NDArray[np.integer]) -> None:
         raise ConfigError(f"the mesh has {len(faces):,} triangles; it may have {MOST_TRIANGLES:,}")
     if not np.all(np.isfinite(vertices)):
         raise ConfigError("the mesh has a vertex that is not finite; give it numbers")
+
+
+def check_mesh(vertices: Numbers, faces: NDArray[np.integer]) -> None:
+    """Raises unless a finite mesh [V, 3], metres, of triangles [F, 3] is closed and turned outwards.
+
+    Raises:
+        ConfigError: says what is wrong and what would be right.
+    """
     _, same = np.unique(vertices, axis=0, return_inverse=True)
     corners = same.reshape(-1)[faces]
     corners = corners[(corners != np.roll(corners, 1, axis=1)).all(1)]
@@ -199,16 +220,16 @@ def _cell_for(half: Numbers, is_convex: bool) -> float:
     return cell
 
 
-def _lowered_values_of_solid(triangles: Numbers, half: Numbers, cell: float) -> Numbers:
-    """Returns distances [X, Y, Z] as `_lowered_values`, of triangles [F, 3, 3] of any closed mesh."""
+def _lowered_values_of_solid(triangles: Numbers, half: Numbers, cell: float, thickness: float) -> Numbers:
+    """Returns distances [X, Y, Z] as `_lowered_values`, of triangles [F, 3, 3] of any mesh."""
     counts = _counts(half, cell).astype(int)
-    found, middles = solid_distances(triangles, counts, cell)
+    found, middles = solid_distances(triangles, counts, cell, is_closed=not thickness)
     exact = found.astype(np.float64)
     between = functools.reduce(_means, range(3), exact)
     near = np.abs(middles) < (_BAND - 1) * cell
     excess = np.zeros(middles.shape)
     excess[near] = np.maximum(_UNSEEN * (between[near] - middles[near]), 0.0)
-    # The surface itself is where both sides of something thin meet.
+    # At the surface itself both sides of something thin meet.
     surface = split_triangles(triangles, cell).mean(1)
     at = surface / cell + (counts - 1) / 2
     places = np.minimum(at.astype(np.int64), counts - 2)
@@ -219,7 +240,7 @@ def _lowered_values_of_solid(triangles: Numbers, half: Numbers, cell: float) -> 
         lowering = np.moveaxis(np.maximum(moved[1:], moved[:-1]), 0, axis)
     far = exact > (_BAND - 1) * cell
     lowering[far] = np.maximum(lowering[far], cell**2 / (4 * exact[far]))
-    return exact - lowering
+    return exact - lowering - thickness / 2
 
 
 def _means(values: Numbers, axis: int) -> Numbers:

@@ -47,6 +47,9 @@ VOLUME_MARGIN = 5.0
 LONGEST_VOLUME = 500.0
 """Most metres along an axis of a flight volume; A*'s lattice must hold it."""
 
+SCANS = (".ply", ".stl", ".obj", ".glb")
+"""Endings of files of which `edqn world` makes worlds."""
+
 MAX_SHAPES = 500
 """Geoms of a world: 2 000 of them take 8 GB to train in."""
 
@@ -78,6 +81,8 @@ def resolve_world(name: str) -> Path:
     """
     path = Path(name).expanduser()
     if path.is_file():
+        if path.suffix.lower() in SCANS:
+            raise SceneError(f"'{name}' is a scan; `edqn world {name} --out {path.stem}` makes a world of it")
         return path
     folder = scenes_folder()
     named = folder / f"{name}.xml"
@@ -292,7 +297,9 @@ def mjcf_of(scene: Scene, *, title: str = "world") -> str:
     shapes = named_shapes(scene)
     for name, shape in shapes:
         attributes = _attributes(shape)
-        made = kind_of(shape)[1].asset
+        made, numbers = kind_of(shape)[1].asset, kind_of(shape)[1].custom
+        for word, values in ({} if numbers is None else numbers(shape)).items():
+            ElementTree.SubElement(custom, "numeric", name=f"{word}{name}", data=numbers_text(values))
         if made is not None:
             mesh = {key: numbers_text(values) for key, values in made(shape).items()}
             ElementTree.SubElement(asset, "mesh", {"name": name, **mesh})

@@ -57,7 +57,7 @@ def lattice_axes(counts: NDArray[np.integer], cell: float) -> list[Numbers]:
 
 
 def solid_distances(
-    triangles: Numbers, counts: NDArray[np.integer], cell: float
+    triangles: Numbers, counts: NDArray[np.integer], cell: float, is_closed: bool = True
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Returns distances at the points of a lattice and in the middles of its cells, metres, negative inside.
 
@@ -65,6 +65,7 @@ def solid_distances(
         triangles: [F, 3, 3] of a closed mesh.
         counts: [3] of the lattice.
         cell: metres.
+        is_closed: whether there is an inside.
 
     Returns:
         corners: [X, Y, Z]; beyond `EXACT_CELLS` from the surface about a tenth of a cell too small.
@@ -76,6 +77,8 @@ def solid_distances(
         corners, middles, nearest = _near_distances(pieces, table, counts, cell)
         away = _far_distances(table, nearest, corners, cell) - _FAR_CELLS * cell
     corners[~np.isfinite(corners)] = np.maximum(away, EXACT_CELLS * cell)
+    if not is_closed:
+        return corners, middles
     axes = lattice_axes(counts, cell)
     for values, lattice in ((corners, axes), (middles, [axis[:-1] + cell / 2 for axis in axes])):
         np.negative(values, out=values, where=inside_of(triangles, lattice))

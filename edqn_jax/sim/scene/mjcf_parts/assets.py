@@ -112,8 +112,8 @@ def read_mesh(file: Path) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     return vertices, number.reshape(-1)[faces]
 
 
-def load_geometry(file: Path, kind: str) -> Any:
-    """Returns what trimesh reads of a file: a mesh, or a cloud of points.
+def load_geometry(file: Path, kind: str, most: int = MOST_TRIANGLES) -> Any:
+    """Returns what trimesh reads of a file of at most so many triangles: a mesh, or a cloud of points.
 
     Raises:
         ConfigError: if it has too many triangles or cannot be read.
@@ -122,25 +122,24 @@ def load_geometry(file: Path, kind: str) -> Any:
 
     try:
         with file.open("rb") as opened:
-            check_number(file, _announced(opened.read(_HEADER), kind, file.stat().st_size))
+            check_number(file, _announced(opened.read(_HEADER), kind, file.stat().st_size), most)
         content = io.BytesIO(file.read_bytes())
     except OSError as error:
         raise ConfigError(f"cannot read the mesh file '{file}': {error.strerror}") from None
     try:
         loaded = trimesh.load(content, file_type=kind, process=False)
-        return loaded.to_mesh() if isinstance(loaded, trimesh.Scene) else loaded
+        return loaded.to_geometry() if isinstance(loaded, trimesh.Scene) else loaded
     except Exception as error:  # trimesh passes on whatever a file makes its readers raise
         reason = " ".join(str(error).split())[:200]
         raise ConfigError(f"the mesh file '{file}' cannot be read as .{kind}: {reason}") from None
 
 
-def check_number(file: Path, count: int, most: int | None = None) -> None:
+def check_number(file: Path, count: int, most: int = MOST_TRIANGLES) -> None:
     """Raises ConfigError if a file has too many triangles.
 
     Raises:
         ConfigError: says how many it may have.
     """
-    most = MOST_TRIANGLES if most is None else most
     if count > most:
         raise ConfigError(f"the mesh file '{file}' has {count:,} triangles; it may have {most:,}, so thin it out")
 

@@ -26,6 +26,7 @@ from edqn_jax.sim.scene.shapes.kind import (
     FAR,
     GREY,
     PARKED,
+    THICKNESS,
     Geom,
     Hits,
     ShapeKind,
@@ -167,7 +168,7 @@ def _meet(fields: Fields, origin: Array, ray: Vector) -> Hits:
 def _read(geom: Geom) -> Fields | None:
     if geom.mesh is None:
         return None
-    grid, middle = grid_of_mesh(*geom.mesh)
+    grid, middle = grid_of_mesh(*geom.mesh, thickness=geom.thickness)
     position = geom.position + geom.rotation @ middle
     return Fields(position, geom.rotation, grid.half, np.float32(0), geom.albedo, grids=(grid,))  # type: ignore[arg-type]
 
@@ -180,6 +181,11 @@ def grid_of(one: Fields) -> Grid:
 def _asset(one: Fields) -> dict[str, Any]:
     grid = grid_of(one)
     return {"vertex": grid.vertices, "face": grid.faces}
+
+
+def _custom(one: Fields) -> dict[str, Any]:
+    thickness = grid_of(one).thickness
+    return {THICKNESS: [thickness]} if thickness else {}
 
 
 def _faces(one: Fields) -> list[np.ndarray]:
@@ -224,6 +230,7 @@ FIELD = ShapeKind(
     read=_read,
     write=lambda one: {"quat": quaternion_of(one.rotation)},
     asset=_asset,
+    custom=_custom,
     share=_share,
     slack=SLACK_M,
     reach=lambda fields: (abs(fields.rotation) * fields.half[..., None, :]).sum(-1),

@@ -33,6 +33,9 @@ UP = np.array([0.0, 0.0, 1.0])
 
 TINY = 1e-9
 
+THICKNESS = "thickness:"
+"""Before the name of a geom, the numeric of the thickness of its mesh, metres."""
+
 LEVEL = 1e-6
 """An axis this near to vertical (sine of the angle) is vertical: 0.1 mm over 100 m."""
 
@@ -90,6 +93,8 @@ class Geom:
     mesh: tuple[np.ndarray, np.ndarray] | None = None
     """Vertices [V, 3], metres, in the geom's axes, and triangles [F, 3] of a mesh, an ellipsoid or a height field;
     None: it is none of them."""
+    thickness: float = 0.0
+    """Metres of a mesh that is a surface and not closed; 0 of a closed one."""
 
     def is_upright(self, axis: int = 2) -> bool:
         """Returns whether one of its axes is vertical."""
@@ -118,6 +123,8 @@ class ShapeKind:
     """A single shape → attributes of its geom beside type, pos and rgba: numbers."""
     asset: Callable[[Any], dict[str, Any]] | None = None
     """A single shape → attributes of the mesh that its geom names: numbers; None: it names none."""
+    custom: Callable[[Any], dict[str, Any]] | None = None
+    """A single shape → numerics of `<custom>` for its geom: numbers by the word that stands before the geom's name."""
     share: Callable[[Sequence[Any]], Sequence[Any]] | None = None
     """Shapes of several worlds, single or not → the same with equal static fields; None: there are none."""
     slack: float = 0.0
@@ -145,6 +152,7 @@ class ShapeKind:
                 "read": "geom",
                 "write": "shape",
                 "asset": "shape",
+                "custom": "shape",
                 "share": "several",
                 "reach": "shapes",
                 "faces": "shape",
