@@ -2,8 +2,8 @@
 
     python scripts/make_building.py
 
-Walls and furniture are closed solids that overlap. The hall in the middle is as high as the house; the rooms around it
-have openings of 3 m.
+Walls and furniture are closed solids that overlap. The hall in the middle is as high as the house; the rooms beside it
+have openings of 5 m.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ FILE = Path(__file__).parents[1] / "scenes/examples/building.obj"
 LENGTH, WIDTH, STOREY, THICK = 24.0, 14.0, 4.0, 0.2
 HALL = (9.0, 15.0)
 """Metres along x between which the upper floor is open."""
-DOOR = 3.0
+DOOR = 5.0
 
 
 def block(low: tuple[float, float, float], high: tuple[float, float, float]) -> Trimesh:
@@ -49,13 +49,10 @@ def shell() -> list[Trimesh]:
 
 
 def partition(x: float, floor: float) -> list[Trimesh]:
-    """Returns a wall across the house with two openings as high as the storey less half a metre."""
-    top, lintel = floor + STOREY, floor + STOREY - 0.5
-    solid, begin = [block((x, 0, lintel), (x + THICK, WIDTH, top))], 0.0
-    for middle in (WIDTH / 4, 3 * WIDTH / 4):
-        solid.append(block((x, begin, floor), (x + THICK, middle - DOOR / 2, top)))
-        begin = middle + DOOR / 2
-    return [*solid, block((x, begin, floor), (x + THICK, WIDTH, top))]
+    """Returns a wall across the house with an opening in its middle, as high as the storey less half a metre."""
+    top, side = floor + STOREY, (WIDTH - DOOR) / 2
+    lintel = block((x, 0, top - 0.5), (x + THICK, WIDTH, top))
+    return [lintel, *(block((x, y, floor), (x + THICK, y + side, top)) for y in (0.0, WIDTH - side))]
 
 
 def table(x: float, y: float, floor: float) -> list[Trimesh]:
@@ -106,15 +103,16 @@ def furniture() -> list[Trimesh]:
     for floor in (THICK, STOREY + THICK / 2):
         ceiling = (STOREY - THICK / 2) if floor < STOREY else 2 * STOREY - THICK
         for x in (4.5, 19.5):
-            for y in (1.6, WIDTH / 2, WIDTH - 1.6):
+            for y in (1.6, 3.4, WIDTH - 3.4, WIDTH - 1.6):
                 parts += table(x + rng.uniform(-1.5, 1.5), y, floor)
             for dx in (-2.5, 2.5):
                 parts += shelf(x + dx, 0.4, floor) + shelf(x + dx, WIDTH - 0.4, floor)
                 for y in (WIDTH / 4, 3 * WIDTH / 4):
                     parts += lamp(x + dx / 2, y, ceiling)
-            for y in (0.7, WIDTH / 2 - 1.2, WIDTH / 2 + 1.2, WIDTH - 0.7):
+            for y in (0.7, 2.4, WIDTH - 2.4, WIDTH - 0.7):
                 parts += plant(x + (3.6 if x < 12 else -3.6), y, floor, rng)
-            parts.append(block((x - 4.2, WIDTH / 2 - 1, floor), (x - 3.4, WIDTH / 2 + 1, floor + 0.45)))
+            end = x - 4.2 if x < LENGTH / 2 else x + 3.4
+            parts.append(block((end, WIDTH / 2 - 1, floor), (end + 0.8, WIDTH / 2 + 1, floor + 0.45)))
     for y in (1.5, WIDTH - 1.5):
         parts += [post(x, y, 0.0, 2 * STOREY, 0.25, 64) for x in (10.5, 13.5)]
     for x, y in ((10.0, 4.0), (14.0, 4.0), (10.0, 10.0), (14.0, 10.0)):

@@ -34,7 +34,7 @@ MARGIN_M = 0.5
 """Metres around a mesh that its grid reaches, more than a drone's radius."""
 
 MOST_VALUES = 2**22
-"""Of a grid, and of all grids of a world: programs hold each of them eight times, 128 MiB."""
+"""Of a grid, and of all grids of a world, 16 MiB that every program holds."""
 
 MOST_TRIANGLES = 500_000
 
