@@ -102,7 +102,7 @@ def test_a_ray_along_a_wall_arrives_at_the_one_behind(tmp_path: Path) -> None:
     vertices = np.concatenate([part.vertices for part in parts])
     walls = vertices, np.concatenate([part.faces + 8 * i for i, part in enumerate(parts)])
     scene = load_scene(mesh_world(tmp_path, '<geom type="mesh" mesh="m" pos="2 2 1"/>', m=walls))
-    rays = jnp.asarray(np.tile(np.float32([1, 0.004, 0]), (1, 8, 1)))
+    rays = jnp.asarray(np.tile(np.array([1, 0.004, 0], np.float32), (1, 8, 1)))
     for y, least in np.array([[2.5, 12.7], [2.35, 8.0]]):
         depth, hit, *_ = meet(scene.others["fields"], jnp.array([3.0, y, 2.0]), rays)
         assert bool(hit.all()) and least < float(depth[0, 0, 0]) < 12.81
