@@ -21,6 +21,7 @@ from edqn_jax.cli.record import RecordArgs, parse_record, record_command
 from edqn_jax.cli.report import ReportArgs, parse_report, report_command
 from edqn_jax.cli.train import TrainCommand, train_command
 from edqn_jax.cli.verify import VerifyArgs, parse_verify, verify_command
+from edqn_jax.cli.world import WorldArgs, parse_world, world_command
 from edqn_jax.errors import CheckError, ConfigError, DivergedError, StoppedError, error_sentence, suggest_nearest
 from edqn_jax.extras import MissingPackageError
 from edqn_jax.native.shipped import describe_library
@@ -37,6 +38,7 @@ BY_SIGNAL = 128
 COMMANDS = {
     "train": TrainCommand,
     "evaluate": EvaluateArgs,
+    "world": WorldArgs,
     "check": CheckArgs,
     "record": RecordArgs,
     "report": ReportArgs,
@@ -54,6 +56,7 @@ VERSIONS = ("jax", "mujoco", "mujoco-mjx")
 
 RUN_COMMANDS = {
     "evaluate": (parse_evaluate, evaluate_command),
+    "world": (parse_world, world_command),
     "check": (parse_check, check_command),
     "record": (parse_record, record_command),
     "report": (parse_report, report_command),

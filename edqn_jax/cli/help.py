@@ -18,7 +18,7 @@ from edqn_jax.config.simulation import LOOKS
 
 TRAIN, EVALUATE, RECORD, REPORT = "edqn train", "edqn evaluate", "edqn record", "edqn report"
 VERIFY, EXPORT, EVENTS, COMPLETION = "edqn verify", "edqn export", "edqn events", "edqn completion"
-CHECK = "edqn check"
+CHECK, WORLD = "edqn check", "edqn world"
 
 ABOUT = {
     "edqn": """Train drones to fly through unknown obstacles from the events of a simulated camera, and fly them.
@@ -39,6 +39,12 @@ Examples:
   edqn train                                       medium random worlds, then the paper's map, unseen
   edqn train --world mine.xml --run-dir runs/mine  your own world; the same command continues the run
   edqn train --preset paper --world paper          Table 1 of the paper""",
+    WORLD: """Make a world of a scan, a mesh or a cloud of points: an MJCF file, and the mesh that it names.
+
+Examples:
+  edqn world house.ply --out house
+  edqn world site.glb --out site --scale 0.001 --thickness 0.1
+  edqn world room.obj --out room --up y --start 1 1 1.5 --goal 8 4 1.5""",
     CHECK: """Say whether a policy can fly in a world: what its geoms became, its tightest way, its size, what it costs.
 
 Ends with 0 if it will fly, 1 if it will not, and 2 for a file that cannot be read.

@@ -329,12 +329,13 @@ def _world_digest(world: str) -> str:
         ConfigError: as `options_to_compare`.
     """
     from edqn_jax.sim.scene.mjcf import resolve_world
+    from edqn_jax.sim.scene.mjcf_parts.files import self_contained_bytes
 
     if not world or world in FAMILIES:
         return world
     file = resolve_world(world)
     try:
-        return hashlib.sha256(file.read_bytes()).hexdigest()
+        return hashlib.sha256(self_contained_bytes(file)).hexdigest()
     except OSError as error:
         raise ConfigError(f"cannot read the world '{file}': {error.strerror}") from None
 

@@ -2,7 +2,8 @@
 
 Shares no code with the signed distance that training uses. A probe sphere of the body's radius is added to the
 world. Along the straight segments between physics steps it advances by the clearance that `mj_geomDistance`
-reports; no solid is nearer than that, so the search misses neither a thin wall between two steps nor a graze.
+reports; no solid is nearer than that, so the search misses neither a thin wall between two steps nor a graze. Of meshes
+that are not convex, and height fields, it is trimesh that says how far away they are (`mesh_judge.py`).
 
 Mocap bodies of which the file says how they move stand, at every point of the search, where they are at its time. The
 sphere then advances by the clearance less what the fastest of them may move meanwhile. Where they are is computed here
@@ -12,14 +13,15 @@ from the words of the file, too, by other formulas than the simulator's.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import mujoco
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from edqn_jax.evaluation.mesh_judge import TriangleSolid, triangle_solids
 from edqn_jax.sim.scene.mjcf_parts.geoms import geom_of
 from edqn_jax.sim.scene.mjcf_parts.motion import MotionSpec, as_ellipse, motions_of
 from edqn_jax.sim.scene.shapes.kind import reach_of, read_shape
@@ -177,6 +179,16 @@ class MujocoWorld:
     moving: tuple[Moving, ...] = ()
     target: FlightTrack = FlightTrack((0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
     """From site `start` to site `goal` of the world, at a steady pace."""
+    meshes: Mapping[int, TriangleSolid] = field(default_factory=dict)
+    """The solids, by geom number, that C MuJoCo does not judge."""
+
+    def judge_of(self, geom: str) -> str:
+        """Returns who says how far away the geom of this name is."""
+        return "trimesh" if geom in {self.name_of(number) for number in self.meshes} else "C MuJoCo"
+
+    def name_of(self, geom: int) -> str:
+        """Returns the name of geom number `geom`, or `geom N` where it has none."""
+        return self.model.geom(geom).name or f"geom {geom}"
 
 
 def load_judge(world: str | Path | mujoco.MjSpec, radius: float, volume: ArrayLike | None = None) -> MujocoWorld:
@@ -207,7 +219,8 @@ def load_judge(world: str | Path | mujoco.MjSpec, radius: float, volume: ArrayLi
     reach = np.where(plane, np.inf, model.geom_rbound[solids])
     moving = tuple(_moving(model, data, solids, volume))
     start, goal = (np.array(data.site(n).xpos) if n in _sites(model) else np.zeros(3) for n in ("start", "goal"))
-    return MujocoWorld(model, data, probe, solids, reach, moving, FlightTrack(start, goal))
+    meshes = triangle_solids(model, data, solids)
+    return MujocoWorld(model, data, probe, solids, reach, moving, FlightTrack(start, goal), meshes)
 
 
 def _sites(model: mujoco.MjModel) -> list[str]:
@@ -263,12 +276,15 @@ def clearance(
         if at_least[index] >= nearest:
             break
         geom = int(judge.solids[index])
-        distance = mujoco.mj_geomDistance(judge.model, data, geom, judge.probe, _FARTHEST_M, None)
+        if geom in judge.meshes:
+            distance = judge.meshes[geom].distance(np.asarray(position, np.float64)) - radius
+        else:
+            distance = mujoco.mj_geomDistance(judge.model, data, geom, judge.probe, _FARTHEST_M, None)
         if distance < nearest:
             nearest, name = distance, geom
     if name < 0:
         return np.inf, ""
-    return float(nearest), judge.model.geom(name).name or f"geom {name}"
+    return float(nearest), judge.name_of(name)
 
 
 def max_obstacle_speed(judge: MujocoWorld, seconds: float) -> float:

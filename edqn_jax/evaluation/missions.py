@@ -19,6 +19,7 @@ from edqn_jax.planning.free_space import find_reachable, is_reachable
 from edqn_jax.planning.lattice import CELL_M, lattice_shape
 from edqn_jax.sim.physics.airframe import load_airframe
 from edqn_jax.sim.scene.mjcf import check_scene, load_world, mjcf_of, resolve_world
+from edqn_jax.sim.scene.mjcf_parts.files import self_contained_bytes
 from edqn_jax.sim.scene.scene import Scene, take_scene, with_equal_capacities
 from edqn_jax.sim.task import group
 from edqn_jax.sim.task.crossing import crossing_missions, own_crossings
@@ -57,7 +58,7 @@ class MissionSet:
     def mjcf(self) -> list[str]:
         """Returns every world of the pool as MJCF: the file it was read from, or written from the arrays."""
         if self.file is not None:
-            return [self.file.read_text(encoding="utf-8")]
+            return [self_contained_bytes(self.file).decode()]
         pool = jax.tree.map(np.asarray, self.env_params.pool)
         return [mjcf_of(take_scene(pool, i), title=f"{self.name} {i}") for i in range(pool.start.shape[0])]
 

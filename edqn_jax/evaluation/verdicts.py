@@ -1,4 +1,4 @@
-"""Comparison of the simulator's verdicts on recorded flights with C MuJoCo's, on the worlds' MJCF."""
+"""Comparison of the verdicts on recorded flights with those of C MuJoCo, or trimesh, on the worlds' MJCF."""
 
 from __future__ import annotations
 
@@ -8,8 +8,18 @@ import mujoco
 import numpy as np
 
 from edqn_jax.config import Config
-from edqn_jax.evaluation.judge import FlightTrack, MujocoWorld, Way, load_judge, max_obstacle_speed, replay_contact
+from edqn_jax.evaluation.judge import (
+    FlightTrack,
+    MujocoWorld,
+    Way,
+    clearance,
+    load_judge,
+    max_obstacle_speed,
+    replay_contact,
+)
 from edqn_jax.evaluation.missions import MissionSet
+from edqn_jax.sim.scene.scene import PARKED
+from edqn_jax.sim.scene.shapes.kind import kind_of
 from edqn_jax.sim.task.flights import Flights
 from edqn_jax.sim.task.outcomes import Outcome
 
@@ -33,14 +43,31 @@ class Agreement:
     apart_m: float | None
     """Metres of path between the two moments, where obstacles move at most so many; None unless both exist."""
     touched: str
-    """Name of the geom that C MuJoCo finds touched; empty without a contact."""
+    """Name of the geom that is found touched; empty without a contact."""
+    judge: str = "C MuJoCo"
+    """Who found it: of a mesh that is not convex, and of a height field, `trimesh`."""
+    slack_m: float = 0.0
+    """Most metres that distances of a kind of shape in the world may be too small; 0 where all are exact."""
+    left_m: float | None = None
+    """Metres between body and solids at the stated contact, where there is slack."""
+    depth_m: float = 0.0
+    """Metres that the body was in a solid by the end of the step of the contact that was found."""
 
     @property
     def agrees(self) -> bool:
-        """Whether both find a contact at the same moment, or neither finds one."""
-        if self.apart_m is None:
-            return self.stated is self.found  # neither
-        return self.apart_m <= CONTACT_TOLERANCE_M
+        """Whether both find a contact at the same moment, or neither finds one.
+
+        Where distances may be too small, a contact may be stated that far before one, and beside what is passed.
+        """
+        if self.stated is None and self.found is None:
+            return True
+        if self.apart_m is not None and self.apart_m <= CONTACT_TOLERANCE_M:
+            return True
+        if not self.slack_m:
+            return False
+        if self.stated is None:
+            return self.depth_m <= CONTACT_TOLERANCE_M
+        return self.left_m is not None and -CONTACT_TOLERANCE_M <= self.left_m <= self.slack_m
 
 
 def check_verdicts(config: Config, missions: MissionSet, flights: Flights) -> list[Agreement]:
@@ -54,7 +81,7 @@ def check_verdicts(config: Config, missions: MissionSet, flights: Flights) -> li
     Raises:
         ValueError: if the flights were not recorded.
     """
-    judges = judges_of(config, missions)
+    judges, slacks = judges_of(config, missions), slacks_of(missions)
     pool_missions = missions.env_params.missions
     scenes, starts, goals = (
         np.asarray(pool_missions.scene),
@@ -75,9 +102,30 @@ def check_verdicts(config: Config, missions: MissionSet, flights: Flights) -> li
         if stated is not None and found is not None:
             way = Way(path, max_obstacle_speed(judges[scene], step_s * count) * step_s)
             apart = abs(float(np.diff(np.interp([stated, found], np.arange(count + 1), way.travelled))[0]))
-        touched = "" if contact is None else contact.geom
-        results.append(Agreement(i, Outcome(int(outcome)), stated, found, apart, touched))
+        judge, left, slack = judges[scene], None, slacks[scene]
+        if slack and stated is not None:
+            left, _ = clearance(judge, _path_at(path, stated), step_s * stated, target)
+        touched, by, depth = (
+            ("", "C MuJoCo", 0.0) if contact is None else (contact.geom, judge.judge_of(contact.geom), contact.depth)
+        )
+        results.append(Agreement(i, Outcome(int(outcome)), stated, found, apart, touched, by, slack, left, depth))
     return results
+
+
+def _path_at(path: np.ndarray, moment: float) -> np.ndarray:
+    """Returns the place [3] on a path [K + 1, 3], a point for each physics step, at a moment, metres."""
+    number = min(int(moment), len(path) - 2)
+    return path[number] + (moment - number) * (path[number + 1] - path[number])
+
+
+def slacks_of(missions: MissionSet) -> list[float]:
+    """Returns how much too small distances may be in each of the worlds, metres."""
+    pool = missions.env_params.pool
+    there = [(kind_of(shapes)[1].slack, np.asarray(shapes.position)) for shapes in pool.shapes().values()]
+    return [
+        max([0.0, *(slack for slack, places in there if np.any(np.abs(places[i]) < PARKED / 2))])
+        for i in range(pool.start.shape[0])
+    ]
 
 
 def judges_of(config: Config, missions: MissionSet) -> list[MujocoWorld]:

@@ -45,8 +45,8 @@ _SHAPE_US = {"c": 0.1, "jax": 20.0, "fields": 700.0}
 _SHAPE_BYTES = {"jax": 4.4, "fields": 9.6}
 """Bytes of a pixel that JAX holds for each shape while it draws a batch, as measured."""
 
-_COPIES = 8
-"""Of a grid, in programs (`sim/scene/mesh_field.py`)."""
+_COPIES = 2
+"""Of a grid: in a program, and where it runs."""
 
 
 @dataclasses.dataclass(frozen=True)

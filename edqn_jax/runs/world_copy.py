@@ -1,7 +1,8 @@
 """A run's own copy of the world files that it trains and flies in, so that what it was measured in stays.
 
 `world/name.xml` and `world/flown.xml` are the files of `world.name` and `world.flown`, where these are no random
-worlds; `SHA256SUMS` beside them has their digests, as `sha256sum --check` reads them.
+worlds, with the numbers of the meshes that they name; `SHA256SUMS` beside them has their digests, as `sha256sum
+--check` reads them.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from edqn_jax.errors import ConfigError, DamagedError
 from edqn_jax.files import write_error
 from edqn_jax.runs.checkpoints.sealed import file_digest, sync_to_disk
 from edqn_jax.sim.scene.mjcf import SceneError, resolve_world
+from edqn_jax.sim.scene.mjcf_parts.files import self_contained_bytes
 
 COPIES = "world"
 """The folder of the copies within that of a run."""
@@ -40,7 +42,8 @@ def copy_worlds(folder: Path, config: Config) -> None:
         if roles:
             partial.mkdir()
             for role in roles:
-                shutil.copyfile(resolve_world(getattr(config.world, role)), partial / f"{role}.xml")
+                content = self_contained_bytes(resolve_world(getattr(config.world, role)))
+                (partial / f"{role}.xml").write_bytes(content)
             (partial / SUMS).write_text(_sums(partial), encoding="utf-8")
             for path in (*partial.iterdir(), partial):
                 sync_to_disk(path)
@@ -92,7 +95,7 @@ def _changed_worlds(folder: Path, config: Config) -> list[tuple[str, str, Path]]
         if not copy.is_file():
             raise ConfigError(f"'{folder / COPIES}' has no copy of the world '{name}'")
         try:
-            if resolve_world(name).read_bytes() != copy.read_bytes():
+            if self_contained_bytes(resolve_world(name)) != copy.read_bytes():
                 found.append((role, "has changed since the run began", copy))
         except (SceneError, OSError):
             found.append((role, "is missing", copy))

@@ -16,6 +16,7 @@ from edqn_jax.evaluation import latency
 from edqn_jax.evaluation.missions import load_missions
 from edqn_jax.learn.policy import Policy
 from tests.support.corridors import corridor
+from tests.support.meshes import LUMP
 
 evaluation = import_module("edqn_jax.evaluation.evaluate")
 
@@ -57,11 +58,11 @@ def test_a_world_that_is_not_flown_ends_with_1_and_says_why(tmp_path: Path, caps
 def test_what_is_refused_is_in_the_table_and_nothing_is_drawn(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    corridor(tmp_path, 3.0, '<geom name="egg" type="ellipsoid" size="1 2 3" pos="6 6 3"/>')
+    corridor(tmp_path, 3.0, '<geom name="egg" type="sdf" mesh="lump" pos="6 6 3"/>', asset=LUMP)
     assert main(["check", "corridor.xml", "--out", "map.png"]) == 1
     said = capsys.readouterr()
-    assert "1 × refused" in said.out and "egg: is of the unsupported kind ellipsoid" in said.out
-    assert "'egg' is of the unsupported kind ellipsoid; make it a box" in said.err
+    assert "1 × refused" in said.out and "egg: is of the unsupported kind sdf" in said.out
+    assert "'egg' is of the unsupported kind sdf; make it a box" in said.err
     assert not Path("map.png").exists()
 
 

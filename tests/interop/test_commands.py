@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from edqn_jax.cli import evaluate, events, export, record, report
+from edqn_jax.cli import evaluate, events, export, record, report, world
 from edqn_jax.cli.arguments import check_flags
 from edqn_jax.cli.commands import take_imports
 from edqn_jax.cli.help import VERIFY
@@ -30,6 +30,7 @@ PARSERS = {
     "record": record.parse_record,
     "report": report.parse_report,
     "export": export.parse_export,
+    "world": world.parse_world,
 }
 
 

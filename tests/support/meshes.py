@@ -10,6 +10,9 @@ from scipy.spatial import ConvexHull
 CUBE = np.stack(np.meshgrid(*[[-1.0, 1.0]] * 3, indexing="ij"), -1).reshape(8, 3)
 """Corners of a cube."""
 
+LUMP = '<mesh name="lump" vertex="0 0 0 1 0 0 0 1 0 0 0 1"/>'
+"""A mesh for a geom of the kind sdf, which nothing reads."""
+
 
 def hull(points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Vertices [V, 3] and triangles [F, 3], anticlockwise from outside, of the convex hull of points."""

@@ -9,7 +9,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from edqn_jax.report.worlds.solids import boundary_side, solids_of, standing_rows
+from edqn_jax.report.worlds.solids import Solid, boundary_side, solids_of_shape, standing_rows
 from edqn_jax.sim.scene.motion import NEVER, OUTSIDE_M, ball_positions
 from edqn_jax.sim.scene.scene import Scene, aim_of
 from edqn_jax.sim.scene.shapes.kind import ShapeKind
@@ -25,11 +25,12 @@ def world_data(scene: Scene) -> dict[str, Any]:
     """
     lower, upper = np.asarray(scene.volume, np.float64)
     shapes = []
-    for (kind, shape), solid in zip(standing_rows(scene), solids_of(scene), strict=True):
+    for kind, shape in standing_rows(scene):
         moves = _motion(shape)
-        closes = None if moves else boundary_side(solid, lower, upper)
-        drawn = _drawing(kind, shape) | {"colour": _hex(solid.colour)} | moves
-        shapes.append(drawn | ({} if closes is None else {"closes": list(closes)}))
+        for solid in solids_of_shape(kind, shape):
+            closes = None if moves else boundary_side(solid, lower, upper)
+            drawn = _drawing(kind, shape, solid) | {"colour": _hex(solid.colour)} | moves
+            shapes.append(drawn | ({} if closes is None else {"closes": list(closes)}))
     return {"lower": round_values(lower), "upper": round_values(upper), "shapes": shapes}
 
 
@@ -74,11 +75,14 @@ def _balls(scene: Scene) -> Iterator[dict[str, Any]]:
         }
 
 
-def _drawing(kind: ShapeKind, shape: Any) -> dict[str, Any]:
-    """Returns what the view draws of a shape that stands in the world."""
+def _drawing(kind: ShapeKind, shape: Any, solid: Solid) -> dict[str, Any]:
+    """Returns what the view draws of a shape that stands in the world: the whole, or one of the solids it consists of.
+
+    The view takes each face's outer side from the place that the solid stands at, which is within.
+    """
+    at = shape.position if kind.parts is None else solid.corners.mean(0)
     if kind.page is None:
-        assert kind.faces is not None  # `standing_rows` yields what is drawn
-        sizes = {"kind": "faces", "faces": [face - shape.position for face in kind.faces(shape)]}
+        sizes = {"kind": "faces", "faces": [face - at for face in solid.faces]}
     else:
         sizes = kind.page(shape)
     digits = {"turn": 5, "axis": 5}
@@ -87,7 +91,7 @@ def _drawing(kind: ShapeKind, shape: Any) -> dict[str, Any]:
         for name, value in sizes.items()
         if name != "kind"
     }
-    return {"kind": sizes["kind"], "at": round_values(shape.position), **numbers}
+    return {"kind": sizes["kind"], "at": round_values(at), **numbers}
 
 
 def round_values(values: Any, digits: int = 3) -> Any:

@@ -77,7 +77,14 @@ MAP = View(azimuth=-90.0, elevation=90.0)
 
 def solids_of(scene: Scene) -> list[Solid]:
     """Returns every shape of one world that is not parked; planes are left out, the ground is drawn by itself."""
-    return [Solid(list(kind.faces(shape)), shape.albedo) for kind, shape in standing_rows(scene) if kind.faces]
+    return [solid for kind, shape in standing_rows(scene) for solid in solids_of_shape(kind, shape)]
+
+
+def solids_of_shape(kind: ShapeKind, shape: Any) -> list[Solid]:
+    """Returns the convex solids that a shape that is drawn consists of."""
+    assert kind.faces is not None  # `standing_rows` yields what is drawn
+    parts = [kind.faces(shape)] if kind.parts is None else kind.parts(shape)
+    return [Solid(list(faces), shape.albedo) for faces in parts]
 
 
 def static_scene(scene: Scene) -> Scene:

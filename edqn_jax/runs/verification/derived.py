@@ -13,7 +13,7 @@ from edqn_jax.evaluation.judge import FlightTrack, MujocoWorld, clearance, repla
 from edqn_jax.evaluation.metrics import EMPTY_M
 from edqn_jax.evaluation.missions import RunMissions
 from edqn_jax.evaluation.trajectories import POSITION, columns_of
-from edqn_jax.evaluation.verdicts import CONTACT_TOLERANCE_M
+from edqn_jax.evaluation.verdicts import CONTACT_TOLERANCE_M, slacks_of
 from edqn_jax.sim.task.outcomes import Outcome
 from edqn_jax.training.selection import FLIES
 
@@ -68,6 +68,9 @@ def from_trajectory(
         seconds -= cut * config.drone.physics_dt_s
         ends[-1] = 0.0
     low, high = np.asarray(missions.scene.volume, np.float64)
+    # Where distances may be too small, a contact is stated that far before one.
+    beside = slacks_of(missions.final)[int(pool_missions.scene[0])]
+    is_beside = contact is None and 0 < ends[-1] <= beside
     if contact is not None:
         outcome = Outcome.COLLISION
     elif np.any(positions[-1] < low) or np.any(positions[-1] > high):
@@ -75,7 +78,8 @@ def from_trajectory(
     elif np.linalg.norm(positions[-1] - goal) < config.env.goal_radius_m:
         outcome = Outcome.GOAL
     else:
-        outcome = Outcome.TIME_OUT if steps == config.env.max_decisions * decision else Outcome.DIVERGED
+        other = Outcome.COLLISION if is_beside else Outcome.DIVERGED
+        outcome = Outcome.TIME_OUT if steps == config.env.max_decisions * decision else other
     rewards = recorded["reward"][::decision]
     values = {
         "success": outcome == Outcome.GOAL,
@@ -87,12 +91,14 @@ def from_trajectory(
         "min_clearance_m": min(float(min(ends)), EMPTY_M),
     }
     slack = CONTACT_TOLERANCE_M if contact is not None else 0.0
-    speed = lengths[-1] / config.drone.physics_dt_s if contact is not None else 1.0
+    if beside and (contact is not None or is_beside):
+        slack = float(np.linalg.norm(path[-1] - path[-2]))  # anywhere in the last step
+    speed = lengths[-1] / config.drone.physics_dt_s if slack else 1.0
     return values, {
         "path_length_m": slack,
         "flight_seconds": slack / max(speed, 1e-3),
         "return": DIGITS * float(np.sum(np.abs(rewards))),
-        "min_clearance_m": CLEARANCE_M + slack,
+        "min_clearance_m": CLEARANCE_M + slack + beside,
     }
 
 

@@ -1,7 +1,9 @@
-"""Grids of signed distances of convex meshes, made on the host before anything is compiled.
+"""Grids of signed distances of closed meshes, made on the host before anything that flies is compiled.
 
 Between the points of a grid a distance is interpolated, which is too large beside edges and corners. So values are
-lowered there by as much as the interpolation exceeds the exact distance at points half a cell apart.
+lowered there by as much as the interpolation exceeds the exact distance: of convex meshes at points half a cell apart,
+of others (`solid_distance.py`) in the middle of each cell and at points of the surface, so that what is thinner than a
+cell is still there.
 
 V vertices, F triangles; distances in metres, negative inside.
 """
@@ -9,7 +11,9 @@ V vertices, F triangles; distances in metres, negative inside.
 from __future__ import annotations
 
 import dataclasses
+import functools
 import hashlib
+import itertools
 from functools import lru_cache
 
 import numpy as np
@@ -18,17 +22,24 @@ from scipy.ndimage import maximum_filter
 from scipy.spatial import ConvexHull, QhullError
 
 from edqn_jax.errors import ConfigError
+from edqn_jax.sim.scene.solid_distance import solid_distances, split_triangles
 
 CELL_M = 0.1
-"""Largest cell of a grid, metres."""
+"""Cell of a grid that is neither small nor very large, metres."""
+
+COARSEST_M = 0.4
+"""Largest cell, of a mesh whose grid would have more than `MOST_VALUES` with smaller ones, metres."""
 
 MARGIN_M = 0.5
 """Metres around a mesh that its grid reaches, more than a drone's radius."""
 
 MOST_VALUES = 2**22
-"""Of a grid, and of all grids of a world: programs hold each of them eight times, 128 MiB."""
+"""Of a grid, and of all grids of a world, 16 MiB that every program holds."""
 
-MOST_TRIANGLES = 1_000_000
+MOST_TRIANGLES = 500_000
+
+MOST_THICKNESS_M = 1.0
+"""Of a surface, metres."""
 
 _FINEST_M = 0.025
 _FINE_VALUES = 2**16  # of a grid that has cells below CELL_M, for thin meshes
@@ -50,18 +61,27 @@ class Grid:
     values: NDArray[np.float32]  # [X, Y, Z], its middle in the middle of the box
     cell: float
     half: Numbers  # [3] half extents of the mesh's box
-    vertices: Numbers  # [V, 3] of the mesh's hull, about the middle of the box
+    vertices: Numbers  # [V, 3] about the middle of the box; of a convex mesh those of its hull
     faces: NDArray[np.int64]  # [F, 3] anticlockwise from outside
+    is_convex: bool
+    thickness: float  # metres of a surface; 0 of a closed mesh
     digest: bytes
 
     @classmethod
     def of(
-        cls, values: NDArray[np.floating], cell: float, half: Numbers, vertices: Numbers, faces: NDArray[np.integer]
+        cls,
+        values: NDArray[np.floating],
+        cell: float,
+        half: Numbers,
+        vertices: Numbers,
+        faces: NDArray[np.integer],
+        is_convex: bool = True,
+        thickness: float = 0.0,
     ) -> Grid:
         """Returns a grid of such contents."""
-        content = (np.asarray(values, np.float32), np.asarray(cell), half, vertices, faces)
+        content = (np.asarray(values, np.float32), np.asarray([cell, thickness]), half, vertices, faces)
         digest = hashlib.sha256(b"".join(np.ascontiguousarray(part).tobytes() for part in content)).digest()
-        return cls(content[0], float(cell), half, vertices, np.asarray(faces, np.int64), digest)
+        return cls(content[0], float(cell), half, vertices, np.asarray(faces, np.int64), is_convex, thickness, digest)
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, Grid) and self.digest == other.digest
@@ -70,49 +90,65 @@ class Grid:
         return hash(self.digest)
 
 
-def grid_of_mesh(vertices: Numbers, faces: NDArray[np.integer], cell: float | None = None) -> tuple[Grid, Numbers]:
-    """Returns the grid of a convex mesh, and the middle [3] of the mesh's box.
+def grid_of_mesh(
+    vertices: Numbers, faces: NDArray[np.integer], cell: float | None = None, thickness: float = 0.0
+) -> tuple[Grid, Numbers]:
+    """Returns the grid of a closed mesh, or of a surface with a thickness, and the middle [3] of its box.
 
     Args:
         vertices: [V, 3] metres.
-        faces: [F, 3] vertices of each triangle, anticlockwise from outside.
-        cell: metres; None takes `CELL_M`, and less for thin meshes as long as the grid is small.
+        faces: [F, 3] vertices of each triangle, anticlockwise from outside; parts may overlap.
+        cell: metres; None takes `CELL_M`, less for small meshes as long as the grid is small, and more for large ones.
+        thickness: metres, half of them to either side of the triangles, which need not close anything then; 0 is a
+            closed mesh.
 
     Raises:
-        ConfigError: if the mesh is not closed and convex, or is too large.
+        ConfigError: if the mesh is not closed, or is too large.
     """
     vertices, faces = np.asarray(vertices, np.float64), np.asarray(faces, np.int64)
-    check_mesh(vertices, faces)
-    return _grid(vertices.tobytes(), faces.tobytes(), cell)
+    check_finite(vertices, faces)
+    if not thickness:
+        check_mesh(vertices, faces)
+    elif not 0 < thickness <= MOST_THICKNESS_M:
+        raise ConfigError(f"the mesh has a thickness of {thickness:g} m; it must be above 0, to {MOST_THICKNESS_M:g} m")
+    return _grid(vertices.tobytes(), faces.tobytes(), cell, float(thickness))
 
 
 @lru_cache(maxsize=32)
-def _grid(vertices: bytes, faces: bytes, cell: float | None) -> tuple[Grid, Numbers]:
+def _grid(vertices: bytes, faces: bytes, cell: float | None, thickness: float) -> tuple[Grid, Numbers]:
     """Returns `grid_of_mesh` of the bytes of a mesh, so that geoms of one mesh share a grid."""
-    given = np.frombuffer(vertices).reshape(-1, 3)
-    corners, rings = hull_of(given)
-    filled = _volume(given[np.frombuffer(faces, np.int64).reshape(-1, 3)]) / _volume(corners[rings])
-    if filled < 1 - _DENT:
-        raise ConfigError(
-            f"the mesh is not convex: it fills {100 * filled:.1f} % of its convex hull, with which MuJoCo collides; "
-            "make it of convex meshes"
-        )
-    low, high = corners.min(0), corners.max(0)
+    given, triangles = np.frombuffer(vertices).reshape(-1, 3), np.frombuffer(faces, np.int64).reshape(-1, 3)
+    low, high = given.min(0) - thickness / 2, given.max(0) + thickness / 2
     middle, half = (low + high) / 2, (high - low) / 2
-    cell = _cell_for(half) if cell is None else cell
-    count = float(np.prod(_counts(half, cell)))
-    if not count <= MOST_VALUES:
+    is_convex = not thickness and is_hull(given, triangles)
+    cell = _cell_for(half, is_convex) if cell is None else cell
+    if not np.prod(_counts(half, cell)) <= MOST_VALUES:
         raise ConfigError(
             f"the mesh measures {' x '.join(f'{2 * side:.4g}' for side in half)} m, and its distances on a grid of "
-            f"{cell:g} m would be {count:,.0f} values; a mesh may have {MOST_VALUES:,}, so make it of smaller ones, or "
-            "of boxes"
+            f"{cell:g} m would be {np.prod(_counts(half, cell)):,.0f} values; a mesh may have {MOST_VALUES:,}, so make "
+            "it of smaller ones, or of boxes"
         )
-    values = _lowered_values(corners - middle, rings, half, cell)
-    return Grid.of(values, cell, half, corners - middle, rings), middle
+    if is_convex:
+        corners, rings = hull_of(given)
+        values = _lowered_values(corners - middle, rings, half, cell)
+        return Grid.of(values, cell, half, corners - middle, rings), middle
+    values = _lowered_values_of_solid((given - middle)[triangles], half, cell, thickness)
+    return Grid.of(values, cell, half, given - middle, triangles, is_convex=False, thickness=thickness), middle
 
 
-def check_mesh(vertices: Numbers, faces: NDArray[np.integer]) -> None:
-    """Raises unless a mesh [V, 3], metres, of triangles [F, 3] is finite, small, closed and turned outwards.
+def is_hull(vertices: Numbers, faces: NDArray[np.integer]) -> bool:
+    """Returns whether a closed mesh [V, 3] of triangles [F, 3] fills its convex hull, with which MuJoCo collides.
+
+    Raises:
+        ConfigError: if all lie in a plane.
+    """
+    corners, rings = hull_of(vertices)
+    filled = _volume(vertices[faces]) / _volume(corners[rings])
+    return bool(abs(filled - 1) <= _DENT)
+
+
+def check_finite(vertices: Numbers, faces: NDArray[np.integer]) -> None:
+    """Raises unless a mesh [V, 3], metres, of triangles [F, 3] is finite and small.
 
     Raises:
         ConfigError: says what is wrong and what would be right.
@@ -121,12 +157,23 @@ def check_mesh(vertices: Numbers, faces: NDArray[np.integer]) -> None:
         raise ConfigError(f"the mesh has {len(faces):,} triangles; it may have {MOST_TRIANGLES:,}")
     if not np.all(np.isfinite(vertices)):
         raise ConfigError("the mesh has a vertex that is not finite; give it numbers")
+
+
+def check_mesh(vertices: Numbers, faces: NDArray[np.integer]) -> None:
+    """Raises unless a finite mesh [V, 3], metres, of triangles [F, 3] is closed and turned outwards.
+
+    Raises:
+        ConfigError: says what is wrong and what would be right.
+    """
     _, same = np.unique(vertices, axis=0, return_inverse=True)
     corners = same.reshape(-1)[faces]
     corners = corners[(corners != np.roll(corners, 1, axis=1)).all(1)]
     there = (corners * len(vertices) + np.roll(corners, -1, axis=1)).ravel()
     back = (np.roll(corners, -1, axis=1) * len(vertices) + corners).ravel()
-    lone = int(np.sum(~np.isin(there, back))) + len(there) - len(np.unique(there))
+    edges, number = np.unique(np.concatenate([there, back]), return_inverse=True)
+    weights = np.repeat([1, -1], len(there))
+    # Parts that share an edge have as many triangles on either side of it.
+    lone = int(np.abs(np.bincount(number.reshape(-1), weights, len(edges))).sum()) // 2
     if lone or not len(corners):
         raise ConfigError(
             f"the mesh is not watertight: {lone:,} edges of its {len(faces):,} triangles have none beside them that is "
@@ -164,11 +211,51 @@ def _counts(half: Numbers, cell: float) -> Numbers:
     return 2 * np.ceil((half + MARGIN_M) / cell) + 1
 
 
-def _cell_for(half: Numbers) -> float:
-    cell = float(np.clip(half.min(), _FINEST_M, CELL_M))
+def _cell_for(half: Numbers, is_convex: bool) -> float:
+    cell = float(np.clip(half.min() if is_convex else 0.0, _FINEST_M, CELL_M))
     while cell < CELL_M and np.prod(_counts(half, cell)) > _FINE_VALUES:
         cell = min(2 * cell, CELL_M)
+    while cell < COARSEST_M and np.prod(_counts(half, cell)) > MOST_VALUES:
+        cell = min(1.25 * cell, COARSEST_M)
     return cell
+
+
+def _lowered_values_of_solid(triangles: Numbers, half: Numbers, cell: float, thickness: float) -> Numbers:
+    """Returns distances [X, Y, Z] as `_lowered_values`, of triangles [F, 3, 3] of any mesh."""
+    counts = _counts(half, cell).astype(int)
+    found, middles = solid_distances(triangles, counts, cell, is_closed=not thickness)
+    exact = found.astype(np.float64)
+    between = functools.reduce(_means, range(3), exact)
+    near = np.abs(middles) < (_BAND - 1) * cell
+    excess = np.zeros(middles.shape)
+    excess[near] = np.maximum(_UNSEEN * (between[near] - middles[near]), 0.0)
+    # At the surface itself both sides of something thin meet.
+    surface = split_triangles(triangles, cell).mean(1)
+    at = surface / cell + (counts - 1) / 2
+    places = np.minimum(at.astype(np.int64), counts - 2)
+    np.maximum.at(excess, tuple(places.T), _interpolated(exact, places, at - places))
+    lowering = np.pad(excess, 1)
+    for axis in range(3):
+        moved = np.moveaxis(lowering, axis, 0)
+        lowering = np.moveaxis(np.maximum(moved[1:], moved[:-1]), 0, axis)
+    far = exact > (_BAND - 1) * cell
+    lowering[far] = np.maximum(lowering[far], cell**2 / (4 * exact[far]))
+    return exact - lowering - thickness / 2
+
+
+def _means(values: Numbers, axis: int) -> Numbers:
+    """Returns the means of neighbours along an axis."""
+    moved = np.moveaxis(values, axis, 0)
+    return np.moveaxis((moved[1:] + moved[:-1]) / 2, 0, axis)
+
+
+def _interpolated(values: NDArray[np.floating], places: NDArray[np.int64], parts: Numbers) -> Numbers:
+    """Returns values [P] between those of a lattice, in the cells at `places` [P, 3], `parts` [P, 3] of a cell on."""
+    found = np.zeros(len(places))
+    for corner in itertools.product((0, 1), repeat=3):
+        weight = np.prod(np.where(corner, parts, 1 - parts), axis=1)
+        found += weight * values[tuple((places + corner).T)]
+    return found
 
 
 def _lowered_values(vertices: Numbers, faces: NDArray[np.integer], half: Numbers, cell: float) -> Numbers:

@@ -1,6 +1,7 @@
 """Reads and writes worlds as MJCF, MuJoCo's file format.
 
-An MJCF file that names no other file can be read. A world for the drone consists of
+An MJCF file can be read that names no other file but meshes and height fields in its folder. A world for the drone
+consists of
 
 * its static geoms (on the world body or on bodies welded to it) of any registered kind of shape (`shapes/`), at any
   rotation. Planes are solid below and infinite. A geom is read if it is visible in
@@ -46,6 +47,9 @@ VOLUME_MARGIN = 5.0
 LONGEST_VOLUME = 500.0
 """Most metres along an axis of a flight volume; A*'s lattice must hold it."""
 
+SCANS = (".ply", ".stl", ".obj", ".glb")
+"""Endings of files of which `edqn world` makes worlds."""
+
 MAX_SHAPES = 500
 """Geoms of a world: 2 000 of them take 8 GB to train in."""
 
@@ -77,6 +81,8 @@ def resolve_world(name: str) -> Path:
     """
     path = Path(name).expanduser()
     if path.is_file():
+        if path.suffix.lower() in SCANS:
+            raise SceneError(f"'{name}' is a scan; `edqn world {name} --out {path.stem}` makes a world of it")
         return path
     folder = scenes_folder()
     named = folder / f"{name}.xml"
@@ -291,7 +297,9 @@ def mjcf_of(scene: Scene, *, title: str = "world") -> str:
     shapes = named_shapes(scene)
     for name, shape in shapes:
         attributes = _attributes(shape)
-        made = kind_of(shape)[1].asset
+        made, numbers = kind_of(shape)[1].asset, kind_of(shape)[1].custom
+        for word, values in ({} if numbers is None else numbers(shape)).items():
+            ElementTree.SubElement(custom, "numeric", name=f"{word}{name}", data=numbers_text(values))
         if made is not None:
             mesh = {key: numbers_text(values) for key, values in made(shape).items()}
             ElementTree.SubElement(asset, "mesh", {"name": name, **mesh})

@@ -162,11 +162,6 @@ def test_pools_hold_worlds_with_and_without_meshes_and_with_others(world: Path, 
     )
 
 
-def dented() -> tuple[np.ndarray, np.ndarray]:
-    vertices, faces = hull(CUBE)
-    return np.concatenate([vertices[:7], [[0, 0, 0]]]), faces
-
-
 MOVING = '<body name="b" mocap="true" pos="9 5 3"><geom name="table" type="mesh" mesh="m"/></body>'
 
 
@@ -175,9 +170,8 @@ MOVING = '<body name="b" mocap="true" pos="9 5 3"><geom name="table" type="mesh"
     [
         (TABLE, (BOARD[0], BOARD[1][1:]), "geom 'table': the mesh is not watertight"),
         (TABLE, (BOARD[0], BOARD[1][:, ::-1]), "geom 'table': the mesh is inside out"),
-        (TABLE, dented(), "geom 'table': the mesh is not convex"),
         (TABLE, (np.full((8, 3), np.nan), BOARD[1]), "is not an MJCF that MuJoCo can read: .* is not finite"),
-        (MOVING, BOARD, "geom 'table' is a mesh on a body that moves"),
+        (MOVING, BOARD, "geom 'table' is of the kind mesh on a body that moves"),
     ],
 )
 def test_a_mesh_that_cannot_be_flown_is_refused_by_the_name_of_its_geom(

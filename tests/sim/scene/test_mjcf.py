@@ -40,6 +40,7 @@ from edqn_jax.sim.scene.scene import (
     scene_shapes,
 )
 from edqn_jax.sim.worlds.families import random_scene, world_key
+from tests.support.meshes import LUMP
 
 RADIUS = 0.36
 GREY = np.full(3, 0.5)
@@ -166,10 +167,10 @@ def message(raised) -> str:
 
 def test_a_geom_that_cannot_be_taken_is_named(world_of):
     with pytest.raises(SceneError) as raised:
-        world_of(ENDS + '<geom name="egg" type="ellipsoid" size="1 2 1"/>')
+        world_of(ENDS + '<geom name="egg" type="sdf" mesh="lump"/>', f"<asset>{LUMP}</asset>")
     assert all(
         part in message(raised)
-        for part in ("'egg'", "ellipsoid", "world.xml", "make it a box, cylinder, sphere, capsule, plane or mesh")
+        for part in ("'egg'", "sdf", "world.xml", "make it a box, cylinder, sphere, capsule, plane or mesh")
     )
 
 

@@ -1,4 +1,4 @@
-"""What a world's file may hold: nothing of other files, and nothing huge."""
+"""What a world's file may hold: of other files meshes and height fields alone, and nothing huge."""
 
 from __future__ import annotations
 
@@ -25,9 +25,13 @@ def world(folder: Path, inside: str) -> Path:
         ('<asset><model name="a" file="secret.xml"/></asset>', "has <model>"),
         ('<asset><texture type="2d" name="a" file="secret.png"/></asset>', "names the file 'secret.png' in <texture>"),
         ('<asset><texture type="cube" name="a" fileright="x.png"/></asset>', "names the file 'x.png' in <texture>"),
-        ('<asset><mesh name="a" file="secret.stl"/></asset>', "names the file 'secret.stl' in <mesh>"),
+        (
+            '<asset><mesh name="a" file="none.stl"/></asset>',
+            "names the file 'none.stl' in <mesh>, and there is none in",
+        ),
         ('<extension><plugin plugin="mujoco.sdf.bolt"/></extension>', "has <extension>"),
-        ('<asset><hfield name="a" nrow="99999" ncol="99999" size="1 1 1 1"/></asset>', "has <hfield>"),
+        ('<asset><hfield name="a" nrow="99999" ncol="99999" size="1 1 1 1"/></asset>', "field 'a' of 99999 x 99999"),
+        ('<asset><hfield name="a" nrow="0" ncol="0" size="1 1 1 1"/></asset>', "field 'a' of 0 x 0; it must be 2 x 2"),
         ('<size memory="900G"/>', "has <size>"),
         (
             '<asset><texture type="2d" builtin="flat" width="100000" height="9"/></asset>',

@@ -1,7 +1,8 @@
 """The text of an MJCF world, checked before MuJoCo reads it.
 
-A world may be untrusted, so it is one file without references, and it declares nothing that takes much memory.
-MuJoCo gets the checked elements, serialised again, never a path, so both parse the same.
+A world may be untrusted, so it names no files but meshes and height fields in its own folder (`assets.py`), and it
+declares nothing that takes much memory. MuJoCo gets the checked elements, serialised again, never a path, so both parse
+the same.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ from pathlib import Path
 
 from edqn_jax.errors import ConfigError
 from edqn_jax.sim.scene.mjcf_parts import xml as mjcf_xml
+from edqn_jax.sim.scene.mjcf_parts.assets import inline_files
 
 MAX_BYTES = 20_000_000
 """Of a world's file."""
@@ -23,10 +25,13 @@ MAX_COPIES = 10_000
 MAX_PIXELS = 4096
 """Width and height of a texture, which is not drawn."""
 
+MAX_HEIGHTS = 200_000
+"""Of a height field, rows times columns."""
+
 MAX_PARAMETER = 100
 """Of a mesh that MuJoCo makes: the number of its triangles grows with the square."""
 
-FOREIGN = ("include", "model", "attach", "plugin", "extension", "flexcomp", "composite", "hfield", "skin", "size")
+FOREIGN = ("include", "model", "attach", "plugin", "extension", "flexcomp", "composite", "skin", "size")
 """Elements that name other files, run other code or make much of little; a static world needs none of them."""
 
 
@@ -35,26 +40,64 @@ class SceneError(ConfigError):
 
 
 def load_checked_text(path: Path) -> str:
-    """Returns the text of a world's file as XML of its elements alone.
+    """Returns the text of a world's file as XML of its elements alone, with the numbers of the files that it names.
 
     Raises:
         SceneError: if there is no such file, it is too large or no XML, or it asks for what a world may not have.
+    """
+    return _checked_text(path, _read(path))
+
+
+def self_contained_bytes(path: Path) -> bytes:
+    """Returns the content of a world's file; if it names other files, as text that holds theirs.
+
+    Raises:
+        SceneError: as `load_checked_text`; a file that is no world is returned as it is.
+        OSError: if it cannot be read.
+    """
+    content = path.read_bytes()
+    if b"file" not in content:
+        return content
+    try:
+        text = _checked_text(path, content)
+        return text.encode() if mjcf_xml.parse_xml(_decoded(path, content))[1] != text else content
+    except mjcf_xml.MarkupError:
+        return content
+
+
+def _read(path: Path) -> bytes:
+    """Returns the content of a world's file.
+
+    Raises:
+        SceneError: if it cannot be read or is too large.
     """
     try:
         size = path.stat().st_size
         if size > MAX_BYTES:
             raise SceneError(f"'{path}' has {size:,} bytes; a world may have {MAX_BYTES:,}")
-        content = path.read_bytes()
+        return path.read_bytes()
     except (OSError, RuntimeError) as error:
         raise SceneError(f"cannot read the world '{path}': {getattr(error, 'strerror', None) or error}") from None
+
+
+def _decoded(path: Path, content: bytes) -> str:
+    """Returns the text of a file.
+
+    Raises:
+        SceneError: if it is of an encoding that MuJoCo does not read.
+    """
     if content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)) or b"\0" in content[:4]:
         raise SceneError(f"{path} is not an MJCF that MuJoCo can read: it is UTF-16 or UTF-32 text; save it as UTF-8")
     try:
-        text = content.decode()
+        return content.decode()
     except UnicodeDecodeError:
-        text = content.decode("latin-1")  # MuJoCo asks no name for its encoding
+        return content.decode("latin-1")  # MuJoCo asks no name for its encoding
+
+
+def _checked_text(path: Path, content: bytes) -> str:
+    """Returns `load_checked_text` of a file's content."""
     try:
-        tree, text = mjcf_xml.parse_xml(text)
+        tree, text = mjcf_xml.parse_xml(_decoded(path, content))
     except mjcf_xml.SubsetError:
         raise SceneError(f"{path} has a <!DOCTYPE> that declares something; a world needs none") from None
     except mjcf_xml.MarkupError as error:
@@ -63,6 +106,14 @@ def load_checked_text(path: Path) -> str:
         raise SceneError(f"{path} is not an MJCF: it begins with <{tree.tag}>, not <mujoco>")
     _check_elements(tree, path)
     _check_copies(tree, path)
+    try:
+        if not inline_files(tree, path):
+            return text
+    except ConfigError as error:
+        raise SceneError(str(error)) from None
+    text = ElementTree.tostring(tree, encoding="unicode")
+    if len(text) > MAX_BYTES:
+        raise SceneError(f"{path} has {len(text):,} bytes with the files that it names; a world may have {MAX_BYTES:,}")
     return text
 
 
@@ -76,14 +127,21 @@ def _check_elements(tree: ElementTree.Element, path: Path) -> None:
         if element.tag in FOREIGN:
             raise SceneError(f"{path} has <{element.tag}>; a world is one file of static geoms and sites")
         named = [name for name in element.keys() if name.startswith("file")]  # noqa: SIM118
-        if named:
+        if named and element.tag not in ("mesh", "hfield"):
             raise SceneError(
-                f"{path} names the file '{element.get(named[0])}' in <{element.tag}>; a world is one file, and colours "
-                "are those of its geoms"
+                f"{path} names the file '{element.get(named[0])}' in <{element.tag}>; a world names none but those of "
+                "meshes and height fields, and colours are those of its geoms"
             )
         made = max([0.0, *map(_number, element.get("params", "").split())])
         if element.tag == "mesh" and made > MAX_PARAMETER:
             raise SceneError(f"{path} has <mesh params=...> of more than {MAX_PARAMETER}")
+        if element.tag == "hfield" and not element.get("file"):
+            rows, columns = _number(element.get("nrow")), _number(element.get("ncol"))
+            if not (min(rows, columns) >= 2 and rows * columns <= MAX_HEIGHTS):
+                raise SceneError(
+                    f"{path} has a height field '{element.get('name', '')}' of {rows:g} x {columns:g}; it must be "
+                    f"2 x 2 to {MAX_HEIGHTS:,} heights"
+                )
         if element.tag in ("texture", "numeric"):
             for name in ("width", "height", "size"):
                 if _number(element.get(name)) > MAX_PIXELS:

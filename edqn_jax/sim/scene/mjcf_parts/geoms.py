@@ -11,8 +11,9 @@ from edqn_jax.errors import ConfigError
 from edqn_jax.sim.scene.mesh_field import MOST_VALUES
 from edqn_jax.sim.scene.mjcf_parts.files import SceneError
 from edqn_jax.sim.scene.mjcf_parts.motion import PREFIX
+from edqn_jax.sim.scene.mjcf_parts.solids import ellipsoid_mesh, field_mesh
 from edqn_jax.sim.scene.scene import Shape
-from edqn_jax.sim.scene.shapes.kind import Geom, kinds, read_shape
+from edqn_jax.sim.scene.shapes.kind import THICKNESS, Geom, kinds, read_shape
 
 
 def geom_name(model: mujoco.MjModel, geom: int) -> str:
@@ -60,8 +61,10 @@ def shape_of(model: mujoco.MjModel, data: mujoco.MjData, geom: int, title: str, 
     found = geom_of(model, data, geom)
     if not all(np.all(np.isfinite(values)) for values in (found.position, found.rotation, found.size)):
         raise SceneError(f"{title}: geom '{name}' has a place or a size that is not finite; give it numbers")
-    if moves and found.mesh is not None:
-        raise SceneError(f"{title}: geom '{name}' is a mesh on a body that moves; only what stands may have meshes")
+    if moves and found.mesh is not None and not any(kind.geom == found.kind != "mesh" for kind in kinds().values()):
+        raise SceneError(
+            f"{title}: geom '{name}' is of the kind {found.kind} on a body that moves; only what stands may be"
+        )
     try:
         shape = read_shape(found)
     except ConfigError as error:
@@ -90,23 +93,48 @@ def check_grids(shapes: Sequence[Shape], title: str) -> None:
 
 
 def _mesh_of(model: mujoco.MjModel, geom: int) -> tuple[np.ndarray, np.ndarray] | None:
-    """Returns vertices [V, 3], metres, and triangles [F, 3] of a geom that is a mesh."""
-    if model.geom_type[geom] != mujoco.mjtGeom.mjGEOM_MESH:
+    """Returns vertices [V, 3], metres, and triangles [F, 3] of a mesh, an ellipsoid or a height field."""
+    kind, data = model.geom_type[geom], model.geom_dataid[geom]
+    if kind == mujoco.mjtGeom.mjGEOM_ELLIPSOID:
+        return ellipsoid_mesh(tuple(model.geom_size[geom]))
+    if kind == mujoco.mjtGeom.mjGEOM_HFIELD:
+        return field_mesh(model, data)
+    if kind != mujoco.mjtGeom.mjGEOM_MESH:
         return None
-    mesh = model.geom_dataid[geom]
-    vertex, face = model.mesh_vertadr[mesh], model.mesh_faceadr[mesh]
-    vertices = model.mesh_vert[vertex : vertex + model.mesh_vertnum[mesh]]
-    return vertices, model.mesh_face[face : face + model.mesh_facenum[mesh]]
+    vertex, face = model.mesh_vertadr[data], model.mesh_faceadr[data]
+    vertices = model.mesh_vert[vertex : vertex + model.mesh_vertnum[data]].astype(np.float64)
+    vertices = (vertices @ _turn_of_mesh(model, data).T + model.mesh_pos[data]).astype(np.float32)
+    return vertices, model.mesh_face[face : face + model.mesh_facenum[data]]
+
+
+def _turn_of_mesh(model: mujoco.MjModel, number: int) -> np.ndarray:
+    """Returns the rotation [3, 3] from MuJoCo's axes of a mesh to those of its file."""
+    rotation = np.empty(9)
+    mujoco.mju_quat2Mat(rotation, model.mesh_quat[number])
+    return rotation.reshape(3, 3)
 
 
 def geom_of(model: mujoco.MjModel, data: mujoco.MjData, geom: int) -> Geom:
     """Returns geom number `geom` of a model, in the world's frame."""
     material = model.geom_matid[geom]
+    position, rotation = data.geom_xpos[geom], data.geom_xmat[geom].reshape(3, 3)
+    if model.geom_type[geom] == mujoco.mjtGeom.mjGEOM_MESH:
+        # MuJoCo has turned the mesh to its axes of inertia; walls along the axes of its file are along those of a grid.
+        number = model.geom_dataid[geom]
+        rotation = rotation @ _turn_of_mesh(model, number).T
+        position = position - rotation @ model.mesh_pos[number]
     return Geom(
         kind=kind_name(model, geom),
-        position=data.geom_xpos[geom],
-        rotation=data.geom_xmat[geom].reshape(3, 3),
+        position=position,
+        rotation=rotation,
         size=model.geom_size[geom],
         albedo=(model.geom_rgba[geom] if material < 0 else model.mat_rgba[material])[:3],
         mesh=_mesh_of(model, geom),
+        thickness=thickness_of(model, geom),
     )
+
+
+def thickness_of(model: mujoco.MjModel, geom: int) -> float:
+    """Returns the thickness of a geom's mesh, metres, as the numeric `thickness:NAME` says; 0 without one."""
+    number = mujoco.mj_name2id(model, mujoco.mjtObj.mjOBJ_NUMERIC, f"{THICKNESS}{model.geom(geom).name}")
+    return 0.0 if number < 0 else float(model.numeric_data[model.numeric_adr[number]])

@@ -1,4 +1,4 @@
-"""Fields: solids of any form, here convex meshes, as grids of signed distances (`sim/scene/mesh_field.py`).
+"""Fields: solids of any form as grids of signed distances (`sim/scene/mesh_field.py`).
 
 The grids are static: constants of a program, not rows of a world's arrays, which the camera copies for each column.
 Between its values a distance is interpolated; beyond its grid a field is at least as far away as the box around the
@@ -7,9 +7,8 @@ mesh, and as the nearest point of the grid together with the distance there.
 
 from __future__ import annotations
 
-import math
-from collections.abc import Sequence
-from functools import lru_cache
+from collections.abc import Callable, Sequence
+from functools import lru_cache, partial
 from typing import Any, NamedTuple
 
 import jax
@@ -18,12 +17,16 @@ import numpy as np
 from flax import struct
 from jax import Array, lax
 
+from edqn_jax.sim.scene.grid_boxes import boxes_of_grid
 from edqn_jax.sim.scene.mesh_field import Grid, grid_of_mesh, hull_of, spread_directions
 from edqn_jax.sim.scene.motion import Motion
+from edqn_jax.sim.scene.shapes import field_rays
+from edqn_jax.sim.scene.shapes.faces import faces_of_box
 from edqn_jax.sim.scene.shapes.kind import (
     FAR,
     GREY,
     PARKED,
+    THICKNESS,
     Geom,
     Hits,
     ShapeKind,
@@ -36,13 +39,12 @@ from edqn_jax.sim.scene.shapes.kind import (
 )
 from edqn_jax.sim.scene.surface import Surface
 
-STEPS = 16
-"""Of a ray through a field, each as long as the distance where it begins."""
+SLACK_M = 0.1
+"""Metres that a distance may be too small near a surface, in corners of cells of `CELL_M`."""
 
 TOUCHES = 1e-6
 """Metres that are none."""
 
-_NEAR = 0.1  # of a cell: a ray that ends nearer to a surface meets it
 _MOST_FACES = 400  # of a solid in pictures
 
 
@@ -63,28 +65,34 @@ class Fields:
 class _Table(NamedTuple):
     """All grids as one array, and a row for each grid."""
 
-    cells: np.ndarray  # [cells, 8] values at the corners, so that one gather reads all of a cell
-    first: np.ndarray  # [G] number of its first cell
     counts: np.ndarray  # [G, 3] values along each axis
     cell: np.ndarray  # [G] metres
-
-
-def _cells(values: np.ndarray) -> np.ndarray:
-    """Returns the values at the corners of each cell [cells, 8]."""
-    x, y, z = values.shape
-    parts = [values[i : x - 1 + i, j : y - 1 + j, k : z - 1 + k] for i in range(2) for j in range(2) for k in range(2)]
-    return np.stack([part.ravel() for part in parts], axis=1)
+    values: np.ndarray  # of all grids, one after the other
+    begin: np.ndarray  # [G] number of its first value
+    least: np.ndarray  # of all values in each block of cells
+    blocks_begin: np.ndarray  # [G] number of its first block
 
 
 @lru_cache(maxsize=8)
 def _table(grids: tuple[Grid, ...]) -> _Table:
-    sizes = [math.prod(n - 1 for n in grid.values.shape) for grid in grids]
+    blocks = [_least_of_blocks(grid.values) for grid in grids]
     return _Table(
-        np.concatenate([_cells(grid.values) for grid in grids]),
-        np.cumsum([0, *sizes[:-1]]).astype(np.int32),
         np.array([grid.values.shape for grid in grids], np.int32),
         np.array([grid.cell for grid in grids], np.float32),
+        np.concatenate([grid.values.ravel() for grid in grids]),
+        np.cumsum([0, *(grid.values.size for grid in grids[:-1])]).astype(np.int32),
+        np.concatenate([least.ravel() for least in blocks]),
+        np.cumsum([0, *(least.size for least in blocks[:-1])]).astype(np.int32),
     )
+
+
+def _least_of_blocks(values: np.ndarray) -> np.ndarray:
+    """Returns the least value of each block of `BLOCK` cells along each axis, the values at its ends included."""
+    for axis in range(3):
+        moved, size = np.moveaxis(values, axis, 0), field_rays.BLOCK
+        parts = [moved[begin : begin + size + 1].min(0) for begin in range(0, len(moved) - 1, size)]
+        values = np.moveaxis(np.stack(parts), 0, axis)
+    return values
 
 
 def _interpolate(fields: Fields, place: Vector) -> tuple[Array, Vector]:
@@ -98,10 +106,13 @@ def _interpolate(fields: Fields, place: Vector) -> tuple[Array, Vector]:
         at = jnp.clip(place[i] / cell + last / 2, 0.0, last)
         lower.append(jnp.minimum(at.astype(jnp.int32), last - 1))
         part.append(at - lower[i])
-    across, along = (counts[..., 1] - 1) * (counts[..., 2] - 1), counts[..., 2] - 1
-    first = jnp.asarray(table.first)[number] + lower[0] * across + lower[1] * along + lower[2]
-    eight = jnp.asarray(table.cells).at[first].get(mode="promise_in_bounds")
-    corner = [[[eight[..., 4 * i + 2 * j + k] for k in range(2)] for j in range(2)] for i in range(2)]
+    across, along, values = counts[..., 1] * counts[..., 2], counts[..., 2], jnp.asarray(table.values)
+    first = jnp.asarray(table.begin)[number] + lower[0] * across + lower[1] * along + lower[2]
+
+    def value(i: int, j: int, k: int) -> Array:
+        return values.at[first + i * across + j * along + k].get(mode="promise_in_bounds")
+
+    corner = [[[value(i, j, k) for k in range(2)] for j in range(2)] for i in range(2)]
 
     def between(low: Array, high: Array, axis: int) -> Array:
         return low + part[axis] * (high - low)
@@ -133,36 +144,110 @@ def _distance(fields: Fields, x: Array, y: Array, z: Array) -> Array:
 
 def _meet(fields: Fields, origin: Array, ray: Vector) -> Hits:
     """Returns where rays meet fields: they advance by the distance, within the box around each solid."""
+    shape = jnp.broadcast_shapes(*(part.shape for part in ray))
+    whole: Any = tuple(jnp.broadcast_to(part, shape)[0] for part in ray)
+    if field_rays.is_available():
+        table = _table(fields.grids)
+        grids = table.values, table.begin, table.least, table.blocks_begin, table.counts, table.cell
+        in_c = partial(field_rays.meet, grids)
+        depth, *normal = lax.platform_dependent(fields, origin, whole, cpu=in_c, default=_meet_in_jax)
+    else:
+        depth, *normal = _meet_in_jax(fields, origin, whole)
+    return Hits.of(depth, depth < field_rays.NOWHERE, (normal[0], normal[1], normal[2]))
+
+
+def _meet_in_jax(fields: Fields, origin: Array, ray: Vector) -> tuple[Array, Array, Array, Array]:
+    """Returns depths [N, R, C] of rays [R, C], `FAR_M` where nothing is met, and three parts of the normal."""
+    shape, number = ray[0].shape, fields.position.shape[0]
+    missing = -ray[0].size % field_rays.TOGETHER
+    groups = [jnp.pad(part.ravel(), (0, missing), mode="edge").reshape(1, -1, field_rays.TOGETHER) for part in ray]
     turn = [[per_shape(fields.rotation[:, j, i]) for j in range(3)] for i in range(3)]
     away = [per_shape(origin[i] - fields.position[:, i]) for i in range(3)]
     o: Any = [sum(turn[i][j] * away[j] for j in range(3)) for i in range(3)]
-    d: Any = [sum(turn[i][j] * ray[j] for j in range(3)) for i in range(3)]
+    d: Any = [sum(turn[i][j] * groups[j] for j in range(3)) for i in range(3)]
     cell = per_shape(jnp.asarray(_table(fields.grids).cell)[fields.grid.astype(jnp.int32)])
-    enter, leave = jnp.zeros(()), jnp.asarray(jnp.inf)
+    enter, leave = jnp.zeros(()), jnp.full((), field_rays.FAR_M)
     for i in range(3):
         per_d = safe_inverse(d[i])
         middle, reach = -o[i] * per_d, per_shape(fields.half[:, i]) * jnp.abs(per_d)
         enter, leave = jnp.maximum(enter, middle - reach), jnp.minimum(leave, middle + reach)
-    per_length = lax.rsqrt(ray[0] ** 2 + ray[1] ** 2 + ray[2] ** 2)
+    depth = jnp.maximum(enter, _march_together(fields, o, d, cell, enter, leave))
+    near, per_length = field_rays.STOPS * cell, 1.0 / _length(d)
 
-    def at(depth: Array) -> tuple[Array, Vector]:
-        return _interpolate(fields, (o[0] + depth * d[0], o[1] + depth * d[1], o[2] + depth * d[2]))
+    def coarse(depth: Array) -> tuple[Array, Array]:
+        room = _least_along(fields, o, d, depth)
+        going = (room >= cell) & (depth < leave) & (enter < leave)
+        return going, jnp.where(going, depth + room * per_length, depth)
 
-    def advance(_: Array, depth: Array) -> Array:
-        return depth + jnp.maximum(at(depth)[0], 0.0) * per_length
+    def step(depth: Array) -> tuple[Array, Array]:
+        left, _ = _along(fields, o, d, depth)
+        going = (left >= near + field_rays.CONE * depth) & (depth < leave) & (enter < leave)
+        return going, jnp.where(going, depth + left * per_length, depth)
 
-    depth = lax.fori_loop(0, STEPS, advance, enter)
-    left, slopes = at(depth)
-    hit = (depth > 0) & (depth < leave) & (left < _NEAR * cell)
+    depth = _repeat(step, _repeat(coarse, depth))
+    _, slopes = _along(fields, o, d, depth)
+    hit = (depth > 0) & (depth < leave)
     scale = safe_inverse(norm(*slopes))
-    normal: Any = tuple(scale * sum(turn[i][j] * slopes[i] for i in range(3)) for j in range(3))
-    return Hits.of(depth, hit, normal)
+    normal = [scale * sum(turn[i][j] * slopes[i] for i in range(3)) for j in range(3)]
+    found = (jnp.where(hit, depth, field_rays.FAR_M), *(jnp.where(hit, part, 0.0) for part in normal))
+    x, y, z, w = (part.reshape(number, -1)[:, : ray[0].size].reshape(number, *shape) for part in found)
+    return x, y, z, w
+
+
+def _march_together(fields: Fields, o: Any, d: Any, cell: Array, enter: Array, leave: Array) -> Array:
+    """Returns the depth [N, G, 1] up to which no ray of a group meets anything, of rays `d` [N, G, K] from `o`."""
+    middle = [jnp.mean(part, axis=-1, keepdims=True) for part in d]
+    spread = jnp.max(_length([d[i] - middle[i] for i in range(3)]), axis=-1, keepdims=True)
+    first, last = jnp.min(enter, axis=-1, keepdims=True), jnp.max(leave, axis=-1, keepdims=True)
+    per_length = 1.0 / (_length(middle) + spread)
+
+    def step(depth: Array) -> tuple[Array, Array]:
+        room = _least_along(fields, o, middle, depth) - spread * depth
+        enough = room >= field_rays.WORTH * spread * depth + cell
+        going = enough & (depth < last) & (first < last)
+        return going, jnp.where(going, depth + room * per_length, depth)
+
+    return _repeat(step, first)
+
+
+def _along(fields: Fields, o: Any, d: Any, depth: Array) -> tuple[Array, Vector]:
+    """Returns distances and slopes at depths of rays from `o` in directions `d`, in each field's own axes."""
+    return _interpolate(fields, (o[0] + depth * d[0], o[1] + depth * d[1], o[2] + depth * d[2]))
+
+
+def _least_along(fields: Fields, o: Any, d: Any, depth: Array) -> Array:
+    """Returns the least distances in the blocks where such rays are."""
+    table, number = _table(fields.grids), per_shape(fields.grid.astype(jnp.int32))
+    counts, cell = jnp.asarray(table.counts)[number], jnp.asarray(table.cell)[number]
+    block = []
+    for i in range(3):
+        last = counts[..., i] - 1
+        at = jnp.clip((o[i] + depth * d[i]) / cell + last / 2, 0.0, last)
+        block.append(jnp.minimum(at.astype(jnp.int32), last - 1) // field_rays.BLOCK)
+    y, z = ((counts[..., i] + field_rays.BLOCK - 2) // field_rays.BLOCK for i in (1, 2))
+    first = jnp.asarray(table.blocks_begin)[number] + block[0] * (y * z) + block[1] * z + block[2]
+    return jnp.asarray(table.least).at[first].get(mode="promise_in_bounds")
+
+
+def _length(vector: Any) -> Array:
+    return jnp.sqrt(vector[0] ** 2 + vector[1] ** 2 + vector[2] ** 2)
+
+
+def _repeat(step: Callable[[Array], tuple[Array, Array]], depth: Array) -> Array:
+    """Returns depths after steps, at most `STEPS`, until none goes on; a step returns which do, and the next depths."""
+
+    def more(carry: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+        going, moved = step(carry[1])
+        return carry[0] + 1, moved, jnp.any(going)
+
+    begin = (jnp.zeros((), jnp.int32), depth, jnp.ones((), bool))
+    return lax.while_loop(lambda carry: carry[2] & (carry[0] < field_rays.STEPS), more, begin)[1]
 
 
 def _read(geom: Geom) -> Fields | None:
     if geom.mesh is None:
         return None
-    grid, middle = grid_of_mesh(*geom.mesh)
+    grid, middle = grid_of_mesh(*geom.mesh, thickness=geom.thickness)
     position = geom.position + geom.rotation @ middle
     return Fields(position, geom.rotation, grid.half, np.float32(0), geom.albedo, grids=(grid,))  # type: ignore[arg-type]
 
@@ -177,6 +262,11 @@ def _asset(one: Fields) -> dict[str, Any]:
     return {"vertex": grid.vertices, "face": grid.faces}
 
 
+def _custom(one: Fields) -> dict[str, Any]:
+    thickness = grid_of(one).thickness
+    return {THICKNESS: [thickness]} if thickness else {}
+
+
 def _faces(one: Fields) -> list[np.ndarray]:
     vertices, faces = grid_of(one).vertices, grid_of(one).faces
     if len(faces) > _MOST_FACES:
@@ -184,6 +274,16 @@ def _faces(one: Fields) -> list[np.ndarray]:
         towards = spread_directions(_MOST_FACES // 4)
         vertices, faces = hull_of(vertices[np.unique([np.argmax(vertices @ one) for one in towards])])
     return list((one.position + vertices @ np.asarray(one.rotation).T)[faces])
+
+
+def _parts(one: Fields) -> list[list[np.ndarray]]:
+    grid, turn = grid_of(one), np.asarray(one.rotation)
+    if grid.is_convex:
+        return [_faces(one)]
+    return [
+        faces_of_box(one.position + turn @ (low + high) / 2, (high - low) / 2, turn)
+        for low, high in boxes_of_grid(grid)
+    ]
 
 
 def _share(several: Sequence[Fields]) -> list[Fields]:
@@ -209,7 +309,10 @@ FIELD = ShapeKind(
     read=_read,
     write=lambda one: {"quat": quaternion_of(one.rotation)},
     asset=_asset,
+    custom=_custom,
     share=_share,
+    slack=SLACK_M,
     reach=lambda fields: (abs(fields.rotation) * fields.half[..., None, :]).sum(-1),
     faces=_faces,
+    parts=_parts,
 )

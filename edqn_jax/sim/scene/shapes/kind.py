@@ -33,6 +33,9 @@ UP = np.array([0.0, 0.0, 1.0])
 
 TINY = 1e-9
 
+THICKNESS = "thickness:"
+"""Before the name of a geom, the numeric of the thickness of its mesh, metres."""
+
 LEVEL = 1e-6
 """An axis this near to vertical (sine of the angle) is vertical: 0.1 mm over 100 m."""
 
@@ -88,7 +91,10 @@ class Geom:
     albedo: np.ndarray
     """[3]"""
     mesh: tuple[np.ndarray, np.ndarray] | None = None
-    """Vertices [V, 3], metres, in the geom's axes, and the triangles [F, 3] of a mesh; None: it is none."""
+    """Vertices [V, 3], metres, in the geom's axes, and triangles [F, 3] of a mesh, an ellipsoid or a height field;
+    None: it is none of them."""
+    thickness: float = 0.0
+    """Metres of a mesh that is a surface and not closed; 0 of a closed one."""
 
     def is_upright(self, axis: int = 2) -> bool:
         """Returns whether one of its axes is vertical."""
@@ -117,12 +123,18 @@ class ShapeKind:
     """A single shape → attributes of its geom beside type, pos and rgba: numbers."""
     asset: Callable[[Any], dict[str, Any]] | None = None
     """A single shape → attributes of the mesh that its geom names: numbers; None: it names none."""
+    custom: Callable[[Any], dict[str, Any]] | None = None
+    """A single shape → numerics of `<custom>` for its geom: numbers by the word that stands before the geom's name."""
     share: Callable[[Sequence[Any]], Sequence[Any]] | None = None
     """Shapes of several worlds, single or not → the same with equal static fields; None: there are none."""
+    slack: float = 0.0
+    """Metres that distances near a surface may be too small: a collision there is no error."""
     reach: Callable[[Any], Any] | None = None
     """Shapes, single or not → half extents [..., 3] of the axis-aligned boxes around them, metres; None: endless."""
     faces: Callable[[Any], Sequence[np.ndarray]] | None = None
     """A single shape → rings of corners [k, 3], metres, of a convex solid for pictures; None if it is not drawn."""
+    parts: Callable[[Any], Sequence[Sequence[np.ndarray]]] | None = None
+    """A single shape → several convex solids for pictures, each as `faces`; None: it is the one of `faces`."""
     page: Callable[[Any], dict[str, Any]] | None = None
     """A single shape → `kind` and sizes of a solid that `report/page/page.js` knows; None draws its faces."""
 
@@ -140,9 +152,11 @@ class ShapeKind:
                 "read": "geom",
                 "write": "shape",
                 "asset": "shape",
+                "custom": "shape",
                 "share": "several",
                 "reach": "shapes",
                 "faces": "shape",
+                "parts": "shape",
                 "page": "shape",
             },
         )
@@ -166,8 +180,11 @@ def kind_of(shape: Any) -> tuple[str, ShapeKind]:
 
 
 def read_shape(geom: Geom) -> Any:
-    """Returns a geom as a single shape of the first kind that takes it; None if there is none."""
-    found = (kind.read(geom) for kind in kinds().values() if kind.geom == geom.kind)
+    """Returns a geom as a single shape of the first kind that takes it; None if there is none.
+
+    What has a mesh is read as one where no kind is for its name.
+    """
+    found = (kind.read(geom) for name in (geom.kind, "mesh") for kind in kinds().values() if kind.geom == name)
     return next((shape for shape in found if shape is not None), None)
 
 

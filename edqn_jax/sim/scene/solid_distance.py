@@ -1,0 +1,270 @@
+"""Signed distances of closed meshes of any form on the points of a lattice.
+
+Near the surface they are exact, each block of cells against the triangles around it, in one program of JAX on the CPU.
+Further away they are those to the triangle that is the nearest one of the nearest point at the surface, or of a
+neighbour's, less a margin. Inside is where the surface is crossed inwards more often than outwards from below, so that
+solids may overlap.
+
+F triangles of [3, 3] metres; a lattice has `counts` [3] points, `cell` metres apart, about the origin.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array, lax
+from numpy.typing import NDArray
+from scipy.ndimage import distance_transform_edt
+
+EXACT_CELLS = 2.5
+"""Cells from the surface up to which distances are exact."""
+
+_BLOCK = 4  # cells along each side of a block
+_PIECE_CELLS = 8.0  # longest edge of the pieces that blocks are compared with
+_FAR_CELLS = 0.1  # that distances further away are too small, for they are not to the nearest of all triangles
+_AT_ONCE = 8  # pieces that a block is compared with in one pass
+_THREADS = 2
+_PAIRS = 2**20  # numbers of an intermediate array
+_BESIDE = (3.1e-5, 1.7e-5)  # of a cell: no line upwards meets an edge of a mesh that is aligned to the lattice
+
+Numbers = NDArray[np.floating]
+Integers = NDArray[np.int64]
+
+
+def split_triangles(triangles: Numbers, longest: float) -> Numbers:
+    """Returns triangles [G, 3, 3] that cover the same surface, no edge of which is longer than `longest` metres."""
+    done = []
+    while len(triangles):
+        edges = np.linalg.norm(np.roll(triangles, -1, axis=1) - triangles, axis=2)
+        long = edges.max(1) > longest
+        done.append(triangles[~long])
+        # The longest edge is halved.
+        first = edges[long].argmax(1)[:, None] + np.arange(3)
+        a, b, c = np.moveaxis(np.take_along_axis(triangles[long], first[..., None] % 3, axis=1), 1, 0)
+        middle = (a + b) / 2
+        triangles = np.concatenate([np.stack([a, middle, c], axis=1), np.stack([middle, b, c], axis=1)])
+    return np.concatenate([np.zeros((0, 3, 3)), *done])
+
+
+def lattice_axes(counts: NDArray[np.integer], cell: float) -> list[Numbers]:
+    """Returns the coordinates of a lattice along each axis, metres."""
+    return [cell * (np.arange(n) - (n - 1) / 2) for n in counts]
+
+
+def solid_distances(
+    triangles: Numbers, counts: NDArray[np.integer], cell: float, is_closed: bool = True
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Returns distances at the points of a lattice and in the middles of its cells, metres, negative inside.
+
+    Args:
+        triangles: [F, 3, 3] of a closed mesh.
+        counts: [3] of the lattice.
+        cell: metres.
+        is_closed: whether there is an inside.
+
+    Returns:
+        corners: [X, Y, Z]; beyond `EXACT_CELLS` from the surface about a tenth of a cell too small.
+        middles: [X - 1, Y - 1, Z - 1]; exact within `EXACT_CELLS` of the surface, elsewhere infinite.
+    """
+    pieces = split_triangles(triangles, _PIECE_CELLS * cell)
+    with jax.default_device(jax.local_devices(backend="cpu")[0]):
+        table = jnp.asarray(_table_of(pieces), jnp.float32)
+        corners, middles, nearest = _near_distances(pieces, table, counts, cell)
+        away = _far_distances(table, nearest, corners, cell) - _FAR_CELLS * cell
+    corners[~np.isfinite(corners)] = np.maximum(away, EXACT_CELLS * cell)
+    if not is_closed:
+        return corners, middles
+    axes = lattice_axes(counts, cell)
+    for values, lattice in ((corners, axes), (middles, [axis[:-1] + cell / 2 for axis in axes])):
+        np.negative(values, out=values, where=inside_of(triangles, lattice))
+    return corners, middles
+
+
+def _far_distances(table: Array, nearest: NDArray[np.int32], near: NDArray[np.float32], cell: float) -> Numbers:
+    """Returns the distances of the points of a lattice at which those `near` [X, Y, Z] are infinite."""
+    far = ~np.isfinite(near)
+    index = distance_transform_edt(~(near < cell), return_distances=False, return_indices=True)
+    nearest = nearest[tuple(index)]  # type: ignore[index]
+    places = np.argwhere(far)
+    points = cell * (places - (np.array(near.shape) - 1) / 2)
+    found = np.full(len(places), np.inf, np.float32)
+    for step in (np.zeros(3, int), *np.eye(3, dtype=int), *-np.eye(3, dtype=int)):
+        there = np.clip(places + 2 * step, 0, np.array(near.shape) - 1)
+        found = np.minimum(found, _distances_to(table, nearest[tuple(there.T)], points))
+    return found
+
+
+def inside_of(triangles: Numbers, axes: list[Numbers]) -> NDArray[np.bool_]:
+    """Returns which points [X, Y, Z] of a lattice are within a closed mesh; evenly spaced `axes`, metres."""
+    counts = [len(axis) for axis in axes]
+    steps = [axis[1] - axis[0] for axis in axes]
+    x, y = (axes[i] + _BESIDE[i] * steps[i] for i in range(2))
+    turns = np.zeros((counts[0] * counts[1], counts[2] + 1), np.int16)
+    low, high = triangles.min(1), triangles.max(1)
+    first = np.stack([np.searchsorted(axis, low[:, i]) for i, axis in enumerate((x, y))], axis=1)
+    number = np.stack([np.searchsorted(axis, high[:, i]) for i, axis in enumerate((x, y))], axis=1) - first
+    for owner, place in _boxes(first, number):
+        a, b, c = np.moveaxis(triangles[owner], 1, 0)
+        at = np.stack([x[place[:, 0]], y[place[:, 1]]], axis=1)
+        sides = np.stack([_turn(p, q, at) for p, q in ((b, c), (c, a), (a, b))], axis=1)
+        met = np.all(sides > 0, axis=1) | np.all(sides < 0, axis=1)
+        sides, place = sides[met], place[met]
+        area = sides.sum(1)
+        heights = np.stack([a[met, 2], b[met, 2], c[met, 2]], axis=1)
+        level = np.ceil((np.sum(sides * heights, axis=1) / area - axes[2][0]) / steps[2]).astype(np.int64)
+        # A triangle that looks down is crossed inwards on the way up.
+        columns = place[:, 0] * counts[1] + place[:, 1]
+        np.add.at(turns, (columns, np.clip(level, 0, counts[2])), -np.sign(area).astype(np.int16))
+    return (np.cumsum(turns, axis=1, dtype=np.int16)[:, :-1] > 0).reshape(counts)
+
+
+def _turn(p: Numbers, q: Numbers, at: Numbers) -> Numbers:
+    """Returns twice the area of the level triangle of two points and a third, positive anticlockwise."""
+    return (q[:, 0] - p[:, 0]) * (at[:, 1] - p[:, 1]) - (q[:, 1] - p[:, 1]) * (at[:, 0] - p[:, 0])
+
+
+def _boxes(first: Integers, number: Integers) -> Iterator[tuple[Integers, Integers]]:
+    """Yields the owners [P] and places [P, D] of all members of boxes that begin at `first` [N, D], some at a time."""
+    sizes = np.where((number > 0).all(1), number.prod(1), 0)
+    ends = np.cumsum(sizes)
+    begin = 0
+    while begin < len(sizes):
+        end = max(begin + 1, int(np.searchsorted(ends, (ends[begin - 1] if begin else 0) + _PAIRS, side="right")))
+        owner = np.repeat(np.arange(begin, end), sizes[begin:end])
+        rest = np.arange(len(owner)) - np.repeat(np.cumsum(sizes[begin:end]) - sizes[begin:end], sizes[begin:end])
+        places = np.empty((len(owner), first.shape[1]), np.int64)
+        for axis in reversed(range(first.shape[1])):
+            rest, places[:, axis] = np.divmod(rest, np.maximum(number[owner, axis], 1))
+        if len(owner):
+            yield owner, first[owner] + places
+        begin = end
+
+
+def _near_distances(
+    pieces: Numbers, table: Array, counts: NDArray[np.integer], cell: float
+) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.int32]]:
+    """Returns the unsigned distances of corners and middles, infinite beyond `EXACT_CELLS`, and corners' triangles."""
+    blocks = -(-np.asarray(counts, np.int64) // _BLOCK)
+    reach, side = EXACT_CELLS * cell, _BLOCK * cell
+    corner = -cell * (np.asarray(counts) - 1) / 2
+    low, high = ((pick(pieces, axis=1) - corner) / side for pick in (np.min, np.max))
+    # A block holds its corners and the middles of its cells.
+    first = np.clip(np.floor(low - reach / side - 1 + 0.5 / _BLOCK).astype(np.int64), 0, blocks)
+    last = np.clip(np.floor(high + reach / side).astype(np.int64) + 1, 0, blocks)
+    boxes = _boxes(first, last - first)
+    pairs = [(owner, np.ravel_multi_index(tuple(place.T), tuple(blocks))) for owner, place in boxes]
+    owner, block = (np.concatenate([np.zeros(0, np.int64), *each]) for each in zip(*pairs, strict=True))
+    order = np.argsort(block, kind="stable")
+    used, begin, number = np.unique(block[order], return_index=True, return_counts=True)
+    places = np.stack(np.unravel_index(used, tuple(blocks)), axis=1)
+    members = jnp.asarray(_padded(owner[order], _AT_ONCE), jnp.int32)
+    points = jnp.asarray(_points_of_block(cell), jnp.float32)
+    spans = _padded(np.stack([begin, number], axis=1), 1).astype(np.int32)
+    corners = _padded(corner + side * places, 1).astype(np.float32)
+    parts = [slice(i, None, _THREADS) for i in range(_THREADS)]
+    with ThreadPoolExecutor(_THREADS) as pool:
+        compared = pool.map(lambda part: _compare_blocks(table, members, spans[part], corners[part], points), parts)
+        squares, numbers = (np.stack(each, axis=1).reshape(-1, len(points)) for each in zip(*compared, strict=True))
+    distances = np.sqrt(squares[: len(used)]).reshape(-1, 2, *[_BLOCK] * 3)
+    distances[distances > reach] = np.inf
+    whole = [_whole(distances[:, i], places, blocks, np.inf) for i in range(2)]
+    x, y, z = counts
+    nearest = _whole(numbers[: len(used)].reshape(-1, 2, *[_BLOCK] * 3)[:, 0], places, blocks, 0)
+    return whole[0][:x, :y, :z].copy(), whole[1][: x - 1, : y - 1, : z - 1].copy(), nearest[:x, :y, :z]
+
+
+def _whole(values: NDArray[Any], places: Integers, blocks: Integers, other: float) -> NDArray[Any]:
+    """Returns a lattice with the values [B, n, n, n] of the blocks at `places`, and `other` everywhere else."""
+    whole = np.full((*blocks, *[_BLOCK] * 3), other, values.dtype)
+    whole[tuple(places.T)] = values
+    return whole.transpose(0, 3, 1, 4, 2, 5).reshape(blocks * _BLOCK)
+
+
+def _points_of_block(cell: float) -> Numbers:
+    """Returns corners and middles [2 * _BLOCK^3, 3] of the cells of a block, metres from its lowest corner."""
+    lattice = np.stack(np.meshgrid(*[np.arange(_BLOCK)] * 3, indexing="ij"), -1).reshape(-1, 3)
+    return cell * np.concatenate([lattice, lattice + 0.5])
+
+
+def _padded(rows: NDArray[np.generic], more: int) -> NDArray[np.generic]:
+    """Returns rows and `more` after them, and so many that meshes of similar size share a program."""
+    count = len(rows) + more
+    size = 2 ** max(6, int(np.ceil(np.log2(count))))
+    return np.concatenate([rows, np.zeros((size - len(rows), *rows.shape[1:]), rows.dtype)])
+
+
+def _table_of(triangles: Numbers) -> Numbers:
+    """Returns what `_compare_blocks` reads of each triangle: its corners, and its unit normal, 0 of a flat one."""
+    a, b, c = np.moveaxis(triangles, 1, 0)
+    normal = np.cross(b - a, c - a)
+    length = np.linalg.norm(normal, axis=1, keepdims=True)
+    rows = np.concatenate([a, b, c, np.where(length > 0, normal / np.where(length > 0, length, 1), 0)], axis=1)
+    return _padded(rows, 1)  # type: ignore[return-value]
+
+
+@jax.jit
+def _compare_blocks(table: Array, members: Array, spans: Array, corners: Array, points: Array) -> tuple[Array, Array]:
+    """Returns the squared distances [B, P] of each block's points to its nearest triangle, m², and that one's number.
+
+    Args:
+        table: [T, 12] as `_table_of`.
+        members: triangles of all blocks, one block after the other.
+        spans: [B, 2] where those of each block begin, and how many they are.
+        corners: [B, 3] of the blocks, metres.
+        points: [P, 3] of a block.
+    """
+
+    def of_block(one: tuple[Array, Array]) -> tuple[Array, Array]:
+        span, corner = one
+
+        def nearer(i: Array, found: tuple[Array, Array]) -> tuple[Array, Array]:
+            number = members[span[0] + jnp.minimum(i * _AT_ONCE + jnp.arange(_AT_ONCE), span[1] - 1)]
+            squares, which = found
+            for k, row in enumerate(table[number]):
+                each = _squares(list(row), [points[:, i] + corner[i] for i in range(3)])
+                which = jnp.where(each < squares, number[k], which)
+                squares = jnp.minimum(squares, each)
+            return squares, which
+
+        passes = (span[1] + _AT_ONCE - 1) // _AT_ONCE
+        return lax.fori_loop(0, passes, nearer, (jnp.full(len(points), jnp.inf), jnp.zeros(len(points), jnp.int32)))
+
+    return lax.map(of_block, (spans, corners))
+
+
+@jax.jit
+def _squares_to(table: Array, numbers: Array, points: Array) -> Array:
+    """Returns the squared distance [P] of each point [P, 3] to the triangle of its number, m²."""
+    return _squares(list(table[numbers].T), list(points.T))
+
+
+def _distances_to(table: Array, numbers: NDArray[np.int32], points: Numbers) -> NDArray[np.float32]:
+    """Returns the distance [P] of each point [P, 3] to the triangle of its number, metres."""
+    found = []
+    for i in range(0, len(points), _PAIRS):
+        part = slice(i, i + _PAIRS)
+        given = _padded(numbers[part], 0), _padded(points[part], 0).astype(np.float32)
+        found.append(np.sqrt(np.asarray(_squares_to(table, *given)))[: len(points[part])])
+    return np.concatenate([np.zeros(0, np.float32), *found])
+
+
+def _squares(row: list[Array], place: list[Array]) -> Array:
+    """Returns the squared distances of points to triangles, twelve and three arrays that broadcast, m²."""
+    corners, n = [row[0:3], row[3:6], row[6:9]], row[9:12]
+    away = [[place[i] - corner[i] for i in range(3)] for corner in corners]
+    height = sum(away[0][i] * n[i] for i in range(3))
+    above = n[0] ** 2 + n[1] ** 2 + n[2] ** 2 > 0.5
+    beside = jnp.inf
+    for k in range(3):
+        p, e = away[k], [corners[(k + 1) % 3][i] - corners[k][i] for i in range(3)]
+        outward = e[1] * n[2] - e[2] * n[1], e[2] * n[0] - e[0] * n[2], e[0] * n[1] - e[1] * n[0]
+        above = above & (sum(p[i] * outward[i] for i in range(3)) <= 0)
+        length = jnp.maximum(e[0] ** 2 + e[1] ** 2 + e[2] ** 2, 1e-20)
+        share = jnp.clip(sum(p[i] * e[i] for i in range(3)) / length, 0.0, 1.0)
+        beside = jnp.minimum(beside, sum((p[i] - share * e[i]) ** 2 for i in range(3)))
+    return jnp.where(above, height**2, beside)

@@ -1,0 +1,168 @@
+"""`edqn world`: worlds of meshes and clouds of points, and what is refused."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+
+from edqn_jax.cli import main
+from edqn_jax.sim.scene import scan
+from edqn_jax.sim.scene.mjcf import check_scene, load_world, mjcf_of
+
+ROOM = (8.0, 5.0, 3.0)
+
+
+def room() -> trimesh.Trimesh:
+    """A closed room with walls of 0.2 m and a pillar, its corner at 5 5 5."""
+    outer = trimesh.creation.box(bounds=[[0, 0, 0], ROOM])
+    inner = trimesh.creation.box(bounds=[[0.2] * 3, [side - 0.2 for side in ROOM]])
+    pillar = trimesh.creation.box(bounds=[[4.0, 2.0, 0.1], [4.4, 2.4, 2.9]])
+    inner.invert()
+    parts = [outer, inner, pillar]
+    vertices = np.concatenate([part.vertices for part in parts]) + 5.0
+    return trimesh.Trimesh(
+        vertices, np.concatenate([part.faces + 8 * i for i, part in enumerate(parts)]), process=False
+    )
+
+
+@pytest.fixture(autouse=True)
+def elsewhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+
+
+def flown_inside(folder: str) -> None:
+    """The world can be flown from end to end within the room."""
+    loaded = load_world(Path(folder) / "world.xml")
+    assert loaded.names["fields"] == ("scan",) and loaded.names["planes"] == ("ground",)
+    check_scene(loaded.scene, 0.36, goal_radius=2.0)
+    ends = np.stack([loaded.scene.start, loaded.scene.goal])
+    assert np.all(ends > 0.5) and np.all(ends < np.subtract(ROOM, 0.5))
+
+
+def test_a_closed_mesh_is_a_world(capsys: pytest.CaptureFixture[str]) -> None:
+    room().export("room.ply")
+    assert main(["world", "room.ply", "--out", "here"]) == 0
+    said = capsys.readouterr().out
+    assert "36 triangles, 8.0 × 5.0 × 3.0 m, distances on cells of 0.1 m" in said
+    assert "edqn check here/world.xml" in said
+    assert sorted(file.name for file in Path("here").iterdir()) == ["scan.obj", "world.xml"]
+    flown_inside("here")
+
+
+@pytest.mark.parametrize("kind", ["stl", "glb"])
+def test_scale_and_the_axis_that_points_up_are_taken(kind: str) -> None:
+    mesh = room()
+    mesh.apply_scale(1000)
+    if kind == "glb":  # y up, as the format has it
+        mesh.vertices = mesh.vertices[:, [1, 2, 0]]
+    mesh.export(f"room.{kind}")
+    assert main(["world", f"room.{kind}", "--out", "here", "--scale", ".001"]) == 0
+    flown_inside("here")
+
+
+def test_what_is_not_closed_has_a_thickness(capsys: pytest.CaptureFixture[str]) -> None:
+    mesh = room()
+    trimesh.Trimesh(mesh.vertices, mesh.faces[12:-1], process=False).export("open.ply")
+    words = ["world", "open.ply", "--out", "here"]
+    assert main(words) == 2
+    assert "is not watertight" in (said := capsys.readouterr().err) and "or give --thickness, metres" in said
+    assert not Path("here").exists()
+    assert main([*words, "--thickness", "0.1"]) == 0
+    loaded = load_world("here/world.xml")
+    (grid,) = loaded.scene.others["fields"].grids
+    assert grid.thickness == 0.1
+    again = Path("again.xml")
+    again.write_text(mjcf_of(loaded.scene))
+    assert load_world(again).scene.others["fields"].grids[0].thickness == pytest.approx(0.1)
+
+
+def test_a_cloud_of_points_has_a_thickness(capsys: pytest.CaptureFixture[str]) -> None:
+    points = trimesh.sample.sample_surface(room(), 40_000, seed=1)[0]
+    trimesh.PointCloud(points).export("cloud.ply")
+    assert main(["world", "cloud.ply", "--out", "here"]) == 0
+    assert "40,000 points, 0.1 m thick" in capsys.readouterr().out
+    flown_inside("here")
+
+
+def test_many_triangles_are_thinned_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    ball = trimesh.creation.icosphere(subdivisions=4, radius=2)
+    trimesh.Trimesh(ball.vertices, ball.faces[1:]).export("ball.ply")
+    monkeypatch.setattr(scan, "MOST_KEPT", 2000)
+    read = scan.read_scan(Path("ball.ply"), scan.ScanOptions(thickness=0.3))
+    assert 200 < len(read.faces) <= 2000
+    away = np.linalg.norm(read.vertices[read.faces].mean(1) - 2, axis=1)
+    assert np.abs(away - 2).max() < 0.1
+    with pytest.raises(scan.ConfigError, match="even where those within 0.01 m are one"):
+        scan.read_scan(Path("ball.ply"), scan.ScanOptions(thickness=0.01))
+
+
+BAD = {
+    "none.ply": "there is no file 'none.ply'",
+    "room.fbx": "is no known scan; it must end in .ply, .stl, .obj, .glb",
+    "small.ply": "measures 0.8 x 0.5 x 0.3 m, too little to fly in; give --scale",
+    "large.ply": "m, more than 400; give a smaller --scale, 0.001 if it is in millimetres",
+    "tall.ply": "is taller than it is wide, 3 x 5 x 8 m; say which axis points up: --up y, or --up z",
+    "turned.ply": "the mesh is inside out",
+    "nan.obj": "has a point that is not finite",
+    "sparse.ply": "m apart, and a surface of 0.1 m would have holes; give --thickness, or more points",
+    "many.ply": "has 10,000,000 triangles; it may have 5,000,000",
+}
+
+
+@pytest.mark.parametrize(("name", "says"), BAD.items())
+def test_what_cannot_be_a_world_is_refused_in_a_sentence_and_nothing_is_written(
+    name: str, says: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    mesh = room()
+    Path("room.fbx").write_bytes(b"")
+    if name in ("small.ply", "large.ply"):
+        mesh.apply_scale(0.1 if name == "small.ply" else 1000)
+        mesh.export(name)
+    elif name == "tall.ply":
+        mesh.vertices = mesh.vertices[:, [2, 1, 0]]
+        mesh.export(name)
+    elif name == "turned.ply":
+        trimesh.Trimesh(mesh.vertices, mesh.faces[:, ::-1], process=False).export(name)
+    elif name == "nan.obj":
+        Path(name).write_text("v 0 0 0\nv 1 0 0\nv nan 1 0\nv 1 1 2\nf 1 2 3\nf 2 3 4\n")
+    elif name == "sparse.ply":
+        trimesh.PointCloud(trimesh.sample.sample_surface(mesh, 300, seed=1)[0]).export(name)
+    elif name == "many.ply":
+        Path(name).write_bytes(b"ply\nformat binary_little_endian 1.0\nelement vertex 3\nelement face 10000000\n")
+    before = sorted(Path().iterdir())
+    assert main(["world", name, "--out", "here"]) == 2
+    said = capsys.readouterr().err
+    assert says in said and said.count("\n") == 1 and sorted(Path().iterdir()) == before
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        (["--scale", "0"], "--scale must be above 0 and finite"),
+        (["--scale", "nan"], "--scale must be above 0 and finite"),
+        (["--thickness", "2"], "--thickness must be above 0, to 1 m"),
+        (["--up", "up"], "--up 'up' is no axis; give one of x, y, z, -x, -y, -z"),
+    ],
+)
+def test_options_are_checked(words: list[str], says: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["world", "room.ply", "--out", "here", *words]) == 2
+    assert says in capsys.readouterr().err
+
+
+def test_a_folder_that_holds_something_is_left_alone(capsys: pytest.CaptureFixture[str]) -> None:
+    Path("here").mkdir()
+    Path("here/mine.txt").write_text("mine")
+    assert main(["world", "room.ply", "--out", "here"]) == 2
+    assert "exists and is not empty; name a new folder" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("command", ["evaluate", "check", "train"])
+def test_commands_that_fly_name_the_one_that_makes_a_world(command: str, capsys: pytest.CaptureFixture[str]) -> None:
+    room().export("room.ply")
+    words = {"evaluate": ["pretrained", "--world", "room.ply"], "check": ["room.ply"], "train": ["--world", "room.ply"]}
+    assert main([command, *words[command]]) == 2
+    said = capsys.readouterr().err
+    assert "room.ply' is a scan; `edqn world " in said and "room.ply --out room` makes a world of it" in said

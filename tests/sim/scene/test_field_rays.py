@@ -1,0 +1,117 @@
+"""Rays through fields in C are those in JAX, however they are mapped, and meet what MuJoCo's do."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+import trimesh
+
+from edqn_jax.config import SHAPES
+from edqn_jax.sim.scene.mjcf import load_scene
+from edqn_jax.sim.scene.shapes import field_rays
+from edqn_jax.sim.scene.shapes.field import _least_of_blocks
+from tests.support.meshes import CUBE, hull, mesh_world
+
+RING = trimesh.creation.torus(1.2, 0.3, major_sections=24, minor_sections=12)
+GEOMS = (
+    '<geom name="ring" type="mesh" mesh="ring" pos="8 5 3" euler="0 70 20"/>'
+    '<geom name="block" type="mesh" mesh="block" pos="12 5 3" euler="0 0 30"/>'
+)
+MESHES = {"ring": (np.asarray(RING.vertices), np.asarray(RING.faces)), "block": hull(CUBE * [0.43, 2.02, 1.51])}
+"""None of their faces is a plane of a grid, to either side of which a place may be rounded."""
+
+
+@pytest.fixture
+def file(tmp_path: Path) -> Path:
+    return mesh_world(tmp_path, GEOMS, **MESHES)
+
+
+def rays_ahead() -> np.ndarray:
+    """Rays [13, 17, 3] along x and around, not as many as go together."""
+    across, up = np.meshgrid(np.linspace(-0.6, 0.6, 17), np.linspace(0.4, -0.4, 13))
+    return np.stack([np.ones_like(across), across, up], axis=-1).astype(np.float32)
+
+
+def meet(fields: Any, origin: Any, rays: Any) -> tuple[Any, ...]:
+    """Depths, which are met, and normals."""
+    met = SHAPES.get("fields").meet(fields, origin, tuple(rays[None, ..., i] for i in range(3)))
+    return met.depth, met.hit, *met.normal
+
+
+def compare(monkeypatch: pytest.MonkeyPatch, mapped: Any, *given: Any) -> tuple[np.ndarray, ...]:
+    """The results in C, once they are those in JAX."""
+    if not field_rays.is_available():
+        pytest.skip("there is no C compiler")
+    in_c = [np.asarray(part) for part in jax.jit(lambda *args: mapped(*args))(*given)]
+    monkeypatch.setattr(field_rays, "is_available", lambda: False)
+    in_jax = [np.asarray(part) for part in jax.jit(lambda *args: mapped(*args))(*given)]
+    depth, hit = in_c[:2]
+    assert hit.any() and not hit.all()
+    # Without optimisation XLA rounds a place in one way for one of its results and in another one for the next.
+    for ours, theirs, apart in zip(in_c, in_jax, (1e-5, 0, 1e-3, 1e-3, 1e-3), strict=True):
+        same = np.isclose(ours.astype(float), theirs.astype(float), rtol=apart, atol=apart)
+        assert same.mean() > 0.97
+    return tuple(in_c)
+
+
+def test_c_meets_what_jax_meets_and_mujoco(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    fields, origin, rays = load_scene(file).others["fields"], np.array([4.0, 4.6, 3.2], np.float32), rays_ahead()
+    depth, hit, *normal = compare(monkeypatch, meet, fields, jnp.asarray(origin), jnp.asarray(rays))
+    assert depth.shape == (2, 13, 17)
+    np.testing.assert_allclose(np.linalg.norm([part[hit] for part in normal], axis=0), 1.0, atol=1e-4)
+    nearest = np.where(hit, depth, np.inf).min(0)
+    model = mujoco.MjModel.from_xml_path(str(file))
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    theirs, geom = np.empty((13, 17)), np.zeros(1, np.int32)
+    for place in np.ndindex(13, 17):
+        ray = rays[place].astype(np.float64)
+        there = mujoco.mj_ray(model, data, origin.astype(np.float64), ray, None, 1, -1, geom)
+        theirs[place] = np.inf if there < 0 or geom[0] == 0 else there
+    assert np.isclose(nearest, theirs, rtol=0.05).mean() > 0.93
+    assert np.isinf(theirs).sum() > 30 and np.isfinite(theirs).sum() > 60
+
+
+def test_frames_and_worlds_that_are_mapped_are_those_one_by_one(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    fields, rays = load_scene(file).others["fields"], jnp.asarray(rays_ahead())
+    origins = jnp.array([[4.0, 4.6, 3.2], [4.5, 5.4, 2.9], [2.0, 5.0, 3.0]])
+    shifts = jnp.array([[0.0, 0.0, 0.0], [0.2, 0.1, 0.0]])
+
+    def moved(shift: Any, origin: Any) -> tuple[Any, ...]:
+        return meet(fields.replace(position=fields.position + shift), origin, rays)
+
+    every = jax.vmap(jax.vmap(moved, in_axes=(None, 0)), in_axes=(0, None))
+    depth, *_ = compare(monkeypatch, every, shifts, origins)
+    monkeypatch.undo()
+    alone = jax.jit(moved)(shifts[1], origins[2])[0]
+    np.testing.assert_allclose(np.minimum(depth[1, 2], 1e9), np.minimum(alone, 1e9), rtol=1e-6)
+
+
+def test_a_ray_along_a_wall_arrives_at_the_one_behind(tmp_path: Path) -> None:
+    # Along a wall every step is short; nearer to it the ray ends somewhere at the wall, and never in the sky.
+    parts = [
+        trimesh.creation.box(bounds=bounds)
+        for bounds in ([[0, 0, 0], [14, 0.2, 3]], [[0, 4, 0], [14, 4.2, 3]], [[13.8, 0, 0], [14, 4, 3]])
+    ]
+    vertices = np.concatenate([part.vertices for part in parts])
+    walls = vertices, np.concatenate([part.faces + 8 * i for i, part in enumerate(parts)])
+    scene = load_scene(mesh_world(tmp_path, '<geom type="mesh" mesh="m" pos="2 2 1"/>', m=walls))
+    rays = jnp.asarray(np.tile(np.array([1, 0.004, 0], np.float32), (1, 8, 1)))
+    for y, least in np.array([[2.5, 12.7], [2.35, 8.0]]):
+        depth, hit, *_ = meet(scene.others["fields"], jnp.array([3.0, y, 2.0]), rays)
+        assert bool(hit.all()) and least < float(depth[0, 0, 0]) < 12.81
+
+
+def test_the_least_of_blocks_is_never_more_than_a_value_in_them() -> None:
+    values = np.random.default_rng(0).normal(size=(10, 9, 6))
+    least = _least_of_blocks(values)
+    assert least.shape == (3, 2, 2)
+    for place in np.ndindex(*least.shape):
+        block = values[tuple(slice(4 * i, 4 * i + 5) for i in place)]
+        assert least[place] == block.min()

@@ -1,0 +1,172 @@
+"""Meshes and height fields in files of their own, and ellipsoids: what they become, and what is refused."""
+
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+import trimesh
+
+from edqn_jax.config import Config, WorldConfig
+from edqn_jax.runs.world_copy import copy_worlds, with_copied_worlds
+from edqn_jax.sim.scene.distance import shape_distances
+from edqn_jax.sim.scene.mjcf import SceneError, load_world, mjcf_of
+from edqn_jax.sim.scene.mjcf_parts import assets
+from edqn_jax.sim.scene.mjcf_parts.files import load_checked_text
+
+RING = trimesh.creation.torus(1, 0.3, major_sections=16, minor_sections=8)
+SITES = (
+    '<site name="start" pos="1 5 6"/><site name="goal" pos="19 5 6"/>'
+    '<site name="volume" type="box" pos="10 5 4" size="10 5 4" group="3"/>'
+)
+HEIGHTS = np.random.default_rng(0).uniform(0, 1, (4, 6))
+
+
+def world(folder: Path, assets: str, geoms: str, compiler: str = "") -> Path:
+    file = folder / "world.xml"
+    file.write_text(
+        f"<mujoco>{compiler}<asset>{assets}</asset><worldbody>{SITES}{geoms}</worldbody></mujoco>", encoding="utf-8"
+    )
+    return file
+
+
+def rays_down(file: Path, count: int = 150) -> tuple[np.ndarray, np.ndarray]:
+    """Points [P, 3] where MuJoCo's rays from above meet a world, and the numbers of the geoms there."""
+    model = mujoco.MjModel.from_xml_string(load_checked_text(file))
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    points, geoms = [], []
+    for x, y in np.random.default_rng(1).uniform((2, 1), (18, 9), (count, 2)):
+        geom = np.zeros(1, np.int32)
+        there = mujoco.mj_ray(model, data, np.array([x, y, 20.0]), np.array([0, 0, -1.0]), None, 1, -1, geom)
+        if there > 0:
+            points.append([x, y, 20 - there])
+            geoms.append(geom[0])
+    return np.array(points), np.array(geoms)
+
+
+def test_what_mujoco_sees_of_files_ellipsoids_and_height_fields_is_the_surface_of_fields(tmp_path: Path) -> None:
+    folder = tmp_path / "meshes"
+    folder.mkdir()
+    for kind in assets.KINDS:
+        RING.export(folder / f"ring.{kind}")
+    elevation = " ".join(f"{height:.6g}" for height in HEIGHTS.ravel())
+    file = world(
+        tmp_path,
+        '<mesh name="a" file="ring.stl" scale="1 1 2" refpos=".2 0 0"/><mesh name="b" file="ring.ply"/>'
+        '<mesh file="ring.obj" refquat=".9 .1 0 0"/>'
+        f'<hfield name="h" nrow="4" ncol="6" size="8 4 1.5 .5" elevation="{elevation}"/>',
+        '<geom type="mesh" mesh="a" pos="4 5 4" euler="30 0 0"/><geom type="mesh" mesh="b" pos="8 5 4"/>'
+        '<geom type="mesh" mesh="ring" pos="12 5 4"/>'
+        '<geom type="ellipsoid" size="1.5 1 .5" pos="16 5 4" euler="0 20 0"/>'
+        '<geom name="land" type="hfield" hfield="h" pos="10 5 .5" euler="0 0 10"/>',
+        '<compiler meshdir="meshes"/>',
+    )
+    loaded = load_world(file)
+    assert len(loaded.names["fields"]) == 5 and loaded.names["fields"][-1] == "land"
+    points, geoms = rays_down(file)
+    assert set(geoms) == set(range(5))
+    found = jax.jit(jax.vmap(lambda point: shape_distances(loaded.scene, point)["fields"]))
+    distances = np.asarray(found(jnp.asarray(points, jnp.float32)))[np.arange(len(geoms)), geoms]
+    assert distances.max() < 0.005 and distances.min() > -0.05
+
+
+@pytest.mark.parametrize("kind", ["png", "bin"])
+def test_the_file_of_a_height_field_is_the_one_that_mujoco_reads(tmp_path: Path, kind: str) -> None:
+    levels = np.round(255 * HEIGHTS).astype(np.uint8)
+    if kind == "png":
+        from PIL import Image
+
+        Image.fromarray(levels).save(tmp_path / "land.png")
+    else:
+        (tmp_path / "land.bin").write_bytes(struct.pack("<2i", 4, 6) + levels.astype("<f4").tobytes())
+    asset = f'<hfield name="h" file="land.{kind}" size="8 4 1.5 .5"/>'
+    file = world(tmp_path, asset, '<geom type="hfield" hfield="h" pos="10 5 .5"/>')
+    theirs = mujoco.MjModel.from_xml_string(
+        file.read_text(), {f"land.{kind}": (tmp_path / f"land.{kind}").read_bytes()}
+    )
+    ours = mujoco.MjModel.from_xml_string(load_checked_text(file))
+    np.testing.assert_allclose(ours.hfield_data, theirs.hfield_data, atol=1e-6)
+
+
+def test_a_run_keeps_a_copy_that_needs_no_other_file(tmp_path: Path) -> None:
+    RING.export(tmp_path / "ring.stl")
+    file = world(tmp_path, '<mesh name="a" file="ring.stl"/>', '<geom type="mesh" mesh="a" pos="9 5 4"/>')
+    run = tmp_path / "run"
+    run.mkdir()
+    config = Config(world=WorldConfig(name=str(file)))
+    copy_worlds(run, config)
+    assert with_copied_worlds(run, config) == (config, [])
+    before = load_world(file)
+    RING.copy().apply_scale(1.1).export(tmp_path / "ring.stl")
+    changed, (note,) = with_copied_worlds(run, config)
+    assert "has changed since the run began" in note
+    (tmp_path / "ring.stl").unlink()
+    copy = load_world(changed.world.name)
+    assert mjcf_of(copy.scene) == mjcf_of(before.scene)
+
+
+def stl_of(count: int) -> bytes:
+    """The beginning of a file that says that it has so many triangles."""
+    return b"\0" * 80 + struct.pack("<I", count)
+
+
+BAD = {
+    "../ring.stl": "which lies outside of the world's folder; copy it there",
+    "/etc/hostname": "which lies outside of the world's folder",
+    "link.stl": "which lies outside of the world's folder",
+    "none.stl": "and there is none in",
+    "ring.glb": r"must end in .obj, .stl, .ply",
+    "large.ply": "has 10,000,000 triangles; it may have 500,000, so thin it out",
+    "large.stl": "names files of more than 100,000,000 bytes together",
+    "nan.obj": "has a vertex that is not finite",
+    "points.ply": "has no triangles; `edqn world` makes a world of points",
+    "broken.ply": "cannot be read as .ply",
+    "open.stl": "geom 'thing': the mesh is not watertight",
+    "turned.stl": "geom 'thing': the mesh is inside out",
+}
+
+
+@pytest.mark.parametrize(("name", "says"), BAD.items())
+def test_a_file_that_cannot_be_flown_is_refused_in_one_sentence(tmp_path: Path, name: str, says: str) -> None:
+    home = tmp_path / "home"
+    home.mkdir()
+    RING.export(tmp_path / "ring.stl")
+    (home / "link.stl").symlink_to(tmp_path / "ring.stl")
+    RING.export(home / "ring.glb")
+    (home / "large.ply").write_bytes(b"ply\nformat binary_little_endian 1.0\nelement vertex 3\nelement face 10000000\n")
+    with (home / "large.stl").open("wb") as large:
+        large.write(stl_of(10_000_000))
+        large.truncate(500_000_084)  # no byte of it is on the disk
+    (home / "nan.obj").write_text("v 0 0 0\nv nan 0 0\nv 0 1 0\nf 1 2 3\n")
+    trimesh.PointCloud(RING.vertices).export(home / "points.ply")
+    (home / "broken.ply").write_bytes(b"ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nend_header\n1\n")
+    trimesh.Trimesh(RING.vertices, RING.faces[1:]).export(home / "open.stl")
+    trimesh.Trimesh(RING.vertices, RING.faces[:, ::-1]).export(home / "turned.stl")
+    file = world(home, f'<mesh name="m" file="{name}"/>', '<geom name="thing" type="mesh" mesh="m" pos="9 5 4"/>')
+    before = sorted(home.iterdir())
+    with pytest.raises(SceneError, match=says) as raised:
+        load_world(file)
+    assert "\n" not in str(raised.value) and sorted(home.iterdir()) == before
+
+
+def test_a_text_with_its_meshes_may_not_be_too_large(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    RING.export(tmp_path / "ring.stl")
+    file = world(tmp_path, '<mesh name="a" file="ring.stl"/>', '<geom type="mesh" mesh="a" pos="9 5 4"/>')
+    monkeypatch.setattr("edqn_jax.sim.scene.mjcf_parts.files.MAX_BYTES", 2000)
+    with pytest.raises(SceneError, match="with the files that it names; a world may have 2,000"):
+        load_world(file)
+
+
+def test_an_ellipsoid_that_moves_is_refused(tmp_path: Path) -> None:
+    geom = '<body name="b" mocap="true" pos="9 5 3"><geom name="egg" type="ellipsoid" size="1 .5 .5"/></body>'
+    file = world(tmp_path, "", geom)
+    moves = '<custom><text name="motion:b" data="oscillate 0 1 0 4 0"/></custom></mujoco>'
+    file.write_text(file.read_text().replace("</mujoco>", moves))
+    with pytest.raises(SceneError, match="geom 'egg' is of the kind ellipsoid on a body that moves"):
+        load_world(file)
