@@ -81,6 +81,8 @@ class Inputs:
     """What was last heard of vehicle and camera; times are seconds of the host's clock, None before the first."""
 
     heartbeat_at: float | None = None
+    wrong: str = ""
+    """Why this vehicle cannot be flown; empty if nothing says so."""
     mode: str = "other"
     """The vehicle's: `offboard`, `hold`, `land` or `other`."""
     armed: bool = False

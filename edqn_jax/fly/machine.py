@@ -127,6 +127,8 @@ def _refusal(inputs: Inputs, settings: Settings) -> str:
     """Returns why a flight can never begin; empty if nothing says so."""
     if inputs.stop:
         return str(Fault.STOPPED)
+    if inputs.wrong:
+        return inputs.wrong
     if not is_inside(settings.goal, settings.fence):
         return str(Fault.GOAL)
     if inputs.camera is not None and inputs.camera != settings.camera:

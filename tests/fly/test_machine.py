@@ -121,7 +121,15 @@ def test_a_command_is_held_for_its_period_and_not_longer() -> None:
     base = fly(settings(), seconds=4.0)
     assert Phase.FLYING in base.phases
     own = Odometry(1.0, np.array([1.0, 0.0, 5.0]), np.zeros(3))
-    heard = Inputs(1.0, "offboard", True, True, own, 1.0, 1e5, CAMERA, command=Command(1.0, np.array([4.0, 0, 0]), 0.3))
+    heard = Inputs(
+        1.0,
+        mode="offboard",
+        odometry=own,
+        packet_at=1.0,
+        rate_hz=1e5,
+        camera=CAMERA,
+        command=Command(1.0, np.array([4.0, 0, 0]), 0.3),
+    )
     state, output = step(flying, heard, 1.0, settings())
     assert output.velocity == (4.0, 0.0, 0.0) and output.yaw == 0.3
     later = 1.0 + PERIOD_S + settings().limits.late_s + 0.01
@@ -170,6 +178,7 @@ def test_nothing_is_sent_against_a_pilot() -> None:
         ({"camera": (640, 480)}, "640 x 480 pixels"),
         ({"battery": 0.1}, "low battery"),
         ({"stop": True}, "process stopped"),
+        ({"wrong": "vehicle 1 is no multirotor"}, "no multirotor"),
     ],
 )
 def test_nothing_is_sent_to_a_vehicle_that_is_not_ready(changes: dict[str, Any], says: str) -> None:
