@@ -78,7 +78,7 @@ class FlyArgs:
     """What is done about a fault, hover, hold or land, as in "low battery=hold"; docs/deployment.md has their names."""
     max_s: Annotated[float, arg(metavar="S")] = 300.0
     """Longest flight, seconds."""
-    least_rate: Annotated[float, arg(metavar="HZ")] = 0.02
+    least_rate: Annotated[float, arg(metavar="HZ")] = 0.1
     """Events per second and pixel that a drone in motion sees at least; set it above the camera's noise."""
     dry: bool = False
     """Bench test with props off: decides and logs, sends zero velocity, asks for no mode."""

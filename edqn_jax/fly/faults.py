@@ -114,7 +114,7 @@ class Limits:
     silent_s: float = 0.1
     """Without a packet of the camera."""
     burst_hz: float = 1e7
-    covered_hz: float = 0.02
+    covered_hz: float = 0.1
     """Events per second and pixel of the camera that a drone in motion sees at least."""
     covered_s: float = 0.4
     """For so long there must be fewer."""

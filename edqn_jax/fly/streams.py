@@ -143,13 +143,19 @@ class SocketStream:
         except (OSError, ValueError) as error:
             raise ConfigError(f"there is no camera at '{address}' ({error}); write it as tcp:HOST:PORT") from error
         self._decoder, self.events = Decoder(), Events()
+        try:
+            self._read_header(address)
+        except ConfigError:
+            self._socket.close()
+            raise
+
+    def _read_header(self, address: str) -> None:
+        """Waits for the size of the camera's image."""
         self._socket.settimeout(START_S)
-        # The header says which camera it is.
         while self._decoder.size is None:
-            try:
+            data = b""
+            with contextlib.suppress(OSError):
                 data = self._socket.recv(HEADER.size)
-            except OSError as error:
-                raise ConfigError(f"the camera at '{address}' says nothing; is it another program's port?") from error
             if not data:
                 raise ConfigError(f"the camera at '{address}' says nothing; is it another program's port?")
             list(self._decoder.feed(data))
