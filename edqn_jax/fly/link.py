@@ -86,6 +86,8 @@ def connect(address: str, system: int = SYSTEM, component: int = COMPONENT) -> A
     """
     device, _, baud = address.partition(",")
     try:
+        if ":" in device:
+            int(device.rpartition(":")[2])  # pymavlink leaves a socket open where this is no number
         return mavlink().mavlink_connection(
             device, baud=int(baud or 57600), source_system=system, source_component=component, retries=1
         )

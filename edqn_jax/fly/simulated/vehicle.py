@@ -84,6 +84,11 @@ class Vehicle:
         numbers = (*body.position, *body.quaternion, *body.velocity)
         return TRUTH.pack(self._steps * STEP_S, *numbers, *self.manners.mode, is_armed, self.manners.airborne)
 
+    def close(self) -> None:
+        """Closes its endpoints."""
+        for wire in self._wires:
+            wire.close()
+
     def _take(self, message: Any, wire: Any) -> None:
         kind = message.get_type()
         if kind == "SET_POSITION_TARGET_LOCAL_NED":
@@ -153,16 +158,19 @@ def parse(argv: Sequence[str] | None = None) -> argparse.Namespace:
 
 def run(args: argparse.Namespace) -> None:
     """Flies until its time or the simulation ends."""
-    vehicle = Vehicle(args)
     simulated = SimulatedClock(args.clock, "vehicle") if args.clock else None
     clock: Clock = simulated or WallClock()
+    vehicle = Vehicle(args)
     began, steps = clock.now(), 0
-    while steps * STEP_S < args.seconds:
-        vehicle.step()
-        steps += 1
-        if simulated is not None:
-            simulated.told = vehicle.truth()
-        clock.sleep_until(began + steps * STEP_S)
+    try:
+        while steps * STEP_S < args.seconds:
+            vehicle.step()
+            steps += 1
+            if simulated is not None:
+                simulated.told = vehicle.truth()
+            clock.sleep_until(began + steps * STEP_S)
+    finally:
+        vehicle.close()
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -315,11 +315,15 @@ def count_events(
             f"{columns.size} x {rows.size}; say how large the camera's is"
         )
     pair = np.searchsorted(edges - edges[0], window["t"].astype(np.int64) - start_us, side="right") - 1
-    column, row = columns[window["x"]], rows[window["y"]]
+    many: NDArray = np.ones(window.size, np.int64)
+    x, y, sign = window["x"], window["y"], window["p"]
+    if about.get("sensor_pixels", 1) > 1 and pixels.max() > 1:
+        pair, y, x, sign, many = _net_of_pixels(pair, window, (edges.size - 1, rows.size, columns.size))
+    column, row = columns[x], rows[y]
     seen = (column >= 0) & (row >= 0)
     shape = (edges.size - 1, 2, about["height"], about["width"])
-    cell = np.ravel_multi_index((pair[seen], (window["p"][seen] < 0).astype(np.int64), row[seen], column[seen]), shape)
-    number = np.bincount(cell, minlength=int(np.prod(shape))).reshape(shape)
+    cell = np.ravel_multi_index((pair[seen], (sign[seen] < 0).astype(np.int64), row[seen], column[seen]), shape)
+    number = np.bincount(cell, many[seen], minlength=int(np.prod(shape))).reshape(shape)
     told = contrast is None or about.get("known_contrast")
     per_event = [1.0 if told else contrast / own for own in (about["contrast_on"], about["contrast_off"])]
     change = number * np.asarray(per_event)[:, None, None] / np.maximum(pixels, 1)
@@ -333,6 +337,19 @@ def count_events(
     # Rounding must not take away what is exactly one event.
     counts = np.floor(np.maximum(change, 0.0) + 1e-6).astype(np.int32)
     return np.where(counts >= about["least_count"], counts, 0).astype(np.int32)
+
+
+def _net_of_pixels(
+    pair: NDArray, window: NDArray, shape: tuple[int, int, int]
+) -> tuple[NDArray, NDArray, NDArray, NDArray, NDArray]:
+    """Returns pair, row, column, sign and number of what is left of each camera pixel's events in a pair of frames.
+
+    Its ON and OFF events cancel, as they do between the two frames that the policy was trained with.
+    """
+    place = np.ravel_multi_index((pair, window["y"], window["x"]), shape)
+    net = np.bincount(place, window["p"].astype(np.float64), minlength=int(np.prod(shape)))
+    left = np.flatnonzero(net)
+    return *np.unravel_index(left, shape), np.sign(net[left]), np.abs(net[left])
 
 
 def _own_grid(about: Mapping[str, Any]) -> tuple[NDArray, NDArray, NDArray]:
