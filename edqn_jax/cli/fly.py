@@ -70,6 +70,9 @@ class FlyArgs:
     """Where the vehicle's local frame begins, in the policy's world."""
     goal_radius: Annotated[float, arg(metavar="M")] = 1.0
     """How near is there, metres."""
+    pace: Annotated[float, arg(metavar="X")] = 1.0
+    """Share of the policy's speed, from 0.2 to 1, with all its times as much longer, for a vehicle that is slower to
+    follow: it needs the square of this share of the acceleration."""
     after_hover: Literal["hold", "land"] = "hold"
     """What follows a hover of 3 s after a fault, and a flight that takes too long."""
     at_goal: Ending = "hold"
@@ -102,6 +105,8 @@ def parse_fly(argv: Sequence[str]) -> FlyArgs:
         raise ConfigError("--missions must be at least 1, --seed at least 0 and --speed more than 0")
     if args.camera is not None and min(args.camera) < 1:
         raise ConfigError(f"--camera must be two whole numbers of at least 1, not {args.camera[0]} {args.camera[1]}")
+    if not 0.2 <= args.pace <= 1.0:
+        raise ConfigError(f"--pace must be from 0.2 to 1, not {args.pace:g}")
     actions_of(args.on)
     if args.simulate is not None:
         if args.policy.suffix != ".onnx":
@@ -171,7 +176,7 @@ def fly(args: FlyArgs, stops: Stops) -> None:
         size = source.events.size
         assert size is not None
         runner = load_runner(args, size)
-        settings = settings_of(args, size, runner.period_s)
+        settings = settings_of(args, size, runner.period_s / args.pace)
         link = Link(args.mavlink, args.origin)
         stack.callback(link.close)
         log = None
@@ -182,7 +187,7 @@ def fly(args: FlyArgs, stops: Stops) -> None:
         stack.enter_context(stops.obey_signals(lambda _: None))
         volume = np.reshape(args.volume, (2, 3))
         stop = stops.is_requested
-        pilot = Pilot(runner, link, source, clock, settings, volume, log=log, stop=stop, dry=args.dry)
+        pilot = Pilot(runner, link, source, clock, settings, volume, log=log, stop=stop, dry=args.dry, pace=args.pace)
         try:
             report = pilot.fly()
         except ConnectionError as error:
@@ -296,7 +301,7 @@ def simulate(args: FlyArgs) -> None:
     with tempfile.TemporaryDirectory() as folder:
         file = export_policy(policy, Path(folder) / "policy.onnx").file
         size = (346, 260) if args.camera is None else args.camera
-        setup = Setup(file, size, speed=args.speed, picture=args.picture, out=args.out)
+        setup = Setup(file, size, speed=args.speed, picture=args.picture, out=args.out, pace=args.pace)
         ended = []
         for mission in fly_missions(environment, setup):
             ended.append(mission)

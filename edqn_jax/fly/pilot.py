@@ -8,7 +8,7 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from edqn_jax.fly.clocks import Clock
 from edqn_jax.fly.faults import Command, Inputs, Settings
@@ -57,6 +57,13 @@ class Report:
     """Between two setpoints of the flight."""
 
 
+def at_pace(events: NDArray, until_us: int, pace: float) -> NDArray:
+    """Returns events [N] before `until_us` as a drone at the policy's own speed would have seen them: nearer to it."""
+    paced = events.copy()
+    paced["t"] = until_us - np.ceil((until_us - events["t"]) * pace).astype(np.int64)
+    return paced
+
+
 class Pilot:
     """One flight."""
 
@@ -72,6 +79,7 @@ class Pilot:
         log: FlightLog | None = None,
         stop: Callable[[], bool] = lambda: False,
         dry: bool = False,
+        pace: float = 1.0,
         tell: Callable[[str], None] = print,
     ) -> None:
         """Prepares a flight.
@@ -86,10 +94,13 @@ class Pilot:
             log: where everything is written.
             stop: says whether the process was asked to stop.
             dry: decides and sends zero velocity, and asks for no mode: a bench test.
+            pace: share of the policy's speed that is flown, with all its times as much longer: it cannot tell, and the
+                vehicle needs only `pace`² of the acceleration. `settings.period_s` is the policy's over `pace`.
             tell: takes each sentence for people.
         """
         self.runner, self.link, self.source, self.clock, self.settings = runner, link, source, clock, settings
         self._volume, self._log, self._stop, self._dry, self._tell = np.asarray(volume), log, stop, dry, tell
+        self._pace = pace
         self.state = State()
         self.latency = Latency()
         self._command: Command | None = None
@@ -101,7 +112,7 @@ class Pilot:
     def fly(self) -> Report:
         """Flies until it has ended."""
         if self._log is not None:
-            self._log.write("settings", settings=self.settings, about=self.runner.about, volume=self._volume)
+            self._log.write("settings", settings=self.settings, pace=self._pace, about=self.runner.about)
         began, ticks = self.clock.now(), 0
         try:
             while self.state.phase is not Phase.ENDED:
@@ -133,7 +144,7 @@ class Pilot:
         decides = output.decides and now >= self._due - 1e-6
         decide_s = 0.0
         if decides:
-            self._due = max(self._due + self.runner.period_s, now)
+            self._due = max(self._due + self.settings.period_s, now)
             began = time.perf_counter()
             self._command = self._decide(now)
             decide_s = time.perf_counter() - began
@@ -178,26 +189,27 @@ class Pilot:
         if own is None or events.offset.value is None:
             return self._command
         until = events.until_us
-        seen_at = 1e-6 * until + events.offset.value
+        seen_at, times = 1e-6 * until + events.offset.value, self.runner.about["frame_times_us"]
+        window = events.window(until - round(self.runner.window_us / self._pace), until)
         asked: dict[str, Any] = {
             "until_us": until,
             "position": own.odometry.position,
             "quaternion": own.quaternion,
-            "velocity": own.odometry.velocity,
-            "yaw_rate": own.yaw_rate,
+            "velocity": own.odometry.velocity / self._pace,
+            "yaw_rate": own.yaw_rate / self._pace,
             "goal": self.settings.goal,
             "volume": self._volume,
-            "attitudes": [self.link.attitude_at(seen_at + 1e-6 * t) for t in self.runner.about["frame_times_us"]],
+            "attitudes": [self.link.attitude_at(seen_at + 1e-6 * t / self._pace) for t in times],
         }
         try:
-            wanted = self.runner.decide(events.window(until - self.runner.window_us, until), **asked)
+            wanted = self.runner.decide(at_pace(window, until, self._pace), **asked)
         except ValueError as error:
             self._tell(f"{now:.2f} s: the policy cannot decide: {error}")
             return self._command
         if self._log is not None:
             self._log.write("decision", at=now, fresh=self._fresh, asked=asked, move=wanted.move, values=wanted.values)
         self._fresh = False
-        return Command(now, wanted.velocity, wanted.yaw)
+        return Command(now, self._pace * wanted.velocity, wanted.yaw)
 
     def _send(self, output: Output, now: float) -> None:
         velocity = (0.0, 0.0, 0.0) if self._dry and output.velocity is not None else output.velocity

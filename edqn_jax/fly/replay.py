@@ -9,6 +9,7 @@ import numpy as np
 
 from edqn_jax.errors import ConfigError
 from edqn_jax.fly.machine import State, step
+from edqn_jax.fly.pilot import at_pace
 from edqn_jax.fly.records import EVENTS, inputs_of, read_records, settings_of
 from edqn_jax.fly.streams import EVENT, read_stream
 from edqn_jax.interop.deployment.runner import Runner
@@ -49,11 +50,11 @@ def replay(folder: Path, runner: Runner | None = None) -> Replayed:
         velocity = None if output.velocity is None else list(output.velocity)
         other += state.phase != tick["phase"] or velocity != tick["output"]["velocity"]
     decisions = [each for each in records if each["kind"] == "decision"] if runner is not None else []
-    moves = 0 if runner is None else _other_moves(folder, decisions, runner)
+    moves = 0 if runner is None else _other_moves(folder, decisions, runner, begun["pace"])
     return Replayed(len(ticks), other, len(decisions), moves, state.outcome)
 
 
-def _other_moves(folder: Path, decisions: list[dict], runner: Runner) -> int:
+def _other_moves(folder: Path, decisions: list[dict], runner: Runner, pace: float) -> int:
     packets = read_stream(folder / EVENTS)
     ends = np.array([until for until, _ in packets], np.int64)
     other = 0
@@ -62,8 +63,9 @@ def _other_moves(folder: Path, decisions: list[dict], runner: Runner) -> int:
             runner.reset()
         asked = decision["asked"]
         until = asked["until_us"]
-        first, last = np.searchsorted(ends, [until - runner.window_us, until + 1])
+        since = until - round(runner.window_us / pace)
+        first, last = np.searchsorted(ends, [since, until + 1])
         held = np.concatenate([np.empty(0, EVENT), *(events for _, events in packets[first:last])])
-        window = held[(held["t"] >= until - runner.window_us) & (held["t"] < until)]
-        other += runner.decide(window, **asked).move != decision["move"]
+        window = held[(held["t"] >= since) & (held["t"] < until)]
+        other += runner.decide(at_pace(window, until, pace), **asked).move != decision["move"]
     return other

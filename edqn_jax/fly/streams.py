@@ -39,7 +39,7 @@ CHUNK = 1 << 20
 class Events:
     """The newest events of a camera."""
 
-    def __init__(self, size: tuple[int, int] | None = None, keep_us: int = 500_000) -> None:
+    def __init__(self, size: tuple[int, int] | None = None, keep_us: int = 1_000_000) -> None:
         self.size = size
         """Width and height that the camera says it has; None before it has said so."""
         self.until_us = -1

@@ -354,6 +354,7 @@ def test_help_fits_a_screen_and_has_the_defaults_of_the_world(flag):
         (["verify", "--help"], "Verify a finished run"),
         (["export", "--help"], "Write a policy as ONNX"),
         (["events", "--help"], "Say what a file of events holds"),
+        (["fly", "--help"], "Fly an exported policy over MAVLink"),
         (["completion", "--help"], "Print a script"),
     ],
 )

@@ -14,7 +14,7 @@ from edqn_jax.errors import ConfigError
 from edqn_jax.fly.faults import Fault, Inputs, Odometry, Settings
 from edqn_jax.fly.link import Own
 from edqn_jax.fly.machine import Output, Phase
-from edqn_jax.fly.pilot import Pilot
+from edqn_jax.fly.pilot import Pilot, at_pace
 from edqn_jax.fly.records import RECORDS, FlightLog, inputs_of, read_records, settings_of
 from edqn_jax.fly.replay import replay
 from edqn_jax.fly.streams import EVENT, Events
@@ -203,6 +203,27 @@ def test_a_log_is_not_written_over_and_no_log_is_one_sentence(tmp_path: Path) ->
     (tmp_path / RECORDS).write_text("{}\nnot json\n{}\n")
     with pytest.raises(ConfigError, match="is damaged"):
         read_records(tmp_path)
+
+
+def test_at_half_the_pace_a_policy_sees_and_is_told_what_it_would_at_its_own() -> None:
+    told: list[dict[str, Any]] = []
+
+    class Asked(Policy):
+        def decide(self, packet: np.ndarray, until_us: int, **own: Any) -> Command:
+            told.append(own | {"since": until_us - int(packet["t"].min())})
+            return super().decide(packet, until_us, **own)
+
+    pilot, wire = make(Asked(), pace=0.5, settings=dataclasses.replace(SETTINGS, period_s=2 * PERIOD_S))
+    report = pilot.fly()
+    assert report.outcome == "goal"
+    sent = [each for each in wire.sent if each[1] is not None and any(each[1])]
+    assert {velocity for _, velocity, _ in sent} == {(1.5, 0.0, 0.0)}
+    assert told[-1]["velocity"][0] == pytest.approx(3.0, abs=0.01) and told[-1]["since"] <= Policy.window_us
+    assert told[-1]["since"] > 0.8 * Policy.window_us
+    assert report.decisions == pytest.approx(report.seconds / (2 * PERIOD_S), abs=1.5)
+    events = np.zeros(3, EVENT)
+    events["t"] = [1000, 1500, 1999]
+    assert at_pace(events, 2000, 0.5)["t"].tolist() == [1500, 1750, 1999]
 
 
 def test_the_phases_are_told() -> None:

@@ -59,6 +59,8 @@ class Setup:
     """Of MuJoCo's picture."""
     out: Path | None = None
     """Folder of the flights' logs; None keeps none."""
+    pace: float = 1.0
+    """As in `Pilot`."""
     autopilot: tuple[str, ...] = ()
     """More options of `edqn fly`."""
     vehicle: tuple[str, ...] = ()
@@ -156,7 +158,7 @@ def fly_mission(environment: Environment, number: int, setup: Setup, show: Calla
         autopilot = stack.enter_context(_process(words, show, quiet=True))
         keeper.admit({"vehicle", "autopilot"}, lambda: vehicle.poll() is None and autopilot.poll() is None)
         began = time.monotonic()
-        longest = config.env.max_decisions * config.drone.physics_steps * config.drone.physics_dt_s + EXTRA_S
+        longest = EXTRA_S + _mission_s(config, setup.pace)
         _conduct(keeper, camera, server, flight, setup.frame_s, longest)
         speed = keeper.now / (time.monotonic() - began)
         keeper.close()
@@ -184,6 +186,11 @@ def _conduct(
         else:
             keeper.wake_first(streamed)
     flight.judge_now()
+
+
+def _mission_s(config: Config, pace: float) -> float:
+    """Returns the longest flight of a mission, seconds."""
+    return config.env.max_decisions * config.drone.physics_steps * config.drone.physics_dt_s / pace
 
 
 def _judged(number: int, flight: Flight, out: Path, events_hz: float, speed: float) -> Mission:
@@ -227,6 +234,7 @@ def _autopilot_words(
         *("--camera", *map(str, setup.size), "--fov", repr(config.camera.horizontal_fov_deg)),
         *("--contrast", repr(CONTRAST), "--goal", *numbers(scene.goal), "--volume", *numbers(scene.volume)),
         *("--origin", *numbers(scene.start), "--goal-radius", repr(config.env.goal_radius_m - MARGIN_M)),
+        *("--pace", repr(setup.pace), "--max-s", repr(_mission_s(config, setup.pace))),
         *("--out", str(out), "--clock", clock, *setup.autopilot),
     ]
 
