@@ -67,10 +67,13 @@ class Events:
 
     def window(self, since_us: int, until_us: int) -> NDArray:
         """Returns the events in [since, until), microseconds of the camera's clock: `EVENT`."""
-        held = [
-            each[(each["t"] >= since_us) & (each["t"] < until_us)] for _, end, each in self._packets if end >= since_us
-        ]
-        return np.concatenate([np.empty(0, EVENT), *held])
+        held, begin = [np.empty(0, EVENT)], -1
+        for _, end, events in self._packets:
+            if end > since_us and begin < until_us:
+                whole = begin >= since_us and end <= until_us
+                held.append(events if whole else events[(events["t"] >= since_us) & (events["t"] < until_us)])
+            begin = end
+        return np.concatenate(held)
 
     def since(self, until_us: int) -> list[tuple[int, NDArray]]:
         """Returns `until` and events of the packets after that which ended at `until_us`."""
