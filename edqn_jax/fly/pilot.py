@@ -124,12 +124,16 @@ class Pilot:
         except BaseException:
             if self.state.phase in (Phase.FLYING, Phase.HOVERING) and not self._dry:
                 self.link.request("hold")
+            self._report("cut off")
             raise
+        return self._report(self.state.outcome)
+
+    def _report(self, outcome: str) -> Report:
+        """Returns how the flight went, and logs it."""
         seconds = 0.0 if self._flying_at is None else self.clock.now() - self._flying_at
-        report = Report(self.state.outcome, seconds, len(self.latency.decide), self.latency, self._gap_s)
         if self._log is not None:
-            self._log.write("end", outcome=report.outcome, seconds=seconds, latency=self.latency.percentiles())
-        return report
+            self._log.write("end", outcome=outcome, seconds=seconds, latency=self.latency.percentiles())
+        return Report(outcome, seconds, len(self.latency.decide), self.latency, self._gap_s)
 
     def tick(self) -> None:
         """Reads, decides where it is time to, and sends."""
@@ -211,7 +215,7 @@ class Pilot:
         if self._log is not None:
             self._log.write("decision", at=now, fresh=self._fresh, asked=asked, move=wanted.move, values=wanted.values)
         self._fresh = False
-        return Command(now, self._pace * wanted.velocity, wanted.yaw)
+        return Command(now, self._pace * np.asarray(wanted.velocity, np.float64), wanted.yaw)
 
     def _send(self, output: Output, now: float) -> None:
         velocity = (0.0, 0.0, 0.0) if self._dry and output.velocity is not None else output.velocity

@@ -79,7 +79,7 @@ def inputs_of(record: dict[str, Any]) -> Inputs:
         fields["odometry"] = Odometry(own["at"], np.array(own["position"]), np.array(own["velocity"]), own["resets"])
     if fields["command"] is not None:
         wanted = fields["command"]
-        fields["command"] = Command(wanted["at"], np.array(wanted["velocity"], np.float32), wanted["yaw"])
+        fields["command"] = Command(wanted["at"], np.array(wanted["velocity"]), wanted["yaw"])
     fields["camera"] = None if fields["camera"] is None else tuple(fields["camera"])
     return Inputs(**fields)
 

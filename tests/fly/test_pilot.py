@@ -111,7 +111,8 @@ class Camera:
 def make(policy: Any = None, wire: Any = None, camera: Any = None, **more: Any) -> tuple[Pilot, Any]:
     wire = wire or Wire()
     settings = more.pop("settings", SETTINGS)
-    pilot = Pilot(policy or Policy(), wire, camera or Camera(), Time(), settings, FENCE, tell=lambda _: None, **more)
+    flier: Any = policy or Policy()
+    pilot = Pilot(flier, wire, camera or Camera(), Time(), settings, FENCE, tell=lambda _: None, **more)
     return pilot, wire
 
 
@@ -171,11 +172,13 @@ def test_a_policy_that_cannot_decide_does_not_move() -> None:
     assert not any(velocity is not None and any(velocity) for _, velocity, _ in wire.sent)
 
 
-def test_a_fault_of_ours_asks_for_hold_and_is_not_hidden() -> None:
-    pilot, wire = make(Policy(ZeroDivisionError("ours")))
+def test_a_fault_of_ours_asks_for_hold_and_is_not_hidden(tmp_path: Path) -> None:
+    log = FlightLog(tmp_path)
+    pilot, wire = make(Policy(ZeroDivisionError("ours")), log=log)
     with pytest.raises(ZeroDivisionError):
         pilot.fly()
-    assert wire.asked == ["offboard", "hold"]
+    log.close()
+    assert wire.asked == ["offboard", "hold"] and read_records(tmp_path)[-1]["outcome"] == "cut off"
 
 
 def test_a_process_that_is_stopped_asks_for_hold() -> None:

@@ -196,9 +196,11 @@ def _mission_s(config: Config, pace: float) -> float:
 def _judged(number: int, flight: Flight, out: Path, events_hz: float, speed: float) -> Mission:
     records = read_records(out) if (out / RECORDS).is_file() else []
     end: dict[str, Any] = next((each for each in reversed(records) if each["kind"] == "end"), {})
-    outcome = end.get("outcome", "time out")
+    outcome = end.get("outcome", "the autopilot was lost")
     if flight.hit:
         outcome = "collision"
+    elif outcome == "cut off":
+        outcome = "time out"
     elif outcome == "goal" and not flight.reached:
         outcome = "beside the goal"
     return Mission(

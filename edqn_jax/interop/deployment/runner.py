@@ -356,7 +356,8 @@ def _net_of_pixels(
     """
     net = np.bincount((pair * shape[1] + y) * shape[2] + x, sign, minlength=int(np.prod(shape)))
     left = np.flatnonzero(net)
-    return *np.unravel_index(left, shape), np.sign(net[left]), np.abs(net[left])
+    pair, y, x = np.unravel_index(left, shape)
+    return pair, y, x, np.sign(net[left]), np.abs(net[left])
 
 
 def _own_grid(about: Mapping[str, Any]) -> tuple[NDArray, NDArray, NDArray]:
