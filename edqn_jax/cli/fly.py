@@ -164,7 +164,7 @@ def fly(args: FlyArgs, stops: Stops) -> None:
 
     from edqn_jax.fly.clocks import WallClock
     from edqn_jax.fly.link import Link
-    from edqn_jax.fly.pilot import Pilot
+    from edqn_jax.fly.pilot import Pilot, Task
     from edqn_jax.fly.records import FlightLog
     from edqn_jax.fly.simulated.lockstep import SimulatedClock
     from edqn_jax.fly.streams import open_events
@@ -185,9 +185,8 @@ def fly(args: FlyArgs, stops: Stops) -> None:
             stack.callback(log.close)
         clock = SimulatedClock(args.clock, "autopilot") if args.clock else WallClock()
         stack.enter_context(stops.obey_signals(lambda _: None))
-        volume = np.reshape(args.volume, (2, 3))
-        stop = stops.is_requested
-        pilot = Pilot(runner, link, source, clock, settings, volume, log=log, stop=stop, dry=args.dry, pace=args.pace)
+        task = Task(settings, np.reshape(args.volume, (2, 3)), args.pace, args.dry)
+        pilot = Pilot(runner, link, source, clock, task, log=log, stop=stops.is_requested)
         try:
             report = pilot.fly()
         except ConnectionError:  # of the simulated clock, whose keeper says why it ended

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import collections
 import dataclasses
+import itertools
 import os
 from typing import Any
 
@@ -48,6 +49,9 @@ DO_SET_MODE, SET_MESSAGE_INTERVAL = 176, 511
 IN_AIR = {2, 3, 4}
 LOW_BATTERY = {2, 3, 4, 5, 6}
 HISTORY_S = 1.0
+
+MANY = 2000
+"""Messages that are taken at once."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -128,8 +132,8 @@ class Link:
         """What the vehicle told people, and what it refused; whoever reads it empties it."""
 
     def read(self, now: float) -> None:
-        """Takes all that has come."""
-        while (message := self._wire.recv_msg()) is not None:
+        """Takes what has come, of a flood not all at once."""
+        for message in itertools.takewhile(lambda each: each is not None, (self._wire.recv_msg() for _ in range(MANY))):
             kind = message.get_type()
             if kind == "BAD_DATA":
                 self._wrong = self._wrong or ("" if self._vehicle else "what comes there is not MAVLink")

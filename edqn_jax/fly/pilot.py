@@ -57,6 +57,21 @@ class Report:
     """Between two setpoints of the flight."""
 
 
+@dataclasses.dataclass(frozen=True)
+class Task:
+    """What is flown."""
+
+    settings: Settings
+    """Of the state machine; their `period_s` is the policy's over `pace`."""
+    volume: ArrayLike
+    """[2, 3] that the policy is told: lowest and highest corner, metres."""
+    pace: float = 1.0
+    """Share of the policy's speed that is flown, with all its times as much longer: it cannot tell, and the vehicle
+    needs only the square of it of the acceleration."""
+    dry: bool = False
+    """A bench test: decides and sends zero velocity, and asks for no mode."""
+
+
 def at_pace(events: NDArray, until_us: int, pace: float) -> NDArray:
     """Returns events [N] before `until_us` as a drone at the policy's own speed would have seen them: nearer to it."""
     if pace == 1.0:
@@ -75,13 +90,10 @@ class Pilot:
         link: Link,
         source: EventSource,
         clock: Clock,
-        settings: Settings,
-        volume: ArrayLike,
+        task: Task,
         *,
         log: FlightLog | None = None,
         stop: Callable[[], bool] = lambda: False,
-        dry: bool = False,
-        pace: float = 1.0,
         tell: Callable[[str], None] = print,
     ) -> None:
         """Prepares a flight.
@@ -91,18 +103,15 @@ class Pilot:
             link: to the vehicle.
             source: of events.
             clock: the host's.
-            settings: of the flight.
-            volume: [2, 3] that the policy is told: lowest and highest corner, metres.
+            task: what is flown.
             log: where everything is written.
             stop: says whether the process was asked to stop.
-            dry: decides and sends zero velocity, and asks for no mode: a bench test.
-            pace: share of the policy's speed that is flown, with all its times as much longer: it cannot tell, and the
-                vehicle needs only `pace`² of the acceleration. `settings.period_s` is the policy's over `pace`.
             tell: takes each sentence for people.
         """
-        self.runner, self.link, self.source, self.clock, self.settings = runner, link, source, clock, settings
-        self._volume, self._log, self._stop, self._dry, self._tell = np.asarray(volume), log, stop, dry, tell
-        self._pace = pace
+        self.runner, self.link, self.source, self.clock = runner, link, source, clock
+        self.settings, self._volume = task.settings, np.asarray(task.volume)
+        self._pace, self._dry = task.pace, task.dry
+        self._log, self._stop, self._tell = log, stop, tell
         self.state = State()
         self.latency = Latency()
         self._command: Command | None = None

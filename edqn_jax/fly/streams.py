@@ -199,13 +199,19 @@ class DvStream:
 
     def read(self, now: float, least_us: int = -1) -> None:
         """Takes what has come; its packets are never empty, so a still camera without noise seems to be gone."""
-        while (batch := self._reader.getNextEventBatch()) is not None:
+        while (batch := self._next()) is not None:
             found = batch.numpy()
             events = np.empty(len(found), EVENT)
             events["t"], events["x"], events["y"] = found["timestamp"], found["x"], found["y"]
             events["p"] = np.where(found["polarity"] > 0, 1, -1)
             if events.size:
                 self.events.add(events, int(events["t"].max()) + 1, now)
+
+    def _next(self) -> Any:
+        """Returns a batch of events; None if none has come, or the stream has ended."""
+        with contextlib.suppress(RuntimeError):
+            return self._reader.getNextEventBatch()
+        return None
 
     def close(self) -> None:
         """Lets the stream go."""

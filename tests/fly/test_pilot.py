@@ -14,7 +14,7 @@ from edqn_jax.errors import ConfigError
 from edqn_jax.fly.faults import Fault, Inputs, Odometry, Settings
 from edqn_jax.fly.link import Own
 from edqn_jax.fly.machine import Output, Phase
-from edqn_jax.fly.pilot import Pilot, at_pace
+from edqn_jax.fly.pilot import Pilot, Task, at_pace
 from edqn_jax.fly.records import RECORDS, FlightLog, inputs_of, read_records, settings_of
 from edqn_jax.fly.replay import replay
 from edqn_jax.fly.streams import EVENT, Events
@@ -110,9 +110,9 @@ class Camera:
 
 def make(policy: Any = None, wire: Any = None, camera: Any = None, **more: Any) -> tuple[Pilot, Any]:
     wire = wire or Wire()
-    settings = more.pop("settings", SETTINGS)
+    task = Task(more.pop("settings", SETTINGS), FENCE, more.pop("pace", 1.0), more.pop("dry", False))
     flier: Any = policy or Policy()
-    pilot = Pilot(flier, wire, camera or Camera(), Time(), settings, FENCE, tell=lambda _: None, **more)
+    pilot = Pilot(flier, wire, camera or Camera(), Time(), task, tell=lambda _: None, **more)
     return pilot, wire
 
 
