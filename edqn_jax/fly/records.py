@@ -42,7 +42,7 @@ class FlightLog:
         self._records.write("\n")
 
     def write_events(self, size: tuple[int, int], packets: list[tuple[int, NDArray]]) -> None:
-        """Writes packets of the camera."""
+        """Writes packets of the camera: `until` and events [N]."""
         if self._until_us is None:
             self._events.write(HEADER.pack(MAGIC, *size))
             self._until_us = -1

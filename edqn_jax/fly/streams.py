@@ -52,7 +52,7 @@ class Events:
         self._packets: collections.deque[tuple[float, int, NDArray]] = collections.deque()
 
     def add(self, events: NDArray, until_us: int, at: float) -> None:
-        """Takes a packet that came at a time of the host's clock."""
+        """Takes a packet of events [N] that came at a time of the host's clock."""
         if events.size and self.size is not None:
             needed = int(events["x"].max()) + 1, int(events["y"].max()) + 1
             if needed[0] > self.size[0] or needed[1] > self.size[1]:
@@ -66,7 +66,7 @@ class Events:
             self._packets.popleft()
 
     def window(self, since_us: int, until_us: int) -> NDArray:
-        """Returns the events in [since, until), microseconds of the camera's clock: `EVENT`."""
+        """Returns the events [N] of `EVENT` from `since` to before `until`, microseconds of the camera's clock."""
         held, begin = [np.empty(0, EVENT)], -1
         for _, end, events in self._packets:
             if end > since_us and begin < until_us:
@@ -76,7 +76,7 @@ class Events:
         return np.concatenate(held)
 
     def since(self, until_us: int) -> list[tuple[int, NDArray]]:
-        """Returns `until` and events of the packets after that which ended at `until_us`."""
+        """Returns `until` and events [N] of the packets after that which ended at `until_us`."""
         return [(end, events) for _, end, events in self._packets if end > until_us]
 
     def rate_hz(self, now: float) -> float:
@@ -106,7 +106,7 @@ class Decoder:
         self.size: tuple[int, int] | None = None
 
     def feed(self, data: bytes) -> Iterator[tuple[int, NDArray]]:
-        """Yields `until` and events of each packet that is whole now.
+        """Yields `until` and events [N] of each packet that is whole now.
 
         Raises:
             ConfigError: if the bytes are no stream of events.
@@ -132,7 +132,7 @@ class Decoder:
 
 
 def packet_bytes(until_us: int, events: NDArray) -> bytes:
-    """Returns a packet of the stream."""
+    """Returns a packet of the stream, of events [N]."""
     return PACKET.pack(until_us, events.size) + np.ascontiguousarray(events.astype(EVENT, copy=False)).tobytes()
 
 
@@ -266,7 +266,7 @@ def open_events(name: str, size: tuple[int, int] | None = None) -> EventSource:
 
 
 def read_stream(file: Path) -> list[tuple[int, NDArray]]:
-    """Returns `until` and events of each packet of a stream in a file; a packet that was cut off is left out."""
+    """Returns `until` and events [N] of each packet of a stream in a file; a packet that was cut off is left out."""
     decoder = Decoder()
     with contextlib.closing(file.open("rb")) as opened:
         return list(decoder.feed(opened.read()))

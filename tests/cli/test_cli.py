@@ -177,7 +177,7 @@ def test_every_kind_of_option_can_be_a_flag():
         (["train", "--resume", "must"], "--resume must needs --run-dir"),
         (["evaluate"], "POLICY"),
         (["evaluate", "nowhere"], "there is no run in 'nowhere'"),
-        (["fly"], "there is no command 'fly'; known are train, evaluate"),
+        (["quux"], "there is no command 'quux'; known are train, evaluate"),
         (["trian"], "did you mean 'train'?"),
         (["train", "--nun-envs", "64"], "there is no option '--nun-envs'; did you mean '--num-envs'?"),
         (["evaluate", "runs", "--misions=3"], "there is no option '--misions'; did you mean '--missions'?"),

@@ -38,7 +38,7 @@ class EventCamera:
         """Events so far."""
 
     def frame(self, time: float, position: NDArray[np.float64], quaternion: NDArray[np.float64]) -> tuple[int, NDArray]:
-        """Returns until when its events are known, microseconds of its own clock, and those since the frame before."""
+        """Returns until when its events are known, its own clock's microseconds, and those [N] since the frame before."""
         own_s = AHEAD_S + time * (1.0 + FAST)
         made = self._emulate(self._see(position, self._rotation(quaternion)), own_s)
         self.seen += len(made)
@@ -62,7 +62,7 @@ class EventServer:
         self._thread.start()
 
     def send(self, until_us: int, events: NDArray) -> None:
-        """Sends a packet."""
+        """Sends a packet of events [N]."""
         self._packets.put(packet_bytes(until_us, events))
 
     def close(self) -> None:

@@ -22,7 +22,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-import edqn_jax
 from edqn_jax.config import Config
 from edqn_jax.evaluation.judge import MujocoWorld, clearance, load_judge, replay_contact
 from edqn_jax.fly.records import RECORDS, read_records
@@ -32,7 +31,7 @@ from edqn_jax.fly.simulated.vehicle import TRUTH
 from edqn_jax.interop.outer import pictures
 from edqn_jax.interop.outer.event_cameras import CONTRAST
 from edqn_jax.interop.outer.poses import camera_rotation
-from edqn_jax.sim.environment import Environment
+from edqn_jax.sim.environment import Environment, make
 
 MARGIN_M = 0.25
 """The autopilot's goal is so much smaller than the mission's: it knows its place no better."""
@@ -273,9 +272,9 @@ def environment_of(world: str, config: Config, missions: int, seed: int) -> Envi
     """Returns the missions to fly: test worlds of a family, the first of which `edqn evaluate` flies, or one of a file.
 
     Raises:
-        ConfigError: as `edqn_jax.make`.
+        ConfigError: as `make`.
     """
-    return edqn_jax.make(world, config, worlds=missions, seed=seed, split="test")
+    return make(world, config, worlds=missions, seed=seed, split="test")
 
 
 def write_json(file: Path, missions: list[Mission]) -> None:
