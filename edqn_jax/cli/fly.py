@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import contextlib
+import json
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -14,6 +15,7 @@ from edqn_jax.cli.arguments import Point, check_is_saved, check_run, parse_argum
 from edqn_jax.cli.help import FLY
 from edqn_jax.cli.process.signals import Stops
 from edqn_jax.errors import CheckError, ConfigError, StoppedError, suggest_nearest
+from edqn_jax.files import check_can_write, write_atomically
 
 if TYPE_CHECKING:
     from edqn_jax.fly.faults import Settings
@@ -21,6 +23,9 @@ if TYPE_CHECKING:
     from edqn_jax.interop.deployment.runner import Runner
 
 Ending = Literal["hover", "hold", "land"]
+
+OF_THE_WORLD = ("events", "fov", "contrast", "goal", "volume", "fence", "dry", "clock")
+"""Options that a simulated flight has from its world."""
 
 
 @dataclass(frozen=True)
@@ -41,6 +46,8 @@ class FlyArgs:
     """With --simulate: most simulated seconds a second. Where the machine is slower, the clock waits for it."""
     picture: Literal["own", "mujoco"] = "own"
     """With --simulate: who draws what the camera sees."""
+    json: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
+    """With --simulate: file for how each mission ended."""
     replay: Annotated[Path | None, arg(metavar="FLIGHT", help_behavior_hint="")] = None
     """Play the log of a flight again, and compare what state machine and policy do with what they did."""
     mavlink: Annotated[str, arg(metavar="ADDRESS")] = "udpin:0.0.0.0:14540"
@@ -108,10 +115,15 @@ def parse_fly(argv: Sequence[str]) -> FlyArgs:
     if not 0.2 <= args.pace <= 1.0:
         raise ConfigError(f"--pace must be from 0.2 to 1, not {args.pace:g}")
     actions_of(args.on)
+    if args.json is not None:
+        check_can_write(args.json)
     if args.simulate is not None:
         if args.policy.suffix != ".onnx":
             check_is_saved(args.policy, f"{FLY} --simulate")
             check_run(args.policy)
+        for name in OF_THE_WORLD:
+            if getattr(args, name) not in (None, False):
+                raise ConfigError(f"--simulate gives --{name} itself; leave it out")
         return args
     if args.policy.suffix != ".onnx":
         raise ConfigError(f"'{args.policy}' must be an exported policy; 'edqn export {args.policy}' writes one")
@@ -288,6 +300,7 @@ def simulate(args: FlyArgs) -> None:
     """Flies missions here, over the wire."""
     import tempfile
 
+    from edqn_jax.evaluation.metrics import wilson_interval
     from edqn_jax.fly.simulated.missions import Setup, environment_of, fly_missions
     from edqn_jax.interop.deployment.onnx_export import export_policy
     from edqn_jax.runs.policies import load_policy
@@ -300,7 +313,9 @@ def simulate(args: FlyArgs) -> None:
     with tempfile.TemporaryDirectory() as folder:
         file = export_policy(policy, Path(folder) / "policy.onnx").file
         size = (346, 260) if args.camera is None else args.camera
-        setup = Setup(file, size, speed=args.speed, picture=args.picture, out=args.out, pace=args.pace)
+        answers = ["--after-hover", args.after_hover, "--at-goal", args.at_goal, "--least-rate", repr(args.least_rate)]
+        more = (*answers, *(("--on", *args.on) if args.on else ()))
+        setup = Setup(file, size, speed=args.speed, picture=args.picture, out=args.out, pace=args.pace, autopilot=more)
         ended = []
         for mission in fly_missions(environment, setup):
             ended.append(mission)
@@ -312,4 +327,7 @@ def simulate(args: FlyArgs) -> None:
                 flush=True,
             )
     reached = sum(each.outcome == "goal" for each in ended)
-    print(f"{reached} of {len(ended)} reached the goal")
+    low, high = wilson_interval(reached, len(ended))
+    print(f"{reached} of {len(ended)} reached the goal ({100 * low:.0f} to {100 * high:.0f} %, Wilson)")
+    if args.json is not None:
+        write_atomically(args.json, json.dumps([asdict(each) for each in ended], indent=2) + "\n")

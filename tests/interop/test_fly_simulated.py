@@ -176,6 +176,8 @@ ROOM = ["--goal", "9", "0", "5", "--volume", "0", "-5", "0", "20", "5", "9"]
         (["pretrained", "--simulate", "medium", "--speed", "0"], "--speed more than 0"),
         (["nowhere", "--simulate", "medium"], "there is no run in 'nowhere'"),
         (["a.onnx", "--simulate", "medium"], "needs the folder of a run"),
+        (["pretrained", "--simulate", "medium", "--goal", "1", "2", "3"], "--simulate gives --goal itself"),
+        (["a.onnx", "--pace", "3"], "--pace must be from 0.2 to 1"),
         (["a.onnx", "--simulate", "medium", "--replay", "b"], "give one of them"),
     ],
 )

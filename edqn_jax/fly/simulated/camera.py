@@ -38,7 +38,7 @@ class EventCamera:
         """Events so far."""
 
     def frame(self, time: float, position: NDArray[np.float64], quaternion: NDArray[np.float64]) -> tuple[int, NDArray]:
-        """Returns until when its events are known, its own clock's microseconds, and those [N] since the frame before."""
+        """Returns until when its events are known, its own clock's microseconds, and those [N] since the last frame."""
         own_s = AHEAD_S + time * (1.0 + FAST)
         made = self._emulate(self._see(position, self._rotation(quaternion)), own_s)
         self.seen += len(made)

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import json
 import os
 import socket
 import subprocess
@@ -275,8 +274,3 @@ def environment_of(world: str, config: Config, missions: int, seed: int) -> Envi
         ConfigError: as `make`.
     """
     return make(world, config, worlds=missions, seed=seed, split="test")
-
-
-def write_json(file: Path, missions: list[Mission]) -> None:
-    """Writes how missions ended."""
-    file.write_text(json.dumps([dataclasses.asdict(each) for each in missions], indent=1), encoding="utf-8")
