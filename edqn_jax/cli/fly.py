@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -208,10 +208,8 @@ def fly(args: FlyArgs, stops: Stops) -> None:
 
 def end(report: Report, stops: Stops) -> None:
     """Prints how a flight ended, and raises unless it was at its goal."""
-    parts = report.latency.percentiles()
-    if parts:
-        said = ", ".join(f"{name} {median:.1f} / {p99:.1f}" for name, (median, p99) in parts.items())
-        print(f"newest event to setpoint, ms, median / 99 %: {said}; longest gap {1e3 * report.longest_gap_s:.0f} ms")
+    if parts := report.latency.percentiles():
+        print(f"{latency_sentence(parts)}; longest gap {1e3 * report.longest_gap_s:.0f} ms")
     sentence = f"{report.outcome} after {report.seconds:.1f} s and {report.decisions} decisions"
     if report.outcome == "goal":
         print(f"reached the {sentence}")
@@ -221,6 +219,12 @@ def end(report: Report, stops: Stops) -> None:
     if report.outcome.startswith("refused: "):
         raise ConfigError(f"no flight: {report.outcome.removeprefix('refused: ')}")
     raise CheckError(f"the flight ended with {sentence}")
+
+
+def latency_sentence(parts: Mapping[str, Sequence[float]]) -> str:
+    """Returns medians and 99th percentiles of parts of the latency, as people read them."""
+    said = ", ".join(f"{name} {median:.1f} / {p99:.1f}" for name, (median, p99) in parts.items())
+    return f"newest event to setpoint, ms, median / 99 %: {said}"
 
 
 def load_runner(args: FlyArgs, size: tuple[int, int]) -> Runner:
@@ -319,11 +323,10 @@ def simulate(args: FlyArgs) -> None:
         ended = []
         for mission in fly_missions(environment, setup):
             ended.append(mission)
-            median, p99 = mission.latency.get("computing", (float("nan"),) * 2)
             print(
                 f"mission {mission.number}: {mission.outcome} after {mission.seconds:.1f} s, {mission.clearance_m:.2f} "
-                f"m clear at least; event to setpoint {median:.1f} ms, 99 % {p99:.1f} ms; {mission.events_hz:,.0f} "
-                f"events/s; {mission.speed:.2f} simulated seconds a second",
+                f"m clear at least; {mission.events_hz:,.0f} events/s; {mission.speed:.2f} simulated seconds a second; "
+                f"{latency_sentence(mission.latency)}",
                 flush=True,
             )
     reached = sum(each.outcome == "goal" for each in ended)

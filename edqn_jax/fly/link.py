@@ -49,6 +49,7 @@ DO_SET_MODE, SET_MESSAGE_INTERVAL = 176, 511
 IN_AIR = {2, 3, 4}
 LOW_BATTERY = {2, 3, 4, 5, 6}
 HISTORY_S = 1.0
+SETTLES_S = 0.3
 
 MANY = 2000
 """Messages that are taken at once."""
@@ -120,9 +121,9 @@ class Link:
         self._origin = np.asarray(origin, np.float64)
         self._vehicle: tuple[int, int] | None = None
         self._autopilot = PX4
-        self._wrong, self._landed_told, self._mode_asked = "", False, ""
+        self._wrong, self._landed_told, self._mode_asked, self._mode_at = "", False, "", -np.inf
+        self._asked_ns: collections.deque[int] = collections.deque(maxlen=20)
         self._heard = Inputs()
-        self._resets: dict[int, int] = {}
         self._attitudes: collections.deque[tuple[float, NDArray[np.float64]]] = collections.deque()
         self._yaw_rate = 0.0
         self._sent_at: dict[str, float] = {}
@@ -190,7 +191,8 @@ class Link:
         if self._vehicle is None:
             return
         if self._is_due("timesync", 0.1, now):
-            out.timesync_send(0, round(1e9 * now))
+            self._asked_ns.append(round(1e9 * now))
+            out.timesync_send(0, self._asked_ns[-1])
         if self._is_due("streams", 5.0, now):
             self._ask_streams()
         if velocity is not None:
@@ -261,7 +263,8 @@ class Link:
         known = {those: name for name, those in MODES[self._autopilot].items()}
         armed = bool(message.base_mode & 128)
         airborne = self._heard.airborne if self._landed_told else armed and message.system_status == 4
-        mode = known.get(numbers, "other")
+        # A heartbeat on its way while the vehicle answered a request tells of the mode before.
+        mode = self._heard.mode if now - self._mode_at < SETTLES_S else known.get(numbers, "other")
         self._heard = dataclasses.replace(self._heard, heartbeat_at=now, mode=mode, armed=armed, airborne=airborne)
 
     def _take_extended_sys_state(self, message: Any, now: float) -> None:
@@ -270,10 +273,10 @@ class Link:
             self._heard = dataclasses.replace(self._heard, airborne=message.landed_state in IN_AIR)
 
     def _take_command_ack(self, message: Any, now: float) -> None:
-        if message.command != DO_SET_MODE:
+        if message.command != DO_SET_MODE or not self._mode_asked:
             return
         if message.result == 0:
-            self._heard = dataclasses.replace(self._heard, mode=self._mode_asked or self._heard.mode)
+            self._heard, self._mode_at = dataclasses.replace(self._heard, mode=self._mode_asked), now
         else:
             self.said.append(f"the vehicle refused {self._mode_asked} (MAV_RESULT {message.result})")
 
@@ -281,7 +284,7 @@ class Link:
         self.said.append(str(message.text))
 
     def _take_timesync(self, message: Any, now: float) -> None:
-        if message.tc1:
+        if message.tc1 and message.ts1 in self._asked_ns:  # an answer, and to us
             self.offset.add_exchange(1e-9 * message.ts1, 1e-9 * message.tc1, now)
 
     def _take_sys_status(self, message: Any, now: float) -> None:

@@ -40,6 +40,8 @@ class FlightLog:
         """Writes a record."""
         json.dump({"kind": kind, **fields}, self._records, default=_plain)
         self._records.write("\n")
+        if kind != "tick":
+            self._records.flush()
 
     def write_events(self, size: tuple[int, int], packets: list[tuple[int, NDArray]]) -> None:
         """Writes packets of the camera: `until` and events [N]."""

@@ -146,6 +146,8 @@ def test_the_vehicles_clock_is_asked_for_and_odometry_has_its_time(link: Link, e
         (question,) = (each for each in end.received() if each.get_type() == "TIMESYNC")
         end.wire.mav.timesync_send(round(1e9 * (now - 90.0)), question.ts1)  # 90 s behind us
         link.read(now)
+    end.wire.mav.timesync_send(1_000_000_000, 77)  # an answer to someone else
+    link.read(100.4)
     assert link.offset.value == pytest.approx(90.0)
     end.wire.mav.local_position_ned_send(10_350, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     link.read(100.4)
@@ -162,8 +164,12 @@ def test_an_answer_to_a_request_changes_the_mode_at_once(link: Link, ends: Ends)
     link.read(1.1)
     assert link.inputs().mode == "hold" and link.said == ["the vehicle refused offboard (MAV_RESULT 1)"]
     end.wire.mav.command_ack_send(176, 0)
+    end.heartbeat()  # on its way before
     link.read(1.2)
     assert link.inputs().mode == "offboard"
+    end.heartbeat()
+    link.read(2.2)
+    assert link.inputs().mode == "hold"
 
 
 @pytest.mark.parametrize(
