@@ -12,8 +12,12 @@ import pytest
 pytest.importorskip("pymavlink")
 pytest.importorskip("rotorpy")
 
+from edqn_jax.fly.faults import Settings  # noqa: E402
 from edqn_jax.fly.link import Link  # noqa: E402
+from edqn_jax.fly.pilot import Pilot, Task  # noqa: E402
 from edqn_jax.fly.simulated import vehicle as simulated  # noqa: E402
+from edqn_jax.fly.streams import EVENT, Events  # noqa: E402
+from edqn_jax.interop.deployment.runner import Command  # noqa: E402
 from edqn_jax.interop.outer.rotorpy_body import STEP_S  # noqa: E402
 
 pytestmark = pytest.mark.filterwarnings("ignore")  # pymavlink, rotorpy and what they import
@@ -135,6 +139,100 @@ def test_a_ground_station_on_another_endpoint_is_forwarded(make: Callable[..., T
     both.run(1.2)
     station.close()
     assert both.link.inputs().other_master and both.link.inputs().mode == "other"
+
+
+class Steps:
+    """A clock that lets the vehicle fly while the pilot sleeps, and what happens to it at a time."""
+
+    def __init__(self, both: Together, at: float, happens: Callable[[Together], None]) -> None:
+        self.both, self._at, self._happens = both, both.now + at, happens
+
+    def now(self) -> float:
+        return self.both.now
+
+    def sleep_until(self, moment: float) -> None:
+        while self.both.now < moment - STEP_S / 2:
+            self.both.vehicle.step()
+            self.both.now += STEP_S
+        if self.both.now >= self._at:
+            self._happens(self.both)
+
+    def work(self) -> None: ...
+
+
+class Sees:
+    """A camera that always sees enough."""
+
+    def __init__(self) -> None:
+        self.events = Events((346, 260))
+
+    def read(self, now: float, least_us: int = -1) -> None:
+        events = np.zeros(5000, EVENT)
+        events["t"], events["p"] = round(1e6 * now) - 1, 1
+        self.events.add(events, round(1e6 * now), now)
+
+    def close(self) -> None: ...
+
+
+class Ahead:
+    """A policy that flies along x."""
+
+    period_s, window_us, about = 0.26, 160_000, {"frame_times_us": [-160_000, 0]}
+
+    def reset(self) -> None: ...
+
+    def decide(self, packet: np.ndarray, until_us: int, **own: Any) -> Command:
+        return Command(22, np.array([3.0, 0.0, 0.0], np.float32), 0.0, np.zeros(27, np.float32))
+
+
+def fly_until(both: Together, happens: Callable[[Together], None], at: float = 3.5) -> str:
+    fence = np.array([[-10.0, -10.0, 0.0], [200.0, 20.0, 20.0]])
+    settings = Settings(goal=np.array([100.0, 4.0, 5.0]), fence=fence, camera=(346, 260), period_s=0.26)
+    policy: Any = Ahead()
+    task = Task(settings, fence)
+    return Pilot(policy, both.link, Sees(), Steps(both, at, happens), task, tell=lambda _: None).fly().outcome
+
+
+def drain(both: Together) -> None:
+    both.vehicle._battery = 0.15
+
+
+def take_over(both: Together) -> None:
+    both.vehicle.manners.mode = (3, 0)
+
+
+def fall_silent(both: Together) -> None:
+    both.vehicle._tell_state = lambda body: None  # pyright: ignore[reportAttributeAccessIssue]
+
+
+def jump(both: Together) -> None:
+    both.vehicle._drift = np.array([0.0, 3.0, 0.0])
+
+
+def drift(both: Together) -> None:
+    both.vehicle._drift += [0.0, 0.025, 0.0]
+
+
+@pytest.mark.parametrize(
+    ("happens", "outcome", "mode"),
+    [
+        (drain, "low battery", (4, 6)),
+        (take_over, "taken over", (3, 0)),
+        (fall_silent, "stale odometry", (4, 3)),
+        (jump, "odometry jump", (4, 3)),
+        (drift, "odometry drift", (4, 3)),
+    ],
+)
+def test_faults_over_the_wire_end_as_configured(
+    make: Callable[..., Together], happens: Callable[[Together], None], outcome: str, mode: tuple[int, int]
+) -> None:
+    both = make("--ground", "4.8")
+    assert fly_until(both, happens) == outcome
+    assert both.vehicle.manners.mode == mode
+    place, velocity = both.truth()
+    assert place[0] > START[0] + 2.0, "it flew"
+    if mode != (4, 6):
+        assert np.linalg.norm(velocity) < 0.5 or outcome == "taken over"
 
 
 def test_bad_input_is_one_sentence(capsys: pytest.CaptureFixture[str]) -> None:
