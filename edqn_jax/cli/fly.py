@@ -302,7 +302,11 @@ def replay(args: FlyArgs, folder: Path) -> None:
 
 def simulate(args: FlyArgs) -> None:
     """Flies missions here, over the wire."""
+    import os
     import tempfile
+
+    if args.picture == "mujoco":
+        os.environ.setdefault("MUJOCO_GL", "egl")  # read as MuJoCo is imported
 
     from edqn_jax.evaluation.metrics import wilson_interval
     from edqn_jax.fly.simulated.missions import Setup, environment_of, fly_missions

@@ -52,9 +52,7 @@ class Setup:
     speed: float = np.inf
     """Most simulated seconds a second."""
     picture: str = "own"
-    """Who draws: `own` or `mujoco`."""
-    look: str = "plain"
-    """Of MuJoCo's picture."""
+    """Who draws: `own`, or `mujoco` with the patterns and the light of our own."""
     out: Path | None = None
     """Folder of the flights' logs; None keeps none."""
     pace: float = 1.0
@@ -211,7 +209,7 @@ def _see(environment: Environment, number: int, setup: Setup, stack: contextlib.
     lens = dataclasses.replace(config.camera, width=setup.size[0], height=setup.size[1])
     if setup.picture == "own":
         return pictures.own_pictures(dataclasses.replace(config, camera=lens), environment, number)
-    drawn = pictures.mujoco_pictures(pictures.spec_of(environment, number, setup.look, number), lens)
+    drawn = pictures.mujoco_pictures(pictures.spec_of(environment, number, "own", number), lens)
     stack.callback(drawn.close)
     return drawn.see
 
