@@ -292,8 +292,9 @@ def count_events(
     mean change. So a pixel's ON and OFF events within one pair of frames cancel, as they do for two frames; only a
     policy that was trained with sensor noise counts them apart. At the policy's own resolution and contrast every count
     is that of the events themselves. A policy that knows the contrast counts in the camera's own; of one that was
-    trained with the mean of many pixels, a count is that of so many pixels together, and a camera pixel's ON and OFF
-    events within one pair of frames cancel.
+    trained with the mean of many pixels, a count is that of so many pixels together, and of a finer camera the ON and OFF
+    events of all of them cancel: a picture that is finer than the policy's pixels makes both at once, of which it has
+    learnt the mean alone.
 
     Args:
         about: of the policy, see `Runner.about`.
@@ -322,42 +323,26 @@ def count_events(
     pair = np.zeros(since.size, np.int64)
     for edge in edges[1:-1] - edges[0]:
         pair += since >= edge
-    many: NDArray = np.ones(x.size)
-    if about.get("sensor_pixels", 1) > 1 and pixels.max() > 1:
-        pair, y, x, sign, many = _net_of_pixels(pair, y, x, sign, (edges.size - 1, rows.size, columns.size))
     column, row = columns[x], rows[y]
     shape = (edges.size - 1, 2, about["height"], about["width"])
     cell = ((2 * pair + (sign < 0)) * shape[2] + row) * shape[3] + column
     seen = (column >= 0) & (row >= 0)
     if not seen.all():
-        cell, many = cell[seen], many[seen]
-    number = np.bincount(cell, many, minlength=int(np.prod(shape))).reshape(shape)
+        cell = cell[seen]
+    number = np.bincount(cell, minlength=int(np.prod(shape))).reshape(shape)
     told = contrast is None or about.get("known_contrast")
     per_event = [1.0 if told else contrast / own for own in (about["contrast_on"], about["contrast_off"])]
     change = number * np.asarray(per_event)[:, None, None] / np.maximum(pixels, 1)
-    if about["counts_net"]:
+    together = about.get("sensor_pixels", 1)
+    if about["counts_net"] or (together > 1 and pixels.max() > 1):
         # In contrasts of the policy, which may differ between ON and OFF.
         log_change = change[:, 0] * about["contrast_on"] - change[:, 1] * about["contrast_off"]
         change = np.stack([log_change / about["contrast_on"], -log_change / about["contrast_off"]], axis=1)
-    together = about.get("sensor_pixels", 1)
     if together > 1:
         return np.rint(np.maximum(change, 0.0) * together).astype(np.int32)
     # Rounding must not take away what is exactly one event.
     counts = np.floor(np.maximum(change, 0.0) + 1e-6).astype(np.int32)
     return np.where(counts >= about["least_count"], counts, 0).astype(np.int32)
-
-
-def _net_of_pixels(
-    pair: NDArray, y: NDArray, x: NDArray, sign: NDArray, shape: tuple[int, int, int]
-) -> tuple[NDArray, NDArray, NDArray, NDArray, NDArray]:
-    """Returns pair, row, column, sign and number of what is left of each camera pixel's events in a pair of frames.
-
-    Its ON and OFF events cancel, as they do between the two frames that the policy was trained with.
-    """
-    net = np.bincount((pair * shape[1] + y) * shape[2] + x, sign, minlength=int(np.prod(shape)))
-    left = np.flatnonzero(net)
-    pair, y, x = np.unravel_index(left, shape)
-    return pair, y, x, np.sign(net[left]), np.abs(net[left])
 
 
 def _own_grid(about: Mapping[str, Any]) -> tuple[NDArray, NDArray, NDArray]:
