@@ -33,14 +33,15 @@ from edqn_jax.evaluation.judge import clearance, load_judge, replay_contact
 from edqn_jax.evaluation.metrics import wilson_interval
 from edqn_jax.interop.deployment.onnx_export import export_policy
 from edqn_jax.interop.deployment.runner import Runner
+from edqn_jax.interop.outer import event_cameras, pictures
+from edqn_jax.interop.outer.poses import Track
 from edqn_jax.runs.policies import load_policy
 from edqn_jax.runs.provenance import describe_workload
 from edqn_jax.sim.environment import Environment
 from edqn_jax.sim.task.observation import MAX_YAW_RATE, knows_contrast
 from measurement import json_report
 from measurement.command import Parser, at_least_one, in_a_sentence
-from outer import event_cameras, flights, pictures
-from outer.poses import Track
+from outer import flights
 
 
 @dataclasses.dataclass(frozen=True)

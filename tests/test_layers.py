@@ -30,7 +30,7 @@ ORDER = (
     ),
     *("sim.actions", "sim.scene", "sim.worlds", "sim.physics", "sim.camera", "sim.sensors", "sim.task", "sim"),
     *("planning", "learn.perception", "learn", "policies", "evaluation", "training"),
-    *("runs.checkpoints", "runs", "runs.verification", "report", "interop", "cli.process", "cli"),
+    *("runs.checkpoints", "runs", "runs.verification", "report", "interop", "fly", "cli.process", "cli"),
 )
 """Places of the package: a module imports from its own place and from those before it."""
 

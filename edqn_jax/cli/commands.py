@@ -14,6 +14,7 @@ from edqn_jax.cli.completion import CompletionArgs, completion_script, parse_com
 from edqn_jax.cli.evaluate import EvaluateArgs, evaluate_command, parse_evaluate
 from edqn_jax.cli.events import EventsArgs, events_command, parse_events
 from edqn_jax.cli.export import ExportArgs, export_command, parse_export
+from edqn_jax.cli.fly import FlyArgs, fly_command, parse_fly
 from edqn_jax.cli.help import ABOUT
 from edqn_jax.cli.process.signals import Stops
 from edqn_jax.cli.process.variables import check_devices, start_jax
@@ -45,6 +46,7 @@ COMMANDS = {
     "verify": VerifyArgs,
     "export": ExportArgs,
     "events": EventsArgs,
+    "fly": FlyArgs,
     "completion": CompletionArgs,
 }
 
@@ -109,6 +111,11 @@ def _dispatch(argv: Sequence[str], stops: Stops) -> int:
         train_command(rest, stops)
     elif command in RUN_COMMANDS:
         _dispatch_run_command(command, rest)
+    elif command == "fly":
+        flight = parse_fly(rest)
+        if flight.simulate is not None:  # whoever flies a drone needs no JAX
+            _start_jax_on_cpus()
+        fly_command(flight, stops)
     elif command == "completion":
         print(completion_script(parse_completion(rest).shell, COMMANDS))
     elif command == "--version":
@@ -166,6 +173,11 @@ def _dispatch_run_command(command: str, argv: Sequence[str]) -> None:
     """Runs a command on a finished run, a world or a file; JAX is imported once the arguments are known to be right."""
     parse, run_command = RUN_COMMANDS[command]
     args = parse(argv)
+    _start_jax_on_cpus()
+    run_command(args)
+
+
+def _start_jax_on_cpus() -> None:
     start_jax()
 
     from edqn_jax.devices.cache import enable_compilation_cache
@@ -174,4 +186,3 @@ def _dispatch_run_command(command: str, argv: Sequence[str]) -> None:
     use_cpu_devices()
     check_devices()
     enable_compilation_cache()
-    run_command(args)

@@ -18,7 +18,7 @@ from edqn_jax.config.simulation import LOOKS
 
 TRAIN, EVALUATE, RECORD, REPORT = "edqn train", "edqn evaluate", "edqn record", "edqn report"
 VERIFY, EXPORT, EVENTS, COMPLETION = "edqn verify", "edqn export", "edqn events", "edqn completion"
-CHECK, WORLD = "edqn check", "edqn world"
+CHECK, WORLD, FLY = "edqn check", "edqn world", "edqn fly"
 
 ABOUT = {
     "edqn": """Train drones to fly through unknown obstacles from the events of a simulated camera, and fly them.
@@ -87,6 +87,14 @@ Examples:
   edqn events recording.h5
   edqn events recording.raw --policy pretrained --picture seen.png
   edqn events recording.aedat4 --start 2 --stop 4 --out part.npz""",
+    FLY: """Fly an exported policy over MAVLink (extra `fly`), play a flight again, or simulate flights over the wire.
+
+Nothing is armed: a pilot takes off, and the policy takes over in offboard mode.
+
+Examples:
+  edqn fly pretrained-looks --simulate medium
+  edqn fly policy.onnx --events dv:127.0.0.1:7777 --goal 40 0 3 --volume -5 -20 0 60 20 10 --out flight
+  edqn fly policy.onnx --replay flight""",
     COMPLETION: """Print a script that completes commands, options and their values in a shell.
 
 Examples:

@@ -10,11 +10,12 @@ import pytest
 
 import edqn_jax
 from edqn_jax.interop.deployment.runner import Command
+from edqn_jax.interop.outer import event_cameras
+from edqn_jax.interop.outer.poses import Track, heading_of
 from edqn_jax.learn.policy import Policy
 from edqn_jax.sim.actions import ACTIONS
 from edqn_jax.sim.environment import Environment
-from outer import event_cameras, flights
-from outer.poses import Track, heading_of
+from outer import flights
 
 import transfer  # isort: skip
 

@@ -178,7 +178,7 @@ def test_every_kind_of_option_can_be_a_flag():
         (["train", "--resume", "must"], "--resume must needs --run-dir"),
         (["evaluate"], "POLICY"),
         (["evaluate", "nowhere"], "there is no run in 'nowhere'"),
-        (["fly"], "there is no command 'fly'; known are train, evaluate"),
+        (["quux"], "there is no command 'quux'; known are train, evaluate"),
         (["trian"], "did you mean 'train'?"),
         (["train", "--nun-envs", "64"], "there is no option '--nun-envs'; did you mean '--num-envs'?"),
         (["evaluate", "runs", "--misions=3"], "there is no option '--misions'; did you mean '--missions'?"),
@@ -355,6 +355,7 @@ def test_help_fits_a_screen_and_has_the_defaults_of_the_world(flag):
         (["verify", "--help"], "Verify a finished run"),
         (["export", "--help"], "Write a policy as ONNX"),
         (["events", "--help"], "Say what a file of events holds"),
+        (["fly", "--help"], "Fly an exported policy over MAVLink"),
         (["completion", "--help"], "Print a script"),
     ],
 )

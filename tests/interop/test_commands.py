@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from edqn_jax.cli import evaluate, events, export, record, report, world
+from edqn_jax.cli import evaluate, events, export, fly, record, report, world
 from edqn_jax.cli.arguments import check_flags
 from edqn_jax.cli.commands import take_imports
 from edqn_jax.cli.help import VERIFY
@@ -23,7 +23,7 @@ EXTRAS = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["option
 
 BLOCKS = [(name_of(page), code) for page in PAGES for code in blocks_of(page, *SHELL)]
 
-RUNS = ("edqn evaluate", "edqn record", "edqn report", "edqn verify", "edqn export", "edqn events")
+RUNS = ("edqn evaluate", "edqn record", "edqn report", "edqn verify", "edqn export", "edqn events", "edqn fly")
 
 PARSERS = {
     "evaluate": evaluate.parse_evaluate,
@@ -31,6 +31,7 @@ PARSERS = {
     "report": report.parse_report,
     "export": export.parse_export,
     "world": world.parse_world,
+    "fly": fly.parse_fly,
 }
 
 
@@ -55,7 +56,7 @@ def test_a_shell_block_is_a_script(page: str, code: str) -> None:
 
 @pytest.mark.parametrize(("page", "words"), COMMANDS, ids=[f"{page}: {' '.join(words)}" for page, words in COMMANDS])
 def test_a_command_parses(page: str, words: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
-    for command in (evaluate, record, report, export, events):
+    for command in (evaluate, record, report, export, events, fly):
         monkeypatch.setattr(command, "check_run", lambda folder: None)  # runs/DIR is a reader's
     words, imported = take_imports(words)
     if imported:  # the page has what the file registers

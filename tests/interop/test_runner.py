@@ -236,6 +236,17 @@ def test_a_policy_of_many_pixels_counts_the_mean_of_the_cameras():
     assert found[0, 0, 0, 1] == 75 and found.sum() == 75
 
 
+def test_on_and_off_events_of_many_pixels_cancel_as_in_their_mean():
+    about = {"sensor_pixels": 100, "known_contrast": KNOWN, "counts_net": False}
+    there_and_back = np.concatenate([event(t, 2, 0, sign) for t, sign in ((1, 1), (2, 1), (3, -1))])
+    assert counts(there_and_back, (8, 4), about=about)[0, :, 0, 1].tolist() == [25, 0]
+    there_and_back["x"][2] = 3  # another pixel's, of the same of the policy's
+    assert counts(there_and_back, (8, 4), about=about)[0, :, 0, 1].tolist() == [25, 0]
+    # A camera of the policy's own pixels has been counted as the sensor that it was trained with.
+    assert counts(there_and_back, about=about)[0, :, 0, 2].tolist() == [200, 0]
+    assert counts(there_and_back, about=about)[0, :, 0, 3].tolist() == [0, 100]
+
+
 @pytest.mark.parametrize("contrast", [0.0, -0.1, np.nan, np.inf])
 def test_a_contrast_that_no_camera_has_is_refused(exported, contrast):
     with pytest.raises(ValueError, match="contrast must be more than 0"):

@@ -15,13 +15,13 @@ import pytest
 
 import edqn_jax
 from edqn_jax.config import CameraConfig
+from edqn_jax.interop.outer import pictures
+from edqn_jax.interop.outer.poses import camera_rotation
 from edqn_jax.sim.camera import camera
 from edqn_jax.sim.camera.painting.materials import painted_spec
 from edqn_jax.sim.environment import Environment
 from edqn_jax.sim.scene.mjcf import mjcf_of
 from edqn_jax.sim.scene.scene import Capsules, Spheres, TiltedBoxes, TiltedCylinders
-from outer import pictures
-from outer.poses import camera_rotation
 from tests.support.drawn_scenes import box, pillar, rotation_of, scene_of
 
 import transfer  # isort: skip

@@ -292,7 +292,9 @@ def count_events(
     mean change. So a pixel's ON and OFF events within one pair of frames cancel, as they do for two frames; only a
     policy that was trained with sensor noise counts them apart. At the policy's own resolution and contrast every count
     is that of the events themselves. A policy that knows the contrast counts in the camera's own; of one that was
-    trained with the mean of many pixels, a count is that of so many pixels together.
+    trained with the mean of many pixels, a count is that of so many pixels together, and of a finer camera the ON and OFF
+    events of all of them cancel: a picture that is finer than the policy's pixels makes both at once, of which it has
+    learnt the mean alone.
 
     Args:
         about: of the policy, see `Runner.about`.
@@ -308,26 +310,34 @@ def count_events(
     _check_packet(packet)
     edges = np.asarray(about["frame_times_us"], np.int64)
     since = packet["t"].astype(np.int64) - start_us
-    window = packet[(since >= 0) & (since < edges[-1] - edges[0])]
-    if window.size and (window["x"].max() >= columns.size or window["y"].max() >= rows.size):
+    inside = (since >= 0) & (since < edges[-1] - edges[0])
+    if not inside.all():
+        packet, since = packet[inside], since[inside]
+    x, y, sign = (packet[name].astype(np.int64) for name in ("x", "y", "p"))
+    if x.size and (x.max() >= columns.size or y.max() >= rows.size):
         raise ValueError(
-            f"an event is at pixel ({window['x'].max()}, {window['y'].max()}), outside of an image of "
+            f"an event is at pixel ({x.max()}, {y.max()}), outside of an image of "
             f"{columns.size} x {rows.size}; say how large the camera's is"
         )
-    pair = np.searchsorted(edges - edges[0], window["t"].astype(np.int64) - start_us, side="right") - 1
-    column, row = columns[window["x"]], rows[window["y"]]
-    seen = (column >= 0) & (row >= 0)
+    # A comparison for each of the few frames is faster than a search for each of the many events.
+    pair = np.zeros(since.size, np.int64)
+    for edge in edges[1:-1] - edges[0]:
+        pair += since >= edge
+    column, row = columns[x], rows[y]
     shape = (edges.size - 1, 2, about["height"], about["width"])
-    cell = np.ravel_multi_index((pair[seen], (window["p"][seen] < 0).astype(np.int64), row[seen], column[seen]), shape)
+    cell = ((2 * pair + (sign < 0)) * shape[2] + row) * shape[3] + column
+    seen = (column >= 0) & (row >= 0)
+    if not seen.all():
+        cell = cell[seen]
     number = np.bincount(cell, minlength=int(np.prod(shape))).reshape(shape)
     told = contrast is None or about.get("known_contrast")
     per_event = [1.0 if told else contrast / own for own in (about["contrast_on"], about["contrast_off"])]
     change = number * np.asarray(per_event)[:, None, None] / np.maximum(pixels, 1)
-    if about["counts_net"]:
+    together = about.get("sensor_pixels", 1)
+    if about["counts_net"] or (together > 1 and pixels.max() > 1):
         # In contrasts of the policy, which may differ between ON and OFF.
         log_change = change[:, 0] * about["contrast_on"] - change[:, 1] * about["contrast_off"]
         change = np.stack([log_change / about["contrast_on"], -log_change / about["contrast_off"]], axis=1)
-    together = about.get("sensor_pixels", 1)
     if together > 1:
         return np.rint(np.maximum(change, 0.0) * together).astype(np.int32)
     # Rounding must not take away what is exactly one event.
@@ -433,9 +443,9 @@ def _check_packet(packet: NDArray) -> None:
     names = getattr(getattr(packet, "dtype", None), "names", None) or ()
     if not set(FIELDS) <= set(names) or packet.ndim != 1:
         raise ValueError("a packet of events must be a structured array [N] with the fields t, x, y and p")
-    if packet.size and not np.all(np.abs(packet["p"].astype(np.int64)) == 1):
+    if packet.size and not np.all((packet["p"] == 1) | (packet["p"] == -1)):
         raise ValueError("the polarity p of an event must be -1 or 1; with 0 and 1, give 2 * p - 1")
-    if packet.size and (packet["x"].min() < 0 or packet["y"].min() < 0):
+    if packet.size and any(packet[name].dtype.kind == "i" and packet[name].min() < 0 for name in ("x", "y")):
         raise ValueError("the pixels x and y of events must be at least 0")
 
 

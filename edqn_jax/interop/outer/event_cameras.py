@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 
 from edqn_jax.config import EventsConfig
 from edqn_jax.extras import MissingPackageError, require_extra
+from edqn_jax.interop.outer.pictures import See
+from edqn_jax.interop.outer.poses import Track, camera_rotation
 from edqn_jax.sim.sensors.events import STREAM_DTYPE
-from outer.pictures import See
-from outer.poses import Track, camera_rotation
 
 WIDE, HIGH = 346, 260
 """Pixels of the cameras of `esim` and `v2e`: a DAVIS346."""
@@ -99,7 +99,8 @@ def esim() -> Any:
         MissingPackageError: if evlib, or PyTorch, on which its simulator stands, is not installed.
     """
     simulation = require_extra("evlib.simulation", extra="transfer")
-    require_extra("torch", extra="transfer")
+    # Its tensors are small: several threads wait for each other, 40 times as long where the cores are busy.
+    require_extra("torch", extra="transfer").set_num_threads(1)
     config = simulation.ESIMConfig(
         positive_threshold=CONTRAST,
         negative_threshold=CONTRAST,

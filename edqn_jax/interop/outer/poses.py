@@ -9,6 +9,20 @@ from numpy.typing import NDArray
 
 
 @dataclasses.dataclass(frozen=True)
+class Body:
+    """What a drone knows of itself at a decision."""
+
+    position: NDArray[np.float64]
+    """[3] metres."""
+    quaternion: NDArray[np.float64]
+    """[4] w, x, y, z, from the body to the world."""
+    velocity: NDArray[np.float64]
+    """[3] m/s in the world."""
+    yaw_rate: float
+    """Of the heading, rad/s to the left."""
+
+
+@dataclasses.dataclass(frozen=True)
 class Track:
     """Poses of a flight; K of them, in the order of time."""
 

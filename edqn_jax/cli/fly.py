@@ -1,0 +1,340 @@
+"""`edqn fly`: flies an exported policy over MAVLink, plays a flight again, or simulates flights over the wire."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
+
+from tyro.conf import Positional, arg
+
+from edqn_jax.cli.arguments import Point, check_is_saved, check_run, parse_arguments
+from edqn_jax.cli.help import FLY
+from edqn_jax.cli.process.signals import Stops
+from edqn_jax.errors import CheckError, ConfigError, StoppedError, suggest_nearest
+from edqn_jax.files import check_can_write, write_atomically
+
+if TYPE_CHECKING:
+    from edqn_jax.fly.faults import Settings
+    from edqn_jax.fly.pilot import Report
+    from edqn_jax.interop.deployment.runner import Runner
+
+Ending = Literal["hover", "hold", "land"]
+
+OF_THE_WORLD = ("events", "fov", "contrast", "goal", "volume", "fence", "dry", "clock")
+"""Options that a simulated flight has from its world."""
+
+
+@dataclass(frozen=True)
+class FlyArgs:
+    """Fly an exported policy over MAVLink from a camera's events; play a logged flight again; simulate flights."""
+
+    policy: Annotated[Positional[Path], arg(metavar="POLICY")]
+    """POLICY.onnx, as `edqn export` writes it; with --simulate also the folder of a run, `pretrained` or
+    `pretrained-looks`."""
+    simulate: Annotated[str | None, arg(metavar="WORLD", help_behavior_hint="")] = None
+    """Fly here, in a world by name or an MJCF file: three processes, RotorPy's quadrotor, evlib's events (extra
+    `transfer`)."""
+    missions: Annotated[int, arg(metavar="N")] = 1
+    """With --simulate: how many."""
+    seed: Annotated[int, arg(metavar="S")] = 0
+    """With --simulate: of the test worlds."""
+    speed: Annotated[float, arg(metavar="X")] = 1.0
+    """With --simulate: most simulated seconds a second. Where the machine is slower, the clock waits for it."""
+    picture: Literal["own", "mujoco"] = "own"
+    """With --simulate: who draws what the camera sees."""
+    json: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
+    """With --simulate: file for how each mission ended."""
+    replay: Annotated[Path | None, arg(metavar="FLIGHT", help_behavior_hint="")] = None
+    """Play the log of a flight again, and compare what state machine and policy do with what they did."""
+    mavlink: Annotated[str, arg(metavar="ADDRESS")] = "udpin:0.0.0.0:14540"
+    """The vehicle, as pymavlink writes it: udpin:HOST:PORT, tcp:HOST:PORT, or DEVICE,BAUD."""
+    events: Annotated[str | None, arg(metavar="SOURCE", help_behavior_hint="")] = None
+    """The camera: dv:HOST:PORT (dv-processing's network writer), tcp:HOST:PORT (the stream of
+    `edqn_jax.fly.streams`), or a recording, played at its own speed."""
+    camera: Annotated[tuple[int, int] | None, arg(metavar="W H", help_behavior_hint="")] = None
+    """Pixels of the camera across and down (default: with --simulate 346 260, else what it says)."""
+    fov: Annotated[float | None, arg(metavar="DEG", help_behavior_hint="")] = None
+    """Horizontal field of view of the camera, degrees (default: the policy's)."""
+    contrast: Annotated[float | None, arg(metavar="C", help_behavior_hint="")] = None
+    """Change of log brightness that makes an event in the camera (default: the policy's)."""
+    goal: Annotated[Point | None, arg(metavar="X Y Z", help_behavior_hint="")] = None
+    """Goal in the policy's world: metres east, north, up."""
+    volume: Annotated[
+        tuple[float, float, float, float, float, float] | None,
+        arg(metavar="X Y Z X Y Z", help_behavior_hint=""),
+    ] = None
+    """Lowest and highest corner of the flight volume, which the policy is told, as large as in training."""
+    fence: Annotated[
+        tuple[float, float, float, float, float, float] | None,
+        arg(metavar="X Y Z X Y Z", help_behavior_hint=""),
+    ] = None
+    """Lowest and highest corner of what must not be left (default: the volume)."""
+    origin: Annotated[Point, arg(metavar="X Y Z")] = (0.0, 0.0, 0.0)
+    """Where the vehicle's local frame begins, in the policy's world."""
+    goal_radius: Annotated[float, arg(metavar="M")] = 1.0
+    """How near is there, metres."""
+    pace: Annotated[float, arg(metavar="X")] = 1.0
+    """Share of the policy's speed, from 0.2 to 1, with all its times as much longer, for a vehicle that is slower to
+    follow: it needs the square of this share of the acceleration."""
+    after_hover: Literal["hold", "land"] = "hold"
+    """What follows a hover of 3 s after a fault, and a flight that takes too long."""
+    at_goal: Ending = "hold"
+    """What follows the goal."""
+    on: Annotated[tuple[str, ...], arg(metavar="FAULT=ACTION")] = ()
+    """What is done about a fault, hover, hold or land, as in "low battery=hold"; docs/deployment.md has their names."""
+    max_s: Annotated[float, arg(metavar="S")] = 300.0
+    """Longest flight, seconds."""
+    least_rate: Annotated[float, arg(metavar="HZ")] = 0.1
+    """Events per second and pixel that a drone in motion sees at least; set it above the camera's noise."""
+    dry: bool = False
+    """Bench test with props off: decides and logs, sends zero velocity, asks for no mode."""
+    out: Annotated[Path | None, arg(metavar="FOLDER", help_behavior_hint="")] = None
+    """Where everything is logged (default: nowhere)."""
+    clock: Annotated[str | None, arg(metavar="HOST:PORT", help_behavior_hint="")] = None
+    """Clock of a simulation; --simulate gives it."""
+
+
+def parse_fly(argv: Sequence[str]) -> FlyArgs:
+    """Returns the checked arguments of `edqn fly`.
+
+    Raises:
+        ConfigError: if one is missing, out of its limits, or does not go with another.
+        SystemExit: after printing, for --help and for what does not parse.
+    """
+    args = parse_arguments(FlyArgs, argv, FLY)
+    if args.simulate is not None and args.replay is not None:
+        raise ConfigError("--simulate flies and --replay plays a flight again; give one of them")
+    if args.missions < 1 or args.seed < 0 or args.speed <= 0:
+        raise ConfigError("--missions must be at least 1, --seed at least 0 and --speed more than 0")
+    if args.camera is not None and min(args.camera) < 1:
+        raise ConfigError(f"--camera must be two whole numbers of at least 1, not {args.camera[0]} {args.camera[1]}")
+    if not 0.2 <= args.pace <= 1.0:
+        raise ConfigError(f"--pace must be from 0.2 to 1, not {args.pace:g}")
+    actions_of(args.on)
+    if args.json is not None:
+        check_can_write(args.json)
+    if args.simulate is not None:
+        if args.policy.suffix != ".onnx":
+            check_is_saved(args.policy, f"{FLY} --simulate")
+            check_run(args.policy)
+        for name in OF_THE_WORLD:
+            if getattr(args, name) not in (None, False):
+                raise ConfigError(f"--simulate gives --{name} itself; leave it out")
+        return args
+    if args.policy.suffix != ".onnx":
+        raise ConfigError(f"'{args.policy}' must be an exported policy; 'edqn export {args.policy}' writes one")
+    if args.replay is None:
+        for name in ("events", "goal", "volume"):
+            if getattr(args, name) is None:
+                raise ConfigError(f"--{name} is missing; '{FLY} --help' says what it is")
+    return args
+
+
+def actions_of(words: Sequence[str]) -> dict:
+    """Returns the action of each fault that words such as `low battery=hold` name.
+
+    Raises:
+        ConfigError: if there is no such fault or action.
+    """
+    from edqn_jax.fly.faults import Action, Fault
+
+    found = {}
+    for word in words:
+        fault, _, action = word.partition("=")
+        if fault not in list(Fault):
+            raise ConfigError(f"there is no fault '{fault}'{suggest_nearest(fault, list(Fault))}")
+        if action not in list(Action):
+            raise ConfigError(f"a fault is answered by hover, hold or land, not by '{action}'")
+        found[Fault(fault)] = Action(action)
+    return found
+
+
+def fly_command(args: FlyArgs, stops: Stops) -> None:
+    """Runs `edqn fly` with these arguments.
+
+    Raises:
+        CheckError: if a flight ended otherwise than at its goal, or a replay differs.
+        ConfigError: if policy, camera or vehicle are not as they should be; nothing was sent then.
+        MissingPackageError: if a package of the extra `fly` or `transfer` is not installed.
+        StoppedError: if a signal ended the flight.
+    """
+    if args.simulate is not None:
+        simulate(args)
+    elif args.replay is not None:
+        replay(args, args.replay)
+    else:
+        fly(args, stops)
+
+
+def fly(args: FlyArgs, stops: Stops) -> None:
+    """Flies one mission."""
+    import numpy as np
+
+    from edqn_jax.fly.clocks import WallClock
+    from edqn_jax.fly.link import Link
+    from edqn_jax.fly.pilot import Pilot, Task
+    from edqn_jax.fly.records import FlightLog
+    from edqn_jax.fly.simulated.lockstep import SimulatedClock
+    from edqn_jax.fly.streams import open_events
+
+    assert args.events is not None and args.volume is not None
+    with contextlib.ExitStack() as stack:
+        source = open_events(args.events, args.camera)
+        stack.callback(source.close)
+        size = source.events.size
+        assert size is not None
+        runner = load_runner(args, size)
+        settings = settings_of(args, size, runner.period_s / args.pace)
+        link = Link(args.mavlink, args.origin)
+        stack.callback(link.close)
+        log = None
+        if args.out is not None:
+            log = FlightLog(args.out)
+            stack.callback(log.close)
+        clock = SimulatedClock(args.clock, "autopilot") if args.clock else WallClock()
+        stack.enter_context(stops.obey_signals(lambda _: None))
+        task = Task(settings, np.reshape(args.volume, (2, 3)), args.pace, args.dry)
+        pilot = Pilot(runner, link, source, clock, task, log=log, stop=stops.is_requested)
+        try:
+            report = pilot.fly()
+        except ConnectionError:  # of the simulated clock, whose keeper says why it ended
+            return
+    end(report, stops)
+
+
+def end(report: Report, stops: Stops) -> None:
+    """Prints how a flight ended, and raises unless it was at its goal."""
+    if parts := report.latency.percentiles():
+        print(f"{latency_sentence(parts)}; longest gap {1e3 * report.longest_gap_s:.0f} ms")
+    sentence = f"{report.outcome} after {report.seconds:.1f} s and {report.decisions} decisions"
+    if report.outcome == "goal":
+        print(f"reached the {sentence}")
+        return
+    if stops.is_requested():
+        raise StoppedError(f"the flight was stopped: {sentence}")
+    if report.outcome.startswith("refused: "):
+        raise ConfigError(f"no flight: {report.outcome.removeprefix('refused: ')}")
+    raise CheckError(f"the flight ended with {sentence}")
+
+
+def latency_sentence(parts: Mapping[str, Sequence[float]]) -> str:
+    """Returns medians and 99th percentiles of parts of the latency, as people read them."""
+    said = ", ".join(f"{name} {median:.1f} / {p99:.1f}" for name, (median, p99) in parts.items())
+    return f"newest event to setpoint, ms, median / 99 %: {said}"
+
+
+def load_runner(args: FlyArgs, size: tuple[int, int]) -> Runner:
+    """Returns the policy for a camera of a size.
+
+    Raises:
+        ConfigError: if the file is no policy, or the camera is not that of --camera or cannot stand for the policy's.
+        MissingPackageError: if onnxruntime is not installed.
+    """
+    from edqn_jax.extras import require_extra
+    from edqn_jax.interop.deployment.runner import Runner
+
+    require_extra("onnxruntime", "fly")
+    if args.camera is not None and args.camera != size:
+        told = f"{args.camera[0]} x {args.camera[1]}"
+        raise ConfigError(f"the camera has {size[0]} x {size[1]} pixels, and --camera says {told}")
+    try:
+        runner = Runner(args.policy, camera=size, camera_fov_deg=args.fov, contrast=args.contrast)
+    except ValueError as error:
+        raise ConfigError(str(error)) from error
+    return runner
+
+
+def settings_of(args: FlyArgs, size: tuple[int, int], period_s: float) -> Settings:
+    """Returns what a flight is to do.
+
+    Raises:
+        ConfigError: if it could not be ended so, or a box's first corner is not the lower one.
+    """
+    import numpy as np
+
+    from edqn_jax.fly.faults import Action, Limits, Settings
+
+    assert args.volume is not None and args.goal is not None
+    boxes = {"volume": np.reshape(args.volume, (2, 3))}
+    boxes["fence"] = boxes["volume"] if args.fence is None else np.reshape(args.fence, (2, 3))
+    for name, box in boxes.items():
+        if not np.all(box[0] < box[1]):
+            raise ConfigError(f"--{name} must be its lowest and its highest corner, each coordinate of the first lower")
+    try:
+        return Settings(
+            goal=np.array(args.goal),
+            fence=boxes["fence"],
+            camera=size,
+            period_s=period_s,
+            goal_radius_m=args.goal_radius,
+            actions=actions_of(args.on),
+            after_hover=Action(args.after_hover),
+            at_goal=Action(args.at_goal),
+            flight_s=args.max_s,
+            limits=Limits(covered_hz=args.least_rate),
+        )
+    except ValueError as error:
+        raise ConfigError(str(error)) from error
+
+
+def replay(args: FlyArgs, folder: Path) -> None:
+    """Plays a flight again."""
+    from edqn_jax.fly.records import read_records
+    from edqn_jax.fly.replay import replay as play
+
+    begun = next((each for each in read_records(folder) if each["kind"] == "settings"), None)
+    runner = None
+    if begun is not None:
+        width, height = begun["settings"]["camera"]
+        runner = load_runner(replace(args, camera=None), (width, height))
+    again = play(folder, runner)
+    print(
+        f"{again.ticks:,} ticks, {again.other_outputs} of them with another output; {again.decisions:,} decisions, "
+        f"{again.other_moves} of them another move; outcome: {again.outcome}"
+    )
+    if again.other_outputs or again.other_moves:
+        raise CheckError(f"the flight in '{folder}' goes another way once more")
+
+
+def simulate(args: FlyArgs) -> None:
+    """Flies missions here, over the wire."""
+    import os
+    import tempfile
+
+    if args.picture == "mujoco":
+        os.environ.setdefault("MUJOCO_GL", "egl")  # read as MuJoCo is imported
+
+    from edqn_jax.evaluation.metrics import wilson_interval
+    from edqn_jax.fly.simulated.missions import Setup, environment_of, fly_missions
+    from edqn_jax.interop.deployment.onnx_export import export_policy
+    from edqn_jax.runs.policies import load_policy
+
+    assert args.simulate is not None
+    if args.policy.suffix == ".onnx":
+        raise ConfigError("--simulate needs the folder of a run, pretrained or pretrained-looks, for its worlds")
+    policy = load_policy(args.policy)
+    environment = environment_of(args.simulate, policy.config, args.missions, args.seed)
+    with tempfile.TemporaryDirectory() as folder:
+        file = export_policy(policy, Path(folder) / "policy.onnx").file
+        size = (346, 260) if args.camera is None else args.camera
+        answers = ["--after-hover", args.after_hover, "--at-goal", args.at_goal, "--least-rate", repr(args.least_rate)]
+        more = (*answers, *(("--on", *args.on) if args.on else ()))
+        setup = Setup(file, size, speed=args.speed, picture=args.picture, out=args.out, pace=args.pace, autopilot=more)
+        ended = []
+        for mission in fly_missions(environment, setup):
+            ended.append(mission)
+            print(
+                f"mission {mission.number}: {mission.outcome} after {mission.seconds:.1f} s, {mission.clearance_m:.2f} "
+                f"m clear at least; {mission.events_hz:,.0f} events/s; {mission.speed:.2f} simulated seconds a second; "
+                f"{latency_sentence(mission.latency)}",
+                flush=True,
+            )
+    reached = sum(each.outcome == "goal" for each in ended)
+    low, high = wilson_interval(reached, len(ended))
+    print(f"{reached} of {len(ended)} reached the goal ({100 * low:.0f} to {100 * high:.0f} %, Wilson)")
+    if args.json is not None:
+        write_atomically(args.json, json.dumps([asdict(each) for each in ended], indent=2) + "\n")

@@ -1,0 +1,239 @@
+"""The loop of a flight, with a policy, a vehicle and a camera of a few lines each, in virtual time; and its log."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from edqn_jax.errors import ConfigError
+from edqn_jax.fly.faults import Fault, Inputs, Odometry, Settings
+from edqn_jax.fly.link import Own
+from edqn_jax.fly.machine import Output, Phase
+from edqn_jax.fly.pilot import Pilot, Task, at_pace
+from edqn_jax.fly.records import RECORDS, FlightLog, inputs_of, read_records, settings_of
+from edqn_jax.fly.replay import replay
+from edqn_jax.fly.streams import EVENT, Events
+from edqn_jax.interop.deployment.runner import Command
+from tests.fly.virtual import CAMERA, PERIOD_S, TICK_S, Vehicle
+
+GOAL = np.array([12.0, 0.0, 5.0])
+FENCE = np.array([[-5.0, -20.0, 0.0], [40.0, 20.0, 25.0]])
+SETTINGS = Settings(goal=GOAL, fence=FENCE, camera=CAMERA, period_s=PERIOD_S)
+
+
+class Time:
+    def __init__(self) -> None:
+        self.moment = 50.0
+
+    def now(self) -> float:
+        return self.moment
+
+    def sleep_until(self, moment: float) -> None:
+        assert moment <= self.moment + TICK_S + 1e-9
+        self.moment = max(self.moment, moment)
+
+    def work(self) -> None:
+        self.moment += 0.004
+
+
+class Policy:
+    """Flies ahead; its move tells of the number of events."""
+
+    period_s, window_us = PERIOD_S, 160_000
+    about = {"frame_times_us": [-160_000, -80_000, 0]}
+
+    def __init__(self, error: Exception | None = None) -> None:
+        self.resets, self.error = 0, error
+
+    def reset(self) -> None:
+        self.resets += 1
+
+    def decide(self, packet: np.ndarray, until_us: int, **own: Any) -> Command:
+        if self.error is not None:
+            raise self.error
+        assert np.asarray(own["attitudes"]).shape == (3, 4)
+        return Command(packet.size % 27, np.array([3.0, 0.0, 0.0], np.float32), 0.25, np.zeros(27, np.float32))
+
+
+class Wire:
+    """`Link`, to a vehicle in virtual time."""
+
+    def __init__(self, armed: bool = True) -> None:
+        self.vehicle, self.said, self.sent, self.asked = Vehicle(np.array([0.0, 0.0, 5.0])), [], [], []
+        self._now, self._armed = 0.0, armed
+
+    def read(self, now: float) -> None:
+        while self._now < now - 1e-9:
+            self._now = now if now - self._now > 1.0 else self._now + TICK_S
+            self.vehicle.move()
+
+    def inputs(self) -> Inputs:
+        own = Odometry(self._now, self.vehicle.position, self.vehicle.velocity)
+        return Inputs(self._now, mode=self.vehicle.mode, armed=self._armed, airborne=self._armed, odometry=own)
+
+    def own(self, now: float) -> Own:
+        return Own(Odometry(now, self.vehicle.position, self.vehicle.velocity), np.array([1.0, 0, 0, 0]), 0.0)
+
+    def attitude_at(self, time: float) -> np.ndarray:
+        return np.array([1.0, 0, 0, 0])
+
+    def send(self, velocity: Any, yaw: float | None, now: float) -> None:
+        self.sent.append((now, velocity, yaw))
+        self.vehicle.obey(Output(velocity), now)
+
+    def request(self, mode: str) -> None:
+        self.asked.append(mode)
+        self.vehicle.obey(Output(request=mode), self._now)
+
+    def forget_masters(self) -> None: ...
+
+
+class Camera:
+    def __init__(self, ends_at: float = np.inf) -> None:
+        self.events, self._ends_at, self._random = Events(CAMERA), ends_at, np.random.default_rng(0)
+
+    def read(self, now: float, least_us: int = -1) -> None:
+        if now > self._ends_at:
+            return
+        until = round(1e6 * (now + 7.0))
+        events = np.zeros(int(self._random.integers(2000, 4000)), EVENT)
+        events["t"], events["p"] = until - 1, 1
+        self.events.add(events, until, now)
+
+    def close(self) -> None: ...
+
+
+def make(policy: Any = None, wire: Any = None, camera: Any = None, **more: Any) -> tuple[Pilot, Any]:
+    wire = wire or Wire()
+    task = Task(more.pop("settings", SETTINGS), FENCE, more.pop("pace", 1.0), more.pop("dry", False))
+    flier: Any = policy or Policy()
+    pilot = Pilot(flier, wire, camera or Camera(), Time(), task, tell=lambda _: None, **more)
+    return pilot, wire
+
+
+def test_a_flight_reaches_its_goal_and_sends_what_was_decided() -> None:
+    policy = Policy()
+    pilot, wire = make(policy)
+    report = pilot.fly()
+    assert report.outcome == "goal" and wire.asked == ["offboard", "hold"] and policy.resets == 1
+    moving = [each for each in wire.sent if each[1] is not None and any(each[1])]
+    assert {each[1:] for each in moving} == {((3.0, 0.0, 0.0), 0.25)}
+    gaps = np.diff([now for now, velocity, _ in wire.sent if velocity is not None])
+    assert gaps.max() < 0.05 and report.longest_gap_s == pytest.approx(gaps.max())
+    assert report.decisions == pytest.approx(report.seconds / PERIOD_S, abs=1.5)
+    parts = report.latency.percentiles()
+    assert parts["all"][0] >= parts["computing"][0] >= parts["decide"][0] > 0.0
+
+
+def test_a_log_is_played_again_with_the_same_outputs_and_moves(tmp_path: Path) -> None:
+    log = FlightLog(tmp_path / "flight")
+    pilot, _ = make(log=log)
+    report = pilot.fly()
+    log.close()
+    again = replay(tmp_path / "flight", Policy())  # pyright: ignore[reportArgumentType]
+    assert (again.other_outputs, again.other_moves, again.outcome) == (0, 0, "goal")
+    assert again.decisions == report.decisions and again.ticks > 100
+    file = tmp_path / "flight" / RECORDS
+    lines = file.read_text().splitlines()
+    number = next(k for k, line in enumerate(lines) if json.loads(line)["kind"] == "decision")
+    lines[number] = json.dumps(json.loads(lines[number]) | {"move": 99})
+    file.write_text("\n".join(lines) + "\n{cut off")
+    assert replay(tmp_path / "flight", Policy()).other_moves == 1  # pyright: ignore[reportArgumentType]
+
+
+def test_inputs_and_settings_come_back_from_a_log(tmp_path: Path) -> None:
+    log = FlightLog(tmp_path)
+    heard = dataclasses.replace(Wire().inputs(), camera=CAMERA, battery=0.5)
+    log.write("tick", inputs=heard)
+    log.write("settings", settings=dataclasses.replace(SETTINGS, actions={Fault.BATTERY: "hold"}))
+    log.close()
+    tick, settings = read_records(tmp_path)
+    assert repr(inputs_of(tick["inputs"])) == repr(heard)
+    assert settings_of(settings["settings"]).action_on(Fault.BATTERY) == "hold"
+    assert settings_of(settings["settings"]).limits == SETTINGS.limits
+
+
+def test_a_camera_that_falls_silent_ends_in_a_hover_and_then_hold() -> None:
+    pilot, wire = make(camera=Camera(ends_at=52.5))
+    report = pilot.fly()
+    assert report.outcome == Fault.NO_EVENTS and wire.asked == ["offboard", "hold"]
+    late = [velocity for now, velocity, _ in wire.sent if now > 52.5 + 0.14 and velocity is not None]
+    assert late and not any(any(velocity) for velocity in late)
+
+
+def test_a_policy_that_cannot_decide_does_not_move() -> None:
+    pilot, wire = make(Policy(ValueError("an event is at pixel (400, 3)")))
+    assert pilot.fly().outcome == Fault.LATE
+    assert not any(velocity is not None and any(velocity) for _, velocity, _ in wire.sent)
+
+
+def test_a_fault_of_ours_asks_for_hold_and_is_not_hidden(tmp_path: Path) -> None:
+    log = FlightLog(tmp_path)
+    pilot, wire = make(Policy(ZeroDivisionError("ours")), log=log)
+    with pytest.raises(ZeroDivisionError):
+        pilot.fly()
+    log.close()
+    assert wire.asked == ["offboard", "hold"] and read_records(tmp_path)[-1]["outcome"] == "cut off"
+
+
+def test_a_process_that_is_stopped_asks_for_hold() -> None:
+    asked = iter(range(10_000))
+    pilot, wire = make(stop=lambda: next(asked) > 150)
+    assert pilot.fly().outcome == Fault.STOPPED
+    assert wire.asked == ["offboard", "hold"] and wire.vehicle.mode == "hold"
+
+
+def test_a_bench_test_decides_and_moves_nothing() -> None:
+    pilot, wire = make(wire=Wire(armed=False), dry=True, settings=dataclasses.replace(SETTINGS, flight_s=3.0))
+    report = pilot.fly()
+    assert report.outcome == "time out" and report.decisions == 12 and wire.asked == []
+    assert {velocity for _, velocity, _ in wire.sent} == {None, (0.0, 0.0, 0.0)}
+
+
+def test_a_log_is_not_written_over_and_no_log_is_one_sentence(tmp_path: Path) -> None:
+    FlightLog(tmp_path).close()
+    with pytest.raises(ConfigError, match="holds a flight already"):
+        FlightLog(tmp_path)
+    with pytest.raises(ConfigError, match="no flight in"):
+        read_records(tmp_path / "nowhere")
+    with pytest.raises(ConfigError, match="cut off before it began"):
+        replay(tmp_path)
+    (tmp_path / RECORDS).write_text("{}\nnot json\n{}\n")
+    with pytest.raises(ConfigError, match="is damaged"):
+        read_records(tmp_path)
+
+
+def test_at_half_the_pace_a_policy_sees_and_is_told_what_it_would_at_its_own() -> None:
+    told: list[dict[str, Any]] = []
+
+    class Asked(Policy):
+        def decide(self, packet: np.ndarray, until_us: int, **own: Any) -> Command:
+            told.append(own | {"since": until_us - int(packet["t"].min())})
+            return super().decide(packet, until_us, **own)
+
+    pilot, wire = make(Asked(), pace=0.5, settings=dataclasses.replace(SETTINGS, period_s=2 * PERIOD_S))
+    report = pilot.fly()
+    assert report.outcome == "goal"
+    sent = [each for each in wire.sent if each[1] is not None and any(each[1])]
+    assert {velocity for _, velocity, _ in sent} == {(1.5, 0.0, 0.0)}
+    assert told[-1]["velocity"][0] == pytest.approx(3.0, abs=0.01) and told[-1]["since"] <= Policy.window_us
+    assert told[-1]["since"] > 0.8 * Policy.window_us
+    assert report.decisions == pytest.approx(report.seconds / (2 * PERIOD_S), abs=1.5)
+    events = np.zeros(3, EVENT)
+    events["t"] = [1000, 1500, 1999]
+    assert at_pace(events, 2000, 0.5)["t"].tolist() == [1500, 1750, 1999]
+
+
+def test_the_phases_are_told() -> None:
+    told: list[str] = []
+    pilot, _ = make()
+    pilot._tell = told.append
+    pilot.fly()
+    assert [line.split(": ")[1].split(" ")[0] for line in told] == [
+        Phase.READY, Phase.FLYING, Phase.HOLDING, Phase.ENDED,
+    ]  # fmt: skip

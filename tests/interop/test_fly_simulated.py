@@ -1,0 +1,241 @@
+"""`edqn fly`: a whole flight over the wire in an easy world; processes that are stopped or killed; bad input."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip("pymavlink")
+pytest.importorskip("rotorpy")
+pytest.importorskip("evlib")
+
+from edqn_jax.cli import main  # noqa: E402
+from edqn_jax.fly.link import Link  # noqa: E402
+from edqn_jax.fly.records import read_records  # noqa: E402
+from edqn_jax.fly.simulated.camera import EventServer  # noqa: E402
+from edqn_jax.fly.simulated.missions import Setup, environment_of, fly_mission  # noqa: E402
+from edqn_jax.fly.streams import EVENT, DvStream  # noqa: E402
+from edqn_jax.interop.deployment.onnx_export import export_policy  # noqa: E402
+from edqn_jax.runs.policies import load_policy  # noqa: E402
+
+pytestmark = pytest.mark.filterwarnings("ignore")  # jax2onnx, evlib, rotorpy and what they import
+
+EASY = """
+<mujoco>
+  <worldbody>
+    <site name="volume" type="box" pos="15 10 4" size="15 10 4" group="3"/>
+    <site name="start" pos="4 10 3"/>
+    <site name="goal" pos="14 10 3"/>
+    <geom name="ground" type="plane" pos="15 10 0" size="15 10 0.1"/>
+    <geom name="box" type="box" pos="9 16 2" size="1 1 2"/>
+    <geom name="mast" type="cylinder" pos="20 6 2" size="0.5 2"/>
+  </worldbody>
+</mujoco>
+"""
+
+SIZE = (64, 48)
+"""A small camera, so that the flight takes seconds."""
+
+
+@pytest.fixture(scope="module")
+def exported(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("policy")
+    return export_policy(load_policy("pretrained-looks"), folder / "policy.onnx", checks=20).file
+
+
+@pytest.mark.slow
+def test_a_mission_is_flown_over_the_wire_and_its_log_goes_the_same_way_once_more(
+    exported: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    world = tmp_path / "easy.xml"
+    world.write_text(EASY)
+    environment = environment_of(str(world), load_policy("pretrained-looks").config, 1, 0)
+    setup = Setup(exported, SIZE, frame_s=0.01, out=tmp_path)
+    flown = fly_mission(environment, 0, setup)
+    assert flown.outcome == "goal" and flown.clearance_m > 0.0 and flown.events_hz > 0.0
+    assert flown.latency["computing"][0] > 0.0
+    folder = tmp_path / "mission-0"
+    assert read_records(folder)[-1]["kind"] == "end"
+    words = ["fly", str(exported), "--fov", "90", "--contrast", "0.2", "--replay", str(folder)]
+    assert main(words) == 0
+    assert " 0 of them with another output" in capsys.readouterr().out
+
+
+class Bench:
+    """A vehicle in a process of its own, a camera that sees noise, and an observer of the vehicle."""
+
+    def __init__(self) -> None:
+        self.port, observer = free_port(), free_port()
+        ends = [f"udpout:127.0.0.1:{port}" for port in (self.port, observer)]
+        self.vehicle = start("edqn_jax.fly.simulated.vehicle", "--mavlink", *ends, "--start", "0", "0", "5")
+        self.link = Link(f"udpin:127.0.0.1:{observer}")
+        self.server = EventServer(SIZE)
+        self.ended = threading.Event()
+        self._thread = threading.Thread(target=self._see)
+        self._thread.start()
+
+    def _see(self) -> None:
+        rng, count = np.random.default_rng(0), 200
+        while not self.ended.wait(0.01):
+            events, until = np.empty(count, EVENT), round(1e6 * time.monotonic())
+            events["x"], events["y"] = rng.integers(0, SIZE[0], count), rng.integers(0, SIZE[1], count)
+            events["t"], events["p"] = until - 1, rng.choice([-1, 1], count)
+            self.server.send(until, events)
+
+    def fly(self, exported: Path, out: Path, *words: str) -> subprocess.Popen:
+        wire = ["--mavlink", f"udpin:127.0.0.1:{self.port}", "--events", f"tcp:{self.server.address}"]
+        room = ["--goal", "90", "0", "5", "--volume", "-10", "-50", "-5", "100", "50", "20", "--contrast", "0.2"]
+        return start("edqn_jax", "fly", str(exported), *wire, *room, "--out", str(out), *words)
+
+    def wait_for(self, mode: str) -> None:
+        """Waits until the vehicle is in a mode."""
+        until = time.monotonic() + 60.0
+        while self.link.inputs().mode != mode:
+            assert time.monotonic() < until, f"the vehicle is in {self.link.inputs().mode}, not {mode}"
+            time.sleep(0.02)
+            self.link.read(time.monotonic())
+
+    def close(self) -> None:
+        self.ended.set()
+        self._thread.join()
+        self.server.close()
+        self.link.close()
+        self.vehicle.kill()
+        self.vehicle.communicate()
+
+
+def start(module: str, *words: str) -> subprocess.Popen:
+    command = [sys.executable, "-u", "-m", module, *words]
+    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=dict(os.environ))
+
+
+def free_port() -> int:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind(("127.0.0.1", 0))
+        return probe.getsockname()[1]
+
+
+@pytest.fixture
+def bench() -> Iterator[Bench]:
+    made = Bench()
+    yield made
+    made.close()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 143), (signal.SIGINT, 130), (signal.SIGKILL, -9)])
+def test_a_process_that_is_stopped_or_killed_leaves_a_vehicle_that_holds(
+    bench: Bench, exported: Path, tmp_path: Path, number: int, code: int
+) -> None:
+    flight = bench.fly(exported, tmp_path / "flight")
+    bench.wait_for("offboard")
+    flight.send_signal(number)
+    bench.wait_for("hold")
+    _, said = flight.communicate(timeout=30)
+    assert flight.returncode == code
+    if number != signal.SIGKILL:
+        assert said.count("\n") == 1 and "the flight was stopped: process stopped" in said
+        assert read_records(tmp_path / "flight")[-1]["outcome"] == "process stopped"
+
+
+@pytest.mark.slow
+def test_a_bench_test_decides_and_the_vehicle_stays_in_its_mode(bench: Bench, exported: Path, tmp_path: Path) -> None:
+    flight = bench.fly(exported, tmp_path / "flight", "--dry", "--max-s", "2")
+    said = flight.communicate(timeout=60)[1]
+    assert flight.returncode == 1 and "the flight ended with time out" in said
+    records = read_records(tmp_path / "flight")
+    assert sum(each["kind"] == "decision" for each in records) >= 7
+    bench.link.read(time.monotonic())
+    assert bench.link.inputs().mode == "hold"
+
+
+ROOM = ["--goal", "9", "0", "5", "--volume", "0", "-5", "0", "20", "5", "9"]
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        (["policy", *ROOM], "'policy' must be an exported policy"),
+        (["a.onnx"], "--events is missing"),
+        (["a.onnx", "--events", "tcp:127.0.0.1:1", *ROOM], "there is no camera at"),
+        (["a.onnx", "--events", "nowhere", *ROOM], "no camera and no file"),
+        (["a.onnx", "--on", "bad weather=hold"], "there is no fault 'bad weather'"),
+        (["a.onnx", "--on", "low battery=flip"], "hover, hold or land, not by 'flip'"),
+        (["a.onnx", "--replay", "nowhere"], "there is no flight in 'nowhere'"),
+        (["a.onnx", "--camera", "0", "4"], "--camera must be two whole numbers"),
+        (["pretrained", "--simulate", "medium", "--speed", "0"], "--speed more than 0"),
+        (["nowhere", "--simulate", "medium"], "there is no run in 'nowhere'"),
+        (["a.onnx", "--simulate", "medium"], "needs the folder of a run"),
+        (["pretrained", "--simulate", "medium", "--goal", "1", "2", "3"], "--simulate gives --goal itself"),
+        (["a.onnx", "--pace", "3"], "--pace must be from 0.2 to 1"),
+        (["a.onnx", "--simulate", "medium", "--replay", "b"], "give one of them"),
+    ],
+)
+def test_bad_input_is_one_sentence(capsys: pytest.CaptureFixture[str], words: list[str], says: str) -> None:
+    assert main(["fly", *words]) == 2
+    said = capsys.readouterr().err
+    assert says in said and said.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        (["--camera", "128", "96", *ROOM], "the camera has 64 x 48 pixels, and --camera says 128 x 96"),
+        (["--goal", "9", "0", "5", "--volume", "0", "5", "0", "20", "-5", "9"], "lowest and its highest corner"),
+        ([*ROOM, "--on", "process stopped=hover"], "cannot be answered by hover"),
+        ([*ROOM, "--mavlink", "udpin:127.0.0.1:x"], "cannot be opened"),
+        (["--goal", "90", "0", "5", *ROOM[4:]], "no flight: goal outside the fence"),
+    ],
+)
+def test_a_camera_or_a_room_that_does_not_fit_is_one_sentence(
+    exported: Path, capsys: pytest.CaptureFixture[str], words: list[str], says: str
+) -> None:
+    server = EventServer(SIZE)
+    port = ["--mavlink", f"udpin:127.0.0.1:{free_port()}"]
+    assert main(["fly", str(exported), "--events", f"tcp:{server.address}", *port, *words]) == 2
+    server.close()
+    said = capsys.readouterr().err
+    assert says in said and said.count("\n") == 1
+
+
+def test_events_of_dv_processings_network_writer_are_read() -> None:
+    pytest.importorskip("dv_processing")
+    program = """
+import sys, time
+import dv_processing as dv
+
+writer = dv.io.NetworkWriter("127.0.0.1", int(sys.argv[1]), dv.io.Stream.EventStream(0, "events", "CAM", (346, 260)))
+print("there", flush=True)
+while writer.getClientCount() == 0:
+    time.sleep(0.01)
+store = dv.EventStore()
+for k in range(1000):
+    store.push_back(1_000_000 + k, k % 346, k % 260, k % 3 == 0)
+writer.writeEvents(store)
+time.sleep(60)
+"""
+    with socket.create_server(("127.0.0.1", 0)) as probe:
+        port = probe.getsockname()[1]
+    writer = subprocess.Popen([sys.executable, "-c", program, str(port)], stdout=subprocess.PIPE, text=True)
+    assert writer.stdout is not None and writer.stdout.readline() == "there\n"
+    source = DvStream(f"127.0.0.1:{port}")
+    until = time.monotonic() + 20.0
+    while source.events.until_us < 0 and time.monotonic() < until:
+        source.read(3.0)
+    writer.kill()
+    writer.communicate()
+    source.close()
+    window = source.events.window(1_000_000, 1_001_000)
+    assert source.events.size == (346, 260) and window.size == 1000
+    assert window["x"].tolist() == [k % 346 for k in range(1000)]
+    assert np.mean(window["p"] == 1) == pytest.approx(0.334)
