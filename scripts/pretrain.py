@@ -1,7 +1,11 @@
-"""Makes a policy that comes with the package: trains five seeds, measures the best and writes its model card.
+r"""Makes a policy that comes with the package: trains five seeds, measures the best and writes its model card.
 
     python scripts/pretrain.py --run runs/pretrained --out edqn_jax/policies/pretrained
-    python scripts/pretrain.py --looks --run runs/looks --out edqn_jax/policies/pretrained-looks
+    python scripts/pretrain.py --kind looks --run runs/looks --out runs/looks-first
+    python scripts/pretrain.py --kind further --start-from runs/looks-first --run runs/further \
+        --out edqn_jax/policies/pretrained-looks
+    python scripts/pretrain.py --kind body --start-from runs/looks-first --run runs/body \
+        --out edqn_jax/policies/pretrained-body
 
 Training needs a GPU: for `mixed` worlds 24 minutes on two H100, 16 of them training (`train.py ... --train.devices 2`,
 with the options that this script has), for `open` ones eight on one. Where --run holds the seeds already, the best is
@@ -49,8 +53,16 @@ LOOKS = (
     *("--body.mass-share", "0.2", "--motors.gain-share", "0.2", "--motors.lag-s", "0.05"),
     *("--train.validation-missions", "64"),
 )
-"""Further options of the policy of any look (`--looks`, docs/surfaces.md): surfaces and event sensors that are drawn, a
-third frame, from which motion shows, an encoder that is larger and learns five times as long, errors of tracking."""
+"""Further options of the policy of any look (docs/surfaces.md): surfaces and event sensors that are drawn, a third
+frame, from which motion shows, an encoder that is larger and learns five times as long, errors of tracking."""
+
+AGAIN = (
+    *("--encoder.warmup-decisions", "2097152", "--encoder.learning-rate", "1e-3"),
+    *("--agent.exploration-start", "0.2", "--agent.exploration-fraction", "0.05"),
+)
+"""What begins with a policy: its encoder learns again, by smaller steps; a fifth of the moves are random at first."""
+
+BODY = ("--camera.mount", "body", "--encoder.levelled")
 
 VALIDATED_EVERY = {"open": 20_000_000, "mixed": 0}
 """Decisions between validations, by the worlds; 0 validates at the end alone: several seeds take minutes for one."""
@@ -58,8 +70,14 @@ VALIDATED_EVERY = {"open": 20_000_000, "mixed": 0}
 DECISIONS = {"open": 60_000_000, "mixed": 300_000_000}
 """Decisions of each seed, by the worlds that can be trained on."""
 
-OF_LOOKS = 220_000_000
-"""Decisions of each seed of the policy of any look."""
+KINDS: dict[str, tuple[int, tuple[str, ...]]] = {
+    "plaid": (0, ("--surface.pattern", "plaid")),
+    "looks": (220_000_000, LOOKS),
+    "further": (185_000_000, (*LOOKS, *AGAIN, "--encoder.retrain-at", "0.05", "0.35")),
+    "body": (230_000_000, (*LOOKS, *AGAIN, *BODY, "--encoder.retrain-at", "0.06", "0.3")),
+}
+"""Decisions of each seed, 0 as `DECISIONS`, and further options, by the kind of policy: of one plaid, of any look, the
+latter trained further, and with a camera on the body; these two begin with one of any look."""
 
 MISSIONS = 1000
 """Test worlds of each family; training never uses them."""
@@ -110,20 +128,24 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("--run", type=Path, required=True, help="folder of the runs; trained if there are none")
     parser.add_argument("--out", type=Path, required=True, help="folder of policy and card; replaced")
     parser.add_argument("--world", choices=sorted(DECISIONS), default="mixed", help="to train on (default mixed)")
-    parser.add_argument("--looks", action="store_true", help="with surfaces and event sensors that are drawn")
+    parser.add_argument("--kind", choices=sorted(KINDS), default="plaid", help="of policy (default plaid)")
+    parser.add_argument("--start-from", type=Path, help="policy of any look that `further` and `body` begin with")
     parser.add_argument("--missions", type=int, default=MISSIONS, help=f"test worlds of a family (default {MISSIONS})")
     parser.add_argument("--trained", help="where and how long the run was trained, if its summary.json does not say")
     parser.add_argument("--commit", help="commit that the run was trained at; needed if it is not trained now")
     args = parser.parse_args(argv)
     if args.missions < 1:
         parser.error(f"--missions must be at least 1, not {args.missions}")
+    if (args.kind in ("further", "body")) != (args.start_from is not None):
+        parser.error("--start-from is for the kinds further and body, and needed there")
     trained = args.run.is_dir()
     if trained and args.commit is None:
         parser.error(f"'{args.run}' was trained before; say with --commit at which commit")
     try:
         _check_replaceable(args.out)
         if not trained:
-            _train(args.run, args.world, args.looks)
+            begin = [] if args.start_from is None else ["--start-from", str(args.start_from)]
+            _train(args.run, [*options_of(args.world, args.kind), *begin])
         use_cpu_devices()
         run = best_of(args.run)
         policy = load_policy(run)
@@ -186,12 +208,12 @@ def card_of(
     )
 
 
-def options_of(world: str, looks: bool = False) -> list[str]:
-    """Returns the options of train.py for these worlds, without seeds and folder."""
-    decisions = OF_LOOKS if looks else DECISIONS[world]
-    numbers = {"--total-steps": decisions, "--train.validation-every": VALIDATED_EVERY[world]}
+def options_of(world: str, kind: str = "plaid") -> list[str]:
+    """Returns the options of train.py for these worlds and a kind of policy, without seeds, folder and beginning."""
+    decisions, further = KINDS[kind]
+    numbers = {"--total-steps": decisions or DECISIONS[world], "--train.validation-every": VALIDATED_EVERY[world]}
     words = [*FLAGS, "--world", world, *(word for name, number in numbers.items() for word in (name, str(number)))]
-    return [*words, *LOOKS] if looks else words
+    return [*words, *further]
 
 
 def families_of(policy: Policy) -> list[str]:
@@ -239,8 +261,8 @@ def _paper(figures: dict[str, Any], radius: float) -> str:
     )
 
 
-def _train(run: Path, world: str, looks: bool) -> None:
-    asked = [*options_of(world, looks), "--seeds", str(SEEDS), "--run-dir", str(run)]
+def _train(run: Path, options: Sequence[str]) -> None:
+    asked = [*options, "--seeds", str(SEEDS), "--run-dir", str(run)]
     code = subprocess.run([sys.executable, str(ROOT / "train.py"), *asked]).returncode
     if code:
         raise ConfigError(f"the training in '{run}' ended with exit code {code}; what it printed says why")

@@ -62,9 +62,9 @@ class TrainOptions:
     """Train K policies, of the seeds from --seed on, side by side in one program; each gets a folder `seed-N` in the
     folder of the run, whose summary has every seed's success and their interquartile mean."""
     start_from: Annotated[Path | None, arg(metavar="POLICY", help_behavior_hint="")] = None
-    """Begin with the networks of a policy: the folder of a run, or `pretrained` or `pretrained-looks`. Camera, sensor,
-    encoder and network are then its own, the encoder learns no more unless `encoder.warmup_decisions` says so, and a
-    tenth of the moves are random at first."""
+    """Begin with the networks of a policy: the folder of a run, or one of the package, such as `pretrained-looks`.
+    Camera, sensor, encoder and network are then its own, the encoder learns no more unless `encoder.warmup_decisions`
+    says so, and a tenth of the moves are random at first."""
     run_dir: Annotated[Path | None, arg(metavar="DIR", help_behavior_hint="")] = None
     """Folder for the files of the run (default: a new, dated folder under runs/)."""
     resume: Resume = "auto"

@@ -25,12 +25,12 @@ class EncoderConfig:
 
     architecture: str = "patches"
     """How the encoder reads what the sensor shows."""
-    levelled: bool = False
-    """Whether the events of a camera on the body are moved to where a level one would have them, by roll and pitch,
-    before they are encoded; the label is drawn level then, too."""
     target: Literal["nearness", "sensed", "both"] = "nearness"
     """What the decoder draws. `nearness`: how near things are, a label of the simulator that only training needs;
     `sensed`: what the sensor shows, as in the paper; `both`."""
+    levelled: bool = False
+    """Whether the events of a camera on the body are moved to where a level one would have them, by roll and pitch,
+    before they are encoded; the label is drawn level then, too."""
     code_size: Annotated[int, COUNT] = 32
     """Values in the code z."""
     patch_pixels: Annotated[int, COUNT] = 4

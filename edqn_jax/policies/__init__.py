@@ -8,10 +8,11 @@ from pathlib import Path
 
 from edqn_jax.errors import ConfigError
 
-PRETRAINED, LOOKS = "pretrained", "pretrained-looks"
-"""Names of the policies for random worlds, open and closed ones: of one plaid, and of surfaces of any look."""
+PRETRAINED, LOOKS, BODY = "pretrained", "pretrained-looks", "pretrained-body"
+"""Names of the policies for random worlds, open and closed ones: of one plaid, of surfaces of any look, and of any look
+with a camera on the body."""
 
-SHIPPED = (PRETRAINED, LOOKS)
+SHIPPED = (PRETRAINED, LOOKS, BODY)
 
 
 def function_named(name: str | Path) -> tuple[str, str] | None:

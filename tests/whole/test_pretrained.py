@@ -12,7 +12,7 @@ import pytest
 
 import edqn_jax
 from edqn_jax.cli.train import parse_train
-from edqn_jax.policies import LOOKS, PRETRAINED, SHIPPED, policy_folder
+from edqn_jax.policies import BODY, LOOKS, PRETRAINED, SHIPPED, policy_folder
 from edqn_jax.runs.directory import version_of
 
 FOLDER = policy_folder(Path(PRETRAINED))
@@ -69,7 +69,10 @@ def test_its_script_trains_with_its_options(name: str, monkeypatch: pytest.Monke
     monkeypatch.syspath_prepend(str(Path(__file__).parents[2] / "scripts"))
     options = edqn_jax.load_policy(name).config
     script = import_module("pretrain")
-    _, asked = parse_train(script.options_of(options.world.name, looks=name == LOOKS))
+    words = script.options_of(options.world.name, {PRETRAINED: "plaid", LOOKS: "further", BODY: "body"}[name])
+    _, asked = parse_train(words)
+    if name != PRETRAINED:  # began with a policy of any look
+        assert parse_train([*words, "--start-from", LOOKS])[1] == asked
     # Where it ran and how often it saved say nothing of what was learnt.
     elsewhere = {
         name: getattr(options.train, name) for name in ("seed", "devices", "checkpoint_every_s", "checkpoints")

@@ -292,9 +292,9 @@ def count_events(
     mean change. So a pixel's ON and OFF events within one pair of frames cancel, as they do for two frames; only a
     policy that was trained with sensor noise counts them apart. At the policy's own resolution and contrast every count
     is that of the events themselves. A policy that knows the contrast counts in the camera's own; of one that was
-    trained with the mean of many pixels, a count is that of so many pixels together, and of a finer camera the ON and OFF
-    events of all of them cancel: a picture that is finer than the policy's pixels makes both at once, of which it has
-    learnt the mean alone.
+    trained with the mean of many pixels, a count is that of so many pixels together, and of a finer camera the ON and
+    OFF events of all of them cancel: a picture that is finer than the policy's pixels makes both at once, of which it
+    has learnt the mean alone.
 
     Args:
         about: of the policy, see `Runner.about`.

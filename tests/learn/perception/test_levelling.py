@@ -70,9 +70,9 @@ def test_roll_and_pitch_are_those_of_the_attitude() -> None:
 
 
 def field_of(signed: np.ndarray, *, with_noise: bool = False) -> EventField:
-    signed = jnp.asarray(signed, jnp.int32)
-    times = jnp.broadcast_to(0.01 * jnp.arange(signed.shape[-3], dtype=jnp.float32)[:, None, None], signed.shape)
-    return EventField(jnp.abs(signed), jnp.sign(signed).astype(jnp.int8), times, times, 0.08, with_noise=with_noise)
+    events = jnp.asarray(signed, jnp.int32)
+    times = jnp.broadcast_to(0.01 * jnp.arange(events.shape[-3], dtype=jnp.float32)[:, None, None], events.shape)
+    return EventField(jnp.abs(events), jnp.sign(events).astype(jnp.int8), times, times, 0.08, with_noise=with_noise)
 
 
 @pytest.mark.parametrize("whole", [True, False])
@@ -99,14 +99,14 @@ def test_many_fields_are_levelled_as_one_by_one_pixel_by_pixel(whole: bool) -> N
             for half in (pair, pair + 2):
                 expected = np.zeros((24, 32))
                 for r, c in zip(*np.nonzero(seen), strict=True):
-                    expected[r, c] = _sample(signed[one, half], rows[r, c], columns[r, c], whole)
+                    expected[r, c] = _sample(signed[one, half], float(rows[r, c]), float(columns[r, c]), whole)
                 np.testing.assert_allclose(found[one, half], expected, atol=0.51)  # rounded to whole events
                 assert seen.mean() > 0.3
 
 
 def _sample(picture: np.ndarray, row: float, column: float, whole: bool) -> float:
     if whole:
-        return picture[round(float(row)), round(float(column))]
+        return picture[round(row), round(column)]
     top, left = int(row), int(column)
     below, beside = min(top + 1, 23), min(left + 1, 31)
     down, right = row - top, column - left
