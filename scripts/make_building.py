@@ -1,4 +1,4 @@
-"""Makes `scenes/examples/building.obj`: a furnished house of two storeys, 24 x 14 x 8 m, some 50,000 triangles.
+"""Makes `scenes/examples/building.obj`: a furnished house of two storeys, 24 x 14 x 8 m, some 60,000 triangles.
 
     python scripts/make_building.py
 

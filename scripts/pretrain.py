@@ -89,7 +89,7 @@ A policy for random worlds ({families}), flown from simulated events.
 
 | | |
 | --- | --- |
-| trained on | {pool:,} worlds (`--world {world}`, the training split), {missions:,} missions |
+| trained on | {pool:,} worlds (`--world {world} --surface.pattern plaid`, the training split), {missions:,} missions |
 | training | {decisions:,} decisions in {envs:,} environments, last averaged parameters; {trained} |
 | seed | {seed}, the best of {seeds} in the validation worlds |
 | sees | events of the last {window:g} s (threshold {threshold:g}), its own state and motion |

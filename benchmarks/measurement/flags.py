@@ -14,7 +14,7 @@ SAMPLES = 4
 
 
 ONE_LOOK = ("--surface.pattern", "plaid")
-"""What is flown unless options say otherwise: every figure of the pages was measured in worlds of one plaid."""
+"""What is flown unless options say otherwise: the figures of the pages are of one plaid unless their row says more."""
 
 
 def split(words: Sequence[str]) -> tuple[list[str], list[str]]:

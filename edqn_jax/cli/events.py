@@ -50,7 +50,8 @@ class EventsArgs:
     stop: Annotated[float | None, arg(metavar="S", help_behavior_hint="")] = None
     """Leave out what is from this on, seconds from the first event."""
     policy: Annotated[Path | None, arg(metavar="RUN", help_behavior_hint="")] = None
-    """Run, or `pretrained`, at whose resolution and in whose windows the events are shown, and which encodes them."""
+    """Run, or a policy of the package, at whose resolution and in whose windows the events are shown, and which encodes
+    them."""
     contrast: Annotated[float | None, arg(metavar="C", help_behavior_hint="")] = None
     """Change of log brightness that makes an event in the camera (default: that of the policy)."""
     fov: Annotated[float | None, arg(metavar="DEG", help_behavior_hint="")] = None

@@ -19,7 +19,7 @@ class ExportArgs:
     """Write a policy as ONNX, for a computer without JAX, and beside it the runner that flies it; compare both."""
 
     run: Annotated[Positional[Path], arg(metavar="RUN")]
-    """Folder of the run, or `pretrained`: the policy that comes with the package."""
+    """Folder of the run, or a policy of the package: `pretrained`, `pretrained-looks` or `pretrained-body`."""
     out: Annotated[Path, arg(metavar="FILE.onnx")]
     """File to write; it replaces one of that name."""
     checks: Annotated[int, arg(metavar="N")] = 1000

@@ -21,7 +21,7 @@ class RecordArgs:
     """Fly a policy once and write the flight as a GIF or MP4, or the events of a camera that watches it."""
 
     run: Annotated[Positional[Path], arg(metavar="POLICY")]
-    """Folder of a run, or `pretrained`: the policy that comes with the package; or any function of your own, as
+    """Folder of a run, or a policy of the package, such as `pretrained`; or any function of your own, as
     `module:name` or `path/to/file.py:name`."""
     file: Annotated[Positional[Path], arg(metavar="FILE")]
     """What to write; it replaces a file of that name. FILE.gif or .mp4 (extra `video`): the view, what the drone sees,

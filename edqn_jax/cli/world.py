@@ -29,7 +29,8 @@ class WorldArgs:
     scale: Annotated[float, arg(metavar="M")] = 1.0
     """Metres of a unit of the file: 0.001 if it is in millimetres."""
     up: Annotated[str | None, arg(metavar="AXIS", help_behavior_hint="")] = None
-    """Axis of the file that points up: x, y, z, -x, -y or -z (default: y of .glb, z of the others)."""
+    """Axis of the file that points up: x, y or z, or --up=-x, --up=-y or --up=-z (default: y of .glb, z of the
+    others)."""
     thickness: Annotated[float | None, arg(metavar="M", help_behavior_hint="")] = None
     """Thickness of the surface of a mesh that is not closed, or of points, metres (default: a mesh must be closed;
     points 0.1)."""
@@ -53,7 +54,7 @@ def parse_world(argv: Sequence[str]) -> WorldArgs:
         raise ConfigError(f"--thickness must be above 0, to 1 m, not {args.thickness:g}")
     ups = ("x", "y", "z", "-x", "-y", "-z")
     if args.up is not None and args.up not in ups:
-        raise ConfigError(f"--up '{args.up}' is no axis; give one of {', '.join(ups)}")
+        raise ConfigError(f"--up '{args.up}' is no axis; give --up={', --up='.join(ups)}")
     if args.out.exists() and (not args.out.is_dir() or any(args.out.iterdir())):
         raise ConfigError(f"--out '{args.out}' exists and is not empty; name a new folder")
     return args

@@ -144,7 +144,7 @@ def test_what_cannot_be_a_world_is_refused_in_a_sentence_and_nothing_is_written(
         (["--scale", "0"], "--scale must be above 0 and finite"),
         (["--scale", "nan"], "--scale must be above 0 and finite"),
         (["--thickness", "2"], "--thickness must be above 0, to 1 m"),
-        (["--up", "up"], "--up 'up' is no axis; give one of x, y, z, -x, -y, -z"),
+        (["--up", "up"], "--up 'up' is no axis; give --up=x, --up=y, --up=z, --up=-x, --up=-y, --up=-z"),
     ],
 )
 def test_options_are_checked(words: list[str], says: str, capsys: pytest.CaptureFixture[str]) -> None:

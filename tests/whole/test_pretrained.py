@@ -39,7 +39,10 @@ def test_a_folder_of_that_name_goes_first(tmp_path: Path, monkeypatch: pytest.Mo
 def test_its_card_tells_of_its_training() -> None:
     card, config = (FOLDER / "README.md").read_text(), edqn_jax.load_policy(PRETRAINED).config
     assert f"{config.train.total_steps:,} decisions" in card and f"| seed | {config.train.seed}, " in card
-    assert f"{config.world.pool_size:,} worlds (`--world mixed`" in card and config.world.name == "mixed"
+    assert (
+        f"{config.world.pool_size:,} worlds (`--world mixed --surface.pattern plaid`" in card
+        and config.world.name == "mixed"
+    )
     for family in ("sparse", "medium", "dense", "rooms", "forest", "canyon"):
         assert re.search(rf"^\| {family} \| 1000 \| (9\d|100)\.\d% \| ", card, re.MULTILINE), family
 

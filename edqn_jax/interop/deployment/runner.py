@@ -333,8 +333,16 @@ def count_events(
     told = contrast is None or about.get("known_contrast")
     per_event = [1.0 if told else contrast / own for own in (about["contrast_on"], about["contrast_off"])]
     change = number * np.asarray(per_event)[:, None, None] / np.maximum(pixels, 1)
+    return _counts_of(about, change, is_finer=bool(pixels.max() > 1))
+
+
+def _counts_of(about: Mapping[str, Any], change: NDArray, *, is_finer: bool) -> NDArray[np.int32]:
+    """Returns events as the policy counts them of mean changes [F, 2, H, W] in contrasts, ON and OFF.
+
+    `is_finer` says whether the camera has several pixels under one of the policy's.
+    """
     together = about.get("sensor_pixels", 1)
-    if about["counts_net"] or (together > 1 and pixels.max() > 1):
+    if about["counts_net"] or (together > 1 and is_finer):
         # In contrasts of the policy, which may differ between ON and OFF.
         log_change = change[:, 0] * about["contrast_on"] - change[:, 1] * about["contrast_off"]
         change = np.stack([log_change / about["contrast_on"], -log_change / about["contrast_off"]], axis=1)

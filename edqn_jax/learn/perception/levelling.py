@@ -52,7 +52,7 @@ def level_events(camera: CameraConfig, field: EventField, lean: Array, *, whole:
     moved = jnp.where(seen, moved, 0)
     first, step = (pick(x, *near) for x in (field.t_first, field.t_step))
     return dataclasses.replace(
-        field, count=jnp.abs(moved), polarity=jnp.sign(moved).astype(jnp.int8), t_first=first, t_step=step
+        field, count=jnp.abs(moved), polarity=jnp.sign(moved).astype(field.polarity.dtype), t_first=first, t_step=step
     )
 
 

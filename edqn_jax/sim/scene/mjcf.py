@@ -158,7 +158,7 @@ def load_world(path: str | Path) -> LoadedWorld:
 
 
 def compile_model(path: Path) -> mujoco.MjModel:
-    """Returns the model of a file, which names no other.
+    """Returns the model of a file, which names none but meshes and height fields in its folder.
 
     Raises:
         SceneError: if MuJoCo cannot read it, or it has more geoms than `MAX_SHAPES`.

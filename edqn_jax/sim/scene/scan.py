@@ -23,9 +23,6 @@ from edqn_jax.sim.scene.shapes.kind import THICKNESS
 KINDS = ("ply", "stl", "obj", "glb")
 """Endings of scans."""
 
-UPS = ("x", "y", "z", "-x", "-y", "-z")
-"""Axes of a file that may point up."""
-
 MOST_READ = 5_000_000
 """Triangles, or points, of a scan."""
 

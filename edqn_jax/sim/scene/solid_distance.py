@@ -72,8 +72,10 @@ def solid_distances(
         middles: [X - 1, Y - 1, Z - 1]; exact within `EXACT_CELLS` of the surface, elsewhere infinite.
     """
     pieces = split_triangles(triangles, _PIECE_CELLS * cell)
-    with jax.default_device(jax.local_devices(backend="cpu")[0]):
-        table = jnp.asarray(_table_of(pieces), jnp.float32)
+    cpu = jax.local_devices(backend="cpu")[0]
+    with jax.default_device(cpu):
+        # Put there for good: the default is a thread's own, and threads compare.
+        table = jax.device_put(np.asarray(_table_of(pieces), np.float32), cpu)
         corners, middles, nearest = _near_distances(pieces, table, counts, cell)
         away = _far_distances(table, nearest, corners, cell) - _FAR_CELLS * cell
     corners[~np.isfinite(corners)] = np.maximum(away, EXACT_CELLS * cell)
