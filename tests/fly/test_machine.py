@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from edqn_jax.fly.faults import ACTIONS, PASSING, Action, Command, Fault, Inputs, Odometry, Settings
 from edqn_jax.fly.machine import Phase, State, step
-from tests.fly.virtual import CAMERA, PERIOD_S, TICK_S, Change, fly
+from tests.support.virtual_flight import CAMERA, PERIOD_S, TICK_S, Change, fly
 
 FENCE = np.array([[-5.0, -20.0, 0.0], [100.0, 20.0, 25.0]])
 GOAL = np.array([60.0, 5.0, 6.0])

@@ -19,7 +19,7 @@ from edqn_jax.fly.records import RECORDS, FlightLog, inputs_of, read_records, se
 from edqn_jax.fly.replay import replay
 from edqn_jax.fly.streams import EVENT, Events
 from edqn_jax.interop.deployment.runner import Command
-from tests.fly.virtual import CAMERA, PERIOD_S, TICK_S, Vehicle
+from tests.support.virtual_flight import CAMERA, PERIOD_S, TICK_S, Vehicle
 
 GOAL = np.array([12.0, 0.0, 5.0])
 FENCE = np.array([[-5.0, -20.0, 0.0], [40.0, 20.0, 25.0]])

@@ -18,7 +18,7 @@ import pytest
 from edqn_jax.native import build, shipped
 from edqn_jax.sim.camera import native
 from edqn_jax.sim.camera.camera import LUMA_WEIGHTS
-from tests.sim.camera.test_native import CONFIG, ROUNDING, TIES, crowd, frames, in_c
+from tests.support.camera_in_c import CONFIG, ROUNDING, TIES, crowd, frames, in_c
 from tests.support.processes import ROOT
 
 X86 = [f"x86-64-v{level}" for level in (4, 3, 2)]

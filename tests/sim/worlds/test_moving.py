@@ -222,7 +222,8 @@ def test_moving_worlds_reuse_no_key_and_promote_no_rank():
 
 
 def test_environments_and_evaluations_fly_in_what_the_configuration_says():
-    config = make_config("medium", world={"moving_share": 1.0, "moving_speed_m_s": 2.0, "balls": 2})
+    moving = {"moving_share": 1.0, "moving_speed_m_s": 2.0, "balls": 2}
+    config = make_config("medium", world=moving, surface={"pattern": "plaid"})
     expected = random_pool("medium", world_keys("test", 2), Moving(share=1.0, speed_m_s=2.0, balls=2))
     for pool in (
         make("medium", config, worlds=2, split="test").world.pool,
