@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -24,8 +24,11 @@ if TYPE_CHECKING:
 
 Ending = Literal["hover", "hold", "land"]
 
-OF_THE_WORLD = ("events", "fov", "contrast", "goal", "volume", "fence", "dry", "clock")
+OF_THE_WORLD = "mavlink events fov contrast goal volume fence origin goal_radius max_s dry clock".split()
 """Options that a simulated flight has from its world."""
+
+OF_THE_LOG = ("fov", "contrast")
+"""Options that a flight's log holds, where they are not given once more."""
 
 
 @dataclass(frozen=True)
@@ -33,7 +36,7 @@ class FlyArgs:
     """Fly an exported policy over MAVLink from a camera's events; play a logged flight again; simulate flights."""
 
     policy: Annotated[Positional[Path], arg(metavar="POLICY")]
-    """POLICY.onnx, as `edqn export` writes it; with --simulate also the folder of a run, `pretrained` or
+    """POLICY.onnx, as `edqn export` writes it; with --simulate the folder of a run, or a policy of the package, such as
     `pretrained-looks`."""
     simulate: Annotated[str | None, arg(metavar="WORLD", help_behavior_hint="")] = None
     """Fly here, in a world by name or an MJCF file: three processes, RotorPy's quadrotor, evlib's events (extra
@@ -58,9 +61,9 @@ class FlyArgs:
     camera: Annotated[tuple[int, int] | None, arg(metavar="W H", help_behavior_hint="")] = None
     """Pixels of the camera across and down (default: with --simulate 346 260, else what it says)."""
     fov: Annotated[float | None, arg(metavar="DEG", help_behavior_hint="")] = None
-    """Horizontal field of view of the camera, degrees (default: the policy's)."""
+    """Horizontal field of view of the camera, degrees (default: the policy's; with --replay the log's)."""
     contrast: Annotated[float | None, arg(metavar="C", help_behavior_hint="")] = None
-    """Change of log brightness that makes an event in the camera (default: the policy's)."""
+    """Change of log brightness that makes an event in the camera (default: the policy's; with --replay the log's)."""
     goal: Annotated[Point | None, arg(metavar="X Y Z", help_behavior_hint="")] = None
     """Goal in the policy's world: metres east, north, up."""
     volume: Annotated[
@@ -118,12 +121,16 @@ def parse_fly(argv: Sequence[str]) -> FlyArgs:
     if args.json is not None:
         check_can_write(args.json)
     if args.simulate is not None:
-        if args.policy.suffix != ".onnx":
-            check_is_saved(args.policy, f"{FLY} --simulate")
-            check_run(args.policy)
-        for name in OF_THE_WORLD:
-            if getattr(args, name) not in (None, False):
-                raise ConfigError(f"--simulate gives --{name} itself; leave it out")
+        if args.policy.suffix == ".onnx":
+            raise ConfigError(
+                f"--simulate needs the folder of a run, or a policy of the package, such as pretrained-looks, not "
+                f"'{args.policy}', which does not say what it was trained for"
+            )
+        check_is_saved(args.policy, f"{FLY} --simulate")
+        check_run(args.policy)
+        for each in fields(FlyArgs):
+            if each.name in OF_THE_WORLD and getattr(args, each.name) != each.default:
+                raise ConfigError(f"--simulate gives --{each.name.replace('_', '-')} itself; leave it out")
         return args
     if args.policy.suffix != ".onnx":
         raise ConfigError(f"'{args.policy}' must be an exported policy; 'edqn export {args.policy}' writes one")
@@ -195,14 +202,19 @@ def fly(args: FlyArgs, stops: Stops) -> None:
         if args.out is not None:
             log = FlightLog(args.out)
             stack.callback(log.close)
-        clock = SimulatedClock(args.clock, "autopilot") if args.clock else WallClock()
+        clock = WallClock()
+        if args.clock is not None:
+            clock = SimulatedClock(args.clock, "autopilot")
+            stack.callback(clock.close)
         stack.enter_context(stops.obey_signals(lambda _: None))
-        task = Task(settings, np.reshape(args.volume, (2, 3)), args.pace, args.dry)
+        task = Task(settings, np.reshape(args.volume, (2, 3)), args.pace, args.dry, args.fov, args.contrast)
         pilot = Pilot(runner, link, source, clock, task, log=log, stop=stops.is_requested)
         try:
             report = pilot.fly()
-        except ConnectionError:  # of the simulated clock, whose keeper says why it ended
-            return
+        except ConnectionError:
+            if args.clock is None:
+                raise
+            return  # the clock's keeper says why it ended
     end(report, stops)
 
 
@@ -290,7 +302,8 @@ def replay(args: FlyArgs, folder: Path) -> None:
     runner = None
     if begun is not None:
         width, height = begun["settings"]["camera"]
-        runner = load_runner(replace(args, camera=None), (width, height))
+        told = {name: begun.get(name) if getattr(args, name) is None else getattr(args, name) for name in OF_THE_LOG}
+        runner = load_runner(replace(args, camera=None, **told), (width, height))
     again = play(folder, runner)
     print(
         f"{again.ticks:,} ticks, {again.other_outputs} of them with another output; {again.decisions:,} decisions, "
@@ -314,8 +327,6 @@ def simulate(args: FlyArgs) -> None:
     from edqn_jax.runs.policies import load_policy
 
     assert args.simulate is not None
-    if args.policy.suffix == ".onnx":
-        raise ConfigError("--simulate needs the folder of a run, pretrained or pretrained-looks, for its worlds")
     policy = load_policy(args.policy)
     environment = environment_of(args.simulate, policy.config, args.missions, args.seed)
     with tempfile.TemporaryDirectory() as folder:

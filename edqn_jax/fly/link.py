@@ -7,9 +7,11 @@ guided, brake and land (the latter was tried against no ArduPilot). Nothing here
 from __future__ import annotations
 
 import collections
+import contextlib
 import dataclasses
 import itertools
 import os
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -127,14 +129,15 @@ class Link:
         self._attitudes: collections.deque[tuple[float, NDArray[np.float64]]] = collections.deque()
         self._yaw_rate = 0.0
         self._sent_at: dict[str, float] = {}
+        self._errors: set[str] = set()
         self.offset = ClockOffset()
         """Of the autopilot's clock."""
         self.said: list[str] = []
         """What the vehicle told people, and what it refused; whoever reads it empties it."""
 
     def read(self, now: float) -> None:
-        """Takes what has come, of a flood not all at once."""
-        for message in itertools.takewhile(lambda each: each is not None, (self._wire.recv_msg() for _ in range(MANY))):
+        """Takes what has come, of a flood not all at once; a link that breaks falls silent."""
+        for message in itertools.takewhile(lambda each: each is not None, (self._next() for _ in range(MANY))):
             kind = message.get_type()
             if kind == "BAD_DATA":
                 self._wrong = self._wrong or ("" if self._vehicle else "what comes there is not MAVLink")
@@ -185,6 +188,10 @@ class Link:
             yaw: radians from the world's x to the left; None keeps the heading.
             now: host's seconds.
         """
+        with self._told_if_it_breaks():
+            self._send(velocity, yaw, now)
+
+    def _send(self, velocity: ArrayLike | None, yaw: float | None, now: float) -> None:
         out = self._wire.mav
         if self._is_due("heartbeat", 1.0, now):
             out.heartbeat_send(18, 8, 0, 0, 4)  # an onboard controller, no autopilot
@@ -216,7 +223,8 @@ class Link:
             return
         main, sub = MODES[self._autopilot][mode]
         self._mode_asked = mode
-        self._command(DO_SET_MODE, 1, main, sub)
+        with self._told_if_it_breaks():
+            self._command(DO_SET_MODE, 1, main, sub)
 
     def forget_masters(self) -> None:
         """Forgets who steered before: to be called as a flight begins."""
@@ -225,6 +233,22 @@ class Link:
     def close(self) -> None:
         """Closes the link."""
         self._wire.close()
+
+    @contextlib.contextmanager
+    def _told_if_it_breaks(self) -> Iterator[None]:
+        """Tells people of each error of socket or device once; the state machine knows a lost link by its silence."""
+        try:
+            yield
+        except OSError as error:
+            if str(error) not in self._errors:
+                self._errors.add(str(error))
+                self.said.append(f"the link is broken: {error}")
+
+    def _next(self) -> Any:
+        """Returns a message; None if none has come, or none can."""
+        with self._told_if_it_breaks():
+            return self._wire.recv_msg()
+        return None
 
     def _is_due(self, what: str, every_s: float, now: float) -> bool:
         if now - self._sent_at.get(what, -np.inf) < every_s - 1e-6:

@@ -70,6 +70,9 @@ class Task:
     needs only the square of it of the acceleration."""
     dry: bool = False
     """A bench test: decides and sends zero velocity, and asks for no mode."""
+    fov_deg: float | None = None
+    """Of the camera, as the runner was told; for the log, as `contrast`."""
+    contrast: float | None = None
 
 
 def at_pace(events: NDArray, until_us: int, pace: float) -> NDArray:
@@ -111,6 +114,7 @@ class Pilot:
         self.runner, self.link, self.source, self.clock = runner, link, source, clock
         self.settings, self._volume = task.settings, np.asarray(task.volume)
         self._pace, self._dry = task.pace, task.dry
+        self._camera = {"fov": task.fov_deg, "contrast": task.contrast}
         self._log, self._stop, self._tell = log, stop, tell
         self.state = State()
         self.latency = Latency()
@@ -123,7 +127,8 @@ class Pilot:
     def fly(self) -> Report:
         """Flies until it has ended."""
         if self._log is not None:
-            self._log.write("settings", settings=self.settings, pace=self._pace, about=self.runner.about)
+            about = self.runner.about
+            self._log.write("settings", settings=self.settings, pace=self._pace, **self._camera, about=about)
         began, ticks = self.clock.now(), 0
         try:
             while self.state.phase is not Phase.ENDED:
@@ -153,6 +158,8 @@ class Pilot:
         inputs = self._inputs()
         before = self.state.phase
         self.state, output = step(self.state, inputs, now, self.settings)
+        if self.state.phase is Phase.READY and before is not Phase.READY:
+            self.link.forget_masters()  # a mode that a pilot chose before is none of the flight
         if self.state.phase is Phase.FLYING and before is not Phase.FLYING:
             self._begin(now)
         self._write_tick(now, inputs, output)
@@ -254,6 +261,8 @@ class Pilot:
                 self._log.write("said", now=now, text=said)
             events = self.source.events
             if events.size is not None:
+                if events.until_us < self._written_us:  # the camera's clock began anew
+                    self._written_us = -1
                 packets = events.since(self._written_us)
                 self._log.write_events(events.size, packets)
                 self._written_us = packets[-1][0] if packets else self._written_us

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import json
 from pathlib import Path
@@ -29,7 +30,10 @@ class FlightLog:
         try:
             folder.mkdir(parents=True, exist_ok=True)
             self._records = (folder / RECORDS).open("x", encoding="utf-8")
-            self._events = (folder / EVENTS).open("xb")
+            with contextlib.ExitStack() as stack:
+                stack.callback(self._records.close)
+                self._events = (folder / EVENTS).open("xb")
+                stack.pop_all()
         except FileExistsError:
             raise ConfigError(f"'{folder}' holds a flight already; name another folder in --out") from None
         except OSError as error:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from pathlib import Path
 
 import numpy as np
@@ -55,14 +56,20 @@ def replay(folder: Path, runner: Runner | None = None) -> Replayed:
 
 
 def _other_moves(folder: Path, decisions: list[dict], runner: Runner, pace: float) -> int:
-    packets = read_stream(folder / EVENTS)
-    ends = np.array([until for until, _ in packets], np.int64)
-    other = 0
+    written = read_stream(folder / EVENTS)
+    anew = np.flatnonzero(np.diff([until for until, _ in written]) < 0) + 1
+    # The packets of each stretch in which the camera's clock did not begin anew, and their ends.
+    stretches = [written[first:last] for first, last in itertools.pairwise([0, *anew, len(written)])]
+    clocks = [(packets, np.array([until for until, _ in packets], np.int64)) for packets in stretches]
+    (packets, ends), newest, other = clocks.pop(0), -1, 0
     for decision in decisions:
         if decision["fresh"]:
             runner.reset()
         asked = decision["asked"]
         until = asked["until_us"]
+        while clocks and (until < newest or until > ends[-1]):
+            (packets, ends), newest = clocks.pop(0), -1
+        newest = until
         since = until - round(runner.window_us / pace)
         first, last = np.searchsorted(ends, [since, until + 1])
         held = np.concatenate([np.empty(0, EVENT), *(events for _, events in packets[first:last])])

@@ -10,14 +10,15 @@ from typing import Any
 import numpy as np
 import pytest
 
+from edqn_jax.cli import fly as command
 from edqn_jax.errors import ConfigError
 from edqn_jax.fly.faults import Fault, Inputs, Odometry, Settings
 from edqn_jax.fly.link import Own
 from edqn_jax.fly.machine import Output, Phase
 from edqn_jax.fly.pilot import Pilot, Task, at_pace
-from edqn_jax.fly.records import RECORDS, FlightLog, inputs_of, read_records, settings_of
+from edqn_jax.fly.records import EVENTS, RECORDS, FlightLog, inputs_of, read_records, settings_of
 from edqn_jax.fly.replay import replay
-from edqn_jax.fly.streams import EVENT, Events
+from edqn_jax.fly.streams import EVENT, Events, read_stream
 from edqn_jax.interop.deployment.runner import Command
 from tests.support.virtual_flight import CAMERA, PERIOD_S, TICK_S, Vehicle
 
@@ -100,17 +101,22 @@ class Camera:
     def read(self, now: float, least_us: int = -1) -> None:
         if now > self._ends_at:
             return
-        until = round(1e6 * (now + 7.0))
+        until = round(1e6 * self.shows(now))
         events = np.zeros(int(self._random.integers(2000, 4000)), EVENT)
         events["t"], events["p"] = until - 1, 1
         self.events.add(events, until, now)
+
+    def shows(self, now: float) -> float:
+        """Returns seconds of its clock."""
+        return now + 7.0
 
     def close(self) -> None: ...
 
 
 def make(policy: Any = None, wire: Any = None, camera: Any = None, **more: Any) -> tuple[Pilot, Any]:
     wire = wire or Wire()
-    task = Task(more.pop("settings", SETTINGS), FENCE, more.pop("pace", 1.0), more.pop("dry", False))
+    known = {name: more.pop(name) for name in ("pace", "dry", "fov_deg", "contrast") if name in more}
+    task = Task(more.pop("settings", SETTINGS), FENCE, **known)
     flier: Any = policy or Policy()
     pilot = Pilot(flier, wire, camera or Camera(), Time(), task, tell=lambda _: None, **more)
     return pilot, wire
@@ -144,6 +150,52 @@ def test_a_log_is_played_again_with_the_same_outputs_and_moves(tmp_path: Path) -
     lines[number] = json.dumps(json.loads(lines[number]) | {"move": 99})
     file.write_text("\n".join(lines) + "\n{cut off")
     assert replay(tmp_path / "flight", Policy()).other_moves == 1  # pyright: ignore[reportArgumentType]
+
+
+@pytest.mark.parametrize(("words", "fov", "contrast"), [([], 70.0, 0.15), (["--fov", "80"], 80.0, 0.15)])
+def test_a_replay_knows_the_camera_of_the_flight_unless_it_is_told_another(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, words: list[str], fov: float, contrast: float
+) -> None:
+    log = FlightLog(tmp_path)
+    pilot, _ = make(log=log, fov_deg=70.0, contrast=0.15)
+    pilot.fly()
+    log.close()
+    told: list[Any] = []
+    monkeypatch.setattr(command, "load_runner", lambda args, size: told.append((args.fov, args.contrast)) or Policy())
+    command.replay(command.parse_fly(["a.onnx", "--replay", str(tmp_path), *words]), tmp_path)
+    assert told == [(fov, contrast)]
+
+
+class Restarted(Camera):
+    """A camera whose clock begins anew at 52 s."""
+
+    def shows(self, now: float) -> float:
+        return now + 7.0 if now < 52.0 else now - 51.8
+
+
+def test_events_after_the_cameras_clock_began_anew_are_logged_and_played_again(tmp_path: Path) -> None:
+    log = FlightLog(tmp_path)
+    pilot, _ = make(camera=Restarted(), log=log)
+    report = pilot.fly()
+    log.close()
+    ends = [until for until, _ in read_stream(tmp_path / EVENTS)]
+    assert min(ends) < 1e6 < max(ends) and sum(np.diff(ends) < 0) == 1
+    again = replay(tmp_path, Policy())  # pyright: ignore[reportArgumentType]
+    assert (again.decisions, again.other_moves, again.outcome) == (report.decisions, 0, "goal")
+
+
+def test_a_mode_that_was_chosen_before_the_flight_is_of_no_second_master() -> None:
+    class Steered(Wire):
+        steered = True
+
+        def inputs(self) -> Inputs:
+            return dataclasses.replace(super().inputs(), other_master=self.steered)
+
+        def forget_masters(self) -> None:
+            self.steered = False
+
+    pilot, _ = make(wire=Steered())
+    assert pilot.fly().outcome == "goal"
 
 
 def test_inputs_and_settings_come_back_from_a_log(tmp_path: Path) -> None:
@@ -206,6 +258,16 @@ def test_a_log_is_not_written_over_and_no_log_is_one_sentence(tmp_path: Path) ->
     (tmp_path / RECORDS).write_text("{}\nnot json\n{}\n")
     with pytest.raises(ConfigError, match="is damaged"):
         read_records(tmp_path)
+
+
+def test_a_log_that_cannot_be_begun_leaves_no_file_open(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    opened: list[Any] = []
+    once = Path.open
+    monkeypatch.setattr(Path, "open", lambda *args, **more: opened.append(once(*args, **more)) or opened[-1])
+    (tmp_path / EVENTS).touch()
+    with pytest.raises(ConfigError, match="holds a flight already"):
+        FlightLog(tmp_path)
+    assert [each.closed for each in opened] == [True]
 
 
 def test_at_half_the_pace_a_policy_sees_and_is_told_what_it_would_at_its_own() -> None:

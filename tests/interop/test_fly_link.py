@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import socket
+import struct
 import subprocess
 import sys
 import time
@@ -208,6 +209,41 @@ def test_what_is_not_mavlink_is_told(link: Link, port: int) -> None:
         other.sendto(b"$GPGGA,123519,4807.038,N,01131.000,E\r\n" * 3, ("127.0.0.1", port))
     link.read(1.0)
     assert link.inputs().wrong == "what comes there is not MAVLink"
+
+
+def test_a_link_that_is_reset_falls_silent_and_is_told_once() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        link = Link(f"tcp:127.0.0.1:{server.getsockname()[1]}")
+        far, _ = server.accept()
+    far.sendall(link._wire.mav.heartbeat_encode(2, 12, 129, 4 << 16 | 3 << 24, 4).pack(link._wire.mav))
+    until = time.monotonic() + 20.0
+    while link.inputs().heartbeat_at is None and time.monotonic() < until:
+        link.read(1.0)
+    far.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+    far.close()  # with a reset
+    while not link.said and time.monotonic() < until:
+        link.read(2.0)
+    for _ in range(3):
+        link.send((1.0, 0.0, 0.0), None, 3.0)
+        link.request("hold")
+        link.read(3.0)
+    link.close()
+    assert link.inputs().heartbeat_at == 1.0
+    assert len(link.said) == 1 and link.said[0].startswith("the link is broken: ")
+
+
+def test_a_device_that_cannot_be_written_to_is_told_once(link: Link, ends: Ends) -> None:
+    ends().heartbeat()
+    link.read(1.0)
+
+    def fail(buffer: bytes) -> None:
+        raise OSError("no such device")
+
+    link._wire.write = fail
+    for _ in range(3):
+        link.send((1.0, 0.0, 0.0), None, 2.0)
+        link.request("hold")
+    assert link.said == ["the link is broken: no such device"]
 
 
 @pytest.mark.parametrize("address", ["udpin:127.0.0.1:notaport", "tcp:127.0.0.1:1", "/dev/nowhere,57600"])

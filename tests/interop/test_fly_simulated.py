@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import signal
 import socket
@@ -11,6 +12,8 @@ import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -19,10 +22,15 @@ pytest.importorskip("pymavlink")
 pytest.importorskip("rotorpy")
 pytest.importorskip("evlib")
 
+from edqn_jax.cli import fly as command  # noqa: E402
 from edqn_jax.cli import main  # noqa: E402
+from edqn_jax.cli.process.signals import Stops  # noqa: E402
 from edqn_jax.fly.link import Link  # noqa: E402
-from edqn_jax.fly.records import read_records  # noqa: E402
+from edqn_jax.fly.pilot import Pilot  # noqa: E402
+from edqn_jax.fly.records import FlightLog, read_records  # noqa: E402
+from edqn_jax.fly.simulated import missions  # noqa: E402
 from edqn_jax.fly.simulated.camera import EventServer  # noqa: E402
+from edqn_jax.fly.simulated.lockstep import SimulatedClock  # noqa: E402
 from edqn_jax.fly.simulated.missions import Setup, environment_of, fly_mission  # noqa: E402
 from edqn_jax.fly.streams import EVENT, DvStream  # noqa: E402
 from edqn_jax.interop.deployment.onnx_export import export_policy  # noqa: E402
@@ -66,9 +74,66 @@ def test_a_mission_is_flown_over_the_wire_and_its_log_goes_the_same_way_once_mor
     assert flown.latency["computing"][0] > 0.0
     folder = tmp_path / "mission-0"
     assert read_records(folder)[-1]["kind"] == "end"
-    words = ["fly", str(exported), "--fov", "90", "--contrast", "0.2", "--replay", str(folder)]
-    assert main(words) == 0
+    assert main(["fly", str(exported), "--replay", str(folder)]) == 0
     assert " 0 of them with another output" in capsys.readouterr().out
+
+
+class Left:
+    """`Keeper`, after members have left or time has passed."""
+
+    def __init__(self, now: float, *members: str) -> None:
+        self.now, self._members = now, set(members)
+
+    def collect(self) -> dict[str, bytes]:
+        return {}
+
+    def members(self) -> set[str]:
+        return self._members
+
+
+@pytest.mark.parametrize(
+    ("keeper", "said", "outcome"),
+    [
+        (Left(20.1, "vehicle", "autopilot"), "cut off", "time out"),
+        (Left(1.0, "vehicle"), "cut off", "the autopilot was lost"),
+        (Left(1.0, "vehicle"), None, "the autopilot was lost"),
+        (Left(1.0, "autopilot"), "cut off", "the vehicle was lost"),
+        (Left(1.0, "vehicle"), "low battery", "low battery"),
+    ],
+)
+def test_a_flight_that_is_cut_off_says_why(tmp_path: Path, keeper: Any, said: str | None, outcome: str) -> None:
+    nothing: Any = None
+    flight = missions.Flight(nothing, np.zeros(3), 1.0)
+    flight.least_clearance = lambda: 1.0
+    why = missions._conduct(keeper, nothing, nothing, flight, 0.01, 20.0)
+    if said is not None:
+        log = FlightLog(tmp_path)
+        log.write("end", outcome=said)
+        log.close()
+    assert missions._judged(0, flight, tmp_path, 0.0, 1.0, why).outcome == outcome
+
+
+@pytest.mark.parametrize("simulated", [False, True])
+def test_a_connection_that_ends_is_silent_only_where_it_is_the_simulations(
+    monkeypatch: pytest.MonkeyPatch, simulated: bool
+) -> None:
+    def fail(pilot: Pilot) -> None:
+        raise ConnectionResetError("reset")
+
+    left: list[SimulatedClock] = []
+    close = SimulatedClock.close
+    monkeypatch.setattr(SimulatedClock, "close", lambda clock: (left.append(clock), close(clock)))
+    monkeypatch.setattr(Pilot, "fly", fail)
+    monkeypatch.setattr(command, "load_runner", lambda args, size: SimpleNamespace(period_s=0.26))
+    server = EventServer(SIZE)
+    wire = ["--events", f"tcp:{server.address}", "--mavlink", f"udpin:127.0.0.1:{free_port()}"]
+    with socket.create_server(("127.0.0.1", 0)) as keeper, contextlib.ExitStack() as stack:
+        clock = ["--clock", f"127.0.0.1:{keeper.getsockname()[1]}"] if simulated else []
+        if not simulated:
+            stack.enter_context(pytest.raises(ConnectionResetError))
+        command.fly_command(command.parse_fly(["a.onnx", *wire, *ROOM, *clock]), Stops())
+    server.close()
+    assert len(left) == simulated
 
 
 class Bench:
@@ -175,13 +240,21 @@ ROOM = ["--goal", "9", "0", "5", "--volume", "0", "-5", "0", "20", "5", "9"]
         (["a.onnx", "--camera", "0", "4"], "--camera must be two whole numbers"),
         (["pretrained", "--simulate", "medium", "--speed", "0"], "--speed more than 0"),
         (["nowhere", "--simulate", "medium"], "there is no run in 'nowhere'"),
-        (["a.onnx", "--simulate", "medium"], "needs the folder of a run"),
+        (["a.onnx", "--simulate", "medium"], "the folder of a run, or a policy of the package"),
         (["pretrained", "--simulate", "medium", "--goal", "1", "2", "3"], "--simulate gives --goal itself"),
+        (["pretrained", "--simulate", "medium", "--mavlink", "tcp:127.0.0.1:1"], "--simulate gives --mavlink itself"),
+        (["pretrained", "--simulate", "medium", "--origin", "0", "0", "1"], "--simulate gives --origin itself"),
+        (["pretrained", "--simulate", "medium", "--goal-radius", "2"], "--simulate gives --goal-radius itself"),
+        (["pretrained", "--simulate", "medium", "--max-s", "9"], "--simulate gives --max-s itself"),
+        (["pretrained", "--simulate", "medium", "--dry"], "--simulate gives --dry itself"),
         (["a.onnx", "--pace", "3"], "--pace must be from 0.2 to 1"),
         (["a.onnx", "--simulate", "medium", "--replay", "b"], "give one of them"),
     ],
 )
-def test_bad_input_is_one_sentence(capsys: pytest.CaptureFixture[str], words: list[str], says: str) -> None:
+def test_bad_input_is_one_sentence(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, words: list[str], says: str
+) -> None:
+    monkeypatch.setattr(command, "simulate", lambda args: pytest.fail("it is said before JAX is loaded"))
     assert main(["fly", *words]) == 2
     said = capsys.readouterr().err
     assert says in said and said.count("\n") == 1

@@ -16,6 +16,7 @@ from edqn_jax.fly.faults import Settings  # noqa: E402
 from edqn_jax.fly.link import Link  # noqa: E402
 from edqn_jax.fly.pilot import Pilot, Task  # noqa: E402
 from edqn_jax.fly.simulated import vehicle as simulated  # noqa: E402
+from edqn_jax.fly.simulated.lockstep import SimulatedClock  # noqa: E402
 from edqn_jax.fly.streams import EVENT, Events  # noqa: E402
 from edqn_jax.interop.deployment.runner import Command  # noqa: E402
 from edqn_jax.interop.outer.rotorpy_body import STEP_S  # noqa: E402
@@ -233,6 +234,17 @@ def test_faults_over_the_wire_end_as_configured(
     assert place[0] > START[0] + 2.0, "it flew"
     if mode != (4, 6):
         assert np.linalg.norm(velocity) < 0.5 or outcome == "taken over"
+
+
+def test_it_leaves_the_clock_as_it_ends(monkeypatch: pytest.MonkeyPatch) -> None:
+    left: list[SimulatedClock] = []
+    close = SimulatedClock.close
+    monkeypatch.setattr(SimulatedClock, "close", lambda clock: (left.append(clock), close(clock)))
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        clock = f"127.0.0.1:{server.getsockname()[1]}"
+        assert simulated.main(["--clock", clock, "--mavlink", "nowhere"]) == 2
+        assert simulated.main(["--clock", clock, "--mavlink", "udpout:127.0.0.1:9", "--seconds", "0"]) == 0
+    assert len(left) == 2
 
 
 def test_bad_input_is_one_sentence(capsys: pytest.CaptureFixture[str]) -> None:

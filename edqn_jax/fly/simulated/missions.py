@@ -14,7 +14,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -117,13 +117,13 @@ class Flight:
         return 0.0 if self.hit else min(clearance(self.judge, place)[0] for place in self.places[::4])
 
 
-def fly_missions(environment: Environment, setup: Setup, show: Callable[[str], None] = print) -> Iterator[Mission]:
+def fly_missions(environment: Environment, setup: Setup) -> Iterator[Mission]:
     """Yields how each mission of an environment ended."""
     for number in range(environment.missions):
-        yield fly_mission(environment, number, setup, show)
+        yield fly_mission(environment, number, setup)
 
 
-def fly_mission(environment: Environment, number: int, setup: Setup, show: Callable[[str], None] = print) -> Mission:
+def fly_mission(environment: Environment, number: int, setup: Setup) -> Mission:
     """Flies one mission and returns how it ended.
 
     Raises:
@@ -149,23 +149,27 @@ def fly_mission(environment: Environment, number: int, setup: Setup, show: Calla
         port = _free_port()
         yaw = float(np.arctan2(goal[1] - start[1], goal[0] - start[0]))
         words = _vehicle_words(start, yaw, port, keeper.address, number, setup)
-        vehicle = stack.enter_context(_process(words, show, quiet=False))
+        vehicle = stack.enter_context(_process(words, quiet=False))
         words = _autopilot_words(config, scene, port, server.address, keeper.address, out, setup)
-        autopilot = stack.enter_context(_process(words, show, quiet=True))
+        autopilot = stack.enter_context(_process(words, quiet=True))
         keeper.admit({"vehicle", "autopilot"}, lambda: vehicle.poll() is None and autopilot.poll() is None)
         began = time.monotonic()
         longest = EXTRA_S + _mission_s(config, setup.pace)
-        _conduct(keeper, camera, server, flight, setup.frame_s, longest)
+        why = _conduct(keeper, camera, server, flight, setup.frame_s, longest)
         speed = keeper.now / (time.monotonic() - began)
         keeper.close()
         _wait(autopilot)
-        return _judged(number, flight, out, camera.seen / max(keeper.now, 1e-9), speed)
+        return _judged(number, flight, out, camera.seen / max(keeper.now, 1e-9), speed, why)
 
 
 def _conduct(
     keeper: Keeper, camera: EventCamera, server: EventServer, flight: Flight, frame_s: float, longest_s: float
-) -> None:
-    """Lets vehicle, camera and autopilot take their turns until the autopilot or the flight has ended."""
+) -> str:
+    """Lets vehicle, camera and autopilot take their turns until the autopilot or the flight has ended.
+
+    Returns:
+        Why the flight has ended, if the autopilot does not say it.
+    """
     frames, streamed = 0, -1
     position = quaternion = None
     while True:
@@ -182,6 +186,9 @@ def _conduct(
         else:
             keeper.wake_first(streamed)
     flight.judge_now()
+    if keeper.now > longest_s:
+        return "time out"
+    return "the autopilot was lost" if "vehicle" in keeper.members() else "the vehicle was lost"
 
 
 def _mission_s(config: Config, pace: float) -> float:
@@ -189,14 +196,15 @@ def _mission_s(config: Config, pace: float) -> float:
     return config.env.max_decisions * config.drone.physics_steps * config.drone.physics_dt_s / pace
 
 
-def _judged(number: int, flight: Flight, out: Path, events_hz: float, speed: float) -> Mission:
+def _judged(number: int, flight: Flight, out: Path, events_hz: float, speed: float, why: str) -> Mission:
+    """Returns how a mission ended; `why` is that of a flight that the autopilot did not end."""
     records = read_records(out) if (out / RECORDS).is_file() else []
     end: dict[str, Any] = next((each for each in reversed(records) if each["kind"] == "end"), {})
-    outcome = end.get("outcome", "the autopilot was lost")
+    outcome = end.get("outcome", "cut off")
     if flight.hit:
         outcome = "collision"
     elif outcome == "cut off":
-        outcome = "time out"
+        outcome = why
     elif outcome == "goal" and not flight.reached:
         outcome = "beside the goal"
     return Mission(
@@ -238,7 +246,7 @@ def _autopilot_words(
 
 
 @contextlib.contextmanager
-def _process(words: list[str], show: Callable[[str], None], *, quiet: bool) -> Iterator[subprocess.Popen]:
+def _process(words: list[str], *, quiet: bool) -> Iterator[subprocess.Popen]:
     """Runs Python with these words within the block; what it prints to stdout is not shown if `quiet`."""
     # In a group of its own: a Ctrl-C is ours to answer, and what ends here ends theirs.
     where = subprocess.DEVNULL if quiet else None

@@ -7,6 +7,7 @@ with `--clock` it is a member of a simulation. It starts in the air, armed, in h
 from __future__ import annotations
 
 import argparse
+import contextlib
 import struct
 import sys
 from collections.abc import Sequence
@@ -158,19 +159,20 @@ def parse(argv: Sequence[str] | None = None) -> argparse.Namespace:
 
 def run(args: argparse.Namespace) -> None:
     """Flies until its time or the simulation ends."""
-    simulated = SimulatedClock(args.clock, "vehicle") if args.clock else None
-    clock: Clock = simulated or WallClock()
-    vehicle = Vehicle(args)
-    began, steps = clock.now(), 0
-    try:
+    with contextlib.ExitStack() as stack:
+        simulated = SimulatedClock(args.clock, "vehicle") if args.clock else None
+        if simulated is not None:
+            stack.callback(simulated.close)
+        clock: Clock = simulated or WallClock()
+        vehicle = Vehicle(args)
+        stack.callback(vehicle.close)
+        began, steps = clock.now(), 0
         while steps * STEP_S < args.seconds:
             vehicle.step()
             steps += 1
             if simulated is not None:
                 simulated.told = vehicle.truth()
             clock.sleep_until(began + steps * STEP_S)
-    finally:
-        vehicle.close()
 
 
 def main(argv: Sequence[str] | None = None) -> int:
