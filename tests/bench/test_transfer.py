@@ -55,10 +55,10 @@ def test_with_all_parts_our_own_it_flies_as_the_package_does():
     [
         (
             ["--mount", "body"],
-            {},
+            {"surface": {"pattern": "plaid"}},
             ["camera.mount level alone", "surface.pattern plaid alone; MuJoCo's picture is plain"],
         ),
-        (["--picture", "own"], {}, []),
+        (["--picture", "own"], {"surface": {"pattern": "plaid"}}, []),
         (["--look", "textured"], {"surface": {"pattern": "drawn"}}, []),
         (["--mount", "level"], {"surface": {"pattern": "drawn"}, "camera": {"mount": "body"}}, ["flies with level"]),
     ],
