@@ -38,7 +38,7 @@ def look_of(sensor: str) -> Look:
 EVENTS, NEARNESS = look_of("events"), look_of("depth")
 
 RECONSTRUCTED_EVENTS = Look("events", "events per pixel\n(ON + OFF)", COUNTS)
-"""The VAE's reconstruction of events: their number per pixel, whatever the sign."""
+"""The VAE's reconstruction of events, as their number per pixel, whatever the sign."""
 
 
 def plot_sight(

@@ -32,7 +32,7 @@ OLDEST_ONNXRUNTIME = (1, 14)
 """The oldest version of onnxruntime that runs the operators of exported policies."""
 
 FIELDS = ("t", "x", "y", "p")
-"""Fields of a packet of events: microseconds, column, row, polarity in {-1, 1}."""
+"""Fields of a packet of events, which are microseconds, column, row, and polarity in {-1, 1}."""
 
 
 @dataclasses.dataclass(frozen=True)
