@@ -109,7 +109,7 @@ def check_command(args: CheckArgs) -> None:
 
 def check_table(found: WorldCheck, policy: str) -> Table:
     """Returns what was found as a table for people."""
-    flies = "it will fly" if found.refusal is None else "it will not fly"
+    flies = "it can be flown" if found.refusal is None else "it cannot be flown"
     table = Table(title=escape(f"{found.name}: {flies}"), show_header=False, title_justify="left")
     table.add_column()
     table.add_column()
@@ -165,7 +165,7 @@ def _add_space(table: Table, found: WorldCheck, policy: str) -> None:
 
 def _add_cost(table: Table, cost: Cost) -> None:
     """Adds what a world takes."""
-    by = "C, on GPUs CUDA" if not cost.drawn_by_jax else f"JAX alone, because of its {_words(*cost.drawn_by_jax)}"
+    by = "C, on GPUs CUDA" if not cost.drawn_by_jax else f"JAX, because of its {_words(*cost.drawn_by_jax)}"
     _add_row(table, "pictures are drawn by", f"{by}; about {_rounded(cost.picture_us)} µs each on two CPU cores")
     _add_row(
         table,

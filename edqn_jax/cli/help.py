@@ -47,7 +47,7 @@ Examples:
   edqn world room.obj --out room --up y --start 1 1 1.5 --goal 8 4 1.5""",
     CHECK: """Say whether a policy can fly in a world: what its geoms became, its tightest way, its size, what it costs.
 
-Ends with 0 if it will fly, 1 if it will not, and 2 for a file that cannot be read.
+Ends with 0 if it can be flown, 1 if it cannot, and 2 for a file that cannot be read.
 
 Examples:
   edqn check mine.xml --out mine.png

@@ -15,6 +15,7 @@ from edqn_jax.keys import run_streams
 from edqn_jax.sim.actions import move_name
 from edqn_jax.sim.physics.drone import hover_state
 from edqn_jax.sim.task.outcomes import Outcome
+from measurement.flags import parse_config, parse_options
 from tests.support.policies import CONFIG
 
 WORLD = """<mujoco><worldbody>
@@ -69,3 +70,10 @@ def test_a_world_of_a_file_is_refused(capsys: pytest.CaptureFixture[str]) -> Non
     with pytest.raises(SystemExit):
         gates.main(["--world", "paper"])
     assert "invalid choice: 'paper'" in capsys.readouterr().err
+
+
+def test_benchmarks_stay_in_worlds_of_one_plaid_unless_their_options_say_otherwise():
+    assert parse_options(["--world", "rooms"]).surface.pattern == "plaid"
+    assert parse_config(["--world", "medium"]).surface.pattern == "plaid"
+    for words in (["--surface.pattern", "drawn"], ["--surface.pattern=bricks"]):
+        assert parse_options(["--world", "rooms", *words]).surface.pattern in ("drawn", "bricks")

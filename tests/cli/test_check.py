@@ -34,7 +34,7 @@ def test_a_world_that_is_flown_ends_with_0_and_writes_what_was_asked_for(
     file = corridor(tmp_path, 1.4)
     assert main(["check", file.name]) == 0
     said = capsys.readouterr()
-    assert "it will fly" in said.out and "0.70 m of clearance, 1.9 body radii" in said.out
+    assert "it can be flown" in said.out and "0.70 m of clearance, 1.9 body radii" in said.out
     assert "is tight at (12, 6, 2.5)" in said.out and "2 × box" in said.out and not said.err
     assert list(tmp_path.iterdir()) == [file]
     assert main(["check", "corridor.xml", "--out", "map.png", "--json", "found.json"]) == 0
@@ -48,7 +48,7 @@ def test_a_world_that_is_not_flown_ends_with_1_and_says_why(tmp_path: Path, caps
     corridor(tmp_path, 0.0)
     assert main(["check", "corridor.xml", "--out", "map.png", "--json", "found.json"]) == 1
     said = capsys.readouterr()
-    assert "it will not fly" in said.out
+    assert "it cannot be flown" in said.out
     assert (
         said.err.startswith("edqn: 'corridor.xml' has no way from its start to its goal") and said.err.count("\n") == 1
     )

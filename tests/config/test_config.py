@@ -353,3 +353,13 @@ def test_options_of_the_world_are_a_group_like_any_other() -> None:
     assert make_config(world={"name": "paper"}) == make_config("paper")
     with pytest.raises(ConfigError, match="'world' must hold keys such as"):
         make_config(world="medium")  # type: ignore[arg-type]
+
+
+def test_random_worlds_have_drawn_looks_and_files_the_plaid() -> None:
+    """On both kinds of hardware, and unless an option says otherwise."""
+    for hardware in ("cpu", "gpu"):
+        looks = {
+            world: make_config(world, tuned_for=hardware).surface.pattern for world in ("medium", "mixed", "paper")
+        }
+        assert looks == {"medium": "drawn", "mixed": "drawn", "paper": "plaid"}
+    assert make_config("medium", surface={"pattern": "plaid"}).surface.pattern == "plaid"

@@ -106,7 +106,7 @@ def test_a_mesh_becomes_a_field_that_only_jax_draws(tmp_path: Path) -> None:
     assert found.survey is not None and found.cost is not None and found.refusal is None
     assert [fate.became for fate in found.survey.geoms] == ["planes", "fields"]
     assert found.cost.drawn_by_jax == ["fields"]
-    assert [warning for warning in found.warnings if "only JAX draws the fields" in warning] == list(found.warnings)
+    assert [warning for warning in found.warnings if "alone do not draw the fields" in warning] == list(found.warnings)
     plain = check_world(ROOMS, str(corridor(tmp_path, WIDE))).cost
     assert plain is not None and plain.drawn_by_jax == [] and found.cost.picture_us > 10 * plain.picture_us
     grid = load_scene(file).others["fields"].grids[0]

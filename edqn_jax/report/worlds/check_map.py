@@ -51,10 +51,10 @@ def plot_check(
         scene: one world.
         way: None where there is none; the map then stands alone.
         radius: of the body, metres.
-        title: says whether it will fly.
+        title: says whether it can be flown.
         text: below the picture.
         file: where to write.
-        flies: whether it will fly.
+        flies: whether it can be flown.
         goal_radius_m: the circle around the goal.
     """
     colour = OUTCOME_COLOURS["goal"] if flies else TIGHT_COLOUR

@@ -16,9 +16,9 @@ from edqn_jax.learn.perception.levelling import level_events, level_places
 from edqn_jax.sim.camera.raycast import camera_rays, pitch_of
 from edqn_jax.sim.physics import drone
 from edqn_jax.sim.sensors.events import EventField
-from edqn_jax.sim.sensors.sensor import mount_rotation
+from edqn_jax.sim.sensors.sensor import label_image, mount_rotation, nearness_image
 from edqn_jax.sim.task.observation import Observation, lean_of, motion_size, own_size
-from tests.support.drawn_scenes import rotation_of
+from tests.support.drawn_scenes import every_kind, rotation_of
 
 LEVEL, BODY = CameraConfig(), CameraConfig(mount="body")
 LEANS = [(0.0, 0.0), (0.3, 0.0), (0.0, -0.4), (-0.25, 0.5), (1.2, 0.9)]
@@ -137,3 +137,18 @@ def test_only_events_of_a_camera_on_the_body_are_levelled() -> None:
         with pytest.raises(ConfigError, match=r"encoder.levelled.*camera.mount is body and env.sensor is events"):
             make_config(camera={"mount": camera}, env={"sensor": sensor}, encoder={"levelled": True})
     assert dataclasses.replace(LEVEL, mount="body") == BODY
+
+
+def test_the_label_of_levelled_events_is_that_of_a_level_camera() -> None:
+    """At the heading to which roll and pitch are relative; without levelling it is the body's own view."""
+    scene = every_kind(np.random.default_rng(4))
+    position, attitude = jnp.array([5.0, 5.0, 3.0]), jnp.asarray(quaternion_of(0.3, -0.25, 0.6), jnp.float32)
+    level, body = make_config("medium"), make_config("medium", camera={"mount": "body"})
+    levelled = make_config("medium", camera={"mount": "body"}, encoder={"levelled": True})
+    flat = jnp.asarray(quaternion_of(0.0, 0.0, 0.6), jnp.float32)
+    label = label_image(levelled, scene, position, attitude)
+    np.testing.assert_allclose(label, nearness_image(level, scene, position, flat), atol=1e-4)
+    np.testing.assert_allclose(
+        label_image(body, scene, position, attitude), nearness_image(body, scene, position, attitude)
+    )
+    assert np.abs(label - label_image(body, scene, position, attitude)).max() > 0.1
