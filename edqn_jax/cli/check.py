@@ -69,7 +69,7 @@ def check_command(args: CheckArgs) -> None:
     """Runs `edqn check` with these arguments.
 
     Raises:
-        CheckError: if it will not fly there; says why.
+        CheckError: if it cannot be flown there; says why.
         ConfigError: if the policy, the world or a file to write is not as it should be.
     """
     from edqn_jax.evaluation.world_check import check_world
@@ -91,7 +91,7 @@ def check_command(args: CheckArgs) -> None:
     if args.out is not None and found.scene is not None:
         from edqn_jax.report.worlds.check_map import plot_check
 
-        title = f"{Path(found.name).name}: it will {'' if found.refusal is None else 'not '}fly"
+        title = f"{Path(found.name).name}: {_verdict(found)}"
         radii = config.drone.body_radius_m, config.env.goal_radius_m
         plot_check(
             found.scene,
@@ -107,10 +107,14 @@ def check_command(args: CheckArgs) -> None:
         raise CheckError(found.refusal)
 
 
+def _verdict(found: WorldCheck) -> str:
+    """Returns whether a world can be flown, in words for a title; how well, no check says."""
+    return "it can be flown" if found.refusal is None else "it cannot be flown"
+
+
 def check_table(found: WorldCheck, policy: str) -> Table:
     """Returns what was found as a table for people."""
-    flies = "it can be flown" if found.refusal is None else "it cannot be flown"
-    table = Table(title=escape(f"{found.name}: {flies}"), show_header=False, title_justify="left")
+    table = Table(title=escape(f"{found.name}: {_verdict(found)}"), show_header=False, title_justify="left")
     table.add_column()
     table.add_column()
     if found.survey is not None:

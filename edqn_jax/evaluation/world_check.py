@@ -82,7 +82,7 @@ class WorldCheck:
     cost: Cost | None = None
     warnings: tuple[str, ...] = ()
     refusal: str | None = None
-    """Why it will not fly, a sentence; None if it will."""
+    """Why it cannot be flown, a sentence; None if it can."""
     note: str | None = None
 
     @property
