@@ -143,7 +143,7 @@ def with_conditions(config: Config, conditions: Layer, source: str) -> Config:
             if option not in CONDITIONS.get(group, ()):
                 raise ConfigError(
                     f"{source}: '{group}.{option}' is a policy's own; conditions are {', '.join(CONDITIONS)} "
-                    "(of env action_delay, delay_share and drones alone, of events the pixels' thresholds and faults)"
+                    f"(of env {', '.join(CONDITIONS['env'])} alone, of events the pixels' thresholds and faults)"
                 )
     validate(changed, trains=False)
     return changed

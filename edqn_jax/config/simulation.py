@@ -229,6 +229,9 @@ class EnvConfig:
     """Decisions between choosing a move and flying it: 0, or 1, with which the first decision of an episode hovers."""
     delay_share: Annotated[float, RATE] = 1.0
     """Share of the episodes, drawn for each, in which `action_delay` delays."""
+    setpoint_m_s2: Annotated[float, NOT_NEGATIVE] = 0.0
+    """Least rate at which an autopilot lets the velocity it holds change, m/s^2; an episode's is between this and any,
+    its inverse uniform. 0 is off: the commanded velocity is held at once."""
     heading: Literal["goal", "flight"] = "goal"
     """Where the drone and its camera turn to. `goal`: towards the goal. `flight`: towards where a move flies;
     needs `position` to be false."""

@@ -54,16 +54,22 @@ class Control(NamedTuple):
     """[] radians, after the decision."""
 
 
-def control_of(config: DroneConfig, airframe: Airframe, state: DroneState, command: Command) -> Control:
-    """Returns the controller of the decision that begins at `state` [...] and holds a command."""
+def control_of(
+    config: DroneConfig, airframe: Airframe, state: DroneState, command: Command, velocities: Array | None = None
+) -> Control:
+    """Returns the controller of the decision that begins at `state` [...] and holds a command.
+
+    `velocities` [physics_steps, 3] m/s (world) replace the one velocity that is commanded.
+    """
     if isinstance(command, RateCommand):
         return Control(lambda now, _: rate_thrusts(config, airframe, now, command), None, state.yaw_setpoint)
     yaws = _setpoints(config, state, command.heading)
 
-    def thrusts(now: DroneState, half_yaw: tuple[Array, Array]) -> Array:
-        return _thrusts(config, airframe, now, command.velocity, *half_yaw)
+    def thrusts(now: DroneState, given: tuple[Array, Array, Array | None]) -> Array:
+        cos, sin, velocity = given
+        return _thrusts(config, airframe, now, command.velocity if velocity is None else velocity, cos, sin)
 
-    return Control(thrusts, (jnp.cos(yaws / 2), jnp.sin(yaws / 2)), wrap_angle(yaws[-1]))
+    return Control(thrusts, (jnp.cos(yaws / 2), jnp.sin(yaws / 2), velocities), wrap_angle(yaws[-1]))
 
 
 def _setpoints(config: DroneConfig, state: DroneState, target_yaw: Array) -> Array:

@@ -1,5 +1,5 @@
 """Disturbances: wind, gusts and drag, body and motors that differ from the controller's model,
-moves that are delayed by a decision, and errors of the state estimate.
+moves that are delayed by a decision, velocities that an autopilot changes slowly, and errors of the state estimate.
 
 All is drawn anew for each episode; with every option off there is no state and nothing is computed.
 
@@ -23,7 +23,7 @@ import jax.numpy as jnp
 from flax import struct
 from jax import Array
 
-from edqn_jax.config import AirConfig, Config, MotorsConfig, NoiseConfig
+from edqn_jax.config import AirConfig, Config, DroneConfig, MotorsConfig, NoiseConfig
 
 AIR_DENSITY = 1.225
 """Density of air at sea level, kg/m^3 (International Standard Atmosphere)."""
@@ -46,6 +46,8 @@ class Disturbance:
     gain: Array | None = None  # [R] flown thrust per commanded thrust
     lag_s: Array | None = None  # [] time constant of the thrusts
     thrust: Array | None = None  # [R] newtons, before the gain, as motors that lag have it now
+    ramp: Array | None = None  # [] s^2/m, least time in which the velocity that is held changes by 1 m/s
+    held: Array | None = None  # [3] m/s, velocity that the controller holds now, world
     late: Array | None = None  # [] bool, whether moves are delayed; None where they are in every episode, or in none
     move: Array | None = (
         None  # action chosen in the decision before, flown in the next one; None in what `sample_disturbance` returns
@@ -71,7 +73,8 @@ def any_on(config: Config) -> bool:
 def changes_flight(config: Config) -> bool:
     """Returns whether the body's dynamics differ from the controller's model."""
     body, motors = config.body, config.motors
-    return has_air(config.air) or any((body.mass_share, body.inertia_share, motors.gain_share, motors.lag_s))
+    own = (body.mass_share, body.inertia_share, motors.gain_share, motors.lag_s, config.env.setpoint_m_s2)
+    return has_air(config.air) or any(own)
 
 
 def has_air(air: AirConfig) -> bool:
@@ -98,6 +101,10 @@ def sample_disturbance(config: Config, hover_thrust: Array, key: Array) -> Distu
     if config.env.action_delay and config.env.delay_share < 1:
         key, delay = jax.random.split(key)
         late = jax.random.bernoulli(delay, config.env.delay_share)
+    ramp = None
+    if config.env.setpoint_m_s2:
+        key, slow = jax.random.split(key)
+        ramp = jax.random.uniform(slow, maxval=1 / config.env.setpoint_m_s2)
     azimuth, wind, gusts, mass, inertia, gain, lag, place, speed = jax.random.split(key, 9)
     air, body, motors, noise = config.air, config.body, config.motors, config.noise
     angle = jax.random.uniform(azimuth, maxval=2 * math.pi)
@@ -111,6 +118,8 @@ def sample_disturbance(config: Config, hover_thrust: Array, key: Array) -> Distu
         gain=_share(motors.gain_share, (4,), gain),
         lag_s=jax.random.uniform(lag, maxval=motors.lag_s) if motors.lag_s else None,
         thrust=jnp.full(4, hover_thrust) if motors.lag_s else None,
+        ramp=ramp,
+        held=None if ramp is None else jnp.zeros(3),
         late=late,
         position_bias=_normal(noise.position_bias_m, place),
         velocity_bias=_normal(noise.velocity_bias_m_s, speed),
@@ -258,6 +267,21 @@ def load_of(air: AirConfig, disturbance: Disturbance, velocity: Array) -> Load:
     """Returns the external load on a body at `velocity` [3] m/s (world)."""
     force = drag_force(air, velocity, air_velocity(air, disturbance)) if has_air(air) else None
     return Load(force=force, mass=disturbance.mass, inertia=disturbance.inertia)
+
+
+def held_velocities(drone: DroneConfig, disturbance: Disturbance, commanded: Array) -> tuple[Disturbance, Array | None]:
+    """Returns the disturbance after a decision, and the velocities [physics_steps, 3] m/s that the controller is given.
+
+    They go straight from the one that is held to `commanded` [3] m/s, world. None where they may jump.
+    """
+    if disturbance.ramp is None or disturbance.held is None:
+        return disturbance, None
+    change = commanded - disturbance.held
+    needed = disturbance.ramp * jnp.sqrt(jnp.sum(change * change))
+    time = drone.physics_dt_s * jnp.arange(1, drone.physics_steps + 1, dtype=jnp.float32)
+    share = jnp.minimum(1.0, time / jnp.maximum(needed, 1e-6))
+    velocities = disturbance.held[None] + share[:, None] * change[None]
+    return dataclasses.replace(disturbance, held=velocities[-1]), velocities
 
 
 def motor_step(

@@ -180,7 +180,10 @@ def fly_disturbed(
         disturbance: of the episode, as of the decision before.
         key: consumed by gusts.
     """
-    control = control_of(config.drone, airframe, state, command)
+    velocities = None
+    if isinstance(command, VelocityCommand):
+        disturbance, velocities = disturbances.held_velocities(config.drone, disturbance, command.velocity)
+    control = control_of(config.drone, airframe, state, command, velocities)
     dt_s = config.drone.physics_dt_s
 
     def body(

@@ -223,6 +223,32 @@ def test_a_hovering_drone_drifts_downwind_until_its_controller_leans_as_hard_as_
     assert 0.5 < np.linalg.norm(velocity) < 1.5
 
 
+def test_the_velocity_that_is_held_changes_no_faster_than_the_autopilot_lets_it():
+    config = with_engine("rigid_body", Config(env=EnvConfig(setpoint_m_s2=4.0)))
+    drone, dt_s = config.drone, config.drone.physics_dt_s
+    disturbance = Disturbance(ramp=jnp.float32(1 / 5.0), held=jnp.array([0.0, -1.0, 0.0]))
+    plain = np.array([0.0, -1.0, 0.0])
+    for command in ((3.0, 1.0, 0.5), (0.0, 0.0, -2.0)):  # the second is asked before the first is held
+        disturbance, given = disturbances.held_velocities(drone, disturbance, jnp.array(command))
+        for velocity in np.asarray(given):
+            change = np.array(command) - plain
+            plain = plain + change * min(1.0, 5.0 * dt_s / max(float(np.linalg.norm(change)), 1e-9))
+            np.testing.assert_allclose(velocity, plain, atol=1e-5)
+    assert plain[2] > -1.5
+
+
+def test_a_velocity_that_may_jump_is_flown_as_without_an_autopilot_and_a_slow_one_later():
+    config = with_engine("rigid_body", Config(env=EnvConfig(setpoint_m_s2=4.0)))
+    jumps, slow = (Disturbance(ramp=jnp.float32(ramp), held=jnp.zeros(3)) for ramp in (0.0, 0.25))
+    free = flown_disturbed(config, Disturbance(), (4, 0, 0), 2)[0].velocity
+    np.testing.assert_allclose(flown_disturbed(config, jumps, (4, 0, 0), 2)[0].velocity, free, atol=1e-4)
+    # 0.52 s of 4 m/s^2, less what the drone lags behind: one time constant of its controller and some of its attitude
+    late = float(flown_disturbed(config, slow, (4, 0, 0), 2)[0].velocity[0])
+    assert 0.8 < late < 2.08 < free[0]
+    held = flown_disturbed(config, slow, (4, 0, 0), 2)[1].held
+    np.testing.assert_allclose(held, [2.08, 0, 0], atol=1e-4)
+
+
 def test_the_controller_gives_the_nominal_thrust_so_that_a_light_drone_rises_and_a_weak_one_sinks():
     config = with_engine("rigid_body", Config(body=BodyConfig(mass_share=0.2), motors=MotorsConfig(gain_share=0.2)))
     gain = config.drone.climb_gain
@@ -255,7 +281,7 @@ AHEAD, BACK = move_number("ahead"), move_number("back")
 
 EVERYTHING = dataclasses.replace(
     QUIET,
-    env=dataclasses.replace(QUIET.env, action_delay=1),
+    env=dataclasses.replace(QUIET.env, action_delay=1, setpoint_m_s2=4.0),
     air=AIR,
     body=BodyConfig(0.2, 0.2),
     motors=MotorsConfig(0.2, 0.05),
@@ -298,6 +324,7 @@ def test_with_everything_off_there_is_no_state_and_nothing_is_drawn(world):
         ({"body": BodyConfig(inertia_share=0.2)}, {"inertia"}),
         ({"motors": MotorsConfig(gain_share=0.2)}, {"gain"}),
         ({"motors": MotorsConfig(lag_s=0.1)}, {"lag_s", "thrust"}),
+        ({"env": EnvConfig(setpoint_m_s2=4.0)}, {"ramp", "held"}),
         ({"env": EnvConfig(action_delay=1)}, set()),  # the move that is flown late belongs to the task
         ({"noise": NoiseConfig(position_m=0.5)}, set()),
         ({"noise": NoiseConfig(velocity_bias_m_s=0.5)}, {"velocity_bias"}),
@@ -320,6 +347,7 @@ def test_draws_are_uniform_within_their_limits_and_differ_between_episodes():
         (drawn.gain, 0.8, 1.2),
         (drawn.wind, 0.0, 8.0),
         (drawn.lag_s, 0.0, 0.05),
+        (drawn.ramp, 0.0, 0.25),
     ):
         assert low <= value.min() and value.max() <= high
         np.testing.assert_allclose(value.mean(), (low + high) / 2, atol=0.02 * (high - low))
@@ -329,7 +357,9 @@ def test_draws_are_uniform_within_their_limits_and_differ_between_episodes():
     np.testing.assert_allclose(drawn.position_bias.std(), 0.4, rtol=0.03)
     np.testing.assert_allclose(drawn.velocity_bias.std(), 0.2, rtol=0.03)
     # Nothing depends on anything else.
-    numbers = np.stack([drawn.mass, drawn.inertia, *drawn.gain.T, drawn.wind, drawn.lag_s, drawn.ahead[:, 0]])
+    numbers = np.stack(
+        [drawn.mass, drawn.inertia, *drawn.gain.T, drawn.wind, drawn.lag_s, drawn.ramp, drawn.ahead[:, 0]]
+    )
     assert np.abs(np.corrcoef(numbers) - np.eye(len(numbers))).max() < 0.06  # four deviations of 1 / sqrt(4000)
 
 
