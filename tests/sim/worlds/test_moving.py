@@ -261,7 +261,7 @@ def test_environments_and_evaluations_fly_in_what_the_configuration_says():
         (
             "medium",
             {"balls": 1, "ball_seconds": (0.2, 1.0)},
-            r"ball_seconds must be at least 0.25 and more: a ball of 6",
+            r"ball_seconds must be at least 0.25 and more: a ball",
         ),
         ("paper", {"moving_share": 0.5}, r"world.moving_share is for random worlds .* give --world.moving-share 0"),
         ("paper", {"balls": 2}, r"world.balls is for random worlds .* in 'paper' the file says what moves"),
