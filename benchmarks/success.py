@@ -1,9 +1,9 @@
 """How many unseen worlds does a policy fly? Trains several seeds in one program and flies test worlds, row by row.
 
 A row is a world with a sensor. It is written when it is done, with the policies, and a row that is written already is
-not measured again: a command that was stopped goes on where it was. No row is begun that would not end in time. With
---train-only a machine with a GPU trains; the same command without it flies, on any machine, at the same commit and with
-the same options (-- --tuned-for gpu).
+not measured again: a command that was stopped goes on where it was, and several may share the rows. No row is begun
+that would not end in time. With --train-only a machine with a GPU trains; the same command without it flies, on any
+machine, at the same commit and with the same options (-- --tuned-for gpu).
 
     python benchmarks/success.py --out runs/success
     python benchmarks/success.py --out runs/success --worlds medium --sensors events depth -- --total-steps 9000000
@@ -21,6 +21,7 @@ leaves it out.
 from __future__ import annotations
 
 import argparse
+import contextlib
 import dataclasses
 import functools
 import hashlib
@@ -29,10 +30,11 @@ import shutil
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import filelock
 import jax
 import numpy as np
 import yaml
@@ -130,7 +132,7 @@ def row_file(out: Path, config: Config, missions: int, identity: str) -> Path:
         missions: of each seed.
         identity: what else tells rows apart.
     """
-    text = f"{identity} {missions} {_commit()}\n{to_yaml(config)}"
+    text = f"{identity} {missions} {commit()}\n{to_yaml(config)}"
     digest = hashlib.sha256(text.encode()).hexdigest()[:10]
     return out / f"{config.world.name}-{config.env.sensor}-{digest}.json"
 
@@ -149,7 +151,7 @@ def digest_of(policies: Sequence[Policy]) -> str:
 
 
 @functools.cache
-def _commit() -> str | None:
+def commit() -> str | None:
     """Returns the commit of this checkout; None where git does not say."""
     try:
         said = subprocess.run(["git", "rev-parse", "HEAD"], cwd=Path(__file__).parent, capture_output=True, text=True)
@@ -207,7 +209,7 @@ def trained(config: Config, seeds: int, folder: Path) -> tuple[list[Policy], dic
         "train_seconds": results[0].train_seconds,
         "compile_seconds": results[0].compile_seconds,
         "seconds": time.perf_counter() - began,
-        "commit": _commit(),
+        "commit": commit(),
         **json_report.machine(jax.devices()),
     }
     json_report.write_row(file, training)
@@ -268,7 +270,7 @@ def _row(
         "decisions": decisions,
         **took,
         "row_seconds": time.perf_counter() - began,
-        "commit": _commit(),
+        "commit": commit(),
         "options": to_yaml(config),
         "turns": turns,
         **json_report.machine(jax.devices()),
@@ -354,32 +356,57 @@ class Wanted:
     file: Path
     measure: Callable[[], Row]
     train: Callable[[], object] | None = None  # what `measure` does first; None where nothing is to be trained
+    says: Callable[[Row], str] = lambda row: f"{figures(row, None)['success']:.2%}"  # of the row, on the screen
 
 
-def measure(wanted: Sequence[Wanted], rows: list[Row], until: float) -> int:
+def measure(wanted: Sequence[Wanted], rows: list[Row], until: float, first_row_s: float = FIRST_ROW_S) -> int:
     """Measures, writes and appends the rows that are not written yet, while there is time; returns how many are left.
+
+    A row that another process measures is left to it; so several may be given the same rows and folder.
 
     Args:
         wanted: rows.
         rows: that are written already.
         until: when the last row must have ended, in seconds of `time.perf_counter`.
+        first_row_s: assumed duration of a row before one has been measured.
 
     Raises:
         ConfigError: if a row cannot be measured.
     """
-    left = [one for one in wanted if not one.file.is_file()]
-    longest = FIRST_ROW_S
-    while left and time.perf_counter() + longest < until:
-        row = left[0].measure()
-        left[0].file.parent.mkdir(parents=True, exist_ok=True)
-        json_report.write_row(left[0].file, row)
+    took: list[float] = []
+    for one in wanted:
+        if one.file.is_file():
+            continue
+        if time.perf_counter() + max(took, default=first_row_s) >= until:
+            break
+        one.file.parent.mkdir(parents=True, exist_ok=True)
+        with _claim(one.file) as is_ours:
+            if not is_ours or one.file.is_file():
+                continue
+            row = one.measure()
+            json_report.write_row(one.file, row)
         rows.append(row)
-        longest = max(row["row_seconds"] for row in rows[-len(wanted) :])
-        print(f"{left[0].file.name}: {figures(row, None)['success']:.2%}, {row['row_seconds']:.0f} s", file=sys.stderr)
-        left.pop(0)
+        took.append(row["row_seconds"])
+        print(f"{one.file.name}: {one.says(row)}, {row['row_seconds']:.0f} s", file=sys.stderr)
+    left = sum(not one.file.is_file() for one in wanted)
     if left:
-        print(f"{len(left)} rows are left; the same command goes on with them", file=sys.stderr)
-    return len(left)
+        print(f"{left} rows are left; the same command goes on with them", file=sys.stderr)
+    return left
+
+
+@contextlib.contextmanager
+def _claim(file: Path) -> Iterator[bool]:
+    """Yields whether this process may measure the row of a file; the claim ends with the process, however that ends."""
+    lock = filelock.FileLock(file.with_name(file.name + ".lock"), blocking=False)
+    try:
+        lock.acquire()
+    except filelock.Timeout:
+        yield False
+        return
+    try:
+        yield True
+    finally:
+        lock.release()
 
 
 def train_all(wanted: Sequence[Wanted], until: float) -> None:

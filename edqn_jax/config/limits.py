@@ -65,6 +65,9 @@ ON_OR_OFF = Limit("0 or 1", lambda value: value in (0, 1))
 WIDTHS = Limit("one or more widths of at least 1", lambda widths: min(widths, default=0) >= 1)
 SHARES = Limit("three shares between 0 and 1", lambda values: all(0 <= value <= 1 for value in values))
 RISING_SHARES = Limit("shares between 0 and 1 in rising order", lambda values: _rises((0, *values, 1)))
+LEAST_AND_MOST = Limit(
+    "two numbers above 0, the least and the most", lambda values: 0 < values[0] <= values[1] < math.inf
+)
 TWO_TIMES = Limit("at least two times, the last 0", lambda times: len(times) >= 2)
 LAST_AT_0 = Limit("times that end at 0, the decision", lambda times: times[-1] == 0)
 RISING_TIMES = Limit("times in rising order", lambda times: _rises(times))

@@ -116,6 +116,10 @@ def _flight_rules(config: Config, trains: bool) -> Rules:
         before = round(config.drone.physics_steps + times[0] / dt) * dt
         limit = f"at most {before:g}, the seconds of a decision before events.frame_times_s"
         yield exposure.longest_s <= before + 1e-3 * dt, "exposure.longest_s", limit
+    if config.world.balls:
+        slowest = config.world.ball_slowest * config.world.ball_speed_m_s
+        limit = f"at least {1.5 / slowest:.2g} and more: a ball of {slowest:g} m/s must fly 1.5 m"
+        yield slowest * config.world.ball_seconds[0] >= 1.5 - 1e-6, "world.ball_seconds", limit
     if env.drones > 1:
         limit = f"0 with env.drones {env.drones}: balls are thrown at one drone"
         yield not config.world.balls, "world.balls", limit

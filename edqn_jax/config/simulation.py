@@ -12,6 +12,7 @@ from edqn_jax.config.limits import (
     DEVIATION,
     FINITE,
     LAST_AT_0,
+    LEAST_AND_MOST,
     NOT_NEGATIVE,
     ON_OR_OFF,
     POSITIVE,
@@ -53,9 +54,15 @@ class WorldConfig:
     """Speed of the fastest of them, m/s; each has its own, of at least 0.3 times this."""
     balls: Annotated[int, NOT_NEGATIVE, at_most(64)] = 0
     """Balls in each random world, thrown at where the drone will be if it goes on as it flies then."""
-    # Of 1.5 s at least: balls are launched 3 m away or further.
     ball_speed_m_s: Annotated[float, at_most(100), at_least(2)] = 6.0
-    """Speed of these balls, m/s."""
+    """Speed of these balls, m/s; of the fastest where `ball_slowest` is below 1."""
+    ball_slowest: Annotated[float, RATE] = 1.0
+    """Speed of the slowest ball in shares of `ball_speed_m_s`; each has its own."""
+    ball_seconds: Annotated[tuple[float, float], LEAST_AND_MOST] = (1.5, 3.0)
+    """How long before it would meet the drone a ball is launched: least and most, seconds. The slowest must fly 1.5 m
+    in the least."""
+    ball_radii_m: Annotated[tuple[float, float], LEAST_AND_MOST] = (0.3, 0.5)
+    """Least and largest radius of these balls, metres."""
     ball_gravity_m_s2: Annotated[float, NOT_NEGATIVE] = 0.0
     """Gravity that bends their way, m/s^2; at 0 they fly straight."""
 

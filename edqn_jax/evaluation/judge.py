@@ -38,7 +38,7 @@ _FARTHEST_M = 1e3
 _AWAY_M = 1e6
 _OUT_M = 1.0  # beyond the flight volume, and its radius, a ball is no more
 _AT_ONCE_S = 1e-3  # times that differ by less are the same
-_LEAST_LAUNCH_M = 3.0  # nearer to the drone no ball is launched; it is then thrown at where the drone is
+_LEAST_LAUNCH_M = 3.0  # nearer than this, and than it flies, no ball is launched; it is thrown at where the drone is
 
 
 @dataclass(frozen=True)
@@ -138,7 +138,8 @@ class Moving:
         heading = math.atan2(goal[1] - here[1], goal[0] - here[0]) + math.radians(bearing)
         up = math.radians(elevation)
         from_there = np.array([math.cos(heading) * math.cos(up), math.sin(heading) * math.cos(up), math.sin(up)])
-        if target.places is not None and np.linalg.norm(aim + speed * early * from_there - here) < _LEAST_LAUNCH_M:
+        least = min(speed * early, _LEAST_LAUNCH_M)
+        if target.places is not None and np.linalg.norm(aim + speed * early * from_there - here) < least:
             aim = here
         flown = time - launch
         # From the point of launch, with what is thrown upwards for gravity to take back by the hit.

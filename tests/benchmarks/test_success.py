@@ -57,7 +57,7 @@ def test_a_row_is_measured_once_and_then_read(tmp_path: Path, monkeypatch, capsy
     monkeypatch.setattr(success, "train_row", lambda *_: pytest.fail("measured again"))
     assert call(tmp_path) == 0 and capsys.readouterr().out == shown
     # A row of other code is another row.
-    monkeypatch.setattr(success, "_commit", lambda: "0123456")
+    monkeypatch.setattr(success, "commit", lambda: "0123456")
     assert call(tmp_path, "--minutes", "0.01", "--no-spl") == 3
 
 

@@ -52,7 +52,10 @@ NEVER = 1e6
 """Seconds after every flight."""
 
 LEAST_LAUNCH_M = 3.0
-"""Metres from the drone at which a ball is launched at least, so that none hits within its first physics step."""
+"""Metres from the drone at which a ball is launched at least, or as far as it flies until it would meet it."""
+
+LEAST_FLOWN_M = 1.5
+"""Metres that a ball flies at least until then, so that none hits within its first physics step."""
 
 TIME_TOLERANCE_S = 1e-3
 """Times that differ by less are the same: times of physics steps are rounded. A ball is absent at its launch."""
@@ -148,7 +151,8 @@ def no_aim(throw: Throw) -> Aim:
 def aim_at(throw: Throw, goal: Array, volume: Array, launch: Array, here: Array, moved: Array, step_s: float) -> Aim:
     """Returns the aim of balls at the drone's position extrapolated from its last decision.
 
-    A ball that would then begin within `LEAST_LAUNCH_M` of the drone is aimed at the present position.
+    A ball that would then begin within `LEAST_LAUNCH_M` of the drone, and nearer than it flies, is aimed at the present
+    position.
 
     Args:
         throw: of N balls.
@@ -166,7 +170,8 @@ def aim_at(throw: Throw, goal: Array, volume: Array, launch: Array, here: Array,
     way = goal[None] - here
     heading = jnp.arctan2(way[:, 1], way[:, 0])
     away = ahead + (throw.speed * throw.early)[:, None] * _comes_from(throw, heading) - here
-    near = jnp.sum(away**2, axis=1) < LEAST_LAUNCH_M**2
+    least = jnp.minimum(throw.speed * throw.early, LEAST_LAUNCH_M)
+    near = jnp.sum(away**2, axis=1) < least**2
     point = jnp.where(near[:, None], here, ahead)
     return Aim(launch=jnp.broadcast_to(launch, (count,)), point=point, heading=heading)
 

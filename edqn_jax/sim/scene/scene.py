@@ -158,7 +158,7 @@ def speed_bounds(scene: Scene, time: Array) -> dict[str, Array]:
     """Returns a bound [N] m/s of the speed of every shape at `time` [] seconds, of the kinds that move.
 
     Between two times no shape moves further than at the mean of its bounds there, but for a ball that is launched in
-    between, which is then `LEAST_LAUNCH_M` away. Other drones are not among them.
+    between, which is then `LEAST_FLOWN_M` away or further. Other drones are not among them.
     """
     shapes = scene.shapes().items()
     bounds = {kind: top_speeds(each.motion) for kind, each in shapes if getattr(each, "motion", None)}

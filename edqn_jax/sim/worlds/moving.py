@@ -31,9 +31,6 @@ SWING = (1.0, 4.0)
 """Amplitude of what sways, and radius of what circles, metres."""
 SHARES = (0.2, 0.95)
 """Where balls meet the drone, in shares of its way."""
-EARLY = (1.5, 3.0)
-"""How long a ball flies before that, seconds."""
-BALL_RADIUS = (0.3, 0.5)
 BEARING = math.radians(40.0)
 """Balls come from at most so far to either side of the way to the goal, so that a drone that hovers or flies straight
 has them in its image."""
@@ -49,6 +46,9 @@ class Moving:
     speed_m_s: float = 3.0
     balls: int = 0
     ball_speed_m_s: float = 6.0
+    ball_slowest: float = 1.0
+    ball_seconds: tuple[float, float] = (1.5, 3.0)
+    ball_radii_m: tuple[float, float] = (0.3, 0.5)
     ball_gravity_m_s2: float = 0.0
     pace_m_s: float = 4.0
     """Of the drone that balls are thrown at."""
@@ -62,6 +62,9 @@ class Moving:
             speed_m_s=world.moving_speed_m_s,
             balls=world.balls,
             ball_speed_m_s=world.ball_speed_m_s,
+            ball_slowest=world.ball_slowest,
+            ball_seconds=world.ball_seconds,
+            ball_radii_m=world.ball_radii_m,
             ball_gravity_m_s2=world.ball_gravity_m_s2,
             pace_m_s=config.env.speed_m_s,
         )
@@ -162,14 +165,17 @@ def _between_faces(motion: Motion, shapes: Any, volume: Array) -> Motion:
 
 def _with_balls(scene: Scene, moving: Moving, key: Array) -> Scene:
     """Returns the world with balls that are thrown at the drone on its way; the first meets it first."""
-    count = moving.balls
-    uniforms = jax.random.uniform(key, (count, 5 + building.COLOUR_DRAWS))
+    count, differ = moving.balls, moving.ball_slowest < 1
+    uniforms = jax.random.uniform(key, (count, 5 + building.COLOUR_DRAWS + differ))
     share = building.scale_uniforms(SHARES, (jnp.arange(count) + uniforms[:, 0]) / count)
     one = jnp.ones(count)
+    speed = moving.ball_speed_m_s * one
+    if differ:
+        speed = speed * building.scale_uniforms((moving.ball_slowest, 1.0), uniforms[:, -1])
     throw = Throw(
         share=share,
-        early=building.scale_uniforms(EARLY, uniforms[:, 1]),
-        speed=moving.ball_speed_m_s * one,
+        early=building.scale_uniforms(moving.ball_seconds, uniforms[:, 1]),
+        speed=speed,
         bearing=BEARING * (2 * uniforms[:, 2] - 1),
         elevation=ELEVATION * uniforms[:, 3],
         gravity=moving.ball_gravity_m_s2 * one,
@@ -177,8 +183,8 @@ def _with_balls(scene: Scene, moving: Moving, key: Array) -> Scene:
     )
     balls = Spheres(
         position=jnp.full((count, 3), PARKED),
-        radius=building.scale_uniforms(BALL_RADIUS, uniforms[:, 4]),
-        albedo=building.make_albedos(uniforms[:, 5:]),
+        radius=building.scale_uniforms(moving.ball_radii_m, uniforms[:, 4]),
+        albedo=building.make_albedos(uniforms[:, 5 : 5 + building.COLOUR_DRAWS]),
         motion=None if scene.spheres.motion is None else at_rest(count),
         throw=throw,
     )

@@ -295,6 +295,14 @@ def test_no_ball_begins_close_to_the_drone_and_none_is_slower_than_it_may_be():
         assert (np.linalg.norm(two - one, axis=1) / 0.02 <= bound * 1.001 + 2e-3).all()
 
 
+def test_a_late_ball_from_ahead_is_aimed_at_where_the_drone_will_be():
+    late = Throw(*(jnp.full(2, value) for value in (0.5, 0.3, 6.0, 0.0, 0.0, 0.0, 4.0)))
+    here, ahead = jnp.float32([20, 20, 6]), jnp.float32([[1.04, 0, 0], [-1.04, 0, 0]])
+    aim = aim_at(late, jnp.float32([50, 20, 6]), jnp.asarray(VOLUME, jnp.float32), 1.3, here, ahead, 0.26)
+    # Who flies away from it would be 0.6 m from its launch: it is thrown at where that drone is.
+    np.testing.assert_allclose(aim.point, [[21.2, 20, 6], [20, 20, 6]], atol=1e-5)
+
+
 def test_a_mission_has_its_balls_thrown_at_its_own_drone():
     world = world_of(BALL)
     start, goal = jnp.float32([[10, 5, 4]]), jnp.float32([[50, 5, 4]])

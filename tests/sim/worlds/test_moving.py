@@ -203,6 +203,20 @@ def test_balls_meet_a_drone_that_flies_straight_and_come_from_ahead(pools):
     assert np.abs(bearings).max() <= 40.01 and np.ptp(bearings) > 50
 
 
+def test_balls_are_as_late_as_fast_and_as_large_as_the_options_say():
+    late = {"ball_seconds": (0.3, 1.0), "ball_speed_m_s": 12.0, "ball_slowest": 0.5, "ball_radii_m": (0.15, 0.3)}
+    config = make_config("medium", world={"balls": 8, **late}, surface={"pattern": "plaid"})
+    pool = random_pool("medium", KEYS, Moving.from_config(config))
+    throw = jax.tree.map(lambda leaf: np.asarray(leaf)[:, -8:], pool.spheres.throw)
+    for values, (least, most) in ((throw.early, (0.3, 1.0)), (throw.speed, (6.0, 12.0))):
+        assert least <= values.min() < least + 0.1 * (most - least)
+        assert most - 0.1 * (most - least) < values.max() <= most
+    radius = np.asarray(pool.spheres.radius)[:, -8:]
+    assert 0.15 <= radius.min() < 0.17 and 0.28 < radius.max() <= 0.3
+    # Speeds are drawn apart: the other numbers do not follow them.
+    assert abs(np.corrcoef(throw.early.ravel(), throw.speed.ravel())[0, 1]) < 0.3
+
+
 def test_no_ball_comes_near_the_start_in_the_first_seconds(pools):
     pool = random_pool("medium", KEYS, Moving(balls=4))
     for i in range(WORLDS):
@@ -243,6 +257,12 @@ def test_environments_and_evaluations_fly_in_what_the_configuration_says():
         ("medium", {"balls": -1}, r"world.balls must be 0 or more, not -1"),
         ("medium", {"balls": 65}, r"world.balls must be at most 64, not 65"),
         ("medium", {"ball_speed_m_s": 0.0}, r"world.ball_speed_m_s must be at least 2, not 0.0"),
+        ("medium", {"ball_seconds": (1.0, 0.5)}, r"world.ball_seconds must be two numbers above 0, the least and the"),
+        (
+            "medium",
+            {"balls": 1, "ball_seconds": (0.2, 1.0)},
+            r"ball_seconds must be at least 0.25 and more: a ball",
+        ),
         ("paper", {"moving_share": 0.5}, r"world.moving_share is for random worlds .* give --world.moving-share 0"),
         ("paper", {"balls": 2}, r"world.balls is for random worlds .* in 'paper' the file says what moves"),
     ],

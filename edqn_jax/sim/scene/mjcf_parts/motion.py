@@ -30,7 +30,7 @@ import mujoco
 import numpy as np
 
 from edqn_jax.sim.scene.mjcf_parts.files import SceneError
-from edqn_jax.sim.scene.motion import LEAST_LAUNCH_M, Throw, at_rest
+from edqn_jax.sim.scene.motion import LEAST_FLOWN_M, Throw, at_rest
 from edqn_jax.sim.scene.scene import PARKED, Shape, Spheres
 from edqn_jax.sim.scene.shapes.kind import kind_of, reach_of
 
@@ -94,8 +94,8 @@ def _parse_motion(words: Sequence[str], title: str) -> MotionSpec:
         raise SceneError(f"{title} must have a period that is not 0")
     if word == "throw" and (numbers[0] < 0 or min(numbers[1], numbers[2], numbers[6]) <= 0):
         raise SceneError(f"{title} must have a share of 0 or more, and EARLY, SPEED and PACE above 0")
-    if word == "throw" and numbers[1] * numbers[2] < LEAST_LAUNCH_M:
-        raise SceneError(f"{title} must begin {LEAST_LAUNCH_M:g} m away or further: EARLY times SPEED")
+    if word == "throw" and numbers[1] * numbers[2] < LEAST_FLOWN_M * (1 - 1e-6):
+        raise SceneError(f"{title} must begin {LEAST_FLOWN_M:g} m away or further: EARLY times SPEED")
     return word, tuple(numbers)
 
 

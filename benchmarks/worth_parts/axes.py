@@ -1,0 +1,147 @@
+"""What each axis of `worth.py` varies: what policies are trained with, what they see, and where they fly."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import success
+from edqn_jax.config import Config
+
+Layer = Mapping[str, Mapping[str, Any]]
+
+BLIND, DEPTH = "blind", "depth"
+"""Controls that every axis has beside its sensors: what a policy comes to that sees nothing, or the truth."""
+
+FRAMES = ("frames", "frame-pair", "frame-difference")
+"""Sensors of a camera of frames."""
+
+LOOKS = ("plaid", "drawn", "bricks", "posters", "wood", "blank")
+"""Looks that are flown. Policies are trained in the first two; `blank` is among those of `drawn`, the others never."""
+
+_REAL_EVENTS = ("--events.profile", "dvs", "--events.threshold", "0.03", "--events.tolerance", "0.03")
+_REAL_FRAMES = ("--exposure.real",)
+LUX = (0.1, 1.0, 10.0, 100.0, 10_000.0)
+
+QUICK = (
+    *("--drone.physics-steps", "2", "--env.max-decisions", "400", "--events.frame-times-s", "-0.04", "0"),
+    *("--agent.discount", "0.99", "--agent.n-step", "8", "--agent.history", "3", "--env.step-reward", "-0.03"),
+    *("--encoder.hold-decisions", "20"),
+)
+"""Decisions at 25 Hz: what the defaults say of 0.26 s, said of 0.04 s; three observations for every sensor."""
+
+SECONDS = ((0.3, 0.4), (0.4, 0.5), (0.5, 0.7), (0.7, 1.0))
+SPEEDS_M_S = (6.0, 9.0, 12.0)
+RADII_M = (0.15, 0.3)
+
+
+@dataclasses.dataclass(frozen=True)
+class Axis:
+    """An axis of the map."""
+
+    question: str
+    worlds: Sequence[str]
+    trained: Mapping[str, Sequence[str]]
+    """By condition: options of training in it."""
+    sensors: Mapping[str, Sequence[str]]
+    """By `env.sensor`: options that the sensor has."""
+    flown: Mapping[str, Layer]
+    """By condition: what is otherwise than in training. A comma parts it into column and row of the figure."""
+    flags: Sequence[str] = ()
+    """Options of all rows."""
+    same_trained: bool = False
+    """Whether the controls see nothing of what differs between conditions of training, and are trained in one."""
+    same_flown: bool = False
+    """Likewise of the conditions that are flown."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Place:
+    """A row of an axis: a world, a condition of training and a sensor."""
+
+    world: str
+    trained: str
+    sensor: str
+
+
+AXES: dict[str, Axis] = {
+    "looks": Axis(
+        "Looks never trained on",
+        ("medium", "rooms"),
+        {look: ("--surface.pattern", look) for look in LOOKS[:2]},
+        dict.fromkeys((BLIND, DEPTH, "events", *FRAMES), ()),
+        {look: {"surface": {"pattern": look}} for look in LOOKS},
+        same_trained=True,
+        same_flown=True,
+    ),
+    "age": Axis(
+        "Age of what is seen, and time to impact",
+        ("court",),
+        {"0.3 to 1 s": ()},
+        dict.fromkeys((BLIND, DEPTH, "depth-late-1", "depth-late-2", "events", "frame-pair", "frames"), ()),
+        {
+            f"{least:g} to {most:g} s, {speed:g} m/s": {
+                "world": {"ball_seconds": (least, most), "ball_speed_m_s": speed, "ball_slowest": 1.0}
+            }
+            for speed in SPEEDS_M_S
+            for least, most in SECONDS
+        },
+        (
+            *QUICK,
+            *("--world.balls", "4", "--world.ball-seconds", str(SECONDS[0][0]), str(SECONDS[-1][1])),
+            *("--world.ball-speed-m-s", str(SPEEDS_M_S[-1]), "--world.ball-slowest", "0.5"),
+            *("--world.ball-radii-m", *map(str, RADII_M)),
+        ),
+    ),
+    "dark": Axis(
+        "Light and speed",
+        ("medium",),
+        {f"{speed:g} m/s": ("--env.speed-m-s", str(speed)) for speed in (4.0, 8.0)},
+        {BLIND: (), DEPTH: (), "events": _REAL_EVENTS, "frames": _REAL_FRAMES, "frame-pair": _REAL_FRAMES},
+        {f"{lux:g} lux": {"light": {"least_lux": lux, "most_lux": lux}} for lux in LUX},
+        ("--light.least-lux", str(LUX[0]), "--light.most-lux", str(LUX[-1])),
+        same_flown=True,
+    ),
+}
+"""By name."""
+
+
+def places_of(axis: Axis, worlds: Sequence[str], trained: Sequence[str], sensors: Sequence[str]) -> list[Place]:
+    """Returns those rows of an axis that are of these worlds, conditions of training and sensors; in its own order.
+
+    A control that sees nothing of the conditions of training has the first of them alone.
+    """
+    first = next(iter(axis.trained))
+    return [
+        Place(world, condition, sensor)
+        for world in axis.worlds
+        for sensor in axis.sensors
+        for condition in axis.trained
+        if world in worlds and sensor in sensors and (condition in trained or is_first_alone(axis, sensor))
+        if condition == first or not is_first_alone(axis, sensor)
+    ]
+
+
+def is_first_alone(axis: Axis, sensor: str) -> bool:
+    """Returns whether a sensor is trained in the first condition alone, and stands for all of them."""
+    return axis.same_trained and sensor in (BLIND, DEPTH)
+
+
+def flown_of(axis: Axis, sensor: str) -> dict[str, Layer]:
+    """Returns the conditions in which a policy of this sensor flies; the first stands for all that it cannot tell."""
+    flown = dict(axis.flown)
+    if axis.same_flown and sensor in (BLIND, DEPTH):
+        first = next(iter(flown))
+        return {first: flown[first]}
+    return flown
+
+
+def config_of(axis: Axis, place: Place, flags: Sequence[str]) -> Config:
+    """Returns the configuration of a row's first seed; `flags` are options of train.py beside those of the axis.
+
+    Raises:
+        ConfigError: if the options are invalid.
+    """
+    own = (*axis.flags, *axis.trained[place.trained], *axis.sensors[place.sensor])
+    return success.config_of(place.world, place.sensor, [*own, *flags])

@@ -1,0 +1,89 @@
+"""What the axes see and fly beside what the package has: two sensors, and worlds with nothing but balls."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+import edqn_jax
+from edqn_jax.config import Config
+from edqn_jax.config.registry import FAMILIES, SENSORS
+from edqn_jax.sim.physics.drone import Flight
+from edqn_jax.sim.scene.scene import Scene
+from edqn_jax.sim.sensors.sensor import Image, last_view, nearness_image
+from edqn_jax.sim.worlds import building
+from edqn_jax.sim.worlds.free_points import TRIES
+
+MOST_LATE = 3
+"""Observations by which `depth-late-N` is late at most."""
+
+COURT_M = (40.0, 40.0, 16.0)
+"""Flight volume of the worlds `court`, metres: missions are 20 m long or more."""
+
+
+def difference() -> edqn_jax.Sensor:
+    """Returns the sensor `frame-difference`: of a frame pair, how much darker each frame before the newest was.
+
+    The newest frame itself is not shown.
+    """
+    pair = SENSORS.get("frame-pair")
+
+    def show(config: Config, scene: Scene, poses: Flight, memory: Any, key: Array) -> tuple[Array, Any]:
+        pictures, memory = pair.show(config, scene, poses, memory, key)
+        return pictures[1:], memory
+
+    def shape(config: Config) -> tuple[int, ...]:
+        count, *size = pair.shape(config)
+        return count - 1, *size
+
+    return edqn_jax.Sensor(
+        show,
+        shape=shape,
+        frame_times_s=pair.frame_times_s,
+        draws_frames=True,
+        exposes=True,
+        at_rest=pair.at_rest,
+        image=Image("change of log brightness", "change of log brightness", signed=True),
+    )
+
+
+def late_depth(count: int) -> edqn_jax.Sensor:
+    """Returns the sensor `depth-late-N`: the picture of `depth` of `count` observations before.
+
+    Until there is one, the drone has been at rest, and it is the first.
+    """
+
+    def show(config: Config, scene: Scene, poses: Flight, memory: Any, key: Array) -> tuple[Array, Any]:
+        pictures, seen = memory
+        now = nearness_image(config, *last_view(scene, poses))[None]
+        pictures = jnp.where(seen, pictures, now)
+        return pictures[:1], (jnp.concatenate([pictures[1:], now]), jnp.ones((), bool))
+
+    def at_rest(config: Config, key: Array) -> tuple[Array, Array]:
+        return jnp.zeros((count, config.camera.height, config.camera.width)), jnp.zeros((), bool)
+
+    return edqn_jax.Sensor(
+        show,
+        shape=lambda config: (1, config.camera.height, config.camera.width),
+        draws_frames=True,
+        at_rest=at_rest,
+        image=Image("nearness", "nearness (3 is contact)"),
+    )
+
+
+def sample_court(key: Array) -> Scene:
+    """Returns a world with level ground and nothing on it, a start and a goal; the key is consumed."""
+    return building.build_scene(COURT_M, jax.random.uniform(key, (2, TRIES, 3)), building.make_ground())
+
+
+def register() -> None:
+    """Registers these sensors and worlds, once."""
+    if "court" in FAMILIES:
+        return
+    FAMILIES.register("court", edqn_jax.Family(sample_court, COURT_M, edge_m=None), "nothing but balls that are thrown")
+    SENSORS.register("frame-difference", difference(), "how the brightness has changed between two frames")
+    for count in range(1, MOST_LATE + 1):
+        SENSORS.register(f"depth-late-{count}", late_depth(count), f"true depth of {count} observations before")

@@ -1,0 +1,147 @@
+"""The map of `worth.py` as one picture: who leads where, with "no difference" as a colour of its own."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from pathlib import Path
+
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.patches import Patch, Rectangle
+
+import success
+from edqn_jax.errors import ConfigError
+from edqn_jax.report.style import INK, MUTED, open_figure
+from worth_parts import traffic
+from worth_parts.axes import AXES, BLIND, DEPTH
+from worth_parts.table import Cell, best_of, cells_of, rows_of, verdict_of
+
+COLOURS = {
+    "events": "#e69f00",
+    "frames": "#56b4e9",
+    "frame-pair": "#3f7fbf",
+    "frame-difference": "#7f6fc4",
+    "frames or pairs": "#9cc3e0",
+    "depth": "#009e73",
+    "depth-late-1": "#a6d9c7",
+    "depth-late-2": "#d3ece4",
+    "no difference": "#d9d9d9",
+    "–": "#ffffff",
+}
+"""By verdict; those of the bytes are `events`, `frames` and `no difference`."""
+
+LABELS = {
+    "events": "events lead",
+    "frames": "one frame leads (bytes: frames cost less)",
+    "frame-pair": "frame pair leads",
+    "frame-difference": "difference of the pair leads",
+    "frames or pairs": "frames or pairs, events behind",
+    "depth": "fresh depth ahead of older",
+    "depth-late-1": "depth one observation old leads",
+    "depth-late-2": "depth two observations old leads",
+    "no difference": "no difference",
+}
+
+SHORT = {"frames": "frame", "frame-pair": "pair", "frame-difference": "diff.", "depth-late-1": "late", BLIND: "blind"}
+
+CONTRAST = 0.2
+"""Of the sensor whose bytes are drawn; tables have others."""
+
+ROW_IN, LABEL_IN, CELL_IN, HEAD_IN = 0.42, 2.1, 1.02, 0.62
+"""Height of a row, width of row labels, width of a column, and height over a panel, inches."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Panel:
+    """A grid of cells."""
+
+    title: str
+    rows: list[str]
+    columns: list[str]
+    cells: dict[tuple[str, str], tuple[str, str]]
+    """By row and column: who leads, and what is written there."""
+
+
+def draw_map(rows: Sequence[success.Row], file: Path) -> Figure:
+    """Writes the map as a PNG, a panel for each axis of which there are rows, and returns the figure.
+
+    Raises:
+        ConfigError: if there are no rows.
+    """
+    panels = [_flights_panel(name, rows_of(rows, name)) for name in AXES if rows_of(rows, name)]
+    if counted := rows_of(rows, "bytes"):
+        panels.append(_bytes_panel(counted))
+    if not panels:
+        raise ConfigError(f"there are no rows of this benchmark beside '{file}'; measure some with --axis first")
+    heights = [HEAD_IN + ROW_IN * len(panel.rows) for panel in panels]
+    width = LABEL_IN + CELL_IN * max(len(panel.columns) for panel in panels) + 0.2
+    shown = {who for panel in panels for who, _ in panel.cells.values()}
+    foot = 0.3 + 0.2 * -(-len(shown) // 3)
+    height = sum(heights) + foot
+    with open_figure(width, height, file) as figure:
+        figure.set_layout_engine("none")  # panels are placed to the inch
+        top = height
+        for panel, tall in zip(panels, heights, strict=True):
+            top -= tall
+            across = CELL_IN * len(panel.columns)
+            box = (LABEL_IN / width, top / height, across / width, ROW_IN * len(panel.rows) / height)
+            _draw_panel(figure.add_axes(box), panel)
+        marks = [Patch(color=COLOURS[who], label=LABELS[who]) for who in LABELS if who in shown]
+        figure.legend(handles=marks, loc="lower left", ncols=3, frameon=False, fontsize=7, bbox_to_anchor=(0.01, 0.0))
+    return figure
+
+
+def _flights_panel(name: str, rows: Sequence[success.Row]) -> Panel:
+    axis, found, heads, sides = AXES[name], {}, [], []
+    for cell in cells_of(rows, axis):
+        column, _, aside = cell.flown.partition(", ")
+        parts = [cell.world, f"trained: {cell.trained}", aside]
+        side = ", ".join(part for part in parts if part)
+        heads += [column] if column not in heads else []
+        sides += [side] if side not in sides else []
+        best = best_of(cell)
+        found[side, column] = verdict_of(best, cell.rivals), _written(cell, best)
+    return Panel(f"{axis.question}: success in %, blind → best → depth", sides, heads, found)
+
+
+def _written(cell: Cell, best: Sequence[str]) -> str:
+    """Returns success as blind → best → depth, and by how much the best of the events' camera is ahead or behind."""
+    named = [sensor for sensor in (BLIND, *best[:1], DEPTH) if sensor in cell.arrived]
+    rates = " → ".join(f"{100 * cell.arrived[sensor].mean():.0f}" for sensor in dict.fromkeys(named))
+    tied = ", ".join(SHORT.get(sensor, sensor) for sensor in best[:3])
+    return f"{rates}\n{tied}"
+
+
+def _bytes_panel(rows: Sequence[success.Row]) -> Panel:
+    found, sides = {}, []
+    columns = [f"{rate} frames/s" for rate in traffic.FRAME_RATES]
+    for row in sorted(rows, key=lambda row: (traffic.WORLDS.index(row["world"]), row["width"])):
+        side = f"{row['world']}, {row['look']}, {row['width']} × {row['height']}"
+        sides.append(side)
+        even, low, high = traffic.break_even(row, str(CONTRAST), traffic.EVENT_BYTES[0])
+        for rate, column in zip(traffic.FRAME_RATES, columns, strict=True):
+            who = "events" if high < rate else "frames" if low > rate else "no difference"
+            found[side, column] = who, f"{even / rate:.2g}"
+    title = (
+        f"Bytes: those of events (contrast {CONTRAST:g}, {traffic.EVENT_BYTES[0]} bytes each) over those of 8-bit "
+        "frames; below 1 events cost less"
+    )
+    return Panel(title, sides, columns, found)
+
+
+def _draw_panel(axes: Axes, panel: Panel) -> None:
+    for (row, column), (who, said) in panel.cells.items():
+        x, y = panel.columns.index(column), panel.rows.index(row)
+        axes.add_patch(Rectangle((x, y), 1, 1, facecolor=COLOURS[who], edgecolor="white", linewidth=1.5))
+        axes.text(x + 0.5, y + 0.5, said, ha="center", va="center", fontsize=6.5, color=INK, linespacing=1.3)
+    axes.set_xlim(0, len(panel.columns))
+    axes.set_ylim(len(panel.rows), 0)
+    axes.set_xticks([x + 0.5 for x in range(len(panel.columns))], panel.columns, fontsize=7)
+    axes.set_yticks([y + 0.5 for y in range(len(panel.rows))], panel.rows, fontsize=7)
+    axes.xaxis.tick_top()
+    axes.tick_params(length=0, colors=MUTED)
+    axes.grid(False)
+    for spine in axes.spines.values():
+        spine.set_visible(False)
+    axes.set_title(panel.title, fontsize=8, loc="left", pad=16, color=INK)

@@ -1,0 +1,165 @@
+"""Tables of `worth.py`: success as blind, sensors, true depth, and which of them leads."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+
+import success
+from edqn_jax.errors import ConfigError
+from edqn_jax.evaluation.intervals import bootstrap_rates, percentile_interval, rate_interval
+from measurement.intervals import difference_interval
+from worth_parts import traffic
+from worth_parts.axes import AXES, BLIND, DEPTH, FRAMES, Axis, flown_of, is_first_alone
+
+GOAL = "1"
+"""Digit of a flight that arrived."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Cell:
+    """Policies of several sensors in the same missions, trained and flown in one condition each."""
+
+    world: str
+    trained: str
+    flown: str
+    arrived: dict[str, np.ndarray]
+    """[S, M] bool by sensor: S seeds, M missions."""
+
+    @property
+    def rivals(self) -> list[str]:
+        """Returns the sensors that are compared: all but the controls; true depth of several ages where no other is."""
+        sensors = [sensor for sensor in self.arrived if sensor not in (BLIND, DEPTH)]
+        if all(sensor.startswith("depth-late") for sensor in sensors):
+            return [sensor for sensor in self.arrived if sensor != BLIND]
+        return [sensor for sensor in sensors if not sensor.startswith("depth-late")]
+
+
+def rows_of(rows: Iterable[success.Row], axis: str) -> list[success.Row]:
+    """Returns the rows of an axis, of those with the same name the newest.
+
+    Raises:
+        ConfigError: if they were not trained and flown alike.
+    """
+    newest = {}
+    for row in rows:
+        if row.get("benchmark") == "worth" and row["axis"] == axis:
+            newest[tuple(row.get(key) for key in ("world", "trained", "sensor", "width", "look"))] = row
+    found = list(newest.values())
+    for key, said in (("decisions", "decisions"), ("missions", "missions"), ("test_seed", "test worlds")):
+        if len({row.get(key) for row in found}) > 1:
+            raise ConfigError(f"the rows of the axis {axis} have other {said} than each other; move some of them away")
+    return found
+
+
+def cells_of(rows: Sequence[success.Row], axis: Axis) -> list[Cell]:
+    """Returns the cells of an axis of which there are rows, in its order; a control that is alike stands in each."""
+    of = {(row["world"], row["trained"], row["sensor"]): row for row in rows}
+    first, cells = next(iter(axis.trained)), []
+    for world, trained, flown in itertools.product(axis.worlds, axis.trained, axis.flown):
+        arrived = {}
+        for sensor in axis.sensors:
+            row = of.get((world, first if is_first_alone(axis, sensor) else trained, sensor))
+            if row is None:
+                continue
+            alike = next(iter(axis.flown)) if len(flown_of(axis, sensor)) == 1 else flown
+            if alike in row["flown"]:
+                arrived[sensor] = np.array([[digit == GOAL for digit in seed] for seed in row["flown"][alike]])
+        if arrived.keys() - {BLIND, DEPTH} or len(axis.sensors) == len(arrived):
+            cells.append(Cell(world, trained, flown, arrived))
+    return cells
+
+
+def best_of(cell: Cell) -> list[str]:
+    """Returns the rival with the most success, and after it those from which its interval of difference holds 0."""
+    rivals = sorted(cell.rivals, key=lambda sensor: -cell.arrived[sensor].mean())
+    if not rivals:
+        return []
+    drawn = dict(zip(rivals, bootstrap_rates([cell.arrived[sensor] for sensor in rivals]), strict=True))
+    first = rivals[0]
+
+    def is_behind(sensor: str) -> bool:
+        both = [cell.arrived[each] for each in (first, sensor)]
+        if all(0 < each.mean() < 1 for each in both):
+            low, _ = percentile_interval(drawn[first] - drawn[sensor])
+        else:
+            low, _ = difference_interval(*both)
+        return low > 0
+
+    return [first, *(sensor for sensor in rivals[1:] if not is_behind(sensor))]
+
+
+def verdict_of(best: Sequence[str], rivals: Sequence[str]) -> str:
+    """Returns who leads, in words: a sensor; `frames or pairs` where only events are behind; or `no difference`."""
+    if len(rivals) < 2:
+        return "–"
+    if len(best) == 1:
+        return best[0]
+    if set(best) <= set(FRAMES) and not set(rivals) <= set(FRAMES):
+        return "frames or pairs"
+    return "no difference"
+
+
+def tables(rows: Sequence[success.Row]) -> str:
+    """Returns the rows as Markdown, a table for each axis of which there are some.
+
+    Raises:
+        ConfigError: if rows of an axis were not measured alike.
+    """
+    shown = [_flights_table(name, rows_of(rows, name)) for name in AXES if rows_of(rows, name)]
+    if counted := rows_of(rows, "bytes"):
+        shown.append(_bytes_table(counted))
+    return "\n\n".join(shown) if shown else "There are no rows."
+
+
+def _flights_table(name: str, rows: Sequence[success.Row]) -> str:
+    axis, cells = AXES[name], cells_of(rows, AXES[name])
+    sensors = [sensor for sensor in axis.sensors if sensor not in (BLIND, DEPTH)]
+    columns = [sensor for sensor in (BLIND, *sensors, DEPTH) if any(sensor in cell.arrived for cell in cells)]
+    first, seeds = rows[0], sorted({len(row["seeds"]) for row in rows})
+    worlds = first["test_seed"] * first["missions"]
+    lines = [
+        f"{axis.question}: {' or '.join(map(str, seeds))} seeds × {first['missions']:,} missions a cell, the same for "
+        f"all sensors (test worlds {worlds} to {worlds + first['missions'] - 1}), {first['decisions']:,} decisions a "
+        "seed. Success in % with its 95 % interval; the last column says who leads of all but the controls.",
+        "",
+        f"| world | trained | flown | {' | '.join(columns)} | leads |",
+        f"| --- | --- | --- |{' --- |' * len(columns)} --- |",
+    ]
+    for cell in cells:
+        shown = " | ".join(_rate(cell.arrived.get(sensor)) for sensor in columns)
+        leads = verdict_of(best_of(cell), cell.rivals)
+        lines.append(f"| {cell.world} | {cell.trained} | {cell.flown} | {shown} | {leads} |")
+    return "\n".join(lines)
+
+
+def _rate(arrived: np.ndarray | None) -> str:
+    if arrived is None:
+        return "–"
+    low, high = rate_interval(arrived)
+    return f"{100 * arrived.mean():.1f} ({100 * low:.1f} to {100 * high:.1f})"
+
+
+def _bytes_table(rows: Sequence[success.Row]) -> str:
+    first = rows[0]
+    heads = [f"{size} bytes an event" for size in traffic.EVENT_BYTES]
+    lines = [
+        f"Bytes: the policy {first['policy']} in {first['missions']} test worlds each, {traffic.MOMENTS} moments of "
+        "0.2 s a flight, an ESIM sensor without noise. The break-even is the frame rate at which 8-bit frames cost as "
+        "many bytes a second, with its 95 % interval over flights: slower frames cost less than events.",
+        "",
+        f"| world | look | pixels | contrast | events a second | {' | '.join(f'break-even, {x}' for x in heads)} |",
+        f"| --- | --- | --- | ---: | ---: |{' ---: |' * len(heads)}",
+    ]
+    for row in sorted(rows, key=lambda row: (traffic.WORLDS.index(row["world"]), row["width"])):
+        for contrast, rates in row["events_per_second"].items():
+            found = [traffic.break_even(row, contrast, size) for size in traffic.EVENT_BYTES]
+            shown = " | ".join(f"{rate:.1f} Hz ({low:.1f} to {high:.1f})" for rate, low, high in found)
+            lines.append(
+                f"| {row['world']} | {row['look']} | {row['width']} × {row['height']} | {contrast} "
+                f"| {np.mean(rates):,.0f} | {shown} |"
+            )
+    return "\n".join(lines)
