@@ -39,10 +39,11 @@ class FlyArgs:
     """POLICY.onnx, as `edqn export` writes it; with --simulate the folder of a run, or a policy of the package, such as
     `pretrained-looks`."""
     simulate: Annotated[str | None, arg(metavar="WORLD", help_behavior_hint="")] = None
-    """Fly here, in a world by name or an MJCF file: three processes, RotorPy's quadrotor, evlib's events (extra
-    `transfer`)."""
+    """Fly here, in a world by name or an MJCF file: three processes, RotorPy's quadrotor, an ESIM's events."""
     missions: Annotated[int, arg(metavar="N")] = 1
     """With --simulate: how many."""
+    jobs: Annotated[int, arg(metavar="J")] = 1
+    """With --simulate: how many missions are flown at once, each on a core of its own."""
     seed: Annotated[int, arg(metavar="S")] = 0
     """With --simulate: of the test worlds."""
     speed: Annotated[float, arg(metavar="X")] = 1.0
@@ -111,8 +112,8 @@ def parse_fly(argv: Sequence[str]) -> FlyArgs:
     args = parse_arguments(FlyArgs, argv, FLY)
     if args.simulate is not None and args.replay is not None:
         raise ConfigError("--simulate flies and --replay plays a flight again; give one of them")
-    if args.missions < 1 or args.seed < 0 or args.speed <= 0:
-        raise ConfigError("--missions must be at least 1, --seed at least 0 and --speed more than 0")
+    if min(args.missions, args.jobs) < 1 or args.seed < 0 or args.speed <= 0:
+        raise ConfigError("--missions and --jobs must be at least 1, --seed at least 0 and --speed more than 0")
     if args.camera is not None and min(args.camera) < 1:
         raise ConfigError(f"--camera must be two whole numbers of at least 1, not {args.camera[0]} {args.camera[1]}")
     if not 0.2 <= args.pace <= 1.0:
@@ -323,29 +324,35 @@ def simulate(args: FlyArgs) -> None:
 
     from edqn_jax.evaluation.metrics import wilson_interval
     from edqn_jax.fly.simulated.missions import Setup, environment_of, fly_missions
+    from edqn_jax.fly.simulated.several import fly_at_once
     from edqn_jax.interop.deployment.onnx_export import export_policy
     from edqn_jax.runs.policies import load_policy
 
     assert args.simulate is not None
     policy = load_policy(args.policy)
-    environment = environment_of(args.simulate, policy.config, args.missions, args.seed)
+    asked = args.simulate, policy.config, args.missions, args.seed
+    ended = []
     with tempfile.TemporaryDirectory() as folder:
         file = export_policy(policy, Path(folder) / "policy.onnx").file
         size = (346, 260) if args.camera is None else args.camera
         answers = ["--after-hover", args.after_hover, "--at-goal", args.at_goal, "--least-rate", repr(args.least_rate)]
         more = (*answers, *(("--on", *args.on) if args.on else ()))
         setup = Setup(file, size, speed=args.speed, picture=args.picture, out=args.out, pace=args.pace, autopilot=more)
-        ended = []
-        for mission in fly_missions(environment, setup):
-            ended.append(mission)
+        flown = (
+            fly_missions(environment_of(*asked), setup)
+            if args.jobs == 1
+            else fly_at_once(*asked, setup, jobs=args.jobs)
+        )
+        for mission in flown:
+            ended = sorted([*ended, mission], key=lambda each: each.number)
             print(
                 f"mission {mission.number}: {mission.outcome} after {mission.seconds:.1f} s, {mission.clearance_m:.2f} "
                 f"m clear at least; {mission.events_hz:,.0f} events/s; {mission.speed:.2f} simulated seconds a second; "
                 f"{latency_sentence(mission.latency)}",
                 flush=True,
             )
+            if args.json is not None:  # after each: who is cut off has those that ended
+                write_atomically(args.json, json.dumps([asdict(each) for each in ended], indent=2) + "\n")
     reached = sum(each.outcome == "goal" for each in ended)
     low, high = wilson_interval(reached, len(ended))
     print(f"{reached} of {len(ended)} reached the goal ({100 * low:.0f} to {100 * high:.0f} %, Wilson)")
-    if args.json is not None:
-        write_atomically(args.json, json.dumps([asdict(each) for each in ended], indent=2) + "\n")

@@ -21,6 +21,9 @@ from edqn_jax.interop.deployment.runner import Runner
 TICK_S = 0.02
 """Setpoints are sent at 50 Hz."""
 
+GAP_S = 0.1
+"""Longer gaps between setpoints are counted; PX4 leaves offboard mode after 0.5 s."""
+
 
 @dataclasses.dataclass
 class Latency:
@@ -33,11 +36,13 @@ class Latency:
     decide: list[float] = dataclasses.field(default_factory=list)
     """Counting the events of the window, and the network."""
     send: list[float] = dataclasses.field(default_factory=list)
+    rest: list[float] = dataclasses.field(default_factory=list)
+    """The state machine and the log."""
 
     def percentiles(self) -> dict[str, tuple[float, float]]:
         """Returns median and 99th percentile of each part, and of their sum without `age` as `computing`."""
         parts = {field.name: np.array(getattr(self, field.name)) for field in dataclasses.fields(self)}
-        parts["computing"] = parts["read"] + parts["decide"] + parts["send"]
+        parts["computing"] = parts["read"] + parts["decide"] + parts["send"] + parts["rest"]
         parts["all"] = parts["computing"] + parts["age"]
         return {
             name: (float(np.median(each)), float(np.percentile(each, 99))) for name, each in parts.items() if each.size
@@ -55,6 +60,8 @@ class Report:
     latency: Latency
     longest_gap_s: float
     """Between two setpoints of the flight."""
+    gaps: int
+    """How many of those between setpoints were longer than `GAP_S`."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -122,7 +129,7 @@ class Pilot:
         self._due, self._written_us = 0.0, -1
         self._flying_at: float | None = None
         self._sent_at: float | None = None
-        self._gap_s, self._fresh = 0.0, True
+        self._gap_s, self._gaps, self._fresh = 0.0, 0, True
 
     def fly(self) -> Report:
         """Flies until it has ended."""
@@ -147,14 +154,14 @@ class Pilot:
         seconds = 0.0 if self._flying_at is None else self.clock.now() - self._flying_at
         if self._log is not None:
             self._log.write("end", outcome=outcome, seconds=seconds, latency=self.latency.percentiles())
-        return Report(outcome, seconds, len(self.latency.decide), self.latency, self._gap_s)
+        return Report(outcome, seconds, len(self.latency.decide), self.latency, self._gap_s, self._gaps)
 
     def tick(self) -> None:
         """Reads, decides where it is time to, and sends."""
-        began, now = time.perf_counter(), self.clock.now()
+        awoke, now = time.perf_counter(), self.clock.now()
         self.source.read(now, getattr(self.clock, "streamed_us", -1))
         self.link.read(now)
-        read_s = time.perf_counter() - began
+        read_s = time.perf_counter() - awoke
         inputs = self._inputs()
         before = self.state.phase
         self.state, output = step(self.state, inputs, now, self.settings)
@@ -164,20 +171,23 @@ class Pilot:
             self._begin(now)
         self._write_tick(now, inputs, output)
         decides = output.decides and now >= self._due - 1e-6
-        decide_s = 0.0
+        decide_s = waited_s = 0.0
         if decides:
             self._due = max(self._due + self.settings.period_s, now)
             began = time.perf_counter()
             self._command = self._decide(now)
             decide_s = time.perf_counter() - began
+            began = time.perf_counter()
             self.clock.work()
+            waited_s = time.perf_counter() - began
             now, inputs = self.clock.now(), dataclasses.replace(inputs, command=self._command)
             self.state, output = step(self.state, inputs, now, self.settings)
             self._write_tick(now, inputs, output)
         began = time.perf_counter()
         self._send(output, now)
         if decides:
-            self._keep_latency(now, read_s, decide_s, time.perf_counter() - began)
+            send_s, spent_s = time.perf_counter() - began, time.perf_counter() - awoke - waited_s
+            self._keep_latency(now, read_s, decide_s, send_s, spent_s - read_s - decide_s - send_s)
         if self.state.phase is not before:
             self._tell(f"{now:.2f} s: {self.state.phase}" + (f" ({why})" if (why := self._why()) else ""))
 
@@ -241,15 +251,18 @@ class Pilot:
         if velocity is None:
             self._sent_at = None
             return
+        sent_at = self.clock.now()
         if self._sent_at is not None:
-            self._gap_s = max(self._gap_s, now - self._sent_at)
-        self._sent_at = now
+            self._gap_s = max(self._gap_s, sent_at - self._sent_at)
+            self._gaps += sent_at - self._sent_at > GAP_S
+        self._sent_at = sent_at
 
-    def _keep_latency(self, now: float, read_s: float, decide_s: float, send_s: float) -> None:
+    def _keep_latency(self, now: float, read_s: float, decide_s: float, send_s: float, rest_s: float) -> None:
         packet_at, latency = self.source.events.packet_at, self.latency
         seen_at = 1e-6 * self.source.events.until_us + (self.source.events.offset.value or 0.0)
         latency.age.append(1e3 * max(0.0, (packet_at or now) - seen_at))
-        for part, spent in ((latency.read, read_s), (latency.decide, decide_s), (latency.send, send_s)):
+        parts = (latency.read, read_s), (latency.decide, decide_s), (latency.send, send_s), (latency.rest, rest_s)
+        for part, spent in parts:
             part.append(1e3 * spent)
 
     def _write_tick(self, now: float, inputs: Inputs, output: Output) -> None:

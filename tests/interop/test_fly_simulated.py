@@ -20,11 +20,11 @@ import pytest
 
 pytest.importorskip("pymavlink")
 pytest.importorskip("rotorpy")
-pytest.importorskip("evlib")
 
 from edqn_jax.cli import fly as command  # noqa: E402
 from edqn_jax.cli import main  # noqa: E402
 from edqn_jax.cli.process.signals import Stops  # noqa: E402
+from edqn_jax.errors import ConfigError  # noqa: E402
 from edqn_jax.fly.link import Link  # noqa: E402
 from edqn_jax.fly.pilot import Pilot  # noqa: E402
 from edqn_jax.fly.records import FlightLog, read_records  # noqa: E402
@@ -32,6 +32,7 @@ from edqn_jax.fly.simulated import missions  # noqa: E402
 from edqn_jax.fly.simulated.camera import EventServer  # noqa: E402
 from edqn_jax.fly.simulated.lockstep import SimulatedClock  # noqa: E402
 from edqn_jax.fly.simulated.missions import Setup, environment_of, fly_mission  # noqa: E402
+from edqn_jax.fly.simulated.several import fly_at_once  # noqa: E402
 from edqn_jax.fly.streams import EVENT, DvStream  # noqa: E402
 from edqn_jax.interop.deployment.onnx_export import export_policy  # noqa: E402
 from edqn_jax.runs.policies import load_policy  # noqa: E402
@@ -76,6 +77,23 @@ def test_a_mission_is_flown_over_the_wire_and_its_log_goes_the_same_way_once_mor
     assert read_records(folder)[-1]["kind"] == "end"
     assert main(["fly", str(exported), "--replay", str(folder)]) == 0
     assert " 0 of them with another output" in capsys.readouterr().out
+
+
+@pytest.mark.slow
+def test_missions_that_are_flown_at_once_end_as_one_by_one(exported: Path) -> None:
+    asked = "medium", load_policy("pretrained-looks").config, 2, 0
+    setup = Setup(exported, SIZE, frame_s=0.01, autopilot=("--max-s", "1"))
+    alone = list(missions.fly_missions(environment_of(*asked), setup))
+    at_once = sorted(fly_at_once(*asked, setup, jobs=2), key=lambda each: each.number)
+    told = [(each.number, each.outcome, each.seconds, each.clearance_m) for each in alone]
+    assert told == [(each.number, each.outcome, each.seconds, each.clearance_m) for each in at_once]
+    assert [each.outcome for each in alone] == ["time out", "time out"]
+
+
+def test_an_environment_that_cannot_be_made_at_once_is_one_sentence() -> None:
+    nothing: Any = None
+    with pytest.raises(ConfigError, match="worlds must be 1 for 'nowhere'"):
+        list(fly_at_once("nowhere", load_policy("pretrained-looks").config, 2, 0, nothing, jobs=2))
 
 
 class Left:
@@ -239,6 +257,7 @@ ROOM = ["--goal", "9", "0", "5", "--volume", "0", "-5", "0", "20", "5", "9"]
         (["a.onnx", "--replay", "nowhere"], "there is no flight in 'nowhere'"),
         (["a.onnx", "--camera", "0", "4"], "--camera must be two whole numbers"),
         (["pretrained", "--simulate", "medium", "--speed", "0"], "--speed more than 0"),
+        (["pretrained", "--simulate", "medium", "--jobs", "0"], "--missions and --jobs must be at least 1"),
         (["nowhere", "--simulate", "medium"], "there is no run in 'nowhere'"),
         (["a.onnx", "--simulate", "medium"], "the folder of a run, or a policy of the package"),
         (["pretrained", "--simulate", "medium", "--goal", "1", "2", "3"], "--simulate gives --goal itself"),

@@ -12,8 +12,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from edqn_jax.fly.simulated.esim import Esim
 from edqn_jax.fly.streams import EVENT, HEADER, MAGIC, packet_bytes
-from edqn_jax.interop.outer.event_cameras import esim
+from edqn_jax.interop.outer.event_cameras import CONTRAST
 from edqn_jax.interop.outer.pictures import See
 
 AHEAD_S, FAST = 77.7, 1e-5
@@ -21,7 +22,7 @@ AHEAD_S, FAST = 77.7, 1e-5
 
 
 class EventCamera:
-    """evlib's ESIM on pictures of a world, frame by frame."""
+    """ESIM on pictures of a world, frame by frame."""
 
     def __init__(self, see: See, rotation: Callable[[NDArray[np.float64]], NDArray[np.float64]]) -> None:
         """Prepares a camera.
@@ -29,22 +30,19 @@ class EventCamera:
         Args:
             see: draws a picture from a position [3] and a rotation [3, 3].
             rotation: of the camera, for an attitude [4] of the body.
-
-        Raises:
-            MissingPackageError: if evlib or PyTorch is not installed.
         """
-        self._see, self._rotation, self._emulate = see, rotation, esim()
+        self._see, self._rotation, self._esim = see, rotation, Esim(CONTRAST)
         self.seen = 0
         """Events so far."""
 
     def frame(self, time: float, position: NDArray[np.float64], quaternion: NDArray[np.float64]) -> tuple[int, NDArray]:
         """Returns until when its events are known, its own clock's microseconds, and those [N] since the last frame."""
         own_s = AHEAD_S + time * (1.0 + FAST)
-        made = self._emulate(self._see(position, self._rotation(quaternion)), own_s)
-        self.seen += len(made)
+        columns, rows, signs = self._esim.events(self._see(position, self._rotation(quaternion)))
+        self.seen += len(signs)
         until = round(1e6 * own_s)
-        events = np.empty(len(made), EVENT)
-        events["x"], events["y"], events["p"] = made["x"], made["y"], made["p"]
+        events = np.empty(len(signs), EVENT)
+        events["x"], events["y"], events["p"] = columns, rows, signs
         # ESIM gives them the frame's time, which is the end of what they tell of.
         events["t"] = until - 1
         return until, events

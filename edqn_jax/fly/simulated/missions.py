@@ -14,7 +14,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -146,13 +146,15 @@ def fly_mission(environment: Environment, number: int, setup: Setup) -> Mission:
         stack.callback(server.close)
         keeper = Keeper(setup.speed)
         stack.callback(keeper.close)
-        port = _free_port()
+        port, let_go = _held_port()
+        stack.callback(let_go)
         yaw = float(np.arctan2(goal[1] - start[1], goal[0] - start[0]))
         words = _vehicle_words(start, yaw, port, keeper.address, number, setup)
         vehicle = stack.enter_context(_process(words, quiet=False))
         words = _autopilot_words(config, scene, port, server.address, keeper.address, out, setup)
         autopilot = stack.enter_context(_process(words, quiet=True))
         keeper.admit({"vehicle", "autopilot"}, lambda: vehicle.poll() is None and autopilot.poll() is None)
+        let_go()
         began = time.monotonic()
         longest = EXTRA_S + _mission_s(config, setup.pace)
         why = _conduct(keeper, camera, server, flight, setup.frame_s, longest)
@@ -267,10 +269,12 @@ def _wait(process: subprocess.Popen) -> None:
         process.wait()
 
 
-def _free_port() -> int:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.bind(("127.0.0.1", 0))
-        return probe.getsockname()[1]
+def _held_port() -> tuple[int, Callable[[], None]]:
+    """Returns a free UDP port, and what lets it go: no other mission gets it before the autopilot has taken it."""
+    held = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    held.bind(("127.0.0.1", 0))
+    held.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)  # as pymavlink's, which binds beside it
+    return held.getsockname()[1], held.close
 
 
 def environment_of(world: str, config: Config, missions: int, seed: int) -> Environment:

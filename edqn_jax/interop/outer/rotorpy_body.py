@@ -47,9 +47,9 @@ class RotorPyBody:
         Raises:
             MissingPackageError: if RotorPy is not installed.
         """
-        vehicles = require_extra("rotorpy.vehicles.multirotor", extra="transfer")
-        control = require_extra("rotorpy.controllers.quadrotor_control", extra="transfer")
-        params = require_extra("rotorpy.vehicles.hummingbird_params", extra="transfer").quad_params
+        vehicles = require_extra("rotorpy.vehicles.multirotor", extra="fly")
+        control = require_extra("rotorpy.controllers.quadrotor_control", extra="fly")
+        params = require_extra("rotorpy.vehicles.hummingbird_params", extra="fly").quad_params
         self._control = control.SE3Control(params)
         hover = np.sqrt(params["mass"] * 9.81 / 4 / params["k_eta"])
         self._state: dict[str, Any] = {
