@@ -48,8 +48,9 @@ def _show_events(
 ) -> tuple[Sensed, SensorMemory]:
     frames = _views(config, scene, poses)
     assert isinstance(memory, EventMemory)
-    options = config.events
-    return events.generate_events(options, memory, frames, options.frame_times_s, key, continuous=options.stream)
+    options, times = config.events, config.events.frame_times_s
+    gap_s = max(config.drone.physics_steps * config.drone.physics_dt_s + times[0], 0.0)
+    return events.generate_events(options, memory, frames, times, key, continuous=options.stream, gap_s=gap_s)
 
 
 def _show_event_image(
