@@ -333,12 +333,17 @@ class LightConfig:
 class ExposureConfig:
     """How a camera takes the frames of the sensors `frames` and `frame-pair`."""
 
+    rate_hz: Annotated[float, Limit("0, or from 1 to 1000", lambda value: value == 0 or 1 <= value <= 1000)] = 0.0
+    """Frames a second, at a phase that is drawn for each episode: a decision sees the newest that is there, and the one
+    before it that is nearest to `events.frame_times_s`. 0: frames end exactly at these times."""
+    latency_s: Annotated[float, between(0, 1)] = 0.0
+    """Seconds from the end of an exposure until the frame is there, for readout and transfer."""
     real: bool = False
     """Whether frames have an exposure time, motion blur, noise and 8 bits; needs `light`. If not, they are perfect."""
     shortest_s: Annotated[float, POSITIVE] = 1e-4
     """Shortest exposure, seconds; the camera chooses it by the light."""
     longest_s: Annotated[float, POSITIVE] = 0.02
-    """Longest exposure, seconds."""
+    """Longest exposure, seconds; never longer than the period of `rate_hz`."""
     target: Annotated[float, BELOW_1] = 0.4
     """Mean level of a picture that exposure and gain are set for, as a share of white."""
     most_gain: Annotated[float, between(1, 1000)] = 4.0

@@ -18,7 +18,7 @@ from edqn_jax.sim.physics.drone import DroneState, Flight
 from edqn_jax.sim.scene.scene import Scene, has_motion
 from edqn_jax.sim.sensors import contrast, sensor
 from edqn_jax.sim.sensors.events import EventMemory
-from edqn_jax.sim.sensors.sensor import Sensed, SensorMemory, frame_steps, sensor_of
+from edqn_jax.sim.sensors.sensor import Sensed, SensorMemory, attitudes_seen, count_attitudes, frame_steps, sensor_of
 
 OWN_SIZE = 10
 """Values of the drone's own state in an observation, without what `own_size` adds."""
@@ -76,7 +76,7 @@ def motion_size(config: Config) -> int:
 
 def lean_motion_size(config: Config) -> int:
     """Returns the number of values of `with_lean`."""
-    return MOTION_SIZE + 2 * len(frame_steps(config)) * leans(config)
+    return MOTION_SIZE + 2 * count_attitudes(config) * leans(config)
 
 
 def mirrored_motion(config: Config) -> tuple[float, ...]:
@@ -92,7 +92,7 @@ def with_lean(config: Config, quaternions: Array, motion: Array) -> Array:
 
     Args:
         config: of camera and sensor.
-        quaternions: [..., T, 4] when the sensor looked.
+        quaternions: [..., T, 4] of `attitudes_seen`.
         motion: of `own_motion`.
     """
     if not leans(config):
@@ -131,7 +131,7 @@ def observe(config: Config, view: View, memory: SensorMemory, key: Array) -> tup
         state = dataclasses.replace(state, position=position, velocity=velocity)
     sensed, memory = sensor.sense(config, view.scene, view.poses, memory, key)
     own = with_contrast(config, memory, own_state(config.env, view.scene, view.goal, state))
-    motion = with_lean(config, view.poses.quaternion, own_motion(config.env, state, view.move))
+    motion = with_lean(config, attitudes_seen(view.poses, memory), own_motion(config.env, state, view.move))
     motion = with_contrast(config, memory, motion)
     return Observation(sensed=sensed, own=own, motion=motion), memory
 
