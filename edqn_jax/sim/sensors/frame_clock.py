@@ -2,8 +2,8 @@
 
 A decision sees the newest frame whose transfer has ended, so that what it sees is older by up to a period and the
 latency. The phase is drawn for each episode. Frames are taken from where the drone was then, which may be before the
-decision began: poses of the physics steps before it are remembered. What moves is seen where it was then; only the other
-drones of a group are where they were as the decision began, at the earliest.
+decision began: poses of the physics steps before it are remembered. What moves is seen where it was then; only the
+other drones of a group are where they were as the decision began, at the earliest.
 
 T frames of a decision, n physics steps of a decision, M steps before it that a frame may reach into.
 """
