@@ -107,6 +107,9 @@ def _flight_rules(config: Config, trains: bool) -> Rules:
         yield lit.holds(light.most_lux), "light.most_lux", lit.says
         least = light.least_lux <= light.most_lux
         yield least, "light.least_lux", f"at most light.most_lux ({light.most_lux:g})"
+    yield light.most_lux > 0 or not light.told, "light.told", "false without light.least_lux and light.most_lux"
+    exposed = exposure.real or not (light.told and env.sensor in ("frames", "frame-pair"))
+    yield exposed, "exposure.real", f"true with light.told and env.sensor {env.sensor}"
     yield from _event_sensor_rules(config.events)
     shortest = exposure.shortest_s <= exposure.longest_s
     yield shortest, "exposure.shortest_s", f"at most exposure.longest_s ({exposure.longest_s:g})"

@@ -176,8 +176,8 @@ class EventsConfig:
     """C- (`esim`): log-brightness fall per event."""
     airsim_tolerance: Annotated[float, POSITIVE] = 0.5
     """TOL of AirSim's event simulator (`airsim`)."""
-    refractory_ns: Annotated[float, POSITIVE] = 1000.0
-    """Refractory period, nanoseconds; caps a pixel's events in a window (Eq. 3)."""
+    refractory_ns: Annotated[float, NOT_NEGATIVE] = 1000.0
+    """Refractory period, nanoseconds; caps a pixel's events in a window (Eq. 3). 0 is no cap."""
     log_epsilon: Annotated[float, POSITIVE] = 1e-3
     """Added to brightness in [0, 1] before the logarithm of Eq. 1."""
     bandwidth_hz: Annotated[float, NOT_NEGATIVE] = 0.0
@@ -327,6 +327,8 @@ class LightConfig:
     0.1 on; 0 is off."""
     most_lux: Annotated[float, NOT_NEGATIVE] = 0.0
     """Most illuminance, lux; up to 10000, and 0 is off."""
+    told: bool = False
+    """Whether the networks know the episode's illuminance, of sensors that depend on it."""
 
 
 @dataclass(frozen=True)

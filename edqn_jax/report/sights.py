@@ -32,8 +32,8 @@ from edqn_jax.sim.task.observation import (
     Observation,
     heading_velocity,
     own_size,
-    with_contrast,
     with_lean,
+    with_told,
 )
 
 FINE = 8
@@ -138,7 +138,7 @@ class FlightRenderer:
             if embedding.needs_nearness(config):
                 nearness = sensor.label_image(config, now, position[-1], quaternion[-1])
             # The goal is not part of a code.
-            motion = with_contrast(config, memory, with_lean(config, sensor.attitudes_seen(here, memory), motion))
+            motion = with_told(config, memory, with_lean(config, sensor.attitudes_seen(here, memory), motion))
             observation = Observation(sensed, own=jnp.zeros(own_size(config)), motion=motion)
             code = actor.code(actor.encode(params, actor.init(), observation))
             read = embedding.as_encoder_input(config, observation).sensed

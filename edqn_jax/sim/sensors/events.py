@@ -40,6 +40,9 @@ LEAST_SHARE = 1e-3
 NO_FRAME = -1.0
 """Luma of `EventMemory.frame` before there is one."""
 
+MOST_OF_PIXEL = 1_000_000
+"""Events of a pixel between two frames that are never reached, where many pixels have no other limit."""
+
 MICROSECOND = 1e-6
 
 
@@ -383,9 +386,11 @@ def _limits(config: EventsConfig, times: NDArray, faults: Array | None) -> Array
     """Returns the most events of all sensor pixels between two frames [F, 1, 1] int32."""
     if faults is None and config.sensor_pixels == 1:
         return jnp.array([max_events(config, dt) for dt in np.diff(times)], jnp.int32)[:, None, None]
+    if config.refractory_ns <= 0.0:
+        return jnp.full((len(times) - 1, 1, 1), config.sensor_pixels * MOST_OF_PIXEL, jnp.int32)
     # Rounding must not take away the event that just fits.
     whole = jnp.floor(jnp.asarray(np.diff(times) / (config.refractory_ns * 1e-9)) / _or_1(faults) + 1e-4)
-    return config.sensor_pixels * jnp.minimum(whole, 1e6).astype(jnp.int32)[:, None, None]
+    return config.sensor_pixels * jnp.minimum(whole, MOST_OF_PIXEL).astype(jnp.int32)[:, None, None]
 
 
 def _many_pixels(
