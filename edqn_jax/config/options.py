@@ -56,7 +56,7 @@ CONDITIONS: dict[str, tuple[str, ...]] = {
         *("reference_lux", "least_contrast", "most_contrast", "faults_share", "sensor_pixels"),
     ),
     **{
-        group: tuple(option.name for option in fields(kind))
+        group: tuple(option.name for option in fields(kind) if option.name != "told")
         for group, kind in (
             ("air", AirConfig),
             ("body", BodyConfig),

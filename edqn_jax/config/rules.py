@@ -107,15 +107,23 @@ def _flight_rules(config: Config, trains: bool) -> Rules:
         yield lit.holds(light.most_lux), "light.most_lux", lit.says
         least = light.least_lux <= light.most_lux
         yield least, "light.least_lux", f"at most light.most_lux ({light.most_lux:g})"
+    yield light.most_lux > 0 or not light.told, "light.told", "false without light.least_lux and light.most_lux"
+    exposed = exposure.real or not (light.told and env.sensor in ("frames", "frame-pair"))
+    yield exposed, "exposure.real", f"true with light.told and env.sensor {env.sensor}"
     yield from _event_sensor_rules(config.events)
     shortest = exposure.shortest_s <= exposure.longest_s
     yield shortest, "exposure.shortest_s", f"at most exposure.longest_s ({exposure.longest_s:g})"
+    clocked = exposure.rate_hz > 0 or exposure.latency_s > 0
+    if exposure.rate_hz:
+        period = exposure.shortest_s * exposure.rate_hz <= 1
+        yield period, "exposure.shortest_s", f"at most {1 / exposure.rate_hz:g}, the period of exposure.rate_hz"
     if exposure.real:
         yield light.most_lux > 0, "exposure.real", "false without light.least_lux and light.most_lux"
         # Poses are known from the beginning of a decision on, and an exposure reaches into whole physics steps.
         before = round(config.drone.physics_steps + times[0] / dt) * dt
         limit = f"at most {before:g}, the seconds of a decision before events.frame_times_s"
-        yield exposure.longest_s <= before + 1e-3 * dt, "exposure.longest_s", limit
+        limit = "at most 1 with exposure.rate_hz or exposure.latency_s" if clocked else limit
+        yield exposure.longest_s <= (1 if clocked else before + 1e-3 * dt), "exposure.longest_s", limit
     if config.world.balls:
         slowest = config.world.ball_slowest * config.world.ball_speed_m_s
         limit = f"at least {1.5 / slowest:.2g} and more: a ball of {slowest:g} m/s must fly 1.5 m"

@@ -183,8 +183,8 @@ class EventsConfig:
     """C- (`esim`): log-brightness fall per event."""
     airsim_tolerance: Annotated[float, POSITIVE] = 0.5
     """TOL of AirSim's event simulator (`airsim`)."""
-    refractory_ns: Annotated[float, POSITIVE] = 1000.0
-    """Refractory period, nanoseconds; caps a pixel's events in a window (Eq. 3)."""
+    refractory_ns: Annotated[float, NOT_NEGATIVE] = 1000.0
+    """Refractory period, nanoseconds; caps a pixel's events in a window (Eq. 3). 0 is no cap."""
     log_epsilon: Annotated[float, POSITIVE] = 1e-3
     """Added to brightness in [0, 1] before the logarithm of Eq. 1."""
     bandwidth_hz: Annotated[float, NOT_NEGATIVE] = 0.0
@@ -337,18 +337,25 @@ class LightConfig:
     0.1 on; 0 is off."""
     most_lux: Annotated[float, NOT_NEGATIVE] = 0.0
     """Most illuminance, lux; up to 10000, and 0 is off."""
+    told: bool = False
+    """Whether the networks know the episode's illuminance, of sensors that depend on it."""
 
 
 @dataclass(frozen=True)
 class ExposureConfig:
     """How a camera takes the frames of the sensors `frames` and `frame-pair`."""
 
+    rate_hz: Annotated[float, Limit("0, or from 1 to 1000", lambda value: value == 0 or 1 <= value <= 1000)] = 0.0
+    """Frames a second, at a phase that is drawn for each episode: a decision sees the newest that is there, and the one
+    before it that is nearest to `events.frame_times_s`. 0: frames end exactly at these times."""
+    latency_s: Annotated[float, between(0, 1)] = 0.0
+    """Seconds from the end of an exposure until the frame is there, for readout and transfer."""
     real: bool = False
     """Whether frames have an exposure time, motion blur, noise and 8 bits; needs `light`. If not, they are perfect."""
     shortest_s: Annotated[float, POSITIVE] = 1e-4
     """Shortest exposure, seconds; the camera chooses it by the light."""
     longest_s: Annotated[float, POSITIVE] = 0.02
-    """Longest exposure, seconds."""
+    """Longest exposure, seconds; never longer than the period of `rate_hz`."""
     target: Annotated[float, BELOW_1] = 0.4
     """Mean level of a picture that exposure and gain are set for, as a share of white."""
     most_gain: Annotated[float, between(1, 1000)] = 4.0

@@ -28,12 +28,12 @@ from edqn_jax.sim.physics.drone import Flight
 from edqn_jax.sim.scene.scene import Scene, scene_at
 from edqn_jax.sim.sensors import sensor
 from edqn_jax.sim.task.observation import (
+    MOTION_SIZE,
     Observation,
     heading_velocity,
-    lean_motion_size,
     own_size,
-    with_contrast,
     with_lean,
+    with_told,
 )
 
 FINE = 8
@@ -113,7 +113,7 @@ class FlightRenderer:
         config, decisions = self.config, self.config.env.max_decisions
         looks = len(sensor.frame_steps(config))
         params = jax.eval_shape(lambda: fresh_policy(config)) if self._decodes else None
-        motion = jax.ShapeDtypeStruct((decisions, lean_motion_size(config)), np.float32)
+        motion = jax.ShapeDtypeStruct((decisions, MOTION_SIZE), np.float32)
         return _compiled(self._all_shown, self.scene, params, *_blank_poses(decisions, looks), motion)
 
     def _all_shown(
@@ -138,9 +138,8 @@ class FlightRenderer:
             if embedding.needs_nearness(config):
                 nearness = sensor.label_image(config, now, position[-1], quaternion[-1])
             # The goal is not part of a code.
-            observation = Observation(
-                sensed, own=jnp.zeros(own_size(config)), motion=with_contrast(config, memory, motion)
-            )
+            motion = with_told(config, memory, with_lean(config, sensor.attitudes_seen(here, memory), motion))
+            observation = Observation(sensed, own=jnp.zeros(own_size(config)), motion=motion)
             code = actor.code(actor.encode(params, actor.init(), observation))
             read = embedding.as_encoder_input(config, observation).sensed
             assert read is not None
@@ -194,7 +193,7 @@ def downsample_picture(picture: np.ndarray) -> np.ndarray:
 
 
 def own_motions(config: Config, trajectory: Mapping[str, np.ndarray], rows: np.ndarray) -> np.ndarray:
-    """Returns the own motions [D, lean_motion_size] at the last of each decision's rows [D, T].
+    """Returns the own motions [D, MOTION_SIZE] at the last of each decision's rows [D, T].
 
     The yaw rate is that of the heading between the last two rows, which a trajectory holds.
     """
@@ -209,9 +208,7 @@ def own_motions(config: Config, trajectory: Mapping[str, np.ndarray], rows: np.n
     ahead = heading_velocity(config.env, yaw, velocity)
     after = Flight(jnp.asarray(place), jnp.asarray(now), velocity)
     commanded = directions(config, after, actions_of(trajectory)[last])
-    motion = jnp.concatenate([ahead, rate[:, None], commanded], axis=-1)
-    attitudes = jnp.asarray(trajectory_poses(trajectory, rows)[1])
-    return np.asarray(with_lean(config, attitudes, motion), np.float32)
+    return np.asarray(jnp.concatenate([ahead, rate[:, None], commanded], axis=-1), np.float32)
 
 
 def _compiled(program: Any, *arguments: Any) -> Compiled:

@@ -30,6 +30,7 @@ from edqn_jax.sim.scene.scene import stack_scenes
 from edqn_jax.sim.sensors import events, sensor
 from edqn_jax.sim.task import env
 from edqn_jax.sim.task.missions import own_missions
+from edqn_jax.sim.task.observation import with_lean
 from tests.support.box_flight import SMALL, world_with_a_box
 
 HEIGHT, WIDTH = SMALL.camera.height, SMALL.camera.width
@@ -85,7 +86,8 @@ def test_own_motions_are_those_that_the_drone_knew(flight):
     )
     assert np.abs(motion[:, 3]).max() > 0.01
     leaning = dataclasses.replace(SMALL, camera=dataclasses.replace(SMALL.camera, mount="body"))
-    lean = own_motions(leaning, flown, decision_rows(SMALL, flown))[:, 7:]
+    attitudes = jnp.asarray(trajectory_poses(flown, decision_rows(SMALL, flown))[1])
+    lean = np.asarray(with_lean(leaning, attitudes, jnp.asarray(motion)))[:, 7:]
     assert lean.shape == (len(MOVES), 4) and np.abs(lean).max() > 0.01
     leant = drone.roll_and_pitch_of(steps.flight.quaternion[:, -1])
     np.testing.assert_allclose(lean[:, 2:], leant, atol=1e-4)  # of attitudes that were written as text

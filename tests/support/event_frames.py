@@ -30,9 +30,9 @@ AIRSIM = EventsConfig(law="airsim", refractory_ns=6e6)
 ESIM = EventsConfig(law="esim", contrast_on=0.12, contrast_off=0.09, refractory_ns=0.0)
 
 
-@partial(jax.jit, static_argnames=("config", "times", "continuous"))
-def run(config, memory, frames, times=TIMES, continuous=False):
-    return ev.generate_events(config, memory, frames, times, jax.random.key(KEY), continuous=continuous)
+@partial(jax.jit, static_argnames=("config", "times", "continuous", "gap_s"))
+def run(config, memory, frames, times=TIMES, continuous=False, gap_s=None):
+    return ev.generate_events(config, memory, frames, times, jax.random.key(KEY), continuous=continuous, gap_s=gap_s)
 
 
 @partial(jax.jit, static_argnames=("config", "height", "width"))

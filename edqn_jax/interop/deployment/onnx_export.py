@@ -31,6 +31,7 @@ from edqn_jax.sim.task.observation import (
     MAX_YAW_RATE,
     Observation,
     knows_contrast,
+    knows_light,
     leans,
     motion_size,
     own_size,
@@ -79,8 +80,8 @@ def export_policy(policy: Policy, file: str | Path, *, checks: int = CHECKS, dig
 
     Raises:
         CheckError: if ONNX and JAX do not agree; nothing is written.
-        ConfigError: if the policy is a function, does not see events, or sees more of them than their counts, or the
-            file cannot be written.
+        ConfigError: if the policy is a function, does not see events, sees more of them than their counts or knows the
+            light, or the file cannot be written.
     """
     check_has_params(policy, "an ONNX file")
     file = Path(file)
@@ -130,11 +131,13 @@ def about_policy(config: Config) -> dict[str, Any]:
     """Returns what the runner must know of a policy, as plain data.
 
     Raises:
-        ConfigError: if the policy does not see events, or sees more of them than their counts.
+        ConfigError: if the policy does not see events, sees more of them than their counts, or knows the light.
     """
     sensor, law = config.env.sensor, config.events
     if sensor not in ("events", "event-image"):
         raise ConfigError(f"only policies that see events can be exported; the sensor of this one is '{sensor}'")
+    if knows_light(config):
+        raise ConfigError("a policy that knows the light (light.told) cannot be exported: the runner is told no light")
     encoder = config.encoder
     if sensor == "events" and encoder.architecture in ENCODERS.own:
         raise ConfigError(

@@ -48,8 +48,9 @@ def _show_events(
 ) -> tuple[Sensed, SensorMemory]:
     frames = _views(config, scene, poses)
     assert isinstance(memory, EventMemory)
-    options = config.events
-    return events.generate_events(options, memory, frames, options.frame_times_s, key, continuous=options.stream)
+    options, times = config.events, config.events.frame_times_s
+    gap_s = max(config.drone.physics_steps * config.drone.physics_dt_s + times[0], 0.0)
+    return events.generate_events(options, memory, frames, times, key, continuous=options.stream, gap_s=gap_s)
 
 
 def _show_event_image(
@@ -72,32 +73,33 @@ def _event_memory(config: Config, key: Array) -> SensorMemory:
 def _show_frame(
     config: Config, scene: Scene, poses: Flight, memory: SensorMemory, key: Array
 ) -> tuple[Sensed, SensorMemory]:
-    if config.exposure.real:
-        frames, memory = _expose(config, scene, poses, memory, key)
+    if not exposure.is_perfect(config.exposure):
+        frames, memory = _take_frames(config, scene, poses, memory, key, (0.0,))
         return brightness(config, frames), memory
     scene, position, quaternion = last_view(scene, poses)
     return brightness(config, render_view(config, scene, position, quaternion))[None], None
 
 
-def _expose(
-    config: Config, scene: Scene, poses: Flight, memory: SensorMemory, key: Array
+def _take_frames(
+    config: Config, scene: Scene, poses: Flight, memory: SensorMemory, key: Array, times: tuple[float, ...]
 ) -> tuple[Array, SensorMemory]:
-    """Returns pictures [T, H, W] that a camera takes, as shares of white, and its memory; see `exposure`.
+    """Returns the pictures [T, H, W] that a camera takes, as shares of white, and its memory; see `exposure`.
 
     Args:
-        poses: [T (K + 1)] up to the times of the frames.
+        poses: at the times of `exposure.pose_times`.
+        times: [T] seconds, when a camera without a clock takes them.
     """
     assert isinstance(memory, FrameMemory)
-    options, dt, lux = config.exposure, config.drone.physics_dt_s, memory.lux
-    time, gain = exposure.exposure_settings(options, lux, memory.metered)
-    of_frame = exposure.steps_touched(options, dt) + 1
-    windows = jax.tree.map(lambda x: x.reshape(-1, of_frame, *x.shape[1:]), poses)
-    within = jax.vmap(lambda window: exposure.poses_within(window, dt, time, options.sub_frames))(windows)
+    lux, metered, time, gain = memory.lux, memory.metered, jnp.zeros(()), jnp.ones(())
+    if lux is not None and metered is not None:
+        time, gain = exposure.exposure_settings(config.exposure, lux, metered)
+    within, clock = exposure.poses_of_frames(config, memory.clock, poses, time, times)
     views = _views(config, scene, jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), within))
-    luma = jnp.mean(views.reshape(-1, options.sub_frames, *views.shape[1:]), axis=1)
-    frames = exposure.develop_picture(options, luma, lux, time, gain, key)
-    metered = exposure.meter_brightness(options, frames[-1], lux, time, gain)
-    return frames, FrameMemory(lux=lux, metered=metered)
+    frames = jnp.mean(views.reshape(len(times), -1, *views.shape[1:]), axis=1)
+    if lux is not None:
+        frames = exposure.develop_picture(config.exposure, frames, lux, time, gain, key)
+        metered = exposure.meter_brightness(config.exposure, frames[-1], lux, time, gain)
+    return frames, FrameMemory(lux=lux, metered=metered, clock=clock)
 
 
 def _show_frame_pair(
@@ -108,10 +110,10 @@ def _show_frame_pair(
     That is all that is in the frames, and what moved is as large a number as what stands: in the frames as they are an
     encoder would have to take the small difference of two large numbers.
     """
-    if config.exposure.real:
-        frames, memory = _expose(config, scene, poses, memory, key)
-    else:
+    if exposure.is_perfect(config.exposure):
         frames = _views(config, scene, poses)
+    else:
+        frames, memory = _take_frames(config, scene, poses, memory, key, _window(config))
     frames = brightness(config, frames)
     change = (frames[-1:] - frames[:-1]) / CHANGE_SCALE
     return jnp.concatenate([frames[-1:], change]), memory
@@ -187,7 +189,7 @@ FRAMES = Sensor(  # of the same camera, perfect or as `exposure` has it
     frame_times_s=lambda config: exposure.pose_times(config, (0.0,)),
     draws_frames=True,
     exposes=True,
-    at_rest=exposure.at_rest,
+    at_rest=lambda config, key: exposure.at_rest(config, key, (0.0,)),
     image=Image("log brightness", "log brightness + 1"),
 )
 
@@ -197,7 +199,7 @@ FRAME_PAIR = Sensor(  # at the times of the frames that events are made of
     frame_times_s=lambda config: exposure.pose_times(config, _window(config)),
     draws_frames=True,
     exposes=True,
-    at_rest=exposure.at_rest,
+    at_rest=lambda config, key: exposure.at_rest(config, key, _window(config)),
     image=Image("log brightness", "log brightness + 1"),
 )
 

@@ -37,6 +37,12 @@ MIN_THRESHOLD_GAIN = 0.1
 LEAST_SHARE = 1e-3
 """Of its faults that an episode's sensor always has, so that their inverse is finite."""
 
+NO_FRAME = -1.0
+"""Luma of `EventMemory.frame` before there is one."""
+
+MOST_OF_PIXEL = 1_000_000
+"""Events of a pixel between two frames that are never reached, where many pixels have no other limit."""
+
 MICROSECOND = 1e-6
 
 
@@ -67,7 +73,8 @@ class EventMemory:
     gain: Array | None  # [2, H, W] or [2, 1, 1] thresholds of ON and OFF, relative to the configured ones
     hot: Array | None  # [H, W] bool, pixels that fire on their own; with `sensor_pixels` how many do, int32
     lux: Array | None = None  # [] illuminance of the episode; None where there is always enough light
-    lag: Array | None = None  # [H, W] esim with finite bandwidth: what the photoreceptor shows minus log brightness
+    lag: Array | None = None  # [H, W] with finite bandwidth: what the photoreceptor shows minus log brightness
+    frame: Array | None = None  # [H, W] with finite bandwidth: luma of the last frame; -1 before the first
     contrast: Array | None = None  # [] log-brightness change per event; None where it is not drawn
     faults: Array | None = None  # [] share of its faults that the episode's sensor has; None is all
 
@@ -160,6 +167,9 @@ def reset_memory(config: EventsConfig, height: int, width: int, key: Array, lux:
         else:
             hot = jax.random.bernoulli(key_hot, share, (height, width))
     memory = EventMemory(residual=None, last_event=None, gain=gain, hot=hot, lux=lux, contrast=drawn, faults=faults)
+    if config.bandwidth_hz > 0.0:
+        size = (height, width)
+        memory = dataclasses.replace(memory, lag=jnp.zeros(size), frame=jnp.full(size, NO_FRAME))
     if config.law != "esim":
         return memory
     contrast_on, contrast_off = _thresholds(gain, config.contrast_on, config.contrast_off)
@@ -167,12 +177,7 @@ def reset_memory(config: EventsConfig, height: int, width: int, key: Array, lux:
     residual = share * (contrast_on + contrast_off) - contrast_off
     if config.sensor_pixels > 1:
         residual = share * 0.5 * (contrast_on + contrast_off)
-    return dataclasses.replace(
-        memory,
-        residual=residual,
-        last_event=jnp.full((height, width), -jnp.inf),
-        lag=jnp.zeros((height, width)) if config.bandwidth_hz > 0.0 else None,
-    )
+    return dataclasses.replace(memory, residual=residual, last_event=jnp.full((height, width), -jnp.inf))
 
 
 def _gain(
@@ -228,6 +233,7 @@ def generate_events(
     key: Array,
     *,
     continuous: bool = False,
+    gap_s: float | None = None,
 ) -> tuple[EventField, EventMemory]:
     """Returns the events of one window, and the memory after it.
 
@@ -237,9 +243,11 @@ def generate_events(
         frame_times: T times in seconds, rising; only their differences matter. Known when tracing.
         key: consumed only by noise events.
         continuous: the first frame is the previous window's last one (`stream` mode), so that esim's
-            refractory clock and the lag of its photoreceptors run on. Otherwise there is a gap between the windows:
-            esim's reference is set at the first frame, keeping each pixel's sub-threshold residual, and
-            photoreceptors have settled there, as they always have under the laws without memory.
+            refractory clock runs on. Otherwise there is a gap between the windows, and esim's reference is set at the
+            first frame, keeping each pixel's sub-threshold residual.
+        gap_s: seconds between the previous window's last frame and the first one, in which brightness is taken to
+            change linearly, so that the lag of photoreceptors runs on; 0 if `continuous`. None: not known, and they
+            have settled at the first frame, as they have at that of the first window.
 
     Raises:
         ValueError: if there are fewer than two frames, or not one rising time for each.
@@ -253,17 +261,12 @@ def generate_events(
     times = times - times[0]
     window_s = float(times[-1])
     key, dither = jax.random.split(key) if config.sensor_pixels > 1 else (key, key)
-    level = airsim_log_brightness(frames) if config.law == "airsim" else log_brightness(config, frames)
-    light = 1.0 if memory.lux is None else memory.lux / config.reference_lux
+    level = _level(config, frames)
     current = None
     if config.bandwidth_hz > 0.0 or (memory.lux is not None and config.shot_rate_hz > 0.0):
-        current = photoreceptor.between_frames(photoreceptor.photocurrent(frames, light))
+        current = photoreceptor.between_frames(photoreceptor.photocurrent(frames, _light(config, memory)))
     if config.bandwidth_hz > 0.0:
-        assert current is not None
-        lag = memory.lag if continuous and memory.lag is not None else jnp.zeros(frames.shape[1:])
-        faster = current if memory.faults is None else current / memory.faults
-        level, lag = photoreceptor.filter_log_brightness(config.bandwidth_hz, level, times, faster, lag)
-        memory = dataclasses.replace(memory, lag=lag if config.law == "esim" else None)
+        level, memory = _follow_light(config, memory, frames, times, 0.0 if continuous else gap_s)
     if config.sensor_pixels > 1:
         field, memory = _many_pixels(config, memory, level, times, dither)
     elif config.law == "esim":
@@ -277,6 +280,32 @@ def generate_events(
         field = merge_fields(config, split_polarity(field), noise, times, memory.faults)
     even, unit = divides_window(config, len(times)), unit_of(config, memory.contrast)
     return dataclasses.replace(field, window_s=window_s, divides_window=even, with_noise=noisy, unit=unit), memory
+
+
+def _level(config: EventsConfig, frames: Array) -> Array:
+    """Returns Eq. 1 of the law, of luma [...]."""
+    return airsim_log_brightness(frames) if config.law == "airsim" else log_brightness(config, frames)
+
+
+def _light(config: EventsConfig, memory: EventMemory) -> Array | float:
+    """Returns the illuminance as a share of `reference_lux`; 1 where there is always enough."""
+    return 1.0 if memory.lux is None else memory.lux / config.reference_lux
+
+
+def _follow_light(
+    config: EventsConfig, memory: EventMemory, frames: Array, times: NDArray, gap_s: float | None
+) -> tuple[Array, EventMemory]:
+    """Returns what photoreceptors show at the frames [T, H, W], and the memory with their lag after the last."""
+    lag, count = jnp.zeros(frames.shape[1:]), len(times)
+    if gap_s is not None and memory.lag is not None and memory.frame is not None:
+        # The gap is one more frame pair. Before an episode's first frame the pixels have settled at it.
+        begun = memory.frame >= 0.0
+        frames = jnp.concatenate([jnp.where(begun, memory.frame, frames[0])[None], frames])
+        lag, times = memory.lag, np.concatenate([[times[0] - gap_s], times])
+    current = photoreceptor.between_frames(photoreceptor.photocurrent(frames, _light(config, memory)))
+    current = current if memory.faults is None else current / memory.faults
+    shown, lag = photoreceptor.filter_log_brightness(config.bandwidth_hz, _level(config, frames), times, current, lag)
+    return shown[-count:], dataclasses.replace(memory, lag=lag, frame=frames[-1])
 
 
 def divides_window(config: EventsConfig, frames: int) -> bool:
@@ -357,9 +386,11 @@ def _limits(config: EventsConfig, times: NDArray, faults: Array | None) -> Array
     """Returns the most events of all sensor pixels between two frames [F, 1, 1] int32."""
     if faults is None and config.sensor_pixels == 1:
         return jnp.array([max_events(config, dt) for dt in np.diff(times)], jnp.int32)[:, None, None]
+    if config.refractory_ns <= 0.0:
+        return jnp.full((len(times) - 1, 1, 1), config.sensor_pixels * MOST_OF_PIXEL, jnp.int32)
     # Rounding must not take away the event that just fits.
     whole = jnp.floor(jnp.asarray(np.diff(times) / (config.refractory_ns * 1e-9)) / _or_1(faults) + 1e-4)
-    return config.sensor_pixels * jnp.minimum(whole, 1e6).astype(jnp.int32)[:, None, None]
+    return config.sensor_pixels * jnp.minimum(whole, MOST_OF_PIXEL).astype(jnp.int32)[:, None, None]
 
 
 def _many_pixels(

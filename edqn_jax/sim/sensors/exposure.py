@@ -1,11 +1,11 @@
-"""A camera that takes frames: exposure time, motion blur, photon and read noise, a full well, 8 bits.
+"""A camera that takes frames: exposure time, motion blur, photon and read noise, a full well, 8 bits; and its clock.
 
 Photons arrive at random, so N electrons have a standard deviation of sqrt(N); reading them adds `read_noise_e` (EMVA
 standard 1288, the linear camera model, without dark current). A picture is the sum of the light over its exposure: here
 the mean of `sub_frames` pictures from where the drone was in the middle of as many equal parts of it.
 
 The camera sets exposure time and gain from its own last picture, once a decision: all frames of a decision share them.
-S sub-frames, K physics steps that the longest exposure may touch.
+A perfect camera may have a clock alone. T frames, S sub-frames, K physics steps that the longest exposure may touch.
 """
 
 from __future__ import annotations
@@ -19,7 +19,8 @@ from jax import Array
 
 from edqn_jax.config import Config, ExposureConfig
 from edqn_jax.sim.physics.drone import Flight
-from edqn_jax.sim.sensors import light
+from edqn_jax.sim.sensors import frame_clock, light
+from edqn_jax.sim.sensors.frame_clock import Clock, poses_before
 
 WHITE = 255.0
 """Largest value of 8 bits."""
@@ -33,17 +34,29 @@ DARKEST = 1e-3
 
 @struct.dataclass
 class FrameMemory:
-    """State of a frame camera between decisions."""
+    """State of a frame camera between decisions; None for what a configuration does not need."""
 
-    lux: Array  # [] illuminance of the episode
-    metered: Array  # [] mean brightness of the last picture, as a share of a surface that faces the sun
+    lux: Array | None  # [] illuminance of the episode
+    metered: Array | None  # [] mean brightness of the last picture, as a share of a surface that faces the sun
+    clock: Clock | None = None
 
 
-def at_rest(config: Config, key: Array) -> FrameMemory | None:
+def is_perfect(exposure: ExposureConfig) -> bool:
+    """Returns whether frames have neither an exposure nor a clock, so that the camera has no memory."""
+    return not (exposure.real or frame_clock.is_on(exposure))
+
+
+def at_rest(config: Config, key: Array, frame_times_s: tuple[float, ...]) -> FrameMemory | None:
     """Returns the memory before the first decision; None for a perfect camera. `key` is consumed."""
-    if not config.exposure.real:
+    options, clock = config.exposure, None
+    if is_perfect(options):
         return None
-    return FrameMemory(lux=light.sample_illuminance(config.light, key), metered=jnp.float32(AT_REST))
+    if frame_clock.is_on(options):
+        key, drawing = jax.random.split(key)
+        clock = frame_clock.at_rest(config, frame_times_s, drawing)
+    if not options.real:
+        return FrameMemory(None, None, clock)
+    return FrameMemory(light.sample_illuminance(config.light, key), jnp.float32(AT_REST), clock)
 
 
 def steps_touched(exposure: ExposureConfig, dt_s: float) -> int:
@@ -52,12 +65,41 @@ def steps_touched(exposure: ExposureConfig, dt_s: float) -> int:
 
 
 def pose_times(config: Config, frame_times_s: tuple[float, ...]) -> tuple[float, ...]:
-    """Returns when poses are needed for frames at these times: K + 1 for each, or one for a perfect camera."""
-    if not config.exposure.real:
+    """Returns when poses are needed for frames at these times: K + 1 for each, one for a perfect camera, and all of the
+    decision for one with a clock.
+    """
+    options, dt = config.exposure, config.drone.physics_dt_s
+    if frame_clock.is_on(options):
+        return tuple(-dt * step for step in range(config.drone.physics_steps, -1, -1))
+    if not options.real:
         return frame_times_s
-    dt = config.drone.physics_dt_s
-    back = range(steps_touched(config.exposure, dt), -1, -1)
+    back = range(steps_touched(options, dt), -1, -1)
     return tuple(time - dt * step for time in frame_times_s for step in back)
+
+
+def poses_of_frames(
+    config: Config, clock: Clock | None, poses: Flight, time: Array, frame_times_s: tuple[float, ...]
+) -> tuple[Flight, Clock | None]:
+    """Returns the poses [T, S] from which frames are taken, newest first in each, and the next clock.
+
+    Of an exposure of `time` [] seconds they are in the middle of S equal parts of it; a perfect frame has one.
+
+    Args:
+        config: of exposure and drone.
+        clock: None for a camera whose frames end at `frame_times_s`.
+        poses: at the times of `pose_times`.
+        time: [] seconds, 0 for a perfect frame.
+        frame_times_s: [T] as of a camera without a clock.
+    """
+    options, dt = config.exposure, config.drone.physics_dt_s
+    count = options.sub_frames if options.real else 1
+    parts = time / dt * (jnp.arange(count) + 0.5) / count  # in physics steps
+    if clock is None:
+        of_frame = steps_touched(options, dt) + 1
+        windows = jax.tree.map(lambda x: x.reshape(-1, of_frame, *x.shape[1:]), poses)
+        return jax.vmap(lambda window: poses_before(window, parts))(windows), None
+    path, ages, clock = frame_clock.read_clock(config, clock, poses, frame_times_s)
+    return jax.vmap(lambda age: poses_before(path, age / dt + parts))(ages), clock
 
 
 def exposure_settings(exposure: ExposureConfig, lux: Array, metered: Array) -> tuple[Array, Array]:
@@ -67,38 +109,8 @@ def exposure_settings(exposure: ExposureConfig, lux: Array, metered: Array) -> t
     """
     white = exposure.sensitivity_e_lux_s * lux / exposure.full_well_e  # of the full well, per second
     wanted = exposure.target / (white * jnp.maximum(metered, DARKEST))
-    time = jnp.clip(wanted, exposure.shortest_s, exposure.longest_s)
+    time = jnp.clip(wanted, exposure.shortest_s, frame_clock.longest_exposure_s(exposure))
     return time, jnp.clip(wanted / time, 1.0, exposure.most_gain)
-
-
-def poses_within(poses: Flight, dt_s: float, time: Array, count: int) -> Flight:
-    """Returns poses [S] in the middle of `count` equal parts of an exposure of `time` [] s that ends at the last pose.
-
-    Positions and times are interpolated linearly between physics steps, attitudes linearly and then normalised.
-
-    Args:
-        poses: [K + 1] after physics steps of `dt_s` seconds in a row.
-    """
-    last = poses.position.shape[0] - 1
-    before = time / dt_s * (jnp.arange(count) + 0.5) / count  # in physics steps, newest first
-    step = jnp.clip(jnp.floor(before), 0, last - 1).astype(jnp.int32)
-    share = before - step
-
-    def between(values: Array) -> Array:
-        new, old = values[last - step], values[last - step - 1]
-        return new + share.reshape(-1, *[1] * (values.ndim - 1)) * (old - new)
-
-    # A quaternion and its negative are one attitude: neighbours must not be opposite ones.
-    quaternion = poses.quaternion
-    turned = jnp.sign(jnp.sum(quaternion[1:] * quaternion[:-1], axis=-1, keepdims=True) + 1e-9)
-    signs = jnp.concatenate([jnp.ones((1, 1)), jnp.cumprod(turned, axis=0)])
-    mixed = between(quaternion * signs)
-    return Flight(
-        position=between(poses.position),
-        quaternion=mixed * jax.lax.rsqrt(jnp.sum(mixed * mixed, axis=-1, keepdims=True)),
-        velocity=between(poses.velocity),
-        time=None if poses.time is None else between(poses.time),
-    )
 
 
 def develop_picture(exposure: ExposureConfig, luma: Array, lux: Array, time: Array, gain: Array, key: Array) -> Array:

@@ -14,6 +14,9 @@ from jax import Array
 
 from edqn_jax.config import LightConfig
 
+MIDDLE_LUX, HALF_DECADES = 10.0**1.5, 2.5
+"""Illuminance that the networks know as 0, and its decades up to 1: from -1 at 0.1 lux to 1 at 10 000."""
+
 
 def is_on(light: LightConfig) -> bool:
     """Returns whether episodes have an illuminance; without one, no sensor knows of light."""
@@ -24,3 +27,12 @@ def sample_illuminance(light: LightConfig, key: Array) -> Array:
     """Returns an episode's illuminance [] lux, log-uniform between the least and the most; `key` is consumed."""
     least, most = math.log(light.least_lux), math.log(light.most_lux)
     return jnp.exp(jax.random.uniform(key, minval=least, maxval=most))
+
+
+def value_of(lux: Array) -> Array:
+    """Returns what the networks know of illuminances [...] lux, of order 1.
+
+    >>> print(jnp.round(value_of(jnp.array([0.1, 31.623, 10_000.0])), 2))
+    [-1.  0.  1.]
+    """
+    return jnp.log10(lux / MIDDLE_LUX) / HALF_DECADES

@@ -31,7 +31,7 @@ from edqn_jax.sim.camera.raycast import Rays
 from edqn_jax.sim.physics.drone import Flight
 from edqn_jax.sim.scene.scene import Scene, scene_at
 from edqn_jax.sim.scene.shapes.kind import TINY
-from edqn_jax.sim.sensors import events, exposure
+from edqn_jax.sim.sensors import events, exposure, frame_clock
 from edqn_jax.sim.sensors.events import EventField, EventMemory
 from edqn_jax.sim.sensors.exposure import FrameMemory
 from edqn_jax.user_code import check_functions, describe_object
@@ -89,7 +89,7 @@ class Sensor:
     makes_events: bool = False
     """Whether its memory is an `EventMemory`, whose contrast the networks know where it is drawn."""
     exposes: bool = False
-    """Whether its pictures are taken as `exposure` has it, over the poses up to a frame's time."""
+    """Whether its pictures are taken as `exposure` has it, from the poses up to a frame's time."""
     at_rest: Callable[[Config, Array], Any] = lambda config, key: None
     """Memory before the first decision, from a key; None where nothing is carried from one decision to the next."""
     image: Image | None = None
@@ -269,14 +269,36 @@ def frame_steps(config: Config) -> tuple[int, ...]:
     return steps
 
 
+def has_clock(config: Config) -> bool:
+    """Returns whether the sensor's frames are those of a camera with a clock of its own."""
+    return sensor_of(config).exposes and frame_clock.is_on(config.exposure)
+
+
+def count_attitudes(config: Config) -> int:
+    """Returns T, the number of attitudes of `attitudes_seen`."""
+    return sensor_of(config).count_pictures(config) if has_clock(config) else len(frame_steps(config))
+
+
+def attitudes_seen(poses: Flight, memory: SensorMemory) -> Array:
+    """Returns the attitudes [T, 4] at which the sensor looked: at its poses, or by a clock at its frames' ends.
+
+    Args:
+        poses: that it was given.
+        memory: after `sense`.
+    """
+    if isinstance(memory, FrameMemory) and memory.clock is not None and memory.clock.attitudes is not None:
+        return memory.clock.attitudes
+    return poses.quaternion
+
+
 def frames_per_decision(config: Config) -> int:
     """Returns the number of pictures that are drawn for one decision."""
     if not sensor_of(config).draws_frames:
         return 0
-    if not (sensor_of(config).exposes and config.exposure.real):
+    options = config.exposure
+    if not sensor_of(config).exposes or exposure.is_perfect(options):
         return len(frame_steps(config))
-    poses = exposure.steps_touched(config.exposure, config.drone.physics_dt_s) + 1
-    return len(frame_steps(config)) // poses * config.exposure.sub_frames
+    return sensor_of(config).count_pictures(config) * (options.sub_frames if options.real else 1)
 
 
 def render_view(config: Config, scene: Scene, position: Array, quaternion: Array) -> Array:

@@ -16,9 +16,10 @@ from edqn_jax.sim.physics import disturbances, drone
 from edqn_jax.sim.physics.disturbances import Disturbance
 from edqn_jax.sim.physics.drone import DroneState, Flight
 from edqn_jax.sim.scene.scene import Scene, has_motion
-from edqn_jax.sim.sensors import contrast, sensor
+from edqn_jax.sim.sensors import contrast, light, sensor
 from edqn_jax.sim.sensors.events import EventMemory
-from edqn_jax.sim.sensors.sensor import Sensed, SensorMemory, frame_steps, sensor_of
+from edqn_jax.sim.sensors.exposure import FrameMemory
+from edqn_jax.sim.sensors.sensor import Sensed, SensorMemory, attitudes_seen, count_attitudes, frame_steps, sensor_of
 
 OWN_SIZE = 10
 """Values of the drone's own state in an observation, without what `own_size` adds."""
@@ -38,8 +39,8 @@ class Observation:
     """Observation of one drone: sensor output, by default the events before the decision, and own state."""
 
     sensed: Sensed
-    own: Array  # [own_size], see `own_state` and `with_contrast`
-    motion: Array  # [motion_size], see `own_motion`, `with_lean` and `with_contrast`; only the encoder sees it
+    own: Array  # [own_size], see `own_state` and `with_told`
+    motion: Array  # [motion_size], see `own_motion`, `with_lean` and `with_told`; only the encoder sees it
 
 
 @struct.dataclass
@@ -59,6 +60,17 @@ def knows_contrast(config: Config) -> bool:
     return contrast.is_drawn(config.events) and sensor_of(config).makes_events
 
 
+def knows_light(config: Config) -> bool:
+    """Returns whether the networks know the episode's illuminance, as one more value."""
+    sensor = sensor_of(config)
+    return config.light.told and (sensor.makes_events or (sensor.exposes and config.exposure.real))
+
+
+def told_size(config: Config) -> int:
+    """Returns the number of values that the networks are told of the episode's sensor."""
+    return knows_light(config) + knows_contrast(config)
+
+
 def leans(config: Config) -> bool:
     """Returns whether the camera leans with the body, so that the own motion has the body's roll and pitch."""
     return config.camera.mount == "body"
@@ -66,23 +78,23 @@ def leans(config: Config) -> bool:
 
 def own_size(config: Config) -> int:
     """Returns the number of values of the own state in an observation."""
-    return OWN_SIZE + knows_contrast(config)
+    return OWN_SIZE + told_size(config)
 
 
 def motion_size(config: Config) -> int:
     """Returns the number of values of the own motion in an observation."""
-    return lean_motion_size(config) + knows_contrast(config)
+    return lean_motion_size(config) + told_size(config)
 
 
 def lean_motion_size(config: Config) -> int:
     """Returns the number of values of `with_lean`."""
-    return MOTION_SIZE + 2 * len(frame_steps(config)) * leans(config)
+    return MOTION_SIZE + 2 * count_attitudes(config) * leans(config)
 
 
 def mirrored_motion(config: Config) -> tuple[float, ...]:
     """Returns factors [motion_size] on the own motion when left and right are exchanged."""
     lean = (lean_motion_size(config) - MOTION_SIZE) // 2
-    return (*MIRRORED_MOTION, *(-1.0, 1.0) * lean, *[1.0] * knows_contrast(config))
+    return (*MIRRORED_MOTION, *(-1.0, 1.0) * lean, *[1.0] * told_size(config))
 
 
 def with_lean(config: Config, quaternions: Array, motion: Array) -> Array:
@@ -92,7 +104,7 @@ def with_lean(config: Config, quaternions: Array, motion: Array) -> Array:
 
     Args:
         config: of camera and sensor.
-        quaternions: [..., T, 4] when the sensor looked.
+        quaternions: [..., T, 4] of `attitudes_seen`.
         motion: of `own_motion`.
     """
     if not leans(config):
@@ -106,12 +118,15 @@ def lean_of(config: Config, motion: Array) -> Array:
     return motion[..., MOTION_SIZE : lean_motion_size(config)].reshape(*motion.shape[:-1], -1, 2)
 
 
-def with_contrast(config: Config, memory: SensorMemory, values: Array) -> Array:
-    """Returns own values [N] with that of the episode's contrast after them, where the networks know it."""
-    if not knows_contrast(config):
-        return values
-    assert isinstance(memory, EventMemory) and memory.contrast is not None
-    return jnp.concatenate([values, contrast.value_of(memory.contrast)[None]])
+def with_told(config: Config, memory: SensorMemory, values: Array) -> Array:
+    """Returns own values [N] and after them those of the episode's light and contrast that the networks know."""
+    if knows_light(config):
+        assert isinstance(memory, EventMemory | FrameMemory) and memory.lux is not None
+        values = jnp.concatenate([values, light.value_of(memory.lux)[None]])
+    if knows_contrast(config):
+        assert isinstance(memory, EventMemory) and memory.contrast is not None
+        values = jnp.concatenate([values, contrast.value_of(memory.contrast)[None]])
+    return values
 
 
 def observe(config: Config, view: View, memory: SensorMemory, key: Array) -> tuple[Observation, SensorMemory]:
@@ -130,9 +145,9 @@ def observe(config: Config, view: View, memory: SensorMemory, key: Array) -> tup
         )
         state = dataclasses.replace(state, position=position, velocity=velocity)
     sensed, memory = sensor.sense(config, view.scene, view.poses, memory, key)
-    own = with_contrast(config, memory, own_state(config.env, view.scene, view.goal, state))
-    motion = with_lean(config, view.poses.quaternion, own_motion(config.env, state, view.move))
-    motion = with_contrast(config, memory, motion)
+    own = with_told(config, memory, own_state(config.env, view.scene, view.goal, state))
+    motion = with_lean(config, attitudes_seen(view.poses, memory), own_motion(config.env, state, view.move))
+    motion = with_told(config, memory, motion)
     return Observation(sensed=sensed, own=own, motion=motion), memory
 
 

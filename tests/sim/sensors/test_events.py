@@ -14,6 +14,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from edqn_jax.config import Config, EventsConfig
+from edqn_jax.config.loading import make_config
 from edqn_jax.sim.sensors import events as ev
 from edqn_jax.sim.sensors import poisson
 from tests.oracles import event_fields, events_plain
@@ -133,6 +134,23 @@ def test_a_change_must_exceed_the_threshold():
     change = jnp.nextafter(threshold, jnp.array([0.0, 0.1, 1.0], jnp.float32))
     np.testing.assert_array_equal(ev.event_polarity(change, threshold), [0, 0, 1])
     np.testing.assert_array_equal(ev.event_polarity(-change, threshold), [0, 0, -1])
+
+
+@pytest.mark.parametrize("pixels", [1, 9])
+@pytest.mark.parametrize("faults_share", [0.0, 1.0])
+def test_the_dvs_flies_with_any_refractory_period(pixels, faults_share):
+    """None, v2e's 0.5 ms and 10 ms."""
+    given = {"profile": "dvs", "sensor_pixels": pixels, "faults_share": faults_share, "shot_rate_hz": 500.0}
+    frames, totals = np.tile(random_frames(1), (1, 8, 8)), []
+    for period in (0.0, 5e5, 1e7):
+        config = make_config("medium", events={**given, "refractory_ns": period})
+        assert (config.events.refractory_ns, config.events.bandwidth_hz) == (period, 30.0)
+        memory = memory_of(config.events, 0, *frames.shape[1:])
+        memory = dataclasses.replace(memory, faults=jnp.float32(0.9) if faults_share else None)
+        field = host(run(config.events, memory, frames)[0])
+        assert field.count.min() >= 0 and np.isfinite(field.t_first).all() and np.isfinite(field.t_step).all()
+        totals.append(int(field.count.sum()))
+    assert totals[0] >= totals[1] > 1.5 * totals[2] > 0
 
 
 @pytest.mark.parametrize(("refractory_ns", "limit"), [(1000.0, 40_000), (6e6, 6), (1e8, 0), (0.0, 2**31 - 1)])

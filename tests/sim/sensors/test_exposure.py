@@ -57,7 +57,10 @@ def test_sub_frames_are_taken_where_the_drone_was(seed, steps, share):
     time = share * steps * dt
     times = np.arange(steps + 1) * dt + 1.0
     poses = Flight(*(jnp.asarray(x, jnp.float32) for x in (position, quaternion, position, times)))
-    found = exposure.poses_within(poses, dt, jnp.float32(time), 5)
+    config = dataclasses.replace(config_of("frames"), exposure=dataclasses.replace(REAL, longest_s=steps * dt))
+    taken, clock = exposure.poses_of_frames(config, None, poses, jnp.float32(time), (0.0,))
+    found = jax.tree.map(lambda x: x[0], taken)
+    assert clock is None
     for k in range(5):
         before = time * (k + 0.5) / 5
         where, attitude = exposure_plain.pose(position, quaternion, dt, before)

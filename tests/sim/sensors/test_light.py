@@ -11,18 +11,21 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from edqn_jax.config import CameraConfig, Config, DroneConfig, EventsConfig, LightConfig
+from edqn_jax.config import CameraConfig, Config, DroneConfig, EnvConfig, EventsConfig, ExposureConfig, LightConfig
 from edqn_jax.config.loading import with_conditions
+from edqn_jax.config.rules import validate
 from edqn_jax.errors import ConfigError
-from edqn_jax.learn import policy
+from edqn_jax.interop.deployment.onnx_export import about_policy
+from edqn_jax.learn import actor, policy
 from edqn_jax.sim.physics.airframe import load_airframe
 from edqn_jax.sim.scene.mjcf import load_scene
 from edqn_jax.sim.scene.scene import stack_scenes
+from edqn_jax.sim.sensors import contrast, light, photoreceptor
 from edqn_jax.sim.sensors import events as ev
-from edqn_jax.sim.sensors import light, photoreceptor
 from edqn_jax.sim.task import env
 from edqn_jax.sim.task.missions import own_missions
 from edqn_jax.sim.task.observation import MOTION_SIZE, OWN_SIZE, Observation
+from edqn_jax.sim.task.task import task_of
 from tests.support.event_frames import PAPER, host, memory_of, random_frames, run
 from tests.support.miniature import WORLD
 
@@ -121,6 +124,41 @@ def test_shot_noise_follows_brightness_where_a_pixel_has_a_bandwidth():
     assert abs(count[:, size:].mean() / 50.0 - 1) < 0.05
     uniform = lit(dataclasses.replace(config, bandwidth_hz=0.0), None, frames).count.sum(0) / 0.04
     assert abs(uniform[:, :size].mean() / uniform[:, size:].mean() - 1) < 0.05
+
+
+@pytest.mark.parametrize("sensor", ["events", "frame-pair"])
+def test_the_networks_are_told_the_light_of_an_episode_before_its_contrast(world, sensor):
+    told = dataclasses.replace(
+        LIT,
+        light=LightConfig(0.1, 10_000.0, told=True),
+        exposure=ExposureConfig(real=True),
+        env=EnvConfig(sensor=sensor),
+        events=dataclasses.replace(LIT.events, least_contrast=0.02, most_contrast=0.3),
+    )
+    validate(told)
+    state, seen = jax.jit(lambda key: env.reset(told, world, key))(jax.random.key(0))
+    value, more = (np.log10(float(state.memory.lux)) - 1.5) / 2.5, 1 + (sensor == "events")
+    for values, size in ((seen.own, OWN_SIZE), (seen.motion, MOTION_SIZE)):
+        assert values.shape == (size + more,)
+        np.testing.assert_allclose(values[size], value, atol=1e-5)
+    assert more == 1 or float(seen.own[-1]) == pytest.approx(float(contrast.value_of(state.memory.contrast)), abs=1e-6)
+    blank = actor.blank_observation(told)
+    assert (blank.own.shape, blank.motion.shape) == (seen.own.shape, seen.motion.shape)
+    task = task_of(told)
+    assert task.mirror is not None and task.mirror[MOTION_SIZE:] == (1.0,) * more
+
+
+def test_light_is_told_only_where_there_is_some_and_of_sensors_that_depend_on_it():
+    blind = dataclasses.replace(LIT, light=LightConfig(1.0, 1.0, told=True), env=EnvConfig(sensor="blind"))
+    assert task_of(blind).own_size == OWN_SIZE
+    with pytest.raises(ConfigError, match="light.told must be false without light.least_lux and light.most_lux"):
+        validate(dataclasses.replace(LIT, light=LightConfig(told=True)))
+    with pytest.raises(ConfigError, match="exposure.real must be true with light.told and env.sensor frames"):
+        validate(dataclasses.replace(blind, env=EnvConfig(sensor="frames")))
+    with pytest.raises(ConfigError, match="'light.told' is a policy's own"):
+        with_conditions(LIT, {"light": {"told": True}}, "conditions")
+    with pytest.raises(ConfigError, match="knows the light .* cannot be exported"):
+        about_policy(dataclasses.replace(blind, env=EnvConfig()))
 
 
 def test_a_policy_is_flown_in_other_light_than_it_was_trained_in():

@@ -13,7 +13,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from edqn_jax.config import CameraConfig, Config, DroneConfig, EventsConfig
+from edqn_jax.config import CameraConfig, Config, DroneConfig, EventsConfig, LightConfig
 from edqn_jax.config.rules import validate
 from edqn_jax.sim.physics.airframe import load_airframe
 from edqn_jax.sim.scene.mjcf import load_scene
@@ -95,14 +95,55 @@ def test_the_same_contrast_makes_fewer_events_in_a_dark_pixel_than_in_a_bright_o
     assert 0 <= dark < middle < bright <= np.log(2) / 0.09
 
 
-def test_a_law_without_memory_begins_each_window_settled():
+def test_a_window_without_a_known_gap_before_it_begins_settled():
     config = dataclasses.replace(PAPER, **SLOW)
     frames, memory = jnp.asarray(random_frames(5)), memory_of(config, 0)
     first, after = run(config, memory, frames)
     again, _ = run(config, after, frames)
-    assert after.lag is None
+    assert np.abs(after.lag).max() > 0.1
     for name in ("count", "t_first", "t_step"):
         np.testing.assert_array_equal(getattr(first, name), getattr(again, name))
+
+
+GAP = 0.22
+"""Seconds between the windows of two decisions."""
+
+
+@pytest.mark.parametrize("lux", [0.1, 1.0, 10.0])
+@pytest.mark.parametrize("law", [PAPER, AIRSIM, ESIM], ids=["paper", "airsim", "esim"])
+def test_the_lag_of_an_episode_is_that_of_one_filter_over_all_of_it(law, lux):
+    """Decision by decision, with gaps in which nothing is rendered, against a filter that never stops."""
+    config = dataclasses.replace(law, airsim_tolerance=0.001, tolerance=0.001, threshold=0.001, **SLOW)
+    config = dataclasses.replace(config, contrast_on=0.001, contrast_off=0.001, refractory_ns=1.0)
+    frames = long_flight(6, 18)
+    times = np.concatenate([0.26 * k + np.array(TIMES) for k in range(6)])
+    memory = dataclasses.replace(memory_of(config, 3), lux=jnp.float32(lux))
+    level = (ev.airsim_log_brightness(frames) if law is AIRSIM else ev.log_brightness(config, frames)).__array__()
+    shown = photoreceptor_plain.follow(30.0 * lux / 10.0, level, times, frames, np.zeros(level.shape[1:]), parts=2000)
+    changes = []
+    for k in range(6):
+        field, memory = run(config, memory, jnp.asarray(frames[3 * k : 3 * k + 3]), gap_s=GAP)
+        np.testing.assert_allclose(memory.lag, shown[3 * k + 2] - level[3 * k + 2], atol=2e-4)
+        changes.append(0.001 * np.asarray(field.count * field.polarity).sum(0))
+    wanted = shown[2::3] - shown[::3]
+    # Of each frame pair less than a threshold is left over, by AirSim's law less than two.
+    assert np.abs(np.array(changes) - wanted).max() < 0.005
+    assert lux > 1 or np.abs(wanted[1:]).max() > 2 * np.abs(wanted[0]).max()  # what came before is still seen
+
+
+@pytest.mark.parametrize(("lux", "most"), [(0.1, 0.04), (1.0, 0.31)])
+def test_a_steady_change_is_seen_in_full_however_dark(lux, most):
+    config = dataclasses.replace(PAPER, **SLOW, threshold=1e-5, tolerance=1e-5, refractory_ns=1.0)
+    memory = dataclasses.replace(memory_of(config, 0), lux=jnp.float32(lux))
+    slope = 0.025  # of log brightness, 1/s: 0.39 in the 60 decisions that follow
+    for gap_s, least, largest in ((GAP, 0.95, 1.05), (None, 0.0, most)):
+        carried = memory
+        for k in range(60):
+            level = -1.0 + slope * (0.26 * k + np.array(TIMES))
+            frames = jnp.broadcast_to(jnp.exp(jnp.asarray(level, jnp.float32))[:, None, None], (3, 4, 5))
+            field, carried = run(config, carried, frames, gap_s=gap_s)
+        share = 1e-5 * float(field.count[:, 0, 0].sum()) / (slope * 0.04)
+        assert least <= share <= largest
 
 
 def test_the_lag_of_a_stream_is_carried_from_window_to_window():
@@ -143,6 +184,57 @@ def test_infinite_bandwidth_traces_nothing():
     trace = jax.make_jaxpr(lambda k, f: ev.generate_events(PAPER, ev.EventMemory(None, None, None, None), f, TIMES, k))
     plain = str(trace(jax.random.key(0), jnp.ones((3, 2, 2))))
     assert "exp" not in plain and EventsConfig().bandwidth_hz == 0
+
+
+@pytest.fixture(scope="module")
+def flown():
+    """The configuration and world of a noiseless slow sensor, and the state after three decisions, each."""
+    options = EventsConfig(**SLOW)
+    drone = DroneConfig(physics="rigid_body")
+    config = Config(camera=CameraConfig(width=16, height=12), drone=drone, events=options, light=LightConfig(1.0, 1.0))
+    pool = stack_scenes([load_scene(WORLD)])
+    world = env.EnvParams(load_airframe(drone), pool, own_missions(pool))
+    step = jax.jit(lambda s, move: env.step(config, world, s, move))
+    states, flights = [jax.jit(lambda key: env.reset(config, world, key))(jax.random.key(0))[0]], []
+    for move in (26, 22, 4):
+        state, seen = step(states[-1], move)
+        states.append(state)
+        flights.append(seen.flight)
+    return config, pool, step, states, flights
+
+
+def test_an_environment_carries_the_lag_from_decision_to_decision(flown):
+    config, pool, _, states, flights = flown
+    first, scene = states[0].drone, jax.tree.map(lambda x: x[0], pool)
+    # The windows begin after 11 of the 13 physics steps, and end with them.
+    rows = [(flight.position[i], flight.quaternion[i]) for flight in flights for i in (10, 12)]
+    places, attitudes = (
+        jnp.stack([start, start, *path])
+        for start, path in zip((first.position, first.quaternion), zip(*rows, strict=True), strict=True)
+    )
+    see = jax.jit(jax.vmap(lambda p, q: sensor.render_view(config, scene, p, q)))
+    frames = np.asarray(see(places, attitudes))
+    times = np.concatenate([0.26 * k + np.array([-0.04, 0.0]) for k in range(4)])
+    level = levels(config.events, frames)
+    plain = photoreceptor_plain.follow(3.0, level, times, frames, np.zeros(level.shape[1:]), parts=1000)
+    for k, state in enumerate(states):
+        np.testing.assert_allclose(state.memory.lag, plain[2 * k + 1] - level[2 * k + 1], atol=2e-3)
+    assert np.abs(states[-1].memory.lag).max() > 0.1
+
+
+def test_an_episode_begins_with_settled_pixels(flown):
+    _, _, step, states, _ = flown
+    fresh, seen = step(dataclasses.replace(states[-1], ended=jnp.ones((), bool)), 0)
+    assert bool(seen.is_reset) and int(seen.observation.sensed.count.sum()) == 0
+    np.testing.assert_allclose(fresh.memory.lag, 0.0, atol=1e-6)
+    assert float(fresh.memory.frame.min()) >= 0
+
+
+def test_pixels_without_bandwidth_limits_carry_nothing(flown):
+    config = flown[0]
+    ideal = dataclasses.replace(config, events=EventsConfig(), light=LightConfig())
+    assert jax.tree.leaves(sensor.at_rest(ideal, jax.random.key(0))) == []
+    assert len(jax.tree.leaves(sensor.at_rest(config, jax.random.key(0)))) == 3  # light, lag and last frame
 
 
 @pytest.mark.slow
