@@ -5,8 +5,8 @@
 
 A file counts if MuJoCo opens it and it has a solid geom at rest that is no plane. Start and goal are free places in
 opposite corners of its flight volume; a world is flown if `edqn check` finds a way between them. With --still, what
-moves is taken away first: MuJoCo writes each file without joints, and what acts on them, to a folder of its own in
-SCRATCH, together with its meshes and height fields; and what is said of meshes that are not closed is done, they get a
+moves is taken away first, and what acts on it: MuJoCo writes each file to a folder of its own in SCRATCH, together with
+the meshes and height fields that are left; and what is said of meshes that are not closed is done, they get a
 thickness. One row a file: its path, `flown`, `refused` or `crashed`, how many meshes got a thickness, seconds, the
 reason.
 """
@@ -42,14 +42,25 @@ THICKNESS_M = 0.05
 ROOM_M = 0.9
 """Clearance of start and goal."""
 
-MOVING = ("actuator", "sensor", "tendon", "equality", "keyframe", "contact", "deformable", "extension")
-"""Elements that say how things move, or what is measured of it."""
+MOVING = (
+    "camera",
+    "light",
+    "actuator",
+    "sensor",
+    "tendon",
+    "equality",
+    "keyframe",
+    "contact",
+    "deformable",
+    "extension",
+)
+"""Elements that say how things move, what is measured of it, or what looks at it."""
 
-JOINTS = ("joint", "freejoint", "inertial")
+JOINTS = {"joint", "freejoint"}
 
 
-def is_counted(path: Path, strip: bool) -> bool:
-    """Returns whether MuJoCo opens a file and it has a solid geom that is no plane, at rest unless all will be."""
+def is_counted(path: Path) -> bool:
+    """Returns whether MuJoCo opens a file and it has a solid geom at rest that is no plane."""
     try:
         model = mujoco.MjModel.from_xml_path(str(path))
     except ValueError:
@@ -57,13 +68,13 @@ def is_counted(path: Path, strip: bool) -> bool:
     return any(
         is_solid(model, geom)
         and model.geom_type[geom] != mujoco.mjtGeom.mjGEOM_PLANE
-        and (strip or not model.body_weldid[model.geom_bodyid[geom]])
+        and not model.body_weldid[model.geom_bodyid[geom]]
         for geom in range(model.ngeom)
     )
 
 
 def write_still(path: Path, folder: Path) -> Path:
-    """Writes a file without what moves, in one piece, to a folder, with the files that it names; returns it."""
+    """Writes what of a file stands still, in one piece, to a folder, with the files that it names; returns it."""
     spec = mujoco.MjSpec.from_file(str(path))
     spec.compile()
     root = ElementTree.fromstring(spec.to_xml())
@@ -72,15 +83,20 @@ def write_still(path: Path, folder: Path) -> Path:
     folder.mkdir(parents=True)
     for parent in list(root.iter()):
         for child in list(parent):
-            if child.tag in (*MOVING, *JOINTS) or (parent is not root and child.tag == "general"):
+            if child.tag in MOVING or (child.tag == "body" and _moves(child)):
                 parent.remove(child)
-            elif parent.tag in ("body", "worldbody") and child.get("mocap"):
-                del child.attrib["mocap"]
-    for number, element in enumerate(each for each in root.iter() if each.tag in ("mesh", "hfield")):
-        if (name := element.get("file")) is not None:
-            element.set("file", f"{number}{Path(name).suffix}")
-            element.attrib.setdefault("name", Path(name).stem)
-            shutil.copyfile(home / name, folder / f"{number}{Path(name).suffix}")
+    used = {geom.get(kind) for geom in root.iter("geom") for kind in ("mesh", "hfield")}
+    for parent in list(root.iter("asset")):
+        for number, element in enumerate(list(parent)):
+            if element.tag not in ("mesh", "hfield"):
+                continue
+            name = element.get("file")
+            element.attrib.setdefault("name", Path(name or "").stem)
+            if element.get("name") not in used:
+                parent.remove(element)
+            elif name is not None:
+                element.set("file", f"{number}{Path(name).suffix}")
+                shutil.copyfile(home / name, folder / f"{number}{Path(name).suffix}")
     for number, geom in enumerate(geom for world in root.iter("worldbody") for geom in world.iter("geom")):
         geom.attrib.setdefault("name", f"geom {number}")
     for compiler in root.iter("compiler"):
@@ -89,6 +105,10 @@ def write_still(path: Path, folder: Path) -> Path:
     made = folder / "world.xml"
     made.write_bytes(ElementTree.tostring(root))
     return made
+
+
+def _moves(body: ElementTree.Element) -> bool:
+    return body.get("mocap") == "true" or any(child.tag in JOINTS for child in body)
 
 
 def add_thickness(path: Path) -> int:
@@ -147,7 +167,7 @@ def main() -> None:
     counts: Counter[str] = Counter()
     with args.out.open("w", encoding="utf-8") as table:
         for file in sorted(args.folder.rglob("*.xml")):
-            if not is_counted(file, args.still is not None):
+            if not is_counted(file):
                 continue
             begin, name, thickened = time.monotonic(), file.relative_to(args.folder), 0
             try:
