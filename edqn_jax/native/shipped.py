@@ -25,7 +25,7 @@ FOLDER = Path(__file__).with_name("built")
 COMPILER = "compiler.txt"
 """In this folder: name and version of what compiled the library."""
 
-SOURCES = ("native/all_sum.c", "sim/camera/pictures.c")
+SOURCES = ("native/all_sum.c", "sim/camera/pictures.c", "sim/scene/shapes/field_rays.c")
 """What is in it, below the package."""
 
 FLAGS = (

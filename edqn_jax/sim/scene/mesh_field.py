@@ -22,6 +22,7 @@ from scipy.ndimage import maximum_filter
 from scipy.spatial import ConvexHull, QhullError
 
 from edqn_jax.errors import ConfigError
+from edqn_jax.sim.scene.kept_grids import KEPT_VALUES, kept_values
 from edqn_jax.sim.scene.solid_distance import solid_distances, split_triangles
 
 CELL_M = 0.1
@@ -132,7 +133,13 @@ def _grid(vertices: bytes, faces: bytes, cell: float | None, thickness: float) -
         corners, rings = hull_of(given)
         values = _lowered_values(corners - middle, rings, half, cell)
         return Grid.of(values, cell, half, corners - middle, rings), middle
-    values = _lowered_values_of_solid((given - middle)[triangles], half, cell, thickness)
+
+    def make() -> Numbers:
+        return _lowered_values_of_solid((given - middle)[triangles], half, cell, thickness)
+
+    is_large = np.prod(_counts(half, cell)) >= KEPT_VALUES
+    content = (vertices, faces, np.array([cell, thickness]).tobytes())
+    values = kept_values(content, make) if is_large else make()
     return Grid.of(values, cell, half, given - middle, triangles, is_convex=False, thickness=thickness), middle
 
 
@@ -251,10 +258,12 @@ def _means(values: Numbers, axis: int) -> Numbers:
 
 def _interpolated(values: NDArray[np.floating], places: NDArray[np.int64], parts: Numbers) -> Numbers:
     """Returns values [P] between those of a lattice, in the cells at `places` [P, 3], `parts` [P, 3] of a cell on."""
+    strides = np.array([values.shape[1] * values.shape[2], values.shape[2], 1])
+    first, flat = places @ strides, values.ravel()
+    shares = [(1 - part, part) for part in parts.T]
     found = np.zeros(len(places))
-    for corner in itertools.product((0, 1), repeat=3):
-        weight = np.prod(np.where(corner, parts, 1 - parts), axis=1)
-        found += weight * values[tuple((places + corner).T)]
+    for i, j, k in itertools.product((0, 1), repeat=3):
+        found += shares[0][i] * shares[1][j] * shares[2][k] * flat[first + np.dot(strides, (i, j, k))]
     return found
 
 

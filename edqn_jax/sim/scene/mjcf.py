@@ -1,7 +1,7 @@
 """Reads and writes worlds as MJCF, MuJoCo's file format.
 
-An MJCF file can be read that names no other file but meshes and height fields in its folder. A world for the drone
-consists of
+An MJCF file can be read that names no other file but meshes, height fields and MJCF to include in its folder; pictures
+of textures are not looked for. A world for the drone consists of
 
 * its static geoms (on the world body or on bodies welded to it) of any registered kind of shape (`shapes/`), at any
   rotation. Planes are solid below and infinite. A geom is read if it is visible in
@@ -158,7 +158,7 @@ def load_world(path: str | Path) -> LoadedWorld:
 
 
 def compile_model(path: Path) -> mujoco.MjModel:
-    """Returns the model of a file, which names none but meshes and height fields in its folder.
+    """Returns the model of a file, with the files in its folder that it names.
 
     Raises:
         SceneError: if MuJoCo cannot read it, or it has more geoms than `MAX_SHAPES`.

@@ -27,7 +27,7 @@ EXACT_CELLS = 2.5
 _BLOCK = 4  # cells along each side of a block
 _PIECE_CELLS = 8.0  # longest edge of the pieces that blocks are compared with
 _FAR_CELLS = 0.1  # that distances further away are too small, for they are not to the nearest of all triangles
-_AT_ONCE = 8  # pieces that a block is compared with in one pass
+_AT_ONCE = 32  # pieces that a block is compared with in one pass
 _THREADS = 2
 _PAIRS = 2**20  # numbers of an intermediate array
 _BESIDE = (3.1e-5, 1.7e-5)  # of a cell: no line upwards meets an edge of a mesh that is aligned to the lattice
@@ -38,17 +38,18 @@ Integers = NDArray[np.int64]
 
 def split_triangles(triangles: Numbers, longest: float) -> Numbers:
     """Returns triangles [G, 3, 3] that cover the same surface, no edge of which is longer than `longest` metres."""
+    left = np.ascontiguousarray(np.moveaxis(triangles, 0, -1))  # [3, 3, F], so that sums are over whole rows
     done = []
-    while len(triangles):
-        edges = np.linalg.norm(np.roll(triangles, -1, axis=1) - triangles, axis=2)
-        long = edges.max(1) > longest
-        done.append(triangles[~long])
+    while left.shape[-1]:
+        squares = np.sum((np.roll(left, -1, axis=0) - left) ** 2, axis=1)
+        long = squares.max(0) > longest**2
+        done.append(left[..., ~long])
+        left, first = left[..., long], squares[:, long].argmax(0)
         # The longest edge is halved.
-        first = edges[long].argmax(1)[:, None] + np.arange(3)
-        a, b, c = np.moveaxis(np.take_along_axis(triangles[long], first[..., None] % 3, axis=1), 1, 0)
+        a, b, c = (np.take_along_axis(left, ((first + i) % 3)[None, None], axis=0)[0] for i in range(3))
         middle = (a + b) / 2
-        triangles = np.concatenate([np.stack([a, middle, c], axis=1), np.stack([middle, b, c], axis=1)])
-    return np.concatenate([np.zeros((0, 3, 3)), *done])
+        left = np.concatenate([np.stack([a, middle, c]), np.stack([middle, b, c])], axis=-1)
+    return np.moveaxis(np.concatenate([np.zeros((3, 3, 0)), *done], axis=-1), -1, 0)
 
 
 def lattice_axes(counts: NDArray[np.integer], cell: float) -> list[Numbers]:
@@ -227,11 +228,10 @@ def _compare_blocks(table: Array, members: Array, spans: Array, corners: Array, 
         def nearer(i: Array, found: tuple[Array, Array]) -> tuple[Array, Array]:
             number = members[span[0] + jnp.minimum(i * _AT_ONCE + jnp.arange(_AT_ONCE), span[1] - 1)]
             squares, which = found
-            for k, row in enumerate(table[number]):
-                each = _squares(list(row), [points[:, i] + corner[i] for i in range(3)])
-                which = jnp.where(each < squares, number[k], which)
-                squares = jnp.minimum(squares, each)
-            return squares, which
+            each = _squares(list(table[number].T[:, :, None]), [(points[:, i] + corner[i])[None] for i in range(3)])
+            least = jnp.min(each, axis=0)
+            first = jnp.max(jnp.where(each == least, number[:, None], 0), axis=0)
+            return jnp.minimum(squares, least), jnp.where(least < squares, first, which)
 
         passes = (span[1] + _AT_ONCE - 1) // _AT_ONCE
         return lax.fori_loop(0, passes, nearer, (jnp.full(len(points), jnp.inf), jnp.zeros(len(points), jnp.int32)))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,7 @@ from edqn_jax.config import SHAPES
 from edqn_jax.sim.scene.mjcf import load_scene
 from edqn_jax.sim.scene.shapes import field_rays
 from edqn_jax.sim.scene.shapes.field import _least_of_blocks
+from edqn_jax.sim.scene.shapes.kind import TINY
 from tests.support.meshes import CUBE, hull, mesh_world
 
 RING = trimesh.creation.torus(1.2, 0.3, major_sections=24, minor_sections=12)
@@ -58,6 +60,14 @@ def compare(monkeypatch: pytest.MonkeyPatch, mapped: Any, *given: Any) -> tuple[
         same = np.isclose(ours.astype(float), theirs.astype(float), rtol=apart, atol=apart)
         assert same.mean() > 0.97
     return tuple(in_c)
+
+
+def test_the_constants_in_c_are_those_of_python() -> None:
+    found = re.findall(r"^#define (\w+) ([\d.e+-]+)f?\b", field_rays.SOURCE.read_text(), re.MULTILINE)
+    names = {"FAR": "FAR_M"}
+    assert len(found) == 8
+    for name, value in found:
+        assert float(value) == (TINY if name == "TINY" else getattr(field_rays, names.get(name, name)))
 
 
 def test_c_meets_what_jax_meets_and_mujoco(file: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -16,7 +16,6 @@ from edqn_jax.config import Config, WorldConfig
 from edqn_jax.runs.world_copy import copy_worlds, with_copied_worlds
 from edqn_jax.sim.scene.distance import shape_distances
 from edqn_jax.sim.scene.mjcf import SceneError, load_world, mjcf_of
-from edqn_jax.sim.scene.mjcf_parts import assets
 from edqn_jax.sim.scene.mjcf_parts.files import load_checked_text
 
 RING = trimesh.creation.torus(1, 0.3, major_sections=16, minor_sections=8)
@@ -53,7 +52,7 @@ def rays_down(file: Path, count: int = 150) -> tuple[np.ndarray, np.ndarray]:
 def test_what_mujoco_sees_of_files_ellipsoids_and_height_fields_is_the_surface_of_fields(tmp_path: Path) -> None:
     folder = tmp_path / "meshes"
     folder.mkdir()
-    for kind in assets.KINDS:
+    for kind in ("obj", "stl", "ply"):
         RING.export(folder / f"ring.{kind}")
     elevation = " ".join(f"{height:.6g}" for height in HEIGHTS.ravel())
     file = world(
@@ -111,6 +110,23 @@ def test_a_run_keeps_a_copy_that_needs_no_other_file(tmp_path: Path) -> None:
     assert mjcf_of(copy.scene) == mjcf_of(before.scene)
 
 
+def msh_of(mesh: trimesh.Trimesh) -> bytes:
+    """A mesh in MuJoCo's own binary form, with a place on a texture for each vertex."""
+    counts = struct.pack("<4i", len(mesh.vertices), 0, len(mesh.vertices), len(mesh.faces))
+    parts = mesh.vertices.astype("<f4"), mesh.vertices[:, :2].astype("<f4"), mesh.faces.astype("<i4")
+    return counts + b"".join(part.tobytes() for part in parts)
+
+
+def test_a_mesh_of_mujocos_own_form_is_the_one_that_mujoco_reads(tmp_path: Path) -> None:
+    (tmp_path / "ring.msh").write_bytes(msh_of(RING))
+    file = world(tmp_path, '<mesh name="a" file="ring.msh"/>', '<geom type="mesh" mesh="a" pos="10 5 4"/>')
+    theirs = mujoco.MjModel.from_xml_path(str(file))
+    ours = mujoco.MjModel.from_xml_string(load_checked_text(file))
+    assert theirs.nmeshface == ours.nmeshface == len(RING.faces)
+    np.testing.assert_allclose(ours.geom_pos, theirs.geom_pos, atol=1e-6)
+    np.testing.assert_allclose(np.ptp(ours.mesh_vert, axis=0), np.ptp(theirs.mesh_vert, axis=0), atol=1e-5)
+
+
 def stl_of(count: int) -> bytes:
     """The beginning of a file that says that it has so many triangles."""
     return b"\0" * 80 + struct.pack("<I", count)
@@ -121,7 +137,10 @@ BAD = {
     "/etc/hostname": "which lies outside of the world's folder",
     "link.stl": "which lies outside of the world's folder",
     "none.stl": "and there is none in",
-    "ring.glb": r"must end in .obj, .stl, .ply",
+    "ring.glb": r"must end in .obj, .stl, .ply, .msh",
+    "short.msh": "cannot be read as .msh: its length is not that of what it counts",
+    "empty.msh": "cannot be read as .msh",
+    "wrong.msh": "has a triangle of vertices that it does not have",
     "large.ply": "has 10,000,000 triangles; it may have 500,000, so thin it out",
     "large.stl": "names files of more than 100,000,000 bytes together",
     "nan.obj": "has a vertex that is not finite",
@@ -140,6 +159,9 @@ def test_a_file_that_cannot_be_flown_is_refused_in_one_sentence(tmp_path: Path, 
     (home / "link.stl").symlink_to(tmp_path / "ring.stl")
     RING.export(home / "ring.glb")
     (home / "large.ply").write_bytes(b"ply\nformat binary_little_endian 1.0\nelement vertex 3\nelement face 10000000\n")
+    (home / "short.msh").write_bytes(msh_of(RING)[:-1])
+    (home / "empty.msh").write_bytes(b"")
+    (home / "wrong.msh").write_bytes(msh_of(RING)[:-4] + struct.pack("<i", len(RING.vertices)))
     with (home / "large.stl").open("wb") as large:
         large.write(stl_of(10_000_000))
         large.truncate(500_000_084)  # no byte of it is on the disk

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from edqn_jax.sim.scene.mjcf import MAX_SHAPES, SceneError, load_world
@@ -21,10 +22,11 @@ def world(folder: Path, inside: str) -> Path:
 @pytest.mark.parametrize(
     ("inside", "says"),
     [
-        ('<include file="../secret.xml"/>', "has <include>; a world is one file"),
+        ('<include file="../secret.xml"/>', "names the file '../secret.xml' in <include>, which lies outside"),
+        ('<include file="none.xml"/>', "names the file 'none.xml' in <include>, and there is none in"),
+        ('<include file="world.xml"/>', "includes 'world.xml' twice"),
         ('<asset><model name="a" file="secret.xml"/></asset>', "has <model>"),
-        ('<asset><texture type="2d" name="a" file="secret.png"/></asset>', "names the file 'secret.png' in <texture>"),
-        ('<asset><texture type="cube" name="a" fileright="x.png"/></asset>', "names the file 'x.png' in <texture>"),
+        ('<asset><material name="a" file="secret.png"/></asset>', "names the file 'secret.png' in <material>"),
         (
             '<asset><mesh name="a" file="none.stl"/></asset>',
             "names the file 'none.stl' in <mesh>, and there is none in",
@@ -32,11 +34,6 @@ def world(folder: Path, inside: str) -> Path:
         ('<extension><plugin plugin="mujoco.sdf.bolt"/></extension>', "has <extension>"),
         ('<asset><hfield name="a" nrow="99999" ncol="99999" size="1 1 1 1"/></asset>', "field 'a' of 99999 x 99999"),
         ('<asset><hfield name="a" nrow="0" ncol="0" size="1 1 1 1"/></asset>', "field 'a' of 0 x 0; it must be 2 x 2"),
-        ('<size memory="900G"/>', "has <size>"),
-        (
-            '<asset><texture type="2d" builtin="flat" width="100000" height="9"/></asset>',
-            "width=...> of more than 4096",
-        ),
         ('<asset><mesh builtin="supersphere" params="9000 1 1"/></asset>', "params=...> of more than 100"),
         ('<custom><numeric name="a" size="900000000"/></custom>', "size=...> of more than 4096"),
         ('<worldbody><flexcomp name="a" type="grid" count="60 60 60"/></worldbody>', "has <flexcomp>"),
@@ -87,3 +84,58 @@ def test_copies_and_sizes_have_limits(tmp_path: Path, monkeypatch: pytest.Monkey
     monkeypatch.setattr(mjcf_files, "MAX_BYTES", 100)
     with pytest.raises(SceneError, match=r"has 1\d\d bytes; a world may have 100"):
         load_world(world(tmp_path, ""))
+
+
+LOOPS = {
+    "one.xml": '<mujoco><include file="two.xml"/></mujoco>',
+    "two.xml": '<mujoco><include file="one.xml"/></mujoco>',
+}
+
+
+def test_what_a_world_includes_is_part_of_it_as_in_mujoco(tmp_path: Path) -> None:
+    (tmp_path / "parts").mkdir()
+    (tmp_path / "parts" / "looks.xml").write_text(
+        '<mujoco><size memory="900G"/><asset><texture type="2d" name="wood" file="none.png"/>'
+        '<texture type="2d" name="huge" builtin="flat" width="100000" height="9"/>'
+        '<texture type="cube" file="parts/sky.png" gridsize="1 1"/>'
+        '<material name="brown" texture="wood" rgba=".5 .3 .1 1"/><material name="b" texture="sky"/></asset></mujoco>'
+    )
+    (tmp_path / "parts" / "table.xml").write_text(
+        '<mujocoinclude><geom name="top" type="box" size="1 1 .1" pos="0 0 1" material="brown"/>'
+        '<include file="parts/leg.xml"/></mujocoinclude>'
+    )
+    (tmp_path / "parts" / "leg.xml").write_text(
+        '<mujoco><geom name="leg" type="box" size=".1 .1 .5" pos="0 0 .5"/></mujoco>'
+    )
+    file = world(
+        tmp_path,
+        '<include file="parts/looks.xml"/>'
+        '<worldbody><body pos="5 1 0"><include file="parts/table.xml"/></body></worldbody>',
+    )
+    loaded = load_world(file)
+    assert loaded.names["boxes"] == ("top", "leg")
+    np.testing.assert_allclose(loaded.scene.boxes.position, [[5, 1, 1], [5, 1, 0.5]])
+    np.testing.assert_allclose(loaded.scene.boxes.albedo[0], [0.5, 0.3, 0.1], atol=1e-6)
+    copied = tmp_path / "copy.xml"
+    copied.write_bytes(mjcf_files.self_contained_bytes(file))
+    (tmp_path / "parts").rename(tmp_path / "elsewhere")
+    assert load_world(copied).names == loaded.names
+
+
+def test_what_is_included_has_limits(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    for name, text in LOOPS.items():
+        (tmp_path / name).write_text(text)
+    with pytest.raises(SceneError, match="includes 'one.xml' twice; MuJoCo allows it once"):
+        load_world(world(tmp_path, '<include file="one.xml"/>'))
+    deep = 300
+    (tmp_path / "deep.xml").write_text(f"<mujoco>{'<body>' * deep}{'</body>' * deep}</mujoco>")
+    inner = "<body>" * deep + '<include file="deep.xml"/>' + "</body>" * deep
+    with pytest.raises(SceneError, match="has more than 500 elements within each other"):
+        load_world(world(tmp_path, f"<worldbody>{inner}</worldbody>"))
+    (tmp_path / "broken.xml").write_text("<mujoco>")
+    with pytest.raises(SceneError, match="broken.xml is not an MJCF"):
+        load_world(world(tmp_path, '<include file="broken.xml"/>'))
+    (tmp_path / "long.xml").write_text(f"<mujoco>{' ' * 500}</mujoco>")
+    monkeypatch.setattr(mjcf_files, "MAX_BYTES", 400)
+    with pytest.raises(SceneError, match=r"long.xml' has 517 bytes; a world may have 400"):
+        load_world(world(tmp_path, '<include file="long.xml"/>'))

@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 from edqn_jax.errors import ConfigError
 from edqn_jax.sim.scene.mesh_field import MOST_TRIANGLES
 
-KINDS = ("obj", "stl", "ply")
-"""Endings of the mesh files that a world may name."""
+KINDS = ("obj", "stl", "ply", "msh")
+"""Endings of the mesh files that a world may name; `.msh` is MuJoCo's own."""
 
 MAX_FILE_BYTES = 100_000_000
 """Of all files that a world names."""
@@ -46,7 +46,7 @@ def inline_files(tree: ElementTree.Element, path: Path) -> bool:
     named = [element for element in tree.iter() if element.tag in ("mesh", "hfield") and element.get("file")]
     folder, left = mesh_folder(tree), MAX_FILE_BYTES
     for element in named:
-        file = _find(path, folder, str(element.get("file")), element.tag)
+        file = find_file(path, folder, str(element.get("file")), element.tag)
         left -= file.stat().st_size
         if left < 0:
             raise ConfigError(f"{path} names files of more than {MAX_FILE_BYTES:,} bytes together; thin them out")
@@ -71,8 +71,14 @@ def mesh_folder(tree: ElementTree.Element) -> str:
     return found
 
 
-def _find(path: Path, folder: str, name: str, tag: str) -> Path:
-    """Returns the file of a name within a world.
+def find_file(path: Path, folder: str, name: str, tag: str) -> Path:
+    """Returns the file that a world names.
+
+    Args:
+        path: of the world.
+        folder: below its own in which such files lie.
+        name: of the file.
+        tag: of the element that names it.
 
     Raises:
         ConfigError: if it is no file in the folder of the world.
@@ -101,7 +107,7 @@ def read_mesh(file: Path) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     kind = file.suffix.lower().removeprefix(".")
     if kind not in KINDS:
         raise ConfigError(f"the mesh file '{file}' must end in {', '.join(f'.{each}' for each in KINDS)}")
-    found = load_geometry(file, kind)
+    found = _load_msh(file) if kind == "msh" else load_geometry(file, kind)
     faces = np.asarray(getattr(found, "faces", np.zeros((0, 3))), np.int64)
     if not len(faces):
         raise ConfigError(f"the mesh file '{file}' has no triangles; `edqn world` makes a world of points")
@@ -132,6 +138,30 @@ def load_geometry(file: Path, kind: str, most: int = MOST_TRIANGLES) -> Any:
     except Exception as error:  # trimesh passes on whatever a file makes its readers raise
         reason = " ".join(str(error).split())[:200]
         raise ConfigError(f"the mesh file '{file}' cannot be read as .{kind}: {reason}") from None
+
+
+def _load_msh(file: Path) -> Any:
+    """Returns what is in a mesh file of MuJoCo's own kind, which may lack triangles: four counts, then what they count.
+
+    Raises:
+        ConfigError: if it is of another length, has too many triangles, or names vertices that it does not have.
+    """
+    import trimesh
+
+    try:
+        content = file.read_bytes()
+    except OSError as error:
+        raise ConfigError(f"cannot read the mesh file '{file}': {error.strerror}") from None
+    counts = np.frombuffer(content[:16], "<i4").astype(np.int64) if len(content) >= 16 else np.full(4, -1)
+    vertices, normals, places, faces = map(int, counts)
+    if counts.min() < 0 or len(content) != 16 + 4 * (3 * vertices + 3 * normals + 2 * places + 3 * faces):
+        raise ConfigError(f"the mesh file '{file}' cannot be read as .msh: its length is not that of what it counts")
+    check_number(file, faces)
+    numbers = np.frombuffer(content[16 : 16 + 12 * vertices], "<f4").reshape(-1, 3)
+    rings = np.frombuffer(content[len(content) - 12 * faces :], "<i4").reshape(-1, 3)
+    if len(rings) and not (rings.min() >= 0 and rings.max() < vertices):
+        raise ConfigError(f"the mesh file '{file}' has a triangle of vertices that it does not have")
+    return trimesh.Trimesh(numbers, rings, process=False)
 
 
 def check_number(file: Path, count: int, most: int = MOST_TRIANGLES) -> None:

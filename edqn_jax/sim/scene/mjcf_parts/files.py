@@ -1,8 +1,8 @@
 """The text of an MJCF world, checked before MuJoCo reads it.
 
-A world may be untrusted, so it names no files but meshes and height fields in its own folder (`assets.py`), and it
-declares nothing that takes much memory. MuJoCo gets the checked elements, serialised again, never a path, so both parse
-the same.
+A world may be untrusted, so no files are read but meshes, height fields and MJCF in its own folder (`assets.py`,
+`includes.py`), and it declares nothing that takes much memory. MuJoCo gets the checked elements, serialised again,
+never a path, so both parse the same.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from pathlib import Path
 from edqn_jax.errors import ConfigError
 from edqn_jax.sim.scene.mjcf_parts import xml as mjcf_xml
 from edqn_jax.sim.scene.mjcf_parts.assets import inline_files
+from edqn_jax.sim.scene.mjcf_parts.includes import drop_unused, insert_includes
 
 MAX_BYTES = 20_000_000
 """Of a world's file."""
@@ -22,8 +23,8 @@ MAX_BYTES = 20_000_000
 MAX_COPIES = 10_000
 """That `replicate` elements within each other may ask for."""
 
-MAX_PIXELS = 4096
-"""Width and height of a texture, which is not drawn."""
+MAX_NUMBERS = 4096
+"""Of a numeric."""
 
 MAX_HEIGHTS = 200_000
 """Of a height field, rows times columns."""
@@ -31,7 +32,7 @@ MAX_HEIGHTS = 200_000
 MAX_PARAMETER = 100
 """Of a mesh that MuJoCo makes: the number of its triangles grows with the square."""
 
-FOREIGN = ("include", "model", "attach", "plugin", "extension", "flexcomp", "composite", "skin", "size")
+FOREIGN = ("model", "attach", "plugin", "extension", "flexcomp", "composite", "skin")
 """Elements that name other files, run other code or make much of little; a static world needs none of them."""
 
 
@@ -96,25 +97,49 @@ def _decoded(path: Path, content: bytes) -> str:
 
 def _checked_text(path: Path, content: bytes) -> str:
     """Returns `load_checked_text` of a file's content."""
-    try:
-        tree, text = mjcf_xml.parse_xml(_decoded(path, content))
-    except mjcf_xml.SubsetError:
-        raise SceneError(f"{path} has a <!DOCTYPE> that declares something; a world needs none") from None
-    except mjcf_xml.MarkupError as error:
-        raise SceneError(f"{path} is not an MJCF that MuJoCo can read: {error}") from None
+    tree, text = _parsed(path, content)
     if tree.tag != "mujoco":
         raise SceneError(f"{path} is not an MJCF: it begins with <{tree.tag}>, not <mujoco>")
-    _check_elements(tree, path)
-    _check_copies(tree, path)
+    left = MAX_BYTES - len(content)
+
+    def parse(file: Path) -> ElementTree.Element:
+        nonlocal left
+        more = _read(file)
+        left -= len(more)
+        if left < 0:
+            raise SceneError(f"{path} has more than {MAX_BYTES:,} bytes with the files that it includes; thin them out")
+        return _parsed(file, more)[0]
+
     try:
-        if not inline_files(tree, path):
-            return text
+        is_changed = insert_includes(tree, path, parse)
+        is_changed |= drop_unused(tree)
+        _check_elements(tree, path)
+        _check_copies(tree, path)
+        is_changed |= inline_files(tree, path)
+    except SceneError:
+        raise
     except ConfigError as error:
         raise SceneError(str(error)) from None
+    if not is_changed:
+        return text
     text = ElementTree.tostring(tree, encoding="unicode")
     if len(text) > MAX_BYTES:
         raise SceneError(f"{path} has {len(text):,} bytes with the files that it names; a world may have {MAX_BYTES:,}")
     return text
+
+
+def _parsed(path: Path, content: bytes) -> tuple[ElementTree.Element, str]:
+    """Returns the first element of a file, and the file as XML of it alone.
+
+    Raises:
+        SceneError: if MuJoCo would not read it.
+    """
+    try:
+        return mjcf_xml.parse_xml(_decoded(path, content))
+    except mjcf_xml.SubsetError:
+        raise SceneError(f"{path} has a <!DOCTYPE> that declares something; a world needs none") from None
+    except mjcf_xml.MarkupError as error:
+        raise SceneError(f"{path} is not an MJCF that MuJoCo can read: {error}") from None
 
 
 def _check_elements(tree: ElementTree.Element, path: Path) -> None:
@@ -125,12 +150,12 @@ def _check_elements(tree: ElementTree.Element, path: Path) -> None:
     """
     for element in tree.iter():
         if element.tag in FOREIGN:
-            raise SceneError(f"{path} has <{element.tag}>; a world is one file of static geoms and sites")
+            raise SceneError(f"{path} has <{element.tag}>; a world is static geoms and sites")
         named = [name for name in element.keys() if name.startswith("file")]  # noqa: SIM118
         if named and element.tag not in ("mesh", "hfield"):
             raise SceneError(
                 f"{path} names the file '{element.get(named[0])}' in <{element.tag}>; a world names none but those of "
-                "meshes and height fields, and colours are those of its geoms"
+                "meshes and height fields, and worlds to include"
             )
         made = max([0.0, *map(_number, element.get("params", "").split())])
         if element.tag == "mesh" and made > MAX_PARAMETER:
@@ -142,10 +167,8 @@ def _check_elements(tree: ElementTree.Element, path: Path) -> None:
                     f"{path} has a height field '{element.get('name', '')}' of {rows:g} x {columns:g}; it must be "
                     f"2 x 2 to {MAX_HEIGHTS:,} heights"
                 )
-        if element.tag in ("texture", "numeric"):
-            for name in ("width", "height", "size"):
-                if _number(element.get(name)) > MAX_PIXELS:
-                    raise SceneError(f"{path} has <{element.tag} {name}=...> of more than {MAX_PIXELS}")
+        if element.tag == "numeric" and _number(element.get("size")) > MAX_NUMBERS:
+            raise SceneError(f"{path} has <numeric size=...> of more than {MAX_NUMBERS}")
 
 
 def _check_copies(tree: ElementTree.Element, path: Path) -> None:

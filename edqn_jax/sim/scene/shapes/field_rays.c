@@ -11,6 +11,13 @@
 #include "xla/ffi/api/c_api.h"
 #include "handler.h"
 
+#define TINY 1e-9f /* kind.py; the others are of field_rays.py: tests/sim/scene/test_field_rays.py holds them equal */
+#define STEPS 64
+#define STOPS 0.03f
+#define CONE 0.0005f
+#define TOGETHER 8
+#define BLOCK 4
+#define WORTH 0.2f
 #define FAR 1e30f
 
 enum { VALUES, FIRST, LEAST, FIRST_LEAST, COUNTS, CELL, POSITION, ROTATION, HALF, GRID, ORIGIN, RAYS, OPERANDS };

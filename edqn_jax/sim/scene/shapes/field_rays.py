@@ -11,7 +11,7 @@ import numpy as np
 from jax import Array
 
 from edqn_jax.native import build
-from edqn_jax.sim.scene.shapes.kind import TINY, Vector
+from edqn_jax.sim.scene.shapes.kind import Vector
 
 STEPS = 64
 """Most steps of a ray, each as long as the distance where it begins: along a wall they are short."""
@@ -34,15 +34,13 @@ FAR_M = 1e30
 
 NOWHERE = 1e29
 
-_SOURCE = Path(__file__).with_name("field_rays.c")
+SOURCE = Path(__file__).with_name("field_rays.c")
 _TARGET = "edqn_field_rays"
 
 
 def is_available() -> bool:
     """Returns whether the library is compiled, loaded and registered, which the first call does."""
-    definitions = (f"STEPS={STEPS}", f"STOPS={STOPS:e}f", f"CONE={CONE:e}f", f"TINY={TINY:e}f")
-    definitions += (f"TOGETHER={TOGETHER}", f"BLOCK={BLOCK}", f"WORTH={WORTH:e}f")
-    return build.ensure_registered(_SOURCE, (_TARGET,), definitions)
+    return build.ensure_registered(SOURCE, (_TARGET,))
 
 
 def meet(table: tuple[np.ndarray, ...], fields: Any, origin: Array, ray: Vector) -> tuple[Array, Array, Array, Array]:
