@@ -17,6 +17,7 @@ from edqn_jax.fly.machine import Output, Phase, State, step
 from edqn_jax.fly.records import FlightLog
 from edqn_jax.fly.streams import EventSource
 from edqn_jax.interop.deployment.runner import Runner
+from edqn_jax.interop.recordings.lens import Lens
 
 TICK_S = 0.02
 """Setpoints are sent at 50 Hz."""
@@ -80,6 +81,7 @@ class Task:
     fov_deg: float | None = None
     """Of the camera, as the runner was told; for the log, as `contrast`."""
     contrast: float | None = None
+    lens: Lens | None = None
 
 
 def at_pace(events: NDArray, until_us: int, pace: float) -> NDArray:
@@ -121,7 +123,7 @@ class Pilot:
         self.runner, self.link, self.source, self.clock = runner, link, source, clock
         self.settings, self._volume = task.settings, np.asarray(task.volume)
         self._pace, self._dry = task.pace, task.dry
-        self._camera = {"fov": task.fov_deg, "contrast": task.contrast}
+        self._camera = {"fov": task.fov_deg, "contrast": task.contrast, "lens": task.lens}
         self._log, self._stop, self._tell = log, stop, tell
         self.state = State()
         self.latency = Latency()

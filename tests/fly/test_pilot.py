@@ -20,6 +20,7 @@ from edqn_jax.fly.records import EVENTS, RECORDS, FlightLog, inputs_of, read_rec
 from edqn_jax.fly.replay import replay
 from edqn_jax.fly.streams import EVENT, Events, read_stream
 from edqn_jax.interop.deployment.runner import Command
+from edqn_jax.interop.recordings.lens import Lens
 from tests.support.virtual_flight import CAMERA, PERIOD_S, TICK_S, Vehicle
 
 GOAL = np.array([12.0, 0.0, 5.0])
@@ -115,7 +116,7 @@ class Camera:
 
 def make(policy: Any = None, wire: Any = None, camera: Any = None, **more: Any) -> tuple[Pilot, Any]:
     wire = wire or Wire()
-    known = {name: more.pop(name) for name in ("pace", "dry", "fov_deg", "contrast") if name in more}
+    known = {name: more.pop(name) for name in ("pace", "dry", "fov_deg", "contrast", "lens") if name in more}
     task = Task(more.pop("settings", SETTINGS), FENCE, **known)
     flier: Any = policy or Policy()
     pilot = Pilot(flier, wire, camera or Camera(), Time(), task, tell=lambda _: None, **more)
@@ -152,18 +153,37 @@ def test_a_log_is_played_again_with_the_same_outputs_and_moves(tmp_path: Path) -
     assert replay(tmp_path / "flight", Policy()).other_moves == 1  # pyright: ignore[reportArgumentType]
 
 
-@pytest.mark.parametrize(("words", "fov", "contrast"), [([], 70.0, 0.15), (["--fov", "80"], 80.0, 0.15)])
+LENS = Lens((64, 48), (60.0, 60.0, 32.0, 24.0), "radtan", (-0.1, 0.0, 0.0, 0.0))
+
+
+@pytest.mark.parametrize(
+    ("flown", "words", "told"),
+    [
+        ({"fov_deg": 70.0}, [], (70.0, 0.15, None)),
+        ({"fov_deg": 70.0}, ["--fov", "80"], (80.0, 0.15, None)),
+        ({"lens": LENS}, [], (None, 0.15, LENS)),
+        ({"lens": LENS}, ["--fov", "80"], (80.0, 0.15, None)),
+        ({"fov_deg": 70.0}, ["--calibration", "lens.yaml"], (None, 0.15, LENS)),
+    ],
+)
 def test_a_replay_knows_the_camera_of_the_flight_unless_it_is_told_another(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, words: list[str], fov: float, contrast: float
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, flown: dict[str, Any], words: list[str], told: Any
 ) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("lens.yaml").write_text(
+        "cam0:\n  distortion_model: radtan\n  distortion_coeffs: [-0.1, 0, 0, 0]\n"
+        "  intrinsics: [60, 60, 32, 24]\n  resolution: [64, 48]\n"
+    )
     log = FlightLog(tmp_path)
-    pilot, _ = make(log=log, fov_deg=70.0, contrast=0.15)
+    pilot, _ = make(log=log, contrast=0.15, **flown)
     pilot.fly()
     log.close()
-    told: list[Any] = []
-    monkeypatch.setattr(command, "load_runner", lambda args, size: told.append((args.fov, args.contrast)) or Policy())
+    seen: list[Any] = []
+    monkeypatch.setattr(
+        command, "load_runner", lambda args, size, lens: seen.append((args.fov, args.contrast, lens)) or Policy()
+    )
     command.replay(command.parse_fly(["a.onnx", "--replay", str(tmp_path), *words]), tmp_path)
-    assert told == [(fov, contrast)]
+    assert seen == [told]
 
 
 class Restarted(Camera):

@@ -59,6 +59,7 @@ class Runner:
         camera: tuple[int, int] | None = None,
         camera_fov_deg: float | None = None,
         contrast: float | None = None,
+        directions: ArrayLike | None = None,
         threads: int = 1,
     ) -> None:
         """Loads a policy.
@@ -69,6 +70,8 @@ class Runner:
             camera_fov_deg: the camera's horizontal field of view; None takes its whole image for the policy's.
             contrast: change of log brightness that makes an event in the camera, which a policy that knows it is told;
                 None is the policy's own, or the middle of those that it was trained with.
+            directions: [H, W, 2] of a calibrated lens, in place of `camera_fov_deg`: where each pixel of the camera
+                looks, how far to the right and down for one ahead; not finite where it sees nothing.
             threads: of onnxruntime; the network is so small that one is fastest.
 
         Raises:
@@ -89,7 +92,7 @@ class Runner:
         self._session: Any = session
         self.about = _about(self._session.get_modelmeta().custom_metadata_map, path)
         """What the policy expects, as `edqn export` wrote it."""
-        self._grid = Grid.of(self.about, camera, camera_fov_deg)
+        self._grid = Grid.of(self.about, camera, camera_fov_deg, directions)
         self._contrast = camera_contrast(self.about, contrast)
         self._actions = np.asarray(self.about["actions"], np.float32)
         shape = next(given.shape for given in self._session.get_inputs() if given.name == "memory")
@@ -193,64 +196,82 @@ class Runner:
 
 @dataclasses.dataclass(frozen=True)
 class Grid:
-    """Which of the policy's pixels each pixel of a camera belongs to; -1 is outside of the policy's view."""
+    """Which of the policy's pixels each pixel of a camera belongs to."""
 
-    columns: NDArray[np.int64]
-    """[camera width]"""
-    rows: NDArray[np.int64]
-    """[camera height]"""
+    cells: NDArray[np.int32]
+    """[camera height, camera width] row times width plus column of the policy's pixel; -1 is outside of its view."""
     pixels: NDArray[np.int64]
     """[H, W] of the camera that belong to each pixel of the policy."""
 
     @classmethod
     def of(
-        cls, about: Mapping[str, Any], camera: tuple[int, int] | None = None, camera_fov_deg: float | None = None
+        cls,
+        about: Mapping[str, Any],
+        camera: tuple[int, int] | None = None,
+        camera_fov_deg: float | None = None,
+        directions: ArrayLike | None = None,
     ) -> Grid:
-        """Returns the grid of a camera.
+        """Returns the grid of a camera that looks the same way as the policy's.
 
-        Both cameras are pinholes that look the same way, with square pixels where a field of view is given.
+        Without directions both are pinholes, with square pixels where a field of view is given.
 
         Args:
             about: `width`, `height` and `horizontal_fov_deg` of the policy's camera.
             camera: width and height; None is the policy's own.
             camera_fov_deg: horizontal; None stretches the camera's image over the policy's.
+            directions: as of `Runner`.
 
         Raises:
-            ValueError: if the camera has fewer pixels in the policy's view than the policy.
+            ValueError: if the camera has fewer pixels in the policy's view than the policy, or the directions are not
+                those of its pixels.
         """
         width, height = about["width"], about["height"]
         across, down = camera or (width, height)
-        if camera_fov_deg is None:
+        half = np.tan(np.radians(about["horizontal_fov_deg"]) / 2)
+        if directions is not None:
+            towards = np.asarray(directions, np.float64)
+            if camera_fov_deg is not None or towards.shape != (down, across, 2):
+                raise ValueError(
+                    f"directions must be given without camera_fov_deg, {down} x {across} x 2 of them for a camera of "
+                    f"{across} x {down} pixels, not {' x '.join(map(str, towards.shape))}"
+                )
+            columns = _within(towards[..., 0] * width / (2 * half) + width / 2, width)
+            rows = _within(towards[..., 1] * width / (2 * half) + height / 2, height)
+        elif camera_fov_deg is None:
             columns, rows = (np.arange(many) * size // many for many, size in ((across, width), (down, height)))
+            rows = rows[:, None]
         else:
             if not 0.0 < camera_fov_deg < 180.0:
                 raise ValueError(f"camera_fov_deg must be between 0 and 180, not {camera_fov_deg}")
             # Pixels of the policy per pixel of the camera.
             scale = np.tan(np.radians(camera_fov_deg) / 2) / across
-            scale /= np.tan(np.radians(about["horizontal_fov_deg"]) / 2) / width
-            columns, rows = _places(across, width, scale), _places(down, height, scale)
-        many = np.bincount(rows[rows >= 0], minlength=height)[:, None] * np.bincount(
-            columns[columns >= 0], minlength=width
-        )
-        inside = _hull(rows)[1], _hull(columns)[1]
-        if np.any(many[_hull(rows)[0] : inside[0], _hull(columns)[0] : inside[1]] == 0):
+            scale /= half / width
+            columns, rows = _places(across, width, scale), _places(down, height, scale)[:, None]
+        cells = np.where((columns >= 0) & (rows >= 0), rows * width + columns, -1).astype(np.int32)
+        many = np.bincount(cells[cells >= 0], minlength=width * height).reshape(height, width)
+        if _has_holes(many > 0) or _has_holes(many.T > 0):
             raise ValueError(
                 f"a camera of {across} x {down} pixels has fewer in the policy's view than the policy, which sees "
                 f"{width} x {height}; take one with more"
             )
-        return cls(columns, rows, many)
+        return cls(cells, many)
 
 
 def _places(many: int, size: int, scale: float) -> NDArray[np.int64]:
     """Returns the policy's pixel [many] of each pixel of a camera along one axis; -1 outside of the policy's view."""
-    places = np.floor((np.arange(many) + 0.5 - many / 2) * scale + size / 2).astype(np.int64)
-    return np.where((places >= 0) & (places < size), places, -1)
+    return _within((np.arange(many) + 0.5 - many / 2) * scale + size / 2, size)
 
 
-def _hull(places: NDArray[np.int64]) -> tuple[int, int]:
-    """Returns the first of the policy's pixels that is seen, and the one after the last."""
-    seen = places[places >= 0]
-    return int(seen.min()), int(seen.max()) + 1
+def _within(places: NDArray[np.floating], size: int) -> NDArray[np.int64]:
+    """Returns the pixels that places along an axis are in; -1 outside of its `size` pixels, or where not finite."""
+    inside = (places >= 0) & (places < size)
+    return np.floor(np.where(inside, places, -1.0)).astype(np.int64)
+
+
+def _has_holes(seen: NDArray[np.bool_]) -> bool:
+    """Returns whether in a row of pixels [H, W] one is not seen between two that are."""
+    before, after = np.logical_or.accumulate(seen, 1), np.logical_or.accumulate(seen[:, ::-1], 1)[:, ::-1]
+    return bool(np.any(before & after & ~seen))
 
 
 def camera_contrast(about: Mapping[str, Any], contrast: float | None = None) -> float | None:
@@ -306,30 +327,32 @@ def count_events(
     Raises:
         ValueError: if the packet is no array of events, or one of them is outside of the image.
     """
-    columns, rows, pixels = _own_grid(about) if grid is None else (grid.columns, grid.rows, grid.pixels)
+    grid = Grid.of(about) if grid is None else grid
+    (down, across), pixels = grid.cells.shape, grid.pixels
     _check_packet(packet)
     edges = np.asarray(about["frame_times_us"], np.int64)
     since = packet["t"].astype(np.int64) - start_us
     inside = (since >= 0) & (since < edges[-1] - edges[0])
     if not inside.all():
         packet, since = packet[inside], since[inside]
-    x, y, sign = (packet[name].astype(np.int64) for name in ("x", "y", "p"))
-    if x.size and (x.max() >= columns.size or y.max() >= rows.size):
+    x, y, sign = packet["x"], packet["y"], packet["p"]
+    if x.size and (x.max() >= across or y.max() >= down):
         raise ValueError(
-            f"an event is at pixel ({x.max()}, {y.max()}), outside of an image of "
-            f"{columns.size} x {rows.size}; say how large the camera's is"
+            f"an event is at pixel ({x.max()}, {y.max()}), outside of an image of {across} x {down}; say how large "
+            "the camera's is"
         )
     # A comparison for each of the few frames is faster than a search for each of the many events.
-    pair = np.zeros(since.size, np.int64)
+    pair = np.zeros(since.size, np.int32)
     for edge in edges[1:-1] - edges[0]:
         pair += since >= edge
-    column, row = columns[x], rows[y]
+    cell = grid.cells.ravel()[y.astype(np.int32) * np.int32(across) + x.astype(np.int32)]
     shape = (edges.size - 1, 2, about["height"], about["width"])
-    cell = ((2 * pair + (sign < 0)) * shape[2] + row) * shape[3] + column
-    seen = (column >= 0) & (row >= 0)
-    if not seen.all():
-        cell = cell[seen]
-    number = np.bincount(cell, minlength=int(np.prod(shape))).reshape(shape)
+    pair *= 2
+    pair += sign < 0
+    pair *= shape[2] * shape[3]
+    pair += cell
+    number = np.bincount(pair if cell.size == 0 or cell.min() >= 0 else pair[cell >= 0], minlength=int(np.prod(shape)))
+    number = number.reshape(shape)
     told = contrast is None or about.get("known_contrast")
     per_event = [1.0 if told else contrast / own for own in (about["contrast_on"], about["contrast_off"])]
     change = number * np.asarray(per_event)[:, None, None] / np.maximum(pixels, 1)
@@ -351,11 +374,6 @@ def _counts_of(about: Mapping[str, Any], change: NDArray, *, is_finer: bool) -> 
     # Rounding must not take away what is exactly one event.
     counts = np.floor(np.maximum(change, 0.0) + 1e-6).astype(np.int32)
     return np.where(counts >= about["least_count"], counts, 0).astype(np.int32)
-
-
-def _own_grid(about: Mapping[str, Any]) -> tuple[NDArray, NDArray, NDArray]:
-    width, height = about["width"], about["height"]
-    return np.arange(width), np.arange(height), np.ones((height, width), np.int64)
 
 
 def heading_of(quaternion: NDArray[np.float32]) -> np.float32:
