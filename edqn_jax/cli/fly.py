@@ -55,6 +55,8 @@ class FlyArgs:
     """With --simulate: file for how each mission ended."""
     replay: Annotated[Path | None, arg(metavar="FLIGHT", help_behavior_hint="")] = None
     """Play the log of a flight again, and compare what state machine and policy do with what they did."""
+    mcap: Annotated[Path | None, arg(metavar="FILE.mcap", help_behavior_hint="")] = None
+    """With --replay: also write that flight as MCAP, for Foxglove and others."""
     mavlink: Annotated[str, arg(metavar="ADDRESS")] = "udpin:0.0.0.0:14540"
     """The vehicle, as pymavlink writes it: udpin:HOST:PORT, tcp:HOST:PORT, or DEVICE,BAUD."""
     events: Annotated[str | None, arg(metavar="SOURCE", help_behavior_hint="")] = None
@@ -120,6 +122,10 @@ def parse_fly(argv: Sequence[str]) -> FlyArgs:
         raise ConfigError("--missions and --jobs must be at least 1, --seed at least 0 and --speed more than 0")
     if args.camera is not None and min(args.camera) < 1:
         raise ConfigError(f"--camera must be two whole numbers of at least 1, not {args.camera[0]} {args.camera[1]}")
+    if args.mcap is not None and args.replay is None:
+        raise ConfigError("--mcap writes a flight that --replay plays; give --replay FLIGHT, too")
+    if args.mcap is not None and args.mcap.suffix != ".mcap":
+        raise ConfigError(f"'{args.mcap}' must end in .mcap")
     if args.fov is not None and args.calibration is not None:
         raise ConfigError("--fov and --calibration cannot both be given: a calibration says the field of view")
     if not 0.2 <= args.pace <= 1.0:
@@ -311,6 +317,7 @@ def settings_of(args: FlyArgs, size: tuple[int, int], period_s: float) -> Settin
 
 def replay(args: FlyArgs, folder: Path) -> None:
     """Plays a flight again."""
+    from edqn_jax.fly.mcap_file import write_mcap
     from edqn_jax.fly.records import lens_of, read_records
     from edqn_jax.fly.replay import replay as play
     from edqn_jax.interop.recordings.lens import read_lens
@@ -331,6 +338,8 @@ def replay(args: FlyArgs, folder: Path) -> None:
         f"{again.ticks:,} ticks, {again.other_outputs} of them with another output; {again.decisions:,} decisions, "
         f"{again.other_moves} of them another move; outcome: {again.outcome}"
     )
+    if args.mcap is not None:
+        print(f"'{args.mcap}' has {write_mcap(folder, args.mcap):,} messages")
     if again.other_outputs or again.other_moves:
         raise CheckError(f"the flight in '{folder}' goes another way once more")
 
