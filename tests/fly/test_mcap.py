@@ -54,8 +54,8 @@ def test_it_holds_each_record_and_each_event_in_the_order_of_time(flight: Path, 
     ends = [m.log_time for topic, _, m in found if topic == "/events"]
     ahead_ms = {round((until - 1e-3 * at) / 1e3) for at, (until, _) in zip(ends, packets, strict=True)}
     assert ahead_ms == {7000}  # the camera's clock
-    (pose, *_) = [(schema.name, json.loads(m.data)) for topic, schema, m in found if topic == "/pose"]
-    assert pose[0] == "foxglove.PoseInFrame" and pose[1]["pose"]["orientation"]["w"] == 1.0
+    pose, *_ = [(schema, json.loads(m.data)) for topic, schema, m in found if topic == "/pose"]
+    assert pose[0] is not None and pose[0].name == "foxglove.PoseInFrame" and pose[1]["pose"]["orientation"]["w"] == 1.0
     said = [json.loads(m.data)["message"] for topic, schema, m in found if topic == "/said"]
     assert said == ["ready to fly"]
 
