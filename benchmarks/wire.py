@@ -194,7 +194,7 @@ def fly(runner: Runner, vehicle: str, camera: str, args: argparse.Namespace) -> 
             resumes=10**9,
             flight_s=60.0 * args.minutes,
             # A simulated vehicle that waits for a core lags behind its own clock, which is no fault of the pilot's.
-            limits=Limits(battery=0.0, stale_s=5.0, jump_m=np.inf, drift_m=np.inf),
+            limits=Limits(battery=0.0, link_s=60.0, stale_s=10.0, jump_m=np.inf, drift_m=np.inf),
         )
         volume = [[0.0, 0.0, 0.0], [110.0, 110.0, 25.0]]
         pilot = Pilot(runner, link, source, WallClock(), Task(settings, volume, args.pace), log=log, tell=said.append)

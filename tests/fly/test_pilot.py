@@ -15,10 +15,11 @@ from edqn_jax.errors import ConfigError
 from edqn_jax.fly.faults import Fault, Inputs, Odometry, Settings
 from edqn_jax.fly.link import Own
 from edqn_jax.fly.machine import Output, Phase
-from edqn_jax.fly.pilot import Pilot, Task, at_pace
+from edqn_jax.fly.pilot import Pilot, Task
 from edqn_jax.fly.records import EVENTS, RECORDS, FlightLog, inputs_of, read_records, settings_of
 from edqn_jax.fly.replay import replay
 from edqn_jax.fly.streams import EVENT, Events, read_stream
+from edqn_jax.fly.tally import events_at_pace
 from edqn_jax.interop.deployment.runner import Command
 from edqn_jax.interop.recordings.lens import Lens
 from tests.support.virtual_flight import CAMERA, PERIOD_S, TICK_S, Vehicle
@@ -54,6 +55,9 @@ class Policy:
 
     def reset(self) -> None:
         self.resets += 1
+
+    def count(self, packet: np.ndarray) -> None:
+        """Counts nothing: it is given the events themselves."""
 
     def decide(self, packet: np.ndarray, until_us: int, **own: Any) -> Command:
         if self.error is not None:
@@ -308,7 +312,7 @@ def test_at_half_the_pace_a_policy_sees_and_is_told_what_it_would_at_its_own() -
     assert report.decisions == pytest.approx(report.seconds / (2 * PERIOD_S), abs=1.5)
     events = np.zeros(3, EVENT)
     events["t"] = [1000, 1500, 1999]
-    assert at_pace(events, 2000, 0.5)["t"].tolist() == [1500, 1750, 1999]
+    assert events_at_pace(events, 2000, 0.5)["t"].tolist() == [1500, 1750, 1999]
 
 
 def test_the_phases_are_told() -> None:

@@ -134,7 +134,8 @@ class Runner:
 
         Args:
             packet: structured array [N] with the fields `t` (microseconds, any order), `x`, `y` and `p` (-1 or 1);
-                events that are not in the window [until_us - window_us, until_us) are left out.
+                events that are not in the window [until_us - window_us, until_us) are left out. Or how many there are
+                [F, 2, H, W]: sums of `count` for each pair of frames.
             until_us: time of the decision, on the events' clock.
             position: [3] metres in the world.
             quaternion: [4] w, x, y, z, from the body (x ahead, y left, z up) to the world.
@@ -156,7 +157,10 @@ class Runner:
         turn = _numbers("yaw_rate", yaw_rate, ())
         move = self._last_move if last_move is None else _numbers("last_move", last_move, (3,))
         yaw = heading_of(attitude)
-        counts = count_events(self.about, packet, until_us - self.window_us, grid=self._grid, contrast=self._contrast)
+        number = packet
+        if packet.dtype.names is not None or packet.ndim != 4:
+            number = _numbers_of(self.about, packet, until_us - self.window_us, self._grid)
+        counts = _counts_of(self.about, number, self._grid, self._contrast)
         values, memory = self._session.run(
             ["values", "memory_after"],
             {
@@ -172,6 +176,19 @@ class Runner:
         wanted = self.velocity_of(best, float(yaw))
         self._yaw = self._setpoint(place, float(yaw), aim, wanted)
         return Command(best, wanted, self._yaw, values[0])
+
+    def count(self, packet: NDArray) -> NDArray[np.int64] | None:
+        """Returns how many events of a packet [N] are in each of the policy's pixels [2, H, W], ON and OFF.
+
+        Packets can be counted as they come, so that a decision has less to do. None, where `decide` would refuse them.
+        """
+        try:
+            _check_packet(packet)
+            _check_pixels(packet, self._grid)
+        except ValueError:
+            return None
+        times = np.zeros(packet.size, np.int64)
+        return _number_in(self.about, packet, times, self._grid, pairs=1)[0]
 
     def _told(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
         """Returns own values as the network takes them, [1, N]."""
@@ -328,45 +345,53 @@ def count_events(
         ValueError: if the packet is no array of events, or one of them is outside of the image.
     """
     grid = Grid.of(about) if grid is None else grid
-    (down, across), pixels = grid.cells.shape, grid.pixels
+    return _counts_of(about, _numbers_of(about, packet, start_us, grid), grid, contrast)
+
+
+def _numbers_of(about: Mapping[str, Any], packet: NDArray, start_us: int, grid: Grid) -> NDArray[np.int64]:
+    """Returns how many events of a window are in each of the policy's pixels, [F, 2, H, W].
+
+    Raises:
+        ValueError: as `count_events`.
+    """
     _check_packet(packet)
     edges = np.asarray(about["frame_times_us"], np.int64)
     since = packet["t"].astype(np.int64) - start_us
     inside = (since >= 0) & (since < edges[-1] - edges[0])
     if not inside.all():
         packet, since = packet[inside], since[inside]
-    x, y, sign = packet["x"], packet["y"], packet["p"]
-    if x.size and (x.max() >= across or y.max() >= down):
-        raise ValueError(
-            f"an event is at pixel ({x.max()}, {y.max()}), outside of an image of {across} x {down}; say how large "
-            "the camera's is"
-        )
+    _check_pixels(packet, grid)
     # A comparison for each of the few frames is faster than a search for each of the many events.
     pair = np.zeros(since.size, np.int32)
     for edge in edges[1:-1] - edges[0]:
         pair += since >= edge
-    cell = grid.cells.ravel()[y.astype(np.int32) * np.int32(across) + x.astype(np.int32)]
-    shape = (edges.size - 1, 2, about["height"], about["width"])
-    pair *= 2
-    pair += sign < 0
-    pair *= shape[2] * shape[3]
-    pair += cell
-    number = np.bincount(pair if cell.size == 0 or cell.min() >= 0 else pair[cell >= 0], minlength=int(np.prod(shape)))
-    number = number.reshape(shape)
+    return _number_in(about, packet, pair, grid, pairs=edges.size - 1)
+
+
+def _number_in(
+    about: Mapping[str, Any], packet: NDArray, pair: NDArray, grid: Grid, *, pairs: int
+) -> NDArray[np.int64]:
+    """Returns how many events [N], each of its pair of frames, are in each of the policy's pixels."""
+    shape = (pairs, 2, about["height"], about["width"])
+    place = packet["y"].astype(np.int32) * np.int32(grid.cells.shape[1]) + packet["x"].astype(np.int32)
+    cell = grid.cells.ravel()[place]
+    where = ((2 * pair + (packet["p"] < 0)) * (shape[2] * shape[3])) + cell
+    if cell.size and cell.min() < 0:
+        where = where[cell >= 0]
+    return np.bincount(where, minlength=int(np.prod(shape))).reshape(shape)
+
+
+def _counts_of(
+    about: Mapping[str, Any], number: NDArray, grid: Grid, contrast: float | None = None
+) -> NDArray[np.int32]:
+    """Returns events as the policy counts them, of those of the camera [F, 2, H, W]."""
     told = contrast is None or about.get("known_contrast")
     per_event = [1.0 if told else contrast / own for own in (about["contrast_on"], about["contrast_off"])]
-    change = number * np.asarray(per_event)[:, None, None] / np.maximum(pixels, 1)
-    return _counts_of(about, change, is_finer=bool(pixels.max() > 1))
-
-
-def _counts_of(about: Mapping[str, Any], change: NDArray, *, is_finer: bool) -> NDArray[np.int32]:
-    """Returns events as the policy counts them of mean changes [F, 2, H, W] in contrasts, ON and OFF.
-
-    `is_finer` says whether the camera has several pixels under one of the policy's.
-    """
-    together = about.get("sensor_pixels", 1)
+    # In contrasts of the policy, means over the camera's pixels.
+    change = number * np.asarray(per_event)[:, None, None] / np.maximum(grid.pixels, 1)
+    is_finer, together = bool(grid.pixels.max() > 1), about.get("sensor_pixels", 1)
     if about["counts_net"] or (together > 1 and is_finer):
-        # In contrasts of the policy, which may differ between ON and OFF.
+        # Contrasts may differ between ON and OFF.
         log_change = change[:, 0] * about["contrast_on"] - change[:, 1] * about["contrast_off"]
         change = np.stack([log_change / about["contrast_on"], -log_change / about["contrast_off"]], axis=1)
     if together > 1:
@@ -473,6 +498,15 @@ def _check_packet(packet: NDArray) -> None:
         raise ValueError("the polarity p of an event must be -1 or 1; with 0 and 1, give 2 * p - 1")
     if packet.size and any(packet[name].dtype.kind == "i" and packet[name].min() < 0 for name in ("x", "y")):
         raise ValueError("the pixels x and y of events must be at least 0")
+
+
+def _check_pixels(packet: NDArray, grid: Grid) -> None:
+    x, y, (down, across) = packet["x"], packet["y"], grid.cells.shape
+    if x.size and (x.max() >= across or y.max() >= down):
+        raise ValueError(
+            f"an event is at pixel ({x.max()}, {y.max()}), outside of an image of {across} x {down}; say how large "
+            "the camera's is"
+        )
 
 
 def _numbers(name: str, given: ArrayLike, shape: tuple[int, ...]) -> NDArray[np.float32]:
