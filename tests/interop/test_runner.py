@@ -178,6 +178,21 @@ def test_events_outside_of_the_window_change_nothing(exported):
 
 # ------------------------------------------------------------------------------------- another camera
 
+
+def test_events_that_are_counted_before_are_those_of_the_packet(exported):
+    each = next(each for each in whole_flight(0) if each.packet.size)
+    flier = runner.Runner(exported)
+    wanted = flier.decide(each.packet, each.until_us, **each.given).values
+    first, last = (each.until_us + time for time in flier.about["frame_times_us"])
+    flier.reset()
+    number = flier.count(each.packet[(each.packet["t"] >= first) & (each.packet["t"] < last)])
+    assert number is not None
+    assert np.array_equal(flier.decide(number[None], each.until_us, **each.given).values, wanted)
+    wrong = each.packet[:1].copy()
+    wrong["p"] = 0
+    assert flier.count(wrong) is None
+
+
 ABOUT = {
     "width": 4,
     "height": 2,
