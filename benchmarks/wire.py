@@ -79,6 +79,7 @@ def parse(argv: Sequence[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--camera", nargs=2, type=int, default=[346, 260], metavar=("W", "H"), help="its pixels")
     parser.add_argument("--pace", type=float, default=1.0, help="as of edqn fly")
     parser.add_argument("--seen", type=float, default=10.0, help="seconds of flight that the camera repeats")
+    parser.add_argument("--first", action="store_true", help="pilot and camera come before all else (SCHED_FIFO)")
     parser.add_argument("--no-log", action="store_true", help="log nothing (a log has some GB in ten minutes)")
     args = parser.parse(argv)
     if min(args.minutes, args.seen, args.pace) <= 0.0 or args.pace > 1.0 or min(args.camera) < 1:
@@ -99,6 +100,18 @@ def keep_to(chosen: Sequence[int]) -> None:
         os.sched_setaffinity(0, set(chosen))
 
 
+def come_first() -> None:
+    """Lets this process run whenever it wants to.
+
+    Raises:
+        ConfigError: if it may not, or the system cannot.
+    """
+    try:
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(10))
+    except (OSError, AttributeError) as error:
+        raise ConfigError(f"--first cannot be had ({error}); it needs Linux, and root or CAP_SYS_NICE") from None
+
+
 def seen_packets(policy: Policy, size: tuple[int, int], seconds: float) -> list[NDArray]:
     """Returns a packet [N] of `EVENT` for each `FRAME_S` of the policy's flight, as a camera of a size sees it."""
     config = policy.config
@@ -114,9 +127,11 @@ def seen_packets(policy: Policy, size: tuple[int, int], seconds: float) -> list[
     return [camera.frame(FRAME_S * k, *track.at(FRAME_S * k))[1] for k in range(frames)]
 
 
-def stream(file: Path, size: tuple[int, int], chosen: Sequence[int], address: Any) -> None:
+def stream(file: Path, size: tuple[int, int], chosen: Sequence[int], first: bool, address: Any) -> None:
     """Is the camera's process: sends its address, then packets of a file again and again on the machine's clock."""
     keep_to(chosen)
+    if first:
+        come_first()
     with np.load(file) as held:
         packets = np.split(held["events"], held["ends"][:-1])
     server, clock = EventServer(size), WallClock()
@@ -144,7 +159,9 @@ class OwnClock(ClockOffset):
 
 
 @contextlib.contextmanager
-def others(packets: Sequence[NDArray], size: tuple[int, int], chosen: Sequence[int], *, busy: bool) -> Iterator[Any]:
+def others(
+    packets: Sequence[NDArray], size: tuple[int, int], chosen: Sequence[int], *, busy: bool, first: bool
+) -> Iterator[Any]:
     """Yields address of the vehicle and of the camera, processes that run on the chosen cores within the block."""
     fresh = multiprocessing.get_context("spawn")
     with contextlib.ExitStack() as stack:
@@ -152,7 +169,7 @@ def others(packets: Sequence[NDArray], size: tuple[int, int], chosen: Sequence[i
         ends = np.cumsum([len(each) for each in packets])
         np.savez(folder / "seen.npz", events=np.concatenate([np.empty(0, EVENT), *packets]), ends=ends)
         here, there = fresh.Pipe()
-        camera = fresh.Process(target=stream, args=(folder / "seen.npz", size, chosen, there), daemon=True)
+        camera = fresh.Process(target=stream, args=(folder / "seen.npz", size, chosen, first, there), daemon=True)
         camera.start()
         stack.callback(camera.terminate)
         with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
@@ -193,7 +210,7 @@ def fly(runner: Runner, vehicle: str, camera: str, args: argparse.Namespace) -> 
             resumes=10**9,
             flight_s=60.0 * args.minutes,
             # A simulated vehicle that waits for a core lags behind its own clock, which is no fault of the pilot's.
-            limits=Limits(battery=0.0, jump_m=np.inf, drift_m=np.inf),
+            limits=Limits(battery=0.0, link_s=60.0, stale_s=10.0, jump_m=np.inf, drift_m=np.inf),
         )
         volume = [[0.0, 0.0, 0.0], [110.0, 110.0, 25.0]]
         pilot = Pilot(runner, link, source, WallClock(), Task(settings, volume, args.pace), log=log, tell=said.append)
@@ -208,9 +225,13 @@ def measure(policy: Policy, args: argparse.Namespace) -> dict[str, Any]:
     with tempfile.TemporaryDirectory() as folder:
         runner = Runner(export_policy(policy, Path(folder) / "policy.onnx").file, camera=size, contrast=CONTRAST)
     pilot, *rest = cores()
-    with others(packets, size, rest, busy=args.busy) as (vehicle, camera):
+    with others(packets, size, rest, busy=args.busy, first=args.first) as (vehicle, camera):
         keep_to([pilot])
+        if args.first:
+            come_first()
         report, faults = fly(runner, vehicle, camera, args)
+        if args.first:
+            os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
         keep_to([pilot, *rest])
     if report.outcome != "time out":
         raise ConfigError(f"the flight ended after {report.seconds:.1f} s with {report.outcome}")
@@ -223,6 +244,7 @@ def measure(policy: Policy, args: argparse.Namespace) -> dict[str, Any]:
         "busy": args.busy,
         "logged": not args.no_log,
         "pace": args.pace,
+        "first": args.first,
         "seconds": report.seconds,
         "decisions": report.decisions,
         "longest_gap_ms": 1e3 * report.longest_gap_s,

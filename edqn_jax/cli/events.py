@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal
@@ -19,6 +19,9 @@ from edqn_jax.errors import ConfigError
 from edqn_jax.files import check_can_write, write_atomically
 
 if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from edqn_jax.config import Config
     from edqn_jax.interop.recordings.recording import Recording
     from edqn_jax.report.recordings import Strip
 
@@ -56,6 +59,13 @@ class EventsArgs:
     """Change of log brightness that makes an event in the camera (default: that of the policy)."""
     fov: Annotated[float | None, arg(metavar="DEG", help_behavior_hint="")] = None
     """The camera's horizontal field of view, degrees (default: its whole image is taken for the policy's)."""
+    calibration: Annotated[str | None, arg(metavar="FILE[:CAMERA]", help_behavior_hint="")] = None
+    """The camera's lens, in place of --fov: YAML of Kalibr or in DSEC's layout (of a camera other than cam0, with its
+    name); events are taken to where their pixels look."""
+    poses: Annotated[Path | None, arg(metavar="FILE", help_behavior_hint="")] = None
+    """Where the camera was, on the events' clock: text, lines of t x y z qx qy qz qw (TUM's), or with named columns."""
+    poses_of: Literal["camera", "body"] = "camera"
+    """Whose poses: of the camera (z ahead, x to the right), or of a body (x ahead, z up) on which it looks ahead."""
     velocity: Annotated[Point, arg(metavar="X Y Z")] = (0.0, 0.0, 0.0)
     """Velocity ahead, to the left and up, m/s, where the file has no flight: the encoder reads events with it."""
     yaw_rate: Annotated[float, arg(metavar="R")] = 0.0
@@ -87,6 +97,10 @@ def parse_events(argv: Sequence[str]) -> EventsArgs:
             raise ConfigError(f"{name} must be above 0, not {number}")
     if args.window is not None and args.policy is not None:
         raise ConfigError("--window and --policy cannot both be given: a policy has a window of its own")
+    if args.policy is None and (args.poses is not None or args.calibration is not None):
+        raise ConfigError("--poses and --calibration are for what a policy sees; give --policy, too")
+    if args.fov is not None and args.calibration is not None:
+        raise ConfigError("--fov and --calibration cannot both be given: a calibration says the field of view")
     if args.picture is not None and args.picture.suffix.lower() not in (".png", ".gif"):
         raise ConfigError(f"'{args.picture}' must end in .png or .gif")
     if args.policy is not None:
@@ -116,7 +130,7 @@ def events_command(args: EventsArgs) -> None:
     strips, times_s, period_s = _strips(args, recording, figures)
     Console().print(recording_table(figures))
     if args.policy is not None:
-        for note in _notes(args, recording):
+        for note in _notes(args, recording, figures["seen"]):
             print(note)
     if args.picture is not None:
         from edqn_jax.report.recordings import animate_recording, plot_recording
@@ -202,11 +216,13 @@ def _strips(args: EventsArgs, recording: Recording, figures: dict[str, Any]) -> 
         period_s = window_us * 1e-6
     else:
         policy = load_policy(args.policy)
+        placed = _with_poses(args, recording, policy.config)
         seen = observe_recording(
             policy,
-            recording,
+            placed,
             contrast=args.contrast,
             fov_deg=args.fov,
+            directions=_directions(args, recording),
             velocity=args.velocity,
             yaw_rate=args.yaw_rate,
         )
@@ -220,6 +236,7 @@ def _strips(args: EventsArgs, recording: Recording, figures: dict[str, Any]) -> 
             "width": policy.config.camera.width,
             "height": policy.config.camera.height,
             "events_per_window": float(np.abs(seen.image).sum(axis=(1, 2)).mean()),
+            **({} if placed.flight is None else motion_figures(placed.flight)),
         }
     if args.picture is None:
         return [], [], period_s
@@ -240,17 +257,60 @@ def _strips(args: EventsArgs, recording: Recording, figures: dict[str, Any]) -> 
     return strips, [float(ends[number] - begin) * 1e-6 for number in chosen], period_s
 
 
-def _notes(args: EventsArgs, recording: Recording) -> list[str]:
-    """Returns a sentence for each thing that the policy was told without the file saying so."""
+def motion_figures(flight: Mapping[str, NDArray]) -> dict[str, float]:
+    """Returns how fast a camera was on average, m/s, and how far from level, degrees."""
+    w, x, y, z = flight["quaternion"].T
+    tilt = np.degrees(np.arccos(np.clip(1 - 2 * (x * x + y * y), -1.0, 1.0)))
+    return {
+        "mean_speed_m_s": float(np.linalg.norm(flight["velocity"], axis=1).mean()),
+        "mean_tilt_deg": float(tilt.mean()),
+    }
+
+
+def _notes(args: EventsArgs, recording: Recording, seen: Mapping[str, Any]) -> list[str]:
+    """Returns a sentence for each thing that a policy must know: what it was told, or what was assumed."""
     notes = []
-    if args.contrast is None and recording.contrast is None:
+    if args.contrast is not None or recording.contrast is not None:
+        told = f"{args.contrast:g}, as given" if args.contrast is not None else f"{recording.contrast:g}, of the file"
+        notes.append(f"contrast: {told}")
+    else:
         notes.append("contrast: that of the policy was assumed; --contrast gives the camera's")
-    if args.fov is None:
+    if args.calibration is not None:
+        notes.append(f"lens: events were rectified by '{args.calibration}'")
+    elif args.fov is not None:
+        notes.append(f"lens: {args.fov:g} degrees across, as given, without distortion; --calibration gives its own")
+    else:
         notes.append("field of view: the camera's whole image was taken for the policy's; --fov gives its own")
-    if recording.flight is None:
+    if "mean_speed_m_s" in seen:
+        whose = "that of the file" if args.poses is None else f"by '{args.poses}', poses of the {args.poses_of}"
+        notes.append(
+            f"own motion: {whose}, {seen['mean_speed_m_s']:.2f} m/s and {seen['mean_tilt_deg']:.0f} degrees from level "
+            "on average; that z is up was assumed"
+        )
+    else:
         speed = " ".join(f"{each:g}" for each in args.velocity)
         notes.append(
-            f"own motion: the encoder was told {speed} m/s and {args.yaw_rate:g} rad/s throughout; --velocity and "
-            "--yaw-rate give it, and without the right one its nearness is none"
+            f"own motion: the encoder was told {speed} m/s and {args.yaw_rate:g} rad/s throughout; --poses, or "
+            "--velocity and --yaw-rate give it, and without the right one its nearness is none"
         )
     return notes
+
+
+def _with_poses(args: EventsArgs, recording: Recording, config: Config) -> Recording:
+    """Returns the recording with the flight of --poses, if it is given."""
+    if args.poses is None:
+        return recording
+    from edqn_jax.interop.recordings.poses import with_poses
+
+    return with_poses(recording, args.poses, args.poses_of, config.env.speed_m_s)
+
+
+def _directions(args: EventsArgs, recording: Recording) -> NDArray | None:
+    """Returns where each pixel looks by --calibration, if it is given."""
+    if args.calibration is None:
+        return None
+    from edqn_jax.interop.recordings.lens import read_lens
+
+    lens = read_lens(args.calibration)
+    lens.check_size(recording.size(), args.calibration)
+    return lens.directions()

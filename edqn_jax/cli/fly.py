@@ -21,10 +21,11 @@ if TYPE_CHECKING:
     from edqn_jax.fly.faults import Settings
     from edqn_jax.fly.pilot import Report
     from edqn_jax.interop.deployment.runner import Runner
+    from edqn_jax.interop.recordings.lens import Lens
 
 Ending = Literal["hover", "hold", "land"]
 
-OF_THE_WORLD = "mavlink events fov contrast goal volume fence origin goal_radius max_s dry clock".split()
+OF_THE_WORLD = "mavlink events fov calibration contrast goal volume fence origin goal_radius max_s dry clock".split()
 """Options that a simulated flight has from its world."""
 
 OF_THE_LOG = ("fov", "contrast")
@@ -54,6 +55,8 @@ class FlyArgs:
     """With --simulate: file for how each mission ended."""
     replay: Annotated[Path | None, arg(metavar="FLIGHT", help_behavior_hint="")] = None
     """Play the log of a flight again, and compare what state machine and policy do with what they did."""
+    mcap: Annotated[Path | None, arg(metavar="FILE.mcap", help_behavior_hint="")] = None
+    """With --replay: also write that flight as MCAP, for Foxglove and others."""
     mavlink: Annotated[str, arg(metavar="ADDRESS")] = "udpin:0.0.0.0:14540"
     """The vehicle, as pymavlink writes it: udpin:HOST:PORT, tcp:HOST:PORT, or DEVICE,BAUD."""
     events: Annotated[str | None, arg(metavar="SOURCE", help_behavior_hint="")] = None
@@ -63,6 +66,9 @@ class FlyArgs:
     """Pixels of the camera across and down (default: with --simulate 346 260, else what it says)."""
     fov: Annotated[float | None, arg(metavar="DEG", help_behavior_hint="")] = None
     """Horizontal field of view of the camera, degrees (default: the policy's; with --replay the log's)."""
+    calibration: Annotated[str | None, arg(metavar="FILE[:CAMERA]", help_behavior_hint="")] = None
+    """The camera's lens, in place of --fov: YAML of Kalibr or in DSEC's layout (of a camera other than cam0, with its
+    name); with --replay the log's."""
     contrast: Annotated[float | None, arg(metavar="C", help_behavior_hint="")] = None
     """Change of log brightness that makes an event in the camera (default: the policy's; with --replay the log's)."""
     goal: Annotated[Point | None, arg(metavar="X Y Z", help_behavior_hint="")] = None
@@ -116,6 +122,12 @@ def parse_fly(argv: Sequence[str]) -> FlyArgs:
         raise ConfigError("--missions and --jobs must be at least 1, --seed at least 0 and --speed more than 0")
     if args.camera is not None and min(args.camera) < 1:
         raise ConfigError(f"--camera must be two whole numbers of at least 1, not {args.camera[0]} {args.camera[1]}")
+    if args.mcap is not None and args.replay is None:
+        raise ConfigError("--mcap writes a flight that --replay plays; give --replay FLIGHT, too")
+    if args.mcap is not None and args.mcap.suffix != ".mcap":
+        raise ConfigError(f"'{args.mcap}' must end in .mcap")
+    if args.fov is not None and args.calibration is not None:
+        raise ConfigError("--fov and --calibration cannot both be given: a calibration says the field of view")
     if not 0.2 <= args.pace <= 1.0:
         raise ConfigError(f"--pace must be from 0.2 to 1, not {args.pace:g}")
     actions_of(args.on)
@@ -188,6 +200,7 @@ def fly(args: FlyArgs, stops: Stops) -> None:
     from edqn_jax.fly.records import FlightLog
     from edqn_jax.fly.simulated.lockstep import SimulatedClock
     from edqn_jax.fly.streams import open_events
+    from edqn_jax.interop.recordings.lens import read_lens
 
     assert args.events is not None and args.volume is not None
     with contextlib.ExitStack() as stack:
@@ -195,7 +208,8 @@ def fly(args: FlyArgs, stops: Stops) -> None:
         stack.callback(source.close)
         size = source.events.size
         assert size is not None
-        runner = load_runner(args, size)
+        lens = None if args.calibration is None else read_lens(args.calibration)
+        runner = load_runner(args, size, lens)
         settings = settings_of(args, size, runner.period_s / args.pace)
         link = Link(args.mavlink, args.origin)
         stack.callback(link.close)
@@ -208,7 +222,7 @@ def fly(args: FlyArgs, stops: Stops) -> None:
             clock = SimulatedClock(args.clock, "autopilot")
             stack.callback(clock.close)
         stack.enter_context(stops.obey_signals(lambda _: None))
-        task = Task(settings, np.reshape(args.volume, (2, 3)), args.pace, args.dry, args.fov, args.contrast)
+        task = Task(settings, np.reshape(args.volume, (2, 3)), args.pace, args.dry, args.fov, args.contrast, lens)
         pilot = Pilot(runner, link, source, clock, task, log=log, stop=stops.is_requested)
         try:
             report = pilot.fly()
@@ -240,11 +254,12 @@ def latency_sentence(parts: Mapping[str, Sequence[float]]) -> str:
     return f"newest event to setpoint, ms, median / 99 %: {said}"
 
 
-def load_runner(args: FlyArgs, size: tuple[int, int]) -> Runner:
+def load_runner(args: FlyArgs, size: tuple[int, int], lens: Lens | None) -> Runner:
     """Returns the policy for a camera of a size.
 
     Raises:
-        ConfigError: if the file is no policy, or the camera is not that of --camera or cannot stand for the policy's.
+        ConfigError: if the file is no policy, or the camera is not that of --camera or of the lens, or cannot stand for
+            the policy's.
         MissingPackageError: if onnxruntime is not installed.
     """
     from edqn_jax.extras import require_extra
@@ -254,8 +269,14 @@ def load_runner(args: FlyArgs, size: tuple[int, int]) -> Runner:
     if args.camera is not None and args.camera != size:
         told = f"{args.camera[0]} x {args.camera[1]}"
         raise ConfigError(f"the camera has {size[0]} x {size[1]} pixels, and --camera says {told}")
+    directions = None
+    if lens is not None:
+        lens.check_size(size, args.calibration or "of the log")
+        directions = lens.directions()
     try:
-        runner = Runner(args.policy, camera=size, camera_fov_deg=args.fov, contrast=args.contrast)
+        runner = Runner(
+            args.policy, camera=size, camera_fov_deg=args.fov, contrast=args.contrast, directions=directions
+        )
     except ValueError as error:
         raise ConfigError(str(error)) from error
     return runner
@@ -296,20 +317,29 @@ def settings_of(args: FlyArgs, size: tuple[int, int], period_s: float) -> Settin
 
 def replay(args: FlyArgs, folder: Path) -> None:
     """Plays a flight again."""
-    from edqn_jax.fly.records import read_records
+    from edqn_jax.fly.mcap_file import write_mcap
+    from edqn_jax.fly.records import lens_of, read_records
     from edqn_jax.fly.replay import replay as play
+    from edqn_jax.interop.recordings.lens import read_lens
 
     begun = next((each for each in read_records(folder) if each["kind"] == "settings"), None)
     runner = None
     if begun is not None:
         width, height = begun["settings"]["camera"]
         told = {name: begun.get(name) if getattr(args, name) is None else getattr(args, name) for name in OF_THE_LOG}
-        runner = load_runner(replace(args, camera=None, **told), (width, height))
+        lens = lens_of(begun.get("lens")) if args.calibration is None else read_lens(args.calibration)
+        if args.fov is not None:
+            lens = None
+        elif lens is not None:
+            told["fov"] = None
+        runner = load_runner(replace(args, camera=None, **told), (width, height), lens)
     again = play(folder, runner)
     print(
         f"{again.ticks:,} ticks, {again.other_outputs} of them with another output; {again.decisions:,} decisions, "
         f"{again.other_moves} of them another move; outcome: {again.outcome}"
     )
+    if args.mcap is not None:
+        print(f"'{args.mcap}' has {write_mcap(folder, args.mcap):,} messages")
     if again.other_outputs or again.other_moves:
         raise CheckError(f"the flight in '{folder}' goes another way once more")
 

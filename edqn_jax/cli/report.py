@@ -23,7 +23,7 @@ class ReportArgs:
 
     runs: Annotated[Positional[tuple[Path, ...]], arg(metavar="RUN [RUN ...]", help_behavior_hint="")]
     """Folders of runs, or `pretrained`; the folder of several seeds stands for the run of each seed. Or functions of
-    your own, as `module:name` or `path/to/file.py:name`."""
+    your own, as `module:name` or `path/to/file.py:name`. Or one folder of a flight that `edqn fly` logged."""
     out: Annotated[Path | None, arg(metavar="FILE.html", help_behavior_hint="")] = None
     """HTML file to write; it replaces a file of that name (default: report.html in the first run's folder, of
     `pretrained` in the current one)."""
@@ -43,13 +43,28 @@ def parse_report(argv: Sequence[str]) -> ReportArgs:
         raise ConfigError("give the folder of a run, such as edqn report runs/DIR")
     if args.missions < 1:
         raise ConfigError(f"--missions must be at least 1, not {args.missions}")
-    for run in args.runs:
-        check_run(run)
+    if not _is_flight(args):
+        for run in args.runs:
+            check_run(run)
     first = args.runs[0] / "report.html"
     out = args.out or (first if args.runs[0].is_dir() else Path("report.html"))
     if out.suffix.lower() not in (".html", ".htm"):
         raise ConfigError(f"--out '{out}' must end in .html")
     return dataclasses.replace(args, out=out)
+
+
+def _is_flight(args: ReportArgs) -> bool:
+    """Returns whether the page is that of a flight.
+
+    Raises:
+        ConfigError: if more than a flight is asked for.
+    """
+    from edqn_jax.fly.records import RECORDS
+
+    flights = [run for run in args.runs if (run / RECORDS).is_file()]
+    if flights and len(args.runs) > 1:
+        raise ConfigError(f"a page shows one flight, or runs; give '{flights[0]}' alone")
+    return bool(flights)
 
 
 def report_command(args: ReportArgs) -> None:
@@ -58,10 +73,15 @@ def report_command(args: ReportArgs) -> None:
     Raises:
         ConfigError: if a run or the file to write is not as it should be.
     """
-    from edqn_jax.report.page.document import build_report
-
     assert args.out is not None
     check_can_write(args.out)
-    page = build_report(args.runs, args.missions, functools.partial(print, flush=True)).encode()
+    if _is_flight(args):
+        from edqn_jax.fly.page import flight_page
+
+        page = flight_page(args.runs[0]).encode()
+    else:
+        from edqn_jax.report.page.document import build_report
+
+        page = build_report(args.runs, args.missions, functools.partial(print, flush=True)).encode()
     write_atomically(args.out, page)
     print(f"'{args.out}' has {len(page) / 1e6:.1f} MB; open it in a browser")

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from edqn_jax.fly.clocks import Clock
 from edqn_jax.fly.faults import Command, Inputs, Settings
@@ -16,7 +16,9 @@ from edqn_jax.fly.link import Link
 from edqn_jax.fly.machine import Output, Phase, State, step
 from edqn_jax.fly.records import FlightLog
 from edqn_jax.fly.streams import EventSource
+from edqn_jax.fly.tally import Tally, events_at_pace
 from edqn_jax.interop.deployment.runner import Runner
+from edqn_jax.interop.recordings.lens import Lens
 
 TICK_S = 0.02
 """Setpoints are sent at 50 Hz."""
@@ -80,15 +82,7 @@ class Task:
     fov_deg: float | None = None
     """Of the camera, as the runner was told; for the log, as `contrast`."""
     contrast: float | None = None
-
-
-def at_pace(events: NDArray, until_us: int, pace: float) -> NDArray:
-    """Returns events [N] before `until_us` as a drone at the policy's own speed would have seen them: nearer to it."""
-    if pace == 1.0:
-        return events
-    paced = events.copy()
-    paced["t"] = until_us - np.ceil((until_us - events["t"]) * pace).astype(np.int64)
-    return paced
+    lens: Lens | None = None
 
 
 class Pilot:
@@ -121,11 +115,12 @@ class Pilot:
         self.runner, self.link, self.source, self.clock = runner, link, source, clock
         self.settings, self._volume = task.settings, np.asarray(task.volume)
         self._pace, self._dry = task.pace, task.dry
-        self._camera = {"fov": task.fov_deg, "contrast": task.contrast}
+        self._camera = {"fov": task.fov_deg, "contrast": task.contrast, "lens": task.lens}
         self._log, self._stop, self._tell = log, stop, tell
         self.state = State()
         self.latency = Latency()
         self._command: Command | None = None
+        self._tally, self._counted_us = Tally(runner, task.pace), -1
         self._due, self._written_us = 0.0, -1
         self._flying_at: float | None = None
         self._sent_at: float | None = None
@@ -161,6 +156,7 @@ class Pilot:
         awoke, now = time.perf_counter(), self.clock.now()
         self.source.read(now, getattr(self.clock, "streamed_us", -1))
         self.link.read(now)
+        self._count()
         read_s = time.perf_counter() - awoke
         inputs = self._inputs()
         before = self.state.phase
@@ -190,6 +186,14 @@ class Pilot:
             self._keep_latency(now, read_s, decide_s, send_s, spent_s - read_s - decide_s - send_s)
         if self.state.phase is not before:
             self._tell(f"{now:.2f} s: {self.state.phase}" + (f" ({why})" if (why := self._why()) else ""))
+
+    def _count(self) -> None:
+        """Counts the packets that are new."""
+        events = self.source.events
+        if events.until_us < self._counted_us:  # the camera's clock began anew
+            self._counted_us = -1
+        self._tally.take(events.since(self._counted_us))
+        self._counted_us = events.until_us
 
     def _inputs(self) -> Inputs:
         events = self.source.events
@@ -222,7 +226,10 @@ class Pilot:
             return self._command
         until = events.until_us
         seen_at, times = 1e-6 * until + events.offset.value, self.runner.about["frame_times_us"]
-        window = events.window(until - round(self.runner.window_us / self._pace), until)
+        seen = self._tally.number(until)
+        if seen is None:
+            window = events.window(until - round(self.runner.window_us / self._pace), until)
+            seen = events_at_pace(window, until, self._pace)
         asked: dict[str, Any] = {
             "until_us": until,
             "position": own.odometry.position,
@@ -234,7 +241,7 @@ class Pilot:
             "attitudes": [self.link.attitude_at(seen_at + 1e-6 * t / self._pace) for t in times],
         }
         try:
-            wanted = self.runner.decide(at_pace(window, until, self._pace), **asked)
+            wanted = self.runner.decide(seen, **asked)
         except ValueError as error:
             self._tell(f"{now:.2f} s: the policy cannot decide: {error}")
             return self._command

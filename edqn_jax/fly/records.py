@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from edqn_jax.errors import ConfigError
 from edqn_jax.fly.faults import Action, Command, Fault, Inputs, Limits, Odometry, Settings
 from edqn_jax.fly.streams import HEADER, MAGIC, packet_bytes
+from edqn_jax.interop.recordings.lens import Lens
 
 RECORDS, EVENTS = "flight.jsonl", "events.bin"
 
@@ -99,6 +100,14 @@ def settings_of(record: dict[str, Any]) -> Settings:
     fields["after_hover"], fields["at_goal"] = Action(fields["after_hover"]), Action(fields["at_goal"])
     fields["limits"] = Limits(**fields["limits"])
     return Settings(**fields)
+
+
+def lens_of(record: dict[str, Any] | None) -> Lens | None:
+    """Returns a lens as a record holds it; None if it holds none."""
+    if record is None:
+        return None
+    size, matrix, coefficients = (tuple(record[name]) for name in ("size", "matrix", "coefficients"))
+    return Lens(size, matrix, record["model"], coefficients)
 
 
 def _plain(value: Any) -> Any:

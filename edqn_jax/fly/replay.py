@@ -10,9 +10,9 @@ import numpy as np
 
 from edqn_jax.errors import ConfigError
 from edqn_jax.fly.machine import State, step
-from edqn_jax.fly.pilot import at_pace
 from edqn_jax.fly.records import EVENTS, inputs_of, read_records, settings_of
 from edqn_jax.fly.streams import EVENT, read_stream
+from edqn_jax.fly.tally import events_at_pace
 from edqn_jax.interop.deployment.runner import Runner
 
 
@@ -74,5 +74,5 @@ def _other_moves(folder: Path, decisions: list[dict], runner: Runner, pace: floa
         first, last = np.searchsorted(ends, [since, until + 1])
         held = np.concatenate([np.empty(0, EVENT), *(events for _, events in packets[first:last])])
         window = held[(held["t"] >= since) & (held["t"] < until)]
-        other += runner.decide(at_pace(window, until, pace), **asked).move != decision["move"]
+        other += runner.decide(events_at_pace(window, until, pace), **asked).move != decision["move"]
     return other

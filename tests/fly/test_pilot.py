@@ -15,11 +15,13 @@ from edqn_jax.errors import ConfigError
 from edqn_jax.fly.faults import Fault, Inputs, Odometry, Settings
 from edqn_jax.fly.link import Own
 from edqn_jax.fly.machine import Output, Phase
-from edqn_jax.fly.pilot import Pilot, Task, at_pace
+from edqn_jax.fly.pilot import Pilot, Task
 from edqn_jax.fly.records import EVENTS, RECORDS, FlightLog, inputs_of, read_records, settings_of
 from edqn_jax.fly.replay import replay
 from edqn_jax.fly.streams import EVENT, Events, read_stream
+from edqn_jax.fly.tally import events_at_pace
 from edqn_jax.interop.deployment.runner import Command
+from edqn_jax.interop.recordings.lens import Lens
 from tests.support.virtual_flight import CAMERA, PERIOD_S, TICK_S, Vehicle
 
 GOAL = np.array([12.0, 0.0, 5.0])
@@ -53,6 +55,9 @@ class Policy:
 
     def reset(self) -> None:
         self.resets += 1
+
+    def count(self, packet: np.ndarray) -> None:
+        """Counts nothing: it is given the events themselves."""
 
     def decide(self, packet: np.ndarray, until_us: int, **own: Any) -> Command:
         if self.error is not None:
@@ -115,7 +120,7 @@ class Camera:
 
 def make(policy: Any = None, wire: Any = None, camera: Any = None, **more: Any) -> tuple[Pilot, Any]:
     wire = wire or Wire()
-    known = {name: more.pop(name) for name in ("pace", "dry", "fov_deg", "contrast") if name in more}
+    known = {name: more.pop(name) for name in ("pace", "dry", "fov_deg", "contrast", "lens") if name in more}
     task = Task(more.pop("settings", SETTINGS), FENCE, **known)
     flier: Any = policy or Policy()
     pilot = Pilot(flier, wire, camera or Camera(), Time(), task, tell=lambda _: None, **more)
@@ -152,18 +157,37 @@ def test_a_log_is_played_again_with_the_same_outputs_and_moves(tmp_path: Path) -
     assert replay(tmp_path / "flight", Policy()).other_moves == 1  # pyright: ignore[reportArgumentType]
 
 
-@pytest.mark.parametrize(("words", "fov", "contrast"), [([], 70.0, 0.15), (["--fov", "80"], 80.0, 0.15)])
+LENS = Lens((64, 48), (60.0, 60.0, 32.0, 24.0), "radtan", (-0.1, 0.0, 0.0, 0.0))
+
+
+@pytest.mark.parametrize(
+    ("flown", "words", "told"),
+    [
+        ({"fov_deg": 70.0}, [], (70.0, 0.15, None)),
+        ({"fov_deg": 70.0}, ["--fov", "80"], (80.0, 0.15, None)),
+        ({"lens": LENS}, [], (None, 0.15, LENS)),
+        ({"lens": LENS}, ["--fov", "80"], (80.0, 0.15, None)),
+        ({"fov_deg": 70.0}, ["--calibration", "lens.yaml"], (None, 0.15, LENS)),
+    ],
+)
 def test_a_replay_knows_the_camera_of_the_flight_unless_it_is_told_another(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, words: list[str], fov: float, contrast: float
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, flown: dict[str, Any], words: list[str], told: Any
 ) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("lens.yaml").write_text(
+        "cam0:\n  distortion_model: radtan\n  distortion_coeffs: [-0.1, 0, 0, 0]\n"
+        "  intrinsics: [60, 60, 32, 24]\n  resolution: [64, 48]\n"
+    )
     log = FlightLog(tmp_path)
-    pilot, _ = make(log=log, fov_deg=70.0, contrast=0.15)
+    pilot, _ = make(log=log, contrast=0.15, **flown)
     pilot.fly()
     log.close()
-    told: list[Any] = []
-    monkeypatch.setattr(command, "load_runner", lambda args, size: told.append((args.fov, args.contrast)) or Policy())
+    seen: list[Any] = []
+    monkeypatch.setattr(
+        command, "load_runner", lambda args, size, lens: seen.append((args.fov, args.contrast, lens)) or Policy()
+    )
     command.replay(command.parse_fly(["a.onnx", "--replay", str(tmp_path), *words]), tmp_path)
-    assert told == [(fov, contrast)]
+    assert seen == [told]
 
 
 class Restarted(Camera):
@@ -288,7 +312,7 @@ def test_at_half_the_pace_a_policy_sees_and_is_told_what_it_would_at_its_own() -
     assert report.decisions == pytest.approx(report.seconds / (2 * PERIOD_S), abs=1.5)
     events = np.zeros(3, EVENT)
     events["t"] = [1000, 1500, 1999]
-    assert at_pace(events, 2000, 0.5)["t"].tolist() == [1500, 1750, 1999]
+    assert events_at_pace(events, 2000, 0.5)["t"].tolist() == [1500, 1750, 1999]
 
 
 def test_the_phases_are_told() -> None:

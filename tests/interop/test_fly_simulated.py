@@ -142,7 +142,7 @@ def test_a_connection_that_ends_is_silent_only_where_it_is_the_simulations(
     close = SimulatedClock.close
     monkeypatch.setattr(SimulatedClock, "close", lambda clock: (left.append(clock), close(clock)))
     monkeypatch.setattr(Pilot, "fly", fail)
-    monkeypatch.setattr(command, "load_runner", lambda args, size: SimpleNamespace(period_s=0.26))
+    monkeypatch.setattr(command, "load_runner", lambda args, size, lens: SimpleNamespace(period_s=0.26))
     server = EventServer(SIZE)
     wire = ["--events", f"tcp:{server.address}", "--mavlink", f"udpin:127.0.0.1:{free_port()}"]
     with socket.create_server(("127.0.0.1", 0)) as keeper, contextlib.ExitStack() as stack:
@@ -267,6 +267,8 @@ ROOM = ["--goal", "9", "0", "5", "--volume", "0", "-5", "0", "20", "5", "9"]
         (["pretrained", "--simulate", "medium", "--max-s", "9"], "--simulate gives --max-s itself"),
         (["pretrained", "--simulate", "medium", "--dry"], "--simulate gives --dry itself"),
         (["a.onnx", "--pace", "3"], "--pace must be from 0.2 to 1"),
+        (["a.onnx", *ROOM, "--fov", "70", "--calibration", "a.yaml"], "--fov and --calibration cannot both be given"),
+        (["pretrained", "--simulate", "medium", "--calibration", "a"], "--simulate gives --calibration itself"),
         (["a.onnx", "--simulate", "medium", "--replay", "b"], "give one of them"),
     ],
 )
@@ -285,13 +287,24 @@ def test_bad_input_is_one_sentence(
         (["--camera", "128", "96", *ROOM], "the camera has 64 x 48 pixels, and --camera says 128 x 96"),
         (["--goal", "9", "0", "5", "--volume", "0", "5", "0", "20", "-5", "9"], "lowest and its highest corner"),
         ([*ROOM, "--on", "process stopped=hover"], "cannot be answered by hover"),
+        ([*ROOM, "--calibration", "nowhere.yaml"], "there is no calibration 'nowhere.yaml'"),
+        ([*ROOM, "--calibration", "large.yaml"], "'large.yaml' is of 346 x 260 pixels, and the camera has 64 x 48"),
         ([*ROOM, "--mavlink", "udpin:127.0.0.1:x"], "cannot be opened"),
         (["--goal", "90", "0", "5", *ROOM[4:]], "no flight: goal outside the fence"),
     ],
 )
 def test_a_camera_or_a_room_that_does_not_fit_is_one_sentence(
-    exported: Path, capsys: pytest.CaptureFixture[str], words: list[str], says: str
+    exported: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    words: list[str],
+    says: str,
 ) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("large.yaml").write_text(
+        "cam0:\n  distortion_model: none\n  intrinsics: [250, 250, 172, 130]\n  resolution: [346, 260]\n"
+    )
     server = EventServer(SIZE)
     port = ["--mavlink", f"udpin:127.0.0.1:{free_port()}"]
     assert main(["fly", str(exported), "--events", f"tcp:{server.address}", *port, *words]) == 2

@@ -178,6 +178,21 @@ def test_events_outside_of_the_window_change_nothing(exported):
 
 # ------------------------------------------------------------------------------------- another camera
 
+
+def test_events_that_are_counted_before_are_those_of_the_packet(exported):
+    each = next(each for each in whole_flight(0) if each.packet.size)
+    flier = runner.Runner(exported)
+    wanted = flier.decide(each.packet, each.until_us, **each.given).values
+    first, last = (each.until_us + time for time in flier.about["frame_times_us"])
+    flier.reset()
+    number = flier.count(each.packet[(each.packet["t"] >= first) & (each.packet["t"] < last)])
+    assert number is not None
+    assert np.array_equal(flier.decide(number[None], each.until_us, **each.given).values, wanted)
+    wrong = each.packet[:1].copy()
+    wrong["p"] = 0
+    assert flier.count(wrong) is None
+
+
 ABOUT = {
     "width": 4,
     "height": 2,
@@ -257,10 +272,10 @@ def test_a_wider_camera_is_cropped_and_a_narrower_one_leaves_a_margin():
     packet = np.concatenate([event(1, x, 3, 1) for x in range(16)] * 4)
     # tan(126.87 deg / 2) = 2: the middle half of the image is what the policy sees.
     wide = runner.Grid.of(ABOUT, (16, 8), 126.8699)
-    assert wide.columns.tolist() == [-1] * 4 + [0, 0, 1, 1, 2, 2, 3, 3] + [-1] * 4
+    assert wide.cells[4].tolist() == [-1] * 4 + [4, 4, 5, 5, 6, 6, 7, 7] + [-1] * 4
     assert runner.count_events(ABOUT, packet, 0, grid=wide).any()
     narrow = runner.Grid.of(ABOUT, (16, 8), 53.1301)
-    assert narrow.columns.tolist() == [1] * 8 + [2] * 8
+    assert (narrow.cells[0] % 4).tolist() == [1] * 8 + [2] * 8
     assert not runner.count_events(ABOUT, packet, 0, grid=narrow)[..., [0, 3]].any()
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from pathlib import Path
 
 import pytest
@@ -11,6 +12,7 @@ pytest.importorskip("pymavlink")
 pytest.importorskip("rotorpy")
 
 import wire  # noqa: E402
+from edqn_jax.errors import ConfigError  # noqa: E402
 
 pytestmark = pytest.mark.filterwarnings("ignore")  # jax2onnx, rotorpy and what they import
 
@@ -32,6 +34,9 @@ def test_a_short_flight_in_real_time_is_measured(tmp_path: Path, capsys: pytest.
 def test_bad_input_is_one_sentence(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     assert wire.main(["--minutes", "0"]) == 2
     assert capsys.readouterr().err.startswith("--minutes, --seen and --pace must be above 0")
+    monkeypatch.delattr(os, "sched_setscheduler", raising=False)
+    with pytest.raises(ConfigError, match="--first cannot be had"):
+        wire.come_first()
     monkeypatch.setattr(wire, "cores", lambda: [0])
     assert wire.main([]) == 2
     assert "need a core beside the pilot's" in capsys.readouterr().err

@@ -59,6 +59,7 @@ class Runner:
         camera: tuple[int, int] | None = None,
         camera_fov_deg: float | None = None,
         contrast: float | None = None,
+        directions: ArrayLike | None = None,
         threads: int = 1,
     ) -> None:
         """Loads a policy.
@@ -69,6 +70,8 @@ class Runner:
             camera_fov_deg: the camera's horizontal field of view; None takes its whole image for the policy's.
             contrast: change of log brightness that makes an event in the camera, which a policy that knows it is told;
                 None is the policy's own, or the middle of those that it was trained with.
+            directions: [H, W, 2] of a calibrated lens, in place of `camera_fov_deg`: where each pixel of the camera
+                looks, how far to the right and down for one ahead; not finite where it sees nothing.
             threads: of onnxruntime; the network is so small that one is fastest.
 
         Raises:
@@ -89,7 +92,7 @@ class Runner:
         self._session: Any = session
         self.about = _about(self._session.get_modelmeta().custom_metadata_map, path)
         """What the policy expects, as `edqn export` wrote it."""
-        self._grid = Grid.of(self.about, camera, camera_fov_deg)
+        self._grid = Grid.of(self.about, camera, camera_fov_deg, directions)
         self._contrast = camera_contrast(self.about, contrast)
         self._actions = np.asarray(self.about["actions"], np.float32)
         shape = next(given.shape for given in self._session.get_inputs() if given.name == "memory")
@@ -131,7 +134,8 @@ class Runner:
 
         Args:
             packet: structured array [N] with the fields `t` (microseconds, any order), `x`, `y` and `p` (-1 or 1);
-                events that are not in the window [until_us - window_us, until_us) are left out.
+                events that are not in the window [until_us - window_us, until_us) are left out. Or how many there are
+                [F, 2, H, W]: sums of `count` for each pair of frames.
             until_us: time of the decision, on the events' clock.
             position: [3] metres in the world.
             quaternion: [4] w, x, y, z, from the body (x ahead, y left, z up) to the world.
@@ -153,7 +157,10 @@ class Runner:
         turn = _numbers("yaw_rate", yaw_rate, ())
         move = self._last_move if last_move is None else _numbers("last_move", last_move, (3,))
         yaw = heading_of(attitude)
-        counts = count_events(self.about, packet, until_us - self.window_us, grid=self._grid, contrast=self._contrast)
+        number = packet
+        if packet.dtype.names is not None or packet.ndim != 4:
+            number = _numbers_of(self.about, packet, until_us - self.window_us, self._grid)
+        counts = _counts_of(self.about, number, self._grid, self._contrast)
         values, memory = self._session.run(
             ["values", "memory_after"],
             {
@@ -169,6 +176,19 @@ class Runner:
         wanted = self.velocity_of(best, float(yaw))
         self._yaw = self._setpoint(place, float(yaw), aim, wanted)
         return Command(best, wanted, self._yaw, values[0])
+
+    def count(self, packet: NDArray) -> NDArray[np.int64] | None:
+        """Returns how many events of a packet [N] are in each of the policy's pixels [2, H, W], ON and OFF.
+
+        Packets can be counted as they come, so that a decision has less to do. None, where `decide` would refuse them.
+        """
+        try:
+            _check_packet(packet)
+            _check_pixels(packet, self._grid)
+        except ValueError:
+            return None
+        times = np.zeros(packet.size, np.int64)
+        return _number_in(self.about, packet, times, self._grid, pairs=1)[0]
 
     def _told(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
         """Returns own values as the network takes them, [1, N]."""
@@ -193,64 +213,82 @@ class Runner:
 
 @dataclasses.dataclass(frozen=True)
 class Grid:
-    """Which of the policy's pixels each pixel of a camera belongs to; -1 is outside of the policy's view."""
+    """Which of the policy's pixels each pixel of a camera belongs to."""
 
-    columns: NDArray[np.int64]
-    """[camera width]"""
-    rows: NDArray[np.int64]
-    """[camera height]"""
+    cells: NDArray[np.int32]
+    """[camera height, camera width] row times width plus column of the policy's pixel; -1 is outside of its view."""
     pixels: NDArray[np.int64]
     """[H, W] of the camera that belong to each pixel of the policy."""
 
     @classmethod
     def of(
-        cls, about: Mapping[str, Any], camera: tuple[int, int] | None = None, camera_fov_deg: float | None = None
+        cls,
+        about: Mapping[str, Any],
+        camera: tuple[int, int] | None = None,
+        camera_fov_deg: float | None = None,
+        directions: ArrayLike | None = None,
     ) -> Grid:
-        """Returns the grid of a camera.
+        """Returns the grid of a camera that looks the same way as the policy's.
 
-        Both cameras are pinholes that look the same way, with square pixels where a field of view is given.
+        Without directions both are pinholes, with square pixels where a field of view is given.
 
         Args:
             about: `width`, `height` and `horizontal_fov_deg` of the policy's camera.
             camera: width and height; None is the policy's own.
             camera_fov_deg: horizontal; None stretches the camera's image over the policy's.
+            directions: as of `Runner`.
 
         Raises:
-            ValueError: if the camera has fewer pixels in the policy's view than the policy.
+            ValueError: if the camera has fewer pixels in the policy's view than the policy, or the directions are not
+                those of its pixels.
         """
         width, height = about["width"], about["height"]
         across, down = camera or (width, height)
-        if camera_fov_deg is None:
+        half = np.tan(np.radians(about["horizontal_fov_deg"]) / 2)
+        if directions is not None:
+            towards = np.asarray(directions, np.float64)
+            if camera_fov_deg is not None or towards.shape != (down, across, 2):
+                raise ValueError(
+                    f"directions must be given without camera_fov_deg, {down} x {across} x 2 of them for a camera of "
+                    f"{across} x {down} pixels, not {' x '.join(map(str, towards.shape))}"
+                )
+            columns = _within(towards[..., 0] * width / (2 * half) + width / 2, width)
+            rows = _within(towards[..., 1] * width / (2 * half) + height / 2, height)
+        elif camera_fov_deg is None:
             columns, rows = (np.arange(many) * size // many for many, size in ((across, width), (down, height)))
+            rows = rows[:, None]
         else:
             if not 0.0 < camera_fov_deg < 180.0:
                 raise ValueError(f"camera_fov_deg must be between 0 and 180, not {camera_fov_deg}")
             # Pixels of the policy per pixel of the camera.
             scale = np.tan(np.radians(camera_fov_deg) / 2) / across
-            scale /= np.tan(np.radians(about["horizontal_fov_deg"]) / 2) / width
-            columns, rows = _places(across, width, scale), _places(down, height, scale)
-        many = np.bincount(rows[rows >= 0], minlength=height)[:, None] * np.bincount(
-            columns[columns >= 0], minlength=width
-        )
-        inside = _hull(rows)[1], _hull(columns)[1]
-        if np.any(many[_hull(rows)[0] : inside[0], _hull(columns)[0] : inside[1]] == 0):
+            scale /= half / width
+            columns, rows = _places(across, width, scale), _places(down, height, scale)[:, None]
+        cells = np.where((columns >= 0) & (rows >= 0), rows * width + columns, -1).astype(np.int32)
+        many = np.bincount(cells[cells >= 0], minlength=width * height).reshape(height, width)
+        if _has_holes(many > 0) or _has_holes(many.T > 0):
             raise ValueError(
                 f"a camera of {across} x {down} pixels has fewer in the policy's view than the policy, which sees "
                 f"{width} x {height}; take one with more"
             )
-        return cls(columns, rows, many)
+        return cls(cells, many)
 
 
 def _places(many: int, size: int, scale: float) -> NDArray[np.int64]:
     """Returns the policy's pixel [many] of each pixel of a camera along one axis; -1 outside of the policy's view."""
-    places = np.floor((np.arange(many) + 0.5 - many / 2) * scale + size / 2).astype(np.int64)
-    return np.where((places >= 0) & (places < size), places, -1)
+    return _within((np.arange(many) + 0.5 - many / 2) * scale + size / 2, size)
 
 
-def _hull(places: NDArray[np.int64]) -> tuple[int, int]:
-    """Returns the first of the policy's pixels that is seen, and the one after the last."""
-    seen = places[places >= 0]
-    return int(seen.min()), int(seen.max()) + 1
+def _within(places: NDArray[np.floating], size: int) -> NDArray[np.int64]:
+    """Returns the pixels that places along an axis are in; -1 outside of its `size` pixels, or where not finite."""
+    inside = (places >= 0) & (places < size)
+    return np.floor(np.where(inside, places, -1.0)).astype(np.int64)
+
+
+def _has_holes(seen: NDArray[np.bool_]) -> bool:
+    """Returns whether in a row of pixels [H, W] one is not seen between two that are."""
+    before, after = np.logical_or.accumulate(seen, 1), np.logical_or.accumulate(seen[:, ::-1], 1)[:, ::-1]
+    return bool(np.any(before & after & ~seen))
 
 
 def camera_contrast(about: Mapping[str, Any], contrast: float | None = None) -> float | None:
@@ -306,44 +344,54 @@ def count_events(
     Raises:
         ValueError: if the packet is no array of events, or one of them is outside of the image.
     """
-    columns, rows, pixels = _own_grid(about) if grid is None else (grid.columns, grid.rows, grid.pixels)
+    grid = Grid.of(about) if grid is None else grid
+    return _counts_of(about, _numbers_of(about, packet, start_us, grid), grid, contrast)
+
+
+def _numbers_of(about: Mapping[str, Any], packet: NDArray, start_us: int, grid: Grid) -> NDArray[np.int64]:
+    """Returns how many events of a window are in each of the policy's pixels, [F, 2, H, W].
+
+    Raises:
+        ValueError: as `count_events`.
+    """
     _check_packet(packet)
     edges = np.asarray(about["frame_times_us"], np.int64)
     since = packet["t"].astype(np.int64) - start_us
     inside = (since >= 0) & (since < edges[-1] - edges[0])
     if not inside.all():
         packet, since = packet[inside], since[inside]
-    x, y, sign = (packet[name].astype(np.int64) for name in ("x", "y", "p"))
-    if x.size and (x.max() >= columns.size or y.max() >= rows.size):
-        raise ValueError(
-            f"an event is at pixel ({x.max()}, {y.max()}), outside of an image of "
-            f"{columns.size} x {rows.size}; say how large the camera's is"
-        )
+    _check_pixels(packet, grid)
     # A comparison for each of the few frames is faster than a search for each of the many events.
-    pair = np.zeros(since.size, np.int64)
+    pair = np.zeros(since.size, np.int32)
     for edge in edges[1:-1] - edges[0]:
         pair += since >= edge
-    column, row = columns[x], rows[y]
-    shape = (edges.size - 1, 2, about["height"], about["width"])
-    cell = ((2 * pair + (sign < 0)) * shape[2] + row) * shape[3] + column
-    seen = (column >= 0) & (row >= 0)
-    if not seen.all():
-        cell = cell[seen]
-    number = np.bincount(cell, minlength=int(np.prod(shape))).reshape(shape)
+    return _number_in(about, packet, pair, grid, pairs=edges.size - 1)
+
+
+def _number_in(
+    about: Mapping[str, Any], packet: NDArray, pair: NDArray, grid: Grid, *, pairs: int
+) -> NDArray[np.int64]:
+    """Returns how many events [N], each of its pair of frames, are in each of the policy's pixels."""
+    shape = (pairs, 2, about["height"], about["width"])
+    place = packet["y"].astype(np.int32) * np.int32(grid.cells.shape[1]) + packet["x"].astype(np.int32)
+    cell = grid.cells.ravel()[place]
+    where = ((2 * pair + (packet["p"] < 0)) * (shape[2] * shape[3])) + cell
+    if cell.size and cell.min() < 0:
+        where = where[cell >= 0]
+    return np.bincount(where, minlength=int(np.prod(shape))).reshape(shape)
+
+
+def _counts_of(
+    about: Mapping[str, Any], number: NDArray, grid: Grid, contrast: float | None = None
+) -> NDArray[np.int32]:
+    """Returns events as the policy counts them, of those of the camera [F, 2, H, W]."""
     told = contrast is None or about.get("known_contrast")
     per_event = [1.0 if told else contrast / own for own in (about["contrast_on"], about["contrast_off"])]
-    change = number * np.asarray(per_event)[:, None, None] / np.maximum(pixels, 1)
-    return _counts_of(about, change, is_finer=bool(pixels.max() > 1))
-
-
-def _counts_of(about: Mapping[str, Any], change: NDArray, *, is_finer: bool) -> NDArray[np.int32]:
-    """Returns events as the policy counts them of mean changes [F, 2, H, W] in contrasts, ON and OFF.
-
-    `is_finer` says whether the camera has several pixels under one of the policy's.
-    """
-    together = about.get("sensor_pixels", 1)
+    # In contrasts of the policy, means over the camera's pixels.
+    change = number * np.asarray(per_event)[:, None, None] / np.maximum(grid.pixels, 1)
+    is_finer, together = bool(grid.pixels.max() > 1), about.get("sensor_pixels", 1)
     if about["counts_net"] or (together > 1 and is_finer):
-        # In contrasts of the policy, which may differ between ON and OFF.
+        # Contrasts may differ between ON and OFF.
         log_change = change[:, 0] * about["contrast_on"] - change[:, 1] * about["contrast_off"]
         change = np.stack([log_change / about["contrast_on"], -log_change / about["contrast_off"]], axis=1)
     if together > 1:
@@ -351,11 +399,6 @@ def _counts_of(about: Mapping[str, Any], change: NDArray, *, is_finer: bool) -> 
     # Rounding must not take away what is exactly one event.
     counts = np.floor(np.maximum(change, 0.0) + 1e-6).astype(np.int32)
     return np.where(counts >= about["least_count"], counts, 0).astype(np.int32)
-
-
-def _own_grid(about: Mapping[str, Any]) -> tuple[NDArray, NDArray, NDArray]:
-    width, height = about["width"], about["height"]
-    return np.arange(width), np.arange(height), np.ones((height, width), np.int64)
 
 
 def heading_of(quaternion: NDArray[np.float32]) -> np.float32:
@@ -455,6 +498,15 @@ def _check_packet(packet: NDArray) -> None:
         raise ValueError("the polarity p of an event must be -1 or 1; with 0 and 1, give 2 * p - 1")
     if packet.size and any(packet[name].dtype.kind == "i" and packet[name].min() < 0 for name in ("x", "y")):
         raise ValueError("the pixels x and y of events must be at least 0")
+
+
+def _check_pixels(packet: NDArray, grid: Grid) -> None:
+    x, y, (down, across) = packet["x"], packet["y"], grid.cells.shape
+    if x.size and (x.max() >= across or y.max() >= down):
+        raise ValueError(
+            f"an event is at pixel ({x.max()}, {y.max()}), outside of an image of {across} x {down}; say how large "
+            "the camera's is"
+        )
 
 
 def _numbers(name: str, given: ArrayLike, shape: tuple[int, ...]) -> NDArray[np.float32]:

@@ -74,6 +74,7 @@ def observe_recording(
     *,
     contrast: float | None = None,
     fov_deg: float | None = None,
+    directions: NDArray[np.float64] | None = None,
     velocity: tuple[float, float, float] = (0.0, 0.0, 0.0),
     yaw_rate: float = 0.0,
 ) -> Seen:
@@ -84,6 +85,7 @@ def observe_recording(
         recording: of a camera that looks ahead.
         contrast: of the camera; None is what the recording says, or the policy's own.
         fov_deg: horizontal; None takes the camera's whole image for the policy's.
+        directions: [H, W, 2] of a calibrated lens, in place of `fov_deg`, as of `Runner`.
         velocity: [3] m/s ahead, to the left and up, where the recording has no flight.
         yaw_rate: rad/s to the left, likewise.
 
@@ -96,7 +98,7 @@ def observe_recording(
         raise ConfigError(f"only policies with the sensor 'events' encode events, not '{config.env.sensor}'")
     about = about_policy(config)
     try:
-        grid = runner.Grid.of(about, recording.size(), fov_deg)
+        grid = runner.Grid.of(about, recording.size(), fov_deg, directions)
     except ConfigError:
         raise
     except ValueError as error:
