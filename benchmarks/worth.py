@@ -41,7 +41,7 @@ from measurement.flags import split
 from worth_parts import own, traffic
 from worth_parts.axes import AXES, config_of, places_of
 from worth_parts.flown import measure_row
-from worth_parts.table import tables
+from worth_parts.table import all_cells, tables
 
 BYTES = "bytes"
 MISSIONS = {BYTES: 32}
@@ -124,8 +124,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         from worth_parts.picture import draw_map  # matplotlib is for the report alone
 
         rows = success.read_rows(args.out)
-        print(tables(rows))
-        draw_map(rows, args.figure or args.out / "worth.png")
+        cells = all_cells(rows)
+        print(tables(rows, cells), flush=True)
+        draw_map(rows, cells, args.figure or args.out / "worth.png")
         return 0
     wanted = traffic.wanted_rows(args) if args.axis == BYTES else wanted_rows(args)
     return 3 if success.measure(wanted, [], began + 60 * args.minutes, args.row_seconds) else 0

@@ -27,7 +27,7 @@ LUX = (0.1, 1.0, 10.0, 100.0, 10_000.0)
 QUICK = (
     *("--drone.physics-steps", "2", "--env.max-decisions", "400", "--events.frame-times-s", "-0.04", "0"),
     *("--agent.discount", "0.99", "--agent.n-step", "8", "--agent.history", "3", "--env.step-reward", "-0.03"),
-    *("--encoder.hold-decisions", "20"),
+    *("--encoder.hold-decisions", "20", "--env.collision-reward", "-100", "--env.left-volume-reward", "-100"),
 )
 """Decisions at 25 Hz: what the defaults say of 0.26 s, said of 0.04 s; three observations for every sensor."""
 

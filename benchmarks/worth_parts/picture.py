@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from matplotlib.axes import Axes
@@ -15,7 +15,7 @@ from edqn_jax.errors import ConfigError
 from edqn_jax.report.style import INK, MUTED, open_figure
 from worth_parts import traffic
 from worth_parts.axes import AXES, BLIND, DEPTH
-from worth_parts.table import Cell, best_of, cells_of, rows_of, verdict_of
+from worth_parts.table import Cell, best_of, rows_of, verdict_of
 
 COLOURS = {
     "events": "#e69f00",
@@ -32,7 +32,7 @@ COLOURS = {
 """By verdict; those of the bytes are `events`, `frames` and `no difference`."""
 
 LABELS = {
-    "events": "events lead",
+    "events": "events lead (bytes: events cost less)",
     "frames": "one frame leads (bytes: frames cost less)",
     "frame-pair": "frame pair leads",
     "frame-difference": "difference of the pair leads",
@@ -63,13 +63,18 @@ class Panel:
     """By row and column: who leads, and what is written there."""
 
 
-def draw_map(rows: Sequence[success.Row], file: Path) -> Figure:
+def draw_map(rows: Sequence[success.Row], cells: Mapping[str, Sequence[Cell]], file: Path) -> Figure:
     """Writes the map as a PNG, a panel for each axis of which there are rows, and returns the figure.
+
+    Args:
+        rows: all.
+        cells: of `table.all_cells`.
+        file: that is written.
 
     Raises:
         ConfigError: if there are no rows.
     """
-    panels = [_flights_panel(name, rows_of(rows, name)) for name in AXES if rows_of(rows, name)]
+    panels = [_flights_panel(name, found) for name, found in cells.items()]
     if counted := rows_of(rows, "bytes"):
         panels.append(_bytes_panel(counted))
     if not panels:
@@ -92,9 +97,9 @@ def draw_map(rows: Sequence[success.Row], file: Path) -> Figure:
     return figure
 
 
-def _flights_panel(name: str, rows: Sequence[success.Row]) -> Panel:
+def _flights_panel(name: str, cells: Sequence[Cell]) -> Panel:
     axis, found, heads, sides = AXES[name], {}, [], []
-    for cell in cells_of(rows, axis):
+    for cell in cells:
         column, _, aside = cell.flown.partition(", ")
         parts = [cell.world, f"trained: {cell.trained}", aside]
         side = ", ".join(part for part in parts if part)
