@@ -45,8 +45,8 @@ LABELS = {
 
 SHORT = {"frames": "frame", "frame-pair": "pair", "frame-difference": "diff.", "depth-late-1": "late", BLIND: "blind"}
 
-CONTRAST = 0.2
-"""Of the sensor whose bytes are drawn; tables have others."""
+CONTRASTS = (0.05, 0.2)
+"""Of the sensors whose bytes are drawn; tables have others, and more resolutions than the smallest and the largest."""
 
 ROW_IN, LABEL_IN, CELL_IN, HEAD_IN = 0.42, 2.1, 1.02, 0.62
 """Height of a row, width of row labels, width of a column, and height over a panel, inches."""
@@ -120,19 +120,22 @@ def _written(cell: Cell, best: Sequence[str]) -> str:
 
 def _bytes_panel(rows: Sequence[success.Row]) -> Panel:
     found, sides = {}, []
-    columns = [f"{rate} frames/s" for rate in traffic.FRAME_RATES]
+    columns = {(each, rate): f"{each:g}, {rate} a second" for each in CONTRASTS for rate in traffic.FRAME_RATES}
+    ends = {of([row["width"] for row in rows]) for of in (min, max)}
     for row in sorted(rows, key=lambda row: (traffic.WORLDS.index(row["world"]), row["width"])):
+        if row["width"] not in ends:
+            continue
         side = f"{row['world']}, {row['look']}, {row['width']} × {row['height']}"
         sides.append(side)
-        even, low, high = traffic.break_even(row, str(CONTRAST), traffic.EVENT_BYTES[0])
-        for rate, column in zip(traffic.FRAME_RATES, columns, strict=True):
+        for (contrast, rate), column in columns.items():
+            even, low, high = traffic.break_even(row, str(contrast), traffic.EVENT_BYTES[0])
             who = "events" if high < rate else "frames" if low > rate else "no difference"
             found[side, column] = who, f"{even / rate:.2g}"
     title = (
-        f"Bytes: those of events (contrast {CONTRAST:g}, {traffic.EVENT_BYTES[0]} bytes each) over those of 8-bit "
-        "frames; below 1 events cost less"
+        f"Bytes of events, by contrast and {traffic.EVENT_BYTES[0]} each, over those of so many 8-bit frames a second; "
+        "below 1 events cost less"
     )
-    return Panel(title, sides, columns, found)
+    return Panel(title, sides, list(columns.values()), found)
 
 
 def _draw_panel(axes: Axes, panel: Panel) -> None:

@@ -146,15 +146,16 @@ def _flights_table(name: str, rows: Sequence[success.Row], cells: Sequence[Cell]
     lines = [
         f"{axis.question}: {' or '.join(map(str, seeds))} seeds × {first['missions']:,} missions a cell, the same for "
         f"all sensors (test worlds {worlds} to {worlds + first['missions'] - 1}), {first['decisions']:,} decisions a "
-        "seed. Success in % with its 95 % interval; the last column says who leads of all but the controls.",
+        "seed. Success in % with its 95 % interval; who leads of all but the controls; and by how many points events "
+        "are ahead of that sensor of frames which does best in the cell.",
         "",
-        f"| world | trained | flown | {' | '.join(columns)} | leads |",
-        f"| --- | --- | --- |{' --- |' * len(columns)} --- |",
+        f"| world | trained | flown | {' | '.join(columns)} | leads | events ahead by |",
+        f"| --- | --- | --- |{' --- |' * len(columns)} --- | --- |",
     ]
     for cell in cells:
         shown = " | ".join(_rate(cell, sensor) for sensor in columns)
         leads = verdict_of(best_of(cell), cell.rivals)
-        lines.append(f"| {cell.world} | {cell.trained} | {cell.flown} | {shown} | {leads} |")
+        lines.append(f"| {cell.world} | {cell.trained} | {cell.flown} | {shown} | {leads} | {_ahead(cell)} |")
     return "\n".join(lines)
 
 
@@ -163,6 +164,17 @@ def _rate(cell: Cell, sensor: str) -> str:
         return "–"
     low, high = cell.interval(sensor)
     return f"{100 * cell.arrived[sensor].mean():.1f} ({100 * low:.1f} to {100 * high:.1f})"
+
+
+def _ahead(cell: Cell) -> str:
+    """Returns by how many points events are ahead of the best sensor of frames, with the interval."""
+    frames = [sensor for sensor in cell.arrived if sensor in FRAMES]
+    if not frames or "events" not in cell.arrived:
+        return "–"
+    best = max(frames, key=lambda sensor: cell.arrived[sensor].mean())
+    low, high = cell.lead("events", best)
+    ahead = cell.arrived["events"].mean() - cell.arrived[best].mean()
+    return f"{100 * ahead:.1f} ({100 * low:.1f} to {100 * high:.1f})"
 
 
 def _bytes_table(rows: Sequence[success.Row]) -> str:
