@@ -20,14 +20,17 @@ FRAMES = ("frames", "frame-pair", "frame-difference")
 LOOKS = ("plaid", "drawn", "bricks", "posters", "wood", "blank")
 """Looks that are flown. Policies are trained in the first two; `blank` is among those of `drawn`, the others never."""
 
-_REAL_EVENTS = ("--events.profile", "dvs", "--events.threshold", "0.03", "--events.tolerance", "0.03")
-_REAL_FRAMES = ("--exposure.real",)
+REAL_EVENTS = ("--events.profile", "dvs", "--events.threshold", "0.03", "--events.tolerance", "0.03")
+REAL_FRAMES = ("--exposure.real",)
+REAL = {BLIND: (), DEPTH: (), "events": REAL_EVENTS, "frames": REAL_FRAMES, "frame-pair": REAL_FRAMES}
+"""Sensors with the faults of real ones, for axes with light."""
+
 LUX = (0.1, 1.0, 10.0, 100.0, 10_000.0)
 
 QUICK = (
     *("--drone.physics-steps", "2", "--env.max-decisions", "400", "--events.frame-times-s", "-0.04", "0"),
     *("--agent.discount", "0.99", "--agent.n-step", "8", "--agent.history", "3", "--env.step-reward", "-0.03"),
-    *("--encoder.hold-decisions", "20"),
+    *("--encoder.hold-decisions", "20", "--env.collision-reward", "-100", "--env.left-volume-reward", "-100"),
 )
 """Decisions at 25 Hz: what the defaults say of 0.26 s, said of 0.04 s; three observations for every sensor."""
 
@@ -98,9 +101,21 @@ AXES: dict[str, Axis] = {
         "Light and speed",
         ("medium",),
         {f"{speed:g} m/s": ("--env.speed-m-s", str(speed)) for speed in (4.0, 8.0)},
-        {BLIND: (), DEPTH: (), "events": _REAL_EVENTS, "frames": _REAL_FRAMES, "frame-pair": _REAL_FRAMES},
+        REAL,
         {f"{lux:g} lux": {"light": {"least_lux": lux, "most_lux": lux}} for lux in LUX},
         ("--light.least-lux", str(LUX[0]), "--light.most-lux", str(LUX[-1])),
+        same_flown=True,
+    ),
+    "turning": Axis(
+        "A camera on the body, at speed among trunks",
+        ("forest",),
+        {f"{speed:g} m/s": ("--env.speed-m-s", str(speed)) for speed in (8.0, 12.0)},
+        REAL,
+        {f"{lux:g} lux": {"light": {"least_lux": lux, "most_lux": lux}} for lux in (50.0, 500.0)},
+        (
+            *("--camera.mount", "body", "--camera.width", "64", "--camera.height", "48"),
+            *("--encoder.replay-size", "131072", "--light.least-lux", "50", "--light.most-lux", "500"),
+        ),
         same_flown=True,
     ),
 }

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from matplotlib.axes import Axes
@@ -15,7 +15,7 @@ from edqn_jax.errors import ConfigError
 from edqn_jax.report.style import INK, MUTED, open_figure
 from worth_parts import traffic
 from worth_parts.axes import AXES, BLIND, DEPTH
-from worth_parts.table import Cell, best_of, cells_of, rows_of, verdict_of
+from worth_parts.table import Cell, best_of, rows_of, verdict_of
 
 COLOURS = {
     "events": "#e69f00",
@@ -32,7 +32,7 @@ COLOURS = {
 """By verdict; those of the bytes are `events`, `frames` and `no difference`."""
 
 LABELS = {
-    "events": "events lead",
+    "events": "events lead (bytes: events cost less)",
     "frames": "one frame leads (bytes: frames cost less)",
     "frame-pair": "frame pair leads",
     "frame-difference": "difference of the pair leads",
@@ -45,8 +45,8 @@ LABELS = {
 
 SHORT = {"frames": "frame", "frame-pair": "pair", "frame-difference": "diff.", "depth-late-1": "late", BLIND: "blind"}
 
-CONTRAST = 0.2
-"""Of the sensor whose bytes are drawn; tables have others."""
+CONTRASTS = (0.05, 0.2)
+"""Of the sensors whose bytes are drawn; tables have others, and more resolutions than the smallest and the largest."""
 
 ROW_IN, LABEL_IN, CELL_IN, HEAD_IN = 0.42, 2.1, 1.02, 0.62
 """Height of a row, width of row labels, width of a column, and height over a panel, inches."""
@@ -63,13 +63,18 @@ class Panel:
     """By row and column: who leads, and what is written there."""
 
 
-def draw_map(rows: Sequence[success.Row], file: Path) -> Figure:
+def draw_map(rows: Sequence[success.Row], cells: Mapping[str, Sequence[Cell]], file: Path) -> Figure:
     """Writes the map as a PNG, a panel for each axis of which there are rows, and returns the figure.
+
+    Args:
+        rows: all.
+        cells: of `table.all_cells`.
+        file: that is written.
 
     Raises:
         ConfigError: if there are no rows.
     """
-    panels = [_flights_panel(name, rows_of(rows, name)) for name in AXES if rows_of(rows, name)]
+    panels = [_flights_panel(name, found) for name, found in cells.items()]
     if counted := rows_of(rows, "bytes"):
         panels.append(_bytes_panel(counted))
     if not panels:
@@ -92,9 +97,9 @@ def draw_map(rows: Sequence[success.Row], file: Path) -> Figure:
     return figure
 
 
-def _flights_panel(name: str, rows: Sequence[success.Row]) -> Panel:
+def _flights_panel(name: str, cells: Sequence[Cell]) -> Panel:
     axis, found, heads, sides = AXES[name], {}, [], []
-    for cell in cells_of(rows, axis):
+    for cell in cells:
         column, _, aside = cell.flown.partition(", ")
         parts = [cell.world, f"trained: {cell.trained}", aside]
         side = ", ".join(part for part in parts if part)
@@ -115,19 +120,22 @@ def _written(cell: Cell, best: Sequence[str]) -> str:
 
 def _bytes_panel(rows: Sequence[success.Row]) -> Panel:
     found, sides = {}, []
-    columns = [f"{rate} frames/s" for rate in traffic.FRAME_RATES]
+    columns = {(each, rate): f"{each:g}, {rate} a second" for each in CONTRASTS for rate in traffic.FRAME_RATES}
+    ends = {of([row["width"] for row in rows]) for of in (min, max)}
     for row in sorted(rows, key=lambda row: (traffic.WORLDS.index(row["world"]), row["width"])):
+        if row["width"] not in ends:
+            continue
         side = f"{row['world']}, {row['look']}, {row['width']} × {row['height']}"
         sides.append(side)
-        even, low, high = traffic.break_even(row, str(CONTRAST), traffic.EVENT_BYTES[0])
-        for rate, column in zip(traffic.FRAME_RATES, columns, strict=True):
+        for (contrast, rate), column in columns.items():
+            even, low, high = traffic.break_even(row, str(contrast), traffic.EVENT_BYTES[0])
             who = "events" if high < rate else "frames" if low > rate else "no difference"
             found[side, column] = who, f"{even / rate:.2g}"
     title = (
-        f"Bytes: those of events (contrast {CONTRAST:g}, {traffic.EVENT_BYTES[0]} bytes each) over those of 8-bit "
-        "frames; below 1 events cost less"
+        f"Bytes of events, by contrast and {traffic.EVENT_BYTES[0]} each, over those of so many 8-bit frames a second; "
+        "below 1 events cost less"
     )
-    return Panel(title, sides, columns, found)
+    return Panel(title, sides, list(columns.values()), found)
 
 
 def _draw_panel(axes: Axes, panel: Panel) -> None:

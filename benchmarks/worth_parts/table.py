@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 import itertools
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 
@@ -18,8 +19,11 @@ from worth_parts.axes import AXES, BLIND, DEPTH, FRAMES, Axis, flown_of, is_firs
 GOAL = "1"
 """Digit of a flight that arrived."""
 
+DRAWS = 4000
+"""Of the bootstrap of a cell, over seeds and missions; the missions of a draw are the same for all of its sensors."""
 
-@dataclasses.dataclass(frozen=True)
+
+@dataclasses.dataclass
 class Cell:
     """Policies of several sensors in the same missions, trained and flown in one condition each."""
 
@@ -28,6 +32,24 @@ class Cell:
     flown: str
     arrived: dict[str, np.ndarray]
     """[S, M] bool by sensor: S seeds, M missions."""
+
+    @functools.cached_property
+    def drawn(self) -> dict[str, np.ndarray]:
+        """Returns rates of success [DRAWS] of bootstrap draws by sensor."""
+        return dict(zip(self.arrived, bootstrap_rates(list(self.arrived.values()), DRAWS), strict=True))
+
+    def interval(self, sensor: str) -> tuple[float, float]:
+        """Returns the interval of a sensor's success; of 0 and of 1, whose bootstrap does not vary, Wilson's."""
+        if 0 < self.arrived[sensor].mean() < 1:
+            return percentile_interval(self.drawn[sensor])
+        return rate_interval(self.arrived[sensor])
+
+    def lead(self, first: str, second: str) -> tuple[float, float]:
+        """Returns the interval of the success of the first sensor minus that of the second, on the same missions."""
+        both = [self.arrived[sensor] for sensor in (first, second)]
+        if all(0 < each.mean() < 1 for each in both):
+            return percentile_interval(self.drawn[first] - self.drawn[second])
+        return difference_interval(*both)
 
     @property
     def rivals(self) -> list[str]:
@@ -76,20 +98,7 @@ def cells_of(rows: Sequence[success.Row], axis: Axis) -> list[Cell]:
 def best_of(cell: Cell) -> list[str]:
     """Returns the rival with the most success, and after it those from which its interval of difference holds 0."""
     rivals = sorted(cell.rivals, key=lambda sensor: -cell.arrived[sensor].mean())
-    if not rivals:
-        return []
-    drawn = dict(zip(rivals, bootstrap_rates([cell.arrived[sensor] for sensor in rivals]), strict=True))
-    first = rivals[0]
-
-    def is_behind(sensor: str) -> bool:
-        both = [cell.arrived[each] for each in (first, sensor)]
-        if all(0 < each.mean() < 1 for each in both):
-            low, _ = percentile_interval(drawn[first] - drawn[sensor])
-        else:
-            low, _ = difference_interval(*both)
-        return low > 0
-
-    return [first, *(sensor for sensor in rivals[1:] if not is_behind(sensor))]
+    return [*rivals[:1], *(sensor for sensor in rivals[1:] if cell.lead(rivals[0], sensor)[0] <= 0)]
 
 
 def verdict_of(best: Sequence[str], rivals: Sequence[str]) -> str:
@@ -103,20 +112,33 @@ def verdict_of(best: Sequence[str], rivals: Sequence[str]) -> str:
     return "no difference"
 
 
-def tables(rows: Sequence[success.Row]) -> str:
-    """Returns the rows as Markdown, a table for each axis of which there are some.
+def all_cells(rows: Sequence[success.Row]) -> dict[str, list[Cell]]:
+    """Returns the cells of each axis of which there are rows.
 
     Raises:
         ConfigError: if rows of an axis were not measured alike.
     """
-    shown = [_flights_table(name, rows_of(rows, name)) for name in AXES if rows_of(rows, name)]
+    return {name: cells_of(found, axis) for name, axis in AXES.items() if (found := rows_of(rows, name))}
+
+
+def tables(rows: Sequence[success.Row], cells: Mapping[str, Sequence[Cell]]) -> str:
+    """Returns the rows as Markdown, a table for each axis of which there are some.
+
+    Args:
+        rows: all.
+        cells: of `all_cells`.
+
+    Raises:
+        ConfigError: if rows of an axis were not measured alike.
+    """
+    shown = [_flights_table(name, rows_of(rows, name), found) for name, found in cells.items()]
     if counted := rows_of(rows, "bytes"):
         shown.append(_bytes_table(counted))
     return "\n\n".join(shown) if shown else "There are no rows."
 
 
-def _flights_table(name: str, rows: Sequence[success.Row]) -> str:
-    axis, cells = AXES[name], cells_of(rows, AXES[name])
+def _flights_table(name: str, rows: Sequence[success.Row], cells: Sequence[Cell]) -> str:
+    axis = AXES[name]
     sensors = [sensor for sensor in axis.sensors if sensor not in (BLIND, DEPTH)]
     columns = [sensor for sensor in (BLIND, *sensors, DEPTH) if any(sensor in cell.arrived for cell in cells)]
     first, seeds = rows[0], sorted({len(row["seeds"]) for row in rows})
@@ -124,23 +146,35 @@ def _flights_table(name: str, rows: Sequence[success.Row]) -> str:
     lines = [
         f"{axis.question}: {' or '.join(map(str, seeds))} seeds × {first['missions']:,} missions a cell, the same for "
         f"all sensors (test worlds {worlds} to {worlds + first['missions'] - 1}), {first['decisions']:,} decisions a "
-        "seed. Success in % with its 95 % interval; the last column says who leads of all but the controls.",
+        "seed. Success in % with its 95 % interval; who leads of all but the controls; and by how many points events "
+        "are ahead of that sensor of frames which does best in the cell.",
         "",
-        f"| world | trained | flown | {' | '.join(columns)} | leads |",
-        f"| --- | --- | --- |{' --- |' * len(columns)} --- |",
+        f"| world | trained | flown | {' | '.join(columns)} | leads | events ahead by |",
+        f"| --- | --- | --- |{' --- |' * len(columns)} --- | --- |",
     ]
     for cell in cells:
-        shown = " | ".join(_rate(cell.arrived.get(sensor)) for sensor in columns)
+        shown = " | ".join(_rate(cell, sensor) for sensor in columns)
         leads = verdict_of(best_of(cell), cell.rivals)
-        lines.append(f"| {cell.world} | {cell.trained} | {cell.flown} | {shown} | {leads} |")
+        lines.append(f"| {cell.world} | {cell.trained} | {cell.flown} | {shown} | {leads} | {_ahead(cell)} |")
     return "\n".join(lines)
 
 
-def _rate(arrived: np.ndarray | None) -> str:
-    if arrived is None:
+def _rate(cell: Cell, sensor: str) -> str:
+    if sensor not in cell.arrived:
         return "–"
-    low, high = rate_interval(arrived)
-    return f"{100 * arrived.mean():.1f} ({100 * low:.1f} to {100 * high:.1f})"
+    low, high = cell.interval(sensor)
+    return f"{100 * cell.arrived[sensor].mean():.1f} ({100 * low:.1f} to {100 * high:.1f})"
+
+
+def _ahead(cell: Cell) -> str:
+    """Returns by how many points events are ahead of the best sensor of frames, with the interval."""
+    frames = [sensor for sensor in cell.arrived if sensor in FRAMES]
+    if not frames or "events" not in cell.arrived:
+        return "–"
+    best = max(frames, key=lambda sensor: cell.arrived[sensor].mean())
+    low, high = cell.lead("events", best)
+    ahead = cell.arrived["events"].mean() - cell.arrived[best].mean()
+    return f"{100 * ahead:.1f} ({100 * low:.1f} to {100 * high:.1f})"
 
 
 def _bytes_table(rows: Sequence[success.Row]) -> str:

@@ -195,3 +195,23 @@ def test_a_drone_is_hit_by_balls_where_the_world_of_its_flight_has_them(physics_
         assert abs(gaps[0]) < 0.02, (i, gaps)  # found within a step of 0.12 m
         steady += gaps[1] < 0.02
     assert steady < 4  # thrown at a drone of steady pace they would have missed nearly all
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("ahead", [1, -1])
+def test_late_balls_hit_where_mujoco_has_them(ahead):
+    late = {"balls": 8, "ball_seconds": (0.3, 1.0), "ball_speed_m_s": 12.0, "ball_slowest": 0.5}
+    config = dataclasses.replace(
+        CONFIG,
+        drone=dataclasses.replace(CONFIG.drone, physics_steps=2),
+        env=dataclasses.replace(CONFIG.env, max_decisions=300),
+        world=make_config("sparse", world={**late, "ball_radii_m": (0.15, 0.3)}).world,
+    )
+    course = load_missions(config, "sparse", 24)
+    moves = always((ahead, 0, 0))  # who flies away from a late ball's launch has it thrown at where it is
+    flights = fly_missions(config, course.env_params, moves, jax.random.key(0), extras=Extras(record=True))
+    flights = jax.tree.map(np.asarray, flights)
+    results = check_verdicts(config, course, flights)
+    assert all(result.agrees for result in results), [result for result in results if not result.agrees]
+    hits = [result for result in results if result.outcome == Outcome.COLLISION and "sphere" in str(result.touched)]
+    assert len(hits) > (5 if ahead > 0 else 0), [result.touched for result in results]

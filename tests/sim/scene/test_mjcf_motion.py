@@ -136,6 +136,7 @@ def test_a_still_world_has_no_text_and_no_body():
         ("circle 1 4 0; oscillate 0 2 0 4 0", BOX, "must be one motion, or a bounce and another one"),
         ("throw .5 2 6 0 0 0 4; bounce 1 0 0", BALL, "must be one motion, or a bounce and another one"),
         ("throw .5 0 6 0 0 0 4", BALL, "must have a share of 0 or more, and EARLY, SPEED and PACE above 0"),
+        ("throw .5 .2 6 0 0 0 4", BALL, "must begin 1.5 m away or further: EARLY times SPEED"),
         ("throw .5 2 6 0 0 0 4", BOX, "the body 'it' is thrown and must be one sphere"),
         ("oscillate 0 90 0 1 0", BOX, "the body 'it' moves at 565 m/s; an obstacle may move at 100"),
         ("bounce 0 0 1", BOX.replace('size="1 .5 2"', 'size="1 .5 6"'), "bounces and must be within the flight volume"),
