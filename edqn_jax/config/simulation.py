@@ -351,7 +351,7 @@ class ExposureConfig:
     latency_s: Annotated[float, between(0, 1)] = 0.0
     """Seconds from the end of an exposure until the frame is there, for readout and transfer."""
     real: bool = False
-    """Whether frames have an exposure time, motion blur, noise and 8 bits; needs `light`. If not, they are perfect."""
+    """Whether frames have an exposure time, motion blur, noise and levels; needs `light`. If not, they are perfect."""
     shortest_s: Annotated[float, POSITIVE] = 1e-4
     """Shortest exposure, seconds; the camera chooses it by the light."""
     longest_s: Annotated[float, POSITIVE] = 0.02
@@ -368,3 +368,8 @@ class ExposureConfig:
     """Electrons that a pixel holds; at a gain of 1 they are white."""
     read_noise_e: Annotated[float, NOT_NEGATIVE] = 18.0
     """Standard deviation of the read noise, electrons."""
+    bits: Literal[8, 10, 12] = 8
+    """Bits of a level."""
+    metering_s: Annotated[float, NOT_NEGATIVE] = 0.0
+    """Time constant with which exposure follows the brightness of the pictures, seconds. 0: the last decision's picture
+    alone sets it."""

@@ -37,7 +37,7 @@ def pose(position: NDArray, quaternion: NDArray, dt: float, before: float) -> tu
     return (1 - share) * position[newer] + share * position[older], mixed / np.linalg.norm(mixed)
 
 
-def level(electrons: float, random: float, gain: float, read_noise: float, well: float) -> int:
-    """The 8-bit level of a pixel whose standard normal random number is `random`."""
+def level(electrons: float, random: float, gain: float, read_noise: float, well: float, white: int = 255) -> int:
+    """The level of a pixel whose standard normal random number is `random`."""
     read = electrons + random * (electrons + read_noise**2) ** 0.5
-    return min(max(round(255.0 * gain * read / well), 0), 255)
+    return min(max(round(white * gain * read / well), 0), white)

@@ -85,7 +85,7 @@ def test_a_sound_run_against_every_disturbance_has_no_fault() -> None:
 def test_a_sound_run_with_a_faulty_sensor_in_any_light_has_no_fault(sensor: str) -> None:
     light = ("--light.least-lux", "0.1", "--light.most-lux", "10000", "--events.hot-pixel-fraction", "0.1")
     faults = ("--events.profile", "dvs", "--exposure.real", "--env.sensor", sensor, "--events.law", "esim")
-    clock = ("--exposure.rate-hz", "30", "--exposure.latency-s", "0.2")
+    clock = ("--exposure.rate-hz", "30", "--exposure.latency-s", "0.2", "--exposure.bits", "12")
     trainer = trainer_of((*CHECKED, *light, *faults, *clock))
     state, (_, losses) = trainer.chunk(trainer.init(0), 0)
     assert jnp.isfinite(losses.metrics["reconstruction_loss"][-1])

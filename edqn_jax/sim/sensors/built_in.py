@@ -91,14 +91,16 @@ def _take_frames(
     """
     assert isinstance(memory, FrameMemory)
     lux, metered, time, gain = memory.lux, memory.metered, jnp.zeros(()), jnp.ones(())
+    options = config.exposure
     if lux is not None and metered is not None:
-        time, gain = exposure.exposure_settings(config.exposure, lux, metered)
+        time, gain = exposure.exposure_settings(options, lux, metered)
     within, clock = exposure.poses_of_frames(config, memory.clock, poses, time, times)
     views = _views(config, scene, jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), within))
     frames = jnp.mean(views.reshape(len(times), -1, *views.shape[1:]), axis=1)
-    if lux is not None:
-        frames = exposure.develop_picture(config.exposure, frames, lux, time, gain, key)
-        metered = exposure.meter_brightness(config.exposure, frames[-1], lux, time, gain)
+    if lux is not None and metered is not None:
+        frames = exposure.develop_picture(options, frames, lux, time, gain, key)
+        measured = exposure.meter_brightness(options, frames[-1], lux, time, gain)
+        metered = exposure.follow_brightness(config, metered, measured)
     return frames, FrameMemory(lux=lux, metered=metered, clock=clock)
 
 

@@ -1,4 +1,4 @@
-"""A camera that takes frames: exposure time, motion blur, photon and read noise, a full well, 8 bits; and its clock.
+"""A camera that takes frames: exposure time, motion blur, photon and read noise, a full well, levels; and its clock.
 
 Photons arrive at random, so N electrons have a standard deviation of sqrt(N); reading them adds `read_noise_e` (EMVA
 standard 1288, the linear camera model, without dark current). A picture is the sum of the light over its exposure: here
@@ -21,9 +21,6 @@ from edqn_jax.config import Config, ExposureConfig
 from edqn_jax.sim.physics.drone import Flight
 from edqn_jax.sim.sensors import frame_clock, light
 from edqn_jax.sim.sensors.frame_clock import Clock, poses_before
-
-WHITE = 255.0
-"""Largest value of 8 bits."""
 
 AT_REST = 0.4
 """Mean brightness that a camera expects before its first picture: about that of a scene with some sky."""
@@ -114,7 +111,7 @@ def exposure_settings(exposure: ExposureConfig, lux: Array, metered: Array) -> t
 
 
 def develop_picture(exposure: ExposureConfig, luma: Array, lux: Array, time: Array, gain: Array, key: Array) -> Array:
-    """Returns the picture [...] of mean luma [...]: 8-bit levels as shares of white. `key` is consumed.
+    """Returns the picture [...] of mean luma [...]: levels of `bits` as shares of white. `key` is consumed.
 
     The Poisson distribution of electrons is taken for a normal one of its variance, which is far off only where there
     are fewer than `read_noise_e` squared anyway.
@@ -128,8 +125,9 @@ def develop_picture(exposure: ExposureConfig, luma: Array, lux: Array, time: Arr
     electrons = exposure.sensitivity_e_lux_s * lux * time * luma
     spread = jnp.sqrt(electrons + exposure.read_noise_e**2)
     read = electrons + spread * jax.random.normal(key, luma.shape)
-    levels = jnp.round(WHITE * gain * read / exposure.full_well_e)
-    return jnp.clip(levels, 0.0, WHITE) / WHITE
+    white = 2.0**exposure.bits - 1.0
+    levels = jnp.round(white * gain * read / exposure.full_well_e)
+    return jnp.clip(levels, 0.0, white) / white
 
 
 def meter_brightness(exposure: ExposureConfig, picture: Array, lux: Array, time: Array, gain: Array) -> Array:
@@ -140,3 +138,15 @@ def meter_brightness(exposure: ExposureConfig, picture: Array, lux: Array, time:
         lux, time, gain: illuminance in lux, seconds of exposure, and gain, as in `develop_picture`.
     """
     return jnp.mean(picture) * exposure.full_well_e / (exposure.sensitivity_e_lux_s * lux * time * gain)
+
+
+def follow_brightness(config: Config, metered: Array, measured: Array) -> Array:
+    """Returns the mean brightness [] that the next exposure is set for, a decision after `metered` [] was.
+
+    It follows what is `measured` [] of the picture with the time constant `metering_s`, in the logarithm.
+    """
+    if not config.exposure.metering_s:
+        return measured
+    left = math.exp(-config.drone.physics_steps * config.drone.physics_dt_s / config.exposure.metering_s)
+    before, now = jnp.log(jnp.maximum(metered, DARKEST)), jnp.log(jnp.maximum(measured, DARKEST))
+    return jnp.exp(now + left * (before - now))

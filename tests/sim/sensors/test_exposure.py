@@ -70,20 +70,26 @@ def test_sub_frames_are_taken_where_the_drone_was(seed, steps, share):
 
 
 @few
-@given(seed=st.integers(0, 2**31 - 1), lux=st.floats(0.1, 10_000.0), gain=st.floats(1.0, 4.0))
-def test_levels_are_those_of_the_plain_camera(seed, lux, gain):
+@given(
+    seed=st.integers(0, 2**31 - 1),
+    lux=st.floats(0.1, 10_000.0),
+    gain=st.floats(1.0, 4.0),
+    bits=st.sampled_from([8, 10, 12]),
+)
+def test_levels_are_those_of_the_plain_camera(seed, lux, gain, bits):
     luma = np.random.default_rng(seed).random((4, 5)).astype(np.float32)
     key, time = jax.random.key(seed), 0.4 * 10_000 / (6000 * lux)
+    white, options = 2**bits - 1, dataclasses.replace(REAL, bits=bits)
     shown = exposure.develop_picture(
-        REAL, jnp.asarray(luma), jnp.float32(lux), jnp.float32(time), jnp.float32(gain), key
+        options, jnp.asarray(luma), jnp.float32(lux), jnp.float32(time), jnp.float32(gain), key
     )
     random = np.asarray(jax.random.normal(key, (4, 5)))
     plain = [
-        exposure_plain.level(6000 * lux * time * e, z, gain, 18.0, 10_000.0)
+        exposure_plain.level(6000 * lux * time * e, z, gain, 18.0, 10_000.0, white)
         for e, z in zip(luma.flat, random.flat, strict=True)
     ]
     # float32 may round a level that is nearly half way to the other side.
-    difference = np.abs(np.asarray(shown).ravel() * 255 - plain)
+    difference = np.abs(np.asarray(shown).ravel() * white - plain)
     assert difference.max() <= 1.001 and np.mean(difference > 0.01) <= 0.05
 
 
@@ -101,6 +107,25 @@ def test_quantisation_errs_by_at_most_half_a_level():
     error = np.abs(taken(QUIET, luma, 100.0, 0.01) - luma) * 255
     assert error.max() <= 0.5 + 1e-3 and error.max() > 0.49
     assert np.unique(taken(QUIET, luma, 100.0, 0.01)).size == 256
+
+
+def test_twelve_bits_resolve_the_shade_that_eight_do_not():
+    luma = np.linspace(0.0, 0.004, 200, dtype=np.float32)  # of white: one level of 8 bits
+    shown = {bits: taken(dataclasses.replace(QUIET, bits=bits), luma, 100.0, 0.01) for bits in (8, 12)}
+    assert np.unique(shown[8]).size == 2 and np.unique(shown[12]).size == 17
+
+
+def test_exposure_follows_the_light_with_its_time_constant():
+    config = config_of("frames", dataclasses.replace(REAL, metering_s=0.5))
+    metered = jnp.float32(0.04)
+    for decision in range(1, 5):
+        metered = exposure.follow_brightness(config, metered, jnp.float32(0.4))
+        # A decision is 0.26 s; in the logarithm what is left of a factor of ten decays.
+        assert np.log10(float(metered) / 0.4) == pytest.approx(-np.exp(-0.26 * decision / 0.5), abs=1e-4)
+    at_once = exposure.follow_brightness(config_of("frames"), jnp.float32(0.04), jnp.float32(0.4))
+    assert float(at_once) == pytest.approx(0.4)
+    black = exposure.follow_brightness(config, jnp.float32(0.0), jnp.float32(0.0))
+    assert float(black) == pytest.approx(exposure.DARKEST)
 
 
 def test_the_mean_of_many_noisy_frames_is_the_ideal_one():
