@@ -17,6 +17,7 @@ from scipy.spatial import KDTree
 
 from edqn_jax.errors import ConfigError
 from edqn_jax.sim.scene.free_ends import find_ends
+from edqn_jax.sim.scene.grid_boxes import clustered
 from edqn_jax.sim.scene.mesh_field import Grid, check_mesh, grid_of_mesh
 from edqn_jax.sim.scene.mjcf_parts.assets import load_geometry
 from edqn_jax.sim.scene.octomap import read_octomap
@@ -123,7 +124,7 @@ def read_scan(file: Path, options: ScanOptions) -> Scan:
                 f"'{file}' has {len(faces):,} triangles, even where those within {options.thickness:g} m "
                 "are one; give a larger --thickness, or a smaller part of it"
             )
-        vertices, faces = _clustered(vertices, faces, step)
+        vertices, faces = clustered(vertices, faces, step)
     return Scan(vertices, faces, options.thickness, was)
 
 
@@ -248,18 +249,6 @@ def _triangles_of_points(points: NDArray[np.float64], radius: float) -> tuple[ND
     corners = radius * np.stack([np.cos(turn), np.sin(turn), np.zeros(3)], axis=1)
     vertices = np.round(points[:, None] + corners, 4).reshape(-1, 3)
     return vertices, np.arange(len(vertices)).reshape(-1, 3)
-
-
-def _clustered(
-    vertices: NDArray[np.float64], faces: NDArray[np.int64], step: float
-) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Returns a mesh whose vertices in each cube of sides `step` are one."""
-    _, first, number = np.unique(
-        np.floor(vertices / step).astype(np.int64), axis=0, return_index=True, return_inverse=True
-    )
-    rings = np.unique(np.sort(number.reshape(-1)[faces], axis=1), axis=0)
-    rings = rings[(np.diff(rings, axis=1) > 0).all(1)]
-    return vertices[first], rings
 
 
 def _text(values: Any) -> str:
