@@ -4,16 +4,17 @@
     python scripts/try_public_mjcf.py FOLDER --out table.tsv --still SCRATCH
 
 A file counts if MuJoCo opens it and it has a solid geom at rest that is no plane. Start and goal are free places in
-opposite corners of its flight volume; a world is flown if `edqn check` finds a way between them. With --still, what
+opposite corners of its flight volume; a world is flown if there is a way between them for the drone. With --still, what
 moves is taken away first, and what acts on it: MuJoCo writes each file to a folder of its own in SCRATCH, together with
 the meshes and height fields that are left; and what is said of meshes that are not closed is done, they get a
 thickness. One row a file: its path, `flown`, `refused` or `crashed`, how many meshes got a thickness, seconds, the
-reason.
+reason. Rows that the table has already are kept.
 """
 
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import shutil
 import sys
 import time
@@ -27,12 +28,13 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 
-from edqn_jax import load_policy
+from edqn_jax.config import Config
 from edqn_jax.errors import ConfigError
-from edqn_jax.evaluation.world_check import check_world
-from edqn_jax.sim.scene.distance import signed_distance
-from edqn_jax.sim.scene.mjcf import check_volume, load_world
+from edqn_jax.planning.lattice import clearances
+from edqn_jax.planning.widest import find_widest_way, is_roomy
+from edqn_jax.sim.scene.mjcf import check_scene, check_volume, load_world
 from edqn_jax.sim.scene.mjcf_parts.geoms import is_solid
+from edqn_jax.sim.scene.scene import Scene
 from edqn_jax.sim.scene.shapes.kind import THICKNESS
 from edqn_jax.sim.scene.survey import survey_world
 
@@ -125,8 +127,8 @@ def add_thickness(path: Path) -> int:
     return len(open_ones)
 
 
-def free_corners(path: Path) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    """Returns free places far apart in the volume of a world.
+def with_free_ends(path: Path) -> Scene:
+    """Returns a world with start and goal at free places far apart in its volume.
 
     Raises:
         ConfigError: if there are none, or the file is no world.
@@ -135,20 +137,22 @@ def free_corners(path: Path) -> tuple[tuple[float, ...], tuple[float, ...]]:
     low, high = check_volume(scene, path.name)
     axes = [np.linspace(a + ROOM_M, b - ROOM_M, 9) for a, b in zip(low, high, strict=True)]
     points = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
-    distance = jax.jit(jax.vmap(lambda point: signed_distance(scene, point)))(jnp.asarray(points, jnp.float32))
-    free = points[np.asarray(distance) >= ROOM_M]
+    free = points[clearances(scene, points) >= ROOM_M]
     if len(free) < 2:
-        raise ConfigError("it has no two free places")
+        raise ConfigError(f"it has no two free places, {ROOM_M:g} m from all that is there")
     away = (free - low) @ np.array([1.0, 1.0, 0.2])
-    return tuple(map(float, free[np.argmin(away)])), tuple(map(float, free[np.argmax(away)]))
+    start, goal = (jnp.asarray(free[pick(away)], jnp.float32) for pick in (np.argmin, np.argmax))
+    return dataclasses.replace(scene, start=start, goal=goal)
 
 
-def outcome_of(path: Path) -> tuple[str, str]:
+def outcome_of(path: Path, radius: float) -> tuple[str, str]:
     """Returns what became of a file, and why."""
     try:
-        start, goal = free_corners(path)
-        found = check_world(load_policy("pretrained").config, str(path), start=start, goal=goal)  # type: ignore[arg-type]
-        return ("flown", "") if found.refusal is None else ("refused", found.refusal)
+        scene = with_free_ends(path)
+        check_scene(scene, radius)
+        if is_roomy(scene, radius, radius) or ((way := find_widest_way(scene, radius)) is not None and way.fits):
+            return "flown", ""
+        return "refused", "there is no way between two free places"
     except ConfigError as error:
         return "refused", str(error)
     except Exception as error:
@@ -164,17 +168,19 @@ def main() -> None:
     parser.add_argument("--still", type=Path, help="folder for the files without what moves")
     args = parser.parse_args()
     mujoco.set_mju_user_warning(lambda _: None)
-    counts: Counter[str] = Counter()
-    with args.out.open("w", encoding="utf-8") as table:
+    rows = [line.split("\t") for line in args.out.read_text().splitlines()] if args.out.is_file() else []
+    counts, known = Counter(row[1] for row in rows), {row[0] for row in rows}
+    radius = Config().drone.body_radius_m
+    with args.out.open("a", encoding="utf-8") as table:
         for file in sorted(args.folder.rglob("*.xml")):
-            if not is_counted(file):
+            if str(file.relative_to(args.folder)) in known or not is_counted(file):
                 continue
             begin, name, thickened = time.monotonic(), file.relative_to(args.folder), 0
             try:
                 tried = file if args.still is None else write_still(file, args.still / name.with_suffix(""))
                 if args.still is not None:
                     thickened = add_thickness(tried)
-                outcome, reason = outcome_of(tried)
+                outcome, reason = outcome_of(tried, radius)
                 reason = reason.replace(str(tried), file.name)
             except (ValueError, OSError, ElementTree.ParseError) as error:
                 outcome, reason = "not made still", " ".join(str(error).split())

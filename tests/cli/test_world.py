@@ -11,6 +11,7 @@ import trimesh
 from edqn_jax.cli import main
 from edqn_jax.sim.scene import scan
 from edqn_jax.sim.scene.mjcf import check_scene, load_world, mjcf_of
+from tests.support.octomaps import octomap_of
 
 ROOM = (8.0, 5.0, 3.0)
 
@@ -87,6 +88,18 @@ def test_a_cloud_of_points_has_a_thickness(capsys: pytest.CaptureFixture[str]) -
     flown_inside("here")
 
 
+def test_an_octomap_is_a_world(capsys: pytest.CaptureFixture[str]) -> None:
+    x, y, z = np.indices((80, 50, 30))
+    walls = (np.minimum(x, 79 - x) < 2) | (np.minimum(y, 49 - y) < 2) | (np.minimum(z, 29 - z) < 2)
+    walls |= (abs(x - 42) < 3) & (abs(y - 22) < 3)
+    Path("room.bt").write_bytes(octomap_of(np.argwhere(walls) - 20, 0.1))
+    assert main(["world", "room.bt", "--out", "here"]) == 0
+    assert f"{walls.sum():,} voxels, 0.15 m thick" in capsys.readouterr().out
+    flown_inside("here")
+    grid = load_world("here/world.xml").scene.others["fields"].grids[0]
+    assert grid.thickness == pytest.approx(0.15)
+
+
 def test_many_triangles_are_thinned_out(monkeypatch: pytest.MonkeyPatch) -> None:
     ball = trimesh.creation.icosphere(subdivisions=4, radius=2)
     trimesh.Trimesh(ball.vertices, ball.faces[1:]).export("ball.ply")
@@ -101,7 +114,8 @@ def test_many_triangles_are_thinned_out(monkeypatch: pytest.MonkeyPatch) -> None
 
 BAD = {
     "none.ply": "there is no file 'none.ply'",
-    "room.fbx": "is no known scan; it must end in .ply, .stl, .obj, .glb",
+    "room.fbx": "is no known scan; it must end in .ply, .stl, .obj, .glb, .bt",
+    "empty.bt": "'empty.bt' has 0 points; a world needs more",
     "small.ply": "measures 0.8 x 0.5 x 0.3 m, too little to fly in; give --scale",
     "large.ply": "m, more than 400; give a smaller --scale, 0.001 if it is in millimetres",
     "tall.ply": "is taller than it is wide, 3 x 5 x 8 m; say which axis points up: --up y, or --up z",
@@ -130,6 +144,8 @@ def test_what_cannot_be_a_world_is_refused_in_a_sentence_and_nothing_is_written(
         Path(name).write_text("v 0 0 0\nv 1 0 0\nv nan 1 0\nv 1 1 2\nf 1 2 3\nf 2 3 4\n")
     elif name == "sparse.ply":
         trimesh.PointCloud(trimesh.sample.sample_surface(mesh, 300, seed=1)[0]).export(name)
+    elif name == "empty.bt":
+        Path(name).write_bytes(b"# Octomap OcTree binary file\nid OcTree\nres 0.1\ndata\n")
     elif name == "many.ply":
         Path(name).write_bytes(b"ply\nformat binary_little_endian 1.0\nelement vertex 3\nelement face 10000000\n")
     before = sorted(Path().iterdir())

@@ -64,6 +64,7 @@
     constructor(canvas) {
       this.renderer = new THREE.WebGLRenderer({ canvas, antialias: true, preserveDrawingBuffer: true });
       this.renderer.setPixelRatio(Math.min(window.devicePixelRatio || 1, 2));
+      this.renderer.localClippingEnabled = true;
       this.scene = new THREE.Scene();
       this.scene.background = new THREE.Color("#e9eef3");
       this.scene.add(new THREE.HemisphereLight("#ffffff", "#b9b4a6", 2.2));
@@ -87,6 +88,7 @@
         this.drop("solids");
         this.solids = new THREE.Group();
         this.closing = [];
+        this.hiding = [];
         this.movers = [];
         this.solids.add(ground(world));
         for (const shape of world.shapes) {
@@ -94,6 +96,7 @@
           this.solids.add(solid);
           if (shape.closes) this.closing.push([solid, shape]);
           if (shape.moves) this.movers.push([solid, shape]);
+          if (shape.hides) this.hiding.push(cutOff(solid));
         }
         this.scene.add(this.solids);
       }
@@ -185,6 +188,8 @@
         const scale = Math.max(1, position.distanceTo(this.camera.position) / far);
         drone.children.forEach((part) => { if (part.name === "body") part.scale.setScalar(scale); });
         if (chosen) {
+          const cut = position.z + 1;
+          this.hiding.forEach((plane) => { plane.constant = !riding && this.camera.position.z > cut ? cut : 1e9; });
           this.sightOf(drone, turn, flight);
           drone.visible = this.mode !== "eye";
           line.visible = this.mode !== "eye";
@@ -289,9 +294,26 @@
       }
     }
     const geometry = new THREE.BufferGeometry();
-    geometry.setAttribute("position", new THREE.Float32BufferAttribute(corners, 3));
+    geometry.setAttribute("position", new THREE.BufferAttribute(new Float32Array(corners), 3));
     geometry.computeVertexNormals();
     return geometry;
+  }
+
+  const BOTH_SIDES = 2;  // three.js's own number
+
+  /** Returns a surface of triangles. */
+  function meshOf({ vertices, triangles }) {
+    const geometry = new THREE.BufferGeometry();
+    geometry.setAttribute("position", new THREE.BufferAttribute(new Float32Array(triangles.flat().flatMap((corner) => vertices[corner])), 3));
+    geometry.computeVertexNormals();
+    return geometry;
+  }
+
+  /** Lets a solid end at a height, and returns the plane that says which. */
+  function cutOff(solid) {
+    const plane = { normal: new THREE.Vector3(0, 0, -1), constant: 1e9 };
+    solid.material.clippingPlanes = [plane];
+    return plane;
   }
 
   function solidOf(shape) {
@@ -300,8 +322,9 @@
     else if (shape.kind === "sphere") geometry = new THREE.SphereGeometry(shape.radius, 32, 20);
     else if (shape.kind === "capsule") geometry = new THREE.CapsuleGeometry(shape.radius, 2 * shape.half, 10, 28);
     else if (shape.kind === "faces") geometry = geometryOf(shape.faces);
+    else if (shape.kind === "mesh") geometry = meshOf(shape);
     else geometry = new THREE.CylinderGeometry(shape.radius, shape.radius, 2 * shape.half, 40);
-    const solid = new THREE.Mesh(geometry, new THREE.MeshLambertMaterial({ color: shape.colour }));
+    const solid = new THREE.Mesh(geometry, new THREE.MeshLambertMaterial({ color: shape.colour, side: shape.kind === "mesh" ? BOTH_SIDES : 0 }));
     if (shape.turn) {
       const m = shape.turn;
       solid.quaternion.setFromRotationMatrix(

@@ -9,7 +9,7 @@ from typing import Any
 import jax.numpy as jnp
 import numpy as np
 
-from edqn_jax.report.worlds.solids import Solid, boundary_side, solids_of_shape, standing_rows
+from edqn_jax.report.worlds.solids import Solid, boundary_side, cut_of, solids_of_shape, standing_rows
 from edqn_jax.sim.scene.motion import NEVER, OUTSIDE_M, ball_positions
 from edqn_jax.sim.scene.scene import Scene, aim_of
 from edqn_jax.sim.scene.shapes.kind import ShapeKind
@@ -18,8 +18,9 @@ from edqn_jax.sim.scene.shapes.kind import ShapeKind
 def world_data(scene: Scene) -> dict[str, Any]:
     """Returns one world as plain JSON data: `lower` and `upper` of its volume, and `shapes`, lengths in metres.
 
-    A shape has its `kind` (box, cylinder, capsule, sphere, faces), centre `at`, `colour`, and of its kind `half` and
-    `turn` (body-to-world, row by row), `radius`, `axis` and `half`, or `faces`, rings of corners about the centre.
+    A shape has its `kind` (box, cylinder, capsule, sphere, faces, mesh), centre `at`, `colour`, and of its kind `half`
+    and `turn` (body-to-world, row by row), `radius`, `axis` and `half`, `faces`, rings of corners about the centre, or
+    `turn`, `vertices` and `triangles`; a mesh that `hides` flights is cut off above the drone, seen from above.
     `closes` is the axis and the sign of the side of the volume that a ceiling or an outer wall closes: the view leaves
     it out when it looks from there. `moves` says where a shape is at another time.
     """
@@ -27,9 +28,13 @@ def world_data(scene: Scene) -> dict[str, Any]:
     shapes = []
     for kind, shape in standing_rows(scene):
         moves = _motion(shape)
-        for solid in solids_of_shape(kind, shape):
+        parts = solids_of_shape(kind, shape)
+        hides = {"hides": True} if cut_of(parts, scene) is not None else {}
+        if kind.page is not None and kind.faces is not None:
+            parts = [Solid(list(kind.faces(shape)), shape.albedo)]
+        for solid in parts:
             closes = None if moves else boundary_side(solid, lower, upper)
-            drawn = _drawing(kind, shape, solid) | {"colour": _hex(solid.colour)} | moves
+            drawn = _drawing(kind, shape, solid) | {"colour": _hex(solid.colour)} | moves | hides
             shapes.append(drawn | ({} if closes is None else {"closes": list(closes)}))
     return {"lower": round_values(lower), "upper": round_values(upper), "shapes": shapes}
 
@@ -80,14 +85,18 @@ def _drawing(kind: ShapeKind, shape: Any, solid: Solid) -> dict[str, Any]:
 
     The view takes each face's outer side from the place that the solid stands at, which is within.
     """
-    at = shape.position if kind.parts is None else solid.corners.mean(0)
+    at = solid.corners.mean(0) if kind.page is None and kind.parts is not None else shape.position
     if kind.page is None:
         sizes = {"kind": "faces", "faces": [face - at for face in solid.faces]}
     else:
         sizes = kind.page(shape)
     digits = {"turn": 5, "axis": 5}
     numbers = {
-        name: [round_values(ring) for ring in value] if name == "faces" else round_values(value, digits.get(name, 3))
+        name: [round_values(ring) for ring in value]
+        if name == "faces"
+        else np.asarray(value).tolist()
+        if name == "triangles"
+        else round_values(value, digits.get(name, 3))
         for name, value in sizes.items()
         if name != "kind"
     }

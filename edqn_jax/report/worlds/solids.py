@@ -24,6 +24,8 @@ SUN = np.array([-0.45, -0.6, 0.66])
 GROUND = "#f4f3ef"
 SHADOW = "#dedcd5"
 OUTLINE = "#a8a8a4"
+ABOVE_M = 1.0
+"""Metres above start and goal at which what is above them is cut off."""
 NEARLY_ALL = 0.75
 """Share of the volume's width that a ceiling or an outer wall covers."""
 
@@ -87,6 +89,27 @@ def solids_of_shape(kind: ShapeKind, shape: Any) -> list[Solid]:
     return [Solid(list(faces), shape.albedo) for faces in parts]
 
 
+def cut_of(parts: Sequence[Solid], scene: Scene) -> float | None:
+    """Returns the height, metres, above which a shape of several parts hides flights: some of it is above their ends.
+
+    None of what lies above neither start nor goal.
+    """
+    ends = [end for end in np.asarray([scene.start, scene.goal], np.float64) if np.all(np.isfinite(end))]
+    for solid in parts if len(parts) > 1 else ():
+        low, high = solid.corners.min(0), solid.corners.max(0)
+        if any(np.all(low[:2] <= end[:2]) and np.all(end[:2] <= high[:2]) and low[2] > end[2] for end in ends):
+            return float(max(end[2] for end in ends)) + ABOVE_M
+    return None
+
+
+def _below(solid: Solid, cut: float) -> Solid | None:
+    """Returns the part of an upright solid below a height; None if there is none."""
+    if solid.corners[:, 2].min() >= cut:
+        return None
+    low = [np.minimum(face, [np.inf, np.inf, cut]) for face in solid.faces]
+    return Solid([face for face in low if np.linalg.norm(_newell(face)) > 1e-9], solid.colour)
+
+
 def static_scene(scene: Scene) -> Scene:
     """Returns one world without the shapes that move, and without drones."""
     scene = dataclasses.replace(scene, drones=None)
@@ -129,12 +152,15 @@ class CutawayView:
     """Whether a ceiling was left out."""
     moving: list[Solid]
     """What moves, where it is at time 0: drawn as outlines."""
+    cut: float | None = None
+    """Height, metres, above which a shape was cut off."""
 
     @property
     def note(self) -> str:
         """Note on what was cut away, for the figure; empty if nothing was."""
         parts = [name for name, cut in (("ceiling", self.has_ceiling), ("near walls", self.near_walls)) if cut]
         notes = [f"{' and '.join(parts)} cut away"] if parts else []
+        notes += [] if self.cut is None else [f"cut off above {self.cut:.1f} m"]
         return "; ".join(notes + (["outlined: what moves, as at the start"] if self.moving else []))
 
 
@@ -148,8 +174,14 @@ def make_cutaway(scene: Scene, view: View) -> CutawayView:
     middle = (lower[2] + upper[2]) / 2
     planes = zip(np.asarray(scene.planes.position), np.asarray(scene.planes.normal), strict=True)
     has_ceiling = any(normal[2] < -0.9 and middle < position[2] < PARKED / 10 for position, normal in planes)
-    shown, near_walls = [], []
-    for solid in solids_of(static_scene(scene)):
+    shown, near_walls, solids, cut = [], [], [], None
+    for kind, shape in standing_rows(static_scene(scene)):
+        parts = solids_of_shape(kind, shape)
+        above = cut_of(parts, scene)
+        if above is not None:
+            cut, parts = above, [low for each in parts if (low := _below(each, above)) is not None]
+        solids += parts
+    for solid in solids:
         side = boundary_side(solid, lower, upper)
         if side == (2, 1):
             has_ceiling = True
@@ -157,7 +189,7 @@ def make_cutaway(scene: Scene, view: View) -> CutawayView:
             near_walls.append(solid)
         else:
             shown.append(solid)
-    return CutawayView(shown, near_walls, has_ceiling, moving_solids(scene, 0.0))
+    return CutawayView(shown, near_walls, has_ceiling, moving_solids(scene, 0.0), cut)
 
 
 def boundary_side(solid: Solid, lower: np.ndarray, upper: np.ndarray) -> tuple[int, int] | None:
@@ -250,8 +282,12 @@ def standing_rows(scene: Scene) -> Iterator[tuple[ShapeKind, Any]]:
 
 def _ring_normal(face: np.ndarray) -> np.ndarray:
     # Newell's sum over the edges does not mind a corner that lies on a line between two others.
-    normal = np.sum(np.cross(face, np.roll(face, -1, axis=0)), axis=0)
+    normal = _newell(face)
     return normal / np.linalg.norm(normal)
+
+
+def _newell(face: np.ndarray) -> np.ndarray:
+    return np.sum(np.cross(face, np.roll(face, -1, axis=0)), axis=0)
 
 
 def _shadow(face: np.ndarray) -> np.ndarray:

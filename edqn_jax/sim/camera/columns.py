@@ -257,7 +257,7 @@ def _layers_of_others(config: CameraConfig, frame: Frame, u: Array, depth: int, 
     many, rays = _rays(config, frame, u, config.samples_across, config.samples_down), _rays(config, frame, u)
     for kind, met in raycast.hits(frame.scene, frame.origin, many, without=EXACT).items():
         bright = raycast.brightness_of(light, met, frame.value[kind])
-        layers = coverage.add_sampled_layers(met, bright, first[kind], many, layers)
+        layers = coverage.add_sampled_layers(met, bright, first[kind], many, layers, kind in coverage.SLOPED)
     if spheres:
         layers = coverage.sphere_layers(config, frame.scene, frame.origin, rays, frame.value, layers)
     return layers

@@ -40,6 +40,11 @@ FAR_U = 1e3
 LEVEL_FACE = 1e9
 """Value of `Layer.slope` for a face whose closeness changes with the row only."""
 
+SLOPED = ("fields",)
+"""Kinds of sampled layers with large faces, seen at any angle."""
+
+_LEVEL = 0.7  # of a unit normal: a face that is rather level than upright
+
 DEPTH_OF_LAYERS = 3
 """Layers kept per pixel. With two, slivers of near corners hide the shapes behind them (docs/decisions)."""
 
@@ -358,7 +363,9 @@ def sphere_layers(
     return layers
 
 
-def add_sampled_layers(met: Hits, brightness: Array, first: int, rays: Rays, layers: Layers) -> Layers:
+def add_sampled_layers(
+    met: Hits, brightness: Array, first: int, rays: Rays, layers: Layers, has_slopes: bool = False
+) -> Layers:
     """Adds layers of any shapes from `across` x `down` rays per pixel: the share of rays that meet the shape.
 
     Args:
@@ -367,6 +374,7 @@ def add_sampled_layers(met: Hits, brightness: Array, first: int, rays: Rays, lay
         first: number of the first of these shapes.
         rays: of all pixels.
         layers: of what was drawn before.
+        has_slopes: whether the texture is averaged along slopes, as on the large faces of `SLOPED`.
     """
     shape = jnp.broadcast_shapes(rays.dx.shape, rays.dz.shape)
     rows, columns = shape[0] // rays.down, shape[1] // rays.across
@@ -374,20 +382,29 @@ def add_sampled_layers(met: Hits, brightness: Array, first: int, rays: Rays, lay
     def mean(x: Array) -> Array:
         return jnp.mean(materialise_tree(x).reshape(rays.down, rows, rays.across, columns), axis=(0, 2))
 
+    def slope_of(hit: Array, depth: Array, normal: list[Array], coverage: Array) -> Array:
+        """Returns `Layer.slope`, that of each ray's plane: along it closeness is n . d over the distance."""
+        lean = (normal[0] * rays.right[0] + normal[1] * rays.right[1] + normal[2] * rays.right[2]) * rays.pitch
+        ahead = normal[0] * rays.dx + normal[1] * rays.dy + normal[2] * rays.dz
+        slope = mean(jnp.where(hit, lean * safe_inverse(depth) * safe_inverse(ahead), 0.0))
+        level = mean((hit & (jnp.abs(normal[2]) > _LEVEL)).astype(jnp.float32))
+        return jnp.where(level > coverage / 2, LEVEL_FACE, slope / jnp.maximum(coverage, TINY))
+
     def add(layers: Layers, one: tuple[Array, ...]) -> tuple[Layers, None]:
-        hit, depth, bright, *number = one
+        hit, depth, bright, *others = one
+        number, normal = others[3 * has_slopes :], others[: 3 * has_slopes]
         coverage = mean(hit.astype(jnp.float32))
         inverse_depth = mean(jnp.where(hit, safe_inverse(depth), 0.0))
         layer = Layer(
             closeness=inverse_depth / jnp.maximum(coverage, TINY),
             coverage=coverage,
             value=mean(jnp.where(hit, bright, 0.0)),
-            slope=jnp.zeros_like(coverage),
+            slope=slope_of(hit, depth, normal, coverage) if has_slopes else jnp.zeros_like(coverage),
             shape=jnp.broadcast_to(number[0], coverage.shape) if number else None,
         )
         return insert_layer(layers, layer), None
 
-    given = (met.hit, met.depth, brightness)
+    given = (met.hit, met.depth, brightness, *(met.normal if has_slopes else ()))
     many = tuple(jnp.broadcast_to(x, x.shape[:1] + shape) for x in given)
     if layers[0].shape is not None:
         many += (first + jnp.arange(many[0].shape[0], dtype=jnp.float32),)

@@ -1,4 +1,4 @@
-"""A grid of distances as boxes, for pictures, which draw convex solids."""
+"""A grid of distances as boxes, for pictures, which draw convex solids; and meshes of fewer triangles."""
 
 from __future__ import annotations
 
@@ -26,6 +26,28 @@ def boxes_of_grid(grid: Grid) -> NDArray[np.float64]:
         stride *= 2
         boxes = _merged_boxes(_coarser(filled, stride))
     return np.clip(low + stride * grid.cell * boxes, -grid.half, grid.half)
+
+
+def clustered(
+    vertices: NDArray[np.float64], faces: NDArray[np.int64], step: float
+) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Returns a mesh whose vertices in each cube of sides `step` are one."""
+    _, first, number = np.unique(
+        np.floor(vertices / step).astype(np.int64), axis=0, return_index=True, return_inverse=True
+    )
+    rings = np.unique(np.sort(number.reshape(-1)[faces], axis=1), axis=0)
+    rings = rings[(np.diff(rings, axis=1) > 0).all(1)]
+    return vertices[first], rings
+
+
+def thinned(vertices: NDArray[np.float64], faces: Integers, most: int) -> tuple[NDArray[np.float64], Integers]:
+    """Returns a mesh [V, 3] of at most so many triangles [F, 3]: vertices in cubes are one, the smallest that do."""
+    step = float(np.ptp(vertices, axis=0).max()) / 2000 if len(faces) > most else 0.0
+    found = vertices, faces
+    while len(found[1]) > most:
+        found = clustered(vertices, faces, step)
+        step *= 1.25
+    return found
 
 
 def _coarser(filled: NDArray[np.bool_], stride: int) -> NDArray[np.bool_]:

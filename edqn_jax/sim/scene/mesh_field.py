@@ -1,9 +1,9 @@
 """Grids of signed distances of closed meshes, made on the host before anything that flies is compiled.
 
 Between the points of a grid a distance is interpolated, which is too large beside edges and corners. So values are
-lowered there by as much as the interpolation exceeds the exact distance: of convex meshes at points half a cell apart,
-of others (`solid_distance.py`) in the middle of each cell and at points of the surface, so that what is thinner than a
-cell is still there.
+lowered there by as much as the interpolation exceeds the exact distance: of small convex meshes at points half a cell
+apart, of others (`solid_distance.py`) in the middle of each cell and at points of the surface, so that what is thinner
+than a cell is still there.
 
 V vertices, F triangles; distances in metres, negative inside.
 """
@@ -129,18 +129,19 @@ def _grid(vertices: bytes, faces: bytes, cell: float | None, thickness: float) -
             f"{cell:g} m would be {np.prod(_counts(half, cell)):,.0f} values; a mesh may have {MOST_VALUES:,}, so make "
             "it of smaller ones, or of boxes"
         )
-    if is_convex:
-        corners, rings = hull_of(given)
-        values = _lowered_values(corners - middle, rings, half, cell)
-        return Grid.of(values, cell, half, corners - middle, rings), middle
+    corners, rings = hull_of(given) if is_convex else (given, triangles)
+    corners = corners - middle
 
     def make() -> Numbers:
-        return _lowered_values_of_solid((given - middle)[triangles], half, cell, thickness)
+        # Of large convex meshes, points half a cell apart are too many.
+        if is_convex and not is_large:
+            return _lowered_values(corners, rings, half, cell)
+        return _lowered_values_of_solid(corners[rings], half, cell, thickness)
 
     is_large = np.prod(_counts(half, cell)) >= KEPT_VALUES
     content = (vertices, faces, np.array([cell, thickness]).tobytes())
     values = kept_values(content, make) if is_large else make()
-    return Grid.of(values, cell, half, given - middle, triangles, is_convex=False, thickness=thickness), middle
+    return Grid.of(values, cell, half, corners, rings, is_convex, thickness), middle
 
 
 def is_hull(vertices: Numbers, faces: NDArray[np.integer]) -> bool:

@@ -1,6 +1,7 @@
-"""A scan, a mesh or a cloud of points, as a world: an MJCF file and the mesh that it names.
+"""A scan, a mesh, a cloud of points or an OctoMap, as a world: an MJCF file and the mesh that it names.
 
-What is closed stays as it is. Anything else is a surface with a thickness, of which a point is a small triangle.
+What is closed stays as it is. Anything else is a surface with a thickness, of which a point is a small triangle; of a
+map the points are the middles of its occupied voxels.
 """
 
 from __future__ import annotations
@@ -16,11 +17,13 @@ from scipy.spatial import KDTree
 
 from edqn_jax.errors import ConfigError
 from edqn_jax.sim.scene.free_ends import find_ends
+from edqn_jax.sim.scene.grid_boxes import clustered
 from edqn_jax.sim.scene.mesh_field import Grid, check_mesh, grid_of_mesh
 from edqn_jax.sim.scene.mjcf_parts.assets import load_geometry
+from edqn_jax.sim.scene.octomap import read_octomap
 from edqn_jax.sim.scene.shapes.kind import THICKNESS
 
-KINDS = ("ply", "stl", "obj", "glb")
+KINDS = ("ply", "stl", "obj", "glb", "bt")
 """Endings of scans."""
 
 MOST_READ = 5_000_000
@@ -33,6 +36,9 @@ SMALLEST_M, LARGEST_M = 1.0, 400.0
 """Between which the longest side of a scan is plausible."""
 
 CLOUD_THICKNESS_M = 0.1
+
+VOXEL_THICKNESS = 1.5
+"""Sides of a voxel; neighbours then leave no gap."""
 
 MARGIN_M = 2.0
 """Metres of the flight volume around a scan, and above it."""
@@ -54,7 +60,8 @@ class ScanOptions:
     up: str | None = None
     """Axis of the file that points up; None: y of .glb, z of the others."""
     thickness: float | None = None
-    """Metres of a surface that is not closed; None: a cloud has `CLOUD_THICKNESS_M`, and a mesh is closed."""
+    """Metres of a surface that is not closed; None: a cloud has `CLOUD_THICKNESS_M`, a map `VOXEL_THICKNESS` of its
+    voxels' sides, and a mesh is closed."""
     start: Point | None = None
     """Metres, in the world; None: free places far apart are found."""
     goal: Point | None = None
@@ -85,14 +92,19 @@ def read_scan(file: Path, options: ScanOptions) -> Scan:
         raise ConfigError(f"'{file}' is no known scan; it must end in {', '.join(f'.{each}' for each in KINDS)}")
     if not file.is_file():
         raise ConfigError(f"there is no file '{file}'")
-    found = load_geometry(file, kind, MOST_READ)
-    vertices, faces, was = _content(file, found)
+    usual = CLOUD_THICKNESS_M
+    if kind == "bt":
+        vertices, side = read_octomap(file)
+        faces, was, usual = None, f"{len(vertices):,} voxels", VOXEL_THICKNESS * side * options.scale
+        _check_points(file, vertices)
+    else:
+        vertices, faces, was = _content(file, load_geometry(file, kind, MOST_READ))
     up = options.up or ("y" if kind == "glb" else "z")
     vertices = options.scale * vertices @ _turn(up).T
     _check_size(file, np.ptp(vertices, axis=0), options)
     vertices = vertices - vertices.min(0)
     if faces is None:
-        thickness = options.thickness or CLOUD_THICKNESS_M
+        thickness = options.thickness or usual
         _check_spacing(file, vertices, thickness)
         return Scan(*_triangles_of_points(_thinned(vertices, thickness / 2), thickness / 4), thickness, was)
     vertices, number = np.unique(np.round(vertices, 4), axis=0, return_inverse=True)
@@ -112,7 +124,7 @@ def read_scan(file: Path, options: ScanOptions) -> Scan:
                 f"'{file}' has {len(faces):,} triangles, even where those within {options.thickness:g} m "
                 "are one; give a larger --thickness, or a smaller part of it"
             )
-        vertices, faces = _clustered(vertices, faces, step)
+        vertices, faces = clustered(vertices, faces, step)
     return Scan(vertices, faces, options.thickness, was)
 
 
@@ -169,11 +181,16 @@ def _content(file: Path, found: Any) -> tuple[NDArray[np.float64], NDArray[np.in
     count, what = (len(faces), "triangles") if len(faces) else (len(vertices), "points")
     if count > MOST_READ:
         raise ConfigError(f"'{file}' has {count:,} {what}; it may have {MOST_READ:,}, so thin it out")
-    if len(vertices) < 4:
-        raise ConfigError(f"'{file}' has {len(vertices)} points; a world needs more")
+    _check_points(file, vertices)
     if not np.all(np.isfinite(vertices)):
         raise ConfigError(f"'{file}' has a point that is not finite; give it numbers")
     return vertices, faces if len(faces) else None, f"{count:,} {what}"
+
+
+def _check_points(file: Path, points: NDArray[np.float64]) -> None:
+    """Raises ConfigError if a scan has too few points [P, 3]."""
+    if len(points) < 4:
+        raise ConfigError(f"'{file}' has {len(points)} points; a world needs more")
 
 
 def _turn(up: str) -> NDArray[np.float64]:
@@ -232,18 +249,6 @@ def _triangles_of_points(points: NDArray[np.float64], radius: float) -> tuple[ND
     corners = radius * np.stack([np.cos(turn), np.sin(turn), np.zeros(3)], axis=1)
     vertices = np.round(points[:, None] + corners, 4).reshape(-1, 3)
     return vertices, np.arange(len(vertices)).reshape(-1, 3)
-
-
-def _clustered(
-    vertices: NDArray[np.float64], faces: NDArray[np.int64], step: float
-) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Returns a mesh whose vertices in each cube of sides `step` are one."""
-    _, first, number = np.unique(
-        np.floor(vertices / step).astype(np.int64), axis=0, return_index=True, return_inverse=True
-    )
-    rings = np.unique(np.sort(number.reshape(-1)[faces], axis=1), axis=0)
-    rings = rings[(np.diff(rings, axis=1) > 0).all(1)]
-    return vertices[first], rings
 
 
 def _text(values: Any) -> str:

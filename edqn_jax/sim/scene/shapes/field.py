@@ -17,7 +17,7 @@ import numpy as np
 from flax import struct
 from jax import Array, lax
 
-from edqn_jax.sim.scene.grid_boxes import boxes_of_grid
+from edqn_jax.sim.scene.grid_boxes import boxes_of_grid, thinned
 from edqn_jax.sim.scene.mesh_field import Grid, grid_of_mesh, hull_of, spread_directions
 from edqn_jax.sim.scene.motion import Motion
 from edqn_jax.sim.scene.shapes import field_rays
@@ -46,6 +46,7 @@ TOUCHES = 1e-6
 """Metres that are none."""
 
 _MOST_FACES = 400  # of a solid in pictures
+_MOST_TRIANGLES = 50_000  # of a mesh on the page
 
 
 @struct.dataclass
@@ -286,6 +287,14 @@ def _parts(one: Fields) -> list[list[np.ndarray]]:
     ]
 
 
+def _page(one: Fields) -> dict[str, Any]:
+    grid = grid_of(one)
+    if grid.is_convex:
+        return {"kind": "faces", "faces": [ring - one.position for ring in _faces(one)]}
+    vertices, faces = thinned(grid.vertices, grid.faces, _MOST_TRIANGLES)
+    return {"kind": "mesh", "turn": np.asarray(one.rotation).ravel(), "vertices": vertices, "triangles": faces}
+
+
 def _share(several: Sequence[Fields]) -> list[Fields]:
     """Returns fields, single or not, with one tuple of grids, in which each grid stands once."""
     grids = tuple(dict.fromkeys(grid for each in several for grid in each.grids))
@@ -315,4 +324,5 @@ FIELD = ShapeKind(
     reach=lambda fields: (abs(fields.rotation) * fields.half[..., None, :]).sum(-1),
     faces=_faces,
     parts=_parts,
+    page=_page,
 )
