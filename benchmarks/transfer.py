@@ -200,7 +200,6 @@ def measure(args: argparse.Namespace, show: Callable[[str], None] = print) -> di
             camera=(event_cameras.WIDE, event_cameras.HIGH) if fine else None,
             camera_fov_deg=config.camera.horizontal_fov_deg if fine else None,
             contrast=contrast_of(args, config),
-            turning=args.events != "pair",  # its phases are drawn anew for each pair
         )
         for mission in range(args.missions):
             watcher, close = prepare_camera(args, config, environment, mission)

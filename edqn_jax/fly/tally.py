@@ -50,7 +50,7 @@ class Tally:
                 self._packets.popleft()
                 self._spans.popleft()
 
-    def number(self, until_us: int) -> NDArray[np.float64] | None:
+    def number(self, until_us: int) -> NDArray[np.int64] | None:
         """Returns how many events there are before `until_us` [F, 2, H, W], as `Runner.decide` takes them.
 
         None, where a packet could not be counted, or there is none.
@@ -61,24 +61,17 @@ class Tally:
         start_us = until_us - int(self._edges[-1])
         since = at_pace(np.array(self._spans, np.int64), until_us, self._pace) - start_us
         pairs = np.searchsorted(self._edges, since, side="right") - 1  # -1 before, len - 1 from the end on
-        total = np.zeros((len(self._edges) - 1, *known[0].shape))
+        total = np.zeros((len(self._edges) - 1, *known[0].shape), np.int64)
         for (first, last), (_, events, _), counted in zip(pairs, self._packets, known, strict=True):
             if first != last:
-                total += self._apart(events, counted, until_us, start_us)
+                total += self._apart(events, until_us, start_us)
             elif 0 <= first < len(total):
                 total[first] += counted
         return total
 
-    def _apart(self, events: NDArray, counted: NDArray, until_us: int, start_us: int) -> NDArray[np.float64]:
-        """Returns the number of events of a packet that is not within one pair of frames.
-
-        Its pixels that turned count in the proportion of its events.
-        """
+    def _apart(self, events: NDArray, until_us: int, start_us: int) -> NDArray[np.int64]:
+        """Returns the number of events of a packet that is not within one pair of frames."""
         since = at_pace(events["t"], until_us, self._pace) - start_us
         pairs = np.searchsorted(self._edges, since, side="right") - 1
-        turned = counted - self._runner.count(events, turning=False)
-        parts = []
-        for pair in range(len(self._edges) - 1):
-            inside = events[pairs == pair]
-            parts.append(self._runner.count(inside, turning=False) + turned * (inside.size / events.size))
-        return np.stack(parts)
+        parts = [self._runner.count(events[pairs == pair]) for pair in range(len(self._edges) - 1)]
+        return np.stack([part for part in parts if part is not None])

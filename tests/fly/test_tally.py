@@ -27,10 +27,9 @@ ABOUT = {
 class Counting(runner.Runner):
     """A runner without a network."""
 
-    def __init__(self, **options: Any) -> None:
-        self.about = ABOUT | options
-        self._grid = runner.Grid.of(self.about, SIZE, 100.0)
-        self._turning = runner.Turning(self._grid) if options else None
+    def __init__(self) -> None:
+        self.about = ABOUT
+        self._grid = runner.Grid.of(ABOUT, SIZE, 100.0)
 
 
 def packet(rng: np.random.Generator, begin: int, end: int) -> np.ndarray:
@@ -61,24 +60,6 @@ def test_they_are_those_of_the_window(pace: float) -> None:
             assert np.array_equal(found, wanted)
             checked += int(wanted.sum() > 0)
     assert checked > 70
-
-
-def test_of_many_pixels_those_that_turn_count_as_in_a_decision_but_for_packets_across_two_pairs() -> None:
-    rng, counting = np.random.default_rng(0), Counting(sensor_pixels=64)
-    tally, end, several = Tally(counting, 1.0), 3_000_000, []
-    whole = runner.Turning(counting._grid)
-    for _ in range(12):  # 80,000 us
-        begin, end = end, end + 6_667
-        several.append(packet(rng, begin, end))
-        tally.take([(end, several[-1])])
-    events = np.concatenate(several)
-    found: Any = tally.number(end)
-    wanted = runner._numbers_of(counting.about, events, end - counting.window_us, counting._grid, whole)
-    assert np.abs(wanted - np.round(wanted)).sum() > 20
-    # ON and OFF of a pixel that turns twice cancel, as all of a policy of many pixels do.
-    found, wanted = found[:, 0] - found[:, 1], wanted[:, 0] - wanted[:, 1]
-    np.testing.assert_allclose(found.sum(axis=0), wanted.sum(axis=0))
-    assert np.abs(found - wanted).sum() < 0.1 * np.abs(wanted).sum()
 
 
 def test_what_cannot_be_counted_is_left_to_the_decision() -> None:

@@ -60,7 +60,6 @@ class Runner:
         camera_fov_deg: float | None = None,
         contrast: float | None = None,
         directions: ArrayLike | None = None,
-        turning: bool = True,
         threads: int = 1,
     ) -> None:
         """Loads a policy.
@@ -73,8 +72,6 @@ class Runner:
                 None is the policy's own, or the middle of those that it was trained with.
             directions: [H, W, 2] of a calibrated lens, in place of `camera_fov_deg`: where each pixel of the camera
                 looks, how far to the right and down for one ahead; not finite where it sees nothing.
-            turning: whether to add what pixels that turn leave out (`Turning`), for a policy of many pixels and a finer
-                camera; false for events that say on average how much brightness changed.
             threads: of onnxruntime; the network is so small that one is fastest.
 
         Raises:
@@ -96,7 +93,6 @@ class Runner:
         self.about = _about(self._session.get_modelmeta().custom_metadata_map, path)
         """What the policy expects, as `edqn export` wrote it."""
         self._grid = Grid.of(self.about, camera, camera_fov_deg, directions)
-        self._turns = turning and _is_mean_of(self.about, self._grid)
         self._contrast = camera_contrast(self.about, contrast)
         self._actions = np.asarray(self.about["actions"], np.float32)
         shape = next(given.shape for given in self._session.get_inputs() if given.name == "memory")
@@ -108,7 +104,6 @@ class Runner:
         self._memory = self._empty
         self._last_move = np.zeros(3, np.float32)
         self._yaw: float | None = None
-        self._turning = Turning(self._grid) if self._turns else None
 
     @property
     def period_s(self) -> float:
@@ -164,7 +159,7 @@ class Runner:
         yaw = heading_of(attitude)
         number = packet
         if packet.dtype.names is not None or packet.ndim != 4:
-            number = _numbers_of(self.about, packet, until_us - self.window_us, self._grid, self._turning)
+            number = _numbers_of(self.about, packet, until_us - self.window_us, self._grid)
         counts = _counts_of(self.about, number, self._grid, self._contrast)
         values, memory = self._session.run(
             ["values", "memory_after"],
@@ -182,11 +177,10 @@ class Runner:
         self._yaw = self._setpoint(place, float(yaw), aim, wanted)
         return Command(best, wanted, self._yaw, values[0])
 
-    def count(self, packet: NDArray, *, turning: bool = True) -> NDArray | None:
+    def count(self, packet: NDArray) -> NDArray[np.int64] | None:
         """Returns how many events of a packet [N] are in each of the policy's pixels [2, H, W], ON and OFF.
 
-        Packets can be counted as they come, each once and in the order of time, so that a decision has less to do.
-        None, where `decide` would refuse them. With `turning` what `Turning` adds is counted, too, and remembered.
+        Packets can be counted as they come, so that a decision has less to do. None, where `decide` would refuse them.
         """
         try:
             _check_packet(packet)
@@ -194,8 +188,7 @@ class Runner:
         except ValueError:
             return None
         times = np.zeros(packet.size, np.int64)
-        number = _number_in(self.about, packet, times, self._grid, pairs=1)[0]
-        return number + self._turning.take(packet) if turning and self._turning is not None else number
+        return _number_in(self.about, packet, times, self._grid, pairs=1)[0]
 
     def _told(self, values: NDArray[np.float32]) -> NDArray[np.float32]:
         """Returns own values as the network takes them, [1, N]."""
@@ -281,38 +274,6 @@ class Grid:
         return cls(cells, many)
 
 
-class Turning:
-    """Which way each pixel of a camera fired last, and what that says of the change that its events leave out.
-
-    A pixel that fired ON has, on average, gone on by half a contrast since, and one that fired OFF has gone down by it;
-    one that has not fired is where it was. So its first event, and each that turns the other way, stand for more than a
-    contrast: half of the change of direction is added, 0.5 or 1. Else a tenth to a third of the change is missing.
-    """
-
-    def __init__(self, grid: Grid) -> None:
-        self._grid = grid
-        self._last = np.zeros(grid.cells.size, np.int8)
-
-    def take(self, packet: NDArray) -> NDArray[np.float64]:
-        """Returns what is to be added to the events of a packet [N], [2, H, W] ON and OFF, and remembers it."""
-        if packet.size and np.any(packet["t"][1:] < packet["t"][:-1]):
-            packet = packet[np.argsort(packet["t"], kind="stable")]
-        last = self._last.copy()
-        # Of several events of a pixel the newest stays.
-        last[packet["y"].astype(np.int32) * np.int32(self._grid.cells.shape[1]) + packet["x"]] = packet["p"]
-        turned = np.flatnonzero((last != self._last) & (self._grid.cells.ravel() >= 0))
-        half, cell = 0.5 * (last[turned] - self._last[turned]), self._grid.cells.ravel()[turned]
-        self._last = last
-        shape = self._grid.pixels.shape
-        parts = (np.bincount(cell, np.maximum(sign * half, 0.0), minlength=shape[0] * shape[1]) for sign in (1, -1))
-        return np.stack([part.reshape(shape) for part in parts])
-
-
-def _is_mean_of(about: Mapping[str, Any], grid: Grid) -> bool:
-    """Returns whether a policy of many pixels has a camera finer than its own pixels."""
-    return about.get("sensor_pixels", 1) > 1 and bool(grid.pixels.max() > 1)
-
-
 def _places(many: int, size: int, scale: float) -> NDArray[np.int64]:
     """Returns the policy's pixel [many] of each pixel of a camera along one axis; -1 outside of the policy's view."""
     return _within((np.arange(many) + 0.5 - many / 2) * scale + size / 2, size)
@@ -387,10 +348,8 @@ def count_events(
     return _counts_of(about, _numbers_of(about, packet, start_us, grid), grid, contrast)
 
 
-def _numbers_of(
-    about: Mapping[str, Any], packet: NDArray, start_us: int, grid: Grid, turning: Turning | None = None
-) -> NDArray:
-    """Returns how many events of a window are in each of the policy's pixels, [F, 2, H, W], with what turning adds.
+def _numbers_of(about: Mapping[str, Any], packet: NDArray, start_us: int, grid: Grid) -> NDArray[np.int64]:
+    """Returns how many events of a window are in each of the policy's pixels, [F, 2, H, W].
 
     Raises:
         ValueError: as `count_events`.
@@ -400,20 +359,13 @@ def _numbers_of(
     since = packet["t"].astype(np.int64) - start_us
     inside = (since >= 0) & (since < edges[-1] - edges[0])
     if not inside.all():
-        before = packet[since < 0]
         packet, since = packet[inside], since[inside]
-        if turning is not None:
-            _check_pixels(before, grid)
-            turning.take(before)
     _check_pixels(packet, grid)
     # A comparison for each of the few frames is faster than a search for each of the many events.
     pair = np.zeros(since.size, np.int32)
     for edge in edges[1:-1] - edges[0]:
         pair += since >= edge
-    number = _number_in(about, packet, pair, grid, pairs=edges.size - 1)
-    if turning is None:
-        return number
-    return number + np.stack([turning.take(packet[pair == each]) for each in range(edges.size - 1)])
+    return _number_in(about, packet, pair, grid, pairs=edges.size - 1)
 
 
 def _number_in(
@@ -437,8 +389,8 @@ def _counts_of(
     per_event = [1.0 if told else contrast / own for own in (about["contrast_on"], about["contrast_off"])]
     # In contrasts of the policy, means over the camera's pixels.
     change = number * np.asarray(per_event)[:, None, None] / np.maximum(grid.pixels, 1)
-    together = about.get("sensor_pixels", 1)
-    if about["counts_net"] or _is_mean_of(about, grid):
+    is_finer, together = bool(grid.pixels.max() > 1), about.get("sensor_pixels", 1)
+    if about["counts_net"] or (together > 1 and is_finer):
         # Contrasts may differ between ON and OFF.
         log_change = change[:, 0] * about["contrast_on"] - change[:, 1] * about["contrast_off"]
         change = np.stack([log_change / about["contrast_on"], -log_change / about["contrast_off"]], axis=1)
